@@ -1,0 +1,1 @@
+//! Learns moving Gaussian scenes from posed captures.

@@ -1,0 +1,94 @@
+//! One error type: what happened, where, and what to do about it.
+
+use std::fmt;
+
+/// Result with this crate's [`Error`].
+pub type Result<T, E = Error> = std::result::Result<T, E>;
+
+/// What class of trouble an [`Error`] is; shells map it to an exit code.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum ErrorKind {
+    /// The user's data or options are wrong (exit code 2).
+    BadInput,
+    /// A file could not be read or written (exit code 2).
+    Io,
+    /// A valid file that this version cannot handle (exit code 2).
+    Unsupported,
+    /// The work would need, or needed, more memory than allowed (exit code 1).
+    Memory,
+    /// Training diverged and could not be rolled back (exit code 1).
+    Diverged,
+    /// The user asked to stop; what was done is saved (exit code 1).
+    Interrupted,
+}
+
+/// What happened, where (file, frame, camera, byte) and what to do.
+#[derive(Debug)]
+pub struct Error {
+    kind: ErrorKind,
+    what: String,
+    place: String,
+    remedy: String,
+    source: Option<Box<dyn std::error::Error + Send + Sync>>,
+}
+
+impl Error {
+    /// An error of `kind`; `what` is a clause without a final full stop.
+    pub fn new(kind: ErrorKind, what: impl Into<String>) -> Self {
+        Self { kind, what: what.into(), place: String::new(), remedy: String::new(), source: None }
+    }
+
+    /// Bad user data.
+    pub fn input(what: impl Into<String>) -> Self {
+        Self::new(ErrorKind::BadInput, what)
+    }
+
+    /// A failed read or write.
+    pub fn io(what: impl Into<String>, source: std::io::Error) -> Self {
+        Self { source: Some(Box::new(source)), ..Self::new(ErrorKind::Io, what) }
+    }
+
+    /// Names the place. Called again further out, the outer place is put in front.
+    #[must_use]
+    pub fn at(mut self, place: impl fmt::Display) -> Self {
+        self.place = if self.place.is_empty() { place.to_string() } else { format!("{place}: {}", self.place) };
+        self
+    }
+
+    /// Says what to do; the first (innermost) remedy is kept.
+    #[must_use]
+    pub fn remedy(mut self, remedy: impl Into<String>) -> Self {
+        if self.remedy.is_empty() {
+            self.remedy = remedy.into();
+        }
+        self
+    }
+
+    /// The class of trouble.
+    pub fn kind(&self) -> ErrorKind {
+        self.kind
+    }
+}
+
+impl fmt::Display for Error {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if !self.place.is_empty() {
+            write!(f, "{}: ", self.place)?;
+        }
+        write!(f, "{}", self.what)?;
+        if let Some(source) = &self.source {
+            write!(f, " ({source})")?;
+        }
+        if !self.remedy.is_empty() {
+            write!(f, ". {}", self.remedy)?;
+        }
+        Ok(())
+    }
+}
+
+impl std::error::Error for Error {
+    fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
+        self.source.as_ref().map(|s| s.as_ref() as _)
+    }
+}

@@ -1,0 +1,11 @@
+//! Moving 3D Gaussian scenes: tables, motion models and a differentiable renderer.
+//!
+//! The chain is `motion.at → render → loss → render.backward → motion.backward`. A motion model answers one
+//! question (which [`scene::Splats`] at time t), the renderer never sees time, a motion model never sees a pixel.
+//! This crate reads bytes, not paths; it knows no loss, no optimiser and no data set.
+
+pub mod error;
+pub mod math;
+pub mod scene;
+
+pub use error::{Error, ErrorKind, Result};

@@ -1,0 +1,13 @@
+//! Small mathematics: quaternions, symmetric 3x3 matrices, rigid motions, spherical harmonics, counter-based random
+//! numbers, and the [`Real`] trait that lets every kernel run in f32 and be checked in f64.
+
+pub mod quat;
+pub mod real;
+pub mod rng;
+pub mod se3;
+pub mod sh;
+pub mod sym3;
+
+pub use real::Real;
+pub use rng::Rng;
+pub use se3::Se3;

@@ -1,0 +1,114 @@
+//! Cameras: OpenCV axes (x right, y down, z forward), pixel centres at +0.5, poses named `cam_from_world`.
+
+use crate::math::Se3;
+
+/// Focal lengths and principal point, pixels (the centre of the first pixel is at 0.5).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Intrinsics {
+    /// Horizontal focal length.
+    pub fx: f64,
+    /// Vertical focal length.
+    pub fy: f64,
+    /// Principal point, x.
+    pub cx: f64,
+    /// Principal point, y.
+    pub cy: f64,
+}
+
+/// How the lens bends rays. The renderer draws pinhole images; captures are undistorted on load.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[non_exhaustive]
+pub enum Lens {
+    /// No distortion.
+    Pinhole,
+    /// OpenCV's rational model: radial k1..k6, tangential p1 p2, thin prism s1..s4.
+    Brown {
+        /// k1..k6
+        k: [f64; 6],
+        /// p1, p2
+        p: [f64; 2],
+        /// s1..s4
+        s: [f64; 4],
+    },
+    /// Kannala-Brandt fisheye: r = θ(1 + k1θ² + k2θ⁴ + k3θ⁶ + k4θ⁸).
+    Fisheye {
+        /// k1..k4
+        k: [f64; 4],
+    },
+}
+
+/// A posed camera.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Camera {
+    /// Takes world points into the camera's axes. (In other systems: viewmat, w2c, extrinsic.)
+    #[doc(alias = "viewmat")]
+    pub cam_from_world: Se3,
+    /// Focal lengths and principal point.
+    pub intrinsics: Intrinsics,
+    /// Lens distortion of the original picture.
+    pub lens: Lens,
+    /// Pixels across.
+    pub width: usize,
+    /// Pixels down.
+    pub height: usize,
+}
+
+impl Camera {
+    /// A pinhole camera with square pixels, its principal point in the middle. `fov_y` in radians.
+    pub fn with_fov_y(cam_from_world: Se3, fov_y: f64, width: usize, height: usize) -> Self {
+        let f = 0.5 * height as f64 / (0.5 * fov_y).tan();
+        let intrinsics = Intrinsics { fx: f, fy: f, cx: 0.5 * width as f64, cy: 0.5 * height as f64 };
+        Self { cam_from_world, intrinsics, lens: Lens::Pinhole, width, height }
+    }
+
+    /// The camera's centre in the world.
+    pub fn center(&self) -> [f64; 3] {
+        self.cam_from_world.inverse().translation
+    }
+
+    /// The viewing direction in the world (unit).
+    pub fn forward(&self) -> [f64; 3] {
+        self.cam_from_world.rotation[2]
+    }
+
+    /// Pixel position and depth z of a world point (pinhole); `None` at or behind the camera.
+    pub fn project(&self, x: [f64; 3]) -> Option<([f64; 2], f64)> {
+        let p = self.cam_from_world.apply(x);
+        let k = &self.intrinsics;
+        (p[2] > 1e-9).then(|| ([k.fx * p[0] / p[2] + k.cx, k.fy * p[1] / p[2] + k.cy], p[2]))
+    }
+
+    /// The world point at depth z behind pixel position (u, v) (pinhole).
+    pub fn unproject(&self, [u, v]: [f64; 2], z: f64) -> [f64; 3] {
+        let k = &self.intrinsics;
+        self.cam_from_world.inverse().apply([(u - k.cx) / k.fx * z, (v - k.cy) / k.fy * z, z])
+    }
+
+    /// The same view on a raster `k` times smaller: intrinsics divided, size rounded down.
+    pub fn downscaled(&self, k: usize) -> Self {
+        let f = k as f64;
+        let i = &self.intrinsics;
+        Self {
+            intrinsics: Intrinsics { fx: i.fx / f, fy: i.fy / f, cx: i.cx / f, cy: i.cy / f },
+            width: self.width / k,
+            height: self.height / k,
+            ..self.clone()
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn unproject_inverts_project() {
+        let pose = Se3::look_at([1.0, 2.0, 5.0], [0.0; 3], [0.0, 1.0, 0.0]);
+        let camera = Camera::with_fov_y(pose, 0.8, 40, 30);
+        let x = [0.3, -0.2, 0.4];
+        let (uv, z) = camera.project(x).unwrap();
+        let back = camera.unproject(uv, z);
+        assert!((0..3).all(|k| (back[k] - x[k]).abs() < 1e-12));
+        assert!(camera.project([2.0, 4.0, 10.0]).is_none(), "a point behind the camera has no pixel");
+    }
+}

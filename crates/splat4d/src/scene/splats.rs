@@ -1,0 +1,99 @@
+//! [`Splats`]: the scene at one instant, activated: all the renderer ever sees.
+
+use super::table::Table;
+use crate::math::Real;
+
+/// Which rows of a table are meant. Output is compact: output row j belongs to row `ids[j]`.
+#[derive(Clone, Copy, Debug)]
+pub enum Rows<'a> {
+    /// Every row.
+    All,
+    /// These, strictly increasing.
+    Some(&'a [u32]),
+}
+
+impl Rows<'_> {
+    /// How many rows, of a table that has `total`.
+    pub fn len(&self, total: usize) -> usize {
+        match self {
+            Rows::All => total,
+            Rows::Some(ids) => ids.len(),
+        }
+    }
+
+    /// The row behind output row j.
+    #[inline(always)]
+    pub fn id(&self, j: usize) -> usize {
+        match self {
+            Rows::All => j,
+            Rows::Some(ids) => ids[j] as usize,
+        }
+    }
+}
+
+/// Columns of [`Part::out`].
+pub const SPLAT_COLUMNS: [(&str, usize); 3] = [("mean", 3), ("cov", 6), ("opacity", 1)];
+/// First column of the covariance (xx, xy, xz, yy, yz, zz) in [`Part::out`].
+pub const COV: usize = 3;
+/// Column of the opacity in [`Part::out`].
+pub const SPLAT_OPACITY: usize = 9;
+
+/// Where a part's colour comes from.
+#[derive(Clone, Copy, Debug)]
+pub enum Color<'a, F = f32> {
+    /// Spherical harmonics, borrowed from the parameters: splat j has row `rows.id(j)`.
+    Sh {
+        /// [N, 3·K·blocks]; coefficient k of channel c is column 3k + c.
+        table: &'a Table<F>,
+        /// Which rows.
+        rows: Rows<'a>,
+        /// Optional weights [splats, blocks] of blocks of coefficients (time-dependent SH).
+        weights: Option<&'a Table<F>>,
+        /// Whether the table is the layer's own SH, whose gradient goes straight to `Grads`.
+        base: bool,
+    },
+    /// One colour a splat, [splats, C].
+    Direct {
+        /// [splats, C]
+        table: &'a Table<F>,
+    },
+}
+
+/// The splats of one layer at one instant.
+#[derive(Clone, Copy, Debug)]
+pub struct Part<'a, F = f32> {
+    /// [splats, 10]: world mean 3, world covariance 6, opacity 1 in (0,1), life and edits applied.
+    pub out: &'a Table<F>,
+    /// Colour.
+    pub color: Color<'a, F>,
+}
+
+/// A scene at one instant: a part a layer. Splats are numbered through all parts in order.
+#[derive(Clone, Debug, Default)]
+pub struct Splats<'a, F = f32> {
+    /// One a layer.
+    pub parts: Vec<Part<'a, F>>,
+}
+
+impl<F: Real> Splats<'_, F> {
+    /// Splats in all parts.
+    pub fn len(&self) -> usize {
+        self.parts.iter().map(|p| p.out.rows()).sum()
+    }
+
+    /// Whether there is nothing to draw.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+}
+
+/// Gradients to one [`Part`], in its own compact rows.
+#[derive(Clone, Copy, Debug)]
+pub struct SplatGrads<'a, F = f32> {
+    /// [splats, 10]
+    pub out: &'a Table<F>,
+    /// Gradient to `Direct` colours or to SH that is not the layer's own, [splats, width].
+    pub color: Option<&'a Table<F>>,
+    /// Gradient to the SH block weights, [splats, blocks].
+    pub weights: Option<&'a Table<F>>,
+}
