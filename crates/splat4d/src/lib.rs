@@ -5,7 +5,9 @@
 //! This crate reads bytes, not paths; it knows no loss, no optimiser and no data set.
 
 pub mod error;
+pub mod layers;
 pub mod math;
+pub mod motion;
 pub mod scene;
 
 pub use error::{Error, ErrorKind, Result};

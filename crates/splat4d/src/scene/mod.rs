@@ -1,6 +1,7 @@
 //! What a scene is made of: tables of Gaussians, the instant they are looked at, and the cameras that look.
 
 pub mod camera;
+pub mod life;
 pub mod params;
 pub mod planes;
 pub mod splats;
@@ -8,6 +9,7 @@ pub mod table;
 pub mod time;
 
 pub use camera::{Camera, Intrinsics, Lens};
+pub use life::{LifeBuckets, LifeKind};
 pub use params::{Born, GEOMETRY, Grads, Key, LIFE, ParamInfo, Params, RowEdit, SH, Space};
 pub use planes::Planes;
 pub use splats::{Color, Part, Rows, SplatGrads, Splats};

@@ -1,0 +1,336 @@
+//! A scene is a sum of layers: each a set of Gaussians with one motion model and one kind of life, all splatted together.
+
+#[cfg(test)]
+mod tests;
+
+use crate::math::Real;
+use crate::math::Rng;
+use crate::motion::{At, Cache, Motion, Tape, fill_rows, for_rows};
+use crate::scene::GEOMETRY;
+use crate::scene::params::OPACITY;
+use crate::scene::splats::SPLAT_OPACITY;
+use crate::scene::{
+    Grads, LIFE, LifeBuckets, LifeKind, Params, Part, RowEdit, Rows, Space, SplatGrads, Splats, Table, Time,
+};
+use std::sync::Arc;
+
+/// A splat fainter than this is not drawn, so that a Gaussian below it is not alive (1/255, Kerbl et al. 2023).
+pub const ALPHA_MIN: f64 = 1.0 / 255.0;
+
+/// Gaussians with one motion model and one kind of life.
+pub struct Layer<F: Real = f32> {
+    /// What the user calls it.
+    pub name: String,
+    /// All learnable state.
+    pub params: Params<F>,
+    /// How it moves.
+    pub motion: Arc<dyn Motion<F>>,
+    /// How long its Gaussians live.
+    pub life: LifeKind,
+}
+
+impl<F: Real> Clone for Layer<F> {
+    fn clone(&self) -> Self {
+        Self { name: self.name.clone(), params: self.params.clone(), motion: self.motion.clone(), life: self.life }
+    }
+}
+
+impl<F: Real> std::fmt::Debug for Layer<F> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Layer({}, {} Gaussians, {:?}, {:?})", self.name, self.params.len(), self.motion.spec(), self.life)
+    }
+}
+
+/// One layer's answer at one time, and what its backward needs.
+#[derive(Debug)]
+pub struct LayerTape<F = f32> {
+    of: Space,
+    t: Time,
+    all: bool,
+    ids: Vec<u32>,
+    tape: Tape<F>,
+    /// [splats, 4]: σ, ∂σ/∂t, ∂σ/∂log width, ∂σ/∂log softness; empty where σ is 1.
+    life: Table<F>,
+    d_out: Table<F>,
+}
+
+impl<F: Real> Default for LayerTape<F> {
+    fn default() -> Self {
+        Self {
+            of: Space::Gaussians,
+            t: Time(0.0),
+            all: true,
+            ids: Vec::new(),
+            tape: Tape::default(),
+            life: Table::default(),
+            d_out: Table::default(),
+        }
+    }
+}
+
+impl<F: Real> LayerTape<F> {
+    /// A tape for the question (space, rows, time).
+    pub fn ask(&mut self, of: Space, rows: Rows<'_>, t: Time) {
+        (self.of, self.t) = (of, t);
+        self.ids.clear();
+        match rows {
+            Rows::All => self.all = true,
+            Rows::Some(ids) => {
+                self.all = false;
+                self.ids.extend_from_slice(ids);
+            }
+        }
+    }
+
+    /// Asks for the Gaussians of `layer` that are alive at t.
+    pub fn ask_active(&mut self, layer: &Layer<F>, t: Time) {
+        (self.of, self.t) = (Space::Gaussians, t);
+        self.all = layer.active(t, &mut self.ids);
+    }
+
+    /// The rows asked for.
+    pub fn rows(&self) -> Rows<'_> {
+        if self.all { Rows::All } else { Rows::Some(&self.ids) }
+    }
+
+    /// The space asked for.
+    pub fn space(&self) -> Space {
+        self.of
+    }
+
+    /// The time asked for.
+    pub fn time(&self) -> Time {
+        self.t
+    }
+
+    /// [splats, 10], life applied.
+    pub fn out(&self) -> &Table<F> {
+        &self.tape.out
+    }
+
+    /// The question as the motion model sees it.
+    pub fn question<'a>(&'a self, p: &'a Params<F>) -> At<'a, F> {
+        At { p, of: self.of, rows: self.rows(), t: self.t }
+    }
+}
+
+impl<F: Real> Layer<F> {
+    /// The rows alive at t into `ids` (strictly increasing): those whose opacity times life reaches [`ALPHA_MIN`].
+    /// Returns true, and leaves `ids` empty, where every row is meant (infinite life).
+    pub fn active(&self, t: Time, ids: &mut Vec<u32>) -> bool {
+        ids.clear();
+        let mut own = Table::new(&[("life", 2)], 0);
+        let (table, kind) = if self.motion.life(&self.params, &mut own) {
+            (&own, LifeKind::GaussHalf)
+        } else {
+            (&self.params[LIFE], self.life)
+        };
+        if kind == LifeKind::Infinite {
+            return true;
+        }
+        let geometry = &self.params[GEOMETRY];
+        // σ ≥ α_min needs u² ≤ 2 ln 255 (an interval: beyond its ends); a wide first test spares most exponentials.
+        let widest = F::of((2.0 * -ALPHA_MIN.ln()).sqrt());
+        for id in 0..table.rows() {
+            let row = life_row(table, id);
+            let width = match kind {
+                LifeKind::Interval => row[1].exp() + row[2].exp() * widest,
+                _ => row[1].exp() * widest,
+            };
+            // Phrased so that a NaN is kept and found by the trainer's guard, not hidden.
+            if (F::of(t.0) - row[0]).abs() > width {
+                continue;
+            }
+            if geometry.get(id, OPACITY).sigmoid() * kind.eval(row, t).sigma < F::of(ALPHA_MIN) {
+                continue;
+            }
+            ids.push(id as u32);
+        }
+        false
+    }
+
+    /// [from, to] in seconds for every row: when its opacity times life is at least [`ALPHA_MIN`]; (1, 0) for never.
+    pub fn spans(&self) -> Vec<[f64; 2]> {
+        let mut own = Table::new(&[("life", 2)], 0);
+        let (table, kind) = if self.motion.life(&self.params, &mut own) {
+            (&own, LifeKind::GaussHalf)
+        } else {
+            (&self.params[LIFE], self.life)
+        };
+        let geometry = &self.params[GEOMETRY];
+        let span = |id: usize| {
+            let row: [f64; 3] = life_row(table, id).map(Real::f64);
+            let reach = kind.reach(row, geometry.get(id, OPACITY).sigmoid().f64(), ALPHA_MIN);
+            if reach < 0.0 { [1.0, 0.0] } else { [row[0] - reach, row[0] + reach] }
+        };
+        (0..self.params.len()).map(span).collect()
+    }
+
+    /// Buckets for playback over a clip.
+    pub fn buckets(&self, clip: [f64; 2], count: usize) -> LifeBuckets {
+        LifeBuckets::new(self.spans(), clip, count)
+    }
+
+    /// Answers the question in `tape`: the motion model, then the life.
+    pub fn at(&self, cache: &Cache, tape: &mut LayerTape<F>) {
+        let mut own = std::mem::take(&mut tape.tape);
+        self.motion.at(&tape.question(&self.params), cache, &mut own);
+        tape.tape = own;
+        if self.life == LifeKind::Infinite || tape.of != Space::Gaussians {
+            tape.life = Table::default();
+            return;
+        }
+        let table = &self.params[LIFE];
+        if tape.life.width() == 0 {
+            tape.life = Table::new(&[("sigma", 4)], 0);
+        }
+        tape.life.resize(tape.tape.out.rows());
+        let (kind, t) = (self.life, tape.t);
+        let rows = if tape.all { Rows::All } else { Rows::Some(&tape.ids) };
+        fill_rows(&mut tape.life, rows, |id| {
+            let v = kind.eval(life_row(table, id), t);
+            [v.sigma, v.d_time, v.d_log_width, v.d_log_softness]
+        });
+        let sigma = &tape.life;
+        for_rows([&mut tape.tape.out], Rows::All, |_, j, [out]| {
+            let [o] = out.read::<1>(j, SPLAT_OPACITY);
+            out.write(j, SPLAT_OPACITY, [o * sigma.get(j, 0)]);
+            0.0
+        });
+    }
+
+    /// The splats that the last [`at`](Self::at) left in `tape`.
+    pub fn part<'a>(&'a self, tape: &'a LayerTape<F>) -> Part<'a, F> {
+        let color = self.motion.color(&tape.question(&self.params), &tape.tape);
+        Part { out: &tape.tape.out, color }
+    }
+
+    /// The VJP of [`at`](Self::at): adds to `d` and `d_cache`, returns dL/dt. `d_out.out` is to what `at` returned.
+    pub fn backward(
+        &self,
+        cache: &Cache,
+        tape: &mut LayerTape<F>,
+        d_out: &SplatGrads<'_, F>,
+        d_cache: &mut Cache,
+        d: &mut Grads<F>,
+    ) -> f64 {
+        d.activate(tape.of, if tape.all { Rows::All } else { Rows::Some(&tape.ids) });
+        let mut own = std::mem::take(&mut tape.tape);
+        let mut d_motion = std::mem::take(&mut tape.d_out);
+        let mut d_time = 0.0;
+        let question = tape.question(&self.params);
+        if tape.life.width() == 0 {
+            d_time += self.motion.backward(&question, cache, &mut own, d_out, d_cache, d);
+        } else {
+            // o_eff = o·σ: the motion gets dL/do = σ·dL/do_eff, the life dL/dσ = o·dL/do_eff.
+            d_motion.clone_from(d_out.out);
+            let sigma = &tape.life;
+            for_rows([&mut d_motion], Rows::All, |_, j, [d_row]| {
+                let [g] = d_row.read::<1>(j, SPLAT_OPACITY);
+                d_row.write(j, SPLAT_OPACITY, [g * sigma.get(j, 0)]);
+                0.0
+            });
+            let (geometry, kind) = (&self.params[GEOMETRY], self.life);
+            d_time += for_rows(d.of([LIFE]), question.rows, |j, id, [d_life]| {
+                let [_, by_time, by_width, by_softness] = sigma.read::<4>(j, 0);
+                let g = d_out.out.get(j, SPLAT_OPACITY) * geometry.get(id, OPACITY).sigmoid();
+                match kind {
+                    LifeKind::Interval => d_life.add(id, 0, [-g * by_time, g * by_width, g * by_softness]),
+                    _ => d_life.add(id, 0, [-g * by_time, g * by_width]),
+                }
+                (g * by_time).f64()
+            });
+            let scaled = SplatGrads { out: &d_motion, ..*d_out };
+            d_time += self.motion.backward(&question, cache, &mut own, &scaled, d_cache, d);
+        }
+        tape.tape = own;
+        tape.d_out = d_motion;
+        d_time
+    }
+
+    /// One row edit: gathers every table of its space, then lets the model mend what copying cannot.
+    pub fn edit(&mut self, edit: &RowEdit, rng: &Rng) {
+        self.params.apply(edit);
+        self.motion.clone().on_edit(&mut self.params, edit, rng);
+    }
+}
+
+/// A row of the life table; columns that it does not have are zero.
+#[inline(always)]
+fn life_row<F: Real>(table: &Table<F>, id: usize) -> [F; 3] {
+    match table.width() {
+        0 => [F::ZERO; 3],
+        2 => {
+            let [c, w] = table.read::<2>(id, 0);
+            [c, w, F::ZERO]
+        }
+        _ => table.read::<3>(id, 0),
+    }
+}
+
+/// How blended channels become colour.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Head {
+    /// They are the colour.
+    #[default]
+    Identity,
+}
+
+/// A sum of layers on one clock.
+#[derive(Clone, Debug, Default)]
+pub struct Scene<F: Real = f32> {
+    /// Splatted together in this order.
+    pub layers: Vec<Layer<F>>,
+    /// Colour behind everything.
+    pub background: [f32; 3],
+    /// First and last second of the clip.
+    pub clip: [f64; 2],
+    /// Frames a second of the clip.
+    pub fps: f64,
+    /// The direction that is up in the world (unit).
+    pub up: [f64; 3],
+    /// How blended channels become colour.
+    pub head: Head,
+}
+
+/// A scene at one instant: a tape a layer, reused from frame to frame.
+#[derive(Debug)]
+pub struct Instant<F = f32> {
+    /// One a layer.
+    pub tapes: Vec<LayerTape<F>>,
+}
+
+impl<F: Real> Default for Instant<F> {
+    fn default() -> Self {
+        Self { tapes: Vec::new() }
+    }
+}
+
+impl<F: Real> Scene<F> {
+    /// Gaussians in all layers.
+    pub fn len(&self) -> usize {
+        self.layers.iter().map(|l| l.params.len()).sum()
+    }
+
+    /// Whether there is nothing to see.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// The scene at time t, for playback: only Gaussians alive then.
+    pub fn at(&self, t: Time, instant: &mut Instant<F>) {
+        instant.tapes.resize_with(self.layers.len(), LayerTape::default);
+        for (layer, tape) in self.layers.iter().zip(&mut instant.tapes) {
+            let mut cache = Cache::default();
+            tape.ask_active(layer, t);
+            layer.motion.prepare(&layer.params, &[tape.question(&layer.params)], &mut cache);
+            layer.at(&cache, tape);
+        }
+    }
+
+    /// The splats that [`at`](Self::at) left in `instant`.
+    pub fn splats<'a>(&'a self, instant: &'a Instant<F>) -> Splats<'a, F> {
+        Splats { parts: self.layers.iter().zip(&instant.tapes).map(|(l, t)| l.part(t)).collect() }
+    }
+}

@@ -1,0 +1,233 @@
+//! Motion models: at time t, which splats? A model never sees a pixel; it is a pure function of its parameters.
+//!
+//! A model has no hidden state. Sequential ones (state space, filters) do their scan in [`Motion::prepare`], add to the
+//! scan's gradient in [`Motion::backward`], and run the reverse scan in [`Motion::finish`]; pointwise ones leave those empty.
+
+pub mod spacetime;
+pub mod still;
+
+use crate::math::{Real, Rng};
+use crate::scene::splats::SPLAT_COLUMNS;
+use crate::scene::table::TableMut;
+use crate::scene::{BLOCK, Color, Grads, Params, RowEdit, Rows, SH, Space, SplatGrads, Table, Time};
+use crate::{Error, Result};
+use rayon::prelude::*;
+use std::any::Any;
+use std::sync::Arc;
+
+pub use spacetime::{Spacetime, SpacetimeSpec};
+pub use still::Still;
+
+/// One question to a motion model.
+#[derive(Clone, Copy, Debug)]
+pub struct At<'a, F = f32> {
+    /// The layer's parameters.
+    pub p: &'a Params<F>,
+    /// Gaussians, or nodes (which then answer as splats: node losses, node warm-up).
+    pub of: Space,
+    /// Which rows.
+    pub rows: Rows<'a>,
+    /// When.
+    pub t: Time,
+}
+
+impl<F: Real> At<'_, F> {
+    /// How many splats are asked for.
+    pub fn len(&self) -> usize {
+        self.rows.len(self.p.rows_of(self.of))
+    }
+
+    /// Whether none is.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+}
+
+/// A model's typed scratch, owned by the step and reused.
+#[derive(Default)]
+pub struct Slot(Option<Box<dyn Any + Send + Sync>>);
+
+impl Slot {
+    /// The value of type T, made by `Default` when absent or of another type.
+    pub fn get_or_default<T: Any + Send + Sync + Default>(&mut self) -> &mut T {
+        if !self.0.as_ref().is_some_and(|b| b.is::<T>()) {
+            self.0 = Some(Box::new(T::default()));
+        }
+        self.0.as_mut().and_then(|b| b.downcast_mut()).expect("the slot was just filled with this type")
+    }
+
+    /// The value of type T, if there.
+    pub fn get<T: Any>(&self) -> Option<&T> {
+        self.0.as_ref().and_then(|b| b.downcast_ref())
+    }
+}
+
+impl std::fmt::Debug for Slot {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(if self.0.is_some() { "Slot(filled)" } else { "Slot(empty)" })
+    }
+}
+
+/// What a model computes once a step for all questions together; its gradient is another one.
+pub type Cache = Slot;
+
+/// One answer, and what the model needs to remember of it for its backward.
+#[derive(Debug, Default)]
+pub struct Tape<F = f32> {
+    /// [splats, 10], see [`SPLAT_COLUMNS`].
+    pub out: Table<F>,
+    /// The model's own.
+    pub own: Slot,
+}
+
+impl<F: Real> Tape<F> {
+    /// Makes `out` a splat table of `rows` rows, keeping the allocation.
+    pub fn start(&mut self, rows: usize) {
+        if self.out.width() == 0 {
+            self.out = Table::new(&SPLAT_COLUMNS, rows);
+        } else {
+            self.out.resize(rows);
+        }
+    }
+}
+
+/// A model as plain data: what files store, and all that [`build`] needs to make it again.
+#[derive(Clone, Debug, PartialEq)]
+#[non_exhaustive]
+pub enum Spec {
+    /// Nothing moves.
+    Still,
+    /// Explicit kinematics around each Gaussian's life.
+    Spacetime(SpacetimeSpec),
+    /// A model from outside this library; it cannot be built from a file.
+    Custom(String),
+}
+
+impl Spec {
+    /// The name that `--motion` takes and files store.
+    pub fn name(&self) -> &str {
+        match self {
+            Spec::Still => "still",
+            Spec::Spacetime(_) => "spacetime",
+            Spec::Custom(name) => name,
+        }
+    }
+}
+
+/// Every model of [`Spec`] that the library can build, by name.
+pub const BUILT_IN: [&str; 2] = ["still", "spacetime"];
+
+/// Makes the model, and in `p` the tables it needs (or claims the loaded ones).
+///
+/// Errors: `Spec::Custom`; loaded arrays of the wrong shape.
+pub fn build<F: Real>(spec: &Spec, p: &mut Params<F>) -> Result<Arc<dyn Motion<F>>> {
+    match spec {
+        Spec::Still => Ok(Arc::new(Still)),
+        Spec::Spacetime(s) => Ok(Arc::new(Spacetime::new(*s, p)?)),
+        Spec::Custom(name) => Err(Error::input(format!("motion model `{name}` is not one of this version's"))
+            .remedy(format!("It knows: {}. A newer splat4d may know more", BUILT_IN.join(", ")))),
+    }
+}
+
+/// A motion model. Immutable: a spec and keys.
+pub trait Motion<F: Real = f32>: Any + Send + Sync {
+    /// Plain data from which [`build`] makes this model again.
+    fn spec(&self) -> Spec;
+
+    /// Once a step, before any `at`, with all its questions: scans, filters, neighbours, node poses.
+    fn prepare(&self, _p: &Params<F>, _q: &[At<'_, F>], _cache: &mut Cache) {}
+
+    /// Fills `tape.out` [rows, 10] for one question; random access in t.
+    fn at(&self, q: &At<'_, F>, cache: &Cache, tape: &mut Tape<F>);
+
+    /// Where the splats' colour comes from; the layer's SH unless a model says otherwise.
+    fn color<'a>(&self, q: &At<'a, F>, _tape: &'a Tape<F>) -> Color<'a, F> {
+        Color::Sh { table: &q.p[SH], rows: q.rows, weights: None, base: true }
+    }
+
+    /// The VJP of `at` (and of `color`, unless it is the layer's SH): adds to `d` and `d_cache`, returns dL/dt.
+    ///
+    /// Must not read the opacity column of `tape.out`: the layer has multiplied it by the life.
+    fn backward(
+        &self,
+        q: &At<'_, F>,
+        cache: &Cache,
+        tape: &mut Tape<F>,
+        d_out: &SplatGrads<'_, F>,
+        d_cache: &mut Cache,
+        d: &mut Grads<F>,
+    ) -> f64;
+
+    /// Once a step, after every `backward`: the VJP of `prepare`.
+    fn finish(&self, _p: &Params<F>, _q: &[At<'_, F>], _cache: &mut Cache, _d_cache: &mut Cache, _d: &mut Grads<F>) {}
+
+    /// After a row edit has gathered every table: what copying alone cannot do (re-timed clones, 4D split offsets).
+    fn on_edit(&self, _p: &mut Params<F>, _edit: &RowEdit, _rng: &Rng) {}
+
+    /// For models whose life is not the layer's: fills [N, 2] with (centre, log width) of a `GaussHalf` life and returns
+    /// true. False: the layer's own life table says it.
+    fn life(&self, _p: &Params<F>, _out: &mut Table<F>) -> bool {
+        false
+    }
+
+    /// dμ/dt in scene units a second, [rows, 3]: central differences over ± [`VELOCITY_STEP`] unless a model knows better.
+    fn velocity(&self, q: &At<'_, F>, out: &mut Table<F>) {
+        let sides = [-VELOCITY_STEP, VELOCITY_STEP].map(|h| {
+            let side = At { t: Time(q.t.0 + h), ..*q };
+            let (mut cache, mut tape) = (Cache::default(), Tape::default());
+            self.prepare(q.p, &[side], &mut cache);
+            self.at(&side, &cache, &mut tape);
+            tape.out
+        });
+        *out = Table::new(&[("velocity", 3)], q.len());
+        for j in 0..q.len() {
+            let (a, b) = (sides[0].read::<3>(j, 0), sides[1].read::<3>(j, 0));
+            out.write(j, 0, std::array::from_fn::<F, 3, _>(|k| (b[k] - a[k]) / F::of(2.0 * VELOCITY_STEP)));
+        }
+    }
+}
+
+/// Half the step of the default velocity: half a frame at 60 frames a second, seconds.
+pub const VELOCITY_STEP: f64 = 1.0 / 120.0;
+
+/// Blocks of rows a task takes: 1024 rows are some hundreds of kilobytes of parameters, enough to hide task costs.
+const TASK_BLOCKS: usize = 64;
+
+/// Calls `f(j, id, tables)` for every asked row, in parallel over runs of table rows, and returns the sum of the results
+/// in a fixed order. `tables` are views that hold row `id`; j is the compact row.
+pub fn for_rows<F: Real, const N: usize>(
+    tables: [&mut Table<F>; N],
+    rows: Rows<'_>,
+    f: impl Fn(usize, usize, &mut [TableMut<'_, F>; N]) -> f64 + Sync,
+) -> f64 {
+    let total = tables[0].rows();
+    let count = total.div_ceil(TASK_BLOCKS * BLOCK);
+    let mut chunks: [_; N] = tables.map(|t| t.chunks_mut(TASK_BLOCKS));
+    let tasks: Vec<[TableMut<'_, F>; N]> = (0..count)
+        .map(|_| chunks.each_mut().map(|c| c.next().expect("tables of one space have as many rows")))
+        .collect();
+    let sums: Vec<f64> = tasks
+        .into_par_iter()
+        .map(|mut views| {
+            let (first, end) = (views[0].first, views[0].first + views[0].rows);
+            let (from, to) = match rows {
+                Rows::All => (first, end),
+                Rows::Some(ids) => {
+                    (ids.partition_point(|&i| (i as usize) < first), ids.partition_point(|&i| (i as usize) < end))
+                }
+            };
+            (from..to).map(|j| f(j, rows.id(j), &mut views)).sum()
+        })
+        .collect();
+    sums.into_iter().sum()
+}
+
+/// Fills compact rows of `out` in parallel: `f(j, id)` gives row j's values from column 0 on.
+pub fn fill_rows<F: Real, const W: usize>(out: &mut Table<F>, rows: Rows<'_>, f: impl Fn(usize) -> [F; W] + Sync) {
+    let tasks: Vec<TableMut<'_, F>> = out.chunks_mut(TASK_BLOCKS).collect();
+    tasks.into_par_iter().for_each(|mut view| {
+        for j in view.first..view.first + view.rows {
+            view.write(j, 0, f(rows.id(j)));
+        }
+    });
+}

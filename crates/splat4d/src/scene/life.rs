@@ -1,0 +1,226 @@
+//! The life of a Gaussian: an envelope in time that any layer may carry, so that birth, death and the active set work for
+//! every motion model.
+
+use super::Time;
+use crate::math::Real;
+
+/// The shape of the envelope σ(t) of a layer's Gaussians. Centres and widths are in seconds, widths as logarithms.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum LifeKind {
+    /// σ = 1 for ever; no columns.
+    Infinite,
+    /// σ = exp(−½u²), u = (t − centre)/width: FreeTimeGS (Wang et al. 2025) and native 4D Gaussians.
+    GaussHalf,
+    /// σ = exp(−u²): Spacetime Gaussians (Li et al. 2024). The same life needs a width √2 larger than `GaussHalf`.
+    GaussOne,
+    /// σ = 1 within ± width of the centre, Gaussian tails exp(−½e²) outside, e in units of `softness` (Ex4DGS).
+    Interval,
+}
+
+/// Column of the centre in the life table.
+pub const CENTER: usize = 0;
+/// Column of the logarithm of the width in the life table.
+pub const LOG_WIDTH: usize = 1;
+/// Column of the logarithm of the softness in the life table (interval only).
+pub const LOG_SOFTNESS: usize = 2;
+
+/// σ and its derivatives to (t, centre, log width, log softness).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct LifeValue<F> {
+    /// The envelope, in [0, 1].
+    pub sigma: F,
+    /// ∂σ/∂t; ∂σ/∂centre is its negative.
+    pub d_time: F,
+    /// ∂σ/∂ log width
+    pub d_log_width: F,
+    /// ∂σ/∂ log softness
+    pub d_log_softness: F,
+}
+
+impl LifeKind {
+    /// The life table's columns.
+    pub fn columns(self) -> &'static [(&'static str, usize)] {
+        match self {
+            Self::Infinite => &[],
+            Self::GaussHalf | Self::GaussOne => &[("life_centers", 1), ("life_log_widths", 1)],
+            Self::Interval => &[("life_centers", 1), ("life_log_widths", 1), ("life_log_softness", 1)],
+        }
+    }
+
+    /// The name that files and recipes use.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Infinite => "infinite",
+            Self::GaussHalf => "gauss-half",
+            Self::GaussOne => "gauss-one",
+            Self::Interval => "interval",
+        }
+    }
+
+    /// The kind with this name.
+    pub fn from_name(name: &str) -> Option<Self> {
+        [Self::Infinite, Self::GaussHalf, Self::GaussOne, Self::Interval].into_iter().find(|k| k.name() == name)
+    }
+
+    /// σ at time t and its derivatives; `row` holds the life columns (unused ones are not read).
+    #[inline(always)]
+    pub fn eval<F: Real>(self, row: [F; 3], t: Time) -> LifeValue<F> {
+        let zero = F::ZERO;
+        let delta = F::of(t.0) - row[CENTER];
+        match self {
+            Self::Infinite => LifeValue { sigma: F::ONE, d_time: zero, d_log_width: zero, d_log_softness: zero },
+            Self::GaussHalf | Self::GaussOne => {
+                let half = if self == Self::GaussHalf { F::HALF } else { F::ONE };
+                let inverse = (-row[LOG_WIDTH]).exp();
+                let u = delta * inverse;
+                let sigma = (-half * u * u).exp();
+                let slope = F::TWO * half * sigma * u;
+                LifeValue { sigma, d_time: -slope * inverse, d_log_width: slope * u, d_log_softness: zero }
+            }
+            Self::Interval => {
+                let width = row[LOG_WIDTH].exp();
+                let over = delta.abs() - width;
+                if over <= zero {
+                    return LifeValue { sigma: F::ONE, d_time: zero, d_log_width: zero, d_log_softness: zero };
+                }
+                let inverse = (-row[LOG_SOFTNESS]).exp();
+                let e = over * inverse;
+                let sigma = (-F::HALF * e * e).exp();
+                let slope = sigma * e * inverse; // −∂σ/∂|Δ|
+                let sign = if delta < zero { -F::ONE } else { F::ONE };
+                LifeValue { sigma, d_time: -slope * sign, d_log_width: slope * width, d_log_softness: sigma * e * e }
+            }
+        }
+    }
+
+    /// The seconds before and after the centre at which σ·opacity falls to `alpha_min`; negative where it never reaches it.
+    pub fn reach(self, row: [f64; 3], opacity: f64, alpha_min: f64) -> f64 {
+        let level = (opacity / alpha_min).ln();
+        if level < 0.0 {
+            return -1.0;
+        }
+        match self {
+            Self::Infinite => f64::INFINITY,
+            Self::GaussHalf => row[LOG_WIDTH].exp() * (2.0 * level).sqrt(),
+            Self::GaussOne => row[LOG_WIDTH].exp() * level.sqrt(),
+            Self::Interval => row[LOG_WIDTH].exp() + row[LOG_SOFTNESS].exp() * (2.0 * level).sqrt(),
+        }
+    }
+}
+
+/// Exact interval buckets over a clip: the rows alive at t without a look at the others.
+#[derive(Clone, Debug, Default)]
+pub struct LifeBuckets {
+    start: f64,
+    width: f64,
+    spans: Vec<[f64; 2]>,
+    buckets: Vec<Vec<u32>>,
+}
+
+impl LifeBuckets {
+    /// Sorts rows with the given spans [from, to] (seconds; from > to: never alive) into `count` buckets over the clip.
+    /// Times outside the clip look into the first or last bucket, which also hold everything beyond.
+    pub fn new(spans: Vec<[f64; 2]>, clip: [f64; 2], count: usize) -> Self {
+        let count = count.max(1);
+        let width = ((clip[1] - clip[0]) / count as f64).max(f64::MIN_POSITIVE);
+        let mut buckets = vec![Vec::new(); count];
+        let bucket = |t: f64| (((t - clip[0]) / width).floor().clamp(0.0, (count - 1) as f64)) as usize;
+        for (row, [from, to]) in spans.iter().enumerate() {
+            if from <= to {
+                for b in &mut buckets[bucket(*from)..=bucket(*to)] {
+                    b.push(row as u32);
+                }
+            }
+        }
+        Self { start: clip[0], width, spans, buckets }
+    }
+
+    /// The rows whose span holds t, strictly increasing.
+    pub fn active(&self, t: Time, ids: &mut Vec<u32>) {
+        ids.clear();
+        if self.buckets.is_empty() {
+            return;
+        }
+        let b = ((t.0 - self.start) / self.width).floor().clamp(0.0, (self.buckets.len() - 1) as f64) as usize;
+        let alive = |&row: &u32| self.spans[row as usize][0] <= t.0 && t.0 <= self.spans[row as usize][1];
+        ids.extend(self.buckets[b].iter().copied().filter(alive));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::math::Rng;
+
+    #[test]
+    fn derivatives_equal_finite_differences() {
+        for kind in [LifeKind::GaussHalf, LifeKind::GaussOne, LifeKind::Interval] {
+            for i in 0..40 {
+                let t = -2.0 + i as f64 * 0.11;
+                let row = [0.1, -0.4, -0.7];
+                let v = kind.eval(row, Time(t));
+                let h = 1e-6;
+                let fd = |k: usize| {
+                    let (mut up, mut down) = (row, row);
+                    up[k] += h;
+                    down[k] -= h;
+                    (kind.eval(up, Time(t)).sigma - kind.eval(down, Time(t)).sigma) / (2.0 * h)
+                };
+                let fd_t = (kind.eval(row, Time(t + h)).sigma - kind.eval(row, Time(t - h)).sigma) / (2.0 * h);
+                for (a, b) in [(v.d_time, fd_t), (-v.d_time, fd(0)), (v.d_log_width, fd(1)), (v.d_log_softness, fd(2))]
+                {
+                    assert!((a - b).abs() < 1e-7, "{kind:?} t {t}: {a} {b}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn spacetime_and_freetime_lives_agree_at_width_times_sqrt_two() {
+        for t in [-0.7, 0.0, 0.2, 1.5] {
+            let free = LifeKind::GaussHalf.eval([0.2, -0.5, 0.0], Time(t)).sigma;
+            let stg = LifeKind::GaussOne.eval([0.2, -0.5 + 2.0f64.sqrt().ln(), 0.0], Time(t)).sigma;
+            assert!((free - stg).abs() < 1e-14);
+        }
+    }
+
+    #[test]
+    fn interval_has_a_flat_top_and_infinite_life_is_one() {
+        let row = [1.0, 0.5f64.ln(), 0.1f64.ln()];
+        assert_eq!(LifeKind::Interval.eval(row, Time(1.49)).sigma, 1.0);
+        assert!(LifeKind::Interval.eval(row, Time(1.7)).sigma < 0.2);
+        assert_eq!(LifeKind::Infinite.eval([0.0; 3], Time(1e9)).sigma, 1.0);
+    }
+
+    #[test]
+    fn buckets_equal_brute_force() {
+        let rng = Rng::new(1, "buckets", 0);
+        let spans: Vec<[f64; 2]> = (0..500)
+            .map(|i| {
+                let c = rng.uniform(2 * i) * 3.0 - 1.0;
+                let r = rng.uniform(2 * i + 1) * 0.8 - 0.1;
+                [c - r, c + r]
+            })
+            .collect();
+        let buckets = LifeBuckets::new(spans.clone(), [0.0, 1.0], 16);
+        let mut ids = Vec::new();
+        for i in 0..300 {
+            let t = -0.7 + i as f64 * 0.008;
+            buckets.active(Time(t), &mut ids);
+            let brute: Vec<u32> =
+                (0..500u32).filter(|&r| spans[r as usize][0] <= t && t <= spans[r as usize][1]).collect();
+            assert_eq!(ids, brute, "t = {t}");
+        }
+    }
+
+    #[test]
+    fn reach_is_where_the_envelope_falls_to_the_threshold() {
+        let row = [0.0, -1.0, -2.0];
+        for kind in [LifeKind::GaussHalf, LifeKind::GaussOne, LifeKind::Interval] {
+            let r = kind.reach(row, 0.7, 1.0 / 255.0);
+            let level = 0.7 * kind.eval(row, Time(r)).sigma;
+            assert!((level * 255.0 - 1.0).abs() < 1e-9, "{kind:?}");
+            assert!(kind.reach(row, 1e-3, 1.0 / 255.0) < 0.0);
+        }
+    }
+}
