@@ -1,0 +1,92 @@
+//! What the trainer tells whoever listens: progress bar, log, live viewer, Python.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+/// One piece of news. Serialised (with `type`) it is what `--json` prints, a line each.
+#[derive(Clone, Debug, serde::Serialize)]
+#[serde(tag = "type", rename_all = "snake_case")]
+#[non_exhaustive]
+pub enum Event {
+    /// A long preparation began or moved on (reading, initial points, probes, evaluation).
+    Phase {
+        /// What is being done.
+        name: String,
+        /// Done so far.
+        done: usize,
+        /// To do in all; 0 when not known.
+        total: usize,
+    },
+    /// Training begins.
+    Started {
+        /// Where the run is written.
+        run: PathBuf,
+        /// First iteration (not 0 after a resume).
+        iteration: usize,
+        /// Last iteration.
+        iterations: usize,
+        /// Gaussians at the start.
+        gaussians: usize,
+        /// Estimated peak memory of training, bytes.
+        memory_estimate: u64,
+    },
+    /// A step was taken; sent every so many iterations.
+    Progress {
+        /// Steps taken.
+        iteration: usize,
+        /// Steps in all.
+        iterations: usize,
+        /// The stage's name.
+        stage: String,
+        /// Smoothed loss.
+        loss: f64,
+        /// Smoothed PSNR of the training views seen lately, dB.
+        psnr: f64,
+        /// Gaussians now.
+        gaussians: usize,
+        /// Seconds of training so far.
+        seconds: f64,
+        /// Seconds that are left, estimated.
+        seconds_left: f64,
+    },
+    /// A checkpoint is on disk.
+    Checkpoint {
+        /// Steps taken.
+        iteration: usize,
+        /// The file.
+        path: PathBuf,
+    },
+    /// Something the user should know.
+    Warning {
+        /// What and what to do.
+        message: String,
+    },
+    /// A number was not finite; training went back to the last checkpoint with smaller steps.
+    RolledBack {
+        /// The step that failed.
+        iteration: usize,
+        /// The step it went back to.
+        to: usize,
+        /// Tensor, row and camera.
+        what: String,
+    },
+    /// A scene to show while it learns, in the playback file's own bytes.
+    Snapshot {
+        /// Steps taken.
+        iteration: usize,
+        /// The file's bytes.
+        #[serde(skip)]
+        bytes: Arc<[u8]>,
+    },
+    /// Training is over.
+    Finished {
+        /// Steps taken.
+        iteration: usize,
+        /// Seconds of training, resumed ones included.
+        seconds: f64,
+        /// Gaussians at the end.
+        gaussians: usize,
+        /// Peak resident memory of the process, bytes; 0 where the system does not tell.
+        peak_memory: u64,
+    },
+}

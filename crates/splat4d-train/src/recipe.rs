@@ -1,0 +1,390 @@
+//! The recipe: every knob of a run, typed, with the names users of splatting systems know. It is TOML on disk; the
+//! effective one is saved with the run, and a run repeats bit for bit from it (on the same SIMD level).
+//!
+//! Learning rates of positions are in units of the scene's extent; everything with time in it is stated per clip length.
+//! Iteration knobs left at 0 follow from `iterations` (see [`Recipe::resolve`]).
+
+use crate::{Error, Result};
+use serde::{Deserialize, Serialize};
+
+macro_rules! recipe {
+    ($($(#[$doc:meta])* $name:ident : $t:ty = $default:expr,)*) => {
+        /// All knobs. See the fields.
+        #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+        #[serde(default, deny_unknown_fields)]
+        pub struct Recipe { $($(#[$doc])* pub $name: $t,)* }
+
+        impl Default for Recipe {
+            fn default() -> Self { Self { $($name: $default,)* } }
+        }
+
+        impl Recipe {
+            /// Name, default and documentation of every knob, in order.
+            pub fn knobs() -> Vec<Knob> {
+                let mut out = Vec::new();
+                $(out.push(Knob {
+                    name: stringify!($name),
+                    default: toml::Value::try_from::<$t>($default).map(|v| v.to_string()).unwrap_or_default(),
+                    doc: knob_doc(stringify!($($doc)*)),
+                });)*
+                out
+            }
+        }
+    };
+}
+
+/// One knob, for help and for the nearest-name suggestion.
+#[derive(Clone, Debug)]
+pub struct Knob {
+    /// Its name in TOML and in `--set`.
+    pub name: &'static str,
+    /// Its default, as TOML.
+    pub default: String,
+    /// What it does.
+    pub doc: String,
+}
+
+recipe! {
+    /// Motion model: still or spacetime.
+    motion: String = "spacetime".into(),
+    /// Seed of every random choice.
+    seed: u64 = 0,
+    /// Training steps in all.
+    iterations: usize = 6000,
+    /// Views a step.
+    batch_size: usize = 1,
+    /// Images are reduced by this factor (mean of k×k boxes).
+    downscale: usize = 1,
+    /// Held-out views: empty (the data set's own convention), "camera=0,10", "every=8" or "none".
+    hold_out: String = String::new(),
+    /// Frames a second; 0: as the capture says.
+    fps: f64 = 0.0,
+    /// Only this many frames of the take; 0: all.
+    max_frames: usize = 0,
+    /// First frame of the take that is used.
+    first_frame: usize = 0,
+    /// RGBA captures composite on white; false: on black.
+    white_background: bool = true,
+    /// Highest degree of the spherical harmonics, 0 to 3.
+    sh_degree: usize = 1,
+    /// Iterations before each further SH degree is unlocked; 0: iterations/10.
+    sh_degree_interval: usize = 0,
+    /// Share of D-SSIM in the photometric loss.
+    lambda_dssim: f64 = 0.2,
+    /// Weight of the alpha-mask loss |alpha − mask| where masks cover the whole scene (RGBA captures).
+    lambda_mask: f64 = 0.0,
+    /// Where Gaussians start: "auto", "points", "hull", "random", or a .ply file.
+    init: String = "auto".into(),
+    /// Initial Gaussians besides the capture's points.
+    num_pts: usize = 10_000,
+    /// Initial opacity.
+    init_opacity: f64 = 0.1,
+    /// Moments at which initial points are spread over the clip; 0: about every 5 frames.
+    init_keyframes: usize = 0,
+    /// Rate of positions at the start, of the extent.
+    position_lr_init: f64 = 1.6e-4,
+    /// Rate of positions at the end, of the extent.
+    position_lr_final: f64 = 1.6e-6,
+    /// Rate of base colour; the higher SH degrees learn 20 times slower.
+    feature_lr: f64 = 2.5e-3,
+    /// Rate of opacity logits.
+    opacity_lr: f64 = 0.05,
+    /// Rate of log scales.
+    scaling_lr: f64 = 5e-3,
+    /// Rate of quaternions.
+    rotation_lr: f64 = 1e-3,
+    /// spacetime: order of the motion polynomial, 0 to 3.
+    motion_order: usize = 1,
+    /// spacetime: whether quaternions turn with time.
+    rotation_rate: bool = false,
+    /// spacetime: the life: infinite, gauss-half, gauss-one or interval.
+    life: String = "gauss-half".into(),
+    /// spacetime: life's centre learns from opacity alone (STG).
+    detach: bool = false,
+    /// spacetime: rate of velocities at the start, extents a clip.
+    velocity_lr_init: f64 = 1.6e-3,
+    /// spacetime: rate of velocities at the end, extents a clip.
+    velocity_lr_final: f64 = 1.6e-5,
+    /// spacetime: rate of quaternion rates, 1/clip.
+    rotation_rate_lr: f64 = 1e-3,
+    /// spacetime: rate of life centres, clips.
+    life_center_lr: f64 = 1e-3,
+    /// spacetime: rate of log life widths.
+    life_width_lr: f64 = 0.01,
+    /// spacetime: initial life width of moving points, clips; 0: twice the gap between keyframes.
+    init_life: f64 = 0.0,
+    /// spacetime: life widths never fall below this many frames.
+    min_life_frames: f64 = 0.5,
+    /// Weight of the σ-weighted opacity regulariser (FreeTimeGS).
+    lambda_opacity_life: f64 = 0.0,
+    /// Weight of the velocity smoothness over nearest neighbours.
+    lambda_velocity: f64 = 0.0,
+    /// Densification: mcmc, adc or none.
+    strategy: String = "mcmc".into(),
+    /// Never more Gaussians than this.
+    max_cap: usize = 30_000,
+    /// Iterations between densifications; 0: iterations/60, at least 50.
+    densification_interval: usize = 0,
+    /// First iteration that densifies; 0: iterations/20.
+    densify_from_iter: usize = 0,
+    /// Last iteration that densifies; 0: 3/4 of iterations.
+    densify_until_iter: usize = 0,
+    /// adc: mean 2D gradient above which a Gaussian is cloned or split (NDC units).
+    densify_grad_threshold: f64 = 2e-4,
+    /// adc: Gaussians larger than this share of the extent are split, smaller ones cloned.
+    percent_dense: f64 = 0.01,
+    /// adc: iterations between opacity resets; 0: never (a reset destroys temporal models).
+    opacity_reset_interval: usize = 0,
+    /// Opacity below which a Gaussian is dead.
+    min_opacity: f64 = 0.005,
+    /// mcmc: growth a densification, up to the cap.
+    growth: f64 = 1.05,
+    /// mcmc: strength of the position noise.
+    noise_lr: f64 = 5e5,
+    /// mcmc: share of the 2D gradient (against opacity) in where relocated Gaussians go (FreeTimeGS).
+    relocate_gradient: f64 = 0.5,
+    /// Weight of the mean opacity.
+    opacity_reg: f64 = 0.01,
+    /// Weight of the mean scale.
+    scale_reg: f64 = 0.01,
+    /// Learn a gain and an offset a camera and channel.
+    exposure: bool = false,
+    /// Rate of the exposure.
+    exposure_lr: f64 = 1e-4,
+    /// Antialiased mode (opacity compensation).
+    antialias: bool = false,
+    /// Iterations between checkpoints; 0: iterations/10.
+    checkpoint_interval: usize = 0,
+    /// Bytes of decoded images kept.
+    image_memory: u64 = 1 << 30,
+    /// Bytes that training may take in all; 0: no limit. Checked before the start, then kept by the cap.
+    memory_limit: u64 = 0,
+}
+
+impl Recipe {
+    /// Reads TOML. Errors: syntax, an unknown key (with the nearest known one), a wrong type or range.
+    pub fn from_toml(text: &str) -> Result<Self> {
+        let table: toml::Table = toml::from_str(text).map_err(|e| {
+            Error::input(format!("the recipe is not valid TOML: {}", e.message()))
+                .remedy("Write lines such as `iterations = 3000`; `splat4d train --help` lists the knobs")
+        })?;
+        let mut recipe = Self::default();
+        for (key, value) in &table {
+            recipe = recipe.with(key, value.clone())?;
+        }
+        recipe.check()?;
+        Ok(recipe)
+    }
+
+    /// As TOML; reading it back gives the same recipe.
+    pub fn to_toml(&self) -> String {
+        toml::to_string(self).expect("a recipe is plain numbers, flags and strings")
+    }
+
+    /// Applies one `key=value`, as `--set` takes it. Strings need no quotes.
+    pub fn set(&mut self, assignment: &str) -> Result<()> {
+        let (key, text) = assignment.split_once('=').ok_or_else(|| {
+            Error::input(format!("`{assignment}` is not of the form key=value"))
+                .remedy("For instance --set iterations=300")
+        })?;
+        let text = text.trim();
+        let value = toml::from_str::<toml::Table>(&format!("v = {text}"))
+            .ok()
+            .and_then(|mut t| t.remove("v"))
+            .unwrap_or_else(|| toml::Value::String(text.to_owned()));
+        let next = self.with(key.trim(), value)?;
+        next.check()?;
+        *self = next;
+        Ok(())
+    }
+
+    fn with(&self, key: &str, value: toml::Value) -> Result<Self> {
+        let mut table = toml::Table::try_from(self).expect("a recipe is a TOML table");
+        let Some(old) = table.get(key) else {
+            let names: Vec<&str> = Self::knobs().iter().map(|k| k.name).collect();
+            let near = nearest(key, &names);
+            return Err(Error::input(format!("`{key}` is not a knob of the recipe"))
+                .remedy(near.map_or("`splat4d train --help` lists them".into(), |n| format!("Did you mean `{n}`?"))));
+        };
+        // Whole numbers are welcome where a fraction is expected, and 3e3 where a whole number is.
+        let value = match (old, value) {
+            (toml::Value::Float(_), toml::Value::Integer(i)) => toml::Value::Float(i as f64),
+            (toml::Value::Integer(_), toml::Value::Float(f)) if f.fract() == 0.0 && f.abs() < 9e15 => {
+                toml::Value::Integer(f as i64)
+            }
+            (_, v) => v,
+        };
+        let expected = old.type_str();
+        let shown = value.to_string();
+        table.insert(key.to_owned(), value);
+        table.try_into().map_err(|_| {
+            Error::input(format!("knob `{key}` cannot be {shown}"))
+                .remedy(format!("It takes a value of type {expected}"))
+        })
+    }
+
+    /// Ranges. Errors name the knob.
+    pub fn check(&self) -> Result<()> {
+        let bad = |knob: &str, value: String, need: &str| {
+            Err(Error::input(format!("knob `{knob}` cannot be {value}")).remedy(format!("It must be {need}")))
+        };
+        let positive = [
+            ("position_lr_init", self.position_lr_init),
+            ("position_lr_final", self.position_lr_final),
+            ("feature_lr", self.feature_lr),
+            ("opacity_lr", self.opacity_lr),
+            ("scaling_lr", self.scaling_lr),
+            ("rotation_lr", self.rotation_lr),
+            ("velocity_lr_init", self.velocity_lr_init),
+            ("velocity_lr_final", self.velocity_lr_final),
+            ("growth", self.growth),
+        ];
+        for (knob, value) in positive {
+            if !(value > 0.0 && value.is_finite()) {
+                return bad(knob, value.to_string(), "a positive number");
+            }
+        }
+        let natural = [
+            ("lambda_mask", self.lambda_mask),
+            ("lambda_opacity_life", self.lambda_opacity_life),
+            ("lambda_velocity", self.lambda_velocity),
+            ("noise_lr", self.noise_lr),
+            ("opacity_reg", self.opacity_reg),
+            ("scale_reg", self.scale_reg),
+            ("exposure_lr", self.exposure_lr),
+            ("rotation_rate_lr", self.rotation_rate_lr),
+            ("life_center_lr", self.life_center_lr),
+            ("life_width_lr", self.life_width_lr),
+            ("init_life", self.init_life),
+            ("min_life_frames", self.min_life_frames),
+            ("fps", self.fps),
+            ("percent_dense", self.percent_dense),
+            ("densify_grad_threshold", self.densify_grad_threshold),
+        ];
+        for (knob, value) in natural {
+            if !(value >= 0.0 && value.is_finite()) {
+                return bad(knob, value.to_string(), "zero or a positive number");
+            }
+        }
+        let shares = [
+            ("lambda_dssim", self.lambda_dssim),
+            ("relocate_gradient", self.relocate_gradient),
+            ("min_opacity", self.min_opacity),
+        ];
+        for (knob, value) in shares {
+            if !(0.0..=1.0).contains(&value) {
+                return bad(knob, value.to_string(), "between 0 and 1");
+            }
+        }
+        if !(self.init_opacity > 0.0 && self.init_opacity < 1.0) {
+            return bad("init_opacity", self.init_opacity.to_string(), "above 0 and below 1");
+        }
+        for (knob, value) in [
+            ("iterations", self.iterations),
+            ("batch_size", self.batch_size),
+            ("downscale", self.downscale),
+            ("max_cap", self.max_cap),
+        ] {
+            if value == 0 {
+                return bad(knob, "0".into(), "at least 1");
+            }
+        }
+        if self.sh_degree > 3 {
+            return bad("sh_degree", self.sh_degree.to_string(), "0, 1, 2 or 3");
+        }
+        if self.motion_order > 3 {
+            return bad("motion_order", self.motion_order.to_string(), "0, 1, 2 or 3");
+        }
+        for (knob, value, known) in [
+            ("motion", &self.motion, &splat4d::motion::BUILT_IN[..]),
+            ("life", &self.life, &["infinite", "gauss-half", "gauss-one", "interval"][..]),
+            ("strategy", &self.strategy, &["mcmc", "adc", "none"][..]),
+        ] {
+            if !known.contains(&value.as_str()) {
+                let near = nearest(value, known).map(|n| format!("; did you mean `{n}`?")).unwrap_or_default();
+                return bad(knob, format!("`{value}`"), &format!("one of {}{near}", known.join(", ")));
+            }
+        }
+        Ok(())
+    }
+
+    /// Fills every iteration knob that is 0 from `iterations`, so that the saved recipe says all.
+    #[must_use]
+    pub fn resolve(&self) -> Self {
+        let mut r = self.clone();
+        let fill = |knob: &mut usize, value: usize| {
+            if *knob == 0 {
+                *knob = value.max(1);
+            }
+        };
+        fill(&mut r.sh_degree_interval, r.iterations / 10);
+        fill(&mut r.densification_interval, (r.iterations / 60).max(50));
+        fill(&mut r.densify_from_iter, r.iterations / 20);
+        fill(&mut r.densify_until_iter, r.iterations * 3 / 4);
+        fill(&mut r.checkpoint_interval, (r.iterations / 10).max(50));
+        r
+    }
+}
+
+/// The known name closest to `name` (Damerau-free Levenshtein), if it is close enough to be meant.
+pub fn nearest<'a>(name: &str, known: &[&'a str]) -> Option<&'a str> {
+    let distance = |a: &str, b: &str| {
+        let b: Vec<char> = b.chars().collect();
+        let mut row: Vec<usize> = (0..=b.len()).collect();
+        for (i, ca) in a.chars().enumerate() {
+            let mut diagonal = row[0];
+            row[0] = i + 1;
+            for (j, cb) in b.iter().enumerate() {
+                let next = (diagonal + usize::from(ca != *cb)).min(row[j] + 1).min(row[j + 1] + 1);
+                diagonal = std::mem::replace(&mut row[j + 1], next);
+            }
+        }
+        row[b.len()]
+    };
+    let best = known.iter().map(|k| (distance(&name.to_lowercase(), k), *k)).min()?;
+    (best.0 <= 2.max(name.len() / 3)).then_some(best.1)
+}
+
+fn knob_doc(attributes: &str) -> String {
+    // stringify! gives `doc = r" text"` or `doc = " text"`; keep the text.
+    let text = attributes.split_once('"').map_or("", |(_, t)| t);
+    text.rsplit_once('"').map_or(text, |(t, _)| t).trim().to_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn toml_round_trip_and_set() {
+        let mut r = Recipe::default();
+        r.set("iterations=300").unwrap();
+        r.set("motion = still").unwrap();
+        r.set("position_lr_init=1").unwrap();
+        r.set("max_cap=2e4").unwrap();
+        assert_eq!((r.iterations, r.motion.as_str(), r.max_cap), (300, "still", 20_000));
+        assert_eq!(Recipe::from_toml(&r.to_toml()).unwrap(), r);
+    }
+
+    #[test]
+    fn unknown_knobs_get_a_suggestion_and_wrong_values_a_reason() {
+        let mut r = Recipe::default();
+        let error = |r: &mut Recipe, s: &str| r.set(s).unwrap_err().to_string();
+        assert!(error(&mut r, "iteration=3").contains("`iterations`"));
+        assert!(error(&mut r, "iterations=many").contains("integer"));
+        assert!(error(&mut r, "motion=spacetme").contains("`spacetime`"));
+        assert!(error(&mut r, "iterations").contains("key=value"));
+        assert!(error(&mut r, "opacity_lr=nan").contains("positive"));
+        assert!(Recipe::from_toml("densify_untl_iter = 3").unwrap_err().to_string().contains("densify_until_iter"));
+        assert!(Recipe::from_toml("= 3").is_err());
+        assert_eq!(r, Recipe::default(), "a refused setting changes nothing");
+    }
+
+    #[test]
+    fn resolve_leaves_nothing_open_and_every_knob_is_documented() {
+        let r = Recipe { iterations: 1000, ..Recipe::default() }.resolve();
+        assert_eq!((r.densify_from_iter, r.densify_until_iter, r.checkpoint_interval), (50, 750, 100));
+        assert_eq!(r.resolve(), r);
+        assert!(Recipe::knobs().iter().all(|k| k.doc.len() > 8), "{:?}", Recipe::knobs());
+    }
+}
