@@ -2,7 +2,13 @@
 //!
 //! The trainer only emits [`event::Event`]s; progress bars, logs and viewers listen.
 
+pub mod densify;
 pub mod event;
+pub mod init;
+pub mod loss;
+pub mod models;
+pub mod optim;
 pub mod recipe;
+pub mod train;
 
 pub use splat4d::{Error, ErrorKind, Result};

@@ -1,0 +1,177 @@
+//! Where Gaussians start: the capture's points, the visual hull of the masks at several moments, or random points in the
+//! volume that the cameras share.
+
+pub mod hull;
+pub mod knn;
+pub mod volume;
+
+use crate::models::{Plan, Program};
+use crate::train::frames::Frames;
+use crate::{Error, Result};
+use knn::mean_square_distance;
+use splat4d::layers::{Layer, Scene};
+use splat4d::math::Rng;
+use splat4d::math::sh::rgb_to_dc;
+use splat4d::motion::build;
+use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
+use splat4d::scene::{GEOMETRY, LIFE, LifeKind, Params, SH};
+
+/// Points to start from.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Seeds {
+    /// Positions, world.
+    pub points: Vec<[f64; 3]>,
+    /// Colours in [0, 1].
+    pub colors: Vec<[f32; 3]>,
+    /// When the point was seen, seconds; `None`: during the whole clip.
+    pub times: Vec<Option<f64>>,
+}
+
+impl Seeds {
+    /// Number of points.
+    pub fn len(&self) -> usize {
+        self.points.len()
+    }
+
+    /// Whether there is none.
+    pub fn is_empty(&self) -> bool {
+        self.points.is_empty()
+    }
+
+    /// Adds one.
+    pub fn push(&mut self, point: [f64; 3], color: [f32; 3], time: Option<f64>) {
+        self.points.push(point);
+        self.colors.push(color);
+        self.times.push(time);
+    }
+
+    /// Adds all of another set.
+    pub fn append(&mut self, mut other: Self) {
+        self.points.append(&mut other.points);
+        self.colors.append(&mut other.colors);
+        self.times.append(&mut other.times);
+    }
+
+    /// At most `count` of them, evenly chosen.
+    pub fn truncate_evenly(&mut self, count: usize, rng: Rng) {
+        if self.len() <= count {
+            return;
+        }
+        let mut chosen = rng.permutation(self.len());
+        chosen.truncate(count);
+        chosen.sort_unstable();
+        let old = std::mem::take(self);
+        for i in chosen {
+            let i = i as usize;
+            self.push(old.points[i], old.colors[i], old.times[i]);
+        }
+    }
+}
+
+/// A random colour would have to be unlearnt; grey is the least wrong.
+const UNKNOWN_COLOR: [f32; 3] = [0.5; 3];
+/// A life this many clips wide is practically for ever: at the clip's ends σ is still above 0.96.
+const LONG_LIFE_CLIPS: f64 = 2.0;
+/// One keyframe of initial points about every so many frames.
+const FRAMES_PER_KEYFRAME: usize = 5;
+/// Initial scales are clamped to this share of the extent: a lone point would otherwise hide the scene.
+const LARGEST_SCALE: f64 = 0.05;
+/// Smallest initial scale, of the extent.
+const SMALLEST_SCALE: f64 = 1e-5;
+/// Softness of an interval life's ends at the start, frames.
+const INITIAL_SOFTNESS_FRAMES: f64 = 1.0;
+
+/// The keyframe times of the plan: evenly over the clip, at least one.
+pub fn keyframes(plan: &Plan) -> Vec<f64> {
+    let count = match plan.recipe.init_keyframes {
+        0 => plan.times.div_ceil(FRAMES_PER_KEYFRAME).max(1),
+        k => k.min(plan.times.max(1)),
+    };
+    (0..count).map(|k| plan.clip[0] + (plan.clip[1] - plan.clip[0]) * (k as f64 + 0.5) / count as f64).collect()
+}
+
+/// Chooses initial points as the recipe says. `points`: the capture's own.
+pub fn seeds(plan: &Plan, frames: &dyn Frames, points: Option<Seeds>, moving: bool) -> Result<Seeds> {
+    let r = &plan.recipe;
+    let rng = Rng::new(r.seed, "init", 0);
+    let volume = volume::common(frames);
+    let times = if moving { keyframes(plan) } else { vec![0.5 * (plan.clip[0] + plan.clip[1])] };
+    let have_points = points.as_ref().is_some_and(|p| !p.is_empty());
+    let mut out = Seeds::default();
+    match r.init.as_str() {
+        "points" if !have_points => {
+            return Err(Error::input("the capture has no points to start from")
+                .remedy("Add a points file to the capture, or use --set init=random"));
+        }
+        "hull" if !frames.has_masks() => {
+            return Err(Error::input("the visual hull needs masks, and the capture has none")
+                .remedy("Add masks to the capture, or use --set init=random"));
+        }
+        _ => {}
+    }
+    let use_hull = frames.has_masks() && matches!(r.init.as_str(), "auto" | "hull") && (moving || !have_points);
+    if have_points && r.init != "random" && r.init != "hull" {
+        out.append(points.expect("just seen"));
+    }
+    if use_hull {
+        out.append(hull::carve(frames, &volume, &times, r.num_pts, moving, rng.fork(1))?);
+    } else if r.init == "random" || !have_points {
+        out.append(volume::random(&volume, r.num_pts, moving.then_some(plan.clip), rng.fork(2)));
+    }
+    out.truncate_evenly(r.max_cap, rng.fork(3));
+    Ok(out)
+}
+
+/// One layer of Gaussians at the seeds: isotropic, as large as the distance to their neighbours of the same moment.
+pub fn scene(plan: &Plan, program: &dyn Program, seeds: &Seeds, background: [f32; 3], up: [f64; 3]) -> Result<Scene<f32>> {
+    let r = &plan.recipe;
+    let life = program.life(plan);
+    let n = seeds.len();
+    let mut params = Params::<f32>::new(n, (r.sh_degree + 1) * (r.sh_degree + 1), life.columns());
+    let scales = scales(seeds, plan.extent);
+    let gap = plan.seconds() / keyframes(plan).len() as f64;
+    let short = if r.init_life > 0.0 { r.init_life * plan.seconds() } else { 2.0 * gap };
+    let logit = (r.init_opacity / (1.0 - r.init_opacity)).ln() as f32;
+    for i in 0..n {
+        let geometry = &mut params[GEOMETRY];
+        geometry.write(i, 0, seeds.points[i].map(|x| x as f32));
+        geometry.write(i, QUAT, [1.0, 0.0, 0.0, 0.0]);
+        geometry.write(i, LOG_SCALE, [scales[i].ln() as f32; 3]);
+        geometry.set(i, OPACITY, logit);
+        params[SH].write(i, 0, seeds.colors[i].map(rgb_to_dc));
+        if life != LifeKind::Infinite {
+            let (center, width) = match seeds.times[i] {
+                Some(t) => (t, short),
+                None => (0.5 * (plan.clip[0] + plan.clip[1]), LONG_LIFE_CLIPS * plan.seconds()),
+            };
+            params[LIFE].write(i, 0, [center as f32, width.ln() as f32]);
+            if life == LifeKind::Interval {
+                params[LIFE].write(i, 2, [(INITIAL_SOFTNESS_FRAMES / plan.fps).ln() as f32]);
+            }
+        }
+    }
+    let motion = build(&program.spec(plan), &mut params)?;
+    let layer = Layer { name: "scene".into(), params, motion, life };
+    Ok(Scene { layers: vec![layer], background, clip: plan.clip, fps: plan.fps, up, ..Scene::default() })
+}
+
+/// Root mean square distance to the three nearest seeds of the same moment (Kerbl et al. 2023), clamped.
+fn scales(seeds: &Seeds, extent: f64) -> Vec<f64> {
+    let mut order: Vec<usize> = (0..seeds.len()).collect();
+    let key = |i: usize| seeds.times[i].unwrap_or(f64::NEG_INFINITY);
+    order.sort_by(|&a, &b| key(a).total_cmp(&key(b)).then(a.cmp(&b)));
+    let mut out = vec![0.0; seeds.len()];
+    let mut rest = order.as_slice();
+    while let Some(&first) = rest.first() {
+        let count = rest.partition_point(|&i| key(i) == key(first));
+        let (group, tail) = rest.split_at(count);
+        // Random points have a moment each; then all of them are one group.
+        let group = if count < 8 { rest } else { group };
+        let points: Vec<[f32; 3]> = group.iter().map(|&i| seeds.points[i].map(|x| x as f32)).collect();
+        for (&i, d) in group.iter().zip(mean_square_distance(&points)) {
+            out[i] = f64::from(d).sqrt().clamp(SMALLEST_SCALE * extent, LARGEST_SCALE * extent);
+        }
+        rest = if count < 8 { &[] } else { tail };
+    }
+    out
+}

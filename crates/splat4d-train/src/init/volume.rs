@@ -1,0 +1,93 @@
+//! The volume that the cameras share, and random points in it.
+
+use super::{Seeds, UNKNOWN_COLOR};
+use crate::train::frames::Frames;
+use splat4d::math::Rng;
+use splat4d::math::se3::{dot, norm, sub};
+
+/// Where the cameras look.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Volume {
+    /// The point nearest to all optical axes.
+    pub center: [f64; 3],
+    /// Half the edge of the box around it, scene units.
+    pub radius: f64,
+}
+
+/// The box reaches this share of the way from its centre to the nearest camera's: 3 m of a rig of radius 4 m.
+const REACH: f64 = 0.75;
+
+/// The least-squares meeting point of the optical axes, and a box around it that stops short of the cameras.
+///
+/// Where axes are nearly parallel the depth is taken from the spread of the cameras.
+pub fn common(frames: &dyn Frames) -> Volume {
+    // Σ (I − d dᵀ) x = Σ (I − d dᵀ) c, slightly pulled to a point in front of the cameras so that parallel axes meet.
+    let mut a = [[0.0; 3]; 3];
+    let mut b = [0.0; 3];
+    let n = frames.len().max(1) as f64;
+    let centers: Vec<[f64; 3]> = (0..frames.len()).map(|i| frames.camera(i).center()).collect();
+    let centroid: [f64; 3] = std::array::from_fn(|k| centers.iter().map(|c| c[k]).sum::<f64>() / n);
+    let spread = centers.iter().map(|&c| norm(sub(c, centroid))).fold(0.0, f64::max).max(1e-3);
+    let pull = 1e-3;
+    for (i, c) in centers.iter().enumerate() {
+        let d = frames.camera(i).forward();
+        let ahead: [f64; 3] = std::array::from_fn(|k| c[k] + d[k] * spread);
+        for r in 0..3 {
+            for s in 0..3 {
+                let m = f64::from(u8::from(r == s)) - d[r] * d[s];
+                a[r][s] += m;
+                b[r] += m * c[s];
+            }
+            a[r][r] += pull;
+            b[r] += pull * ahead[r];
+        }
+    }
+    let center = solve(a, b).unwrap_or(centroid);
+    let nearest = centers.iter().map(|&c| norm(sub(c, center))).fold(f64::INFINITY, f64::min);
+    let radius = if nearest.is_finite() { (REACH * nearest).max(1e-3 * spread) } else { 1.0 };
+    Volume { center, radius }
+}
+
+/// Cramer's rule; `None` when singular.
+fn solve(a: [[f64; 3]; 3], b: [f64; 3]) -> Option<[f64; 3]> {
+    use splat4d::math::se3::cross;
+    let columns: [[f64; 3]; 3] = std::array::from_fn(|c| std::array::from_fn(|r| a[r][c]));
+    let det = dot(columns[0], cross(columns[1], columns[2]));
+    if det.abs() < 1e-12 {
+        return None;
+    }
+    Some([
+        dot(b, cross(columns[1], columns[2])) / det,
+        dot(columns[0], cross(b, columns[2])) / det,
+        dot(columns[0], cross(columns[1], b)) / det,
+    ])
+}
+
+/// Uniform points in the box; with `clip`, each at a random moment of it.
+pub fn random(volume: &Volume, count: usize, clip: Option<[f64; 2]>, rng: Rng) -> Seeds {
+    let mut out = Seeds::default();
+    for i in 0..count as u64 {
+        let point = point(volume, rng, i);
+        let time = clip.map(|[from, to]| from + (to - from) * rng.fork(9).uniform(i));
+        out.push(point, UNKNOWN_COLOR, time);
+    }
+    out
+}
+
+/// The i-th uniform point in the box.
+pub fn point(volume: &Volume, rng: Rng, i: u64) -> [f64; 3] {
+    std::array::from_fn(|k| volume.center[k] + volume.radius * (2.0 * rng.uniform(3 * i + k as u64) - 1.0))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::train::tests::Made;
+
+    #[test]
+    fn a_ring_of_cameras_meets_at_its_center() {
+        let v = common(&Made::new(6, 2, 8));
+        assert!(norm(v.center) < 0.02, "{v:?}");
+        assert!(v.radius > 1.0 && v.radius < 4.0);
+    }
+}

@@ -1,0 +1,394 @@
+//! The fused kernel behind [`super::Photometric`]: L1 and SSIM of one strip of rows of one channel, forwards and
+//! backwards in one rolling pass.
+//!
+//! With windowed means ⟨·⟩ (11x11 Gaussian), render x, truth y:
+//!
+//! ```text
+//! S = a1·a2 / (b1·b2),  a1 = 2⟨x⟩⟨y⟩ + C1,        a2 = 2(⟨xy⟩ − ⟨x⟩⟨y⟩) + C2,
+//!                       b1 = ⟨x⟩² + ⟨y⟩² + C1,    b2 = ⟨xx + yy⟩ − ⟨x⟩² − ⟨y⟩² + C2
+//! ∂S/∂⟨x⟩     = 2 (⟨y⟩(a2 − a1) + ⟨x⟩ S (b1 − b2)) / (b1·b2)
+//! ∂S/∂⟨xx+yy⟩ = −S / b2
+//! ∂S/∂⟨xy⟩    = 2 a1 / (b1·b2)
+//! d_x = ⟨w ∂S/∂⟨x⟩⟩ + 2x ⟨w ∂S/∂⟨xx+yy⟩⟩ + y ⟨w ∂S/∂⟨xy⟩⟩
+//! ```
+//!
+//! Only the sum of the two variances occurs, so four moments do (x, y, xx+yy, xy), not five. Four rows at a time go
+//! through: products → vertical means → horizontal means and S's derivatives → vertical means → horizontal means and
+//! the gradient. Products and derivatives live in rings of 16 rows, which stay in the second-level cache.
+
+use splat4d::math::Real;
+
+/// Taps of the window and their reach on either side (Wang 2004; 3DGS `loss_utils`).
+pub(super) const TAPS: usize = 11;
+const REACH: usize = TAPS / 2;
+/// Standard deviation of the window in pixels (Wang 2004).
+const SIGMA: f64 = 1.5;
+/// (0.01·L)² and (0.03·L)² for the range L = 1 (Wang 2004).
+const C1: f64 = 1e-4;
+const C2: f64 = 9e-4;
+
+/// Lanes of the inner loops: one AVX2 register of f32.
+const LANES: usize = 8;
+/// Rows that go through the pipeline together; a vertical pass then loads 14 rows for 44 products.
+const GROUP: usize = 4;
+/// Rows a group's window spans.
+const SPAN: usize = GROUP + TAPS - 1;
+/// Rows in a ring: a span, rounded up to a power of two.
+const RING: usize = 16;
+/// Moments (x, y, xx+yy, xy) and derivatives.
+const MOMENTS: usize = 4;
+const DERIVATIVES: usize = 3;
+/// Widest run of columns worked on at a time, so that the rings fit the second-level cache.
+const MAX_COLUMNS: usize = 512;
+/// Numbers in a scratch row: columns, a window's halo twice, each rounded up to whole lanes.
+const STRIDE: usize = MAX_COLUMNS + 32;
+
+/// One strip's work.
+pub(super) struct Strip<'a, F> {
+    /// The whole channel of the render, [height, width].
+    pub render: &'a [F],
+    /// The whole channel of the truth.
+    pub truth: &'a [F],
+    /// Weight of every pixel, ≥ 0.
+    pub weight: Option<&'a [F]>,
+    /// Pixels in a row.
+    pub width: usize,
+    /// Rows of the image.
+    pub height: usize,
+    /// First row of the strip.
+    pub first: usize,
+    /// The window, [`window`].
+    pub taps: [F; TAPS],
+    /// ∂loss/∂(Σ w|x − y|).
+    pub d_l1: F,
+    /// ∂loss/∂(Σ w S).
+    pub d_ssim: F,
+}
+
+/// The normalised window.
+pub(super) fn window<F: Real>() -> [F; TAPS] {
+    let bell = |i: usize| (-(i as f64 - REACH as f64).powi(2) / (2.0 * SIGMA * SIGMA)).exp();
+    let sum: f64 = (0..TAPS).map(bell).sum();
+    std::array::from_fn(|i| F::of(bell(i) / sum))
+}
+
+/// Working rows of one thread.
+#[derive(Debug)]
+pub(super) struct Scratch<F> {
+    /// Ring of products, [RING, MOMENTS, STRIDE].
+    products: Vec<F>,
+    /// Ring of S's derivatives, [RING, DERIVATIVES, STRIDE].
+    derivatives: Vec<F>,
+    /// Vertical means of one group, [GROUP, MOMENTS, STRIDE].
+    means: Vec<F>,
+    /// Weights from column −5 on, 0 outside the image, [STRIDE].
+    weights: Vec<F>,
+    /// Results of one row, [3, STRIDE].
+    row: Vec<F>,
+}
+
+impl<F: Real> Scratch<F> {
+    /// Rows for any strip.
+    pub fn new() -> Self {
+        let rows = |n: usize| vec![F::ZERO; n * STRIDE];
+        Self {
+            products: rows(RING * MOMENTS),
+            derivatives: rows(RING * DERIVATIVES),
+            means: rows(GROUP * MOMENTS),
+            weights: rows(1),
+            row: rows(3),
+        }
+    }
+}
+
+/// [Σ w|x − y|, Σ w S] over the strip; writes its gradient into `d` ([rows, width]).
+#[inline(always)]
+pub(super) fn strip<F: Real, const FMA: bool>(job: &Strip<'_, F>, scratch: &mut Scratch<F>, d: &mut [F]) -> [f64; 2] {
+    // Column runs of even size, so that no narrow rest pays a full halo.
+    let runs = job.width.div_ceil(MAX_COLUMNS);
+    let run = job.width.div_ceil(runs).next_multiple_of(LANES);
+    let mut sums = [0.0; 2];
+    for x0 in (0..job.width).step_by(run) {
+        let tile = Tile::new(job, x0, run.min(job.width - x0), d.len() / job.width);
+        let part = tile.walk::<FMA>(scratch, d);
+        sums[0] += part[0];
+        sums[1] += part[1];
+    }
+    sums
+}
+
+/// Some columns of a strip. Its derivative row/column i is the image's `first − 5 + i`, its product row/column i the
+/// image's `first − 10 + i`: a derivative at i then needs the products i..i+11, the gradient at i the derivatives
+/// i..i+11.
+struct Tile<'a, F> {
+    job: &'a Strip<'a, F>,
+    x0: usize,
+    columns: usize,
+    rows: usize,
+    /// Columns of a pass, in whole lanes: gradient, derivative, product.
+    gradient_columns: usize,
+    derivative_columns: usize,
+    product_columns: usize,
+}
+
+impl<'a, F: Real> Tile<'a, F> {
+    fn new(job: &'a Strip<'a, F>, x0: usize, columns: usize, rows: usize) -> Self {
+        let gradient_columns = columns.next_multiple_of(LANES);
+        let derivative_columns = (gradient_columns + TAPS - 1).next_multiple_of(LANES);
+        let product_columns = (derivative_columns + TAPS - 1).next_multiple_of(LANES);
+        Self { job, x0, columns, rows, gradient_columns, derivative_columns, product_columns }
+    }
+
+    #[inline(always)]
+    fn walk<const FMA: bool>(&self, s: &mut Scratch<F>, d: &mut [F]) -> [f64; 2] {
+        let mut sums = [0.0; 2];
+        self.fill_weights(s, 0);
+        for row in 0..2 * REACH {
+            self.fill_products(s, row);
+        }
+        // At `head`, derivative rows head..head+4 are made, and with them gradient rows head−10..head−6.
+        let mut head = 0;
+        while head < self.rows + 2 * REACH {
+            for row in 0..GROUP {
+                self.fill_products(s, head + 2 * REACH + row);
+            }
+            vertical::<F, FMA, MOMENTS>(&self.job.taps, &s.products, head, self.product_columns, &mut s.means);
+            for row in 0..GROUP {
+                sums[1] += self.derivatives::<FMA>(s, head + row, row);
+            }
+            if head + GROUP > 2 * REACH {
+                // A group that straddles the strip's first row reads rows before it from the ring; they are not used.
+                let from = (head + RING - 2 * REACH) % RING;
+                vertical::<F, FMA, DERIVATIVES>(
+                    &self.job.taps,
+                    &s.derivatives,
+                    from,
+                    self.derivative_columns,
+                    &mut s.means,
+                );
+                for row in 0..GROUP {
+                    if (2 * REACH..self.rows + 2 * REACH).contains(&(head + row)) {
+                        sums[0] += self.gradient::<FMA>(s, head + row - 2 * REACH, row, d);
+                    }
+                }
+            }
+            head += GROUP;
+        }
+        sums
+    }
+
+    /// The image's row for derivative row `row`, if it has one.
+    #[inline(always)]
+    fn image_row(&self, row: usize, halo: usize) -> Option<usize> {
+        (self.job.first + row).checked_sub(halo).filter(|&y| y < self.job.height)
+    }
+
+    /// The scratch columns that lie in the image, of `count` with this halo; the first is image column `x0 + start −
+    /// halo`.
+    #[inline(always)]
+    fn inside(&self, halo: usize, count: usize) -> (usize, usize) {
+        let start = halo.saturating_sub(self.x0);
+        (start, count.min(self.job.width + halo - self.x0))
+    }
+
+    /// Weights of the image row that derivative row `row` stands for (its halo is 5 columns).
+    #[inline(always)]
+    fn fill_weights(&self, s: &mut Scratch<F>, row: usize) {
+        let (start, end) = self.inside(REACH, self.derivative_columns);
+        match (self.job.weight, self.image_row(row, REACH)) {
+            (None, _) => {
+                s.weights.fill(F::ZERO);
+                s.weights[start..end].fill(F::ONE);
+            }
+            (Some(weight), Some(y)) => {
+                let from = y * self.job.width + self.x0 + start - REACH;
+                s.weights.fill(F::ZERO);
+                s.weights[start..end].copy_from_slice(&weight[from..from + end - start]);
+            }
+            (Some(_), None) => s.weights.fill(F::ZERO),
+        }
+    }
+
+    /// Products of one row; zero outside the image and where the weight is zero.
+    #[inline(always)]
+    fn fill_products(&self, s: &mut Scratch<F>, row: usize) {
+        let out = &mut s.products[row % RING * MOMENTS * STRIDE..][..MOMENTS * STRIDE];
+        let Some(y) = self.image_row(row, 2 * REACH) else {
+            out.fill(F::ZERO);
+            return;
+        };
+        let (start, end) = self.inside(2 * REACH, self.product_columns);
+        let from = y * self.job.width + self.x0 + start - 2 * REACH;
+        let n = end - start;
+        let (render, truth) = (&self.job.render[from..from + n], &self.job.truth[from..from + n]);
+        let (a, rest) = out.split_at_mut(STRIDE);
+        let (b, rest) = rest.split_at_mut(STRIDE);
+        let (c, e) = rest.split_at_mut(STRIDE);
+        for part in [&mut *a, &mut *b, &mut *c, &mut *e] {
+            part[..start].fill(F::ZERO);
+            part[end..].fill(F::ZERO);
+        }
+        let (a, b, c, e) = (&mut a[start..end], &mut b[start..end], &mut c[start..end], &mut e[start..end]);
+        a.copy_from_slice(render);
+        b.copy_from_slice(truth);
+        if let Some(weight) = self.job.weight {
+            let weight = &weight[from..from + n];
+            for i in 0..n {
+                if weight[i] <= F::ZERO {
+                    (a[i], b[i]) = (F::ZERO, F::ZERO);
+                }
+            }
+        }
+        for i in 0..n {
+            c[i] = a[i] * a[i] + b[i] * b[i];
+            e[i] = a[i] * b[i];
+        }
+    }
+
+    /// Horizontal means of one row of a group, S and its weighted derivatives; returns Σ w S over the tile's own pixels.
+    #[inline(always)]
+    fn derivatives<const FMA: bool>(&self, s: &mut Scratch<F>, row: usize, in_group: usize) -> f64 {
+        let out = &mut s.derivatives[row % RING * DERIVATIVES * STRIDE..][..DERIVATIVES * STRIDE];
+        if self.image_row(row, REACH).is_none() {
+            out.fill(F::ZERO);
+            return 0.0;
+        }
+        if self.job.weight.is_some() {
+            self.fill_weights(s, row);
+        }
+        let out = &mut s.derivatives[row % RING * DERIVATIVES * STRIDE..][..DERIVATIVES * STRIDE];
+        let means = &s.means[in_group * MOMENTS * STRIDE..][..MOMENTS * STRIDE];
+        let taps = &self.job.taps;
+        let (c1, c2) = (F::of(C1), F::of(C2));
+        for i in (0..self.derivative_columns).step_by(LANES) {
+            let mx = horizontal::<F, FMA>(taps, &means[i..]);
+            let my = horizontal::<F, FMA>(taps, &means[STRIDE + i..]);
+            let sq = horizontal::<F, FMA>(taps, &means[2 * STRIDE + i..]);
+            let xy = horizontal::<F, FMA>(taps, &means[3 * STRIDE + i..]);
+            let w: [F; LANES] = lanes(&s.weights[i..]);
+            let mut r = [[F::ZERO; LANES]; 4];
+            for l in 0..LANES {
+                let (mx, my) = (mx[l], my[l]);
+                let mxy = mx * my;
+                let m2 = mx.fma::<FMA>(mx, my * my);
+                let a1 = F::TWO.fma::<FMA>(mxy, c1);
+                let a2 = F::TWO.fma::<FMA>(xy[l] - mxy, c2);
+                let b1 = m2 + c1;
+                // Rounding can make a variance negative; b2 must not follow.
+                let b2 = (sq[l] - m2).max(F::ZERO) + c2;
+                let inv = F::ONE / (b1 * b2);
+                let ssim = a1 * a2 * inv;
+                let wi = w[l] * inv;
+                r[0][l] = F::TWO * wi * my.fma::<FMA>(a2 - a1, mx * ssim * (b1 - b2));
+                r[1][l] = -(ssim * b1 * wi);
+                r[2][l] = F::TWO * a1 * wi;
+                r[3][l] = ssim * w[l];
+            }
+            out[i..i + LANES].copy_from_slice(&r[0]);
+            out[STRIDE + i..][..LANES].copy_from_slice(&r[1]);
+            out[2 * STRIDE + i..][..LANES].copy_from_slice(&r[2]);
+            s.row[i..i + LANES].copy_from_slice(&r[3]);
+        }
+        let own = (REACH..self.rows + REACH).contains(&row);
+        if own { sum(&s.row[REACH..REACH + self.columns]) } else { 0.0 }
+    }
+
+    /// Horizontal means of the derivatives of one row of a group, and the gradient; returns Σ w|x − y|.
+    #[inline(always)]
+    fn gradient<const FMA: bool>(&self, s: &mut Scratch<F>, row: usize, in_group: usize, d: &mut [F]) -> f64 {
+        if self.job.weight.is_some() {
+            self.fill_weights(s, row + REACH);
+        }
+        let means = &s.means[in_group * DERIVATIVES * STRIDE..][..DERIVATIVES * STRIDE];
+        let products = &s.products[(row + 2 * REACH) % RING * MOMENTS * STRIDE..][..2 * STRIDE];
+        let taps = &self.job.taps;
+        let (d_l1, d_ssim) = (self.job.d_l1, self.job.d_ssim);
+        for i in (0..self.gradient_columns).step_by(LANES) {
+            let da = horizontal::<F, FMA>(taps, &means[i..]);
+            let db = horizontal::<F, FMA>(taps, &means[STRIDE + i..]);
+            let dc = horizontal::<F, FMA>(taps, &means[2 * STRIDE + i..]);
+            let x: [F; LANES] = lanes(&products[i + 2 * REACH..]);
+            let y: [F; LANES] = lanes(&products[STRIDE + i + 2 * REACH..]);
+            let w: [F; LANES] = lanes(&s.weights[i + REACH..]);
+            let mut r = [[F::ZERO; LANES]; 2];
+            for l in 0..LANES {
+                let diff = x[l] - y[l];
+                let sign =
+                    if diff > F::ZERO { F::ONE } else { F::ZERO } - if diff < F::ZERO { F::ONE } else { F::ZERO };
+                let inside = if w[l] > F::ZERO { d_ssim } else { F::ZERO };
+                let chain = (F::TWO * x[l]).fma::<FMA>(db[l], y[l].fma::<FMA>(dc[l], da[l]));
+                r[0][l] = chain.fma::<FMA>(inside, sign * w[l] * d_l1);
+                r[1][l] = diff.abs() * w[l];
+            }
+            s.row[i..i + LANES].copy_from_slice(&r[0]);
+            s.row[STRIDE + i..][..LANES].copy_from_slice(&r[1]);
+        }
+        d[row * self.job.width + self.x0..][..self.columns].copy_from_slice(&s.row[..self.columns]);
+        sum(&s.row[STRIDE..STRIDE + self.columns])
+    }
+}
+
+#[inline(always)]
+fn lanes<F: Real>(s: &[F]) -> [F; LANES] {
+    let s = &s[..LANES];
+    std::array::from_fn(|l| s[l])
+}
+
+/// Windowed sums along a row, of [`LANES`] neighbours; the first reads from the slice's start.
+#[inline(always)]
+fn horizontal<F: Real, const FMA: bool>(taps: &[F; TAPS], row: &[F]) -> [F; LANES] {
+    let row = &row[..LANES + TAPS - 1];
+    let mut acc = [F::ZERO; LANES];
+    for t in 0..TAPS {
+        for l in 0..LANES {
+            acc[l] = row[t + l].fma::<FMA>(taps[t], acc[l]);
+        }
+    }
+    acc
+}
+
+/// Windowed sums down the columns for [`GROUP`] rows of `MAPS` maps; the first reads ring rows `from..from+11`.
+#[inline(always)]
+fn vertical<F: Real, const FMA: bool, const MAPS: usize>(
+    taps: &[F; TAPS],
+    ring: &[F],
+    from: usize,
+    columns: usize,
+    out: &mut [F],
+) {
+    let ring = &ring[..RING * MAPS * STRIDE];
+    let out = &mut out[..GROUP * MAPS * STRIDE];
+    let starts: [usize; SPAN] = std::array::from_fn(|t| (from + t) % RING * MAPS * STRIDE);
+    for map in 0..MAPS {
+        for i in (map * STRIDE..map * STRIDE + columns).step_by(LANES) {
+            let mut acc = [[F::ZERO; LANES]; GROUP];
+            for t in 0..SPAN {
+                let v: [F; LANES] = lanes(&ring[starts[t] + i..]);
+                for g in 0..GROUP {
+                    if t >= g && t - g < TAPS {
+                        for l in 0..LANES {
+                            acc[g][l] = v[l].fma::<FMA>(taps[t - g], acc[g][l]);
+                        }
+                    }
+                }
+            }
+            for g in 0..GROUP {
+                out[g * MAPS * STRIDE + i..][..LANES].copy_from_slice(&acc[g]);
+            }
+        }
+    }
+}
+
+/// Sum of a row: lane by lane, then in f64.
+#[inline(always)]
+fn sum<F: Real>(row: &[F]) -> f64 {
+    let mut acc = [F::ZERO; LANES];
+    let chunks = row.chunks_exact(LANES);
+    let rest: f64 = chunks.remainder().iter().map(|x| x.f64()).sum();
+    for c in chunks {
+        for l in 0..LANES {
+            acc[l] += c[l];
+        }
+    }
+    acc.iter().map(|x| x.f64()).sum::<f64>() + rest
+}

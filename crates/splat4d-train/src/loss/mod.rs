@@ -1,0 +1,10 @@
+//! What training minimises: the picture loss and the regularisers, each with its gradient.
+//!
+//! Every function returns its value and writes or adds its gradient; none keeps state that a result depends on.
+
+mod kernel;
+pub mod photometric;
+pub mod scene;
+pub mod simd;
+
+pub use photometric::{LossValue, Photometric};

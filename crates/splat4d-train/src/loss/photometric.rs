@@ -1,0 +1,124 @@
+//! The picture loss of 3DGS, (1 − λ)·L1 + λ·(1 − SSIM), and its gradient, in one pass over the image.
+
+use super::kernel::{self, Scratch, Strip};
+use super::simd::{self, Simd};
+use rayon::prelude::*;
+use splat4d::math::Real;
+use splat4d::scene::Planes;
+use std::sync::Mutex;
+
+/// Rows of a strip: the unit of parallel work. Fixed, so that sums do not depend on the number of threads.
+const STRIP_ROWS: usize = 64;
+
+/// The loss of one image.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct LossValue {
+    /// (1 − λ)·l1 + λ·(1 − ssim)
+    pub total: f64,
+    /// Weighted mean |render − truth| over pixels and channels.
+    pub l1: f64,
+    /// Weighted mean of the SSIM map over pixels and channels; 1 for equal images.
+    pub ssim: f64,
+}
+
+/// L1 and SSIM with their gradient; keeps its working memory between calls.
+#[derive(Debug)]
+pub struct Photometric<F = f32> {
+    /// λ: the share of 1 − SSIM, 0.2 in 3DGS.
+    pub lambda_dssim: f32,
+    simd: Simd,
+    taps: [F; kernel::TAPS],
+    /// One a thread of the pool; a thread holds its own only while it works on one strip.
+    scratch: Vec<Mutex<Scratch<F>>>,
+    /// [channels, strips] sums, added up in order.
+    sums: Vec<[f64; 2]>,
+}
+
+impl<F: Real> Photometric<F> {
+    /// A loss with this λ, at the best instruction set of this CPU.
+    pub fn new(lambda_dssim: f32) -> Self {
+        Self::with_simd(lambda_dssim, Simd::detect())
+    }
+
+    /// A loss with this λ at a given instruction set.
+    pub fn with_simd(lambda_dssim: f32, simd: Simd) -> Self {
+        Self { lambda_dssim, simd, taps: kernel::window(), scratch: Vec::new(), sums: Vec::new() }
+    }
+
+    /// (1 − λ)·L1 + λ·(1 − SSIM), and its gradient to `render`, which overwrites `d_render`.
+    ///
+    /// Shapes: render, truth [C,H,W], values nominally in [0,1]; weight [1,H,W], ≥ 0; d_render becomes [C,H,W].
+    /// SSIM has an 11x11 Gaussian window (σ = 1.5), zero padding, C1 = 0.01², C2 = 0.03², per channel.
+    /// With weights, L1 and SSIM are Σ w·(…) / (C·Σ w). A pixel of weight 0 is treated as if it lay outside the image:
+    /// zero in both images, as the padding, so what it shows reaches neither the value nor the gradient, not even
+    /// through a neighbour's window. If every weight is 0 the loss is 0, with ssim 1.
+    /// The bits do not depend on the number of threads; nothing is allocated once sizes have been seen.
+    /// Panics: shapes differ. Source: Wang 2004; Kerbl 2023 §5 (`utils/loss_utils.py` for the padding).
+    pub fn loss_and_grad(
+        &mut self,
+        render: &Planes<F>,
+        truth: &Planes<F>,
+        weight: Option<&Planes<F>>,
+        d_render: &mut Planes<F>,
+    ) -> LossValue {
+        let (channels, height, width) = (render.channels, render.height, render.width);
+        assert_eq!(
+            (channels, height, width),
+            (truth.channels, truth.height, truth.width),
+            "render and truth must have the same channels, height and width"
+        );
+        if let Some(w) = weight {
+            assert_eq!(
+                (1, height, width),
+                (w.channels, w.height, w.width),
+                "the weight must be one plane of that size"
+            );
+        }
+        if (d_render.channels, d_render.height, d_render.width) != (channels, height, width) {
+            d_render.reset(channels, height, width);
+        }
+        let pixels = render.pixels();
+        let total_weight = match weight {
+            None => pixels as f64,
+            Some(w) => w.data.iter().map(|x| x.f64()).sum(),
+        } * channels as f64;
+        if total_weight <= 0.0 {
+            d_render.data.fill(F::ZERO);
+            return LossValue { total: 0.0, l1: 0.0, ssim: 1.0 };
+        }
+
+        let lambda = f64::from(self.lambda_dssim);
+        let strips = height.div_ceil(STRIP_ROWS);
+        while self.scratch.len() < rayon::current_num_threads() {
+            self.scratch.push(Mutex::new(Scratch::new()));
+        }
+        self.sums.resize(channels * strips, [0.0; 2]);
+        let (simd, scratch, taps) = (self.simd, &self.scratch, self.taps);
+        let weight = weight.map(|w| w.data.as_slice());
+        let (d_l1, d_ssim) = (F::of((1.0 - lambda) / total_weight), F::of(-lambda / total_weight));
+
+        let planes = d_render.data.par_chunks_exact_mut(pixels).zip(self.sums.par_chunks_exact_mut(strips));
+        planes.enumerate().for_each(|(c, (d, sums))| {
+            let (render, truth) = (render.plane(c), truth.plane(c));
+            d.par_chunks_mut(STRIP_ROWS * width).zip(sums).enumerate().for_each(|(i, (d, sums))| {
+                let first = i * STRIP_ROWS;
+                let job = Strip { render, truth, weight, width, height, first, taps, d_l1, d_ssim };
+                // A loop of one step may run on the caller's own thread, then alone.
+                let thread = rayon::current_thread_index().unwrap_or(0);
+                let mut scratch = scratch[thread].lock().expect("no strip panics while it holds its scratch");
+                *sums = simd::strip(simd, &job, &mut scratch, d);
+            });
+        });
+
+        let (mut l1, mut ssim) = (0.0, 0.0);
+        for s in &self.sums {
+            l1 += s[0];
+            ssim += s[1];
+        }
+        let (l1, ssim) = (l1 / total_weight, ssim / total_weight);
+        LossValue { total: (1.0 - lambda) * l1 + lambda * (1.0 - ssim), l1, ssim }
+    }
+}
+
+#[cfg(test)]
+mod tests;

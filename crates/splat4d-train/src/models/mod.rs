@@ -1,0 +1,199 @@
+//! How motion models are learnt: a [`Program`] a model, which makes the list of [`Stage`]s that the trainer runs.
+//!
+//! `splat4d::motion::x` holds a model's mathematics, `models::x` its stages, rates, losses and what it needs of a capture.
+
+pub mod spacetime;
+pub mod still;
+
+use crate::densify::Densify;
+use crate::recipe::Recipe;
+use crate::train::chain::{ParamLoss, ProbeLoss};
+use crate::train::sampler::Sampler;
+use crate::{Error, Result};
+use splat4d::layers::Scene;
+use splat4d::math::Real;
+use splat4d::motion::Spec;
+use splat4d::scene::LifeKind;
+
+/// What a program may know of the capture and of the user's wishes.
+#[derive(Clone, Debug)]
+pub struct Plan {
+    /// All knobs, resolved.
+    pub recipe: Recipe,
+    /// 1.1 times the largest distance of a camera from the cameras' centroid, scene units (Kerbl et al. 2023).
+    pub extent: f64,
+    /// First and last second of the clip.
+    pub clip: [f64; 2],
+    /// Frames a second.
+    pub fps: f64,
+    /// Distinct times in the capture.
+    pub times: usize,
+    /// Cameras that do not move.
+    pub fixed_cameras: usize,
+}
+
+impl Plan {
+    /// Seconds of the clip, its last frame's duration included: the unit in which recipes state time.
+    pub fn seconds(&self) -> f64 {
+        self.clip[1] - self.clip[0] + 1.0 / self.fps
+    }
+}
+
+/// A learning rate over a stage: log-linear from `start` to `end`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Rate {
+    /// At the stage's first step.
+    pub start: f64,
+    /// At its last.
+    pub end: f64,
+}
+
+impl Rate {
+    /// One rate throughout.
+    pub fn constant(rate: f64) -> Self {
+        Self { start: rate, end: rate }
+    }
+
+    /// The rate after the share `progress` of the stage.
+    pub fn at(&self, progress: f64) -> f64 {
+        if self.start <= 0.0 || self.end <= 0.0 {
+            return self.start.max(0.0) * (1.0 - progress) + self.end.max(0.0) * progress;
+        }
+        (self.start.ln() * (1.0 - progress) + self.end.ln() * progress).exp()
+    }
+}
+
+/// A learnable group: one column group of one table. What no group names is frozen.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Group {
+    /// The layer.
+    pub layer: usize,
+    /// The column group's name; it is unique in a layer.
+    pub column: String,
+    /// Columns of the group that it covers (first, count); `None`: all.
+    pub part: Option<(usize, usize)>,
+    /// How fast.
+    pub rate: Rate,
+}
+
+impl Group {
+    /// All columns of a group of layer 0.
+    pub fn new(column: &str, rate: Rate) -> Self {
+        Self { layer: 0, column: column.to_owned(), part: None, rate }
+    }
+}
+
+/// What a stage does to the scene at its start or end: add pages, replace the cloud, build a graph.
+pub type Hook<F> = Box<dyn Fn(&mut Scene<F>) -> Result<()> + Send + Sync>;
+
+/// One stage of training.
+pub struct Stage<F: Real = f32> {
+    /// What progress and metrics call it.
+    pub name: String,
+    /// Steps.
+    pub iterations: usize,
+    /// Which frames.
+    pub sampler: Sampler,
+    /// Views a step.
+    pub batch: usize,
+    /// What learns, and how fast.
+    pub groups: Vec<Group>,
+    /// Losses over several times.
+    pub probes: Vec<Box<dyn ProbeLoss<F>>>,
+    /// Losses on raw parameters.
+    pub params: Vec<Box<dyn ParamLoss<F>>>,
+    /// Where Gaussians are added and removed.
+    pub densify: Densify,
+    /// First, last step of the stage that densifies, and the steps between.
+    pub densify_steps: (usize, usize, usize),
+    /// Steps before each further SH degree; 0: all at once.
+    pub sh_interval: usize,
+    /// Lower bound of log life widths, by layer; learnt values are lifted to it.
+    pub min_log_life: Option<f64>,
+    /// Before the first step.
+    pub start: Option<Hook<F>>,
+    /// After the last.
+    pub end: Option<Hook<F>>,
+}
+
+impl<F: Real> Stage<F> {
+    /// A stage that learns nothing yet.
+    pub fn new(name: &str, iterations: usize) -> Self {
+        Self {
+            name: name.to_owned(),
+            iterations,
+            sampler: Sampler::Uniform,
+            batch: 1,
+            groups: Vec::new(),
+            probes: Vec::new(),
+            params: Vec::new(),
+            densify: Densify::None,
+            densify_steps: (0, 0, 0),
+            sh_interval: 0,
+            min_log_life: None,
+            start: None,
+            end: None,
+        }
+    }
+}
+
+/// How one motion model is learnt.
+pub trait Program: Send + Sync {
+    /// The model that training starts with.
+    fn spec(&self, plan: &Plan) -> Spec;
+    /// The life its Gaussians have.
+    fn life(&self, plan: &Plan) -> LifeKind;
+    /// Says before training, and not after an hour, that the model cannot work on a capture.
+    fn check(&self, _plan: &Plan) -> Result<()> {
+        Ok(())
+    }
+    /// The stages.
+    fn stages(&self, plan: &Plan) -> Vec<Stage>;
+}
+
+/// The program of a built-in motion model.
+pub fn program(motion: &str) -> Result<Box<dyn Program>> {
+    match motion {
+        "still" => Ok(Box::new(still::StillProgram)),
+        "spacetime" => Ok(Box::new(spacetime::SpacetimeProgram)),
+        other => Err(Error::input(format!("there is no motion model `{other}`"))
+            .remedy(format!("Use one of: {}", splat4d::motion::BUILT_IN.join(", ")))),
+    }
+}
+
+/// The strategy and its steps as the recipe has them.
+pub fn densify_of(r: &Recipe) -> (Densify, (usize, usize, usize)) {
+    let densify = match r.strategy.as_str() {
+        "mcmc" => Densify::Mcmc(crate::densify::Mcmc {
+            growth: r.growth,
+            gradient_share: r.relocate_gradient,
+            noise_lr: r.noise_lr,
+        }),
+        "adc" => Densify::Adc(crate::densify::Adc {
+            grad_threshold: r.densify_grad_threshold,
+            percent_dense: r.percent_dense,
+        }),
+        _ => Densify::None,
+    };
+    (densify, (r.densify_from_iter, r.densify_until_iter, r.densification_interval))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_built_in_model_has_a_program() {
+        for name in splat4d::motion::BUILT_IN {
+            assert!(program(name).is_ok(), "{name} has mathematics but no program");
+        }
+        assert!(program("warp").is_err_and(|e| e.to_string().contains("spacetime")));
+    }
+
+    #[test]
+    fn rates_are_log_linear() {
+        let r = Rate { start: 1e-2, end: 1e-4 };
+        assert!((r.at(0.0) - 1e-2).abs() < 1e-12 && (r.at(0.5) - 1e-3).abs() < 1e-12 && (r.at(1.0) - 1e-4).abs() < 1e-12);
+        assert_eq!(Rate::constant(0.0).at(0.3), 0.0);
+    }
+}

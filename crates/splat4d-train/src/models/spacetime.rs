@@ -1,0 +1,58 @@
+//! `spacetime`: one stage; velocities, lives and rotation rates learn beside geometry and colour.
+
+use super::still;
+use super::{Group, Plan, Program, Rate, Stage};
+use crate::loss::scene::{LivingOpacity, VelocitySmoothness};
+use splat4d::motion::{Spec, SpacetimeSpec};
+use splat4d::scene::LifeKind;
+
+/// Explicit kinematics (STG, FreeTimeGS).
+#[derive(Clone, Copy, Debug)]
+pub struct SpacetimeProgram;
+
+impl Program for SpacetimeProgram {
+    fn spec(&self, plan: &Plan) -> Spec {
+        let r = &plan.recipe;
+        Spec::Spacetime(SpacetimeSpec {
+            order: r.motion_order,
+            rotation: r.rotation_rate,
+            detach: r.detach,
+            origin: 0.5 * (plan.clip[0] + plan.clip[1]),
+        })
+    }
+
+    fn life(&self, plan: &Plan) -> LifeKind {
+        LifeKind::from_name(&plan.recipe.life).expect("the recipe was checked")
+    }
+
+    fn stages(&self, plan: &Plan) -> Vec<Stage> {
+        let r = &plan.recipe;
+        let clip = plan.seconds();
+        let mut stage = still::stage("spacetime", plan);
+        // Rates of v_k are extents per clip^k: in seconds they shrink by clip^k.
+        for k in 0..r.motion_order {
+            let unit = plan.extent / clip.powi(k as i32 + 1);
+            let rate = Rate { start: r.velocity_lr_init * unit, end: r.velocity_lr_final * unit };
+            stage.groups.push(Group { part: Some((3 * k, 3)), ..Group::new("velocities", rate) });
+        }
+        if r.rotation_rate {
+            stage.groups.push(Group::new("rotation_rates", Rate::constant(r.rotation_rate_lr / clip)));
+        }
+        let life = self.life(plan);
+        if life != LifeKind::Infinite {
+            stage.groups.push(Group::new("life_centers", Rate::constant(r.life_center_lr * clip)));
+            stage.groups.push(Group::new("life_log_widths", Rate::constant(r.life_width_lr)));
+            stage.min_log_life = Some((r.min_life_frames / plan.fps).max(1e-6).ln());
+        }
+        if life == LifeKind::Interval {
+            stage.groups.push(Group::new("life_log_softness", Rate::constant(r.life_width_lr)));
+        }
+        if r.lambda_opacity_life > 0.0 {
+            stage.params.push(Box::new(LivingOpacity { weight: r.lambda_opacity_life }));
+        }
+        if r.lambda_velocity > 0.0 && r.motion_order > 0 {
+            stage.params.push(Box::new(VelocitySmoothness::new(r.lambda_velocity, clip / plan.extent)));
+        }
+        vec![stage]
+    }
+}

@@ -1,0 +1,72 @@
+//! `still`: one stage, every group of static 3DGS. Also the base that other programs add to.
+
+use super::{Group, Plan, Program, Rate, Stage, densify_of};
+use crate::loss::scene::{MeanOpacity, MeanScale};
+use crate::recipe::Recipe;
+use crate::train::chain::ParamLoss;
+use splat4d::motion::Spec;
+use splat4d::scene::LifeKind;
+
+/// The higher SH degrees learn this much slower than the base colour (Kerbl et al. 2023).
+const SH_REST_SLOWDOWN: f64 = 20.0;
+
+/// Static 3D Gaussian Splatting.
+#[derive(Clone, Copy, Debug)]
+pub struct StillProgram;
+
+impl Program for StillProgram {
+    fn spec(&self, _plan: &Plan) -> Spec {
+        Spec::Still
+    }
+
+    fn life(&self, _plan: &Plan) -> LifeKind {
+        LifeKind::Infinite
+    }
+
+    fn stages(&self, plan: &Plan) -> Vec<Stage> {
+        vec![stage("still", plan)]
+    }
+}
+
+/// The groups of geometry and colour.
+pub fn groups(r: &Recipe, extent: f64) -> Vec<Group> {
+    let positions = Rate { start: r.position_lr_init * extent, end: r.position_lr_final * extent };
+    let mut groups = vec![
+        Group::new("means", positions),
+        Group::new("quats", Rate::constant(r.rotation_lr)),
+        Group::new("log_scales", Rate::constant(r.scaling_lr)),
+        Group::new("opacity_logits", Rate::constant(r.opacity_lr)),
+        Group { part: Some((0, 3)), ..Group::new("sh", Rate::constant(r.feature_lr)) },
+    ];
+    let rest = 3 * ((r.sh_degree + 1) * (r.sh_degree + 1) - 1);
+    if rest > 0 {
+        let rate = Rate::constant(r.feature_lr / SH_REST_SLOWDOWN);
+        groups.push(Group { part: Some((3, rest)), ..Group::new("sh", rate) });
+    }
+    groups
+}
+
+/// A stage with the recipe's densification and regularisers.
+pub fn stage(name: &str, plan: &Plan) -> Stage {
+    let r = &plan.recipe;
+    let (densify, densify_steps) = densify_of(r);
+    let mut params: Vec<Box<dyn ParamLoss<f32>>> = Vec::new();
+    // These two belong to MCMC: they make room; under ADC they only dim.
+    if r.strategy == "mcmc" {
+        if r.opacity_reg > 0.0 {
+            params.push(Box::new(MeanOpacity { weight: r.opacity_reg }));
+        }
+        if r.scale_reg > 0.0 {
+            params.push(Box::new(MeanScale { weight: r.scale_reg }));
+        }
+    }
+    Stage {
+        batch: r.batch_size,
+        groups: groups(r, plan.extent),
+        params,
+        densify,
+        densify_steps,
+        sh_interval: r.sh_degree_interval,
+        ..Stage::new(name, r.iterations)
+    }
+}

@@ -1,0 +1,497 @@
+//! The fixed chain of one step: `motion.at → render → loss → render.backward → motion.backward`.
+//!
+//! Views and the questions of losses that look at several times are merged: one `prepare`, one `at` and one `backward`
+//! for every distinct (layer, space, time), one `finish`.
+
+use splat4d::layers::{LayerTape, Scene};
+use splat4d::math::Real;
+use splat4d::motion::{At, Cache};
+use splat4d::render::{Image, ImageGrads, RenderConfig, RenderGrads, Renderer};
+use splat4d::scene::{Camera, Color, Grads, Planes, Rows, SH, Space, SplatGrads, Splats, Table, Time};
+use std::time::{Duration, Instant as Clock};
+
+/// Draws splats and takes gradients back; [`Renderer`] is the one in use, tests put the oracle here.
+pub trait Draw<F: Real> {
+    /// Fills `out`.
+    fn render(&mut self, splats: &Splats<'_, F>, camera: &Camera, background: [F; 3], out: &mut Image<F>);
+    /// The VJP of the last `render`; see [`Renderer::backward`].
+    fn backward(
+        &mut self,
+        splats: &Splats<'_, F>,
+        camera: &Camera,
+        background: [F; 3],
+        grads: &ImageGrads<'_, F>,
+        d_sh: &mut [Option<&mut Table<F>>],
+        d: &mut RenderGrads<F>,
+    );
+    /// Pixel radius of every splat of the last `render`, 0 where culled.
+    fn radii(&self) -> &[F];
+    /// The settings, to change the SH degree between steps.
+    fn config(&mut self) -> &mut RenderConfig;
+}
+
+impl<F: Real> Draw<F> for Renderer<F> {
+    fn render(&mut self, splats: &Splats<'_, F>, camera: &Camera, background: [F; 3], out: &mut Image<F>) {
+        Renderer::render(self, splats, camera, background, None, out);
+    }
+
+    fn backward(
+        &mut self,
+        splats: &Splats<'_, F>,
+        camera: &Camera,
+        background: [F; 3],
+        grads: &ImageGrads<'_, F>,
+        d_sh: &mut [Option<&mut Table<F>>],
+        d: &mut RenderGrads<F>,
+    ) {
+        Renderer::backward(self, splats, camera, background, None, grads, d_sh, d);
+    }
+
+    fn radii(&self) -> &[F] {
+        Renderer::radii(self)
+    }
+
+    fn config(&mut self) -> &mut RenderConfig {
+        &mut self.config
+    }
+}
+
+/// One picture that the scene is compared with.
+#[derive(Clone, Copy, Debug)]
+pub struct View<'a, F = f32> {
+    /// From where.
+    pub camera: &'a Camera,
+    /// When.
+    pub t: Time,
+    /// Colour behind the scene.
+    pub background: [F; 3],
+    /// The truth, 3 channels.
+    pub truth: &'a Planes<F>,
+    /// Foreground mask, 1 channel.
+    pub mask: Option<&'a Planes<F>>,
+    /// Pixels that count, 1 channel.
+    pub weight: Option<&'a Planes<F>>,
+    /// The frame's number in the capture, for messages.
+    pub frame: usize,
+    /// The camera's number in the capture, for the exposure.
+    pub rig: usize,
+}
+
+/// Compares a picture with its truth.
+pub trait ImageLoss<F: Real> {
+    /// The loss; overwrites `d_color`, and `d_alpha` if it returns true (alpha takes part).
+    fn eval(&mut self, view: &View<'_, F>, image: &Image<F>, d_color: &mut Planes<F>, d_alpha: &mut Planes<F>) -> (f64, bool);
+}
+
+/// Where in training a loss is asked.
+#[derive(Clone, Debug)]
+pub struct StepInfo {
+    /// Steps taken before this one.
+    pub iteration: usize,
+    /// The times of the step's views.
+    pub times: Vec<Time>,
+    /// Seed of the run.
+    pub seed: u64,
+    /// Share of the stage that is done, in [0, 1).
+    pub progress: f64,
+}
+
+/// What a loss over several times wants to see.
+#[derive(Clone, Debug)]
+pub struct Probe {
+    /// Which layer.
+    pub layer: usize,
+    /// Gaussians or nodes.
+    pub of: Space,
+    /// Which rows (strictly increasing); `None`: all.
+    pub rows: Option<Vec<u32>>,
+    /// At which times.
+    pub times: Vec<Time>,
+}
+
+/// A loss over splats at several times (rigidity pairs, velocities, transport triples).
+pub trait ProbeLoss<F: Real>: Send + Sync {
+    /// Its name, in recipes and metrics.
+    fn name(&self) -> &str;
+    /// What it looks at in this step; empty: nothing.
+    fn probes(&self, scene: &Scene<F>, info: &StepInfo) -> Vec<Probe>;
+    /// The loss. `seen[i][k]` is [rows, 10] of probe i at its k-th time; adds its gradient to `d[i][k]`, of like shape.
+    fn eval(&self, scene: &Scene<F>, probes: &[Probe], seen: &[Vec<Table<F>>], d: &mut [Vec<Table<F>>]) -> f64;
+}
+
+/// A loss on raw parameters; must add only to rows that are active in `d`.
+pub trait ParamLoss<F: Real>: Send + Sync {
+    /// Its name, in recipes and metrics.
+    fn name(&self) -> &str;
+    /// The loss; adds to one `Grads` a layer.
+    fn eval(&self, scene: &Scene<F>, info: &StepInfo, d: &mut [Grads<F>]) -> f64;
+    /// Rows were edited: whatever was remembered of rows is stale.
+    fn on_edit(&self) {}
+    /// What a checkpoint must hold of it, if it remembers anything from step to step.
+    fn state(&self) -> Vec<u32> {
+        Vec::new()
+    }
+    /// Takes back what [`state`](Self::state) gave.
+    fn restore(&self, _state: &[u32]) {}
+}
+
+/// Where a step's time went.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Timings {
+    /// `prepare` and `at`.
+    pub motion: Duration,
+    /// Drawing.
+    pub render: Duration,
+    /// Image, probe and parameter losses with their gradients.
+    pub loss: Duration,
+    /// The renderer's VJP.
+    pub render_backward: Duration,
+    /// The motion's VJP and `finish`.
+    pub motion_backward: Duration,
+}
+
+/// What the densifier may know of one view of one layer.
+#[derive(Clone, Copy, Debug)]
+pub struct Observation<'a, F> {
+    /// The layer.
+    pub layer: usize,
+    /// Its rows that were drawn: splat j is row `rows.id(j)`.
+    pub rows: Rows<'a>,
+    /// |dL/dmean2d| a splat, NDC units.
+    pub mean2d: &'a [F],
+    /// Pixel radius a splat, 0 where culled.
+    pub radii: &'a [F],
+}
+
+/// The result of a step.
+#[derive(Clone, Debug, Default)]
+pub struct StepReport {
+    /// All losses together.
+    pub loss: f64,
+    /// The image loss of every view.
+    pub view_losses: Vec<f64>,
+    /// dL/dt of every view's time: the same number for views at one time, which share it.
+    pub d_times: Vec<f64>,
+    /// dL/d pose of every view, left perturbation (ρ, θ).
+    pub d_cameras: Vec<[f64; 6]>,
+    /// Where the time went.
+    pub timings: Timings,
+}
+
+/// One distinct (layer, space, time) of a step.
+struct Ask<F: Real> {
+    layer: usize,
+    tape: LayerTape<F>,
+    d_out: Table<F>,
+    d_color: Option<Table<F>>,
+    d_weights: Option<Table<F>>,
+    d_time: f64,
+}
+
+/// The chain's arena: reused from step to step.
+pub struct Chain<F: Real = f32> {
+    asks: Vec<Ask<F>>,
+    spare: Vec<Ask<F>>,
+    caches: Vec<(Cache, Cache)>,
+    image: Image<F>,
+    d_color: Planes<F>,
+    d_alpha: Planes<F>,
+    d_render: RenderGrads<F>,
+    /// Number of `Motion::at` calls of the last step, for tests and reports.
+    pub at_calls: usize,
+}
+
+impl<F: Real> Default for Chain<F> {
+    fn default() -> Self {
+        Self {
+            asks: Vec::new(),
+            spare: Vec::new(),
+            caches: Vec::new(),
+            image: Image::default(),
+            d_color: Planes::default(),
+            d_alpha: Planes::default(),
+            d_render: RenderGrads::default(),
+            at_calls: 0,
+        }
+    }
+}
+
+/// The losses of a step.
+pub struct Losses<'a, F: Real> {
+    /// Compares pictures.
+    pub image: &'a mut dyn ImageLoss<F>,
+    /// Look at several times.
+    pub probes: &'a [Box<dyn ProbeLoss<F>>],
+    /// Look at raw parameters.
+    pub params: &'a [Box<dyn ParamLoss<F>>],
+}
+
+impl<F: Real> Chain<F> {
+    /// One step: adds all gradients to `d` (one a layer, cleared by the caller). `observe` is told of every view.
+    pub fn step(
+        &mut self,
+        scene: &Scene<F>,
+        views: &[View<'_, F>],
+        info: &StepInfo,
+        draw: &mut dyn Draw<F>,
+        losses: &mut Losses<'_, F>,
+        d: &mut [Grads<F>],
+        observe: &mut dyn FnMut(Observation<'_, F>),
+    ) -> StepReport {
+        assert_eq!(d.len(), scene.layers.len(), "a gradient a layer is needed");
+        let mut report = StepReport::default();
+        let clock = Clock::now();
+        let probes: Vec<Vec<Probe>> = losses.probes.iter().map(|l| l.probes(scene, info)).collect();
+        self.ask(scene, views, &probes);
+        self.caches.resize_with(scene.layers.len(), Default::default);
+        for (layer, (cache, d_cache)) in self.caches.iter_mut().enumerate() {
+            *d_cache = Cache::default();
+            let questions = questions(&self.asks, scene, layer);
+            scene.layers[layer].motion.prepare(&scene.layers[layer].params, &questions, cache);
+        }
+        self.at_calls = self.asks.len();
+        for ask in &mut self.asks {
+            scene.layers[ask.layer].at(&self.caches[ask.layer].0, &mut ask.tape);
+            reset_like(&mut ask.d_out, ask.tape.out());
+            (ask.d_color, ask.d_weights, ask.d_time) = (None, None, 0.0);
+            d[ask.layer].activate(ask.tape.space(), ask.tape.rows());
+        }
+        report.timings.motion = clock.elapsed();
+        for view in views {
+            self.view(scene, view, draw, losses.image, d, observe, &mut report);
+        }
+        let clock = Clock::now();
+        for (loss, probes) in losses.probes.iter().zip(&probes) {
+            if !probes.is_empty() {
+                report.loss += self.probe(scene, loss.as_ref(), probes);
+            }
+        }
+        for loss in losses.params {
+            report.loss += loss.eval(scene, info, d);
+        }
+        report.timings.loss += clock.elapsed();
+        let clock = Clock::now();
+        for ask in &mut self.asks {
+            let (cache, d_cache) = &mut self.caches[ask.layer];
+            let d_out =
+                SplatGrads { out: &ask.d_out, color: ask.d_color.as_ref(), weights: ask.d_weights.as_ref() };
+            ask.d_time = scene.layers[ask.layer].backward(cache, &mut ask.tape, &d_out, d_cache, &mut d[ask.layer]);
+        }
+        for (layer, (cache, d_cache)) in self.caches.iter_mut().enumerate() {
+            let questions = questions(&self.asks, scene, layer);
+            let l = &scene.layers[layer];
+            l.motion.finish(&l.params, &questions, cache, d_cache, &mut d[layer]);
+        }
+        report.timings.motion_backward = clock.elapsed();
+        for view in views {
+            let of_view = |a: &&Ask<F>| a.tape.space() == Space::Gaussians && a.tape.time() == view.t;
+            report.d_times.push(self.asks.iter().filter(of_view).map(|a| a.d_time).sum());
+        }
+        report
+    }
+
+    /// Collects the distinct questions: what views see is what is alive, probes add their rows.
+    fn ask(&mut self, scene: &Scene<F>, views: &[View<'_, F>], probes: &[Vec<Probe>]) {
+        self.spare.append(&mut self.asks);
+        for view in views {
+            for (layer, l) in scene.layers.iter().enumerate() {
+                if self.find(layer, Space::Gaussians, view.t).is_none() {
+                    let mut ask = self.spare.pop().unwrap_or_else(Ask::new);
+                    ask.layer = layer;
+                    ask.tape.ask_active(l, view.t);
+                    self.asks.push(ask);
+                }
+            }
+        }
+        for probe in probes.iter().flatten() {
+            for &t in &probe.times {
+                let wanted = probe.rows.as_deref().map_or(Rows::All, Rows::Some);
+                match self.find(probe.layer, probe.of, t) {
+                    Some(i) => {
+                        let tape = &mut self.asks[i].tape;
+                        match (tape.rows(), wanted) {
+                            (Rows::All, _) => {}
+                            (_, Rows::All) => tape.ask(probe.of, Rows::All, t),
+                            (Rows::Some(a), Rows::Some(b)) => {
+                                let both = union(a, b);
+                                tape.ask(probe.of, Rows::Some(&both), t);
+                            }
+                        }
+                    }
+                    None => {
+                        let mut ask = self.spare.pop().unwrap_or_else(Ask::new);
+                        ask.layer = probe.layer;
+                        ask.tape.ask(probe.of, wanted, t);
+                        self.asks.push(ask);
+                    }
+                }
+            }
+        }
+    }
+
+    fn find(&self, layer: usize, of: Space, t: Time) -> Option<usize> {
+        self.asks.iter().position(|a| a.layer == layer && a.tape.space() == of && a.tape.time() == t)
+    }
+
+    /// Draws one view, compares it, and takes the gradient back to its splats.
+    fn view(
+        &mut self,
+        scene: &Scene<F>,
+        view: &View<'_, F>,
+        draw: &mut dyn Draw<F>,
+        loss: &mut dyn ImageLoss<F>,
+        d: &mut [Grads<F>],
+        observe: &mut dyn FnMut(Observation<'_, F>),
+        report: &mut StepReport,
+    ) {
+        let asked: Vec<usize> = (0..scene.layers.len())
+            .map(|layer| self.find(layer, Space::Gaussians, view.t).expect("every view's time was asked"))
+            .collect();
+        let parts = asked.iter().enumerate().map(|(layer, &i)| scene.layers[layer].part(&self.asks[i].tape)).collect();
+        let splats = Splats { parts };
+        let clock = Clock::now();
+        draw.render(&splats, view.camera, view.background, &mut self.image);
+        report.timings.render += clock.elapsed();
+        let clock = Clock::now();
+        let (value, alpha) = loss.eval(view, &self.image, &mut self.d_color, &mut self.d_alpha);
+        report.loss += value;
+        report.view_losses.push(value);
+        report.timings.loss += clock.elapsed();
+        let clock = Clock::now();
+        let grads =
+            ImageGrads { color: &self.d_color, alpha: alpha.then_some(&self.d_alpha), depth: None, extra: None };
+        let mut d_sh: Vec<Option<&mut Table<F>>> = d
+            .iter_mut()
+            .zip(&splats.parts)
+            .map(|(d, part)| match part.color {
+                Color::Sh { base: true, .. } => {
+                    let [table] = d.of([SH]);
+                    Some(table)
+                }
+                _ => None,
+            })
+            .collect();
+        draw.backward(&splats, view.camera, view.background, &grads, &mut d_sh, &mut self.d_render);
+        report.d_cameras.push(self.d_render.camera);
+        let mut first = 0;
+        for (layer, &i) in asked.iter().enumerate() {
+            let count = splats.parts[layer].out.rows();
+            observe(Observation {
+                layer,
+                rows: self.asks[i].tape.rows(),
+                mean2d: &self.d_render.mean2d[first..first + count],
+                radii: &draw.radii()[first..first + count],
+            });
+            first += count;
+        }
+        drop(splats);
+        for (&i, part) in asked.iter().zip(&self.d_render.parts) {
+            let ask = &mut self.asks[i];
+            add_table(&mut ask.d_out, &part.out);
+            add_optional(&mut ask.d_color, part.color.as_ref());
+            add_optional(&mut ask.d_weights, part.weights.as_ref());
+        }
+        report.timings.render_backward += clock.elapsed();
+    }
+
+    /// Shows a loss the rows it asked for and scatters its gradient back.
+    fn probe(&mut self, scene: &Scene<F>, loss: &dyn ProbeLoss<F>, probes: &[Probe]) -> f64 {
+        let mut places = Vec::new();
+        let mut seen = Vec::new();
+        for probe in probes {
+            let mut tables = Vec::new();
+            let mut place = Vec::new();
+            for &t in &probe.times {
+                let i = self.find(probe.layer, probe.of, t).expect("every probe's time was asked");
+                let out = self.asks[i].tape.out();
+                let index: Vec<u32> = match (self.asks[i].tape.rows(), &probe.rows) {
+                    (_, None) => (0..out.rows() as u32).collect(),
+                    (Rows::All, Some(rows)) => rows.clone(),
+                    (Rows::Some(ids), Some(rows)) => rows
+                        .iter()
+                        .map(|r| ids.binary_search(r).expect("the asked rows hold the probe's rows") as u32)
+                        .collect(),
+                };
+                tables.push(out.gather(&index));
+                place.push((i, index));
+            }
+            seen.push(tables);
+            places.push(place);
+        }
+        let mut d: Vec<Vec<Table<F>>> = seen.iter().map(|t| t.iter().map(Table::zeros_like).collect()).collect();
+        let value = loss.eval(scene, probes, &seen, &mut d);
+        for (place, tables) in places.iter().zip(&d) {
+            for ((i, index), table) in place.iter().zip(tables) {
+                let d_out = &mut self.asks[*i].d_out;
+                for (j, &row) in index.iter().enumerate() {
+                    d_out.add(row as usize, 0, table.read::<10>(j, 0));
+                }
+            }
+        }
+        value
+    }
+
+    /// The last view drawn.
+    pub fn image(&self) -> &Image<F> {
+        &self.image
+    }
+}
+
+impl<F: Real> Ask<F> {
+    fn new() -> Self {
+        Self {
+            layer: 0,
+            tape: LayerTape::default(),
+            d_out: Table::default(),
+            d_color: None,
+            d_weights: None,
+            d_time: 0.0,
+        }
+    }
+}
+
+fn questions<'a, F: Real>(asks: &'a [Ask<F>], scene: &'a Scene<F>, layer: usize) -> Vec<At<'a, F>> {
+    asks.iter().filter(|a| a.layer == layer).map(|a| a.tape.question(&scene.layers[layer].params)).collect()
+}
+
+fn union(a: &[u32], b: &[u32]) -> Vec<u32> {
+    let mut out = Vec::with_capacity(a.len() + b.len());
+    let (mut i, mut j) = (0, 0);
+    while i < a.len() || j < b.len() {
+        let next = match (a.get(i), b.get(j)) {
+            (Some(&x), Some(&y)) => x.min(y),
+            (Some(&x), None) => x,
+            (None, Some(&y)) => y,
+            (None, None) => unreachable!("the loop's condition holds one of them"),
+        };
+        i += usize::from(a.get(i) == Some(&next));
+        j += usize::from(b.get(j) == Some(&next));
+        out.push(next);
+    }
+    out
+}
+
+/// Makes `d` an all-zero table in the shape of `like`, keeping the allocation.
+fn reset_like<F: Real>(d: &mut Table<F>, like: &Table<F>) {
+    if d.width() == like.width() {
+        d.resize(like.rows());
+        d.fill(F::ZERO);
+    } else {
+        *d = like.zeros_like();
+    }
+}
+
+fn add_table<F: Real>(to: &mut Table<F>, from: &Table<F>) {
+    assert_eq!((to.rows(), to.width()), (from.rows(), from.width()), "gradients of one ask have one shape");
+    for (a, b) in to.data_mut().iter_mut().zip(from.data()) {
+        *a += *b;
+    }
+}
+
+fn add_optional<F: Real>(to: &mut Option<Table<F>>, from: Option<&Table<F>>) {
+    match (to, from) {
+        (Some(to), Some(from)) => add_table(to, from),
+        (to @ None, Some(from)) => *to = Some(from.clone()),
+        (_, None) => {}
+    }
+}

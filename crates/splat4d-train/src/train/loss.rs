@@ -1,0 +1,140 @@
+//! The trainer's image loss: photometric, mask, and a gain and offset a camera where exposures differ.
+
+use super::chain::{ImageLoss, View};
+use crate::loss::photometric::Photometric;
+use crate::optim::Moments;
+use splat4d::render::Image;
+use splat4d::scene::{Grads, Key, Params, Planes, Space};
+
+/// A gain exp(m) and an offset c a camera and channel: columns m 3, c 3. Camera 0 is the reference and stays as it is.
+/// Source: Luiten et al. 2024 (gain and offset a camera).
+#[derive(Debug)]
+pub struct Exposure {
+    /// One table [cameras, 6].
+    pub params: Params<f32>,
+    /// Its moments.
+    pub moments: Moments<f32>,
+    key: Key,
+    grads: Grads<f32>,
+}
+
+impl Exposure {
+    /// The identity for every camera.
+    pub fn new(cameras: usize) -> Self {
+        let mut params = Params::new(0, 0, &[]);
+        let key = params
+            .entry("exposure", Space::Fixed, &[("exposure", 6)], cameras, |_| {})
+            .expect("a new table fits itself");
+        Self { moments: Moments::new(&params), grads: Grads::new(&params), params, key }
+    }
+
+    /// The table's key.
+    pub fn key(&self) -> Key {
+        self.key
+    }
+
+    /// One Adam step with what the last views gave. Returns whether all was finite.
+    pub fn step(&mut self, rate: f64) -> bool {
+        let mut rates = vec![None; self.key.0 as usize];
+        rates.push(Some(vec![rate; 6]));
+        let finite = self.moments.step(&mut self.params, &self.grads, &rates).is_empty();
+        self.grads.clear(&self.params);
+        finite
+    }
+}
+
+/// See the module's documentation.
+pub struct TrainLoss {
+    photometric: Photometric,
+    lambda_mask: f32,
+    /// Where cameras learn an exposure.
+    pub exposure: Option<Exposure>,
+    exposed: Planes<f32>,
+    /// L1 of the last view.
+    pub l1: f64,
+    /// SSIM of the last view.
+    pub ssim: f64,
+    /// Mean squared error of the last view, in [0, 1] colours.
+    pub mse: f64,
+}
+
+impl TrainLoss {
+    /// Shares of D-SSIM and of the mask loss.
+    pub fn new(lambda_dssim: f64, lambda_mask: f64, exposure: Option<Exposure>) -> Self {
+        Self {
+            photometric: Photometric::new(lambda_dssim as f32),
+            lambda_mask: lambda_mask as f32,
+            exposure,
+            exposed: Planes::default(),
+            l1: 0.0,
+            ssim: 0.0,
+            mse: 0.0,
+        }
+    }
+}
+
+impl ImageLoss<f32> for TrainLoss {
+    fn eval(
+        &mut self,
+        view: &View<'_, f32>,
+        image: &Image<f32>,
+        d_color: &mut Planes<f32>,
+        d_alpha: &mut Planes<f32>,
+    ) -> (f64, bool) {
+        let row = self.exposure.as_ref().filter(|_| view.rig > 0).map(|e| e.params[e.key].read::<6>(view.rig, 0));
+        if let Some(row) = row {
+            self.exposed.clone_from(&image.color);
+            for c in 0..3 {
+                let gain = row[c].exp();
+                self.exposed.plane_mut(c).iter_mut().for_each(|x| *x = *x * gain + row[3 + c]);
+            }
+        }
+        let shown = if row.is_some() { &self.exposed } else { &image.color };
+        let value = self.photometric.loss_and_grad(shown, view.truth, view.weight, d_color);
+        (self.l1, self.ssim) = (value.l1, value.ssim);
+        self.mse = mean_squared_error(shown, view.truth);
+        if let (Some(row), Some(e)) = (row, &mut self.exposure) {
+            let mut d = [0.0f32; 6];
+            for c in 0..3 {
+                let gain = row[c].exp();
+                let (mut d_gain, mut d_offset) = (0.0f64, 0.0f64);
+                for (g, x) in d_color.plane_mut(c).iter_mut().zip(image.color.plane(c)) {
+                    d_offset += f64::from(*g);
+                    d_gain += f64::from(*g * x * gain);
+                    *g *= gain;
+                }
+                (d[c], d[3 + c]) = (d_gain as f32, d_offset as f32);
+            }
+            e.grads.of([e.key])[0].add(view.rig, 0, d);
+        }
+        let mut total = value.total;
+        let mut alpha = false;
+        if let Some(mask) = view.mask.filter(|_| self.lambda_mask > 0.0) {
+            alpha = true;
+            d_alpha.reset(1, mask.height, mask.width);
+            let scale = self.lambda_mask / mask.pixels() as f32;
+            let mut sum = 0.0f64;
+            for ((d, a), m) in d_alpha.data.iter_mut().zip(&image.alpha.data).zip(&mask.data) {
+                let e = a - m;
+                sum += f64::from(e.abs());
+                *d = if e > 0.0 { scale } else if e < 0.0 { -scale } else { 0.0 };
+            }
+            total += sum * f64::from(scale);
+        }
+        (total, alpha)
+    }
+}
+
+/// Mean over pixels and channels of the squared difference, the render clamped to [0, 1].
+pub fn mean_squared_error(render: &Planes<f32>, truth: &Planes<f32>) -> f64 {
+    let sum: f64 = render
+        .data
+        .iter()
+        .zip(&truth.data)
+        .map(|(a, b)| {
+            let e = f64::from(a.clamp(0.0, 1.0) - b);
+            e * e
+        })
+        .sum();
+    sum / render.data.len().max(1) as f64
+}

@@ -1,0 +1,137 @@
+//! Which frames a step sees: a pure function of (seed, stage, step), so that nothing has to be saved for a resume.
+
+use super::frames::Frames;
+use splat4d::math::Rng;
+
+/// How a stage draws its frames.
+#[derive(Clone, Debug, Default, PartialEq)]
+#[non_exhaustive]
+pub enum Sampler {
+    /// Every frame once an epoch, in random order.
+    #[default]
+    Uniform,
+    /// As `Uniform`, but all views of a step at one time (Spacetime Gaussians).
+    SameTime,
+    /// Four of five from a window of so many distinct times that slides over the clip as the stage proceeds, the rest from
+    /// the whole take (long takes).
+    Window(usize),
+    /// Only frames at the k-th distinct time (per-frame tracking).
+    Frame(usize),
+    /// The step's views at so many consecutive distinct times, one each.
+    Tuple(usize),
+}
+
+/// Share of a window sampler's frames that come from its window; the rest replays the take.
+const WINDOW_SHARE: f64 = 0.8;
+
+/// Frame numbers sorted by distinct time.
+#[derive(Clone, Debug)]
+pub struct Timeline {
+    frames: Vec<Vec<u32>>,
+    count: usize,
+}
+
+impl Timeline {
+    /// Groups the frames by time.
+    pub fn new(frames: &dyn Frames) -> Self {
+        let mut order: Vec<usize> = (0..frames.len()).collect();
+        order.sort_by(|&a, &b| frames.time(a).0.total_cmp(&frames.time(b).0).then(a.cmp(&b)));
+        let mut groups: Vec<Vec<u32>> = Vec::new();
+        let mut last = f64::NAN;
+        for i in order {
+            if frames.time(i).0 != last {
+                groups.push(Vec::new());
+                last = frames.time(i).0;
+            }
+            groups.last_mut().expect("a group was just pushed").push(i as u32);
+        }
+        Self { frames: groups, count: frames.len() }
+    }
+
+    /// Number of distinct times.
+    pub fn times(&self) -> usize {
+        self.frames.len()
+    }
+
+    /// The frames at the k-th time.
+    pub fn at(&self, k: usize) -> &[u32] {
+        &self.frames[k]
+    }
+
+    /// The frames of step `step` of a stage of `steps` steps. Panics: no frames; a frame number beyond the clip.
+    pub fn draw(&self, sampler: &Sampler, batch: usize, seed: u64, stage: usize, step: usize, steps: usize) -> Vec<usize> {
+        assert!(self.count > 0, "a capture without frames cannot be trained on");
+        let rng = Rng::new(seed, "frames", stage as u64);
+        let step_rng = rng.fork(step as u64 + 1);
+        let (times, n) = (self.frames.len(), self.count);
+        let flat = |i: usize| {
+            // The i-th draw without replacement: which epoch, and where in its permutation.
+            let order = Rng::new(seed, "epoch", (stage * 1_000_003 + i / n) as u64).permutation(n);
+            order[i % n] as usize
+        };
+        let any_of = |group: &[u32], draw: u64| group[step_rng.below(draw, group.len())] as usize;
+        match *sampler {
+            Sampler::Uniform => (0..batch).map(|b| flat(step * batch + b)).collect(),
+            Sampler::SameTime => {
+                let order = Rng::new(seed, "epoch", (stage * 1_000_003 + step / times) as u64).permutation(times);
+                let group = &self.frames[order[step % times] as usize];
+                let offset = step_rng.below(0, group.len());
+                (0..batch.min(group.len())).map(|b| group[(offset + b) % group.len()] as usize).collect()
+            }
+            Sampler::Window(width) => {
+                let width = width.clamp(1, times);
+                let first = ((times - width) as f64 * step as f64 / steps.max(1) as f64) as usize;
+                (0..batch as u64)
+                    .map(|b| {
+                        let inside = step_rng.uniform(3 * b) < WINDOW_SHARE;
+                        let k = if inside { first + step_rng.below(3 * b + 1, width) } else { step_rng.below(3 * b + 1, times) };
+                        any_of(&self.frames[k], 3 * b + 2)
+                    })
+                    .collect()
+            }
+            Sampler::Frame(k) => {
+                assert!(k < times, "the clip has {times} distinct times, frame {k} was asked");
+                let group = &self.frames[k];
+                (0..batch).map(|b| group[(step * batch + b + step_rng.below(0, 2)) % group.len()] as usize).collect()
+            }
+            Sampler::Tuple(count) => {
+                let count = count.clamp(1, times);
+                let first = step_rng.below(0, times - count + 1);
+                (0..count).map(|k| any_of(&self.frames[first + k], k as u64 + 1)).collect()
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::Made;
+    use super::*;
+
+    #[test]
+    fn every_frame_comes_once_an_epoch_and_the_draw_is_a_pure_function() {
+        let frames = Made::new(3, 5, 4);
+        let line = Timeline::new(&frames);
+        assert_eq!(line.times(), 5);
+        let mut seen: Vec<usize> = (0..15).flat_map(|s| line.draw(&Sampler::Uniform, 1, 7, 0, s, 100)).collect();
+        seen.sort_unstable();
+        assert_eq!(seen, (0..15).collect::<Vec<_>>());
+        let again = |s| line.draw(&Sampler::Window(2), 4, 7, 0, s, 100);
+        assert_eq!(again(13), again(13));
+        assert_ne!(again(13), again(14));
+    }
+
+    #[test]
+    fn samplers_keep_to_their_times() {
+        let frames = Made::new(3, 5, 4);
+        let line = Timeline::new(&frames);
+        for step in 0..50 {
+            let time = |i: &usize| frames.time(*i).0;
+            let same = line.draw(&Sampler::SameTime, 2, 1, 0, step, 50);
+            assert!(same.len() == 2 && time(&same[0]) == time(&same[1]) && same[0] != same[1]);
+            assert!(line.draw(&Sampler::Frame(3), 2, 1, 0, step, 50).iter().all(|i| line.at(3).contains(&(*i as u32))));
+            let tuple = line.draw(&Sampler::Tuple(3), 1, 1, 0, step, 50);
+            assert!(tuple.len() == 3 && time(&tuple[0]) < time(&tuple[1]) && time(&tuple[1]) < time(&tuple[2]));
+        }
+    }
+}

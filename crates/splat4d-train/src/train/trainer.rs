@@ -1,0 +1,410 @@
+//! [`Trainer`]: the state of a run and one step of it. Files, progress and clocks are the business of `run`.
+
+use super::chain::{Chain, Draw, Losses, StepInfo, StepReport, View};
+use super::frames::{Frames, Picture};
+use super::loss::TrainLoss;
+use super::sampler::Timeline;
+use crate::densify::{Change, Densify, Limits, Stats, adc, mcmc, morton_edit};
+use crate::models::Stage;
+use crate::optim::Moments;
+use crate::{Error, ErrorKind, Result};
+use splat4d::layers::Scene;
+use splat4d::math::Rng;
+use splat4d::scene::life::LOG_WIDTH;
+use splat4d::scene::{GEOMETRY, Grads, LIFE, Space};
+use std::sync::Arc;
+use std::time::{Duration, Instant as Clock};
+
+/// Settings that hold for all stages.
+#[derive(Clone, Debug)]
+pub struct Settings {
+    /// Seed of every random choice.
+    pub seed: u64,
+    /// Cap, extent and dead opacity.
+    pub limits: Limits,
+    /// Colour behind the scene.
+    pub background: [f32; 3],
+    /// Highest SH degree.
+    pub sh_degree: usize,
+    /// adc: steps between opacity resets; 0: never.
+    pub opacity_reset_interval: usize,
+    /// Rate of the exposure.
+    pub exposure_lr: f64,
+}
+
+/// How far a run is. All of it is in every checkpoint.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Progress {
+    /// Steps taken.
+    pub iteration: usize,
+    /// Current stage.
+    pub stage: usize,
+    /// Steps taken in it.
+    pub stage_step: usize,
+    /// Every rate is multiplied by this; halved after a rollback.
+    pub rate_scale: f64,
+    /// Rollbacks so far.
+    pub strikes: usize,
+}
+
+/// What a step did.
+#[derive(Clone, Debug, Default)]
+pub struct Stepped {
+    /// Losses, timings and gradients to times and cameras.
+    pub report: StepReport,
+    /// L1 of the last view.
+    pub l1: f64,
+    /// SSIM of the last view.
+    pub ssim: f64,
+    /// Mean squared error over the step's views.
+    pub mse: f64,
+    /// Loading pictures.
+    pub load: Duration,
+    /// Adam.
+    pub adam: Duration,
+    /// Densification, noise and the rest.
+    pub other: Duration,
+    /// Gaussians born, moved, removed.
+    pub change: Change,
+}
+
+/// A number that was not finite: what, where, when.
+#[derive(Clone, Debug)]
+pub struct Fault(pub String);
+
+/// The state of a run.
+pub struct Trainer<'a> {
+    /// The scene that learns.
+    pub scene: Scene<f32>,
+    /// What to do, in order.
+    pub stages: Vec<Stage>,
+    /// How far.
+    pub progress: Progress,
+    /// One a layer.
+    pub moments: Vec<Moments<f32>>,
+    /// What was seen since the last densification.
+    pub stats: Stats,
+    /// Compares pictures.
+    pub loss: TrainLoss,
+    /// Settings that hold for all stages.
+    pub settings: Settings,
+    frames: Arc<dyn Frames>,
+    timeline: Timeline,
+    draw: Box<dyn Draw<f32> + 'a>,
+    grads: Vec<Grads<f32>>,
+    chain: Chain<f32>,
+    pictures: Vec<Picture>,
+}
+
+impl<'a> Trainer<'a> {
+    /// A run that has not begun. Panics: no frames, no stages.
+    pub fn new(
+        scene: Scene<f32>,
+        stages: Vec<Stage>,
+        frames: Arc<dyn Frames>,
+        draw: Box<dyn Draw<f32> + 'a>,
+        loss: TrainLoss,
+        settings: Settings,
+    ) -> Self {
+        assert!(!stages.is_empty(), "a program has at least one stage");
+        let timeline = Timeline::new(frames.as_ref());
+        let mut trainer = Self {
+            moments: Vec::new(),
+            stats: Stats::new(&scene),
+            scene,
+            stages,
+            progress: Progress { rate_scale: 1.0, ..Progress::default() },
+            loss,
+            settings,
+            frames,
+            timeline,
+            draw,
+            grads: Vec::new(),
+            chain: Chain::default(),
+            pictures: Vec::new(),
+        };
+        trainer.adapt();
+        trainer
+    }
+
+    /// Steps of all stages.
+    pub fn iterations(&self) -> usize {
+        self.stages.iter().map(|s| s.iterations).sum()
+    }
+
+    /// Whether every stage is done.
+    pub fn is_done(&self) -> bool {
+        self.progress.stage >= self.stages.len()
+    }
+
+    /// The stage's name.
+    pub fn stage_name(&self) -> &str {
+        self.stages.get(self.progress.stage).map_or("done", |s| &s.name)
+    }
+
+    /// Fits gradients, moments and statistics to a scene that a hook changed; what still fits is kept.
+    fn adapt(&mut self) {
+        self.moments.resize_with(self.scene.layers.len(), Moments::default);
+        self.moments.truncate(self.scene.layers.len());
+        for (layer, moments) in self.scene.layers.iter().zip(&mut self.moments) {
+            let fresh = Moments::new(&layer.params);
+            let old = std::mem::replace(moments, fresh);
+            moments.adopt(old);
+        }
+        self.fit_grads();
+        self.stats.clear(&self.scene);
+    }
+
+    fn fit_grads(&mut self) {
+        self.grads = self.scene.layers.iter().map(|l| Grads::new(&l.params)).collect();
+    }
+
+    /// Takes over a checkpoint's state. The scene and all tables must belong together.
+    pub fn restore(&mut self, scene: Scene<f32>, moments: Vec<Moments<f32>>, stats: Stats, progress: Progress) {
+        (self.scene, self.moments, self.stats, self.progress) = (scene, moments, stats, progress);
+        self.fit_grads();
+    }
+
+    /// Whether a step is the first after a row of zero-step stages; runs the hooks that are due.
+    fn enter_stage(&mut self) -> Result<()> {
+        while let Some(stage) = self.stages.get(self.progress.stage) {
+            if self.progress.stage_step == 0
+                && let Some(hook) = &stage.start
+            {
+                hook(&mut self.scene)?;
+                self.adapt();
+            }
+            if stage.iterations > 0 {
+                return Ok(());
+            }
+            self.leave_stage()?;
+        }
+        Ok(())
+    }
+
+    fn leave_stage(&mut self) -> Result<()> {
+        if let Some(hook) = &self.stages[self.progress.stage].end {
+            hook(&mut self.scene)?;
+            self.adapt();
+        }
+        self.progress.stage += 1;
+        self.progress.stage_step = 0;
+        Ok(())
+    }
+
+    /// The frames that step `stage_step` of the current stage will see.
+    fn draw_frames(&self, stage_step: usize) -> Vec<usize> {
+        let s = &self.stages[self.progress.stage];
+        let (seed, stage) = (self.settings.seed, self.progress.stage);
+        self.timeline.draw(&s.sampler, s.batch, seed, stage, stage_step, s.iterations)
+    }
+
+    /// One step. Inner error: a number was not finite, nothing is to be trusted until a rollback.
+    pub fn step(&mut self) -> Result<std::result::Result<Stepped, Fault>> {
+        self.enter_stage()?;
+        let mut out = Stepped::default();
+        if self.is_done() {
+            return Ok(Ok(out));
+        }
+        let clock = Clock::now();
+        let seen = self.draw_frames(self.progress.stage_step);
+        self.pictures.resize_with(seen.len(), Picture::default);
+        for (&i, picture) in seen.iter().zip(&mut self.pictures) {
+            self.frames.load(i, picture)?;
+        }
+        if self.progress.stage_step + 1 < self.stages[self.progress.stage].iterations {
+            self.frames.prefetch(&self.draw_frames(self.progress.stage_step + 1));
+        }
+        out.load = clock.elapsed();
+        self.forward_backward(&seen, &mut out);
+        let clock = Clock::now();
+        let bad = self.learn();
+        out.adam = clock.elapsed();
+        if let Some(fault) = self.fault(&out.report, &bad, &seen) {
+            return Ok(Err(fault));
+        }
+        let clock = Clock::now();
+        out.change = self.maintain();
+        self.progress.iteration += 1;
+        self.progress.stage_step += 1;
+        if self.progress.stage_step == self.stages[self.progress.stage].iterations {
+            self.leave_stage()?;
+        }
+        out.other = clock.elapsed();
+        Ok(Ok(out))
+    }
+
+    fn forward_backward(&mut self, seen: &[usize], out: &mut Stepped) {
+        let stage = &self.stages[self.progress.stage];
+        let background = self.settings.background;
+        let views: Vec<View<'_, f32>> = seen
+            .iter()
+            .zip(&self.pictures)
+            .map(|(&i, picture)| View {
+                camera: self.frames.camera(i),
+                t: self.frames.time(i),
+                background,
+                truth: &picture.color,
+                mask: picture.mask.as_ref(),
+                weight: picture.weight.as_ref(),
+                frame: i,
+                rig: self.frames.rig(i),
+            })
+            .collect();
+        let info = StepInfo {
+            iteration: self.progress.iteration,
+            times: views.iter().map(|v| v.t).collect(),
+            seed: self.settings.seed,
+            progress: self.progress.stage_step as f64 / stage.iterations as f64,
+        };
+        self.draw.config().sh_degree = match self.progress.stage_step.checked_div(stage.sh_interval) {
+            Some(unlocked) => unlocked.min(self.settings.sh_degree),
+            None => self.settings.sh_degree,
+        };
+        let mut mse = Mse { inner: &mut self.loss, sum: 0.0 };
+        let mut losses = Losses { image: &mut mse, probes: &stage.probes, params: &stage.params };
+        let stats = &mut self.stats;
+        out.report = self.chain.step(
+            &self.scene,
+            &views,
+            &info,
+            self.draw.as_mut(),
+            &mut losses,
+            &mut self.grads,
+            &mut |o| stats.observe(o),
+        );
+        out.mse = mse.sum / views.len().max(1) as f64;
+        (out.l1, out.ssim) = (self.loss.l1, self.loss.ssim);
+    }
+
+    /// Adam on every group of the stage. Returns what was not finite.
+    fn learn(&mut self) -> Vec<(usize, splat4d::scene::Key)> {
+        let stage = &self.stages[self.progress.stage];
+        let progress = self.progress.stage_step as f64 / stage.iterations as f64;
+        let mut bad = Vec::new();
+        for (index, layer) in self.scene.layers.iter_mut().enumerate() {
+            let mut rates: Vec<Option<Vec<f64>>> = layer.params.keys().map(|_| None).collect();
+            for group in stage.groups.iter().filter(|g| g.layer == index) {
+                let found = layer.params.keys().find_map(|k| layer.params[k].column(&group.column).map(|c| (k, c)));
+                let Some((key, (first, width))) = found else { continue };
+                let (from, count) = group.part.unwrap_or((0, width));
+                let table = rates[key.0 as usize].get_or_insert_with(|| vec![0.0; layer.params[key].width()]);
+                let end = (first + from + count).min(first + width);
+                table[first + from..end].fill(group.rate.at(progress) * self.progress.rate_scale);
+            }
+            let keys = self.moments[index].step(&mut layer.params, &self.grads[index], &rates);
+            bad.extend(keys.into_iter().map(|k| (index, k)));
+            if let Some(floor) = stage.min_log_life
+                && layer.params[LIFE].width() > LOG_WIDTH
+            {
+                let floor = floor as f32;
+                let active = self.grads[index].active(Space::Gaussians);
+                for row in (0..active.len()).filter(|&r| active[r]) {
+                    let w = layer.params[LIFE].get_mut(row, LOG_WIDTH);
+                    *w = w.max(floor);
+                }
+            }
+        }
+        if let Some(exposure) = &mut self.loss.exposure {
+            let _ = exposure.step(self.settings.exposure_lr * self.progress.rate_scale);
+        }
+        bad
+    }
+
+    /// Names the first number that is not finite, if the step was not sound.
+    fn fault(&self, report: &StepReport, bad: &[(usize, splat4d::scene::Key)], seen: &[usize]) -> Option<Fault> {
+        let views = || seen.iter().map(|&i| self.frames.name(i)).collect::<Vec<_>>().join(", ");
+        let (layer, key) = match bad.first() {
+            Some(&place) => place,
+            None if report.loss.is_finite() => return None,
+            None => return Some(Fault(format!("the loss is {} ({})", report.loss, views()))),
+        };
+        let params = &self.scene.layers[layer].params;
+        let (row, col) = self.grads[layer]
+            .table(key)
+            .first_non_finite()
+            .or_else(|| params[key].first_non_finite())
+            .unwrap_or((0, 0));
+        let column = params.column_name(key, col);
+        Some(Fault(format!("`{column}` of Gaussian {row} of layer {layer} is not finite ({})", views())))
+    }
+
+    /// Noise, densification, resets, memory order; clears the gradients.
+    fn maintain(&mut self) -> Change {
+        let stage = &self.stages[self.progress.stage];
+        let (step, seed) = (self.progress.stage_step + 1, self.settings.seed);
+        let address = self.progress.iteration as u64;
+        if let Densify::Mcmc(m) = &stage.densify {
+            let rate = |layer: usize| {
+                let group = stage.groups.iter().find(|g| g.layer == layer && g.column == "means")?;
+                Some(group.rate.at(self.progress.stage_step as f64 / stage.iterations as f64))
+            };
+            for (index, layer) in self.scene.layers.iter_mut().enumerate() {
+                let Some(rate) = rate(index) else { continue };
+                let rng = Rng::new(seed, "noise", address).fork(index as u64);
+                let active = self.grads[index].active(Space::Gaussians);
+                mcmc::add_noise(layer, active, rate * m.noise_lr, self.settings.limits.min_opacity, rng);
+            }
+        }
+        for (d, layer) in self.grads.iter_mut().zip(&self.scene.layers) {
+            d.clear(&layer.params);
+        }
+        let (from, until, every) = stage.densify_steps;
+        let mut change = Change::default();
+        let due = every > 0 && step >= from && step <= until && step.is_multiple_of(every);
+        if due && stage.densify != Densify::None {
+            change = stage.densify.run(
+                &mut self.scene,
+                &mut self.moments,
+                &mut self.stats,
+                &self.settings.limits,
+                seed,
+                address,
+            );
+            // The last densification leaves rows in Morton order for the rest of the run.
+            if step + every > until {
+                for layer in 0..self.scene.layers.len() {
+                    let edit = morton_edit(&self.scene, layer);
+                    crate::densify::apply(&mut self.scene, &mut self.moments, layer, &edit, &Rng::new(seed, "order", address));
+                }
+            }
+            stage.params.iter().for_each(|l| l.on_edit());
+            self.fit_grads();
+        }
+        let stage = &self.stages[self.progress.stage];
+        let reset = self.settings.opacity_reset_interval;
+        if matches!(stage.densify, Densify::Adc(_)) && reset > 0 && step.is_multiple_of(reset) && step < until {
+            adc::reset_opacity(&mut self.scene, &mut self.moments, 2.0 * self.settings.limits.min_opacity);
+        }
+        change
+    }
+
+    /// Errors if the scene is empty: nothing could be learnt.
+    pub fn check_not_empty(&self) -> Result<()> {
+        if self.scene.layers.iter().all(|l| l.params[GEOMETRY].rows() == 0) {
+            return Err(Error::new(ErrorKind::BadInput, "there is not one Gaussian to start from")
+                .remedy("Give points, masks or --set init=random --set num_pts=10000"));
+        }
+        Ok(())
+    }
+}
+
+/// Passes a loss through and sums the mean squared errors of the step's views.
+struct Mse<'a> {
+    inner: &'a mut TrainLoss,
+    sum: f64,
+}
+
+impl super::chain::ImageLoss<f32> for Mse<'_> {
+    fn eval(
+        &mut self,
+        view: &View<'_, f32>,
+        image: &splat4d::render::Image<f32>,
+        d_color: &mut splat4d::scene::Planes<f32>,
+        d_alpha: &mut splat4d::scene::Planes<f32>,
+    ) -> (f64, bool) {
+        let out = self.inner.eval(view, image, d_color, d_alpha);
+        self.sum += self.inner.mse;
+        out
+    }
+}
