@@ -1,0 +1,15 @@
+//! What is on disk: every reader takes bytes and every writer fills an [`std::io::Write`], so that nothing here knows
+//! a path.
+//!
+//! **Readers never panic, hang or allocate more than a small multiple of the bytes they were given**, whatever the
+//! bytes say: counts and lengths are compared with what is really there before anything is allocated.
+
+pub mod arrays;
+mod half;
+#[cfg(test)]
+mod mutate;
+pub mod npy;
+pub mod ply;
+pub mod safetensors;
+
+pub use arrays::{params_to_arrays, tensors_to_loaded};

@@ -1,0 +1,465 @@
+//! The safetensors container: named arrays of plain numbers behind a JSON header.
+//!
+//! Layout: u64 little-endian header length, JSON `{"name": {"dtype", "shape", "data_offsets"}, "__metadata__": {..}}`,
+//! then the arrays one behind the other without holes. Source: the format section of github.com/huggingface/safetensors.
+//!
+//! Why not the `safetensors` crate (0.8.0, Apache-2.0, bounds-checked and sound when read): it keeps metadata in a
+//! `HashMap`, so that the same scene gives files of different bytes (15 kinds in 20 writes of four keys), while our runs
+//! must repeat byte for byte; it takes a name that stands twice without a word; and its errors do not name the array.
+
+use super::half::{bf16_to_f32, f16_to_f32};
+use crate::{Error, ErrorKind, Result};
+use serde::de::{Deserialize, Deserializer, MapAccess, Visitor};
+use std::borrow::Cow;
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt::Write as _;
+use std::io::Write;
+
+/// Longest header that is believed, as in the reference implementation.
+const MAX_HEADER: usize = 100_000_000;
+/// The header's key for free text.
+const METADATA: &str = "__metadata__";
+/// The header is padded with spaces to a multiple of this, so that the first array is aligned.
+const ALIGN: usize = 8;
+
+macro_rules! dtypes {
+    ($($(#[$doc:meta])* $name:ident $text:literal $size:literal;)*) => {
+        /// What an array's numbers are; names and sizes as in the format.
+        #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+        #[non_exhaustive]
+        pub enum Dtype { $($(#[$doc])* $name,)* }
+
+        impl Dtype {
+            /// The name in the header.
+            pub fn name(self) -> &'static str {
+                match self { $(Dtype::$name => $text,)* }
+            }
+
+            /// Bytes a number.
+            pub fn size(self) -> usize {
+                match self { $(Dtype::$name => $size,)* }
+            }
+
+            fn parse(text: &str) -> Option<Self> {
+                match text { $($text => Some(Dtype::$name),)* _ => None }
+            }
+        }
+    };
+}
+
+dtypes! {
+    /// One byte, 0 or 1.
+    Bool "BOOL" 1;
+    /// Unsigned 8 bits.
+    U8 "U8" 1;
+    /// Signed 8 bits.
+    I8 "I8" 1;
+    /// Unsigned 16 bits.
+    U16 "U16" 2;
+    /// Signed 16 bits.
+    I16 "I16" 2;
+    /// IEEE binary16.
+    F16 "F16" 2;
+    /// The upper half of an f32.
+    BF16 "BF16" 2;
+    /// Unsigned 32 bits.
+    U32 "U32" 4;
+    /// Signed 32 bits.
+    I32 "I32" 4;
+    /// IEEE binary32.
+    F32 "F32" 4;
+    /// Unsigned 64 bits.
+    U64 "U64" 8;
+    /// Signed 64 bits.
+    I64 "I64" 8;
+    /// IEEE binary64.
+    F64 "F64" 8;
+}
+
+/// A named array, read from a file (its bytes borrowed) or about to be written.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Tensor<'a> {
+    name: String,
+    dtype: Dtype,
+    shape: Vec<usize>,
+    bytes: Cow<'a, [u8]>,
+}
+
+macro_rules! typed {
+    ($make:ident, $as:ident, $t:ty, $dtype:ident) => {
+        #[doc = concat!("An array of ", stringify!($t), ", row-major. Panics: the shape holds another count.")]
+        pub fn $make(name: impl Into<String>, shape: &[usize], data: &'a [$t]) -> Self {
+            let bytes = if cfg!(target_endian = "little") {
+                Cow::Borrowed(bytemuck::cast_slice(data))
+            } else {
+                Cow::Owned(data.iter().flat_map(|x| x.to_le_bytes()).collect())
+            };
+            Self::new(name, Dtype::$dtype, shape, bytes)
+        }
+
+        #[doc = concat!("The numbers, bit for bit. Errors: the array is not of ", stringify!($t), ".")]
+        pub fn $as(&self) -> Result<Vec<$t>> {
+            self.must_be(Dtype::$dtype)?;
+            Ok(self.bytes.as_chunks().0.iter().map(|&b| <$t>::from_le_bytes(b)).collect())
+        }
+    };
+}
+
+impl<'a> Tensor<'a> {
+    /// An array from little-endian bytes, row-major. Panics: the shape holds another count of bytes.
+    pub fn new(name: impl Into<String>, dtype: Dtype, shape: &[usize], bytes: Cow<'a, [u8]>) -> Self {
+        let name = name.into();
+        let size = shape.iter().product::<usize>() * dtype.size();
+        assert_eq!(size, bytes.len(), "array {name} of shape {shape:?} needs another number of bytes");
+        Self { name, dtype, shape: shape.to_vec(), bytes }
+    }
+
+    typed!(f32, as_f32, f32, F32);
+    typed!(f64, as_f64, f64, F64);
+    typed!(u32, as_u32, u32, U32);
+    typed!(u64, as_u64, u64, U64);
+    typed!(i64, as_i64, i64, I64);
+
+    /// An array of u8, row-major. Panics: the shape holds another count.
+    pub fn u8(name: impl Into<String>, shape: &[usize], data: &'a [u8]) -> Self {
+        Self::new(name, Dtype::U8, shape, Cow::Borrowed(data))
+    }
+
+    /// The bytes. Errors: the array is not of u8.
+    pub fn as_u8(&self) -> Result<&[u8]> {
+        self.must_be(Dtype::U8)?;
+        Ok(&self.bytes)
+    }
+
+    /// The numbers as f32, from any floating-point type (f64 is rounded). Errors: integers.
+    pub fn to_f32(&self) -> Result<Vec<f32>> {
+        let half = |of: fn(u16) -> f32| self.bytes.as_chunks().0.iter().map(|&b| of(u16::from_le_bytes(b))).collect();
+        match self.dtype {
+            Dtype::F32 => self.as_f32(),
+            Dtype::F64 => Ok(self.as_f64()?.into_iter().map(|x| x as f32).collect()),
+            Dtype::F16 => Ok(half(f16_to_f32)),
+            Dtype::BF16 => Ok(half(bf16_to_f32)),
+            other => Err(self.wrong(format!("holds {}, but floating-point numbers are needed", other.name()))),
+        }
+    }
+
+    /// The name.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// What the numbers are.
+    pub fn dtype(&self) -> Dtype {
+        self.dtype
+    }
+
+    /// Length of each axis; empty for a single number.
+    pub fn shape(&self) -> &[usize] {
+        &self.shape
+    }
+
+    /// The numbers' little-endian bytes, row-major; unaligned.
+    pub fn bytes(&self) -> &[u8] {
+        &self.bytes
+    }
+
+    fn must_be(&self, dtype: Dtype) -> Result<()> {
+        if self.dtype == dtype {
+            return Ok(());
+        }
+        Err(self.wrong(format!("holds {}, but {} is needed", self.dtype.name(), dtype.name())))
+    }
+
+    fn wrong(&self, what: String) -> Error {
+        Error::input(format!("array `{}` {what}", self.name)).remedy("The file was written for another purpose")
+    }
+}
+
+/// A file's arrays and metadata.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct SafeTensors<'a> {
+    metadata: BTreeMap<String, String>,
+    tensors: BTreeMap<String, Tensor<'a>>,
+}
+
+impl<'a> SafeTensors<'a> {
+    /// Reads a file; the arrays borrow its bytes.
+    ///
+    /// Errors: a header that is too long, not JSON or names an array twice; an unknown type; a shape that does not match
+    /// its bytes; arrays that overlap, leave holes, or do not end where the file ends.
+    pub fn read(bytes: &'a [u8]) -> Result<Self> {
+        let Some((length, rest)) = bytes.split_first_chunk::<8>() else {
+            return Err(broken("the file is shorter than its header's length"));
+        };
+        let length = u64::from_le_bytes(*length);
+        let Some(length) = usize::try_from(length).ok().filter(|&n| n <= MAX_HEADER.min(rest.len())) else {
+            return Err(broken(format!(
+                "the header claims {length} bytes, which is more than the {} that follow or the limit of {MAX_HEADER}",
+                rest.len()
+            )));
+        };
+        let (header, data) = rest.split_at(length);
+        let mut header: Header =
+            serde_json::from_slice(header).map_err(|e| broken(format!("the header cannot be read: {e}")))?;
+        header.entries.sort_by_key(|(_, e)| e.data_offsets);
+        let mut end = 0;
+        let mut tensors = BTreeMap::new();
+        for (name, entry) in header.entries {
+            let tensor = entry.view(&name, data, &mut end)?;
+            tensors.insert(name, tensor);
+        }
+        if end != data.len() {
+            return Err(broken(format!("the arrays end at byte {end} of the data, but there are {} bytes", data.len())));
+        }
+        Ok(Self { metadata: header.metadata, tensors })
+    }
+
+    /// The free text of the header.
+    pub fn metadata(&self) -> &BTreeMap<String, String> {
+        &self.metadata
+    }
+
+    /// All arrays, by name.
+    pub fn tensors(&self) -> impl ExactSizeIterator<Item = &Tensor<'a>> {
+        self.tensors.values()
+    }
+
+    /// The array of that name, if there is one.
+    pub fn get(&self, name: &str) -> Option<&Tensor<'a>> {
+        self.tensors.get(name)
+    }
+
+    /// The array of that name. Errors: there is none.
+    pub fn tensor(&self, name: &str) -> Result<&Tensor<'a>> {
+        self.get(name).ok_or_else(|| {
+            Error::input(format!("array `{name}` is missing")).remedy("The file was written for another purpose")
+        })
+    }
+}
+
+/// Writes a file: the same arrays and metadata always give the same bytes.
+///
+/// Arrays are ordered by the size of their numbers, largest first, then as given, so that every array is aligned. Errors:
+/// the sink's. Panics: two arrays of one name, or one called `__metadata__`.
+pub fn write(tensors: &[Tensor<'_>], metadata: &BTreeMap<String, String>, out: &mut impl Write) -> Result<()> {
+    let mut order: Vec<&Tensor<'_>> = tensors.iter().collect();
+    order.sort_by_key(|t| std::cmp::Reverse(t.dtype.size()));
+    let mut names = BTreeSet::from([METADATA]);
+    let mut header = String::from("{");
+    if !metadata.is_empty() {
+        let text = serde_json::to_string(metadata).expect("a map of strings is JSON");
+        write!(header, "\"{METADATA}\":{text}").expect("a string grows");
+    }
+    let mut begin = 0;
+    for t in &order {
+        assert!(names.insert(&t.name), "two arrays of one file are called {}", t.name);
+        let end = begin + t.bytes.len();
+        let comma = if header.len() > 1 { "," } else { "" };
+        let name = serde_json::to_string(&t.name).expect("a string is JSON");
+        let shape = serde_json::to_string(&t.shape).expect("a list of integers is JSON");
+        let dtype = t.dtype.name();
+        write!(header, "{comma}{name}:{{\"dtype\":\"{dtype}\",\"shape\":{shape},\"data_offsets\":[{begin},{end}]}}")
+            .expect("a string grows");
+        begin = end;
+    }
+    header.push('}');
+    let padding = header.len().next_multiple_of(ALIGN) - header.len();
+    header.extend(std::iter::repeat_n(' ', padding));
+    let mut write = |bytes: &[u8]| out.write_all(bytes).map_err(|e| Error::io("the arrays could not be written", e));
+    write(&(header.len() as u64).to_le_bytes())?;
+    write(header.as_bytes())?;
+    order.iter().try_for_each(|t| write(&t.bytes))
+}
+
+/// The header as it stands in the file; a list, so that a name that stands twice is seen.
+#[derive(Default)]
+struct Header {
+    metadata: BTreeMap<String, String>,
+    entries: Vec<(String, Entry)>,
+}
+
+#[derive(serde::Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Entry {
+    dtype: String,
+    shape: Vec<usize>,
+    data_offsets: (usize, usize),
+}
+
+impl Entry {
+    /// The array; `end` is where the one before it ended, and is moved on.
+    fn view<'a>(&self, name: &str, data: &'a [u8], end: &mut usize) -> Result<Tensor<'a>> {
+        let Some(dtype) = Dtype::parse(&self.dtype) else {
+            return Err(Error::new(ErrorKind::Unsupported, format!("array `{name}` holds the type `{}`", self.dtype))
+                .remedy("Convert it to F32, F16 or an integer type"));
+        };
+        let (first, last) = self.data_offsets;
+        if first != *end {
+            return Err(broken(format!("array `{name}` begins at byte {first}, but the one before it ends at {end}")));
+        }
+        let Some(bytes) = data.get(first..last) else {
+            return Err(broken(format!("array `{name}` claims bytes {first}..{last} of {}", data.len())));
+        };
+        let size = self.shape.iter().try_fold(dtype.size(), |n, &d| n.checked_mul(d));
+        if size != Some(bytes.len()) {
+            return Err(broken(format!(
+                "array `{name}` of shape {:?} and type {} claims {} bytes",
+                self.shape,
+                self.dtype,
+                bytes.len()
+            )));
+        }
+        *end = last;
+        Ok(Tensor { name: name.to_owned(), dtype, shape: self.shape.clone(), bytes: Cow::Borrowed(bytes) })
+    }
+}
+
+impl<'de> Deserialize<'de> for Header {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        struct HeaderVisitor;
+        impl<'de> Visitor<'de> for HeaderVisitor {
+            type Value = Header;
+
+            fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+                f.write_str("an object of arrays")
+            }
+
+            fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Header, A::Error> {
+                let mut header = Header::default();
+                let mut names = BTreeSet::new();
+                while let Some(name) = map.next_key::<String>()? {
+                    if !names.insert(name.clone()) {
+                        return Err(serde::de::Error::custom(format_args!("`{name}` stands twice")));
+                    }
+                    if name == METADATA {
+                        header.metadata = map.next_value()?;
+                    } else {
+                        header.entries.push((name, map.next_value()?));
+                    }
+                }
+                Ok(header)
+            }
+        }
+        deserializer.deserialize_map(HeaderVisitor)
+    }
+}
+
+fn broken(what: impl Into<String>) -> Error {
+    Error::input(what).remedy("The file is damaged, cut short or not a safetensors file; copy or export it again")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::format::mutate::mutants;
+    use crate::math::Rng;
+
+    fn file(header: &str, data: &[u8]) -> Vec<u8> {
+        let mut out = (header.len() as u64).to_le_bytes().to_vec();
+        out.extend(header.bytes());
+        out.extend(data);
+        out
+    }
+
+    fn sample() -> Vec<u8> {
+        let rng = Rng::new(1, "tensors", 0);
+        // Arbitrary bits: NaN payloads and subnormals must survive.
+        let f32s: Vec<f32> = (0..12).map(|i| f32::from_bits(rng.bits(i) as u32)).collect();
+        let f64s: Vec<f64> = (0..5).map(|i| f64::from_bits(rng.bits(i + 50))).collect();
+        let u32s: Vec<u32> = (0..3).map(|i| rng.bits(i + 80) as u32).collect();
+        let u64s = [u64::MAX, 0, 1 << 63];
+        let tensors = [
+            Tensor::u8("rng", &[3], &[1, 2, 255]),
+            Tensor::f32("layers.0.means", &[4, 3], &f32s),
+            Tensor::f64("moments \"quoted\" é", &[5], &f64s),
+            Tensor::u32("parents", &[3, 1], &u32s),
+            Tensor::u64("counter", &[3], &u64s),
+            Tensor::i64("signed", &[], &[-5]),
+            Tensor::f32("none", &[0, 3], &[]),
+        ];
+        let metadata = [("spec", "{\"version\": 1}"), ("a", "b")].map(|(k, v)| (k.to_owned(), v.to_owned()));
+        let mut out = Vec::new();
+        write(&tensors, &metadata.into(), &mut out).unwrap();
+        let read = SafeTensors::read(&out).unwrap();
+        assert_eq!(read.tensors().len(), tensors.len());
+        for t in &tensors {
+            let got = read.tensor(t.name()).unwrap();
+            assert_eq!(got, t);
+            let begin = got.bytes().as_ptr() as usize - out.as_ptr() as usize;
+            assert_eq!(begin % got.dtype().size(), 0, "{} is aligned in the file", t.name());
+        }
+        let bits = |v: Vec<f32>| v.into_iter().map(f32::to_bits).collect::<Vec<_>>();
+        assert_eq!(bits(read.tensor("layers.0.means").unwrap().as_f32().unwrap()), bits(f32s));
+        assert_eq!(read.tensor("parents").unwrap().as_u32().unwrap(), u32s);
+        assert_eq!(read.tensor("counter").unwrap().as_u64().unwrap(), u64s);
+        assert_eq!(read.tensor("rng").unwrap().as_u8().unwrap(), [1, 2, 255]);
+        assert_eq!(read.tensor("signed").unwrap().as_i64().unwrap(), [-5]);
+        assert_eq!(read.metadata()["spec"], "{\"version\": 1}");
+        out
+    }
+
+    #[test]
+    fn every_type_comes_back_bit_for_bit() {
+        assert_eq!(sample(), sample(), "the same content must give the same bytes");
+    }
+
+    #[test]
+    fn a_foreign_file_in_another_order_is_read() {
+        let header = r#"{"b":{"shape":[2],"data_offsets":[4,8],"dtype":"F16"},
+            "a":{"dtype":"BF16","shape":[1,2],"data_offsets":[0,4]},"__metadata__":{"format":"pt"}}   "#;
+        let bytes = file(header, &[0x80, 0x3F, 0x80, 0xBF, 0x00, 0x3C, 0x00, 0xC0]);
+        let read = SafeTensors::read(&bytes).unwrap();
+        assert_eq!(read.tensor("a").unwrap().to_f32().unwrap(), [1.0, -1.0]);
+        assert_eq!(read.tensor("b").unwrap().to_f32().unwrap(), [1.0, -2.0]);
+        assert_eq!(read.tensor("a").unwrap().shape(), [1, 2]);
+        let wrong = read.tensor("b").unwrap().as_u32().unwrap_err().to_string();
+        assert!(wrong.contains("`b`") && wrong.contains("F16"), "{wrong}");
+        assert!(read.tensor("c").unwrap_err().to_string().contains("`c`"));
+    }
+
+    #[test]
+    fn lies_are_errors_that_name_the_array() {
+        let one = |body: &str| file(&format!("{{\"a\":{body}}}"), &[0; 8]);
+        let cases = [
+            (vec![1, 2, 3], "shorter"),
+            (u64::MAX.to_le_bytes().to_vec(), "claims"),
+            (file("{\"a\":", &[]), "header cannot be read"),
+            (file("[]", &[]), "header cannot be read"),
+            (file("{}", &[0]), "end at byte 0"),
+            (one(r#"{"dtype":"F32","shape":[3],"data_offsets":[0,8]}"#), "`a` of shape [3]"),
+            (one(r#"{"dtype":"F32","shape":[2],"data_offsets":[0,9]}"#), "`a` claims bytes 0..9"),
+            (one(r#"{"dtype":"F32","shape":[2],"data_offsets":[8,0]}"#), "`a` begins at byte 8"),
+            (one(r#"{"dtype":"F32","shape":[1],"data_offsets":[4,8]}"#), "`a` begins at byte 4"),
+            (one(r#"{"dtype":"F32","shape":[1],"data_offsets":[0,4]}"#), "end at byte 4"),
+            (one(r#"{"dtype":"F32","shape":[-2],"data_offsets":[0,8]}"#), "cannot be read"),
+            (one(r#"{"dtype":"F4","shape":[2],"data_offsets":[0,8]}"#), "`F4`"),
+            (one(r#"{"dtype":"U8","shape":[4294967296,4294967296],"data_offsets":[0,8]}"#), "`a` of shape"),
+            (one(r#"{"dtype":"F64","shape":[2305843009213693953],"data_offsets":[0,8]}"#), "`a` of shape"),
+            (
+                file(
+                    r#"{"a":{"dtype":"U8","shape":[1],"data_offsets":[0,1]},"a":{"dtype":"U8","shape":[1],"data_offsets":[0,1]}}"#,
+                    &[0],
+                ),
+                "`a` stands twice",
+            ),
+            (
+                file(
+                    r#"{"a":{"dtype":"U8","shape":[2],"data_offsets":[0,2]},"b":{"dtype":"U8","shape":[2],"data_offsets":[1,3]}}"#,
+                    &[0; 3],
+                ),
+                "`b` begins at byte 1",
+            ),
+            (file(&format!("{{\"a\":{}1{}}}", "[".repeat(5000), "]".repeat(5000)), &[]), "header cannot be read"),
+        ];
+        for (bytes, needle) in cases {
+            let error = SafeTensors::read(&bytes).unwrap_err().to_string();
+            assert!(error.contains(needle), "`{error}` should say `{needle}`");
+        }
+    }
+
+    #[test]
+    fn mutants_are_read_or_refused() {
+        let read = mutants(&sample(), 1000, "safetensors").filter(|m| SafeTensors::read(m).is_ok()).count();
+        assert!(0 < read && read < 1000, "{read} of 1000 mutants were readable");
+    }
+}
