@@ -1,1 +1,3 @@
 //! Learns moving Gaussian scenes from posed captures.
+
+pub mod capture;
