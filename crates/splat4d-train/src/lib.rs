@@ -2,6 +2,7 @@
 //!
 //! The trainer only emits [`event::Event`]s; progress bars, logs and viewers listen.
 
+pub mod capture;
 pub mod densify;
 pub mod event;
 pub mod init;

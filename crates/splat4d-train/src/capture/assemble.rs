@@ -1,0 +1,287 @@
+//! From what the files say to a checked capture: poses, sizes, files, duplicates, split, clock.
+
+use super::{Capture, CaptureOptions, Frame, HoldOut, RawFrame, Rig, Split, Take};
+use super::{options, picture, pose};
+use splat4d::math::se3::{norm, normalize, sub};
+use splat4d::scene::{Camera, Lens, Time};
+use splat4d::{Error, Result};
+use std::collections::{BTreeMap, BTreeSet};
+
+/// Poses closer than this, relative to the distance from the origin, are one pose.
+const SAME_POSE: f64 = 1e-9;
+/// Every how many images one is held out where no rig and no convention says otherwise (LLFF's habit).
+const HOLD_EVERY: usize = 8;
+/// White: what transparent pixels are composited on unless told (the papers' choice for D-NeRF).
+const WHITE: [f32; 3] = [1.0; 3];
+
+/// Checks a take and turns it into a capture.
+pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Capture> {
+    let root = take.root.clone();
+    let located = |e: Error| e.at(root.display());
+    if take.frames.is_empty() {
+        return Err(located(
+            Error::input("the capture has no frames")
+                .remedy("Check that the file lists pictures and that the pictures lie where it says."),
+        ));
+    }
+    options::check_rate("frame rate", take.fps).map_err(located)?;
+    for frame in &mut take.frames {
+        check_frame(frame, &take.cameras[frame.camera], options)?;
+    }
+    drop_unused_cameras(&mut take);
+    let cameras = rigs(&take);
+    check_poses(&take, &cameras)?;
+    check_duplicates(&mut take, &cameras).map_err(located)?;
+    let has_alpha = check_headers(&take)?;
+    check_masks(&take, has_alpha)?;
+    let background = options.background.or(take.background).or(has_alpha.then_some(WHITE)).filter(|_| has_alpha);
+    let (train, held, validation) = split(&mut take, &cameras, options).map_err(located)?;
+    let up = take.up.map(normalize).filter(|u| norm(*u) > 0.0).unwrap_or_else(|| estimate_up(&take.frames));
+    let frames: Vec<Frame> = take.frames.into_iter().map(|f| finish(f, options.downscale)).collect();
+    let name = take.name.unwrap_or_else(|| {
+        let full = std::path::absolute(&take.root).unwrap_or_else(|_| take.root.clone());
+        full.file_name().map_or_else(|| "capture".into(), |n| n.to_string_lossy().into_owned())
+    });
+    Ok(Capture {
+        name,
+        root: take.root,
+        kind: take.kind,
+        cameras,
+        frames,
+        held,
+        train,
+        validation,
+        fps: take.fps,
+        points: take.points.map(|p| p.voxel_downsample(options.max_points)).filter(|p| !p.points.is_empty()),
+        background,
+        up,
+        downscale: options.downscale,
+        warnings: take.warnings,
+    })
+}
+
+/// The pinhole view of the picture as it will be loaded.
+fn finish(raw: RawFrame, downscale: usize) -> Frame {
+    let view = Camera { lens: Lens::Pinhole, ..raw.source.downscaled(downscale) };
+    Frame {
+        camera: raw.camera,
+        view,
+        source: raw.source,
+        time: Time(raw.time),
+        index: raw.index,
+        image: raw.image,
+        mask: raw.mask,
+    }
+}
+
+fn check_frame(frame: &mut RawFrame, camera: &str, options: &CaptureOptions) -> Result<()> {
+    let place = |e: Error| e.at(format!("{} (camera {camera}, frame {})", frame.image.display(), frame.index));
+    let source = &mut frame.source;
+    pose::check_intrinsics(&source.intrinsics, source.width, source.height).map_err(place)?;
+    source.cam_from_world = pose::checked(source.cam_from_world).map_err(place)?;
+    if !frame.time.is_finite() {
+        return Err(place(Error::input("its time is not finite").remedy("Give its time in seconds.")));
+    }
+    if source.width < options.downscale || source.height < options.downscale {
+        let what =
+            format!("nothing of a {}x{} image is left at downscale {}", source.width, source.height, options.downscale);
+        return Err(place(Error::input(what).remedy("Choose a smaller downscale.")));
+    }
+    let files = [("picture", Some(&frame.image)), ("mask", frame.mask.as_ref())];
+    for (what, file) in files.into_iter().filter_map(|(what, file)| Some((what, file?))) {
+        if !file.is_file() {
+            return Err(Error::input(format!("the {what} of camera {camera}, frame {} is missing", frame.index))
+                .at(file.display())
+                .remedy("Restore the file, or take the frame out of the capture."));
+        }
+    }
+    Ok(())
+}
+
+/// Cameras without frames would be rows without meaning everywhere else.
+fn drop_unused_cameras(take: &mut Take) {
+    let used: BTreeSet<usize> = take.frames.iter().map(|f| f.camera).collect();
+    let unused: Vec<&str> =
+        take.cameras.iter().enumerate().filter(|(i, _)| !used.contains(i)).map(|(_, n)| n.as_str()).collect();
+    if !unused.is_empty() {
+        take.warnings.push(format!("Cameras without any frame are left out: {}.", unused.join(", ")));
+    }
+    let renumbered: BTreeMap<usize, usize> = used.iter().enumerate().map(|(new, &old)| (old, new)).collect();
+    take.frames.iter_mut().for_each(|f| f.camera = renumbered[&f.camera]);
+    take.cameras = used.iter().map(|&i| std::mem::take(&mut take.cameras[i])).collect();
+}
+
+/// Which cameras keep one pose.
+fn rigs(take: &Take) -> Vec<Rig> {
+    let mut first: Vec<Option<&RawFrame>> = vec![None; take.cameras.len()];
+    let mut fixed = vec![true; take.cameras.len()];
+    for frame in &take.frames {
+        let reference = *first[frame.camera].get_or_insert(frame);
+        fixed[frame.camera] &= same_pose(&reference.source, &frame.source);
+    }
+    take.cameras.iter().zip(fixed).map(|(name, fixed)| Rig { name: name.clone(), fixed }).collect()
+}
+
+/// Whether two cameras stand at one place and look the same way.
+pub(super) fn same_pose(a: &Camera, b: &Camera) -> bool {
+    let (p, q) = (&a.cam_from_world, &b.cam_from_world);
+    let turn = p.rotation.iter().flatten().zip(q.rotation.iter().flatten()).map(|(x, y)| (x - y).abs());
+    let moved = norm(sub(p.translation, q.translation));
+    turn.fold(0.0, f64::max) <= SAME_POSE && moved <= SAME_POSE * (1.0 + norm(p.translation))
+}
+
+/// Two fixed cameras with one pose are a slip of the hand: a copied matrix.
+fn check_poses(take: &Take, cameras: &[Rig]) -> Result<()> {
+    let mut first: BTreeMap<usize, &RawFrame> = BTreeMap::new();
+    for frame in take.frames.iter().filter(|f| cameras[f.camera].fixed) {
+        first.entry(frame.camera).or_insert(frame);
+    }
+    // Sorting by one coordinate leaves only neighbours to compare, so that huge rigs stay cheap.
+    let mut sorted: Vec<&RawFrame> = first.into_values().collect();
+    sorted.sort_by(|a, b| a.source.cam_from_world.translation[0].total_cmp(&b.source.cam_from_world.translation[0]));
+    for (i, a) in sorted.iter().enumerate() {
+        let x = a.source.cam_from_world.translation[0];
+        let reach = 2.0 * SAME_POSE * (1.0 + norm(a.source.cam_from_world.translation));
+        for b in sorted[i + 1..].iter().take_while(|b| b.source.cam_from_world.translation[0] - x <= reach) {
+            if same_pose(&a.source, &b.source) {
+                let (a, b) = (a.camera.min(b.camera), a.camera.max(b.camera));
+                let what = format!("cameras {} and {} have one pose", cameras[a].name, cameras[b].name);
+                return Err(Error::input(what).at(take.root.display()).remedy(
+                    "A matrix was probably copied from one to the other: correct it, or remove one of the cameras.",
+                ));
+            }
+        }
+    }
+    Ok(())
+}
+
+/// One camera takes one picture at a time. A moving "camera" may stand for several, so there the pose counts too; a
+/// frame that training and measuring share is reported, not refused (published data sets do it).
+fn check_duplicates(take: &mut Take, cameras: &[Rig]) -> Result<()> {
+    let mut groups: BTreeMap<(usize, u64), Vec<usize>> = BTreeMap::new();
+    let mut shared = 0;
+    for (i, frame) in take.frames.iter().enumerate() {
+        // Adding 0.0 makes −0 and 0 one time.
+        let earlier = groups.entry((frame.camera, (frame.time + 0.0).to_bits())).or_default();
+        for &j in earlier.iter() {
+            let other = &take.frames[j];
+            if !cameras[frame.camera].fixed && !same_pose(&other.source, &frame.source) {
+                continue;
+            }
+            if other.split != frame.split {
+                shared += 1;
+                continue;
+            }
+            let what = format!(
+                "camera {} has two pictures at {} s: {} and {}",
+                cameras[frame.camera].name,
+                frame.time,
+                other.image.display(),
+                frame.image.display()
+            );
+            return Err(Error::input(what).remedy("Remove one, or correct its time or frame number."));
+        }
+        earlier.push(i);
+    }
+    if shared > 0 {
+        take.warnings.push(format!(
+            "{shared} frames of the training, validation and test sets agree in camera and time: figures measured on \
+             them do not tell how new views look."
+        ));
+    }
+    Ok(())
+}
+
+/// Compares the size of one picture per camera with its intrinsics; returns whether any has an alpha channel.
+fn check_headers(take: &Take) -> Result<bool> {
+    let mut seen = vec![false; take.cameras.len()];
+    let mut alpha = false;
+    for frame in &take.frames {
+        if !std::mem::replace(&mut seen[frame.camera], true) {
+            let header = picture::header(&frame.image)?;
+            picture::check_size(&frame.image, (header.width, header.height), &frame.source)
+                .map_err(|e| e.at(format!("camera {}", take.cameras[frame.camera])))?;
+            alpha |= header.alpha;
+        }
+    }
+    Ok(alpha)
+}
+
+/// An error if masks exist and not one of them shows anything; stops at the first that does.
+fn check_masks(take: &Take, has_alpha: bool) -> Result<()> {
+    let masked: Vec<&RawFrame> = take.frames.iter().filter(|f| f.mask.is_some() || has_alpha).collect();
+    let Some(first) = masked.first() else { return Ok(()) };
+    for frame in &masked {
+        match picture::any_foreground(frame.mask.as_deref().unwrap_or(&frame.image), frame.mask.is_none()) {
+            Ok(true) => return Ok(()),
+            Ok(false) => {}
+            // A broken picture has its own error, with more to say, when it is loaded.
+            Err(_) if frame.mask.is_none() => return Ok(()),
+            Err(e) => return Err(e),
+        }
+    }
+    let place = first.mask.as_ref().unwrap_or(&first.image);
+    Err(Error::input("the masks exclude everything: no picture has a foreground pixel")
+        .at(place.display())
+        .remedy("Masks are white where the picture counts: invert them, or leave them out of the capture."))
+}
+
+type Indices = Vec<usize>;
+
+/// The training, held-out and validation frames.
+fn split(take: &mut Take, cameras: &[Rig], options: &CaptureOptions) -> Result<(Indices, Indices, Indices)> {
+    let told = options.hold_out.clone().or_else(|| take.hold_out.clone());
+    let of = |split: Split| -> Indices { (0..take.frames.len()).filter(|&i| take.frames[i].split == split).collect() };
+    let validation = of(Split::Validation);
+    let by_convention = of(Split::Held);
+    let rule = match told {
+        Some(rule) => rule,
+        None if !by_convention.is_empty() => {
+            let train = of(Split::Train);
+            return non_empty(train, by_convention, validation);
+        }
+        None if cameras.len() >= 2 && cameras.iter().all(|c| c.fixed) => {
+            HoldOut::Cameras(vec![cameras[0].name.clone()])
+        }
+        None => HoldOut::Every(HOLD_EVERY),
+    };
+    let pool: Indices = (0..take.frames.len()).filter(|&i| take.frames[i].split != Split::Validation).collect();
+    let held: Vec<bool> = match &rule {
+        HoldOut::None => vec![false; pool.len()],
+        HoldOut::Every(n) => (0..pool.len()).map(|i| pool.len() > 1 && i % n == 0).collect(),
+        HoldOut::Cameras(names) => {
+            let chosen: Vec<usize> = names.iter().map(|n| find_camera(n, cameras)).collect::<Result<_>>()?;
+            pool.iter().map(|&i| chosen.contains(&take.frames[i].camera)).collect()
+        }
+    };
+    let pick = |want: bool| pool.iter().zip(&held).filter(|&(_, &h)| h == want).map(|(&i, _)| i).collect();
+    non_empty(pick(false), pick(true), validation)
+}
+
+fn non_empty(train: Indices, held: Indices, validation: Indices) -> Result<(Indices, Indices, Indices)> {
+    if train.is_empty() {
+        return Err(Error::input("every frame is held out, none is left to train on")
+            .remedy("Hold out fewer cameras, or none (--hold-out none)."));
+    }
+    Ok((train, held, validation))
+}
+
+fn find_camera(name: &str, cameras: &[Rig]) -> Result<usize> {
+    let by_name = cameras.iter().position(|c| c.name == name);
+    let by_number = || name.parse::<usize>().ok().filter(|&i| i < cameras.len());
+    by_name.or_else(by_number).ok_or_else(|| {
+        let names: Vec<&str> = cameras.iter().map(|c| c.name.as_str()).take(40).collect();
+        Error::input(format!("the held-out camera {name} does not exist"))
+            .remedy(format!("The capture's cameras are: {}.", names.join(", ")))
+    })
+}
+
+/// People hold cameras upright: minus the mean of the pictures' y axes.
+fn estimate_up(frames: &[RawFrame]) -> [f64; 3] {
+    let mut sum = [0.0; 3];
+    for frame in frames {
+        (0..3).for_each(|k| sum[k] -= frame.source.cam_from_world.rotation[1][k]);
+    }
+    // Cameras all round a scene that look straight down cancel out; then any axis is as good.
+    if norm(sum) > 1e-3 * frames.len() as f64 { normalize(sum) } else { [0.0, 0.0, 1.0] }
+}

@@ -1,0 +1,291 @@
+//! Posed captures: where the pictures lie, which camera took each and when; and the pictures themselves, out of memory
+//! until they are asked for.
+//!
+//! [`Capture::open`] finds out which of the known layouts a folder has, reads poses and times, checks them and brings
+//! them to one form: pinhole cameras with OpenCV axes, seconds, and one held-out split. No pixel is kept; an
+//! [`ImageStore`] decodes on demand within a byte budget. Every reader produces a [`Take`] (what the files say) and
+//! [`assemble`] alone turns takes into captures, so that all layouts are checked alike.
+
+mod assemble;
+mod dnerf;
+mod json;
+mod lens;
+mod options;
+mod own;
+mod panoptic;
+mod picture;
+mod ply;
+mod points;
+mod pose;
+mod preflight;
+mod rig;
+mod store;
+
+pub use lens::Distortion;
+pub use options::{CaptureOptions, HoldOut, MAX_POINTS};
+pub use points::PointCloud;
+pub use preflight::{Finding, Severity};
+pub use store::{ImageStore, Picture, StoredPicture};
+
+use splat4d::scene::{Camera, Time};
+use splat4d::{Error, ErrorKind, Result};
+use std::path::{Path, PathBuf};
+
+/// Which layout a capture was read from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum CaptureKind {
+    /// Our own `capture.json`.
+    Own,
+    /// D-NeRF / Blender `transforms_{train,val,test}.json`.
+    DNerf,
+    /// PanopticSports `train_meta.json` and `test_meta.json`.
+    Panoptic,
+}
+
+/// One picture of the take.
+#[derive(Clone, Debug)]
+pub struct Frame {
+    /// Index into [`Capture::cameras`].
+    pub camera: usize,
+    /// The camera of the picture that [`ImageStore::load`] returns: a pinhole, undistorted and downscaled.
+    pub view: Camera,
+    /// The camera of the picture file: full size, with its lens.
+    pub source: Camera,
+    /// Seconds on the scene clock.
+    pub time: Time,
+    /// Frame number in the take, from 0; frames of several cameras with one number belong to one instant unless the
+    /// cameras have time offsets.
+    pub index: usize,
+    /// The picture file.
+    pub image: PathBuf,
+    /// The foreground mask file (white = foreground).
+    pub mask: Option<PathBuf>,
+}
+
+/// One camera of the rig, or one moving camera.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Rig {
+    /// Its name in the data set.
+    pub name: String,
+    /// Whether one pose holds for the whole take.
+    pub fixed: bool,
+}
+
+/// What a frame is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Split {
+    /// Trained on.
+    Train,
+    /// Kept from training: measures the result.
+    Held,
+    /// Kept from training: the data set's own validation set (D-NeRF).
+    Validation,
+}
+
+/// A posed, timed set of pictures on disk.
+#[derive(Clone, Debug)]
+pub struct Capture {
+    /// A short name: what the capture calls itself, else the folder's.
+    pub name: String,
+    /// The folder.
+    pub root: PathBuf,
+    /// The layout it was read from.
+    pub kind: CaptureKind,
+    /// The cameras; a moving camera is one entry that is not `fixed`.
+    pub cameras: Vec<Rig>,
+    /// All pictures.
+    pub frames: Vec<Frame>,
+    /// Indices of the frames held out to measure.
+    pub held: Vec<usize>,
+    /// Indices of the frames to train on.
+    pub train: Vec<usize>,
+    /// Indices of the data set's own validation frames.
+    pub validation: Vec<usize>,
+    /// Frames per second.
+    pub fps: f64,
+    /// The initial cloud, in the scene's units, already thinned to [`CaptureOptions::max_points`].
+    pub points: Option<PointCloud>,
+    /// What transparent pixels are composited on, sRGB in [0,1]; `None`: the pictures have no alpha.
+    pub background: Option<[f32; 3]>,
+    /// Upwards in the world (unit); estimated from the cameras where the data set states none.
+    pub up: [f64; 3],
+    /// The k of [`CaptureOptions::downscale`].
+    pub downscale: usize,
+    /// What the reader noticed, one sentence each.
+    pub warnings: Vec<String>,
+}
+
+/// What a reader found in the files, before any check.
+struct Take {
+    name: Option<String>,
+    root: PathBuf,
+    kind: CaptureKind,
+    cameras: Vec<String>,
+    frames: Vec<RawFrame>,
+    /// The data set's convention, where it is not told by the frames' splits.
+    hold_out: Option<HoldOut>,
+    fps: f64,
+    points: Option<PointCloud>,
+    background: Option<[f32; 3]>,
+    up: Option<[f64; 3]>,
+    warnings: Vec<String>,
+}
+
+/// A frame as a reader found it.
+struct RawFrame {
+    camera: usize,
+    source: Camera,
+    time: f64,
+    index: usize,
+    image: PathBuf,
+    mask: Option<PathBuf>,
+    split: Split,
+}
+
+/// A reader: the capture's folder and the marker file that was found, to what the files say.
+type Reader = fn(&Path, &Path, &CaptureOptions) -> Result<Take>;
+
+/// Marker files (or folders) in the order in which they are looked for, with their readers.
+const READERS: &[(&str, Reader)] =
+    &[("capture.json", own::read), ("transforms_train.json", dnerf::read), ("train_meta.json", panoptic::read)];
+
+/// Markers of layouts that this version does not read, and what to do.
+const FOREIGN: &[(&str, &str)] = &[
+    ("dataset.json", "HyperNeRF and Nerfies captures"),
+    ("reconstruction.json", "OpenSfM reconstructions"),
+    ("sfm_data.json", "OpenMVG reconstructions"),
+];
+
+const VIDEO_ENDINGS: &[&str] = &["mp4", "mov", "mkv", "avi", "webm"];
+
+impl Capture {
+    /// Opens the capture in a folder, or that of a marker file.
+    ///
+    /// Reads poses, times and the headers of one picture per camera; checks that every picture exists. Errors name the
+    /// file, frame or camera and what to do.
+    pub fn open(path: &Path, options: &CaptureOptions) -> Result<Self> {
+        options.check()?;
+        if !path.exists() {
+            return Err(Error::input("there is no such file or folder")
+                .at(path.display())
+                .remedy("Give the folder that holds the capture."));
+        }
+        let file_name = path.file_name().and_then(|n| n.to_str()).unwrap_or_default();
+        if path.is_file() {
+            let root = path.parent().unwrap_or(Path::new("."));
+            let known = READERS.iter().find(|(marker, _)| *marker == file_name);
+            let (_, reader) = known.ok_or_else(|| unknown_layout(root, path))?;
+            return assemble::assemble(reader(root, path, options)?, options);
+        }
+        for (marker, reader) in READERS {
+            let found = path.join(marker);
+            if found.exists() {
+                return assemble::assemble(reader(path, &found, options)?, options);
+            }
+        }
+        Err(unknown_layout(path, path))
+    }
+
+    /// The first and last time of all frames, seconds.
+    pub fn time_range(&self) -> (f64, f64) {
+        let times = self.frames.iter().map(|f| f.time.0);
+        times.fold((f64::INFINITY, f64::NEG_INFINITY), |(lo, hi), t| (lo.min(t), hi.max(t)))
+    }
+
+    /// All distinct times, seconds, in order.
+    pub fn times(&self) -> Vec<f64> {
+        let mut times: Vec<f64> = self.frames.iter().map(|f| f.time.0).collect();
+        times.sort_by(f64::total_cmp);
+        times.dedup();
+        times
+    }
+
+    /// Whether every camera keeps one pose for the whole take.
+    pub fn fixed_cameras(&self) -> bool {
+        self.cameras.iter().all(|c| c.fixed)
+    }
+
+    /// What `frame` is for.
+    pub fn split(&self, frame: usize) -> Split {
+        if self.held.binary_search(&frame).is_ok() {
+            Split::Held
+        } else if self.validation.binary_search(&frame).is_ok() {
+            Split::Validation
+        } else {
+            Split::Train
+        }
+    }
+
+    /// Indices of the frames of one camera, in time.
+    pub fn frames_of(&self, camera: usize) -> Vec<usize> {
+        let mut found: Vec<usize> = (0..self.frames.len()).filter(|&i| self.frames[i].camera == camera).collect();
+        found.sort_by(|&a, &b| self.frames[a].time.0.total_cmp(&self.frames[b].time.0));
+        found
+    }
+
+    /// The centroid of the training cameras' centres and 1.1 times the largest distance from it: the length scale that
+    /// the field's learning rates refer to (Kerbl 2023, `getNerfppNorm`). At least 10⁻⁶.
+    pub fn center_and_radius(&self) -> ([f64; 3], f64) {
+        /// Margin around the outermost camera (Kerbl 2023).
+        const MARGIN: f64 = 1.1;
+        let mut centers: Vec<[f64; 3]> = Vec::new();
+        let mut seen = vec![false; self.cameras.len()];
+        for &i in &self.train {
+            let frame = &self.frames[i];
+            if !(self.cameras[frame.camera].fixed && std::mem::replace(&mut seen[frame.camera], true)) {
+                centers.push(frame.view.center());
+            }
+        }
+        let n = centers.len().max(1) as f64;
+        let mut mean = [0.0; 3];
+        for c in &centers {
+            (0..3).for_each(|k| mean[k] += c[k] / n);
+        }
+        let far = centers.iter().map(|&c| splat4d::math::se3::norm(splat4d::math::se3::sub(c, mean)));
+        (mean, (MARGIN * far.fold(0.0, f64::max)).max(1e-6))
+    }
+}
+
+/// Why a folder is no capture, and what to do about it.
+fn unknown_layout(root: &Path, named: &Path) -> Error {
+    for (marker, what) in FOREIGN {
+        if root.join(marker).exists() {
+            return Error::new(ErrorKind::Unsupported, format!("{what} ({marker}) are not read"))
+                .at(named.display())
+                .remedy("Export the poses as COLMAP or Nerfstudio, or write a capture.json (docs/capture-format.md).");
+        }
+    }
+    let markers: Vec<&str> = READERS.iter().map(|(marker, _)| *marker).collect();
+    let mut error =
+        Error::input(format!("is not a capture: none of {} is there", markers.join(", "))).at(named.display());
+    if let Some(video) = videos(root).first() {
+        error = error.remedy(format!(
+            "It holds videos, but no camera poses. Extract frames with `{}`, then calibrate the cameras (COLMAP on the \
+             first frames will do) or write a capture.json (docs/capture-format.md).",
+            ffmpeg_command(video)
+        ));
+    }
+    error.remedy(
+        "Write a capture.json with your cameras (docs/capture-format.md), or give the folder of a known layout.",
+    )
+}
+
+/// Names of the video files in a folder, sorted.
+fn videos(folder: &Path) -> Vec<String> {
+    let mut found: Vec<String> = rig::file_names(folder)
+        .into_iter()
+        .filter(|n| Path::new(n).extension().is_some_and(|e| VIDEO_ENDINGS.iter().any(|v| e.eq_ignore_ascii_case(v))))
+        .collect();
+    found.sort();
+    found
+}
+
+/// The command that turns one video into a folder of frames named as the readers expect.
+fn ffmpeg_command(video: &str) -> String {
+    let stem = Path::new(video).file_stem().and_then(|s| s.to_str()).unwrap_or("cam00");
+    format!("mkdir -p images/{stem} && ffmpeg -i {video} -start_number 0 -qscale:v 2 images/{stem}/%06d.jpg")
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,119 @@
+//! What a user may say about a capture besides where it lies.
+
+use splat4d::{Error, Result};
+use std::str::FromStr;
+
+/// Which frames are kept from training and used to measure.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum HoldOut {
+    /// All frames of these cameras, by name, else by position in the capture's list of cameras.
+    Cameras(Vec<String>),
+    /// Every n-th image (0, n, 2n, ...) in the capture's order (camera by camera, in time). n ≥ 2.
+    Every(usize),
+    /// Train on everything.
+    None,
+}
+
+impl FromStr for HoldOut {
+    type Err = Error;
+
+    /// Reads `camera=0,10`, `every=8` or `none`.
+    fn from_str(text: &str) -> Result<Self> {
+        const REMEDY: &str = "Write camera=NAME[,NAME...], every=N (N at least 2), or none.";
+        let bad = |what: String| Error::input(what).at("hold-out").remedy(REMEDY);
+        match text.trim().split_once('=').map(|(key, value)| (key.trim(), value.trim())) {
+            None if text.trim().eq_ignore_ascii_case("none") => Ok(Self::None),
+            Some(("camera" | "cameras", list)) => {
+                let names: Vec<String> = list.split(',').map(|n| n.trim().to_string()).collect();
+                if names.iter().any(String::is_empty) {
+                    return Err(bad(format!("\"{text}\" names an empty camera")));
+                }
+                Ok(Self::Cameras(names))
+            }
+            Some(("every", n)) => match n.parse() {
+                Ok(n) if n >= 2 => Ok(Self::Every(n)),
+                _ => Err(bad(format!("every={n} is no whole number of at least 2"))),
+            },
+            _ => Err(bad(format!("\"{text}\" is not understood"))),
+        }
+    }
+}
+
+/// How a capture is read. `CaptureOptions::default()` follows the data set's own conventions.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CaptureOptions {
+    /// Pictures become means of k×k boxes; 1 leaves them as they are. Rows and columns that fill no box are cut off.
+    pub downscale: usize,
+    /// Held-out frames; `None` follows the data set's convention.
+    pub hold_out: Option<HoldOut>,
+    /// Frames per second; `None` takes what the capture states, else 30. Scales the clock of D-NeRF captures too.
+    pub fps: Option<f64>,
+    /// What transparent pixels are composited on, sRGB in [0,1]; `None` takes the capture's own, else white.
+    pub background: Option<[f32; 3]>,
+    /// Length in seconds of captures that count time from 0 to 1 (D-NeRF, Nerfstudio); `None`: (N − 1)/fps for N
+    /// training frames.
+    pub unit_time_seconds: Option<f64>,
+    /// Most points of the initial cloud; larger clouds are thinned by voxel.
+    pub max_points: usize,
+}
+
+/// Most points an initial cloud keeps by default.
+pub const MAX_POINTS: usize = 40_000;
+
+impl Default for CaptureOptions {
+    fn default() -> Self {
+        Self {
+            downscale: 1,
+            hold_out: None,
+            fps: None,
+            background: None,
+            unit_time_seconds: None,
+            max_points: MAX_POINTS,
+        }
+    }
+}
+
+impl CaptureOptions {
+    /// An error for values that mean nothing: downscale 0, fps ≤ 0, a background outside [0,1].
+    pub(super) fn check(&self) -> Result<()> {
+        if self.downscale == 0 {
+            return Err(Error::input("downscale is 0").remedy("Give 1 (full size) or more."));
+        }
+        for (name, value) in [("fps", self.fps), ("length in seconds", self.unit_time_seconds)] {
+            if let Some(value) = value {
+                check_rate(name, value)?;
+            }
+        }
+        if self.background.is_some_and(|b| b.iter().any(|v| !(0.0..=1.0).contains(v))) {
+            return Err(Error::input("the background is outside [0,1]").remedy("Give three numbers from 0 to 1."));
+        }
+        Ok(())
+    }
+}
+
+/// Fastest camera that is believed, frames per second; also the longest take in seconds that is.
+const MAX_RATE: f64 = 1e6;
+
+/// An error unless 0 < value ≤ 10⁶.
+pub(super) fn check_rate(name: &str, value: f64) -> Result<()> {
+    if value.is_finite() && value > 0.0 && value <= MAX_RATE {
+        return Ok(());
+    }
+    Err(Error::input(format!("the {name} is {value}")).remedy(format!("Give a number above 0, at most {MAX_RATE}.")))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn hold_out_is_read_or_explained() {
+        assert_eq!("camera=0, 10".parse::<HoldOut>().unwrap(), HoldOut::Cameras(vec!["0".into(), "10".into()]));
+        assert_eq!("every=8".parse::<HoldOut>().unwrap(), HoldOut::Every(8));
+        assert_eq!(" none ".parse::<HoldOut>().unwrap(), HoldOut::None);
+        for bad in ["", "every=1", "every=x", "camera=", "camera=a,,b", "cam=3", "8"] {
+            let message = bad.parse::<HoldOut>().unwrap_err().to_string();
+            assert!(message.contains("every=N"), "{bad}: {message}");
+        }
+    }
+}

@@ -1,0 +1,283 @@
+//! Our own `capture.json`: what a user with a rig writes by hand. docs/capture-format.md is its specification.
+
+use super::json::{self, Node};
+use super::{CaptureKind, CaptureOptions, HoldOut, RawFrame, Split, Take, ply, pose};
+use splat4d::math::Se3;
+use splat4d::scene::time::DEFAULT_FPS;
+use splat4d::scene::{Camera, Intrinsics, Lens};
+use splat4d::{Error, ErrorKind, Result};
+use std::path::{Path, PathBuf};
+
+/// The version of the format that this reader knows.
+const VERSION: usize = 1;
+const TOP_KEYS: &[&str] = &[
+    "version",
+    "name",
+    "axes",
+    "fps",
+    "start",
+    "count",
+    "cameras",
+    "hold_out",
+    "points",
+    "background",
+    "up",
+    "comment",
+    "extra",
+];
+const CAMERA_KEYS: &[&str] = &[
+    "name",
+    "width",
+    "height",
+    "fx",
+    "fy",
+    "cx",
+    "cy",
+    "distortion",
+    "world_to_camera",
+    "camera_to_world",
+    "time_offset",
+    "images",
+    "masks",
+    "start",
+    "count",
+    "comment",
+    "extra",
+];
+/// Most digits that a pattern may pad to.
+const MAX_DIGITS: usize = 32;
+
+/// Reads a `capture.json`.
+pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
+    let value = json::read(marker)?;
+    read_value(root, &Node::root(&value), options).map_err(|e| e.at(marker.display()))
+}
+
+fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<Take> {
+    let version = top.get("version")?.count()?;
+    if version != VERSION {
+        return Err(Error::new(ErrorKind::Unsupported, format!("the format version is {version}, not {VERSION}"))
+            .remedy("Write version 1, or use a newer splat4d."));
+    }
+    top.only(TOP_KEYS)?;
+    let opengl = match top.opt("axes")?.map(|a| a.text()).transpose()? {
+        None | Some("opencv") => false,
+        Some("opengl") => true,
+        Some(other) => {
+            return Err(Error::input(format!("the axes \"{other:.30}\" are not known"))
+                .remedy("Write \"opencv\" (x right, y down, z forward) or \"opengl\" (x right, y up, z backward)."));
+        }
+    };
+    let fps = match (options.fps, top.opt("fps")?) {
+        (Some(fps), _) => fps,
+        (None, Some(fps)) => fps.number()?,
+        (None, None) => DEFAULT_FPS,
+    };
+    super::options::check_rate("frame rate", fps)?;
+    let mut cameras: Vec<String> = Vec::new();
+    let mut frames = Vec::new();
+    for node in top.get("cameras")?.list()? {
+        let name = node.get("name")?.text()?.to_string();
+        if cameras.contains(&name) {
+            return Err(node.error(format!("the camera name \"{name:.80}\" is given twice")).remedy("Rename one."));
+        }
+        let context = Context { root, top, opengl, fps, camera: cameras.len() };
+        read_camera(&context, &node, &mut frames).map_err(|e| e.at(format!("camera {name:.80}")))?;
+        cameras.push(name);
+    }
+    Ok(Take {
+        name: top.opt("name")?.map(|n| n.text()).transpose()?.map(str::to_string),
+        root: root.to_path_buf(),
+        kind: CaptureKind::Own,
+        cameras,
+        frames,
+        hold_out: top.opt("hold_out")?.map(|n| read_hold_out(&n)).transpose()?,
+        fps,
+        points: top.opt("points")?.map(|n| ply::read(&root.join(n.text()?))).transpose()?,
+        background: read_background(top)?,
+        up: top.opt("up")?.map(|n| n.numbers::<3>()).transpose()?,
+        warnings: Vec::new(),
+    })
+}
+
+fn read_background(top: &Node<'_>) -> Result<Option<[f32; 3]>> {
+    let Some(node) = top.opt("background")? else { return Ok(None) };
+    let color = node.numbers::<3>()?;
+    if color.iter().any(|v| !(0.0..=1.0).contains(v)) {
+        return Err(node.error("the background is outside [0,1]").remedy("Give three numbers from 0 to 1."));
+    }
+    Ok(Some(color.map(|v| v as f32)))
+}
+
+fn read_hold_out(node: &Node<'_>) -> Result<HoldOut> {
+    if let Some(text) = node.value.as_str() {
+        return text.parse().map_err(|e| node.at(e));
+    }
+    node.only(&["cameras", "every"])?;
+    match (node.opt("cameras")?, node.opt("every")?) {
+        (Some(list), None) => {
+            let names = list.list()?.iter().map(|n| n.text().map(str::to_string)).collect::<Result<Vec<_>>>()?;
+            Ok(HoldOut::Cameras(names))
+        }
+        (None, Some(every)) => format!("every={}", every.count()?).parse().map_err(|e| node.at(e)),
+        _ => Err(node
+            .error("expected one of \"cameras\" and \"every\"")
+            .remedy("For example {\"cameras\": [\"cam00\"]}.")),
+    }
+}
+
+struct Context<'a> {
+    root: &'a Path,
+    top: &'a Node<'a>,
+    opengl: bool,
+    fps: f64,
+    camera: usize,
+}
+
+impl Context<'_> {
+    /// A camera's own value, else the one for all.
+    fn shared(&self, camera: &Node<'_>, key: &str) -> Result<Option<usize>> {
+        let own = camera.opt(key)?;
+        own.or(self.top.opt(key)?).map(|n| n.count()).transpose()
+    }
+
+    fn pose(&self, node: &Node<'_>, inverted: bool) -> Result<Se3> {
+        let rows = node.matrix4()?;
+        let mut pose = pose::checked(Se3::from_rows(&rows)).map_err(|e| node.at(e))?;
+        if inverted {
+            pose = pose.inverse();
+        }
+        if self.opengl {
+            // The camera's y and z axes point the other way: rows of world-to-camera.
+            for i in [1, 2] {
+                pose.rotation[i] = pose.rotation[i].map(|v| -v);
+                pose.translation[i] = -pose.translation[i];
+            }
+        }
+        Ok(pose)
+    }
+}
+
+fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame>) -> Result<()> {
+    node.only(CAMERA_KEYS)?;
+    let number = |key: &str| node.get(key)?.number();
+    let (width, height) = (node.get("width")?.count()?, node.get("height")?.count()?);
+    let intrinsics = Intrinsics { fx: number("fx")?, fy: number("fy")?, cx: number("cx")?, cy: number("cy")? };
+    pose::check_intrinsics(&intrinsics, width, height)?;
+    let lens = node.opt("distortion")?.map_or(Ok(Lens::Pinhole), |n| read_lens(&n))?;
+    let (poses, inverted) = match (node.opt("world_to_camera")?, node.opt("camera_to_world")?) {
+        (Some(node), None) => (node, false),
+        (None, Some(node)) => (node, true),
+        _ => {
+            return Err(node
+                .error("expected one of \"world_to_camera\" and \"camera_to_world\"")
+                .remedy("Give one 4x4 matrix (a list of rows), or a list with one matrix per frame."));
+        }
+    };
+    // A list of rows of numbers is one matrix; a list of lists of rows is one matrix per frame.
+    let moving = poses.value.pointer("/0/0").is_some_and(serde_json::Value::is_array);
+    let poses: Vec<Se3> = if moving {
+        poses.list()?.iter().map(|n| context.pose(n, inverted)).collect::<Result<_>>()?
+    } else {
+        vec![context.pose(&poses, inverted)?]
+    };
+    let offset = node.opt("time_offset")?.map_or(Ok(0.0), |n| n.number())?;
+    let start = context.shared(node, "start")?.unwrap_or(0);
+    let count = context.shared(node, "count")?;
+    let images = Files::read(&node.get("images")?)?;
+    let masks = node.opt("masks")?.map(|n| Files::read(&n)).transpose()?;
+    for index in 0..count.unwrap_or(usize::MAX) {
+        let Some(image) = images.name(context.root, start, index) else { break };
+        if !image.is_file() {
+            if count.is_none() && matches!(images, Files::Pattern { .. }) && index > 0 {
+                break;
+            }
+            return Err(Error::input(format!("the picture of frame {index} is missing"))
+                .at(image.display())
+                .remedy("Restore the file, or correct \"images\", \"start\" and \"count\"."));
+        }
+        let pose = if moving { poses.get(index) } else { poses.first() };
+        let Some(&cam_from_world) = pose else {
+            let what = format!("there are {} poses, but a picture of frame {index}", poses.len());
+            return Err(node.error(what).remedy("Give one pose per frame, or \"count\"."));
+        };
+        frames.push(RawFrame {
+            camera: context.camera,
+            source: Camera { cam_from_world, intrinsics, lens, width, height },
+            time: index as f64 / context.fps + offset,
+            index,
+            image,
+            mask: masks.as_ref().and_then(|m| m.name(context.root, start, index)),
+            split: Split::Train,
+        });
+    }
+    Ok(())
+}
+
+fn read_lens(node: &Node<'_>) -> Result<Lens> {
+    let coefficients = |key: &str, most: usize| -> Result<Vec<f64>> {
+        let Some(list) = node.opt(key)? else { return Ok(vec![0.0; most]) };
+        let mut values = list.list()?.iter().map(|n| n.number()).collect::<Result<Vec<f64>>>()?;
+        if values.len() > most {
+            return Err(list.error(format!("there are {} coefficients, more than {most}", values.len())));
+        }
+        values.resize(most, 0.0);
+        Ok(values)
+    };
+    match node.get("model")?.text()? {
+        "none" | "pinhole" => Ok(Lens::Pinhole),
+        "opencv" => {
+            node.only(&["model", "k", "p", "s"])?;
+            let (k, p, s) = (coefficients("k", 6)?, coefficients("p", 2)?, coefficients("s", 4)?);
+            Ok(Lens::Brown { k: std::array::from_fn(|i| k[i]), p: [p[0], p[1]], s: std::array::from_fn(|i| s[i]) })
+        }
+        "fisheye" => {
+            node.only(&["model", "k"])?;
+            let k = coefficients("k", 4)?;
+            Ok(Lens::Fisheye { k: std::array::from_fn(|i| k[i]) })
+        }
+        other => Err(node
+            .error(format!("the distortion model \"{other:.30}\" is not known"))
+            .remedy("Write \"opencv\" (k1..k6, p1 p2, s1..s4), \"fisheye\" (k1..k4) or \"pinhole\".")),
+    }
+}
+
+/// The files of a camera: a printf pattern or a list.
+enum Files {
+    Pattern { before: String, digits: usize, after: String },
+    List(Vec<String>),
+}
+
+impl Files {
+    fn read(node: &Node<'_>) -> Result<Self> {
+        let Some(text) = node.value.as_str() else {
+            return Ok(Self::List(node.list()?.iter().map(|n| n.text().map(str::to_string)).collect::<Result<_>>()?));
+        };
+        let bad = || {
+            node.error(format!("\"{text:.200}\" is no file pattern")).remedy(
+                "Write the frame number as %d or, padded with zeros, %04d; for example \"images/cam00/%04d.png\".",
+            )
+        };
+        let (before, rest) = text.split_once('%').ok_or_else(bad)?;
+        let (digits, after) = rest.split_once('d').ok_or_else(bad)?;
+        let digits = match digits.strip_prefix('0') {
+            Some(n) => n.parse().map_err(|_| bad())?,
+            None if digits.is_empty() => 0,
+            None => return Err(bad()),
+        };
+        if digits > MAX_DIGITS || after.contains('%') {
+            return Err(bad());
+        }
+        Ok(Self::Pattern { before: before.into(), digits, after: after.into() })
+    }
+
+    fn name(&self, root: &Path, start: usize, index: usize) -> Option<PathBuf> {
+        match self {
+            Self::List(names) => names.get(index).map(|n| root.join(n)),
+            Self::Pattern { before, digits, after } => {
+                let number = start.checked_add(index)?;
+                Some(root.join(format!("{before}{number:0digits$}{after}")))
+            }
+        }
+    }
+}

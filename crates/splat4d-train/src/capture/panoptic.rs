@@ -1,0 +1,100 @@
+//! PanopticSports captures (Luiten 2024): `train_meta.json`, `test_meta.json`, `ims/`, `seg/`; fixed cameras, OpenCV
+//! axes, world to camera.
+
+use super::json::{self, Node};
+use super::{CaptureKind, CaptureOptions, RawFrame, Split, Take, ply, rig};
+use splat4d::Result;
+use splat4d::math::Se3;
+use splat4d::scene::time::DEFAULT_FPS;
+use splat4d::scene::{Camera, Intrinsics, Lens};
+use std::path::Path;
+
+/// Upwards in the studio.
+const UP: [f64; 3] = [0.0, -1.0, 0.0];
+
+/// Reads both files; the cameras of `test_meta.json` are held out.
+pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
+    let fps = options.fps.unwrap_or(DEFAULT_FPS);
+    let mut found: Vec<(usize, RawFrame)> = Vec::new();
+    let test = root.join("test_meta.json");
+    for (path, split) in [(marker, Split::Train), (&test, Split::Held)] {
+        if path.exists() {
+            let value = json::read(path)?;
+            read_meta(root, &Node::root(&value), split, fps, &mut found).map_err(|e| e.at(path.display()))?;
+        }
+    }
+    let mut ids: Vec<usize> = found.iter().map(|(id, _)| *id).collect();
+    ids.sort_unstable();
+    ids.dedup();
+    for (id, frame) in &mut found {
+        frame.camera = ids.partition_point(|i| i < id);
+    }
+    found.sort_by_key(|(_, f)| (f.camera, f.index));
+    let mut warnings = Vec::new();
+    let points = read_points(root, &mut warnings)?;
+    Ok(Take {
+        name: None,
+        root: root.to_path_buf(),
+        kind: CaptureKind::Panoptic,
+        cameras: ids.iter().map(ToString::to_string).collect(),
+        frames: found.into_iter().map(|(_, f)| f).collect(),
+        hold_out: None,
+        fps,
+        points,
+        background: None,
+        up: Some(UP),
+        warnings,
+    })
+}
+
+fn read_meta(root: &Path, top: &Node<'_>, split: Split, fps: f64, out: &mut Vec<(usize, RawFrame)>) -> Result<()> {
+    let (width, height) = (top.get("w")?.count()?, top.get("h")?.count()?);
+    let columns = ["k", "w2c", "fn", "cam_id"].map(|key| top.get(key).and_then(|n| n.list()));
+    let [k, w2c, names, ids] = columns;
+    let (k, w2c, names, ids) = (k?, w2c?, names?, ids?);
+    if [w2c.len(), names.len(), ids.len()].iter().any(|&n| n != k.len()) {
+        return Err(top.error("the lists k, w2c, fn and cam_id are not equally long").remedy("Export the file again."));
+    }
+    for t in 0..k.len() {
+        let (k, w2c, names, ids) = (k[t].list()?, w2c[t].list()?, names[t].list()?, ids[t].list()?);
+        if [w2c.len(), names.len(), ids.len()].iter().any(|&n| n != k.len()) {
+            let what = format!("at instant {t} the lists k, w2c, fn and cam_id are not equally long");
+            return Err(top.error(what).remedy("Export the file again."));
+        }
+        for c in 0..k.len() {
+            let m = k[c].matrix3()?;
+            let name = names[c].text()?;
+            let mask = Path::new("seg").join(name).with_extension("png");
+            let source = Camera {
+                cam_from_world: Se3::from_rows(&w2c[c].matrix4()?),
+                intrinsics: Intrinsics { fx: m[0][0], fy: m[1][1], cx: m[0][2], cy: m[1][2] },
+                lens: Lens::Pinhole,
+                width,
+                height,
+            };
+            let mask = Some(root.join(mask)).filter(|m| m.is_file());
+            let image = root.join("ims").join(name);
+            let raw = RawFrame { camera: 0, source, time: t as f64 / fps, index: t, image, mask, split };
+            out.push((ids[c].count()?, raw));
+        }
+    }
+    Ok(())
+}
+
+/// The cloud: any .ply beside the metadata, `points3d_f0_sift.ply` first.
+fn read_points(root: &Path, warnings: &mut Vec<String>) -> Result<Option<super::PointCloud>> {
+    let names = rig::file_names(root);
+    let plys: Vec<&String> = names.iter().filter(|n| n.to_ascii_lowercase().ends_with(".ply")).collect();
+    let chosen =
+        plys.iter().find(|n| n.as_str() == "points3d_f0_sift.ply").or(plys.first().filter(|_| plys.len() == 1));
+    if chosen.is_none() {
+        if plys.len() > 1 {
+            warnings.push("Several .ply files lie beside train_meta.json; none is used as the initial cloud.".into());
+        } else if names.iter().any(|n| n == "init_pt_cld.npz") {
+            warnings.push(
+                "init_pt_cld.npz is not read: convert it to a .ply beside train_meta.json to start from it.".into(),
+            );
+        }
+    }
+    chosen.map(|name| ply::read(&root.join(name))).transpose()
+}

@@ -1,0 +1,221 @@
+//! Picture files: headers without pixels, and upright pixels in planes. JPEG, PNG and WebP; EXIF orientation honoured.
+
+use super::{json, pose};
+use image::metadata::Orientation;
+use image::{DynamicImage, ImageDecoder, ImageReader};
+use splat4d::scene::Camera;
+use splat4d::{Error, Result};
+use std::io::Cursor;
+use std::path::Path;
+use zune_core::colorspace::ColorSpace;
+use zune_core::options::DecoderOptions;
+use zune_jpeg::JpegDecoder;
+
+/// What a header tells.
+pub(super) struct Header {
+    /// Pixels across, upright.
+    pub width: usize,
+    /// Pixels down, upright.
+    pub height: usize,
+    /// Whether there is an alpha channel.
+    pub alpha: bool,
+}
+
+/// Decoded samples.
+#[derive(Debug, PartialEq)]
+pub(super) enum Samples {
+    /// 8 bits a sample.
+    Eight(Vec<u8>),
+    /// 16 bits a sample.
+    Sixteen(Vec<u16>),
+}
+
+/// An upright decoded picture.
+pub(super) struct Raster {
+    /// Pixels across.
+    pub width: usize,
+    /// Pixels down.
+    pub height: usize,
+    /// 1 grey, 2 grey and alpha, 3 RGB, 4 RGB and alpha.
+    pub channels: usize,
+    /// width·height·channels samples.
+    pub samples: Samples,
+}
+
+impl Raster {
+    /// One sample in [0,1].
+    pub fn get(&self, pixel: usize, channel: usize) -> f32 {
+        let i = pixel * self.channels + channel;
+        match &self.samples {
+            Samples::Eight(s) => f32::from(s[i]) / 255.0,
+            Samples::Sixteen(s) => f32::from(s[i]) / 65535.0,
+        }
+    }
+
+    /// The channel that holds alpha.
+    pub fn alpha(&self) -> Option<usize> {
+        (self.channels % 2 == 0).then(|| self.channels - 1)
+    }
+}
+
+fn is_jpeg(bytes: &[u8]) -> bool {
+    bytes.starts_with(&[0xFF, 0xD8])
+}
+
+fn broken(path: &Path, detail: impl std::fmt::Display) -> Error {
+    Error::input(format!("the picture is damaged, truncated or of another format than JPEG, PNG and WebP ({detail})"))
+        .at(path.display())
+        .remedy("Copy or extract it again, or take the frame out of the capture.")
+}
+
+/// Reads size and channels without decoding pixels.
+pub(super) fn header(path: &Path) -> Result<Header> {
+    let bytes = json::read_bytes(path)?;
+    let (width, height, alpha, orientation) = if is_jpeg(&bytes) {
+        let mut decoder = JpegDecoder::new(Cursor::new(bytes.as_slice()));
+        decoder.decode_headers().map_err(|e| broken(path, e))?;
+        let info = decoder.info().ok_or_else(|| broken(path, "no header"))?;
+        let orientation = decoder.exif().and_then(|e| Orientation::from_exif_chunk(e));
+        (usize::from(info.width), usize::from(info.height), false, orientation)
+    } else {
+        let mut decoder = open(&bytes, path)?;
+        let (width, height) = decoder.dimensions();
+        let orientation = decoder.orientation().ok();
+        (width as usize, height as usize, decoder.color_type().has_alpha(), orientation)
+    };
+    let turned = swaps_sides(orientation.unwrap_or(Orientation::NoTransforms));
+    let (width, height) = if turned { (height, width) } else { (width, height) };
+    Ok(Header { width, height, alpha })
+}
+
+fn swaps_sides(orientation: Orientation) -> bool {
+    use Orientation::{Rotate90, Rotate90FlipH, Rotate270, Rotate270FlipH};
+    matches!(orientation, Rotate90 | Rotate270 | Rotate90FlipH | Rotate270FlipH)
+}
+
+fn open<'a>(bytes: &'a [u8], path: &Path) -> Result<impl ImageDecoder + 'a> {
+    let reader = ImageReader::new(Cursor::new(bytes)).with_guessed_format().map_err(|e| broken(path, e))?;
+    reader.into_decoder().map_err(|e| broken(path, e))
+}
+
+/// An error unless a picture of `size` is what its camera describes.
+pub(super) fn check_size(path: &Path, size: (usize, usize), camera: &Camera) -> Result<()> {
+    if size == (camera.width, camera.height) {
+        return Ok(());
+    }
+    let what = format!(
+        "the picture is {}x{}, but its camera's intrinsics are for {}x{}",
+        size.0, size.1, camera.width, camera.height
+    );
+    Err(Error::input(what).at(path.display()).remedy(
+        "Give the intrinsics of the pictures as they are stored (upright, after EXIF rotation), or resize the pictures.",
+    ))
+}
+
+/// Decodes a picture, upright. Fails before any large allocation if its size is impossible or, where given, not
+/// `expected`.
+pub(super) fn decode(path: &Path, expected: Option<&Camera>) -> Result<Raster> {
+    let bytes = json::read_bytes(path)?;
+    if is_jpeg(&bytes) { decode_jpeg(&bytes, path, expected) } else { decode_other(&bytes, path, expected) }
+}
+
+fn admit(path: &Path, size: (usize, usize), turned: bool, expected: Option<&Camera>) -> Result<()> {
+    let size = if turned { (size.1, size.0) } else { size };
+    match expected {
+        Some(camera) => check_size(path, size, camera),
+        None => pose::check_size(size.0, size.1).map_err(|e| e.at(path.display())),
+    }
+}
+
+fn decode_jpeg(bytes: &[u8], path: &Path, expected: Option<&Camera>) -> Result<Raster> {
+    if !jpeg_ends(bytes) {
+        return Err(broken(path, "the end-of-image mark is missing"));
+    }
+    let options = DecoderOptions::default()
+        .set_max_width(pose::MAX_SIDE)
+        .set_max_height(pose::MAX_SIDE)
+        .jpeg_set_out_colorspace(ColorSpace::RGB);
+    let mut decoder = JpegDecoder::new_with_options(Cursor::new(bytes), options);
+    decoder.decode_headers().map_err(|e| broken(path, e))?;
+    let info = decoder.info().ok_or_else(|| broken(path, "no header"))?;
+    let orientation = decoder.exif().and_then(|e| Orientation::from_exif_chunk(e));
+    let orientation = orientation.unwrap_or(Orientation::NoTransforms);
+    let (width, height) = (usize::from(info.width), usize::from(info.height));
+    admit(path, (width, height), swaps_sides(orientation), expected)?;
+    let pixels = decoder.decode().map_err(|e| broken(path, e))?;
+    let buffer = image::RgbImage::from_raw(width as u32, height as u32, pixels);
+    let picture = buffer.ok_or_else(|| broken(path, "fewer pixels than its header says"))?;
+    Ok(upright(DynamicImage::ImageRgb8(picture), orientation))
+}
+
+/// Whether a JPEG's data is followed by its end mark. The decoder fills what is missing with grey, so that a truncated
+/// file would pass unnoticed. Inside the data FF is always followed by 00 or a restart mark, so FF D9 is the end.
+fn jpeg_ends(bytes: &[u8]) -> bool {
+    const START_OF_SCAN: u8 = 0xDA;
+    let mut at = 2;
+    while at + 4 <= bytes.len() {
+        if bytes[at] != 0xFF {
+            // Not a marker: leave the verdict to the decoder, and look for the end from here.
+            break;
+        }
+        let marker = bytes[at + 1];
+        if marker == 0xFF {
+            at += 1;
+            continue;
+        }
+        if marker == START_OF_SCAN {
+            break;
+        }
+        at += 2 + usize::from(u16::from_be_bytes([bytes[at + 2], bytes[at + 3]]));
+    }
+    bytes.get(at..).is_some_and(|rest| rest.windows(2).any(|w| w == [0xFF, 0xD9]))
+}
+
+fn decode_other(bytes: &[u8], path: &Path, expected: Option<&Camera>) -> Result<Raster> {
+    let mut decoder = open(bytes, path)?;
+    let (width, height) = decoder.dimensions();
+    let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
+    admit(path, (width as usize, height as usize), swaps_sides(orientation), expected)?;
+    let picture = DynamicImage::from_decoder(decoder).map_err(|e| broken(path, e))?;
+    Ok(upright(picture, orientation))
+}
+
+fn upright(mut picture: DynamicImage, orientation: Orientation) -> Raster {
+    picture.apply_orientation(orientation);
+    let (width, height) = (picture.width() as usize, picture.height() as usize);
+    let (channels, samples) = match picture {
+        DynamicImage::ImageLuma8(p) => (1, Samples::Eight(p.into_raw())),
+        DynamicImage::ImageLumaA8(p) => (2, Samples::Eight(p.into_raw())),
+        DynamicImage::ImageRgb8(p) => (3, Samples::Eight(p.into_raw())),
+        DynamicImage::ImageRgba8(p) => (4, Samples::Eight(p.into_raw())),
+        DynamicImage::ImageLuma16(p) => (1, Samples::Sixteen(p.into_raw())),
+        DynamicImage::ImageLumaA16(p) => (2, Samples::Sixteen(p.into_raw())),
+        DynamicImage::ImageRgb16(p) => (3, Samples::Sixteen(p.into_raw())),
+        DynamicImage::ImageRgba16(p) => (4, Samples::Sixteen(p.into_raw())),
+        other => (4, Samples::Sixteen(other.into_rgba16().into_raw())),
+    };
+    Raster { width, height, channels, samples }
+}
+
+/// A mask's values in [0,1], one per pixel, from the alpha channel if `use_alpha`, else from the first channel.
+///
+/// Some tools write masks of zeros and ones into 8 bits: where no value is above 1, one counts as white.
+pub(super) fn mask_values(raster: &Raster, use_alpha: bool) -> Vec<f32> {
+    let channel = if use_alpha { raster.alpha().unwrap_or(0) } else { 0 };
+    let n = raster.width * raster.height;
+    let ones = match &raster.samples {
+        Samples::Eight(s) => !use_alpha && (0..n).all(|p| s[p * raster.channels] <= 1),
+        Samples::Sixteen(_) => false,
+    };
+    let scale = if ones { 255.0 } else { 1.0 };
+    (0..n).map(|p| scale * raster.get(p, channel)).collect()
+}
+
+/// Whether a mask (or, with `use_alpha`, a picture's alpha channel) shows anything. Pictures without alpha do.
+pub(super) fn any_foreground(path: &Path, use_alpha: bool) -> Result<bool> {
+    let raster = decode(path, None)?;
+    if use_alpha && raster.alpha().is_none() {
+        return Ok(true);
+    }
+    Ok(mask_values(&raster, use_alpha).iter().any(|&v| v > 0.0))
+}

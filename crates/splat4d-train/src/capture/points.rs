@@ -1,0 +1,103 @@
+//! Initial point clouds.
+
+use std::collections::BTreeMap;
+
+/// Coloured points, some with the time at which they were seen.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct PointCloud {
+    /// World positions.
+    pub points: Vec<[f64; 3]>,
+    /// sRGB in [0,1], one per point.
+    pub colors: Vec<[f32; 3]>,
+    /// Seconds, one per point; `None` where the point was not seen at one time.
+    pub times: Vec<Option<f64>>,
+}
+
+/// Cells along the longest side of the finest voxel grid that is tried: finer than any cloud resolves, and three cell
+/// numbers still fit one 64-bit key.
+const MAX_CELLS: f64 = (1u64 << 20) as f64;
+/// Bisection steps for the voxel size; each halves an interval of 20 octaves.
+const STEPS: usize = 24;
+
+impl PointCloud {
+    /// Thins the cloud to at most `max_points`: the finest voxel grid that leaves few enough cells, and the mean of
+    /// position and colour in each. The same cloud always gives the same result; small clouds come back unchanged.
+    /// Points of different time stay apart (a cell holds one time, taken from its first point, per time value).
+    pub fn voxel_downsample(&self, max_points: usize) -> Self {
+        let n = self.points.len();
+        if n <= max_points || max_points == 0 {
+            return if max_points == 0 { Self::default() } else { self.clone() };
+        }
+        let mut low = [f64::INFINITY; 3];
+        let mut high = [f64::NEG_INFINITY; 3];
+        for p in &self.points {
+            for k in 0..3 {
+                low[k] = low[k].min(p[k]);
+                high[k] = high[k].max(p[k]);
+            }
+        }
+        let side = (0..3).map(|k| high[k] - low[k]).fold(0.0, f64::max).max(f64::MIN_POSITIVE);
+        // log2 of the number of cells along the longest side. At 0 one cell per time is left.
+        let (mut coarse, mut fine) = (0.0, MAX_CELLS.log2());
+        for _ in 0..STEPS {
+            let middle: f64 = 0.5 * (coarse + fine);
+            let cells = self.cells(low, middle.exp2() / side);
+            *(if cells.len() <= max_points { &mut coarse } else { &mut fine }) = middle;
+        }
+        let cells = self.cells(low, f64::exp2(coarse) / side);
+        let mut out = Self::default();
+        // More distinct times than points are asked for: no voxel size helps, so every n-th cell is kept.
+        let stride = cells.len().div_ceil(max_points);
+        for members in cells.values().step_by(stride) {
+            let weight = 1.0 / members.len() as f64;
+            let mut point = [0.0; 3];
+            let mut color = [0.0; 3];
+            for &i in members {
+                for k in 0..3 {
+                    point[k] += weight * self.points[i][k];
+                    color[k] += weight * f64::from(self.colors[i][k]);
+                }
+            }
+            out.points.push(point);
+            out.colors.push(color.map(|c| c as f32));
+            out.times.push(self.times[members[0]]);
+        }
+        out
+    }
+
+    /// Members of every occupied cell; cells of one time only.
+    fn cells(&self, low: [f64; 3], per_unit: f64) -> BTreeMap<(u64, Option<u64>), Vec<usize>> {
+        let mut cells: BTreeMap<(u64, Option<u64>), Vec<usize>> = BTreeMap::new();
+        for (i, p) in self.points.iter().enumerate() {
+            let cell = |k: usize| ((p[k] - low[k]) * per_unit).clamp(0.0, MAX_CELLS) as u64;
+            let key = (cell(0) << 42) | (cell(1) << 21) | cell(2);
+            cells.entry((key, self.times[i].map(f64::to_bits))).or_default().push(i);
+        }
+        cells
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use splat4d::math::Rng;
+
+    #[test]
+    fn thinning_keeps_the_cap_and_the_shape() {
+        let rng = Rng::new(5, "cloud", 0);
+        let mut cloud = PointCloud::default();
+        for i in 0..5000u64 {
+            cloud.points.push([rng.uniform(3 * i), 2.0 * rng.uniform(3 * i + 1), 0.1 * rng.uniform(3 * i + 2)]);
+            cloud.colors.push([0.25; 3]);
+            cloud.times.push(None);
+        }
+        let thin = cloud.voxel_downsample(700);
+        assert!((500..=700).contains(&thin.points.len()), "{}", thin.points.len());
+        assert!(thin.points.iter().all(|p| (0.0..=1.0).contains(&p[0]) && (0.0..=2.0).contains(&p[1])));
+        assert!(thin.colors.iter().all(|c| (c[0] - 0.25).abs() < 1e-6));
+        assert_eq!(thin, cloud.voxel_downsample(700));
+        assert_eq!(cloud.voxel_downsample(5000), cloud);
+        cloud.times = (0..5000).map(|i| Some(f64::from(i))).collect();
+        assert!(cloud.voxel_downsample(700).points.len() <= 700, "many times must not break the cap");
+    }
+}

@@ -1,0 +1,113 @@
+//! Poses as data sets write them, checked and brought to `cam_from_world` in OpenCV axes.
+
+use splat4d::math::Se3;
+use splat4d::math::se3::{mat_mul, transpose};
+use splat4d::scene::Intrinsics;
+use splat4d::{Error, Result};
+
+/// Largest |R Rᵀ − I| of a rotation that is accepted: poses typed with three decimals stay below it, scaled or sheared
+/// ones do not.
+const MAX_SHEAR: f64 = 0.02;
+/// Newton-Schulz steps that make an accepted matrix a rotation: the error squares with each, 0.02 → 1e-15 in three.
+const POLAR_STEPS: usize = 4;
+/// Longest side of a picture, pixels: twice the largest sensors in use.
+pub(super) const MAX_SIDE: usize = 1 << 15;
+/// Most pixels of a picture (134 million): decoding one takes below 1 GiB.
+pub(super) const MAX_PIXELS: usize = 1 << 27;
+
+/// Checks that `pose` is a rigid motion and removes rounding from its rotation.
+pub(super) fn checked(pose: Se3) -> Result<Se3> {
+    let finite = pose.rotation.iter().flatten().chain(&pose.translation).all(|x| x.is_finite());
+    if !finite {
+        return Err(Error::input("the pose holds NaN or infinity")
+            .remedy("Calibrate that camera again or leave its frames out."));
+    }
+    if pose.det() < 0.0 {
+        return Err(Error::input("the pose is mirrored (its rotation has determinant −1)").remedy(
+            "One axis has the wrong sign: check whether the file's axes are OpenCV (x right, y down, z forward) or \
+             OpenGL (y up, z backward), and that no two axes are exchanged.",
+        ));
+    }
+    let shear = pose.orthogonality_error();
+    if shear > MAX_SHEAR {
+        return Err(Error::input(format!("the pose is no rigid motion (its rotation is off by {shear:.3})"))
+            .remedy("Remove scale and shear from the matrix, and write it row by row with at least four decimals."));
+    }
+    Ok(Se3 { rotation: nearest_rotation(pose.rotation), ..pose })
+}
+
+/// R ← R (3 I − Rᵀ R) / 2, the Newton-Schulz iteration for the orthogonal polar factor.
+fn nearest_rotation(mut r: [[f64; 3]; 3]) -> [[f64; 3]; 3] {
+    for _ in 0..POLAR_STEPS {
+        let gram = mat_mul(&transpose(&r), &r);
+        let step: [[f64; 3]; 3] =
+            std::array::from_fn(|i| std::array::from_fn(|j| 1.5 * f64::from(u8::from(i == j)) - 0.5 * gram[i][j]));
+        r = mat_mul(&r, &step);
+    }
+    r
+}
+
+/// `cam_from_world` from a camera-to-world matrix in OpenGL axes (x right, y up, z backward), as NeRF data has it.
+pub(super) fn from_opengl(m: &[[f64; 4]; 4]) -> Result<Se3> {
+    let mut world_from_cam = Se3::from_rows(m);
+    for row in &mut world_from_cam.rotation {
+        row[1] = -row[1];
+        row[2] = -row[2];
+    }
+    Ok(checked(world_from_cam)?.inverse())
+}
+
+/// Checks focal lengths, principal point and size.
+pub(super) fn check_intrinsics(k: &Intrinsics, width: usize, height: usize) -> Result<()> {
+    let [fx, fy] = [k.fx, k.fy];
+    if !(fx.is_finite() && fy.is_finite() && fx > 0.0 && fy > 0.0) {
+        return Err(Error::input(format!("the focal length is {fx} x {fy}"))
+            .remedy("Give focal lengths in pixels, above zero."));
+    }
+    if !(k.cx.is_finite() && k.cy.is_finite()) {
+        return Err(Error::input(format!("the principal point is {} {}", k.cx, k.cy))
+            .remedy("Give it in pixels; the middle of the image is width/2, height/2."));
+    }
+    check_size(width, height)
+}
+
+/// Checks that a picture of this size can be handled at all.
+pub(super) fn check_size(width: usize, height: usize) -> Result<()> {
+    let fits = (1..=MAX_SIDE).contains(&width) && (1..=MAX_SIDE).contains(&height) && width * height <= MAX_PIXELS;
+    if fits {
+        return Ok(());
+    }
+    Err(Error::input(format!("the image size {width}x{height} is not possible"))
+        .remedy(format!("Sides must be 1 to {MAX_SIDE} pixels, at most {MAX_PIXELS} in all.")))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bad_poses_are_named_and_rounded_ones_repaired() {
+        let good = Se3::look_at([1.0, 2.0, 3.0], [0.0; 3], [0.0, 0.0, 1.0]);
+        let mut rounded = good;
+        rounded.rotation.iter_mut().flatten().for_each(|x| *x = (*x * 1e3).round() / 1e3);
+        assert!(rounded.orthogonality_error() > 1e-5);
+        assert!(checked(rounded).unwrap().orthogonality_error() < 1e-13);
+        let mut mirrored = good;
+        mirrored.rotation[0] = mirrored.rotation[0].map(|x| -x);
+        assert!(checked(mirrored).unwrap_err().to_string().contains("mirrored"));
+        let mut scaled = good;
+        scaled.rotation.iter_mut().flatten().for_each(|x| *x *= 2.0);
+        assert!(checked(scaled).unwrap_err().to_string().contains("no rigid motion"));
+        let mut nan = good;
+        nan.translation[1] = f64::NAN;
+        assert!(checked(nan).unwrap_err().to_string().contains("NaN"));
+    }
+
+    #[test]
+    fn opengl_camera_at_the_origin_looks_along_minus_z() {
+        let identity: [[f64; 4]; 4] = std::array::from_fn(|i| std::array::from_fn(|j| f64::from(u8::from(i == j))));
+        let pose = from_opengl(&identity).unwrap();
+        let p = pose.apply([0.1, 0.2, -3.0]);
+        assert!((p[0] - 0.1).abs() < 1e-12 && (p[1] + 0.2).abs() < 1e-12 && (p[2] - 3.0).abs() < 1e-12);
+    }
+}

@@ -1,0 +1,183 @@
+//! What to tell a user before hours of training: few cameras, narrow coverage, uneven clocks.
+
+use super::{Capture, Frame};
+use splat4d::math::se3::{dot, norm, normalize, sub};
+
+/// How bad a [`Finding`] is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Severity {
+    /// Worth knowing.
+    Note,
+    /// The result will probably suffer.
+    Warning,
+}
+
+/// Something about a capture that will show in the result.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Finding {
+    /// How bad it is.
+    pub severity: Severity,
+    /// What was found, a sentence.
+    pub what: String,
+    /// What to do about it, a sentence.
+    pub remedy: String,
+}
+
+/// Below this many views of an instant, surfaces are not pinned down between them.
+const FEW_CAMERAS: usize = 6;
+/// Narrower rigs see little parallax, degrees.
+const NARROW_DEGREES: f64 = 20.0;
+/// Gaps between instants may differ by this factor before the clock is called uneven.
+const UNEVEN: f64 = 1.5;
+/// Angle and relative distance below which two cameras add little to each other.
+const CLOSE_DEGREES: f64 = 0.5;
+
+impl Capture {
+    /// Looks for what commonly spoils results. Cheap: opens no picture.
+    pub fn preflight(&self) -> Vec<Finding> {
+        let mut findings = Vec::new();
+        for warning in &self.warnings {
+            findings.push(finding(Severity::Warning, warning.clone(), "See the capture's documentation."));
+        }
+        let views = self.training_views();
+        self.check_views(&views, &mut findings);
+        self.check_clock(&mut findings);
+        self.check_completeness(&mut findings);
+        if self.points.is_none() {
+            findings.push(finding(
+                Severity::Note,
+                "The capture has no initial points: training starts from random ones.".into(),
+                "A sparse cloud (COLMAP, or any coloured .ply) gives a better start.",
+            ));
+        }
+        if self.held.is_empty() {
+            findings.push(finding(
+                Severity::Note,
+                "No frame is held out: quality on new views cannot be measured.".into(),
+                "Hold out a camera (camera=0) or every 8th image (every=8).",
+            ));
+        }
+        findings
+    }
+
+    /// One frame per fixed training camera; all training frames of moving ones.
+    fn training_views(&self) -> Vec<&Frame> {
+        let mut seen = vec![false; self.cameras.len()];
+        let frames = self.train.iter().map(|&i| &self.frames[i]);
+        frames.filter(|f| !(self.cameras[f.camera].fixed && std::mem::replace(&mut seen[f.camera], true))).collect()
+    }
+
+    fn check_views(&self, views: &[&Frame], findings: &mut Vec<Finding>) {
+        if !self.fixed_cameras() {
+            return;
+        }
+        if views.len() < FEW_CAMERAS {
+            findings.push(finding(
+                Severity::Warning,
+                format!("Only {} cameras see the scene: extrapolated views are unreliable.", views.len()),
+                "Judge the result near the recorded views, or add cameras (six or more all round the scene).",
+            ));
+        }
+        let target = look_at(views);
+        let rays: Vec<[f64; 3]> = views.iter().map(|f| normalize(sub(f.view.center(), target))).collect();
+        let mut widest: f64 = 0.0;
+        let mut closest: Option<(f64, usize, usize)> = None;
+        for (i, a) in rays.iter().enumerate() {
+            for (j, b) in rays.iter().enumerate().skip(i + 1) {
+                let angle = dot(*a, *b).clamp(-1.0, 1.0).acos().to_degrees();
+                widest = widest.max(angle);
+                if closest.is_none_or(|c| angle < c.0) {
+                    closest = Some((angle, i, j));
+                }
+            }
+        }
+        if widest < NARROW_DEGREES && views.len() > 1 {
+            findings.push(finding(
+                Severity::Warning,
+                format!("The cameras cover only {widest:.0}° around the scene: depth is poorly determined."),
+                "Spread the cameras, or expect good pictures only between them.",
+            ));
+        }
+        if let Some((angle, i, j)) = closest.filter(|c| c.0 < CLOSE_DEGREES) {
+            let name = |i: usize| &self.cameras[views[i].camera].name;
+            findings.push(finding(
+                Severity::Note,
+                format!("Cameras {} and {} see the scene from directions only {angle:.2}° apart.", name(i), name(j)),
+                "Check that their poses are not copies of one another.",
+            ));
+        }
+    }
+
+    fn check_clock(&self, findings: &mut Vec<Finding>) {
+        let times = self.times();
+        let gaps: Vec<f64> = times.windows(2).map(|w| w[1] - w[0]).collect();
+        let (low, high) = gaps.iter().fold((f64::INFINITY, 0.0f64), |(l, h), &g| (l.min(g), h.max(g)));
+        if !self.fixed_cameras() || gaps.len() < 2 || high <= UNEVEN * low {
+            return;
+        }
+        findings.push(finding(
+            Severity::Note,
+            format!("The instants are unevenly spaced: gaps from {low:.4} s to {high:.4} s."),
+            "Check frame numbers and time offsets; missing frames and unsynchronised cameras blur fast motion.",
+        ));
+    }
+
+    fn check_completeness(&self, findings: &mut Vec<Finding>) {
+        let mut counts = vec![0usize; self.cameras.len()];
+        self.frames.iter().for_each(|f| counts[f.camera] += 1);
+        let most = counts.iter().copied().max().unwrap_or(0);
+        let short: Vec<String> = (0..counts.len())
+            .filter(|&c| counts[c] < most)
+            .map(|c| format!("{} ({})", self.cameras[c].name, counts[c]))
+            .collect();
+        if !short.is_empty() {
+            findings.push(finding(
+                Severity::Note,
+                format!("Some cameras have fewer than {most} frames: {}.", short.join(", ")),
+                "Check that no frames were lost when they were extracted.",
+            ));
+        }
+    }
+}
+
+fn finding(severity: Severity, what: String, remedy: &str) -> Finding {
+    Finding { severity, what, remedy: remedy.into() }
+}
+
+/// The point nearest to all optical axes (least squares); the cameras' centroid moved ahead if they are parallel.
+fn look_at(views: &[&Frame]) -> [f64; 3] {
+    let mut matrix = [[0.0f64; 3]; 3];
+    let mut right = [0.0f64; 3];
+    let mut center = [0.0; 3];
+    for frame in views {
+        let (c, d) = (frame.view.center(), frame.view.forward());
+        for i in 0..3 {
+            center[i] += c[i] / views.len() as f64;
+            for j in 0..3 {
+                let m = f64::from(u8::from(i == j)) - d[i] * d[j];
+                matrix[i][j] += m;
+                right[i] += m * c[j];
+            }
+        }
+    }
+    solve(matrix, right).unwrap_or_else(|| {
+        let ahead = views.first().map_or([0.0, 0.0, 1.0], |f| f.view.forward());
+        let reach = views.iter().map(|f| norm(sub(f.view.center(), center))).fold(1.0, f64::max);
+        std::array::from_fn(|k| center[k] + 3.0 * reach * ahead[k])
+    })
+}
+
+/// Cramer's rule; `None` for a matrix that is nearly singular.
+fn solve(m: [[f64; 3]; 3], b: [f64; 3]) -> Option<[f64; 3]> {
+    let det = |a: &[[f64; 3]; 3]| dot(a[0], splat4d::math::se3::cross(a[1], a[2]));
+    let d = det(&m);
+    let scale = m.iter().flatten().fold(0.0f64, |s, v| s.max(v.abs()));
+    if !(d.abs() > 1e-9 * scale.powi(3)) {
+        return None;
+    }
+    Some(std::array::from_fn(|k| {
+        let mut replaced = m;
+        (0..3).for_each(|i| replaced[i][k] = b[i]);
+        det(&replaced) / d
+    }))
+}

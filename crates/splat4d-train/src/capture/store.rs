@@ -1,0 +1,415 @@
+//! Pictures on demand: decoded, composited, undistorted and downscaled, in a byte budget shared by all threads.
+//!
+//! A picture is a pure function of its files and the capture's options, so neither the order of loads nor the prefetch
+//! thread nor eviction can change a result. Plain 8-bit pictures stay 8 bits a sample, exactly as in the file; whatever
+//! was composited, resampled or averaged is kept in 16 bits, whose rounding (1/131070) is far below the half 8-bit step
+//! (1/510) that an 8-bit copy would lose, at half the memory of f32.
+
+use super::lens::Distortion;
+use super::picture::{self, Raster, Samples};
+use super::{Capture, Frame};
+use rayon::prelude::*;
+use splat4d::Result;
+use splat4d::scene::{Camera, Planes};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::path::Path;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard};
+use std::thread::JoinHandle;
+
+/// A loaded picture in floating point.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Picture {
+    /// [3, height, width] sRGB values in [0,1], composited on the capture's background.
+    pub color: Planes<f32>,
+    /// [1, height, width] foreground weight in [0,1], from the mask file, else from the picture's alpha.
+    pub mask: Option<Planes<f32>>,
+    /// [1, height, width] part of the pixel that the original picture covers, where undistortion left borders. Colour
+    /// there is meaningless; losses and measurements must leave those pixels out.
+    pub valid: Option<Planes<f32>>,
+}
+
+/// A loaded picture as it is kept: planes of 8 or 16 bits.
+#[derive(Debug, PartialEq)]
+pub struct StoredPicture {
+    width: usize,
+    height: usize,
+    color: Samples,
+    mask: Option<Vec<u8>>,
+    valid: Option<Vec<u8>>,
+}
+
+impl StoredPicture {
+    /// Pixels across and down.
+    pub fn size(&self) -> (usize, usize) {
+        (self.width, self.height)
+    }
+
+    /// Bytes of the samples.
+    pub fn bytes(&self) -> usize {
+        let color = match &self.color {
+            Samples::Eight(s) => s.len(),
+            Samples::Sixteen(s) => 2 * s.len(),
+        };
+        color + [&self.mask, &self.valid].into_iter().flatten().map(Vec::len).sum::<usize>()
+    }
+
+    /// Writes the colour as [3, height, width] sRGB values in [0,1], reusing `out`'s memory.
+    pub fn color_into(&self, out: &mut Planes<f32>) {
+        out.reset(3, self.height, self.width);
+        match &self.color {
+            Samples::Eight(s) => out.data.iter_mut().zip(s).for_each(|(o, &v)| *o = f32::from(v) / 255.0),
+            Samples::Sixteen(s) => out.data.iter_mut().zip(s).for_each(|(o, &v)| *o = f32::from(v) / 65535.0),
+        }
+    }
+
+    /// Writes the mask as [1, height, width] in [0,1]; false (and `out` untouched) if there is none.
+    pub fn mask_into(&self, out: &mut Planes<f32>) -> bool {
+        self.weights_into(self.mask.as_deref(), out)
+    }
+
+    /// Writes the validity as [1, height, width] in [0,1]; false (and `out` untouched) if all pixels are valid.
+    pub fn valid_into(&self, out: &mut Planes<f32>) -> bool {
+        self.weights_into(self.valid.as_deref(), out)
+    }
+
+    fn weights_into(&self, weights: Option<&[u8]>, out: &mut Planes<f32>) -> bool {
+        let Some(weights) = weights else { return false };
+        out.reset(1, self.height, self.width);
+        out.data.iter_mut().zip(weights).for_each(|(o, &v)| *o = f32::from(v) / 255.0);
+        true
+    }
+
+    /// Everything in floating point.
+    pub fn to_picture(&self) -> Picture {
+        let mut color = Planes::default();
+        self.color_into(&mut color);
+        let plane = |weights: &Option<Vec<u8>>| {
+            let mut out = Planes::default();
+            self.weights_into(weights.as_deref(), &mut out).then_some(out)
+        };
+        Picture { color, mask: plane(&self.mask), valid: plane(&self.valid) }
+    }
+}
+
+/// A cache of decoded pictures that never exceeds its byte budget.
+///
+/// The least recently used picture goes first. Pictures in use by callers (their `Arc`s) and the one being decoded are
+/// not counted; a picture larger than the whole budget is handed out without being kept.
+pub struct ImageStore {
+    shared: Arc<Shared>,
+    worker: Mutex<Option<JoinHandle<()>>>,
+}
+
+struct Shared {
+    capture: Arc<Capture>,
+    budget: usize,
+    state: Mutex<State>,
+    /// Woken when a load ends and when the prefetch queue changes.
+    changed: Condvar,
+}
+
+#[derive(Default)]
+struct State {
+    kept: BTreeMap<usize, Kept>,
+    bytes: usize,
+    peak: usize,
+    clock: u64,
+    loads: usize,
+    loading: BTreeSet<usize>,
+    queue: VecDeque<usize>,
+    closed: bool,
+}
+
+struct Kept {
+    picture: Arc<StoredPicture>,
+    used: u64,
+}
+
+impl ImageStore {
+    /// A store for the pictures of `capture` that keeps at most `budget_bytes` of them decoded.
+    pub fn new(capture: Arc<Capture>, budget_bytes: usize) -> Self {
+        let state = Mutex::new(State::default());
+        let shared = Shared { capture, budget: budget_bytes, state, changed: Condvar::new() };
+        Self { shared: Arc::new(shared), worker: Mutex::new(None) }
+    }
+
+    /// The capture whose pictures these are.
+    pub fn capture(&self) -> &Arc<Capture> {
+        &self.shared.capture
+    }
+
+    /// The picture of a frame; decodes it unless it is kept. Errors name the file. Panics: `frame` out of range.
+    pub fn load(&self, frame: usize) -> Result<Arc<StoredPicture>> {
+        assert!(frame < self.shared.capture.frames.len(), "frame {frame} must be one of the capture's frames");
+        self.shared.load(frame)
+    }
+
+    /// Decodes these frames in the background, in this order; replaces what an earlier call left undone. Stops at half
+    /// the budget so that it cannot push out what it just brought. Errors are reported by [`Self::load`].
+    /// Panics: a frame out of range.
+    pub fn prefetch(&self, frames: &[usize]) {
+        let count = self.shared.capture.frames.len();
+        assert!(frames.iter().all(|&f| f < count), "prefetched frames must be the capture's frames");
+        let mut state = self.shared.lock();
+        state.queue = frames.iter().copied().collect();
+        drop(state);
+        self.shared.changed.notify_all();
+        let mut worker = self.worker.lock().unwrap_or_else(|e| e.into_inner());
+        if worker.is_none() {
+            let shared = Arc::clone(&self.shared);
+            // Without a thread (a process limit, say) pictures are simply decoded when they are asked for.
+            *worker = std::thread::Builder::new().name("prefetch".into()).spawn(move || shared.work()).ok();
+        }
+    }
+
+    /// Bytes of the pictures kept now.
+    pub fn bytes(&self) -> usize {
+        self.shared.lock().bytes
+    }
+
+    /// Most bytes of pictures kept at any time so far; at most the budget.
+    pub fn peak_bytes(&self) -> usize {
+        self.shared.lock().peak
+    }
+
+    /// How many pictures were decoded so far.
+    pub fn decoded(&self) -> usize {
+        self.shared.lock().loads
+    }
+}
+
+impl Drop for ImageStore {
+    fn drop(&mut self) {
+        let mut state = self.shared.lock();
+        state.closed = true;
+        state.queue.clear();
+        drop(state);
+        self.shared.changed.notify_all();
+        if let Some(worker) = self.worker.get_mut().unwrap_or_else(|e| e.into_inner()).take() {
+            // A panic of the worker was already printed; there is nothing left to save.
+            let _ = worker.join();
+        }
+    }
+}
+
+/// Takes a frame off the list of those being decoded, also when decoding panics: others wait for it.
+struct Loading<'a>(&'a Shared, usize);
+
+impl Drop for Loading<'_> {
+    fn drop(&mut self) {
+        self.0.lock().loading.remove(&self.1);
+        self.0.changed.notify_all();
+    }
+}
+
+impl Shared {
+    fn lock(&self) -> MutexGuard<'_, State> {
+        // Every change of the state is complete before its lock is released, so a poisoned lock is harmless.
+        self.state.lock().unwrap_or_else(|e| e.into_inner())
+    }
+
+    fn load(&self, frame: usize) -> Result<Arc<StoredPicture>> {
+        let mut state = self.lock();
+        loop {
+            state.clock += 1;
+            let now = state.clock;
+            if let Some(kept) = state.kept.get_mut(&frame) {
+                kept.used = now;
+                return Ok(Arc::clone(&kept.picture));
+            }
+            if state.loading.insert(frame) {
+                break;
+            }
+            state = self.changed.wait(state).unwrap_or_else(|e| e.into_inner());
+        }
+        drop(state);
+        let _loading = Loading(self, frame);
+        let picture = Arc::new(prepare(&self.capture.frames[frame], &self.capture)?);
+        self.keep(frame, &picture);
+        Ok(picture)
+    }
+
+    fn keep(&self, frame: usize, picture: &Arc<StoredPicture>) {
+        let mut state = self.lock();
+        state.loads += 1;
+        let bytes = picture.bytes();
+        if bytes > self.budget {
+            return;
+        }
+        while state.bytes + bytes > self.budget {
+            let oldest = state.kept.iter().min_by_key(|(_, k)| k.used).map(|(&f, _)| f);
+            let Some(gone) = oldest.and_then(|f| state.kept.remove(&f)) else { break };
+            state.bytes -= gone.picture.bytes();
+        }
+        state.bytes += bytes;
+        state.peak = state.peak.max(state.bytes);
+        state.clock += 1;
+        let used = state.clock;
+        state.kept.insert(frame, Kept { picture: Arc::clone(picture), used });
+    }
+
+    /// The prefetch thread.
+    fn work(&self) {
+        // Bytes decoded ahead of their use since the queue was last empty.
+        let mut ahead = 0;
+        loop {
+            let mut state = self.lock();
+            while state.queue.is_empty() && !state.closed {
+                ahead = 0;
+                state = self.changed.wait(state).unwrap_or_else(|e| e.into_inner());
+            }
+            if state.closed {
+                return;
+            }
+            let Some(frame) = state.queue.pop_front() else { continue };
+            if state.kept.contains_key(&frame) || state.loading.contains(&frame) {
+                continue;
+            }
+            if ahead > self.budget / 2 {
+                state.queue.clear();
+                continue;
+            }
+            drop(state);
+            if let Ok(picture) = self.load(frame) {
+                ahead += picture.bytes();
+            }
+        }
+    }
+}
+
+/// White: stands in where a picture has alpha although the capture's first pictures had none.
+const WHITE: [f32; 3] = [1.0; 3];
+
+/// Decodes a frame's picture and mask and brings both to the frame's view.
+fn prepare(frame: &Frame, capture: &Capture) -> Result<StoredPicture> {
+    let place = |e: splat4d::Error| {
+        let camera = &capture.cameras[frame.camera].name;
+        e.at(format!("camera {camera}, frame {}", frame.index))
+    };
+    let raster = picture::decode(&frame.image, Some(&frame.source)).map_err(place)?;
+    let background = capture.background.unwrap_or(WHITE);
+    let mask = frame.mask.as_deref().map(|m| read_mask(m, &frame.source)).transpose().map_err(place)?;
+    let mask = mask.or_else(|| raster.alpha().map(|_| picture::mask_values(&raster, true)));
+    let lens = Distortion::new(frame.source.lens);
+    let opaque = raster.alpha().is_none_or(|a| (0..raster.width * raster.height).all(|p| raster.get(p, a) >= 1.0));
+    if let (true, true, 1, Samples::Eight(samples)) = (opaque, lens.is_pinhole(), capture.downscale, &raster.samples) {
+        let mask = mask.map(|m| m.iter().map(|&v| to_byte(v)).collect());
+        let color = Samples::Eight(planar(samples, raster.channels));
+        return Ok(StoredPicture { width: raster.width, height: raster.height, color, mask, valid: None });
+    }
+    let (width, height) = (raster.width, raster.height);
+    let mut planes = composite(&raster, background);
+    drop(raster);
+    planes.extend(mask);
+    let mut valid = None;
+    if !lens.is_pinhole() {
+        let map = UndistortMap::new(&lens, &frame.source);
+        planes = planes.iter().map(|p| map.apply(p, width, height)).collect();
+        valid = map.valid();
+    }
+    let k = capture.downscale;
+    planes.iter_mut().chain(&mut valid).for_each(|p| *p = box_mean(p, width, height, k));
+    let bytes = |plane: Vec<f32>| plane.iter().map(|&v| to_byte(v)).collect();
+    let mask = (planes.len() == 4).then(|| planes.pop()).flatten().map(bytes);
+    // Any doubt about a pixel must not round to certainty.
+    let valid = valid.map(|plane| plane.iter().map(|&v| (v.clamp(0.0, 1.0) * 255.0) as u8).collect());
+    let color = planes.iter().flatten().map(|&v| (v.clamp(0.0, 1.0) * 65535.0).round() as u16).collect();
+    Ok(StoredPicture { width: width / k, height: height / k, color: Samples::Sixteen(color), mask, valid })
+}
+
+fn to_byte(v: f32) -> u8 {
+    (v.clamp(0.0, 1.0) * 255.0).round() as u8
+}
+
+fn read_mask(path: &Path, camera: &Camera) -> Result<Vec<f32>> {
+    let raster = picture::decode(path, Some(camera))?;
+    Ok(picture::mask_values(&raster, false))
+}
+
+/// Interleaved samples to three planes; grey becomes three equal ones, alpha is dropped.
+fn planar(samples: &[u8], channels: usize) -> Vec<u8> {
+    let mut out = Vec::with_capacity(samples.len() / channels * 3);
+    for c in 0..3 {
+        let c = if channels < 3 { 0 } else { c };
+        out.extend(samples.iter().skip(c).step_by(channels));
+    }
+    out
+}
+
+/// Three planes of colour·α + background·(1 − α), in the picture's own (sRGB) values as the papers do.
+fn composite(raster: &Raster, background: [f32; 3]) -> Vec<Vec<f32>> {
+    let n = raster.width * raster.height;
+    (0..3)
+        .map(|c| {
+            let channel = if raster.channels < 3 { 0 } else { c };
+            let pixel = |p: usize| match raster.alpha() {
+                None => raster.get(p, channel),
+                Some(a) => {
+                    let alpha = raster.get(p, a);
+                    raster.get(p, channel) * alpha + background[c] * (1.0 - alpha)
+                }
+            };
+            (0..n).map(pixel).collect()
+        })
+        .collect()
+}
+
+/// Means of k×k boxes; rows and columns that fill no box are cut off.
+fn box_mean(plane: &[f32], width: usize, height: usize, k: usize) -> Vec<f32> {
+    if k == 1 {
+        return plane.to_vec();
+    }
+    let scale = 1.0 / (k * k) as f32;
+    let mut out = Vec::with_capacity((width / k) * (height / k));
+    for y in 0..height / k {
+        for x in 0..width / k {
+            let rows = (0..k).map(|j| (y * k + j) * width + x * k);
+            out.push(scale * rows.map(|start| plane[start..start + k].iter().sum::<f32>()).sum::<f32>());
+        }
+    }
+    out
+}
+
+/// For every pixel of the pinhole picture, where it is in the distorted one.
+struct UndistortMap {
+    /// Pixel positions minus one half (so that whole numbers are pixel centres); NaN where the picture does not reach.
+    positions: Vec<[f32; 2]>,
+}
+
+impl UndistortMap {
+    fn new(lens: &Distortion, camera: &Camera) -> Self {
+        let k = &camera.intrinsics;
+        let (width, height) = (camera.width as f64, camera.height as f64);
+        let at = |i: usize| {
+            let (x, y) = ((i % camera.width) as f64 + 0.5, (i / camera.width) as f64 + 0.5);
+            let outside = [f32::NAN; 2];
+            let Some([x, y]) = lens.distort([(x - k.cx) / k.fx, (y - k.cy) / k.fy]) else { return outside };
+            let (u, v) = (k.fx * x + k.cx, k.fy * y + k.cy);
+            let inside = (0.0..=width).contains(&u) && (0.0..=height).contains(&v);
+            if inside { [(u - 0.5) as f32, (v - 0.5) as f32] } else { outside }
+        };
+        Self { positions: (0..camera.width * camera.height).into_par_iter().map(at).collect() }
+    }
+
+    /// 1 where the original picture reaches, else 0; `None` if it reaches everywhere.
+    fn valid(&self) -> Option<Vec<f32>> {
+        let reaches: Vec<f32> = self.positions.iter().map(|p| if p[0].is_nan() { 0.0 } else { 1.0 }).collect();
+        reaches.contains(&0.0).then_some(reaches)
+    }
+
+    /// Bilinear samples; 0 where the picture does not reach.
+    fn apply(&self, plane: &[f32], width: usize, height: usize) -> Vec<f32> {
+        let sample = |&[x, y]: &[f32; 2]| {
+            if x.is_nan() {
+                return 0.0;
+            }
+            let (x, y) = (x.clamp(0.0, (width - 1) as f32), y.clamp(0.0, (height - 1) as f32));
+            let (x0, y0) = (x as usize, y as usize);
+            let (x1, y1) = ((x0 + 1).min(width - 1), (y0 + 1).min(height - 1));
+            let (fx, fy) = (x - x0 as f32, y - y0 as f32);
+            let row = |y: usize| plane[y * width + x0] * (1.0 - fx) + plane[y * width + x1] * fx;
+            row(y0) * (1.0 - fy) + row(y1) * fy
+        };
+        self.positions.par_iter().map(sample).collect()
+    }
+}
