@@ -11,5 +11,6 @@ mod mutate;
 pub mod npy;
 pub mod ply;
 pub mod safetensors;
+pub mod scene;
 
 pub use arrays::{params_to_arrays, tensors_to_loaded};

@@ -1,0 +1,267 @@
+//! `scene.safetensors`: the lossless learnable state of a scene.
+//!
+//! Metadata `splat4d` holds JSON: version, clip, fps, up, background, head, and a list of layers with name, rows, SH
+//! coefficients, life and motion. Every column group of every table is one row-major array: `layers.0.means` [N,3],
+//! `layers.0.quats` [N,4] wxyz, `layers.0.sh` [N,K,3], `layers.0.velocities` [N,3·order] … Seconds and scene units.
+
+use super::safetensors::{SafeTensors, Tensor};
+use super::{params_to_arrays, tensors_to_loaded};
+use crate::layers::{Head, Layer, Scene};
+use crate::motion::{Spec, SpacetimeSpec, build};
+use crate::scene::{LifeKind, Params, SH};
+use crate::{Error, ErrorKind, Result};
+use serde_json::{Value, json};
+use std::collections::BTreeMap;
+use std::io::Write;
+
+/// Version of the metadata this library writes, and the newest it reads.
+pub const VERSION: u64 = 1;
+/// The metadata's key.
+pub const METADATA: &str = "splat4d";
+
+/// A scene's metadata as JSON.
+pub fn metadata(scene: &Scene<f32>) -> Value {
+    let layers: Vec<Value> = scene
+        .layers
+        .iter()
+        .map(|l| {
+            json!({
+                "name": l.name,
+                "rows": l.params.len(),
+                "sh_coefficients": l.params[SH].width() / 3,
+                "life": l.life.name(),
+                "motion": spec_to_json(&l.motion.spec()),
+            })
+        })
+        .collect();
+    json!({
+        "version": VERSION,
+        "units": "scene units, seconds, colours in [0, 1]",
+        "axes": "OpenCV: x right, y down, z forward in the camera",
+        "clip": scene.clip,
+        "fps": scene.fps,
+        "up": scene.up,
+        "background": scene.background,
+        "head": "identity",
+        "layers": layers,
+    })
+}
+
+/// A motion model's spec as JSON.
+pub fn spec_to_json(spec: &Spec) -> Value {
+    match spec {
+        Spec::Still => json!({ "model": "still" }),
+        Spec::Spacetime(s) => json!({
+            "model": "spacetime", "order": s.order, "rotation": s.rotation, "detach": s.detach, "origin": s.origin,
+        }),
+        Spec::Custom(name) => json!({ "model": name, "custom": true }),
+    }
+}
+
+/// A motion model's spec from JSON. Errors: a model that this version does not know, or a field that is missing.
+pub fn spec_from_json(v: &Value) -> Result<Spec> {
+    let model = text(v, "model")?;
+    match model.as_str() {
+        "still" => Ok(Spec::Still),
+        "spacetime" => {
+            let order = count(v, "order")?;
+            if order > crate::motion::spacetime::MAX_ORDER {
+                return Err(broken(format!("motion order {order} is not 0 to 3")));
+            }
+            let flag = |key: &str| v[key].as_bool().ok_or_else(|| broken(format!("`{key}` is not a flag")));
+            Ok(Spec::Spacetime(SpacetimeSpec {
+                order,
+                rotation: flag("rotation")?,
+                detach: flag("detach")?,
+                origin: number(v, "origin")?,
+            }))
+        }
+        other => Err(Error::new(ErrorKind::Unsupported, format!("the scene moves by `{other}`, which this version does not know"))
+            .remedy("Open it with the splat4d that wrote it, or a newer one")),
+    }
+}
+
+/// All arrays of a scene, ready to be written (also into a checkpoint).
+pub fn arrays(scene: &Scene<f32>) -> Vec<super::arrays::Array> {
+    scene.layers.iter().enumerate().flat_map(|(i, l)| params_to_arrays(&format!("layers.{i}."), &l.params)).collect()
+}
+
+/// Writes a scene. Errors: the sink's.
+pub fn write(scene: &Scene<f32>, out: &mut impl Write) -> Result<()> {
+    let arrays = arrays(scene);
+    let tensors: Vec<Tensor<'_>> = arrays.iter().map(|a| a.tensor()).collect();
+    let metadata = BTreeMap::from([(METADATA.to_owned(), metadata(scene).to_string())]);
+    super::safetensors::write(&tensors, &metadata, out)
+}
+
+/// Reads a scene. Errors: not a scene, a newer version, an unknown motion model, arrays that do not fit.
+pub fn read(bytes: &[u8]) -> Result<Scene<f32>> {
+    from_tensors(&SafeTensors::read(bytes)?)
+}
+
+/// The scene in an open file.
+pub fn from_tensors(file: &SafeTensors<'_>) -> Result<Scene<f32>> {
+    let Some(meta) = file.metadata().get(METADATA) else {
+        return Err(broken("it has no `splat4d` metadata".into()));
+    };
+    let meta: Value = serde_json::from_str(meta).map_err(|e| broken(format!("its metadata is not JSON: {e}")))?;
+    let version = meta["version"].as_u64().ok_or_else(|| broken("its metadata has no version".into()))?;
+    if version > VERSION {
+        return Err(Error::new(ErrorKind::Unsupported, format!("the scene has version {version}, this splat4d reads up to {VERSION}"))
+            .remedy("Install a newer splat4d"));
+    }
+    let [start, end] = numbers::<2>(&meta, "clip")?;
+    let mut scene = Scene {
+        clip: [start, end],
+        fps: number(&meta, "fps")?,
+        up: numbers::<3>(&meta, "up")?,
+        background: numbers::<3>(&meta, "background")?.map(|x| x as f32),
+        head: Head::Identity,
+        layers: Vec::new(),
+    };
+    let layers = meta["layers"].as_array().ok_or_else(|| broken("its metadata lists no layers".into()))?;
+    for (i, layer) in layers.iter().enumerate() {
+        scene.layers.push(read_layer(file, layer, i).map_err(|e| e.at(format!("layer {i}")))?);
+    }
+    Ok(scene)
+}
+
+fn read_layer(file: &SafeTensors<'_>, meta: &Value, index: usize) -> Result<Layer<f32>> {
+    let prefix = format!("layers.{index}.");
+    let rows = count(meta, "rows")?;
+    let coefficients = count(meta, "sh_coefficients")?;
+    // The means bound what the metadata may claim, before anything is allocated.
+    let means = file.tensor(&format!("{prefix}means"))?;
+    if means.shape() != [rows, 3] {
+        return Err(broken(format!("the metadata claims {rows} Gaussians, the means have shape {:?}", means.shape())));
+    }
+    if coefficients > crate::math::sh::MAX_COEFFS {
+        return Err(broken(format!("{coefficients} SH coefficients are more than degree 3 has")));
+    }
+    let life = text(meta, "life")?;
+    let life = LifeKind::from_name(&life).ok_or_else(|| broken(format!("life `{life}` is not known")))?;
+    let loaded = tensors_to_loaded(&prefix, file)?;
+    let mut params = Params::build(loaded, rows, coefficients, life.columns())?;
+    let motion = build(&spec_from_json(&meta["motion"])?, &mut params)?;
+    if let Some(array) = params.unclaimed().first() {
+        return Err(broken(format!("array `{}` belongs to no table of this layer", array.name)));
+    }
+    Ok(Layer { name: text(meta, "name")?, params, motion, life })
+}
+
+fn broken(what: String) -> Error {
+    Error::input(format!("this is not a readable scene: {what}")).remedy("Export it again; `splat4d info` shows what a file holds")
+}
+
+fn text(v: &Value, key: &str) -> Result<String> {
+    v[key].as_str().map(str::to_owned).ok_or_else(|| broken(format!("`{key}` is missing")))
+}
+
+fn count(v: &Value, key: &str) -> Result<usize> {
+    let n = v[key].as_u64().and_then(|n| usize::try_from(n).ok());
+    n.ok_or_else(|| broken(format!("`{key}` is not a count")))
+}
+
+fn number(v: &Value, key: &str) -> Result<f64> {
+    v[key].as_f64().filter(|x| x.is_finite()).ok_or_else(|| broken(format!("`{key}` is not a number")))
+}
+
+fn numbers<const N: usize>(v: &Value, key: &str) -> Result<[f64; N]> {
+    let list = v[key].as_array().filter(|l| l.len() == N).ok_or_else(|| broken(format!("`{key}` is not {N} numbers")))?;
+    let mut out = [0.0; N];
+    for (o, x) in out.iter_mut().zip(list) {
+        *o = x.as_f64().filter(|x| x.is_finite()).ok_or_else(|| broken(format!("`{key}` is not {N} numbers")))?;
+    }
+    Ok(out)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::math::Rng;
+    use crate::scene::Time;
+
+    fn scene() -> Scene<f32> {
+        let layer = |spec: &Spec, life: LifeKind, seed: u64| {
+            let mut params = Params::new(37, 4, life.columns());
+            let motion = build(spec, &mut params).unwrap();
+            for key in params.keys().collect::<Vec<_>>() {
+                for r in 0..37 {
+                    for c in 0..params[key].width() {
+                        let x = Rng::new(seed, "x", u64::from(key.0)).normal((r * 99 + c) as u64) as f32;
+                        params[key].set(r, c, x);
+                    }
+                }
+            }
+            Layer { name: format!("layer {seed}"), params, motion, life }
+        };
+        let spacetime = Spec::Spacetime(SpacetimeSpec { order: 2, rotation: true, detach: true, origin: 0.25 });
+        Scene {
+            layers: vec![
+                layer(&Spec::Still, LifeKind::Infinite, 1),
+                layer(&spacetime, LifeKind::Interval, 2),
+                layer(&Spec::Spacetime(SpacetimeSpec { order: 0, ..SpacetimeSpec::default() }), LifeKind::GaussHalf, 3),
+            ],
+            background: [1.0, 0.5, 0.0],
+            clip: [0.0, 0.1 + 0.2],
+            fps: 30.0,
+            up: [0.0, -1.0, 0.0],
+            head: Head::Identity,
+        }
+    }
+
+    #[test]
+    fn a_scene_comes_back_bit_for_bit() {
+        let s = scene();
+        let mut bytes = Vec::new();
+        write(&s, &mut bytes).unwrap();
+        let back = read(&bytes).unwrap();
+        assert_eq!((back.clip, back.fps, back.up, back.background), (s.clip, s.fps, s.up, s.background));
+        for (a, b) in s.layers.iter().zip(&back.layers) {
+            assert_eq!((&a.name, a.life, a.motion.spec()), (&b.name, b.life, b.motion.spec()));
+            assert_eq!(a.params, b.params);
+        }
+        let mut again = Vec::new();
+        write(&back, &mut again).unwrap();
+        assert_eq!(bytes, again);
+    }
+
+    #[test]
+    fn what_does_not_fit_is_named() {
+        let mut bytes = Vec::new();
+        write(&scene(), &mut bytes).unwrap();
+        let with = |from: &str, to: &str| {
+            assert_eq!(from.len(), to.len());
+            let at = bytes.windows(from.len()).position(|w| w == from.as_bytes()).unwrap();
+            let mut b = bytes.clone();
+            b[at..at + to.len()].copy_from_slice(to.as_bytes());
+            read(&b).unwrap_err().to_string()
+        };
+        assert!(with("\\\"spacetime\\\"", "\\\"spacetimf\\\"").contains("spacetimf"));
+        assert!(with("\\\"version\\\":1", "\\\"version\\\":9").contains("version 9"));
+        assert!(with("\\\"rows\\\":37", "\\\"rows\\\":99").contains("99"));
+        assert!(with("layers.1.velocities", "layers.1.velocitiez").contains("velocit"));
+    }
+
+    #[test]
+    fn mutated_files_never_panic() {
+        let mut bytes = Vec::new();
+        write(&scene(), &mut bytes).unwrap();
+        let rng = Rng::new(5, "mutants", 0);
+        for i in 0..400u64 {
+            let mut b = bytes.clone();
+            for k in 0..1 + rng.below(4 * i, 4) as u64 {
+                let at = rng.fork(i).below(2 * k, b.len().min(4096));
+                b[at] ^= 1 << rng.fork(i).below(2 * k + 1, 8);
+            }
+            if i % 3 == 0 {
+                b.truncate(rng.below(4 * i + 1, b.len()));
+            }
+            if let Ok(s) = read(&b) {
+                // What is accepted must also be usable.
+                let mut instant = crate::layers::Instant::default();
+                s.at(Time(0.1), &mut instant);
+            }
+        }
+    }
+}
