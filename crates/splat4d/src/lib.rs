@@ -6,6 +6,7 @@
 
 pub mod error;
 pub mod math;
+pub mod render;
 pub mod scene;
 
 pub use error::{Error, ErrorKind, Result};
