@@ -27,6 +27,7 @@ use crate::scene::{Camera, Planes, Splats, Table};
 use bin::Footprint;
 use rasterize::{CHANNELS, PixelGrads, Raster};
 use rayon::prelude::*;
+use std::time::Instant;
 
 /// Whether thin splats are dimmed for the low-pass that widens them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
@@ -151,6 +152,23 @@ pub struct RenderStats {
     pub pairs: usize,
 }
 
+/// Seconds that the stages of the last render and the last backward took.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct StageSeconds {
+    /// Projection and footprints.
+    pub project: f64,
+    /// Colours.
+    pub shade: f64,
+    /// Lists, sort and records.
+    pub bin: f64,
+    /// Blending, all passes, with the writing of the picture.
+    pub blend: f64,
+    /// Blending backward, all passes, with the sums per splat.
+    pub blend_backward: f64,
+    /// Projection and colours backward.
+    pub splats_backward: f64,
+}
+
 /// Draws splats and keeps what the way back needs. All memory is reused from call to call.
 #[derive(Debug)]
 pub struct Renderer<F = f32> {
@@ -170,6 +188,7 @@ pub struct Renderer<F = f32> {
     radii: Vec<F>,
     pose_partial: Vec<[f64; 6]>,
     center_partial: Vec<[f64; 3]>,
+    seconds: StageSeconds,
 }
 
 impl<F: Real> Renderer<F> {
@@ -189,6 +208,7 @@ impl<F: Real> Renderer<F> {
             radii: Vec::new(),
             pose_partial: Vec::new(),
             center_partial: Vec::new(),
+            seconds: StageSeconds::default(),
         }
     }
 
@@ -215,11 +235,15 @@ impl<F: Real> Renderer<F> {
         self.projected.resize(n, Projected::default());
         self.footprints.resize(n, Footprint::default());
         self.channels.resize(n, [F::ZERO; CHANNELS]);
+        let mut clock = Clock::start();
         project::forward(splats, &view, simd, &mut self.projected, &mut self.footprints);
+        self.seconds.project = clock.lap();
         shade::forward(splats, &view, self.config.sh_degree, simd, &self.projected, &mut self.channels);
+        self.seconds.shade = clock.lap();
         self.radii.resize(n, F::ZERO);
         self.radii.par_iter_mut().zip(&self.projected).with_min_len(4096).for_each(|(r, p)| *r = p.radius);
         self.raster.prepare(&self.projected, &self.footprints, w, h, simd);
+        self.seconds.bin = clock.lap();
         self.raster.blend(&self.channels, &self.config);
         let widths = extra.map_or(0, Table::width);
         reshape(&mut out.color, 3, h, w);
@@ -231,7 +255,14 @@ impl<F: Real> Renderer<F> {
         }
         self.raster.alpha(out.alpha.plane_mut(0));
         self.raster.channel(3, F::ZERO, out.depth.plane_mut(0));
+        self.render_extra(extra, out);
+        self.seconds.blend = clock.lap();
+    }
+
+    /// The passes of further channels.
+    fn render_extra(&mut self, extra: Option<&Table<F>>, out: &mut Image<F>) {
         let Some(table) = extra else { return };
+        let widths = table.width();
         for first in (0..widths).step_by(CHANNELS) {
             pack(table, first, &mut self.extra);
             self.raster.blend(&self.extra, &self.config);
@@ -279,6 +310,7 @@ impl<F: Real> Renderer<F> {
         self.d_projected.resize(n, ProjectedGrads::default());
         self.d_channels.resize(n, [F::ZERO; CHANNELS]);
 
+        let mut clock = Clock::start();
         let pixels = PixelGrads {
             channels: [
                 Some(grads.color.plane(0)),
@@ -304,6 +336,7 @@ impl<F: Real> Renderer<F> {
         d.background = std::array::from_fn(|c| F::of(d_background[c]));
         self.backward_extra(extra, grads.extra, &mut d.extra);
 
+        self.seconds.blend_backward = clock.lap();
         // Depth is the fourth channel; the norms of the screen gradient are what densification reads.
         d.mean2d.resize(n, F::ZERO);
         d.mean2d_abs.resize(n, F::ZERO);
@@ -349,6 +382,7 @@ impl<F: Real> Renderer<F> {
             &mut d.camera,
             &mut self.center_partial,
         );
+        self.seconds.splats_backward = clock.lap();
     }
 
     /// The passes of further channels: adds to the geometry's gradient, overwrites `d_extra`.
@@ -432,6 +466,16 @@ impl<F: Real> Renderer<F> {
             + self.radii.capacity() * size_of::<F>()
     }
 
+    /// Where the time of the last render and the last backward went.
+    pub fn stage_seconds(&self) -> StageSeconds {
+        self.seconds
+    }
+
+    /// Pixels that the blend loop evaluates for the last render's pairs, were no pixel to stop early.
+    pub fn blend_work(&self) -> usize {
+        self.raster.blend_work()
+    }
+
     /// Counts of the last render.
     pub fn stats(&self) -> RenderStats {
         RenderStats {
@@ -439,6 +483,21 @@ impl<F: Real> Renderer<F> {
             visible: self.radii.iter().filter(|&&r| r > F::ZERO).count(),
             pairs: self.raster.pairs(),
         }
+    }
+}
+
+/// Times consecutive stages.
+struct Clock(Instant);
+
+impl Clock {
+    fn start() -> Self {
+        Self(Instant::now())
+    }
+
+    /// Seconds since the start or the last lap.
+    fn lap(&mut self) -> f64 {
+        let now = Instant::now();
+        (now - std::mem::replace(&mut self.0, now)).as_secs_f64()
     }
 }
 

@@ -292,6 +292,13 @@ impl<F: Real> Raster<F> {
         self.bins.keys.len()
     }
 
+    /// Pixels that the blend loop evaluates for these pairs, were no pixel to stop early.
+    pub fn blend_work(&self) -> usize {
+        let tiles =
+            |r: &Record<F>, ty: usize| (r.mask >> (ty * SIDE) & 15).count_ones() as usize * tile_rows(r, ty).len();
+        self.records.iter().map(|r| (0..SIDE).map(|ty| tiles(r, ty)).sum::<usize>() * TILE).sum()
+    }
+
     /// Bytes held.
     pub fn memory_bytes(&self) -> usize {
         self.bins.memory_bytes()
