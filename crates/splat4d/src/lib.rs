@@ -9,6 +9,7 @@ pub mod format;
 pub mod layers;
 pub mod math;
 pub mod motion;
+pub mod render;
 pub mod scene;
 
 pub use error::{Error, ErrorKind, Result};

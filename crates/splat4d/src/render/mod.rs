@@ -1,0 +1,516 @@
+//! The differentiable renderer: [`Splats`] and a [`Camera`] become colour, alpha, depth and any further channels, and
+//! gradients to a picture become gradients to every input and to the camera's pose.
+//!
+//! Four stages, each public with its VJP beside it: [`project`] (Gaussian → screen ellipse and the bins it touches),
+//! [`shade`] (colour along the viewing direction), [`bin`] (sorted lists), [`rasterize`] (blending). [`Renderer`] runs
+//! them over one arena that is reused from step to step. [`oracle`] is the slow f64 definition that they are tested
+//! against. The renderer never sees time.
+//!
+//! The same bits come out for any number of threads: every floating-point sum has a fixed order, and nothing is ever
+//! added atomically.
+
+pub mod bin;
+pub mod oracle;
+mod parallel;
+pub mod project;
+pub mod rasterize;
+pub mod shade;
+mod simd;
+#[cfg(test)]
+mod tests;
+
+pub use project::{Projected, ProjectedGrads, View};
+pub use simd::Simd;
+
+use crate::math::Real;
+use crate::scene::{Camera, Planes, Splats, Table};
+use bin::Footprint;
+use rasterize::{CHANNELS, PixelGrads, Raster};
+use rayon::prelude::*;
+use std::time::Instant;
+
+/// Whether thin splats are dimmed for the low-pass that widens them.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
+pub enum Antialias {
+    /// As plain 3DGS.
+    #[default]
+    Off,
+    /// Opacity times ρ = √(det Σ0 / det(Σ0 + low_pass·I)), at least .005 (Mip-Splatting, gsplat).
+    On,
+}
+
+/// What the renderer may be told.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RenderConfig {
+    /// Splats with z ≤ near are not drawn, scene units.
+    pub near: f64,
+    /// α below this is skipped.
+    pub alpha_min: f64,
+    /// α is never above this.
+    pub alpha_max: f64,
+    /// A pixel stops before its transmittance would fall below this.
+    pub transmittance_min: f64,
+    /// Added to the screen covariance, px².
+    pub low_pass: f64,
+    /// Compensation for the low-pass.
+    pub antialias: Antialias,
+    /// Highest degree of spherical harmonics drawn, lowered to what a table holds.
+    pub sh_degree: usize,
+    /// Instructions to use; lowered to what the machine has.
+    pub simd: Simd,
+}
+
+impl Default for RenderConfig {
+    /// near as gsplat; the blend's limits as Kerbl et al. 2023; the best instructions of this machine.
+    fn default() -> Self {
+        Self {
+            near: 0.01,
+            alpha_min: 1.0 / 255.0,
+            alpha_max: 0.99,
+            transmittance_min: 1e-4,
+            low_pass: 0.3,
+            antialias: Antialias::Off,
+            sh_degree: crate::math::sh::MAX_DEGREE,
+            simd: Simd::detect(),
+        }
+    }
+}
+
+/// A rendered picture.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Image<F = f32> {
+    /// Red, green, blue over the background, not clamped, [3, h, w].
+    pub color: Planes<F>,
+    /// 1 − final transmittance, [1, h, w].
+    pub alpha: Planes<F>,
+    /// Σ z α T, z in camera axes, [1, h, w].
+    pub depth: Planes<F>,
+    /// Further channels, without background, [C, h, w].
+    pub extra: Planes<F>,
+}
+
+impl<F: Real> Image<F> {
+    /// Expected depth D / max(A, `epsilon`), [1, h, w].
+    pub fn expected_depth(&self, epsilon: F) -> Planes<F> {
+        let mut out = self.depth.clone();
+        for (d, &a) in out.data.iter_mut().zip(&self.alpha.data) {
+            *d = *d / a.max(epsilon);
+        }
+        out
+    }
+}
+
+/// Gradients to a picture; `None` is zero.
+#[derive(Clone, Copy, Debug)]
+pub struct ImageGrads<'a, F = f32> {
+    /// To colour, [3, h, w].
+    pub color: &'a Planes<F>,
+    /// To alpha, [1, h, w].
+    pub alpha: Option<&'a Planes<F>>,
+    /// To Σ z α T, [1, h, w].
+    pub depth: Option<&'a Planes<F>>,
+    /// To the further channels, [C, h, w].
+    pub extra: Option<&'a Planes<F>>,
+}
+
+/// Gradients to one part of the splats, in its compact rows.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct PartGrads<F = f32> {
+    /// [splats, 10]: mean 3, covariance 6 (an off-diagonal stands for both its places), opacity 1.
+    pub out: Table<F>,
+    /// To direct colours [splats, C], or to SH that is not the layer's own [splats, 3·K·blocks].
+    pub color: Option<Table<F>>,
+    /// To the weights of SH blocks, [splats, blocks].
+    pub weights: Option<Table<F>>,
+}
+
+/// Gradients to everything that was drawn.
+#[derive(Clone, Debug, Default)]
+pub struct RenderGrads<F = f32> {
+    /// One a part.
+    pub parts: Vec<PartGrads<F>>,
+    /// To the further channels, [all splats, C].
+    pub extra: Option<Table<F>>,
+    /// To the background.
+    pub background: [F; 3],
+    /// To a left perturbation exp(ρ, θ)·cam_from_world: ρ 3, θ 3.
+    pub camera: [f64; 6],
+    /// |dL/d mean2d| of every splat, x times width/2 and y times height/2, as densification thresholds assume.
+    pub mean2d: Vec<F>,
+    /// The same norm of Σ over pixels of |gradient| (AbsGS). Passes of four channels are summed apart.
+    pub mean2d_abs: Vec<F>,
+}
+
+/// What the last render did.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct RenderStats {
+    /// Splats given.
+    pub splats: usize,
+    /// Splats that touch the picture.
+    pub visible: usize,
+    /// Pairs of bin and splat.
+    pub pairs: usize,
+}
+
+/// Seconds that the stages of the last render and the last backward took.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct StageSeconds {
+    /// Projection and footprints.
+    pub project: f64,
+    /// Colours.
+    pub shade: f64,
+    /// Lists, sort and records.
+    pub bin: f64,
+    /// Blending, all passes, with the writing of the picture.
+    pub blend: f64,
+    /// Blending backward, all passes, with the sums per splat.
+    pub blend_backward: f64,
+    /// Projection and colours backward.
+    pub splats_backward: f64,
+}
+
+/// Draws splats and keeps what the way back needs. All memory is reused from call to call.
+#[derive(Debug)]
+pub struct Renderer<F = f32> {
+    /// Options; may be changed between renders, not between a render and its backward.
+    pub config: RenderConfig,
+    size: [usize; 2],
+    projected: Vec<Projected<F>>,
+    footprints: Vec<Footprint>,
+    /// Red, green, blue, depth of every splat.
+    channels: Vec<[F; CHANNELS]>,
+    /// Four further channels of every splat, refilled for each pass.
+    extra: Vec<[F; CHANNELS]>,
+    raster: Raster<F>,
+    d_projected: Vec<ProjectedGrads<F>>,
+    d_channels: Vec<[F; CHANNELS]>,
+    d_extra: Vec<[F; CHANNELS]>,
+    radii: Vec<F>,
+    pose_partial: Vec<[f64; 6]>,
+    center_partial: Vec<[f64; 3]>,
+    seconds: StageSeconds,
+}
+
+impl<F: Real> Renderer<F> {
+    /// A renderer without memory yet.
+    pub fn new(config: RenderConfig) -> Self {
+        Self {
+            config,
+            size: [0; 2],
+            projected: Vec::new(),
+            footprints: Vec::new(),
+            channels: Vec::new(),
+            extra: Vec::new(),
+            raster: Raster::default(),
+            d_projected: Vec::new(),
+            d_channels: Vec::new(),
+            d_extra: Vec::new(),
+            radii: Vec::new(),
+            pose_partial: Vec::new(),
+            center_partial: Vec::new(),
+            seconds: StageSeconds::default(),
+        }
+    }
+
+    /// Draws `splats` as `camera` (a pinhole) sees them over `background`.
+    ///
+    /// Shapes: `extra` [all splats, C]; `out` is resized to the camera's picture. Rows that are NaN, infinite, behind
+    /// the camera or transparent are not drawn. Panics: `extra` has not one row a splat.
+    pub fn render(
+        &mut self,
+        splats: &Splats<'_, F>,
+        camera: &Camera,
+        background: [F; 3],
+        extra: Option<&Table<F>>,
+        out: &mut Image<F>,
+    ) {
+        let n = splats.len();
+        let (w, h) = (camera.width, camera.height);
+        if let Some(extra) = extra {
+            assert_eq!(extra.rows(), n, "further channels need one row a splat");
+        }
+        let simd = self.config.simd;
+        let view = View::new(camera, &self.config);
+        self.size = [w, h];
+        self.projected.resize(n, Projected::default());
+        self.footprints.resize(n, Footprint::default());
+        self.channels.resize(n, [F::ZERO; CHANNELS]);
+        let mut clock = Clock::start();
+        project::forward(splats, &view, simd, &mut self.projected, &mut self.footprints);
+        self.seconds.project = clock.lap();
+        shade::forward(splats, &view, self.config.sh_degree, simd, &self.projected, &mut self.channels);
+        self.seconds.shade = clock.lap();
+        self.radii.resize(n, F::ZERO);
+        self.radii.par_iter_mut().zip(&self.projected).with_min_len(4096).for_each(|(r, p)| *r = p.radius);
+        self.raster.prepare(&self.projected, &self.footprints, w, h, simd);
+        self.seconds.bin = clock.lap();
+        self.raster.blend(&self.channels, &self.config);
+        let widths = extra.map_or(0, Table::width);
+        reshape(&mut out.color, 3, h, w);
+        reshape(&mut out.alpha, 1, h, w);
+        reshape(&mut out.depth, 1, h, w);
+        reshape(&mut out.extra, widths, h, w);
+        for (c, &b) in background.iter().enumerate() {
+            self.raster.channel(c, b, out.color.plane_mut(c));
+        }
+        self.raster.alpha(out.alpha.plane_mut(0));
+        self.raster.channel(3, F::ZERO, out.depth.plane_mut(0));
+        self.render_extra(extra, out);
+        self.seconds.blend = clock.lap();
+    }
+
+    /// The passes of further channels.
+    fn render_extra(&mut self, extra: Option<&Table<F>>, out: &mut Image<F>) {
+        let Some(table) = extra else { return };
+        let widths = table.width();
+        for first in (0..widths).step_by(CHANNELS) {
+            pack(table, first, &mut self.extra);
+            self.raster.blend(&self.extra, &self.config);
+            for c in first..widths.min(first + CHANNELS) {
+                self.raster.channel(c - first, F::ZERO, out.extra.plane_mut(c));
+            }
+        }
+    }
+
+    /// VJP of the last [`Renderer::render`], whose arguments must be given again.
+    ///
+    /// `d_sh` has one entry a part: for a part whose colour is the layer's own SH, the gradient is *added* to rows
+    /// `rows.id(j)` of that table; `None` skips it. `d` is overwritten, its allocations are reused.
+    /// Panics: shapes are not those of the last render.
+    pub fn backward(
+        &mut self,
+        splats: &Splats<'_, F>,
+        camera: &Camera,
+        background: [F; 3],
+        extra: Option<&Table<F>>,
+        grads: &ImageGrads<'_, F>,
+        d_sh: &mut [Option<&mut Table<F>>],
+        d: &mut RenderGrads<F>,
+    ) {
+        let n = splats.len();
+        let size = [camera.width, camera.height];
+        assert!(
+            self.size == size && self.projected.len() == n,
+            "backward must follow the render of the same splats and camera: {n} splats now, {} then",
+            self.projected.len()
+        );
+        let plane = |planes: Option<&'_ Planes<F>>, channels: usize| {
+            if let Some(p) = planes {
+                let shape = [p.channels, p.height, p.width];
+                assert_eq!(shape, [channels, size[1], size[0]], "a picture's gradient has the picture's shape");
+            }
+        };
+        let widths = extra.map_or(0, Table::width);
+        plane(Some(grads.color), 3);
+        plane(grads.alpha, 1);
+        plane(grads.depth, 1);
+        plane(grads.extra, widths);
+        let view = View::new(camera, &self.config);
+        let simd = self.config.simd;
+        self.d_projected.resize(n, ProjectedGrads::default());
+        self.d_channels.resize(n, [F::ZERO; CHANNELS]);
+
+        let mut clock = Clock::start();
+        let pixels = PixelGrads {
+            channels: [
+                Some(grads.color.plane(0)),
+                Some(grads.color.plane(1)),
+                Some(grads.color.plane(2)),
+                grads.depth.map(|p| p.plane(0)),
+            ],
+            alpha: grads.alpha.map(|p| p.plane(0)),
+        };
+        let over = [background[0], background[1], background[2], F::ZERO];
+        let (projected, footprints) = (&self.projected, &self.footprints);
+        let d_background = self.raster.backward(
+            projected,
+            footprints,
+            &self.channels,
+            over,
+            &pixels,
+            &self.config,
+            rasterize::Geometry::Overwrite,
+            &mut self.d_projected,
+            &mut self.d_channels,
+        );
+        d.background = std::array::from_fn(|c| F::of(d_background[c]));
+        self.backward_extra(extra, grads.extra, &mut d.extra);
+
+        self.seconds.blend_backward = clock.lap();
+        // Depth is the fourth channel; the norms of the screen gradient are what densification reads.
+        d.mean2d.resize(n, F::ZERO);
+        d.mean2d_abs.resize(n, F::ZERO);
+        let half = [F::of(0.5 * size[0] as f64), F::of(0.5 * size[1] as f64)];
+        let norm = |v: [F; 2]| {
+            let (x, y) = (v[0] * half[0], v[1] * half[1]);
+            (x * x + y * y).sqrt()
+        };
+        let norms = d.mean2d.par_iter_mut().zip(d.mean2d_abs.par_iter_mut());
+        let rows = self.d_projected.par_iter_mut().zip(&self.d_channels);
+        rows.zip(norms).with_min_len(2048).for_each(|((row, channels), (mean2d, mean2d_abs))| {
+            row.depth += channels[3];
+            *mean2d = norm(row.mean2d);
+            *mean2d_abs = norm(row.mean2d_abs);
+        });
+
+        d.parts.resize_with(splats.parts.len(), PartGrads::default);
+        for (part, out) in splats.parts.iter().zip(&mut d.parts) {
+            project::reshape(&mut out.out, part.out);
+        }
+        d.camera = [0.0; 6];
+        let partial = &mut self.pose_partial;
+        project::backward(
+            splats,
+            &view,
+            simd,
+            &self.projected,
+            &self.d_projected,
+            &mut d.parts,
+            &mut d.camera,
+            partial,
+        );
+        shade::backward(
+            splats,
+            &view,
+            self.config.sh_degree,
+            simd,
+            &self.projected,
+            &self.channels,
+            &self.d_channels,
+            d_sh,
+            &mut d.parts,
+            &mut d.camera,
+            &mut self.center_partial,
+        );
+        self.seconds.splats_backward = clock.lap();
+    }
+
+    /// The passes of further channels: adds to the geometry's gradient, overwrites `d_extra`.
+    fn backward_extra(&mut self, extra: Option<&Table<F>>, grads: Option<&Planes<F>>, d_extra: &mut Option<Table<F>>) {
+        let Some(table) = extra else {
+            *d_extra = None;
+            return;
+        };
+        let out = d_extra.get_or_insert_with(|| Table::with_columns(table.columns().to_vec(), 0));
+        project::reshape(out, table);
+        out.fill(F::ZERO);
+        let Some(grads) = grads else { return };
+        self.d_extra.resize(table.rows(), [F::ZERO; CHANNELS]);
+        for first in (0..table.width()).step_by(CHANNELS) {
+            let end = table.width().min(first + CHANNELS);
+            pack(table, first, &mut self.extra);
+            let pixels = PixelGrads {
+                channels: std::array::from_fn(|c| (first + c < end).then(|| grads.plane(first + c))),
+                alpha: None,
+            };
+            self.raster.backward(
+                &self.projected,
+                &self.footprints,
+                &self.extra,
+                [F::ZERO; CHANNELS],
+                &pixels,
+                &self.config,
+                rasterize::Geometry::Add,
+                &mut self.d_projected,
+                &mut self.d_extra,
+            );
+            for (j, d) in self.d_extra.iter().enumerate() {
+                for c in first..end {
+                    out.set(j, c, d[c - first]);
+                }
+            }
+        }
+    }
+
+    /// Radius of every splat of the last render: 3σ of the larger axis, pixels; 0: not drawn.
+    pub fn radii(&self) -> &[F] {
+        &self.radii
+    }
+
+    /// Σ α T over the pixels of the last render, one a splat: how much of the picture it is. Used as pruning score.
+    pub fn contributions(&mut self, out: &mut Vec<F>) {
+        let n = self.projected.len();
+        // It is the gradient of a channel's sum to that channel, so the way back computes it.
+        let ones = vec![F::ONE; self.size[0] * self.size[1]];
+        let mut geometry = vec![ProjectedGrads::default(); n];
+        self.d_extra.resize(n, [F::ZERO; CHANNELS]);
+        self.raster.backward(
+            &self.projected,
+            &self.footprints,
+            &self.channels,
+            [F::ZERO; CHANNELS],
+            &PixelGrads { channels: [Some(&ones), None, None, None], alpha: None },
+            &self.config,
+            rasterize::Geometry::Overwrite,
+            &mut geometry,
+            &mut self.d_extra,
+        );
+        out.clear();
+        out.extend(self.d_extra.iter().map(|d| d[0]));
+    }
+
+    /// Screen ellipses of the last render, one a splat; radius 0: not drawn.
+    pub fn projected(&self) -> &[Projected<F>] {
+        &self.projected
+    }
+
+    /// Bytes of memory held.
+    pub fn memory_bytes(&self) -> usize {
+        let channels = self.channels.capacity() + self.extra.capacity();
+        let d_channels = self.d_channels.capacity() + self.d_extra.capacity();
+        self.raster.memory_bytes()
+            + self.projected.capacity() * size_of::<Projected<F>>()
+            + self.footprints.capacity() * size_of::<Footprint>()
+            + (channels + d_channels) * size_of::<[F; CHANNELS]>()
+            + self.d_projected.capacity() * size_of::<ProjectedGrads<F>>()
+            + self.radii.capacity() * size_of::<F>()
+    }
+
+    /// Where the time of the last render and the last backward went.
+    pub fn stage_seconds(&self) -> StageSeconds {
+        self.seconds
+    }
+
+    /// Pixels that the blend loop evaluates for the last render's pairs, were no pixel to stop early.
+    pub fn blend_work(&self) -> usize {
+        self.raster.blend_work()
+    }
+
+    /// Counts of the last render.
+    pub fn stats(&self) -> RenderStats {
+        RenderStats {
+            splats: self.projected.len(),
+            visible: self.radii.iter().filter(|&&r| r > F::ZERO).count(),
+            pairs: self.raster.pairs(),
+        }
+    }
+}
+
+/// Times consecutive stages.
+struct Clock(Instant);
+
+impl Clock {
+    fn start() -> Self {
+        Self(Instant::now())
+    }
+
+    /// Seconds since the start or the last lap.
+    fn lap(&mut self) -> f64 {
+        let now = Instant::now();
+        (now - std::mem::replace(&mut self.0, now)).as_secs_f64()
+    }
+}
+
+/// Sizes an image that is about to be overwritten; pixels keep what they held.
+fn reshape<F: Real>(planes: &mut Planes<F>, channels: usize, height: usize, width: usize) {
+    (planes.channels, planes.height, planes.width) = (channels, height, width);
+    planes.data.resize(channels * height * width, F::ZERO);
+}
+
+/// Four columns of a table from `first` on; columns that it lacks are 0.
+fn pack<F: Real>(table: &Table<F>, first: usize, out: &mut Vec<[F; CHANNELS]>) {
+    out.resize(table.rows(), [F::ZERO; CHANNELS]);
+    out.par_iter_mut().with_min_len(4096).enumerate().for_each(|(j, row)| {
+        *row = std::array::from_fn(|c| if first + c < table.width() { table.get(j, first + c) } else { F::ZERO });
+    });
+}

@@ -1,0 +1,508 @@
+//! From a Gaussian in the world to an ellipse on the screen (EWA splatting), and back.
+//!
+//! Source: Zwicker et al. 2001; Kerbl et al. 2023 section 4; clamp of x/z and y/z inside J and the compensation ρ as
+//! in gsplat; no 3σ cap on the extent (SnugBox, Hanson et al. 2024).
+
+use super::bin::{BIN, Footprint};
+use super::simd::{Kernel, Simd, dispatch};
+use super::{Antialias, PartGrads, RenderConfig};
+use crate::math::Real;
+use crate::scene::splats::{COV, SPLAT_OPACITY};
+use crate::scene::{BLOCK, Camera, Splats, Table};
+use rayon::prelude::*;
+
+/// x/z inside J may leave the picture by this share of its half-width's tangent (Inria, gsplat).
+const J_MARGIN: f64 = 0.3;
+/// Least compensation ρ of the antialiased mode (gsplat).
+const RHO_MIN: f64 = 0.005;
+/// Added to τ, so that rounding never loses a pixel at the α cut-off; the blend decides about each pixel itself.
+const TAU_MARGIN: f64 = 1e-3;
+/// The smallest α cut-off that is told from 0: an extent must be finite.
+const ALPHA_FLOOR: f64 = 1e-30;
+/// Radius in standard deviations that `radius` reports (Inria).
+const RADIUS_SIGMAS: f64 = 3.0;
+/// Rows in a task: whole blocks of a table.
+pub(super) const CHUNK_ROWS: usize = 1024;
+
+/// One splat on the screen. Plain old data.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Projected<F = f32> {
+    /// Centre, pixels (the first pixel's centre is at 0.5).
+    pub mean2d: [F; 2],
+    /// Inverse of the screen covariance with low-pass: xx, xy, yy, px⁻².
+    pub conic: [F; 3],
+    /// Opacity, times ρ in the antialiased mode.
+    pub opacity: F,
+    /// z in camera axes.
+    pub depth: F,
+    /// 3σ of the larger axis, pixels; 0: culled, and nothing else in the row means anything.
+    pub radius: F,
+    /// Half width and height of the box of the ellipse on which α is the cut-off, pixels.
+    pub half: [F; 2],
+    /// dᵀ conic d on that ellipse.
+    pub tau: F,
+    /// The compensation ρ; 1 without antialiasing.
+    pub rho: F,
+}
+
+/// Gradient to one [`Projected`]. Plain old data.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct ProjectedGrads<F = f32> {
+    /// To the centre.
+    pub mean2d: [F; 2],
+    /// Sum over pixels of the absolute gradient to the centre (AbsGS).
+    pub mean2d_abs: [F; 2],
+    /// To the conic's three numbers.
+    pub conic: [F; 3],
+    /// To the opacity after compensation.
+    pub opacity: F,
+    /// To the depth.
+    pub depth: F,
+}
+
+/// A camera and a configuration as the projection needs them.
+#[derive(Clone, Copy, Debug)]
+pub struct View<F = f32> {
+    /// Rows of the rotation cam_from_world.
+    pub rotation: [[F; 3]; 3],
+    /// Translation of cam_from_world.
+    pub translation: [F; 3],
+    /// The camera's centre in the world.
+    pub center: [F; 3],
+    /// fx, fy, pixels.
+    pub focal: [F; 2],
+    /// cx, cy, pixels.
+    pub principal: [F; 2],
+    /// Least x/z and y/z inside J.
+    pub low: [F; 2],
+    /// Largest x/z and y/z inside J.
+    pub high: [F; 2],
+    /// Pixels across.
+    pub width: usize,
+    /// Pixels down.
+    pub height: usize,
+    near: F,
+    low_pass: F,
+    alpha_min: F,
+    antialias: Antialias,
+}
+
+impl<F: Real> View<F> {
+    /// Of `camera` (drawn as a pinhole) under `config`.
+    pub fn new(camera: &Camera, config: &RenderConfig) -> Self {
+        let k = &camera.intrinsics;
+        let pose = &camera.cam_from_world;
+        let (w, h) = (camera.width as f64, camera.height as f64);
+        let margin = [J_MARGIN * 0.5 * w / k.fx, J_MARGIN * 0.5 * h / k.fy];
+        Self {
+            rotation: pose.rotation.map(|r| r.map(F::of)),
+            translation: pose.translation.map(F::of),
+            center: camera.center().map(F::of),
+            focal: [F::of(k.fx), F::of(k.fy)],
+            principal: [F::of(k.cx), F::of(k.cy)],
+            low: [F::of(-(k.cx / k.fx + margin[0])), F::of(-(k.cy / k.fy + margin[1]))],
+            high: [F::of((w - k.cx) / k.fx + margin[0]), F::of((h - k.cy) / k.fy + margin[1])],
+            width: camera.width,
+            height: camera.height,
+            near: F::of(config.near),
+            low_pass: F::of(config.low_pass),
+            alpha_min: F::of(config.alpha_min.max(ALPHA_FLOOR)),
+            antialias: config.antialias,
+        }
+    }
+}
+
+/// What forward and backward both need of one Gaussian.
+struct Ellipse<F> {
+    /// Mean in camera axes.
+    p: [F; 3],
+    inv_z: F,
+    /// x/z, y/z.
+    uv: [F; 2],
+    /// The same inside J.
+    clamped: [F; 2],
+    /// M = J W, 2x3.
+    m: [[F; 3]; 2],
+    /// M Σ, 2x3.
+    ms: [[F; 3]; 2],
+    /// Screen covariance before the low-pass: xx, xy, yy.
+    s0: [F; 3],
+    /// Its determinant, never below 0.
+    det0: F,
+    /// Determinant after the low-pass.
+    det1: F,
+}
+
+#[inline(always)]
+fn dot<F: Real>(a: [F; 3], b: [F; 3]) -> F {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+#[inline(always)]
+fn sym_vec<F: Real>(s: [F; 6], v: [F; 3]) -> [F; 3] {
+    [
+        s[0] * v[0] + s[1] * v[1] + s[2] * v[2],
+        s[1] * v[0] + s[3] * v[1] + s[4] * v[2],
+        s[2] * v[0] + s[4] * v[1] + s[5] * v[2],
+    ]
+}
+
+#[inline(always)]
+fn in_camera<F: Real>(view: &View<F>, mean: [F; 3]) -> [F; 3] {
+    let (r, t) = (&view.rotation, &view.translation);
+    [dot(r[0], mean) + t[0], dot(r[1], mean) + t[1], dot(r[2], mean) + t[2]]
+}
+
+#[inline(always)]
+fn ellipse<F: Real>(view: &View<F>, p: [F; 3], cov: [F; 6]) -> Ellipse<F> {
+    let r = &view.rotation;
+    let inv_z = F::ONE / p[2];
+    let uv = [p[0] * inv_z, p[1] * inv_z];
+    let clamped: [F; 2] = std::array::from_fn(|k| uv[k].max(view.low[k]).min(view.high[k]));
+    // Row k of J W is (f_k/z)(W_k − clamped_k W_2).
+    let m: [[F; 3]; 2] = std::array::from_fn(|k| {
+        let s = view.focal[k] * inv_z;
+        std::array::from_fn(|i| s * (r[k][i] - clamped[k] * r[2][i]))
+    });
+    let ms = [sym_vec(cov, m[0]), sym_vec(cov, m[1])];
+    let s0 = [dot(ms[0], m[0]), dot(ms[0], m[1]), dot(ms[1], m[1])];
+    // det(Σ0 + λI) = det Σ0 + λ tr Σ0 + λ²: written so, a needle's determinant cannot cancel to nothing.
+    let det0 = (s0[0] * s0[2] - s0[1] * s0[1]).max(F::ZERO);
+    let det1 = det0 + view.low_pass * (s0[0] + s0[2] + view.low_pass);
+    Ellipse { p, inv_z, uv, clamped, m, ms, s0, det0, det1 }
+}
+
+/// ρ = √max(ρ_min², det Σ0/det Σ1), and whether it is at its floor.
+#[inline(always)]
+fn compensation<F: Real>(view: &View<F>, e: &Ellipse<F>) -> (F, bool) {
+    if view.antialias == Antialias::Off {
+        return (F::ONE, true);
+    }
+    let (square, least) = (e.det0 / e.det1, F::of(RHO_MIN * RHO_MIN));
+    if square > least { (square.sqrt(), false) } else { (F::of(RHO_MIN), true) }
+}
+
+/// Projects one Gaussian: mean [3] and covariance [6] in the world, opacity in (0,1).
+///
+/// `None`, culled: z ≤ near, opacity (after ρ) below the α cut-off, determinant ≤ 0, anything not finite.
+#[inline(always)]
+pub fn project<F: Real>(view: &View<F>, mean: [F; 3], cov: [F; 6], opacity: F) -> Option<Projected<F>> {
+    let p = in_camera(view, mean);
+    // Phrased so that a NaN is culled too.
+    if !(p[2] > view.near && opacity >= view.alpha_min) {
+        return None;
+    }
+    let e = ellipse(view, p, cov);
+    let (xx, yy) = (e.s0[0] + view.low_pass, e.s0[2] + view.low_pass);
+    let (rho, _) = compensation(view, &e);
+    let opacity = opacity * rho;
+    if !(e.det1 > F::ZERO && xx > F::ZERO && yy > F::ZERO && opacity >= view.alpha_min) {
+        return None;
+    }
+    let inv = F::ONE / e.det1;
+    let tau = F::TWO * (opacity / view.alpha_min).ln() + F::of(TAU_MARGIN);
+    let mid = F::HALF * (xx + yy);
+    let largest = mid + (mid * mid - e.det1).max(F::ZERO).sqrt();
+    let out = Projected {
+        mean2d: std::array::from_fn(|k| view.focal[k] * e.uv[k] + view.principal[k]),
+        conic: [yy * inv, -e.s0[1] * inv, xx * inv],
+        opacity,
+        depth: p[2],
+        radius: F::of(RADIUS_SIGMAS) * largest.sqrt(),
+        half: [(tau * xx).sqrt(), (tau * yy).sqrt()],
+        tau,
+        rho,
+    };
+    let all = out.mean2d[0] + out.mean2d[1] + out.conic[0] + out.conic[1] + out.conic[2] + out.half[0] + out.half[1];
+    (all.is_finite() && out.depth.is_finite() && out.radius > F::ZERO).then_some(out)
+}
+
+/// Gradients of one Gaussian's inputs.
+#[derive(Clone, Copy, Debug)]
+pub struct GaussianGrads<F> {
+    /// To the world mean.
+    pub mean: [F; 3],
+    /// To the six packed numbers of the world covariance.
+    pub cov: [F; 6],
+    /// To the opacity before compensation.
+    pub opacity: F,
+    /// To a left perturbation of cam_from_world: translation, rotation.
+    pub pose: [F; 6],
+}
+
+/// VJP of [`project`] for a row that was not culled.
+///
+/// Source: gsplat and Kerbl et al. 2023, appendix; d_conic → d_Σ' = −Σ'⁻¹ G Σ'⁻¹.
+#[inline(always)]
+pub fn project_backward<F: Real>(
+    view: &View<F>,
+    mean: [F; 3],
+    cov: [F; 6],
+    opacity: F,
+    row: &Projected<F>,
+    d: &ProjectedGrads<F>,
+) -> GaussianGrads<F> {
+    let e = ellipse(view, in_camera(view, mean), cov);
+    let r = &view.rotation;
+    let h = F::HALF;
+    // Conic to Σ1, as a full symmetric matrix [xx, xy, yy].
+    let k = row.conic;
+    let g = [d.conic[0], h * d.conic[1], d.conic[2]];
+    let kg = [
+        [k[0] * g[0] + k[1] * g[1], k[0] * g[1] + k[1] * g[2]],
+        [k[1] * g[0] + k[2] * g[1], k[1] * g[1] + k[2] * g[2]],
+    ];
+    let mut s = [
+        -(kg[0][0] * k[0] + kg[0][1] * k[1]),
+        -(kg[0][0] * k[1] + kg[0][1] * k[2]),
+        -(kg[1][0] * k[1] + kg[1][1] * k[2]),
+    ];
+    // Opacity and ρ: ∂ρ²/∂Σ0 = adj(Σ0)/det Σ1 − ρ² Σ1⁻¹.
+    let (rho, at_floor) = compensation(view, &e);
+    if !at_floor {
+        let d_square = d.opacity * opacity / (F::TWO * rho);
+        let (inv, square) = (F::ONE / e.det1, rho * rho);
+        s[0] += d_square * (e.s0[2] * inv - square * k[0]);
+        s[1] += d_square * (-e.s0[1] * inv - square * k[1]);
+        s[2] += d_square * (e.s0[0] * inv - square * k[2]);
+    }
+    // Σ0 = M Σ Mᵀ.
+    let m = &e.m;
+    let gm: [[F; 3]; 2] = [
+        std::array::from_fn(|i| s[0] * m[0][i] + s[1] * m[1][i]),
+        std::array::from_fn(|i| s[1] * m[0][i] + s[2] * m[1][i]),
+    ];
+    let full = |i: usize, j: usize| m[0][i] * gm[0][j] + m[1][i] * gm[1][j];
+    let d_cov = [full(0, 0), F::TWO * full(0, 1), F::TWO * full(0, 2), full(1, 1), F::TWO * full(1, 2), full(2, 2)];
+    // d_M = 2 G M Σ, d_J = d_M Wᵀ.
+    let d_m: [[F; 3]; 2] = [
+        std::array::from_fn(|i| F::TWO * (s[0] * e.ms[0][i] + s[1] * e.ms[1][i])),
+        std::array::from_fn(|i| F::TWO * (s[1] * e.ms[0][i] + s[2] * e.ms[1][i])),
+    ];
+    let d_j: [[F; 3]; 2] = std::array::from_fn(|a| std::array::from_fn(|b| dot(d_m[a], r[b])));
+    // J = f/z (1, −clamped) in its two rows; the mean's path comes on top.
+    let iz = e.inv_z;
+    let mut d_p = [F::ZERO, F::ZERO, d.depth];
+    for a in 0..2 {
+        let f = view.focal[a];
+        let mut d_uv = d.mean2d[a] * f;
+        if e.uv[a] == e.clamped[a] {
+            d_uv -= d_j[a][2] * f * iz;
+        }
+        d_p[a] += d_uv * iz;
+        d_p[2] += -d_uv * e.uv[a] * iz - f * iz * iz * (d_j[a][a] - d_j[a][2] * e.clamped[a]);
+    }
+    let d_mean = std::array::from_fn(|i| r[0][i] * d_p[0] + r[1][i] * d_p[1] + r[2][i] * d_p[2]);
+    // Q = Jᵀ d_J for the rotation's path through the covariance.
+    let j = [
+        [view.focal[0] * iz, F::ZERO, -view.focal[0] * iz * e.clamped[0]],
+        [F::ZERO, view.focal[1] * iz, -view.focal[1] * iz * e.clamped[1]],
+    ];
+    let q = |a: usize, b: usize| j[0][a] * d_j[0][b] + j[1][a] * d_j[1][b];
+    let p = e.p;
+    let pose = [
+        d_p[0],
+        d_p[1],
+        d_p[2],
+        p[1] * d_p[2] - p[2] * d_p[1] + q(2, 1) - q(1, 2),
+        p[2] * d_p[0] - p[0] * d_p[2] + q(0, 2) - q(2, 0),
+        p[0] * d_p[1] - p[1] * d_p[0] + q(1, 0) - q(0, 1),
+    ];
+    GaussianGrads { mean: d_mean, cov: d_cov, opacity: d.opacity * rho, pose }
+}
+
+/// Projects all splats and finds the bins that each can touch. A splat that touches no pixel is culled.
+///
+/// Shapes: `projected`, `footprints` [all splats], overwritten.
+pub fn forward<F: Real>(
+    splats: &Splats<'_, F>,
+    view: &View<F>,
+    simd: Simd,
+    projected: &mut [Projected<F>],
+    footprints: &mut [Footprint],
+) {
+    assert_eq!(projected.len(), splats.len(), "one projected row a splat");
+    assert_eq!(footprints.len(), splats.len(), "one footprint a splat");
+    let (mut rows, mut feet) = (projected, footprints);
+    for part in &splats.parts {
+        let n = part.out.rows();
+        let (head, tail) = std::mem::take(&mut rows).split_at_mut(n);
+        let (head_feet, tail_feet) = std::mem::take(&mut feet).split_at_mut(n);
+        (rows, feet) = (tail, tail_feet);
+        head.par_chunks_mut(CHUNK_ROWS).zip(head_feet.par_chunks_mut(CHUNK_ROWS)).enumerate().for_each(
+            |(chunk, (rows, feet))| {
+                dispatch(simd, Forward { out: part.out, view, first: chunk * CHUNK_ROWS, rows, feet });
+            },
+        );
+    }
+}
+
+/// One task's share of [`forward`].
+struct Forward<'a, F> {
+    out: &'a Table<F>,
+    view: &'a View<F>,
+    first: usize,
+    rows: &'a mut [Projected<F>],
+    feet: &'a mut [Footprint],
+}
+
+impl<F: Real> Kernel for Forward<'_, F> {
+    type Out = ();
+    #[inline(always)]
+    fn run<const FMA: bool>(self) {
+        for (i, (row, foot)) in self.rows.iter_mut().zip(self.feet).enumerate() {
+            let j = self.first + i;
+            (*row, *foot) = Default::default();
+            let (mean, cov) = (self.out.read::<3>(j, 0), self.out.read::<6>(j, COV));
+            if let Some(p) = project(self.view, mean, cov, self.out.get(j, SPLAT_OPACITY)) {
+                *foot = Footprint::new(&p, self.view.width, self.view.height);
+                if foot.count() > 0 {
+                    *row = p;
+                }
+            }
+        }
+    }
+}
+
+/// VJP of [`forward`]: overwrites `parts[..].out` (culled rows get 0) and adds to the pose gradient.
+///
+/// `partial` is scratch. Sums run in a fixed order: rows in a chunk, then chunks.
+pub fn backward<F: Real>(
+    splats: &Splats<'_, F>,
+    view: &View<F>,
+    simd: Simd,
+    projected: &[Projected<F>],
+    d: &[ProjectedGrads<F>],
+    parts: &mut [PartGrads<F>],
+    pose: &mut [f64; 6],
+    partial: &mut Vec<[f64; 6]>,
+) {
+    assert_eq!(parts.len(), splats.parts.len(), "one gradient a part");
+    let mut first = 0;
+    for (part, out) in splats.parts.iter().zip(parts) {
+        let n = part.out.rows();
+        let (rows, d_rows) = (&projected[first..first + n], &d[first..first + n]);
+        first += n;
+        let width = out.out.width();
+        assert!(width == part.out.width() && out.out.rows() == n, "a part's gradient has the part's shape");
+        let blocks = out.out.data_mut().par_chunks_mut(CHUNK_ROWS * width);
+        blocks
+            .zip(rows.par_chunks(CHUNK_ROWS).zip(d_rows.par_chunks(CHUNK_ROWS)))
+            .enumerate()
+            .map(|(chunk, (data, (rows, d)))| {
+                dispatch(simd, Backward { out: part.out, view, first: chunk * CHUNK_ROWS, rows, d, data })
+            })
+            .collect_into_vec(partial);
+        for sum in partial.iter() {
+            for k in 0..6 {
+                pose[k] += sum[k];
+            }
+        }
+    }
+}
+
+/// One task's share of [`backward`]; returns its sum of the pose's gradient.
+struct Backward<'a, F> {
+    out: &'a Table<F>,
+    view: &'a View<F>,
+    first: usize,
+    rows: &'a [Projected<F>],
+    d: &'a [ProjectedGrads<F>],
+    /// Blocks of the gradient's table.
+    data: &'a mut [F],
+}
+
+impl<F: Real> Kernel for Backward<'_, F> {
+    type Out = [f64; 6];
+    #[inline(always)]
+    fn run<const FMA: bool>(self) -> [f64; 6] {
+        let (mut sum, width) = ([0.0; 6], self.out.width());
+        for (i, (row, d)) in self.rows.iter().zip(self.d).enumerate() {
+            let mut values = [F::ZERO; SPLAT_OPACITY + 1];
+            if row.radius > F::ZERO {
+                let j = self.first + i;
+                let (mean, cov) = (self.out.read::<3>(j, 0), self.out.read::<6>(j, COV));
+                let g = project_backward(self.view, mean, cov, self.out.get(j, SPLAT_OPACITY), row, d);
+                values[..3].copy_from_slice(&g.mean);
+                values[COV..COV + 6].copy_from_slice(&g.cov);
+                values[SPLAT_OPACITY] = g.opacity;
+                for k in 0..6 {
+                    sum[k] += g.pose[k].f64();
+                }
+            }
+            let at = i / BLOCK * width * BLOCK + i % BLOCK;
+            for (k, v) in values.iter().enumerate() {
+                self.data[at + k * BLOCK] = *v;
+            }
+        }
+        sum
+    }
+}
+
+/// A table [rows, 10] for the gradient of a part's `out`, reusing `table` where its shape allows.
+pub(super) fn reshape<F: Real>(table: &mut Table<F>, like: &Table<F>) {
+    if table.width() == like.width() {
+        table.resize(like.rows());
+    } else {
+        *table = Table::with_columns(like.columns().to_vec(), like.rows());
+    }
+}
+
+impl Footprint {
+    /// The bins that hold a pixel centre inside the cut-off ellipse of `p`, in a picture of `width` x `height`.
+    #[inline(always)]
+    pub fn new<F: Real>(p: &Projected<F>, width: usize, height: usize) -> Self {
+        // Pixel i has its centre at i + ½. Casts saturate, so that a footprint of 10^6 pixels is no trouble.
+        let range = |k: usize, size: usize| {
+            let low = (p.mean2d[k] - p.half[k] - F::HALF).f64().ceil().max(0.0);
+            let high = (p.mean2d[k] + p.half[k] - F::HALF).f64().floor().min(size as f64 - 1.0);
+            (low <= high).then_some((low as usize, high as usize))
+        };
+        let (Some((x0, x1)), Some((y0, y1))) = (range(0, width), range(1, height)) else {
+            return Self::default();
+        };
+        let (bx0, bx1, by0, by1) = (x0 / BIN, x1 / BIN + 1, y0 / BIN, y1 / BIN + 1);
+        let mut out = Self { x0: bx0 as u16, x1: bx1 as u16, y0: by0 as u16, y1: by1 as u16, mask: 0 };
+        let (across, down) = (bx1 - bx0, by1 - by0);
+        if across > 8 || down > 8 {
+            return out;
+        }
+        // A connected ellipse meets every bin of a single row or column of its own box.
+        let test = across > 1 && down > 1;
+        for by in 0..down {
+            for bx in 0..across {
+                let x = [(bx0 + bx) * BIN, ((bx0 + bx + 1) * BIN).min(width)];
+                let y = [(by0 + by) * BIN, ((by0 + by + 1) * BIN).min(height)];
+                let hit = !test || {
+                    let edge = |v: usize, k: usize, side: F| F::of(v as f64) + side - p.mean2d[k];
+                    let (x0, x1) = (edge(x[0], 0, F::HALF), edge(x[1], 0, -F::HALF));
+                    let (y0, y1) = (edge(y[0], 1, F::HALF), edge(y[1], 1, -F::HALF));
+                    ellipse_distance(p.conic, -p.conic[1] / p.conic[2], -p.conic[1] / p.conic[0], [x0, x1], [y0, y1])
+                        <= p.tau
+                };
+                out.mask |= u64::from(hit) << (by * 8 + bx);
+            }
+        }
+        if out.mask == 0 { Self::default() } else { out }
+    }
+}
+
+/// Least dᵀ conic d over a rectangle of offsets from the centre; exact.
+///
+/// The least point lies on a side that faces the centre, so a clamped minimum along each facing side finds it; for a
+/// centre inside the range of a side the candidate is an inner point, which is allowed too. `y_slope` = −b/c and
+/// `x_slope` = −b/a are the lines of those minima.
+#[inline(always)]
+pub(super) fn ellipse_distance<F: Real>(conic: [F; 3], y_slope: F, x_slope: F, x: [F; 2], y: [F; 2]) -> F {
+    let clamp = |v: F, r: [F; 2]| {
+        let v = if v > r[0] { v } else { r[0] };
+        if v < r[1] { v } else { r[1] }
+    };
+    let q = |dx: F, dy: F| conic[0] * dx * dx + F::TWO * conic[1] * dx * dy + conic[2] * dy * dy;
+    let (ex, ey) = (clamp(F::ZERO, x), clamp(F::ZERO, y));
+    let along_x = q(ex, clamp(y_slope * ex, y));
+    let along_y = q(clamp(x_slope * ey, x), ey);
+    if along_x < along_y { along_x } else { along_y }
+}

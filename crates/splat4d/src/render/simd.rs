@@ -1,0 +1,73 @@
+//! Which instructions the kernels may use, chosen once at run time.
+//!
+//! A kernel is one `#[inline(always)]` body over fixed-size lane arrays. It is compiled three times, inside functions
+//! that enable nothing, AVX2 with FMA, and AVX-512; LLVM turns the lane loops into that level's vectors. All levels
+//! use the same lanes in the same order, so AVX2 and AVX-512 differ in nothing but speed, and the scalar level only in
+//! the rounding of fused multiply-adds. On ARM the baseline has NEON and fused multiply-add already.
+#![allow(unsafe_code)] // calling a function that enables a target feature, after that feature was found present
+
+/// An instruction level; a level that the machine lacks is lowered to the best that it has.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Simd {
+    /// What the compiler was told every machine of the target has.
+    Scalar,
+    /// x86-64 with AVX2 and FMA.
+    Avx2,
+    /// x86-64 with AVX-512 F, BW, DQ and VL.
+    Avx512,
+}
+
+impl Simd {
+    /// The best level of this machine.
+    pub fn detect() -> Self {
+        #[cfg(target_arch = "x86_64")]
+        {
+            let avx2 = is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
+            let avx512 = is_x86_feature_detected!("avx512f")
+                && is_x86_feature_detected!("avx512bw")
+                && is_x86_feature_detected!("avx512dq")
+                && is_x86_feature_detected!("avx512vl");
+            if avx2 && avx512 {
+                return Simd::Avx512;
+            }
+            if avx2 {
+                return Simd::Avx2;
+            }
+        }
+        Simd::Scalar
+    }
+}
+
+/// Work that is compiled once for each level. `run` must be `#[inline(always)]`, or it would be compiled once only.
+pub(super) trait Kernel {
+    /// What it returns.
+    type Out;
+    /// Does the work; `FMA` says whether fused multiply-add is an instruction here.
+    fn run<const FMA: bool>(self) -> Self::Out;
+}
+
+/// Runs `kernel` at `level`, or at the best level below it that this machine has.
+pub(super) fn dispatch<K: Kernel>(level: Simd, kernel: K) -> K::Out {
+    #[cfg(target_arch = "x86_64")]
+    match level.min(Simd::detect()) {
+        // SAFETY: detect() has just found every feature that avx512 enables.
+        Simd::Avx512 => return unsafe { avx512(kernel) },
+        // SAFETY: detect() has just found every feature that avx2 enables.
+        Simd::Avx2 => return unsafe { avx2(kernel) },
+        Simd::Scalar => {}
+    }
+    let _ = level;
+    kernel.run::<{ cfg!(target_arch = "aarch64") }>()
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2,fma")]
+fn avx2<K: Kernel>(kernel: K) -> K::Out {
+    kernel.run::<true>()
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2,fma,avx512f,avx512bw,avx512dq,avx512vl")]
+fn avx512<K: Kernel>(kernel: K) -> K::Out {
+    kernel.run::<true>()
+}
