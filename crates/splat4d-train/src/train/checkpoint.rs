@@ -1,0 +1,240 @@
+//! Checkpoints hold everything: scene, moments, statistics, exposure, the losses' memory and how far the run is. Random
+//! numbers and samplers are functions of the step and need no saving. A resumed run is bit for bit the unbroken one.
+//!
+//! The file is a scene file with more arrays (`moments.L.T`, `stats.L`, `exposure…`), so that every reader of scenes
+//! opens it too.
+
+use super::trainer::{Progress, Trainer};
+use crate::densify::Stats;
+use crate::optim::Moments;
+use crate::{Error, ErrorKind, Result};
+use serde_json::{Value, json};
+use splat4d::format::safetensors::{self, SafeTensors, Tensor};
+use splat4d::format::scene::{self, METADATA};
+use splat4d::scene::{Key, Table};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// Version of the checkpoint's own metadata.
+const VERSION: u64 = 1;
+/// The metadata's key.
+const CHECKPOINT: &str = "splat4d-checkpoint";
+
+/// What a checkpoint is of; a run must not continue on another capture or recipe.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Identity {
+    /// Fingerprint of the capture: names, sizes, poses, times.
+    pub capture: String,
+    /// Fingerprint of the recipe.
+    pub recipe: String,
+}
+
+/// What the run, and not the trainer, remembers.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct RunState {
+    /// Seconds of training so far. Never reaches a result.
+    pub seconds: f64,
+    /// Smoothed loss, PSNR for progress. Never reach a result.
+    pub smooth: [f64; 2],
+}
+
+/// A run's checkpoint as bytes.
+pub fn write(trainer: &Trainer<'_>, identity: &Identity, state: &RunState) -> Result<Vec<u8>> {
+    let mut arrays: Vec<(String, Vec<usize>, Vec<f32>)> =
+        scene::arrays(&trainer.scene).into_iter().map(|a| (a.name, a.shape, a.data)).collect();
+    let mut push = |name: String, table: &Table<f32>| {
+        if table.width() > 0 {
+            arrays.push((name, vec![table.rows(), table.width()], table.column_to_rows(0, table.width())));
+        }
+    };
+    for (l, (layer, moments)) in trainer.scene.layers.iter().zip(&trainer.moments).enumerate() {
+        for key in layer.params.keys() {
+            push(format!("moments.{l}.{}", key.0), moments.table(key));
+        }
+        push(format!("stats.{l}"), &trainer.stats.tables[l]);
+    }
+    if let Some(e) = &trainer.loss.exposure {
+        push("exposure".into(), &e.params[e.key()]);
+        push("exposure.moments".into(), e.moments.table(e.key()));
+    }
+    let memories: Vec<(String, Vec<u32>)> = trainer
+        .stages
+        .iter()
+        .enumerate()
+        .flat_map(|(s, stage)| stage.params.iter().enumerate().map(move |(k, l)| (format!("memory.{s}.{k}"), l.state())))
+        .filter(|(_, state)| !state.is_empty())
+        .collect();
+    let mut tensors: Vec<Tensor<'_>> = arrays.iter().map(|(n, shape, data)| Tensor::f32(n.clone(), shape, data)).collect();
+    tensors.extend(memories.iter().map(|(n, data)| Tensor::u32(n.clone(), &[data.len()], data)));
+    let p = trainer.progress;
+    let meta = json!({
+        "version": VERSION,
+        "iteration": p.iteration,
+        "stage": p.stage,
+        "stage_step": p.stage_step,
+        "rate_scale": p.rate_scale,
+        "strikes": p.strikes,
+        "seconds": state.seconds,
+        "smooth": state.smooth,
+        "capture": identity.capture,
+        "recipe": identity.recipe,
+    });
+    let metadata = BTreeMap::from([
+        (METADATA.to_owned(), scene::metadata(&trainer.scene).to_string()),
+        (CHECKPOINT.to_owned(), meta.to_string()),
+    ]);
+    let mut bytes = Vec::new();
+    safetensors::write(&tensors, &metadata, &mut bytes)?;
+    Ok(bytes)
+}
+
+/// Puts a checkpoint's state into a trainer of the same program. Errors: another version, capture or recipe; damage.
+pub fn read(bytes: &[u8], trainer: &mut Trainer<'_>, identity: &Identity) -> Result<RunState> {
+    let file = SafeTensors::read(bytes)?;
+    let meta = metadata(&file)?;
+    for (key, mine, what) in [("capture", &identity.capture, "capture"), ("recipe", &identity.recipe, "recipe")] {
+        if meta[key].as_str() != Some(mine) {
+            return Err(Error::input(format!("the checkpoint belongs to another {what}")).remedy(format!(
+                "Its {what} changed since the run began: put it back, or start a new run with -o"
+            )));
+        }
+    }
+    let scene = scene::from_tensors(&file)?;
+    let mut moments = Vec::new();
+    let mut stats = Stats::new(&scene);
+    for (l, layer) in scene.layers.iter().enumerate() {
+        let mut m = Moments::new(&layer.params);
+        for key in layer.params.keys().collect::<Vec<Key>>() {
+            load(&file, &format!("moments.{l}.{}", key.0), m.table_mut(key))?;
+        }
+        moments.push(m);
+        load(&file, &format!("stats.{l}"), &mut stats.tables[l])?;
+    }
+    if let Some(e) = &mut trainer.loss.exposure {
+        let key = e.key();
+        load(&file, "exposure", &mut e.params[key])?;
+        load(&file, "exposure.moments", e.moments.table_mut(key))?;
+    }
+    for (s, stage) in trainer.stages.iter().enumerate() {
+        for (k, loss) in stage.params.iter().enumerate() {
+            match file.get(&format!("memory.{s}.{k}")) {
+                Some(t) => loss.restore(&t.as_u32()?),
+                None => loss.restore(&[]),
+            }
+        }
+    }
+    let count = |key: &str| {
+        let n = meta[key].as_u64().and_then(|n| usize::try_from(n).ok());
+        n.ok_or_else(|| damaged(format!("`{key}` is missing")))
+    };
+    let number = |v: &Value, key: &str| v.as_f64().ok_or_else(|| damaged(format!("`{key}` is missing")));
+    let progress = Progress {
+        iteration: count("iteration")?,
+        stage: count("stage")?,
+        stage_step: count("stage_step")?,
+        rate_scale: number(&meta["rate_scale"], "rate_scale")?,
+        strikes: count("strikes")?,
+    };
+    let fits = progress.stage <= trainer.stages.len()
+        && trainer.stages.get(progress.stage).is_none_or(|s| progress.stage_step < s.iterations.max(1));
+    if !fits {
+        return Err(damaged("it stands beyond the recipe's last step".into()));
+    }
+    trainer.restore(scene, moments, stats, progress);
+    Ok(RunState {
+        seconds: number(&meta["seconds"], "seconds")?,
+        smooth: [number(&meta["smooth"][0], "smooth")?, number(&meta["smooth"][1], "smooth")?],
+    })
+}
+
+/// Steps that the checkpoint in these bytes has taken, without reading its arrays' values.
+pub fn iteration(bytes: &[u8]) -> Result<usize> {
+    let file = SafeTensors::read(bytes)?;
+    let n = metadata(&file)?["iteration"].as_u64().and_then(|n| usize::try_from(n).ok());
+    n.ok_or_else(|| damaged("`iteration` is missing".into()))
+}
+
+fn metadata(file: &SafeTensors<'_>) -> Result<Value> {
+    let Some(meta) = file.metadata().get(CHECKPOINT) else {
+        return Err(Error::input("this is no checkpoint").remedy("Give the run's folder: its newest checkpoint is found"));
+    };
+    let meta: Value = serde_json::from_str(meta).map_err(|e| damaged(format!("its metadata is not JSON ({e})")))?;
+    match meta["version"].as_u64() {
+        Some(VERSION) => Ok(meta),
+        Some(v) => Err(Error::new(
+            ErrorKind::Unsupported,
+            format!("the checkpoint has version {v}, this splat4d continues version {VERSION}"),
+        )
+        .remedy("Continue with the splat4d that wrote it; its scene can still be rendered and exported")),
+        None => Err(damaged("its metadata has no version".into())),
+    }
+}
+
+fn damaged(what: String) -> Error {
+    Error::input(format!("the checkpoint is damaged: {what}"))
+        .remedy("Delete it; the run continues from the one before")
+}
+
+fn load(file: &SafeTensors<'_>, name: &str, table: &mut Table<f32>) -> Result<()> {
+    if table.width() == 0 {
+        return Ok(());
+    }
+    let tensor = file.tensor(name)?;
+    if tensor.shape() != [table.rows(), table.width()] {
+        return Err(damaged(format!(
+            "array `{name}` has shape {:?}, not [{}, {}]",
+            tensor.shape(),
+            table.rows(),
+            table.width()
+        )));
+    }
+    table.column_from_rows(0, table.width(), &tensor.as_f32()?);
+    Ok(())
+}
+
+/// Writes a file so that a crash leaves the old one or the new one, never half: a temporary name in the same folder, then
+/// a rename.
+pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<()> {
+    let place = |e: std::io::Error, what: &str| {
+        Error::io(what, e).at(path.display()).remedy("Check that the folder exists, is writable and has space")
+    };
+    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    std::fs::create_dir_all(folder).map_err(|e| place(e, "the folder cannot be made"))?;
+    let name = path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+    let temporary = folder.join(format!(".{name}.{}.tmp", std::process::id()));
+    let written = (|| {
+        use std::io::Write;
+        let mut file = std::fs::File::create(&temporary)?;
+        file.write_all(bytes)?;
+        file.sync_all()?;
+        std::fs::rename(&temporary, path)
+    })();
+    written.map_err(|e| {
+        let _ = std::fs::remove_file(&temporary);
+        place(e, "the file cannot be written")
+    })
+}
+
+/// The run's checkpoints, oldest first.
+pub fn list(run: &Path) -> Vec<PathBuf> {
+    let mut found: Vec<PathBuf> = std::fs::read_dir(folder(run))
+        .into_iter()
+        .flatten()
+        .flatten()
+        .map(|e| e.path())
+        .filter(|p| p.extension().is_some_and(|e| e == "safetensors"))
+        .filter(|p| p.file_name().is_some_and(|n| !n.to_string_lossy().starts_with('.')))
+        .collect();
+    found.sort();
+    found
+}
+
+/// The folder of a run's checkpoints.
+pub fn folder(run: &Path) -> PathBuf {
+    run.join("checkpoints")
+}
+
+/// The file of the checkpoint after `iteration` steps.
+pub fn path(run: &Path, iteration: usize) -> PathBuf {
+    folder(run).join(format!("{iteration:08}.safetensors"))
+}

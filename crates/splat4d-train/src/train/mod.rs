@@ -1,0 +1,16 @@
+//! Training: the fixed chain of a step, the trainer that repeats it, and the run that keeps it safe on disk.
+
+pub mod chain;
+pub mod checkpoint;
+pub mod dataset;
+pub mod frames;
+pub mod loss;
+pub mod minutes;
+pub mod run;
+pub mod sampler;
+pub mod trainer;
+
+#[cfg(test)]
+pub(crate) mod tests;
+
+pub use run::{Outcome, TrainOptions, resume, train};
