@@ -76,27 +76,27 @@ pub(super) fn window<F: Real>() -> [F; TAPS] {
 #[derive(Debug)]
 pub(super) struct Scratch<F> {
     /// Ring of products, [RING, MOMENTS, STRIDE].
-    products: Vec<F>,
+    products: Vec<[F; STRIDE]>,
     /// Ring of S's derivatives, [RING, DERIVATIVES, STRIDE].
-    derivatives: Vec<F>,
+    derivatives: Vec<[F; STRIDE]>,
     /// Vertical means of one group, [GROUP, MOMENTS, STRIDE].
-    means: Vec<F>,
+    means: Vec<[F; STRIDE]>,
     /// Weights from column −5 on, 0 outside the image, [STRIDE].
-    weights: Vec<F>,
-    /// Results of one row, [3, STRIDE].
-    row: Vec<F>,
+    weights: Box<[F; STRIDE]>,
+    /// Results of one row, [2, STRIDE].
+    row: Vec<[F; STRIDE]>,
 }
 
 impl<F: Real> Scratch<F> {
     /// Rows for any strip.
     pub fn new() -> Self {
-        let rows = |n: usize| vec![F::ZERO; n * STRIDE];
+        let rows = |n: usize| vec![[F::ZERO; STRIDE]; n];
         Self {
             products: rows(RING * MOMENTS),
             derivatives: rows(RING * DERIVATIVES),
             means: rows(GROUP * MOMENTS),
-            weights: rows(1),
-            row: rows(3),
+            weights: Box::new([F::ZERO; STRIDE]),
+            row: rows(2),
         }
     }
 }
@@ -212,23 +212,20 @@ impl<'a, F: Real> Tile<'a, F> {
     /// Products of one row; zero outside the image and where the weight is zero.
     #[inline(always)]
     fn fill_products(&self, s: &mut Scratch<F>, row: usize) {
-        let out = &mut s.products[row % RING * MOMENTS * STRIDE..][..MOMENTS * STRIDE];
+        let (out, _) = s.products[row % RING * MOMENTS..].split_first_chunk_mut::<MOMENTS>().expect("a ring row");
         let Some(y) = self.image_row(row, 2 * REACH) else {
-            out.fill(F::ZERO);
+            out.as_flattened_mut().fill(F::ZERO);
             return;
         };
         let (start, end) = self.inside(2 * REACH, self.product_columns);
         let from = y * self.job.width + self.x0 + start - 2 * REACH;
         let n = end - start;
         let (render, truth) = (&self.job.render[from..from + n], &self.job.truth[from..from + n]);
-        let (a, rest) = out.split_at_mut(STRIDE);
-        let (b, rest) = rest.split_at_mut(STRIDE);
-        let (c, e) = rest.split_at_mut(STRIDE);
-        for part in [&mut *a, &mut *b, &mut *c, &mut *e] {
+        for part in out.iter_mut() {
             part[..start].fill(F::ZERO);
             part[end..].fill(F::ZERO);
         }
-        let (a, b, c, e) = (&mut a[start..end], &mut b[start..end], &mut c[start..end], &mut e[start..end]);
+        let [a, b, c, e] = out.each_mut().map(|part| &mut part[start..end]);
         a.copy_from_slice(render);
         b.copy_from_slice(truth);
         if let Some(weight) = self.job.weight {
@@ -248,24 +245,25 @@ impl<'a, F: Real> Tile<'a, F> {
     /// Horizontal means of one row of a group, S and its weighted derivatives; returns Σ w S over the tile's own pixels.
     #[inline(always)]
     fn derivatives<const FMA: bool>(&self, s: &mut Scratch<F>, row: usize, in_group: usize) -> f64 {
-        let out = &mut s.derivatives[row % RING * DERIVATIVES * STRIDE..][..DERIVATIVES * STRIDE];
+        let slot = row % RING * DERIVATIVES;
         if self.image_row(row, REACH).is_none() {
-            out.fill(F::ZERO);
+            s.derivatives[slot..slot + DERIVATIVES].as_flattened_mut().fill(F::ZERO);
             return 0.0;
         }
         if self.job.weight.is_some() {
             self.fill_weights(s, row);
         }
-        let out = &mut s.derivatives[row % RING * DERIVATIVES * STRIDE..][..DERIVATIVES * STRIDE];
-        let means = &s.means[in_group * MOMENTS * STRIDE..][..MOMENTS * STRIDE];
+        let (out, _) = s.derivatives[slot..].split_first_chunk_mut::<DERIVATIVES>().expect("a ring row");
+        let (means, _) = s.means[in_group * MOMENTS..].split_first_chunk::<MOMENTS>().expect("a row of means");
+        let map = &mut s.row[0];
         let taps = &self.job.taps;
         let (c1, c2) = (F::of(C1), F::of(C2));
         for i in (0..self.derivative_columns).step_by(LANES) {
-            let mx = horizontal::<F, FMA>(taps, &means[i..]);
-            let my = horizontal::<F, FMA>(taps, &means[STRIDE + i..]);
-            let sq = horizontal::<F, FMA>(taps, &means[2 * STRIDE + i..]);
-            let xy = horizontal::<F, FMA>(taps, &means[3 * STRIDE + i..]);
-            let w: [F; LANES] = lanes(&s.weights[i..]);
+            let mx = horizontal::<F, FMA>(taps, &means[0], i);
+            let my = horizontal::<F, FMA>(taps, &means[1], i);
+            let sq = horizontal::<F, FMA>(taps, &means[2], i);
+            let xy = horizontal::<F, FMA>(taps, &means[3], i);
+            let w: [F; LANES] = std::array::from_fn(|l| s.weights[i + l]);
             let mut r = [[F::ZERO; LANES]; 4];
             for l in 0..LANES {
                 let (mx, my) = (mx[l], my[l]);
@@ -284,13 +282,13 @@ impl<'a, F: Real> Tile<'a, F> {
                 r[2][l] = F::TWO * a1 * wi;
                 r[3][l] = ssim * w[l];
             }
-            out[i..i + LANES].copy_from_slice(&r[0]);
-            out[STRIDE + i..][..LANES].copy_from_slice(&r[1]);
-            out[2 * STRIDE + i..][..LANES].copy_from_slice(&r[2]);
-            s.row[i..i + LANES].copy_from_slice(&r[3]);
+            for (out, r) in out.iter_mut().zip(&r) {
+                out[i..i + LANES].copy_from_slice(r);
+            }
+            map[i..i + LANES].copy_from_slice(&r[3]);
         }
         let own = (REACH..self.rows + REACH).contains(&row);
-        if own { sum(&s.row[REACH..REACH + self.columns]) } else { 0.0 }
+        if own { sum(&map[REACH..REACH + self.columns]) } else { 0.0 }
     }
 
     /// Horizontal means of the derivatives of one row of a group, and the gradient; returns Σ w|x − y|.
@@ -299,17 +297,19 @@ impl<'a, F: Real> Tile<'a, F> {
         if self.job.weight.is_some() {
             self.fill_weights(s, row + REACH);
         }
-        let means = &s.means[in_group * DERIVATIVES * STRIDE..][..DERIVATIVES * STRIDE];
-        let products = &s.products[(row + 2 * REACH) % RING * MOMENTS * STRIDE..][..2 * STRIDE];
+        let (means, _) = s.means[in_group * DERIVATIVES..].split_first_chunk::<DERIVATIVES>().expect("a row of means");
+        let slot = (row + 2 * REACH) % RING * MOMENTS;
+        let (px, py) = (&s.products[slot], &s.products[slot + 1]);
+        let [out, l1] = s.row.first_chunk_mut::<2>().expect("two rows of results");
         let taps = &self.job.taps;
         let (d_l1, d_ssim) = (self.job.d_l1, self.job.d_ssim);
         for i in (0..self.gradient_columns).step_by(LANES) {
-            let da = horizontal::<F, FMA>(taps, &means[i..]);
-            let db = horizontal::<F, FMA>(taps, &means[STRIDE + i..]);
-            let dc = horizontal::<F, FMA>(taps, &means[2 * STRIDE + i..]);
-            let x: [F; LANES] = lanes(&products[i + 2 * REACH..]);
-            let y: [F; LANES] = lanes(&products[STRIDE + i + 2 * REACH..]);
-            let w: [F; LANES] = lanes(&s.weights[i + REACH..]);
+            let da = horizontal::<F, FMA>(taps, &means[0], i);
+            let db = horizontal::<F, FMA>(taps, &means[1], i);
+            let dc = horizontal::<F, FMA>(taps, &means[2], i);
+            let x: [F; LANES] = std::array::from_fn(|l| px[i + 2 * REACH + l]);
+            let y: [F; LANES] = std::array::from_fn(|l| py[i + 2 * REACH + l]);
+            let w: [F; LANES] = std::array::from_fn(|l| s.weights[i + REACH + l]);
             let mut r = [[F::ZERO; LANES]; 2];
             for l in 0..LANES {
                 let diff = x[l] - y[l];
@@ -320,24 +320,18 @@ impl<'a, F: Real> Tile<'a, F> {
                 r[0][l] = chain.fma::<FMA>(inside, sign * w[l] * d_l1);
                 r[1][l] = diff.abs() * w[l];
             }
-            s.row[i..i + LANES].copy_from_slice(&r[0]);
-            s.row[STRIDE + i..][..LANES].copy_from_slice(&r[1]);
+            out[i..i + LANES].copy_from_slice(&r[0]);
+            l1[i..i + LANES].copy_from_slice(&r[1]);
         }
-        d[row * self.job.width + self.x0..][..self.columns].copy_from_slice(&s.row[..self.columns]);
-        sum(&s.row[STRIDE..STRIDE + self.columns])
+        d[row * self.job.width + self.x0..][..self.columns].copy_from_slice(&out[..self.columns]);
+        sum(&l1[..self.columns])
     }
 }
 
+/// Windowed sums along a row, of [`LANES`] neighbours; the first reads columns `i..i+11`.
 #[inline(always)]
-fn lanes<F: Real>(s: &[F]) -> [F; LANES] {
-    let s = &s[..LANES];
-    std::array::from_fn(|l| s[l])
-}
-
-/// Windowed sums along a row, of [`LANES`] neighbours; the first reads from the slice's start.
-#[inline(always)]
-fn horizontal<F: Real, const FMA: bool>(taps: &[F; TAPS], row: &[F]) -> [F; LANES] {
-    let row = &row[..LANES + TAPS - 1];
+fn horizontal<F: Real, const FMA: bool>(taps: &[F; TAPS], row: &[F; STRIDE], i: usize) -> [F; LANES] {
+    let row = &row[i..i + LANES + TAPS - 1];
     let mut acc = [F::ZERO; LANES];
     for t in 0..TAPS {
         for l in 0..LANES {
@@ -351,32 +345,34 @@ fn horizontal<F: Real, const FMA: bool>(taps: &[F; TAPS], row: &[F]) -> [F; LANE
 #[inline(always)]
 fn vertical<F: Real, const FMA: bool, const MAPS: usize>(
     taps: &[F; TAPS],
-    ring: &[F],
+    ring: &[[F; STRIDE]],
     from: usize,
     columns: usize,
-    out: &mut [F],
+    out: &mut [[F; STRIDE]],
 ) {
-    let ring = &ring[..RING * MAPS * STRIDE];
-    let out = &mut out[..GROUP * MAPS * STRIDE];
-    let starts: [usize; SPAN] = std::array::from_fn(|t| (from + t) % RING * MAPS * STRIDE);
+    let ring = &ring[..RING * MAPS];
+    let (out, _) = out.as_chunks_mut::<MAPS>();
     for map in 0..MAPS {
-        for i in (map * STRIDE..map * STRIDE + columns).step_by(LANES) {
-            let mut acc = [[F::ZERO; LANES]; GROUP];
-            for t in 0..SPAN {
-                let v: [F; LANES] = lanes(&ring[starts[t] + i..]);
-                for g in 0..GROUP {
-                    if t >= g && t - g < TAPS {
-                        for l in 0..LANES {
-                            acc[g][l] = v[l].fma::<FMA>(taps[t - g], acc[g][l]);
-                        }
-                    }
-                }
-            }
-            for g in 0..GROUP {
-                out[g * MAPS * STRIDE + i..][..LANES].copy_from_slice(&acc[g]);
-            }
+        let rows: [&[F; STRIDE]; SPAN] = std::array::from_fn(|t| &ring[(from + t) % RING * MAPS + map]);
+        let [o0, o1, o2, o3] = out.first_chunk_mut::<GROUP>().expect("a group of rows").each_mut().map(|m| &mut m[map]);
+        for i in 0..columns.min(STRIDE) {
+            let v: [F; SPAN] = std::array::from_fn(|t| rows[t][i]);
+            o0[i] = weigh::<F, FMA>(taps, &v, 0);
+            o1[i] = weigh::<F, FMA>(taps, &v, 1);
+            o2[i] = weigh::<F, FMA>(taps, &v, 2);
+            o3[i] = weigh::<F, FMA>(taps, &v, 3);
         }
     }
+}
+
+/// Σ taps[t]·v[from + t], by the window's symmetry.
+#[inline(always)]
+fn weigh<F: Real, const FMA: bool>(taps: &[F; TAPS], v: &[F], from: usize) -> F {
+    let mut acc = v[from + REACH] * taps[REACH];
+    for t in 0..REACH {
+        acc = (v[from + t] + v[from + TAPS - 1 - t]).fma::<FMA>(taps[t], acc);
+    }
+    acc
 }
 
 /// Sum of a row: lane by lane, then in f64.
