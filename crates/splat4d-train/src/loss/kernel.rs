@@ -13,7 +13,7 @@
 //! ```
 //!
 //! Only the sum of the two variances occurs, so four moments do (x, y, xx+yy, xy), not five. Four rows at a time go
-//! through: products → vertical means → horizontal means and S's derivatives → vertical means → horizontal means and
+//! through the stages: products → vertical means → horizontal means and S's derivatives → vertical means → horizontal means and
 //! the gradient. Products and derivatives live in rings of 16 rows, which stay in the second-level cache.
 
 use splat4d::math::Real;
@@ -27,7 +27,7 @@ const SIGMA: f64 = 1.5;
 const C1: f64 = 1e-4;
 const C2: f64 = 9e-4;
 
-/// Lanes of the inner loops: one AVX2 register of f32.
+/// Passes run over whole AVX2 registers of f32, so that no loop has a scalar rest.
 const LANES: usize = 8;
 /// Rows that go through the pipeline together; a vertical pass then loads 14 rows for 44 products.
 const GROUP: usize = 4;
@@ -125,18 +125,16 @@ struct Tile<'a, F> {
     x0: usize,
     columns: usize,
     rows: usize,
-    /// Columns of a pass, in whole lanes: gradient, derivative, product.
-    gradient_columns: usize,
+    /// Columns of a pass, in whole lanes.
     derivative_columns: usize,
     product_columns: usize,
 }
 
 impl<'a, F: Real> Tile<'a, F> {
     fn new(job: &'a Strip<'a, F>, x0: usize, columns: usize, rows: usize) -> Self {
-        let gradient_columns = columns.next_multiple_of(LANES);
-        let derivative_columns = (gradient_columns + TAPS - 1).next_multiple_of(LANES);
+        let derivative_columns = (columns + TAPS - 1).next_multiple_of(LANES);
         let product_columns = (derivative_columns + TAPS - 1).next_multiple_of(LANES);
-        Self { job, x0, columns, rows, gradient_columns, derivative_columns, product_columns }
+        Self { job, x0, columns, rows, derivative_columns, product_columns }
     }
 
     #[inline(always)]
@@ -258,34 +256,27 @@ impl<'a, F: Real> Tile<'a, F> {
         let map = &mut s.row[0];
         let taps = &self.job.taps;
         let (c1, c2) = (F::of(C1), F::of(C2));
-        for i in (0..self.derivative_columns).step_by(LANES) {
-            let mx = horizontal::<F, FMA>(taps, &means[0], i);
-            let my = horizontal::<F, FMA>(taps, &means[1], i);
-            let sq = horizontal::<F, FMA>(taps, &means[2], i);
-            let xy = horizontal::<F, FMA>(taps, &means[3], i);
-            let w: [F; LANES] = std::array::from_fn(|l| s.weights[i + l]);
-            let mut r = [[F::ZERO; LANES]; 4];
-            for l in 0..LANES {
-                let (mx, my) = (mx[l], my[l]);
-                let mxy = mx * my;
-                let m2 = mx.fma::<FMA>(mx, my * my);
-                let a1 = F::TWO.fma::<FMA>(mxy, c1);
-                let a2 = F::TWO.fma::<FMA>(xy[l] - mxy, c2);
-                let b1 = m2 + c1;
-                // Rounding can make a variance negative; b2 must not follow.
-                let b2 = (sq[l] - m2).max(F::ZERO) + c2;
-                let inv = F::ONE / (b1 * b2);
-                let ssim = a1 * a2 * inv;
-                let wi = w[l] * inv;
-                r[0][l] = F::TWO * wi * my.fma::<FMA>(a2 - a1, mx * ssim * (b1 - b2));
-                r[1][l] = -(ssim * b1 * wi);
-                r[2][l] = F::TWO * a1 * wi;
-                r[3][l] = ssim * w[l];
-            }
-            for (out, r) in out.iter_mut().zip(&r) {
-                out[i..i + LANES].copy_from_slice(r);
-            }
-            map[i..i + LANES].copy_from_slice(&r[3]);
+        let [da, db, dc] = out;
+        for i in 0..self.derivative_columns.min(STRIDE - TAPS + 1) {
+            let mx = along::<F, FMA>(taps, &means[0], i);
+            let my = along::<F, FMA>(taps, &means[1], i);
+            let sq = along::<F, FMA>(taps, &means[2], i);
+            let xy = along::<F, FMA>(taps, &means[3], i);
+            let mxy = mx * my;
+            let m2 = mx.fma::<FMA>(mx, my * my);
+            let a1 = F::TWO.fma::<FMA>(mxy, c1);
+            let a2 = F::TWO.fma::<FMA>(xy - mxy, c2);
+            let b1 = m2 + c1;
+            // Rounding can make a variance negative; b2 must not follow.
+            let b2 = (sq - m2).max(F::ZERO) + c2;
+            let inv = F::ONE / (b1 * b2);
+            let ssim = a1 * a2 * inv;
+            let w = s.weights[i];
+            let wi = w * inv;
+            da[i] = F::TWO * wi * my.fma::<FMA>(a2 - a1, mx * ssim * (b1 - b2));
+            db[i] = -(ssim * b1 * wi);
+            dc[i] = F::TWO * a1 * wi;
+            map[i] = ssim * w;
         }
         let own = (REACH..self.rows + REACH).contains(&row);
         if own { sum(&map[REACH..REACH + self.columns]) } else { 0.0 }
@@ -303,42 +294,27 @@ impl<'a, F: Real> Tile<'a, F> {
         let [out, l1] = s.row.first_chunk_mut::<2>().expect("two rows of results");
         let taps = &self.job.taps;
         let (d_l1, d_ssim) = (self.job.d_l1, self.job.d_ssim);
-        for i in (0..self.gradient_columns).step_by(LANES) {
-            let da = horizontal::<F, FMA>(taps, &means[0], i);
-            let db = horizontal::<F, FMA>(taps, &means[1], i);
-            let dc = horizontal::<F, FMA>(taps, &means[2], i);
-            let x: [F; LANES] = std::array::from_fn(|l| px[i + 2 * REACH + l]);
-            let y: [F; LANES] = std::array::from_fn(|l| py[i + 2 * REACH + l]);
-            let w: [F; LANES] = std::array::from_fn(|l| s.weights[i + REACH + l]);
-            let mut r = [[F::ZERO; LANES]; 2];
-            for l in 0..LANES {
-                let diff = x[l] - y[l];
-                let sign =
-                    if diff > F::ZERO { F::ONE } else { F::ZERO } - if diff < F::ZERO { F::ONE } else { F::ZERO };
-                let inside = if w[l] > F::ZERO { d_ssim } else { F::ZERO };
-                let chain = (F::TWO * x[l]).fma::<FMA>(db[l], y[l].fma::<FMA>(dc[l], da[l]));
-                r[0][l] = chain.fma::<FMA>(inside, sign * w[l] * d_l1);
-                r[1][l] = diff.abs() * w[l];
-            }
-            out[i..i + LANES].copy_from_slice(&r[0]);
-            l1[i..i + LANES].copy_from_slice(&r[1]);
+        for i in 0..self.columns.min(STRIDE - TAPS + 1 - REACH) {
+            let da = along::<F, FMA>(taps, &means[0], i);
+            let db = along::<F, FMA>(taps, &means[1], i);
+            let dc = along::<F, FMA>(taps, &means[2], i);
+            let (x, y, w) = (px[i + 2 * REACH], py[i + 2 * REACH], s.weights[i + REACH]);
+            let diff = x - y;
+            let sign = if diff > F::ZERO { F::ONE } else { F::ZERO } - if diff < F::ZERO { F::ONE } else { F::ZERO };
+            let inside = if w > F::ZERO { d_ssim } else { F::ZERO };
+            let chain = (F::TWO * x).fma::<FMA>(db, y.fma::<FMA>(dc, da));
+            out[i] = chain.fma::<FMA>(inside, sign * w * d_l1);
+            l1[i] = diff.abs() * w;
         }
         d[row * self.job.width + self.x0..][..self.columns].copy_from_slice(&out[..self.columns]);
         sum(&l1[..self.columns])
     }
 }
 
-/// Windowed sums along a row, of [`LANES`] neighbours; the first reads columns `i..i+11`.
+/// The windowed sum along a row; reads columns `i..i+11`.
 #[inline(always)]
-fn horizontal<F: Real, const FMA: bool>(taps: &[F; TAPS], row: &[F; STRIDE], i: usize) -> [F; LANES] {
-    let row = &row[i..i + LANES + TAPS - 1];
-    let mut acc = [F::ZERO; LANES];
-    for t in 0..TAPS {
-        for l in 0..LANES {
-            acc[l] = row[t + l].fma::<FMA>(taps[t], acc[l]);
-        }
-    }
-    acc
+fn along<F: Real, const FMA: bool>(taps: &[F; TAPS], row: &[F; STRIDE], i: usize) -> F {
+    weigh::<F, FMA>(taps, &row[i..i + TAPS], 0)
 }
 
 /// Windowed sums down the columns for [`GROUP`] rows of `MAPS` maps; the first reads ring rows `from..from+11`.
