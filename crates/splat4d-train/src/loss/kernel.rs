@@ -13,7 +13,7 @@
 //! ```
 //!
 //! Only the sum of the two variances occurs, so four moments do (x, y, xx+yy, xy), not five. Four rows at a time go
-//! through: products → vertical means → horizontal means and S's derivatives → vertical means → horizontal means and
+//! through the stages: products → vertical means → horizontal means and S's derivatives → vertical means → horizontal means and
 //! the gradient. Products and derivatives live in rings of 16 rows, which stay in the second-level cache.
 
 use splat4d::math::Real;
@@ -27,7 +27,7 @@ const SIGMA: f64 = 1.5;
 const C1: f64 = 1e-4;
 const C2: f64 = 9e-4;
 
-/// Lanes of the inner loops: one AVX2 register of f32.
+/// Passes run over whole AVX2 registers of f32, so that no loop has a scalar rest.
 const LANES: usize = 8;
 /// Rows that go through the pipeline together; a vertical pass then loads 14 rows for 44 products.
 const GROUP: usize = 4;
@@ -76,27 +76,27 @@ pub(super) fn window<F: Real>() -> [F; TAPS] {
 #[derive(Debug)]
 pub(super) struct Scratch<F> {
     /// Ring of products, [RING, MOMENTS, STRIDE].
-    products: Vec<F>,
+    products: Vec<[F; STRIDE]>,
     /// Ring of S's derivatives, [RING, DERIVATIVES, STRIDE].
-    derivatives: Vec<F>,
+    derivatives: Vec<[F; STRIDE]>,
     /// Vertical means of one group, [GROUP, MOMENTS, STRIDE].
-    means: Vec<F>,
+    means: Vec<[F; STRIDE]>,
     /// Weights from column −5 on, 0 outside the image, [STRIDE].
-    weights: Vec<F>,
-    /// Results of one row, [3, STRIDE].
-    row: Vec<F>,
+    weights: Box<[F; STRIDE]>,
+    /// Results of one row, [2, STRIDE].
+    row: Vec<[F; STRIDE]>,
 }
 
 impl<F: Real> Scratch<F> {
     /// Rows for any strip.
     pub fn new() -> Self {
-        let rows = |n: usize| vec![F::ZERO; n * STRIDE];
+        let rows = |n: usize| vec![[F::ZERO; STRIDE]; n];
         Self {
             products: rows(RING * MOMENTS),
             derivatives: rows(RING * DERIVATIVES),
             means: rows(GROUP * MOMENTS),
-            weights: rows(1),
-            row: rows(3),
+            weights: Box::new([F::ZERO; STRIDE]),
+            row: rows(2),
         }
     }
 }
@@ -125,18 +125,16 @@ struct Tile<'a, F> {
     x0: usize,
     columns: usize,
     rows: usize,
-    /// Columns of a pass, in whole lanes: gradient, derivative, product.
-    gradient_columns: usize,
+    /// Columns of a pass, in whole lanes.
     derivative_columns: usize,
     product_columns: usize,
 }
 
 impl<'a, F: Real> Tile<'a, F> {
     fn new(job: &'a Strip<'a, F>, x0: usize, columns: usize, rows: usize) -> Self {
-        let gradient_columns = columns.next_multiple_of(LANES);
-        let derivative_columns = (gradient_columns + TAPS - 1).next_multiple_of(LANES);
+        let derivative_columns = (columns + TAPS - 1).next_multiple_of(LANES);
         let product_columns = (derivative_columns + TAPS - 1).next_multiple_of(LANES);
-        Self { job, x0, columns, rows, gradient_columns, derivative_columns, product_columns }
+        Self { job, x0, columns, rows, derivative_columns, product_columns }
     }
 
     #[inline(always)]
@@ -212,23 +210,20 @@ impl<'a, F: Real> Tile<'a, F> {
     /// Products of one row; zero outside the image and where the weight is zero.
     #[inline(always)]
     fn fill_products(&self, s: &mut Scratch<F>, row: usize) {
-        let out = &mut s.products[row % RING * MOMENTS * STRIDE..][..MOMENTS * STRIDE];
+        let (out, _) = s.products[row % RING * MOMENTS..].split_first_chunk_mut::<MOMENTS>().expect("a ring row");
         let Some(y) = self.image_row(row, 2 * REACH) else {
-            out.fill(F::ZERO);
+            out.as_flattened_mut().fill(F::ZERO);
             return;
         };
         let (start, end) = self.inside(2 * REACH, self.product_columns);
         let from = y * self.job.width + self.x0 + start - 2 * REACH;
         let n = end - start;
         let (render, truth) = (&self.job.render[from..from + n], &self.job.truth[from..from + n]);
-        let (a, rest) = out.split_at_mut(STRIDE);
-        let (b, rest) = rest.split_at_mut(STRIDE);
-        let (c, e) = rest.split_at_mut(STRIDE);
-        for part in [&mut *a, &mut *b, &mut *c, &mut *e] {
+        for part in out.iter_mut() {
             part[..start].fill(F::ZERO);
             part[end..].fill(F::ZERO);
         }
-        let (a, b, c, e) = (&mut a[start..end], &mut b[start..end], &mut c[start..end], &mut e[start..end]);
+        let [a, b, c, e] = out.each_mut().map(|part| &mut part[start..end]);
         a.copy_from_slice(render);
         b.copy_from_slice(truth);
         if let Some(weight) = self.job.weight {
@@ -248,49 +243,43 @@ impl<'a, F: Real> Tile<'a, F> {
     /// Horizontal means of one row of a group, S and its weighted derivatives; returns Σ w S over the tile's own pixels.
     #[inline(always)]
     fn derivatives<const FMA: bool>(&self, s: &mut Scratch<F>, row: usize, in_group: usize) -> f64 {
-        let out = &mut s.derivatives[row % RING * DERIVATIVES * STRIDE..][..DERIVATIVES * STRIDE];
+        let slot = row % RING * DERIVATIVES;
         if self.image_row(row, REACH).is_none() {
-            out.fill(F::ZERO);
+            s.derivatives[slot..slot + DERIVATIVES].as_flattened_mut().fill(F::ZERO);
             return 0.0;
         }
         if self.job.weight.is_some() {
             self.fill_weights(s, row);
         }
-        let out = &mut s.derivatives[row % RING * DERIVATIVES * STRIDE..][..DERIVATIVES * STRIDE];
-        let means = &s.means[in_group * MOMENTS * STRIDE..][..MOMENTS * STRIDE];
+        let (out, _) = s.derivatives[slot..].split_first_chunk_mut::<DERIVATIVES>().expect("a ring row");
+        let (means, _) = s.means[in_group * MOMENTS..].split_first_chunk::<MOMENTS>().expect("a row of means");
+        let map = &mut s.row[0];
         let taps = &self.job.taps;
         let (c1, c2) = (F::of(C1), F::of(C2));
-        for i in (0..self.derivative_columns).step_by(LANES) {
-            let mx = horizontal::<F, FMA>(taps, &means[i..]);
-            let my = horizontal::<F, FMA>(taps, &means[STRIDE + i..]);
-            let sq = horizontal::<F, FMA>(taps, &means[2 * STRIDE + i..]);
-            let xy = horizontal::<F, FMA>(taps, &means[3 * STRIDE + i..]);
-            let w: [F; LANES] = lanes(&s.weights[i..]);
-            let mut r = [[F::ZERO; LANES]; 4];
-            for l in 0..LANES {
-                let (mx, my) = (mx[l], my[l]);
-                let mxy = mx * my;
-                let m2 = mx.fma::<FMA>(mx, my * my);
-                let a1 = F::TWO.fma::<FMA>(mxy, c1);
-                let a2 = F::TWO.fma::<FMA>(xy[l] - mxy, c2);
-                let b1 = m2 + c1;
-                // Rounding can make a variance negative; b2 must not follow.
-                let b2 = (sq[l] - m2).max(F::ZERO) + c2;
-                let inv = F::ONE / (b1 * b2);
-                let ssim = a1 * a2 * inv;
-                let wi = w[l] * inv;
-                r[0][l] = F::TWO * wi * my.fma::<FMA>(a2 - a1, mx * ssim * (b1 - b2));
-                r[1][l] = -(ssim * b1 * wi);
-                r[2][l] = F::TWO * a1 * wi;
-                r[3][l] = ssim * w[l];
-            }
-            out[i..i + LANES].copy_from_slice(&r[0]);
-            out[STRIDE + i..][..LANES].copy_from_slice(&r[1]);
-            out[2 * STRIDE + i..][..LANES].copy_from_slice(&r[2]);
-            s.row[i..i + LANES].copy_from_slice(&r[3]);
+        let [da, db, dc] = out;
+        for i in 0..self.derivative_columns.min(STRIDE - TAPS + 1) {
+            let mx = along::<F, FMA>(taps, &means[0], i);
+            let my = along::<F, FMA>(taps, &means[1], i);
+            let sq = along::<F, FMA>(taps, &means[2], i);
+            let xy = along::<F, FMA>(taps, &means[3], i);
+            let mxy = mx * my;
+            let m2 = mx.fma::<FMA>(mx, my * my);
+            let a1 = F::TWO.fma::<FMA>(mxy, c1);
+            let a2 = F::TWO.fma::<FMA>(xy - mxy, c2);
+            let b1 = m2 + c1;
+            // Rounding can make a variance negative; b2 must not follow.
+            let b2 = (sq - m2).max(F::ZERO) + c2;
+            let inv = F::ONE / (b1 * b2);
+            let ssim = a1 * a2 * inv;
+            let w = s.weights[i];
+            let wi = w * inv;
+            da[i] = F::TWO * wi * my.fma::<FMA>(a2 - a1, mx * ssim * (b1 - b2));
+            db[i] = -(ssim * b1 * wi);
+            dc[i] = F::TWO * a1 * wi;
+            map[i] = ssim * w;
         }
         let own = (REACH..self.rows + REACH).contains(&row);
-        if own { sum(&s.row[REACH..REACH + self.columns]) } else { 0.0 }
+        if own { sum(&map[REACH..REACH + self.columns]) } else { 0.0 }
     }
 
     /// Horizontal means of the derivatives of one row of a group, and the gradient; returns Σ w|x − y|.
@@ -299,84 +288,67 @@ impl<'a, F: Real> Tile<'a, F> {
         if self.job.weight.is_some() {
             self.fill_weights(s, row + REACH);
         }
-        let means = &s.means[in_group * DERIVATIVES * STRIDE..][..DERIVATIVES * STRIDE];
-        let products = &s.products[(row + 2 * REACH) % RING * MOMENTS * STRIDE..][..2 * STRIDE];
+        let (means, _) = s.means[in_group * DERIVATIVES..].split_first_chunk::<DERIVATIVES>().expect("a row of means");
+        let slot = (row + 2 * REACH) % RING * MOMENTS;
+        let (px, py) = (&s.products[slot], &s.products[slot + 1]);
+        let [out, l1] = s.row.first_chunk_mut::<2>().expect("two rows of results");
         let taps = &self.job.taps;
         let (d_l1, d_ssim) = (self.job.d_l1, self.job.d_ssim);
-        for i in (0..self.gradient_columns).step_by(LANES) {
-            let da = horizontal::<F, FMA>(taps, &means[i..]);
-            let db = horizontal::<F, FMA>(taps, &means[STRIDE + i..]);
-            let dc = horizontal::<F, FMA>(taps, &means[2 * STRIDE + i..]);
-            let x: [F; LANES] = lanes(&products[i + 2 * REACH..]);
-            let y: [F; LANES] = lanes(&products[STRIDE + i + 2 * REACH..]);
-            let w: [F; LANES] = lanes(&s.weights[i + REACH..]);
-            let mut r = [[F::ZERO; LANES]; 2];
-            for l in 0..LANES {
-                let diff = x[l] - y[l];
-                let sign =
-                    if diff > F::ZERO { F::ONE } else { F::ZERO } - if diff < F::ZERO { F::ONE } else { F::ZERO };
-                let inside = if w[l] > F::ZERO { d_ssim } else { F::ZERO };
-                let chain = (F::TWO * x[l]).fma::<FMA>(db[l], y[l].fma::<FMA>(dc[l], da[l]));
-                r[0][l] = chain.fma::<FMA>(inside, sign * w[l] * d_l1);
-                r[1][l] = diff.abs() * w[l];
-            }
-            s.row[i..i + LANES].copy_from_slice(&r[0]);
-            s.row[STRIDE + i..][..LANES].copy_from_slice(&r[1]);
+        for i in 0..self.columns.min(STRIDE - TAPS + 1 - REACH) {
+            let da = along::<F, FMA>(taps, &means[0], i);
+            let db = along::<F, FMA>(taps, &means[1], i);
+            let dc = along::<F, FMA>(taps, &means[2], i);
+            let (x, y, w) = (px[i + 2 * REACH], py[i + 2 * REACH], s.weights[i + REACH]);
+            let diff = x - y;
+            let sign = if diff > F::ZERO { F::ONE } else { F::ZERO } - if diff < F::ZERO { F::ONE } else { F::ZERO };
+            let inside = if w > F::ZERO { d_ssim } else { F::ZERO };
+            let chain = (F::TWO * x).fma::<FMA>(db, y.fma::<FMA>(dc, da));
+            out[i] = chain.fma::<FMA>(inside, sign * w * d_l1);
+            l1[i] = diff.abs() * w;
         }
-        d[row * self.job.width + self.x0..][..self.columns].copy_from_slice(&s.row[..self.columns]);
-        sum(&s.row[STRIDE..STRIDE + self.columns])
+        d[row * self.job.width + self.x0..][..self.columns].copy_from_slice(&out[..self.columns]);
+        sum(&l1[..self.columns])
     }
 }
 
+/// The windowed sum along a row; reads columns `i..i+11`.
 #[inline(always)]
-fn lanes<F: Real>(s: &[F]) -> [F; LANES] {
-    let s = &s[..LANES];
-    std::array::from_fn(|l| s[l])
-}
-
-/// Windowed sums along a row, of [`LANES`] neighbours; the first reads from the slice's start.
-#[inline(always)]
-fn horizontal<F: Real, const FMA: bool>(taps: &[F; TAPS], row: &[F]) -> [F; LANES] {
-    let row = &row[..LANES + TAPS - 1];
-    let mut acc = [F::ZERO; LANES];
-    for t in 0..TAPS {
-        for l in 0..LANES {
-            acc[l] = row[t + l].fma::<FMA>(taps[t], acc[l]);
-        }
-    }
-    acc
+fn along<F: Real, const FMA: bool>(taps: &[F; TAPS], row: &[F; STRIDE], i: usize) -> F {
+    weigh::<F, FMA>(taps, &row[i..i + TAPS], 0)
 }
 
 /// Windowed sums down the columns for [`GROUP`] rows of `MAPS` maps; the first reads ring rows `from..from+11`.
 #[inline(always)]
 fn vertical<F: Real, const FMA: bool, const MAPS: usize>(
     taps: &[F; TAPS],
-    ring: &[F],
+    ring: &[[F; STRIDE]],
     from: usize,
     columns: usize,
-    out: &mut [F],
+    out: &mut [[F; STRIDE]],
 ) {
-    let ring = &ring[..RING * MAPS * STRIDE];
-    let out = &mut out[..GROUP * MAPS * STRIDE];
-    let starts: [usize; SPAN] = std::array::from_fn(|t| (from + t) % RING * MAPS * STRIDE);
+    let ring = &ring[..RING * MAPS];
+    let (out, _) = out.as_chunks_mut::<MAPS>();
     for map in 0..MAPS {
-        for i in (map * STRIDE..map * STRIDE + columns).step_by(LANES) {
-            let mut acc = [[F::ZERO; LANES]; GROUP];
-            for t in 0..SPAN {
-                let v: [F; LANES] = lanes(&ring[starts[t] + i..]);
-                for g in 0..GROUP {
-                    if t >= g && t - g < TAPS {
-                        for l in 0..LANES {
-                            acc[g][l] = v[l].fma::<FMA>(taps[t - g], acc[g][l]);
-                        }
-                    }
-                }
-            }
-            for g in 0..GROUP {
-                out[g * MAPS * STRIDE + i..][..LANES].copy_from_slice(&acc[g]);
-            }
+        let rows: [&[F; STRIDE]; SPAN] = std::array::from_fn(|t| &ring[(from + t) % RING * MAPS + map]);
+        let [o0, o1, o2, o3] = out.first_chunk_mut::<GROUP>().expect("a group of rows").each_mut().map(|m| &mut m[map]);
+        for i in 0..columns.min(STRIDE) {
+            let v: [F; SPAN] = std::array::from_fn(|t| rows[t][i]);
+            o0[i] = weigh::<F, FMA>(taps, &v, 0);
+            o1[i] = weigh::<F, FMA>(taps, &v, 1);
+            o2[i] = weigh::<F, FMA>(taps, &v, 2);
+            o3[i] = weigh::<F, FMA>(taps, &v, 3);
         }
     }
+}
+
+/// Σ taps[t]·v[from + t], by the window's symmetry.
+#[inline(always)]
+fn weigh<F: Real, const FMA: bool>(taps: &[F; TAPS], v: &[F], from: usize) -> F {
+    let mut acc = v[from + REACH] * taps[REACH];
+    for t in 0..REACH {
+        acc = (v[from + t] + v[from + TAPS - 1 - t]).fma::<FMA>(taps[t], acc);
+    }
+    acc
 }
 
 /// Sum of a row: lane by lane, then in f64.
