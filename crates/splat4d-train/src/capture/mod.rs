@@ -289,3 +289,8 @@ fn ffmpeg_command(video: &str) -> String {
 
 #[cfg(test)]
 mod tests;
+
+/// A coloured point cloud from a .ply file. Errors: not a point cloud, damage, absurd counts.
+pub fn read_points(path: &Path) -> Result<PointCloud> {
+    ply::read(path)
+}

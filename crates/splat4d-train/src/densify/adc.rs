@@ -52,8 +52,7 @@ impl Adc {
         *spare -= wanting.len();
         let mut grows = vec![false; rows];
         wanting.iter().for_each(|&(_, r)| grows[r as usize] = true);
-        let splits: Vec<bool> =
-            (0..rows).map(|r| grows[r] && size(r) > self.percent_dense * limits.extent).collect();
+        let splits: Vec<bool> = (0..rows).map(|r| grows[r] && size(r) > self.percent_dense * limits.extent).collect();
         let mut edit = RowEdit { space: Space::Gaussians, parent: Vec::new(), born: Vec::new() };
         for r in (0..rows).filter(|&r| keep[r]) {
             edit.push(r as u32, if splits[r] { Born::Split } else { Born::Kept });

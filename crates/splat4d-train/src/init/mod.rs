@@ -123,7 +123,13 @@ pub fn seeds(plan: &Plan, frames: &dyn Frames, points: Option<Seeds>, moving: bo
 }
 
 /// One layer of Gaussians at the seeds: isotropic, as large as the distance to their neighbours of the same moment.
-pub fn scene(plan: &Plan, program: &dyn Program, seeds: &Seeds, background: [f32; 3], up: [f64; 3]) -> Result<Scene<f32>> {
+pub fn scene(
+    plan: &Plan,
+    program: &dyn Program,
+    seeds: &Seeds,
+    background: [f32; 3],
+    up: [f64; 3],
+) -> Result<Scene<f32>> {
     let r = &plan.recipe;
     let life = program.life(plan);
     let n = seeds.len();

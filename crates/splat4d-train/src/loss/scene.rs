@@ -213,7 +213,7 @@ mod tests {
     use super::*;
     use splat4d::layers::Layer;
     use splat4d::math::Rng;
-    use splat4d::motion::{Spec, SpacetimeSpec, build};
+    use splat4d::motion::{SpacetimeSpec, Spec, build};
     use splat4d::scene::{Key, Params, Time};
 
     fn scene() -> Scene<f64> {
@@ -267,7 +267,11 @@ mod tests {
                     assert!((fd - got).abs() < 1e-8, "{} {row},{col}: {fd} {got}", loss.name());
                 }
             }
-            assert!((0..base.layers[0].params[*key].width()).all(|c| d.table(*key).get(4, c) == 0.0), "{}", loss.name());
+            assert!(
+                (0..base.layers[0].params[*key].width()).all(|c| d.table(*key).get(4, c) == 0.0),
+                "{}",
+                loss.name()
+            );
         }
     }
 

@@ -193,7 +193,9 @@ mod tests {
     #[test]
     fn rates_are_log_linear() {
         let r = Rate { start: 1e-2, end: 1e-4 };
-        assert!((r.at(0.0) - 1e-2).abs() < 1e-12 && (r.at(0.5) - 1e-3).abs() < 1e-12 && (r.at(1.0) - 1e-4).abs() < 1e-12);
+        assert!(
+            (r.at(0.0) - 1e-2).abs() < 1e-12 && (r.at(0.5) - 1e-3).abs() < 1e-12 && (r.at(1.0) - 1e-4).abs() < 1e-12
+        );
         assert_eq!(Rate::constant(0.0).at(0.3), 0.0);
     }
 }

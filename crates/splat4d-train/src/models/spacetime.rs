@@ -3,7 +3,7 @@
 use super::still;
 use super::{Group, Plan, Program, Rate, Stage};
 use crate::loss::scene::{LivingOpacity, VelocitySmoothness};
-use splat4d::motion::{Spec, SpacetimeSpec};
+use splat4d::motion::{SpacetimeSpec, Spec};
 use splat4d::scene::LifeKind;
 
 /// Explicit kinematics (STG, FreeTimeGS).

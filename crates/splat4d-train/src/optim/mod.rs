@@ -95,8 +95,11 @@ fn step_table<F: Real>(
     let (width, rows) = (p.width(), p.rows());
     assert_eq!(rates.len(), width, "a rate a column is needed");
     let rates: Vec<F> = rates.iter().map(|&r| F::of(r)).collect();
-    let tasks: Vec<_> =
-        p.chunks_mut(TASK_BLOCKS).zip(m.chunks_mut(TASK_BLOCKS)).zip(d.data().chunks(TASK_BLOCKS * width * BLOCK)).collect();
+    let tasks: Vec<_> = p
+        .chunks_mut(TASK_BLOCKS)
+        .zip(m.chunks_mut(TASK_BLOCKS))
+        .zip(d.data().chunks(TASK_BLOCKS * width * BLOCK))
+        .collect();
     tasks
         .into_par_iter()
         .map(|((p, m), d)| {
@@ -104,9 +107,8 @@ fn step_table<F: Real>(
             let blocks = p.data.chunks_exact_mut(width * BLOCK).zip(m.data.chunks_exact_mut((2 * width + 1) * BLOCK));
             for (b, ((p_block, m_block), d_block)) in blocks.zip(d.chunks_exact(width * BLOCK)).enumerate() {
                 let first = p.first + b * BLOCK;
-                let lanes: [bool; BLOCK] = std::array::from_fn(|lane| {
-                    first + lane < rows && (space == Space::Fixed || active[first + lane])
-                });
+                let lanes: [bool; BLOCK] =
+                    std::array::from_fn(|lane| first + lane < rows && (space == Space::Fixed || active[first + lane]));
                 if lanes.contains(&true) {
                     finite &= step_block(p_block, d_block, m_block, &lanes, &rates);
                 }

@@ -80,7 +80,13 @@ pub struct View<'a, F = f32> {
 /// Compares a picture with its truth.
 pub trait ImageLoss<F: Real> {
     /// The loss; overwrites `d_color`, and `d_alpha` if it returns true (alpha takes part).
-    fn eval(&mut self, view: &View<'_, F>, image: &Image<F>, d_color: &mut Planes<F>, d_alpha: &mut Planes<F>) -> (f64, bool);
+    fn eval(
+        &mut self,
+        view: &View<'_, F>,
+        image: &Image<F>,
+        d_color: &mut Planes<F>,
+        d_alpha: &mut Planes<F>,
+    ) -> (f64, bool);
 }
 
 /// Where in training a loss is asked.
@@ -273,8 +279,7 @@ impl<F: Real> Chain<F> {
         let clock = Clock::now();
         for ask in &mut self.asks {
             let (cache, d_cache) = &mut self.caches[ask.layer];
-            let d_out =
-                SplatGrads { out: &ask.d_out, color: ask.d_color.as_ref(), weights: ask.d_weights.as_ref() };
+            let d_out = SplatGrads { out: &ask.d_out, color: ask.d_color.as_ref(), weights: ask.d_weights.as_ref() };
             ask.d_time = scene.layers[ask.layer].backward(cache, &mut ask.tape, &d_out, d_cache, &mut d[ask.layer]);
         }
         for (layer, (cache, d_cache)) in self.caches.iter_mut().enumerate() {

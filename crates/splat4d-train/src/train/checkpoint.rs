@@ -61,10 +61,13 @@ pub fn write(trainer: &Trainer<'_>, identity: &Identity, state: &RunState) -> Re
         .stages
         .iter()
         .enumerate()
-        .flat_map(|(s, stage)| stage.params.iter().enumerate().map(move |(k, l)| (format!("memory.{s}.{k}"), l.state())))
+        .flat_map(|(s, stage)| {
+            stage.params.iter().enumerate().map(move |(k, l)| (format!("memory.{s}.{k}"), l.state()))
+        })
         .filter(|(_, state)| !state.is_empty())
         .collect();
-    let mut tensors: Vec<Tensor<'_>> = arrays.iter().map(|(n, shape, data)| Tensor::f32(n.clone(), shape, data)).collect();
+    let mut tensors: Vec<Tensor<'_>> =
+        arrays.iter().map(|(n, shape, data)| Tensor::f32(n.clone(), shape, data)).collect();
     tensors.extend(memories.iter().map(|(n, data)| Tensor::u32(n.clone(), &[data.len()], data)));
     let p = trainer.progress;
     let meta = json!({
@@ -94,9 +97,8 @@ pub fn read(bytes: &[u8], trainer: &mut Trainer<'_>, identity: &Identity) -> Res
     let meta = metadata(&file)?;
     for (key, mine, what) in [("capture", &identity.capture, "capture"), ("recipe", &identity.recipe, "recipe")] {
         if meta[key].as_str() != Some(mine) {
-            return Err(Error::input(format!("the checkpoint belongs to another {what}")).remedy(format!(
-                "Its {what} changed since the run began: put it back, or start a new run with -o"
-            )));
+            return Err(Error::input(format!("the checkpoint belongs to another {what}"))
+                .remedy(format!("Its {what} changed since the run began: put it back, or start a new run with -o")));
         }
     }
     let scene = scene::from_tensors(&file)?;
@@ -156,7 +158,9 @@ pub fn iteration(bytes: &[u8]) -> Result<usize> {
 
 fn metadata(file: &SafeTensors<'_>) -> Result<Value> {
     let Some(meta) = file.metadata().get(CHECKPOINT) else {
-        return Err(Error::input("this is no checkpoint").remedy("Give the run's folder: its newest checkpoint is found"));
+        return Err(
+            Error::input("this is no checkpoint").remedy("Give the run's folder: its newest checkpoint is found")
+        );
     };
     let meta: Value = serde_json::from_str(meta).map_err(|e| damaged(format!("its metadata is not JSON ({e})")))?;
     match meta["version"].as_u64() {

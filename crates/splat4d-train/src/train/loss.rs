@@ -117,7 +117,13 @@ impl ImageLoss<f32> for TrainLoss {
             for ((d, a), m) in d_alpha.data.iter_mut().zip(&image.alpha.data).zip(&mask.data) {
                 let e = a - m;
                 sum += f64::from(e.abs());
-                *d = if e > 0.0 { scale } else if e < 0.0 { -scale } else { 0.0 };
+                *d = if e > 0.0 {
+                    scale
+                } else if e < 0.0 {
+                    -scale
+                } else {
+                    0.0
+                };
             }
             total += sum * f64::from(scale);
         }

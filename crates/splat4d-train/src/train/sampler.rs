@@ -59,7 +59,15 @@ impl Timeline {
     }
 
     /// The frames of step `step` of a stage of `steps` steps. Panics: no frames; a frame number beyond the clip.
-    pub fn draw(&self, sampler: &Sampler, batch: usize, seed: u64, stage: usize, step: usize, steps: usize) -> Vec<usize> {
+    pub fn draw(
+        &self,
+        sampler: &Sampler,
+        batch: usize,
+        seed: u64,
+        stage: usize,
+        step: usize,
+        steps: usize,
+    ) -> Vec<usize> {
         assert!(self.count > 0, "a capture without frames cannot be trained on");
         let rng = Rng::new(seed, "frames", stage as u64);
         let step_rng = rng.fork(step as u64 + 1);
@@ -84,7 +92,11 @@ impl Timeline {
                 (0..batch as u64)
                     .map(|b| {
                         let inside = step_rng.uniform(3 * b) < WINDOW_SHARE;
-                        let k = if inside { first + step_rng.below(3 * b + 1, width) } else { step_rng.below(3 * b + 1, times) };
+                        let k = if inside {
+                            first + step_rng.below(3 * b + 1, width)
+                        } else {
+                            step_rng.below(3 * b + 1, times)
+                        };
                         any_of(&self.frames[k], 3 * b + 2)
                     })
                     .collect()

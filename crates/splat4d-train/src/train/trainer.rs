@@ -155,6 +155,12 @@ impl<'a> Trainer<'a> {
         self.stats.clear(&self.scene);
     }
 
+    /// Fits the step's scratch to rows that were edited from outside (moments and statistics were edited with them).
+    pub fn refit(&mut self) {
+        self.fit_grads();
+        self.stages.iter().flat_map(|s| &s.params).for_each(|l| l.on_edit());
+    }
+
     fn fit_grads(&mut self) {
         self.grads = self.scene.layers.iter().map(|l| Grads::new(&l.params)).collect();
     }
@@ -168,13 +174,14 @@ impl<'a> Trainer<'a> {
     /// Whether a step is the first after a row of zero-step stages; runs the hooks that are due.
     fn enter_stage(&mut self) -> Result<()> {
         while let Some(stage) = self.stages.get(self.progress.stage) {
+            let empty = stage.iterations == 0;
             if self.progress.stage_step == 0
                 && let Some(hook) = &stage.start
             {
                 hook(&mut self.scene)?;
                 self.adapt();
             }
-            if stage.iterations > 0 {
+            if !empty {
                 return Ok(());
             }
             self.leave_stage()?;
@@ -264,15 +271,10 @@ impl<'a> Trainer<'a> {
         let mut mse = Mse { inner: &mut self.loss, sum: 0.0 };
         let mut losses = Losses { image: &mut mse, probes: &stage.probes, params: &stage.params };
         let stats = &mut self.stats;
-        out.report = self.chain.step(
-            &self.scene,
-            &views,
-            &info,
-            self.draw.as_mut(),
-            &mut losses,
-            &mut self.grads,
-            &mut |o| stats.observe(o),
-        );
+        out.report =
+            self.chain.step(&self.scene, &views, &info, self.draw.as_mut(), &mut losses, &mut self.grads, &mut |o| {
+                stats.observe(o)
+            });
         out.mse = mse.sum / views.len().max(1) as f64;
         (out.l1, out.ssim) = (self.loss.l1, self.loss.ssim);
     }
@@ -365,7 +367,13 @@ impl<'a> Trainer<'a> {
             if step + every > until {
                 for layer in 0..self.scene.layers.len() {
                     let edit = morton_edit(&self.scene, layer);
-                    crate::densify::apply(&mut self.scene, &mut self.moments, layer, &edit, &Rng::new(seed, "order", address));
+                    crate::densify::apply(
+                        &mut self.scene,
+                        &mut self.moments,
+                        layer,
+                        &edit,
+                        &Rng::new(seed, "order", address),
+                    );
                 }
             }
             stage.params.iter().for_each(|l| l.on_edit());

@@ -7,7 +7,7 @@
 use super::safetensors::{SafeTensors, Tensor};
 use super::{params_to_arrays, tensors_to_loaded};
 use crate::layers::{Head, Layer, Scene};
-use crate::motion::{Spec, SpacetimeSpec, build};
+use crate::motion::{SpacetimeSpec, Spec, build};
 use crate::scene::{LifeKind, Params, SH};
 use crate::{Error, ErrorKind, Result};
 use serde_json::{Value, json};
@@ -76,8 +76,11 @@ pub fn spec_from_json(v: &Value) -> Result<Spec> {
                 origin: number(v, "origin")?,
             }))
         }
-        other => Err(Error::new(ErrorKind::Unsupported, format!("the scene moves by `{other}`, which this version does not know"))
-            .remedy("Open it with the splat4d that wrote it, or a newer one")),
+        other => Err(Error::new(
+            ErrorKind::Unsupported,
+            format!("the scene moves by `{other}`, which this version does not know"),
+        )
+        .remedy("Open it with the splat4d that wrote it, or a newer one")),
     }
 }
 
@@ -107,8 +110,11 @@ pub fn from_tensors(file: &SafeTensors<'_>) -> Result<Scene<f32>> {
     let meta: Value = serde_json::from_str(meta).map_err(|e| broken(format!("its metadata is not JSON: {e}")))?;
     let version = meta["version"].as_u64().ok_or_else(|| broken("its metadata has no version".into()))?;
     if version > VERSION {
-        return Err(Error::new(ErrorKind::Unsupported, format!("the scene has version {version}, this splat4d reads up to {VERSION}"))
-            .remedy("Install a newer splat4d"));
+        return Err(Error::new(
+            ErrorKind::Unsupported,
+            format!("the scene has version {version}, this splat4d reads up to {VERSION}"),
+        )
+        .remedy("Install a newer splat4d"));
     }
     let [start, end] = numbers::<2>(&meta, "clip")?;
     let mut scene = Scene {
@@ -150,7 +156,8 @@ fn read_layer(file: &SafeTensors<'_>, meta: &Value, index: usize) -> Result<Laye
 }
 
 fn broken(what: String) -> Error {
-    Error::input(format!("this is not a readable scene: {what}")).remedy("Export it again; `splat4d info` shows what a file holds")
+    Error::input(format!("this is not a readable scene: {what}"))
+        .remedy("Export it again; `splat4d info` shows what a file holds")
 }
 
 fn text(v: &Value, key: &str) -> Result<String> {
@@ -167,7 +174,8 @@ fn number(v: &Value, key: &str) -> Result<f64> {
 }
 
 fn numbers<const N: usize>(v: &Value, key: &str) -> Result<[f64; N]> {
-    let list = v[key].as_array().filter(|l| l.len() == N).ok_or_else(|| broken(format!("`{key}` is not {N} numbers")))?;
+    let list =
+        v[key].as_array().filter(|l| l.len() == N).ok_or_else(|| broken(format!("`{key}` is not {N} numbers")))?;
     let mut out = [0.0; N];
     for (o, x) in out.iter_mut().zip(list) {
         *o = x.as_f64().filter(|x| x.is_finite()).ok_or_else(|| broken(format!("`{key}` is not {N} numbers")))?;

@@ -1,0 +1,117 @@
+//! `--minutes M`: how many iterations fit. A few steps are timed at the initial and at the capped number of Gaussians; the
+//! iterations follow from the densification's own schedule, and are saved in the recipe, so that the run repeats.
+
+use super::run::Bench;
+use crate::densify::{Densify, Mcmc};
+use crate::event::Event;
+use crate::recipe::Recipe;
+use crate::{Error, ErrorKind, Result};
+use std::time::Instant as Clock;
+
+/// Steps that warm caches up and are not timed.
+const WARM_UP: usize = 12;
+/// Steps that are timed.
+const TIMED: usize = 25;
+/// Bounds of what is sensible.
+const ITERATIONS: std::ops::RangeInclusive<usize> = 50..=1_000_000;
+
+/// The recipe with its iterations fixed so that training takes `minutes`.
+pub(super) fn plan(bench: &Bench, recipe: &Recipe, minutes: f64, listen: &mut dyn FnMut(&Event)) -> Result<Recipe> {
+    if !(minutes > 0.0 && minutes.is_finite()) {
+        return Err(
+            Error::input(format!("--minutes cannot be {minutes}")).remedy("Give a positive number, for instance 3")
+        );
+    }
+    let tell = |listen: &mut dyn FnMut(&Event), done| {
+        listen(&Event::Phase { name: "timing probes".into(), done, total: 2 });
+    };
+    tell(listen, 0);
+    let plan = bench.plan(recipe);
+    let scene = bench.initial_scene(&plan)?;
+    let start = scene.len();
+    // A probe's rates do not matter, its number of Gaussians does: nothing of it is kept.
+    let mut trainer = bench.trainer(&plan, scene)?;
+    trainer.check_not_empty()?;
+    let first = time(&mut trainer)?;
+    tell(listen, 1);
+    let grow = Densify::Mcmc(Mcmc { growth: 2.0, gradient_share: 0.0, noise_lr: 0.0 });
+    let mut step = 0;
+    while recipe.strategy != "none" && trainer.scene.len() < recipe.max_cap && step < 40 {
+        let limits = trainer.settings.limits;
+        grow.run(&mut trainer.scene, &mut trainer.moments, &mut trainer.stats, &limits, recipe.seed, step);
+        step += 1;
+    }
+    trainer.refit();
+    let end = trainer.scene.len();
+    let last = if end > start { time(&mut trainer)? } else { first };
+    tell(listen, 2);
+    let seconds = minutes * 60.0;
+    let cost = |iterations: usize| {
+        schedule_cost(&Recipe { iterations, ..reset(recipe) }.resolve(), [start, end], [first, last])
+    };
+    let (mut low, mut high) = (*ITERATIONS.start(), *ITERATIONS.end());
+    while low + 1 < high {
+        let middle = low.midpoint(high);
+        if cost(middle) <= seconds { low = middle } else { high = middle }
+    }
+    Ok(Recipe { iterations: low, ..reset(recipe) })
+}
+
+/// Schedules that followed from another number of iterations are derived anew.
+fn reset(recipe: &Recipe) -> Recipe {
+    Recipe {
+        sh_degree_interval: 0,
+        densification_interval: 0,
+        densify_from_iter: 0,
+        densify_until_iter: 0,
+        checkpoint_interval: 0,
+        ..recipe.clone()
+    }
+}
+
+/// Seconds a step.
+fn time(trainer: &mut super::trainer::Trainer<'_>) -> Result<f64> {
+    let mut clock = Clock::now();
+    for i in 0..WARM_UP + TIMED {
+        if i == WARM_UP {
+            clock = Clock::now();
+        }
+        if let Err(fault) = trainer.step()? {
+            return Err(Error::new(ErrorKind::Diverged, format!("the timing probe failed: {}", fault.0))
+                .remedy("Look for wrong poses with `splat4d info CAPTURE`"));
+        }
+    }
+    Ok(clock.elapsed().as_secs_f64() / TIMED as f64)
+}
+
+/// Seconds of a whole run: the cost of a step is linear in the number of Gaussians, which grows by the schedule.
+fn schedule_cost(r: &Recipe, gaussians: [usize; 2], step: [f64; 2]) -> f64 {
+    let [start, end] = gaussians.map(|n| n as f64);
+    let slope = if end > start { (step[1] - step[0]) / (end - start) } else { 0.0 };
+    let mut count = start;
+    let mut total = 0.0;
+    let mut i = 0;
+    while i < r.iterations {
+        let until = (i + r.densification_interval).min(r.iterations);
+        total += (until - i) as f64 * (step[0] + slope * (count - start));
+        i = until;
+        if i >= r.densify_from_iter && i <= r.densify_until_iter {
+            count = (count * r.growth).min(end);
+        }
+    }
+    total
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_cost_follows_the_growth() {
+        let r = Recipe { iterations: 1000, ..Recipe::default() }.resolve();
+        let flat = schedule_cost(&r, [1000, 1000], [0.01, 0.01]);
+        assert!((flat - 10.0).abs() < 1e-9);
+        let grown = schedule_cost(&r, [1000, 2000], [0.01, 0.02]);
+        assert!(grown > 12.0 && grown < 20.0, "{grown}");
+    }
+}

@@ -1,0 +1,583 @@
+//! A run on disk: folder, recipe, checkpoints, metrics, resume, rollback. It emits events and never prints.
+
+use super::checkpoint::{self, Identity, RunState, write_atomically};
+use super::dataset::Dataset;
+use super::loss::{Exposure, TrainLoss};
+use super::minutes;
+use super::trainer::{Settings, Stepped, Trainer};
+use crate::capture::{Capture, CaptureOptions, ImageStore};
+use crate::densify::Limits;
+use crate::event::Event;
+use crate::init::{self, Seeds};
+use crate::models::{Plan, program};
+use crate::recipe::Recipe;
+use crate::{Error, ErrorKind, Result};
+use serde_json::json;
+use splat4d::layers::Scene;
+use splat4d::render::{Antialias, RenderConfig, Renderer, Simd};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant as Clock;
+
+/// What is asked of a run besides its recipe.
+#[derive(Clone, Debug, Default)]
+pub struct TrainOptions {
+    /// Fix the iterations so that training takes so long.
+    pub minutes: Option<f64>,
+}
+
+/// How a run ended.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Outcome {
+    /// Its folder.
+    pub run: PathBuf,
+    /// Steps taken.
+    pub iteration: usize,
+    /// Gaussians at the end.
+    pub gaussians: usize,
+    /// Seconds of training, resumed ones included.
+    pub seconds: f64,
+    /// Whether it was stopped before its last step; `resume` continues it.
+    pub interrupted: bool,
+}
+
+/// Rollbacks after which a run is given up.
+const MAX_STRIKES: usize = 3;
+/// After a rollback rates are multiplied by this.
+const ROLLBACK_RATE: f64 = 0.5;
+/// Weight of the newest step in smoothed numbers.
+const SMOOTHING: f64 = 0.05;
+/// Rows of metrics.csv in a whole run, about.
+const METRIC_ROWS: usize = 600;
+/// Seconds between two progress events.
+const PROGRESS_SECONDS: f64 = 0.25;
+/// Bytes a Gaussian takes in training, per number: value, gradient, two moments.
+const BYTES_PER_NUMBER: u64 = 16;
+/// Bytes a Gaussian takes in the renderer: records, gradient records, projections (measured: about 1.2 kB).
+const RENDER_BYTES: u64 = 1200;
+/// Bytes a pixel takes in training: pictures, gradients and the loss's scratch, all f32.
+const PIXEL_BYTES: u64 = 200;
+
+/// The options with which a recipe opens its capture.
+pub fn capture_options(recipe: &Recipe) -> Result<CaptureOptions> {
+    let hold_out = if recipe.hold_out.is_empty() { None } else { Some(recipe.hold_out.parse()?) };
+    Ok(CaptureOptions {
+        downscale: recipe.downscale,
+        hold_out,
+        fps: (recipe.fps > 0.0).then_some(recipe.fps),
+        background: (!recipe.white_background).then_some([0.0; 3]),
+        ..CaptureOptions::default()
+    })
+}
+
+/// Trains a scene of `capture` into the folder `run`.
+pub fn train(
+    capture: Arc<Capture>,
+    recipe: Recipe,
+    run: &Path,
+    options: &TrainOptions,
+    stop: &AtomicBool,
+    listen: &mut dyn FnMut(&Event),
+) -> Result<Outcome> {
+    recipe.check()?;
+    if !checkpoint::list(run).is_empty() {
+        return Err(Error::input("this folder already holds a run")
+            .at(run.display())
+            .remedy("Continue it with `train --resume`, or give another folder with -o"));
+    }
+    let bench = Bench::new(capture, &recipe)?;
+    let mut listen = listen;
+    let recipe = match options.minutes {
+        Some(m) => minutes::plan(&bench, &recipe, m, &mut listen)?,
+        None => recipe,
+    }
+    .resolve();
+    let plan = bench.plan(&recipe);
+    program(&recipe.motion)?.check(&plan)?;
+    let estimate = memory_estimate(&bench.capture, &recipe);
+    if recipe.memory_limit > 0 && estimate > recipe.memory_limit {
+        return Err(Error::new(
+            ErrorKind::Memory,
+            format!(
+                "training would take about {} MiB, and memory_limit is {} MiB",
+                estimate >> 20,
+                recipe.memory_limit >> 20
+            ),
+        )
+        .remedy("Lower max_cap or image_memory, or use --downscale 2"));
+    }
+    listen(&Event::Phase { name: "initial points".into(), done: 0, total: 0 });
+    let scene = bench.initial_scene(&plan)?;
+    let mut trainer = bench.trainer(&plan, scene)?;
+    trainer.check_not_empty()?;
+    write_atomically(&run.join("recipe.toml"), recipe.to_toml().as_bytes())?;
+    let identity = bench.identity(&recipe);
+    let state = RunState::default();
+    save_checkpoint(run, &trainer, &identity, &state, &mut listen)?;
+    write_run_json(run, &bench, &recipe, &Totals::default(), &trainer, &state, false)?;
+    let session = Session { run, bench: &bench, recipe: &recipe, identity, estimate, stop };
+    session.drive(&mut trainer, state, &mut listen)
+}
+
+/// Continues the run in the folder `run`, exactly.
+pub fn resume(run: &Path, stop: &AtomicBool, listen: &mut dyn FnMut(&Event)) -> Result<Outcome> {
+    let (recipe, capture) = open_run(run)?;
+    let bench = Bench::new(Arc::new(capture), &recipe)?;
+    let plan = bench.plan(&recipe);
+    let empty =
+        init::scene(&plan, program(&recipe.motion)?.as_ref(), &Seeds::default(), bench.background(), bench.capture.up)?;
+    let mut trainer = bench.trainer(&plan, empty)?;
+    let identity = bench.identity(&recipe);
+    let (state, from) = restore_newest(run, &mut trainer, &identity)?;
+    let mut listen = listen;
+    if let Some(warning) = from {
+        listen(&Event::Warning { message: warning });
+    }
+    let estimate = memory_estimate(&bench.capture, &recipe);
+    let session = Session { run, bench: &bench, recipe: &recipe, identity, estimate, stop };
+    session.drive(&mut trainer, state, &mut listen)
+}
+
+/// A run's recipe and its capture. Errors: not a run; the capture has gone.
+pub fn open_run(run: &Path) -> Result<(Recipe, Capture)> {
+    let text = read_text(&run.join("recipe.toml"))?;
+    let recipe = Recipe::from_toml(&text).map_err(|e| e.at(run.join("recipe.toml").display()))?;
+    let info: serde_json::Value = serde_json::from_str(&read_text(&run.join("run.json"))?)
+        .map_err(|e| Error::input(format!("it is not JSON: {e}")).at(run.join("run.json").display()))?;
+    let path = info["capture"].as_str().ok_or_else(|| {
+        Error::input("it does not name its capture").at(run.join("run.json").display()).remedy("Train again")
+    })?;
+    let capture = open_capture(Path::new(path), &recipe)
+        .map_err(|e| e.remedy("The run needs its capture where it was when it was trained"))?;
+    Ok((recipe, capture))
+}
+
+/// Opens a capture as a recipe wants it: scale, split, and the part of the take that is used.
+pub fn open_capture(path: &Path, recipe: &Recipe) -> Result<Capture> {
+    let mut capture = Capture::open(path, &capture_options(recipe)?)?;
+    if recipe.first_frame > 0 || recipe.max_frames > 0 {
+        let last =
+            if recipe.max_frames == 0 { usize::MAX } else { recipe.first_frame.saturating_add(recipe.max_frames) };
+        let keep = |i: &usize| (recipe.first_frame..last).contains(&capture.frames[*i].index);
+        let (train, held) =
+            (capture.train.iter().copied().filter(keep).collect(), capture.held.iter().copied().filter(keep).collect());
+        let validation = capture.validation.iter().copied().filter(keep).collect();
+        (capture.train, capture.held, capture.validation) = (train, held, validation);
+        if capture.train.is_empty() {
+            return Err(Error::input(format!("no training frame is left of frames {}..{last}", recipe.first_frame))
+                .remedy("Change first_frame or max_frames"));
+        }
+    }
+    Ok(capture)
+}
+
+fn read_text(path: &Path) -> Result<String> {
+    std::fs::read_to_string(path)
+        .map_err(|e| Error::io("the run cannot be read", e).at(path.display()).remedy("Give the folder of a run"))
+}
+
+/// Puts the newest sound checkpoint into the trainer. A damaged newest one is skipped, and said so.
+fn restore_newest(run: &Path, trainer: &mut Trainer<'_>, identity: &Identity) -> Result<(RunState, Option<String>)> {
+    let mut first_error = None;
+    for path in checkpoint::list(run).iter().rev() {
+        let read = std::fs::read(path)
+            .map_err(|e| Error::io("the checkpoint cannot be read", e))
+            .and_then(|bytes| checkpoint::read(&bytes, trainer, identity))
+            .map_err(|e| e.at(path.display()));
+        match read {
+            Ok(state) => return Ok((state, first_error.map(|e: Error| e.to_string()))),
+            // Another version or capture is not damage: older ones would say the same.
+            Err(e) if e.kind() == ErrorKind::Unsupported => return Err(e),
+            Err(e) => first_error = first_error.or(Some(e)),
+        }
+    }
+    Err(first_error.unwrap_or_else(|| {
+        Error::input("there is no checkpoint to continue from").at(run.display()).remedy("Train from the start")
+    }))
+}
+
+/// A capture opened for training: what fresh runs, resumes and probes share.
+pub(super) struct Bench {
+    pub(super) capture: Arc<Capture>,
+    frames: Arc<Dataset>,
+    simd: Simd,
+}
+
+impl Bench {
+    fn new(capture: Arc<Capture>, recipe: &Recipe) -> Result<Self> {
+        if capture.train.is_empty() {
+            return Err(
+                Error::input("the capture has no training frames").remedy("Hold out fewer views with --hold-out")
+            );
+        }
+        let store = Arc::new(ImageStore::new(capture.clone(), recipe.image_memory as usize));
+        let frames = Arc::new(Dataset::new(store, capture.train.clone()));
+        Ok(Self { capture, frames, simd: Simd::detect() })
+    }
+
+    pub(super) fn plan(&self, recipe: &Recipe) -> Plan {
+        let mut times: Vec<f64> = self.capture.train.iter().map(|&i| self.capture.frames[i].time.0).collect();
+        times.sort_by(f64::total_cmp);
+        times.dedup();
+        let clip = [times[0], times[times.len() - 1]];
+        let centers: Vec<[f64; 3]> = self.capture.train.iter().map(|&i| self.capture.frames[i].view.center()).collect();
+        Plan {
+            recipe: recipe.resolve(),
+            extent: extent(&centers),
+            clip,
+            fps: self.capture.fps,
+            times: times.len(),
+            fixed_cameras: self.capture.cameras.iter().filter(|c| c.fixed).count(),
+        }
+    }
+
+    fn background(&self) -> [f32; 3] {
+        self.capture.background.unwrap_or([0.0; 3])
+    }
+
+    pub(super) fn initial_scene(&self, plan: &Plan) -> Result<Scene<f32>> {
+        let program = program(&plan.recipe.motion)?;
+        let moving = plan.recipe.motion != "still" && plan.times > 1;
+        let init = &plan.recipe.init;
+        let points = if init.ends_with(".ply") {
+            let cloud = crate::capture::read_points(Path::new(init))?;
+            Some(Seeds { points: cloud.points, colors: cloud.colors, times: cloud.times })
+        } else {
+            self.capture.points.as_ref().map(|c| Seeds {
+                points: c.points.clone(),
+                colors: c.colors.clone(),
+                times: c.times.clone(),
+            })
+        };
+        let seeds = init::seeds(plan, self.frames.as_ref(), points, moving)?;
+        init::scene(plan, program.as_ref(), &seeds, self.background(), self.capture.up)
+    }
+
+    pub(super) fn trainer(&self, plan: &Plan, scene: Scene<f32>) -> Result<Trainer<'static>> {
+        let r = &plan.recipe;
+        let config = RenderConfig {
+            antialias: if r.antialias { Antialias::On } else { Antialias::Off },
+            sh_degree: r.sh_degree,
+            simd: self.simd,
+            ..RenderConfig::default()
+        };
+        let exposure = r.exposure.then(|| Exposure::new(self.capture.cameras.len()));
+        let settings = Settings {
+            seed: r.seed,
+            limits: Limits { cap: r.max_cap, extent: plan.extent, min_opacity: r.min_opacity },
+            background: self.background(),
+            sh_degree: r.sh_degree,
+            opacity_reset_interval: r.opacity_reset_interval,
+            exposure_lr: r.exposure_lr,
+        };
+        Ok(Trainer::new(
+            scene,
+            program(&r.motion)?.stages(plan),
+            self.frames.clone(),
+            Box::new(Renderer::new(config)),
+            TrainLoss::new(r.lambda_dssim, r.lambda_mask, exposure),
+            settings,
+        ))
+    }
+
+    fn identity(&self, recipe: &Recipe) -> Identity {
+        // Knobs that only say how memory is spent never reach a result and may change between resumes.
+        let neutral = Recipe { image_memory: 0, memory_limit: 0, checkpoint_interval: 0, ..recipe.clone() };
+        Identity { capture: fingerprint(&self.capture), recipe: hash(&neutral.to_toml()) }
+    }
+}
+
+/// 1.1 times the largest distance of a camera from the cameras' centroid (Kerbl et al. 2023); 1 for a single place.
+fn extent(centers: &[[f64; 3]]) -> f64 {
+    use splat4d::math::se3::{norm, sub};
+    let n = centers.len().max(1) as f64;
+    let centroid: [f64; 3] = std::array::from_fn(|k| centers.iter().map(|c| c[k]).sum::<f64>() / n);
+    let largest = centers.iter().map(|&c| norm(sub(c, centroid))).fold(0.0, f64::max);
+    if largest > 0.0 { 1.1 * largest } else { 1.0 }
+}
+
+/// Names, sizes, poses and times of a capture in 16 hexadecimal digits.
+fn fingerprint(capture: &Capture) -> String {
+    let mut text = String::new();
+    for &i in &capture.train {
+        let f = &capture.frames[i];
+        let image = f.image.strip_prefix(&capture.root).unwrap_or(&f.image);
+        text += &format!("{image:?} {:?} {:?};", f.view, f.time);
+    }
+    hash(&text)
+}
+
+/// FNV-1a, 64 bits: it guards against mistakes, not against malice.
+fn hash(text: &str) -> String {
+    let h = text.bytes().fold(0xcbf2_9ce4_8422_2325u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3));
+    format!("{h:016x}")
+}
+
+/// Estimated peak memory of training, bytes: images in the cache, Gaussians at the cap, pixels in flight.
+pub fn memory_estimate(capture: &Capture, recipe: &Recipe) -> u64 {
+    let sh = 3 * (recipe.sh_degree as u64 + 1).pow(2);
+    let motion = if recipe.motion == "still" {
+        0
+    } else {
+        3 * recipe.motion_order as u64 + 2 + 4 * u64::from(recipe.rotation_rate)
+    };
+    let gaussians = recipe.max_cap as u64 * ((11 + sh + motion) * BYTES_PER_NUMBER + RENDER_BYTES);
+    let frame =
+        capture.train.iter().map(|&i| (capture.frames[i].view.width * capture.frames[i].view.height) as u64).max();
+    let pixels = frame.unwrap_or(0);
+    let images = (pixels * 4 * capture.train.len() as u64).min(recipe.image_memory);
+    images + gaussians + pixels * PIXEL_BYTES * recipe.batch_size as u64
+}
+
+/// Peak resident memory of this process, bytes; 0 where the system does not tell.
+pub fn peak_memory() -> u64 {
+    std::fs::read_to_string("/proc/self/status")
+        .ok()
+        .and_then(|s| {
+            let line = s.lines().find(|l| l.starts_with("VmHWM:"))?.to_owned();
+            line.split_whitespace().nth(1)?.parse::<u64>().ok()
+        })
+        .map_or(0, |kib| kib * 1024)
+}
+
+fn save_checkpoint(
+    run: &Path,
+    trainer: &Trainer<'_>,
+    identity: &Identity,
+    state: &RunState,
+    listen: &mut dyn FnMut(&Event),
+) -> Result<()> {
+    let path = checkpoint::path(run, trainer.progress.iteration);
+    write_atomically(&path, &checkpoint::write(trainer, identity, state)?)?;
+    // The one before stays, in case this one is damaged on disk.
+    let all = checkpoint::list(run);
+    for old in all.iter().rev().skip(2) {
+        let _ = std::fs::remove_file(old);
+    }
+    listen(&Event::Checkpoint { iteration: trainer.progress.iteration, path });
+    Ok(())
+}
+
+/// Seconds by stage of the chain, over the whole session.
+#[derive(Clone, Copy, Debug, Default)]
+struct Totals {
+    seconds: [f64; 8],
+    steps: usize,
+}
+
+/// Names of the columns that [`Totals`] holds.
+const STAGE_NAMES: [&str; 8] =
+    ["motion", "render", "loss", "render_backward", "motion_backward", "adam", "load", "other"];
+
+impl Totals {
+    fn of(s: &Stepped) -> [f64; 8] {
+        let t = &s.report.timings;
+        [t.motion, t.render, t.loss, t.render_backward, t.motion_backward, s.adam, s.load, s.other]
+            .map(|d| d.as_secs_f64())
+    }
+
+    fn add(&mut self, s: &Stepped) {
+        self.steps += 1;
+        for (sum, x) in self.seconds.iter_mut().zip(Self::of(s)) {
+            *sum += x;
+        }
+    }
+}
+
+fn write_run_json(
+    run: &Path,
+    bench: &Bench,
+    recipe: &Recipe,
+    totals: &Totals,
+    trainer: &Trainer<'_>,
+    state: &RunState,
+    finished: bool,
+) -> Result<()> {
+    let steps = totals.steps.max(1) as f64;
+    let ms: serde_json::Map<String, serde_json::Value> =
+        STAGE_NAMES.iter().zip(totals.seconds).map(|(n, s)| ((*n).to_owned(), json!(s * 1e3 / steps))).collect();
+    let root = std::fs::canonicalize(&bench.capture.root).unwrap_or_else(|_| bench.capture.root.clone());
+    let info = json!({
+        "version": env!("CARGO_PKG_VERSION"),
+        "capture": root,
+        "capture_name": bench.capture.name,
+        "capture_fingerprint": fingerprint(&bench.capture),
+        "motion": recipe.motion,
+        "seed": recipe.seed,
+        "simd": format!("{:?}", bench.simd).to_lowercase(),
+        "threads": rayon::current_num_threads(),
+        "iteration": trainer.progress.iteration,
+        "iterations": trainer.iterations(),
+        "gaussians": trainer.scene.len(),
+        "seconds": state.seconds,
+        "finished": finished,
+        "rollbacks": trainer.progress.strikes,
+        "peak_memory": peak_memory(),
+        "memory_estimate": memory_estimate(&bench.capture, recipe),
+        "ms_per_step": ms,
+        "warnings": bench.capture.warnings,
+    });
+    let text = serde_json::to_string_pretty(&info).expect("plain data is JSON");
+    write_atomically(&run.join("run.json"), text.as_bytes())
+}
+
+/// metrics.csv: kept in memory, written whole at every checkpoint, so that it never runs ahead of one.
+struct Metrics {
+    rows: Vec<(usize, String)>,
+    every: usize,
+}
+
+impl Metrics {
+    const HEADER: &'static str = "iteration,stage,loss,l1,ssim,psnr,gaussians,seconds,motion_ms,render_ms,loss_ms,\
+        render_backward_ms,motion_backward_ms,adam_ms,load_ms,other_ms";
+
+    fn open(run: &Path, iteration: usize, iterations: usize) -> Self {
+        let text = std::fs::read_to_string(run.join("metrics.csv")).unwrap_or_default();
+        let row = |line: &str| Some((line.split(',').next()?.parse::<usize>().ok()?, line.to_owned()));
+        let rows = text.lines().skip(1).filter_map(row).filter(|(i, _)| *i <= iteration).collect();
+        Self { rows, every: (iterations / METRIC_ROWS).max(1) }
+    }
+
+    fn push(&mut self, trainer: &Trainer<'_>, s: &Stepped, state: &RunState) {
+        let i = trainer.progress.iteration;
+        if !i.is_multiple_of(self.every) && !trainer.is_done() {
+            return;
+        }
+        let ms: Vec<String> = Totals::of(s).iter().map(|t| format!("{:.3}", t * 1e3)).collect();
+        let row = format!(
+            "{i},{},{:.6},{:.6},{:.6},{:.4},{},{:.2},{}",
+            trainer.stage_name(),
+            s.report.loss,
+            s.l1,
+            s.ssim,
+            psnr(s.mse),
+            trainer.scene.len(),
+            state.seconds,
+            ms.join(",")
+        );
+        self.rows.push((i, row));
+    }
+
+    fn write(&self, run: &Path) -> Result<()> {
+        let mut text = Self::HEADER.to_owned() + "\n";
+        for (_, row) in &self.rows {
+            text += row;
+            text.push('\n');
+        }
+        write_atomically(&run.join("metrics.csv"), text.as_bytes())
+    }
+}
+
+fn psnr(mse: f64) -> f64 {
+    -10.0 * mse.max(1e-10).log10()
+}
+
+struct Session<'a> {
+    run: &'a Path,
+    bench: &'a Bench,
+    recipe: &'a Recipe,
+    identity: Identity,
+    estimate: u64,
+    stop: &'a AtomicBool,
+}
+
+impl Session<'_> {
+    fn drive(&self, trainer: &mut Trainer<'_>, mut state: RunState, listen: &mut dyn FnMut(&Event)) -> Result<Outcome> {
+        let iterations = trainer.iterations();
+        let first = trainer.progress.iteration;
+        listen(&Event::Started {
+            run: self.run.to_owned(),
+            iteration: first,
+            iterations,
+            gaussians: trainer.scene.len(),
+            memory_estimate: self.estimate,
+        });
+        let mut metrics = Metrics::open(self.run, first, iterations);
+        let mut totals = Totals::default();
+        let (mut clock, mut told) = (Clock::now(), Clock::now());
+        while !trainer.is_done() && !self.stop.load(Ordering::Relaxed) {
+            let step = match trainer.step()? {
+                Ok(step) => step,
+                Err(fault) => {
+                    state = self.roll_back(trainer, &fault.0, listen)?;
+                    metrics.rows.retain(|(i, _)| *i <= trainer.progress.iteration);
+                    continue;
+                }
+            };
+            state.seconds += clock.elapsed().as_secs_f64();
+            clock = Clock::now();
+            let fresh = if trainer.progress.iteration <= 1 { 1.0 } else { SMOOTHING };
+            for (old, new) in state.smooth.iter_mut().zip([step.report.loss, step.mse]) {
+                *old += fresh * (new - *old);
+            }
+            totals.add(&step);
+            metrics.push(trainer, &step, &state);
+            if told.elapsed().as_secs_f64() > PROGRESS_SECONDS || trainer.is_done() {
+                told = Clock::now();
+                listen(&self.progress(trainer, &state, iterations));
+            }
+            let i = trainer.progress.iteration;
+            if i.is_multiple_of(self.recipe.checkpoint_interval) && !trainer.is_done() {
+                self.save(trainer, &state, &metrics, &totals, false, listen)?;
+            }
+        }
+        let done = trainer.is_done();
+        self.save(trainer, &state, &metrics, &totals, done, listen)?;
+        let gaussians = trainer.scene.len();
+        let iteration = trainer.progress.iteration;
+        if done {
+            let mut bytes = Vec::new();
+            splat4d::format::scene::write(&trainer.scene, &mut bytes)?;
+            write_atomically(&self.run.join("scene.safetensors"), &bytes)?;
+            listen(&Event::Finished { iteration, seconds: state.seconds, gaussians, peak_memory: peak_memory() });
+        }
+        Ok(Outcome { run: self.run.to_owned(), iteration, gaussians, seconds: state.seconds, interrupted: !done })
+    }
+
+    fn progress(&self, trainer: &Trainer<'_>, state: &RunState, iterations: usize) -> Event {
+        let iteration = trainer.progress.iteration;
+        Event::Progress {
+            iteration,
+            iterations,
+            stage: trainer.stage_name().to_owned(),
+            loss: state.smooth[0],
+            psnr: psnr(state.smooth[1]),
+            gaussians: trainer.scene.len(),
+            seconds: state.seconds,
+            seconds_left: state.seconds / iteration.max(1) as f64 * (iterations - iteration) as f64,
+        }
+    }
+
+    fn save(
+        &self,
+        trainer: &Trainer<'_>,
+        state: &RunState,
+        metrics: &Metrics,
+        totals: &Totals,
+        finished: bool,
+        listen: &mut dyn FnMut(&Event),
+    ) -> Result<()> {
+        metrics.write(self.run)?;
+        save_checkpoint(self.run, trainer, &self.identity, state, listen)?;
+        write_run_json(self.run, self.bench, self.recipe, totals, trainer, state, finished)
+    }
+
+    /// Back to the last checkpoint with half the rates; the third time the run is given up.
+    fn roll_back(&self, trainer: &mut Trainer<'_>, what: &str, listen: &mut dyn FnMut(&Event)) -> Result<RunState> {
+        let (failed, strikes, rate) =
+            (trainer.progress.iteration + 1, trainer.progress.strikes + 1, trainer.progress.rate_scale);
+        if strikes > MAX_STRIKES {
+            return Err(Error::new(
+                ErrorKind::Diverged,
+                format!("training diverged {strikes} times, last at iteration {failed}: {what}"),
+            )
+            .remedy("Look for wrong poses with `splat4d info CAPTURE`, or lower position_lr_init and scaling_lr"));
+        }
+        let (state, _) = restore_newest(self.run, trainer, &self.identity)?;
+        trainer.progress.strikes = strikes;
+        trainer.progress.rate_scale = rate * ROLLBACK_RATE;
+        listen(&Event::RolledBack { iteration: failed, to: trainer.progress.iteration, what: what.to_owned() });
+        Ok(state)
+    }
+}
