@@ -24,7 +24,8 @@ mod tests {
     #[test]
     fn landmarks_of_binary16() {
         // Values from the IEEE 754 tables: largest finite, smallest normal, smallest subnormal.
-        let table = [(0x3C00, 1.0), (0xC000, -2.0), (0x7BFF, 65504.0), (0x0400, 6.103_515_6e-5), (0x0001, 5.960_464_5e-8)];
+        let table =
+            [(0x3C00, 1.0), (0xC000, -2.0), (0x7BFF, 65504.0), (0x0400, 6.103_515_6e-5), (0x0001, 5.960_464_5e-8)];
         for (bits, value) in table {
             assert_eq!(f16_to_f32(bits), value, "{bits:#x}");
         }

@@ -388,9 +388,10 @@ mod tests {
 
     #[test]
     fn foreign_types_orders_and_versions() {
-        let big = file("{'shape': (2,), 'fortran_order': False, 'descr': '>f8'}\n", &[
-            0x3F, 0xF8, 0, 0, 0, 0, 0, 0, 0xC0, 0, 0, 0, 0, 0, 0, 0,
-        ]);
+        let big = file(
+            "{'shape': (2,), 'fortran_order': False, 'descr': '>f8'}\n",
+            &[0x3F, 0xF8, 0, 0, 0, 0, 0, 0, 0xC0, 0, 0, 0, 0, 0, 0, 0],
+        );
         assert_eq!(Npy::read(&big).unwrap().values, Values::F64(vec![1.5, -2.0]));
         let half = file("{\"descr\":\"<f2\",\"fortran_order\":False,\"shape\":()}", &[0, 0x3C]);
         assert_eq!(Npy::read(&half).unwrap(), Npy { shape: vec![], values: Values::F32(vec![1.0]) });
@@ -430,7 +431,8 @@ mod tests {
     fn mutants_are_read_or_refused() {
         let (_, bytes) = saved(&[6, 7]);
         let fortran = file("{'descr': '<i2', 'fortran_order': True, 'shape': (2, 3, 4)}", &[7; 48]);
-        let read = mutants(&bytes, 600, "npy").chain(mutants(&fortran, 400, "npy-f")).filter_map(|m| Npy::read(&m).ok());
+        let read =
+            mutants(&bytes, 600, "npy").chain(mutants(&fortran, 400, "npy-f")).filter_map(|m| Npy::read(&m).ok());
         let read = read.inspect(|a| assert_eq!(a.len(), a.shape.iter().product::<usize>())).count();
         assert!(0 < read && read < 1000, "{read} of 1000 mutants were readable");
     }

@@ -209,7 +209,10 @@ impl<'a> SafeTensors<'a> {
             tensors.insert(name, tensor);
         }
         if end != data.len() {
-            return Err(broken(format!("the arrays end at byte {end} of the data, but there are {} bytes", data.len())));
+            return Err(broken(format!(
+                "the arrays end at byte {end} of the data, but there are {} bytes",
+                data.len()
+            )));
         }
         Ok(Self { metadata: header.metadata, tensors })
     }

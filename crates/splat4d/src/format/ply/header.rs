@@ -81,6 +81,11 @@ impl Element {
     pub(super) fn find(&self, name: &str) -> Option<usize> {
         self.properties.iter().position(|p| p.name == name && matches!(p.kind, Kind::Scalar(_)))
     }
+
+    /// Whether a property is a floating-point number.
+    pub(super) fn is_floating(&self, property: usize) -> bool {
+        matches!(self.properties[property].kind, Kind::Scalar(Scalar::F32 | Scalar::F64))
+    }
 }
 
 /// What the header says.
