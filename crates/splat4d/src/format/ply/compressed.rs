@@ -1,9 +1,9 @@
 //! PlayCanvas' compressed `.ply`: chunks of 256 Gaussians, four 32-bit words a Gaussian, quantised between the chunk's
 //! smallest and largest values.
 //!
-//! Words, highest bits first: position and log scale 11-10-11 (x, y, z); rotation 2-10-10-10 (index of the largest part of
-//! (w, x, y, z), then the other three times 1/√2 plus ½); colour 8-8-8 and opacity 8. An optional element `sh` holds
-//! f_rest in bytes over [-4, 4]. Source: layout of PlayCanvas' splat-transform (MIT).
+//! Words, highest bits first: position and log scale 11-10-11 (x, y, z); rotation 2-10-10-10 (index of the largest part
+//! of (w, x, y, z), then the other three times 1/√2 plus ½); colour 8-8-8 and opacity 8. An optional element `sh`
+//! holds f_rest in bytes over [-4, 4]. Source: layout of PlayCanvas' splat-transform (MIT).
 
 use super::header::{Element, Header, broken};
 use super::{PlyInfo, degree, f_rest_columns, non_finite, rows};

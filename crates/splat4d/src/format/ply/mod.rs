@@ -1,7 +1,7 @@
 //! Gaussian `.ply` files: the plain 3DGS layout (read and written) and PlayCanvas' compressed one (read).
 //!
-//! A plain file has a row per Gaussian: x y z, nx ny nz (unused), f_dc_0..2, f_rest_*, opacity, scale_0..2, rot_0..3, all
-//! f32. Scales are logarithms, opacity is a logit, the quaternion is (w, x, y, z) and not normalised, and f_rest is
+//! A plain file has a row per Gaussian: x y z, nx ny nz (unused), f_dc_0..2, f_rest_*, opacity, scale_0..2, rot_0..3,
+//! all f32. Scales are logarithms, opacity is a logit, the quaternion is (w, x, y, z) and not normalised, and f_rest is
 //! **channel-major** (all coefficients of red first), while our tables are coefficient-major.
 //! Source: the files of Kerbl et al. 2023.
 
@@ -92,7 +92,8 @@ pub fn read(bytes: &[u8]) -> Result<(Params, PlyInfo)> {
     Ok((params, info))
 }
 
-/// Reads the positions of any PLY file and the colours of its points (`red green blue`, or the base colour of Gaussians).
+/// Reads the positions of any PLY file and the colours of its points: `red green blue`, or the base colour of
+/// Gaussians.
 ///
 /// Errors: not a PLY file, truncated, or without positions.
 pub fn read_points(bytes: &[u8]) -> Result<PlyPoints> {
@@ -131,9 +132,11 @@ pub fn read_points(bytes: &[u8]) -> Result<PlyPoints> {
 ///
 /// Errors: the sink's. Panics: the layer's SH coefficients are not 1, 4, 9 or 16 (degree 0-3).
 pub fn write(params: &Params, out: &mut impl Write) -> Result<()> {
-    let coefficients = params[SH].width() / 3;
-    let f_rest = 3 * (coefficients - 1);
-    assert!(F_REST_COUNTS.contains(&f_rest), "a layer has 1, 4, 9 or 16 SH coefficients, not {coefficients}");
+    let width = params[SH].width();
+    let Some(f_rest) = F_REST_COUNTS.into_iter().find(|n| n + 3 == width) else {
+        panic!("a layer has 3 times 1, 4, 9 or 16 SH columns, not {width}");
+    };
+    let coefficients = width / 3;
     let rest: Vec<String> = (0..f_rest).map(|i| format!("f_rest_{i}")).collect();
     let names = ["x", "y", "z"].into_iter().chain(NORMAL_NAMES).chain(DC_NAMES).chain(rest.iter().map(String::as_str));
     let names = names.chain(["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]);

@@ -85,7 +85,8 @@ fn the_written_layout_is_the_plain_one() {
 #[test]
 fn a_foreign_text_file_is_read() {
     let text = "ply\r\nformat ascii 1.0\r\ncomment made by hand\r\nelement camera 1\r\nproperty list uchar int ids\r\n\
-        property float f\r\nelement vertex 2\r\nproperty double rot_3\r\nproperty float rot_2\r\nproperty float rot_1\r\n\
+        property float f\r\nelement vertex 2\r\nproperty double rot_3\r\nproperty float rot_2\r\n\
+        property float rot_1\r\n\
         property float rot_0\r\nproperty float z\r\nproperty float y\r\nproperty int x\r\nproperty uchar label\r\n\
         property float opacity\r\nproperty float scale_0\r\nproperty float scale_1\r\nproperty float scale_2\r\n\
         property float f_dc_2\r\nproperty float f_dc_1\r\nproperty float f_dc_0\r\nelement face 1\r\n\
@@ -290,6 +291,23 @@ fn compressed_gaussians_are_within_their_quantisation_steps() {
     short[at + 14] = b'1';
     short.extend([0; 48]);
     assert!(read(&short).unwrap_err().to_string().contains("chunk for every 256"));
+}
+
+#[test]
+fn a_header_of_a_megabyte_takes_no_time() {
+    let start = Instant::now();
+    let elements: Vec<String> = (0..60_000).map(|i| format!("element e{i} 0")).collect();
+    let properties: Vec<String> = (0..40_000).map(|i| format!("property float p{i}")).collect();
+    for (mut lines, needle) in [(elements, "no element `vertex`"), (properties, "lacks the properties x")] {
+        lines.splice(0..0, ["ply", "format ascii 1.0", "element vertex 0"].map(String::from));
+        if needle.starts_with("no") {
+            lines.remove(2);
+        }
+        lines.push("end_header\n".into());
+        let error = read(lines.join("\n").as_bytes()).unwrap_err().to_string();
+        assert!(error.contains(needle), "{error}");
+    }
+    assert!(start.elapsed().as_secs_f64() < 2.0, "two headers took {:?}", start.elapsed());
 }
 
 #[test]
