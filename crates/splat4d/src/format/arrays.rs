@@ -12,7 +12,7 @@ const SH_GROUP: &str = "sh";
 pub struct Array {
     /// The layer's prefix and the column group's name, e.g. `layers.0.means`.
     pub name: String,
-    /// [rows] where a row is one number, [N, K, 3] for `sh`, [rows, width] otherwise.
+    /// `[rows]` where a row is one number, `[N, K, 3]` for `sh`, `[rows, width]` otherwise.
     pub shape: Vec<usize>,
     /// Row-major.
     pub data: Vec<f32>,

@@ -81,6 +81,11 @@ impl Element {
     pub(super) fn find(&self, name: &str) -> Option<usize> {
         self.properties.iter().position(|p| p.name == name && matches!(p.kind, Kind::Scalar(_)))
     }
+
+    /// Whether a property is a floating-point number.
+    pub(super) fn is_floating(&self, property: usize) -> bool {
+        matches!(self.properties[property].kind, Kind::Scalar(Scalar::F32 | Scalar::F64))
+    }
 }
 
 /// What the header says.
@@ -123,7 +128,7 @@ impl Header {
                 Some("comment" | "obj_info") => {
                     header.comments.push(line.split_once(' ').map_or("", |(_, text)| text).to_owned());
                 }
-                Some("element") => header.elements.push(element(line, words, &header.elements).map_err(at)?),
+                Some("element") => header.elements.push(element(line, words).map_err(at)?),
                 Some("property") => {
                     let Some(element) = header.elements.last_mut() else {
                         return Err(at(broken("a property stands before the first element")));
@@ -138,27 +143,32 @@ impl Header {
             return Err(broken("the header has no `format` line"));
         }
         header.body = lines.at;
+        if let Some(name) = repeated(header.elements.iter().map(|e| &*e.name)) {
+            return Err(broken(format!("there are two elements called `{name}`")));
+        }
         for element in &header.elements {
-            let mut names: Vec<&str> = element.properties.iter().map(|p| p.name.as_str()).collect();
-            names.sort_unstable();
-            if let Some(pair) = names.windows(2).find(|w| w[0] == w[1]) {
-                return Err(broken(format!("the element `{}` has two properties called `{}`", element.name, pair[0])));
+            if let Some(name) = repeated(element.properties.iter().map(|p| &*p.name)) {
+                return Err(broken(format!("the element `{}` has two properties called `{name}`", element.name)));
             }
         }
         Ok(header)
     }
 }
 
-fn element<'a>(line: &str, mut words: impl Iterator<Item = &'a str>, before: &[Element]) -> Result<Element> {
+/// A name that stands twice. By sorting, since a false header may hold a hundred thousand.
+fn repeated<'a>(names: impl Iterator<Item = &'a str>) -> Option<&'a str> {
+    let mut names: Vec<&str> = names.collect();
+    names.sort_unstable();
+    names.windows(2).find(|w| w[0] == w[1]).map(|w| w[0])
+}
+
+fn element<'a>(line: &str, mut words: impl Iterator<Item = &'a str>) -> Result<Element> {
     let (Some(name), Some(count), None) = (words.next(), words.next(), words.next()) else {
         return Err(broken(format!("`{line}` should be `element <name> <count>`")));
     };
     let Ok(count) = count.parse::<usize>() else {
         return Err(broken(format!("the element `{name}` has the count `{count}`, which is not a number of rows")));
     };
-    if before.iter().any(|e| e.name == name) {
-        return Err(broken(format!("there are two elements called `{name}`")));
-    }
     Ok(Element { name: name.to_owned(), count, properties: Vec::new() })
 }
 

@@ -1,1 +1,244 @@
-//! x
+//! Gaussian `.ply` files: the plain 3DGS layout (read and written) and PlayCanvas' compressed one (read).
+//!
+//! A plain file has a row per Gaussian: x y z, nx ny nz (unused), f_dc_0..2, f_rest_*, opacity, scale_0..2, rot_0..3,
+//! all f32. Scales are logarithms, opacity is a logit, the quaternion is (w, x, y, z) and not normalised, and f_rest is
+//! **channel-major** (all coefficients of red first), while our tables are coefficient-major.
+//! Source: the files of Kerbl et al. 2023.
+
+mod compressed;
+mod header;
+mod rows;
+
+use crate::scene::params::{GEOMETRY, GEOMETRY_COLUMNS, Params, SH};
+use crate::scene::table::{BLOCK, Table};
+use crate::{Error, ErrorKind, Result};
+use header::{Element, Header, broken};
+use rayon::prelude::*;
+use rows::Rows;
+use std::io::Write;
+
+/// f_rest properties of SH degree 0, 1, 2 and 3: three channels of the coefficients above the first.
+const F_REST_COUNTS: [usize; 4] = [0, 9, 24, 45];
+/// The columns of [`GEOMETRY`] as a plain file calls them.
+const GEOMETRY_NAMES: [&str; 11] =
+    ["x", "y", "z", "rot_0", "rot_1", "rot_2", "rot_3", "scale_0", "scale_1", "scale_2", "opacity"];
+/// The base colour, coefficient 0 of red, green and blue.
+const DC_NAMES: [&str; 3] = ["f_dc_0", "f_dc_1", "f_dc_2"];
+/// Written as zeros by everybody and read by nobody.
+const NORMAL_NAMES: [&str; 3] = ["nx", "ny", "nz"];
+/// Colours of point clouds.
+const RGB_NAMES: [&str; 3] = ["red", "green", "blue"];
+/// Blocks of rows that one task converts.
+const BLOCKS_PER_TASK: usize = 64;
+/// Rows that the writer formats at a time.
+const ROWS_PER_WRITE: usize = 4096;
+const _: () = assert!(GEOMETRY_COLUMNS.len() == 4, "GEOMETRY_NAMES names these columns");
+
+/// What a file contains besides its numbers.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct PlyInfo {
+    /// Rows.
+    pub gaussians: usize,
+    /// Degree of the spherical harmonics, 0-3.
+    pub sh_degree: usize,
+    /// Rows that hold a NaN or an infinity; they are kept as they are.
+    pub non_finite_rows: usize,
+    /// Whether the numbers were quantised (PlayCanvas' compressed layout).
+    pub compressed: bool,
+    /// The header's comments.
+    pub comments: Vec<String>,
+    /// Properties of a Gaussian that were ignored; normals are not listed.
+    pub extra_properties: Vec<String>,
+}
+
+/// Coloured points without Gaussians.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct PlyPoints {
+    /// Positions, in the file's units.
+    pub positions: Vec<[f32; 3]>,
+    /// Red, green, blue of each point in [0, 1] (in sRGB, as cameras give it); empty where the file has no colours.
+    pub colors: Vec<[f32; 3]>,
+}
+
+/// Reads Gaussians: any order and type of properties, binary of either byte order or text, any other elements.
+///
+/// Errors: not a PLY file; truncated, or fewer bytes than the header claims; no Gaussians in it (the message names what
+/// is missing); spherical harmonics above degree 3.
+pub fn read(bytes: &[u8]) -> Result<(Params, PlyInfo)> {
+    let header = Header::read(bytes)?;
+    let Some(vertex) = header.elements.iter().find(|e| e.name == "vertex") else {
+        return Err(broken("the file has no element `vertex`"));
+    };
+    if compressed::is_packed(vertex) {
+        return compressed::read(&header, bytes);
+    }
+    let (geometry, sh) = gaussian_columns(vertex)?;
+    let [rows] = rows::find(&header, bytes, ["vertex"])?;
+    let rows = rows.expect("the element was found above");
+    let mut params = Params::new(rows.len(), sh.len() / 3, &[]);
+    let mut bad = vec![0; rows.len().div_ceil(BLOCK)];
+    fill(&mut params[GEOMETRY], &geometry, &rows, &mut bad);
+    fill(&mut params[SH], &sh, &rows, &mut bad);
+    let is_used = |i: &usize| geometry.contains(i) || sh.contains(i);
+    let extra = vertex.properties.iter().enumerate().filter(|(i, _)| !is_used(i)).map(|(_, p)| p.name.clone());
+    let info = PlyInfo {
+        gaussians: rows.len(),
+        sh_degree: degree(sh.len() / 3),
+        non_finite_rows: bad.iter().map(|mask| mask.count_ones() as usize).sum(),
+        compressed: false,
+        extra_properties: extra.filter(|name| !NORMAL_NAMES.contains(&name.as_str())).collect(),
+        comments: header.comments,
+    };
+    Ok((params, info))
+}
+
+/// Reads the positions of any PLY file and the colours of its points: `red green blue`, or the base colour of
+/// Gaussians.
+///
+/// Errors: not a PLY file, truncated, or without positions.
+pub fn read_points(bytes: &[u8]) -> Result<PlyPoints> {
+    let header = Header::read(bytes)?;
+    let Some(vertex) = header.elements.iter().find(|e| e.name == "vertex") else {
+        return Err(broken("the file has no element `vertex`"));
+    };
+    let all = |names: [&str; 3]| names.map(|n| vertex.find(n));
+    let [Some(x), Some(y), Some(z)] = all(["x", "y", "z"]) else {
+        return Err(broken("the file has no positions: its points lack x, y or z"));
+    };
+    let [rows] = rows::find(&header, bytes, ["vertex"])?;
+    let rows = rows.expect("the element was found above");
+    let column = |i: usize, of: fn(f32) -> f32| {
+        let mut out = vec![0.0; rows.len()];
+        rows.read(i, 0, &mut out);
+        out.iter_mut().for_each(|v| *v = of(*v));
+        out
+    };
+    let join = |i: [usize; 3], of: fn(f32) -> f32| -> Vec<[f32; 3]> {
+        let [a, b, c] = i.map(|i| column(i, of));
+        a.into_iter().zip(b).zip(c).map(|((a, b), c)| [a, b, c]).collect()
+    };
+    let colors = if let [Some(r), Some(g), Some(b)] = all(RGB_NAMES) {
+        // Bytes span 0..255, and nobody writes floating-point colours in any range but 0..1.
+        join([r, g, b], if vertex.is_floating(r) { |v| v } else { |v| v / 255.0 })
+    } else if let [Some(r), Some(g), Some(b)] = all(DC_NAMES) {
+        join([r, g, b], |v| 0.5 + compressed::SH_C0 * v)
+    } else {
+        Vec::new()
+    };
+    Ok(PlyPoints { positions: join([x, y, z], |v| v), colors })
+}
+
+/// Writes Gaussians in the plain layout, little-endian; normals are zero and other tables are left out.
+///
+/// Errors: the sink's. Panics: the layer's SH coefficients are not 1, 4, 9 or 16 (degree 0-3).
+pub fn write(params: &Params, out: &mut impl Write) -> Result<()> {
+    let width = params[SH].width();
+    let Some(f_rest) = F_REST_COUNTS.into_iter().find(|n| n + 3 == width) else {
+        panic!("a layer has 3 times 1, 4, 9 or 16 SH columns, not {width}");
+    };
+    let coefficients = width / 3;
+    let rest: Vec<String> = (0..f_rest).map(|i| format!("f_rest_{i}")).collect();
+    let names = ["x", "y", "z"].into_iter().chain(NORMAL_NAMES).chain(DC_NAMES).chain(rest.iter().map(String::as_str));
+    let names = names.chain(["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]);
+    let mut text = format!("ply\nformat binary_little_endian 1.0\nelement vertex {}\n", params.len());
+    for name in names {
+        text.push_str(&format!("property float {name}\n"));
+    }
+    text.push_str("end_header\n");
+    let mut write = |bytes: &[u8]| out.write_all(bytes).map_err(|e| Error::io("the Gaussians could not be written", e));
+    write(text.as_bytes())?;
+    let (geometry, sh) = (&params[GEOMETRY], &params[SH]);
+    let mut buffer: Vec<u8> = Vec::new();
+    for first in (0..params.len()).step_by(ROWS_PER_WRITE) {
+        buffer.clear();
+        for row in first..params.len().min(first + ROWS_PER_WRITE) {
+            let g: [f32; 11] = geometry.read(row, 0);
+            let mut put = |x: f32| buffer.extend_from_slice(&x.to_le_bytes());
+            g[..3].iter().for_each(|&x| put(x));
+            NORMAL_NAMES.iter().for_each(|_| put(0.0));
+            (0..3).for_each(|c| put(sh.get(row, c)));
+            for c in 0..3 {
+                (1..coefficients).for_each(|k| put(sh.get(row, 3 * k + c)));
+            }
+            put(g[10]);
+            g[7..10].iter().chain(&g[3..7]).for_each(|&x| put(x));
+        }
+        write(&buffer)?;
+    }
+    Ok(())
+}
+
+/// The property of each column of the geometry and SH tables.
+fn gaussian_columns(vertex: &Element) -> Result<(Vec<usize>, Vec<usize>)> {
+    let wanted: Vec<&str> = GEOMETRY_NAMES.into_iter().chain(DC_NAMES).collect();
+    let missing: Vec<&str> = wanted.iter().copied().filter(|n| vertex.find(n).is_none()).collect();
+    let is_position = |n: &&str| ["x", "y", "z"].contains(n);
+    if missing.len() == wanted.len() - 3 && !missing.iter().any(is_position) {
+        let names: Vec<&str> = vertex.properties.iter().map(|p| p.name.as_str()).take(8).collect();
+        return Err(Error::input(format!(
+            "this is a point cloud without Gaussians: its points have {} only, no scale, rotation or opacity",
+            names.join(", ")
+        ))
+        .remedy("A point cloud can start a training, but it cannot be drawn; give a trained .ply"));
+    }
+    if !missing.is_empty() {
+        return Err(Error::input(format!("the element `vertex` lacks the properties {}", missing.join(", ")))
+            .remedy("A file of 3D Gaussians has x y z, f_dc_0..2, opacity, scale_0..2 and rot_0..3"));
+    }
+    let index = |name: &str| vertex.find(name).expect("checked above");
+    let geometry = GEOMETRY_NAMES.map(index).to_vec();
+    let mut sh = DC_NAMES.map(index).to_vec();
+    sh.extend(f_rest_columns(vertex)?);
+    Ok((geometry, sh))
+}
+
+/// The f_rest properties of an element, in coefficient-major order.
+fn f_rest_columns(element: &Element) -> Result<Vec<usize>> {
+    let count = element.properties.iter().filter(|p| p.name.starts_with("f_rest_")).count();
+    if !F_REST_COUNTS.contains(&count) {
+        let what = format!("there are {count} f_rest properties; degree 0-3 has 0, 9, 24 or 45");
+        return Err(Error::new(ErrorKind::Unsupported, what)
+            .remedy("Export the file again with spherical harmonics of degree 3 or less"));
+    }
+    let rest = count / 3;
+    let mut out = Vec::with_capacity(count);
+    for k in 0..rest {
+        for c in 0..3 {
+            let name = format!("f_rest_{}", c * rest + k);
+            let Some(i) = element.find(&name) else {
+                return Err(broken(format!("there are {count} f_rest properties, but no `{name}` among them")));
+            };
+            out.push(i);
+        }
+    }
+    Ok(out)
+}
+
+/// SH degree of 1, 4, 9 or 16 coefficients.
+fn degree(coefficients: usize) -> usize {
+    coefficients.isqrt() - 1
+}
+
+/// Fills a table from the properties `columns`; sets bit r % 16 of `bad[r / 16]` where row r has a number that is not
+/// finite.
+fn fill(table: &mut Table, columns: &[usize], rows: &Rows<'_>, bad: &mut [u16]) {
+    let tasks: Vec<_> = table.chunks_mut(BLOCKS_PER_TASK).zip(bad.chunks_mut(BLOCKS_PER_TASK)).collect();
+    tasks.into_par_iter().for_each(|(chunk, bad)| {
+        for (b, (block, bad)) in chunk.data.chunks_exact_mut(columns.len() * BLOCK).zip(bad).enumerate() {
+            let first = chunk.first + b * BLOCK;
+            let count = BLOCK.min(rows.len() - first);
+            for (&property, column) in columns.iter().zip(block.chunks_exact_mut(BLOCK)) {
+                rows.read(property, first, &mut column[..count]);
+                *bad |= non_finite(&column[..count]);
+            }
+        }
+    });
+}
+
+/// A bit for each number (at most 16) that is NaN or infinite.
+fn non_finite(numbers: &[f32]) -> u16 {
+    numbers.iter().enumerate().fold(0, |mask, (r, x)| mask | u16::from(!x.is_finite()) << r)
+}
+
+#[cfg(test)]
+mod tests;
