@@ -125,6 +125,12 @@ fn least<F: Real>(a: F, b: F) -> F {
     if a < b { a } else { b }
 }
 
+/// The larger, in one instruction.
+#[inline(always)]
+fn greatest<F: Real>(a: F, b: F) -> F {
+    if a > b { a } else { b }
+}
+
 /// One of two values that are both at hand. Without the hint LLVM makes a branch of it, and of the branch a masked
 /// store, which costs tens of cycles.
 #[inline(always)]
@@ -463,12 +469,16 @@ fn blend_splat<F: Real, const FMA: bool>(
         for l in 0..TILE {
             let power = least((cy + bx[l]).fma::<FMA>(dy, ax[l]), F::ZERO);
             let alpha = least(r.opacity * power.blend_exp::<FMA>(), limits.alpha_max);
-            let next = (-alpha).fma::<FMA>(t[l], t[l]);
+            let added = alpha * t[l];
             let visible = alpha >= limits.alpha_min;
-            let blends = visible & (next >= limits.t_min);
-            weight[l] = select(blends, alpha * t[l], F::ZERO);
-            last[l] = select(blends, index, last[l]);
-            t[l] = select(blends, next, select(visible, -t[l].abs(), t[l]));
+            let open = t[l] - added >= limits.t_min;
+            let w = select(visible & open, added, F::ZERO);
+            weight[l] = w;
+            // Neither this nor T is written as a choice between the old value and a new one: LLVM would make masked
+            // stores of it, which cost tens of cycles on some machines. Sums of whole numbers are exact.
+            last[l] += select(w > F::ZERO, index - last[l], F::ZERO);
+            let kept = t[l] - w;
+            t[l] = least(kept, select(visible & !open, -kept, kept));
         }
         tile.t[y] = t;
         tile.last[y] = last;
@@ -569,10 +579,10 @@ fn most<F: Real>(rows: &[Row<F>; TILE]) -> F {
     let mut lanes = rows[0];
     for row in &rows[1..] {
         for l in 0..TILE {
-            lanes[l] = if row[l] > lanes[l] { row[l] } else { lanes[l] };
+            lanes[l] = greatest(row[l], lanes[l]);
         }
     }
-    lanes.iter().fold(lanes[0], |m, &v| if v > m { v } else { m })
+    lanes.iter().fold(lanes[0], |m, &v| greatest(v, m))
 }
 
 /// Sum of eight lanes, always by the same tree.
