@@ -33,11 +33,14 @@ const PAIR: usize = 12;
 /// Splats in a reduction task.
 const CHUNK: usize = 2048;
 
+/// Exponents are not taken below this: e^-60 is far below any cut-off, and no product becomes a slow subnormal.
+const POWER_MIN: f64 = -60.0;
+
 /// A row of pixels.
 type Row<F> = [F; TILE];
 
-/// The state of 64 pixels after a pass.
-#[repr(C)]
+/// The state of 64 pixels after a pass. Aligned, so that no vector straddles two cache lines.
+#[repr(C, align(64))]
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Tile<F = f32> {
     color: [[Row<F>; TILE]; CHANNELS],
@@ -348,6 +351,11 @@ impl<F: Real> Kernel for Gather<'_, F> {
             })
         };
         let (xs, ys) = (ends(self.x0, self.width), ends(self.y0, self.height));
+        let lanes = |ends: &[[F; 2]; SIDE], k: usize, of: fn(usize) -> usize| -> [F; TILES] {
+            std::array::from_fn(|t| ends[of(t)][k])
+        };
+        let (left, right) = (lanes(&xs, 0, |t| t % SIDE), lanes(&xs, 1, |t| t % SIDE));
+        let (top, bottom) = (lanes(&ys, 0, |t| t / SIDE), lanes(&ys, 1, |t| t / SIDE));
         let full: u16 = (0..TILES)
             .filter(|t| xs[t % SIDE][0] <= xs[t % SIDE][1] && ys[t / SIDE][0] <= ys[t / SIDE][1])
             .fold(0, |m, t| m | 1 << t);
@@ -355,13 +363,16 @@ impl<F: Real> Kernel for Gather<'_, F> {
             let p = &self.projected[id(*key)];
             let (x, y) = (p.mean2d[0] - at(self.x0), p.mean2d[1] - at(self.y0));
             let (y_slope, x_slope) = (-p.conic[1] / p.conic[2], -p.conic[1] / p.conic[0]);
-            let mut hit = [0u16; TILES];
+            let mut q = [F::ZERO; TILES];
             for t in 0..TILES {
-                let (rx, ry) = (xs[t % SIDE], ys[t / SIDE]);
-                let (rx, ry) = ([rx[0] - x, rx[1] - x], [ry[0] - y, ry[1] - y]);
-                let q = ellipse_distance(p.conic, y_slope, x_slope, rx, ry);
-                hit[t] = if q <= p.tau { 1 << t } else { 0 };
+                let (rx, ry) = ([left[t] - x, right[t] - x], [top[t] - y, bottom[t] - y]);
+                q[t] = ellipse_distance(p.conic, y_slope, x_slope, rx, ry);
             }
+            let mut hit = [0u32; TILES];
+            for t in 0..TILES {
+                hit[t] = u32::from(q[t] <= p.tau) << t;
+            }
+            let hit = hit.iter().fold(0, |m, h| m | h) as u16;
             let row = |v: F, round: fn(f64) -> f64| round((v - F::HALF).f64()).clamp(-1.0, BIN as f64) as i32;
             *record = Record {
                 x,
@@ -371,7 +382,7 @@ impl<F: Real> Kernel for Gather<'_, F> {
                 c: -F::HALF * p.conic[2],
                 opacity: p.opacity,
                 channels: record.channels,
-                mask: hit.iter().fold(0, |m, h| m | h) & full,
+                mask: hit & full,
                 row0: row(y - p.half[1], f64::ceil).max(0) as u8,
                 row1: (row(y + p.half[1], f64::floor) + 1).clamp(0, BIN as i32) as u8,
             };
@@ -467,7 +478,7 @@ fn blend_splat<F: Real, const FMA: bool>(
         let (mut t, mut last) = (tile.t[y], tile.last[y]);
         let mut weight = [F::ZERO; TILE];
         for l in 0..TILE {
-            let power = least((cy + bx[l]).fma::<FMA>(dy, ax[l]), F::ZERO);
+            let power = greatest(least((cy + bx[l]).fma::<FMA>(dy, ax[l]), F::ZERO), F::of(POWER_MIN));
             let alpha = least(r.opacity * power.blend_exp::<FMA>(), limits.alpha_max);
             let added = alpha * t[l];
             let visible = alpha >= limits.alpha_min;
@@ -505,6 +516,7 @@ struct Backward<'a, F> {
 }
 
 /// What the way back carries for 64 pixels.
+#[repr(C, align(64))]
 struct Back<F> {
     /// Transmittance behind the splat in hand.
     t: [Row<F>; TILE],
@@ -621,7 +633,7 @@ fn backward_splat<F: Real, const FMA: bool>(
         let (mut t, mut behind, last) = (back.t[y], back.behind[y], back.last[y]);
         let g = [back.g[0][y], back.g[1][y], back.g[2][y], back.g[3][y]];
         for l in 0..TILE {
-            let power = least((cy + bx[l]).fma::<FMA>(dy, ax[l]), F::ZERO);
+            let power = greatest(least((cy + bx[l]).fma::<FMA>(dy, ax[l]), F::ZERO), F::of(POWER_MIN));
             let raw = r.opacity * power.blend_exp::<FMA>();
             let clamped = least(raw, limits.alpha_max);
             let used = (clamped >= limits.alpha_min) & (index <= last[l]);
