@@ -164,7 +164,7 @@ impl<F: Real> Raster<F> {
         });
     }
 
-    /// Blends four channels; `channels` [splats].
+    /// Blends four channels; one row of `channels` a splat.
     pub fn blend(&mut self, channels: &[[F; CHANNELS]], config: &RenderConfig) {
         let (simd, bins, limits) = (self.simd.unwrap_or(Simd::Scalar), &self.bins, Limits::new(config));
         let (width, height) = (self.width, self.height);
@@ -211,7 +211,7 @@ impl<F: Real> Raster<F> {
 
     /// VJP of the last [`Raster::blend`] with the same `channels`.
     ///
-    /// Shapes: `d` [splats], `d_channels` [splats]. `geometry` says whether `d` is overwritten or added to;
+    /// `d` and `d_channels` have one row a splat. `geometry` says whether `d` is overwritten or added to;
     /// `d_channels` is overwritten. Returns the gradient to the background.
     pub fn backward(
         &mut self,
@@ -480,15 +480,14 @@ fn blend_splat<F: Real, const FMA: bool>(
         for l in 0..TILE {
             let power = greatest(least((cy + bx[l]).fma::<FMA>(dy, ax[l]), F::ZERO), F::of(POWER_MIN));
             let alpha = least(r.opacity * power.blend_exp::<FMA>(), limits.alpha_max);
-            let added = alpha * t[l];
             let visible = alpha >= limits.alpha_min;
-            let open = t[l] - added >= limits.t_min;
-            let w = select(visible & open, added, F::ZERO);
-            weight[l] = w;
+            let open = t[l] * (F::ONE - alpha) >= limits.t_min;
+            let used = select(visible & open, alpha, F::ZERO);
+            weight[l] = used * t[l];
             // Neither this nor T is written as a choice between the old value and a new one: LLVM would make masked
             // stores of it, which cost tens of cycles on some machines. Sums of whole numbers are exact.
-            last[l] += select(w > F::ZERO, index - last[l], F::ZERO);
-            let kept = t[l] - w;
+            last[l] += select(used > F::ZERO, index - last[l], F::ZERO);
+            let kept = t[l] * (F::ONE - used);
             t[l] = least(kept, select(visible & !open, -kept, kept));
         }
         tile.t[y] = t;
@@ -638,7 +637,7 @@ fn backward_splat<F: Real, const FMA: bool>(
             let clamped = least(raw, limits.alpha_max);
             let used = (clamped >= limits.alpha_min) & (index <= last[l]);
             let alpha = select(used, clamped, F::ZERO);
-            t[l] = t[l] / (F::ONE - alpha);
+            t[l] /= F::ONE - alpha;
             let mut s = r.channels[0] * g[0][l];
             for c in 1..CHANNELS {
                 s = r.channels[c].fma::<FMA>(g[c][l], s);
