@@ -1,6 +1,6 @@
 //! Times the renderer on 30,000 random Gaussians with spherical harmonics of degree 3.
 //!
-//! `cargo run --release -p splat4d --example render_speed [COUNT]`: forward, and forward with backward, at 400² and
+//! `cargo run --release -p splat4d --example render_speed [COUNT [SIZE [THREADS]]]`: forward, and forward with backward, at 400² and
 //! 800², on one and two threads; median of several runs. Footprints are the same share of the picture at both sizes.
 
 use splat4d::math::{Rng, Se3, sym3};
@@ -46,14 +46,14 @@ fn main() {
     let color = Color::Sh { table: &sh, rows: Rows::All, weights: None, base: true };
     let splats = Splats { parts: vec![Part { out: &out, color }] };
     println!("{n} Gaussians, {:?}", Simd::detect());
-    for size in [400, 800] {
+    for size in std::env::args().nth(2).map_or(vec![400, 800], |s| vec![s.parse().unwrap_or(400)]) {
         let pose = Se3::look_at([0.0, 0.0, -4.0], [0.0; 3], [0.0, -1.0, 0.0]);
         let camera = Camera::with_fov_y(pose, 2.0 * (0.5f64 / 1.2).atan(), size, size);
         let mut grad = Planes::new(3, size, size);
         for (i, v) in grad.data.iter_mut().enumerate() {
             *v = rng.normal(i as u64) as f32;
         }
-        for threads in [1, 2] {
+        for threads in std::env::args().nth(3).map_or(vec![1, 2], |s| vec![s.parse().unwrap_or(1)]) {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a thread pool");
             pool.install(|| {
                 let (mut renderer, mut image) = (Renderer::new(RenderConfig::default()), Image::default());

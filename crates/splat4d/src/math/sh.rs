@@ -89,7 +89,7 @@ pub fn basis<F: Real>(d: [F; 3]) -> [F; MAX_COEFFS] {
     ]
 }
 
-/// Derivatives [16][3] of [`basis`] by x, y and z, taken as polynomials of three free variables.
+/// Derivatives (16 rows of 3) of [`basis`] by x, y and z, taken as polynomials of three free variables.
 #[inline(always)]
 pub fn basis_gradient<F: Real>(d: [F; 3]) -> [[F; 3]; MAX_COEFFS] {
     let [x, y, z] = d;
@@ -118,7 +118,7 @@ pub fn basis_gradient<F: Real>(d: [F; 3]) -> [[F; 3]; MAX_COEFFS] {
 
 /// Colour max(0, Σ_k Y_k(d) f_k + ½) of a Gaussian seen along unit direction `d`.
 ///
-/// Shapes: coefficients [K,3] with K one of 1, 4, 9, 16 → rgb [3].
+/// Shapes: coefficients [K, 3] with K one of 1, 4, 9, 16 → rgb.
 pub fn evaluate<F: Real>(coeffs: &[[F; 3]], d: [F; 3]) -> [F; 3] {
     let y = basis(d);
     let mut rgb = [F::of(COLOR_OFFSET); 3];
@@ -130,7 +130,7 @@ pub fn evaluate<F: Real>(coeffs: &[[F; 3]], d: [F; 3]) -> [F; 3] {
     rgb.map(|v| v.max(F::ZERO))
 }
 
-/// VJP of [`evaluate`]: writes d_coeffs [K,3] and returns the gradient to the direction (not yet made tangential: see
+/// VJP of [`evaluate`]: writes d_coeffs [K, 3] and returns the gradient to the direction (not yet made tangential: see
 /// [`direction_backward`]). A channel that was clamped at 0 passes nothing.
 pub fn evaluate_backward<F: Real>(coeffs: &[[F; 3]], d: [F; 3], d_rgb: [F; 3], d_coeffs: &mut [[F; 3]]) -> [F; 3] {
     let (y, dy, rgb) = (basis(d), basis_gradient(d), evaluate(coeffs, d));

@@ -94,7 +94,7 @@ impl<F: Real> Image<F> {
     pub fn expected_depth(&self, epsilon: F) -> Planes<F> {
         let mut out = self.depth.clone();
         for (d, &a) in out.data.iter_mut().zip(&self.alpha.data) {
-            *d = *d / a.max(epsilon);
+            *d /= a.max(epsilon);
         }
         out
     }

@@ -184,7 +184,7 @@ fn compensation<F: Real>(view: &View<F>, e: &Ellipse<F>) -> (F, bool) {
     if square > least { (square.sqrt(), false) } else { (F::of(RHO_MIN), true) }
 }
 
-/// Projects one Gaussian: mean [3] and covariance [6] in the world, opacity in (0,1).
+/// Projects one Gaussian: mean and packed covariance in the world, opacity in (0,1).
 ///
 /// `None`, culled: z ≤ near, opacity (after ρ) below the α cut-off, determinant ≤ 0, anything not finite.
 #[inline(always)]

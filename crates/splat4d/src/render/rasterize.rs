@@ -33,11 +33,14 @@ const PAIR: usize = 12;
 /// Splats in a reduction task.
 const CHUNK: usize = 2048;
 
+/// Exponents are not taken below this: e^-60 is far below any cut-off, and no product becomes a slow subnormal.
+const POWER_MIN: f64 = -60.0;
+
 /// A row of pixels.
 type Row<F> = [F; TILE];
 
-/// The state of 64 pixels after a pass.
-#[repr(C)]
+/// The state of 64 pixels after a pass. Aligned, so that no vector straddles two cache lines.
+#[repr(C, align(64))]
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Tile<F = f32> {
     color: [[Row<F>; TILE]; CHANNELS],
@@ -125,6 +128,19 @@ fn least<F: Real>(a: F, b: F) -> F {
     if a < b { a } else { b }
 }
 
+/// The larger, in one instruction.
+#[inline(always)]
+fn greatest<F: Real>(a: F, b: F) -> F {
+    if a > b { a } else { b }
+}
+
+/// One of two values that are both at hand. Without the hint LLVM makes a branch of it, and of the branch a masked
+/// store, which costs tens of cycles.
+#[inline(always)]
+fn select<F: Real>(condition: bool, yes: F, no: F) -> F {
+    std::hint::select_unpredictable(condition, yes, no)
+}
+
 impl<F: Real> Raster<F> {
     /// Bins, sorts and gathers the splats of a picture of `width` x `height`.
     pub fn prepare(
@@ -148,7 +164,7 @@ impl<F: Real> Raster<F> {
         });
     }
 
-    /// Blends four channels; `channels` [splats].
+    /// Blends four channels; one row of `channels` a splat.
     pub fn blend(&mut self, channels: &[[F; CHANNELS]], config: &RenderConfig) {
         let (simd, bins, limits) = (self.simd.unwrap_or(Simd::Scalar), &self.bins, Limits::new(config));
         let (width, height) = (self.width, self.height);
@@ -195,7 +211,7 @@ impl<F: Real> Raster<F> {
 
     /// VJP of the last [`Raster::blend`] with the same `channels`.
     ///
-    /// Shapes: `d` [splats], `d_channels` [splats]. `geometry` says whether `d` is overwritten or added to;
+    /// `d` and `d_channels` have one row a splat. `geometry` says whether `d` is overwritten or added to;
     /// `d_channels` is overwritten. Returns the gradient to the background.
     pub fn backward(
         &mut self,
@@ -335,6 +351,11 @@ impl<F: Real> Kernel for Gather<'_, F> {
             })
         };
         let (xs, ys) = (ends(self.x0, self.width), ends(self.y0, self.height));
+        let lanes = |ends: &[[F; 2]; SIDE], k: usize, of: fn(usize) -> usize| -> [F; TILES] {
+            std::array::from_fn(|t| ends[of(t)][k])
+        };
+        let (left, right) = (lanes(&xs, 0, |t| t % SIDE), lanes(&xs, 1, |t| t % SIDE));
+        let (top, bottom) = (lanes(&ys, 0, |t| t / SIDE), lanes(&ys, 1, |t| t / SIDE));
         let full: u16 = (0..TILES)
             .filter(|t| xs[t % SIDE][0] <= xs[t % SIDE][1] && ys[t / SIDE][0] <= ys[t / SIDE][1])
             .fold(0, |m, t| m | 1 << t);
@@ -342,13 +363,16 @@ impl<F: Real> Kernel for Gather<'_, F> {
             let p = &self.projected[id(*key)];
             let (x, y) = (p.mean2d[0] - at(self.x0), p.mean2d[1] - at(self.y0));
             let (y_slope, x_slope) = (-p.conic[1] / p.conic[2], -p.conic[1] / p.conic[0]);
-            let mut hit = [0u16; TILES];
+            let mut q = [F::ZERO; TILES];
             for t in 0..TILES {
-                let (rx, ry) = (xs[t % SIDE], ys[t / SIDE]);
-                let (rx, ry) = ([rx[0] - x, rx[1] - x], [ry[0] - y, ry[1] - y]);
-                let q = ellipse_distance(p.conic, y_slope, x_slope, rx, ry);
-                hit[t] = if q <= p.tau { 1 << t } else { 0 };
+                let (rx, ry) = ([left[t] - x, right[t] - x], [top[t] - y, bottom[t] - y]);
+                q[t] = ellipse_distance(p.conic, y_slope, x_slope, rx, ry);
             }
+            let mut hit = [0u32; TILES];
+            for t in 0..TILES {
+                hit[t] = u32::from(q[t] <= p.tau) << t;
+            }
+            let hit = hit.iter().fold(0, |m, h| m | h) as u16;
             let row = |v: F, round: fn(f64) -> f64| round((v - F::HALF).f64()).clamp(-1.0, BIN as f64) as i32;
             *record = Record {
                 x,
@@ -358,7 +382,7 @@ impl<F: Real> Kernel for Gather<'_, F> {
                 c: -F::HALF * p.conic[2],
                 opacity: p.opacity,
                 channels: record.channels,
-                mask: hit.iter().fold(0, |m, h| m | h) & full,
+                mask: hit & full,
                 row0: row(y - p.half[1], f64::ceil).max(0) as u8,
                 row1: (row(y + p.half[1], f64::floor) + 1).clamp(0, BIN as i32) as u8,
             };
@@ -408,13 +432,13 @@ impl<F: Real> Kernel for Blend<'_, F> {
         for t in 0..TILES {
             let (tx, ty) = (t % SIDE, t / SIDE);
             let tile = &mut self.tiles[t];
-            *tile = Tile::default();
-            for y in 0..TILE {
-                for x in 0..TILE {
-                    // Pixels outside the picture have stopped from the start.
-                    let within = tx * TILE + x < self.inside[0] && ty * TILE + y < self.inside[1];
-                    tile.t[y][x] = if within { F::ONE } else { -F::ONE };
-                    tile.last[y][x] = -F::ONE;
+            *tile = Tile { t: [[F::ONE; TILE]; TILE], last: [[-F::ONE; TILE]; TILE], ..Tile::default() };
+            let nx = self.inside[0].saturating_sub(tx * TILE);
+            let ny = self.inside[1].saturating_sub(ty * TILE);
+            if nx < TILE || ny < TILE {
+                // Pixels outside the picture have stopped from the start.
+                for (y, row) in tile.t.iter_mut().enumerate() {
+                    row[if y < ny { nx.min(TILE) } else { 0 }..].fill(-F::ONE);
                 }
             }
             let list = tile_list(self.records, self.list, t);
@@ -422,13 +446,7 @@ impl<F: Real> Kernel for Blend<'_, F> {
                 for &i in batch {
                     blend_splat::<F, FMA>(tile, &self.records[i as usize], F::of(f64::from(i)), tx, ty, &self.limits);
                 }
-                let mut open = F::ZERO;
-                for row in &tile.t {
-                    for &t in row {
-                        open = if t > open { t } else { open };
-                    }
-                }
-                if open < self.limits.t_min {
+                if most(&tile.t) < self.limits.t_min.max(F::ZERO) {
                     break;
                 }
             }
@@ -451,21 +469,26 @@ fn blend_splat<F: Real, const FMA: bool>(
         ax[l] = r.a * dx[l] * dx[l];
         bx[l] = r.b * dx[l];
     }
-    for y in tile_rows(r, ty) {
-        let dy = r.y - (F::of((ty * TILE + y) as f64) + F::HALF);
+    let rows = tile_rows(r, ty);
+    let mut center = F::of((ty * TILE + rows.start) as f64) + F::HALF;
+    for y in rows {
+        let dy = r.y - center;
+        center += F::ONE;
         let cy = r.c * dy;
         let (mut t, mut last) = (tile.t[y], tile.last[y]);
         let mut weight = [F::ZERO; TILE];
         for l in 0..TILE {
-            let power = least((cy + bx[l]).fma::<FMA>(dy, ax[l]), F::ZERO);
+            let power = greatest(least((cy + bx[l]).fma::<FMA>(dy, ax[l]), F::ZERO), F::of(POWER_MIN));
             let alpha = least(r.opacity * power.blend_exp::<FMA>(), limits.alpha_max);
-            let next = (-alpha).fma::<FMA>(t[l], t[l]);
             let visible = alpha >= limits.alpha_min;
-            let blends = visible & (next >= limits.t_min);
-            weight[l] = if blends { alpha * t[l] } else { F::ZERO };
-            last[l] = if blends { index } else { last[l] };
-            let stopped = if visible { -t[l].abs() } else { t[l] };
-            t[l] = if blends { next } else { stopped };
+            let open = t[l] * (F::ONE - alpha) >= limits.t_min;
+            let used = select(visible & open, alpha, F::ZERO);
+            weight[l] = used * t[l];
+            // Neither this nor T is written as a choice between the old value and a new one: LLVM would make masked
+            // stores of it, which cost tens of cycles on some machines. Sums of whole numbers are exact.
+            last[l] += select(used > F::ZERO, index - last[l], F::ZERO);
+            let kept = t[l] * (F::ONE - used);
+            t[l] = least(kept, select(visible & !open, -kept, kept));
         }
         tile.t[y] = t;
         tile.last[y] = last;
@@ -492,6 +515,7 @@ struct Backward<'a, F> {
 }
 
 /// What the way back carries for 64 pixels.
+#[repr(C, align(64))]
 struct Back<F> {
     /// Transmittance behind the splat in hand.
     t: [Row<F>; TILE],
@@ -528,7 +552,6 @@ impl<F: Real> Kernel for Backward<'_, F> {
             let g: [_; CHANNELS] = std::array::from_fn(|c| fetch(self.grads.channels[c]));
             let alpha = fetch(self.grads.alpha);
             let mut back = Back { t: tile.t, last: tile.last, g, behind: [[F::ZERO; TILE]; TILE] };
-            let mut reach = -F::ONE;
             for y in 0..TILE {
                 for x in 0..TILE {
                     back.t[y][x] = tile.t[y][x].abs();
@@ -537,9 +560,9 @@ impl<F: Real> Kernel for Backward<'_, F> {
                         sum += self.background[c] * g[c][y][x];
                     }
                     back.behind[y][x] = sum;
-                    reach = if tile.last[y][x] > reach { tile.last[y][x] } else { reach };
                 }
             }
+            let reach = most(&tile.last);
             for c in 0..CHANNELS {
                 let mut rows = [F::ZERO; TILE];
                 for y in 0..TILE {
@@ -559,6 +582,18 @@ impl<F: Real> Kernel for Backward<'_, F> {
         }
         d_background
     }
+}
+
+/// The largest of 64 values, lanes first.
+#[inline(always)]
+fn most<F: Real>(rows: &[Row<F>; TILE]) -> F {
+    let mut lanes = rows[0];
+    for row in &rows[1..] {
+        for l in 0..TILE {
+            lanes[l] = greatest(row[l], lanes[l]);
+        }
+    }
+    lanes.iter().fold(lanes[0], |m, &v| greatest(v, m))
 }
 
 /// Sum of eight lanes, always by the same tree.
@@ -588,18 +623,21 @@ fn backward_splat<F: Real, const FMA: bool>(
     // Sums down each column; dx is the same for all rows, so its powers wait until the end.
     let (mut v0, mut v1, mut v2, mut abs_x, mut abs_y) = (zero, zero, zero, zero, zero);
     let mut light = [zero; CHANNELS];
-    for y in tile_rows(r, ty) {
-        let dy = r.y - (F::of((ty * TILE + y) as f64) + F::HALF);
+    let rows = tile_rows(r, ty);
+    let mut center = F::of((ty * TILE + rows.start) as f64) + F::HALF;
+    for y in rows {
+        let dy = r.y - center;
+        center += F::ONE;
         let (cy, by, ey) = (r.c * dy, r.b * dy, F::TWO * r.c * dy);
         let (mut t, mut behind, last) = (back.t[y], back.behind[y], back.last[y]);
         let g = [back.g[0][y], back.g[1][y], back.g[2][y], back.g[3][y]];
         for l in 0..TILE {
-            let power = least((cy + bx[l]).fma::<FMA>(dy, ax[l]), F::ZERO);
+            let power = greatest(least((cy + bx[l]).fma::<FMA>(dy, ax[l]), F::ZERO), F::of(POWER_MIN));
             let raw = r.opacity * power.blend_exp::<FMA>();
             let clamped = least(raw, limits.alpha_max);
             let used = (clamped >= limits.alpha_min) & (index <= last[l]);
-            let alpha = if used { clamped } else { F::ZERO };
-            t[l] = t[l] / (F::ONE - alpha);
+            let alpha = select(used, clamped, F::ZERO);
+            t[l] /= F::ONE - alpha;
             let mut s = r.channels[0] * g[0][l];
             for c in 1..CHANNELS {
                 s = r.channels[c].fma::<FMA>(g[c][l], s);
@@ -611,7 +649,7 @@ fn backward_splat<F: Real, const FMA: bool>(
             }
             behind[l] = alpha.fma::<FMA>(ahead, behind[l]);
             // dL/d power; nothing passes where α is at its ceiling.
-            let v = if raw <= limits.alpha_max { weight * ahead } else { F::ZERO };
+            let v = select(raw <= limits.alpha_max, weight * ahead, F::ZERO);
             let vy = v * dy;
             v0[l] += v;
             v1[l] += vy;

@@ -32,8 +32,11 @@ struct Layout {
 
 impl Layout {
     fn new(width: usize, blocks: usize, degree: usize) -> Self {
-        let block = if blocks == 0 { 0 } else { width / blocks };
-        assert!(block * blocks == width && block % 3 == 0, "an SH table has 3·K·blocks columns, not {width}/{blocks}");
+        let block = width.checked_div(blocks).unwrap_or(0);
+        assert!(
+            block * blocks == width && block.is_multiple_of(3),
+            "an SH table has 3·K·blocks columns, not {width}/{blocks}"
+        );
         let used = sh::degree_of(block / 3).map_or(0, |d| sh::coeffs(d.min(degree)));
         Self { blocks, block, used }
     }
