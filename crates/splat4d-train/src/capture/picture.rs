@@ -54,7 +54,7 @@ impl Raster {
 
     /// The channel that holds alpha.
     pub fn alpha(&self) -> Option<usize> {
-        (self.channels % 2 == 0).then(|| self.channels - 1)
+        self.channels.is_multiple_of(2).then(|| self.channels - 1)
     }
 }
 
