@@ -71,6 +71,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         kind: CaptureKind::Colmap,
         cameras: naming.cameras,
         frames,
+        named: naming.told,
         hold_out: None,
         fps,
         points: cloud(&points),

@@ -292,3 +292,37 @@ fn points_txt(text: &str) -> Result<Vec<Point>> {
     }
     Ok(points)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_common_model_is_read() {
+        let text = "1 SIMPLE_PINHOLE 8 6 5 4 3\n2 PINHOLE 8 6 5 6 4 3\n3 SIMPLE_RADIAL 8 6 5 4 3 .1\n\
+                    4 RADIAL 8 6 5 4 3 .1 .2\n5 OPENCV 8 6 5 6 4 3 .1 .2 .3 .4\n\
+                    6 OPENCV_FISHEYE 8 6 5 6 4 3 .1 .2 .3 .4\n\
+                    7 FULL_OPENCV 8 6 5 6 4 3 .1 .2 .3 .4 .5 .6 .7 .8\n8 SIMPLE_RADIAL_FISHEYE 8 6 5 4 3 .1\n\
+                    9 RADIAL_FISHEYE 8 6 5 4 3 .1 .2\n";
+        let cameras = cameras_txt(text).unwrap();
+        let brown = |k, p| Lens::Brown { k, p, s: [0.0; 4] };
+        let lenses = [
+            Lens::Pinhole,
+            Lens::Pinhole,
+            brown([0.1, 0.0, 0.0, 0.0, 0.0, 0.0], [0.0; 2]),
+            brown([0.1, 0.2, 0.0, 0.0, 0.0, 0.0], [0.0; 2]),
+            brown([0.1, 0.2, 0.0, 0.0, 0.0, 0.0], [0.3, 0.4]),
+            Lens::Fisheye { k: [0.1, 0.2, 0.3, 0.4] },
+            brown([0.1, 0.2, 0.5, 0.6, 0.7, 0.8], [0.3, 0.4]),
+            Lens::Fisheye { k: [0.1, 0.0, 0.0, 0.0] },
+            Lens::Fisheye { k: [0.1, 0.2, 0.0, 0.0] },
+        ];
+        for (camera, lens) in cameras.values().zip(lenses) {
+            assert_eq!(camera.lens, lens);
+            let k = camera.intrinsics;
+            assert!(k.fx == 5.0 && (k.fy == 5.0 || k.fy == 6.0) && k.cx == 4.0 && k.cy == 3.0, "{k:?}");
+        }
+        assert_eq!(cameras.len(), 9);
+        assert!(cameras_txt("1 FOV 8 6 5 6 4 3 .1\n").unwrap_err().to_string().contains("FOV"));
+    }
+}

@@ -133,6 +133,8 @@ struct Take {
     root: PathBuf,
     kind: CaptureKind,
     cameras: Vec<String>,
+    /// Whether the data set tells cameras apart; else one entry may stand for many.
+    named: bool,
     frames: Vec<RawFrame>,
     /// The data set's convention, where it is not told by the frames' splits.
     hold_out: Option<HoldOut>,

@@ -67,6 +67,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         kind: CaptureKind::N3dv,
         cameras: folders.into_iter().map(|f| f.name).collect(),
         frames,
+        named: true,
         hold_out: None,
         fps,
         points: points.map(|p| ply::read(&p)).transpose()?,

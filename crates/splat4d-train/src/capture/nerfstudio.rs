@@ -67,6 +67,7 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<T
         kind: CaptureKind::Nerfstudio,
         cameras: naming.cameras,
         frames: frames.collect(),
+        named: naming.told,
         hold_out: None,
         fps,
         points,
@@ -219,7 +220,8 @@ fn clock(
     };
     if unit && options.unit_time_seconds.is_none() && instants.len() > 1 {
         warnings.push(format!(
-            "Times run from 0 to 1; they are taken as parts of a take of {} instants at {fps} frames per second ({scale:.3} s).",
+            "Times run from 0 to 1; they are taken as parts of a take of {} instants at {fps} frames per second \
+             ({scale:.3} s).",
             instants.len()
         ));
     }

@@ -38,6 +38,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         kind: CaptureKind::Panoptic,
         cameras: ids.iter().map(ToString::to_string).collect(),
         frames: found.into_iter().map(|(_, f)| f).collect(),
+        named: true,
         hold_out: None,
         fps,
         points,

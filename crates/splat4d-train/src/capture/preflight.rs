@@ -37,7 +37,11 @@ impl Capture {
     pub fn preflight(&self) -> Vec<Finding> {
         let mut findings = Vec::new();
         for warning in &self.warnings {
-            findings.push(finding(Severity::Warning, warning.clone(), "See the capture's documentation."));
+            findings.push(finding(
+                Severity::Warning,
+                warning.clone(),
+                "docs/capture-format.md says what the layout expects.",
+            ));
         }
         let views = self.training_views();
         self.check_views(&views, &mut findings);

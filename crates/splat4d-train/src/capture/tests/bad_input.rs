@@ -61,7 +61,7 @@ fn missing_and_truncated_pictures() {
                 .edit("capture.json", |v| v["cameras"][0]["images"] = json!(["images/a.jpg", "images/cam00/0006.png"]));
         }
         let bytes = std::fs::read(sample.path(name)).unwrap();
-        for keep in [0, 10, bytes.len() / 2, bytes.len() - 3] {
+        for keep in [0, 10, bytes.len() / 2, bytes.len() - if name.ends_with("png") { 40 } else { 1 }] {
             sample.write(name, &bytes[..keep]);
             assert_says(&message(&sample), &[name, "truncated", "again"]);
         }
@@ -183,13 +183,8 @@ fn damaged_metadata() {
 
 #[test]
 fn absurd_counts() {
-    let counts: [(&str, fn() -> Sample); 3] = [
-        ("sparse/0/cameras.bin", samples::colmap_bin),
-        ("sparse/0/images.bin", samples::colmap_bin),
-        ("sparse/0/points3D.bin", samples::colmap_bin),
-    ];
-    for (file, make) in counts {
-        let sample = make();
+    for name in ["cameras", "images", "points3D"] {
+        let (file, sample) = (&format!("sparse/0/{name}.bin"), samples::colmap_bin());
         let mut bytes = std::fs::read(sample.path(file)).unwrap();
         bytes[..8].copy_from_slice(&u64::MAX.to_le_bytes());
         sample.write(file, &bytes);

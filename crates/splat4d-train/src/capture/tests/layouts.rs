@@ -182,6 +182,27 @@ fn colmap_binary_and_text_agree() {
 }
 
 #[test]
+fn colmap_siblings_by_prefix() {
+    let sample = samples::colmap_txt();
+    let mut text = std::fs::read_to_string(sample.path("sparse/0/images.txt")).unwrap();
+    for c in 0..3 {
+        for t in 0..2 {
+            let flat = sample.path(&format!("images/cam{c}_frame{t:04}.png"));
+            std::fs::rename(sample.path(&format!("images/cam{c}/{t:04}.png")), flat).unwrap();
+        }
+        sample.mask(&format!("masks/cam{c}_frame0001.png.png"), |_, _| 255);
+        text = text.replace(&format!("cam{c}/0000.png"), &format!("cam{c}_frame0000.png"));
+    }
+    sample.write("sparse/0/images.txt", text.as_bytes());
+    let capture = open(&sample);
+    assert_eq!((names(&capture), capture.frames.len()), (vec!["cam0", "cam1", "cam2"], 6));
+    for (i, frame) in capture.frames.iter().enumerate() {
+        assert_pose(frame, i / 2);
+        assert_eq!((frame.index, frame.mask.is_some()), (i % 2, i % 2 == 1));
+    }
+}
+
+#[test]
 fn colmap_of_one_moving_camera() {
     let sample = samples::colmap_txt();
     let text = std::fs::read_to_string(sample.path("sparse/0/images.txt")).unwrap();

@@ -239,8 +239,8 @@ pub fn colmap_txt() -> Sample {
     let sample = Sample::new(&["sparse/0/cameras.txt", "sparse/0/images.txt", "sparse/0/points3D.txt"]);
     let names = colmap_pictures(&sample);
     let cameras = format!(
-        "# comment\n1 PINHOLE {WIDTH} {HEIGHT} {FOCAL} {FOCAL} 12 8\n2 OPENCV {WIDTH} {HEIGHT} {FOCAL} {FOCAL} 12 8 -0.1 \
-         0.01 0.001 -0.001\n"
+        "# comment\n1 PINHOLE {WIDTH} {HEIGHT} {FOCAL} {FOCAL} 12 8\n2 OPENCV {WIDTH} {HEIGHT} {FOCAL} {FOCAL} 12 8 \
+         -0.1 0.01 0.001 -0.001\n"
     );
     let mut images = "# comment\n".to_string();
     for (i, name) in names.iter().enumerate() {
