@@ -155,7 +155,8 @@ fn check_poses(take: &Take, cameras: &[Rig]) -> Result<()> {
     Ok(())
 }
 
-/// One camera takes one picture at a time. A moving "camera" may stand for several, so there the pose counts too; a
+/// One camera takes one picture at a time. Where the data set
+/// names none, one "camera" may stand for several, so that the pose counts too; a
 /// frame that training and measuring share is reported, not refused (published data sets do it).
 fn check_duplicates(take: &mut Take, cameras: &[Rig]) -> Result<()> {
     let mut groups: BTreeMap<(usize, u64), Vec<usize>> = BTreeMap::new();
@@ -165,7 +166,7 @@ fn check_duplicates(take: &mut Take, cameras: &[Rig]) -> Result<()> {
         let earlier = groups.entry((frame.camera, (frame.time + 0.0).to_bits())).or_default();
         for &j in earlier.iter() {
             let other = &take.frames[j];
-            if !cameras[frame.camera].fixed && !same_pose(&other.source, &frame.source) {
+            if !take.named && !cameras[frame.camera].fixed && !same_pose(&other.source, &frame.source) {
                 continue;
             }
             if other.split != frame.split {

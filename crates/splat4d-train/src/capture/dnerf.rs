@@ -55,6 +55,7 @@ pub(super) fn read(root: &Path, _marker: &Path, options: &CaptureOptions) -> Res
         kind: CaptureKind::DNerf,
         cameras: vec!["moving".into()],
         frames,
+        named: false,
         hold_out: None,
         fps,
         points: None,

@@ -38,7 +38,7 @@ pub(super) fn read(path: &Path) -> Result<Value> {
 }
 
 /// A value and the path that leads to it (`cameras[3].fx`).
-#[derive(Clone)]
+#[derive(Clone, Debug)]
 pub(super) struct Node<'a> {
     /// The value itself.
     pub value: &'a Value,

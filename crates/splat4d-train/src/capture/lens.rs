@@ -94,7 +94,7 @@ impl Distortion {
             if miss[0].hypot(miss[1]) < TOLERANCE {
                 return (ray[0].hypot(ray[1]) <= self.limit && d > 0.0).then_some(ray);
             }
-            if !(d.abs() > 1e-12) {
+            if d.abs() <= 1e-12 || d.is_nan() {
                 return None;
             }
             ray[0] -= (j[1][1] * miss[0] - j[0][1] * miss[1]) / d;
@@ -111,19 +111,24 @@ impl Distortion {
 /// The first place in (0, end] where the slope is no longer positive; `end` if there is none.
 fn first_fold(end: f64, slope: impl Fn(f64) -> f64) -> f64 {
     let at = |i: usize| end * i as f64 / FOLD_SAMPLES as f64;
-    // Written so that NaN counts as a fold.
-    let Some(i) = (1..=FOLD_SAMPLES).find(|&i| !(slope(at(i)) > 0.0)) else { return end };
+    // NaN counts as a fold.
+    let folded = |x: f64| {
+        let slope = slope(x);
+        slope <= 0.0 || slope.is_nan()
+    };
+    let Some(i) = (1..=FOLD_SAMPLES).find(|&i| folded(at(i))) else { return end };
     let (mut low, mut high) = (at(i - 1), at(i));
     for _ in 0..MAX_STEPS {
         let middle = 0.5 * (low + high);
-        *(if slope(middle) > 0.0 { &mut low } else { &mut high }) = middle;
+        *(if folded(middle) { &mut high } else { &mut low }) = middle;
     }
     low
 }
 
 /// Solves f(x) = y for x in [0, end] by Newton guarded with bisection; f(0) = 0 and f grows up to `end`.
 fn invert(end: f64, y: f64, f: impl Fn(f64) -> (f64, f64)) -> Option<f64> {
-    if !(y <= f(end).0) {
+    let most = f(end).0;
+    if y > most || most.is_nan() || y.is_nan() {
         return None;
     }
     let (mut low, mut high) = (0.0, end);

@@ -7,9 +7,14 @@
 //! [`assemble`] alone turns takes into captures, so that all layouts are checked alike.
 
 mod assemble;
+mod colmap;
+mod colmap_files;
 mod dnerf;
 mod json;
 mod lens;
+mod n3dv;
+mod nerfstudio;
+mod npy;
 mod options;
 mod own;
 mod panoptic;
@@ -41,6 +46,12 @@ pub enum CaptureKind {
     DNerf,
     /// PanopticSports `train_meta.json` and `test_meta.json`.
     Panoptic,
+    /// Nerfstudio `transforms.json`.
+    Nerfstudio,
+    /// A COLMAP reconstruction in `sparse/`.
+    Colmap,
+    /// N3DV: `poses_bounds.npy` and a folder of frames per camera.
+    N3dv,
 }
 
 /// One picture of the take.
@@ -122,6 +133,8 @@ struct Take {
     root: PathBuf,
     kind: CaptureKind,
     cameras: Vec<String>,
+    /// Whether the data set tells cameras apart; else one entry may stand for many.
+    named: bool,
     frames: Vec<RawFrame>,
     /// The data set's convention, where it is not told by the frames' splits.
     hold_out: Option<HoldOut>,
@@ -147,8 +160,14 @@ struct RawFrame {
 type Reader = fn(&Path, &Path, &CaptureOptions) -> Result<Take>;
 
 /// Marker files (or folders) in the order in which they are looked for, with their readers.
-const READERS: &[(&str, Reader)] =
-    &[("capture.json", own::read), ("transforms_train.json", dnerf::read), ("train_meta.json", panoptic::read)];
+const READERS: &[(&str, Reader)] = &[
+    ("capture.json", own::read),
+    ("transforms_train.json", dnerf::read),
+    ("train_meta.json", panoptic::read),
+    ("transforms.json", nerfstudio::read),
+    ("poses_bounds.npy", n3dv::read),
+    ("sparse", colmap::read),
+];
 
 /// Markers of layouts that this version does not read, and what to do.
 const FOREIGN: &[(&str, &str)] = &[
@@ -180,7 +199,9 @@ impl Capture {
         }
         for (marker, reader) in READERS {
             let found = path.join(marker);
-            if found.exists() {
+            // Single-camera LLFF folders have the same marker, and are read from their COLMAP model.
+            let llff = *marker == "poses_bounds.npy" && path.join("sparse").is_dir() && !n3dv::applies(path);
+            if found.exists() && !llff {
                 return assemble::assemble(reader(path, &found, options)?, options);
             }
         }

@@ -91,6 +91,7 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<T
         kind: CaptureKind::Own,
         cameras,
         frames,
+        named: true,
         hold_out: top.opt("hold_out")?.map(|n| read_hold_out(&n)).transpose()?,
         fps,
         points: top.opt("points")?.map(|n| ply::read(&root.join(n.text()?))).transpose()?,

@@ -2,11 +2,11 @@
 //! axes, world to camera.
 
 use super::json::{self, Node};
-use super::{CaptureKind, CaptureOptions, RawFrame, Split, Take, ply, rig};
-use splat4d::Result;
+use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Split, Take, npy, ply, rig};
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::scene::{Camera, Intrinsics, Lens};
+use splat4d::{Error, Result};
 use std::path::Path;
 
 /// Upwards in the studio.
@@ -38,6 +38,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         kind: CaptureKind::Panoptic,
         cameras: ids.iter().map(ToString::to_string).collect(),
         frames: found.into_iter().map(|(_, f)| f).collect(),
+        named: true,
         hold_out: None,
         fps,
         points,
@@ -81,8 +82,8 @@ fn read_meta(root: &Path, top: &Node<'_>, split: Split, fps: f64, out: &mut Vec<
     Ok(())
 }
 
-/// The cloud: any .ply beside the metadata, `points3d_f0_sift.ply` first.
-fn read_points(root: &Path, warnings: &mut Vec<String>) -> Result<Option<super::PointCloud>> {
+/// The cloud: the .ply beside the metadata (`points3d_f0_sift.ply` if there are several), else [`ARCHIVE`].
+fn read_points(root: &Path, warnings: &mut Vec<String>) -> Result<Option<PointCloud>> {
     let names = rig::file_names(root);
     let plys: Vec<&String> = names.iter().filter(|n| n.to_ascii_lowercase().ends_with(".ply")).collect();
     let chosen =
@@ -90,11 +91,31 @@ fn read_points(root: &Path, warnings: &mut Vec<String>) -> Result<Option<super::
     if chosen.is_none() {
         if plys.len() > 1 {
             warnings.push("Several .ply files lie beside train_meta.json; none is used as the initial cloud.".into());
-        } else if names.iter().any(|n| n == "init_pt_cld.npz") {
-            warnings.push(
-                "init_pt_cld.npz is not read: convert it to a .ply beside train_meta.json to start from it.".into(),
-            );
+        } else if names.iter().any(|n| n == ARCHIVE) {
+            return read_archive(&root.join(ARCHIVE)).map(Some);
         }
     }
     chosen.map(|name| ply::read(&root.join(name))).transpose()
+}
+
+/// Luiten's own cloud: `data` [N,7] = position, sRGB in [0,1], foreground.
+const ARCHIVE: &str = "init_pt_cld.npz";
+
+fn read_archive(path: &Path) -> Result<PointCloud> {
+    let bytes = json::read_bytes(path)?;
+    let array = npy::member(&bytes, "data").and_then(npy::parse).map_err(|e| e.at(path.display()))?;
+    let columns = match array.shape[..] {
+        [_, columns] if columns >= 6 => columns,
+        _ => {
+            let what = format!("expected an array of shape [points, 7], found {:?}", array.shape);
+            return Err(Error::input(what).at(path.display()).remedy("Remove the file to start without it."));
+        }
+    };
+    let mut cloud = PointCloud::default();
+    for row in array.data.chunks_exact(columns).filter(|r| r[..6].iter().all(|v| v.is_finite())) {
+        cloud.points.push([row[0], row[1], row[2]]);
+        cloud.colors.push([row[3], row[4], row[5]].map(|v| v.clamp(0.0, 1.0) as f32));
+        cloud.times.push(None);
+    }
+    Ok(cloud)
 }

@@ -54,7 +54,7 @@ impl Raster {
 
     /// The channel that holds alpha.
     pub fn alpha(&self) -> Option<usize> {
-        (self.channels % 2 == 0).then(|| self.channels - 1)
+        self.channels.is_multiple_of(2).then(|| self.channels - 1)
     }
 }
 
@@ -63,6 +63,8 @@ fn is_jpeg(bytes: &[u8]) -> bool {
 }
 
 fn broken(path: &Path, detail: impl std::fmt::Display) -> Error {
+    // Some decoders' messages hold line breaks.
+    let detail = detail.to_string().split_whitespace().collect::<Vec<_>>().join(" ");
     Error::input(format!("the picture is damaged, truncated or of another format than JPEG, PNG and WebP ({detail})"))
         .at(path.display())
         .remedy("Copy or extract it again, or take the frame out of the capture.")
@@ -108,7 +110,7 @@ pub(super) fn check_size(path: &Path, size: (usize, usize), camera: &Camera) -> 
         size.0, size.1, camera.width, camera.height
     );
     Err(Error::input(what).at(path.display()).remedy(
-        "Give the intrinsics of the pictures as they are stored (upright, after EXIF rotation), or resize the pictures.",
+        "Give the intrinsics of the pictures as they are stored (upright, after EXIF rotation), or resize them.",
     ))
 }
 

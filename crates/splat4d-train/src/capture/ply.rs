@@ -195,7 +195,8 @@ mod tests {
 
     #[test]
     fn ascii_and_binary_agree_whatever_the_order() {
-        let ascii = "ply\nformat ascii 1.0\ncomment made up\nelement vertex 2\nproperty uchar red\nproperty uchar green\n\
+        let ascii = "ply\nformat ascii 1.0\ncomment made up\nelement vertex 2\nproperty uchar red\n\
+                     property uchar green\n\
                      property uchar blue\nproperty double x\nproperty float y\nproperty int z\nproperty float time\n\
                      end_header\n255 0 51 1.5 -2 3 0.5\n0 255 0 nan 0 0 0\n";
         let cloud = parse(ascii.as_bytes()).unwrap();

@@ -1,6 +1,6 @@
 //! Initial point clouds.
 
-use std::collections::BTreeMap;
+use rayon::prelude::*;
 
 /// Coloured points, some with the time at which they were seen.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -17,7 +17,7 @@ pub struct PointCloud {
 /// numbers still fit one 64-bit key.
 const MAX_CELLS: f64 = (1u64 << 20) as f64;
 /// Bisection steps for the voxel size; each halves an interval of 20 octaves.
-const STEPS: usize = 24;
+const STEPS: usize = 16;
 
 impl PointCloud {
     /// Thins the cloud to at most `max_points`: the finest voxel grid that leaves few enough cells, and the mean of
@@ -41,18 +41,19 @@ impl PointCloud {
         let (mut coarse, mut fine) = (0.0, MAX_CELLS.log2());
         for _ in 0..STEPS {
             let middle: f64 = 0.5 * (coarse + fine);
-            let cells = self.cells(low, middle.exp2() / side);
-            *(if cells.len() <= max_points { &mut coarse } else { &mut fine }) = middle;
+            let count = self.cells(low, middle.exp2() / side).chunk_by(|a, b| a.0 == b.0).count();
+            *(if count <= max_points { &mut coarse } else { &mut fine }) = middle;
         }
-        let cells = self.cells(low, f64::exp2(coarse) / side);
+        let sorted = self.cells(low, f64::exp2(coarse) / side);
+        let cells: Vec<&[(Cell, usize)]> = sorted.chunk_by(|a, b| a.0 == b.0).collect();
         let mut out = Self::default();
         // More distinct times than points are asked for: no voxel size helps, so every n-th cell is kept.
         let stride = cells.len().div_ceil(max_points);
-        for members in cells.values().step_by(stride) {
+        for members in cells.iter().step_by(stride) {
             let weight = 1.0 / members.len() as f64;
             let mut point = [0.0; 3];
             let mut color = [0.0; 3];
-            for &i in members {
+            for &(_, i) in *members {
                 for k in 0..3 {
                     point[k] += weight * self.points[i][k];
                     color[k] += weight * f64::from(self.colors[i][k]);
@@ -60,22 +61,26 @@ impl PointCloud {
             }
             out.points.push(point);
             out.colors.push(color.map(|c| c as f32));
-            out.times.push(self.times[members[0]]);
+            out.times.push(self.times[members[0].1]);
         }
         out
     }
 
-    /// Members of every occupied cell; cells of one time only.
-    fn cells(&self, low: [f64; 3], per_unit: f64) -> BTreeMap<(u64, Option<u64>), Vec<usize>> {
-        let mut cells: BTreeMap<(u64, Option<u64>), Vec<usize>> = BTreeMap::new();
-        for (i, p) in self.points.iter().enumerate() {
+    /// The cell of every point, sorted by cell and then by point.
+    fn cells(&self, low: [f64; 3], per_unit: f64) -> Vec<(Cell, usize)> {
+        let cell_of = |(i, p): (usize, &[f64; 3])| {
             let cell = |k: usize| ((p[k] - low[k]) * per_unit).clamp(0.0, MAX_CELLS) as u64;
-            let key = (cell(0) << 42) | (cell(1) << 21) | cell(2);
-            cells.entry((key, self.times[i].map(f64::to_bits))).or_default().push(i);
-        }
+            let place = (cell(0) << 42) | (cell(1) << 21) | cell(2);
+            ((place, self.times[i].map(f64::to_bits)), i)
+        };
+        let mut cells: Vec<(Cell, usize)> = self.points.par_iter().enumerate().map(cell_of).collect();
+        cells.par_sort_unstable();
         cells
     }
 }
+
+/// A voxel's three numbers in one key, and the bits of a time.
+type Cell = (u64, Option<u64>);
 
 #[cfg(test)]
 mod tests {

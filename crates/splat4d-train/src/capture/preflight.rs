@@ -37,7 +37,11 @@ impl Capture {
     pub fn preflight(&self) -> Vec<Finding> {
         let mut findings = Vec::new();
         for warning in &self.warnings {
-            findings.push(finding(Severity::Warning, warning.clone(), "See the capture's documentation."));
+            findings.push(finding(
+                Severity::Warning,
+                warning.clone(),
+                "docs/capture-format.md says what the layout expects.",
+            ));
         }
         let views = self.training_views();
         self.check_views(&views, &mut findings);
@@ -172,7 +176,7 @@ fn solve(m: [[f64; 3]; 3], b: [f64; 3]) -> Option<[f64; 3]> {
     let det = |a: &[[f64; 3]; 3]| dot(a[0], splat4d::math::se3::cross(a[1], a[2]));
     let d = det(&m);
     let scale = m.iter().flatten().fold(0.0f64, |s, v| s.max(v.abs()));
-    if !(d.abs() > 1e-9 * scale.powi(3)) {
+    if d.is_nan() || d.abs() <= 1e-9 * scale.powi(3) {
         return None;
     }
     Some(std::array::from_fn(|k| {

@@ -1,5 +1,6 @@
 //! Names and files: which pictures lie in a folder, and what a picture's name says about camera and frame number.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 /// Endings of pictures that can be decoded.
@@ -29,4 +30,80 @@ pub(super) fn trailing_number(name: &str) -> Option<usize> {
     let stem = name.rsplit_once('.').map_or(name, |(stem, _)| stem);
     let digits = stem.len() - stem.trim_end_matches(|c: char| c.is_ascii_digit()).len();
     stem[stem.len() - digits..].parse().ok()
+}
+
+/// What the names of all pictures say together.
+pub(super) struct Naming {
+    /// Camera names, sorted.
+    pub cameras: Vec<String>,
+    /// For each picture its camera and its frame number, counted from the smallest.
+    pub frames: Vec<(usize, usize)>,
+    /// Whether the names tell cameras apart (`cam/frame`, `cam_frameN`), or all belong to one.
+    pub told: bool,
+}
+
+/// Folders that hold pictures but name no camera.
+const PLAIN_FOLDERS: &[&str] = &["images", "image", "frames", "rgb", "input", "train", "test", "val", "."];
+
+/// The camera in `cam/frame.png`, `cam/images/frame.png` or `cam_frame12.png`.
+fn camera_of(name: &str) -> Option<&str> {
+    let (folders, file) = name.rsplit_once('/').unwrap_or(("", name));
+    let named = |f: &&str| {
+        // ns-process-data writes reduced copies to images_2, images_4, images_8.
+        let plain = f.strip_prefix("images_").is_some_and(|n| n.parse::<usize>().is_ok());
+        !f.is_empty() && !plain && !PLAIN_FOLDERS.contains(f)
+    };
+    if let Some(folder) = folders.rsplit('/').find(named) {
+        return Some(folder);
+    }
+    let stem = file.rsplit_once('.').map_or(file, |(stem, _)| stem);
+    let (camera, number) = stem.rsplit_once("_frame").or_else(|| stem.rsplit_once("-frame"))?;
+    let number = number.trim_start_matches(['_', '-']);
+    (!camera.is_empty() && !number.is_empty() && number.bytes().all(|b| b.is_ascii_digit())).then_some(camera)
+}
+
+/// Finds cameras and frame numbers in picture names. Where names carry no usable numbers, their order counts.
+pub(super) fn naming(names: &[&str]) -> Naming {
+    let told = !names.is_empty() && names.iter().all(|n| camera_of(n).is_some());
+    let camera = |n: &str| if told { camera_of(n).unwrap_or_default().to_string() } else { "moving".to_string() };
+    let mut groups: BTreeMap<String, Vec<usize>> = BTreeMap::new();
+    for (i, name) in names.iter().enumerate() {
+        groups.entry(camera(name)).or_default().push(i);
+    }
+    let numbers: Vec<Option<usize>> = names.iter().map(|n| trailing_number(n)).collect();
+    let distinct = groups.values().all(|members| {
+        let found: BTreeSet<usize> = members.iter().filter_map(|&i| numbers[i]).collect();
+        found.len() == members.len()
+    });
+    let first = numbers.iter().flatten().min().copied().unwrap_or(0);
+    let mut frames = vec![(0, 0); names.len()];
+    for (c, members) in groups.values().enumerate() {
+        let mut ordered = members.clone();
+        ordered.sort_by_key(|&i| names[i]);
+        for (rank, i) in ordered.into_iter().enumerate() {
+            frames[i] = (c, numbers[i].filter(|_| distinct).map_or(rank, |n| n - first));
+        }
+    }
+    Naming { cameras: groups.into_keys().collect(), frames, told }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_tell_cameras_and_frames() {
+        let n = naming(&["cam02/0007.png", "images/cam01/0005.jpg", "cam01/images/0006.png"]);
+        assert_eq!((n.cameras.as_slice(), n.told), (&["cam01".to_string(), "cam02".into()][..], true));
+        assert_eq!(n.frames, [(1, 2), (0, 0), (0, 1)]);
+        let n = naming(&["cam01_frame000003.jpg", "cam02_frame_000004.jpg"]);
+        assert_eq!(
+            (n.cameras.as_slice(), n.frames),
+            (&["cam01".to_string(), "cam02".into()][..], vec![(0, 0), (1, 1)])
+        );
+        let n = naming(&["images/IMG_12.jpg", "images/IMG_10.jpg"]);
+        assert_eq!((n.cameras.len(), n.told, n.frames), (1, false, vec![(0, 2), (0, 0)]));
+        let n = naming(&["b.png", "a.png"]);
+        assert_eq!(n.frames, [(0, 1), (0, 0)]);
+    }
 }

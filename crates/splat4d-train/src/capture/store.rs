@@ -29,7 +29,7 @@ pub struct Picture {
 }
 
 /// A loaded picture as it is kept: planes of 8 or 16 bits.
-#[derive(Debug, PartialEq)]
+#[derive(PartialEq)]
 pub struct StoredPicture {
     width: usize,
     height: usize,
@@ -88,6 +88,20 @@ impl StoredPicture {
             self.weights_into(weights.as_deref(), &mut out).then_some(out)
         };
         Picture { color, mask: plane(&self.mask), valid: plane(&self.valid) }
+    }
+}
+
+impl std::fmt::Debug for StoredPicture {
+    /// Size and kind; millions of samples help nobody.
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let (mask, valid) = (self.mask.is_some(), self.valid.is_some());
+        write!(
+            f,
+            "StoredPicture {{ {}x{}, {} bytes, mask: {mask}, valid: {valid} }}",
+            self.width,
+            self.height,
+            self.bytes()
+        )
     }
 }
 

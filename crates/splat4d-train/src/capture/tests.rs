@@ -1,1 +1,7 @@
-use super::*;
+//! Every reader on a made-up sample that the test writes; bad input; mutated files.
+
+mod bad_input;
+mod layouts;
+mod mutants;
+mod pictures;
+mod samples;

@@ -1,0 +1,189 @@
+//! COLMAP reconstructions: `sparse/0/{cameras,images,points3D}.{bin,txt}` and the pictures in `images/`.
+//!
+//! COLMAP knows no time. Picture names `cam/frame` or `cam_frameN` give camera and frame number; where each camera has
+//! only one registered picture, the other pictures of that camera on disk share its pose: the usual way to calibrate a
+//! fixed rig is to reconstruct one instant.
+
+use super::colmap_files::{self, Point, Registered};
+use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Split, Take, rig};
+use splat4d::math::{Se3, quat};
+use splat4d::scene::Camera;
+use splat4d::scene::time::DEFAULT_FPS;
+use splat4d::{Error, Result};
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+/// Below this part of registered pictures the reconstruction is probably incomplete, and below the second broken.
+const FEW_REGISTERED: [f64; 2] = [0.9, 0.7];
+/// Mean reprojection error above which poses blur the result, pixels.
+const LARGE_ERROR: f64 = 1.5;
+
+/// Reads the reconstruction below `marker` (the folder `sparse`) with the most pictures.
+pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
+    let fps = options.fps.unwrap_or(DEFAULT_FPS);
+    let mut warnings = Vec::new();
+    let (folder, registered) = best_model(marker, &mut warnings)?;
+    let optics = colmap_files::cameras(&folder)?;
+    let points = colmap_files::points(&folder)?;
+    let base = image_folder(root, &registered);
+    let mut shots = Vec::new();
+    for picture in &registered {
+        let place = |e: Error| e.at(format!("{}: picture {:.200}", folder.display(), picture.name));
+        let camera = optics.get(&picture.camera).ok_or_else(|| {
+            place(Error::input(format!("its camera {} is not in the cameras file", picture.camera)))
+                .remedy("Export the reconstruction again.")
+        })?;
+        let cam_from_world = pose_of(picture).map_err(place)?;
+        let source = Camera {
+            cam_from_world,
+            intrinsics: camera.intrinsics,
+            lens: camera.lens,
+            width: camera.width,
+            height: camera.height,
+        };
+        shots.push((picture.name.clone(), source));
+    }
+    let listed = shots.len();
+    add_siblings(&base, &mut shots);
+    if shots.len() == listed {
+        check_registration(&base, &registered, &mut warnings);
+    }
+    check_errors(&points, &mut warnings);
+    let names: Vec<&str> = shots.iter().map(|(name, _)| name.as_str()).collect();
+    let naming = rig::naming(&names);
+    let mut frames: Vec<RawFrame> = shots
+        .iter()
+        .zip(&naming.frames)
+        .map(|((name, source), &(camera, index))| RawFrame {
+            camera,
+            source: source.clone(),
+            time: index as f64 / fps,
+            index,
+            image: base.join(name),
+            mask: mask_of(root, name),
+            split: Split::Train,
+        })
+        .collect();
+    frames.sort_by(|a, b| (a.camera, a.index, &a.image).cmp(&(b.camera, b.index, &b.image)));
+    Ok(Take {
+        name: None,
+        root: root.to_path_buf(),
+        kind: CaptureKind::Colmap,
+        cameras: naming.cameras,
+        frames,
+        named: naming.told,
+        hold_out: None,
+        fps,
+        points: cloud(&points),
+        background: None,
+        up: None,
+        warnings,
+    })
+}
+
+/// The model folder (`sparse` itself or a numbered one in it) with the most registered pictures.
+fn best_model(sparse: &Path, warnings: &mut Vec<String>) -> Result<(PathBuf, Vec<Registered>)> {
+    let mut candidates = vec![sparse.to_path_buf()];
+    candidates.extend(rig::file_names(sparse).iter().filter(|n| n.parse::<u32>().is_ok()).map(|n| sparse.join(n)));
+    candidates.retain(|c| ["cameras.bin", "cameras.txt"].iter().any(|n| c.join(n).is_file()));
+    let mut models = Vec::new();
+    for folder in candidates {
+        let images = colmap_files::images(&folder)?;
+        models.push((folder, images));
+    }
+    let count = models.len();
+    // The first of equals: `max_by_key` would take the last.
+    let best = models.into_iter().rev().max_by_key(|(_, images)| images.len()).ok_or_else(|| {
+        Error::input("there is no cameras.bin or cameras.txt")
+            .at(sparse.display())
+            .remedy("Point to a finished COLMAP reconstruction (sparse/0).")
+    })?;
+    if count > 1 {
+        warnings.push(format!(
+            "COLMAP split the pictures into {count} separate models; {} is used ({} pictures).",
+            best.0.display(),
+            best.1.len()
+        ));
+    }
+    Ok(best)
+}
+
+fn pose_of(picture: &Registered) -> Result<Se3> {
+    let (unit, length) = quat::normalize(picture.quat);
+    if !(length.is_finite() && length > 1e-6) || picture.translation.iter().any(|v| !v.is_finite()) {
+        return Err(Error::input("the pose holds NaN, infinity or a zero quaternion")
+            .remedy("Reconstruct again, or remove that picture."));
+    }
+    Ok(Se3 { rotation: quat::to_rotation(unit), translation: picture.translation })
+}
+
+/// `images/`, unless the pictures lie elsewhere.
+fn image_folder(root: &Path, registered: &[Registered]) -> PathBuf {
+    let Some(first) = registered.first() else { return root.join("images") };
+    let folders = ["images", "input", "."].map(|f| root.join(f));
+    let found = folders.iter().find(|f| f.join(&first.name).is_file());
+    found.unwrap_or(&folders[0]).clone()
+}
+
+/// Where every camera has exactly one registered picture, adds the other pictures of its folder (or, for `cam_frameN`,
+/// of its prefix).
+fn add_siblings(base: &Path, shots: &mut Vec<(String, Camera)>) {
+    let names: Vec<&str> = shots.iter().map(|(n, _)| n.as_str()).collect();
+    let naming = rig::naming(&names);
+    if !naming.told || naming.cameras.len() != shots.len() {
+        return;
+    }
+    let mut listings: BTreeMap<String, Vec<String>> = BTreeMap::new();
+    let registered = shots.clone();
+    for (i, (name, source)) in registered.iter().enumerate() {
+        let folder = name.rsplit_once('/').map_or("", |(folder, _)| folder);
+        let listing = listings.entry(folder.to_string()).or_insert_with(|| rig::image_names(&base.join(folder)));
+        let camera = &naming.cameras[naming.frames[i].0];
+        for file in listing {
+            let path = if folder.is_empty() { file.clone() } else { format!("{folder}/{file}") };
+            let same = rig::naming(&[&path]);
+            if path != *name && same.told && same.cameras[0] == *camera {
+                shots.push((path, source.clone()));
+            }
+        }
+    }
+}
+
+/// Warns where pictures on disk were not registered.
+fn check_registration(base: &Path, registered: &[Registered], warnings: &mut Vec<String>) {
+    let folders: BTreeSet<&str> = registered.iter().map(|r| r.name.rsplit_once('/').map_or("", |(f, _)| f)).collect();
+    let on_disk: usize = folders.iter().map(|f| rig::image_names(&base.join(f)).len()).sum();
+    let part = registered.len() as f64 / on_disk.max(1) as f64;
+    if part >= FEW_REGISTERED[0] {
+        return;
+    }
+    let advice =
+        if part < FEW_REGISTERED[1] { "the reconstruction is probably broken" } else { "parts may be missing" };
+    warnings.push(format!("COLMAP registered only {} of {on_disk} pictures: {advice}.", registered.len()));
+}
+
+fn check_errors(points: &[Point], warnings: &mut Vec<String>) {
+    let errors: Vec<f64> = points.iter().map(|p| p.error).filter(|e| e.is_finite() && *e >= 0.0).collect();
+    let mean = errors.iter().sum::<f64>() / errors.len().max(1) as f64;
+    if mean > LARGE_ERROR {
+        warnings
+            .push(format!("COLMAP's mean reprojection error is {mean:.2} px: poses are inexact, results will blur."));
+    }
+}
+
+fn cloud(points: &[Point]) -> Option<PointCloud> {
+    let mut cloud = PointCloud::default();
+    for point in points.iter().filter(|p| p.position.iter().all(|v| v.is_finite())) {
+        cloud.points.push(point.position);
+        cloud.colors.push(point.color.map(|v| f32::from(v) / 255.0));
+        cloud.times.push(None);
+    }
+    (!cloud.points.is_empty()).then_some(cloud)
+}
+
+/// `masks/name.jpg.png` (COLMAP's habit) or `masks/name.png`.
+fn mask_of(root: &Path, name: &str) -> Option<PathBuf> {
+    let masks = root.join("masks");
+    let appended = masks.join(format!("{name}.png"));
+    [appended, masks.join(name).with_extension("png")].into_iter().find(|p| p.is_file())
+}

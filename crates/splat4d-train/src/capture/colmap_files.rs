@@ -1,0 +1,328 @@
+//! COLMAP's three files, binary and text. Counts are compared with the file's length before anything is reserved.
+
+use splat4d::scene::{Intrinsics, Lens};
+use splat4d::{Error, ErrorKind, Result};
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use super::json::read_bytes;
+
+/// A camera's intrinsics.
+#[derive(Clone, Debug)]
+pub(super) struct Optics {
+    /// Focal lengths and principal point.
+    pub intrinsics: Intrinsics,
+    /// Distortion.
+    pub lens: Lens,
+    /// Pixels across.
+    pub width: usize,
+    /// Pixels down.
+    pub height: usize,
+}
+
+/// A registered picture.
+#[derive(Clone, Debug)]
+pub(super) struct Registered {
+    /// Rotation world to camera as a quaternion wxyz.
+    pub quat: [f64; 4],
+    /// Translation world to camera.
+    pub translation: [f64; 3],
+    /// Key of its [`Optics`].
+    pub camera: u32,
+    /// Path below `images/`.
+    pub name: String,
+}
+
+/// A triangulated point.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Point {
+    /// World position.
+    pub position: [f64; 3],
+    /// sRGB, 0 to 255.
+    pub color: [u8; 3],
+    /// Mean reprojection error, pixels.
+    pub error: f64,
+}
+
+/// The models of COLMAP's `sensor/models.h`: name and number of parameters, by id.
+const MODELS: [(&str, usize); 11] = [
+    ("SIMPLE_PINHOLE", 3),
+    ("PINHOLE", 4),
+    ("SIMPLE_RADIAL", 4),
+    ("RADIAL", 5),
+    ("OPENCV", 8),
+    ("OPENCV_FISHEYE", 8),
+    ("FULL_OPENCV", 12),
+    ("FOV", 5),
+    ("SIMPLE_RADIAL_FISHEYE", 4),
+    ("RADIAL_FISHEYE", 5),
+    ("THIN_PRISM_FISHEYE", 12),
+];
+
+/// Least bytes of one entry in a binary file: camera (id, model, size, 3 parameters), image (id, pose, camera, empty
+/// name, count), point (id, position, colour, error, track length).
+const LEAST: [usize; 3] = [4 + 4 + 16 + 24, 4 + 56 + 4 + 1 + 8, 8 + 24 + 3 + 8 + 8];
+/// Longest picture name.
+const MAX_NAME: usize = 4096;
+
+fn truncated() -> Error {
+    Error::input("the file is truncated")
+}
+
+/// Little-endian reader that cannot run over the end.
+struct Cursor<'a>(&'a [u8]);
+
+impl<'a> Cursor<'a> {
+    fn take(&mut self, n: usize) -> Result<&'a [u8]> {
+        let (head, tail) = self.0.split_at_checked(n).ok_or_else(truncated)?;
+        self.0 = tail;
+        Ok(head)
+    }
+
+    fn array<const N: usize>(&mut self) -> Result<[u8; N]> {
+        self.take(N)?.try_into().map_err(|_| truncated())
+    }
+
+    fn u32(&mut self) -> Result<u32> {
+        Ok(u32::from_le_bytes(self.array()?))
+    }
+
+    fn u64(&mut self) -> Result<u64> {
+        Ok(u64::from_le_bytes(self.array()?))
+    }
+
+    fn f64s<const N: usize>(&mut self) -> Result<[f64; N]> {
+        let mut out = [0.0; N];
+        for slot in &mut out {
+            *slot = f64::from_le_bytes(self.array()?);
+        }
+        Ok(out)
+    }
+
+    /// Passes over `count` records of `size` bytes.
+    fn skip(&mut self, count: u64, size: usize) -> Result<()> {
+        let bytes = usize::try_from(count).ok().and_then(|n| n.checked_mul(size)).ok_or_else(truncated)?;
+        self.take(bytes).map(|_| ())
+    }
+
+    /// The number of entries at the start, checked against what the file can hold.
+    fn count(&mut self, least: usize) -> Result<u64> {
+        let count = self.u64()?;
+        let most = (self.0.len() / least) as u64;
+        if count > most {
+            let what = format!("the header claims {count} entries, but the file can hold {most}: it is truncated");
+            return Err(Error::input(what));
+        }
+        Ok(count)
+    }
+}
+
+fn optics(id: u32, model: usize, size: [u64; 2], p: &[f64]) -> Result<Optics> {
+    let named = |e: Error| e.at(format!("camera {id}"));
+    let (name, _) = MODELS[model];
+    let brown = |k: [f64; 6], p: [f64; 2]| Lens::Brown { k, p, s: [0.0; 4] };
+    let single = |lens: Lens| (Intrinsics { fx: p[0], fy: p[0], cx: p[1], cy: p[2] }, lens);
+    let double = |lens: Lens| (Intrinsics { fx: p[0], fy: p[1], cx: p[2], cy: p[3] }, lens);
+    let (intrinsics, lens) = match name {
+        "SIMPLE_PINHOLE" => single(Lens::Pinhole),
+        "PINHOLE" => double(Lens::Pinhole),
+        "SIMPLE_RADIAL" => single(brown([p[3], 0.0, 0.0, 0.0, 0.0, 0.0], [0.0; 2])),
+        "RADIAL" => single(brown([p[3], p[4], 0.0, 0.0, 0.0, 0.0], [0.0; 2])),
+        "OPENCV" => double(brown([p[4], p[5], 0.0, 0.0, 0.0, 0.0], [p[6], p[7]])),
+        "FULL_OPENCV" => double(brown([p[4], p[5], p[8], p[9], p[10], p[11]], [p[6], p[7]])),
+        "OPENCV_FISHEYE" => double(Lens::Fisheye { k: [p[4], p[5], p[6], p[7]] }),
+        "SIMPLE_RADIAL_FISHEYE" => single(Lens::Fisheye { k: [p[3], 0.0, 0.0, 0.0] }),
+        "RADIAL_FISHEYE" => single(Lens::Fisheye { k: [p[3], p[4], 0.0, 0.0] }),
+        other => {
+            return Err(named(
+                Error::new(ErrorKind::Unsupported, format!("the camera model {other} is not read"))
+                    .remedy("Undistort with `colmap image_undistorter`, or reconstruct with OPENCV or OPENCV_FISHEYE."),
+            ));
+        }
+    };
+    if p.iter().any(|v| !v.is_finite()) {
+        return Err(named(Error::input("a parameter is NaN or infinite").remedy("Reconstruct that camera again.")));
+    }
+    // A lens without any terms is a pinhole, which needs no resampling.
+    let lens = match lens {
+        Lens::Brown { k, p, .. } if k == [0.0; 6] && p == [0.0; 2] => Lens::Pinhole,
+        lens => lens,
+    };
+    let side = |v: u64| usize::try_from(v).unwrap_or(usize::MAX);
+    let (width, height) = (side(size[0]), side(size[1]));
+    super::pose::check_intrinsics(&intrinsics, width, height).map_err(named)?;
+    Ok(Optics { intrinsics, lens, width, height })
+}
+
+/// Reads `cameras.bin` or `cameras.txt`.
+pub(super) fn cameras(folder: &Path) -> Result<BTreeMap<u32, Optics>> {
+    load(folder, "cameras", cameras_bin, cameras_txt)
+}
+
+/// Reads `images.bin` or `images.txt`.
+pub(super) fn images(folder: &Path) -> Result<Vec<Registered>> {
+    load(folder, "images", images_bin, images_txt)
+}
+
+/// Reads `points3D.bin` or `points3D.txt`; an empty list where neither exists.
+pub(super) fn points(folder: &Path) -> Result<Vec<Point>> {
+    let there = ["points3D.bin", "points3D.txt"].iter().any(|n| folder.join(n).is_file());
+    if there { load(folder, "points3D", points_bin, points_txt) } else { Ok(Vec::new()) }
+}
+
+fn load<T>(folder: &Path, stem: &str, bin: fn(&[u8]) -> Result<T>, txt: fn(&str) -> Result<T>) -> Result<T> {
+    let (binary, text) = (folder.join(format!("{stem}.bin")), folder.join(format!("{stem}.txt")));
+    let path = if binary.is_file() { &binary } else { &text };
+    let bytes = read_bytes(path)?;
+    let read = if path == &binary {
+        bin(&bytes)
+    } else {
+        std::str::from_utf8(&bytes).map_err(|_| Error::input("the file is no text")).and_then(txt)
+    };
+    read.map_err(|e| e.at(path.display()).remedy("Export the reconstruction again (colmap model_converter)."))
+}
+
+fn cameras_bin(bytes: &[u8]) -> Result<BTreeMap<u32, Optics>> {
+    let mut cursor = Cursor(bytes);
+    let mut cameras = BTreeMap::new();
+    for _ in 0..cursor.count(LEAST[0])? {
+        let (id, model) = (cursor.u32()?, cursor.u32()? as usize);
+        let size = [cursor.u64()?, cursor.u64()?];
+        let (_, count) =
+            *MODELS.get(model).ok_or_else(|| Error::input(format!("camera {id} has no known model ({model})")))?;
+        let parameters = (0..count).map(|_| Ok(cursor.f64s::<1>()?[0])).collect::<Result<Vec<f64>>>()?;
+        cameras.insert(id, optics(id, model, size, &parameters)?);
+    }
+    Ok(cameras)
+}
+
+fn images_bin(bytes: &[u8]) -> Result<Vec<Registered>> {
+    let mut cursor = Cursor(bytes);
+    let mut images = Vec::new();
+    for _ in 0..cursor.count(LEAST[1])? {
+        cursor.u32()?;
+        let (quat, translation, camera) = (cursor.f64s()?, cursor.f64s()?, cursor.u32()?);
+        let end = cursor.0.iter().take(MAX_NAME).position(|&b| b == 0).ok_or_else(truncated)?;
+        let name = String::from_utf8_lossy(cursor.take(end)?).into_owned();
+        cursor.take(1)?;
+        let points = cursor.u64()?;
+        cursor.skip(points, 24)?;
+        images.push(Registered { quat, translation, camera, name });
+    }
+    Ok(images)
+}
+
+fn points_bin(bytes: &[u8]) -> Result<Vec<Point>> {
+    let mut cursor = Cursor(bytes);
+    let mut points = Vec::new();
+    for _ in 0..cursor.count(LEAST[2])? {
+        cursor.u64()?;
+        let (position, color) = (cursor.f64s()?, cursor.array()?);
+        let [error] = cursor.f64s()?;
+        let track = cursor.u64()?;
+        cursor.skip(track, 8)?;
+        points.push(Point { position, color, error });
+    }
+    Ok(points)
+}
+
+/// Numbered lines that are no comments.
+fn lines(text: &str) -> impl Iterator<Item = (usize, &str)> {
+    text.lines().enumerate().map(|(i, l)| (i + 1, l.trim())).filter(|(_, l)| !l.starts_with('#'))
+}
+
+fn word<'a, T: std::str::FromStr>(words: &mut impl Iterator<Item = &'a str>, line: usize, what: &str) -> Result<T> {
+    let text = words.next().ok_or_else(|| Error::input(format!("line {line} ends before the {what}")))?;
+    text.parse().map_err(|_| Error::input(format!("line {line}: \"{text:.40}\" is no {what}")))
+}
+
+fn numbers<'a, const N: usize>(words: &mut impl Iterator<Item = &'a str>, line: usize, what: &str) -> Result<[f64; N]> {
+    let mut out = [0.0; N];
+    for slot in &mut out {
+        *slot = word(words, line, what)?;
+    }
+    Ok(out)
+}
+
+fn cameras_txt(text: &str) -> Result<BTreeMap<u32, Optics>> {
+    let mut cameras = BTreeMap::new();
+    for (line, text) in lines(text).filter(|(_, l)| !l.is_empty()) {
+        let mut words = text.split_ascii_whitespace();
+        let id = word(&mut words, line, "camera id")?;
+        let model: String = word(&mut words, line, "camera model")?;
+        let known = MODELS.iter().position(|(name, _)| *name == model);
+        let model =
+            known.ok_or_else(|| Error::input(format!("line {line}: the camera model {model:.40} is not known")))?;
+        let size = [word(&mut words, line, "width")?, word(&mut words, line, "height")?];
+        let parameters =
+            (0..MODELS[model].1).map(|_| word(&mut words, line, "camera parameter")).collect::<Result<Vec<_>>>()?;
+        cameras.insert(id, optics(id, model, size, &parameters)?);
+    }
+    Ok(cameras)
+}
+
+fn images_txt(text: &str) -> Result<Vec<Registered>> {
+    let mut images = Vec::new();
+    let mut lines = lines(text);
+    while let Some((line, text)) = lines.next() {
+        if text.is_empty() {
+            continue;
+        }
+        let mut words = text.splitn(10, [' ', '\t']);
+        word::<u32>(&mut words, line, "image id")?;
+        let (quat, translation) = (numbers(&mut words, line, "quaternion")?, numbers(&mut words, line, "translation")?);
+        let camera = word(&mut words, line, "camera id")?;
+        let name: String = word(&mut words, line, "picture name")?;
+        images.push(Registered { quat, translation, camera, name: name.trim().to_string() });
+        // The picture's 2D points follow on a line of their own, which may be empty.
+        lines.next();
+    }
+    Ok(images)
+}
+
+fn points_txt(text: &str) -> Result<Vec<Point>> {
+    let mut points = Vec::new();
+    for (line, text) in lines(text).filter(|(_, l)| !l.is_empty()) {
+        let mut words = text.split_ascii_whitespace();
+        word::<u64>(&mut words, line, "point id")?;
+        let position = numbers(&mut words, line, "position")?;
+        let color = numbers::<3>(&mut words, line, "colour")?.map(|v| v.clamp(0.0, 255.0) as u8);
+        let [error] = numbers(&mut words, line, "reprojection error")?;
+        points.push(Point { position, color, error });
+    }
+    Ok(points)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_common_model_is_read() {
+        let text = "1 SIMPLE_PINHOLE 8 6 5 4 3\n2 PINHOLE 8 6 5 6 4 3\n3 SIMPLE_RADIAL 8 6 5 4 3 .1\n\
+                    4 RADIAL 8 6 5 4 3 .1 .2\n5 OPENCV 8 6 5 6 4 3 .1 .2 .3 .4\n\
+                    6 OPENCV_FISHEYE 8 6 5 6 4 3 .1 .2 .3 .4\n\
+                    7 FULL_OPENCV 8 6 5 6 4 3 .1 .2 .3 .4 .5 .6 .7 .8\n8 SIMPLE_RADIAL_FISHEYE 8 6 5 4 3 .1\n\
+                    9 RADIAL_FISHEYE 8 6 5 4 3 .1 .2\n";
+        let cameras = cameras_txt(text).unwrap();
+        let brown = |k, p| Lens::Brown { k, p, s: [0.0; 4] };
+        let lenses = [
+            Lens::Pinhole,
+            Lens::Pinhole,
+            brown([0.1, 0.0, 0.0, 0.0, 0.0, 0.0], [0.0; 2]),
+            brown([0.1, 0.2, 0.0, 0.0, 0.0, 0.0], [0.0; 2]),
+            brown([0.1, 0.2, 0.0, 0.0, 0.0, 0.0], [0.3, 0.4]),
+            Lens::Fisheye { k: [0.1, 0.2, 0.3, 0.4] },
+            brown([0.1, 0.2, 0.5, 0.6, 0.7, 0.8], [0.3, 0.4]),
+            Lens::Fisheye { k: [0.1, 0.0, 0.0, 0.0] },
+            Lens::Fisheye { k: [0.1, 0.2, 0.0, 0.0] },
+        ];
+        for (camera, lens) in cameras.values().zip(lenses) {
+            assert_eq!(camera.lens, lens);
+            let k = camera.intrinsics;
+            assert!(k.fx == 5.0 && (k.fy == 5.0 || k.fy == 6.0) && k.cx == 4.0 && k.cy == 3.0, "{k:?}");
+        }
+        assert_eq!(cameras.len(), 9);
+        assert!(cameras_txt("1 FOV 8 6 5 6 4 3 .1\n").unwrap_err().to_string().contains("FOV"));
+    }
+}
