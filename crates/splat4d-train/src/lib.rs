@@ -1,3 +1,5 @@
 //! Learns moving Gaussian scenes from posed captures.
 
+pub mod eval;
+pub mod init;
 pub mod loss;

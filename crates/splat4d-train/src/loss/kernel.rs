@@ -13,8 +13,9 @@
 //! ```
 //!
 //! Only the sum of the two variances occurs, so four moments do (x, y, xx+yy, xy), not five. Four rows at a time go
-//! through the stages: products → vertical means → horizontal means and S's derivatives → vertical means → horizontal means and
-//! the gradient. Products and derivatives live in rings of 16 rows, which stay in the second-level cache.
+//! through the stages: products → vertical means → horizontal means and S's derivatives → vertical means → horizontal
+//! means and the gradient. Products and derivatives live in rings of 16 rows, which stay in the second-level cache.
+//! The loops are plain ones over a row, because LLVM vectorises those reliably, and blocks of lanes it does not.
 
 use splat4d::math::Real;
 

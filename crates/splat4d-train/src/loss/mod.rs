@@ -4,6 +4,7 @@
 
 mod kernel;
 pub mod photometric;
+pub mod regular;
 pub mod simd;
 
 pub use photometric::{LossValue, Photometric};

@@ -1,0 +1,3 @@
+//! Measures how good a render is, and writes it down in the files that 3DGS users know.
+
+pub mod metrics;

@@ -1,0 +1,3 @@
+//! Where the first Gaussians come from.
+
+pub mod knn;
