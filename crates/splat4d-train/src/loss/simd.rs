@@ -5,6 +5,7 @@
 #![allow(unsafe_code)]
 
 use super::kernel::{self, Scratch, Strip};
+use crate::eval::conv;
 use splat4d::math::Real;
 /// An instruction set that this CPU is known to have.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -56,4 +57,26 @@ pub(super) fn strip<F: Real>(level: Simd, job: &Strip<'_, F>, scratch: &mut Scra
 #[target_feature(enable = "avx2,fma")]
 fn strip_avx2<F: Real>(job: &Strip<'_, F>, scratch: &mut Scratch<F>, d: &mut [F]) -> [f64; 2] {
     kernel::strip::<F, true>(job, scratch, d)
+}
+
+/// Runs the convolution kernel at this level; see [`conv::row`].
+pub(crate) fn convolve(level: Simd, job: &conv::Row<'_>, out: &mut [f32]) {
+    if !level.fused {
+        return conv::row::<false>(job, out);
+    }
+    #[cfg(target_arch = "x86_64")]
+    {
+        // SAFETY: `Simd::detect` is the only way to a fused level, and it has seen AVX2 and FMA on this CPU.
+        unsafe { convolve_avx2(job, out) }
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    {
+        conv::row::<true>(job, out)
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2,fma")]
+fn convolve_avx2(job: &conv::Row<'_>, out: &mut [f32]) {
+    conv::row::<true>(job, out)
 }
