@@ -7,8 +7,8 @@ use splat4d::scene::Planes;
 
 /// Output channels worked on together: one load of the input serves all of them.
 const OUT_BLOCK: usize = 4;
-/// Columns worked on together: two AVX2 registers.
-const COLUMNS: usize = 16;
+/// Rows are whole AVX2 registers long, so that no loop has a scalar rest.
+const COLUMNS: usize = 8;
 
 /// A square convolution with bias.
 #[derive(Clone, Debug, PartialEq)]
@@ -109,32 +109,49 @@ pub(crate) struct Row<'a> {
 pub(crate) fn row<const FMA: bool>(job: &Row<'_>, out: &mut [f32]) {
     let image = job.image;
     let top = job.y * image.stride;
-    for x in (0..image.row).step_by(COLUMNS) {
-        let mut acc = [[0.0f32; COLUMNS]; OUT_BLOCK];
-        for o in 0..OUT_BLOCK {
-            acc[o] = [job.bias[o]; COLUMNS];
-        }
-        let mut weights = job.weights.chunks_exact(OUT_BLOCK);
-        for c in 0..image.channels {
-            for ky in 0..job.side {
-                let line = (c * image.height + top + ky) * image.stride;
-                for kx in 0..job.side {
-                    let start = (line + kx % image.stride) * image.phase + kx / image.stride + x;
-                    let input = &image.data[start..start + COLUMNS];
-                    let Some(w) = weights.next() else { return };
-                    for o in 0..OUT_BLOCK {
-                        for l in 0..COLUMNS {
-                            acc[o][l] = input[l].fma::<FMA>(w[o], acc[o][l]);
-                        }
-                    }
+    for (out, bias) in out.chunks_exact_mut(image.row).zip(job.bias) {
+        out.fill(bias);
+    }
+    for c in 0..image.channels {
+        for ky in 0..job.side {
+            let line = (c * image.height + top + ky) * image.stride;
+            let weights = &job.weights[(c * job.side + ky) * job.side * OUT_BLOCK..][..job.side * OUT_BLOCK];
+            let weight = |kx: usize| -> [f32; OUT_BLOCK] { std::array::from_fn(|o| weights[kx * OUT_BLOCK + o]) };
+            // Taps a stride apart read neighbours of one remainder: three of them go together.
+            for shift in 0..image.stride.min(job.side) {
+                let input = &image.data[(line + shift) * image.phase..][..image.phase];
+                let mut kx = shift;
+                while kx + 2 * image.stride < job.side {
+                    let w = [weight(kx), weight(kx + image.stride), weight(kx + 2 * image.stride)];
+                    add_taps::<FMA, 3>(&input[kx / image.stride..], &w, image.row, out);
+                    kx += 3 * image.stride;
+                }
+                while kx < job.side {
+                    add_taps::<FMA, 1>(&input[kx / image.stride..], &[weight(kx)], image.row, out);
+                    kx += image.stride;
                 }
             }
         }
-        for o in 0..OUT_BLOCK {
-            for l in 0..COLUMNS {
-                out[o * image.row + x + l] = Real::max(acc[o][l], 0.0);
+    }
+    out.iter_mut().for_each(|x| *x = Real::max(*x, 0.0));
+}
+
+/// Adds `K` neighbouring taps to four rows of outputs.
+#[inline(always)]
+fn add_taps<const FMA: bool, const K: usize>(input: &[f32], w: &[[f32; OUT_BLOCK]; K], row: usize, out: &mut [f32]) {
+    let input = &input[..row + K - 1];
+    let (o0, rest) = out.split_at_mut(row);
+    let (o1, rest) = rest.split_at_mut(row);
+    let (o2, rest) = rest.split_at_mut(row);
+    let o3 = &mut rest[..row];
+    for x in 0..row {
+        let mut acc = [o0[x], o1[x], o2[x], o3[x]];
+        for k in 0..K {
+            for o in 0..OUT_BLOCK {
+                acc[o] = input[x + k].fma::<FMA>(w[k][o], acc[o]);
             }
         }
+        (o0[x], o1[x], o2[x], o3[x]) = (acc[0], acc[1], acc[2], acc[3]);
     }
 }
 

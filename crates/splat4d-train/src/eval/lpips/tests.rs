@@ -16,8 +16,10 @@ fn weights(net: Net) -> Tensors {
     for layer in net.layers() {
         match *layer {
             Layer::Conv(i, _, [inputs, outputs, side, ..]) => {
-                let spread = (2.0 / (inputs * side * side) as f64).sqrt();
-                add(format!("features.{i}.weight"), vec![outputs, inputs, side, side], &|r, k| r.normal(k) * spread);
+                let spread = (24.0 / (inputs * side * side) as f64).sqrt();
+                add(format!("features.{i}.weight"), vec![outputs, inputs, side, side], &|r, k| {
+                    (r.uniform(k) - 0.5) * spread
+                });
                 add(format!("features.{i}.bias"), vec![outputs], &|r, k| 0.1 * r.normal(k));
                 channels = outputs;
             }
