@@ -104,7 +104,7 @@ pub(crate) struct Row<'a> {
     y: usize,
 }
 
-/// Convolves one row of four output channels and clamps at zero; `out` is [4, row].
+/// Convolves one row of four output channels and clamps at zero; `out` is `[4, row]`.
 #[inline(always)]
 pub(crate) fn row<const FMA: bool>(job: &Row<'_>, out: &mut [f32]) {
     let image = job.image;

@@ -5,7 +5,7 @@
 //! | name | shape |
 //! |---|---|
 //! | `features.{i}.weight`, `features.{i}.bias` | as torchvision's AlexNet or VGG16 (i: see below) |
-//! | `lin{l}.model.1.weight`, l = 0..4 | [1, channels, 1, 1], as the PyPI package `lpips` stores them |
+//! | `lin{l}.model.1.weight`, l = 0..4 | `[1, channels, 1, 1]`, as the PyPI package `lpips` stores them |
 //!
 //! AlexNet has convolutions at i = 0, 3, 6, 8, 10, VGG16 at 0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28. The names
 //! of the `lpips` package's own state (`net.slice1.0.weight` …) are understood too. Which network it is shows in the
@@ -18,7 +18,7 @@ use splat4d::math::Real;
 use splat4d::scene::Planes;
 use splat4d::{Error, Result};
 
-/// Mean and spread of ImageNet colours for inputs in [−1,1] (`lpips` `ScalingLayer`).
+/// Mean and spread of ImageNet colours for inputs in `[−1,1]` (`lpips` `ScalingLayer`).
 const SHIFT: [f32; 3] = [-0.030, -0.088, -0.188];
 const SCALE: [f32; 3] = [0.458, 0.448, 0.450];
 /// Keeps the norm of a feature that is all zero from dividing by zero (`lpips` `normalize_tensor`).
@@ -36,10 +36,10 @@ pub enum Net {
     Vgg,
 }
 
-/// How values in [0,1] enter the network.
+/// How values in `[0,1]` enter the network.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum InputScaling {
-    /// Mapped to [−1,1] first, as the `lpips` package asks for.
+    /// Mapped to `[−1,1]` first, as the `lpips` package asks for.
     Signed,
     /// As they are, as the Inria 3DGS evaluation script does.
     Unit,
@@ -203,9 +203,9 @@ impl Lpips {
         self.net
     }
 
-    /// The distance, ≥ 0 for the published weights, 0 for equal images; values are clamped to [0,1] first.
+    /// The distance, ≥ 0 for the published weights, 0 for equal images; values are clamped to `[0,1]` first.
     ///
-    /// Shapes: [3,H,W] both. `None` where the image is too small for the network's pooling.
+    /// Shapes: `[3,H,W]` both. `None` where the image is too small for the network's pooling.
     /// Panics: shapes differ, or there are not three channels.
     pub fn distance(&self, render: &Planes<f32>, truth: &Planes<f32>, scaling: InputScaling) -> Option<f64> {
         assert_eq!(

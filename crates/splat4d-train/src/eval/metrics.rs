@@ -1,6 +1,6 @@
 //! Image metrics that need no learnt weights.
 //!
-//! Every metric sees values clamped to [0,1] and not rounded to 8 bits; a metric that is not defined for an image is
+//! Every metric sees values clamped to `[0,1]` and not rounded to 8 bits; a metric that is not defined for an image is
 //! `None`, never a made-up number. All sums run in a fixed order in f64.
 
 use crate::loss::Photometric;
@@ -18,7 +18,7 @@ const TAPS: usize = 11;
 const SIGMA: f64 = 1.5;
 const C1: f64 = 1e-4;
 const C2: f64 = 9e-4;
-/// 8-bit steps in [0,1]: flicker is told in these.
+/// 8-bit steps in `[0,1]`: flicker is told in these.
 const LEVELS: f64 = 255.0;
 
 fn assert_same(render: &Planes<f32>, truth: &Planes<f32>) {
@@ -31,14 +31,14 @@ fn assert_same(render: &Planes<f32>, truth: &Planes<f32>) {
 
 /// −10 log₁₀ of the mean squared error in dB; infinite for equal images, `None` for one without pixels.
 ///
-/// Shapes: [C,H,W] both. Panics: shapes differ.
+/// Shapes: `[C,H,W]` both. Panics: shapes differ.
 pub fn psnr(render: &Planes<f32>, truth: &Planes<f32>) -> Option<f64> {
     psnr_where(render, truth, |_| true)
 }
 
 /// [`psnr`] over the pixels p (row-major) with `region[p]`; `None` where there are none.
 ///
-/// Panics: shapes differ, or the region is not [H·W].
+/// Panics: shapes differ, or the region is not `[H·W]`.
 pub fn psnr_region(render: &Planes<f32>, truth: &Planes<f32>, region: &[bool]) -> Option<f64> {
     assert_eq!(region.len(), render.pixels(), "a region holds one value a pixel");
     psnr_where(render, truth, |p| region[p])
@@ -200,7 +200,7 @@ impl TemporalMean {
     }
 }
 
-/// The pixels that move: [H·W], true where any channel is more than [`DYNAMIC_THRESHOLD`] from the temporal mean.
+/// The pixels that move: `[H·W]`, true where any channel is more than [`DYNAMIC_THRESHOLD`] from the temporal mean.
 ///
 /// Only a fixed camera has a temporal mean. Panics: sizes differ.
 pub fn dynamic_region(truth: &Planes<f32>, temporal_mean: &Planes<f32>) -> Vec<bool> {
@@ -257,7 +257,7 @@ impl Flicker {
 const RAMP: [[f32; 3]; 5] =
     [[0.0, 0.0, 0.02], [0.26, 0.06, 0.42], [0.71, 0.20, 0.36], [0.98, 0.57, 0.16], [1.0, 1.0, 0.78]];
 
-/// The mean |render − truth| over channels as a colour picture [3,H,W]; an error of `full` and above is the last colour.
+/// The mean |render − truth| over channels as a colour picture `[3,H,W]`; errors from `full` on are the last colour.
 ///
 /// Panics: shapes differ, or `full` is not above 0.
 pub fn error_map(render: &Planes<f32>, truth: &Planes<f32>, full: f32) -> Planes<f32> {

@@ -16,9 +16,9 @@ use splat4d::scene::Planes;
 /// What is known about a view besides its two images.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct ViewContext<'a> {
-    /// The pixels [H·W] that a mask calls foreground; `None` where the capture has no masks.
+    /// The pixels `[H·W]` that a mask calls foreground; `None` where the capture has no masks.
     pub foreground: Option<&'a [bool]>,
-    /// The pixels [H·W] that move ([`metrics::dynamic_region`]); `None` where the camera is not fixed.
+    /// The pixels `[H·W]` that move ([`metrics::dynamic_region`]); `None` where the camera is not fixed.
     pub dynamic: Option<&'a [bool]>,
     /// A network, and how images enter it; `None` where the user named no weights.
     pub lpips: Option<(&'a Lpips, InputScaling)>,
@@ -27,7 +27,7 @@ pub struct ViewContext<'a> {
 /// All metrics of one view.
 ///
 /// Keys: `PSNR`, `SSIM`, `MS-SSIM`, `D-SSIM`, `PSNR-dynamic`, with masks `PSNR-foreground`, with a network `LPIPS-alex`
-/// or `LPIPS-vgg` (with ` (input 0..1)` behind it for [`InputScaling::Unit`]). Shapes: [3,H,W] both; the name is the
+/// or `LPIPS-vgg` (with ` (input 0..1)` behind it for [`InputScaling::Unit`]). Shapes: `[3,H,W]` both; the name is the
 /// image's file name. Panics: shapes differ.
 pub fn score_view(name: &str, render: &Planes<f32>, truth: &Planes<f32>, context: &ViewContext<'_>) -> View {
     let mut view = View::new(name);

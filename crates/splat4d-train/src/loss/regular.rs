@@ -8,7 +8,7 @@ use splat4d::scene::{Planes, Rows, Table};
 
 /// λ · mean_j(o_j · σ_j): makes Gaussians that live long pay for being opaque, which removes blockers early on.
 ///
-/// Shapes: `logits` any table whose column `column` is the opacity logit (o = sigmoid); `life` the value σ ∈ [0,1] of
+/// Shapes: `logits` any table whose column `column` is the opacity logit (o = sigmoid); `life` the value σ ∈ `[0,1]` of
 /// the life envelope of row `rows.id(j)` (unitless); the mean is over the listed rows. The gradient goes to o alone: σ
 /// is a constant here. Adds to `d` (the shape of `logits`). Panics: `life` is not as long as `rows`.
 /// Source: the 4D regularisation of FreeTimeGS 2025 (λ = 1e-2 there).
@@ -76,7 +76,7 @@ pub fn scale<F: Real>(lambda: f64, log_scales: &Table<F>, column: usize, d: &mut
 
 /// λ · mean over rows and neighbours of ‖v_i − v_j‖²: neighbours move alike.
 ///
-/// Shapes: `velocities` any table whose columns `column..column+3` are v (scene units a second); `neighbours` [N,k]
+/// Shapes: `velocities` any table whose columns `column..column+3` are v (scene units a second); `neighbours` `[N,k]`
 /// row-major row numbers, as [`crate::init::knn::knn`] makes them. Adds to `d` at both ends of a pair.
 /// Panics: `neighbours` is not a whole number of rows or names a row that does not exist.
 /// Source: the rigidity and momentum priors of Luiten 2024 §3.3, in their simplest, translation-only form.
@@ -114,7 +114,7 @@ pub fn velocity_smoothness<F: Real>(
 
 /// λ · mean |A − M| over pixels: the render covers the mask and nothing else.
 ///
-/// Shapes: `alpha` [1,H,W] the render's coverage 1 − T; `mask` [1,H,W] in [0,1]; adds to `d_alpha` [1,H,W].
+/// Shapes: `alpha` `[1,H,W]` the render's coverage 1 − T; `mask` `[1,H,W]` in `[0,1]`; adds to `d_alpha` `[1,H,W]`.
 /// Panics: sizes differ. Source: the usual silhouette term.
 pub fn alpha_mask<F: Real>(lambda: f64, alpha: &Planes<F>, mask: &Planes<F>, d_alpha: &mut Planes<F>) -> f64 {
     let size = |p: &Planes<F>| (p.channels, p.height, p.width);
