@@ -4,6 +4,7 @@
 
 pub mod capture;
 pub mod densify;
+pub mod eval;
 pub mod event;
 pub mod init;
 pub mod loss;

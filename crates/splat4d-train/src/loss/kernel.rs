@@ -13,8 +13,9 @@
 //! ```
 //!
 //! Only the sum of the two variances occurs, so four moments do (x, y, xx+yy, xy), not five. Four rows at a time go
-//! through the stages: products → vertical means → horizontal means and S's derivatives → vertical means → horizontal means and
-//! the gradient. Products and derivatives live in rings of 16 rows, which stay in the second-level cache.
+//! through the stages: products → vertical means → horizontal means and S's derivatives → vertical means → horizontal
+//! means and the gradient. Products and derivatives live in rings of 16 rows, which stay in the second-level cache.
+//! The loops are plain ones over a row, because LLVM vectorises those reliably, and blocks of lanes it does not.
 
 use splat4d::math::Real;
 
@@ -75,15 +76,15 @@ pub(super) fn window<F: Real>() -> [F; TAPS] {
 /// Working rows of one thread.
 #[derive(Debug)]
 pub(super) struct Scratch<F> {
-    /// Ring of products, [RING, MOMENTS, STRIDE].
+    /// Ring of products, `[RING, MOMENTS, STRIDE]`.
     products: Vec<[F; STRIDE]>,
-    /// Ring of S's derivatives, [RING, DERIVATIVES, STRIDE].
+    /// Ring of S's derivatives, `[RING, DERIVATIVES, STRIDE]`.
     derivatives: Vec<[F; STRIDE]>,
-    /// Vertical means of one group, [GROUP, MOMENTS, STRIDE].
+    /// Vertical means of one group, `[GROUP, MOMENTS, STRIDE]`.
     means: Vec<[F; STRIDE]>,
-    /// Weights from column −5 on, 0 outside the image, [STRIDE].
+    /// Weights from column −5 on, 0 outside the image, `[STRIDE]`.
     weights: Box<[F; STRIDE]>,
-    /// Results of one row, [2, STRIDE].
+    /// Results of one row, `[2, STRIDE]`.
     row: Vec<[F; STRIDE]>,
 }
 

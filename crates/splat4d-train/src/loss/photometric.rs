@@ -47,7 +47,7 @@ impl<F: Real> Photometric<F> {
 
     /// (1 − λ)·L1 + λ·(1 − SSIM), and its gradient to `render`, which overwrites `d_render`.
     ///
-    /// Shapes: render, truth [C,H,W], values nominally in [0,1]; weight [1,H,W], ≥ 0; d_render becomes [C,H,W].
+    /// Shapes: render, truth `[C,H,W]`, values nominally in `[0,1]`; weight `[1,H,W]`, ≥ 0; d_render becomes `[C,H,W]`.
     /// SSIM has an 11x11 Gaussian window (σ = 1.5), zero padding, C1 = 0.01², C2 = 0.03², per channel.
     /// With weights, L1 and SSIM are Σ w·(…) / (C·Σ w). A pixel of weight 0 is treated as if it lay outside the image:
     /// zero in both images, as the padding, so what it shows reaches neither the value nor the gradient, not even
