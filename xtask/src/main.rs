@@ -1,1 +1,63 @@
-fn main() {}
+//! The project's own chores: `cargo run --release -p xtask -- CHORE`.
+
+mod camera;
+mod capture;
+mod glb;
+mod light;
+mod material;
+mod mesh;
+mod metrics;
+mod picture;
+mod raster;
+mod scene;
+mod skin;
+mod strip;
+mod texture;
+mod truth;
+mod vector;
+
+use anyhow::{Context, Result, bail, ensure};
+use std::path::Path;
+use std::process::ExitCode;
+
+const USAGE: &str = "\
+usage: cargo run --release -p xtask -- CHORE
+
+chores:
+  capture [FOLDER]           draws the bundled capture into FOLDER (default: examples/knight)
+  capture --check [N]        draws N random pictures (default 3) and compares them with examples/knight byte for byte
+  strip-character IN.glb OUT.glb CLIP... [--drop NODE...]
+                             keeps the named animation clips of a character, drops the named nodes' meshes";
+
+fn main() -> ExitCode {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    match run(&arguments) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn run(arguments: &[String]) -> Result<()> {
+    let (chore, rest) = arguments.split_first().context(USAGE)?;
+    match chore.as_str() {
+        "capture" => capture::command(rest),
+        "strip-character" => strip_character(rest),
+        _ => bail!("unknown chore {chore}\n{USAGE}"),
+    }
+}
+
+fn strip_character(arguments: &[String]) -> Result<()> {
+    ensure!(arguments.len() >= 2, "{USAGE}");
+    let (paths, names) = arguments.split_at(2);
+    let split = names.iter().position(|n| n == "--drop").unwrap_or(names.len());
+    let (clips, drop) = (&names[..split], names.get(split + 1..).unwrap_or(&[]));
+    let bytes = std::fs::read(&paths[0]).with_context(|| paths[0].clone())?;
+    let stripped = strip::strip(&glb::Glb::parse(&bytes)?, clips, drop)?.to_bytes();
+    skin::Character::load(&glb::Glb::parse(&stripped)?).context("the stripped file cannot be read back")?;
+    capture::write_file(Path::new(&paths[1]), &stripped)?;
+    println!("{}: {} KB, was {} KB", paths[1], stripped.len() / 1000, bytes.len() / 1000);
+    Ok(())
+}
