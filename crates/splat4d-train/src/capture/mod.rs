@@ -3,8 +3,8 @@
 //!
 //! [`Capture::open`] finds out which of the known layouts a folder has, reads poses and times, checks them and brings
 //! them to one form: pinhole cameras with OpenCV axes, seconds, and one held-out split. No pixel is kept; an
-//! [`ImageStore`] decodes on demand within a byte budget. Every reader produces a [`Take`] (what the files say) and
-//! [`assemble`] alone turns takes into captures, so that all layouts are checked alike.
+//! [`ImageStore`] decodes on demand within a byte budget. Every reader produces a `Take` (what the files say) and
+//! `assemble` alone turns takes into captures, so that all layouts are checked alike.
 
 mod assemble;
 mod colmap;
