@@ -117,7 +117,7 @@ pub struct Capture {
     pub fps: f64,
     /// The initial cloud, in the scene's units, already thinned to [`CaptureOptions::max_points`].
     pub points: Option<PointCloud>,
-    /// What transparent pixels are composited on, sRGB in [0,1]; `None`: the pictures have no alpha.
+    /// What transparent pixels are composited on, sRGB from 0 to 1; `None`: the pictures have no alpha.
     pub background: Option<[f32; 3]>,
     /// Upwards in the world (unit); estimated from the cameras where the data set states none.
     pub up: [f64; 3],
