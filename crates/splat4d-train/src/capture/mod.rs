@@ -3,8 +3,8 @@
 //!
 //! [`Capture::open`] finds out which of the known layouts a folder has, reads poses and times, checks them and brings
 //! them to one form: pinhole cameras with OpenCV axes, seconds, and one held-out split. No pixel is kept; an
-//! [`ImageStore`] decodes on demand within a byte budget. Every reader produces a [`Take`] (what the files say) and
-//! [`assemble`] alone turns takes into captures, so that all layouts are checked alike.
+//! [`ImageStore`] decodes on demand within a byte budget. Every reader produces a `Take` (what the files say) and
+//! `assemble` alone turns takes into captures, so that all layouts are checked alike.
 
 mod assemble;
 mod colmap;
@@ -117,7 +117,7 @@ pub struct Capture {
     pub fps: f64,
     /// The initial cloud, in the scene's units, already thinned to [`CaptureOptions::max_points`].
     pub points: Option<PointCloud>,
-    /// What transparent pixels are composited on, sRGB in [0,1]; `None`: the pictures have no alpha.
+    /// What transparent pixels are composited on, sRGB from 0 to 1; `None`: the pictures have no alpha.
     pub background: Option<[f32; 3]>,
     /// Upwards in the world (unit); estimated from the cameras where the data set states none.
     pub up: [f64; 3],

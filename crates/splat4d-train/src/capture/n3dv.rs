@@ -106,8 +106,8 @@ fn folders(root: &Path) -> Vec<Folder> {
         });
         named.collect()
     };
-    let direct = within(root.to_path_buf());
-    if direct.is_empty() { within(root.join("images")) } else { direct }
+    let (direct, inner) = (within(root.to_path_buf()), within(root.join("images")));
+    if direct.len() >= inner.len() { direct } else { inner }
 }
 
 fn camera_of(row: &[f64], width: usize, height: usize) -> Result<Camera> {

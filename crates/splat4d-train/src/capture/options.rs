@@ -48,7 +48,7 @@ pub struct CaptureOptions {
     pub hold_out: Option<HoldOut>,
     /// Frames per second; `None` takes what the capture states, else 30. Scales the clock of D-NeRF captures too.
     pub fps: Option<f64>,
-    /// What transparent pixels are composited on, sRGB in [0,1]; `None` takes the capture's own, else white.
+    /// What transparent pixels are composited on, sRGB from 0 to 1; `None` takes the capture's own, else white.
     pub background: Option<[f32; 3]>,
     /// Length in seconds of captures that count time from 0 to 1 (D-NeRF, Nerfstudio); `None`: (N − 1)/fps for N
     /// training frames.
@@ -74,7 +74,7 @@ impl Default for CaptureOptions {
 }
 
 impl CaptureOptions {
-    /// An error for values that mean nothing: downscale 0, fps ≤ 0, a background outside [0,1].
+    /// An error for values that mean nothing: downscale 0, fps ≤ 0, a background outside 0 to 1.
     pub(super) fn check(&self) -> Result<()> {
         if self.downscale == 0 {
             return Err(Error::input("downscale is 0").remedy("Give 1 (full size) or more."));

@@ -187,6 +187,18 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
     let count = context.shared(node, "count")?;
     let images = Files::read(&node.get("images")?)?;
     let masks = node.opt("masks")?.map(|n| Files::read(&n)).transpose()?;
+    for (key, files) in [("images", Some(&images)), ("masks", masks.as_ref())] {
+        let Some(Files::List(names)) = files else { continue };
+        let expected = match (&images, count) {
+            (_, Some(count)) => count,
+            (Files::List(images), None) => images.len(),
+            (Files::Pattern { .. }, None) => continue,
+        };
+        if names.len() < expected {
+            let what = format!("\"{key}\" lists {} files for {expected} frames", names.len());
+            return Err(node.error(what).remedy("List one file per frame, or correct \"count\"."));
+        }
+    }
     for index in 0..count.unwrap_or(usize::MAX) {
         let Some(image) = images.name(context.root, start, index) else { break };
         if !image.is_file() {

@@ -98,7 +98,7 @@ fn read_points(root: &Path, warnings: &mut Vec<String>) -> Result<Option<PointCl
     chosen.map(|name| ply::read(&root.join(name))).transpose()
 }
 
-/// Luiten's own cloud: `data` [N,7] = position, sRGB in [0,1], foreground.
+/// Luiten's own cloud: `data` of shape `[N, 7]`: position, sRGB from 0 to 1, foreground.
 const ARCHIVE: &str = "init_pt_cld.npz";
 
 fn read_archive(path: &Path) -> Result<PointCloud> {

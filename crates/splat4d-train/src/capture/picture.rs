@@ -43,7 +43,7 @@ pub(super) struct Raster {
 }
 
 impl Raster {
-    /// One sample in [0,1].
+    /// One sample from 0 to 1.
     pub fn get(&self, pixel: usize, channel: usize) -> f32 {
         let i = pixel * self.channels + channel;
         match &self.samples {
@@ -199,7 +199,7 @@ fn upright(mut picture: DynamicImage, orientation: Orientation) -> Raster {
     Raster { width, height, channels, samples }
 }
 
-/// A mask's values in [0,1], one per pixel, from the alpha channel if `use_alpha`, else from the first channel.
+/// A mask's values from 0 to 1, one per pixel, from the alpha channel if `use_alpha`, else from the first channel.
 ///
 /// Some tools write masks of zeros and ones into 8 bits: where no value is above 1, one counts as white.
 pub(super) fn mask_values(raster: &Raster, use_alpha: bool) -> Vec<f32> {

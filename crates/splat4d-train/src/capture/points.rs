@@ -7,7 +7,7 @@ use rayon::prelude::*;
 pub struct PointCloud {
     /// World positions.
     pub points: Vec<[f64; 3]>,
-    /// sRGB in [0,1], one per point.
+    /// sRGB from 0 to 1, one per point.
     pub colors: Vec<[f32; 3]>,
     /// Seconds, one per point; `None` where the point was not seen at one time.
     pub times: Vec<Option<f64>>,

@@ -42,6 +42,8 @@ pub(super) struct Naming {
     pub told: bool,
 }
 
+/// Widest range of numbers that are frame numbers, not time stamps: nine hours at 30 frames per second.
+const MAX_SPAN: usize = 1_000_000;
 /// Folders that hold pictures but name no camera.
 const PLAIN_FOLDERS: &[&str] = &["images", "image", "frames", "rgb", "input", "train", "test", "val", "."];
 
@@ -71,11 +73,13 @@ pub(super) fn naming(names: &[&str]) -> Naming {
         groups.entry(camera(name)).or_default().push(i);
     }
     let numbers: Vec<Option<usize>> = names.iter().map(|n| trailing_number(n)).collect();
-    let distinct = groups.values().all(|members| {
-        let found: BTreeSet<usize> = members.iter().filter_map(|&i| numbers[i]).collect();
-        found.len() == members.len()
-    });
     let first = numbers.iter().flatten().min().copied().unwrap_or(0);
+    let last = numbers.iter().flatten().max().copied().unwrap_or(0);
+    let distinct = last - first <= MAX_SPAN
+        && groups.values().all(|members| {
+            let found: BTreeSet<usize> = members.iter().filter_map(|&i| numbers[i]).collect();
+            found.len() == members.len()
+        });
     let mut frames = vec![(0, 0); names.len()];
     for (c, members) in groups.values().enumerate() {
         let mut ordered = members.clone();
@@ -105,5 +109,7 @@ mod tests {
         assert_eq!((n.cameras.len(), n.told, n.frames), (1, false, vec![(0, 2), (0, 0)]));
         let n = naming(&["b.png", "a.png"]);
         assert_eq!(n.frames, [(0, 1), (0, 0)]);
+        let n = naming(&["1700000000500.png", "1700009000000.png"]);
+        assert_eq!(n.frames, [(0, 0), (0, 1)], "time stamps count by their order");
     }
 }

@@ -19,9 +19,9 @@ use std::thread::JoinHandle;
 /// A loaded picture in floating point.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Picture {
-    /// [3, height, width] sRGB values in [0,1], composited on the capture's background.
+    /// [3, height, width] sRGB values from 0 to 1, composited on the capture's background.
     pub color: Planes<f32>,
-    /// [1, height, width] foreground weight in [0,1], from the mask file, else from the picture's alpha.
+    /// [1, height, width] foreground weight from 0 to 1, from the mask file, else from the picture's alpha.
     pub mask: Option<Planes<f32>>,
     /// [1, height, width] part of the pixel that the original picture covers, where undistortion left borders. Colour
     /// there is meaningless; losses and measurements must leave those pixels out.
@@ -53,7 +53,7 @@ impl StoredPicture {
         color + [&self.mask, &self.valid].into_iter().flatten().map(Vec::len).sum::<usize>()
     }
 
-    /// Writes the colour as [3, height, width] sRGB values in [0,1], reusing `out`'s memory.
+    /// Writes the colour as [3, height, width] sRGB values from 0 to 1, reusing `out`'s memory.
     pub fn color_into(&self, out: &mut Planes<f32>) {
         out.reset(3, self.height, self.width);
         match &self.color {
@@ -62,12 +62,12 @@ impl StoredPicture {
         }
     }
 
-    /// Writes the mask as [1, height, width] in [0,1]; false (and `out` untouched) if there is none.
+    /// Writes the mask as [1, height, width] from 0 to 1; false (and `out` untouched) if there is none.
     pub fn mask_into(&self, out: &mut Planes<f32>) -> bool {
         self.weights_into(self.mask.as_deref(), out)
     }
 
-    /// Writes the validity as [1, height, width] in [0,1]; false (and `out` untouched) if all pixels are valid.
+    /// Writes the validity as [1, height, width] from 0 to 1; false (and `out` untouched) if all pixels are valid.
     pub fn valid_into(&self, out: &mut Planes<f32>) -> bool {
         self.weights_into(self.valid.as_deref(), out)
     }

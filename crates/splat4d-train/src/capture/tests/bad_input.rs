@@ -157,6 +157,12 @@ fn damaged_metadata() {
         v["backgrond"] = json!([0, 0, 0]);
     });
     assert_says(&message(&sample), &["backgrond", "Did you mean \"background\"?"]);
+    sample.edit("capture.json", |v| {
+        v.as_object_mut().unwrap().remove("backgrond");
+        v["cameras"][0]["masks"] = json!(["masks/cam00/0005.png"]);
+        v["cameras"][0]["count"] = json!(2);
+    });
+    assert_says(&message(&sample), &["cam00", "\"masks\" lists 1 files for 2 frames"]);
     sample.edit("capture.json", |v| v["version"] = json!(2));
     assert_says(&message(&sample), &["version is 2"]);
     for (name, sample) in samples::all() {
