@@ -16,7 +16,7 @@ const TOP_KEYS: &[&str] = &[
     "axes",
     "fps",
     "start",
-    "count",
+    "frames",
     "cameras",
     "hold_out",
     "points",
@@ -40,7 +40,7 @@ const CAMERA_KEYS: &[&str] = &[
     "images",
     "masks",
     "start",
-    "count",
+    "frames",
     "comment",
     "extra",
 ];
@@ -184,7 +184,7 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
     };
     let offset = node.opt("time_offset")?.map_or(Ok(0.0), |n| n.number())?;
     let start = context.shared(node, "start")?.unwrap_or(0);
-    let count = context.shared(node, "count")?;
+    let count = context.shared(node, "frames")?;
     let images = Files::read(&node.get("images")?)?;
     let masks = node.opt("masks")?.map(|n| Files::read(&n)).transpose()?;
     for (key, files) in [("images", Some(&images)), ("masks", masks.as_ref())] {
@@ -196,7 +196,7 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
         };
         if names.len() < expected {
             let what = format!("\"{key}\" lists {} files for {expected} frames", names.len());
-            return Err(node.error(what).remedy("List one file per frame, or correct \"count\"."));
+            return Err(node.error(what).remedy("List one file per frame, or correct \"frames\"."));
         }
     }
     for index in 0..count.unwrap_or(usize::MAX) {

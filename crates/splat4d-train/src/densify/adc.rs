@@ -113,11 +113,9 @@ mod tests {
         for r in [0, 1, 2, 3] {
             stats.tables[0].write(r, 0, [1.0 + r as f32, 2.0, 5.0]);
         }
-        let adc = Densify::Adc(Adc { grad_threshold: 0.1, percent_dense: 0.1 });
+        let adc = Densify::Adc(Adc { grad_threshold: 0.1, percent_dense: 0.05 });
         let mut capped = s.clone();
-        let limits = Limits { cap: 100, extent: 1.0, min_opacity: 0.005 };
-        // Extent 1 would make the large one huge; it is only larger than the split threshold here.
-        let limits = Limits { extent: 4.0, ..limits };
+        let limits = Limits { cap: 100, extent: 4.0, min_opacity: 0.005 };
         let change = adc.run(&mut s, &mut moments, &mut stats.clone(), &limits, 1, 0);
         assert_eq!((change.added, change.removed, s.len()), (3, 1, 22));
         let g = &s.layers[0].params[GEOMETRY];

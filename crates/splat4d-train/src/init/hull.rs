@@ -1,25 +1,24 @@
 //! Visual hull: a random point is kept where (almost) every camera that sees it at that moment has it in its mask.
 
 use super::Seeds;
-use super::volume::{Volume, point};
+use super::volume::Volume;
 use crate::Result;
 use crate::train::frames::{Frames, Picture};
 use rayon::prelude::*;
 use splat4d::math::Rng;
 
 /// Candidates a wanted point: the hull is a small part of the box.
-const CANDIDATES: usize = 60;
+const CANDIDATES: usize = 40;
+/// Rounds of narrowing the box.
+const ROUNDS: u64 = 4;
+/// The next round's box is this much larger on every side than what was kept.
+const MARGIN: f64 = 0.05;
 /// A point may be outside this share of the masks that see it (masks have ragged edges).
 const MISSES: f64 = 0.05;
 /// A point must be seen by at least so many pictures.
 const MIN_VIEWS: usize = 2;
 /// One moving camera: pictures of so many moments around stand in for other cameras.
 const MONOCULAR_PICTURES: usize = 60;
-
-struct Seen {
-    votes: Vec<(u16, u16)>,
-    colors: Vec<Vec<[f32; 3]>>,
-}
 
 /// About `count` points over all `times`. For a still scene (`moving` false) masks of the first time stand for all.
 pub fn carve(
@@ -62,42 +61,76 @@ fn spread(frames: &dyn Frames) -> Vec<usize> {
     (0..frames.len()).step_by(step).collect()
 }
 
+/// Carves one moment in rounds: each looks only in the box of what the last one kept, so that a small object in a large
+/// volume still gets its points.
 fn carve_moment(frames: &dyn Frames, pictures: &[usize], volume: &Volume, wanted: usize, rng: Rng) -> Result<Seeds> {
-    let total = wanted * CANDIDATES;
-    let points: Vec<[f64; 3]> = (0..total as u64).map(|i| point(volume, rng, i)).collect();
-    let mut seen = Seen { votes: vec![(0, 0); total], colors: vec![Vec::new(); total] };
-    let mut picture = Picture::default();
+    let mut low = volume.center.map(|c| c - volume.radius);
+    let mut high = volume.center.map(|c| c + volume.radius);
+    let mut loaded = Vec::new();
     for &i in pictures {
+        let mut picture = Picture::default();
         frames.load(i, &mut picture)?;
-        let Some(mask) = &picture.mask else { continue };
-        let camera = frames.camera(i);
-        points.par_iter().zip(&mut seen.votes).zip(&mut seen.colors).for_each(|((x, (views, inside)), colors)| {
-            // Out of the race already: save the work.
-            if f64::from(*views - *inside) > MISSES * pictures.len() as f64 {
-                return;
-            }
-            let Some(([u, v], _)) = camera.project(*x) else { return };
-            if !(u >= 0.0 && v >= 0.0 && u < mask.width as f64 && v < mask.height as f64) {
-                return;
-            }
-            *views += 1;
-            let (px, py) = (u as usize, v as usize);
-            if mask.get(0, py, px) > 0.5 {
-                *inside += 1;
-                colors.push(std::array::from_fn(|c| picture.color.get(c, py, px)));
-            }
-        });
+        loaded.push((i, picture));
     }
     let mut out = Seeds::default();
-    for (i, x) in points.iter().enumerate() {
-        let (views, inside) = seen.votes[i];
-        let enough = usize::from(views) >= MIN_VIEWS.max(pictures.len() / 4);
-        if enough && f64::from(views - inside) <= MISSES * f64::from(views) {
-            out.push(*x, median(&mut seen.colors[i]), None);
+    for round in 0..ROUNDS {
+        let round_rng = rng.fork(round);
+        let points: Vec<[f64; 3]> = (0..(wanted * CANDIDATES) as u64)
+            .map(|i| std::array::from_fn(|k| low[k] + (high[k] - low[k]) * round_rng.uniform(3 * i + k as u64)))
+            .collect();
+        let kept = vote(frames, &loaded, &points);
+        if kept.is_empty() {
+            break;
+        }
+        for k in 0..3 {
+            let side = (high[k] - low[k]) * MARGIN;
+            let values = || kept.points.iter().map(|p| p[k]);
+            (low[k], high[k]) = (
+                low[k].max(values().fold(f64::INFINITY, f64::min) - side),
+                high[k].min(values().fold(f64::NEG_INFINITY, f64::max) + side),
+            );
+        }
+        let enough = kept.len() >= wanted;
+        out = kept;
+        if enough {
+            break;
         }
     }
     out.truncate_evenly(wanted, rng.fork(77));
     Ok(out)
+}
+
+/// The points that lie in (almost) all masks that see them, with their median colour.
+fn vote(frames: &dyn Frames, pictures: &[(usize, Picture)], points: &[[f64; 3]]) -> Seeds {
+    let keep = |x: &[f64; 3]| -> Option<[f32; 3]> {
+        let (mut views, mut inside) = (0usize, 0usize);
+        let mut colors = Vec::new();
+        for (i, picture) in pictures {
+            let Some(mask) = &picture.mask else { continue };
+            let Some(([u, v], _)) = frames.camera(*i).project(*x) else { continue };
+            if !(u >= 0.0 && v >= 0.0 && u < mask.width as f64 && v < mask.height as f64) {
+                continue;
+            }
+            views += 1;
+            let (px, py) = (u as usize, v as usize);
+            if mask.get(0, py, px) > 0.5 {
+                inside += 1;
+                colors.push(std::array::from_fn(|c| picture.color.get(c, py, px)));
+            } else if (views - inside) as f64 > MISSES * pictures.len() as f64 {
+                return None;
+            }
+        }
+        let enough = views >= MIN_VIEWS.max(pictures.len().div_ceil(2));
+        (enough && (views - inside) as f64 <= MISSES * views as f64).then(|| median(&mut colors))
+    };
+    let found: Vec<Option<[f32; 3]>> = points.par_iter().map(keep).collect();
+    let mut out = Seeds::default();
+    for (x, color) in points.iter().zip(found) {
+        if let Some(color) = color {
+            out.push(*x, color, None);
+        }
+    }
+    out
 }
 
 fn median(colors: &mut [[f32; 3]]) -> [f32; 3] {

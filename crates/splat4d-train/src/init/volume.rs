@@ -67,16 +67,12 @@ fn solve(a: [[f64; 3]; 3], b: [f64; 3]) -> Option<[f64; 3]> {
 pub fn random(volume: &Volume, count: usize, clip: Option<[f64; 2]>, rng: Rng) -> Seeds {
     let mut out = Seeds::default();
     for i in 0..count as u64 {
-        let point = point(volume, rng, i);
+        let point =
+            std::array::from_fn(|k| volume.center[k] + volume.radius * (2.0 * rng.uniform(3 * i + k as u64) - 1.0));
         let time = clip.map(|[from, to]| from + (to - from) * rng.fork(9).uniform(i));
         out.push(point, UNKNOWN_COLOR, time);
     }
     out
-}
-
-/// The i-th uniform point in the box.
-pub fn point(volume: &Volume, rng: Rng, i: u64) -> [f64; 3] {
-    std::array::from_fn(|k| volume.center[k] + volume.radius * (2.0 * rng.uniform(3 * i + k as u64) - 1.0))
 }
 
 #[cfg(test)]

@@ -160,7 +160,7 @@ fn damaged_metadata() {
     sample.edit("capture.json", |v| {
         v.as_object_mut().unwrap().remove("backgrond");
         v["cameras"][0]["masks"] = json!(["masks/cam00/0005.png"]);
-        v["cameras"][0]["count"] = json!(2);
+        v["cameras"][0]["frames"] = json!(2);
     });
     assert_says(&message(&sample), &["cam00", "\"masks\" lists 1 files for 2 frames"]);
     sample.edit("capture.json", |v| v["version"] = json!(2));
@@ -197,7 +197,7 @@ fn absurd_counts() {
         assert_says(&message(&sample), &[file, "claims 18446744073709551615 entries", "truncated"]);
     }
     let sample = samples::own();
-    sample.edit("capture.json", |v| v["count"] = json!(1_000_000_000_000u64));
+    sample.edit("capture.json", |v| v["frames"] = json!(1_000_000_000_000u64));
     assert_says(&message(&sample), &["cam00", "frame 2", "missing"]);
     let sample = samples::own();
     let ply = std::fs::read_to_string(sample.path("points.ply")).unwrap().replace("vertex 2", "vertex 99999999999");
