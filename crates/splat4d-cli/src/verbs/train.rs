@@ -9,7 +9,7 @@ use splat4d::{Error, ErrorKind};
 use splat4d_train::capture::{Capture, Severity};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::train::run::{memory_estimate, open_capture};
-use splat4d_train::train::{self, Outcome, TrainOptions};
+use splat4d_train::train::{self, Outcome, TrainOptions, checkpoint};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -112,6 +112,9 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         files::write(&run.join("cameras.json"), &cameras)?;
         let options = TrainOptions { minutes: args.minutes };
         let trained = train::train(Arc::new(capture), recipe, &run, &options, &stop, &mut listen);
+        if trained.is_err() {
+            leave_nothing(&run)?;
+        }
         (run, trained)
     };
     console.clear();
@@ -192,6 +195,17 @@ fn place(args: &Args, capture: &Capture, console: &Console) -> anyhow::Result<Pa
         console.say(&format!("{} is taken{hint}: this run goes to {}", wanted.display(), run.display()));
     }
     Ok(run)
+}
+
+/// Removes a run that failed before its first checkpoint after the start: there is nothing in it to continue.
+fn leave_nothing(run: &Path) -> anyhow::Result<()> {
+    let begun = checkpoint::list(run).iter().any(|path| *path != checkpoint::path(run, 0));
+    if !begun {
+        run_folder::clear(run)?;
+        // Fails where the user keeps files of their own there, as it should.
+        let _ = std::fs::remove_dir(run);
+    }
+    Ok(())
 }
 
 fn describe(capture: &Capture, recipe: &Recipe, console: &Console) {
