@@ -52,6 +52,8 @@ pub trait Real:
     fn abs(self) -> Self;
     /// Largest integer not above.
     fn floor(self) -> Self;
+    /// Integer part; saturates, NaN is 0.
+    fn i32(self) -> i32;
     /// Smaller of two; NaN loses.
     fn min(self, other: Self) -> Self;
     /// Larger of two; NaN loses.
@@ -116,6 +118,10 @@ macro_rules! common {
         #[inline(always)]
         fn floor(self) -> Self {
             <$t>::floor(self)
+        }
+        #[inline(always)]
+        fn i32(self) -> i32 {
+            self as i32
         }
         #[inline(always)]
         fn min(self, other: Self) -> Self {

@@ -10,9 +10,10 @@
 use super::RenderConfig;
 use super::bin::{BIN, Bins, Footprint, id};
 use super::parallel::{Even, Ragged, for_each_group};
-use super::project::{ALPHA_FLOOR, Projected, ProjectedGrads};
+use super::project::{ALPHA_FLOOR, Projected, ProjectedGrads, TAU_MARGIN};
 use super::simd::{Kernel, Simd, dispatch};
 use crate::math::Real;
+use crate::scene::BLOCK;
 use rayon::prelude::*;
 use std::f64::consts::{LN_2, LOG2_E};
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -38,8 +39,6 @@ const CHUNK: usize = 2048;
 const ROWS: usize = 2;
 /// Splats whose lists of tiles are made at once: a number in a batch is one byte.
 const BATCH: usize = 256;
-/// Bits of the first column of a bin's tiles.
-const COLUMN: u32 = 0x1111;
 /// Added under the root of a row range, so that rounding never loses a row that a tangent touches.
 const CHORD_MARGIN: f64 = 1e-5;
 
@@ -57,7 +56,7 @@ pub struct Tile<F = f32> {
     last: [Row<F>; TILE],
 }
 
-/// One splat as the blend loop reads it: o·g = 2^min(a dx² + b dx dy + c dy² + log_opacity, log_opacity).
+/// One splat as the blend loop reads it: o·g = o·2^min(a dx² + b dx dy + c dy², 0).
 #[repr(C, align(64))]
 #[derive(Clone, Copy, Debug, Default)]
 struct Record<F> {
@@ -68,8 +67,8 @@ struct Record<F> {
     a: F,
     b: F,
     c: F,
-    /// log₂ of the opacity.
-    log_opacity: F,
+    /// log₂ of o/α_min, of which τ is the multiple: no logarithm is taken here.
+    log_ratio: F,
     channels: [F; CHANNELS],
     /// Bit 4·row + column: the tile may be touched.
     mask: u16,
@@ -237,8 +236,7 @@ impl<F: Real> Raster<F> {
         self.place.resize_with(pairs, AtomicU32::default);
         self.backgrounds.resize(bins.starts.len() - 1, [0.0; CHANNELS]);
         let place = &self.place;
-        let data =
-            (Ragged(&mut self.records), (Ragged(&mut self.pair_grads), Even(&mut self.backgrounds, 1)));
+        let data = (Ragged(&mut self.records), (Ragged(&mut self.pair_grads), Even(&mut self.backgrounds, 1)));
         for_each_group(&bins.starts, data, &|bin, (records, (out, background_out))| {
             let start = bins.starts[bin] as usize;
             let keys = &bins.keys[start..bins.starts[bin + 1] as usize];
@@ -344,60 +342,69 @@ impl<F: Real> Kernel for Gather<'_, F> {
     #[inline(always)]
     fn run<const FMA: bool>(self) {
         let at = |v: usize| F::of(v as f64);
-        // First and last pixel centres of the tiles' columns, inside the picture; each twice: upper and lower branch.
-        let mut columns = [[F::ZERO; 2 * SIDE]; 2];
-        for k in 0..SIDE {
-            let (low, high) = (k * TILE, (k * TILE + TILE).min(self.width - self.x0));
-            // A column outside the picture is an empty range.
-            let ends = if high > low { [at(low) + F::HALF, at(high) - F::HALF] } else { [F::ZERO, -F::ONE] };
-            for side in 0..2 {
-                columns[side][k] = ends[side];
-                columns[side][SIDE + k] = ends[side];
+        let zero = [F::ZERO; BLOCK];
+        let last_row = (self.height - self.y0).min(BIN) as i32;
+        // Sixteen splats at once, so that every step is a loop over lanes.
+        for (records, keys) in self.records.chunks_mut(BLOCK).zip(self.keys.chunks(BLOCK)) {
+            let [mut x, mut y, mut a, mut b, mut c] = [zero; 5];
+            let [mut half_x, mut half_y, mut tau] = [zero; 3];
+            for (l, key) in keys.iter().enumerate() {
+                let p = &self.projected[id(*key)];
+                (x[l], y[l]) = (p.mean2d[0] - at(self.x0), p.mean2d[1] - at(self.y0));
+                [a[l], b[l], c[l]] = p.conic;
+                (half_x[l], half_y[l], tau[l]) = (p.half[0], p.half[1], p.tau);
             }
-        }
-        let last_row = at((self.height - self.y0).min(BIN));
-        for (record, key) in self.records.iter_mut().zip(self.keys) {
-            let p = &self.projected[id(*key)];
-            let (x, y) = (p.mean2d[0] - at(self.x0), p.mean2d[1] - at(self.y0));
-            let (y_slope, top) = (-p.conic[1] / p.conic[2], p.conic[1] / p.conic[0] * p.half[1]);
-            let (inverse, reach) = (F::ONE / p.half[0], (p.tau / p.conic[2]).sqrt());
-            let limit = F::ONE + F::of(CHORD_MARGIN);
-            // y = slope·dx ± reach·√(1 − (dx/half)²): each branch is farthest out as near to its summit as the column
-            // comes. Lanes 0-3 are the upper branch, mirrored to be one equation with the lower.
-            let mut bounds = [F::ZERO; 2 * SIDE];
-            for l in 0..2 * SIDE {
-                let sign = if l < SIDE { -F::ONE } else { F::ONE };
-                let (left, right) = (columns[0][l] - x, columns[1][l] - x);
-                let dx = least(greatest(-sign * top, left), right);
-                let u = dx * inverse;
-                let square = limit - u * u;
-                let edge = y + y_slope * dx + sign * reach * greatest(square, F::ZERO).sqrt();
-                // First row whose centre is not above the edge, or one past the last whose centre is not below.
-                let row = (edge * sign + F::HALF).floor() * sign;
-                let row = least(greatest(row, F::ZERO), last_row);
-                bounds[l] = if (square >= F::ZERO) & (left <= right) { row } else { F::ZERO };
+            // The ellipse is y = slope·dx ± reach·√(1 − (dx/half_x)²), with its lowest point at dx = summit.
+            let [mut slope, mut reach, mut inverse, mut summit] = [zero; 4];
+            for l in 0..BLOCK {
+                slope[l] = -b[l] / c[l];
+                reach[l] = (tau[l] / c[l]).sqrt();
+                inverse[l] = F::ONE / half_x[l];
+                summit[l] = -b[l] / a[l] * half_y[l];
             }
-            let (mut mask, mut rows) = (0, [[0; 2]; SIDE]);
+            let (mut mask, mut rows) = ([0u32; BLOCK], [[[0i32; BLOCK]; 2]; SIDE]);
             for k in 0..SIDE {
-                let (first, end) = (bounds[k].f64() as u32, bounds[SIDE + k].f64() as u32);
-                rows[k] = [first as u8, end as u8];
-                if first < end {
-                    let above = !0 << (first / TILE as u32 * SIDE as u32);
-                    let below = !(!0u32 << ((end + TILE as u32 - 1) / TILE as u32 * SIDE as u32));
-                    mask |= (COLUMN << k) & above & below;
+                let (left, right) = (k * TILE, (k * TILE + TILE).min(self.width - self.x0));
+                if right <= left {
+                    break;
+                }
+                let (left, right) = (at(left) + F::HALF, at(right) - F::HALF);
+                let mut meets = [true; BLOCK];
+                for (side, sign) in [(0, -F::ONE), (1, F::ONE)] {
+                    // Each branch is farthest out as near to its summit as the column comes.
+                    for l in 0..BLOCK {
+                        let dx = least(greatest(sign * summit[l], left - x[l]), right - x[l]);
+                        let u = dx * inverse[l];
+                        let square = F::ONE + F::of(CHORD_MARGIN) - u * u;
+                        meets[l] &= square >= F::ZERO;
+                        let edge = y[l] + slope[l] * dx + sign * reach[l] * greatest(square, F::ZERO).sqrt();
+                        // First row whose centre is not above the edge, or one past the last not below it.
+                        let row = least(greatest((edge * sign + F::HALF).floor() * sign, F::ZERO), at(BIN));
+                        rows[k][side][l] = row.i32().min(last_row);
+                    }
+                }
+                for l in 0..BLOCK {
+                    let (first, end) = (rows[k][0][l], rows[k][1][l]);
+                    for ty in 0..SIDE {
+                        let top = (ty * TILE) as i32;
+                        let hit = meets[l] & (first < end) & (first < top + TILE as i32) & (end > top);
+                        mask[l] |= u32::from(hit) << (ty * SIDE + k);
+                    }
                 }
             }
-            *record = Record {
-                x,
-                y,
-                a: F::of(-0.5 * LOG2_E) * p.conic[0],
-                b: F::of(-LOG2_E) * p.conic[1],
-                c: F::of(-0.5 * LOG2_E) * p.conic[2],
-                log_opacity: F::of(LOG2_E) * p.opacity.ln(),
-                channels: record.channels,
-                mask: mask as u16,
-                rows,
-            };
+            for (l, record) in records.iter_mut().enumerate() {
+                *record = Record {
+                    x: x[l],
+                    y: y[l],
+                    a: F::of(-0.5 * LOG2_E) * a[l],
+                    b: F::of(-LOG2_E) * b[l],
+                    c: F::of(-0.5 * LOG2_E) * c[l],
+                    log_ratio: F::of(0.5 * LOG2_E) * (tau[l] - F::of(TAU_MARGIN)),
+                    channels: record.channels,
+                    mask: mask[l] as u16,
+                    rows: std::array::from_fn(|k| [rows[k][0][l] as u8, rows[k][1][l] as u8]),
+                };
+            }
         }
     }
 }
@@ -458,16 +465,16 @@ struct Exponent<F> {
 
 impl<F: Real> Exponent<F> {
     #[inline(always)]
-    fn new<const FMA: bool>(r: &Record<F>, tx: usize, ty: usize) -> Self {
-        let dx = offsets(r.x, tx);
+    fn new<const FMA: bool>(r: &Record<F>, tx: usize, ty: usize, limits: &Limits<F>) -> Self {
+        let (dx, log_opacity) = (offsets(r.x, tx), limits.log_min + r.log_ratio);
         let (mut ax, mut bx) = ([F::ZERO; TILE], [F::ZERO; TILE]);
         for l in 0..TILE {
-            ax[l] = (r.a * dx[l]).fma::<FMA>(dx[l], r.log_opacity);
+            ax[l] = (r.a * dx[l]).fma::<FMA>(dx[l], log_opacity);
             bx[l] = r.b * dx[l];
         }
         let y = r.y - (F::of((ty * TILE) as f64) + F::HALF);
         let steps = std::array::from_fn(|k| F::of(k as f64));
-        Self { dx, ax, bx, c: r.c, y, log_opacity: r.log_opacity, steps }
+        Self { dx, ax, bx, c: r.c, y, log_opacity, steps }
     }
 
     /// log₂ of o·g at lane `l` of a row at offset `dy`; `cy` = c·dy. Rounding may take a needle's above its top.
@@ -545,7 +552,7 @@ fn blend_splat<F: Real, const FMA: bool>(
     ty: usize,
     limits: &Limits<F>,
 ) {
-    let e = Exponent::new::<FMA>(r, tx, ty);
+    let e = Exponent::new::<FMA>(r, tx, ty, limits);
     for top in tile_rows(r, tx, ty).step_by(ROWS) {
         for y in top..top + ROWS {
             let dy = e.y - e.steps[y];
@@ -560,10 +567,10 @@ fn blend_splat<F: Real, const FMA: bool>(
                 let kept = t[l] * (F::ONE - alpha);
                 let open = kept >= limits.t_min;
                 weight[l] = select(open, alpha * t[l], F::ZERO);
-                // Neither is a choice between the old value and a new one: LLVM would make masked stores of it, which
-                // cost tens of cycles on some machines.
+                // Neither is a choice between the old value and a new one, nor a maximum: LLVM would make masked stores
+                // of it, which cost tens of cycles on some machines. Sums of whole numbers are exact.
                 t[l] = select(open, kept, -t[l].abs());
-                last[l] = greatest(last[l], select(open, number, F::ZERO));
+                last[l] += select(open, number - last[l], F::ZERO);
             }
             tile.t[y] = t;
             tile.last[y] = last;
@@ -709,7 +716,7 @@ fn backward_splat<F: Real, const FMA: bool>(
     out: &mut [F; PAIR],
 ) {
     let zero = [F::ZERO; TILE];
-    let e = Exponent::new::<FMA>(r, tx, ty);
+    let e = Exponent::new::<FMA>(r, tx, ty, limits);
     let mut ex = zero;
     for l in 0..TILE {
         ex[l] = F::TWO * r.a * e.dx[l];
