@@ -87,6 +87,8 @@ recipe! {
     position_lr_init: f64 = 1.6e-4,
     /// Rate of positions at the end, of the extent.
     position_lr_final: f64 = 1.6e-6,
+    /// Rates that are not given two ends (colour, opacity, scale, rotation, life) fall to this share of themselves.
+    lr_decay: f64 = 0.1,
     /// Rate of base colour; the higher SH degrees learn 20 times slower.
     feature_lr: f64 = 2.5e-3,
     /// Rate of opacity logits.
@@ -240,6 +242,7 @@ impl Recipe {
             ("velocity_lr_init", self.velocity_lr_init),
             ("velocity_lr_final", self.velocity_lr_final),
             ("growth", self.growth),
+            ("lr_decay", self.lr_decay),
         ];
         for (knob, value) in positive {
             if !(value > 0.0 && value.is_finite()) {

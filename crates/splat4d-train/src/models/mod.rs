@@ -63,6 +63,13 @@ impl Rate {
     }
 }
 
+impl Recipe {
+    /// A rate that falls to `lr_decay` of itself over the stage.
+    pub fn falling(&self, rate: f64) -> Rate {
+        Rate { start: rate, end: rate * self.lr_decay }
+    }
+}
+
 /// A learnable group: one column group of one table. What no group names is frozen.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Group {
