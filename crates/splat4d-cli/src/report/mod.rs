@@ -58,7 +58,7 @@ fn header(out: &mut String, run: &Run) {
     if let Some(seconds) = run.number("seconds") {
         words.push(format!("trained in {} minutes", human_seconds(seconds)));
     }
-    let _ = write!(out, "<header><h1>{}</h1><p>{}</p></header>\n", escape(&run.name()), escape(&words.join(" · ")));
+    let _ = writeln!(out, "<header><h1>{}</h1><p>{}</p></header>", escape(&run.name()), escape(&words.join(" · ")));
 }
 
 fn cards(out: &mut String, run: &Run) {
