@@ -309,7 +309,8 @@ fn panels<const N: usize>(out: &mut String, title: &str, charts: [(&str, Option<
         })
         .collect();
     if !shown.is_empty() {
-        let _ = write!(out, "<h2>{}</h2>\n<div class=\"grid2\">{shown}</div>\n", escape(title));
+        let columns = N.clamp(2, 3);
+        let _ = write!(out, "<h2>{}</h2>\n<div class=\"grid{columns}\">{shown}</div>\n", escape(title));
     }
 }
 
