@@ -69,6 +69,8 @@ recipe! {
     sh_degree: usize = 1,
     /// Iterations before each further SH degree is unlocked; 0: iterations/10.
     sh_degree_interval: usize = 0,
+    /// Share of the iterations, from the first, that see pictures at half size.
+    half_size_until: f64 = 0.4,
     /// Share of D-SSIM in the photometric loss.
     lambda_dssim: f64 = 0.2,
     /// Weight of the alpha-mask loss |alpha − mask| where masks cover the whole scene (RGBA captures).
@@ -268,6 +270,7 @@ impl Recipe {
         }
         let shares = [
             ("lambda_dssim", self.lambda_dssim),
+            ("half_size_until", self.half_size_until),
             ("relocate_gradient", self.relocate_gradient),
             ("min_opacity", self.min_opacity),
         ];

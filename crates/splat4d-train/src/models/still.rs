@@ -67,6 +67,7 @@ pub fn stage(name: &str, plan: &Plan) -> Stage {
         densify,
         densify_steps,
         sh_interval: r.sh_degree_interval,
+        half_size_steps: (r.half_size_until * r.iterations as f64) as usize,
         ..Stage::new(name, r.iterations)
     }
 }
