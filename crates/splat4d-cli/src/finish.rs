@@ -84,7 +84,10 @@ pub(crate) fn scores(
     let evaluation = evaluate(scene, &capture, &store, iteration, &options, &mut |event| console.event(event))?;
     console.clear();
     if capture.held.is_empty() {
-        console.warn("no view was held out, so that quality on new views cannot be measured. Hold out a camera (--hold-out camera=0) or every 8th picture (--hold-out every=8).");
+        console.warn(
+            "no view was held out, so that quality on new views cannot be measured. Hold out a camera (--hold-out \
+             camera=0) or every 8th picture (--hold-out every=8).",
+        );
     }
     Ok(evaluation)
 }
@@ -121,7 +124,9 @@ fn say_scores(run: &Run, console: &Console) {
         console.say(&format!("where things move: {:+.2} dB over a still scene ({still:.2} dB)", ours - still));
     }
     if let Some(results) = &run.results {
-        console.emit(&json!({"type": "results", "iteration": run.iteration(), "results": results, "still": run.all_results.get("still")}));
+        let still = run.all_results.get(EvalOptions::STILL);
+        let iteration = run.iteration();
+        console.emit(&json!({"type": "results", "iteration": iteration, "results": results, "still": still}));
     }
 }
 

@@ -10,6 +10,12 @@ use std::process::{Child, ChildStdin, Command, Stdio};
 
 /// x264's quality: 18 is visually lossless for most material (FFmpeg's H.264 guide).
 const CRF: &str = "18";
+/// What films may end in.
+const ENDINGS: &str =
+    "Use .mp4, .mkv or .mov (needs ffmpeg), .png (animated), or a name without ending for a folder of pictures.";
+/// What to do without ffmpeg.
+const INSTEAD: &str =
+    "Install ffmpeg, or write an animated .png or a folder of pictures instead (-o NAME.png, -o FOLDER).";
 /// Most bytes kept of what ffmpeg says.
 const STDERR_BYTES: usize = 64 << 10;
 
@@ -73,8 +79,8 @@ pub(crate) enum Film {
 }
 
 impl Film {
-    /// Starts a film of `frames` frames at `path`: `.mp4` (or another ending that ffmpeg knows as video) through ffmpeg,
-    /// `.png`/`.apng` as animated PNG, no ending as a folder of numbered PNGs.
+    /// Starts a film of `frames` frames at `path`: `.mp4`, `.mkv` and `.mov` through ffmpeg, `.png` and `.apng` as
+    /// animated PNG, no ending as a folder of numbered PNGs.
     pub(crate) fn create(path: &Path, [width, height]: [usize; 2], fps: f64, frames: usize) -> anyhow::Result<Self> {
         let ending = path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase()).unwrap_or_default();
         match ending.as_str() {
@@ -86,7 +92,7 @@ impl Film {
             }
             _ => Err(Error::input(format!("films cannot be written as .{ending}"))
                 .at(path.display())
-                .remedy("Use .mp4, .mkv or .mov (needs ffmpeg), .png (animated), or a name without ending for a folder of pictures.")
+                .remedy(ENDINGS)
                 .into()),
         }
     }
@@ -103,11 +109,9 @@ impl Film {
         command.args(["-vf", "crop=max(2\\,trunc(iw/2)*2):max(2\\,trunc(ih/2)*2)", "-c:v", "libx264", "-crf", CRF]);
         command.args(["-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", container]).arg(output.path());
         command.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped());
-        let mut child = command.spawn().map_err(|e| {
-            Error::io("the program ffmpeg, which writes films, cannot be started", e).remedy(
-                "Install ffmpeg, or write an animated .png or a folder of pictures instead (-o NAME.png, -o FOLDER).",
-            )
-        })?;
+        let mut child = command
+            .spawn()
+            .map_err(|e| Error::io("the program ffmpeg, which writes films, cannot be started", e).remedy(INSTEAD))?;
         let pipe = child.stdin.take();
         let words = child.stderr.take().map(|mut stderr| {
             std::thread::spawn(move || {
@@ -193,8 +197,7 @@ impl Film {
             return Error::io("the film cannot be written", error).remedy(files::WRITE_REMEDY).into();
         }
         anyhow::anyhow!(
-            "ffmpeg could not write the film ({}). Write an animated .png or a folder of pictures instead (-o NAME.png, \
-             -o FOLDER)",
+            "ffmpeg could not write the film ({}). {INSTEAD}",
             if last.is_empty() { "it said nothing".into() } else { last.join("; ") }
         )
     }
@@ -214,15 +217,11 @@ pub(crate) fn check(path: &Path) -> anyhow::Result<()> {
     if matches!(ending.as_str(), "mp4" | "mkv" | "mov") && !have_ffmpeg() {
         return Err(Error::input("the program ffmpeg, which writes films, was not found")
             .at(path.display())
-            .remedy(
-                "Install ffmpeg, or write an animated .png or a folder of pictures instead (-o NAME.png, -o FOLDER).",
-            )
+            .remedy(INSTEAD)
             .into());
     }
     if !matches!(ending.as_str(), "" | "png" | "apng" | "mp4" | "mkv" | "mov") {
-        bail!(Error::input(format!("films cannot be written as .{ending}")).at(path.display()).remedy(
-            "Use .mp4, .mkv or .mov (needs ffmpeg), .png (animated), or a name without ending for a folder of pictures."
-        ));
+        bail!(Error::input(format!("films cannot be written as .{ending}")).at(path.display()).remedy(ENDINGS));
     }
     Ok(())
 }

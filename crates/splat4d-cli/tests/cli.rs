@@ -370,3 +370,32 @@ fn a_default_folder_that_is_taken_gets_a_number() {
     let quiet = splat4d(&["export", "runs/capture", "-o", "now.ply", "-q"]).run_in(work.path());
     assert_eq!(quiet.ok(), "");
 }
+
+#[test]
+#[cfg(unix)]
+fn an_interrupt_saves_and_says_how_to_continue() {
+    use std::io::{BufRead, BufReader, Read};
+    let work = tempfile::tempdir().unwrap();
+    let capture = Capture::new(work.path()).write();
+    let run = work.path().join("run");
+    let mut child = std::process::Command::new(env!("CARGO_BIN_EXE_splat4d"))
+        .args(["train", str(&capture), "-o", str(&run), "--json"])
+        .args(TINY)
+        .arg("--set=iterations=1000000")
+        .stdout(std::process::Stdio::piped())
+        .stderr(std::process::Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
+    lines.find(|l| l.as_ref().unwrap().contains("\"progress\"")).unwrap().unwrap();
+    let sent = std::process::Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
+    assert!(sent.success());
+    let last: Value = serde_json::from_str(&lines.last().unwrap().unwrap()).unwrap();
+    assert_eq!((&last["type"], &last["code"]), (&json!("error"), &json!(1)));
+    let mut stderr = String::new();
+    child.stderr.take().unwrap().read_to_string(&mut stderr).unwrap();
+    assert_eq!(child.wait().unwrap().code(), Some(1));
+    assert!(stderr.contains(&format!("--resume {}", run.display())), "{stderr}");
+    assert!(std::fs::read_dir(run.join("checkpoints")).unwrap().count() > 0);
+    assert!(!run.join("scene.safetensors").exists());
+}

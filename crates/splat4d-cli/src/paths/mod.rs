@@ -98,8 +98,9 @@ impl Clock {
     fn frames(&self, seconds: f64) -> Result<usize> {
         let frames = (seconds * self.fps).round().max(1.0);
         if frames > MAX_FRAMES {
-            return Err(Error::input(format!("the film would have {frames} frames"))
-                .remedy(format!("Take a shorter time range, fewer frames a second (--fps) or less slow motion: at most {MAX_FRAMES} frames are drawn.")));
+            return Err(Error::input(format!("the film would have {frames} frames")).remedy(format!(
+                "Take a shorter time range, fewer frames a second or less slow motion: {MAX_FRAMES} is the most."
+            )));
         }
         Ok(frames as usize)
     }

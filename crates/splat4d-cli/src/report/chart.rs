@@ -16,12 +16,14 @@ const MAX_TIPS: usize = 48;
 /// Colours that the style sheet defines (`--c0` …).
 const COLORS: usize = 6;
 
+type Points = Vec<(f64, f64)>;
+
 /// One curve.
 pub(crate) struct Series {
     /// Shown in the legend; empty: none.
     pub name: String,
     /// (x, y), x rising.
-    pub points: Vec<(f64, f64)>,
+    pub points: Points,
 }
 
 /// Text that is safe inside HTML and attributes.
@@ -43,7 +45,7 @@ pub(crate) fn escape(text: &str) -> String {
 
 /// Curves over a common x axis; `None` where there is nothing to draw.
 pub(crate) fn lines(series: &[Series], x_label: &str, unit: &str) -> Option<String> {
-    let series: Vec<(usize, &str, Vec<(f64, f64)>)> = series
+    let series: Vec<(usize, &str, Points)> = series
         .iter()
         .enumerate()
         .map(|(i, s)| (i, s.name.as_str(), reduced(&s.points)))
@@ -176,8 +178,8 @@ fn range(values: impl Iterator<Item = f64>) -> Option<(f64, f64)> {
 }
 
 /// Finite points, thinned to means of equal runs.
-fn reduced(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
-    let finite: Vec<(f64, f64)> = points.iter().copied().filter(|p| p.0.is_finite() && p.1.is_finite()).collect();
+fn reduced(points: &[(f64, f64)]) -> Points {
+    let finite: Points = points.iter().copied().filter(|p| p.0.is_finite() && p.1.is_finite()).collect();
     let run = finite.len().div_ceil(MAX_POINTS).max(1);
     let mean = |c: &[(f64, f64)]| {
         let n = c.len() as f64;

@@ -58,7 +58,7 @@ fn header(out: &mut String, run: &Run) {
     if let Some(seconds) = run.number("seconds") {
         words.push(format!("trained in {} minutes", human_seconds(seconds)));
     }
-    let _ = write!(out, "<header><h1>{}</h1><p>{}</p></header>\n", escape(&run.name()), escape(&words.join(" · ")));
+    let _ = writeln!(out, "<header><h1>{}</h1><p>{}</p></header>", escape(&run.name()), escape(&words.join(" · ")));
 }
 
 fn cards(out: &mut String, run: &Run) {
@@ -309,7 +309,8 @@ fn panels<const N: usize>(out: &mut String, title: &str, charts: [(&str, Option<
         })
         .collect();
     if !shown.is_empty() {
-        let _ = write!(out, "<h2>{}</h2>\n<div class=\"grid2\">{shown}</div>\n", escape(title));
+        let columns = N.clamp(2, 3);
+        let _ = write!(out, "<h2>{}</h2>\n<div class=\"grid{columns}\">{shown}</div>\n", escape(title));
     }
 }
 
