@@ -8,7 +8,7 @@
 //! T_min. Source: Kerbl et al. 2023; gradients are 0 where α is at its ceiling, as in gsplat.
 
 use super::RenderConfig;
-use super::bin::{BIN, Bins, Footprint, id};
+use super::bin::{BIN, Bins, Footprint, PAIR_BUDGET, id};
 use super::parallel::{Even, Ragged, for_each_group};
 use super::project::{ALPHA_FLOOR, Projected, ProjectedGrads, TAU_MARGIN};
 use super::simd::{Kernel, Simd, dispatch};
@@ -35,8 +35,6 @@ const PAIR: usize = 12;
 /// Splats in a reduction task.
 const CHUNK: usize = 2048;
 
-/// Rows blended together: two independent chains hide each other's latency and share every constant.
-const ROWS: usize = 2;
 /// Splats whose lists of tiles are made at once: a number in a batch is one byte.
 const BATCH: usize = 256;
 /// Added under the root of a row range, so that rounding never loses a row that a tangent touches.
@@ -118,6 +116,8 @@ pub struct PixelGrads<'a, F = f32> {
 pub struct Raster<F = f32> {
     /// Sorted lists.
     pub bins: Bins,
+    /// Instead of [`PAIR_BUDGET`].
+    pub(super) budget: Option<usize>,
     width: usize,
     height: usize,
     simd: Option<Simd>,
@@ -158,9 +158,23 @@ impl<F: Real> Raster<F> {
         simd: Simd,
     ) {
         (self.width, self.height, self.simd) = (width, height, Some(simd));
-        self.bins.build(footprints, projected, width, height);
+        self.bins.count(footprints, width, height, self.budget.unwrap_or(PAIR_BUDGET));
+        self.tiles.resize(self.bins.bins() * TILES, Tile::default());
+        self.gather(projected, footprints, 0);
+    }
+
+    /// Sees to it that lists and records are those of run `run`.
+    fn hold(&mut self, projected: &[Projected<F>], footprints: &[Footprint], run: usize) {
+        if self.bins.current != run {
+            self.gather(projected, footprints, run);
+        }
+    }
+
+    /// Makes lists and records of one run of bins.
+    fn gather(&mut self, projected: &[Projected<F>], footprints: &[Footprint], run: usize) {
+        let (width, height, simd) = (self.width, self.height, self.simd.unwrap_or(Simd::Scalar));
+        self.bins.fill(footprints, projected, run);
         self.records.resize(self.bins.keys.len(), Record::default());
-        self.tiles.resize((self.bins.starts.len() - 1) * TILES, Tile::default());
         let bins = &self.bins;
         for_each_group(&bins.starts, Ragged(&mut self.records), &|bin, records| {
             let (x0, y0) = (bin % bins.across * BIN, bin / bins.across * BIN);
@@ -169,12 +183,29 @@ impl<F: Real> Raster<F> {
         });
     }
 
-    /// Blends four channels; one row of `channels` a splat.
-    pub fn blend(&mut self, channels: &[[F; CHANNELS]], config: &RenderConfig) {
+    /// Blends four channels; one row of `channels` a splat, the other rows as they were prepared.
+    pub fn blend(
+        &mut self,
+        projected: &[Projected<F>],
+        footprints: &[Footprint],
+        channels: &[[F; CHANNELS]],
+        config: &RenderConfig,
+    ) {
+        for run in 0..self.bins.runs.len() {
+            self.hold(projected, footprints, run);
+            self.blend_run(channels, config);
+        }
+    }
+
+    fn blend_run(&mut self, channels: &[[F; CHANNELS]], config: &RenderConfig) {
         let (simd, bins, limits) = (self.simd.unwrap_or(Simd::Scalar), &self.bins, Limits::new(config));
         let (width, height) = (self.width, self.height);
         let data = (Ragged(&mut self.records), Even(&mut self.tiles, TILES));
+        let run = &bins.runs[bins.current];
         for_each_group(&bins.starts, data, &|bin, (records, tiles)| {
+            if !run.contains(&bin) {
+                return;
+            }
             let keys = &bins.keys[bins.starts[bin] as usize..bins.starts[bin + 1] as usize];
             for (r, key) in records.0.iter_mut().zip(keys) {
                 r.channels = channels[id(*key)];
@@ -229,15 +260,48 @@ impl<F: Real> Raster<F> {
         d: &mut [ProjectedGrads<F>],
         d_channels: &mut [[F; CHANNELS]],
     ) -> [f64; CHANNELS] {
+        if geometry == Geometry::Overwrite {
+            d.fill(ProjectedGrads::default());
+        }
+        d_channels.fill([F::ZERO; CHANNELS]);
+        self.backgrounds.clear();
+        self.backgrounds.resize(self.bins.bins(), [0.0; CHANNELS]);
+        for run in 0..self.bins.runs.len() {
+            self.hold(projected, footprints, run);
+            self.backward_run(projected, footprints, channels, background, grads, config, d, d_channels);
+        }
+        let mut total = [0.0; CHANNELS];
+        for bin in &self.backgrounds {
+            for c in 0..CHANNELS {
+                total[c] += bin[c];
+            }
+        }
+        total
+    }
+
+    /// [`Raster::backward`] of the current run, added to `d` and `d_channels`.
+    fn backward_run(
+        &mut self,
+        projected: &[Projected<F>],
+        footprints: &[Footprint],
+        channels: &[[F; CHANNELS]],
+        background: [F; CHANNELS],
+        grads: &PixelGrads<'_, F>,
+        config: &RenderConfig,
+        d: &mut [ProjectedGrads<F>],
+        d_channels: &mut [[F; CHANNELS]],
+    ) {
         let (simd, bins, limits) = (self.simd.unwrap_or(Simd::Scalar), &self.bins, Limits::new(config));
         let (width, height, tiles) = (self.width, self.height, &self.tiles);
         let pairs = bins.keys.len();
         self.pair_grads.resize(pairs, [F::ZERO; PAIR]);
         self.place.resize_with(pairs, AtomicU32::default);
-        self.backgrounds.resize(bins.starts.len() - 1, [0.0; CHANNELS]);
-        let place = &self.place;
+        let (place, run) = (&self.place, &bins.runs[bins.current]);
         let data = (Ragged(&mut self.records), (Ragged(&mut self.pair_grads), Even(&mut self.backgrounds, 1)));
         for_each_group(&bins.starts, data, &|bin, (records, (out, background_out))| {
+            if !run.contains(&bin) {
+                return;
+            }
             let start = bins.starts[bin] as usize;
             let keys = &bins.keys[start..bins.starts[bin + 1] as usize];
             let (bx, by) = (bin % bins.across, bin / bins.across);
@@ -245,8 +309,8 @@ impl<F: Real> Raster<F> {
                 let splat = id(*key);
                 r.channels = channels[splat];
                 // Every slot is written by exactly one task, so that the order of writes cannot matter.
-                let slot = bins.first[splat] as usize + footprints[splat].rank(bx, by);
-                place[slot].store((start + i) as u32, Ordering::Relaxed);
+                let slot = bins.first[splat].wrapping_add(footprints[splat].rank(bx, by) as u32);
+                place[slot as usize].store((start + i) as u32, Ordering::Relaxed);
             }
             out.0.fill([F::ZERO; PAIR]);
             let kernel = Backward {
@@ -267,17 +331,12 @@ impl<F: Real> Raster<F> {
             for (i, (d, d_ch)) in d.iter_mut().zip(d_ch).enumerate() {
                 let splat = chunk * CHUNK + i;
                 let mut sum = [F::ZERO; PAIR];
-                let first = bins.first[splat] as usize;
-                for slot in &place[first..first + footprints[splat].count()] {
+                for slot in &place[bins.slots(splat, &footprints[splat])] {
                     let pair = &pair_grads[slot.load(Ordering::Relaxed) as usize];
                     for k in 0..PAIR {
                         sum[k] += pair[k];
                     }
                 }
-                if geometry == Geometry::Overwrite {
-                    *d = ProjectedGrads::default();
-                }
-                *d_ch = [F::ZERO; CHANNELS];
                 let p = &projected[splat];
                 if p.radius > F::ZERO {
                     let [v, vx, vxx, vy, vxy, vyy, abs_x, abs_y, ..] = sum;
@@ -291,25 +350,20 @@ impl<F: Real> Raster<F> {
                     d.conic[1] -= vxy;
                     d.conic[2] -= F::HALF * vyy;
                     d.opacity += v / p.opacity;
-                    d_ch.copy_from_slice(&sum[8..]);
+                    for c in 0..CHANNELS {
+                        d_ch[c] += sum[8 + c];
+                    }
                 }
             }
         });
-        let mut total = [0.0; CHANNELS];
-        for bin in &self.backgrounds {
-            for c in 0..CHANNELS {
-                total[c] += bin[c];
-            }
-        }
-        total
     }
 
     /// Pairs of bin and splat.
     pub fn pairs(&self) -> usize {
-        self.bins.keys.len()
+        self.bins.total as usize
     }
 
-    /// Pixels that the blend loop evaluates for these pairs, were no pixel to stop early.
+    /// Pixels that the blend loop evaluates for the pairs that are held, were no pixel to stop early.
     pub fn blend_work(&self) -> usize {
         let rows = |r: &Record<F>, t: usize| usize::from(r.mask >> t & 1) * tile_rows(r, t % SIDE, t / SIDE).len();
         self.records.iter().map(|r| (0..TILES).map(|t| rows(r, t)).sum::<usize>() * TILE).sum()
@@ -440,12 +494,11 @@ impl Lists {
     }
 }
 
-/// The rows of tile (tx, ty) that a record can touch, widened to whole groups of [`ROWS`].
+/// The rows of tile (tx, ty) that a record can touch.
 #[inline(always)]
 fn tile_rows<F>(r: &Record<F>, tx: usize, ty: usize) -> std::ops::Range<usize> {
     let (top, [first, end]) = (ty * TILE, r.rows[tx % SIDE]);
-    let end = usize::from(end).saturating_sub(top).min(TILE);
-    usize::from(first).saturating_sub(top) / ROWS * ROWS..end.next_multiple_of(ROWS)
+    usize::from(first).saturating_sub(top)..usize::from(end).saturating_sub(top).min(TILE)
 }
 
 /// Exponents of α and their constants for one splat in one tile.
@@ -553,8 +606,8 @@ fn blend_splat<F: Real, const FMA: bool>(
     limits: &Limits<F>,
 ) {
     let e = Exponent::new::<FMA>(r, tx, ty, limits);
-    for top in tile_rows(r, tx, ty).step_by(ROWS) {
-        for y in top..top + ROWS {
+    for y in tile_rows(r, tx, ty) {
+        {
             let dy = e.y - e.steps[y];
             let cy = e.c * dy;
             let (mut t, mut last) = (tile.t[y], tile.last[y]);
@@ -724,8 +777,8 @@ fn backward_splat<F: Real, const FMA: bool>(
     // Sums down each column; dx is the same for all rows, so its powers wait until the end.
     let (mut v0, mut v1, mut v2, mut abs_x, mut abs_y) = (zero, zero, zero, zero, zero);
     let mut light = [zero; CHANNELS];
-    for top in tile_rows(r, tx, ty).step_by(ROWS) {
-        for y in top..top + ROWS {
+    for y in tile_rows(r, tx, ty) {
+        {
             let dy = e.y - e.steps[y];
             let (cy, by) = (e.c * dy, r.b * dy);
             let (mut t, mut behind, last) = (back.t[y], back.behind[y], back.last[y]);
