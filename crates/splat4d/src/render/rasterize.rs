@@ -36,7 +36,7 @@ const PAIR: usize = 12;
 const CHUNK: usize = 2048;
 
 /// Splats whose lists of tiles are made at once: a number in a batch is one byte.
-const BATCH: usize = 256;
+const BATCH: usize = 128;
 /// Added under the root of a row range, so that rounding never loses a row that a tangent touches.
 const CHORD_MARGIN: f64 = 1e-5;
 
@@ -261,7 +261,7 @@ impl<F: Real> Raster<F> {
         d_channels: &mut [[F; CHANNELS]],
     ) -> [f64; CHANNELS] {
         if geometry == Geometry::Overwrite {
-            d.fill(ProjectedGrads::default());
+            d.par_chunks_mut(CHUNK).for_each(|d| d.fill(ProjectedGrads::default()));
         }
         d_channels.fill([F::ZERO; CHANNELS]);
         self.backgrounds.clear();
@@ -607,31 +607,29 @@ fn blend_splat<F: Real, const FMA: bool>(
 ) {
     let e = Exponent::new::<FMA>(r, tx, ty, limits);
     for y in tile_rows(r, tx, ty) {
-        {
-            let dy = e.y - e.steps[y];
-            let cy = e.c * dy;
-            let (mut t, mut last) = (tile.t[y], tile.last[y]);
-            let mut weight = [F::ZERO; TILE];
+        let dy = e.y - e.steps[y];
+        let cy = e.c * dy;
+        let (mut t, mut last) = (tile.t[y], tile.last[y]);
+        let mut weight = [F::ZERO; TILE];
+        for l in 0..TILE {
+            let power = e.at::<FMA>(l, dy, cy);
+            let alpha = least(power.blend_exp2::<FMA>(), limits.alpha_max);
+            let alpha = select(power >= limits.log_min, alpha, F::ZERO);
+            // A pixel that has stopped has a negative T and stays below the limit.
+            let kept = t[l] * (F::ONE - alpha);
+            let open = kept >= limits.t_min;
+            weight[l] = select(open, alpha * t[l], F::ZERO);
+            // Neither is a choice between the old value and a new one, nor a maximum: LLVM would make masked stores
+            // of it, which cost tens of cycles on some machines. Sums of whole numbers are exact.
+            t[l] = select(open, kept, -t[l].abs());
+            last[l] += select(open, number - last[l], F::ZERO);
+        }
+        tile.t[y] = t;
+        tile.last[y] = last;
+        for c in 0..CHANNELS {
+            let color = &mut tile.color[c][y];
             for l in 0..TILE {
-                let power = e.at::<FMA>(l, dy, cy);
-                let alpha = least(power.blend_exp2::<FMA>(), limits.alpha_max);
-                let alpha = select(power >= limits.log_min, alpha, F::ZERO);
-                // A pixel that has stopped has a negative T and stays below the limit.
-                let kept = t[l] * (F::ONE - alpha);
-                let open = kept >= limits.t_min;
-                weight[l] = select(open, alpha * t[l], F::ZERO);
-                // Neither is a choice between the old value and a new one, nor a maximum: LLVM would make masked stores
-                // of it, which cost tens of cycles on some machines. Sums of whole numbers are exact.
-                t[l] = select(open, kept, -t[l].abs());
-                last[l] += select(open, number - last[l], F::ZERO);
-            }
-            tile.t[y] = t;
-            tile.last[y] = last;
-            for c in 0..CHANNELS {
-                let color = &mut tile.color[c][y];
-                for l in 0..TILE {
-                    color[l] = weight[l].fma::<FMA>(r.channels[c], color[l]);
-                }
+                color[l] = weight[l].fma::<FMA>(r.channels[c], color[l]);
             }
         }
     }
@@ -672,6 +670,7 @@ impl<F: Real> Kernel for Backward<'_, F> {
             self.begin(t, &mut backs[t], &mut d_background);
             reach[t] = most(&self.tiles[t].last).f64() as usize;
         }
+        let mut sums = [[[F::ZERO; TILE]; PAIR]; BATCH];
         let mut lists = Lists::new();
         for (k, batch) in self.records.chunks(BATCH).enumerate().rev() {
             let first = k * BATCH;
@@ -679,15 +678,21 @@ impl<F: Real> Kernel for Backward<'_, F> {
                 continue;
             }
             lists.fill(batch);
-            let out = &mut self.out[first..first + batch.len()];
+            sums[..batch.len()].fill([[F::ZERO; TILE]; PAIR]);
             for t in 0..TILES {
                 let list = lists.of(t);
                 let end = list.partition_point(|&i| first + usize::from(i) < reach[t]);
                 for &i in list[..end].iter().rev() {
                     let i = usize::from(i);
-                    let (number, sums) = (F::of((first + i + 1) as f64), &mut out[i]);
+                    let (number, sums) = (F::of((first + i + 1) as f64), &mut sums[i]);
                     let (tx, ty) = (t % SIDE, t / SIDE);
                     backward_splat::<F, FMA>(&mut backs[t], &batch[i], number, tx, ty, &self.limits, sums);
+                }
+            }
+            // Lanes are summed once a splat, not once a tile.
+            for (out, sums) in self.out[first..].iter_mut().zip(&sums[..batch.len()]) {
+                for k in 0..PAIR {
+                    out[k] = sum_lanes(sums[k]);
                 }
             }
         }
@@ -766,7 +771,7 @@ fn backward_splat<F: Real, const FMA: bool>(
     tx: usize,
     ty: usize,
     limits: &Limits<F>,
-    out: &mut [F; PAIR],
+    sums: &mut [Row<F>; PAIR],
 ) {
     let zero = [F::ZERO; TILE];
     let e = Exponent::new::<FMA>(r, tx, ty, limits);
@@ -778,39 +783,37 @@ fn backward_splat<F: Real, const FMA: bool>(
     let (mut v0, mut v1, mut v2, mut abs_x, mut abs_y) = (zero, zero, zero, zero, zero);
     let mut light = [zero; CHANNELS];
     for y in tile_rows(r, tx, ty) {
-        {
-            let dy = e.y - e.steps[y];
-            let (cy, by) = (e.c * dy, r.b * dy);
-            let (mut t, mut behind, last) = (back.t[y], back.behind[y], back.last[y]);
-            let g = [back.g[0][y], back.g[1][y], back.g[2][y], back.g[3][y]];
-            for l in 0..TILE {
-                let power = e.at::<FMA>(l, dy, cy);
-                let raw = power.blend_exp2::<FMA>();
-                let used = (power >= limits.log_min) & (number <= last[l]);
-                let alpha = select(used, least(raw, limits.alpha_max), F::ZERO);
-                t[l] /= F::ONE - alpha;
-                let mut s = r.channels[0] * g[0][l];
-                for c in 1..CHANNELS {
-                    s = r.channels[c].fma::<FMA>(g[c][l], s);
-                }
-                let ahead = s - behind[l];
-                let weight = alpha * t[l];
-                for c in 0..CHANNELS {
-                    light[c][l] = weight.fma::<FMA>(g[c][l], light[c][l]);
-                }
-                behind[l] = alpha.fma::<FMA>(ahead, behind[l]);
-                // dL/d ln α; nothing passes where α is at its ceiling.
-                let v = select(raw <= limits.alpha_max, weight * ahead, F::ZERO);
-                let vy = v * dy;
-                v0[l] += v;
-                v1[l] += vy;
-                v2[l] = vy.fma::<FMA>(dy, v2[l]);
-                abs_x[l] = v.abs().fma::<FMA>((ex[l] + by).abs(), abs_x[l]);
-                abs_y[l] = v.abs().fma::<FMA>((e.bx[l] + (cy + cy)).abs(), abs_y[l]);
+        let dy = e.y - e.steps[y];
+        let (cy, by) = (e.c * dy, r.b * dy);
+        let (mut t, mut behind, last) = (back.t[y], back.behind[y], back.last[y]);
+        let g = [back.g[0][y], back.g[1][y], back.g[2][y], back.g[3][y]];
+        for l in 0..TILE {
+            let power = e.at::<FMA>(l, dy, cy);
+            let raw = power.blend_exp2::<FMA>();
+            let used = (power >= limits.log_min) & (number <= last[l]);
+            let alpha = select(used, least(raw, limits.alpha_max), F::ZERO);
+            t[l] /= F::ONE - alpha;
+            let mut s = r.channels[0] * g[0][l];
+            for c in 1..CHANNELS {
+                s = r.channels[c].fma::<FMA>(g[c][l], s);
             }
-            back.t[y] = t;
-            back.behind[y] = behind;
+            let ahead = s - behind[l];
+            let weight = alpha * t[l];
+            for c in 0..CHANNELS {
+                light[c][l] = weight.fma::<FMA>(g[c][l], light[c][l]);
+            }
+            behind[l] = alpha.fma::<FMA>(ahead, behind[l]);
+            // dL/d ln α; nothing passes where α is at its ceiling.
+            let v = select(raw <= limits.alpha_max, weight * ahead, F::ZERO);
+            let vy = v * dy;
+            v0[l] += v;
+            v1[l] += vy;
+            v2[l] = vy.fma::<FMA>(dy, v2[l]);
+            abs_x[l] = v.abs().fma::<FMA>((ex[l] + by).abs(), abs_x[l]);
+            abs_y[l] = v.abs().fma::<FMA>((e.bx[l] + (cy + cy)).abs(), abs_y[l]);
         }
+        back.t[y] = t;
+        back.behind[y] = behind;
     }
     let dx = e.dx;
     let (mut vx, mut vxx, mut vxy) = (zero, zero, zero);
@@ -821,6 +824,8 @@ fn backward_splat<F: Real, const FMA: bool>(
     }
     let lanes = [v0, vx, vxx, v1, vxy, v2, abs_x, abs_y, light[0], light[1], light[2], light[3]];
     for k in 0..PAIR {
-        out[k] += sum_lanes(lanes[k]);
+        for l in 0..TILE {
+            sums[k][l] += lanes[k][l];
+        }
     }
 }
