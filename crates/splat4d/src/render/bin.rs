@@ -59,14 +59,16 @@ impl Footprint {
     }
 
     /// How many touched bins have a number below `bin`, bins being numbered by rows of `across`.
+    #[inline(always)]
     fn below(&self, bin: usize, across: usize) -> usize {
-        if self.y0 == self.y1 || bin < usize::from(self.y0) * across {
+        // The two cases of a run of all bins come first, without a division.
+        if bin <= usize::from(self.y0) * across {
             return 0;
         }
-        let (x, y) = (bin % across, bin / across);
-        if y >= usize::from(self.y1) {
+        if bin >= usize::from(self.y1) * across {
             return self.count();
         }
+        let (x, y) = (bin % across, bin / across);
         let (column, row) = (x.clamp(self.x0.into(), self.x1.into()) - usize::from(self.x0), y - usize::from(self.y0));
         if self.mask != 0 {
             return (u128::from(self.mask) & ((1 << (row * MASK_SIDE + column)) - 1)).count_ones() as usize;
