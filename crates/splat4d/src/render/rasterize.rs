@@ -8,7 +8,7 @@
 //! T_min. Source: Kerbl et al. 2023; gradients are 0 where α is at its ceiling, as in gsplat.
 
 use super::RenderConfig;
-use super::bin::{BIN, Bins, Footprint, id};
+use super::bin::{BIN, Bins, Footprint, PAIR_BUDGET, id};
 use super::parallel::{Even, Ragged, for_each_group};
 use super::project::{ALPHA_FLOOR, Projected, ProjectedGrads, TAU_MARGIN};
 use super::simd::{Kernel, Simd, dispatch};
@@ -35,10 +35,8 @@ const PAIR: usize = 12;
 /// Splats in a reduction task.
 const CHUNK: usize = 2048;
 
-/// Rows blended together: two independent chains hide each other's latency and share every constant.
-const ROWS: usize = 2;
 /// Splats whose lists of tiles are made at once: a number in a batch is one byte.
-const BATCH: usize = 256;
+const BATCH: usize = 128;
 /// Added under the root of a row range, so that rounding never loses a row that a tangent touches.
 const CHORD_MARGIN: f64 = 1e-5;
 
@@ -118,6 +116,8 @@ pub struct PixelGrads<'a, F = f32> {
 pub struct Raster<F = f32> {
     /// Sorted lists.
     pub bins: Bins,
+    /// Instead of [`PAIR_BUDGET`].
+    pub(super) budget: Option<usize>,
     width: usize,
     height: usize,
     simd: Option<Simd>,
@@ -158,9 +158,23 @@ impl<F: Real> Raster<F> {
         simd: Simd,
     ) {
         (self.width, self.height, self.simd) = (width, height, Some(simd));
-        self.bins.build(footprints, projected, width, height);
+        self.bins.count(footprints, width, height, self.budget.unwrap_or(PAIR_BUDGET));
+        self.tiles.resize(self.bins.bins() * TILES, Tile::default());
+        self.gather(projected, footprints, 0);
+    }
+
+    /// Sees to it that lists and records are those of run `run`.
+    fn hold(&mut self, projected: &[Projected<F>], footprints: &[Footprint], run: usize) {
+        if self.bins.current != run {
+            self.gather(projected, footprints, run);
+        }
+    }
+
+    /// Makes lists and records of one run of bins.
+    fn gather(&mut self, projected: &[Projected<F>], footprints: &[Footprint], run: usize) {
+        let (width, height, simd) = (self.width, self.height, self.simd.unwrap_or(Simd::Scalar));
+        self.bins.fill(footprints, projected, run);
         self.records.resize(self.bins.keys.len(), Record::default());
-        self.tiles.resize((self.bins.starts.len() - 1) * TILES, Tile::default());
         let bins = &self.bins;
         for_each_group(&bins.starts, Ragged(&mut self.records), &|bin, records| {
             let (x0, y0) = (bin % bins.across * BIN, bin / bins.across * BIN);
@@ -169,12 +183,29 @@ impl<F: Real> Raster<F> {
         });
     }
 
-    /// Blends four channels; one row of `channels` a splat.
-    pub fn blend(&mut self, channels: &[[F; CHANNELS]], config: &RenderConfig) {
+    /// Blends four channels; one row of `channels` a splat, the other rows as they were prepared.
+    pub fn blend(
+        &mut self,
+        projected: &[Projected<F>],
+        footprints: &[Footprint],
+        channels: &[[F; CHANNELS]],
+        config: &RenderConfig,
+    ) {
+        for run in 0..self.bins.runs.len() {
+            self.hold(projected, footprints, run);
+            self.blend_run(channels, config);
+        }
+    }
+
+    fn blend_run(&mut self, channels: &[[F; CHANNELS]], config: &RenderConfig) {
         let (simd, bins, limits) = (self.simd.unwrap_or(Simd::Scalar), &self.bins, Limits::new(config));
         let (width, height) = (self.width, self.height);
         let data = (Ragged(&mut self.records), Even(&mut self.tiles, TILES));
+        let run = &bins.runs[bins.current];
         for_each_group(&bins.starts, data, &|bin, (records, tiles)| {
+            if !run.contains(&bin) {
+                return;
+            }
             let keys = &bins.keys[bins.starts[bin] as usize..bins.starts[bin + 1] as usize];
             for (r, key) in records.0.iter_mut().zip(keys) {
                 r.channels = channels[id(*key)];
@@ -229,15 +260,48 @@ impl<F: Real> Raster<F> {
         d: &mut [ProjectedGrads<F>],
         d_channels: &mut [[F; CHANNELS]],
     ) -> [f64; CHANNELS] {
+        if geometry == Geometry::Overwrite {
+            d.par_chunks_mut(CHUNK).for_each(|d| d.fill(ProjectedGrads::default()));
+        }
+        d_channels.fill([F::ZERO; CHANNELS]);
+        self.backgrounds.clear();
+        self.backgrounds.resize(self.bins.bins(), [0.0; CHANNELS]);
+        for run in 0..self.bins.runs.len() {
+            self.hold(projected, footprints, run);
+            self.backward_run(projected, footprints, channels, background, grads, config, d, d_channels);
+        }
+        let mut total = [0.0; CHANNELS];
+        for bin in &self.backgrounds {
+            for c in 0..CHANNELS {
+                total[c] += bin[c];
+            }
+        }
+        total
+    }
+
+    /// [`Raster::backward`] of the current run, added to `d` and `d_channels`.
+    fn backward_run(
+        &mut self,
+        projected: &[Projected<F>],
+        footprints: &[Footprint],
+        channels: &[[F; CHANNELS]],
+        background: [F; CHANNELS],
+        grads: &PixelGrads<'_, F>,
+        config: &RenderConfig,
+        d: &mut [ProjectedGrads<F>],
+        d_channels: &mut [[F; CHANNELS]],
+    ) {
         let (simd, bins, limits) = (self.simd.unwrap_or(Simd::Scalar), &self.bins, Limits::new(config));
         let (width, height, tiles) = (self.width, self.height, &self.tiles);
         let pairs = bins.keys.len();
         self.pair_grads.resize(pairs, [F::ZERO; PAIR]);
         self.place.resize_with(pairs, AtomicU32::default);
-        self.backgrounds.resize(bins.starts.len() - 1, [0.0; CHANNELS]);
-        let place = &self.place;
+        let (place, run) = (&self.place, &bins.runs[bins.current]);
         let data = (Ragged(&mut self.records), (Ragged(&mut self.pair_grads), Even(&mut self.backgrounds, 1)));
         for_each_group(&bins.starts, data, &|bin, (records, (out, background_out))| {
+            if !run.contains(&bin) {
+                return;
+            }
             let start = bins.starts[bin] as usize;
             let keys = &bins.keys[start..bins.starts[bin + 1] as usize];
             let (bx, by) = (bin % bins.across, bin / bins.across);
@@ -245,8 +309,8 @@ impl<F: Real> Raster<F> {
                 let splat = id(*key);
                 r.channels = channels[splat];
                 // Every slot is written by exactly one task, so that the order of writes cannot matter.
-                let slot = bins.first[splat] as usize + footprints[splat].rank(bx, by);
-                place[slot].store((start + i) as u32, Ordering::Relaxed);
+                let slot = bins.first[splat].wrapping_add(footprints[splat].rank(bx, by) as u32);
+                place[slot as usize].store((start + i) as u32, Ordering::Relaxed);
             }
             out.0.fill([F::ZERO; PAIR]);
             let kernel = Backward {
@@ -267,17 +331,12 @@ impl<F: Real> Raster<F> {
             for (i, (d, d_ch)) in d.iter_mut().zip(d_ch).enumerate() {
                 let splat = chunk * CHUNK + i;
                 let mut sum = [F::ZERO; PAIR];
-                let first = bins.first[splat] as usize;
-                for slot in &place[first..first + footprints[splat].count()] {
+                for slot in &place[bins.slots(splat, &footprints[splat])] {
                     let pair = &pair_grads[slot.load(Ordering::Relaxed) as usize];
                     for k in 0..PAIR {
                         sum[k] += pair[k];
                     }
                 }
-                if geometry == Geometry::Overwrite {
-                    *d = ProjectedGrads::default();
-                }
-                *d_ch = [F::ZERO; CHANNELS];
                 let p = &projected[splat];
                 if p.radius > F::ZERO {
                     let [v, vx, vxx, vy, vxy, vyy, abs_x, abs_y, ..] = sum;
@@ -291,25 +350,20 @@ impl<F: Real> Raster<F> {
                     d.conic[1] -= vxy;
                     d.conic[2] -= F::HALF * vyy;
                     d.opacity += v / p.opacity;
-                    d_ch.copy_from_slice(&sum[8..]);
+                    for c in 0..CHANNELS {
+                        d_ch[c] += sum[8 + c];
+                    }
                 }
             }
         });
-        let mut total = [0.0; CHANNELS];
-        for bin in &self.backgrounds {
-            for c in 0..CHANNELS {
-                total[c] += bin[c];
-            }
-        }
-        total
     }
 
     /// Pairs of bin and splat.
     pub fn pairs(&self) -> usize {
-        self.bins.keys.len()
+        self.bins.total as usize
     }
 
-    /// Pixels that the blend loop evaluates for these pairs, were no pixel to stop early.
+    /// Pixels that the blend loop evaluates for the pairs that are held, were no pixel to stop early.
     pub fn blend_work(&self) -> usize {
         let rows = |r: &Record<F>, t: usize| usize::from(r.mask >> t & 1) * tile_rows(r, t % SIDE, t / SIDE).len();
         self.records.iter().map(|r| (0..TILES).map(|t| rows(r, t)).sum::<usize>() * TILE).sum()
@@ -440,12 +494,11 @@ impl Lists {
     }
 }
 
-/// The rows of tile (tx, ty) that a record can touch, widened to whole groups of [`ROWS`].
+/// The rows of tile (tx, ty) that a record can touch.
 #[inline(always)]
 fn tile_rows<F>(r: &Record<F>, tx: usize, ty: usize) -> std::ops::Range<usize> {
     let (top, [first, end]) = (ty * TILE, r.rows[tx % SIDE]);
-    let end = usize::from(end).saturating_sub(top).min(TILE);
-    usize::from(first).saturating_sub(top) / ROWS * ROWS..end.next_multiple_of(ROWS)
+    usize::from(first).saturating_sub(top)..usize::from(end).saturating_sub(top).min(TILE)
 }
 
 /// Exponents of α and their constants for one splat in one tile.
@@ -553,32 +606,30 @@ fn blend_splat<F: Real, const FMA: bool>(
     limits: &Limits<F>,
 ) {
     let e = Exponent::new::<FMA>(r, tx, ty, limits);
-    for top in tile_rows(r, tx, ty).step_by(ROWS) {
-        for y in top..top + ROWS {
-            let dy = e.y - e.steps[y];
-            let cy = e.c * dy;
-            let (mut t, mut last) = (tile.t[y], tile.last[y]);
-            let mut weight = [F::ZERO; TILE];
+    for y in tile_rows(r, tx, ty) {
+        let dy = e.y - e.steps[y];
+        let cy = e.c * dy;
+        let (mut t, mut last) = (tile.t[y], tile.last[y]);
+        let mut weight = [F::ZERO; TILE];
+        for l in 0..TILE {
+            let power = e.at::<FMA>(l, dy, cy);
+            let alpha = least(power.blend_exp2::<FMA>(), limits.alpha_max);
+            let alpha = select(power >= limits.log_min, alpha, F::ZERO);
+            // A pixel that has stopped has a negative T and stays below the limit.
+            let kept = t[l] * (F::ONE - alpha);
+            let open = kept >= limits.t_min;
+            weight[l] = select(open, alpha * t[l], F::ZERO);
+            // Neither is a choice between the old value and a new one, nor a maximum: LLVM would make masked stores
+            // of it, which cost tens of cycles on some machines. Sums of whole numbers are exact.
+            t[l] = select(open, kept, -t[l].abs());
+            last[l] += select(open, number - last[l], F::ZERO);
+        }
+        tile.t[y] = t;
+        tile.last[y] = last;
+        for c in 0..CHANNELS {
+            let color = &mut tile.color[c][y];
             for l in 0..TILE {
-                let power = e.at::<FMA>(l, dy, cy);
-                let alpha = least(power.blend_exp2::<FMA>(), limits.alpha_max);
-                let alpha = select(power >= limits.log_min, alpha, F::ZERO);
-                // A pixel that has stopped has a negative T and stays below the limit.
-                let kept = t[l] * (F::ONE - alpha);
-                let open = kept >= limits.t_min;
-                weight[l] = select(open, alpha * t[l], F::ZERO);
-                // Neither is a choice between the old value and a new one, nor a maximum: LLVM would make masked stores
-                // of it, which cost tens of cycles on some machines. Sums of whole numbers are exact.
-                t[l] = select(open, kept, -t[l].abs());
-                last[l] += select(open, number - last[l], F::ZERO);
-            }
-            tile.t[y] = t;
-            tile.last[y] = last;
-            for c in 0..CHANNELS {
-                let color = &mut tile.color[c][y];
-                for l in 0..TILE {
-                    color[l] = weight[l].fma::<FMA>(r.channels[c], color[l]);
-                }
+                color[l] = weight[l].fma::<FMA>(r.channels[c], color[l]);
             }
         }
     }
@@ -619,6 +670,7 @@ impl<F: Real> Kernel for Backward<'_, F> {
             self.begin(t, &mut backs[t], &mut d_background);
             reach[t] = most(&self.tiles[t].last).f64() as usize;
         }
+        let mut sums = [[[F::ZERO; TILE]; PAIR]; BATCH];
         let mut lists = Lists::new();
         for (k, batch) in self.records.chunks(BATCH).enumerate().rev() {
             let first = k * BATCH;
@@ -626,15 +678,21 @@ impl<F: Real> Kernel for Backward<'_, F> {
                 continue;
             }
             lists.fill(batch);
-            let out = &mut self.out[first..first + batch.len()];
+            sums[..batch.len()].fill([[F::ZERO; TILE]; PAIR]);
             for t in 0..TILES {
                 let list = lists.of(t);
                 let end = list.partition_point(|&i| first + usize::from(i) < reach[t]);
                 for &i in list[..end].iter().rev() {
                     let i = usize::from(i);
-                    let (number, sums) = (F::of((first + i + 1) as f64), &mut out[i]);
+                    let (number, sums) = (F::of((first + i + 1) as f64), &mut sums[i]);
                     let (tx, ty) = (t % SIDE, t / SIDE);
                     backward_splat::<F, FMA>(&mut backs[t], &batch[i], number, tx, ty, &self.limits, sums);
+                }
+            }
+            // Lanes are summed once a splat, not once a tile.
+            for (out, sums) in self.out[first..].iter_mut().zip(&sums[..batch.len()]) {
+                for k in 0..PAIR {
+                    out[k] = sum_lanes(sums[k]);
                 }
             }
         }
@@ -713,7 +771,7 @@ fn backward_splat<F: Real, const FMA: bool>(
     tx: usize,
     ty: usize,
     limits: &Limits<F>,
-    out: &mut [F; PAIR],
+    sums: &mut [Row<F>; PAIR],
 ) {
     let zero = [F::ZERO; TILE];
     let e = Exponent::new::<FMA>(r, tx, ty, limits);
@@ -724,40 +782,38 @@ fn backward_splat<F: Real, const FMA: bool>(
     // Sums down each column; dx is the same for all rows, so its powers wait until the end.
     let (mut v0, mut v1, mut v2, mut abs_x, mut abs_y) = (zero, zero, zero, zero, zero);
     let mut light = [zero; CHANNELS];
-    for top in tile_rows(r, tx, ty).step_by(ROWS) {
-        for y in top..top + ROWS {
-            let dy = e.y - e.steps[y];
-            let (cy, by) = (e.c * dy, r.b * dy);
-            let (mut t, mut behind, last) = (back.t[y], back.behind[y], back.last[y]);
-            let g = [back.g[0][y], back.g[1][y], back.g[2][y], back.g[3][y]];
-            for l in 0..TILE {
-                let power = e.at::<FMA>(l, dy, cy);
-                let raw = power.blend_exp2::<FMA>();
-                let used = (power >= limits.log_min) & (number <= last[l]);
-                let alpha = select(used, least(raw, limits.alpha_max), F::ZERO);
-                t[l] /= F::ONE - alpha;
-                let mut s = r.channels[0] * g[0][l];
-                for c in 1..CHANNELS {
-                    s = r.channels[c].fma::<FMA>(g[c][l], s);
-                }
-                let ahead = s - behind[l];
-                let weight = alpha * t[l];
-                for c in 0..CHANNELS {
-                    light[c][l] = weight.fma::<FMA>(g[c][l], light[c][l]);
-                }
-                behind[l] = alpha.fma::<FMA>(ahead, behind[l]);
-                // dL/d ln α; nothing passes where α is at its ceiling.
-                let v = select(raw <= limits.alpha_max, weight * ahead, F::ZERO);
-                let vy = v * dy;
-                v0[l] += v;
-                v1[l] += vy;
-                v2[l] = vy.fma::<FMA>(dy, v2[l]);
-                abs_x[l] = v.abs().fma::<FMA>((ex[l] + by).abs(), abs_x[l]);
-                abs_y[l] = v.abs().fma::<FMA>((e.bx[l] + (cy + cy)).abs(), abs_y[l]);
+    for y in tile_rows(r, tx, ty) {
+        let dy = e.y - e.steps[y];
+        let (cy, by) = (e.c * dy, r.b * dy);
+        let (mut t, mut behind, last) = (back.t[y], back.behind[y], back.last[y]);
+        let g = [back.g[0][y], back.g[1][y], back.g[2][y], back.g[3][y]];
+        for l in 0..TILE {
+            let power = e.at::<FMA>(l, dy, cy);
+            let raw = power.blend_exp2::<FMA>();
+            let used = (power >= limits.log_min) & (number <= last[l]);
+            let alpha = select(used, least(raw, limits.alpha_max), F::ZERO);
+            t[l] /= F::ONE - alpha;
+            let mut s = r.channels[0] * g[0][l];
+            for c in 1..CHANNELS {
+                s = r.channels[c].fma::<FMA>(g[c][l], s);
             }
-            back.t[y] = t;
-            back.behind[y] = behind;
+            let ahead = s - behind[l];
+            let weight = alpha * t[l];
+            for c in 0..CHANNELS {
+                light[c][l] = weight.fma::<FMA>(g[c][l], light[c][l]);
+            }
+            behind[l] = alpha.fma::<FMA>(ahead, behind[l]);
+            // dL/d ln α; nothing passes where α is at its ceiling.
+            let v = select(raw <= limits.alpha_max, weight * ahead, F::ZERO);
+            let vy = v * dy;
+            v0[l] += v;
+            v1[l] += vy;
+            v2[l] = vy.fma::<FMA>(dy, v2[l]);
+            abs_x[l] = v.abs().fma::<FMA>((ex[l] + by).abs(), abs_x[l]);
+            abs_y[l] = v.abs().fma::<FMA>((e.bx[l] + (cy + cy)).abs(), abs_y[l]);
         }
+        back.t[y] = t;
+        back.behind[y] = behind;
     }
     let dx = e.dx;
     let (mut vx, mut vxx, mut vxy) = (zero, zero, zero);
@@ -768,6 +824,8 @@ fn backward_splat<F: Real, const FMA: bool>(
     }
     let lanes = [v0, vx, vxx, v1, vxy, v2, abs_x, abs_y, light[0], light[1], light[2], light[3]];
     for k in 0..PAIR {
-        out[k] += sum_lanes(lanes[k]);
+        for l in 0..TILE {
+            sums[k][l] += lanes[k][l];
+        }
     }
 }
