@@ -50,7 +50,7 @@ recipe! {
     /// Seed of every random choice.
     seed: u64 = 0,
     /// Training steps in all.
-    iterations: usize = 6000,
+    iterations: usize = 5500,
     /// Views a step.
     batch_size: usize = 1,
     /// Images are reduced by this factor (mean of k×k boxes).
@@ -84,17 +84,17 @@ recipe! {
     /// Moments at which initial points are spread over the clip; 0: about every 5 frames.
     init_keyframes: usize = 0,
     /// Rate of positions at the start, of the extent.
-    position_lr_init: f64 = 1.6e-4,
+    position_lr_init: f64 = 1e-3,
     /// Rate of positions at the end, of the extent.
-    position_lr_final: f64 = 1.6e-6,
+    position_lr_final: f64 = 1e-5,
     /// Rates that are not given two ends (colour, opacity, scale, rotation, life) fall to this share of themselves.
-    lr_decay: f64 = 0.1,
+    lr_decay: f64 = 1.0,
     /// Rate of base colour; the higher SH degrees learn 20 times slower.
-    feature_lr: f64 = 2.5e-3,
+    feature_lr: f64 = 6e-3,
     /// Rate of opacity logits.
     opacity_lr: f64 = 0.05,
     /// Rate of log scales.
-    scaling_lr: f64 = 5e-3,
+    scaling_lr: f64 = 0.015,
     /// Rate of quaternions.
     rotation_lr: f64 = 1e-3,
     /// spacetime: order of the motion polynomial, 0 to 3.
@@ -106,7 +106,7 @@ recipe! {
     /// spacetime: life's centre learns from opacity alone (STG).
     detach: bool = false,
     /// spacetime: rate of velocities at the start, extents a clip.
-    velocity_lr_init: f64 = 1.6e-3,
+    velocity_lr_init: f64 = 5e-3,
     /// spacetime: rate of velocities at the end, extents a clip.
     velocity_lr_final: f64 = 1.6e-5,
     /// spacetime: rate of quaternion rates, 1/clip.
@@ -123,8 +123,8 @@ recipe! {
     lambda_opacity_life: f64 = 0.0,
     /// Weight of the velocity smoothness over nearest neighbours.
     lambda_velocity: f64 = 0.0,
-    /// Densification: mcmc, adc or none.
-    strategy: String = "mcmc".into(),
+    /// Densification: adc, mcmc or none.
+    strategy: String = "adc".into(),
     /// Never more Gaussians than this.
     max_cap: usize = 30_000,
     /// Iterations between densifications; 0: iterations/60, at least 50.
@@ -140,7 +140,7 @@ recipe! {
     /// adc: iterations between opacity resets; 0: never (a reset destroys temporal models).
     opacity_reset_interval: usize = 0,
     /// Opacity below which a Gaussian is dead.
-    min_opacity: f64 = 0.005,
+    min_opacity: f64 = 0.02,
     /// mcmc: growth a densification, up to the cap.
     growth: f64 = 1.05,
     /// mcmc: strength of the position noise.
