@@ -410,20 +410,25 @@ fn foreign_checkpoints_are_refused_with_a_reason() {
 }
 
 #[test]
+#[cfg(unix)]
 fn unwritable_outputs_and_too_little_memory_are_refused() {
     let place = Place::new();
     let base = recipe(&[]);
     let file = place.run("file");
     std::fs::write(&file, b"x").unwrap();
-    for run in [file.as_path(), Path::new("/dev/full"), &file.join("below")] {
+    // Always through a link in our own folder: a writer that replaced its target would replace the link, no device.
+    let full = place.run("full");
+    std::os::unix::fs::symlink("/dev/full", &full).unwrap();
+    for run in [file.as_path(), full.as_path(), &file.join("below")] {
         let (options, stop) = (TrainOptions::default(), AtomicBool::new(false));
         let error = train(place.open(&base), base.clone(), run, &options, &stop, &mut |_| {}).unwrap_err();
         assert_eq!(error.kind(), ErrorKind::Io, "{error}");
         assert!(error.to_string().contains(&run.display().to_string()), "{error}");
     }
     assert_eq!(std::fs::read(&file).unwrap(), b"x");
-    let error = write_atomically(Path::new("/dev/full"), b"0123").unwrap_err();
+    let error = write_atomically(&full, b"0123").unwrap_err();
     assert_eq!(error.kind(), ErrorKind::Io, "{error}");
+    assert!(full.is_symlink() && !full.metadata().unwrap().is_file(), "a device is never replaced");
     let error = place.train("poor", &recipe(&["memory_limit=100000"])).unwrap_err();
     assert_eq!(error.kind(), ErrorKind::Memory, "{error}");
     assert!(error.to_string().contains("max_cap"), "{error}");
