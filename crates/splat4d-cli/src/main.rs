@@ -1,1 +1,149 @@
-fn main() {}
+//! The `splat4d` command: posed, moving captures become trained, measured and rendered 4D scenes on a plain CPU.
+//!
+//! Each verb is a file in `verbs`. Only this crate prints, parses arguments or exits: 0 done, 1 failed, 2 bad input.
+
+mod camera_file;
+mod console;
+mod draw;
+mod files;
+mod finish;
+mod freeze;
+mod interrupt;
+mod paths;
+mod report;
+mod run_folder;
+mod source;
+mod verbs;
+mod video;
+
+use clap::{Parser, Subcommand};
+use console::{Console, Loudness};
+use splat4d::{Error, ErrorKind};
+use std::process::ExitCode;
+
+/// Exit code of work that failed.
+const FAILED: u8 = 1;
+/// Exit code of bad input: the user's files or options.
+const BAD_INPUT: u8 = 2;
+
+const EXAMPLES: &str = "\
+Examples:
+  splat4d train examples/knight            train, measure, report and film the bundled capture
+  splat4d train my-take --minutes 10       fit the steps of training into ten minutes
+  splat4d train --resume runs/my-take      continue exactly where a run stopped
+  splat4d eval runs/knight --baseline      measure again, next to a scene that stands still
+  splat4d render runs/knight -o turn.mp4   film an orbit through space and time
+  splat4d export runs/knight -o now.ply --time 0.5
+  splat4d info my-take                     what is in a capture, run or file; is it healthy?
+
+Exit codes: 0 done, 1 failed or interrupted, 2 bad input.";
+
+/// 4D Gaussian splatting on a plain CPU: a posed, moving capture becomes a scene to look at from anywhere, at any time.
+#[derive(Debug, Parser)]
+#[command(name = "splat4d", version, after_help = EXAMPLES, max_term_width = 110)]
+struct Cli {
+    #[command(flatten)]
+    globals: Globals,
+    #[command(subcommand)]
+    verb: Verb,
+}
+
+/// Options of every verb.
+#[derive(Debug, clap::Args)]
+struct Globals {
+    /// Print events and results for machines: one JSON object a line
+    #[arg(long, global = true)]
+    json: bool,
+    /// Say more
+    #[arg(short, long, global = true, conflicts_with = "quiet")]
+    verbose: bool,
+    /// Say only warnings and errors
+    #[arg(short, long, global = true)]
+    quiet: bool,
+    /// Threads to work with [default: all cores]; the result does not depend on it
+    #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    threads: Option<u16>,
+}
+
+#[derive(Debug, Subcommand)]
+enum Verb {
+    Train(Box<verbs::train::Args>),
+    Eval(verbs::eval::Args),
+    Render(verbs::render::Args),
+    Export(verbs::export::Args),
+    Info(verbs::info::Args),
+    Completions(verbs::completions::Args),
+}
+
+fn main() -> ExitCode {
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(error) => {
+            let _ = error.print();
+            return if error.use_stderr() { BAD_INPUT.into() } else { ExitCode::SUCCESS };
+        }
+    };
+    let loudness = match (cli.globals.quiet, cli.globals.verbose) {
+        (true, _) => Loudness::Quiet,
+        (_, true) => Loudness::Verbose,
+        _ => Loudness::Normal,
+    };
+    let console = Console::new(loudness, cli.globals.json);
+    let done = threads(cli.globals.threads).and_then(|()| match cli.verb {
+        Verb::Train(args) => verbs::train::run(&args, &console),
+        Verb::Eval(args) => verbs::eval::run(&args, &console),
+        Verb::Render(args) => verbs::render::run(&args, &console),
+        Verb::Export(args) => verbs::export::run(&args, &console),
+        Verb::Info(args) => verbs::info::run(&args, &console),
+        Verb::Completions(args) => verbs::completions::run(&args, &console),
+    });
+    match done {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            let code = exit_code(&error);
+            console.error(&format!("{error:#}"), code);
+            code.into()
+        }
+    }
+}
+
+fn threads(count: Option<u16>) -> anyhow::Result<()> {
+    if let Some(count) = count {
+        rayon::ThreadPoolBuilder::new()
+            .num_threads(count.into())
+            .build_global()
+            .map_err(|e| anyhow::anyhow!("{count} threads could not be started ({e}). Ask for fewer."))?;
+    }
+    Ok(())
+}
+
+/// 2 where the user's data, files or options are at fault, 1 for everything else.
+fn exit_code(error: &anyhow::Error) -> u8 {
+    match error.downcast_ref::<Error>().map(Error::kind) {
+        Some(ErrorKind::BadInput | ErrorKind::Io | ErrorKind::Unsupported) => BAD_INPUT,
+        _ => FAILED,
+    }
+}
+
+/// The whole command, for completions and help.
+fn command() -> clap::Command {
+    <Cli as clap::CommandFactory>::command()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        command().debug_assert();
+    }
+
+    #[test]
+    fn errors_of_the_users_data_are_two_and_failures_one() {
+        assert_eq!(exit_code(&Error::input("x").into()), 2);
+        assert_eq!(exit_code(&Error::new(ErrorKind::Unsupported, "x").into()), 2);
+        assert_eq!(exit_code(&Error::new(ErrorKind::Diverged, "x").into()), 1);
+        assert_eq!(exit_code(&anyhow::anyhow!("ffmpeg died")), 1);
+    }
+}

@@ -69,6 +69,8 @@ recipe! {
     sh_degree: usize = 1,
     /// Iterations before each further SH degree is unlocked; 0: iterations/10.
     sh_degree_interval: usize = 0,
+    /// Share of the iterations, from the first, that see pictures at half size.
+    half_size_until: f64 = 0.4,
     /// Share of D-SSIM in the photometric loss.
     lambda_dssim: f64 = 0.2,
     /// Weight of the alpha-mask loss |alpha − mask| where masks cover the whole scene (RGBA captures).
@@ -85,6 +87,8 @@ recipe! {
     position_lr_init: f64 = 1.6e-4,
     /// Rate of positions at the end, of the extent.
     position_lr_final: f64 = 1.6e-6,
+    /// Rates that are not given two ends (colour, opacity, scale, rotation, life) fall to this share of themselves.
+    lr_decay: f64 = 0.1,
     /// Rate of base colour; the higher SH degrees learn 20 times slower.
     feature_lr: f64 = 2.5e-3,
     /// Rate of opacity logits.
@@ -238,6 +242,7 @@ impl Recipe {
             ("velocity_lr_init", self.velocity_lr_init),
             ("velocity_lr_final", self.velocity_lr_final),
             ("growth", self.growth),
+            ("lr_decay", self.lr_decay),
         ];
         for (knob, value) in positive {
             if !(value > 0.0 && value.is_finite()) {
@@ -268,6 +273,7 @@ impl Recipe {
         }
         let shares = [
             ("lambda_dssim", self.lambda_dssim),
+            ("half_size_until", self.half_size_until),
             ("relocate_gradient", self.relocate_gradient),
             ("min_opacity", self.min_opacity),
         ];

@@ -7,6 +7,7 @@ pub(crate) mod conv;
 pub mod lpips;
 pub mod metrics;
 mod report;
+pub mod run;
 
 pub use lpips::{InputScaling, Lpips, Net};
 pub use report::{Report, Score, Split, View};

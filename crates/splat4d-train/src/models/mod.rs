@@ -65,6 +65,13 @@ impl Rate {
     }
 }
 
+impl Recipe {
+    /// A rate that falls to `lr_decay` of itself over the stage.
+    pub fn falling(&self, rate: f64) -> Rate {
+        Rate { start: rate, end: rate * self.lr_decay }
+    }
+}
+
 /// A learnable group: one column group of one table. What no group names is frozen.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Group {
@@ -110,6 +117,8 @@ pub struct Stage<F: Real = f32> {
     pub densify_steps: (usize, usize, usize),
     /// Steps before each further SH degree; 0: all at once.
     pub sh_interval: usize,
+    /// The first so many steps see pictures at half size: coarse things first, and four times faster.
+    pub half_size_steps: usize,
     /// Lower bound of log life widths, by layer; learnt values are lifted to it.
     pub min_log_life: Option<f64>,
     /// Before the first step.
@@ -132,6 +141,7 @@ impl<F: Real> Stage<F> {
             densify: Densify::None,
             densify_steps: (0, 0, 0),
             sh_interval: 0,
+            half_size_steps: 0,
             min_log_life: None,
             start: None,
             end: None,

@@ -36,16 +36,16 @@ impl Program for SpacetimeProgram {
             stage.groups.push(Group { part: Some((3 * k, 3)), ..Group::new("velocities", rate) });
         }
         if r.rotation_rate {
-            stage.groups.push(Group::new("rotation_rates", Rate::constant(r.rotation_rate_lr / clip)));
+            stage.groups.push(Group::new("rotation_rates", r.falling(r.rotation_rate_lr / clip)));
         }
         let life = self.life(plan);
         if life != LifeKind::Infinite {
-            stage.groups.push(Group::new("life_centers", Rate::constant(r.life_center_lr * clip)));
-            stage.groups.push(Group::new("life_log_widths", Rate::constant(r.life_width_lr)));
+            stage.groups.push(Group::new("life_centers", r.falling(r.life_center_lr * clip)));
+            stage.groups.push(Group::new("life_log_widths", r.falling(r.life_width_lr)));
             stage.min_log_life = Some((r.min_life_frames / plan.fps).max(1e-6).ln());
         }
         if life == LifeKind::Interval {
-            stage.groups.push(Group::new("life_log_softness", Rate::constant(r.life_width_lr)));
+            stage.groups.push(Group::new("life_log_softness", r.falling(r.life_width_lr)));
         }
         if r.lambda_opacity_life > 0.0 {
             stage.params.push(Box::new(LivingOpacity { weight: r.lambda_opacity_life }));

@@ -33,14 +33,14 @@ pub fn groups(r: &Recipe, extent: f64) -> Vec<Group> {
     let positions = Rate { start: r.position_lr_init * extent, end: r.position_lr_final * extent };
     let mut groups = vec![
         Group::new("means", positions),
-        Group::new("quats", Rate::constant(r.rotation_lr)),
-        Group::new("log_scales", Rate::constant(r.scaling_lr)),
-        Group::new("opacity_logits", Rate::constant(r.opacity_lr)),
-        Group { part: Some((0, 3)), ..Group::new("sh", Rate::constant(r.feature_lr)) },
+        Group::new("quats", r.falling(r.rotation_lr)),
+        Group::new("log_scales", r.falling(r.scaling_lr)),
+        Group::new("opacity_logits", r.falling(r.opacity_lr)),
+        Group { part: Some((0, 3)), ..Group::new("sh", r.falling(r.feature_lr)) },
     ];
     let rest = 3 * ((r.sh_degree + 1) * (r.sh_degree + 1) - 1);
     if rest > 0 {
-        let rate = Rate::constant(r.feature_lr / SH_REST_SLOWDOWN);
+        let rate = r.falling(r.feature_lr / SH_REST_SLOWDOWN);
         groups.push(Group { part: Some((3, rest)), ..Group::new("sh", rate) });
     }
     groups
@@ -67,6 +67,7 @@ pub fn stage(name: &str, plan: &Plan) -> Stage {
         densify,
         densify_steps,
         sh_interval: r.sh_degree_interval,
+        half_size_steps: (r.half_size_until * r.iterations as f64) as usize,
         ..Stage::new(name, r.iterations)
     }
 }

@@ -14,6 +14,30 @@ pub struct Picture {
     pub weight: Option<Planes<f32>>,
 }
 
+impl Picture {
+    /// Half the size: the mean of 2x2 boxes, an odd last row or column left out (as `Camera::downscaled`).
+    pub fn halve(&mut self) {
+        halve(&mut self.color);
+        self.mask.as_mut().map(halve);
+        self.weight.as_mut().map(halve);
+    }
+}
+
+fn halve(planes: &mut Planes<f32>) {
+    let (height, width) = (planes.height / 2, planes.width / 2);
+    let mut out = Planes::new(planes.channels, height, width);
+    for c in 0..planes.channels {
+        for (y, row) in out.plane_mut(c).chunks_exact_mut(width).enumerate() {
+            let first = (c * planes.height + 2 * y) * planes.width;
+            let (upper, lower) = (&planes.data[first..], &planes.data[first + planes.width..]);
+            for (x, o) in row.iter_mut().enumerate() {
+                *o = 0.25 * (upper[2 * x] + upper[2 * x + 1] + lower[2 * x] + lower[2 * x + 1]);
+            }
+        }
+    }
+    *planes = out;
+}
+
 /// The pictures a scene is trained on.
 pub trait Frames: Send + Sync {
     /// How many.
@@ -38,4 +62,16 @@ pub trait Frames: Send + Sync {
     fn load(&self, i: usize, out: &mut Picture) -> Result<()>;
     /// These will be asked for soon; must not change any result.
     fn prefetch(&self, _frames: &[usize]) {}
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn half_a_picture_is_the_mean_of_its_boxes() {
+        let mut p = Planes::from_interleaved(1, 3, 5, &(0..15).map(|x| x as f32).collect::<Vec<_>>());
+        halve(&mut p);
+        assert_eq!((p.height, p.width, p.data), (1, 2, vec![3.0, 5.0]));
+    }
 }

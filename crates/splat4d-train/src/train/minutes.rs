@@ -32,7 +32,7 @@ pub(super) fn plan(bench: &Bench, recipe: &Recipe, minutes: f64, listen: &mut dy
     // A probe's rates do not matter, its number of Gaussians does: nothing of it is kept.
     let mut trainer = bench.trainer(&plan, scene)?;
     trainer.check_not_empty()?;
-    let first = time(&mut trainer)?;
+    let first = [time(&mut trainer, true)?, time(&mut trainer, false)?];
     tell(listen, 1);
     let grow = Densify::Mcmc(Mcmc { growth: 2.0, gradient_share: 0.0, noise_lr: 0.0 });
     let mut step = 0;
@@ -43,12 +43,11 @@ pub(super) fn plan(bench: &Bench, recipe: &Recipe, minutes: f64, listen: &mut dy
     }
     trainer.refit();
     let end = trainer.scene.len();
-    let last = if end > start { time(&mut trainer)? } else { first };
+    let last = [time(&mut trainer, true)?, time(&mut trainer, false)?];
     tell(listen, 2);
     let seconds = minutes * 60.0;
-    let cost = |iterations: usize| {
-        schedule_cost(&Recipe { iterations, ..reset(recipe) }.resolve(), [start, end], [first, last])
-    };
+    let cost =
+        |iterations: usize| schedule_cost(&Recipe { iterations, ..reset(recipe) }.resolve(), [start, end], first, last);
     let (mut low, mut high) = (*ITERATIONS.start(), *ITERATIONS.end());
     while low + 1 < high {
         let middle = low.midpoint(high);
@@ -69,8 +68,11 @@ fn reset(recipe: &Recipe) -> Recipe {
     }
 }
 
-/// Seconds a step.
-fn time(trainer: &mut super::trainer::Trainer<'_>) -> Result<f64> {
+/// Seconds a step, at half or at full size.
+fn time(trainer: &mut super::trainer::Trainer<'_>, half: bool) -> Result<f64> {
+    for stage in &mut trainer.stages {
+        stage.half_size_steps = if half { usize::MAX } else { 0 };
+    }
     let mut clock = Clock::now();
     for i in 0..WARM_UP + TIMED {
         if i == WARM_UP {
@@ -84,34 +86,42 @@ fn time(trainer: &mut super::trainer::Trainer<'_>) -> Result<f64> {
     Ok(clock.elapsed().as_secs_f64() / TIMED as f64)
 }
 
-/// Seconds of a whole run: the cost of a step is linear in the number of Gaussians, which grows by the schedule.
-fn schedule_cost(r: &Recipe, gaussians: [usize; 2], step: [f64; 2]) -> f64 {
+/// Seconds of a whole run: the cost of a step is linear in the number of Gaussians, which grows by the schedule. `first`
+/// and `last`: seconds a step [half size, full size] at the two numbers of Gaussians.
+fn schedule_cost(r: &Recipe, gaussians: [usize; 2], first: [f64; 2], last: [f64; 2]) -> f64 {
     let [start, end] = gaussians.map(|n| n as f64);
-    let slope = if end > start { (step[1] - step[0]) / (end - start) } else { 0.0 };
+    let half_until = (r.half_size_until * r.iterations as f64) as usize;
     let mut count = start;
     let mut total = 0.0;
-    let mut i = 0;
-    while i < r.iterations {
-        let until = (i + r.densification_interval).min(r.iterations);
-        total += (until - i) as f64 * (step[0] + slope * (count - start));
-        i = until;
-        if i >= r.densify_from_iter && i <= r.densify_until_iter {
-            count = (count * r.growth).min(end);
+    for i in 0..r.iterations {
+        let size = usize::from(i >= half_until);
+        let slope = if end > start { (last[size] - first[size]) / (end - start) } else { 0.0 };
+        total += first[size] + slope * (count - start);
+        let step = i + 1;
+        let densifies = step >= r.densify_from_iter && step <= r.densify_until_iter;
+        if densifies && step.is_multiple_of(r.densification_interval) {
+            // ADC reaches the cap within a few densifications; MCMC grows by its factor.
+            count = (count * if r.strategy == "adc" { ADC_GROWTH } else { r.growth }).min(end);
         }
     }
     total
 }
+
+/// About how much a densification by gradients adds on real captures, until the cap.
+const ADC_GROWTH: f64 = 1.2;
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn the_cost_follows_the_growth() {
-        let r = Recipe { iterations: 1000, ..Recipe::default() }.resolve();
-        let flat = schedule_cost(&r, [1000, 1000], [0.01, 0.01]);
+    fn the_cost_follows_the_growth_and_the_size() {
+        let r = Recipe { iterations: 1000, half_size_until: 0.0, ..Recipe::default() }.resolve();
+        let flat = schedule_cost(&r, [1000, 1000], [0.01; 2], [0.01; 2]);
         assert!((flat - 10.0).abs() < 1e-9);
-        let grown = schedule_cost(&r, [1000, 2000], [0.01, 0.02]);
+        let grown = schedule_cost(&r, [1000, 2000], [0.01; 2], [0.02; 2]);
         assert!(grown > 12.0 && grown < 20.0, "{grown}");
+        let r = Recipe { half_size_until: 0.5, ..r };
+        assert!((schedule_cost(&r, [1000, 1000], [0.0, 0.01], [0.0, 0.01]) - 5.0).abs() < 1e-9);
     }
 }

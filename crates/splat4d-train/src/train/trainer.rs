@@ -11,7 +11,7 @@ use crate::{Error, ErrorKind, Result};
 use splat4d::layers::Scene;
 use splat4d::math::Rng;
 use splat4d::scene::life::LOG_WIDTH;
-use splat4d::scene::{GEOMETRY, Grads, LIFE, Space};
+use splat4d::scene::{Camera, GEOMETRY, Grads, LIFE, Space};
 use std::sync::Arc;
 use std::time::{Duration, Instant as Clock};
 
@@ -256,11 +256,26 @@ impl<'a> Trainer<'a> {
     fn forward_backward(&mut self, seen: &[usize], out: &mut Stepped) {
         let stage = &self.stages[self.progress.stage];
         let background = self.settings.background;
+        let half = self.progress.stage_step < stage.half_size_steps;
+        let cameras: Vec<Camera> = seen
+            .iter()
+            .zip(&mut self.pictures)
+            .map(|(&i, picture)| {
+                let camera = self.frames.camera(i);
+                if half && camera.width > 1 && camera.height > 1 {
+                    picture.halve();
+                    camera.downscaled(2)
+                } else {
+                    camera.clone()
+                }
+            })
+            .collect();
         let views: Vec<View<'_, f32>> = seen
             .iter()
             .zip(&self.pictures)
-            .map(|(&i, picture)| View {
-                camera: self.frames.camera(i),
+            .zip(&cameras)
+            .map(|((&i, picture), camera)| View {
+                camera,
                 t: self.frames.time(i),
                 background,
                 truth: &picture.color,

@@ -244,7 +244,7 @@ impl<F: Real> Renderer<F> {
         self.radii.par_iter_mut().zip(&self.projected).with_min_len(4096).for_each(|(r, p)| *r = p.radius);
         self.raster.prepare(&self.projected, &self.footprints, w, h, simd);
         self.seconds.bin = clock.lap();
-        self.raster.blend(&self.channels, &self.config);
+        self.raster.blend(&self.projected, &self.footprints, &self.channels, &self.config);
         let widths = extra.map_or(0, Table::width);
         reshape(&mut out.color, 3, h, w);
         reshape(&mut out.alpha, 1, h, w);
@@ -265,7 +265,7 @@ impl<F: Real> Renderer<F> {
         let widths = table.width();
         for first in (0..widths).step_by(CHANNELS) {
             pack(table, first, &mut self.extra);
-            self.raster.blend(&self.extra, &self.config);
+            self.raster.blend(&self.projected, &self.footprints, &self.extra, &self.config);
             for c in first..widths.min(first + CHANNELS) {
                 self.raster.channel(c - first, F::ZERO, out.extra.plane_mut(c));
             }

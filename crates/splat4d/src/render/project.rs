@@ -16,9 +16,9 @@ const J_MARGIN: f64 = 0.3;
 /// Least compensation ρ of the antialiased mode (gsplat).
 const RHO_MIN: f64 = 0.005;
 /// Added to τ, so that rounding never loses a pixel at the α cut-off; the blend decides about each pixel itself.
-const TAU_MARGIN: f64 = 1e-3;
+pub(super) const TAU_MARGIN: f64 = 1e-3;
 /// The smallest α cut-off that is told from 0: an extent must be finite.
-const ALPHA_FLOOR: f64 = 1e-30;
+pub(super) const ALPHA_FLOOR: f64 = 1e-30;
 /// Radius in standard deviations that `radius` reports (Inria).
 const RADIUS_SIGMAS: f64 = 3.0;
 /// Rows in a task: whole blocks of a table.

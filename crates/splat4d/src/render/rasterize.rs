@@ -8,12 +8,14 @@
 //! T_min. Source: Kerbl et al. 2023; gradients are 0 where α is at its ceiling, as in gsplat.
 
 use super::RenderConfig;
-use super::bin::{BIN, Bins, Footprint, id};
+use super::bin::{BIN, Bins, Footprint, PAIR_BUDGET, id};
 use super::parallel::{Even, Ragged, for_each_group};
-use super::project::{Projected, ProjectedGrads, ellipse_distance};
+use super::project::{ALPHA_FLOOR, Projected, ProjectedGrads, TAU_MARGIN};
 use super::simd::{Kernel, Simd, dispatch};
 use crate::math::Real;
+use crate::scene::BLOCK;
 use rayon::prelude::*;
+use std::f64::consts::{LN_2, LOG2_E};
 use std::sync::atomic::{AtomicU32, Ordering};
 
 /// Channels of one pass.
@@ -33,8 +35,10 @@ const PAIR: usize = 12;
 /// Splats in a reduction task.
 const CHUNK: usize = 2048;
 
-/// Exponents are not taken below this: e^-60 is far below any cut-off, and no product becomes a slow subnormal.
-const POWER_MIN: f64 = -60.0;
+/// Splats whose lists of tiles are made at once: a number in a batch is one byte.
+const BATCH: usize = 128;
+/// Added under the root of a row range, so that rounding never loses a row that a tangent touches.
+const CHORD_MARGIN: f64 = 1e-5;
 
 /// A row of pixels.
 type Row<F> = [F; TILE];
@@ -46,34 +50,35 @@ pub struct Tile<F = f32> {
     color: [[Row<F>; TILE]; CHANNELS],
     /// Transmittance; negated once a pixel has stopped.
     t: [Row<F>; TILE],
-    /// Number in the bin's list of the last splat that added to a pixel; −1: none.
+    /// 1 + number in the bin's list of the last splat that a pixel met before it stopped; 0: none.
     last: [Row<F>; TILE],
 }
 
-/// One splat as the blend loop reads it.
-#[repr(C)]
+/// One splat as the blend loop reads it: o·g = o·2^min(a dx² + b dx dy + c dy², 0).
+#[repr(C, align(64))]
 #[derive(Clone, Copy, Debug, Default)]
 struct Record<F> {
     /// Centre relative to the bin's corner.
     x: F,
     y: F,
-    /// −½ conic xx, −conic xy, −½ conic yy.
+    /// log₂ e times −½ conic xx, −conic xy, −½ conic yy.
     a: F,
     b: F,
     c: F,
-    opacity: F,
+    /// log₂ of o/α_min, of which τ is the multiple: no logarithm is taken here.
+    log_ratio: F,
     channels: [F; CHANNELS],
     /// Bit 4·row + column: the tile may be touched.
     mask: u16,
-    /// Pixel rows of the bin that the ellipse's box holds.
-    row0: u8,
-    row1: u8,
+    /// Pixel rows of the bin that the ellipse reaches in each column of tiles: first, one past the last.
+    rows: [[u8; 2]; SIDE],
 }
 
 /// The blend's limits.
 #[derive(Clone, Copy, Debug)]
 struct Limits<F> {
-    alpha_min: F,
+    /// log₂ of α's cut-off.
+    log_min: F,
     alpha_max: F,
     t_min: F,
 }
@@ -81,9 +86,9 @@ struct Limits<F> {
 impl<F: Real> Limits<F> {
     fn new(config: &RenderConfig) -> Self {
         Self {
-            alpha_min: F::of(config.alpha_min),
+            log_min: F::of(config.alpha_min.max(ALPHA_FLOOR).log2()),
             alpha_max: F::of(config.alpha_max.min(ALPHA_CEILING)),
-            t_min: F::of(config.transmittance_min),
+            t_min: F::of(config.transmittance_min.max(0.0)),
         }
     }
 }
@@ -111,11 +116,12 @@ pub struct PixelGrads<'a, F = f32> {
 pub struct Raster<F = f32> {
     /// Sorted lists.
     pub bins: Bins,
+    /// Instead of [`PAIR_BUDGET`].
+    pub(super) budget: Option<usize>,
     width: usize,
     height: usize,
     simd: Option<Simd>,
     records: Vec<Record<F>>,
-    lists: Vec<u32>,
     tiles: Vec<Tile<F>>,
     pair_grads: Vec<[F; PAIR]>,
     place: Vec<AtomicU32>,
@@ -152,10 +158,23 @@ impl<F: Real> Raster<F> {
         simd: Simd,
     ) {
         (self.width, self.height, self.simd) = (width, height, Some(simd));
-        self.bins.build(footprints, projected, width, height);
+        self.bins.count(footprints, width, height, self.budget.unwrap_or(PAIR_BUDGET));
+        self.tiles.resize(self.bins.bins() * TILES, Tile::default());
+        self.gather(projected, footprints, 0);
+    }
+
+    /// Sees to it that lists and records are those of run `run`.
+    fn hold(&mut self, projected: &[Projected<F>], footprints: &[Footprint], run: usize) {
+        if self.bins.current != run {
+            self.gather(projected, footprints, run);
+        }
+    }
+
+    /// Makes lists and records of one run of bins.
+    fn gather(&mut self, projected: &[Projected<F>], footprints: &[Footprint], run: usize) {
+        let (width, height, simd) = (self.width, self.height, self.simd.unwrap_or(Simd::Scalar));
+        self.bins.fill(footprints, projected, run);
         self.records.resize(self.bins.keys.len(), Record::default());
-        self.lists.resize(self.bins.keys.len(), 0);
-        self.tiles.resize((self.bins.starts.len() - 1) * TILES, Tile::default());
         let bins = &self.bins;
         for_each_group(&bins.starts, Ragged(&mut self.records), &|bin, records| {
             let (x0, y0) = (bin % bins.across * BIN, bin / bins.across * BIN);
@@ -164,19 +183,35 @@ impl<F: Real> Raster<F> {
         });
     }
 
-    /// Blends four channels; one row of `channels` a splat.
-    pub fn blend(&mut self, channels: &[[F; CHANNELS]], config: &RenderConfig) {
+    /// Blends four channels; one row of `channels` a splat, the other rows as they were prepared.
+    pub fn blend(
+        &mut self,
+        projected: &[Projected<F>],
+        footprints: &[Footprint],
+        channels: &[[F; CHANNELS]],
+        config: &RenderConfig,
+    ) {
+        for run in 0..self.bins.runs.len() {
+            self.hold(projected, footprints, run);
+            self.blend_run(channels, config);
+        }
+    }
+
+    fn blend_run(&mut self, channels: &[[F; CHANNELS]], config: &RenderConfig) {
         let (simd, bins, limits) = (self.simd.unwrap_or(Simd::Scalar), &self.bins, Limits::new(config));
         let (width, height) = (self.width, self.height);
-        let data = (Ragged(&mut self.records), (Ragged(&mut self.lists), Even(&mut self.tiles, TILES)));
-        for_each_group(&bins.starts, data, &|bin, (records, (lists, tiles))| {
+        let data = (Ragged(&mut self.records), Even(&mut self.tiles, TILES));
+        let run = &bins.runs[bins.current];
+        for_each_group(&bins.starts, data, &|bin, (records, tiles)| {
+            if !run.contains(&bin) {
+                return;
+            }
             let keys = &bins.keys[bins.starts[bin] as usize..bins.starts[bin + 1] as usize];
             for (r, key) in records.0.iter_mut().zip(keys) {
                 r.channels = channels[id(*key)];
             }
             let inside = [width - bin % bins.across * BIN, height - bin / bins.across * BIN];
-            let (records, list, tiles) = (&*records.0, lists.0, tiles.0);
-            dispatch(simd, Blend { records, list, tiles, inside, limits });
+            dispatch(simd, Blend { records: &*records.0, tiles: tiles.0, inside, limits });
         });
     }
 
@@ -225,18 +260,48 @@ impl<F: Real> Raster<F> {
         d: &mut [ProjectedGrads<F>],
         d_channels: &mut [[F; CHANNELS]],
     ) -> [f64; CHANNELS] {
+        if geometry == Geometry::Overwrite {
+            d.par_chunks_mut(CHUNK).for_each(|d| d.fill(ProjectedGrads::default()));
+        }
+        d_channels.fill([F::ZERO; CHANNELS]);
+        self.backgrounds.clear();
+        self.backgrounds.resize(self.bins.bins(), [0.0; CHANNELS]);
+        for run in 0..self.bins.runs.len() {
+            self.hold(projected, footprints, run);
+            self.backward_run(projected, footprints, channels, background, grads, config, d, d_channels);
+        }
+        let mut total = [0.0; CHANNELS];
+        for bin in &self.backgrounds {
+            for c in 0..CHANNELS {
+                total[c] += bin[c];
+            }
+        }
+        total
+    }
+
+    /// [`Raster::backward`] of the current run, added to `d` and `d_channels`.
+    fn backward_run(
+        &mut self,
+        projected: &[Projected<F>],
+        footprints: &[Footprint],
+        channels: &[[F; CHANNELS]],
+        background: [F; CHANNELS],
+        grads: &PixelGrads<'_, F>,
+        config: &RenderConfig,
+        d: &mut [ProjectedGrads<F>],
+        d_channels: &mut [[F; CHANNELS]],
+    ) {
         let (simd, bins, limits) = (self.simd.unwrap_or(Simd::Scalar), &self.bins, Limits::new(config));
         let (width, height, tiles) = (self.width, self.height, &self.tiles);
         let pairs = bins.keys.len();
         self.pair_grads.resize(pairs, [F::ZERO; PAIR]);
         self.place.resize_with(pairs, AtomicU32::default);
-        self.backgrounds.resize(bins.starts.len() - 1, [0.0; CHANNELS]);
-        let place = &self.place;
-        let data = (
-            (Ragged(&mut self.records), Ragged(&mut self.lists)),
-            (Ragged(&mut self.pair_grads), Even(&mut self.backgrounds, 1)),
-        );
-        for_each_group(&bins.starts, data, &|bin, ((records, lists), (out, background_out))| {
+        let (place, run) = (&self.place, &bins.runs[bins.current]);
+        let data = (Ragged(&mut self.records), (Ragged(&mut self.pair_grads), Even(&mut self.backgrounds, 1)));
+        for_each_group(&bins.starts, data, &|bin, (records, (out, background_out))| {
+            if !run.contains(&bin) {
+                return;
+            }
             let start = bins.starts[bin] as usize;
             let keys = &bins.keys[start..bins.starts[bin + 1] as usize];
             let (bx, by) = (bin % bins.across, bin / bins.across);
@@ -244,13 +309,12 @@ impl<F: Real> Raster<F> {
                 let splat = id(*key);
                 r.channels = channels[splat];
                 // Every slot is written by exactly one task, so that the order of writes cannot matter.
-                let slot = bins.first[splat] as usize + footprints[splat].rank(bx, by);
-                place[slot].store((start + i) as u32, Ordering::Relaxed);
+                let slot = bins.first[splat].wrapping_add(footprints[splat].rank(bx, by) as u32);
+                place[slot as usize].store((start + i) as u32, Ordering::Relaxed);
             }
             out.0.fill([F::ZERO; PAIR]);
             let kernel = Backward {
                 records: &*records.0,
-                list: lists.0,
                 tiles: &tiles[bin * TILES..(bin + 1) * TILES],
                 grads,
                 background,
@@ -267,59 +331,49 @@ impl<F: Real> Raster<F> {
             for (i, (d, d_ch)) in d.iter_mut().zip(d_ch).enumerate() {
                 let splat = chunk * CHUNK + i;
                 let mut sum = [F::ZERO; PAIR];
-                let first = bins.first[splat] as usize;
-                for slot in &place[first..first + footprints[splat].count()] {
+                for slot in &place[bins.slots(splat, &footprints[splat])] {
                     let pair = &pair_grads[slot.load(Ordering::Relaxed) as usize];
                     for k in 0..PAIR {
                         sum[k] += pair[k];
                     }
                 }
-                if geometry == Geometry::Overwrite {
-                    *d = ProjectedGrads::default();
-                }
-                *d_ch = [F::ZERO; CHANNELS];
                 let p = &projected[splat];
                 if p.radius > F::ZERO {
                     let [v, vx, vxx, vy, vxy, vyy, abs_x, abs_y, ..] = sum;
                     let [a, b, c] = p.conic;
                     d.mean2d[0] -= a * vx + b * vy;
                     d.mean2d[1] -= b * vx + c * vy;
-                    d.mean2d_abs[0] += abs_x;
-                    d.mean2d_abs[1] += abs_y;
+                    // The records' conic is in powers of 2.
+                    d.mean2d_abs[0] += F::of(LN_2) * abs_x;
+                    d.mean2d_abs[1] += F::of(LN_2) * abs_y;
                     d.conic[0] -= F::HALF * vxx;
                     d.conic[1] -= vxy;
                     d.conic[2] -= F::HALF * vyy;
                     d.opacity += v / p.opacity;
-                    d_ch.copy_from_slice(&sum[8..]);
+                    for c in 0..CHANNELS {
+                        d_ch[c] += sum[8 + c];
+                    }
                 }
             }
         });
-        let mut total = [0.0; CHANNELS];
-        for bin in &self.backgrounds {
-            for c in 0..CHANNELS {
-                total[c] += bin[c];
-            }
-        }
-        total
     }
 
     /// Pairs of bin and splat.
     pub fn pairs(&self) -> usize {
-        self.bins.keys.len()
+        self.bins.total as usize
     }
 
-    /// Pixels that the blend loop evaluates for these pairs, were no pixel to stop early.
+    /// Pixels that the blend loop evaluates for the pairs that are held, were no pixel to stop early.
     pub fn blend_work(&self) -> usize {
-        let tiles =
-            |r: &Record<F>, ty: usize| (r.mask >> (ty * SIDE) & 15).count_ones() as usize * tile_rows(r, ty).len();
-        self.records.iter().map(|r| (0..SIDE).map(|ty| tiles(r, ty)).sum::<usize>() * TILE).sum()
+        let rows = |r: &Record<F>, t: usize| usize::from(r.mask >> t & 1) * tile_rows(r, t % SIDE, t / SIDE).len();
+        self.records.iter().map(|r| (0..TILES).map(|t| rows(r, t)).sum::<usize>() * TILE).sum()
     }
 
     /// Bytes held.
     pub fn memory_bytes(&self) -> usize {
         self.bins.memory_bytes()
             + self.records.capacity() * size_of::<Record<F>>()
-            + 4 * (self.lists.capacity() + self.place.capacity())
+            + 4 * self.place.capacity()
             + self.tiles.capacity() * size_of::<Tile<F>>()
             + self.pair_grads.capacity() * size_of::<[F; PAIR]>()
             + self.backgrounds.capacity() * size_of::<[f64; CHANNELS]>()
@@ -342,71 +396,145 @@ impl<F: Real> Kernel for Gather<'_, F> {
     #[inline(always)]
     fn run<const FMA: bool>(self) {
         let at = |v: usize| F::of(v as f64);
-        // First and last pixel centres of the tiles, inside the picture; tiles outside get an empty range far away.
-        let ends = |corner: usize, size: usize| -> [[F; 2]; SIDE] {
-            std::array::from_fn(|k| {
-                let low = k * TILE;
-                let high = (low + TILE).min(size - corner);
-                if high > low { [at(low) + F::HALF, at(high) - F::HALF] } else { [F::ZERO, F::of(-1.0)] }
-            })
-        };
-        let (xs, ys) = (ends(self.x0, self.width), ends(self.y0, self.height));
-        let lanes = |ends: &[[F; 2]; SIDE], k: usize, of: fn(usize) -> usize| -> [F; TILES] {
-            std::array::from_fn(|t| ends[of(t)][k])
-        };
-        let (left, right) = (lanes(&xs, 0, |t| t % SIDE), lanes(&xs, 1, |t| t % SIDE));
-        let (top, bottom) = (lanes(&ys, 0, |t| t / SIDE), lanes(&ys, 1, |t| t / SIDE));
-        let full: u16 = (0..TILES)
-            .filter(|t| xs[t % SIDE][0] <= xs[t % SIDE][1] && ys[t / SIDE][0] <= ys[t / SIDE][1])
-            .fold(0, |m, t| m | 1 << t);
-        for (record, key) in self.records.iter_mut().zip(self.keys) {
-            let p = &self.projected[id(*key)];
-            let (x, y) = (p.mean2d[0] - at(self.x0), p.mean2d[1] - at(self.y0));
-            let (y_slope, x_slope) = (-p.conic[1] / p.conic[2], -p.conic[1] / p.conic[0]);
-            let mut q = [F::ZERO; TILES];
-            for t in 0..TILES {
-                let (rx, ry) = ([left[t] - x, right[t] - x], [top[t] - y, bottom[t] - y]);
-                q[t] = ellipse_distance(p.conic, y_slope, x_slope, rx, ry);
+        let zero = [F::ZERO; BLOCK];
+        let last_row = (self.height - self.y0).min(BIN) as i32;
+        // Sixteen splats at once, so that every step is a loop over lanes.
+        for (records, keys) in self.records.chunks_mut(BLOCK).zip(self.keys.chunks(BLOCK)) {
+            let [mut x, mut y, mut a, mut b, mut c] = [zero; 5];
+            let [mut half_x, mut half_y, mut tau] = [zero; 3];
+            for (l, key) in keys.iter().enumerate() {
+                let p = &self.projected[id(*key)];
+                (x[l], y[l]) = (p.mean2d[0] - at(self.x0), p.mean2d[1] - at(self.y0));
+                [a[l], b[l], c[l]] = p.conic;
+                (half_x[l], half_y[l], tau[l]) = (p.half[0], p.half[1], p.tau);
             }
-            let mut hit = [0u32; TILES];
-            for t in 0..TILES {
-                hit[t] = u32::from(q[t] <= p.tau) << t;
+            // The ellipse is y = slope·dx ± reach·√(1 − (dx/half_x)²), with its lowest point at dx = summit.
+            let [mut slope, mut reach, mut inverse, mut summit] = [zero; 4];
+            for l in 0..BLOCK {
+                slope[l] = -b[l] / c[l];
+                reach[l] = (tau[l] / c[l]).sqrt();
+                inverse[l] = F::ONE / half_x[l];
+                summit[l] = -b[l] / a[l] * half_y[l];
             }
-            let hit = hit.iter().fold(0, |m, h| m | h) as u16;
-            let row = |v: F, round: fn(f64) -> f64| round((v - F::HALF).f64()).clamp(-1.0, BIN as f64) as i32;
-            *record = Record {
-                x,
-                y,
-                a: -F::HALF * p.conic[0],
-                b: -p.conic[1],
-                c: -F::HALF * p.conic[2],
-                opacity: p.opacity,
-                channels: record.channels,
-                mask: hit & full,
-                row0: row(y - p.half[1], f64::ceil).max(0) as u8,
-                row1: (row(y + p.half[1], f64::floor) + 1).clamp(0, BIN as i32) as u8,
-            };
+            let (mut mask, mut rows) = ([0u32; BLOCK], [[[0i32; BLOCK]; 2]; SIDE]);
+            for k in 0..SIDE {
+                let (left, right) = (k * TILE, (k * TILE + TILE).min(self.width - self.x0));
+                if right <= left {
+                    break;
+                }
+                let (left, right) = (at(left) + F::HALF, at(right) - F::HALF);
+                let mut meets = [true; BLOCK];
+                for (side, sign) in [(0, -F::ONE), (1, F::ONE)] {
+                    // Each branch is farthest out as near to its summit as the column comes.
+                    for l in 0..BLOCK {
+                        let dx = least(greatest(sign * summit[l], left - x[l]), right - x[l]);
+                        let u = dx * inverse[l];
+                        let square = F::ONE + F::of(CHORD_MARGIN) - u * u;
+                        meets[l] &= square >= F::ZERO;
+                        let edge = y[l] + slope[l] * dx + sign * reach[l] * greatest(square, F::ZERO).sqrt();
+                        // First row whose centre is not above the edge, or one past the last not below it.
+                        let row = least(greatest((edge * sign + F::HALF).floor() * sign, F::ZERO), at(BIN));
+                        rows[k][side][l] = row.i32().min(last_row);
+                    }
+                }
+                for l in 0..BLOCK {
+                    let (first, end) = (rows[k][0][l], rows[k][1][l]);
+                    for ty in 0..SIDE {
+                        let top = (ty * TILE) as i32;
+                        let hit = meets[l] & (first < end) & (first < top + TILE as i32) & (end > top);
+                        mask[l] |= u32::from(hit) << (ty * SIDE + k);
+                    }
+                }
+            }
+            for (l, record) in records.iter_mut().enumerate() {
+                *record = Record {
+                    x: x[l],
+                    y: y[l],
+                    a: F::of(-0.5 * LOG2_E) * a[l],
+                    b: F::of(-LOG2_E) * b[l],
+                    c: F::of(-0.5 * LOG2_E) * c[l],
+                    log_ratio: F::of(0.5 * LOG2_E) * (tau[l] - F::of(TAU_MARGIN)),
+                    channels: record.channels,
+                    mask: mask[l] as u16,
+                    rows: std::array::from_fn(|k| [rows[k][0][l] as u8, rows[k][1][l] as u8]),
+                };
+            }
         }
     }
 }
 
-/// Numbers of the records that may touch tile `t`, in order.
-#[inline(always)]
-fn tile_list<'a, F>(records: &[Record<F>], list: &'a mut [u32], t: usize) -> &'a [u32] {
-    let mut n = 0;
-    for (i, r) in records.iter().enumerate() {
-        // Written always, kept only where the bit is set: no branch to guess.
-        list[n] = i as u32;
-        n += usize::from(r.mask >> t & 1);
-    }
-    &list[..n]
+/// For each tile the numbers of the splats of one batch that may touch it, ascending.
+struct Lists {
+    numbers: [[u8; BATCH]; TILES],
+    counts: [usize; TILES],
 }
 
-/// The rows of tile row `ty` that a record can touch.
+impl Lists {
+    fn new() -> Self {
+        Self { numbers: [[0; BATCH]; TILES], counts: [0; TILES] }
+    }
+
+    #[inline(always)]
+    fn fill<F>(&mut self, records: &[Record<F>]) {
+        debug_assert!(records.len() <= BATCH);
+        for (t, (numbers, count)) in self.numbers.iter_mut().zip(&mut self.counts).enumerate() {
+            let mut n = 0;
+            for (i, r) in records.iter().enumerate() {
+                // Written always, kept only where the bit is set: no branch to guess.
+                numbers[n % BATCH] = i as u8;
+                n += usize::from(r.mask >> t & 1);
+            }
+            *count = n;
+        }
+    }
+
+    #[inline(always)]
+    fn of(&self, t: usize) -> &[u8] {
+        &self.numbers[t][..self.counts[t]]
+    }
+}
+
+/// The rows of tile (tx, ty) that a record can touch.
 #[inline(always)]
-fn tile_rows<F>(r: &Record<F>, ty: usize) -> std::ops::Range<usize> {
-    let top = ty * TILE;
-    usize::from(r.row0).saturating_sub(top)..usize::from(r.row1).saturating_sub(top).min(TILE)
+fn tile_rows<F>(r: &Record<F>, tx: usize, ty: usize) -> std::ops::Range<usize> {
+    let (top, [first, end]) = (ty * TILE, r.rows[tx % SIDE]);
+    usize::from(first).saturating_sub(top)..usize::from(end).saturating_sub(top).min(TILE)
+}
+
+/// Exponents of α and their constants for one splat in one tile.
+struct Exponent<F> {
+    /// x offsets from the splat's centre.
+    dx: Row<F>,
+    /// Terms of the exponent along a row: without dy, and times dy.
+    ax: Row<F>,
+    bx: Row<F>,
+    c: F,
+    /// y of the centre relative to the tile's first pixel row.
+    y: F,
+    log_opacity: F,
+    /// Row numbers of a tile as floats.
+    steps: Row<F>,
+}
+
+impl<F: Real> Exponent<F> {
+    #[inline(always)]
+    fn new<const FMA: bool>(r: &Record<F>, tx: usize, ty: usize, limits: &Limits<F>) -> Self {
+        let (dx, log_opacity) = (offsets(r.x, tx), limits.log_min + r.log_ratio);
+        let (mut ax, mut bx) = ([F::ZERO; TILE], [F::ZERO; TILE]);
+        for l in 0..TILE {
+            ax[l] = (r.a * dx[l]).fma::<FMA>(dx[l], log_opacity);
+            bx[l] = r.b * dx[l];
+        }
+        let y = r.y - (F::of((ty * TILE) as f64) + F::HALF);
+        let steps = std::array::from_fn(|k| F::of(k as f64));
+        Self { dx, ax, bx, c: r.c, y, log_opacity, steps }
+    }
+
+    /// log₂ of o·g at lane `l` of a row at offset `dy`; `cy` = c·dy. Rounding may take a needle's above its top.
+    #[inline(always)]
+    fn at<const FMA: bool>(&self, l: usize, dy: F, cy: F) -> F {
+        least((cy + self.bx[l]).fma::<FMA>(dy, self.ax[l]), self.log_opacity)
+    }
 }
 
 /// x offsets of a tile row's pixels from the splat's centre.
@@ -418,7 +546,6 @@ fn offsets<F: Real>(x: F, tx: usize) -> Row<F> {
 /// Forward over one bin.
 struct Blend<'a, F> {
     records: &'a [Record<F>],
-    list: &'a mut [u32],
     tiles: &'a mut [Tile<F>],
     /// Pixels from the bin's corner to the picture's right and lower ends.
     inside: [usize; 2],
@@ -429,25 +556,40 @@ impl<F: Real> Kernel for Blend<'_, F> {
     type Out = ();
     #[inline(always)]
     fn run<const FMA: bool>(self) {
-        for t in 0..TILES {
-            let (tx, ty) = (t % SIDE, t / SIDE);
-            let tile = &mut self.tiles[t];
-            *tile = Tile { t: [[F::ONE; TILE]; TILE], last: [[-F::ONE; TILE]; TILE], ..Tile::default() };
-            let nx = self.inside[0].saturating_sub(tx * TILE);
-            let ny = self.inside[1].saturating_sub(ty * TILE);
+        // Bit t: tile t has a pixel that has not stopped.
+        let mut open = 0u32;
+        for (t, tile) in self.tiles.iter_mut().enumerate() {
+            *tile = Tile { t: [[F::ONE; TILE]; TILE], ..Tile::default() };
+            let nx = self.inside[0].saturating_sub(t % SIDE * TILE);
+            let ny = self.inside[1].saturating_sub(t / SIDE * TILE);
             if nx < TILE || ny < TILE {
                 // Pixels outside the picture have stopped from the start.
                 for (y, row) in tile.t.iter_mut().enumerate() {
                     row[if y < ny { nx.min(TILE) } else { 0 }..].fill(-F::ONE);
                 }
             }
-            let list = tile_list(self.records, self.list, t);
-            for batch in list.chunks(EXIT_EVERY) {
-                for &i in batch {
-                    blend_splat::<F, FMA>(tile, &self.records[i as usize], F::of(f64::from(i)), tx, ty, &self.limits);
+            open |= u32::from(nx > 0 && ny > 0) << t;
+        }
+        let mut lists = Lists::new();
+        for (k, batch) in self.records.chunks(BATCH).enumerate() {
+            if open == 0 {
+                break;
+            }
+            lists.fill(batch);
+            for (t, tile) in self.tiles.iter_mut().enumerate() {
+                if open >> t & 1 == 0 {
+                    continue;
                 }
-                if most(&tile.t) < self.limits.t_min.max(F::ZERO) {
-                    break;
+                for run in lists.of(t).chunks(EXIT_EVERY) {
+                    for &i in run {
+                        let number = F::of((k * BATCH + usize::from(i) + 1) as f64);
+                        let record = &batch[usize::from(i)];
+                        blend_splat::<F, FMA>(tile, record, number, t % SIDE, t / SIDE, &self.limits);
+                    }
+                    if most(&tile.t) < F::ZERO {
+                        open &= !(1 << t);
+                        break;
+                    }
                 }
             }
         }
@@ -458,37 +600,29 @@ impl<F: Real> Kernel for Blend<'_, F> {
 fn blend_splat<F: Real, const FMA: bool>(
     tile: &mut Tile<F>,
     r: &Record<F>,
-    index: F,
+    number: F,
     tx: usize,
     ty: usize,
     limits: &Limits<F>,
 ) {
-    let dx = offsets(r.x, tx);
-    let (mut ax, mut bx) = ([F::ZERO; TILE], [F::ZERO; TILE]);
-    for l in 0..TILE {
-        ax[l] = r.a * dx[l] * dx[l];
-        bx[l] = r.b * dx[l];
-    }
-    let rows = tile_rows(r, ty);
-    let mut center = F::of((ty * TILE + rows.start) as f64) + F::HALF;
-    for y in rows {
-        let dy = r.y - center;
-        center += F::ONE;
-        let cy = r.c * dy;
+    let e = Exponent::new::<FMA>(r, tx, ty, limits);
+    for y in tile_rows(r, tx, ty) {
+        let dy = e.y - e.steps[y];
+        let cy = e.c * dy;
         let (mut t, mut last) = (tile.t[y], tile.last[y]);
         let mut weight = [F::ZERO; TILE];
         for l in 0..TILE {
-            let power = greatest(least((cy + bx[l]).fma::<FMA>(dy, ax[l]), F::ZERO), F::of(POWER_MIN));
-            let alpha = least(r.opacity * power.blend_exp::<FMA>(), limits.alpha_max);
-            let visible = alpha >= limits.alpha_min;
-            let open = t[l] * (F::ONE - alpha) >= limits.t_min;
-            let used = select(visible & open, alpha, F::ZERO);
-            weight[l] = used * t[l];
-            // Neither this nor T is written as a choice between the old value and a new one: LLVM would make masked
-            // stores of it, which cost tens of cycles on some machines. Sums of whole numbers are exact.
-            last[l] += select(used > F::ZERO, index - last[l], F::ZERO);
-            let kept = t[l] * (F::ONE - used);
-            t[l] = least(kept, select(visible & !open, -kept, kept));
+            let power = e.at::<FMA>(l, dy, cy);
+            let alpha = least(power.blend_exp2::<FMA>(), limits.alpha_max);
+            let alpha = select(power >= limits.log_min, alpha, F::ZERO);
+            // A pixel that has stopped has a negative T and stays below the limit.
+            let kept = t[l] * (F::ONE - alpha);
+            let open = kept >= limits.t_min;
+            weight[l] = select(open, alpha * t[l], F::ZERO);
+            // Neither is a choice between the old value and a new one, nor a maximum: LLVM would make masked stores
+            // of it, which cost tens of cycles on some machines. Sums of whole numbers are exact.
+            t[l] = select(open, kept, -t[l].abs());
+            last[l] += select(open, number - last[l], F::ZERO);
         }
         tile.t[y] = t;
         tile.last[y] = last;
@@ -504,7 +638,6 @@ fn blend_splat<F: Real, const FMA: bool>(
 /// Backward over one bin; returns the gradient to the background.
 struct Backward<'a, F> {
     records: &'a [Record<F>],
-    list: &'a mut [u32],
     tiles: &'a [Tile<F>],
     grads: &'a PixelGrads<'a, F>,
     background: [F; CHANNELS],
@@ -516,6 +649,7 @@ struct Backward<'a, F> {
 
 /// What the way back carries for 64 pixels.
 #[repr(C, align(64))]
+#[derive(Clone, Copy, Default)]
 struct Back<F> {
     /// Transmittance behind the splat in hand.
     t: [Row<F>; TILE],
@@ -531,56 +665,83 @@ impl<F: Real> Kernel for Backward<'_, F> {
     #[inline(always)]
     fn run<const FMA: bool>(self) -> [f64; CHANNELS] {
         let mut d_background = [0.0; CHANNELS];
+        let (mut backs, mut reach) = ([Back::<F>::default(); TILES], [0; TILES]);
         for t in 0..TILES {
-            let (tx, ty) = (t % SIDE, t / SIDE);
-            let (x0, y0) = (self.corner[0] + tx * TILE, self.corner[1] + ty * TILE);
-            if x0 >= self.size[0] || y0 >= self.size[1] {
+            self.begin(t, &mut backs[t], &mut d_background);
+            reach[t] = most(&self.tiles[t].last).f64() as usize;
+        }
+        let mut sums = [[[F::ZERO; TILE]; PAIR]; BATCH];
+        let mut lists = Lists::new();
+        for (k, batch) in self.records.chunks(BATCH).enumerate().rev() {
+            let first = k * BATCH;
+            if reach.iter().all(|&r| r <= first) {
                 continue;
             }
-            let tile = &self.tiles[t];
-            let (nx, ny) = ((self.size[0] - x0).min(TILE), (self.size[1] - y0).min(TILE));
-            let fetch = |plane: Option<&[F]>| {
-                let mut out = [[F::ZERO; TILE]; TILE];
-                if let Some(plane) = plane {
-                    for y in 0..ny {
-                        let at = (y0 + y) * self.size[0] + x0;
-                        out[y][..nx].copy_from_slice(&plane[at..at + nx]);
-                    }
-                }
-                out
-            };
-            let g: [_; CHANNELS] = std::array::from_fn(|c| fetch(self.grads.channels[c]));
-            let alpha = fetch(self.grads.alpha);
-            let mut back = Back { t: tile.t, last: tile.last, g, behind: [[F::ZERO; TILE]; TILE] };
-            for y in 0..TILE {
-                for x in 0..TILE {
-                    back.t[y][x] = tile.t[y][x].abs();
-                    let mut sum = -alpha[y][x];
-                    for c in 0..CHANNELS {
-                        sum += self.background[c] * g[c][y][x];
-                    }
-                    back.behind[y][x] = sum;
+            lists.fill(batch);
+            sums[..batch.len()].fill([[F::ZERO; TILE]; PAIR]);
+            for t in 0..TILES {
+                let list = lists.of(t);
+                let end = list.partition_point(|&i| first + usize::from(i) < reach[t]);
+                for &i in list[..end].iter().rev() {
+                    let i = usize::from(i);
+                    let (number, sums) = (F::of((first + i + 1) as f64), &mut sums[i]);
+                    let (tx, ty) = (t % SIDE, t / SIDE);
+                    backward_splat::<F, FMA>(&mut backs[t], &batch[i], number, tx, ty, &self.limits, sums);
                 }
             }
-            let reach = most(&tile.last);
-            for c in 0..CHANNELS {
-                let mut rows = [F::ZERO; TILE];
-                for y in 0..TILE {
-                    for x in 0..TILE {
-                        rows[x] += back.t[y][x] * g[c][y][x];
-                    }
+            // Lanes are summed once a splat, not once a tile.
+            for (out, sums) in self.out[first..].iter_mut().zip(&sums[..batch.len()]) {
+                for k in 0..PAIR {
+                    out[k] = sum_lanes(sums[k]);
                 }
-                d_background[c] += rows.iter().map(|v| v.f64()).sum::<f64>();
-            }
-            let list = tile_list(self.records, self.list, t);
-            let end = list.partition_point(|&i| F::of(f64::from(i)) <= reach);
-            for &i in list[..end].iter().rev() {
-                let r = &self.records[i as usize];
-                let index = F::of(f64::from(i));
-                backward_splat::<F, FMA>(&mut back, r, index, tx, ty, &self.limits, &mut self.out[i as usize]);
             }
         }
         d_background
+    }
+}
+
+impl<F: Real> Backward<'_, F> {
+    /// Reads the pixels of tile `t` and adds their share of the background's gradient.
+    #[inline(always)]
+    fn begin(&self, t: usize, back: &mut Back<F>, d_background: &mut [f64; CHANNELS]) {
+        let (x0, y0) = (self.corner[0] + t % SIDE * TILE, self.corner[1] + t / SIDE * TILE);
+        if x0 >= self.size[0] || y0 >= self.size[1] {
+            return;
+        }
+        let tile = &self.tiles[t];
+        let (nx, ny) = ((self.size[0] - x0).min(TILE), (self.size[1] - y0).min(TILE));
+        let fetch = |plane: Option<&[F]>| {
+            let mut out = [[F::ZERO; TILE]; TILE];
+            if let Some(plane) = plane {
+                for y in 0..ny {
+                    let at = (y0 + y) * self.size[0] + x0;
+                    out[y][..nx].copy_from_slice(&plane[at..at + nx]);
+                }
+            }
+            out
+        };
+        let g: [_; CHANNELS] = std::array::from_fn(|c| fetch(self.grads.channels[c]));
+        let alpha = fetch(self.grads.alpha);
+        *back = Back { t: tile.t, last: tile.last, g, behind: [[F::ZERO; TILE]; TILE] };
+        for y in 0..TILE {
+            for x in 0..TILE {
+                back.t[y][x] = tile.t[y][x].abs();
+                let mut sum = -alpha[y][x];
+                for c in 0..CHANNELS {
+                    sum += self.background[c] * g[c][y][x];
+                }
+                back.behind[y][x] = sum;
+            }
+        }
+        for c in 0..CHANNELS {
+            let mut rows = [F::ZERO; TILE];
+            for y in 0..TILE {
+                for x in 0..TILE {
+                    rows[x] += back.t[y][x] * g[c][y][x];
+                }
+            }
+            d_background[c] += rows.iter().map(|v| v.f64()).sum::<f64>();
+        }
     }
 }
 
@@ -606,37 +767,31 @@ fn sum_lanes<F: Real>(v: Row<F>) -> F {
 fn backward_splat<F: Real, const FMA: bool>(
     back: &mut Back<F>,
     r: &Record<F>,
-    index: F,
+    number: F,
     tx: usize,
     ty: usize,
     limits: &Limits<F>,
-    out: &mut [F; PAIR],
+    sums: &mut [Row<F>; PAIR],
 ) {
     let zero = [F::ZERO; TILE];
-    let dx = offsets(r.x, tx);
-    let (mut ax, mut bx, mut ex) = (zero, zero, zero);
+    let e = Exponent::new::<FMA>(r, tx, ty, limits);
+    let mut ex = zero;
     for l in 0..TILE {
-        ax[l] = r.a * dx[l] * dx[l];
-        bx[l] = r.b * dx[l];
-        ex[l] = F::TWO * r.a * dx[l];
+        ex[l] = F::TWO * r.a * e.dx[l];
     }
     // Sums down each column; dx is the same for all rows, so its powers wait until the end.
     let (mut v0, mut v1, mut v2, mut abs_x, mut abs_y) = (zero, zero, zero, zero, zero);
     let mut light = [zero; CHANNELS];
-    let rows = tile_rows(r, ty);
-    let mut center = F::of((ty * TILE + rows.start) as f64) + F::HALF;
-    for y in rows {
-        let dy = r.y - center;
-        center += F::ONE;
-        let (cy, by, ey) = (r.c * dy, r.b * dy, F::TWO * r.c * dy);
+    for y in tile_rows(r, tx, ty) {
+        let dy = e.y - e.steps[y];
+        let (cy, by) = (e.c * dy, r.b * dy);
         let (mut t, mut behind, last) = (back.t[y], back.behind[y], back.last[y]);
         let g = [back.g[0][y], back.g[1][y], back.g[2][y], back.g[3][y]];
         for l in 0..TILE {
-            let power = greatest(least((cy + bx[l]).fma::<FMA>(dy, ax[l]), F::ZERO), F::of(POWER_MIN));
-            let raw = r.opacity * power.blend_exp::<FMA>();
-            let clamped = least(raw, limits.alpha_max);
-            let used = (clamped >= limits.alpha_min) & (index <= last[l]);
-            let alpha = select(used, clamped, F::ZERO);
+            let power = e.at::<FMA>(l, dy, cy);
+            let raw = power.blend_exp2::<FMA>();
+            let used = (power >= limits.log_min) & (number <= last[l]);
+            let alpha = select(used, least(raw, limits.alpha_max), F::ZERO);
             t[l] /= F::ONE - alpha;
             let mut s = r.channels[0] * g[0][l];
             for c in 1..CHANNELS {
@@ -648,18 +803,19 @@ fn backward_splat<F: Real, const FMA: bool>(
                 light[c][l] = weight.fma::<FMA>(g[c][l], light[c][l]);
             }
             behind[l] = alpha.fma::<FMA>(ahead, behind[l]);
-            // dL/d power; nothing passes where α is at its ceiling.
+            // dL/d ln α; nothing passes where α is at its ceiling.
             let v = select(raw <= limits.alpha_max, weight * ahead, F::ZERO);
             let vy = v * dy;
             v0[l] += v;
             v1[l] += vy;
             v2[l] = vy.fma::<FMA>(dy, v2[l]);
             abs_x[l] = v.abs().fma::<FMA>((ex[l] + by).abs(), abs_x[l]);
-            abs_y[l] = v.abs().fma::<FMA>((bx[l] + ey).abs(), abs_y[l]);
+            abs_y[l] = v.abs().fma::<FMA>((e.bx[l] + (cy + cy)).abs(), abs_y[l]);
         }
         back.t[y] = t;
         back.behind[y] = behind;
     }
+    let dx = e.dx;
     let (mut vx, mut vxx, mut vxy) = (zero, zero, zero);
     for l in 0..TILE {
         vx[l] = v0[l] * dx[l];
@@ -668,6 +824,8 @@ fn backward_splat<F: Real, const FMA: bool>(
     }
     let lanes = [v0, vx, vxx, v1, vxy, v2, abs_x, abs_y, light[0], light[1], light[2], light[3]];
     for k in 0..PAIR {
-        out[k] += sum_lanes(lanes[k]);
+        for l in 0..TILE {
+            sums[k][l] += lanes[k][l];
+        }
     }
 }

@@ -476,6 +476,40 @@ fn threads_change_no_bit() {
 }
 
 #[test]
+fn a_picture_of_too_many_pairs_is_drawn_in_runs_of_bins() {
+    // Wide and small splats, on a picture of more than 8 bins across.
+    for (size, (w, h)) in [(0.8, (300, 100)), (0.05, (150, 131))] {
+        let s = scene(17, 40, size);
+        let view = camera(w, h);
+        let loss = Loss::new(&view, s.extra.width());
+        let run = |budget: usize| {
+            let mut renderer = Renderer::new(RenderConfig::default());
+            renderer.raster.budget = Some(budget);
+            let (splats, mut image, mut d) = (s.splats(), Image::default(), RenderGrads::default());
+            let mut own = s.own.zeros_like();
+            renderer.render(&splats, &view, BACKGROUND, Some(&s.extra), &mut image);
+            let d_sh = &mut [Some(&mut own), None, None];
+            renderer.backward(&splats, &view, BACKGROUND, Some(&s.extra), &loss.grads(), d_sh, &mut d);
+            let (runs, held) = (renderer.raster.bins.runs.len(), renderer.raster.bins.keys.capacity());
+            (runs, held, renderer.stats().pairs, image, d)
+        };
+        let (runs, held, pairs, image, d) = run(usize::MAX);
+        assert!(runs == 1 && held >= pairs);
+        for budget in [pairs / 3, 1] {
+            let (runs, held, pairs_too, in_runs, d_in_runs) = run(budget);
+            assert!(runs > 2 && held < pairs && pairs_too == pairs, "{runs} runs, {held} of {pairs} pairs held");
+            assert!(image == in_runs, "the picture does not depend on the budget");
+            let close = |a: &Table<f64>, b: &Table<f64>| {
+                a.data().iter().zip(b.data()).all(|(a, b)| (a - b).abs() <= 1e-9 * (1.0 + a.abs()))
+            };
+            assert!(d.parts.iter().zip(&d_in_runs.parts).all(|(a, b)| close(&a.out, &b.out)));
+            assert!(close(d.extra.as_ref().unwrap(), d_in_runs.extra.as_ref().unwrap()));
+            assert!(d.background == d_in_runs.background);
+        }
+    }
+}
+
+#[test]
 fn instruction_levels_agree() {
     let s = scene(5, 200, 0.1).cast::<f32>();
     let view = camera(100, 80);

@@ -1,0 +1,259 @@
+//! What the user sees while work goes on: a progress bar on a terminal, plain lines elsewhere, JSON lines for machines.
+//! Results go to stdout; progress, warnings and errors go to stderr (with `--json`, all of them are lines on stdout).
+
+use crate::files::{grouped, human_bytes, human_seconds};
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use serde_json::{Value, json};
+use splat4d_train::event::Event;
+use std::cell::RefCell;
+use std::io::{IsTerminal, Write};
+use std::time::{Duration, Instant};
+
+/// How much is said.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Loudness {
+    /// Warnings and errors only.
+    Quiet,
+    /// Progress and results.
+    Normal,
+    /// Details too.
+    Verbose,
+}
+
+/// Seconds between progress lines where stderr is no terminal.
+const PLAIN_INTERVAL: Duration = Duration::from_secs(10);
+/// Redraws of a bar a second: often enough to look alive, cheap over slow remote shells.
+const BAR_RATE: u8 = 8;
+
+/// The one place that prints.
+#[derive(Debug)]
+pub(crate) struct Console {
+    loudness: Loudness,
+    json: bool,
+    terminal: bool,
+    state: RefCell<State>,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    bar: Option<ProgressBar>,
+    phase: String,
+    last_line: Option<Instant>,
+    /// The first iteration after a pause gets a plain line of its own.
+    said_progress: bool,
+    warnings: Vec<String>,
+}
+
+impl Console {
+    pub(crate) fn new(loudness: Loudness, json: bool) -> Self {
+        let terminal = std::io::stderr().is_terminal() && std::env::var_os("TERM").is_none_or(|t| t != "dumb");
+        Self { loudness, json, terminal, state: RefCell::default() }
+    }
+
+    /// Whether machines are listening.
+    pub(crate) fn json(&self) -> bool {
+        self.json
+    }
+
+    /// A result, on stdout; not with `--json`, not when quiet.
+    pub(crate) fn say(&self, text: &str) {
+        if !self.json && self.loudness > Loudness::Quiet {
+            self.above_bar(|| print(text));
+        }
+    }
+
+    /// A detail, on stderr, with `-v`.
+    pub(crate) fn detail(&self, text: &str) {
+        if !self.json && self.loudness == Loudness::Verbose {
+            self.above_bar(|| eprint_line(text));
+        }
+    }
+
+    /// What the verb was asked for: on stdout whatever the loudness.
+    pub(crate) fn result(&self, text: &str) {
+        self.above_bar(|| print(text));
+    }
+
+    /// One JSON line; only with `--json`.
+    pub(crate) fn emit(&self, value: &Value) {
+        if self.json {
+            print(&value.to_string());
+        }
+    }
+
+    /// A file was written.
+    pub(crate) fn written(&self, path: &std::path::Path) {
+        self.say(&format!("wrote {}", path.display()));
+        self.emit(&json!({"type": "written", "path": path}));
+    }
+
+    /// A warning: always said, and kept for the report.
+    pub(crate) fn warn(&self, message: &str) {
+        self.state.borrow_mut().warnings.push(message.to_owned());
+        if self.json {
+            self.emit(&json!({"type": "warning", "message": message}));
+        } else {
+            self.above_bar(|| eprint_line(&format!("warning: {message}")));
+        }
+    }
+
+    /// The warnings so far.
+    pub(crate) fn warnings(&self) -> Vec<String> {
+        self.state.borrow().warnings.clone()
+    }
+
+    /// The error that ends the program: one paragraph.
+    pub(crate) fn error(&self, message: &str, code: u8) {
+        self.clear();
+        let paragraph = message.split_whitespace().collect::<Vec<_>>().join(" ");
+        let end = if paragraph.ends_with(['.', '?', '!']) { "" } else { "." };
+        eprint_line(&format!("error: {paragraph}{end}"));
+        self.emit(&json!({"type": "error", "message": paragraph, "code": code}));
+    }
+
+    /// Shows an event of the trainer.
+    pub(crate) fn event(&self, event: &Event) {
+        if let Event::Warning { message } = event {
+            return self.warn(message);
+        }
+        if self.json {
+            let value = serde_json::to_value(event).expect("events are plain data");
+            return print(&value.to_string());
+        }
+        match event {
+            Event::Phase { name, done, total } => self.phase(name, *done, *total),
+            Event::Started { run, iteration, iterations, gaussians, memory_estimate } => {
+                self.clear();
+                let from =
+                    if *iteration > 0 { format!("from step {} on, ", grouped(*iteration)) } else { String::new() };
+                self.say(&format!(
+                    "training {from}{} steps, {} Gaussians at the start, about {} of memory, into {}",
+                    grouped(*iterations),
+                    grouped(*gaussians),
+                    human_bytes(*memory_estimate),
+                    run.display()
+                ));
+            }
+            Event::Progress { iteration, iterations, stage, loss, psnr, gaussians, seconds, seconds_left } => {
+                let words = format!(
+                    "PSNR {psnr:.2} dB  {} Gaussians  {} left",
+                    grouped(*gaussians),
+                    human_seconds(*seconds_left)
+                );
+                self.advance(stage, *iteration, *iterations, &words, || {
+                    format!(
+                        "step {}/{}  {words}  loss {loss:.4}  {} spent",
+                        grouped(*iteration),
+                        grouped(*iterations),
+                        human_seconds(*seconds)
+                    )
+                });
+            }
+            Event::Checkpoint { iteration, path } => {
+                self.detail(&format!("checkpoint of step {} in {}", grouped(*iteration), path.display()));
+            }
+            Event::RolledBack { iteration, to, what } => self.warn(&format!(
+                "step {iteration} was not finite ({what}); training went back to step {to} and continues with \
+                 smaller steps"
+            )),
+            Event::Finished { iteration, seconds, gaussians, peak_memory } => {
+                self.clear();
+                let memory = match peak_memory {
+                    0 => String::new(),
+                    m => format!(", {} of memory at most", human_bytes(*m)),
+                };
+                self.say(&format!(
+                    "trained {} steps in {}: {} Gaussians{memory}",
+                    grouped(*iteration),
+                    human_seconds(*seconds),
+                    grouped(*gaussians)
+                ));
+            }
+            _ => {}
+        }
+    }
+
+    /// Progress of a preparation or of rendering.
+    pub(crate) fn phase(&self, name: &str, done: usize, total: usize) {
+        if self.json {
+            return self.emit(&json!({"type": "phase", "name": name, "done": done, "total": total}));
+        }
+        let words = String::new();
+        self.advance(name, done, total, &words, || match total {
+            0 => format!("{name} ..."),
+            _ => format!("{name} {done}/{total}"),
+        });
+    }
+
+    fn advance(&self, name: &str, done: usize, total: usize, words: &str, line: impl FnOnce() -> String) {
+        if self.loudness == Loudness::Quiet {
+            return;
+        }
+        let mut state = self.state.borrow_mut();
+        let fresh = state.phase != name;
+        if fresh {
+            if let Some(bar) = state.bar.take() {
+                bar.finish_and_clear();
+            }
+            state.phase = name.to_owned();
+            state.said_progress = false;
+        }
+        if self.terminal {
+            let bar = state.bar.get_or_insert_with(|| bar(total));
+            bar.set_length(total.max(done).max(1) as u64);
+            bar.set_position(done as u64);
+            bar.set_prefix(name.to_owned());
+            bar.set_message(words.to_owned());
+            return;
+        }
+        let due = state.last_line.is_none_or(|t| t.elapsed() >= PLAIN_INTERVAL);
+        let ends = total > 0 && done >= total;
+        // A phase that is over at once needs no second line.
+        if fresh || due || (ends && state.said_progress) {
+            state.last_line = Some(Instant::now());
+            state.said_progress = !ends && !fresh;
+            eprint_line(&line());
+        }
+    }
+
+    /// Ends the bar.
+    pub(crate) fn clear(&self) {
+        let mut state = self.state.borrow_mut();
+        if let Some(bar) = state.bar.take() {
+            bar.finish_and_clear();
+        }
+        state.phase.clear();
+    }
+
+    fn above_bar(&self, f: impl FnOnce()) {
+        let bar = self.state.borrow().bar.clone();
+        match bar {
+            Some(bar) => bar.suspend(f),
+            None => f(),
+        }
+    }
+}
+
+fn bar(total: usize) -> ProgressBar {
+    let bar = ProgressBar::with_draw_target(Some(total as u64), ProgressDrawTarget::stderr_with_hz(BAR_RATE));
+    let style = ProgressStyle::with_template("{prefix} {bar:28} {pos}/{len}  {msg}").expect("the template is fixed");
+    bar.set_style(style.progress_chars("█▉▊▋▌▍▎▏ "));
+    bar
+}
+
+/// Prints a line on stdout. A reader that has gone (`| head`) ends the program in peace; a full disk is an error.
+fn print(text: &str) {
+    let mut out = std::io::stdout().lock();
+    if let Err(error) = writeln!(out, "{text}").and_then(|()| out.flush()) {
+        if error.kind() == std::io::ErrorKind::BrokenPipe {
+            std::process::exit(0);
+        }
+        eprint_line(&format!("error: standard output cannot be written ({error}). {}", crate::files::WRITE_REMEDY));
+        std::process::exit(crate::BAD_INPUT.into());
+    }
+}
+
+/// Prints a line on stderr; where that is closed there is nobody to tell.
+fn eprint_line(text: &str) {
+    let _ = writeln!(std::io::stderr().lock(), "{text}");
+}

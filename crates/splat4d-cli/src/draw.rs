@@ -1,0 +1,136 @@
+//! The seam to the renderer: a scene, a camera and a time become a picture for people.
+
+use crate::video::Rgb;
+use splat4d::layers::{Instant, Scene};
+use splat4d::render::{Antialias, Image, RenderConfig, Renderer};
+use splat4d::scene::{Camera, Planes, Time};
+
+/// What is shown.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub(crate) enum Channel {
+    /// Colour over the background
+    Color,
+    /// How opaque: white where something is
+    Alpha,
+    /// Expected depth: near is bright
+    Depth,
+}
+
+/// Alpha below which a pixel has no depth worth showing.
+const DEPTH_ALPHA: f32 = 0.1;
+/// Colours of depth from far to near, sRGB: dark blue to pale yellow, brightness rising throughout.
+const DEPTH_COLORS: [[f32; 3]; 6] = [
+    [13.0, 10.0, 36.0],
+    [74.0, 25.0, 101.0],
+    [148.0, 44.0, 98.0],
+    [218.0, 84.0, 67.0],
+    [250.0, 158.0, 74.0],
+    [252.0, 245.0, 186.0],
+];
+
+/// Draws; memory is reused from picture to picture.
+pub(crate) struct Painter<'a> {
+    scene: &'a Scene<f32>,
+    background: [f32; 3],
+    renderer: Renderer<f32>,
+    instant: Instant<f32>,
+    /// The last picture.
+    pub image: Image<f32>,
+}
+
+impl<'a> Painter<'a> {
+    pub(crate) fn new(scene: &'a Scene<f32>, background: [f32; 3], antialias: bool) -> Self {
+        let antialias = if antialias { Antialias::On } else { Antialias::Off };
+        let config = RenderConfig { antialias, ..RenderConfig::default() };
+        Self {
+            scene,
+            background,
+            renderer: Renderer::new(config),
+            instant: Instant::default(),
+            image: Image::default(),
+        }
+    }
+
+    /// Draws into [`image`](Self::image).
+    pub(crate) fn draw(&mut self, camera: &Camera, time: f64) {
+        self.scene.at(Time(time), &mut self.instant);
+        let splats = self.scene.splats(&self.instant);
+        self.renderer.render(&splats, camera, self.background, None, &mut self.image);
+    }
+
+    /// The last picture in 8 bits. `range`: nearest and farthest depth of the depth colours.
+    pub(crate) fn rgb(&self, channel: Channel, range: [f32; 2]) -> Rgb {
+        match channel {
+            Channel::Color => color_rgb(&self.image.color),
+            Channel::Alpha => {
+                let plane = &self.image.alpha;
+                let data = plane.data.iter().flat_map(|a| [byte(*a); 3]).collect();
+                Rgb { width: plane.width, height: plane.height, data }
+            }
+            Channel::Depth => {
+                let (depth, alpha) = (&self.image.depth, &self.image.alpha);
+                let pixel = |(d, a): (&f32, &f32)| {
+                    if *a < DEPTH_ALPHA { [0; 3] } else { depth_color(d / a, range) }
+                };
+                let data = depth.data.iter().zip(&alpha.data).flat_map(pixel).collect();
+                Rgb { width: depth.width, height: depth.height, data }
+            }
+        }
+    }
+
+    /// Nearest and farthest of the last picture's expected depths, without the outermost hundredths.
+    pub(crate) fn depth_range(&self) -> Option<[f32; 2]> {
+        let pairs = self.image.depth.data.iter().zip(&self.image.alpha.data);
+        let mut depths: Vec<f32> = pairs.filter(|(_, a)| **a >= 0.5).map(|(d, a)| d / a).collect();
+        if depths.is_empty() {
+            return None;
+        }
+        depths.sort_by(f32::total_cmp);
+        let n = depths.len();
+        Some([depths[n / 100], depths[n - 1 - n / 100]])
+    }
+}
+
+/// Near is bright; even steps of disparity look even.
+fn depth_color(depth: f32, [near, far]: [f32; 2]) -> [u8; 3] {
+    let (n, f) = (1.0 / near.max(1e-6), 1.0 / far.max(near * 1.0001).max(1e-6));
+    let share = ((1.0 / depth.max(1e-6) - f) / (n - f)).clamp(0.0, 1.0);
+    let place = share * (DEPTH_COLORS.len() - 1) as f32;
+    let i = (place as usize).min(DEPTH_COLORS.len() - 2);
+    let u = place - i as f32;
+    std::array::from_fn(|k| (DEPTH_COLORS[i][k] * (1.0 - u) + DEPTH_COLORS[i + 1][k] * u).round() as u8)
+}
+
+/// Clamped and rounded; NaN is black.
+fn byte(v: f32) -> u8 {
+    (v.clamp(0.0, 1.0) * 255.0).round() as u8
+}
+
+/// Colour planes in 8 bits.
+pub(crate) fn color_rgb(color: &Planes<f32>) -> Rgb {
+    let n = color.pixels();
+    let mut data = Vec::with_capacity(3 * n);
+    for p in 0..n {
+        data.extend((0..3).map(|c| byte(color.data[c * n + p])));
+    }
+    Rgb { width: color.width, height: color.height, data }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn colours_are_clamped_and_rounded() {
+        let color = Planes::from_interleaved(3, 1, 2, &[-0.2, 0.5, 1.7, 1.0 / 255.0, 0.0, f32::NAN]);
+        assert_eq!(color_rgb(&color).data, [0, 128, 255, 1, 0, 0]);
+    }
+
+    #[test]
+    fn near_is_brighter_than_far() {
+        let sum = |d: f32| depth_color(d, [1.0, 9.0]).iter().map(|b| u32::from(*b)).sum::<u32>();
+        assert!(sum(1.0) > sum(2.0) && sum(2.0) > sum(5.0) && sum(5.0) > sum(9.0));
+        assert_eq!(sum(0.5), sum(1.0));
+        assert_eq!(depth_color(3.0, [3.0, 3.0]).len(), 3);
+    }
+}

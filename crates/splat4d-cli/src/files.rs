@@ -1,0 +1,205 @@
+//! Writing files so that nobody ever finds half of one.
+
+use splat4d::{Error, Result};
+use std::ffi::OsString;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+/// What to do when a file cannot be written.
+pub(crate) const WRITE_REMEDY: &str =
+    "Check that the folder exists, that you may write there and that the disk is not full.";
+
+/// Writes a file: to a temporary name in the same folder, then renamed. Devices and pipes are written directly.
+pub(crate) fn write(path: &Path, bytes: &[u8]) -> Result<()> {
+    let out = Output::new(path)?;
+    let fail = |e| cannot_write(path, e);
+    let mut file = std::fs::File::create(out.path()).map_err(fail)?;
+    file.write_all(bytes).map_err(fail)?;
+    file.flush().map_err(fail)?;
+    drop(file);
+    out.keep()
+}
+
+/// Makes a folder and its parents.
+pub(crate) fn make_folder(path: &Path) -> Result<()> {
+    std::fs::create_dir_all(path).map_err(|e| Error::io("the folder cannot be made", e).at(path.display())).map_err(
+        |e| e.remedy("Choose another place with -o: one where you may write, below a folder and not below a file."),
+    )
+}
+
+/// The error of a failed write.
+pub(crate) fn cannot_write(path: &Path, error: std::io::Error) -> Error {
+    Error::io("cannot be written", error).at(path.display()).remedy(WRITE_REMEDY)
+}
+
+/// Reads a text file.
+pub(crate) fn read_text(path: &Path) -> Result<String> {
+    std::fs::read_to_string(path).map_err(|e| cannot_read(path, e))
+}
+
+/// The error of a failed read.
+pub(crate) fn cannot_read(path: &Path, error: std::io::Error) -> Error {
+    Error::io("cannot be read", error).at(path.display()).remedy("Check that the file exists and may be read by you.")
+}
+
+/// A file under a temporary name beside its place; [`keep`](Self::keep) renames it, dropping it removes it.
+#[derive(Debug)]
+pub(crate) struct Output {
+    temporary: Option<PathBuf>,
+    target: PathBuf,
+}
+
+impl Output {
+    /// Prepares to write `path`. Errors: a folder stands there.
+    pub(crate) fn new(path: &Path) -> Result<Self> {
+        // A link is followed, so that the file behind it is replaced and not the link.
+        let target = std::fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
+        if target.is_dir() {
+            return Err(Error::input("is a folder").at(path.display()).remedy("Give the name of a file."));
+        }
+        let Some(name) = target.file_name() else {
+            return Err(Error::input("is no file name").at(path.display()).remedy("Give the name of a file."));
+        };
+        // A device or pipe (/dev/stdout, /dev/null) must not be replaced by a file.
+        let special = target.metadata().is_ok_and(|m| !m.is_file());
+        let temporary = (!special).then(|| {
+            let mut hidden = OsString::from(format!(".{}.", std::process::id()));
+            hidden.push(name);
+            target.with_file_name(hidden)
+        });
+        Ok(Self { temporary, target })
+    }
+
+    /// Where to write now.
+    pub(crate) fn path(&self) -> &Path {
+        self.temporary.as_deref().unwrap_or(&self.target)
+    }
+
+    /// Gives the file its name.
+    pub(crate) fn keep(mut self) -> Result<()> {
+        if let Some(temporary) = self.temporary.take() {
+            std::fs::rename(&temporary, &self.target).map_err(|e| {
+                let _ = std::fs::remove_file(&temporary);
+                cannot_write(&self.target, e)
+            })?;
+        }
+        Ok(())
+    }
+}
+
+impl Drop for Output {
+    fn drop(&mut self) {
+        if let Some(temporary) = &self.temporary {
+            let _ = std::fs::remove_file(temporary);
+        }
+    }
+}
+
+/// Standard base64 (RFC 4648) with padding, for data URIs.
+pub(crate) fn base64(bytes: &[u8]) -> String {
+    const ALPHABET: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+    let mut out = String::with_capacity(bytes.len().div_ceil(3) * 4);
+    for chunk in bytes.chunks(3) {
+        let word = chunk.iter().enumerate().fold(0u32, |w, (i, &b)| w | u32::from(b) << (16 - 8 * i));
+        for i in 0..4 {
+            let digit = ALPHABET[(word >> (18 - 6 * i) & 63) as usize];
+            out.push(if i <= chunk.len() { digit as char } else { '=' });
+        }
+    }
+    out
+}
+
+/// `1.5 GiB` for people.
+pub(crate) fn human_bytes(bytes: u64) -> String {
+    const UNITS: [&str; 5] = ["B", "KiB", "MiB", "GiB", "TiB"];
+    let mut value = bytes as f64;
+    let mut unit = 0;
+    while value >= 1024.0 && unit + 1 < UNITS.len() {
+        value /= 1024.0;
+        unit += 1;
+    }
+    if unit == 0 { format!("{bytes} B") } else { format!("{value:.1} {}", UNITS[unit]) }
+}
+
+/// Bytes from `512MiB`, `1.5G`, `800000000`. Both 1 MB and 1 MiB count 2²⁰ bytes: the difference never matters here.
+pub(crate) fn parse_bytes(text: &str) -> Result<u64, String> {
+    let text = text.trim();
+    let split = text.find(|c: char| !(c.is_ascii_digit() || c == '.')).unwrap_or(text.len());
+    let (number, unit) = text.split_at(split);
+    let power = match unit.trim().to_ascii_lowercase().as_str() {
+        "" | "b" => 0,
+        "k" | "kb" | "kib" => 1,
+        "m" | "mb" | "mib" => 2,
+        "g" | "gb" | "gib" => 3,
+        "t" | "tb" | "tib" => 4,
+        _ => return Err(format!("`{unit}` is no unit of memory; write for instance 512MiB or 1.5GiB")),
+    };
+    let value: f64 = number.parse().map_err(|_| format!("`{text}` is no size; write for instance 512MiB or 1.5GiB"))?;
+    let bytes = value * 1024f64.powi(power);
+    if bytes < 1.0 || bytes > 2f64.powi(50) {
+        return Err(format!("`{text}` is not between 1 byte and 1024 TiB"));
+    }
+    Ok(bytes as u64)
+}
+
+/// `1:23` or `1:02:03`.
+pub(crate) fn human_seconds(seconds: f64) -> String {
+    let s = seconds.max(0.0).round() as u64;
+    if s >= 3600 {
+        format!("{}:{:02}:{:02}", s / 3600, s / 60 % 60, s % 60)
+    } else {
+        format!("{}:{:02}", s / 60, s % 60)
+    }
+}
+
+/// `30,000`
+pub(crate) fn grouped(n: usize) -> String {
+    let digits = n.to_string();
+    let mut out = String::new();
+    for (i, c) in digits.chars().enumerate() {
+        if i > 0 && (digits.len() - i).is_multiple_of(3) {
+            out.push(',');
+        }
+        out.push(c);
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn base64_as_in_rfc_4648() {
+        for (plain, coded) in [("", ""), ("f", "Zg=="), ("fo", "Zm8="), ("foo", "Zm9v"), ("foobar", "Zm9vYmFy")] {
+            assert_eq!(base64(plain.as_bytes()), coded);
+        }
+    }
+
+    #[test]
+    fn sizes_and_numbers_are_read_and_written_for_people() {
+        assert_eq!(parse_bytes("128MiB"), Ok(128 << 20));
+        assert_eq!(parse_bytes("1.5 g"), Ok(3 << 29));
+        assert_eq!(parse_bytes("1000"), Ok(1000));
+        for bad in ["", "GiB", "1.2.3M", "-3M", "0", "5 parsecs", "1e9T"] {
+            assert!(parse_bytes(bad).is_err(), "{bad}");
+        }
+        assert_eq!(human_bytes(3 << 29), "1.5 GiB");
+        assert_eq!(human_seconds(3723.4), "1:02:03");
+        assert_eq!((grouped(999), grouped(1234567)), ("999".into(), "1,234,567".into()));
+    }
+
+    #[test]
+    fn a_full_device_is_an_error_and_stays_a_device() {
+        if !Path::new("/dev/full").exists() {
+            return;
+        }
+        let folder = tempfile::tempdir().unwrap();
+        let link = folder.path().join("out.png");
+        std::os::unix::fs::symlink("/dev/full", &link).unwrap();
+        let message = write(&link, b"pixels").unwrap_err().to_string();
+        assert!(message.contains("out.png") && message.contains("disk"), "{message}");
+        assert!(!Path::new("/dev/full").metadata().unwrap().is_file());
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "nothing half-written stays");
+    }
+}

@@ -1,0 +1,179 @@
+//! What follows training: scores and pictures of held-out views, an orbit film and the report.
+
+use crate::console::Console;
+use crate::draw::{Channel, Painter};
+use crate::files;
+use crate::paths::{Clock, Route, Stage, shots};
+use crate::report;
+use crate::run_folder::Run;
+use crate::source::{not_empty, read_scene};
+use crate::video::{Film, have_ffmpeg};
+use serde_json::{Value, json};
+use splat4d::layers::Scene;
+use splat4d::{Error, Result};
+use splat4d_train::capture::ImageStore;
+use splat4d_train::eval::run::{EvalOptions, Evaluation, evaluate};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Instant;
+
+/// Frames a second of the orbit film: cinema's, and a fifth less work than 30.
+const ORBIT_FPS: f64 = 24.0;
+/// The same where the film is an animated PNG, which grows ten times as large.
+const ORBIT_FPS_PNG: f64 = 10.0;
+/// Longer side of an animated PNG, pixels.
+const ORBIT_SIDE_PNG: usize = 400;
+
+/// Options of measuring.
+#[derive(Debug, Default, clap::Args)]
+pub(crate) struct Measure {
+    /// Weights (safetensors) for LPIPS; without them it is not computed
+    #[arg(long, value_name = "FILE", help_heading = "What is measured")]
+    pub lpips_weights: Option<PathBuf>,
+}
+
+impl Measure {
+    /// Finds missing files before hours of training.
+    pub(crate) fn check(&self) -> Result<()> {
+        match &self.lpips_weights {
+            Some(path) if !path.is_file() => Err(Error::input("there is no such file")
+                .at(path.display())
+                .remedy("Name the LPIPS weights as a .safetensors file, or leave --lpips-weights out.")),
+            _ => Ok(()),
+        }
+    }
+}
+
+/// Scores, film and report.
+pub(crate) fn all(run: &Path, measure: &Measure, console: &Console) -> anyhow::Result<()> {
+    let scene = read_scene(&Run::open(run)?.scene_file()?)?;
+    let started = Instant::now();
+    scores(run, &scene, measure, console)?;
+    amend(run, [("evaluation_seconds".into(), json!(started.elapsed().as_secs_f64()))])?;
+    let started = Instant::now();
+    match orbit(run, &scene, console) {
+        Ok(film) => {
+            console.written(&film);
+            amend(run, [("orbit_seconds".into(), json!(started.elapsed().as_secs_f64()))])?;
+        }
+        // The scene and its scores stand without the film.
+        Err(error) => console.warn(&format!("there is no orbit film: {error:#}")),
+    }
+    write_report(run, console)
+}
+
+/// Renders and scores the held-out views.
+pub(crate) fn scores(
+    run: &Path,
+    scene: &Scene<f32>,
+    measure: &Measure,
+    console: &Console,
+) -> anyhow::Result<Evaluation> {
+    not_empty(scene, run)?;
+    let opened = Run::open(run)?;
+    let (capture, recipe) = opened.open_capture()?;
+    let capture = Arc::new(capture);
+    let store = ImageStore::new(capture.clone(), usize::try_from(recipe.image_memory).unwrap_or(usize::MAX));
+    let options = EvalOptions {
+        folder: run.to_owned(),
+        antialias: recipe.antialias,
+        lpips_weights: measure.lpips_weights.clone(),
+        ..EvalOptions::default()
+    };
+    let iteration = opened.iteration().unwrap_or(0);
+    let evaluation = evaluate(scene, &capture, &store, iteration, &options, &mut |event| console.event(event))?;
+    console.clear();
+    if capture.held.is_empty() {
+        console.warn(
+            "no view was held out, so that quality on new views cannot be measured. Hold out a camera (--hold-out \
+             camera=0) or every 8th picture (--hold-out every=8).",
+        );
+    }
+    Ok(evaluation)
+}
+
+/// The report.
+pub(crate) fn write_report(run: &Path, console: &Console) -> anyhow::Result<()> {
+    let run = Run::open(run)?;
+    say_scores(&run, console);
+    console.written(&report::write(&run)?);
+    Ok(())
+}
+
+/// The scores in one line.
+fn say_scores(run: &Run, console: &Console) {
+    let mut words = Vec::new();
+    for (key, name, digits, unit) in [
+        ("PSNR", "PSNR", 2, " dB"),
+        ("PSNR-dynamic", "where things move", 2, " dB"),
+        ("PSNR-foreground", "foreground", 2, " dB"),
+        ("SSIM", "SSIM", 4, ""),
+        ("MS-SSIM", "MS-SSIM", 4, ""),
+        ("LPIPS-vgg", "LPIPS (VGG)", 4, ""),
+        ("LPIPS-alex", "LPIPS (AlexNet)", 4, ""),
+        ("flicker", "flicker", 3, "/255"),
+    ] {
+        if let Some(value) = run.score(key) {
+            words.push(format!("{name} {value:.digits$}{unit}"));
+        }
+    }
+    if !words.is_empty() {
+        console.say(&format!("held-out views: {}", words.join(", ")));
+    }
+    if let (Some(ours), Some(still)) = (run.score("PSNR-dynamic"), run.baseline("PSNR-dynamic")) {
+        console.say(&format!("where things move: {:+.2} dB over a still scene ({still:.2} dB)", ours - still));
+    }
+    if let Some(results) = &run.results {
+        let still = run.all_results.get(EvalOptions::STILL);
+        let iteration = run.iteration();
+        console.emit(&json!({"type": "results", "iteration": iteration, "results": results, "still": still}));
+    }
+}
+
+/// Films an orbit through space and time: mp4 where ffmpeg is found, an animated PNG otherwise.
+fn orbit(run: &Path, scene: &Scene<f32>, console: &Console) -> anyhow::Result<PathBuf> {
+    let opened = Run::open(run)?;
+    let views = opened.views()?;
+    let stage = Stage::of_views(&views, scene.up);
+    let mp4 = have_ffmpeg();
+    let (name, other, fps) =
+        if mp4 { ("orbit.mp4", "orbit.png", ORBIT_FPS) } else { ("orbit.png", "orbit.mp4", ORBIT_FPS_PNG) };
+    let clock = Clock { from: scene.clip[0], to: scene.clip[1], freeze: None, slow_motion: None, fps };
+    let size = (!mp4).then(|| small([stage.template.width, stage.template.height]));
+    let shots = shots(&Route::Orbit, &clock, &views, &stage, size)?;
+    let antialias = opened.recipe().is_ok_and(|r| r.antialias);
+    let mut painter = Painter::new(scene, scene.background, antialias);
+    let path = run.join(name);
+    let first = &shots[0].camera;
+    let mut film = Film::create(&path, [first.width, first.height], fps, shots.len())?;
+    for (i, shot) in shots.iter().enumerate() {
+        painter.draw(&shot.camera, shot.time);
+        film.frame(&painter.rgb(Channel::Color, [0.0, 1.0]))?;
+        console.phase("filming the orbit", i + 1, shots.len());
+    }
+    film.finish()?;
+    console.clear();
+    let _ = std::fs::remove_file(run.join(other));
+    Ok(path)
+}
+
+fn small([width, height]: [usize; 2]) -> [usize; 2] {
+    let long = width.max(height).max(1);
+    let side = |s: usize| if long > ORBIT_SIDE_PNG { (s * ORBIT_SIDE_PNG / long).max(1) } else { s };
+    [side(width), side(height)]
+}
+
+/// Adds entries to `run.json`.
+pub(crate) fn amend<const N: usize>(run: &Path, entries: [(String, Value); N]) -> Result<()> {
+    let path = run.join("run.json");
+    let mut info = if path.is_file() {
+        crate::camera_file::json(&files::read_text(&path)?).map_err(|e| e.at(path.display()))?
+    } else {
+        json!({})
+    };
+    if let Some(map) = info.as_object_mut() {
+        map.extend(entries);
+    }
+    let text = serde_json::to_string_pretty(&info).expect("run.json is plain data");
+    files::write(&path, text.as_bytes())
+}

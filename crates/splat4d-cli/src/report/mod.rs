@@ -1,0 +1,318 @@
+//! `report.html`: one page that opens without a server and tells how a run went: figures, held-out views beside their
+//! truth and error, curves, scores by camera and time, timings, memory, findings, the recipe and how to do it again.
+//! It is made from the run folder's files alone; what is missing there is missing in the page.
+
+pub(crate) mod chart;
+mod pictures;
+
+use crate::files::{self, grouped, human_bytes, human_seconds};
+use crate::run_folder::{Metrics, Run, ViewScore};
+use chart::{Series, bars, escape, lines, short};
+use serde_json::Value;
+use splat4d::Result;
+use std::fmt::Write;
+use std::path::PathBuf;
+
+const STYLE: &str = include_str!("style.css");
+/// Held-out views shown: every camera class and moment gets a glance, the page stays below 2 MB.
+const VIEWS: usize = 8;
+/// Curves of single cameras; more would be a tangle.
+const CAMERA_CURVES: usize = 5;
+/// Bars of single cameras: the weakest are shown.
+const CAMERA_BARS: usize = 24;
+
+/// Writes the page and returns its path.
+pub(crate) fn write(run: &Run) -> Result<PathBuf> {
+    let path = run.path.join("report.html");
+    files::write(&path, page(run).as_bytes())?;
+    Ok(path)
+}
+
+fn page(run: &Run) -> String {
+    let mut body = String::new();
+    header(&mut body, run);
+    cards(&mut body, run);
+    findings(&mut body, run);
+    film(&mut body, run);
+    views(&mut body, run);
+    curves(&mut body, run);
+    scores(&mut body, run);
+    costs(&mut body, run);
+    again(&mut body, run);
+    let title = escape(&run.name());
+    format!(
+        "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><meta name=\"viewport\" \
+         content=\"width=device-width, initial-scale=1\"><title>{title} · splat4d</title>\n<style>\n{STYLE}</style></head>\
+         \n<body><main>\n{body}</main></body></html>\n"
+    )
+}
+
+fn header(out: &mut String, run: &Run) {
+    let mut words = Vec::new();
+    if let Some(motion) = run.recipe_text("motion") {
+        words.push(format!("motion model {motion}"));
+    }
+    if let Some(n) = run.iteration() {
+        words.push(format!("{} steps", grouped(n)));
+    }
+    if let Some(seconds) = run.number("seconds") {
+        words.push(format!("trained in {} minutes", human_seconds(seconds)));
+    }
+    let _ = writeln!(out, "<header><h1>{}</h1><p>{}</p></header>", escape(&run.name()), escape(&words.join(" · ")));
+}
+
+fn cards(out: &mut String, run: &Run) {
+    out.push_str("<div class=\"cards\">");
+    let mut card = |class: &str, value: String, unit: &str, name: &str| {
+        let _ = write!(
+            out,
+            "<div class=\"card {class}\"><b>{}<small>{}</small></b><span>{}</span></div>",
+            escape(&value),
+            escape(unit),
+            escape(name)
+        );
+    };
+    for (class, key, digits, unit, name) in [
+        ("main", "PSNR", 2, "dB", "PSNR, held-out views"),
+        ("main", "PSNR-dynamic", 2, "dB", "PSNR where things move"),
+        ("", "PSNR-foreground", 2, "dB", "PSNR of the foreground"),
+        ("", "SSIM", 4, "", "SSIM"),
+        ("", "MS-SSIM", 4, "", "MS-SSIM"),
+        ("", "LPIPS-vgg", 4, "", "LPIPS (VGG)"),
+        ("", "LPIPS-alex", 4, "", "LPIPS (AlexNet)"),
+        ("", "LPIPS", 4, "", "LPIPS"),
+        ("", "flicker", 3, "/255", "flicker"),
+    ] {
+        if let Some(value) = run.score(key) {
+            card(class, format!("{value:.digits$}"), unit, name);
+        }
+    }
+    if let (Some(ours), Some(still)) = (run.score("PSNR-dynamic"), run.baseline("PSNR-dynamic")) {
+        card("main", format!("{:+.2}", ours - still), "dB", "where things move, over a still scene");
+    }
+    if let Some(n) = run.number("gaussians").or(run.metrics.last().map(|m| m.gaussians)) {
+        card("", grouped(n as usize), "", "Gaussians");
+    }
+    if let Some(bytes) = run.number("peak_memory").filter(|b| *b > 0.0) {
+        let text = human_bytes(bytes as u64);
+        let (value, unit) = text.split_once(' ').unwrap_or((&text, ""));
+        card("", value.into(), unit, "memory at most");
+    }
+    if let Some(seconds) = run.number("seconds") {
+        card("", human_seconds(seconds), "min", "training time");
+    }
+    out.push_str("</div>\n");
+    if run.results.is_some() && !["LPIPS", "LPIPS-vgg", "LPIPS-alex"].iter().any(|k| run.score(k).is_some()) {
+        out.push_str("<p class=\"note\">LPIPS was not computed: name its weights with --lpips-weights.</p>\n");
+    }
+}
+
+fn findings(out: &mut String, run: &Run) {
+    let findings = run.findings();
+    if findings.is_empty() {
+        return;
+    }
+    out.push_str("<h2>Worth knowing</h2>\n");
+    for finding in findings {
+        let _ = writeln!(out, "<div class=\"warn\">{}</div>", escape(&finding));
+    }
+}
+
+fn film(out: &mut String, run: &Run) {
+    if let Some(film) = pictures::film(&run.path) {
+        let _ = writeln!(out, "<h2>Through space and time</h2>\n{film}");
+    }
+}
+
+fn views(out: &mut String, run: &Run) {
+    let Some(folder) = run.pictures() else { return };
+    let mut shown = String::new();
+    // One camera after the other would show one moment only: take views spread over the list of all.
+    for i in pictures::spread(run.views.len(), VIEWS) {
+        let view = &run.views[i];
+        let pictures: Vec<Option<String>> = ["gt", "renders", "errors"]
+            .iter()
+            .map(|kind| pictures::inline(&folder.join(kind).join(&view.file)))
+            .collect();
+        if pictures.iter().all(Option::is_none) {
+            continue;
+        }
+        shown.push_str("<div class=\"view\">");
+        let place = match (&view.camera, view.time) {
+            (Some(camera), Some(time)) => format!("camera {camera}, {time:.2} s"),
+            (Some(camera), None) => format!("camera {camera}"),
+            _ => view.file.clone(),
+        };
+        let score = view.psnr.map(|p| format!("render, {p:.2} dB")).unwrap_or_else(|| "render".into());
+        for (picture, caption) in pictures.iter().zip([format!("truth, {place}"), score, "error".into()]) {
+            let image = picture.as_ref().map(|p| format!("<img alt=\"{}\" src=\"{p}\">", escape(&caption)));
+            let _ = write!(
+                shown,
+                "<figure>{}<figcaption>{}</figcaption></figure>",
+                image.unwrap_or_default(),
+                escape(&caption)
+            );
+        }
+        shown.push_str("</div>\n");
+    }
+    if !shown.is_empty() {
+        let _ = write!(
+            out,
+            "<h2>Views that training never saw</h2>\n<div class=\"views\">{shown}</div>\n<p class=\"note\">Error: the \
+             mean difference of the channels, from none (dark) to a quarter of full scale and more (bright).</p>\n"
+        );
+    }
+}
+
+fn curves(out: &mut String, run: &Run) {
+    let series = |name: &str, f: fn(&Metrics) -> f64| {
+        let points = run.metrics.iter().map(|m| (m.iteration, f(m))).collect();
+        [Series { name: name.into(), points }]
+    };
+    let charts = [
+        ("PSNR of the training views, dB", lines(&series("", |m| m.psnr), "step", "dB")),
+        ("Loss", lines(&series("", |m| m.loss), "step", "loss")),
+        ("Gaussians", lines(&series("", |m| m.gaussians), "step", "Gaussians")),
+    ];
+    panels(out, "How it learned", charts);
+}
+
+fn scores(out: &mut String, run: &Run) {
+    let mut cameras: Vec<(String, Vec<&ViewScore>)> = Vec::new();
+    for view in run.views.iter().filter(|v| v.psnr.is_some()) {
+        let Some(name) = &view.camera else { continue };
+        match cameras.iter_mut().find(|c| c.0 == *name) {
+            Some(camera) => camera.1.push(view),
+            None => cameras.push((name.clone(), vec![view])),
+        }
+    }
+    let mean = |views: &[&ViewScore]| views.iter().filter_map(|v| v.psnr).sum::<f64>() / views.len().max(1) as f64;
+    let mut rows: Vec<(String, f64, String)> =
+        cameras.iter().map(|(name, views)| (name.clone(), mean(views), format!("{:.2} dB", mean(views)))).collect();
+    let all = rows.len();
+    if all > CAMERA_BARS {
+        rows.sort_by(|a, b| a.1.total_cmp(&b.1));
+        rows.truncate(CAMERA_BARS);
+    }
+    let lowest = rows.iter().map(|r| r.1).fold(f64::INFINITY, f64::min);
+    let title = if all > CAMERA_BARS { "PSNR by camera, the weakest" } else { "PSNR by camera" };
+    let by_camera = bars(&rows, (lowest - 5.0).max(0.0), title);
+
+    let mut times: Vec<f64> = run.views.iter().filter_map(|v| v.time).collect();
+    times.sort_by(f64::total_cmp);
+    times.dedup();
+    let at = |time: f64| -> Vec<&ViewScore> {
+        run.views.iter().filter(|v| v.time == Some(time) && v.psnr.is_some()).collect()
+    };
+    let all_cameras = times.iter().map(|t| (*t, mean(&at(*t)))).collect();
+    let mut series = vec![Series { name: "all".into(), points: all_cameras }];
+    if cameras.len() > 1 {
+        series.extend(cameras.iter().take(CAMERA_CURVES).map(|(name, views)| {
+            let mut points: Vec<(f64, f64)> = views.iter().filter_map(|v| v.time.zip(v.psnr)).collect();
+            points.sort_by(|a, b| a.0.total_cmp(&b.0));
+            Series { name: name.clone(), points }
+        }));
+        // A moving camera gives one point a camera; curves need more.
+        series.retain(|s| s.points.len() > 1 || s.name == "all");
+    }
+    let by_time = if times.len() > 1 { lines(&series, "seconds", "dB") } else { None };
+    panels(out, "Where and when it is good", [(title, by_camera), ("PSNR by time, dB", by_time)]);
+}
+
+fn costs(out: &mut String, run: &Run) {
+    let mut rows: Vec<(String, f64, String)> = Vec::new();
+    for (i, name) in run.stages.iter().enumerate() {
+        let values: Vec<f64> =
+            run.metrics.iter().filter_map(|m| m.stages.get(i).copied()).filter(|v| v.is_finite()).collect();
+        if !values.is_empty() {
+            let mean = values.iter().sum::<f64>() / values.len() as f64;
+            rows.push((name.replace('_', " "), mean, format!("{} ms", short(mean))));
+        }
+    }
+    let total: f64 = rows.iter().map(|r| r.1).sum();
+    let mut table = String::new();
+    let mut row = |name: &str, value: String| {
+        let _ = write!(table, "<tr><th>{}</th><td>{}</td></tr>", escape(name), escape(&value));
+    };
+    if total > 0.0 {
+        row("A step takes", format!("{} ms on average", short(total)));
+    }
+    for (key, name) in [("evaluation_seconds", "Evaluation"), ("orbit_seconds", "Orbit film")] {
+        if let Some(seconds) = run.number(key) {
+            row(name, format!("{seconds:.1} s"));
+        }
+    }
+    for (key, name) in [("memory_estimate", "Memory, estimated before"), ("peak_memory", "Memory, at most")] {
+        if let Some(bytes) = run.number(key).filter(|b| *b > 0.0) {
+            row(name, human_bytes(bytes as u64));
+        }
+    }
+    let table = (!table.is_empty()).then(|| format!("<table>{table}</table>"));
+    panels(
+        out,
+        "What it cost",
+        [("A training step by stage", bars(&rows, 0.0, "time by stage")), ("Time and memory", table)],
+    );
+}
+
+fn again(out: &mut String, run: &Run) {
+    let mut lines = String::new();
+    if let Some(capture) = run.capture() {
+        let _ = writeln!(
+            lines,
+            "splat4d train {} --recipe {}/recipe.toml -o NEW_RUN",
+            capture.display(),
+            run.path.display()
+        );
+    }
+    for (key, name) in [
+        ("version", "splat4d"),
+        ("simd", "instructions"),
+        ("threads", "threads"),
+        ("capture_fingerprint", "capture fingerprint"),
+    ] {
+        match run.info.get(key) {
+            Some(Value::String(s)) => {
+                let _ = writeln!(lines, "# {name}: {s}");
+            }
+            Some(Value::Number(n)) => {
+                let _ = writeln!(lines, "# {name}: {n}");
+            }
+            _ => {}
+        }
+    }
+    if let Some(seed) = run.recipe_text("seed") {
+        let _ = writeln!(lines, "# seed: {seed}");
+    }
+    if !lines.is_empty() {
+        let _ = write!(
+            out,
+            "<h2>Do it again</h2>\n<pre>{}</pre>\n<p class=\"note\">The same recipe gives the same bits with any number of \
+             threads on processors with the same instructions.</p>\n",
+            escape(&lines)
+        );
+    }
+    if let Some(recipe) = &run.recipe {
+        let _ = write!(
+            out,
+            "<h2>Recipe</h2>\n<details><summary>all knobs</summary><pre>{}</pre></details>\n",
+            escape(recipe)
+        );
+    }
+}
+
+fn panels<const N: usize>(out: &mut String, title: &str, charts: [(&str, Option<String>); N]) {
+    let shown: String = charts
+        .iter()
+        .filter_map(|(name, chart)| {
+            Some(format!("<div class=\"panel\"><h3>{}</h3>{}</div>", escape(name), chart.as_ref()?))
+        })
+        .collect();
+    if !shown.is_empty() {
+        let columns = N.clamp(2, 3);
+        let _ = write!(out, "<h2>{}</h2>\n<div class=\"grid{columns}\">{shown}</div>\n", escape(title));
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,389 @@
+//! What a run folder holds, read back: `recipe.toml`, `run.json`, `metrics.csv`, `results.json`, `per_view.json`,
+//! `cameras.json`, `scene.safetensors` and checkpoints. Everything but the folder may be missing.
+
+use crate::files::{cannot_read, read_text};
+use crate::paths::View;
+use serde_json::{Value, json};
+use splat4d::math::Se3;
+use splat4d::scene::{Camera, Intrinsics, Lens};
+use splat4d::{Error, Result};
+use splat4d_train::capture::{Capture, Split};
+use splat4d_train::recipe::Recipe;
+use std::path::{Path, PathBuf};
+
+/// Files that mark a folder as a run.
+const MARKERS: [&str; 4] = ["recipe.toml", "run.json", "scene.safetensors", "checkpoints"];
+/// What splat4d writes into a run; `--force` replaces these and nothing else.
+const OURS: [&str; 15] = [
+    "recipe.toml",
+    "run.json",
+    "scene.safetensors",
+    "checkpoints",
+    "metrics.csv",
+    "results.json",
+    "per_view.json",
+    "cameras.json",
+    "test",
+    "train",
+    "orbit.mp4",
+    "orbit.png",
+    "report.html",
+    "baseline",
+    "renders",
+];
+
+/// One row of `metrics.csv`.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Metrics {
+    pub iteration: f64,
+    pub loss: f64,
+    pub psnr: f64,
+    pub gaussians: f64,
+    /// Milliseconds of each of [`Run::stages`].
+    pub stages: Vec<f64>,
+}
+
+/// The scores of one held-out view.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct ViewScore {
+    /// `00000.png`
+    pub file: String,
+    pub camera: Option<String>,
+    pub time: Option<f64>,
+    pub psnr: Option<f64>,
+}
+
+/// A run folder's files.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Run {
+    pub path: PathBuf,
+    /// `recipe.toml`
+    pub recipe: Option<String>,
+    /// `run.json`
+    pub info: Value,
+    pub metrics: Vec<Metrics>,
+    /// Names of the stages of a step.
+    pub stages: Vec<String>,
+    /// The newest entry of `results.json`.
+    pub results: Option<Value>,
+    /// All of `results.json`.
+    pub all_results: Value,
+    /// Held-out views, from `per_view.json`.
+    pub views: Vec<ViewScore>,
+    iteration: Option<usize>,
+}
+
+impl Run {
+    /// Whether this folder is a run.
+    pub(crate) fn is(path: &Path) -> bool {
+        path.is_dir() && MARKERS.iter().any(|m| path.join(m).exists())
+    }
+
+    /// Whether this run has trained to its end.
+    pub(crate) fn is_finished(path: &Path) -> bool {
+        path.join("scene.safetensors").is_file()
+    }
+
+    /// Reads the folder. Errors: it is no run; a file in it is damaged.
+    pub(crate) fn open(path: &Path) -> Result<Self> {
+        if !path.exists() {
+            return Err(Error::input("there is no such run")
+                .at(path.display())
+                .remedy("Give the folder that `splat4d train` wrote, for instance runs/knight."));
+        }
+        if !Self::is(path) {
+            return Err(Error::input("is not a run: it holds neither recipe.toml nor a scene nor checkpoints")
+                .at(path.display())
+                .remedy("Give the folder that `splat4d train` wrote, for instance runs/knight."));
+        }
+        let mut run = Self { path: path.to_owned(), ..Self::default() };
+        let text = |name: &str| {
+            let file = path.join(name);
+            if file.is_file() { read_text(&file).map(Some) } else { Ok(None) }
+        };
+        run.recipe = text("recipe.toml")?;
+        let parse = |name: &str| -> Result<Value> {
+            let Some(text) = text(name)? else { return Ok(Value::Null) };
+            crate::camera_file::json(&text).map_err(|e| e.at(path.join(name).display()))
+        };
+        run.info = parse("run.json")?;
+        if let Some(csv) = text("metrics.csv")? {
+            run.read_metrics(&csv);
+        }
+        run.all_results = parse("results.json")?;
+        if let Some((iteration, entry)) = newest(&run.all_results) {
+            run.iteration = Some(iteration);
+            run.results = Some(entry.clone());
+        }
+        run.views = newest(&parse("per_view.json")?).map(|(_, entry)| view_scores(entry)).unwrap_or_default();
+        Ok(run)
+    }
+
+    fn read_metrics(&mut self, csv: &str) {
+        let mut lines = csv.lines();
+        let header: Vec<&str> = lines.next().unwrap_or_default().split(',').map(str::trim).collect();
+        let column = |name: &str| header.iter().position(|h| *h == name);
+        let stages: Vec<(usize, &str)> =
+            header.iter().enumerate().filter_map(|(i, h)| Some((i, h.strip_suffix("_ms")?))).collect();
+        self.stages = stages.iter().map(|s| s.1.to_owned()).collect();
+        let (iteration, loss, psnr, gaussians) =
+            (column("iteration"), column("loss"), column("psnr"), column("gaussians"));
+        for line in lines {
+            let cells: Vec<f64> = line.split(',').map(|c| c.trim().parse().unwrap_or(f64::NAN)).collect();
+            let get = |i: Option<usize>| i.and_then(|i| cells.get(i).copied()).unwrap_or(f64::NAN);
+            self.metrics.push(Metrics {
+                iteration: get(iteration),
+                loss: get(loss),
+                psnr: get(psnr),
+                gaussians: get(gaussians),
+                stages: stages.iter().map(|s| get(Some(s.0))).collect(),
+            });
+        }
+    }
+
+    /// The capture's name.
+    pub(crate) fn name(&self) -> String {
+        let told = self.info.get("capture_name").and_then(Value::as_str).map(str::to_owned);
+        let folder = || self.path.file_name().map(|n| n.to_string_lossy().into_owned());
+        told.or_else(folder).unwrap_or_else(|| "run".into())
+    }
+
+    /// A number of `run.json`.
+    pub(crate) fn number(&self, key: &str) -> Option<f64> {
+        self.info.get(key).and_then(Value::as_f64)
+    }
+
+    /// A knob of the recipe, as text.
+    pub(crate) fn recipe_text(&self, knob: &str) -> Option<String> {
+        let table: toml::Table = self.recipe.as_deref()?.parse().ok()?;
+        table.get(knob).map(|v| v.as_str().map_or_else(|| v.to_string(), str::to_owned))
+    }
+
+    /// The recipe.
+    pub(crate) fn recipe(&self) -> Result<Recipe> {
+        let path = self.path.join("recipe.toml");
+        let text = self.recipe.as_deref().ok_or_else(|| {
+            Error::input("the run has no recipe.toml")
+                .at(path.display())
+                .remedy("Train again; it is written at the start.")
+        })?;
+        Recipe::from_toml(text).map_err(|e| e.at(path.display()))
+    }
+
+    /// Steps taken, where something tells.
+    pub(crate) fn iteration(&self) -> Option<usize> {
+        let told = self.number("iteration").map(|n| n as usize);
+        told.or(self.iteration).or_else(|| self.metrics.last().map(|m| m.iteration as usize))
+    }
+
+    /// A held-out score.
+    pub(crate) fn score(&self, key: &str) -> Option<f64> {
+        self.results.as_ref()?.get(key).and_then(Value::as_f64)
+    }
+
+    /// A held-out score of the still baseline.
+    pub(crate) fn baseline(&self, key: &str) -> Option<f64> {
+        self.all_results.get("still").and_then(|b| b.get(key)).and_then(Value::as_f64)
+    }
+
+    /// The capture it was trained on.
+    pub(crate) fn capture(&self) -> Option<PathBuf> {
+        self.info.get("capture").and_then(Value::as_str).map(PathBuf::from)
+    }
+
+    /// What the capture's reader noticed, and the warnings since, in that order.
+    pub(crate) fn findings(&self) -> Vec<String> {
+        let mut out: Vec<String> = Vec::new();
+        for key in ["warnings", "notes"] {
+            for entry in self.info.get(key).and_then(Value::as_array).into_iter().flatten() {
+                let text = entry.as_str().map(str::to_owned).or_else(|| {
+                    let what = entry.get("what")?.as_str()?;
+                    let remedy = entry.get("remedy").and_then(Value::as_str).unwrap_or_default();
+                    Some(format!("{what} {remedy}").trim().to_owned())
+                });
+                out.extend(text.filter(|t| !out.contains(t)));
+            }
+        }
+        out
+    }
+
+    /// The folder of the newest held-out pictures.
+    pub(crate) fn pictures(&self) -> Option<PathBuf> {
+        let test = self.path.join("test");
+        let told = self.iteration.map(|n| test.join(format!("ours_{n}")));
+        told.filter(|p| p.is_dir()).or_else(|| {
+            let folders = std::fs::read_dir(&test).ok()?.flatten().map(|e| e.path()).filter(|p| p.is_dir());
+            folders.max_by_key(|p| step_of(&p.file_name()?.to_string_lossy()))
+        })
+    }
+
+    /// The newest scene: `scene.safetensors`, or else the newest checkpoint.
+    pub(crate) fn scene_file(&self) -> Result<PathBuf> {
+        let scene = self.path.join("scene.safetensors");
+        if scene.is_file() {
+            return Ok(scene);
+        }
+        splat4d_train::train::checkpoint::list(&self.path).pop().ok_or_else(|| {
+            Error::input("the run holds no scene and no checkpoint yet")
+                .at(self.path.display())
+                .remedy("Let it train, or continue it with `splat4d train --resume`.")
+        })
+    }
+
+    /// Opens the capture again, as the run saw it.
+    pub(crate) fn open_capture(&self) -> Result<(Capture, Recipe)> {
+        let (recipe, capture) = splat4d_train::train::run::open_run(&self.path)?;
+        Ok((capture, recipe))
+    }
+
+    /// The cameras of the data set: from `cameras.json`, or else from the capture.
+    pub(crate) fn views(&self) -> Result<Vec<View>> {
+        let file = self.path.join("cameras.json");
+        if file.is_file() {
+            let value = crate::camera_file::json(&read_text(&file)?).map_err(|e| e.at(file.display()))?;
+            let list = value.as_array().map(Vec::as_slice).unwrap_or_default();
+            let views: Option<Vec<View>> = list.iter().map(read_view).collect();
+            return views.filter(|v| !v.is_empty()).ok_or_else(|| {
+                Error::input("is no list of cameras as splat4d writes it")
+                    .at(file.display())
+                    .remedy("Delete it: the cameras are then read from the capture.")
+            });
+        }
+        Ok(views_of(&self.open_capture()?.0))
+    }
+}
+
+/// The pictures that a run uses as views, held-out ones marked.
+pub(crate) fn views_of(capture: &Capture) -> Vec<View> {
+    let view = |i: usize| {
+        let frame = &capture.frames[i];
+        View {
+            camera: frame.view.clone(),
+            name: capture.cameras[frame.camera].name.clone(),
+            time: frame.time.0,
+            held: capture.split(i) == Split::Held,
+        }
+    };
+    // A run may use a part of the take only: `train` and `held` say which.
+    let mut used: Vec<usize> = capture.train.iter().chain(&capture.held).copied().collect();
+    used.sort_unstable();
+    used.into_iter().map(view).collect()
+}
+
+/// `cameras.json` as 3DGS viewers read it (camera-to-world position and rotation), with a few keys more.
+pub(crate) fn cameras_json(capture: &Capture) -> Value {
+    let one = |(id, view): (usize, View)| {
+        let world = view.camera.cam_from_world.inverse();
+        let k = &view.camera.intrinsics;
+        json!({
+            "id": id, "img_name": view.name, "width": view.camera.width, "height": view.camera.height,
+            "position": world.translation, "rotation": world.rotation, "fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy,
+            "time": view.time, "split": if view.held { "test" } else { "train" },
+        })
+    };
+    views_of(capture).into_iter().enumerate().map(one).collect()
+}
+
+fn read_view(value: &Value) -> Option<View> {
+    let number = |key: &str| value.get(key).and_then(Value::as_f64).filter(|x| x.is_finite());
+    let side = |key: &str| number(key).filter(|n| (1.0..=crate::camera_file::MAX_SIDE as f64).contains(n));
+    let position = crate::camera_file::numbers(value.get("position")?)?;
+    let rows: Vec<Vec<f64>> =
+        value.get("rotation")?.as_array()?.iter().filter_map(crate::camera_file::numbers).collect();
+    if position.len() != 3 || rows.len() != 3 || rows.iter().any(|r| r.len() != 3) {
+        return None;
+    }
+    let rotation = std::array::from_fn(|i| std::array::from_fn(|j| rows[i][j]));
+    let world = Se3 { rotation, translation: [position[0], position[1], position[2]] };
+    let (width, height) = (side("width")? as usize, side("height")? as usize);
+    let intrinsics = Intrinsics {
+        fx: number("fx").filter(|f| *f > 0.0)?,
+        fy: number("fy").filter(|f| *f > 0.0)?,
+        cx: number("cx").unwrap_or(0.5 * width as f64),
+        cy: number("cy").unwrap_or(0.5 * height as f64),
+    };
+    Some(View {
+        camera: Camera { cam_from_world: world.inverse(), intrinsics, lens: Lens::Pinhole, width, height },
+        name: value.get("img_name").and_then(Value::as_str).unwrap_or_default().to_owned(),
+        time: number("time").unwrap_or(0.0),
+        held: value.get("split").and_then(Value::as_str) == Some("test"),
+    })
+}
+
+/// Where a new run goes: the wanted folder, or with a number behind it if that is taken.
+pub(crate) fn free_folder(wanted: &Path) -> PathBuf {
+    let taken = |p: &Path| p.is_file() || std::fs::read_dir(p).is_ok_and(|mut d| d.next().is_some());
+    if !taken(wanted) {
+        return wanted.to_owned();
+    }
+    let name = wanted.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+    (2usize..).map(|i| wanted.with_file_name(format!("{name}-{i}"))).find(|p| !taken(p)).expect("some number is free")
+}
+
+/// Removes what splat4d wrote into a run, and nothing else.
+pub(crate) fn clear(run: &Path) -> Result<()> {
+    for name in OURS {
+        let path = run.join(name);
+        let removed = if path.is_dir() && !path.is_symlink() {
+            std::fs::remove_dir_all(&path)
+        } else {
+            std::fs::remove_file(&path)
+        };
+        match removed {
+            Err(e) if e.kind() != std::io::ErrorKind::NotFound => return Err(cannot_read(&path, e)),
+            _ => {}
+        }
+    }
+    Ok(())
+}
+
+/// The entry `ours_N` with the largest N.
+fn newest(results: &Value) -> Option<(usize, &Value)> {
+    results.as_object()?.iter().filter_map(|(k, v)| Some((step_of(k)?, v))).max_by_key(|e| e.0)
+}
+
+fn step_of(name: &str) -> Option<usize> {
+    name.strip_prefix("ours_")?.parse().ok()
+}
+
+fn view_scores(entry: &Value) -> Vec<ViewScore> {
+    let psnr = entry.get("PSNR").and_then(Value::as_object);
+    let mut views: Vec<ViewScore> = psnr
+        .into_iter()
+        .flatten()
+        .map(|(file, value)| ViewScore {
+            file: file.clone(),
+            camera: entry.get("camera").and_then(|c| c.get(file)).and_then(Value::as_str).map(str::to_owned),
+            time: entry.get("time").and_then(|c| c.get(file)).and_then(Value::as_f64),
+            psnr: value.as_f64(),
+        })
+        .collect();
+    views.sort_by(|a, b| a.file.cmp(&b.file));
+    views
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn taken_folders_get_a_number() {
+        let folder = tempfile::tempdir().unwrap();
+        let wanted = folder.path().join("knight");
+        assert_eq!(free_folder(&wanted), wanted);
+        std::fs::create_dir(&wanted).unwrap();
+        assert_eq!(free_folder(&wanted), wanted, "an empty folder is free");
+        std::fs::write(wanted.join("recipe.toml"), "").unwrap();
+        assert_eq!(free_folder(&wanted), folder.path().join("knight-2"));
+        std::fs::write(wanted.join("mine.txt"), "").unwrap();
+        clear(&wanted).unwrap();
+        assert!(wanted.join("mine.txt").exists() && !wanted.join("recipe.toml").exists());
+    }
+
+    #[test]
+    fn the_newest_results_are_found() {
+        let value = json!({"ours_900": {"PSNR": 1.0}, "ours_6000": {"PSNR": 2.0}, "train_ours_6000": {}, "still": {}});
+        let (iteration, entry) = newest(&value).unwrap();
+        assert_eq!((iteration, entry["PSNR"].as_f64()), (6000, Some(2.0)));
+    }
+}

@@ -1,0 +1,369 @@
+//! `info`: what a capture, a run or a file contains, and whether it looks healthy.
+
+use crate::console::Console;
+use crate::files::{grouped, human_bytes, human_seconds};
+use crate::run_folder::Run;
+use crate::source::{Source, cloud};
+use serde_json::{Value, json};
+use splat4d::Error;
+use splat4d::layers::Scene;
+use splat4d::math::sh::degree_of;
+use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
+use splat4d::scene::{GEOMETRY, SH};
+use splat4d_train::capture::{Capture, Severity};
+use splat4d_train::recipe::Recipe;
+use splat4d_train::train::run::{memory_estimate, open_capture};
+use std::fmt::Write;
+use std::path::{Path, PathBuf};
+
+/// Edges of the opacity histogram.
+const OPACITY_EDGES: [f64; 6] = [0.0, 0.005, 0.1, 0.5, 0.9, 1.0];
+/// Decades of the scale histogram, as powers of ten of the scene's radius.
+const SCALE_EDGES: [f64; 6] = [-8.0, -4.0, -3.0, -2.0, -1.0, 3.0];
+/// Share of nearly invisible Gaussians above which a file wastes much of its size.
+const MANY_FAINT: f64 = 0.5;
+/// A Gaussian larger than the scene's radius is usually a floater or a sky.
+const HUGE: f64 = 1.0;
+/// Share of huge Gaussians that is not healthy.
+const MANY_HUGE: f64 = 0.02;
+/// Below this many Gaussians shares say nothing.
+const FEW: usize = 100;
+/// Longest bar of a histogram, characters.
+const BAR: usize = 32;
+
+const EXAMPLES: &str = "\
+Examples:
+  splat4d info my-take            cameras, frames, split, findings, memory estimate
+  splat4d info runs/knight        recipe, progress, scores
+  splat4d info scene.ply --json   Gaussians, SH degree, bounds, opacity and scales, damage";
+
+/// Tell what a capture, run or file contains, and whether it looks healthy
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub(crate) struct Args {
+    /// A capture folder, a run, a scene.safetensors, a checkpoint or a 3DGS .ply
+    #[arg(value_name = "ANY")]
+    path: PathBuf,
+    /// Read a capture with pictures reduced by k
+    #[arg(long, value_name = "K")]
+    downscale: Option<usize>,
+    /// Read a capture with these views held out: camera=0,10 or every=8 or none
+    #[arg(long, value_name = "RULE")]
+    hold_out: Option<String>,
+}
+
+/// What is told: a JSON object, and the same for people.
+struct Told {
+    json: Value,
+    text: String,
+    /// Why it does not look healthy.
+    troubles: Vec<String>,
+}
+
+pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
+    let path = &args.path;
+    if !path.exists() {
+        return Err(Error::input("there is no such file or folder")
+            .at(path.display())
+            .remedy("Give a capture, a run or a scene file.")
+            .into());
+    }
+    let marker = path.extension().is_some_and(|e| e == "json");
+    let mut told = if Run::is(path) {
+        of_run(path)?
+    } else if path.is_dir() || marker {
+        of_capture(path, args)?
+    } else {
+        of_file(path)?
+    };
+    if console.json() {
+        told.json["healthy"] = json!(told.troubles.is_empty());
+        told.json["troubles"] = json!(told.troubles);
+        console.emit(&told.json);
+        return Ok(());
+    }
+    for trouble in &told.troubles {
+        let _ = writeln!(told.text, "! {trouble}");
+    }
+    let verdict = if told.troubles.is_empty() { "looks healthy" } else { "does not look healthy, see above" };
+    console.result(&format!("{}{verdict}", told.text));
+    Ok(())
+}
+
+fn line(out: &mut String, name: &str, value: &str) {
+    let _ = writeln!(out, "{name:<16} {value}");
+}
+
+fn of_capture(path: &Path, args: &Args) -> anyhow::Result<Told> {
+    let mut recipe = Recipe::default();
+    if let Some(k) = args.downscale {
+        recipe.set(&format!("downscale={k}"))?;
+    }
+    if let Some(rule) = &args.hold_out {
+        recipe.set(&format!("hold_out={}", toml::Value::String(rule.clone())))?;
+    }
+    let capture = open_capture(path, &recipe)?;
+    let (first, last) = capture.time_range();
+    let (times, sizes) = (capture.times(), sizes(&capture));
+    let memory = memory_estimate(&capture, &recipe);
+    let findings = capture.preflight();
+    let fixed = capture.cameras.iter().filter(|c| c.fixed).count();
+    let moving = capture.cameras.len() - fixed;
+    let held: Vec<String> = held_cameras(&capture);
+    let masks = capture.frames.iter().filter(|f| f.mask.is_some()).count();
+
+    let mut text = String::new();
+    line(&mut text, "capture", &format!("{} ({:?})", capture.name, capture.kind));
+    line(&mut text, "cameras", &format!("{fixed} fixed, {moving} moving"));
+    line(&mut text, "pictures", &format!("{} at {} moments", grouped(capture.frames.len()), grouped(times.len())));
+    let all: Vec<String> = sizes.iter().map(|s| format!("{}x{}", s[0], s[1])).collect();
+    line(&mut text, "size", &all.join(", "));
+    line(&mut text, "time", &format!("{first:.3} to {last:.3} s, {} frames a second", capture.fps));
+    let mut split = format!("{} to train on, {} held out", grouped(capture.train.len()), grouped(capture.held.len()));
+    if !capture.validation.is_empty() {
+        let _ = write!(split, ", {} for validation", capture.validation.len());
+    }
+    if !held.is_empty() && held.len() <= 12 {
+        let _ = write!(split, " (cameras {})", held.join(", "));
+    }
+    line(&mut text, "split", &split);
+    line(&mut text, "masks", &format!("{masks} of {}", capture.frames.len()));
+    let points = capture.points.as_ref().map_or("none".into(), |p| grouped(p.points.len()));
+    line(&mut text, "initial points", &points);
+    line(&mut text, "memory", &format!("about {} with the default recipe", human_bytes(memory)));
+    let mut troubles = Vec::new();
+    for finding in &findings {
+        match finding.severity {
+            Severity::Warning => troubles.push(format!("{} {}", finding.what, finding.remedy)),
+            Severity::Note => line(&mut text, "note", &format!("{} {}", finding.what, finding.remedy)),
+        }
+    }
+    let json = json!({
+        "type": "capture", "name": capture.name, "layout": format!("{:?}", capture.kind),
+        "fixed_cameras": fixed, "moving_cameras": moving, "pictures": capture.frames.len(), "moments": times.len(),
+        "sizes": sizes, "first_second": first, "last_second": last, "fps": capture.fps,
+        "train": capture.train.len(), "held_out": capture.held.len(), "validation": capture.validation.len(),
+        "held_out_cameras": held, "masks": masks, "points": capture.points.as_ref().map(|p| p.points.len()),
+        "memory_estimate": memory,
+        "findings": findings.iter().map(|f| json!({"severity": format!("{:?}", f.severity).to_lowercase(),
+            "what": f.what, "remedy": f.remedy})).collect::<Vec<_>>(),
+    });
+    Ok(Told { json, text, troubles })
+}
+
+fn sizes(capture: &Capture) -> Vec<[usize; 2]> {
+    let mut sizes: Vec<[usize; 2]> = capture.frames.iter().map(|f| [f.view.width, f.view.height]).collect();
+    sizes.sort_unstable();
+    sizes.dedup();
+    sizes
+}
+
+/// Names of the cameras with held-out frames, where each of them is one of a rig.
+fn held_cameras(capture: &Capture) -> Vec<String> {
+    let mut ids: Vec<usize> = capture.held.iter().map(|&i| capture.frames[i].camera).collect();
+    ids.sort_unstable();
+    ids.dedup();
+    ids.into_iter().map(|c| capture.cameras[c].name.clone()).collect()
+}
+
+fn of_run(path: &Path) -> anyhow::Result<Told> {
+    let run = Run::open(path)?;
+    let mut text = String::new();
+    let mut troubles = Vec::new();
+    line(&mut text, "run", &run.name());
+    if let Some(capture) = run.capture() {
+        line(&mut text, "capture", &capture.display().to_string());
+        if !capture.exists() {
+            troubles
+                .push("The capture has moved away: the run can be rendered, but neither resumed nor measured.".into());
+        }
+    }
+    let defaults: toml::Table = Recipe::default().to_toml().parse()?;
+    let own: toml::Table = run.recipe()?.to_toml().parse()?;
+    let resolved: toml::Table = Recipe::from_toml(&own.to_string())
+        .map(|r| Recipe { iterations: r.iterations, ..Recipe::default() }.resolve().to_toml())?
+        .parse()?;
+    // Schedules that follow from the iterations are no choice of the user's.
+    let changed: Vec<String> = own
+        .iter()
+        .filter(|(k, v)| defaults.get(*k) != Some(*v) && (*k == "iterations" || resolved.get(*k) != Some(*v)))
+        .map(|(k, v)| format!("{k}={v}"))
+        .collect();
+    let recipe = run.recipe_text("motion").unwrap_or_default();
+    let choices = if changed.is_empty() { "all defaults".to_owned() } else { changed.join(" ") };
+    line(&mut text, "recipe", &format!("{recipe}; {choices}"));
+    let total = run.number("iterations").or_else(|| run.recipe().ok().map(|r| r.iterations as f64));
+    let done = run.iteration().unwrap_or(0);
+    let finished = Run::is_finished(path);
+    let state = if finished { "finished" } else { "unfinished" };
+    line(
+        &mut text,
+        "progress",
+        &format!("{state}, step {} of {}", grouped(done), grouped(total.unwrap_or(0.0) as usize)),
+    );
+    if !finished {
+        troubles.push(format!("It is unfinished: splat4d train --resume {} continues it.", path.display()));
+    }
+    if let Some(seconds) = run.number("seconds") {
+        line(&mut text, "time", &human_seconds(seconds));
+    }
+    if let Some(bytes) = run.number("peak_memory").filter(|b| *b > 0.0) {
+        line(&mut text, "memory", &format!("{} at most", human_bytes(bytes as u64)));
+    }
+    if let Some(n) = run.number("rollbacks").filter(|n| *n > 0.0) {
+        troubles.push(format!("Training went back {n} times because a number was not finite: look at the poses."));
+    }
+    if let Some(results) = run.results.as_ref().and_then(Value::as_object) {
+        let scores: Vec<String> = results.iter().filter_map(|(k, v)| Some(format!("{k} {:.4}", v.as_f64()?))).collect();
+        line(&mut text, "held-out scores", &scores.join(", "));
+    } else {
+        line(&mut text, "held-out scores", "not measured yet: splat4d eval RUN");
+    }
+    let mut json = json!({
+        "type": "run", "name": run.name(), "capture": run.capture(), "finished": finished, "iteration": done,
+        "iterations": total, "changed_knobs": changed, "info": run.info, "results": run.all_results,
+    });
+    if let Ok(file) = run.scene_file() {
+        let scene = crate::source::read_scene(&file)?;
+        let inner = of_scene(&scene);
+        text.push_str(&inner.text);
+        troubles.extend(inner.troubles);
+        json["scene"] = inner.json;
+    }
+    Ok(Told { json, text, troubles })
+}
+
+fn of_file(path: &Path) -> anyhow::Result<Told> {
+    let source = Source::open(path)?;
+    let bytes = path.metadata().map(|m| m.len()).unwrap_or(0);
+    let mut text = String::new();
+    line(&mut text, "file", &format!("{}, {}", path.display(), human_bytes(bytes)));
+    let kind = match &source.ply {
+        Some(info) if info.compressed => "3DGS .ply, compressed (PlayCanvas)",
+        Some(_) => "3DGS .ply",
+        None => "splat4d scene",
+    };
+    line(&mut text, "kind", kind);
+    if let Some(info) = &source.ply {
+        if !info.extra_properties.is_empty() {
+            line(&mut text, "not read", &info.extra_properties.join(", "));
+        }
+        for comment in info.comments.iter().take(4) {
+            line(&mut text, "comment", comment);
+        }
+    }
+    let inner = of_scene(&source.scene);
+    text.push_str(&inner.text);
+    let mut json = inner.json;
+    json["type"] = json!(if source.ply.is_some() { "ply" } else { "scene" });
+    json["bytes"] = json!(bytes);
+    Ok(Told { json, text, troubles: inner.troubles })
+}
+
+/// Gaussians, degree, bounds, histograms and damage.
+fn of_scene(scene: &Scene<f32>) -> Told {
+    let (center, radius) = cloud(scene);
+    let mut opacity = [0usize; OPACITY_EDGES.len() - 1];
+    let mut scales = [0usize; SCALE_EDGES.len() - 1];
+    let (mut low, mut high) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
+    let (mut damaged, mut zero_quats, mut huge) = (0usize, 0usize, 0usize);
+    let mut layers = Vec::new();
+    for layer in &scene.layers {
+        let table = &layer.params[GEOMETRY];
+        let degree = degree_of(layer.params[SH].width() / 3).unwrap_or(0);
+        layers.push((
+            layer.name.clone(),
+            layer.motion.spec().name().to_owned(),
+            layer.life.name(),
+            table.rows(),
+            degree,
+        ));
+        let rows: Vec<usize> = (0..table.rows()).collect();
+        let bad = |row: &usize| {
+            layer.params.keys().any(|key| {
+                let t = &layer.params[key];
+                t.rows() == table.rows() && (0..t.width()).any(|c| !t.get(*row, c).is_finite())
+            })
+        };
+        for row in rows {
+            if bad(&row) {
+                damaged += 1;
+                continue;
+            }
+            let mean = table.read::<3>(row, 0).map(f64::from);
+            (0..3).for_each(|k| (low[k], high[k]) = (low[k].min(mean[k]), high[k].max(mean[k])));
+            zero_quats += usize::from(table.read::<4>(row, QUAT).iter().all(|q| *q == 0.0));
+            let o = 1.0 / (1.0 + (-f64::from(table.get(row, OPACITY))).exp());
+            opacity[bucket(&OPACITY_EDGES, o)] += 1;
+            let largest = table.read::<3>(row, LOG_SCALE).into_iter().map(f64::from).fold(f64::NEG_INFINITY, f64::max);
+            let decades = (largest - radius.ln()) / std::f64::consts::LN_10;
+            scales[bucket(&SCALE_EDGES, decades)] += 1;
+            huge += usize::from(largest.exp() > HUGE * radius);
+        }
+    }
+    let n = scene.len();
+    let sound = (n - damaged).max(1) as f64;
+    let mut troubles = Vec::new();
+    if n == 0 {
+        troubles.push("It holds no Gaussians.".into());
+    }
+    if damaged > 0 {
+        troubles.push(format!(
+            "{} Gaussians hold NaN or infinity: they are not drawn. Train or export again.",
+            grouped(damaged)
+        ));
+    }
+    if zero_quats > 0 {
+        troubles.push(format!("{} Gaussians have a zero rotation: they are not drawn as meant.", grouped(zero_quats)));
+    }
+    if opacity[0] as f64 > MANY_FAINT * sound && n >= FEW {
+        troubles.push(format!("{} of {} Gaussians are too faint to be seen.", grouped(opacity[0]), grouped(n)));
+    }
+    if huge as f64 > MANY_HUGE * sound && n >= FEW {
+        troubles.push(format!("{} Gaussians are larger than the whole scene: floaters, or a sky.", grouped(huge)));
+    }
+    let mut text = String::new();
+    line(&mut text, "Gaussians", &grouped(n));
+    for (name, motion, life, rows, degree) in &layers {
+        line(&mut text, "layer", &format!("{name}: {} by {motion}, life {life}, SH degree {degree}", grouped(*rows)));
+    }
+    if scene.clip[1] > scene.clip[0] {
+        line(
+            &mut text,
+            "clip",
+            &format!("{:.3} to {:.3} s, {} frames a second", scene.clip[0], scene.clip[1], scene.fps),
+        );
+    }
+    let finite = low[0] <= high[0];
+    if finite {
+        let corner = |c: [f64; 3]| format!("{:.3} {:.3} {:.3}", c[0], c[1], c[2]);
+        line(&mut text, "bounds", &format!("{} to {}", corner(low), corner(high)));
+        line(&mut text, "middle", &format!("{}; nine tenths within {radius:.3}", corner(center)));
+        let name = |w: &[f64]| format!("{} to {}", w[0], w[1]);
+        histogram(&mut text, "opacity", &OPACITY_EDGES, &opacity, name);
+        histogram(&mut text, "largest scale", &SCALE_EDGES, &scales, |w| format!("below 1e{} radii", w[1]));
+    }
+    line(&mut text, "damaged rows", &grouped(damaged));
+    let json = json!({
+        "type": "scene", "gaussians": n, "damaged_rows": damaged, "zero_rotations": zero_quats,
+        "layers": layers.iter().map(|l| json!({"name": l.0, "motion": l.1, "life": l.2, "gaussians": l.3,
+            "sh_degree": l.4})).collect::<Vec<_>>(),
+        "clip": scene.clip, "fps": scene.fps, "bounds": finite.then_some([low, high]), "middle": center,
+        "radius": radius, "opacity_histogram": {"edges": OPACITY_EDGES, "counts": opacity},
+        "scale_histogram": {"edges_log10_radii": SCALE_EDGES, "counts": scales},
+    });
+    Told { json, text, troubles }
+}
+
+fn bucket(edges: &[f64], value: f64) -> usize {
+    edges[1..edges.len() - 1].iter().take_while(|e| value >= **e).count()
+}
+
+fn histogram(out: &mut String, name: &str, edges: &[f64], counts: &[usize], label: impl Fn(&[f64]) -> String) {
+    let most = counts.iter().copied().max().unwrap_or(0).max(1);
+    for (i, count) in counts.iter().enumerate() {
+        let bar = "#".repeat((count * BAR).div_ceil(most));
+        let first = if i == 0 { name } else { "" };
+        let _ = writeln!(out, "{first:<16} {:<18} {:>10} {bar}", label(&edges[i..i + 2]), grouped(*count));
+    }
+}

@@ -1,0 +1,8 @@
+//! A file per verb: its options, its help and what it does.
+
+pub(crate) mod completions;
+pub(crate) mod eval;
+pub(crate) mod export;
+pub(crate) mod info;
+pub(crate) mod render;
+pub(crate) mod train;

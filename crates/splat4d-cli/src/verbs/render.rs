@@ -1,0 +1,277 @@
+//! `render`: pictures and films of a run, a scene file or a plain 3DGS .ply.
+
+use crate::console::Console;
+use crate::draw::{Channel, Painter};
+use crate::paths::{self, Clock, Route, parse_size, shots};
+use crate::source::{Source, not_empty};
+use crate::video::{self, Film};
+use crate::{camera_file, files};
+use splat4d::scene::Planes;
+use splat4d::{Error, format};
+use std::ffi::OsString;
+use std::path::{Path, PathBuf};
+
+/// Frames a second of films unless told.
+const FPS: f64 = 30.0;
+/// Shots that are looked at to find the range of depths.
+const DEPTH_PROBES: usize = 8;
+/// Depth range of a film in which nothing is to be seen.
+const NO_DEPTH: [f32; 2] = [1.0, 2.0];
+
+const EXAMPLES: &str = "\
+Examples:
+  splat4d render runs/knight                               an orbit, into runs/knight/renders/orbit.mp4
+  splat4d render runs/knight -o frozen.mp4 --freeze 0.4    bullet time: everything at 0.4 s
+  splat4d render runs/knight --path camera=cam03 --slow-motion 4 -o slow.mp4
+  splat4d render runs/knight --path keys.json --size 1280x720 -o flight.mp4
+  splat4d render runs/knight --path test -o views/         held-out views as numbered PNGs
+  splat4d render runs/knight --channel depth --from 0.2 --to 0.8 -o depth.mp4
+  splat4d render scene.ply --camera cam.json -o view.png --raw view
+
+The output's ending decides: .mp4 (needs ffmpeg), .png (animated if it has several frames), no ending: a folder of
+PNGs. A key frame file is
+  {\"fps\": 30, \"keys\": [{\"time\": 0, \"position\": [0, 1, 4], \"look_at\": [0, 1, 0], \"fov_y\": 45, \"scene_time\": 0},
+                       {\"time\": 3, \"world_to_camera\": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]}]}
+and a camera file
+  {\"fx\": 500, \"fy\": 500, \"cx\": 320, \"cy\": 240, \"w\": 640, \"h\": 480, \"background\": [0, 0, 0],
+   \"world_to_camera\": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]}
+with a row-major pose in OpenCV axes (x right, y down, z forward) and pixel centres at +0.5.";
+
+/// Draw pictures and films of a run, a scene.safetensors or a 3DGS .ply
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub(crate) struct Args {
+    /// The run, scene file or .ply
+    #[arg(value_name = "RUN|FILE", required_unless_present = "model")]
+    source: Option<PathBuf>,
+    /// Where to write: NAME.mp4, NAME.png, or a folder
+    #[arg(short, long, value_name = "OUT")]
+    output: Option<PathBuf>,
+    /// Where the camera goes: orbit, test, train, camera=NAME or a key frame file [default: orbit]
+    #[arg(long, value_name = "PATH", help_heading = "Camera")]
+    path: Option<Route>,
+    /// One picture from this camera (JSON)
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["path", "from", "to", "slow_motion", "fps", "size"],
+        help_heading = "Camera")]
+    camera: Option<PathBuf>,
+    /// Size of the pictures [default: the training cameras']
+    #[arg(long, value_name = "WxH", value_parser = parse_size, help_heading = "Camera")]
+    size: Option<[usize; 2]>,
+    /// First second of the scene that is shown
+    #[arg(long, value_name = "S", value_parser = second, help_heading = "Time", allow_negative_numbers = true)]
+    from: Option<f64>,
+    /// Last second of the scene that is shown
+    #[arg(long, value_name = "S", value_parser = second, help_heading = "Time", allow_negative_numbers = true)]
+    to: Option<f64>,
+    /// Everything at this second of the scene
+    #[arg(long, value_name = "S", value_parser = second, visible_alias = "time", conflicts_with_all = ["from", "to"],
+        help_heading = "Time", allow_negative_numbers = true)]
+    freeze: Option<f64>,
+    /// How many times slower than life
+    #[arg(long, value_name = "F", value_parser = factor, help_heading = "Time")]
+    slow_motion: Option<f64>,
+    /// Frames a second of the film [default: 30, or the key frame file's]
+    #[arg(long, value_name = "N", value_parser = fps, help_heading = "Time")]
+    fps: Option<f64>,
+    /// What is shown
+    #[arg(long, value_enum, default_value = "color", help_heading = "Picture")]
+    channel: Channel,
+    /// Colour behind the scene, 0 to 1 [default: the scene's, or the camera file's]
+    #[arg(long, value_name = "R,G,B", value_parser = color, help_heading = "Picture")]
+    background: Option<Color>,
+    /// With --camera: also write P.npy [h,w,3], P.alpha.npy [h,w] and P.depth.npy [h,w] (Σ zαT), unclamped
+    #[arg(long, value_name = "P", requires = "camera", help_heading = "Picture")]
+    raw: Option<PathBuf>,
+
+    #[arg(short = 'm', long = "model-path", alias = "model_path", hide = true, conflicts_with = "source")]
+    model: Option<PathBuf>,
+}
+
+type Color = [f32; 3];
+
+pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
+    let path = args.source.as_ref().or(args.model.as_ref()).expect("clap asks for a source");
+    match &args.camera {
+        Some(camera) => one(args, path, camera, console),
+        None => film(args, path, console),
+    }
+}
+
+/// One picture from a camera file.
+fn one(args: &Args, path: &Path, camera: &Path, console: &Console) -> anyhow::Result<()> {
+    let (camera, background) = camera_file::read(camera)?;
+    let Some(output) = args.output.as_ref().or(args.raw.as_ref()) else {
+        return Err(Error::input("there is nowhere to write to").remedy("Add -o NAME.png, --raw NAME or both.").into());
+    };
+    if args.output.as_ref().is_some_and(|o| o.extension().is_none_or(|e| !e.eq_ignore_ascii_case("png"))) {
+        return Err(Error::input("one picture is written as .png")
+            .at(output.display())
+            .remedy("Use -o NAME.png.")
+            .into());
+    }
+    let source = Source::open(path)?;
+    let mut painter = Painter::new(&source.scene, args.background.unwrap_or(background), antialias(&source));
+    painter.draw(&camera, args.freeze.unwrap_or(source.scene.clip[0]));
+    if let Some(out) = &args.output {
+        let range = painter.depth_range().unwrap_or(NO_DEPTH);
+        files::write(out, &painter.rgb(args.channel, range).png())?;
+        console.written(out);
+    }
+    if let Some(raw) = &args.raw {
+        let image = &painter.image;
+        raw_array(raw, ".npy", &[camera.height, camera.width, 3], &image.color.interleaved(), console)?;
+        raw_array(raw, ".alpha.npy", &[camera.height, camera.width], plane(&image.alpha), console)?;
+        raw_array(raw, ".depth.npy", &[camera.height, camera.width], plane(&image.depth), console)?;
+    }
+    Ok(())
+}
+
+fn plane(planes: &Planes<f32>) -> &[f32] {
+    &planes.data
+}
+
+fn raw_array(prefix: &Path, ending: &str, shape: &[usize], data: &[f32], console: &Console) -> anyhow::Result<()> {
+    // `--raw view` and `--raw view.npy` mean the same.
+    let mut name: OsString = prefix.as_os_str().to_owned();
+    if prefix.extension().is_some_and(|e| e == "npy") {
+        name = prefix.with_extension("").into_os_string();
+    }
+    name.push(ending);
+    let path = PathBuf::from(name);
+    let mut bytes = Vec::new();
+    format::npy::write_f32(shape, data, &mut bytes)?;
+    files::write(&path, &bytes)?;
+    console.written(&path);
+    Ok(())
+}
+
+/// Many pictures along a path.
+fn film(args: &Args, path: &Path, console: &Console) -> anyhow::Result<()> {
+    if let Some(out) = &args.output {
+        video::check(out)?;
+    }
+    let source = Source::open(path)?;
+    let scene = &source.scene;
+    not_empty(scene, path)?;
+    let route = args.path.clone().unwrap_or(Route::Orbit);
+    let views = source.views()?;
+    let told = match &route {
+        Route::Keys(file) => paths::fps_of(file)?,
+        _ => None,
+    };
+    let clock = Clock {
+        from: args.from.unwrap_or(scene.clip[0]),
+        to: args.to.unwrap_or(scene.clip[1]),
+        freeze: args.freeze,
+        slow_motion: args.slow_motion,
+        fps: args.fps.or(told).unwrap_or(FPS),
+    };
+    if clock.to < clock.from {
+        return Err(Error::input(format!("the time range ends ({} s) before it begins ({} s)", clock.to, clock.from))
+            .remedy(format!("The scene lasts from {} to {} s.", scene.clip[0], scene.clip[1]))
+            .into());
+    }
+    let stage = source.stage(&views);
+    let shots = shots(&route, &clock, &views, &stage, args.size)?;
+    let output = args.output.clone().unwrap_or_else(|| default_output(path, &route, source.run.is_some()));
+    let size = [shots[0].camera.width, shots[0].camera.height];
+    if let Some(other) = shots.iter().find(|s| [s.camera.width, s.camera.height] != size)
+        && output.extension().is_some()
+    {
+        return Err(Error::input(format!(
+            "the views have several sizes ({}x{} and {}x{}), a film has one",
+            size[0], size[1], other.camera.width, other.camera.height
+        ))
+        .remedy("Add --size, or write a folder of pictures (-o FOLDER).")
+        .into());
+    }
+    let mut painter = Painter::new(scene, args.background.unwrap_or(scene.background), antialias(&source));
+    let range = if args.channel == Channel::Depth { depth_range(&mut painter, &shots) } else { NO_DEPTH };
+    if args.output.is_none()
+        && let Some(folder) = output.parent().filter(|p| !p.as_os_str().is_empty())
+    {
+        files::make_folder(folder)?;
+    }
+    let mut film = Film::create(&output, size, clock.fps, shots.len())?;
+    for (i, shot) in shots.iter().enumerate() {
+        painter.draw(&shot.camera, shot.time);
+        film.frame(&painter.rgb(args.channel, range))?;
+        console.phase("rendering", i + 1, shots.len());
+    }
+    film.finish()?;
+    console.clear();
+    console.detail(&format!("{} frames of {}x{}", shots.len(), size[0], size[1]));
+    console.written(&output);
+    Ok(())
+}
+
+/// One range for the whole film, so that depth does not flicker.
+fn depth_range(painter: &mut Painter<'_>, shots: &[paths::Shot]) -> [f32; 2] {
+    let step = shots.len().div_ceil(DEPTH_PROBES).max(1);
+    let mut range: Option<[f32; 2]> = None;
+    for shot in shots.iter().step_by(step) {
+        painter.draw(&shot.camera, shot.time);
+        if let Some([near, far]) = painter.depth_range() {
+            range = Some(range.map_or([near, far], |[n, f]| [n.min(near), f.max(far)]));
+        }
+    }
+    range.unwrap_or(NO_DEPTH)
+}
+
+fn antialias(source: &Source) -> bool {
+    source.run.as_ref().and_then(|r| r.recipe().ok()).is_some_and(|r| r.antialias)
+}
+
+fn default_output(path: &Path, route: &Route, run: bool) -> PathBuf {
+    let name = match route {
+        Route::Orbit => "orbit".to_owned(),
+        Route::Test => "test".to_owned(),
+        Route::Train => "train".to_owned(),
+        Route::Camera(name) => {
+            name.chars().map(|c| if c.is_alphanumeric() || "-_".contains(c) { c } else { '-' }).collect()
+        }
+        Route::Keys(file) => file.file_stem().map_or("keys".into(), |s| s.to_string_lossy().into_owned()),
+    };
+    let stills = matches!(route, Route::Test | Route::Train);
+    let ending = match (stills, video::have_ffmpeg()) {
+        (true, _) => "",
+        (false, true) => ".mp4",
+        (false, false) => ".png",
+    };
+    if run {
+        return path.join("renders").join(format!("{name}{ending}"));
+    }
+    let stem = path.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
+    path.with_file_name(format!("{stem}-{name}{ending}"))
+}
+
+fn number(text: &str) -> Result<f64, String> {
+    text.trim().parse::<f64>().ok().filter(|x| x.is_finite()).ok_or_else(|| "give a number".to_owned())
+}
+
+fn second(text: &str) -> Result<f64, String> {
+    number(text).map_err(|_| "give seconds of the scene, for instance 0.5".into())
+}
+
+fn factor(text: &str) -> Result<f64, String> {
+    match number(text) {
+        Ok(f) if (0.001..=1000.0).contains(&f) => Ok(f),
+        _ => Err("give a factor from 0.001 to 1000; 4 is four times slower than life".into()),
+    }
+}
+
+fn fps(text: &str) -> Result<f64, String> {
+    match number(text) {
+        Ok(f) if (0.1..=1000.0).contains(&f) => Ok(f),
+        _ => Err("give frames a second, 0.1 to 1000".into()),
+    }
+}
+
+fn color(text: &str) -> Result<Color, String> {
+    let parts: Result<Vec<f64>, String> = text.split(',').map(number).collect();
+    match parts.as_deref() {
+        Ok([r, g, b]) => Ok([*r as f32, *g as f32, *b as f32]),
+        Ok([v]) => Ok([*v as f32; 3]),
+        _ => Err("give red, green and blue, 0 to 1, for instance 1,1,1".into()),
+    }
+}

@@ -1,0 +1,251 @@
+//! `train`: a capture becomes a run: trained, measured, filmed and reported.
+
+use crate::console::Console;
+use crate::files::{self, human_bytes, parse_bytes};
+use crate::run_folder::{self, Run, cameras_json};
+use crate::{finish, interrupt};
+use serde_json::json;
+use splat4d::{Error, ErrorKind};
+use splat4d_train::capture::{Capture, Severity};
+use splat4d_train::recipe::Recipe;
+use splat4d_train::train::run::{memory_estimate, open_capture};
+use splat4d_train::train::{self, Outcome, TrainOptions, checkpoint};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+const EXAMPLES: &str = "\
+Examples:
+  splat4d train examples/knight                     default recipe, into runs/knight
+  splat4d train my-take -o runs/first --minutes 10  as many steps as fit into ten minutes
+  splat4d train my-take --motion still              one scene for all times: a calibration check
+  splat4d train my-take --downscale 4 --set iterations=1000 --set sh_degree=0
+  splat4d train my-take --hold-out camera=0,10      measure on these cameras
+  splat4d train --resume runs/first                 continue exactly where it stopped
+
+A capture is a folder with one of these: capture.json (write it by hand for your own rig), transforms_train.json
+(D-NeRF, Blender), transforms.json (Nerfstudio), sparse/ (COLMAP), train_meta.json (PanopticSports) or
+poses_bounds.npy (N3DV). `splat4d info CAPTURE` checks one. `--help` lists every knob of the recipe.";
+
+/// Train a scene from a capture, then measure it, film it and write a report
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES, after_long_help = long_help())]
+pub(crate) struct Args {
+    /// The capture: a folder, or its marker file
+    #[arg(value_name = "CAPTURE", required_unless_present_any = ["resume", "source"])]
+    capture: Option<PathBuf>,
+    /// Where the run is written [default: runs/NAME, or runs/NAME-2 ... if that is taken]
+    #[arg(short, long, value_name = "RUN", short_alias = 'm', alias = "model_path", alias = "model-path")]
+    output: Option<PathBuf>,
+    /// Continue this run exactly where its newest checkpoint is
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["capture", "output", "motion", "minutes", "recipe", "set",
+        "downscale", "hold_out", "image_memory", "seed", "source", "iterations", "force"])]
+    resume: Option<PathBuf>,
+    /// Replace the run in the -o folder
+    #[arg(long)]
+    force: bool,
+    /// How Gaussians move: still or spacetime
+    #[arg(long, value_name = "MODEL", help_heading = "What is learned")]
+    motion: Option<String>,
+    /// Train for about M minutes: steps and schedules are fitted and saved in the recipe
+    #[arg(long, value_name = "M", value_parser = minutes, help_heading = "What is learned")]
+    minutes: Option<f64>,
+    /// Start from this recipe (TOML); a run's own recipe.toml repeats it
+    #[arg(long, value_name = "FILE", help_heading = "What is learned")]
+    recipe: Option<PathBuf>,
+    /// Set a knob of the recipe; may be repeated
+    #[arg(long, value_name = "KEY=VALUE", help_heading = "What is learned")]
+    set: Vec<String>,
+    /// Seed of every random choice
+    #[arg(long, value_name = "N", help_heading = "What is learned")]
+    seed: Option<u64>,
+    /// Reduce pictures by k: the mean of k x k boxes
+    #[arg(long, value_name = "K", short_alias = 'r', alias = "resolution", help_heading = "What is read")]
+    downscale: Option<usize>,
+    /// Views kept from training: camera=0,10 or every=8 or none [default: the data set's convention]
+    #[arg(long, value_name = "RULE", help_heading = "What is read")]
+    hold_out: Option<String>,
+    /// Memory for decoded pictures [default: 1GiB]
+    #[arg(long, value_name = "SIZE", value_parser = parse_bytes, help_heading = "What is read")]
+    image_memory: Option<u64>,
+    #[command(flatten)]
+    measure: finish::Measure,
+    /// Only train: no evaluation, film or report
+    #[arg(long, help_heading = "What is measured")]
+    no_eval: bool,
+
+    // What users of other systems type.
+    #[arg(
+        short = 's',
+        long = "source-path",
+        alias = "source_path",
+        alias = "data",
+        hide = true,
+        conflicts_with = "capture"
+    )]
+    source: Option<PathBuf>,
+    #[arg(long, alias = "total-steps", hide = true)]
+    iterations: Option<usize>,
+    #[arg(long, alias = "max_cap", alias = "max-splats", hide = true)]
+    max_cap: Option<usize>,
+    #[arg(long, alias = "sh_degree", hide = true)]
+    sh_degree: Option<usize>,
+    #[arg(long = "eval", hide = true)]
+    _eval: bool,
+}
+
+pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
+    args.measure.check()?;
+    let stop = interrupt::flag("stopping: a checkpoint is being saved");
+    let mut listen = |event: &splat4d_train::event::Event| console.event(event);
+    let (run, trained) = if let Some(run) = &args.resume {
+        Run::open(run)?;
+        (run.clone(), train::resume(run, &stop, &mut listen))
+    } else {
+        let recipe = recipe(args)?;
+        let source = args.capture.as_ref().or(args.source.as_ref()).expect("clap asks for a capture");
+        console.phase("reading the capture", 0, 0);
+        let capture = open_capture(source, &recipe)?;
+        let run = place(args, &capture, console)?;
+        describe(&capture, &recipe, console);
+        files::make_folder(&run)?;
+        let cameras = serde_json::to_vec(&cameras_json(&capture))?;
+        files::write(&run.join("cameras.json"), &cameras)?;
+        let options = TrainOptions { minutes: args.minutes };
+        let trained = train::train(Arc::new(capture), recipe, &run, &options, &stop, &mut listen);
+        if trained.is_err() {
+            leave_nothing(&run)?;
+        }
+        (run, trained)
+    };
+    console.clear();
+    let outcome: Outcome = trained?;
+    finish::amend(&run, [("notes".into(), json!(console.warnings()))])?;
+    if outcome.interrupted {
+        return Err(Error::new(
+            ErrorKind::Interrupted,
+            format!("training was stopped after step {} and saved", outcome.iteration),
+        )
+        .remedy(format!("Continue with: splat4d train --resume {}", run.display()))
+        .into());
+    }
+    console.say(&format!("wrote {}", run.join("scene.safetensors").display()));
+    if !args.no_eval {
+        finish::all(&run, &args.measure, console)?;
+    }
+    console.emit(&json!({"type": "done", "run": run}));
+    Ok(())
+}
+
+/// The recipe file, then the options, then every --set.
+fn recipe(args: &Args) -> anyhow::Result<Recipe> {
+    let mut recipe = match &args.recipe {
+        None => Recipe::default(),
+        Some(path) => Recipe::from_toml(&files::read_text(path)?).map_err(|e| e.at(path.display()))?,
+    };
+    let mut set = |knob: &str, value: Option<String>| value.map_or(Ok(()), |v| recipe.set(&format!("{knob}={v}")));
+    let quoted = |text: &String| toml::Value::String(text.clone()).to_string();
+    set("motion", args.motion.as_ref().map(quoted))?;
+    set("seed", args.seed.map(|v| v.to_string()))?;
+    set("downscale", args.downscale.map(|v| v.to_string()))?;
+    set("hold_out", args.hold_out.as_ref().map(quoted))?;
+    set("image_memory", args.image_memory.map(|v| v.to_string()))?;
+    set("iterations", args.iterations.map(|v| v.to_string()))?;
+    set("max_cap", args.max_cap.map(|v| v.to_string()))?;
+    set("sh_degree", args.sh_degree.map(|v| v.to_string()))?;
+    for assignment in &args.set {
+        recipe.set(assignment).map_err(|e| e.at("--set"))?;
+    }
+    Ok(recipe)
+}
+
+/// Where the run goes. A folder that the user named is never silently taken over.
+fn place(args: &Args, capture: &Capture, console: &Console) -> anyhow::Result<PathBuf> {
+    if let Some(run) = &args.output {
+        let used = std::fs::read_dir(run).is_ok_and(|mut d| d.next().is_some());
+        if used && args.force {
+            run_folder::clear(run)?;
+        } else if used && Run::is(run) {
+            let what = if Run::is_finished(run) { "a finished run" } else { "an unfinished run" };
+            return Err(Error::input(format!("holds {what} already"))
+                .at(run.display())
+                .remedy(format!(
+                    "Continue it with --resume {}, replace it with --force, or choose another folder with -o.",
+                    run.display()
+                ))
+                .into());
+        } else if used {
+            return Err(Error::input("is not empty and is no run")
+                .at(run.display())
+                .remedy("Choose another folder with -o.")
+                .into());
+        }
+        return Ok(run.clone());
+    }
+    let name: String =
+        capture.name.chars().map(|c| if c.is_alphanumeric() || "-_.".contains(c) { c } else { '-' }).collect();
+    let name = name.trim_matches(['.', '-']);
+    let wanted = Path::new("runs").join(if name.is_empty() { "run" } else { name });
+    let run = run_folder::free_folder(&wanted);
+    if run != wanted {
+        let hint = if Run::is(&wanted) && !Run::is_finished(&wanted) {
+            format!(" (it is unfinished: --resume {} would continue it)", wanted.display())
+        } else {
+            String::new()
+        };
+        console.say(&format!("{} is taken{hint}: this run goes to {}", wanted.display(), run.display()));
+    }
+    Ok(run)
+}
+
+/// Removes a run that failed before its first checkpoint after the start: there is nothing in it to continue.
+fn leave_nothing(run: &Path) -> anyhow::Result<()> {
+    let begun = checkpoint::list(run).iter().any(|path| *path != checkpoint::path(run, 0));
+    if !begun {
+        run_folder::clear(run)?;
+        // Fails where the user keeps files of their own there, as it should.
+        let _ = std::fs::remove_dir(run);
+    }
+    Ok(())
+}
+
+fn describe(capture: &Capture, recipe: &Recipe, console: &Console) {
+    let (first, last) = capture.time_range();
+    let size = capture.frames.first().map_or([0, 0], |f| [f.view.width, f.view.height]);
+    console.say(&format!(
+        "{}: {} cameras, {} pictures of {}x{} over {:.2} s; {} train, {} held out",
+        capture.name,
+        capture.cameras.len(),
+        capture.frames.len(),
+        size[0],
+        size[1],
+        last - first,
+        capture.train.len(),
+        capture.held.len()
+    ));
+    console.detail(&format!("memory estimate: {}", human_bytes(memory_estimate(capture, recipe))));
+    for finding in capture.preflight() {
+        let text = format!("{} {}", finding.what, finding.remedy);
+        match finding.severity {
+            Severity::Warning => console.warn(&text),
+            Severity::Note => console.detail(&text),
+        }
+    }
+}
+
+fn minutes(text: &str) -> Result<f64, String> {
+    /// A week: longer is a slip.
+    const MOST: f64 = 7.0 * 24.0 * 60.0;
+    let value: f64 = text.parse().map_err(|_| "give minutes, for instance 10 or 2.5".to_owned())?;
+    if value > 0.0 && value <= MOST { Ok(value) } else { Err(format!("give minutes above 0, at most {MOST}")) }
+}
+
+/// The examples, and every knob with its default.
+fn long_help() -> String {
+    let mut text =
+        format!("{EXAMPLES}\n\nKnobs of the recipe (--set KEY=VALUE, or lines of a TOML file for --recipe):\n");
+    for knob in Recipe::knobs() {
+        let default = if knob.default == "\"\"" { "empty" } else { &knob.default };
+        text.push_str(&format!("  {:<24} {} [{}]\n", knob.name, knob.doc.trim_end_matches('.'), default));
+    }
+    text
+}

@@ -1,0 +1,401 @@
+//! The built binary on small made-up captures: what users type, what they get, and what they are told.
+
+#[path = "cli/sample.rs"]
+mod sample;
+
+use sample::{Answer, Capture, splat4d};
+use serde_json::{Value, json};
+use splat4d::format::npy::Npy;
+use splat4d::format::ply;
+use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
+use splat4d::scene::{GEOMETRY, LifeKind, Params, SH};
+use std::path::Path;
+
+/// Options of a run that takes a second.
+const TINY: [&str; 6] = [
+    "--set=iterations=20",
+    "--set=num_pts=120",
+    "--set=max_cap=150",
+    "--set=sh_degree=1",
+    "--set=checkpoint_interval=10",
+    "--seed=3",
+];
+
+fn train(capture: &Path, run: &Path) -> Answer {
+    splat4d(&["train", str(capture), "-o", str(run)]).args(&TINY).run()
+}
+
+fn str(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+fn json_of(path: &Path) -> Value {
+    serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap()
+}
+
+#[test]
+fn help_teaches_and_completions_complete() {
+    let help = splat4d(&["--help"]).run().ok();
+    for verb in ["train", "eval", "render", "export", "info", "completions"] {
+        assert!(help.contains(verb), "{verb} is missing");
+        let own = splat4d(&[verb, "--help"]).run().ok();
+        assert!(own.contains("Examples:") && own.contains(&format!("splat4d {verb}")), "{verb} --help teaches nothing");
+    }
+    let train = splat4d(&["train", "--help"]).run().ok();
+    for knob in ["position_lr_init", "densify_until_iter", "lambda_dssim", "max_cap"] {
+        assert!(train.contains(knob), "{knob} is missing");
+    }
+    for shell in ["bash", "zsh", "fish"] {
+        assert!(splat4d(&["completions", shell]).run().ok().contains("image-memory"), "{shell}");
+    }
+    assert!(splat4d(&["--version"]).run().ok().starts_with("splat4d "));
+}
+
+#[test]
+fn a_capture_becomes_a_run_and_everything_follows() {
+    let work = tempfile::tempdir().unwrap();
+    let capture = Capture::new(work.path()).write();
+    let run = work.path().join("run");
+    let said = train(&capture, &run).ok();
+    assert!(said.contains("PSNR") && said.contains("report.html"), "{said}");
+    for file in [
+        "recipe.toml",
+        "run.json",
+        "scene.safetensors",
+        "metrics.csv",
+        "results.json",
+        "per_view.json",
+        "cameras.json",
+        "report.html",
+        "test/ours_20/renders/00000.png",
+        "test/ours_20/gt/00003.png",
+        "test/ours_20/errors/00003.png",
+    ] {
+        assert!(run.join(file).is_file(), "{file} is missing");
+    }
+    assert!(run.join("orbit.mp4").is_file() || run.join("orbit.png").is_file());
+    let results = json_of(&run.join("results.json"));
+    let psnr = results["ours_20"]["PSNR"].as_f64().unwrap();
+    assert!((5.0..60.0).contains(&psnr), "{psnr}");
+    assert!(results["ours_20"]["PSNR-dynamic"].is_f64(), "fixed cameras have a dynamic region");
+    assert!(results["train"]["ours_20"]["PSNR"].is_f64(), "training views stand apart");
+    let views = json_of(&run.join("per_view.json"));
+    assert_eq!(views["ours_20"]["camera"]["00000.png"], "cam0");
+    let mean = (0..4).map(|i| views["ours_20"]["PSNR"][format!("{i:05}.png")].as_f64().unwrap()).sum::<f64>() / 4.0;
+    assert!((mean - psnr).abs() < 1e-9, "the mean of the views is the result");
+    let page = std::fs::read_to_string(run.join("report.html")).unwrap();
+    assert!(page.contains("data:image/jpeg") && page.contains(&format!("{psnr:.2}")));
+
+    let again = train(&capture, &run);
+    assert!(again.refused().contains("--resume"), "a finished run is never silently replaced");
+
+    // eval, with the still baseline, as machines read it.
+    let lines = splat4d(&["eval", str(&run), "--baseline", "--no-film", "--json"]).run().ok();
+    let results: Vec<Value> = lines.lines().map(|l| serde_json::from_str(l).unwrap()).collect();
+    let scores = results.iter().find(|e| e["type"] == "results").unwrap();
+    assert!(scores["still"]["PSNR-dynamic"].is_f64() && scores["results"]["PSNR"].as_f64() == Some(psnr));
+    assert!(results.iter().any(|e| e["type"] == "written"));
+    let cached = splat4d(&["eval", str(&run), "--baseline", "--no-film", "--json"]).run().ok();
+    assert!(!cached.contains("\"started\""), "the baseline is trained once");
+
+    // info
+    let told: Value = serde_json::from_str(&splat4d(&["info", str(&run), "--json"]).run().ok()).unwrap();
+    assert_eq!((&told["finished"], &told["iteration"]), (&json!(true), &json!(20)));
+    assert!(told["scene"]["gaussians"].as_u64().unwrap() > 10);
+    let told = splat4d(&["info", str(&capture)]).run().ok();
+    assert!(told.contains("4 fixed") && told.contains("16 at 4 moments") && told.contains("cam0"), "{told}");
+
+    // render
+    let frames = work.path().join("frames");
+    splat4d(&["render", str(&run), "--path", "test", "-o", str(&frames)]).run().ok();
+    assert_eq!(std::fs::read_dir(&frames).unwrap().count(), 4);
+    let shown = image::open(frames.join("00002.png")).unwrap().to_rgb8();
+    let measured = image::open(run.join("test/ours_20/renders/00002.png")).unwrap().to_rgb8();
+    assert_eq!(shown, measured, "render draws what eval measured");
+    let film = work.path().join("film.png");
+    let keys = work.path().join("keys.json");
+    let key = |t: i32, x: f64| json!({"time": t, "position": [x, 0.3, -3.5], "look_at": [0, 0, 0], "scene_time": 0.05});
+    std::fs::write(&keys, json!({"fps": 4, "keys": [key(0, -1.0), key(1, 1.0)]}).to_string()).unwrap();
+    splat4d(&["render", str(&run), "--path", str(&keys), "--size", "24x18", "--channel", "depth", "-o", str(&film)])
+        .run()
+        .ok();
+    let decoder = png::Decoder::new(std::io::BufReader::new(std::fs::File::open(&film).unwrap()));
+    let reader = decoder.read_info().unwrap();
+    assert_eq!((reader.info().width, reader.info().animation_control().unwrap().num_frames), (24, 4));
+
+    // export
+    let ply_file = work.path().join("now.ply");
+    splat4d(&["export", str(&run), "-o", str(&ply_file), "--time", "0.05"]).run().ok();
+    assert!(ply::read(&std::fs::read(&ply_file).unwrap()).unwrap().0.len() > 10);
+    let sequence = work.path().join("plys");
+    splat4d(&["export", str(&run), "--sequence", str(&sequence)]).run().ok();
+    assert!(sequence.join("frame_00003.ply").is_file() && !sequence.join("frame_00004.ply").exists());
+    assert!(splat4d(&["info", str(&ply_file)]).run().ok().contains("3DGS .ply"));
+    assert!(splat4d(&["info", str(&run.join("scene.safetensors"))]).run().ok().contains("spacetime"));
+}
+
+#[test]
+fn a_stopped_run_continues_and_a_foreign_checkpoint_does_not() {
+    let work = tempfile::tempdir().unwrap();
+    let capture = Capture::new(work.path()).write();
+    let run = work.path().join("run");
+    splat4d(&["train", str(&capture), "-o", str(&run), "--no-eval"]).args(&TINY).run().ok();
+    let whole = std::fs::read(run.join("scene.safetensors")).unwrap();
+    // Back to the checkpoint of step 10, as if the machine had died.
+    std::fs::remove_file(run.join("scene.safetensors")).unwrap();
+    std::fs::remove_file(run.join("checkpoints/00000020.safetensors")).unwrap();
+    assert!(splat4d(&["info", str(&run)]).run().ok().contains("--resume"));
+    splat4d(&["train", "--resume", str(&run), "--no-eval", "--threads", "1"]).run().ok();
+    let resumed = std::fs::read(run.join("scene.safetensors")).unwrap();
+    assert!(resumed == whole, "the resumed run must be the unbroken one, bit for bit");
+
+    // A checkpoint of another version.
+    let bytes = std::fs::read(run.join("checkpoints/00000020.safetensors")).unwrap();
+    let text = String::from_utf8_lossy(&bytes[8..600]).into_owned();
+    let at = text.find("\\\"version\\\":1").map(|i| i + 8 + "\\\"version\\\":".len());
+    let mut foreign = bytes.clone();
+    foreign[at.expect("the metadata tells a version")] = b'7';
+    for file in std::fs::read_dir(run.join("checkpoints")).unwrap() {
+        std::fs::write(file.unwrap().path(), &foreign).unwrap();
+    }
+    let message = splat4d(&["train", "--resume", str(&run)]).run().refused();
+    assert!(message.contains("version 7") && message.contains("checkpoints"), "{message}");
+
+    // The same run on another capture: a camera has moved.
+    std::fs::write(run.join("checkpoints/00000020.safetensors"), &bytes).unwrap();
+    let mut moved = Capture::new(work.path());
+    moved.distance = 3.1;
+    moved.write();
+    let message = splat4d(&["train", "--resume", str(&run)]).run().refused();
+    assert!(message.contains("capture"), "{message}");
+}
+
+#[test]
+fn a_plain_file_is_drawn_as_computed_by_hand() {
+    let work = tempfile::tempdir().unwrap();
+    let file = work.path().join("one.ply");
+    // One round Gaussian on the axis at z = 4, deviation 0.5, opacity 0.6, colour (1, 0.5, 0).
+    let (z, scale, opacity, color) = (4.0f64, 0.5f64, 0.6f64, [1.0f64, 0.5, 0.0]);
+    let mut params = Params::new(1, 1, LifeKind::Infinite.columns());
+    let [geometry, sh] = params.get_mut([GEOMETRY, SH]);
+    geometry.write(0, 0, [0.0, 0.0, z as f32]);
+    geometry.write(0, QUAT, [1.0, 0.0, 0.0, 0.0]);
+    geometry.write(0, LOG_SCALE, [scale.ln() as f32; 3]);
+    geometry.set(0, OPACITY, (opacity / (1.0 - opacity)).ln() as f32);
+    sh.write(0, 0, color.map(|c| ((c - 0.5) / 0.282_094_791_773_878_14) as f32));
+    let mut bytes = Vec::new();
+    ply::write(&params, &mut bytes).unwrap();
+    std::fs::write(&file, bytes).unwrap();
+    let (w, h, f, cx, cy, background) = (31usize, 20usize, 24.0, 15.5, 10.0, [0.1, 0.2, 0.3]);
+    let camera = json!({"fx": f, "fy": f, "cx": cx, "cy": cy, "w": w, "h": h, "background": background,
+        "world_to_camera": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]});
+    let camera_file = work.path().join("cam.json");
+    std::fs::write(&camera_file, camera.to_string()).unwrap();
+    let (png, raw) = (work.path().join("out.png"), work.path().join("view"));
+    splat4d(&["render", str(&file), "--camera", str(&camera_file), "-o", str(&png), "--raw", str(&raw)]).run().ok();
+
+    let read = |name: &str| Npy::read(&std::fs::read(work.path().join(name)).unwrap()).unwrap();
+    let (color_map, alpha_map, depth_map) = (read("view.npy"), read("view.alpha.npy"), read("view.depth.npy"));
+    assert_eq!((&color_map.shape, &alpha_map.shape, &depth_map.shape), (&vec![h, w, 3], &vec![h, w], &vec![h, w]));
+    let (rgb, alpha, depth) = (color_map.to_f64(), alpha_map.to_f64(), depth_map.to_f64());
+    // Screen variance (f·s/z)² + 0.3 px²; on the axis the projection has no shear.
+    let variance = (f * scale / z).powi(2) + 0.3;
+    let picture = image::open(&png).unwrap().to_rgb8();
+    for y in 0..h {
+        for x in 0..w {
+            let (dx, dy) = (x as f64 + 0.5 - cx, y as f64 + 0.5 - cy);
+            let a = opacity * (-(dx * dx + dy * dy) / (2.0 * variance)).exp();
+            let a = if a < 1.0 / 255.0 { 0.0 } else { a };
+            let i = y * w + x;
+            // At the cut-off one side or the other is right.
+            let tolerance = if (a - 1.0 / 255.0).abs() < 1e-4 || a == 0.0 { 5e-3 } else { 2e-5 };
+            assert!((alpha[i] - a).abs() < tolerance, "alpha at {x} {y}: {} for {a}", alpha[i]);
+            assert!((depth[i] - z * a).abs() < 4.0 * tolerance);
+            for c in 0..3 {
+                let value = color[c] * a + background[c] * (1.0 - a);
+                assert!((rgb[3 * i + c] - value).abs() < tolerance, "colour {c} at {x} {y}");
+                let byte = (rgb[3 * i + c].clamp(0.0, 1.0) * 255.0).round() as u8;
+                assert_eq!(picture.get_pixel(x as u32, y as u32).0[c], byte);
+            }
+        }
+    }
+    let info: Value = serde_json::from_str(&splat4d(&["info", str(&file), "--json"]).run().ok()).unwrap();
+    assert_eq!(
+        (&info["gaussians"], &info["healthy"], &info["layers"][0]["sh_degree"]),
+        (&json!(1), &json!(true), &json!(0))
+    );
+
+    // The same file with wrong cameras and places.
+    for (key, value, reason) in [
+        ("fx", json!(0), "focal"),
+        ("world_to_camera", json!([[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), "mirrored"),
+        ("w", json!(1e7), "\"w\""),
+        ("cx", Value::Null, "\"cx\""),
+    ] {
+        let mut wrong = camera.clone();
+        wrong[key] = value;
+        std::fs::write(&camera_file, wrong.to_string()).unwrap();
+        let message = splat4d(&["render", str(&file), "--camera", str(&camera_file), "-o", str(&png)]).run().refused();
+        assert!(message.contains(reason) && message.contains("cam.json"), "{message}");
+    }
+}
+
+#[test]
+fn options_are_checked_before_any_work() {
+    let work = tempfile::tempdir().unwrap();
+    let capture = Capture::new(work.path()).write();
+    let capture = str(&capture);
+    let run = work.path().join("run");
+    let recipe = work.path().join("mine.toml");
+    std::fs::write(&recipe, "iteratons = 3\n").unwrap();
+    let damaged = work.path().join("damaged.ply");
+    std::fs::write(
+        &damaged,
+        "ply\nformat binary_little_endian 1.0\nelement vertex 99999999999\nproperty float x\nend_header\n",
+    )
+    .unwrap();
+    let cases: &[(&[&str], &str)] = &[
+        (&["train", capture, "--set", "iterations=many"], "integer"),
+        (&["train", capture, "--set", "densify_untl_iter=3"], "`densify_until_iter`"),
+        (&["train", capture, "--recipe", str(&recipe)], "`iterations`"),
+        (&["train", capture, "--motion", "spacetim"], "`spacetime`"),
+        (&["train", capture, "--hold-out", "camera=9"], "9"),
+        (&["train", capture, "--hold-out", "cams=1"], "every=N"),
+        (&["train", capture, "--downscale", "100"], "100"),
+        (&["train", capture, "--minutes", "0"], "minutes"),
+        (&["train", capture, "--image-memory", "much"], "512MiB"),
+        (&["train", capture, "--lpips-weights", "/nowhere.safetensors"], "/nowhere.safetensors"),
+        (&["train", "/nowhere"], "/nowhere"),
+        (&["train"], "CAPTURE"),
+        (&["trian", capture], "train"),
+        (&["train", "--resume", "/nowhere"], "/nowhere"),
+        (&["train", "--resume", capture], "run"),
+        (&["eval", "/nowhere"], "/nowhere"),
+        (&["eval", capture], "not a run"),
+        (&["info", "/nowhere"], "/nowhere"),
+        (&["info", str(&damaged)], "damaged.ply"),
+        (&["export", str(&damaged), "-o", "out.ply"], "damaged.ply"),
+        (&["render", str(&damaged), "-o", "film.gif"], ".gif"),
+        (&["render", str(&damaged), "--path", "spiral"], "orbit"),
+        (&["render", str(&damaged), "--size", "0x4"], "pixels"),
+    ];
+    for (args, reason) in cases {
+        let message = splat4d(args).run_in(work.path()).refused();
+        assert!(message.contains(reason), "{args:?}: {message}");
+    }
+    assert!(!run.exists() && !work.path().join("runs").exists(), "nothing half-written stays");
+}
+
+#[test]
+fn bad_captures_are_refused_with_name_and_remedy() {
+    let work = tempfile::tempdir().unwrap();
+    let spoil = |name: &str, change: &dyn Fn(&mut Capture)| {
+        let folder = work.path().join(name);
+        std::fs::create_dir(&folder).unwrap();
+        let mut capture = Capture::new(&folder);
+        change(&mut capture);
+        let path = capture.write();
+        let run = folder.join("run");
+        (path, run)
+    };
+    type Change<'a> = (&'a str, &'a dyn Fn(&mut Capture), &'a str);
+    let cases: &[Change<'_>] = &[
+        ("missing", &|c| c.missing = Some((2, 1)), "0001.png"),
+        ("truncated", &|c| c.truncated = Some((2, 1)), "0001.png"),
+        ("size", &|c| c.pictures = [40, 30], "40x30"),
+        ("focal", &|c| c.focal = 0.0, "focal"),
+        ("mirrored", &|c| c.mirrored = true, "mirrored"),
+        ("twins", &|c| c.twins = true, "pose"),
+        ("json", &|c| c.cut_json = true, "capture.json"),
+        ("masked", &|c| c.black_masks = true, "mask"),
+    ];
+    for (name, change, reason) in cases {
+        let (path, run) = spoil(name, *change);
+        let message = train(&path, &run).refused();
+        assert!(message.contains(reason), "{name}: {message}");
+        assert!(
+            !run.join("scene.safetensors").exists() && !run.join("recipe.toml").exists(),
+            "{name} left a half-written run"
+        );
+    }
+}
+
+#[test]
+fn unwritable_places_are_refused() {
+    let work = tempfile::tempdir().unwrap();
+    let capture = Capture::new(work.path()).write();
+    let file = work.path().join("file");
+    std::fs::write(&file, "mine").unwrap();
+    let message = train(&capture, &file.join("run")).refused();
+    assert!(message.contains("run") && message.contains("-o"), "{message}");
+    assert_eq!(std::fs::read_to_string(&file).unwrap(), "mine");
+    let mine = work.path().join("mine");
+    std::fs::create_dir(&mine).unwrap();
+    std::fs::write(mine.join("thesis.txt"), "words").unwrap();
+    assert!(train(&capture, &mine).refused().contains("not empty"));
+    assert!(train(&capture, Path::new("/proc/nobody/run")).refused().contains("/proc/nobody"));
+
+    if Path::new("/dev/full").exists() {
+        let run = work.path().join("run");
+        splat4d(&["train", str(&capture), "-o", str(&run), "--no-eval"]).args(&TINY).run().ok();
+        for args in [
+            &["export", str(&run), "-o", "/dev/full"][..],
+            &["render", str(&run), "--path", "orbit", "--fps", "1", "-o", "/dev/full/film.png"],
+        ] {
+            let message = splat4d(args).run().refused();
+            assert!(message.contains("/dev/full"), "{message}");
+        }
+        let link = work.path().join("full.ply");
+        std::os::unix::fs::symlink("/dev/full", &link).unwrap();
+        let message = splat4d(&["export", str(&run), "-o", str(&link)]).run().refused();
+        assert!(message.contains("disk") && message.contains("full.ply"), "{message}");
+        let shell = format!("{} info {} > /dev/full", env!("CARGO_BIN_EXE_splat4d"), str(&run));
+        let status = std::process::Command::new("sh").args(["-c", &shell]).status().unwrap();
+        assert_eq!(status.code(), Some(2), "a full disk behind standard output is an error");
+    }
+}
+
+#[test]
+fn a_default_folder_that_is_taken_gets_a_number() {
+    let work = tempfile::tempdir().unwrap();
+    let capture = Capture::new(work.path()).write();
+    for folder in ["runs/capture", "runs/capture-2"] {
+        let answer = splat4d(&["train", "-s", str(&capture), "--iterations", "3", "--no-eval"])
+            .args(&TINY[1..])
+            .run_in(work.path());
+        let said = answer.ok();
+        assert!(said.contains(folder), "{said}");
+        assert!(work.path().join(folder).join("scene.safetensors").is_file());
+    }
+    let quiet = splat4d(&["export", "runs/capture", "-o", "now.ply", "-q"]).run_in(work.path());
+    assert_eq!(quiet.ok(), "");
+}
+
+#[test]
+#[cfg(unix)]
+fn an_interrupt_saves_and_says_how_to_continue() {
+    use std::io::{BufRead, BufReader, Read};
+    let work = tempfile::tempdir().unwrap();
+    let capture = Capture::new(work.path()).write();
+    let run = work.path().join("run");
+    let mut child = std::process::Command::new(env!("CARGO_BIN_EXE_splat4d"))
+        .args(["train", str(&capture), "-o", str(&run), "--json"])
+        .args(TINY)
+        .arg("--set=iterations=1000000")
+        .stdout(std::process::Stdio::piped())
+        .stderr(std::process::Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
+    lines.find(|l| l.as_ref().unwrap().contains("\"progress\"")).unwrap().unwrap();
+    let sent = std::process::Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
+    assert!(sent.success());
+    let last: Value = serde_json::from_str(&lines.last().unwrap().unwrap()).unwrap();
+    assert_eq!((&last["type"], &last["code"]), (&json!("error"), &json!(1)));
+    let mut stderr = String::new();
+    child.stderr.take().unwrap().read_to_string(&mut stderr).unwrap();
+    assert_eq!(child.wait().unwrap().code(), Some(1));
+    assert!(stderr.contains(&format!("--resume {}", run.display())), "{stderr}");
+    assert!(std::fs::read_dir(run.join("checkpoints")).unwrap().count() > 0);
+    assert!(!run.join("scene.safetensors").exists());
+}

@@ -1,0 +1,186 @@
+//! A made-up capture: four cameras on an arc look at a bright square that crosses a grey wall, four frames each; and a
+//! way to call the binary.
+
+use image::{GrayImage, Luma, Rgb, RgbImage};
+use serde_json::{Value, json};
+use splat4d::math::Se3;
+use std::ffi::OsString;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+const CAMERAS: usize = 4;
+const FRAMES: usize = 4;
+const SIZE: [u32; 2] = [32, 24];
+
+/// What is written, and how it is spoilt.
+pub struct Capture {
+    folder: PathBuf,
+    pub distance: f64,
+    pub focal: f64,
+    /// Size of the picture files.
+    pub pictures: [u32; 2],
+    /// (camera, frame) whose picture is not there.
+    pub missing: Option<(usize, usize)>,
+    /// (camera, frame) whose picture file ends early.
+    pub truncated: Option<(usize, usize)>,
+    pub mirrored: bool,
+    /// Two cameras have one pose.
+    pub twins: bool,
+    pub cut_json: bool,
+    pub black_masks: bool,
+}
+
+impl Capture {
+    pub fn new(work: &Path) -> Self {
+        Self {
+            folder: work.join("capture"),
+            distance: 3.0,
+            focal: 30.0,
+            pictures: SIZE,
+            missing: None,
+            truncated: None,
+            mirrored: false,
+            twins: false,
+            cut_json: false,
+            black_masks: false,
+        }
+    }
+
+    /// Writes the folder and returns it.
+    pub fn write(&self) -> PathBuf {
+        let cameras: Vec<Value> = (0..CAMERAS).map(|c| self.camera(c)).collect();
+        let text = json!({"version": 1, "fps": 30, "cameras": cameras}).to_string();
+        let text = if self.cut_json { text[..text.len() / 2].to_owned() } else { text };
+        std::fs::create_dir_all(&self.folder).unwrap();
+        std::fs::write(self.folder.join("capture.json"), text).unwrap();
+        self.folder.clone()
+    }
+
+    fn pose(&self, camera: usize) -> Se3 {
+        let camera = if self.twins && camera == 3 { 2 } else { camera };
+        let angle = 0.35 * (camera as f64 - 1.5);
+        let eye = [self.distance * angle.sin(), 0.4, -self.distance * angle.cos()];
+        Se3::look_at(eye, [0.0; 3], [0.0, 1.0, 0.0])
+    }
+
+    fn camera(&self, camera: usize) -> Value {
+        let pose = self.pose(camera);
+        let images = self.folder.join(format!("images/cam{camera}"));
+        let masks = self.folder.join(format!("masks/cam{camera}"));
+        std::fs::create_dir_all(&images).unwrap();
+        std::fs::create_dir_all(&masks).unwrap();
+        for frame in 0..FRAMES {
+            let path = images.join(format!("{frame:04}.png"));
+            if self.missing == Some((camera, frame)) {
+                let _ = std::fs::remove_file(&path);
+                continue;
+            }
+            self.picture(&pose, frame).save(&path).unwrap();
+            if self.truncated == Some((camera, frame)) {
+                let bytes = std::fs::read(&path).unwrap();
+                std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
+            }
+            if self.black_masks {
+                GrayImage::from_pixel(SIZE[0], SIZE[1], Luma([0])).save(masks.join(format!("{frame:04}.png"))).unwrap();
+            }
+        }
+        let rows: Vec<[f64; 4]> = (0..3)
+            .map(|i| {
+                let r = pose.rotation[i].map(|x| if self.mirrored && i == 0 { -x } else { x });
+                [r[0], r[1], r[2], pose.translation[i]]
+            })
+            .chain([[0.0, 0.0, 0.0, 1.0]])
+            .collect();
+        let mut value = json!({
+            "name": format!("cam{camera}"), "width": SIZE[0], "height": SIZE[1], "fx": self.focal, "fy": self.focal,
+            "cx": 16, "cy": 12, "world_to_camera": rows, "images": format!("images/cam{camera}/%04d.png"),
+            "frames": FRAMES,
+        });
+        if self.black_masks {
+            value["masks"] = json!(format!("masks/cam{camera}/%04d.png"));
+        }
+        value
+    }
+
+    /// A square of half-width 0.3 at x = −0.6 … 0.6 before a wall with a slow pattern.
+    fn picture(&self, pose: &Se3, frame: usize) -> RgbImage {
+        let center = -0.6 + 0.4 * frame as f64;
+        let world = pose.inverse();
+        let eye = world.translation;
+        RgbImage::from_fn(self.pictures[0], self.pictures[1], |x, y| {
+            let ray = [(f64::from(x) + 0.5 - 16.0) / 30.0, (f64::from(y) + 0.5 - 12.0) / 30.0, 1.0];
+            let far = world.apply(ray);
+            let direction: [f64; 3] = std::array::from_fn(|k| far[k] - eye[k]);
+            let at = |z: f64| {
+                let s = (z - eye[2]) / direction[2];
+                [eye[0] + s * direction[0], eye[1] + s * direction[1]]
+            };
+            let square = at(0.0);
+            if (square[0] - center).abs() < 0.3 && square[1].abs() < 0.3 {
+                return Rgb([230, 120, 40]);
+            }
+            let wall = at(1.0);
+            let shade = 120.0 + 50.0 * (3.0 * wall[0]).sin() * (3.0 * wall[1]).cos();
+            Rgb([shade as u8, shade as u8, (shade * 0.8) as u8])
+        })
+    }
+}
+
+/// A call of the binary.
+pub struct Call {
+    args: Vec<OsString>,
+}
+
+/// How it went.
+pub struct Answer {
+    call: String,
+    code: Option<i32>,
+    stdout: String,
+    stderr: String,
+}
+
+/// `splat4d ARGS`
+pub fn splat4d(args: &[&str]) -> Call {
+    Call { args: args.iter().map(OsString::from).collect() }
+}
+
+impl Call {
+    /// More arguments.
+    pub fn args(mut self, args: &[&str]) -> Self {
+        self.args.extend(args.iter().map(OsString::from));
+        self
+    }
+
+    /// Runs in the current folder.
+    pub fn run(self) -> Answer {
+        self.run_in(Path::new("."))
+    }
+
+    /// Runs in a folder.
+    pub fn run_in(self, folder: &Path) -> Answer {
+        let output = Command::new(env!("CARGO_BIN_EXE_splat4d")).args(&self.args).current_dir(folder).output().unwrap();
+        Answer {
+            call: format!("{:?}", self.args),
+            code: output.status.code(),
+            stdout: String::from_utf8(output.stdout).unwrap(),
+            stderr: String::from_utf8(output.stderr).unwrap(),
+        }
+    }
+}
+
+impl Answer {
+    /// Standard output of a call that worked.
+    pub fn ok(self) -> String {
+        assert_eq!(self.code, Some(0), "{}: {}", self.call, self.stderr);
+        self.stdout
+    }
+
+    /// The one-paragraph error of a call that was refused for bad input.
+    pub fn refused(self) -> String {
+        assert_eq!(self.code, Some(2), "{}: {}{}", self.call, self.stdout, self.stderr);
+        let errors: Vec<&str> = self.stderr.lines().filter(|l| l.starts_with("error: ")).collect();
+        assert_eq!(errors.len(), 1, "{}: one paragraph, not {:?}", self.call, self.stderr);
+        assert!(!self.stderr.contains("panicked"), "{}", self.stderr);
+        self.stderr
+    }
+}

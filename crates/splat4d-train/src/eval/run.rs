@@ -1,0 +1,325 @@
+//! Evaluation of a scene on a capture: every held-out view is drawn and compared with its picture, a few training views
+//! too; scores, pictures and a summary are written as 3DGS users know them.
+//!
+//! | file | content |
+//! |---|---|
+//! | `results.json` | [`Report::results`], with `dynamic-share` besides; other entries are kept |
+//! | `per_view.json` | [`Report::per_view`], with `camera` and `time` of every picture besides |
+//! | `test/ours_N/{renders,gt,errors}/00000.png` | held-out views, in the capture's order |
+//!
+//! PSNR is clamped to [0,1], not rounded, per picture, then the mean. The dynamic region (pixels that leave their
+//! camera's temporal mean) and flicker are defined for fixed cameras only. Where a picture was undistorted, pixels
+//! without an original take the truth's colour, so that they count as right in every metric.
+
+use super::metrics::{self, Flicker, TemporalMean};
+use super::{InputScaling, Lpips, Report, Score, Split, View, ViewContext, score_view};
+use crate::capture::{Capture, ImageStore, StoredPicture};
+use crate::event::Event;
+use crate::train::checkpoint::write_atomically;
+use crate::{Error, Result};
+use image::codecs::png::{CompressionType, FilterType, PngEncoder};
+use image::{ExtendedColorType, ImageEncoder};
+use rayon::prelude::*;
+use serde_json::{Value, json};
+use splat4d::format::safetensors::SafeTensors;
+use splat4d::layers::{Instant, Scene};
+use splat4d::render::{Antialias, Image, RenderConfig, Renderer};
+use splat4d::scene::Planes;
+use std::path::{Path, PathBuf};
+
+/// Training views that are measured: their mean moves by less than 0.1 dB beyond that.
+const TRAIN_VIEWS: usize = 24;
+/// A mean difference of the channels as large as this is the last colour of an error picture.
+const ERROR_FULL: f32 = 0.25;
+/// Mask values above this are foreground.
+const FOREGROUND: f32 = 0.5;
+
+/// What is measured, and where it is written.
+#[derive(Clone, Debug)]
+pub struct EvalOptions {
+    /// The run's folder.
+    pub folder: PathBuf,
+    /// Antialiased mode, as the scene was trained.
+    pub antialias: bool,
+    /// Weights of LPIPS (safetensors); `None`: not computed.
+    pub lpips_weights: Option<PathBuf>,
+    /// Whether pictures are written.
+    pub pictures: bool,
+    /// Most training views measured.
+    pub train_views: usize,
+}
+
+impl Default for EvalOptions {
+    fn default() -> Self {
+        Self { folder: PathBuf::new(), antialias: false, lpips_weights: None, pictures: true, train_views: TRAIN_VIEWS }
+    }
+}
+
+impl EvalOptions {
+    /// The entry of `results.json` that holds the still baseline's scores.
+    pub const STILL: &'static str = "still";
+}
+
+/// What an evaluation found.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Evaluation {
+    /// Scores of the held-out views and of some training views.
+    pub report: Report,
+    /// Share of the held-out pixels that are dynamic; `None` without fixed held-out cameras.
+    pub dynamic_share: Option<f64>,
+}
+
+impl Evaluation {
+    /// A mean over the held-out views; `None` where it is not defined.
+    pub fn held(&self, metric: &str) -> Option<f64> {
+        match self.report.test.means().0.get(metric) {
+            Some(Score::Value(value)) => Some(*value),
+            _ => None,
+        }
+    }
+}
+
+/// Draws and measures the held-out views of `capture` (and a few training views), and writes the files above.
+///
+/// Errors: a picture that cannot be read, weights that do not fit, a folder that cannot be written.
+pub fn evaluate(
+    scene: &Scene<f32>,
+    capture: &Capture,
+    store: &ImageStore,
+    iteration: usize,
+    options: &EvalOptions,
+    listen: &mut dyn FnMut(&Event),
+) -> Result<Evaluation> {
+    let lpips = options.lpips_weights.as_deref().map(load_lpips).transpose()?;
+    let folder = options.folder.join("test").join(format!("ours_{iteration}"));
+    let mut judge = Judge::new(scene, capture, store, lpips, options.antialias);
+    let pictures = options.pictures.then_some(folder.as_path());
+    let test = judge.split(&capture.held, pictures, "evaluating held-out views", listen)?;
+    let dynamic_share = judge.dynamic_share();
+    let some = spread(&capture.train, options.train_views);
+    let train = judge.split(&some, None, "evaluating training views", listen)?;
+
+    let report = Report { iteration: iteration as u64, test, train: (!some.is_empty()).then_some(train) };
+    let (mut results, mut views) = (report.results(), report.per_view());
+    let ours = report.method();
+    results[&ours]["dynamic-share"] = json!(dynamic_share);
+    views[&ours]["camera"] = by_file(&capture.held, |f| json!(capture.cameras[capture.frames[f].camera].name));
+    views[&ours]["time"] = by_file(&capture.held, |f| json!(capture.frames[f].time.0));
+    merge(&options.folder.join("results.json"), results)?;
+    merge(&options.folder.join("per_view.json"), views)?;
+    Ok(Evaluation { report, dynamic_share })
+}
+
+struct Judge<'a> {
+    scene: &'a Scene<f32>,
+    capture: &'a Capture,
+    store: &'a ImageStore,
+    lpips: Option<Lpips>,
+    renderer: Renderer<f32>,
+    instant: Instant<f32>,
+    image: Image<f32>,
+    /// Pixels seen and dynamic pixels among them.
+    dynamic: [usize; 2],
+}
+
+impl<'a> Judge<'a> {
+    fn new(
+        scene: &'a Scene<f32>,
+        capture: &'a Capture,
+        store: &'a ImageStore,
+        lpips: Option<Lpips>,
+        antialias: bool,
+    ) -> Self {
+        let antialias = if antialias { Antialias::On } else { Antialias::Off };
+        let config = RenderConfig { antialias, ..RenderConfig::default() };
+        let renderer = Renderer::new(config);
+        Self {
+            scene,
+            capture,
+            store,
+            lpips,
+            renderer,
+            instant: Instant::default(),
+            image: Image::default(),
+            dynamic: [0; 2],
+        }
+    }
+
+    fn dynamic_share(&self) -> Option<f64> {
+        (self.dynamic[0] > 0).then(|| self.dynamic[1] as f64 / self.dynamic[0] as f64)
+    }
+
+    /// Measures the frames, camera by camera in time, so that one temporal mean and one earlier frame are in memory.
+    fn split(
+        &mut self,
+        frames: &[usize],
+        pictures: Option<&Path>,
+        name: &str,
+        listen: &mut dyn FnMut(&Event),
+    ) -> Result<Split> {
+        self.dynamic = [0; 2];
+        let mut views: Vec<Option<View>> = vec![None; frames.len()];
+        let mut flicker: Vec<Flicker> = Vec::new();
+        let mut done = 0;
+        for camera in cameras(self.capture, frames) {
+            // Temporal means and flicker are scores of new views: training views are a subset, out of order.
+            let fixed = pictures.is_some() && self.capture.cameras[camera.id].fixed && camera.places.len() > 1;
+            let mean = if fixed { Some(self.temporal_mean(frames, &camera.places)?) } else { None };
+            let mut changes = Flicker::default();
+            self.store.prefetch(&camera.places.iter().map(|&p| frames[p]).collect::<Vec<_>>());
+            for &place in &camera.places {
+                let (view, image, truth) = self.view(&file_name(place), frames[place], mean.as_ref())?;
+                if fixed {
+                    changes.push(&image, &truth);
+                }
+                views[place] = Some(view);
+                if let Some(folder) = pictures {
+                    write_pictures(folder, place, &image, &truth)?;
+                }
+                done += 1;
+                listen(&Event::Phase { name: name.into(), done, total: frames.len() });
+            }
+            flicker.push(changes);
+        }
+        let mut split = Split { views: views.into_iter().flatten().collect(), ..Split::default() };
+        if pictures.is_some() {
+            let reason = "not defined: no held-out camera is fixed and has two frames";
+            split.whole.insert("flicker".into(), Score::or(Flicker::over(&flicker), reason));
+        }
+        Ok(split)
+    }
+
+    fn temporal_mean(&self, frames: &[usize], places: &[usize]) -> Result<Planes<f32>> {
+        let (mut mean, mut truth) = (TemporalMean::default(), Planes::default());
+        for &place in places {
+            self.store.load(frames[place])?.color_into(&mut truth);
+            mean.push(&truth);
+        }
+        Ok(mean.mean().expect("a camera has at least one frame"))
+    }
+
+    /// Draws one frame and measures it. Returns the render (clean of pixels without truth) and the truth.
+    fn view(
+        &mut self,
+        name: &str,
+        frame: usize,
+        mean: Option<&Planes<f32>>,
+    ) -> Result<(View, Planes<f32>, Planes<f32>)> {
+        let stored = self.store.load(frame)?;
+        let (info, mut truth) = (&self.capture.frames[frame], Planes::default());
+        stored.color_into(&mut truth);
+        self.scene.at(info.time, &mut self.instant);
+        let splats = self.scene.splats(&self.instant);
+        self.renderer.render(&splats, &info.view, self.scene.background, None, &mut self.image);
+        let mut render = self.image.color.clone();
+        hide_unknown(&stored, &mut render, &truth);
+        let foreground = foreground(&stored);
+        let dynamic = mean.map(|m| metrics::dynamic_region(&truth, m));
+        if let Some(region) = &dynamic {
+            self.dynamic[0] += region.len();
+            self.dynamic[1] += region.iter().filter(|d| **d).count();
+        }
+        let context = ViewContext {
+            foreground: foreground.as_deref(),
+            dynamic: dynamic.as_deref(),
+            lpips: self.lpips.as_ref().map(|l| (l, InputScaling::Signed)),
+        };
+        Ok((score_view(name, &render, &truth, &context), render, truth))
+    }
+}
+
+/// A camera and the places of its frames in a list, in time.
+struct CameraFrames {
+    id: usize,
+    places: Vec<usize>,
+}
+
+fn cameras(capture: &Capture, frames: &[usize]) -> Vec<CameraFrames> {
+    let mut out: Vec<CameraFrames> = Vec::new();
+    for (place, &frame) in frames.iter().enumerate() {
+        let id = capture.frames[frame].camera;
+        match out.iter_mut().find(|c| c.id == id) {
+            Some(camera) => camera.places.push(place),
+            None => out.push(CameraFrames { id, places: vec![place] }),
+        }
+    }
+    for camera in &mut out {
+        camera.places.sort_by(|&a, &b| capture.frames[frames[a]].time.0.total_cmp(&capture.frames[frames[b]].time.0));
+    }
+    out
+}
+
+/// Pixels that the original picture does not cover take the truth's colour.
+fn hide_unknown(stored: &StoredPicture, render: &mut Planes<f32>, truth: &Planes<f32>) {
+    let mut valid = Planes::default();
+    if !stored.valid_into(&mut valid) {
+        return;
+    }
+    for c in 0..render.channels {
+        for ((r, t), v) in render.plane_mut(c).iter_mut().zip(truth.plane(c)).zip(&valid.data) {
+            *r = *r * v + t * (1.0 - v);
+        }
+    }
+}
+
+fn foreground(stored: &StoredPicture) -> Option<Vec<bool>> {
+    let mut mask = Planes::default();
+    stored.mask_into(&mut mask).then(|| mask.data.iter().map(|m| *m > FOREGROUND).collect())
+}
+
+fn load_lpips(path: &Path) -> Result<Lpips> {
+    let bytes = std::fs::read(path).map_err(|e| {
+        Error::io("the LPIPS weights cannot be read", e).at(path.display()).remedy("Check the path of --lpips-weights")
+    })?;
+    let file = SafeTensors::read(&bytes).map_err(|e| e.at(path.display()))?;
+    let tensor = |name: &str| {
+        let tensor = file.tensor(name).ok()?;
+        Some((tensor.shape().to_vec(), tensor.as_f32().ok()?.to_vec()))
+    };
+    Lpips::load(tensor).map_err(|e| e.at(path.display()))
+}
+
+fn file_name(place: usize) -> String {
+    format!("{place:05}.png")
+}
+
+fn write_pictures(folder: &Path, place: usize, render: &Planes<f32>, truth: &Planes<f32>) -> Result<()> {
+    let error = metrics::error_map(render, truth, ERROR_FULL);
+    let all = [("renders", render), ("gt", truth), ("errors", &error)];
+    all.into_par_iter()
+        .try_for_each(|(kind, picture)| write_atomically(&folder.join(kind).join(file_name(place)), &png(picture)))
+}
+
+fn png(picture: &Planes<f32>) -> Vec<u8> {
+    let data: Vec<u8> = picture.interleaved().iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
+    let mut bytes = Vec::new();
+    PngEncoder::new_with_quality(&mut bytes, CompressionType::Fast, FilterType::Adaptive)
+        .write_image(&data, picture.width as u32, picture.height as u32, ExtendedColorType::Rgb8)
+        .expect("a picture in memory can be encoded");
+    bytes
+}
+
+/// One value a picture, by its file name.
+fn by_file(frames: &[usize], value: impl Fn(usize) -> Value) -> Value {
+    frames.iter().enumerate().map(|(place, &frame)| (file_name(place), value(frame))).collect()
+}
+
+/// Puts entries into a JSON file that may hold others.
+fn merge(path: &Path, entries: Value) -> Result<()> {
+    // A damaged file is replaced: everything in it can be measured again.
+    let old = std::fs::read_to_string(path).ok().and_then(|text| serde_json::from_str::<Value>(&text).ok());
+    let mut all = old.filter(Value::is_object).unwrap_or_else(|| json!({}));
+    if let (Value::Object(all), Value::Object(entries)) = (&mut all, entries) {
+        all.extend(entries);
+    }
+    write_atomically(path, format!("{all:#}\n").as_bytes())
+}
+
+/// At most `count` of these, spread evenly.
+fn spread(frames: &[usize], count: usize) -> Vec<usize> {
+    let n = frames.len();
+    if n <= count {
+        return frames.to_vec();
+    }
+    (0..count).map(|i| frames[i * n / count]).collect()
+}
