@@ -5,6 +5,7 @@
 //! This crate reads bytes, not paths; it knows no loss, no optimiser and no data set.
 
 pub mod error;
+pub mod flow;
 pub mod format;
 pub mod layers;
 pub mod math;

@@ -1,7 +1,7 @@
 //! Adaptive density control: clone small and split large Gaussians whose screen position still wants to move; prune the
 //! transparent and the huge. Source: Kerbl et al. 2023 §5.2 and appendix B; the split's opacity as revised by Bulò 2024.
 
-use super::{Change, Limits, Stats, apply, covariances, is_dead, logit, opacity, sample, scale_row};
+use super::{Change, Limits, Stats, apply, covariances, is_dead, logit, opacity, sample};
 use crate::optim::Moments;
 use splat4d::layers::Scene;
 use splat4d::math::{Rng, sym3};
@@ -27,7 +27,7 @@ impl Adc {
         &self,
         scene: &mut Scene<f32>,
         moments: &mut [Moments<f32>],
-        stats: &Stats,
+        stats: &mut Stats,
         limits: &Limits,
         layer: usize,
         spare: &mut usize,
@@ -61,18 +61,18 @@ impl Adc {
             edit.push(r as u32, if splits[r] { Born::Split } else { Born::Clone });
         }
         let old_opacity: Vec<f64> = edit.parent.iter().map(|&r| opacity(scene, layer, r as usize)).collect();
-        apply(scene, moments, layer, &edit, &rng);
-        let geometry = &mut scene.layers[layer].params[GEOMETRY];
+        apply(scene, moments, stats, layer, &edit, &rng);
+        let layer = &mut scene.layers[layer];
         for (j, (&parent, born)) in edit.parent.iter().zip(&edit.born).enumerate() {
             let r = parent as usize;
             if *born == Born::Split {
                 let offset = sample(covs[r], rng.fork(j as u64));
-                geometry.add(j, 0, offset.map(|x| x as f32));
-                scale_row(geometry, j, 1.0 / SPLIT_SHRINK);
+                layer.params[GEOMETRY].add(j, 0, offset.map(|x| x as f32));
+                layer.resize(j, 1.0 / SPLIT_SHRINK);
             }
             if grows[r] {
                 // Two halves in one place are as opaque as the whole: 1 − √(1 − o) each.
-                geometry.set(j, OPACITY, logit(1.0 - (1.0 - old_opacity[j]).sqrt()));
+                layer.params[GEOMETRY].set(j, OPACITY, logit(1.0 - (1.0 - old_opacity[j]).sqrt()));
             }
         }
         Change { added: wanting.len(), moved: 0, removed }

@@ -4,7 +4,7 @@
 //! Where they go is drawn in space-time from opacity and screen gradient (FreeTimeGS): a row carries its life with it.
 //! Source: Kheradmand et al. 2024 (3DGS as MCMC) §3; Wang et al. 2025 (FreeTimeGS) §3.3.
 
-use super::{Change, Limits, Stats, apply, is_dead, logit, opacity, scale_row};
+use super::{Change, Limits, Stats, apply, is_dead, logit, opacity};
 use crate::optim::Moments;
 use splat4d::layers::{Layer, Scene};
 use splat4d::math::{Real, Rng, sym3};
@@ -51,7 +51,7 @@ impl Mcmc {
         &self,
         scene: &mut Scene<f32>,
         moments: &mut [Moments<f32>],
-        stats: &Stats,
+        stats: &mut Stats,
         limits: &Limits,
         layer: usize,
         spare: &mut usize,
@@ -112,15 +112,15 @@ impl Mcmc {
             }
         }
         let old: Vec<f64> = (0..rows).map(|r| opacity(scene, layer, r)).collect();
-        apply(scene, moments, layer, &edit, &rng);
-        let geometry = &mut scene.layers[layer].params[GEOMETRY];
+        apply(scene, moments, stats, layer, &edit, &rng);
+        let layer = &mut scene.layers[layer];
         for (j, &parent) in edit.parent.iter().enumerate() {
             let n = copies[parent as usize];
             if n > 1 {
                 let (o, factor) = relocated(old[parent as usize], n);
                 // Never below the dead opacity, or it would be moved again at once.
-                geometry.set(j, OPACITY, logit(o.max(limits.min_opacity * 1.001)));
-                scale_row(geometry, j, factor);
+                layer.params[GEOMETRY].set(j, OPACITY, logit(o.max(limits.min_opacity * 1.001)));
+                layer.resize(j, factor);
             }
         }
         Change { added, moved, removed: 0 }

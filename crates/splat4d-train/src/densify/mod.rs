@@ -53,6 +53,17 @@ impl Stats {
         if count > 0.0 { sum / count } else { 0.0 }
     }
 
+    /// Follows a row edit of a layer: rows that are not `Kept` have not been seen yet.
+    pub fn edit(&mut self, layer: usize, edit: &RowEdit) {
+        if edit.space == Space::Gaussians {
+            let table = &mut self.tables[layer];
+            *table = table.gather(&edit.parent);
+            for (row, _) in edit.born.iter().enumerate().filter(|(_, b)| **b != Born::Kept) {
+                table.clear_row(row);
+            }
+        }
+    }
+
     /// Forgets everything; also takes over a changed number of rows.
     pub fn clear<F: Real>(&mut self, scene: &Scene<F>) {
         *self = Self::new(scene);
@@ -106,13 +117,20 @@ impl Densify {
     ) -> Change {
         let mut change = Change::default();
         let mut spare = limits.cap.saturating_sub(scene.len());
+        let mut rest = scene.len();
         for layer in 0..scene.layers.len() {
+            // What is left of the cap is shared by size, so that the first layer does not starve the others; what a
+            // layer does not use goes to the next.
+            let rows = scene.layers[layer].params.len();
+            let mut room = (spare * rows).div_ceil(rest.max(1));
+            (spare, rest) = (spare - room, rest - rows);
             let rng = Rng::new(seed, "densify", step).fork(layer as u64);
             let c = match self {
                 Densify::None => Change::default(),
-                Densify::Adc(adc) => adc.run(scene, moments, stats, limits, layer, &mut spare, rng),
-                Densify::Mcmc(mcmc) => mcmc.run(scene, moments, stats, limits, layer, &mut spare, rng),
+                Densify::Adc(adc) => adc.run(scene, moments, stats, limits, layer, &mut room, rng),
+                Densify::Mcmc(mcmc) => mcmc.run(scene, moments, stats, limits, layer, &mut room, rng),
             };
+            spare += room;
             change.added += c.added;
             change.moved += c.moved;
             change.removed += c.removed;
@@ -122,9 +140,17 @@ impl Densify {
     }
 }
 
-/// Applies one edit to a layer and to its moments.
-pub fn apply(scene: &mut Scene<f32>, moments: &mut [Moments<f32>], layer: usize, edit: &RowEdit, rng: &Rng) {
+/// Applies one edit to a layer, its moments and its statistics.
+pub fn apply(
+    scene: &mut Scene<f32>,
+    moments: &mut [Moments<f32>],
+    stats: &mut Stats,
+    layer: usize,
+    edit: &RowEdit,
+    rng: &Rng,
+) {
     moments[layer].edit(&scene.layers[layer].params, edit);
+    stats.edit(layer, edit);
     scene.layers[layer].edit(edit, rng);
 }
 
@@ -168,11 +194,6 @@ fn sample(cov: [f64; 6], rng: Rng) -> [f64; 3] {
     let (values, vectors) = sym3::eigen(cov);
     let z: [f64; 3] = std::array::from_fn(|k| rng.normal(k as u64) * values[k].max(0.0).sqrt());
     std::array::from_fn(|r| vectors[r][0] * z[0] + vectors[r][1] * z[1] + vectors[r][2] * z[2])
-}
-
-/// Scales a row's learnable size by `factor`.
-fn scale_row(geometry: &mut Table<f32>, row: usize, factor: f64) {
-    geometry.add(row, LOG_SCALE, [factor.ln() as f32; 3]);
 }
 
 /// Shuffles the rows of a layer by the Morton order of their means: neighbours in space become neighbours in memory.
@@ -246,7 +267,8 @@ mod tests {
         };
         let before = distance(&s);
         let mut moments: Vec<_> = s.layers.iter().map(|l| Moments::new(&l.params)).collect();
-        apply(&mut s, &mut moments, 0, &edit, &Rng::new(0, "m", 0));
+        let mut stats = Stats::new(&s);
+        apply(&mut s, &mut moments, &mut stats, 0, &edit, &Rng::new(0, "m", 0));
         assert!(distance(&s) < 0.6 * before);
     }
 

@@ -4,6 +4,8 @@
 
 pub mod spacetime;
 pub mod still;
+#[cfg(test)]
+mod tests;
 
 use crate::densify::Densify;
 use crate::recipe::Recipe;
@@ -186,26 +188,4 @@ pub fn densify_of(r: &Recipe) -> (Densify, (usize, usize, usize)) {
         _ => Densify::None,
     };
     (densify, (r.densify_from_iter, r.densify_until_iter, r.densification_interval))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn every_built_in_model_has_a_program() {
-        for name in splat4d::motion::BUILT_IN {
-            assert!(program(name).is_ok(), "{name} has mathematics but no program");
-        }
-        assert!(program("warp").is_err_and(|e| e.to_string().contains("spacetime")));
-    }
-
-    #[test]
-    fn rates_are_log_linear() {
-        let r = Rate { start: 1e-2, end: 1e-4 };
-        assert!(
-            (r.at(0.0) - 1e-2).abs() < 1e-12 && (r.at(0.5) - 1e-3).abs() < 1e-12 && (r.at(1.0) - 1e-4).abs() < 1e-12
-        );
-        assert_eq!(Rate::constant(0.0).at(0.3), 0.0);
-    }
 }

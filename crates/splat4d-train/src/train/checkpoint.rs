@@ -197,11 +197,19 @@ fn load(file: &SafeTensors<'_>, name: &str, table: &mut Table<f32>) -> Result<()
 }
 
 /// Writes a file so that a crash leaves the old one or the new one, never half: a temporary name in the same folder, then
-/// a rename.
+/// a rename. A device or a pipe is written to and never replaced: as root, a rename would put a file in its place.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<()> {
     let place = |e: std::io::Error, what: &str| {
         Error::io(what, e).at(path.display()).remedy("Check that the folder exists, is writable and has space")
     };
+    // Folders fall through to the rename, which refuses to replace them.
+    if std::fs::metadata(path).is_ok_and(|m| !m.is_file() && !m.is_dir()) {
+        let written = std::fs::OpenOptions::new().write(true).open(path).and_then(|mut f| {
+            use std::io::Write;
+            f.write_all(bytes)
+        });
+        return written.map_err(|e| place(e, "the file cannot be written"));
+    }
     let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     std::fs::create_dir_all(folder).map_err(|e| place(e, "the folder cannot be made"))?;
     let name = path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();

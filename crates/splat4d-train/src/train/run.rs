@@ -1,5 +1,9 @@
 //! A run on disk: folder, recipe, checkpoints, metrics, resume, rollback. It emits events and never prints.
 
+#[cfg(test)]
+#[path = "run_tests.rs"]
+mod tests;
+
 use super::checkpoint::{self, Identity, RunState, write_atomically};
 use super::dataset::Dataset;
 use super::loss::{Exposure, TrainLoss};
@@ -42,7 +46,7 @@ pub struct Outcome {
     pub interrupted: bool,
 }
 
-/// Rollbacks after which a run is given up.
+/// Faults at which a run is given up.
 const MAX_STRIKES: usize = 3;
 /// After a rollback rates are multiplied by this.
 const ROLLBACK_RATE: f64 = 0.5;
@@ -567,7 +571,7 @@ impl Session<'_> {
     fn roll_back(&self, trainer: &mut Trainer<'_>, what: &str, listen: &mut dyn FnMut(&Event)) -> Result<RunState> {
         let (failed, strikes, rate) =
             (trainer.progress.iteration + 1, trainer.progress.strikes + 1, trainer.progress.rate_scale);
-        if strikes > MAX_STRIKES {
+        if strikes >= MAX_STRIKES {
             return Err(Error::new(
                 ErrorKind::Diverged,
                 format!("training diverged {strikes} times, last at iteration {failed}: {what}"),

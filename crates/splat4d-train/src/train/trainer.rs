@@ -127,6 +127,18 @@ impl<'a> Trainer<'a> {
         trainer
     }
 
+    /// Draws with another device from now on.
+    #[cfg(test)]
+    pub(super) fn set_draw(&mut self, draw: Box<dyn Draw<f32> + 'a>) {
+        self.draw = draw;
+    }
+
+    /// Looks at other frames, of the same times, from now on.
+    #[cfg(test)]
+    pub(super) fn set_frames(&mut self, frames: Arc<dyn Frames>) {
+        self.frames = frames;
+    }
+
     /// Steps of all stages.
     pub fn iterations(&self) -> usize {
         self.stages.iter().map(|s| s.iterations).sum()
@@ -385,6 +397,7 @@ impl<'a> Trainer<'a> {
                     crate::densify::apply(
                         &mut self.scene,
                         &mut self.moments,
+                        &mut self.stats,
                         layer,
                         &edit,
                         &Rng::new(seed, "order", address),

@@ -253,6 +253,11 @@ impl<F: Real> Layer<F> {
         self.params.apply(edit);
         self.motion.clone().on_edit(&mut self.params, edit, rng);
     }
+
+    /// Makes Gaussian `row` `factor` times as large in space.
+    pub fn resize(&mut self, row: usize, factor: f64) {
+        self.motion.clone().resize(&mut self.params, row, factor);
+    }
 }
 
 /// A row of the life table; columns that it does not have are zero.

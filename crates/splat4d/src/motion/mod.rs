@@ -7,9 +7,10 @@ pub mod spacetime;
 pub mod still;
 
 use crate::math::{Real, Rng};
+use crate::scene::params::LOG_SCALE;
 use crate::scene::splats::SPLAT_COLUMNS;
 use crate::scene::table::TableMut;
-use crate::scene::{BLOCK, Color, Grads, Params, RowEdit, Rows, SH, Space, SplatGrads, Table, Time};
+use crate::scene::{BLOCK, Color, GEOMETRY, Grads, Params, RowEdit, Rows, SH, Space, SplatGrads, Table, Time};
 use crate::{Error, Result};
 use rayon::prelude::*;
 use std::any::Any;
@@ -163,6 +164,12 @@ pub trait Motion<F: Real = f32>: Any + Send + Sync {
 
     /// After a row edit has gathered every table: what copying alone cannot do (re-timed clones, 4D split offsets).
     fn on_edit(&self, _p: &mut Params<F>, _edit: &RowEdit, _rng: &Rng) {}
+
+    /// Makes Gaussian `row` `factor` times as large in space (splits and relocations do). Models whose size is not in
+    /// `log_scales` scale what they have instead.
+    fn resize(&self, p: &mut Params<F>, row: usize, factor: f64) {
+        p[GEOMETRY].add(row, LOG_SCALE, [F::of(factor.ln()); 3]);
+    }
 
     /// For models whose life is not the layer's: fills [N, 2] with (centre, log width) of a `GaussHalf` life and returns
     /// true. False: the layer's own life table says it.

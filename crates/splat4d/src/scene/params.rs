@@ -115,6 +115,11 @@ pub struct LoadedArray {
     pub data: Vec<f32>,
 }
 
+/// What the page of frame `frame` of a table or column group called `name` is called.
+pub fn page_name(name: &str, frame: u32) -> String {
+    format!("{name}@{frame}")
+}
+
 /// All learnable state of one layer.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Params<F = f32> {
@@ -155,11 +160,41 @@ impl<F: Real> Params<F> {
         rows: usize,
         init: impl FnOnce(&mut Table<F>),
     ) -> Result<Key> {
-        assert!(self.find(name).is_none(), "a layer has one table called {name}");
-        let mut table = Table::new(columns, rows);
+        let columns = columns.iter().map(|&(column, width)| Column { name: column.into(), width }).collect();
+        self.claim(name.to_owned(), space, columns, rows, init)
+    }
+
+    /// One frame's table of a model that has parameters per frame: as [`entry`](Self::entry), but the table is called
+    /// `name@frame` and its column groups likewise, so that learnable groups and files can name every page.
+    pub fn page(
+        &mut self,
+        name: &str,
+        frame: u32,
+        space: Space,
+        columns: &[(&str, usize)],
+        rows: usize,
+        init: impl FnOnce(&mut Table<F>),
+    ) -> Result<Key> {
+        let columns =
+            columns.iter().map(|(c, width)| Column { name: page_name(c, frame).into(), width: *width }).collect();
+        let key = self.claim(page_name(name, frame), space, columns, rows, init)?;
+        self.info_mut(key).page = Some(frame);
+        Ok(key)
+    }
+
+    fn claim(
+        &mut self,
+        name: String,
+        space: Space,
+        columns: Vec<Column>,
+        rows: usize,
+        init: impl FnOnce(&mut Table<F>),
+    ) -> Result<Key> {
+        assert!(self.find(&name).is_none(), "a layer has one table called {name}");
+        let mut table = Table::with_columns(columns, rows);
         let mut found = 0;
         let mut first = 0;
-        for &(column, width) in columns {
+        for Column { name: column, width } in table.columns().to_vec() {
             if let Some(i) = self.loaded.iter().position(|a| a.name == column) {
                 let a = self.loaded.swap_remove(i);
                 if a.rows != rows || a.width != width {
@@ -177,11 +212,11 @@ impl<F: Real> Params<F> {
         }
         if found == 0 {
             init(&mut table);
-        } else if found < columns.len() {
+        } else if found < table.columns().len() {
             return Err(Error::input(format!("table `{name}` is incomplete: some of its arrays are missing"))
                 .remedy("The file is damaged or was written by another program; export it again"));
         }
-        self.infos.push(ParamInfo { name: name.to_owned(), space, page: None, trainable: true });
+        self.infos.push(ParamInfo { name, space, page: None, trainable: true });
         self.tables.push(table);
         Ok(Key(self.tables.len() as u32 - 1))
     }

@@ -1,0 +1,459 @@
+//! Whole runs on a tiny capture on disk: the same bits for any number of threads, after any stop and after a crash; faults
+//! that roll back; outputs, memory and checkpoints that are refused.
+
+use super::*;
+use crate::train::chain::Draw;
+use crate::train::frames::{Frames, Picture};
+use crate::train::tests::Made;
+use serde_json::Value;
+use splat4d::math::Rng;
+use splat4d::render::{Image, ImageGrads, RenderGrads};
+use splat4d::scene::{Camera, Splats, Table};
+use tempfile::TempDir;
+
+const SIZE: usize = 24;
+const CAMERAS: usize = 4;
+const MOMENTS: usize = 3;
+const STEPS: usize = 40;
+
+/// Four cameras, three frames, on disk.
+fn capture_on_disk() -> TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    let made = Made::new(CAMERAS, MOMENTS, SIZE);
+    let mut picture = Picture::default();
+    for i in 0..made.len() {
+        made.load(i, &mut picture).unwrap();
+        let path = folder.path().join(format!("images/{}/{:04}.png", made.rig(i), i / CAMERAS));
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        let color = |x: u32, y: u32, c: usize| (picture.color.get(c, y as usize, x as usize) * 255.0).round() as u8;
+        let pixel = |x: u32, y: u32| image::Rgb([0, 1, 2].map(|c| color(x, y, c)));
+        image::RgbImage::from_fn(SIZE as u32, SIZE as u32, pixel).save(path).unwrap();
+    }
+    let cameras: Vec<Value> = (0..CAMERAS)
+        .map(|i| {
+            let (c, pose) = (made.camera(i), &made.camera(i).cam_from_world);
+            let row = |r: usize| {
+                let m = pose.rotation[r];
+                json!([m[0], m[1], m[2], pose.translation[r]])
+            };
+            json!({
+                "name": format!("cam{i}"), "width": SIZE, "height": SIZE, "fx": c.intrinsics.fx,
+                "fy": c.intrinsics.fy, "cx": c.intrinsics.cx, "cy": c.intrinsics.cy,
+                "world_to_camera": [row(0), row(1), row(2), [0, 0, 0, 1]], "images": format!("images/{i}/%04d.png"),
+            })
+        })
+        .collect();
+    let text = json!({ "version": 1, "fps": 10, "cameras": cameras }).to_string();
+    std::fs::write(folder.path().join("capture.json"), text).unwrap();
+    folder
+}
+
+fn recipe(changes: &[&str]) -> Recipe {
+    let mut r = Recipe {
+        iterations: STEPS,
+        num_pts: 80,
+        max_cap: 130,
+        densification_interval: 6,
+        densify_from_iter: 6,
+        densify_until_iter: 30,
+        checkpoint_interval: 10,
+        init: "random".into(),
+        ..Recipe::default()
+    };
+    changes.iter().for_each(|c| r.set(c).unwrap());
+    r
+}
+
+/// A folder with the capture and room for runs.
+struct Place {
+    capture: TempDir,
+    runs: TempDir,
+}
+
+impl Place {
+    fn new() -> Self {
+        Self { capture: capture_on_disk(), runs: tempfile::tempdir().unwrap() }
+    }
+
+    fn run(&self, name: &str) -> PathBuf {
+        self.runs.path().join(name)
+    }
+
+    fn open(&self, recipe: &Recipe) -> Arc<Capture> {
+        Arc::new(open_capture(self.capture.path(), recipe).unwrap())
+    }
+
+    fn train(&self, name: &str, recipe: &Recipe) -> Result<Outcome> {
+        let run = self.run(name);
+        train(self.open(recipe), recipe.clone(), &run, &TrainOptions::default(), &AtomicBool::new(false), &mut |_| {})
+    }
+
+    /// As `train`, with another drawing device and ears.
+    fn train_with(
+        &self,
+        name: &str,
+        recipe: &Recipe,
+        draw: Box<dyn Draw<f32>>,
+        stop: &AtomicBool,
+        listen: &mut dyn FnMut(&Event),
+    ) -> Result<Outcome> {
+        let (run, recipe) = (self.run(name), recipe.resolve());
+        let bench = Bench::new(self.open(&recipe), &recipe)?;
+        let plan = bench.plan(&recipe);
+        let mut trainer = bench.trainer(&plan, bench.initial_scene(&plan)?)?;
+        trainer.set_draw(draw);
+        write_atomically(&run.join("recipe.toml"), recipe.to_toml().as_bytes())?;
+        let (identity, state) = (bench.identity(&recipe), RunState::default());
+        save_checkpoint(&run, &trainer, &identity, &state, listen)?;
+        write_run_json(&run, &bench, &recipe, &Totals::default(), &trainer, &state, false)?;
+        Session { run: &run, bench: &bench, recipe: &recipe, identity, estimate: 0, stop }.drive(
+            &mut trainer,
+            state,
+            listen,
+        )
+    }
+
+    fn scene(&self, name: &str) -> Vec<u8> {
+        std::fs::read(self.run(name).join("scene.safetensors")).unwrap()
+    }
+
+    /// metrics.csv without what depends on the clock.
+    fn metrics(&self, name: &str) -> Vec<String> {
+        let text = std::fs::read_to_string(self.run(name).join("metrics.csv")).unwrap();
+        text.lines().map(|l| l.split(',').take(7).collect::<Vec<_>>().join(",")).collect()
+    }
+}
+
+fn resume_quietly(run: &Path) -> Result<Outcome> {
+    resume(run, &AtomicBool::new(false), &mut |_| {})
+}
+
+fn copy_folder(from: &Path, to: &Path) {
+    std::fs::create_dir_all(to).unwrap();
+    for entry in std::fs::read_dir(from).unwrap() {
+        let entry = entry.unwrap();
+        if entry.path().is_dir() {
+            copy_folder(&entry.path(), &to.join(entry.file_name()));
+        } else {
+            std::fs::copy(entry.path(), to.join(entry.file_name())).unwrap();
+        }
+    }
+}
+
+/// The renderer, and something that happens at the n-th picture.
+struct Meddled<F: FnMut(usize, &mut Image<f32>) + Send> {
+    inner: Renderer<f32>,
+    drawn: usize,
+    meddle: F,
+}
+
+fn meddled(meddle: impl FnMut(usize, &mut Image<f32>) + Send + 'static) -> Box<dyn Draw<f32>> {
+    let config = RenderConfig { sh_degree: Recipe::default().sh_degree, simd: Simd::detect(), ..Default::default() };
+    Box::new(Meddled { inner: Renderer::new(config), drawn: 0, meddle })
+}
+
+impl<F: FnMut(usize, &mut Image<f32>) + Send> Draw<f32> for Meddled<F> {
+    fn render(&mut self, splats: &Splats<'_, f32>, camera: &Camera, background: [f32; 3], out: &mut Image<f32>) {
+        self.inner.render(splats, camera, background, None, out);
+        self.drawn += 1;
+        (self.meddle)(self.drawn, out);
+    }
+
+    fn backward(
+        &mut self,
+        splats: &Splats<'_, f32>,
+        camera: &Camera,
+        background: [f32; 3],
+        grads: &ImageGrads<'_, f32>,
+        d_sh: &mut [Option<&mut Table<f32>>],
+        d: &mut RenderGrads<f32>,
+    ) {
+        self.inner.backward(splats, camera, background, None, grads, d_sh, d);
+    }
+
+    fn radii(&self) -> &[f32] {
+        self.inner.radii()
+    }
+
+    fn config(&mut self) -> &mut RenderConfig {
+        &mut self.inner.config
+    }
+}
+
+/// What could go wrong in a resume: losses with a memory, exposures, both strategies, a reset of opacities, SH steps.
+fn recipes() -> Vec<Recipe> {
+    vec![
+        recipe(&[]),
+        recipe(&["lambda_velocity=0.1", "lambda_opacity_life=0.01", "exposure=true", "exposure_lr=0.01"]),
+        recipe(&["strategy=adc", "densify_grad_threshold=1e-5", "opacity_reset_interval=8", "batch_size=2"]),
+        recipe(&["motion_order=2", "rotation_rate=true", "life=interval", "lambda_velocity=0.1", "strategy=none"]),
+        recipe(&["motion=still", "sh_degree=2", "sh_degree_interval=7"]),
+    ]
+}
+
+#[test]
+fn any_number_of_threads_gives_the_same_bytes() {
+    let place = Place::new();
+    for (k, recipe) in recipes().iter().enumerate() {
+        for threads in 1..=3 {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| place.train(&format!("{k}-{threads}"), recipe)).unwrap();
+        }
+        for threads in 2..=3 {
+            assert!(place.scene(&format!("{k}-1")) == place.scene(&format!("{k}-{threads}")), "{k}, {threads} threads");
+        }
+    }
+}
+
+#[test]
+fn a_run_stopped_at_any_step_resumes_to_the_same_bytes() {
+    let place = Place::new();
+    for (k, recipe) in recipes().iter().enumerate() {
+        let whole = format!("{k}-whole");
+        place.train(&whole, recipe).unwrap();
+        for round in 0..2 {
+            let name = format!("{k}-{round}");
+            let at = 1 + Rng::new(8, "stop", k as u64).below(round, (STEPS - 2) * recipe.batch_size);
+            let stop = Arc::new(AtomicBool::new(false));
+            let (flag, steps) = (stop.clone(), at.div_ceil(recipe.batch_size));
+            let mut draw = meddled(move |n, _| flag.store(n >= at, Ordering::Relaxed));
+            draw.config().sh_degree = recipe.sh_degree;
+            let outcome = place.train_with(&name, recipe, draw, &stop, &mut |_| {}).unwrap();
+            assert!(outcome.interrupted && outcome.iteration == steps, "{outcome:?}");
+            assert!(!place.run(&name).join("scene.safetensors").exists(), "a stopped run has no scene yet");
+            assert!(!resume_quietly(&place.run(&name)).unwrap().interrupted);
+            assert!(place.scene(&name) == place.scene(&whole), "recipe {k} stopped after {steps} steps");
+            assert_eq!(place.metrics(&name), place.metrics(&whole), "recipe {k} stopped after {steps} steps");
+        }
+    }
+}
+
+#[test]
+fn a_killed_run_resumes_from_whatever_is_on_disk() {
+    let place = Place::new();
+    for (k, recipe) in recipes().iter().enumerate().take(3) {
+        let whole = format!("{k}-whole");
+        let mut copies = 0;
+        let mut listen = |e: &Event| {
+            if let Event::Checkpoint { .. } = e {
+                let to = place.run(&format!("{k}-{copies}"));
+                // The first checkpoint stands before run.json does.
+                if place.run(&whole).join("run.json").exists() {
+                    copy_folder(&place.run(&whole), &to);
+                    copies += 1;
+                }
+            }
+        };
+        let (capture, run) = (place.open(recipe), place.run(&whole));
+        train(capture, recipe.clone(), &run, &TrainOptions::default(), &AtomicBool::new(false), &mut listen).unwrap();
+        assert!(copies >= 3, "{copies}");
+        for i in 0..copies {
+            let name = format!("{k}-{i}");
+            let run = place.run(&name);
+            let list = checkpoint::list(&run);
+            let newest = std::fs::read(&list[list.len() - 1]).unwrap();
+            // A crash in the middle of a write: a stale temporary file. A disk that lost blocks: a newest checkpoint cut
+            // short, beyond the sound one.
+            std::fs::write(run.join("checkpoints/.00000099.safetensors.123.tmp"), &newest[..newest.len() / 3]).unwrap();
+            std::fs::write(run.join("checkpoints/00000038.safetensors"), &newest[..newest.len() / 2]).unwrap();
+            let mut warned = 0;
+            let stop = AtomicBool::new(false);
+            resume(&run, &stop, &mut |e| warned += usize::from(matches!(e, Event::Warning { .. }))).unwrap();
+            if i + 1 < copies {
+                assert_eq!(warned, 1, "a damaged checkpoint is skipped, and said so");
+            }
+            assert!(place.scene(&name) == place.scene(&whole), "recipe {k}, crash {i}");
+            assert_eq!(place.metrics(&name), place.metrics(&whole), "recipe {k}, crash {i}");
+        }
+    }
+}
+
+#[test]
+fn neither_prefetch_nor_image_memory_matters() {
+    struct Plain(Arc<Dataset>);
+    impl Frames for Plain {
+        fn len(&self) -> usize {
+            self.0.len()
+        }
+        fn camera(&self, i: usize) -> &Camera {
+            self.0.camera(i)
+        }
+        fn time(&self, i: usize) -> splat4d::scene::Time {
+            self.0.time(i)
+        }
+        fn rig(&self, i: usize) -> usize {
+            self.0.rig(i)
+        }
+        fn name(&self, i: usize) -> String {
+            self.0.name(i)
+        }
+        fn load(&self, i: usize, out: &mut Picture) -> Result<()> {
+            self.0.load(i, out)
+        }
+    }
+    let place = Place::new();
+    let plain = recipe(&[]);
+    place.train("plain", &plain).unwrap();
+    place.train("starved", &recipe(&["image_memory=1"])).unwrap();
+    assert!(place.scene("plain") == place.scene("starved"), "the image cache reached a result");
+    let r = plain.resolve();
+    let bench = Bench::new(place.open(&r), &r).unwrap();
+    let plan = bench.plan(&r);
+    let mut trainer = bench.trainer(&plan, bench.initial_scene(&plan).unwrap()).unwrap();
+    trainer.set_frames(Arc::new(Plain(bench.frames.clone())));
+    while !trainer.is_done() {
+        trainer.step().unwrap().unwrap();
+    }
+    let mut bytes = Vec::new();
+    splat4d::format::scene::write(&trainer.scene, &mut bytes).unwrap();
+    assert!(place.scene("plain") == bytes, "prefetch reached a result");
+}
+
+#[test]
+fn a_fault_rolls_back_with_smaller_steps_and_names_its_place() {
+    let place = Place::new();
+    let recipe = recipe(&[]);
+    let draw = meddled(|n, image| {
+        if n == 17 {
+            image.color.data[40] = f32::NAN;
+        }
+    });
+    let mut faults = Vec::new();
+    let mut listen = |e: &Event| {
+        if let Event::RolledBack { iteration, to, what } = e {
+            faults.push((*iteration, *to, what.clone()));
+        }
+    };
+    let outcome = place.train_with("once", &recipe, draw, &AtomicBool::new(false), &mut listen).unwrap();
+    assert!(!outcome.interrupted && outcome.iteration == STEPS);
+    assert_eq!(faults.len(), 1);
+    let (iteration, to, what) = &faults[0];
+    assert_eq!((*iteration, *to), (17, 10));
+    assert!(what.contains('`') && what.contains("camera cam") && what.contains("frame"), "{what}");
+    let info: Value = serde_json::from_str(&read_text(&place.run("once").join("run.json")).unwrap()).unwrap();
+    assert_eq!(info["rollbacks"], 1);
+    // Half the rates, and they stay so in the checkpoint.
+    let bench = Bench::new(place.open(&recipe), &recipe).unwrap();
+    let plan = bench.plan(&recipe);
+    let mut trainer = bench.trainer(&plan, bench.initial_scene(&plan).unwrap()).unwrap();
+    restore_newest(&place.run("once"), &mut trainer, &bench.identity(&recipe.resolve())).unwrap();
+    assert_eq!((trainer.progress.rate_scale, trainer.progress.strikes), (ROLLBACK_RATE, 1));
+    let scene = splat4d::format::scene::read(&place.scene("once")).unwrap();
+    assert!(scene.layers.iter().all(|l| l.params.first_non_finite().is_none()));
+    let metrics = place.metrics("once");
+    let numbers: Vec<usize> = metrics[1..].iter().map(|l| l.split(',').next().unwrap().parse().unwrap()).collect();
+    assert!(numbers.windows(2).all(|w| w[0] < w[1]), "no row stands twice: {numbers:?}");
+}
+
+#[test]
+fn the_third_fault_gives_up() {
+    let place = Place::new();
+    let draw = meddled(|n, image| {
+        if n > 12 {
+            image.color.data[7] = f32::INFINITY;
+        }
+    });
+    let mut rolled = 0;
+    let mut listen = |e: &Event| rolled += usize::from(matches!(e, Event::RolledBack { .. }));
+    let stop = AtomicBool::new(false);
+    let error = place.train_with("always", &recipe(&[]), draw, &stop, &mut listen).unwrap_err();
+    assert_eq!((error.kind(), rolled), (ErrorKind::Diverged, MAX_STRIKES - 1), "{error}");
+    assert!(error.to_string().contains("camera cam"), "{error}");
+    assert!(!place.run("always").join("scene.safetensors").exists());
+}
+
+#[test]
+fn foreign_checkpoints_are_refused_with_a_reason() {
+    let place = Place::new();
+    let base = recipe(&[]);
+    place.train("base", &base).unwrap();
+    let copy = |name: &str| {
+        copy_folder(&place.run("base"), &place.run(name));
+        place.run(name)
+    };
+    let newest = |run: &Path| checkpoint::list(run).pop().unwrap();
+    // Another version: the last number called `version` in the header is the checkpoint's own.
+    let run = copy("version");
+    let mut bytes = std::fs::read(newest(&run)).unwrap();
+    let needle = br#"\"version\":1"#;
+    let at = bytes.windows(needle.len()).rposition(|w| w == needle).unwrap();
+    bytes[at + needle.len() - 1] = b'9';
+    std::fs::write(newest(&run), &bytes).unwrap();
+    let error = resume_quietly(&run).unwrap_err();
+    assert_eq!(error.kind(), ErrorKind::Unsupported, "{error}");
+    assert!(error.to_string().contains("version 9"), "{error}");
+    // Another recipe.
+    let run = copy("recipe");
+    let other = Recipe { feature_lr: 0.004, ..base.resolve() };
+    std::fs::write(run.join("recipe.toml"), other.to_toml()).unwrap();
+    let error = resume_quietly(&run).unwrap_err().to_string();
+    assert!(error.contains("another recipe") && error.contains("start a new run"), "{error}");
+    // What only says how memory is spent may change.
+    let run = copy("memory");
+    let other = Recipe { image_memory: 1 << 20, checkpoint_interval: 7, ..base.resolve() };
+    std::fs::write(run.join("recipe.toml"), other.to_toml()).unwrap();
+    resume_quietly(&run).unwrap();
+    // No checkpoint, no run.
+    let run = copy("none");
+    std::fs::remove_dir_all(run.join("checkpoints")).unwrap();
+    assert!(resume_quietly(&run).unwrap_err().to_string().contains("no checkpoint"));
+    assert_eq!(resume_quietly(&place.run("nowhere")).unwrap_err().kind(), ErrorKind::Io);
+    // Another capture in the same place.
+    let path = place.capture.path().join("capture.json");
+    let mut capture: Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
+    capture["cameras"][2]["fx"] = json!(21.5);
+    std::fs::write(&path, capture.to_string()).unwrap();
+    let error = resume_quietly(&copy("capture")).unwrap_err().to_string();
+    assert!(error.contains("another capture"), "{error}");
+    // A fresh run does not overwrite an old one.
+    assert!(place.train("base", &base).unwrap_err().to_string().contains("already holds a run"));
+}
+
+#[test]
+#[cfg(unix)]
+fn unwritable_outputs_and_too_little_memory_are_refused() {
+    let place = Place::new();
+    let base = recipe(&[]);
+    let file = place.run("file");
+    std::fs::write(&file, b"x").unwrap();
+    // Always through a link in our own folder: a writer that replaced its target would replace the link, no device.
+    let full = place.run("full");
+    std::os::unix::fs::symlink("/dev/full", &full).unwrap();
+    for run in [file.as_path(), full.as_path(), &file.join("below")] {
+        let (options, stop) = (TrainOptions::default(), AtomicBool::new(false));
+        let error = train(place.open(&base), base.clone(), run, &options, &stop, &mut |_| {}).unwrap_err();
+        assert_eq!(error.kind(), ErrorKind::Io, "{error}");
+        assert!(error.to_string().contains(&run.display().to_string()), "{error}");
+    }
+    assert_eq!(std::fs::read(&file).unwrap(), b"x");
+    let error = write_atomically(&full, b"0123").unwrap_err();
+    assert_eq!(error.kind(), ErrorKind::Io, "{error}");
+    assert!(full.is_symlink() && !full.metadata().unwrap().is_file(), "a device is never replaced");
+    let error = place.train("poor", &recipe(&["memory_limit=100000"])).unwrap_err();
+    assert_eq!(error.kind(), ErrorKind::Memory, "{error}");
+    assert!(error.to_string().contains("max_cap"), "{error}");
+    assert!(!place.run("poor").exists(), "nothing half-written");
+}
+
+#[test]
+fn minutes_fix_a_recipe_that_repeats() {
+    let place = Place::new();
+    let base = Recipe { init: "random".into(), num_pts: 80, max_cap: 120, ..Recipe::default() };
+    let options = TrainOptions { minutes: Some(0.005) };
+    let run = place.run("timed");
+    train(place.open(&base), base.clone(), &run, &options, &AtomicBool::new(false), &mut |_| {}).unwrap();
+    let fixed = Recipe::from_toml(&read_text(&run.join("recipe.toml")).unwrap()).unwrap();
+    assert_eq!(fixed.resolve(), fixed, "every schedule is set");
+    assert!(fixed.iterations >= 50 && fixed.iterations != base.iterations);
+    let schedules = [fixed.densify_from_iter, fixed.densify_until_iter, fixed.densification_interval];
+    assert!(schedules.iter().all(|&s| s > 0 && s <= fixed.iterations), "{schedules:?}");
+    place.train("again", &fixed).unwrap();
+    assert!(place.scene("timed") == place.scene("again"));
+    for minutes in [0.0, -1.0, f64::NAN, f64::INFINITY] {
+        let options = TrainOptions { minutes: Some(minutes) };
+        let stop = AtomicBool::new(false);
+        let run = place.run("bad");
+        assert!(train(place.open(&base), base.clone(), &run, &options, &stop, &mut |_| {}).is_err(), "{minutes}");
+        assert!(!run.exists());
+    }
+}

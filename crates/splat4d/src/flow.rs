@@ -1,0 +1,128 @@
+//! Scene flow: velocities of Gaussians, rendered 3D velocity, and rendered 2D flow between two instants and cameras.
+//!
+//! A motion model already *is* scene flow; everything here is written once over [`Motion::at`] and
+//! [`Motion::velocity`](crate::motion::Motion::velocity) and drawn as further channels of the renderer, with the blend
+//! weights w_i = α_i T_i of the first instant's picture.
+//!
+//! [`Motion::at`]: crate::motion::Motion::at
+
+#[cfg(test)]
+mod tests;
+
+use crate::layers::{Instant, Scene};
+use crate::math::Real;
+use crate::motion::Cache;
+use crate::render::{Image, Renderer};
+use crate::scene::{Camera, Planes, Space, Splats, Table, Time};
+
+/// Less alpha than this does not carry a flow: dividing by it would only amplify rounding.
+pub const FLOW_ALPHA_MIN: f64 = 1e-3;
+
+/// An instant of a scene as a camera sees it.
+#[derive(Clone, Copy, Debug)]
+pub struct Shot<'a> {
+    /// When.
+    pub t: Time,
+    /// From where (pinhole).
+    pub camera: &'a Camera,
+}
+
+/// A rendered vector field.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Flow<F = f32> {
+    /// [C, h, w]: Σ w_i s_i / max(Σ w_i, [`FLOW_ALPHA_MIN`]).
+    pub vectors: Planes<F>,
+    /// Σ w_i over splats that have a vector, [1, h, w]; where it is small the vector means nothing.
+    pub weight: Planes<F>,
+    /// The first instant's picture.
+    pub image: Image<F>,
+}
+
+/// dμ/dt of every splat of `scene.at(t, instant)`, in the order of the splats: [splats, 3], scene units a second.
+///
+/// Panics: `instant` is not this scene's.
+pub fn velocities<F: Real>(scene: &Scene<F>, instant: &Instant<F>) -> Table<F> {
+    let mut out = Table::new(&[("velocity", 3)], scene.splats(instant).len());
+    let mut first = 0;
+    for (layer, tape) in scene.layers.iter().zip(&instant.tapes) {
+        let mut own = Table::default();
+        layer.motion.velocity(&tape.question(&layer.params), &mut own);
+        for j in 0..own.rows() {
+            out.write(first + j, 0, own.read::<3>(j, 0));
+        }
+        first += own.rows();
+    }
+    out
+}
+
+/// The velocity of what each pixel shows, in scene units a second: [3, h, w] world axes.
+pub fn render_velocity<F: Real>(scene: &Scene<F>, shot: Shot<'_>, renderer: &mut Renderer<F>) -> Flow<F> {
+    let mut instant = Instant::default();
+    scene.at(shot.t, &mut instant);
+    let moving = velocities(scene, &instant);
+    let mut extra = Table::new(&[("velocity", 3), ("valid", 1)], moving.rows());
+    for j in 0..moving.rows() {
+        let [x, y, z] = moving.read::<3>(j, 0);
+        extra.write(j, 0, [x, y, z, F::ONE]);
+    }
+    draw(&scene.splats(&instant), shot.camera, scene.background, &extra, renderer)
+}
+
+/// 2D flow in pixels, [2, h, w] (x right, y down): F(p) = Σ w_i [π_to(μ_i(t_to)) − π_from(μ_i(t_from))] / Σ w_i.
+///
+/// The rows alive at `from.t` are followed to `to.t`, whatever their life says there. With the same camera twice it is
+/// the flow of objects alone, else the camera's motion is in it. A splat that is behind a camera has no vector.
+/// Source: "F_simple" of rendered optical flow, Σ w Δμ_2D, as in Gao et al. 2024 (GaussianFlow) §3.2 without its
+/// covariance term.
+pub fn render_flow<F: Real>(scene: &Scene<F>, from: Shot<'_>, to: Shot<'_>, renderer: &mut Renderer<F>) -> Flow<F> {
+    let (mut start, mut end) = (Instant::default(), Instant::default());
+    scene.at(from.t, &mut start);
+    follow(scene, &start, to.t, &mut end);
+    let splats = scene.splats(&start);
+    let mut extra = Table::new(&[("flow", 2), ("valid", 1)], splats.len());
+    let mut j = 0;
+    for (a, b) in start.tapes.iter().zip(&end.tapes) {
+        for r in 0..a.out().rows() {
+            let [at, then] = [a, b].map(|t| t.out().read::<3>(r, 0).map(F::f64));
+            if let (Some((p, _)), Some((q, _))) = (from.camera.project(at), to.camera.project(then)) {
+                extra.write(j, 0, [F::of(q[0] - p[0]), F::of(q[1] - p[1]), F::ONE]);
+            }
+            j += 1;
+        }
+    }
+    draw(&splats, from.camera, scene.background, &extra, renderer)
+}
+
+/// The same rows as in `of`, at time t.
+fn follow<F: Real>(scene: &Scene<F>, of: &Instant<F>, t: Time, out: &mut Instant<F>) {
+    out.tapes.resize_with(scene.layers.len(), Default::default);
+    for ((layer, from), tape) in scene.layers.iter().zip(&of.tapes).zip(&mut out.tapes) {
+        let mut cache = Cache::default();
+        tape.ask(Space::Gaussians, from.rows(), t);
+        layer.motion.prepare(&layer.params, &[tape.question(&layer.params)], &mut cache);
+        layer.at(&cache, tape);
+    }
+}
+
+/// Blends vectors (all columns but the last) and divides by the blended last column, 1 where there is a vector.
+fn draw<F: Real>(
+    splats: &Splats<'_, F>,
+    camera: &Camera,
+    background: [f32; 3],
+    extra: &Table<F>,
+    renderer: &mut Renderer<F>,
+) -> Flow<F> {
+    let mut image = Image::default();
+    renderer.render(splats, camera, background.map(|b| F::of(f64::from(b))), Some(extra), &mut image);
+    let count = extra.width() - 1;
+    let mut vectors = Planes::new(count, camera.height, camera.width);
+    let mut weight = Planes::new(1, camera.height, camera.width);
+    weight.data.copy_from_slice(image.extra.plane(count));
+    for c in 0..count {
+        let sums = image.extra.plane(c).iter().zip(&weight.data);
+        for (out, (&sum, &w)) in vectors.plane_mut(c).iter_mut().zip(sums) {
+            *out = sum / w.max(F::of(FLOW_ALPHA_MIN));
+        }
+    }
+    Flow { vectors, weight, image }
+}
