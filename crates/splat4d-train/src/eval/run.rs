@@ -51,13 +51,7 @@ pub struct EvalOptions {
 
 impl Default for EvalOptions {
     fn default() -> Self {
-        Self {
-            folder: PathBuf::new(),
-            antialias: false,
-            lpips_weights: None,
-            pictures: true,
-            train_views: TRAIN_VIEWS,
-        }
+        Self { folder: PathBuf::new(), antialias: false, lpips_weights: None, pictures: true, train_views: TRAIN_VIEWS }
     }
 }
 
@@ -292,9 +286,8 @@ fn file_name(place: usize) -> String {
 fn write_pictures(folder: &Path, place: usize, render: &Planes<f32>, truth: &Planes<f32>) -> Result<()> {
     let error = metrics::error_map(render, truth, ERROR_FULL);
     let all = [("renders", render), ("gt", truth), ("errors", &error)];
-    all.into_par_iter().try_for_each(|(kind, picture)| {
-        write_atomically(&folder.join(kind).join(file_name(place)), &png(picture))
-    })
+    all.into_par_iter()
+        .try_for_each(|(kind, picture)| write_atomically(&folder.join(kind).join(file_name(place)), &png(picture)))
 }
 
 fn png(picture: &Planes<f32>) -> Vec<u8> {
