@@ -7,10 +7,12 @@ pub mod densify;
 pub mod eval;
 pub mod event;
 pub mod init;
+pub mod knn;
 pub mod loss;
 pub mod models;
 pub mod optim;
 pub mod recipe;
+pub mod sampler;
 pub mod train;
 
 pub use splat4d::{Error, ErrorKind, Result};

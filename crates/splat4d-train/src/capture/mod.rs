@@ -10,6 +10,7 @@ mod assemble;
 mod colmap;
 mod colmap_files;
 mod dnerf;
+pub mod frames;
 mod json;
 mod lens;
 mod n3dv;

@@ -7,7 +7,6 @@ pub mod adc;
 pub mod mcmc;
 
 use crate::optim::Moments;
-use crate::train::chain::Observation;
 use splat4d::layers::{LayerTape, Scene};
 use splat4d::math::{Real, Rng, sym3};
 use splat4d::motion::Cache;
@@ -17,6 +16,19 @@ use splat4d::scene::{Born, GEOMETRY, RowEdit, Rows, Space, Table, Time};
 
 pub use adc::Adc;
 pub use mcmc::Mcmc;
+
+/// What the densifier may know of one view of one layer.
+#[derive(Clone, Copy, Debug)]
+pub struct Observation<'a, F> {
+    /// The layer.
+    pub layer: usize,
+    /// Its rows that were drawn: splat j is row `rows.id(j)`.
+    pub rows: Rows<'a>,
+    /// |dL/dmean2d| a splat, NDC units.
+    pub mean2d: &'a [F],
+    /// Pixel radius a splat, 0 where culled.
+    pub radii: &'a [F],
+}
 
 /// Columns of a layer's statistics.
 const STATS_COLUMNS: [(&str, usize); 3] = [("gradient_sum", 1), ("gradient_count", 1), ("radius_max", 1)];

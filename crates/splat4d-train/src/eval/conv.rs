@@ -1,6 +1,7 @@
 //! The layers that the LPIPS networks need: convolution, ReLU and max pooling of channels-first images.
 
-use crate::loss::simd::{self, Simd};
+use super::simd;
+use crate::loss::simd::Simd;
 use rayon::prelude::*;
 use splat4d::math::Real;
 use splat4d::scene::Planes;

@@ -3,11 +3,12 @@
 //! [`score_view`] measures one image, a [`Split`] holds the images of the held-out or the training cameras, and
 //! [`Report::write`] writes `results.json` (means) and `per_view.json` in the layout of the 3DGS scripts.
 
-pub(crate) mod conv;
+mod conv;
 pub mod lpips;
 pub mod metrics;
 mod report;
 pub mod run;
+mod simd;
 
 pub use lpips::{InputScaling, Lpips, Net};
 pub use report::{Report, Score, Split, View};

@@ -3,7 +3,7 @@
 use super::Seeds;
 use super::volume::Volume;
 use crate::Result;
-use crate::train::frames::{Frames, Picture};
+use crate::capture::frames::{Frames, Picture};
 use rayon::prelude::*;
 use splat4d::math::Rng;
 

@@ -2,13 +2,12 @@
 //! volume that the cameras share.
 
 pub mod hull;
-pub mod knn;
 pub mod volume;
 
+use crate::capture::frames::Frames;
+use crate::knn::mean_square_distance;
 use crate::models::{Plan, Program};
-use crate::train::frames::Frames;
 use crate::{Error, Result};
-use knn::mean_square_distance;
 use splat4d::layers::{Layer, Scene};
 use splat4d::math::Rng;
 use splat4d::math::sh::rgb_to_dc;

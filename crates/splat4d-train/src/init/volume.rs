@@ -1,7 +1,7 @@
 //! The volume that the cameras share, and random points in it.
 
 use super::{Seeds, UNKNOWN_COLOR};
-use crate::train::frames::Frames;
+use crate::capture::frames::Frames;
 use splat4d::math::Rng;
 use splat4d::math::se3::{dot, norm, sub};
 

@@ -1,7 +1,7 @@
 //! Losses on a scene's raw parameters. Each is a mean over the rows that are active in the step, and adds only to them.
 
-use crate::init::knn::knn;
-use crate::train::chain::{ParamLoss, StepInfo};
+use super::terms::{ParamLoss, StepInfo};
+use crate::knn::knn;
 use splat4d::layers::Scene;
 use splat4d::math::Real;
 use splat4d::motion::for_rows;

@@ -1,12 +1,12 @@
-//! The one place where losses and metrics choose their instruction set at run time.
+//! The instruction sets of losses and metrics, chosen at run time, and the dispatch of the loss kernel.
 //!
 //! A kernel is written once and compiled twice: for the baseline CPU, and with AVX2 and FMA switched on. [`Simd`] can
 //! only hold a level that this CPU has, which is what makes the calls below sound.
 #![allow(unsafe_code)]
 
 use super::kernel::{self, Scratch, Strip};
-use crate::eval::conv;
 use splat4d::math::Real;
+
 /// An instruction set that this CPU is known to have.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Simd {
@@ -57,26 +57,4 @@ pub(super) fn strip<F: Real>(level: Simd, job: &Strip<'_, F>, scratch: &mut Scra
 #[target_feature(enable = "avx2,fma")]
 fn strip_avx2<F: Real>(job: &Strip<'_, F>, scratch: &mut Scratch<F>, d: &mut [F]) -> [f64; 2] {
     kernel::strip::<F, true>(job, scratch, d)
-}
-
-/// Runs the convolution kernel at this level; see [`conv::row`].
-pub(crate) fn convolve(level: Simd, job: &conv::Row<'_>, out: &mut [f32]) {
-    if !level.fused {
-        return conv::row::<false>(job, out);
-    }
-    #[cfg(target_arch = "x86_64")]
-    {
-        // SAFETY: `Simd::detect` is the only way to a fused level, and it has seen AVX2 and FMA on this CPU.
-        unsafe { convolve_avx2(job, out) }
-    }
-    #[cfg(not(target_arch = "x86_64"))]
-    {
-        conv::row::<true>(job, out)
-    }
-}
-
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2,fma")]
-fn convolve_avx2(job: &conv::Row<'_>, out: &mut [f32]) {
-    conv::row::<true>(job, out)
 }

@@ -8,9 +8,9 @@ pub mod still;
 mod tests;
 
 use crate::densify::Densify;
+use crate::loss::terms::{ParamLoss, ProbeLoss};
 use crate::recipe::Recipe;
-use crate::train::chain::{ParamLoss, ProbeLoss};
-use crate::train::sampler::Sampler;
+use crate::sampler::Sampler;
 use crate::{Error, Result};
 use splat4d::layers::Scene;
 use splat4d::math::Real;

@@ -2,8 +2,8 @@
 
 use super::{Group, Plan, Program, Rate, Stage, densify_of};
 use crate::loss::scene::{MeanOpacity, MeanScale};
+use crate::loss::terms::ParamLoss;
 use crate::recipe::Recipe;
-use crate::train::chain::ParamLoss;
 use splat4d::motion::Spec;
 use splat4d::scene::LifeKind;
 

@@ -3,6 +3,8 @@
 //! Views and the questions of losses that look at several times are merged: one `prepare`, one `at` and one `backward`
 //! for every distinct (layer, space, time), one `finish`.
 
+pub use crate::densify::Observation;
+pub use crate::loss::terms::{ParamLoss, Probe, ProbeLoss, StepInfo};
 use splat4d::layers::{LayerTape, Scene};
 use splat4d::math::Real;
 use splat4d::motion::{At, Cache};
@@ -89,58 +91,6 @@ pub trait ImageLoss<F: Real> {
     ) -> (f64, bool);
 }
 
-/// Where in training a loss is asked.
-#[derive(Clone, Debug)]
-pub struct StepInfo {
-    /// Steps taken before this one.
-    pub iteration: usize,
-    /// The times of the step's views.
-    pub times: Vec<Time>,
-    /// Seed of the run.
-    pub seed: u64,
-    /// Share of the stage that is done, in [0, 1).
-    pub progress: f64,
-}
-
-/// What a loss over several times wants to see.
-#[derive(Clone, Debug)]
-pub struct Probe {
-    /// Which layer.
-    pub layer: usize,
-    /// Gaussians or nodes.
-    pub of: Space,
-    /// Which rows (strictly increasing); `None`: all.
-    pub rows: Option<Vec<u32>>,
-    /// At which times.
-    pub times: Vec<Time>,
-}
-
-/// A loss over splats at several times (rigidity pairs, velocities, transport triples).
-pub trait ProbeLoss<F: Real>: Send + Sync {
-    /// Its name, in recipes and metrics.
-    fn name(&self) -> &str;
-    /// What it looks at in this step; empty: nothing.
-    fn probes(&self, scene: &Scene<F>, info: &StepInfo) -> Vec<Probe>;
-    /// The loss. `seen[i][k]` is [rows, 10] of probe i at its k-th time; adds its gradient to `d[i][k]`, of like shape.
-    fn eval(&self, scene: &Scene<F>, probes: &[Probe], seen: &[Vec<Table<F>>], d: &mut [Vec<Table<F>>]) -> f64;
-}
-
-/// A loss on raw parameters; must add only to rows that are active in `d`.
-pub trait ParamLoss<F: Real>: Send + Sync {
-    /// Its name, in recipes and metrics.
-    fn name(&self) -> &str;
-    /// The loss; adds to one `Grads` a layer.
-    fn eval(&self, scene: &Scene<F>, info: &StepInfo, d: &mut [Grads<F>]) -> f64;
-    /// Rows were edited: whatever was remembered of rows is stale.
-    fn on_edit(&self) {}
-    /// What a checkpoint must hold of it, if it remembers anything from step to step.
-    fn state(&self) -> Vec<u32> {
-        Vec::new()
-    }
-    /// Takes back what [`state`](Self::state) gave.
-    fn restore(&self, _state: &[u32]) {}
-}
-
 /// Where a step's time went.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Timings {
@@ -154,19 +104,6 @@ pub struct Timings {
     pub render_backward: Duration,
     /// The motion's VJP and `finish`.
     pub motion_backward: Duration,
-}
-
-/// What the densifier may know of one view of one layer.
-#[derive(Clone, Copy, Debug)]
-pub struct Observation<'a, F> {
-    /// The layer.
-    pub layer: usize,
-    /// Its rows that were drawn: splat j is row `rows.id(j)`.
-    pub rows: Rows<'a>,
-    /// |dL/dmean2d| a splat, NDC units.
-    pub mean2d: &'a [F],
-    /// Pixel radius a splat, 0 where culled.
-    pub radii: &'a [F],
 }
 
 /// The result of a step.

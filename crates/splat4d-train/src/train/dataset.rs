@@ -1,7 +1,7 @@
 //! A capture on disk as the trainer sees it: one of its splits, through the image store.
 
-use super::frames::{Frames, Picture};
 use crate::Result;
+use crate::capture::frames::{Frames, Picture};
 use crate::capture::{Capture, ImageStore};
 use splat4d::scene::{Camera, Planes, Time};
 use std::sync::Arc;

@@ -3,14 +3,14 @@
 pub mod chain;
 pub mod checkpoint;
 pub mod dataset;
-pub mod frames;
 pub mod loss;
 pub mod minutes;
 pub mod run;
-pub mod sampler;
 pub mod trainer;
 
 #[cfg(test)]
 pub(crate) mod tests;
 
+pub use crate::capture::frames;
+pub use crate::sampler;
 pub use run::{Outcome, TrainOptions, resume, train};

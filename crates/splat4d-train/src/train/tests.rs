@@ -1,7 +1,7 @@
 //! A made-up capture: a ring of cameras around a shaded ball that moves in front of a striped sky.
 
-use super::frames::{Frames, Picture};
 use crate::Result;
+use crate::capture::frames::{Frames, Picture};
 use splat4d::math::Se3;
 use splat4d::math::se3::{dot, norm, normalize, sub};
 use splat4d::scene::{Camera, Planes, Time};

@@ -1,12 +1,12 @@
 //! [`Trainer`]: the state of a run and one step of it. Files, progress and clocks are the business of `run`.
 
 use super::chain::{Chain, Draw, Losses, StepInfo, StepReport, View};
-use super::frames::{Frames, Picture};
 use super::loss::TrainLoss;
-use super::sampler::Timeline;
+use crate::capture::frames::{Frames, Picture};
 use crate::densify::{Change, Densify, Limits, Stats, adc, mcmc, morton_edit};
 use crate::models::Stage;
 use crate::optim::Moments;
+use crate::sampler::Timeline;
 use crate::{Error, ErrorKind, Result};
 use splat4d::layers::Scene;
 use splat4d::math::Rng;

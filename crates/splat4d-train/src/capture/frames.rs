@@ -1,4 +1,4 @@
-//! What the trainer needs of a capture: posed pictures by number. Captures on disk and made-up ones in tests both serve.
+//! What initialisation and training need of a capture: posed pictures by number. Captures on disk and made-up ones in tests both serve.
 
 use crate::Result;
 use splat4d::scene::{Camera, Planes, Time};

@@ -1,6 +1,6 @@
 //! Which frames a step sees: a pure function of (seed, stage, step), so that nothing has to be saved for a resume.
 
-use super::frames::Frames;
+use crate::capture::frames::Frames;
 use splat4d::math::Rng;
 
 /// How a stage draws its frames.
@@ -117,8 +117,8 @@ impl Timeline {
 
 #[cfg(test)]
 mod tests {
-    use super::super::tests::Made;
     use super::*;
+    use crate::train::tests::Made;
 
     #[test]
     fn every_frame_comes_once_an_epoch_and_the_draw_is_a_pure_function() {

@@ -1,0 +1,398 @@
+//! Tidy: what the compiler does not check. Import order, file sizes, `unsafe`, printing, and that the documents tell the
+//! truth about paths and flags. Reads files only: no network, well under a second.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+/// The allowed order of a crate's top modules: a module may import those before it. Names that do not exist yet
+/// hold a place for what the design foresees.
+const ORDER: [(&str, &[&str]); 3] = [
+    (
+        "crates/splat4d",
+        &["error", "math", "gpu", "scene", "nn", "motion", "layers", "render", "flow", "format", "play", "edit"],
+    ),
+    (
+        "crates/splat4d-train",
+        // The recipe stands first because everything is told by it; losses before densification and both before
+        // `models`, which choose among them; `init` needs a model's plan; `eval` writes as safely as `train` does.
+        &[
+            "recipe", "event", "capture", "sampler", "knn", "optim", "loss", "densify", "models", "init", "train",
+            "eval", "compress", "dynamics", "dist",
+        ],
+    ),
+    (
+        "crates/splat4d-cli",
+        &[
+            "files",
+            "interrupt",
+            "camera_file",
+            "console",
+            "video",
+            "draw",
+            "freeze",
+            "paths",
+            "run_folder",
+            "source",
+            "report",
+            "finish",
+            "verbs",
+            "main",
+        ],
+    ),
+];
+
+/// What a module must not import although it stands before it: the design's first invariant.
+const NEVER: [(&str, &str, &[&str]); 1] = [
+    // The renderer knows no time: it sees splats, not the models and layers that make them.
+    ("crates/splat4d", "render", &["motion", "layers"]),
+];
+
+/// Files longer than `MAX_LINES`, each with its reason.
+const LONG_FILES: [(&str, &str); 0] = [];
+const MAX_LINES: usize = 800;
+
+/// Files that may say `unsafe`: run-time dispatch to SIMD instructions only.
+const UNSAFE_FILES: [&str; 3] = [
+    "crates/splat4d/src/render/simd.rs",
+    "crates/splat4d-train/src/loss/simd.rs",
+    "crates/splat4d-train/src/eval/simd.rs",
+];
+
+/// Words that only the shells (the command and the chores) may say: libraries neither print nor exit nor look around.
+const SHELL_WORDS: [&str; 9] =
+    ["println!", "eprintln!", "print!", "eprint!", "dbg!", "process::exit", "env::args", "env::var", "stdin()"];
+const SHELLS: [&str; 2] = ["crates/splat4d-cli/", "xtask/"];
+
+/// Words that `splat4d` may not say: it reads bytes, not paths.
+const PATH_WORDS: [&str; 3] = ["std::fs", "std::path", "File::open"];
+
+/// Documents whose paths and flags are checked.
+const DOCS: [&str; 8] = [
+    "README.md",
+    "ARCHITECTURE.md",
+    "CONVENTIONS.md",
+    "CHANGELOG.md",
+    "docs/benchmarks.md",
+    "docs/bundled-capture.md",
+    "docs/capture-format.md",
+    "docs/recipe.md",
+];
+
+/// Folders of the repository that a path in a document begins with.
+const ROOTS: [&str; 5] = ["crates/", "docs/", "examples/", "xtask/", ".ci/"];
+
+/// Named in a document, and made by hand at release. Drop a line once its file is there.
+const PENDING: [&str; 1] = ["docs/images/knight.png"];
+
+/// Flags of other programs that documents show.
+const FOREIGN_FLAGS: [&str; 10] = [
+    "--release",
+    "--workspace",
+    "--all",
+    "--check",
+    "--all-targets",
+    "--no-deps",
+    "--example",
+    "--test",
+    "--locked",
+    "--bench",
+];
+
+fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("xtask lies in the repository").to_owned()
+}
+
+/// Every file below `folder` with this ending, relative to the repository, in order.
+fn files(folder: &str, ending: &str) -> Vec<String> {
+    let (root, mut todo, mut found) = (root(), vec![root().join(folder)], Vec::new());
+    while let Some(dir) = todo.pop() {
+        let Ok(entries) = std::fs::read_dir(&dir) else { continue };
+        for path in entries.map(|e| e.expect("a folder of the repository can be listed").path()) {
+            if path.is_dir() && path.file_name().is_some_and(|n| n != "target") {
+                todo.push(path);
+            } else if path.extension().is_some_and(|e| e == ending) {
+                let name = path.strip_prefix(&root).expect("it lies below").to_string_lossy().replace('\\', "/");
+                found.push(name);
+            }
+        }
+    }
+    found.sort();
+    found
+}
+
+fn sources() -> Vec<String> {
+    [files("crates", "rs"), files("xtask", "rs")].concat()
+}
+
+fn read(path: &str) -> String {
+    std::fs::read_to_string(root().join(path)).unwrap_or_else(|e| panic!("{path} cannot be read: {e}"))
+}
+
+/// Whether the whole file is a test, an example or a benchmark.
+fn is_test(path: &str) -> bool {
+    ["/tests/", "/examples/", "/benches/"].iter().any(|p| path.contains(p))
+        || path.ends_with("/tests.rs")
+        || path.ends_with("_tests.rs")
+}
+
+/// Lines of code with their numbers: comments are blanked, an inline `mod tests {` ends the file.
+fn code(text: &str) -> Vec<(usize, String)> {
+    let mut out = Vec::new();
+    let lines: Vec<&str> = text.lines().collect();
+    for (i, line) in lines.iter().enumerate() {
+        let next = lines.get(i + 1).map_or("", |l| l.trim_start());
+        if line.starts_with("#[cfg(test)]") && next.starts_with("mod ") && next.ends_with('{') {
+            break;
+        }
+        let bare = line.split("//").next().unwrap_or("");
+        out.push((i + 1, bare.to_owned()));
+    }
+    out
+}
+
+fn report(troubles: Vec<String>, remedy: &str) {
+    assert!(troubles.is_empty(), "\n{}\n{remedy}", troubles.join("\n"));
+}
+
+fn is_word(c: char) -> bool {
+    c.is_alphanumeric() || c == '_'
+}
+
+/// First names behind `prefix` in a statement: `crate::a::b` gives a, `crate::{a, b::{c, d}}` gives a and b.
+fn names_behind(statement: &str, prefix: &str) -> Vec<String> {
+    let mut out = Vec::new();
+    for (at, _) in statement.match_indices(prefix) {
+        if statement[..at].chars().next_back().is_some_and(|c| is_word(c) || c == ':') {
+            continue;
+        }
+        let rest = &statement[at + prefix.len()..];
+        let Some(list) = rest.strip_prefix('{') else {
+            out.push(rest.chars().take_while(|&c| is_word(c)).collect());
+            continue;
+        };
+        let (mut depth, mut word, mut fresh) = (0, String::new(), true);
+        for c in list.chars() {
+            match c {
+                '{' => depth += 1,
+                '}' if depth == 0 => break,
+                '}' => depth -= 1,
+                ',' if depth == 0 => {
+                    out.push(std::mem::take(&mut word));
+                    fresh = true;
+                }
+                c if depth == 0 && fresh && is_word(c) => word.push(c),
+                c if c.is_whitespace() => {}
+                _ => fresh = false,
+            }
+        }
+        out.push(word);
+    }
+    out.retain(|name| !name.is_empty());
+    out
+}
+
+#[test]
+fn names_behind_a_prefix_are_found() {
+    assert_eq!(names_behind("use crate::a::b;", "crate::"), ["a"]);
+    assert_eq!(names_behind("use crate::{Error, a, b::{c, d}, e};", "crate::"), ["Error", "a", "b", "e"]);
+    assert_eq!(names_behind("x = crate::a::f(super::super::b)", "super::super::"), ["b"]);
+}
+
+#[test]
+fn modules_import_downwards() {
+    let mut troubles = Vec::new();
+    for (place, order) in ORDER {
+        let src = format!("{place}/src/");
+        let exists = |name: &str| {
+            root().join(format!("{src}{name}.rs")).is_file() || root().join(format!("{src}{name}/mod.rs")).is_file()
+        };
+        let rank = |name: &str| order.iter().position(|n| *n == name);
+        for path in files(&src, "rs").into_iter().filter(|p| !is_test(p)) {
+            let inside = path.strip_prefix(&src).expect("it lies below").trim_end_matches(".rs");
+            let module = inside.split('/').next().expect("a path has a first part");
+            if module == "lib" {
+                continue;
+            }
+            let Some(own) = rank(module) else {
+                troubles.push(format!("{path}: module `{module}` has no place in ORDER"));
+                continue;
+            };
+            // `super::` as often as the module lies deep is another way to say `crate::`.
+            let depth = inside.trim_end_matches("/mod").split('/').count();
+            let above = "super::".repeat(depth);
+            let lines = code(&read(&path));
+            let text: String = lines.iter().map(|(_, l)| l.as_str().to_owned() + "\n").collect();
+            let mut named = names_behind(&text, "crate::");
+            named.extend(names_behind(&text, &above));
+            for name in named.into_iter().filter(|n| exists(n) && n != module).collect::<BTreeSet<_>>() {
+                if rank(&name).is_some_and(|r| r > own) {
+                    troubles.push(format!("{path}: `{module}` imports `{name}`, which stands above it"));
+                }
+                if NEVER.iter().any(|(c, m, n)| *c == place && *m == module && n.contains(&name.as_str())) {
+                    troubles.push(format!("{path}: `{module}` must not know `{name}`"));
+                }
+            }
+        }
+    }
+    report(troubles, "Move what both need into the lower module; see ARCHITECTURE.md and ORDER in this test.");
+}
+
+#[test]
+fn files_are_short() {
+    let mut troubles = Vec::new();
+    for path in sources() {
+        let lines = read(&path).lines().count();
+        let listed = LONG_FILES.iter().any(|(p, _)| *p == path);
+        if lines > MAX_LINES && !listed {
+            troubles.push(format!("{path}: {lines} lines"));
+        }
+        if lines <= MAX_LINES && listed {
+            troubles.push(format!("{path}: is short now; take it out of LONG_FILES"));
+        }
+    }
+    report(troubles, "Split the file by nouns, or list it in LONG_FILES with a reason.");
+}
+
+#[test]
+fn unsafe_stays_where_it_is() {
+    let says = |path: &str| {
+        let word = |l: &str| l.split(|c| !is_word(c)).any(|w| w == "unsafe");
+        code(&read(path)).iter().any(|(_, l)| word(l))
+    };
+    let found: Vec<String> = sources().into_iter().filter(|p| !p.ends_with("xtask/tests/tidy.rs") && says(p)).collect();
+    let mut listed = UNSAFE_FILES.map(str::to_owned).to_vec();
+    listed.sort();
+    assert_eq!(found, listed, "files that say `unsafe` (left) are those in UNSAFE_FILES (right): SIMD dispatch only");
+}
+
+#[test]
+fn libraries_do_not_print_and_splat4d_opens_no_file() {
+    let mut troubles = Vec::new();
+    for path in sources().into_iter().filter(|p| !is_test(p) && !SHELLS.iter().any(|s| p.starts_with(s))) {
+        for (number, line) in code(&read(&path)) {
+            for word in SHELL_WORDS {
+                let found =
+                    line.match_indices(word).any(|(at, _)| !line[..at].chars().next_back().is_some_and(is_word));
+                if found {
+                    troubles.push(format!("{path}:{number}: a library says `{word}`"));
+                }
+            }
+            if path.starts_with("crates/splat4d/") && PATH_WORDS.iter().any(|w| line.contains(w)) {
+                troubles.push(format!("{path}:{number}: splat4d reads bytes, not paths"));
+            }
+        }
+    }
+    report(troubles, "Emit an Event, return an Error, or take bytes from the caller.");
+}
+
+/// Pieces of a document that may be paths: between spaces, quotes, brackets and backticks.
+fn tokens(text: &str) -> impl Iterator<Item = &str> {
+    text.split(|c: char| c.is_whitespace() || "`'\"()<>|,;".contains(c))
+        .map(|t| t.trim_start_matches('[').trim_end_matches(['.', ':', ']', '*']))
+}
+
+#[test]
+fn paths_in_documents_exist() {
+    let mut troubles = Vec::new();
+    for doc in DOCS {
+        let text = read(doc);
+        let folder = Path::new(doc).parent().unwrap_or(Path::new(""));
+        for token in tokens(&text) {
+            let pattern = token.contains(['*', '{', '%', '$', '…']);
+            if ROOTS.iter().any(|r| token.starts_with(r)) && !pattern && !PENDING.contains(&token) {
+                // `docs/x.md#part` is a place in a file, `motion/x.rs::f` a name in one.
+                let path = token.split(['#', ':']).next().expect("a split has a first part");
+                if !root().join(path).exists() {
+                    troubles.push(format!("{doc}: there is no {path}"));
+                }
+            }
+        }
+        for (at, _) in text.match_indices("](") {
+            let target = text[at + 2..].split(')').next().unwrap_or("");
+            let path = target.split('#').next().unwrap_or("");
+            let foreign = path.is_empty() || path.contains("://") || PENDING.contains(&path);
+            if !foreign && !root().join(folder).join(path).exists() {
+                troubles.push(format!("{doc}: the link to {path} leads nowhere"));
+            }
+        }
+    }
+    report(troubles, "Write the path as it is now, or take it out.");
+}
+
+#[test]
+fn the_code_map_is_complete() {
+    let map = read("ARCHITECTURE.md");
+    let mut troubles = Vec::new();
+    for manifest in files("crates", "toml").into_iter().filter(|p| p.ends_with("/Cargo.toml")) {
+        let src = manifest.replace("Cargo.toml", "src/");
+        for path in files(&src, "rs").into_iter().filter(|p| !is_test(p)) {
+            let inside = path.strip_prefix(&src).expect("it lies below");
+            let Some((folder, _)) = inside.rsplit_once('/') else { continue };
+            let name = format!("`{src}{folder}/`");
+            if !map.contains(&name) {
+                troubles.push(format!("ARCHITECTURE.md does not name {name}"));
+            }
+        }
+    }
+    troubles.dedup();
+    report(troubles, "Give it a line in the code map.");
+}
+
+/// Long flags that the command declares: `long`, `long = "x"` and aliases in `#[arg(...)]`, with the field's name.
+fn declared_flags() -> BTreeSet<String> {
+    let mut flags: BTreeSet<String> = ["--help", "--version"].map(str::to_owned).into();
+    for path in files("crates/splat4d-cli/src", "rs") {
+        let text = read(&path);
+        for (at, _) in text.match_indices("#[arg(") {
+            let end = at + text[at..].find(")]").expect("an attribute ends");
+            // The attribute may end at an earlier `)]` inside it; the field then follows the last one before it.
+            let field = text[end..].split(&[':', '{'][..]).next().unwrap_or("");
+            let field = field.split(|c| !is_word(c)).rfind(|w| !w.is_empty()).unwrap_or("");
+            let attribute = &text[at + 6..end];
+            for piece in attribute.split(',').map(str::trim) {
+                if piece == "long" {
+                    flags.insert(format!("--{}", field.trim_start_matches('_').replace('_', "-")));
+                }
+                let name = ["long = ", "alias = ", "visible_alias = "].iter().find_map(|k| piece.strip_prefix(k));
+                if let Some(name) = name {
+                    flags.insert(format!("--{}", name.trim_matches('"')));
+                }
+            }
+        }
+    }
+    flags
+}
+
+/// Words of a text that look like long flags.
+fn flags_in(text: &str) -> BTreeSet<String> {
+    let mut out = BTreeSet::new();
+    for (at, _) in text.match_indices("--") {
+        let before = text[..at].chars().next_back();
+        let name: String =
+            text[at + 2..].chars().take_while(|c| c.is_ascii_alphanumeric() || "-_".contains(*c)).collect();
+        if before.is_none_or(|c| c.is_whitespace() || "`\"([|/".contains(c))
+            && name.starts_with(|c: char| c.is_ascii_lowercase())
+        {
+            out.insert(format!("--{}", name.trim_end_matches('-')));
+        }
+    }
+    out
+}
+
+#[test]
+fn flags_in_documents_exist() {
+    let mut known = declared_flags();
+    assert!(known.contains("--motion") && known.contains("--slow-motion"), "the command's flags are read: {known:?}");
+    known.extend(FOREIGN_FLAGS.map(str::to_owned));
+    // The chores and the example script have flags of their own.
+    for path in files("xtask/src", "rs").into_iter().chain(files("examples", "py")) {
+        known.extend(flags_in(&read(&path)));
+    }
+    let mut troubles = Vec::new();
+    for doc in DOCS {
+        for flag in flags_in(&read(doc)).difference(&known) {
+            troubles.push(format!("{doc}: there is no flag {flag}"));
+        }
+    }
+    report(troubles, "Write the flag as `splat4d VERB --help` shows it.");
+}
