@@ -11,7 +11,7 @@ use crate::train::chain::Observation;
 use splat4d::layers::{LayerTape, Scene};
 use splat4d::math::{Real, Rng, sym3};
 use splat4d::motion::Cache;
-use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
+use splat4d::scene::params::{OPACITY, QUAT};
 use splat4d::scene::splats::COV;
 use splat4d::scene::{Born, GEOMETRY, RowEdit, Rows, Space, Table, Time};
 
@@ -236,6 +236,7 @@ mod tests {
     use super::*;
     use splat4d::layers::Layer;
     use splat4d::motion::{Spec, build};
+    use splat4d::scene::params::LOG_SCALE;
     use splat4d::scene::{LifeKind, Params};
 
     /// One still layer of random Gaussians of opacity one half.
