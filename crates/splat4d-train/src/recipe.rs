@@ -21,13 +21,11 @@ macro_rules! recipe {
         impl Recipe {
             /// Name, default and documentation of every knob, in order.
             pub fn knobs() -> Vec<Knob> {
-                let mut out = Vec::new();
-                $(out.push(Knob {
+                vec![$(Knob {
                     name: stringify!($name),
                     default: toml::Value::try_from::<$t>($default).map(|v| v.to_string()).unwrap_or_default(),
                     doc: knob_doc(stringify!($($doc)*)),
-                });)*
-                out
+                }),*]
             }
         }
     };
