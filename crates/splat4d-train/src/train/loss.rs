@@ -6,8 +6,9 @@ use crate::optim::Moments;
 use splat4d::render::Image;
 use splat4d::scene::{Grads, Key, Params, Planes, Space};
 
-/// A gain exp(m) and an offset c a camera and channel: columns m 3, c 3. Camera 0 is the reference and stays as it is.
-/// Source: Luiten et al. 2024 (gain and offset a camera).
+/// A gain exp(m) and an offset c a camera and channel: columns m 3, c 3. The cameras' mean is held at the identity, so that
+/// the scene keeps the rig's mean exposure and held-out cameras are drawn with it.
+/// Source: Luiten et al. 2024 (gain and offset a camera); the fixed mean is ours.
 #[derive(Debug)]
 pub struct Exposure {
     /// One table [cameras, 6].
@@ -16,16 +17,17 @@ pub struct Exposure {
     pub moments: Moments<f32>,
     key: Key,
     grads: Grads<f32>,
+    trained: Vec<usize>,
 }
 
 impl Exposure {
-    /// The identity for every camera.
-    pub fn new(cameras: usize) -> Self {
+    /// The identity for every camera; only the `trained` ones ever change.
+    pub fn new(cameras: usize, trained: Vec<usize>) -> Self {
         let mut params = Params::new(0, 0, &[]);
         let key = params
             .entry("exposure", Space::Fixed, &[("exposure", 6)], cameras, |_| {})
             .expect("a new table fits itself");
-        Self { moments: Moments::new(&params), grads: Grads::new(&params), params, key }
+        Self { moments: Moments::new(&params), grads: Grads::new(&params), params, key, trained }
     }
 
     /// The table's key.
@@ -39,6 +41,12 @@ impl Exposure {
         rates.push(Some(vec![rate; 6]));
         let finite = self.moments.step(&mut self.params, &self.grads, &rates).is_empty();
         self.grads.clear(&self.params);
+        let table = &mut self.params[self.key];
+        for col in 0..6 {
+            let sum: f64 = self.trained.iter().map(|&c| f64::from(table.get(c, col))).sum();
+            let mean = (sum / self.trained.len().max(1) as f64) as f32;
+            self.trained.iter().for_each(|&c| *table.get_mut(c, col) -= mean);
+        }
         finite
     }
 }
@@ -81,7 +89,7 @@ impl ImageLoss<f32> for TrainLoss {
         d_color: &mut Planes<f32>,
         d_alpha: &mut Planes<f32>,
     ) -> (f64, bool) {
-        let row = self.exposure.as_ref().filter(|_| view.rig > 0).map(|e| e.params[e.key].read::<6>(view.rig, 0));
+        let row = self.exposure.as_ref().map(|e| e.params[e.key].read::<6>(view.rig, 0));
         if let Some(row) = row {
             self.exposed.clone_from(&image.color);
             for c in 0..3 {
