@@ -112,7 +112,7 @@ impl Light {
         sum / ((2 * n + 1) * (2 * n + 1)) as f64
     }
 
-    /// Light that arrives at a matt surface with unit `normal`; `open` in [0,1] is how much of the sky it sees.
+    /// Light that arrives at a matt surface with unit `normal`; `open` in `[0,1]` is how much of the sky it sees.
     pub fn arriving(&self, point: V3, normal: V3, open: f64) -> V3 {
         let sky = SKY_COLOR * (0.5 + 0.5 * normal.y) + GROUND_COLOR * (0.5 - 0.5 * normal.y);
         let mut sum = sky * open + FILL_COLOR * normal.dot(self.fill).max(0.0);

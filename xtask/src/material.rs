@@ -16,7 +16,7 @@ pub const FLOOR: u16 = 2;
 pub const WALL: u16 = 3;
 /// Stone drums; uv = (turn, height).
 pub const COLUMN: u16 = 4;
-/// Wooden crate; uv in [0,1]² per face.
+/// Wooden crate; uv in `[0,1]`² per face.
 pub const CRATE: u16 = 5;
 /// Painted crate, as above.
 pub const PAINTED_CRATE: u16 = 6;

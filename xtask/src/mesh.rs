@@ -61,7 +61,7 @@ impl Mesh {
         self.push_triangle([first, first + 2, first + 3], material, object);
     }
 
-    /// A box standing on the origin of `place`; each face has uv in [0,1]².
+    /// A box standing on the origin of `place`; each face has uv in `[0,1]`².
     pub fn crate_box(&mut self, place: &Affine, size: V3, material: u16, object: u8) {
         let (hx, hz) = (0.5 * size.x, 0.5 * size.z);
         let corner = |x: f64, y: f64, z: f64| v3(x * hx, y * size.y, z * hz);

@@ -135,7 +135,7 @@ fn check_gradient() -> splat4d::Result<()> {
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     check_gradient()?;
     let scene = scene()?;
-    let pose = Se3::look_at([0.0, 0.8, -3.0], [0.0, 0.5, 0.0], scene.up);
+    let pose = Se3::look_at([0.0, 1.0, -4.5], [0.0, 0.5, 0.0], scene.up);
     let camera = Camera::with_fov_y(pose, 0.7, 160, 120);
     let (mut renderer, mut instant, mut image) =
         (Renderer::new(RenderConfig::default()), Instant::default(), Image::default());

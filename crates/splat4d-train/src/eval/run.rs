@@ -7,7 +7,7 @@
 //! | `per_view.json` | [`Report::per_view`], with `camera` and `time` of every picture besides |
 //! | `test/ours_N/{renders,gt,errors}/00000.png` | held-out views, in the capture's order |
 //!
-//! PSNR is clamped to [0,1], not rounded, per picture, then the mean. The dynamic region (pixels that leave their
+//! PSNR is clamped to `[0,1]`, not rounded, per picture, then the mean. The dynamic region (pixels that leave their
 //! camera's temporal mean) and flicker are defined for fixed cameras only. Where a picture was undistorted, pixels
 //! without an original take the truth's colour, so that they count as right in every metric.
 

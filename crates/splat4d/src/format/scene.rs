@@ -1,8 +1,8 @@
 //! `scene.safetensors`: the lossless learnable state of a scene.
 //!
 //! Metadata `splat4d` holds JSON: version, clip, fps, up, background, head, and a list of layers with name, rows, SH
-//! coefficients, life and motion. Every column group of every table is one row-major array: `layers.0.means` [N,3],
-//! `layers.0.quats` [N,4] wxyz, `layers.0.sh` [N,K,3], `layers.0.velocities` [N,3·order] … Seconds and scene units.
+//! coefficients, life and motion. Every column group of every table is one row-major array: `layers.0.means` `[N,3]`,
+//! `layers.0.quats` `[N,4]` wxyz, `layers.0.sh` `[N,K,3]`, `layers.0.velocities` `[N,3·order]` … Seconds and scene units.
 
 use super::safetensors::{SafeTensors, Tensor};
 use super::{params_to_arrays, tensors_to_loaded};
