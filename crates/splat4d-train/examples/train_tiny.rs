@@ -119,7 +119,6 @@ fn main() -> Result<()> {
             sh_degree: 0,
             opacity_reset_interval: 0,
             exposure_lr: 0.0,
-            clearance: 0.0,
         },
     );
     let mut mse = 0.0;

@@ -145,8 +145,6 @@ recipe! {
     opacity_reset_interval: usize = 0,
     /// Opacity below which a Gaussian is dead; 0: 0.02 for adc, 0.005 for mcmc.
     min_opacity: f64 = 0.0,
-    /// Gaussians in front of a training camera nearer than this share of the extent are removed; 0: none.
-    camera_clearance: f64 = 0.1,
     /// mcmc: growth a densification, up to the cap.
     growth: f64 = 1.05,
     /// mcmc: strength of the position noise.
@@ -270,7 +268,6 @@ impl Recipe {
             ("min_life_frames", self.min_life_frames),
             ("fps", self.fps),
             ("percent_dense", self.percent_dense),
-            ("camera_clearance", self.camera_clearance),
             ("densify_grad_threshold", self.densify_grad_threshold),
         ];
         for (knob, value) in natural {

@@ -9,10 +9,10 @@ pub mod mcmc;
 use crate::optim::Moments;
 use splat4d::layers::{LayerTape, Scene};
 use splat4d::math::{Real, Rng, sym3};
-use splat4d::motion::{Cache, for_rows};
+use splat4d::motion::Cache;
 use splat4d::scene::params::{OPACITY, QUAT};
 use splat4d::scene::splats::COV;
-use splat4d::scene::{Born, Camera, GEOMETRY, RowEdit, Rows, Space, Table, Time};
+use splat4d::scene::{Born, GEOMETRY, RowEdit, Rows, Space, Table, Time};
 
 pub use adc::Adc;
 pub use mcmc::Mcmc;
@@ -201,26 +201,6 @@ fn is_dead(scene: &Scene<f32>, layer: usize, row: usize, min_opacity: f64, span:
         || quat == 0.0
 }
 
-/// Makes Gaussians dead that hang in front of a camera nearer than `clearance`: one picture alone explains them, and they
-/// blind every view that was not trained on.
-pub fn clear_view(scene: &mut Scene<f32>, cameras: &[Camera], clearance: f64) {
-    for layer in &mut scene.layers {
-        let [geometry] = layer.params.get_mut([GEOMETRY]);
-        for_rows([geometry], Rows::All, |_, row, [geometry]| {
-            let mean = geometry.read::<3>(row, 0).map(f64::from);
-            let blinds = |c: &Camera| {
-                c.project(mean).is_some_and(|([u, v], z)| {
-                    z < clearance && u >= 0.0 && v >= 0.0 && u <= c.width as f64 && v <= c.height as f64
-                })
-            };
-            if clearance > 0.0 && cameras.iter().any(blinds) {
-                geometry.write(row, OPACITY, [logit(0.0)]);
-            }
-            0.0
-        });
-    }
-}
-
 /// A point drawn from N(0, Σ).
 fn sample(cov: [f64; 6], rng: Rng) -> [f64; 3] {
     let (values, vectors) = sym3::eigen(cov);
@@ -303,18 +283,6 @@ mod tests {
         let mut stats = Stats::new(&s);
         apply(&mut s, &mut moments, &mut stats, 0, &edit, &Rng::new(0, "m", 0));
         assert!(distance(&s) < 0.6 * before);
-    }
-
-    #[test]
-    fn only_what_hangs_before_a_camera_is_cleared() {
-        let mut s = scene(3);
-        let g = &mut s.layers[0].params[GEOMETRY];
-        g.write(0, 0, [0.0, 0.0, 0.2]); // before the lens
-        g.write(1, 0, [0.0, 0.0, 2.0]); // far enough
-        g.write(2, 0, [0.0, 0.0, -0.2]); // behind it
-        let camera = Camera::with_fov_y(splat4d::math::Se3::IDENTITY, 1.0, 20, 20);
-        clear_view(&mut s, &[camera], 0.5);
-        assert_eq!([0, 1, 2].map(|r| opacity(&s, 0, r) > 0.1), [false, true, true]);
     }
 
     #[test]

@@ -279,7 +279,6 @@ impl Bench {
             sh_degree: r.sh_degree,
             opacity_reset_interval: r.opacity_reset_interval,
             exposure_lr: r.exposure_lr,
-            clearance: r.camera_clearance * plan.extent,
         };
         Ok(Trainer::new(
             scene,

@@ -3,7 +3,7 @@
 use super::chain::{Chain, Draw, Losses, StepInfo, StepReport, View};
 use super::loss::TrainLoss;
 use crate::capture::frames::{Frames, Picture};
-use crate::densify::{self, Change, Densify, Limits, Stats, adc, mcmc, morton_edit};
+use crate::densify::{Change, Densify, Limits, Stats, adc, mcmc, morton_edit};
 use crate::models::Stage;
 use crate::optim::Moments;
 use crate::sampler::Timeline;
@@ -30,8 +30,6 @@ pub struct Settings {
     pub opacity_reset_interval: usize,
     /// Rate of the exposure.
     pub exposure_lr: f64,
-    /// Gaussians in front of a training camera nearer than this (scene units) are removed; 0: none.
-    pub clearance: f64,
 }
 
 /// How far a run is. All of it is in every checkpoint.
@@ -91,7 +89,6 @@ pub struct Trainer<'a> {
     /// Settings that hold for all stages.
     pub settings: Settings,
     frames: Arc<dyn Frames>,
-    eyes: Vec<Camera>,
     timeline: Timeline,
     draw: Box<dyn Draw<f32> + 'a>,
     grads: Vec<Grads<f32>>,
@@ -119,7 +116,6 @@ impl<'a> Trainer<'a> {
             progress: Progress { rate_scale: 1.0, ..Progress::default() },
             loss,
             settings,
-            eyes: distinct_cameras(frames.as_ref()),
             frames,
             timeline,
             draw,
@@ -386,7 +382,6 @@ impl<'a> Trainer<'a> {
         let mut change = Change::default();
         let due = every > 0 && step >= from && step <= until && step.is_multiple_of(every);
         if due && stage.densify != Densify::None {
-            densify::clear_view(&mut self.scene, &self.eyes, self.settings.clearance);
             change = stage.densify.run(
                 &mut self.scene,
                 &mut self.moments,
@@ -399,7 +394,7 @@ impl<'a> Trainer<'a> {
             if step + every > until {
                 for layer in 0..self.scene.layers.len() {
                     let edit = morton_edit(&self.scene, layer);
-                    densify::apply(
+                    crate::densify::apply(
                         &mut self.scene,
                         &mut self.moments,
                         &mut self.stats,
@@ -449,18 +444,3 @@ impl super::chain::ImageLoss<f32> for Mse<'_> {
         out
     }
 }
-
-/// The cameras of all frames, every pose once.
-fn distinct_cameras(frames: &dyn Frames) -> Vec<Camera> {
-    let mut out: Vec<Camera> = Vec::new();
-    for camera in (0..frames.len()).map(|i| frames.camera(i)) {
-        // A rig's poses repeat every frame, a moving camera's never: looking back a rig's size finds them all.
-        if !out.iter().rev().take(LOOK_BACK).any(|c| c == camera) {
-            out.push(camera.clone());
-        }
-    }
-    out
-}
-
-/// How many poses are compared with a new one: more cameras than any rig has.
-const LOOK_BACK: usize = 512;

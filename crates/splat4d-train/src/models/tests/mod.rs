@@ -265,7 +265,6 @@ fn trainer(scene: Scene<f32>, stages: Vec<Stage>, cap: usize) -> Trainer<'static
         sh_degree: 1,
         opacity_reset_interval: 0,
         exposure_lr: 0.0,
-        clearance: 0.0,
     };
     let draw = Box::new(Renderer::new(RenderConfig::default()));
     Trainer::new(scene, stages, Arc::new(Made::new(4, 3, 16)), draw, TrainLoss::new(0.2, 0.0, None), settings)
