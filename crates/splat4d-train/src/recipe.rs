@@ -88,9 +88,9 @@ recipe! {
     /// Moments at which initial points are spread over the clip; 0: about every 5 frames.
     init_keyframes: usize = 0,
     /// Rate of positions at the start, of the extent.
-    position_lr_init: f64 = 1e-3,
+    position_lr_init: f64 = 2e-3,
     /// Rate of positions at the end, of the extent.
-    position_lr_final: f64 = 1e-5,
+    position_lr_final: f64 = 5e-5,
     /// Rates that are not given two ends (colour, opacity, scale, rotation, life) fall to this share of themselves.
     lr_decay: f64 = 1.0,
     /// Rate of base colour; the higher SH degrees learn 20 times slower.

@@ -3,7 +3,7 @@
 use super::chain::{Chain, Draw, Losses, StepInfo, StepReport, View};
 use super::loss::TrainLoss;
 use crate::capture::frames::{Frames, Picture};
-use crate::densify::{Change, Densify, Limits, Stats, adc, mcmc, morton_edit};
+use crate::densify::{self, Change, Densify, Limits, Stats, adc, mcmc, morton_edit};
 use crate::models::Stage;
 use crate::optim::Moments;
 use crate::sampler::Timeline;
@@ -394,7 +394,7 @@ impl<'a> Trainer<'a> {
             if step + every > until {
                 for layer in 0..self.scene.layers.len() {
                     let edit = morton_edit(&self.scene, layer);
-                    crate::densify::apply(
+                    densify::apply(
                         &mut self.scene,
                         &mut self.moments,
                         &mut self.stats,
