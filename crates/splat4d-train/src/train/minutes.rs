@@ -2,7 +2,6 @@
 //! iterations follow from the densification's own schedule, and are saved in the recipe, so that the run repeats.
 
 use super::run::Bench;
-use crate::densify::{Densify, Mcmc};
 use crate::event::Event;
 use crate::recipe::Recipe;
 use crate::{Error, ErrorKind, Result};
@@ -12,6 +11,10 @@ use std::time::Instant as Clock;
 const WARM_UP: usize = 12;
 /// Steps that are timed.
 const TIMED: usize = 25;
+/// Steps between two densifications of the probe, and at most so many steps until it stands at the cap.
+const HURRIED: usize = 20;
+/// See [`HURRIED`].
+const GROWTH_STEPS: usize = 400;
 /// Bounds of what is sensible.
 const ITERATIONS: std::ops::RangeInclusive<usize> = 50..=1_000_000;
 
@@ -34,14 +37,21 @@ pub(super) fn plan(bench: &Bench, recipe: &Recipe, minutes: f64, listen: &mut dy
     trainer.check_not_empty()?;
     let first = [time(&mut trainer, true)?, time(&mut trainer, false)?];
     tell(listen, 1);
-    let grow = Densify::Mcmc(Mcmc { growth: 2.0, gradient_share: 0.0, noise_lr: 0.0 });
-    let mut step = 0;
-    while recipe.strategy != "none" && trainer.scene.len() < recipe.max_cap && step < 40 {
-        let limits = trainer.settings.limits;
-        grow.run(&mut trainer.scene, &mut trainer.moments, &mut trainer.stats, &limits, recipe.seed, step);
-        step += 1;
+    // Copies of initial Gaussians would cost far more than trained ones, which are small: the probe grows by the
+    // recipe's own strategy, in a hurry.
+    let scene = bench.initial_scene(&plan)?;
+    let mut trainer = bench.trainer(&plan, scene)?;
+    for stage in &mut trainer.stages {
+        stage.densify_steps = (HURRIED, usize::MAX, HURRIED);
+        stage.half_size_steps = usize::MAX;
     }
-    trainer.refit();
+    for _ in 0..GROWTH_STEPS {
+        if trainer.is_done() || trainer.scene.len() >= recipe.max_cap {
+            break;
+        }
+        step(&mut trainer)?;
+    }
+    trainer.stages.iter_mut().for_each(|s| s.densify_steps = (0, 0, 0));
     let end = trainer.scene.len();
     let last = [time(&mut trainer, true)?, time(&mut trainer, false)?];
     tell(listen, 2);
@@ -78,12 +88,17 @@ fn time(trainer: &mut super::trainer::Trainer<'_>, half: bool) -> Result<f64> {
         if i == WARM_UP {
             clock = Clock::now();
         }
-        if let Err(fault) = trainer.step()? {
-            return Err(Error::new(ErrorKind::Diverged, format!("the timing probe failed: {}", fault.0))
-                .remedy("Look for wrong poses with `splat4d info CAPTURE`"));
-        }
+        step(trainer)?;
     }
     Ok(clock.elapsed().as_secs_f64() / TIMED as f64)
+}
+
+fn step(trainer: &mut super::trainer::Trainer<'_>) -> Result<()> {
+    match trainer.step()? {
+        Ok(_) => Ok(()),
+        Err(fault) => Err(Error::new(ErrorKind::Diverged, format!("the timing probe failed: {}", fault.0))
+            .remedy("Look for wrong poses with `splat4d info CAPTURE`")),
+    }
 }
 
 /// Seconds of a whole run: the cost of a step is linear in the number of Gaussians, which grows by the schedule. `first`
@@ -98,10 +113,10 @@ fn schedule_cost(r: &Recipe, gaussians: [usize; 2], first: [f64; 2], last: [f64;
         let slope = if end > start { (last[size] - first[size]) / (end - start) } else { 0.0 };
         total += first[size] + slope * (count - start);
         let step = i + 1;
-        let densifies = step >= r.densify_from_iter && step <= r.densify_until_iter;
+        let densifies = r.strategy != "none" && step >= r.densify_from_iter && step <= r.densify_until_iter;
         if densifies && step.is_multiple_of(r.densification_interval) {
             // ADC reaches the cap within a few densifications; MCMC grows by its factor.
-            count = (count * if r.strategy == "adc" { ADC_GROWTH } else { r.growth }).min(end);
+            count = (count * if r.strategy == "adc" { ADC_GROWTH } else { r.growth }).min(r.max_cap as f64);
         }
     }
     total
@@ -116,7 +131,7 @@ mod tests {
 
     #[test]
     fn the_cost_follows_the_growth_and_the_size() {
-        let r = Recipe { iterations: 1000, half_size_until: 0.0, ..Recipe::default() }.resolve();
+        let r = Recipe { iterations: 1000, half_size_until: 0.0, max_cap: 2000, ..Recipe::default() }.resolve();
         let flat = schedule_cost(&r, [1000, 1000], [0.01; 2], [0.01; 2]);
         assert!((flat - 10.0).abs() < 1e-9);
         let grown = schedule_cost(&r, [1000, 2000], [0.01; 2], [0.02; 2]);
