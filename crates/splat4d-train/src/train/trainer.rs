@@ -167,12 +167,6 @@ impl<'a> Trainer<'a> {
         self.stats.clear(&self.scene);
     }
 
-    /// Fits the step's scratch to rows that were edited from outside (moments and statistics were edited with them).
-    pub fn refit(&mut self) {
-        self.fit_grads();
-        self.stages.iter().flat_map(|s| &s.params).for_each(|l| l.on_edit());
-    }
-
     fn fit_grads(&mut self) {
         self.grads = self.scene.layers.iter().map(|l| Grads::new(&l.params)).collect();
     }
