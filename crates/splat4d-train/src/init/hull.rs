@@ -66,19 +66,13 @@ fn spread(frames: &dyn Frames) -> Vec<usize> {
 fn carve_moment(frames: &dyn Frames, pictures: &[usize], volume: &Volume, wanted: usize, rng: Rng) -> Result<Seeds> {
     let mut low = volume.center.map(|c| c - volume.radius);
     let mut high = volume.center.map(|c| c + volume.radius);
-    let mut loaded = Vec::new();
-    for &i in pictures {
-        let mut picture = Picture::default();
-        frames.load(i, &mut picture)?;
-        loaded.push((i, picture));
-    }
     let mut out = Seeds::default();
     for round in 0..ROUNDS {
         let round_rng = rng.fork(round);
         let points: Vec<[f64; 3]> = (0..(wanted * CANDIDATES) as u64)
             .map(|i| std::array::from_fn(|k| low[k] + (high[k] - low[k]) * round_rng.uniform(3 * i + k as u64)))
             .collect();
-        let kept = vote(frames, &loaded, &points);
+        let kept = vote(frames, pictures, &points)?;
         if kept.is_empty() {
             break;
         }
@@ -100,37 +94,50 @@ fn carve_moment(frames: &dyn Frames, pictures: &[usize], volume: &Volume, wanted
     Ok(out)
 }
 
-/// The points that lie in (almost) all masks that see them, with their median colour.
-fn vote(frames: &dyn Frames, pictures: &[(usize, Picture)], points: &[[f64; 3]]) -> Seeds {
-    let keep = |x: &[f64; 3]| -> Option<[f32; 3]> {
-        let (mut views, mut inside) = (0usize, 0usize);
-        let mut colors = Vec::new();
-        for (i, picture) in pictures {
-            let Some(mask) = &picture.mask else { continue };
-            let Some(([u, v], _)) = frames.camera(*i).project(*x) else { continue };
-            if !(u >= 0.0 && v >= 0.0 && u < mask.width as f64 && v < mask.height as f64) {
-                continue;
+/// What the pictures so far say of one point.
+#[derive(Clone, Default)]
+struct Votes {
+    views: usize,
+    inside: usize,
+    colors: Vec<[f32; 3]>,
+}
+
+/// The points that lie in (almost) all masks that see them, with their median colour. One picture at a time is held.
+fn vote(frames: &dyn Frames, pictures: &[usize], points: &[[f64; 3]]) -> Result<Seeds> {
+    let allowed = MISSES * pictures.len() as f64;
+    let mut votes = vec![Votes::default(); points.len()];
+    let mut picture = Picture::default();
+    for &i in pictures {
+        frames.load(i, &mut picture)?;
+        let Some(mask) = &picture.mask else { continue };
+        let camera = frames.camera(i);
+        points.par_iter().zip(&mut votes).for_each(|(x, v)| {
+            if (v.views - v.inside) as f64 > allowed {
+                return;
             }
-            views += 1;
-            let (px, py) = (u as usize, v as usize);
+            let Some(([px, py], _)) = camera.project(*x) else { return };
+            if !(px >= 0.0 && py >= 0.0 && px < mask.width as f64 && py < mask.height as f64) {
+                return;
+            }
+            v.views += 1;
+            let (px, py) = (px as usize, py as usize);
             if mask.get(0, py, px) > 0.5 {
-                inside += 1;
-                colors.push(std::array::from_fn(|c| picture.color.get(c, py, px)));
-            } else if (views - inside) as f64 > MISSES * pictures.len() as f64 {
-                return None;
+                v.inside += 1;
+                v.colors.push(std::array::from_fn(|c| picture.color.get(c, py, px)));
+            } else if (v.views - v.inside) as f64 > allowed {
+                v.colors = Vec::new();
             }
-        }
-        let enough = views >= MIN_VIEWS.max(pictures.len().div_ceil(2));
-        (enough && (views - inside) as f64 <= MISSES * views as f64).then(|| median(&mut colors))
-    };
-    let found: Vec<Option<[f32; 3]>> = points.par_iter().map(keep).collect();
+        });
+    }
     let mut out = Seeds::default();
-    for (x, color) in points.iter().zip(found) {
-        if let Some(color) = color {
-            out.push(*x, color, None);
+    for (x, v) in points.iter().zip(&mut votes) {
+        let misses = (v.views - v.inside) as f64;
+        let enough = v.views >= MIN_VIEWS.max(pictures.len().div_ceil(2));
+        if enough && misses <= allowed && misses <= MISSES * v.views as f64 {
+            out.push(*x, median(&mut v.colors), None);
         }
     }
-    out
+    Ok(out)
 }
 
 fn median(colors: &mut [[f32; 3]]) -> [f32; 3] {
