@@ -263,7 +263,9 @@ fn follow(
                 own: learnt(&layer.params[GEOMETRY].read::<11>(row.id, 0)),
                 colors: (colors == 0).then(|| sample::own_colors(layer, row.id)),
             };
-            fitter.pieces(&subject)
+            // Colours that are no numbers would show as black; what cannot be drawn is left out.
+            let sound = subject.colors.is_none_or(|c| c.iter().all(|x| x.is_finite()));
+            if sound { fitter.pieces(&subject) } else { Vec::new() }
         };
         let all: Vec<Vec<Piece>> = samples.rows.par_iter().map(pieces).collect();
         for pieces in all {
