@@ -1,7 +1,7 @@
 //! Baked against model: both drawn, from some cameras at some frames.
 
-use super::draft::{Node, Primitive};
 use super::turn::product;
+use crate::format::playback::{Node, Primitive};
 use crate::layers::{ALPHA_MIN, Instant, Scene};
 use crate::math::quat;
 use crate::math::sh::{MAX_COEFFS, rgb_to_dc};

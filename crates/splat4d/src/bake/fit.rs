@@ -1,14 +1,14 @@
 //! One Gaussian becomes pieces: straight lines in the deepest nodes that hold its life, halved where they miss.
 
-use super::draft::Primitive;
 use super::life::Envelope;
 use super::lookout::Lookout;
 use super::sample::{GEOMETRY, Row, Samples};
 use super::tree::{Span, Tree};
 use super::turn::{Shape, decompose, difference};
+use crate::format::playback::Primitive;
 use crate::layers::ALPHA_MIN;
-use crate::math::sh::{MAX_COEFFS, dc_to_rgb};
 use crate::math::se3::{norm, sub};
+use crate::math::sh::{MAX_COEFFS, dc_to_rgb};
 
 /// What a full step of opacity (or of colour, 0 to 1) counts as, pixels. A Gaussian one pixel wide that is d pixels off
 /// changes its neighbourhood by up to 0.6·d, but with both signs, so that most of it cancels; a wrong opacity does
@@ -48,6 +48,8 @@ pub(super) struct Fitter<'a> {
 pub(super) struct Subject<'a> {
     pub samples: &'a Samples,
     pub row: &'a Row,
+    /// The seconds in which its layer is seen.
+    pub window: [f64; 2],
     pub life: Envelope,
     /// Learnt rotation and scales: exact where motion leaves shapes alone.
     pub own: Shape,
@@ -74,26 +76,20 @@ impl Fitter<'_> {
 
     /// Goes down while one half holds all that is to be seen, then fits; a miss goes on in both halves.
     fn place(&self, subject: &Subject<'_>, span: Span, out: &mut Vec<Piece>) {
-        let [from, to] = subject.row.seen;
-        if !(to >= self.tree.border(span[0]) && from < self.tree.border(span[1])) {
-            return;
-        }
+        let inside = match narrow(self.tree, subject.row.seen, subject.window, span) {
+            Place::Nowhere => return,
+            Place::In(half) => return self.place(subject, half, out),
+            Place::Across => false,
+            Place::Here => true,
+        };
         let halves = self.tree.split(span);
-        if let Some([left, right]) = halves.filter(|_| self.tree.is_coarse(span)) {
-            let middle = self.tree.border(left[1]);
-            if to < middle {
-                return self.place(subject, left, out);
-            }
-            if from >= middle {
-                return self.place(subject, right, out);
-            }
-        }
-        let Some((primitive, error)) = self.fit(subject, span) else { return };
-        match halves {
-            Some(halves) if !(error <= self.tolerance) => {
-                halves.into_iter().for_each(|half| self.place(subject, half, out));
-            }
-            _ => out.push(Piece { span, primitive, error }),
+        let fitted = if inside || halves.is_none() { self.fit(subject, span) } else { None };
+        match (fitted, halves) {
+            (Some((primitive, error)), _) if error <= self.tolerance => out.push(Piece { span, primitive, error }),
+            // Where nothing could be fitted a half may still hold a frame that is sound.
+            (_, Some(halves)) => halves.into_iter().for_each(|half| self.place(subject, half, out)),
+            (Some((primitive, error)), None) => out.push(Piece { span, primitive, error }),
+            (None, None) => {}
         }
     }
 
@@ -264,18 +260,50 @@ pub(super) fn primitive(
     }
 }
 
-/// The span in which a Gaussian whose motion is a straight line lies: the deepest that holds all that is to be seen.
-pub(super) fn home(tree: &Tree, seen: [f64; 2]) -> Span {
-    let mut span = tree.root();
-    while let Some([left, right]) = tree.split(span).filter(|_| tree.is_coarse(span)) {
-        let middle = tree.border(left[1]);
-        span = match () {
-            () if seen[1] < middle => left,
-            () if seen[0] >= middle => right,
-            () => break,
-        };
+/// How a node and a Gaussian's time lie to each other.
+enum Place {
+    /// Nothing is to be seen in the node.
+    Nowhere,
+    /// All of it lies in this half, and the node is longer than a segment.
+    In(Span),
+    /// The node reaches beyond the time in which the layer is seen.
+    Across,
+    /// The node may hold it.
+    Here,
+}
+
+fn narrow(tree: &Tree, seen: [f64; 2], window: [f64; 2], span: Span) -> Place {
+    let [from, to] = [tree.border(span[0]), tree.border(span[1])];
+    if !(seen[1] >= from && seen[0] < to) {
+        return Place::Nowhere;
     }
-    span
+    if let Some([left, right]) = tree.split(span).filter(|_| tree.is_coarse(span)) {
+        let middle = tree.border(left[1]);
+        if seen[1] < middle {
+            return Place::In(left);
+        }
+        if seen[0] >= middle {
+            return Place::In(right);
+        }
+    }
+    let within = (window[0] <= from || span[0] == 0 && window[0] <= tree.clip()[0])
+        && (window[1] >= to || span[1] == tree.frames() && window[1] > tree.clip()[1]);
+    if within { Place::Here } else { Place::Across }
+}
+
+/// The spans in which a Gaussian whose motion is a straight line lies: the deepest that holds all that is to be seen; where
+/// that reaches beyond the time in which the layer is seen, spans that do not.
+pub(super) fn homes(tree: &Tree, seen: [f64; 2], window: [f64; 2]) -> Vec<Span> {
+    let (mut open, mut out) = (vec![tree.root()], Vec::new());
+    while let Some(span) = open.pop() {
+        match (narrow(tree, seen, window, span), tree.split(span)) {
+            (Place::Nowhere, _) => {}
+            (Place::In(half), _) => open.push(half),
+            (Place::Across, Some([left, right])) => open.extend([right, left]),
+            (Place::Across, None) | (Place::Here, _) => out.push(span),
+        }
+    }
+    out
 }
 
 /// The seconds of the clip in which something of this envelope and opacity can be seen.

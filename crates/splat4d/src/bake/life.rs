@@ -4,6 +4,9 @@ use crate::layers::Layer;
 use crate::scene::life::{CENTER, LOG_SOFTNESS, LOG_WIDTH};
 use crate::scene::{LIFE, LifeKind, Table};
 
+/// A half-width above this is for ever, seconds: three years, as intervals that stand for it have thirty.
+const FOR_EVER: f64 = 1e8;
+
 /// σ(t) = exp(−½(max(0, |t − centre| − half)/softness)²); 1 for ever where `half` is infinite.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Envelope {
@@ -47,8 +50,18 @@ impl<'a> Lives<'a> {
         Self { table: std::borrow::Cow::Borrowed(&layer.params[LIFE]), kind: layer.life }
     }
 
-    /// The envelope of row `id`; one that lives for ever has its centre at 0.
+    /// The envelope of row `id`.
     pub(super) fn envelope(&self, id: usize) -> Envelope {
+        let own = self.row(id);
+        if own.half > FOR_EVER { Envelope::forever(own.center) } else { own }
+    }
+
+    /// Whether lives have centres.
+    pub(super) fn has_centers(&self) -> bool {
+        self.table.width() > 0
+    }
+
+    fn row(&self, id: usize) -> Envelope {
         let get = |column: usize| f64::from(self.table.get(id, column));
         match self.kind {
             LifeKind::Infinite => Envelope::forever(0.0),
@@ -59,11 +72,9 @@ impl<'a> Lives<'a> {
                 half: 0.0,
                 softness: get(LOG_WIDTH).exp() * std::f64::consts::FRAC_1_SQRT_2,
             },
-            LifeKind::Interval => Envelope {
-                center: get(CENTER),
-                half: get(LOG_WIDTH).exp(),
-                softness: get(LOG_SOFTNESS).exp(),
-            },
+            LifeKind::Interval => {
+                Envelope { center: get(CENTER), half: get(LOG_WIDTH).exp(), softness: get(LOG_SOFTNESS).exp() }
+            }
         }
     }
 }
@@ -71,6 +82,7 @@ impl<'a> Lives<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::layers::ALWAYS;
     use crate::motion::Still;
     use crate::scene::{Params, Time};
     use std::sync::Arc;
@@ -82,7 +94,7 @@ mod tests {
             let mut params = Params::new(1, 1, kind.columns());
             let width = params[LIFE].width();
             (0..width).for_each(|k| params[LIFE].set(0, k, row[k]));
-            let layer = Layer { name: "a".into(), params, motion: Arc::new(Still), life: kind };
+            let layer = Layer { name: "a".into(), params, motion: Arc::new(Still), life: kind, span: ALWAYS };
             let envelope = Lives::new(&layer).envelope(0);
             for i in 0..50 {
                 let t = -1.0 + 0.05 * f64::from(i);

@@ -10,7 +10,6 @@
 //! so that memory does not grow with frames times Gaussians.
 
 mod compare;
-mod draft;
 mod fit;
 mod life;
 mod lookout;
@@ -22,8 +21,8 @@ mod tests;
 mod tree;
 mod turn;
 
+use crate::format::playback::{Node, Primitive};
 pub use compare::{Likeness, Moment, Shown, compare};
-pub use draft::{Node, Primitive};
 
 use crate::layers::{Layer, Scene};
 use crate::scene::{Camera, GEOMETRY};
@@ -224,10 +223,10 @@ fn copy(
     let (lives, spans) = (Lives::new(layer), layer.spans());
     for first in (0..spans.len()).step_by(STRAIGHT_RUN) {
         let ids = first..spans.len().min(first + STRAIGHT_RUN);
-        let piece = |id: usize| line.piece(layer, &lives, id, spans[id], fitter.tree, fitter.lookout);
-        let pieces: Vec<Option<Piece>> = ids.into_par_iter().map(piece).collect();
-        for piece in pieces {
-            tally.add(piece)?;
+        let pieces = |id: usize| line.pieces(layer, &lives, id, spans[id], fitter.tree, fitter.lookout);
+        let all: Vec<Vec<Piece>> = ids.into_par_iter().map(pieces).collect();
+        for pieces in all {
+            tally.add(pieces)?;
         }
         progress(tally.done);
     }
@@ -235,12 +234,7 @@ fn copy(
 }
 
 /// Any other layer.
-fn follow(
-    layer: &Layer<f32>,
-    fitter: &Fitter<'_>,
-    tally: &mut Tally,
-    progress: &mut dyn FnMut(usize),
-) -> Result<()> {
+fn follow(layer: &Layer<f32>, fitter: &Fitter<'_>, tally: &mut Tally, progress: &mut dyn FnMut(usize)) -> Result<()> {
     let lives = Lives::new(layer);
     let spans = layer.spans();
     let shown = |(id, span): (usize, &[f64; 2])| seen(fitter.tree, *span).map(|s| (id, s));
@@ -259,6 +253,7 @@ fn follow(
             let subject = Subject {
                 samples: &samples,
                 row,
+                window: layer.span,
                 life: lives.envelope(row.id),
                 own: learnt(&layer.params[GEOMETRY].read::<11>(row.id, 0)),
                 colors: (colors == 0).then(|| sample::own_colors(layer, row.id)),

@@ -1,8 +1,8 @@
 //! A take played many times over: what stands still for ever is kept once, all else once a round.
 
-use super::draft::{Node, Primitive};
 use super::fit::LEVEL_PIXELS;
 use super::lookout::Lookout;
+use crate::format::playback::{Node, Primitive};
 
 /// How a take is repeated.
 #[derive(Clone, Copy, Debug)]

@@ -1,10 +1,10 @@
 //! Motion that is a straight line already: its primitives are read off the parameters, exactly and at once.
 
-use super::fit::{COLORS, Piece, home, is_visible, primitive, seen};
+use super::fit::{COLORS, Piece, homes, is_visible, primitive, seen};
 use super::life::{Envelope, Lives};
 use super::lookout::Lookout;
 use super::sample::own_colors;
-use super::tree::Tree;
+use super::tree::{Span, Tree};
 use super::turn::Shape;
 use crate::layers::Layer;
 use crate::math::quat;
@@ -34,8 +34,9 @@ impl Line {
         }
     }
 
-    /// The primitive of row `id`; `None` where it is never seen in the clip or is not finite.
-    pub(super) fn piece(
+    /// The primitive of row `id`, one for every span in `window` (the layer's span); none where it is never seen in the
+    /// clip or is not finite.
+    pub(super) fn pieces(
         &self,
         layer: &Layer<f32>,
         lives: &Lives<'_>,
@@ -43,31 +44,32 @@ impl Line {
         span: [f64; 2],
         tree: &Tree,
         lookout: &Lookout,
-    ) -> Option<Piece> {
-        let seen = seen(tree, span)?;
+    ) -> Vec<Piece> {
+        let Some(seen) = seen(tree, span) else { return Vec::new() };
         let row = layer.params[GEOMETRY].read::<11>(id, 0);
         let opacity = f64::from(1.0 / (1.0 + (-row[OPACITY]).exp()));
         let shape = learnt(&row);
         let velocity = self.velocities.map_or([0.0; 3], |key| layer.params[key].read::<3>(id, 0).map(f64::from));
         let colors: [f32; COLORS] = own_colors(layer, id);
-        let mut mean: [f64; 3] = std::array::from_fn(|k| f64::from(row[k]));
+        let mean: [f64; 3] = std::array::from_fn(|k| f64::from(row[k]));
+        let own = lives.envelope(id);
         let finite = row.iter().chain(&colors).all(|x| x.is_finite()) && velocity.iter().all(|x| x.is_finite());
-        if !finite || !is_visible(opacity) {
-            return None;
+        if !finite || !is_visible(opacity) || !(own.center + own.softness).is_finite() {
+            return Vec::new();
         }
-        let node = home(tree, seen);
-        let [from, to] = [tree.border(node[0]), tree.border(node[1])];
-        let mut life = lives.envelope(id);
-        if life.is_forever() {
-            // The middle of the node: nothing is ever further from it than half the node.
-            life = Envelope::forever(0.5 * (from + to));
-            mean = std::array::from_fn(|k| mean[k] + velocity[k] * (life.center - self.origin));
-        }
-        let middle = 0.5 * (seen[0] + seen[1]) - life.center;
-        let pixels = lookout.pixels(std::array::from_fn(|k| mean[k] + velocity[k] * middle));
-        let area = pixels * pixels * ((seen[1] - seen[0]) / (to - from)).clamp(0.0, 1.0);
-        let primitive = primitive(mean, &life, &shape, opacity, velocity, &colors, area);
-        Some(Piece { span: node, primitive, error: 0.0 })
+        let origin = if lives.has_centers() { own.center } else { self.origin };
+        let piece = |node: Span| {
+            let [from, to] = [tree.border(node[0]), tree.border(node[1])];
+            // For ever counts from the middle of the node: nothing is ever further from it than half the node.
+            let life = if own.is_forever() { Envelope::forever(0.5 * (from + to)) } else { own };
+            let at = |t: f64| std::array::from_fn(|k| mean[k] + velocity[k] * (t - origin));
+            let shown = [seen[0].max(from), seen[1].min(to)];
+            let pixels = lookout.pixels(at(0.5 * (shown[0] + shown[1])));
+            let area = pixels * pixels * ((shown[1] - shown[0]) / (to - from)).clamp(0.0, 1.0);
+            let primitive = primitive(at(life.center), &life, &shape, opacity, velocity, &colors, area);
+            Piece { span: node, primitive, error: 0.0 }
+        };
+        homes(tree, seen, layer.span).into_iter().map(piece).collect()
     }
 }
 

@@ -2,7 +2,8 @@
 //! every Gaussian once.
 
 use super::*;
-use crate::layers::{ALPHA_MIN, Instant};
+use crate::format::playback::{Draft, Meta, WriteConfig, read, write};
+use crate::layers::{ALPHA_MIN, ALWAYS, Instant};
 use crate::math::{Rng, Se3};
 use crate::motion::still::activate;
 use crate::motion::{At, Cache, Motion, SpacetimeSpec, Spec, Tape, build, fill_rows};
@@ -37,7 +38,7 @@ fn layer(spec: &Spec, life: LifeKind, n: usize, pace: f32, clip: f64) -> Layer<f
             (1..params[LIFE].width()).for_each(|k| params[LIFE].set(i, k, (-1.6 + rng.normal(k as u64)) as f32));
         }
     }
-    Layer { name: "cloud".into(), params, motion, life }
+    Layer { name: "cloud".into(), params, motion, life, span: ALWAYS }
 }
 
 /// Fills geometry and colour.
@@ -157,7 +158,8 @@ fn curves_and_turns_are_split_and_stay_within_the_tolerance() {
 fn leaps_become_key_states() {
     let mut params = Params::new(60, 4, LifeKind::Infinite.columns());
     cloud(&mut params, 60);
-    let leaping = Layer { name: "leaps".into(), params, motion: Arc::new(Leaps), life: LifeKind::Infinite };
+    let leaping =
+        Layer { name: "leaps".into(), params, motion: Arc::new(Leaps), life: LifeKind::Infinite, span: ALWAYS };
     let scene = scene(vec![leaping], 19.0 / FPS);
     let baked = baked(&scene, &options(0.25));
     let visible = 60 - baked.report.unseen;
@@ -254,7 +256,7 @@ fn rounds_keep_what_stands_still_once() {
 fn colours_that_change_are_followed() {
     let mut params = Params::new(40, 4, LifeKind::Infinite.columns());
     cloud(&mut params, 40);
-    let layer = Layer { name: "lamps".into(), params, motion: Arc::new(Lamps), life: LifeKind::Infinite };
+    let layer = Layer { name: "lamps".into(), params, motion: Arc::new(Lamps), life: LifeKind::Infinite, span: ALWAYS };
     let scene = scene(vec![layer], 1.0);
     let baked = baked(&scene, &options(0.25));
     assert!(baked.report.split > 10, "{:?}", baked.report);
@@ -290,6 +292,31 @@ fn odd_scenes_bake_or_are_refused() {
             assert!(numbers.chain([p.center, p.softness, f64::from(p.opacity)]).all(f64::is_finite));
         }
     }
+}
+
+#[test]
+fn a_file_is_as_good_and_can_be_baked_again() {
+    let a = layer(&spacetime(2, true), LifeKind::GaussHalf, 150, 0.4, 1.9);
+    let scene = scene(vec![a, layer(&Spec::Still, LifeKind::Infinite, 100, 0.1, 1.9)], 1.9);
+    let first = baked(&scene, &options(0.25));
+    let file = |baked: &Baked| {
+        let meta = Meta { clip: baked.clip, fps: FPS, up: scene.up, sh_degree: baked.sh_degree, ..Meta::default() };
+        let draft = Draft { meta, nodes: baked.nodes.clone(), poster: None };
+        let mut bytes = Vec::new();
+        write(&draft, &WriteConfig::default(), &mut bytes).unwrap();
+        read(&bytes).unwrap()
+    };
+    let like = |file: &Scene<f32>| {
+        let times: Vec<f64> = (0..57).step_by(5).map(|k| f64::from(k) / FPS).collect();
+        let config = RenderConfig::default();
+        compare(&scene, Shown::File(file), &cameras(), &times, &config, &mut |_, _| {}).unwrap()
+    };
+    let played = file(&first);
+    assert!(like(&played).psnr > 40.0, "{:?} {:?}", like(&played), likeness(&scene, &first));
+    let again = baked(&played, &options(0.25));
+    let pages = again.report.primitives as f64 / first.report.primitives as f64;
+    assert!((0.9..1.3).contains(&pages), "{:?}\n{:?}", first.report, again.report);
+    assert!(like(&file(&again)).psnr > 38.0, "{:?}", like(&file(&again)));
 }
 
 /// Another model, unrecognisable.
