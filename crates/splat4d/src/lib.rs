@@ -11,6 +11,7 @@ pub mod format;
 pub mod layers;
 pub mod math;
 pub mod motion;
+pub mod play;
 pub mod render;
 pub mod scene;
 
