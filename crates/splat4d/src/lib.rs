@@ -12,5 +12,6 @@ pub mod math;
 pub mod motion;
 pub mod render;
 pub mod scene;
+pub mod wgsl;
 
 pub use error::{Error, ErrorKind, Result};
