@@ -7,6 +7,8 @@
 pub mod error;
 pub mod flow;
 pub mod format;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod layers;
 pub mod math;
 pub mod motion;
