@@ -7,10 +7,13 @@
 pub mod error;
 pub mod flow;
 pub mod format;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod layers;
 pub mod math;
 pub mod motion;
 pub mod render;
 pub mod scene;
+pub mod wgsl;
 
 pub use error::{Error, ErrorKind, Result};
