@@ -39,6 +39,8 @@ export class Stream {
   #now = [];
   #later = [];
   #key = '';
+  /// When a page that was given up may be tried again.
+  #again = Infinity;
   #last = { time: NaN, playing: false, speed: 1, loop: true };
   #waiting = [];
   #over = false;
@@ -75,8 +77,9 @@ export class Stream {
     const reach = playing ? Math.max(Math.abs(speed), 0.1) * AHEAD : BESIDE;
     const key = `${before(this.#starts, t)} ${before(this.#ends, t)} ${Math.floor((t / reach) * STEP)} ${playing} ${speed} ${loop}`;
     Object.assign(this.#last, { time: t, playing, speed, loop });
-    if (key === this.#key) return;
+    if (key === this.#key && performance.now() < this.#again) return;
     this.#key = key;
+    this.#again = Infinity;
     this.#plan(t, playing, speed, loop, reach);
     this.#pump();
   }
@@ -165,7 +168,7 @@ export class Stream {
   #wants(page) {
     if (this.#resident.has(page.id) || this.#flight.has(page.id)) return false;
     const failed = this.#failed.get(page.id);
-    return !failed || failed.tries < TRIES || performance.now() - failed.at > REST;
+    return !failed || failed.tries < TRIES || performance.now() - failed.at >= REST;
   }
 
   /// Starts what is to be fetched now: this moment's pages all at once, and only when those are there, later ones.
@@ -204,7 +207,10 @@ export class Stream {
       const failed = this.#failed.get(entry.id);
       const tries = (failed && performance.now() - failed.at < REST ? failed.tries : 0) + 1;
       this.#failed.set(entry.id, { tries, at: performance.now() });
-      if (tries >= TRIES) this.#onerror(error);
+      if (tries >= TRIES) {
+        this.#again = performance.now() + REST;
+        this.#onerror(error);
+      }
     } finally {
       // An aborted page may be on its way again already, under another controller.
       if (this.#flight.get(entry.id) === stop) this.#flight.delete(entry.id);
