@@ -4,7 +4,7 @@ use crate::files::cannot_read;
 use crate::paths::{Stage, View};
 use crate::run_folder::Run;
 use splat4d::format::ply::PlyInfo;
-use splat4d::layers::{Layer, Scene};
+use splat4d::layers::{ALWAYS, Layer, Scene};
 use splat4d::motion::Still;
 use splat4d::scene::{GEOMETRY, LifeKind};
 use splat4d::{Error, Result, format};
@@ -41,7 +41,7 @@ impl Source {
             return Ok(Self { scene, run: None, ply: None });
         }
         let (params, info) = format::ply::read(&bytes).map_err(|e| e.at(path.display()))?;
-        let layer = Layer { name: "ply".into(), params, motion: Arc::new(Still), life: LifeKind::Infinite };
+        let layer = Layer { name: "ply".into(), params, motion: Arc::new(Still), life: LifeKind::Infinite, span: ALWAYS };
         let scene =
             Scene { layers: vec![layer], up: PLY_UP, fps: splat4d::scene::time::DEFAULT_FPS, ..Scene::default() };
         Ok(Self { scene, run: None, ply: Some(info) })

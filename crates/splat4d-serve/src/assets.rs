@@ -15,7 +15,34 @@ macro_rules! player {
 }
 
 /// Every file of `player/` that a browser fetches: the shaders' own files are in `shaders.js` already.
-const FILES: &[(&str, &str)] = player!["index.html",];
+const FILES: &[(&str, &str)] = player![
+    "assets.js",
+    "camera.js",
+    "controls.js",
+    "decode.worker.js",
+    "dom.js",
+    "element.js",
+    "errors.js",
+    "glsl.js",
+    "icons.js",
+    "index.html",
+    "live.js",
+    "motion.js",
+    "page.js",
+    "panels.js",
+    "player.js",
+    "ranges.js",
+    "scene-file.js",
+    "shaders.js",
+    "sort.worker.js",
+    "stream.js",
+    "style.js",
+    "track.js",
+    "ui.js",
+    "webgl2.js",
+    "webgpu.js",
+    "xr.js",
+];
 
 /// The page.
 pub(crate) const INDEX: &str = "index.html";

@@ -4,6 +4,7 @@
 //! question (which [`scene::Splats`] at time t), the renderer never sees time, a motion model never sees a pixel.
 //! This crate reads bytes, not paths; it knows no loss, no optimiser and no data set.
 
+pub mod bake;
 pub mod error;
 pub mod flow;
 pub mod format;

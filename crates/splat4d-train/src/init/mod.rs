@@ -8,7 +8,7 @@ use crate::capture::frames::Frames;
 use crate::knn::mean_square_distance;
 use crate::models::{Plan, Program};
 use crate::{Error, Result};
-use splat4d::layers::{Layer, Scene};
+use splat4d::layers::{ALWAYS, Layer, Scene};
 use splat4d::math::Rng;
 use splat4d::math::sh::rgb_to_dc;
 use splat4d::motion::build;
@@ -156,7 +156,7 @@ pub fn scene(
         }
     }
     let motion = build(&program.spec(plan), &mut params)?;
-    let layer = Layer { name: "scene".into(), params, motion, life };
+    let layer = Layer { name: "scene".into(), params, motion, life, span: ALWAYS };
     Ok(Scene { layers: vec![layer], background, clip: plan.clip, fps: plan.fps, up, ..Scene::default() })
 }
 

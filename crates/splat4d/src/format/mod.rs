@@ -9,7 +9,9 @@ mod half;
 #[cfg(test)]
 mod mutate;
 pub mod npy;
+pub mod playback;
 pub mod ply;
+pub mod quant;
 pub mod safetensors;
 pub mod scene;
 

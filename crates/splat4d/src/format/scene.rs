@@ -6,7 +6,7 @@
 
 use super::safetensors::{SafeTensors, Tensor};
 use super::{params_to_arrays, tensors_to_loaded};
-use crate::layers::{Head, Layer, Scene};
+use crate::layers::{ALWAYS, Head, Layer, Scene};
 use crate::motion::{SpacetimeSpec, Spec, build};
 use crate::scene::{LifeKind, Params, SH};
 use crate::{Error, ErrorKind, Result};
@@ -25,13 +25,18 @@ pub fn metadata(scene: &Scene<f32>) -> Value {
         .layers
         .iter()
         .map(|l| {
-            json!({
+            let mut layer = json!({
                 "name": l.name,
                 "rows": l.params.len(),
                 "sh_coefficients": l.params[SH].width() / 3,
                 "life": l.life.name(),
                 "motion": spec_to_json(&l.motion.spec()),
-            })
+            });
+            // JSON knows no infinity: a side that is open is null, and a layer that is always seen says nothing.
+            if l.span != ALWAYS {
+                layer["span"] = json!(l.span.map(|t| t.is_finite().then_some(t)));
+            }
+            layer
         })
         .collect();
     json!({
@@ -152,7 +157,21 @@ fn read_layer(file: &SafeTensors<'_>, meta: &Value, index: usize) -> Result<Laye
     if let Some(array) = params.unclaimed().first() {
         return Err(broken(format!("array `{}` belongs to no table of this layer", array.name)));
     }
-    Ok(Layer { name: text(meta, "name")?, params, motion, life })
+    Ok(Layer { name: text(meta, "name")?, params, motion, life, span: span(meta)? })
+}
+
+/// When the layer is seen; a side that is null is open, and so are both where nothing is said.
+fn span(meta: &Value) -> Result<[f64; 2]> {
+    if meta["span"].is_null() {
+        return Ok(ALWAYS);
+    }
+    let sides = meta["span"].as_array().filter(|l| l.len() == 2);
+    let sides = sides.ok_or_else(|| broken("`span` is not a first and a last second".into()))?;
+    let mut out = ALWAYS;
+    for (o, side) in out.iter_mut().zip(sides).filter(|(_, side)| !side.is_null()) {
+        *o = side.as_f64().ok_or_else(|| broken("`span` is not a first and a last second".into()))?;
+    }
+    Ok(out)
 }
 
 fn broken(what: String) -> Error {
@@ -201,7 +220,8 @@ mod tests {
                     }
                 }
             }
-            Layer { name: format!("layer {seed}"), params, motion, life }
+            let span = if seed == 2 { [0.1, f64::INFINITY] } else { ALWAYS };
+            Layer { name: format!("layer {seed}"), params, motion, life, span }
         };
         let spacetime = Spec::Spacetime(SpacetimeSpec { order: 2, rotation: true, detach: true, origin: 0.25 });
         Scene {
@@ -226,7 +246,7 @@ mod tests {
         let back = read(&bytes).unwrap();
         assert_eq!((back.clip, back.fps, back.up, back.background), (s.clip, s.fps, s.up, s.background));
         for (a, b) in s.layers.iter().zip(&back.layers) {
-            assert_eq!((&a.name, a.life, a.motion.spec()), (&b.name, b.life, b.motion.spec()));
+            assert_eq!((&a.name, a.life, a.span, a.motion.spec()), (&b.name, b.life, b.span, b.motion.spec()));
             assert_eq!(a.params, b.params);
         }
         let mut again = Vec::new();

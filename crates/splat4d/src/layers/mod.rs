@@ -17,6 +17,9 @@ use std::sync::Arc;
 /// A splat fainter than this is not drawn, so that a Gaussian below it is not alive (1/255, Kerbl et al. 2023).
 pub const ALPHA_MIN: f64 = 1.0 / 255.0;
 
+/// The span of a layer that may be seen at any time.
+pub const ALWAYS: [f64; 2] = [f64::NEG_INFINITY, f64::INFINITY];
+
 /// Gaussians with one motion model and one kind of life.
 pub struct Layer<F: Real = f32> {
     /// What the user calls it.
@@ -27,11 +30,19 @@ pub struct Layer<F: Real = f32> {
     pub motion: Arc<dyn Motion<F>>,
     /// How long its Gaussians live.
     pub life: LifeKind,
+    /// The layer is seen for from ≤ t < to, seconds; [`ALWAYS`] but for pages of a playback file.
+    pub span: [f64; 2],
 }
 
 impl<F: Real> Clone for Layer<F> {
     fn clone(&self) -> Self {
-        Self { name: self.name.clone(), params: self.params.clone(), motion: self.motion.clone(), life: self.life }
+        Self {
+            name: self.name.clone(),
+            params: self.params.clone(),
+            motion: self.motion.clone(),
+            life: self.life,
+            span: self.span,
+        }
     }
 }
 
@@ -115,10 +126,19 @@ impl<F: Real> LayerTape<F> {
 }
 
 impl<F: Real> Layer<F> {
-    /// The rows alive at t into `ids` (strictly increasing): those whose opacity times life reaches [`ALPHA_MIN`].
+    /// Whether t lies in the layer's span. A NaN does, so that the trainer's guard finds it.
+    pub fn spans_over(&self, t: Time) -> bool {
+        !(t.0 < self.span[0] || t.0 >= self.span[1])
+    }
+
+    /// The rows alive at t into `ids` (strictly increasing): those whose opacity times life reaches [`ALPHA_MIN`], none
+    /// outside the layer's span.
     /// Returns true, and leaves `ids` empty, where every row is meant (infinite life).
     pub fn active(&self, t: Time, ids: &mut Vec<u32>) -> bool {
         ids.clear();
+        if !self.spans_over(t) {
+            return false;
+        }
         let mut own = Table::new(&[("life", 2)], 0);
         let (table, kind) = if self.motion.life(&self.params, &mut own) {
             (&own, LifeKind::GaussHalf)
@@ -149,7 +169,8 @@ impl<F: Real> Layer<F> {
         false
     }
 
-    /// [from, to] in seconds for every row: when its opacity times life is at least [`ALPHA_MIN`]; (1, 0) for never.
+    /// [from, to] in seconds for every row: when its opacity times life is at least [`ALPHA_MIN`] within the layer's span;
+    /// (1, 0) for never.
     pub fn spans(&self) -> Vec<[f64; 2]> {
         let mut own = Table::new(&[("life", 2)], 0);
         let (table, kind) = if self.motion.life(&self.params, &mut own) {
@@ -158,10 +179,13 @@ impl<F: Real> Layer<F> {
             (&self.params[LIFE], self.life)
         };
         let geometry = &self.params[GEOMETRY];
+        // The span's end is not part of it, but an interval's is.
+        let end = if self.span[1].is_finite() { self.span[1].next_down() } else { self.span[1] };
         let span = |id: usize| {
             let row: [f64; 3] = life_row(table, id).map(Real::f64);
             let reach = kind.reach(row, geometry.get(id, OPACITY).sigmoid().f64(), ALPHA_MIN);
-            if reach < 0.0 { [1.0, 0.0] } else { [row[0] - reach, row[0] + reach] }
+            let (from, to) = ((row[0] - reach).max(self.span[0]), (row[0] + reach).min(end));
+            if reach < 0.0 || from > to { [1.0, 0.0] } else { [from, to] }
         };
         (0..self.params.len()).map(span).collect()
     }

@@ -1,0 +1,320 @@
+//! One Gaussian becomes pieces: straight lines in the deepest nodes that hold its life, halved where they miss.
+
+use super::life::Envelope;
+use super::lookout::Lookout;
+use super::sample::{GEOMETRY, Row, Samples};
+use super::tree::{Span, Tree};
+use super::turn::{Shape, decompose, difference};
+use crate::format::playback::Primitive;
+use crate::layers::ALPHA_MIN;
+use crate::math::se3::{norm, sub};
+use crate::math::sh::{MAX_COEFFS, dc_to_rgb};
+
+/// What a full step of opacity (or of colour, 0 to 1) counts as, pixels. A Gaussian one pixel wide that is d pixels off
+/// changes its neighbourhood by up to 0.6·d, but with both signs, so that most of it cancels; a wrong opacity does
+/// not, and is held five times as strictly.
+pub(super) const LEVEL_PIXELS: f64 = 8.0;
+/// Weight of a look at which nothing is to be seen: it keeps a line through two frames defined.
+const FAINT: f64 = 1e-4;
+/// Share of the trace by which a covariance may differ before it counts as turned or stretched: f32 rounding.
+const SAME_SHAPE: f64 = 1e-5;
+/// The envelope's centre may lie so many reaches off a node before rounded velocities would be felt; a piece further
+/// out gets a centre of its own.
+const FAR: f64 = 8.0;
+/// SH coefficients of all channels.
+pub(super) const COLORS: usize = 3 * MAX_COEFFS;
+
+/// A primitive and where it belongs.
+#[derive(Clone, Debug)]
+pub(super) struct Piece {
+    /// The node.
+    pub span: Span,
+    /// What is drawn there.
+    pub primitive: Primitive,
+    /// Largest error over its frames, pixels.
+    pub error: f64,
+}
+
+/// What all fits share.
+#[derive(Clone, Copy)]
+pub(super) struct Fitter<'a> {
+    pub tree: &'a Tree,
+    pub lookout: &'a Lookout,
+    /// Pixels.
+    pub tolerance: f64,
+}
+
+/// One Gaussian and everything that was seen of it.
+pub(super) struct Subject<'a> {
+    pub samples: &'a Samples,
+    pub row: &'a Row,
+    /// The seconds in which its layer is seen.
+    pub window: [f64; 2],
+    pub life: Envelope,
+    /// Learnt rotation and scales: exact where motion leaves shapes alone.
+    pub own: Shape,
+    /// Colour, where it is the same at all times.
+    pub colors: Option<[f32; COLORS]>,
+}
+
+/// One frame's look, in f64.
+struct Look {
+    time: f64,
+    mean: [f64; 3],
+    cov: [f64; 6],
+    alpha: f64,
+    frame: usize,
+}
+
+impl Fitter<'_> {
+    /// All pieces of one Gaussian, in time order.
+    pub(super) fn pieces(&self, subject: &Subject<'_>) -> Vec<Piece> {
+        let mut out = Vec::new();
+        self.place(subject, self.tree.root(), &mut out);
+        out
+    }
+
+    /// Goes down while one half holds all that is to be seen, then fits; a miss goes on in both halves.
+    fn place(&self, subject: &Subject<'_>, span: Span, out: &mut Vec<Piece>) {
+        let inside = match narrow(self.tree, subject.row.seen, subject.window, span) {
+            Place::Nowhere => return,
+            Place::In(half) => return self.place(subject, half, out),
+            Place::Across => false,
+            Place::Here => true,
+        };
+        let halves = self.tree.split(span);
+        let fitted = if inside || halves.is_none() { self.fit(subject, span) } else { None };
+        match (fitted, halves) {
+            (Some((primitive, error)), _) if error <= self.tolerance => out.push(Piece { span, primitive, error }),
+            // Where nothing could be fitted a half may still hold a frame that is sound.
+            (_, Some(halves)) => halves.into_iter().for_each(|half| self.place(subject, half, out)),
+            (Some((primitive, error)), None) => out.push(Piece { span, primitive, error }),
+            (None, None) => {}
+        }
+    }
+
+    /// The best primitive of a node, and its error in pixels. None: not one look is finite.
+    fn fit(&self, subject: &Subject<'_>, span: Span) -> Option<(Primitive, f64)> {
+        let looks = self.looks(subject, span);
+        let single = span[1] - span[0] == 1;
+        let first = looks.first().filter(|l| !single || l.frame == span[0])?;
+        // The look at a node's end belongs to the next node. The line goes through it, so that motion is whole between
+        // frames too, but a single frame is what it is.
+        let held = if single { &looks[..1] } else { &looks[..] };
+
+        let weight = |l: &Look| l.alpha + FAINT;
+        let total: f64 = looks.iter().map(weight).sum();
+        let time = looks.iter().map(|l| weight(l) * l.time).sum::<f64>() / total;
+        let mean: [f64; 3] = std::array::from_fn(|k| looks.iter().map(|l| weight(l) * l.mean[k]).sum::<f64>() / total);
+        let spread: f64 = looks.iter().map(|l| weight(l) * (l.time - time).powi(2)).sum();
+        let velocity: [f64; 3] = std::array::from_fn(|k| {
+            let sum: f64 = looks.iter().map(|l| weight(l) * (l.time - time) * (l.mean[k] - mean[k])).sum();
+            if spread > 0.0 { sum / spread } else { 0.0 }
+        });
+
+        let (life, opacity) = self.life(subject, span, held);
+        let shape = shape(subject, held, life.center);
+        let colors = colors(subject, held);
+        let center: [f64; 3] = std::array::from_fn(|k| mean[k] + velocity[k] * (life.center - time));
+        let pixels = self.lookout.pixels(mean);
+        let mut error = 0.0f64;
+        for look in held {
+            let delta = look.time - life.center;
+            let at: [f64; 3] = std::array::from_fn(|k| center[k] + velocity[k] * delta);
+            let level = (opacity * life.sigma(look.time) - look.alpha).abs();
+            let strength = look.alpha.max(opacity * life.sigma(look.time));
+            let mut off = norm(sub(at, look.mean)).max(difference(shape.covariance(delta), look.cov)) * pixels;
+            if subject.colors.is_none() {
+                let seen = &subject.samples.at(subject.row, look.frame)[GEOMETRY..];
+                off = off.max(LEVEL_PIXELS * color_difference(&colors, seen));
+            }
+            // NaN must end as an error, not as a fit.
+            let worst = (strength * off).max(LEVEL_PIXELS * level);
+            error = if worst.is_finite() { error.max(worst) } else { f64::INFINITY };
+        }
+        let ends = self.shown(subject, span);
+        let share = ((ends[1] - ends[0]) / (self.tree.border(span[1]) - self.tree.border(span[0]))).clamp(0.0, 1.0);
+        let sound = first.mean.iter().chain(&velocity).chain(&shape.scales).all(|x| x.is_finite());
+        let primitive = primitive(center, &life, &shape, opacity, velocity, &colors, share * pixels * pixels);
+        sound.then_some((primitive, error))
+    }
+
+    /// The finite looks at a span's frames, its end included.
+    fn looks(&self, subject: &Subject<'_>, span: Span) -> Vec<Look> {
+        let [first, last] = subject.row.frames;
+        let look = |frame: usize| {
+            let v = subject.samples.at(subject.row, frame);
+            v.iter().all(|x| x.is_finite()).then(|| Look {
+                time: self.tree.time(frame),
+                mean: std::array::from_fn(|k| f64::from(v[k])),
+                cov: std::array::from_fn(|k| f64::from(v[3 + k])),
+                alpha: f64::from(v[9]),
+                frame,
+            })
+        };
+        (first.max(span[0])..=last.min(span[1])).filter_map(look).collect()
+    }
+
+    /// The seconds of a span in which the Gaussian can be seen.
+    fn shown(&self, subject: &Subject<'_>, span: Span) -> [f64; 2] {
+        [subject.row.seen[0].max(self.tree.border(span[0])), subject.row.seen[1].min(self.tree.border(span[1]))]
+    }
+
+    /// Envelope and opacity: the life as it was learnt, or, where that is not what is seen, a constant.
+    fn life(&self, subject: &Subject<'_>, span: Span, looks: &[Look]) -> (Envelope, f64) {
+        let [from, to] = [self.tree.border(span[0]), self.tree.border(span[1])];
+        let still = Envelope::forever(0.5 * (from + to));
+        let range = looks.iter().fold([1.0f64, 0.0], |r, l| [r[0].min(l.alpha), r[1].max(l.alpha)]);
+        let constant = (0.5 * (range[0] + range[1])).clamp(0.0, 1.0);
+        let own = subject.life;
+        if own.is_forever() {
+            return (still, constant);
+        }
+        let (mut above, mut below) = (0.0, 0.0);
+        for look in looks {
+            let sigma = own.sigma(look.time);
+            above += look.alpha * sigma * (look.alpha + FAINT);
+            below += sigma * sigma * (look.alpha + FAINT);
+        }
+        let opacity = if below > 0.0 { (above / below).clamp(0.0, 1.0) } else { 0.0 };
+        let miss = looks.iter().map(|l| (opacity * own.sigma(l.time) - l.alpha).abs()).fold(0.0, f64::max);
+        let ends = self.shown(subject, span);
+        let reach = (own.half + 3.0 * own.softness).min(to - from);
+        let far = ends.iter().map(|t| (t - own.center).abs()).fold(0.0, f64::max) > FAR * reach;
+        let flat = 0.5 * (range[1] - range[0]);
+        let enough = LEVEL_PIXELS * flat <= self.tolerance;
+        if (far && enough) || flat < miss { (still, constant) } else { (own, opacity) }
+    }
+}
+
+/// The shape: as it was learnt where that is what is seen, else turning at a steady rate.
+fn shape(subject: &Subject<'_>, looks: &[Look], center: f64) -> Shape {
+    let own = subject.own;
+    let same = |cov: [f64; 6], other: [f64; 6]| {
+        let trace = (cov[0] + cov[3] + cov[5]).abs();
+        cov.iter().zip(other).all(|(a, b)| (a - b).abs() <= SAME_SHAPE * trace)
+    };
+    let learnt = own.covariance(0.0);
+    if looks.iter().all(|l| same(l.cov, learnt)) {
+        return own;
+    }
+    let clearest = looks.iter().max_by(|a, b| a.alpha.total_cmp(&b.alpha)).expect("a fit has looks");
+    let start = if same(clearest.cov, learnt) { own } else { decompose(clearest.cov) };
+    if looks.iter().all(|l| same(l.cov, clearest.cov)) {
+        return start;
+    }
+    let seen: Vec<_> = looks.iter().map(|l| (l.time - center, l.alpha + FAINT, l.cov)).collect();
+    start.fit(&seen)
+}
+
+/// SH coefficients: the Gaussian's own, or the weighted mean of what is seen.
+fn colors(subject: &Subject<'_>, looks: &[Look]) -> [f32; COLORS] {
+    if let Some(own) = subject.colors {
+        return own;
+    }
+    let mut sum = [0.0f64; COLORS];
+    let total: f64 = looks.iter().map(|l| l.alpha + FAINT).sum();
+    for look in looks {
+        let seen = &subject.samples.at(subject.row, look.frame)[GEOMETRY..];
+        sum.iter_mut().zip(seen).for_each(|(s, c)| *s += (look.alpha + FAINT) / total * f64::from(*c));
+    }
+    sum.map(|x| x as f32)
+}
+
+/// The largest channel's difference of colour, root mean square over all directions (Parseval: |Y| integrates to 1).
+fn color_difference(a: &[f32; COLORS], b: &[f32]) -> f64 {
+    let mut square = [0.0f64; 3];
+    for (k, (a, b)) in a.iter().zip(b).enumerate() {
+        square[k % 3] += f64::from(a - b).powi(2);
+    }
+    (square.into_iter().fold(0.0, f64::max) / (4.0 * std::f64::consts::PI)).sqrt()
+}
+
+/// Assembles a primitive. `area` weighs its importance: pixels² a unit² times the share of the node in which it lives.
+pub(super) fn primitive(
+    mean: [f64; 3],
+    life: &Envelope,
+    shape: &Shape,
+    opacity: f64,
+    velocity: [f64; 3],
+    colors: &[f32; COLORS],
+    area: f64,
+) -> Primitive {
+    let mut sizes = shape.scales;
+    sizes.sort_by(f64::total_cmp);
+    // How much of the picture it covers, how strongly, for how long: what is missed most comes first.
+    let importance = (opacity * sizes[2] * sizes[1] * area) as f32;
+    Primitive {
+        mean,
+        center: life.center,
+        half_width: life.half,
+        softness: life.softness,
+        quat: shape.quat.map(|x| x as f32),
+        scales: shape.scales.map(|x| x as f32),
+        opacity: opacity as f32,
+        velocity: velocity.map(|x| x as f32),
+        turn: shape.turn.map(|x| x as f32),
+        base_color: std::array::from_fn(|k| dc_to_rgb(colors[k])),
+        sh_rest: std::array::from_fn(|k| colors[k + 3]),
+        importance: if importance.is_finite() { importance } else { 0.0 },
+    }
+}
+
+/// How a node and a Gaussian's time lie to each other.
+enum Place {
+    /// Nothing is to be seen in the node.
+    Nowhere,
+    /// All of it lies in this half, and the node is longer than a segment.
+    In(Span),
+    /// The node reaches beyond the time in which the layer is seen.
+    Across,
+    /// The node may hold it.
+    Here,
+}
+
+fn narrow(tree: &Tree, seen: [f64; 2], window: [f64; 2], span: Span) -> Place {
+    let [from, to] = [tree.border(span[0]), tree.border(span[1])];
+    if !(seen[1] >= from && seen[0] < to) {
+        return Place::Nowhere;
+    }
+    if let Some([left, right]) = tree.split(span).filter(|_| tree.is_coarse(span)) {
+        let middle = tree.border(left[1]);
+        if seen[1] < middle {
+            return Place::In(left);
+        }
+        if seen[0] >= middle {
+            return Place::In(right);
+        }
+    }
+    let within = (window[0] <= from || span[0] == 0 && window[0] <= tree.clip()[0])
+        && (window[1] >= to || span[1] == tree.frames() && window[1] > tree.clip()[1]);
+    if within { Place::Here } else { Place::Across }
+}
+
+/// The spans in which a Gaussian whose motion is a straight line lies: the deepest that holds all that is to be seen; where
+/// that reaches beyond the time in which the layer is seen, spans that do not.
+pub(super) fn homes(tree: &Tree, seen: [f64; 2], window: [f64; 2]) -> Vec<Span> {
+    let (mut open, mut out) = (vec![tree.root()], Vec::new());
+    while let Some(span) = open.pop() {
+        match (narrow(tree, seen, window, span), tree.split(span)) {
+            (Place::Nowhere, _) => {}
+            (Place::In(half), _) => open.push(half),
+            (Place::Across, Some([left, right])) => open.extend([right, left]),
+            (Place::Across, None) | (Place::Here, _) => out.push(span),
+        }
+    }
+    out
+}
+
+/// The seconds of the clip in which something of this envelope and opacity can be seen.
+pub(super) fn seen(tree: &Tree, [from, to]: [f64; 2]) -> Option<[f64; 2]> {
+    let clip = tree.clip();
+    let seen = [from.max(clip[0]), to.min(clip[1])];
+    // NaN compares as never: such rows are not drawn by the renderer either.
+    (from <= to && seen[0] <= seen[1]).then_some(seen)
+}
+
+/// A Gaussian as faint as this is not drawn at any time.
+pub(super) fn is_visible(opacity: f64) -> bool {
+    opacity >= ALPHA_MIN
+}

@@ -1,0 +1,307 @@
+//! Bakes a scene for playback: whatever moves it, it becomes kinematic primitives in a tree of time spans.
+//!
+//! Every Gaussian goes to the deepest node that holds all the time in which it can be seen. There a straight line, a
+//! steady turn, one shape, one colour and its own life are fitted to what the model shows frame by frame; where that
+//! misses by more than the tolerance, both halves of the node are tried in its stead, down to single frames, which are
+//! what the model is then (key states). Motion that is straight already is copied and not fitted.
+//!
+//! Errors are pixels as the cameras see them, weighted by how visible the Gaussian is: distance and outline on the
+//! screen, and opacity and colour converted to pixels. The model is looked at in runs of rows, each at all its frames,
+//! so that memory does not grow with frames times Gaussians.
+
+mod compare;
+mod fit;
+mod life;
+mod lookout;
+mod repeat;
+mod sample;
+mod straight;
+#[cfg(test)]
+mod tests;
+mod tree;
+mod turn;
+
+use crate::format::playback::{Node, Primitive};
+pub use compare::{Likeness, Moment, Shown, compare};
+
+use crate::layers::{Layer, Scene};
+use crate::scene::{Camera, GEOMETRY};
+use crate::{Error, ErrorKind, Result};
+use fit::{Fitter, Piece, Subject, seen};
+use life::Lives;
+use lookout::Lookout;
+use rayon::prelude::*;
+use repeat::Rounds;
+use std::collections::BTreeMap;
+use straight::{Line, learnt};
+use tree::{Span, Tree};
+
+/// Default of [`Options::tolerance`], pixels: on models that no straight line holds, baked and model then differ by
+/// less than 40 dB can tell (measured; see the tests), at a fraction of the pieces that a tenth of it would need.
+pub const TOLERANCE: f64 = 0.25;
+/// Default of [`Options::segment`], seconds: what a player fetches for a seek; shorter ones repeat too much.
+pub const SEGMENT: f64 = 1.0;
+/// Most rounds of [`Options::repeat`].
+pub const MAX_REPEAT: usize = 10_000;
+/// Most primitives of a scene: about 3 GB of memory while baking, 300 MB of file.
+const MAX_PRIMITIVES: usize = 10_000_000;
+/// Rows of a straight layer between two calls of the progress listener.
+const STRAIGHT_RUN: usize = 1 << 16;
+
+/// What may be told.
+#[derive(Clone, Debug)]
+pub struct Options {
+    /// Largest error that is not split further, pixels.
+    pub tolerance: f64,
+    /// About how long a segment lasts, seconds.
+    pub segment: f64,
+    /// The take is played so many times over.
+    pub repeat: usize,
+    /// The cameras whose pixels count. None: a 1080p picture that the scene fills.
+    pub cameras: Vec<Camera>,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self { tolerance: TOLERANCE, segment: SEGMENT, repeat: 1, cameras: Vec::new() }
+    }
+}
+
+/// A baked scene.
+#[derive(Clone, Debug)]
+pub struct Baked {
+    /// Primitives by the span in which they are drawn; spans rise, longer ones first.
+    pub nodes: Vec<Node>,
+    /// First and last second, all rounds.
+    pub clip: [f64; 2],
+    /// Highest degree of spherical harmonics that is not zero.
+    pub sh_degree: usize,
+    /// What was done.
+    pub report: Report,
+}
+
+/// What baking did.
+#[derive(Clone, Debug, Default, PartialEq, serde::Serialize)]
+pub struct Report {
+    /// Gaussians of the model.
+    pub gaussians: usize,
+    /// Those that nobody would see in the clip, or that hold no numbers.
+    pub unseen: usize,
+    /// Those that became more than one primitive.
+    pub split: usize,
+    /// Primitives in all nodes.
+    pub primitives: usize,
+    /// Primitives that last one frame: key states.
+    pub key_states: usize,
+    /// Nodes with primitives.
+    pub nodes: usize,
+    /// Largest error allowed, pixels.
+    pub tolerance: f64,
+    /// Errors of Gaussians (of each its worst primitive, pixels).
+    pub errors: Errors,
+}
+
+/// Quantiles and a histogram of errors a Gaussian, pixels.
+#[derive(Clone, Debug, Default, PartialEq, serde::Serialize)]
+pub struct Errors {
+    /// Half of the Gaussians are better.
+    pub median: f64,
+    /// Nine tenths are better.
+    pub p90: f64,
+    /// 99 of 100 are better.
+    pub p99: f64,
+    /// The worst; above the tolerance only where single frames miss too.
+    pub worst: f64,
+    /// Upper ends of the histogram's bins, pixels; the last bin has none.
+    pub bins: Vec<f64>,
+    /// Gaussians in each bin, one more than `bins`.
+    pub counts: Vec<usize>,
+}
+
+/// Bakes a scene. `progress` hears how many Gaussians of how many are done.
+///
+/// Errors: options out of range; a clip that is no clip; a model that would become too many primitives.
+pub fn bake(scene: &Scene<f32>, options: &Options, progress: &mut dyn FnMut(usize, usize)) -> Result<Baked> {
+    // An endless tolerance is allowed: nothing is split then.
+    if options.tolerance.is_nan() || options.tolerance <= 0.0 {
+        return Err(Error::input(format!("a tolerance of {} pixels", options.tolerance)).remedy("Give pixels above 0."));
+    }
+    if !(1..=MAX_REPEAT).contains(&options.repeat) {
+        return Err(Error::input(format!("{} rounds", options.repeat)).remedy(format!("Give 1 to {MAX_REPEAT}.")));
+    }
+    let tree = Tree::new(scene.clip, scene.fps, options.segment)?;
+    let lookout = Lookout::new(&options.cameras, &means(scene));
+    let fitter = Fitter { tree: &tree, lookout: &lookout, tolerance: options.tolerance };
+    let total = scene.len();
+    let mut tally = Tally::default();
+    progress(0, total);
+    for layer in &scene.layers {
+        match Line::of(layer) {
+            Some(line) => copy(layer, &line, &fitter, &mut tally, &mut |n| progress(n, total))?,
+            None => follow(layer, &fitter, &mut tally, &mut |n| progress(n, total))?,
+        }
+    }
+    let key_states = tally.spans.iter().filter(|(s, _)| s[1] - s[0] == 1 && tree.frames() > 1).map(|s| s.1.len()).sum();
+    let errors = quantiles(std::mem::take(&mut tally.errors), options.tolerance);
+    // Spans sort by their beginning; of those that begin together the longest, which holds the others, comes first.
+    let mut spans: Vec<(Span, Vec<Primitive>)> = tally.spans.into_iter().collect();
+    spans.sort_by_key(|(s, _)| (s[0], std::cmp::Reverse(s[1])));
+    let node = |(span, primitives): (Span, Vec<Primitive>)| Node {
+        from: tree.border(span[0]),
+        to: tree.border(span[1]),
+        primitives,
+    };
+    let mut nodes: Vec<Node> = spans.into_iter().map(node).collect();
+    let mut clip = scene.clip;
+    if options.repeat > 1 {
+        let one: usize = nodes.iter().map(|n| n.primitives.len()).sum();
+        bounded(one.saturating_mul(options.repeat))?;
+        let length = tree.border(tree.frames()) - clip[0];
+        let rounds = Rounds { first: clip[0], length, count: options.repeat };
+        nodes = rounds.spread(nodes, &lookout, options.tolerance);
+        clip[1] += length * (options.repeat - 1) as f64;
+    }
+    let report = Report {
+        gaussians: total,
+        unseen: tally.unseen,
+        split: tally.split,
+        primitives: nodes.iter().map(|n| n.primitives.len()).sum(),
+        key_states,
+        nodes: nodes.len(),
+        tolerance: options.tolerance,
+        errors,
+    };
+    Ok(Baked { sh_degree: sh_degree(&nodes), nodes, clip, report })
+}
+
+/// What the layers have become so far.
+#[derive(Default)]
+struct Tally {
+    spans: BTreeMap<Span, Vec<Primitive>>,
+    errors: Vec<f64>,
+    primitives: usize,
+    unseen: usize,
+    split: usize,
+    done: usize,
+}
+
+impl Tally {
+    /// Adds all pieces of one Gaussian.
+    fn add(&mut self, pieces: impl IntoIterator<Item = Piece>) -> Result<()> {
+        let (mut count, mut error) = (0, 0.0f64);
+        for piece in pieces {
+            (count, error) = (count + 1, error.max(piece.error));
+            self.spans.entry(piece.span).or_default().push(piece.primitive);
+        }
+        self.done += 1;
+        match count {
+            0 => self.unseen += 1,
+            _ => self.errors.push(error),
+        }
+        self.split += usize::from(count > 1);
+        self.primitives += count;
+        bounded(self.primitives)
+    }
+}
+
+fn bounded(primitives: usize) -> Result<()> {
+    if primitives <= MAX_PRIMITIVES {
+        return Ok(());
+    }
+    Err(Error::new(ErrorKind::Memory, format!("the baked scene would have more than {MAX_PRIMITIVES} primitives"))
+        .remedy("Raise --tolerance, or bake a shorter clip or fewer Gaussians."))
+}
+
+/// A straight layer.
+fn copy(
+    layer: &Layer<f32>,
+    line: &Line,
+    fitter: &Fitter<'_>,
+    tally: &mut Tally,
+    progress: &mut dyn FnMut(usize),
+) -> Result<()> {
+    let (lives, spans) = (Lives::new(layer), layer.spans());
+    for first in (0..spans.len()).step_by(STRAIGHT_RUN) {
+        let ids = first..spans.len().min(first + STRAIGHT_RUN);
+        let pieces = |id: usize| line.pieces(layer, &lives, id, spans[id], fitter.tree, fitter.lookout);
+        let all: Vec<Vec<Piece>> = ids.into_par_iter().map(pieces).collect();
+        for pieces in all {
+            tally.add(pieces)?;
+        }
+        progress(tally.done);
+    }
+    Ok(())
+}
+
+/// Any other layer.
+fn follow(layer: &Layer<f32>, fitter: &Fitter<'_>, tally: &mut Tally, progress: &mut dyn FnMut(usize)) -> Result<()> {
+    let lives = Lives::new(layer);
+    let spans = layer.spans();
+    let shown = |(id, span): (usize, &[f64; 2])| seen(fitter.tree, *span).map(|s| (id, s));
+    let rows: Vec<(usize, [f64; 2])> = spans.iter().enumerate().filter_map(shown).collect();
+    (tally.done, tally.unseen) = (tally.done + spans.len() - rows.len(), tally.unseen + spans.len() - rows.len());
+    if rows.is_empty() {
+        return Ok(());
+    }
+    let colors = sample::color_width(layer, fitter.tree.clip()[0]);
+    let mut rest = rows.as_slice();
+    while !rest.is_empty() {
+        let (run, later) = rest.split_at(sample::run_length(rest, fitter.tree, colors));
+        rest = later;
+        let samples = sample::look(layer, run, fitter.tree, colors);
+        let pieces = |row: &sample::Row| {
+            let subject = Subject {
+                samples: &samples,
+                row,
+                window: layer.span,
+                life: lives.envelope(row.id),
+                own: learnt(&layer.params[GEOMETRY].read::<11>(row.id, 0)),
+                colors: (colors == 0).then(|| sample::own_colors(layer, row.id)),
+            };
+            // Colours that are no numbers would show as black; what cannot be drawn is left out.
+            let sound = subject.colors.is_none_or(|c| c.iter().all(|x| x.is_finite()));
+            if sound { fitter.pieces(&subject) } else { Vec::new() }
+        };
+        let all: Vec<Vec<Piece>> = samples.rows.par_iter().map(pieces).collect();
+        for pieces in all {
+            tally.add(pieces)?;
+        }
+        progress(tally.done);
+    }
+    Ok(())
+}
+
+/// All finite means.
+fn means(scene: &Scene<f32>) -> Vec<[f64; 3]> {
+    let of = |layer: &'_ Layer<f32>| {
+        let table = &layer.params[GEOMETRY];
+        (0..table.rows()).map(|i| table.read::<3>(i, 0).map(f64::from)).collect::<Vec<_>>()
+    };
+    scene.layers.iter().flat_map(of).filter(|m| m.iter().all(|x| x.is_finite())).collect()
+}
+
+/// The highest degree with a coefficient that is not zero.
+fn sh_degree(nodes: &[Node]) -> usize {
+    let mut used = 0;
+    for primitive in nodes.iter().flat_map(|n| &n.primitives) {
+        // Coefficient k = 1 + i/3 belongs to the degree ⌊√k⌋.
+        let last = primitive.sh_rest.iter().rposition(|c| *c != 0.0).map_or(0, |i| 1 + i / 3);
+        used = used.max(last.isqrt());
+    }
+    used
+}
+
+fn quantiles(mut errors: Vec<f64>, tolerance: f64) -> Errors {
+    errors.sort_by(f64::total_cmp);
+    let at = |share: f64| match errors.len() {
+        0 => 0.0,
+        n => errors[((n as f64 * share) as usize).min(n - 1)],
+    };
+    let unit = if tolerance.is_finite() { tolerance } else { TOLERANCE };
+    let bins = [0.0, 0.125, 0.25, 0.5, 1.0, 2.0, 8.0].map(|share| share * unit).to_vec();
+    let mut counts = vec![0; bins.len() + 1];
+    for error in &errors {
+        counts[bins.partition_point(|b| b < error)] += 1;
+    }
+    Errors { median: at(0.5), p90: at(0.9), p99: at(0.99), worst: at(1.0), bins, counts }
+}

@@ -1,0 +1,137 @@
+//! A layer looked at frame after frame: what the fit is made from.
+//!
+//! Rows come in runs that are small enough for all frames of a run to lie in memory at once, however long the take is.
+
+use super::tree::{Span, Tree};
+use crate::layers::{Layer, LayerTape};
+use crate::math::sh::{MAX_COEFFS, rgb_to_dc};
+use crate::motion::{At, Cache};
+use crate::scene::{Color, Rows, SH, Space, Time};
+
+/// Numbers of a sample before its colour: mean 3, covariance 6, opacity 1 (life applied).
+pub(super) const GEOMETRY: usize = 10;
+/// Numbers that the samples of one run may hold: 64 MiB.
+const BUDGET: usize = 16 << 20;
+
+/// One Gaussian of a run.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Row {
+    /// Its row in the layer.
+    pub id: usize,
+    /// The seconds in which it can be seen, within the clip.
+    pub seen: [f64; 2],
+    /// First and last frame that was looked at.
+    pub frames: Span,
+    /// Where its samples begin.
+    offset: usize,
+}
+
+/// All looks at one run of rows.
+#[derive(Debug)]
+pub(super) struct Samples {
+    /// The rows, ids rising.
+    pub rows: Vec<Row>,
+    /// Numbers a look.
+    width: usize,
+    data: Vec<f32>,
+}
+
+impl Samples {
+    /// What row `row` was at frame k.
+    pub(super) fn at(&self, row: &Row, k: usize) -> &[f32] {
+        let start = row.offset + (k - row.frames[0]) * self.width;
+        &self.data[start..start + self.width]
+    }
+}
+
+/// How many SH coefficients (all channels) a look must hold: 0 where the layer's own SH is the colour at all times.
+pub(super) fn color_width(layer: &Layer<f32>, time: f64) -> usize {
+    let mut tape = LayerTape::default();
+    tape.ask(Space::Gaussians, Rows::Some(&[0]), Time(time));
+    let mut cache = Cache::default();
+    layer.motion.prepare(&layer.params, &[tape.question(&layer.params)], &mut cache);
+    layer.at(&cache, &mut tape);
+    match layer.part(&tape).color {
+        Color::Sh { weights: None, base: true, .. } => 0,
+        Color::Sh { table, weights, .. } => table.width() / weights.map_or(1, |w| w.width().max(1)),
+        Color::Direct { .. } => 3,
+    }
+    .min(3 * MAX_COEFFS)
+}
+
+/// How many of the rows (id, seconds in which it can be seen) fit into the next run; at least one.
+pub(super) fn run_length(rows: &[(usize, [f64; 2])], tree: &Tree, colors: usize) -> usize {
+    let mut numbers = 0;
+    let fits = rows.iter().take_while(|(_, seen)| {
+        let [first, last] = tree.around(*seen);
+        numbers += (last + 1 - first) * (GEOMETRY + colors);
+        numbers <= BUDGET
+    });
+    fits.count().clamp(1, rows.len().max(1))
+}
+
+/// Looks at the rows at every frame at which they can be seen, and at one frame before and after.
+pub(super) fn look(layer: &Layer<f32>, rows: &[(usize, [f64; 2])], tree: &Tree, colors: usize) -> Samples {
+    let width = GEOMETRY + colors;
+    let mut offset = 0;
+    let place = |&(id, seen): &(usize, [f64; 2])| {
+        let frames = tree.around(seen);
+        let row = Row { id, seen, frames, offset };
+        offset += (frames[1] + 1 - frames[0]) * width;
+        row
+    };
+    let rows: Vec<Row> = rows.iter().map(place).collect();
+    let mut data = vec![0.0; offset];
+    let first = rows.iter().map(|r| r.frames[0]).min().unwrap_or(0);
+    let last = rows.iter().map(|r| r.frames[1]).max().unwrap_or(0);
+    let alive = |k: usize| rows.iter().filter(move |r| (r.frames[0]..=r.frames[1]).contains(&k));
+    let ids: Vec<Vec<u32>> = (first..=last).map(|k| alive(k).map(|r| r.id as u32).collect()).collect();
+    let asked = |i: usize| At {
+        p: &layer.params,
+        of: Space::Gaussians,
+        rows: Rows::Some(&ids[i]),
+        t: Time(tree.time(first + i)),
+    };
+    // One preparation for all frames: a model that scans through time does so once a run.
+    let questions: Vec<At<'_, f32>> = (0..ids.len()).map(asked).collect();
+    let (mut cache, mut tape) = (Cache::default(), LayerTape::default());
+    layer.motion.prepare(&layer.params, &questions, &mut cache);
+    for (k, ids) in (first..).zip(&ids) {
+        tape.ask(Space::Gaussians, Rows::Some(ids), Time(tree.time(k)));
+        layer.at(&cache, &mut tape);
+        let part = layer.part(&tape);
+        for (j, row) in alive(k).enumerate() {
+            let start = row.offset + (k - row.frames[0]) * width;
+            let out = &mut data[start..start + width];
+            out[..GEOMETRY].copy_from_slice(&part.out.read::<GEOMETRY>(j, 0));
+            coefficients(&part.color, j, &mut out[GEOMETRY..]);
+        }
+    }
+    Samples { rows, width, data }
+}
+
+/// The layer's own SH coefficients of row `id`, coefficient-major; those that it lacks are 0.
+pub(super) fn own_colors(layer: &Layer<f32>, id: usize) -> [f32; 3 * MAX_COEFFS] {
+    let table = &layer.params[SH];
+    std::array::from_fn(|k| if k < table.width() { table.get(id, k) } else { 0.0 })
+}
+
+/// The SH coefficients of splat j, as many as `out` takes. A colour without a direction is one coefficient a channel.
+fn coefficients(color: &Color<'_>, j: usize, out: &mut [f32]) {
+    match color {
+        Color::Sh { table, rows, weights, .. } => {
+            let id = rows.id(j);
+            let blocks = weights.map_or(1, |w| w.width().max(1));
+            let block = table.width() / blocks;
+            let weight = |b: usize| weights.map_or(1.0, |w| w.get(j, b));
+            for (k, out) in out.iter_mut().enumerate().take(block) {
+                *out = (0..blocks).map(|b| weight(b) * table.get(id, b * block + k)).sum();
+            }
+        }
+        Color::Direct { table } => {
+            for (k, out) in out.iter_mut().enumerate().take(table.width().min(3)) {
+                *out = rgb_to_dc(table.get(j, k));
+            }
+        }
+    }
+}

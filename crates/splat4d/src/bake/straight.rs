@@ -1,0 +1,81 @@
+//! Motion that is a straight line already: its primitives are read off the parameters, exactly and at once.
+
+use super::fit::{COLORS, Piece, homes, is_visible, primitive, seen};
+use super::life::{Envelope, Lives};
+use super::lookout::Lookout;
+use super::sample::own_colors;
+use super::tree::{Span, Tree};
+use super::turn::Shape;
+use crate::layers::Layer;
+use crate::math::quat;
+use crate::motion::Spec;
+use crate::motion::spacetime::VELOCITIES;
+use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
+use crate::scene::{GEOMETRY, Key};
+
+/// How a straight layer moves.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Line {
+    velocities: Option<Key>,
+    /// Origin of Δ for Gaussians that live for ever.
+    origin: f64,
+}
+
+impl Line {
+    /// The layer's motion, where it is straight.
+    pub(super) fn of(layer: &Layer<f32>) -> Option<Self> {
+        match layer.motion.spec() {
+            Spec::Still => Some(Self { velocities: None, origin: 0.0 }),
+            Spec::Spacetime(s) if s.order <= 1 && !s.rotation => {
+                let velocities = if s.order == 1 { Some(layer.params.find(VELOCITIES)?) } else { None };
+                Some(Self { velocities, origin: s.origin })
+            }
+            _ => None,
+        }
+    }
+
+    /// The primitive of row `id`, one for every span in `window` (the layer's span); none where it is never seen in the
+    /// clip or is not finite.
+    pub(super) fn pieces(
+        &self,
+        layer: &Layer<f32>,
+        lives: &Lives<'_>,
+        id: usize,
+        span: [f64; 2],
+        tree: &Tree,
+        lookout: &Lookout,
+    ) -> Vec<Piece> {
+        let Some(seen) = seen(tree, span) else { return Vec::new() };
+        let row = layer.params[GEOMETRY].read::<11>(id, 0);
+        let opacity = f64::from(1.0 / (1.0 + (-row[OPACITY]).exp()));
+        let shape = learnt(&row);
+        let velocity = self.velocities.map_or([0.0; 3], |key| layer.params[key].read::<3>(id, 0).map(f64::from));
+        let colors: [f32; COLORS] = own_colors(layer, id);
+        let mean: [f64; 3] = std::array::from_fn(|k| f64::from(row[k]));
+        let own = lives.envelope(id);
+        let finite = row.iter().chain(&colors).all(|x| x.is_finite()) && velocity.iter().all(|x| x.is_finite());
+        if !finite || !is_visible(opacity) || !(own.center + own.softness).is_finite() {
+            return Vec::new();
+        }
+        let origin = if lives.has_centers() { own.center } else { self.origin };
+        let piece = |node: Span| {
+            let [from, to] = [tree.border(node[0]), tree.border(node[1])];
+            // For ever counts from the middle of the node: nothing is ever further from it than half the node.
+            let life = if own.is_forever() { Envelope::forever(0.5 * (from + to)) } else { own };
+            let at = |t: f64| std::array::from_fn(|k| mean[k] + velocity[k] * (t - origin));
+            let shown = [seen[0].max(from), seen[1].min(to)];
+            let pixels = lookout.pixels(at(0.5 * (shown[0] + shown[1])));
+            let area = pixels * pixels * ((shown[1] - shown[0]) / (to - from)).clamp(0.0, 1.0);
+            let primitive = primitive(at(life.center), &life, &shape, opacity, velocity, &colors, area);
+            Piece { span: node, primitive, error: 0.0 }
+        };
+        homes(tree, seen, layer.span).into_iter().map(piece).collect()
+    }
+}
+
+/// Rotation and scales as they are learnt.
+pub(super) fn learnt(row: &[f32; 11]) -> Shape {
+    let q = std::array::from_fn(|k| f64::from(row[QUAT + k]));
+    let scales = std::array::from_fn(|k| f64::from(row[LOG_SCALE + k]).exp());
+    Shape { quat: quat::normalize(q).0, scales, turn: [0.0; 3] }
+}

@@ -1,0 +1,143 @@
+//! The binary tree of time spans that a clip is cut into.
+
+use crate::scene::time::DEFAULT_FPS;
+use crate::{Error, Result};
+
+/// Frames [from, to) of the clip.
+pub(super) type Span = [usize; 2];
+
+/// Most frames of a clip: nine hours at 30 frames a second; more is a damaged clock.
+const MAX_FRAMES: f64 = 1_000_000.0;
+
+/// Borders of spans lie on frames, so that a frame is shown by one node a level and by no two.
+///
+/// The tree halves the clip at the borders of segments, and a segment, where motion demands it, frame by frame. Its
+/// last border lies one frame behind the clip's last second, so that this second is inside.
+#[derive(Clone, Debug)]
+pub(super) struct Tree {
+    clip: [f64; 2],
+    step: f64,
+    frames: usize,
+    /// Frames at which segments begin, and the end.
+    grid: Vec<usize>,
+}
+
+impl Tree {
+    /// Errors: the clip or the segment's length is no sensible number.
+    pub(super) fn new(clip: [f64; 2], fps: f64, segment: f64) -> Result<Self> {
+        let fps = if fps > 0.0 && fps.is_finite() { fps } else { DEFAULT_FPS };
+        let frames = ((clip[1] - clip[0]) * fps).round() + 1.0;
+        if !(1.0..=MAX_FRAMES).contains(&frames) || clip.iter().any(|t| !t.is_finite()) {
+            return Err(Error::input(format!("the clip from {} to {} s at {fps} frames/s", clip[0], clip[1]))
+                .remedy(format!("A scene lasts from 1 to {MAX_FRAMES} frames; correct its clip or its frame rate.")));
+        }
+        if !(segment > 0.0 && segment.is_finite()) {
+            return Err(Error::input(format!("segments of {segment} s")).remedy("Give seconds above zero, such as 1."));
+        }
+        let (frames, step) = (frames as usize, 1.0 / fps);
+        let segments = ((frames as f64 * step / segment).round() as usize).clamp(1, frames);
+        let grid = (0..=segments).map(|i| (i * frames + segments / 2) / segments).collect();
+        Ok(Self { clip, step, frames, grid })
+    }
+
+    /// Frames of the clip.
+    pub(super) fn frames(&self) -> usize {
+        self.frames
+    }
+
+    /// First and last second.
+    pub(super) fn clip(&self) -> [f64; 2] {
+        self.clip
+    }
+
+    /// All frames.
+    pub(super) fn root(&self) -> Span {
+        [0, self.frames]
+    }
+
+    /// The second of frame k.
+    pub(super) fn time(&self, k: usize) -> f64 {
+        (self.clip[0] + k as f64 * self.step).min(self.clip[1])
+    }
+
+    /// The second at which a span that ends (or begins) at frame k ends (or begins).
+    pub(super) fn border(&self, k: usize) -> f64 {
+        if k >= self.frames { self.clip[1] + self.step } else { self.time(k) }
+    }
+
+    /// The frames that surround the seconds [from, to] within the clip.
+    pub(super) fn around(&self, [from, to]: [f64; 2]) -> Span {
+        let place = |t: f64| ((t - self.clip[0]) / self.step).clamp(0.0, (self.frames - 1) as f64);
+        [place(from).floor() as usize, place(to).ceil() as usize]
+    }
+
+    /// Whether the span holds more than one segment.
+    pub(super) fn is_coarse(&self, span: Span) -> bool {
+        let [from, to] = self.cells(span);
+        to - from > 1
+    }
+
+    /// The two halves of a span; a single frame has none.
+    pub(super) fn split(&self, span: Span) -> Option<[Span; 2]> {
+        if span[1] - span[0] <= 1 {
+            return None;
+        }
+        let [from, to] = self.cells(span);
+        let middle = if to - from > 1 { self.grid[(from + to) / 2] } else { (span[0] + span[1]) / 2 };
+        Some([[span[0], middle], [middle, span[1]]])
+    }
+
+    /// The segments that a span touches, [first, end).
+    fn cells(&self, span: Span) -> [usize; 2] {
+        let from = self.grid.partition_point(|&g| g <= span[0]) - 1;
+        [from, self.grid.partition_point(|&g| g < span[1])]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Every span of the tree, depth first.
+    fn all(tree: &Tree, span: Span, out: &mut Vec<Span>) {
+        out.push(span);
+        for half in tree.split(span).into_iter().flatten() {
+            all(tree, half, out);
+        }
+    }
+
+    #[test]
+    fn halves_tile_their_parent_down_to_single_frames() {
+        for (frames, segment) in [(1usize, 1.0), (2, 1.0), (30, 1.0), (47, 0.3), (301, 1.0), (20, 0.01)] {
+            let tree = Tree::new([2.0, 2.0 + (frames - 1) as f64 / 30.0], 30.0, segment).unwrap();
+            assert_eq!(tree.frames(), frames);
+            let mut spans = Vec::new();
+            all(&tree, tree.root(), &mut spans);
+            assert_eq!(spans.len(), 2 * frames - 1, "a full binary tree over its frames");
+            for span in spans {
+                assert!(tree.border(span[0]) < tree.border(span[1]));
+                let Some([a, b]) = tree.split(span) else { continue };
+                assert!(a[0] == span[0] && a[1] == b[0] && b[1] == span[1] && a[0] < a[1] && b[0] < b[1]);
+                if tree.is_coarse(span) {
+                    assert!(tree.grid.contains(&a[1]), "long spans are cut at segments");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn segments_last_about_as_long_as_asked() {
+        let tree = Tree::new([0.0, 10.0 - 1.0 / 30.0], 30.0, 1.0).unwrap();
+        assert_eq!(tree.grid, (0..=10).map(|i| 30 * i).collect::<Vec<_>>());
+        assert!((tree.border(300) - 10.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_clock_that_is_no_clock_is_refused() {
+        for clip in [[0.0, f64::NAN], [1.0, 0.0], [0.0, 1e9], [f64::NEG_INFINITY, 0.0]] {
+            assert!(Tree::new(clip, 30.0, 1.0).is_err(), "{clip:?}");
+        }
+        assert!(Tree::new([0.0, 1.0], 30.0, 0.0).is_err());
+        assert_eq!(Tree::new([0.0, 1.0], 0.0, 1.0).unwrap().frames(), 31, "no rate: the default one");
+    }
+}

@@ -1,0 +1,417 @@
+//! The start of a playback file: header, JSON, and the table of sections.
+
+use super::{BLOCK_GAUSSIANS, BLOCK_HEADER, HEADER_BYTES, MAGIC, MAX_PAGE_GAUSSIANS, MAX_PALETTE, Meta, PAGE_WORDS};
+use crate::math::sh;
+use crate::{Error, ErrorKind, Result};
+
+/// Bytes of an entry of the table.
+pub(super) const ENTRY_BYTES: usize = 64;
+/// Largest index (docs/format.md, "Layout").
+pub(super) const MAX_INDEX: usize = 64 << 20;
+/// Most sections (docs/format.md, "Layout").
+pub(super) const MAX_SECTIONS: usize = 1_000_000;
+/// Deflate shrinks at most 1032 times: 258 bytes from 2 bits (RFC 1951, §3.2.5).
+pub(super) const MAX_DEFLATE: u64 = 1032;
+/// A page that has base colours only.
+pub(super) const NO_PALETTE: u32 = u32::MAX;
+/// Flag of an entry: who does not know the kind refuses the file.
+const REQUIRED: u32 = 1;
+
+/// What a section holds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Kind {
+    /// Gaussians of one span of time.
+    Page,
+    /// Spherical harmonics above degree 0.
+    Palette,
+    /// A picture.
+    Poster,
+    /// Something newer, which is skipped.
+    Other([u8; 4]),
+}
+
+impl Kind {
+    pub(super) fn tag(self) -> [u8; 4] {
+        match self {
+            Kind::Page => *b"PAGE",
+            Kind::Palette => *b"PALT",
+            Kind::Poster => *b"POST",
+            Kind::Other(tag) => tag,
+        }
+    }
+
+    fn of(tag: [u8; 4]) -> Self {
+        [Kind::Page, Kind::Palette, Kind::Poster].into_iter().find(|k| k.tag() == tag).unwrap_or(Kind::Other(tag))
+    }
+
+    /// The four characters that the file has, others as dots.
+    pub fn name(self) -> String {
+        self.tag().iter().map(|&b| if b.is_ascii_graphic() { b as char } else { '.' }).collect()
+    }
+}
+
+/// How a section is stored.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Codec {
+    /// As it is.
+    Raw,
+    /// RFC 1951 without a wrapper.
+    Deflate,
+    /// Something newer.
+    Other(u16),
+}
+
+impl Codec {
+    pub(super) fn code(self) -> u16 {
+        match self {
+            Codec::Raw => 0,
+            Codec::Deflate => 1,
+            Codec::Other(code) => code,
+        }
+    }
+}
+
+/// One section, as the table has it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Entry {
+    /// What it holds.
+    pub kind: Kind,
+    /// Whether who does not know the kind must refuse the file.
+    pub required: bool,
+    /// First byte in the file.
+    pub offset: u64,
+    /// Bytes in the file.
+    pub stored: u32,
+    /// Bytes after decoding.
+    pub bytes: u32,
+    /// CRC-32 of the stored bytes.
+    pub crc: u32,
+    /// How it is stored.
+    pub codec: Codec,
+    /// Page: the tier, 0 the most important.
+    pub tier: u16,
+    /// Palette: the degree of its spherical harmonics, 1 to 3.
+    pub degree: u16,
+    /// Page: Gaussians. Palette: entries.
+    pub count: u32,
+    /// Page: it is drawn for from ≤ t < to, seconds.
+    pub span: [f64; 2],
+    /// Page: place of its palette in the table of sections; none: base colour only.
+    pub palette: Option<u32>,
+}
+
+/// The start of a file, understood and checked.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Index {
+    /// Major and minor version of the format.
+    pub version: [u16; 2],
+    /// Bytes of the whole file, as its header says.
+    pub file_len: u64,
+    /// The JSON.
+    pub meta: Meta,
+    /// All sections in the order in which a player wants them.
+    pub sections: Vec<Entry>,
+}
+
+/// The fixed header.
+struct Header {
+    version: [u16; 2],
+    index_bytes: usize,
+    file_len: u64,
+    index_crc: u32,
+}
+
+impl Index {
+    /// Bytes from the start that [`parse`](Self::parse) wants: 64 as long as `prefix` is shorter, then the exact number.
+    ///
+    /// Errors: not a playback file, a newer major version, a damaged header.
+    pub fn needed(prefix: &[u8]) -> Result<usize> {
+        if prefix.len() < HEADER_BYTES {
+            let known = prefix.len().min(MAGIC.len());
+            return if prefix[..known] == MAGIC[..known] { Ok(HEADER_BYTES) } else { Err(foreign()) };
+        }
+        Ok(HEADER_BYTES + Header::parse(prefix)?.index_bytes)
+    }
+
+    /// Understands the start of a file, of which `prefix` holds at least [`needed`](Self::needed) bytes. `file_len`, where
+    /// it is known, is how long the file really is: a shorter one is cut short, which is no error here.
+    ///
+    /// Errors: not a playback file, a newer major version, damage, a required section of an unknown kind.
+    pub fn parse(prefix: &[u8], file_len: Option<u64>) -> Result<Self> {
+        let end = Self::needed(prefix)?;
+        if prefix.len() < end {
+            let have = file_len.unwrap_or(prefix.len() as u64);
+            return Err(broken(format!("its index ends at byte {end}, but there are only {have}")));
+        }
+        let header = Header::parse(prefix)?;
+        let index = &prefix[HEADER_BYTES..end];
+        if crc(index) != header.index_crc {
+            return Err(broken("the checksum of its index is wrong".into()));
+        }
+        let json_len = read_u32(index, 0).ok_or_else(short)? as usize;
+        let json = index.get(4..).and_then(|rest| rest.get(..json_len)).ok_or_else(short)?;
+        let meta: Meta =
+            serde_json::from_slice(json).map_err(|e| broken(format!("its JSON is not what it must be: {e}")))?;
+        meta.check()?;
+        let rest = &index[4 + json_len..];
+        let count = read_u32(rest, 0).ok_or_else(short)? as usize;
+        let table = rest[4..].get(..count.saturating_mul(ENTRY_BYTES)).filter(|_| count <= MAX_SECTIONS);
+        let table = table.ok_or_else(|| broken(format!("its table claims {count} sections")))?;
+        let sections: Vec<Entry> = table
+            .chunks_exact(ENTRY_BYTES)
+            .enumerate()
+            .map(|(i, bytes)| Entry::parse(bytes).map_err(|e| e.at(format!("section {i}"))))
+            .collect::<Result<_>>()?;
+        let index = Self { version: header.version, file_len: header.file_len, meta, sections };
+        index.check(end as u64)?;
+        Ok(index)
+    }
+
+    /// The pages (with their places in the table) that are drawn at second t, most important tier first. Clamps t to the
+    /// clip.
+    pub fn pages_at(&self, t: f64) -> Vec<(usize, &Entry)> {
+        let t = t.max(self.meta.clip[0]).min(self.meta.clip[1]);
+        let mut pages: Vec<_> = self.pages().filter(|(_, e)| e.span[0] <= t && t < e.span[1]).collect();
+        pages.sort_by_key(|(_, e)| e.tier);
+        pages
+    }
+
+    /// All pages with their places in the table.
+    pub fn pages(&self) -> impl Iterator<Item = (usize, &Entry)> {
+        self.sections.iter().enumerate().filter(|(_, e)| e.kind == Kind::Page)
+    }
+
+    /// What ties sections to each other and to the file.
+    fn check(&self, first_byte: u64) -> Result<()> {
+        let mut order: Vec<usize> = (0..self.sections.len()).collect();
+        order.sort_by_key(|&i| (self.sections[i].offset, self.sections[i].stored));
+        let mut free = first_byte;
+        for i in order {
+            let e = &self.sections[i];
+            let end = e.offset.checked_add(u64::from(e.stored)).filter(|&end| end <= self.file_len);
+            let end = end.ok_or_else(|| broken("it ends beyond the file".into()).at(format!("section {i}")))?;
+            if e.offset < free {
+                return Err(broken("it overlaps another".into()).at(format!("section {i}")));
+            }
+            free = end;
+        }
+        let mut gaussians = 0u64;
+        for (i, page) in self.pages() {
+            gaussians += u64::from(page.count);
+            let Some(p) = page.palette else { continue };
+            if self.sections.get(p as usize).is_none_or(|e| e.kind != Kind::Palette) {
+                return Err(broken(format!("its palette, section {p}, is none")).at(format!("section {i}")));
+            }
+        }
+        if gaussians != self.meta.gaussians as u64 {
+            let claimed = self.meta.gaussians;
+            return Err(broken(format!("its pages hold {gaussians} Gaussians, its JSON says {claimed}")));
+        }
+        Ok(())
+    }
+
+    /// Header and index of a file with these sections; `offset`s are moved behind the index, and the file's length is
+    /// set. `generator` is the program that writes.
+    ///
+    /// Panics: more sections, or a larger index, than the format allows.
+    pub(super) fn bytes(&mut self, generator: &str) -> Vec<u8> {
+        assert!(self.sections.len() <= MAX_SECTIONS, "a file has at most {MAX_SECTIONS} sections");
+        let mut json = serde_json::to_value(&self.meta).expect("plain numbers and texts are JSON");
+        json["generator"] = generator.into();
+        let mut json = json.to_string().into_bytes();
+        json.resize(json.len().next_multiple_of(4), b' ');
+        let index_bytes = 8 + json.len() + ENTRY_BYTES * self.sections.len();
+        assert!(index_bytes <= MAX_INDEX, "an index has at most {MAX_INDEX} bytes");
+        let mut offset = (HEADER_BYTES + index_bytes) as u64;
+        for e in &mut self.sections {
+            e.offset = offset;
+            offset += u64::from(e.stored);
+        }
+        self.file_len = offset;
+        let mut out = Vec::with_capacity(HEADER_BYTES + index_bytes);
+        out.extend_from_slice(&MAGIC);
+        self.version.iter().for_each(|v| out.extend_from_slice(&v.to_le_bytes()));
+        out.extend_from_slice(&(index_bytes as u32).to_le_bytes());
+        out.extend_from_slice(&self.file_len.to_le_bytes());
+        out.resize(HEADER_BYTES, 0);
+        out.extend_from_slice(&(json.len() as u32).to_le_bytes());
+        out.extend_from_slice(&json);
+        out.extend_from_slice(&(self.sections.len() as u32).to_le_bytes());
+        self.sections.iter().for_each(|e| e.append(&mut out));
+        seal(&mut out);
+        out
+    }
+}
+
+/// Writes both checksums of a file's start. Panics: fewer bytes than header and index have.
+pub(super) fn seal(file: &mut [u8]) {
+    let index_bytes = read_u32(file, 12).expect("a header") as usize;
+    let index_crc = crc(&file[HEADER_BYTES..HEADER_BYTES + index_bytes]);
+    file[24..28].copy_from_slice(&index_crc.to_le_bytes());
+    let header_crc = crc(&file[..60]);
+    file[60..64].copy_from_slice(&header_crc.to_le_bytes());
+}
+
+impl Header {
+    /// Panics: fewer than 64 bytes.
+    fn parse(bytes: &[u8]) -> Result<Self> {
+        if bytes[..8] != MAGIC {
+            return Err(foreign());
+        }
+        let [major, minor] = [8, 10].map(|at| u16::from_le_bytes([bytes[at], bytes[at + 1]]));
+        // Asked first: a newer format may have another header behind these bytes.
+        if major != super::VERSION[0] {
+            return Err(Error::new(
+                ErrorKind::Unsupported,
+                format!(
+                    "this playback file has version {major}.{minor}, this splat4d reads version {}",
+                    super::VERSION[0]
+                ),
+            )
+            .remedy("Install a newer splat4d, or bake the scene again with this one"));
+        }
+        let u32_at = |at| read_u32(bytes, at).expect("64 bytes");
+        if u32_at(60) != crc(&bytes[..60]) {
+            return Err(broken("the checksum of its header is wrong".into()));
+        }
+        let index_bytes = u32_at(12) as usize;
+        let file_len = u64::from(u32_at(16)) | u64::from(u32_at(20)) << 32;
+        if index_bytes > MAX_INDEX || (HEADER_BYTES + index_bytes) as u64 > file_len {
+            return Err(broken(format!("its header claims an index of {index_bytes} bytes in a file of {file_len}")));
+        }
+        Ok(Self { version: [major, minor], index_bytes, file_len, index_crc: u32_at(24) })
+    }
+}
+
+impl Entry {
+    /// Panics: fewer than 64 bytes.
+    fn parse(b: &[u8]) -> Result<Self> {
+        let u32_at = |at| read_u32(b, at).expect("64 bytes");
+        let u16_at = |at: usize| u16::from_le_bytes([b[at], b[at + 1]]);
+        let u64_at = |at| u64::from(u32_at(at)) | u64::from(u32_at(at + 4)) << 32;
+        let kind = Kind::of([b[0], b[1], b[2], b[3]]);
+        let required = u32_at(4) & REQUIRED != 0;
+        let entry = Self {
+            kind,
+            required,
+            offset: u64_at(8),
+            stored: u32_at(16),
+            bytes: u32_at(20),
+            crc: u32_at(24),
+            codec: match u16_at(28) {
+                0 => Codec::Raw,
+                1 => Codec::Deflate,
+                other => Codec::Other(other),
+            },
+            tier: if kind == Kind::Page { u16_at(30) } else { 0 },
+            degree: if kind == Kind::Palette { u16_at(30) } else { 0 },
+            count: u32_at(32),
+            span: [f64::from_bits(u64_at(40)), f64::from_bits(u64_at(48))],
+            palette: Some(u32_at(56)).filter(|&p| kind == Kind::Page && p != NO_PALETTE),
+        };
+        if let Kind::Other(_) = kind {
+            if required {
+                let what = format!("the file cannot be drawn without a section `{}`", kind.name());
+                return Err(Error::new(ErrorKind::Unsupported, what).remedy("Install a newer splat4d"));
+            }
+            return Ok(entry);
+        }
+        entry.check(u32_at(36) as usize)?;
+        Ok(entry)
+    }
+
+    /// What an entry of a known kind says about itself must fit together.
+    fn check(&self, words: usize) -> Result<()> {
+        let most = match self.codec {
+            Codec::Raw => u64::from(self.stored),
+            Codec::Deflate => u64::from(self.stored) * MAX_DEFLATE,
+            Codec::Other(code) => {
+                return Err(Error::new(ErrorKind::Unsupported, format!("codec {code} is not known"))
+                    .remedy("Install a newer splat4d"));
+            }
+        };
+        if u64::from(self.bytes) > most {
+            return Err(broken(format!("{} bytes cannot be stored in {}", self.bytes, self.stored)));
+        }
+        let count = self.count as usize;
+        match self.kind {
+            Kind::Page => {
+                if words != PAGE_WORDS {
+                    let what = format!("a page has {words} words a Gaussian, this splat4d knows {PAGE_WORDS}");
+                    return Err(Error::new(ErrorKind::Unsupported, what).remedy("Install a newer splat4d"));
+                }
+                if !(1..=MAX_PAGE_GAUSSIANS).contains(&count) || self.bytes as usize != page_bytes(count) {
+                    return Err(broken(format!("a page of {count} Gaussians does not have {} bytes", self.bytes)));
+                }
+                if !(self.span.iter().all(|t| t.is_finite()) && self.span[0] < self.span[1]) {
+                    return Err(broken(format!("a page cannot be drawn from {} to {} s", self.span[0], self.span[1])));
+                }
+            }
+            Kind::Palette => {
+                let degree = usize::from(self.degree);
+                if !(1..=sh::MAX_DEGREE).contains(&degree) {
+                    return Err(broken(format!("a palette has degree {degree}")));
+                }
+                if !(1..=MAX_PALETTE).contains(&count) || self.bytes as usize != palette_bytes(degree, count) {
+                    return Err(broken(format!("a palette of {count} entries does not have {} bytes", self.bytes)));
+                }
+            }
+            Kind::Poster | Kind::Other(_) => {}
+        }
+        Ok(())
+    }
+
+    fn append(&self, out: &mut Vec<u8>) {
+        let start = out.len();
+        out.extend_from_slice(&self.kind.tag());
+        out.extend_from_slice(&(if self.required { REQUIRED } else { 0 }).to_le_bytes());
+        out.extend_from_slice(&self.offset.to_le_bytes());
+        for x in [self.stored, self.bytes, self.crc] {
+            out.extend_from_slice(&x.to_le_bytes());
+        }
+        out.extend_from_slice(&self.codec.code().to_le_bytes());
+        out.extend_from_slice(&(self.tier | self.degree).to_le_bytes());
+        let words = if self.kind == Kind::Page { PAGE_WORDS as u32 } else { 0 };
+        out.extend_from_slice(&self.count.to_le_bytes());
+        out.extend_from_slice(&words.to_le_bytes());
+        self.span.iter().for_each(|t| out.extend_from_slice(&t.to_le_bytes()));
+        let palette = if self.kind == Kind::Page { self.palette.unwrap_or(NO_PALETTE) } else { 0 };
+        out.extend_from_slice(&palette.to_le_bytes());
+        out.resize(start + ENTRY_BYTES, 0);
+    }
+}
+
+/// Decoded bytes of a page.
+pub(super) fn page_bytes(gaussians: usize) -> usize {
+    gaussians.div_ceil(BLOCK_GAUSSIANS) * 4 * BLOCK_HEADER + gaussians * 4 * PAGE_WORDS
+}
+
+/// Decoded bytes of a palette.
+pub(super) fn palette_bytes(degree: usize, entries: usize) -> usize {
+    12 + 3 * (sh::coeffs(degree) - 1) * entries
+}
+
+/// CRC-32 as in zip.
+pub(super) fn crc(bytes: &[u8]) -> u32 {
+    let mut crc = flate2::Crc::new();
+    crc.update(bytes);
+    crc.sum()
+}
+
+fn read_u32(bytes: &[u8], at: usize) -> Option<u32> {
+    Some(u32::from_le_bytes(bytes.get(at..at + 4)?.try_into().ok()?))
+}
+
+fn short() -> Error {
+    broken("its index is shorter than it says".into())
+}
+
+fn foreign() -> Error {
+    Error::input("this is not a playback file: it does not begin as one")
+        .remedy("Give a .splat4d file; `splat4d bake` makes one from a run")
+}
+
+/// A file that does not hold together.
+pub(super) fn broken(what: String) -> Error {
+    Error::input(format!("this playback file is damaged: {what}")).remedy("Copy or download it again, or bake it again")
+}

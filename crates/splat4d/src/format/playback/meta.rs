@@ -1,0 +1,121 @@
+//! The JSON of a playback file.
+
+use crate::{Error, Result};
+use serde::{Deserialize, Serialize};
+
+/// About the scene, as the file's JSON has it. Seconds, scene units, world axes as captured.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Meta {
+    /// First and last second.
+    pub clip: [f64; 2],
+    /// Frames a second of the capture.
+    pub fps: f64,
+    /// The direction that is up, unit.
+    pub up: [f64; 3],
+    /// Colour behind everything, 0 to 1.
+    pub background: [f32; 3],
+    /// Degree of the spherical harmonics, 0 to 3.
+    pub sh_degree: usize,
+    /// Records in all pages.
+    pub gaussians: usize,
+    /// Metres a scene unit, where known.
+    #[serde(default)]
+    pub unit: Option<f64>,
+    /// What people call it.
+    #[serde(default)]
+    pub title: String,
+    /// Least and greatest corner of the means.
+    #[serde(default, rename = "box", skip_serializing_if = "Option::is_none")]
+    pub bounds: Option<[[f64; 3]; 2]>,
+    /// The first view.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub view: Option<Viewpoint>,
+    /// Cameras of the capture.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub cameras: Vec<NamedCamera>,
+    /// The default camera path.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub path: Vec<PathKey>,
+}
+
+/// A place to look from.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Viewpoint {
+    /// The eye.
+    pub position: [f64; 3],
+    /// What is in the middle of the picture.
+    pub target: [f64; 3],
+    /// Upwards in the picture.
+    pub up: [f64; 3],
+    /// Vertical field of view, degrees.
+    pub fov_y: f64,
+}
+
+/// A camera of the capture; its pictures are without distortion.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct NamedCamera {
+    /// As the capture calls it.
+    pub name: String,
+    /// 3x4, row-major: takes camera points (x right, y down, z forward) into the world.
+    pub world_from_camera: [f64; 12],
+    /// Pixels across.
+    pub width: usize,
+    /// Pixels down.
+    pub height: usize,
+    /// Horizontal focal length, pixels.
+    pub fx: f64,
+    /// Vertical focal length, pixels.
+    pub fy: f64,
+    /// Principal point, pixels; the centre of the first pixel is at 0.5.
+    pub cx: f64,
+    /// Principal point, pixels.
+    pub cy: f64,
+}
+
+/// A key of a camera path.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct PathKey {
+    /// Seconds from the path's start.
+    pub at: f64,
+    /// The eye.
+    pub position: [f64; 3],
+    /// What is in the middle of the picture.
+    pub target: [f64; 3],
+    /// Upwards in the picture.
+    pub up: [f64; 3],
+    /// Vertical field of view, degrees.
+    pub fov_y: f64,
+    /// Second of the scene; none: time goes on by itself.
+    #[serde(default)]
+    pub time: Option<f64>,
+}
+
+impl Meta {
+    /// Refuses what no reader could draw. Errors: the first field that is out of range, by name.
+    pub(super) fn check(&self) -> Result<()> {
+        let wrong = |what: &str| Err(Error::input(format!("the playback file's {what}")));
+        let finite = |values: &[f64]| values.iter().all(|x| x.is_finite());
+        if !finite(&self.clip) || self.clip[0] > self.clip[1] {
+            return wrong("`clip` is not a first and a last second");
+        }
+        if !(self.fps.is_finite() && self.fps > 0.0) {
+            return wrong("`fps` is not a positive number");
+        }
+        if !finite(&self.up) || self.up == [0.0; 3] {
+            return wrong("`up` is not a direction");
+        }
+        if !self.background.iter().all(|x| x.is_finite()) {
+            return wrong("`background` is not a colour");
+        }
+        if self.sh_degree > crate::math::sh::MAX_DEGREE {
+            return wrong("`sh_degree` is above 3");
+        }
+        if self.unit.is_some_and(|u| !(u.is_finite() && u > 0.0)) {
+            return wrong("`unit` is not a positive number");
+        }
+        if self.bounds.is_some_and(|b| !finite(b.as_flattened())) {
+            return wrong("`box` is not finite");
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,95 @@
+//! The playback file `.splat4d`: a moving scene, small, readable in parts, checked. docs/format.md is its specification.
+//!
+//! [`write()`] takes a [`Draft`] (floats, sorted into time spans by whoever bakes it), orders, quantises and packs it.
+//! [`Index::parse`] understands the start of a file, [`decode_page`] and [`decode_palette`] any section of it by itself,
+//! and [`read()`] a whole file as a scene of one layer a page.
+
+mod cluster;
+mod index;
+mod layer;
+mod meta;
+mod order;
+mod page;
+mod palette;
+mod read;
+#[cfg(test)]
+mod tests;
+mod write;
+
+pub use index::{Codec, Entry, Index, Kind};
+pub use meta::{Meta, NamedCamera, PathKey, Viewpoint};
+pub use page::{Page, Record, decode_page};
+pub use palette::{Palette, decode_palette};
+pub use read::read;
+pub use write::{ErrorStat, Errors, Summary, WriteConfig, write};
+
+/// First bytes of a playback file.
+pub const MAGIC: [u8; 8] = *b"\x89S4D\r\n\x1a\n";
+/// The version that this library writes: major, minor.
+pub const VERSION: [u16; 2] = [1, 0];
+/// Bytes of the header.
+pub const HEADER_BYTES: usize = 64;
+/// Gaussians in a block, which share ranges.
+pub const BLOCK_GAUSSIANS: usize = 256;
+/// Most Gaussians of a page: 2 MiB of words, and a row number has 16 bits.
+pub const MAX_PAGE_GAUSSIANS: usize = 65_536;
+/// Words of a Gaussian.
+pub const PAGE_WORDS: usize = 8;
+/// Numbers in a block's header.
+pub const BLOCK_HEADER: usize = 24;
+/// Most entries of a palette: labels have 16 bits.
+pub const MAX_PALETTE: usize = 65_536;
+/// The least importance a `σ` has before it counts as dead, as everywhere: 1/255.
+const ALPHA_MIN: f64 = crate::layers::ALPHA_MIN;
+
+/// One Gaussian in floats that moves on a straight line and turns at an even rate, before quantisation (docs/format.md,
+/// "Page").
+#[derive(Clone, Debug, PartialEq)]
+pub struct Primitive {
+    /// Mean at `center`, scene units.
+    pub mean: [f64; 3],
+    /// Middle of its life, and the time to which mean and rotation belong, seconds.
+    pub center: f64,
+    /// Seconds before and after the centre for which it is fully there; infinite: it lives for ever.
+    pub half_width: f64,
+    /// Standard deviation of the Gaussian tails of its life, seconds.
+    pub softness: f64,
+    /// Rotation wxyz at `center`; need not be normalised.
+    pub quat: [f32; 4],
+    /// Standard deviations along its axes, scene units.
+    pub scales: [f32; 3],
+    /// Opacity in the middle of its life, 0 to 1.
+    pub opacity: f32,
+    /// Scene units a second.
+    pub velocity: [f32; 3],
+    /// Angular velocity about the world's axes, radians a second.
+    pub turn: [f32; 3],
+    /// ½ + Y₀₀·(SH coefficient 0), not clamped.
+    pub base_color: [f32; 3],
+    /// SH coefficients k = 1 … 15 of channel c at 3(k − 1) + c; those above the scene's degree are not read.
+    pub sh_rest: [f32; 45],
+    /// How much it adds to pictures; any unit. Decides tiers and how much the palette cares.
+    pub importance: f32,
+}
+
+/// Gaussians that are drawn for from ≤ t < to.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Node {
+    /// First second.
+    pub from: f64,
+    /// The second at which it ends.
+    pub to: f64,
+    /// In any order.
+    pub primitives: Vec<Primitive>,
+}
+
+/// All that goes into a playback file.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Draft {
+    /// About the scene; `gaussians` is counted by the writer.
+    pub meta: Meta,
+    /// Spans of time.
+    pub nodes: Vec<Node>,
+    /// A JPEG or PNG picture.
+    pub poster: Option<Vec<u8>>,
+}

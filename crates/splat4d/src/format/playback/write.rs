@@ -1,0 +1,351 @@
+//! Writes a playback file: tiers, order, palette, pages, and the index before them.
+
+use super::cluster::cluster;
+use super::index::crc;
+use super::page::{encode_page, parse_page};
+use super::{Codec, Draft, Entry, Index, Kind, MAX_PAGE_GAUSSIANS, MAX_PALETTE, Node, Page, Palette, VERSION, order};
+use crate::math::{Rng, quat, sh};
+use crate::{Error, Result};
+use std::io::Write;
+
+/// Gaussians an entry of the palette: an entry costs 45 bytes, so that it adds under 4 bytes to each of its Gaussians.
+const GAUSSIANS_PER_ENTRY: usize = 12;
+/// A palette may always have this many entries: 11 kB.
+const SMALL_PALETTE: usize = 256;
+/// Share of a node's Gaussians in its first tier, and the least worth a page of its own.
+const FIRST_TIER: f64 = 0.25;
+const SMALLEST_TIER: usize = 4096;
+/// A poster up to this size comes before everything else; a larger one would only delay the first picture.
+const SMALL_POSTER: usize = 64 << 10;
+/// The palette takes a Gaussian's importance for at least and at most this many times the mean.
+const WEIGHTS: [f32; 2] = [0.01, 100.0];
+
+/// How to write.
+#[derive(Clone, Debug, PartialEq)]
+pub struct WriteConfig {
+    /// Most entries of the palette, at most 65,536. There are never more than one for 12 Gaussians (or 256 in all).
+    pub palette: usize,
+    /// Rounds of k-means for the palette.
+    pub kmeans_rounds: usize,
+    /// Gaussians in the first tier of a node; 0: a quarter of them, at least 4096.
+    pub tier: usize,
+    /// Effort of deflate, 0 to 9.
+    pub deflate_level: u32,
+    /// Seed of the palette's start.
+    pub seed: u64,
+}
+
+impl Default for WriteConfig {
+    fn default() -> Self {
+        Self { palette: 8192, kmeans_rounds: 8, tier: 0, deflate_level: 6, seed: 0 }
+    }
+}
+
+/// Root mean square and largest of some differences.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct ErrorStat {
+    /// Root mean square.
+    pub rms: f64,
+    /// Largest.
+    pub max: f64,
+    count: f64,
+}
+
+impl ErrorStat {
+    fn add(&mut self, difference: f64) {
+        let d = difference.abs();
+        self.max = self.max.max(d);
+        // Until `finish` the sum of squares stands in `rms`.
+        self.rms += d * d;
+        self.count += 1.0;
+    }
+
+    fn finish(&mut self) {
+        self.rms = (self.rms / f64::max(self.count, 1.0)).sqrt();
+    }
+}
+
+/// What quantisation changed.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Errors {
+    /// Means in the middle of lives, per axis, scene units.
+    pub mean: ErrorStat,
+    /// Scales, difference of logarithms.
+    pub scale: ErrorStat,
+    /// Rotations in the middle of lives, radians.
+    pub rotation: ErrorStat,
+    /// Opacity in the middle of lives.
+    pub opacity: ErrorStat,
+    /// Half-widths and softness of lives, seconds.
+    pub life: ErrorStat,
+    /// Velocities, scene units a second and axis.
+    pub velocity: ErrorStat,
+    /// Angular velocities, radians a second and axis.
+    pub turn: ErrorStat,
+    /// Base colours, per channel.
+    pub base_color: ErrorStat,
+    /// Coefficients of the spherical harmonics above degree 0.
+    pub sh: ErrorStat,
+}
+
+/// What was written.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Summary {
+    /// Bytes of the file.
+    pub bytes: u64,
+    /// Pages.
+    pub pages: usize,
+    /// Records in all pages.
+    pub gaussians: usize,
+    /// Entries of the palette, 0 where there is none.
+    pub palette_entries: usize,
+    /// Stored bytes of all pages.
+    pub page_bytes: u64,
+    /// Stored bytes of the palette.
+    pub palette_bytes: u64,
+    /// Stored bytes of the poster.
+    pub poster_bytes: u64,
+    /// What quantisation changed.
+    pub errors: Errors,
+}
+
+/// Some Gaussians of a node that become a page.
+struct Piece {
+    node: usize,
+    tier: u16,
+    rows: Vec<u32>,
+}
+
+/// Writes a playback file. The order of a node's primitives does not matter, but decides between equals.
+///
+/// Errors: numbers that are not finite, spans or metadata out of range, the sink's.
+/// Panics: a node has more than 4 billion Gaussians.
+pub fn write(draft: &Draft, config: &WriteConfig, out: &mut dyn Write) -> Result<Summary> {
+    let mut meta = draft.meta.clone();
+    meta.gaussians = draft.nodes.iter().map(|n| n.primitives.len()).sum();
+    meta.check()?;
+    draft.nodes.iter().enumerate().try_for_each(|(i, n)| check(n).map_err(|e| e.at(format!("node {i}"))))?;
+    let (palette, labels) = palette(draft, config);
+    let mut summary = Summary { gaussians: meta.gaussians, ..Summary::default() };
+    let mut file = Index { version: VERSION, file_len: 0, meta, sections: Vec::new() };
+    let mut bodies: Vec<Vec<u8>> = Vec::new();
+    let mut add = |entry: Entry, body: Vec<u8>, sections: &mut Vec<Entry>| {
+        let (entry, stored) = pack(entry, body, config.deflate_level);
+        let size = u64::from(entry.stored);
+        sections.push(entry);
+        bodies.push(stored);
+        size
+    };
+
+    let poster = draft.poster.as_ref().filter(|p| !p.is_empty());
+    let poster_first = poster.is_some_and(|p| p.len() <= SMALL_POSTER);
+    if let Some(p) = poster.filter(|_| poster_first) {
+        summary.poster_bytes = add(entry(Kind::Poster), p.clone(), &mut file.sections);
+    }
+    // First what the first picture needs: the important Gaussians of the clip's start in their base colours, what
+    // colours them, the rest of them; then time goes on.
+    let start = draft.meta.clip[0];
+    let mut pieces = pieces(draft, config);
+    let holds = |p: &Piece| draft.nodes[p.node].from <= start && start < draft.nodes[p.node].to;
+    pieces.sort_by(|a, b| {
+        let (na, nb) = (&draft.nodes[a.node], &draft.nodes[b.node]);
+        let (first_a, first_b) = (holds(a), holds(b));
+        let by_time = na.from.total_cmp(&nb.from).then(nb.to.total_cmp(&na.to)).then(a.node.cmp(&b.node));
+        let by_tier = a.tier.cmp(&b.tier);
+        // At the start all nodes are wanted at once, and a tier goes before a node; later it is the other way round.
+        first_b.cmp(&first_a).then(if first_a && first_b { by_tier.then(by_time) } else { by_time.then(by_tier) })
+    });
+    let before = pieces.iter().take_while(|p| p.tier == 0 && holds(p)).count();
+    let palette_at = (file.sections.len() + before) as u32;
+    let mut page_number = 0;
+    for place in 0..=pieces.len() {
+        if place == before
+            && let Some(p) = &palette
+        {
+            let degree = p.degree as u16;
+            let e = Entry { degree, count: p.entries as u32, required: true, ..entry(Kind::Palette) };
+            summary.palette_bytes = add(e, p.bytes(), &mut file.sections);
+            summary.palette_entries = p.entries;
+        }
+        let Some(piece) = pieces.get_mut(place) else { break };
+        let node = &draft.nodes[piece.node];
+        let span = [node.from, node.to];
+        order::sort(&mut piece.rows, &node.primitives, span);
+        let rows: Vec<_> = piece
+            .rows
+            .iter()
+            .map(|&i| (&node.primitives[i as usize], labels.get(piece.node).map_or(0, |l| l[i as usize])))
+            .collect();
+        let body = encode_page(&rows, span);
+        let e = Entry {
+            required: true,
+            tier: piece.tier,
+            count: rows.len() as u32,
+            span,
+            palette: palette.is_some().then_some(palette_at),
+            ..entry(Kind::Page)
+        };
+        let page = parse_page(&body, &e).expect("a page that was just written");
+        compare(&mut summary.errors, &page, &rows, palette.as_ref());
+        summary.page_bytes += add(e, body, &mut file.sections);
+        page_number += 1;
+    }
+    if let Some(p) = poster.filter(|_| !poster_first) {
+        summary.poster_bytes = add(entry(Kind::Poster), p.clone(), &mut file.sections);
+    }
+    summary.pages = page_number;
+    let head = file.bytes(concat!("splat4d ", env!("CARGO_PKG_VERSION")));
+    summary.bytes = file.file_len;
+    summary.errors.finish();
+    let mut write = |bytes: &[u8]| out.write_all(bytes).map_err(|e| Error::io("the scene could not be written", e));
+    write(&head)?;
+    bodies.iter().try_for_each(|b| write(b))?;
+    Ok(summary)
+}
+
+/// An entry of a kind, all else empty.
+fn entry(kind: Kind) -> Entry {
+    Entry {
+        kind,
+        required: false,
+        offset: 0,
+        stored: 0,
+        bytes: 0,
+        crc: 0,
+        codec: Codec::Raw,
+        tier: 0,
+        degree: 0,
+        count: 0,
+        span: [0.0; 2],
+        palette: None,
+    }
+}
+
+/// Deflates a section where that makes it smaller; pictures are compressed already.
+fn pack(mut entry: Entry, body: Vec<u8>, level: u32) -> (Entry, Vec<u8>) {
+    entry.bytes = u32::try_from(body.len()).expect("a section has less than 4 GiB");
+    let mut stored = body;
+    if entry.kind != Kind::Poster {
+        let mut encoder = flate2::write::DeflateEncoder::new(Vec::new(), flate2::Compression::new(level.min(9)));
+        encoder.write_all(&stored).expect("a vector takes every byte");
+        let small = encoder.finish().expect("a vector takes every byte");
+        if small.len() < stored.len() {
+            (stored, entry.codec) = (small, Codec::Deflate);
+        }
+    }
+    (entry.stored, entry.crc) = (stored.len() as u32, crc(&stored));
+    (entry, stored)
+}
+
+/// Refuses what cannot be written.
+fn check(node: &Node) -> Result<()> {
+    if !(node.from.is_finite() && node.to.is_finite() && node.from < node.to) {
+        return Err(Error::input(format!("a part of a scene cannot last from {} to {} s", node.from, node.to)));
+    }
+    assert!(u32::try_from(node.primitives.len()).is_ok(), "a node has at most 4 billion Gaussians");
+    for (i, p) in node.primitives.iter().enumerate() {
+        let numbers = p.mean.iter().chain([&p.center, &p.softness]).all(|x| (*x as f32).is_finite());
+        let shape = p.quat.iter().chain(&p.scales).chain(&p.velocity).chain(&p.turn);
+        let color = p.base_color.iter().chain(&p.sh_rest).chain([&p.opacity, &p.importance]);
+        if !numbers || p.half_width.is_nan() || !shape.chain(color).all(|x| x.is_finite()) {
+            return Err(Error::input(format!("Gaussian {i} holds NaN or infinity"))
+                .remedy("Leave it out, or train or export the scene again"));
+        }
+    }
+    Ok(())
+}
+
+/// Divides nodes into pages: the first tier, then the rest, by importance.
+fn pieces(draft: &Draft, config: &WriteConfig) -> Vec<Piece> {
+    let mut out = Vec::new();
+    for (node, n) in draft.nodes.iter().enumerate() {
+        let mut rows: Vec<u32> = (0..n.primitives.len() as u32).collect();
+        let importance = |i: u32| n.primitives[i as usize].importance;
+        rows.sort_by(|&a, &b| importance(b).total_cmp(&importance(a)).then(a.cmp(&b)));
+        let quarter = ((rows.len() as f64 * FIRST_TIER) as usize).max(SMALLEST_TIER);
+        let first = if config.tier > 0 { config.tier } else { quarter }.min(MAX_PAGE_GAUSSIANS);
+        // A rest that is smaller than its tier is not worth another request.
+        let first = if rows.len() < 2 * first && rows.len() <= MAX_PAGE_GAUSSIANS { rows.len() } else { first };
+        let (head, rest) = rows.split_at(first);
+        let size = rest.len().div_ceil(rest.len().div_ceil(MAX_PAGE_GAUSSIANS).max(1)).max(1);
+        for (tier, rows) in std::iter::once(head).chain(rest.chunks(size)).filter(|r| !r.is_empty()).enumerate() {
+            out.push(Piece { node, tier: tier.min(usize::from(u16::MAX)) as u16, rows: rows.to_vec() });
+        }
+    }
+    out
+}
+
+/// The palette, and every Gaussian's entry by node. None, and no labels, for scenes of degree 0.
+fn palette(draft: &Draft, config: &WriteConfig) -> (Option<Palette>, Vec<Vec<u16>>) {
+    let degree = draft.meta.sh_degree;
+    let width = 3 * (sh::coeffs(degree) - 1);
+    let all = || draft.nodes.iter().flat_map(|n| &n.primitives);
+    let n = all().count();
+    if width == 0 || n == 0 {
+        return (None, Vec::new());
+    }
+    let points: Vec<f32> = all().flat_map(|p| &p.sh_rest[..width]).copied().collect();
+    let importance = |p: &super::Primitive| f64::from(p.importance.max(0.0));
+    let mean = all().map(importance).sum::<f64>() / n as f64;
+    let weight = |p| if mean > 0.0 { (importance(p) / mean) as f32 } else { 1.0 };
+    let weights: Vec<f32> = all().map(|p| weight(p).clamp(WEIGHTS[0], WEIGHTS[1])).collect();
+    let worth = (n / GAUSSIANS_PER_ENTRY).max(SMALL_PALETTE);
+    let entries = config.palette.clamp(1, MAX_PALETTE).min(worth);
+    let clusters =
+        cluster(&points, width, &weights, entries, config.kmeans_rounds, Rng::new(config.seed, "palette", 0));
+    let mut labels = clusters.labels.iter().map(|&l| l as u16);
+    let by_node = draft.nodes.iter().map(|n| labels.by_ref().take(n.primitives.len()).collect()).collect();
+    (Some(Palette::new(degree, &clusters.centroids)), by_node)
+}
+
+/// Adds a page's errors.
+fn compare(errors: &mut Errors, page: &Page, rows: &[(&super::Primitive, u16)], palette: Option<&Palette>) {
+    for (i, (p, _)) in rows.iter().enumerate() {
+        let r = page.record(i);
+        let delta = r.center - p.center;
+        for k in 0..3 {
+            let velocity = f64::from(p.velocity[k]);
+            errors.mean.add(r.mean[k] - p.mean[k] - velocity * delta);
+            errors.scale.add((r.scales[k] / f64::from(p.scales[k]).max(f64::MIN_POSITIVE)).ln());
+            errors.velocity.add(r.velocity[k] - velocity);
+            errors.turn.add(r.turn[k] - f64::from(p.turn[k]));
+            errors.base_color.add(r.base_color[k] - f64::from(p.base_color[k]));
+        }
+        let start = quat::normalize(p.quat.map(f64::from)).0;
+        let rate = super::page::rate(start, p.turn.map(f64::from));
+        let q = quat::normalize::<f64>(std::array::from_fn(|k| start[k] + delta * rate[k])).0;
+        let distance = |s: f64| (0..4).map(|k| (q[k] - s * r.quat[k]).powi(2)).sum::<f64>().sqrt();
+        errors.rotation.add(4.0 * (distance(1.0).min(distance(-1.0)) / 2.0).asin());
+        errors.opacity.add(r.opacity - f64::from(p.opacity));
+        if r.half_width.is_finite() {
+            errors.life.add(r.half_width - p.half_width);
+            errors.life.add(r.softness - p.softness);
+        }
+        for plane in 0..palette.map_or(0, Palette::width) {
+            let value = palette.map_or(0.0, |pal| pal.value(usize::from(r.label), plane));
+            errors.sh.add(f64::from(value - p.sh_rest[plane]));
+        }
+    }
+}
+
+impl Errors {
+    /// All by name.
+    pub fn named(&self) -> [(&'static str, ErrorStat); 9] {
+        [
+            ("mean", self.mean),
+            ("scale", self.scale),
+            ("rotation", self.rotation),
+            ("opacity", self.opacity),
+            ("life", self.life),
+            ("velocity", self.velocity),
+            ("turn", self.turn),
+            ("base colour", self.base_color),
+            ("spherical harmonics", self.sh),
+        ]
+    }
+
+    fn finish(&mut self) {
+        let Self { mean, scale, rotation, opacity, life, velocity, turn, base_color, sh } = self;
+        [mean, scale, rotation, opacity, life, velocity, turn, base_color, sh].into_iter().for_each(ErrorStat::finish);
+    }
+}
