@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 const ORDER: [(&str, &[&str]); 3] = [
     (
         "crates/splat4d",
-        &["error", "math", "gpu", "scene", "nn", "motion", "layers", "render", "flow", "format", "play", "edit"],
+        &["error", "math", "gpu", "scene", "nn", "motion", "layers", "render", "flow", "format", "bake", "play", "edit"],
     ),
     (
         "crates/splat4d-train",
@@ -33,6 +33,7 @@ const ORDER: [(&str, &[&str]); 3] = [
             "paths",
             "run_folder",
             "source",
+            "baking",
             "report",
             "finish",
             "verbs",

@@ -1,12 +1,13 @@
-//! What follows training: scores and pictures of held-out views, an orbit film and the report.
+//! What follows training: scores and pictures of held-out views, an orbit film, the playback file and the report.
 
+use crate::baking::{Baking, bake_into};
 use crate::console::Console;
 use crate::draw::{Channel, Painter};
 use crate::files;
 use crate::paths::{Clock, Route, Stage, shots};
 use crate::report;
 use crate::run_folder::Run;
-use crate::source::{not_empty, read_scene};
+use crate::source::{Source, not_empty, read_scene};
 use crate::video::{Film, have_ffmpeg};
 use serde_json::{Value, json};
 use splat4d::layers::Scene;
@@ -44,7 +45,7 @@ impl Measure {
     }
 }
 
-/// Scores, film and report.
+/// Scores, film, playback file and report.
 pub(crate) fn all(run: &Path, measure: &Measure, console: &Console) -> anyhow::Result<()> {
     let scene = read_scene(&Run::open(run)?.scene_file()?)?;
     let started = Instant::now();
@@ -59,7 +60,32 @@ pub(crate) fn all(run: &Path, measure: &Measure, console: &Console) -> anyhow::R
         // The scene and its scores stand without the film.
         Err(error) => console.warn(&format!("there is no orbit film: {error:#}")),
     }
+    playback(run, console)?;
     write_report(run, console)
+}
+
+/// Bakes the run into `scene.splat4d`. What goes wrong is said and never costs the run.
+pub(crate) fn playback(run: &Path, console: &Console) -> Result<()> {
+    let baked = Source::open(run).map_err(anyhow::Error::from).and_then(|source| {
+        not_empty(&source.scene, run)?;
+        let title = Run::open(run)?.name();
+        bake_into(&source, &title, &run.join("scene.splat4d"), &Baking::default(), console)
+    });
+    console.clear();
+    match baked {
+        Ok(report) => amend(
+            run,
+            [
+                ("playback_bytes".into(), report["bytes"].clone()),
+                ("playback_psnr".into(), report["likeness"]["psnr"].clone()),
+                ("playback_seconds".into(), report["seconds"].clone()),
+            ],
+        ),
+        Err(error) => {
+            console.warn(&format!("there is no playback file: {error:#}"));
+            Ok(())
+        }
+    }
 }
 
 /// Renders and scores the held-out views.

@@ -2,6 +2,7 @@
 //!
 //! Each verb is a file in `verbs`. Only this crate prints, parses arguments or exits: 0 done, 1 failed, 2 bad input.
 
+mod baking;
 mod camera_file;
 mod console;
 mod draw;
@@ -33,6 +34,7 @@ Examples:
   splat4d train --resume runs/my-take      continue exactly where a run stopped
   splat4d eval runs/knight --baseline      measure again, next to a scene that stands still
   splat4d render runs/knight -o turn.mp4   film an orbit through space and time
+  splat4d bake runs/knight -o knight.splat4d       one small, seekable file for players
   splat4d export runs/knight -o now.ply --time 0.5
   splat4d info my-take                     what is in a capture, run or file; is it healthy?
 
@@ -70,6 +72,7 @@ enum Verb {
     Train(Box<verbs::train::Args>),
     Eval(verbs::eval::Args),
     Render(verbs::render::Args),
+    Bake(verbs::bake::Args),
     Export(verbs::export::Args),
     Info(verbs::info::Args),
     Completions(verbs::completions::Args),
@@ -93,6 +96,7 @@ fn main() -> ExitCode {
         Verb::Train(args) => verbs::train::run(&args, &console),
         Verb::Eval(args) => verbs::eval::run(&args, &console),
         Verb::Render(args) => verbs::render::run(&args, &console),
+        Verb::Bake(args) => verbs::bake::run(&args, &console),
         Verb::Export(args) => verbs::export::run(&args, &console),
         Verb::Info(args) => verbs::info::run(&args, &console),
         Verb::Completions(args) => verbs::completions::run(&args, &console),

@@ -14,10 +14,11 @@ use std::path::{Path, PathBuf};
 /// Files that mark a folder as a run.
 const MARKERS: [&str; 4] = ["recipe.toml", "run.json", "scene.safetensors", "checkpoints"];
 /// What splat4d writes into a run; `--force` replaces these and nothing else.
-const OURS: [&str; 15] = [
+const OURS: [&str; 16] = [
     "recipe.toml",
     "run.json",
     "scene.safetensors",
+    "scene.splat4d",
     "checkpoints",
     "metrics.csv",
     "results.json",

@@ -41,7 +41,8 @@ impl Source {
             return Ok(Self { scene, run: None, ply: None });
         }
         let (params, info) = format::ply::read(&bytes).map_err(|e| e.at(path.display()))?;
-        let layer = Layer { name: "ply".into(), params, motion: Arc::new(Still), life: LifeKind::Infinite, span: ALWAYS };
+        let layer =
+            Layer { name: "ply".into(), params, motion: Arc::new(Still), life: LifeKind::Infinite, span: ALWAYS };
         let scene =
             Scene { layers: vec![layer], up: PLY_UP, fps: splat4d::scene::time::DEFAULT_FPS, ..Scene::default() };
         Ok(Self { scene, run: None, ply: Some(info) })

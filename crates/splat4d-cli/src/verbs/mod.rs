@@ -1,5 +1,6 @@
 //! A file per verb: its options, its help and what it does.
 
+pub(crate) mod bake;
 pub(crate) mod completions;
 pub(crate) mod eval;
 pub(crate) mod export;

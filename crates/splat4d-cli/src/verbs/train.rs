@@ -69,7 +69,7 @@ pub(crate) struct Args {
     image_memory: Option<u64>,
     #[command(flatten)]
     measure: finish::Measure,
-    /// Only train: no evaluation, film or report
+    /// Only train and bake: no evaluation, film or report
     #[arg(long, help_heading = "What is measured")]
     no_eval: bool,
 
@@ -129,7 +129,9 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         .into());
     }
     console.say(&format!("wrote {}", run.join("scene.safetensors").display()));
-    if !args.no_eval {
+    if args.no_eval {
+        finish::playback(&run, console)?;
+    } else {
         finish::all(&run, &args.measure, console)?;
     }
     console.emit(&json!({"type": "done", "run": run}));

@@ -1,0 +1,246 @@
+//! A scene becomes a playback file: baked, written, read back and compared with its model.
+
+use crate::console::Console;
+use crate::draw::{Painter, color_rgb};
+use crate::files::{self, grouped, human_bytes};
+use crate::paths::{Stage, View};
+use crate::run_folder::Run;
+use crate::source::Source;
+use image::codecs::jpeg::JpegEncoder;
+use serde_json::{Value, json};
+use splat4d::bake::{self, Options, Shown, bake};
+use splat4d::format::playback::{self, Draft, Meta, NamedCamera, Node, PathKey, Viewpoint, WriteConfig};
+use splat4d::layers::Scene;
+use splat4d::render::{Antialias, RenderConfig};
+use splat4d::scene::Camera;
+use std::path::Path;
+use std::time::Instant;
+
+/// Cameras and moments at which baked and model are compared; every one costs two pictures.
+const COMPARED_CAMERAS: usize = 4;
+const COMPARED_TIMES: usize = 6;
+/// Longer side of those pictures, pixels.
+const COMPARED_SIDE: usize = 800;
+/// Most bytes of a poster: it comes before everything else.
+const POSTER_BYTES: usize = 30 << 10;
+/// Longer side of a poster and JPEG qualities, tried in turn until it is small enough.
+const POSTERS: [(usize, u8); 5] = [(640, 85), (640, 70), (480, 70), (320, 60), (160, 50)];
+/// Most cameras that the file names: a player lists them.
+const NAMED_CAMERAS: usize = 200;
+/// Keys of the default path, an orbit, and seconds from key to key.
+const PATH_KEYS: usize = 16;
+const PATH_STEP: f64 = 0.75;
+
+/// What may be told.
+#[derive(Clone, Debug)]
+pub(crate) struct Baking {
+    pub options: Options,
+    /// Most entries of the palette.
+    pub palette: usize,
+    pub poster: bool,
+}
+
+impl Default for Baking {
+    fn default() -> Self {
+        Self { options: Options::default(), palette: WriteConfig::default().palette, poster: true }
+    }
+}
+
+/// Bakes into the file `out` and says how well; returns the report. The options' cameras are the source's.
+pub(crate) fn bake_into(
+    source: &Source,
+    title: &str,
+    out: &Path,
+    baking: &Baking,
+    console: &Console,
+) -> anyhow::Result<Value> {
+    let started = Instant::now();
+    let scene = &source.scene;
+    let views = source.views()?;
+    let stage = source.stage(&views);
+    let cameras = distinct(&views);
+    let options = Options { cameras: cameras.iter().map(|v| v.camera.clone()).collect(), ..baking.options.clone() };
+    let baked = bake(scene, &options, &mut |done, total| console.phase("baking", done, total))?;
+    let antialias = source.run.as_ref().and_then(|r| r.recipe().ok()).is_some_and(|r| r.antialias);
+    let meta = Meta { title: title.to_owned(), ..meta(scene, &baked, &stage, &cameras) };
+    let poster = baking.poster.then(|| poster(scene, &stage, antialias)).flatten();
+    console.phase("writing", 0, 0);
+    let draft = Draft { meta, nodes: baked.nodes, poster };
+    let config = WriteConfig { palette: baking.palette, ..WriteConfig::default() };
+    let mut bytes = Vec::new();
+    let summary = playback::write(&draft, &config, &mut bytes)?;
+    files::write(out, &bytes)?;
+    let seconds = started.elapsed().as_secs_f64();
+
+    let likeness = compare(scene, &bytes, &stage, &cameras, antialias, console)?;
+    console.clear();
+    let report = &baked.report;
+    let quantised: serde_json::Map<String, Value> = summary
+        .errors
+        .named()
+        .iter()
+        .map(|(name, e)| ((*name).to_owned(), json!({"rms": e.rms, "max": e.max})))
+        .collect();
+    let value = json!({
+        "type": "baked", "file": out, "bytes": summary.bytes, "seconds": seconds, "clip": baked.clip,
+        "bytes_per_primitive": summary.bytes as f64 / report.primitives.max(1) as f64,
+        "pages": summary.pages, "page_bytes": summary.page_bytes, "palette_entries": summary.palette_entries,
+        "palette_bytes": summary.palette_bytes, "poster_bytes": summary.poster_bytes, "baking": report,
+        "likeness": likeness, "quantisation": quantised,
+    });
+    say(report, likeness.as_ref(), summary.bytes, seconds, console);
+    if antialias {
+        console.warn(
+            "the run was trained with antialias = true, which playback files cannot hold: thin things look stronger \
+             in the player.",
+        );
+    }
+    console.emit(&value);
+    console.written(out);
+    Ok(value)
+}
+
+fn say(report: &bake::Report, likeness: Option<&bake::Likeness>, bytes: u64, seconds: f64, console: &Console) {
+    let mut words = format!(
+        "{} Gaussians became {} primitives in {} spans of time, {} in {seconds:.1} s",
+        grouped(report.gaussians),
+        grouped(report.primitives),
+        grouped(report.nodes),
+        human_bytes(bytes)
+    );
+    for (count, what) in [
+        (report.split, "were split"),
+        (report.key_states, "primitives last one frame only"),
+        (report.unseen, "are never seen"),
+    ] {
+        if count > 0 {
+            words += &format!("; {} {what}", grouped(count));
+        }
+    }
+    console.say(&words);
+    let e = &report.errors;
+    if e.worst > 0.0 {
+        console.say(&format!(
+            "error a Gaussian: median {:.3} px, 99 of 100 below {:.3} px, worst {:.3} px (tolerance {} px)",
+            e.median, e.p99, e.worst, report.tolerance
+        ));
+    }
+    if let Some(l) = likeness {
+        console.say(&format!(
+            "the file against its model: {:.2} dB over {} pictures, {:.2} dB in the worst ({:.2} s)",
+            l.psnr, l.pictures, l.worst_psnr, l.worst_time
+        ));
+    }
+}
+
+/// Reads the file back and compares what it shows with what the model shows.
+fn compare(
+    scene: &Scene<f32>,
+    bytes: &[u8],
+    stage: &Stage,
+    views: &[&View],
+    antialias: bool,
+    console: &Console,
+) -> anyhow::Result<Option<bake::Likeness>> {
+    let played = playback::read(bytes)?;
+    let mut cameras: Vec<Camera> = views
+        .iter()
+        .step_by(views.len().div_ceil(COMPARED_CAMERAS).max(1))
+        .map(|v| v.camera.downscaled(v.camera.width.max(v.camera.height).div_ceil(COMPARED_SIDE).max(1)))
+        .collect();
+    if cameras.is_empty() {
+        cameras = (0..COMPARED_CAMERAS).map(|i| stage.orbit(i as f64 / COMPARED_CAMERAS as f64)).collect();
+    }
+    let [from, to] = scene.clip;
+    // In the middle of equal parts: neither only on frames nor only between them.
+    let mut times: Vec<f64> =
+        (0..COMPARED_TIMES).map(|i| from + (to - from) * (i as f64 + 0.5) / COMPARED_TIMES as f64).collect();
+    times.dedup();
+    let antialias = if antialias { Antialias::On } else { Antialias::Off };
+    let config = RenderConfig { antialias, ..RenderConfig::default() };
+    Ok(bake::compare(scene, Shown::File(&played), &cameras, &times, &config, &mut |done, total| {
+        console.phase("comparing with the model", done, total);
+    }))
+}
+
+/// Every camera once, by name, spread over the rig where there are too many.
+fn distinct(views: &[View]) -> Vec<&View> {
+    let mut seen = std::collections::BTreeSet::new();
+    let all: Vec<&View> = views.iter().filter(|v| seen.insert(v.name.as_str())).collect();
+    let stride = all.len().div_ceil(NAMED_CAMERAS).max(1);
+    all.into_iter().step_by(stride).collect()
+}
+
+/// What the file says about the scene.
+fn meta(scene: &Scene<f32>, baked: &bake::Baked, stage: &Stage, views: &[&View]) -> Meta {
+    let named = |view: &&View| {
+        let (camera, world) = (&view.camera, view.camera.cam_from_world.inverse());
+        let k = &camera.intrinsics;
+        NamedCamera {
+            name: view.name.clone(),
+            world_from_camera: std::array::from_fn(|i| match i % 4 {
+                3 => world.translation[i / 4],
+                column => world.rotation[i / 4][column],
+            }),
+            width: camera.width,
+            height: camera.height,
+            fx: k.fx,
+            fy: k.fy,
+            cx: k.cx,
+            cy: k.cy,
+        }
+    };
+    let look = |share: f64| {
+        let camera = stage.orbit(share);
+        let fov = 2.0 * (0.5 * camera.height as f64 / camera.intrinsics.fy).atan();
+        Viewpoint { position: camera.center(), target: stage.center, up: stage.up, fov_y: fov.to_degrees() }
+    };
+    let key = |i: usize| {
+        let Viewpoint { position, target, up, fov_y } = look(i as f64 / PATH_KEYS as f64);
+        PathKey { at: i as f64 * PATH_STEP, position, target, up, fov_y, time: None }
+    };
+    let fps = if scene.fps > 0.0 && scene.fps.is_finite() { scene.fps } else { splat4d::scene::time::DEFAULT_FPS };
+    Meta {
+        clip: baked.clip,
+        fps,
+        up: scene.up,
+        background: scene.background,
+        sh_degree: baked.sh_degree,
+        bounds: bounds(&baked.nodes),
+        view: Some(look(0.0)),
+        cameras: views.iter().map(named).collect(),
+        // The last key is the first again, so that the orbit closes.
+        path: (0..=PATH_KEYS).map(key).collect(),
+        ..Meta::default()
+    }
+}
+
+/// Least and greatest corner of the means.
+fn bounds(nodes: &[Node]) -> Option<[[f64; 3]; 2]> {
+    let means = || nodes.iter().flat_map(|n| &n.primitives).map(|p| p.mean);
+    means().next()?;
+    let fold =
+        |start: f64, f: fn(f64, f64) -> f64| means().fold([start; 3], |b, m| std::array::from_fn(|k| f(b[k], m[k])));
+    Some([fold(f64::INFINITY, f64::min), fold(f64::NEG_INFINITY, f64::max)])
+}
+
+/// The first view at the clip's start as a JPEG that is small enough.
+fn poster(scene: &Scene<f32>, stage: &Stage, antialias: bool) -> Option<Vec<u8>> {
+    let mut painter = Painter::new(scene, scene.background, antialias);
+    let camera = stage.orbit(0.0);
+    POSTERS.iter().find_map(|&(side, quality)| {
+        let shrink = camera.width.max(camera.height).div_ceil(side).max(1);
+        painter.draw(&camera.downscaled(shrink), scene.clip[0]);
+        let rgb = color_rgb(&painter.image.color);
+        let picture = image::RgbImage::from_raw(rgb.width as u32, rgb.height as u32, rgb.data)?;
+        let mut bytes = Vec::new();
+        JpegEncoder::new_with_quality(&mut bytes, quality).encode_image(&picture).ok()?;
+        (bytes.len() <= POSTER_BYTES).then_some(bytes)
+    })
+}
+
+/// What people call the scene: the capture's name, or the file's.
+pub(crate) fn title(source: &Source, path: &Path) -> String {
+    let stem = || path.file_stem().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+    source.run.as_ref().map_or_else(stem, Run::name)
+}

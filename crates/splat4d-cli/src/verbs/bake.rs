@@ -1,0 +1,81 @@
+//! `bake`: a run or a scene becomes one file for playback.
+
+use crate::baking::{Baking, bake_into, title};
+use crate::console::Console;
+use crate::files;
+use crate::source::{Source, not_empty};
+use splat4d::Error;
+use splat4d::bake::{MAX_REPEAT, Options, SEGMENT, TOLERANCE};
+use splat4d::format::playback::{MAX_PALETTE, WriteConfig};
+use std::path::PathBuf;
+
+const EXAMPLES: &str = "\
+Examples:
+  splat4d bake runs/knight -o knight.splat4d       everything in one small file that plays anywhere
+  splat4d bake runs/knight -o tight.splat4d --tolerance 0.1
+  splat4d bake runs/knight -o long.splat4d --repeat 20    the take twenty times over, to try long takes
+
+`train` does this at its end: the file is RUN/scene.splat4d.";
+
+/// Bake a scene into one seekable file for players
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub(crate) struct Args {
+    /// The run, scene file or .ply
+    #[arg(value_name = "RUN|FILE")]
+    source: PathBuf,
+    /// The file to write
+    #[arg(short, long, value_name = "OUT.splat4d")]
+    output: PathBuf,
+    /// Largest error of a Gaussian, pixels of the capture's cameras; smaller ones cost more pieces
+    #[arg(long, value_name = "PX", default_value_t = TOLERANCE)]
+    tolerance: f64,
+    /// About how many seconds are fetched for a seek
+    #[arg(long, value_name = "S", default_value_t = SEGMENT)]
+    segment: f64,
+    /// Play the take N times over
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    repeat: usize,
+    /// Most colours-by-direction in the file's palette
+    #[arg(long, value_name = "N", default_value_t = WriteConfig::default().palette)]
+    palette: usize,
+    /// Leave the small picture out that is shown while the file loads
+    #[arg(long)]
+    no_poster: bool,
+    /// Write what was done and how good it is as JSON
+    #[arg(long, value_name = "FILE")]
+    report: Option<PathBuf>,
+}
+
+pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
+    let out = &args.output;
+    if out.extension().is_none_or(|e| !e.eq_ignore_ascii_case("splat4d")) && !out.starts_with("/dev") {
+        return Err(Error::input("the name does not end in .splat4d")
+            .at(out.display())
+            .remedy("Use -o NAME.splat4d.")
+            .into());
+    }
+    if !(1..=MAX_REPEAT).contains(&args.repeat) || !(1..=MAX_PALETTE).contains(&args.palette) {
+        return Err(Error::input("--repeat or --palette is out of range")
+            .remedy(format!("Give 1 to {MAX_REPEAT} rounds and 1 to {MAX_PALETTE} entries."))
+            .into());
+    }
+    let source = Source::open(&args.source)?;
+    not_empty(&source.scene, &args.source)?;
+    let baking = Baking {
+        options: Options {
+            tolerance: args.tolerance,
+            segment: args.segment,
+            repeat: args.repeat,
+            ..Options::default()
+        },
+        palette: args.palette,
+        poster: !args.no_poster,
+    };
+    let report = bake_into(&source, &title(&source, &args.source), out, &baking, console)?;
+    if let Some(path) = &args.report {
+        files::write(path, serde_json::to_string_pretty(&report)?.as_bytes())?;
+        console.written(path);
+    }
+    Ok(())
+}
