@@ -7,3 +7,4 @@ pub(crate) mod export;
 pub(crate) mod info;
 pub(crate) mod render;
 pub(crate) mod train;
+pub(crate) mod view;
