@@ -151,4 +151,5 @@ if (typeof WorkerGlobalScope !== 'undefined' && self instanceof WorkerGlobalScop
     const ms = performance.now() - begin;
     self.postMessage({ order, count, active, ms, generation: data.generation }, [order.buffer]);
   };
+  self.postMessage({ ready: true });
 }

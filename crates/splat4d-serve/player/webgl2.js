@@ -70,13 +70,16 @@ export class WebGL2Backend {
   #base = 0;
   /// Counts pages that came and went; an order carries the number it knew.
   #generation = 0;
-  #shown = 0;
+  /// Orders of an earlier scene carry a smaller number.
+  #least = 0;
+  #clip = [0, 0];
   #orders = [];
   #front = 0;
   #count = 0;
   #returned = null;
   #sorter = null;
   #worker = null;
+  #early = [];
   #sorting = false;
   #asked = { time: NaN, depth: [NaN, 0, 0, 0], generation: -1 };
   #request = { time: 0, depth: [0, 0, 0, 0], near: NEAR };
@@ -142,8 +145,11 @@ export class WebGL2Backend {
     for (const id of [...this.#pages.keys()]) this.dropPage(id);
     this.#palettes.clear();
     this.#paletteRows = 0;
+    this.#clip = meta.clip;
     this.#base = meta.clip[0];
     this.#last = null;
+    this.#count = 0;
+    this.#least = this.#generation;
   }
 
   /// `palette`: of SceneFile.palette.
@@ -218,7 +224,7 @@ export class WebGL2Backend {
   /// Draws with the newest order there is, and asks for a better one where time or camera moved. `target` (a headset's):
   /// {framebuffer, x, y}: where the picture goes instead of the canvas.
   draw({ time, view, channel = 'color', background = [0, 0, 0], depthRange = [0, 1], flowScale = 100, target = null }) {
-    this.#last = { time, view, channel, background, depthRange, flowScale, target };
+    this.#last = { time: Math.min(Math.max(time, this.#clip[0]), this.#clip[1]), view, channel, background, depthRange, flowScale, target };
     this.#ask();
     this.#redraw();
   }
@@ -321,21 +327,34 @@ export class WebGL2Backend {
   // Order
 
   #startWorker() {
-    try {
-      this.#worker = worker('sort.worker.js');
-      this.#worker.onmessage = ({ data }) => this.#sorted(data);
-      // A page's policy may forbid workers: then sorting happens here, and what was sent is sent again by the caller.
-      this.#worker.onerror = (event) => {
-        event.preventDefault?.();
-        throw new SceneError('The sorting worker ended', event.message ?? '', 'Reload the page.');
-      };
-    } catch {
+    // Until the worker says that it runs, messages wait: a page's policy may forbid workers, and then all is done here.
+    const here = () => {
+      this.#worker?.terminate();
       this.#worker = null;
       this.#sorter = new Sorter();
+      for (const [message] of this.#early?.splice(0) ?? []) this.#tell(message);
+      this.#early = null;
+    };
+    try {
+      this.#worker = worker('sort.worker.js');
+    } catch {
+      return here();
     }
+    this.#worker.onmessage = ({ data }) => {
+      if (!data.ready) return this.#sorted(data);
+      const early = this.#early;
+      this.#early = null;
+      for (const [message, move] of early) this.#tell(message, move);
+    };
+    this.#worker.onerror = (event) => {
+      if (!this.#early) return;
+      event.preventDefault?.();
+      here();
+    };
   }
 
   #tell(message, move = []) {
+    if (this.#early && this.#worker) return this.#early.push([message, move]);
     if (this.#worker) return this.#worker.postMessage(message, move);
     if (message.add) this.#sorter.add(message.add);
     else if (message.drop !== undefined) this.#sorter.drop(message.drop);
@@ -362,7 +381,7 @@ export class WebGL2Backend {
     this.#sorting = true;
     const order = this.#returned;
     this.#returned = null;
-    this.#tell({ sort: this.#request, generation: this.#generation, order }, order && this.#worker ? [order.buffer] : []);
+    this.#tell({ sort: this.#request, generation: this.#generation, order }, order ? [order.buffer] : []);
     return true;
   }
 
@@ -377,9 +396,8 @@ export class WebGL2Backend {
     }
     if (count) gl.bufferSubData(gl.ARRAY_BUFFER, 0, order, 0, count);
     this.#front = 1 - this.#front;
-    this.#count = count;
+    this.#count = generation < this.#least ? 0 : count;
     this.#returned = order;
-    this.#shown = generation;
     Object.assign(this.stats, { active, drawn: count, sortMs: ms });
     // What this order no longer names may be overwritten.
     this.#retired = this.#retired.filter((r) => r.generation > generation || (this.#rows.give(r.row, r.count), false));
