@@ -45,7 +45,7 @@ export function path(words, headers, i, span, out) {
 export class Sorter {
   #pages = [];
   #depths = new Float32Array(0);
-  #bits = new Uint32Array(0);
+  #bits = new Int32Array(0);
   #ids = new Uint32Array(0);
   #keys = new Uint16Array(0);
   #starts = new Uint32Array(KEYS);
@@ -80,7 +80,13 @@ export class Sorter {
     this.#pages = this.#pages.filter((p) => p.id !== id);
   }
 
-  /// Room that an order needs, in numbers.
+  /// `order` where it has room for everybody, else a new one: whole rows of ROW numbers.
+  room(order) {
+    const rows = Math.ceil(this.total / ROW);
+    return order?.length >= rows * ROW ? order : new Uint32Array(rows * ROW);
+  }
+
+  /// Gaussians of all pages.
   get total() {
     return this.#pages.reduce((n, p) => n + p.count, 0);
   }
@@ -91,7 +97,7 @@ export class Sorter {
     const total = this.total;
     if (this.#depths.length < total) {
       this.#depths = new Float32Array(total);
-      this.#bits = new Uint32Array(this.#depths.buffer);
+      this.#bits = new Int32Array(this.#depths.buffer);
       this.#ids = new Uint32Array(total);
       this.#keys = new Uint16Array(total);
     }
@@ -121,11 +127,11 @@ export class Sorter {
     // The bits of positive floats grow like their logarithm, bent a little: near and far get alike fine steps.
     this.#range[0] = low;
     this.#range[1] = high;
-    const edge = new Uint32Array(this.#range.buffer);
+    const edge = new Int32Array(this.#range.buffer);
     const least = edge[0], scale = edge[1] > least ? (KEYS - 1) / (edge[1] - least) : 0;
     starts.fill(0);
     for (let i = 0; i < n; i++) {
-      const key = KEYS - 1 - Math.floor((bits[i] - least) * scale);
+      const key = KEYS - 1 - (((bits[i] - least) * scale) | 0);
       keys[i] = key;
       starts[key]++;
     }
@@ -146,9 +152,10 @@ if (typeof WorkerGlobalScope !== 'undefined' && self instanceof WorkerGlobalScop
     if (data.add) return sorter.add(data.add);
     if (data.drop !== undefined) return sorter.drop(data.drop);
     const begin = performance.now();
-    const order = data.order?.length >= sorter.total ? data.order : new Uint32Array(sorter.total);
+    const order = sorter.room(data.order);
     const { count, active } = sorter.sort(data.sort, order);
     const ms = performance.now() - begin;
     self.postMessage({ order, count, active, ms, generation: data.generation }, [order.buffer]);
   };
+  self.postMessage({ ready: true });
 }
