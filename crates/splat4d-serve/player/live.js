@@ -73,10 +73,11 @@ export class Training {
     this.ui = ui;
     this.dot = h('i', { class: 'dot' });
     this.state = h('span', {}, 'Connecting');
+    this.left = h('small');
     this.figures = h('div', { class: 'figures' });
     this.canvas = h('canvas', { role: 'img', 'aria-label': 'Quality over the steps' });
     this.card = h('section', { class: 'card live', 'aria-label': 'Training' },
-      h('div', {}, this.dot, this.state), this.canvas, this.figures);
+      h('div', { class: 'row' }, this.dot, this.state, h('span', { class: 'space' }), this.left), this.canvas, this.figures);
     ui.left.append(this.card);
     ui.root.addEventListener('themechange', () => this.#draw());
     this.resizes = new ResizeObserver(() => this.#draw());
@@ -114,6 +115,7 @@ export class Training {
 
   #finish() {
     this.over = true;
+    this.left.textContent = '';
     this.#show(this.link);
   }
 
@@ -124,11 +126,11 @@ export class Training {
     const count = n => Number(n).toLocaleString('en-GB');
     const left = s => (s > 5400 ? `${(s / 3600).toFixed(1)} h` : s > 90 ? `${Math.round(s / 60)} min` : `${Math.round(s)} s`);
     const cells = [
-      [`${count(data.step)}`, data.of ? `of ${count(data.of)} steps` : 'steps'],
-      [isFinite(data.psnr) ? `${(+data.psnr).toFixed(2)} dB` : '–', 'PSNR'],
+      [count(data.step), data.of ? `of ${count(data.of)} steps` : 'steps'],
+      [isFinite(data.psnr) ? data.psnr.toFixed(2) : '–', 'dB PSNR'],
       [count(data.gaussians ?? 0), 'Gaussians'],
     ];
-    if (data.left > 0) cells.push([left(data.left), 'left']);
+    this.left.textContent = data.left > 0 && !this.over ? `${left(data.left)} left` : '';
     this.figures.replaceChildren(...cells.map(([value, name]) => h('div', {}, value, h('small', {}, name))));
   }
 
