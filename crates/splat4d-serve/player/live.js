@@ -4,6 +4,8 @@ import { h } from './dom.js';
 
 /** Milliseconds before another try to reach the server, doubled up to the second. */
 const RETRY = [500, 8000];
+/** Snapshots told within this time, ms, are one piece of news. */
+const TOGETHER = 30;
 /** Points of the curve that are kept; beyond it every second one goes. */
 const CURVE_MAX = 2000;
 
@@ -84,11 +86,15 @@ export class Training {
     this.resizes.observe(this.canvas);
     let newest = null;
     const show = number => {
-      if (number === newest) return;
-      newest = number;
-      const address = new URL(src, document.baseURI);
-      address.searchParams.set('v', number);
-      reload(address.href);
+      clearTimeout(this.timer);
+      // A server that tells what was missed may name several: only the last is worth loading.
+      this.timer = setTimeout(() => {
+        if (number === newest) return;
+        newest = number;
+        const address = new URL(src, document.baseURI);
+        address.searchParams.set('v', number);
+        reload(address.href);
+      }, TOGETHER);
     };
     if (version != null) show(version);
     const past = () => metrics && fetch(metrics).then(r => (r.ok ? r.text() : '')).then(text => text
@@ -170,6 +176,7 @@ export class Training {
   }
 
   close() {
+    clearTimeout(this.timer);
     this.feed.close();
     this.resizes.disconnect();
     this.card.remove();

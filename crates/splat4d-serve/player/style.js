@@ -23,7 +23,7 @@ export const CSS = `
 .stage:focus-visible::after{content:"";position:absolute;inset:3px;border-radius:8px;pointer-events:none;
  border:2px solid var(--accent)}
 canvas{display:block}
-.stage>canvas{width:100%;height:100%}
+.stage>canvas{position:absolute;inset:0;width:100%;height:100%}
 .poster{position:absolute;inset:0;width:100%;height:100%;object-fit:contain;pointer-events:none;opacity:0;
  transition:opacity .35s}
 .poster.on{opacity:1}
