@@ -9,8 +9,15 @@ mod half;
 #[cfg(test)]
 mod mutate;
 pub mod npy;
+mod octets;
 pub mod ply;
 pub mod safetensors;
+#[cfg(test)]
+mod samples;
 pub mod scene;
+pub mod splat;
+pub mod spz;
+pub mod warnings;
 
 pub use arrays::{params_to_arrays, tensors_to_loaded};
+pub use warnings::Warnings;
