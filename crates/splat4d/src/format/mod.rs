@@ -6,6 +6,7 @@
 
 pub mod arrays;
 mod half;
+mod kinematic;
 #[cfg(test)]
 mod mutate;
 pub mod npy;
@@ -16,6 +17,7 @@ pub mod safetensors;
 mod samples;
 pub mod scene;
 pub mod splat;
+pub mod splatv;
 pub mod spz;
 pub mod warnings;
 
