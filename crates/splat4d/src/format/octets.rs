@@ -48,11 +48,6 @@ impl<'a> Cursor<'a> {
     pub(super) fn u64(&mut self) -> Result<u64> {
         self.array().map(u64::from_le_bytes)
     }
-
-    /// All that is left.
-    pub(super) fn rest(&self) -> &'a [u8] {
-        self.rest
-    }
 }
 
 /// f32 number `i` of little-endian bytes that are known to hold it.
