@@ -12,6 +12,7 @@ mod interrupt;
 mod paths;
 mod report;
 mod run_folder;
+mod sequence;
 mod source;
 mod verbs;
 mod video;
@@ -34,6 +35,7 @@ Examples:
   splat4d eval runs/knight --baseline      measure again, next to a scene that stands still
   splat4d render runs/knight -o turn.mp4   film an orbit through space and time
   splat4d export runs/knight -o now.ply --time 0.5
+  splat4d convert scene.sog scene.spz      between the formats of other programs
   splat4d info my-take                     what is in a capture, run or file; is it healthy?
 
 Exit codes: 0 done, 1 failed or interrupted, 2 bad input.";
@@ -71,6 +73,7 @@ enum Verb {
     Eval(verbs::eval::Args),
     Render(verbs::render::Args),
     Export(verbs::export::Args),
+    Convert(verbs::convert::Args),
     Info(verbs::info::Args),
     Completions(verbs::completions::Args),
 }
@@ -94,6 +97,7 @@ fn main() -> ExitCode {
         Verb::Eval(args) => verbs::eval::run(&args, &console),
         Verb::Render(args) => verbs::render::run(&args, &console),
         Verb::Export(args) => verbs::export::run(&args, &console),
+        Verb::Convert(args) => verbs::convert::run(&args, &console),
         Verb::Info(args) => verbs::info::run(&args, &console),
         Verb::Completions(args) => verbs::completions::run(&args, &console),
     });

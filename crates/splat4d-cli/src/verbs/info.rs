@@ -6,6 +6,7 @@ use crate::run_folder::Run;
 use crate::source::{Source, cloud};
 use serde_json::{Value, json};
 use splat4d::Error;
+use splat4d::format::Dialect;
 use splat4d::layers::Scene;
 use splat4d::math::sh::degree_of;
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
@@ -238,11 +239,7 @@ fn of_file(path: &Path) -> anyhow::Result<Told> {
     let bytes = path.metadata().map(|m| m.len()).unwrap_or(0);
     let mut text = String::new();
     line(&mut text, "file", &format!("{}, {}", path.display(), human_bytes(bytes)));
-    let kind = match &source.ply {
-        Some(info) if info.compressed => "3DGS .ply, compressed (PlayCanvas)",
-        Some(_) => "3DGS .ply",
-        None => "splat4d scene",
-    };
+    let kind = source.dialect.map_or("splat4d scene", Dialect::name);
     line(&mut text, "kind", kind);
     if let Some(info) = &source.ply {
         if !info.extra_properties.is_empty() {
@@ -252,9 +249,11 @@ fn of_file(path: &Path) -> anyhow::Result<Told> {
             line(&mut text, "comment", comment);
         }
     }
+    source.warnings.lines().iter().for_each(|w| line(&mut text, "note", w));
     let inner = of_scene(&source.scene);
     text.push_str(&inner.text);
     let mut json = inner.json;
+    json["dialect"] = json!(source.dialect.map(Dialect::name));
     json["type"] = json!(if source.ply.is_some() { "ply" } else { "scene" });
     json["bytes"] = json!(bytes);
     Ok(Told { json, text, troubles: inner.troubles })
