@@ -17,7 +17,8 @@ export class Rows {
   take(count) {
     const i = this.#free.findIndex((run) => run.count >= count);
     if (i < 0) return -1;
-    const run = this.#free[i], row = run.row;
+    const run = this.#free[i],
+      row = run.row;
     run.row += count;
     run.count -= count;
     if (!run.count) this.#free.splice(i, 1);
@@ -47,7 +48,10 @@ export function texture(gl, format, width, height) {
 /// A linked program and the places of its uniforms.
 export function program(gl, vertex, fragment) {
   const made = gl.createProgram();
-  for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+  for (const [kind, text] of [
+    [gl.VERTEX_SHADER, vertex],
+    [gl.FRAGMENT_SHADER, fragment],
+  ]) {
     const shader = gl.createShader(kind);
     gl.shaderSource(shader, text);
     gl.compileShader(shader);
@@ -57,8 +61,11 @@ export function program(gl, vertex, fragment) {
   gl.linkProgram(made);
   if (!gl.getProgramParameter(made, gl.LINK_STATUS) && !gl.isContextLost()) {
     const logs = (gl.getAttachedShaders(made) ?? []).map((s) => gl.getShaderInfoLog(s)).join(' ');
-    throw new SceneError("The graphics driver refuses the player's shaders", (gl.getProgramInfoLog(made) + logs).slice(0, 500),
-      'Update the browser or the driver.');
+    throw new SceneError(
+      "The graphics driver refuses the player's shaders",
+      (gl.getProgramInfoLog(made) + logs).slice(0, 500),
+      'Update the browser or the driver.',
+    );
   }
   const at = {};
   for (let i = gl.getProgramParameter(made, gl.ACTIVE_UNIFORMS) - 1; i >= 0; i--) {

@@ -192,7 +192,6 @@ Splat splat(ivec2 texel) {
 }
 ${QUAD}`;
 
-
 /// α = min(0.99, o·exp(−½ dᵀ conic d)), below 1/255 nothing (Kerbl et al. 2023). Writes premultiplied colour.
 export const DRAW_FRAGMENT = `#version 300 es
 precision highp float;

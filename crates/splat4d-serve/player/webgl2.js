@@ -1,24 +1,36 @@
 // The WebGL2 backend: words in textures, order from a worker, blending in half floats where that is to be had.
 
-import { worker } from './assets.js';
 import { SceneError } from './errors.js';
 import { Rows, check, program, texture } from './gl.js';
 import {
-  BATCH, BLOCK_TEXELS, CHANNELS, DIRECT_VERTEX, DRAW_FRAGMENT, DRAW_VERTEX, ORDER_WIDTH, PROJECT_FRAGMENT, SHOW_FRAGMENT,
+  BATCH,
+  BLOCK_TEXELS,
+  CHANNELS,
+  DIRECT_VERTEX,
+  DRAW_FRAGMENT,
+  DRAW_VERTEX,
+  ORDER_WIDTH,
+  PROJECT_FRAGMENT,
+  SHOW_FRAGMENT,
   SHOW_VERTEX,
 } from './glsl.js';
-import { ROW, Sorter } from './sort.worker.js';
+import { Order } from './order.js';
+import { ROW } from './sort.worker.js';
 
 /// Texels across the words' and the palettes' textures: every WebGL2 device has them (its minimum for a texture).
 const WIDTH = 2048;
 /// Gaussians a block, blocks a row, f32 numbers of a header (docs/format.md).
-const BLOCK = 256, BLOCKS = ROW / BLOCK, HEADER = 24;
+const BLOCK = 256,
+  BLOCKS = ROW / BLOCK,
+  HEADER = 24;
 /// Header numbers that are times on the scene clock: life centre min and max, alive from and to.
 const TIMES = [6, 7, 8, 9];
 /// Rows of the words' texture to begin with: 2 MiB each 64.
 const FIRST_ROWS = 256;
-/// z ≤ near is not drawn; x/z and y/z inside J may leave the picture by this share of its half-width (CONVENTIONS.md).
-const NEAR = 0.01, J_MARGIN = 0.3;
+/// z ≤ near is not drawn; x/z and y/z inside J may leave the picture by this share of its half-width's tangent
+/// (CONVENTIONS.md).
+const NEAR = 0.01,
+  J_MARGIN = 0.3;
 
 export class WebGL2Backend {
   /// Throws SceneError where WebGL2 is not to be had. `onlost(SceneError)` is called when the browser takes it away.
@@ -31,41 +43,61 @@ export class WebGL2Backend {
   #canvas;
   #gl;
   #lost;
-  #pages = new Map();
-  #palettes = new Map();
+  #destroyed = false;
+  /// Programs: {program, at: places of uniforms}. `#project` is null where every corner computes its splat.
+  #project = null;
+  #draw;
+  #show;
+  /// Textures of words, block headers and palettes, and how their rows are lent. Texture: its greatest height.
+  #words = null;
+  #blocks;
+  #palette;
+  #maxRows;
+  #rows = new Rows(0);
   #paletteRows = 0;
   #paletteHeight = 0;
-  #rows;
+  /// id → {row, rows, count}; id → {row, degree, ranges}.
+  #pages = new Map();
+  #palettes = new Map();
   /// Rows of dropped pages: [{row, count, generation}]. The order on the screen may still name them.
   #retired = [];
-  #base = 0;
-  /// Counts pages that came and went; an order carries the number it knew.
-  #generation = 0;
-  /// Orders of an earlier scene carry a smaller number.
-  #least = 0;
   #clip = [0, 0];
+  /// The worker's orders, in two textures in turn: `#front` is drawn, its first `#count` numbers.
+  #order;
   #orders = [0, 1].map(() => ({ texture: null, rows: 0 }));
   #front = 0;
   #count = 0;
-  #returned = null;
-  #sorter = null;
-  #worker = null;
-  #early = [];
-  #sorting = false;
-  #asked = { time: NaN, depth: [NaN, 0, 0, 0], generation: -1 };
-  #request = { time: 0, depth: [0, 0, 0, 0], near: NEAR };
+  /// Orders of an earlier scene carry a smaller generation.
+  #least = 0;
+  /// What PROJECT_FRAGMENT writes, and what is blended: {frame, texture(s), …}.
+  #splats = null;
+  #sums;
+  #size = [0, 0];
+  /// Vertex arrays: none at all, and quads; the latter's corners.
+  #empty;
+  #quads;
+  #corners;
+  /// What the last `draw` was given, whether something came since that picture, and the frame that will show it.
   #last = null;
+  #stale = false;
   #frame = 0;
   #waiting = [];
-  #size = [0, 0];
-  #destroyed = false;
-  /// Whether something came since the last picture.
-  #stale = false;
 
   constructor(canvas, onlost) {
-    const options = { alpha: false, antialias: false, depth: false, stencil: false, powerPreference: 'high-performance' };
+    const options = {
+      alpha: false,
+      antialias: false,
+      depth: false,
+      stencil: false,
+      powerPreference: 'high-performance',
+    };
     const gl = canvas.getContext('webgl2', options);
-    if (!gl) throw new SceneError('This browser offers no WebGL2', '', 'Switch on hardware acceleration, or use another browser.');
+    if (!gl)
+      throw new SceneError(
+        'This browser offers no WebGL2',
+        '',
+        'Switch on hardware acceleration, or use another browser.',
+      );
     this.#canvas = canvas;
     this.#gl = gl;
     this.#lost = (event) => {
@@ -88,7 +120,6 @@ export class WebGL2Backend {
     }
     this.#draw = full ? program(gl, DRAW_VERTEX, DRAW_FRAGMENT) : program(gl, DIRECT_VERTEX, DRAW_FRAGMENT);
     this.#show = program(gl, SHOW_VERTEX, SHOW_FRAGMENT);
-    this.#rows = new Rows(0);
     this.#blocks = texture(gl, gl.RGBA32F, BLOCKS * BLOCK_TEXELS, this.#maxRows);
     this.#grow(FIRST_ROWS);
     this.#palette = texture(gl, gl.RGBA8UI, 1, 1);
@@ -100,21 +131,9 @@ export class WebGL2Backend {
     const corners = Uint16Array.from({ length: 6 * BATCH }, (_, i) => 4 * Math.floor(i / 6) + CORNERS[i % 6]);
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
     gl.bindVertexArray(null);
-    this.#startWorker();
+    this.#order = new Order(NEAR, (answer) => this.#ordered(answer));
     check(gl, 'The graphics memory did not suffice to begin');
   }
-  #sums;
-  #maxRows;
-  #project = null;
-  #splats = null;
-  #draw;
-  #show;
-  #words = null;
-  #blocks;
-  #palette;
-  #empty;
-  #quads;
-  #corners;
 
   /// The WebGL2 context (a headset's session needs it).
   get gl() {
@@ -127,15 +146,16 @@ export class WebGL2Backend {
     this.#palettes.clear();
     this.#paletteRows = 0;
     this.#clip = meta.clip;
-    this.#base = meta.clip[0];
     this.#last = null;
     this.#count = 0;
-    this.#least = this.#generation;
+    this.#least = this.#order.generation;
   }
 
   /// `palette`: of SceneFile.palette.
   addPalette({ id, degree, count, ranges, bytes }) {
-    const gl = this.#gl, per = (degree + 1) ** 2 - 1, rows = Math.ceil((count * per) / WIDTH);
+    const gl = this.#gl,
+      per = (degree + 1) ** 2 - 1,
+      rows = Math.ceil((count * per) / WIDTH);
     const row = this.#paletteRows;
     if (row + rows > this.#maxRows) throw new SceneError('The palettes are too many for this graphics card');
     if (row + rows > this.#paletteHeight) {
@@ -160,27 +180,37 @@ export class WebGL2Backend {
 
   /// `page`: of SceneFile.page, whose arrays are the backend's from now on. `entry`: its section.
   addPage(page, entry) {
-    const gl = this.#gl, { id, count, words, headers } = page, rows = Math.ceil(count / ROW);
+    const gl = this.#gl,
+      { id, count, words, headers } = page,
+      rows = Math.ceil(count / ROW);
     let row = this.#rows.take(rows);
     if (row < 0) {
       this.#grow(Math.min(Math.max(2 * this.#rows.rows, this.#rows.rows + rows), this.#maxRows));
       row = this.#rows.take(rows);
     }
     if (row < 0) throw new SceneError('The graphics memory is full', '', 'Lower the memory budget.');
-    const whole = Math.floor(count / ROW), rest = count % ROW;
+    const whole = Math.floor(count / ROW),
+      rest = count % ROW;
     gl.bindTexture(gl.TEXTURE_2D, this.#words);
-    const put = (y, width, height, at) => gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, y, width, height, gl.RGBA_INTEGER,
-      gl.UNSIGNED_INT, words, at);
+    const put = (y, width, height, at) =>
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, y, width, height, gl.RGBA_INTEGER, gl.UNSIGNED_INT, words, at);
     if (whole) put(row, WIDTH, whole, 0);
     if (rest) put(row + whole, 2 * rest, 1, whole * ROW * 8);
     gl.bindTexture(gl.TEXTURE_2D, this.#blocks);
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, row, BLOCKS * BLOCK_TEXELS, rows, gl.RGBA, gl.FLOAT,
-      this.#blockTexels(headers, rows, entry));
+    gl.texSubImage2D(
+      gl.TEXTURE_2D,
+      0,
+      0,
+      row,
+      BLOCKS * BLOCK_TEXELS,
+      rows,
+      gl.RGBA,
+      gl.FLOAT,
+      this.#blockTexels(headers, rows, entry),
+    );
     this.#pages.set(id, { row, rows, count });
     this.stats.resident += count;
-    this.#generation++;
-    const { from, to } = entry;
-    this.#tell({ add: { id, row, count, words, headers, from, to } }, [words.buffer, headers.buffer]);
+    this.#order.add(page, entry, row);
     this.#refresh();
   }
 
@@ -189,8 +219,8 @@ export class WebGL2Backend {
     if (!page) return;
     this.#pages.delete(id);
     this.stats.resident -= page.count;
-    this.#retired.push({ row: page.row, count: page.rows, generation: ++this.#generation });
-    this.#tell({ drop: id });
+    this.#order.drop(id);
+    this.#retired.push({ row: page.row, count: page.rows, generation: this.#order.generation });
     this.#refresh();
   }
 
@@ -202,17 +232,25 @@ export class WebGL2Backend {
     this.#room(width, height);
   }
 
-  /// Draws with the newest order there is, and asks for a better one where time or camera moved. `target` (a headset's):
-  /// {framebuffer, x, y}: where the picture goes instead of the canvas.
+  /// Draws with the newest order there is, and asks for a better one where time or camera moved. `target` {framebuffer,
+  /// x, y}: where the picture goes instead of the canvas (a headset's).
   draw({ time, view, channel = 'color', background = [0, 0, 0], depthRange = [0, 1], flowScale = 100, target = null }) {
-    this.#last = { time: Math.min(Math.max(time, this.#clip[0]), this.#clip[1]), view, channel, background, depthRange, flowScale, target };
+    this.#last = {
+      time: Math.min(Math.max(time, this.#clip[0]), this.#clip[1]),
+      view,
+      channel,
+      background,
+      depthRange,
+      flowScale,
+      target,
+    };
     this.#ask();
     this.#redraw();
   }
 
   /// Resolves when the picture of the last `draw` is in its final order.
   async settled() {
-    while (this.#last && !this.#destroyed && !this.#gl.isContextLost() && (this.#sorting || this.#ask())) {
+    while (this.#last && !this.#destroyed && !this.#gl.isContextLost() && this.#ask()) {
       await new Promise((done) => this.#waiting.push(done));
     }
     if (this.#stale) this.#redraw();
@@ -220,10 +258,12 @@ export class WebGL2Backend {
 
   /// The picture of the last `draw`: {width, height, data: RGBA bytes, rows from the top}.
   async readPixels() {
-    const gl = this.#gl, [width, height] = this.#size;
+    const gl = this.#gl,
+      [width, height] = this.#size;
     const data = new Uint8ClampedArray(width * height * 4);
     if (!this.#last || gl.isContextLost()) return { width, height, data };
-    const target = texture(gl, gl.RGBA8, width, height), frame = gl.createFramebuffer();
+    const target = texture(gl, gl.RGBA8, width, height),
+      frame = gl.createFramebuffer();
     gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, target, 0);
     this.#resolve(frame, 0, 0, 0);
@@ -236,7 +276,7 @@ export class WebGL2Backend {
 
   destroy() {
     this.#destroyed = true;
-    this.#worker?.terminate();
+    this.#order.destroy();
     cancelAnimationFrame(this.#frame);
     this.#wake();
     this.#canvas.removeEventListener('webglcontextlost', this.#lost);
@@ -256,11 +296,12 @@ export class WebGL2Backend {
     const texels = new Float32Array(rows * BLOCKS * BLOCK_TEXELS * 4);
     const { row, degree, ranges } = this.#palettes.get(palette) ?? { row: -1, degree: 0, ranges: [0, 0, 0] };
     for (let b = 0; b * HEADER < headers.length; b++) {
-      const o = b * BLOCK_TEXELS * 4, h = headers.subarray(b * HEADER, (b + 1) * HEADER);
+      const o = b * BLOCK_TEXELS * 4,
+        h = headers.subarray(b * HEADER, (b + 1) * HEADER);
       texels.set(h, o);
       // Relative to the clip's start, so that 32 bits keep their precision on a clock that started long ago.
-      for (const k of TIMES) texels[o + k] = h[k] - this.#base;
-      texels.set([from - this.#base, to - this.#base, row, degree, ...ranges, to - from], o + HEADER);
+      for (const k of TIMES) texels[o + k] = h[k] - this.#clip[0];
+      texels.set([from - this.#clip[0], to - this.#clip[0], row, degree, ...ranges, to - from], o + HEADER);
     }
     return texels;
   }
@@ -272,7 +313,8 @@ export class WebGL2Backend {
 
   /// A texture of `height` rows with the first `kept` rows of `old`, which is deleted.
   #enlarged(old, format, kept, height) {
-    const gl = this.#gl, grown = texture(gl, format, WIDTH, height);
+    const gl = this.#gl,
+      grown = texture(gl, format, WIDTH, height);
     if (old && kept) {
       const frame = gl.createFramebuffer();
       gl.bindFramebuffer(gl.READ_FRAMEBUFFER, frame);
@@ -292,7 +334,8 @@ export class WebGL2Backend {
   }
 
   #room(width, height) {
-    const gl = this.#gl, sums = this.#sums;
+    const gl = this.#gl,
+      sums = this.#sums;
     gl.deleteTexture(sums.texture);
     sums.texture = texture(gl, sums.format, width, height);
     gl.bindFramebuffer(gl.FRAMEBUFFER, sums.frame);
@@ -306,69 +349,15 @@ export class WebGL2Backend {
 
   // Order
 
-  #startWorker() {
-    // Until the worker says that it runs, messages wait: a page's policy may forbid workers, and then all is done here.
-    const here = () => {
-      this.#worker?.terminate();
-      this.#worker = null;
-      this.#sorter = new Sorter();
-      for (const [message] of this.#early?.splice(0) ?? []) this.#tell(message);
-      this.#early = null;
-    };
-    try {
-      this.#worker = worker('sort.worker.js');
-    } catch {
-      return here();
-    }
-    this.#worker.onmessage = ({ data }) => {
-      if (!data.ready) return this.#sorted(data);
-      const early = this.#early;
-      this.#early = null;
-      for (const [message, move] of early) this.#tell(message, move);
-    };
-    this.#worker.onerror = (event) => {
-      if (!this.#early) return;
-      event.preventDefault?.();
-      here();
-    };
-  }
-
-  #tell(message, move = []) {
-    if (this.#early && this.#worker) return this.#early.push([message, move]);
-    if (this.#worker) return this.#worker.postMessage(message, move);
-    if (message.add) this.#sorter.add(message.add);
-    else if (message.drop !== undefined) this.#sorter.drop(message.drop);
-    else {
-      const order = this.#sorter.room(message.order);
-      const begin = performance.now(), result = this.#sorter.sort(message.sort, order);
-      const ms = performance.now() - begin;
-      queueMicrotask(() => this.#sorted({ order, ...result, ms, generation: message.generation }));
-    }
-  }
-
-  /// Asks for an order where the last one asked for is not that of the last draw. Returns whether one is on its way.
   #ask() {
-    if (this.#sorting) return true;
-    const { time, view } = this.#last, m = view.cameraFromWorld, asked = this.#asked;
-    const same = asked.time === time && asked.generation === this.#generation
-      && asked.depth[0] === m[8] && asked.depth[1] === m[9] && asked.depth[2] === m[10] && asked.depth[3] === m[11];
-    if (same) return false;
-    for (const o of [asked, this.#request]) {
-      o.time = time;
-      for (let k = 0; k < 4; k++) o.depth[k] = m[8 + k];
-    }
-    asked.generation = this.#generation;
-    this.#sorting = true;
-    const order = this.#returned;
-    this.#returned = null;
-    this.#tell({ sort: this.#request, generation: this.#generation, order }, order ? [order.buffer] : []);
-    return true;
+    return this.#order.ask(this.#last.time, this.#last.view.cameraFromWorld);
   }
 
-  #sorted({ order, count, active, ms, generation }) {
-    this.#sorting = false;
-    if (this.#destroyed || this.#gl.isContextLost()) return this.#wake();
-    const gl = this.#gl, back = this.#orders[1 - this.#front], rows = Math.ceil(count / ORDER_WIDTH);
+  #ordered({ order, count, active, ms, generation }) {
+    if (this.#gl.isContextLost()) return this.#wake();
+    const gl = this.#gl,
+      back = this.#orders[1 - this.#front],
+      rows = Math.ceil(count / ORDER_WIDTH);
     if (back.rows < rows) {
       gl.deleteTexture(back.texture);
       // Room for all that is resident, so that it does not grow in small steps.
@@ -381,7 +370,6 @@ export class WebGL2Backend {
     }
     this.#front = 1 - this.#front;
     this.#count = generation < this.#least ? 0 : count;
-    this.#returned = order;
     Object.assign(this.stats, { active, drawn: count, sortMs: ms });
     // What this order no longer names may be overwritten.
     this.#stale = true;
@@ -409,13 +397,15 @@ export class WebGL2Backend {
   // Pictures
 
   #redraw() {
-    const last = this.#last, gl = this.#gl;
+    const last = this.#last,
+      gl = this.#gl;
     if (!last || this.#destroyed || gl.isContextLost()) return;
     if (this.#frame) cancelAnimationFrame(this.#frame);
     this.#frame = 0;
     this.#stale = false;
     const begin = performance.now();
-    const { view, target } = last, { width, height } = view;
+    const { view, target } = last,
+      { width, height } = view;
     if (this.#size[0] !== width || this.#size[1] !== height) this.#room(width, height);
     if (this.#count && this.#project) this.#projected();
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.#sums.frame);
@@ -429,7 +419,9 @@ export class WebGL2Backend {
 
   /// Gives `made` (a program that computes splats) the view, and the textures it reads.
   #look({ program, at }) {
-    const gl = this.#gl, { time, view, channel, depthRange, flowScale } = this.#last, m = view.cameraFromWorld;
+    const gl = this.#gl,
+      { time, view, channel, depthRange, flowScale } = this.#last,
+      m = view.cameraFromWorld;
     const { width, height, fx, fy, cx, cy } = view;
     gl.useProgram(program);
     this.#bind(at, 'words', 0, this.#words);
@@ -444,11 +436,12 @@ export class WebGL2Backend {
     gl.uniform2f(at.focal, fx, fy);
     gl.uniform2f(at.center, cx, cy);
     gl.uniform2f(at.size, width, height);
-    const mx = (J_MARGIN * 0.5 * width) / fx, my = (J_MARGIN * 0.5 * height) / fy;
+    const mx = (J_MARGIN * 0.5 * width) / fx,
+      my = (J_MARGIN * 0.5 * height) / fy;
     gl.uniform2f(at.low, -(cx / fx + mx), -(cy / fy + my));
     gl.uniform2f(at.high, (width - cx) / fx + mx, (height - cy) / fy + my);
     gl.uniform2f(at.depth_range, depthRange[0], depthRange[1]);
-    gl.uniform1f(at.time, time - this.#base);
+    gl.uniform1f(at.time, time - this.#clip[0]);
     gl.uniform1f(at.near, NEAR);
     gl.uniform1f(at.flow_scale, flowScale);
     gl.uniform1i(at.channel, CHANNELS[channel]);
@@ -465,7 +458,9 @@ export class WebGL2Backend {
 
   /// Computes every splat of the order, a texel each.
   #projected() {
-    const gl = this.#gl, splats = this.#splats, rows = Math.ceil(this.#count / ORDER_WIDTH);
+    const gl = this.#gl,
+      splats = this.#splats,
+      rows = Math.ceil(this.#count / ORDER_WIDTH);
     gl.bindFramebuffer(gl.FRAMEBUFFER, splats.frame);
     if (splats.rows < rows) {
       for (const t of splats.textures) gl.deleteTexture(t);
@@ -486,7 +481,9 @@ export class WebGL2Backend {
 
   /// Blends the splats over one another, the farthest first.
   #blend() {
-    const gl = this.#gl, { program, at } = this.#draw, [width, height] = this.#size;
+    const gl = this.#gl,
+      { program, at } = this.#draw,
+      [width, height] = this.#size;
     if (this.#project) {
       gl.useProgram(program);
       gl.uniform2f(at.size, width, height);
@@ -503,7 +500,9 @@ export class WebGL2Backend {
 
   /// Writes the sums as a picture; `turned`: its height where rows go from the bottom.
   #resolve(framebuffer, x, y, turned) {
-    const gl = this.#gl, { program, at } = this.#show, { background, channel } = this.#last;
+    const gl = this.#gl,
+      { program, at } = this.#show,
+      { background, channel } = this.#last;
     gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
     gl.viewport(x, y, this.#size[0], this.#size[1]);
     gl.useProgram(program);
@@ -521,4 +520,3 @@ export class WebGL2Backend {
 const SCRATCH = new Float32Array(9);
 /// Two triangles of a quad's four corners.
 const CORNERS = [0, 1, 2, 2, 1, 3];
-

@@ -8,8 +8,16 @@ import path from 'node:path';
 /// Where Chromium is: CHROMIUM, or where Debian puts it.
 const PROGRAM = process.env.CHROMIUM ?? '/usr/bin/chromium';
 /// WebGPU and WebGL2 through SwiftShader, and nothing that phones home.
-const FLAGS = ['--no-sandbox', '--disable-background-networking', '--disable-component-update', '--disable-sync',
-  '--no-first-run', '--enable-unsafe-webgpu', '--use-webgpu-adapter=swiftshader', '--enable-unsafe-swiftshader'];
+const FLAGS = [
+  '--no-sandbox',
+  '--disable-background-networking',
+  '--disable-component-update',
+  '--disable-sync',
+  '--no-first-run',
+  '--enable-unsafe-webgpu',
+  '--use-webgpu-adapter=swiftshader',
+  '--enable-unsafe-swiftshader',
+];
 
 /// A browser, or null where there is none; with REQUIRE_BROWSER=1 that is an error.
 export async function launch() {
@@ -27,7 +35,8 @@ export async function launch() {
 
 /// A page at `url` that records what goes wrong: {page, errors}.
 export async function open(browser, url, options = {}) {
-  const page = await browser.newPage(options), errors = [];
+  const page = await browser.newPage(options),
+    errors = [];
   page.on('console', (m) => m.type() === 'error' && errors.push(m.text()));
   page.on('pageerror', (e) => errors.push(e.stack ?? e.message));
   await page.goto(url);

@@ -11,7 +11,8 @@ import { moved } from './reference.mjs';
 import { layout, random, sample } from './sample.mjs';
 import { serve } from './server.mjs';
 
-const near = (a, b, tolerance, what) => a.forEach((v, k) => assert.ok(Math.abs(v - b[k]) <= tolerance * (1 + Math.abs(b[k])), `${what} ${k}: ${v} ${b[k]}`));
+const near = (a, b, tolerance, what) =>
+  a.forEach((v, k) => assert.ok(Math.abs(v - b[k]) <= tolerance * (1 + Math.abs(b[k])), `${what} ${k}: ${v} ${b[k]}`));
 
 test('what was written is what is read, at any time', async () => {
   const { bytes, json, truth } = sample();
@@ -24,18 +25,32 @@ test('what was written is what is read, at any time', async () => {
     const page = await file.page(entry.id);
     const palette = entry.palette < 0 ? null : await file.palette(entry.palette);
     for (let i = 0; i < entry.count; i++, k++) {
-      const g = gaussian(page, entry, i), want = truth[k];
-      for (const key of ['mean', 'velocity', 'spin', 'scale', 'quat', 'color']) near(g[key], want[key], 1e-5, `${k} ${key}`);
+      const g = gaussian(page, entry, i),
+        want = truth[k];
+      for (const key of ['mean', 'velocity', 'spin', 'scale', 'quat', 'color'])
+        near(g[key], want[key], 1e-5, `${k} ${key}`);
       near([g.center, g.soft, g.opacity], [want.center, want.soft, want.opacity], 1e-5, `${k} life`);
       assert.ok(g.half === want.half || Math.abs(g.half - want.half) < 1e-5 * want.half);
       if (palette) {
         const per = palette.bytes.length / palette.count / 3;
-        want.sh.forEach((f, c) => near([0, 1, 2].map((ch) => (palette.ranges[c < 3 ? 0 : c < 8 ? 1 : 2]
-          * (palette.bytes[(3 * c + ch) * palette.count + g.label] - 128)) / 127), f, 1e-5, `${k} sh ${c}`));
+        want.sh.forEach((f, c) =>
+          near(
+            [0, 1, 2].map(
+              (ch) =>
+                (palette.ranges[c < 3 ? 0 : c < 8 ? 1 : 2] *
+                  (palette.bytes[(3 * c + ch) * palette.count + g.label] - 128)) /
+                127,
+            ),
+            f,
+            1e-5,
+            `${k} sh ${c}`,
+          ),
+        );
         assert.equal(want.sh.length, per);
       }
       for (const t of [entry.from, (entry.from + entry.to) / 2]) {
-        const now = at(g, t), there = moved(want, t);
+        const now = at(g, t),
+          there = moved(want, t);
         assert.equal(now.opacity > 0, there !== null, `${k} at ${t}`);
         if (there) near([...now.mean, now.opacity], [...there.mean, there.opacity], 1e-4, `${k} at ${t}`);
       }
@@ -50,7 +65,16 @@ test('what was written is what is read, at any time', async () => {
 test('spans say what is drawn, and time is held inside the clip', async () => {
   const file = await SceneFile.open(sample().bytes);
   const at = (t) => file.activePages(t).map((p) => p.id);
-  assert.deepEqual([at(-9), at(2.99), at(3), at(6), at(99)], [[4, 5, 6], [4, 5, 6], [4, 5, 7], [4, 5, 9], [4, 5, 9]]);
+  assert.deepEqual(
+    [at(-9), at(2.99), at(3), at(6), at(99)],
+    [
+      [4, 5, 6],
+      [4, 5, 6],
+      [4, 5, 7],
+      [4, 5, 9],
+      [4, 5, 9],
+    ],
+  );
 });
 
 test('a server gives parts, each byte once, neighbours in one request', async () => {
@@ -66,7 +90,8 @@ test('a server gives parts, each byte once, neighbours in one request', async ()
     assert.equal(file.bytesRead, server.sent);
     const requests = server.log.length;
     assert.ok(requests <= 4, `${requests} requests`);
-    const stop = new AbortController(), gone = file.page(b.id, { signal: stop.signal });
+    const stop = new AbortController(),
+      gone = file.page(b.id, { signal: stop.signal });
     stop.abort();
     await assert.rejects(gone, { name: 'AbortError' });
     assert.ok((await file.page(b.id)).words.length === 8 * b.count);
@@ -78,7 +103,8 @@ test('a server gives parts, each byte once, neighbours in one request', async ()
 });
 
 test('a long index takes a second request', async () => {
-  const title = 'x'.repeat(200_000), { bytes } = sample({ json: { title } });
+  const title = 'x'.repeat(200_000),
+    { bytes } = sample({ json: { title } });
   const server = await serve({ files: { a: bytes } });
   try {
     const file = await SceneFile.open(server.url + 'a');
@@ -91,7 +117,8 @@ test('a long index takes a second request', async () => {
 });
 
 test('a server without ranges sends all, with progress', async () => {
-  const { bytes } = sample({ scale: 5, codec: 0 }), server = await serve({ files: { a: bytes }, ranges: false });
+  const { bytes } = sample({ scale: 5, codec: 0 }),
+    server = await serve({ files: { a: bytes }, ranges: false });
   try {
     const seen = [];
     const file = await SceneFile.open(server.url + 'a', { onprogress: (n, all) => seen.push([n, all]) });
@@ -123,7 +150,8 @@ test('a connection that breaks once is tried again, one that stays broken is an 
 
 test('a file that was cut short is complete up to there', async () => {
   const { bytes } = sample();
-  const whole = await SceneFile.open(bytes), cut = whole.pages[3].offset + 10;
+  const whole = await SceneFile.open(bytes),
+    cut = whole.pages[3].offset + 10;
   const file = await SceneFile.open(bytes.subarray(0, cut));
   assert.deepEqual([file.truncated, file.pages.length], [true, 3]);
   for (const p of file.pages) await file.page(p.id);
@@ -131,8 +159,21 @@ test('a file that was cut short is complete up to there', async () => {
 });
 
 test('hostile and foreign files are refused in words', async () => {
-  const base = sample().json, PAGE = (more) => ({ kind: 'PAGE', data: Buffer.alloc(96 + 32), codec: 0, count: 1, words: 8, from: 2, to: 7, ...more });
-  const patch = (at, value, size = 4) => (e) => size === 8 ? e.writeBigUInt64LE(value, at) : size === 2 ? e.writeUInt16LE(value, at) : e.writeUInt32LE(value, at);
+  const base = sample().json,
+    PAGE = (more) => ({
+      kind: 'PAGE',
+      data: Buffer.alloc(96 + 32),
+      codec: 0,
+      count: 1,
+      words: 8,
+      from: 2,
+      to: 7,
+      ...more,
+    });
+  const patch =
+    (at, value, size = 4) =>
+    (e) =>
+      size === 8 ? e.writeBigUInt64LE(value, at) : size === 2 ? e.writeUInt16LE(value, at) : e.writeUInt32LE(value, at);
   const cases = [
     ['version', layout(base, [PAGE()], { major: 2 })],
     ['no valid "clip"', layout({ ...base, clip: [3, 2] }, [])],
@@ -164,7 +205,11 @@ test('hostile and foreign files are refused in words', async () => {
   }
   const lazy = [
     ['no finite', PAGE({ data: Buffer.alloc(128, 255) })],
-    ['palette of 1', PAGE({ palette: 1, data: Buffer.alloc(128, 1) }), { kind: 'PALT', data: Buffer.alloc(12 + 9), count: 1, level: 1 }],
+    [
+      'palette of 1',
+      PAGE({ palette: 1, data: Buffer.alloc(128, 1) }),
+      { kind: 'PALT', data: Buffer.alloc(12 + 9), count: 1, level: 1 },
+    ],
     ['checksum', PAGE({ patch: patch(24, 1) })],
   ];
   for (const [say, ...sections] of lazy) {
@@ -174,10 +219,11 @@ test('hostile and foreign files are refused in words', async () => {
 });
 
 test('inflating stops at the stated size', async () => {
-  const base = sample().json, state = (data) => (e) => {
-    e.writeUInt32LE(96 + 32, 20);
-    e.writeUInt32LE(1, 32);
-  };
+  const base = sample().json,
+    state = (data) => (e) => {
+      e.writeUInt32LE(96 + 32, 20);
+      e.writeUInt32LE(1, 32);
+    };
   // 60 MB of zeros in 58 kB, stated as the 128 bytes of one Gaussian; then too few; then no deflate at all.
   const page = { kind: 'PAGE', codec: 1, count: 1, words: 8, from: 2, to: 7 };
   const bomb = layout(base, [{ ...page, data: Buffer.alloc(60 << 20), patch: state() }]);
@@ -198,9 +244,11 @@ test('inflating stops at the stated size', async () => {
 });
 
 test('any changed byte is an error or the same picture, never a hang', async () => {
-  const { bytes } = sample({ scale: 0.02 }), next = random(3);
+  const { bytes } = sample({ scale: 0.02 }),
+    next = random(3);
   for (let n = 0; n < 400; n++) {
-    const broken = Buffer.from(bytes), where = Math.floor(next() * bytes.length);
+    const broken = Buffer.from(bytes),
+      where = Math.floor(next() * bytes.length);
     if (n % 4 === 3) broken.fill(255 * (n & 8), where, where + 40);
     else broken[where] ^= 1 << (n % 8);
     const cut = n % 16 === 5 ? broken.subarray(0, where) : broken;
@@ -214,7 +262,9 @@ test('any changed byte is an error or the same picture, never a hang', async () 
 });
 
 test('sorting finds everybody who is seen, the farthest first', async () => {
-  const file = await SceneFile.open(sample().bytes), sorter = new Sorter(), known = new Map();
+  const file = await SceneFile.open(sample().bytes),
+    sorter = new Sorter(),
+    known = new Map();
   let row = 0;
   for (const entry of file.pages) {
     const page = await file.page(entry.id);
@@ -222,10 +272,14 @@ test('sorting finds everybody who is seen, the farthest first', async () => {
     sorter.add({ ...page, row, from: entry.from, to: entry.to });
     row += Math.ceil(entry.count / 1024);
   }
-  const out = new Uint32Array(sorter.total), depth = [0.1, -0.2, 0.97, 0.3];
+  const out = new Uint32Array(sorter.total),
+    depth = [0.1, -0.2, 0.97, 0.3];
   for (const time of [2, 3.7, 6]) {
     const { count, active } = sorter.sort({ time, depth, near: 0.01 }, out);
-    assert.equal(active, file.activePages(time).reduce((n, p) => n + p.count, 0));
+    assert.equal(
+      active,
+      file.activePages(time).reduce((n, p) => n + p.count, 0),
+    );
     const seen = new Set(out.subarray(0, count));
     assert.equal(seen.size, count);
     let last = Infinity;

@@ -9,13 +9,14 @@ export const PLAYER = fileURLToPath(new URL('../../player/', import.meta.url));
 const TYPES = { '.html': 'text/html', '.js': 'text/javascript', '.mjs': 'text/javascript', '.css': 'text/css' };
 
 /// Serves `files` (name → bytes or text) and the folders in `folders` (prefix → folder; the player is at /player/).
-/// `ranges: false`: a server that knows no ranges. `delay`: ms before each answer. `fail(request, count)`: true cuts the
-/// connection. Returns {url, log: [{url, from, to, status}], sent: bytes of bodies, set(name, bytes), close()}.
+/// `ranges: false`: a server that knows no ranges. `delay`: ms before each answer. `fail(request, count)`: true cuts
+/// the connection. Returns {url, log: [{url, from, to, status}], sent: bytes of bodies, set(name, bytes), close()}.
 export async function serve({ files = {}, folders = {}, ranges = true, delay = 0, fail = () => false } = {}) {
   const state = { log: [], sent: 0, options: { ranges, delay, fail } };
   const roots = { '/player/': PLAYER, ...folders };
   const server = http.createServer(async (request, response) => {
-    const name = decodeURIComponent(new URL(request.url, 'http://x').pathname), { options } = state;
+    const name = decodeURIComponent(new URL(request.url, 'http://x').pathname),
+      { options } = state;
     // What every browser asks for unasked.
     if (name === '/favicon.ico') return response.writeHead(204).end();
     if (options.delay) await new Promise((done) => setTimeout(done, options.delay));
@@ -24,7 +25,8 @@ export async function serve({ files = {}, folders = {}, ranges = true, delay = 0
       return request.socket.destroy();
     }
     const prefix = Object.keys(roots).find((p) => name.startsWith(p));
-    let body = files[name.slice(1)] ?? null, file = null;
+    let body = files[name.slice(1)] ?? null,
+      file = null;
     if (body === null && prefix && !name.includes('..')) file = path.join(roots[prefix], name.slice(prefix.length));
     let size = body === null ? 0 : Buffer.byteLength(body);
     try {
@@ -38,7 +40,11 @@ export async function serve({ files = {}, folders = {}, ranges = true, delay = 0
     }
     const type = TYPES[path.extname(name)] ?? 'application/octet-stream';
     const asked = options.ranges && /^bytes=(\d+)-(\d*)$/.exec(request.headers.range ?? '');
-    const headers = { 'content-type': type, 'cache-control': 'no-store', 'accept-ranges': options.ranges ? 'bytes' : 'none' };
+    const headers = {
+      'content-type': type,
+      'cache-control': 'no-store',
+      'accept-ranges': options.ranges ? 'bytes' : 'none',
+    };
     let [from, to, status] = [0, size - 1, 200];
     if (asked) {
       [from, to, status] = [Number(asked[1]), Math.min(asked[2] ? Number(asked[2]) : Infinity, size - 1), 206];
