@@ -211,7 +211,7 @@ pub(super) mod tests {
                 }
             }
         }
-        let layer = Layer { name: "flying".into(), params, motion, life };
+        let layer = Layer { name: "flying".into(), params, motion, life, span: ALWAYS };
         Scene { layers: vec![layer], clip: [2.0, 5.0], fps: 25.0, up: UP, ..Scene::default() }
     }
 

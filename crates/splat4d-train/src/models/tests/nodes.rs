@@ -356,7 +356,7 @@ fn warm_up_then_nodes_then_frame_by_frame_tracking() {
             params,
             motion: Arc::new(model),
             life: LifeKind::Infinite,
-            span: splat4d::layers::ALWAYS,
+            span: ALWAYS,
         };
         scene.layers = vec![layer];
         Ok(())
