@@ -399,3 +399,31 @@ fn an_interrupt_saves_and_says_how_to_continue() {
     assert!(std::fs::read_dir(run.join("checkpoints")).unwrap().count() > 0);
     assert!(!run.join("scene.safetensors").exists());
 }
+
+#[test]
+fn a_playback_file_is_told_exported_and_refused_when_damaged() {
+    let work = tempfile::tempdir().unwrap();
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../splat4d/tests/data/tiny.splat4d");
+    let told: Value = serde_json::from_str(&splat4d(&["info", "--json", str(&file)]).run().ok()).unwrap();
+    assert_eq!((&told["type"], &told["gaussians"]), (&json!("playback"), &json!(2)));
+    let moments = told["playback"]["moments"].as_array().unwrap();
+    let alive: Vec<u64> = moments.iter().map(|m| m["gaussians"].as_u64().unwrap()).collect();
+    assert_eq!(alive, [2, 2, 2, 1, 1], "one lives in the first half only");
+    let text = splat4d(&["info", str(&file)]).run().ok();
+    assert!(text.contains("playback file") && text.contains("PALT") && text.contains("Mbit/s"), "{text}");
+
+    let out = work.path().join("now.ply");
+    splat4d(&["export", str(&file), "-o", str(&out), "--time", "0.3"]).run().ok();
+    let (params, _) = ply::read(&std::fs::read(&out).unwrap()).unwrap();
+    // It moves at 2 units a second and was at x = 1 at 0.25 s.
+    assert_eq!(params.len(), 2);
+    assert!((params[GEOMETRY].get(1, 0) - 1.1).abs() < 1e-3, "{}", params[GEOMETRY].get(1, 0));
+
+    let mut bytes = std::fs::read(&file).unwrap();
+    let last = bytes.len() - 1;
+    bytes[last] ^= 1;
+    let spoilt = work.path().join("spoilt.splat4d");
+    std::fs::write(&spoilt, &bytes).unwrap();
+    let told = splat4d(&["info", str(&spoilt)]).run().refused();
+    assert!(told.contains("checksum") && told.contains("spoilt.splat4d"), "{told}");
+}

@@ -194,3 +194,30 @@ fn infinite_life_equals_still_without_one() {
     let base = crate::motion::still::activate(a.params[GEOMETRY].read::<11>(3, 0));
     assert_eq!(tape.out().read::<10>(3, 0), base);
 }
+
+#[test]
+fn a_layer_is_seen_in_its_span_only() {
+    let mut a = layer(&Spec::Still, LifeKind::Infinite, 5, 1);
+    let mut b = layer(&Spec::Still, LifeKind::GaussHalf, 20, 2);
+    let whole = b.spans();
+    a.span = [0.25, 0.5];
+    b.span = [0.25, 0.5];
+    let mut ids = Vec::new();
+    for t in [0.24, 0.5, 3.0] {
+        assert!(!a.active(Time(t), &mut ids) && ids.is_empty(), "nothing at {t}");
+        assert!(!b.active(Time(t), &mut ids) && ids.is_empty(), "nothing at {t}");
+    }
+    assert!(a.active(Time(0.25), &mut ids), "all rows from the first moment on");
+    assert_eq!(a.spans(), vec![[0.25, 0.5f64.next_down()]; 5]);
+    for (cut, [from, to]) in b.spans().into_iter().zip(whole) {
+        let overlap = from <= to && from < 0.5 && to >= 0.25;
+        assert_eq!(cut, if overlap { [from.max(0.25), to.min(0.5f64.next_down())] } else { [1.0, 0.0] });
+    }
+    // A scene's splats at a time outside are those of the other layers.
+    let scene = Scene { layers: vec![a, layer(&Spec::Still, LifeKind::Infinite, 3, 4)], ..Scene::default() };
+    let mut instant = Instant::default();
+    scene.at(Time(0.6), &mut instant);
+    assert_eq!(scene.splats(&instant).len(), 3);
+    scene.at(Time(0.3), &mut instant);
+    assert_eq!(scene.splats(&instant).len(), 8);
+}
