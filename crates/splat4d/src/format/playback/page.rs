@@ -216,7 +216,7 @@ impl Row {
 }
 
 /// Scales as they are written: positive, and none far below the largest.
-fn scales(p: &Primitive) -> [f64; 3] {
+pub(super) fn scales(p: &Primitive) -> [f64; 3] {
     let scales = p.scales.map(f64::from);
     let largest = scales[0].max(scales[1]).max(scales[2]);
     scales.map(|s| s.max(THINNEST * largest).max((-MAX_LOG).exp()))

@@ -70,7 +70,7 @@ impl ErrorStat {
 pub struct Errors {
     /// Means in the middle of lives, per axis, scene units.
     pub mean: ErrorStat,
-    /// Scales, difference of logarithms.
+    /// Scales, difference of logarithms; those below 1/1000 of the Gaussian's largest are taken for 1/1000, as written.
     pub scale: ErrorStat,
     /// Rotations in the middle of lives, radians.
     pub rotation: ErrorStat,
@@ -303,10 +303,11 @@ fn compare(errors: &mut Errors, page: &Page, rows: &[(&super::Primitive, u16)], 
     for (i, (p, _)) in rows.iter().enumerate() {
         let r = page.record(i);
         let delta = r.center - p.center;
+        let scales = super::page::scales(p);
         for k in 0..3 {
             let velocity = f64::from(p.velocity[k]);
             errors.mean.add(r.mean[k] - p.mean[k] - velocity * delta);
-            errors.scale.add((r.scales[k] / f64::from(p.scales[k]).max(f64::MIN_POSITIVE)).ln());
+            errors.scale.add((r.scales[k] / scales[k]).ln());
             errors.velocity.add(r.velocity[k] - velocity);
             errors.turn.add(r.turn[k] - f64::from(p.turn[k]));
             errors.base_color.add(r.base_color[k] - f64::from(p.base_color[k]));
