@@ -110,7 +110,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         files::make_folder(&run)?;
         let cameras = serde_json::to_vec(&cameras_json(&capture))?;
         files::write(&run.join("cameras.json"), &cameras)?;
-        let options = TrainOptions { minutes: args.minutes };
+        let options = TrainOptions { minutes: args.minutes, ..TrainOptions::default() };
         let trained = train::train(Arc::new(capture), recipe, &run, &options, &stop, &mut listen);
         if trained.is_err() {
             leave_nothing(&run)?;
