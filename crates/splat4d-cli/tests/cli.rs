@@ -424,7 +424,7 @@ fn a_run_is_baked_and_the_file_is_as_good() {
         (vec!["-o", str(&out), "--repeat", "0"], "repeat"),
         (vec!["-o", str(&out), "--segment", "nan"], "segments"),
     ] {
-        let message = splat4d(&["bake", str(&run)]).args(&args).run().bad();
+        let message = splat4d(&["bake", str(&run)]).args(&args).run().refused();
         assert!(message.contains(reason), "{args:?}: {message}");
     }
 }
