@@ -1,12 +1,14 @@
-//! Anything that holds a scene: a run folder, a scene file (`.safetensors`, checkpoints too) or a 3DGS `.ply`.
+//! Anything that holds a scene: a run folder, a scene file (`.safetensors`, checkpoints too), a playback file
+//! (`.splat4d`) or a 3DGS `.ply`.
 
 use crate::files::cannot_read;
 use crate::paths::{Stage, View};
 use crate::run_folder::Run;
+use splat4d::format::playback::{self, Index};
 use splat4d::format::ply::PlyInfo;
 use splat4d::layers::{ALWAYS, Layer, Scene};
 use splat4d::motion::Still;
-use splat4d::scene::{GEOMETRY, LifeKind};
+use splat4d::scene::{Camera, GEOMETRY, LifeKind};
 use splat4d::{Error, Result, format};
 use std::path::Path;
 use std::sync::Arc;
@@ -23,6 +25,8 @@ pub(crate) struct Source {
     pub run: Option<Run>,
     /// What the .ply said, where it is one.
     pub ply: Option<PlyInfo>,
+    /// The start of the playback file, where it is one.
+    pub playback: Option<Index>,
 }
 
 impl Source {
@@ -31,25 +35,40 @@ impl Source {
         if path.is_dir() {
             let run = Run::open(path)?;
             let scene = read_scene(&run.scene_file()?)?;
-            return Ok(Self { scene, run: Some(run), ply: None });
+            return Ok(Self { scene, run: Some(run), ply: None, playback: None });
         }
         let bytes = std::fs::read(path).map_err(|e| cannot_read(path, e))?;
+        if bytes.starts_with(&playback::MAGIC) {
+            let index = Index::parse(&bytes, Some(bytes.len() as u64)).map_err(|e| e.at(path.display()))?;
+            let scene = playback::read(&bytes).map_err(|e| e.at(path.display()))?;
+            return Ok(Self { scene, run: None, ply: None, playback: Some(index) });
+        }
         if !bytes.starts_with(b"ply") {
             let scene = format::scene::read(&bytes).map_err(|e| {
-                e.at(path.display()).remedy("Give a run folder, a scene.safetensors, a checkpoint or a 3DGS .ply.")
+                e.at(path.display())
+                    .remedy("Give a run folder, a scene.safetensors, a checkpoint, a .splat4d or a 3DGS .ply.")
             })?;
-            return Ok(Self { scene, run: None, ply: None });
+            return Ok(Self { scene, run: None, ply: None, playback: None });
         }
         let (params, info) = format::ply::read(&bytes).map_err(|e| e.at(path.display()))?;
         let layer =
             Layer { name: "ply".into(), params, motion: Arc::new(Still), life: LifeKind::Infinite, span: ALWAYS };
         let scene =
             Scene { layers: vec![layer], up: PLY_UP, fps: splat4d::scene::time::DEFAULT_FPS, ..Scene::default() };
-        Ok(Self { scene, run: None, ply: Some(info) })
+        Ok(Self { scene, run: None, ply: Some(info), playback: None })
     }
 
-    /// The data set's cameras; empty for bare files.
+    /// The data set's cameras; those that a playback file brings along; empty for other bare files.
     pub(crate) fn views(&self) -> Result<Vec<View>> {
+        if let Some(index) = &self.playback {
+            let time = index.meta.clip[0];
+            let fits = |c: &Camera| c.width.max(c.height) <= crate::camera_file::MAX_SIDE;
+            let views = index.meta.cameras.iter().filter_map(|c| {
+                let camera = c.camera().filter(fits)?;
+                Some(View { camera, name: c.name.clone(), time, held: false })
+            });
+            return Ok(views.collect());
+        }
         self.run.as_ref().map_or_else(|| Ok(Vec::new()), Run::views)
     }
 
