@@ -46,6 +46,33 @@ impl Default for Baking {
     }
 }
 
+/// A baked scene as a file's bytes, and what became of it.
+pub(crate) struct Packed {
+    pub bytes: Vec<u8>,
+    baked: bake::Baked,
+    summary: playback::Summary,
+    antialias: bool,
+}
+
+/// Bakes a scene and packs it, without a look at how well. The options' cameras are the source's.
+pub(crate) fn pack(source: &Source, title: &str, baking: &Baking, console: &Console) -> anyhow::Result<Packed> {
+    let scene = &source.scene;
+    let views = source.views()?;
+    let stage = source.stage(&views);
+    let cameras = distinct(&views);
+    let options = Options { cameras: cameras.iter().map(|v| v.camera.clone()).collect(), ..baking.options.clone() };
+    let mut baked = bake(scene, &options, &mut |done, total| console.phase("baking", done, total))?;
+    let antialias = source.run.as_ref().and_then(|r| r.recipe().ok()).is_some_and(|r| r.antialias);
+    let meta = Meta { title: title.to_owned(), ..meta(scene, &baked, &stage, &cameras) };
+    let poster = baking.poster.then(|| poster(scene, &stage, antialias)).flatten();
+    console.phase("writing", 0, 0);
+    let draft = Draft { meta, nodes: std::mem::take(&mut baked.nodes), poster };
+    let config = WriteConfig { palette: baking.palette, ..WriteConfig::default() };
+    let mut bytes = Vec::new();
+    let summary = playback::write(&draft, &config, &mut bytes)?;
+    Ok(Packed { bytes, baked, summary, antialias })
+}
+
 /// Bakes into the file `out` and says how well; returns the report. The options' cameras are the source's.
 pub(crate) fn bake_into(
     source: &Source,
@@ -56,21 +83,11 @@ pub(crate) fn bake_into(
 ) -> anyhow::Result<Value> {
     let started = Instant::now();
     let scene = &source.scene;
-    let views = source.views()?;
-    let stage = source.stage(&views);
-    let cameras = distinct(&views);
-    let options = Options { cameras: cameras.iter().map(|v| v.camera.clone()).collect(), ..baking.options.clone() };
-    let baked = bake(scene, &options, &mut |done, total| console.phase("baking", done, total))?;
-    let antialias = source.run.as_ref().and_then(|r| r.recipe().ok()).is_some_and(|r| r.antialias);
-    let meta = Meta { title: title.to_owned(), ..meta(scene, &baked, &stage, &cameras) };
-    let poster = baking.poster.then(|| poster(scene, &stage, antialias)).flatten();
-    console.phase("writing", 0, 0);
-    let draft = Draft { meta, nodes: baked.nodes, poster };
-    let config = WriteConfig { palette: baking.palette, ..WriteConfig::default() };
-    let mut bytes = Vec::new();
-    let summary = playback::write(&draft, &config, &mut bytes)?;
+    let Packed { bytes, baked, summary, antialias } = pack(source, title, baking, console)?;
     files::write(out, &bytes)?;
     let seconds = started.elapsed().as_secs_f64();
+    let views = source.views()?;
+    let (stage, cameras) = (source.stage(&views), distinct(&views));
 
     let likeness = compare(scene, &bytes, &stage, &cameras, antialias, console)?;
     console.clear();

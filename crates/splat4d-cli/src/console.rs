@@ -55,6 +55,11 @@ impl Console {
         self.json
     }
 
+    /// Whether a person at a terminal is listening.
+    pub(crate) fn terminal(&self) -> bool {
+        self.terminal && !self.json
+    }
+
     /// A result, on stdout; not with `--json`, not when quiet.
     pub(crate) fn say(&self, text: &str) {
         if !self.json && self.loudness > Loudness::Quiet {

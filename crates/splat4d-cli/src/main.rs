@@ -11,8 +11,11 @@ mod finish;
 mod freeze;
 mod interrupt;
 mod paths;
+mod playable;
 mod report;
 mod run_folder;
+mod sequence;
+mod serving;
 mod source;
 mod verbs;
 mod video;
@@ -35,7 +38,10 @@ Examples:
   splat4d eval runs/knight --baseline      measure again, next to a scene that stands still
   splat4d render runs/knight -o turn.mp4   film an orbit through space and time
   splat4d bake runs/knight -o knight.splat4d       one small, seekable file for players
+  splat4d view runs/knight                 play it in the browser
   splat4d export runs/knight -o now.ply --time 0.5
+  splat4d export runs/knight --html -o knight.html
+  splat4d convert scene.sog scene.spz      between the formats of other programs
   splat4d info my-take                     what is in a capture, run or file; is it healthy?
 
 Exit codes: 0 done, 1 failed or interrupted, 2 bad input.";
@@ -74,6 +80,8 @@ enum Verb {
     Render(verbs::render::Args),
     Bake(verbs::bake::Args),
     Export(verbs::export::Args),
+    View(verbs::view::Args),
+    Convert(verbs::convert::Args),
     Info(verbs::info::Args),
     Completions(verbs::completions::Args),
 }
@@ -98,6 +106,8 @@ fn main() -> ExitCode {
         Verb::Render(args) => verbs::render::run(&args, &console),
         Verb::Bake(args) => verbs::bake::run(&args, &console),
         Verb::Export(args) => verbs::export::run(&args, &console),
+        Verb::View(args) => verbs::view::run(&args, &console),
+        Verb::Convert(args) => verbs::convert::run(&args, &console),
         Verb::Info(args) => verbs::info::run(&args, &console),
         Verb::Completions(args) => verbs::completions::run(&args, &console),
     });

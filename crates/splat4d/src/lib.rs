@@ -8,10 +8,14 @@ pub mod bake;
 pub mod error;
 pub mod flow;
 pub mod format;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod layers;
 pub mod math;
 pub mod motion;
+pub mod play;
 pub mod render;
 pub mod scene;
+pub mod wgsl;
 
 pub use error::{Error, ErrorKind, Result};

@@ -1,31 +1,33 @@
-//! `export`: moments of a scene as plain 3DGS .ply files.
+//! `export`: moments of a scene as plain 3DGS .ply files, or the whole of it as one page with its player.
 
 use crate::console::Console;
 use crate::files;
 use crate::freeze::freeze;
+use crate::playable::Playable;
+use crate::sequence;
 use crate::source::{Source, not_empty};
 use serde_json::json;
 use splat4d::{Error, format};
+use splat4d_serve::{Page, SceneIn};
 use std::path::{Path, PathBuf};
-
-/// Most files of a sequence.
-const MAX_FILES: f64 = 100_000.0;
 
 const EXAMPLES: &str = "\
 Examples:
   splat4d export runs/knight -o now.ply --time 0.5         one moment; every 3DGS viewer opens it
   splat4d export runs/knight --sequence frames/            frames/frame_00000.ply ...; SuperSplat plays them
-  splat4d export runs/knight --sequence frames/ --fps 10 --from 0.2 --to 0.8";
+  splat4d export runs/knight --sequence frames/ --fps 10 --from 0.2 --to 0.8
+  splat4d export runs/knight --html -o knight.html         player and scene in one page: send it, host it, open it
+  splat4d export runs/knight --html -o index.html --link knight.splat4d     for a web server: seeks, starts at once";
 
-/// Write moments of a scene as 3DGS .ply files
+/// Write moments of a scene as 3DGS .ply files, or all of it as a page
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
-    /// The run, scene file or .ply
+    /// The run, scene file or .ply; for a page also a playback file
     #[arg(value_name = "RUN|FILE", required_unless_present = "model")]
     source: Option<PathBuf>,
-    /// The file of one moment
-    #[arg(short, long, value_name = "OUT.ply", required_unless_present = "sequence")]
+    /// The file of one moment, or the page
+    #[arg(short, long, value_name = "OUT", required_unless_present = "sequence")]
     output: Option<PathBuf>,
     /// The moment, seconds of the scene [default: the clip's start]
     #[arg(long, value_name = "T", allow_negative_numbers = true, conflicts_with = "sequence")]
@@ -43,6 +45,13 @@ pub(crate) struct Args {
     #[arg(long, value_name = "S", requires = "sequence", allow_negative_numbers = true)]
     to: Option<f64>,
 
+    /// Write one page with the player and the scene in it; it needs no network and no server
+    #[arg(long, conflicts_with_all = ["time", "sequence"], requires = "output")]
+    html: bool,
+    /// Keep the page's scene in this file, in the page's folder or below: for web servers, which can send parts of it
+    #[arg(long, value_name = "FILE", requires = "html")]
+    link: Option<PathBuf>,
+
     #[arg(short = 'm', long = "model-path", alias = "model_path", hide = true, conflicts_with = "source")]
     model: Option<PathBuf>,
 }
@@ -56,6 +65,9 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
                 .into());
         }
     }
+    if args.html {
+        return page(path, args, console);
+    }
     let source = Source::open(path)?;
     let scene = &source.scene;
     not_empty(scene, path)?;
@@ -67,25 +79,16 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         Ok(params.len())
     };
     if let Some(folder) = &args.sequence {
-        let fps = args.fps.unwrap_or(if scene.fps > 0.0 { scene.fps } else { splat4d::scene::time::DEFAULT_FPS });
-        let (from, to) = (args.from.unwrap_or(scene.clip[0]), args.to.unwrap_or(scene.clip[1]));
-        let count = ((to - from) * fps + 1e-6).floor() + 1.0;
-        if !(1.0..=MAX_FILES).contains(&count) {
-            return Err(Error::input(format!("from {from} s to {to} s at {fps} a second are {count} files"))
-                .remedy(format!(
-                    "The scene lasts from {} to {} s; at most {MAX_FILES} files are written.",
-                    scene.clip[0], scene.clip[1]
-                ))
-                .into());
-        }
+        let (fps, times) = sequence::moments(scene, args.fps, [args.from, args.to])?;
+        let pattern = sequence::Pattern::in_folder(folder);
         files::make_folder(folder)?;
-        let count = count as usize;
-        for i in 0..count {
-            write(from + i as f64 / fps, &folder.join(format!("frame_{i:05}.ply")))?;
-            console.phase("exporting", i + 1, count);
+        for (i, &time) in times.iter().enumerate() {
+            write(time, &pattern.file(i))?;
+            console.phase("exporting", i + 1, times.len());
         }
         console.clear();
-        console.say(&format!("{count} files, {fps} a second, from {from} to {to} s"));
+        let (from, to) = (times[0], times[times.len() - 1]);
+        console.say(&format!("{} files, {fps} a second, from {from} to {to} s", times.len()));
         console.written(folder);
         return Ok(());
     }
@@ -105,4 +108,67 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     console.emit(&json!({"type": "exported", "gaussians": n, "time": time}));
     console.written(out);
     Ok(())
+}
+
+/// Writes the page, and the scene beside it where that is wanted.
+fn page(path: &Path, args: &Args, console: &Console) -> anyhow::Result<()> {
+    let out = args.output.as_ref().expect("clap asks for an output");
+    let address = args.link.as_ref().map(|link| address(link, out)).transpose()?;
+    let scene = Playable::open(path, console)?;
+    let bytes = scene.bytes()?;
+    let inside = SceneIn::Inside(&bytes);
+    let html = Page { title: &scene.title, scene: address.as_deref().map_or(inside, SceneIn::Linked) }.html()?;
+    if let Some(link) = &args.link {
+        files::write(link, &bytes)?;
+        console.written(link);
+    }
+    files::write(out, html.as_bytes())?;
+    console.say(&format!("a page of {}", files::human_bytes(html.len() as u64)));
+    console.written(out);
+    if args.link.is_some() {
+        console.say("put both on a web server: browsers do not let a page from a disk read a file beside it");
+    }
+    Ok(())
+}
+
+/// How the page names the file: relative to its own folder, percent-encoded.
+fn address(link: &Path, page: &Path) -> anyhow::Result<String> {
+    let folder = |path: &Path| -> anyhow::Result<PathBuf> {
+        let parent = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        Ok(std::fs::canonicalize(parent).map_err(|e| files::cannot_write(path, e))?)
+    };
+    let (at, below) = (folder(page)?, folder(link)?);
+    let (Ok(below), Some(name)) = (below.strip_prefix(&at), link.file_name()) else {
+        return Err(Error::input("does not lie in the page's folder")
+            .at(link.display())
+            .remedy("Give --link a file beside the page, or in a folder below it.")
+            .into());
+    };
+    let parts = below.iter().chain([name]).map(|part| percent(&part.to_string_lossy()));
+    Ok(format!("./{}", parts.collect::<Vec<_>>().join("/")))
+}
+
+/// A part of an address (RFC 3986): everything but unreserved characters as bytes in hexadecimal.
+fn percent(text: &str) -> String {
+    let one = |b: u8| {
+        let plain = b.is_ascii_alphanumeric() || b"-._~".contains(&b);
+        if plain { char::from(b).to_string() } else { format!("%{b:02X}") }
+    };
+    text.bytes().map(one).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_page_names_its_scene_from_where_it_lies() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::create_dir(folder.path().join("a b")).unwrap();
+        let at = |name: &str| folder.path().join(name);
+        assert_eq!(address(&at("x.splat4d"), &at("page.html")).unwrap(), "./x.splat4d");
+        assert_eq!(address(&at("a b/ü#?.splat4d"), &at("page.html")).unwrap(), "./a%20b/%C3%BC%23%3F.splat4d");
+        assert!(address(&at("x.splat4d"), &at("a b/page.html")).is_err(), "browsers would ask above the page");
+        assert!(address(&at("none/x.splat4d"), &at("page.html")).is_err());
+    }
 }

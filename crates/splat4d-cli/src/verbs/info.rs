@@ -8,6 +8,7 @@ use crate::run_folder::Run;
 use crate::source::{Source, cloud};
 use serde_json::{Value, json};
 use splat4d::Error;
+use splat4d::format::Dialect;
 use splat4d::layers::Scene;
 use splat4d::math::sh::degree_of;
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
@@ -242,9 +243,8 @@ fn of_file(path: &Path) -> anyhow::Result<Told> {
     let bytes = path.metadata().map(|m| m.len()).unwrap_or(0);
     let mut text = String::new();
     line(&mut text, "file", &format!("{}, {}", path.display(), human_bytes(bytes)));
-    let kind = match &source.ply {
-        Some(info) if info.compressed => "3DGS .ply, compressed (PlayCanvas)",
-        Some(_) => "3DGS .ply",
+    let kind = match source.dialect {
+        Some(dialect) => dialect.name(),
         None if source.playback.is_some() => "playback file",
         None => "splat4d scene",
     };
@@ -261,9 +261,11 @@ fn of_file(path: &Path) -> anyhow::Result<Told> {
             line(&mut text, "comment", comment);
         }
     }
+    source.warnings.lines().iter().for_each(|w| line(&mut text, "note", w));
     let inner = of_scene(&source.scene);
     text.push_str(&inner.text);
     let mut json = inner.json;
+    json["dialect"] = json!(source.dialect.map(Dialect::name));
     json["type"] = json!(if source.ply.is_some() { "ply" } else { "scene" });
     json["bytes"] = json!(bytes);
     if let Some(told) = told {

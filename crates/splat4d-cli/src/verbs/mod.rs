@@ -2,8 +2,10 @@
 
 pub(crate) mod bake;
 pub(crate) mod completions;
+pub(crate) mod convert;
 pub(crate) mod eval;
 pub(crate) mod export;
 pub(crate) mod info;
 pub(crate) mod render;
 pub(crate) mod train;
+pub(crate) mod view;

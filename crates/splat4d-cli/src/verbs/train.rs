@@ -3,20 +3,27 @@
 use crate::console::Console;
 use crate::files::{self, human_bytes, parse_bytes};
 use crate::run_folder::{self, Run, cameras_json};
+use crate::serving::{self, Place, Watch};
 use crate::{finish, interrupt};
 use serde_json::json;
 use splat4d::{Error, ErrorKind};
 use splat4d_train::capture::{Capture, Severity};
+use splat4d_train::event::Event;
 use splat4d_train::recipe::Recipe;
 use splat4d_train::train::run::{memory_estimate, open_capture};
 use splat4d_train::train::{self, Outcome, TrainOptions, checkpoint};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Duration;
+
+/// A new picture of the learning scene about so often: sooner than anybody would reload, later than they could follow.
+const SNAPSHOT_INTERVAL: Duration = Duration::from_secs(3);
 
 const EXAMPLES: &str = "\
 Examples:
   splat4d train examples/knight                     default recipe, into runs/knight
   splat4d train my-take -o runs/first --minutes 10  as many steps as fit into ten minutes
+  splat4d train my-take --view                      watch it learn in the browser
   splat4d train my-take --motion still              one scene for all times: a calibration check
   splat4d train my-take --downscale 4 --set iterations=1000 --set sh_degree=0
   splat4d train my-take --hold-out camera=0,10      measure on these cameras
@@ -69,6 +76,11 @@ pub(crate) struct Args {
     image_memory: Option<u64>,
     #[command(flatten)]
     measure: finish::Measure,
+    /// Show the scene in the browser while it learns, and on a terminal afterwards too, until Ctrl-C
+    #[arg(long, help_heading = "Where it is served")]
+    view: bool,
+    #[command(flatten)]
+    place: Place,
     /// Only train and bake: no evaluation, film or report
     #[arg(long, help_heading = "What is measured")]
     no_eval: bool,
@@ -95,11 +107,23 @@ pub(crate) struct Args {
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     args.measure.check()?;
+    if !args.view && args.place.is_told() {
+        return Err(Error::input("--port, --host and --no-open belong to --view").remedy("Add --view.").into());
+    }
     let stop = interrupt::flag("stopping: a checkpoint is being saved");
-    let mut listen = |event: &splat4d_train::event::Event| console.event(event);
-    let (run, trained) = if let Some(run) = &args.resume {
-        Run::open(run)?;
-        (run.clone(), train::resume(run, &stop, &mut listen))
+    let watch = |title: &str| {
+        if args.view { Watch::start(title, &args.place, console) } else { Watch::nobody() }
+    };
+    let snapshots = |watch: &Watch| watch.is_on().then_some(SNAPSHOT_INTERVAL);
+    let listen = |event: &Event, watch: &Watch| {
+        watch.hear(event);
+        console.event(event);
+    };
+    let (run, watch, trained) = if let Some(run) = &args.resume {
+        let watch = watch(&Run::open(run)?.name());
+        let options = TrainOptions { snapshots: snapshots(&watch), ..TrainOptions::default() };
+        let trained = train::resume_with(run, &options, &stop, &mut |event| listen(event, &watch));
+        (run.clone(), watch, trained)
     } else {
         let recipe = recipe(args)?;
         let source = args.capture.as_ref().or(args.source.as_ref()).expect("clap asks for a capture");
@@ -110,12 +134,14 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         files::make_folder(&run)?;
         let cameras = serde_json::to_vec(&cameras_json(&capture))?;
         files::write(&run.join("cameras.json"), &cameras)?;
-        let options = TrainOptions { minutes: args.minutes, ..TrainOptions::default() };
-        let trained = train::train(Arc::new(capture), recipe, &run, &options, &stop, &mut listen);
+        let watch = watch(&capture.name);
+        let options = TrainOptions { minutes: args.minutes, snapshots: snapshots(&watch) };
+        let capture = Arc::new(capture);
+        let trained = train::train(capture, recipe, &run, &options, &stop, &mut |event| listen(event, &watch));
         if trained.is_err() {
             leave_nothing(&run)?;
         }
-        (run, trained)
+        (run, watch, trained)
     };
     console.clear();
     let outcome: Outcome = trained?;
@@ -134,7 +160,12 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     } else {
         finish::all(&run, &args.measure, console)?;
     }
+    watch.show(&run, outcome.iteration);
     console.emit(&json!({"type": "done", "run": run}));
+    if watch.is_on() && console.terminal() {
+        console.say("the player stays until Ctrl-C");
+        serving::wait(&stop);
+    }
     Ok(())
 }
 

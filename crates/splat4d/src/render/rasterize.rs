@@ -215,8 +215,8 @@ impl<F: Real> Raster<F> {
         });
     }
 
-    /// Writes one plane: `f(tile state's channel value, T)` of every pixel.
-    fn read(&self, plane: &mut [F], f: impl Fn(&Tile<F>, usize, usize) -> F + Sync) {
+    /// Writes one plane: `f(tile, y)` is row y of a tile's pixels. A row at a time, so that it is a vector's work.
+    fn read(&self, plane: &mut [F], f: impl Fn(&Tile<F>, usize) -> Row<F> + Sync) {
         let (w, across) = (self.width, self.bins.across);
         if w == 0 {
             return;
@@ -226,8 +226,10 @@ impl<F: Real> Raster<F> {
                 for (tx, run) in row.chunks_mut(TILE).enumerate() {
                     let bin = band * across + tx / SIDE;
                     let tile = &self.tiles[bin * TILES + y / TILE * SIDE + tx % SIDE];
-                    for (x, out) in run.iter_mut().enumerate() {
-                        *out = f(tile, y % TILE, x);
+                    let values = f(tile, y % TILE);
+                    match <&mut Row<F>>::try_from(&mut *run) {
+                        Ok(run) => *run = values,
+                        Err(_) => run.copy_from_slice(&values[..run.len()]),
                     }
                 }
             }
@@ -236,12 +238,12 @@ impl<F: Real> Raster<F> {
 
     /// Channel `c` over `background`: Σ c α T + T_end·background, [height, width].
     pub fn channel(&self, c: usize, background: F, plane: &mut [F]) {
-        self.read(plane, |tile, y, x| tile.color[c][y][x] + tile.t[y][x].abs() * background);
+        self.read(plane, |tile, y| std::array::from_fn(|x| tile.color[c][y][x] + tile.t[y][x].abs() * background));
     }
 
     /// 1 − T_end, [height, width].
     pub fn alpha(&self, plane: &mut [F]) {
-        self.read(plane, |tile, y, x| F::ONE - tile.t[y][x].abs());
+        self.read(plane, |tile, y| std::array::from_fn(|x| F::ONE - tile.t[y][x].abs()));
     }
 
     /// VJP of the last [`Raster::blend`] with the same `channels`.

@@ -1,0 +1,74 @@
+//! Anything that can be played, as a playback file: one as it is; a run's, if it is not older than its scene; any other
+//! scene baked in memory.
+
+use crate::baking::{Baking, pack, title};
+use crate::console::Console;
+use crate::files::cannot_read;
+use crate::run_folder::Run;
+use crate::source::{Source, not_empty};
+use splat4d::Result;
+use splat4d::format::playback::{HEADER_BYTES, Index, MAGIC};
+use splat4d_serve::Content;
+use std::fs::File;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+/// A playback file and what people call it.
+pub(crate) struct Playable {
+    pub title: String,
+    pub content: Content,
+}
+
+impl Playable {
+    /// Opens a run or a file, baking it where it must be. Errors: no scene; a damaged playback file.
+    pub(crate) fn open(path: &Path, console: &Console) -> anyhow::Result<Self> {
+        if let Some(file) = ready(path)? {
+            let index = index(&file)?;
+            let stem = || path.file_stem().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+            let title = if index.meta.title.is_empty() { stem() } else { index.meta.title };
+            return Ok(Self { title, content: Content::File(file) });
+        }
+        let source = Source::open(path)?;
+        not_empty(&source.scene, path)?;
+        let title = title(&source, path);
+        let packed = pack(&source, &title, &Baking::default(), console)?;
+        console.clear();
+        Ok(Self { title, content: Content::Bytes(packed.bytes.into()) })
+    }
+
+    /// The whole file.
+    pub(crate) fn bytes(&self) -> Result<Vec<u8>> {
+        match &self.content {
+            Content::File(path) => std::fs::read(path).map_err(|e| cannot_read(path, e)),
+            Content::Bytes(bytes) => Ok(bytes.to_vec()),
+            _ => Ok(Vec::new()),
+        }
+    }
+}
+
+/// The playback file that is there already.
+fn ready(path: &Path) -> Result<Option<PathBuf>> {
+    if path.is_dir() {
+        let changed = |p: &Path| p.metadata().and_then(|m| m.modified()).ok();
+        let baked = path.join("scene.splat4d");
+        let scene = Run::open(path)?.scene_file().ok();
+        let current = baked.is_file() && scene.is_none_or(|scene| changed(&scene) <= changed(&baked));
+        return Ok(current.then_some(baked));
+    }
+    let mut start = Vec::new();
+    let file = File::open(path).map_err(|e| cannot_read(path, e))?;
+    file.take(MAGIC.len() as u64).read_to_end(&mut start).map_err(|e| cannot_read(path, e))?;
+    Ok((start == MAGIC).then(|| path.to_owned()))
+}
+
+/// A playback file's index; the rest is not read. A damaged file is better told of here than in a browser.
+fn index(path: &Path) -> Result<Index> {
+    let fail = |e| cannot_read(path, e);
+    let file = File::open(path).map_err(fail)?;
+    let length = file.metadata().map_err(fail)?.len();
+    let mut start = Vec::new();
+    (&file).take(HEADER_BYTES as u64).read_to_end(&mut start).map_err(fail)?;
+    let needed = Index::needed(&start).map_err(|e| e.at(path.display()))?;
+    (&file).take((needed - HEADER_BYTES) as u64).read_to_end(&mut start).map_err(fail)?;
+    Index::parse(&start, Some(length)).map_err(|e| e.at(path.display()))
+}

@@ -1,0 +1,123 @@
+// From the stored bytes of a section to what a backend wants: checks the CRC, inflates, transposes byte planes into
+// words. A worker without imports (it must run from a blob URL); a page that may start no worker imports `decode`.
+
+/// Gaussians a block header describes, and its f32 numbers (docs/format.md).
+const BLOCK = 256,
+  HEADER = 24;
+/// 32-bit words a Gaussian (docs/format.md).
+const WORDS = 8;
+/// Bytes given to the inflater at a time. A browser inflates a piece whole, at most 1 : 1032, before anybody can stop
+/// it: so a hostile section costs 16 MB and no more.
+const PIECE = 16384;
+
+/// Where the platform is big endian, the typed arrays below would read nonsense; no browser runs on one.
+const CRC_TABLE = Uint32Array.from({ length: 256 }, (_, n) => {
+  for (let k = 0; k < 8; k++) n = n & 1 ? (n >>> 1) ^ 0xedb88320 : n >>> 1;
+  return n;
+});
+
+/// CRC-32 (IEEE 802.3, as in zip) of bytes.
+export function crc32(bytes) {
+  let c = ~0;
+  for (let i = 0; i < bytes.length; i++) c = CRC_TABLE[(c ^ bytes[i]) & 255] ^ (c >>> 8);
+  return ~c >>> 0;
+}
+
+/// Inflates `stored` (RFC 1951) to exactly `bytes` bytes; throws when there are more or fewer.
+async function inflate(stored, bytes) {
+  const stream = new DecompressionStream('deflate-raw');
+  const writer = stream.writable.getWriter(),
+    reader = stream.readable.getReader();
+  const feed = (async () => {
+    for (let i = 0; i < stored.length; i += PIECE) await writer.write(stored.subarray(i, i + PIECE));
+    await writer.close();
+  })();
+  // The reader meets the same error and reports it; here it must only not go unhandled.
+  feed.catch(() => {});
+  const out = new Uint8Array(bytes);
+  let at = 0;
+  for (;;) {
+    const { done, value } = await reader.read();
+    if (done) break;
+    if (at + value.length > bytes) {
+      reader.cancel().catch(() => {});
+      throw new Error(`it inflates to more than the ${bytes} bytes that the index states`);
+    }
+    out.set(value, at);
+    at += value.length;
+  }
+  if (at !== bytes) throw new Error(`it inflates to ${at} bytes, not the ${bytes} that the index states`);
+  return out;
+}
+
+function finite(numbers, what) {
+  for (let i = 0; i < numbers.length; i++) {
+    if (!Number.isFinite(numbers[i])) throw new Error(`${what} ${i} is no finite number`);
+  }
+}
+
+/// Transposes the 32 byte planes of `count` Gaussians, from byte `at` on, into words: word w of i is [8i + w].
+function transpose(data, at, count) {
+  const words = new Uint32Array(WORDS * count);
+  for (let w = 0; w < WORDS; w++) {
+    const a = at + 4 * w * count,
+      b = a + count,
+      c = b + count,
+      d = c + count;
+    for (let i = 0, o = w; i < count; i++, o += WORDS) {
+      words[o] = data[a + i] | (data[b + i] << 8) | (data[c + i] << 16) | (data[d + i] << 24);
+    }
+  }
+  return words;
+}
+
+function page(data, { count, labels }) {
+  const start = Math.ceil(count / BLOCK) * HEADER * 4;
+  const headers = new Float32Array(data.slice(0, start).buffer);
+  finite(headers, 'number of the block headers');
+  const words = transpose(data, start, count);
+  for (let i = 0; labels && i < count; i++) {
+    const label = words[WORDS * i + 7] & 0xffff;
+    if (label >= labels) throw new Error(`Gaussian ${i} names entry ${label} of a palette of ${labels}`);
+  }
+  return { count, headers, words };
+}
+
+function palette(data, { count, degree }) {
+  const ranges = new Float32Array(data.slice(0, 12).buffer);
+  finite(ranges, 'range');
+  return { degree, count, ranges, bytes: data.slice(12) };
+}
+
+/// Decodes one section.
+///
+/// `job`: {kind 'PAGE' | 'PALT' | other: bytes as they are, stored Uint8Array, crc, codec, bytes, count, degree,
+/// labels: entries of the page's palette, 0: none}. Its sizes have been checked against the file. Throws an Error that
+/// says why.
+export async function decode(job) {
+  if (crc32(job.stored) !== job.crc) throw new Error('its bytes are damaged: the checksum differs');
+  let data = job.stored;
+  if (job.codec === 1) {
+    try {
+      data = await inflate(job.stored, job.bytes);
+    } catch (e) {
+      // The platform's own texts ("The compressed data was not valid") name no culprit.
+      throw e instanceof TypeError || e?.code ? new Error('its compressed bytes are not valid') : e;
+    }
+  }
+  if (job.kind === 'PAGE') return page(data, job);
+  if (job.kind === 'PALT') return palette(data, job);
+  return { bytes: data };
+}
+
+if (typeof WorkerGlobalScope !== 'undefined' && self instanceof WorkerGlobalScope) {
+  self.onmessage = async ({ data: { ticket, job } }) => {
+    try {
+      const result = await decode(job);
+      const move = [result.words, result.headers, result.bytes, result.ranges].filter(Boolean).map((a) => a.buffer);
+      self.postMessage({ ticket, result }, move);
+    } catch (e) {
+      self.postMessage({ ticket, error: e.message });
+    }
+  };
+}

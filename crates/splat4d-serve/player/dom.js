@@ -1,0 +1,86 @@
+// Small builders of page elements. Text goes in as text, never as markup: titles and names come out of foreign files.
+
+import { icon } from './icons.js';
+
+/** An element with properties ('on…' are listeners, others attributes) and children. */
+export function h(tag, props = {}, ...children) {
+  const node = document.createElement(tag);
+  for (const [key, value] of Object.entries(props)) {
+    if (key.startsWith('on')) node.addEventListener(key.slice(2), value);
+    else if (value === true) node.setAttribute(key, '');
+    else if (value !== false && value != null) node.setAttribute(key, value);
+  }
+  node.append(...children.filter(c => c != null));
+  return node;
+}
+
+/** A button that is only an icon; its name is for screen readers and the tooltip. */
+export function tool(name, label, onclick, props = {}) {
+  return h('button', { type: 'button', class: 'tool', title: label, 'aria-label': label, onclick, ...props }, icon(name));
+}
+
+/** Changes an icon button's picture and name. */
+export function retool(button, name, label) {
+  if (button.title === label) return;
+  button.title = label;
+  button.setAttribute('aria-label', label);
+  button.replaceChildren(icon(name));
+}
+
+export const button = (label, onclick, props = {}, name = null) =>
+  h('button', { type: 'button', class: 'soft', onclick, ...props }, name && icon(name), label);
+
+let groups = 0;
+/** A choice of one of a few: radio buttons that look like one control. set(value) shows a value. */
+export function segments(label, options, onpick, props = {}) {
+  const name = `splat4d-${groups++}`;
+  const inputs = new Map();
+  const node = h('div', { role: 'radiogroup', 'aria-label': label, ...props, class: `seg ${props.class ?? ''}` },
+    ...options.map(([value, text, title]) => {
+      const input = h('input', { type: 'radio', name, value, 'aria-label': title ?? text, onchange: () => onpick(value) });
+      inputs.set(value, input);
+      return h('label', { title }, input, h('span', {}, text));
+    }));
+  node.set = value => { const input = inputs.get(value); if (input) input.checked = true; };
+  return node;
+}
+
+/** A list to choose from. set(value) shows a value, adding it where it is not among the options. */
+export function choice(label, options, onpick, props = {}) {
+  const option = ([value, text]) => h('option', { value }, text);
+  const node = h('select', { 'aria-label': label, title: label, ...props, onchange: () => onpick(node.value) },
+    ...options.map(option));
+  node.set = (value, text) => {
+    if (![...node.options].some(o => o.value === String(value))) node.append(option([value, text ?? String(value)]));
+    node.value = String(value);
+  };
+  return node;
+}
+
+export const field = (label, control, more = '') =>
+  h('div', { class: `field ${more}` }, h('span', {}, label), control);
+
+/** m:ss.cc, with hours where the clip has them. */
+export function clock(seconds, long) {
+  const s = Math.max(0, seconds), hours = Math.floor(s / 3600);
+  const minutes = Math.floor(s / 60) % 60, rest = (Math.floor(s * 100 + 1e-6) / 100 % 60).toFixed(2).padStart(5, '0');
+  return hours || long >= 3600 ? `${hours}:${String(minutes).padStart(2, '0')}:${rest}` : `${minutes}:${rest}`;
+}
+
+export function bytes(n) {
+  return n < 1e3 ? `${n} B` : n < 1e6 ? `${(n / 1e3).toFixed(0)} kB` : `${(n / 1e6).toFixed(n < 1e8 ? 1 : 0)} MB`;
+}
+
+/** Offers a file for saving. */
+export function save(blob, name) {
+  const href = URL.createObjectURL(blob);
+  h('a', { href, download: name }).click();
+  // Long enough for every browser to have begun reading it.
+  setTimeout(() => URL.revokeObjectURL(href), 60000);
+}
+
+/** Asks for a file; nothing happens where the asked person changes their mind. */
+export function pick(accept, onfile) {
+  const input = h('input', { type: 'file', accept, onchange: () => input.files[0] && onfile(input.files[0]) });
+  input.click();
+}

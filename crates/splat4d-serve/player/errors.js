@@ -1,0 +1,14 @@
+// One error type for the user: what happened, where, and what to do about it (the twin of splat4d's error.rs).
+
+export class SceneError extends Error {
+  constructor(what, where = '', remedy = '', cause = undefined) {
+    super(`${what}${where ? ` (${where})` : ''}.${remedy ? ` ${remedy}` : ''}`, { cause });
+    this.name = 'SceneError';
+    Object.assign(this, { what, where, remedy });
+  }
+}
+
+/// Whether `error` only says that somebody no longer wants the answer.
+export function isAbort(error) {
+  return error?.name === 'AbortError';
+}

@@ -1,0 +1,184 @@
+// A scene that is still being learned: the server's events, the curve of its quality, and the newest snapshot.
+
+import { h } from './dom.js';
+
+/** Milliseconds before another try to reach the server, doubled up to the second. */
+const RETRY = [500, 8000];
+/** Snapshots told within this time, ms, are one piece of news. */
+const TOGETHER = 30;
+/** Points of the curve that are kept; beyond it every second one goes. */
+const CURVE_MAX = 2000;
+
+/** Follows `events`; `handlers`: {step(data), snapshot(version), state('connecting' | 'live' | 'away')}. */
+export class Feed {
+  #wait = RETRY[0];
+  #timer = 0;
+  #source = null;
+
+  constructor(url, handlers) {
+    this.url = url;
+    this.handlers = handlers;
+    this.#connect();
+  }
+
+  #connect() {
+    this.handlers.state('connecting');
+    const source = this.#source = new EventSource(this.url);
+    source.onopen = () => { this.#wait = RETRY[0]; this.handlers.state('live'); };
+    source.onmessage = e => this.#message(e.data);
+    source.onerror = () => {
+      // A browser tries again by itself only after some kinds of failure, so that it is done here after all of them.
+      source.close();
+      this.handlers.state('away');
+      this.#timer = setTimeout(() => this.#connect(), this.#wait);
+      this.#wait = Math.min(2 * this.#wait, RETRY[1]);
+    };
+  }
+
+  #message(text) {
+    let data;
+    try { data = JSON.parse(text); } catch { return; }
+    if (data?.kind === 'step') this.handlers.step(readStep(data));
+    else if (data?.kind === 'snapshot') this.handlers.snapshot(data.version);
+    else if (data?.kind) this.handlers.other?.(data);
+  }
+
+  close() {
+    clearTimeout(this.#timer);
+    this.#source?.close();
+  }
+}
+
+/** A step as the server tells it, by either of its two sets of names. */
+function readStep({ step, iteration = step, of, iterations = of, psnr, loss, gaussians, left_s, seconds_left = left_s }) {
+  return { step: +iteration, of: +iterations, psnr: +psnr, loss: +loss, gaussians, left: +seconds_left };
+}
+
+/** Steps already taken: JSON (a list, or the server's {news}) or the CSV of a run. */
+export function readMetrics(text) {
+  const usable = rows => rows.filter(r => isFinite(r.step) && isFinite(r.psnr));
+  if (/^\s*[[{]/.test(text)) {
+    const value = JSON.parse(text);
+    return usable((Array.isArray(value) ? value : value.news ?? []).map(readStep));
+  }
+  const [head, ...lines] = text.trim().split(/\r?\n/).map(line => line.split(','));
+  const column = name => head.indexOf(name);
+  const [step, psnr, loss] = [column('iteration'), column('psnr'), column('loss')];
+  return usable(lines.map(line => ({ step: +line[step], psnr: +line[psnr], loss: +line[loss] })));
+}
+
+/** The card: what is being learned, how good it is, how long it will take. */
+export class Training {
+  #points = [];
+
+  constructor(ui, { events, src, metrics, version, reload }) {
+    this.ui = ui;
+    this.dot = h('i', { class: 'dot' });
+    this.state = h('span', {}, 'Connecting');
+    this.left = h('small');
+    this.figures = h('div', { class: 'figures' });
+    this.canvas = h('canvas', { role: 'img', 'aria-label': 'Quality over the steps' });
+    this.card = h('section', { class: 'card live', 'aria-label': 'Training' },
+      h('div', { class: 'row' }, this.dot, this.state, h('span', { class: 'space' }), this.left), this.canvas, this.figures);
+    ui.left.append(this.card);
+    ui.root.addEventListener('themechange', () => this.#draw());
+    this.resizes = new ResizeObserver(() => this.#draw());
+    this.resizes.observe(this.canvas);
+    let newest = null;
+    const show = number => {
+      clearTimeout(this.timer);
+      // A server that tells what was missed may name several: only the last is worth loading.
+      this.timer = setTimeout(() => {
+        if (number === newest) return;
+        newest = number;
+        const address = new URL(src, document.baseURI);
+        address.searchParams.set('v', number);
+        reload(address.href);
+      }, TOGETHER);
+    };
+    if (version != null) show(version);
+    const past = () => metrics && fetch(metrics).then(r => (r.ok ? r.text() : '')).then(text => text
+      && this.#merge(readMetrics(text))).catch(() => { /* The curve then begins with what arrives. */ });
+    this.feed = new Feed(events, {
+      step: data => this.#step(data),
+      snapshot: show,
+      state: state => {
+        this.#show(state);
+        // Whoever joins late, or was away, asks for what was missed.
+        if (state === 'live') past();
+      },
+      other: data => { if (data.kind === 'done' || data.kind === 'finished') this.#finish(); },
+    });
+  }
+
+  #show(state) {
+    this.link = state;
+    const over = this.over || this.last?.step >= this.last?.of;
+    this.dot.className = `dot ${state === 'live' && !over ? 'on' : 'off'}`;
+    this.state.textContent = over ? 'Training finished'
+      : { connecting: this.last ? 'Reconnecting' : 'Connecting', live: 'Training', away: 'Reconnecting' }[state];
+  }
+
+  #finish() {
+    this.over = true;
+    this.left.textContent = '';
+    this.#show(this.link);
+  }
+
+  #step(data) {
+    this.last = data;
+    this.#merge([data]);
+    this.#show(this.link);
+    const count = n => Number(n).toLocaleString('en-GB');
+    const left = s => (s > 5400 ? `${(s / 3600).toFixed(1)} h` : s > 90 ? `${Math.round(s / 60)} min` : `${Math.round(s)} s`);
+    const cells = [
+      [count(data.step), data.of ? `of ${count(data.of)} steps` : 'steps'],
+      [isFinite(data.psnr) ? data.psnr.toFixed(2) : '–', 'dB PSNR'],
+      [count(data.gaussians ?? 0), 'Gaussians'],
+    ];
+    this.left.textContent = data.left > 0 && !this.over ? `${left(data.left)} left` : '';
+    this.figures.replaceChildren(...cells.map(([value, name]) => h('div', {}, value, h('small', {}, name))));
+  }
+
+  #merge(steps) {
+    const known = new Map(this.#points.map(p => [p.step, p]));
+    for (const s of steps) known.set(s.step, s);
+    this.#points = [...known.values()].sort((a, b) => a.step - b.step);
+    while (this.#points.length > CURVE_MAX) this.#points = this.#points.filter((_, i) => i % 2 === 0);
+    this.#draw();
+  }
+
+  /** PSNR in the accent colour, the loss behind it; each over its own range. */
+  #draw() {
+    const { canvas } = this, box = canvas.getBoundingClientRect(), ratio = devicePixelRatio || 1;
+    if (!box.width || this.#points.length < 2) return;
+    canvas.width = Math.round(box.width * ratio);
+    canvas.height = Math.round(box.height * ratio);
+    const g = canvas.getContext('2d'), style = getComputedStyle(canvas);
+    const [first, last] = [this.#points[0].step, this.#points.at(-1).step];
+    const edge = 3 * ratio, w = canvas.width - 2 * edge, height = canvas.height - 2 * edge;
+    const curve = (key, colour, width) => {
+      const points = this.#points.filter(p => isFinite(p[key]));
+      const [low, high] = [Math.min(...points.map(p => p[key])), Math.max(...points.map(p => p[key]))];
+      g.beginPath();
+      for (const p of points) {
+        g.lineTo(edge + w * (p.step - first) / (last - first || 1),
+          edge + height * (1 - (p[key] - low) / (high - low || 1)));
+      }
+      Object.assign(g, { strokeStyle: colour, lineWidth: width * ratio, lineJoin: 'round', lineCap: 'round' });
+      g.stroke();
+    };
+    curve('loss', style.getPropertyValue('--line'), 1.5);
+    curve('psnr', style.getPropertyValue('--accent'), 2);
+    const psnr = this.#points.map(p => p.psnr);
+    canvas.setAttribute('aria-label', `Quality over the steps: PSNR from ${psnr[0].toFixed(1)} to ${
+      psnr.at(-1).toFixed(1)} dB`);
+  }
+
+  close() {
+    clearTimeout(this.timer);
+    this.feed.close();
+    this.resizes.disconnect();
+    this.card.remove();
+  }
+}

@@ -1,0 +1,163 @@
+// The two panels over the bar (View, Cameras), the help page and the figures.
+
+import { CHANNELS } from './player.js';
+import { Track } from './track.js';
+import { button, bytes, choice, clock, field, h, pick, save, segments, tool } from './dom.js';
+
+export const CHANNEL_NAMES = { color: 'Colour', depth: 'Depth', alpha: 'Alpha', flow: 'Flow' };
+export const SPEEDS = [0.1, 0.25, 0.5, 0.75, 1, 1.5, 2, 3, 4];
+const SCALES = [['auto', 'Automatic'], [1, 'Full'], [0.75, '75 %'], [0.5, '50 %'], [0.25, '25 %']];
+const BACKENDS = [['auto', 'Automatic'], ['webgpu', 'WebGPU'], ['webgl2', 'WebGL2']];
+const BACKGROUNDS = { scene: null, black: [0, 0, 0], grey: [0.5, 0.5, 0.5], white: [1, 1, 1] };
+
+const KEYS = [
+  ['Play or pause', 'Space'], ['Seek', '←', '→'], ['One frame', ',', '.'], ['Start, end', 'Home', 'End'],
+  ['Slower, faster', '[', ']'], ['Loop', 'L'], ['Colour, depth, alpha, flow', 'C'], ['Cameras', '1', '…', '9'],
+  ['Next camera', 'N'], ['Reset the view', 'R'], ['Orbit or fly', 'M'], ['Move', 'W', 'A', 'S', 'D'],
+  ['Down, up', 'Q', 'E'], ['Faster moves', 'Shift'], ['Turn', 'Shift + arrows'], ['Nearer, farther', '↑', '↓'],
+  ['Add a path key', 'K'], ['Play the path', 'P'], ['Bullet time', 'B'], ['Full screen', 'F'], ['Figures', 'I'],
+  ['Picture', 'G'], ['Light or dark', 'T'], ['This help', 'H', '?'],
+];
+const GESTURES = [
+  ['Drag', 'Turn'], ['Right drag, two fingers', 'Move'], ['Wheel, pinch', 'Nearer, farther'],
+  ['Alt + wheel', 'Field of view'],
+];
+
+function panel(title, close, ...children) {
+  const node = h('section', { class: 'card panel', role: 'dialog', 'aria-label': title, hidden: true },
+    h('div', { class: 'head' }, h('h2', {}, title), tool('close', 'Close', close)), ...children);
+  return node;
+}
+
+export function viewPanel(ui) {
+  const { player } = ui;
+  const channel = segments('Picture', CHANNELS.map(c => [c, CHANNEL_NAMES[c]]), c => player.setChannel(c));
+  const speed = choice('Speed', SPEEDS.map(s => [s, `${s}×`]), s => { player.speed = +s; });
+  const loop = h('input', { type: 'checkbox', 'aria-label': 'Loop', onchange: () => ui.setLoop(loop.checked) });
+  const scale = choice('Resolution', SCALES, s => ui.setResolution(s));
+  const backend = choice('Drawn with', BACKENDS, b => player.useBackend(b));
+  const ground = segments('Background', Object.keys(BACKGROUNDS).map(b => [b, b[0].toUpperCase() + b.slice(1)]), b => {
+    player.background = BACKGROUNDS[b];
+    player.redraw();
+  });
+  const theme = segments('Theme', [['auto', 'Auto'], ['light', 'Light'], ['dark', 'Dark']], t => ui.setTheme(t));
+  const figures = h('input', { type: 'checkbox', 'aria-label': 'Figures', onchange: () => ui.setFigures(figures.checked) });
+  const path = h('div', { class: 'wrap narrow' },
+    button('Back', () => player.step(-1), { 'aria-label': 'One frame back' }, 'back'),
+    button('Next', () => player.step(1), { 'aria-label': 'One frame on' }, 'next'),
+    button('Keys', () => ui.toggleHelp(), {}, 'help'));
+  const node = panel('View', () => ui.open(null),
+    h('div', { class: 'field cramped' }, channel),
+    path,
+    field('Speed', speed, 'narrow'), field('Loop', loop, 'narrow'), field('Resolution', scale),
+    field('Background', ground), field('Theme', theme), field('Drawn with', backend), field('Figures', figures),
+    h('div', { class: 'wrap' },
+      button('Save picture', () => ui.screenshot(), {}, 'photo'),
+      ui.page ? button('Copy link', () => ui.copyLink(), {}, 'link') : null,
+      ui.page ? button('Open file', () => ui.pickFile(), {}, 'open') : null));
+  node.refresh = () => {
+    channel.set(player.channel);
+    speed.set(player.speed, `${+player.speed.toFixed(2)}×`);
+    loop.checked = player.loop;
+    scale.set(player.resolution);
+    backend.set(player.backendName);
+    const now = JSON.stringify(player.background);
+    ground.set(Object.keys(BACKGROUNDS).find(k => JSON.stringify(BACKGROUNDS[k]) === now));
+    theme.set(ui.theme);
+    figures.checked = ui.figuresOn;
+    for (const item of [path.children[0], path.children[1], speed, loop]) item.disabled = player.still;
+  };
+  return node;
+}
+
+export function cameraPanel(ui) {
+  const { player } = ui;
+  const mode = segments('Movement', [['orbit', 'Orbit'], ['fly', 'Fly']], m => player.setMode(m));
+  const list = choice('Camera of the capture', [], i => player.view(+i));
+  const views = h('div', { class: 'field' }, list, h('div', { class: 'row' },
+    tool('back', 'Previous camera', () => player.view((player.viewed ?? 0) - 1)),
+    tool('next', 'Next camera', () => player.view((player.viewed ?? -1) + 1))));
+  const keys = h('ol', { class: 'keys', 'aria-label': 'Keys of the path' });
+  const note = h('p', { class: 'note' },
+    'A key keeps the camera and the scene’s time. Two or more make a path.');
+  const play = button('Play path', () => ui.playPath(), {}, 'play');
+  const bullet = button('Bullet time', () => ui.bullet(), { title: 'Time stands still, the camera moves' });
+  const out = button('Export', () => save(new Blob([JSON.stringify(player.track, null, 1)],
+    { type: 'application/json' }), 'path.json'), { title: 'For splat4d render --path path.json' });
+  const views3 = h('h3', {}, 'Cameras of the capture');
+  const node = panel('Cameras', () => ui.open(null),
+    field('Movement', mode),
+    button('Reset the view', () => player.reset()),
+    views3, views,
+    h('h3', {}, 'Camera path'), note, keys,
+    h('div', { class: 'wrap' },
+      button('Add key', () => ui.addKey()), play, bullet, out,
+      button('Import', () => pick('.json,application/json', file => ui.importPath(file)))));
+  let shown = null;
+  node.refresh = () => {
+    mode.set(player.controls.mode);
+    const cameras = player.meta?.cameras ?? [];
+    if (shown !== cameras) {
+      shown = cameras;
+      list.replaceChildren(h('option', { value: -1, disabled: true }, 'Free view'),
+        ...cameras.map((c, i) => h('option', { value: i }, `${i + 1} · ${c.name ?? 'camera'}`)));
+      views.hidden = views3.hidden = !cameras.length;
+    }
+    list.value = String(player.viewed ?? -1);
+    const n = player.track.keys.length;
+    play.disabled = n < 2 && !player.film;
+    play.lastChild.textContent = player.film && !player.film.frozen ? 'Stop path' : 'Play path';
+    bullet.lastChild.textContent = player.film?.frozen ? 'Stop bullet time' : 'Bullet time';
+    out.disabled = !n;
+    note.hidden = n > 1;
+    keys.hidden = !n;
+    if (!keys.contains(ui.focused())) keys.replaceChildren(...player.track.keys.map((key, i) => pathKey(ui, key, i)));
+  };
+  return node;
+}
+
+function pathKey(ui, key, i) {
+  const { player } = ui;
+  const seconds = h('input', { type: 'number', step: 0.1, value: +key.time.toFixed(2),
+    'aria-label': `Key ${i + 1}, second of the film`,
+    onchange: () => { player.track.move(i, +seconds.value); seconds.value = +key.time.toFixed(2); } });
+  const scene = key.sceneTime === null ? '' : ` · scene ${clock(key.sceneTime - player.first)}`;
+  return h('li', {}, h('b', {}, `${i + 1}`), seconds, h('span', {}, `s${scene}`),
+    button('Go', () => ui.goTo(key), { 'aria-label': `Go to key ${i + 1}` }),
+    tool('bin', `Delete key ${i + 1}`, () => { player.track.keys.splice(i, 1); ui.refresh(); }));
+}
+
+export function helpPage(close) {
+  return h('div', { class: 'centre veil', hidden: true, onclick: e => e.target === e.currentTarget && close() },
+    h('section', { class: 'card help', role: 'dialog', 'aria-modal': 'true', 'aria-label': 'Keys and gestures' },
+      h('div', { class: 'head' }, h('h2', {}, 'Keys and gestures'), tool('close', 'Close help', close)),
+      h('dl', {}, ...KEYS.map(([what, ...keys]) => h('div', { class: 'pair' }, h('dt', {}, what),
+        h('dd', {}, ...keys.map(k => (k === '…' ? ' … ' : h('kbd', {}, k)))))),
+      ...GESTURES.map(([what, does]) => h('div', { class: 'pair' }, h('dt', {}, what), h('dd', {}, does))))));
+}
+
+/** The figures card; refresh() reads the player's statistics. */
+export function figuresCard(player) {
+  const node = h('dl', { class: 'card stats', hidden: true, 'aria-label': 'Figures' });
+  const count = n => (n ?? 0).toLocaleString('en-GB');
+  node.refresh = () => {
+    const s = player.statistics;
+    const rows = [
+      ['Frames/s', s.fps ? s.fps.toFixed(0) : '–'],
+      ['Frame', s.frameMs ? `${s.frameMs.toFixed(1)} ms` : '–'],
+      ['Sorting', s.sortMs ? `${s.sortMs.toFixed(1)} ms` : '–'],
+      ['Picture', `${s.width} × ${s.height}`], ['Scale', `${Math.round(100 * s.scale)} %`],
+      ['Drawn', count(s.drawn)], ['Active', count(s.active)], ['Resident', count(s.resident)],
+      ['Gaussians', count(s.gaussians)], ['Read', `${bytes(s.bytesRead)} of ${bytes(s.bytesTotal)}`],
+      ['First picture', s.firstFrame ? `${s.firstFrame.toFixed(0)} ms` : '–'],
+      ['Drawn with', s.backend === 'webgpu' ? 'WebGPU' : s.backend === 'webgl2' ? 'WebGL2' : s.backend ?? '–'],
+    ];
+    node.replaceChildren(...rows.flatMap(([k, v]) => [h('dt', {}, k), h('dd', {}, v)]));
+  };
+  return node;
+}
+
+/** Reads a path file; the message says what is wrong with it. */
+export async function readPath(file, camera) {
+  return Track.parse(await file.text(), camera);
+}

@@ -1,0 +1,358 @@
+// A playback file (docs/format.md), read in parts: index, pages, palettes, poster. Trusts no number of the file.
+
+import { worker } from './assets.js';
+import { crc32, decode } from './decode.worker.js';
+import { SceneError, isAbort } from './errors.js';
+import { Local, Remote } from './ranges.js';
+
+/// First request, bytes: header and index of most files, and often the poster.
+const FIRST = 65536;
+/// Sizes of docs/format.md.
+const HEAD = 64,
+  ENTRY = 64,
+  BLOCK = 256,
+  BLOCK_BYTES = 96,
+  WORDS = 8;
+const MAGIC = [0x89, 0x53, 0x34, 0x44, 0x0d, 0x0a, 0x1a, 0x0a];
+const MAJOR = 1;
+const MAX_INDEX = 64 << 20,
+  MAX_SECTIONS = 1e6,
+  MAX_COUNT = 65536,
+  NO_PALETTE = 0xffffffff;
+/// Deflate shrinks at most 1 : 1032 (RFC 1951: 258 bytes from two bits).
+const DEFLATE_RATIO = 1032;
+/// A poster larger than this is no preview, bytes.
+const MAX_POSTER = 32 << 20;
+/// Workers: inflating a page takes some ms, and the network is slower than two.
+const WORKERS = (globalThis.navigator?.hardwareConcurrency ?? 2) > 2 ? 2 : 1;
+
+const DAMAGED = 'Fetch or bake it again.';
+
+/// Decodes in workers, or on this thread where the page may start none.
+class Decoder {
+  #workers = [];
+  #waiting = new Map();
+  #ticket = 0;
+  #here = typeof Worker === 'undefined';
+
+  run(job) {
+    const lane = this.#here ? null : this.#lane();
+    if (!lane) return decode(job);
+    return new Promise((resolve, reject) => {
+      const ticket = ++this.#ticket;
+      this.#waiting.set(ticket, { resolve, reject, job, lane });
+      lane.load++;
+      // Copied, not moved: if the worker turns out not to start, the job is done here.
+      lane.worker.postMessage({ ticket, job }, lane.proven ? [job.stored.buffer] : []);
+    });
+  }
+
+  close() {
+    for (const { worker } of this.#workers) worker.terminate();
+    this.#workers = [];
+    for (const { reject } of this.#waiting.values()) reject(new DOMException('closed', 'AbortError'));
+    this.#waiting.clear();
+  }
+
+  #lane() {
+    const idle = this.#workers.find((w) => w.load === 0);
+    if (idle || this.#workers.length >= WORKERS) {
+      return idle ?? this.#workers.reduce((a, b) => (b.load < a.load ? b : a));
+    }
+    try {
+      const lane = { worker: worker('decode.worker.js'), load: 0, proven: false };
+      lane.worker.onmessage = ({ data: { ticket, result, error } }) => {
+        lane.proven = true;
+        lane.load--;
+        const waiting = this.#waiting.get(ticket);
+        this.#waiting.delete(ticket);
+        if (error) waiting?.reject(new Error(error));
+        else waiting?.resolve(result);
+      };
+      lane.worker.onerror = (event) => {
+        event.preventDefault?.();
+        this.#fall(lane);
+      };
+      this.#workers.push(lane);
+      return lane;
+    } catch {
+      this.#here = true;
+      return null;
+    }
+  }
+
+  /// A worker that did not start (a page's policy may forbid it): what it was given is done here.
+  #fall(lane) {
+    this.#here = true;
+    for (const [ticket, w] of [...this.#waiting]) {
+      if (w.lane !== lane) continue;
+      this.#waiting.delete(ticket);
+      if (lane.proven) w.reject(new Error('the decoder ended unexpectedly'));
+      else decode(w.job).then(w.resolve, w.reject);
+    }
+    this.#workers = this.#workers.filter((l) => l !== lane);
+    lane.worker.terminate();
+  }
+}
+
+/// One playback file. Make it with `SceneFile.open`.
+export class SceneFile {
+  /// Opens a URL (text or URL object), a Blob or an ArrayBuffer. `onprogress(read, total)` is called while a server
+  /// without range requests sends the whole file. Throws SceneError.
+  static async open(source, { signal, onprogress } = {}) {
+    const file = new SceneFile();
+    const remote = typeof source === 'string' || source instanceof URL;
+    file.#where = remote ? String(source) : source?.name || 'the file';
+    file.#source = remote ? new Remote(String(source)) : new Local(source);
+    try {
+      const read = (length) =>
+        remote ? file.#source.open(length, signal, onprogress) : file.#source.read(0, length, signal);
+      await file.#start(await read(FIRST), signal);
+    } catch (e) {
+      file.close();
+      throw e;
+    }
+    return file;
+  }
+
+  /// The JSON of the index, checked: every key of docs/format.md, those that are not there null or empty.
+  meta;
+  /// All sections: {id, kind, flags, offset, stored, bytes, crc, codec, tier, degree, count, words, from, to,
+  /// palette: id or -1, missing: behind the end of a file that was cut short}.
+  sections = [];
+  /// The sections of kind PAGE that are there.
+  pages = [];
+  /// Whether the file was cut short.
+  truncated = false;
+  #source;
+  #where;
+  #head;
+  #decoder = new Decoder();
+
+  /// Bytes that came from the network or the disk.
+  get bytesRead() {
+    return this.#source.bytesRead;
+  }
+
+  /// Length of the file, bytes.
+  bytesTotal = 0;
+
+  /// Fetches, checks and decodes page `id`: {id, count, headers: Float32Array(24·blocks), words: Uint32Array(8·count),
+  /// word w of Gaussian i at [8i + w]}.
+  async page(id, { signal } = {}) {
+    const entry = this.sections[id];
+    return { id, ...(await this.#decoded(entry, signal, this.sections[entry.palette]?.count ?? 0)) };
+  }
+
+  /// The same for a palette: {id, degree, count, ranges: Float32Array(3), bytes: its planes}.
+  async palette(id, { signal } = {}) {
+    return { id, ...(await this.#decoded(this.sections[id], signal, 0)) };
+  }
+
+  /// The poster as a Blob, or null.
+  async poster({ signal } = {}) {
+    const entry = this.sections.find((s) => s.kind === 'POST' && !s.missing);
+    if (!entry || entry.bytes > MAX_POSTER || entry.stored > MAX_POSTER) return null;
+    const { bytes } = await this.#decoded(entry, signal, 0);
+    return new Blob([bytes], { type: bytes[0] === MAGIC[0] ? 'image/png' : 'image/jpeg' });
+  }
+
+  /// `time` held inside the clip.
+  clamp(time) {
+    const [first, last] = this.meta.clip;
+    return Math.min(Math.max(time, first), last);
+  }
+
+  /// The pages that are drawn at `time`.
+  activePages(time) {
+    const t = this.clamp(time);
+    return this.pages.filter((p) => p.from <= t && t < p.to);
+  }
+
+  close() {
+    this.#source.close();
+    this.#decoder.close();
+  }
+
+  async #decoded(entry, signal, labels) {
+    const { kind, offset, stored, crc, codec, bytes, count, degree, id, missing } = entry;
+    const where = `${this.#where}, section ${id}`;
+    if (missing) throw new SceneError('The file was cut short before this part', where, DAMAGED);
+    const data = await this.#bytes(offset, stored, signal);
+    signal?.throwIfAborted();
+    try {
+      if (data.length !== stored) throw new Error('the file ends before it');
+      return await this.#decoder.run({ kind, stored: data, crc, codec, bytes, count, degree, labels });
+    } catch (e) {
+      if (isAbort(e)) throw e;
+      throw new SceneError(`A part of the scene cannot be read: ${e.message}`, where, DAMAGED, e);
+    }
+  }
+
+  /// Bytes of the file; what the first request brought is not fetched again.
+  async #bytes(offset, length, signal) {
+    const known = this.#head.slice(offset, offset + length);
+    if (known.length === length) return known;
+    const rest = await this.#source.read(offset + known.length, length - known.length, signal);
+    if (!known.length) return rest;
+    const data = new Uint8Array(known.length + rest.length);
+    data.set(known);
+    data.set(rest, known.length);
+    return data;
+  }
+
+  #refuse(what, remedy = DAMAGED) {
+    throw new SceneError(what, this.#where, remedy);
+  }
+
+  async #start(head, signal) {
+    if (head.length < HEAD || MAGIC.some((b, i) => head[i] !== b)) {
+      this.#refuse('This is no .splat4d file', 'Bake or convert the scene to .splat4d first.');
+    }
+    const view = new DataView(head.buffer, head.byteOffset, head.byteLength);
+    if (view.getUint32(60, true) !== crc32(head.subarray(0, 60)))
+      this.#refuse('The header is damaged: its checksum differs');
+    const major = view.getUint16(8, true);
+    if (major !== MAJOR) {
+      this.#refuse(`This file has version ${major}, this player reads ${MAJOR}`, 'Use a newer player.');
+    }
+    const indexBytes = view.getUint32(12, true);
+    const length = long(view, 16);
+    this.bytesTotal = Math.min(length, this.#source.size);
+    this.truncated = this.#source.size < length;
+    if (indexBytes > MAX_INDEX || HEAD + indexBytes > length) this.#refuse('The index is longer than may be');
+    this.#head = head;
+    const whole = HEAD + indexBytes <= this.bytesTotal;
+    const index = whole ? await this.#bytes(HEAD, indexBytes, signal) : [];
+    if (index.length !== indexBytes) this.#refuse('The file is cut short inside its index');
+    if (crc32(index) !== view.getUint32(24, true)) this.#refuse('The index is damaged: its checksum differs');
+    this.#index(index, HEAD + indexBytes, length);
+  }
+
+  #index(index, begin, length) {
+    const view = new DataView(index.buffer, index.byteOffset, index.byteLength);
+    const jsonBytes = index.length >= 8 ? view.getUint32(0, true) : NO_PALETTE;
+    if (jsonBytes % 4 || jsonBytes > index.length - 8) this.#refuse('The index does not hold its own description');
+    let json;
+    try {
+      json = JSON.parse(new TextDecoder('utf-8', { fatal: true }).decode(index.subarray(4, 4 + jsonBytes)));
+    } catch {
+      this.#refuse("The scene's description is no valid JSON");
+    }
+    const table = 8 + jsonBytes,
+      count = view.getUint32(4 + jsonBytes, true);
+    if (count > MAX_SECTIONS || index.length !== table + count * ENTRY) {
+      this.#refuse(`The index is no table of ${count} sections`);
+    }
+    this.meta = this.#checkedMeta(json);
+    for (let id = 0; id < count; id++) this.sections.push(this.#entry(view, table + id * ENTRY, id, begin, length));
+    const order = this.sections.map((s) => s).sort((a, b) => a.offset - b.offset);
+    for (let i = 1; i < order.length; i++) {
+      if (order[i].offset < order[i - 1].offset + order[i - 1].stored) {
+        this.#refuse(`Sections ${order[i - 1].id} and ${order[i].id} overlap`);
+      }
+    }
+    for (const page of this.sections) {
+      if (page.kind !== 'PAGE') continue;
+      const palette = this.sections[page.palette];
+      if (page.palette !== -1 && palette?.kind !== 'PALT') this.#refuse(`Page ${page.id} names no palette`);
+      // Without its palette a page cannot be drawn.
+      if (palette?.missing) page.missing = true;
+      if (!page.missing) this.pages.push(page);
+    }
+    // What the pages state is what will be drawn, whatever the description says.
+    this.meta.gaussians = this.pages.reduce((n, p) => n + p.count, 0);
+  }
+
+  #entry(view, at, id, begin, length) {
+    const u32 = (o) => view.getUint32(at + o, true);
+    const kind = String.fromCharCode(...[0, 1, 2, 3].map((i) => view.getUint8(at + i)));
+    const [offset, stored, bytes] = [long(view, at + 8), u32(16), u32(20)];
+    const [codec, level, count] = [view.getUint16(at + 28, true), view.getUint16(at + 30, true), u32(32)];
+    const section = { id, kind, flags: u32(4), offset, stored, bytes, crc: u32(24), codec, count };
+    Object.assign(section, { tier: level, degree: level, words: u32(36), from: view.getFloat64(at + 40, true) });
+    Object.assign(section, { to: view.getFloat64(at + 48, true), palette: u32(56) === NO_PALETTE ? -1 : u32(56) });
+    section.missing = offset + stored > this.bytesTotal;
+    const refuse = (what, remedy) => this.#refuse(`Section ${id} (${kind.replace(/[^ -~]/g, '?')}) ${what}`, remedy);
+    if (!(offset >= begin && offset + stored <= length)) refuse('lies outside the file');
+    if (!['PAGE', 'PALT', 'POST'].includes(kind)) {
+      if (section.flags & 1) refuse('is of a kind that this player does not know', 'Use a newer player.');
+      return section;
+    }
+    if (codec > 1) refuse(`is packed with method ${codec}, unknown here`, 'Use a newer player.');
+    if (codec === 0 ? stored !== bytes : bytes > DEFLATE_RATIO * stored) refuse('cannot hold what it states');
+    if (kind === 'POST') return section;
+    if (count < 1 || count > MAX_COUNT) refuse(`states ${count} entries, not 1 to ${MAX_COUNT}`);
+    if (kind === 'PAGE' && section.words !== WORDS) {
+      refuse(`has ${section.words} words a Gaussian, not ${WORDS}`, 'Use a newer player.');
+    }
+    if (kind === 'PALT' && !(level >= 1 && level <= 3)) refuse(`has degree ${level}, not 1 to 3`);
+    const right =
+      kind === 'PAGE'
+        ? Math.ceil(count / BLOCK) * BLOCK_BYTES + 4 * WORDS * count
+        : 12 + 3 * ((level + 1) ** 2 - 1) * count;
+    if (bytes !== right) refuse(`decodes to ${bytes} bytes, not the ${right} that its ${count} entries need`);
+    // Deflate stores what it cannot shrink with few bytes more; twice is nothing that a writer makes.
+    if (stored > 2 * bytes) refuse('is longer packed than unpacked');
+    if (kind === 'PAGE' && !(section.from < section.to && Number.isFinite(section.to - section.from))) {
+      refuse('has no valid span of time');
+    }
+    return section;
+  }
+
+  #checkedMeta(json) {
+    const need = (ok, key) => ok || this.#refuse(`The scene's description has no valid "${key}"`);
+    const text = (v) => (typeof v === 'string' ? v : null);
+    const j = json ?? {};
+    need(numbers(j.clip, 2) && j.clip[0] <= j.clip[1], 'clip');
+    need(number(j.fps) && j.fps > 0, 'fps');
+    need(numbers(j.up, 3) && Math.hypot(...j.up) > 0.5, 'up');
+    need(numbers(j.background, 3), 'background');
+    need([0, 1, 2, 3].includes(j.sh_degree), 'sh_degree');
+    need(Number.isSafeInteger(j.gaussians) && j.gaussians >= 0, 'gaussians');
+    const box = Array.isArray(j.box) && j.box.length === 2 && j.box.every((c) => numbers(c, 3)) ? j.box : null;
+    const up = j.up.map((v) => v / Math.hypot(...j.up));
+    return {
+      clip: [...j.clip],
+      fps: j.fps,
+      up,
+      background: j.background.map((v) => Math.min(Math.max(v, 0), 1)),
+      sh_degree: j.sh_degree,
+      gaussians: j.gaussians,
+      unit: number(j.unit) && j.unit > 0 ? j.unit : null,
+      title: text(j.title),
+      generator: text(j.generator),
+      box,
+      view: look(j.view) ? j.view : null,
+      cameras: list(j.cameras)
+        .filter(camera)
+        .map((c, i) => ({ ...c, name: text(c.name) ?? `camera ${i + 1}` })),
+      path: list(j.path)
+        .filter((k) => look(k) && number(k.at))
+        .map((k) => ({ ...k, time: number(k.time) ? k.time : null })),
+    };
+  }
+}
+
+const number = (v) => typeof v === 'number' && Number.isFinite(v);
+const numbers = (v, n) => Array.isArray(v) && v.length === n && v.every(number);
+const list = (v) => (Array.isArray(v) ? v : []);
+const look = (v) =>
+  v &&
+  numbers(v.position, 3) &&
+  numbers(v.target, 3) &&
+  numbers(v.up, 3) &&
+  number(v.fov_y) &&
+  v.fov_y > 0 &&
+  v.fov_y < 180;
+const camera = (v) =>
+  v &&
+  numbers(v.world_from_camera, 12) &&
+  number(v.cx) &&
+  number(v.cy) &&
+  [v.width, v.height, v.fx, v.fy].every((n) => number(n) && n > 0);
+
+/// A u64, as a float: beyond 2⁵³ it is no length that exists, and fails the comparison with what is there.
+function long(view, at) {
+  return view.getUint32(at, true) + view.getUint32(at + 4, true) * 2 ** 32;
+}

@@ -1,0 +1,260 @@
+// Keeps the right pages in a backend: first those of this moment (most important tier first), then those just ahead;
+// above its budget it lets go of what is farthest in time, never of what this moment needs.
+
+import { isAbort } from './errors.js';
+
+/// Bytes of 32-bit words that stay resident, by default, and on small machines (navigator.deviceMemory, GiB).
+const BUDGET = 512 << 20,
+  SMALL_BUDGET = 128 << 20,
+  SMALL_MEMORY = 4;
+/// Bytes a Gaussian (docs/format.md: 8 words).
+const GAUSSIAN = 32;
+/// Looked ahead while playing, s of the viewer's time; to both sides while not, s of the scene's.
+const AHEAD = 2,
+  BESIDE = 0.5;
+/// Times on the scene clock change each frame; a plan is made anew when one moved by this part of what is looked ahead.
+const STEP = 8;
+/// Pages in flight for later: few, so that a seek is not behind many.
+const LATER = 4;
+/// A page is tried this often; after the last failure it rests, ms.
+const TRIES = 2,
+  REST = 10_000;
+
+/// The budget for this machine, bytes.
+export function defaultBudget() {
+  const memory = globalThis.navigator?.deviceMemory ?? 8;
+  return memory <= SMALL_MEMORY ? SMALL_BUDGET : BUDGET;
+}
+
+export class Stream {
+  #file;
+  #backend;
+  #budget;
+  #onchange;
+  #onerror;
+  #resident = new Set();
+  /// id → AbortController of what is on its way.
+  #flight = new Map();
+  #bytes = 0;
+  /// id → {tries, at}: pages that failed.
+  #failed = new Map();
+  /// palette id → promise of its being in the backend.
+  #palettes = new Map();
+  #now = [];
+  #later = [];
+  #key = '';
+  /// When a page that was given up may be tried again.
+  #again = Infinity;
+  #last = { time: NaN, playing: false, speed: 1, loop: true };
+  #waiting = [];
+  #over = false;
+  #starts;
+  #ends;
+
+  /// `file`: SceneFile. `backend`: of PLAYER's interface; it owns the arrays it is given. `budget`: bytes of words.
+  /// `onchange()` after each page that came or went, `onerror(SceneError)` for a page that is given up for now.
+  constructor(file, backend, { budget = defaultBudget(), onchange, onerror } = {}) {
+    this.#file = file;
+    this.#backend = backend;
+    this.#budget = Math.min(budget, backend.capacity ?? Infinity);
+    this.#onchange = onchange ?? (() => {});
+    this.#onerror = onerror ?? (() => {});
+    this.#starts = Float64Array.from(file.pages, (p) => p.from).sort();
+    this.#ends = Float64Array.from(file.pages, (p) => p.to).sort();
+  }
+
+  /// Bytes of words that are resident.
+  get bytes() {
+    return this.#bytes;
+  }
+
+  /// Pages on their way.
+  get loading() {
+    return this.#flight.size;
+  }
+
+  /// Tells what is shown. Cheap where nothing changed: call it every frame.
+  update(time, { playing = false, speed = 1, loop = true } = {}) {
+    if (this.#over) return;
+    const t = this.#file.clamp(time);
+    // Which pages are drawn is decided by how many spans began and ended; what lies ahead, in coarse steps.
+    const reach = playing ? Math.max(Math.abs(speed), 0.1) * AHEAD : BESIDE;
+    const step = Math.floor((t / reach) * STEP);
+    const key = `${before(this.#starts, t)} ${before(this.#ends, t)} ${step} ${playing} ${speed} ${loop}`;
+    Object.assign(this.#last, { time: t, playing, speed, loop });
+    if (key === this.#key && performance.now() < this.#again) return;
+    this.#key = key;
+    this.#again = Infinity;
+    this.#plan(t, playing, speed, loop, reach);
+    this.#pump();
+  }
+
+  /// Share of the Gaussians of `time` that are resident, 0 to 1.
+  ready(time) {
+    let all = 0,
+      there = 0;
+    for (const page of this.#file.activePages(time)) {
+      all += page.count;
+      if (this.#resident.has(page.id)) there += page.count;
+    }
+    return all ? there / all : 1;
+  }
+
+  /// Resolves when all pages of `time` are resident, or given up, or more than the budget holds.
+  settled(time) {
+    const { playing, speed, loop } = this.#last;
+    this.update(time, { playing, speed, loop });
+    return new Promise((done) => {
+      this.#waiting.push(done);
+      this.#wake();
+    });
+  }
+
+  destroy() {
+    this.#over = true;
+    for (const stop of this.#flight.values()) stop.abort();
+    this.#flight.clear();
+    for (const done of this.#waiting.splice(0)) done();
+  }
+
+  /// Decides what should be resident: `#now` and `#later`, both in the order in which they are wanted, within budget.
+  #plan(t, playing, speed, loop, reach) {
+    const [first, last] = this.#file.meta.clip;
+    const now = [],
+      later = [];
+    const forward = speed >= 0;
+    for (const page of this.#file.pages) {
+      if (page.from <= t && t < page.to) {
+        now.push(page);
+        continue;
+      }
+      // How long until it is needed, on the scene clock; while nothing plays, either way.
+      let wait = page.from > t ? page.from - t : Math.max(t - page.to, 0);
+      if (playing) {
+        wait = forward ? page.from - t : t - page.to;
+        const round = forward ? last - t + page.from - first : t - first + last - page.to;
+        if (wait < 0) wait = loop ? Math.max(round, 0) : Infinity;
+      }
+      page.wait = wait;
+      if (wait <= reach) later.push(page);
+    }
+    now.sort((a, b) => a.tier - b.tier || a.id - b.id);
+    later.sort((a, b) => a.wait - b.wait || a.tier - b.tier || a.id - b.id);
+    let room = this.#budget;
+    const fits = (page) => (page.count * GAUSSIAN <= room ? ((room -= page.count * GAUSSIAN), true) : false);
+    this.#now = now.filter(fits);
+    // What is later may not push out more of itself than the budget has left.
+    this.#later = later.filter(fits);
+    const wanted = new Set([...this.#now, ...this.#later].map((p) => p.id));
+    for (const [id, stop] of this.#flight) if (!wanted.has(id)) stop.abort();
+    this.#shrink(wanted);
+  }
+
+  /// Drops pages until what is wanted fits: the farthest in time first.
+  #shrink(wanted) {
+    let missing = 0;
+    for (const page of [...this.#now, ...this.#later]) {
+      if (!this.#resident.has(page.id)) missing += page.count * GAUSSIAN;
+    }
+    if (this.#bytes + missing <= this.#budget) return;
+    const { time, playing, speed } = this.#last;
+    const far = (page) => {
+      const gap = page.from > time ? page.from - time : Math.max(time - page.to, 0);
+      // While it plays, what has just passed is needed later than what comes.
+      const passed = playing && (speed >= 0 ? page.to <= time : page.from > time);
+      return passed ? gap + AHEAD : gap;
+    };
+    const spare = [...this.#resident].filter((id) => !wanted.has(id)).map((id) => this.#file.sections[id]);
+    spare.sort((a, b) => far(b) - far(a) || b.tier - a.tier || b.id - a.id);
+    for (const page of spare) {
+      if (this.#bytes + missing <= this.#budget) break;
+      this.#resident.delete(page.id);
+      this.#bytes -= page.count * GAUSSIAN;
+      this.#backend.dropPage(page.id);
+      this.#onchange();
+    }
+  }
+
+  #wants(page) {
+    if (this.#resident.has(page.id) || this.#flight.has(page.id)) return false;
+    const failed = this.#failed.get(page.id);
+    return !failed || failed.tries < TRIES || performance.now() - failed.at >= REST;
+  }
+
+  /// Starts what is to be fetched now: this moment's pages all at once, and only when those are there, later ones.
+  #pump() {
+    if (this.#over) return;
+    let open = false;
+    for (const page of this.#now) {
+      if (this.#wants(page)) this.#load(page);
+      open ||= this.#flight.has(page.id);
+    }
+    if (!open) {
+      for (const page of this.#later) {
+        if (this.#flight.size >= LATER) break;
+        if (this.#wants(page)) this.#load(page);
+      }
+    }
+    this.#wake();
+  }
+
+  async #load(entry) {
+    const stop = new AbortController();
+    this.#flight.set(entry.id, stop);
+    try {
+      const [page] = await Promise.all([
+        this.#file.page(entry.id, { signal: stop.signal }),
+        entry.palette < 0 ? null : this.#palette(entry.palette),
+      ]);
+      if (stop.signal.aborted) return;
+      this.#backend.addPage(page, entry);
+      this.#resident.add(entry.id);
+      this.#bytes += entry.count * GAUSSIAN;
+      this.#failed.delete(entry.id);
+      this.#onchange();
+    } catch (error) {
+      if (stop.signal.aborted || this.#over || isAbort(error)) return;
+      const failed = this.#failed.get(entry.id);
+      const tries = (failed && performance.now() - failed.at < REST ? failed.tries : 0) + 1;
+      this.#failed.set(entry.id, { tries, at: performance.now() });
+      if (tries >= TRIES) {
+        this.#again = performance.now() + REST;
+        this.#onerror(error);
+      }
+    } finally {
+      // An aborted page may be on its way again already, under another controller.
+      if (this.#flight.get(entry.id) === stop) this.#flight.delete(entry.id);
+      this.#pump();
+    }
+  }
+
+  /// Fetched once and kept: palettes are small, and most pages share one.
+  #palette(id) {
+    let there = this.#palettes.get(id);
+    if (!there) {
+      there = this.#file.palette(id).then((palette) => this.#over || this.#backend.addPalette(palette));
+      this.#palettes.set(id, there);
+      there.catch(() => this.#palettes.delete(id));
+    }
+    return there;
+  }
+
+  /// Answers `settled` where nothing of this moment is on its way any more.
+  #wake() {
+    if (!this.#waiting.length) return;
+    if (this.#now.some((page) => this.#flight.has(page.id) || this.#wants(page))) return;
+    for (const done of this.#waiting.splice(0)) done();
+  }
+}
+
+/// How many of the sorted `numbers` are ≤ x.
+function before(numbers, x) {
+  let low = 0,
+    high = numbers.length;
+  while (low < high) {
+    const mid = (low + high) >> 1;
+    if (numbers[mid] <= x) low = mid + 1;
+    else high = mid;
+  }
+  return low;
+}

@@ -1,0 +1,522 @@
+// The WebGL2 backend: words in textures, order from a worker, blending in half floats where that is to be had.
+
+import { SceneError } from './errors.js';
+import { Rows, check, program, texture } from './gl.js';
+import {
+  BATCH,
+  BLOCK_TEXELS,
+  CHANNELS,
+  DIRECT_VERTEX,
+  DRAW_FRAGMENT,
+  DRAW_VERTEX,
+  ORDER_WIDTH,
+  PROJECT_FRAGMENT,
+  SHOW_FRAGMENT,
+  SHOW_VERTEX,
+} from './glsl.js';
+import { Order } from './order.js';
+import { ROW } from './sort.worker.js';
+
+/// Texels across the words' and the palettes' textures: every WebGL2 device has them (its minimum for a texture).
+const WIDTH = 2048;
+/// Gaussians a block, blocks a row, f32 numbers of a header (docs/format.md).
+const BLOCK = 256,
+  BLOCKS = ROW / BLOCK,
+  HEADER = 24;
+/// Header numbers that are times on the scene clock: life centre min and max, alive from and to.
+const TIMES = [6, 7, 8, 9];
+/// Rows of the words' texture to begin with: 2 MiB each 64.
+const FIRST_ROWS = 256;
+/// z ≤ near is not drawn; x/z and y/z inside J may leave the picture by this share of its half-width's tangent
+/// (CONVENTIONS.md).
+const NEAR = 0.01,
+  J_MARGIN = 0.3;
+
+export class WebGL2Backend {
+  /// Throws SceneError where WebGL2 is not to be had. `onlost(SceneError)` is called when the browser takes it away.
+  static async create(canvas, { onlost } = {}) {
+    return new WebGL2Backend(canvas, onlost);
+  }
+
+  name = 'webgl2';
+  stats = { resident: 0, active: 0, drawn: 0, sortMs: 0, drawMs: 0 };
+  #canvas;
+  #gl;
+  #lost;
+  #destroyed = false;
+  /// Programs: {program, at: places of uniforms}. `#project` is null where every corner computes its splat.
+  #project = null;
+  #draw;
+  #show;
+  /// Textures of words, block headers and palettes, and how their rows are lent. Texture: its greatest height.
+  #words = null;
+  #blocks;
+  #palette;
+  #maxRows;
+  #rows = new Rows(0);
+  #paletteRows = 0;
+  #paletteHeight = 0;
+  /// id → {row, rows, count}; id → {row, degree, ranges}.
+  #pages = new Map();
+  #palettes = new Map();
+  /// Rows of dropped pages: [{row, count, generation}]. The order on the screen may still name them.
+  #retired = [];
+  #clip = [0, 0];
+  /// The worker's orders, in two textures in turn: `#front` is drawn, its first `#count` numbers.
+  #order;
+  #orders = [0, 1].map(() => ({ texture: null, rows: 0 }));
+  #front = 0;
+  #count = 0;
+  /// Orders of an earlier scene carry a smaller generation.
+  #least = 0;
+  /// What PROJECT_FRAGMENT writes, and what is blended: {frame, texture(s), …}.
+  #splats = null;
+  #sums;
+  #size = [0, 0];
+  /// Vertex arrays: none at all, and quads; the latter's corners.
+  #empty;
+  #quads;
+  #corners;
+  /// What the last `draw` was given, whether something came since that picture, and the frame that will show it.
+  #last = null;
+  #stale = false;
+  #frame = 0;
+  #waiting = [];
+
+  constructor(canvas, onlost) {
+    const options = {
+      alpha: false,
+      antialias: false,
+      depth: false,
+      stencil: false,
+      powerPreference: 'high-performance',
+    };
+    const gl = canvas.getContext('webgl2', options);
+    if (!gl)
+      throw new SceneError(
+        'This browser offers no WebGL2',
+        '',
+        'Switch on hardware acceleration, or use another browser.',
+      );
+    this.#canvas = canvas;
+    this.#gl = gl;
+    this.#lost = (event) => {
+      event.preventDefault();
+      if (this.#destroyed) return;
+      this.#wake();
+      onlost?.(new SceneError('The graphics device was taken away', '', 'Reload the page.'));
+    };
+    canvas.addEventListener('webglcontextlost', this.#lost);
+    const full = gl.getExtension('EXT_color_buffer_float');
+    const float = full ?? gl.getExtension('EXT_color_buffer_half_float');
+    this.#sums = { texture: null, frame: gl.createFramebuffer(), format: float ? gl.RGBA16F : gl.RGBA8 };
+    this.#maxRows = gl.getParameter(gl.MAX_TEXTURE_SIZE);
+    /// Bytes of words that fit; half a row is lost at the end of a page on average.
+    this.capacity = Math.floor(this.#maxRows * ROW * 32 * 0.98);
+    // Splats are computed once each where 32-bit floats can be rendered to, else once a corner.
+    if (full) {
+      this.#project = program(gl, SHOW_VERTEX, PROJECT_FRAGMENT);
+      this.#splats = { frame: gl.createFramebuffer(), textures: [], rows: 0 };
+    }
+    this.#draw = full ? program(gl, DRAW_VERTEX, DRAW_FRAGMENT) : program(gl, DIRECT_VERTEX, DRAW_FRAGMENT);
+    this.#show = program(gl, SHOW_VERTEX, SHOW_FRAGMENT);
+    this.#blocks = texture(gl, gl.RGBA32F, BLOCKS * BLOCK_TEXELS, this.#maxRows);
+    this.#grow(FIRST_ROWS);
+    this.#palette = texture(gl, gl.RGBA8UI, 1, 1);
+    this.#empty = gl.createVertexArray();
+    this.#quads = gl.createVertexArray();
+    gl.bindVertexArray(this.#quads);
+    this.#corners = gl.createBuffer();
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.#corners);
+    const corners = Uint16Array.from({ length: 6 * BATCH }, (_, i) => 4 * Math.floor(i / 6) + CORNERS[i % 6]);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
+    gl.bindVertexArray(null);
+    this.#order = new Order(NEAR, (answer) => this.#ordered(answer));
+    check(gl, 'The graphics memory did not suffice to begin');
+  }
+
+  /// The WebGL2 context (a headset's session needs it).
+  get gl() {
+    return this.#gl;
+  }
+
+  /// Begins another scene: what was resident goes.
+  setScene(meta) {
+    for (const id of [...this.#pages.keys()]) this.dropPage(id);
+    this.#palettes.clear();
+    this.#paletteRows = 0;
+    this.#clip = meta.clip;
+    this.#last = null;
+    this.#count = 0;
+    this.#least = this.#order.generation;
+  }
+
+  /// `palette`: of SceneFile.palette.
+  addPalette({ id, degree, count, ranges, bytes }) {
+    const gl = this.#gl,
+      per = (degree + 1) ** 2 - 1,
+      rows = Math.ceil((count * per) / WIDTH);
+    const row = this.#paletteRows;
+    if (row + rows > this.#maxRows) throw new SceneError('The palettes are too many for this graphics card');
+    if (row + rows > this.#paletteHeight) {
+      const height = Math.min(Math.max(row + rows, 2 * this.#paletteHeight), this.#maxRows);
+      this.#palette = this.#enlarged(this.#palette, gl.RGBA8UI, row, height);
+      this.#paletteHeight = height;
+    }
+    // From planes (coefficient, channel) to texels: one coefficient of an entry each, entry by entry.
+    const texels = new Uint8Array(rows * WIDTH * 4);
+    for (let k = 0; k < per; k++) {
+      for (let c = 0; c < 3; c++) {
+        const plane = (3 * k + c) * count;
+        for (let i = 0; i < count; i++) texels[(i * per + k) * 4 + c] = bytes[plane + i];
+      }
+    }
+    gl.bindTexture(gl.TEXTURE_2D, this.#palette);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, row, WIDTH, rows, gl.RGBA_INTEGER, gl.UNSIGNED_BYTE, texels);
+    check(gl, 'The graphics memory is full');
+    this.#paletteRows += rows;
+    this.#palettes.set(id, { row, degree, ranges });
+  }
+
+  /// `page`: of SceneFile.page, whose arrays are the backend's from now on. `entry`: its section.
+  addPage(page, entry) {
+    const gl = this.#gl,
+      { id, count, words, headers } = page,
+      rows = Math.ceil(count / ROW);
+    let row = this.#rows.take(rows);
+    if (row < 0) {
+      this.#grow(Math.min(Math.max(2 * this.#rows.rows, this.#rows.rows + rows), this.#maxRows));
+      row = this.#rows.take(rows);
+    }
+    if (row < 0) throw new SceneError('The graphics memory is full', '', 'Lower the memory budget.');
+    const whole = Math.floor(count / ROW),
+      rest = count % ROW;
+    gl.bindTexture(gl.TEXTURE_2D, this.#words);
+    const put = (y, width, height, at) =>
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, y, width, height, gl.RGBA_INTEGER, gl.UNSIGNED_INT, words, at);
+    if (whole) put(row, WIDTH, whole, 0);
+    if (rest) put(row + whole, 2 * rest, 1, whole * ROW * 8);
+    gl.bindTexture(gl.TEXTURE_2D, this.#blocks);
+    gl.texSubImage2D(
+      gl.TEXTURE_2D,
+      0,
+      0,
+      row,
+      BLOCKS * BLOCK_TEXELS,
+      rows,
+      gl.RGBA,
+      gl.FLOAT,
+      this.#blockTexels(headers, rows, entry),
+    );
+    this.#pages.set(id, { row, rows, count });
+    this.stats.resident += count;
+    this.#order.add(page, entry, row);
+    this.#refresh();
+  }
+
+  dropPage(id) {
+    const page = this.#pages.get(id);
+    if (!page) return;
+    this.#pages.delete(id);
+    this.stats.resident -= page.count;
+    this.#order.drop(id);
+    this.#retired.push({ row: page.row, count: page.rows, generation: this.#order.generation });
+    this.#refresh();
+  }
+
+  /// Size of the drawing buffer, px.
+  resize(width, height) {
+    if (this.#size[0] === width && this.#size[1] === height && this.#sums.texture) return;
+    this.#canvas.width = width;
+    this.#canvas.height = height;
+    this.#room(width, height);
+  }
+
+  /// Draws with the newest order there is, and asks for a better one where time or camera moved. `target` {framebuffer,
+  /// x, y}: where the picture goes instead of the canvas (a headset's).
+  draw({ time, view, channel = 'color', background = [0, 0, 0], depthRange = [0, 1], flowScale = 100, target = null }) {
+    this.#last = {
+      time: Math.min(Math.max(time, this.#clip[0]), this.#clip[1]),
+      view,
+      channel,
+      background,
+      depthRange,
+      flowScale,
+      target,
+    };
+    this.#ask();
+    this.#redraw();
+  }
+
+  /// Resolves when the picture of the last `draw` is in its final order.
+  async settled() {
+    while (this.#last && !this.#destroyed && !this.#gl.isContextLost() && this.#ask()) {
+      await new Promise((done) => this.#waiting.push(done));
+    }
+    if (this.#stale) this.#redraw();
+  }
+
+  /// The picture of the last `draw`: {width, height, data: RGBA bytes, rows from the top}.
+  async readPixels() {
+    const gl = this.#gl,
+      [width, height] = this.#size;
+    const data = new Uint8ClampedArray(width * height * 4);
+    if (!this.#last || gl.isContextLost()) return { width, height, data };
+    const target = texture(gl, gl.RGBA8, width, height),
+      frame = gl.createFramebuffer();
+    gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, target, 0);
+    this.#resolve(frame, 0, 0, 0);
+    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(data.buffer));
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.deleteFramebuffer(frame);
+    gl.deleteTexture(target);
+    return { width, height, data };
+  }
+
+  destroy() {
+    this.#destroyed = true;
+    this.#order.destroy();
+    cancelAnimationFrame(this.#frame);
+    this.#wake();
+    this.#canvas.removeEventListener('webglcontextlost', this.#lost);
+    const gl = this.#gl;
+    for (const t of [this.#words, this.#blocks, this.#palette, this.#sums.texture]) gl.deleteTexture(t);
+    for (const t of [...this.#orders.map((o) => o.texture), ...(this.#splats?.textures ?? [])]) gl.deleteTexture(t);
+    for (const a of [this.#empty, this.#quads]) gl.deleteVertexArray(a);
+    gl.deleteBuffer(this.#corners);
+    gl.deleteFramebuffer(this.#sums.frame);
+    if (this.#splats) gl.deleteFramebuffer(this.#splats.frame);
+    for (const p of [this.#project, this.#draw, this.#show]) gl.deleteProgram(p?.program ?? null);
+  }
+
+  // Textures
+
+  #blockTexels(headers, rows, { from, to, palette }) {
+    const texels = new Float32Array(rows * BLOCKS * BLOCK_TEXELS * 4);
+    const { row, degree, ranges } = this.#palettes.get(palette) ?? { row: -1, degree: 0, ranges: [0, 0, 0] };
+    for (let b = 0; b * HEADER < headers.length; b++) {
+      const o = b * BLOCK_TEXELS * 4,
+        h = headers.subarray(b * HEADER, (b + 1) * HEADER);
+      texels.set(h, o);
+      // Relative to the clip's start, so that 32 bits keep their precision on a clock that started long ago.
+      for (const k of TIMES) texels[o + k] = h[k] - this.#clip[0];
+      texels.set([from - this.#clip[0], to - this.#clip[0], row, degree, ...ranges, to - from], o + HEADER);
+    }
+    return texels;
+  }
+
+  #grow(rows) {
+    this.#words = this.#enlarged(this.#words, this.#gl.RGBA32UI, this.#rows.rows, rows);
+    this.#rows.grow(rows);
+  }
+
+  /// A texture of `height` rows with the first `kept` rows of `old`, which is deleted.
+  #enlarged(old, format, kept, height) {
+    const gl = this.#gl,
+      grown = texture(gl, format, WIDTH, height);
+    if (old && kept) {
+      const frame = gl.createFramebuffer();
+      gl.bindFramebuffer(gl.READ_FRAMEBUFFER, frame);
+      gl.framebufferTexture2D(gl.READ_FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, old, 0);
+      gl.copyTexSubImage2D(gl.TEXTURE_2D, 0, 0, 0, 0, 0, WIDTH, kept);
+      gl.bindFramebuffer(gl.READ_FRAMEBUFFER, null);
+      gl.deleteFramebuffer(frame);
+    }
+    try {
+      check(gl, 'The graphics memory is full');
+    } catch (e) {
+      gl.deleteTexture(grown);
+      throw e;
+    }
+    if (old) gl.deleteTexture(old);
+    return grown;
+  }
+
+  #room(width, height) {
+    const gl = this.#gl,
+      sums = this.#sums;
+    gl.deleteTexture(sums.texture);
+    sums.texture = texture(gl, sums.format, width, height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, sums.frame);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, sums.texture, 0);
+    if (gl.checkFramebufferStatus(gl.FRAMEBUFFER) !== gl.FRAMEBUFFER_COMPLETE && sums.format !== gl.RGBA8) {
+      sums.format = gl.RGBA8;
+      return this.#room(width, height);
+    }
+    this.#size = [width, height];
+  }
+
+  // Order
+
+  #ask() {
+    return this.#order.ask(this.#last.time, this.#last.view.cameraFromWorld);
+  }
+
+  #ordered({ order, count, active, ms, generation }) {
+    if (this.#gl.isContextLost()) return this.#wake();
+    const gl = this.#gl,
+      back = this.#orders[1 - this.#front],
+      rows = Math.ceil(count / ORDER_WIDTH);
+    if (back.rows < rows) {
+      gl.deleteTexture(back.texture);
+      // Room for all that is resident, so that it does not grow in small steps.
+      back.rows = Math.min(Math.max(order.length / ORDER_WIDTH, 2 * back.rows), this.#maxRows);
+      back.texture = texture(gl, gl.R32UI, ORDER_WIDTH, back.rows);
+    }
+    if (rows) {
+      gl.bindTexture(gl.TEXTURE_2D, back.texture);
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ORDER_WIDTH, rows, gl.RED_INTEGER, gl.UNSIGNED_INT, order, 0);
+    }
+    this.#front = 1 - this.#front;
+    this.#count = generation < this.#least ? 0 : count;
+    Object.assign(this.stats, { active, drawn: count, sortMs: ms });
+    // What this order no longer names may be overwritten.
+    this.#stale = true;
+    this.#retired = this.#retired.filter((r) => r.generation > generation || (this.#rows.give(r.row, r.count), false));
+    if (this.#last) this.#ask();
+    this.#wake();
+    this.#refresh();
+  }
+
+  #wake() {
+    for (const done of this.#waiting.splice(0)) done();
+  }
+
+  /// Draws again at the next frame, where nobody else does before: a page arrived or a better order.
+  #refresh() {
+    if (!this.#last || this.#frame || this.#last.target) return;
+    this.#frame = requestAnimationFrame(() => {
+      this.#frame = 0;
+      if (this.#destroyed || !this.#last) return;
+      this.#ask();
+      this.#redraw();
+    });
+  }
+
+  // Pictures
+
+  #redraw() {
+    const last = this.#last,
+      gl = this.#gl;
+    if (!last || this.#destroyed || gl.isContextLost()) return;
+    if (this.#frame) cancelAnimationFrame(this.#frame);
+    this.#frame = 0;
+    this.#stale = false;
+    const begin = performance.now();
+    const { view, target } = last,
+      { width, height } = view;
+    if (this.#size[0] !== width || this.#size[1] !== height) this.#room(width, height);
+    if (this.#count && this.#project) this.#projected();
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.#sums.frame);
+    gl.viewport(0, 0, width, height);
+    gl.clearColor(0, 0, 0, 0);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    if (this.#count) this.#blend();
+    this.#resolve(target?.framebuffer ?? null, target?.x ?? 0, target?.y ?? 0, height);
+    this.stats.drawMs = performance.now() - begin;
+  }
+
+  /// Gives `made` (a program that computes splats) the view, and the textures it reads.
+  #look({ program, at }) {
+    const gl = this.#gl,
+      { time, view, channel, depthRange, flowScale } = this.#last,
+      m = view.cameraFromWorld;
+    const { width, height, fx, fy, cx, cy } = view;
+    gl.useProgram(program);
+    this.#bind(at, 'words', 0, this.#words);
+    this.#bind(at, 'blocks', 1, this.#blocks);
+    this.#bind(at, 'palette', 2, this.#palette);
+    this.#bind(at, 'order', 3, this.#orders[this.#front].texture);
+    for (let k = 0; k < 9; k++) SCRATCH[k] = m[4 * (k % 3) + Math.floor(k / 3)];
+    gl.uniformMatrix3fv(at.rotation, false, SCRATCH);
+    gl.uniform3f(at.translation, m[3], m[7], m[11]);
+    const eye = (k) => -(m[k] * m[3] + m[4 + k] * m[7] + m[8 + k] * m[11]);
+    gl.uniform3f(at.eye, eye(0), eye(1), eye(2));
+    gl.uniform2f(at.focal, fx, fy);
+    gl.uniform2f(at.center, cx, cy);
+    gl.uniform2f(at.size, width, height);
+    const mx = (J_MARGIN * 0.5 * width) / fx,
+      my = (J_MARGIN * 0.5 * height) / fy;
+    gl.uniform2f(at.low, -(cx / fx + mx), -(cy / fy + my));
+    gl.uniform2f(at.high, (width - cx) / fx + mx, (height - cy) / fy + my);
+    gl.uniform2f(at.depth_range, depthRange[0], depthRange[1]);
+    gl.uniform1f(at.time, time - this.#clip[0]);
+    gl.uniform1f(at.near, NEAR);
+    gl.uniform1f(at.flow_scale, flowScale);
+    gl.uniform1i(at.channel, CHANNELS[channel]);
+    if (at.count) gl.uniform1i(at.count, this.#count);
+  }
+
+  #bind(at, name, unit, bound) {
+    const gl = this.#gl;
+    gl.activeTexture(gl.TEXTURE0 + unit);
+    gl.bindTexture(gl.TEXTURE_2D, bound);
+    gl.uniform1i(at[name], unit);
+    gl.activeTexture(gl.TEXTURE0);
+  }
+
+  /// Computes every splat of the order, a texel each.
+  #projected() {
+    const gl = this.#gl,
+      splats = this.#splats,
+      rows = Math.ceil(this.#count / ORDER_WIDTH);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, splats.frame);
+    if (splats.rows < rows) {
+      for (const t of splats.textures) gl.deleteTexture(t);
+      splats.rows = this.#orders[this.#front].rows;
+      const points = [0, 1, 2].map((k) => gl.COLOR_ATTACHMENT0 + k);
+      splats.textures = points.map((point) => {
+        const made = texture(gl, gl.RGBA32F, ORDER_WIDTH, splats.rows);
+        gl.framebufferTexture2D(gl.FRAMEBUFFER, point, gl.TEXTURE_2D, made, 0);
+        return made;
+      });
+      gl.drawBuffers(points);
+    }
+    gl.viewport(0, 0, ORDER_WIDTH, rows);
+    this.#look(this.#project);
+    gl.bindVertexArray(this.#empty);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  /// Blends the splats over one another, the farthest first.
+  #blend() {
+    const gl = this.#gl,
+      { program, at } = this.#draw,
+      [width, height] = this.#size;
+    if (this.#project) {
+      gl.useProgram(program);
+      gl.uniform2f(at.size, width, height);
+      ['shapes', 'places', 'tints'].forEach((name, i) => this.#bind(at, name, i, this.#splats.textures[i]));
+    } else {
+      this.#look(this.#draw);
+    }
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    gl.bindVertexArray(this.#quads);
+    gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, Math.ceil(this.#count / BATCH));
+    gl.disable(gl.BLEND);
+  }
+
+  /// Writes the sums as a picture; `turned`: its height where rows go from the bottom.
+  #resolve(framebuffer, x, y, turned) {
+    const gl = this.#gl,
+      { program, at } = this.#show,
+      { background, channel } = this.#last;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+    gl.viewport(x, y, this.#size[0], this.#size[1]);
+    gl.useProgram(program);
+    gl.bindVertexArray(this.#empty);
+    gl.bindTexture(gl.TEXTURE_2D, this.#sums.texture);
+    gl.uniform1i(at.sums, 0);
+    gl.uniform3f(at.background, background[0], background[1], background[2]);
+    gl.uniform2i(at.origin, x, y);
+    gl.uniform1i(at.turned, turned);
+    gl.uniform1i(at.channel, CHANNELS[channel]);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+}
+
+const SCRATCH = new Float32Array(9);
+/// Two triangles of a quad's four corners.
+const CORNERS = [0, 1, 2, 2, 1, 3];

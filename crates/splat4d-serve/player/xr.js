@@ -1,0 +1,63 @@
+// Immersive viewing, with the WebGL2 backend, which draws each eye straight into the headset's picture. Tested: that nothing happens and no button shows where no headset is
+// offered, and the mathematics of an eye's view. Never tested for want of a device: a session in a real headset, its
+// frame rate, and how order by depth, which arrives a frame late in WebGL2, looks while the head turns.
+
+import { add, bounds, quatMul, quatNormal, quatRows, quatTurn } from './camera.js';
+
+/** A scene that states no unit is shown this large, metres from its middle: a dolls' house on a table. */
+const TABLE_RADIUS = 0.6;
+
+export async function offered() {
+  try { return !!(await navigator.xr?.isSessionSupported('immersive-vr')); } catch { return false; }
+}
+
+/** WebXR's axes (x right, y up, z back) are ours turned half about x. */
+const FLIP = [0, 1, 0, 0];
+
+/** The contract's view of an eye; `start` is the camera that the headset's origin stands for, `unit` metres a unit. */
+export function eyeView(eye, start, unit, width, height) {
+  const { position: p, orientation: o } = eye.transform;
+  // Headset origin → world: the starting camera's pose; the eye's own pose is relative to it, in metres.
+  const turn = quatMul(start.quat, FLIP);
+  const quat = quatNormal(quatMul(turn, quatMul([o.w, o.x, o.y, o.z], FLIP.map((x, i) => (i ? -x : x)))));
+  const position = add(start.position, quatTurn(turn, [p.x, p.y, p.z].map(x => x / unit)));
+  const rows = quatRows(quat), out = new Float64Array(12);
+  for (let i = 0; i < 3; i++) {
+    const row = [rows[0][i], rows[1][i], rows[2][i]];
+    out.set([...row, -(row[0] * position[0] + row[1] * position[1] + row[2] * position[2])], 4 * i);
+  }
+  const P = eye.projectionMatrix;
+  return { cameraFromWorld: out, width, height, fx: P[0] * width / 2, fy: P[5] * height / 2,
+    cx: (1 - P[8]) * width / 2, cy: (1 + P[9]) * height / 2 };
+}
+
+/** Runs a session on the player; resolves when it has ended. */
+export async function enter(player) {
+  const session = await navigator.xr.requestSession('immersive-vr');
+  if (player.backend?.name !== 'webgl2') await player.useBackend('webgl2');
+  const { gl } = player.backend;
+  await gl.makeXRCompatible();
+  const layer = new XRWebGLLayer(session, gl, { antialias: false, alpha: false });
+  await session.updateRenderState({ baseLayer: layer });
+  const space = await session.requestReferenceSpace('local');
+  const start = player.camera.clone(), { radius } = bounds(player.meta);
+  // The headset's horizon is level: only the heading of the page's camera is kept.
+  const ahead = add(start.forward, start.up, -start.forward.reduce((s, x, i) => s + x * start.up[i], 0));
+  start.look(start.position, add(start.position, ahead));
+  const unit = player.meta.unit ?? TABLE_RADIUS / radius;
+  player.immersed = true;
+  let last = 0;
+  const tick = (now, frame) => {
+    session.requestAnimationFrame(tick);
+    player.advance(Math.min((now - last) / 1000, 0.1));
+    last = now;
+    for (const eye of frame.getViewerPose(space)?.views ?? []) {
+      const { x, y, width, height } = layer.getViewport(eye);
+      player.backend.draw({ ...player.drawing(width, height), view: eyeView(eye, start, unit, width, height),
+        target: { framebuffer: layer.framebuffer, x, y } });
+    }
+  };
+  session.requestAnimationFrame(tick);
+  await new Promise(done => session.addEventListener('end', done));
+  player.immersed = false;
+}

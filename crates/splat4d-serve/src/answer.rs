@@ -1,0 +1,277 @@
+//! From a request to an answer: fixed routes, and headers that keep a browser from doing anything else with them.
+
+use crate::assets::{self, Asset, INDEX};
+use crate::body::Body;
+use crate::events::Hub;
+use crate::guard::Guard;
+use crate::range::{self, Wanted};
+use crate::scene::{Missing, Scene};
+use hyper::body::Bytes;
+use hyper::header::{self, HeaderMap, HeaderName, HeaderValue};
+use hyper::http::request::Parts;
+use hyper::{Method, Response, StatusCode};
+use serde_json::{Value, json};
+use std::path::PathBuf;
+use std::sync::Arc;
+use tokio::sync::Semaphore;
+
+/// Listeners of live news at a time; each keeps a connection for itself.
+const MAX_LISTENERS: usize = 64;
+/// Name of the route of the scene.
+const SCENE: &str = "scene.splat4d";
+/// On every answer. Another origin can neither embed nor read anything; a type is what it is said to be.
+const HEADERS: [(HeaderName, &str); 5] = [
+    (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
+    (header::REFERRER_POLICY, "no-referrer"),
+    (HeaderName::from_static("cross-origin-opener-policy"), "same-origin"),
+    (HeaderName::from_static("cross-origin-embedder-policy"), "require-corp"),
+    (HeaderName::from_static("cross-origin-resource-policy"), "same-origin"),
+];
+
+/// What all connections share.
+#[derive(Debug)]
+pub(crate) struct Shared {
+    pub scene: Scene,
+    pub hub: Arc<Hub>,
+    pub guard: Guard,
+    /// What `/config.json` says besides.
+    pub about: Value,
+    pub live: bool,
+    /// A scene elsewhere, and its origin.
+    pub foreign: Option<(String, String)>,
+    pub player_folder: Option<PathBuf>,
+    listeners: Arc<Semaphore>,
+    policy: HeaderValue,
+}
+
+impl Shared {
+    pub(crate) fn new(scene: Scene, guard: Guard, about: Value, live: bool, foreign: Option<(String, String)>) -> Self {
+        let policy = policy(foreign.as_ref().map_or("", |f| &f.1));
+        Self {
+            scene,
+            hub: Arc::new(Hub::new()),
+            guard,
+            about,
+            live,
+            foreign,
+            player_folder: None,
+            listeners: Arc::new(Semaphore::new(MAX_LISTENERS)),
+            policy: policy.parse().expect("an origin was checked"),
+        }
+    }
+}
+
+/// What the page may do: run the player's modules and workers, fetch from here, and from the one origin that was named.
+/// Styles may be inline because an element of the player carries its own.
+fn policy(origin: &str) -> String {
+    format!(
+        "default-src 'none'; script-src 'self' blob:; worker-src 'self' blob:; style-src 'self' 'unsafe-inline'; \
+         img-src 'self' data: blob:; media-src blob:; connect-src 'self' blob: data: {origin}; base-uri 'none'; \
+         form-action 'none'; frame-ancestors 'self'"
+    )
+}
+
+/// Answers one request.
+pub(crate) async fn answer(shared: &Arc<Shared>, request: &Parts) -> Response<Body> {
+    let mut response = match shared.guard.check(request) {
+        Err(refusal) => text(refusal.status, refusal.why),
+        Ok(()) => route(shared, request).await,
+    };
+    let headers = response.headers_mut();
+    for (name, value) in HEADERS {
+        headers.insert(name, HeaderValue::from_static(value));
+    }
+    headers.insert(header::CONTENT_SECURITY_POLICY, shared.policy.clone());
+    if response.status() == StatusCode::METHOD_NOT_ALLOWED {
+        response.headers_mut().insert(header::ALLOW, HeaderValue::from_static("GET, HEAD"));
+    }
+    if request.method == Method::HEAD {
+        // The length stays that of the body it would be.
+        if let Some(length) = http_body::Body::size_hint(response.body()).exact() {
+            response.headers_mut().entry(header::CONTENT_LENGTH).or_insert(length.into());
+        }
+        *response.body_mut() = Body::empty();
+    }
+    response
+}
+
+async fn route(shared: &Arc<Shared>, request: &Parts) -> Response<Body> {
+    // The path is compared as it is: nothing is decoded, nothing is joined to a folder.
+    let path = request.uri.path().strip_prefix('/').unwrap_or_default();
+    match path {
+        SCENE => scene(shared, request),
+        "config.json" => whole(config(shared).to_string().into(), "application/json"),
+        "metrics.json" => whole(shared.hub.json(), "application/json"),
+        "events" => events(shared, request),
+        "" => player(shared, INDEX, &request.headers).await,
+        name => player(shared, name.strip_prefix("player/").unwrap_or(name), &request.headers).await,
+    }
+}
+
+/// What the page is to show.
+fn config(shared: &Shared) -> Value {
+    let mut config = if shared.about.is_object() { shared.about.clone() } else { json!({}) };
+    let version = shared.scene.version(None).map(|v| v.number).ok();
+    config["live"] = json!(shared.live);
+    config["version"] = json!(version);
+    config["scene"] = match &shared.foreign {
+        Some((url, _)) => json!(url),
+        None => json!(version.map(|_| SCENE)),
+    };
+    config
+}
+
+async fn player(shared: &Arc<Shared>, name: &str, headers: &HeaderMap) -> Response<Body> {
+    let Some(folder) = &shared.player_folder else {
+        return assets::asset(name).map_or_else(missing, |asset| file(asset, headers));
+    };
+    let (folder, name) = (folder.clone(), name.to_owned());
+    let read = tokio::task::spawn_blocking(move || assets::from_folder(&folder, &name)).await;
+    read.ok().flatten().map_or_else(missing, |asset| file(&asset, headers))
+}
+
+fn file(asset: &Asset, headers: &HeaderMap) -> Response<Body> {
+    if headers.get(header::IF_NONE_MATCH).is_some_and(|tags| matches(tags, &asset.etag)) {
+        return with(Body::empty(), StatusCode::NOT_MODIFIED, &[(header::ETAG, &asset.etag)]);
+    }
+    let accepted = headers.get(header::ACCEPT_ENCODING).and_then(|v| v.to_str().ok()).unwrap_or_default();
+    let gzip = accepts_gzip(accepted);
+    let bytes = if gzip { asset.gzip.clone().into() } else { Bytes::from(asset.text.clone().into_owned()) };
+    let mut response = whole(bytes, asset.mime());
+    let headers = response.headers_mut();
+    headers.insert(header::ETAG, value(&asset.etag));
+    headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-cache"));
+    headers.insert(header::VARY, HeaderValue::from_static("accept-encoding"));
+    if gzip {
+        headers.insert(header::CONTENT_ENCODING, HeaderValue::from_static("gzip"));
+    }
+    response
+}
+
+/// Whether gzip is named, and not with the weight 0.
+fn accepts_gzip(header: &str) -> bool {
+    header.split(',').any(|one| {
+        let (name, weight) = one.split_once(';').unwrap_or((one, ""));
+        let refused = weight.trim().strip_prefix("q=").is_some_and(|q| q.trim().parse() == Ok(0.0f32));
+        ["gzip", "*"].contains(&name.trim()) && !refused
+    })
+}
+
+fn scene(shared: &Shared, request: &Parts) -> Response<Body> {
+    let mut wanted = request.uri.query().unwrap_or_default().split('&').filter_map(|pair| pair.strip_prefix("v="));
+    let number = match wanted.next().map(str::parse) {
+        None => None,
+        Some(Ok(number)) => Some(number),
+        Some(Err(_)) => return missing(),
+    };
+    let version = match shared.scene.version(number) {
+        Ok(version) => version,
+        Err(Missing::Gone) => return text(StatusCode::GONE, "this version was replaced by a newer one"),
+        Err(Missing::Never) => return text(StatusCode::NOT_FOUND, "there is no scene yet"),
+    };
+    let headers = &request.headers;
+    let common = [
+        (header::ETAG, version.etag.as_str()),
+        (header::ACCEPT_RANGES, "bytes"),
+        (header::CONTENT_TYPE, "application/octet-stream"),
+        // The player keeps what it needs; a second copy of a large file in the browser's cache helps nobody.
+        (header::CACHE_CONTROL, "no-store"),
+    ];
+    if headers.get(header::IF_NONE_MATCH).is_some_and(|tags| matches(tags, &version.etag)) {
+        return with(Body::empty(), StatusCode::NOT_MODIFIED, &common);
+    }
+    // A range counts for GET only (RFC 9110), and only of the state that the client knows, where it says which. No date
+    // is ever given out, so that a date matches nothing.
+    let fresh = headers.get(header::IF_RANGE).is_none_or(|tag| tag.as_bytes() == version.etag.as_bytes());
+    let range = headers.get(header::RANGE).filter(|_| fresh && request.method == Method::GET);
+    match range.and_then(|r| r.to_str().ok()).map_or(Wanted::Whole, |r| range::parse(r, version.length)) {
+        Wanted::Whole if request.method == Method::HEAD => {
+            let mut response = with(Body::empty(), StatusCode::OK, &common);
+            response.headers_mut().insert(header::CONTENT_LENGTH, version.length.into());
+            response
+        }
+        Wanted::Whole => with(version.body(0, version.length), StatusCode::OK, &common),
+        Wanted::Part { start, end } => {
+            let mut response = with(version.body(start, end), StatusCode::PARTIAL_CONTENT, &common);
+            let part = format!("bytes {start}-{}/{}", end - 1, version.length);
+            response.headers_mut().insert(header::CONTENT_RANGE, value(&part));
+            response
+        }
+        Wanted::Nothing => {
+            let mut response = text(StatusCode::RANGE_NOT_SATISFIABLE, "the range begins behind the end");
+            response.headers_mut().insert(header::CONTENT_RANGE, value(&format!("bytes */{}", version.length)));
+            response
+        }
+    }
+}
+
+fn events(shared: &Shared, request: &Parts) -> Response<Body> {
+    if request.method == Method::HEAD {
+        return whole(Bytes::new(), "text/event-stream");
+    }
+    let Ok(place) = shared.listeners.clone().try_acquire_owned() else {
+        let mut response = text(StatusCode::SERVICE_UNAVAILABLE, "too many pages are listening");
+        response.headers_mut().insert(header::RETRY_AFTER, HeaderValue::from_static("5"));
+        return response;
+    };
+    let last = request.headers.get("last-event-id").and_then(|v| v.to_str().ok());
+    let headers = [(header::CONTENT_TYPE, "text/event-stream"), (header::CACHE_CONTROL, "no-store")];
+    with(shared.hub.stream(last, place), StatusCode::OK, &headers)
+}
+
+/// Whether a list of entity tags holds ours. Weak comparison, as `If-None-Match` has it.
+fn matches(list: &HeaderValue, etag: &str) -> bool {
+    let list = list.to_str().unwrap_or_default();
+    list.split(',').map(str::trim).any(|tag| tag == "*" || tag.trim_start_matches("W/") == etag)
+}
+
+fn missing() -> Response<Body> {
+    text(StatusCode::NOT_FOUND, "there is nothing here")
+}
+
+fn text(status: StatusCode, what: &'static str) -> Response<Body> {
+    let mut response = whole(Bytes::from_static(what.as_bytes()), "text/plain; charset=utf-8");
+    *response.status_mut() = status;
+    response
+}
+
+/// Bytes that are not to be kept.
+fn whole(bytes: Bytes, mime: &str) -> Response<Body> {
+    let headers = [(header::CONTENT_TYPE, mime), (header::CACHE_CONTROL, "no-store")];
+    with(bytes.into(), StatusCode::OK, &headers)
+}
+
+fn with(body: Body, status: StatusCode, headers: &[(HeaderName, &str)]) -> Response<Body> {
+    let mut response = Response::new(body);
+    *response.status_mut() = status;
+    for (name, text) in headers {
+        response.headers_mut().insert(name, value(text));
+    }
+    response
+}
+
+fn value(text: &str) -> HeaderValue {
+    HeaderValue::from_str(text).expect("headers are written here, in ASCII")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn gzip_is_sent_to_who_takes_it() {
+        for yes in ["gzip", "br, gzip", "deflate, gzip;q=0.5", "*"] {
+            assert!(accepts_gzip(yes), "{yes}");
+        }
+        for no in ["", "br", "gzip;q=0", "gzip;q=0.0", "xgzip"] {
+            assert!(!accepts_gzip(no), "{no}");
+        }
+    }
+
+    #[test]
+    fn a_list_of_tags_is_compared() {
+        let is = |list: &str| matches(&value(list), "\"a\"");
+        assert!(is("\"a\"") && is("W/\"a\"") && is("\"b\", \"a\"") && is("*"));
+        assert!(!is("\"b\"") && !is("a") && !is(""));
+    }
+}

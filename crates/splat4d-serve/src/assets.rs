@@ -1,0 +1,174 @@
+//! The player's files, embedded, and compressed once.
+
+use flate2::write::GzEncoder;
+use flate2::{Compression, Crc};
+use std::borrow::Cow;
+use std::io::Write;
+use std::path::Path;
+use std::sync::OnceLock;
+
+/// Lists files of `player/`; a test compares it with the folder.
+macro_rules! player {
+    ($($name:literal,)*) => {
+        &[$(($name, include_str!(concat!("../player/", $name))),)*]
+    };
+}
+
+/// Every file of `player/` that a browser fetches: the shaders' own files are in `shaders.js` already.
+const FILES: &[(&str, &str)] = player![
+    "assets.js",
+    "camera.js",
+    "controls.js",
+    "decode.worker.js",
+    "dom.js",
+    "element.js",
+    "errors.js",
+    "glsl.js",
+    "icons.js",
+    "index.html",
+    "live.js",
+    "motion.js",
+    "page.js",
+    "panels.js",
+    "player.js",
+    "ranges.js",
+    "scene-file.js",
+    "shaders.js",
+    "sort.worker.js",
+    "stream.js",
+    "style.js",
+    "track.js",
+    "ui.js",
+    "webgl2.js",
+    "webgpu.js",
+    "xr.js",
+];
+
+/// The page.
+pub(crate) const INDEX: &str = "index.html";
+
+/// A file of the player.
+#[derive(Clone, Debug)]
+pub struct Asset {
+    /// Its name; there are no folders.
+    pub name: Cow<'static, str>,
+    /// What it says, UTF-8.
+    pub text: Cow<'static, str>,
+    /// The same, as gzip.
+    pub gzip: Vec<u8>,
+    /// Its entity tag, with quotes.
+    pub etag: String,
+}
+
+impl Asset {
+    fn new(name: impl Into<Cow<'static, str>>, text: impl Into<Cow<'static, str>>) -> Self {
+        let (name, text) = (name.into(), text.into());
+        let mut gzip = GzEncoder::new(Vec::new(), Compression::best());
+        gzip.write_all(text.as_bytes()).expect("memory takes all bytes");
+        let mut crc = Crc::new();
+        crc.update(text.as_bytes());
+        let etag = format!("\"p{:x}-{:x}\"", crc.sum(), text.len());
+        Self { gzip: gzip.finish().expect("memory takes all bytes"), etag, name, text }
+    }
+
+    /// Its media type.
+    pub fn mime(&self) -> &'static str {
+        mime(&self.name).expect("names were chosen by their endings")
+    }
+}
+
+/// All files that the player transfers.
+pub fn assets() -> &'static [Asset] {
+    static ASSETS: OnceLock<Vec<Asset>> = OnceLock::new();
+    ASSETS.get_or_init(|| FILES.iter().map(|(name, text)| Asset::new(*name, *text)).collect())
+}
+
+/// A file by name.
+pub fn asset(name: &str) -> Option<&'static Asset> {
+    assets().iter().find(|a| a.name == name)
+}
+
+/// A file from a folder, for whoever writes the player; reads the disk. None where there is no such file.
+pub(crate) fn from_folder(folder: &Path, name: &str) -> Option<Asset> {
+    if !is_name(name) {
+        return None;
+    }
+    mime(name)?;
+    Some(Asset::new(name.to_owned(), std::fs::read_to_string(folder.join(name)).ok()?))
+}
+
+/// Whether this is a plain file name, one that cannot lead out of a folder on any system.
+fn is_name(name: &str) -> bool {
+    name.starts_with(|c: char| c.is_ascii_lowercase())
+        && name.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b"-.".contains(&b))
+        && !name.contains("..")
+}
+
+fn mime(name: &str) -> Option<&'static str> {
+    match name.rsplit_once('.')?.1 {
+        "html" => Some("text/html; charset=utf-8"),
+        "js" => Some("text/javascript; charset=utf-8"),
+        "css" => Some("text/css; charset=utf-8"),
+        "svg" => Some("image/svg+xml"),
+        _ => None,
+    }
+}
+
+/// A string as JavaScript and JSON write it; `<` is escaped so that no tag can hide in it.
+pub(crate) fn literal(text: &str) -> String {
+    let json = serde_json::Value::String(text.to_owned()).to_string();
+    json.replace('<', "\\u003c").replace('\u{2028}', "\\u2028").replace('\u{2029}', "\\u2029")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::collections::BTreeSet;
+
+    /// The bound on what a browser transfers for the player, bytes.
+    const MOST: usize = 100_000;
+
+    fn folder() -> std::path::PathBuf {
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("player")
+    }
+
+    #[test]
+    fn every_file_of_the_folder_is_embedded() {
+        let there: BTreeSet<String> =
+            std::fs::read_dir(folder()).unwrap().map(|f| f.unwrap().file_name().into_string().unwrap()).collect();
+        let there: BTreeSet<String> = there.into_iter().filter(|name| !name.ends_with(".wgsl")).collect();
+        let listed: BTreeSet<String> = FILES.iter().map(|(name, _)| (*name).to_owned()).collect();
+        assert_eq!(there, listed, "list the folder's files in FILES");
+        for name in &listed {
+            assert!(is_name(name) && mime(name).is_some(), "{name}");
+        }
+        assert_eq!(listed.len(), FILES.len(), "none twice");
+    }
+
+    #[test]
+    fn the_player_is_small() {
+        let sizes: Vec<(usize, &str)> = assets().iter().map(|a| (a.gzip.len(), &*a.name)).collect();
+        let total: usize = sizes.iter().map(|s| s.0).sum();
+        assert!(total <= MOST, "{total} bytes: {sizes:?}");
+    }
+
+    #[test]
+    fn gzip_comes_back() {
+        for asset in assets() {
+            let mut text = String::new();
+            std::io::Read::read_to_string(&mut flate2::read::GzDecoder::new(&asset.gzip[..]), &mut text).unwrap();
+            assert_eq!(text, asset.text, "{}", asset.name);
+        }
+    }
+
+    #[test]
+    fn a_folder_gives_plain_names_only() {
+        let folder = folder();
+        assert!(from_folder(&folder, INDEX).is_some());
+        for name in
+            ["../Cargo.toml", "..", ".", "", "src/lib.rs", "/etc/passwd", "..\\x.js", "c:x.js", "nul\0.js", "A.js"]
+        {
+            assert!(from_folder(&folder, name).is_none(), "{name}");
+        }
+    }
+}

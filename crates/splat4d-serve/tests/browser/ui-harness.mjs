@@ -1,0 +1,68 @@
+// For the interface's tests: a server with the player's files, stand-ins for what draws and reads, and made-up live
+// events.
+
+import { createServer } from 'node:http';
+import { readFile } from 'node:fs/promises';
+import { dirname, join } from 'node:path';
+import { fileURLToPath } from 'node:url';
+
+const HERE = dirname(fileURLToPath(import.meta.url));
+const PLAYER = join(HERE, '../../player');
+const TYPES = { js: 'text/javascript', html: 'text/html', json: 'application/json' };
+
+/** Serves `/` and the player; `pages` are further routes {path: html}; `config` is /config.json. */
+export class Site {
+  config = { title: 'Two knights', scene: 'scene.splat4d', live: false };
+  pages = {};
+  listeners = new Set();
+  joined = 0;
+  mocks = true;
+
+  async start(port = 0) {
+    this.server = createServer((request, response) => this.#answer(request, response));
+    await new Promise(done => this.server.listen(port, '127.0.0.1', done));
+    this.port = this.server.address().port;
+    this.url = `http://127.0.0.1:${this.port}/`;
+    return this;
+  }
+
+  async #answer(request, response) {
+    const path = new URL(request.url, this.url).pathname;
+    if (path === '/config.json') return this.#send(response, JSON.stringify(this.config), 'json');
+    if (this.pages[path]) return this.#send(response, this.pages[path], 'html');
+    if (path === '/events') return this.#listen(response);
+    const name = path === '/' ? 'index.html' : path.replace(/^\/(player\/)?/, '');
+    for (const folder of this.mocks ? [join(HERE, 'mock'), PLAYER] : [PLAYER]) {
+      const text = /^[\w.-]+$/.test(name) && await readFile(join(folder, name)).catch(() => null);
+      if (text) return this.#send(response, text, name.split('.').at(-1));
+    }
+    response.writeHead(404).end();
+  }
+
+  #send(response, body, type) {
+    response.writeHead(200, { 'content-type': TYPES[type] ?? 'text/plain', 'cache-control': 'no-store' }).end(body);
+  }
+
+  #listen(response) {
+    this.joined++;
+    response.writeHead(200, { 'content-type': 'text/event-stream' });
+    response.write(':\n\n');
+    for (const line of this.history ?? []) response.write(line);
+    this.listeners.add(response);
+    response.on('close', () => this.listeners.delete(response));
+  }
+
+  say(data, keep = true) {
+    const line = `data: ${JSON.stringify(data)}\n\n`;
+    if (keep) (this.history ??= []).push(line);
+    for (const r of this.listeners) r.write(line);
+  }
+
+  /** Cuts all event streams, as a lost network does. */
+  cut() { for (const r of this.listeners) r.destroy(); }
+
+  async stop() {
+    this.server.closeAllConnections();
+    await new Promise(done => this.server.close(done));
+  }
+}

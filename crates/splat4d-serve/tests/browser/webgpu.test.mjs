@@ -1,0 +1,301 @@
+// The WebGPU backend in a real headless Chromium (SwiftShader) against the f64 oracle.
+
+import assert from 'node:assert/strict';
+import { after, before, test } from 'node:test';
+import http from 'node:http';
+import { readFile } from 'node:fs/promises';
+import { createRequire } from 'node:module';
+import * as oracle from './oracle.mjs';
+import * as toy from './toy.mjs';
+
+const { chromium } = createRequire(process.env.PLAYWRIGHT ?? import.meta.url)('playwright-core');
+/// Least agreement of a picture with the oracle's, dB: 8-bit rounding alone gives 59.
+const LEAST_DB = 42;
+let server, browser, tab;
+const complaints = [];
+
+before(async () => {
+  const types = { js: 'text/javascript', mjs: 'text/javascript', html: 'text/html' };
+  const root = new URL('../../', import.meta.url);
+  server = http.createServer(async (request, response) => {
+    const path = new URL(request.url, 'http://x').pathname;
+    try {
+      const body = path === '/' ? '<!doctype html><link rel="icon" href="data:,"><canvas id="c"></canvas>' : await readFile(new URL('.' + path, root));
+      response.writeHead(200, { 'content-type': types[path.split('.').pop()] ?? 'text/html' }).end(body);
+    } catch {
+      response.writeHead(404).end();
+    }
+  });
+  await new Promise((done) => server.listen(0, '127.0.0.1', done));
+  browser = await chromium.launch({
+    executablePath: process.env.CHROMIUM ?? '/usr/bin/chromium',
+    args: ['--no-sandbox', '--disable-background-networking', '--disable-component-update', '--disable-sync',
+      '--no-first-run', '--enable-unsafe-webgpu', '--use-webgpu-adapter=swiftshader',
+      // Without these three a WebGPU canvas takes the GPU process down where there is no graphics card.
+      '--enable-features=Vulkan', '--use-vulkan=swiftshader', '--use-angle=swiftshader'],
+  });
+  tab = await browser.newPage();
+  tab.on('console', (m) => { if (['error', 'warning'].includes(m.type())) complaints.push(m.text()); });
+  tab.on('pageerror', (e) => complaints.push(String(e)));
+  await tab.goto(`http://127.0.0.1:${server.address().port}/`);
+  await tab.evaluate(async () => {
+    Object.assign(globalThis, await import('/player/webgpu.js'), await import('/player/shaders.js'));
+    globalThis.toy = await import('/tests/browser/toy.mjs');
+    // A backend over a fresh canvas, with a scene: pages and palettes by the arguments of toy.mjs.
+    globalThis.scene = async ({ pages, palettes = [], clip = [0, 1] }, width, height) => {
+      globalThis.backend?.destroy();
+      const canvas = document.createElement('canvas');
+      globalThis.backend = await WebGPUBackend.create(canvas, { onlost: (e) => { globalThis.lost = String(e); } });
+      backend.resize(width, height);
+      backend.setScene({ clip, sh_degree: 3 });
+      for (const p of palettes) backend.addPalette(toy.palette(...p));
+      for (const p of pages) {
+        const made = toy.page(...p);
+        backend.addPage(made.page, made.entry);
+      }
+    };
+    globalThis.picture = async (what) => {
+      backend.draw({ ...what, view: toy.view(...what.view) });
+      await backend.settled();
+      return Array.from((await backend.readPixels()).data);
+    };
+  });
+});
+
+after(async () => {
+  await browser?.close();
+  server?.close();
+});
+
+/// The oracle's twin of `scene` in the page.
+function build({ pages, palettes = [] }) {
+  const known = new Map(palettes.map((p) => [p[0], toy.palette(...p)]));
+  return pages.map((p) => {
+    const made = toy.page(...p);
+    return { ...made, palette: known.get(made.entry.palette) };
+  });
+}
+
+const SCENE = {
+  palettes: [[7, 3, 40], [8, 1, 5, 3]],
+  pages: [
+    [0, 1500, { from: 0, to: 1.04, palette: 7, entries: 40 }],
+    [1, 700, { from: 0, to: 0.5, palette: 8, entries: 5, tier: 0 }],
+    [2, 300, { from: 0.5, to: 1.04, logScale: [-6, -1.5] }],
+  ],
+};
+const VIEW = [[1.5, 0.8, 2.4], 200, 150, 190];
+
+const LOOK = { view: VIEW, background: [0.2, 0.5, 0.9], depthRange: [1.5, 4.5], flowScale: 60 };
+/// Depth shows black where alpha is below a half: pixels whose alpha is within this of it may fall on either side.
+const HALF = 4;
+
+/// Draws `what` of `setup` in the browser and by the oracle; answers the agreement in dB.
+async function compare(setup, what) {
+  const size = what.view.slice(1, 3);
+  const got = await tab.evaluate(async ([s, w, size]) => {
+    await scene(s, ...size);
+    return picture(w);
+  }, [setup, what, size]);
+  const pages = build(setup), full = { ...what, view: toy.view(...what.view) };
+  const truth = oracle.render(pages, full);
+  assert.ok(new Set(truth.data).size > 20, 'the oracle drew something');
+  if (what.channel === 'depth') {
+    const alpha = oracle.render(pages, { ...full, channel: 'alpha' }).data;
+    for (let i = 0; i < alpha.length; i++) if (Math.abs(alpha[i] - 128) < HALF) truth.data[i] = got[i];
+  }
+  return oracle.psnr(got, truth.data);
+}
+
+for (const [channel, time] of [['color', 0.3], ['color', 0.7], ['color', 1], ['alpha', 0.3], ['depth', 0.7], ['flow', 0.3]]) {
+  test(`${channel} at ${time} s is the oracle's`, async (t) => {
+    const db = await compare(SCENE, { ...LOOK, channel, time });
+    t.diagnostic(`${db.toFixed(1)} dB`);
+    assert.ok(db >= LEAST_DB, `${db} dB`);
+  });
+}
+
+test('a camera amidst the Gaussians sees what the oracle sees, so no block is culled too early', async (t) => {
+  const setup = { pages: [[0, 5000, { from: 0, to: 1, logScale: [-5, -1.7], size: 2, edges: true, seed: 9 }]] };
+  for (const eye of [[0.4, 0.1, 0.3], [-1.2, 0.3, -0.2], [2, -2, 0.1]]) {
+    const db = await compare(setup, { ...LOOK, view: [eye, 120, 90, 60], time: 0.4 });
+    t.diagnostic(`${db.toFixed(1)} dB`);
+    assert.ok(db >= LEAST_DB, `${db} dB from ${eye}`);
+  }
+});
+
+test('resident.wgsl unpacks random words and every edge code as the format says', async (t) => {
+  const [span, times] = [0.8, [-0.05, 0.31, 0.79]];
+  const words = toy.page(3, 4096, { from: 0, to: span, edges: true, opacity: [0, 255], forever: 0.1 }).page;
+  const got = await tab.evaluate(async ([span, times]) => {
+    const { page } = toy.page(3, 4096, { from: 0, to: span, edges: true, opacity: [0, 255], forever: 0.1 });
+    const device = await (await navigator.gpu.requestAdapter()).requestDevice();
+    const code = `${RESIDENT}
+      @group(0) @binding(0) var<storage, read> words: array<array<u32, 8>>;
+      @group(0) @binding(1) var<storage, read> headers: array<array<f32, 24>>;
+      @group(0) @binding(2) var<storage, read_write> out: array<array<f32, 18>>;
+      @group(0) @binding(3) var<storage, read> time: array<f32>; // span, t
+      @compute @workgroup_size(64) fn unpack(@builtin(global_invocation_id) id: vec3<u32>) {
+        var f: array<vec4<f32>, 6>;
+        for (var k = 0u; k < 24u; k++) { f[k / 4u][k % 4u] = headers[id.x / 256u][k]; }
+        let life = life_at(words[id.x], f, time[0], time[1]);
+        let g = gaussian(words[id.x], f, life);
+        out[id.x] = array<f32, 18>(g.mean.x, g.mean.y, g.mean.z, g.quat.x, g.quat.y, g.quat.z, g.quat.w,
+          g.scale.x, g.scale.y, g.scale.z, g.opacity, g.velocity.x, g.velocity.y, g.velocity.z,
+          g.base.x, g.base.y, g.base.z, f32(g.label));
+      }`;
+    const module = device.createShaderModule({ code });
+    const pipeline = device.createComputePipeline({ layout: 'auto', compute: { module, entryPoint: 'unpack' } });
+    const storage = (size) => device.createBuffer({ size, usage: GPUBufferUsage.STORAGE | GPUBufferUsage.COPY_DST
+      | GPUBufferUsage.COPY_SRC });
+    const bytes = 72 * page.count;
+    const buffers = [page.words.byteLength, page.headers.byteLength, bytes, 8].map(storage);
+    device.queue.writeBuffer(buffers[0], 0, page.words);
+    device.queue.writeBuffer(buffers[1], 0, page.headers);
+    const back = device.createBuffer({ size: bytes, usage: GPUBufferUsage.MAP_READ | GPUBufferUsage.COPY_DST });
+    const group = device.createBindGroup({ layout: pipeline.getBindGroupLayout(0),
+      entries: buffers.map((buffer, binding) => ({ binding, resource: { buffer } })) });
+    const all = [];
+    for (const t of times) {
+      device.queue.writeBuffer(buffers[3], 0, new Float32Array([span, t]));
+      const encoder = device.createCommandEncoder(), pass = encoder.beginComputePass();
+      pass.setPipeline(pipeline);
+      pass.setBindGroup(0, group);
+      pass.dispatchWorkgroups(page.count / 64);
+      pass.end();
+      encoder.copyBufferToBuffer(buffers[2], 0, back, 0, bytes);
+      device.queue.submit([encoder.finish()]);
+      await back.mapAsync(GPUMapMode.READ);
+      all.push(Array.from(new Float32Array(back.getMappedRange())));
+      back.unmap();
+    }
+    device.destroy();
+    return all;
+  }, [span, times]);
+  // Header numbers are f32; exp in f32 is good to a few units in the last place.
+  const tolerance = 2e-5;
+  let worst = 0;
+  const seen = { half: new Set(), largest: new Set() };
+  times.forEach((time, k) => {
+    for (let i = 0; i < words.count; i++) {
+      const w = words.words.subarray(8 * i, 8 * i + 8), f = words.headers.subarray(24 * (i >> 8), 24 * (i >> 8) + 24);
+      const g = oracle.gaussian(f, w, span, time);
+      const truth = [...g.mean, ...g.quat, ...g.scale, g.opacity, ...g.velocity, ...g.base, g.label];
+      seen.half.add(w[6] >>> 24);
+      seen.largest.add(w[3] >>> 30);
+      truth.forEach((v, c) => {
+        const error = Math.abs(got[k][18 * i + c] - v) / Math.max(1, Math.abs(v));
+        assert.ok(error <= tolerance, `Gaussian ${i}, number ${c}, ${time} s: ${got[k][18 * i + c]} is not ${v}`);
+        worst = Math.max(worst, error);
+      });
+    }
+  });
+  assert.ok([0, 1, 254, 255].every((h) => seen.half.has(h)) && seen.largest.size === 4, 'every edge code was there');
+  t.diagnostic(`largest relative error ${worst.toExponential(1)}`);
+});
+
+test('the order on the GPU is that of depth, then number, and repeats', async (t) => {
+  const what = { ...LOOK, time: 0.3 };
+  const [first, second] = await tab.evaluate(async ([s, w]) => {
+    const run = async () => {
+      await scene(s, w.view[1], w.view[2]);
+      await picture(w);
+      const { order, keys, records } = await backend.inspect();
+      return { order: Array.from(order), keys: Array.from(keys), depths: Array.from(order, (p) => records[8 * p + 5]) };
+    };
+    return [await run(), await run()];
+  }, [SCENE, what]);
+  const truth = oracle.project(build(SCENE), toy.view(...VIEW), what.time)
+    .filter((s) => [0, 1].every((k) => s.at[k] + s.extent[k] > 0.5 && s.at[k] - s.extent[k] < VIEW[1 + k] - 0.5));
+  assert.ok(Math.abs(first.order.length - truth.length) <= 2, `${first.order.length} drawn, not ${truth.length}`);
+  assert.deepEqual(first.order, second.order);
+  assert.equal(new Set(first.order).size, first.order.length, 'every record once');
+  for (let i = 1; i < first.order.length; i++) {
+    const tie = first.keys[i] === first.keys[i - 1];
+    assert.ok(first.keys[i] > first.keys[i - 1] || (tie && first.order[i] > first.order[i - 1]), `place ${i}`);
+  }
+  // 16-bit keys: neighbours may be exchanged only where their depths are within a step of each other.
+  const step = (first.depths.at(-1) - first.depths[0]) / 65535 * 4;
+  first.depths.forEach((z, i) => assert.ok(i === 0 || z > first.depths[i - 1] - step, `depth ${i}`));
+  t.diagnostic(`${first.order.length} records`);
+});
+
+test('pages come and go, palettes come late, and nothing is drawn twice', async () => {
+  const result = await tab.evaluate(async ([s, w]) => {
+    await scene(s, w.view[1], w.view[2]);
+    const whole = await picture(w);
+    // The same in another order, with palettes last, and after a page that is dropped again.
+    await scene({ ...s, pages: [], palettes: [] }, w.view[1], w.view[2]);
+    const empty = await picture(w);
+    const stray = toy.page(9, 900, { from: 0, to: 2, seed: 5 });
+    backend.addPage(stray.page, stray.entry);
+    for (const p of s.pages.toReversed()) {
+      const made = toy.page(...p);
+      backend.addPage(made.page, made.entry);
+    }
+    const other = await picture(w);
+    backend.dropPage(9);
+    for (const p of s.palettes) backend.addPalette(toy.palette(...p));
+    const late = await picture(w);
+    const resident = backend.stats.resident;
+    // Switching channels there and back, resizing there and back, and drawing again change nothing.
+    await picture({ ...w, channel: 'depth' });
+    const back = await picture(w);
+    backend.resize(60, 50);
+    backend.resize(w.view[1], w.view[2]);
+    const resized = await picture(w);
+    const same = (a, b) => a.every((v, i) => v === b[i]);
+    return { empty: empty.slice(0, 4), other: same(whole, other), late: same(whole, late), back: same(whole, back),
+      resized: same(whole, resized), resident };
+  }, [SCENE, { ...LOOK, time: 0.3 }]);
+  assert.deepEqual(result, { empty: [51, 128, 230, 255], other: false, late: true, back: true, resized: true,
+    resident: 2500 });
+});
+
+test('more than a first page of room: buffers grow and keep what was there', async () => {
+  const same = await tab.evaluate(async ([s, w]) => {
+    await scene(s, w.view[1], w.view[2]);
+    const before = await picture(w);
+    // 65,536 Gaussians of another time: words, headers and lists must move.
+    const more = toy.page(5, 65536, { from: 3, to: 4 });
+    if (!backend.addPage(more.page, more.entry)) return 'no room';
+    const after = await picture(w);
+    return before.every((v, i) => v === after[i]);
+  }, [SCENE, { ...LOOK, time: 0.3 }]);
+  assert.equal(same, true);
+});
+
+test('30,000 Gaussians at 800x800: time a stage', async (t) => {
+  const setup = { palettes: [[7, 3, 256]], pages: [[0, 30000, { from: 0, to: 1, palette: 7, entries: 256,
+    logScale: [-6, -3.6] }]] };
+  const what = { ...LOOK, view: [VIEW[0], 800, 800, 760] };
+  const stats = await tab.evaluate(async ([s, w]) => {
+    await scene(s, 800, 800);
+    const view = toy.view(...w.view), walls = [];
+    for (let i = 0; i < 12; i++) {
+      const start = performance.now();
+      backend.draw({ ...w, view, time: 0.2 + 0.02 * i });
+      await backend.settled();
+      walls.push(performance.now() - start);
+    }
+    await new Promise((done) => setTimeout(done, 50));
+    return { ...backend.stats, wall: walls.sort((a, b) => a - b)[6] };
+  }, [setup, what]);
+  t.diagnostic(JSON.stringify(stats));
+  assert.ok(stats.drawn > 5000 && stats.drawn <= 30000 && stats.active === 30000 && stats.resident === 30000);
+});
+
+test('a lost device is told once and nothing throws', async () => {
+  const told = await tab.evaluate(async ([s, w]) => {
+    await scene(s, w.view[1], w.view[2]);
+    // More than any device holds: the driver refuses, and that is an error of the device, not of the page.
+    const made = toy.page(0, 10, { from: 0, to: 1 });
+    made.page.words = new Uint32Array(79);
+    let thrown = '';
+    try { backend.addPage(made.page, made.entry); } catch (e) { thrown = e.name; }
+    return thrown;
+  }, [SCENE, LOOK]);
+  assert.equal(told, 'OperationError');
+});
+
+test('nothing complained', () => assert.deepEqual(complaints, []));

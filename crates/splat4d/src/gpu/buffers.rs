@@ -1,0 +1,177 @@
+//! GPU memory: one arena that grows and is reused from frame to frame.
+
+use super::device::Gpu;
+use crate::{Error, ErrorKind, Result};
+use wgpu::BufferUsages as Usage;
+
+/// Bytes that the smallest buffer has: no binding may be empty.
+const LEAST: u64 = 256;
+/// A buffer that grows gets this share more than it needs, so that a scene that grows slowly does not make it anew
+/// every frame.
+const SPARE: u64 = 4;
+
+/// One buffer, made anew when it must hold more.
+#[derive(Debug)]
+pub(super) struct Grown {
+    what: &'static str,
+    usage: Usage,
+    buffer: Option<wgpu::Buffer>,
+}
+
+impl Grown {
+    /// Nothing yet. `what` names the content in errors.
+    pub fn new(what: &'static str, usage: Usage) -> Self {
+        Self { what, usage, buffer: None }
+    }
+
+    /// Storage that copies may read and write.
+    pub fn storage(what: &'static str) -> Self {
+        Self::new(what, Usage::STORAGE | Usage::COPY_SRC | Usage::COPY_DST)
+    }
+
+    /// Sees to it that there are `bytes`. Whether the buffer is a new one: what it held is lost then.
+    ///
+    /// Errors: more than one binding may hold (128 MiB), or no memory.
+    pub fn ensure(&mut self, gpu: &Gpu, bytes: u64) -> Result<bool> {
+        let most = largest_binding(gpu);
+        if bytes > most {
+            let mib = |b: u64| b.div_ceil(1 << 20);
+            let text =
+                format!("{} need {} MiB in one GPU buffer, {} MiB are allowed", self.what, mib(bytes), mib(most));
+            return Err(Error::new(ErrorKind::Unsupported, text).remedy("Render on the CPU."));
+        }
+        if self.buffer.as_ref().is_some_and(|b| b.size() >= bytes.max(LEAST)) {
+            return Ok(false);
+        }
+        let size = (bytes + bytes / SPARE).clamp(LEAST, most).next_multiple_of(LEAST);
+        // The old one goes first: both together may be more than there is.
+        self.buffer = None;
+        self.buffer = Some(gpu.device.create_buffer(&wgpu::BufferDescriptor {
+            label: Some(self.what),
+            size,
+            usage: self.usage,
+            mapped_at_creation: false,
+        }));
+        gpu.check()?;
+        Ok(true)
+    }
+
+    /// The buffer. Panics before the first [`Grown::ensure`].
+    pub fn get(&self) -> &wgpu::Buffer {
+        self.buffer.as_ref().expect("a buffer is made before it is used")
+    }
+
+    /// All of it.
+    pub fn all(&self) -> wgpu::BindingResource<'_> {
+        self.get().as_entire_binding()
+    }
+
+    /// Bytes held.
+    pub fn bytes(&self) -> u64 {
+        self.buffer.as_ref().map_or(0, wgpu::Buffer::size)
+    }
+}
+
+/// Bytes that one binding may hold.
+pub(super) fn largest_binding(gpu: &Gpu) -> u64 {
+    let limits = gpu.device.limits();
+    limits.max_storage_buffer_binding_size.min(limits.max_buffer_size)
+}
+
+/// Bytes between two uniforms in one buffer (WebGPU's default alignment).
+pub(super) const UNIFORM_STRIDE: u64 = 256;
+
+/// Everything but the scene's tables.
+#[derive(Debug)]
+pub(super) struct Buffers {
+    /// One structure every [`UNIFORM_STRIDE`] bytes.
+    pub uniforms: Grown,
+    /// Splats, visible ones, pairs.
+    pub counts: Grown,
+    /// Sizes of dispatches over the visible splats, and over the pairs: apart, because no buffer may be written while
+    /// it gives the size of a dispatch.
+    pub arguments: [Grown; 2],
+    /// Two vec4 a splat.
+    pub shapes: Grown,
+    /// A vec4 a splat.
+    pub colors: Grown,
+    /// 1 a visible splat.
+    pub marks: Grown,
+    /// Exclusive sums of the marks.
+    pub places: Grown,
+    /// Depths of visible splats, to and fro.
+    pub depth_keys: [Grown; 2],
+    /// Their numbers.
+    pub depth_values: [Grown; 2],
+    /// Counts of the sort.
+    pub sort_counts: Grown,
+    /// Sums of blocks of the scan.
+    pub scan_sums: Grown,
+    /// Tiles a visible splat, nearest first.
+    pub tile_counts: Grown,
+    /// Exclusive sums of them.
+    pub first_pairs: Grown,
+    /// Tiles of pairs, to and fro.
+    pub pair_keys: [Grown; 2],
+    /// Their splats.
+    pub pair_values: [Grown; 2],
+    /// Two numbers a tile.
+    pub ranges: Grown,
+    /// Five planes.
+    pub planes: Grown,
+    /// Timestamps.
+    pub times: Grown,
+    /// What the CPU reads.
+    pub staging: Grown,
+}
+
+impl Buffers {
+    /// Without memory yet.
+    pub fn new() -> Self {
+        let storage = Grown::storage;
+        let sizes = || Grown::new("sizes", Usage::STORAGE | Usage::INDIRECT | Usage::COPY_SRC | Usage::COPY_DST);
+        Self {
+            uniforms: Grown::new("uniforms", Usage::UNIFORM | Usage::COPY_DST),
+            counts: storage("counts"),
+            arguments: [sizes(), sizes()],
+            shapes: storage("the splats' shapes"),
+            colors: storage("the splats' colours"),
+            marks: storage("marks"),
+            places: storage("places"),
+            depth_keys: [storage("depths"), storage("depths")],
+            depth_values: [storage("the splats' numbers"), storage("the splats' numbers")],
+            sort_counts: storage("counts of the sort"),
+            scan_sums: storage("sums"),
+            tile_counts: storage("counts of tiles"),
+            first_pairs: storage("numbers of pairs"),
+            pair_keys: [storage("pairs of tile and splat"), storage("pairs of tile and splat")],
+            pair_values: [storage("pairs of tile and splat"), storage("pairs of tile and splat")],
+            ranges: storage("the tiles' lists"),
+            planes: storage("the picture's planes"),
+            times: Grown::new("timestamps", Usage::QUERY_RESOLVE | Usage::COPY_SRC),
+            staging: Grown::new("the picture", Usage::MAP_READ | Usage::COPY_DST),
+        }
+    }
+
+    /// Bytes held.
+    pub fn bytes(&self) -> u64 {
+        let one = [
+            &self.uniforms,
+            &self.counts,
+            &self.shapes,
+            &self.colors,
+            &self.marks,
+            &self.places,
+            &self.sort_counts,
+            &self.scan_sums,
+            &self.tile_counts,
+            &self.first_pairs,
+            &self.ranges,
+            &self.planes,
+            &self.times,
+            &self.staging,
+        ];
+        let two = [&self.arguments, &self.depth_keys, &self.depth_values, &self.pair_keys, &self.pair_values];
+        one.iter().map(|b| b.bytes()).sum::<u64>() + two.iter().flat_map(|b| b.iter()).map(Grown::bytes).sum::<u64>()
+    }
+}

@@ -1,0 +1,149 @@
+//! Which GPU, and how it is opened: nothing beyond WebGPU's default limits is asked for, so that what runs here runs in
+//! a browser too.
+
+use crate::{Error, ErrorKind, Result};
+use std::future::Future;
+use std::pin::pin;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::task::{Context, Poll, Waker};
+
+/// Which adapters will do.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Adapters {
+    /// Only a GPU: a driver that computes on the CPU is no faster than the CPU renderer.
+    Hardware,
+    /// A GPU if there is one, else a driver that computes on the CPU (Mesa's lavapipe).
+    Any,
+}
+
+/// The first error that the driver reported since it was last asked for.
+type Trouble = Arc<Mutex<Option<(ErrorKind, String)>>>;
+
+/// An open GPU.
+#[derive(Debug)]
+pub struct Gpu {
+    pub(super) device: wgpu::Device,
+    pub(super) queue: wgpu::Queue,
+    info: wgpu::AdapterInfo,
+    trouble: Trouble,
+}
+
+impl Gpu {
+    /// Opens the best adapter: discrete before integrated, hardware before software.
+    ///
+    /// Errors: there is none (the message says what was found), or its driver refuses WebGPU's default limits.
+    pub fn open(adapters: Adapters) -> Result<Self> {
+        let mut found = all_adapters();
+        found.retain(|a| adapters == Adapters::Any || a.get_info().device_type != wgpu::DeviceType::Cpu);
+        let Some(adapter) = found.into_iter().min_by_key(|a| rank(a.get_info().device_type)) else {
+            let software = adapters == Adapters::Hardware && !all_adapters().is_empty();
+            let what = if software {
+                "there is no GPU, only a driver that computes on the CPU"
+            } else {
+                "no Vulkan, Metal or Direct3D 12 driver was found"
+            };
+            return Err(Error::new(ErrorKind::Unsupported, what)
+                .remedy("Install the graphics card's driver, or render on the CPU."));
+        };
+        let info = adapter.get_info();
+        let refused = |e: wgpu::RequestDeviceError| {
+            Error::new(ErrorKind::Unsupported, format!("the GPU cannot be opened ({e})"))
+                .at(&info.name)
+                .remedy("Update its driver, or render on the CPU.")
+        };
+        let descriptor = wgpu::DeviceDescriptor {
+            label: Some("splat4d"),
+            required_features: adapter.features() & wgpu::Features::TIMESTAMP_QUERY,
+            required_limits: wgpu::Limits::default(),
+            ..Default::default()
+        };
+        let (device, queue) = block_on(adapter.request_device(&descriptor)).map_err(refused)?;
+        let trouble = Trouble::default();
+        let first = Arc::clone(&trouble);
+        device.on_uncaptured_error(Arc::new(move |e: wgpu::Error| {
+            let kind = match &e {
+                wgpu::Error::OutOfMemory { .. } => ErrorKind::Memory,
+                _ => ErrorKind::Unsupported,
+            };
+            first.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert((kind, e.to_string()));
+        }));
+        Ok(Self { device, queue, info, trouble })
+    }
+
+    /// The card's name as its driver gives it.
+    pub fn name(&self) -> &str {
+        &self.info.name
+    }
+
+    /// Whether the adapter computes on the CPU.
+    pub fn is_software(&self) -> bool {
+        self.info.device_type == wgpu::DeviceType::Cpu
+    }
+
+    /// Card, kind, interface and driver in one line.
+    pub fn describe(&self) -> String {
+        let i = &self.info;
+        let driver = [i.driver.as_str(), i.driver_info.as_str()].join(" ");
+        format!("{} ({:?}, {}, {})", i.name, i.device_type, i.backend, driver.trim())
+    }
+
+    /// Whether the GPU's own clock can be read.
+    pub fn has_timestamps(&self) -> bool {
+        self.device.features().contains(wgpu::Features::TIMESTAMP_QUERY)
+    }
+
+    /// Waits until all work has been done.
+    pub(super) fn wait(&self) -> Result<()> {
+        self.device
+            .poll(wgpu::PollType::wait_indefinitely())
+            .map_err(|e| self.error(ErrorKind::Unsupported, e.to_string()))?;
+        self.check()
+    }
+
+    /// The first error that was reported since the last call.
+    pub(super) fn check(&self) -> Result<()> {
+        match self.trouble.lock().unwrap_or_else(PoisonError::into_inner).take() {
+            None => Ok(()),
+            Some((kind, text)) => Err(self.error(kind, text)),
+        }
+    }
+
+    fn error(&self, kind: ErrorKind, text: String) -> Error {
+        let what = match kind {
+            ErrorKind::Memory => "the GPU has too little memory",
+            _ => "the GPU's driver failed",
+        };
+        Error::new(kind, format!("{what} ({text})")).at(&self.info.name).remedy("Render on the CPU.")
+    }
+}
+
+/// Every adapter of this machine. Validation of indirect dispatches is left out: our own kernels write their sizes,
+/// and the check costs a dispatch each.
+fn all_adapters() -> Vec<wgpu::Adapter> {
+    let mut descriptor = wgpu::InstanceDescriptor::new_without_display_handle();
+    descriptor.backends = wgpu::Backends::PRIMARY;
+    descriptor.flags = wgpu::InstanceFlags::from_build_config() - wgpu::InstanceFlags::VALIDATION_INDIRECT_CALL;
+    block_on(wgpu::Instance::new(descriptor).enumerate_adapters(wgpu::Backends::PRIMARY))
+}
+
+fn rank(kind: wgpu::DeviceType) -> u8 {
+    match kind {
+        wgpu::DeviceType::DiscreteGpu => 0,
+        wgpu::DeviceType::IntegratedGpu => 1,
+        wgpu::DeviceType::VirtualGpu => 2,
+        wgpu::DeviceType::Other => 3,
+        wgpu::DeviceType::Cpu => 4,
+    }
+}
+
+/// Waits for a future. Natively wgpu's are ready at once; a thread that yields is enough for any that is not.
+fn block_on<T>(future: impl Future<Output = T>) -> T {
+    let mut future = pin!(future);
+    let mut context = Context::from_waker(Waker::noop());
+    loop {
+        if let Poll::Ready(value) = future.as_mut().poll(&mut context) {
+            return value;
+        }
+        std::thread::yield_now();
+    }
+}

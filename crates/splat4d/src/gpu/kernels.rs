@@ -1,0 +1,152 @@
+//! The compute pipelines, compiled once. Bindings are written out, so that all entry points of a file share one layout.
+
+use super::device::Gpu;
+use crate::wgsl;
+
+/// What a binding is.
+#[derive(Clone, Copy, Debug)]
+enum Kind {
+    Uniform,
+    Read,
+    Write,
+}
+use Kind::{Read, Uniform, Write};
+
+/// The entry points of one file.
+#[derive(Debug)]
+pub(super) struct Kernel {
+    layout: wgpu::BindGroupLayout,
+    /// In the order in which the entry points were named.
+    pub pipelines: Vec<wgpu::ComputePipeline>,
+}
+
+impl Kernel {
+    fn new(gpu: &Gpu, label: &str, sources: &[&str], bindings: &[Kind], entries: &[&str]) -> Self {
+        let device = &gpu.device;
+        let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
+            label: Some(label),
+            source: wgpu::ShaderSource::Wgsl(sources.join("\n").into()),
+        });
+        let entry = |(i, kind): (usize, &Kind)| wgpu::BindGroupLayoutEntry {
+            binding: i as u32,
+            visibility: wgpu::ShaderStages::COMPUTE,
+            ty: wgpu::BindingType::Buffer {
+                ty: match kind {
+                    Uniform => wgpu::BufferBindingType::Uniform,
+                    Read => wgpu::BufferBindingType::Storage { read_only: true },
+                    Write => wgpu::BufferBindingType::Storage { read_only: false },
+                },
+                has_dynamic_offset: false,
+                min_binding_size: None,
+            },
+            count: None,
+        };
+        let layout = device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
+            label: Some(label),
+            entries: &bindings.iter().enumerate().map(entry).collect::<Vec<_>>(),
+        });
+        let pipeline_layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
+            label: Some(label),
+            bind_group_layouts: &[Some(&layout)],
+            immediate_size: 0,
+        });
+        let pipelines = entries
+            .iter()
+            .map(|name| {
+                device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+                    label: Some(name),
+                    layout: Some(&pipeline_layout),
+                    module: &module,
+                    entry_point: Some(name),
+                    compilation_options: Default::default(),
+                    cache: None,
+                })
+            })
+            .collect();
+        Self { layout, pipelines }
+    }
+
+    /// Binds `resources` in the order of the bindings.
+    pub fn bind(&self, gpu: &Gpu, resources: &[wgpu::BindingResource<'_>]) -> wgpu::BindGroup {
+        let entries: Vec<_> = resources
+            .iter()
+            .enumerate()
+            .map(|(i, r)| wgpu::BindGroupEntry { binding: i as u32, resource: r.clone() })
+            .collect();
+        gpu.device.create_bind_group(&wgpu::BindGroupDescriptor {
+            label: None,
+            layout: &self.layout,
+            entries: &entries,
+        })
+    }
+}
+
+/// All kernels.
+#[derive(Debug)]
+pub(super) struct Kernels {
+    /// splats
+    pub splats: Kernel,
+    /// block_sums, total, offsets
+    pub scan: Kernel,
+    /// compact
+    pub compact: Kernel,
+    /// histogram, scan, scatter
+    pub sort: Kernel,
+    /// count, emit
+    pub tiles: Kernel,
+    /// ranges_of
+    pub ranges: Kernel,
+    /// rasterize
+    pub rasterize: Kernel,
+}
+
+impl Kernels {
+    /// Compiles everything.
+    pub fn new(gpu: &Gpu) -> Self {
+        Self {
+            splats: Kernel::new(
+                gpu,
+                "splats",
+                &[wgsl::PROJECT, wgsl::SHADE, wgsl::SPLATS],
+                &[Uniform, Uniform, Read, Read, Read, Read, Write, Write, Write],
+                &["splats"],
+            ),
+            scan: Kernel::new(
+                gpu,
+                "scan",
+                &[wgsl::SCAN],
+                &[Uniform, Write, Read, Write, Write, Write],
+                &["block_sums", "total", "offsets"],
+            ),
+            compact: Kernel::new(
+                gpu,
+                "compact",
+                &[wgsl::COMPACT],
+                &[Read, Read, Read, Read, Write, Write],
+                &["compact"],
+            ),
+            sort: Kernel::new(
+                gpu,
+                "sort",
+                &[wgsl::SORT],
+                &[Uniform, Read, Read, Read, Write, Write, Write],
+                &["histogram", "scan", "scatter"],
+            ),
+            tiles: Kernel::new(
+                gpu,
+                "tiles",
+                &[wgsl::PROJECT, wgsl::TILES],
+                &[Uniform, Uniform, Read, Read, Read, Write, Read, Write, Write],
+                &["count", "emit"],
+            ),
+            ranges: Kernel::new(gpu, "ranges", &[wgsl::RANGES], &[Read, Read, Write], &["ranges_of"]),
+            rasterize: Kernel::new(
+                gpu,
+                "rasterize",
+                &[wgsl::PROJECT, wgsl::RASTERIZE],
+                &[Uniform, Uniform, Read, Read, Read, Read, Write],
+                &["rasterize"],
+            ),
+        }
+    }
+}

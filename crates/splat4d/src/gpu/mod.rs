@@ -1,0 +1,417 @@
+//! The renderer on a GPU (feature `gpu`): the same stages as [`crate::render`] in WGSL, through `wgpu`.
+//!
+//! Stages: project and colour every splat; gather the visible ones; sort them by depth (ties by number, the order that
+//! `render::bin` defines); count, sum and write pairs of tile and splat in that order; sort the pairs stably by tile;
+//! blend 16² tiles. Every stage is checked against its CPU twin. The shaders stay inside WebGPU's default limits and
+//! are the ones the browser's player uses.
+//!
+//! Memory is one arena that only grows: a steady scene allocates nothing. How many pairs there are is known only when
+//! they have been counted, so a frame runs with the room of the last one; were they more, the arena grows and the
+//! lists are made again. A picture whose pairs or pixels would not fit into a binding is drawn in bands of tile rows.
+
+mod buffers;
+mod clock;
+mod device;
+mod frame;
+mod kernels;
+#[cfg(test)]
+mod tests;
+mod upload;
+
+pub use clock::{GpuTimings, StageClock};
+pub use device::{Adapters, Gpu};
+
+use crate::render::{Antialias, Image, RenderConfig};
+use crate::scene::{Camera, Planes, Splats};
+use crate::{Error, ErrorKind, Result};
+use buffers::{Buffers, UNIFORM_STRIDE, largest_binding};
+use clock::{Queries, Recorder, TIMES_BYTES};
+use frame::{BLOCK, Band, DIGITS, Frame, Groups, TILE, arguments, count, slot};
+use kernels::Kernels;
+use rayon::prelude::*;
+use std::time::Instant;
+use upload::Upload;
+
+/// The smallest α cut-off that is told from 0, as on the CPU.
+const ALPHA_FLOOR: f64 = 1e-30;
+/// α never reaches 1, as on the CPU.
+const ALPHA_CEILING: f64 = 1.0 - 1e-6;
+/// Planes of a picture: red, green, blue, alpha, depth.
+const PLANES: usize = 5;
+/// Bit of the view's flags in project.wgsl.
+const FLAG_ANTIALIAS: u32 = 1;
+/// Pairs of tile and splat that are held at once (a quarter GiB); bands are made so that no more are needed.
+const MOST_PAIRS: usize = 1 << 24;
+/// Pairs that there is room for at first, for each splat and at least.
+const FIRST_PAIRS: (usize, usize) = (4, 1 << 16);
+/// Workgroups of one dispatch in one direction (WebGPU's default limit).
+const MOST_GROUPS: usize = 65_535;
+
+/// Whether a scene's tables change between renders.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Tables {
+    /// Everything is sent for every picture.
+    Changing,
+    /// A layer's own SH table ([`crate::scene::Color::Sh`] with `base`) that lies at the same address and has the same
+    /// size as in the last render is the same table, and is not sent again: right for a scene that is played, wrong
+    /// for one that learns. Everything else of an instant is sent all the same.
+    Constant,
+}
+
+/// What the last render did.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct GpuStats {
+    /// Splats given.
+    pub splats: usize,
+    /// Splats whose box touches the picture.
+    pub visible: usize,
+    /// Pairs of 16² tile and splat.
+    pub pairs: usize,
+    /// Bands in which the picture was drawn.
+    pub bands: usize,
+}
+
+/// Draws splats on a GPU. All memory is reused from call to call.
+#[derive(Debug)]
+pub struct GpuRenderer {
+    /// Options; `simd` means nothing here.
+    pub config: RenderConfig,
+    /// Whether tables are sent for every picture.
+    pub tables: Tables,
+    /// What times the stages.
+    pub clock: StageClock,
+    gpu: Gpu,
+    kernels: Kernels,
+    buffers: Buffers,
+    upload: Upload,
+    groups: Option<Groups>,
+    queries: Queries,
+    uniforms: Vec<u8>,
+    /// Instead of [`MOST_PAIRS`].
+    most_pairs: usize,
+    timings: GpuTimings,
+    stats: GpuStats,
+}
+
+impl GpuRenderer {
+    /// Compiles the kernels. Errors: the driver refuses one.
+    pub fn new(gpu: Gpu, config: RenderConfig) -> Result<Self> {
+        let kernels = Kernels::new(&gpu);
+        gpu.check()?;
+        let queries = Queries::new(&gpu);
+        let clock = if gpu.has_timestamps() { StageClock::Gpu } else { StageClock::Off };
+        Ok(Self {
+            config,
+            tables: Tables::Changing,
+            clock,
+            gpu,
+            kernels,
+            buffers: Buffers::new(),
+            upload: Upload::default(),
+            groups: None,
+            queries,
+            uniforms: Vec::new(),
+            most_pairs: MOST_PAIRS,
+            timings: GpuTimings::default(),
+            stats: GpuStats::default(),
+        })
+    }
+
+    /// The GPU.
+    pub fn gpu(&self) -> &Gpu {
+        &self.gpu
+    }
+
+    /// Milliseconds of the last render.
+    pub fn timings(&self) -> GpuTimings {
+        self.timings
+    }
+
+    /// Counts of the last render.
+    pub fn stats(&self) -> GpuStats {
+        self.stats
+    }
+
+    /// Bytes of GPU memory held, tables included.
+    pub fn memory_bytes(&self) -> u64 {
+        self.buffers.bytes() + self.upload.bytes()
+    }
+
+    /// Draws `splats` as `camera` (a pinhole) sees them over `background`, as [`crate::render::Renderer::render`] does;
+    /// `out.extra` becomes empty.
+    ///
+    /// Errors: the scene or the picture is too large for WebGPU's limits (the message says what), or the driver failed;
+    /// `out` means nothing then, and the CPU can draw instead.
+    pub fn render(
+        &mut self,
+        splats: &Splats<'_, f32>,
+        camera: &Camera,
+        background: [f32; 3],
+        out: &mut Image<f32>,
+    ) -> Result<()> {
+        let start = Instant::now();
+        self.timings = GpuTimings::default();
+        let (n, w, h) = (splats.len(), camera.width, camera.height);
+        self.stats = GpuStats { splats: n, ..GpuStats::default() };
+        reshape(&mut out.color, 3, h, w);
+        reshape(&mut out.alpha, 1, h, w);
+        reshape(&mut out.depth, 1, h, w);
+        reshape(&mut out.extra, 0, h, w);
+        if w == 0 || h == 0 {
+            return Ok(());
+        }
+        let (across, down) = (w.div_ceil(TILE), h.div_ceil(TILE));
+        // What is read back holds the planes and, behind them, a few numbers.
+        let room = largest_binding(&self.gpu) - 4 * UNIFORM_STRIDE;
+        let band_rows = (room / (4 * PLANES * TILE * w) as u64).min(MOST_GROUPS as u64) as usize;
+        if across > MOST_GROUPS || band_rows == 0 {
+            return Err(Error::new(
+                ErrorKind::Unsupported,
+                format!("a picture {w} pixels wide is too large for the GPU"),
+            )
+            .remedy("Render on the CPU."));
+        }
+        self.upload.send(&self.gpu, splats, self.tables)?;
+        let mut fresh = self.make_room_for_splats(n)?;
+        self.timings.upload = start.elapsed().as_secs_f64() * 1e3;
+        // Bands from the top: the last of the list comes first.
+        let mut bands: Vec<Band> =
+            (0..down).step_by(band_rows).map(|first| Band { first, rows: band_rows.min(down - first) }).rev().collect();
+        let mut projected = false;
+        while let Some(band) = bands.pop() {
+            fresh |= self.make_room_for_band(band, across, w)?;
+            if fresh || self.groups.is_none() {
+                self.groups = Some(Groups::new(&self.gpu, &self.kernels, &self.buffers));
+                fresh = false;
+            }
+            self.write_uniforms(camera, background, band, across)?;
+            let pairs = self.draw(band, across, !projected, out)?;
+            projected = true;
+            if pairs <= self.pair_capacity() {
+                self.stats.pairs += pairs;
+                self.stats.bands += 1;
+                continue;
+            }
+            // Too many pairs for the room there is: more room, or two halves.
+            if pairs <= self.most_pairs {
+                fresh |= self.make_room_for_pairs(pairs)?;
+                bands.push(band);
+            } else if band.rows > 1 {
+                let half = band.rows / 2;
+                bands.push(Band { first: band.first + half, rows: band.rows - half });
+                bands.push(Band { first: band.first, rows: half });
+                if self.pair_capacity() < self.most_pairs {
+                    fresh |= self.make_room_for_pairs(self.most_pairs)?;
+                }
+            } else {
+                let text = format!("{pairs} pairs of Gaussian and tile in one row of tiles are too many for the GPU");
+                return Err(Error::new(ErrorKind::Unsupported, text).remedy("Render on the CPU."));
+            }
+        }
+        self.timings.total = start.elapsed().as_secs_f64() * 1e3;
+        Ok(())
+    }
+
+    /// Buffers with a row a splat; whether any is new.
+    fn make_room_for_splats(&mut self, n: usize) -> Result<bool> {
+        let (gpu, b) = (&self.gpu, &mut self.buffers);
+        let n = n as u64;
+        let mut fresh = false;
+        fresh |= b.uniforms.ensure(gpu, (slot::PIECES + self.upload.draws.len()) as u64 * UNIFORM_STRIDE)?;
+        fresh |= b.counts.ensure(gpu, 4 * count::ALL as u64)?;
+        for buffer in &mut b.arguments {
+            fresh |= buffer.ensure(gpu, arguments::BYTES)?;
+        }
+        fresh |= b.shapes.ensure(gpu, 32 * n)?;
+        fresh |= b.colors.ensure(gpu, 16 * n)?;
+        let blocks = n.div_ceil(BLOCK as u64);
+        for buffer in [&mut b.marks, &mut b.places, &mut b.tile_counts, &mut b.first_pairs] {
+            fresh |= buffer.ensure(gpu, 4 * n)?;
+        }
+        for buffer in b.depth_keys.iter_mut().chain(&mut b.depth_values) {
+            fresh |= buffer.ensure(gpu, 4 * n)?;
+        }
+        fresh |= b.scan_sums.ensure(gpu, 4 * blocks)?;
+        fresh |= b.sort_counts.ensure(gpu, sort_bytes(b.depth_keys[0].bytes() / 4))?;
+        fresh |= b.times.ensure(gpu, TIMES_BYTES)?;
+        if b.pair_keys[0].bytes() == 0 {
+            let (each, least) = FIRST_PAIRS;
+            self.make_room_for_pairs((each * n as usize).clamp(least, MOST_PAIRS).min(self.most_pairs))?;
+            fresh = true;
+        }
+        self.gpu.queue.write_buffer(self.buffers.counts.get(), 0, bytemuck::cast_slice(&[n as u32, 0, 0]));
+        Ok(fresh)
+    }
+
+    fn make_room_for_pairs(&mut self, pairs: usize) -> Result<bool> {
+        let (gpu, b) = (&self.gpu, &mut self.buffers);
+        let mut fresh = false;
+        for buffer in b.pair_keys.iter_mut().chain(&mut b.pair_values) {
+            fresh |= buffer.ensure(gpu, 4 * pairs as u64)?;
+        }
+        fresh |= b.sort_counts.ensure(gpu, sort_bytes(b.pair_keys[0].bytes() / 4))?;
+        Ok(fresh)
+    }
+
+    fn make_room_for_band(&mut self, band: Band, across: usize, width: usize) -> Result<bool> {
+        let (gpu, b) = (&self.gpu, &mut self.buffers);
+        let planes = plane_bytes(band, width);
+        let mut fresh = b.ranges.ensure(gpu, (8 * band.rows * across) as u64)?;
+        fresh |= b.planes.ensure(gpu, planes)?;
+        fresh |= b.staging.ensure(gpu, counts_at(planes) + UNIFORM_STRIDE + TIMES_BYTES)?;
+        Ok(fresh)
+    }
+
+    /// Pairs that there is room for.
+    fn pair_capacity(&self) -> usize {
+        (self.buffers.pair_keys[0].bytes() / 4) as usize
+    }
+
+    /// Writes every uniform of a submission.
+    fn write_uniforms(&mut self, camera: &Camera, background: [f32; 3], band: Band, across: usize) -> Result<()> {
+        let draws = &self.upload.draws;
+        self.uniforms.clear();
+        self.uniforms.resize((slot::PIECES + draws.len()) * UNIFORM_STRIDE as usize, 0);
+        let capacity = self.pair_capacity() as u32;
+        let out = &mut self.uniforms;
+        put(out, slot::VIEW, &view(camera, &self.config, self.stats.splats));
+        put(out, slot::SCAN_VISIBLE, &[count::SPLATS as u32, count::VISIBLE as u32, 0, u32::MAX]);
+        put(out, slot::SCAN_PAIRS, &[count::VISIBLE as u32, count::PAIRS as u32, 0, capacity]);
+        for (pass, slot) in (slot::SORT_DEPTH..slot::SORT_TILE).enumerate() {
+            put(out, slot, &[8 * pass as u32, count::VISIBLE as u32]);
+        }
+        for (pass, slot) in (slot::SORT_TILE..slot::BAND).enumerate() {
+            put(out, slot, &[8 * pass as u32, count::PAIRS as u32]);
+        }
+        let [first, rows, across] = [band.first, band.rows, across].map(|v| v as u32);
+        put(out, slot::BAND, &[first, rows, across, 0]);
+        let c = &self.config;
+        let pixel_rows = pixel_rows(band, camera.height) as u32;
+        let limits = [c.alpha_max.min(ALPHA_CEILING) as f32, c.transmittance_min.max(0.0) as f32].map(f32::to_bits);
+        let [r, g, b] = background.map(f32::to_bits);
+        put(out, slot::BLEND, &[r, g, b, limits[0], limits[1], first, pixel_rows, 0]);
+        for (i, draw) in draws.iter().enumerate() {
+            put(out, slot::PIECES + i, std::slice::from_ref(&draw.piece));
+        }
+        self.gpu.queue.write_buffer(self.buffers.uniforms.get(), 0, &self.uniforms);
+        self.gpu.check()
+    }
+
+    /// Runs a submission and reads its picture, unless there were too many pairs. Returns how many there were.
+    fn draw(&mut self, band: Band, across: usize, project: bool, out: &mut Image<f32>) -> Result<usize> {
+        let (gpu, b) = (&self.gpu, &self.buffers);
+        let groups = self.groups.as_ref().expect("groups are made before a frame");
+        let frame = Frame { gpu, kernels: &self.kernels, buffers: b, groups };
+        let mut recorder = Recorder::new(gpu, &self.queries, self.clock);
+        if project {
+            frame.splats(&mut recorder, &self.upload, self.stats.splats)?;
+        }
+        frame.band(&mut recorder, band, across)?;
+        let (width, height) = (out.alpha.width, out.alpha.height);
+        let rows = pixel_rows(band, height);
+        let planes = (4 * PLANES * width * rows) as u64;
+        let counts_at = counts_at(planes);
+        let times_at = counts_at + UNIFORM_STRIDE;
+        recorder.copy(b.planes.get(), b.staging.get(), 0, planes);
+        recorder.copy(b.counts.get(), b.staging.get(), counts_at, 4 * count::ALL as u64);
+        let timed = recorder.resolve(b.times.get());
+        if timed {
+            recorder.copy(b.times.get(), b.staging.get(), times_at, TIMES_BYTES);
+        }
+        let start = Instant::now();
+        recorder.submit();
+        let staging = b.staging.get();
+        // Failing to map is told by the view below, or by the device's own error.
+        staging.map_async(wgpu::MapMode::Read, .., |_| ());
+        gpu.wait()?;
+        let lost = |e: wgpu::MapRangeError| {
+            Error::new(ErrorKind::Unsupported, format!("the picture cannot be read from the GPU ({e})"))
+                .at(gpu.name())
+                .remedy("Render on the CPU.")
+        };
+        let view = staging.get_mapped_range(..).map_err(lost)?;
+        let counts: Vec<u32> = bytemuck::pod_collect_to_vec(&view[counts_at as usize..][..4 * count::ALL]);
+        let pairs = counts[count::PAIRS] as usize;
+        self.stats.visible = counts[count::VISIBLE] as usize;
+        let stamps: Vec<u64> = bytemuck::pod_collect_to_vec(&view[times_at as usize..][..TIMES_BYTES as usize]);
+        if pairs <= (b.pair_keys[0].bytes() / 4) as usize {
+            read_planes(&view[..planes as usize], band.first * TILE, rows, out);
+        }
+        drop(view);
+        staging.unmap();
+        self.timings.wait += start.elapsed().as_secs_f64() * 1e3;
+        self.timings.add(if timed { recorder.stages(&stamps) } else { recorder.by_wall });
+        Ok(pairs)
+    }
+}
+
+/// Copies the planes of a band into the picture, from pixel row `first` on.
+fn read_planes(bytes: &[u8], first: usize, rows: usize, out: &mut Image<f32>) {
+    let width = out.alpha.width;
+    let Image { color, alpha, depth, .. } = out;
+    let pixels = color.height * width;
+    let targets = color.data.chunks_mut(pixels).chain([&mut alpha.data[..], &mut depth.data[..]]);
+    let sources = bytes.chunks(4 * width * rows);
+    let pairs: Vec<_> = targets.zip(sources).collect();
+    pairs.into_par_iter().for_each(|(target, source)| {
+        let target = &mut target[first * width..(first + rows) * width];
+        bytemuck::cast_slice_mut::<f32, u8>(target).copy_from_slice(source);
+    });
+}
+
+/// Rows of pixels of a band in a picture of `height`.
+fn pixel_rows(band: Band, height: usize) -> usize {
+    (band.rows * TILE).min(height - band.first * TILE)
+}
+
+/// Bytes of a band's planes, rows beyond the picture included.
+fn plane_bytes(band: Band, width: usize) -> u64 {
+    (4 * PLANES * width * band.rows * TILE) as u64
+}
+
+/// Where the counts begin in what the CPU reads.
+fn counts_at(planes: u64) -> u64 {
+    planes.next_multiple_of(UNIFORM_STRIDE)
+}
+
+/// Bytes of the sort's counts for so many pairs.
+fn sort_bytes(pairs: u64) -> u64 {
+    4 * DIGITS as u64 * (pairs.div_ceil(BLOCK as u64) + 1)
+}
+
+/// Writes a structure into its slot.
+fn put<T: bytemuck::NoUninit>(out: &mut [u8], slot: usize, data: &[T]) {
+    let bytes = bytemuck::cast_slice(data);
+    out[slot * UNIFORM_STRIDE as usize..][..bytes.len()].copy_from_slice(bytes);
+}
+
+/// `struct View` of project.wgsl, as the bits of its 32 numbers.
+fn view(camera: &Camera, config: &RenderConfig, splats: usize) -> [u32; 32] {
+    let pose = &camera.cam_from_world;
+    let (r, t, k, center) = (&pose.rotation, &pose.translation, &camera.intrinsics, camera.center());
+    let mut out = [0; 32];
+    for column in 0..3 {
+        for row in 0..3 {
+            out[4 * column + row] = (r[row][column] as f32).to_bits();
+        }
+        out[12 + column] = (t[column] as f32).to_bits();
+        out[24 + column] = (center[column] as f32).to_bits();
+    }
+    out[15] = 1f32.to_bits();
+    let alpha_min = config.alpha_min.max(ALPHA_FLOOR);
+    let numbers = [k.fx, k.fy, k.cx, k.cy, camera.width as f64, camera.height as f64, config.near, config.low_pass];
+    for (to, v) in out[16..24].iter_mut().zip(numbers) {
+        *to = (v as f32).to_bits();
+    }
+    out[27] = (alpha_min as f32).to_bits();
+    out[28] = config.sh_degree.min(crate::math::sh::MAX_DEGREE) as u32;
+    out[29] = splats as u32;
+    out[31] = if config.antialias == Antialias::On { FLAG_ANTIALIAS } else { 0 };
+    out
+}
+
+/// Sizes planes that are about to be overwritten.
+fn reshape(planes: &mut Planes<f32>, channels: usize, height: usize, width: usize) {
+    (planes.channels, planes.height, planes.width) = (channels, height, width);
+    planes.data.resize(channels * height * width, 0.0);
+}

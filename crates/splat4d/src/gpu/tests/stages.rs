@@ -1,0 +1,263 @@
+//! Stage by stage.
+
+use super::*;
+use crate::render::{View, project, shade};
+
+/// Relative difference of a depth, a colour, an extent or an opacity: a few roundings of f32.
+const RELATIVE: f32 = 2e-5;
+/// Difference of centres, pixels: the last place of a coordinate of some hundred pixels, a few times.
+const PIXELS: f32 = 2e-3;
+/// Relative difference of conics and extents: determinants of thin ellipses cancel.
+const CONIC: f32 = 2e-3;
+/// How far from the cut-off ellipse a tile may be counted or left out, in units of τ.
+const TAU: f64 = 5e-3;
+
+fn close(a: f32, b: f32, relative: f32, absolute: f32) -> bool {
+    (a - b).abs() <= absolute + relative * a.abs().max(b.abs())
+}
+
+/// Renders, so that every buffer holds what its stage wrote.
+fn drawn(r: &mut GpuRenderer, splats: &Splats<'_, f32>, camera: &Camera) {
+    r.render(splats, camera, BACKGROUND, &mut Image::default()).expect("a small scene is drawn");
+}
+
+#[test]
+fn projection_equals_the_cpus() {
+    let Some(mut r) = renderer() else { return };
+    let scene = Scenery::new(1, 3000, 2.0, 0.05);
+    for (camera, antialias) in [
+        (camera([0.0, 0.5, -4.0], 131, 77), Antialias::Off),
+        (skewed(200, 120), Antialias::On),
+        (camera([0.3, 0.0, 0.2], 64, 64), Antialias::Off),
+    ] {
+        r.config.antialias = antialias;
+        drawn(&mut r, &scene.splats(), &camera);
+        let n = scene.out.rows();
+        let shapes: Vec<[f32; 8]> = read(&r.gpu, &r.buffers.shapes, n);
+        let colors: Vec<[f32; 4]> = read(&r.gpu, &r.buffers.colors, n);
+        let marks: Vec<u32> = read(&r.gpu, &r.buffers.marks, n);
+        let view = View::new(&camera, &r.config);
+        let (mut seen, mut doubtful) = (0, 0);
+        for j in 0..n {
+            let p = project::project(&view, scene.out.read(j, 0), scene.out.read(j, 3), scene.out.get(j, 9));
+            let inside = p.is_some_and(|p| {
+                let meets = |k: usize, size: usize| {
+                    let (low, high) = (p.mean2d[k] - p.half[k] - 0.5, p.mean2d[k] + p.half[k] - 0.5);
+                    low.ceil().max(0.0) <= high.floor().min(size as f32 - 1.0)
+                };
+                meets(0, camera.width) && meets(1, camera.height)
+            });
+            if inside != (marks[j] == 1) {
+                doubtful += 1;
+                continue;
+            }
+            let (Some(p), true) = (p, inside) else { continue };
+            seen += 1;
+            let [x, y, half_x, half_y, a, b, c, opacity] = shapes[j];
+            assert!(close(x, p.mean2d[0], RELATIVE, PIXELS) && close(y, p.mean2d[1], RELATIVE, PIXELS), "centre {j}");
+            assert!(close(half_x, p.half[0], CONIC, PIXELS) && close(half_y, p.half[1], CONIC, PIXELS), "extent {j}");
+            let scale = (p.conic[0] * p.conic[2]).sqrt();
+            for (v, w) in [a, b, c].into_iter().zip(p.conic) {
+                assert!(close(v, w, CONIC, CONIC * scale), "conic {j}: {v} {w}");
+            }
+            assert!(close(opacity, p.opacity, CONIC, 0.0), "opacity {j}: {opacity} {}", p.opacity);
+            assert!(close(colors[j][3], p.depth, RELATIVE, RELATIVE), "depth {j}");
+        }
+        assert!(seen > n / 20, "the test must see something: {seen}");
+        // Only a splat on the very edge of the picture or of the α cut-off may be judged otherwise.
+        assert!(doubtful <= 2, "{doubtful} splats are visible on one side only");
+    }
+}
+
+#[test]
+fn colours_equal_the_cpus() {
+    let Some(mut r) = renderer() else { return };
+    let (scene, camera) = (Scenery::new(2, 1000, 1.0, 0.05), camera([0.0, 0.5, -4.0], 131, 77));
+    for degree in 0..=3 {
+        r.config.sh_degree = degree;
+        drawn(&mut r, &scene.splats(), &camera);
+        let n = scene.out.rows();
+        let colors: Vec<[f32; 4]> = read(&r.gpu, &r.buffers.colors, n);
+        let (cpu, _) = on_cpu(&scene.splats(), &camera, &r.config);
+        let mut expected = vec![[0.0; 4]; n];
+        let view = View::new(&camera, &r.config);
+        shade::forward(&scene.splats(), &view, degree, r.config.simd, cpu.projected(), &mut expected);
+        let marks: Vec<u32> = read(&r.gpu, &r.buffers.marks, n);
+        let both = (0..n).filter(|&j| marks[j] == 1 && cpu.projected()[j].radius > 0.0);
+        let mut seen = 0;
+        for j in both {
+            seen += 1;
+            for c in 0..4 {
+                assert!(close(colors[j][c], expected[j][c], RELATIVE, RELATIVE), "degree {degree}, splat {j}, {c}");
+            }
+        }
+        assert!(seen > n / 2);
+    }
+}
+
+/// Pairs sorted by the low `passes` bytes of their keys on the GPU.
+fn sorted(gpu: &Gpu, kernels: &Kernels, keys: &[u32], values: &[u32], passes: u32) -> (Vec<u32>, Vec<u32>) {
+    let n = keys.len();
+    let keys = [storage(gpu, keys), storage(gpu, keys)];
+    let values = [storage(gpu, values), storage(gpu, values)];
+    let counts = storage(gpu, &[7, n as u32, 9]);
+    // Not cleared, on purpose: the kernels must not rely on it.
+    let sums = storage(gpu, &vec![0xdead_beefu32; DIGITS * (n.div_ceil(BLOCK) + 1)]);
+    for pass in 0..passes {
+        let mut uniform = Grown::new("pass", wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST);
+        uniform.ensure(gpu, 8).expect("a small buffer");
+        gpu.queue.write_buffer(uniform.get(), 0, bytemuck::cast_slice(&[8 * pass, 1]));
+        let (from, to) = (pass as usize % 2, 1 - pass as usize % 2);
+        let resources = [&uniform, &counts, &keys[from], &values[from], &keys[to], &values[to], &sums].map(Grown::all);
+        let group = kernels.sort.bind(gpu, &resources);
+        let mut encoder = gpu.device.create_command_encoder(&Default::default());
+        {
+            let mut cp = encoder.begin_compute_pass(&Default::default());
+            cp.set_bind_group(0, &group, &[]);
+            // More workgroups than blocks: the spare ones do nothing.
+            let blocks = n.div_ceil(BLOCK) as u32 + 1;
+            for (pipeline, groups) in kernels.sort.pipelines.iter().zip([blocks, DIGITS as u32, blocks]) {
+                cp.set_pipeline(pipeline);
+                cp.dispatch_workgroups(groups, 1, 1);
+            }
+        }
+        gpu.queue.submit([encoder.finish()]);
+    }
+    let last = passes as usize % 2;
+    gpu.wait().expect("the sort runs");
+    (read(gpu, &keys[last], n), read(gpu, &values[last], n))
+}
+
+#[test]
+fn the_sort_is_the_stable_one() {
+    let Some(gpu) = gpu() else { return };
+    let kernels = Kernels::new(&gpu);
+    let rng = Rng::new(3, "sort", 0);
+    for (n, mask) in [
+        (0, u32::MAX),
+        (1, u32::MAX),
+        (2, 0),
+        (255, 3),
+        (257, u32::MAX),
+        (2048, 0xff),
+        (2049, 0x00ff_ff00),
+        (70_001, 0x3f),
+        (100_000, u32::MAX),
+    ] {
+        let keys: Vec<u32> = (0..n as u64).map(|i| (rng.uniform(i) * 4_294_967_296.0) as u32 & mask).collect();
+        // Values that are not in order, so that sorting by them would be seen.
+        let values: Vec<u32> = (0..n as u32).map(|i| i ^ 0x5555).collect();
+        let mut expected: Vec<(u32, u32)> = keys.iter().copied().zip(values.iter().copied()).collect();
+        expected.sort_by_key(|p| p.0);
+        let (keys, values) = sorted(&gpu, &kernels, &keys, &values, 4);
+        let got: Vec<(u32, u32)> = keys.into_iter().zip(values).collect();
+        assert!(got == expected, "{n} pairs, mask {mask:x}: the order is not that of a stable sort");
+    }
+    // One pass sorts by its eight bits alone.
+    let keys: Vec<u32> = (0..5000u32).map(|i| i.wrapping_mul(2_654_435_761)).collect();
+    let values: Vec<u32> = (0..5000).collect();
+    let mut expected = values.clone();
+    expected.sort_by_key(|&i| keys[i as usize] & 0xff);
+    assert_eq!(sorted(&gpu, &kernels, &keys, &values, 1).1, expected);
+}
+
+#[test]
+fn sums_are_exclusive_and_stop_at_the_top() {
+    let Some(gpu) = gpu() else { return };
+    let kernels = Kernels::new(&gpu);
+    let rng = Rng::new(4, "scan", 0);
+    for (n, top) in [(0, 3.0), (1, 3.0), (2047, 3.0), (2049, 100.0), (70_001, 5.0), (300_001, 1.0), (5000, 4e6)] {
+        let input: Vec<u32> = (0..n as u64).map(|i| (rng.uniform(i) * (top + 1.0)) as u32).collect();
+        let counts = storage(&gpu, &[n as u32, 0, 0]);
+        let arguments = storage(&gpu, &[0u32; 12]);
+        let (scan_in, out) = (storage(&gpu, &input), storage(&gpu, &vec![0u32; n]));
+        let sums = storage(&gpu, &vec![0u32; n.div_ceil(BLOCK)]);
+        let mut uniform = Grown::new("pass", wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST);
+        uniform.ensure(&gpu, 16).expect("a small buffer");
+        gpu.queue.write_buffer(uniform.get(), 0, bytemuck::cast_slice(&[0u32, 2, 6, 1_000_000]));
+        let resources = [&uniform, &counts, &scan_in, &out, &sums, &arguments].map(Grown::all);
+        let group = kernels.scan.bind(&gpu, &resources);
+        let mut encoder = gpu.device.create_command_encoder(&Default::default());
+        {
+            let mut cp = encoder.begin_compute_pass(&Default::default());
+            cp.set_bind_group(0, &group, &[]);
+            let blocks = n.div_ceil(BLOCK) as u32;
+            for (pipeline, groups) in kernels.scan.pipelines.iter().zip([blocks, 1, blocks]) {
+                cp.set_pipeline(pipeline);
+                cp.dispatch_workgroups(groups, 1, 1);
+            }
+        }
+        gpu.queue.submit([encoder.finish()]);
+        let mut sum = 0u32;
+        let mut expected = Vec::new();
+        for v in &input {
+            expected.push(sum);
+            sum = sum.saturating_add(*v);
+        }
+        assert!(read::<u32>(&gpu, &out, n) == expected, "{n} sums");
+        assert_eq!(read::<u32>(&gpu, &counts, 3), [n as u32, 0, sum], "{n}: the total");
+        let things = sum.min(1_000_000);
+        let written = [things.div_ceil(256), 1, 1, things.div_ceil(2048), 1, 1];
+        assert_eq!(read::<u32>(&gpu, &arguments, 12)[6..], written, "{n}: sizes of dispatches");
+    }
+}
+
+/// Least dᵀ conic d over the pixel centres of a tile, in f64.
+fn least_distance(shape: &[f32; 8], tile: [usize; 2], size: [usize; 2]) -> f64 {
+    let mut least = f64::INFINITY;
+    let [a, b, c] = [4, 5, 6].map(|k| f64::from(shape[k]));
+    for y in tile[1] * TILE..((tile[1] + 1) * TILE).min(size[1]) {
+        for x in tile[0] * TILE..((tile[0] + 1) * TILE).min(size[0]) {
+            let (dx, dy) = (x as f64 + 0.5 - f64::from(shape[0]), y as f64 + 0.5 - f64::from(shape[1]));
+            least = least.min(a * dx * dx + 2.0 * b * dx * dy + c * dy * dy);
+        }
+    }
+    least
+}
+
+#[test]
+fn lists_of_tiles_are_complete_and_in_the_cpus_order() {
+    let Some(mut r) = renderer() else { return };
+    // The last has rows twice over: equal depths are told apart by the splats' numbers.
+    let mut twins = Scenery::new(6, 400, 1.0, 0.1);
+    for j in 200..400 {
+        let mean: [f32; 3] = twins.out.read(j - 200, 0);
+        twins.out.write(j, 0, mean);
+    }
+    for (scene, camera) in [
+        (Scenery::new(5, 600, 1.5, 0.05), camera([0.0, 0.5, -4.0], 131, 77)),
+        (Scenery::new(6, 200, 1.0, 0.4), skewed(331, 90)),
+        (twins, skewed(97, 145)),
+    ] {
+        drawn(&mut r, &scene.splats(), &camera);
+        let n = scene.out.rows();
+        let (across, down) = (camera.width.div_ceil(TILE), camera.height.div_ceil(TILE));
+        let shapes: Vec<[f32; 8]> = read(&r.gpu, &r.buffers.shapes, n);
+        let colors: Vec<[f32; 4]> = read(&r.gpu, &r.buffers.colors, n);
+        let marks: Vec<u32> = read(&r.gpu, &r.buffers.marks, n);
+        let ranges: Vec<[u32; 2]> = read(&r.gpu, &r.buffers.ranges, across * down);
+        let last = frame::tile_passes(across * down) % 2;
+        let values: Vec<u32> = read(&r.gpu, &r.buffers.pair_values[last], r.stats().pairs);
+        assert_eq!(ranges.iter().map(|[a, b]| (b - a) as usize).sum::<usize>(), values.len(), "every pair has a tile");
+        let mut spare = 0;
+        for (tile, [first, end]) in ranges.iter().enumerate() {
+            let list = &values[*first as usize..*end as usize];
+            let key = |&s: &u32| (colors[s as usize][3].to_bits(), s);
+            assert!(list.windows(2).all(|p| key(&p[0]) < key(&p[1])), "tile {tile} is not in order");
+            let place = [tile % across, tile / across];
+            for j in 0..n {
+                let (listed, visible) = (list.contains(&(j as u32)), marks[j] == 1);
+                assert!(visible || !listed, "splat {j} is not visible, but listed");
+                if !visible {
+                    continue;
+                }
+                let tau = 2.0 * (f64::from(shapes[j][7]) / r.config.alpha_min).ln();
+                let distance = least_distance(&shapes[j], place, [camera.width, camera.height]);
+                assert!(listed || distance > tau, "tile {tile} lacks splat {j}: {distance} of {tau}");
+                // The span of a row of tiles is exact for lines; pixel centres are fewer, so a little is spare.
+                spare += usize::from(listed && distance > tau + TAU * tau.max(1.0));
+            }
+        }
+        assert!(spare * 5 < values.len(), "{spare} of {} pairs touch no pixel", values.len());
+    }
+}

@@ -1,0 +1,199 @@
+//! A scene's tables on the GPU, just as they lie in memory: `[row / 16][column][16]`.
+//!
+//! Tables of colours may be larger than a binding: they are cut by rows, and each cut is projected and coloured by a
+//! dispatch of its own.
+
+use super::Tables;
+use super::buffers::{Grown, largest_binding};
+use super::device::Gpu;
+use crate::scene::splats::{Part, Rows, SPLAT_OPACITY};
+use crate::scene::{BLOCK, Color, Splats, Table};
+use crate::{Error, ErrorKind, Result};
+
+/// Bits of [`Piece::flags`], as in splats.wgsl.
+const DIRECT: u32 = 1;
+const IDS: u32 = 2;
+const WEIGHTS: u32 = 4;
+
+/// The uniform of splats.wgsl.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, bytemuck::Pod, bytemuck::Zeroable)]
+pub(super) struct Piece {
+    first_row: u32,
+    /// Rows of this dispatch.
+    pub rows: u32,
+    first_splat: u32,
+    width: u32,
+    blocks: u32,
+    flags: u32,
+    first_id: u32,
+    spare: u32,
+}
+
+/// One dispatch: its uniform, and which buffers it reads.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Draw {
+    /// The uniform.
+    pub piece: Piece,
+    /// Number of the part.
+    pub part: usize,
+    /// Number of the cut of its table of colours.
+    pub cut: usize,
+}
+
+/// The buffers of one part.
+#[derive(Debug)]
+pub(super) struct PartBuffers {
+    /// Mean, covariance, opacity.
+    pub geometry: Grown,
+    /// Cuts of the table of colours.
+    pub tables: Vec<Grown>,
+    /// Rows of that table.
+    pub ids: Grown,
+    /// Weights of its blocks.
+    pub weights: Grown,
+    /// Address and length of the table that was sent last.
+    sent: Option<(usize, usize)>,
+}
+
+impl PartBuffers {
+    fn new() -> Self {
+        Self {
+            geometry: Grown::storage("a layer's Gaussians"),
+            tables: Vec::new(),
+            ids: Grown::storage("a layer's active rows"),
+            weights: Grown::storage("a layer's weights of colours"),
+            sent: None,
+        }
+    }
+}
+
+/// The tables of all parts.
+#[derive(Debug, Default)]
+pub(super) struct Upload {
+    /// One a part of the largest scene so far.
+    pub parts: Vec<PartBuffers>,
+    /// Dispatches of the last scene.
+    pub draws: Vec<Draw>,
+}
+
+/// Writes `data` into `buffer`, which grows if it must.
+fn send<T: bytemuck::NoUninit>(gpu: &Gpu, buffer: &mut Grown, data: &[T]) -> Result<()> {
+    buffer.ensure(gpu, size_of_val(data) as u64)?;
+    if !data.is_empty() {
+        gpu.queue.write_buffer(buffer.get(), 0, bytemuck::cast_slice(data));
+    }
+    Ok(())
+}
+
+impl Upload {
+    /// Sends what changed, and lists the dispatches.
+    pub fn send(&mut self, gpu: &Gpu, splats: &Splats<'_, f32>, tables: Tables) -> Result<()> {
+        self.draws.clear();
+        if u32::try_from(splats.len()).is_err() {
+            return Err(Error::new(ErrorKind::Unsupported, "the GPU counts Gaussians in 32 bits"));
+        }
+        while self.parts.len() < splats.parts.len() {
+            self.parts.push(PartBuffers::new());
+        }
+        let mut first_splat = 0;
+        for (i, part) in splats.parts.iter().enumerate() {
+            let n = part.out.rows();
+            if n > 0 {
+                assert_eq!(part.out.width(), SPLAT_OPACITY + 1, "a part has mean, covariance and opacity");
+                self.send_part(gpu, i, part, first_splat, tables)?;
+            }
+            first_splat += n;
+        }
+        Ok(())
+    }
+
+    fn send_part(
+        &mut self,
+        gpu: &Gpu,
+        i: usize,
+        part: &Part<'_, f32>,
+        first_splat: usize,
+        tables: Tables,
+    ) -> Result<()> {
+        let n = part.out.rows();
+        let own = &mut self.parts[i];
+        send(gpu, &mut own.geometry, part.out.data())?;
+        let (table, rows, weights, mut flags, base) = match &part.color {
+            Color::Direct { table } => (*table, Rows::All, None, DIRECT, false),
+            Color::Sh { table, rows, weights, base } => (*table, *rows, *weights, 0, *base),
+        };
+        let blocks = weights.map_or(1, Table::width).max(1);
+        assert!(
+            flags == DIRECT || table.width().is_multiple_of(3 * blocks),
+            "an SH table has 3·K·blocks columns, not {}/{blocks}",
+            table.width()
+        );
+        own.ids.ensure(gpu, 0)?;
+        if let Rows::Some(ids) = rows {
+            send(gpu, &mut own.ids, ids)?;
+            flags |= IDS;
+        }
+        own.weights.ensure(gpu, 0)?;
+        if let Some(weights) = weights {
+            send(gpu, &mut own.weights, weights.data())?;
+            flags |= WEIGHTS;
+        }
+        // Whole blocks of as many rows as one binding holds.
+        let block_bytes = (table.width().max(1) * BLOCK * size_of::<f32>()) as u64;
+        let blocks_a_cut = (largest_binding(gpu) / block_bytes) as usize;
+        if blocks_a_cut == 0 {
+            return Err(Error::new(
+                ErrorKind::Unsupported,
+                format!("{} columns of colours are too many", table.width()),
+            )
+            .remedy("Render on the CPU."));
+        }
+        let cut_rows = blocks_a_cut * BLOCK;
+        let cuts = table.rows().div_ceil(cut_rows).max(1);
+        let name = (table.data().as_ptr() as usize, table.data().len());
+        let known = base && tables == Tables::Constant && own.sent == Some(name);
+        own.sent = None;
+        let mut from = 0;
+        for cut in 0..cuts {
+            if own.tables.len() <= cut {
+                own.tables.push(Grown::storage("a layer's colours"));
+            }
+            if !known {
+                let numbers = cut_rows * table.width();
+                let data = table.data().chunks(numbers.max(1)).nth(cut).unwrap_or_default();
+                send(gpu, &mut own.tables[cut], data)?;
+            }
+            let first_id = cut * cut_rows;
+            let to = match rows {
+                Rows::All => n.min(first_id + cut_rows),
+                Rows::Some(ids) => ids.partition_point(|&id| (id as usize) < first_id + cut_rows),
+            };
+            if to > from {
+                let piece = Piece {
+                    first_row: from as u32,
+                    rows: (to - from) as u32,
+                    first_splat: (first_splat + from) as u32,
+                    width: table.width() as u32,
+                    blocks: blocks as u32,
+                    flags,
+                    first_id: first_id as u32,
+                    spare: 0,
+                };
+                self.draws.push(Draw { piece, part: i, cut });
+            }
+            from = to.max(from);
+        }
+        assert_eq!(from, n, "every splat has a row of colours");
+        own.sent = Some(name);
+        Ok(())
+    }
+
+    /// Bytes held.
+    pub fn bytes(&self) -> u64 {
+        let part = |p: &PartBuffers| {
+            p.geometry.bytes() + p.ids.bytes() + p.weights.bytes() + p.tables.iter().map(Grown::bytes).sum::<u64>()
+        };
+        self.parts.iter().map(part).sum()
+    }
+}

@@ -1,0 +1,71 @@
+//! The shaders as text, shared by the native renderer (feature `gpu`) and the browser's player.
+//!
+//! No feature and no dependency: whoever needs a shader puts the files it names one after the other. Each file's header
+//! names its twin in Rust, its buffers and what a thread owns.
+
+/// `struct View`, `Cov`, `Ellipse`; `covariance`, `project`: twin of `render::project`. No bindings.
+pub const PROJECT: &str = include_str!("render/project.wgsl");
+/// `sh_basis`: twin of `math::sh::basis`. No bindings.
+pub const SHADE: &str = include_str!("render/shade.wgsl");
+/// One stable pass of a radix sort over (key, value) pairs: `histogram`, `scan`, `scatter`. Bindings in its header.
+pub const SORT: &str = include_str!("gpu/sort.wgsl");
+/// A row of a scene's tables → shape, colour, mark. After [`PROJECT`] and [`SHADE`].
+pub const SPLATS: &str = include_str!("gpu/splats.wgsl");
+/// Exclusive sums, and the sizes of later dispatches.
+pub const SCAN: &str = include_str!("gpu/scan.wgsl");
+/// Visible splats as (depth, number) pairs.
+pub const COMPACT: &str = include_str!("gpu/compact.wgsl");
+/// (tile, splat) pairs: `count`, `emit`. After [`PROJECT`].
+pub const TILES: &str = include_str!("gpu/tiles.wgsl");
+/// Where each tile's list begins and ends.
+pub const RANGES: &str = include_str!("gpu/ranges.wgsl");
+/// Blends to colour, alpha and depth. After [`PROJECT`].
+pub const RASTERIZE: &str = include_str!("gpu/rasterize.wgsl");
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use naga::valid::{Capabilities, ValidationFlags, Validator};
+
+    /// WebGPU's default limits that shaders can break.
+    const STORAGE_BUFFERS: usize = 8;
+    const WORKGROUP_BYTES: u32 = 16 << 10;
+    const INVOCATIONS: u32 = 256;
+
+    #[test]
+    fn every_shader_is_valid_within_webgpus_default_limits() {
+        let shaders: [(&str, &[&str]); 8] = [
+            ("project and shade", &[PROJECT, SHADE]),
+            ("sort", &[SORT]),
+            ("splats", &[PROJECT, SHADE, SPLATS]),
+            ("scan", &[SCAN]),
+            ("compact", &[COMPACT]),
+            ("tiles", &[PROJECT, TILES]),
+            ("ranges", &[RANGES]),
+            ("rasterize", &[PROJECT, RASTERIZE]),
+        ];
+        for (name, files) in shaders {
+            let text = files.join("\n");
+            let module =
+                naga::front::wgsl::parse_str(&text).unwrap_or_else(|e| panic!("{name}: {}", e.emit_to_string(&text)));
+            Validator::new(ValidationFlags::all(), Capabilities::empty())
+                .validate(&module)
+                .unwrap_or_else(|e| panic!("{name}: {}", e.emit_to_string(&text)));
+            let mut layouter = naga::proc::Layouter::default();
+            layouter.update(module.to_ctx()).expect("a valid module has a layout");
+            let (mut buffers, mut shared) = (0, 0);
+            for (_, variable) in module.global_variables.iter() {
+                match variable.space {
+                    naga::AddressSpace::Storage { .. } => buffers += 1,
+                    naga::AddressSpace::WorkGroup => shared += layouter[variable.ty].size,
+                    _ => (),
+                }
+            }
+            assert!(buffers <= STORAGE_BUFFERS, "{name} binds {buffers} storage buffers");
+            assert!(shared <= WORKGROUP_BYTES, "{name} shares {shared} bytes");
+            for entry in &module.entry_points {
+                assert!(entry.workgroup_size.iter().product::<u32>() <= INVOCATIONS, "{name}: {}", entry.name);
+            }
+        }
+    }
+}
