@@ -4,8 +4,10 @@ use crate::layers::Layer;
 use crate::scene::life::{CENTER, LOG_SOFTNESS, LOG_WIDTH};
 use crate::scene::{LIFE, LifeKind, Table};
 
-/// A half-width above this is for ever, seconds: three years, as intervals that stand for it have thirty.
+/// A half-width or softness above this is for ever, seconds: three years, as intervals that stand for it have thirty.
 const FOR_EVER: f64 = 1e8;
+/// A softness below this is an edge, seconds.
+const SHARP: f64 = 1e-9;
 
 /// σ(t) = exp(−½(max(0, |t − centre| − half)/softness)²); 1 for ever where `half` is infinite.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -53,7 +55,11 @@ impl<'a> Lives<'a> {
     /// The envelope of row `id`.
     pub(super) fn envelope(&self, id: usize) -> Envelope {
         let own = self.row(id);
-        if own.half > FOR_EVER { Envelope::forever(own.center) } else { own }
+        if own.half > FOR_EVER || own.softness > FOR_EVER {
+            return Envelope::forever(own.center);
+        }
+        // Written so that NaN stays NaN, which is then left out.
+        Envelope { softness: if own.softness < SHARP { SHARP } else { own.softness }, ..own }
     }
 
     /// Whether lives have centres.

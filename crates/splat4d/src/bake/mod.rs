@@ -189,7 +189,7 @@ impl Tally {
     /// Adds all pieces of one Gaussian.
     fn add(&mut self, pieces: impl IntoIterator<Item = Piece>) -> Result<()> {
         let (mut count, mut error) = (0, 0.0f64);
-        for piece in pieces {
+        for piece in pieces.into_iter().filter(|p| is_sound(&p.primitive)) {
             (count, error) = (count + 1, error.max(piece.error));
             self.spans.entry(piece.span).or_default().push(piece.primitive);
         }
@@ -202,6 +202,13 @@ impl Tally {
         self.primitives += count;
         bounded(self.primitives)
     }
+}
+
+/// Whether every number fits into the file's f32.
+fn is_sound(p: &Primitive) -> bool {
+    let wide = p.mean.iter().chain([&p.center, &p.softness]).all(|x| (*x as f32).is_finite());
+    let shape = p.quat.iter().chain(&p.scales).chain(&p.velocity).chain(&p.turn);
+    wide && !p.half_width.is_nan() && shape.chain(&p.base_color).chain(&p.sh_rest).all(|x| x.is_finite())
 }
 
 fn bounded(primitives: usize) -> Result<()> {

@@ -5,6 +5,7 @@ use super::*;
 use crate::format::playback::{Draft, Meta, WriteConfig, read, write};
 use crate::layers::{ALPHA_MIN, ALWAYS, Instant};
 use crate::math::{Rng, Se3};
+use crate::motion::spacetime::VELOCITIES;
 use crate::motion::still::activate;
 use crate::motion::{At, Cache, Motion, SpacetimeSpec, Spec, Tape, build, fill_rows};
 use crate::render::RenderConfig;
@@ -285,6 +286,12 @@ fn odd_scenes_bake_or_are_refused() {
         sick.params[LIFE].set(6, 0, f32::NAN);
         sick.params[LIFE].set(7, 1, f32::NAN);
         sick.params[SH].set(8, 2, f32::NAN);
+        // Not sick, but odd: a life without end, one without length, and a leap out of all numbers.
+        sick.params[LIFE].set(9, 1, 300.0);
+        sick.params[LIFE].set(10, 1, -300.0);
+        let velocities = sick.params.find(VELOCITIES).unwrap();
+        sick.params[velocities].set(11, 0, 3e38);
+        sick.params[LIFE].set(11, 0, -9.0);
         let well = baked(&scene(vec![sick], 1.0), &options(0.25));
         assert!(well.report.unseen >= 6 && well.report.primitives >= 15, "{:?}", well.report);
         for p in well.nodes.iter().flat_map(|n| &n.primitives) {
