@@ -98,9 +98,12 @@ function compare(a, b, kind) {
     return v.map((x) => x / norm);
   };
   for (let i = 0; i < p.count; i++) {
-    const [u, v] = [unit(p, i), unit(q, i)];
-    const sign = u.reduce((s, x, k) => s + x * v[k], 0) < 0 ? -1 : 1;
-    note('turn', 4 * Math.asin(Math.min(1, Math.hypot(...u.map((x, k) => x - sign * v[k])) / 2)));
+    // A Gaussian looks the same after half a turn about one of its own axes: programs that flip axes make those.
+    const [u, [w, x, y, z]] = [unit(p, i), unit(q, i)];
+    const twins = [[w, x, y, z], [-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]];
+    const apart = (v, sign) => Math.hypot(...u.map((a, k) => a - sign * v[k]));
+    const nearest = Math.min(...twins.flatMap((v) => [apart(v, 1), apart(v, -1)]));
+    note('turn', 4 * Math.asin(Math.min(1, nearest / 2)));
     note('opacity', Math.abs(sigmoid(p.column('opacity')(i)) - sigmoid(q.column('opacity')(i))));
   }
   worst.mean /= size || 1;

@@ -8,7 +8,7 @@ use crate::sequence::{self, Pattern};
 use crate::source::{Source, not_empty};
 use serde_json::json;
 use splat4d::format::{self, Dialect, Warnings, dialect, ply, spz};
-use splat4d::layers::{Scene, rotation_between};
+use splat4d::layers::{ALWAYS, Scene, rotation_between};
 use splat4d::math::Se3;
 use splat4d::motion::Spec;
 use splat4d::scene::time::DEFAULT_FPS;
@@ -329,7 +329,7 @@ fn turned(camera: Camera, r: &[[f64; 3]; 3]) -> Camera {
 }
 
 fn is_moving(scene: &Scene<f32>) -> bool {
-    scene.layers.iter().any(|l| l.motion.spec() != Spec::Still || l.life != LifeKind::Infinite)
+    scene.layers.iter().any(|l| l.motion.spec() != Spec::Still || l.life != LifeKind::Infinite || l.span != ALWAYS)
 }
 
 /// A scene that stands still as `scene` does at `time`.
