@@ -1,5 +1,5 @@
-//! Anything that holds a scene: a run folder, a scene file (`.safetensors`, checkpoints too), a playback file (`.splat4d`), a file or
-//! folder of another program's Gaussians, or a sequence of such files.
+//! Anything that holds a scene: a run folder, a scene file (`.safetensors`, checkpoints too), a playback file
+//! (`.splat4d`), a file or folder of another program's Gaussians, or a sequence of such files.
 
 use crate::files::cannot_read;
 use crate::paths::{Stage, View};

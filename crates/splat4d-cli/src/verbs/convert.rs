@@ -33,8 +33,8 @@ Examples:
   splat4d convert runs/knight 'frames/f_%04d.spz' --frames
   splat4d convert frames/ all.safetensors --fps 25    numbered files become one moving scene
 
-Written: .splat4d .ply .compressed.ply .stg.ply .spz .splat .splatv .safetensors; read besides: SOG version 2 (.sog or folder).
-docs/formats.md tells what each can hold and which axes it assumes.";
+Written: .splat4d .ply .compressed.ply .stg.ply .spz .splat .splatv .safetensors.
+Read as well: SOG version 2 (.sog or a folder). docs/formats.md tells what each can hold and which axes it assumes.";
 
 /// Convert between Gaussian file formats, and say what is lost
 #[derive(Debug, clap::Args)]
@@ -68,7 +68,8 @@ pub(crate) struct Args {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(0..=3))]
     sh: Option<u8>,
     /// Version of .spz to write
-    #[arg(long, value_name = "V", default_value_t = spz::DEFAULT_VERSION, value_parser = clap::value_parser!(u32).range(2..=4))]
+    #[arg(long, value_name = "V", default_value_t = spz::DEFAULT_VERSION,
+          value_parser = clap::value_parser!(u32).range(2..=4))]
     spz_version: u32,
 }
 
