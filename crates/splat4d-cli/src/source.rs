@@ -1,5 +1,5 @@
-//! Anything that holds a scene: a run folder, a scene file (`.safetensors`, checkpoints too), a playback file (`.splat4d`), a file or
-//! folder of another program's Gaussians, or a sequence of such files.
+//! Anything that holds a scene: a run folder, a scene file (`.safetensors`, checkpoints too), a playback file
+//! (`.splat4d`), a file or folder of another program's Gaussians, or a sequence of such files.
 
 use crate::files::cannot_read;
 use crate::paths::{Stage, View};
@@ -11,7 +11,7 @@ use splat4d::format::{Dialect, Warnings, dialect, sog};
 use splat4d::layers::Scene;
 use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::scene::{Camera, GEOMETRY};
-use splat4d::{Error, Result, format};
+use splat4d::{Error, ErrorKind, Result, format};
 use std::borrow::Cow;
 use std::path::Path;
 
@@ -21,6 +21,11 @@ const OUTLIERS: f64 = 0.1;
 /// What can be opened, for errors.
 const REMEDY: &str =
     "Give a run folder, a scene.safetensors, a checkpoint, a .splat4d, or a .ply, .spz, .splat, .splatv or SOG file.";
+
+/// Marks a folder of SOG scenes, one for each level of detail.
+const SOG_LEVELS: &str = "lod-meta.json";
+/// Endings of formats that people hold and we do not read.
+const UNREAD: [&str; 5] = ["ksplat", "glb", "gltf", "4dgs", "usdz"];
 
 /// A scene and where it came from.
 pub(crate) struct Source {
@@ -72,6 +77,10 @@ impl Source {
                 warnings: o.warnings,
                 ..Self::own(o.scene)
             }),
+            None if path.extension().is_some_and(|e| UNREAD.iter().any(|u| e.eq_ignore_ascii_case(u))) => {
+                Err(Error::new(ErrorKind::Unsupported, "this format is not read")
+                    .remedy("Convert it to .ply first, for instance with splat-transform."))
+            }
             None => format::scene::read(&bytes).map(Self::own).map_err(|e| e.remedy(REMEDY)),
         };
         opened.map_err(|e| e.at(path.display()))
@@ -137,6 +146,11 @@ fn open_sog(folder: &Path) -> Result<Source> {
 
 /// Files of one frame each.
 fn open_sequence(path: &Path, fps: f64) -> Result<Source> {
+    if path.join(SOG_LEVELS).is_file() {
+        return Err(Error::input("holds a scene in several levels of detail")
+            .at(path.display())
+            .remedy(format!("Give the folder of one level, for instance {}.", path.join("0_0").display())));
+    }
     let files = sequence::frames(path)?;
     let (mut frames, mut kind, mut warnings) = (Vec::with_capacity(files.len()), None, Warnings::default());
     for file in &files {

@@ -8,7 +8,7 @@ use crate::sequence::{self, Pattern};
 use crate::source::{Source, not_empty};
 use serde_json::json;
 use splat4d::format::{self, Dialect, Warnings, dialect, ply, spz};
-use splat4d::layers::{Scene, rotation_between};
+use splat4d::layers::{ALWAYS, Scene, rotation_between};
 use splat4d::math::Se3;
 use splat4d::motion::Spec;
 use splat4d::scene::time::DEFAULT_FPS;
@@ -33,8 +33,8 @@ Examples:
   splat4d convert runs/knight 'frames/f_%04d.spz' --frames
   splat4d convert frames/ all.safetensors --fps 25    numbered files become one moving scene
 
-Written: .splat4d .ply .compressed.ply .stg.ply .spz .splat .splatv .safetensors; read besides: SOG version 2 (.sog or folder).
-docs/formats.md tells what each can hold and which axes it assumes.";
+Written: .splat4d .ply .compressed.ply .stg.ply .spz .splat .splatv .safetensors.
+Read as well: SOG version 2 (.sog or a folder). docs/formats.md tells what each can hold and which axes it assumes.";
 
 /// Convert between Gaussian file formats, and say what is lost
 #[derive(Debug, clap::Args)]
@@ -68,7 +68,8 @@ pub(crate) struct Args {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(0..=3))]
     sh: Option<u8>,
     /// Version of .spz to write
-    #[arg(long, value_name = "V", default_value_t = spz::DEFAULT_VERSION, value_parser = clap::value_parser!(u32).range(2..=4))]
+    #[arg(long, value_name = "V", default_value_t = spz::DEFAULT_VERSION,
+          value_parser = clap::value_parser!(u32).range(2..=4))]
     spz_version: u32,
 }
 
@@ -329,7 +330,7 @@ fn turned(camera: Camera, r: &[[f64; 3]; 3]) -> Camera {
 }
 
 fn is_moving(scene: &Scene<f32>) -> bool {
-    scene.layers.iter().any(|l| l.motion.spec() != Spec::Still || l.life != LifeKind::Infinite)
+    scene.layers.iter().any(|l| l.motion.spec() != Spec::Still || l.life != LifeKind::Infinite || l.span != ALWAYS)
 }
 
 /// A scene that stands still as `scene` does at `time`.

@@ -98,6 +98,9 @@ pub(super) fn rows(scene: &Scene<f32>, clock: Clock, name: &str, warnings: &mut 
         if layer.life == LifeKind::Interval {
             return Err(cannot_hold(layer, name, "lives of the kind `interval`, which have a flat top"));
         }
+        if layer.span != ALWAYS {
+            return Err(cannot_hold(layer, name, "a span of time outside of which it is not drawn"));
+        }
         let find = |name| layer.params.find(name);
         let (path, rates) = (find(VELOCITIES), find(ROTATION_RATES));
         shaded += if layer.params[SH].width() > 3 { layer.params.len() } else { 0 };
@@ -265,5 +268,9 @@ pub(super) mod tests {
         let scene = moving(5, LifeKind::Interval, 1, false);
         let message = rows(&scene, clock, ".splatv", &mut Warnings::default()).unwrap_err().to_string();
         assert!(message.contains("`flying`") && message.contains("interval") && message.contains("--frames"));
+        let mut scene = moving(5, LifeKind::Infinite, 1, false);
+        scene.layers[0].span = [2.0, 3.0];
+        let message = rows(&scene, clock, ".splatv", &mut Warnings::default()).unwrap_err().to_string();
+        assert!(message.contains("span"), "{message}");
     }
 }

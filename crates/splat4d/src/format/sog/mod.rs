@@ -141,7 +141,7 @@ struct Rest {
 impl Rest {
     fn open(meta: &Value, centroids: Picture, labels: Picture) -> Result<Self> {
         let coefficients = centroids.width / ROW_OF_CENTROIDS;
-        if ![3, 8, 15].contains(&coefficients) || centroids.width % ROW_OF_CENTROIDS != 0 {
+        if ![3, 8, 15].contains(&coefficients) || !centroids.width.is_multiple_of(ROW_OF_CENTROIDS) {
             return Err(damaged(format!("its shN centroids are {} pixels wide, not 192, 512 or 960", centroids.width)));
         }
         let rows = centroids.height * ROW_OF_CENTROIDS;

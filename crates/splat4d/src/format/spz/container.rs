@@ -188,7 +188,7 @@ pub(super) fn close(header: &Header, streams: &Streams<'_>) -> Vec<u8> {
     if header.version < 4 {
         out.push(0);
         streams.iter().for_each(|s| out.extend_from_slice(s));
-        let mut zip = GzEncoder::new(Vec::new(), Compression::best());
+        let mut zip = GzEncoder::new(Vec::new(), Compression::default());
         zip.write_all(&out).expect("memory takes all bytes");
         return zip.finish().expect("memory takes all bytes");
     }
