@@ -9,7 +9,10 @@ use std::path::{Path, PathBuf};
 const ORDER: [(&str, &[&str]); 3] = [
     (
         "crates/splat4d",
-        &["error", "math", "gpu", "scene", "nn", "motion", "layers", "render", "flow", "format", "play", "edit"],
+        &[
+            "error", "wgsl", "math", "scene", "nn", "motion", "layers", "render", "gpu", "flow", "format", "play",
+            "edit",
+        ],
     ),
     (
         "crates/splat4d-train",
@@ -28,6 +31,7 @@ const ORDER: [(&str, &[&str]); 3] = [
             "camera_file",
             "console",
             "video",
+            "device",
             "draw",
             "freeze",
             "paths",

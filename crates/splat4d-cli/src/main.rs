@@ -4,6 +4,7 @@
 
 mod camera_file;
 mod console;
+mod device;
 mod draw;
 mod files;
 mod finish;
