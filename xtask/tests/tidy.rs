@@ -10,7 +10,7 @@ const ORDER: [(&str, &[&str]); 4] = [
     (
         "crates/splat4d",
         &[
-            "error", "math", "gpu", "scene", "nn", "motion", "layers", "render", "flow", "format", "bake", "play",
+            "error", "wgsl", "math", "scene", "nn", "motion", "layers", "render", "gpu", "flow", "format", "bake", "play",
             "edit",
         ],
     ),
@@ -35,6 +35,7 @@ const ORDER: [(&str, &[&str]); 4] = [
             "camera_file",
             "console",
             "video",
+            "device",
             "draw",
             "freeze",
             "paths",

@@ -1,8 +1,10 @@
 //! The seam to the renderer: a scene, a camera and a time become a picture for people.
 
+use crate::console::Console;
+use crate::device::{Brush, Device};
 use crate::video::Rgb;
 use splat4d::layers::{Instant, Scene};
-use splat4d::render::{Antialias, Image, RenderConfig, Renderer};
+use splat4d::render::{Antialias, Image, RenderConfig};
 use splat4d::scene::{Camera, Planes, Time};
 
 /// What is shown.
@@ -28,11 +30,12 @@ const DEPTH_COLORS: [[f32; 3]; 6] = [
     [252.0, 245.0, 186.0],
 ];
 
-/// Draws; memory is reused from picture to picture.
+/// Draws, on the CPU unless told; memory is reused from picture to picture.
 pub(crate) struct Painter<'a> {
     scene: &'a Scene<f32>,
     background: [f32; 3],
-    renderer: Renderer<f32>,
+    config: RenderConfig,
+    brush: Brush<'a>,
     instant: Instant<f32>,
     /// The last picture.
     pub image: Image<f32>,
@@ -42,20 +45,26 @@ impl<'a> Painter<'a> {
     pub(crate) fn new(scene: &'a Scene<f32>, background: [f32; 3], antialias: bool) -> Self {
         let antialias = if antialias { Antialias::On } else { Antialias::Off };
         let config = RenderConfig { antialias, ..RenderConfig::default() };
-        Self {
-            scene,
-            background,
-            renderer: Renderer::new(config),
-            instant: Instant::default(),
-            image: Image::default(),
-        }
+        let (instant, image) = (Instant::default(), Image::default());
+        Self { scene, background, config, brush: Brush::cpu(config), instant, image }
+    }
+
+    /// The same on another device.
+    pub(crate) fn on(mut self, device: Device, console: &'a Console) -> Self {
+        self.brush = Brush::open(device, self.config, console);
+        self
+    }
+
+    /// What draws, in words.
+    pub(crate) fn device(&self) -> String {
+        self.brush.name()
     }
 
     /// Draws into [`image`](Self::image).
     pub(crate) fn draw(&mut self, camera: &Camera, time: f64) {
         self.scene.at(Time(time), &mut self.instant);
         let splats = self.scene.splats(&self.instant);
-        self.renderer.render(&splats, camera, self.background, None, &mut self.image);
+        self.brush.draw(&splats, camera, self.background, &mut self.image);
     }
 
     /// The last picture in 8 bits. `range`: nearest and farthest depth of the depth colours.

@@ -5,6 +5,7 @@
 mod baking;
 mod camera_file;
 mod console;
+mod device;
 mod draw;
 mod files;
 mod finish;

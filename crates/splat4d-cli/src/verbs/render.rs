@@ -1,6 +1,7 @@
 //! `render`: pictures and films of a run, a scene file or a plain 3DGS .ply.
 
 use crate::console::Console;
+use crate::device::Device;
 use crate::draw::{Channel, Painter};
 use crate::paths::{self, Clock, Route, parse_size, shots};
 use crate::source::{Source, not_empty};
@@ -10,6 +11,7 @@ use splat4d::scene::Planes;
 use splat4d::{Error, format};
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
 /// Frames a second of films unless told.
 const FPS: f64 = 30.0;
@@ -27,6 +29,7 @@ Examples:
   splat4d render runs/knight --path test -o views/         held-out views as numbered PNGs
   splat4d render runs/knight --channel depth --from 0.2 --to 0.8 -o depth.mp4
   splat4d render scene.ply --camera cam.json -o view.png --raw view
+  splat4d render runs/knight --device gpu -v               on the GPU, or say why not; prints frames/s
 
 The output's ending decides: .mp4 (needs ffmpeg), .png (animated if it has several frames), no ending: a folder of
 PNGs. A key frame file is
@@ -83,6 +86,10 @@ pub(crate) struct Args {
     #[arg(long, value_name = "P", requires = "camera", help_heading = "Picture")]
     raw: Option<PathBuf>,
 
+    /// What draws
+    #[arg(long, value_enum, default_value = "auto")]
+    device: Device,
+
     #[arg(short = 'm', long = "model-path", alias = "model_path", hide = true, conflicts_with = "source")]
     model: Option<PathBuf>,
 }
@@ -110,7 +117,8 @@ fn one(args: &Args, path: &Path, camera: &Path, console: &Console) -> anyhow::Re
             .into());
     }
     let source = Source::open(path)?;
-    let mut painter = Painter::new(&source.scene, args.background.unwrap_or(background), antialias(&source));
+    let mut painter =
+        Painter::new(&source.scene, args.background.unwrap_or(background), antialias(&source)).on(args.device, console);
     painter.draw(&camera, args.freeze.unwrap_or(source.scene.clip[0]));
     if let Some(out) = &args.output {
         let range = painter.depth_range().unwrap_or(NO_DEPTH);
@@ -185,7 +193,8 @@ fn film(args: &Args, path: &Path, console: &Console) -> anyhow::Result<()> {
         .remedy("Add --size, or write a folder of pictures (-o FOLDER).")
         .into());
     }
-    let mut painter = Painter::new(scene, args.background.unwrap_or(scene.background), antialias(&source));
+    let mut painter =
+        Painter::new(scene, args.background.unwrap_or(scene.background), antialias(&source)).on(args.device, console);
     let range = if args.channel == Channel::Depth { depth_range(&mut painter, &shots) } else { NO_DEPTH };
     if args.output.is_none()
         && let Some(folder) = output.parent().filter(|p| !p.as_os_str().is_empty())
@@ -193,14 +202,24 @@ fn film(args: &Args, path: &Path, console: &Console) -> anyhow::Result<()> {
         files::make_folder(folder)?;
     }
     let mut film = Film::create(&output, size, clock.fps, shots.len())?;
+    let mut drawing = Duration::ZERO;
     for (i, shot) in shots.iter().enumerate() {
+        let start = Instant::now();
         painter.draw(&shot.camera, shot.time);
+        drawing += start.elapsed();
         film.frame(&painter.rgb(args.channel, range))?;
         console.phase("rendering", i + 1, shots.len());
     }
     film.finish()?;
     console.clear();
-    console.detail(&format!("{} frames of {}x{}", shots.len(), size[0], size[1]));
+    console.detail(&format!(
+        "{} frames of {}x{}, drawn on {} at {:.1} frames/s, coding apart",
+        shots.len(),
+        size[0],
+        size[1],
+        painter.device(),
+        shots.len() as f64 / drawing.as_secs_f64().max(f64::MIN_POSITIVE)
+    ));
     console.written(&output);
     Ok(())
 }
