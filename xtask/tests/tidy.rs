@@ -39,6 +39,7 @@ const ORDER: [(&str, &[&str]); 4] = [
             "freeze",
             "paths",
             "run_folder",
+            "sequence",
             "source",
             "baking",
             "playable",
@@ -80,7 +81,7 @@ const SHELLS: [&str; 2] = ["crates/splat4d-cli/", "xtask/"];
 const PATH_WORDS: [&str; 3] = ["std::fs", "std::path", "File::open"];
 
 /// Documents whose paths and flags are checked.
-const DOCS: [&str; 8] = [
+const DOCS: [&str; 9] = [
     "README.md",
     "ARCHITECTURE.md",
     "CONVENTIONS.md",
@@ -88,6 +89,7 @@ const DOCS: [&str; 8] = [
     "docs/benchmarks.md",
     "docs/bundled-capture.md",
     "docs/capture-format.md",
+    "docs/formats.md",
     "docs/recipe.md",
 ];
 

@@ -14,6 +14,7 @@ mod paths;
 mod playable;
 mod report;
 mod run_folder;
+mod sequence;
 mod serving;
 mod source;
 mod verbs;
@@ -40,6 +41,7 @@ Examples:
   splat4d view runs/knight                 play it in the browser
   splat4d export runs/knight -o now.ply --time 0.5
   splat4d export runs/knight --html -o knight.html
+  splat4d convert scene.sog scene.spz      between the formats of other programs
   splat4d info my-take                     what is in a capture, run or file; is it healthy?
 
 Exit codes: 0 done, 1 failed or interrupted, 2 bad input.";
@@ -79,6 +81,7 @@ enum Verb {
     Bake(verbs::bake::Args),
     Export(verbs::export::Args),
     View(verbs::view::Args),
+    Convert(verbs::convert::Args),
     Info(verbs::info::Args),
     Completions(verbs::completions::Args),
 }
@@ -104,6 +107,7 @@ fn main() -> ExitCode {
         Verb::Bake(args) => verbs::bake::run(&args, &console),
         Verb::Export(args) => verbs::export::run(&args, &console),
         Verb::View(args) => verbs::view::run(&args, &console),
+        Verb::Convert(args) => verbs::convert::run(&args, &console),
         Verb::Info(args) => verbs::info::run(&args, &console),
         Verb::Completions(args) => verbs::completions::run(&args, &console),
     });

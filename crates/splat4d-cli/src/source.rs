@@ -1,20 +1,26 @@
-//! Anything that holds a scene: a run folder, a scene file (`.safetensors`, checkpoints too) or a 3DGS `.ply`.
+//! Anything that holds a scene: a run folder, a scene file (`.safetensors`, checkpoints too), a playback file (`.splat4d`), a file or
+//! folder of another program's Gaussians, or a sequence of such files.
 
 use crate::files::cannot_read;
 use crate::paths::{Stage, View};
 use crate::run_folder::Run;
+use crate::sequence;
+use splat4d::format::playback::{self, Index};
 use splat4d::format::ply::PlyInfo;
-use splat4d::layers::{ALWAYS, Layer, Scene};
-use splat4d::motion::Still;
-use splat4d::scene::{GEOMETRY, LifeKind};
+use splat4d::format::{Dialect, Warnings, dialect, sog};
+use splat4d::layers::Scene;
+use splat4d::scene::time::DEFAULT_FPS;
+use splat4d::scene::{Camera, GEOMETRY};
 use splat4d::{Error, Result, format};
+use std::borrow::Cow;
 use std::path::Path;
-use std::sync::Arc;
 
-/// Upwards in plain 3DGS files: COLMAP's worlds have y down.
-const PLY_UP: [f64; 3] = [0.0, -1.0, 0.0];
 /// Share of a cloud, outermost first, that does not count for its size: a few far Gaussians must not shrink the rest.
 const OUTLIERS: f64 = 0.1;
+
+/// What can be opened, for errors.
+const REMEDY: &str =
+    "Give a run folder, a scene.safetensors, a checkpoint, a .splat4d, or a .ply, .spz, .splat, .splatv or SOG file.";
 
 /// A scene and where it came from.
 pub(crate) struct Source {
@@ -23,33 +29,69 @@ pub(crate) struct Source {
     pub run: Option<Run>,
     /// What the .ply said, where it is one.
     pub ply: Option<PlyInfo>,
+    /// The start of the playback file, where it is one.
+    pub playback: Option<Index>,
+    /// Whose format it is, where it is not our own.
+    pub dialect: Option<Dialect>,
+    /// What could not be read, or had to be assumed.
+    pub warnings: Warnings,
 }
 
 impl Source {
-    /// Opens a run or a file.
+    /// Opens a run, a file or a sequence.
     pub(crate) fn open(path: &Path) -> Result<Self> {
+        Self::open_at(path, DEFAULT_FPS)
+    }
+
+    /// The same; a sequence of files has `fps` a second.
+    pub(crate) fn open_at(path: &Path, fps: f64) -> Result<Self> {
+        if !path.exists() && sequence::Pattern::of(path).is_some() {
+            return open_sequence(path, fps);
+        }
+        if path.is_dir() && !Run::is(path) {
+            return if path.join(sog::META).is_file() { open_sog(path) } else { open_sequence(path, fps) };
+        }
         if path.is_dir() {
             let run = Run::open(path)?;
             let scene = read_scene(&run.scene_file()?)?;
-            return Ok(Self { scene, run: Some(run), ply: None });
+            return Ok(Self { run: Some(run), ..Self::own(scene) });
+        }
+        if path.file_name().is_some_and(|n| n == sog::META) {
+            return open_sog(path.parent().unwrap_or(Path::new("")));
         }
         let bytes = std::fs::read(path).map_err(|e| cannot_read(path, e))?;
-        if !bytes.starts_with(b"ply") {
-            let scene = format::scene::read(&bytes).map_err(|e| {
-                e.at(path.display()).remedy("Give a run folder, a scene.safetensors, a checkpoint or a 3DGS .ply.")
-            })?;
-            return Ok(Self { scene, run: None, ply: None });
+        if bytes.starts_with(&playback::MAGIC) {
+            let index = Index::parse(&bytes, Some(bytes.len() as u64)).map_err(|e| e.at(path.display()))?;
+            let scene = playback::read(&bytes).map_err(|e| e.at(path.display()))?;
+            return Ok(Self { playback: Some(index), ..Self::own(scene) });
         }
-        let (params, info) = format::ply::read(&bytes).map_err(|e| e.at(path.display()))?;
-        let layer =
-            Layer { name: "ply".into(), params, motion: Arc::new(Still), life: LifeKind::Infinite, span: ALWAYS };
-        let scene =
-            Scene { layers: vec![layer], up: PLY_UP, fps: splat4d::scene::time::DEFAULT_FPS, ..Scene::default() };
-        Ok(Self { scene, run: None, ply: Some(info) })
+        let opened = match dialect_of(path, &bytes) {
+            Some(kind) => dialect::open(kind, &bytes).map(|o| Self {
+                ply: o.ply,
+                dialect: Some(kind),
+                warnings: o.warnings,
+                ..Self::own(o.scene)
+            }),
+            None => format::scene::read(&bytes).map(Self::own).map_err(|e| e.remedy(REMEDY)),
+        };
+        opened.map_err(|e| e.at(path.display()))
     }
 
-    /// The data set's cameras; empty for bare files.
+    fn own(scene: Scene<f32>) -> Self {
+        Self { scene, run: None, ply: None, playback: None, dialect: None, warnings: Warnings::default() }
+    }
+
+    /// The data set's cameras; those that a playback file brings along; empty for other bare files.
     pub(crate) fn views(&self) -> Result<Vec<View>> {
+        if let Some(index) = &self.playback {
+            let time = index.meta.clip[0];
+            let fits = |c: &Camera| c.width.max(c.height) <= crate::camera_file::MAX_SIDE;
+            let views = index.meta.cameras.iter().filter_map(|c| {
+                let camera = c.camera().filter(fits)?;
+                Some(View { camera, name: c.name.clone(), time, held: false })
+            });
+            return Ok(views.collect());
+        }
         self.run.as_ref().map_or_else(|| Ok(Vec::new()), Run::views)
     }
 
@@ -61,6 +103,58 @@ impl Source {
         let (center, extent) = cloud(&self.scene);
         Stage::of_cloud(center, extent, self.scene.up)
     }
+}
+
+/// By content; by its ending only where there is nothing in the content to know it by.
+fn dialect_of(path: &Path, bytes: &[u8]) -> Option<Dialect> {
+    let splat = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("splat"));
+    Dialect::of(bytes).or(splat.then_some(Dialect::Splat))
+}
+
+/// A SOG scene whose files lie in a folder.
+fn open_sog(folder: &Path) -> Result<Source> {
+    let read = |name: &str| {
+        let file = folder.join(name);
+        std::fs::read(&file).map_err(|e| cannot_read(&file, e))
+    };
+    let meta = read(sog::META)?;
+    let mut files = sog::Files::new();
+    for name in sog::files_of(&meta).map_err(|e| e.at(folder.display()))? {
+        // The list comes from the file: it must not lead out of the folder.
+        if Path::new(&name).components().any(|c| !matches!(c, std::path::Component::Normal(_))) {
+            return Err(Error::input(format!("names the file `{name}`, which lies elsewhere"))
+                .at(folder.join(sog::META).display())
+                .remedy("Export the scene again."));
+        }
+        let bytes = read(&name)?;
+        files.insert(name, Cow::Owned(bytes));
+    }
+    files.insert(sog::META.into(), Cow::Owned(meta));
+    let (params, warnings) = sog::read(&files).map_err(|e| e.at(folder.display()))?;
+    let scene = dialect::still(params, Dialect::Sog);
+    Ok(Source { dialect: Some(Dialect::Sog), warnings, ..Source::own(scene) })
+}
+
+/// Files of one frame each.
+fn open_sequence(path: &Path, fps: f64) -> Result<Source> {
+    let files = sequence::frames(path)?;
+    let (mut frames, mut kind, mut warnings) = (Vec::with_capacity(files.len()), None, Warnings::default());
+    for file in &files {
+        let bytes = std::fs::read(file).map_err(|e| cannot_read(file, e))?;
+        let own = dialect_of(file, &bytes).filter(|d| !d.moves());
+        let Some(own) = own.filter(|d| kind.is_none_or(|k: Dialect| k.up() == d.up())) else {
+            return Err(Error::input("is no frame of a sequence like the others")
+                .at(file.display())
+                .remedy("Frames are .ply, .spz or .splat files of one kind."));
+        };
+        kind = Some(own);
+        let mut opened = dialect::open(own, &bytes).map_err(|e| e.at(file.display()))?;
+        warnings.append(opened.warnings);
+        frames.push(std::mem::take(&mut opened.scene.layers[0].params));
+    }
+    let up = kind.map_or([0.0, -1.0, 0.0], Dialect::up);
+    let scene = format::sequence::join(&frames, fps, up).map_err(|e| e.at(path.display()))?;
+    Ok(Source { dialect: kind, warnings, ..Source::own(scene) })
 }
 
 /// Reads a scene file.

@@ -36,7 +36,7 @@ fn json_of(path: &Path) -> Value {
 #[test]
 fn help_teaches_and_completions_complete() {
     let help = splat4d(&["--help"]).run().ok();
-    for verb in ["train", "eval", "render", "export", "info", "completions"] {
+    for verb in ["train", "eval", "render", "bake", "export", "info", "completions"] {
         assert!(help.contains(verb), "{verb} is missing");
         let own = splat4d(&[verb, "--help"]).run().ok();
         assert!(own.contains("Examples:") && own.contains(&format!("splat4d {verb}")), "{verb} --help teaches nothing");
@@ -62,6 +62,7 @@ fn a_capture_becomes_a_run_and_everything_follows() {
         "recipe.toml",
         "run.json",
         "scene.safetensors",
+        "scene.splat4d",
         "metrics.csv",
         "results.json",
         "per_view.json",
@@ -398,4 +399,32 @@ fn an_interrupt_saves_and_says_how_to_continue() {
     assert!(stderr.contains(&format!("--resume {}", run.display())), "{stderr}");
     assert!(std::fs::read_dir(run.join("checkpoints")).unwrap().count() > 0);
     assert!(!run.join("scene.safetensors").exists());
+}
+
+#[test]
+fn a_run_is_baked_and_the_file_is_as_good() {
+    let work = tempfile::tempdir().unwrap();
+    let capture = Capture::new(work.path()).write();
+    let run = work.path().join("run");
+    let said = splat4d(&["train", str(&capture), "-o", str(&run), "--no-eval"]).args(&TINY).run().ok();
+    assert!(said.contains("scene.splat4d") && said.contains("against its model"), "{said}");
+    let (out, report) = (work.path().join("out.splat4d"), work.path().join("report.json"));
+    let said =
+        splat4d(&["bake", str(&run), "-o", str(&out), "--report", str(&report), "--repeat", "3", "--json"]).run().ok();
+    assert!(said.lines().any(|l| l.contains("\"type\":\"baked\"")), "{said}");
+    let told = json_of(&report);
+    assert!(told["likeness"]["psnr"].as_f64().unwrap() > 40.0, "{told}");
+    assert!(told["baking"]["gaussians"].as_u64().unwrap() > 50 && told["clip"][1].as_f64().unwrap() > 0.3, "{told}");
+    assert_eq!(told["bytes"].as_u64().unwrap(), std::fs::metadata(&out).unwrap().len());
+    let played = splat4d::format::playback::read(&std::fs::read(&out).unwrap()).unwrap();
+    assert_eq!(played.len() as u64, told["baking"]["primitives"].as_u64().unwrap());
+    for (args, reason) in [
+        (vec!["-o", "x.ply"], "splat4d"),
+        (vec!["-o", str(&out), "--tolerance", "0"], "tolerance"),
+        (vec!["-o", str(&out), "--repeat", "0"], "repeat"),
+        (vec!["-o", str(&out), "--segment", "nan"], "segments"),
+    ] {
+        let message = splat4d(&["bake", str(&run)]).args(&args).run().refused();
+        assert!(message.contains(reason), "{args:?}: {message}");
+    }
 }

@@ -1,12 +1,14 @@
 // From the resident Gaussians of the pages at time t to a list of screen ellipses in the order of depth keys: the part
 // before the sort. Concatenated after resident.wgsl, project.wgsl and shade.wgsl.
 //
-//   cull   a workgroup owns a block of 256: tests the block, then each thread its Gaussian; survivors become records,
-//          packed within the block's 256 places, so that the order stays that of the file and repeats from run to run
-//   total  one workgroup: exclusive sums of the blocks' counts, and the arguments of the indirect dispatches and draw
-//   keys   a workgroup owns a block again: 16-bit depth key and place of every record, without gaps
+//   cull            a workgroup owns a block of 256: tests the block, then each thread its Gaussian; what is visible
+//                   becomes a record at its own place and a bit of the block's mask
+//   total           one workgroup: exclusive sums of the masks' bits, and the arguments of indirect dispatches and draw
+//   keys_of_depths  a workgroup owns a block again: 16-bit depth key and place of every record, without gaps
 //
-// The same depth key means: the lower place is in front, as in the CPU renderer's (depth, id).
+// Places are in the file's order, so all of this repeats from run to run, and where two depth keys are the same the lower
+// place is in front, as in the CPU renderer's order (depth, id). Threads of cull do not wait for each other: software
+// devices, which are what tests run on, would take three times as long.
 
 // One picture; 160 bytes.
 struct Frame {
@@ -44,11 +46,12 @@ struct Range {
 @group(0) @binding(3) var<storage, read> block_list: array<u32>;         // the blocks of the pages at this time
 @group(0) @binding(4) var<storage, read> palette: array<u32>;            // a word a coefficient: bytes r, g, b
 @group(0) @binding(5) var<storage, read_write> records: array<Record>;   // 256 a listed block
-@group(0) @binding(6) var<storage, read_write> counts: array<u32>;       // a listed block's records; after total: sums
+@group(0) @binding(6) var<storage, read_write> masks: array<atomic<u32>>; // 8 a listed block; cleared before cull
 @group(0) @binding(7) var<storage, read_write> range: Range;
 @group(0) @binding(8) var<storage, read_write> arguments: array<u32>;    // see total
 @group(0) @binding(9) var<storage, read_write> keys: array<u32>;
 @group(0) @binding(10) var<storage, read_write> places: array<u32>;
+@group(0) @binding(11) var<storage, read_write> firsts: array<u32>;      // records before a listed block
 
 const BLOCK: u32 = 256u;
 // Standard deviations to alpha = 1/255 of an opaque Gaussian, sqrt(2 ln 255), rounded up.
@@ -57,12 +60,16 @@ const SIGMAS: f32 = 3.34;
 const LIFE_REACHES: f32 = 1.12;
 // Largest key: two passes of eight bits.
 const KEY_MAX: f32 = 65535.0;
+// Vertices of a splat in draw.wgsl.
+const CORNERS: u32 = 6u;
+// 32-bit words that hold a bit for each Gaussian of a block.
+const MASKS: u32 = 8u;
 // Pairs that a workgroup of sort.wgsl takes (SORT_BLOCK there).
 const PAIRS: u32 = 2048u;
+// Its scan takes a workgroup a digit, or one for all up to so many pairs (SORT_FEW blocks there).
+const SCAN_GROUPS: u32 = 256u;
+const FEW_PAIRS: u32 = 65536u;
 
-var<workgroup> group_mask: array<atomic<u32>, 8>;
-var<workgroup> group_near: atomic<u32>;
-var<workgroup> group_far: atomic<u32>;
 var<workgroup> group_sums: array<u32, 256>;
 
 // Whether nothing of the block can be seen. Errs on the side of drawing.
@@ -169,69 +176,57 @@ fn cull(
     let block = block_list[slot];
     let header = blocks[block].f;
     let span = blocks[block].span;
-    if (block_hidden(header, span)) {
-        if (thread == 0u) {
-            counts[slot] = 0u;
-        }
+    if (thread >= blocks[block].count || block_hidden(header, span)) {
+        return;
+    }
+    let i = 2u * (block * BLOCK + thread);
+    let a = words[i];
+    let b = words[i + 1u];
+    let w = array<u32, 8>(a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w);
+    let life = life_at(w, header, span, frame.view.time);
+    if (!(opacity_at(w, life) >= frame.view.alpha_min)) {
+        return;
+    }
+    let g = gaussian(w, header, life);
+    let ellipse = project(frame.view, g.mean, covariance(g.quat, g.scale), g.opacity);
+    if (ellipse.visible == 0u) {
         return;
     }
     var record: Record;
-    var visible = false;
-    if (thread < blocks[block].count) {
-        let i = 2u * (block * BLOCK + thread);
-        let a = words[i];
-        let b = words[i + 1u];
-        let w = array<u32, 8>(a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w);
-        let life = life_at(w, header, span, frame.view.time);
-        if (opacity_at(w, life) >= frame.view.alpha_min) {
-            let g = gaussian(w, header, life);
-            let ellipse = project(frame.view, g.mean, covariance(g.quat, g.scale), g.opacity);
-            visible = ellipse.visible != 0u;
-            if (visible) {
-                record.center = ellipse.center;
-                record.depth = ellipse.depth;
-                set_axes(&record, ellipse);
-                var rgb = vec3<f32>(0.0);
-                if (frame.channel == CHANNEL_COLOR) {
-                    rgb = sight_color(g.base, g.mean, g.label, block);
-                } else if (frame.channel == CHANNEL_FLOW) {
-                    rgb = flow_color(flow(g.mean, g.velocity));
-                }
-                record.color = vec2<u32>(pack2x16float(rgb.xy), pack2x16float(vec2<f32>(rgb.z, g.opacity * ellipse.rho)));
-            }
-        }
+    record.center = ellipse.center;
+    record.depth = ellipse.depth;
+    set_axes(&record, ellipse);
+    var rgb = vec3<f32>(0.0);
+    if (frame.channel == CHANNEL_COLOR) {
+        rgb = sight_color(g.base, g.mean, g.label, block);
+    } else if (frame.channel == CHANNEL_FLOW) {
+        rgb = flow_color(flow(g.mean, g.velocity));
     }
-    // Workgroup memory starts as zeros.
-    if (thread == 0u) {
-        atomicStore(&group_near, 0xffffffffu);
+    record.color = vec2<u32>(pack2x16float(rgb.xy), pack2x16float(vec2<f32>(rgb.z, g.opacity * ellipse.rho)));
+    records[slot * BLOCK + thread] = record;
+    atomicOr(&masks[slot * MASKS + thread / 32u], 1u << (thread % 32u));
+    // Looking first keeps all but a few threads from queueing for these two.
+    let depth = bitcast<u32>(record.depth);
+    if (depth < atomicLoad(&range.near)) {
+        atomicMin(&range.near, depth);
     }
-    workgroupBarrier();
-    if (visible) {
-        atomicOr(&group_mask[thread / 32u], 1u << (thread % 32u));
-        atomicMin(&group_near, bitcast<u32>(record.depth));
-        atomicMax(&group_far, bitcast<u32>(record.depth));
-    }
-    workgroupBarrier();
-    // A record's place is the number of visible threads below.
-    var rank = countOneBits(atomicLoad(&group_mask[thread / 32u]) & ((1u << (thread % 32u)) - 1u));
-    for (var w = 0u; w < thread / 32u; w++) {
-        rank += countOneBits(atomicLoad(&group_mask[w]));
-    }
-    if (visible) {
-        records[slot * BLOCK + rank] = record;
-    }
-    if (thread == BLOCK - 1u) {
-        let count = rank + u32(visible);
-        counts[slot] = count;
-        if (count > 0u) {
-            atomicMin(&range.near, atomicLoad(&group_near));
-            atomicMax(&range.far, atomicLoad(&group_far));
-        }
+    if (depth > atomicLoad(&range.far)) {
+        atomicMax(&range.far, depth);
     }
 }
 
-// Exclusive sums of counts, the sum of all behind them, and in `arguments`:
-// 0-2 workgroups of histogram and scatter, 3 number of records, 4-7 drawIndirect: vertices, instances, 0, 0.
+// Records of a listed block.
+fn records_of(slot: u32) -> u32 {
+    var sum = 0u;
+    for (var w = 0u; w < MASKS; w++) {
+        sum += countOneBits(atomicLoad(&masks[slot * MASKS + w]));
+    }
+    return sum;
+}
+
+// Exclusive sums of the blocks' records, and in `arguments`:
+// 0-2 workgroups of histogram and scatter, 3 number of records, 4-7 drawIndirect: vertices, one instance, 0, 0,
+// 8-10 workgroups of scan.
 @compute @workgroup_size(256)
 fn total(@builtin(local_invocation_index) thread: u32) {
     let n = frame.view.count;
@@ -240,7 +235,7 @@ fn total(@builtin(local_invocation_index) thread: u32) {
     let end = min(first + run, n);
     var sum = 0u;
     for (var i = first; i < end; i++) {
-        sum += counts[i];
+        sum += records_of(i);
     }
     group_sums[thread] = sum;
     workgroupBarrier();
@@ -255,21 +250,22 @@ fn total(@builtin(local_invocation_index) thread: u32) {
     }
     var before = group_sums[thread] - sum;
     for (var i = first; i < end; i++) {
-        let count = counts[i];
-        counts[i] = before;
-        before += count;
+        firsts[i] = before;
+        before += records_of(i);
     }
     if (thread == BLOCK - 1u) {
         let all = group_sums[thread];
-        counts[n] = all;
         arguments[0] = (all + PAIRS - 1u) / PAIRS;
         arguments[1] = 1u;
         arguments[2] = 1u;
         arguments[3] = all;
-        arguments[4] = 4u;
-        arguments[5] = all;
+        arguments[4] = CORNERS * all;
+        arguments[5] = 1u;
         arguments[6] = 0u;
         arguments[7] = 0u;
+        arguments[8] = select(SCAN_GROUPS, 1u, all <= FEW_PAIRS);
+        arguments[9] = 1u;
+        arguments[10] = 1u;
     }
 }
 
@@ -284,14 +280,20 @@ fn keys_of_depths(
     if (slot >= frame.view.count) {
         return;
     }
-    let first = counts[slot];
-    if (thread >= counts[slot + 1u] - first) {
+    let word = thread / 32u;
+    let bit = 1u << (thread % 32u);
+    let mask = atomicLoad(&masks[slot * MASKS + word]);
+    if ((mask & bit) == 0u) {
         return;
+    }
+    var to = firsts[slot] + countOneBits(mask & (bit - 1u));
+    for (var w = 0u; w < word; w++) {
+        to += countOneBits(atomicLoad(&masks[slot * MASKS + w]));
     }
     let place = slot * BLOCK + thread;
     let near = atomicLoad(&range.near);
     let width = max(f32(atomicLoad(&range.far) - near), 1.0);
     let above = f32(bitcast<u32>(records[place].depth) - near);
-    keys[first + thread] = u32(min(above / width, 1.0) * KEY_MAX);
-    places[first + thread] = place;
+    keys[to] = u32(min(above / width, 1.0) * KEY_MAX);
+    places[to] = place;
 }

@@ -1,8 +1,9 @@
 // From the stored bytes of a section to what a backend wants: checks the CRC, inflates, transposes byte planes into
-// words. A worker without imports (it must run from a blob URL); the page imports `decode` where it may start no worker.
+// words. A worker without imports (it must run from a blob URL); a page that may start no worker imports `decode`.
 
 /// Gaussians a block header describes, and its f32 numbers (docs/format.md).
-const BLOCK = 256, HEADER = 24;
+const BLOCK = 256,
+  HEADER = 24;
 /// 32-bit words a Gaussian (docs/format.md).
 const WORDS = 8;
 /// Bytes given to the inflater at a time. A browser inflates a piece whole, at most 1 : 1032, before anybody can stop
@@ -25,7 +26,8 @@ export function crc32(bytes) {
 /// Inflates `stored` (RFC 1951) to exactly `bytes` bytes; throws when there are more or fewer.
 async function inflate(stored, bytes) {
   const stream = new DecompressionStream('deflate-raw');
-  const writer = stream.writable.getWriter(), reader = stream.readable.getReader();
+  const writer = stream.writable.getWriter(),
+    reader = stream.readable.getReader();
   const feed = (async () => {
     for (let i = 0; i < stored.length; i += PIECE) await writer.write(stored.subarray(i, i + PIECE));
     await writer.close();
@@ -58,7 +60,10 @@ function finite(numbers, what) {
 function transpose(data, at, count) {
   const words = new Uint32Array(WORDS * count);
   for (let w = 0; w < WORDS; w++) {
-    const a = at + 4 * w * count, b = a + count, c = b + count, d = c + count;
+    const a = at + 4 * w * count,
+      b = a + count,
+      c = b + count,
+      d = c + count;
     for (let i = 0, o = w; i < count; i++, o += WORDS) {
       words[o] = data[a + i] | (data[b + i] << 8) | (data[c + i] << 16) | (data[d + i] << 24);
     }
@@ -86,8 +91,9 @@ function palette(data, { count, degree }) {
 
 /// Decodes one section.
 ///
-/// `job`: {kind 'PAGE' | 'PALT' | other: bytes as they are, stored Uint8Array, crc, codec, bytes, count, degree, labels:
-/// entries of the page's palette, 0: none}. Its sizes have been checked against the file. Throws an Error that says why.
+/// `job`: {kind 'PAGE' | 'PALT' | other: bytes as they are, stored Uint8Array, crc, codec, bytes, count, degree,
+/// labels: entries of the page's palette, 0: none}. Its sizes have been checked against the file. Throws an Error that
+/// says why.
 export async function decode(job) {
   if (crc32(job.stored) !== job.crc) throw new Error('its bytes are damaged: the checksum differs');
   let data = job.stored;

@@ -57,7 +57,8 @@ export function choice(label, options, onpick, props = {}) {
   return node;
 }
 
-export const field = (label, control) => h('div', { class: 'field' }, h('span', {}, label), control);
+export const field = (label, control, more = '') =>
+  h('div', { class: `field ${more}` }, h('span', {}, label), control);
 
 /** m:ss.cc, with hours where the clip has them. */
 export function clock(seconds, long) {

@@ -2,13 +2,15 @@
 // Concatenated after resident.wgsl, project.wgsl, shade.wgsl and cull.wgsl, whose bindings 0, 5, 8 and 10 have
 // read-only twins here.
 
-@group(0) @binding(11) var<storage, read> drawn: array<Record>;
-@group(0) @binding(12) var<storage, read> order: array<u32>;      // places, nearest first
-@group(0) @binding(13) var<storage, read> drawn_count: array<u32>; // `arguments` of cull.wgsl
-@group(0) @binding(14) var picture: texture_2d<f32>;
+@group(0) @binding(12) var<storage, read> drawn: array<Record>;
+@group(0) @binding(13) var<storage, read> order: array<u32>;      // places, nearest first
+@group(0) @binding(14) var<storage, read> drawn_count: array<u32>; // `arguments` of cull.wgsl
+@group(0) @binding(15) var picture: texture_2d<f32>;
 
 // Alpha is never above this (Kerbl et al. 2023).
 const ALPHA_MAX: f32 = 0.99;
+// Which corner (bit 0 right, bit 1 lower) each vertex of a splat is, two bits a vertex: 0 1 2 2 1 3.
+const CORNER_BITS: u32 = 0xda4u;
 // Where among drawn_count the number of records is.
 const COUNT: u32 = 3u;
 
@@ -18,10 +20,12 @@ struct Corner {
     @location(1) @interpolate(flat) color: vec4<f32>,  // rgb, opacity
 }
 
-// Vertex k of instance i: a corner of the box along the axes, as large as the ellipse on which alpha is the cut-off.
+// Vertices 6 i to 6 i + 5 are two triangles: the box along the axes, as large as the ellipse on which alpha is the
+// cut-off. No instances: those of a few vertices each run badly on many devices, and very badly on software ones.
 @vertex
-fn corner(@builtin(vertex_index) k: u32, @builtin(instance_index) i: u32) -> Corner {
-    let record = drawn[order[drawn_count[COUNT] - 1u - i]];
+fn corner(@builtin(vertex_index) vertex: u32) -> Corner {
+    let record = drawn[order[drawn_count[COUNT] - 1u - vertex / CORNERS]];
+    let k = (CORNER_BITS >> (2u * (vertex % CORNERS))) & 3u;
     let rg = unpack2x16float(record.color.x);
     let ba = unpack2x16float(record.color.y);
     let radius = sqrt(max(cutoff(frame.view, ba.y), 0.0));

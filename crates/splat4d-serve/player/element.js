@@ -46,13 +46,16 @@ export class Splat4D extends HTMLElement {
     const root = h('div', { class: 'root', part: 'root' }, stage);
     shadow.replaceChildren(root);
     const player = this.#player = new Player(stage);
-    this.#ui = new Interface(root, player, {
+    const ui = this.#ui = new Interface(root, player, {
       page: this.hasAttribute('page'), embed: this.hasAttribute('embed'),
       open: file => { this.scene = file; }, retry: () => this.#load(),
     });
     for (const name of EVENTS) {
       player.addEventListener(name, e => this.dispatchEvent(new CustomEvent(name, { detail: e.detail })));
     }
+    player.addEventListener('scene', () => {
+      ui.setTitle(this.getAttribute('heading') ?? player.meta.title ?? this.#scene?.name);
+    });
     for (const name of OBSERVED) if (name !== 'src') this.#apply(name, this.getAttribute(name));
     this.#ui.xr = () => enter(player).catch(error => this.#ui.toast(error.message));
     offered().then(yes => { if (this.#ui) { this.#ui.xrTool.hidden = !yes; } });
@@ -115,19 +118,19 @@ export class Splat4D extends HTMLElement {
       if (this.hasAttribute('page') && !this.#training) ui.showEmpty();
       return;
     }
-    const link = this.hasAttribute('page') ? readLink(location.hash) : {};
-    const time = this.getAttribute('time');
-    const start = {
-      camera: place(this.getAttribute('camera')), time: time === null ? undefined : +time,
-      channel: this.getAttribute('channel') ?? undefined, playing: this.hasAttribute('autoplay'), ...link,
-    };
     const poster = this.getAttribute('poster');
     if (poster) ui.setPoster(new URL(poster, document.baseURI).href);
-    p.addEventListener('scene', () => {
-      const name = this.getAttribute('heading') ?? p.meta?.title ?? this.#scene?.name;
-      ui.setTitle(name);
-    }, { once: true });
-    await p.load(source, { start });
+    await p.load(source, { start: this.#start() });
+  }
+
+  /** How a scene begins: the attributes say, and a page's address says more. */
+  #start() {
+    const time = this.getAttribute('time');
+    return {
+      camera: place(this.getAttribute('camera')), time: time === null ? undefined : +time,
+      channel: this.getAttribute('channel') ?? undefined, playing: this.hasAttribute('autoplay'),
+      ...(this.hasAttribute('page') ? readLink(location.hash) : {}),
+    };
   }
 
   #hash = () => {
@@ -169,7 +172,7 @@ export class Splat4D extends HTMLElement {
   follow(run) {
     this.#training?.close();
     this.#training = new Training(this.#ui, { ...run,
-      reload: address => this.#player?.load(address, { keep: true }) });
+      reload: address => this.#player?.load(address, { keep: true, start: this.#start() }) });
   }
 }
 

@@ -6,24 +6,26 @@ export const CHANNELS = { color: 0, depth: 1, alpha: 2, flow: 3 };
 /// its palette or -1, SH degree, then the palette's three ranges, then the span's length.
 export const BLOCK_TEXELS = 8;
 
-/// One instance a Gaussian, four corners: unpacks, moves, projects and shades it.
+/// Texels across the textures of orders and of splats.
+export const ORDER_WIDTH = 1024;
+
+/// What both ways of drawing share: unpacks, moves, projects and shades one Gaussian.
 ///
 /// Culls: outside its span, z ≤ near, opacity·σ < 1/255, determinant ≤ 0, nothing in the picture.
 /// Constants: low-pass 0.3 px² and α ≥ 1/255 of Kerbl et al. 2023, τ margin of project.rs.
-export const DRAW_VERTEX = `#version 300 es
+const SPLAT = `#version 300 es
 precision highp float; precision highp int;
 precision highp sampler2D; precision highp usampler2D;
-uniform usampler2D words, palette;
+uniform usampler2D words, palette, order;
 uniform sampler2D blocks;
 uniform mat3 rotation;
 uniform vec3 translation, eye;
 uniform vec2 focal, center, size, low, high, depth_range;
 uniform float time, near, flow_scale;
-uniform int channel;
-layout(location = 0) in uint id;
-flat out vec4 shape;
-flat out vec2 middle;
-flat out vec3 tint;
+uniform int channel, count;
+
+// conic xx xy yy and opacity; centre and half sizes of the box in px; colour.
+struct Splat { vec4 shape, place; vec3 tint; };
 
 const float LOW_PASS = 0.3, ALPHA_MIN = 1.0 / 255.0, TAU_MARGIN = 1e-3;
 // Only an order that is older than this picture can hold pages outside their span: s.
@@ -67,15 +69,18 @@ vec3 flow_color(vec2 velocity) {
   return value * clamp(abs(fract(hue + vec3(0, 2.0 / 3.0, 1.0 / 3.0)) * 6.0 - 3.0) - 1.0, 0.0, 1.0);
 }
 
-void main() {
-  gl_Position = vec4(2, 2, 0, 1);
+// The splat of instance i of the order; half sizes 0: nothing to draw.
+Splat splat(ivec2 texel) {
+  Splat none = Splat(vec4(0), vec4(0), vec3(0));
+  if (texel.y * ${ORDER_WIDTH} + texel.x >= count) return none;
+  uint id = texelFetch(order, texel, 0).r;
   int row = int(id >> 10), column = int(id & 1023u), b = (column >> 8) * BLOCK_TEXELS;
   uvec4 p = texelFetch(words, ivec2(2 * column, row), 0), q = texelFetch(words, ivec2(2 * column + 1, row), 0);
   vec4 h0 = texelFetch(blocks, ivec2(b, row), 0), h1 = texelFetch(blocks, ivec2(b + 1, row), 0);
   vec4 h2 = texelFetch(blocks, ivec2(b + 2, row), 0), h3 = texelFetch(blocks, ivec2(b + 3, row), 0);
   vec4 h4 = texelFetch(blocks, ivec2(b + 4, row), 0), h5 = texelFetch(blocks, ivec2(b + 5, row), 0);
   vec4 page = texelFetch(blocks, ivec2(b + 6, row), 0), more = texelFetch(blocks, ivec2(b + 7, row), 0);
-  if (time < page.x - SPAN_SLACK || time >= page.y + SPAN_SLACK) return;
+  if (time < page.x - SPAN_SLACK || time >= page.y + SPAN_SLACK) return none;
 
   // Life.
   float dt = time - lerp(h1.z, h1.w, float(p.y >> 16) / 65535.0);
@@ -84,7 +89,7 @@ void main() {
   float soft = max(exp(lerp(h4.x, h4.y, share(q.w, 16))), 1e-30);
   float outside = wide == 255u ? 0.0 : max(0.0, abs(dt) - half_width) / soft;
   float opacity = share(p.z, 24) * exp(-0.5 * outside * outside);
-  if (!(opacity >= ALPHA_MIN)) return;
+  if (!(opacity >= ALPHA_MIN)) return none;
   float reach = wide == 255u ? 0.5 * more.w : min(half_width + 3.0 * soft, more.w);
 
   // Motion.
@@ -101,7 +106,7 @@ void main() {
 
   // Projection (EWA).
   vec3 c = rotation * mean + translation;
-  if (!(c.z > near)) return;
+  if (!(c.z > near)) return none;
   vec2 uv = c.xy / c.z, clamped = clamp(uv, low, high);
   vec3 scale = exp(h2.z + (h2.w - h2.z) * vec3(share(p.z, 0), share(p.z, 8), share(p.z, 16)));
   mat3 axes = mat3(
@@ -118,12 +123,12 @@ void main() {
   float det = max(sxx * syy - sxy * sxy, 0.0) + LOW_PASS * (sxx + syy + LOW_PASS);
   float tau = 2.0 * log(opacity / ALPHA_MIN) + TAU_MARGIN;
   vec2 extent = sqrt(tau * vec2(xx, yy));
-  middle = focal * uv + center;
+  vec2 middle = focal * uv + center;
   vec2 first = middle - extent, last = middle + extent;
   // Phrased so that a NaN is culled too.
-  if (!(det > 0.0 && last.x > 0.0 && last.y > 0.0 && first.x < size.x && first.y < size.y)) return;
-  shape = vec4(yy / det, -sxy / det, xx / det, opacity);
+  if (!(det > 0.0 && last.x > 0.0 && last.y > 0.0 && first.x < size.x && first.y < size.y)) return none;
 
+  vec3 tint = vec3(1);
   if (channel == ${CHANNELS.color}) {
     tint = vec3(h4.zw, h5.x) + (h5.yzw - vec3(h4.zw, h5.x)) * vec3(share(q.z, 0), share(q.z, 8), share(q.z, 16));
     if (page.z >= 0.0) {
@@ -135,13 +140,57 @@ void main() {
   } else if (channel == ${CHANNELS.flow}) {
     vec3 v = rotation * velocity;
     tint = flow_color(focal * (v.xy - uv * v.z) / c.z);
-  } else {
-    tint = vec3(1);
   }
-  vec2 corner = mix(max(first, vec2(0)), min(last, size), vec2(gl_VertexID & 1, gl_VertexID >> 1));
+  return Splat(vec4(yy / det, -sxy / det, xx / det, opacity), vec4(middle, extent), tint);
+}
+`;
+
+/// Splats an instance. One each would be slow: graphics processors fill their lanes from one instance, and SwiftShader
+/// starts anew for each (measured: about 50 µs an instance).
+export const BATCH = 256;
+
+/// Four corners a splat, around the box of its ellipse.
+const QUAD = `
+flat out vec4 shape;
+flat out vec2 middle;
+flat out vec3 tint;
+void main() {
+  int i = gl_InstanceID * ${BATCH} + (gl_VertexID >> 2), corner = gl_VertexID & 3;
+  Splat s = splat(ivec2(i % ${ORDER_WIDTH}, i / ${ORDER_WIDTH}));
+  shape = s.shape;
+  middle = s.place.xy;
+  tint = s.tint;
+  vec2 first = max(middle - s.place.zw, vec2(0)), last = min(middle + s.place.zw, size);
   // Rows go from the top in this target; the way to the canvas turns them.
-  gl_Position = vec4(corner / size * 2.0 - 1.0, 0, 1);
+  gl_Position = vec4(mix(first, last, vec2(corner & 1, corner >> 1)) / size * 2.0 - 1.0, 0, 1);
+  if (s.place.z <= 0.0) gl_Position = vec4(2, 2, 0, 1);
 }`;
+
+/// Every corner computes its splat: where no 32-bit floats can be rendered to.
+export const DIRECT_VERTEX = SPLAT + QUAD;
+
+/// One fragment a splat of the order: each is computed once, not once a corner.
+export const PROJECT_FRAGMENT = `${SPLAT}
+layout(location = 0) out vec4 shape;
+layout(location = 1) out vec4 place;
+layout(location = 2) out vec4 tint;
+void main() {
+  Splat s = splat(ivec2(gl_FragCoord.xy));
+  shape = s.shape;
+  place = s.place;
+  tint = vec4(s.tint, 0);
+}`;
+
+/// Corners from what PROJECT_FRAGMENT wrote.
+export const DRAW_VERTEX = `#version 300 es
+precision highp float; precision highp int;
+uniform highp sampler2D shapes, places, tints;
+uniform vec2 size;
+struct Splat { vec4 shape, place; vec3 tint; };
+Splat splat(ivec2 texel) {
+  return Splat(texelFetch(shapes, texel, 0), texelFetch(places, texel, 0), texelFetch(tints, texel, 0).rgb);
+}
+${QUAD}`;
 
 /// α = min(0.99, o·exp(−½ dᵀ conic d)), below 1/255 nothing (Kerbl et al. 2023). Writes premultiplied colour.
 export const DRAW_FRAGMENT = `#version 300 es

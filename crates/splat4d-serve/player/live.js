@@ -4,6 +4,8 @@ import { h } from './dom.js';
 
 /** Milliseconds before another try to reach the server, doubled up to the second. */
 const RETRY = [500, 8000];
+/** Snapshots told within this time, ms, are one piece of news. */
+const TOGETHER = 30;
 /** Points of the curve that are kept; beyond it every second one goes. */
 const CURVE_MAX = 2000;
 
@@ -73,21 +75,26 @@ export class Training {
     this.ui = ui;
     this.dot = h('i', { class: 'dot' });
     this.state = h('span', {}, 'Connecting');
+    this.left = h('small');
     this.figures = h('div', { class: 'figures' });
     this.canvas = h('canvas', { role: 'img', 'aria-label': 'Quality over the steps' });
     this.card = h('section', { class: 'card live', 'aria-label': 'Training' },
-      h('div', {}, this.dot, this.state), this.canvas, this.figures);
+      h('div', { class: 'row' }, this.dot, this.state, h('span', { class: 'space' }), this.left), this.canvas, this.figures);
     ui.left.append(this.card);
     ui.root.addEventListener('themechange', () => this.#draw());
     this.resizes = new ResizeObserver(() => this.#draw());
     this.resizes.observe(this.canvas);
     let newest = null;
     const show = number => {
-      if (number === newest) return;
-      newest = number;
-      const address = new URL(src, document.baseURI);
-      address.searchParams.set('v', number);
-      reload(address.href);
+      clearTimeout(this.timer);
+      // A server that tells what was missed may name several: only the last is worth loading.
+      this.timer = setTimeout(() => {
+        if (number === newest) return;
+        newest = number;
+        const address = new URL(src, document.baseURI);
+        address.searchParams.set('v', number);
+        reload(address.href);
+      }, TOGETHER);
     };
     if (version != null) show(version);
     const past = () => metrics && fetch(metrics).then(r => (r.ok ? r.text() : '')).then(text => text
@@ -114,6 +121,7 @@ export class Training {
 
   #finish() {
     this.over = true;
+    this.left.textContent = '';
     this.#show(this.link);
   }
 
@@ -124,11 +132,11 @@ export class Training {
     const count = n => Number(n).toLocaleString('en-GB');
     const left = s => (s > 5400 ? `${(s / 3600).toFixed(1)} h` : s > 90 ? `${Math.round(s / 60)} min` : `${Math.round(s)} s`);
     const cells = [
-      [`${count(data.step)}`, data.of ? `of ${count(data.of)} steps` : 'steps'],
-      [isFinite(data.psnr) ? `${(+data.psnr).toFixed(2)} dB` : '–', 'PSNR'],
+      [count(data.step), data.of ? `of ${count(data.of)} steps` : 'steps'],
+      [isFinite(data.psnr) ? data.psnr.toFixed(2) : '–', 'dB PSNR'],
       [count(data.gaussians ?? 0), 'Gaussians'],
     ];
-    if (data.left > 0) cells.push([left(data.left), 'left']);
+    this.left.textContent = data.left > 0 && !this.over ? `${left(data.left)} left` : '';
     this.figures.replaceChildren(...cells.map(([value, name]) => h('div', {}, value, h('small', {}, name))));
   }
 
@@ -168,6 +176,7 @@ export class Training {
   }
 
   close() {
+    clearTimeout(this.timer);
     this.feed.close();
     this.resizes.disconnect();
     this.card.remove();

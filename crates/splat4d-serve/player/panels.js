@@ -17,7 +17,10 @@ const KEYS = [
   ['Down, up', 'Q', 'E'], ['Faster moves', 'Shift'], ['Turn', 'Shift + arrows'], ['Nearer, farther', '↑', '↓'],
   ['Add a path key', 'K'], ['Play the path', 'P'], ['Bullet time', 'B'], ['Full screen', 'F'], ['Figures', 'I'],
   ['Picture', 'G'], ['Light or dark', 'T'], ['This help', 'H', '?'],
-  ['Drag', 'orbit'], ['Right drag, two fingers', 'move'], ['Wheel, pinch', 'zoom'], ['Alt + wheel', 'field of view'],
+];
+const GESTURES = [
+  ['Drag', 'Turn'], ['Right drag, two fingers', 'Move'], ['Wheel, pinch', 'Nearer, farther'],
+  ['Alt + wheel', 'Field of view'],
 ];
 
 function panel(title, close, ...children) {
@@ -39,14 +42,14 @@ export function viewPanel(ui) {
   });
   const theme = segments('Theme', [['auto', 'Auto'], ['light', 'Light'], ['dark', 'Dark']], t => ui.setTheme(t));
   const figures = h('input', { type: 'checkbox', 'aria-label': 'Figures', onchange: () => ui.setFigures(figures.checked) });
-  const path = h('div', { class: 'wrap cramped' },
+  const path = h('div', { class: 'wrap narrow' },
     button('Back', () => player.step(-1), { 'aria-label': 'One frame back' }, 'back'),
     button('Next', () => player.step(1), { 'aria-label': 'One frame on' }, 'next'),
-    button('Full screen', () => ui.fullscreen(), {}, 'full'), button('Keys', () => ui.toggleHelp(), {}, 'help'));
+    button('Keys', () => ui.toggleHelp(), {}, 'help'));
   const node = panel('View', () => ui.open(null),
-    h('div', { class: 'field' }, channel),
+    h('div', { class: 'field cramped' }, channel),
     path,
-    field('Speed', speed), field('Loop', loop), field('Resolution', scale),
+    field('Speed', speed, 'narrow'), field('Loop', loop, 'narrow'), field('Resolution', scale),
     field('Background', ground), field('Theme', theme), field('Drawn with', backend), field('Figures', figures),
     h('div', { class: 'wrap' },
       button('Save picture', () => ui.screenshot(), {}, 'photo'),
@@ -118,7 +121,8 @@ function pathKey(ui, key, i) {
   const seconds = h('input', { type: 'number', step: 0.1, value: +key.time.toFixed(2),
     'aria-label': `Key ${i + 1}, second of the film`,
     onchange: () => { player.track.move(i, +seconds.value); seconds.value = +key.time.toFixed(2); } });
-  return h('li', {}, seconds, h('span', {}, key.sceneTime === null ? 's' : `s · at ${clock(key.sceneTime)}`),
+  const scene = key.sceneTime === null ? '' : ` · scene ${clock(key.sceneTime - player.first)}`;
+  return h('li', {}, h('b', {}, `${i + 1}`), seconds, h('span', {}, `s${scene}`),
     button('Go', () => ui.goTo(key), { 'aria-label': `Go to key ${i + 1}` }),
     tool('bin', `Delete key ${i + 1}`, () => { player.track.keys.splice(i, 1); ui.refresh(); }));
 }
@@ -128,7 +132,8 @@ export function helpPage(close) {
     h('section', { class: 'card help', role: 'dialog', 'aria-modal': 'true', 'aria-label': 'Keys and gestures' },
       h('div', { class: 'head' }, h('h2', {}, 'Keys and gestures'), tool('close', 'Close help', close)),
       h('dl', {}, ...KEYS.map(([what, ...keys]) => h('div', { class: 'pair' }, h('dt', {}, what),
-        h('dd', {}, ...keys.map(k => (k === '…' ? ' … ' : h('kbd', {}, k)))))))));
+        h('dd', {}, ...keys.map(k => (k === '…' ? ' … ' : h('kbd', {}, k)))))),
+      ...GESTURES.map(([what, does]) => h('div', { class: 'pair' }, h('dt', {}, what), h('dd', {}, does))))));
 }
 
 /** The figures card; refresh() reads the player's statistics. */

@@ -80,6 +80,7 @@ export class Player extends EventTarget {
   #frame = 0;
   #told = { time: null };
   #xr = false;
+  #still = null;
 
   constructor(stage) {
     super();
@@ -145,6 +146,7 @@ export class Player extends EventTarget {
   }
 
   #adopt(file, { keep, start }) {
+    if (keep) this.#freeze();
     this.#stream?.destroy();
     this.file?.close();
     this.file = file;
@@ -167,6 +169,18 @@ export class Player extends EventTarget {
     this.emit('camerachange', { camera: this.camera.toJSON() });
   }
 
+  /** The picture of now stays over the canvas until the next scene has one of its own. */
+  #freeze() {
+    if (!this.#stream || !this.canvas.width) return;
+    // A canvas can be copied only in the task that drew it.
+    this.#paint(performance.now(), this.scale);
+    this.#still?.remove();
+    const still = this.#still = document.createElement('canvas');
+    [still.width, still.height] = [this.canvas.width, this.canvas.height];
+    still.getContext('2d').drawImage(this.canvas, 0, 0);
+    this.canvas.after(still);
+  }
+
   /** Gives the scene to the backend, at first and after a lost device. */
   #attach() {
     this.backend.setScene(this.meta);
@@ -185,13 +199,21 @@ export class Player extends EventTarget {
   }
 
   async #firstPicture(run, began, keep) {
-    while (run === this.#run && !(this.#drawnAt > began && this.state !== 'error')) {
+    for (let shown = null, since = began; !shown || shown !== this.backend;) {
       await new Promise(done => setTimeout(done, 16));
-      if (this.state === 'error') return;
+      if (run !== this.#run || this.state === 'error') return;
+      if (this.#drawnAt <= since) continue;
+      shown = this.backend;
+      try { await shown?.settled(); } catch (error) {
+        // What is wrong with one backend another may do.
+        since = performance.now();
+        if (shown === this.backend) await this.#lost(error);
+        shown = null;
+      }
     }
-    await this.backend?.settled();
     if (run !== this.#run || this.state === 'error') return;
     if (!keep) this.figures.firstFrame = performance.now() - began;
+    this.#still?.remove();
     this.#become('ready');
   }
 
@@ -203,6 +225,7 @@ export class Player extends EventTarget {
   }
 
   fail(error, source) {
+    this.#still?.remove();
     const where = typeof source === 'string' ? source : source?.name;
     const told = error instanceof SceneError ? error : Object.assign(new SceneError(
       error.message || String(error), where ?? 'player',
@@ -232,10 +255,13 @@ export class Player extends EventTarget {
   /** WebGPU where there is one, else WebGL2; a canvas that one of them has touched is of no use to the other. */
   async #makeBackend() {
     const wanted = this.backendName === 'auto' ? ['webgpu', 'webgl2'] : [this.backendName];
+    // A second loss makes WebGPU the less likely of the two.
+    if (this.#losses.length > 1) wanted.reverse();
     const reasons = [];
     for (const name of wanted) {
+      const { canvas } = this;
+      const onlost = reason => canvas === this.canvas && this.#lost(reason);
       try {
-        const onlost = reason => this.#lost(reason);
         if (name === 'webgpu') {
           if (!navigator.gpu) throw new Error(isSecureContext ? 'not offered' : 'needs https or this computer');
           this.backend = await (await import('./webgpu.js')).WebGPUBackend.create(this.canvas, { onlost });
@@ -262,7 +288,7 @@ export class Player extends EventTarget {
     const now = performance.now();
     this.#losses = this.#losses.filter(t => now - t < 60000).concat(now);
     if (this.#losses.length > LOSSES) {
-      return this.fail(new SceneError('The graphics device was lost again and again', String(reason ?? 'GPU'),
+      return this.fail(new SceneError('The graphics device was lost again and again', reason?.message ?? 'GPU',
         'Close other pages that use the GPU, lower the resolution, then load the page again.'));
     }
     await this.#rebuild().catch(error => this.fail(error));
@@ -426,7 +452,7 @@ export class Player extends EventTarget {
   }
 
   #moveTime(dt) {
-    if (!this.playing) return;
+    if (!this.playing || this.state !== 'ready') return;
     const waiting = this.#stream.ready(this.time) < ENOUGH;
     if (waiting !== this.waiting) { this.waiting = waiting; this.emit('waiting', { waiting }); }
     if (waiting) return;
@@ -474,8 +500,8 @@ export class Player extends EventTarget {
       this.#told.size = size.join();
       this.backend.resize(...size);
     }
-    this.backend.draw(this.drawing(...size));
-    this.#drawnAt = now;
+    try { this.backend.draw(this.drawing(...size)); } catch (error) { return this.#lost(error); }
+    this.#drawnAt = performance.now();
   }
 
   /** What a backend is told to draw now, at a size in px. */

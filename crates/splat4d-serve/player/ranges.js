@@ -18,9 +18,11 @@ export class Local {
   bytesRead = 0;
   constructor(source) {
     this.blob = source instanceof Blob ? source : null;
-    this.bytes = this.blob ? null : ArrayBuffer.isView(source)
-      ? new Uint8Array(source.buffer, source.byteOffset, source.byteLength)
-      : new Uint8Array(source);
+    this.bytes = this.blob
+      ? null
+      : ArrayBuffer.isView(source)
+        ? new Uint8Array(source.buffer, source.byteOffset, source.byteLength)
+        : new Uint8Array(source);
     this.size = this.blob ? this.blob.size : this.bytes.length;
   }
   async read(offset, length, signal) {
@@ -31,7 +33,12 @@ export class Local {
     try {
       return new Uint8Array(await this.blob.slice(offset, end).arrayBuffer());
     } catch (e) {
-      throw new SceneError('The file could not be read', this.blob.name, 'Was it moved or changed? Choose it again.', e);
+      throw new SceneError(
+        'The file could not be read',
+        this.blob.name,
+        'Was it moved or changed? Choose it again.',
+        e,
+      );
     }
   }
   close() {}
@@ -70,9 +77,14 @@ export class Remote {
     } catch (e) {
       if (signal?.aborted || e instanceof SceneError) throw e;
       const local = /^file:/.test(new URL(this.url, globalThis.location?.href).protocol);
-      throw new SceneError('The scene could not be fetched', this.url, local
-        ? 'A browser reads no files beside a page: open it with the file button, or serve the folder.'
-        : 'Check the address and the connection; a server of another site must allow it (CORS).', e);
+      throw new SceneError(
+        'The scene could not be fetched',
+        this.url,
+        local
+          ? 'A browser reads no files beside a page: open it with the file button, or serve the folder.'
+          : 'Check the address and the connection; a server of another site must allow it (CORS).',
+        e,
+      );
     }
   }
 
@@ -109,9 +121,10 @@ export class Remote {
       const first = this.#queue.shift();
       if (first.done) continue;
       const run = [first];
-      for (let grown = true, end = first.offset + first.length; grown; ) {
-        const i = this.#queue.findIndex((j) => !j.done && j.offset >= end && j.offset <= end + GAP
-          && j.offset + j.length - first.offset <= RUN);
+      for (let grown = true, end = first.offset + first.length; grown;) {
+        const i = this.#queue.findIndex(
+          (j) => !j.done && j.offset >= end && j.offset <= end + GAP && j.offset + j.length - first.offset <= RUN,
+        );
         grown = i >= 0;
         if (grown) {
           const [job] = this.#queue.splice(i, 1);
@@ -137,7 +150,8 @@ export class Remote {
       await this.#twice(async () => {
         const open = run.filter((j) => !j.done);
         if (!open.length) return;
-        const offset = open[0].offset, last = open[open.length - 1];
+        const offset = open[0].offset,
+          last = open[open.length - 1];
         const length = last.offset + last.length - offset;
         const response = await this.#request(offset, length, stop.signal);
         if (response.status !== 206) {
@@ -156,8 +170,10 @@ export class Remote {
         if (bytes.length < length) throw new TypeError('the connection ended early');
       }, stop.signal);
     } catch (e) {
-      const error = e instanceof SceneError || stop.signal.aborted ? e
-        : new SceneError('The connection failed', this.url, 'The player goes on when it is back.', e);
+      const error =
+        e instanceof SceneError || stop.signal.aborted
+          ? e
+          : new SceneError('The connection failed', this.url, 'The player goes on when it is back.', e);
       for (const job of run) {
         if (!job.done) {
           job.settle();
@@ -188,9 +204,12 @@ export class Remote {
     if (response.status === 200 || response.status === 206) return response;
     response.body?.cancel().catch(() => {});
     const error = new SceneError(
-      response.status === 416 ? 'The file is shorter than its index says, or empty'
+      response.status === 416
+        ? 'The file is shorter than its index says, or empty'
         : `The server answered ${response.status} ${response.statusText}`.trimEnd(),
-      this.url, response.status === 404 ? 'Check the address.' : '');
+      this.url,
+      response.status === 404 ? 'Check the address.' : '',
+    );
     error.transient = response.status >= 500 || response.status === 429;
     throw error;
   }
@@ -198,7 +217,8 @@ export class Remote {
   /// All bytes of a response, at most `limit` where one is given.
   async #body(response, progress, limit = 0, answer = null) {
     const reader = response.body.getReader();
-    let bytes = new Uint8Array(limit || 1 << 16), n = 0;
+    let bytes = new Uint8Array(limit || 1 << 16),
+      n = 0;
     for (;;) {
       const { done, value } = await reader.read();
       if (done) return bytes.subarray(0, n);

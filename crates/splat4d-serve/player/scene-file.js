@@ -8,10 +8,17 @@ import { Local, Remote } from './ranges.js';
 /// First request, bytes: header and index of most files, and often the poster.
 const FIRST = 65536;
 /// Sizes of docs/format.md.
-const HEAD = 64, ENTRY = 64, BLOCK = 256, BLOCK_BYTES = 96, WORDS = 8;
+const HEAD = 64,
+  ENTRY = 64,
+  BLOCK = 256,
+  BLOCK_BYTES = 96,
+  WORDS = 8;
 const MAGIC = [0x89, 0x53, 0x34, 0x44, 0x0d, 0x0a, 0x1a, 0x0a];
 const MAJOR = 1;
-const MAX_INDEX = 64 << 20, MAX_SECTIONS = 1e6, MAX_COUNT = 65536, NO_PALETTE = 0xffffffff;
+const MAX_INDEX = 64 << 20,
+  MAX_SECTIONS = 1e6,
+  MAX_COUNT = 65536,
+  NO_PALETTE = 0xffffffff;
 /// Deflate shrinks at most 1 : 1032 (RFC 1951: 258 bytes from two bits).
 const DEFLATE_RATIO = 1032;
 /// A poster larger than this is no preview, bytes.
@@ -98,7 +105,8 @@ export class SceneFile {
     file.#where = remote ? String(source) : source?.name || 'the file';
     file.#source = remote ? new Remote(String(source)) : new Local(source);
     try {
-      const read = (length) => remote ? file.#source.open(length, signal, onprogress) : file.#source.read(0, length, signal);
+      const read = (length) =>
+        remote ? file.#source.open(length, signal, onprogress) : file.#source.read(0, length, signal);
       await file.#start(await read(FIRST), signal);
     } catch (e) {
       file.close();
@@ -129,7 +137,8 @@ export class SceneFile {
   /// Length of the file, bytes.
   bytesTotal = 0;
 
-  /// Fetches, checks and decodes page `id`: {id, count, headers: Float32Array(24·blocks), words: Uint32Array(8·count)}.
+  /// Fetches, checks and decodes page `id`: {id, count, headers: Float32Array(24·blocks), words: Uint32Array(8·count),
+  /// word w of Gaussian i at [8i + w]}.
   async page(id, { signal } = {}) {
     const entry = this.sections[id];
     return { id, ...(await this.#decoded(entry, signal, this.sections[entry.palette]?.count ?? 0)) };
@@ -169,8 +178,7 @@ export class SceneFile {
     const { kind, offset, stored, crc, codec, bytes, count, degree, id, missing } = entry;
     const where = `${this.#where}, section ${id}`;
     if (missing) throw new SceneError('The file was cut short before this part', where, DAMAGED);
-    const data = offset + stored <= this.#head.length ? this.#head.slice(offset, offset + stored)
-      : await this.#source.read(offset, stored, signal);
+    const data = await this.#bytes(offset, stored, signal);
     signal?.throwIfAborted();
     try {
       if (data.length !== stored) throw new Error('the file ends before it');
@@ -179,6 +187,18 @@ export class SceneFile {
       if (isAbort(e)) throw e;
       throw new SceneError(`A part of the scene cannot be read: ${e.message}`, where, DAMAGED, e);
     }
+  }
+
+  /// Bytes of the file; what the first request brought is not fetched again.
+  async #bytes(offset, length, signal) {
+    const known = this.#head.slice(offset, offset + length);
+    if (known.length === length) return known;
+    const rest = await this.#source.read(offset + known.length, length - known.length, signal);
+    if (!known.length) return rest;
+    const data = new Uint8Array(known.length + rest.length);
+    data.set(known);
+    data.set(rest, known.length);
+    return data;
   }
 
   #refuse(what, remedy = DAMAGED) {
@@ -190,7 +210,8 @@ export class SceneFile {
       this.#refuse('This is no .splat4d file', 'Bake or convert the scene to .splat4d first.');
     }
     const view = new DataView(head.buffer, head.byteOffset, head.byteLength);
-    if (view.getUint32(60, true) !== crc32(head.subarray(0, 60))) this.#refuse('The header is damaged: its checksum differs');
+    if (view.getUint32(60, true) !== crc32(head.subarray(0, 60)))
+      this.#refuse('The header is damaged: its checksum differs');
     const major = view.getUint16(8, true);
     if (major !== MAJOR) {
       this.#refuse(`This file has version ${major}, this player reads ${MAJOR}`, 'Use a newer player.');
@@ -200,18 +221,11 @@ export class SceneFile {
     this.bytesTotal = Math.min(length, this.#source.size);
     this.truncated = this.#source.size < length;
     if (indexBytes > MAX_INDEX || HEAD + indexBytes > length) this.#refuse('The index is longer than may be');
-    let index = head.subarray(HEAD, HEAD + indexBytes);
-    if (index.length < indexBytes) {
-      if (HEAD + indexBytes > this.bytesTotal) this.#refuse('The file is cut short inside its index');
-      const rest = await this.#source.read(head.length, HEAD + indexBytes - head.length, signal);
-      const whole = new Uint8Array(index.length + rest.length);
-      whole.set(index);
-      whole.set(rest, index.length);
-      index = whole;
-      if (index.length !== indexBytes) this.#refuse('The file is cut short inside its index');
-    }
-    if (crc32(index) !== view.getUint32(24, true)) this.#refuse('The index is damaged: its checksum differs');
     this.#head = head;
+    const whole = HEAD + indexBytes <= this.bytesTotal;
+    const index = whole ? await this.#bytes(HEAD, indexBytes, signal) : [];
+    if (index.length !== indexBytes) this.#refuse('The file is cut short inside its index');
+    if (crc32(index) !== view.getUint32(24, true)) this.#refuse('The index is damaged: its checksum differs');
     this.#index(index, HEAD + indexBytes, length);
   }
 
@@ -225,7 +239,8 @@ export class SceneFile {
     } catch {
       this.#refuse("The scene's description is no valid JSON");
     }
-    const table = 8 + jsonBytes, count = view.getUint32(4 + jsonBytes, true);
+    const table = 8 + jsonBytes,
+      count = view.getUint32(4 + jsonBytes, true);
     if (count > MAX_SECTIONS || index.length !== table + count * ENTRY) {
       this.#refuse(`The index is no table of ${count} sections`);
     }
@@ -272,8 +287,10 @@ export class SceneFile {
       refuse(`has ${section.words} words a Gaussian, not ${WORDS}`, 'Use a newer player.');
     }
     if (kind === 'PALT' && !(level >= 1 && level <= 3)) refuse(`has degree ${level}, not 1 to 3`);
-    const right = kind === 'PAGE' ? Math.ceil(count / BLOCK) * BLOCK_BYTES + 4 * WORDS * count
-      : 12 + 3 * ((level + 1) ** 2 - 1) * count;
+    const right =
+      kind === 'PAGE'
+        ? Math.ceil(count / BLOCK) * BLOCK_BYTES + 4 * WORDS * count
+        : 12 + 3 * ((level + 1) ** 2 - 1) * count;
     if (bytes !== right) refuse(`decodes to ${bytes} bytes, not the ${right} that its ${count} entries need`);
     // Deflate stores what it cannot shrink with few bytes more; twice is nothing that a writer makes.
     if (stored > 2 * bytes) refuse('is longer packed than unpacked');
@@ -296,12 +313,23 @@ export class SceneFile {
     const box = Array.isArray(j.box) && j.box.length === 2 && j.box.every((c) => numbers(c, 3)) ? j.box : null;
     const up = j.up.map((v) => v / Math.hypot(...j.up));
     return {
-      clip: [...j.clip], fps: j.fps, up, background: j.background.map((v) => Math.min(Math.max(v, 0), 1)),
-      sh_degree: j.sh_degree, gaussians: j.gaussians, unit: number(j.unit) && j.unit > 0 ? j.unit : null,
-      title: text(j.title), generator: text(j.generator), box,
+      clip: [...j.clip],
+      fps: j.fps,
+      up,
+      background: j.background.map((v) => Math.min(Math.max(v, 0), 1)),
+      sh_degree: j.sh_degree,
+      gaussians: j.gaussians,
+      unit: number(j.unit) && j.unit > 0 ? j.unit : null,
+      title: text(j.title),
+      generator: text(j.generator),
+      box,
       view: look(j.view) ? j.view : null,
-      cameras: list(j.cameras).filter(camera).map((c, i) => ({ ...c, name: text(c.name) ?? `camera ${i + 1}` })),
-      path: list(j.path).filter((k) => look(k) && number(k.at)).map((k) => ({ ...k, time: number(k.time) ? k.time : null })),
+      cameras: list(j.cameras)
+        .filter(camera)
+        .map((c, i) => ({ ...c, name: text(c.name) ?? `camera ${i + 1}` })),
+      path: list(j.path)
+        .filter((k) => look(k) && number(k.at))
+        .map((k) => ({ ...k, time: number(k.time) ? k.time : null })),
     };
   }
 }
@@ -309,10 +337,20 @@ export class SceneFile {
 const number = (v) => typeof v === 'number' && Number.isFinite(v);
 const numbers = (v, n) => Array.isArray(v) && v.length === n && v.every(number);
 const list = (v) => (Array.isArray(v) ? v : []);
-const look = (v) => v && numbers(v.position, 3) && numbers(v.target, 3) && numbers(v.up, 3) && number(v.fov_y)
-  && v.fov_y > 0 && v.fov_y < 180;
-const camera = (v) => v && numbers(v.world_from_camera, 12) && number(v.cx) && number(v.cy)
-  && [v.width, v.height, v.fx, v.fy].every((n) => number(n) && n > 0);
+const look = (v) =>
+  v &&
+  numbers(v.position, 3) &&
+  numbers(v.target, 3) &&
+  numbers(v.up, 3) &&
+  number(v.fov_y) &&
+  v.fov_y > 0 &&
+  v.fov_y < 180;
+const camera = (v) =>
+  v &&
+  numbers(v.world_from_camera, 12) &&
+  number(v.cx) &&
+  number(v.cy) &&
+  [v.width, v.height, v.fx, v.fy].every((n) => number(n) && n > 0);
 
 /// A u64, as a float: beyond 2⁵³ it is no length that exists, and fails the comparison with what is there.
 function long(view, at) {

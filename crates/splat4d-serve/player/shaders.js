@@ -284,6 +284,8 @@ export const SORT = `
 const SORT_THREADS: u32 = 256u;
 const SORT_ROUNDS: u32 = 8u;
 const SORT_BLOCK: u32 = 2048u;
+const SORT_ROW: u32 = 16u;
+const SORT_FEW: u32 = 32u;
 const SORT_WORDS: u32 = 8u;
 struct SortPass {
 shift: u32,
@@ -298,6 +300,7 @@ count_index: u32,
 @group(0) @binding(6) var<storage, read_write> sort_counts: array<u32>;
 var<workgroup> sort_digits: array<atomic<u32>, 256>;
 var<workgroup> sort_sums: array<u32, 256>;
+var<workgroup> sort_rows: array<u32, 16>;
 var<workgroup> sort_masks: array<atomic<u32>, 2048>;
 fn sort_pairs() -> u32 {
 return min(sort_count[sort_pass.count_index], arrayLength(&keys_in));
@@ -329,20 +332,33 @@ sort_counts[thread * blocks + block] = atomicLoad(&sort_digits[thread]);
 fn sort_exclusive(thread: u32, value: u32) -> u32 {
 sort_sums[thread] = value;
 workgroupBarrier();
-for (var step = 1u; step < SORT_THREADS; step *= 2u) {
-var below = 0u;
-if (thread >= step) {
-below = sort_sums[thread - step];
+if (thread < SORT_ROW) {
+var sum = 0u;
+for (var i = 0u; i < SORT_ROW; i++) {
+sum += sort_sums[thread * SORT_ROW + i];
+}
+sort_rows[thread] = sum;
 }
 workgroupBarrier();
-sort_sums[thread] += below;
-workgroupBarrier();
+let row = thread / SORT_ROW;
+var before = 0u;
+for (var r = 0u; r < row; r++) {
+before += sort_rows[r];
 }
-return sort_sums[thread] - value;
+for (var i = row * SORT_ROW; i < thread; i++) {
+before += sort_sums[i];
+}
+return before;
 }
 @compute @workgroup_size(256)
 fn scan(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) thread: u32) {
 let blocks = sort_blocks();
+if (blocks <= SORT_FEW) {
+if (group.x == 0u) {
+sort_counts[SORT_THREADS * blocks + thread] = sort_run(thread * blocks, thread * blocks + blocks, 0u);
+}
+return;
+}
 let digit = group.x;
 let run = (blocks + SORT_THREADS - 1u) / SORT_THREADS;
 let first = min(thread * run, blocks);
@@ -351,15 +367,20 @@ var sum = 0u;
 for (var b = first; b < end; b++) {
 sum += sort_counts[digit * blocks + b];
 }
-var before = sort_exclusive(thread, sum);
+let before = sort_exclusive(thread, sum);
 if (thread == SORT_THREADS - 1u) {
 sort_counts[SORT_THREADS * blocks + digit] = before + sum;
 }
-for (var b = first; b < end; b++) {
-let count = sort_counts[digit * blocks + b];
-sort_counts[digit * blocks + b] = before;
+_ = sort_run(digit * blocks + first, digit * blocks + end, before);
+}
+fn sort_run(first: u32, end: u32, start: u32) -> u32 {
+var before = start;
+for (var i = first; i < end; i++) {
+let count = sort_counts[i];
+sort_counts[i] = before;
 before += count;
 }
+return before;
 }
 @compute @workgroup_size(256)
 fn scatter(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) thread: u32) {
@@ -438,19 +459,21 @@ far: atomic<u32>,
 @group(0) @binding(3) var<storage, read> block_list: array<u32>;
 @group(0) @binding(4) var<storage, read> palette: array<u32>;
 @group(0) @binding(5) var<storage, read_write> records: array<Record>;
-@group(0) @binding(6) var<storage, read_write> counts: array<u32>;
+@group(0) @binding(6) var<storage, read_write> masks: array<atomic<u32>>;
 @group(0) @binding(7) var<storage, read_write> range: Range;
 @group(0) @binding(8) var<storage, read_write> arguments: array<u32>;
 @group(0) @binding(9) var<storage, read_write> keys: array<u32>;
 @group(0) @binding(10) var<storage, read_write> places: array<u32>;
+@group(0) @binding(11) var<storage, read_write> firsts: array<u32>;
 const BLOCK: u32 = 256u;
 const SIGMAS: f32 = 3.34;
 const LIFE_REACHES: f32 = 1.12;
 const KEY_MAX: f32 = 65535.0;
+const CORNERS: u32 = 6u;
+const MASKS: u32 = 8u;
 const PAIRS: u32 = 2048u;
-var<workgroup> group_mask: array<atomic<u32>, 8>;
-var<workgroup> group_near: atomic<u32>;
-var<workgroup> group_far: atomic<u32>;
+const SCAN_GROUPS: u32 = 256u;
+const FEW_PAIRS: u32 = 65536u;
 var<workgroup> group_sums: array<u32, 256>;
 fn block_hidden(header: array<vec4<f32>, 6>, span: f32) -> bool {
 let t = frame.view.time;
@@ -540,25 +563,23 @@ return;
 let block = block_list[slot];
 let header = blocks[block].f;
 let span = blocks[block].span;
-if (block_hidden(header, span)) {
-if (thread == 0u) {
-counts[slot] = 0u;
-}
+if (thread >= blocks[block].count || block_hidden(header, span)) {
 return;
 }
-var record: Record;
-var visible = false;
-if (thread < blocks[block].count) {
 let i = 2u * (block * BLOCK + thread);
 let a = words[i];
 let b = words[i + 1u];
 let w = array<u32, 8>(a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w);
 let life = life_at(w, header, span, frame.view.time);
-if (opacity_at(w, life) >= frame.view.alpha_min) {
+if (!(opacity_at(w, life) >= frame.view.alpha_min)) {
+return;
+}
 let g = gaussian(w, header, life);
 let ellipse = project(frame.view, g.mean, covariance(g.quat, g.scale), g.opacity);
-visible = ellipse.visible != 0u;
-if (visible) {
+if (ellipse.visible == 0u) {
+return;
+}
+var record: Record;
 record.center = ellipse.center;
 record.depth = ellipse.depth;
 set_axes(&record, ellipse);
@@ -569,34 +590,22 @@ rgb = sight_color(g.base, g.mean, g.label, block);
 rgb = flow_color(flow(g.mean, g.velocity));
 }
 record.color = vec2<u32>(pack2x16float(rgb.xy), pack2x16float(vec2<f32>(rgb.z, g.opacity * ellipse.rho)));
+records[slot * BLOCK + thread] = record;
+atomicOr(&masks[slot * MASKS + thread / 32u], 1u << (thread % 32u));
+let depth = bitcast<u32>(record.depth);
+if (depth < atomicLoad(&range.near)) {
+atomicMin(&range.near, depth);
+}
+if (depth > atomicLoad(&range.far)) {
+atomicMax(&range.far, depth);
 }
 }
+fn records_of(slot: u32) -> u32 {
+var sum = 0u;
+for (var w = 0u; w < MASKS; w++) {
+sum += countOneBits(atomicLoad(&masks[slot * MASKS + w]));
 }
-if (thread == 0u) {
-atomicStore(&group_near, 0xffffffffu);
-}
-workgroupBarrier();
-if (visible) {
-atomicOr(&group_mask[thread / 32u], 1u << (thread % 32u));
-atomicMin(&group_near, bitcast<u32>(record.depth));
-atomicMax(&group_far, bitcast<u32>(record.depth));
-}
-workgroupBarrier();
-var rank = countOneBits(atomicLoad(&group_mask[thread / 32u]) & ((1u << (thread % 32u)) - 1u));
-for (var w = 0u; w < thread / 32u; w++) {
-rank += countOneBits(atomicLoad(&group_mask[w]));
-}
-if (visible) {
-records[slot * BLOCK + rank] = record;
-}
-if (thread == BLOCK - 1u) {
-let count = rank + u32(visible);
-counts[slot] = count;
-if (count > 0u) {
-atomicMin(&range.near, atomicLoad(&group_near));
-atomicMax(&range.far, atomicLoad(&group_far));
-}
-}
+return sum;
 }
 @compute @workgroup_size(256)
 fn total(@builtin(local_invocation_index) thread: u32) {
@@ -606,7 +615,7 @@ let first = min(thread * run, n);
 let end = min(first + run, n);
 var sum = 0u;
 for (var i = first; i < end; i++) {
-sum += counts[i];
+sum += records_of(i);
 }
 group_sums[thread] = sum;
 workgroupBarrier();
@@ -621,21 +630,22 @@ workgroupBarrier();
 }
 var before = group_sums[thread] - sum;
 for (var i = first; i < end; i++) {
-let count = counts[i];
-counts[i] = before;
-before += count;
+firsts[i] = before;
+before += records_of(i);
 }
 if (thread == BLOCK - 1u) {
 let all = group_sums[thread];
-counts[n] = all;
 arguments[0] = (all + PAIRS - 1u) / PAIRS;
 arguments[1] = 1u;
 arguments[2] = 1u;
 arguments[3] = all;
-arguments[4] = 4u;
-arguments[5] = all;
+arguments[4] = CORNERS * all;
+arguments[5] = 1u;
 arguments[6] = 0u;
 arguments[7] = 0u;
+arguments[8] = select(SCAN_GROUPS, 1u, all <= FEW_PAIRS);
+arguments[9] = 1u;
+arguments[10] = 1u;
 }
 }
 @compute @workgroup_size(256)
@@ -648,25 +658,32 @@ let slot = group.x + group.y * groups.x;
 if (slot >= frame.view.count) {
 return;
 }
-let first = counts[slot];
-if (thread >= counts[slot + 1u] - first) {
+let word = thread / 32u;
+let bit = 1u << (thread % 32u);
+let mask = atomicLoad(&masks[slot * MASKS + word]);
+if ((mask & bit) == 0u) {
 return;
+}
+var to = firsts[slot] + countOneBits(mask & (bit - 1u));
+for (var w = 0u; w < word; w++) {
+to += countOneBits(atomicLoad(&masks[slot * MASKS + w]));
 }
 let place = slot * BLOCK + thread;
 let near = atomicLoad(&range.near);
 let width = max(f32(atomicLoad(&range.far) - near), 1.0);
 let above = f32(bitcast<u32>(records[place].depth) - near);
-keys[first + thread] = u32(min(above / width, 1.0) * KEY_MAX);
-places[first + thread] = place;
+keys[to] = u32(min(above / width, 1.0) * KEY_MAX);
+places[to] = place;
 }
 `;
 
 export const DRAW = `
-@group(0) @binding(11) var<storage, read> drawn: array<Record>;
-@group(0) @binding(12) var<storage, read> order: array<u32>;
-@group(0) @binding(13) var<storage, read> drawn_count: array<u32>;
-@group(0) @binding(14) var picture: texture_2d<f32>;
+@group(0) @binding(12) var<storage, read> drawn: array<Record>;
+@group(0) @binding(13) var<storage, read> order: array<u32>;
+@group(0) @binding(14) var<storage, read> drawn_count: array<u32>;
+@group(0) @binding(15) var picture: texture_2d<f32>;
 const ALPHA_MAX: f32 = 0.99;
+const CORNER_BITS: u32 = 0xda4u;
 const COUNT: u32 = 3u;
 struct Corner {
 @builtin(position) position: vec4<f32>,
@@ -674,8 +691,9 @@ struct Corner {
 @location(1) @interpolate(flat) color: vec4<f32>,
 }
 @vertex
-fn corner(@builtin(vertex_index) k: u32, @builtin(instance_index) i: u32) -> Corner {
-let record = drawn[order[drawn_count[COUNT] - 1u - i]];
+fn corner(@builtin(vertex_index) vertex: u32) -> Corner {
+let record = drawn[order[drawn_count[COUNT] - 1u - vertex / CORNERS]];
+let k = (CORNER_BITS >> (2u * (vertex % CORNERS))) & 3u;
 let rg = unpack2x16float(record.color.x);
 let ba = unpack2x16float(record.color.y);
 let radius = sqrt(max(cutoff(frame.view, ba.y), 0.0));

@@ -2,7 +2,9 @@
 // imports (it must run from a blob URL). `path` is the motion of docs/format.md; motion.js builds on it.
 
 /// Gaussians a block header describes, its f32 numbers, words a Gaussian (docs/format.md).
-const BLOCK = 256, HEADER = 24, WORDS = 8;
+const BLOCK = 256,
+  HEADER = 24,
+  WORDS = 8;
 /// Gaussians a row of the backend's texture: 2048 texels, two each.
 export const ROW = 1024;
 /// Numbers kept of a Gaussian: position at the page's first second, velocity, first and last second it can be seen.
@@ -24,7 +26,9 @@ export const lerp = (a, b, u) => a + (b - a) * u;
 /// Motion and life of Gaussian `i` of a page whose span is `span` long, into `out`: mean at the life's centre (3), that
 /// centre, velocity (3), half-width, softness, opacity, reach.
 export function path(words, headers, i, span, out) {
-  const w = WORDS * i, f = HEADER * Math.floor(i / BLOCK), h = headers;
+  const w = WORDS * i,
+    f = HEADER * Math.floor(i / BLOCK),
+    h = headers;
   out[0] = lerp(h[f], h[f + 3], (words[w] & 0xffff) / 65535);
   out[1] = lerp(h[f + 1], h[f + 4], (words[w] >>> 16) / 65535);
   out[2] = lerp(h[f + 2], h[f + 5], (words[w + 1] & 0xffff) / 65535);
@@ -45,7 +49,7 @@ export function path(words, headers, i, span, out) {
 export class Sorter {
   #pages = [];
   #depths = new Float32Array(0);
-  #bits = new Uint32Array(0);
+  #bits = new Int32Array(0);
   #ids = new Uint32Array(0);
   #keys = new Uint16Array(0);
   #starts = new Uint32Array(KEYS);
@@ -53,11 +57,13 @@ export class Sorter {
 
   /// `page`: {id, row: its first row in the texture, count, words, headers, from, to}.
   add({ id, row, count, words, headers, from, to }) {
-    const track = new Float32Array(TRACK * count), p = new Float64Array(11);
+    const track = new Float32Array(TRACK * count),
+      p = new Float64Array(11);
     const blocks = new Float64Array(2 * Math.ceil(count / BLOCK));
     for (let i = 0; i < count; i++) {
       path(words, headers, i, to - from, p);
-      const o = TRACK * i, c = p[3] - from;
+      const o = TRACK * i,
+        c = p[3] - from;
       for (let k = 0; k < 3; k++) {
         track[o + k] = p[k] - p[4 + k] * c;
         track[o + 3 + k] = p[4 + k];
@@ -67,7 +73,7 @@ export class Sorter {
       track[o + 6] = p[9] < ALPHA_MIN ? Infinity : p[7] === Infinity ? -Infinity : c - p[7] - tail - SLACK;
       track[o + 7] = p[9] < ALPHA_MIN ? -Infinity : p[7] === Infinity ? Infinity : c + p[7] + tail + SLACK;
       const b = i >> 8;
-      if (i % BLOCK === 0) (blocks[2 * b] = Infinity), (blocks[2 * b + 1] = -Infinity);
+      if (i % BLOCK === 0) ((blocks[2 * b] = Infinity), (blocks[2 * b + 1] = -Infinity));
       blocks[2 * b] = Math.min(blocks[2 * b], track[o + 6]);
       blocks[2 * b + 1] = Math.max(blocks[2 * b + 1], track[o + 7]);
     }
@@ -80,23 +86,36 @@ export class Sorter {
     this.#pages = this.#pages.filter((p) => p.id !== id);
   }
 
-  /// Room that an order needs, in numbers.
+  /// `order` where it has room for everybody, else a new one: whole rows of ROW numbers.
+  room(order) {
+    const rows = Math.ceil(this.total / ROW);
+    return order?.length >= rows * ROW ? order : new Uint32Array(rows * ROW);
+  }
+
+  /// Gaussians of all pages.
   get total() {
     return this.#pages.reduce((n, p) => n + p.count, 0);
   }
 
   /// Writes the visible Gaussians (row·1024 + column) at `time` into `out`, the farthest first, by the camera's depth
-  /// z = a·x + b·y + c·z + d for `depth` [a, b, c, d]. Returns {count, active: Gaussians of the pages of this moment}.
+  /// z = a·x + b·y + c·z + d for `depth` [a, b, c, d]. Returns {count, active: Gaussians of this moment's pages}.
   sort({ time, depth: [a, b, c, d], near }, out) {
     const total = this.total;
     if (this.#depths.length < total) {
       this.#depths = new Float32Array(total);
-      this.#bits = new Uint32Array(this.#depths.buffer);
+      this.#bits = new Int32Array(this.#depths.buffer);
       this.#ids = new Uint32Array(total);
       this.#keys = new Uint16Array(total);
     }
-    const depths = this.#depths, bits = this.#bits, ids = this.#ids, keys = this.#keys, starts = this.#starts;
-    let n = 0, active = 0, low = Infinity, high = 0;
+    const depths = this.#depths,
+      bits = this.#bits,
+      ids = this.#ids,
+      keys = this.#keys,
+      starts = this.#starts;
+    let n = 0,
+      active = 0,
+      low = Infinity,
+      high = 0;
     for (const { row, count, from, to, track, blocks } of this.#pages) {
       if (!(from <= time && time < to)) continue;
       active += count;
@@ -106,8 +125,11 @@ export class Sorter {
         const end = Math.min(first + BLOCK, count);
         for (let i = first, o = TRACK * first; i < end; i++, o += TRACK) {
           if (t < track[o + 6] || t > track[o + 7]) continue;
-          const z = a * (track[o] + track[o + 3] * t) + b * (track[o + 1] + track[o + 4] * t)
-            + c * (track[o + 2] + track[o + 5] * t) + d;
+          const z =
+            a * (track[o] + track[o + 3] * t) +
+            b * (track[o + 1] + track[o + 4] * t) +
+            c * (track[o + 2] + track[o + 5] * t) +
+            d;
           // Phrased so that a NaN is left out too.
           if (!(z > near && z < Infinity)) continue;
           depths[n] = z;
@@ -121,11 +143,12 @@ export class Sorter {
     // The bits of positive floats grow like their logarithm, bent a little: near and far get alike fine steps.
     this.#range[0] = low;
     this.#range[1] = high;
-    const edge = new Uint32Array(this.#range.buffer);
-    const least = edge[0], scale = edge[1] > least ? (KEYS - 1) / (edge[1] - least) : 0;
+    const edge = new Int32Array(this.#range.buffer);
+    const least = edge[0],
+      scale = edge[1] > least ? (KEYS - 1) / (edge[1] - least) : 0;
     starts.fill(0);
     for (let i = 0; i < n; i++) {
-      const key = KEYS - 1 - Math.floor((bits[i] - least) * scale);
+      const key = KEYS - 1 - (((bits[i] - least) * scale) | 0);
       keys[i] = key;
       starts[key]++;
     }
@@ -146,9 +169,10 @@ if (typeof WorkerGlobalScope !== 'undefined' && self instanceof WorkerGlobalScop
     if (data.add) return sorter.add(data.add);
     if (data.drop !== undefined) return sorter.drop(data.drop);
     const begin = performance.now();
-    const order = data.order?.length >= sorter.total ? data.order : new Uint32Array(sorter.total);
+    const order = sorter.room(data.order);
     const { count, active } = sorter.sort(data.sort, order);
     const ms = performance.now() - begin;
     self.postMessage({ order, count, active, ms, generation: data.generation }, [order.buffer]);
   };
+  self.postMessage({ ready: true });
 }

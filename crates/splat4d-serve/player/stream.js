@@ -4,17 +4,21 @@
 import { isAbort } from './errors.js';
 
 /// Bytes of 32-bit words that stay resident, by default, and on small machines (navigator.deviceMemory, GiB).
-const BUDGET = 512 << 20, SMALL_BUDGET = 128 << 20, SMALL_MEMORY = 4;
+const BUDGET = 512 << 20,
+  SMALL_BUDGET = 128 << 20,
+  SMALL_MEMORY = 4;
 /// Bytes a Gaussian (docs/format.md: 8 words).
 const GAUSSIAN = 32;
 /// Looked ahead while playing, s of the viewer's time; to both sides while not, s of the scene's.
-const AHEAD = 2, BESIDE = 0.5;
+const AHEAD = 2,
+  BESIDE = 0.5;
 /// Times on the scene clock change each frame; a plan is made anew when one moved by this part of what is looked ahead.
 const STEP = 8;
 /// Pages in flight for later: few, so that a seek is not behind many.
 const LATER = 4;
 /// A page is tried this often; after the last failure it rests, ms.
-const TRIES = 2, REST = 10_000;
+const TRIES = 2,
+  REST = 10_000;
 
 /// The budget for this machine, bytes.
 export function defaultBudget() {
@@ -75,7 +79,8 @@ export class Stream {
     const t = this.#file.clamp(time);
     // Which pages are drawn is decided by how many spans began and ended; what lies ahead, in coarse steps.
     const reach = playing ? Math.max(Math.abs(speed), 0.1) * AHEAD : BESIDE;
-    const key = `${before(this.#starts, t)} ${before(this.#ends, t)} ${Math.floor((t / reach) * STEP)} ${playing} ${speed} ${loop}`;
+    const step = Math.floor((t / reach) * STEP);
+    const key = `${before(this.#starts, t)} ${before(this.#ends, t)} ${step} ${playing} ${speed} ${loop}`;
     Object.assign(this.#last, { time: t, playing, speed, loop });
     if (key === this.#key && performance.now() < this.#again) return;
     this.#key = key;
@@ -86,7 +91,8 @@ export class Stream {
 
   /// Share of the Gaussians of `time` that are resident, 0 to 1.
   ready(time) {
-    let all = 0, there = 0;
+    let all = 0,
+      there = 0;
     for (const page of this.#file.activePages(time)) {
       all += page.count;
       if (this.#resident.has(page.id)) there += page.count;
@@ -114,7 +120,8 @@ export class Stream {
   /// Decides what should be resident: `#now` and `#later`, both in the order in which they are wanted, within budget.
   #plan(t, playing, speed, loop, reach) {
     const [first, last] = this.#file.meta.clip;
-    const now = [], later = [];
+    const now = [],
+      later = [];
     const forward = speed >= 0;
     for (const page of this.#file.pages) {
       if (page.from <= t && t < page.to) {
@@ -125,7 +132,8 @@ export class Stream {
       let wait = page.from > t ? page.from - t : Math.max(t - page.to, 0);
       if (playing) {
         wait = forward ? page.from - t : t - page.to;
-        if (wait < 0) wait = loop ? Math.max(forward ? last - t + page.from - first : t - first + last - page.to, 0) : Infinity;
+        const round = forward ? last - t + page.from - first : t - first + last - page.to;
+        if (wait < 0) wait = loop ? Math.max(round, 0) : Infinity;
       }
       page.wait = wait;
       if (wait <= reach) later.push(page);
@@ -145,7 +153,9 @@ export class Stream {
   /// Drops pages until what is wanted fits: the farthest in time first.
   #shrink(wanted) {
     let missing = 0;
-    for (const page of [...this.#now, ...this.#later]) if (!this.#resident.has(page.id)) missing += page.count * GAUSSIAN;
+    for (const page of [...this.#now, ...this.#later]) {
+      if (!this.#resident.has(page.id)) missing += page.count * GAUSSIAN;
+    }
     if (this.#bytes + missing <= this.#budget) return;
     const { time, playing, speed } = this.#last;
     const far = (page) => {
@@ -239,7 +249,8 @@ export class Stream {
 
 /// How many of the sorted `numbers` are ≤ x.
 function before(numbers, x) {
-  let low = 0, high = numbers.length;
+  let low = 0,
+    high = numbers.length;
   while (low < high) {
     const mid = (low + high) >> 1;
     if (numbers[mid] <= x) low = mid + 1;

@@ -1,17 +1,17 @@
 // The look: calm surfaces over the picture, one accent colour. Sizes are in em of one font size that grows with the
 // player, so that it is legible from 360 px to 4K. No blur: it would be paid for on every frame without a GPU.
 
-const DARK = `--page:#0d0f12;--surface:rgba(20,23,28,.92);--raised:rgba(255,255,255,.07);--press:rgba(255,255,255,.13);
+const DARK = `--page:#0d0f12;--surface:rgba(20,23,28,.96);--raised:rgba(255,255,255,.07);--press:rgba(255,255,255,.13);
 --line:rgba(255,255,255,.11);--text:#eef1f4;--muted:#a4adb8;--accent:#58d0be;--on-accent:#05211c;--bad:#ff9f8f;
 --shadow:0 1px 2px rgba(0,0,0,.35),0 10px 32px rgba(0,0,0,.32);color-scheme:dark`;
-const LIGHT = `--page:#eef0f2;--surface:rgba(255,255,255,.95);--raised:rgba(12,24,36,.06);--press:rgba(12,24,36,.12);
+const LIGHT = `--page:#eef0f2;--surface:rgba(255,255,255,.985);--raised:rgba(12,24,36,.06);--press:rgba(12,24,36,.12);
 --line:rgba(12,24,36,.14);--text:#14191f;--muted:#56606b;--accent:#0a776b;--on-accent:#fff;--bad:#b3301c;
 --shadow:0 1px 2px rgba(15,25,35,.1),0 10px 32px rgba(15,25,35,.14);color-scheme:light`;
 
 export const CSS = `
 :host{display:block;position:relative;width:100%;aspect-ratio:16/9;min-height:180px;overflow:hidden;contain:content}
 :host([hidden]){display:none}
-.root{${DARK};position:absolute;inset:0;container-type:size;background:var(--page);color:var(--text);
+.root{${DARK};position:absolute;inset:0;overflow:clip;container-type:size;background:var(--page);color:var(--text);
  font-family:system-ui,-apple-system,"Segoe UI",Roboto,"DejaVu Sans",sans-serif;line-height:1.4;
  -webkit-tap-highlight-color:transparent}
 @media (prefers-color-scheme:light){.root:not([data-theme=dark]){${LIGHT}}}
@@ -23,7 +23,7 @@ export const CSS = `
 .stage:focus-visible::after{content:"";position:absolute;inset:3px;border-radius:8px;pointer-events:none;
  border:2px solid var(--accent)}
 canvas{display:block}
-.stage>canvas{width:100%;height:100%}
+.stage>canvas{position:absolute;inset:0;width:100%;height:100%}
 .poster{position:absolute;inset:0;width:100%;height:100%;object-fit:contain;pointer-events:none;opacity:0;
  transition:opacity .35s}
 .poster.on{opacity:1}
@@ -69,6 +69,7 @@ button[disabled]{opacity:.4;pointer-events:none}
 .tip{position:absolute;bottom:100%;transform:translateX(-50%);padding:.1em .55em;border-radius:.5em;font-size:.86em;
  background:var(--surface);border:1px solid var(--line);font-variant-numeric:tabular-nums;pointer-events:none;opacity:0}
 .scrub:hover .tip{opacity:1}
+input[type=checkbox]{width:1.15em;height:1.15em;accent-color:var(--accent);margin:.3em}
 select{border:0;background:transparent;border-radius:.6em;padding:.45em .3em .45em .6em;cursor:pointer;height:2.6em;
  max-width:100%}
 select:hover{background:var(--raised)}
@@ -82,7 +83,7 @@ option{background:Canvas;color:CanvasText}
 .seg label:hover span{color:var(--text)}
 .seg input:checked+span{background:var(--surface);color:var(--text);box-shadow:0 0 0 1px var(--line)}
 .seg input:focus-visible+span{outline:2px solid var(--accent);outline-offset:1px}
-.panel{width:23em;max-width:100%;overflow:auto;overscroll-behavior:contain;padding:1.1em 1.2em 1.2em;
+.panel{width:25em;max-width:100%;overflow:auto;overscroll-behavior:contain;padding:1.1em 1.2em 1.2em;
  max-height:calc(100cqh - 8em);display:flex;flex-direction:column;gap:.95em}
 .panel[hidden],[hidden]{display:none!important}
 .head{display:flex;align-items:center;justify-content:space-between;margin:-.3em -.5em -.4em 0}
@@ -92,12 +93,12 @@ h3{font-size:.8em;margin:.2em 0 -.4em;font-weight:600;color:var(--muted);letter-
 .note{color:var(--muted);font-size:.88em;margin:0}
 .keys{list-style:none;margin:0;padding:0;display:flex;flex-direction:column;gap:.3em;max-height:11em;overflow:auto}
 .keys li{display:flex;align-items:center;gap:.4em;background:var(--raised);border-radius:.6em;padding-left:.6em}
-.keys input{width:5.2em;background:transparent;border:0;padding:.3em;border-radius:.4em}
+.keys input{width:4.6em;background:var(--raised);border:0;padding:.15em .1em .15em .5em;border-radius:.4em}
+.keys .soft{background:none}
 .keys span{flex:1;color:var(--muted);font-size:.88em;font-variant-numeric:tabular-nums}
 .wrap{display:flex;flex-wrap:wrap;gap:.45em}
 .top{position:absolute;left:clamp(8px,1.2em,28px);top:clamp(8px,1.2em,28px);right:clamp(8px,1.2em,28px);
- display:flex;justify-content:space-between;align-items:flex-start;gap:.7em;pointer-events:none;
- transition:opacity .25s}
+ pointer-events:none}
 .left{display:flex;flex-direction:column;gap:.7em;align-items:flex-start;min-width:0;max-width:100%}
 .title{padding:.4em .9em;max-width:100%;overflow:hidden;text-overflow:ellipsis;white-space:nowrap;font-weight:600}
 .idle .title{opacity:0}
@@ -108,13 +109,15 @@ h3{font-size:.8em;margin:.2em 0 -.4em;font-weight:600;color:var(--muted);letter-
 .stats dd{margin:0;text-align:right}
 .live{padding:.75em .95em;width:19em;max-width:100%;pointer-events:auto;display:flex;flex-direction:column;gap:.5em}
 .live canvas{width:100%;height:5em;display:block}
-.live .figures{display:flex;justify-content:space-between;gap:.8em;font-variant-numeric:tabular-nums}
-.live .figures small{display:block;color:var(--muted)}
+.live .figures{display:flex;justify-content:space-between;gap:.8em;font-variant-numeric:tabular-nums;
+ white-space:nowrap}
+.live small{color:var(--muted);font-size:.85em}
+.live .figures small{display:block}
 .dot{width:.6em;height:.6em;border-radius:50%;background:var(--accent);display:inline-block;margin-right:.55em}
 .dot.off{background:var(--muted)}
 @keyframes breathe{50%{opacity:.35}}
 .dot.on{animation:breathe 2s infinite}
-.centre{position:absolute;inset:0;display:grid;place-items:center;padding:1.2em;pointer-events:none}
+.centre{position:absolute;inset:0;display:grid;place-items:center;grid-template:minmax(0,1fr)/minmax(0,1fr);padding:1.2em;pointer-events:none}
 .notice{pointer-events:auto;max-width:34em;padding:1.8em 2em;display:flex;flex-direction:column;gap:.8em;
  align-items:flex-start;max-height:100%;overflow:auto}
 .notice h2{font-size:1.2em;display:flex;gap:.6em;align-items:center;overflow-wrap:anywhere}
@@ -128,6 +131,7 @@ h3{font-size:.8em;margin:.2em 0 -.4em;font-weight:600;color:var(--muted);letter-
 .help div.pair{display:flex;justify-content:space-between;gap:1em;padding:.3em 0;border-bottom:1px solid var(--line)}
 .help dt{color:var(--muted)}
 .help dd{margin:0;white-space:nowrap}
+.help dd.plain{color:var(--text)}
 kbd{font:inherit;font-size:.88em;background:var(--raised);border:1px solid var(--line);border-radius:.4em;
  padding:.05em .45em;margin-left:.25em}
 .veil{background:color-mix(in srgb,var(--page) 55%,transparent)}
@@ -135,12 +139,15 @@ kbd{font:inherit;font-size:.88em;background:var(--raised);border:1px solid var(-
  align-items:center;pointer-events:none;font-variant-numeric:tabular-nums}
 .ring{width:1.2em;height:1.2em;border-radius:50%;border:.18em solid var(--press);border-top-color:var(--accent);
  animation:spin 1s linear infinite}
+.mark{width:3.4em;height:2.8em;background:radial-gradient(circle at 70% 34%,var(--accent) 0 .85em,transparent .9em),
+ radial-gradient(circle at 38% 58%,var(--muted) 0 1.15em,transparent 1.2em);opacity:.9}
 @keyframes spin{to{transform:rotate(1turn)}}
 .toast{position:absolute;left:50%;top:clamp(8px,1.2em,28px);transform:translateX(-50%);padding:.45em 1.1em;
  pointer-events:none;opacity:0;transition:opacity .2s;max-width:calc(100% - 2em);z-index:3;text-align:center}
 .toast.on{opacity:1}
-.narrow{display:none}
-@container (max-width:760px){.wide{display:none!important}.narrow{display:flex}.panel{width:100%}
+.field.narrow,.wrap.narrow{display:none}
+@container (max-width:760px){.wide{display:none!important}.field.narrow,.wrap.narrow{display:flex}
+ .panel{width:100%;max-height:60cqh}
  .tool{width:2.85em;height:2.85em}}
 @container (max-width:420px){.time .of{display:none}.stats{font-size:.8em}}
 @container (max-width:1000px){.roomy{display:none!important}}

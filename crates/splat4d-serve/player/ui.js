@@ -64,14 +64,14 @@ export class Interface {
     this.panels = { cameras: cameraPanel(this), view: viewPanel(this) };
     this.dock = h('div', { class: 'dock' }, this.panels.cameras, this.panels.view, this.bar);
     this.title = h('div', { class: 'card title', hidden: true });
-    this.left = h('div', { class: 'left' }, this.title);
     this.figures = figuresCard(p);
+    this.left = h('div', { class: 'left' }, this.title, this.figures);
     this.help = helpPage(() => this.toggleHelp(false));
     this.notice = h('div', { class: 'centre' });
     this.ring = h('div', { class: 'card load', role: 'status', hidden: true }, h('div', { class: 'ring' }), h('span', {}));
     this.toastBox = h('div', { class: 'card toast', role: 'status', 'aria-live': 'polite' });
     this.posterBox = h('img', { class: 'poster', alt: '' });
-    this.face = h('div', { class: 'ui' }, h('div', { class: 'top' }, this.left, this.figures), this.ring, this.dock,
+    this.face = h('div', { class: 'ui' }, h('div', { class: 'top' }, this.left), this.ring, this.dock,
       this.notice, this.help, this.toastBox);
     this.root.append(this.posterBox, this.face);
   }
@@ -181,7 +181,7 @@ export class Interface {
     const on = !!this.root.getRootNode().fullscreenElement;
     retool(this.full, on ? 'small' : 'full', on ? 'Leave full screen' : 'Full screen');
     this.full.hidden = !document.fullscreenEnabled;
-    this.dock.hidden = (this.hiddenControls ?? false) || p.state === 'empty';
+    this.dock.hidden = (this.hiddenControls ?? false) || ['empty', 'error'].includes(p.state);
     for (const panel of Object.values(this.panels)) panel.refresh();
     if (!this.#panel) this.wake();
   }
@@ -265,6 +265,7 @@ export class Interface {
   /** The page without a scene. */
   showEmpty() {
     this.notice.replaceChildren(h('section', { class: 'card notice drop', 'aria-label': 'Open a scene' },
+      h('div', { class: 'mark' }),
       h('h2', {}, 'Open a moving scene'),
       h('p', { class: 'note' }, 'Drop a .splat4d file here. It stays on this computer.'),
       button('Choose a file', () => this.pickFile(), { class: 'main' })));
@@ -296,7 +297,7 @@ export class Interface {
     if (on === !this.help.hidden) return;
     this.help.hidden = !on;
     this.face.querySelector('.dock').inert = on;
-    if (on) { this.before = this.focused(); this.help.querySelector('button').focus(); }
+    if (on) { this.before = this.focused(); this.help.querySelector('button').focus({ preventScroll: true }); }
     else (this.before ?? this.stage).focus?.({ preventScroll: true });
   }
 

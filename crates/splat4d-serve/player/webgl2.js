@@ -1,53 +1,36 @@
 // The WebGL2 backend: words in textures, order from a worker, blending in half floats where that is to be had.
 
-import { worker } from './assets.js';
 import { SceneError } from './errors.js';
-import { BLOCK_TEXELS, CHANNELS, DRAW_FRAGMENT, DRAW_VERTEX, SHOW_FRAGMENT, SHOW_VERTEX } from './glsl.js';
-import { ROW, Sorter } from './sort.worker.js';
+import { Rows, check, program, texture } from './gl.js';
+import {
+  BATCH,
+  BLOCK_TEXELS,
+  CHANNELS,
+  DIRECT_VERTEX,
+  DRAW_FRAGMENT,
+  DRAW_VERTEX,
+  ORDER_WIDTH,
+  PROJECT_FRAGMENT,
+  SHOW_FRAGMENT,
+  SHOW_VERTEX,
+} from './glsl.js';
+import { Order } from './order.js';
+import { ROW } from './sort.worker.js';
 
 /// Texels across the words' and the palettes' textures: every WebGL2 device has them (its minimum for a texture).
 const WIDTH = 2048;
 /// Gaussians a block, blocks a row, f32 numbers of a header (docs/format.md).
-const BLOCK = 256, BLOCKS = ROW / BLOCK, HEADER = 24;
+const BLOCK = 256,
+  BLOCKS = ROW / BLOCK,
+  HEADER = 24;
 /// Header numbers that are times on the scene clock: life centre min and max, alive from and to.
 const TIMES = [6, 7, 8, 9];
 /// Rows of the words' texture to begin with: 2 MiB each 64.
 const FIRST_ROWS = 256;
-/// z ≤ near is not drawn; x/z and y/z inside J may leave the picture by this share of its half-width (CONVENTIONS.md).
-const NEAR = 0.01, J_MARGIN = 0.3;
-
-/// Rows of a texture, lent in runs.
-class Rows {
-  #free = [];
-  constructor(rows) {
-    this.rows = 0;
-    this.grow(rows);
-  }
-  grow(rows) {
-    this.give(this.rows, rows - this.rows);
-    this.rows = rows;
-  }
-  /// First row of `count` free ones, or -1.
-  take(count) {
-    const i = this.#free.findIndex((run) => run.count >= count);
-    if (i < 0) return -1;
-    const run = this.#free[i], row = run.row;
-    run.row += count;
-    run.count -= count;
-    if (!run.count) this.#free.splice(i, 1);
-    return row;
-  }
-  give(row, count) {
-    this.#free.push({ row, count });
-    this.#free.sort((a, b) => a.row - b.row);
-    this.#free = this.#free.reduce((runs, run) => {
-      const last = runs[runs.length - 1];
-      if (last && last.row + last.count === run.row) last.count += run.count;
-      else runs.push(run);
-      return runs;
-    }, []);
-  }
-}
+/// z ≤ near is not drawn; x/z and y/z inside J may leave the picture by this share of its half-width's tangent
+/// (CONVENTIONS.md).
+const NEAR = 0.01,
+  J_MARGIN = 0.3;
 
 export class WebGL2Backend {
   /// Throws SceneError where WebGL2 is not to be had. `onlost(SceneError)` is called when the browser takes it away.
@@ -60,36 +43,61 @@ export class WebGL2Backend {
   #canvas;
   #gl;
   #lost;
-  #pages = new Map();
-  #palettes = new Map();
+  #destroyed = false;
+  /// Programs: {program, at: places of uniforms}. `#project` is null where every corner computes its splat.
+  #project = null;
+  #draw;
+  #show;
+  /// Textures of words, block headers and palettes, and how their rows are lent. Texture: its greatest height.
+  #words = null;
+  #blocks;
+  #palette;
+  #maxRows;
+  #rows = new Rows(0);
   #paletteRows = 0;
   #paletteHeight = 0;
-  #rows;
+  /// id → {row, rows, count}; id → {row, degree, ranges}.
+  #pages = new Map();
+  #palettes = new Map();
   /// Rows of dropped pages: [{row, count, generation}]. The order on the screen may still name them.
   #retired = [];
-  #base = 0;
-  /// Counts pages that came and went; an order carries the number it knew.
-  #generation = 0;
-  #shown = 0;
-  #orders = [];
+  #clip = [0, 0];
+  /// The worker's orders, in two textures in turn: `#front` is drawn, its first `#count` numbers.
+  #order;
+  #orders = [0, 1].map(() => ({ texture: null, rows: 0 }));
   #front = 0;
   #count = 0;
-  #returned = null;
-  #sorter = null;
-  #worker = null;
-  #sorting = false;
-  #asked = { time: NaN, depth: [NaN, 0, 0, 0], generation: -1 };
-  #request = { time: 0, depth: [0, 0, 0, 0], near: NEAR };
+  /// Orders of an earlier scene carry a smaller generation.
+  #least = 0;
+  /// What PROJECT_FRAGMENT writes, and what is blended: {frame, texture(s), …}.
+  #splats = null;
+  #sums;
+  #size = [0, 0];
+  /// Vertex arrays: none at all, and quads; the latter's corners.
+  #empty;
+  #quads;
+  #corners;
+  /// What the last `draw` was given, whether something came since that picture, and the frame that will show it.
   #last = null;
+  #stale = false;
   #frame = 0;
   #waiting = [];
-  #size = [0, 0];
-  #destroyed = false;
 
   constructor(canvas, onlost) {
-    const options = { alpha: false, antialias: false, depth: false, stencil: false, powerPreference: 'high-performance' };
+    const options = {
+      alpha: false,
+      antialias: false,
+      depth: false,
+      stencil: false,
+      powerPreference: 'high-performance',
+    };
     const gl = canvas.getContext('webgl2', options);
-    if (!gl) throw new SceneError('This browser offers no WebGL2', '', 'Switch on hardware acceleration, or use another browser.');
+    if (!gl)
+      throw new SceneError(
+        'This browser offers no WebGL2',
+        '',
+        'Switch on hardware acceleration, or use another browser.',
+      );
     this.#canvas = canvas;
     this.#gl = gl;
     this.#lost = (event) => {
@@ -99,38 +107,33 @@ export class WebGL2Backend {
       onlost?.(new SceneError('The graphics device was taken away', '', 'Reload the page.'));
     };
     canvas.addEventListener('webglcontextlost', this.#lost);
-    const float = gl.getExtension('EXT_color_buffer_float') ?? gl.getExtension('EXT_color_buffer_half_float');
+    const full = gl.getExtension('EXT_color_buffer_float');
+    const float = full ?? gl.getExtension('EXT_color_buffer_half_float');
     this.#sums = { texture: null, frame: gl.createFramebuffer(), format: float ? gl.RGBA16F : gl.RGBA8 };
     this.#maxRows = gl.getParameter(gl.MAX_TEXTURE_SIZE);
     /// Bytes of words that fit; half a row is lost at the end of a page on average.
     this.capacity = Math.floor(this.#maxRows * ROW * 32 * 0.98);
-    this.#draw = program(gl, DRAW_VERTEX, DRAW_FRAGMENT);
+    // Splats are computed once each where 32-bit floats can be rendered to, else once a corner.
+    if (full) {
+      this.#project = program(gl, SHOW_VERTEX, PROJECT_FRAGMENT);
+      this.#splats = { frame: gl.createFramebuffer(), textures: [], rows: 0 };
+    }
+    this.#draw = full ? program(gl, DRAW_VERTEX, DRAW_FRAGMENT) : program(gl, DIRECT_VERTEX, DRAW_FRAGMENT);
     this.#show = program(gl, SHOW_VERTEX, SHOW_FRAGMENT);
-    this.#rows = new Rows(0);
     this.#blocks = texture(gl, gl.RGBA32F, BLOCKS * BLOCK_TEXELS, this.#maxRows);
     this.#grow(FIRST_ROWS);
     this.#palette = texture(gl, gl.RGBA8UI, 1, 1);
-    this.#orders = [0, 1].map(() => {
-      const array = gl.createVertexArray(), buffer = gl.createBuffer();
-      gl.bindVertexArray(array);
-      gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
-      gl.enableVertexAttribArray(0);
-      gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
-      gl.vertexAttribDivisor(0, 1);
-      return { array, buffer, room: 0 };
-    });
     this.#empty = gl.createVertexArray();
-    this.#startWorker();
+    this.#quads = gl.createVertexArray();
+    gl.bindVertexArray(this.#quads);
+    this.#corners = gl.createBuffer();
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.#corners);
+    const corners = Uint16Array.from({ length: 6 * BATCH }, (_, i) => 4 * Math.floor(i / 6) + CORNERS[i % 6]);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
+    gl.bindVertexArray(null);
+    this.#order = new Order(NEAR, (answer) => this.#ordered(answer));
     check(gl, 'The graphics memory did not suffice to begin');
   }
-  #sums;
-  #maxRows;
-  #draw;
-  #show;
-  #words = null;
-  #blocks;
-  #palette;
-  #empty;
 
   /// The WebGL2 context (a headset's session needs it).
   get gl() {
@@ -142,13 +145,17 @@ export class WebGL2Backend {
     for (const id of [...this.#pages.keys()]) this.dropPage(id);
     this.#palettes.clear();
     this.#paletteRows = 0;
-    this.#base = meta.clip[0];
+    this.#clip = meta.clip;
     this.#last = null;
+    this.#count = 0;
+    this.#least = this.#order.generation;
   }
 
   /// `palette`: of SceneFile.palette.
   addPalette({ id, degree, count, ranges, bytes }) {
-    const gl = this.#gl, per = (degree + 1) ** 2 - 1, rows = Math.ceil((count * per) / WIDTH);
+    const gl = this.#gl,
+      per = (degree + 1) ** 2 - 1,
+      rows = Math.ceil((count * per) / WIDTH);
     const row = this.#paletteRows;
     if (row + rows > this.#maxRows) throw new SceneError('The palettes are too many for this graphics card');
     if (row + rows > this.#paletteHeight) {
@@ -173,27 +180,37 @@ export class WebGL2Backend {
 
   /// `page`: of SceneFile.page, whose arrays are the backend's from now on. `entry`: its section.
   addPage(page, entry) {
-    const gl = this.#gl, { id, count, words, headers } = page, rows = Math.ceil(count / ROW);
+    const gl = this.#gl,
+      { id, count, words, headers } = page,
+      rows = Math.ceil(count / ROW);
     let row = this.#rows.take(rows);
     if (row < 0) {
       this.#grow(Math.min(Math.max(2 * this.#rows.rows, this.#rows.rows + rows), this.#maxRows));
       row = this.#rows.take(rows);
     }
     if (row < 0) throw new SceneError('The graphics memory is full', '', 'Lower the memory budget.');
-    const whole = Math.floor(count / ROW), rest = count % ROW;
+    const whole = Math.floor(count / ROW),
+      rest = count % ROW;
     gl.bindTexture(gl.TEXTURE_2D, this.#words);
-    const put = (y, width, height, at) => gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, y, width, height, gl.RGBA_INTEGER,
-      gl.UNSIGNED_INT, words, at);
+    const put = (y, width, height, at) =>
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, y, width, height, gl.RGBA_INTEGER, gl.UNSIGNED_INT, words, at);
     if (whole) put(row, WIDTH, whole, 0);
     if (rest) put(row + whole, 2 * rest, 1, whole * ROW * 8);
     gl.bindTexture(gl.TEXTURE_2D, this.#blocks);
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, row, BLOCKS * BLOCK_TEXELS, rows, gl.RGBA, gl.FLOAT,
-      this.#blockTexels(headers, rows, entry));
+    gl.texSubImage2D(
+      gl.TEXTURE_2D,
+      0,
+      0,
+      row,
+      BLOCKS * BLOCK_TEXELS,
+      rows,
+      gl.RGBA,
+      gl.FLOAT,
+      this.#blockTexels(headers, rows, entry),
+    );
     this.#pages.set(id, { row, rows, count });
     this.stats.resident += count;
-    this.#generation++;
-    const { from, to } = entry;
-    this.#tell({ add: { id, row, count, words, headers, from, to } }, [words.buffer, headers.buffer]);
+    this.#order.add(page, entry, row);
     this.#refresh();
   }
 
@@ -202,8 +219,8 @@ export class WebGL2Backend {
     if (!page) return;
     this.#pages.delete(id);
     this.stats.resident -= page.count;
-    this.#retired.push({ row: page.row, count: page.rows, generation: ++this.#generation });
-    this.#tell({ drop: id });
+    this.#order.drop(id);
+    this.#retired.push({ row: page.row, count: page.rows, generation: this.#order.generation });
     this.#refresh();
   }
 
@@ -215,28 +232,38 @@ export class WebGL2Backend {
     this.#room(width, height);
   }
 
-  /// Draws with the newest order there is, and asks for a better one where time or camera moved. `target` (a headset's):
-  /// {framebuffer, x, y}: where the picture goes instead of the canvas.
+  /// Draws with the newest order there is, and asks for a better one where time or camera moved. `target` {framebuffer,
+  /// x, y}: where the picture goes instead of the canvas (a headset's).
   draw({ time, view, channel = 'color', background = [0, 0, 0], depthRange = [0, 1], flowScale = 100, target = null }) {
-    this.#last = { time, view, channel, background, depthRange, flowScale, target };
+    this.#last = {
+      time: Math.min(Math.max(time, this.#clip[0]), this.#clip[1]),
+      view,
+      channel,
+      background,
+      depthRange,
+      flowScale,
+      target,
+    };
     this.#ask();
     this.#redraw();
   }
 
   /// Resolves when the picture of the last `draw` is in its final order.
   async settled() {
-    while (this.#last && !this.#destroyed && !this.#gl.isContextLost() && (this.#sorting || this.#ask())) {
+    while (this.#last && !this.#destroyed && !this.#gl.isContextLost() && this.#ask()) {
       await new Promise((done) => this.#waiting.push(done));
     }
-    this.#redraw();
+    if (this.#stale) this.#redraw();
   }
 
   /// The picture of the last `draw`: {width, height, data: RGBA bytes, rows from the top}.
   async readPixels() {
-    const gl = this.#gl, [width, height] = this.#size;
+    const gl = this.#gl,
+      [width, height] = this.#size;
     const data = new Uint8ClampedArray(width * height * 4);
     if (!this.#last || gl.isContextLost()) return { width, height, data };
-    const target = texture(gl, gl.RGBA8, width, height), frame = gl.createFramebuffer();
+    const target = texture(gl, gl.RGBA8, width, height),
+      frame = gl.createFramebuffer();
     gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, target, 0);
     this.#resolve(frame, 0, 0, 0);
@@ -249,19 +276,18 @@ export class WebGL2Backend {
 
   destroy() {
     this.#destroyed = true;
-    this.#worker?.terminate();
+    this.#order.destroy();
     cancelAnimationFrame(this.#frame);
     this.#wake();
     this.#canvas.removeEventListener('webglcontextlost', this.#lost);
     const gl = this.#gl;
     for (const t of [this.#words, this.#blocks, this.#palette, this.#sums.texture]) gl.deleteTexture(t);
-    for (const { array, buffer } of this.#orders) {
-      gl.deleteVertexArray(array);
-      gl.deleteBuffer(buffer);
-    }
+    for (const t of [...this.#orders.map((o) => o.texture), ...(this.#splats?.textures ?? [])]) gl.deleteTexture(t);
+    for (const a of [this.#empty, this.#quads]) gl.deleteVertexArray(a);
+    gl.deleteBuffer(this.#corners);
     gl.deleteFramebuffer(this.#sums.frame);
-    gl.deleteProgram(this.#draw.program);
-    gl.deleteProgram(this.#show.program);
+    if (this.#splats) gl.deleteFramebuffer(this.#splats.frame);
+    for (const p of [this.#project, this.#draw, this.#show]) gl.deleteProgram(p?.program ?? null);
   }
 
   // Textures
@@ -270,11 +296,12 @@ export class WebGL2Backend {
     const texels = new Float32Array(rows * BLOCKS * BLOCK_TEXELS * 4);
     const { row, degree, ranges } = this.#palettes.get(palette) ?? { row: -1, degree: 0, ranges: [0, 0, 0] };
     for (let b = 0; b * HEADER < headers.length; b++) {
-      const o = b * BLOCK_TEXELS * 4, h = headers.subarray(b * HEADER, (b + 1) * HEADER);
+      const o = b * BLOCK_TEXELS * 4,
+        h = headers.subarray(b * HEADER, (b + 1) * HEADER);
       texels.set(h, o);
       // Relative to the clip's start, so that 32 bits keep their precision on a clock that started long ago.
-      for (const k of TIMES) texels[o + k] = h[k] - this.#base;
-      texels.set([from - this.#base, to - this.#base, row, degree, ...ranges, to - from], o + HEADER);
+      for (const k of TIMES) texels[o + k] = h[k] - this.#clip[0];
+      texels.set([from - this.#clip[0], to - this.#clip[0], row, degree, ...ranges, to - from], o + HEADER);
     }
     return texels;
   }
@@ -286,7 +313,8 @@ export class WebGL2Backend {
 
   /// A texture of `height` rows with the first `kept` rows of `old`, which is deleted.
   #enlarged(old, format, kept, height) {
-    const gl = this.#gl, grown = texture(gl, format, WIDTH, height);
+    const gl = this.#gl,
+      grown = texture(gl, format, WIDTH, height);
     if (old && kept) {
       const frame = gl.createFramebuffer();
       gl.bindFramebuffer(gl.READ_FRAMEBUFFER, frame);
@@ -306,7 +334,8 @@ export class WebGL2Backend {
   }
 
   #room(width, height) {
-    const gl = this.#gl, sums = this.#sums;
+    const gl = this.#gl,
+      sums = this.#sums;
     gl.deleteTexture(sums.texture);
     sums.texture = texture(gl, sums.format, width, height);
     gl.bindFramebuffer(gl.FRAMEBUFFER, sums.frame);
@@ -320,68 +349,30 @@ export class WebGL2Backend {
 
   // Order
 
-  #startWorker() {
-    try {
-      this.#worker = worker('sort.worker.js');
-      this.#worker.onmessage = ({ data }) => this.#sorted(data);
-      // A page's policy may forbid workers: then sorting happens here, and what was sent is sent again by the caller.
-      this.#worker.onerror = (event) => {
-        event.preventDefault?.();
-        throw new SceneError('The sorting worker ended', event.message ?? '', 'Reload the page.');
-      };
-    } catch {
-      this.#worker = null;
-      this.#sorter = new Sorter();
-    }
-  }
-
-  #tell(message, move = []) {
-    if (this.#worker) return this.#worker.postMessage(message, move);
-    if (message.add) this.#sorter.add(message.add);
-    else if (message.drop !== undefined) this.#sorter.drop(message.drop);
-    else {
-      const order = message.order?.length >= this.#sorter.total ? message.order : new Uint32Array(this.#sorter.total);
-      const begin = performance.now(), result = this.#sorter.sort(message.sort, order);
-      const ms = performance.now() - begin;
-      queueMicrotask(() => this.#sorted({ order, ...result, ms, generation: message.generation }));
-    }
-  }
-
-  /// Asks for an order where the last one asked for is not that of the last draw. Returns whether one is on its way.
   #ask() {
-    if (this.#sorting) return true;
-    const { time, view } = this.#last, m = view.cameraFromWorld, asked = this.#asked;
-    const same = asked.time === time && asked.generation === this.#generation
-      && asked.depth[0] === m[8] && asked.depth[1] === m[9] && asked.depth[2] === m[10] && asked.depth[3] === m[11];
-    if (same) return false;
-    for (const o of [asked, this.#request]) {
-      o.time = time;
-      for (let k = 0; k < 4; k++) o.depth[k] = m[8 + k];
-    }
-    asked.generation = this.#generation;
-    this.#sorting = true;
-    const order = this.#returned;
-    this.#returned = null;
-    this.#tell({ sort: this.#request, generation: this.#generation, order }, order && this.#worker ? [order.buffer] : []);
-    return true;
+    return this.#order.ask(this.#last.time, this.#last.view.cameraFromWorld);
   }
 
-  #sorted({ order, count, active, ms, generation }) {
-    this.#sorting = false;
-    if (this.#destroyed || this.#gl.isContextLost()) return this.#wake();
-    const gl = this.#gl, back = this.#orders[1 - this.#front];
-    gl.bindBuffer(gl.ARRAY_BUFFER, back.buffer);
-    if (back.room < count) {
-      back.room = Math.max(order.length, 2 * back.room);
-      gl.bufferData(gl.ARRAY_BUFFER, 4 * back.room, gl.DYNAMIC_DRAW);
+  #ordered({ order, count, active, ms, generation }) {
+    if (this.#gl.isContextLost()) return this.#wake();
+    const gl = this.#gl,
+      back = this.#orders[1 - this.#front],
+      rows = Math.ceil(count / ORDER_WIDTH);
+    if (back.rows < rows) {
+      gl.deleteTexture(back.texture);
+      // Room for all that is resident, so that it does not grow in small steps.
+      back.rows = Math.min(Math.max(order.length / ORDER_WIDTH, 2 * back.rows), this.#maxRows);
+      back.texture = texture(gl, gl.R32UI, ORDER_WIDTH, back.rows);
     }
-    if (count) gl.bufferSubData(gl.ARRAY_BUFFER, 0, order, 0, count);
+    if (rows) {
+      gl.bindTexture(gl.TEXTURE_2D, back.texture);
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ORDER_WIDTH, rows, gl.RED_INTEGER, gl.UNSIGNED_INT, order, 0);
+    }
     this.#front = 1 - this.#front;
-    this.#count = count;
-    this.#returned = order;
-    this.#shown = generation;
+    this.#count = generation < this.#least ? 0 : count;
     Object.assign(this.stats, { active, drawn: count, sortMs: ms });
     // What this order no longer names may be overwritten.
+    this.#stale = true;
     this.#retired = this.#retired.filter((r) => r.generation > generation || (this.#rows.give(r.row, r.count), false));
     if (this.#last) this.#ask();
     this.#wake();
@@ -406,58 +397,112 @@ export class WebGL2Backend {
   // Pictures
 
   #redraw() {
-    const last = this.#last, gl = this.#gl;
+    const last = this.#last,
+      gl = this.#gl;
     if (!last || this.#destroyed || gl.isContextLost()) return;
     if (this.#frame) cancelAnimationFrame(this.#frame);
     this.#frame = 0;
+    this.#stale = false;
     const begin = performance.now();
-    const { time, view, channel, depthRange, flowScale, target } = last, m = view.cameraFromWorld;
-    const { width, height, fx, fy, cx, cy } = view;
+    const { view, target } = last,
+      { width, height } = view;
     if (this.#size[0] !== width || this.#size[1] !== height) this.#room(width, height);
+    if (this.#count && this.#project) this.#projected();
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.#sums.frame);
     gl.viewport(0, 0, width, height);
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT);
-    if (this.#count) {
-      const { program, at } = this.#draw;
-      gl.useProgram(program);
-      [this.#words, this.#blocks, this.#palette].forEach((t, i) => {
-        gl.activeTexture(gl.TEXTURE0 + i);
-        gl.bindTexture(gl.TEXTURE_2D, t);
-      });
-      gl.activeTexture(gl.TEXTURE0);
-      gl.uniform1i(at.words, 0);
-      gl.uniform1i(at.blocks, 1);
-      gl.uniform1i(at.palette, 2);
-      SCRATCH.set([m[0], m[4], m[8], m[1], m[5], m[9], m[2], m[6], m[10]]);
-      gl.uniformMatrix3fv(at.rotation, false, SCRATCH);
-      gl.uniform3f(at.translation, m[3], m[7], m[11]);
-      const eye = (k) => -(m[k] * m[3] + m[4 + k] * m[7] + m[8 + k] * m[11]);
-      gl.uniform3f(at.eye, eye(0), eye(1), eye(2));
-      gl.uniform2f(at.focal, fx, fy);
-      gl.uniform2f(at.center, cx, cy);
-      gl.uniform2f(at.size, width, height);
-      const mx = (J_MARGIN * 0.5 * width) / fx, my = (J_MARGIN * 0.5 * height) / fy;
-      gl.uniform2f(at.low, -(cx / fx + mx), -(cy / fy + my));
-      gl.uniform2f(at.high, (width - cx) / fx + mx, (height - cy) / fy + my);
-      gl.uniform2f(at.depth_range, depthRange[0], depthRange[1]);
-      gl.uniform1f(at.time, time - this.#base);
-      gl.uniform1f(at.near, NEAR);
-      gl.uniform1f(at.flow_scale, flowScale);
-      gl.uniform1i(at.channel, CHANNELS[channel]);
-      gl.enable(gl.BLEND);
-      gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-      gl.bindVertexArray(this.#orders[this.#front].array);
-      gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.#count);
-      gl.disable(gl.BLEND);
-    }
+    if (this.#count) this.#blend();
     this.#resolve(target?.framebuffer ?? null, target?.x ?? 0, target?.y ?? 0, height);
     this.stats.drawMs = performance.now() - begin;
   }
 
+  /// Gives `made` (a program that computes splats) the view, and the textures it reads.
+  #look({ program, at }) {
+    const gl = this.#gl,
+      { time, view, channel, depthRange, flowScale } = this.#last,
+      m = view.cameraFromWorld;
+    const { width, height, fx, fy, cx, cy } = view;
+    gl.useProgram(program);
+    this.#bind(at, 'words', 0, this.#words);
+    this.#bind(at, 'blocks', 1, this.#blocks);
+    this.#bind(at, 'palette', 2, this.#palette);
+    this.#bind(at, 'order', 3, this.#orders[this.#front].texture);
+    for (let k = 0; k < 9; k++) SCRATCH[k] = m[4 * (k % 3) + Math.floor(k / 3)];
+    gl.uniformMatrix3fv(at.rotation, false, SCRATCH);
+    gl.uniform3f(at.translation, m[3], m[7], m[11]);
+    const eye = (k) => -(m[k] * m[3] + m[4 + k] * m[7] + m[8 + k] * m[11]);
+    gl.uniform3f(at.eye, eye(0), eye(1), eye(2));
+    gl.uniform2f(at.focal, fx, fy);
+    gl.uniform2f(at.center, cx, cy);
+    gl.uniform2f(at.size, width, height);
+    const mx = (J_MARGIN * 0.5 * width) / fx,
+      my = (J_MARGIN * 0.5 * height) / fy;
+    gl.uniform2f(at.low, -(cx / fx + mx), -(cy / fy + my));
+    gl.uniform2f(at.high, (width - cx) / fx + mx, (height - cy) / fy + my);
+    gl.uniform2f(at.depth_range, depthRange[0], depthRange[1]);
+    gl.uniform1f(at.time, time - this.#clip[0]);
+    gl.uniform1f(at.near, NEAR);
+    gl.uniform1f(at.flow_scale, flowScale);
+    gl.uniform1i(at.channel, CHANNELS[channel]);
+    if (at.count) gl.uniform1i(at.count, this.#count);
+  }
+
+  #bind(at, name, unit, bound) {
+    const gl = this.#gl;
+    gl.activeTexture(gl.TEXTURE0 + unit);
+    gl.bindTexture(gl.TEXTURE_2D, bound);
+    gl.uniform1i(at[name], unit);
+    gl.activeTexture(gl.TEXTURE0);
+  }
+
+  /// Computes every splat of the order, a texel each.
+  #projected() {
+    const gl = this.#gl,
+      splats = this.#splats,
+      rows = Math.ceil(this.#count / ORDER_WIDTH);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, splats.frame);
+    if (splats.rows < rows) {
+      for (const t of splats.textures) gl.deleteTexture(t);
+      splats.rows = this.#orders[this.#front].rows;
+      const points = [0, 1, 2].map((k) => gl.COLOR_ATTACHMENT0 + k);
+      splats.textures = points.map((point) => {
+        const made = texture(gl, gl.RGBA32F, ORDER_WIDTH, splats.rows);
+        gl.framebufferTexture2D(gl.FRAMEBUFFER, point, gl.TEXTURE_2D, made, 0);
+        return made;
+      });
+      gl.drawBuffers(points);
+    }
+    gl.viewport(0, 0, ORDER_WIDTH, rows);
+    this.#look(this.#project);
+    gl.bindVertexArray(this.#empty);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  /// Blends the splats over one another, the farthest first.
+  #blend() {
+    const gl = this.#gl,
+      { program, at } = this.#draw,
+      [width, height] = this.#size;
+    if (this.#project) {
+      gl.useProgram(program);
+      gl.uniform2f(at.size, width, height);
+      ['shapes', 'places', 'tints'].forEach((name, i) => this.#bind(at, name, i, this.#splats.textures[i]));
+    } else {
+      this.#look(this.#draw);
+    }
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    gl.bindVertexArray(this.#quads);
+    gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, Math.ceil(this.#count / BATCH));
+    gl.disable(gl.BLEND);
+  }
+
   /// Writes the sums as a picture; `turned`: its height where rows go from the bottom.
   #resolve(framebuffer, x, y, turned) {
-    const gl = this.#gl, { program, at } = this.#show, { background, channel } = this.#last;
+    const gl = this.#gl,
+      { program, at } = this.#show,
+      { background, channel } = this.#last;
     gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
     gl.viewport(x, y, this.#size[0], this.#size[1]);
     gl.useProgram(program);
@@ -473,43 +518,5 @@ export class WebGL2Backend {
 }
 
 const SCRATCH = new Float32Array(9);
-
-function texture(gl, format, width, height) {
-  const made = gl.createTexture();
-  gl.bindTexture(gl.TEXTURE_2D, made);
-  gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
-  for (const p of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, p, gl.NEAREST);
-  return made;
-}
-
-/// A linked program and the places of its uniforms.
-function program(gl, vertex, fragment) {
-  const made = gl.createProgram();
-  for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
-    const shader = gl.createShader(kind);
-    gl.shaderSource(shader, text);
-    gl.compileShader(shader);
-    gl.attachShader(made, shader);
-    gl.deleteShader(shader);
-  }
-  gl.linkProgram(made);
-  if (!gl.getProgramParameter(made, gl.LINK_STATUS) && !gl.isContextLost()) {
-    const logs = (gl.getAttachedShaders(made) ?? []).map((s) => gl.getShaderInfoLog(s)).join(' ');
-    throw new SceneError("The graphics driver refuses the player's shaders", (gl.getProgramInfoLog(made) + logs).slice(0, 500),
-      'Update the browser or the driver.');
-  }
-  const at = {};
-  for (let i = gl.getProgramParameter(made, gl.ACTIVE_UNIFORMS) - 1; i >= 0; i--) {
-    const { name } = gl.getActiveUniform(made, i);
-    at[name] = gl.getUniformLocation(made, name);
-  }
-  return { program: made, at };
-}
-
-/// Throws where the driver ran out of memory.
-function check(gl, what) {
-  for (let e = gl.getError(); e !== gl.NO_ERROR && e !== gl.CONTEXT_LOST_WEBGL; e = gl.getError()) {
-    if (e === gl.OUT_OF_MEMORY) throw new SceneError(what, '', 'Close other pages, or choose a smaller scene.');
-    throw new SceneError(`The graphics driver answers error ${e}`, '', 'Update the browser or the driver.');
-  }
-}
+/// Two triangles of a quad's four corners.
+const CORNERS = [0, 1, 2, 2, 1, 3];

@@ -12,14 +12,19 @@ const WORDS = 8;
 const BLOCK_BYTES = BLOCK * WORDS * 4;
 const HEADER_BYTES = 128;
 const RECORD_BYTES = BLOCK * 32;
+/// Bytes of a listed block's mask of visible Gaussians.
+const MASK_BYTES = BLOCK / 8;
 /// Pairs that a workgroup of sort.wgsl takes, digits of a pass, and 8-bit passes for 16-bit keys.
 const SORT_BLOCK = 2048;
 const DIGITS = 256;
 const SHIFTS = [0, 8];
-/// Place of the number of records in `arguments` (cull.wgsl), and byte offset of the draw's arguments there.
+/// Place of the number of records in `arguments` (cull.wgsl), and byte offsets of the draw's and the scan's there.
 const COUNT_INDEX = 3;
 const DRAW_OFFSET = 16;
-const ARGUMENT_BYTES = 32;
+const SCAN_OFFSET = 32;
+const ARGUMENT_BYTES = 48;
+/// Bytes of a frame's four timestamps.
+const TIME_BYTES = 32;
 /// struct Frame in words; its first 32 are the View.
 const FRAME_WORDS = 40;
 const VIEW_WORDS = 32;
@@ -153,14 +158,14 @@ export class WebGPUBackend {
     this.#b.frame = this.#buffer(4 * FRAME_WORDS, UNIFORM | COPY_DST);
     this.#b.arguments = this.#buffer(ARGUMENT_BYTES, STORAGE | INDIRECT | COPY_SRC);
     this.#b.range = this.#buffer(8, STORAGE | COPY_DST);
-    this.#b.readback = this.#buffer(2 * ARGUMENT_BYTES, MAP_READ | COPY_DST);
+    this.#b.readback = this.#buffer(ARGUMENT_BYTES + TIME_BYTES, MAP_READ | COPY_DST);
     SHIFTS.forEach((shift, i) => {
       this.#b[`pass${i}`] = this.#buffer(8, UNIFORM | COPY_DST);
       this.#queue.writeBuffer(this.#b[`pass${i}`], 0, new Uint32Array([shift, COUNT_INDEX]));
     });
     if (device.features.has('timestamp-query')) {
       this.#timer = device.createQuerySet({ type: 'timestamp', count: 4 });
-      this.#b.times = this.#buffer(ARGUMENT_BYTES, QUERY_RESOLVE | COPY_SRC);
+      this.#b.times = this.#buffer(TIME_BYTES, QUERY_RESOLVE | COPY_SRC);
     }
     this.#roomForBlocks(FIRST_BLOCKS);
     this.#roomForPalette(BLOCK);
@@ -420,7 +425,8 @@ export class WebGPUBackend {
     const sizes = {
       list: 4 * room,
       records: RECORD_BYTES * room,
-      counts: 4 * (room + 1),
+      masks: MASK_BYTES * room,
+      firsts: 4 * room,
       keys: 4 * BLOCK * room,
       places: 4 * BLOCK * room,
       keys2: 4 * BLOCK * room,
@@ -512,6 +518,7 @@ export class WebGPUBackend {
   #cullAndSort(encoder, blocks) {
     const g = this.#groups, p = this.#pipelines, args = this.#b.arguments;
     this.#queue.writeBuffer(this.#b.range, 0, this.#rangeStart);
+    encoder.clearBuffer(this.#b.masks, 0, MASK_BYTES * blocks);
     const timed = this.#timer && { querySet: this.#timer, beginningOfPassWriteIndex: 0, endOfPassWriteIndex: 1 };
     const pass = encoder.beginComputePass(timed ? { timestampWrites: timed } : undefined);
     const over = (name) => {
@@ -530,7 +537,7 @@ export class WebGPUBackend {
       pass.dispatchWorkgroupsIndirect(args, 0);
       pass.setPipeline(p.scan);
       pass.setBindGroup(0, g.scan[i]);
-      pass.dispatchWorkgroups(DIGITS);
+      pass.dispatchWorkgroupsIndirect(args, SCAN_OFFSET);
       pass.setPipeline(p.scatter);
       pass.setBindGroup(0, g.scatter[i]);
       pass.dispatchWorkgroupsIndirect(args, 0);
@@ -567,7 +574,7 @@ export class WebGPUBackend {
     encoder.copyBufferToBuffer(this.#b.arguments, 0, this.#b.readback, 0, ARGUMENT_BYTES);
     if (this.#timer) {
       encoder.resolveQuerySet(this.#timer, 0, 4, this.#b.times, 0);
-      encoder.copyBufferToBuffer(this.#b.times, 0, this.#b.readback, ARGUMENT_BYTES, ARGUMENT_BYTES);
+      encoder.copyBufferToBuffer(this.#b.times, 0, this.#b.readback, ARGUMENT_BYTES, TIME_BYTES);
     }
     return true;
   }
@@ -612,7 +619,7 @@ export class WebGPUBackend {
   }
 
   #resolveGroup(pipeline) {
-    return this.#group(pipeline, { 0: this.#b.frame, 14: this.#pictureView });
+    return this.#group(pipeline, { 0: this.#b.frame, 15: this.#pictureView });
   }
 
   #makeGroups() {
@@ -622,15 +629,17 @@ export class WebGPUBackend {
       this.#group(pipeline, { 0: b[`pass${i}`], 1: b.arguments, 2: keys, 6: b.sums }));
     this.#groups = {
       cull: this.#group(p.cull, {
-        0: b.frame, 1: b.words, 2: b.blocks, 3: b.list, 4: b.palette, 5: b.records, 6: b.counts, 7: b.range,
+        0: b.frame, 1: b.words, 2: b.blocks, 3: b.list, 4: b.palette, 5: b.records, 6: b.masks, 7: b.range,
       }),
-      total: this.#group(p.total, { 0: b.frame, 6: b.counts, 8: b.arguments }),
-      keys: this.#group(p.keys, { 0: b.frame, 5: b.records, 6: b.counts, 7: b.range, 9: b.keys, 10: b.places }),
+      total: this.#group(p.total, { 0: b.frame, 6: b.masks, 8: b.arguments, 11: b.firsts }),
+      keys: this.#group(p.keys, {
+        0: b.frame, 5: b.records, 6: b.masks, 7: b.range, 9: b.keys, 10: b.places, 11: b.firsts,
+      }),
       histogram: counting(p.histogram),
       scan: counting(p.scan),
       scatter: passes.map(([k, v, k2, v2], i) =>
         this.#group(p.scatter, { 0: b[`pass${i}`], 1: b.arguments, 2: k, 3: v, 4: k2, 5: v2, 6: b.sums })),
-      splat: this.#group(p.splat, { 0: b.frame, 11: b.records, 12: b.places, 13: b.arguments }),
+      splat: this.#group(p.splat, { 0: b.frame, 12: b.records, 13: b.places, 14: b.arguments }),
       resolve: this.#resolveGroup(p.resolve),
     };
   }
@@ -662,7 +671,7 @@ async function makePipelines(device, format) {
     histogram: compute(sort, 'histogram'),
     scan: compute(sort, 'scan'),
     scatter: compute(sort, 'scatter'),
-    splat: render('corner', 'splat', { format: PICTURE_FORMAT, blend: { color: over, alpha: over } }, 'triangle-strip'),
+    splat: render('corner', 'splat', { format: PICTURE_FORMAT, blend: { color: over, alpha: over } }, 'triangle-list'),
     resolve: render('cover', 'resolve', { format }, 'triangle-list'),
     resolve8: render('cover', 'resolve', { format: 'rgba8unorm' }, 'triangle-list'),
   };

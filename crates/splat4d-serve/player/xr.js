@@ -1,5 +1,4 @@
-// Immersive viewing. Each eye is drawn into the page's own WebGL2 canvas and copied to the headset's picture, so that
-// the backend needs to know nothing of headsets. Tested: that nothing happens and no button shows where no headset is
+// Immersive viewing, with the WebGL2 backend, which draws each eye straight into the headset's picture. Tested: that nothing happens and no button shows where no headset is
 // offered, and the mathematics of an eye's view. Never tested for want of a device: a session in a real headset, its
 // frame rate, and how order by depth, which arrives a frame late in WebGL2, looks while the head turns.
 
@@ -48,24 +47,15 @@ export async function enter(player) {
   const unit = player.meta.unit ?? TABLE_RADIUS / radius;
   player.immersed = true;
   let last = 0;
-  const frame = (now, { session: s }, pose) => {
+  const tick = (now, frame) => {
+    session.requestAnimationFrame(tick);
     player.advance(Math.min((now - last) / 1000, 0.1));
     last = now;
-    for (const eye of pose?.views ?? []) {
-      const v = layer.getViewport(eye);
-      player.backend.resize(v.width, v.height);
-      player.backend.draw({ ...player.drawing(v.width, v.height), view: eyeView(eye, start, unit, v.width, v.height) });
-      gl.bindFramebuffer(gl.READ_FRAMEBUFFER, null);
-      gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, layer.framebuffer);
-      gl.blitFramebuffer(0, 0, v.width, v.height, v.x, v.y, v.x + v.width, v.y + v.height,
-        gl.COLOR_BUFFER_BIT, gl.NEAREST);
-      gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    for (const eye of frame.getViewerPose(space)?.views ?? []) {
+      const { x, y, width, height } = layer.getViewport(eye);
+      player.backend.draw({ ...player.drawing(width, height), view: eyeView(eye, start, unit, width, height),
+        target: { framebuffer: layer.framebuffer, x, y } });
     }
-    return s;
-  };
-  const tick = (now, xrFrame) => {
-    session.requestAnimationFrame(tick);
-    frame(now, xrFrame, xrFrame.getViewerPose(space));
   };
   session.requestAnimationFrame(tick);
   await new Promise(done => session.addEventListener('end', done));

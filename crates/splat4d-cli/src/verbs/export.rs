@@ -4,14 +4,12 @@ use crate::console::Console;
 use crate::files;
 use crate::freeze::freeze;
 use crate::playable::Playable;
+use crate::sequence;
 use crate::source::{Source, not_empty};
 use serde_json::json;
 use splat4d::{Error, format};
 use splat4d_serve::{Page, SceneIn};
 use std::path::{Path, PathBuf};
-
-/// Most files of a sequence.
-const MAX_FILES: f64 = 100_000.0;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -81,25 +79,16 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         Ok(params.len())
     };
     if let Some(folder) = &args.sequence {
-        let fps = args.fps.unwrap_or(if scene.fps > 0.0 { scene.fps } else { splat4d::scene::time::DEFAULT_FPS });
-        let (from, to) = (args.from.unwrap_or(scene.clip[0]), args.to.unwrap_or(scene.clip[1]));
-        let count = ((to - from) * fps + 1e-6).floor() + 1.0;
-        if !(1.0..=MAX_FILES).contains(&count) {
-            return Err(Error::input(format!("from {from} s to {to} s at {fps} a second are {count} files"))
-                .remedy(format!(
-                    "The scene lasts from {} to {} s; at most {MAX_FILES} files are written.",
-                    scene.clip[0], scene.clip[1]
-                ))
-                .into());
-        }
+        let (fps, times) = sequence::moments(scene, args.fps, [args.from, args.to])?;
+        let pattern = sequence::Pattern::in_folder(folder);
         files::make_folder(folder)?;
-        let count = count as usize;
-        for i in 0..count {
-            write(from + i as f64 / fps, &folder.join(format!("frame_{i:05}.ply")))?;
-            console.phase("exporting", i + 1, count);
+        for (i, &time) in times.iter().enumerate() {
+            write(time, &pattern.file(i))?;
+            console.phase("exporting", i + 1, times.len());
         }
         console.clear();
-        console.say(&format!("{count} files, {fps} a second, from {from} to {to} s"));
+        let (from, to) = (times[0], times[times.len() - 1]);
+        console.say(&format!("{} files, {fps} a second, from {from} to {to} s", times.len()));
         console.written(folder);
         return Ok(());
     }

@@ -1,11 +1,14 @@
 //! `info`: what a capture, a run or a file contains, and whether it looks healthy.
 
+mod playback;
+
 use crate::console::Console;
 use crate::files::{grouped, human_bytes, human_seconds};
 use crate::run_folder::Run;
 use crate::source::{Source, cloud};
 use serde_json::{Value, json};
 use splat4d::Error;
+use splat4d::format::Dialect;
 use splat4d::layers::Scene;
 use splat4d::math::sh::degree_of;
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
@@ -28,6 +31,8 @@ const HUGE: f64 = 1.0;
 const MANY_HUGE: f64 = 0.02;
 /// Below this many Gaussians shares say nothing.
 const FEW: usize = 100;
+/// Layers that are listed; playback files have one a page, and their sections are told already.
+const MANY_LAYERS: usize = 8;
 /// Longest bar of a histogram, characters.
 const BAR: usize = 32;
 
@@ -41,7 +46,7 @@ Examples:
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
-    /// A capture folder, a run, a scene.safetensors, a checkpoint or a 3DGS .ply
+    /// A capture folder, a run, a scene.safetensors, a checkpoint, a .splat4d or a 3DGS .ply
     #[arg(value_name = "ANY")]
     path: PathBuf,
     /// Read a capture with pictures reduced by k
@@ -238,12 +243,16 @@ fn of_file(path: &Path) -> anyhow::Result<Told> {
     let bytes = path.metadata().map(|m| m.len()).unwrap_or(0);
     let mut text = String::new();
     line(&mut text, "file", &format!("{}, {}", path.display(), human_bytes(bytes)));
-    let kind = match &source.ply {
-        Some(info) if info.compressed => "3DGS .ply, compressed (PlayCanvas)",
-        Some(_) => "3DGS .ply",
+    let kind = match source.dialect {
+        Some(dialect) => dialect.name(),
+        None if source.playback.is_some() => "playback file",
         None => "splat4d scene",
     };
     line(&mut text, "kind", kind);
+    let told = source.playback.as_ref().map(playback::of_index);
+    if let Some(told) = &told {
+        text.push_str(&told.text);
+    }
     if let Some(info) = &source.ply {
         if !info.extra_properties.is_empty() {
             line(&mut text, "not read", &info.extra_properties.join(", "));
@@ -252,11 +261,17 @@ fn of_file(path: &Path) -> anyhow::Result<Told> {
             line(&mut text, "comment", comment);
         }
     }
+    source.warnings.lines().iter().for_each(|w| line(&mut text, "note", w));
     let inner = of_scene(&source.scene);
     text.push_str(&inner.text);
     let mut json = inner.json;
+    json["dialect"] = json!(source.dialect.map(Dialect::name));
     json["type"] = json!(if source.ply.is_some() { "ply" } else { "scene" });
     json["bytes"] = json!(bytes);
+    if let Some(told) = told {
+        json["type"] = json!("playback");
+        json["playback"] = told.json;
+    }
     Ok(Told { json, text, troubles: inner.troubles })
 }
 
@@ -324,7 +339,7 @@ fn of_scene(scene: &Scene<f32>) -> Told {
     }
     let mut text = String::new();
     line(&mut text, "Gaussians", &grouped(n));
-    for (name, motion, life, rows, degree) in &layers {
+    for (name, motion, life, rows, degree) in layers.iter().filter(|_| layers.len() <= MANY_LAYERS) {
         line(&mut text, "layer", &format!("{name}: {} by {motion}, life {life}, SH degree {degree}", grouped(*rows)));
     }
     if scene.clip[1] > scene.clip[0] {

@@ -2,6 +2,7 @@
 
 pub(crate) mod bake;
 pub(crate) mod completions;
+pub(crate) mod convert;
 pub(crate) mod eval;
 pub(crate) mod export;
 pub(crate) mod info;

@@ -14,6 +14,10 @@ use splat4d_train::train::run::{memory_estimate, open_capture};
 use splat4d_train::train::{self, Outcome, TrainOptions, checkpoint};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Duration;
+
+/// A new picture of the learning scene about so often: sooner than anybody would reload, later than they could follow.
+const SNAPSHOT_INTERVAL: Duration = Duration::from_secs(3);
 
 const EXAMPLES: &str = "\
 Examples:
@@ -110,13 +114,15 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let watch = |title: &str| {
         if args.view { Watch::start(title, &args.place, console) } else { Watch::nobody() }
     };
+    let snapshots = |watch: &Watch| watch.is_on().then_some(SNAPSHOT_INTERVAL);
     let listen = |event: &Event, watch: &Watch| {
         watch.hear(event);
         console.event(event);
     };
     let (run, watch, trained) = if let Some(run) = &args.resume {
         let watch = watch(&Run::open(run)?.name());
-        let trained = train::resume(run, &stop, &mut |event| listen(event, &watch));
+        let options = TrainOptions { snapshots: snapshots(&watch), ..TrainOptions::default() };
+        let trained = train::resume_with(run, &options, &stop, &mut |event| listen(event, &watch));
         (run.clone(), watch, trained)
     } else {
         let recipe = recipe(args)?;
@@ -128,8 +134,8 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         files::make_folder(&run)?;
         let cameras = serde_json::to_vec(&cameras_json(&capture))?;
         files::write(&run.join("cameras.json"), &cameras)?;
-        let options = TrainOptions { minutes: args.minutes };
         let watch = watch(&capture.name);
+        let options = TrainOptions { minutes: args.minutes, snapshots: snapshots(&watch) };
         let capture = Arc::new(capture);
         let trained = train::train(capture, recipe, &run, &options, &stop, &mut |event| listen(event, &watch));
         if trained.is_err() {

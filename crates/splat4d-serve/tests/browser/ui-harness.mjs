@@ -1,33 +1,14 @@
 // For the interface's tests: a server with the player's files, stand-ins for what draws and reads, and made-up live
-// events; and the browser itself.
+// events.
 
 import { createServer } from 'node:http';
 import { readFile } from 'node:fs/promises';
-import { createRequire } from 'node:module';
 import { dirname, join } from 'node:path';
 import { fileURLToPath } from 'node:url';
 
 const HERE = dirname(fileURLToPath(import.meta.url));
 const PLAYER = join(HERE, '../../player');
 const TYPES = { js: 'text/javascript', html: 'text/html', json: 'application/json' };
-
-/** playwright-core from wherever NODE_PATH or this folder has it. */
-export function playwright() {
-  const places = [HERE, ...(process.env.NODE_PATH ?? '').split(':').filter(Boolean).map(p => dirname(p))];
-  for (const place of places) {
-    try { return createRequire(join(place, 'x.js'))('playwright-core'); } catch { /* The next place. */ }
-  }
-  throw new Error('playwright-core is not installed: npm install playwright-core, or set NODE_PATH');
-}
-
-export async function browser() {
-  const { chromium } = playwright();
-  return chromium.launch({
-    executablePath: process.env.CHROMIUM ?? '/usr/bin/chromium',
-    args: ['--no-sandbox', '--disable-background-networking', '--disable-component-update', '--disable-sync',
-      '--no-first-run'],
-  });
-}
 
 /** Serves `/` and the player; `pages` are further routes {path: html}; `config` is /config.json. */
 export class Site {

@@ -6,6 +6,7 @@ pub mod dataset;
 pub mod loss;
 pub mod minutes;
 pub mod run;
+mod snapshot;
 pub mod trainer;
 
 #[cfg(test)]
@@ -13,4 +14,4 @@ pub(crate) mod tests;
 
 pub use crate::capture::frames;
 pub use crate::sampler;
-pub use run::{Outcome, TrainOptions, resume, train};
+pub use run::{Outcome, TrainOptions, resume, resume_with, train};

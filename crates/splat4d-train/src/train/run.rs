@@ -8,6 +8,7 @@ use super::checkpoint::{self, Identity, RunState, write_atomically};
 use super::dataset::Dataset;
 use super::loss::{Exposure, TrainLoss};
 use super::minutes;
+use super::snapshot::Snapshots;
 use super::trainer::{Settings, Stepped, Trainer};
 use crate::capture::{Capture, CaptureOptions, ImageStore};
 use crate::densify::Limits;
@@ -22,13 +23,16 @@ use splat4d::render::{Antialias, RenderConfig, Renderer, Simd};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Instant as Clock;
+use std::time::{Duration, Instant as Clock};
 
 /// What is asked of a run besides its recipe.
 #[derive(Clone, Debug, Default)]
 pub struct TrainOptions {
     /// Fix the iterations so that training takes so long.
     pub minutes: Option<f64>,
+    /// Emit [`Event::Snapshot`] about so often, and at the end. They never take more than a fortieth of the time, and
+    /// do not change the result.
+    pub snapshots: Option<Duration>,
 }
 
 /// How a run ended.
@@ -120,12 +124,23 @@ pub fn train(
     let state = RunState::default();
     save_checkpoint(run, &trainer, &identity, &state, &mut listen)?;
     write_run_json(run, &bench, &recipe, &Totals::default(), &trainer, &state, false)?;
-    let session = Session { run, bench: &bench, recipe: &recipe, identity, estimate, stop };
+    let snapshots = options.snapshots;
+    let session = Session { run, bench: &bench, recipe: &recipe, identity, estimate, snapshots, stop };
     session.drive(&mut trainer, state, &mut listen)
 }
 
 /// Continues the run in the folder `run`, exactly.
 pub fn resume(run: &Path, stop: &AtomicBool, listen: &mut dyn FnMut(&Event)) -> Result<Outcome> {
+    resume_with(run, &TrainOptions::default(), stop, listen)
+}
+
+/// As [`resume`]; of the options only `snapshots` counts, the rest was settled at the start.
+pub fn resume_with(
+    run: &Path,
+    options: &TrainOptions,
+    stop: &AtomicBool,
+    listen: &mut dyn FnMut(&Event),
+) -> Result<Outcome> {
     let (recipe, capture) = open_run(run)?;
     let bench = Bench::new(Arc::new(capture), &recipe)?;
     let plan = bench.plan(&recipe);
@@ -139,7 +154,8 @@ pub fn resume(run: &Path, stop: &AtomicBool, listen: &mut dyn FnMut(&Event)) -> 
         listen(&Event::Warning { message: warning });
     }
     let estimate = memory_estimate(&bench.capture, &recipe);
-    let session = Session { run, bench: &bench, recipe: &recipe, identity, estimate, stop };
+    let snapshots = options.snapshots;
+    let session = Session { run, bench: &bench, recipe: &recipe, identity, estimate, snapshots, stop };
     session.drive(&mut trainer, state, &mut listen)
 }
 
@@ -488,6 +504,7 @@ struct Session<'a> {
     recipe: &'a Recipe,
     identity: Identity,
     estimate: u64,
+    snapshots: Option<Duration>,
     stop: &'a AtomicBool,
 }
 
@@ -504,6 +521,7 @@ impl Session<'_> {
         });
         let mut metrics = Metrics::open(self.run, first, iterations);
         let mut totals = Totals::default();
+        let mut snapshots = self.snapshots.map(|interval| Snapshots::new(interval, &self.bench.capture));
         let (mut clock, mut told) = (Clock::now(), Clock::now());
         while !trainer.is_done() && !self.stop.load(Ordering::Relaxed) {
             let step = match trainer.step()? {
@@ -527,6 +545,9 @@ impl Session<'_> {
                 listen(&self.progress(trainer, &state, iterations));
             }
             let i = trainer.progress.iteration;
+            if let Some(event) = snapshots.as_mut().and_then(|s| s.take(&trainer.scene, i)) {
+                listen(&event);
+            }
             if i.is_multiple_of(self.recipe.checkpoint_interval) && !trainer.is_done() {
                 self.save(trainer, &state, &metrics, &totals, false, listen)?;
             }
@@ -535,6 +556,9 @@ impl Session<'_> {
         self.save(trainer, &state, &metrics, &totals, done, listen)?;
         let gaussians = trainer.scene.len();
         let iteration = trainer.progress.iteration;
+        if let Some(snapshots) = &mut snapshots {
+            listen(&snapshots.now(&trainer.scene, iteration));
+        }
         if done {
             let mut bytes = Vec::new();
             splat4d::format::scene::write(&trainer.scene, &mut bytes)?;

@@ -106,7 +106,7 @@ impl Place {
         let (identity, state) = (bench.identity(&recipe), RunState::default());
         save_checkpoint(&run, &trainer, &identity, &state, listen)?;
         write_run_json(&run, &bench, &recipe, &Totals::default(), &trainer, &state, false)?;
-        Session { run: &run, bench: &bench, recipe: &recipe, identity, estimate: 0, stop }.drive(
+        Session { run: &run, bench: &bench, recipe: &recipe, identity, estimate: 0, snapshots: None, stop }.drive(
             &mut trainer,
             state,
             listen,
@@ -439,7 +439,7 @@ fn unwritable_outputs_and_too_little_memory_are_refused() {
 fn minutes_fix_a_recipe_that_repeats() {
     let place = Place::new();
     let base = Recipe { init: "random".into(), num_pts: 80, max_cap: 120, ..Recipe::default() };
-    let options = TrainOptions { minutes: Some(0.005) };
+    let options = TrainOptions { minutes: Some(0.005), ..TrainOptions::default() };
     let run = place.run("timed");
     train(place.open(&base), base.clone(), &run, &options, &AtomicBool::new(false), &mut |_| {}).unwrap();
     let fixed = Recipe::from_toml(&read_text(&run.join("recipe.toml")).unwrap()).unwrap();
@@ -450,10 +450,32 @@ fn minutes_fix_a_recipe_that_repeats() {
     place.train("again", &fixed).unwrap();
     assert!(place.scene("timed") == place.scene("again"));
     for minutes in [0.0, -1.0, f64::NAN, f64::INFINITY] {
-        let options = TrainOptions { minutes: Some(minutes) };
+        let options = TrainOptions { minutes: Some(minutes), ..TrainOptions::default() };
         let stop = AtomicBool::new(false);
         let run = place.run("bad");
         assert!(train(place.open(&base), base.clone(), &run, &options, &stop, &mut |_| {}).is_err(), "{minutes}");
         assert!(!run.exists());
     }
+}
+
+#[test]
+fn who_watches_changes_nothing() {
+    let place = Place::new();
+    let base = recipe(&[]);
+    place.train("alone", &base).unwrap();
+    let run = place.run("watched");
+    let options = TrainOptions { snapshots: Some(Duration::ZERO), ..TrainOptions::default() };
+    let mut seen = Vec::new();
+    let mut listen = |event: &Event| {
+        if let Event::Snapshot { iteration, bytes } = event {
+            seen.push((*iteration, bytes.clone()));
+        }
+    };
+    train(place.open(&base), base.clone(), &run, &options, &AtomicBool::new(false), &mut listen).unwrap();
+    assert!(place.scene("alone") == place.scene("watched"), "snapshots must not change a bit of the result");
+    assert!(seen.len() >= 2 && seen[0].0 == 1 && seen.last().unwrap().0 == STEPS, "the first and the last are shown");
+    let last = splat4d::format::playback::read(&seen.last().unwrap().1).unwrap();
+    let learnt = splat4d::format::scene::read(&place.scene("watched")).unwrap();
+    assert!(last.len() * 10 > learnt.len() * 9 && last.len() <= learnt.len(), "{} of {}", last.len(), learnt.len());
+    assert_eq!(last.clip, learnt.clip);
 }

@@ -1,4 +1,4 @@
-//! The two 16-bit floating-point types of files, widened exactly.
+//! The two 16-bit floating-point types of files: widened exactly, and binary16 rounded to.
 
 /// Widens an IEEE 754 binary16 number, given by its bits; exact, NaN and infinity included.
 pub(super) fn f16_to_f32(bits: u16) -> f32 {
@@ -10,6 +10,24 @@ pub(super) fn f16_to_f32(bits: u16) -> f32 {
         31 => f32::NAN,
         _ => sign * (1.0 + fraction / 1024.0) * 2.0f32.powi(exponent - 15),
     }
+}
+
+/// Rounds to the nearest binary16 number, ties to even; beyond ±65504 to the largest finite one. NaN gives NaN.
+pub(super) fn f32_to_f16(x: f32) -> u16 {
+    let sign = ((x.to_bits() >> 16) & 0x8000) as u16;
+    let size = x.abs();
+    if size.is_nan() {
+        return sign | 0x7E00;
+    }
+    // Steps of the binade: 2^(e−10), and 2^-24 below 2^-14, where numbers are no longer normal.
+    let exponent = ((size.to_bits() >> 23) as i32 - 127).max(-14);
+    if exponent > 15 {
+        return sign | 0x7BFF;
+    }
+    let steps = (size * 2.0f32.powi(10 - exponent)).round_ties_even() as u16;
+    // A normal number has 1024..2048 steps; one that rounds up to 2048 carries into the exponent by itself.
+    let bits = ((exponent + 14) as u16) * 1024 + steps;
+    sign | bits.min(0x7BFF)
 }
 
 /// Widens a bfloat16 number, given by its bits: it is the upper half of an f32.
@@ -33,5 +51,24 @@ mod tests {
         assert!(f16_to_f32(0x7C01).is_nan());
         assert!(f16_to_f32(0x8000).is_sign_negative() && f16_to_f32(0x8000) == 0.0);
         assert_eq!(bf16_to_f32(0xBF80), -1.0);
+    }
+
+    #[test]
+    fn every_binary16_number_comes_back_and_others_go_to_the_nearest() {
+        for bits in 0..=u16::MAX {
+            let x = f16_to_f32(bits);
+            if x.is_nan() {
+                assert!(f16_to_f32(f32_to_f16(x)).is_nan());
+            } else if x.is_finite() {
+                assert_eq!(f32_to_f16(x), bits, "{bits:#x}");
+                let next = f16_to_f32(bits + 1);
+                if next.is_finite() && bits & 0x7FFF < 0x7BFF {
+                    let (low, high) = (x + 0.4 * (next - x), x + 0.6 * (next - x));
+                    assert_eq!((f32_to_f16(low), f32_to_f16(high)), (bits, bits + 1), "{bits:#x}");
+                    assert_eq!(f32_to_f16(0.5 * (x + next)) & 1, 0, "ties go to even: {bits:#x}");
+                }
+            }
+        }
+        assert_eq!((f32_to_f16(1e9), f32_to_f16(f32::NEG_INFINITY)), (0x7BFF, 0xFBFF));
     }
 }

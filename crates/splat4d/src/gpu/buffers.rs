@@ -88,8 +88,9 @@ pub(super) struct Buffers {
     pub uniforms: Grown,
     /// Splats, visible ones, pairs.
     pub counts: Grown,
-    /// Sizes of indirect dispatches.
-    pub arguments: Grown,
+    /// Sizes of dispatches over the visible splats, and over the pairs: apart, because no buffer may be written while
+    /// it gives the size of a dispatch.
+    pub arguments: [Grown; 2],
     /// Two vec4 a splat.
     pub shapes: Grown,
     /// A vec4 a splat.
@@ -128,10 +129,11 @@ impl Buffers {
     /// Without memory yet.
     pub fn new() -> Self {
         let storage = Grown::storage;
+        let sizes = || Grown::new("sizes", Usage::STORAGE | Usage::INDIRECT | Usage::COPY_SRC | Usage::COPY_DST);
         Self {
             uniforms: Grown::new("uniforms", Usage::UNIFORM | Usage::COPY_DST),
             counts: storage("counts"),
-            arguments: Grown::new("arguments", Usage::STORAGE | Usage::INDIRECT | Usage::COPY_SRC | Usage::COPY_DST),
+            arguments: [sizes(), sizes()],
             shapes: storage("the splats' shapes"),
             colors: storage("the splats' colours"),
             marks: storage("marks"),
@@ -156,7 +158,6 @@ impl Buffers {
         let one = [
             &self.uniforms,
             &self.counts,
-            &self.arguments,
             &self.shapes,
             &self.colors,
             &self.marks,
@@ -170,7 +171,7 @@ impl Buffers {
             &self.times,
             &self.staging,
         ];
-        let two = [&self.depth_keys, &self.depth_values, &self.pair_keys, &self.pair_values];
+        let two = [&self.arguments, &self.depth_keys, &self.depth_values, &self.pair_keys, &self.pair_values];
         one.iter().map(|b| b.bytes()).sum::<u64>() + two.iter().flat_map(|b| b.iter()).map(Grown::bytes).sum::<u64>()
     }
 }

@@ -1,6 +1,6 @@
 //! One frame as dispatches: which kernel runs over which buffers, in which order.
 
-use super::buffers::{Buffers, UNIFORM_STRIDE};
+use super::buffers::{Buffers, Grown, UNIFORM_STRIDE};
 use super::clock::{Recorder, Stage};
 use super::device::Gpu;
 use super::kernels::{Kernel, Kernels};
@@ -40,11 +40,14 @@ pub(super) mod count {
     pub const ALL: usize = 3;
 }
 
-/// Places of triples of u32 in the buffer of arguments: a thread a thing, then a block of things a workgroup.
+/// The two buffers of arguments, and what is in each: triples of u32, first for a thread a thing, then for a workgroup a
+/// block of things.
 pub(super) mod arguments {
     pub const VISIBLE: usize = 0;
-    pub const PAIRS: usize = 6;
-    pub const ALL: usize = 12;
+    pub const PAIRS: usize = 1;
+    pub const THREADS: u64 = 0;
+    pub const BLOCKS: u64 = 12;
+    pub const BYTES: u64 = 24;
 }
 
 /// Rows of tiles that are drawn at once.
@@ -90,13 +93,18 @@ pub(super) struct Groups {
 impl Groups {
     /// Binds all buffers.
     pub fn new(gpu: &Gpu, k: &Kernels, b: &Buffers) -> Self {
-        let scan = |slot, input: &super::buffers::Grown, output: &super::buffers::Grown| {
-            let pass = uniform(b, slot, SCAN_BYTES);
-            let rest = [b.scan_sums.all(), b.arguments.all()];
-            let [sums, arguments] = rest;
-            k.scan.bind(gpu, &[pass, b.counts.all(), input.all(), output.all(), sums, arguments])
+        let scan = |slot, input: &Grown, output: &Grown, sizes: usize| {
+            let group = [
+                uniform(b, slot, SCAN_BYTES),
+                b.counts.all(),
+                input.all(),
+                output.all(),
+                b.scan_sums.all(),
+                b.arguments[sizes].all(),
+            ];
+            k.scan.bind(gpu, &group)
         };
-        let sort = |slot, from: usize, keys: &[super::buffers::Grown; 2], values: &[super::buffers::Grown; 2]| {
+        let sort = |slot, from: usize, keys: &[Grown; 2], values: &[Grown; 2]| {
             let (source, target) = (from % 2, 1 - from % 2);
             let group = [
                 uniform(b, slot, SORT_BYTES),
@@ -143,8 +151,8 @@ impl Groups {
             b.depth_values[0].all(),
         ];
         Self {
-            scan_visible: scan(slot::SCAN_VISIBLE, &b.marks, &b.places),
-            scan_pairs: scan(slot::SCAN_PAIRS, &b.tile_counts, &b.first_pairs),
+            scan_visible: scan(slot::SCAN_VISIBLE, &b.marks, &b.places, arguments::VISIBLE),
+            scan_pairs: scan(slot::SCAN_PAIRS, &b.tile_counts, &b.first_pairs, arguments::PAIRS),
             compact: k.compact.bind(gpu, &compact),
             sort_depth: (0..DEPTH_PASSES)
                 .map(|p| sort(slot::SORT_DEPTH + p, p, &b.depth_keys, &b.depth_values))
@@ -157,18 +165,19 @@ impl Groups {
     }
 }
 
-/// How many groups a scan of things takes: known here, or written by an earlier kernel at this place.
+/// How many workgroups a dispatch has: known here, or written by an earlier kernel, in this buffer of sizes and at this
+/// place.
 #[derive(Clone, Copy)]
-enum Groups1 {
+enum Size {
     Known(usize),
-    Written(usize),
+    Written(usize, u64),
 }
 
-fn dispatch(pass: &mut ComputePass<'_>, kernel: &Kernel, entry: usize, buffers: &Buffers, groups: Groups1) {
+fn dispatch(pass: &mut ComputePass<'_>, kernel: &Kernel, entry: usize, buffers: &Buffers, groups: Size) {
     pass.set_pipeline(&kernel.pipelines[entry]);
     match groups {
-        Groups1::Known(n) => pass.dispatch_workgroups(n as u32, 1, 1),
-        Groups1::Written(at) => pass.dispatch_workgroups_indirect(buffers.arguments.get(), 4 * at as u64),
+        Size::Known(n) => pass.dispatch_workgroups(n as u32, 1, 1),
+        Size::Written(of, at) => pass.dispatch_workgroups_indirect(buffers.arguments[of].get(), at),
     }
 }
 
@@ -187,22 +196,22 @@ pub(super) struct Frame<'a> {
 
 impl Frame<'_> {
     /// Exclusive sums.
-    fn scan(&self, pass: &mut ComputePass<'_>, group: &BindGroup, blocks: Groups1) {
+    fn scan(&self, pass: &mut ComputePass<'_>, group: &BindGroup, blocks: Size) {
         let kernel = &self.kernels.scan;
         pass.set_bind_group(0, group, &[]);
         dispatch(pass, kernel, 0, self.buffers, blocks);
-        dispatch(pass, kernel, 1, self.buffers, Groups1::Known(1));
+        dispatch(pass, kernel, 1, self.buffers, Size::Known(1));
         dispatch(pass, kernel, 2, self.buffers, blocks);
     }
 
-    /// One pass of a sort a group; blocks of pairs are written at `blocks`.
-    fn sort(&self, pass: &mut ComputePass<'_>, groups: &[BindGroup], blocks: usize) {
+    /// One pass of a sort a group; `of` says in which buffer the number of blocks is.
+    fn sort(&self, pass: &mut ComputePass<'_>, groups: &[BindGroup], of: usize) {
         let kernel = &self.kernels.sort;
         for group in groups {
             pass.set_bind_group(0, group, &[]);
-            dispatch(pass, kernel, 0, self.buffers, Groups1::Written(blocks));
-            dispatch(pass, kernel, 1, self.buffers, Groups1::Known(DIGITS));
-            dispatch(pass, kernel, 2, self.buffers, Groups1::Written(blocks));
+            dispatch(pass, kernel, 0, self.buffers, Size::Written(of, arguments::BLOCKS));
+            dispatch(pass, kernel, 1, self.buffers, Size::Known(DIGITS));
+            dispatch(pass, kernel, 2, self.buffers, Size::Written(of, arguments::BLOCKS));
         }
     }
 
@@ -228,16 +237,16 @@ impl Frame<'_> {
         recorder.stage(Stage::Project, |pass| {
             for (group, groups) in &draws {
                 pass.set_bind_group(0, group, &[]);
-                dispatch(pass, &k.splats, 0, b, Groups1::Known(*groups));
+                dispatch(pass, &k.splats, 0, b, Size::Known(*groups));
             }
         })?;
         recorder.stage(Stage::Compact, |pass| {
-            self.scan(pass, &self.groups.scan_visible, Groups1::Known(splats.div_ceil(BLOCK)));
+            self.scan(pass, &self.groups.scan_visible, Size::Known(splats.div_ceil(BLOCK)));
             pass.set_bind_group(0, &self.groups.compact, &[]);
-            dispatch(pass, &k.compact, 0, b, Groups1::Known(splats.div_ceil(THREADS)));
+            dispatch(pass, &k.compact, 0, b, Size::Known(splats.div_ceil(THREADS)));
         })?;
         recorder.stage(Stage::SortSplats, |pass| {
-            self.sort(pass, &self.groups.sort_depth, arguments::VISIBLE + 3);
+            self.sort(pass, &self.groups.sort_depth, arguments::VISIBLE);
         })
     }
 
@@ -247,17 +256,17 @@ impl Frame<'_> {
         let tiles = band.rows * across;
         recorder.stage(Stage::Tiles, |pass| {
             pass.set_bind_group(0, &self.groups.tiles, &[]);
-            dispatch(pass, &k.tiles, 0, b, Groups1::Written(arguments::VISIBLE));
-            self.scan(pass, &self.groups.scan_pairs, Groups1::Written(arguments::VISIBLE + 3));
+            dispatch(pass, &k.tiles, 0, b, Size::Written(arguments::VISIBLE, arguments::THREADS));
+            self.scan(pass, &self.groups.scan_pairs, Size::Written(arguments::VISIBLE, arguments::BLOCKS));
             pass.set_bind_group(0, &self.groups.tiles, &[]);
-            dispatch(pass, &k.tiles, 1, b, Groups1::Written(arguments::VISIBLE));
+            dispatch(pass, &k.tiles, 1, b, Size::Written(arguments::VISIBLE, arguments::THREADS));
         })?;
         let passes = tile_passes(tiles);
         recorder.clear(b.ranges.get(), 8 * tiles as u64);
         recorder.stage(Stage::SortPairs, |pass| {
-            self.sort(pass, &self.groups.sort_tile[..passes], arguments::PAIRS + 3);
+            self.sort(pass, &self.groups.sort_tile[..passes], arguments::PAIRS);
             pass.set_bind_group(0, &self.groups.ranges[passes % 2], &[]);
-            dispatch(pass, &k.ranges, 0, b, Groups1::Written(arguments::PAIRS + 3));
+            dispatch(pass, &k.ranges, 0, b, Size::Written(arguments::PAIRS, arguments::BLOCKS));
         })?;
         recorder.stage(Stage::Rasterize, |pass| {
             pass.set_bind_group(0, &self.groups.rasterize[passes % 2], &[]);

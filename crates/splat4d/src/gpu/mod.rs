@@ -52,8 +52,9 @@ const MOST_GROUPS: usize = 65_535;
 pub enum Tables {
     /// Everything is sent for every picture.
     Changing,
-    /// A table of colours at the same address and of the same size as in the last render is the same table, and is
-    /// not sent again: right for a scene that is played, wrong for one that learns.
+    /// A layer's own SH table ([`crate::scene::Color::Sh`] with `base`) that lies at the same address and has the same
+    /// size as in the last render is the same table, and is not sent again: right for a scene that is played, wrong
+    /// for one that learns. Everything else of an instant is sent all the same.
     Constant,
 }
 
@@ -218,7 +219,9 @@ impl GpuRenderer {
         let mut fresh = false;
         fresh |= b.uniforms.ensure(gpu, (slot::PIECES + self.upload.draws.len()) as u64 * UNIFORM_STRIDE)?;
         fresh |= b.counts.ensure(gpu, 4 * count::ALL as u64)?;
-        fresh |= b.arguments.ensure(gpu, 4 * arguments::ALL as u64)?;
+        for buffer in &mut b.arguments {
+            fresh |= buffer.ensure(gpu, arguments::BYTES)?;
+        }
         fresh |= b.shapes.ensure(gpu, 32 * n)?;
         fresh |= b.colors.ensure(gpu, 16 * n)?;
         let blocks = n.div_ceil(BLOCK as u64);
@@ -272,10 +275,8 @@ impl GpuRenderer {
         let capacity = self.pair_capacity() as u32;
         let out = &mut self.uniforms;
         put(out, slot::VIEW, &view(camera, &self.config, self.stats.splats));
-        let visible = [count::SPLATS, count::VISIBLE, arguments::VISIBLE].map(|v| v as u32);
-        put(out, slot::SCAN_VISIBLE, &[visible[0], visible[1], visible[2], u32::MAX]);
-        let pairs = [count::VISIBLE, count::PAIRS, arguments::PAIRS].map(|v| v as u32);
-        put(out, slot::SCAN_PAIRS, &[pairs[0], pairs[1], pairs[2], capacity]);
+        put(out, slot::SCAN_VISIBLE, &[count::SPLATS as u32, count::VISIBLE as u32, 0, u32::MAX]);
+        put(out, slot::SCAN_PAIRS, &[count::VISIBLE as u32, count::PAIRS as u32, 0, capacity]);
         for (pass, slot) in (slot::SORT_DEPTH..slot::SORT_TILE).enumerate() {
             put(out, slot, &[8 * pass as u32, count::VISIBLE as u32]);
         }

@@ -4,7 +4,7 @@
 //
 // One pass is three dispatches, in this order, pairs going from keys_in/values_in to keys_out/values_out:
 //   histogram   as many workgroups as there are blocks (or more: the rest do nothing)
-//   scan        256 workgroups
+//   scan        256 workgroups; 1 is enough for up to SORT_FEW blocks
 //   scatter     as histogram
 // A block is SORT_BLOCK pairs; blocks = ceil(pairs / SORT_BLOCK), at most 65,535. The number of pairs is read from
 // sort_count, so that an earlier dispatch decides it; dispatch indirectly, or for the most pairs there can be.
@@ -22,6 +22,10 @@ const SORT_THREADS: u32 = 256u;
 // Rounds of a workgroup, 256 pairs each: more rounds make fewer counts to scan, and fewer workgroups to run at once.
 const SORT_ROUNDS: u32 = 8u;
 const SORT_BLOCK: u32 = 2048u; // SORT_THREADS x SORT_ROUNDS
+// Side of the square in which a workgroup adds up its 256 numbers.
+const SORT_ROW: u32 = 16u;
+// Up to this many blocks one thread walks along a digit's counts: fewer steps than a workgroup's sums take.
+const SORT_FEW: u32 = 32u;
 // 32-bit words that hold a bit for each thread.
 const SORT_WORDS: u32 = 8u;
 
@@ -40,6 +44,7 @@ struct SortPass {
 
 var<workgroup> sort_digits: array<atomic<u32>, 256>;
 var<workgroup> sort_sums: array<u32, 256>;
+var<workgroup> sort_rows: array<u32, 16>;
 var<workgroup> sort_masks: array<atomic<u32>, 2048>; // 256 digits x SORT_WORDS
 
 fn sort_pairs() -> u32 {
@@ -75,26 +80,41 @@ fn histogram(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_
     }
 }
 
-// Exclusive sums over the workgroup's 256 numbers, one a thread; uses sort_sums.
+// Exclusive sums over the workgroup's 256 numbers, one a thread; uses sort_sums and sort_rows. Rows of 16 keep it at
+// two barriers: software devices pay for each, and on others the few more additions cost nothing.
 fn sort_exclusive(thread: u32, value: u32) -> u32 {
     sort_sums[thread] = value;
     workgroupBarrier();
-    for (var step = 1u; step < SORT_THREADS; step *= 2u) {
-        var below = 0u;
-        if (thread >= step) {
-            below = sort_sums[thread - step];
+    if (thread < SORT_ROW) {
+        var sum = 0u;
+        for (var i = 0u; i < SORT_ROW; i++) {
+            sum += sort_sums[thread * SORT_ROW + i];
         }
-        workgroupBarrier();
-        sort_sums[thread] += below;
-        workgroupBarrier();
+        sort_rows[thread] = sum;
     }
-    return sort_sums[thread] - value;
+    workgroupBarrier();
+    let row = thread / SORT_ROW;
+    var before = 0u;
+    for (var r = 0u; r < row; r++) {
+        before += sort_rows[r];
+    }
+    for (var i = row * SORT_ROW; i < thread; i++) {
+        before += sort_sums[i];
+    }
+    return before;
 }
 
-// Turns a digit's counts by block into exclusive sums, and writes their total. A workgroup owns a digit.
+// Turns a digit's counts by block into exclusive sums, and writes their total. A workgroup owns a digit; where there are
+// few blocks, the first workgroup does all of it, a thread a digit.
 @compute @workgroup_size(256)
 fn scan(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) thread: u32) {
     let blocks = sort_blocks();
+    if (blocks <= SORT_FEW) {
+        if (group.x == 0u) {
+            sort_counts[SORT_THREADS * blocks + thread] = sort_run(thread * blocks, thread * blocks + blocks, 0u);
+        }
+        return;
+    }
     let digit = group.x;
     // A thread sums a run of neighbouring blocks, so that one pass over the workgroup is enough for any number.
     let run = (blocks + SORT_THREADS - 1u) / SORT_THREADS;
@@ -104,15 +124,22 @@ fn scan(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index
     for (var b = first; b < end; b++) {
         sum += sort_counts[digit * blocks + b];
     }
-    var before = sort_exclusive(thread, sum);
+    let before = sort_exclusive(thread, sum);
     if (thread == SORT_THREADS - 1u) {
         sort_counts[SORT_THREADS * blocks + digit] = before + sum;
     }
-    for (var b = first; b < end; b++) {
-        let count = sort_counts[digit * blocks + b];
-        sort_counts[digit * blocks + b] = before;
+    _ = sort_run(digit * blocks + first, digit * blocks + end, before);
+}
+
+// Turns counts first to end - 1 into exclusive sums that begin at `start`; answers the sum behind them.
+fn sort_run(first: u32, end: u32, start: u32) -> u32 {
+    var before = start;
+    for (var i = first; i < end; i++) {
+        let count = sort_counts[i];
+        sort_counts[i] = before;
         before += count;
     }
+    return before;
 }
 
 // Moves the pairs of a block to their places. A workgroup owns a block; in each round a thread owns one pair.

@@ -10,6 +10,8 @@ use crate::render::Renderer;
 use crate::scene::splats::{Part, SPLAT_COLUMNS};
 use crate::scene::{Color, Rows, Table};
 use buffers::Grown;
+use std::ops::{Deref, DerefMut};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 /// An adapter of any kind.
 fn gpu() -> Option<Gpu> {
@@ -23,8 +25,38 @@ fn gpu() -> Option<Gpu> {
     }
 }
 
-fn renderer() -> Option<GpuRenderer> {
+fn own_renderer() -> Option<GpuRenderer> {
     gpu().map(|gpu| GpuRenderer::new(gpu, RenderConfig::default()).expect("the kernels compile"))
+}
+
+/// The renderer that the tests share, with its defaults: on lavapipe compiling the kernels takes longer than most of
+/// them. Memory that an earlier test left behind must not matter.
+fn renderer() -> Option<impl DerefMut<Target = GpuRenderer>> {
+    static SHARED: Mutex<Option<Box<GpuRenderer>>> = Mutex::new(None);
+    /// A lock whose content is there.
+    struct Held(MutexGuard<'static, Option<Box<GpuRenderer>>>);
+    impl Deref for Held {
+        type Target = GpuRenderer;
+        fn deref(&self) -> &GpuRenderer {
+            self.0.as_deref().expect("it was made")
+        }
+    }
+    impl DerefMut for Held {
+        fn deref_mut(&mut self) -> &mut GpuRenderer {
+            self.0.as_deref_mut().expect("it was made")
+        }
+    }
+    // A test that failed holds nothing that the next one reads.
+    let mut shared = SHARED.lock().unwrap_or_else(PoisonError::into_inner);
+    if shared.is_none() {
+        *shared = own_renderer().map(Box::new);
+    }
+    shared.as_ref()?;
+    let mut held = Held(shared);
+    held.config = RenderConfig::default();
+    held.tables = Tables::Changing;
+    held.clock = if held.gpu.has_timestamps() { StageClock::Gpu } else { StageClock::Off };
+    Some(held)
 }
 
 /// The first `n` numbers of a buffer.

@@ -119,9 +119,9 @@ impl Upload {
         let n = part.out.rows();
         let own = &mut self.parts[i];
         send(gpu, &mut own.geometry, part.out.data())?;
-        let (table, rows, weights, mut flags) = match &part.color {
-            Color::Direct { table } => (*table, Rows::All, None, DIRECT),
-            Color::Sh { table, rows, weights, .. } => (*table, *rows, *weights, 0),
+        let (table, rows, weights, mut flags, base) = match &part.color {
+            Color::Direct { table } => (*table, Rows::All, None, DIRECT, false),
+            Color::Sh { table, rows, weights, base } => (*table, *rows, *weights, 0, *base),
         };
         let blocks = weights.map_or(1, Table::width).max(1);
         assert!(
@@ -152,7 +152,7 @@ impl Upload {
         let cut_rows = blocks_a_cut * BLOCK;
         let cuts = table.rows().div_ceil(cut_rows).max(1);
         let name = (table.data().as_ptr() as usize, table.data().len());
-        let known = tables == Tables::Constant && own.sent == Some(name);
+        let known = base && tables == Tables::Constant && own.sent == Some(name);
         own.sent = None;
         let mut from = 0;
         for cut in 0..cuts {

@@ -2,6 +2,9 @@
 
 #[cfg(test)]
 mod tests;
+mod turn;
+
+pub use turn::rotation_between;
 
 use crate::math::Real;
 use crate::math::Rng;

@@ -6,8 +6,10 @@ pub mod real;
 pub mod rng;
 pub mod se3;
 pub mod sh;
+pub mod sh_turn;
 pub mod sym3;
 
 pub use real::Real;
 pub use rng::Rng;
 pub use se3::Se3;
+pub use sh_turn::sh_rotation;

@@ -238,9 +238,7 @@ impl<F: Real> Raster<F> {
 
     /// Channel `c` over `background`: Σ c α T + T_end·background, [height, width].
     pub fn channel(&self, c: usize, background: F, plane: &mut [F]) {
-        self.read(plane, |tile, y| {
-            std::array::from_fn(|x| tile.color[c][y][x] + tile.t[y][x].abs() * background)
-        });
+        self.read(plane, |tile, y| std::array::from_fn(|x| tile.color[c][y][x] + tile.t[y][x].abs() * background));
     }
 
     /// 1 − T_end, [height, width].

@@ -351,7 +351,13 @@ fn warm_up_then_nodes_then_frame_by_frame_tracking() {
         let mut params = old.clone();
         params.apply(&edit);
         let model = Skinned::new(&mut params, &centers);
-        let layer = Layer { name: "skinned".into(), params, motion: Arc::new(model), life: LifeKind::Infinite, span: splat4d::layers::ALWAYS };
+        let layer = Layer {
+            name: "skinned".into(),
+            params,
+            motion: Arc::new(model),
+            life: LifeKind::Infinite,
+            span: splat4d::layers::ALWAYS,
+        };
         scene.layers = vec![layer];
         Ok(())
     });

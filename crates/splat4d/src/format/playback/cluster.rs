@@ -199,10 +199,8 @@ impl Set<'_> {
         let counts = self.means(&ids, labels.iter().copied(), &mut centroids);
         let mut place = vec![0u32; counts.len()];
         let mut kept = Vec::with_capacity(centroids.len());
-        let mut next = 0;
         for (c, centroid) in centroids.chunks_exact(self.stride).enumerate().filter(|(c, _)| counts[*c] > 0) {
-            place[c] = next;
-            next += 1;
+            place[c] = (kept.len() / self.stride) as u32;
             kept.extend_from_slice(centroid);
         }
         labels.iter_mut().for_each(|l| *l = place[*l as usize]);

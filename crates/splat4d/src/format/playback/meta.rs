@@ -1,5 +1,7 @@
 //! The JSON of a playback file.
 
+use crate::math::Se3;
+use crate::scene::{Camera, Intrinsics, Lens};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 
@@ -90,6 +92,39 @@ pub struct PathKey {
     pub time: Option<f64>,
 }
 
+/// Largest distance of a camera's rotation from an orthogonal matrix, per element: six digits of text are enough.
+const NOT_A_ROTATION: f64 = 1e-3;
+
+impl NamedCamera {
+    /// The camera of the renderer with this name.
+    pub fn new(name: &str, camera: &Camera) -> Self {
+        let world = camera.cam_from_world.inverse();
+        let cell = |i: usize| if i % 4 < 3 { world.rotation[i / 4][i % 4] } else { world.translation[i / 4] };
+        let Intrinsics { fx, fy, cx, cy } = camera.intrinsics;
+        let (width, height) = (camera.width, camera.height);
+        Self { name: name.to_owned(), world_from_camera: std::array::from_fn(cell), width, height, fx, fy, cx, cy }
+    }
+
+    /// As the renderer wants it; none where the numbers are no camera.
+    pub fn camera(&self) -> Option<Camera> {
+        let m = &self.world_from_camera;
+        let world = Se3 {
+            rotation: std::array::from_fn(|i| std::array::from_fn(|j| m[4 * i + j])),
+            translation: [m[3], m[7], m[11]],
+        };
+        let finite = m.iter().chain([&self.fx, &self.fy, &self.cx, &self.cy]).all(|x| x.is_finite());
+        let rigid = world.orthogonality_error() <= NOT_A_ROTATION && world.det() > 0.0;
+        let sound = finite && rigid && self.fx > 0.0 && self.fy > 0.0 && self.width > 0 && self.height > 0;
+        sound.then(|| Camera {
+            cam_from_world: world.inverse(),
+            intrinsics: Intrinsics { fx: self.fx, fy: self.fy, cx: self.cx, cy: self.cy },
+            lens: Lens::Pinhole,
+            width: self.width,
+            height: self.height,
+        })
+    }
+}
+
 impl Meta {
     /// Refuses what no reader could draw. Errors: the first field that is out of range, by name.
     pub(super) fn check(&self) -> Result<()> {
@@ -117,5 +152,30 @@ impl Meta {
             return wrong("`box` is not finite");
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_camera_comes_back_and_nonsense_is_none() {
+        let pose = Se3::look_at([1.0, -2.0, 3.0], [0.2, 0.1, 0.0], [0.0, -1.0, 0.0]);
+        let camera = Camera::with_fov_y(pose, 0.7, 320, 200);
+        let named = NamedCamera::new("left", &camera);
+        assert_eq!(
+            [3, 7, 11].map(|i| (named.world_from_camera[i] * 1e9).round() / 1e9),
+            [1.0, -2.0, 3.0],
+            "its centre"
+        );
+        let back = named.camera().unwrap();
+        let x = [0.3, 0.4, 0.5];
+        let (a, b) = (camera.cam_from_world.apply(x), back.cam_from_world.apply(x));
+        assert!((0..3).all(|k| (a[k] - b[k]).abs() < 1e-12), "{a:?} {b:?}");
+        assert_eq!((back.intrinsics, back.width, back.height), (camera.intrinsics, 320, 200));
+        let mut flat = named.clone();
+        flat.world_from_camera[0] += 0.1;
+        assert!(flat.camera().is_none() && NamedCamera { fx: -1.0, ..named }.camera().is_none());
     }
 }

@@ -193,8 +193,11 @@ impl Row {
             turn: p.turn.map(f64::from),
         };
         if lives_through(p, span) {
-            // Whatever the centre was: from the middle of the span the reach is shortest, and codes are finest.
-            row.move_to(0.5 * (span[0] + span[1]));
+            // From the middle of the span the reach is shortest. A turn keeps its own centre: normalize(q₀ + ½Δ(0, ω)⊗q₀)
+            // is fastest there, and no other centre gives the same motion.
+            if row.turn == [0.0; 3] {
+                row.move_to(0.5 * (span[0] + span[1]));
+            }
         } else {
             let softness = p.softness.max(SHARPEST);
             row.life = Some([if p.half_width < NO_WIDTH * softness { 0.0 } else { p.half_width }, softness]);
@@ -202,17 +205,13 @@ impl Row {
         row
     }
 
-    /// Takes another time as the centre of the same motion.
+    /// Takes another time as the centre: exact for the mean, and for a turn as near as that time is.
     fn move_to(&mut self, center: f64) {
         let delta = center - self.center;
         self.center = center;
         (0..3).for_each(|k| self.mean[k] += self.velocity[k] * delta);
         let rate = rate(self.quat, self.turn);
-        // q(t) ∝ q₀ + ½Δ(0, ω)⊗q₀ is a line of quaternions; seen from another point of it, it passes more slowly:
-        // (0, ω)⊗(1 + ½δ(0, ω))⁻¹ has the vector part ω/(1 + ¼δ²ω²), and its scalar part only changes the length.
         self.quat = quaternion::normalize(std::array::from_fn(|i| self.quat[i] + delta * rate[i])).0;
-        let slower = 1.0 + 0.25 * delta * delta * self.turn.iter().map(|w| w * w).sum::<f64>();
-        self.turn = self.turn.map(|w| w / slower);
     }
 }
 

@@ -7,18 +7,17 @@
 
 use super::header::{Element, Header, broken};
 use super::{PlyInfo, degree, f_rest_columns, non_finite, rows};
+use crate::format::octets::{SH_C0, logit_of_byte};
 use crate::scene::params::{GEOMETRY, LOG_SCALE, OPACITY, Params, QUAT, SH};
 use crate::scene::table::Table;
 use crate::{Error, ErrorKind, Result};
 
-/// SH basis function of degree 0, 1/(2√π): colour = ½ + C0·f_dc.
-pub(super) const SH_C0: f32 = 0.282_094_79;
 /// Gaussians that share their bounds.
-const CHUNK: usize = 256;
+pub(super) const CHUNK: usize = 256;
 /// The four words of a Gaussian.
-const WORDS: [&str; 4] = ["packed_position", "packed_rotation", "packed_scale", "packed_color"];
+pub(super) const WORDS: [&str; 4] = ["packed_position", "packed_rotation", "packed_scale", "packed_color"];
 /// Bounds that every chunk has, in the order in which `Bounds` uses them.
-const BOUNDS: [&str; 12] = [
+pub(super) const BOUNDS: [&str; 12] = [
     "min_x",
     "min_y",
     "min_z",
@@ -33,9 +32,9 @@ const BOUNDS: [&str; 12] = [
     "max_scale_z",
 ];
 /// Bounds of the colours; files of the first version lack them and mean 0 and 1.
-const COLOR_BOUNDS: [&str; 6] = ["min_r", "min_g", "min_b", "max_r", "max_g", "max_b"];
+pub(super) const COLOR_BOUNDS: [&str; 6] = ["min_r", "min_g", "min_b", "max_r", "max_g", "max_b"];
 /// SH bytes span [-SH_RANGE/2, SH_RANGE/2].
-const SH_RANGE: f32 = 8.0;
+pub(super) const SH_RANGE: f32 = 8.0;
 
 /// Whether the element holds packed Gaussians.
 pub(super) fn is_packed(vertex: &Element) -> bool {
@@ -84,7 +83,7 @@ pub(super) fn read(header: &Header, bytes: &[u8]) -> Result<(Params, PlyInfo)> {
         geometry.write(row, 0, means);
         geometry.write(row, QUAT, unpack_rotation(rotation));
         geometry.write(row, LOG_SCALE, log_scales);
-        geometry.set(row, OPACITY, logit(byte(3)));
+        geometry.set(row, OPACITY, logit_of_byte(rgba as u8));
         table.write(row, 0, dc);
         let is_bad = |numbers: &[f32]| non_finite(numbers) != 0;
         non_finite_rows += usize::from(is_bad(&means) || is_bad(&log_scales) || is_bad(&dc));
@@ -129,13 +128,6 @@ fn unpack_rotation(word: u32) -> [f32; 4] {
     let rest = (1.0 - small.iter().map(|x| x * x).sum::<f32>()).max(0.0).sqrt();
     let mut others = small.into_iter();
     std::array::from_fn(|i| if i == largest { rest } else { others.next().expect("three of four are small") })
-}
-
-/// The logit of an opacity of `byte`/255. The ends stand for half an interval, whose middle is taken: their own logits
-/// are infinite.
-fn logit(byte: f32) -> f32 {
-    let a = byte.clamp(0.25, 254.75) / 255.0;
-    (a / (1.0 - a)).ln()
 }
 
 /// The writer floors, so that a byte stands for the middle of its interval; the ends stand for themselves.

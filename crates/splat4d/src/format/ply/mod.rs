@@ -1,4 +1,5 @@
-//! Gaussian `.ply` files: the plain 3DGS layout (read and written) and PlayCanvas' compressed one (read).
+//! Gaussian `.ply` files, read and written: the plain 3DGS layout, PlayCanvas' compressed one
+//! and the moving one of Spacetime Gaussians.
 //!
 //! A plain file has a row per Gaussian: x y z, nx ny nz (unused), f_dc_0..2, f_rest_*, opacity, scale_0..2, rot_0..3,
 //! all f32. Scales are logarithms, opacity is a logit, the quaternion is (w, x, y, z) and not normalised, and f_rest is
@@ -7,7 +8,9 @@
 
 mod compressed;
 mod header;
+mod pack;
 mod rows;
+mod stg;
 
 use crate::scene::params::{GEOMETRY, GEOMETRY_COLUMNS, Params, SH};
 use crate::scene::table::{BLOCK, Table};
@@ -16,6 +19,9 @@ use header::{Element, Header, broken};
 use rayon::prelude::*;
 use rows::Rows;
 use std::io::Write;
+
+pub use pack::write_compressed;
+pub use stg::{is_stg, read_stg, write_stg};
 
 /// f_rest properties of SH degree 0, 1, 2 and 3: three channels of the coefficients above the first.
 const F_REST_COUNTS: [usize; 4] = [0, 9, 24, 45];
@@ -92,6 +98,12 @@ pub fn read(bytes: &[u8]) -> Result<(Params, PlyInfo)> {
     Ok((params, info))
 }
 
+/// Whether a .ply file has PlayCanvas' compressed layout. False for anything unreadable.
+pub fn is_compressed(bytes: &[u8]) -> bool {
+    let packed = |e: &Element| e.name == "vertex" && compressed::is_packed(e);
+    Header::read(bytes).is_ok_and(|h| h.elements.iter().any(packed))
+}
+
 /// Reads the positions of any PLY file and the colours of its points: `red green blue`, or the base colour of
 /// Gaussians.
 ///
@@ -121,7 +133,7 @@ pub fn read_points(bytes: &[u8]) -> Result<PlyPoints> {
         // Bytes span 0..255, and nobody writes floating-point colours in any range but 0..1.
         join([r, g, b], if vertex.is_floating(r) { |v| v } else { |v| v / 255.0 })
     } else if let [Some(r), Some(g), Some(b)] = all(DC_NAMES) {
-        join([r, g, b], |v| 0.5 + compressed::SH_C0 * v)
+        join([r, g, b], |v| 0.5 + super::octets::SH_C0 * v)
     } else {
         Vec::new()
     };

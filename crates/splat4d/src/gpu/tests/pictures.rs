@@ -3,11 +3,11 @@
 use super::*;
 use crate::render::RenderStats;
 
-/// Largest difference of a colour or an alpha. A splat at the α cut-off may be drawn on one side only: 1/255 of a
-/// colour, mostly hidden.
-const PIXEL: f32 = 6e-3;
+/// Largest difference of a colour or an alpha. A splat at the α cut-off may be drawn on one side only, which is 1/255
+/// of what is left of the light there.
+const PIXEL: f32 = 2e-3;
 /// Largest difference of Σ z α T, of the scene's depth.
-const DEPTH: f32 = 6e-3;
+const DEPTH: f32 = 2e-3;
 /// Least PSNR of colour, dB.
 const PSNR: f64 = 60.0;
 
@@ -129,24 +129,29 @@ fn nothing_to_draw_is_the_background() {
     assert!(image.color.data.is_empty());
 }
 
+/// A scene of which one number, and one whole row, is each of `values`.
+fn spoilt(values: &[f32]) -> Scenery {
+    let mut scene = Scenery::new(19, 500, 1.0, 0.08);
+    for (i, &v) in values.iter().enumerate() {
+        for column in 0..10 {
+            scene.out.set(10 * i + column, column, v);
+        }
+        scene.out.write(100 + i, 0, [v; 10]);
+    }
+    scene
+}
+
 #[test]
 fn absurd_numbers_are_not_drawn() {
     let Some(mut r) = renderer() else { return };
     let camera = camera([0.0, 0.5, -4.0], 90, 70);
-    let mut scene = Scenery::new(19, 500, 1.0, 0.08);
-    for (i, v) in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 1e38, -1e38, 1e30].into_iter().enumerate() {
-        for column in 0..10 {
-            scene.out.set(10 * i + column, column, v);
-        }
-        // The whole row.
-        scene.out.write(100 + i, 0, [v; 10]);
-    }
-    let (_, expected) = on_cpu(&scene.splats(), &camera, &r.config);
+    let scene = spoilt(&[f32::NAN, f32::INFINITY, f32::NEG_INFINITY]);
+    compare(&mut r, &scene.splats(), &camera, "NaN and infinities");
+    // Numbers of which squares overflow mean nothing on either side, but they end, and in a finite picture.
+    let scene = spoilt(&[1e38, -1e38, 1e30, -1e30, 1e-38]);
     let mut image = Image::default();
     r.render(&scene.splats(), &camera, BACKGROUND, &mut image).expect("it is drawn");
     assert!(image.color.data.iter().chain(&image.alpha.data).all(|v| v.is_finite()));
-    let db = psnr(&image.color.data, &expected.color.data);
-    assert!(db > PSNR, "absurd rows are treated otherwise than on the CPU: {db} dB");
     // And cameras that are no cameras: neither hang nor failure.
     for broken in [f64::NAN, f64::INFINITY, 0.0, -1.0, 1e300] {
         let mut camera = camera.clone();
@@ -157,21 +162,21 @@ fn absurd_numbers_are_not_drawn() {
 
 #[test]
 fn bands_make_the_same_picture() {
-    let Some(mut r) = renderer() else { return };
+    let Some(mut r) = own_renderer() else { return };
     let (scene, camera) = (Scenery::new(20, 20_000, 1.2, 0.05), camera([0.0, 0.5, -4.0], 300, 210));
     let (mut whole, mut bands) = (Image::default(), Image::default());
     r.render(&scene.splats(), &camera, BACKGROUND, &mut whole).expect("it is drawn");
     let (pairs, one) = (r.stats().pairs, r.stats().bands);
     assert!(one == 1 && pairs > 1 << 16, "{pairs} pairs must be more than there was room for at first");
-    let Some(mut r) = renderer() else { return };
+    // A renderer without memory yet, so that there is little room.
+    let Some(mut r) = own_renderer() else { return };
     r.most_pairs = pairs / 4;
     r.render(&scene.splats(), &camera, BACKGROUND, &mut bands).expect("it is drawn");
     assert!(r.stats().bands > 1 && r.stats().pairs == pairs);
     assert!(whole == bands, "a picture in bands is the same, bit for bit");
-    r.most_pairs = 10;
-    let mut r = GpuRenderer { most_pairs: 10, ..renderer().expect("there was one") };
+    // A row of tiles holds more than that.
+    let mut r = GpuRenderer { most_pairs: 10, buffers: Buffers::new(), groups: None, ..r };
     let error = r.render(&scene.splats(), &camera, BACKGROUND, &mut bands);
-    // A few numbers more fit than were asked for; a row of tiles holds thousands.
     assert!(error.is_err_and(|e| e.to_string().contains("too many")), "too many pairs are an error");
 }
 

@@ -189,7 +189,11 @@ fn sums_are_exclusive_and_stop_at_the_top() {
         }
         gpu.queue.submit([encoder.finish()]);
         let mut sum = 0u32;
-        let expected: Vec<u32> = input.iter().map(|v| std::mem::replace(&mut sum, sum.saturating_add(*v))).collect();
+        let mut expected = Vec::new();
+        for v in &input {
+            expected.push(sum);
+            sum = sum.saturating_add(*v);
+        }
         assert!(read::<u32>(&gpu, &out, n) == expected, "{n} sums");
         assert_eq!(read::<u32>(&gpu, &counts, 3), [n as u32, 0, sum], "{n}: the total");
         let things = sum.min(1_000_000);

@@ -1,0 +1,412 @@
+//! `convert`: from any scene to the formats of other programs, with axes, order and fade of each.
+
+use crate::baking::{self, Baking};
+use crate::console::Console;
+use crate::files::{self, grouped, human_bytes};
+use crate::freeze::freeze;
+use crate::sequence::{self, Pattern};
+use crate::source::{Source, not_empty};
+use serde_json::json;
+use splat4d::format::{self, Dialect, Warnings, dialect, ply, spz};
+use splat4d::layers::{Scene, rotation_between};
+use splat4d::math::Se3;
+use splat4d::motion::Spec;
+use splat4d::scene::time::DEFAULT_FPS;
+use splat4d::scene::{Camera, LifeKind, Params};
+use splat4d::{Error, ErrorKind, Result};
+use std::path::{Path, PathBuf};
+
+/// Turns by less than this (cosine to the identity's trace) are rounding, and are not made.
+const NO_TURN: f64 = 1e-12;
+/// No turn.
+const IDENTITY: [[f64; 3]; 3] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
+/// Warnings of a sequence are those of its first frame; the rest would be the same with other numbers.
+const FIRST: &str = "first frame";
+
+const EXAMPLES: &str = "\
+Examples:
+  splat4d convert scene.ply scene.spz                 .spz, version 3; --spz-version 4 for the newest
+  splat4d convert scene.sog scene.ply --up y          y up instead of the format's own y down
+  splat4d convert scene.ply small.compressed.ply --sh 1
+  splat4d convert runs/knight knight.splatv           moving: splaTV and gsplat.js play it
+  splat4d convert runs/knight now.spz --time 0.5      one moment
+  splat4d convert runs/knight 'frames/f_%04d.spz' --frames
+  splat4d convert frames/ all.safetensors --fps 25    numbered files become one moving scene
+
+Written: .splat4d .ply .compressed.ply .stg.ply .spz .splat .splatv .safetensors; read besides: SOG version 2 (.sog or folder).
+docs/formats.md tells what each can hold and which axes it assumes.";
+
+/// Convert between Gaussian file formats, and say what is lost
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub(crate) struct Args {
+    /// A run, scene, .ply, .spz, .splat, .splatv or SOG file, a SOG folder, or a folder of numbered files
+    #[arg(value_name = "IN")]
+    input: PathBuf,
+    /// The file to write, known by its ending; with --frames a folder, or a pattern such as f_%04d.spz
+    #[arg(value_name = "OUT")]
+    output: PathBuf,
+    /// One moment, seconds of the scene
+    #[arg(long, value_name = "T", allow_negative_numbers = true, conflicts_with = "frames")]
+    time: Option<f64>,
+    /// One file a frame
+    #[arg(long)]
+    frames: bool,
+    /// Frames a second: of a sequence that is read (30), or of --frames (those of the scene)
+    #[arg(long, value_name = "N")]
+    fps: Option<f64>,
+    /// First second of --frames
+    #[arg(long, value_name = "S", requires = "frames", allow_negative_numbers = true)]
+    from: Option<f64>,
+    /// Last second of --frames
+    #[arg(long, value_name = "S", requires = "frames", allow_negative_numbers = true)]
+    to: Option<f64>,
+    /// Turn the scene so that this axis is up [default: the format's custom]
+    #[arg(long, value_name = "AXIS", value_enum, allow_hyphen_values = true)]
+    up: Option<Up>,
+    /// Highest degree of spherical harmonics to keep
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(0..=3))]
+    sh: Option<u8>,
+    /// Version of .spz to write
+    #[arg(long, value_name = "V", default_value_t = spz::DEFAULT_VERSION, value_parser = clap::value_parser!(u32).range(2..=4))]
+    spz_version: u32,
+}
+
+/// Which axis is up.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum Up {
+    /// The axes stay as they are
+    Keep,
+    #[value(name = "y")]
+    Y,
+    #[value(name = "-y")]
+    MinusY,
+    #[value(name = "z")]
+    Z,
+    #[value(name = "-z")]
+    MinusZ,
+    #[value(name = "x")]
+    X,
+    #[value(name = "-x")]
+    MinusX,
+}
+
+impl Up {
+    fn direction(self) -> Option<[f64; 3]> {
+        Some(match self {
+            Self::Keep => return None,
+            Self::X => [1.0, 0.0, 0.0],
+            Self::MinusX => [-1.0, 0.0, 0.0],
+            Self::Y => [0.0, 1.0, 0.0],
+            Self::MinusY => [0.0, -1.0, 0.0],
+            Self::Z => [0.0, 0.0, 1.0],
+            Self::MinusZ => [0.0, 0.0, -1.0],
+        })
+    }
+}
+
+/// What is written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Target {
+    Dialect(Dialect),
+    /// scene.safetensors: everything, exactly.
+    Scene,
+    /// .splat4d, baked as `bake` does without options.
+    Playback,
+}
+
+impl Target {
+    fn of(path: &Path) -> Result<Self> {
+        let name = path.file_name().map(|n| n.to_string_lossy().to_ascii_lowercase()).unwrap_or_default();
+        let table = [
+            (".compressed.ply", Self::Dialect(Dialect::CompressedPly)),
+            (".stg.ply", Self::Dialect(Dialect::StgPly)),
+            (".ply", Self::Dialect(Dialect::Ply)),
+            (".spz", Self::Dialect(Dialect::Spz)),
+            (".splatv", Self::Dialect(Dialect::Splatv)),
+            (".splat", Self::Dialect(Dialect::Splat)),
+            (".safetensors", Self::Scene),
+            (".splat4d", Self::Playback),
+        ];
+        if let Some((_, target)) = table.iter().find(|(ending, _)| name.ends_with(ending)) {
+            return Ok(*target);
+        }
+        let (what, remedy) = match name.rsplit_once('.').map(|n| n.1) {
+            Some("sog") => {
+                ("SOG is read, but not written", "Write .compressed.ply or .spz; splat-transform makes SOG of either.")
+            }
+            Some("ksplat" | "glb" | "4dgs") => ("this format is not written", "Write .ply or .spz."),
+            _ => ("has no ending that names a format", "Use .ply .compressed.ply .stg.ply .spz .splat .splatv."),
+        };
+        Err(Error::new(ErrorKind::Unsupported, what).at(path.display()).remedy(remedy))
+    }
+
+    fn moves(self) -> bool {
+        match self {
+            Self::Dialect(d) => d.moves(),
+            Self::Scene | Self::Playback => true,
+        }
+    }
+
+    fn name(self) -> &'static str {
+        match self {
+            Self::Dialect(d) => d.name(),
+            Self::Scene => "scene.safetensors",
+            Self::Playback => "playback file",
+        }
+    }
+}
+
+pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
+    let pattern = frames_pattern(args)?;
+    let target = Target::of(pattern.as_ref().map_or(&args.output, |p| p.1.as_path()))?;
+    if args.time.is_some_and(|t| !t.is_finite()) || args.fps.is_some_and(|f| !(0.01..=1000.0).contains(&f)) {
+        return Err(Error::input("--time or --fps is out of range").remedy("Give a plain, sensible number.").into());
+    }
+    if target == Target::Playback && (args.time.is_some() || args.frames) {
+        return Err(Error::input("a playback file holds the whole take")
+            .at(args.output.display())
+            .remedy("Leave --time or --frames out.")
+            .into());
+    }
+    let mut source = Source::open_at(&args.input, args.fps.unwrap_or(DEFAULT_FPS))?;
+    not_empty(&source.scene, &args.input)?;
+    source.warnings.lines().iter().for_each(|w| console.warn(&format!("{w}.")));
+    if let Some(degree) = args.sh {
+        let had = source.scene.limit_sh(degree.into());
+        if had > usize::from(degree) {
+            console.say(&format!("spherical harmonics lowered from degree {had} to {degree}"));
+        }
+    }
+    let cameras = first_camera(&source);
+    let turn = turn(&mut source.scene, args.up, target, console)?;
+    let cameras: Vec<Camera> = cameras.into_iter().map(|c| turned(c, &turn)).collect();
+    if target == Target::Playback {
+        return bake(source, args, turn != IDENTITY, console);
+    }
+    let scene = &source.scene;
+    let writer = Writer { target, spz_version: args.spz_version, cameras };
+    if let Some((pattern, _)) = pattern {
+        return write_frames(args, scene, &pattern, &writer, console);
+    }
+    let moment = match args.time {
+        Some(time) => Some(time),
+        None if target.moves() || !is_moving(scene) => None,
+        None => {
+            let start = scene.clip[0];
+            console.warn(&format!(
+                "{} holds one moment: {start} s, the clip's start, is taken. Choose with --time, or use --frames, \
+                 .splatv or .stg.ply.",
+                target.name()
+            ));
+            Some(start)
+        }
+    };
+    let still;
+    let whole = match moment {
+        Some(time) => {
+            still = one_moment(scene, time)?;
+            console.say(&format!("{} of {} Gaussians at {time} s", grouped(still.len()), grouped(scene.len())));
+            &still
+        }
+        None => scene,
+    };
+    let (bytes, warnings) = writer.bytes(whole).map_err(|e| e.at(args.input.display()))?;
+    warnings.lines().iter().for_each(|w| console.warn(&format!("{w}.")));
+    files::write(&args.output, &bytes)?;
+    let each = bytes.len() as f64 / whole.len().max(1) as f64;
+    console.say(&format!(
+        "{}: {} Gaussians, {} ({each:.1} bytes each)",
+        target.name(),
+        grouped(whole.len()),
+        human_bytes(bytes.len() as u64)
+    ));
+    console.emit(&json!({"type": "converted", "format": target.name(), "gaussians": whole.len(),
+        "bytes": bytes.len(), "time": moment, "warnings": warnings.lines()}));
+    console.written(&args.output);
+    Ok(())
+}
+
+/// A playback file. The capture's cameras belong to the old axes: a scene that was turned goes without them.
+fn bake(mut source: Source, args: &Args, turned: bool, console: &Console) -> anyhow::Result<()> {
+    let title = baking::title(&source, &args.input);
+    if turned {
+        (source.run, source.playback) = (None, None);
+    }
+    baking::bake_into(&source, &title, &args.output, &Baking::default(), console)?;
+    Ok(())
+}
+
+/// With --frames: the pattern, and a name by which the format is known.
+fn frames_pattern(args: &Args) -> Result<Option<(Pattern, PathBuf)>> {
+    if !args.frames {
+        return match Pattern::of(&args.output) {
+            Some(_) => Err(Error::input("is a pattern for many files")
+                .at(args.output.display())
+                .remedy("Add --frames, or give the name of one file.")),
+            None => Ok(None),
+        };
+    }
+    let pattern = match Pattern::of(&args.output) {
+        Some(pattern) => pattern,
+        None if Target::of(&args.output).is_ok() => {
+            return Err(Error::input("is one file, but --frames writes many")
+                .at(args.output.display())
+                .remedy("Give a folder, or a pattern such as frames/f_%04d.spz."));
+        }
+        None => Pattern::in_folder(&args.output),
+    };
+    let example = pattern.file(0);
+    Ok(Some((pattern, example)))
+}
+
+fn write_frames(
+    args: &Args,
+    scene: &Scene<f32>,
+    pattern: &Pattern,
+    writer: &Writer,
+    console: &Console,
+) -> anyhow::Result<()> {
+    let (fps, times) = sequence::moments(scene, args.fps, [args.from, args.to])?;
+    if !pattern.folder().as_os_str().is_empty() {
+        files::make_folder(pattern.folder())?;
+    }
+    let mut total = 0;
+    for (i, &time) in times.iter().enumerate() {
+        let (bytes, warnings) =
+            writer.bytes(&one_moment(scene, time)?).map_err(|e| e.at(format_args!("the frame at {time} s")))?;
+        if i == 0 {
+            warnings.lines().iter().for_each(|w| console.warn(&format!("{FIRST}: {w}.")));
+        }
+        files::write(&pattern.file(i), &bytes)?;
+        total += bytes.len();
+        console.phase("converting", i + 1, times.len());
+    }
+    console.clear();
+    console.say(&format!(
+        "{} files, {fps} a second, from {} to {} s, {} together",
+        times.len(),
+        times[0],
+        times[times.len() - 1],
+        human_bytes(total as u64)
+    ));
+    console.emit(&json!({"type": "converted", "format": writer.target.name(), "files": times.len(), "fps": fps,
+        "bytes": total}));
+    console.written(&pattern.file(0));
+    Ok(())
+}
+
+/// Turns the scene so that the wanted axis is up, and returns the rotation that was made.
+fn turn(scene: &mut Scene<f32>, up: Option<Up>, target: Target, console: &Console) -> Result<[[f64; 3]; 3]> {
+    let custom = match target {
+        Target::Dialect(d) => Some(d.up()),
+        Target::Scene | Target::Playback => None,
+    };
+    let Some(wanted) = up.map_or(custom, Up::direction) else { return Ok(IDENTITY) };
+    let Some(r) = rotation_between(scene.up, wanted) else {
+        console.warn("the scene does not say which way is up: its axes stay as they are.");
+        return Ok(IDENTITY);
+    };
+    if 3.0 - (r[0][0] + r[1][1] + r[2][2]) <= NO_TURN {
+        return Ok(IDENTITY);
+    }
+    let axis = |v: [f64; 3]| format!("({:.3} {:.3} {:.3})", v[0], v[1], v[2]);
+    let old = axis(scene.up);
+    scene.turn(&r)?;
+    console.say(&format!("turned: up was {old}, is {}; --up keep leaves axes as they are", axis(wanted)));
+    Ok(r)
+}
+
+/// The first camera of the data set, if it is at hand: a place from which the scene looks right.
+fn first_camera(source: &Source) -> Option<Camera> {
+    Some(source.views().ok()?.into_iter().next()?.camera)
+}
+
+fn turned(camera: Camera, r: &[[f64; 3]; 3]) -> Camera {
+    let old = camera.cam_from_world.rotation;
+    let rotation = std::array::from_fn(|i| std::array::from_fn(|j| (0..3).map(|k| old[i][k] * r[j][k]).sum::<f64>()));
+    Camera { cam_from_world: Se3 { rotation, ..camera.cam_from_world }, ..camera }
+}
+
+fn is_moving(scene: &Scene<f32>) -> bool {
+    scene.layers.iter().any(|l| l.motion.spec() != Spec::Still || l.life != LifeKind::Infinite)
+}
+
+/// A scene that stands still as `scene` does at `time`.
+fn one_moment(scene: &Scene<f32>, time: f64) -> Result<Scene<f32>> {
+    let mut still = dialect::still(moment(scene, time), Dialect::Ply);
+    still.up = scene.up;
+    still.background = scene.background;
+    Ok(still)
+}
+
+fn moment(scene: &Scene<f32>, time: f64) -> Params {
+    match &scene.layers[..] {
+        // What stands still anyway keeps its very bits.
+        [only] if !is_moving(scene) => only.params.clone(),
+        _ => freeze(scene, time),
+    }
+}
+
+/// Writes one file of a kind.
+struct Writer {
+    target: Target,
+    spz_version: u32,
+    cameras: Vec<Camera>,
+}
+
+impl Writer {
+    /// A scene as a file; where the format holds one moment, the scene stands still.
+    fn bytes(&self, scene: &Scene<f32>) -> Result<(Vec<u8>, Warnings)> {
+        let mut out = Vec::new();
+        let Target::Dialect(dialect) = self.target else {
+            format::scene::write(scene, &mut out)?;
+            return Ok((out, Warnings::default()));
+        };
+        if dialect.moves() {
+            let warnings = match dialect {
+                Dialect::StgPly => ply::write_stg(scene, &mut out)?,
+                _ => format::splatv::write(scene, &self.cameras, &mut out)?,
+            };
+            return Ok((out, warnings));
+        }
+        let params = moment(scene, scene.clip[0]);
+        let warnings = match dialect {
+            Dialect::Ply => ply::write(&params, &mut out).map(|()| Warnings::default())?,
+            Dialect::CompressedPly => ply::write_compressed(&params, &mut out)?,
+            Dialect::Spz => spz::write(&params, self.spz_version, &mut out)?,
+            Dialect::Splat => format::splat::write(&params, &mut out)?,
+            other => unreachable!("{} has no writer, and `Target::of` never names it", other.name()),
+        };
+        Ok((out, warnings))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn formats_are_known_by_their_endings() {
+        let of = |name: &str| Target::of(Path::new(name));
+        assert_eq!(of("a.PLY").unwrap(), Target::Dialect(Dialect::Ply));
+        assert_eq!(of("a.compressed.ply").unwrap(), Target::Dialect(Dialect::CompressedPly));
+        assert_eq!(of("a.stg.ply").unwrap(), Target::Dialect(Dialect::StgPly));
+        assert_eq!(of("x/a.splatv").unwrap(), Target::Dialect(Dialect::Splatv));
+        assert_eq!(of("a.splat").unwrap(), Target::Dialect(Dialect::Splat));
+        assert_eq!(of("scene.safetensors").unwrap(), Target::Scene);
+        for (name, word) in [("a.sog", "not written"), ("a.glb", ".ply"), ("a", "ending")] {
+            assert!(of(name).unwrap_err().to_string().contains(word), "{name}");
+        }
+    }
+
+    #[test]
+    fn a_turned_camera_sees_the_turned_point_where_it_was() {
+        let camera = Camera::with_fov_y(Se3::look_at([1.0, 2.0, 5.0], [0.0; 3], [0.0, 1.0, 0.0]), 0.8, 40, 30);
+        let r = rotation_between([0.0, 1.0, 0.0], [0.3, -0.2, 0.9]).unwrap();
+        let x = [0.3, -0.2, 0.4];
+        let there = std::array::from_fn(|k| (0..3).map(|l| r[k][l] * x[l]).sum());
+        let (a, b) = (camera.project(x).unwrap(), turned(camera, &r).project(there).unwrap());
+        assert!((a.0[0] - b.0[0]).abs() < 1e-9 && (a.0[1] - b.0[1]).abs() < 1e-9 && (a.1 - b.1).abs() < 1e-9);
+    }
+}

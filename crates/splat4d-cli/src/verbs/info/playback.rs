@@ -1,0 +1,120 @@
+//! What the index of a playback file says: sections, sizes, and how much has to arrive before there is something to see.
+
+use super::line;
+use crate::files::{grouped, human_bytes};
+use serde_json::{Value, json};
+use splat4d::format::playback::{Codec, Entry, HEADER_BYTES, Index, Kind};
+use std::fmt::Write;
+
+/// Sections that are listed; `--json` has them all.
+const LISTED: usize = 24;
+/// Moments of the clip that are looked at.
+const MOMENTS: usize = 5;
+
+/// The index in words and as JSON.
+pub(super) struct ToldIndex {
+    pub text: String,
+    pub json: Value,
+}
+
+pub(super) fn of_index(index: &Index) -> ToldIndex {
+    let (meta, sections) = (&index.meta, &index.sections);
+    let stored = |kind: Kind| sections.iter().filter(|e| e.kind == kind).map(|e| u64::from(e.stored)).sum::<u64>();
+    let known: u64 = sections.iter().map(|e| u64::from(e.stored)).sum();
+    let seconds = meta.clip[1] - meta.clip[0];
+    let rate = (seconds > 0.0).then(|| index.file_len as f64 * 8e-6 / seconds);
+    let mut text = String::new();
+    line(&mut text, "version", &format!("{}.{}", index.version[0], index.version[1]));
+    if !meta.title.is_empty() {
+        line(&mut text, "title", &meta.title);
+    }
+    line(&mut text, "degree", &format!("{} of the spherical harmonics", meta.sh_degree));
+    let extras = [("cameras", meta.cameras.len()), ("keys of a camera path", meta.path.len())];
+    for (name, count) in extras.into_iter().filter(|(_, count)| *count > 0) {
+        line(&mut text, "brings along", &format!("{count} {name}"));
+    }
+    let _ = writeln!(
+        text,
+        "{:<16} {:<5} {:>4} {:>18} {:>10} {:>11}",
+        "sections", "kind", "tier", "seconds", "count", "bytes"
+    );
+    for (i, e) in sections.iter().enumerate().take(LISTED) {
+        let (tier, span) = match e.kind {
+            Kind::Page => (e.tier.to_string(), format!("{:.3} to {:.3}", e.span[0], e.span[1])),
+            _ => (String::new(), String::new()),
+        };
+        let (count, bytes) = (grouped(e.count as usize), grouped(e.stored as usize));
+        let _ = writeln!(text, "{i:>16} {:<5} {tier:>4} {span:>18} {count:>10} {bytes:>11}", e.kind.name());
+    }
+    if sections.len() > LISTED {
+        line(&mut text, "", &format!("and {} more", grouped(sections.len() - LISTED)));
+    }
+    let sizes = [Kind::Page, Kind::Palette, Kind::Poster].map(|kind| (kind, stored(kind)));
+    let head = index.file_len.saturating_sub(known);
+    let parts: Vec<String> = [("pages", sizes[0].1), ("palettes", sizes[1].1), ("poster", sizes[2].1), ("index", head)]
+        .into_iter()
+        .filter(|(_, bytes)| *bytes > 0)
+        .map(|(name, bytes)| format!("{name} {}", human_bytes(bytes)))
+        .collect();
+    line(&mut text, "bytes", &parts.join(", "));
+    line(&mut text, "first picture", &format!("after {}", human_bytes(first_picture(index))));
+    if let Some(rate) = rate {
+        line(&mut text, "stream", &format!("{rate:.1} Mbit/s over {seconds:.3} s"));
+    }
+    let moments = moments(index);
+    for (i, m) in moments.iter().enumerate() {
+        let name = if i == 0 { "at" } else { "" };
+        let what = format!("{} Gaussians in {} pages, {}", grouped(m.gaussians), m.pages, human_bytes(m.bytes));
+        line(&mut text, name, &format!("{:>8.3} s  {what}", m.time));
+    }
+    let json = json!({
+        "version": index.version, "meta": meta, "sections": sections.iter().map(section).collect::<Vec<_>>(),
+        "page_bytes": sizes[0].1, "palette_bytes": sizes[1].1, "poster_bytes": sizes[2].1, "index_bytes": head,
+        "first_picture_bytes": first_picture(index), "megabits_per_second": rate,
+        "moments": moments.iter().map(|m| json!({"time": m.time, "gaussians": m.gaussians, "pages": m.pages,
+            "bytes": m.bytes})).collect::<Vec<_>>(),
+    });
+    ToldIndex { text, json }
+}
+
+fn section(e: &Entry) -> Value {
+    let mut v = json!({"kind": e.kind.name(), "required": e.required, "offset": e.offset, "stored": e.stored,
+        "bytes": e.bytes, "crc": e.crc, "deflated": e.codec == Codec::Deflate});
+    if e.kind == Kind::Page {
+        v["tier"] = json!(e.tier);
+        v["gaussians"] = json!(e.count);
+        v["span"] = json!(e.span);
+        v["palette"] = json!(e.palette);
+    }
+    if e.kind == Kind::Palette {
+        v["degree"] = json!(e.degree);
+        v["entries"] = json!(e.count);
+    }
+    v
+}
+
+/// Bytes from the file's start to the end of the first tier of the clip's start, and of the palettes on the way.
+fn first_picture(index: &Index) -> u64 {
+    let start = index.pages_at(index.meta.clip[0]);
+    let first = start.iter().filter(|(_, e)| e.tier == 0).map(|(_, e)| e.offset + u64::from(e.stored)).max();
+    first.unwrap_or(HEADER_BYTES as u64)
+}
+
+struct Moment {
+    time: f64,
+    gaussians: usize,
+    pages: usize,
+    bytes: u64,
+}
+
+fn moments(index: &Index) -> Vec<Moment> {
+    let [from, to] = index.meta.clip;
+    let count = if to > from { MOMENTS } else { 1 };
+    let one = |i: usize| {
+        let time = from + (to - from) * i as f64 / (count - 1).max(1) as f64;
+        let pages = index.pages_at(time);
+        let gaussians = pages.iter().map(|(_, e)| e.count as usize).sum();
+        Moment { time, gaussians, pages: pages.len(), bytes: pages.iter().map(|(_, e)| u64::from(e.stored)).sum() }
+    };
+    (0..count).map(one).collect()
+}

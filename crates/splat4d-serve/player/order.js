@@ -1,0 +1,110 @@
+// The order in which Gaussians are drawn, asked of a worker; on this thread where the page may start none.
+
+import { worker } from './assets.js';
+import { Sorter } from './sort.worker.js';
+
+/// One order is on its way at a time; what is asked meanwhile waits for the next.
+export class Order {
+  /// Counts pages that came and went; an order carries the number it knew.
+  generation = 0;
+  /// Whether an order is on its way.
+  busy = false;
+  #onorder;
+  #near;
+  #worker = null;
+  #sorter = null;
+  /// [message, what moves with it], until the worker says that it runs: a page's policy may forbid workers.
+  #early = [];
+  #asked = { time: NaN, depth: [NaN, 0, 0, 0], generation: -1 };
+  #request;
+  /// The array that goes back and forth.
+  #array = null;
+
+  /// `onorder({order, count, active, ms, generation})`: the first `count` of `order` are the visible Gaussians, the
+  /// farthest first; it is valid during the call only.
+  constructor(near, onorder) {
+    this.#request = { time: 0, depth: [0, 0, 0, 0], near };
+    this.#onorder = onorder;
+    try {
+      this.#worker = worker('sort.worker.js');
+    } catch {
+      return void this.#here();
+    }
+    this.#worker.onmessage = ({ data }) => {
+      if (!data.ready) return this.#arrived(data);
+      const early = this.#early;
+      this.#early = null;
+      for (const [message, move] of early) this.#worker.postMessage(message, move);
+    };
+    this.#worker.onerror = (event) => {
+      if (!this.#early) return;
+      event.preventDefault?.();
+      this.#here();
+    };
+  }
+
+  /// A page whose arrays are the order's from now on, and its first row in the texture.
+  add({ id, count, words, headers }, { from, to }, row) {
+    this.generation++;
+    this.#tell({ add: { id, row, count, words, headers, from, to } }, [words.buffer, headers.buffer]);
+  }
+
+  drop(id) {
+    this.generation++;
+    this.#tell({ drop: id });
+  }
+
+  /// Asks for the order at `time` seen by `m` (camera from world, 3x4), where the last one asked for is not that one.
+  /// Returns whether one is on its way.
+  ask(time, m) {
+    if (this.busy) return true;
+    const { depth } = this.#asked;
+    let same = this.#asked.time === time && this.#asked.generation === this.generation;
+    for (let k = 0; k < 4; k++) same &&= depth[k] === m[8 + k];
+    if (same) return false;
+    this.#asked.generation = this.generation;
+    for (const o of [this.#asked, this.#request]) {
+      o.time = time;
+      for (let k = 0; k < 4; k++) o.depth[k] = m[8 + k];
+    }
+    this.busy = true;
+    const array = this.#array;
+    this.#array = null;
+    this.#tell({ sort: this.#request, generation: this.generation, order: array }, array ? [array.buffer] : []);
+    return true;
+  }
+
+  destroy() {
+    this.#onorder = () => {};
+    this.#worker?.terminate();
+  }
+
+  #tell(message, move = []) {
+    if (this.#sorter) this.#answer(message);
+    else if (this.#early) this.#early.push([message, move]);
+    else this.#worker.postMessage(message, move);
+  }
+
+  #here() {
+    this.#worker?.terminate();
+    this.#sorter = new Sorter();
+    for (const [message] of this.#early.splice(0)) this.#answer(message);
+  }
+
+  #answer({ add, drop, sort, generation, order }) {
+    if (add) return this.#sorter.add(add);
+    if (drop !== undefined) return this.#sorter.drop(drop);
+    const begin = performance.now();
+    const array = this.#sorter.room(order);
+    const { count, active } = this.#sorter.sort(sort, array);
+    const ms = performance.now() - begin;
+    // Later, as a worker's answer would come: whoever asks is not in the middle of something then.
+    setTimeout(() => this.#arrived({ order: array, count, active, ms, generation }), 0);
+  }
+
+  #arrived(answer) {
+    this.busy = false;
+    this.#array = answer.order;
+    this.#onorder(answer);
+  }
+}

@@ -1,0 +1,155 @@
+// What the stream asks for and lets go of, with a recorded file and backend.
+
+import assert from 'node:assert/strict';
+import test from 'node:test';
+import { SceneFile } from '../../player/scene-file.js';
+import { Stream } from '../../player/stream.js';
+import { sample } from './sample.mjs';
+import { serve } from './server.mjs';
+
+/// A file of `segments` one-second pages of 1,000 Gaussians and a root of two tiers; pages come when `let` says so.
+function recorded(segments = 20, root = 2) {
+  const entry = (id, from, to, tier) => ({ id, from, to, tier, count: 1000, palette: -1 });
+  const pages = [...Array(root).keys()].map((i) => entry(i, 0, segments, i));
+  for (let i = 0; i < segments; i++) pages.push(entry(root + i, i, i + 1, 0));
+  const asked = [],
+    open = new Map(),
+    bad = new Set();
+  const clamp = (t) => Math.min(Math.max(t, 0), segments - 1e-9);
+  const file = {
+    meta: { clip: [0, segments - 1e-9] },
+    sections: pages,
+    pages,
+    clamp,
+    activePages: (t) => pages.filter((p) => p.from <= clamp(t) && clamp(t) < p.to),
+    page: (id, { signal }) =>
+      new Promise((resolve, reject) => {
+        asked.push(id);
+        if (bad.has(id)) return reject(new Error(`page ${id}`));
+        open.set(id, () => (open.delete(id), resolve({ id })));
+        signal.addEventListener('abort', () => (open.delete(id), reject(signal.reason)));
+      }),
+  };
+  const there = new Set();
+  const backend = { addPage: ({ id }) => there.add(id), dropPage: (id) => there.delete(id) };
+  const tick = () => new Promise((done) => setTimeout(done, 0));
+  const arrive = async () => {
+    for (const go of [...open.values()]) go();
+    await tick();
+  };
+  const all = async () => {
+    while (open.size) await arrive();
+  };
+  return { file, backend, there, asked, open, bad, tick, arrive, all };
+}
+
+test('a seek asks for its own moment first, by tier; what lies ahead comes after', async () => {
+  const r = recorded(),
+    stream = new Stream(r.file, r.backend);
+  stream.update(5.5);
+  assert.deepEqual(r.asked, [0, 7, 1]);
+  assert.equal(stream.ready(5.5), 0);
+  await r.arrive();
+  assert.equal(stream.ready(5.5), 1);
+  // Half a second to both sides.
+  assert.deepEqual(
+    r.asked.slice(3).sort((a, b) => a - b),
+    [6, 8],
+  );
+  stream.update(15.2);
+  assert.deepEqual(r.asked.slice(5), [17], 'only the new segment');
+  assert.deepEqual([...r.open.keys()], [17], 'and what is no longer wanted is stopped');
+  await r.all();
+  assert.ok(stream.ready(15.2) === 1);
+});
+
+test('playing looks ahead two seconds, in its direction and round the loop', async () => {
+  for (const [time, speed, ahead] of [
+    [3.1, 1, [6, 7]],
+    [18.5, 1, [21, 2]],
+    [10.5, 2, [13, 14, 15, 16]],
+    [10.5, -1, [11, 10]],
+  ]) {
+    const r = recorded(),
+      stream = new Stream(r.file, r.backend);
+    stream.update(time, { playing: true, speed });
+    await r.all();
+    assert.deepEqual(
+      r.asked.slice(3).filter((id) => ahead.includes(id)),
+      ahead,
+      `${time} at ${speed}`,
+    );
+    assert.ok(r.asked.length <= 3 + ahead.length + 1, `${r.asked}`);
+  }
+});
+
+test('nothing is asked for twice, and an unchanged moment costs nothing', async () => {
+  const r = recorded(),
+    stream = new Stream(r.file, r.backend);
+  for (let i = 0; i < 100; i++) stream.update(4.5 + i * 1e-4);
+  await r.all();
+  for (let i = 0; i < 100; i++) stream.update(4.5 + i * 1e-4);
+  assert.equal(new Set(r.asked).size, r.asked.length);
+});
+
+test('above the budget the farthest goes, never this moment; too small a budget leaves lower tiers out', async () => {
+  const r = recorded(),
+    stream = new Stream(r.file, r.backend, { budget: 8 * 32_000 });
+  for (let t = 0.5; t < 20; t++) {
+    stream.update(t, { playing: true });
+    await r.all();
+    assert.equal(stream.ready(t), 1, `${t}`);
+    assert.ok(r.there.size <= 8 && stream.bytes <= 8 * 32_000);
+  }
+  const small = recorded(),
+    tight = new Stream(small.file, small.backend, { budget: 2 * 32_000 });
+  for (let t = 0.5; t < 20; t++) {
+    tight.update(t, { playing: true });
+    await small.all();
+    assert.deepEqual(
+      [...small.there].sort((a, b) => a - b),
+      [0, 2 + Math.floor(t)],
+    );
+    await tight.settled(t);
+  }
+  const none = recorded(),
+    nothing = new Stream(none.file, none.backend, { budget: 10 });
+  await nothing.settled(3);
+  assert.equal(none.there.size, 0);
+});
+
+test('a page that fails is tried again, then reported; the rest goes on', async () => {
+  const r = recorded(),
+    errors = [],
+    stream = new Stream(r.file, r.backend, { onerror: (e) => errors.push(e.message) });
+  r.bad.add(7);
+  const settled = stream.settled(5.5);
+  await r.tick();
+  await r.all();
+  await settled;
+  assert.deepEqual(errors, ['page 7']);
+  assert.equal(r.asked.filter((id) => id === 7).length, 2);
+  assert.ok(r.there.has(0) && r.there.has(1) && r.there.has(8));
+  assert.equal(stream.ready(5.5), 2 / 3);
+});
+
+test('a palette is there before its page, and asked for once', async () => {
+  const { bytes } = sample({ scale: 5, codec: 0 }),
+    server = await serve({ files: { a: bytes } });
+  try {
+    const file = await SceneFile.open(server.url + 'a'),
+      palettes = [],
+      done = [];
+    const stream = new Stream(file, {
+      addPalette: ({ id }) => palettes.push(id),
+      addPage: ({ id }, entry) => done.push(id) && assert.ok(entry.palette < 0 || palettes.includes(entry.palette)),
+      dropPage: () => {},
+    });
+    await stream.settled(3.5);
+    assert.deepEqual(done.toSorted(), [4, 5, 7]);
+    assert.equal(stream.ready(3.5), 1);
+    stream.destroy();
+  } finally {
+    await server.close();
+  }
+});

@@ -1,0 +1,269 @@
+//! What the two moving dialects, .splatv and STG's .ply, can say of a Gaussian: a cubic path, a quaternion with a rate, and
+//! a fade exp(−u²) **without the ½**, all on a clock of their own that runs from 0 to 1.
+
+use super::octets::sound_rows;
+use super::warnings::Warnings;
+use crate::layers::{ALWAYS, Layer, Scene};
+use crate::math::quat;
+use crate::motion::spacetime::{ROTATION_RATES, VELOCITIES};
+use crate::motion::{SpacetimeSpec, Spec, build};
+use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
+use crate::scene::{GEOMETRY, LIFE, LifeKind, Params, SH};
+use crate::{Error, ErrorKind, Result};
+
+/// Width, in clips, of a fade that stands for "lives for ever": over the clip it dims by 1e-8.
+pub(super) const FOREVER: f64 = 1e4;
+/// Narrowest fade that is believed, in clips: below it lies no number, and nothing to see.
+const NARROWEST: f64 = 1e-7;
+/// Up in the worlds of these formats: y down, as in plain .ply files.
+const UP: [f64; 3] = [0.0, -1.0, 0.0];
+/// What a file without a clock of its own is taken for: one second.
+const UNKNOWN_CLIP: f64 = 1.0;
+
+/// Where the file's 0 and 1 lie on the scene clock.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Clock {
+    /// First and last second of the clip.
+    pub(super) clip: [f64; 2],
+    /// Frames a second.
+    pub(super) fps: f64,
+    /// Seconds from the file's 0 to its 1.
+    pub(super) duration: f64,
+}
+
+impl Clock {
+    /// A file's own clock, if it states a sensible one; otherwise one second.
+    pub(super) fn stated(clip: [f64; 2], fps: f64, duration: f64) -> Option<Self> {
+        let sound = clip.iter().all(|t| t.is_finite()) && clip[1] >= clip[0] && duration.is_finite() && duration > 0.0;
+        (sound && fps.is_finite() && fps > 0.0).then_some(Self { clip, fps, duration })
+    }
+
+    /// What is assumed where a file says nothing.
+    pub(super) fn assumed(warnings: &mut Warnings) -> Self {
+        warnings.say("the file does not say how long it lasts: one second is assumed");
+        Self { clip: [0.0, UNKNOWN_CLIP], fps: crate::scene::time::DEFAULT_FPS, duration: UNKNOWN_CLIP }
+    }
+}
+
+/// A Gaussian on the file's clock.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Moving {
+    pub(super) mean: [f64; 3],
+    /// Unit, wxyz, at the centre.
+    pub(super) quat: [f64; 4],
+    pub(super) log_scale: [f32; 3],
+    pub(super) opacity_logit: f32,
+    /// Base colour coefficients.
+    pub(super) dc: [f32; 3],
+    /// Units per clip, clip², clip³.
+    pub(super) path: [[f64; 3]; 3],
+    /// Per clip.
+    pub(super) turn: [f64; 4],
+    /// Centre of the fade and origin of the motion.
+    pub(super) center: f64,
+    /// s of exp(−((u − centre)/s)²).
+    pub(super) width: f64,
+}
+
+impl Moving {
+    /// The same motion told from another centre: the polynomial is expanded there, exactly. The fade moves along.
+    pub(super) fn recentered(mut self, center: f64) -> Self {
+        let d = center - self.center;
+        let [a, b, c] = self.path;
+        for k in 0..3 {
+            self.mean[k] += d * (a[k] + d * (b[k] + d * c[k]));
+            self.path[0][k] = a[k] + d * (2.0 * b[k] + d * 3.0 * c[k]);
+            self.path[1][k] = b[k] + 3.0 * d * c[k];
+        }
+        for k in 0..4 {
+            self.quat[k] += d * self.turn[k];
+        }
+        self.center = center;
+        self
+    }
+}
+
+/// All Gaussians of a scene on the clock of a file called `name`.
+///
+/// Errors: a layer's motion or life is not of this kind; the message says what to do.
+pub(super) fn rows(scene: &Scene<f32>, clock: Clock, name: &str, warnings: &mut Warnings) -> Result<Vec<Moving>> {
+    let mut out = Vec::with_capacity(scene.len());
+    let mut shaded = 0;
+    for layer in &scene.layers {
+        let spec = match layer.motion.spec() {
+            Spec::Still => SpacetimeSpec { order: 0, ..SpacetimeSpec::default() },
+            Spec::Spacetime(spec) => spec,
+            other => return Err(cannot_hold(layer, name, &format!("the motion `{}`", other.name()))),
+        };
+        if layer.life == LifeKind::Interval {
+            return Err(cannot_hold(layer, name, "lives of the kind `interval`, which have a flat top"));
+        }
+        let find = |name| layer.params.find(name);
+        let (path, rates) = (find(VELOCITIES), find(ROTATION_RATES));
+        shaded += if layer.params[SH].width() > 3 { layer.params.len() } else { 0 };
+        let p = &layer.params;
+        for row in sound_rows(p, warnings) {
+            let geometry = &p[GEOMETRY];
+            // Raw numbers may be of any length; file programs differ in when they normalise, unit ones suit all.
+            let (quat, norm) = quat::normalize(geometry.read::<4>(row, QUAT).map(f64::from));
+            let norm = if norm > 0.0 { norm } else { 1.0 };
+            let (center, width) = match layer.life {
+                LifeKind::Infinite => (spec.origin, FOREVER * clock.duration),
+                // exp(−½(Δ/w)²) = exp(−(Δ/s)²) at s = √2·w.
+                LifeKind::GaussHalf => (life(p, row, 0), life(p, row, 1).exp() * std::f64::consts::SQRT_2),
+                _ => (life(p, row, 0), life(p, row, 1).exp()),
+            };
+            let mut moving = Moving {
+                mean: geometry.read::<3>(row, 0).map(f64::from),
+                quat,
+                log_scale: geometry.read(row, LOG_SCALE),
+                opacity_logit: geometry.get(row, OPACITY),
+                dc: p[SH].read(row, 0),
+                path: [[0.0; 3]; 3],
+                turn: [0.0; 4],
+                center: (center - clock.clip[0]) / clock.duration,
+                width: (width / clock.duration).clamp(NARROWEST, FOREVER),
+            };
+            for k in 0..spec.order {
+                let power = clock.duration.powi(k as i32 + 1);
+                let v = p[path.expect("a spacetime layer has its tables")].read::<3>(row, 3 * k);
+                moving.path[k] = v.map(|v| f64::from(v) * power);
+            }
+            if spec.rotation {
+                let rate = p[rates.expect("a spacetime layer has its tables")].read::<4>(row, 0);
+                moving.turn = rate.map(|w| f64::from(w) * clock.duration / norm);
+            }
+            out.push(moving);
+        }
+    }
+    if shaded > 0 {
+        let what = "lose their view dependence (spherical harmonics above degree 0)";
+        warnings.counted(shaded, scene.len(), &format!("{what}: {name} holds one colour each"));
+    }
+    Ok(out)
+}
+
+fn life(p: &Params, row: usize, column: usize) -> f64 {
+    f64::from(p[LIFE].get(row, column))
+}
+
+fn cannot_hold(layer: &Layer<f32>, name: &str, what: &str) -> Error {
+    let text = format!("{name} cannot hold layer `{}`: it has {what}", layer.name);
+    Error::new(ErrorKind::Unsupported, text)
+        .remedy("Write one moment (--time T), a file a frame (--frames), or .splat4d, which holds every motion.")
+}
+
+/// The scene of a file's Gaussians.
+pub(super) fn scene(rows: &[Moving], clock: Clock) -> Result<Scene<f32>> {
+    let kind = LifeKind::GaussOne;
+    let origin = 0.5 * (clock.clip[0] + clock.clip[1]);
+    let spec = Spec::Spacetime(SpacetimeSpec { order: 3, rotation: true, detach: true, origin });
+    let mut params = Params::new(rows.len(), 1, kind.columns());
+    let motion = build(&spec, &mut params)?;
+    let find = |p: &Params, name| p.find(name).expect("the model has just made its tables");
+    let (path, rates) = (find(&params, VELOCITIES), find(&params, ROTATION_RATES));
+    let [geometry, sh, life, path, rates] = params.get_mut([GEOMETRY, SH, LIFE, path, rates]);
+    for (row, m) in rows.iter().enumerate() {
+        geometry.write(row, 0, m.mean.map(|x| x as f32));
+        geometry.write(row, QUAT, m.quat.map(|x| x as f32));
+        geometry.write(row, LOG_SCALE, m.log_scale);
+        geometry.set(row, OPACITY, m.opacity_logit);
+        sh.write(row, 0, m.dc);
+        let width = m.width.max(NARROWEST) * clock.duration;
+        life.write(row, 0, [(clock.clip[0] + m.center * clock.duration) as f32, width.ln() as f32]);
+        for k in 0..3 {
+            let power = clock.duration.powi(k as i32 + 1);
+            path.write(row, 3 * k, m.path[k].map(|v| (v / power) as f32));
+        }
+        rates.write(row, 0, m.turn.map(|w| (w / clock.duration) as f32));
+    }
+    let layer = Layer { name: "moving".into(), params, motion, life: kind, span: ALWAYS };
+    Ok(Scene { layers: vec![layer], clip: clock.clip, fps: clock.fps, up: UP, ..Scene::default() })
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+    use crate::format::samples::gaussians;
+    use crate::layers::Instant;
+    use crate::math::Rng;
+    use crate::scene::Time;
+    use crate::scene::splats::SPLAT_OPACITY;
+
+    /// A scene of one layer that flies and spins between seconds 2 and 5.
+    pub(in crate::format) fn moving(rows: usize, life: LifeKind, order: usize, rotation: bool) -> Scene<f32> {
+        let base = gaussians(rows, 1);
+        let mut params = Params::new(rows, 1, life.columns());
+        let spec = Spec::Spacetime(SpacetimeSpec { order, rotation, detach: true, origin: 3.5 });
+        let motion = build(&spec, &mut params).unwrap();
+        let rng = Rng::new(4, "kinematic", 0);
+        for key in params.keys().collect::<Vec<_>>() {
+            for row in 0..rows {
+                for col in 0..params[key].width() {
+                    let n = rng.fork(row as u64).fork(u64::from(key.0)).normal(col as u64) as f32;
+                    let x = match key {
+                        GEOMETRY | SH => base[key].get(row, col),
+                        LIFE if col == 0 => 3.5 + 0.8 * n,
+                        LIFE => 0.3 * n,
+                        _ => 0.3 * n,
+                    };
+                    params[key].set(row, col, x);
+                }
+            }
+        }
+        let layer = Layer { name: "flying".into(), params, motion, life };
+        Scene { layers: vec![layer], clip: [2.0, 5.0], fps: 25.0, up: UP, ..Scene::default() }
+    }
+
+    /// Largest difference of means, covariances and opacities of two scenes over the clip; all rows.
+    pub(in crate::format) fn apart(a: &Scene<f32>, b: &Scene<f32>) -> [f32; 3] {
+        let mut worst = [0.0f32; 3];
+        for i in 0..=10 {
+            let t = Time(a.clip[0] + (a.clip[1] - a.clip[0]) * f64::from(i) / 10.0);
+            let all = |scene: &Scene<f32>| {
+                let mut instant = Instant::default();
+                scene.at(t, &mut instant);
+                for (tape, layer) in instant.tapes.iter_mut().zip(&scene.layers) {
+                    tape.ask(crate::scene::Space::Gaussians, crate::scene::Rows::All, t);
+                    layer.at(&crate::motion::Cache::default(), tape);
+                }
+                instant.tapes[0].out().clone()
+            };
+            let (p, q) = (all(a), all(b));
+            assert_eq!(p.rows(), q.rows());
+            for row in 0..p.rows() {
+                for col in 0..10 {
+                    let group = if col < 3 { 0 } else { 1 + usize::from(col == SPLAT_OPACITY) };
+                    worst[group] = worst[group].max((p.get(row, col) - q.get(row, col)).abs());
+                }
+            }
+        }
+        worst
+    }
+
+    #[test]
+    fn the_way_there_and_back_is_exact_for_every_life_and_order() {
+        let clock = Clock { clip: [2.0, 5.0], fps: 25.0, duration: 3.0 };
+        for life in [LifeKind::Infinite, LifeKind::GaussHalf, LifeKind::GaussOne] {
+            for (order, rotation) in [(0, false), (1, true), (3, true)] {
+                let scene = moving(50, life, order, rotation);
+                let rows = rows(&scene, clock, "x", &mut Warnings::default()).unwrap();
+                let back = super::scene(&rows, clock).unwrap();
+                let [mean, cov, opacity] = apart(&scene, &back);
+                assert!(mean < 2e-5 && cov < 2e-5 && opacity < 2e-6, "{life:?} {order}: {mean} {cov} {opacity}");
+                // Told from other centres, the motion stays; the fade must move along, so that opacity is not compared.
+                let shifted: Vec<Moving> = rows.iter().map(|m| m.recentered(m.center + 0.1)).collect();
+                let [mean, cov, _] = apart(&scene, &super::scene(&shifted, clock).unwrap());
+                assert!(mean < 5e-5 && cov < 5e-5, "{life:?} {order}: {mean} {cov}");
+            }
+        }
+    }
+
+    #[test]
+    fn what_cannot_be_held_is_named_with_the_way_out() {
+        let clock = Clock { clip: [2.0, 5.0], fps: 25.0, duration: 3.0 };
+        let scene = moving(5, LifeKind::Interval, 1, false);
+        let message = rows(&scene, clock, ".splatv", &mut Warnings::default()).unwrap_err().to_string();
+        assert!(message.contains("`flying`") && message.contains("interval") && message.contains("--frames"));
+    }
+}

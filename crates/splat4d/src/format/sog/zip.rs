@@ -1,0 +1,105 @@
+//! Just enough of zip to open a `.sog` file: stored and deflated files, named in the central directory.
+//!
+//! Source: PKWARE's APPNOTE 6.3.10, sections 4.3 and 4.4. Own code, because a general crate brings ciphers and ten other
+//! compressions, and this is a page.
+
+use super::{Files, META, damaged};
+use crate::format::octets::Cursor;
+use crate::{Error, ErrorKind, Result};
+use flate2::read::DeflateDecoder;
+use std::borrow::Cow;
+use std::io::Read;
+
+/// First bytes of a zip file with something in it.
+pub const MAGIC: [u8; 4] = *b"PK\x03\x04";
+/// First bytes of an entry of the central directory.
+const ENTRY: [u8; 4] = *b"PK\x01\x02";
+/// First bytes of the end record.
+const END: [u8; 4] = *b"PK\x05\x06";
+/// Length of the end record without its comment, and the longest comment.
+const END_LENGTH: usize = 22;
+const MOST_COMMENT: usize = 65_535;
+/// Stands for "see the zip64 record".
+const ZIP64: u32 = u32::MAX;
+/// Deflate shrinks 1032:1 at the very most (zlib technical details).
+const MOST_RATIO: usize = 1032;
+/// Most files that are looked at: a SOG scene has eight.
+const MOST_FILES: u16 = 4096;
+
+/// All files, by the name they have beside `meta.json`.
+pub(super) fn read(bytes: &[u8]) -> Result<Files<'_>> {
+    let tail = bytes.len().saturating_sub(END_LENGTH + MOST_COMMENT);
+    let end = bytes[tail..].windows(END.len()).rposition(|w| w == END);
+    let end = tail + end.ok_or_else(|| damaged("the zip file has no end: it is cut short"))?;
+    let mut c = Cursor::new(&bytes[end..], "zip file");
+    c.take(10)?;
+    let count = c.u16()?;
+    let (length, offset) = (c.u32()?, c.u32()?);
+    if count == u16::MAX || length == ZIP64 || offset == ZIP64 || count > MOST_FILES {
+        return Err(Error::new(ErrorKind::Unsupported, format!("the zip file holds {count} files or is a zip64"))
+            .remedy("A SOG scene has eight files and less than 4 GiB; export it again."));
+    }
+    let directory = bytes.get(offset as usize..end);
+    let mut c = Cursor::new(directory.ok_or_else(|| damaged("the zip's directory lies outside"))?, "zip directory");
+    let mut files = Files::new();
+    for _ in 0..count {
+        if c.take(4)? != ENTRY {
+            return Err(damaged("the zip's directory has a wrong entry"));
+        }
+        c.take(4)?;
+        let (flags, method) = (c.u16()?, c.u16()?);
+        c.take(8)?;
+        let (packed, plain) = (c.u32()? as usize, c.u32()? as usize);
+        let (name, extra, comment) = (c.u16()?, c.u16()?, c.u16()?);
+        c.take(8)?;
+        let offset = c.u32()? as usize;
+        let name = String::from_utf8_lossy(c.take(name.into())?).into_owned();
+        c.take(usize::from(extra) + usize::from(comment))?;
+        let file = body(bytes, offset, packed).and_then(|b| unpack(b, plain, flags, method));
+        files.insert(name.clone(), file.map_err(|e| e.at(name))?);
+    }
+    Ok(beside_meta(files))
+}
+
+/// The packed bytes of the file whose local header stands at `offset`.
+fn body(bytes: &[u8], offset: usize, packed: usize) -> Result<&[u8]> {
+    let mut c = Cursor::new(bytes.get(offset..).unwrap_or_default(), "zip file");
+    if c.take(4)? != MAGIC {
+        return Err(damaged("the zip's directory points to no file"));
+    }
+    // Lengths may be missing here, those of the directory count; only the two of names are needed.
+    c.take(22)?;
+    let (name, extra) = (c.u16()?, c.u16()?);
+    c.take(usize::from(name) + usize::from(extra))?;
+    c.take(packed)
+}
+
+fn unpack(body: &[u8], plain: usize, flags: u16, method: u16) -> Result<Cow<'_, [u8]>> {
+    if flags & 1 != 0 {
+        return Err(Error::new(ErrorKind::Unsupported, "the file is encrypted").remedy("Unzip it with its password."));
+    }
+    match method {
+        0 => Ok(Cow::Borrowed(body)),
+        8 => {
+            if plain > MOST_RATIO * body.len() + 1 {
+                return Err(damaged(format!("a file of {} bytes cannot become one of {plain}", body.len())));
+            }
+            let mut out = Vec::new();
+            let read = DeflateDecoder::new(body).take(plain as u64 + 1).read_to_end(&mut out);
+            read.map_err(|e| damaged(format!("a file cannot be inflated ({e})")))?;
+            if out.len() != plain {
+                return Err(damaged(format!("a file should have {plain} bytes, but has {}", out.len())));
+            }
+            Ok(Cow::Owned(out))
+        }
+        other => Err(Error::new(ErrorKind::Unsupported, format!("the file is compressed by zip method {other}"))
+            .remedy("Zip it again with deflate, or export the scene again.")),
+    }
+}
+
+/// Some zip a whole folder: names lose what stands before `meta.json`.
+fn beside_meta(files: Files<'_>) -> Files<'_> {
+    let folder = files.keys().find_map(|n| n.strip_suffix(META).filter(|f| f.ends_with('/')).map(str::to_owned));
+    let Some(folder) = folder.filter(|_| !files.contains_key(META)) else { return files };
+    files.into_iter().filter_map(|(name, f)| Some((name.strip_prefix(&folder)?.to_owned(), f))).collect()
+}

@@ -1,0 +1,206 @@
+//! How the streams lie in the file: one gzip stream (versions 2, 3) or a table of contents and zstd frames (version 4).
+
+use super::streams::{STREAMS, Streams, lengths};
+use super::{EXTENDED, GZIP_MAGIC, Header, MAGIC, damaged};
+use crate::format::octets::Cursor;
+use crate::format::warnings::Warnings;
+use crate::{Error, Result};
+use flate2::Compression;
+use flate2::read::GzDecoder;
+use flate2::write::GzEncoder;
+use ruzstd::decoding::StreamingDecoder;
+use ruzstd::encoding::{CompressionLevel, compress_to_vec};
+use std::borrow::Cow;
+use std::io::{Read, Write};
+
+/// Length of the header of versions 2 and 3, which lies inside the gzip stream.
+const OLD_HEADER: usize = 16;
+/// Length of the plain header of version 4.
+const NEW_HEADER: usize = 32;
+/// Bytes of an entry of the table of contents: u64 compressed, u64 plain length.
+const ENTRY: usize = 16;
+/// Deflate shrinks 1032:1 at the very most (zlib technical details); the reference reader grants zstd 1024:1 too.
+const MOST_RATIO: u64 = 1032;
+/// Bytes of extensions behind the streams that are inflated to get to the checksum.
+const MOST_TAIL: u64 = 1 << 20;
+/// Largest zstd window that is granted, bytes: what RFC 8878 (3.1.1.1.2) asks every decoder to support. A larger one is
+/// granted up to the plain length.
+const WINDOW: u64 = 8 << 20;
+/// Extension that says in which axes the numbers are (Adobe).
+const AXES_EXTENSION: u32 = 0xADBE_0003;
+
+/// Header and plain streams of a file. Nothing is allocated that the length of the file does not bear out.
+pub(super) fn open<'a>(bytes: &'a [u8], warnings: &mut Warnings) -> Result<(Header, Streams<'a>)> {
+    if bytes.starts_with(&GZIP_MAGIC) {
+        let mut unzip = GzDecoder::new(bytes);
+        let mut start = [0; OLD_HEADER];
+        unzip.read_exact(&mut start).map_err(|e| damaged(format!("its gzip stream cannot be read ({e})")))?;
+        let header = old_header(&start)?;
+        let body: u64 = lengths(&header).iter().map(|&n| n as u64).sum();
+        if body > MOST_RATIO * bytes.len() as u64 {
+            return Err(too_many(&header, bytes.len()));
+        }
+        let mut plain = Vec::new();
+        let broken = |e| damaged(format!("its gzip stream cannot be read ({e})"));
+        (&mut unzip).take(body).read_to_end(&mut plain).map_err(broken)?;
+        // The checksum is compared at the end of the stream, behind extensions if there are any.
+        std::io::copy(&mut unzip.take(MOST_TAIL), &mut std::io::sink()).map_err(broken)?;
+        extensions_ignored(&header, warnings);
+        return Ok((header, split(&header, Cow::Owned(plain))?));
+    }
+    if !bytes.starts_with(&MAGIC) {
+        return Err(Error::input("this is not an .spz file: it begins neither with gzip's bytes nor with `NGSP`")
+            .remedy("Give a file that Scaniverse, splat-transform or splat4d wrote."));
+    }
+    let mut cursor = Cursor::new(bytes, ".spz file");
+    cursor.take(MAGIC.len())?;
+    if matches!(cursor.u32()?, 2 | 3) {
+        // Nobody should write these versions without gzip, but test data of the field does.
+        let header = old_header(cursor_start(bytes)?)?;
+        extensions_ignored(&header, warnings);
+        return Ok((header, split(&header, Cow::Borrowed(&bytes[OLD_HEADER..]))?));
+    }
+    new_streams(bytes, warnings)
+}
+
+fn cursor_start(bytes: &[u8]) -> Result<&[u8; OLD_HEADER]> {
+    bytes.first_chunk().ok_or_else(|| damaged("it ends within its header"))
+}
+
+fn old_header(bytes: &[u8; OLD_HEADER]) -> Result<Header> {
+    let mut c = Cursor::new(bytes, "header");
+    if c.take(4)? != MAGIC {
+        return Err(Error::input("this is a gzip file, but no .spz file is in it").remedy("Give an .spz file."));
+    }
+    let (version, count) = (c.u32()?, c.u32()? as usize);
+    let (degree, fraction_bits, flags) = (usize::from(c.u8()?), c.u8()?, c.u8()?);
+    let header = Header { version, count, degree, fraction_bits, flags }.checked()?;
+    if header.version > 3 {
+        return Err(damaged(format!("version {version} is not stored in gzip")));
+    }
+    Ok(header)
+}
+
+fn too_many(header: &Header, bytes: usize) -> Error {
+    damaged(format!("it claims {} Gaussians, more than {bytes} bytes can hold", header.count))
+}
+
+fn extensions_ignored(header: &Header, warnings: &mut Warnings) {
+    if header.flags & EXTENDED != 0 {
+        warnings.say("the file has vendors' extensions, which are not read; if one says other axes, use --up");
+    }
+}
+
+/// Cuts a plain body into its streams.
+fn split<'a>(header: &Header, body: Cow<'a, [u8]>) -> Result<Streams<'a>> {
+    let lengths = lengths(header);
+    let total: usize = lengths.iter().sum();
+    if body.len() < total {
+        return Err(damaged(format!("{} Gaussians take {total} bytes, but {} are there", header.count, body.len())));
+    }
+    let mut at = 0;
+    Ok(lengths.map(|n| {
+        let range = at..at + n;
+        at += n;
+        match &body {
+            Cow::Borrowed(b) => Cow::Borrowed(&b[range]),
+            Cow::Owned(b) => Cow::Owned(b[range].to_vec()),
+        }
+    }))
+}
+
+/// Version 4.
+fn new_streams<'a>(bytes: &'a [u8], warnings: &mut Warnings) -> Result<(Header, Streams<'a>)> {
+    let mut c = Cursor::new(bytes, ".spz header");
+    c.take(MAGIC.len())?;
+    let (version, count) = (c.u32()?, c.u32()? as usize);
+    let (degree, fraction_bits, flags) = (usize::from(c.u8()?), c.u8()?, c.u8()?);
+    let header = Header { version, count, degree, fraction_bits, flags }.checked()?;
+    let stated = usize::from(c.u8()?);
+    let contents = c.u32()? as usize;
+    let lengths = lengths(&header);
+    let body: u64 = lengths.iter().map(|&n| n as u64).sum();
+    if body > MOST_RATIO * bytes.len() as u64 {
+        return Err(too_many(&header, bytes.len()));
+    }
+    // Streams without bytes are not in the file.
+    let wanted = lengths.iter().filter(|&&n| n > 0).count();
+    if stated != wanted {
+        return Err(damaged(format!("it has {stated} streams, but {wanted} are needed for degree {degree}")));
+    }
+    if contents < NEW_HEADER {
+        return Err(damaged(format!("its table of contents begins at byte {contents}, within the header")));
+    }
+    if flags & EXTENDED != 0 {
+        name_extensions(bytes.get(NEW_HEADER..contents).unwrap_or_default(), warnings);
+    }
+    let table = bytes.get(contents..).and_then(|b| b.get(..wanted * ENTRY));
+    let table = table.ok_or_else(|| damaged("it ends within its table of contents"))?;
+    let mut entries = Cursor::new(table, "table of contents");
+    let mut data = Cursor::new(&bytes[contents + table.len()..], ".spz file");
+    let mut streams: Streams<'a> = [const { Cow::Borrowed(&[]) }; STREAMS];
+    for (stream, &length) in streams.iter_mut().zip(&lengths).filter(|(_, n)| **n > 0) {
+        let (packed, plain) = (entries.u64()?, entries.u64()?);
+        if plain != length as u64 {
+            return Err(damaged(format!("a stream should have {length} bytes, but its entry says {plain}")));
+        }
+        let packed = usize::try_from(packed).map_err(|_| damaged("a stream is longer than the file"))?;
+        *stream = Cow::Owned(inflate(data.take(packed)?, length)?);
+    }
+    Ok((header, streams))
+}
+
+/// Says which extensions are not read. Records are u32 type, u32 length and that many bytes.
+fn name_extensions(bytes: &[u8], warnings: &mut Warnings) {
+    let mut c = Cursor::new(bytes, "extensions");
+    while let (Ok(kind), Ok(length)) = (c.u32(), c.u32()) {
+        warnings.say(match kind {
+            AXES_EXTENSION => "the file says other axes than usual (extension 0xADBE0003), which is not read: \
+                use --up if it comes out lying"
+                .to_owned(),
+            _ => format!("extension {kind:#010X} is not read"),
+        });
+        if c.take(length as usize).is_err() {
+            break;
+        }
+    }
+}
+
+/// A zstd frame of exactly `length` plain bytes.
+fn inflate(packed: &[u8], length: usize) -> Result<Vec<u8>> {
+    let broken = |e: &dyn std::fmt::Display| damaged(format!("a zstd stream cannot be read ({e})"));
+    let window = WINDOW.max(length as u64);
+    let unzip = StreamingDecoder::new_with_max_window_size(packed, window).map_err(|e| broken(&e))?;
+    let mut plain = Vec::new();
+    unzip.take(length as u64 + 1).read_to_end(&mut plain).map_err(|e| broken(&e))?;
+    if plain.len() != length {
+        return Err(damaged(format!("a stream of {length} bytes has {} or more", plain.len())));
+    }
+    Ok(plain)
+}
+
+/// The whole file.
+pub(super) fn close(header: &Header, streams: &Streams<'_>) -> Vec<u8> {
+    let mut out = MAGIC.to_vec();
+    out.extend(header.version.to_le_bytes());
+    out.extend((header.count as u32).to_le_bytes());
+    out.extend([header.degree as u8, header.fraction_bits, header.flags]);
+    if header.version < 4 {
+        out.push(0);
+        streams.iter().for_each(|s| out.extend_from_slice(s));
+        let mut zip = GzEncoder::new(Vec::new(), Compression::best());
+        zip.write_all(&out).expect("memory takes all bytes");
+        return zip.finish().expect("memory takes all bytes");
+    }
+    let there: Vec<&[u8]> = streams.iter().map(|s| &**s).filter(|s| !s.is_empty()).collect();
+    out.push(there.len() as u8);
+    out.extend((NEW_HEADER as u32).to_le_bytes());
+    out.resize(NEW_HEADER, 0);
+    let packed: Vec<Vec<u8>> = there.iter().map(|s| compress_to_vec(*s, CompressionLevel::Fastest)).collect();
+    for (plain, packed) in there.iter().zip(&packed) {
+        out.extend((packed.len() as u64).to_le_bytes());
+        out.extend((plain.len() as u64).to_le_bytes());
+    }
+    packed.iter().for_each(|p| out.extend_from_slice(p));
+    out
+}

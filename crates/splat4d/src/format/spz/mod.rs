@@ -1,0 +1,124 @@
+//! `.spz`: Gaussians in some 20 bytes each, before compression. Versions 2, 3 and 4 are read and written.
+//!
+//! Six streams, one value after the other through all Gaussians: positions (24-bit fixed point), opacities (u8), base
+//! colours (u8, ½ + 0.15·f_dc), log scales (u8, b/16 − 10), rotations, spherical harmonics (u8, (b − 128)/128,
+//! coefficient-major as our tables). Versions 2 and 3 are one gzip stream: header of 16 bytes, then the streams; version
+//! 4 has a plain header of 32 bytes, extensions, a table of contents and a zstd frame a stream. Version 2 stores the
+//! quaternion's x, y, z; later ones its smallest three parts. World axes: x right, **y up**, z back.
+//!
+//! Source: github.com/nianticlabs/spz (MIT), README and extensions/README.
+
+mod container;
+mod streams;
+#[cfg(test)]
+mod tests;
+
+use super::octets::sound_rows;
+use super::warnings::Warnings;
+use crate::math::sh::degree_of;
+use crate::scene::{Params, SH};
+use crate::{Error, ErrorKind, Result};
+use std::io::Write;
+
+/// The versions this library reads and writes.
+pub const VERSIONS: std::ops::RangeInclusive<u32> = 2..=4;
+/// What is written unless asked otherwise: the version that most programs open.
+pub const DEFAULT_VERSION: u32 = 3;
+/// First bytes of a version 4 file, and of the header inside older ones.
+pub const MAGIC: [u8; 4] = *b"NGSP";
+/// First bytes of a gzip stream (RFC 1952).
+pub const GZIP_MAGIC: [u8; 2] = [0x1F, 0x8B];
+/// Flag: trained with the anti-aliasing filter of Mip-Splatting.
+const ANTIALIASED: u8 = 1;
+/// Flag: vendors' extensions are present.
+const EXTENDED: u8 = 2;
+
+/// What a file says besides its Gaussians.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SpzInfo {
+    /// 2, 3 or 4.
+    pub version: u32,
+    /// Degree of the spherical harmonics in the file, 0-4; degree 4 is left out on reading.
+    pub sh_degree: usize,
+    /// Whether it was trained with the anti-aliasing filter (our `antialias`).
+    pub antialiased: bool,
+    /// Bits behind the point of a coordinate.
+    pub fraction_bits: u8,
+}
+
+/// The header's numbers, the same in all versions.
+#[derive(Clone, Copy, Debug)]
+struct Header {
+    version: u32,
+    count: usize,
+    degree: usize,
+    fraction_bits: u8,
+    flags: u8,
+}
+
+impl Header {
+    /// Checks what every version demands.
+    fn checked(self) -> Result<Self> {
+        if self.version == 1 {
+            return Err(Error::new(ErrorKind::Unsupported, "the file has version 1 of .spz, which was never released")
+                .remedy("Export it again with a program of today."));
+        }
+        if !VERSIONS.contains(&self.version) {
+            let what = format!("the file has version {} of .spz, this splat4d reads 2 to 4", self.version);
+            return Err(Error::new(ErrorKind::Unsupported, what)
+                .remedy("Install a newer splat4d, or export the file as version 4."));
+        }
+        if self.degree > streams::MAX_DEGREE {
+            return Err(damaged(format!("its spherical harmonics have degree {}, but 4 is the highest", self.degree)));
+        }
+        if self.fraction_bits > streams::POSITION_BITS {
+            return Err(damaged(format!(
+                "its coordinates of 24 bits have {} bits behind the point",
+                self.fraction_bits
+            )));
+        }
+        Ok(self)
+    }
+}
+
+/// Reads a file of version 2 to 4. Errors: not .spz, another version, truncated, streams of the wrong length.
+pub fn read(bytes: &[u8]) -> Result<(Params, SpzInfo, Warnings)> {
+    let mut warnings = Warnings::default();
+    let (header, streams) = container::open(bytes, &mut warnings)?;
+    let params = streams::unpack(&header, &streams)?;
+    if header.degree > crate::math::sh::MAX_DEGREE {
+        warnings.say("spherical harmonics of degree 4 are left out: degree 3 is the highest here");
+    }
+    let antialiased = header.flags & ANTIALIASED != 0;
+    if antialiased {
+        warnings.say("the file was trained with an anti-aliasing filter: render it with one");
+    }
+    let info =
+        SpzInfo { version: header.version, sh_degree: header.degree, antialiased, fraction_bits: header.fraction_bits };
+    Ok((params, info, warnings))
+}
+
+/// Writes a file of the given version. Says what was clipped or left out.
+///
+/// Errors: the sink's; no Gaussians (readers refuse such files). Panics: the version is not one of [`VERSIONS`].
+pub fn write(params: &Params, version: u32, out: &mut impl Write) -> Result<Warnings> {
+    assert!(VERSIONS.contains(&version), "versions 2 to 4 of .spz can be written, not {version}");
+    let mut warnings = Warnings::default();
+    let rows = sound_rows(params, &mut warnings);
+    let count = u32::try_from(rows.len()).map_err(|_| Error::input("there are more than 2^32 Gaussians"))?;
+    if rows.is_empty() {
+        return Err(Error::input("there are no Gaussians, and an .spz file cannot be empty")
+            .remedy("Choose another moment, or write .ply files, which can be."));
+    }
+    let degree = degree_of(params[SH].width() / 3).expect("a layer has at least the base colour");
+    let fraction_bits = streams::fraction_bits(params, &rows);
+    let header = Header { version, count: count as usize, degree, fraction_bits, flags: 0 };
+    let streams = streams::pack(params, &rows, &header, &mut warnings);
+    let file = container::close(&header, &streams);
+    out.write_all(&file).map_err(|e| Error::io("the Gaussians could not be written", e))?;
+    Ok(warnings)
+}
+
+fn damaged(what: impl std::fmt::Display) -> Error {
+    Error::input(format!("this .spz file is damaged: {what}")).remedy("Copy or export it again.")
+}

@@ -1,0 +1,35 @@
+//! What a file could not hold, or what had to be assumed: collected while a dialect is read or written, said by the shell.
+
+/// Sentences without a final full stop, in the order in which things came up.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Warnings {
+    lines: Vec<String>,
+}
+
+impl Warnings {
+    /// Adds a sentence.
+    pub fn say(&mut self, text: impl Into<String>) {
+        self.lines.push(text.into());
+    }
+
+    /// Adds "`count` of `of` Gaussians `what`", unless the count is zero.
+    pub fn counted(&mut self, count: usize, of: usize, what: &str) {
+        if count > 0 {
+            self.say(format!("{count} of {of} Gaussians {what}"));
+        }
+    }
+
+    /// All sentences.
+    pub fn lines(&self) -> &[String] {
+        &self.lines
+    }
+
+    /// Adds those of another collection, leaving out repetitions.
+    pub fn append(&mut self, other: Warnings) {
+        for line in other.lines {
+            if !self.lines.contains(&line) {
+                self.lines.push(line);
+            }
+        }
+    }
+}

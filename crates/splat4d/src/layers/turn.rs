@@ -1,0 +1,228 @@
+//! A whole scene turned in space, and its colours simplified: what it takes to move between programs' axes.
+
+use super::Scene;
+use crate::math::{quat, se3, sh, sh_rotation};
+use crate::motion::spacetime::{ROTATION_RATES, VELOCITIES};
+use crate::motion::{SpacetimeSpec, Spec};
+use crate::scene::params::QUAT;
+use crate::scene::{GEOMETRY, Params, SH, Table};
+use crate::{Error, ErrorKind, Result};
+
+/// Vectors shorter than this name no direction.
+const NO_DIRECTION: f64 = 1e-6;
+/// 1 + cos of the angle below which two directions count as opposite: the short way round is then not defined.
+const OPPOSITE: f64 = 1e-9;
+/// Beyond this cosine to x, x has no good part across.
+const ALONG_X: f64 = 0.9;
+
+/// The rotation (rows) that takes direction `from` to `to` the short way. Opposite directions: half a turn about x, which
+/// is what programs with y up and y down do to each other's files; along x, about z.
+///
+/// `None`: one of them is no direction.
+pub fn rotation_between(from: [f64; 3], to: [f64; 3]) -> Option<[[f64; 3]; 3]> {
+    if [from, to].iter().any(|v| !(se3::norm(*v) > NO_DIRECTION && se3::norm(*v).is_finite())) {
+        return None;
+    }
+    let (a, b) = (se3::normalize(from), se3::normalize(to));
+    let w = 1.0 + a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+    if w < OPPOSITE {
+        // Half a turn about the part of x that is across: 2nnᵀ − 1. The zeros of an axis stay zeros.
+        let k = if a[0].abs() > ALONG_X { 2 } else { 0 };
+        let across = se3::normalize(std::array::from_fn(|i| f64::from(u8::from(i == k)) - a[k] * a[i]));
+        return Some(std::array::from_fn(|i| {
+            std::array::from_fn(|j| 2.0 * across[i] * across[j] - f64::from(u8::from(i == j)))
+        }));
+    }
+    let q = [w, a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+    Some(quat::to_rotation(quat::normalize(q).0))
+}
+
+impl Scene<f32> {
+    /// Turns everything by the rotation `r` (rows): means, quaternions, velocities, rotation rates, colours, `up`.
+    ///
+    /// Errors: a layer moves by a model from outside this library, whose parameters nobody here can turn.
+    pub fn turn(&mut self, r: &[[f64; 3]; 3]) -> Result<()> {
+        for layer in &self.layers {
+            if let Spec::Custom(name) = layer.motion.spec() {
+                let what = format!("layer `{}` moves by `{name}`, which cannot be turned", layer.name);
+                return Err(Error::new(ErrorKind::Unsupported, what)
+                    .remedy("Take single moments (--time, --frames), or keep the axes as they are (--up keep)."));
+            }
+        }
+        let (q, m) = (quat::from_rotation(r), sh_rotation(r));
+        for layer in &mut self.layers {
+            turn_geometry(&mut layer.params, r, q);
+            turn_colors(&mut layer.params[SH], &m);
+            if let Spec::Spacetime(SpacetimeSpec { order, rotation, .. }) = layer.motion.spec() {
+                let find = |name| layer.params.find(name).expect("a spacetime layer has its tables");
+                let (velocities, rates) = (find(VELOCITIES), find(ROTATION_RATES));
+                let table = &mut layer.params[velocities];
+                for row in 0..table.rows() {
+                    for k in 0..order {
+                        table.write(row, 3 * k, apply(r, table.read::<3>(row, 3 * k)));
+                    }
+                }
+                let table = &mut layer.params[rates];
+                // q(t) = q + ωΔ is linear, so that a rate turns as the quaternion does.
+                for row in 0..if rotation { table.rows() } else { 0 } {
+                    table.write(row, 0, product(q, table.read::<4>(row, 0)));
+                }
+            }
+        }
+        self.up = std::array::from_fn(|k| (0..3).map(|l| r[k][l] * self.up[l]).sum());
+        Ok(())
+    }
+
+    /// Leaves out spherical harmonics above `degree` (0-3). Returns the highest degree that any layer had.
+    pub fn limit_sh(&mut self, degree: usize) -> usize {
+        let mut highest = 0;
+        for layer in &mut self.layers {
+            let old = &layer.params[SH];
+            let had = sh::degree_of(old.width() / 3).unwrap_or(0);
+            highest = highest.max(had);
+            if had > degree {
+                let mut new = Table::new(&[("sh", 3 * sh::coeffs(degree))], old.rows());
+                for row in 0..old.rows() {
+                    for col in 0..new.width() {
+                        new.set(row, col, old.get(row, col));
+                    }
+                }
+                layer.params[SH] = new;
+            }
+        }
+        highest
+    }
+}
+
+fn turn_geometry(params: &mut Params, r: &[[f64; 3]; 3], q: [f64; 4]) {
+    let table = &mut params[GEOMETRY];
+    for row in 0..table.rows() {
+        table.write(row, 0, apply(r, table.read::<3>(row, 0)));
+        let own = table.read::<4>(row, QUAT);
+        // A zero quaternion stands for the identity wherever it is used, and must turn as the identity does.
+        let own = if own == [0.0; 4] { [1.0, 0.0, 0.0, 0.0] } else { own };
+        table.write(row, QUAT, product(q, own));
+    }
+}
+
+fn turn_colors(table: &mut Table, m: &[[f64; sh::MAX_COEFFS]; sh::MAX_COEFFS]) {
+    let count = (table.width() / 3).min(sh::MAX_COEFFS);
+    for row in 0..table.rows() {
+        for c in 0..3 {
+            let old: [f64; sh::MAX_COEFFS] =
+                std::array::from_fn(|k| if k < count { f64::from(table.get(row, 3 * k + c)) } else { 0.0 });
+            // Degree 0 is the same from everywhere; its bits stay.
+            for k in 1..count {
+                table.set(row, 3 * k + c, (0..count).map(|l| m[k][l] * old[l]).sum::<f64>() as f32);
+            }
+        }
+    }
+}
+
+fn apply(r: &[[f64; 3]; 3], v: [f32; 3]) -> [f32; 3] {
+    std::array::from_fn(|k| (0..3).map(|l| r[k][l] * f64::from(v[l])).sum::<f64>() as f32)
+}
+
+/// a ⊗ b, wxyz.
+fn product(a: [f64; 4], b: [f32; 4]) -> [f32; 4] {
+    let b = b.map(f64::from);
+    [
+        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
+        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
+        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
+        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
+    ]
+    .map(|x| x as f32)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::layers::{Instant, Layer};
+    use crate::math::{Rng, Se3};
+    use crate::motion::build;
+    use crate::render::{Image, RenderConfig, Renderer};
+    use crate::scene::params::LOG_SCALE;
+    use crate::scene::{Camera, LifeKind, Time};
+
+    fn moving() -> Scene<f32> {
+        let spec = Spec::Spacetime(SpacetimeSpec { order: 3, rotation: true, detach: true, origin: 0.0 });
+        let mut params = Params::new(40, 16, LifeKind::GaussOne.columns());
+        let motion = build(&spec, &mut params).unwrap();
+        let rng = Rng::new(3, "turn", 0);
+        for key in params.keys().collect::<Vec<_>>() {
+            let table = &mut params[key];
+            for row in 0..table.rows() {
+                for col in 0..table.width() {
+                    table.set(row, col, 0.5 * rng.fork(u64::from(key.0)).normal((row * 64 + col) as u64) as f32);
+                }
+            }
+        }
+        for row in 0..40 {
+            for k in 0..3 {
+                *params[GEOMETRY].get_mut(row, LOG_SCALE + k) -= 2.0;
+            }
+        }
+        let layer = Layer { name: "a".into(), params, motion, life: LifeKind::GaussOne };
+        Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 30.0, up: [0.0, 1.0, 0.0], ..Scene::default() }
+    }
+
+    fn draw(scene: &Scene<f32>, pose: Se3, time: f64) -> Vec<f32> {
+        let camera = Camera::with_fov_y(pose, 0.9, 48, 40);
+        let (mut instant, mut image) = (Instant::default(), Image::default());
+        scene.at(Time(time), &mut instant);
+        Renderer::new(RenderConfig::default()).render(&scene.splats(&instant), &camera, [0.2; 3], None, &mut image);
+        image.color.data
+    }
+
+    #[test]
+    fn a_turned_scene_seen_by_a_turned_camera_is_the_same_picture() {
+        let scene = moving();
+        let r = quat::to_rotation(quat::normalize([0.4, -0.3, 0.8, 0.2]).0);
+        let mut turned = scene.clone();
+        turned.turn(&r).unwrap();
+        let pose = Se3::look_at([0.5, 0.4, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
+        let rotation = std::array::from_fn(|i| {
+            std::array::from_fn(|j| (0..3).map(|k| pose.rotation[i][k] * r[j][k]).sum::<f64>())
+        });
+        let turned_pose = Se3 { rotation, translation: pose.translation };
+        for time in [0.0, 0.3, 0.9] {
+            let (a, b) = (draw(&scene, pose, time), draw(&turned, turned_pose, time));
+            let worst = a.iter().zip(&b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            assert!(worst < 1e-3, "{time}: {worst}");
+            assert!(a.iter().filter(|v| (**v - 0.2).abs() > 0.05).count() > 200, "the test must look at something");
+        }
+        let kept = draw(&turned, pose, 0.3);
+        let other = draw(&scene, pose, 0.3);
+        assert!(kept.iter().zip(&other).any(|(a, b)| (a - b).abs() > 0.1), "a turn must be visible");
+    }
+
+    #[test]
+    fn up_goes_where_it_should() {
+        let axes = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.1, -0.9, 0.2]];
+        for from in axes.into_iter().chain(axes.map(|a| a.map(|x| -x))) {
+            for to in axes {
+                let r = rotation_between(from, to).unwrap();
+                let pose = Se3 { rotation: r, translation: [0.0; 3] };
+                assert!(pose.orthogonality_error() < 1e-12 && (pose.det() - 1.0).abs() < 1e-12);
+                let (a, b) = (se3::normalize(from), se3::normalize(to));
+                assert!((0..3).all(|k| ((0..3).map(|l| r[k][l] * a[l]).sum::<f64>() - b[k]).abs() < 1e-9));
+            }
+        }
+        // y down to y up is (x, -y, -z): the change between the axes of .ply and .spz.
+        let r = rotation_between([0.0, -1.0, 0.0], [0.0, 1.0, 0.0]).unwrap();
+        assert_eq!(r, [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]);
+        assert!(rotation_between([0.0; 3], [0.0, 1.0, 0.0]).is_none());
+        assert!(rotation_between([f64::NAN; 3], [0.0, 1.0, 0.0]).is_none());
+    }
+
+    #[test]
+    fn lower_degrees_keep_the_first_coefficients() {
+        let mut scene = moving();
+        let before = scene.layers[0].params[SH].read::<12>(7, 0);
+        assert_eq!(scene.limit_sh(1), 3);
+        let table = &scene.layers[0].params[SH];
+        assert_eq!((table.width(), table.read::<12>(7, 0)), (12, before));
+        assert_eq!(scene.limit_sh(2), 1, "a lower degree is not raised");
+    }
+}

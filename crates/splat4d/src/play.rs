@@ -1,0 +1,237 @@
+//! Plays a scene on the CPU: which Gaussians are alive at a time is looked up, not computed, and a playback file is read
+//! as time demands, within a budget of memory.
+//!
+//! Like everything here it reads bytes, not paths: a file is whatever implements [`ReadAt`].
+
+#[cfg(test)]
+mod tests;
+
+use crate::format::playback::{Entry, Index, Kind, Meta, Palette, decode_page, decode_palette};
+use crate::layers::{ALWAYS, Layer, LayerTape, Scene};
+use crate::motion::Cache;
+use crate::scene::{Rows, Space, Splats, Time};
+use crate::{Error, Result};
+use rayon::prelude::*;
+
+/// Rows that share one test of whether any of them is alive: the blocks of the playback file.
+const BLOCK: usize = crate::format::playback::BLOCK_GAUSSIANS;
+/// Memory for unpacked pages unless told, bytes.
+pub const DEFAULT_BUDGET: usize = 1 << 30;
+
+/// Bytes at an offset of something long, such as a file.
+pub trait ReadAt {
+    /// Fills `out` from byte `offset` on. Errors: they are not there, or cannot be read.
+    fn read_at(&mut self, offset: u64, out: &mut [u8]) -> Result<()>;
+}
+
+impl ReadAt for &[u8] {
+    fn read_at(&mut self, offset: u64, out: &mut [u8]) -> Result<()> {
+        let from = usize::try_from(offset).ok().and_then(|o| self.get(o..)).and_then(|rest| rest.get(..out.len()));
+        let from = from.ok_or_else(|| {
+            Error::input(format!("{} bytes at {offset} are not there: the file is cut short", out.len()))
+                .remedy("Copy or download it again")
+        })?;
+        out.copy_from_slice(from);
+        Ok(())
+    }
+}
+
+/// When the rows of one layer are alive.
+#[derive(Debug, Default)]
+struct Alive {
+    /// [from, to] of every row, seconds; from > to: never.
+    spans: Vec<[f64; 2]>,
+    /// [earliest, latest] of every block of rows.
+    blocks: Vec<[f64; 2]>,
+}
+
+impl Alive {
+    fn of(layer: &Layer) -> Self {
+        let spans = layer.spans();
+        let block = |rows: &[[f64; 2]]| {
+            rows.iter()
+                .filter(|[from, to]| from <= to)
+                .fold([f64::INFINITY, f64::NEG_INFINITY], |all, [from, to]| [all[0].min(*from), all[1].max(*to)])
+        };
+        let blocks = spans.chunks(BLOCK).map(block).collect();
+        Self { spans, blocks }
+    }
+
+    /// The rows alive at t, strictly increasing.
+    fn rows(&self, t: f64, ids: &mut Vec<u32>) {
+        ids.clear();
+        for (b, _) in self.blocks.iter().enumerate().filter(|(_, [from, to])| *from <= t && t <= *to) {
+            let first = b * BLOCK;
+            let rows = &self.spans[first..self.spans.len().min(first + BLOCK)];
+            let alive = rows.iter().enumerate().filter(|(_, [from, to])| *from <= t && t <= *to);
+            ids.extend(alive.map(|(i, _)| (first + i) as u32));
+        }
+    }
+}
+
+/// A layer in memory.
+#[derive(Debug)]
+struct Held {
+    /// Its section in the file; its number in the scene.
+    section: usize,
+    layer: Layer,
+    alive: Alive,
+    tape: LayerTape,
+    ids: Vec<u32>,
+    cache: Cache,
+    bytes: usize,
+}
+
+impl Held {
+    fn new(section: usize, layer: Layer) -> Self {
+        let alive = Alive::of(&layer);
+        let numbers: usize = layer.params.keys().map(|k| layer.params[k].data().len()).sum();
+        let bytes = 4 * numbers + 16 * alive.spans.len();
+        Self { section, layer, alive, tape: LayerTape::default(), ids: Vec::new(), cache: Cache::default(), bytes }
+    }
+}
+
+/// Where layers come from that are not in memory.
+struct File {
+    source: Box<dyn ReadAt + Send>,
+    index: Index,
+    /// By section, read when a page first asks.
+    palettes: Vec<(u32, Palette)>,
+}
+
+/// Shows a scene or a playback file at any time.
+pub struct Player {
+    file: Option<File>,
+    meta: Meta,
+    held: Vec<Held>,
+    budget: usize,
+    /// Places in `held` of what the last [`at`](Self::at) shows.
+    shown: Vec<usize>,
+    /// Bytes read from the source so far.
+    bytes_read: u64,
+}
+
+impl std::fmt::Debug for Player {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Player({} layers held, {} bytes)", self.held.len(), self.held_bytes())
+    }
+}
+
+impl Player {
+    /// Plays a scene that is in memory.
+    pub fn of_scene(scene: Scene<f32>) -> Self {
+        let meta = Meta {
+            clip: scene.clip,
+            fps: scene.fps,
+            up: scene.up,
+            background: scene.background,
+            gaussians: scene.len(),
+            ..Meta::default()
+        };
+        let held = scene.layers.into_par_iter().enumerate().map(|(i, layer)| Held::new(i, layer)).collect();
+        Self { file: None, meta, held, budget: usize::MAX, shown: Vec::new(), bytes_read: 0 }
+    }
+
+    /// Plays a playback file of `length` bytes, of which only the index is read now. Pages stay in memory up to `budget`
+    /// bytes; those that one moment needs stay in any case.
+    ///
+    /// Errors: those of [`Index::parse`] and of the source.
+    pub fn open(mut source: Box<dyn ReadAt + Send>, length: u64, budget: usize) -> Result<Self> {
+        let mut prefix = Vec::new();
+        loop {
+            let needed = Index::needed(&prefix)? as u64;
+            let have = prefix.len();
+            if needed <= have as u64 {
+                break;
+            }
+            // Beyond the end nothing is asked for: what is there says what is wrong with it.
+            let want = needed.min(length) as usize;
+            if want <= have {
+                break;
+            }
+            prefix.resize(want, 0);
+            source.read_at(have as u64, &mut prefix[have..])?;
+        }
+        let index = Index::parse(&prefix, Some(length))?;
+        let meta = index.meta.clone();
+        let file = File { source, index, palettes: Vec::new() };
+        let bytes_read = prefix.len() as u64;
+        Ok(Self { file: Some(file), meta, held: Vec::new(), budget, shown: Vec::new(), bytes_read })
+    }
+
+    /// What the scene says of itself.
+    pub fn meta(&self) -> &Meta {
+        &self.meta
+    }
+
+    /// Bytes read so far, the index included.
+    pub fn bytes_read(&self) -> u64 {
+        self.bytes_read
+    }
+
+    /// Bytes of the layers in memory.
+    pub fn held_bytes(&self) -> usize {
+        self.held.iter().map(|h| h.bytes).sum()
+    }
+
+    /// The splats at time t; a playback file's time is clamped to its clip.
+    ///
+    /// Errors: a page that cannot be read. What was shown before is still held then.
+    pub fn at(&mut self, t: Time) -> Result<Splats<'_>> {
+        let clamp = self.file.is_some() || self.held.iter().any(|h| h.layer.span != ALWAYS);
+        let t = if clamp { Time(t.0.max(self.meta.clip[0]).min(self.meta.clip[1])) } else { t };
+        self.load(t)?;
+        self.shown.clear();
+        self.shown.extend((0..self.held.len()).filter(|&i| self.held[i].layer.spans_over(t)));
+        self.held.par_iter_mut().filter(|h| h.layer.spans_over(t)).for_each(|h| {
+            h.alive.rows(t.0, &mut h.ids);
+            h.tape.ask(Space::Gaussians, Rows::Some(&h.ids), t);
+            h.cache = Cache::default();
+            h.layer.motion.prepare(&h.layer.params, &[h.tape.question(&h.layer.params)], &mut h.cache);
+            h.layer.at(&h.cache, &mut h.tape);
+        });
+        Ok(Splats { parts: self.shown.iter().map(|&i| self.held[i].layer.part(&self.held[i].tape)).collect() })
+    }
+
+    /// Brings the pages of t into memory, and lets those farthest in time go where there is no room.
+    fn load(&mut self, t: Time) -> Result<()> {
+        let Some(file) = &mut self.file else { return Ok(()) };
+        let wanted: Vec<(usize, Entry)> = file.index.pages_at(t.0).into_iter().map(|(i, e)| (i, e.clone())).collect();
+        for (section, entry) in wanted {
+            let Err(place) = self.held.binary_search_by_key(&section, |h| h.section) else { continue };
+            let stored = file.stored(&entry, &mut self.bytes_read)?;
+            let palette = file.palette(entry.palette, &mut self.bytes_read)?;
+            let page = decode_page(&entry, &stored).map_err(|e| e.at(format!("section {section}")))?;
+            let layer = page.layer(palette).map_err(|e| e.at(format!("section {section}")))?;
+            self.held.insert(place, Held::new(section, layer));
+        }
+        let distance = |h: &Held| (h.layer.span[0] - t.0).max(t.0 - h.layer.span[1]).max(0.0);
+        while self.held_bytes() > self.budget {
+            let idle = self.held.iter().enumerate().filter(|(_, h)| !h.layer.spans_over(t));
+            let Some((far, _)) = idle.max_by(|a, b| distance(a.1).total_cmp(&distance(b.1))) else { break };
+            self.held.remove(far);
+        }
+        Ok(())
+    }
+}
+
+impl File {
+    fn stored(&mut self, entry: &Entry, count: &mut u64) -> Result<Vec<u8>> {
+        let mut bytes = vec![0; entry.stored as usize];
+        self.source.read_at(entry.offset, &mut bytes)?;
+        *count += u64::from(entry.stored);
+        Ok(bytes)
+    }
+
+    fn palette(&mut self, section: Option<u32>, count: &mut u64) -> Result<Option<&Palette>> {
+        let Some(section) = section else { return Ok(None) };
+        if !self.palettes.iter().any(|(s, _)| *s == section) {
+            let entry = self.index.sections[section as usize].clone();
+            assert!(entry.kind == Kind::Palette, "the index has checked that a page's palette is one");
+            let bytes = self.stored(&entry, count)?;
+            let palette = decode_palette(&entry, &bytes).map_err(|e| e.at(format!("section {section}")))?;
+            self.palettes.push((section, palette));
+        }
+        Ok(self.palettes.iter().find(|(s, _)| *s == section).map(|(_, p)| p))
+    }
+}
