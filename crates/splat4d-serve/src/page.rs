@@ -112,7 +112,9 @@ const BOOT: &str = r#"(() => {
   for (const [name, text] of texts) {
     blobs[name] = URL.createObjectURL(new Blob([link(text, (to) => blobs[to])], { type: 'text/javascript' }));
   }
-  const data = (name) => texts.has(name) && 'data:text/javascript;charset=utf-8,' + encodeURIComponent(link(texts.get(name), data));
+  const data = (name) => texts.has(name)
+    && 'data:text/javascript;charset=utf-8,' + 
+    encodeURIComponent(link(texts.get(name), data)).replaceAll("'", '%27');
   globalThis.SPLAT4D_ASSETS = Object.fromEntries([...texts.keys()].filter((name) => name.endsWith('.worker.js'))
     .map((name) => [name, location.protocol === 'file:' ? data(name) : blobs[name]]));
   let { title, scene, start } = JSON.parse(read('splat4d-page'));
