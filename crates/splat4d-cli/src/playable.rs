@@ -30,6 +30,7 @@ impl Playable {
         }
         let source = Source::open(path)?;
         not_empty(&source.scene, path)?;
+        source.warnings.lines().iter().for_each(|w| console.warn(&format!("{w}.")));
         let title = title(&source, path);
         let packed = pack(&source, &title, &Baking::default(), console)?;
         console.clear();
@@ -48,12 +49,16 @@ impl Playable {
 
 /// The playback file that is there already.
 fn ready(path: &Path) -> Result<Option<PathBuf>> {
-    if path.is_dir() {
+    if Run::is(path) {
         let changed = |p: &Path| p.metadata().and_then(|m| m.modified()).ok();
         let baked = path.join("scene.splat4d");
         let scene = Run::open(path)?.scene_file().ok();
         let current = baked.is_file() && scene.is_none_or(|scene| changed(&scene) <= changed(&baked));
         return Ok(current.then_some(baked));
+    }
+    // A folder or pattern of files, or nothing: whoever opens scenes knows what to say.
+    if !path.is_file() {
+        return Ok(None);
     }
     let mut start = Vec::new();
     let file = File::open(path).map_err(|e| cannot_read(path, e))?;

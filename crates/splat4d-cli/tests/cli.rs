@@ -11,7 +11,7 @@ use splat4d::format::npy::Npy;
 use splat4d::format::ply;
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{GEOMETRY, LifeKind, Params, SH};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Options of a run that takes a second.
 const TINY: [&str; 6] = [
@@ -243,6 +243,105 @@ fn a_plain_file_is_drawn_as_computed_by_hand() {
     }
 }
 
+/// A file with one Gaussian.
+fn one_gaussian(folder: &Path) -> PathBuf {
+    let mut params = Params::new(1, 1, LifeKind::Infinite.columns());
+    params.get_mut([GEOMETRY])[0].write(0, QUAT, [1.0, 0.0, 0.0, 0.0]);
+    let mut bytes = Vec::new();
+    ply::write(&params, &mut bytes).unwrap();
+    let file = folder.join("one <b>.ply");
+    std::fs::write(&file, bytes).unwrap();
+    file
+}
+
+#[test]
+fn a_scene_becomes_a_page_alone_or_beside_its_file() {
+    let work = tempfile::tempdir().unwrap();
+    let (file, page) = (one_gaussian(work.path()), work.path().join("page.html"));
+    splat4d(&["export", str(&file), "--html", "-o", str(&page)]).run().ok();
+    let html = std::fs::read_to_string(&page).unwrap();
+    assert!(html.contains("<title>one &lt;b&gt;</title>") && html.contains("id=\"splat4d-scene\""));
+    // The scene's magic in base64: the player gets a playback file.
+    assert!(html.contains("\niVM0RA0KGgo"));
+    let linked = work.path().join("a b.splat4d");
+    splat4d(&["export", str(&file), "--html", "-o", str(&page), "--link", str(&linked)]).run().ok();
+    let html = std::fs::read_to_string(&page).unwrap();
+    assert!(html.contains("./a%20b.splat4d") && !html.contains("id=\"splat4d-scene\">"));
+    assert!(std::fs::read(&linked).unwrap().starts_with(b"\x89S4D"));
+    // A playback file is taken as it is.
+    let again = work.path().join("again.splat4d");
+    splat4d(&["export", str(&linked), "--html", "-o", str(&page), "--link", str(&again)]).run().ok();
+    assert_eq!(std::fs::read(&linked).unwrap(), std::fs::read(&again).unwrap());
+    let elsewhere = tempfile::tempdir().unwrap();
+    let above = elsewhere.path().join("x.splat4d");
+    let refused = splat4d(&["export", str(&file), "--html", "-o", str(&page), "--link", str(&above)]).run().refused();
+    assert!(refused.contains("--link"), "{refused}");
+}
+
+/// What a server at `url` answers.
+fn get(url: &str, path: &str) -> Vec<u8> {
+    use std::io::{Read, Write};
+    let address = url.strip_prefix("http://").unwrap().trim_end_matches('/');
+    let mut stream = std::net::TcpStream::connect(address).unwrap();
+    write!(stream, "GET {path} HTTP/1.1\r\nhost: {address}\r\nconnection: close\r\n\r\n").unwrap();
+    let mut reply = Vec::new();
+    stream.read_to_end(&mut reply).unwrap();
+    let end = reply.windows(4).position(|w| w == b"\r\n\r\n").unwrap();
+    reply.split_off(end + 4)
+}
+
+/// Starts the command and reads on to the line that names its server.
+fn serve(args: &[&str]) -> (std::process::Child, impl Iterator<Item = String>, String) {
+    use std::io::{BufRead, BufReader};
+    let mut child = std::process::Command::new(env!("CARGO_BIN_EXE_splat4d"))
+        .args(args)
+        .args(["--no-open", "--port", "0", "--json"])
+        .stdout(std::process::Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut lines = BufReader::new(child.stdout.take().unwrap()).lines().map(Result::unwrap);
+    let told = lines.find(|l| l.contains("\"serving\"")).expect("it says where it serves");
+    let url = serde_json::from_str::<Value>(&told).unwrap()["url"].as_str().unwrap().to_owned();
+    (child, lines, url)
+}
+
+#[test]
+#[cfg(unix)]
+fn a_scene_is_served_until_an_interrupt() {
+    let work = tempfile::tempdir().unwrap();
+    let (mut child, _lines, url) = serve(&["view", str(&one_gaussian(work.path()))]);
+    assert!(get(&url, "/scene.splat4d").starts_with(b"\x89S4D"));
+    let config: Value = serde_json::from_slice(&get(&url, "/config.json")).unwrap();
+    assert_eq!((&config["title"], &config["live"]), (&json!("one <b>"), &json!(false)));
+    assert!(get(&url, "/").starts_with(b"<!doctype html>"));
+    std::process::Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
+    assert!(child.wait().unwrap().success());
+    let none = splat4d(&["view", str(&work.path().join("none.ply")), "--no-open"]).run().refused();
+    assert!(none.contains("none.ply"), "{none}");
+}
+
+#[test]
+fn a_run_is_watched_and_trains_without_a_server_too() {
+    let work = tempfile::tempdir().unwrap();
+    let capture = Capture::new(work.path()).write();
+    let run = |name: &str| work.path().join(name);
+    let watched = run("watched");
+    let (mut child, lines, url) =
+        serve(&[&["train", str(&capture), "-o", str(&watched), "--view", "--no-eval"], &TINY[..]].concat());
+    let config: Value = serde_json::from_slice(&get(&url, "/config.json")).unwrap();
+    assert_eq!(config["live"], json!(true));
+    let said: Vec<String> = lines.collect();
+    assert!(child.wait().unwrap().success() && said.iter().any(|l| l.contains("\"snapshot\"")), "{said:?}");
+
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let port = taken.local_addr().unwrap().port().to_string();
+    let answer = splat4d(&["train", str(&capture), "-o", str(&run("unseen")), "--no-eval"]).args(&TINY);
+    let said = answer.args(&["--view", "--no-open", "--json", "--port", &port]).run().ok();
+    assert!(said.contains("goes on unseen") && run("unseen").join("scene.safetensors").is_file(), "{said}");
+    let scene = |name: &str| std::fs::read(run(name).join("scene.safetensors")).unwrap();
+    assert!(scene("watched") == scene("unseen"), "being watched must not change a bit");
+}
+
 #[test]
 fn options_are_checked_before_any_work() {
     let work = tempfile::tempdir().unwrap();
@@ -258,6 +357,7 @@ fn options_are_checked_before_any_work() {
     )
     .unwrap();
     let cases: &[(&[&str], &str)] = &[
+        (&["train", capture, "--port", "80"], "--view"),
         (&["train", capture, "--set", "iterations=many"], "integer"),
         (&["train", capture, "--set", "densify_untl_iter=3"], "`densify_until_iter`"),
         (&["train", capture, "--recipe", str(&recipe)], "`iterations`"),

@@ -52,7 +52,7 @@ impl Page<'_> {
             SceneIn::Linked(_) => " 'self' https: http:",
         };
         let policy = format!(
-            "default-src 'none'; script-src 'unsafe-inline' blob:; worker-src blob:; style-src 'unsafe-inline'; \
+            "default-src 'none'; script-src 'unsafe-inline' blob: data:; worker-src blob: data:; style-src 'unsafe-inline'; \
              img-src data: blob:; media-src blob:; connect-src data: blob:{connect}"
         );
         let title = format!(
@@ -102,15 +102,21 @@ impl Page<'_> {
     }
 }
 
-/// Makes blobs of modules and scene, and starts the page's modules. `SPLAT4D_ASSETS` gives workers their addresses,
-/// `SPLAT4D_CONFIG` stands for the server's `/config.json`; its scene is a Blob, or an address.
+/// Makes blobs of modules and scene, and starts the page's modules. `SPLAT4D_ASSETS` gives workers their addresses: on a
+/// page from a disk they are `data:` ones, because Chromium starts no module worker from a blob there. `SPLAT4D_CONFIG` stands for the server's `/config.json`; its scene is a Blob, or an address.
 const BOOT: &str = r#"(() => {
   const read = (id) => document.getElementById(id).textContent;
-  const urls = globalThis.SPLAT4D_ASSETS = {};
-  for (const [name, text] of JSON.parse(read('splat4d-modules'))) {
-    const linked = text.replace(/(['"])\.\/([\w.-]+)\1/g, (all, q, to) => urls[to] ? q + urls[to] + q : all);
-    urls[name] = URL.createObjectURL(new Blob([linked], { type: 'text/javascript' }));
+  const texts = new Map(JSON.parse(read('splat4d-modules')));
+  const link = (text, urls) => text.replace(/(['"])\.\/([\w.-]+)\1/g, (all, q, to) => urls(to) ? q + urls(to) + q : all);
+  const blobs = {};
+  for (const [name, text] of texts) {
+    blobs[name] = URL.createObjectURL(new Blob([link(text, (to) => blobs[to])], { type: 'text/javascript' }));
   }
+  const data = (name) => texts.has(name)
+    && 'data:text/javascript;charset=utf-8,' + 
+    encodeURIComponent(link(texts.get(name), data)).replaceAll("'", '%27');
+  globalThis.SPLAT4D_ASSETS = Object.fromEntries([...texts.keys()].filter((name) => name.endsWith('.worker.js'))
+    .map((name) => [name, location.protocol === 'file:' ? data(name) : blobs[name]]));
   let { title, scene, start } = JSON.parse(read('splat4d-page'));
   if (!scene) {
     const node = document.getElementById('splat4d-scene');
@@ -119,7 +125,7 @@ const BOOT: &str = r#"(() => {
     scene = new Blob(lines.map((line) => Uint8Array.from(atob(line), (c) => c.charCodeAt(0))));
   }
   globalThis.SPLAT4D_CONFIG = { title, scene, live: false };
-  for (const name of start) import(urls[name]);
+  for (const name of start) import(blobs[name]);
 })();
 "#;
 
