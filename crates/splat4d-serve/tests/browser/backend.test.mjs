@@ -64,31 +64,32 @@ async function shown(backend, made, body, { before, policy } = {}) {
   }
 }
 
-/// A picture from the page: RGBA bytes. `canvas`: as the canvas shows it, else as `readPixels` gives it.
+/// A picture from the page: RGBA bytes. `canvas`: as the browser shows it, else as `readPixels` gives it.
 async function picture(page, params, { canvas = false } = {}) {
-  const text = await page.evaluate(
-    async ([p, fromCanvas]) => {
-      const { backend, stream, canvas } = globalThis.shown;
-      const { width, height } = p.view;
-      p.view.cameraFromWorld = Float64Array.from(p.view.cameraFromWorld);
-      backend.resize(width, height);
-      await stream.settled(p.time);
-      backend.draw(p);
-      await backend.settled();
-      let { data } = await backend.readPixels();
-      if (fromCanvas) {
-        const flat = new OffscreenCanvas(width, height).getContext('2d');
-        // In one task: a canvas that was shown is empty again.
-        backend.draw(p);
-        flat.drawImage(canvas, 0, 0);
-        data = flat.getImageData(0, 0, width, height).data;
-      }
+  let text = await page.evaluate(async (p) => {
+    const { backend, stream } = globalThis.shown;
+    p.view.cameraFromWorld = Float64Array.from(p.view.cameraFromWorld);
+    backend.resize(p.view.width, p.view.height);
+    await stream.settled(p.time);
+    backend.draw(p);
+    await backend.settled();
+    globalThis.pack = (data) => {
       let s = '';
       for (let i = 0; i < data.length; i += 8192) s += String.fromCharCode(...data.subarray(i, i + 8192));
       return btoa(s);
-    },
-    [params, canvas],
-  );
+    };
+    return globalThis.pack((await backend.readPixels()).data);
+  }, params);
+  if (canvas) {
+    const png = await page.locator('canvas').screenshot();
+    text = await page.evaluate(async (base64) => {
+      const bytes = Uint8Array.from(atob(base64), (c) => c.charCodeAt(0));
+      const picture = await createImageBitmap(new Blob([bytes], { type: 'image/png' }));
+      const flat = new OffscreenCanvas(picture.width, picture.height).getContext('2d');
+      flat.drawImage(picture, 0, 0);
+      return globalThis.pack(flat.getImageData(0, 0, picture.width, picture.height).data);
+    }, png.toString('base64'));
+  }
   return Buffer.from(text, 'base64');
 }
 
