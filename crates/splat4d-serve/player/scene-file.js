@@ -47,6 +47,11 @@ class Decoder {
     });
   }
 
+  /// Starts a worker before there is work: that takes as long as the first request.
+  warm() {
+    if (!this.#here) this.#lane();
+  }
+
   close() {
     for (const { worker } of this.#workers) worker.terminate();
     this.#workers = [];
@@ -104,6 +109,7 @@ export class SceneFile {
     const remote = typeof source === 'string' || source instanceof URL;
     file.#where = remote ? String(source) : source?.name || 'the file';
     file.#source = remote ? new Remote(String(source)) : new Local(source);
+    file.#decoder.warm();
     try {
       const read = (length) =>
         remote ? file.#source.open(length, signal, onprogress) : file.#source.read(0, length, signal);
