@@ -1,9 +1,11 @@
 // A playback file (docs/format.md), read in parts: index, pages, palettes, poster. Trusts no number of the file.
 
 import { worker } from './assets.js';
-import { crc32, decode } from './decode.worker.js';
+import './decode.worker.js';
 import { SceneError, isAbort } from './errors.js';
 import { Local, Remote } from './ranges.js';
+
+const { crc32, decode } = globalThis.splat4dDecode;
 
 /// First request, bytes: header and index of most files, and often the poster.
 const FIRST = 65536;

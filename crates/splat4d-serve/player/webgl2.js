@@ -15,7 +15,9 @@ import {
   SHOW_VERTEX,
 } from './glsl.js';
 import { Order } from './order.js';
-import { ROW } from './sort.worker.js';
+import './sort.worker.js';
+
+const { ROW } = globalThis.splat4dSort;
 
 /// Texels across the words' and the palettes' textures: every WebGL2 device has them (its minimum for a texture).
 const WIDTH = 2048;
