@@ -34,7 +34,8 @@ function view(x, y, z, yaw, width = 160, height = 120, f = 150) {
 
 /// Runs `body` on a page that shows `made` (of sample.mjs) with a backend. `before` runs in the page before anything.
 async function shown(backend, made, body, { before, policy } = {}) {
-  const html = `<!doctype html>${policy ? `<meta http-equiv="Content-Security-Policy" content="${policy}">` : ''}<body>`;
+  const rule = policy ? `<meta http-equiv="Content-Security-Policy" content="${policy}">` : '';
+  const html = `<!doctype html>${rule}<body>`;
   const server = await serve({ files: { 'a.html': html, 'a.splat4d': made.bytes } });
   const { page, errors } = await open(browser, server.url + 'a.html');
   try {
