@@ -1,5 +1,9 @@
 // From the stored bytes of a section to what a backend wants: checks the CRC, inflates, transposes byte planes into
-// words. A worker without imports (it must run from a blob URL); a page that may start no worker imports `decode`.
+// words.
+//
+// A classic script that is also a module, and so without imports and exports: a page opened from a disk may start
+// classic workers from blob URLs, but no modules. What a page needs of it is in `globalThis.splat4dDecode`.
+'use strict';
 
 /// Gaussians a block header describes, and its f32 numbers (docs/format.md).
 const BLOCK = 256,
@@ -17,7 +21,7 @@ const CRC_TABLE = Uint32Array.from({ length: 256 }, (_, n) => {
 });
 
 /// CRC-32 (IEEE 802.3, as in zip) of bytes.
-export function crc32(bytes) {
+function crc32(bytes) {
   let c = ~0;
   for (let i = 0; i < bytes.length; i++) c = CRC_TABLE[(c ^ bytes[i]) & 255] ^ (c >>> 8);
   return ~c >>> 0;
@@ -94,7 +98,7 @@ function palette(data, { count, degree }) {
 /// `job`: {kind 'PAGE' | 'PALT' | other: bytes as they are, stored Uint8Array, crc, codec, bytes, count, degree,
 /// labels: entries of the page's palette, 0: none}. Its sizes have been checked against the file. Throws an Error that
 /// says why.
-export async function decode(job) {
+async function decode(job) {
   if (crc32(job.stored) !== job.crc) throw new Error('its bytes are damaged: the checksum differs');
   let data = job.stored;
   if (job.codec === 1) {
@@ -109,6 +113,8 @@ export async function decode(job) {
   if (job.kind === 'PALT') return palette(data, job);
   return { bytes: data };
 }
+
+globalThis.splat4dDecode = { crc32, decode };
 
 if (typeof WorkerGlobalScope !== 'undefined' && self instanceof WorkerGlobalScope) {
   self.onmessage = async ({ data: { ticket, job } }) => {

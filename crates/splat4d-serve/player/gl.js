@@ -82,3 +82,35 @@ export function check(gl, what) {
     throw new SceneError(`The graphics driver answers error ${e}`, '', 'Update the browser or the driver.');
   }
 }
+
+/// Measures how long the graphics processor works on what lies between `begin` and `end`, where the browser tells.
+export class Timer {
+  /// The latest answer, ms; 0 where there is none.
+  ms = 0;
+  #gl;
+  #extension;
+  #query = null;
+  #open = false;
+  constructor(gl) {
+    this.#gl = gl;
+    this.#extension = gl.getExtension('EXT_disjoint_timer_query_webgl2');
+  }
+  begin() {
+    const gl = this.#gl;
+    if (!this.#extension) return;
+    if (this.#query) {
+      // One at a time: answers come frames later.
+      if (!gl.getQueryParameter(this.#query, gl.QUERY_RESULT_AVAILABLE)) return;
+      const valid = !gl.getParameter(this.#extension.GPU_DISJOINT_EXT);
+      if (valid) this.ms = gl.getQueryParameter(this.#query, gl.QUERY_RESULT) / 1e6;
+      gl.deleteQuery(this.#query);
+    }
+    this.#query = gl.createQuery();
+    this.#open = true;
+    gl.beginQuery(this.#extension.TIME_ELAPSED_EXT, this.#query);
+  }
+  end() {
+    if (this.#open) this.#gl.endQuery(this.#extension.TIME_ELAPSED_EXT);
+    this.#open = false;
+  }
+}

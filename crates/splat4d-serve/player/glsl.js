@@ -24,8 +24,9 @@ uniform vec2 focal, center, size, low, high, depth_range;
 uniform float time, near, flow_scale;
 uniform int channel, count;
 
-// conic xx xy yy and opacity; centre and half sizes of the box in px; colour.
-struct Splat { vec4 shape, place; vec3 tint; };
+// conic xx xy yy and opacity; centre and half of the long axis of the ellipse α = 1/255, px; colour, and the short axis
+// as a share of the long one.
+struct Splat { vec4 shape, place, tint; };
 
 const float LOW_PASS = 0.3, ALPHA_MIN = 1.0 / 255.0, TAU_MARGIN = 1e-3;
 // Only an order that is older than this picture can hold pages outside their span: s.
@@ -69,9 +70,9 @@ vec3 flow_color(vec2 velocity) {
   return value * clamp(abs(fract(hue + vec3(0, 2.0 / 3.0, 1.0 / 3.0)) * 6.0 - 3.0) - 1.0, 0.0, 1.0);
 }
 
-// The splat of instance i of the order; half sizes 0: nothing to draw.
+// The splat at a place of the order; a long axis of 0: nothing to draw.
 Splat splat(ivec2 texel) {
-  Splat none = Splat(vec4(0), vec4(0), vec3(0));
+  Splat none = Splat(vec4(0), vec4(0), vec4(0));
   if (texel.y * ${ORDER_WIDTH} + texel.x >= count) return none;
   uint id = texelFetch(order, texel, 0).r;
   int row = int(id >> 10), column = int(id & 1023u), b = (column >> 8) * BLOCK_TEXELS;
@@ -141,7 +142,12 @@ Splat splat(ivec2 texel) {
     vec3 v = rotation * velocity;
     tint = flow_color(focal * (v.xy - uv * v.z) / c.z);
   }
-  return Splat(vec4(yy / det, -sxy / det, xx / det, opacity), vec4(middle, extent), tint);
+  float mid = 0.5 * (xx + yy), most_px = mid + sqrt(max(mid * mid - det, 0.0)), share_px = sqrt(det) / most_px;
+  // The eigenvector of the larger eigenvalue, from the row that does not cancel.
+  vec2 along = xx > yy ? vec2(most_px - yy, sxy) : vec2(sxy, most_px - xx);
+  float norm = length(along);
+  vec2 axis = (norm > 0.0 ? along / norm : vec2(1, 0)) * sqrt(tau * most_px);
+  return Splat(vec4(yy / det, -sxy / det, xx / det, opacity), vec4(middle, axis), vec4(tint, share_px));
 }
 `;
 
@@ -149,7 +155,7 @@ Splat splat(ivec2 texel) {
 /// starts anew for each (measured: about 50 µs an instance).
 export const BATCH = 256;
 
-/// Four corners a splat, around the box of its ellipse.
+/// Four corners a splat, close around its ellipse: a needle's upright box would be empty for the most part.
 const QUAD = `
 flat out vec4 shape;
 flat out vec2 middle;
@@ -159,11 +165,12 @@ void main() {
   Splat s = splat(ivec2(i % ${ORDER_WIDTH}, i / ${ORDER_WIDTH}));
   shape = s.shape;
   middle = s.place.xy;
-  tint = s.tint;
-  vec2 first = max(middle - s.place.zw, vec2(0)), last = min(middle + s.place.zw, size);
+  tint = s.tint.rgb;
+  vec2 axis = s.place.zw, side = vec2((corner & 1) * 2 - 1, (corner >> 1) * 2 - 1);
+  vec2 at = middle + side.x * axis + side.y * s.tint.w * vec2(-axis.y, axis.x);
   // Rows go from the top in this target; the way to the canvas turns them.
-  gl_Position = vec4(mix(first, last, vec2(corner & 1, corner >> 1)) / size * 2.0 - 1.0, 0, 1);
-  if (s.place.z <= 0.0) gl_Position = vec4(2, 2, 0, 1);
+  gl_Position = vec4(at / size * 2.0 - 1.0, 0, 1);
+  if (axis == vec2(0)) gl_Position = vec4(2, 2, 0, 1);
 }`;
 
 /// Every corner computes its splat: where no 32-bit floats can be rendered to.
@@ -178,7 +185,7 @@ void main() {
   Splat s = splat(ivec2(gl_FragCoord.xy));
   shape = s.shape;
   place = s.place;
-  tint = vec4(s.tint, 0);
+  tint = s.tint;
 }`;
 
 /// Corners from what PROJECT_FRAGMENT wrote.
@@ -186,9 +193,9 @@ export const DRAW_VERTEX = `#version 300 es
 precision highp float; precision highp int;
 uniform highp sampler2D shapes, places, tints;
 uniform vec2 size;
-struct Splat { vec4 shape, place; vec3 tint; };
+struct Splat { vec4 shape, place, tint; };
 Splat splat(ivec2 texel) {
-  return Splat(texelFetch(shapes, texel, 0), texelFetch(places, texel, 0), texelFetch(tints, texel, 0).rgb);
+  return Splat(texelFetch(shapes, texel, 0), texelFetch(places, texel, 0), texelFetch(tints, texel, 0));
 }
 ${QUAD}`;
 

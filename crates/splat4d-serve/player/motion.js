@@ -1,6 +1,8 @@
 // docs/format.md in f64: one Gaussian of a page, and where it is at a time. The shaders are its twins.
 
-import { ALPHA_MIN, lerp, path, signed10 } from './sort.worker.js';
+import './sort.worker.js';
+
+const { ALPHA_MIN, lerp, path, signed10 } = globalThis.splat4dSort;
 
 const BLOCK = 256,
   HEADER = 24,

@@ -1,7 +1,9 @@
 // The order in which Gaussians are drawn, asked of a worker; on this thread where the page may start none.
 
 import { worker } from './assets.js';
-import { Sorter } from './sort.worker.js';
+import './sort.worker.js';
+
+const { Sorter } = globalThis.splat4dSort;
 
 /// One order is on its way at a time; what is asked meanwhile waits for the next.
 export class Order {

@@ -1,9 +1,11 @@
 // A playback file (docs/format.md), read in parts: index, pages, palettes, poster. Trusts no number of the file.
 
 import { worker } from './assets.js';
-import { crc32, decode } from './decode.worker.js';
+import './decode.worker.js';
 import { SceneError, isAbort } from './errors.js';
 import { Local, Remote } from './ranges.js';
+
+const { crc32, decode } = globalThis.splat4dDecode;
 
 /// First request, bytes: header and index of most files, and often the poster.
 const FIRST = 65536;
@@ -45,6 +47,11 @@ class Decoder {
       // Copied, not moved: if the worker turns out not to start, the job is done here.
       lane.worker.postMessage({ ticket, job }, lane.proven ? [job.stored.buffer] : []);
     });
+  }
+
+  /// Starts a worker before there is work: that takes as long as the first request.
+  warm() {
+    if (!this.#here) this.#lane();
   }
 
   close() {
@@ -104,6 +111,7 @@ export class SceneFile {
     const remote = typeof source === 'string' || source instanceof URL;
     file.#where = remote ? String(source) : source?.name || 'the file';
     file.#source = remote ? new Remote(String(source)) : new Local(source);
+    file.#decoder.warm();
     try {
       const read = (length) =>
         remote ? file.#source.open(length, signal, onprogress) : file.#source.read(0, length, signal);

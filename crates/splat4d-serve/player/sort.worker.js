@@ -1,12 +1,15 @@
-// Which Gaussians are drawn at a time, and in which order: a counting sort by depth, far first, in a worker without
-// imports (it must run from a blob URL). `path` is the motion of docs/format.md; motion.js builds on it.
+// Which Gaussians are drawn at a time, and in which order: a counting sort by depth, far first. `path` is the motion of
+// docs/format.md; motion.js builds on it.
+//
+// A classic script that is also a module, like decode.worker.js; a page finds it in `globalThis.splat4dSort`.
+'use strict';
 
 /// Gaussians a block header describes, its f32 numbers, words a Gaussian (docs/format.md).
 const BLOCK = 256,
   HEADER = 24,
   WORDS = 8;
 /// Gaussians a row of the backend's texture: 2048 texels, two each.
-export const ROW = 1024;
+const ROW = 1024;
 /// Numbers kept of a Gaussian: position at the page's first second, velocity, first and last second it can be seen.
 const TRACK = 8;
 /// Keys of the counting sort: 16 bits.
@@ -14,18 +17,18 @@ const KEYS = 65536;
 /// A window of visibility is widened by this, s: rounding must lose nobody, the shader decides exactly.
 const SLACK = 1e-5;
 /// Opacity below which nothing is drawn (Kerbl et al. 2023).
-export const ALPHA_MIN = 1 / 255;
+const ALPHA_MIN = 1 / 255;
 
 /// Softnesses that belong to the reach of a Gaussian that dies (docs/format.md).
 const REACH_TAILS = 3;
 
 /// 10 bits as a share of a largest number.
-export const signed10 = (word, bit) => (((word >>> bit) & 1023) - 511) / 511;
-export const lerp = (a, b, u) => a + (b - a) * u;
+const signed10 = (word, bit) => (((word >>> bit) & 1023) - 511) / 511;
+const lerp = (a, b, u) => a + (b - a) * u;
 
 /// Motion and life of Gaussian `i` of a page whose span is `span` long, into `out`: mean at the life's centre (3), that
 /// centre, velocity (3), half-width, softness, opacity, reach.
-export function path(words, headers, i, span, out) {
+function path(words, headers, i, span, out) {
   const w = WORDS * i,
     f = HEADER * Math.floor(i / BLOCK),
     h = headers;
@@ -46,7 +49,7 @@ export function path(words, headers, i, span, out) {
 }
 
 /// Holds what sorting needs of each resident page.
-export class Sorter {
+class Sorter {
   #pages = [];
   #depths = new Float32Array(0);
   #bits = new Int32Array(0);
@@ -162,6 +165,8 @@ export class Sorter {
     return { count: n, active };
   }
 }
+
+globalThis.splat4dSort = { ALPHA_MIN, ROW, Sorter, lerp, path, signed10 };
 
 if (typeof WorkerGlobalScope !== 'undefined' && self instanceof WorkerGlobalScope) {
   const sorter = new Sorter();

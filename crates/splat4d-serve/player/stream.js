@@ -42,10 +42,13 @@ export class Stream {
   #palettes = new Map();
   #now = [];
   #later = [];
-  #key = '';
+  /// The pages of the last update's moment: the same list as long as no span begins or ends.
+  #active = [];
+  #begun = -1;
+  #ended = -1;
   /// When a page that was given up may be tried again.
   #again = Infinity;
-  #last = { time: NaN, playing: false, speed: 1, loop: true };
+  #last = { time: NaN, active: null, step: NaN, playing: false, speed: 1, loop: true };
   #waiting = [];
   #over = false;
   #starts;
@@ -77,13 +80,20 @@ export class Stream {
   update(time, { playing = false, speed = 1, loop = true } = {}) {
     if (this.#over) return;
     const t = this.#file.clamp(time);
-    // Which pages are drawn is decided by how many spans began and ended; what lies ahead, in coarse steps.
+    const begun = before(this.#starts, t);
+    const ended = before(this.#ends, t);
+    if (begun !== this.#begun || ended !== this.#ended) {
+      [this.#begun, this.#ended, this.#active] = [begun, ended, this.#file.activePages(t)];
+    }
+    const active = this.#active;
+    // What lies ahead is looked at anew in coarse steps only.
     const reach = playing ? Math.max(Math.abs(speed), 0.1) * AHEAD : BESIDE;
     const step = Math.floor((t / reach) * STEP);
-    const key = `${before(this.#starts, t)} ${before(this.#ends, t)} ${step} ${playing} ${speed} ${loop}`;
-    Object.assign(this.#last, { time: t, playing, speed, loop });
-    if (key === this.#key && performance.now() < this.#again) return;
-    this.#key = key;
+    const last = this.#last;
+    last.time = t;
+    const same = last.active === active && last.step === step && last.playing === playing;
+    if (same && last.speed === speed && last.loop === loop && performance.now() < this.#again) return;
+    Object.assign(last, { active, step, playing, speed, loop });
     this.#again = Infinity;
     this.#plan(t, playing, speed, loop, reach);
     this.#pump();
@@ -93,7 +103,9 @@ export class Stream {
   ready(time) {
     let all = 0,
       there = 0;
-    for (const page of this.#file.activePages(time)) {
+    const t = this.#file.clamp(time);
+    const now = before(this.#starts, t) === this.#begun && before(this.#ends, t) === this.#ended;
+    for (const page of now ? this.#active : this.#file.activePages(t)) {
       all += page.count;
       if (this.#resident.has(page.id)) there += page.count;
     }

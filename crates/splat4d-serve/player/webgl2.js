@@ -1,7 +1,7 @@
 // The WebGL2 backend: words in textures, order from a worker, blending in half floats where that is to be had.
 
 import { SceneError } from './errors.js';
-import { Rows, check, program, texture } from './gl.js';
+import { Rows, Timer, check, program, texture } from './gl.js';
 import {
   BATCH,
   BLOCK_TEXELS,
@@ -15,7 +15,9 @@ import {
   SHOW_VERTEX,
 } from './glsl.js';
 import { Order } from './order.js';
-import { ROW } from './sort.worker.js';
+import './sort.worker.js';
+
+const { ROW } = globalThis.splat4dSort;
 
 /// Texels across the words' and the palettes' textures: every WebGL2 device has them (its minimum for a texture).
 const WIDTH = 2048;
@@ -72,6 +74,7 @@ export class WebGL2Backend {
   /// What PROJECT_FRAGMENT writes, and what is blended: {frame, texture(s), …}.
   #splats = null;
   #sums;
+  #timer;
   #size = [0, 0];
   /// Vertex arrays: none at all, and quads; the latter's corners.
   #empty;
@@ -131,6 +134,7 @@ export class WebGL2Backend {
     const corners = Uint16Array.from({ length: 6 * BATCH }, (_, i) => 4 * Math.floor(i / 6) + CORNERS[i % 6]);
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
     gl.bindVertexArray(null);
+    this.#timer = new Timer(gl);
     this.#order = new Order(NEAR, (answer) => this.#ordered(answer));
     check(gl, 'The graphics memory did not suffice to begin');
   }
@@ -227,6 +231,7 @@ export class WebGL2Backend {
   /// Size of the drawing buffer, px.
   resize(width, height) {
     if (this.#size[0] === width && this.#size[1] === height && this.#sums.texture) return;
+    [width, height] = [Math.max(width, 1), Math.max(height, 1)];
     this.#canvas.width = width;
     this.#canvas.height = height;
     this.#room(width, height);
@@ -404,6 +409,7 @@ export class WebGL2Backend {
     this.#frame = 0;
     this.#stale = false;
     const begin = performance.now();
+    this.#timer.begin();
     const { view, target } = last,
       { width, height } = view;
     if (this.#size[0] !== width || this.#size[1] !== height) this.#room(width, height);
@@ -414,7 +420,9 @@ export class WebGL2Backend {
     gl.clear(gl.COLOR_BUFFER_BIT);
     if (this.#count) this.#blend();
     this.#resolve(target?.framebuffer ?? null, target?.x ?? 0, target?.y ?? 0, height);
-    this.stats.drawMs = performance.now() - begin;
+    this.#timer.end();
+    // Where the browser tells nothing, at least what giving the orders took.
+    this.stats.drawMs = this.#timer.ms || performance.now() - begin;
   }
 
   /// Gives `made` (a program that computes splats) the view, and the textures it reads.

@@ -2,8 +2,11 @@
 // machines that offer less; and when the graphics device goes away.
 
 import assert from 'node:assert/strict';
-import { existsSync } from 'node:fs';
+import { existsSync, mkdtempSync, readFileSync, rmSync, writeFileSync } from 'node:fs';
+import { tmpdir } from 'node:os';
+import path from 'node:path';
 import test from 'node:test';
+import { pathToFileURL } from 'node:url';
 import { launch, open } from './browser.mjs';
 import { psnr, render } from './reference.mjs';
 import { sample } from './sample.mjs';
@@ -31,7 +34,8 @@ function view(x, y, z, yaw, width = 160, height = 120, f = 150) {
 
 /// Runs `body` on a page that shows `made` (of sample.mjs) with a backend. `before` runs in the page before anything.
 async function shown(backend, made, body, { before, policy } = {}) {
-  const html = `<!doctype html>${policy ? `<meta http-equiv="Content-Security-Policy" content="${policy}">` : ''}<body>`;
+  const rule = policy ? `<meta http-equiv="Content-Security-Policy" content="${policy}">` : '';
+  const html = `<!doctype html>${rule}<body>`;
   const server = await serve({ files: { 'a.html': html, 'a.splat4d': made.bytes } });
   const { page, errors } = await open(browser, server.url + 'a.html');
   try {
@@ -121,6 +125,7 @@ for (const backend of ['webgl2', 'webgpu']) {
         console.log(`${backend} ${look.channel ?? 'color'} at ${look.time}: ${db.toFixed(1)} dB`);
         assert.ok(db >= (look.channel ? BOUND : REACHED), `${look.channel ?? 'color'} at ${look.time}: ${db} dB`);
       }
+      assert.ok(page.workers().length >= 1, 'decoding and sorting have threads of their own');
       const db = await compare(page, made, looks[1], { canvas: true });
       assert.ok(db >= REACHED, `on the canvas: ${db} dB`);
     });
@@ -201,3 +206,33 @@ test('webgl2 says when the device is lost, and waits for nobody then', { skip },
     assert.match(lost[0], /device/);
   }),
 );
+
+test('workers start from blobs on a page opened from a disk', { skip }, async () => {
+  const folder = mkdtempSync(path.join(tmpdir(), 'splat4d-')),
+    file = path.join(folder, 'a.html');
+  try {
+    writeFileSync(file, '<!doctype html><body>');
+    const { page } = await open(browser, pathToFileURL(file).href);
+    for (const [name, message] of [
+      ['sort.worker.js', { sort: { time: 0, depth: [0, 0, 1, 0], near: 0 } }],
+      ['decode.worker.js', { ticket: 1, job: { stored: new Uint8Array(0), crc: 0, codec: 0, kind: 'POST' } }],
+    ]) {
+      const text = readFileSync(PLAYER + name, 'utf8');
+      const answer = await page.evaluate(
+        ([text, message]) =>
+          new Promise((done) => {
+            const made = new Worker(URL.createObjectURL(new Blob([text], { type: 'text/javascript' })));
+            made.onmessage = ({ data }) => data.ready || done(Object.keys(data));
+            made.onerror = () => done('it did not start');
+            if (message.job) message.job.stored = new Uint8Array(0);
+            made.postMessage(message);
+          }),
+        [text, JSON.parse(JSON.stringify(message))],
+      );
+      assert.ok(answer.includes('order') || answer.includes('result'), `${name}: ${answer}`);
+    }
+    await page.close();
+  } finally {
+    rmSync(folder, { recursive: true });
+  }
+});

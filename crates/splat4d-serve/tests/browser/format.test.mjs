@@ -6,10 +6,12 @@ import { deflateRawSync } from 'node:zlib';
 import { at, gaussian } from '../../player/motion.js';
 import { SceneError } from '../../player/errors.js';
 import { SceneFile } from '../../player/scene-file.js';
-import { Sorter } from '../../player/sort.worker.js';
 import { moved } from './reference.mjs';
 import { layout, random, sample } from './sample.mjs';
 import { serve } from './server.mjs';
+
+// Loaded by motion.js; a worker is a classic script and exports nothing.
+const { Sorter } = globalThis.splat4dSort;
 
 const near = (a, b, tolerance, what) =>
   a.forEach((v, k) => assert.ok(Math.abs(v - b[k]) <= tolerance * (1 + Math.abs(b[k])), `${what} ${k}: ${v} ${b[k]}`));

@@ -153,3 +153,32 @@ test('a palette is there before its page, and asked for once', async () => {
     await server.close();
   }
 });
+
+test('a first moment and a seek fetch their own bytes and no others', async () => {
+  const { bytes } = sample({ scale: 8, codec: 0 });
+  const server = await serve({ files: { a: bytes } });
+  try {
+    const file = await SceneFile.open(server.url + 'a');
+    const head = server.sent;
+    const backend = { addPalette: () => {}, addPage: () => {}, dropPage: () => {} };
+    // No room for more than the fullest moment: nothing is fetched ahead, so that every byte can be accounted for.
+    const stream = new Stream(file, backend, { budget: 32 * 8 * (700 + 1025 + 511) });
+    const outside = (ids) =>
+      ids.reduce(
+        (n, id) =>
+          n +
+          Math.max(0, file.sections[id].offset + file.sections[id].stored - Math.max(head, file.sections[id].offset)),
+        0,
+      );
+    await stream.settled(4.5);
+    const first = server.sent;
+    // Both tiers of the root, the third second's page (8), and the palette of all three (0).
+    assert.equal(first - head, outside([0, 4, 5, 8]));
+    await stream.settled(3.5);
+    assert.equal(server.sent - first, outside([7]));
+    assert.equal(file.bytesRead, server.sent);
+    stream.destroy();
+  } finally {
+    await server.close();
+  }
+});
