@@ -31,7 +31,7 @@ struct Record {
     major: vec2<f32>,   // longer axis of the 1 sigma ellipse, px
     minor: f32,         // length of the shorter one, px
     depth: f32,         // z in camera axes
-    color: vec2<u32>,   // r g | b opacity, 16-bit floats
+    color: vec2<u32>,   // r g | b as 16-bit floats, opacity as a 16-bit share of one
 }
 
 // What the GPU decides about a frame. The nearest and farthest depths are positive floats' bits, which sort alike.
@@ -202,7 +202,8 @@ fn cull(
     } else if (frame.channel == CHANNEL_FLOW) {
         rgb = flow_color(flow(g.mean, g.velocity));
     }
-    record.color = vec2<u32>(pack2x16float(rgb.xy), pack2x16float(vec2<f32>(rgb.z, g.opacity * ellipse.rho)));
+    let opacity = pack2x16unorm(vec2<f32>(0.0, g.opacity * ellipse.rho));
+    record.color = vec2<u32>(pack2x16float(rgb.xy), pack2x16float(vec2<f32>(rgb.z, 0.0)) | opacity);
     records[slot * BLOCK + thread] = record;
     atomicOr(&masks[slot * MASKS + thread / 32u], 1u << (thread % 32u));
     // Looking first keeps all but a few threads from queueing for these two.
