@@ -6,9 +6,9 @@
 //   total           one workgroup: exclusive sums of the masks' bits, and the arguments of indirect dispatches and draw
 //   keys_of_depths  a workgroup owns a block again: 16-bit depth key and place of every record, without gaps
 //
-// Places are in the file's order, so all of this repeats from run to run, and where two depth keys are the same the lower
-// place is in front, as in the CPU renderer's order (depth, id). Threads of cull do not wait for each other: software
-// devices, which are what tests run on, would take three times as long.
+// Places are in the file's order, so all of this repeats from run to run, and where two depth keys are the same the
+// lower place is in front, as in the CPU renderer's order (depth, id). Threads of cull do not wait for each other:
+// software devices, which are what tests run on, would take three times as long.
 
 // One picture; 160 bytes.
 struct Frame {

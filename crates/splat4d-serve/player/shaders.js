@@ -1,5 +1,5 @@
-// Made from the .wgsl files, whose comments say what they do, by `UPDATE_GOLDEN=1 cargo test -p splat4d-serve
-// --test shaders`. A test fails when it is out of date.
+// Made from the .wgsl files, whose comments say what they do, by
+// `UPDATE_GOLDEN=1 cargo test -p splat4d-serve --test shaders`. A test fails when it is out of date.
 
 export const RESIDENT = `
 struct BlockHeader {

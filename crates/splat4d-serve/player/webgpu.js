@@ -120,7 +120,8 @@ export class WebGPUBackend {
       requiredLimits[name] = adapter.limits[name];
     }
     const requiredFeatures = ['timestamp-query'].filter((f) => adapter.features.has(f));
-    const refused = (e) => new SceneError('The graphics driver refuses WebGPU', e.message, 'Update it, or use WebGL2.', e);
+    const refused = (e) =>
+      new SceneError('The graphics driver refuses WebGPU', e.message, 'Update it, or use WebGL2.', e);
     let device;
     try {
       device = await adapter.requestDevice({ requiredLimits, requiredFeatures });
@@ -288,7 +289,8 @@ export class WebGPUBackend {
       this.#queue.writeBuffer(this.#b.frame, 0, this.#frame);
       this.#blend(encoder, blocks > 0, cull);
     }
-    this.#resolve(encoder, this.#context.getCurrentTexture().createView(), this.#pipelines.resolve, this.#groups.resolve);
+    const shown = this.#context.getCurrentTexture().createView();
+    this.#resolve(encoder, shown, this.#pipelines.resolve, this.#groups.resolve);
     const measured = cull && this.#copyStats(encoder);
     const start = performance.now();
     this.#queue.submit([encoder.finish()]);
