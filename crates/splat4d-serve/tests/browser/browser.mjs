@@ -16,7 +16,10 @@ const FLAGS = [
   '--no-first-run',
   '--enable-unsafe-webgpu',
   '--use-webgpu-adapter=swiftshader',
-  '--enable-unsafe-swiftshader',
+  // Without these three a WebGPU canvas takes the GPU process down where there is no graphics card.
+  '--enable-features=Vulkan',
+  '--use-vulkan=swiftshader',
+  '--use-angle=swiftshader',
 ];
 
 /// A browser, or null where there is none; with REQUIRE_BROWSER=1 that is an error.
