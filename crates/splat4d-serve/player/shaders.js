@@ -286,7 +286,7 @@ const SORT_ROUNDS: u32 = 8u;
 const SORT_BLOCK: u32 = 2048u;
 const SORT_ROW: u32 = 16u;
 const SORT_FEW: u32 = 32u;
-const SORT_WORDS: u32 = 8u;
+const SORT_WORDS: u32 = 64u;
 struct SortPass {
 shift: u32,
 count_index: u32,
@@ -301,7 +301,7 @@ count_index: u32,
 var<workgroup> sort_digits: array<atomic<u32>, 256>;
 var<workgroup> sort_sums: array<u32, 256>;
 var<workgroup> sort_rows: array<u32, 16>;
-var<workgroup> sort_masks: array<atomic<u32>, 2048>;
+var<workgroup> sort_bytes: array<atomic<u32>, 64>;
 fn sort_pairs() -> u32 {
 return min(sort_count[sort_pass.count_index], arrayLength(&keys_in));
 }
@@ -393,39 +393,42 @@ if (block < blocks) {
 next += sort_counts[thread * blocks + block];
 }
 workgroupBarrier();
-for (var w = 0u; w < SORT_WORDS; w++) {
-atomicStore(&sort_masks[w * SORT_THREADS + thread], 0u);
-}
-let word = thread / 32u;
-let bit = 1u << (thread % 32u);
+let word = thread / 4u;
+let byte = 8u * (thread % 4u);
 for (var round = 0u; round < SORT_ROUNDS; round++) {
 let i = block * SORT_BLOCK + round * SORT_THREADS + thread;
 let there = i < pairs;
 var key = 0u;
 var digit = 0u;
 sort_sums[thread] = next;
+atomicStore(&sort_digits[thread], 0u);
+if (thread < SORT_WORDS) {
+atomicStore(&sort_bytes[thread], 0u);
+}
 workgroupBarrier();
 if (there) {
 key = keys_in[i];
 digit = sort_digit(key);
-atomicOr(&sort_masks[word * SORT_THREADS + digit], bit);
+atomicOr(&sort_bytes[word], digit << byte);
+atomicAdd(&sort_digits[digit], 1u);
 }
 workgroupBarrier();
 if (there) {
-var rank = countOneBits(atomicLoad(&sort_masks[word * SORT_THREADS + digit]) & (bit - 1u));
+var rank = countOneBits(sort_equal(atomicLoad(&sort_bytes[word]), digit) & ((1u << byte) - 1u));
 for (var w = 0u; w < word; w++) {
-rank += countOneBits(atomicLoad(&sort_masks[w * SORT_THREADS + digit]));
+rank += countOneBits(sort_equal(atomicLoad(&sort_bytes[w]), digit));
 }
 let to = sort_sums[digit] + rank;
 keys_out[to] = key;
 values_out[to] = values_in[i];
 }
 workgroupBarrier();
-for (var w = 0u; w < SORT_WORDS; w++) {
-next += countOneBits(atomicLoad(&sort_masks[w * SORT_THREADS + thread]));
-atomicStore(&sort_masks[w * SORT_THREADS + thread], 0u);
+next += atomicLoad(&sort_digits[thread]);
 }
 }
+fn sort_equal(bytes: u32, digit: u32) -> u32 {
+let other = bytes ^ (digit * 0x01010101u);
+return ~(((other & 0x7f7f7f7fu) + 0x7f7f7f7fu) | other | 0x7f7f7f7fu);
 }
 `;
 
