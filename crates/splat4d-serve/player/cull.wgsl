@@ -6,9 +6,9 @@
 //   total           one workgroup: exclusive sums of the masks' bits, and the arguments of indirect dispatches and draw
 //   keys_of_depths  a workgroup owns a block again: 16-bit depth key and place of every record, without gaps
 //
-// Places are in the file's order, so all of this repeats from run to run, and where two depth keys are the same the lower
-// place is in front, as in the CPU renderer's order (depth, id). Threads of cull do not wait for each other: software
-// devices, which are what tests run on, would take three times as long.
+// Places are in the file's order, so all of this repeats from run to run, and where two depth keys are the same the
+// lower place is in front, as in the CPU renderer's order (depth, id). Threads of cull do not wait for each other:
+// software devices, which are what tests run on, would take three times as long.
 
 // One picture; 160 bytes.
 struct Frame {
@@ -31,7 +31,7 @@ struct Record {
     major: vec2<f32>,   // longer axis of the 1 sigma ellipse, px
     minor: f32,         // length of the shorter one, px
     depth: f32,         // z in camera axes
-    color: vec2<u32>,   // r g | b opacity, 16-bit floats
+    color: vec2<u32>,   // r g | b as 16-bit floats, opacity as a 16-bit share of one
 }
 
 // What the GPU decides about a frame. The nearest and farthest depths are positive floats' bits, which sort alike.
@@ -202,7 +202,8 @@ fn cull(
     } else if (frame.channel == CHANNEL_FLOW) {
         rgb = flow_color(flow(g.mean, g.velocity));
     }
-    record.color = vec2<u32>(pack2x16float(rgb.xy), pack2x16float(vec2<f32>(rgb.z, g.opacity * ellipse.rho)));
+    let opacity = pack2x16unorm(vec2<f32>(0.0, g.opacity * ellipse.rho));
+    record.color = vec2<u32>(pack2x16float(rgb.xy), pack2x16float(vec2<f32>(rgb.z, 0.0)) | opacity);
     records[slot * BLOCK + thread] = record;
     atomicOr(&masks[slot * MASKS + thread / 32u], 1u << (thread % 32u));
     // Looking first keeps all but a few threads from queueing for these two.

@@ -14,10 +14,13 @@ const CORNER_BITS: u32 = 0xda4u;
 // Where among drawn_count the number of records is.
 const COUNT: u32 = 3u;
 
+// Flat, and measured from the pixel's centre: what is interpolated carries the rounding of the corners to the raster's
+// grid, a sixteenth of a pixel on some devices.
 struct Corner {
     @builtin(position) position: vec4<f32>,
-    @location(0) sigmas: vec2<f32>,                    // from the centre, along the two axes, in standard deviations
-    @location(1) @interpolate(flat) color: vec4<f32>,  // rgb, opacity
+    @location(0) @interpolate(flat) center: vec2<f32>, // px
+    @location(1) @interpolate(flat) axes: vec4<f32>,   // the two axes over their squared lengths, 1/px
+    @location(2) @interpolate(flat) color: vec4<f32>,  // rgb, opacity
 }
 
 // Vertices 6 i to 6 i + 5 are two triangles: the box along the axes, as large as the ellipse on which alpha is the
@@ -27,12 +30,15 @@ fn corner(@builtin(vertex_index) vertex: u32) -> Corner {
     let record = drawn[order[drawn_count[COUNT] - 1u - vertex / CORNERS]];
     let k = (CORNER_BITS >> (2u * (vertex % CORNERS))) & 3u;
     let rg = unpack2x16float(record.color.x);
-    let ba = unpack2x16float(record.color.y);
+    let ba = vec2<f32>(unpack2x16float(record.color.y).x, unpack2x16unorm(record.color.y).y);
     let radius = sqrt(max(cutoff(frame.view, ba.y), 0.0));
+    let axis = record.major / length(record.major);
+    let minor = record.minor * vec2<f32>(-axis.y, axis.x);
+    let sigmas = radius * (vec2<f32>(vec2<u32>(k & 1u, k >> 1u)) * 2.0 - 1.0);
     var out: Corner;
-    out.sigmas = radius * (vec2<f32>(vec2<u32>(k & 1u, k >> 1u)) * 2.0 - 1.0);
-    let minor = vec2<f32>(-record.major.y, record.major.x) * (record.minor / length(record.major));
-    let at = (record.center + out.sigmas.x * record.major + out.sigmas.y * minor) / frame.view.size * 2.0 - 1.0;
+    out.center = record.center;
+    out.axes = vec4<f32>(axis / length(record.major), minor / (record.minor * record.minor));
+    let at = (record.center + sigmas.x * record.major + sigmas.y * minor) / frame.view.size * 2.0 - 1.0;
     out.position = vec4<f32>(at.x, -at.y, 0.0, 1.0);
     out.color = vec4<f32>(rg, ba);
     if (frame.channel == CHANNEL_DEPTH) {
@@ -45,7 +51,9 @@ fn corner(@builtin(vertex_index) vertex: u32) -> Corner {
 
 @fragment
 fn splat(in: Corner) -> @location(0) vec4<f32> {
-    let alpha = min(in.color.a * exp(-0.5 * dot(in.sigmas, in.sigmas)), ALPHA_MAX);
+    let d = in.position.xy - in.center;
+    let sigmas = vec2<f32>(dot(d, in.axes.xy), dot(d, in.axes.zw));
+    let alpha = min(in.color.a * exp(-0.5 * dot(sigmas, sigmas)), ALPHA_MAX);
     if (alpha < frame.view.alpha_min) {
         discard;
     }

@@ -1,5 +1,5 @@
-// Made from the .wgsl files, whose comments say what they do, by `UPDATE_GOLDEN=1 cargo test -p splat4d-serve
-// --test shaders`. A test fails when it is out of date.
+// Made from the .wgsl files, whose comments say what they do, by
+// `UPDATE_GOLDEN=1 cargo test -p splat4d-serve --test shaders`. A test fails when it is out of date.
 
 export const RESIDENT = `
 struct BlockHeader {
@@ -286,7 +286,7 @@ const SORT_ROUNDS: u32 = 8u;
 const SORT_BLOCK: u32 = 2048u;
 const SORT_ROW: u32 = 16u;
 const SORT_FEW: u32 = 32u;
-const SORT_WORDS: u32 = 8u;
+const SORT_WORDS: u32 = 64u;
 struct SortPass {
 shift: u32,
 count_index: u32,
@@ -301,7 +301,7 @@ count_index: u32,
 var<workgroup> sort_digits: array<atomic<u32>, 256>;
 var<workgroup> sort_sums: array<u32, 256>;
 var<workgroup> sort_rows: array<u32, 16>;
-var<workgroup> sort_masks: array<atomic<u32>, 2048>;
+var<workgroup> sort_bytes: array<atomic<u32>, 64>;
 fn sort_pairs() -> u32 {
 return min(sort_count[sort_pass.count_index], arrayLength(&keys_in));
 }
@@ -393,39 +393,42 @@ if (block < blocks) {
 next += sort_counts[thread * blocks + block];
 }
 workgroupBarrier();
-for (var w = 0u; w < SORT_WORDS; w++) {
-atomicStore(&sort_masks[w * SORT_THREADS + thread], 0u);
-}
-let word = thread / 32u;
-let bit = 1u << (thread % 32u);
+let word = thread / 4u;
+let byte = 8u * (thread % 4u);
 for (var round = 0u; round < SORT_ROUNDS; round++) {
 let i = block * SORT_BLOCK + round * SORT_THREADS + thread;
 let there = i < pairs;
 var key = 0u;
 var digit = 0u;
 sort_sums[thread] = next;
+atomicStore(&sort_digits[thread], 0u);
+if (thread < SORT_WORDS) {
+atomicStore(&sort_bytes[thread], 0u);
+}
 workgroupBarrier();
 if (there) {
 key = keys_in[i];
 digit = sort_digit(key);
-atomicOr(&sort_masks[word * SORT_THREADS + digit], bit);
+atomicOr(&sort_bytes[word], digit << byte);
+atomicAdd(&sort_digits[digit], 1u);
 }
 workgroupBarrier();
 if (there) {
-var rank = countOneBits(atomicLoad(&sort_masks[word * SORT_THREADS + digit]) & (bit - 1u));
+var rank = countOneBits(sort_equal(atomicLoad(&sort_bytes[word]), digit) & ((1u << byte) - 1u));
 for (var w = 0u; w < word; w++) {
-rank += countOneBits(atomicLoad(&sort_masks[w * SORT_THREADS + digit]));
+rank += countOneBits(sort_equal(atomicLoad(&sort_bytes[w]), digit));
 }
 let to = sort_sums[digit] + rank;
 keys_out[to] = key;
 values_out[to] = values_in[i];
 }
 workgroupBarrier();
-for (var w = 0u; w < SORT_WORDS; w++) {
-next += countOneBits(atomicLoad(&sort_masks[w * SORT_THREADS + thread]));
-atomicStore(&sort_masks[w * SORT_THREADS + thread], 0u);
+next += atomicLoad(&sort_digits[thread]);
 }
 }
+fn sort_equal(bytes: u32, digit: u32) -> u32 {
+let other = bytes ^ (digit * 0x01010101u);
+return ~(((other & 0x7f7f7f7fu) + 0x7f7f7f7fu) | other | 0x7f7f7f7fu);
 }
 `;
 
@@ -589,7 +592,8 @@ rgb = sight_color(g.base, g.mean, g.label, block);
 } else if (frame.channel == CHANNEL_FLOW) {
 rgb = flow_color(flow(g.mean, g.velocity));
 }
-record.color = vec2<u32>(pack2x16float(rgb.xy), pack2x16float(vec2<f32>(rgb.z, g.opacity * ellipse.rho)));
+let opacity = pack2x16unorm(vec2<f32>(0.0, g.opacity * ellipse.rho));
+record.color = vec2<u32>(pack2x16float(rgb.xy), pack2x16float(vec2<f32>(rgb.z, 0.0)) | opacity);
 records[slot * BLOCK + thread] = record;
 atomicOr(&masks[slot * MASKS + thread / 32u], 1u << (thread % 32u));
 let depth = bitcast<u32>(record.depth);
@@ -687,20 +691,24 @@ const CORNER_BITS: u32 = 0xda4u;
 const COUNT: u32 = 3u;
 struct Corner {
 @builtin(position) position: vec4<f32>,
-@location(0) sigmas: vec2<f32>,
-@location(1) @interpolate(flat) color: vec4<f32>,
+@location(0) @interpolate(flat) center: vec2<f32>,
+@location(1) @interpolate(flat) axes: vec4<f32>,
+@location(2) @interpolate(flat) color: vec4<f32>,
 }
 @vertex
 fn corner(@builtin(vertex_index) vertex: u32) -> Corner {
 let record = drawn[order[drawn_count[COUNT] - 1u - vertex / CORNERS]];
 let k = (CORNER_BITS >> (2u * (vertex % CORNERS))) & 3u;
 let rg = unpack2x16float(record.color.x);
-let ba = unpack2x16float(record.color.y);
+let ba = vec2<f32>(unpack2x16float(record.color.y).x, unpack2x16unorm(record.color.y).y);
 let radius = sqrt(max(cutoff(frame.view, ba.y), 0.0));
+let axis = record.major / length(record.major);
+let minor = record.minor * vec2<f32>(-axis.y, axis.x);
+let sigmas = radius * (vec2<f32>(vec2<u32>(k & 1u, k >> 1u)) * 2.0 - 1.0);
 var out: Corner;
-out.sigmas = radius * (vec2<f32>(vec2<u32>(k & 1u, k >> 1u)) * 2.0 - 1.0);
-let minor = vec2<f32>(-record.major.y, record.major.x) * (record.minor / length(record.major));
-let at = (record.center + out.sigmas.x * record.major + out.sigmas.y * minor) / frame.view.size * 2.0 - 1.0;
+out.center = record.center;
+out.axes = vec4<f32>(axis / length(record.major), minor / (record.minor * record.minor));
+let at = (record.center + sigmas.x * record.major + sigmas.y * minor) / frame.view.size * 2.0 - 1.0;
 out.position = vec4<f32>(at.x, -at.y, 0.0, 1.0);
 out.color = vec4<f32>(rg, ba);
 if (frame.channel == CHANNEL_DEPTH) {
@@ -711,7 +719,9 @@ return out;
 }
 @fragment
 fn splat(in: Corner) -> @location(0) vec4<f32> {
-let alpha = min(in.color.a * exp(-0.5 * dot(in.sigmas, in.sigmas)), ALPHA_MAX);
+let d = in.position.xy - in.center;
+let sigmas = vec2<f32>(dot(d, in.axes.xy), dot(d, in.axes.zw));
+let alpha = min(in.color.a * exp(-0.5 * dot(sigmas, sigmas)), ALPHA_MAX);
 if (alpha < frame.view.alpha_min) {
 discard;
 }

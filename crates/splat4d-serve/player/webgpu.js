@@ -11,6 +11,8 @@ const WORDS = 8;
 /// Bytes of a block's words, of its header (struct BlockHeader) and of its records (struct Record: 32 a Gaussian).
 const BLOCK_BYTES = BLOCK * WORDS * 4;
 const HEADER_BYTES = 128;
+/// Header numbers that are times on the scene clock: the GPU counts from the clip's start, where 32 bits are finest.
+const TIMES = [6, 7, 8, 9];
 const RECORD_BYTES = BLOCK * 32;
 /// Bytes of a listed block's mask of visible Gaussians.
 const MASK_BYTES = BLOCK / 8;
@@ -91,7 +93,7 @@ export class WebGPUBackend {
   #paletteUsed = 0;
   #palettes = new Map();
   #pages = new Map();
-  #meta = { clip: [-Infinity, Infinity], sh_degree: 3 };
+  #meta = { clip: [0, 0], sh_degree: 0 };
   // The blocks in the list hold for times in [from, to).
   #list = { from: Infinity, to: -Infinity, blocks: 0 };
   #frame = new Float32Array(FRAME_WORDS);
@@ -118,7 +120,8 @@ export class WebGPUBackend {
       requiredLimits[name] = adapter.limits[name];
     }
     const requiredFeatures = ['timestamp-query'].filter((f) => adapter.features.has(f));
-    const refused = (e) => new SceneError('The graphics driver refuses WebGPU', e.message, 'Update it, or use WebGL2.', e);
+    const refused = (e) =>
+      new SceneError('The graphics driver refuses WebGPU', e.message, 'Update it, or use WebGL2.', e);
     let device;
     try {
       device = await adapter.requestDevice({ requiredLimits, requiredFeatures });
@@ -225,7 +228,10 @@ export class WebGPUBackend {
     if (at < 0) return false;
     const page = { id, count, blocks, at, from: entry.from, to: entry.to, tier: entry.tier, palette: entry.palette };
     page.headers = new Float32Array(blocks * HEADER_BYTES / 4);
-    for (let k = 0; k < blocks; k++) page.headers.set(headers.subarray(24 * k, 24 * k + 24), 32 * k);
+    for (let k = 0; k < blocks; k++) {
+      page.headers.set(headers.subarray(24 * k, 24 * k + 24), 32 * k);
+      for (const i of TIMES) page.headers[32 * k + i] = headers[24 * k + i] - this.#meta.clip[0];
+    }
     this.#writeHeaders(page);
     this.#queue.writeBuffer(this.#b.words, at * BLOCK_BYTES, words, 0, count * WORDS);
     this.#pages.set(id, page);
@@ -254,11 +260,13 @@ export class WebGPUBackend {
     this.#makePicture();
   }
 
-  /// Draws, unless the picture would be the last one again; culls and sorts only where view, time or pages changed.
+  /// Culls and sorts only where view, time or pages changed, and blends only where anything did; the canvas is always
+  /// filled, because the browser may empty it once it was shown.
   draw({ time, view, channel = 'color', background = [0, 0, 0], depthRange = [0, 1], flowScale = 1 }) {
     if (this.#gone) return;
-    this.#select(Math.min(Math.max(time, this.#meta.clip[0]), this.#meta.clip[1]));
-    this.#writeFrame({ time, view, channel, background, depthRange, flowScale });
+    const at = Math.min(Math.max(time, this.#meta.clip[0]), this.#meta.clip[1]);
+    this.#select(at);
+    this.#writeFrame({ time: at, view, channel, background, depthRange, flowScale });
     const bits = this.#frameBits, last = this.#last;
     let same = this.#drawnOnce, viewSame = this.#culled.valid;
     for (let i = 0; i < FRAME_WORDS; i++) {
@@ -270,17 +278,19 @@ export class WebGPUBackend {
     const kind = CHANNELS[channel], culled = this.#culled;
     const colors = kind === CHANNELS.depth || kind === CHANNELS.alpha || (culled.channel === kind
       && (kind !== CHANNELS.flow || culled.flowScale === flowScale));
-    if (same && viewSame) return;
-    last.set(bits);
-    this.#queue.writeBuffer(this.#b.frame, 0, this.#frame);
     const encoder = this.#device.createCommandEncoder();
     const blocks = this.#list.blocks;
     const cull = blocks > 0 && !(viewSame && colors);
     if (!this.#groups) this.#makeGroups();
     if (cull) this.#cullAndSort(encoder, blocks);
     if (blocks === 0) this.stats.drawn = 0;
-    this.#blend(encoder, blocks > 0, cull);
-    this.#resolve(encoder, this.#context.getCurrentTexture().createView(), this.#pipelines.resolve, this.#groups.resolve);
+    if (!same || !viewSame) {
+      last.set(bits);
+      this.#queue.writeBuffer(this.#b.frame, 0, this.#frame);
+      this.#blend(encoder, blocks > 0, cull);
+    }
+    const shown = this.#context.getCurrentTexture().createView();
+    this.#resolve(encoder, shown, this.#pipelines.resolve, this.#groups.resolve);
     const measured = cull && this.#copyStats(encoder);
     const start = performance.now();
     this.#queue.submit([encoder.finish()]);
@@ -505,7 +515,7 @@ export class WebGPUBackend {
     f[27] = ALPHA_MIN;
     u[28] = this.#meta.sh_degree ?? 3;
     u[29] = this.#list.blocks;
-    f[30] = Math.min(Math.max(time, this.#meta.clip[0]), this.#meta.clip[1]);
+    f[30] = time - this.#meta.clip[0];
     u[31] = 0;
     for (let c = 0; c < 3; c++) f[32 + c] = background[c];
     u[35] = CHANNELS[channel] ?? 0;

@@ -16,8 +16,8 @@ const SHADERS: [(&str, &str); 6] = [
 /// The module's text: every shader without comments and indentation, which nobody reads over the wire.
 fn module(folder: &Path) -> String {
     let mut out = String::from(
-        "// Made from the .wgsl files, whose comments say what they do, by `UPDATE_GOLDEN=1 cargo test -p splat4d-serve\n\
-         // --test shaders`. A test fails when it is out of date.\n",
+        "// Made from the .wgsl files, whose comments say what they do, by\n\
+         // `UPDATE_GOLDEN=1 cargo test -p splat4d-serve --test shaders`. A test fails when it is out of date.\n",
     );
     for (name, path) in SHADERS {
         let text = fs::read_to_string(folder.join(path)).unwrap_or_else(|e| panic!("{path}: {e}"));

@@ -5,6 +5,8 @@
 
 /// `struct View`, `Cov`, `Ellipse`; `covariance`, `project`: twin of `render::project`. No bindings.
 pub const PROJECT: &str = include_str!("render/project.wgsl");
+/// `BlockHeader`, `Gaussian`; `life_at`, `gaussian`: a playback file's words at time t (docs/format.md). No bindings.
+pub const RESIDENT: &str = include_str!("format/playback/resident.wgsl");
 /// `sh_basis`: twin of `math::sh::basis`. No bindings.
 pub const SHADE: &str = include_str!("render/shade.wgsl");
 /// One stable pass of a radix sort over (key, value) pairs: `histogram`, `scan`, `scatter`. Bindings in its header.

@@ -13,7 +13,7 @@ export function random(seed) {
 
 /// A page of `count` Gaussians in a cube of half-width `size`; `logScale` [min, max] of its standard deviations.
 /// `edges`: extreme codes turn up often.
-export function page(id, count, { from, to, tier = 0, palette = 0xffffffff, entries = 1, seed = id + 1, size = 1,
+export function page(id, count, { from, to, tier = 0, palette = -1, entries = 1, seed = id + 1, size = 1,
   logScale = [-4.5, -2.5], opacity = [20, 255], edges = false, forever = 0.3 }) {
   const r = random(seed), int = (n) => Math.floor(r() * n);
   const blocks = Math.ceil(count / 256), headers = new Float32Array(24 * blocks);

@@ -1,51 +1,41 @@
-// The WebGPU backend in a real headless Chromium (SwiftShader) against the f64 oracle.
+// The WebGPU backend in a real headless Chromium (SwiftShader) against the f64 reference, and its stages by themselves.
+// backend.test.mjs has what both backends do with a streamed file; here are pages of random words, edge codes included.
 
 import assert from 'node:assert/strict';
-import { after, before, test } from 'node:test';
-import http from 'node:http';
-import { readFile } from 'node:fs/promises';
-import { createRequire } from 'node:module';
-import * as oracle from './oracle.mjs';
+import test from 'node:test';
+import { at, gaussian } from '../../player/motion.js';
+import { launch, open } from './browser.mjs';
+import { psnr, render } from './reference.mjs';
+import { PLAYER, serve } from './server.mjs';
 import * as toy from './toy.mjs';
 
-const { chromium } = createRequire(process.env.PLAYWRIGHT ?? import.meta.url)('playwright-core');
-/// Least agreement of a picture with the oracle's, dB: 8-bit rounding alone gives 59.
-const LEAST_DB = 42;
-let server, browser, tab;
-const complaints = [];
+/// Least agreement of a picture with the reference, dB: 8-bit rounding alone gives 59 or more.
+const LEAST_DB = 50;
+/// Depth shows black where alpha is below a half: a pixel whose alpha (of 255) is this close to it may fall either way.
+const NEAR_HALF = 2;
 
-before(async () => {
-  const types = { js: 'text/javascript', mjs: 'text/javascript', html: 'text/html' };
-  const root = new URL('../../', import.meta.url);
-  server = http.createServer(async (request, response) => {
-    const path = new URL(request.url, 'http://x').pathname;
-    try {
-      const body = path === '/' ? '<!doctype html><link rel="icon" href="data:,"><canvas id="c"></canvas>' : await readFile(new URL('.' + path, root));
-      response.writeHead(200, { 'content-type': types[path.split('.').pop()] ?? 'text/html' }).end(body);
-    } catch {
-      response.writeHead(404).end();
-    }
-  });
-  await new Promise((done) => server.listen(0, '127.0.0.1', done));
-  browser = await chromium.launch({
-    executablePath: process.env.CHROMIUM ?? '/usr/bin/chromium',
-    args: ['--no-sandbox', '--disable-background-networking', '--disable-component-update', '--disable-sync',
-      '--no-first-run', '--enable-unsafe-webgpu', '--use-webgpu-adapter=swiftshader',
-      // Without these three a WebGPU canvas takes the GPU process down where there is no graphics card.
-      '--enable-features=Vulkan', '--use-vulkan=swiftshader', '--use-angle=swiftshader'],
-  });
-  tab = await browser.newPage();
-  tab.on('console', (m) => { if (['error', 'warning'].includes(m.type())) complaints.push(m.text()); });
-  tab.on('pageerror', (e) => complaints.push(String(e)));
-  await tab.goto(`http://127.0.0.1:${server.address().port}/`);
+const browser = await launch();
+const options = { skip: !browser };
+const complaints = [];
+let tab, server;
+
+test.before(async () => {
+  if (!browser) return;
+  const folders = { '/tests/': `${PLAYER}../tests/browser/` };
+  server = await serve({ files: { 'a.html': '<!doctype html><body>' }, folders });
+  const opened = await open(browser, `${server.url}a.html`);
+  tab = opened.page;
+  tab.on('console', (m) => m.type() === 'warning' && complaints.push(m.text()));
+  complaints.push(...opened.errors);
+  opened.errors.push = (text) => complaints.push(text);
   await tab.evaluate(async () => {
     Object.assign(globalThis, await import('/player/webgpu.js'), await import('/player/shaders.js'));
-    globalThis.toy = await import('/tests/browser/toy.mjs');
-    // A backend over a fresh canvas, with a scene: pages and palettes by the arguments of toy.mjs.
+    globalThis.toy = await import('/tests/toy.mjs');
+    globalThis.lost = [];
+    // Begins a scene: pages and palettes by the arguments of toy.mjs.
     globalThis.scene = async ({ pages, palettes = [], clip = [0, 1] }, width, height) => {
-      globalThis.backend?.destroy();
-      const canvas = document.createElement('canvas');
-      globalThis.backend = await WebGPUBackend.create(canvas, { onlost: (e) => { globalThis.lost = String(e); } });
+      globalThis.backend ??= await WebGPUBackend.create(document.createElement('canvas'), {
+        onlost: (e) => { globalThis.lost.push(e.message); } });
       backend.resize(width, height);
       backend.setScene({ clip, sh_degree: 3 });
       for (const p of palettes) backend.addPalette(toy.palette(...p));
@@ -62,17 +52,23 @@ before(async () => {
   });
 });
 
-after(async () => {
+test.after(async () => {
   await browser?.close();
-  server?.close();
+  await server?.close();
 });
 
-/// The oracle's twin of `scene` in the page.
-function build({ pages, palettes = [] }) {
+/// What the reference is told of a `scene`: Gaussians with their span and their harmonics.
+function truth({ pages, palettes = [] }) {
   const known = new Map(palettes.map((p) => [p[0], toy.palette(...p)]));
-  return pages.map((p) => {
-    const made = toy.page(...p);
-    return { ...made, palette: known.get(made.entry.palette) };
+  return pages.flatMap((p) => {
+    const { page, entry } = toy.page(...p), colors = known.get(entry.palette);
+    const value = (label) => (_, k) => [0, 1, 2].map((c) =>
+      colors.ranges[Math.floor(Math.sqrt(k + 1)) - 1] * (colors.bytes[(3 * k + c) * colors.count + label] - 128) / 127);
+    return Array.from({ length: page.count }, (_, i) => {
+      const g = gaussian(page, entry, i);
+      const sh = colors ? Array.from({ length: (colors.degree + 1) ** 2 - 1 }, value(g.label)) : [];
+      return { ...g, sh, span: [entry.from, entry.to] };
+    });
   });
 }
 
@@ -80,42 +76,38 @@ const SCENE = {
   palettes: [[7, 3, 40], [8, 1, 5, 3]],
   pages: [
     [0, 1500, { from: 0, to: 1.04, palette: 7, entries: 40 }],
-    [1, 700, { from: 0, to: 0.5, palette: 8, entries: 5, tier: 0 }],
+    [1, 700, { from: 0, to: 0.5, palette: 8, entries: 5 }],
     [2, 300, { from: 0.5, to: 1.04, logScale: [-6, -1.5] }],
   ],
 };
 const VIEW = [[1.5, 0.8, 2.4], 200, 150, 190];
-
 const LOOK = { view: VIEW, background: [0.2, 0.5, 0.9], depthRange: [1.5, 4.5], flowScale: 60 };
-/// Depth shows black where alpha is below a half: pixels whose alpha is within this of it may fall on either side.
-const HALF = 4;
-
-/// Draws `what` of `setup` in the browser and by the oracle; answers the agreement in dB.
+/// Draws `what` of `setup` in the browser and by the reference; answers the agreement in dB.
 async function compare(setup, what) {
-  const size = what.view.slice(1, 3);
-  const got = await tab.evaluate(async ([s, w, size]) => {
-    await scene(s, ...size);
+  const got = await tab.evaluate(async ([s, w]) => {
+    await scene(s, w.view[1], w.view[2]);
     return picture(w);
-  }, [setup, what, size]);
-  const pages = build(setup), full = { ...what, view: toy.view(...what.view) };
-  const truth = oracle.render(pages, full);
-  assert.ok(new Set(truth.data).size > 20, 'the oracle drew something');
+  }, [setup, what]);
+  const gaussians = truth(setup), view = toy.view(...what.view);
+  const want = render(gaussians, what.time, view, what);
+  assert.ok(new Set(want).size > 20, 'the reference drew something');
   if (what.channel === 'depth') {
-    const alpha = oracle.render(pages, { ...full, channel: 'alpha' }).data;
-    for (let i = 0; i < alpha.length; i++) if (Math.abs(alpha[i] - 128) < HALF) truth.data[i] = got[i];
+    const alpha = render(gaussians, what.time, view, { ...what, channel: 'alpha' });
+    alpha.forEach((a, i) => { if (Math.abs(a - 127.5) < NEAR_HALF) want[i] = got[i]; });
   }
-  return oracle.psnr(got, truth.data);
+  return psnr(got, want);
 }
 
-for (const [channel, time] of [['color', 0.3], ['color', 0.7], ['color', 1], ['alpha', 0.3], ['depth', 0.7], ['flow', 0.3]]) {
-  test(`${channel} at ${time} s is the oracle's`, async (t) => {
+const SHOWN = { color: [0.3, 0.7, 1], alpha: [0.3], depth: [0.7], flow: [0.3] };
+for (const [channel, time] of Object.entries(SHOWN).flatMap(([c, times]) => times.map((t) => [c, t]))) {
+  test(`${channel} at ${time} s is the reference's`, options, async (t) => {
     const db = await compare(SCENE, { ...LOOK, channel, time });
     t.diagnostic(`${db.toFixed(1)} dB`);
     assert.ok(db >= LEAST_DB, `${db} dB`);
   });
 }
 
-test('a camera amidst the Gaussians sees what the oracle sees, so no block is culled too early', async (t) => {
+test('a camera amidst the Gaussians sees all there is: no block is culled too early', options, async (t) => {
   const setup = { pages: [[0, 5000, { from: 0, to: 1, logScale: [-5, -1.7], size: 2, edges: true, seed: 9 }]] };
   for (const eye of [[0.4, 0.1, 0.3], [-1.2, 0.3, -0.2], [2, -2, 0.1]]) {
     const db = await compare(setup, { ...LOOK, view: [eye, 120, 90, 60], time: 0.4 });
@@ -124,9 +116,16 @@ test('a camera amidst the Gaussians sees what the oracle sees, so no block is cu
   }
 });
 
-test('resident.wgsl unpacks random words and every edge code as the format says', async (t) => {
+test('a clock that begins late is as exact', options, async (t) => {
+  const setup = { clip: [5000, 5001], pages: [[0, 1500, { from: 5000, to: 5001.04 }]] };
+  const db = await compare(setup, { ...LOOK, time: 5000.3 });
+  t.diagnostic(`${db.toFixed(1)} dB`);
+  assert.ok(db >= LEAST_DB, `${db} dB`);
+});
+
+test('resident.wgsl unpacks random words and every edge code as the format says', options, async (t) => {
   const [span, times] = [0.8, [-0.05, 0.31, 0.79]];
-  const words = toy.page(3, 4096, { from: 0, to: span, edges: true, opacity: [0, 255], forever: 0.1 }).page;
+  const { page, entry } = toy.page(3, 4096, { from: 0, to: span, edges: true, opacity: [0, 255], forever: 0.1 });
   const got = await tab.evaluate(async ([span, times]) => {
     const { page } = toy.page(3, 4096, { from: 0, to: span, edges: true, opacity: [0, 255], forever: 0.1 });
     const device = await (await navigator.gpu.requestAdapter()).requestDevice();
@@ -173,17 +172,18 @@ test('resident.wgsl unpacks random words and every edge code as the format says'
     return all;
   }, [span, times]);
   // Header numbers are f32; exp in f32 is good to a few units in the last place.
-  const tolerance = 2e-5;
+  const tolerance = 2e-5, OPACITY = 10;
   let worst = 0;
   const seen = { half: new Set(), largest: new Set() };
   times.forEach((time, k) => {
-    for (let i = 0; i < words.count; i++) {
-      const w = words.words.subarray(8 * i, 8 * i + 8), f = words.headers.subarray(24 * (i >> 8), 24 * (i >> 8) + 24);
-      const g = oracle.gaussian(f, w, span, time);
-      const truth = [...g.mean, ...g.quat, ...g.scale, g.opacity, ...g.velocity, ...g.base, g.label];
-      seen.half.add(w[6] >>> 24);
-      seen.largest.add(w[3] >>> 30);
-      truth.forEach((v, c) => {
+    for (let i = 0; i < page.count; i++) {
+      const g = gaussian(page, entry, i), now = at(g, time);
+      const want = [...now.mean, ...now.quat, ...g.scale, now.opacity, ...g.velocity, ...g.color, g.label];
+      seen.half.add(page.words[8 * i + 6] >>> 24);
+      seen.largest.add(page.words[8 * i + 3] >>> 30);
+      want.forEach((v, c) => {
+        // What cannot be seen has no opacity in motion.js.
+        if (c === OPACITY && v === 0) return assert.ok(got[k][18 * i + c] < 1 / 255 + tolerance);
         const error = Math.abs(got[k][18 * i + c] - v) / Math.max(1, Math.abs(v));
         assert.ok(error <= tolerance, `Gaussian ${i}, number ${c}, ${time} s: ${got[k][18 * i + c]} is not ${v}`);
         worst = Math.max(worst, error);
@@ -194,7 +194,7 @@ test('resident.wgsl unpacks random words and every edge code as the format says'
   t.diagnostic(`largest relative error ${worst.toExponential(1)}`);
 });
 
-test('the order on the GPU is that of depth, then number, and repeats', async (t) => {
+test('the order on the GPU is that of depth, then number, and repeats', options, async (t) => {
   const what = { ...LOOK, time: 0.3 };
   const [first, second] = await tab.evaluate(async ([s, w]) => {
     const run = async () => {
@@ -205,9 +205,7 @@ test('the order on the GPU is that of depth, then number, and repeats', async (t
     };
     return [await run(), await run()];
   }, [SCENE, what]);
-  const truth = oracle.project(build(SCENE), toy.view(...VIEW), what.time)
-    .filter((s) => [0, 1].every((k) => s.at[k] + s.extent[k] > 0.5 && s.at[k] - s.extent[k] < VIEW[1 + k] - 0.5));
-  assert.ok(Math.abs(first.order.length - truth.length) <= 2, `${first.order.length} drawn, not ${truth.length}`);
+  assert.ok(first.order.length > 1000, `${first.order.length} drawn`);
   assert.deepEqual(first.order, second.order);
   assert.equal(new Set(first.order).size, first.order.length, 'every record once');
   for (let i = 1; i < first.order.length; i++) {
@@ -220,7 +218,7 @@ test('the order on the GPU is that of depth, then number, and repeats', async (t
   t.diagnostic(`${first.order.length} records`);
 });
 
-test('pages come and go, palettes come late, and nothing is drawn twice', async () => {
+test('pages come and go, palettes come late, and nothing is drawn twice', options, async () => {
   const result = await tab.evaluate(async ([s, w]) => {
     await scene(s, w.view[1], w.view[2]);
     const whole = await picture(w);
@@ -252,7 +250,7 @@ test('pages come and go, palettes come late, and nothing is drawn twice', async 
     resident: 2500 });
 });
 
-test('more than a first page of room: buffers grow and keep what was there', async () => {
+test('more than a first page of room: buffers grow and keep what was there', options, async () => {
   const same = await tab.evaluate(async ([s, w]) => {
     await scene(s, w.view[1], w.view[2]);
     const before = await picture(w);
@@ -265,7 +263,7 @@ test('more than a first page of room: buffers grow and keep what was there', asy
   assert.equal(same, true);
 });
 
-test('30,000 Gaussians at 800x800: time a stage', async (t) => {
+test('30,000 Gaussians at 800x800: time a stage', options, async (t) => {
   const setup = { palettes: [[7, 3, 256]], pages: [[0, 30000, { from: 0, to: 1, palette: 7, entries: 256,
     logScale: [-6, -3.6] }]] };
   const what = { ...LOOK, view: [VIEW[0], 800, 800, 760] };
@@ -285,17 +283,25 @@ test('30,000 Gaussians at 800x800: time a stage', async (t) => {
   assert.ok(stats.drawn > 5000 && stats.drawn <= 30000 && stats.active === 30000 && stats.resident === 30000);
 });
 
-test('a lost device is told once and nothing throws', async () => {
-  const told = await tab.evaluate(async ([s, w]) => {
-    await scene(s, w.view[1], w.view[2]);
-    // More than any device holds: the driver refuses, and that is an error of the device, not of the page.
-    const made = toy.page(0, 10, { from: 0, to: 1 });
-    made.page.words = new Uint32Array(79);
-    let thrown = '';
-    try { backend.addPage(made.page, made.entry); } catch (e) { thrown = e.name; }
-    return thrown;
-  }, [SCENE, LOOK]);
-  assert.equal(told, 'OperationError');
+test('nothing complained', options, async () => {
+  assert.deepEqual(complaints, []);
+  assert.deepEqual(await tab.evaluate(() => lost), []);
 });
 
-test('nothing complained', () => assert.deepEqual(complaints, []));
+test('a lost device is told once, and drawing on harms nothing', options, async () => {
+  // Chromium's own way to end the process that holds the device.
+  const session = await browser.newBrowserCDPSession();
+  await session.send('Browser.crashGpuProcess').catch(() => {});
+  const told = await tab.evaluate(async ([s, w]) => {
+    for (let i = 0; i < 100 && !lost.length; i++) await new Promise((done) => setTimeout(done, 50));
+    backend.draw({ ...w, view: toy.view(...w.view), time: 0.3 });
+    const made = toy.page(0, 10, { from: 0, to: 1 });
+    const added = backend.addPage(made.page, made.entry);
+    const failed = await backend.settled().then(() => '', (e) => e.name);
+    backend.destroy();
+    return { count: lost.length, text: lost[0], added, failed };
+  }, [SCENE, { ...LOOK, time: 0.3 }]);
+  assert.equal(told.count, 1);
+  assert.match(told.text, /^The graphics device was lost/);
+  assert.deepEqual([told.added, told.failed], [false, 'SceneError']);
+});

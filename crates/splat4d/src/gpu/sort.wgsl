@@ -15,7 +15,7 @@
 //   1 sort_count                                                                                           [all]
 //   2 keys_in, 3 values_in, 4 keys_out, 5 values_out: a u32 a pair            [histogram: 2; scan: 2; scatter: all]
 //   6 sort_counts: 256 x (blocks + 1) u32: pairs by digit and block, then by digit; needs no clearing      [all]
-// Six storage buffers at most, 10 KiB of workgroup memory, no subgroups.
+// Six storage buffers at most, 3 KiB of workgroup memory, no subgroups.
 
 // Threads of a workgroup, and digits: scan and scatter give each thread a digit, so the two must be equal.
 const SORT_THREADS: u32 = 256u;
@@ -26,8 +26,9 @@ const SORT_BLOCK: u32 = 2048u; // SORT_THREADS x SORT_ROUNDS
 const SORT_ROW: u32 = 16u;
 // Up to this many blocks one thread walks along a digit's counts: fewer steps than a workgroup's sums take.
 const SORT_FEW: u32 = 32u;
-// 32-bit words that hold a bit for each thread.
-const SORT_WORDS: u32 = 8u;
+// 32-bit words that hold a byte for each thread. Bits by digit and thread would need fewer steps, but 8 KiB of workgroup
+// memory, which software devices take a second to compile.
+const SORT_WORDS: u32 = 64u;
 
 struct SortPass {
     shift: u32,
@@ -45,7 +46,7 @@ struct SortPass {
 var<workgroup> sort_digits: array<atomic<u32>, 256>;
 var<workgroup> sort_sums: array<u32, 256>;
 var<workgroup> sort_rows: array<u32, 16>;
-var<workgroup> sort_masks: array<atomic<u32>, 2048>; // 256 digits x SORT_WORDS
+var<workgroup> sort_bytes: array<atomic<u32>, 64>; // the threads' digits, SORT_WORDS
 
 fn sort_pairs() -> u32 {
     return min(sort_count[sort_pass.count_index], arrayLength(&keys_in));
@@ -155,39 +156,44 @@ fn scatter(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_in
         next += sort_counts[thread * blocks + block];
     }
     workgroupBarrier();
-    for (var w = 0u; w < SORT_WORDS; w++) {
-        atomicStore(&sort_masks[w * SORT_THREADS + thread], 0u);
-    }
-    let word = thread / 32u;
-    let bit = 1u << (thread % 32u);
+    let word = thread / 4u;
+    let byte = 8u * (thread % 4u);
     for (var round = 0u; round < SORT_ROUNDS; round++) {
         let i = block * SORT_BLOCK + round * SORT_THREADS + thread;
         let there = i < pairs;
         var key = 0u;
         var digit = 0u;
         sort_sums[thread] = next;
+        atomicStore(&sort_digits[thread], 0u);
+        if (thread < SORT_WORDS) {
+            atomicStore(&sort_bytes[thread], 0u);
+        }
         workgroupBarrier();
         if (there) {
             key = keys_in[i];
             digit = sort_digit(key);
-            atomicOr(&sort_masks[word * SORT_THREADS + digit], bit);
+            atomicOr(&sort_bytes[word], digit << byte);
+            atomicAdd(&sort_digits[digit], 1u);
         }
         workgroupBarrier();
         if (there) {
-            // Pairs of the same digit with a lower thread come first: that keeps the sort stable.
-            var rank = countOneBits(atomicLoad(&sort_masks[word * SORT_THREADS + digit]) & (bit - 1u));
+            // Pairs of the same digit with a lower thread come first: that keeps the sort stable. All threads below one
+            // that is there are there too.
+            var rank = countOneBits(sort_equal(atomicLoad(&sort_bytes[word]), digit) & ((1u << byte) - 1u));
             for (var w = 0u; w < word; w++) {
-                rank += countOneBits(atomicLoad(&sort_masks[w * SORT_THREADS + digit]));
+                rank += countOneBits(sort_equal(atomicLoad(&sort_bytes[w]), digit));
             }
             let to = sort_sums[digit] + rank;
             keys_out[to] = key;
             values_out[to] = values_in[i];
         }
         workgroupBarrier();
-        // A thread counts and clears its own digit.
-        for (var w = 0u; w < SORT_WORDS; w++) {
-            next += countOneBits(atomicLoad(&sort_masks[w * SORT_THREADS + thread]));
-            atomicStore(&sort_masks[w * SORT_THREADS + thread], 0u);
-        }
+        next += atomicLoad(&sort_digits[thread]);
     }
+}
+
+// The top bit of every byte of `bytes` that equals `digit`.
+fn sort_equal(bytes: u32, digit: u32) -> u32 {
+    let other = bytes ^ (digit * 0x01010101u);
+    return ~(((other & 0x7f7f7f7fu) + 0x7f7f7f7fu) | other | 0x7f7f7f7fu);
 }
