@@ -4,6 +4,8 @@ import { DEGREE, FOV_RANGE, add, clamp, dot, quatAbout, quatMul } from './camera
 
 /** A drag across the window's shorter side turns half a circle. */
 const TURN_PER_SIDE = Math.PI;
+/** A pinch on a touch pad comes as a wheel with ctrl and small steps. */
+const PINCH = 5;
 /** Nearest to straight up or down, radians: beyond it left and right would change sides. */
 const POLE = 89 * DEGREE;
 /** One wheel notch (100 px) is a step of about 15 %. */
@@ -86,7 +88,7 @@ export class Controls {
   #wheel(e) {
     if (!this.wheelWanted(e)) return;
     e.preventDefault();
-    const step = e.deltaY * (e.deltaMode ? LINE : 1);
+    const step = e.deltaY * (e.deltaMode ? LINE : 1) * (e.ctrlKey ? PINCH : 1);
     if (e.altKey) {
       this.host.loosen();
       this.host.camera.fov = clamp(this.host.camera.fov * Math.exp(step * WHEEL_RATE / 2), ...FOV_RANGE);

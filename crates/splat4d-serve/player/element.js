@@ -3,9 +3,7 @@
 import { CHANNELS, Player } from './player.js';
 import { CSS } from './style.js';
 import { Interface } from './ui.js';
-import { Training } from './live.js';
 import { h } from './dom.js';
-import { enter, offered } from './xr.js';
 import { readLink, vector } from './camera.js';
 
 const OBSERVED = ['src', 'controls', 'time', 'speed', 'loop', 'backend', 'channel', 'background', 'camera', 'poster',
@@ -57,9 +55,14 @@ export class Splat4D extends HTMLElement {
       ui.setTitle(this.getAttribute('heading') ?? player.meta.title ?? this.#scene?.name);
     });
     for (const name of OBSERVED) if (name !== 'src') this.#apply(name, this.getAttribute(name));
-    this.#ui.xr = () => enter(player).catch(error => this.#ui.toast(error.message));
-    offered().then(yes => { if (this.#ui) { this.#ui.xrTool.hidden = !yes; } });
-    if (this.hasAttribute('page')) addEventListener('hashchange', this.#hash);
+    // What few pages need is fetched when it is needed.
+    ui.xr = () => import('./xr.js').then(m => m.enter(player)).catch(error => ui.toast(error.message));
+    navigator.xr?.isSessionSupported('immersive-vr').then(yes => { ui.xrTool.hidden = !yes; }, () => {});
+    if (this.hasAttribute('page')) {
+      addEventListener('hashchange', this.#hash);
+      // While the page still asks what to show. A failure is told when there is a scene to be drawn.
+      player.prepare().catch(() => {});
+    }
     this.#load();
   }
 
@@ -114,10 +117,7 @@ export class Splat4D extends HTMLElement {
     const p = this.#player, ui = this.#ui;
     const src = this.getAttribute('src');
     const source = this.#scene ?? (src ? new URL(src, document.baseURI).href : null);
-    if (!source) {
-      if (this.hasAttribute('page') && !this.#training) ui.showEmpty();
-      return;
-    }
+    if (!source) return;
     const poster = this.getAttribute('poster');
     if (poster) ui.setPoster(new URL(poster, document.baseURI).href);
     await p.load(source, { start: this.#start() });
@@ -168,8 +168,12 @@ export class Splat4D extends HTMLElement {
   /** The deep link's part behind '#'. */
   get link() { return this.#player?.link(); }
 
+  /** Asks for a file, where there is nothing to show. */
+  invite() { this.#ui.showEmpty(); }
+
   /** Follows a training run: {events, src, metrics} addresses; `version` of the scene that is there already. */
-  follow(run) {
+  async follow(run) {
+    const { Training } = await import('./live.js');
     this.#training?.close();
     this.#training = new Training(this.#ui, { ...run,
       reload: address => this.#player?.load(address, { keep: true, start: this.#start() }) });

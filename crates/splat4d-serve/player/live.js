@@ -73,6 +73,8 @@ export class Training {
 
   constructor(ui, { events, src, metrics, version, reload }) {
     this.ui = ui;
+    // Pages of a version that was replaced fail on the way, and the next version follows at once.
+    ui.quiet = true;
     this.dot = h('i', { class: 'dot' });
     this.state = h('span', {}, 'Connecting');
     this.left = h('small');

@@ -14,17 +14,18 @@ async function config() {
   } catch { return {}; }
 }
 
-const { scene, src = scene, title, live, metrics, version, autoplay = true } = await config();
 const element = document.createElement('splat-4d');
 element.setAttribute('page', '');
+document.body.append(element);
+const { scene, src = scene, title, live, metrics, version, autoplay = true } = await config();
 if (autoplay && !matchMedia('(prefers-reduced-motion: reduce)').matches) element.setAttribute('autoplay', '');
 if (title) {
   element.setAttribute('heading', title);
   document.title = `${title} · splat4d`;
 }
-if (typeof src === 'string' && !live) element.setAttribute('src', src);
-document.body.append(element);
-if (src instanceof Blob) element.scene = src;
 if (live) {
+  // A run that has just begun has no snapshot; the first one is announced.
   element.follow({ events: live === true ? './events' : live, src: src ?? './scene.splat4d', metrics, version });
-}
+} else if (src instanceof Blob) element.scene = src;
+else if (src) element.setAttribute('src', src);
+else element.invite();

@@ -143,7 +143,7 @@ export function figuresCard(player) {
   node.refresh = () => {
     const s = player.statistics;
     const rows = [
-      ['Frames/s', s.fps ? s.fps.toFixed(0) : '–'],
+      ['Frames/s', s.atRest ? 'at rest' : s.fps ? s.fps.toFixed(0) : '–'],
       ['Frame', s.frameMs ? `${s.frameMs.toFixed(1)} ms` : '–'],
       ['Sorting', s.sortMs ? `${s.sortMs.toFixed(1)} ms` : '–'],
       ['Picture', `${s.width} × ${s.height}`], ['Scale', `${Math.round(100 * s.scale)} %`],

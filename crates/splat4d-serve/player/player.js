@@ -15,6 +15,8 @@ const KEEP_FPS = 30;
 const SPARE_FPS = 48;
 /** Smallest automatic scale: a quarter of the pixels a side is still legible. */
 const SCALE_MIN = 0.25;
+/** Where pictures are drawn without a GPU, the first one should not take seconds either. */
+const SCALE_SOFTWARE = 0.5;
 /** Milliseconds between two changes of scale, and how long a scale that was too slow is not tried again. */
 const ADAPT_EVERY = 500;
 const ADAPT_MEMORY = 8000;
@@ -28,9 +30,8 @@ const HOLD = 1500;
 const GLIDE = 0.5;
 /** Longest step of the clock, s: a tab that slept goes on where it was. */
 const STEP_MAX = 0.25;
-/** A still picture is refined to full resolution after this rest, ms, if one drawing takes less than `REFINE_MAX`. */
-const REST = 300;
-const REFINE_MAX = 400;
+/** A still picture is refined twice: after a rest, ms, as far as one drawing is expected to take at most so long, ms. */
+const REFINE = [[300, 400], [1500, 4000]];
 /** A move of half the picture's height in a second shows at full strength in the flow view. */
 const FLOW_SHARE = 0.5;
 /** A device that is lost more often than this within a minute is given up. */
@@ -69,7 +70,10 @@ export class Player extends EventTarget {
   #run = 0;
   #abort = null;
   #dirty = true;
-  #refined = false;
+  /** How often the still picture was refined. */
+  #refined = 0;
+  #dirtyAt = 0;
+  #paintedScale = 0;
   #drawnAt = 0;
   #last = 0;
   #glide = null;
@@ -80,6 +84,7 @@ export class Player extends EventTarget {
   #frame = 0;
   #told = { time: null };
   #xr = false;
+  #starting = null;
   #still = null;
 
   constructor(stage) {
@@ -97,6 +102,9 @@ export class Player extends EventTarget {
     this.resizes.observe(stage);
     this.sight = new IntersectionObserver(list => { this.#seen = list.at(-1).isIntersecting; this.redraw(); });
     this.sight.observe(stage);
+    // Frames that a hidden tab left out were not slow.
+    this.sleeps = () => { this.#interval = 0; };
+    document.addEventListener('visibilitychange', this.sleeps);
     const loop = now => { this.#frame = requestAnimationFrame(loop); this.#tick(now); };
     this.#frame = requestAnimationFrame(loop);
   }
@@ -116,7 +124,7 @@ export class Player extends EventTarget {
   }
   get scale() { return this.resolution === 'auto' ? this.#scale : this.resolution; }
 
-  redraw() { this.#dirty = true; this.#refined = false; }
+  redraw() { this.#dirty = true; }
 
   // Loading.
 
@@ -132,7 +140,7 @@ export class Player extends EventTarget {
     try {
       [file] = await Promise.all([
         SceneFile.open(source, { signal: this.#abort.signal }),
-        this.backend ? null : this.#makeBackend(),
+        this.prepare(),
       ]);
       if (run !== this.#run) return file.close();
       this.#adopt(file, { keep, start });
@@ -141,7 +149,10 @@ export class Player extends EventTarget {
       await this.#firstPicture(run, began, keep);
       if (run === this.#run) this.emit('load', { meta: file.meta, milliseconds: this.figures.firstFrame });
     } catch (error) {
-      if (run === this.#run && error.name !== 'AbortError') this.fail(error, source);
+      if (run !== this.#run || error.name === 'AbortError') return;
+      // A new version that cannot be had leaves the old one where it is.
+      if (keep && this.state === 'ready') this.emit('trouble', { error });
+      else this.fail(error, source);
     }
   }
 
@@ -173,7 +184,7 @@ export class Player extends EventTarget {
   #freeze() {
     if (!this.#stream || !this.canvas.width) return;
     // A canvas can be copied only in the task that drew it.
-    this.#paint(performance.now(), this.scale);
+    this.#paint(this.scale);
     this.#still?.remove();
     const still = this.#still = document.createElement('canvas');
     [still.width, still.height] = [this.canvas.width, this.canvas.height];
@@ -252,6 +263,14 @@ export class Player extends EventTarget {
     this.#told.size = null;
   }
 
+  /** Starts the backend, which may be done ahead of the scene. */
+  prepare() {
+    return this.#starting ??= this.#makeBackend().catch(error => {
+      this.#starting = null;
+      throw error;
+    });
+  }
+
   /** WebGPU where there is one, else WebGL2; a canvas that one of them has touched is of no use to the other. */
   async #makeBackend() {
     const wanted = this.backendName === 'auto' ? ['webgpu', 'webgl2'] : [this.backendName];
@@ -267,6 +286,7 @@ export class Player extends EventTarget {
           this.backend = await (await import('./webgpu.js')).WebGPUBackend.create(this.canvas, { onlost });
         } else this.backend = await (await import('./webgl2.js')).WebGL2Backend.create(this.canvas, { onlost });
         this.figures.fallback = reasons.join('; ');
+        if (software(this.backend.gl)) this.#scale = SCALE_SOFTWARE;
         return this.emit('backend', { name });
       } catch (error) {
         reasons.push(`${name === 'webgpu' ? 'WebGPU' : 'WebGL2'}: ${error.what ?? error.message}`);
@@ -286,6 +306,7 @@ export class Player extends EventTarget {
 
   async #lost(reason) {
     const now = performance.now();
+    this.figures.lost = reason?.message ?? String(reason);
     this.#losses = this.#losses.filter(t => now - t < 60000).concat(now);
     if (this.#losses.length > LOSSES) {
       return this.fail(new SceneError('The graphics device was lost again and again', reason?.message ?? 'GPU',
@@ -298,11 +319,11 @@ export class Player extends EventTarget {
     this.#stream?.destroy();
     this.#stream = null;
     const old = this.backend;
-    this.backend = null;
+    this.backend = this.#starting = null;
     try { old?.destroy(); } catch { /* A lost device may refuse; it is gone anyway. */ }
     this.#newCanvas();
     try {
-      await this.#makeBackend();
+      await this.prepare();
       if (this.file) this.#attach();
     } catch (error) { this.fail(error); }
     this.redraw();
@@ -478,20 +499,27 @@ export class Player extends EventTarget {
       this.#held = 0;
       this.redraw();
     }
-    const resting = now - this.#drawnAt > REST && !this.playing && !this.film && !this.controls.busy;
-    if (!this.#dirty && resting && !this.#refined && this.scale < 1 && this.resolution === 'auto') {
-      const pixels = 1 / this.#scale ** 2;
-      this.#refined = true;
-      if (this.figures.frameMs * pixels < REFINE_MAX) this.#paint(now, 1);
-      return;
-    }
+    if (!this.#dirty) this.#refine(now);
     if (!this.#dirty || !this.#seen) { this.#interval = 0; return; }
     this.#dirty = false;
+    this.#dirtyAt = now;
+    this.#refined = 0;
     this.#measure(now);
-    this.#paint(now, this.scale);
+    this.#paint(this.scale);
   }
 
-  #paint(now, scale) {
+  /** What stands still is shown better than what moves. */
+  #refine(now) {
+    const [rest, budget] = REFINE[this.#refined] ?? [Infinity];
+    const moving = this.playing || this.film || this.controls.busy;
+    if (this.resolution !== 'auto' || moving || now - this.#dirtyAt < rest || !this.#seen) return;
+    this.#refined++;
+    const scale = Math.min(1, this.#scale * Math.sqrt(budget / (this.figures.frameMs || 1)));
+    if (scale > this.#paintedScale) this.#paint(scale);
+  }
+
+  #paint(scale) {
+    this.#paintedScale = scale;
     const ratio = Math.min(devicePixelRatio || 1, RATIO_MAX) * scale;
     const { clientWidth, clientHeight } = this.stage;
     if (!clientWidth || !clientHeight) return;
@@ -520,7 +548,7 @@ export class Player extends EventTarget {
     const ms = now - this.#interval;
     const first = !this.#interval;
     this.#interval = now;
-    if (first || ms > 2000) return;
+    if (first || this.state !== 'ready') return;
     const f = this.figures;
     f.frameMs = f.frameMs ? f.frameMs + 0.1 * (ms - f.frameMs) : ms;
     f.fps = 1000 / f.frameMs;
@@ -528,7 +556,7 @@ export class Player extends EventTarget {
     this.#adapted = now;
     if (f.fps < KEEP_FPS * 0.95 && this.#scale > SCALE_MIN) {
       this.#slow = { scale: this.#scale, at: now };
-      this.#scale = Math.max(SCALE_MIN, this.#scale * clamp(Math.sqrt(f.fps / KEEP_FPS), 0.6, 0.95));
+      this.#scale = Math.max(SCALE_MIN, this.#scale * clamp(Math.sqrt(f.fps / KEEP_FPS), 0.35, 0.95));
       f.frameMs = 0;
     } else if (f.fps > SPARE_FPS && this.#scale < 1) {
       const up = Math.min(1, this.#scale * 1.15);
@@ -569,7 +597,7 @@ export class Player extends EventTarget {
   /** A PNG of the picture, as shown but always at full resolution. */
   async screenshot() {
     if (!this.file || !this.backend) throw new SceneError('There is no picture yet', 'screenshot', 'Wait for the scene.');
-    this.#paint(performance.now(), 1);
+    this.#paint(1);
     await this.backend.settled();
     const { width, height, data } = await this.backend.readPixels();
     const canvas = new OffscreenCanvas(width, height);
@@ -589,7 +617,7 @@ export class Player extends EventTarget {
 
   get statistics() {
     const { width, height } = this.canvas;
-    return { ...this.figures, ...this.backend?.stats, backend: this.backend?.name ?? null, width, height,
+    return { ...this.figures, atRest: performance.now() - this.#dirtyAt > 1000, ...this.backend?.stats, backend: this.backend?.name ?? null, width, height,
       scale: this.scale, gaussians: this.meta?.gaussians ?? 0, ready: this.ready(this.time),
       bytesRead: this.file?.bytesRead ?? 0, bytesTotal: this.file?.bytesTotal ?? 0 };
   }
@@ -605,6 +633,7 @@ export class Player extends EventTarget {
     cancelAnimationFrame(this.#frame);
     this.#run++;
     this.#abort?.abort();
+    document.removeEventListener('visibilitychange', this.sleeps);
     this.resizes.disconnect();
     this.sight.disconnect();
     this.#stream?.destroy();
@@ -612,4 +641,10 @@ export class Player extends EventTarget {
     this.file?.close();
     this.file = null;
   }
+}
+
+/** Whether WebGL says that it is computed on the CPU. */
+function software(gl) {
+  const asked = gl?.getExtension?.('WEBGL_debug_renderer_info');
+  return !!asked && /swiftshader|llvmpipe|software|basic render/i.test(gl.getParameter(asked.UNMASKED_RENDERER_WEBGL));
 }

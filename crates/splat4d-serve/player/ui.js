@@ -123,7 +123,7 @@ export class Interface {
     on('waiting', () => this.#progress());
     on('statechange', () => this.#stateChanged());
     on('error', e => this.#error(e.detail.error));
-    on('trouble', e => this.toast(e.detail.error.what ?? e.detail.error.message, 3 * TOAST));
+    on('trouble', e => this.quiet || this.toast(e.detail.error.what ?? e.detail.error.message, 3 * TOAST));
     on('poster', e => this.setPoster(e.detail.blob));
     on('viewed', e => { this.toast(`Camera ${e.detail.number + 1} · ${e.detail.name ?? ''}`); this.refresh(); });
     on('camerachange', () => { if (p.viewed == null) this.panels.cameras.refresh(); });

@@ -7,10 +7,6 @@ import { add, bounds, quatMul, quatNormal, quatRows, quatTurn } from './camera.j
 /** A scene that states no unit is shown this large, metres from its middle: a dolls' house on a table. */
 const TABLE_RADIUS = 0.6;
 
-export async function offered() {
-  try { return !!(await navigator.xr?.isSessionSupported('immersive-vr')); } catch { return false; }
-}
-
 /** WebXR's axes (x right, y up, z back) are ours turned half about x. */
 const FLIP = [0, 1, 0, 0];
 
