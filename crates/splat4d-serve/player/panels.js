@@ -41,7 +41,8 @@ export function viewPanel(ui) {
     player.redraw();
   });
   const theme = segments('Theme', [['auto', 'Auto'], ['light', 'Light'], ['dark', 'Dark']], t => ui.setTheme(t));
-  const figures = h('input', { type: 'checkbox', 'aria-label': 'Figures', onchange: () => ui.setFigures(figures.checked) });
+  const figures = h('input', { type: 'checkbox', 'aria-label': 'Figures',
+    onchange: () => ui.setFigures(figures.checked) });
   const path = h('div', { class: 'wrap narrow' },
     button('Back', () => player.step(-1), { 'aria-label': 'One frame back' }, 'back'),
     button('Next', () => player.step(1), { 'aria-label': 'One frame on' }, 'next'),

@@ -30,7 +30,7 @@ const HOLD = 1500;
 const GLIDE = 0.5;
 /** Longest step of the clock, s: a tab that slept goes on where it was. */
 const STEP_MAX = 0.25;
-/** A still picture is refined twice: after a rest, ms, as far as one drawing is expected to take at most so long, ms. */
+/** A still picture is refined twice: after a rest, ms, as far as one drawing should take at most so long, ms. */
 const REFINE = [[300, 400], [1500, 4000]];
 /** A move of half the picture's height in a second shows at full strength in the flow view. */
 const FLOW_SHARE = 0.5;
@@ -596,7 +596,9 @@ export class Player extends EventTarget {
 
   /** A PNG of the picture, as shown but always at full resolution. */
   async screenshot() {
-    if (!this.file || !this.backend) throw new SceneError('There is no picture yet', 'screenshot', 'Wait for the scene.');
+    if (!this.file || !this.backend) {
+      throw new SceneError('There is no picture yet', 'screenshot', 'Wait for the scene.');
+    }
     this.#paint(1);
     await this.backend.settled();
     const { width, height, data } = await this.backend.readPixels();
@@ -617,8 +619,8 @@ export class Player extends EventTarget {
 
   get statistics() {
     const { width, height } = this.canvas;
-    return { ...this.figures, atRest: performance.now() - this.#dirtyAt > 1000, ...this.backend?.stats, backend: this.backend?.name ?? null, width, height,
-      scale: this.scale, gaussians: this.meta?.gaussians ?? 0, ready: this.ready(this.time),
+    return { ...this.figures, ...this.backend?.stats, backend: this.backend?.name ?? null,
+      atRest: performance.now() - this.#dirtyAt > 1000, width, height, scale: this.scale, gaussians: this.meta?.gaussians ?? 0, ready: this.ready(this.time),
       bytesRead: this.file?.bytesRead ?? 0, bytesTotal: this.file?.bytesTotal ?? 0 };
   }
 
