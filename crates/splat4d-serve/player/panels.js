@@ -36,7 +36,7 @@ export function viewPanel(ui) {
   const loop = h('input', { type: 'checkbox', 'aria-label': 'Loop', onchange: () => ui.setLoop(loop.checked) });
   const scale = choice('Resolution', SCALES, s => ui.setResolution(s));
   const backend = choice('Drawn with', BACKENDS, b => player.useBackend(b));
-  const ground = segments('Background', Object.keys(BACKGROUNDS).map(b => [b, b[0].toUpperCase() + b.slice(1)]), b => {
+  const ground = choice('Background', Object.keys(BACKGROUNDS).map(b => [b, b[0].toUpperCase() + b.slice(1)]), b => {
     player.background = BACKGROUNDS[b];
     player.redraw();
   });

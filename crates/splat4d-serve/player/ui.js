@@ -178,7 +178,7 @@ export class Interface {
     for (const item of [this.play, this.back, this.next, this.loopTool, this.speed]) item.disabled = p.still || !p.file;
     this.scrub.hidden = p.still;
     this.timeLabel.hidden = p.still;
-    for (const item of [this.play, this.back, this.next]) item.hidden = !!p.file && p.still;
+    for (const item of [this.play, this.back, this.next, this.loopTool, this.speed]) item.hidden = !!p.file && p.still;
     this.loopTool.setAttribute('aria-pressed', String(p.loop));
     this.speed.set(p.speed, `${+p.speed.toFixed(2)}×`);
     this.channel.set(p.channel);

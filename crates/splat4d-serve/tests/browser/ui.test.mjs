@@ -5,6 +5,7 @@
 import assert from 'node:assert/strict';
 import { after, before, test } from 'node:test';
 import { launch } from './browser.mjs';
+import { Pace } from '../../player/pace.js';
 import { Site } from './ui-harness.mjs';
 
 /** Seconds on the mock's clock: its clip begins at 1 and lasts 4, 25 frames a second. */
@@ -44,6 +45,30 @@ async function open(path = '', { size = [1000, 700], config, wrong = false, read
 const near = (a, b, by = 1e-3) => assert.ok(Math.abs(a - b) <= by, `${a} is not ${b}`);
 const settle = page =>
   page.evaluate(() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done))));
+
+test('the picture shrinks as far as it must and helps, and grows again', () => {
+  /** Plays `seconds` on a made-up machine where a frame takes fixed + pixels·scale² ms, at most 60 frames a second. */
+  const play = (pace, fixed, pixels, seconds = 20) => {
+    const scales = [];
+    for (let now = 0; now < 1000 * seconds;) {
+      const ms = Math.max(1000 / 60, fixed + pixels * pace.scale ** 2);
+      now += ms;
+      pace.frame(ms, now + (pace.clock ?? 0));
+      scales.push(pace.scale);
+    }
+    pace.clock = (pace.clock ?? 0) + 1000 * seconds;
+    return scales;
+  };
+  const slow = new Pace();
+  play(slow, 4, 120);
+  assert.ok(slow.fps >= 28.5 && slow.scale > 0.3 && slow.scale < 0.5, `${slow.fps} frames/s at ${slow.scale}`);
+  play(slow, 4, 5);
+  assert.equal(slow.scale, 1, 'a machine that is free again gives the whole picture');
+  const busy = play(new Pace(), 100, 1);
+  assert.ok(busy.filter(s => s < 1).length < busy.length / 4, 'where pixels are not what is slow, they stay');
+  assert.ok(play(new Pace(), 2, 6).every(s => s === 1));
+  assert.equal(Math.min(...play(new Pace(), 1, 5000, 60)), 0.25);
+});
 
 test('keys play, seek, step, change speed, picture and camera', options, async () => {
   const { page, ask, done } = await open();
