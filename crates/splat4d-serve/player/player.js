@@ -13,6 +13,8 @@ export const CHANNELS = ['color', 'depth', 'alpha', 'flow'];
 export const SPEED_RANGE = [0.1, 4];
 /** Where pictures are drawn without a GPU, the first one should not take seconds either. */
 const SCALE_SOFTWARE = 0.5;
+/** Pictures that may be on their way in WebGPU's queue: more would only be shown later. */
+const FLYING_MAX = 2;
 /** Pixel ratios above 2 cost a lot and show nothing. */
 const RATIO_MAX = 2;
 /** Share of a moment's Gaussians below which playing waits: the most important tier makes a fair picture. */
@@ -65,6 +67,7 @@ export class Player extends EventTarget {
   #refined = 0;
   #dirtyAt = 0;
   #paintedScale = 0;
+  #flying = 0;
   #awake = 0;
   #due = 0;
   /** Milliseconds that a picture at full resolution would take. */
@@ -315,6 +318,7 @@ export class Player extends EventTarget {
     this.#stream = null;
     const old = this.backend;
     this.backend = this.#starting = null;
+    this.#flying = 0;
     try { old?.destroy(); } catch { /* A lost device may refuse; it is gone anyway. */ }
     this.#newCanvas();
     try {
@@ -436,8 +440,10 @@ export class Player extends EventTarget {
     const dt = Math.min((now - this.#last) / 1000, STEP_MAX);
     this.#last = now;
     // A picture that takes long makes the next frame late, also one that the backend draws by itself.
-    const at = performance.now(), gap = this.#awake ? at - this.#awake : 0;
+    const at = performance.now();
+    let gap = this.#awake ? at - this.#awake : 0;
     this.#awake = at;
+    if (this.backend) gap = Math.max(gap, this.#graphicsMs);
     this.#cost = Math.max(gap / (this.#paintedScale || 1) ** 2, this.#due ? this.#cost / 2 : this.#cost);
     this.#due = 0;
     if (!this.file || !this.backend || !this.#stream || this.#xr || this.state === 'error') return;
@@ -501,6 +507,7 @@ export class Player extends EventTarget {
     }
     if (!this.#dirty) this.#refine(now);
     if (!this.#dirty || !this.#seen) { this.#interval = 0; return; }
+    if (this.#flying >= FLYING_MAX) return;
     this.#dirty = false;
     this.#dirtyAt = now;
     this.#refined = 0;
@@ -528,8 +535,19 @@ export class Player extends EventTarget {
       this.#told.size = size.join();
       this.backend.resize(...size);
     }
-    try { this.backend.draw(this.drawing(...size)); } catch (error) { return this.#lost(error); }
+    const { backend } = this;
+    try { backend.draw(this.drawing(...size)); } catch (error) { return this.#lost(error); }
+    if (backend.name === 'webgpu') {
+      this.#flying++;
+      backend.settled().catch(() => {}).then(() => { if (backend === this.backend) this.#flying--; });
+    }
     this.#drawnAt = this.#due = performance.now();
+  }
+
+  /** What the newest picture took where the browser's frames do not show it: WebGPU's commands wait in a queue. */
+  get #graphicsMs() {
+    const { name, stats } = this.backend;
+    return name === 'webgpu' ? stats.drawMs + stats.sortMs : 0;
   }
 
   /** What a backend is told to draw now, at a size in px. */
@@ -545,8 +563,8 @@ export class Player extends EventTarget {
   }
 
   #measure(now) {
-    const fixed = this.resolution !== 'auto';
-    if (this.#interval && this.state === 'ready') this.#pace.frame(now - this.#interval, now, fixed);
+    const ms = Math.max(now - this.#interval, this.#graphicsMs);
+    if (this.#interval && this.state === 'ready') this.#pace.frame(ms, now, this.resolution !== 'auto');
     this.#interval = now;
   }
 
@@ -606,10 +624,12 @@ export class Player extends EventTarget {
   get statistics() {
     const { width, height } = this.canvas;
     const { fps, frameMs } = this.#pace;
-    return { ...this.figures, fps, frameMs, ...this.backend?.stats,
-      backend: this.backend?.name ?? null,
-      atRest: performance.now() - this.#dirtyAt > 1000, width, height, scale: this.scale, gaussians: this.meta?.gaussians ?? 0, ready: this.ready(this.time),
-      bytesRead: this.file?.bytesRead ?? 0, bytesTotal: this.file?.bytesTotal ?? 0 };
+    return {
+      ...this.figures, fps, frameMs, atRest: performance.now() - this.#dirtyAt > 1000, ...this.backend?.stats,
+      backend: this.backend?.name ?? null, width, height, scale: this.scale,
+      gaussians: this.meta?.gaussians ?? 0, ready: this.ready(this.time),
+      bytesRead: this.file?.bytesRead ?? 0, bytesTotal: this.file?.bytesTotal ?? 0,
+    };
   }
 
   /** While a headset draws, the page does not. */

@@ -3,6 +3,7 @@
 // interface alone. Run: node --test ui.test.mjs (see browser.mjs for what it needs).
 
 import assert from 'node:assert/strict';
+import { readFileSync } from 'node:fs';
 import { after, before, test } from 'node:test';
 import { launch } from './browser.mjs';
 import { Pace } from '../../player/pace.js';
@@ -45,6 +46,16 @@ async function open(path = '', { size = [1000, 700], config, wrong = false, read
 const near = (a, b, by = 1e-3) => assert.ok(Math.abs(a - b) <= by, `${a} is not ${b}`);
 const settle = page =>
   page.evaluate(() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done))));
+
+test('the page names every module it will need, so that they come all at once', () => {
+  const text = name => readFileSync(new URL(`../../player/${name}`, import.meta.url), 'utf8');
+  const met = new Set(['page.js']);
+  for (const name of met) {
+    for (const [, next] of text(name).matchAll(/^(?:import|export)(?:[^;']*from)? '\.\/([\w.-]+)'/gm)) met.add(next);
+  }
+  const named = [...text('index.html').matchAll(/modulepreload" href="\.\/([\w.-]+)"/g)].map(m => m[1]);
+  assert.deepEqual(named.sort(), [...met].sort());
+});
 
 test('the picture shrinks as far as it must and helps, and grows again', () => {
   /** Plays `seconds` on a made-up machine where a frame takes fixed + pixels·scale² ms, at most 60 frames a second. */
