@@ -199,7 +199,8 @@ export function datasetCamera(meta, entry) {
   camera.set({ position, quat });
   const ahead = dot(add(center, position, -1), camera.forward);
   camera.distance = ahead > 0.05 * radius ? ahead : radius;
-  camera.fov = clamp(2 * Math.atan(Math.min(entry.height / entry.fy, entry.width / entry.fx) / 2) / DEGREE, ...FOV_RANGE);
+  const half = Math.min(entry.height / entry.fy, entry.width / entry.fx) / 2;
+  camera.fov = clamp(2 * Math.atan(half) / DEGREE, ...FOV_RANGE);
   camera.lens = { width: entry.width, height: entry.height, fx: entry.fx, fy: entry.fy, cx: entry.cx, cy: entry.cy };
   return camera;
 }

@@ -16,7 +16,8 @@ export function h(tag, props = {}, ...children) {
 
 /** A button that is only an icon; its name is for screen readers and the tooltip. */
 export function tool(name, label, onclick, props = {}) {
-  return h('button', { type: 'button', class: 'tool', title: label, 'aria-label': label, onclick, ...props }, icon(name));
+  const own = { type: 'button', class: 'tool', title: label, 'aria-label': label, onclick };
+  return h('button', { ...own, ...props }, icon(name));
 }
 
 /** Changes an icon button's picture and name. */
@@ -37,7 +38,8 @@ export function segments(label, options, onpick, props = {}) {
   const inputs = new Map();
   const node = h('div', { role: 'radiogroup', 'aria-label': label, ...props, class: `seg ${props.class ?? ''}` },
     ...options.map(([value, text, title]) => {
-      const input = h('input', { type: 'radio', name, value, 'aria-label': title ?? text, onchange: () => onpick(value) });
+      const own = { type: 'radio', name, value, 'aria-label': title ?? text };
+      const input = h('input', { ...own, onchange: () => onpick(value) });
       inputs.set(value, input);
       return h('label', { title }, input, h('span', {}, text));
     }));

@@ -16,7 +16,8 @@ let sheet;
 /** '#rrggbb' or '#rgb' as three numbers in 0..1; null for 'scene' and for what is no colour. */
 function colour(text) {
   const hex = /^#([0-9a-f]{3}|[0-9a-f]{6})$/i.exec((text ?? '').trim())?.[1];
-  return hex ? hex.match(hex.length === 3 ? /./g : /../g).map(x => parseInt(x + (x.length === 1 ? x : ''), 16) / 255) : null;
+  const digits = hex?.match(hex.length === 3 ? /./g : /../g);
+  return digits?.map(x => parseInt(x + (x.length === 1 ? x : ''), 16) / 255) ?? null;
 }
 
 /** 'x,y,z tx,ty,tz [fov]': where the camera is, what it looks at, degrees. */

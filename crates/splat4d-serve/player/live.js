@@ -50,8 +50,9 @@ export class Feed {
 }
 
 /** A step as the server tells it, by either of its two sets of names. */
-function readStep({ step, iteration = step, of, iterations = of, psnr, loss, gaussians, left_s, seconds_left = left_s }) {
-  return { step: +iteration, of: +iterations, psnr: +psnr, loss: +loss, gaussians, left: +seconds_left };
+function readStep({ psnr, loss, gaussians, ...s }) {
+  const [step, of, left] = [s.iteration ?? s.step, s.iterations ?? s.of, s.seconds_left ?? s.left_s].map(Number);
+  return { step, of, left, psnr: +psnr, loss: +loss, gaussians };
 }
 
 /** Steps already taken: JSON (a list, or the server's {news}) or the CSV of a run. */
@@ -81,7 +82,8 @@ export class Training {
     this.figures = h('div', { class: 'figures' });
     this.canvas = h('canvas', { role: 'img', 'aria-label': 'Quality over the steps' });
     this.card = h('section', { class: 'card live', 'aria-label': 'Training' },
-      h('div', { class: 'row' }, this.dot, this.state, h('span', { class: 'space' }), this.left), this.canvas, this.figures);
+      h('div', { class: 'row' }, this.dot, this.state, h('span', { class: 'space' }), this.left),
+      this.canvas, this.figures);
     ui.left.append(this.card);
     ui.root.addEventListener('themechange', () => this.#draw());
     this.resizes = new ResizeObserver(() => this.#draw());
@@ -132,7 +134,8 @@ export class Training {
     this.#merge([data]);
     this.#show(this.link);
     const count = n => Number(n).toLocaleString('en-GB');
-    const left = s => (s > 5400 ? `${(s / 3600).toFixed(1)} h` : s > 90 ? `${Math.round(s / 60)} min` : `${Math.round(s)} s`);
+    const left = s => (s > 5400 ? `${(s / 3600).toFixed(1)} h`
+      : s > 90 ? `${Math.round(s / 60)} min` : `${Math.round(s)} s`);
     const cells = [
       [count(data.step), data.of ? `of ${count(data.of)} steps` : 'steps'],
       [isFinite(data.psnr) ? data.psnr.toFixed(2) : '–', 'dB PSNR'],

@@ -36,12 +36,13 @@ export function viewPanel(ui) {
   const loop = h('input', { type: 'checkbox', 'aria-label': 'Loop', onchange: () => ui.setLoop(loop.checked) });
   const scale = choice('Resolution', SCALES, s => ui.setResolution(s));
   const backend = choice('Drawn with', BACKENDS, b => player.useBackend(b));
-  const ground = segments('Background', Object.keys(BACKGROUNDS).map(b => [b, b[0].toUpperCase() + b.slice(1)]), b => {
+  const ground = choice('Background', Object.keys(BACKGROUNDS).map(b => [b, b[0].toUpperCase() + b.slice(1)]), b => {
     player.background = BACKGROUNDS[b];
     player.redraw();
   });
   const theme = segments('Theme', [['auto', 'Auto'], ['light', 'Light'], ['dark', 'Dark']], t => ui.setTheme(t));
-  const figures = h('input', { type: 'checkbox', 'aria-label': 'Figures', onchange: () => ui.setFigures(figures.checked) });
+  const figures = h('input', { type: 'checkbox', 'aria-label': 'Figures',
+    onchange: () => ui.setFigures(figures.checked) });
   const path = h('div', { class: 'wrap narrow' },
     button('Back', () => player.step(-1), { 'aria-label': 'One frame back' }, 'back'),
     button('Next', () => player.step(1), { 'aria-label': 'One frame on' }, 'next'),

@@ -3,6 +3,7 @@
 
 import { Camera, bounds, clamp, datasetCamera, dot, add, firstCamera, linkText } from './camera.js';
 import { Controls } from './controls.js';
+import { Pace } from './pace.js';
 import { SceneError } from './errors.js';
 import { SceneFile } from './scene-file.js';
 import { Stream } from './stream.js';
@@ -10,16 +11,10 @@ import { Track } from './track.js';
 
 export const CHANNELS = ['color', 'depth', 'alpha', 'flow'];
 export const SPEED_RANGE = [0.1, 4];
-/** Frames a second that the resolution is lowered to keep, and above which it is raised again. */
-const KEEP_FPS = 30;
-const SPARE_FPS = 48;
-/** Smallest automatic scale: a quarter of the pixels a side is still legible. */
-const SCALE_MIN = 0.25;
 /** Where pictures are drawn without a GPU, the first one should not take seconds either. */
 const SCALE_SOFTWARE = 0.5;
-/** Milliseconds between two changes of scale, and how long a scale that was too slow is not tried again. */
-const ADAPT_EVERY = 500;
-const ADAPT_MEMORY = 8000;
+/** Pictures that may be on their way in WebGPU's queue: more would only be shown later. */
+const FLYING_MAX = 2;
 /** Pixel ratios above 2 cost a lot and show nothing. */
 const RATIO_MAX = 2;
 /** Share of a moment's Gaussians below which playing waits: the most important tier makes a fair picture. */
@@ -30,7 +25,7 @@ const HOLD = 1500;
 const GLIDE = 0.5;
 /** Longest step of the clock, s: a tab that slept goes on where it was. */
 const STEP_MAX = 0.25;
-/** A still picture is refined twice: after a rest, ms, as far as one drawing is expected to take at most so long, ms. */
+/** A still picture is refined twice: after a rest, ms, as far as one drawing should take at most so long, ms. */
 const REFINE = [[300, 400], [1500, 4000]];
 /** A move of half the picture's height in a second shows at full strength in the flow view. */
 const FLOW_SHARE = 0.5;
@@ -60,11 +55,9 @@ export class Player extends EventTarget {
   /** {track, seconds, frozen, loop} while a path plays. */
   film = null;
   buffered = [];
-  figures = { fps: 0, frameMs: 0, firstFrame: 0 };
+  figures = { firstFrame: 0 };
   #speed = 1;
-  #scale = 1;
-  #slow = { scale: Infinity, at: 0 };
-  #adapted = 0;
+  #pace = new Pace();
   #interval = 0;
   #stream = null;
   #run = 0;
@@ -74,6 +67,11 @@ export class Player extends EventTarget {
   #refined = 0;
   #dirtyAt = 0;
   #paintedScale = 0;
+  #flying = 0;
+  #awake = 0;
+  #due = 0;
+  /** Milliseconds that a picture at full resolution would take. */
+  #cost = 0;
   #drawnAt = 0;
   #last = 0;
   #glide = null;
@@ -103,7 +101,7 @@ export class Player extends EventTarget {
     this.sight = new IntersectionObserver(list => { this.#seen = list.at(-1).isIntersecting; this.redraw(); });
     this.sight.observe(stage);
     // Frames that a hidden tab left out were not slow.
-    this.sleeps = () => { this.#interval = 0; };
+    this.sleeps = () => { this.#interval = this.#awake = 0; };
     document.addEventListener('visibilitychange', this.sleeps);
     const loop = now => { this.#frame = requestAnimationFrame(loop); this.#tick(now); };
     this.#frame = requestAnimationFrame(loop);
@@ -122,7 +120,7 @@ export class Player extends EventTarget {
     this.#speed = clamp(+x || 1, ...SPEED_RANGE);
     this.emit('ratechange');
   }
-  get scale() { return this.resolution === 'auto' ? this.#scale : this.resolution; }
+  get scale() { return this.resolution === 'auto' ? this.#pace.scale : this.resolution; }
 
   redraw() { this.#dirty = true; }
 
@@ -286,7 +284,7 @@ export class Player extends EventTarget {
           this.backend = await (await import('./webgpu.js')).WebGPUBackend.create(this.canvas, { onlost });
         } else this.backend = await (await import('./webgl2.js')).WebGL2Backend.create(this.canvas, { onlost });
         this.figures.fallback = reasons.join('; ');
-        if (software(this.backend.gl)) this.#scale = SCALE_SOFTWARE;
+        if (software(this.backend.gl)) this.#pace.scale = SCALE_SOFTWARE;
         return this.emit('backend', { name });
       } catch (error) {
         reasons.push(`${name === 'webgpu' ? 'WebGPU' : 'WebGL2'}: ${error.what ?? error.message}`);
@@ -320,6 +318,7 @@ export class Player extends EventTarget {
     this.#stream = null;
     const old = this.backend;
     this.backend = this.#starting = null;
+    this.#flying = 0;
     try { old?.destroy(); } catch { /* A lost device may refuse; it is gone anyway. */ }
     this.#newCanvas();
     try {
@@ -440,6 +439,13 @@ export class Player extends EventTarget {
   #tick(now) {
     const dt = Math.min((now - this.#last) / 1000, STEP_MAX);
     this.#last = now;
+    // A picture that takes long makes the next frame late, also one that the backend draws by itself.
+    const at = performance.now();
+    let gap = this.#awake ? at - this.#awake : 0;
+    this.#awake = at;
+    if (this.backend) gap = Math.max(gap, this.#graphicsMs);
+    this.#cost = Math.max(gap / (this.#paintedScale || 1) ** 2, this.#due ? this.#cost / 2 : this.#cost);
+    this.#due = 0;
     if (!this.file || !this.backend || !this.#stream || this.#xr || this.state === 'error') return;
     this.controls.tick(dt);
     this.#moveCamera(dt);
@@ -501,6 +507,7 @@ export class Player extends EventTarget {
     }
     if (!this.#dirty) this.#refine(now);
     if (!this.#dirty || !this.#seen) { this.#interval = 0; return; }
+    if (this.#flying >= FLYING_MAX) return;
     this.#dirty = false;
     this.#dirtyAt = now;
     this.#refined = 0;
@@ -514,7 +521,7 @@ export class Player extends EventTarget {
     const moving = this.playing || this.film || this.controls.busy;
     if (this.resolution !== 'auto' || moving || now - this.#dirtyAt < rest || !this.#seen) return;
     this.#refined++;
-    const scale = Math.min(1, this.#scale * Math.sqrt(budget / (this.figures.frameMs || 1)));
+    const scale = Math.min(1, Math.sqrt(budget / (this.#cost || 1)));
     if (scale > this.#paintedScale) this.#paint(scale);
   }
 
@@ -528,8 +535,19 @@ export class Player extends EventTarget {
       this.#told.size = size.join();
       this.backend.resize(...size);
     }
-    try { this.backend.draw(this.drawing(...size)); } catch (error) { return this.#lost(error); }
-    this.#drawnAt = performance.now();
+    const { backend } = this;
+    try { backend.draw(this.drawing(...size)); } catch (error) { return this.#lost(error); }
+    if (backend.name === 'webgpu') {
+      this.#flying++;
+      backend.settled().catch(() => {}).then(() => { if (backend === this.backend) this.#flying--; });
+    }
+    this.#drawnAt = this.#due = performance.now();
+  }
+
+  /** What the newest picture took where the browser's frames do not show it: WebGPU's commands wait in a queue. */
+  get #graphicsMs() {
+    const { name, stats } = this.backend;
+    return name === 'webgpu' ? stats.drawMs + stats.sortMs : 0;
   }
 
   /** What a backend is told to draw now, at a size in px. */
@@ -545,23 +563,9 @@ export class Player extends EventTarget {
   }
 
   #measure(now) {
-    const ms = now - this.#interval;
-    const first = !this.#interval;
+    const ms = Math.max(now - this.#interval, this.#graphicsMs);
+    if (this.#interval && this.state === 'ready') this.#pace.frame(ms, now, this.resolution !== 'auto');
     this.#interval = now;
-    if (first || this.state !== 'ready') return;
-    const f = this.figures;
-    f.frameMs = f.frameMs ? f.frameMs + 0.1 * (ms - f.frameMs) : ms;
-    f.fps = 1000 / f.frameMs;
-    if (this.resolution !== 'auto' || now - this.#adapted < ADAPT_EVERY) return;
-    this.#adapted = now;
-    if (f.fps < KEEP_FPS * 0.95 && this.#scale > SCALE_MIN) {
-      this.#slow = { scale: this.#scale, at: now };
-      this.#scale = Math.max(SCALE_MIN, this.#scale * clamp(Math.sqrt(f.fps / KEEP_FPS), 0.35, 0.95));
-      f.frameMs = 0;
-    } else if (f.fps > SPARE_FPS && this.#scale < 1) {
-      const up = Math.min(1, this.#scale * 1.15);
-      if (up < this.#slow.scale || now - this.#slow.at > ADAPT_MEMORY) this.#scale = up;
-    }
   }
 
   #tell(now) {
@@ -596,7 +600,9 @@ export class Player extends EventTarget {
 
   /** A PNG of the picture, as shown but always at full resolution. */
   async screenshot() {
-    if (!this.file || !this.backend) throw new SceneError('There is no picture yet', 'screenshot', 'Wait for the scene.');
+    if (!this.file || !this.backend) {
+      throw new SceneError('There is no picture yet', 'screenshot', 'Wait for the scene.');
+    }
     this.#paint(1);
     await this.backend.settled();
     const { width, height, data } = await this.backend.readPixels();
@@ -617,9 +623,13 @@ export class Player extends EventTarget {
 
   get statistics() {
     const { width, height } = this.canvas;
-    return { ...this.figures, atRest: performance.now() - this.#dirtyAt > 1000, ...this.backend?.stats, backend: this.backend?.name ?? null, width, height,
-      scale: this.scale, gaussians: this.meta?.gaussians ?? 0, ready: this.ready(this.time),
-      bytesRead: this.file?.bytesRead ?? 0, bytesTotal: this.file?.bytesTotal ?? 0 };
+    const { fps, frameMs } = this.#pace;
+    return {
+      ...this.figures, fps, frameMs, atRest: performance.now() - this.#dirtyAt > 1000, ...this.backend?.stats,
+      backend: this.backend?.name ?? null, width, height, scale: this.scale,
+      gaussians: this.meta?.gaussians ?? 0, ready: this.ready(this.time),
+      bytesRead: this.file?.bytesRead ?? 0, bytesTotal: this.file?.bytesTotal ?? 0,
+    };
   }
 
   /** While a headset draws, the page does not. */

@@ -117,7 +117,8 @@ h3{font-size:.8em;margin:.2em 0 -.4em;font-weight:600;color:var(--muted);letter-
 .dot.off{background:var(--muted)}
 @keyframes breathe{50%{opacity:.35}}
 .dot.on{animation:breathe 2s infinite}
-.centre{position:absolute;inset:0;display:grid;place-items:center;grid-template:minmax(0,1fr)/minmax(0,1fr);padding:1.2em;pointer-events:none}
+.centre{position:absolute;inset:0;display:grid;place-items:center;grid-template:minmax(0,1fr)/minmax(0,1fr);
+ padding:1.2em;pointer-events:none}
 .notice{pointer-events:auto;max-width:34em;padding:1.8em 2em;display:flex;flex-direction:column;gap:.8em;
  align-items:flex-start;max-height:100%;overflow:auto}
 .notice h2{font-size:1.2em;display:flex;gap:.6em;align-items:center;overflow-wrap:anywhere}

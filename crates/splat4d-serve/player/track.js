@@ -135,7 +135,8 @@ function readPose(key, likeness, wrong) {
   if (key.scene_time != null && !plain(key.scene_time)) wrong('"scene_time" is no number');
   if (key.world_to_camera && !key.position && !key.look_at) {
     const m = key.world_to_camera.flat?.(1);
-    if (!Array.isArray(m) || ![12, 16].includes(m.length) || !m.every(plain)) wrong('"world_to_camera" is no 3x4 or 4x4');
+    const matrix = Array.isArray(m) && [12, 16].includes(m.length) && m.every(plain);
+    if (!matrix) wrong('"world_to_camera" is no 3x4 or 4x4 matrix');
     // The rows of camera-from-world are the columns of world-from-camera.
     camera.quat = quatFromRows([0, 1, 2].map(c => [m[c], m[4 + c], m[8 + c]]));
     camera.position = [0, 1, 2].map(c => -(m[c] * m[3] + m[4 + c] * m[7] + m[8 + c] * m[11]));

@@ -51,7 +51,10 @@ export class Interface {
       { class: 'roomy' });
     const opener = (name, label, id) => tool(name, label, () => this.open(this.#panel === id ? null : id),
       { 'aria-expanded': 'false', 'aria-haspopup': 'dialog' });
-    this.openers = { cameras: opener('camera', 'Cameras and paths', 'cameras'), view: opener('view', 'View and settings', 'view') };
+    this.openers = {
+      cameras: opener('camera', 'Cameras and paths', 'cameras'),
+      view: opener('view', 'View and settings', 'view'),
+    };
     this.full = tool('full', 'Full screen', () => this.fullscreen());
     this.xrTool = tool('headset', 'Look through the headset', () => this.enterXr(), { hidden: true });
     this.helpTool = tool('help', 'Keys and gestures', () => this.toggleHelp(), { class: 'tool wide' });
@@ -68,7 +71,8 @@ export class Interface {
     this.left = h('div', { class: 'left' }, this.title, this.figures);
     this.help = helpPage(() => this.toggleHelp(false));
     this.notice = h('div', { class: 'centre' });
-    this.ring = h('div', { class: 'card load', role: 'status', hidden: true }, h('div', { class: 'ring' }), h('span', {}));
+    this.ring = h('div', { class: 'card load', role: 'status', hidden: true },
+      h('div', { class: 'ring' }), h('span'));
     this.toastBox = h('div', { class: 'card toast', role: 'status', 'aria-live': 'polite' });
     this.posterBox = h('img', { class: 'poster', alt: '' });
     this.face = h('div', { class: 'ui' }, h('div', { class: 'top' }, this.left), this.ring, this.dock,
@@ -174,7 +178,7 @@ export class Interface {
     for (const item of [this.play, this.back, this.next, this.loopTool, this.speed]) item.disabled = p.still || !p.file;
     this.scrub.hidden = p.still;
     this.timeLabel.hidden = p.still;
-    for (const item of [this.play, this.back, this.next]) item.hidden = !!p.file && p.still;
+    for (const item of [this.play, this.back, this.next, this.loopTool, this.speed]) item.hidden = !!p.file && p.still;
     this.loopTool.setAttribute('aria-pressed', String(p.loop));
     this.speed.set(p.speed, `${+p.speed.toFixed(2)}×`);
     this.channel.set(p.channel);

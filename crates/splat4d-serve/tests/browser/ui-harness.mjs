@@ -30,6 +30,8 @@ export class Site {
     const path = new URL(request.url, this.url).pathname;
     if (path === '/config.json') return this.#send(response, JSON.stringify(this.config), 'json');
     if (this.pages[path]) return this.#send(response, this.pages[path], 'html');
+    // What every browser asks for unasked.
+    if (path === '/favicon.ico') return response.writeHead(204).end();
     if (path === '/events') return this.#listen(response);
     const name = path === '/' ? 'index.html' : path.replace(/^\/(player\/)?/, '');
     for (const folder of this.mocks ? [join(HERE, 'mock'), PLAYER] : [PLAYER]) {

@@ -3,8 +3,10 @@
 // interface alone. Run: node --test ui.test.mjs (see browser.mjs for what it needs).
 
 import assert from 'node:assert/strict';
+import { readFileSync } from 'node:fs';
 import { after, before, test } from 'node:test';
 import { launch } from './browser.mjs';
+import { Pace } from '../../player/pace.js';
 import { Site } from './ui-harness.mjs';
 
 /** Seconds on the mock's clock: its clip begins at 1 and lasts 4, 25 frames a second. */
@@ -22,7 +24,8 @@ after(async () => {
 /** A page at `path`, ready; errors on its console fail the test unless `wrong` is set. */
 async function open(path = '', { size = [1000, 700], config, wrong = false, ready = true, ...more } = {}) {
   site.config = config ?? { title: 'Two knights', scene: 'scene.splat4d', live: false, autoplay: false };
-  const context = await browser.newContext({ viewport: { width: size[0], height: size[1] }, acceptDownloads: true, ...more });
+  const viewport = { width: size[0], height: size[1] };
+  const context = await browser.newContext({ viewport, acceptDownloads: true, ...more });
   const page = await context.newPage();
   const errors = [];
   page.on('pageerror', e => errors.push(e.stack));
@@ -41,7 +44,42 @@ async function open(path = '', { size = [1000, 700], config, wrong = false, read
 }
 
 const near = (a, b, by = 1e-3) => assert.ok(Math.abs(a - b) <= by, `${a} is not ${b}`);
-const settle = page => page.evaluate(() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done))));
+const settle = page =>
+  page.evaluate(() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done))));
+
+test('the page names every module it will need, so that they come all at once', () => {
+  const text = name => readFileSync(new URL(`../../player/${name}`, import.meta.url), 'utf8');
+  const met = new Set(['page.js']);
+  for (const name of met) {
+    for (const [, next] of text(name).matchAll(/^(?:import|export)(?:[^;']*from)? '\.\/([\w.-]+)'/gm)) met.add(next);
+  }
+  const named = [...text('index.html').matchAll(/modulepreload" href="\.\/([\w.-]+)"/g)].map(m => m[1]);
+  assert.deepEqual(named.sort(), [...met].sort());
+});
+
+test('the picture shrinks as far as it must and helps, and grows again', () => {
+  /** Plays `seconds` on a made-up machine where a frame takes fixed + pixels·scale² ms, at most 60 frames a second. */
+  const play = (pace, fixed, pixels, seconds = 20) => {
+    const scales = [];
+    for (let now = 0; now < 1000 * seconds;) {
+      const ms = Math.max(1000 / 60, fixed + pixels * pace.scale ** 2);
+      now += ms;
+      pace.frame(ms, now + (pace.clock ?? 0));
+      scales.push(pace.scale);
+    }
+    pace.clock = (pace.clock ?? 0) + 1000 * seconds;
+    return scales;
+  };
+  const slow = new Pace();
+  play(slow, 4, 120);
+  assert.ok(slow.fps >= 28.5 && slow.scale > 0.3 && slow.scale < 0.5, `${slow.fps} frames/s at ${slow.scale}`);
+  play(slow, 4, 5);
+  assert.equal(slow.scale, 1, 'a machine that is free again gives the whole picture');
+  const busy = play(new Pace(), 100, 1);
+  assert.ok(busy.filter(s => s < 1).length < busy.length / 4, 'where pixels are not what is slow, they stay');
+  assert.ok(play(new Pace(), 2, 6).every(s => s === 1));
+  assert.equal(Math.min(...play(new Pace(), 1, 5000, 60)), 0.25);
+});
 
 test('keys play, seek, step, change speed, picture and camera', options, async () => {
   const { page, ask, done } = await open();
@@ -111,7 +149,8 @@ test('the mouse orbits about the target, the wheel goes nearer, touch pinches', 
   const finger = (type, id, x, y) => ask((e, [type, id, x, y]) => {
     const stage = e.shadowRoot.querySelector('.stage');
     stage.setPointerCapture = () => {};
-    stage.dispatchEvent(new PointerEvent(type, { pointerId: id, pointerType: 'touch', clientX: x, clientY: y, bubbles: true }));
+    const at = { pointerId: id, pointerType: 'touch', clientX: x, clientY: y, bubbles: true };
+    stage.dispatchEvent(new PointerEvent(type, at));
   }, [type, id, x, y]);
   await finger('pointerdown', 11, 400, 300);
   await finger('pointerdown', 12, 600, 300);
@@ -142,7 +181,9 @@ test('the time slider scrubs by mouse and keys, and shows what is buffered', opt
   near(await ask(e => e.currentTime), FIRST);
   const there = () => ask(e => [...e.shadowRoot.querySelectorAll('.there')].map(i => [i.style.left, i.style.width])
     .sort((a, b) => parseFloat(a[0]) - parseFloat(b[0])));
-  await page.waitForFunction(() => document.querySelector('splat-4d').shadowRoot.querySelectorAll('.there').length === 2);
+  await page.waitForFunction(() => {
+    return document.querySelector('splat-4d').shadowRoot.querySelectorAll('.there').length === 2;
+  });
   // Pages 0 and 1 of the beginning, 4 and 5 of where it was scrubbed to (and 3, where the pointer passed).
   const spans = await there();
   assert.equal(spans[0][0], '0%');
@@ -163,7 +204,8 @@ test('a link brings back camera, time, picture and playing', options, async () =
   const [link, camera] = await first.ask(e => [e.link, e.camera]);
   await first.done();
   const second = await open(`#${link}`);
-  const got = await second.ask(e => ({ camera: e.camera, t: e.currentTime, channel: e.player.channel, paused: e.paused }));
+  const got = await second.ask(e => (
+    { camera: e.camera, t: e.currentTime, channel: e.player.channel, paused: e.paused }));
   camera.position.forEach((x, i) => near(got.camera.position[i], x, 1e-4));
   camera.quat.forEach((x, i) => near(got.camera.quat[i], x, 1e-4));
   near(got.camera.fov, camera.fov);
@@ -188,7 +230,8 @@ test('the element works in a bare page: attributes, events, methods', options, a
       camera="0,1,6 0,1,0 30" heading="Bare" style="width:600px"></splat-4d>`;
   const { page, ask, done } = await open('bare');
   const drawn = await ask(e => ({ ...e.player.backend.drawn, bg: e.player.drawing(10, 10).background, t: e.currentTime,
-    speed: e.player.speed, camera: e.camera, backend: e.player.backend.name, paused: e.paused, height: e.getBoundingClientRect().height }));
+    speed: e.player.speed, camera: e.camera, backend: e.player.backend.name, paused: e.paused,
+    height: e.getBoundingClientRect().height }));
   assert.deepEqual([drawn.t, drawn.speed, drawn.channel, drawn.backend, drawn.paused], [2, 2, 'alpha', 'webgl2', true]);
   assert.deepEqual(drawn.camera.position, [0, 1, 6]);
   assert.equal(drawn.camera.fov, 30);
@@ -233,7 +276,8 @@ test('every control has a name, and the keyboard reaches it', options, async () 
   await page.keyboard.press('k');
   for (const name of ['Cameras and paths', 'View and settings']) {
     await page.getByRole('button', { name }).click();
-    const nameless = await ask(e => [...e.shadowRoot.querySelectorAll('button, select, input, [role=slider], [tabindex]')]
+    const nameless = await ask(e => [...e.shadowRoot
+      .querySelectorAll('button, select, input, [role=slider], [tabindex]')]
       .filter(n => n.checkVisibility()).filter(n => !(n.getAttribute('aria-label') || n.textContent.trim()))
       .map(n => n.outerHTML));
     assert.deepEqual(nameless, []);
@@ -254,7 +298,9 @@ test('every control has a name, and the keyboard reaches it', options, async () 
     await page.keyboard.press('Tab');
     met.add(await ask(e => e.shadowRoot.activeElement?.getAttribute('aria-label')));
   }
-  for (const name of ['Time', 'Play', 'One frame back', 'Speed', 'Colour', 'Full screen']) assert.ok(met.has(name), name);
+  for (const name of ['Time', 'Play', 'One frame back', 'Speed', 'Colour', 'Full screen']) {
+    assert.ok(met.has(name), name);
+  }
   await ask(e => e.shadowRoot.querySelector('.bar input[value=color]').focus());
   await page.keyboard.press('ArrowRight');
   assert.equal(await ask(e => e.player.channel), 'depth');
@@ -267,7 +313,9 @@ test('errors say what, where and what to do; the page recovers', options, async 
   const alert = page.getByRole('alert');
   await alert.waitFor();
   const text = await alert.innerText();
-  for (const part of ['The index is damaged', 'broken.splat4d', 'Fetch or bake it again']) assert.ok(text.includes(part), text);
+  for (const part of ['The index is damaged', 'broken.splat4d', 'Fetch or bake it again']) {
+    assert.ok(text.includes(part), text);
+  }
   await ask(e => { e.scene = new File([new Uint8Array(9)], 'good.splat4d'); });
   await page.waitForFunction(() => document.querySelector('splat-4d').player.state === 'ready');
   assert.equal(await page.getByRole('alert').count(), 0);
@@ -285,7 +333,8 @@ test('a narrow window holds everything without scrolling sideways', options, asy
   for (const size of [[360, 640], [640, 360], [320, 568]]) {
     const { page, ask, done } = await open('', { size, hasTouch: true });
     const check = async what => {
-      const out = await ask(e => [...e.shadowRoot.querySelectorAll('button, select, .card')].filter(n => n.checkVisibility())
+      const out = await ask(e => [...e.shadowRoot.querySelectorAll('button, select, .card')]
+        .filter(n => n.checkVisibility())
         .filter(n => { const b = n.getBoundingClientRect(); return b.left < -0.5 || b.right > innerWidth + 0.5; })
         .map(n => n.outerHTML.slice(0, 80)));
       assert.deepEqual(out, [], `${what} at ${size}`);
@@ -330,27 +379,37 @@ test('a path is made, played, exported and read again; bullet time holds the clo
   await at({ position: [5, 1, 0], target: [0, 1, 0], fov: 50 }, 1.5);
   await page.keyboard.press('k');
   await page.getByRole('button', { name: 'Cameras and paths' }).click();
-  const [download] = await Promise.all([page.waitForEvent('download'), page.getByRole('button', { name: 'Export' }).click()]);
+  const saved = page.waitForEvent('download');
+  await page.getByRole('button', { name: 'Export' }).click();
+  const download = await saved;
   const chunks = [];
   for await (const chunk of await download.createReadStream()) chunks.push(chunk);
   const file = JSON.parse(Buffer.concat(chunks));
   assert.deepEqual(file.keys.map(k => [k.time, k.scene_time, k.position, k.look_at.map(Math.round), k.fov_y]),
     [[0, 1, [0, 1, 5], [0, 1, 0], 40], [0.5, 1.5, [5, 1, 0], [0, 1, 0], 50]]);
-  assert.ok(Object.keys(file.keys[0]).every(k => ['time', 'scene_time', 'position', 'look_at', 'up', 'fov_y'].includes(k)));
-  const middle = await ask(e => { const { camera, sceneTime } = e.player.track.at(0.25); return [camera.position, camera.fov, sceneTime]; });
+  const known = ['time', 'scene_time', 'position', 'look_at', 'up', 'fov_y'];
+  assert.ok(Object.keys(file.keys[0]).every(k => known.includes(k)));
+  const middle = await ask(e => {
+    const { camera, sceneTime } = e.player.track.at(0.25);
+    return [camera.position, camera.fov, sceneTime];
+  });
   // Tangents of the ends are the chord's: in the middle the path is at the chord's middle.
   assert.deepEqual(middle, [[2.5, 1, 2.5], 45, 1.25]);
   const read = text => ask(async (e, text) => {
     const { Track } = await import('/player/track.js');
-    try { return JSON.parse(JSON.stringify(Track.parse(text, e.player.camera))); } catch (error) { return error.message; }
+    try {
+      return JSON.parse(JSON.stringify(Track.parse(text, e.player.camera)));
+    } catch (error) { return error.message; }
   }, text);
   assert.deepEqual((await read(JSON.stringify(file))).keys, file.keys, 'what is written is read');
   const matrix = [[1, 0, 0, 0], [0, -1, 0, 1], [0, 0, -1, 5], [0, 0, 0, 1]];
   const posed = (await read(JSON.stringify({ keys: [{ time: 0, world_to_camera: matrix }] }))).keys[0];
   assert.deepEqual(posed.position, [0, 1, 5]);
   assert.ok(posed.look_at[2] < 5 && Math.abs(posed.up[1] - 1) < 1e-6);
-  for (const [text, reason] of [['{"keys": []}', 'empty'], ['{', 'JSON'], ['{"keys": [{"time": 0}]}', 'world_to_camera'],
-    ['{"keys": [{"time": 0, "lookat": 1}]}', 'lookat'], ['{"keys": [{"time": 0, "position": [0,0,1], "look_at": [0,0,1]}]}', 'one point'],
+  for (const [text, reason] of [
+    ['{"keys": []}', 'empty'], ['{', 'JSON'], ['{"keys": [{"time": 0}]}', 'world_to_camera'],
+    ['{"keys": [{"time": 0, "lookat": 1}]}', 'lookat'],
+    ['{"keys": [{"time": 0, "position": [0,0,1], "look_at": [0,0,1]}]}', 'one point'],
     [JSON.stringify({ keys: [file.keys[0], file.keys[0]] }), 'not after']]) {
     assert.ok((await read(text)).includes(reason), `${text}: ${await read(text)}`);
   }
@@ -372,30 +431,36 @@ test('a path is made, played, exported and read again; bullet time holds the clo
 });
 
 test('training is followed: late join, new snapshots, lost connections', options, async () => {
-  const step = i => site.say({ kind: 'step', step: 10 * i, of: 500, psnr: 15 + i / 10, loss: 0.3 - i / 1000, gaussians: 9000 + i, left_s: 120 - i });
+  const step = i => site.say({ kind: 'step', step: 10 * i, of: 500, psnr: 15 + i / 10, loss: 0.3 - i / 1000,
+    gaussians: 9000 + i, left_s: 120 - i });
   site.history = [];
   for (let i = 1; i <= 20; i++) step(i);
   site.say({ kind: 'snapshot', version: 7 });
-  const { page, ask, done } = await open('', { config: { title: 'learning', scene: 'scene.splat4d', live: true, autoplay: false }, wrong: true });
+  const config = { title: 'learning', scene: 'scene.splat4d', live: true, autoplay: false };
+  const { page, ask, done } = await open('', { config, wrong: true });
   const card = page.getByRole('region', { name: 'Training' });
   await card.getByText('200').waitFor();
   const text = await card.innerText();
-  for (const part of ['Training', 'of 500 steps', '17.00', '9,020', '2 min left']) assert.ok(text.includes(part), `${part} in ${text}`);
+  for (const part of ['Training', 'of 500 steps', '17.00', '9,020', '2 min left']) {
+    assert.ok(text.includes(part), `${part} in ${text}`);
+  }
   assert.match(await page.getByRole('img', { name: /PSNR from/ }).getAttribute('aria-label'), /from 15\.1 to 17\.0 dB/);
-  assert.deepEqual(await page.evaluate(() => globalThis.mockOpened.map(u => new URL(u).search)), ['?v=7'], 'one scene, the newest');
+  const opened = () => page.evaluate(() => globalThis.mockOpened.map(u => new URL(u).search));
+  assert.deepEqual(await opened(), ['?v=7'], 'one scene, the newest');
   await ask(e => { e.camera = { position: [2, 1, 3], target: [0, 1, 0] }; e.seek(3); });
   await settle(page);
   site.say({ kind: 'snapshot', version: 8 });
   await page.waitForFunction(() => globalThis.mockOpened.length === 2);
   await page.waitForTimeout(300);
-  assert.deepEqual(await ask(e => [e.camera.position, e.currentTime, e.player.state]), [[2, 1, 3], 3, 'ready'], 'camera and time stay');
+  const kept = await ask(e => [e.camera.position, e.currentTime, e.player.state]);
+  assert.deepEqual(kept, [[2, 1, 3], 3, 'ready'], 'camera and time stay');
   const joined = site.joined;
   site.cut();
   await card.getByText('Reconnecting').waitFor();
   step(21);
   await card.getByText('210').waitFor({ timeout: 10000 });
   assert.ok(site.joined > joined, 'it came back by itself');
-  assert.equal(await page.evaluate(() => globalThis.mockOpened.length), 2, 'what is known is not loaded again');
+  assert.deepEqual(await opened(), ['?v=7', '?v=8'], 'what is known is not loaded again');
   step(50);
   site.say({ kind: 'done' });
   await card.getByText('Training finished').waitFor();
@@ -413,5 +478,27 @@ test('what is remembered, and the choice of a backend', options, async () => {
   await again.goto(site.url);
   await again.waitForFunction(() => document.querySelector('splat-4d')?.player?.state === 'ready');
   assert.equal(await again.$eval('splat-4d', e => e.shadowRoot.querySelector('.root').dataset.theme), 'light');
+  await done();
+});
+
+test('an eye of a headset sees what the page sees, from its own place', options, async () => {
+  const { ask, done } = await open();
+  const [page, eye, right] = await ask(async e => {
+    const { eyeView } = await import('/player/xr.js');
+    const camera = e.player.camera.clone().set({ position: [1, 1, 4], target: [1, 1, 0], fov: 90 });
+    const at = x => ({
+      transform: { position: { x, y: 0, z: 0 }, orientation: { x: 0, y: 0, z: 0, w: 1 } },
+      // Field of view 90 degrees, square: as WebXR gives it, column by column.
+      projectionMatrix: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, -1, -1, 0, 0, -0.1, 0],
+    });
+    const plain = v => ({ ...v, cameraFromWorld: [...v.cameraFromWorld].map(x => +x.toFixed(9) + 0) });
+    return [camera.view(200, 200), eyeView(at(0), camera, 0.5, 200, 200), eyeView(at(0.03), camera, 0.5, 200, 200)]
+      .map(plain);
+  });
+  assert.deepEqual({ ...eye, fx: 0, fy: 0 }, { ...page, fx: 0, fy: 0 });
+  near(eye.fx, page.fx, 1e-9);
+  near(eye.fy, page.fy, 1e-9);
+  // 3 cm to the right, where half a metre is a unit: 0.06 units.
+  near(right.cameraFromWorld[3], eye.cameraFromWorld[3] - 0.06, 1e-9);
   await done();
 });

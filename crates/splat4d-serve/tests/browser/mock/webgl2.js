@@ -26,7 +26,8 @@ export class WebGL2Backend {
       const p = [r * Math.cos(a), 2 * h, r * Math.sin(a)];
       const [x, y, z] = [0, 4, 8].map(k => m[k] * p[0] + m[k + 1] * p[1] + m[k + 2] * p[2] + m[k + 3]);
       if (z < 0.05) continue;
-      g.fillStyle = channel === 'color' ? `hsl(${200 + 90 * h} 45% ${38 + 24 * Math.cos(a)}%)` : `hsl(0 0% ${100 - 15 * z}%)`;
+      g.fillStyle = channel === 'color' ? `hsl(${200 + 90 * h} 45% ${38 + 24 * Math.cos(a)}%)`
+        : `hsl(0 0% ${100 - 15 * z}%)`;
       g.beginPath();
       g.arc(view.fx * x / z + view.cx, view.fy * y / z + view.cy, 0.016 * view.fx / z, 0, 7);
       g.fill();

@@ -1,0 +1,58 @@
+// How large the picture is drawn, so that it keeps pace: lowered where frames come too slowly, raised again where there
+// is time to spare, and left alone where fewer pixels do not help.
+
+/** Frames a second that are kept, and above which the picture may grow again. */
+const KEEP = 30;
+const SPARE = 48;
+/** Smallest scale: a quarter of the pixels a side is still legible. */
+const SCALE_MIN = 0.25;
+/** Milliseconds and frames between two changes; with frames of half a second three must do. */
+const EVERY = 500;
+const FRAMES = 6;
+const FEW = 3;
+/** A scale that was too slow, or a lowering that was of no use, is not tried again for so long, ms. */
+const MEMORY = 8000;
+/** A lowering that makes frames faster by less than this was of no use. */
+const GAIN = 1.1;
+/** Share of the newest frame in the mean. */
+const SMOOTH = 0.15;
+
+export class Pace {
+  scale = 1;
+  /** Mean milliseconds of a frame. */
+  frameMs = 0;
+  #frames = 0;
+  #changed = 0;
+  #trial = null;
+  #tooSlow = { scale: Infinity, at: 0 };
+  #rest = -Infinity;
+
+  get fps() { return this.frameMs ? 1000 / this.frameMs : 0; }
+
+  /** A frame took `ms`, drawn at the present scale unless `fixed`; `now` in ms. */
+  frame(ms, now, fixed = false) {
+    // The first frame after a change is still one of before.
+    this.frameMs = this.#frames++ > 1 ? this.frameMs + SMOOTH * (ms - this.frameMs) : ms;
+    const since = now - this.#changed, enough = since > 4 * EVERY ? FEW : FRAMES;
+    if (fixed || this.#frames < enough || since < EVERY) return;
+    const { fps, scale } = this, trial = this.#trial;
+    this.#trial = null;
+    if (trial && fps < trial.fps * GAIN) {
+      this.#rest = now;
+      this.#change(trial.scale, now);
+    } else if (fps < 0.95 * KEEP && scale > SCALE_MIN && now - this.#rest > MEMORY) {
+      this.#trial = { scale, fps };
+      this.#tooSlow = { scale, at: now };
+      this.#change(Math.max(SCALE_MIN, scale * Math.min(0.9, Math.max(0.35, Math.sqrt(fps / KEEP)))), now);
+    } else if (fps > SPARE && scale < 1) {
+      const up = Math.min(1, scale * 1.15);
+      if (up < this.#tooSlow.scale || now - this.#tooSlow.at > MEMORY) this.#change(up, now);
+    }
+  }
+
+  #change(scale, now) {
+    this.scale = scale;
+    this.#frames = 0;
+    this.#changed = now;
+  }
+}
