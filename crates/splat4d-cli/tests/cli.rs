@@ -289,7 +289,7 @@ fn get(url: &str, path: &str) -> Vec<u8> {
 }
 
 /// Starts the command and reads on to the line that names its server.
-fn serve(args: &[&str]) -> (std::process::Child, impl Iterator<Item = String>, String) {
+fn serve(args: &[&str]) -> (std::process::Child, impl Iterator<Item = String> + use<>, String) {
     use std::io::{BufRead, BufReader};
     let mut child = std::process::Command::new(env!("CARGO_BIN_EXE_splat4d"))
         .args(args)
