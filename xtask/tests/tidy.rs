@@ -272,7 +272,8 @@ fn files_are_short() {
 #[test]
 fn unsafe_stays_where_it_is() {
     let says = |path: &str| {
-        let word = |l: &str| l.split(|c| !is_word(c)).any(|w| w == "unsafe");
+        // A hyphen belongs to the word: `unsafe-inline` is what web servers say about styles.
+        let word = |l: &str| l.split(|c| !is_word(c) && c != '-').any(|w| w == "unsafe");
         code(&read(path)).iter().any(|(_, l)| word(l))
     };
     let found: Vec<String> = sources().into_iter().filter(|p| !p.ends_with("xtask/tests/tidy.rs") && says(p)).collect();
