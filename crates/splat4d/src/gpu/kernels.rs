@@ -58,7 +58,11 @@ impl Kernel {
                     layout: Some(&pipeline_layout),
                     module: &module,
                     entry_point: Some(name),
-                    compilation_options: Default::default(),
+                    // Every kernel writes its workgroup's memory before it reads it: clearing would be wasted.
+                    compilation_options: wgpu::PipelineCompilationOptions {
+                        zero_initialize_workgroup_memory: false,
+                        ..Default::default()
+                    },
                     cache: None,
                 })
             })

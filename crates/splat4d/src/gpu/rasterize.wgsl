@@ -52,6 +52,11 @@ fn rasterize(
     var sum = vec4<f32>(0.0); // red, green, blue, depth
     var t = 1.0;
     var open = inside;
+    // Set here, because natively nobody clears a workgroup's memory.
+    if (thread == 0u) {
+        atomicStore(&stopped, 0u);
+    }
+    workgroupBarrier();
     if (!inside) {
         atomicAdd(&stopped, 1u);
     }

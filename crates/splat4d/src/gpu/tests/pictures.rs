@@ -40,7 +40,7 @@ fn compare(r: &mut GpuRenderer, splats: &Splats<'_, f32>, camera: &Camera, what:
 fn pictures_equal_the_cpus() {
     let Some(mut r) = renderer() else { return };
     println!("{}", r.gpu().describe());
-    let scenes = [Scenery::new(10, 4000, 1.2, 0.03), Scenery::new(11, 300, 1.0, 0.3), Scenery::new(12, 1, 0.1, 0.2)];
+    let scenes = [Scenery::new(10, 2000, 1.2, 0.03), Scenery::new(11, 200, 1.0, 0.3), Scenery::new(12, 1, 0.1, 0.2)];
     let cameras = [
         camera([0.0, 0.5, -4.0], 131, 77),
         camera([3.0, 1.5, 1.0], 64, 160),
