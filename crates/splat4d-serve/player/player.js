@@ -269,25 +269,30 @@ export class Player extends EventTarget {
     });
   }
 
-  /** WebGPU where there is one, else WebGL2; a canvas that one of them has touched is of no use to the other. */
+  /**
+   * WebGPU on a graphics card, else WebGL2, else WebGPU on the processor; a canvas that one of them has touched is of no
+   * use to another.
+   */
   async #makeBackend() {
-    const wanted = this.backendName === 'auto' ? ['webgpu', 'webgl2'] : [this.backendName];
     // A second loss makes WebGPU the less likely of the two.
-    if (this.#losses.length > 1) wanted.reverse();
+    const auto = this.#losses.length > 1 ? ['webgl2', 'webgpu'] : ['card', 'webgl2', 'webgpu'];
+    const wanted = this.backendName === 'auto' ? auto : [this.backendName];
     const reasons = [];
     for (const name of wanted) {
       const { canvas } = this;
       const onlost = reason => canvas === this.canvas && this.#lost(reason);
       try {
-        if (name === 'webgpu') {
+        if (name !== 'webgl2') {
           if (!navigator.gpu) throw new Error(isSecureContext ? 'not offered' : 'needs https or this computer');
-          this.backend = await (await import('./webgpu.js')).WebGPUBackend.create(this.canvas, { onlost });
+          this.backend = await (await import('./webgpu.js')).WebGPUBackend.create(this.canvas, {
+            onlost, hardware: name === 'card',
+          });
         } else this.backend = await (await import('./webgl2.js')).WebGL2Backend.create(this.canvas, { onlost });
         this.figures.fallback = reasons.join('; ');
         if (software(this.backend.gl)) this.#pace.scale = SCALE_SOFTWARE;
-        return this.emit('backend', { name });
+        return this.emit('backend', { name: this.backend.name });
       } catch (error) {
-        reasons.push(`${name === 'webgpu' ? 'WebGPU' : 'WebGL2'}: ${error.what ?? error.message}`);
+        reasons.push(`${name === 'webgl2' ? 'WebGL2' : 'WebGPU'}: ${error.what ?? error.message}`);
         this.#newCanvas();
       }
     }

@@ -77,6 +77,9 @@ class Runs {
   }
 }
 
+/// Names of drivers that compute on the processor.
+const SOFTWARE = /swiftshader|llvmpipe|lavapipe|software|basic render/i;
+
 export class WebGPUBackend {
   name = 'webgpu';
   stats = { resident: 0, active: 0, drawn: 0, sortMs: 0, drawMs: 0 };
@@ -109,10 +112,15 @@ export class WebGPUBackend {
 
   /// Throws SceneError where WebGPU is missing or refuses; the canvas can then still be used for WebGL2.
   /// `onlost(error)` is called at most once, when the device goes away or refuses a command; draw() then does nothing.
-  static async create(canvas, { onlost } = {}) {
+  /// `hardware`: also refuse where the processor computes WebGPU, which it does slower than WebGL2.
+  static async create(canvas, { onlost, hardware = false } = {}) {
     const adapter = await navigator.gpu?.requestAdapter({ powerPreference: 'high-performance' }).catch(() => null);
     if (!adapter) {
       throw new SceneError('WebGPU is not available', '', 'Use a browser with WebGPU, or let the player use WebGL2.');
+    }
+    const { info = {} } = adapter;
+    if (hardware && (info.isFallbackAdapter || SOFTWARE.test(`${info.architecture} ${info.description}`))) {
+      throw new SceneError('WebGPU would be computed by the processor', '', 'Let the player use WebGL2.');
     }
     // Everything fits the default limits; larger ones only make room for more Gaussians and larger pictures.
     const requiredLimits = {};
