@@ -3,7 +3,7 @@
 use crate::console::Console;
 use crate::device::{Brush, Device};
 use crate::video::Rgb;
-use splat4d::layers::{Instant, Scene};
+use splat4d::layers::{ALWAYS, Instant, Scene};
 use splat4d::render::{Antialias, Image, RenderConfig};
 use splat4d::scene::{Camera, Planes, Time};
 
@@ -60,8 +60,12 @@ impl<'a> Painter<'a> {
         self.brush.name()
     }
 
-    /// Draws into [`image`](Self::image).
+    /// Draws into [`image`](Self::image). Where layers are seen for a span of time only, as pages of playback files are,
+    /// time is held within the clip.
     pub(crate) fn draw(&mut self, camera: &Camera, time: f64) {
+        let [from, to] = self.scene.clip;
+        let paged = self.scene.layers.iter().any(|l| l.span != ALWAYS);
+        let time = if paged { time.max(from).min(to) } else { time };
         self.scene.at(Time(time), &mut self.instant);
         let splats = self.scene.splats(&self.instant);
         self.brush.draw(&splats, camera, self.background, &mut self.image);

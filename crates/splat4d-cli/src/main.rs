@@ -116,7 +116,7 @@ fn main() -> ExitCode {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             let code = exit_code(&error);
-            console.error(&format!("{error:#}"), code);
+            console.error(&told(&error), code);
             code.into()
         }
     }
@@ -130,6 +130,18 @@ fn threads(count: Option<u16>) -> anyhow::Result<()> {
             .map_err(|e| anyhow::anyhow!("{count} threads could not be started ({e}). Ask for fewer."))?;
     }
     Ok(())
+}
+
+/// The error and its causes, but no cause whose words were said already.
+fn told(error: &anyhow::Error) -> String {
+    error.chain().map(ToString::to_string).fold(String::new(), |mut said, cause| {
+        if said.is_empty() {
+            said = cause;
+        } else if !said.contains(&cause) {
+            said += &format!(": {cause}");
+        }
+        said
+    })
 }
 
 /// 2 where the user's data, files or options are at fault, 1 for everything else.
@@ -152,6 +164,14 @@ mod tests {
     #[test]
     fn the_command_line_is_consistent() {
         command().debug_assert();
+    }
+
+    #[test]
+    fn causes_are_told_once() {
+        let io = std::io::Error::other("disk on fire");
+        let error = anyhow::Error::from(Error::io("cannot be read", io)).context("the report");
+        let text = told(&error);
+        assert!(text.starts_with("the report: ") && text.matches("disk on fire").count() == 1, "{text}");
     }
 
     #[test]

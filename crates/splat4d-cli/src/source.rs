@@ -81,6 +81,9 @@ impl Source {
                 Err(Error::new(ErrorKind::Unsupported, "this format is not read")
                     .remedy("Convert it to .ply first, for instance with splat-transform."))
             }
+            None if path.extension().is_some_and(|e| e != "safetensors") && !looks_own(&bytes) => {
+                Err(Error::input("its first bytes are of no format that splat4d reads").remedy(REMEDY))
+            }
             None => format::scene::read(&bytes).map(Self::own).map_err(|e| e.remedy(REMEDY)),
         };
         opened.map_err(|e| e.at(path.display()))
@@ -112,6 +115,11 @@ impl Source {
         let (center, extent) = cloud(&self.scene);
         Stage::of_cloud(center, extent, self.scene.up)
     }
+}
+
+/// Whether a file may be safetensors: eight bytes of length, then JSON.
+fn looks_own(bytes: &[u8]) -> bool {
+    bytes.get(8) == Some(&b'{')
 }
 
 /// By content; by its ending only where there is nothing in the content to know it by.

@@ -26,12 +26,15 @@ fn main() -> splat4d::Result<()> {
     let frames: usize = args.next().and_then(|a| a.parse().ok()).unwrap_or(120);
     let mut times = vec![];
     let (mut renderer, mut image) = (Renderer::new(RenderConfig::default()), Image::default());
-    let mut sums = [0.0f64; 5];
+    let (mut sums, mut lookup) = ([0.0f64; 5], 0.0);
     let (mut visible, mut pairs, mut work, mut active) = (0, 0, 0, 0);
     for frame in 0..frames + 5 {
         let u = frame as f64 / frames as f64;
         let camera = camera(&cameras[frame * 7 % cameras.len()], size);
         let t = clip[0] + (clip[1] - clip[0]) * (u * 3.0).fract();
+        let start = Instant::now();
+        player.alive(Time(t));
+        let looked_up = start.elapsed().as_secs_f64();
         let start = Instant::now();
         let splats = player.at(Time(t))?;
         let evaluated = start.elapsed().as_secs_f64();
@@ -41,6 +44,7 @@ fn main() -> splat4d::Result<()> {
             continue;
         }
         times.push(total);
+        lookup += looked_up;
         let s = renderer.stage_seconds();
         for (sum, v) in sums.iter_mut().zip([evaluated, s.project, s.shade, s.bin, s.blend]) {
             *sum += v;
@@ -62,7 +66,8 @@ fn main() -> splat4d::Result<()> {
         1.0 / times[frames / 2]
     );
     println!(
-        "motion {:.2}  project {:.2}  shade {:.2}  bin {:.2}  blend {:.2} ms",
+        "active set {:.3}, within motion {:.2}  project {:.2}  shade {:.2}  bin {:.2}  blend {:.2} ms",
+        lookup / n * 1e3,
         sums[0] / n * 1e3,
         sums[1] / n * 1e3,
         sums[2] / n * 1e3,

@@ -174,6 +174,15 @@ impl Player {
         self.held.iter().map(|h| h.bytes).sum()
     }
 
+    /// Gaussians in memory that are alive at t: the lookup alone, without any of their motion.
+    pub fn alive(&mut self, t: Time) -> usize {
+        let alive = self.held.iter_mut().filter(|h| h.layer.spans_over(t)).map(|h| {
+            h.alive.rows(t.0, &mut h.ids);
+            h.ids.len()
+        });
+        alive.sum()
+    }
+
     /// The splats at time t; a playback file's time is clamped to its clip.
     ///
     /// Errors: a page that cannot be read. What was shown before is still held then.

@@ -70,6 +70,7 @@ fn a_player_shows_exactly_what_the_scene_holds() {
     for t in [0.0, 0.999, 1.0, 5.5, 5.99, 2.2, CLIP, 0.1] {
         scene.at(Time(t), &mut instant);
         let truth = numbers(&scene.splats(&instant));
+        assert_eq!(10 * whole.alive(Time(t)), truth.len(), "looked up at {t}");
         assert_eq!(numbers(&whole.at(Time(t)).unwrap()), truth, "in memory at {t}");
         assert_eq!(numbers(&streamed.at(Time(t)).unwrap()), truth, "from the file at {t}");
         shown += truth.len();
