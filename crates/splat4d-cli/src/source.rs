@@ -8,7 +8,7 @@ use crate::sequence;
 use splat4d::format::playback::{self, Index};
 use splat4d::format::ply::PlyInfo;
 use splat4d::format::{Dialect, Warnings, dialect, sog};
-use splat4d::layers::Scene;
+use splat4d::layers::{Layer, Scene};
 use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::scene::{Camera, GEOMETRY};
 use splat4d::{Error, ErrorKind, Result, format};
@@ -17,6 +17,10 @@ use std::path::Path;
 
 /// Share of a cloud, outermost first, that does not count for its size: a few far Gaussians must not shrink the rest.
 const OUTLIERS: f64 = 0.1;
+/// Share of a cloud's means beyond each side of the box that a first view shows: thin parts stay in it, strays do not.
+const BEYOND: f64 = 0.01;
+/// Room around that box.
+const ROOM: f64 = 1.1;
 
 /// What can be opened, for errors.
 const REMEDY: &str =
@@ -112,7 +116,7 @@ impl Source {
         if !views.is_empty() {
             return Stage::of_views(views, self.scene.up);
         }
-        let (center, extent) = cloud(&self.scene);
+        let (center, extent) = inner_box(&self.scene);
         Stage::of_cloud(center, extent, self.scene.up)
     }
 }
@@ -195,17 +199,34 @@ pub(crate) fn not_empty(scene: &Scene<f32>, path: &Path) -> Result<()> {
     Ok(())
 }
 
+/// All means that are numbers.
+fn means(scene: &Scene<f32>) -> Vec<[f64; 3]> {
+    let of = |layer: &'_ Layer<f32>| {
+        let table = &layer.params[GEOMETRY];
+        (0..table.rows()).map(|i| table.read::<3>(i, 0).map(f64::from)).collect::<Vec<_>>()
+    };
+    scene.layers.iter().flat_map(of).filter(|m| m.iter().all(|x| x.is_finite())).collect()
+}
+
+/// Middle and half the diagonal of the box of all means but the outermost.
+fn inner_box(scene: &Scene<f32>) -> ([f64; 3], f64) {
+    let means = means(scene);
+    if means.is_empty() {
+        return ([0.0; 3], 1.0);
+    }
+    let sides: [[f64; 2]; 3] = std::array::from_fn(|k| {
+        let mut values: Vec<f64> = means.iter().map(|m| m[k]).collect();
+        values.sort_by(f64::total_cmp);
+        let out = (values.len() as f64 * BEYOND) as usize;
+        [values[out], values[values.len() - 1 - out]]
+    });
+    let half = sides.map(|[low, high]| 0.5 * (high - low));
+    (sides.map(|[low, high]| 0.5 * (low + high)), ROOM * splat4d::math::se3::norm(half).max(1e-6))
+}
+
 /// Middle (medians) and radius of the inner part of all means.
 pub(crate) fn cloud(scene: &Scene<f32>) -> ([f64; 3], f64) {
-    let means: Vec<[f64; 3]> = scene
-        .layers
-        .iter()
-        .flat_map(|l| {
-            let table = &l.params[GEOMETRY];
-            (0..table.rows()).map(move |i| table.read::<3>(i, 0).map(f64::from))
-        })
-        .filter(|m| m.iter().all(|x| x.is_finite()))
-        .collect();
+    let means = means(scene);
     if means.is_empty() {
         return ([0.0; 3], 1.0);
     }
