@@ -3,7 +3,8 @@
 use crate::console::Console;
 use crate::device::{Brush, Device};
 use crate::video::Rgb;
-use splat4d::layers::{ALWAYS, Instant, Scene};
+use splat4d::layers::Scene;
+use splat4d::play::Player;
 use splat4d::render::{Antialias, Image, RenderConfig};
 use splat4d::scene::{Camera, Planes, Time};
 
@@ -32,11 +33,10 @@ const DEPTH_COLORS: [[f32; 3]; 6] = [
 
 /// Draws, on the CPU unless told; memory is reused from picture to picture.
 pub(crate) struct Painter<'a> {
-    scene: &'a Scene<f32>,
+    player: Player<'a>,
     background: [f32; 3],
     config: RenderConfig,
     brush: Brush<'a>,
-    instant: Instant<f32>,
     /// The last picture.
     pub image: Image<f32>,
 }
@@ -45,8 +45,8 @@ impl<'a> Painter<'a> {
     pub(crate) fn new(scene: &'a Scene<f32>, background: [f32; 3], antialias: bool) -> Self {
         let antialias = if antialias { Antialias::On } else { Antialias::Off };
         let config = RenderConfig { antialias, ..RenderConfig::default() };
-        let (instant, image) = (Instant::default(), Image::default());
-        Self { scene, background, config, brush: Brush::cpu(config), instant, image }
+        let (player, brush, image) = (Player::of_scene(scene), Brush::cpu(config), Image::default());
+        Self { player, background, config, brush, image }
     }
 
     /// The same on another device.
@@ -60,14 +60,9 @@ impl<'a> Painter<'a> {
         self.brush.name()
     }
 
-    /// Draws into [`image`](Self::image). Where layers are seen for a span of time only, as pages of playback files are,
-    /// time is held within the clip.
+    /// Draws into [`image`](Self::image).
     pub(crate) fn draw(&mut self, camera: &Camera, time: f64) {
-        let [from, to] = self.scene.clip;
-        let paged = self.scene.layers.iter().any(|l| l.span != ALWAYS);
-        let time = if paged { time.max(from).min(to) } else { time };
-        self.scene.at(Time(time), &mut self.instant);
-        let splats = self.scene.splats(&self.instant);
+        let splats = self.player.at(Time(time)).expect("nothing is read for a scene that is in memory");
         self.brush.draw(&splats, camera, self.background, &mut self.image);
     }
 

@@ -19,7 +19,7 @@ fn main() -> splat4d::Result<()> {
         false => splat4d::format::scene::read(&bytes)?,
     };
     let (clip, background, gaussians) = (scene.clip, scene.background, scene.len());
-    let mut player = Player::of_scene(scene);
+    let mut player = Player::of_scene(&scene);
     let cameras = std::fs::read_to_string(args.next().expect("name cameras.json")).expect("cameras cannot be read");
     let cameras: Vec<Value> = serde_json::from_str(&cameras).expect("cameras.json is a list");
     let size: usize = args.next().and_then(|a| a.parse().ok()).unwrap_or(800);

@@ -12,6 +12,7 @@ use crate::motion::Cache;
 use crate::scene::{Rows, Space, Splats, Time};
 use crate::{Error, Result};
 use rayon::prelude::*;
+use std::borrow::Cow;
 
 /// Rows that share one test of whether any of them is alive: the blocks of the playback file.
 const BLOCK: usize = crate::format::playback::BLOCK_GAUSSIANS;
@@ -39,6 +40,8 @@ impl ReadAt for &[u8] {
 /// When the rows of one layer are alive.
 #[derive(Debug, Default)]
 struct Alive {
+    /// Nobody is ever born or dies: every row is meant.
+    all: bool,
     /// [from, to] of every row, seconds; from > to: never.
     spans: Vec<[f64; 2]>,
     /// [earliest, latest] of every block of rows.
@@ -47,6 +50,11 @@ struct Alive {
 
 impl Alive {
     fn of(layer: &Layer) -> Self {
+        // Asked within its span, because outside of it nobody is alive.
+        let inside = if layer.span[0].is_finite() { layer.span[0] } else { 0.0 };
+        if layer.active(Time(inside), &mut Vec::new()) {
+            return Self { all: true, ..Self::default() };
+        }
         let spans = layer.spans();
         let block = |rows: &[[f64; 2]]| {
             rows.iter()
@@ -54,7 +62,7 @@ impl Alive {
                 .fold([f64::INFINITY, f64::NEG_INFINITY], |all, [from, to]| [all[0].min(*from), all[1].max(*to)])
         };
         let blocks = spans.chunks(BLOCK).map(block).collect();
-        Self { spans, blocks }
+        Self { all: false, spans, blocks }
     }
 
     /// The rows alive at t, strictly increasing.
@@ -71,10 +79,10 @@ impl Alive {
 
 /// A layer in memory.
 #[derive(Debug)]
-struct Held {
+struct Held<'a> {
     /// Its section in the file; its number in the scene.
     section: usize,
-    layer: Layer,
+    layer: Cow<'a, Layer>,
     alive: Alive,
     tape: LayerTape,
     ids: Vec<u32>,
@@ -82,12 +90,21 @@ struct Held {
     bytes: usize,
 }
 
-impl Held {
-    fn new(section: usize, layer: Layer) -> Self {
+impl<'a> Held<'a> {
+    fn new(section: usize, layer: Cow<'a, Layer>) -> Self {
         let alive = Alive::of(&layer);
         let numbers: usize = layer.params.keys().map(|k| layer.params[k].data().len()).sum();
         let bytes = 4 * numbers + 16 * alive.spans.len();
         Self { section, layer, alive, tape: LayerTape::default(), ids: Vec::new(), cache: Cache::default(), bytes }
+    }
+
+    /// Looks up who is alive at t; returns how many.
+    fn look_up(&mut self, t: Time) -> usize {
+        if self.alive.all {
+            return self.layer.params.len();
+        }
+        self.alive.rows(t.0, &mut self.ids);
+        self.ids.len()
     }
 }
 
@@ -100,10 +117,10 @@ struct File {
 }
 
 /// Shows a scene or a playback file at any time.
-pub struct Player {
+pub struct Player<'a> {
     file: Option<File>,
     meta: Meta,
-    held: Vec<Held>,
+    held: Vec<Held<'a>>,
     budget: usize,
     /// Places in `held` of what the last [`at`](Self::at) shows.
     shown: Vec<usize>,
@@ -111,15 +128,15 @@ pub struct Player {
     bytes_read: u64,
 }
 
-impl std::fmt::Debug for Player {
+impl std::fmt::Debug for Player<'_> {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "Player({} layers held, {} bytes)", self.held.len(), self.held_bytes())
     }
 }
 
-impl Player {
+impl<'a> Player<'a> {
     /// Plays a scene that is in memory.
-    pub fn of_scene(scene: Scene<f32>) -> Self {
+    pub fn of_scene(scene: &'a Scene<f32>) -> Self {
         let meta = Meta {
             clip: scene.clip,
             fps: scene.fps,
@@ -128,7 +145,7 @@ impl Player {
             gaussians: scene.len(),
             ..Meta::default()
         };
-        let held = scene.layers.into_par_iter().enumerate().map(|(i, layer)| Held::new(i, layer)).collect();
+        let held = scene.layers.par_iter().enumerate().map(|(i, layer)| Held::new(i, Cow::Borrowed(layer))).collect();
         Self { file: None, meta, held, budget: usize::MAX, shown: Vec::new(), bytes_read: 0 }
     }
 
@@ -176,11 +193,7 @@ impl Player {
 
     /// Gaussians in memory that are alive at t: the lookup alone, without any of their motion.
     pub fn alive(&mut self, t: Time) -> usize {
-        let alive = self.held.iter_mut().filter(|h| h.layer.spans_over(t)).map(|h| {
-            h.alive.rows(t.0, &mut h.ids);
-            h.ids.len()
-        });
-        alive.sum()
+        self.held.iter_mut().filter(|h| h.layer.spans_over(t)).map(|h| h.look_up(t)).sum()
     }
 
     /// The splats at time t; a playback file's time is clamped to its clip.
@@ -193,8 +206,9 @@ impl Player {
         self.shown.clear();
         self.shown.extend((0..self.held.len()).filter(|&i| self.held[i].layer.spans_over(t)));
         self.held.par_iter_mut().filter(|h| h.layer.spans_over(t)).for_each(|h| {
-            h.alive.rows(t.0, &mut h.ids);
-            h.tape.ask(Space::Gaussians, Rows::Some(&h.ids), t);
+            h.look_up(t);
+            let rows = if h.alive.all { Rows::All } else { Rows::Some(&h.ids) };
+            h.tape.ask(Space::Gaussians, rows, t);
             h.cache = Cache::default();
             h.layer.motion.prepare(&h.layer.params, &[h.tape.question(&h.layer.params)], &mut h.cache);
             h.layer.at(&h.cache, &mut h.tape);
@@ -212,9 +226,9 @@ impl Player {
             let palette = file.palette(entry.palette, &mut self.bytes_read)?;
             let page = decode_page(&entry, &stored).map_err(|e| e.at(format!("section {section}")))?;
             let layer = page.layer(palette).map_err(|e| e.at(format!("section {section}")))?;
-            self.held.insert(place, Held::new(section, layer));
+            self.held.insert(place, Held::new(section, Cow::Owned(layer)));
         }
-        let distance = |h: &Held| (h.layer.span[0] - t.0).max(t.0 - h.layer.span[1]).max(0.0);
+        let distance = |h: &Held<'_>| (h.layer.span[0] - t.0).max(t.0 - h.layer.span[1]).max(0.0);
         while self.held_bytes() > self.budget {
             let idle = self.held.iter().enumerate().filter(|(_, h)| !h.layer.spans_over(t));
             let Some((far, _)) = idle.max_by(|a, b| distance(a.1).total_cmp(&distance(b.1))) else { break };

@@ -62,7 +62,7 @@ impl ReadAt for Counted {
 fn a_player_shows_exactly_what_the_scene_holds() {
     let file = take();
     let scene = read(&file).unwrap();
-    let mut whole = Player::of_scene(read(&file).unwrap());
+    let mut whole = Player::of_scene(&scene);
     let length = file.len() as u64;
     let mut streamed = Player::open(Box::new(Counted(file, Arc::default())), length, 1).unwrap();
     let mut instant = Instant::default();
@@ -79,9 +79,25 @@ fn a_player_shows_exactly_what_the_scene_holds() {
 }
 
 #[test]
+fn a_layer_that_lives_for_ever_is_shown_whole() {
+    let mut params = crate::scene::Params::new(3, 1, &[]);
+    let motion = crate::motion::build(&crate::motion::Spec::Still, &mut params).unwrap();
+    // A model may raise an opacity that is next to nothing as it is learnt: the lookup must not judge by it.
+    params[crate::scene::GEOMETRY].set(1, crate::scene::params::OPACITY, -20.0);
+    let life = crate::scene::LifeKind::Infinite;
+    for span in [ALWAYS, [0.5, 2.0]] {
+        let layer = Layer { name: "a".into(), params: params.clone(), motion: motion.clone(), life, span };
+        let scene = Scene { layers: vec![layer], clip: [0.0, 1.0], ..Scene::default() };
+        let mut player = Player::of_scene(&scene);
+        assert_eq!(player.at(Time(0.7)).unwrap().len(), 3);
+        assert_eq!(player.at(Time(0.2)).unwrap().len(), if span == ALWAYS { 3 } else { 0 });
+    }
+}
+
+#[test]
 fn time_is_clamped_to_the_clip_of_a_file() {
-    let file = take();
-    let mut player = Player::of_scene(read(&file).unwrap());
+    let scene = read(&take()).unwrap();
+    let mut player = Player::of_scene(&scene);
     let end = numbers(&player.at(Time(CLIP)).unwrap());
     assert_eq!(numbers(&player.at(Time(1e6)).unwrap()), end);
     assert!(!end.is_empty());
