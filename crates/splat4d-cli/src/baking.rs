@@ -190,23 +190,6 @@ fn distinct(views: &[View]) -> Vec<&View> {
 
 /// What the file says about the scene.
 fn meta(scene: &Scene<f32>, baked: &bake::Baked, stage: &Stage, views: &[&View]) -> Meta {
-    let named = |view: &&View| {
-        let (camera, world) = (&view.camera, view.camera.cam_from_world.inverse());
-        let k = &camera.intrinsics;
-        NamedCamera {
-            name: view.name.clone(),
-            world_from_camera: std::array::from_fn(|i| match i % 4 {
-                3 => world.translation[i / 4],
-                column => world.rotation[i / 4][column],
-            }),
-            width: camera.width,
-            height: camera.height,
-            fx: k.fx,
-            fy: k.fy,
-            cx: k.cx,
-            cy: k.cy,
-        }
-    };
     let look = |share: f64| {
         let camera = stage.orbit(share);
         let fov = 2.0 * (0.5 * camera.height as f64 / camera.intrinsics.fy).atan();
@@ -225,7 +208,7 @@ fn meta(scene: &Scene<f32>, baked: &bake::Baked, stage: &Stage, views: &[&View])
         sh_degree: baked.sh_degree,
         bounds: bounds(&baked.nodes),
         view: Some(look(0.0)),
-        cameras: views.iter().map(named).collect(),
+        cameras: views.iter().map(|v| NamedCamera::new(&v.name, &v.camera)).collect(),
         // The last key is the first again, so that the orbit closes.
         path: (0..=PATH_KEYS).map(key).collect(),
         ..Meta::default()

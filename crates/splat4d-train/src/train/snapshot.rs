@@ -40,22 +40,7 @@ impl Snapshots {
                 poses.push((frame.camera, frame.view.clone()));
             }
         }
-        let named = |(camera, view): &(usize, Camera)| {
-            let (world, k) = (view.cam_from_world.inverse(), &view.intrinsics);
-            NamedCamera {
-                name: capture.cameras[*camera].name.clone(),
-                world_from_camera: std::array::from_fn(|i| match i % 4 {
-                    3 => world.translation[i / 4],
-                    column => world.rotation[i / 4][column],
-                }),
-                width: view.width,
-                height: view.height,
-                fx: k.fx,
-                fy: k.fy,
-                cx: k.cx,
-                cy: k.cy,
-            }
-        };
+        let named = |(camera, view): &(usize, Camera)| NamedCamera::new(&capture.cameras[*camera].name, view);
         Self {
             interval,
             due: Instant::now(),
