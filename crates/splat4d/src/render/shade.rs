@@ -159,13 +159,13 @@ impl<F: Real> Kernel for Forward<'_, F> {
             };
             for (l, (row, out)) in rows.iter().zip(out).enumerate() {
                 let visible = row.radius > F::ZERO;
-                *out = if visible { [rgb[0][l], rgb[1][l], rgb[2][l], row.depth] } else { [F::ZERO; CHANNELS] };
+                *out = if visible { [rgb[0][l], rgb[1][l], rgb[2][l]] } else { [F::ZERO; CHANNELS] };
             }
         }
     }
 }
 
-/// Colours and depths of all splats: red, green, blue, z; culled splats get zeros.
+/// Colours of all splats: red, green, blue; culled splats get zeros.
 ///
 /// Shapes: `projected`, `channels` [all splats]. SH of `degree` at most, clamped at 0 from below; direct colours are
 /// taken as they are, columns beyond the third are not drawn.
@@ -376,7 +376,7 @@ impl<F: Real> Kernel for DirectionGrads<'_, F> {
     }
 }
 
-/// VJP of [`forward`]; depth (channel 3) is the projection's affair.
+/// VJP of [`forward`].
 ///
 /// Adds to `parts[..].out` (means, through the direction), to `d_sh` (base SH, rows `rows.id(j)`) and to the pose
 /// gradient; overwrites `parts[..].color` and `.weights`. `partial` is scratch.
