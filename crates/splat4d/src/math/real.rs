@@ -55,6 +55,8 @@ pub trait Real:
     fn floor(self) -> Self;
     /// Integer part; saturates, NaN is 0.
     fn i32(self) -> i32;
+    /// The whole number that self is, for |self| < 2^22, without a branch; anything else gives any number.
+    fn lane_i32(self) -> i32;
     /// Smaller of two; NaN loses.
     fn min(self, other: Self) -> Self;
     /// Larger of two; NaN loses.
@@ -150,6 +152,10 @@ macro_rules! common {
 impl Real for f64 {
     common!(f64);
     #[inline(always)]
+    fn lane_i32(self) -> i32 {
+        self as i32
+    }
+    #[inline(always)]
     fn blend_exp2<const FMA: bool>(self) -> Self {
         self.exp2()
     }
@@ -166,12 +172,19 @@ const EXP2_MINIMAX: [f32; 4] = [0.693_124_196, 0.240_240_984, 0.055_906_423, 0.0
 /// Bits of an f32 below its exponent.
 const MANTISSA_BITS: u32 = f32::MANTISSA_DIGITS - 1;
 
+/// 1.5·2^23: the sum with a number below 2^22 is rounded to a whole one, which its low bits hold in two's complement.
+const ROUND: f32 = 12_582_912.0;
+
 impl Real for f32 {
     common!(f32);
     #[inline(always)]
+    fn lane_i32(self) -> i32 {
+        // A cast saturates, for which there is no vector instruction.
+        ((self + ROUND).to_bits() as i32).wrapping_sub(ROUND.to_bits() as i32)
+    }
+    #[inline(always)]
     fn blend_exp2<const FMA: bool>(self) -> Self {
-        // 2^x = 2^n · 2^f with n = round(x); adding and subtracting 1.5·2^23 rounds without a branch.
-        const ROUND: f32 = 12_582_912.0;
+        // 2^x = 2^n · 2^f with n = round(x); adding and subtracting rounds without a branch.
         let shifted = self + ROUND;
         let f = self - (shifted - ROUND);
         let mut p = EXP2_MINIMAX[3];
@@ -213,6 +226,13 @@ mod tests {
             }
         }
         assert!(worst < 5e-6, "relative error {worst}");
+    }
+
+    #[test]
+    fn lane_i32_is_a_cast() {
+        for i in [0, 1, -1, 2, 31, 32, 1279, 65_535, (1 << 22) - 1, -(1 << 22) + 1] {
+            assert_eq!((f32::lane_i32(i as f32), f64::lane_i32(i as f64)), (i, i));
+        }
     }
 
     #[test]

@@ -57,6 +57,12 @@ impl Footprint {
         (self.x0 & LARGE != 0).then(|| [self.x0 & !LARGE, x1, self.y0, y1].map(usize::from))
     }
 
+    /// Whether no bin is touched.
+    #[inline(always)]
+    pub fn is_empty(&self) -> bool {
+        self.cover == 0
+    }
+
     /// Number of bins touched; 0 for a culled splat.
     #[inline(always)]
     pub fn count(&self) -> usize {
@@ -102,26 +108,36 @@ impl Footprint {
         }
     }
 
-    /// Calls `f` with the number of every touched bin of `run`, ascending.
+    /// The numbers of all touched bins.
+    #[cfg(test)]
+    pub(super) fn bins_for_tests(&self, out: &mut Vec<usize>, across: usize) {
+        let mut all: Vec<usize> = (0..across * usize::from(u16::MAX)).collect();
+        self.for_each(across, 0, &mut all, |bin| out.push(*bin));
+    }
+
+    /// Calls `f` with what `cells` has for every touched bin, ascending; `cells` holds the bins from `first` on, other
+    /// bins are left out.
     #[inline(always)]
-    fn for_each(&self, across: usize, run: &Range<usize>, mut f: impl FnMut(usize)) {
+    fn for_each<T>(&self, across: usize, first: usize, cells: &mut [T], mut f: impl FnMut(&mut T)) {
         if let Some([x0, x1, y0, y1]) = self.large() {
-            for y in y0.max(run.start / across)..y1.min(run.end.div_ceil(across)) {
-                for bin in (y * across + x0).max(run.start)..(y * across + x1).min(run.end) {
-                    f(bin);
+            let end = first + cells.len();
+            for y in y0.max(first / across)..y1.min(end.div_ceil(across)) {
+                let (from, to) = ((y * across + x0).max(first), (y * across + x1).min(end));
+                if from < to {
+                    cells[from - first..to - first].iter_mut().for_each(&mut f);
                 }
             }
             return;
         }
-        let corner = usize::from(self.y0) * across + usize::from(self.x0);
-        let mut m = self.cover;
-        while m != 0 {
-            let bit = m.trailing_zeros() as usize;
-            let bin = corner + bit / MASK_SIDE * across + bit % MASK_SIDE;
-            if run.contains(&bin) {
-                f(bin);
+        // A bin before the first one wraps to a number that `cells` does not have.
+        let corner = (usize::from(self.y0) * across + usize::from(self.x0)).wrapping_sub(first);
+        let mut mask = self.cover;
+        while mask != 0 {
+            let bit = mask.trailing_zeros() as usize;
+            if let Some(cell) = cells.get_mut(corner.wrapping_add(bit / MASK_SIDE * across + bit % MASK_SIDE)) {
+                f(cell);
             }
-            m &= m - 1;
+            mask &= mask - 1;
         }
     }
 }
@@ -161,57 +177,79 @@ pub fn id(key: u64) -> usize {
     (key & u64::from(u32::MAX)) as usize
 }
 
-/// Most buckets of a sort: their counts stay in the first-level cache.
-const BUCKETS: usize = 2048;
-/// Keys in a bucket above which it is sorted on its own before the last pass, whose time grows with their square.
-const CROWDED: u32 = 24;
+/// Bits of a digit by which a bin of few keys, and of many, is sorted: the counts stay in the first-level cache.
+const DIGIT_BITS: [u32; 2] = [8, 11];
+/// Keys from which digits are wide: the counts cost less than what they save.
+const MANY: usize = 4096;
+/// Keys up to which a sort is insertions only.
+const FEW: usize = 24;
+/// Moves a key that insertions may take on the whole before a comparison sort takes over, whose time has a bound.
+const MOVES: usize = 16;
 
-/// Writes the keys of `from`, which are all different, to `to` in ascending order.
+/// Writes the keys of `staged`, which are all different, to `out` in ascending order; `staged` is scratch afterwards.
 ///
-/// One pass puts keys into about as many buckets of equal ranges of depth as there are keys, and a pass of insertions
-/// puts right what is left. A comparison sort costs three times as much.
-fn sort(from: &[AtomicU64], to: &mut [u64]) {
+/// Two stable passes sort by the two highest digits in which depths differ, which leaves next to nothing for the last
+/// pass, of insertions, by the whole key. Three times as fast as a comparison sort.
+fn sort(staged: &[AtomicU64], out: &mut [u64]) {
     let key = |k: &AtomicU64| k.load(Ordering::Relaxed);
-    let (low, high) = from.iter().map(key).fold((u64::MAX, 0), |(low, high), k| (low.min(k), high.max(k)));
-    // Depths from here on: low ≤ high but for an empty bin.
-    let low = low >> 32;
-    let spread = (high >> 32).saturating_sub(low);
-    let wanted = from.len().next_power_of_two().min(BUCKETS);
-    let shift = 32 + (u64::BITS - spread.leading_zeros()).saturating_sub(wanted.trailing_zeros());
-    let base = low << 32;
-    let bucket = |k: u64| ((k - base) >> shift) as usize % BUCKETS;
-    let mut places = [0u32; BUCKETS];
-    for k in from {
-        places[bucket(key(k))] += 1;
-    }
-    let (mut sum, mut most) = (0, 0);
-    for place in &mut places[..wanted] {
-        most = most.max(*place);
-        sum += std::mem::replace(place, sum);
-    }
-    for k in from {
-        let k = key(k);
-        let place = &mut places[bucket(k)];
-        to[*place as usize] = k;
-        *place += 1;
-    }
-    if most > CROWDED {
-        let mut start = 0;
-        for &end in &places[..wanted] {
-            if end - start > CROWDED {
-                to[start as usize..end as usize].sort_unstable();
-            }
-            start = end;
+    if out.len() > FEW {
+        if out.len() < MANY {
+            by_digits::<{ DIGIT_BITS[0] }, { 1 << DIGIT_BITS[0] }>(staged, out);
+        } else {
+            by_digits::<{ DIGIT_BITS[1] }, { 1 << DIGIT_BITS[1] }>(staged, out);
         }
     }
-    for i in 1..to.len() {
-        let k = to[i];
+    let mut moves = 0;
+    for (i, k) in staged.iter().enumerate() {
+        let k = key(k);
         let mut at = i;
-        while at > 0 && to[at - 1] > k {
-            to[at] = to[at - 1];
+        while at > 0 && out[at - 1] > k {
+            out[at] = out[at - 1];
             at -= 1;
         }
-        to[at] = k;
+        out[at] = k;
+        moves += i - at;
+        if moves > MOVES * out.len() {
+            for (out, k) in out.iter_mut().zip(staged).skip(i + 1) {
+                *out = key(k);
+            }
+            return out.sort_unstable();
+        }
+    }
+}
+
+/// Sorts `staged` stably by the 2·BITS highest bits of those in which the depths differ; `scratch` is as long.
+fn by_digits<const BITS: u32, const SIZE: usize>(staged: &[AtomicU64], scratch: &mut [u64]) {
+    let key = |k: &AtomicU64| k.load(Ordering::Relaxed);
+    let (low, high) = staged.iter().map(key).fold((u64::MAX, 0), |(low, high), k| (low.min(k), high.max(k)));
+    let base = low >> u32::BITS << u32::BITS;
+    let shift = (u64::BITS - (high - base).leading_zeros()).max(u32::BITS + 2 * BITS) - 2 * BITS;
+    let digits = |k: u64| {
+        let v = ((k - base) >> shift) as usize;
+        [v % SIZE, v / SIZE % SIZE]
+    };
+    let mut places = [[0u32; SIZE]; 2];
+    for k in staged {
+        let d = digits(key(k));
+        places[0][d[0]] += 1;
+        places[1][d[1]] += 1;
+    }
+    for places in &mut places {
+        let mut sum = 0;
+        for place in places {
+            sum += std::mem::replace(place, sum);
+        }
+    }
+    for k in staged {
+        let k = key(k);
+        let place = &mut places[0][digits(k)[0]];
+        scratch[*place as usize] = k;
+        *place += 1;
+    }
+    for &k in &*scratch {
+        let place = &mut places[1][digits(k)[1]];
+        staged[*place as usize].store(k, Ordering::Relaxed);
+        *place += 1;
     }
 }
 
@@ -223,51 +261,48 @@ impl Bins {
         (self.across, self.down) = (width.div_ceil(BIN), height.div_ceil(BIN));
         assert!(self.across.max(self.down) < LARGE.into(), "a footprint holds the number of a bin in 15 bits");
         let bins = self.bins();
-        self.total = footprints.par_iter().with_min_len(CHUNK).map(|f| f.count() as u64).sum();
         self.runs.clear();
+        self.runs.push(0..bins);
+        self.total = self.count(footprints, 0..bins);
         if self.total <= budget as u64 {
-            self.runs.push(0..bins);
-        } else {
-            let mut first = 0;
-            let mut held = 0;
-            for (bin, pairs) in self.pairs_by_bin(footprints).into_iter().enumerate() {
-                if bin > first && held + pairs > budget as u64 {
-                    self.runs.push(first..bin);
-                    (first, held) = (bin, 0);
-                }
-                held += pairs;
-            }
-            self.runs.push(first..bins);
+            return self.place(footprints, 0);
         }
+        self.runs.clear();
+        let (mut first, mut held) = (0, 0);
+        for bin in 0..bins {
+            let pairs = self.cursors.iter().skip(bin).step_by(bins).map(|&c| u64::from(c)).sum::<u64>();
+            if bin > first && held + pairs > budget as u64 {
+                self.runs.push(first..bin);
+                (first, held) = (bin, 0);
+            }
+            held += pairs;
+        }
+        self.runs.push(first..bins);
         self.fill(footprints, 0);
     }
 
-    /// Pairs of every bin, in time that does not grow with the size of large footprints.
-    fn pairs_by_bin(&self, footprints: &[Footprint]) -> Vec<u64> {
-        let (across, stride) = (self.across, self.across + 1);
-        let mut counts = vec![0u64; self.bins()];
-        // A large rectangle is four corners of a table of differences; sums wrap back.
-        let mut corners = vec![0u64; stride * (self.down + 1)];
-        for foot in footprints {
-            let Some([x0, x1, y0, y1]) = foot.large() else {
-                foot.for_each(across, &(0..self.bins()), |b| counts[b] += 1);
-                continue;
-            };
-            for (x, y, step) in [(x0, y0, 1), (x1, y1, 1), (x1, y0, u64::MAX), (x0, y1, u64::MAX)] {
-                corners[y * stride + x] = corners[y * stride + x].wrapping_add(step);
-            }
+    /// Makes the lists of run `run`.
+    pub fn fill(&mut self, footprints: &[Footprint], run: usize) {
+        self.count(footprints, self.runs[run].clone());
+        self.place(footprints, run);
+    }
+
+    /// Counts the pairs of every chunk of splats with every bin of `run`; returns how many there are.
+    fn count(&mut self, footprints: &[Footprint], run: Range<usize>) -> u64 {
+        let across = self.across;
+        self.cursors.clear();
+        self.cursors.resize(footprints.len().div_ceil(CHUNK) * run.len(), 0);
+        if run.is_empty() {
+            return 0;
         }
-        for y in 0..self.down {
-            let mut row = 0u64;
-            for x in 0..across {
-                row = row.wrapping_add(corners[y * stride + x]);
-                // What has been summed so far stands where the next row looks.
-                let above = if y > 0 { corners[(y - 1) * stride + x] } else { 0 };
-                corners[y * stride + x] = row.wrapping_add(above);
-                counts[y * across + x] += corners[y * stride + x];
+        let chunks = self.cursors.par_chunks_mut(run.len()).zip(footprints.par_chunks(CHUNK));
+        let pairs = chunks.map(|(counts, feet)| {
+            for foot in feet {
+                foot.for_each(across, run.start, counts, |count| *count += 1);
             }
-        }
-        counts
+            counts.iter().map(|&c| u64::from(c)).sum::<u64>()
+        });
+        pairs.sum()
     }
 
     /// Number of bins.
@@ -275,71 +310,52 @@ impl Bins {
         self.across * self.down
     }
 
-    /// Makes the lists of run `run`.
-    pub fn fill(&mut self, footprints: &[Footprint], run: usize) {
+    /// Makes the lists of run `run`, which has been counted.
+    fn place(&mut self, footprints: &[Footprint], run: usize) {
         self.current = run;
-        let run = self.runs[run].clone();
-        let (across, bins) = (self.across, self.bins());
-        let chunks = footprints.len().div_ceil(CHUNK);
-        self.cursors.clear();
-        self.cursors.resize(chunks * bins, 0);
-        self.first.resize(footprints.len(), 0);
+        let (across, bins, run) = (self.across, self.bins(), self.runs[run].clone());
         self.starts.clear();
         self.starts.resize(bins + 1, 0);
+        self.first.resize(footprints.len(), 0);
         self.chunk_starts.clear();
-        self.chunk_starts.resize(chunks + 1, 0);
-        if bins == 0 || chunks == 0 {
-            self.keys.clear();
-            return;
+        if run.is_empty() {
+            return self.keys.clear();
         }
-        // First pass: count by chunk and bin.
-        let counting = self.cursors.par_chunks_mut(bins).zip(&mut self.chunk_starts[1..]);
-        counting.zip(footprints.par_chunks(CHUNK)).for_each(|((counts, total), feet)| {
-            for foot in feet {
-                foot.for_each(across, &run, |bin| {
-                    counts[bin] += 1;
-                    *total += 1;
-                });
-            }
-        });
-        for chunk in 0..chunks {
-            self.chunk_starts[chunk + 1] += self.chunk_starts[chunk];
-        }
-        for counts in self.cursors.chunks(bins) {
-            for (start, count) in self.starts[1..].iter_mut().zip(counts) {
+        // A bin's keys are those of the first chunk, then those of the second, and so on: counts become places.
+        let starts = &mut self.starts[run.start..];
+        for counts in self.cursors.chunks(run.len()) {
+            for (start, &count) in starts[1..].iter_mut().zip(counts) {
                 *start += count;
             }
         }
-        for b in 0..bins {
-            self.starts[b + 1] += self.starts[b];
+        let mut pairs = 0;
+        for start in &mut *starts {
+            pairs += *start;
+            *start = pairs;
         }
-        // A bin's keys are those of the first chunk, then those of the second: counts become places.
-        let pairs = self.starts[bins] as usize;
-        let mut next = std::mem::take(&mut self.next);
-        next.clear();
-        next.extend_from_slice(&self.starts[..bins]);
-        for counts in self.cursors.chunks_mut(bins) {
-            for (next, count) in next.iter_mut().zip(counts) {
-                let place = *next;
-                *next += *count;
-                *count = place;
+        let mut slot = 0;
+        self.next.clear();
+        self.next.extend_from_slice(&starts[..run.len()]);
+        for counts in self.cursors.chunks_mut(run.len()) {
+            self.chunk_starts.push(slot);
+            for (next, count) in self.next.iter_mut().zip(counts) {
+                slot += *count;
+                *next += std::mem::replace(count, *next);
             }
         }
-        self.next = next;
-        self.staged.resize_with(pairs, AtomicU64::default);
-        self.keys.resize(pairs, 0);
-        // Second pass: each chunk puts its keys where its places are.
+        self.staged.resize_with(pairs as usize, AtomicU64::default);
+        self.keys.resize(pairs as usize, 0);
         let staged = &self.staged;
-        let placing = self.cursors.par_chunks_mut(bins).zip(self.chunk_starts.par_iter());
+        let placing = self.cursors.par_chunks_mut(run.len()).zip(self.chunk_starts.par_iter());
         let splats = footprints.par_chunks(CHUNK).zip(self.first.par_chunks_mut(CHUNK));
         placing.zip(splats).enumerate().for_each(|(chunk, ((places, &slot), (feet, first)))| {
             let mut slot = slot;
             for (i, (foot, first)) in feet.iter().zip(first).enumerate() {
                 *first = slot.wrapping_sub(foot.below(run.start, across) as u32);
-                let key = u64::from(foot.depth) << 32 | (chunk * CHUNK + i) as u64;
-                foot.for_each(across, &run, |bin| {
-                    staged[places[bin] as usize].store(key, Ordering::Relaxed);
-                    places[bin] += 1;
+                let key = u64::from(foot.depth) << u32::BITS | (chunk * CHUNK + i) as u64;
+                foot.for_each(across, run.start, places, |place| {
+                    staged[*place as usize].store(key, Ordering::Relaxed);
+                    *place += 1;
                     slot += 1;
                 });
             }
@@ -363,5 +379,106 @@ impl Bins {
     pub fn memory_bytes(&self) -> usize {
         let words = [&self.starts, &self.first, &self.cursors, &self.chunk_starts, &self.next];
         4 * words.iter().map(|w| w.capacity()).sum::<usize>() + 8 * (self.keys.capacity() + self.staged.capacity())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::math::Rng;
+
+    /// Footprints of every kind on `size` bins: none, single bins, masks, rectangles larger than a mask.
+    fn footprints(n: usize, size: [usize; 2]) -> Vec<Footprint> {
+        let rng = Rng::new(3, "footprints", 0);
+        let foot = |i: usize| {
+            let r = rng.fork(i as u64);
+            let within = |k: u64, size: usize| (r.uniform(k) * size as f64) as usize;
+            // Few depths, so that many are equal.
+            let depth = 0.5 + 0.25 * within(0, 40) as f32;
+            let first = [within(1, size[0]), within(2, size[1])];
+            match i % 5 {
+                0 => Footprint::default(),
+                1 => Footprint::masked(first, 1, depth),
+                2 if first[0] + 9 < size[0] => Footprint::rectangle([first[0], first[0] + 9, first[1], size[1]], depth),
+                _ => {
+                    let inside = |bit: &usize| first[0] + bit % 8 < size[0] && first[1] + bit / 8 < size[1];
+                    let bits = (0..64).filter(inside).filter(|&bit| r.uniform(10 + bit as u64) < 0.3);
+                    Footprint::masked(first, bits.fold(0, |mask, bit| mask | 1 << bit), depth)
+                }
+            }
+        };
+        (0..n).map(foot).collect()
+    }
+
+    /// Whether `foot` touches bin (x, y), from what it holds.
+    fn touches(foot: &Footprint, x: usize, y: usize) -> bool {
+        let (x0, y0) = (usize::from(foot.x0 & !LARGE), usize::from(foot.y0));
+        if x < x0 || y < y0 {
+            return false;
+        }
+        if foot.x0 & LARGE != 0 {
+            return x < (foot.cover & 0xffff) as usize && y < (foot.cover >> 16) as usize;
+        }
+        x - x0 < 8 && y - y0 < 8 && foot.cover >> (8 * (y - y0) + x - x0) & 1 == 1
+    }
+
+    #[test]
+    fn lists_are_what_a_stable_sort_of_all_pairs_gives() {
+        let [across, down] = [21, 11];
+        let feet = footprints(CHUNK + 700, [across, down]);
+        let mut bins = Bins::default();
+        for budget in [usize::MAX, 30_000, 1] {
+            bins.prepare(&feet, across * BIN - 5, down * BIN, budget);
+            assert_eq!((bins.across, bins.down), (across, down));
+            assert_eq!(bins.total, feet.iter().map(|f| f.count() as u64).sum::<u64>());
+            let mut taken = 0;
+            for run in 0..bins.runs.len() {
+                bins.fill(&feet, run);
+                let held = bins.runs[run].clone();
+                let mut slots = vec![false; bins.keys.len()];
+                for bin in 0..across * down {
+                    let keys = &bins.keys[bins.starts[bin] as usize..bins.starts[bin + 1] as usize];
+                    let (x, y) = (bin % across, bin / across);
+                    let mut truth: Vec<usize> = (0..feet.len()).filter(|&i| touches(&feet[i], x, y)).collect();
+                    truth.sort_by(|&a, &b| f32::from_bits(feet[a].depth).total_cmp(&f32::from_bits(feet[b].depth)));
+                    if !held.contains(&bin) {
+                        truth.clear();
+                    }
+                    assert!(keys.iter().map(|&k| id(k)).eq(truth), "bin {x}, {y} of run {held:?}");
+                    for &k in keys {
+                        let slot = bins.first[id(k)].wrapping_add(feet[id(k)].rank(x, y) as u32) as usize;
+                        assert!(bins.slots(id(k), &feet[id(k)]).contains(&slot), "a slot is its splat's");
+                        assert!(!std::mem::replace(&mut slots[slot], true), "a slot is one pair's");
+                    }
+                }
+                taken += bins.keys.len() as u64;
+            }
+            assert_eq!(taken, bins.total, "the runs hold every pair once");
+        }
+    }
+
+    #[test]
+    fn sort_is_a_sort() {
+        let rng = Rng::new(4, "sort", 0);
+        // Spread evenly, all equal, one far away, in reverse, close together but for one: insertions alone would take
+        // for ever over the last.
+        let depths: [fn(f64, usize, usize) -> f32; 5] = [
+            |u, _, _| 0.3 + 4.0 * u as f32,
+            |_, _, _| 2.5,
+            |u, i, _| if i == 7 { 1e30 } else { 1.0 + u as f32 },
+            |_, i, n| 1.0 + (n - i) as f32,
+            |_, i, n| if i == 0 { 1e-30 } else { f32::from_bits(1f32.to_bits() + (n - i) as u32) },
+        ];
+        for (kind, depth) in depths.iter().enumerate() {
+            for n in [0, 1, 2, FEW, FEW + 1, 700, MANY, 20_000] {
+                let bits = |i: usize| u64::from(depth(rng.uniform(i as u64), i, n).to_bits());
+                let keys: Vec<u64> = (0..n).map(|i| bits(i) << 32 | i as u64).collect();
+                let staged: Vec<AtomicU64> = keys.iter().map(|&k| AtomicU64::new(k)).collect();
+                let (mut out, mut truth) = (vec![0; n], keys);
+                sort(&staged, &mut out);
+                truth.sort();
+                assert!(out == truth, "depths of kind {kind}, {n} keys");
+            }
+        }
     }
 }

@@ -399,11 +399,11 @@ impl<F: Real> Kernel for Forward<'_, F> {
         for (g, ((rows, feet), radii)) in blocks.enumerate() {
             let block = columns(self.out, self.first / BLOCK + g);
             let mut p = Projected::<Lanes<F>>::default();
-            let mut pixels = [[0i32; BLOCK]; 4];
+            let mut boxes = [[0i32; BLOCK]; 4];
             for l in 0..BLOCK {
                 let (mean, cov, opacity) = gaussian(block, l);
                 let (one, drawn) = screen(&view, mean, cov, opacity);
-                let (reach, met) = pixel_range(&one, &view);
+                let (bins, met) = bin_range(&one, &view);
                 for k in 0..2 {
                     (p.mean2d[k][l], p.half[k][l]) = (one.mean2d[k], one.half[k]);
                 }
@@ -413,18 +413,19 @@ impl<F: Real> Kernel for Forward<'_, F> {
                 (p.opacity[l], p.depth[l], p.tau[l], p.rho[l]) = (one.opacity, one.depth, one.tau, one.rho);
                 p.radius[l] = select(drawn & met, one.radius, F::ZERO);
                 for k in 0..4 {
-                    pixels[k][l] = reach[k];
+                    boxes[k][l] = bins[k];
                 }
             }
             for (l, ((row, foot), radius)) in rows.iter_mut().zip(feet).zip(radii).enumerate() {
-                (*row, *foot, *radius) = (Projected::default(), Footprint::default(), F::ZERO);
                 if p.radius[l] > F::ZERO {
-                    let one = lane(&p, l);
-                    *foot = Footprint::of_pixels(&one, std::array::from_fn(|k| pixels[k][l]), &view);
-                    if foot.count() > 0 {
-                        (*row, *radius) = (one, one.radius);
+                    *row = lane(&p, l);
+                    *foot = Footprint::of_bins(row, std::array::from_fn(|k| boxes[k][l]), &view);
+                    *radius = row.radius;
+                    if !foot.is_empty() {
+                        continue;
                     }
                 }
+                (*row, *foot, *radius) = (Projected::default(), Footprint::default(), F::ZERO);
             }
         }
     }
@@ -559,20 +560,21 @@ pub(super) fn reshape<F: Real>(table: &mut Table<F>, like: &Table<F>) {
     }
 }
 
-/// First and last column and row of pixels whose centres are in the box of the ellipse, cut to the picture, and
-/// whether there are any.
+/// First and last column and row of bins with pixels whose centres are in the box of the ellipse and in the picture,
+/// and whether there are any.
 #[inline(always)]
-fn pixel_range<F: Real>(p: &Projected<F>, view: &View<F>) -> ([i32; 4], bool) {
+fn bin_range<F: Real>(p: &Projected<F>, view: &View<F>) -> ([i32; 4], bool) {
     let size = [view.width, view.height];
     let mut out = [0; 4];
     let mut met = true;
     for k in 0..2 {
-        // Pixel i has its centre at i + ½.
+        // Pixel i has its centre at i + ½; −⌊−x⌋ is ⌈x⌉.
+        let past = F::of(size[k] as f64);
         let first = greatest(-(F::HALF + p.half[k] - p.mean2d[k]).floor(), F::ZERO);
-        let end = least((p.mean2d[k] + p.half[k] - F::HALF).floor(), F::of(size[k] as f64 - 1.0));
-        met &= first <= end;
-        // Casts saturate, so that a box of 10^6 pixels is no trouble.
-        (out[2 * k], out[2 * k + 1]) = (first.i32(), end.i32());
+        let last = least((p.mean2d[k] + p.half[k] - F::HALF).floor(), past - F::ONE);
+        met &= first <= last;
+        out[2 * k] = least(first, past).lane_i32() >> BIN.ilog2();
+        out[2 * k + 1] = greatest(last, F::ZERO).lane_i32() >> BIN.ilog2();
     }
     (out, met)
 }
@@ -580,46 +582,61 @@ fn pixel_range<F: Real>(p: &Projected<F>, view: &View<F>) -> ([i32; 4], bool) {
 impl Footprint {
     /// The bins that hold a pixel centre inside the cut-off ellipse of `p` in the picture of `view`.
     pub fn new<F: Real>(p: &Projected<F>, view: &View<F>) -> Self {
-        let (pixels, met) = pixel_range(p, view);
-        if met { Self::of_pixels(p, pixels, view) } else { Self::default() }
+        let (bins, met) = bin_range(p, view);
+        if met { Self::of_bins(p, bins, view) } else { Self::default() }
     }
 
-    /// [`Footprint::new`] of a box that has pixels: first and last column, first and last row.
+    /// [`Footprint::new`] of a box that has bins: first and last column, first and last row.
     #[inline(always)]
-    fn of_pixels<F: Real>(p: &Projected<F>, pixels: [i32; 4], view: &View<F>) -> Self {
-        let [x0, x1, y0, y1] = pixels.map(|v| v as usize / BIN);
+    fn of_bins<F: Real>(p: &Projected<F>, bins: [i32; 4], view: &View<F>) -> Self {
+        let [x0, x1, y0, y1] = bins.map(|v| v as usize);
+        let (right, lower) = (x1 - x0, y1 - y0);
         let depth = p.depth.f64() as f32;
-        let (across, down) = (x1 - x0 + 1, y1 - y0 + 1);
-        if across > MASK_SIDE || down > MASK_SIDE {
+        if right.max(lower) >= MASK_SIDE {
             return Self::rectangle([x0, x1 + 1, y0, y1 + 1], depth);
         }
-        if across == 1 || down == 1 {
-            // A connected ellipse meets every bin of a single row or column of its own box.
-            return Self::masked([x0, y0], filled(across, down), depth);
-        }
-        let (y_slope, x_slope) = (-p.conic[1] / p.conic[2], -p.conic[1] / p.conic[0]);
-        let size = [view.width, view.height];
-        let center = |pixel: usize, k: usize, side: F| F::of(pixel as f64) + side - p.mean2d[k];
-        let span = |bin: usize, k: usize| {
-            [center(bin * BIN, k, F::HALF), center(((bin + 1) * BIN).min(size[k]), k, -F::HALF)]
-        };
-        let mut mask = 0;
-        for by in 0..down {
-            let y = span(y0 + by, 1);
-            for bx in 0..across {
-                let hit = ellipse_distance(p.conic, y_slope, x_slope, span(x0 + bx, 0), y) <= p.tau;
-                mask |= u64::from(hit) << (by * MASK_SIDE + bx);
-            }
+        let columns = u64::from(u8::MAX) >> (MASK_SIDE - 1 - right);
+        let rows = FIRST_COLUMN >> (MASK_SIDE * (MASK_SIDE - 1 - lower));
+        let mut mask = columns * rows;
+        // A connected ellipse meets every bin of a single row or column of its own box.
+        if right.min(lower) > 0 {
+            mask &= met_bins(p, [x0, y0], lower, view);
         }
         Self::masked([x0, y0], mask, depth)
     }
 }
 
-/// The mask of all bins of a rectangle.
+/// First bit of each row of a mask.
+const FIRST_COLUMN: u64 = u64::from_ne_bytes([1; MASK_SIDE]);
+
+/// Bit 8·row + column: the ellipse holds a point of the bin's box of pixel centres; of rows 0 to `lower`, and of eight
+/// columns, a vector.
 #[inline(always)]
-fn filled(across: usize, down: usize) -> u64 {
-    let row = (1 << across) - 1;
-    (0..down).fold(0, |mask, y| mask | row << (y * MASK_SIDE))
+fn met_bins<F: Real>(p: &Projected<F>, first: [usize; 2], lower: usize, view: &View<F>) -> u64 {
+    let (y_slope, x_slope) = (-p.conic[1] / p.conic[2], -p.conic[1] / p.conic[0]);
+    let (x0, y0) = (F::of((first[0] * BIN) as f64), F::of((first[1] * BIN) as f64));
+    let (width, height) = (F::of(view.width as f64), F::of(view.height as f64));
+    let mut mask = 0;
+    for by in 0..=lower {
+        let top = y0 + F::of((by * BIN) as f64);
+        let y = [
+            top + F::HALF - p.mean2d[1],
+            least(top + F::of(BIN as f64), height) - F::HALF - p.mean2d[1],
+        ];
+        let mut hits = [false; MASK_SIDE];
+        for (bx, hit) in hits.iter_mut().enumerate() {
+            let left = x0 + F::of((bx * BIN) as f64);
+            let x = [
+                left + F::HALF - p.mean2d[0],
+                least(left + F::of(BIN as f64), width) - F::HALF - p.mean2d[0],
+            ];
+            *hit = ellipse_distance(p.conic, y_slope, x_slope, x, y) <= p.tau;
+        }
+        for (bx, hit) in hits.into_iter().enumerate() {
+            mask |= u64::from(hit) << (by * MASK_SIDE + bx);
+        }
+    }
+    mask
 }
 
 /// Least dᵀ conic d over a rectangle of offsets from the centre; exact.
@@ -638,4 +655,107 @@ pub(super) fn ellipse_distance<F: Real>(conic: [F; 3], y_slope: F, x_slope: F, x
     let along_x = q(ex, clamp(y_slope * ex, y));
     let along_y = q(clamp(x_slope * ey, x), ey);
     if along_x < along_y { along_x } else { along_y }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::math::{Rng, Se3, sym3};
+    use crate::scene::splats::{Part, SPLAT_COLUMNS};
+    use crate::scene::{Color, Intrinsics, Lens};
+
+    fn view(width: usize, height: usize, antialias: Antialias) -> View<f32> {
+        let intrinsics = Intrinsics { fx: 300.0, fy: 310.0, cx: 0.5 * width as f64, cy: 0.4 * height as f64 };
+        let cam_from_world = Se3::look_at([0.5, -0.4, -4.0], [0.0; 3], [0.1, -1.0, 0.0]);
+        let camera = Camera { cam_from_world, intrinsics, lens: Lens::Pinhole, width, height };
+        View::new(&camera, &RenderConfig { antialias, ..RenderConfig::default() })
+    }
+
+    /// Needles, discs and balls of all sizes, some of them culled for every reason there is.
+    fn cloud(n: usize) -> Table<f32> {
+        let (rng, mut out) = (Rng::new(8, "projection", 0), Table::new(&SPLAT_COLUMNS, n));
+        for j in 0..n {
+            let r = rng.fork(j as u64);
+            let scales = std::array::from_fn(|k| -3.5 + 1.5 * r.normal(k as u64) as f32);
+            let quat = std::array::from_fn(|k| r.normal(10 + k as u64) as f32);
+            out.write(j, 0, std::array::from_fn(|k| 1.5 * r.normal(20 + k as u64) as f32));
+            out.write(j, COV, sym3::from_quat_log_scales(quat, scales));
+            out.set(j, SPLAT_OPACITY, r.uniform(4) as f32);
+            let bad = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, -1.0, 0.0, 1e30];
+            if j % 7 == 0 {
+                out.set(j, j / 7 % 10, bad[j / 70 % bad.len()]);
+            }
+        }
+        out
+    }
+
+    #[test]
+    fn blocks_are_projected_as_single_rows_are() {
+        let out = cloud(1500);
+        let table = Table::new(&[("rgb", 3)], 1500);
+        let splats = Splats { parts: vec![Part { out: &out, color: Color::Direct { table: &table } }] };
+        for antialias in [Antialias::Off, Antialias::On] {
+            let view = view(500, 333, antialias);
+            for simd in [Simd::Scalar, Simd::Avx2, Simd::Avx512] {
+                let mut rows = vec![Projected { radius: 9.0, ..Projected::default() }; 1500];
+                let (mut feet, mut radii) = (vec![Footprint::default(); 1500], vec![9.0; 1500]);
+                forward(&splats, &view, simd, &mut rows, &mut feet, &mut radii);
+                let mut drawn = 0;
+                for j in 0..1500 {
+                    let (mean, cov) = (out.read::<3>(j, 0), out.read::<6>(j, COV));
+                    let row = project(&view, mean, cov, out.get(j, SPLAT_OPACITY));
+                    let foot = row.map_or(Footprint::default(), |row| Footprint::new(&row, &view));
+                    let row = row.filter(|_| !foot.is_empty()).unwrap_or_default();
+                    assert!((rows[j], feet[j], radii[j]) == (row, foot, row.radius), "{simd:?}, row {j}");
+                    drawn += usize::from(row.radius > 0.0);
+                }
+                assert!(drawn > 500, "{drawn} rows are drawn");
+            }
+        }
+    }
+
+    #[test]
+    fn footprints_are_the_bins_that_ellipses_meet() {
+        let (out, view) = (cloud(700), view(500, 333, Antialias::Off));
+        let (mut slanted, mut large) = (0, 0);
+        for j in 0..700 {
+            let (mean, cov) = (out.read::<3>(j, 0), out.read::<6>(j, COV));
+            let Some(p) = project(&view, mean, cov, out.get(j, SPLAT_OPACITY)) else { continue };
+            let foot = Footprint::new(&p, &view);
+            if foot.count() > 64 {
+                large += 1;
+                continue;
+            }
+            let mut met = 0;
+            let [x, y] = p.mean2d.map(f64::from);
+            let [a, b, c] = p.conic.map(f64::from);
+            let mut numbers = Vec::new();
+            foot.bins_for_tests(&mut numbers, view.width.div_ceil(BIN));
+            for by in 0..view.height.div_ceil(BIN) {
+                for bx in 0..view.width.div_ceil(BIN) {
+                    // The least of the form over the box of pixel centres, by steps of a quarter of a pixel in x and the
+                    // clamped root of the derivative in y.
+                    let ends = |k: usize, size: usize| [k * BIN, ((k + 1) * BIN).min(size) - 1].map(|v| v as f64 + 0.5);
+                    let ([x0, x1], [y0, y1]) = (ends(bx, view.width), ends(by, view.height));
+                    let steps = (4.0 * (x1 - x0)) as usize;
+                    let least = (0..=steps).map(|i| {
+                        let dx = x0 + 0.25 * i as f64 - x;
+                        let dy = (-b / c * dx).clamp(y0 - y, y1 - y);
+                        a * dx * dx + 2.0 * b * dx * dy + c * dy * dy
+                    });
+                    let least = least.fold(f64::MAX, f64::min);
+                    let hit = numbers.contains(&(by * view.width.div_ceil(BIN) + bx));
+                    let tau = f64::from(p.tau);
+                    assert!(hit || least > tau - TAU_MARGIN, "row {j} meets bin {bx}, {by}: {least} of {tau}");
+                    // A step of ⅛ pixel from the best point, along the steepest form that the low-pass lets be.
+                    let slack = 0.125 * (tau / 0.3).sqrt() * 2.0 + 0.1;
+                    assert!(!hit || least < tau + slack, "row {j} does not meet bin {bx}, {by}: {least} of {tau}");
+                    met += usize::from(hit);
+                }
+            }
+            assert_eq!(met, foot.count());
+            slanted += usize::from(met > 2);
+        }
+        assert!(slanted > 50 && large > 0, "{slanted} masks, {large} large rectangles");
+    }
 }
