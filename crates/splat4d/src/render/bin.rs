@@ -108,11 +108,12 @@ impl Footprint {
         }
     }
 
-    /// The numbers of all touched bins.
+    /// The numbers of all touched bins of a picture.
     #[cfg(test)]
-    pub(super) fn bins_for_tests(&self, out: &mut Vec<usize>, across: usize) {
-        let mut all: Vec<usize> = (0..across * usize::from(u16::MAX)).collect();
+    pub(super) fn numbers(&self, across: usize, down: usize) -> Vec<usize> {
+        let (mut all, mut out) = ((0..across * down).collect::<Vec<usize>>(), Vec::new());
         self.for_each(across, 0, &mut all, |bin| out.push(*bin));
+        out
     }
 
     /// Calls `f` with what `cells` has for every touched bin, ascending; `cells` holds the bins from `first` on, other
