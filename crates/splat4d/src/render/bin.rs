@@ -52,7 +52,7 @@ impl Footprint {
 
     /// Columns and rows of a rectangle larger than a mask.
     #[inline(always)]
-    fn large(&self) -> Option<[usize; 4]> {
+    pub(super) fn large(&self) -> Option<[usize; 4]> {
         let (x1, y1) = (self.cover as u16, (self.cover >> 16) as u16);
         (self.x0 & LARGE != 0).then(|| [self.x0 & !LARGE, x1, self.y0, y1].map(usize::from))
     }

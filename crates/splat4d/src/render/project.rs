@@ -172,7 +172,7 @@ fn greatest<F: Real>(a: F, b: F) -> F {
 
 /// One of two values that are both at hand.
 #[inline(always)]
-fn select<F: Real>(condition: bool, yes: F, no: F) -> F {
+pub(super) fn select<F: Real>(condition: bool, yes: F, no: F) -> F {
     std::hint::select_unpredictable(condition, yes, no)
 }
 
@@ -502,7 +502,9 @@ impl<F: Real> Kernel for Backward<'_, F> {
         let mut sums = [[0.0; BLOCK]; 6];
         let (outs, _) = self.data.as_chunks_mut::<BLOCK>();
         let (outs, _) = outs.as_chunks_mut::<{ SPLAT_OPACITY + 1 }>();
-        for (g, (out, (rows, d_rows))) in outs.iter_mut().zip(self.rows.chunks(BLOCK).zip(self.d.chunks(BLOCK))).enumerate() {
+        for (g, (out, (rows, d_rows))) in
+            outs.iter_mut().zip(self.rows.chunks(BLOCK).zip(self.d.chunks(BLOCK))).enumerate()
+        {
             *out = [[F::ZERO; BLOCK]; SPLAT_OPACITY + 1];
             if rows.iter().all(|row| row.radius <= F::ZERO) {
                 continue;
@@ -620,17 +622,11 @@ fn met_bins<F: Real>(p: &Projected<F>, first: [usize; 2], lower: usize, view: &V
     let mut mask = 0;
     for by in 0..=lower {
         let top = y0 + F::of((by * BIN) as f64);
-        let y = [
-            top + F::HALF - p.mean2d[1],
-            least(top + F::of(BIN as f64), height) - F::HALF - p.mean2d[1],
-        ];
+        let y = [top + F::HALF - p.mean2d[1], least(top + F::of(BIN as f64), height) - F::HALF - p.mean2d[1]];
         let mut hits = [false; MASK_SIDE];
         for (bx, hit) in hits.iter_mut().enumerate() {
             let left = x0 + F::of((bx * BIN) as f64);
-            let x = [
-                left + F::HALF - p.mean2d[0],
-                least(left + F::of(BIN as f64), width) - F::HALF - p.mean2d[0],
-            ];
+            let x = [left + F::HALF - p.mean2d[0], least(left + F::of(BIN as f64), width) - F::HALF - p.mean2d[0]];
             *hit = ellipse_distance(p.conic, y_slope, x_slope, x, y) <= p.tau;
         }
         for (bx, hit) in hits.into_iter().enumerate() {
@@ -723,7 +719,7 @@ mod tests {
             let (mean, cov) = (out.read::<3>(j, 0), out.read::<6>(j, COV));
             let Some(p) = project(&view, mean, cov, out.get(j, SPLAT_OPACITY)) else { continue };
             let foot = Footprint::new(&p, &view);
-            if foot.count() > 64 {
+            if foot.large().is_some() {
                 large += 1;
                 continue;
             }
@@ -755,10 +751,16 @@ mod tests {
                     let far = [(x0 - x).abs().max((x1 - x).abs()), (y0 - y).abs().max((y1 - y).abs())];
                     let rounding = 1e-6 * (a * far[0] * far[0] + c * far[1] * far[1]);
                     let tau = f64::from(p.tau);
-                    assert!(hit || least > tau - TAU_MARGIN - rounding, "row {j} meets bin {bx}, {by}: {least} of {tau}");
+                    assert!(
+                        hit || least > tau - TAU_MARGIN - rounding,
+                        "row {j} meets bin {bx}, {by}: {least} of {tau}"
+                    );
                     // A step of ⅛ pixel from the best point, along the steepest form that the low-pass lets be.
                     let slack = 0.125 * (tau / 0.3).sqrt() * 2.0 + 0.1 + rounding;
-                    assert!(!hit || !tested || least < tau + slack, "row {j} does not meet bin {bx}, {by}: {least} of {tau}");
+                    assert!(
+                        !hit || !tested || least < tau + slack,
+                        "row {j} does not meet bin {bx}, {by}: {least} of {tau}"
+                    );
                     met += usize::from(hit);
                 }
             }
