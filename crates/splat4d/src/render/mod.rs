@@ -245,12 +245,11 @@ impl<F: Real> Renderer<F> {
         self.footprints.resize(n, Footprint::default());
         self.channels.resize(n, [F::ZERO; CHANNELS]);
         let mut clock = Clock::start();
-        project::forward(splats, &view, simd, &mut self.projected, &mut self.footprints);
+        self.radii.resize(n, F::ZERO);
+        project::forward(splats, &view, simd, &mut self.projected, &mut self.footprints, &mut self.radii);
         self.seconds.project = clock.lap();
         shade::forward(splats, &view, self.config.sh_degree, simd, &self.projected, &mut self.channels);
         self.seconds.shade = clock.lap();
-        self.radii.resize(n, F::ZERO);
-        self.radii.par_iter_mut().zip(&self.projected).with_min_len(4096).for_each(|(r, p)| *r = p.radius);
         self.raster.prepare(&self.projected, &self.footprints, w, h, simd);
         self.seconds.bin = clock.lap();
         self.raster.blend(&self.projected, &self.footprints, &self.channels, &self.config);

@@ -65,22 +65,22 @@ impl<F: Real> Raster<F> {
         simd: Simd,
     ) {
         (self.width, self.height, self.simd) = (width, height, Some(simd));
-        self.bins.count(footprints, width, height, self.budget.unwrap_or(PAIR_BUDGET));
+        self.bins.prepare(footprints, width, height, self.budget.unwrap_or(PAIR_BUDGET));
         self.tiles.resize(self.bins.bins() * TILES, Tile::default());
-        self.gather(projected, footprints, 0);
+        self.gather(projected);
     }
 
     /// Sees to it that lists and records are those of run `run`.
     fn hold(&mut self, projected: &[Projected<F>], footprints: &[Footprint], run: usize) {
         if self.bins.current != run {
-            self.gather(projected, footprints, run);
+            self.bins.fill(footprints, run);
+            self.gather(projected);
         }
     }
 
-    /// Makes lists and records of one run of bins.
-    fn gather(&mut self, projected: &[Projected<F>], footprints: &[Footprint], run: usize) {
+    /// Makes the records of the current run's lists.
+    fn gather(&mut self, projected: &[Projected<F>]) {
         let (width, height, simd) = (self.width, self.height, self.simd.unwrap_or(Simd::Scalar));
-        self.bins.fill(footprints, projected, run);
         self.records.resize(self.bins.keys.len(), Record::default());
         let bins = &self.bins;
         for_each_group(&bins.starts, Ragged(&mut self.records), &|bin, records| {
