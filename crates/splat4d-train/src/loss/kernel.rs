@@ -18,6 +18,7 @@
 //! The loops are plain ones over a row, because LLVM vectorises those reliably, and blocks of lanes it does not.
 
 use splat4d::math::Real;
+use splat4d::simd::Pass;
 
 /// Taps of the window and their reach on either side (Wang 2004; 3DGS `loss_utils`).
 pub(super) const TAPS: usize = 11;
@@ -102,20 +103,26 @@ impl<F: Real> Scratch<F> {
     }
 }
 
-/// [Σ w|x − y|, Σ w S] over the strip; writes its gradient into `d` ([rows, width]).
-#[inline(always)]
-pub(super) fn strip<F: Real, const FMA: bool>(job: &Strip<'_, F>, scratch: &mut Scratch<F>, d: &mut [F]) -> [f64; 2] {
-    // Column runs of even size, so that no narrow rest pays a full halo.
-    let runs = job.width.div_ceil(MAX_COLUMNS);
-    let run = job.width.div_ceil(runs).next_multiple_of(LANES);
-    let mut sums = [0.0; 2];
-    for x0 in (0..job.width).step_by(run) {
-        let tile = Tile::new(job, x0, run.min(job.width - x0), d.len() / job.width);
-        let part = tile.walk::<FMA>(scratch, d);
-        sums[0] += part[0];
-        sums[1] += part[1];
+impl<F: Real> Pass for Strip<'_, F> {
+    type Scratch = Scratch<F>;
+    type Into = [F];
+    type Out = [f64; 2];
+
+    /// [Σ w|x − y|, Σ w S] over the strip; writes its gradient into `d` ([rows, width]).
+    #[inline(always)]
+    fn run<const FMA: bool>(&self, scratch: &mut Scratch<F>, d: &mut [F]) -> [f64; 2] {
+        // Column runs of even size, so that no narrow rest pays a full halo.
+        let runs = self.width.div_ceil(MAX_COLUMNS);
+        let run = self.width.div_ceil(runs).next_multiple_of(LANES);
+        let mut sums = [0.0; 2];
+        for x0 in (0..self.width).step_by(run) {
+            let tile = Tile::new(self, x0, run.min(self.width - x0), d.len() / self.width);
+            let part = tile.walk::<FMA>(scratch, d);
+            sums[0] += part[0];
+            sums[1] += part[1];
+        }
+        sums
     }
-    sums
 }
 
 /// Some columns of a strip. Its derivative row/column i is the image's `first − 5 + i`, its product row/column i the

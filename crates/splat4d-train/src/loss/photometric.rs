@@ -1,10 +1,10 @@
 //! The picture loss of 3DGS, (1 − λ)·L1 + λ·(1 − SSIM), and its gradient, in one pass over the image.
 
 use super::kernel::{self, Scratch, Strip};
-use super::simd::{self, Simd};
 use rayon::prelude::*;
 use splat4d::math::Real;
 use splat4d::scene::Planes;
+use splat4d::simd::{Simd, dispatch_pass};
 use std::sync::Mutex;
 
 /// Rows of a strip: the unit of parallel work. Fixed, so that sums do not depend on the number of threads.
@@ -106,7 +106,7 @@ impl<F: Real> Photometric<F> {
                 // A loop of one step may run on the caller's own thread, then alone.
                 let thread = rayon::current_thread_index().unwrap_or(0);
                 let mut scratch = scratch[thread].lock().expect("no strip panics while it holds its scratch");
-                *sums = simd::strip(simd, &job, &mut scratch, d);
+                *sums = dispatch_pass(simd, &job, &mut *scratch, d);
             });
         });
 

@@ -79,7 +79,7 @@ fn value_equals_the_definition_with_and_without_weights() {
             assert!((v.l1 - l1).abs() < 1e-12 && (v.ssim - ssim).abs() < 1e-11, "{c}x{h}x{w} {v:?} {l1} {ssim}");
             assert!((v.total - (0.8 * l1 + 0.2 * (1.0 - ssim))).abs() < 1e-8, "λ is an f32");
             let m32 = weight.map(cast::<f32>);
-            for simd in [Simd::detect(), Simd::baseline()] {
+            for simd in [Simd::detect(), Simd::Scalar] {
                 let mut d32 = Planes::default();
                 let mut loss = Photometric::<f32>::with_simd(0.2, simd);
                 let v = loss.loss_and_grad(&cast(&a), &cast(&b), m32.as_ref(), &mut d32);
@@ -173,7 +173,7 @@ fn time_of_loss_and_gradient() {
     for (h, w) in [(400, 400), (800, 800), (1080, 1920)] {
         let (a, b) = (image::<f32>(3, h, w, 1), image::<f32>(3, h, w, 2));
         let mut d = Planes::default();
-        for (name, simd) in [("detected", Simd::detect()), ("baseline", Simd::baseline())] {
+        for (name, simd) in [("detected", Simd::detect()), ("baseline", Simd::Scalar)] {
             let mut loss = Photometric::<f32>::with_simd(0.2, simd);
             let mut times: Vec<f64> = (0..30)
                 .map(|_| {
