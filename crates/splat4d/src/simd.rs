@@ -89,6 +89,17 @@ pub fn dispatch_pass<P: Pass>(level: Simd, pass: &P, scratch: &mut P::Scratch, i
     pass.run::<BASELINE_FMA>(scratch, into)
 }
 
+/// [f(0), f(1), …]: `std::array::from_fn` for kernels, since that one is not always inlined into them, and then it is
+/// compiled for the baseline alone (seen with 10 elements and more).
+#[inline(always)]
+pub fn each<T: Copy + Default, const N: usize>(f: impl Fn(usize) -> T) -> [T; N] {
+    let mut out = [T::default(); N];
+    for i in 0..N {
+        out[i] = f(i);
+    }
+    out
+}
+
 /// Every 64-bit ARM has fused multiply-add, no x86-64 need have.
 const BASELINE_FMA: bool = cfg!(target_arch = "aarch64");
 

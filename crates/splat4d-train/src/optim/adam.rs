@@ -7,7 +7,7 @@ use super::Floor;
 use splat4d::math::Real;
 use splat4d::scene::table::TableMut;
 use splat4d::scene::{BLOCK, Key};
-use splat4d::simd::Kernel;
+use splat4d::simd::{Kernel, each};
 
 /// Decay of the first moment (Kingma and Ba 2015).
 const BETA1: f64 = 0.9;
@@ -69,9 +69,10 @@ impl<F: Real> Kernel for Step<'_, F> {
                 None => live[..rows].fill(true),
                 Some(active) => live[..rows].copy_from_slice(&active[p.first + b * BLOCK..][..rows]),
             }
-            let finite = if live == [true; BLOCK] {
+            let (all, any) = live.iter().fold((true, false), |(all, any), &one| (all & one, any | one));
+            let finite = if all {
                 step_block::<F, true>(rule, p_block, m_block, d_block, &live)
-            } else if live != [false; BLOCK] {
+            } else if any {
                 step_block::<F, false>(rule, p_block, m_block, d_block, &live)
             } else {
                 continue;
@@ -113,12 +114,12 @@ fn step_block<F: Real, const FULL: bool>(
         if rate == F::ZERO {
             continue;
         }
-        let [m1, m2, x] = step_lanes([&first[c], &second[c], &p[c], &d[c]], rate, &correct1, &correct2);
+        let [m1, m2, x] = step_lanes([first[c], second[c], p[c], d[c]], rate, &correct1, &correct2);
         if FULL {
             (first[c], second[c], p[c]) = (m1, m2, x);
         } else {
-            (first[c], second[c]) = (choose(live, &m1, &first[c]), choose(live, &m2, &second[c]));
-            p[c] = choose(live, &x, &p[c]);
+            (first[c], second[c]) = (choose(live, m1, first[c]), choose(live, m2, second[c]));
+            p[c] = choose(live, x, p[c]);
         }
         for l in 0..BLOCK {
             // 0·x is 0 for finite x and NaN otherwise; padding lanes are finite zeros.
@@ -128,15 +129,16 @@ fn step_block<F: Real, const FULL: bool>(
     // After the check, because a maximum would hide a NaN.
     for floor in rule.floors.iter().filter(|f| f.key == rule.key) {
         let (x, least) = (&mut p[floor.column], F::of(floor.least));
-        let lifted = x.map(|x| if x < least { least } else { x });
-        *x = if FULL { lifted } else { choose(live, &lifted, x) };
+        let lifted = each(|l| if x[l] < least { least } else { x[l] });
+        *x = if FULL { lifted } else { choose(live, lifted, *x) };
     }
     checked.iter().all(|x| *x == F::ZERO)
 }
 
-/// First moment, second moment and parameter after the step.
+/// First moment, second moment and parameter after the step. All come and go by value: through references, LLVM would
+/// ask at run time whether they overlap.
 #[inline(always)]
-fn step_lanes<F: Real>([m1, m2, p, d]: [&Lane<F>; 4], rate: F, c1: &Lane<F>, c2: &Lane<F>) -> [Lane<F>; 3] {
+fn step_lanes<F: Real>([m1, m2, p, d]: [Lane<F>; 4], rate: F, c1: &Lane<F>, c2: &Lane<F>) -> [Lane<F>; 3] {
     let (beta1, beta2, epsilon) = (F::of(BETA1), F::of(BETA2), F::of(EPSILON));
     let mut out = [[F::ZERO; BLOCK]; 3];
     for l in 0..BLOCK {
@@ -150,6 +152,6 @@ fn step_lanes<F: Real>([m1, m2, p, d]: [&Lane<F>; 4], rate: F, c1: &Lane<F>, c2:
 }
 
 #[inline(always)]
-fn choose<F: Real>(live: &[bool; BLOCK], new: &Lane<F>, old: &Lane<F>) -> Lane<F> {
-    std::array::from_fn(|l| if live[l] { new[l] } else { old[l] })
+fn choose<F: Real>(live: &[bool; BLOCK], new: Lane<F>, old: Lane<F>) -> Lane<F> {
+    each(|l| if live[l] { new[l] } else { old[l] })
 }

@@ -7,7 +7,7 @@ use crate::scene::params::OPACITY;
 use crate::scene::splats::SPLAT_OPACITY;
 use crate::scene::table::TableMut;
 use crate::scene::{BLOCK, GEOMETRY, LifeKind, Params, Rows, Table, Time};
-use crate::simd::{Kernel, Simd, dispatch};
+use crate::simd::{Kernel, Simd, dispatch, each};
 
 /// Rows a task looks at.
 const TASK_ROWS: usize = 8192;
@@ -140,7 +140,7 @@ impl<F: Real> Work<F, 2> for Forward<'_, F> {
         let value = eval(self.kind, &read_life(batch, self.p), self.t);
         batch.write(life, 0, &value);
         let [opacity] = batch.lanes(out, SPLAT_OPACITY);
-        batch.write(out, SPLAT_OPACITY, &[std::array::from_fn(|l| opacity[l] * value[0][l])]);
+        batch.write(out, SPLAT_OPACITY, &[each(|l| opacity[l] * value[0][l])]);
         0.0
     }
 }

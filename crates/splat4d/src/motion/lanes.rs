@@ -7,7 +7,7 @@
 use crate::math::Real;
 use crate::scene::table::{TableMut, halve};
 use crate::scene::{BLOCK, Rows, Table};
-use crate::simd::{Kernel, Simd, dispatch};
+use crate::simd::{Kernel, Simd, dispatch, each};
 
 /// One number of sixteen rows.
 pub type Lane<F> = [F; BLOCK];
@@ -32,7 +32,7 @@ pub struct Span {
 
 impl Span {
     fn block(b: usize) -> Self {
-        Self { rows: std::array::from_fn(|l| (b * BLOCK + l) as u32), lie: Lie::Block }
+        Self { rows: each(|l| (b * BLOCK + l) as u32), lie: Lie::Block }
     }
 
     fn of(rows: [u32; BLOCK]) -> Self {
@@ -106,13 +106,13 @@ pub struct Batch {
 impl Batch {
     #[inline(always)]
     fn new(ids: Span, at: Span, live: [bool; BLOCK]) -> Self {
-        Self { ids, at, live, full: live == [true; BLOCK] }
+        Self { ids, at, live, full: live.iter().fold(true, |all, &one| all & one) }
     }
 
     /// The sum of the live lanes, as a tree.
     #[inline(always)]
     pub fn sum<F: Real>(&self, lane: Lane<F>) -> f64 {
-        let mut sums: [f64; BLOCK] = std::array::from_fn(|l| if self.live[l] { lane[l].f64() } else { 0.0 });
+        let mut sums: [f64; BLOCK] = each(|l| if self.live[l] { lane[l].f64() } else { 0.0 });
         for half in [BLOCK / 2, BLOCK / 4, BLOCK / 8, 1] {
             for l in 0..half {
                 sums[l] += sums[l + half];
@@ -133,7 +133,11 @@ impl Batch {
     pub fn lanes<F: Real, const W: usize>(&self, view: &TableMut<'_, F>, col: usize) -> [Lane<F>; W] {
         let from = self.place(view, self.at, col);
         let lanes = view.data[from..from + W * BLOCK].as_chunks().0;
-        std::array::from_fn(|c| lanes[c])
+        {
+            let mut out = [[F::ZERO; BLOCK]; W];
+            out.copy_from_slice(&lanes[..W]);
+            out
+        }
     }
 
     /// Adds to neighbouring columns of the live rows of one of the layer's tables.
@@ -141,7 +145,7 @@ impl Batch {
     pub fn add<F: Real, const W: usize>(&self, view: &mut TableMut<'_, F>, col: usize, values: &[Lane<F>; W]) {
         if self.ids.lie != Lie::Block {
             for l in (0..BLOCK).filter(|&l| self.live[l]) {
-                view.add::<W>(self.ids.row(l), col, std::array::from_fn(|c| values[c][l]));
+                view.add::<W>(self.ids.row(l), col, each(|c| values[c][l]));
             }
             return;
         }
@@ -198,9 +202,9 @@ impl<F: Real, W: Work<F, N>, const N: usize> Kernel for Fill<'_, F, W, N> {
             let last = end - 1;
             let ids = match self.rows {
                 Rows::All => at,
-                Rows::Some(ids) => Span::of(std::array::from_fn(|l| ids[at.row(l).min(last)])),
+                Rows::Some(ids) => Span::of(each(|l| ids[at.row(l).min(last)])),
             };
-            let batch = Batch::new(ids, at, std::array::from_fn(|l| at.row(l) < end));
+            let batch = Batch::new(ids, at, each(|l| at.row(l) < end));
             self.work.run(&batch, &mut self.views);
         }
         0.0
@@ -225,7 +229,7 @@ impl<F: Real, W: Work<F, N>, const N: usize> Kernel for Scatter<'_, F, W, N> {
             let mut sum = 0.0;
             for b in first / BLOCK..end.div_ceil(BLOCK) {
                 let span = Span::block(b);
-                let batch = Batch::new(span, span, std::array::from_fn(|l| span.row(l) < end));
+                let batch = Batch::new(span, span, each(|l| span.row(l) < end));
                 sum += self.work.run(&batch, &mut self.views);
             }
             return sum;
@@ -249,7 +253,7 @@ fn block_batch(ids: &[u32], j: &mut usize) -> Batch {
     let from = *j;
     let whole = from + BLOCK <= ids.len() && ids[from + BLOCK - 1] as usize == b * BLOCK + BLOCK - 1;
     let mut live = [true; BLOCK];
-    let mut at: [u32; BLOCK] = std::array::from_fn(|l| (from + l) as u32);
+    let mut at: [u32; BLOCK] = each(|l| (from + l) as u32);
     if whole && ids[from] as usize == b * BLOCK {
         *j += BLOCK;
         return Batch::new(Span::block(b), Span::of(at), live);
@@ -268,9 +272,9 @@ fn block_batch(ids: &[u32], j: &mut usize) -> Batch {
 fn loose_batch(ids: &[u32], j: &mut usize) -> Batch {
     let (from, last) = (*j, ids.len() - 1);
     *j += BLOCK;
-    let rows = Span::of(std::array::from_fn(|l| ids[(from + l).min(last)]));
-    let at = Span::of(std::array::from_fn(|l| (from + l).min(last) as u32));
-    Batch::new(rows, at, std::array::from_fn(|l| from + l <= last))
+    let rows = Span::of(each(|l| ids[(from + l).min(last)]));
+    let at = Span::of(each(|l| (from + l).min(last) as u32));
+    Batch::new(rows, at, each(|l| from + l <= last))
 }
 
 #[cfg(test)]

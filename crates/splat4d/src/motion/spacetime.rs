@@ -13,6 +13,7 @@ use crate::math::Real;
 use crate::scene::params::QUAT;
 use crate::scene::table::TableMut;
 use crate::scene::{BLOCK, GEOMETRY, Grads, Key, LIFE, Params, Space, SplatGrads, Table};
+use crate::simd::each;
 
 /// Highest order of the polynomial.
 pub const MAX_ORDER: usize = 3;
@@ -155,7 +156,7 @@ impl<'a, F: Real> Reader<'a, F> {
             return [F::of(self.t - self.spec.origin); BLOCK];
         }
         let [center] = batch.ids.read::<F, 1>(self.life, 0);
-        center.map(|c| F::of(self.t) - c)
+        each(|l| F::of(self.t) - center[l])
     }
 
     /// The learnable rows at Δ: means moved, quaternions turned, all else as it is.
@@ -236,7 +237,7 @@ impl<F: Real> Work<F, 4> for Backward<'_, F> {
             batch.add(d_w, 0, &d_rate);
         }
         if r.life.width() > 0 && !r.spec.detach {
-            batch.add(d_life, 0, &[d_delta.map(|x| -x)]);
+            batch.add(d_life, 0, &[each(|l| -d_delta[l])]);
         }
         batch.sum(d_delta)
     }

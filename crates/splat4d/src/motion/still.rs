@@ -8,6 +8,7 @@ use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::splats::{COV, SPLAT_OPACITY};
 use crate::scene::table::TableMut;
 use crate::scene::{BLOCK, GEOMETRY, Grads, SplatGrads, Table};
+use crate::simd::each;
 
 /// Nothing moves; dL/dt is zero.
 #[derive(Clone, Copy, Debug)]
@@ -65,7 +66,7 @@ impl<F: Real> Work<F, 1> for Backward<'_, F> {
 pub fn activate_lanes<F: Real>(g: &[Lane<F>; 11]) -> [Lane<F>; 10] {
     let mut out = [[F::ZERO; BLOCK]; 10];
     for l in 0..BLOCK {
-        let row = activate(std::array::from_fn(|c| g[c][l]));
+        let row = activate(each(|c| g[c][l]));
         for c in 0..10 {
             out[c][l] = row[c];
         }
@@ -78,7 +79,7 @@ pub fn activate_lanes<F: Real>(g: &[Lane<F>; 11]) -> [Lane<F>; 10] {
 pub fn activate_backward_lanes<F: Real>(g: &[Lane<F>; 11], d: &[Lane<F>; 10]) -> [Lane<F>; 11] {
     let mut out = [[F::ZERO; BLOCK]; 11];
     for l in 0..BLOCK {
-        let row = activate_backward(std::array::from_fn(|c| g[c][l]), std::array::from_fn(|c| d[c][l]));
+        let row = activate_backward(each(|c| g[c][l]), each(|c| d[c][l]));
         for c in 0..11 {
             out[c][l] = row[c];
         }
@@ -102,7 +103,7 @@ pub fn activate_backward<F: Real>(g: [F; 11], d: [F; 10]) -> [F; 11] {
     let (d_quat, d_log) = sym3::from_quat_log_scales_backward(
         [g[QUAT], g[QUAT + 1], g[QUAT + 2], g[QUAT + 3]],
         [g[LOG_SCALE], g[LOG_SCALE + 1], g[LOG_SCALE + 2]],
-        std::array::from_fn(|k| d[COV + k]),
+        each(|k| d[COV + k]),
     );
     let o = g[OPACITY].sigmoid();
     let d_logit = d[SPLAT_OPACITY] * o * (F::ONE - o);

@@ -4,6 +4,7 @@
 //! range of rows is one slice. A table of one column is therefore contiguous, so that a matrix product can read it.
 
 use crate::math::Real;
+use crate::simd::each;
 use std::borrow::Cow;
 
 /// Rows in a block.
@@ -102,7 +103,7 @@ impl<F: Real> Table<F> {
     pub fn read<const N: usize>(&self, row: usize, col: usize) -> [F; N] {
         let i = self.index(row, col);
         let s = &self.data[i..i + (N - 1) * BLOCK + 1];
-        std::array::from_fn(|k| s[k * BLOCK])
+        each(|k| s[k * BLOCK])
     }
 
     /// Writes `N` neighbouring columns of one row.
@@ -180,11 +181,20 @@ impl<F: Real> Table<F> {
     /// The table whose row j is this table's row `parents[j]`.
     pub fn gather(&self, parents: &[u32]) -> Self {
         let mut out = Self::with_columns(self.columns.clone(), parents.len());
-        for (j, &i) in parents.iter().enumerate() {
-            for col in 0..self.width {
-                out.set(j, col, self.get(i as usize, col));
-            }
+        let width = self.width;
+        if width == 0 {
+            return out;
         }
+        halve([out.view_mut()], &|[view]| {
+            for (j, &parent) in parents[view.first..view.first + view.rows].iter().enumerate() {
+                let i = parent as usize;
+                assert!(i < self.rows, "a row's parent is one of the {} rows", self.rows);
+                let from = self.data[i / BLOCK * width * BLOCK + i % BLOCK..].iter().step_by(BLOCK);
+                let to = view.data[j / BLOCK * width * BLOCK + j % BLOCK..].iter_mut().step_by(BLOCK);
+                to.zip(from).take(width).for_each(|(to, from)| *to = *from);
+            }
+            0.0
+        });
         out
     }
 
@@ -294,7 +304,7 @@ impl<F: Real> TableMut<'_, F> {
     pub fn read<const N: usize>(&self, row: usize, col: usize) -> [F; N] {
         let i = self.index(row, col);
         let s = &self.data[i..i + (N - 1) * BLOCK + 1];
-        std::array::from_fn(|k| s[k * BLOCK])
+        each(|k| s[k * BLOCK])
     }
 }
 
