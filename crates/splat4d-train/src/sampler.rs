@@ -2,6 +2,7 @@
 
 use crate::capture::frames::Frames;
 use splat4d::math::Rng;
+use std::sync::{Arc, Mutex};
 
 /// How a stage draws its frames.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -29,6 +30,9 @@ const WINDOW_SHARE: f64 = 0.8;
 pub struct Timeline {
     frames: Vec<Vec<u32>>,
     count: usize,
+    /// The permutation looked at last: seed, address, length and the order itself. Without it every step would shuffle
+    /// all frames of the capture to learn of one.
+    order: Arc<Mutex<(u64, u64, Vec<u32>)>>,
 }
 
 impl Timeline {
@@ -45,7 +49,7 @@ impl Timeline {
             }
             groups.last_mut().expect("a group was just pushed").push(i as u32);
         }
-        Self { frames: groups, count: frames.len() }
+        Self { frames: groups, count: frames.len(), order: Arc::default() }
     }
 
     /// Number of distinct times.
@@ -56,6 +60,15 @@ impl Timeline {
     /// The frames at the k-th time.
     pub fn at(&self, k: usize) -> &[u32] {
         &self.frames[k]
+    }
+
+    /// Element i of the permutation of n things at an address.
+    fn shuffled(&self, seed: u64, address: u64, n: usize, i: usize) -> usize {
+        let mut last = self.order.lock().unwrap_or_else(|e| e.into_inner());
+        if (last.0, last.1, last.2.len()) != (seed, address, n) {
+            *last = (seed, address, Rng::new(seed, "epoch", address).permutation(n));
+        }
+        last.2[i] as usize
     }
 
     /// The frames of step `step` of a stage of `steps` steps. Panics: no frames; a frame number beyond the clip.
@@ -74,15 +87,14 @@ impl Timeline {
         let (times, n) = (self.frames.len(), self.count);
         let flat = |i: usize| {
             // The i-th draw without replacement: which epoch, and where in its permutation.
-            let order = Rng::new(seed, "epoch", (stage * 1_000_003 + i / n) as u64).permutation(n);
-            order[i % n] as usize
+            self.shuffled(seed, (stage * 1_000_003 + i / n) as u64, n, i % n)
         };
         let any_of = |group: &[u32], draw: u64| group[step_rng.below(draw, group.len())] as usize;
         match *sampler {
             Sampler::Uniform => (0..batch).map(|b| flat(step * batch + b)).collect(),
             Sampler::SameTime => {
-                let order = Rng::new(seed, "epoch", (stage * 1_000_003 + step / times) as u64).permutation(times);
-                let group = &self.frames[order[step % times] as usize];
+                let epoch = (stage * 1_000_003 + step / times) as u64;
+                let group = &self.frames[self.shuffled(seed, epoch, times, step % times)];
                 let offset = step_rng.below(0, group.len());
                 (0..batch.min(group.len())).map(|b| group[(offset + b) % group.len()] as usize).collect()
             }

@@ -16,6 +16,7 @@ pub mod motion;
 pub mod play;
 pub mod render;
 pub mod scene;
+pub mod simd;
 pub mod wgsl;
 
 pub use error::{Error, ErrorKind, Result};

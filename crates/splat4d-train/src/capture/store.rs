@@ -11,6 +11,7 @@ use super::{Capture, Frame};
 use rayon::prelude::*;
 use splat4d::Result;
 use splat4d::scene::{Camera, Planes};
+use splat4d::simd::{Pass, Simd, dispatch_pass};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::path::Path;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard};
@@ -55,10 +56,9 @@ impl StoredPicture {
 
     /// Writes the colour as [3, height, width] sRGB values from 0 to 1, reusing `out`'s memory.
     pub fn color_into(&self, out: &mut Planes<f32>) {
-        out.reset(3, self.height, self.width);
         match &self.color {
-            Samples::Eight(s) => out.data.iter_mut().zip(s).for_each(|(o, &v)| *o = f32::from(v) / 255.0),
-            Samples::Sixteen(s) => out.data.iter_mut().zip(s).for_each(|(o, &v)| *o = f32::from(v) / 65535.0),
+            Samples::Eight(s) => self.convert(s, 255.0, 3, out),
+            Samples::Sixteen(s) => self.convert(s, 65535.0, 3, out),
         }
     }
 
@@ -74,9 +74,17 @@ impl StoredPicture {
 
     fn weights_into(&self, weights: Option<&[u8]>, out: &mut Planes<f32>) -> bool {
         let Some(weights) = weights else { return false };
-        out.reset(1, self.height, self.width);
-        out.data.iter_mut().zip(weights).for_each(|(o, &v)| *o = f32::from(v) / 255.0);
+        self.convert(weights, 255.0, 1, out);
         true
+    }
+
+    /// Samples over their largest value.
+    fn convert<S: Copy + Sync + Into<f32>>(&self, samples: &[S], largest: f32, channels: usize, out: &mut Planes<f32>) {
+        (out.channels, out.height, out.width) = (channels, self.height, self.width);
+        out.data.resize(samples.len(), 0.0);
+        let simd = Simd::detect();
+        let chunks = out.data.par_chunks_mut(CONVERT_SAMPLES).zip(samples.par_chunks(CONVERT_SAMPLES));
+        chunks.for_each(|(out, samples)| dispatch_pass(simd, &Convert { samples, largest }, &mut (), out));
     }
 
     /// Everything in floating point.
@@ -88,6 +96,25 @@ impl StoredPicture {
             self.weights_into(weights.as_deref(), &mut out).then_some(out)
         };
         Picture { color, mask: plane(&self.mask), valid: plane(&self.valid) }
+    }
+}
+
+/// Samples that a task converts: about ten microseconds of work.
+const CONVERT_SAMPLES: usize = 1 << 16;
+
+struct Convert<'a, S> {
+    samples: &'a [S],
+    largest: f32,
+}
+
+impl<S: Copy + Into<f32>> Pass for Convert<'_, S> {
+    type Scratch = ();
+    type Into = [f32];
+    type Out = ();
+
+    #[inline(always)]
+    fn run<const FMA: bool>(&self, (): &mut (), out: &mut [f32]) {
+        out.iter_mut().zip(self.samples).for_each(|(o, &v)| *o = v.into() / self.largest);
     }
 }
 
@@ -165,7 +192,13 @@ impl ImageStore {
         let count = self.shared.capture.frames.len();
         assert!(frames.iter().all(|&f| f < count), "prefetched frames must be the capture's frames");
         let mut state = self.shared.lock();
-        state.queue = frames.iter().copied().collect();
+        let State { queue, kept, loading, .. } = &mut *state;
+        queue.clear();
+        queue.extend(frames.iter().copied().filter(|f| !kept.contains_key(f) && !loading.contains(f)));
+        if queue.is_empty() {
+            // Once everything is kept, nobody is woken for nothing.
+            return;
+        }
         drop(state);
         self.shared.changed.notify_all();
         let mut worker = self.worker.lock().unwrap_or_else(|e| e.into_inner());

@@ -3,6 +3,7 @@
 
 use super::{Change, Limits, Stats, apply, covariances, is_dead, logit, opacity, sample};
 use crate::optim::Moments;
+use rayon::prelude::*;
 use splat4d::layers::Scene;
 use splat4d::math::{Rng, sym3};
 use splat4d::scene::params::OPACITY;
@@ -36,9 +37,9 @@ impl Adc {
         let rows = scene.layers[layer].params.len();
         let covs = covariances(scene, layer);
         let spans = scene.layers[layer].spans();
-        let size = |r: usize| sym3::eigen(covs[r]).0[0].max(0.0).sqrt();
+        let sizes: Vec<f64> = covs.par_iter().map(|&c| sym3::largest(c).max(0.0).sqrt()).collect();
         let keep: Vec<bool> = (0..rows)
-            .map(|r| !is_dead(scene, layer, r, limits.min_opacity, spans[r]) && size(r) <= HUGE * limits.extent)
+            .map(|r| !is_dead(scene, layer, r, limits.min_opacity, spans[r]) && sizes[r] <= HUGE * limits.extent)
             .collect();
         let removed = keep.iter().filter(|k| !**k).count();
         *spare += removed;
@@ -52,7 +53,7 @@ impl Adc {
         *spare -= wanting.len();
         let mut grows = vec![false; rows];
         wanting.iter().for_each(|&(_, r)| grows[r as usize] = true);
-        let splits: Vec<bool> = (0..rows).map(|r| grows[r] && size(r) > self.percent_dense * limits.extent).collect();
+        let splits: Vec<bool> = (0..rows).map(|r| grows[r] && sizes[r] > self.percent_dense * limits.extent).collect();
         let mut edit = RowEdit { space: Space::Gaussians, parent: Vec::new(), born: Vec::new() };
         for r in (0..rows).filter(|&r| keep[r]) {
             edit.push(r as u32, if splits[r] { Born::Split } else { Born::Kept });

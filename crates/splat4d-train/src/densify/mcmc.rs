@@ -14,6 +14,8 @@ use splat4d::scene::{Born, GEOMETRY, RowEdit, Rows, Space};
 
 /// More copies than this on one place are not told apart (as in gsplat).
 const MAX_COPIES: usize = 51;
+/// Opaque Gaussians get less than a ten-thousandth of the noise: not worth three normal numbers.
+const LEAST_GATE: f64 = 1e-4;
 /// Slope of the sigmoid that ends the noise above the dead opacity (Kheradmand et al. 2024).
 const NOISE_SLOPE: f64 = 100.0;
 
@@ -133,13 +135,15 @@ pub fn add_noise(layer: &mut Layer<f32>, active: &[bool], strength: f64, min_opa
         return;
     }
     let [geometry] = layer.params.get_mut([GEOMETRY]);
+    // The opacity, and its logit, from which the gate is below the least one: most Gaussians are told by one number.
+    let opaque = min_opacity + (1.0 / LEAST_GATE - 1.0).ln() / NOISE_SLOPE;
+    let limit = if opaque < 1.0 { (opaque / (1.0 - opaque)).ln() as f32 } else { f32::INFINITY };
     for_rows([geometry], Rows::All, |_, row, [geometry]| {
-        let g = geometry.read::<11>(row, 0);
-        let gate = (-NOISE_SLOPE * (f64::from(g[OPACITY]).sigmoid() - min_opacity)).sigmoid();
-        // Opaque Gaussians get less than a ten-thousandth: not worth three normal numbers.
-        if !active[row] || gate < 1e-4 {
+        if !active[row] || geometry.read::<1>(row, OPACITY)[0] > limit {
             return 0.0;
         }
+        let g = geometry.read::<11>(row, 0);
+        let gate = (-NOISE_SLOPE * (f64::from(g[OPACITY]).sigmoid() - min_opacity)).sigmoid();
         let c = sym3::from_quat_log_scales(
             [g[QUAT], g[QUAT + 1], g[QUAT + 2], g[QUAT + 3]],
             [g[LOG_SCALE], g[LOG_SCALE + 1], g[LOG_SCALE + 2]],

@@ -9,7 +9,7 @@ pub mod mcmc;
 use crate::optim::Moments;
 use splat4d::layers::{LayerTape, Scene};
 use splat4d::math::{Real, Rng, sym3};
-use splat4d::motion::Cache;
+use splat4d::motion::{Cache, for_rows};
 use splat4d::scene::params::{OPACITY, QUAT};
 use splat4d::scene::splats::COV;
 use splat4d::scene::{Born, GEOMETRY, RowEdit, Rows, Space, Table, Time};
@@ -48,15 +48,15 @@ impl Stats {
 
     /// Adds one view's news.
     pub fn observe<F: Real>(&mut self, o: Observation<'_, F>) {
-        let table = &mut self.tables[o.layer];
-        for (j, &radius) in o.radii.iter().enumerate() {
+        for_rows([&mut self.tables[o.layer]], o.rows, |j, id, [table]| {
+            let radius = o.radii[j];
             if radius > F::ZERO {
-                let id = o.rows.id(j);
                 let [sum, count, largest] = table.read::<3>(id, 0);
                 let next = [sum + o.mean2d[j].f64() as f32, count + 1.0, largest.max(radius.f64() as f32)];
                 table.write(id, 0, next);
             }
-        }
+            0.0
+        });
     }
 
     /// Mean gradient of a row, 0 where never drawn.

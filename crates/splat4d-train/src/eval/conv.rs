@@ -1,10 +1,9 @@
 //! The layers that the LPIPS networks need: convolution, ReLU and max pooling of channels-first images.
 
-use super::simd;
-use crate::loss::simd::Simd;
 use rayon::prelude::*;
 use splat4d::math::Real;
 use splat4d::scene::Planes;
+use splat4d::simd::{Pass, Simd, dispatch_pass};
 
 /// Output channels worked on together: one load of the input serves all of them.
 const OUT_BLOCK: usize = 4;
@@ -46,7 +45,8 @@ impl Conv {
             let count = out.len() / (oh * ow);
             for y in 0..oh {
                 let bias = std::array::from_fn(|o| self.bias.get(b * OUT_BLOCK + o).copied().unwrap_or(0.0));
-                simd::convolve(simd, &Row { image: &padded, weights, side: self.side, bias, y }, &mut band);
+                let job = Row { image: &padded, weights, side: self.side, bias, y };
+                dispatch_pass(simd, &job, &mut (), band.as_mut_slice());
                 for o in 0..count {
                     out[(o * oh + y) * ow..][..ow].copy_from_slice(&band[o * row..][..ow]);
                 }
@@ -85,7 +85,7 @@ impl Conv {
 }
 
 /// An image ready to be convolved: [channels, height, stride, phase].
-pub(crate) struct Padded {
+struct Padded {
     data: Vec<f32>,
     channels: usize,
     height: usize,
@@ -97,7 +97,7 @@ pub(crate) struct Padded {
 }
 
 /// One row of one block of output channels.
-pub(crate) struct Row<'a> {
+struct Row<'a> {
     image: &'a Padded,
     weights: &'a [f32],
     side: usize,
@@ -105,9 +105,20 @@ pub(crate) struct Row<'a> {
     y: usize,
 }
 
-/// Convolves one row of four output channels and clamps at zero; `out` is `[4, row]`.
+impl Pass for Row<'_> {
+    type Scratch = ();
+    type Into = [f32];
+    type Out = ();
+
+    /// Convolves one row of four output channels and clamps at zero; `out` is `[4, row]`.
+    #[inline(always)]
+    fn run<const FMA: bool>(&self, (): &mut (), out: &mut [f32]) {
+        row::<FMA>(self, out);
+    }
+}
+
 #[inline(always)]
-pub(crate) fn row<const FMA: bool>(job: &Row<'_>, out: &mut [f32]) {
+fn row<const FMA: bool>(job: &Row<'_>, out: &mut [f32]) {
     let image = job.image;
     let top = job.y * image.stride;
     for (out, bias) in out.chunks_exact_mut(image.row).zip(job.bias) {

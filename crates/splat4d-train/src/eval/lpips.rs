@@ -13,9 +13,9 @@
 //! Source: Zhang 2018, `lpips` version 0.1.
 
 use super::conv::{Conv, max_pool};
-use crate::loss::simd::Simd;
 use splat4d::math::Real;
 use splat4d::scene::Planes;
+use splat4d::simd::Simd;
 use splat4d::{Error, Result};
 
 /// Mean and spread of ImageNet colours for inputs in `[−1,1]` (`lpips` `ScalingLayer`).

@@ -8,7 +8,6 @@ pub mod lpips;
 pub mod metrics;
 mod report;
 pub mod run;
-mod simd;
 
 pub use lpips::{InputScaling, Lpips, Net};
 pub use report::{Report, Score, Split, View};

@@ -18,6 +18,7 @@
 //! The loops are plain ones over a row, because LLVM vectorises those reliably, and blocks of lanes it does not.
 
 use splat4d::math::Real;
+use splat4d::simd::Pass;
 
 /// Taps of the window and their reach on either side (Wang 2004; 3DGS `loss_utils`).
 pub(super) const TAPS: usize = 11;
@@ -84,7 +85,7 @@ pub(super) struct Scratch<F> {
     means: Vec<[F; STRIDE]>,
     /// Weights from column −5 on, 0 outside the image, `[STRIDE]`.
     weights: Box<[F; STRIDE]>,
-    /// Results of one row, `[2, STRIDE]`.
+    /// Results of one row, `[3, STRIDE]`.
     row: Vec<[F; STRIDE]>,
 }
 
@@ -97,25 +98,32 @@ impl<F: Real> Scratch<F> {
             derivatives: rows(RING * DERIVATIVES),
             means: rows(GROUP * MOMENTS),
             weights: Box::new([F::ZERO; STRIDE]),
-            row: rows(2),
+            row: rows(3),
         }
     }
 }
 
-/// [Σ w|x − y|, Σ w S] over the strip; writes its gradient into `d` ([rows, width]).
-#[inline(always)]
-pub(super) fn strip<F: Real, const FMA: bool>(job: &Strip<'_, F>, scratch: &mut Scratch<F>, d: &mut [F]) -> [f64; 2] {
-    // Column runs of even size, so that no narrow rest pays a full halo.
-    let runs = job.width.div_ceil(MAX_COLUMNS);
-    let run = job.width.div_ceil(runs).next_multiple_of(LANES);
-    let mut sums = [0.0; 2];
-    for x0 in (0..job.width).step_by(run) {
-        let tile = Tile::new(job, x0, run.min(job.width - x0), d.len() / job.width);
-        let part = tile.walk::<FMA>(scratch, d);
-        sums[0] += part[0];
-        sums[1] += part[1];
+impl<F: Real> Pass for Strip<'_, F> {
+    type Scratch = Scratch<F>;
+    type Into = [F];
+    type Out = [f64; 3];
+
+    /// [Σ w|x − y|, Σ w S, Σ w e²] over the strip, e the error of the render clamped to [0, 1]; writes its gradient into `d` ([rows, width]).
+    #[inline(always)]
+    fn run<const FMA: bool>(&self, scratch: &mut Scratch<F>, d: &mut [F]) -> [f64; 3] {
+        // Column runs of even size, so that no narrow rest pays a full halo.
+        let runs = self.width.div_ceil(MAX_COLUMNS);
+        let run = self.width.div_ceil(runs).next_multiple_of(LANES);
+        let mut sums = [0.0; 3];
+        for x0 in (0..self.width).step_by(run) {
+            let tile = Tile::new(self, x0, run.min(self.width - x0), d.len() / self.width);
+            let part = tile.walk::<FMA>(scratch, d);
+            sums[0] += part[0];
+            sums[1] += part[1];
+            sums[2] += part[2];
+        }
+        sums
     }
-    sums
 }
 
 /// Some columns of a strip. Its derivative row/column i is the image's `first − 5 + i`, its product row/column i the
@@ -139,8 +147,8 @@ impl<'a, F: Real> Tile<'a, F> {
     }
 
     #[inline(always)]
-    fn walk<const FMA: bool>(&self, s: &mut Scratch<F>, d: &mut [F]) -> [f64; 2] {
-        let mut sums = [0.0; 2];
+    fn walk<const FMA: bool>(&self, s: &mut Scratch<F>, d: &mut [F]) -> [f64; 3] {
+        let mut sums = [0.0; 3];
         self.fill_weights(s, 0);
         for row in 0..2 * REACH {
             self.fill_products(s, row);
@@ -167,7 +175,8 @@ impl<'a, F: Real> Tile<'a, F> {
                 );
                 for row in 0..GROUP {
                     if (2 * REACH..self.rows + 2 * REACH).contains(&(head + row)) {
-                        sums[0] += self.gradient::<FMA>(s, head + row - 2 * REACH, row, d);
+                        let [l1, square] = self.gradient::<FMA>(s, head + row - 2 * REACH, row, d);
+                        (sums[0], sums[2]) = (sums[0] + l1, sums[2] + square);
                     }
                 }
             }
@@ -283,16 +292,16 @@ impl<'a, F: Real> Tile<'a, F> {
         if own { sum(&map[REACH..REACH + self.columns]) } else { 0.0 }
     }
 
-    /// Horizontal means of the derivatives of one row of a group, and the gradient; returns Σ w|x − y|.
+    /// Horizontal means of the derivatives of one row of a group, and the gradient; returns Σ w|x − y| and Σ w e².
     #[inline(always)]
-    fn gradient<const FMA: bool>(&self, s: &mut Scratch<F>, row: usize, in_group: usize, d: &mut [F]) -> f64 {
+    fn gradient<const FMA: bool>(&self, s: &mut Scratch<F>, row: usize, in_group: usize, d: &mut [F]) -> [f64; 2] {
         if self.job.weight.is_some() {
             self.fill_weights(s, row + REACH);
         }
         let (means, _) = s.means[in_group * DERIVATIVES..].split_first_chunk::<DERIVATIVES>().expect("a row of means");
         let slot = (row + 2 * REACH) % RING * MOMENTS;
         let (px, py) = (&s.products[slot], &s.products[slot + 1]);
-        let [out, l1] = s.row.first_chunk_mut::<2>().expect("two rows of results");
+        let [out, l1, square] = s.row.first_chunk_mut::<3>().expect("three rows of results");
         let taps = &self.job.taps;
         let (d_l1, d_ssim) = (self.job.d_l1, self.job.d_ssim);
         for i in 0..self.columns.min(STRIDE - TAPS + 1 - REACH) {
@@ -306,9 +315,12 @@ impl<'a, F: Real> Tile<'a, F> {
             let chain = (F::TWO * x).fma::<FMA>(db, y.fma::<FMA>(dc, da));
             out[i] = chain.fma::<FMA>(inside, sign * w * d_l1);
             l1[i] = diff.abs() * w;
+            let shown = if x < F::ZERO { F::ZERO } else { x };
+            let e = if shown > F::ONE { F::ONE } else { shown } - y;
+            square[i] = e * e * w;
         }
         d[row * self.job.width + self.x0..][..self.columns].copy_from_slice(&out[..self.columns]);
-        sum(&l1[..self.columns])
+        [sum(&l1[..self.columns]), sum(&square[..self.columns])]
     }
 }
 

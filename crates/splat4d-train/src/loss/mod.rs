@@ -5,7 +5,6 @@
 mod kernel;
 pub mod photometric;
 pub mod scene;
-pub mod simd;
 pub mod terms;
 
 pub use photometric::{LossValue, Photometric};

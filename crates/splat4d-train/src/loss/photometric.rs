@@ -1,10 +1,10 @@
 //! The picture loss of 3DGS, (1 − λ)·L1 + λ·(1 − SSIM), and its gradient, in one pass over the image.
 
 use super::kernel::{self, Scratch, Strip};
-use super::simd::{self, Simd};
 use rayon::prelude::*;
 use splat4d::math::Real;
 use splat4d::scene::Planes;
+use splat4d::simd::{Simd, dispatch_pass};
 use std::sync::Mutex;
 
 /// Rows of a strip: the unit of parallel work. Fixed, so that sums do not depend on the number of threads.
@@ -19,6 +19,8 @@ pub struct LossValue {
     pub l1: f64,
     /// Weighted mean of the SSIM map over pixels and channels; 1 for equal images.
     pub ssim: f64,
+    /// Weighted mean of (render − truth)², the render clamped to [0, 1]; no part of `total`.
+    pub mse: f64,
 }
 
 /// L1 and SSIM with their gradient; keeps its working memory between calls.
@@ -31,7 +33,7 @@ pub struct Photometric<F = f32> {
     /// One a thread of the pool; a thread holds its own only while it works on one strip.
     scratch: Vec<Mutex<Scratch<F>>>,
     /// [channels, strips] sums, added up in order.
-    sums: Vec<[f64; 2]>,
+    sums: Vec<[f64; 3]>,
 }
 
 impl<F: Real> Photometric<F> {
@@ -84,7 +86,7 @@ impl<F: Real> Photometric<F> {
         } * channels as f64;
         if total_weight <= 0.0 {
             d_render.data.fill(F::ZERO);
-            return LossValue { total: 0.0, l1: 0.0, ssim: 1.0 };
+            return LossValue { total: 0.0, l1: 0.0, ssim: 1.0, mse: 0.0 };
         }
 
         let lambda = f64::from(self.lambda_dssim);
@@ -92,7 +94,7 @@ impl<F: Real> Photometric<F> {
         while self.scratch.len() < rayon::current_num_threads() {
             self.scratch.push(Mutex::new(Scratch::new()));
         }
-        self.sums.resize(channels * strips, [0.0; 2]);
+        self.sums.resize(channels * strips, [0.0; 3]);
         let (simd, scratch, taps) = (self.simd, &self.scratch, self.taps);
         let weight = weight.map(|w| w.data.as_slice());
         let (d_l1, d_ssim) = (F::of((1.0 - lambda) / total_weight), F::of(-lambda / total_weight));
@@ -106,17 +108,16 @@ impl<F: Real> Photometric<F> {
                 // A loop of one step may run on the caller's own thread, then alone.
                 let thread = rayon::current_thread_index().unwrap_or(0);
                 let mut scratch = scratch[thread].lock().expect("no strip panics while it holds its scratch");
-                *sums = simd::strip(simd, &job, &mut scratch, d);
+                *sums = dispatch_pass(simd, &job, &mut *scratch, d);
             });
         });
 
-        let (mut l1, mut ssim) = (0.0, 0.0);
+        let mut total = [0.0; 3];
         for s in &self.sums {
-            l1 += s[0];
-            ssim += s[1];
+            (0..3).for_each(|i| total[i] += s[i]);
         }
-        let (l1, ssim) = (l1 / total_weight, ssim / total_weight);
-        LossValue { total: (1.0 - lambda) * l1 + lambda * (1.0 - ssim), l1, ssim }
+        let [l1, ssim, mse] = total.map(|x| x / total_weight);
+        LossValue { total: (1.0 - lambda) * l1 + lambda * (1.0 - ssim), l1, ssim, mse }
     }
 }
 

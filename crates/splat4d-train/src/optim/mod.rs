@@ -1,24 +1,39 @@
 //! Adam, sparse over the active set: rows that took no part in a step, and tables that nothing touched, rest (no decay,
 //! no update), and the bias correction uses the row's own step count.
+//!
+//! A step reads every active number's gradient once and leaves zero in its place, so that no other pass clears it.
 
-use rayon::prelude::*;
+mod adam;
+
 use splat4d::math::Real;
-use splat4d::scene::table::Column;
-use splat4d::scene::{BLOCK, Born, Grads, Key, Params, RowEdit, Space, Table};
-
-/// Decay of the first moment (Kingma and Ba 2015).
-const BETA1: f64 = 0.9;
-/// Decay of the second moment.
-const BETA2: f64 = 0.999;
-/// Added to the root of the second moment (Kerbl et al. 2023 use 1e-15: gradients of single Gaussians are tiny).
-const EPSILON: f64 = 1e-15;
-/// Blocks a task takes.
-const TASK_BLOCKS: usize = 32;
+use splat4d::scene::table::{Column, halve};
+use splat4d::scene::{Born, Grads, Key, Params, RowEdit, Space, Table};
+use splat4d::simd::{Simd, dispatch};
 
 /// First and second moments and step counts: for a table of width W one of width 2W + 1 and as many rows.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default)]
 pub struct Moments<F = f32> {
     tables: Vec<Table<F>>,
+    /// By step count; made by the first step.
+    corrections: Vec<[F; 2]>,
+}
+
+impl<F: PartialEq> PartialEq for Moments<F> {
+    /// What is looked up is no state.
+    fn eq(&self, other: &Self) -> bool {
+        self.tables == other.tables
+    }
+}
+
+/// A lower bound of one column; its active rows are lifted to it after the step.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Floor {
+    /// The table.
+    pub key: Key,
+    /// The column.
+    pub column: usize,
+    /// The bound.
+    pub least: f64,
 }
 
 impl<F: Real> Moments<F> {
@@ -29,7 +44,7 @@ impl<F: Real> Moments<F> {
             let columns = columns.map(|(name, width)| Column { name: name.into(), width });
             Table::with_columns(columns.to_vec(), p[key].rows())
         };
-        Self { tables: p.keys().map(table).collect() }
+        Self { tables: p.keys().map(table).collect(), corrections: Vec::new() }
     }
 
     /// The moments of one table, [rows, 2W + 1].
@@ -65,18 +80,43 @@ impl<F: Real> Moments<F> {
     }
 
     /// One step. `rates[key]` holds a rate a column (0: frozen); a key without an entry rests.
-    /// Returns the tables in which a number was not finite; their parameters are then not to be used.
-    pub fn step(&mut self, p: &mut Params<F>, d: &Grads<F>, rates: &[Option<Vec<f64>>]) -> Vec<Key> {
-        let mut bad = Vec::new();
-        for key in p.keys().collect::<Vec<_>>() {
+    ///
+    /// Gradients of the tables that learn are zero afterwards; what rests is left to [`Grads::clear`]. Returns the tables
+    /// in which a number was not finite: their parameters are then not to be used, and the gradient of the rows to blame
+    /// is kept.
+    pub fn step(
+        &mut self,
+        p: &mut Params<F>,
+        d: &mut Grads<F>,
+        rates: &[Option<Vec<f64>>],
+        floors: &[Floor],
+    ) -> Vec<Key> {
+        if self.corrections.is_empty() {
+            self.corrections = adam::corrections();
+        }
+        let (mut bad, simd) = (Vec::new(), Simd::detect());
+        for key in p.keys() {
             let Some(rates) = rates.get(key.0 as usize).and_then(Option::as_ref) else { continue };
-            if !d.touched(key) || !p.info(key).trainable || p[key].width() == 0 || rates.iter().all(|&r| r == 0.0) {
+            let width = p[key].width();
+            if !p.info(key).trainable || width == 0 || rates.iter().all(|&r| r == 0.0) {
                 continue;
             }
+            assert_eq!(rates.len(), width, "a rate a column is needed");
             let space = p.info(key).space;
-            let flags = d.active(space);
+            let Some((gradient, active)) = d.drain(key, space) else { continue };
+            let rule = adam::Rule {
+                rates,
+                floors,
+                key,
+                active: (space != Space::Fixed).then_some(active),
+                corrections: &self.corrections,
+            };
             let [table] = p.get_mut([key]);
-            if !step_table(table, d.table(key), &mut self.tables[key.0 as usize], flags, space, rates) {
+            let views = [table.view_mut(), self.tables[key.0 as usize].view_mut(), gradient.view_mut()];
+            let faults = halve(views, &|views| dispatch(simd, adam::Step { rule: &rule, views }));
+            if faults > 0.0 {
+                // Whoever asks what went wrong looks at the gradient.
+                let _ = d.of([key]);
                 bad.push(key);
             }
         }
@@ -84,82 +124,10 @@ impl<F: Real> Moments<F> {
     }
 }
 
-fn step_table<F: Real>(
-    p: &mut Table<F>,
-    d: &Table<F>,
-    m: &mut Table<F>,
-    active: &[bool],
-    space: Space,
-    rates: &[f64],
-) -> bool {
-    let (width, rows) = (p.width(), p.rows());
-    assert_eq!(rates.len(), width, "a rate a column is needed");
-    let rates: Vec<F> = rates.iter().map(|&r| F::of(r)).collect();
-    let tasks: Vec<_> = p
-        .chunks_mut(TASK_BLOCKS)
-        .zip(m.chunks_mut(TASK_BLOCKS))
-        .zip(d.data().chunks(TASK_BLOCKS * width * BLOCK))
-        .collect();
-    tasks
-        .into_par_iter()
-        .map(|((p, m), d)| {
-            let mut finite = true;
-            let blocks = p.data.chunks_exact_mut(width * BLOCK).zip(m.data.chunks_exact_mut((2 * width + 1) * BLOCK));
-            for (b, ((p_block, m_block), d_block)) in blocks.zip(d.chunks_exact(width * BLOCK)).enumerate() {
-                let first = p.first + b * BLOCK;
-                let lanes: [bool; BLOCK] =
-                    std::array::from_fn(|lane| first + lane < rows && (space == Space::Fixed || active[first + lane]));
-                if lanes.contains(&true) {
-                    finite &= step_block(p_block, d_block, m_block, &lanes, &rates);
-                }
-            }
-            finite
-        })
-        .reduce(|| true, |a, b| a & b)
-}
-
-/// Sixteen rows: p and d are [W][16], m is [2W + 1][16].
-fn step_block<F: Real>(p: &mut [F], d: &[F], m: &mut [F], active: &[bool; BLOCK], rates: &[F]) -> bool {
-    let width = rates.len();
-    let (beta1, beta2) = (F::of(BETA1), F::of(BETA2));
-    let (first, rest) = m.split_at_mut(width * BLOCK);
-    let (second, steps) = rest.split_at_mut(width * BLOCK);
-    let mut correct1 = [F::ONE; BLOCK];
-    let mut correct2 = [F::ONE; BLOCK];
-    for l in 0..BLOCK {
-        if active[l] {
-            steps[l] += F::ONE;
-        }
-        let n = steps[l].f64().max(1.0) as i32;
-        correct1[l] = F::of(1.0 / (1.0 - BETA1.powi(n)));
-        correct2[l] = F::of(1.0 / (1.0 - BETA2.powi(n)));
-    }
-    let mut checked = [F::ZERO; BLOCK];
-    for c in 0..width {
-        if rates[c] == F::ZERO {
-            continue;
-        }
-        let at = c * BLOCK..(c + 1) * BLOCK;
-        let (p, d) = (&mut p[at.clone()], &d[at.clone()]);
-        let (m1, m2) = (&mut first[at.clone()], &mut second[at]);
-        for l in 0..BLOCK {
-            let a = beta1 * m1[l] + (F::ONE - beta1) * d[l];
-            let b = beta2 * m2[l] + (F::ONE - beta2) * d[l] * d[l];
-            let next = p[l] - rates[c] * (a * correct1[l]) / ((b * correct2[l]).sqrt() + F::of(EPSILON));
-            m1[l] = if active[l] { a } else { m1[l] };
-            m2[l] = if active[l] { b } else { m2[l] };
-            p[l] = if active[l] { next } else { p[l] };
-            // 0·x is 0 for finite x and NaN otherwise; padding lanes are finite zeros.
-            checked[l] += F::ZERO * p[l];
-        }
-    }
-    checked.iter().all(|x| *x == F::ZERO)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use splat4d::scene::{GEOMETRY, Rows, SH};
+    use splat4d::scene::{GEOMETRY, LIFE, Rows, SH};
 
     #[test]
     fn equals_the_textbook_and_rests_where_nothing_is_active() {
@@ -174,7 +142,7 @@ mod tests {
             let [t] = d.of([GEOMETRY]);
             t.set(3, 1, g);
             t.set(4, 1, 9.0); // not active
-            assert!(m.step(&mut p, &d, &rates).is_empty());
+            assert!(m.step(&mut p, &mut d, &rates, &[]).is_empty());
             a = 0.9 * a + 0.1 * g;
             b = 0.999 * b + 0.001 * g * g;
             x -= 0.1 * (a / (1.0 - 0.9f64.powi(step))) / ((b / (1.0 - 0.999f64.powi(step))).sqrt() + 1e-15);
@@ -193,7 +161,58 @@ mod tests {
         let (mut m, mut d) = (Moments::new(&p), Grads::new(&p));
         d.activate(Space::Gaussians, Rows::All);
         d.of([SH])[0].set(1, 0, f32::NAN);
-        assert_eq!(m.step(&mut p, &d, &[None, Some(vec![0.1; 3])]), [SH]);
+        assert_eq!(m.step(&mut p, &mut d, &[None, Some(vec![0.1; 3])], &[]), [SH]);
+        assert!(d.touched(SH) && d.table(SH).get(1, 0).is_nan(), "the gradient to blame is kept");
+    }
+
+    /// The same arithmetic, number by number.
+    fn slow(p: &mut Table<f32>, m: &mut Table<f32>, d: &Table<f32>, active: &[bool], rates: &[f64], least: f32) {
+        let width = p.width();
+        for row in (0..p.rows()).filter(|&r| active[r]) {
+            *m.get_mut(row, 2 * width) += 1.0;
+            let n = m.get(row, 2 * width) as i32;
+            let [c1, c2] = [0.9f64, 0.999].map(|beta| (1.0 / (1.0 - beta.powi(n))) as f32);
+            for c in (0..width).filter(|&c| rates[c] != 0.0) {
+                let g = d.get(row, c);
+                let a = 0.9 * m.get(row, c) + (1.0 - 0.9) * g;
+                let b = 0.999 * m.get(row, width + c) + (1.0 - 0.999) * g * g;
+                let x = p.get(row, c) - rates[c] as f32 * (a * c1) / ((b * c2).sqrt() + 1e-15);
+                m.set(row, c, a);
+                m.set(row, width + c, b);
+                p.set(row, c, if c == 1 { x.max(least) } else { x });
+            }
+        }
+    }
+
+    #[test]
+    fn lanes_equal_number_by_number_and_leave_no_gradient() {
+        let rows = 2500;
+        let mut p = Params::<f32>::new(rows, 1, &[("a", 1), ("b", 1)]);
+        let (mut m, mut d) = (Moments::new(&p), Grads::new(&p));
+        let (mut expected, mut moments) = (p[LIFE].clone(), m.table(LIFE).clone());
+        let rng = splat4d::math::Rng::new(2, "adam", 0);
+        let rates = vec![None, None, Some(vec![0.0, 0.02])];
+        let floor = Floor { key: LIFE, column: 1, least: -0.01 };
+        for step in 0..40u64 {
+            // Blocks that are full, empty and mixed; late steps meet rows of very different counts.
+            let active: Vec<bool> =
+                (0..rows).map(|r| r % 64 < 16 || (r % 64 < 40 && rng.fork(step).uniform(r as u64) < 0.4)).collect();
+            let ids: Vec<u32> = (0..rows as u32).filter(|&r| active[r as usize]).collect();
+            d.activate(Space::Gaussians, Rows::Some(&ids));
+            let [g] = d.of([LIFE]);
+            for &r in &ids {
+                let x = rng.fork(1000 + step).normal(u64::from(r)) as f32;
+                g.write(r as usize, 0, [x, 1e-3 * x * x - 2e-4]);
+            }
+            slow(&mut expected, &mut moments, &d.table(LIFE).clone(), &active, rates[2].as_ref().unwrap(), -0.01);
+            assert!(m.step(&mut p, &mut d, &rates, &[floor]).is_empty());
+            assert!(!d.touched(LIFE) && d.table(LIFE).data().iter().all(|&x| x == 0.0));
+            d.clear(&p);
+        }
+        assert_eq!(p[LIFE].column_to_rows(0, 2), expected.column_to_rows(0, 2));
+        assert_eq!(m.table(LIFE).column_to_rows(0, 5), moments.column_to_rows(0, 5));
+        assert!(expected.column_to_rows(1, 1).contains(&-0.01), "the floor was met");
+        assert_eq!(d, Grads::new(&p));
     }
 
     #[test]

@@ -9,11 +9,12 @@ use splat4d::layers::{LayerTape, Scene};
 use splat4d::math::Real;
 use splat4d::motion::{At, Cache};
 use splat4d::render::{Image, ImageGrads, RenderConfig, RenderGrads, Renderer};
+use splat4d::scene::table::halve;
 use splat4d::scene::{Camera, Color, Grads, Planes, Rows, SH, Space, SplatGrads, Splats, Table, Time};
 use std::time::{Duration, Instant as Clock};
 
 /// Draws splats and takes gradients back; [`Renderer`] is the one in use, tests put the oracle here.
-pub trait Draw<F: Real> {
+pub trait Draw<F: Real>: Send {
     /// Fills `out`.
     fn render(&mut self, splats: &Splats<'_, F>, camera: &Camera, background: [F; 3], out: &mut Image<F>);
     /// The VJP of the last `render`; see [`Renderer::backward`].
@@ -125,6 +126,8 @@ pub struct StepReport {
 struct Ask<F: Real> {
     layer: usize,
     tape: LayerTape<F>,
+    /// Whether the gradients below are this step's.
+    begun: bool,
     d_out: Table<F>,
     d_color: Option<Table<F>>,
     d_weights: Option<Table<F>>,
@@ -195,8 +198,7 @@ impl<F: Real> Chain<F> {
         self.at_calls = self.asks.len();
         for ask in &mut self.asks {
             scene.layers[ask.layer].at(&self.caches[ask.layer].0, &mut ask.tape);
-            reset_like(&mut ask.d_out, ask.tape.out());
-            (ask.d_color, ask.d_weights, ask.d_time) = (None, None, 0.0);
+            (ask.begun, ask.d_time) = (false, 0.0);
             d[ask.layer].activate(ask.tape.space(), ask.tape.rows());
         }
         report.timings.motion = clock.elapsed();
@@ -204,6 +206,10 @@ impl<F: Real> Chain<F> {
             self.view(scene, view, draw, losses.image, d, observe, &mut report);
         }
         let clock = Clock::now();
+        for ask in self.asks.iter_mut().filter(|a| !a.begun) {
+            reset_like(&mut ask.d_out, ask.tape.out());
+            (ask.d_color, ask.d_weights) = (None, None);
+        }
         for (loss, probes) in losses.probes.iter().zip(&probes) {
             if !probes.is_empty() {
                 report.loss += self.probe(scene, loss.as_ref(), probes);
@@ -327,11 +333,19 @@ impl<F: Real> Chain<F> {
             first += count;
         }
         drop(splats);
-        for (&i, part) in asked.iter().zip(&self.d_render.parts) {
+        for (&i, part) in asked.iter().zip(&mut self.d_render.parts) {
             let ask = &mut self.asks[i];
-            add_table(&mut ask.d_out, &part.out);
-            add_optional(&mut ask.d_color, part.color.as_ref());
-            add_optional(&mut ask.d_weights, part.weights.as_ref());
+            if ask.begun {
+                add_table(&mut ask.d_out, &part.out);
+                add_optional(&mut ask.d_color, part.color.as_ref());
+                add_optional(&mut ask.d_weights, part.weights.as_ref());
+            } else {
+                // Nothing to add to: the renderer gets the ask's old tables to overwrite.
+                ask.begun = true;
+                std::mem::swap(&mut ask.d_out, &mut part.out);
+                std::mem::swap(&mut ask.d_color, &mut part.color);
+                std::mem::swap(&mut ask.d_weights, &mut part.weights);
+            }
         }
         report.timings.render_backward += clock.elapsed();
     }
@@ -384,6 +398,7 @@ impl<F: Real> Ask<F> {
         Self {
             layer: 0,
             tape: LayerTape::default(),
+            begun: false,
             d_out: Table::default(),
             d_color: None,
             d_weights: None,
@@ -425,9 +440,11 @@ fn reset_like<F: Real>(d: &mut Table<F>, like: &Table<F>) {
 
 fn add_table<F: Real>(to: &mut Table<F>, from: &Table<F>) {
     assert_eq!((to.rows(), to.width()), (from.rows(), from.width()), "gradients of one ask have one shape");
-    for (a, b) in to.data_mut().iter_mut().zip(from.data()) {
-        *a += *b;
-    }
+    halve([to.view_mut()], &|[to]| {
+        let from = &from.data()[to.first * to.width..];
+        to.data.iter_mut().zip(from).for_each(|(a, b)| *a += *b);
+        0.0
+    });
 }
 
 fn add_optional<F: Real>(to: &mut Option<Table<F>>, from: Option<&Table<F>>) {

@@ -39,7 +39,7 @@ impl Exposure {
     pub fn step(&mut self, rate: f64) -> bool {
         let mut rates = vec![None; self.key.0 as usize];
         rates.push(Some(vec![rate; 6]));
-        let finite = self.moments.step(&mut self.params, &self.grads, &rates).is_empty();
+        let finite = self.moments.step(&mut self.params, &mut self.grads, &rates, &[]).is_empty();
         self.grads.clear(&self.params);
         let table = &mut self.params[self.key];
         for col in 0..6 {
@@ -62,7 +62,7 @@ pub struct TrainLoss {
     pub l1: f64,
     /// SSIM of the last view.
     pub ssim: f64,
-    /// Mean squared error of the last view, in [0, 1] colours.
+    /// Mean squared error of the last view, in [0, 1] colours, over the pixels that count.
     pub mse: f64,
 }
 
@@ -99,8 +99,7 @@ impl ImageLoss<f32> for TrainLoss {
         }
         let shown = if row.is_some() { &self.exposed } else { &image.color };
         let value = self.photometric.loss_and_grad(shown, view.truth, view.weight, d_color);
-        (self.l1, self.ssim) = (value.l1, value.ssim);
-        self.mse = mean_squared_error(shown, view.truth);
+        (self.l1, self.ssim, self.mse) = (value.l1, value.ssim, value.mse);
         if let (Some(row), Some(e)) = (row, &mut self.exposure) {
             let mut d = [0.0f32; 6];
             for c in 0..3 {
@@ -137,18 +136,4 @@ impl ImageLoss<f32> for TrainLoss {
         }
         (total, alpha)
     }
-}
-
-/// Mean over pixels and channels of the squared difference, the render clamped to [0, 1].
-pub fn mean_squared_error(render: &Planes<f32>, truth: &Planes<f32>) -> f64 {
-    let sum: f64 = render
-        .data
-        .iter()
-        .zip(&truth.data)
-        .map(|(a, b)| {
-            let e = f64::from(a.clamp(0.0, 1.0) - b);
-            e * e
-        })
-        .sum();
-    sum / render.data.len().max(1) as f64
 }

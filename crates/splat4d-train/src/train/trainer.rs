@@ -5,7 +5,7 @@ use super::loss::TrainLoss;
 use crate::capture::frames::{Frames, Picture};
 use crate::densify::{self, Change, Densify, Limits, Stats, adc, mcmc, morton_edit};
 use crate::models::Stage;
-use crate::optim::Moments;
+use crate::optim::{Floor, Moments};
 use crate::sampler::Timeline;
 use crate::{Error, ErrorKind, Result};
 use splat4d::layers::Scene;
@@ -92,6 +92,8 @@ pub struct Trainer<'a> {
     timeline: Timeline,
     draw: Box<dyn Draw<f32> + 'a>,
     grads: Vec<Grads<f32>>,
+    /// Scratch: a rate a column, by layer and table.
+    rates: Vec<Vec<Option<Vec<f64>>>>,
     chain: Chain<f32>,
     pictures: Vec<Picture>,
 }
@@ -120,6 +122,7 @@ impl<'a> Trainer<'a> {
             timeline,
             draw,
             grads: Vec::new(),
+            rates: Vec::new(),
             chain: Chain::default(),
             pictures: Vec::new(),
         };
@@ -214,6 +217,12 @@ impl<'a> Trainer<'a> {
 
     /// One step. Inner error: a number was not finite, nothing is to be trusted until a rollback.
     pub fn step(&mut self) -> Result<std::result::Result<Stepped, Fault>> {
+        // On a thread of the pool a task costs next to nothing; from outside, each of a step's dozens of parallel loops
+        // would put this thread to sleep and wake another one.
+        rayon::scope(|_| self.step_in_pool())
+    }
+
+    fn step_in_pool(&mut self) -> Result<std::result::Result<Stepped, Fault>> {
         self.enter_stage()?;
         let mut out = Stepped::default();
         if self.is_done() {
@@ -305,28 +314,25 @@ impl<'a> Trainer<'a> {
         let stage = &self.stages[self.progress.stage];
         let progress = self.progress.stage_step as f64 / stage.iterations as f64;
         let mut bad = Vec::new();
+        self.rates.resize_with(self.scene.layers.len(), Vec::new);
         for (index, layer) in self.scene.layers.iter_mut().enumerate() {
-            let mut rates: Vec<Option<Vec<f64>>> = layer.params.keys().map(|_| None).collect();
+            let rates = &mut self.rates[index];
+            rates.resize(layer.params.keys().count(), None);
+            rates.iter_mut().flatten().for_each(|table| table.fill(0.0));
             for group in stage.groups.iter().filter(|g| g.layer == index) {
                 let found = layer.params.keys().find_map(|k| layer.params[k].column(&group.column).map(|c| (k, c)));
                 let Some((key, (first, width))) = found else { continue };
                 let (from, count) = group.part.unwrap_or((0, width));
-                let table = rates[key.0 as usize].get_or_insert_with(|| vec![0.0; layer.params[key].width()]);
+                let table = rates[key.0 as usize].get_or_insert_default();
+                table.resize(layer.params[key].width(), 0.0);
                 let end = (first + from + count).min(first + width);
                 table[first + from..end].fill(group.rate.at(progress) * self.progress.rate_scale);
             }
-            let keys = self.moments[index].step(&mut layer.params, &self.grads[index], &rates);
+            let floor = stage.min_log_life.filter(|_| layer.params[LIFE].width() > LOG_WIDTH);
+            let floor = floor.map(|least| Floor { key: LIFE, column: LOG_WIDTH, least });
+            let floors = floor.as_slice();
+            let keys = self.moments[index].step(&mut layer.params, &mut self.grads[index], rates, floors);
             bad.extend(keys.into_iter().map(|k| (index, k)));
-            if let Some(floor) = stage.min_log_life
-                && layer.params[LIFE].width() > LOG_WIDTH
-            {
-                let floor = floor as f32;
-                let active = self.grads[index].active(Space::Gaussians);
-                for row in (0..active.len()).filter(|&r| active[r]) {
-                    let w = layer.params[LIFE].get_mut(row, LOG_WIDTH);
-                    *w = w.max(floor);
-                }
-            }
         }
         if let Some(exposure) = &mut self.loss.exposure {
             let _ = exposure.step(self.settings.exposure_lr * self.progress.rate_scale);

@@ -1,5 +1,6 @@
 //! A scene is a sum of layers: each a set of Gaussians with one motion model and one kind of life, all splatted together.
 
+mod envelope;
 #[cfg(test)]
 mod tests;
 mod turn;
@@ -8,10 +9,9 @@ pub use turn::rotation_between;
 
 use crate::math::Real;
 use crate::math::Rng;
-use crate::motion::{At, Cache, Motion, Tape, fill_rows, for_rows};
+use crate::motion::{At, Cache, Motion, Tape};
 use crate::scene::GEOMETRY;
 use crate::scene::params::OPACITY;
-use crate::scene::splats::SPLAT_OPACITY;
 use crate::scene::{
     Grads, LIFE, LifeBuckets, LifeKind, Params, Part, RowEdit, Rows, Space, SplatGrads, Splats, Table, Time,
 };
@@ -151,24 +151,7 @@ impl<F: Real> Layer<F> {
         if kind == LifeKind::Infinite {
             return true;
         }
-        let geometry = &self.params[GEOMETRY];
-        // σ ≥ α_min needs u² ≤ 2 ln 255 (an interval: beyond its ends); a wide first test spares most exponentials.
-        let widest = F::of((2.0 * -ALPHA_MIN.ln()).sqrt());
-        for id in 0..table.rows() {
-            let row = life_row(table, id);
-            let width = match kind {
-                LifeKind::Interval => row[1].exp() + row[2].exp() * widest,
-                _ => row[1].exp() * widest,
-            };
-            // Phrased so that a NaN is kept and found by the trainer's guard, not hidden.
-            if (F::of(t.0) - row[0]).abs() > width {
-                continue;
-            }
-            if geometry.get(id, OPACITY).sigmoid() * kind.eval(row, t).sigma < F::of(ALPHA_MIN) {
-                continue;
-            }
-            ids.push(id as u32);
-        }
+        envelope::active(&self.params[GEOMETRY], table, kind, t, ids);
         false
     }
 
@@ -212,18 +195,8 @@ impl<F: Real> Layer<F> {
             tape.life = Table::new(&[("sigma", 4)], 0);
         }
         tape.life.resize(tape.tape.out.rows());
-        let (kind, t) = (self.life, tape.t);
         let rows = if tape.all { Rows::All } else { Rows::Some(&tape.ids) };
-        fill_rows(&mut tape.life, rows, |id| {
-            let v = kind.eval(life_row(table, id), t);
-            [v.sigma, v.d_time, v.d_log_width, v.d_log_softness]
-        });
-        let sigma = &tape.life;
-        for_rows([&mut tape.tape.out], Rows::All, |_, j, [out]| {
-            let [o] = out.read::<1>(j, SPLAT_OPACITY);
-            out.write(j, SPLAT_OPACITY, [o * sigma.get(j, 0)]);
-            0.0
-        });
+        envelope::forward(table, self.life, tape.t, rows, &mut tape.tape.out, &mut tape.life);
     }
 
     /// The splats that the last [`at`](Self::at) left in `tape`.
@@ -250,23 +223,9 @@ impl<F: Real> Layer<F> {
             d_time += self.motion.backward(&question, cache, &mut own, d_out, d_cache, d);
         } else {
             // o_eff = o·σ: the motion gets dL/do = σ·dL/do_eff, the life dL/dσ = o·dL/do_eff.
-            d_motion.clone_from(d_out.out);
-            let sigma = &tape.life;
-            for_rows([&mut d_motion], Rows::All, |_, j, [d_row]| {
-                let [g] = d_row.read::<1>(j, SPLAT_OPACITY);
-                d_row.write(j, SPLAT_OPACITY, [g * sigma.get(j, 0)]);
-                0.0
-            });
-            let (geometry, kind) = (&self.params[GEOMETRY], self.life);
-            d_time += for_rows(d.of([LIFE]), question.rows, |j, id, [d_life]| {
-                let [_, by_time, by_width, by_softness] = sigma.read::<4>(j, 0);
-                let g = d_out.out.get(j, SPLAT_OPACITY) * geometry.get(id, OPACITY).sigmoid();
-                match kind {
-                    LifeKind::Interval => d_life.add(id, 0, [-g * by_time, g * by_width, g * by_softness]),
-                    _ => d_life.add(id, 0, [-g * by_time, g * by_width]),
-                }
-                (g * by_time).f64()
-            });
+            envelope::to_motion(d_out.out, &tape.life, &mut d_motion);
+            let [d_life] = d.of([LIFE]);
+            d_time += envelope::backward(&self.params, question.rows, d_out.out, &tape.life, d_life);
             let scaled = SplatGrads { out: &d_motion, ..*d_out };
             d_time += self.motion.backward(&question, cache, &mut own, &scaled, d_cache, d);
         }

@@ -3,16 +3,16 @@
 //! A model has no hidden state. Sequential ones (state space, filters) do their scan in [`Motion::prepare`], add to the
 //! scan's gradient in [`Motion::backward`], and run the reverse scan in [`Motion::finish`]; pointwise ones leave those empty.
 
+pub mod lanes;
 pub mod spacetime;
 pub mod still;
 
 use crate::math::{Real, Rng};
 use crate::scene::params::LOG_SCALE;
 use crate::scene::splats::SPLAT_COLUMNS;
-use crate::scene::table::TableMut;
-use crate::scene::{BLOCK, Color, GEOMETRY, Grads, Params, RowEdit, Rows, SH, Space, SplatGrads, Table, Time};
+use crate::scene::table::{TableMut, halve};
+use crate::scene::{Color, GEOMETRY, Grads, Params, RowEdit, Rows, SH, Space, SplatGrads, Table, Time};
 use crate::{Error, Result};
-use rayon::prelude::*;
 use std::any::Any;
 use std::sync::Arc;
 
@@ -197,44 +197,31 @@ pub trait Motion<F: Real = f32>: Any + Send + Sync {
 /// Half the step of the default velocity: half a frame at 60 frames a second, seconds.
 pub const VELOCITY_STEP: f64 = 1.0 / 120.0;
 
-/// Blocks of rows a task takes: 1024 rows are some hundreds of kilobytes of parameters, enough to hide task costs.
-const TASK_BLOCKS: usize = 64;
-
 /// Calls `f(j, id, tables)` for every asked row, in parallel over runs of table rows, and returns the sum of the results
-/// in a fixed order. `tables` are views that hold row `id`; j is the compact row.
+/// in a fixed order. `tables` are views that hold row `id`; j is the compact row. Models that can, use [`lanes`].
 pub fn for_rows<F: Real, const N: usize>(
     tables: [&mut Table<F>; N],
     rows: Rows<'_>,
     f: impl Fn(usize, usize, &mut [TableMut<'_, F>; N]) -> f64 + Sync,
 ) -> f64 {
-    let total = tables[0].rows();
-    let count = total.div_ceil(TASK_BLOCKS * BLOCK);
-    let mut chunks: [_; N] = tables.map(|t| t.chunks_mut(TASK_BLOCKS));
-    let tasks: Vec<[TableMut<'_, F>; N]> = (0..count)
-        .map(|_| chunks.each_mut().map(|c| c.next().expect("tables of one space have as many rows")))
-        .collect();
-    let sums: Vec<f64> = tasks
-        .into_par_iter()
-        .map(|mut views| {
-            let (first, end) = (views[0].first, views[0].first + views[0].rows);
-            let (from, to) = match rows {
-                Rows::All => (first, end),
-                Rows::Some(ids) => {
-                    (ids.partition_point(|&i| (i as usize) < first), ids.partition_point(|&i| (i as usize) < end))
-                }
-            };
-            (from..to).map(|j| f(j, rows.id(j), &mut views)).sum()
-        })
-        .collect();
-    sums.into_iter().sum()
+    halve(tables.map(Table::view_mut), &|mut views| {
+        let (first, end) = (views[0].first, views[0].first + views[0].rows);
+        let (from, to) = match rows {
+            Rows::All => (first, end),
+            Rows::Some(ids) => {
+                (ids.partition_point(|&i| (i as usize) < first), ids.partition_point(|&i| (i as usize) < end))
+            }
+        };
+        (from..to).map(|j| f(j, rows.id(j), &mut views)).sum()
+    })
 }
 
 /// Fills compact rows of `out` in parallel: `f(j, id)` gives row j's values from column 0 on.
 pub fn fill_rows<F: Real, const W: usize>(out: &mut Table<F>, rows: Rows<'_>, f: impl Fn(usize) -> [F; W] + Sync) {
-    let tasks: Vec<TableMut<'_, F>> = out.chunks_mut(TASK_BLOCKS).collect();
-    tasks.into_par_iter().for_each(|mut view| {
+    halve([out.view_mut()], &|[mut view]| {
         for j in view.first..view.first + view.rows {
             view.write(j, 0, f(rows.id(j)));
         }
+        0.0
     });
 }

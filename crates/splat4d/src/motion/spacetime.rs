@@ -5,12 +5,15 @@
 //! `GaussOne`, detached) and native 4D Gaussians in the Cholesky chart.
 //! Source: Li et al. 2024 (STG) §3; Wang et al. 2025 (FreeTimeGS) §3.
 
-use super::still::{activate, activate_backward};
-use super::{At, Cache, Motion, Spec, Tape, fill_rows, for_rows};
+use super::lanes::{Batch, Lane, Work, fill, scatter};
+use super::still::{activate_backward_lanes, activate_lanes};
+use super::{At, Cache, Motion, Spec, Tape, fill_rows};
 use crate::Result;
 use crate::math::Real;
 use crate::scene::params::QUAT;
-use crate::scene::{GEOMETRY, Grads, Key, LIFE, Params, Space, SplatGrads, Table};
+use crate::scene::table::TableMut;
+use crate::scene::{BLOCK, GEOMETRY, Grads, Key, LIFE, Params, Space, SplatGrads, Table};
+use crate::simd::each;
 
 /// Highest order of the polynomial.
 pub const MAX_ORDER: usize = 3;
@@ -78,26 +81,6 @@ impl Spacetime {
         if life.width() == 0 { F::of(t - self.spec.origin) } else { F::of(t) - life.get(id, 0) }
     }
 
-    /// The learnable row at Δ: mean moved, quaternion turned, all else as it is.
-    #[inline(always)]
-    fn moved<F: Real>(&self, mut g: [F; 11], v: &Table<F>, w: &Table<F>, id: usize, delta: F) -> [F; 11] {
-        let mut power = F::ONE;
-        for k in 0..self.spec.order {
-            power *= delta;
-            let c = v.read::<3>(id, 3 * k);
-            for axis in 0..3 {
-                g[axis] += c[axis] * power;
-            }
-        }
-        if self.spec.rotation {
-            let rate = w.read::<4>(id, 0);
-            for i in 0..4 {
-                g[QUAT + i] += rate[i] * delta;
-            }
-        }
-        g
-    }
-
     /// dμ/dΔ
     #[inline(always)]
     fn speed<F: Real>(&self, v: &Table<F>, id: usize, delta: F) -> [F; 3] {
@@ -121,10 +104,7 @@ impl<F: Real> Motion<F> for Spacetime {
 
     fn at(&self, q: &At<'_, F>, _cache: &Cache, tape: &mut Tape<F>) {
         tape.start(q.len());
-        let (geometry, life, v, w) = (&q.p[GEOMETRY], &q.p[LIFE], &q.p[self.velocities], &q.p[self.rates]);
-        fill_rows(&mut tape.out, q.rows, |id| {
-            activate(self.moved(geometry.read::<11>(id, 0), v, w, id, self.delta(life, id, q.t.0)))
-        });
+        fill(&Forward(Reader::new(self, q)), [&mut tape.out], q.rows);
     }
 
     fn backward(
@@ -136,38 +116,129 @@ impl<F: Real> Motion<F> for Spacetime {
         _d_cache: &mut Cache,
         d: &mut Grads<F>,
     ) -> f64 {
-        let (geometry, life, v, w) = (&q.p[GEOMETRY], &q.p[LIFE], &q.p[self.velocities], &q.p[self.rates]);
         let tables = d.of([GEOMETRY, self.velocities, self.rates, LIFE]);
-        for_rows(tables, q.rows, |j, id, [d_geometry, d_v, d_w, d_life]| {
-            let delta = self.delta(life, id, q.t.0);
-            let moved = self.moved(geometry.read::<11>(id, 0), v, w, id, delta);
-            let d_row = activate_backward(moved, d_out.out.read::<10>(j, 0));
-            d_geometry.add(id, 0, d_row);
-            let speed = self.speed(v, id, delta);
-            let mut d_delta = speed[0] * d_row[0] + speed[1] * d_row[1] + speed[2] * d_row[2];
-            let mut power = F::ONE;
-            for k in 0..self.spec.order {
-                power *= delta;
-                d_v.add(id, 3 * k, [d_row[0] * power, d_row[1] * power, d_row[2] * power]);
-            }
-            if self.spec.rotation {
-                let rate = w.read::<4>(id, 0);
-                let d_quat: [F; 4] = std::array::from_fn(|i| d_row[QUAT + i]);
-                d_w.add(id, 0, d_quat.map(|x| x * delta));
-                for i in 0..4 {
-                    d_delta += rate[i] * d_quat[i];
-                }
-            }
-            if life.width() > 0 && !self.spec.detach {
-                d_life.add(id, 0, [-d_delta]);
-            }
-            d_delta.f64()
-        })
+        scatter(&Backward { reader: Reader::new(self, q), d_out: d_out.out }, tables, q.rows)
     }
 
     fn velocity(&self, q: &At<'_, F>, out: &mut Table<F>) {
         let (life, v) = (&q.p[LIFE], &q.p[self.velocities]);
         *out = Table::new(&[("velocity", 3)], q.len());
         fill_rows(out, q.rows, |id| self.speed(v, id, self.delta(life, id, q.t.0)));
+    }
+}
+
+/// One question's parameters, read sixteen rows at a time.
+struct Reader<'a, F> {
+    spec: SpacetimeSpec,
+    geometry: &'a Table<F>,
+    life: &'a Table<F>,
+    v: &'a Table<F>,
+    w: &'a Table<F>,
+    t: f64,
+}
+
+impl<'a, F: Real> Reader<'a, F> {
+    fn new(model: &Spacetime, q: &At<'a, F>) -> Self {
+        let p = q.p;
+        Self {
+            spec: model.spec,
+            geometry: &p[GEOMETRY],
+            life: &p[LIFE],
+            v: &p[model.velocities],
+            w: &p[model.rates],
+            t: q.t.0,
+        }
+    }
+
+    #[inline(always)]
+    fn delta(&self, batch: &Batch) -> Lane<F> {
+        if self.life.width() == 0 {
+            return [F::of(self.t - self.spec.origin); BLOCK];
+        }
+        let [center] = batch.ids.read::<F, 1>(self.life, 0);
+        each(|l| F::of(self.t) - center[l])
+    }
+
+    /// The learnable rows at Δ: means moved, quaternions turned, all else as it is.
+    #[inline(always)]
+    fn moved(&self, batch: &Batch, delta: &Lane<F>) -> [Lane<F>; 11] {
+        let mut g: [Lane<F>; 11] = batch.ids.read(self.geometry, 0);
+        let mut power = [F::ONE; BLOCK];
+        for k in 0..self.spec.order {
+            let c: [Lane<F>; 3] = batch.ids.read(self.v, 3 * k);
+            for l in 0..BLOCK {
+                power[l] *= delta[l];
+                for axis in 0..3 {
+                    g[axis][l] += c[axis][l] * power[l];
+                }
+            }
+        }
+        if self.spec.rotation {
+            let rate: [Lane<F>; 4] = batch.ids.read(self.w, 0);
+            for l in 0..BLOCK {
+                for i in 0..4 {
+                    g[QUAT + i][l] += rate[i][l] * delta[l];
+                }
+            }
+        }
+        g
+    }
+}
+
+struct Forward<'a, F>(Reader<'a, F>);
+
+impl<F: Real> Work<F, 1> for Forward<'_, F> {
+    #[inline(always)]
+    fn run(&self, batch: &Batch, [out]: &mut [TableMut<'_, F>; 1]) -> f64 {
+        let delta = self.0.delta(batch);
+        batch.write(out, 0, &activate_lanes(&self.0.moved(batch, &delta)));
+        0.0
+    }
+}
+
+struct Backward<'a, F> {
+    reader: Reader<'a, F>,
+    d_out: &'a Table<F>,
+}
+
+impl<F: Real> Work<F, 4> for Backward<'_, F> {
+    #[inline(always)]
+    fn run(&self, batch: &Batch, [d_geometry, d_v, d_w, d_life]: &mut [TableMut<'_, F>; 4]) -> f64 {
+        let r = &self.reader;
+        let delta = r.delta(batch);
+        let d_rows = activate_backward_lanes(&r.moved(batch, &delta), &batch.at.read(self.d_out, 0));
+        batch.add(d_geometry, 0, &d_rows);
+        let mut d_delta = [F::ZERO; BLOCK];
+        let mut power = [F::ONE; BLOCK];
+        for k in 0..r.spec.order {
+            // d/dΔ of v_k Δ^k is k v_k Δ^(k−1).
+            let c: [Lane<F>; 3] = batch.ids.read(r.v, 3 * k);
+            let factor = F::of((k + 1) as f64);
+            let mut d_c = [[F::ZERO; BLOCK]; 3];
+            for l in 0..BLOCK {
+                let slope = factor * power[l];
+                power[l] *= delta[l];
+                for axis in 0..3 {
+                    d_delta[l] += c[axis][l] * slope * d_rows[axis][l];
+                    d_c[axis][l] = d_rows[axis][l] * power[l];
+                }
+            }
+            batch.add(d_v, 3 * k, &d_c);
+        }
+        if r.spec.rotation {
+            let rate: [Lane<F>; 4] = batch.ids.read(r.w, 0);
+            let mut d_rate = [[F::ZERO; BLOCK]; 4];
+            for l in 0..BLOCK {
+                for i in 0..4 {
+                    d_rate[i][l] = d_rows[QUAT + i][l] * delta[l];
+                    d_delta[l] += rate[i][l] * d_rows[QUAT + i][l];
+                }
+            }
+            batch.add(d_w, 0, &d_rate);
+        }
+        if r.life.width() > 0 && !r.spec.detach {
+            batch.add(d_life, 0, &[each(|l| -d_delta[l])]);
+        }
+        batch.sum(d_delta)
     }
 }

@@ -1,11 +1,14 @@
 //! `still`: static 3D Gaussian Splatting (Kerbl et al. 2023). The activation of means, quaternions, scales and opacity
 //! stands here, for every model that ends in an ordinary Gaussian.
 
-use super::{At, Cache, Motion, Spec, Tape, fill_rows, for_rows};
+use super::lanes::{Batch, Lane, Work, fill, scatter};
+use super::{At, Cache, Motion, Spec, Tape};
 use crate::math::{Real, sym3};
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::splats::{COV, SPLAT_OPACITY};
-use crate::scene::{GEOMETRY, Grads, SplatGrads};
+use crate::scene::table::TableMut;
+use crate::scene::{BLOCK, GEOMETRY, Grads, SplatGrads, Table};
+use crate::simd::each;
 
 /// Nothing moves; dL/dt is zero.
 #[derive(Clone, Copy, Debug)]
@@ -18,8 +21,7 @@ impl<F: Real> Motion<F> for Still {
 
     fn at(&self, q: &At<'_, F>, _cache: &Cache, tape: &mut Tape<F>) {
         tape.start(q.len());
-        let geometry = &q.p[GEOMETRY];
-        fill_rows(&mut tape.out, q.rows, |id| activate(geometry.read::<11>(id, 0)));
+        fill(&Forward(&q.p[GEOMETRY]), [&mut tape.out], q.rows);
     }
 
     fn backward(
@@ -31,13 +33,58 @@ impl<F: Real> Motion<F> for Still {
         _d_cache: &mut Cache,
         d: &mut Grads<F>,
     ) -> f64 {
-        let geometry = &q.p[GEOMETRY];
-        for_rows(d.of([GEOMETRY]), q.rows, |j, id, [d_geometry]| {
-            let d_row = activate_backward(geometry.read::<11>(id, 0), d_out.out.read::<10>(j, 0));
-            d_geometry.add(id, 0, d_row);
-            0.0
-        })
+        scatter(&Backward { geometry: &q.p[GEOMETRY], d_out: d_out.out }, d.of([GEOMETRY]), q.rows)
     }
+}
+
+struct Forward<'a, F>(&'a Table<F>);
+
+impl<F: Real> Work<F, 1> for Forward<'_, F> {
+    #[inline(always)]
+    fn run(&self, batch: &Batch, [out]: &mut [TableMut<'_, F>; 1]) -> f64 {
+        batch.write(out, 0, &activate_lanes(&batch.ids.read(self.0, 0)));
+        0.0
+    }
+}
+
+struct Backward<'a, F> {
+    geometry: &'a Table<F>,
+    d_out: &'a Table<F>,
+}
+
+impl<F: Real> Work<F, 1> for Backward<'_, F> {
+    #[inline(always)]
+    fn run(&self, batch: &Batch, [d_geometry]: &mut [TableMut<'_, F>; 1]) -> f64 {
+        let rows = activate_backward_lanes(&batch.ids.read(self.geometry, 0), &batch.at.read(self.d_out, 0));
+        batch.add(d_geometry, 0, &rows);
+        0.0
+    }
+}
+
+/// [`activate`] of sixteen rows.
+#[inline(always)]
+pub fn activate_lanes<F: Real>(g: &[Lane<F>; 11]) -> [Lane<F>; 10] {
+    let mut out = [[F::ZERO; BLOCK]; 10];
+    for l in 0..BLOCK {
+        let row = activate(each(|c| g[c][l]));
+        for c in 0..10 {
+            out[c][l] = row[c];
+        }
+    }
+    out
+}
+
+/// [`activate_backward`] of sixteen rows.
+#[inline(always)]
+pub fn activate_backward_lanes<F: Real>(g: &[Lane<F>; 11], d: &[Lane<F>; 10]) -> [Lane<F>; 11] {
+    let mut out = [[F::ZERO; BLOCK]; 11];
+    for l in 0..BLOCK {
+        let row = activate_backward(each(|c| g[c][l]), each(|c| d[c][l]));
+        for c in 0..11 {
+            out[c][l] = row[c];
+        }
+    }
+    out
 }
 
 /// A learnable row (mean 3, raw quaternion 4, log scales 3, opacity logit) as a splat (mean 3, covariance 6, opacity).
@@ -56,7 +103,7 @@ pub fn activate_backward<F: Real>(g: [F; 11], d: [F; 10]) -> [F; 11] {
     let (d_quat, d_log) = sym3::from_quat_log_scales_backward(
         [g[QUAT], g[QUAT + 1], g[QUAT + 2], g[QUAT + 3]],
         [g[LOG_SCALE], g[LOG_SCALE + 1], g[LOG_SCALE + 2]],
-        std::array::from_fn(|k| d[COV + k]),
+        each(|k| d[COV + k]),
     );
     let o = g[OPACITY].sigmoid();
     let d_logit = d[SPLAT_OPACITY] * o * (F::ONE - o);

@@ -17,15 +17,15 @@ mod parallel;
 pub mod project;
 pub mod rasterize;
 pub mod shade;
-mod simd;
 #[cfg(test)]
 mod tests;
 
+pub use crate::simd::Simd;
 pub use project::{Projected, ProjectedGrads, View};
-pub use simd::Simd;
 
 use crate::math::Real;
 use crate::scene::{Camera, Planes, Splats, Table};
+use crate::simd;
 use bin::Footprint;
 use rasterize::{CHANNELS, Geometry, PixelGrads, Raster};
 use rayon::prelude::*;

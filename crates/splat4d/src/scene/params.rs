@@ -356,6 +356,20 @@ impl<F: Real> Grads<F> {
         self.touched[key.0 as usize]
     }
 
+    /// A touched table of `space` and the rows that are active in it, for a reader that leaves its active blocks zero:
+    /// it then counts as untouched. `None`: nothing was added to it.
+    pub fn drain(&mut self, key: Key, space: Space) -> Option<(&mut Table<F>, &[bool])> {
+        if !std::mem::take(&mut self.touched[key.0 as usize]) {
+            return None;
+        }
+        let active = match space {
+            Space::Fixed => &[][..],
+            Space::Gaussians => &self.gaussians,
+            Space::Nodes => &self.nodes,
+        };
+        Some((&mut self.tables[key.0 as usize], active))
+    }
+
     /// Marks rows of a space as taking part in this step.
     pub fn activate(&mut self, space: Space, rows: super::Rows<'_>) {
         let flags = match space {

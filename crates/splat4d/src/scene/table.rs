@@ -4,6 +4,7 @@
 //! range of rows is one slice. A table of one column is therefore contiguous, so that a matrix product can read it.
 
 use crate::math::Real;
+use crate::simd::each;
 use std::borrow::Cow;
 
 /// Rows in a block.
@@ -102,7 +103,7 @@ impl<F: Real> Table<F> {
     pub fn read<const N: usize>(&self, row: usize, col: usize) -> [F; N] {
         let i = self.index(row, col);
         let s = &self.data[i..i + (N - 1) * BLOCK + 1];
-        std::array::from_fn(|k| s[k * BLOCK])
+        each(|k| s[k * BLOCK])
     }
 
     /// Writes `N` neighbouring columns of one row.
@@ -155,6 +156,11 @@ impl<F: Real> Table<F> {
         })
     }
 
+    /// The whole table as one view, to be split among tasks.
+    pub fn view_mut(&mut self) -> TableMut<'_, F> {
+        TableMut { first: 0, rows: self.rows, width: self.width, data: &mut self.data }
+    }
+
     /// Makes the table `rows` long; new rows are zero. Keeps the allocation.
     pub fn resize(&mut self, rows: usize) {
         let old = self.rows;
@@ -175,11 +181,20 @@ impl<F: Real> Table<F> {
     /// The table whose row j is this table's row `parents[j]`.
     pub fn gather(&self, parents: &[u32]) -> Self {
         let mut out = Self::with_columns(self.columns.clone(), parents.len());
-        for (j, &i) in parents.iter().enumerate() {
-            for col in 0..self.width {
-                out.set(j, col, self.get(i as usize, col));
-            }
+        let width = self.width;
+        if width == 0 {
+            return out;
         }
+        halve([out.view_mut()], &|[view]| {
+            for (j, &parent) in parents[view.first..view.first + view.rows].iter().enumerate() {
+                let i = parent as usize;
+                assert!(i < self.rows, "a row's parent is one of the {} rows", self.rows);
+                let from = self.data[i / BLOCK * width * BLOCK + i % BLOCK..].iter().step_by(BLOCK);
+                let to = view.data[j / BLOCK * width * BLOCK + j % BLOCK..].iter_mut().step_by(BLOCK);
+                to.zip(from).take(width).for_each(|(to, from)| *to = *from);
+            }
+            0.0
+        });
         out
     }
 
@@ -241,6 +256,21 @@ pub struct TableMut<'a, F = f32> {
     pub data: &'a mut [F],
 }
 
+impl<F> TableMut<'_, F> {
+    /// Blocks in the view, the last one perhaps not full.
+    pub fn blocks(&self) -> usize {
+        self.rows.div_ceil(BLOCK)
+    }
+
+    /// The first `blocks` blocks, and the rest. Panics: there are not so many.
+    pub fn split_at(self, blocks: usize) -> (Self, Self) {
+        let rows = (blocks * BLOCK).min(self.rows);
+        let (head, tail) = self.data.split_at_mut(blocks * BLOCK * self.width);
+        let a = Self { first: self.first, rows, width: self.width, data: head };
+        (a, Self { first: self.first + rows, rows: self.rows - rows, width: self.width, data: tail })
+    }
+}
+
 impl<F: Real> TableMut<'_, F> {
     #[inline(always)]
     fn index(&self, row: usize, col: usize) -> usize {
@@ -274,8 +304,31 @@ impl<F: Real> TableMut<'_, F> {
     pub fn read<const N: usize>(&self, row: usize, col: usize) -> [F; N] {
         let i = self.index(row, col);
         let s = &self.data[i..i + (N - 1) * BLOCK + 1];
-        std::array::from_fn(|k| s[k * BLOCK])
+        each(|k| s[k * BLOCK])
     }
+}
+
+/// Blocks of rows a task takes: 1024 rows are some hundreds of kilobytes of parameters, enough to hide task costs.
+const TASK_BLOCKS: usize = 64;
+
+/// Calls `f` with runs of the blocks of tables that have as many rows, in parallel and without allocating. Returns the
+/// sum of its results, added up in a tree that depends on the number of rows alone.
+pub fn halve<F: Real, const N: usize>(
+    views: [TableMut<'_, F>; N],
+    f: &(impl Fn([TableMut<'_, F>; N]) -> f64 + Sync),
+) -> f64 {
+    let tasks = views[0].blocks().div_ceil(TASK_BLOCKS);
+    if tasks <= 1 {
+        return if tasks == 0 { 0.0 } else { f(views) };
+    }
+    let mut parts = views.map(|v| {
+        let (a, b) = v.split_at(tasks / 2 * TASK_BLOCKS);
+        (Some(a), Some(b))
+    });
+    let left: [_; N] = std::array::from_fn(|i| parts[i].0.take().expect("every view was cut in two"));
+    let right: [_; N] = std::array::from_fn(|i| parts[i].1.take().expect("every view was cut in two"));
+    let (a, b) = rayon::join(|| halve(left, f), || halve(right, f));
+    a + b
 }
 
 #[cfg(test)]

@@ -4,6 +4,7 @@
 //! that enable nothing, AVX2 with FMA, and AVX-512; LLVM turns the lane loops into that level's vectors. All levels
 //! use the same lanes in the same order, so AVX2 and AVX-512 differ in nothing but speed, and the scalar level only in
 //! the rounding of fused multiply-adds. On ARM the baseline has NEON and fused multiply-add already.
+//! Everything that is fast goes through here: this is the one file of the workspace that says `unsafe`.
 #![allow(unsafe_code)] // calling a function that enables a target feature, after that feature was found present
 
 /// An instruction level; a level that the machine lacks is lowered to the best that it has.
@@ -39,15 +40,29 @@ impl Simd {
 }
 
 /// Work that is compiled once for each level. `run` must be `#[inline(always)]`, or it would be compiled once only.
-pub(super) trait Kernel {
+pub trait Kernel {
     /// What it returns.
     type Out;
     /// Does the work; `FMA` says whether fused multiply-add is an instruction here.
     fn run<const FMA: bool>(self) -> Self::Out;
 }
 
+/// Work that writes to two things that the caller lends. They are arguments of the compiled function itself, since only
+/// then does LLVM know that they do not overlap with what is read: plain loops over slices that stand inside a
+/// [`Kernel`] stay scalar (measured on the loss: five times slower). `run` must be `#[inline(always)]`.
+pub trait Pass {
+    /// Working memory.
+    type Scratch: ?Sized;
+    /// Where results go.
+    type Into: ?Sized;
+    /// What it returns.
+    type Out;
+    /// Does the work; `FMA` says whether fused multiply-add is an instruction here.
+    fn run<const FMA: bool>(&self, scratch: &mut Self::Scratch, into: &mut Self::Into) -> Self::Out;
+}
+
 /// Runs `kernel` at `level`, or at the best level below it that this machine has.
-pub(super) fn dispatch<K: Kernel>(level: Simd, kernel: K) -> K::Out {
+pub fn dispatch<K: Kernel>(level: Simd, kernel: K) -> K::Out {
     #[cfg(target_arch = "x86_64")]
     match level.min(Simd::detect()) {
         // SAFETY: detect() has just found every feature that avx512 enables.
@@ -57,8 +72,36 @@ pub(super) fn dispatch<K: Kernel>(level: Simd, kernel: K) -> K::Out {
         Simd::Scalar => {}
     }
     let _ = level;
-    kernel.run::<{ cfg!(target_arch = "aarch64") }>()
+    kernel.run::<BASELINE_FMA>()
 }
+
+/// Runs `pass` at `level`, or at the best level below it that this machine has.
+pub fn dispatch_pass<P: Pass>(level: Simd, pass: &P, scratch: &mut P::Scratch, into: &mut P::Into) -> P::Out {
+    #[cfg(target_arch = "x86_64")]
+    match level.min(Simd::detect()) {
+        // SAFETY: detect() has just found every feature that pass_avx512 enables.
+        Simd::Avx512 => return unsafe { pass_avx512(pass, scratch, into) },
+        // SAFETY: detect() has just found every feature that pass_avx2 enables.
+        Simd::Avx2 => return unsafe { pass_avx2(pass, scratch, into) },
+        Simd::Scalar => {}
+    }
+    let _ = level;
+    pass.run::<BASELINE_FMA>(scratch, into)
+}
+
+/// [f(0), f(1), …]: `std::array::from_fn` for kernels, since that one is not always inlined into them, and then it is
+/// compiled for the baseline alone (seen with 10 elements and more).
+#[inline(always)]
+pub fn each<T: Copy + Default, const N: usize>(f: impl Fn(usize) -> T) -> [T; N] {
+    let mut out = [T::default(); N];
+    for i in 0..N {
+        out[i] = f(i);
+    }
+    out
+}
+
+/// Every 64-bit ARM has fused multiply-add, no x86-64 need have.
+const BASELINE_FMA: bool = cfg!(target_arch = "aarch64");
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma")]
@@ -70,4 +113,16 @@ fn avx2<K: Kernel>(kernel: K) -> K::Out {
 #[target_feature(enable = "avx2,fma,avx512f,avx512bw,avx512dq,avx512vl")]
 fn avx512<K: Kernel>(kernel: K) -> K::Out {
     kernel.run::<true>()
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2,fma")]
+fn pass_avx2<P: Pass>(pass: &P, scratch: &mut P::Scratch, into: &mut P::Into) -> P::Out {
+    pass.run::<true>(scratch, into)
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2,fma,avx512f,avx512bw,avx512dq,avx512vl")]
+fn pass_avx512<P: Pass>(pass: &P, scratch: &mut P::Scratch, into: &mut P::Into) -> P::Out {
+    pass.run::<true>(scratch, into)
 }
