@@ -10,6 +10,7 @@
 //! added atomically.
 
 pub mod bin;
+pub mod ceiling;
 pub mod oracle;
 mod parallel;
 pub mod project;
@@ -452,6 +453,11 @@ impl<F: Real> Renderer<F> {
     /// Screen ellipses of the last render, one a splat; radius 0: not drawn.
     pub fn projected(&self) -> &[Projected<F>] {
         &self.projected
+    }
+
+    /// What the last render's blend loop did, counted again, slowly; only the last run of bins of an absurd scene.
+    pub fn count_pairs(&self) -> rasterize::PairCounts {
+        self.raster.count_pairs(&self.config)
     }
 
     /// Bytes of memory held.

@@ -7,6 +7,11 @@
 //! α = min(α_max, o·g), g = exp(−½ dᵀ conic d); α < α_min is skipped; a pixel stops before T(1−α) would fall below
 //! T_min. Source: Kerbl et al. 2023; gradients are 0 where α is at its ceiling, as in gsplat.
 
+#[path = "count.rs"]
+mod count;
+
+pub use count::PairCounts;
+
 use super::RenderConfig;
 use super::bin::{BIN, Bins, Footprint, PAIR_BUDGET, id};
 use super::parallel::{Even, Ragged, for_each_group};
