@@ -1,5 +1,7 @@
 //! The built binary on small made-up captures: what users type, what they get, and what they are told.
 
+#[path = "cli/bench.rs"]
+mod bench;
 #[path = "cli/convert.rs"]
 mod convert;
 #[path = "cli/sample.rs"]

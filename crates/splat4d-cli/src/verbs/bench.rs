@@ -1,6 +1,7 @@
 //! `bench`: how long every stage takes on pinned scenes, and how far that is from what this machine could do.
 
 mod ceilings;
+mod growth;
 mod rows;
 mod scenes;
 mod stages;
@@ -9,6 +10,7 @@ mod training;
 use crate::console::Console;
 use crate::files;
 use ceilings::Ceiling;
+use growth::Axis;
 use rows::Row;
 use scenes::{Name, Pinned, Places};
 use splat4d::render::Simd;
@@ -34,6 +36,7 @@ Examples:
   splat4d bench --simd scalar --json              an array of rows for machines
   splat4d bench --save today.json
   splat4d bench --against today.json              ratios to an earlier result
+  splat4d bench --growth all --plots docs/images  steps with more Gaussians, pixels and frames; memory
 
 Times are means over eight views of the best of several rounds. `of ceiling` is the least time in which the stage's
 compulsory work could be done (blending at the speed of its arithmetic alone, bytes at the speed of memory, both measured
@@ -58,6 +61,12 @@ pub(crate) struct Args {
     /// Rounds of which the best counts
     #[arg(long, value_name = "N", default_value_t = ROUNDS, value_parser = rounds)]
     rounds: usize,
+    /// Measure how a training step grows instead; may be given more than once
+    #[arg(long, value_name = "AXIS", value_enum, conflicts_with = "scenes")]
+    growth: Vec<Axis>,
+    /// Folder for pictures of the growth
+    #[arg(long, value_name = "FOLDER", requires = "growth")]
+    plots: Option<PathBuf>,
     /// Print a table for Markdown pages
     #[arg(long)]
     markdown: bool,
@@ -113,8 +122,12 @@ pub(crate) fn run(args: &Args, threads: Option<u16>, console: &Console) -> anyho
             THREADS.into_iter().filter(|n| *n <= std::thread::available_parallelism().map_or(1, usize::from)).collect()
         }
     };
-    let names = if args.scenes.is_empty() { Name::ALL.to_vec() } else { args.scenes.clone() };
     let places = Places { playbot: args.playbot.clone(), file: args.file.clone() };
+    let names = match &args.scenes[..] {
+        _ if !args.growth.is_empty() => vec![Name::T],
+        [] => Name::ALL.to_vec(),
+        names => names.to_vec(),
+    };
     let mut scenes = Vec::new();
     for name in names {
         match Pinned::open(name, &places)? {
@@ -122,8 +135,11 @@ pub(crate) fn run(args: &Args, threads: Option<u16>, console: &Console) -> anyho
             Err(skipped) => console.aside(&skipped.0),
         }
     }
-    let mut rows =
-        if scenes.is_empty() { Vec::new() } else { measure(&scenes, &levels, &threads, args.rounds, console)? };
+    let mut rows = if args.growth.is_empty() {
+        measure(&scenes, &levels, &threads, args.rounds, console)?
+    } else {
+        grow(&scenes, args, &levels, &threads, console)?
+    };
     if let Some(path) = &args.save {
         files::write(path, rows::json(&rows).as_bytes())?;
         console.aside(&format!("wrote {}", path.display()));
@@ -144,6 +160,34 @@ pub(crate) fn run(args: &Args, threads: Option<u16>, console: &Console) -> anyho
     Ok(())
 }
 
+/// Measures what grows, on the most threads, and draws it.
+fn grow(
+    scenes: &[Pinned],
+    args: &Args,
+    levels: &[Simd],
+    threads: &[usize],
+    console: &Console,
+) -> anyhow::Result<Vec<Row>> {
+    let most = threads.iter().copied().max().unwrap_or(1);
+    let pool = pool(most)?;
+    let mut rows = Vec::new();
+    for pinned in scenes {
+        for &simd in levels {
+            let way = Way { threads: most, simd, rounds: args.rounds.min(FEW_ROUNDS) };
+            rows.extend(growth::measure(pinned, &args.growth, way, &pool, &|text| console.note(text))?);
+        }
+    }
+    if let Some(folder) = &args.plots {
+        files::make_folder(folder)?;
+        for (name, svg) in growth::plots(&rows) {
+            let path = folder.join(name);
+            files::write(&path, svg.as_bytes())?;
+            console.note(&format!("wrote {}", path.display()));
+        }
+    }
+    Ok(rows)
+}
+
 fn measure(
     scenes: &[Pinned],
     levels: &[Simd],
@@ -152,7 +196,8 @@ fn measure(
     console: &Console,
 ) -> anyhow::Result<Vec<Row>> {
     let mut rows = Vec::new();
-    for &simd in levels {
+    // Without a scene there is nothing to compare the ceilings with.
+    for &simd in levels.iter().filter(|_| !scenes.is_empty()) {
         let ways: Vec<Way> = threads.iter().map(|&threads| Way { threads, simd, rounds }).collect();
         let pools = ways.iter().map(|w| pool(w.threads)).collect::<anyhow::Result<Vec<_>>>()?;
         let ceilings: Vec<Ceiling> = pools.iter().map(|p| Ceiling::measure(p, simd)).collect();
@@ -172,7 +217,7 @@ fn measure(
                 let large = pinned.scene.len() >= LARGE;
                 let steps = Way { rounds: if large { rounds.min(FEW_ROUNDS) } else { rounds }, ..*way };
                 let mut drawn = pool.install(|| stages::measure(pinned, *way, ceiling))?;
-                let mut trained = pool.install(|| training::measure(pinned, held.clone(), steps, ceiling))?;
+                let mut trained = pool.install(|| training::measure(pinned, &held, steps, ceiling))?;
                 fill_in_step(&mut drawn, &mut trained);
                 rows.append(&mut drawn);
                 rows.append(&mut trained);

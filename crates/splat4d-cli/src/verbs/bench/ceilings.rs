@@ -46,7 +46,7 @@ pub(super) mod bytes {
     }
 
     /// All columns of a layer's tables by Gaussian.
-    pub(crate) fn all_columns(layer: &Layer) -> usize {
+    fn all_columns(layer: &Layer) -> usize {
         columns(layer) + layer.params[SH].width()
     }
 
@@ -58,9 +58,9 @@ pub(super) mod bytes {
     }
 
     /// Parameters in, splats out.
-    pub(crate) fn motion(scene: &Scene<f32>, splats: &Splats<'_, f32>) -> usize {
+    pub(crate) fn motion(scene: &Scene<f32>, splats: usize) -> usize {
         let widest = scene.layers.iter().map(columns).max().unwrap_or(0);
-        splats.len() * (widest * NUMBER + SPLAT)
+        splats * (widest * NUMBER + SPLAT)
     }
 
     /// Splats in, ellipses and footprints out.

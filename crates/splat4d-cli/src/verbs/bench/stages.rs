@@ -18,9 +18,20 @@ pub(super) struct Way {
     pub rounds: usize,
 }
 
-/// Stages in the order in which they run; the last two are their sums.
-const STAGES: [&str; 9] =
-    ["motion", "project", "shade", "bin", "blend", "forward", "blend backward", "splats backward", "forward+backward"];
+/// Stages in the order in which they run. `motion` includes the lookup of who is alive; `forward` is what
+/// `Renderer::render` takes, without the motion; `forward+backward` adds `Renderer::backward`.
+const STAGES: [&str; 10] = [
+    "who is alive",
+    "motion",
+    "project",
+    "shade",
+    "bin",
+    "blend",
+    "forward",
+    "blend backward",
+    "splats backward",
+    "forward+backward",
+];
 
 /// What one view took at best, seconds, and the work in it.
 #[derive(Clone, Copy)]
@@ -41,7 +52,7 @@ pub(super) fn simd_name(simd: Simd) -> &'static str {
     }
 }
 
-/// A smooth-free gradient to a picture: the same numbers everywhere, small and of both signs.
+/// A gradient to a picture: always the same numbers, small and of both signs.
 fn gradient(view: &View) -> Planes<f32> {
     let mut grad = Planes::new(3, view.camera.height, view.camera.width);
     for (i, g) in grad.data.iter_mut().enumerate() {
@@ -72,6 +83,9 @@ pub(super) fn measure(pinned: &Pinned, way: Way, ceiling: &Ceiling) -> Result<Ve
     for round in 0..=way.rounds {
         for (view, seen) in pinned.views.iter().zip(&mut seen) {
             let clock = Instant::now();
+            player.alive(view.time);
+            let alive = clock.elapsed().as_secs_f64();
+            let clock = Instant::now();
             let splats = player.at(view.time)?;
             let motion = clock.elapsed().as_secs_f64();
             let clock = Instant::now();
@@ -80,7 +94,7 @@ pub(super) fn measure(pinned: &Pinned, way: Way, ceiling: &Ceiling) -> Result<Ve
             if round == 0 {
                 let counts = renderer.count_pairs();
                 (seen.tested, seen.contributing) = (counts.tested, counts.contributing);
-                seen.floor = floor(pinned, &splats, &renderer, view, counts.tested, ceiling);
+                seen.floor = floor(pinned, &splats, &renderer, counts.tested, ceiling);
             }
             let grad = gradient(view);
             if d_sh.len() != splats.parts.len() {
@@ -94,7 +108,7 @@ pub(super) fn measure(pinned: &Pinned, way: Way, ceiling: &Ceiling) -> Result<Ve
             if round > 0 {
                 let s = renderer.stage_seconds();
                 let (b, p) = (s.blend_backward, s.splats_backward);
-                let now = [motion, s.project, s.shade, s.bin, s.blend, forward, b, p, forward + backward];
+                let now = [alive, motion, s.project, s.shade, s.bin, s.blend, forward, b, p, forward + backward];
                 seen.best.iter_mut().zip(now).for_each(|(best, now)| *best = best.min(now));
             }
         }
@@ -106,21 +120,19 @@ fn floor(
     pinned: &Pinned,
     splats: &Splats<'_, f32>,
     renderer: &Renderer,
-    view: &View,
     tested: usize,
     ceiling: &Ceiling,
 ) -> [f64; STAGES.len()] {
     let stats = renderer.stats();
     let moved = |bytes: usize| bytes as f64 / ceiling.bytes;
     let blend = tested as f64 / ceiling.pairs;
-    let _ = view;
-    let motion = moved(bytes::motion(&pinned.scene, splats));
+    let motion = moved(bytes::motion(&pinned.scene, splats.len()));
     let project = moved(bytes::project(stats.splats));
     let shade = moved(bytes::shade(splats, stats.visible));
     let bin = moved(bytes::bin(stats.pairs));
     let back = moved(bytes::splats_backward(splats, stats.visible));
     let forward = project + shade + bin + blend;
-    [motion, project, shade, bin, blend, forward, blend, back, forward + blend + back]
+    [0.0, motion, project, shade, bin, blend, forward, blend, back, forward + blend + back]
 }
 
 fn rows(pinned: &Pinned, way: Way, seen: &[Seen]) -> Vec<Row> {
@@ -135,7 +147,7 @@ fn rows(pinned: &Pinned, way: Way, seen: &[Seen]) -> Vec<Row> {
             threads: way.threads,
             simd: simd_name(way.simd).into(),
             ms,
-            ceiling_share: (ms > 0.0).then_some(floor / ms),
+            ceiling_share: (floor > 0.0 && ms > 0.0).then_some(floor / ms),
             tested_pairs: blends.then_some(mean(&|s| s.tested as f64) as u64),
             contributing_pairs: blends.then_some(mean(&|s| s.contributing as f64) as u64),
             ..Row::default()

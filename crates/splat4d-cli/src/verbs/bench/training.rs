@@ -21,7 +21,7 @@ use splat4d_train::train::run::peak_memory;
 use splat4d_train::train::trainer::{Settings, Stepped, Trainer};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 /// Every rate is multiplied by this: the scene stays what it is, the work is the same.
 const STANDSTILL: f64 = 1e-6;
@@ -170,44 +170,83 @@ pub(super) fn step(trainer: &mut Trainer<'_>) -> Result<(Stepped, f64)> {
     Ok((stepped, seconds))
 }
 
-/// Parts of a step, in order.
+/// Parts of a step that have rows of their own, in order.
 const PARTS: [&str; 5] = ["motion in a step", "loss", "motion backward", "adam", "step"];
 
-/// Steps at every view. Call it inside a pool of `way.threads` threads.
-pub(super) fn measure(pinned: &Pinned, held: Arc<Held>, way: Way, ceiling: &Ceiling) -> Result<Vec<Row>> {
-    let views = pinned.views.len();
-    forget_peak();
-    let mut trainer = trainer(pinned.scene.clone(), held.clone(), way)?;
-    let mut best = vec![[f64::MAX; 7]; views];
+/// Milliseconds of one step.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Times {
+    pub motion: f64,
+    pub loss: f64,
+    pub motion_backward: f64,
+    pub adam: f64,
+    /// The renderer's forward and backward.
+    pub renderer: f64,
+    /// All of it.
+    pub step: f64,
+}
+
+impl Times {
+    fn of(stepped: &Stepped, seconds: f64) -> Self {
+        let t = stepped.report.timings;
+        let ms = |d: Duration| 1e3 * d.as_secs_f64();
+        Self {
+            motion: ms(t.motion),
+            loss: ms(t.loss),
+            motion_backward: ms(t.motion_backward),
+            adam: ms(stepped.adam),
+            renderer: ms(t.render) + ms(t.render_backward),
+            step: 1e3 * seconds,
+        }
+    }
+
+    fn each(self) -> [f64; 6] {
+        [self.motion, self.loss, self.motion_backward, self.adam, self.renderer, self.step]
+    }
+
+    fn from(each: [f64; 6]) -> Self {
+        let [motion, loss, motion_backward, adam, renderer, step] = each;
+        Self { motion, loss, motion_backward, adam, renderer, step }
+    }
+}
+
+/// The mean over views of each view's best step. Call it inside a pool of `way.threads` threads.
+pub(super) fn times(scene: Scene<f32>, held: &Arc<Held>, way: Way) -> Result<Times> {
+    let mut trainer = trainer(scene, held.clone(), way)?;
+    let mut best = vec![[f64::MAX; 6]; held.len()];
     for round in 0..=way.rounds {
-        for _ in 0..views {
+        for _ in 0..held.len() {
             let (stepped, seconds) = step(&mut trainer)?;
             if round > 0 {
-                let t = stepped.report.timings;
-                let parts = [t.motion, t.loss, t.motion_backward, stepped.adam].map(|d| d.as_secs_f64());
-                let renderer = [t.render, t.render_backward].map(|d| d.as_secs_f64());
-                let now = [parts[0], parts[1], parts[2], parts[3], seconds, renderer[0], renderer[1]];
                 let seen = &mut best[held.last.load(Ordering::Relaxed)];
+                let now = Times::of(&stepped, seconds).each();
                 seen.iter_mut().zip(now).for_each(|(best, now)| *best = best.min(now));
             }
         }
     }
-    let mean = |k: usize| 1e3 * best.iter().map(|b| b[k]).sum::<f64>() / views as f64;
+    let mean = |k: usize| best.iter().map(|b| b[k]).sum::<f64>() / best.len() as f64;
+    Ok(Times::from(std::array::from_fn(mean)))
+}
+
+/// Steps at every view, in parts. Call it inside a pool of `way.threads` threads.
+pub(super) fn measure(pinned: &Pinned, held: &Arc<Held>, way: Way, ceiling: &Ceiling) -> Result<Vec<Row>> {
+    forget_peak();
+    let t = times(pinned.scene.clone(), held, way)?;
     let (mut alive, mut moment) = (0, Moment::default());
     for view in &pinned.views {
         pinned.scene.at(view.time, &mut moment);
         alive += pinned.scene.splats(&moment).len();
     }
-    let (alive, camera) = (alive / views, &pinned.views[0].camera);
+    let (alive, camera) = (alive / pinned.views.len(), &pinned.views[0].camera);
     let moved = [
-        bytes::motion_backward(&pinned.scene, alive) / 2,
+        bytes::motion(&pinned.scene, alive),
         bytes::loss(camera.width * camera.height),
         bytes::motion_backward(&pinned.scene, alive),
         bytes::adam(&pinned.scene, alive),
     ];
-    let row = |(k, stage): (usize, &&str)| {
-        let ms = mean(k);
+    let row = |((k, stage), ms): ((usize, &&str), f64)| {
         let moved = moved.get(k).map(|b| *b as f64);
+        let whole = *stage == "step";
         Row {
             scene: pinned.name.clone(),
             stage: (*stage).into(),
@@ -216,12 +255,13 @@ pub(super) fn measure(pinned: &Pinned, held: Arc<Held>, way: Way, ceiling: &Ceil
             ms,
             ceiling_share: moved.map(|b| 1e3 * b / ceiling.bytes / ms),
             gb_per_s: moved.map(|b| 1e-6 * b / ms),
-            outside_share: (*stage == "step").then(|| 1.0 - (mean(5) + mean(6)) / ms),
-            peak_memory: (*stage == "step").then(peak_memory),
+            outside_share: whole.then(|| 1.0 - t.renderer / ms),
+            peak_memory: whole.then(peak_memory),
             ..Row::default()
         }
     };
-    Ok(PARTS.iter().enumerate().map(row).collect())
+    let all = [t.motion, t.loss, t.motion_backward, t.adam, t.step];
+    Ok(PARTS.iter().enumerate().zip(all).map(row).collect())
 }
 
 /// Starts the process's peak memory anew where the system lets it (Linux); elsewhere it stays that of the whole run.
