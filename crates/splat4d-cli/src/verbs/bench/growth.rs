@@ -307,10 +307,15 @@ fn split(from: &Scene<f32>, count: usize, degree: usize) -> Scene<f32> {
         let own = p[SH].width().min(colors.width());
         (0..own).for_each(|c| colors.set(child, c, p[SH].get(row, c)));
         let [center, log_width] = match p[LIFE].width() {
-            0 => [
-                0.5 * (from.clip[0] + from.clip[1]) as f32,
-                (10.0 * (from.clip[1] - from.clip[0]).max(1.0)).ln() as f32,
-            ],
+            0 => {
+                let [from, to] = from.clip;
+                [0.5 * (from + to), (10.0 * (to - from).max(1.0)).ln()].map(|x| x as f32)
+            }
+            // An interval's tails count as its width: bakes of Gaussian lives have next to nothing else.
+            3 => {
+                let [center, width, softness] = p[LIFE].read::<3>(row, 0);
+                [center, (width.exp() + softness.exp()).ln()]
+            }
             _ => [p[LIFE].get(row, CENTER), p[LIFE].get(row, LOG_WIDTH)],
         };
         lives.write(child, 0, [center, log_width]);
