@@ -134,7 +134,10 @@ const STYLE: &str = "svg{--c0:#b4501e;--c1:#2463a8;--c2:#3d8a4d;--c3:#8a56ac;--c
 --c3:#c69be4;--c4:#5fd0c5;--c5:#9fb0ba;--soft:#a09a92;--line:#35322e}}.grid{stroke:var(--line)}\
 .tick,.axis{fill:var(--soft);font-size:11.5px}.line{fill:none;stroke-width:1.8}";
 
-/// The same curves as a file of their own, with a mark at every point and the names in the picture.
+/// Room for a name below the curves of a file; three fit.
+const NAME: f64 = 118.0;
+
+/// The same curves as a file of their own, with a mark at every point and the names below.
 pub(crate) fn file(series: &[Series], x_label: &str, unit: &str) -> Option<String> {
     let page = lines(series, x_label, unit)?;
     let svg = page
@@ -146,8 +149,8 @@ pub(crate) fn file(series: &[Series], x_label: &str, unit: &str) -> Option<Strin
     let svg = svg.replacen("<svg ", &size, 1).replacen('>', &format!("><style>{STYLE}</style>"), 1);
     let mut names = String::new();
     let shown = series.iter().enumerate().filter(|(_, s)| !reduced(&s.points).is_empty());
-    for (line, (i, s)) in shown.enumerate() {
-        let (x, y) = (LEFT + 12.0, TOP + 12.0 + 16.0 * line as f64);
+    for (place, (i, s)) in shown.enumerate() {
+        let (x, y) = (LEFT + 34.0 + NAME * place as f64, HEIGHT - 3.0);
         let (color, name) = (i % COLORS, escape(&s.name));
         let _ = write!(names, r#"<text x="{x}" y="{y}" font-size="12" style="fill:var(--c{color})">{name}</text>"#);
     }

@@ -20,6 +20,7 @@ fn nothing(folder: &Path) -> String {
 fn json_is_an_array_of_rows_and_compares_with_an_earlier_one() {
     let work = tempfile::tempdir().unwrap();
     let (earlier, saved) = (work.path().join("earlier.json"), work.path().join("saved.json"));
+    let simd = format!("{:?}", splat4d::render::Simd::detect()).to_lowercase();
     let old = json!([{"scene": "T", "stage": "step", "threads": 1, "simd": simd, "ms": 2.0, "ceiling_share": null}]);
     std::fs::write(&earlier, old.to_string()).unwrap();
     let answer = splat4d(&["bench", "--scene", "T", "--threads", "1", "--rounds", "1", "--json"])

@@ -88,18 +88,58 @@ pub(super) fn compare(rows: &mut [Row], earlier: &[Row]) -> usize {
 
 /// A table cell a string; first the head.
 fn cells(rows: &[Row]) -> Vec<Vec<String>> {
-    let mut threads: Vec<usize> = rows.iter().map(|r| r.threads).collect();
-    threads.sort_unstable();
-    threads.dedup();
-    let compared = rows.iter().any(|r| r.against.is_some());
+    if rows.iter().any(|r| r.x.is_some()) { grown_cells(rows) } else { stage_cells(rows) }
+}
+
+/// Each value once, in order of appearance.
+fn distinct<T: PartialEq>(values: impl Iterator<Item = T>) -> Vec<T> {
+    let mut out = Vec::new();
+    for value in values {
+        if !out.contains(&value) {
+            out.push(value);
+        }
+    }
+    out
+}
+
+/// A line for each thing that grew and how far, with its stages side by side; a line for each place where memory is.
+fn grown_cells(rows: &[Row]) -> Vec<Vec<String>> {
+    let stages = distinct(rows.iter().filter(|r| r.bytes.is_none()).map(|r| r.stage.as_str()));
     let memory = rows.iter().any(|r| r.bytes.is_some());
+    let mut head = vec!["what".to_owned(), "with".into()];
+    head.extend(stages.iter().map(|s| format!("{s}, ms")));
+    if memory {
+        head.push("memory".into());
+    }
+    let mut out = vec![head];
+    let count = |r: &Row| r.x.map_or_else(String::new, |x| grouped(x as usize));
+    for row in rows.iter().filter(|r| r.bytes.is_some()) {
+        let mut line = vec![format!("{}: {}", row.scene, row.stage), count(row)];
+        let step = |s: &&str| if *s == "step" && row.ms > 0.0 { milliseconds(row.ms) } else { String::new() };
+        line.extend(stages.iter().map(step));
+        line.push(row.bytes.map_or_else(String::new, human_bytes));
+        out.push(line);
+    }
+    let place = |r: &Row| (r.scene.clone(), r.x.map(f64::to_bits), r.simd.clone());
+    for at in distinct(rows.iter().filter(|r| r.bytes.is_none()).map(place)) {
+        let here: Vec<&Row> = rows.iter().filter(|r| r.bytes.is_none() && place(r) == at).collect();
+        let mut line = vec![at.0, count(here[0])];
+        let of = |stage: &&str| here.iter().find(|r| r.stage == *stage);
+        line.extend(stages.iter().map(|s| of(s).map_or_else(String::new, |r| milliseconds(r.ms))));
+        line.extend(memory.then(String::new));
+        out.push(line);
+    }
+    out
+}
+
+/// A line for each scene and stage, with its threads side by side.
+fn stage_cells(rows: &[Row]) -> Vec<Vec<String>> {
+    let mut threads = distinct(rows.iter().map(|r| r.threads));
+    threads.sort_unstable();
+    let compared = rows.iter().any(|r| r.against.is_some());
+    let levels = distinct(rows.iter().map(|r| r.simd.as_str())).len() > 1;
     let mut head = vec!["scene".to_owned(), "stage".into()];
-    if rows.iter().any(|r| r.x.is_some()) {
-        head.push("with".into());
-    }
-    for n in &threads {
-        head.push(format!("ms, {n} thread{}", if *n == 1 { "" } else { "s" }));
-    }
+    head.extend(threads.iter().map(|n| format!("ms, {n} thread{}", if *n == 1 { "" } else { "s" })));
     if threads.len() > 1 {
         head.push("gain".into());
     }
@@ -107,35 +147,27 @@ fn cells(rows: &[Row]) -> Vec<Vec<String>> {
     if compared {
         head.push("to earlier".into());
     }
-    head.push(if memory { "bytes".into() } else { "remarks".into() });
+    head.push("remarks".into());
     let mut out = vec![head];
-    let mut done: Vec<&Row> = Vec::new();
-    for row in rows {
-        let same = |other: &&Row| Row { threads: row.threads, ..(*other).clone() }.twin(row);
-        if done.iter().any(|d| same(d)) {
-            continue;
-        }
-        done.push(row);
-        let of = |n: usize| rows.iter().find(|r| r.threads == n && same(r));
+    let place = |r: &Row| (r.scene.clone(), r.stage.clone(), r.simd.clone());
+    for at in distinct(rows.iter().map(place)) {
+        let of = |n: usize| rows.iter().find(|r| r.threads == n && place(r) == at);
         let all: Vec<Option<&Row>> = threads.iter().map(|n| of(*n)).collect();
-        let mut line = vec![row.scene.clone(), row.stage.clone()];
-        if rows.iter().any(|r| r.x.is_some()) {
-            line.push(row.x.map_or_else(String::new, |x| grouped(x as usize)));
-        }
-        let timed = row.bytes.is_none() || row.ms > 0.0;
-        line.extend(all.iter().map(|r| r.filter(|_| timed).map_or_else(String::new, |r| milliseconds(r.ms))));
+        let here: Vec<&Row> = all.iter().flatten().copied().collect();
+        let scene = if levels { format!("{} {}", at.0, at.2) } else { at.0.clone() };
+        let mut line = vec![scene, at.1.clone()];
+        line.extend(all.iter().map(|r| r.map_or_else(String::new, |r| milliseconds(r.ms))));
         if threads.len() > 1 {
             let gain = all[0].zip(all[all.len() - 1]).filter(|(_, many)| many.ms > 0.0);
             line.push(gain.map_or_else(String::new, |(one, many)| format!("{:.2}x", one.ms / many.ms)));
         }
-        let last = all.iter().rev().find_map(|r| *r).unwrap_or(row);
-        let percent = |share: f64| format!("{:.0} %", 100.0 * share);
-        let shares: Vec<String> = all.iter().flatten().filter_map(|r| r.ceiling_share.map(percent)).collect();
-        line.push(shares.join(", "));
+        let joined =
+            |f: &dyn Fn(&Row) -> Option<String>| here.iter().filter_map(|r| f(r)).collect::<Vec<_>>().join(", ");
+        line.push(joined(&|r| r.ceiling_share.map(|share| format!("{:.0} %", 100.0 * share))));
         if compared {
-            line.push(last.against.map_or_else(String::new, |a| format!("{a:.2}")));
+            line.push(joined(&|r| r.against.map(|a| format!("{a:.2}"))));
         }
-        line.push(remarks(last));
+        line.push(here.last().map_or_else(String::new, |r| remarks(r)));
         out.push(line);
     }
     out
@@ -160,9 +192,6 @@ fn remarks(row: &Row) -> String {
     }
     if let Some(share) = row.outside_share {
         said.push(format!("{:.0} % outside the renderer", 100.0 * share));
-    }
-    if let Some(bytes) = row.bytes {
-        said.push(human_bytes(bytes));
     }
     if let Some(bytes) = row.peak_memory.filter(|b| *b > 0) {
         said.push(format!("at most {}", human_bytes(bytes)));
@@ -251,5 +280,20 @@ mod tests {
         let page = markdown(&rows);
         assert!(page.lines().all(|l| l.starts_with('|') && l.ends_with('|')), "{page}");
         assert!(table(&[]).lines().count() == 1);
+        let levels = [row("blend", 1, 2.0), Row { simd: "scalar".into(), ..row("blend", 1, 6.0) }];
+        let text = table(&levels);
+        assert!(text.contains("T avx2") && text.contains("T scalar"), "{text}");
+    }
+
+    #[test]
+    fn what_grew_has_a_line_a_size_and_memory_a_line_a_place() {
+        let grown = |stage: &str, x: f64, ms: f64| Row { scene: "pixels".into(), x: Some(x), ..row(stage, 2, ms) };
+        let place = Row { scene: "memory".into(), bytes: Some(3 << 20), ..grown("parameters", 1e6, 0.0) };
+        let rows = [place, grown("step", 1e4, 5.0), grown("rest", 1e4, 2.0), grown("step", 4e4, 9.0)];
+        let page = markdown(&rows);
+        let lines: Vec<&str> = page.lines().collect();
+        assert_eq!(lines[0], "| what | with | step, ms | rest, ms | memory |");
+        assert_eq!(lines[2], "| memory: parameters | 1,000,000 |  |  | 3.0 MiB |");
+        assert_eq!(lines[3..], ["| pixels | 10,000 | 5.00 | 2.00 |  |", "| pixels | 40,000 | 9.00 |  |  |"]);
     }
 }
