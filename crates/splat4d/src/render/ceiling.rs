@@ -1,7 +1,7 @@
 //! What this machine could do at best, measured: the numbers that the speed of a stage is a share of.
 //!
-//! [`blend`] runs the arithmetic of the blend loop alone (`blend_splat` in `rasterize.rs`: exponent, 2^x, cut-off, α,
-//! stop test, transmittance, three colours), pixels in registers: no list is walked, no row is skipped, no tile changes.
+//! [`blend`] runs the arithmetic of the blend loop alone (exponent from row to row, 2^x, cut-off, α, stop test,
+//! transmittance, three colours), pixels in registers: no list is walked, no row is skipped, no tile changes.
 //! [`bandwidth`] is a triad over buffers far larger than any cache. Both are the best of several short runs, because
 //! everything that disturbs a measurement makes it slower.
 
@@ -28,9 +28,9 @@ const TRIAD_BYTES: usize = 3 * size_of::<f32>();
 ///
 /// How many rows of eight or sixteen lanes in flight serve best depends on the machine's registers and on the code that
 /// the compiler makes of them, so all are tried and the fastest is taken. On the Zen 4 core that this was written on
-/// (2.85 GHz, AVX2) the loop has 26 operations a row of eight pixels, which its four pipes would issue in 6.7 cycles;
-/// it takes 14, whatever the order: a row's operations form one chain of some 60 cycles, and the core's schedulers hold
-/// 128 operations, about four rows. Fewer operations, or a shorter chain, would raise the ceiling itself.
+/// (2.85 GHz, AVX2) a row of eight pixels is 25 operations, which its four pipes would issue in 6.3 cycles; it takes
+/// 11.8, whatever the order: a row's operations form one chain of some 50 cycles, and the core's schedulers hold 128
+/// operations, about five rows. Fewer operations, or a shorter chain, would raise the ceiling itself.
 pub fn blend(simd: Simd) -> f64 {
     let variants = [
         speed::<8, 1>(simd),
@@ -77,17 +77,16 @@ fn speed<const LANES: usize, const ROWS: usize>(simd: Simd) -> f64 {
     (SPLATS * LANES * ROWS) as f64 / best
 }
 
-/// The splat that passes the pixels again and again, each time a little higher; one number a lane, as a register has it.
+/// The splat that passes the pixels again and again, each time a little lower; one number a lane, as a register has it.
 #[repr(C, align(64))]
 struct Splat<const LANES: usize> {
-    /// Terms of the exponent along a row, as in the blend: without dy, and times dy; and that of dy².
+    /// Exponent at a pixel: ax + q·dy.
     ax: [f32; LANES],
-    bx: [f32; LANES],
-    c: [f32; LANES],
-    step: [f32; LANES],
-    log_opacity: [f32; LANES],
+    /// What q and dy change by from row to row.
+    step: [[f32; LANES]; 2],
+    /// log₂ of α's ceiling, which the opacity gives.
+    top: [f32; LANES],
     log_min: [f32; LANES],
-    alpha_max: [f32; LANES],
     t_min: [f32; LANES],
     color: [[f32; LANES]; 3],
 }
@@ -97,12 +96,9 @@ impl<const LANES: usize> Default for Splat<LANES> {
     fn default() -> Self {
         Self {
             ax: std::array::from_fn(|l| -6.0 - 0.01 * l as f32),
-            bx: std::array::from_fn(|l| -1e-3 * l as f32),
-            c: [-0.01; LANES],
-            step: [1e-5; LANES],
-            log_opacity: [-0.5; LANES],
+            step: [[1e-6; LANES], [1e-5; LANES]],
+            top: [-0.5; LANES],
             log_min: [-8.0; LANES],
-            alpha_max: [0.99; LANES],
             t_min: [1e-4; LANES],
             color: [0.2, 0.5, 0.7].map(|c| [c; LANES]),
         }
@@ -115,6 +111,7 @@ struct Pixels<'a, const LANES: usize, const ROWS: usize>(&'a Splat<LANES>);
 /// One row of pixels.
 #[derive(Clone, Copy)]
 struct Row<const LANES: usize> {
+    q: [f32; LANES],
     dy: [f32; LANES],
     t: [f32; LANES],
     color: [[f32; LANES]; 3],
@@ -124,7 +121,8 @@ impl<const LANES: usize, const ROWS: usize> Kernel for Pixels<'_, LANES, ROWS> {
     type Out = f32;
     #[inline(always)]
     fn run<const FMA: bool>(self) -> f32 {
-        let row = |r| Row { dy: [-3.5 - r as f32; LANES], t: [1.0; LANES], color: [[0.0; LANES]; 3] };
+        let (q, t, color) = ([-0.1; LANES], [1.0; LANES], [[0.0; LANES]; 3]);
+        let row = |r| Row { q, dy: [0.1 * r as f32; LANES], t, color };
         let mut rows: [Row<LANES>; ROWS] = std::array::from_fn(row);
         for _ in 0..SPLATS {
             // The splat's numbers are read from the cache each time, as operands of the arithmetic: held in registers
@@ -141,24 +139,25 @@ impl<const LANES: usize, const ROWS: usize> Kernel for Pixels<'_, LANES, ROWS> {
 
 #[inline(always)]
 fn pass<const LANES: usize, const FMA: bool>(s: &Splat<LANES>, row: &mut Row<LANES>) {
-    let Row { mut dy, mut t, mut color } = *row;
+    let Row { mut q, mut dy, mut t, mut color } = *row;
     let mut weight = [0.0; LANES];
     for l in 0..LANES {
-        dy[l] += s.step[l];
-        let power = least((s.c[l].fma::<FMA>(dy[l], s.bx[l])).fma::<FMA>(dy[l], s.ax[l]), s.log_opacity[l]);
-        let alpha = least(power.blend_exp2::<FMA>(), s.alpha_max[l]);
-        let alpha = select_unpredictable(power >= s.log_min[l], alpha, 0.0);
-        let kept = t[l] * (1.0 - alpha);
+        let power = least(q[l].fma::<FMA>(dy[l], s.ax[l]), s.top[l]);
+        let alpha = select_unpredictable(power >= s.log_min[l], power.blend_exp2::<FMA>(), 0.0);
+        let full = alpha * t[l];
+        let kept = t[l] - full;
         let open = kept >= s.t_min[l];
-        weight[l] = select_unpredictable(open, alpha * t[l], 0.0);
+        weight[l] = select_unpredictable(open, full, 0.0);
         t[l] = select_unpredictable(open, kept, -t[l].abs());
+        q[l] -= s.step[0][l];
+        dy[l] -= s.step[1][l];
     }
     for c in 0..3 {
         for l in 0..LANES {
             color[c][l] = weight[l].fma::<FMA>(s.color[c][l], color[c][l]);
         }
     }
-    *row = Row { dy, t, color };
+    *row = Row { q, dy, t, color };
 }
 
 /// The smaller, in one instruction.

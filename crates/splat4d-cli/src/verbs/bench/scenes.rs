@@ -32,8 +32,8 @@ pub(super) enum Name {
 }
 
 impl Name {
-    /// All of them.
-    pub(super) const ALL: [Self; 3] = [Self::S, Self::T, Self::U];
+    /// All of them, the large one last: peaks of memory are those of a process that has held nothing larger.
+    pub(super) const ALL: [Self; 3] = [Self::T, Self::U, Self::S];
 
     pub(super) fn letter(self) -> &'static str {
         match self {
