@@ -78,7 +78,7 @@ fn select<F: Real>(condition: bool, yes: F, no: F) -> F {
 }
 
 /// What happens to a splat in a tile.
-trait Visit<F: Real> {
+pub(super) trait Visit<F: Real> {
     /// Blends record `i` of the batch into tile `t`.
     fn splat<const FMA: bool>(&mut self, t: usize, i: usize, record: &Record<F>);
     /// Whether every pixel of tile `t` has stopped.
@@ -90,7 +90,7 @@ trait Visit<F: Real> {
 /// Shows every record to every tile that it may touch, front to back, until all pixels have stopped. Bit t of `open`:
 /// tile t has a pixel that has not.
 #[inline(always)]
-fn walk<F: Real, V: Visit<F>, const FMA: bool>(records: &[Record<F>], mut open: u32, visit: &mut V) {
+pub(super) fn walk<F: Real, V: Visit<F>, const FMA: bool>(records: &[Record<F>], mut open: u32, visit: &mut V) {
     for (k, batch) in records.chunks(BATCH).enumerate() {
         if open == 0 {
             break;
@@ -223,24 +223,32 @@ impl<F: Real> Kernel for Blend<'_, F> {
     type Out = ();
     #[inline(always)]
     fn run<const FMA: bool>(self) {
-        let mut open = 0;
-        for (t, tile) in self.tiles.iter_mut().enumerate() {
-            let nx = self.inside[0].saturating_sub(t % SIDE * TILE);
-            let ny = self.inside[1].saturating_sub(t / SIDE * TILE);
-            for (y, row) in tile.rows.iter_mut().enumerate() {
-                *row = Pixels { t: [F::ONE; TILE], ..Pixels::default() };
-                // Pixels outside the picture have stopped from the start.
-                row.t[if y < ny { nx.min(TILE) } else { 0 }..].fill(-F::ONE);
-            }
-            open |= u32::from(nx > 0 && ny > 0) << t;
-        }
+        let open = begin(self.tiles, self.inside);
         walk::<F, _, FMA>(self.records, open, &mut Forward { tiles: self.tiles, limits: self.limits });
     }
 }
 
-struct Forward<'a, F> {
-    tiles: &'a mut [Tile<F>],
-    limits: Limits<F>,
+/// Tiles before the first splat; bit t of the result: tile t lies in the picture.
+#[inline(always)]
+pub(super) fn begin<F: Real>(tiles: &mut [Tile<F>], inside: [usize; 2]) -> u32 {
+    let mut open = 0;
+    for (t, tile) in tiles.iter_mut().enumerate() {
+        let nx = inside[0].saturating_sub(t % SIDE * TILE);
+        let ny = inside[1].saturating_sub(t / SIDE * TILE);
+        for (y, row) in tile.rows.iter_mut().enumerate() {
+            *row = Pixels { t: [F::ONE; TILE], ..Pixels::default() };
+            // Pixels outside the picture have stopped from the start.
+            row.t[if y < ny { nx.min(TILE) } else { 0 }..].fill(-F::ONE);
+        }
+        open |= u32::from(nx > 0 && ny > 0) << t;
+    }
+    open
+}
+
+/// Blends into tiles.
+pub(super) struct Forward<'a, F> {
+    pub tiles: &'a mut [Tile<F>],
+    pub limits: Limits<F>,
 }
 
 impl<F: Real> Visit<F> for Forward<'_, F> {

@@ -11,6 +11,8 @@
 
 pub mod bin;
 mod blend;
+pub mod ceiling;
+mod count;
 mod gather;
 pub mod oracle;
 mod parallel;
@@ -21,6 +23,7 @@ pub mod shade;
 mod tests;
 
 pub use crate::simd::Simd;
+pub use count::PairCounts;
 pub use project::{Projected, ProjectedGrads, View};
 
 use crate::math::Real;
@@ -488,6 +491,11 @@ impl<F: Real> Renderer<F> {
     /// Screen ellipses of the last render, one a splat; radius 0: not drawn.
     pub fn projected(&self) -> &[Projected<F>] {
         &self.projected
+    }
+
+    /// What the last render's blend loop did, counted again, slowly; only the last run of bins of an absurd scene.
+    pub fn count_pairs(&self) -> PairCounts {
+        self.raster.count_pairs(&self.config)
     }
 
     /// Bytes of memory held.

@@ -44,10 +44,10 @@ pub struct Raster<F = f32> {
     pub bins: Bins,
     /// Instead of [`PAIR_BUDGET`].
     pub(super) budget: Option<usize>,
-    width: usize,
-    height: usize,
+    pub(super) width: usize,
+    pub(super) height: usize,
     simd: Option<Simd>,
-    records: Vec<Record<F>>,
+    pub(super) records: Vec<Record<F>>,
     tiles: Vec<Tile<F>>,
     pair_grads: Vec<Pair<F>>,
     place: Vec<AtomicU32>,
