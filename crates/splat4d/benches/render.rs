@@ -71,6 +71,7 @@ struct Stages {
     config: RenderConfig,
     projected: Vec<Projected>,
     footprints: Vec<Footprint>,
+    radii: Vec<f32>,
     channels: Vec<[f32; CHANNELS]>,
     raster: Raster,
 }
@@ -83,6 +84,7 @@ impl Stages {
             config,
             projected: vec![Projected::default(); GAUSSIANS],
             footprints: vec![Footprint::default(); GAUSSIANS],
+            radii: vec![0.0; GAUSSIANS],
             channels: vec![[0.0; CHANNELS]; GAUSSIANS],
             raster: Raster::default(),
         };
@@ -95,7 +97,8 @@ impl Stages {
 
     fn project(&mut self, made: &Made) {
         let view = View::new(&made.camera, &self.config);
-        project::forward(&made.splats(), &view, self.config.simd, &mut self.projected, &mut self.footprints);
+        let (rows, feet, radii) = (&mut self.projected, &mut self.footprints, &mut self.radii);
+        project::forward(&made.splats(), &view, self.config.simd, rows, feet, radii);
     }
 
     fn shade(&mut self, made: &Made) {
@@ -146,7 +149,7 @@ fn e_blend_backward(bencher: Bencher<'_, '_>, threads: usize) {
     let mut stages = Stages::run(&made);
     let mut d = vec![ProjectedGrads::default(); GAUSSIANS];
     let mut d_channels = vec![[0.0; CHANNELS]; GAUSSIANS];
-    let channels = [Some(made.grad.plane(0)), Some(made.grad.plane(1)), Some(made.grad.plane(2)), None];
+    let channels = [Some(made.grad.plane(0)), Some(made.grad.plane(1)), Some(made.grad.plane(2))];
     let pixels = PixelGrads { channels, alpha: None };
     bencher.bench_local(|| {
         pool.install(|| {
