@@ -205,7 +205,8 @@ fn compensation<F: Real>(view: &View<F>, e: &Ellipse<F>) -> (F, bool) {
         return (F::ONE, true);
     }
     let (square, floor) = (e.det0 / e.det1, F::of(RHO_MIN * RHO_MIN));
-    (greatest(square, floor).sqrt(), !(square > floor))
+    let square = greatest(square, floor);
+    (square.sqrt(), square == floor)
 }
 
 /// Projects one Gaussian: mean and packed covariance in the world, opacity in (0,1).
