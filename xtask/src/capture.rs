@@ -34,7 +34,7 @@ const JPEG_QUALITY: u8 = 60;
 const TRUTH_CAMERAS: [usize; 4] = [2, 8, 11, 17];
 const TRUTH_FRAMES: [usize; 4] = [3, 10, 17, 24];
 
-/// `capture [FOLDER]` and `capture --check [N]`.
+/// `capture [FOLDER]`, `capture --check [N]` and `capture --still CHARACTER.glb FOLDER ...`.
 pub fn command(arguments: &[String]) -> Result<()> {
     let home = bundled_folder();
     match arguments {
@@ -48,9 +48,10 @@ pub fn command(arguments: &[String]) -> Result<()> {
             let picks = (0..count).map(|i| (u64::from(clock) + 7919 * i) as usize % (CAMERAS * FRAMES));
             check(&home, &picks.map(|p| (p % CAMERAS, p / CAMERAS)).collect::<Vec<_>>())
         }
+        [flag, rest @ ..] if flag == "--still" => crate::still::command(rest),
         [] => write(&home, &home),
         [folder] if !folder.starts_with('-') => write(&home, Path::new(folder)),
-        _ => bail!("capture takes a folder, or --check with a number"),
+        _ => bail!("capture takes a folder, --check with a number, or --still with a character and a folder"),
     }
 }
 
@@ -90,7 +91,7 @@ fn write(home: &Path, folder: &Path) -> Result<()> {
         let points = truth::track_points(&frame.mesh, &tracked);
         let seen: Vec<Visibility> = cameras.par_iter().map(|camera| rasterize(&frame.mesh, camera)).collect();
         let views = (cameras.par_iter().enumerate()).map(|(c, camera)| -> Result<View> {
-            let picture = shade(&stage, &frame, camera, &seen[c]);
+            let picture = shade(stage.textures(), &frame, camera, &seen[c]);
             let (jpeg, mask) = encode(&picture.rgb, &picture.mask)?;
             write_file(&folder.join(picture_path(camera, t)), &jpeg)?;
             write_file(&folder.join(mask_path(camera, t)), &mask)?;
@@ -124,7 +125,7 @@ fn check(folder: &Path, picks: &[(usize, usize)]) -> Result<()> {
     for &(c, t) in picks {
         let camera = &cameras[c];
         let frame = stage.frame(t)?;
-        let picture = shade(&stage, &frame, camera, &rasterize(&frame.mesh, camera));
+        let picture = shade(stage.textures(), &frame, camera, &rasterize(&frame.mesh, camera));
         let (jpeg, mask) = encode(&picture.rgb, &picture.mask)?;
         for (path, drawn) in [(picture_path(camera, t), jpeg), (mask_path(camera, t), mask)] {
             let path = folder.join(path);
@@ -154,24 +155,24 @@ fn encode(rgb: &[u8], mask: &[u8]) -> Result<(Vec<u8>, Vec<u8>)> {
     // Equal steps at all frequencies give the smallest squared error per byte, which is what training measures.
     encoder.set_quantization_tables(QuantizationTableType::Flat, QuantizationTableType::Flat);
     encoder.encode(rgb, WIDTH as u16, HEIGHT as u16, jpeg_encoder::ColorType::Rgb)?;
-    Ok((out, png(mask, ExtendedColorType::L8)?))
+    Ok((out, png(mask, WIDTH, HEIGHT, ExtendedColorType::L8)?))
 }
 
-fn png(data: &[u8], color: ExtendedColorType) -> Result<Vec<u8>> {
+/// A PNG file of `width` x `height` pixels; 16-bit samples in the machine's byte order.
+pub fn png(data: &[u8], width: usize, height: usize, color: ExtendedColorType) -> Result<Vec<u8>> {
     let mut out = Vec::new();
     let filter = if color == ExtendedColorType::L8 { FilterType::NoFilter } else { FilterType::Adaptive };
     let encoder = PngEncoder::new_with_quality(&mut out, CompressionType::Level(9), filter);
-    encoder.write_image(data, WIDTH as u32, HEIGHT as u32, color)?;
+    encoder.write_image(data, width as u32, height as u32, color)?;
     Ok(out)
 }
 
 fn write_truth(folder: &Path, camera: &Camera, seen: &Visibility, t: usize, frame: &Frame, next: &Frame) -> Result<()> {
-    // The encoder takes 16-bit samples in the machine's byte order.
     let bytes = |codes: Vec<u16>| -> Vec<u8> { codes.iter().flat_map(|c| c.to_ne_bytes()).collect() };
     let file = |kind: &str| folder.join(format!("truth/{kind}/{}_{t:04}.png", camera.name));
-    let depth = png(&bytes(truth::depth(camera, seen, frame)), ExtendedColorType::L16)?;
+    let depth = png(&bytes(truth::depth(camera, seen, frame)), WIDTH, HEIGHT, ExtendedColorType::L16)?;
     write_file(&file("depth"), &depth)?;
-    let flow = png(&bytes(truth::flow(camera, seen, frame, next)), ExtendedColorType::Rgb16)?;
+    let flow = png(&bytes(truth::flow(camera, seen, frame, next)), WIDTH, HEIGHT, ExtendedColorType::Rgb16)?;
     write_file(&file("flow"), &flow)
 }
 

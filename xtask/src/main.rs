@@ -11,6 +11,7 @@ mod picture;
 mod raster;
 mod scene;
 mod skin;
+mod still;
 mod strip;
 mod texture;
 mod truth;
@@ -26,6 +27,9 @@ usage: cargo run --release -p xtask -- CHORE
 chores:
   capture [FOLDER]           draws the bundled capture into FOLDER (default: examples/knight)
   capture --check [N]        draws N random pictures (default 3) and compares them with examples/knight byte for byte
+  capture --still CHARACTER.glb FOLDER [--views N] [--size PIXELS] [--pose CLIP SECONDS] [--drop NODE...]
+                             draws a character frozen in one pose, cut out, from N (default 100) cameras on a
+                             hemisphere, PIXELS (default 400) wide and high; every 8th is held out
   strip-character IN.glb OUT.glb CLIP... [--drop NODE...]
                              keeps the named animation clips of a character, drops the named nodes' meshes";
 

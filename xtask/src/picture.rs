@@ -4,7 +4,7 @@ use crate::camera::Camera;
 use crate::material;
 use crate::mesh::Mesh;
 use crate::raster::{Edges, NOTHING, SUPERSAMPLING, Visibility, corners, sample_ray};
-use crate::scene::{BACK, FRONT, Frame, SIDE, Stage};
+use crate::scene::{BACK, FRONT, Frame, SIDE};
 use crate::texture::{Texture, srgb_from_linear};
 use crate::vector::{V3, smooth_step, v3};
 
@@ -25,13 +25,41 @@ const REACH: usize = LENS.len() / 2;
 // The weights are written for three samples per pixel.
 const _: () = assert!(SUPERSAMPLING == 3);
 
-/// Shades every sample and filters the samples to pixels.
-pub fn shade(stage: &Stage, frame: &Frame, camera: &Camera, seen: &Visibility) -> Picture {
+/// The picture, black where nothing is seen. `textures`: the characters', knight first.
+pub fn shade(textures: [&Texture; 2], frame: &Frame, camera: &Camera, seen: &Visibility) -> Picture {
     let pixels = camera.width * camera.height;
     let mut out = Picture { rgb: Vec::with_capacity(3 * pixels), mask: Vec::with_capacity(pixels) };
+    each_pixel(textures, frame, camera, seen, |color, moving| {
+        out.rgb.extend(color.array().map(srgb_from_linear));
+        out.mask.push(if moving > 0.5 { 255 } else { 0 });
+    });
+    out
+}
+
+/// The picture of moving objects alone: sRGB codes of their own colour (not dimmed by their coverage) and coverage, four
+/// per pixel.
+pub fn cut_out(textures: [&Texture; 2], frame: &Frame, camera: &Camera, seen: &Visibility) -> Vec<u8> {
+    let mut out = Vec::with_capacity(4 * camera.width * camera.height);
+    each_pixel(textures, frame, camera, seen, |color, covered| {
+        let own = if covered > 0.0 { color * (1.0 / covered) } else { V3::default() };
+        out.extend(own.array().map(srgb_from_linear));
+        out.push((255.0 * covered).round() as u8);
+    });
+    out
+}
+
+/// Shades every sample, filters the samples to pixels and hands out each pixel's linear colour (nothing is black) and the
+/// share that moving objects cover, rows from the top.
+fn each_pixel(
+    textures: [&Texture; 2],
+    frame: &Frame,
+    camera: &Camera,
+    seen: &Visibility,
+    mut emit: impl FnMut(V3, f64),
+) {
     // Rows of samples already filtered across; only those about the current pixel row are kept.
     let mut rows: Vec<Vec<(V3, f64)>> = vec![Vec::new(); LENS.len()];
-    let mut samples = SampleShader::new(stage, frame, camera, seen);
+    let mut samples = SampleShader { frame, camera, seen, textures, edges: EdgeCache::default() };
     let mut next = 0;
     for y in 0..camera.height {
         let middle = y * SUPERSAMPLING + SUPERSAMPLING / 2;
@@ -47,11 +75,9 @@ pub fn shade(stage: &Stage, frame: &Frame, camera: &Camera, seen: &Visibility) -
                 color = color + c * (weight / LENS_SUM);
                 moving += m * weight / LENS_SUM;
             }
-            out.rgb.extend(color.array().map(srgb_from_linear));
-            out.mask.push(if moving > 0.5 { 255 } else { 0 });
+            emit(color, moving);
         }
     }
-    out
 }
 
 /// Shades samples of one picture.
@@ -63,12 +89,7 @@ struct SampleShader<'a> {
     edges: EdgeCache,
 }
 
-impl<'a> SampleShader<'a> {
-    fn new(stage: &'a Stage, frame: &'a Frame, camera: &'a Camera, seen: &'a Visibility) -> Self {
-        let textures = stage.characters().map(|c| &c.texture);
-        SampleShader { frame, camera, seen, textures, edges: EdgeCache::default() }
-    }
-
+impl SampleShader<'_> {
     /// Linear colour of each pixel column along one row of samples, and the share of moving objects.
     fn filtered_row(&mut self, row: usize) -> Vec<(V3, f64)> {
         let line: Vec<(V3, f64)> = (0..self.seen.width).map(|column| self.sample(column, row)).collect();

@@ -7,6 +7,7 @@ use crate::light::Light;
 use crate::material::{BALL, BARREL, COLUMN, CRATE, FLOOR, KNIGHT, MAGE, ORB, PAINTED_CRATE, WALL};
 use crate::mesh::Mesh;
 use crate::skin::Character;
+use crate::texture::Texture;
 use crate::vector::{Affine, V3, heading, smooth_step, v3};
 use anyhow::{Context, Result};
 use std::ops::Range;
@@ -75,9 +76,9 @@ impl Stage {
         Ok(Stage { knight: character("Knight.glb")?, mage: character("Mage.glb")?, fixed, props })
     }
 
-    /// The characters, knight first.
-    pub fn characters(&self) -> [&Character; 2] {
-        [&self.knight, &self.mage]
+    /// The characters' textures, knight first.
+    pub fn textures(&self) -> [&Texture; 2] {
+        [&self.knight.texture, &self.mage.texture]
     }
 
     /// The scene at frame `t`.

@@ -109,6 +109,11 @@ impl Character {
         self.names.iter().position(|n| n == name).with_context(|| format!("no node is named {name}"))
     }
 
+    /// The pose that the file rests in.
+    pub fn rest(&self) -> &Pose {
+        &self.rest
+    }
+
     /// The pose of `clip` at `seconds`, repeated beyond its end.
     pub fn sample(&self, clip: &str, seconds: f64) -> Result<Pose> {
         let clip = self.clips.iter().find(|c| c.name == clip).with_context(|| format!("no clip is named {clip}"))?;

@@ -226,7 +226,7 @@ fn bounds(nodes: &[Node]) -> Option<[[f64; 3]; 2]> {
 
 /// The first view at the clip's start as a JPEG that is small enough.
 fn poster(scene: &Scene<f32>, stage: &Stage, antialias: bool) -> Option<Vec<u8>> {
-    let mut painter = Painter::new(scene, scene.background, antialias);
+    let mut painter = Painter::new(scene, scene.background, antialias, false);
     let camera = stage.orbit(0.0);
     POSTERS.iter().find_map(|&(side, quality)| {
         let shrink = camera.width.max(camera.height).div_ceil(side).max(1);

@@ -102,6 +102,18 @@ impl Console {
         }
     }
 
+    /// For people only, on stderr even with `--json`: where stdout is one JSON document.
+    pub(crate) fn aside(&self, text: &str) {
+        self.above_bar(|| eprint_line(text));
+    }
+
+    /// The same, but of progress: not when quiet, not with `--json`.
+    pub(crate) fn note(&self, text: &str) {
+        if !self.json && self.loudness > Loudness::Quiet {
+            self.aside(text);
+        }
+    }
+
     /// The warnings so far.
     pub(crate) fn warnings(&self) -> Vec<String> {
         self.state.borrow().warnings.clone()

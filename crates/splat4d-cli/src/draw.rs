@@ -42,9 +42,10 @@ pub(crate) struct Painter<'a> {
 }
 
 impl<'a> Painter<'a> {
-    pub(crate) fn new(scene: &'a Scene<f32>, background: [f32; 3], antialias: bool) -> Self {
+    /// `depth`: whether pictures of depth will be asked for.
+    pub(crate) fn new(scene: &'a Scene<f32>, background: [f32; 3], antialias: bool, depth: bool) -> Self {
         let antialias = if antialias { Antialias::On } else { Antialias::Off };
-        let config = RenderConfig { antialias, ..RenderConfig::default() };
+        let config = RenderConfig { antialias, depth, ..RenderConfig::default() };
         let (player, brush, image) = (Player::of_scene(scene), Brush::cpu(config), Image::default());
         Self { player, background, config, brush, image }
     }

@@ -168,7 +168,7 @@ fn orbit(run: &Path, scene: &Scene<f32>, console: &Console) -> anyhow::Result<Pa
     let size = (!mp4).then(|| small([stage.template.width, stage.template.height]));
     let shots = shots(&Route::Orbit, &clock, &views, &stage, size)?;
     let antialias = opened.recipe().is_ok_and(|r| r.antialias);
-    let mut painter = Painter::new(scene, scene.background, antialias);
+    let mut painter = Painter::new(scene, scene.background, antialias, false);
     let path = run.join(name);
     let first = &shots[0].camera;
     let mut film = Film::create(&path, [first.width, first.height], fps, shots.len())?;

@@ -44,6 +44,7 @@ Examples:
   splat4d export runs/knight --html -o knight.html
   splat4d convert scene.sog scene.spz      between the formats of other programs
   splat4d info my-take                     what is in a capture, run or file; is it healthy?
+  splat4d bench                            how fast this machine draws and trains
 
 Exit codes: 0 done, 1 failed or interrupted, 2 bad input.";
 
@@ -84,6 +85,7 @@ enum Verb {
     View(verbs::view::Args),
     Convert(verbs::convert::Args),
     Info(verbs::info::Args),
+    Bench(verbs::bench::Args),
     Completions(verbs::completions::Args),
 }
 
@@ -110,6 +112,7 @@ fn main() -> ExitCode {
         Verb::View(args) => verbs::view::run(&args, &console),
         Verb::Convert(args) => verbs::convert::run(&args, &console),
         Verb::Info(args) => verbs::info::run(&args, &console),
+        Verb::Bench(args) => verbs::bench::run(&args, cli.globals.threads, &console),
         Verb::Completions(args) => verbs::completions::run(&args, &console),
     });
     match done {

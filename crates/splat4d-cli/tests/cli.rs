@@ -1,5 +1,7 @@
 //! The built binary on small made-up captures: what users type, what they get, and what they are told.
 
+#[path = "cli/bench.rs"]
+mod bench;
 #[path = "cli/convert.rs"]
 mod convert;
 #[path = "cli/sample.rs"]
@@ -38,7 +40,7 @@ fn json_of(path: &Path) -> Value {
 #[test]
 fn help_teaches_and_completions_complete() {
     let help = splat4d(&["--help"]).run().ok();
-    for verb in ["train", "eval", "render", "bake", "view", "export", "convert", "info", "completions"] {
+    for verb in ["train", "eval", "render", "bake", "view", "export", "convert", "info", "bench", "completions"] {
         assert!(help.contains(verb), "{verb} is missing");
         let own = splat4d(&[verb, "--help"]).run().ok();
         assert!(own.contains("Examples:") && own.contains(&format!("splat4d {verb}")), "{verb} --help teaches nothing");

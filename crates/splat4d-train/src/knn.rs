@@ -242,15 +242,4 @@ mod tests {
         assert_eq!(mean_square_distance(&points[..2]), [1.0, 1.0]);
         assert_eq!(knn(&[[f32::NAN; 3], [0.0; 3], [1.0; 3]], 1)[1], 2);
     }
-
-    #[test]
-    #[ignore = "a measurement"]
-    fn time_of_knn() {
-        let points = cloud(100_000, 5);
-        for k in [3, 8, 20] {
-            let start = std::time::Instant::now();
-            let found = knn(&points, k);
-            println!("100k points, k = {k}: {:.3} s ({})", start.elapsed().as_secs_f64(), found[0]);
-        }
-    }
 }

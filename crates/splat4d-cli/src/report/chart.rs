@@ -128,6 +128,36 @@ pub(crate) fn lines(series: &[Series], x_label: &str, unit: &str) -> Option<Stri
     Some(svg)
 }
 
+/// The colours of the page's style sheet, for pictures that stand alone.
+const STYLE: &str = "svg{--c0:#b4501e;--c1:#2463a8;--c2:#3d8a4d;--c3:#8a56ac;--c4:#0f8a80;--c5:#5c6b73;--soft:#6d6a66;\
+--line:#e6e2dc;font-family:sans-serif}@media(prefers-color-scheme:dark){svg{--c0:#f08c4e;--c1:#6fb1f2;--c2:#7cc68d;\
+--c3:#c69be4;--c4:#5fd0c5;--c5:#9fb0ba;--soft:#a09a92;--line:#35322e}}.grid{stroke:var(--line)}\
+.tick,.axis{fill:var(--soft);font-size:11.5px}.line{fill:none;stroke-width:1.8}";
+
+/// Room for a name below the curves of a file; three fit.
+const NAME: f64 = 118.0;
+
+/// The same curves as a file of their own, with a mark at every point and the names below.
+pub(crate) fn file(series: &[Series], x_label: &str, unit: &str) -> Option<String> {
+    let page = lines(series, x_label, unit)?;
+    let svg = page
+        .split_inclusive("</svg>")
+        .next()?
+        .replace(r#"class="tip""#, r#"class="dot""#)
+        .replace(r#"r="5""#, r#"r="3""#);
+    let size = format!(r#"<svg xmlns="http://www.w3.org/2000/svg" width="{WIDTH}" height="{HEIGHT}" "#);
+    let svg = svg.replacen("<svg ", &size, 1).replacen('>', &format!("><style>{STYLE}</style>"), 1);
+    let mut names = String::new();
+    let shown = series.iter().enumerate().filter(|(_, s)| !reduced(&s.points).is_empty());
+    for (place, (i, s)) in shown.enumerate() {
+        let (x, y) = (LEFT + 34.0 + NAME * place as f64, HEIGHT - 3.0);
+        let (color, name) = (i % COLORS, escape(&s.name));
+        let _ = write!(names, r#"<text x="{x}" y="{y}" font-size="12" style="fill:var(--c{color})">{name}</text>"#);
+    }
+    let _ = write!(names, r#"<text class="axis" x="{LEFT}" y="{}">{}</text>"#, HEIGHT - 3.0, escape(unit));
+    Some(svg.replace("</svg>", &format!("{names}</svg>")))
+}
+
 /// One horizontal bar a row: label, value, and the text beside it. Bars start at `from`.
 pub(crate) fn bars(rows: &[(String, f64, String)], from: f64, label: &str) -> Option<String> {
     const ROW: f64 = 24.0;

@@ -1,6 +1,7 @@
 //! A file per verb: its options, its help and what it does.
 
 pub(crate) mod bake;
+pub(crate) mod bench;
 pub(crate) mod completions;
 pub(crate) mod convert;
 pub(crate) mod eval;

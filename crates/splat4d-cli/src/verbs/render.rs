@@ -117,8 +117,9 @@ fn one(args: &Args, path: &Path, camera: &Path, console: &Console) -> anyhow::Re
             .into());
     }
     let source = Source::open(path)?;
-    let mut painter =
-        Painter::new(&source.scene, args.background.unwrap_or(background), antialias(&source)).on(args.device, console);
+    let depth = args.channel == Channel::Depth || args.raw.is_some();
+    let background = args.background.unwrap_or(background);
+    let mut painter = Painter::new(&source.scene, background, antialias(&source), depth).on(args.device, console);
     painter.draw(&camera, args.freeze.unwrap_or(source.scene.clip[0]));
     if let Some(out) = &args.output {
         let range = painter.depth_range().unwrap_or(NO_DEPTH);
@@ -193,8 +194,9 @@ fn film(args: &Args, path: &Path, console: &Console) -> anyhow::Result<()> {
         .remedy("Add --size, or write a folder of pictures (-o FOLDER).")
         .into());
     }
-    let mut painter =
-        Painter::new(scene, args.background.unwrap_or(scene.background), antialias(&source)).on(args.device, console);
+    let background = args.background.unwrap_or(scene.background);
+    let depth = args.channel == Channel::Depth;
+    let mut painter = Painter::new(scene, background, antialias(&source), depth).on(args.device, console);
     let range = if args.channel == Channel::Depth { depth_range(&mut painter, &shots) } else { NO_DEPTH };
     if args.output.is_none()
         && let Some(folder) = output.parent().filter(|p| !p.as_os_str().is_empty())

@@ -175,6 +175,12 @@ impl Answer {
         self.stdout
     }
 
+    /// Standard error of a call that worked.
+    pub fn told(self) -> String {
+        assert_eq!(self.code, Some(0), "{}: {}", self.call, self.stderr);
+        self.stderr
+    }
+
     /// The one-paragraph error of a call that was refused for bad input.
     pub fn refused(self) -> String {
         assert_eq!(self.code, Some(2), "{}: {}{}", self.call, self.stdout, self.stderr);

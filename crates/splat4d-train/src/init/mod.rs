@@ -115,7 +115,7 @@ pub fn seeds(plan: &Plan, frames: &dyn Frames, points: Option<Seeds>, moving: bo
     if use_hull {
         out.append(hull::carve(frames, &volume, &times, r.num_pts, moving, rng.fork(1))?);
     } else if r.init == "random" || !have_points {
-        out.append(volume::random(&volume, r.num_pts, moving.then_some(plan.clip), rng.fork(2)));
+        out.append(volume::random(frames, &volume, r.num_pts, moving.then_some(plan.clip), rng.fork(2)));
     }
     out.truncate_evenly(r.max_cap, rng.fork(3));
     Ok(out)

@@ -4,6 +4,7 @@ use super::{Seeds, UNKNOWN_COLOR};
 use crate::capture::frames::Frames;
 use splat4d::math::Rng;
 use splat4d::math::se3::{dot, norm, sub};
+use splat4d::scene::Camera;
 
 /// Where the cameras look.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -63,14 +64,33 @@ fn solve(a: [[f64; 3]; 3], b: [f64; 3]) -> Option<[f64; 3]> {
     ])
 }
 
-/// Uniform points in the box; with `clip`, each at a random moment of it.
-pub fn random(volume: &Volume, count: usize, clip: Option<[f64; 2]>, rng: Rng) -> Seeds {
+/// Cameras that are asked whether they see a candidate.
+const ASKED: usize = 100;
+/// A random point must be seen by this share of the cameras that see the best seen one: what only few see is hardly
+/// learnt, and hangs as haze before the views that nobody trained on.
+const SEEN_SHARE: f64 = 0.25;
+/// Candidates a wanted point, at most.
+const CANDIDATES: usize = 32;
+
+/// Uniform points of the box where cameras look; with `clip`, each at a random moment of it. Fewer than `count` if
+/// cameras see hardly any of the box.
+pub fn random(frames: &dyn Frames, volume: &Volume, count: usize, clip: Option<[f64; 2]>, rng: Rng) -> Seeds {
+    let asked = frames.len().min(ASKED);
+    let cameras: Vec<&Camera> = (0..asked).map(|k| frames.camera(k * frames.len() / asked)).collect();
+    let sees = |camera: &Camera, x: [f64; 3]| {
+        let inside = |p: f64, size: usize| p >= 0.0 && p < size as f64;
+        camera.project(x).is_some_and(|([u, v], _)| inside(u, camera.width) && inside(v, camera.height))
+    };
+    let place = |i: u64| -> [f64; 3] {
+        std::array::from_fn(|k| volume.center[k] + volume.radius * (2.0 * rng.uniform(3 * i + k as u64) - 1.0))
+    };
+    let views = |i: u64| cameras.iter().filter(|c| sees(c, place(i))).count();
+    let best = (0..count as u64).map(views).max().unwrap_or(0);
+    let needed = (SEEN_SHARE * best as f64).ceil() as usize;
     let mut out = Seeds::default();
-    for i in 0..count as u64 {
-        let point =
-            std::array::from_fn(|k| volume.center[k] + volume.radius * (2.0 * rng.uniform(3 * i + k as u64) - 1.0));
+    for i in (0..(CANDIDATES * count) as u64).filter(|&i| views(i) >= needed).take(count) {
         let time = clip.map(|[from, to]| from + (to - from) * rng.fork(9).uniform(i));
-        out.push(point, UNKNOWN_COLOR, time);
+        out.push(place(i), UNKNOWN_COLOR, time);
     }
     out
 }
@@ -85,5 +105,20 @@ mod tests {
         let v = common(&Made::new(6, 2, 8));
         assert!(norm(v.center) < 0.02, "{v:?}");
         assert!(v.radius > 1.0 && v.radius < 4.0);
+    }
+
+    #[test]
+    fn random_points_lie_where_many_cameras_look() {
+        let frames = Made::new(6, 2, 8);
+        let volume = common(&frames);
+        let seeds = random(&frames, &volume, 300, None, Rng::new(1, "random", 0));
+        assert_eq!(seeds.len(), 300);
+        for x in &seeds.points {
+            let inside = |([u, v], _): ([f64; 2], f64)| (0.0..8.0).contains(&u) && (0.0..8.0).contains(&v);
+            let seen = (0..6).filter(|&i| frames.camera(i).project(*x).is_some_and(inside)).count();
+            assert!(seen >= 2, "{x:?} is seen by {seen} of 6 cameras");
+        }
+        let wide = |k: usize| seeds.points.iter().map(|x| (x[k] - volume.center[k]).abs()).fold(0.0, f64::max);
+        assert!(wide(0) > 0.5 && wide(1) > 0.5, "they fill the volume that the cameras share");
     }
 }

@@ -127,7 +127,8 @@ fn skewed(width: usize, height: usize) -> Camera {
 }
 
 fn on_cpu(splats: &Splats<'_, f32>, camera: &Camera, config: &RenderConfig) -> (Renderer<f32>, Image<f32>) {
-    let (mut renderer, mut image) = (Renderer::new(*config), Image::default());
+    let config = RenderConfig { depth: true, ..*config };
+    let (mut renderer, mut image) = (Renderer::new(config), Image::default());
     renderer.render(splats, camera, BACKGROUND, None, &mut image);
     (renderer, image)
 }

@@ -1,5 +1,6 @@
 //! [`Real`]: f32 for work, f64 for proof.
 
+use std::f32::consts::{FRAC_1_SQRT_2, LN_2};
 use std::fmt::{Debug, Display};
 use std::iter::Sum;
 use std::ops::{Add, AddAssign, Div, DivAssign, Mul, MulAssign, Neg, Sub, SubAssign};
@@ -55,6 +56,8 @@ pub trait Real:
     fn floor(self) -> Self;
     /// Integer part; saturates, NaN is 0.
     fn i32(self) -> i32;
+    /// The whole number that self is, for |self| < 2^22, without a branch; anything else gives any number.
+    fn lane_i32(self) -> i32;
     /// Smaller of two; NaN loses.
     fn min(self, other: Self) -> Self;
     /// Larger of two; NaN loses.
@@ -66,6 +69,10 @@ pub trait Real:
     /// 2^self for self in [-126, 0]: a branch-free polynomial in f32 (relative error ≤ 5e-6, 1 only at 0), exact in
     /// f64. Below the range the result is any number.
     fn blend_exp2<const FMA: bool>(self) -> Self;
+
+    /// Natural logarithm of a positive normal number without a branch: in f32 within 3e-7 of max(1, |ln|), and
+    /// relative near 1; exact in f64. Of anything else it is any number.
+    fn lane_ln(self) -> Self;
 
     /// 1/(1+e^-self), without a branch: where e^-self overflows, the quotient is 0 as it should be.
     #[inline(always)]
@@ -138,6 +145,10 @@ macro_rules! common {
 impl Real for f64 {
     common!(f64);
     #[inline(always)]
+    fn lane_i32(self) -> i32 {
+        self as i32
+    }
+    #[inline(always)]
     fn exp(self) -> Self {
         f64::exp(self)
     }
@@ -145,11 +156,18 @@ impl Real for f64 {
     fn blend_exp2<const FMA: bool>(self) -> Self {
         self.exp2()
     }
+    #[inline(always)]
+    fn lane_ln(self) -> Self {
+        self.ln()
+    }
 }
 
 /// 2^f on [-½, ½] as 1 + c1 f + … + c4 f⁴, least largest relative error (2.8e-6) under a value of exactly 1 at 0
 /// (Lawson's reweighted least squares).
 const EXP2_MINIMAX: [f32; 4] = [0.693_124_196, 0.240_240_984, 0.055_906_423, 0.009_582_866_5];
+
+/// Bits of an f32 below its exponent.
+const MANTISSA_BITS: u32 = f32::MANTISSA_DIGITS - 1;
 
 /// Adding and subtracting 1.5·2^23 rounds a number below 2^22 to an integer without a branch; in between, the low bits of
 /// the sum hold that integer in two's complement.
@@ -170,6 +188,11 @@ const EXP_RANGE: [f32; 2] = [-104.0, 89.0];
 
 impl Real for f32 {
     common!(f32);
+    #[inline(always)]
+    fn lane_i32(self) -> i32 {
+        // A cast saturates, for which there is no vector instruction.
+        ((self + ROUND).to_bits() as i32).wrapping_sub(ROUND.to_bits() as i32)
+    }
     #[inline(always)]
     fn exp(self) -> Self {
         // Phrased so that a NaN stays one. No fused multiply-add: every SIMD level must give the same bits.
@@ -202,6 +225,18 @@ impl Real for f32 {
         // The low bits of `shifted` hold n in two's complement: move it into the exponent field.
         f32::from_bits(p.to_bits().wrapping_add(shifted.to_bits() << 23))
     }
+    #[inline(always)]
+    fn lane_ln(self) -> Self {
+        // x = 2^n·m with m in [√½, √2): taking the bits of √½ away first makes the cut there and not at 1.
+        let above = self.to_bits().wrapping_sub(FRAC_1_SQRT_2.to_bits());
+        let n = (above as i32 >> MANTISSA_BITS) as f32;
+        let m = f32::from_bits((above & ((1 << MANTISSA_BITS) - 1)).wrapping_add(FRAC_1_SQRT_2.to_bits()));
+        // ln m = 2 artanh s with s = (m − 1)/(m + 1), |s| ≤ .172: what the series leaves out is below 1e-9.
+        let s = (m - 1.0) / (m + 1.0);
+        let z = s * s;
+        let tail = z * (2.0 / 3.0 + z * (2.0 / 5.0 + z * (2.0 / 7.0 + z * (2.0 / 9.0))));
+        n * LN_2 + (s * tail + 2.0 * s)
+    }
 }
 
 #[cfg(test)]
@@ -221,6 +256,31 @@ mod tests {
             }
         }
         assert!(worst < 5e-6, "relative error {worst}");
+    }
+
+    #[test]
+    fn lane_i32_is_a_cast() {
+        for i in [0, 1, -1, 2, 31, 32, 1279, 65_535, (1 << 22) - 1, -(1 << 22) + 1] {
+            assert_eq!((f32::lane_i32(i as f32), f64::lane_i32(i as f64)), (i, i));
+        }
+    }
+
+    #[test]
+    fn lane_ln_is_within_its_stated_error() {
+        assert_eq!(1f32.lane_ln(), 0.0);
+        let mut worst = 0.0f64;
+        // Every exponent of a normal number, and numbers close to 1.
+        let spread = (0..2_000_000u32).map(|i| f32::from_bits(0x0080_0000 + i * 1063));
+        let near = (1..1000u32).flat_map(|i| [1.0 + i as f32 * 1e-5, 1.0 - i as f32 * 1e-5]);
+        for x in spread {
+            let truth = f64::from(x).ln();
+            worst = worst.max((f64::from(x.lane_ln()) - truth).abs() / truth.abs().max(1.0));
+        }
+        for x in near {
+            let truth = f64::from(x).ln();
+            worst = worst.max((f64::from(x.lane_ln()) / truth - 1.0).abs());
+        }
+        assert!(worst < 3e-7, "error {worst}");
     }
 
     #[test]

@@ -116,6 +116,16 @@ pub fn basis_gradient<F: Real>(d: [F; 3]) -> [[F; 3]; MAX_COEFFS] {
     ]
 }
 
+/// Which numbers of [`basis_gradient`] are not 0 everywhere.
+pub const GRADIENT_TERMS: [[bool; 3]; MAX_COEFFS] = {
+    const XYZ: [bool; 3] = [true; 3];
+    const XY: [bool; 3] = [true, true, false];
+    const YZ: [bool; 3] = [false, true, true];
+    const XZ: [bool; 3] = [true, false, true];
+    let (none, x, y, z) = ([false; 3], [true, false, false], [false, true, false], [false, false, true]);
+    [none, y, z, x, XY, YZ, XYZ, XZ, XY, XY, XYZ, XYZ, XYZ, XYZ, XYZ, XY]
+};
+
 /// Colour max(0, Σ_k Y_k(d) f_k + ½) of a Gaussian seen along unit direction `d`.
 ///
 /// Shapes: coefficients [K, 3] with K one of 1, 4, 9, 16 → rgb.
@@ -181,6 +191,14 @@ mod tests {
                 let truth = f64::from(u8::from(a == b));
                 assert!((v - truth).abs() < 0.02, "∫ Y{a} Y{b} = {v}");
             }
+        }
+    }
+
+    #[test]
+    fn gradient_terms_are_those_that_are_not_zero() {
+        let gradient = basis_gradient([0.3, -0.5, 0.8]);
+        for (terms, gradient) in GRADIENT_TERMS.iter().zip(gradient) {
+            assert_eq!(*terms, gradient.map(|v| v != 0.0));
         }
     }
 

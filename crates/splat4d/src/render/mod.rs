@@ -10,6 +10,10 @@
 //! added atomically.
 
 pub mod bin;
+mod blend;
+pub mod ceiling;
+mod count;
+mod gather;
 pub mod oracle;
 mod parallel;
 pub mod project;
@@ -19,13 +23,14 @@ pub mod shade;
 mod tests;
 
 pub use crate::simd::Simd;
+pub use count::PairCounts;
 pub use project::{Projected, ProjectedGrads, View};
 
 use crate::math::Real;
 use crate::scene::{Camera, Planes, Splats, Table};
 use crate::simd;
 use bin::Footprint;
-use rasterize::{CHANNELS, PixelGrads, Raster};
+use rasterize::{CHANNELS, Geometry, PixelGrads, Raster};
 use rayon::prelude::*;
 use std::time::Instant;
 
@@ -56,12 +61,16 @@ pub struct RenderConfig {
     pub antialias: Antialias,
     /// Highest degree of spherical harmonics drawn, lowered to what a table holds.
     pub sh_degree: usize,
+    /// Whether [`Image::depth`] is drawn, which takes a further pass over the pixels.
+    pub depth: bool,
+    /// Whether the way back sums absolute gradients ([`RenderGrads::mean2d_abs`]).
+    pub abs_grads: bool,
     /// Instructions to use; lowered to what the machine has.
     pub simd: Simd,
 }
 
 impl Default for RenderConfig {
-    /// near as gsplat; the blend's limits as Kerbl et al. 2023; the best instructions of this machine.
+    /// near as gsplat; the blend's limits as Kerbl et al. 2023; no depth; the best instructions of this machine.
     fn default() -> Self {
         Self {
             near: 0.01,
@@ -71,6 +80,8 @@ impl Default for RenderConfig {
             low_pass: 0.3,
             antialias: Antialias::Off,
             sh_degree: crate::math::sh::MAX_DEGREE,
+            depth: false,
+            abs_grads: false,
             simd: Simd::detect(),
         }
     }
@@ -83,7 +94,7 @@ pub struct Image<F = f32> {
     pub color: Planes<F>,
     /// 1 − final transmittance, [1, h, w].
     pub alpha: Planes<F>,
-    /// Σ z α T, z in camera axes, [1, h, w].
+    /// Σ z α T, z in camera axes, [1, h, w]; [0, h, w] where [`RenderConfig::depth`] is off.
     pub depth: Planes<F>,
     /// Further channels, without background, [C, h, w].
     pub extra: Planes<F>,
@@ -137,7 +148,8 @@ pub struct RenderGrads<F = f32> {
     pub camera: [f64; 6],
     /// |dL/d mean2d| of every splat, x times width/2 and y times height/2, as densification thresholds assume.
     pub mean2d: Vec<F>,
-    /// The same norm of Σ over pixels of |gradient| (AbsGS). Passes of four channels are summed apart.
+    /// The same norm of Σ over pixels of |gradient| (AbsGS), if [`RenderConfig::abs_grads`] is on; passes over the
+    /// pixels are summed apart. Else 0.
     pub mean2d_abs: Vec<F>,
 }
 
@@ -177,9 +189,9 @@ pub struct Renderer<F = f32> {
     size: [usize; 2],
     projected: Vec<Projected<F>>,
     footprints: Vec<Footprint>,
-    /// Red, green, blue, depth of every splat.
+    /// Red, green, blue of every splat.
     channels: Vec<[F; CHANNELS]>,
-    /// Four further channels of every splat, refilled for each pass.
+    /// Depth and further channels of every splat, refilled for each pass.
     extra: Vec<[F; CHANNELS]>,
     raster: Raster<F>,
     d_projected: Vec<ProjectedGrads<F>>,
@@ -236,40 +248,51 @@ impl<F: Real> Renderer<F> {
         self.footprints.resize(n, Footprint::default());
         self.channels.resize(n, [F::ZERO; CHANNELS]);
         let mut clock = Clock::start();
-        project::forward(splats, &view, simd, &mut self.projected, &mut self.footprints);
+        self.radii.resize(n, F::ZERO);
+        project::forward(splats, &view, simd, &mut self.projected, &mut self.footprints, &mut self.radii);
         self.seconds.project = clock.lap();
         shade::forward(splats, &view, self.config.sh_degree, simd, &self.projected, &mut self.channels);
         self.seconds.shade = clock.lap();
-        self.radii.resize(n, F::ZERO);
-        self.radii.par_iter_mut().zip(&self.projected).with_min_len(4096).for_each(|(r, p)| *r = p.radius);
         self.raster.prepare(&self.projected, &self.footprints, w, h, simd);
         self.seconds.bin = clock.lap();
         self.raster.blend(&self.projected, &self.footprints, &self.channels, &self.config);
-        let widths = extra.map_or(0, Table::width);
+        let (depths, widths) = (usize::from(self.config.depth), extra.map_or(0, Table::width));
         reshape(&mut out.color, 3, h, w);
         reshape(&mut out.alpha, 1, h, w);
-        reshape(&mut out.depth, 1, h, w);
+        reshape(&mut out.depth, depths, h, w);
         reshape(&mut out.extra, widths, h, w);
         for (c, &b) in background.iter().enumerate() {
             self.raster.channel(c, b, out.color.plane_mut(c));
         }
         self.raster.alpha(out.alpha.plane_mut(0));
-        self.raster.channel(3, F::ZERO, out.depth.plane_mut(0));
-        self.render_extra(extra, out);
+        for first in self.passes(extra) {
+            self.pack(extra, first);
+            self.raster.blend(&self.projected, &self.footprints, &self.extra, &self.config);
+            for c in first..(depths + widths).min(first + CHANNELS) {
+                let plane = if c < depths { out.depth.plane_mut(c) } else { out.extra.plane_mut(c - depths) };
+                self.raster.channel(c - first, F::ZERO, plane);
+            }
+        }
         self.seconds.blend = clock.lap();
     }
 
-    /// The passes of further channels.
-    fn render_extra(&mut self, extra: Option<&Table<F>>, out: &mut Image<F>) {
-        let Some(table) = extra else { return };
-        let widths = table.width();
-        for first in (0..widths).step_by(CHANNELS) {
-            pack(table, first, &mut self.extra);
-            self.raster.blend(&self.projected, &self.footprints, &self.extra, &self.config);
-            for c in first..widths.min(first + CHANNELS) {
-                self.raster.channel(c - first, F::ZERO, out.extra.plane_mut(c));
-            }
-        }
+    /// First channels of the passes after that of the colours: depth, if it is drawn, then what the caller gave.
+    fn passes(&self, extra: Option<&Table<F>>) -> impl DoubleEndedIterator<Item = usize> + use<F> {
+        let count = usize::from(self.config.depth) + extra.map_or(0, Table::width);
+        (0..count.div_ceil(CHANNELS)).map(|pass| pass * CHANNELS)
+    }
+
+    /// Fills [`Self::extra`] for the pass that begins with channel `first`; channels that there are not are 0.
+    fn pack(&mut self, extra: Option<&Table<F>>, first: usize) {
+        let depths = usize::from(self.config.depth);
+        self.extra.resize(self.projected.len(), [F::ZERO; CHANNELS]);
+        let rows = self.extra.par_iter_mut().zip(&self.projected).with_min_len(4096).enumerate();
+        rows.for_each(|(j, (row, projected))| {
+            *row = std::array::from_fn(|k| match (first + k).checked_sub(depths) {
+                None => projected.depth,
+                Some(c) => extra.filter(|table| c < table.width()).map_or(F::ZERO, |table| table.get(j, c)),
+            });
+        });
     }
 
     /// VJP of the last [`Renderer::render`], whose arguments must be given again.
@@ -303,7 +326,7 @@ impl<F: Real> Renderer<F> {
         let widths = extra.map_or(0, Table::width);
         plane(Some(grads.color), 3);
         plane(grads.alpha, 1);
-        plane(grads.depth, 1);
+        plane(grads.depth, usize::from(self.config.depth));
         plane(grads.extra, widths);
         let view = View::new(camera, &self.config);
         let simd = self.config.simd;
@@ -311,33 +334,30 @@ impl<F: Real> Renderer<F> {
         self.d_channels.resize(n, [F::ZERO; CHANNELS]);
 
         let mut clock = Clock::start();
+        // The tiles hold the last pass; the colours' come last, and are blended again if that was another.
+        let geometry = self.backward_further(extra, grads, &mut d.extra);
+        if self.passes(extra).next().is_some() {
+            self.raster.blend(&self.projected, &self.footprints, &self.channels, &self.config);
+        }
         let pixels = PixelGrads {
-            channels: [
-                Some(grads.color.plane(0)),
-                Some(grads.color.plane(1)),
-                Some(grads.color.plane(2)),
-                grads.depth.map(|p| p.plane(0)),
-            ],
+            channels: std::array::from_fn(|c| Some(grads.color.plane(c))),
             alpha: grads.alpha.map(|p| p.plane(0)),
         };
-        let over = [background[0], background[1], background[2], F::ZERO];
-        let (projected, footprints) = (&self.projected, &self.footprints);
         let d_background = self.raster.backward(
-            projected,
-            footprints,
+            &self.projected,
+            &self.footprints,
             &self.channels,
-            over,
+            background,
             &pixels,
             &self.config,
-            rasterize::Geometry::Overwrite,
+            geometry,
             &mut self.d_projected,
             &mut self.d_channels,
         );
         d.background = std::array::from_fn(|c| F::of(d_background[c]));
-        self.backward_extra(extra, grads.extra, &mut d.extra);
 
         self.seconds.blend_backward = clock.lap();
-        // Depth is the fourth channel; the norms of the screen gradient are what densification reads.
+        // The norms of the screen gradient are what densification reads.
         d.mean2d.resize(n, F::ZERO);
         d.mean2d_abs.resize(n, F::ZERO);
         let half = [F::of(0.5 * size[0] as f64), F::of(0.5 * size[1] as f64)];
@@ -346,9 +366,7 @@ impl<F: Real> Renderer<F> {
             (x * x + y * y).sqrt()
         };
         let norms = d.mean2d.par_iter_mut().zip(d.mean2d_abs.par_iter_mut());
-        let rows = self.d_projected.par_iter_mut().zip(&self.d_channels);
-        rows.zip(norms).with_min_len(2048).for_each(|((row, channels), (mean2d, mean2d_abs))| {
-            row.depth += channels[3];
+        self.d_projected.par_iter().zip(norms).with_min_len(2048).for_each(|(row, (mean2d, mean2d_abs))| {
             *mean2d = norm(row.mean2d);
             *mean2d_abs = norm(row.mean2d_abs);
         });
@@ -385,24 +403,39 @@ impl<F: Real> Renderer<F> {
         self.seconds.splats_backward = clock.lap();
     }
 
-    /// The passes of further channels: adds to the geometry's gradient, overwrites `d_extra`.
-    fn backward_extra(&mut self, extra: Option<&Table<F>>, grads: Option<&Planes<F>>, d_extra: &mut Option<Table<F>>) {
-        let Some(table) = extra else {
-            *d_extra = None;
-            return;
+    /// The passes of depth and further channels, last one first: overwrites the geometry's gradient and `d_extra`.
+    /// Returns what the colours' pass is to do with the former.
+    fn backward_further(
+        &mut self,
+        extra: Option<&Table<F>>,
+        grads: &ImageGrads<'_, F>,
+        d_extra: &mut Option<Table<F>>,
+    ) -> Geometry {
+        match extra {
+            None => *d_extra = None,
+            Some(table) => {
+                let out = d_extra.get_or_insert_with(|| Table::with_columns(table.columns().to_vec(), 0));
+                project::reshape(out, table);
+                out.fill(F::ZERO);
+            }
+        }
+        let (depths, widths) = (usize::from(self.config.depth), extra.map_or(0, Table::width));
+        let plane = |c: usize| match c.checked_sub(depths) {
+            None => grads.depth.map(|p| p.plane(0)),
+            Some(c) => grads.extra.filter(|_| c < widths).map(|p| p.plane(c)),
         };
-        let out = d_extra.get_or_insert_with(|| Table::with_columns(table.columns().to_vec(), 0));
-        project::reshape(out, table);
-        out.fill(F::ZERO);
-        let Some(grads) = grads else { return };
-        self.d_extra.resize(table.rows(), [F::ZERO; CHANNELS]);
-        for first in (0..table.width()).step_by(CHANNELS) {
-            let end = table.width().min(first + CHANNELS);
-            pack(table, first, &mut self.extra);
-            let pixels = PixelGrads {
-                channels: std::array::from_fn(|c| (first + c < end).then(|| grads.plane(first + c))),
-                alpha: None,
-            };
+        self.d_extra.resize(self.projected.len(), [F::ZERO; CHANNELS]);
+        let last = self.passes(extra).next_back();
+        let mut geometry = Geometry::Overwrite;
+        for first in self.passes(extra).rev() {
+            let pixels = PixelGrads { channels: std::array::from_fn(|k| plane(first + k)), alpha: None };
+            if pixels.channels.iter().all(Option::is_none) {
+                continue;
+            }
+            self.pack(extra, first);
+            if Some(first) != last {
+                self.raster.blend(&self.projected, &self.footprints, &self.extra, &self.config);
+            }
             self.raster.backward(
                 &self.projected,
                 &self.footprints,
@@ -410,16 +443,22 @@ impl<F: Real> Renderer<F> {
                 [F::ZERO; CHANNELS],
                 &pixels,
                 &self.config,
-                rasterize::Geometry::Add,
+                geometry,
                 &mut self.d_projected,
                 &mut self.d_extra,
             );
+            geometry = Geometry::Add;
             for (j, d) in self.d_extra.iter().enumerate() {
-                for c in first..end {
-                    out.set(j, c, d[c - first]);
+                for (k, &d) in d.iter().enumerate() {
+                    match (first + k).checked_sub(depths) {
+                        None => self.d_projected[j].depth += d,
+                        Some(c) if c < widths => d_extra.as_mut().expect("made above").set(j, c, d),
+                        Some(_) => {}
+                    }
                 }
             }
         }
+        geometry
     }
 
     /// Radius of every splat of the last render: 3σ of the larger axis, pixels; 0: not drawn.
@@ -439,9 +478,9 @@ impl<F: Real> Renderer<F> {
             &self.footprints,
             &self.channels,
             [F::ZERO; CHANNELS],
-            &PixelGrads { channels: [Some(&ones), None, None, None], alpha: None },
+            &PixelGrads { channels: [Some(&ones), None, None], alpha: None },
             &self.config,
-            rasterize::Geometry::Overwrite,
+            Geometry::Overwrite,
             &mut geometry,
             &mut self.d_extra,
         );
@@ -452,6 +491,11 @@ impl<F: Real> Renderer<F> {
     /// Screen ellipses of the last render, one a splat; radius 0: not drawn.
     pub fn projected(&self) -> &[Projected<F>] {
         &self.projected
+    }
+
+    /// What the last render's blend loop did, counted again, slowly; only the last run of bins of an absurd scene.
+    pub fn count_pairs(&self) -> PairCounts {
+        self.raster.count_pairs(&self.config)
     }
 
     /// Bytes of memory held.
@@ -505,12 +549,4 @@ impl Clock {
 fn reshape<F: Real>(planes: &mut Planes<F>, channels: usize, height: usize, width: usize) {
     (planes.channels, planes.height, planes.width) = (channels, height, width);
     planes.data.resize(channels * height * width, F::ZERO);
-}
-
-/// Four columns of a table from `first` on; columns that it lacks are 0.
-fn pack<F: Real>(table: &Table<F>, first: usize, out: &mut Vec<[F; CHANNELS]>) {
-    out.resize(table.rows(), [F::ZERO; CHANNELS]);
-    out.par_iter_mut().with_min_len(4096).enumerate().for_each(|(j, row)| {
-        *row = std::array::from_fn(|c| if first + c < table.width() { table.get(j, first + c) } else { F::ZERO });
-    });
 }

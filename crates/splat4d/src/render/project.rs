@@ -3,13 +3,16 @@
 //! Source: Zwicker et al. 2001; Kerbl et al. 2023 section 4; clamp of x/z and y/z inside J and the compensation ρ as
 //! in gsplat; no 3σ cap on the extent (SnugBox, Hanson et al. 2024).
 
-use super::bin::{BIN, Footprint};
+use super::bin::{BIN, Footprint, MASK_SIDE};
 use super::simd::{Kernel, Simd, dispatch};
 use super::{Antialias, PartGrads, RenderConfig};
 use crate::math::Real;
 use crate::scene::splats::{COV, SPLAT_OPACITY};
 use crate::scene::{BLOCK, Camera, Splats, Table};
 use rayon::prelude::*;
+
+#[cfg(test)]
+mod tests;
 
 /// x/z inside J may leave the picture by this share of its half-width's tangent (Inria, gsplat).
 const J_MARGIN: f64 = 0.3;
@@ -23,6 +26,9 @@ pub(super) const ALPHA_FLOOR: f64 = 1e-30;
 const RADIUS_SIGMAS: f64 = 3.0;
 /// Rows in a task: whole blocks of a table.
 pub(super) const CHUNK_ROWS: usize = 1024;
+
+/// Numbers of the 16 splats of a table's block.
+pub(super) type Lanes<F> = [F; BLOCK];
 
 /// One splat on the screen. Plain old data.
 #[repr(C)]
@@ -155,12 +161,30 @@ fn in_camera<F: Real>(view: &View<F>, mean: [F; 3]) -> [F; 3] {
     [dot(r[0], mean) + t[0], dot(r[1], mean) + t[1], dot(r[2], mean) + t[2]]
 }
 
+/// The smaller; unlike `f32::min` one instruction.
+#[inline(always)]
+fn least<F: Real>(a: F, b: F) -> F {
+    if a < b { a } else { b }
+}
+
+/// The larger, in one instruction.
+#[inline(always)]
+fn greatest<F: Real>(a: F, b: F) -> F {
+    if a > b { a } else { b }
+}
+
+/// One of two values that are both at hand.
+#[inline(always)]
+pub(super) fn select<F: Real>(condition: bool, yes: F, no: F) -> F {
+    std::hint::select_unpredictable(condition, yes, no)
+}
+
 #[inline(always)]
 fn ellipse<F: Real>(view: &View<F>, p: [F; 3], cov: [F; 6]) -> Ellipse<F> {
     let r = &view.rotation;
     let inv_z = F::ONE / p[2];
     let uv = [p[0] * inv_z, p[1] * inv_z];
-    let clamped: [F; 2] = std::array::from_fn(|k| uv[k].max(view.low[k]).min(view.high[k]));
+    let clamped: [F; 2] = std::array::from_fn(|k| least(greatest(uv[k], view.low[k]), view.high[k]));
     // Row k of J W is (f_k/z)(W_k − clamped_k W_2).
     let m: [[F; 3]; 2] = std::array::from_fn(|k| {
         let s = view.focal[k] * inv_z;
@@ -169,7 +193,7 @@ fn ellipse<F: Real>(view: &View<F>, p: [F; 3], cov: [F; 6]) -> Ellipse<F> {
     let ms = [sym_vec(cov, m[0]), sym_vec(cov, m[1])];
     let s0 = [dot(ms[0], m[0]), dot(ms[0], m[1]), dot(ms[1], m[1])];
     // det(Σ0 + λI) = det Σ0 + λ tr Σ0 + λ²: written so, a needle's determinant cannot cancel to nothing.
-    let det0 = (s0[0] * s0[2] - s0[1] * s0[1]).max(F::ZERO);
+    let det0 = greatest(s0[0] * s0[2] - s0[1] * s0[1], F::ZERO);
     let det1 = det0 + view.low_pass * (s0[0] + s0[2] + view.low_pass);
     Ellipse { p, inv_z, uv, clamped, m, ms, s0, det0, det1 }
 }
@@ -180,8 +204,8 @@ fn compensation<F: Real>(view: &View<F>, e: &Ellipse<F>) -> (F, bool) {
     if view.antialias == Antialias::Off {
         return (F::ONE, true);
     }
-    let (square, least) = (e.det0 / e.det1, F::of(RHO_MIN * RHO_MIN));
-    if square > least { (square.sqrt(), false) } else { (F::of(RHO_MIN), true) }
+    let (square, floor) = (e.det0 / e.det1, F::of(RHO_MIN * RHO_MIN));
+    (greatest(square, floor).sqrt(), !(square > floor))
 }
 
 /// Projects one Gaussian: mean and packed covariance in the world, opacity in (0,1).
@@ -189,34 +213,44 @@ fn compensation<F: Real>(view: &View<F>, e: &Ellipse<F>) -> (F, bool) {
 /// `None`, culled: z ≤ near, opacity (after ρ) below the α cut-off, determinant ≤ 0, anything not finite.
 #[inline(always)]
 pub fn project<F: Real>(view: &View<F>, mean: [F; 3], cov: [F; 6], opacity: F) -> Option<Projected<F>> {
+    let (out, drawn) = screen(view, mean, cov, opacity);
+    drawn.then_some(out)
+}
+
+/// [`project`] without a branch, so that a loop over it is a loop over vectors; `false`: culled, and any numbers.
+#[inline(always)]
+fn screen<F: Real>(view: &View<F>, mean: [F; 3], cov: [F; 6], opacity: F) -> (Projected<F>, bool) {
     let p = in_camera(view, mean);
-    // Phrased so that a NaN is culled too.
-    if !(p[2] > view.near && opacity >= view.alpha_min) {
-        return None;
-    }
     let e = ellipse(view, p, cov);
     let (xx, yy) = (e.s0[0] + view.low_pass, e.s0[2] + view.low_pass);
     let (rho, _) = compensation(view, &e);
-    let opacity = opacity * rho;
-    if !(e.det1 > F::ZERO && xx > F::ZERO && yy > F::ZERO && opacity >= view.alpha_min) {
-        return None;
-    }
+    let shown = opacity * rho;
     let inv = F::ONE / e.det1;
-    let tau = F::TWO * (opacity / view.alpha_min).ln() + F::of(TAU_MARGIN);
+    let tau = F::TWO * (shown / view.alpha_min).lane_ln() + F::of(TAU_MARGIN);
     let mid = F::HALF * (xx + yy);
-    let largest = mid + (mid * mid - e.det1).max(F::ZERO).sqrt();
+    let largest = mid + greatest(mid * mid - e.det1, F::ZERO).sqrt();
     let out = Projected {
         mean2d: std::array::from_fn(|k| view.focal[k] * e.uv[k] + view.principal[k]),
         conic: [yy * inv, -e.s0[1] * inv, xx * inv],
-        opacity,
+        opacity: shown,
         depth: p[2],
         radius: F::of(RADIUS_SIGMAS) * largest.sqrt(),
         half: [(tau * xx).sqrt(), (tau * yy).sqrt()],
         tau,
         rho,
     };
-    let all = out.mean2d[0] + out.mean2d[1] + out.conic[0] + out.conic[1] + out.conic[2] + out.half[0] + out.half[1];
-    (all.is_finite() && out.depth.is_finite() && out.radius > F::ZERO).then_some(out)
+    // A sum is finite only where all its terms are. Comparisons are phrased so that a NaN is culled too.
+    let [x, y] = out.mean2d;
+    let all = x + y + out.conic[0] + out.conic[1] + out.conic[2] + out.half[0] + out.half[1] + shown + p[2];
+    let drawn = (p[2] > view.near)
+        & (opacity >= view.alpha_min)
+        & (shown >= view.alpha_min)
+        & (e.det1 > F::ZERO)
+        & (xx > F::ZERO)
+        & (yy > F::ZERO)
+        & all.is_finite()
+        & (out.radius > F::ZERO);
+    (out, drawn)
 }
 
 /// Gradients of one Gaussian's inputs.
@@ -232,7 +266,7 @@ pub struct GaussianGrads<F> {
     pub pose: [F; 6],
 }
 
-/// VJP of [`project`] for a row that was not culled.
+/// VJP of [`project`] for a row that was not culled; without a branch.
 ///
 /// Source: gsplat and Kerbl et al. 2023, appendix; d_conic → d_Σ' = −Σ'⁻¹ G Σ'⁻¹.
 #[inline(always)]
@@ -261,8 +295,8 @@ pub fn project_backward<F: Real>(
     ];
     // Opacity and ρ: ∂ρ²/∂Σ0 = adj(Σ0)/det Σ1 − ρ² Σ1⁻¹.
     let (rho, at_floor) = compensation(view, &e);
-    if !at_floor {
-        let d_square = d.opacity * opacity / (F::TWO * rho);
+    if view.antialias == Antialias::On {
+        let d_square = select(at_floor, F::ZERO, d.opacity * opacity / (F::TWO * rho));
         let (inv, square) = (F::ONE / e.det1, rho * rho);
         s[0] += d_square * (e.s0[2] * inv - square * k[0]);
         s[1] += d_square * (-e.s0[1] * inv - square * k[1]);
@@ -287,10 +321,8 @@ pub fn project_backward<F: Real>(
     let mut d_p = [F::ZERO, F::ZERO, d.depth];
     for a in 0..2 {
         let f = view.focal[a];
-        let mut d_uv = d.mean2d[a] * f;
-        if e.uv[a] == e.clamped[a] {
-            d_uv -= d_j[a][2] * f * iz;
-        }
+        let inside = select(e.uv[a] == e.clamped[a], d_j[a][2] * f * iz, F::ZERO);
+        let d_uv = d.mean2d[a] * f - inside;
         d_p[a] += d_uv * iz;
         d_p[2] += -d_uv * e.uv[a] * iz - f * iz * iz * (d_j[a][a] - d_j[a][2] * e.clamped[a]);
     }
@@ -315,28 +347,40 @@ pub fn project_backward<F: Real>(
 
 /// Projects all splats and finds the bins that each can touch. A splat that touches no pixel is culled.
 ///
-/// Shapes: `projected`, `footprints` [all splats], overwritten.
+/// Shapes: `projected`, `footprints`, `radii` [all splats], overwritten; `radii` are those of the rows.
 pub fn forward<F: Real>(
     splats: &Splats<'_, F>,
     view: &View<F>,
     simd: Simd,
     projected: &mut [Projected<F>],
     footprints: &mut [Footprint],
+    radii: &mut [F],
 ) {
-    assert_eq!(projected.len(), splats.len(), "one projected row a splat");
-    assert_eq!(footprints.len(), splats.len(), "one footprint a splat");
-    let (mut rows, mut feet) = (projected, footprints);
+    let n = splats.len();
+    assert!(projected.len() == n && footprints.len() == n && radii.len() == n, "one row a splat");
+    let (mut rows, mut feet, mut radii) = (projected, footprints, radii);
     for part in &splats.parts {
         let n = part.out.rows();
-        let (head, tail) = std::mem::take(&mut rows).split_at_mut(n);
-        let (head_feet, tail_feet) = std::mem::take(&mut feet).split_at_mut(n);
-        (rows, feet) = (tail, tail_feet);
-        head.par_chunks_mut(CHUNK_ROWS).zip(head_feet.par_chunks_mut(CHUNK_ROWS)).enumerate().for_each(
-            |(chunk, (rows, feet))| {
-                dispatch(simd, Forward { out: part.out, view, first: chunk * CHUNK_ROWS, rows, feet });
-            },
-        );
+        let head = rows.split_off_mut(..n).expect("as many rows as splats");
+        let head_feet = feet.split_off_mut(..n).expect("as many footprints as splats");
+        let head_radii = radii.split_off_mut(..n).expect("as many radii as splats");
+        let tasks = head.par_chunks_mut(CHUNK_ROWS).zip(head_feet.par_chunks_mut(CHUNK_ROWS));
+        tasks.zip(head_radii.par_chunks_mut(CHUNK_ROWS)).enumerate().for_each(|(chunk, ((rows, feet), radii))| {
+            dispatch(simd, Forward { out: part.out, view, first: chunk * CHUNK_ROWS, rows, feet, radii });
+        });
     }
+}
+
+/// The ten columns of a block of splats.
+#[inline(always)]
+fn columns<F: Real>(out: &Table<F>, block: usize) -> &[Lanes<F>; SPLAT_OPACITY + 1] {
+    out.block(block).as_chunks().0.try_into().expect("a part's table has ten columns")
+}
+
+/// Mean, covariance and opacity of one lane of a block.
+#[inline(always)]
+fn gaussian<F: Real>(block: &[Lanes<F>; SPLAT_OPACITY + 1], l: usize) -> ([F; 3], [F; 6], F) {
+    (std::array::from_fn(|k| block[k][l]), std::array::from_fn(|k| block[COV + k][l]), block[SPLAT_OPACITY][l])
 }
 
 /// One task's share of [`forward`].
@@ -346,23 +390,62 @@ struct Forward<'a, F> {
     first: usize,
     rows: &'a mut [Projected<F>],
     feet: &'a mut [Footprint],
+    radii: &'a mut [F],
 }
 
 impl<F: Real> Kernel for Forward<'_, F> {
     type Out = ();
     #[inline(always)]
     fn run<const FMA: bool>(self) {
-        for (i, (row, foot)) in self.rows.iter_mut().zip(self.feet).enumerate() {
-            let j = self.first + i;
-            (*row, *foot) = Default::default();
-            let (mean, cov) = (self.out.read::<3>(j, 0), self.out.read::<6>(j, COV));
-            if let Some(p) = project(self.view, mean, cov, self.out.get(j, SPLAT_OPACITY)) {
-                *foot = Footprint::new(&p, self.view.width, self.view.height);
-                if foot.count() > 0 {
-                    *row = p;
+        let view = *self.view;
+        let blocks = self.rows.chunks_mut(BLOCK).zip(self.feet.chunks_mut(BLOCK)).zip(self.radii.chunks_mut(BLOCK));
+        for (g, ((rows, feet), radii)) in blocks.enumerate() {
+            let block = columns(self.out, self.first / BLOCK + g);
+            let mut p = Projected::<Lanes<F>>::default();
+            let mut boxes = [[0i32; BLOCK]; 4];
+            for l in 0..BLOCK {
+                let (mean, cov, opacity) = gaussian(block, l);
+                let (one, drawn) = screen(&view, mean, cov, opacity);
+                let (bins, met) = bin_range(&one, &view);
+                for k in 0..2 {
+                    (p.mean2d[k][l], p.half[k][l]) = (one.mean2d[k], one.half[k]);
+                }
+                for k in 0..3 {
+                    p.conic[k][l] = one.conic[k];
+                }
+                (p.opacity[l], p.depth[l], p.tau[l], p.rho[l]) = (one.opacity, one.depth, one.tau, one.rho);
+                p.radius[l] = select(drawn & met, one.radius, F::ZERO);
+                for k in 0..4 {
+                    boxes[k][l] = bins[k];
                 }
             }
+            for (l, ((row, foot), radius)) in rows.iter_mut().zip(feet).zip(radii).enumerate() {
+                if p.radius[l] > F::ZERO {
+                    *row = lane(&p, l);
+                    *foot = Footprint::of_bins(row, std::array::from_fn(|k| boxes[k][l]), &view);
+                    *radius = row.radius;
+                    if !foot.is_empty() {
+                        continue;
+                    }
+                }
+                (*row, *foot, *radius) = (Projected::default(), Footprint::default(), F::ZERO);
+            }
         }
+    }
+}
+
+/// One of sixteen rows.
+#[inline(always)]
+fn lane<F: Real>(p: &Projected<Lanes<F>>, l: usize) -> Projected<F> {
+    Projected {
+        mean2d: [p.mean2d[0][l], p.mean2d[1][l]],
+        conic: [p.conic[0][l], p.conic[1][l], p.conic[2][l]],
+        opacity: p.opacity[l],
+        depth: p.depth[l],
+        radius: p.radius[l],
+        half: [p.half[0][l], p.half[1][l]],
+        tau: p.tau[l],
+        rho: p.rho[l],
     }
 }
 
@@ -418,26 +501,58 @@ impl<F: Real> Kernel for Backward<'_, F> {
     type Out = [f64; 6];
     #[inline(always)]
     fn run<const FMA: bool>(self) -> [f64; 6] {
-        let (mut sum, width) = ([0.0; 6], self.out.width());
-        for (i, (row, d)) in self.rows.iter().zip(self.d).enumerate() {
-            let mut values = [F::ZERO; SPLAT_OPACITY + 1];
-            if row.radius > F::ZERO {
-                let j = self.first + i;
-                let (mean, cov) = (self.out.read::<3>(j, 0), self.out.read::<6>(j, COV));
-                let g = project_backward(self.view, mean, cov, self.out.get(j, SPLAT_OPACITY), row, d);
-                values[..3].copy_from_slice(&g.mean);
-                values[COV..COV + 6].copy_from_slice(&g.cov);
-                values[SPLAT_OPACITY] = g.opacity;
+        let view = *self.view;
+        let mut sums = [[0.0; BLOCK]; 6];
+        let (outs, _) = self.data.as_chunks_mut::<BLOCK>();
+        let (outs, _) = outs.as_chunks_mut::<{ SPLAT_OPACITY + 1 }>();
+        for (g, (out, (rows, d_rows))) in
+            outs.iter_mut().zip(self.rows.chunks(BLOCK).zip(self.d.chunks(BLOCK))).enumerate()
+        {
+            *out = [[F::ZERO; BLOCK]; SPLAT_OPACITY + 1];
+            if rows.iter().all(|row| row.radius <= F::ZERO) {
+                continue;
+            }
+            let (mut conic, mut radius) = ([[F::ZERO; BLOCK]; 3], [F::ZERO; BLOCK]);
+            let mut d = ProjectedGrads::<Lanes<F>>::default();
+            for (l, (row, from)) in rows.iter().zip(d_rows).enumerate() {
+                radius[l] = row.radius;
+                for k in 0..3 {
+                    (conic[k][l], d.conic[k][l]) = (row.conic[k], from.conic[k]);
+                }
+                (d.mean2d[0][l], d.mean2d[1][l]) = (from.mean2d[0], from.mean2d[1]);
+                (d.opacity[l], d.depth[l]) = (from.opacity, from.depth);
+            }
+            let block = columns(self.out, self.first / BLOCK + g);
+            let mut pose = [[F::ZERO; BLOCK]; 6];
+            for l in 0..BLOCK {
+                let (mean, cov, opacity) = gaussian(block, l);
+                let row = Projected { conic: std::array::from_fn(|k| conic[k][l]), ..Projected::default() };
+                let d = ProjectedGrads {
+                    mean2d: [d.mean2d[0][l], d.mean2d[1][l]],
+                    conic: std::array::from_fn(|k| d.conic[k][l]),
+                    opacity: d.opacity[l],
+                    depth: d.depth[l],
+                    ..ProjectedGrads::default()
+                };
+                let g = project_backward(&view, mean, cov, opacity, &row, &d);
+                // Culled rows may hold NaN.
+                let drawn = radius[l] > F::ZERO;
+                for k in 0..3 {
+                    out[k][l] = select(drawn, g.mean[k], F::ZERO);
+                }
                 for k in 0..6 {
-                    sum[k] += g.pose[k].f64();
+                    out[COV + k][l] = select(drawn, g.cov[k], F::ZERO);
+                    pose[k][l] = select(drawn, g.pose[k], F::ZERO);
+                }
+                out[SPLAT_OPACITY][l] = select(drawn, g.opacity, F::ZERO);
+            }
+            for k in 0..6 {
+                for l in 0..BLOCK {
+                    sums[k][l] += pose[k][l].f64();
                 }
             }
-            let at = i / BLOCK * width * BLOCK + i % BLOCK;
-            for (k, v) in values.iter().enumerate() {
-                self.data[at + k * BLOCK] = *v;
-            }
         }
-        sum
+        sums.map(|lanes| lanes.iter().sum())
     }
 }
 
@@ -450,43 +565,78 @@ pub(super) fn reshape<F: Real>(table: &mut Table<F>, like: &Table<F>) {
     }
 }
 
-impl Footprint {
-    /// The bins that hold a pixel centre inside the cut-off ellipse of `p`, in a picture of `width` x `height`.
-    #[inline(always)]
-    pub fn new<F: Real>(p: &Projected<F>, width: usize, height: usize) -> Self {
-        // Pixel i has its centre at i + ½. Casts saturate, so that a footprint of 10^6 pixels is no trouble.
-        let range = |k: usize, size: usize| {
-            let low = (p.mean2d[k] - p.half[k] - F::HALF).f64().ceil().max(0.0);
-            let high = (p.mean2d[k] + p.half[k] - F::HALF).f64().floor().min(size as f64 - 1.0);
-            (low <= high).then_some((low as usize, high as usize))
-        };
-        let (Some((x0, x1)), Some((y0, y1))) = (range(0, width), range(1, height)) else {
-            return Self::default();
-        };
-        let (bx0, bx1, by0, by1) = (x0 / BIN, x1 / BIN + 1, y0 / BIN, y1 / BIN + 1);
-        let mut out = Self { x0: bx0 as u16, x1: bx1 as u16, y0: by0 as u16, y1: by1 as u16, mask: 0 };
-        let (across, down) = (bx1 - bx0, by1 - by0);
-        if across > 8 || down > 8 {
-            return out;
-        }
-        // A connected ellipse meets every bin of a single row or column of its own box.
-        let test = across > 1 && down > 1;
-        for by in 0..down {
-            for bx in 0..across {
-                let x = [(bx0 + bx) * BIN, ((bx0 + bx + 1) * BIN).min(width)];
-                let y = [(by0 + by) * BIN, ((by0 + by + 1) * BIN).min(height)];
-                let hit = !test || {
-                    let edge = |v: usize, k: usize, side: F| F::of(v as f64) + side - p.mean2d[k];
-                    let (x0, x1) = (edge(x[0], 0, F::HALF), edge(x[1], 0, -F::HALF));
-                    let (y0, y1) = (edge(y[0], 1, F::HALF), edge(y[1], 1, -F::HALF));
-                    ellipse_distance(p.conic, -p.conic[1] / p.conic[2], -p.conic[1] / p.conic[0], [x0, x1], [y0, y1])
-                        <= p.tau
-                };
-                out.mask |= u64::from(hit) << (by * 8 + bx);
-            }
-        }
-        if out.mask == 0 { Self::default() } else { out }
+/// First and last column and row of bins with pixels whose centres are in the box of the ellipse and in the picture,
+/// and whether there are any.
+#[inline(always)]
+fn bin_range<F: Real>(p: &Projected<F>, view: &View<F>) -> ([i32; 4], bool) {
+    let size = [view.width, view.height];
+    let mut out = [0; 4];
+    let mut met = true;
+    for k in 0..2 {
+        // Pixel i has its centre at i + ½; −⌊−x⌋ is ⌈x⌉.
+        let past = F::of(size[k] as f64);
+        let first = greatest(-(F::HALF + p.half[k] - p.mean2d[k]).floor(), F::ZERO);
+        let last = least((p.mean2d[k] + p.half[k] - F::HALF).floor(), past - F::ONE);
+        met &= first <= last;
+        out[2 * k] = least(first, past).lane_i32() >> BIN.ilog2();
+        out[2 * k + 1] = greatest(last, F::ZERO).lane_i32() >> BIN.ilog2();
     }
+    (out, met)
+}
+
+impl Footprint {
+    /// The bins that hold a pixel centre inside the cut-off ellipse of `p` in the picture of `view`.
+    pub fn new<F: Real>(p: &Projected<F>, view: &View<F>) -> Self {
+        let (bins, met) = bin_range(p, view);
+        if met { Self::of_bins(p, bins, view) } else { Self::default() }
+    }
+
+    /// [`Footprint::new`] of a box that has bins: first and last column, first and last row.
+    #[inline(always)]
+    fn of_bins<F: Real>(p: &Projected<F>, bins: [i32; 4], view: &View<F>) -> Self {
+        let [x0, x1, y0, y1] = bins.map(|v| v as usize);
+        let (right, lower) = (x1 - x0, y1 - y0);
+        let depth = p.depth.f64() as f32;
+        if right.max(lower) >= MASK_SIDE {
+            return Self::rectangle([x0, x1 + 1, y0, y1 + 1], depth);
+        }
+        let columns = u64::from(u8::MAX) >> (MASK_SIDE - 1 - right);
+        let rows = FIRST_COLUMN >> (MASK_SIDE * (MASK_SIDE - 1 - lower));
+        let mut mask = columns * rows;
+        // A connected ellipse meets every bin of a single row or column of its own box. Where the picture's edge has cut
+        // the box, a bin too many does no harm.
+        if right.min(lower) > 0 {
+            mask &= met_bins(p, [x0, y0], lower, view);
+        }
+        Self::masked([x0, y0], mask, depth)
+    }
+}
+
+/// First bit of each row of a mask.
+const FIRST_COLUMN: u64 = u64::from_ne_bytes([1; MASK_SIDE]);
+
+/// Bit 8·row + column: the ellipse holds a point of the bin's box of pixel centres; of rows 0 to `lower`, and of eight
+/// columns, a vector.
+#[inline(always)]
+fn met_bins<F: Real>(p: &Projected<F>, first: [usize; 2], lower: usize, view: &View<F>) -> u64 {
+    let (y_slope, x_slope) = (-p.conic[1] / p.conic[2], -p.conic[1] / p.conic[0]);
+    let (x0, y0) = (F::of((first[0] * BIN) as f64), F::of((first[1] * BIN) as f64));
+    let (width, height) = (F::of(view.width as f64), F::of(view.height as f64));
+    let mut mask = 0;
+    for by in 0..=lower {
+        let top = y0 + F::of((by * BIN) as f64);
+        let y = [top + F::HALF - p.mean2d[1], least(top + F::of(BIN as f64), height) - F::HALF - p.mean2d[1]];
+        let mut hits = [false; MASK_SIDE];
+        for (bx, hit) in hits.iter_mut().enumerate() {
+            let left = x0 + F::of((bx * BIN) as f64);
+            let x = [left + F::HALF - p.mean2d[0], least(left + F::of(BIN as f64), width) - F::HALF - p.mean2d[0]];
+            *hit = ellipse_distance(p.conic, y_slope, x_slope, x, y) <= p.tau;
+        }
+        for (bx, hit) in hits.into_iter().enumerate() {
+            mask |= u64::from(hit) << (by * MASK_SIDE + bx);
+        }
+    }
+    mask
 }
 
 /// Least dᵀ conic d over a rectangle of offsets from the centre; exact.

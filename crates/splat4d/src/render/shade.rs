@@ -1,8 +1,10 @@
 //! The colour of every visible splat: spherical harmonics along the viewing direction, or a colour given directly.
 //!
-//! Works on 16 splats at once, a block of the table, so that coefficients are read as whole vectors.
+//! Works on the splats of one block of the SH table at once, so that coefficients are read as whole vectors: sixteen
+//! where all rows are drawn, those that are alive elsewhere. The block's columns lie in as many cache lines as one row
+//! does, so that nothing is read for the others' sake.
 
-use super::project::{CHUNK_ROWS, Projected, View};
+use super::project::{CHUNK_ROWS, Lanes, Projected, View, select};
 use super::rasterize::CHANNELS;
 use super::simd::{Kernel, Simd, dispatch};
 use super::{PartGrads, project};
@@ -10,9 +12,7 @@ use crate::math::{Real, sh};
 use crate::scene::splats::{Part, Rows};
 use crate::scene::{BLOCK, Color, Splats, Table};
 use rayon::prelude::*;
-
-/// Numbers of 16 splats.
-type Lanes<F> = [F; BLOCK];
+use std::ops::Range;
 
 /// Columns of a part's table that its colour's gradient has.
 fn color_width<'a, F: Real>(part: &Part<'a, F>) -> Option<&'a Table<F>> {
@@ -42,61 +42,111 @@ impl Layout {
     }
 }
 
-/// Sixteen rows of an SH table: one block where the rows are consecutive, else gathered.
-#[derive(Clone, Copy)]
-enum Source<'a, F> {
-    Block(&'a [F]),
-    Gather(&'a Table<F>, [u32; BLOCK]),
+/// Calls a function of a constant number of coefficients with `$used` of them, which a degree has.
+macro_rules! with_coeffs {
+    ($used:expr, $function:ident, $($argument:expr),*) => {
+        match $used {
+            0 => $function::<F, FMA, 0>($($argument),*),
+            1 => $function::<F, FMA, 1>($($argument),*),
+            4 => $function::<F, FMA, 4>($($argument),*),
+            9 => $function::<F, FMA, 9>($($argument),*),
+            _ => $function::<F, FMA, { sh::MAX_COEFFS }>($($argument),*),
+        }
+    };
 }
 
-impl<'a, F: Real> Source<'a, F> {
+/// Splats that have their parameters in one block of a table.
+#[derive(Clone, Copy)]
+struct Group {
+    block: usize,
+    /// The first of them, and how many.
+    first: usize,
+    len: usize,
+    /// The row of the block that each of them has.
+    lanes: [u8; BLOCK],
+}
+
+impl Group {
+    /// The groups of splats `range`, in order.
     #[inline(always)]
-    fn new(table: &'a Table<F>, rows: &Rows<'_>, j0: usize, n: usize) -> Self {
-        let first = rows.id(j0);
-        if first.is_multiple_of(BLOCK) && rows.id(j0 + n - 1) == first + n - 1 {
-            return Source::Block(table.block(first / BLOCK));
-        }
-        Source::Gather(table, std::array::from_fn(|l| rows.id(j0 + l.min(n - 1)) as u32))
+    fn all(rows: Rows<'_>, range: Range<usize>) -> impl Iterator<Item = Group> {
+        let mut at = range.start;
+        std::iter::from_fn(move || {
+            let first = at;
+            let block = (first < range.end).then(|| rows.id(first) / BLOCK)?;
+            let mut lanes = [0; BLOCK];
+            while at < range.end && rows.id(at) / BLOCK == block {
+                lanes[at - first] = (rows.id(at) % BLOCK) as u8;
+                at += 1;
+            }
+            Some(Group { block, first, len: at - first, lanes })
+        })
     }
 
+    /// Splats and their lanes.
     #[inline(always)]
-    fn column(&self, col: usize) -> Lanes<F> {
-        match self {
-            Source::Block(data) => {
-                let run = &data[col * BLOCK..(col + 1) * BLOCK];
-                std::array::from_fn(|l| run[l])
-            }
-            Source::Gather(table, ids) => std::array::from_fn(|l| table.get(ids[l] as usize, col)),
+    fn each(&self) -> impl Iterator<Item = (usize, usize)> {
+        (0..self.len).map(|k| (self.first + k, usize::from(self.lanes[k]) % BLOCK))
+    }
+
+    /// `N` numbers of each splat from column `col` of a table that has a row a splat; 0 in lanes without one.
+    #[inline(always)]
+    fn read<F: Real, const N: usize>(&self, table: &Table<F>, col: usize) -> [Lanes<F>; N] {
+        let mut out = [[F::ZERO; BLOCK]; N];
+        if self.len == BLOCK && self.first.is_multiple_of(BLOCK) {
+            out.copy_from_slice(&table.block(self.first / BLOCK).as_chunks().0[col..col + N]);
+            return out;
         }
+        for (j, l) in self.each() {
+            let values = table.read::<N>(j, col);
+            for k in 0..N {
+                out[k][l] = values[k];
+            }
+        }
+        out
+    }
+
+    /// The weights of SH block `b`, 1 where there are none.
+    #[inline(always)]
+    fn weights<F: Real>(&self, weights: Option<&Table<F>>, b: usize) -> Lanes<F> {
+        weights.map_or([F::ONE; BLOCK], |table| self.read::<F, 1>(table, b)[0])
     }
 }
 
 /// Unit directions [3][16] from the camera, and 1/length.
 #[inline(always)]
-fn directions<F: Real>(out: &Table<F>, group: usize, center: [F; 3]) -> ([Lanes<F>; 3], Lanes<F>) {
-    let means = out.block(group);
+fn directions<F: Real>(means: &[Lanes<F>; 3], center: [F; 3]) -> ([Lanes<F>; 3], Lanes<F>) {
     let mut d = [[F::ZERO; BLOCK]; 3];
     let mut inverse = [F::ZERO; BLOCK];
     for l in 0..BLOCK {
-        let v: [F; 3] = std::array::from_fn(|k| means[k * BLOCK + l] - center[k]);
-        inverse[l] = F::ONE / (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt();
-        for k in 0..3 {
-            d[k][l] = v[k] * inverse[l];
-        }
+        let v = [means[0][l] - center[0], means[1][l] - center[1], means[2][l] - center[2]];
+        let i = F::ONE / (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt();
+        (d[0][l], d[1][l], d[2][l], inverse[l]) = (v[0] * i, v[1] * i, v[2] * i, i);
     }
     (d, inverse)
 }
 
+/// Adds w·Σ_k Y_k(d) f_k to the colour. One loop over lanes, so that the basis stays in registers.
 #[inline(always)]
-fn basis_lanes<F: Real>(d: &[Lanes<F>; 3]) -> [Lanes<F>; sh::MAX_COEFFS] {
-    let mut out = [[F::ZERO; BLOCK]; sh::MAX_COEFFS];
+fn add_colors<F: Real, const FMA: bool, const K: usize>(
+    columns: &[Lanes<F>],
+    d: &[Lanes<F>; 3],
+    w: &Lanes<F>,
+    rgb: &mut [Lanes<F>; 3],
+) {
+    let columns = &columns[..3 * K];
     for l in 0..BLOCK {
         let y = sh::basis([d[0][l], d[1][l], d[2][l]]);
-        for k in 0..sh::MAX_COEFFS {
-            out[k][l] = y[k];
+        let mut sum = [F::ZERO; 3];
+        for k in 0..K {
+            for c in 0..3 {
+                sum[c] = y[k].fma::<FMA>(columns[3 * k + c][l], sum[c]);
+            }
+        }
+        for c in 0..3 {
+            rgb[c][l] += w[l] * sum[c];
         }
     }
-    out
 }
 
 /// One task's share of [`forward`]: rows `first ..` of a part.
@@ -113,59 +163,49 @@ impl<F: Real> Kernel for Forward<'_, F> {
     type Out = ();
     #[inline(always)]
     fn run<const FMA: bool>(self) {
-        let groups = self.projected.chunks(BLOCK).zip(self.channels.chunks_mut(BLOCK));
-        for (g, (rows, out)) in groups.enumerate() {
-            let j0 = self.first + g * BLOCK;
-            if rows.iter().all(|r| r.radius <= F::ZERO) {
-                out.fill([F::ZERO; CHANNELS]);
-                continue;
-            }
-            let rgb = match self.part.color {
-                Color::Direct { table } => {
-                    let data = table.block(j0 / BLOCK);
-                    let column = |c: usize| std::array::from_fn(|l| data[c * BLOCK + l]);
-                    std::array::from_fn(|c| if c < table.width() { column(c) } else { [F::ZERO; BLOCK] })
+        match self.part.color {
+            Color::Direct { table } => {
+                for (i, (row, out)) in self.projected.iter().zip(&mut *self.channels).enumerate() {
+                    *out = [F::ZERO; CHANNELS];
+                    if row.radius > F::ZERO {
+                        for c in 0..table.width().min(3) {
+                            out[c] = table.get(self.first + i, c);
+                        }
+                    }
                 }
-                Color::Sh { table, ref rows, weights, .. } => {
-                    let layout = Layout::new(table.width(), weights.map_or(1, Table::width), self.degree);
-                    let (d, _) = directions(self.part.out, j0 / BLOCK, self.center);
-                    let y = basis_lanes(&d);
-                    let source = Source::new(table, rows, j0, out.len());
+            }
+            Color::Sh { table, rows, weights, .. } => {
+                let layout = Layout::new(table.width(), weights.map_or(1, Table::width), self.degree);
+                for group in Group::all(rows, self.first..self.first + self.projected.len()) {
+                    let run = group.first - self.first..group.first - self.first + group.len;
+                    let (projected, channels) = (&self.projected[run.clone()], &mut self.channels[run]);
+                    if projected.iter().all(|row| row.radius <= F::ZERO) {
+                        channels.fill([F::ZERO; CHANNELS]);
+                        continue;
+                    }
+                    let (d, _) = directions(&group.read::<F, 3>(self.part.out, 0), self.center);
+                    let columns = table.block(group.block).as_chunks().0;
                     let mut rgb = [[F::ZERO; BLOCK]; 3];
                     for b in 0..layout.blocks {
-                        let mut sum = [[F::ZERO; BLOCK]; 3];
-                        for k in 0..layout.used {
-                            for c in 0..3 {
-                                let f = source.column(b * layout.block + 3 * k + c);
-                                for l in 0..BLOCK {
-                                    sum[c][l] = y[k][l].fma::<FMA>(f[l], sum[c][l]);
-                                }
-                            }
-                        }
-                        for c in 0..3 {
-                            for l in 0..BLOCK {
-                                let w = weights.map_or(F::ONE, |w| w.block(j0 / BLOCK)[b * BLOCK + l]);
-                                rgb[c][l] += w * sum[c][l];
-                            }
-                        }
+                        let (columns, w) = (&columns[b * layout.block..], group.weights(weights, b));
+                        with_coeffs!(layout.used, add_colors, columns, &d, &w, &mut rgb);
                     }
                     for c in 0..3 {
                         for l in 0..BLOCK {
                             rgb[c][l] = (rgb[c][l] + F::of(sh::COLOR_OFFSET)).max(F::ZERO);
                         }
                     }
-                    rgb
+                    for ((row, out), (_, l)) in projected.iter().zip(channels).zip(group.each()) {
+                        let visible = row.radius > F::ZERO;
+                        *out = if visible { [rgb[0][l], rgb[1][l], rgb[2][l]] } else { [F::ZERO; CHANNELS] };
+                    }
                 }
-            };
-            for (l, (row, out)) in rows.iter().zip(out).enumerate() {
-                let visible = row.radius > F::ZERO;
-                *out = if visible { [rgb[0][l], rgb[1][l], rgb[2][l], row.depth] } else { [F::ZERO; CHANNELS] };
             }
         }
     }
 }
 
-/// Colours and depths of all splats: red, green, blue, z; culled splats get zeros.
+/// Colours of all splats: red, green, blue; culled splats get zeros.
 ///
 /// Shapes: `projected`, `channels` [all splats]. SH of `degree` at most, clamped at 0 from below; direct colours are
 /// taken as they are, columns beyond the third are not drawn.
@@ -191,22 +231,44 @@ pub fn forward<F: Real>(
     }
 }
 
-/// Gradient to the three colour sums of 16 splats: zero where culled or clamped.
+impl Group {
+    /// Gradient to the three colour sums: zero where culled or clamped.
+    #[inline(always)]
+    fn color_grads<F: Real>(
+        &self,
+        projected: &[Projected<F>],
+        channels: &[[F; CHANNELS]],
+        d: &[[F; CHANNELS]],
+    ) -> [Lanes<F>; 3] {
+        let mut v = [[F::ZERO; BLOCK]; 3];
+        for (j, l) in self.each() {
+            let drawn = projected[j].radius > F::ZERO;
+            for c in 0..3 {
+                v[c][l] = select(drawn & (channels[j][c] > F::ZERO), d[j][c], F::ZERO);
+            }
+        }
+        v
+    }
+}
+
+/// Adds w·Y_k(d) v to the gradient of the coefficients.
 #[inline(always)]
-fn color_grads<F: Real>(
-    projected: &[Projected<F>],
-    channels: &[[F; CHANNELS]],
-    d: &[[F; CHANNELS]],
-    clamp: bool,
-) -> [Lanes<F>; 3] {
-    let mut v = [[F::ZERO; BLOCK]; 3];
-    for l in 0..projected.len().min(BLOCK) {
+fn add_coeff_grads<F: Real, const FMA: bool, const K: usize>(
+    d: &[Lanes<F>; 3],
+    w: &Lanes<F>,
+    v: &[Lanes<F>; 3],
+    columns: &mut [Lanes<F>],
+) {
+    let columns = &mut columns[..3 * K];
+    for l in 0..BLOCK {
+        let y = sh::basis([d[0][l], d[1][l], d[2][l]]);
         for c in 0..3 {
-            let passes = projected[l].radius > F::ZERO && (!clamp || channels[l][c] > F::ZERO);
-            v[c][l] = if passes { d[l][c] } else { F::ZERO };
+            let v = w[l] * v[c][l];
+            for k in 0..K {
+                columns[3 * k + c][l] += y[k] * v;
+            }
         }
     }
-    v
 }
 
 /// One task's share of the SH gradient: a run of whole blocks of the gradient's table.
@@ -219,7 +281,7 @@ struct ShGrads<'a, F> {
     projected: &'a [Projected<F>],
     channels: &'a [[F; CHANNELS]],
     d: &'a [[F; CHANNELS]],
-    /// First row of the run, its rows, and its blocks.
+    /// First row of the run, and its blocks.
     first: usize,
     data: &'a mut [F],
 }
@@ -231,54 +293,69 @@ impl<F: Real> Kernel for ShGrads<'_, F> {
         let width = self.layout.block * self.layout.blocks;
         let total = self.projected.len();
         let end = self.first + self.data.len() / width;
-        // Output rows of which the run holds the parameters.
-        let (from, to) = match self.rows {
-            Rows::All => (self.first.min(total), end.min(total)),
+        // Splats of which the run holds the parameters.
+        let splats = match self.rows {
+            Rows::All => self.first.min(total)..end.min(total),
             Rows::Some(ids) => {
-                (ids.partition_point(|&i| (i as usize) < self.first), ids.partition_point(|&i| (i as usize) < end))
+                ids.partition_point(|&i| (i as usize) < self.first)..ids.partition_point(|&i| (i as usize) < end)
             }
         };
-        if from == to {
-            return;
-        }
-        for group in from / BLOCK..to.div_ceil(BLOCK) {
-            let j0 = group * BLOCK;
-            let n = (total - j0).min(BLOCK);
-            let v = color_grads(&self.projected[j0..j0 + n], &self.channels[j0..j0 + n], &self.d[j0..j0 + n], true);
+        let (columns, _) = self.data.as_chunks_mut::<BLOCK>();
+        for group in Group::all(self.rows, splats) {
+            let v = group.color_grads(self.projected, self.channels, self.d);
             if v.iter().flatten().all(|&x| x == F::ZERO) {
                 continue;
             }
-            let y = basis_lanes(&directions(self.part.out, group, self.center).0);
-            let id0 = self.rows.id(j0);
-            let whole = j0 >= from && j0 + n <= to;
-            let straight = whole && id0.is_multiple_of(BLOCK) && self.rows.id(j0 + n - 1) == id0 + n - 1;
+            let (mut d, _) = directions(&group.read::<F, 3>(self.part.out, 0), self.center);
+            let at = (group.block - self.first / BLOCK) * width;
             for b in 0..self.layout.blocks {
-                let mut w = [F::ONE; BLOCK];
-                if let Some(weights) = self.weights {
-                    w.copy_from_slice(&weights.block(group)[b * BLOCK..(b + 1) * BLOCK]);
-                }
-                for k in 0..self.layout.used {
-                    for c in 0..3 {
-                        let col = b * self.layout.block + 3 * k + c;
-                        let mut add = [F::ZERO; BLOCK];
-                        for l in 0..BLOCK {
-                            // A culled row may hold NaN; its gradient is 0 all the same.
-                            add[l] = if v[c][l] == F::ZERO { F::ZERO } else { w[l] * y[k][l] * v[c][l] };
-                        }
-                        if straight {
-                            let at = ((id0 - self.first) / BLOCK * width + col) * BLOCK;
-                            for (out, add) in self.data[at..at + BLOCK].iter_mut().zip(add) {
-                                *out += add;
-                            }
-                        } else {
-                            for j in from.max(j0)..to.min(j0 + n) {
-                                let row = self.rows.id(j) - self.first;
-                                self.data[(row / BLOCK * width + col) * BLOCK + row % BLOCK] += add[j - j0];
-                            }
-                        }
+                let mut w = group.weights(self.weights, b);
+                for l in 0..BLOCK {
+                    // A culled row may hold NaN; its gradient is 0 all the same.
+                    let live = (v[0][l] != F::ZERO) | (v[1][l] != F::ZERO) | (v[2][l] != F::ZERO);
+                    w[l] = select(live, w[l], F::ZERO);
+                    for k in 0..3 {
+                        d[k][l] = select(live, d[k][l], F::ZERO);
                     }
                 }
+                let columns = &mut columns[at + b * self.layout.block..];
+                with_coeffs!(self.layout.used, add_coeff_grads, &d, &w, &v, columns);
             }
+        }
+    }
+}
+
+/// Of one block of coefficients: writes Σ_k Y_k(d) Σ_c f_kc v_c, the gradient to its weight, and adds the gradient to
+/// the direction, w·Σ_k ∇Y_k(d) Σ_c f_kc v_c.
+#[inline(always)]
+fn add_direction_grads<F: Real, const FMA: bool, const K: usize>(
+    columns: &[Lanes<F>],
+    d: &[Lanes<F>; 3],
+    w: &Lanes<F>,
+    v: &[Lanes<F>; 3],
+    d_weight: &mut Lanes<F>,
+    d_direction: &mut [Lanes<F>; 3],
+) {
+    let columns = &columns[..3 * K];
+    for l in 0..BLOCK {
+        let unit = [d[0][l], d[1][l], d[2][l]];
+        let (y, gradient) = (sh::basis(unit), sh::basis_gradient(unit));
+        let (mut shown, mut d_dir) = (F::ZERO, [F::ZERO; 3]);
+        for k in 0..K {
+            let mut along = F::ZERO;
+            for c in 0..3 {
+                along = v[c][l].fma::<FMA>(columns[3 * k + c][l], along);
+            }
+            shown = y[k].fma::<FMA>(along, shown);
+            for i in 0..3 {
+                if sh::GRADIENT_TERMS[k][i] {
+                    d_dir[i] = gradient[k][i].fma::<FMA>(along, d_dir[i]);
+                }
+            }
+        }
+        d_weight[l] = shown;
+        for i in 0..3 {
+            d_direction[i][l] += w[l] * d_dir[i];
         }
     }
 }
@@ -291,7 +368,8 @@ struct DirectionGrads<'a, F> {
     weights: Option<&'a Table<F>>,
     layout: Layout,
     center: [F; 3],
-    first: usize,
+    /// The task's splats; the others' numbers are at hand as well.
+    splats: Range<usize>,
     projected: &'a [Projected<F>],
     channels: &'a [[F; CHANNELS]],
     d: &'a [[F; CHANNELS]],
@@ -307,41 +385,24 @@ impl<F: Real> Kernel for DirectionGrads<'_, F> {
     #[inline(always)]
     fn run<const FMA: bool>(self) -> [f64; 3] {
         let mut total = [0.0; 3];
-        for g in 0..self.projected.len().div_ceil(BLOCK) {
-            let run = g * BLOCK..((g + 1) * BLOCK).min(self.projected.len());
-            let n = run.len();
-            let v = color_grads(&self.projected[run.clone()], &self.channels[run.clone()], &self.d[run], true);
+        let first = self.splats.start;
+        for group in Group::all(self.rows, self.splats.clone()) {
+            let v = group.color_grads(self.projected, self.channels, self.d);
             if v.iter().flatten().all(|&x| x == F::ZERO) {
                 continue;
             }
-            let j0 = self.first + g * BLOCK;
-            let (d, inverse) = directions(self.part.out, j0 / BLOCK, self.center);
-            let source = Source::new(self.table, &self.rows, j0, n);
-            let y = basis_lanes(&d);
-            // Σ_c v_c f_kc of every coefficient, blocks weighted.
-            let mut along = [[F::ZERO; BLOCK]; sh::MAX_COEFFS];
+            let (d, inverse) = directions(&group.read::<F, 3>(self.part.out, 0), self.center);
+            let columns = self.table.block(group.block).as_chunks().0;
+            let mut d_direction = [[F::ZERO; BLOCK]; 3];
             for b in 0..self.layout.blocks {
-                let mut shown = [F::ZERO; BLOCK];
-                for k in 0..self.layout.used {
-                    let mut sum = [F::ZERO; BLOCK];
-                    for c in 0..3 {
-                        let f = source.column(b * self.layout.block + 3 * k + c);
-                        for l in 0..BLOCK {
-                            sum[l] = v[c][l].fma::<FMA>(f[l], sum[l]);
-                        }
-                    }
-                    for l in 0..BLOCK {
-                        let w = self.weights.map_or(F::ONE, |w| w.block(j0 / BLOCK)[b * BLOCK + l]);
-                        along[k][l] = w.fma::<FMA>(sum[l], along[k][l]);
-                        shown[l] = y[k][l].fma::<FMA>(sum[l], shown[l]);
-                    }
-                }
+                let (columns, w) = (&columns[b * self.layout.block..], group.weights(self.weights, b));
+                let mut d_weight = [F::ZERO; BLOCK];
+                let d_direction = &mut d_direction;
+                with_coeffs!(self.layout.used, add_direction_grads, columns, &d, &w, &v, &mut d_weight, d_direction);
                 if self.weights.is_some() {
-                    let at = (g * self.layout.blocks + b) * BLOCK;
-                    for l in 0..n {
-                        if self.projected[g * BLOCK + l].radius > F::ZERO {
-                            self.d_weights[at + l] = shown[l];
-                        }
+                    for (j, l) in group.each().filter(|&(j, _)| self.projected[j].radius > F::ZERO) {
+                        let row = j - first;
+                        self.d_weights[(row / BLOCK * self.layout.blocks + b) * BLOCK + row % BLOCK] = d_weight[l];
                     }
                 }
             }
@@ -351,24 +412,15 @@ impl<F: Real> Kernel for DirectionGrads<'_, F> {
             let mut d_mean = [[F::ZERO; BLOCK]; 3];
             for l in 0..BLOCK {
                 let unit = [d[0][l], d[1][l], d[2][l]];
-                let gradient = sh::basis_gradient(unit);
-                let mut d_dir = [F::ZERO; 3];
-                for k in 1..sh::MAX_COEFFS {
-                    for i in 0..3 {
-                        d_dir[i] = gradient[k][i].fma::<FMA>(along[k][l], d_dir[i]);
-                    }
-                }
+                let d_dir = [d_direction[0][l], d_direction[1][l], d_direction[2][l]];
                 let back = sh::direction_backward(unit, inverse[l], d_dir);
-                for i in 0..3 {
-                    d_mean[i][l] = back[i];
-                }
+                (d_mean[0][l], d_mean[1][l], d_mean[2][l]) = (back[0], back[1], back[2]);
             }
-            for l in 0..n {
-                if self.projected[g * BLOCK + l].radius > F::ZERO {
-                    for i in 0..3 {
-                        self.out[(g * self.out_width + i) * BLOCK + l] += d_mean[i][l];
-                        total[i] += d_mean[i][l].f64();
-                    }
+            for (j, l) in group.each().filter(|&(j, _)| self.projected[j].radius > F::ZERO) {
+                let row = j - first;
+                for i in 0..3 {
+                    self.out[(row / BLOCK * self.out_width + i) * BLOCK + row % BLOCK] += d_mean[i][l];
+                    total[i] += d_mean[i][l].f64();
                 }
             }
         }
@@ -376,7 +428,7 @@ impl<F: Real> Kernel for DirectionGrads<'_, F> {
     }
 }
 
-/// VJP of [`forward`]; depth (channel 3) is the projection's affair.
+/// VJP of [`forward`].
 ///
 /// Adds to `parts[..].out` (means, through the direction), to `d_sh` (base SH, rows `rows.id(j)`) and to the pose
 /// gradient; overwrites `parts[..].color` and `.weights`. `partial` is scratch.
@@ -477,7 +529,6 @@ pub fn backward<F: Real>(
         let chunks = grads.out.data_mut().par_chunks_mut(CHUNK_ROWS * out_width);
         let task = |chunk: usize, out: &mut [F], d_weights: &mut [F]| {
             let first = chunk * CHUNK_ROWS;
-            let run = first..(first + CHUNK_ROWS).min(n);
             let kernel = DirectionGrads {
                 part,
                 table,
@@ -485,10 +536,10 @@ pub fn backward<F: Real>(
                 weights,
                 layout,
                 center: view.center,
-                first,
-                projected: &projected[run.clone()],
-                channels: &channels[run.clone()],
-                d: &d[run],
+                splats: first..(first + CHUNK_ROWS).min(n),
+                projected,
+                channels,
+                d,
                 out,
                 out_width,
                 d_weights,

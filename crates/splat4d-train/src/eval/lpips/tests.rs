@@ -195,16 +195,3 @@ fn unfit_weights_are_named() {
         .collect();
     assert!(load(&renamed).is_ok());
 }
-
-/// Prints times; run with `--ignored --nocapture` on an idle machine.
-#[test]
-#[ignore = "a measurement"]
-fn time_of_lpips() {
-    for net in [Net::Alex, Net::Vgg] {
-        let lpips = load(&weights(net)).expect("the names and shapes are right");
-        let (a, b) = (image(400, 400, 1), image(400, 400, 2));
-        let start = std::time::Instant::now();
-        let d = lpips.distance(&a, &b, InputScaling::Signed);
-        println!("{net:?} 400x400: {:.2} s ({d:?})", start.elapsed().as_secs_f64());
-    }
-}

@@ -170,25 +170,3 @@ fn bits_do_not_depend_on_threads_or_on_earlier_calls() {
         assert_eq!(run(threads), (fresh, d.clone()));
     }
 }
-
-/// Prints times; run with `--ignored --nocapture` on an idle machine.
-#[test]
-#[ignore = "a measurement"]
-fn time_of_loss_and_gradient() {
-    for (h, w) in [(400, 400), (800, 800), (1080, 1920)] {
-        let (a, b) = (image::<f32>(3, h, w, 1), image::<f32>(3, h, w, 2));
-        let mut d = Planes::default();
-        for (name, simd) in [("detected", Simd::detect()), ("baseline", Simd::Scalar)] {
-            let mut loss = Photometric::<f32>::with_simd(0.2, simd);
-            let mut times: Vec<f64> = (0..30)
-                .map(|_| {
-                    let t = std::time::Instant::now();
-                    loss.loss_and_grad(&a, &b, None, &mut d);
-                    t.elapsed().as_secs_f64() * 1e3
-                })
-                .collect();
-            times.sort_by(f64::total_cmp);
-            println!("{h}x{w}x3 {name}: best {:.2} ms, median {:.2} ms", times[0], times[15]);
-        }
-    }
-}

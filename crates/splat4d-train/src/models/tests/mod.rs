@@ -46,7 +46,8 @@ const FD_TOLERANCE: (f64, f64) = (2e-6, 2e-9);
 
 /// No thresholds: the picture is a smooth function of every parameter.
 fn smooth() -> RenderConfig {
-    RenderConfig { alpha_min: 1e-14, alpha_max: 1.0 - 1e-9, transmittance_min: 0.0, ..RenderConfig::default() }
+    let all = RenderConfig { depth: true, ..RenderConfig::default() };
+    RenderConfig { alpha_min: 1e-14, alpha_max: 1.0 - 1e-9, transmittance_min: 0.0, ..all }
 }
 
 /// The oracle as a drawing device: a forward without gradients.

@@ -79,7 +79,7 @@ fn colours_equal_the_cpus() {
         let n = scene.out.rows();
         let colors: Vec<[f32; 4]> = read(&r.gpu, &r.buffers.colors, n);
         let (cpu, _) = on_cpu(&scene.splats(), &camera, &r.config);
-        let mut expected = vec![[0.0; 4]; n];
+        let mut expected = vec![[0.0; 3]; n];
         let view = View::new(&camera, &r.config);
         shade::forward(&scene.splats(), &view, degree, r.config.simd, cpu.projected(), &mut expected);
         let marks: Vec<u32> = read(&r.gpu, &r.buffers.marks, n);
@@ -87,8 +87,9 @@ fn colours_equal_the_cpus() {
         let mut seen = 0;
         for j in both {
             seen += 1;
-            for c in 0..4 {
-                assert!(close(colors[j][c], expected[j][c], RELATIVE, RELATIVE), "degree {degree}, splat {j}, {c}");
+            let [r, g, b] = expected[j];
+            for (c, value) in [r, g, b, cpu.projected()[j].depth].into_iter().enumerate() {
+                assert!(close(colors[j][c], value, RELATIVE, RELATIVE), "degree {degree}, splat {j}, {c}");
             }
         }
         assert!(seen > n / 2);

@@ -1,0 +1,245 @@
+//! `bench`: how long every stage takes on pinned scenes, and how far that is from what this machine could do.
+
+mod ceilings;
+mod growth;
+mod rows;
+mod scenes;
+mod stages;
+mod training;
+
+use crate::console::Console;
+use crate::files;
+use ceilings::Ceiling;
+use growth::Axis;
+use rows::Row;
+use scenes::{Name, Pinned, Places};
+use splat4d::render::Simd;
+use splat4d::{Error, ErrorKind, Result};
+use stages::Way;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+/// Rounds over the views of a scene; the best time of each view counts.
+const ROUNDS: usize = 5;
+/// Rounds of whole training steps on S, each of which takes a second.
+const FEW_ROUNDS: usize = 2;
+/// Gaussians from which a scene is large.
+const LARGE: usize = 200_000;
+/// Threads unless told: what a second core gains is one of the figures.
+const THREADS: [usize; 2] = [1, 2];
+
+const EXAMPLES: &str = "\
+Examples:
+  splat4d bench                                   all scenes, one and two threads
+  splat4d bench --scene T --scene U --threads 1
+  splat4d bench --scene S --playbot FOLDER        the folder of the robot's SOG files
+  splat4d bench --simd scalar --json              an array of rows for machines
+  splat4d bench --save today.json
+  splat4d bench --against today.json              ratios to an earlier result
+  splat4d bench --growth all --plots docs/images  steps with more Gaussians, pixels and frames; memory
+
+Times are means over eight views of the best of several rounds. `of ceiling` is the least time in which the stage's
+compulsory work could be done (blending at the speed of its arithmetic alone, bytes at the speed of memory, both measured
+first), as a share of the time it took. Measure on an idle machine: docs/benchmarks.md.";
+
+/// Measure how fast this machine draws and trains
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub(crate) struct Args {
+    /// Which scene; may be given more than once [default: all]
+    #[arg(long = "scene", value_name = "NAME", value_enum, ignore_case = true)]
+    scenes: Vec<Name>,
+    /// Folder with the SOG files of scene S
+    #[arg(long, value_name = "FOLDER")]
+    playbot: Option<PathBuf>,
+    /// The scene of T and U: a run, or a file that brings its cameras along [default: examples/knight.splat4d]
+    #[arg(long, value_name = "FILE")]
+    file: Option<PathBuf>,
+    /// Instructions to use; may be given more than once [default: the best of this machine]
+    #[arg(long, value_name = "LEVEL", value_enum)]
+    simd: Vec<Level>,
+    /// Rounds of which the best counts
+    #[arg(long, value_name = "N", default_value_t = ROUNDS, value_parser = rounds)]
+    rounds: usize,
+    /// Measure how a training step grows instead; may be given more than once
+    #[arg(long, value_name = "AXIS", value_enum, conflicts_with = "scenes")]
+    growth: Vec<Axis>,
+    /// Folder for pictures of the growth
+    #[arg(long, value_name = "FOLDER", requires = "growth")]
+    plots: Option<PathBuf>,
+    /// Print a table for Markdown pages
+    #[arg(long)]
+    markdown: bool,
+    /// Write the rows as JSON, to compare with later
+    #[arg(long, value_name = "FILE")]
+    save: Option<PathBuf>,
+    /// Tell the ratio to an earlier result
+    #[arg(long, value_name = "FILE")]
+    against: Option<PathBuf>,
+}
+
+fn rounds(text: &str) -> std::result::Result<usize, String> {
+    text.parse().ok().filter(|n| (1..=1000).contains(n)).ok_or_else(|| "give a number from 1 to 1000".into())
+}
+
+/// Instruction levels as the command line names them.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum Level {
+    /// What every machine of this kind has
+    Scalar,
+    /// AVX2 with fused multiply-add
+    Avx2,
+    /// AVX-512
+    Avx512,
+}
+
+impl Level {
+    fn simd(self) -> Result<Simd> {
+        let (wanted, best) = match self {
+            Self::Scalar => (Simd::Scalar, Simd::detect()),
+            Self::Avx2 => (Simd::Avx2, Simd::detect()),
+            Self::Avx512 => (Simd::Avx512, Simd::detect()),
+        };
+        if wanted > best {
+            let what = format!("this machine does not have the instructions `{}`", stages::simd_name(wanted));
+            let remedy = format!("Its best level is {}.", stages::simd_name(best));
+            return Err(Error::new(ErrorKind::Unsupported, what).remedy(remedy));
+        }
+        Ok(wanted)
+    }
+}
+
+pub(crate) fn run(args: &Args, threads: Option<u16>, console: &Console) -> anyhow::Result<()> {
+    // What cannot work is said before anything takes time.
+    let earlier = args.against.as_deref().map(rows::read).transpose()?;
+    let levels: Vec<Simd> = match &args.simd[..] {
+        [] => vec![Simd::detect()],
+        levels => levels.iter().map(|l| l.simd()).collect::<Result<_>>()?,
+    };
+    let threads = match threads {
+        Some(n) => vec![usize::from(n)],
+        None => {
+            THREADS.into_iter().filter(|n| *n <= std::thread::available_parallelism().map_or(1, usize::from)).collect()
+        }
+    };
+    let places = Places { playbot: args.playbot.clone(), file: args.file.clone() };
+    let names = match &args.scenes[..] {
+        _ if !args.growth.is_empty() => vec![Name::T],
+        [] => Name::ALL.to_vec(),
+        names => names.to_vec(),
+    };
+    let mut scenes = Vec::new();
+    for name in names {
+        match Pinned::open(name, &places)? {
+            Ok(pinned) => scenes.push(pinned),
+            Err(skipped) => console.aside(&skipped.0),
+        }
+    }
+    let mut rows = if args.growth.is_empty() {
+        measure(&scenes, &levels, &threads, args.rounds, console)?
+    } else {
+        grow(&scenes, args, &levels, &threads, console)?
+    };
+    if let Some(path) = &args.save {
+        files::write(path, rows::json(&rows).as_bytes())?;
+        console.aside(&format!("wrote {}", path.display()));
+    }
+    if let Some(earlier) = earlier
+        && rows::compare(&mut rows, &earlier) == 0
+        && !rows.is_empty()
+    {
+        console.aside("the earlier result has no row with the same scene, stage, threads and instructions");
+    }
+    console.clear();
+    match (console.json(), args.markdown) {
+        (true, _) => console.result(&rows::json(&rows)),
+        (_, true) => console.result(rows::markdown(&rows).trim_end()),
+        _ if rows.is_empty() => {}
+        _ => console.result(rows::table(&rows).trim_end()),
+    }
+    Ok(())
+}
+
+/// Measures what grows, on the most threads, and draws it.
+fn grow(
+    scenes: &[Pinned],
+    args: &Args,
+    levels: &[Simd],
+    threads: &[usize],
+    console: &Console,
+) -> anyhow::Result<Vec<Row>> {
+    let most = threads.iter().copied().max().unwrap_or(1);
+    let pool = pool(most)?;
+    let mut rows = Vec::new();
+    for pinned in scenes {
+        for &simd in levels {
+            let way = Way { threads: most, simd, rounds: args.rounds.min(FEW_ROUNDS) };
+            rows.extend(growth::measure(pinned, &args.growth, way, &pool, &|text| console.note(text))?);
+        }
+    }
+    if let Some(folder) = &args.plots {
+        files::make_folder(folder)?;
+        for (name, svg) in growth::plots(&rows) {
+            let path = folder.join(name);
+            files::write(&path, svg.as_bytes())?;
+            console.note(&format!("wrote {}", path.display()));
+        }
+    }
+    Ok(rows)
+}
+
+fn measure(
+    scenes: &[Pinned],
+    levels: &[Simd],
+    threads: &[usize],
+    rounds: usize,
+    console: &Console,
+) -> anyhow::Result<Vec<Row>> {
+    let mut rows = Vec::new();
+    // Without a scene there is nothing to compare the ceilings with.
+    for &simd in levels.iter().filter(|_| !scenes.is_empty()) {
+        let ways: Vec<Way> = threads.iter().map(|&threads| Way { threads, simd, rounds }).collect();
+        let pools = ways.iter().map(|w| pool(w.threads)).collect::<anyhow::Result<Vec<_>>>()?;
+        let ceilings: Vec<Ceiling> = pools.iter().map(|p| Ceiling::measure(p, simd)).collect();
+        for (way, c) in ways.iter().zip(&ceilings) {
+            console.note(&format!(
+                "{}, {} thread(s): at best {:.2} G pairs/s and {:.1} GB/s",
+                stages::simd_name(simd),
+                way.threads,
+                c.pairs * 1e-9,
+                c.bytes * 1e-9
+            ));
+        }
+        for pinned in scenes {
+            let held = Arc::new(training::Held::of(pinned, ways[0]));
+            for ((way, pool), ceiling) in ways.iter().zip(&pools).zip(&ceilings) {
+                console.note(&format!("scene {}, {} thread(s) ...", pinned.name, way.threads));
+                let large = pinned.scene.len() >= LARGE;
+                let steps = Way { rounds: if large { rounds.min(FEW_ROUNDS) } else { rounds }, ..*way };
+                let mut drawn = pool.install(|| stages::measure(pinned, *way, ceiling))?;
+                let mut trained = pool.install(|| training::measure(pinned, &held, steps, ceiling))?;
+                fill_in_step(&mut drawn, &mut trained);
+                rows.append(&mut drawn);
+                rows.append(&mut trained);
+            }
+        }
+    }
+    Ok(rows)
+}
+
+/// A step's floor is that of its parts together.
+fn fill_in_step(drawn: &mut [Row], trained: &mut [Row]) {
+    let floor = |r: &Row| r.ceiling_share.map_or(0.0, |share| share * r.ms);
+    let renderer: f64 = drawn.iter().filter(|r| r.stage == "forward+backward").map(floor).sum();
+    let parts: f64 = trained.iter().map(floor).sum();
+    for step in trained.iter_mut().filter(|r| r.stage == "step" && r.ms > 0.0) {
+        step.ceiling_share = Some((renderer + parts) / step.ms);
+    }
+}
+
+fn pool(threads: usize) -> anyhow::Result<rayon::ThreadPool> {
+    rayon::ThreadPoolBuilder::new()
+        .num_threads(threads)
+        .build()
+        .map_err(|e| anyhow::anyhow!("{threads} threads could not be started ({e}). Ask for fewer."))
+}

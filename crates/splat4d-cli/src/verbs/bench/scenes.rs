@@ -1,0 +1,165 @@
+//! The pinned scenes: always the same Gaussians from the same places, so that figures of different days compare.
+
+use crate::source::Source;
+use splat4d::layers::{Layer, Scene};
+use splat4d::math::Se3;
+use splat4d::scene::{Born, Camera, RowEdit, Space, Time};
+use splat4d::{Error, Result};
+use std::f64::consts::TAU;
+use std::path::{Path, PathBuf};
+
+/// Views of a scene; figures are means over them.
+pub(super) const VIEWS: usize = 8;
+/// Where scene S lies unless told: the robot among the sample files of the project's data folder.
+const PLAYBOT: &str = "../shared/data/gaussian-files/playbot-sog-lod/0_0";
+/// The trained scene of the bundled capture, from the root of the repository.
+const KNIGHT: &str = "examples/knight.splat4d";
+/// Between the cameras of neighbouring views of T and U: coprime to the capture's 20, so that all sides are seen.
+const CAMERA_STEP: usize = 7;
+
+/// Which scene.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub(super) enum Name {
+    /// 500,000 Gaussians with spherical harmonics of degree 3, standing still, 1280x720
+    #[value(name = "S")]
+    S,
+    /// The bundled capture's scene, 30,000 moving Gaussians, 400x400
+    #[value(name = "T")]
+    T,
+    /// The same, 800x800
+    #[value(name = "U")]
+    U,
+}
+
+impl Name {
+    /// All of them, the large one last: peaks of memory are those of a process that has held nothing larger.
+    pub(super) const ALL: [Self; 3] = [Self::T, Self::U, Self::S];
+
+    pub(super) fn letter(self) -> &'static str {
+        match self {
+            Self::S => "S",
+            Self::T => "T",
+            Self::U => "U",
+        }
+    }
+}
+
+/// Where scenes lie, if not in their usual places.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Places {
+    pub playbot: Option<PathBuf>,
+    pub file: Option<PathBuf>,
+}
+
+impl Places {
+    fn of(&self, name: Name) -> (&Path, &'static str) {
+        match name {
+            Name::S => (self.playbot.as_deref().unwrap_or(Path::new(PLAYBOT)), "--playbot FOLDER"),
+            Name::T | Name::U => (self.file.as_deref().unwrap_or(Path::new(KNIGHT)), "--file FILE"),
+        }
+    }
+}
+
+/// From where, and when.
+#[derive(Clone, Debug)]
+pub(super) struct View {
+    pub camera: Camera,
+    pub time: Time,
+}
+
+/// A scene and how it is looked at.
+#[derive(Debug)]
+pub(super) struct Pinned {
+    pub name: String,
+    pub scene: Scene<f32>,
+    pub views: Vec<View>,
+}
+
+/// Why a scene is not measured.
+pub(super) struct Skipped(pub String);
+
+impl Pinned {
+    /// Reads a scene. The inner error says that its file is not there, which is no fault.
+    pub(super) fn open(name: Name, places: &Places) -> Result<std::result::Result<Self, Skipped>> {
+        let (path, option) = places.of(name);
+        if !path.exists() {
+            let (letter, path) = (name.letter(), path.display());
+            return Ok(Err(Skipped(format!("scene {letter} is skipped: there is no {path}; name it with {option}"))));
+        }
+        let source = Source::open(path)?;
+        crate::source::not_empty(&source.scene, path)?;
+        let views = match name {
+            Name::S => around(),
+            Name::T => of_the_capture(&source, path, 400)?,
+            Name::U => of_the_capture(&source, path, 800)?,
+        };
+        Ok(Ok(Self { name: name.letter().into(), scene: in_one_layer(source.scene), views }))
+    }
+}
+
+/// Eight places around the robot, at its height.
+fn around() -> Vec<View> {
+    const TARGET: [f64; 3] = [0.0, -0.52, 0.0];
+    const DISTANCE: f64 = 1.5;
+    const FOV_Y: f64 = 50.0;
+    let view = |k: usize| {
+        let a = TAU * k as f64 / VIEWS as f64;
+        let eye = [TARGET[0] + DISTANCE * a.sin(), TARGET[1], TARGET[2] - DISTANCE * a.cos()];
+        let pose = Se3::look_at(eye, TARGET, [0.0, -1.0, 0.0]);
+        View { camera: Camera::with_fov_y(pose, FOV_Y.to_radians(), 1280, 720), time: Time(0.0) }
+    };
+    (0..VIEWS).map(view).collect()
+}
+
+/// Eight of the capture's cameras over its clip; square pictures with the same horizontal field of view.
+fn of_the_capture(source: &Source, path: &Path, size: usize) -> Result<Vec<View>> {
+    let cameras = source.views()?;
+    if cameras.is_empty() {
+        return Err(Error::input("it names no cameras to look from")
+            .at(path.display())
+            .remedy("Give a run, or a .splat4d that was baked from one."));
+    }
+    let clip = source.scene.clip;
+    let view = |k: usize| {
+        let camera = &cameras[k * CAMERA_STEP % cameras.len()].camera;
+        let across = 2.0 * (0.5 * camera.width as f64 / camera.intrinsics.fx).atan();
+        let time = Time(clip[0] + (clip[1] - clip[0]) * (k as f64 + 0.5) / VIEWS as f64);
+        View { camera: Camera::with_fov_y(camera.cam_from_world, across, size, size), time }
+    };
+    Ok((0..VIEWS).map(view).collect())
+}
+
+/// The pages of a playback file as the one layer that they were before they were baked. Layers that differ in their
+/// motion, their life or their span stay apart.
+fn in_one_layer(mut scene: Scene<f32>) -> Scene<f32> {
+    let [first, rest @ ..] = &scene.layers[..] else { return scene };
+    let widths = |l: &Layer| l.params.keys().map(|k| l.params[k].width()).collect::<Vec<_>>();
+    let alike = |l: &Layer| {
+        l.motion.spec() == first.motion.spec()
+            && l.life == first.life
+            && l.span == first.span
+            && widths(l) == widths(first)
+    };
+    if rest.is_empty() || !rest.iter().all(alike) {
+        return scene;
+    }
+    let mut whole = first.clone();
+    let mut edit = RowEdit::identity(Space::Gaussians, first.params.len());
+    for _ in 0..rest.iter().map(|l| l.params.len()).sum() {
+        edit.push(0, Born::Kept);
+    }
+    whole.params.apply(&edit);
+    let mut row = first.params.len();
+    for layer in rest {
+        for key in layer.params.keys() {
+            let from = &layer.params[key];
+            let [to] = whole.params.get_mut([key]);
+            for i in 0..layer.params.len() {
+                (0..from.width()).for_each(|c| to.set(row + i, c, from.get(i, c)));
+            }
+        }
+        row += layer.params.len();
+    }
+    scene.layers = vec![whole];
+    scene
+}

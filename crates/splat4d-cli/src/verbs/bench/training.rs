@@ -1,0 +1,271 @@
+//! Times of training: whole steps of the trainer on a scene that is already good, against pictures of itself with noise,
+//! so that every gradient is small and none is zero.
+
+use super::ceilings::{Ceiling, bytes};
+use super::rows::Row;
+use super::scenes::Pinned;
+use super::stages::{Way, simd_name};
+use splat4d::layers::{Instant as Moment, Scene};
+use splat4d::math::Rng;
+use splat4d::math::sh::degree_of;
+use splat4d::motion::Spec;
+use splat4d::render::{Image, RenderConfig, Renderer};
+use splat4d::scene::{Camera, Planes, SH, Time};
+use splat4d::{Error, ErrorKind, Result};
+use splat4d_train::capture::frames::{Frames, Picture};
+use splat4d_train::densify::Limits;
+use splat4d_train::models::{Group, Plan, Stage, program};
+use splat4d_train::recipe::Recipe;
+use splat4d_train::train::loss::TrainLoss;
+use splat4d_train::train::run::peak_memory;
+use splat4d_train::train::trainer::{Settings, Stepped, Trainer};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::{Duration, Instant};
+
+/// Every rate is multiplied by this: the scene stays what it is, the work is the same.
+const STANDSTILL: f64 = 1e-6;
+/// Steps of the stage: never reached.
+const FOR_EVER: usize = 1 << 40;
+/// Standard deviation of the noise on the truth.
+const NOISE: f64 = 0.02;
+/// Standard share of D-SSIM in the loss (Kerbl et al. 2023).
+const LAMBDA_DSSIM: f64 = 0.2;
+
+/// Pictures in memory.
+pub(super) struct Held {
+    cameras: Vec<Camera>,
+    times: Vec<Time>,
+    pictures: Vec<Planes<f32>>,
+    /// The one that was loaded last.
+    last: AtomicUsize,
+}
+
+impl Held {
+    /// What the scene looks like from its views, with noise.
+    pub(super) fn of(pinned: &Pinned, way: Way) -> Self {
+        let mut renderer = Renderer::new(RenderConfig { simd: way.simd, ..RenderConfig::default() });
+        let (mut image, mut moment) = (Image::default(), Moment::default());
+        let rng = Rng::new(1, "noise on the truth", 0);
+        let mut picture = |(v, view): (usize, &super::scenes::View)| {
+            pinned.scene.at(view.time, &mut moment);
+            let splats = pinned.scene.splats(&moment);
+            renderer.render(&splats, &view.camera, pinned.scene.background, None, &mut image);
+            let own = rng.fork(v as u64);
+            let mut truth = image.color.clone();
+            for (i, x) in truth.data.iter_mut().enumerate() {
+                *x = (*x + (NOISE * own.normal(i as u64)) as f32).clamp(0.0, 1.0);
+            }
+            truth
+        };
+        Self {
+            cameras: pinned.views.iter().map(|v| v.camera.clone()).collect(),
+            times: pinned.views.iter().map(|v| v.time).collect(),
+            pictures: pinned.views.iter().enumerate().map(&mut picture).collect(),
+            last: AtomicUsize::new(0),
+        }
+    }
+
+    /// The pictures.
+    pub(super) fn pictures(&self) -> &[Planes<f32>] {
+        &self.pictures
+    }
+}
+
+impl Frames for Held {
+    fn len(&self) -> usize {
+        self.pictures.len()
+    }
+
+    fn camera(&self, i: usize) -> &Camera {
+        &self.cameras[i]
+    }
+
+    fn time(&self, i: usize) -> Time {
+        self.times[i]
+    }
+
+    fn rig(&self, i: usize) -> usize {
+        i
+    }
+
+    fn name(&self, i: usize) -> String {
+        format!("view {i}")
+    }
+
+    fn load(&self, i: usize, out: &mut Picture) -> Result<()> {
+        self.last.store(i, Ordering::Relaxed);
+        out.color.clone_from(&self.pictures[i]);
+        (out.mask, out.weight) = (None, None);
+        Ok(())
+    }
+}
+
+/// The stage in which a scene of this kind is trained, without densification and at full size.
+fn stage(scene: &Scene<f32>, extent: f64) -> Result<Stage> {
+    let first = &scene.layers[0];
+    let (motion, order, rotation) = match first.motion.spec() {
+        Spec::Still => ("still", 0, false),
+        Spec::Spacetime(s) => ("spacetime", s.order, s.rotation),
+        _ => {
+            return Err(Error::new(ErrorKind::Unsupported, "training steps of this motion model are not measured")
+                .remedy("Give a scene of the model `still` or `spacetime`."));
+        }
+    };
+    let recipe = Recipe {
+        motion: motion.into(),
+        motion_order: order,
+        rotation_rate: rotation,
+        life: first.life.name().into(),
+        sh_degree: degree_of(first.params[SH].width() / 3).unwrap_or(0),
+        strategy: "none".into(),
+        half_size_until: 0.0,
+        ..Recipe::default()
+    };
+    let plan = Plan {
+        recipe: recipe.resolve(),
+        extent,
+        clip: scene.clip,
+        fps: scene.fps.max(1.0),
+        times: 8,
+        fixed_cameras: 8,
+    };
+    let mut stages = program(motion)?.stages(&plan);
+    let mut stage = stages.swap_remove(0);
+    (stage.iterations, stage.sh_interval, stage.half_size_steps) = (FOR_EVER, 0, 0);
+    // Programs speak of layer 0; here all layers learn.
+    let of_first = std::mem::take(&mut stage.groups);
+    for layer in 0..scene.layers.len() {
+        stage.groups.extend(of_first.iter().map(|g| Group { layer, ..g.clone() }));
+    }
+    Ok(stage)
+}
+
+/// A trainer that goes on for ever and changes next to nothing.
+pub(super) fn trainer(scene: Scene<f32>, frames: Arc<dyn Frames>, way: Way) -> Result<Trainer<'static>> {
+    // Rates of positions are in units of it; any number would do.
+    let extent = 1.0;
+    let stage = stage(&scene, extent)?;
+    let settings = Settings {
+        seed: 0,
+        limits: Limits { cap: scene.len(), extent, min_opacity: 0.0 },
+        background: scene.background,
+        sh_degree: splat4d::math::sh::MAX_DEGREE,
+        opacity_reset_interval: 0,
+        exposure_lr: 0.0,
+    };
+    let renderer = Renderer::new(RenderConfig { simd: way.simd, ..RenderConfig::default() });
+    let loss = TrainLoss::new(LAMBDA_DSSIM, 0.0, None);
+    let mut trainer = Trainer::new(scene, vec![stage], frames, Box::new(renderer), loss, settings);
+    trainer.progress.rate_scale = STANDSTILL;
+    Ok(trainer)
+}
+
+/// One step, and its seconds.
+pub(super) fn step(trainer: &mut Trainer<'_>) -> Result<(Stepped, f64)> {
+    let clock = Instant::now();
+    let stepped = trainer.step()?;
+    let seconds = clock.elapsed().as_secs_f64();
+    let stepped = stepped.map_err(|fault| Error::new(ErrorKind::Diverged, fault.0))?;
+    Ok((stepped, seconds))
+}
+
+/// Parts of a step that have rows of their own, in order.
+const PARTS: [&str; 5] = ["motion in a step", "loss", "motion backward", "adam", "step"];
+
+/// Milliseconds of one step.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Times {
+    pub motion: f64,
+    pub loss: f64,
+    pub motion_backward: f64,
+    pub adam: f64,
+    /// The renderer's forward and backward.
+    pub renderer: f64,
+    /// All of it.
+    pub step: f64,
+}
+
+impl Times {
+    fn of(stepped: &Stepped, seconds: f64) -> Self {
+        let t = stepped.report.timings;
+        let ms = |d: Duration| 1e3 * d.as_secs_f64();
+        Self {
+            motion: ms(t.motion),
+            loss: ms(t.loss),
+            motion_backward: ms(t.motion_backward),
+            adam: ms(stepped.adam),
+            renderer: ms(t.render) + ms(t.render_backward),
+            step: 1e3 * seconds,
+        }
+    }
+
+    fn each(self) -> [f64; 6] {
+        [self.motion, self.loss, self.motion_backward, self.adam, self.renderer, self.step]
+    }
+
+    fn from(each: [f64; 6]) -> Self {
+        let [motion, loss, motion_backward, adam, renderer, step] = each;
+        Self { motion, loss, motion_backward, adam, renderer, step }
+    }
+}
+
+/// The mean over views of each view's best step. Call it inside a pool of `way.threads` threads.
+pub(super) fn times(scene: Scene<f32>, held: &Arc<Held>, way: Way) -> Result<Times> {
+    let mut trainer = trainer(scene, held.clone(), way)?;
+    let mut best = vec![[f64::MAX; 6]; held.len()];
+    for round in 0..=way.rounds {
+        for _ in 0..held.len() {
+            let (stepped, seconds) = step(&mut trainer)?;
+            if round > 0 {
+                let seen = &mut best[held.last.load(Ordering::Relaxed)];
+                let now = Times::of(&stepped, seconds).each();
+                seen.iter_mut().zip(now).for_each(|(best, now)| *best = best.min(now));
+            }
+        }
+    }
+    let mean = |k: usize| best.iter().map(|b| b[k]).sum::<f64>() / best.len() as f64;
+    Ok(Times::from(std::array::from_fn(mean)))
+}
+
+/// Steps at every view, in parts. Call it inside a pool of `way.threads` threads.
+pub(super) fn measure(pinned: &Pinned, held: &Arc<Held>, way: Way, ceiling: &Ceiling) -> Result<Vec<Row>> {
+    forget_peak();
+    let t = times(pinned.scene.clone(), held, way)?;
+    let (mut alive, mut moment) = (0, Moment::default());
+    for view in &pinned.views {
+        pinned.scene.at(view.time, &mut moment);
+        alive += pinned.scene.splats(&moment).len();
+    }
+    let (alive, camera) = (alive / pinned.views.len(), &pinned.views[0].camera);
+    let moved = [
+        bytes::motion(&pinned.scene, alive),
+        bytes::loss(camera.width * camera.height),
+        bytes::motion_backward(&pinned.scene, alive),
+        bytes::adam(&pinned.scene, alive),
+    ];
+    let row = |((k, stage), ms): ((usize, &&str), f64)| {
+        let moved = moved.get(k).map(|b| *b as f64);
+        let whole = *stage == "step";
+        Row {
+            scene: pinned.name.clone(),
+            stage: (*stage).into(),
+            threads: way.threads,
+            simd: simd_name(way.simd).into(),
+            ms,
+            ceiling_share: moved.map(|b| 1e3 * b / ceiling.bytes / ms),
+            gb_per_s: moved.map(|b| 1e-6 * b / ms),
+            outside_share: whole.then(|| 1.0 - t.renderer / ms),
+            peak_memory: whole.then(peak_memory),
+            ..Row::default()
+        }
+    };
+    let all = [t.motion, t.loss, t.motion_backward, t.adam, t.step];
+    Ok(PARTS.iter().enumerate().zip(all).map(row).collect())
+}
+
+/// Starts the process's peak memory anew where the system lets it (Linux); elsewhere it stays that of the whole run.
+pub(super) fn forget_peak() {
+    const PEAK: &str = "5"; // proc(5), /proc/pid/clear_refs
+    let _ = std::fs::write("/proc/self/clear_refs", PEAK);
+}
