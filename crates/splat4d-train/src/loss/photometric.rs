@@ -7,8 +7,11 @@ use splat4d::scene::Planes;
 use splat4d::simd::{Simd, dispatch_pass};
 use std::sync::Mutex;
 
-/// Rows of a strip: the unit of parallel work. Fixed, so that sums do not depend on the number of threads.
-const STRIP_ROWS: usize = 64;
+/// Most rows of a strip, the unit of parallel work: strips are of even size, and that depends on the image alone, so that
+/// sums do not depend on the number of threads. Every strip works on a window's halo of ten rows besides.
+const STRIP_ROWS: usize = 128;
+/// Strips are whole groups of rows of the kernel.
+const GROUP_ROWS: usize = 4;
 
 /// The loss of one image.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -90,7 +93,8 @@ impl<F: Real> Photometric<F> {
         }
 
         let lambda = f64::from(self.lambda_dssim);
-        let strips = height.div_ceil(STRIP_ROWS);
+        let rows = height.div_ceil(height.div_ceil(STRIP_ROWS).max(1)).next_multiple_of(GROUP_ROWS);
+        let strips = height.div_ceil(rows.max(1));
         while self.scratch.len() < rayon::current_num_threads() {
             self.scratch.push(Mutex::new(Scratch::new()));
         }
@@ -102,8 +106,8 @@ impl<F: Real> Photometric<F> {
         let planes = d_render.data.par_chunks_exact_mut(pixels).zip(self.sums.par_chunks_exact_mut(strips));
         planes.enumerate().for_each(|(c, (d, sums))| {
             let (render, truth) = (render.plane(c), truth.plane(c));
-            d.par_chunks_mut(STRIP_ROWS * width).zip(sums).enumerate().for_each(|(i, (d, sums))| {
-                let first = i * STRIP_ROWS;
+            d.par_chunks_mut(rows * width).zip(sums).enumerate().for_each(|(i, (d, sums))| {
+                let first = i * rows;
                 let job = Strip { render, truth, weight, width, height, first, taps, d_l1, d_ssim };
                 // A loop of one step may run on the caller's own thread, then alone.
                 let thread = rayon::current_thread_index().unwrap_or(0);
