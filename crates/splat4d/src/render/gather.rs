@@ -89,11 +89,17 @@ impl<F: Real> Kernel for Gather<'_, F> {
         for (records, keys) in self.records.chunks_mut(BLOCK).zip(self.keys.chunks(BLOCK)) {
             let [mut x, mut y, mut a, mut b, mut c] = [zero; 5];
             let [mut half_x, mut half_y, mut tau] = [zero; 3];
+            // Rows lie far apart. What is read first is their two ends, so that sixteen of them are on their way from
+            // memory at once.
             for (l, key) in keys.iter().enumerate() {
                 let p = &self.projected[id(*key)];
-                (x[l], y[l]) = (p.mean2d[0] - at(self.x0), p.mean2d[1] - at(self.y0));
+                (x[l], tau[l]) = (p.mean2d[0] - at(self.x0), p.tau);
+            }
+            for (l, key) in keys.iter().enumerate() {
+                let p = &self.projected[id(*key)];
+                y[l] = p.mean2d[1] - at(self.y0);
                 [a[l], b[l], c[l]] = p.conic;
-                (half_x[l], half_y[l], tau[l]) = (p.half[0], p.half[1], p.tau);
+                (half_x[l], half_y[l]) = (p.half[0], p.half[1]);
             }
             // The ellipse is y = slope·dx ± reach·√(1 − (dx/half_x)²), with its lowest point at dx = summit.
             let [mut slope, mut reach, mut inverse, mut summit] = [zero; 4];
@@ -103,33 +109,36 @@ impl<F: Real> Kernel for Gather<'_, F> {
                 inverse[l] = F::ONE / half_x[l];
                 summit[l] = -b[l] / a[l] * half_y[l];
             }
-            let (mut mask, mut rows) = ([0u32; BLOCK], [[[0i32; BLOCK]; 2]; SIDE]);
+            let (mut mask, mut rows) = ([0i32; BLOCK], [[[0i32; BLOCK]; 2]; SIDE]);
             for k in 0..SIDE {
                 let (left, right) = (k * TILE, (k * TILE + TILE).min(self.width - self.x0));
                 if right <= left {
                     break;
                 }
                 let (left, right) = (at(left) + F::HALF, at(right) - F::HALF);
-                let mut meets = [true; BLOCK];
+                // 1 − (dx/half_x)² where a branch comes nearest.
+                let mut inside = [F::ONE; BLOCK];
                 for (side, sign) in [(0, -F::ONE), (1, F::ONE)] {
                     // Each branch is farthest out as near to its summit as the column comes.
                     for l in 0..BLOCK {
                         let dx = least(greatest(sign * summit[l], left - x[l]), right - x[l]);
                         let u = dx * inverse[l];
                         let square = F::ONE + F::of(CHORD_MARGIN) - u * u;
-                        meets[l] &= square >= F::ZERO;
+                        inside[l] = least(inside[l], square);
                         let edge = y[l] + slope[l] * dx + sign * reach[l] * greatest(square, F::ZERO).sqrt();
                         // First row whose centre is not above the edge, or one past the last not below it.
                         let row = least(greatest((edge * sign + F::HALF).floor() * sign, F::ZERO), at(BIN));
-                        rows[k][side][l] = row.i32().min(last_row);
+                        rows[k][side][l] = row.lane_i32().min(last_row);
                     }
                 }
                 for l in 0..BLOCK {
-                    let (first, end) = (rows[k][0][l], rows[k][1][l]);
+                    // No row where a branch does not come into the column.
+                    let end = if inside[l] >= F::ZERO { rows[k][1][l] } else { 0 };
+                    let first = rows[k][0][l];
                     for ty in 0..SIDE {
                         let top = (ty * TILE) as i32;
-                        let hit = meets[l] & (first < end) & (first < top + TILE as i32) & (end > top);
-                        mask[l] |= u32::from(hit) << (ty * SIDE + k);
+                        let hit = (first < end) & (first < top + TILE as i32) & (end > top);
+                        mask[l] |= i32::from(hit) << (ty * SIDE + k);
                     }
                 }
             }
