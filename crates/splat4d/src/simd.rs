@@ -1,9 +1,8 @@
 //! Which instructions the kernels may use, chosen once at run time.
 //!
 //! A kernel is one `#[inline(always)]` body over fixed-size lane arrays. It is compiled three times, inside functions
-//! that enable nothing, AVX2 with FMA, and AVX-512; LLVM turns the lane loops into that level's vectors. All levels
-//! use the same lanes in the same order, so AVX2 and AVX-512 differ in nothing but speed, and the scalar level only in
-//! the rounding of fused multiply-adds. On ARM the baseline has NEON and fused multiply-add already.
+//! that enable nothing, AVX2 with FMA, and AVX-512; LLVM turns the lane loops into that level's vectors. Levels differ in
+//! the rounding of fused multiply-adds (the scalar level) and of what steps from row to row (the blend under AVX-512). On ARM the baseline has NEON and fused multiply-add already.
 //! Everything that is fast goes through here: this is the one file of the workspace that says `unsafe`.
 #![allow(unsafe_code)] // calling a function that enables a target feature, after that feature was found present
 
@@ -45,6 +44,14 @@ pub trait Kernel {
     type Out;
     /// Does the work; `FMA` says whether fused multiply-add is an instruction here.
     fn run<const FMA: bool>(self) -> Self::Out;
+    /// The same where a register holds sixteen numbers and there are 32 of them; `#[inline(always)]` too.
+    #[inline(always)]
+    fn run_wide<const FMA: bool>(self) -> Self::Out
+    where
+        Self: Sized,
+    {
+        self.run::<FMA>()
+    }
 }
 
 /// Work that writes to two things that the caller lends. They are arguments of the compiled function itself, since only
@@ -112,7 +119,7 @@ fn avx2<K: Kernel>(kernel: K) -> K::Out {
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma,avx512f,avx512bw,avx512dq,avx512vl")]
 fn avx512<K: Kernel>(kernel: K) -> K::Out {
-    kernel.run::<true>()
+    kernel.run_wide::<true>()
 }
 
 #[cfg(target_arch = "x86_64")]

@@ -10,13 +10,18 @@
 //! what the picture holds less what has passed (as in Taming 3DGS, Mallick et al. 2024). It needs no record of the
 //! last splat of a pixel, which would cost the forward pass two memory accesses a pixel and splat.
 
+#[cfg(test)]
+mod tests;
+
 use super::RenderConfig;
 use super::gather::{Record, SIDE, TILE, TILES, greatest, least};
 use super::project::ALPHA_FLOOR;
 use super::rasterize::{CHANNELS, PixelGrads};
 use super::simd::Kernel;
 use crate::math::Real;
+use crate::simd::each;
 use std::f64::consts::LN_2;
+use std::ops::Range;
 
 /// Splats whose bit maps are made at once: one a bit.
 const BATCH: usize = 64;
@@ -29,24 +34,39 @@ const ALPHA_CEILING: f64 = 1.0 - 1e-6;
 /// The smallest T that is told from 0: the way back divides by it.
 const T_FLOOR: f64 = 1e-30;
 
-/// A row of pixels.
-type Row<F> = [F; TILE];
+/// Lanes of a strip where a register holds one row of pixels, and where it holds two.
+const ROW: usize = TILE;
+const PAIR_OF_ROWS: usize = 2 * TILE;
 
-/// Eight pixels during a pass. In this order, so that neighbouring stores go to the same cache line.
-#[repr(C)]
-#[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Pixels<F> {
+/// A number of each of a tile's 64 pixels, row by row.
+type Plane<F> = [F; TILE * TILE];
+
+/// The pixels of a tile.
+#[repr(C, align(64))]
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Tile<F> {
     /// Transmittance; negated once a pixel has stopped.
-    pub t: Row<F>,
+    pub t: Plane<F>,
     /// Σ channel·α·T.
-    pub color: [Row<F>; CHANNELS],
+    pub color: [Plane<F>; CHANNELS],
 }
 
-/// The 64 pixels of a tile.
-#[repr(C, align(64))]
-#[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Tile<F> {
-    pub rows: [Pixels<F>; TILE],
+impl<F: Real> Default for Tile<F> {
+    fn default() -> Self {
+        Self { t: [F::ZERO; TILE * TILE], color: [[F::ZERO; TILE * TILE]; CHANNELS] }
+    }
+}
+
+/// Strips of `N` lanes of a plane.
+#[inline(always)]
+fn strips<F, const N: usize>(plane: &mut Plane<F>, range: Range<usize>) -> &mut [[F; N]] {
+    &mut plane.as_chunks_mut().0[range]
+}
+
+/// The strips that hold these rows.
+#[inline(always)]
+fn strip_range<const N: usize>(rows: Range<usize>) -> Range<usize> {
+    rows.start / (N / TILE)..rows.end.div_ceil(N / TILE)
 }
 
 /// The blend's limits.
@@ -149,34 +169,42 @@ fn bit_maps<F>(batch: &[Record<F>]) -> [u64; TILES] {
     maps
 }
 
-/// log₂ of o·g along the rows of one splat in one tile.
-struct Exponent<F> {
-    /// x offsets of a row's pixels from the splat's centre.
-    dx: Row<F>,
+/// log₂ of o·g along the strips of one splat in one tile.
+struct Exponent<F, const N: usize> {
     /// log₂ o + a dx².
-    ax: Row<F>,
-    /// b dx + c dy of the row in hand.
-    q: Row<F>,
-    /// dy of the row in hand, once a lane: adding is cheaper than broadcasting.
-    dy: Row<F>,
-    c: F,
+    ax: [F; N],
+    /// b dx + c dy of the strip in hand.
+    q: [F; N],
+    /// dy of the strip in hand, once a lane: adding is cheaper than broadcasting.
+    dy: [F; N],
+    /// What q and dy fall by from strip to strip.
+    steps: [F; 2],
     /// The exponent's ceiling: log₂ of min(o, α_max). Rounding may take a needle's above its top.
     top: F,
 }
 
-impl<F: Real> Exponent<F> {
-    /// At the first of the tile's rows that are to be visited.
+/// x offsets of a row's pixels from the splat's centre, strip after strip.
+#[inline(always)]
+fn offsets<F: Real, const N: usize>(r: &Record<F>, tx: usize) -> [F; N] {
+    each(|l| r.x - (F::of((tx * TILE + l % TILE) as f64) + F::HALF))
+}
+
+impl<F: Real, const N: usize> Exponent<F, N> {
+    /// At strip `strip` of the tile.
     #[inline(always)]
-    fn new<const FMA: bool>(r: &Record<F>, tx: usize, ty: usize, row: usize, limits: &Limits<F>) -> Self {
+    fn new<const FMA: bool>(r: &Record<F>, tx: usize, ty: usize, strip: usize, limits: &Limits<F>) -> Self {
         let log_opacity = limits.log_min + r.log_ratio;
-        let dx: Row<F> = std::array::from_fn(|l| r.x - (F::of((tx * TILE + l) as f64) + F::HALF));
-        let dy = r.y - (F::of((ty * TILE + row) as f64) + F::HALF);
-        let (mut ax, mut q) = ([F::ZERO; TILE], [F::ZERO; TILE]);
-        for l in 0..TILE {
+        let rows = N / TILE;
+        let first = r.y - (F::of((ty * TILE + strip * rows) as f64) + F::HALF);
+        let dx: [F; N] = offsets(r, tx);
+        let dy: [F; N] = each(|l| first - F::of((l / TILE) as f64));
+        let (mut ax, mut q) = ([F::ZERO; N], [F::ZERO; N]);
+        for l in 0..N {
             ax[l] = (r.a * dx[l]).fma::<FMA>(dx[l], log_opacity);
-            q[l] = r.c.fma::<FMA>(dy, r.b * dx[l]);
+            q[l] = r.c.fma::<FMA>(dy[l], r.b * dx[l]);
         }
-        Self { dx, ax, q, dy: [dy; TILE], c: r.c, top: least(log_opacity, limits.log_max) }
+        let down = F::of(rows as f64);
+        Self { ax, q, dy, steps: [r.c * down, down], top: least(log_opacity, limits.log_max) }
     }
 
     /// The exponent at lane `l`, not yet under its ceiling.
@@ -185,11 +213,11 @@ impl<F: Real> Exponent<F> {
         self.q[l].fma::<FMA>(self.dy[l], self.ax[l])
     }
 
-    /// On to the next row.
+    /// On to the next strip.
     #[inline(always)]
     fn step(&mut self, l: usize) {
-        self.q[l] -= self.c;
-        self.dy[l] -= F::ONE;
+        self.q[l] -= self.steps[0];
+        self.dy[l] -= self.steps[1];
     }
 }
 
@@ -223,8 +251,19 @@ impl<F: Real> Kernel for Blend<'_, F> {
     type Out = ();
     #[inline(always)]
     fn run<const FMA: bool>(self) {
+        self.walk::<FMA, ROW>();
+    }
+    #[inline(always)]
+    fn run_wide<const FMA: bool>(self) {
+        self.walk::<FMA, PAIR_OF_ROWS>();
+    }
+}
+
+impl<F: Real> Blend<'_, F> {
+    #[inline(always)]
+    fn walk<const FMA: bool, const N: usize>(self) {
         let open = begin(self.tiles, self.inside);
-        walk::<F, _, FMA>(self.records, open, &mut Forward { tiles: self.tiles, limits: self.limits });
+        walk::<F, _, FMA>(self.records, open, &mut Forward::<F, N> { tiles: self.tiles, limits: self.limits });
     }
 }
 
@@ -235,51 +274,57 @@ pub(super) fn begin<F: Real>(tiles: &mut [Tile<F>], inside: [usize; 2]) -> u32 {
     for (t, tile) in tiles.iter_mut().enumerate() {
         let nx = inside[0].saturating_sub(t % SIDE * TILE);
         let ny = inside[1].saturating_sub(t / SIDE * TILE);
-        for (y, row) in tile.rows.iter_mut().enumerate() {
-            *row = Pixels { t: [F::ONE; TILE], ..Pixels::default() };
+        *tile = Tile { t: [F::ONE; TILE * TILE], ..Tile::default() };
+        if nx < TILE || ny < TILE {
             // Pixels outside the picture have stopped from the start.
-            row.t[if y < ny { nx.min(TILE) } else { 0 }..].fill(-F::ONE);
+            for (y, row) in tile.t.chunks_mut(TILE).enumerate() {
+                row[if y < ny { nx.min(TILE) } else { 0 }..].fill(-F::ONE);
+            }
         }
         open |= u32::from(nx > 0 && ny > 0) << t;
     }
     open
 }
 
-/// Blends into tiles.
-pub(super) struct Forward<'a, F> {
+/// Blends into tiles, `N` pixels at a time.
+pub(super) struct Forward<'a, F, const N: usize> {
     pub tiles: &'a mut [Tile<F>],
     pub limits: Limits<F>,
 }
 
-impl<F: Real> Visit<F> for Forward<'_, F> {
+impl<F: Real, const N: usize> Visit<F> for Forward<'_, F, N> {
     #[inline(always)]
     fn splat<const FMA: bool>(&mut self, t: usize, _: usize, r: &Record<F>) {
-        let (tx, ty, limits) = (t % SIDE, t / SIDE, &self.limits);
-        let rows = r.tile_rows(tx, ty);
-        let mut e = Exponent::new::<FMA>(r, tx, ty, rows.start, limits);
+        let (tx, ty) = (t % SIDE, t / SIDE);
+        let range = strip_range::<N>(r.tile_rows(tx, ty));
+        let mut e = Exponent::<F, N>::new::<FMA>(r, tx, ty, range.start, &self.limits);
         // Copies, of which LLVM knows that no store changes them.
-        let (channels, limits) = (r.channels, *limits);
-        for px in &mut self.tiles[t].rows[rows] {
-            let (mut t, mut weight) = (px.t, [F::ZERO; TILE]);
-            for l in 0..TILE {
+        let ([red, green, blue], limits) = (r.channels, self.limits);
+        let Tile { t, color } = &mut self.tiles[t];
+        let [reds, greens, blues] = color.each_mut().map(|plane| strips::<F, N>(plane, range.clone()));
+        let ts = strips::<F, N>(t, range);
+        for (((t, reds), greens), blues) in ts.iter_mut().zip(reds).zip(greens).zip(blues) {
+            let mut weight = [F::ZERO; N];
+            let mut after = *t;
+            for l in 0..N {
                 let power = least(e.raw::<FMA>(l), e.top);
-                (t[l], weight[l], _) = pass(t[l], alpha::<F, FMA>(power, &limits), &limits);
+                (after[l], weight[l], _) = pass(after[l], alpha::<F, FMA>(power, &limits), &limits);
                 e.step(l);
             }
-            px.t = t;
-            for c in 0..CHANNELS {
-                let mut color = px.color[c];
-                for l in 0..TILE {
-                    color[l] = weight[l].fma::<FMA>(channels[c], color[l]);
+            *t = after;
+            for (sums, channel) in [(reds, red), (greens, green), (blues, blue)] {
+                let mut sum = *sums;
+                for l in 0..N {
+                    sum[l] = weight[l].fma::<FMA>(channel, sum[l]);
                 }
-                px.color[c] = color;
+                *sums = sum;
             }
         }
     }
 
     #[inline(always)]
     fn stopped(&self, t: usize) -> bool {
-        highest(self.tiles[t].rows.iter().map(|row| &row.t)) < F::ZERO
+        highest(&self.tiles[t].t) < F::ZERO
     }
 
     #[inline(always)]
@@ -288,11 +333,11 @@ impl<F: Real> Visit<F> for Forward<'_, F> {
 
 /// The largest of 64 transmittances, lanes first.
 #[inline(always)]
-fn highest<'a, F: Real>(rows: impl Iterator<Item = &'a Row<F>>) -> F {
-    let mut lanes = [-F::ONE; TILE];
-    for row in rows {
-        for l in 0..TILE {
-            lanes[l] = greatest(row[l], lanes[l]);
+fn highest<F: Real>(plane: &Plane<F>) -> F {
+    let mut lanes = [-F::ONE; PAIR_OF_ROWS];
+    for rows in plane.as_chunks::<PAIR_OF_ROWS>().0 {
+        for l in 0..PAIR_OF_ROWS {
+            lanes[l] = greatest(rows[l], lanes[l]);
         }
     }
     lanes.iter().fold(lanes[0], |m, &v| greatest(v, m))
@@ -386,27 +431,32 @@ impl<F: Real> Kernel for Backward<'_, F> {
     type Out = [f64; CHANNELS];
     #[inline(always)]
     fn run<const FMA: bool>(self) -> [f64; CHANNELS] {
-        if self.abs { self.walk::<FMA, true>() } else { self.walk::<FMA, false>() }
+        if self.abs { self.walk::<FMA, ROW, true>() } else { self.walk::<FMA, ROW, false>() }
+    }
+    #[inline(always)]
+    fn run_wide<const FMA: bool>(self) -> [f64; CHANNELS] {
+        if self.abs { self.walk::<FMA, PAIR_OF_ROWS, true>() } else { self.walk::<FMA, PAIR_OF_ROWS, false>() }
     }
 }
 
-/// What the way back carries for eight pixels.
-#[repr(C)]
-#[derive(Clone, Copy, Default)]
+/// What the way back carries for the pixels of a tile.
+#[repr(C, align(64))]
+#[derive(Clone, Copy)]
 struct Back<F> {
     /// Transmittance in front of the splat in hand; negated once a pixel has stopped.
-    t: Row<F>,
+    t: Plane<F>,
     /// Σ_ch g_ch·(light that is still to come): one number serves all channels and alpha.
-    rest: Row<F>,
+    rest: Plane<F>,
     /// Gradient to the channels.
-    g: [Row<F>; CHANNELS],
+    g: [Plane<F>; CHANNELS],
 }
 
 impl<F: Real> Backward<'_, F> {
     #[inline(always)]
-    fn walk<const FMA: bool, const WITH_ABS: bool>(self) -> [f64; CHANNELS] {
+    fn walk<const FMA: bool, const N: usize, const WITH_ABS: bool>(self) -> [f64; CHANNELS] {
         let mut d_background = [0.0; CHANNELS];
-        let mut backs = [[Back::<F>::default(); TILE]; TILES];
+        let zero = [F::ZERO; TILE * TILE];
+        let mut backs = [Back { t: [-F::ONE; TILE * TILE], rest: zero, g: [zero; CHANNELS] }; TILES];
         let mut open = 0;
         for (t, back) in backs.iter_mut().enumerate() {
             let (x0, y0) = (self.corner[0] + t % SIDE * TILE, self.corner[1] + t / SIDE * TILE);
@@ -415,48 +465,43 @@ impl<F: Real> Backward<'_, F> {
                 open |= 1 << t;
             }
         }
-        let sums = [[[F::ZERO; TILE]; NUMBERS]; BATCH];
-        let rows = [[F::ZERO; TILE]; TILE];
         let (limits, out) = (self.limits, self.out);
         let alpha_max = limits.log_max.blend_exp2::<FMA>();
+        let sums = [[[F::ZERO; TILE]; NUMBERS]; BATCH];
         let mut visit =
-            Behind::<F, WITH_ABS> { backs: &mut backs, limits, alpha_max, alphas: rows, odds: rows, sums, out };
+            Behind::<F, N, WITH_ABS> { backs: &mut backs, limits, alpha_max, alphas: zero, odds: zero, sums, out };
         walk::<F, _, FMA>(self.records, open, &mut visit);
         d_background
     }
 
     /// Reads the pixels of tile `t` and adds their share of the background's gradient.
     #[inline(always)]
-    fn begin(&self, t: usize, [x0, y0]: [usize; 2], back: &mut [Back<F>; TILE], d_background: &mut [f64; CHANNELS]) {
+    fn begin(&self, t: usize, [x0, y0]: [usize; 2], back: &mut Back<F>, d_background: &mut [f64; CHANNELS]) {
         let (nx, ny) = ((self.size[0] - x0).min(TILE), (self.size[1] - y0).min(TILE));
-        let mut ends = [[F::ZERO; TILE]; CHANNELS];
-        for (y, (back, px)) in back.iter_mut().zip(&self.tiles[t].rows).enumerate() {
-            back.t = [-F::ONE; TILE];
-            if y >= ny {
-                continue;
-            }
-            back.t[..nx].fill(F::ONE);
-            let at = (y0 + y) * self.size[0] + x0;
-            let mut alpha = [F::ZERO; TILE];
+        let mut alpha = [F::ZERO; TILE * TILE];
+        for y in 0..ny {
+            let (at, row) = ((y0 + y) * self.size[0] + x0, y * TILE..y * TILE + nx);
+            back.t[row.clone()].fill(F::ONE);
             if let Some(plane) = self.grads.alpha {
-                alpha[..nx].copy_from_slice(&plane[at..at + nx]);
+                alpha[row.clone()].copy_from_slice(&plane[at..at + nx]);
             }
             for (g, plane) in back.g.iter_mut().zip(self.grads.channels) {
                 if let Some(plane) = plane {
-                    g[..nx].copy_from_slice(&plane[at..at + nx]);
+                    g[row.clone()].copy_from_slice(&plane[at..at + nx]);
                 }
             }
-            for l in 0..TILE {
-                let end = px.t[l].abs();
-                let mut behind = -alpha[l];
-                let mut light = F::ZERO;
-                for c in 0..CHANNELS {
-                    behind += self.background[c] * back.g[c][l];
-                    light += px.color[c][l] * back.g[c][l];
-                    ends[c][l] += end * back.g[c][l];
-                }
-                back.rest[l] = light + end * behind;
+        }
+        let tile = &self.tiles[t];
+        let mut ends = [[F::ZERO; TILE]; CHANNELS];
+        for i in 0..TILE * TILE {
+            let end = tile.t[i].abs();
+            let (mut behind, mut light) = (-alpha[i], F::ZERO);
+            for c in 0..CHANNELS {
+                behind += self.background[c] * back.g[c][i];
+                light += tile.color[c][i] * back.g[c][i];
+                ends[c][i % TILE] += end * back.g[c][i];
             }
+            back.rest[i] = light + end * behind;
         }
         for c in 0..CHANNELS {
             d_background[c] += ends[c].iter().map(|v| v.f64()).sum::<f64>();
@@ -464,36 +509,45 @@ impl<F: Real> Backward<'_, F> {
     }
 }
 
-struct Behind<'a, F, const WITH_ABS: bool> {
-    backs: &'a mut [[Back<F>; TILE]; TILES],
+struct Behind<'a, F, const N: usize, const WITH_ABS: bool> {
+    backs: &'a mut [Back<F>; TILES],
     limits: Limits<F>,
     /// α's ceiling as the blend computes it.
     alpha_max: F,
     /// α and α/(1−α) of the splat in hand.
-    alphas: [Row<F>; TILE],
-    odds: [Row<F>; TILE],
-    /// Sums of a batch's splats over all tiles, lane by lane.
-    sums: [[Row<F>; NUMBERS]; BATCH],
+    alphas: Plane<F>,
+    odds: Plane<F>,
+    /// Sums of a batch's splats over all tiles, column by column.
+    sums: [[[F; TILE]; NUMBERS]; BATCH],
     out: &'a mut [Pair<F>],
 }
 
-impl<F: Real, const WITH_ABS: bool> Visit<F> for Behind<'_, F, WITH_ABS> {
+/// Sums of the lanes of one column.
+#[inline(always)]
+fn columns<F: Real, const N: usize>(lanes: [F; N]) -> [F; TILE] {
+    let mut out = [F::ZERO; TILE];
+    for (k, row) in lanes.as_chunks::<TILE>().0.iter().enumerate() {
+        for l in 0..TILE {
+            out[l] = if k == 0 { row[l] } else { out[l] + row[l] };
+        }
+    }
+    out
+}
+
+impl<F: Real, const N: usize, const WITH_ABS: bool> Visit<F> for Behind<'_, F, N, WITH_ABS> {
     #[inline(always)]
     fn splat<const FMA: bool>(&mut self, t: usize, i: usize, r: &Record<F>) {
         let (tx, ty, limits) = (t % SIDE, t / SIDE, self.limits);
-        let rows = r.tile_rows(tx, ty);
-        let mut e = Exponent::new::<FMA>(r, tx, ty, rows.start, &limits);
+        let range = strip_range::<N>(r.tile_rows(tx, ty));
+        let mut e = Exponent::<F, N>::new::<FMA>(r, tx, ty, range.start, &limits);
         // Copies, of which LLVM knows that no store changes them.
-        let (channels, b, alpha_max) = (r.channels, r.b, self.alpha_max);
-        let (zero, dy0) = ([F::ZERO; TILE], e.dy);
-        let mut ex = zero;
-        for l in 0..TILE {
-            ex[l] = F::TWO * r.a * e.dx[l];
-        }
+        let (channels, [a, b, c], alpha_max) = (r.channels, [r.a, r.b, r.c], self.alpha_max);
+        let mut dy = e.dy;
         // In two loops: the second waits for T from splat to splat, and while it does the first, which waits for
         // nothing, fills the core's pipelines. In one loop a row's chain of operations is too long for that.
-        for (alphas, odds) in self.alphas.iter_mut().zip(&mut self.odds).take(rows.len()) {
-            for l in 0..TILE {
+        let odds = strips::<F, N>(&mut self.odds, range.clone());
+        for (alphas, odds) in strips::<F, N>(&mut self.alphas, range.clone()).iter_mut().zip(odds) {
+            for l in 0..N {
                 let a = alpha::<F, FMA>(least(e.raw::<FMA>(l), e.top), &limits);
                 alphas[l] = a;
                 odds[l] = a / (F::ONE - a);
@@ -501,12 +555,17 @@ impl<F: Real, const WITH_ABS: bool> Visit<F> for Behind<'_, F, WITH_ABS> {
             }
         }
         // Sums down each column; dx is the same for all rows, so its powers wait until the end.
+        let zero = [F::ZERO; N];
         let (mut v0, mut v1, mut v2, mut abs_x, mut abs_y) = (zero, zero, zero, zero, zero);
         let mut light = [zero; CHANNELS];
-        let mut dy = dy0;
-        for ((px, alphas), odds) in self.backs[t][rows].iter_mut().zip(&self.alphas).zip(&self.odds) {
-            let (mut t, mut rest, g) = (px.t, px.rest, px.g);
-            for l in 0..TILE {
+        let Back { t, rest, g } = &mut self.backs[t];
+        let [g0, g1, g2] = g.each_mut().map(|plane| &*strips::<F, N>(plane, range.clone()));
+        let pixels = strips::<F, N>(t, range.clone()).iter_mut().zip(strips::<F, N>(rest, range.clone()));
+        let alphas = strips::<F, N>(&mut self.alphas, range.clone());
+        let splats = alphas.iter().zip(&*strips::<F, N>(&mut self.odds, range));
+        for (((((ts, rests), (alphas, odds)), g0), g1), g2) in pixels.zip(splats).zip(g0).zip(g1).zip(g2) {
+            let (mut t, mut rest, g) = (*ts, *rests, [*g0, *g1, *g2]);
+            for l in 0..N {
                 let (after, weight, open) = pass(t[l], alphas[l], &limits);
                 t[l] = after;
                 let mut s = channels[0] * g[0][l];
@@ -525,16 +584,19 @@ impl<F: Real, const WITH_ABS: bool> Visit<F> for Behind<'_, F, WITH_ABS> {
                 v1[l] += vy;
                 v2[l] = vy.fma::<FMA>(dy[l], v2[l]);
                 if WITH_ABS {
-                    let gx = b.fma::<FMA>(dy[l], ex[l]);
-                    let gy = e.c.fma::<FMA>(dy[l] + dy[l], b * e.dx[l]);
-                    abs_x[l] = v.abs().fma::<FMA>(gx.abs(), abs_x[l]);
-                    abs_y[l] = v.abs().fma::<FMA>(gy.abs(), abs_y[l]);
+                    let dx = offsets::<F, N>(r, tx)[l];
+                    let gx = F::TWO * a * dx + b * dy[l];
+                    let gy = b * dx + F::TWO * c * dy[l];
+                    abs_x[l] += v.abs() * gx.abs();
+                    abs_y[l] += v.abs() * gy.abs();
                 }
-                dy[l] -= F::ONE;
+                dy[l] -= e.steps[1];
             }
-            (px.t, px.rest) = (t, rest);
+            (*ts, *rests) = (t, rest);
         }
-        let (dx, sums) = (e.dx, &mut self.sums[i]);
+        let (v0, v1, v2) = (columns(v0), columns(v1), columns(v2));
+        let (light, dx) = (light.map(columns), offsets::<F, TILE>(r, tx));
+        let sums = &mut self.sums[i];
         for l in 0..TILE {
             let vx = v0[l] * dx[l];
             sums[V][l] += v0[l];
@@ -550,16 +612,17 @@ impl<F: Real, const WITH_ABS: bool> Visit<F> for Behind<'_, F, WITH_ABS> {
             }
         }
         if WITH_ABS {
+            let (x, y) = (columns(abs_x), columns(abs_y));
             for l in 0..TILE {
-                sums[ABS][l] += abs_x[l];
-                sums[ABS + 1][l] += abs_y[l];
+                sums[ABS][l] += x[l];
+                sums[ABS + 1][l] += y[l];
             }
         }
     }
 
     #[inline(always)]
     fn stopped(&self, t: usize) -> bool {
-        highest(self.backs[t].iter().map(|row| &row.t)) < F::ZERO
+        highest(&self.backs[t].t) < F::ZERO
     }
 
     #[inline(always)]
@@ -577,6 +640,6 @@ impl<F: Real, const WITH_ABS: bool> Visit<F> for Behind<'_, F, WITH_ABS> {
 
 /// Sum of eight lanes, always by the same tree.
 #[inline(always)]
-fn sum_lanes<F: Real>(v: Row<F>) -> F {
+fn sum_lanes<F: Real>(v: [F; TILE]) -> F {
     ((v[0] + v[4]) + (v[2] + v[6])) + ((v[1] + v[5]) + (v[3] + v[7]))
 }

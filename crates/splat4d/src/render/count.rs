@@ -44,7 +44,7 @@ fn count_bin<F: Real>(records: &[Record<F>], inside: [usize; 2], limits: &Limits
 
 /// Blends as forward does, white light alone: where it grew, the splat was seen.
 struct Counting<'a, F> {
-    forward: Forward<'a, F>,
+    forward: Forward<'a, F, TILE>,
     counts: PairCounts,
 }
 
@@ -53,13 +53,11 @@ impl<F: Real> Visit<F> for Counting<'_, F> {
         let mut record = *r;
         record.channels = [F::ZERO; CHANNELS];
         record.channels[0] = F::ONE;
-        for row in &mut self.forward.tiles[t].rows {
-            row.color[0] = [F::ZERO; TILE];
-        }
+        self.forward.tiles[t].color[0].fill(F::ZERO);
         self.forward.splat::<FMA>(t, i, &record);
         self.counts.tested += r.tile_rows(t % SIDE, t / SIDE).len() * TILE;
-        let light = self.forward.tiles[t].rows.iter().flat_map(|row| &row.color[0]);
-        self.counts.contributing += light.filter(|v| **v > F::ZERO).count();
+        let light = &self.forward.tiles[t].color[0];
+        self.counts.contributing += light.iter().filter(|v| **v > F::ZERO).count();
     }
 
     fn stopped(&self, t: usize) -> bool {

@@ -5,7 +5,7 @@
 
 use super::RenderConfig;
 use super::bin::{BIN, Bins, Footprint, PAIR_BUDGET, id};
-use super::blend::{Backward, Blend, Limits, Pair, Pixels, Tile};
+use super::blend::{Backward, Blend, Limits, Pair, Tile};
 use super::gather::{Gather, Record, SIDE, TILE, TILES};
 use super::parallel::{Even, Ragged, for_each_group};
 use super::project::{Projected, ProjectedGrads};
@@ -122,8 +122,8 @@ impl<F: Real> Raster<F> {
         });
     }
 
-    /// Writes one plane: `f` gives a row of a tile's pixels. A row at a time, so that it is a vector's work.
-    fn read(&self, plane: &mut [F], f: impl Fn(&Pixels<F>) -> [F; TILE] + Sync) {
+    /// Writes one plane: `f(tile, i)` is pixel i of a tile. A row at a time, so that it is a vector's work.
+    fn read(&self, plane: &mut [F], f: impl Fn(&Tile<F>, usize) -> F + Sync) {
         let (w, across) = (self.width, self.bins.across);
         if w == 0 {
             return;
@@ -133,7 +133,7 @@ impl<F: Real> Raster<F> {
                 for (tx, run) in row.chunks_mut(TILE).enumerate() {
                     let bin = band * across + tx / SIDE;
                     let tile = &self.tiles[bin * TILES + y / TILE * SIDE + tx % SIDE];
-                    let values = f(&tile.rows[y % TILE]);
+                    let values: [F; TILE] = std::array::from_fn(|x| f(tile, y % TILE * TILE + x));
                     match <&mut [F; TILE]>::try_from(&mut *run) {
                         Ok(run) => *run = values,
                         Err(_) => run.copy_from_slice(&values[..run.len()]),
@@ -145,12 +145,12 @@ impl<F: Real> Raster<F> {
 
     /// Channel `c` over `background`: Σ c α T + T_end·background, [height, width].
     pub fn channel(&self, c: usize, background: F, plane: &mut [F]) {
-        self.read(plane, |px| std::array::from_fn(|x| px.color[c][x] + px.t[x].abs() * background));
+        self.read(plane, |tile, i| tile.color[c][i] + tile.t[i].abs() * background);
     }
 
     /// 1 − T_end, [height, width].
     pub fn alpha(&self, plane: &mut [F]) {
-        self.read(plane, |px| std::array::from_fn(|x| F::ONE - px.t[x].abs()));
+        self.read(plane, |tile, i| F::ONE - tile.t[i].abs());
     }
 
     /// VJP of the last [`Raster::blend`], which must have been of the same `channels`.
