@@ -28,14 +28,15 @@ impl Ceiling {
 /// Compulsory bytes.
 pub(super) mod bytes {
     use super::{Footprint, Layer, Scene, Splats};
+    use splat4d::render::rasterize::CHANNELS;
     use splat4d::render::{Projected, ProjectedGrads};
     use splat4d::scene::{Color, SH, Space};
 
     const NUMBER: usize = size_of::<f32>();
     /// Mean, covariance, opacity.
     const SPLAT: usize = 10 * NUMBER;
-    /// Red, green, blue, depth.
-    const CHANNELS: usize = 4 * NUMBER;
+    /// Red, green, blue.
+    const COLOR: usize = CHANNELS * NUMBER;
     /// A key and a record of the blend loop.
     const PAIR: usize = 8 + 64;
 
@@ -70,7 +71,7 @@ pub(super) mod bytes {
 
     /// Coefficients of what is visible in, colours out.
     pub(crate) fn shade(splats: &Splats<'_, f32>, visible: usize) -> usize {
-        visible * (sh_width(splats) * NUMBER + CHANNELS)
+        visible * (sh_width(splats) * NUMBER + COLOR)
     }
 
     /// A key and a record out for every pair of bin and splat.
@@ -80,7 +81,7 @@ pub(super) mod bytes {
 
     /// Ellipses and their gradients in, splats' gradients out; coefficients in, and added to their gradients.
     pub(crate) fn splats_backward(splats: &Splats<'_, f32>, visible: usize) -> usize {
-        let each = size_of::<Projected>() + size_of::<ProjectedGrads>() + CHANNELS + 2 * SPLAT;
+        let each = size_of::<Projected>() + size_of::<ProjectedGrads>() + COLOR + 2 * SPLAT;
         splats.len() * each + visible * 3 * sh_width(splats) * NUMBER
     }
 
@@ -95,9 +96,9 @@ pub(super) mod bytes {
         splats * (SPLAT + 3 * widest * NUMBER)
     }
 
-    /// Gradients in; parameters and two moments in and out.
+    /// Gradients in, and zeros out for the next step; parameters and two moments in and out.
     pub(crate) fn adam(scene: &Scene<f32>, splats: usize) -> usize {
         let widest = scene.layers.iter().map(all_columns).max().unwrap_or(0);
-        splats * 7 * widest * NUMBER
+        splats * 8 * widest * NUMBER
     }
 }
