@@ -7,6 +7,7 @@ pub mod adc;
 pub mod mcmc;
 
 use crate::optim::Moments;
+use splat4d::format::quant::{MORTON_BITS, morton};
 use splat4d::layers::{LayerTape, Scene};
 use splat4d::math::{Real, Rng, sym3};
 use splat4d::motion::{Cache, for_rows};
@@ -221,21 +222,13 @@ pub fn morton_edit(scene: &Scene<f32>, layer: usize) -> RowEdit {
             high[k] = high[k].max(m[k]);
         }
     }
-    let spread = |mut x: u64| {
-        // Leaves two zero bits between the 21 bits of x.
-        x &= 0x1F_FFFF;
-        x = (x | x << 32) & 0x001F_0000_0000_FFFF;
-        x = (x | x << 16) & 0x001F_0000_FF00_00FF;
-        x = (x | x << 8) & 0x100F_00F0_0F00_F00F;
-        x = (x | x << 4) & 0x10C3_0C30_C30C_30C3;
-        (x | x << 2) & 0x1249_2492_4924_9249
-    };
+    let most = f64::from((1u32 << MORTON_BITS) - 1);
     let code = |r: usize| {
         let m = geometry.read::<3>(r, 0);
-        (0..3).fold(0u64, |c, k| {
+        morton(std::array::from_fn(|k| {
             let u = (m[k] - low[k]) / (high[k] - low[k]).max(f32::MIN_POSITIVE);
-            c | spread((f64::from(u.clamp(0.0, 1.0)) * 2_097_151.0) as u64) << k
-        })
+            (f64::from(u.clamp(0.0, 1.0)) * most) as u32
+        }))
     };
     let mut order: Vec<(u64, u32)> = (0..rows).map(|r| (code(r), r as u32)).collect();
     order.sort_unstable();

@@ -227,33 +227,4 @@ mod tests {
         assert_eq!(m.table(GEOMETRY).rows(), 3);
         assert_eq!([1, 2].map(|r| m.table(GEOMETRY).get(r, 5)), [2.0, 0.0]);
     }
-
-    /// Prints bytes a second of a step and of a copy of the same bytes; run with `--ignored --nocapture`.
-    #[test]
-    #[ignore = "a measurement"]
-    fn bandwidth_of_a_step() {
-        for rows in [30_000, 1_000_000] {
-            let mut p = Params::<f32>::new(rows, 4, &[]);
-            let (mut m, mut d) = (Moments::new(&p), Grads::new(&p));
-            let rates = vec![None, Some(vec![0.1; 12])];
-            let (mut best, mut copy) = (f64::INFINITY, f64::INFINITY);
-            // Parameter, both moments and gradient, each read and written, and the step count.
-            let bytes = rows * (12 * 4 * 8 + 8);
-            let (from, mut to) = (vec![1.0f32; bytes / 8], vec![0.0f32; bytes / 8]);
-            for _ in 0..20 {
-                d.activate(Space::Gaussians, Rows::All);
-                let _ = d.of([SH]);
-                let clock = std::time::Instant::now();
-                let _ = m.step(&mut p, &mut d, &rates, &[]);
-                best = clock.elapsed().as_secs_f64().min(best);
-                let clock = std::time::Instant::now();
-                let (a, b) = to.split_at_mut(bytes / 16);
-                let (c, e) = from.split_at(bytes / 16);
-                rayon::join(|| a.copy_from_slice(c), || b.copy_from_slice(e));
-                copy = clock.elapsed().as_secs_f64().min(copy);
-            }
-            let rate = |seconds: f64| bytes as f64 / seconds * 1e-9;
-            println!("{rows} rows: {:.3} ms, {:.1} GB/s; a copy: {:.1} GB/s", best * 1e3, rate(best), rate(copy));
-        }
-    }
 }
