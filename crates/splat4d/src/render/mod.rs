@@ -261,16 +261,15 @@ impl<F: Real> Renderer<F> {
         reshape(&mut out.alpha, 1, h, w);
         reshape(&mut out.depth, depths, h, w);
         reshape(&mut out.extra, widths, h, w);
-        for (c, &b) in background.iter().enumerate() {
-            self.raster.channel(c, b, out.color.plane_mut(c));
-        }
-        self.raster.alpha(out.alpha.plane_mut(0));
+        let (red, rest) = out.color.data.split_at_mut(w * h);
+        let (green, blue) = rest.split_at_mut(w * h);
+        self.raster.picture(background, [red, green, blue], out.alpha.plane_mut(0));
         for first in self.passes(extra) {
             self.pack(extra, first);
             self.raster.blend(&self.projected, &self.footprints, &self.extra, &self.config);
             for c in first..(depths + widths).min(first + CHANNELS) {
                 let plane = if c < depths { out.depth.plane_mut(c) } else { out.extra.plane_mut(c - depths) };
-                self.raster.channel(c - first, F::ZERO, plane);
+                self.raster.channel(c - first, plane);
             }
         }
         self.seconds.blend = clock.lap();

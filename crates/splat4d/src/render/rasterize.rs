@@ -12,6 +12,7 @@ use super::project::{Projected, ProjectedGrads};
 use super::simd::{Simd, dispatch};
 use crate::math::Real;
 use rayon::prelude::*;
+use std::ops::Range;
 use std::sync::atomic::{AtomicU32, Ordering};
 
 /// Channels of one pass.
@@ -122,35 +123,50 @@ impl<F: Real> Raster<F> {
         });
     }
 
-    /// Writes one plane: `f(tile, i)` is pixel i of a tile. A row at a time, so that it is a vector's work.
-    fn read(&self, plane: &mut [F], f: impl Fn(&Tile<F>, usize) -> F + Sync) {
-        let (w, across) = (self.width, self.bins.across);
-        if w == 0 {
-            return;
-        }
-        plane.par_chunks_mut(BIN * w).enumerate().for_each(|(band, pixels)| {
-            for (y, row) in pixels.chunks_mut(w).enumerate() {
-                for (tx, run) in row.chunks_mut(TILE).enumerate() {
-                    let bin = band * across + tx / SIDE;
-                    let tile = &self.tiles[bin * TILES + y / TILE * SIDE + tx % SIDE];
-                    let values: [F; TILE] = std::array::from_fn(|x| f(tile, y % TILE * TILE + x));
-                    match <&mut [F; TILE]>::try_from(&mut *run) {
-                        Ok(run) => *run = values,
-                        Err(_) => run.copy_from_slice(&values[..run.len()]),
+    /// Colours over `background`, Σ c α T + T_end·background, and alpha, 1 − T_end: planes [height, width].
+    ///
+    /// All at once, since reading the tiles takes longer than writing the planes.
+    pub fn picture(&self, background: [F; CHANNELS], color: [&mut [F]; CHANNELS], alpha: &mut [F]) {
+        let band = BIN * self.width.max(1);
+        let [red, green, blue] = color.map(|plane| plane.par_chunks_mut(band));
+        red.zip(green).zip(blue).zip(alpha.par_chunks_mut(band)).enumerate().for_each(
+            |(band, (((red, green), blue), alpha))| {
+                self.each_row(band, red.len(), |tile, row, pixels| {
+                    for (c, plane) in [&mut *red, &mut *green, &mut *blue].into_iter().enumerate() {
+                        let (sums, t) = (&tile.color[c][row.clone()], &tile.t[row.clone()]);
+                        for (out, (sum, t)) in plane[pixels.clone()].iter_mut().zip(sums.iter().zip(t)) {
+                            *out = *sum + t.abs() * background[c];
+                        }
                     }
-                }
-            }
+                    for (out, t) in alpha[pixels].iter_mut().zip(&tile.t[row]) {
+                        *out = F::ONE - t.abs();
+                    }
+                });
+            },
+        );
+    }
+
+    /// Channel `c`, Σ c α T, [height, width].
+    pub fn channel(&self, c: usize, plane: &mut [F]) {
+        plane.par_chunks_mut(BIN * self.width.max(1)).enumerate().for_each(|(band, plane)| {
+            self.each_row(band, plane.len(), |tile, row, pixels| {
+                plane[pixels.clone()].copy_from_slice(&tile.color[c][row][..pixels.len()]);
+            });
         });
     }
 
-    /// Channel `c` over `background`: Σ c α T + T_end·background, [height, width].
-    pub fn channel(&self, c: usize, background: F, plane: &mut [F]) {
-        self.read(plane, |tile, i| tile.color[c][i] + tile.t[i].abs() * background);
-    }
-
-    /// 1 − T_end, [height, width].
-    pub fn alpha(&self, plane: &mut [F]) {
-        self.read(plane, |tile, i| F::ONE - tile.t[i].abs());
+    /// Calls `f(tile, row of the tile, its pixels)` for all that lies in one band of bins, which has `count` pixels; a
+    /// row that the picture's edge cuts has fewer pixels than the tile's.
+    #[inline(always)]
+    fn each_row(&self, band: usize, count: usize, mut f: impl FnMut(&Tile<F>, Range<usize>, Range<usize>)) {
+        let (w, across) = (self.width, self.bins.across);
+        for y in 0..count / w.max(1) {
+            for x in (0..w).step_by(TILE) {
+                let tile = (band * across + x / BIN) * TILES + y / TILE * SIDE + x / TILE % SIDE;
+                let row = y % TILE * TILE;
+                f(&self.tiles[tile], row..row + TILE, y * w + x..y * w + w.min(x + TILE));
+            }
+        }
     }
 
     /// VJP of the last [`Raster::blend`], which must have been of the same `channels`.
