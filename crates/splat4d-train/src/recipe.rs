@@ -100,7 +100,7 @@ recipe! {
     /// Rate of log scales.
     scaling_lr: f64 = 0.015,
     /// Rate of quaternions.
-    rotation_lr: f64 = 4e-3,
+    rotation_lr: f64 = 1e-3,
     /// spacetime: order of the motion polynomial, 0 to 3.
     motion_order: usize = 1,
     /// spacetime: whether quaternions turn with time.
