@@ -13,8 +13,6 @@ use splat4d::scene::{Born, GEOMETRY, RowEdit, Space};
 const SPLIT_SHRINK: f64 = 1.6;
 /// Gaussians larger than this share of the extent are removed (as after the first reset in the original).
 const HUGE: f64 = 0.1;
-/// Steps of its life after which a Gaussian that no pixel showed is removed.
-const UNSEEN_STEPS: f32 = 100.0;
 
 /// The strategy's settings.
 #[derive(Clone, Debug, PartialEq)]
@@ -41,11 +39,7 @@ impl Adc {
         let spans = scene.layers[layer].spans();
         let sizes: Vec<f64> = covs.par_iter().map(|&c| sym3::largest(c).max(0.0).sqrt()).collect();
         let keep: Vec<bool> = (0..rows)
-            .map(|r| {
-                !is_dead(scene, layer, r, limits.min_opacity, spans[r])
-                    && sizes[r] <= HUGE * limits.extent
-                    && !is_unseen(&moments[layer], r)
-            })
+            .map(|r| !is_dead(scene, layer, r, limits.min_opacity, spans[r]) && sizes[r] <= HUGE * limits.extent)
             .collect();
         let removed = keep.iter().filter(|k| !**k).count();
         *spare += removed;
@@ -84,14 +78,6 @@ impl Adc {
         }
         Change { added: wanting.len(), moved: 0, removed }
     }
-}
-
-/// Whether the row lived through many steps and not one pixel ever showed it: outside all pictures, or behind what is
-/// opaque. Only views that nobody trained on would show it, as haze.
-fn is_unseen(moments: &Moments<f32>, row: usize) -> bool {
-    let table = moments.table(GEOMETRY);
-    let width = table.width() / 2;
-    table.get(row, 2 * width) >= UNSEEN_STEPS && table.get(row, width + OPACITY) == 0.0
 }
 
 /// Lowers every opacity to at most `ceiling`, and forgets its moments (Kerbl et al. 2023).
@@ -138,24 +124,5 @@ mod tests {
         let mut moments: Vec<_> = capped.layers.iter().map(|l| Moments::new(&l.params)).collect();
         let change = adc.run(&mut capped, &mut moments, &mut stats, &Limits { cap: 21, ..limits }, 1, 0);
         assert_eq!((change.added, capped.len()), (2, 21));
-    }
-
-    #[test]
-    fn what_no_pixel_showed_for_long_is_removed() {
-        let mut s = scene(20);
-        (0..20).for_each(|r| s.layers[0].params[GEOMETRY].write(r, 7, [-6.0f32; 3]));
-        let mut moments: Vec<_> = s.layers.iter().map(|l| Moments::new(&l.params)).collect();
-        let table = moments[0].table_mut(GEOMETRY);
-        let width = table.width() / 2;
-        for r in 0..20 {
-            // Even rows had a gradient once; rows below ten are old.
-            table.set(r, 2 * width, if r < 10 { UNSEEN_STEPS } else { UNSEEN_STEPS - 1.0 });
-            table.set(r, width + OPACITY, if r % 2 == 0 { 1e-20 } else { 0.0 });
-        }
-        let adc = Densify::Adc(Adc { grad_threshold: 0.1, percent_dense: 0.05 });
-        let mut stats = Stats::new(&s);
-        let limits = Limits { cap: 100, extent: 4.0, min_opacity: 0.005 };
-        let change = adc.run(&mut s, &mut moments, &mut stats, &limits, 1, 0);
-        assert_eq!((change.removed, s.len()), (5, 15));
     }
 }
