@@ -540,3 +540,35 @@ fn contributions_sum_to_alpha() {
     assert!((a - b).abs() < 1e-9 * b && renderer.stats().visible > 0, "{a} {b}");
     assert!(renderer.radii().iter().zip(&share).all(|(r, s)| *r > 0.0 || *s == 0.0));
 }
+
+/// What f32 loses on the way back: behind many opaque splats, what is still to come is a small difference of large sums.
+#[test]
+fn f32_gradients_are_those_of_f64() {
+    let mut s = scene(9, 150, 0.12);
+    for out in &mut s.outs {
+        for j in 0..out.rows() {
+            // Half of them at the ceiling of α.
+            out.set(j, 9, if j % 2 == 0 { 0.999 } else { 0.5 });
+        }
+    }
+    let view = camera(80, 60);
+    let config = RenderConfig { simd: Simd::detect(), ..RenderConfig::default() };
+    let rng = Rng::new(5, "gradient", 0);
+    let mut g = Planes::<f64>::new(3, 60, 80);
+    g.data.iter_mut().enumerate().for_each(|(i, v)| *v = rng.normal(i as u64));
+    fn run<F: Real>(s: &Scene<F>, view: &Camera, config: RenderConfig, g: &Planes<F>) -> Vec<f64> {
+        let mut renderer = Renderer::new(config);
+        let (splats, mut out, mut d) = (s.splats(), Image::default(), RenderGrads::default());
+        let background = BACKGROUND.map(F::of);
+        renderer.render(&splats, view, background, None, &mut out);
+        let grads = ImageGrads { color: g, alpha: None, depth: None, extra: None };
+        renderer.backward(&splats, view, background, None, &grads, &mut [None, None, None], &mut d);
+        d.parts.iter().flat_map(|p| (0..p.out.rows()).flat_map(|j| p.out.read::<10>(j, 0))).map(F::f64).collect()
+    }
+    let exact = run(&s, &view, config, &g);
+    let g32 = Planes { channels: 3, height: 60, width: 80, data: g.data.iter().map(|&v| v as f32).collect() };
+    let fast = run(&s.cast::<f32>(), &view, config, &g32);
+    let size: f64 = exact.iter().map(|v| v * v).sum::<f64>().sqrt();
+    let error: f64 = exact.iter().zip(&fast).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt();
+    assert!(size > 0.0 && error < 2e-4 * size, "{error} of {size}");
+}
