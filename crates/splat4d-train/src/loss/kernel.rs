@@ -16,6 +16,9 @@
 //! through the stages: products → vertical means → horizontal means and S's derivatives → vertical means → horizontal
 //! means and the gradient. Products and derivatives live in rings of 16 rows, which stay in the second-level cache.
 //! The loops are plain ones over a row, because LLVM vectorises those reliably, and blocks of lanes it does not.
+//!
+//! A windowed sum is eleven loads, five additions and six multiply-adds, so loads are what it waits for: scratch rows
+//! start at cache lines, rings are arrays whose offsets are constants, and sums are kept by column until a strip ends.
 
 use splat4d::math::Real;
 use splat4d::simd::{Pass, each};
@@ -37,12 +40,15 @@ const GROUP: usize = 4;
 const SPAN: usize = GROUP + TAPS - 1;
 /// Rows in a ring: a span, rounded up to a power of two.
 const RING: usize = 16;
+/// Rows by which the place of the gradient's derivatives in the ring, ten rows back, is past a whole group.
+const LAG: usize = (RING - 2 * REACH) % GROUP;
 /// Moments (x, y, xx+yy, xy) and derivatives.
 const MOMENTS: usize = 4;
 const DERIVATIVES: usize = 3;
 /// Widest run of columns worked on at a time, so that the rings fit the second-level cache.
 const MAX_COLUMNS: usize = 512;
-/// Numbers in a scratch row: columns, a window's halo twice, each rounded up to whole lanes.
+/// Numbers in a scratch row, whole cache lines: columns, the products' halo on both sides, and room for [`READ`] from
+/// the derivatives' first column on.
 const STRIDE: usize = MAX_COLUMNS + 3 * PRODUCT_HALO;
 /// Most numbers that a horizontal pass reads of a row: a window's rest more than it makes.
 const READ: usize = MAX_COLUMNS + 2 * DERIVATIVE_HALO + TAPS - 1;
@@ -85,33 +91,39 @@ pub(super) fn window<F: Real>() -> [F; TAPS] {
 /// Rows of maps.
 type Rows<F, const MAPS: usize, const N: usize> = [[[F; STRIDE]; MAPS]; N];
 
+/// Starts at a cache line, as every row then does: half the registers of a row elsewhere would span two lines.
+#[derive(Debug)]
+#[repr(align(64))]
+struct Lines<T>(T);
+
 /// Working rows of one thread.
 #[derive(Debug)]
 pub(super) struct Scratch<F> {
     /// Ring of products, `[RING, MOMENTS, STRIDE]`.
-    products: Box<Rows<F, MOMENTS, RING>>,
-    /// Ring of S's derivatives, `[RING, DERIVATIVES, STRIDE]`.
-    derivatives: Box<Rows<F, DERIVATIVES, RING>>,
+    products: Box<Lines<Rows<F, MOMENTS, RING>>>,
+    /// Ring of S's derivatives ½∂S/∂⟨x⟩, −∂S/∂⟨xx+yy⟩, ½∂S/∂⟨xy⟩, which need fewest operations,
+    /// `[RING, DERIVATIVES, STRIDE]`.
+    derivatives: Box<Lines<Rows<F, DERIVATIVES, RING>>>,
     /// Vertical means of one group of moments, `[GROUP, MOMENTS, STRIDE]`; zero outside the image.
-    moments: Box<Rows<F, MOMENTS, GROUP>>,
+    moments: Box<Lines<Rows<F, MOMENTS, GROUP>>>,
     /// Vertical means of one group of derivatives, `[GROUP, DERIVATIVES, STRIDE]`.
-    means: Box<Rows<F, DERIVATIVES, GROUP>>,
-    /// Weights from column −5 on, 0 outside the image, `[STRIDE]`.
-    weights: Box<[F; STRIDE]>,
+    means: Box<Lines<Rows<F, DERIVATIVES, GROUP>>>,
+    /// Weights of a row of derivatives, 0 outside the image, `[STRIDE]`.
+    weights: Box<Lines<[F; STRIDE]>>,
     /// What is summed, by column: |x − y|, S and squared error, with weights.
-    totals: Box<[[F; STRIDE]; 3]>,
+    totals: Box<Lines<[[F; STRIDE]; 3]>>,
 }
 
 impl<F: Real> Scratch<F> {
     /// Rows for any strip.
     pub fn new() -> Self {
         Self {
-            products: Box::new([[[F::ZERO; STRIDE]; MOMENTS]; RING]),
-            derivatives: Box::new([[[F::ZERO; STRIDE]; DERIVATIVES]; RING]),
-            moments: Box::new([[[F::ZERO; STRIDE]; MOMENTS]; GROUP]),
-            means: Box::new([[[F::ZERO; STRIDE]; DERIVATIVES]; GROUP]),
-            weights: Box::new([F::ZERO; STRIDE]),
-            totals: Box::new([[F::ZERO; STRIDE]; 3]),
+            products: Box::new(Lines([[[F::ZERO; STRIDE]; MOMENTS]; RING])),
+            derivatives: Box::new(Lines([[[F::ZERO; STRIDE]; DERIVATIVES]; RING])),
+            moments: Box::new(Lines([[[F::ZERO; STRIDE]; MOMENTS]; GROUP])),
+            means: Box::new(Lines([[[F::ZERO; STRIDE]; DERIVATIVES]; GROUP])),
+            weights: Box::new(Lines([F::ZERO; STRIDE])),
+            totals: Box::new(Lines([[F::ZERO; STRIDE]; 3])),
         }
     }
 }
@@ -121,7 +133,8 @@ impl<F: Real> Pass for Strip<'_, F> {
     type Into = [F];
     type Out = [f64; 3];
 
-    /// [Σ w|x − y|, Σ w S, Σ w e²] over the strip, e the error of the render clamped to [0, 1]; writes its gradient into `d` ([rows, width]).
+    /// [Σ w|x − y|, Σ w S, Σ w e²] over the strip, e the error of the render clamped to [0, 1]; writes its gradient
+    /// into `d` ([rows, width]).
     #[inline(always)]
     fn run<const FMA: bool>(&self, scratch: &mut Scratch<F>, d: &mut [F]) -> [f64; 3] {
         // Column runs of even size, so that no narrow rest pays a full halo.
@@ -139,9 +152,9 @@ impl<F: Real> Pass for Strip<'_, F> {
     }
 }
 
-/// Some columns of a strip. Its derivative row/column i is the image's `first − 5 + i`, its product row/column i the
-/// image's `first − 10 + i`: a derivative at i then needs the products i..i+11, the gradient at i the derivatives
-/// i..i+11.
+/// Some columns of a strip. Its derivative row i is the image's `first − 5 + i`, its product row i the image's
+/// `first − 10 + i`: a derivative at i then needs the products i..i+11, the gradient at i the derivatives i..i+11.
+/// Columns have halos of [`DERIVATIVE_HALO`] and [`PRODUCT_HALO`] instead; nothing outside the image is computed.
 struct Tile<'a, F> {
     job: &'a Strip<'a, F>,
     x0: usize,
@@ -163,11 +176,11 @@ impl<'a, F: Real> Tile<'a, F> {
 
     #[inline(always)]
     fn walk<const FMA: bool>(&self, s: &mut Scratch<F>, d: &mut [F]) -> [f64; 3] {
-        s.totals.as_flattened_mut().fill(F::ZERO);
-        clear(&mut s.products[..], self.products);
-        clear(&mut s.moments[..], self.products);
-        clear(&mut s.derivatives[..], self.derivatives);
-        clear(&mut s.means[..], self.derivatives);
+        s.totals.0.as_flattened_mut().fill(F::ZERO);
+        clear(&mut s.products.0[..], self.products);
+        clear(&mut s.moments.0[..], self.products);
+        clear(&mut s.derivatives.0[..], self.derivatives);
+        clear(&mut s.means.0[..], self.derivatives);
         self.fill_weights(s, 0);
         for row in 0..2 * REACH {
             self.fill_products::<FMA>(s, row);
@@ -178,14 +191,19 @@ impl<'a, F: Real> Tile<'a, F> {
             for row in 0..GROUP {
                 self.fill_products::<FMA>(s, head + 2 * REACH + row);
             }
-            vertical::<F, FMA, MOMENTS>(&self.job.taps, &s.products, head, self.products, &mut s.moments);
+            vertical::<F, FMA, MOMENTS, 0>(&self.job.taps, &s.products.0, head, self.products, &mut s.moments.0);
             for row in 0..GROUP {
                 self.derivatives::<FMA>(s, head + row, row);
             }
             if head + GROUP > 2 * REACH {
                 // A group that straddles the strip's first row reads rows before it from the ring; they are not used.
-                let from = (head + RING - 2 * REACH) % RING;
-                vertical::<F, FMA, DERIVATIVES>(&self.job.taps, &s.derivatives, from, self.derivatives, &mut s.means);
+                vertical::<F, FMA, DERIVATIVES, LAG>(
+                    &self.job.taps,
+                    &s.derivatives.0,
+                    head + RING - 2 * REACH - LAG,
+                    self.derivatives,
+                    &mut s.means.0,
+                );
                 for row in 0..GROUP {
                     if (2 * REACH..self.rows + 2 * REACH).contains(&(head + row)) {
                         self.gradient::<FMA>(s, head + row - 2 * REACH, row, d);
@@ -194,7 +212,7 @@ impl<'a, F: Real> Tile<'a, F> {
             }
             head += GROUP;
         }
-        let [l1, ssim, square] = &*s.totals;
+        let [l1, ssim, square] = &s.totals.0;
         let own = DERIVATIVE_HALO..DERIVATIVE_HALO + self.columns;
         [sum(&l1[..self.columns]), sum(&ssim[own]), sum(&square[..self.columns])]
     }
@@ -205,21 +223,21 @@ impl<'a, F: Real> Tile<'a, F> {
         (self.job.first + row).checked_sub(halo).filter(|&y| y < self.job.height)
     }
 
-    /// Weights of the image row that derivative row `row` stands for .
+    /// Weights of the image row that derivative row `row` stands for.
     #[inline(always)]
     fn fill_weights(&self, s: &mut Scratch<F>, row: usize) {
         let [start, end] = inside(self.job.width, self.x0, DERIVATIVE_HALO, self.columns + 2 * DERIVATIVE_HALO);
         match (self.job.weight, self.image_row(row, REACH)) {
             (None, _) => {
-                s.weights.fill(F::ZERO);
-                s.weights[start..end].fill(F::ONE);
+                s.weights.0.fill(F::ZERO);
+                s.weights.0[start..end].fill(F::ONE);
             }
             (Some(weight), Some(y)) => {
                 let from = y * self.job.width + self.x0 + start - DERIVATIVE_HALO;
-                s.weights.fill(F::ZERO);
-                s.weights[start..end].copy_from_slice(&weight[from..from + end - start]);
+                s.weights.0.fill(F::ZERO);
+                s.weights.0[start..end].copy_from_slice(&weight[from..from + end - start]);
             }
-            (Some(_), None) => s.weights.fill(F::ZERO),
+            (Some(_), None) => s.weights.0.fill(F::ZERO),
         }
     }
 
@@ -227,7 +245,7 @@ impl<'a, F: Real> Tile<'a, F> {
     #[inline(always)]
     fn fill_products<const FMA: bool>(&self, s: &mut Scratch<F>, row: usize) {
         let [start, end] = self.products;
-        let out = s.products[row % RING].each_mut().map(|part| &mut part[start..end]);
+        let out = s.products.0[row % RING].each_mut().map(|part| &mut part[start..end]);
         let Some(y) = self.image_row(row, 2 * REACH) else {
             out.into_iter().for_each(|part| part.fill(F::ZERO));
             return;
@@ -248,15 +266,15 @@ impl<'a, F: Real> Tile<'a, F> {
     #[inline(always)]
     fn derivatives<const FMA: bool>(&self, s: &mut Scratch<F>, row: usize, in_group: usize) {
         if self.image_row(row, REACH).is_none() {
-            s.derivatives[row % RING].as_flattened_mut().fill(F::ZERO);
+            s.derivatives.0[row % RING].as_flattened_mut().fill(F::ZERO);
             return;
         }
         if self.job.weight.is_some() {
             self.fill_weights(s, row);
         }
-        let (out, means) = (&mut s.derivatives[row % RING], &s.moments[in_group]);
-        let total = &mut s.totals[1];
-        let own = if (REACH..self.rows + REACH).contains(&row) { F::ONE } else { F::ZERO };
+        let (out, means) = (&mut s.derivatives.0[row % RING], &s.moments.0[in_group]);
+        let total = &mut s.totals.0[1];
+        let twice = if (REACH..self.rows + REACH).contains(&row) { F::TWO } else { F::ZERO };
         let taps = &self.job.taps;
         let (c1, c2) = (F::of(C1), F::of(C2));
         let [start, end] = self.derivatives;
@@ -264,7 +282,7 @@ impl<'a, F: Real> Tile<'a, F> {
         let n = (end - start).min(READ - TAPS + 1);
         let [x, y, squares, cross] = means.each_ref().map(|row| read(row, start + SHIFT));
         let [da, db, dc] = out.each_mut().map(|row| write(row, start));
-        let (weights, total) = (read(&s.weights, start), write(total, start));
+        let (weights, total) = (read(&s.weights.0, start), write(total, start));
         for i in 0..n {
             let mx = along::<F, FMA>(taps, x, i);
             let my = along::<F, FMA>(taps, y, i);
@@ -272,19 +290,19 @@ impl<'a, F: Real> Tile<'a, F> {
             let xy = along::<F, FMA>(taps, cross, i);
             let mxy = mx * my;
             let m2 = mx.fma::<FMA>(mx, my * my);
-            let a1 = F::TWO.fma::<FMA>(mxy, c1);
-            let a2 = F::TWO.fma::<FMA>(xy - mxy, c2);
+            let half_a1 = mxy + c1 * F::HALF;
+            let half_a2 = (xy - mxy) + c2 * F::HALF;
             let b1 = m2 + c1;
             // Rounding can make a variance negative; b2 must not follow.
             let b2 = (sq - m2).max(F::ZERO) + c2;
-            let inv = F::ONE / (b1 * b2);
-            let ssim = a1 * a2 * inv;
+            let inv = F::TWO / (b1 * b2);
+            let half_s = half_a1 * half_a2 * inv;
             let w = weights[i];
             let wi = w * inv;
-            da[i] = F::TWO * wi * my.fma::<FMA>(a2 - a1, mx * ssim * (b1 - b2));
-            db[i] = -(ssim * b1 * wi);
-            dc[i] = F::TWO * a1 * wi;
-            total[i] += ssim * (w * own);
+            da[i] = wi * my.fma::<FMA>(half_a2 - half_a1, mx * half_s * (b1 - b2));
+            db[i] = half_s * b1 * wi;
+            dc[i] = half_a1 * wi;
+            total[i] += half_s * (w * twice);
         }
     }
 
@@ -294,17 +312,17 @@ impl<'a, F: Real> Tile<'a, F> {
         if self.job.weight.is_some() {
             self.fill_weights(s, row + REACH);
         }
-        let means = &s.means[in_group];
-        let [px, py, ..] = &s.products[(row + 2 * REACH) % RING];
-        let [l1, _, square] = &mut *s.totals;
+        let means = &s.means.0[in_group];
+        let [px, py, ..] = &s.products.0[(row + 2 * REACH) % RING];
+        let [l1, _, square] = &mut s.totals.0;
         let d = &mut d[row * self.job.width + self.x0..][..self.columns];
         let taps = &self.job.taps;
-        let (d_l1, d_ssim) = (self.job.d_l1, self.job.d_ssim);
+        let (d_l1, twice) = (self.job.d_l1, F::TWO * self.job.d_ssim);
         let n = d.len().min(READ - TAPS + 1);
         let [a, b, c] = means.each_ref().map(|row| read(row, SHIFT));
         let d = &mut d[..n];
         let (px, py) = (read(px, PRODUCT_HALO), read(py, PRODUCT_HALO));
-        let (weights, l1, square) = (read(&s.weights, DERIVATIVE_HALO), write(l1, 0), write(square, 0));
+        let (weights, l1, square) = (read(&s.weights.0, DERIVATIVE_HALO), write(l1, 0), write(square, 0));
         for i in 0..n {
             let da = along::<F, FMA>(taps, a, i);
             let db = along::<F, FMA>(taps, b, i);
@@ -312,8 +330,8 @@ impl<'a, F: Real> Tile<'a, F> {
             let (x, y, w) = (px[i], py[i], weights[i]);
             let diff = x - y;
             let sign = if diff > F::ZERO { F::ONE } else { F::ZERO } - if diff < F::ZERO { F::ONE } else { F::ZERO };
-            let inside = if w > F::ZERO { d_ssim } else { F::ZERO };
-            let chain = (F::TWO * x).fma::<FMA>(db, y.fma::<FMA>(dc, da));
+            let inside = if w > F::ZERO { twice } else { F::ZERO };
+            let chain = y.fma::<FMA>(dc, (-x).fma::<FMA>(db, da));
             d[i] = chain.fma::<FMA>(inside, sign * w * d_l1);
             l1[i] += diff.abs() * w;
             let shown = if x < F::ZERO { F::ZERO } else { x };
@@ -341,7 +359,8 @@ fn along<F: Real, const FMA: bool>(taps: &[F; TAPS], row: &[F; READ], i: usize) 
     weigh::<F, FMA>(taps, &row[i..i + TAPS], 0)
 }
 
-/// The scratch columns that lie in the image, of `count` with this halo; the first is image column `x0 + start − halo`.
+/// The scratch columns that lie in the image, of `count` with this halo; the first is image column
+/// `x0 + start − halo`.
 #[inline(always)]
 fn inside(width: usize, x0: usize, halo: usize, count: usize) -> [usize; 2] {
     [halo.saturating_sub(x0), count.min(width + halo - x0)]
@@ -389,28 +408,26 @@ fn products_in<F: Real, const FMA: bool>(
     }
 }
 
-/// Windowed sums down these columns for [`GROUP`] rows of `MAPS` maps; the first reads ring rows `from..from+11`.
+/// Windowed sums down these columns for [`GROUP`] rows of `MAPS` maps; the first reads ring rows
+/// `head + PHASE..head + PHASE + 11`, `head` whole groups.
 #[inline(always)]
-fn vertical<F: Real, const FMA: bool, const MAPS: usize>(
+fn vertical<F: Real, const FMA: bool, const MAPS: usize, const PHASE: usize>(
     taps: &[F; TAPS],
     ring: &Rows<F, MAPS, RING>,
-    from: usize,
+    head: usize,
     columns: [usize; 2],
     out: &mut Rows<F, MAPS, GROUP>,
 ) {
     // Where the group stands in the ring is a constant of each copy of the loop, which then needs one pointer, not 14.
-    match from % RING / 2 {
-        0 => vertical_at::<F, FMA, MAPS>(taps, ring, 0, columns, out),
-        1 => vertical_at::<F, FMA, MAPS>(taps, ring, 2, columns, out),
-        2 => vertical_at::<F, FMA, MAPS>(taps, ring, 4, columns, out),
-        3 => vertical_at::<F, FMA, MAPS>(taps, ring, 6, columns, out),
-        4 => vertical_at::<F, FMA, MAPS>(taps, ring, 8, columns, out),
-        5 => vertical_at::<F, FMA, MAPS>(taps, ring, 10, columns, out),
-        6 => vertical_at::<F, FMA, MAPS>(taps, ring, 12, columns, out),
-        _ => vertical_at::<F, FMA, MAPS>(taps, ring, 14, columns, out),
+    match head % RING / GROUP {
+        0 => vertical_at::<F, FMA, MAPS>(taps, ring, PHASE, columns, out),
+        1 => vertical_at::<F, FMA, MAPS>(taps, ring, GROUP + PHASE, columns, out),
+        2 => vertical_at::<F, FMA, MAPS>(taps, ring, 2 * GROUP + PHASE, columns, out),
+        _ => vertical_at::<F, FMA, MAPS>(taps, ring, 3 * GROUP + PHASE, columns, out),
     }
 }
 
+/// The same from one place of the ring on.
 #[inline(always)]
 fn vertical_at<F: Real, const FMA: bool, const MAPS: usize>(
     taps: &[F; TAPS],
