@@ -16,9 +16,12 @@
 //! through the stages: products → vertical means → horizontal means and S's derivatives → vertical means → horizontal
 //! means and the gradient. Products and derivatives live in rings of 16 rows, which stay in the second-level cache.
 //! The loops are plain ones over a row, because LLVM vectorises those reliably, and blocks of lanes it does not.
+//!
+//! A windowed sum is eleven loads, five additions and six multiply-adds, so loads are what it waits for: scratch rows
+//! start at cache lines, rings are arrays whose offsets are constants, and sums are kept by column until a strip ends.
 
 use splat4d::math::Real;
-use splat4d::simd::Pass;
+use splat4d::simd::{Pass, each};
 
 /// Taps of the window and their reach on either side (Wang 2004; 3DGS `loss_utils`).
 pub(super) const TAPS: usize = 11;
@@ -37,13 +40,24 @@ const GROUP: usize = 4;
 const SPAN: usize = GROUP + TAPS - 1;
 /// Rows in a ring: a span, rounded up to a power of two.
 const RING: usize = 16;
+/// Rows by which the place of the gradient's derivatives in the ring, ten rows back, is past a whole group.
+const LAG: usize = (RING - 2 * REACH) % GROUP;
 /// Moments (x, y, xx+yy, xy) and derivatives.
 const MOMENTS: usize = 4;
 const DERIVATIVES: usize = 3;
 /// Widest run of columns worked on at a time, so that the rings fit the second-level cache.
 const MAX_COLUMNS: usize = 512;
-/// Numbers in a scratch row: columns, a window's halo twice, each rounded up to whole lanes.
-const STRIDE: usize = MAX_COLUMNS + 32;
+/// Numbers in a scratch row, whole cache lines: columns, the products' halo on both sides, and room for [`READ`] from
+/// the derivatives' first column on.
+const STRIDE: usize = MAX_COLUMNS + 3 * PRODUCT_HALO;
+/// Most numbers that a horizontal pass reads of a row: a window's rest more than it makes.
+const READ: usize = MAX_COLUMNS + 2 * DERIVATIVE_HALO + TAPS - 1;
+/// Columns of derivatives and of products on either side of the gradient's: a window's reach and twice that, in whole
+/// lanes.
+const DERIVATIVE_HALO: usize = 8;
+const PRODUCT_HALO: usize = 16;
+/// First column of a window less the column of its result, one pass being a halo of 8 further in.
+const SHIFT: usize = DERIVATIVE_HALO - REACH;
 
 /// One strip's work.
 pub(super) struct Strip<'a, F> {
@@ -74,31 +88,42 @@ pub(super) fn window<F: Real>() -> [F; TAPS] {
     std::array::from_fn(|i| F::of(bell(i) / sum))
 }
 
+/// Rows of maps.
+type Rows<F, const MAPS: usize, const N: usize> = [[[F; STRIDE]; MAPS]; N];
+
+/// Starts at a cache line, as every row then does: half the registers of a row elsewhere would span two lines.
+#[derive(Debug)]
+#[repr(align(64))]
+struct Lines<T>(T);
+
 /// Working rows of one thread.
 #[derive(Debug)]
 pub(super) struct Scratch<F> {
     /// Ring of products, `[RING, MOMENTS, STRIDE]`.
-    products: Vec<[F; STRIDE]>,
-    /// Ring of S's derivatives, `[RING, DERIVATIVES, STRIDE]`.
-    derivatives: Vec<[F; STRIDE]>,
-    /// Vertical means of one group, `[GROUP, MOMENTS, STRIDE]`.
-    means: Vec<[F; STRIDE]>,
-    /// Weights from column −5 on, 0 outside the image, `[STRIDE]`.
-    weights: Box<[F; STRIDE]>,
-    /// Results of one row, `[3, STRIDE]`.
-    row: Vec<[F; STRIDE]>,
+    products: Box<Lines<Rows<F, MOMENTS, RING>>>,
+    /// Ring of S's derivatives ½∂S/∂⟨x⟩, −∂S/∂⟨xx+yy⟩, ½∂S/∂⟨xy⟩, which need fewest operations,
+    /// `[RING, DERIVATIVES, STRIDE]`.
+    derivatives: Box<Lines<Rows<F, DERIVATIVES, RING>>>,
+    /// Vertical means of one group of moments, `[GROUP, MOMENTS, STRIDE]`; zero outside the image.
+    moments: Box<Lines<Rows<F, MOMENTS, GROUP>>>,
+    /// Vertical means of one group of derivatives, `[GROUP, DERIVATIVES, STRIDE]`.
+    means: Box<Lines<Rows<F, DERIVATIVES, GROUP>>>,
+    /// Weights of a row of derivatives, 0 outside the image, `[STRIDE]`.
+    weights: Box<Lines<[F; STRIDE]>>,
+    /// What is summed, by column: |x − y|, S and squared error, with weights.
+    totals: Box<Lines<[[F; STRIDE]; 3]>>,
 }
 
 impl<F: Real> Scratch<F> {
     /// Rows for any strip.
     pub fn new() -> Self {
-        let rows = |n: usize| vec![[F::ZERO; STRIDE]; n];
         Self {
-            products: rows(RING * MOMENTS),
-            derivatives: rows(RING * DERIVATIVES),
-            means: rows(GROUP * MOMENTS),
-            weights: Box::new([F::ZERO; STRIDE]),
-            row: rows(3),
+            products: Box::new(Lines([[[F::ZERO; STRIDE]; MOMENTS]; RING])),
+            derivatives: Box::new(Lines([[[F::ZERO; STRIDE]; DERIVATIVES]; RING])),
+            moments: Box::new(Lines([[[F::ZERO; STRIDE]; MOMENTS]; GROUP])),
+            means: Box::new(Lines([[[F::ZERO; STRIDE]; DERIVATIVES]; GROUP])),
+            weights: Box::new(Lines([F::ZERO; STRIDE])),
+            totals: Box::new(Lines([[F::ZERO; STRIDE]; 3])),
         }
     }
 }
@@ -108,7 +133,8 @@ impl<F: Real> Pass for Strip<'_, F> {
     type Into = [F];
     type Out = [f64; 3];
 
-    /// [Σ w|x − y|, Σ w S, Σ w e²] over the strip, e the error of the render clamped to [0, 1]; writes its gradient into `d` ([rows, width]).
+    /// [Σ w|x − y|, Σ w S, Σ w e²] over the strip, e the error of the render clamped to [0, 1]; writes its gradient
+    /// into `d` ([rows, width]).
     #[inline(always)]
     fn run<const FMA: bool>(&self, scratch: &mut Scratch<F>, d: &mut [F]) -> [f64; 3] {
         // Column runs of even size, so that no narrow rest pays a full halo.
@@ -126,63 +152,69 @@ impl<F: Real> Pass for Strip<'_, F> {
     }
 }
 
-/// Some columns of a strip. Its derivative row/column i is the image's `first − 5 + i`, its product row/column i the
-/// image's `first − 10 + i`: a derivative at i then needs the products i..i+11, the gradient at i the derivatives
-/// i..i+11.
+/// Some columns of a strip. Its derivative row i is the image's `first − 5 + i`, its product row i the image's
+/// `first − 10 + i`: a derivative at i then needs the products i..i+11, the gradient at i the derivatives i..i+11.
+/// Columns have halos of [`DERIVATIVE_HALO`] and [`PRODUCT_HALO`] instead; nothing outside the image is computed.
 struct Tile<'a, F> {
     job: &'a Strip<'a, F>,
     x0: usize,
     columns: usize,
     rows: usize,
-    /// Columns of a pass, in whole lanes.
-    derivative_columns: usize,
-    product_columns: usize,
+    /// Scratch columns of derivatives that are in the image, rounded up to whole lanes.
+    derivatives: [usize; 2],
+    /// Scratch columns of products that are in the image.
+    products: [usize; 2],
 }
 
 impl<'a, F: Real> Tile<'a, F> {
     fn new(job: &'a Strip<'a, F>, x0: usize, columns: usize, rows: usize) -> Self {
-        let derivative_columns = (columns + TAPS - 1).next_multiple_of(LANES);
-        let product_columns = (derivative_columns + TAPS - 1).next_multiple_of(LANES);
-        Self { job, x0, columns, rows, derivative_columns, product_columns }
+        let [start, end] = inside(job.width, x0, DERIVATIVE_HALO, columns + 2 * DERIVATIVE_HALO);
+        let derivatives = [start, end.next_multiple_of(LANES)];
+        let products = inside(job.width, x0, PRODUCT_HALO, columns + 2 * PRODUCT_HALO);
+        Self { job, x0, columns, rows, derivatives, products }
     }
 
     #[inline(always)]
     fn walk<const FMA: bool>(&self, s: &mut Scratch<F>, d: &mut [F]) -> [f64; 3] {
-        let mut sums = [0.0; 3];
+        s.totals.0.as_flattened_mut().fill(F::ZERO);
+        clear(&mut s.products.0[..], self.products);
+        clear(&mut s.moments.0[..], self.products);
+        clear(&mut s.derivatives.0[..], self.derivatives);
+        clear(&mut s.means.0[..], self.derivatives);
         self.fill_weights(s, 0);
         for row in 0..2 * REACH {
-            self.fill_products(s, row);
+            self.fill_products::<FMA>(s, row);
         }
         // At `head`, derivative rows head..head+4 are made, and with them gradient rows head−10..head−6.
         let mut head = 0;
         while head < self.rows + 2 * REACH {
             for row in 0..GROUP {
-                self.fill_products(s, head + 2 * REACH + row);
+                self.fill_products::<FMA>(s, head + 2 * REACH + row);
             }
-            vertical::<F, FMA, MOMENTS>(&self.job.taps, &s.products, head, self.product_columns, &mut s.means);
+            vertical::<F, FMA, MOMENTS, 0>(&self.job.taps, &s.products.0, head, self.products, &mut s.moments.0);
             for row in 0..GROUP {
-                sums[1] += self.derivatives::<FMA>(s, head + row, row);
+                self.derivatives::<FMA>(s, head + row, row);
             }
             if head + GROUP > 2 * REACH {
                 // A group that straddles the strip's first row reads rows before it from the ring; they are not used.
-                let from = (head + RING - 2 * REACH) % RING;
-                vertical::<F, FMA, DERIVATIVES>(
+                vertical::<F, FMA, DERIVATIVES, LAG>(
                     &self.job.taps,
-                    &s.derivatives,
-                    from,
-                    self.derivative_columns,
-                    &mut s.means,
+                    &s.derivatives.0,
+                    head + RING - 2 * REACH - LAG,
+                    self.derivatives,
+                    &mut s.means.0,
                 );
                 for row in 0..GROUP {
                     if (2 * REACH..self.rows + 2 * REACH).contains(&(head + row)) {
-                        let [l1, square] = self.gradient::<FMA>(s, head + row - 2 * REACH, row, d);
-                        (sums[0], sums[2]) = (sums[0] + l1, sums[2] + square);
+                        self.gradient::<FMA>(s, head + row - 2 * REACH, row, d);
                     }
                 }
             }
             head += GROUP;
         }
-        sums
+        let [l1, ssim, square] = &s.totals.0;
+        let own = DERIVATIVE_HALO..DERIVATIVE_HALO + self.columns;
+        [sum(&l1[..self.columns]), sum(&ssim[own]), sum(&square[..self.columns])]
     }
 
     /// The image's row for derivative row `row`, if it has one.
@@ -191,165 +223,226 @@ impl<'a, F: Real> Tile<'a, F> {
         (self.job.first + row).checked_sub(halo).filter(|&y| y < self.job.height)
     }
 
-    /// The scratch columns that lie in the image, of `count` with this halo; the first is image column `x0 + start −
-    /// halo`.
-    #[inline(always)]
-    fn inside(&self, halo: usize, count: usize) -> (usize, usize) {
-        let start = halo.saturating_sub(self.x0);
-        (start, count.min(self.job.width + halo - self.x0))
-    }
-
-    /// Weights of the image row that derivative row `row` stands for (its halo is 5 columns).
+    /// Weights of the image row that derivative row `row` stands for.
     #[inline(always)]
     fn fill_weights(&self, s: &mut Scratch<F>, row: usize) {
-        let (start, end) = self.inside(REACH, self.derivative_columns);
+        let [start, end] = inside(self.job.width, self.x0, DERIVATIVE_HALO, self.columns + 2 * DERIVATIVE_HALO);
         match (self.job.weight, self.image_row(row, REACH)) {
             (None, _) => {
-                s.weights.fill(F::ZERO);
-                s.weights[start..end].fill(F::ONE);
+                s.weights.0.fill(F::ZERO);
+                s.weights.0[start..end].fill(F::ONE);
             }
             (Some(weight), Some(y)) => {
-                let from = y * self.job.width + self.x0 + start - REACH;
-                s.weights.fill(F::ZERO);
-                s.weights[start..end].copy_from_slice(&weight[from..from + end - start]);
+                let from = y * self.job.width + self.x0 + start - DERIVATIVE_HALO;
+                s.weights.0.fill(F::ZERO);
+                s.weights.0[start..end].copy_from_slice(&weight[from..from + end - start]);
             }
-            (Some(_), None) => s.weights.fill(F::ZERO),
+            (Some(_), None) => s.weights.0.fill(F::ZERO),
         }
     }
 
     /// Products of one row; zero outside the image and where the weight is zero.
     #[inline(always)]
-    fn fill_products(&self, s: &mut Scratch<F>, row: usize) {
-        let (out, _) = s.products[row % RING * MOMENTS..].split_first_chunk_mut::<MOMENTS>().expect("a ring row");
+    fn fill_products<const FMA: bool>(&self, s: &mut Scratch<F>, row: usize) {
+        let [start, end] = self.products;
+        let out = s.products.0[row % RING].each_mut().map(|part| &mut part[start..end]);
         let Some(y) = self.image_row(row, 2 * REACH) else {
-            out.as_flattened_mut().fill(F::ZERO);
+            out.into_iter().for_each(|part| part.fill(F::ZERO));
             return;
         };
-        let (start, end) = self.inside(2 * REACH, self.product_columns);
-        let from = y * self.job.width + self.x0 + start - 2 * REACH;
-        let n = end - start;
-        let (render, truth) = (&self.job.render[from..from + n], &self.job.truth[from..from + n]);
-        for part in out.iter_mut() {
-            part[..start].fill(F::ZERO);
-            part[end..].fill(F::ZERO);
-        }
-        let [a, b, c, e] = out.each_mut().map(|part| &mut part[start..end]);
-        a.copy_from_slice(render);
-        b.copy_from_slice(truth);
-        if let Some(weight) = self.job.weight {
-            let weight = &weight[from..from + n];
-            for i in 0..n {
-                if weight[i] <= F::ZERO {
-                    (a[i], b[i]) = (F::ZERO, F::ZERO);
-                }
+        let from = y * self.job.width + self.x0 + start - PRODUCT_HALO;
+        let (render, truth) = (&self.job.render[from..from + end - start], &self.job.truth[from..from + end - start]);
+        let [a, b, c, e] = out;
+        match self.job.weight {
+            None => products::<F, FMA>(render, truth, a, b, c, e),
+            Some(weight) => {
+                let weight = &weight[from..from + end - start];
+                products_in::<F, FMA>(weight, render, truth, a, b, c, e);
             }
-        }
-        for i in 0..n {
-            c[i] = a[i] * a[i] + b[i] * b[i];
-            e[i] = a[i] * b[i];
         }
     }
 
-    /// Horizontal means of one row of a group, S and its weighted derivatives; returns Σ w S over the tile's own pixels.
+    /// Horizontal means of one row of a group, S and its weighted derivatives.
     #[inline(always)]
-    fn derivatives<const FMA: bool>(&self, s: &mut Scratch<F>, row: usize, in_group: usize) -> f64 {
-        let slot = row % RING * DERIVATIVES;
+    fn derivatives<const FMA: bool>(&self, s: &mut Scratch<F>, row: usize, in_group: usize) {
         if self.image_row(row, REACH).is_none() {
-            s.derivatives[slot..slot + DERIVATIVES].as_flattened_mut().fill(F::ZERO);
-            return 0.0;
+            s.derivatives.0[row % RING].as_flattened_mut().fill(F::ZERO);
+            return;
         }
         if self.job.weight.is_some() {
             self.fill_weights(s, row);
         }
-        let (out, _) = s.derivatives[slot..].split_first_chunk_mut::<DERIVATIVES>().expect("a ring row");
-        let (means, _) = s.means[in_group * MOMENTS..].split_first_chunk::<MOMENTS>().expect("a row of means");
-        let map = &mut s.row[0];
+        let (out, means) = (&mut s.derivatives.0[row % RING], &s.moments.0[in_group]);
+        let total = &mut s.totals.0[1];
+        let twice = if (REACH..self.rows + REACH).contains(&row) { F::TWO } else { F::ZERO };
         let taps = &self.job.taps;
         let (c1, c2) = (F::of(C1), F::of(C2));
-        let [da, db, dc] = out;
-        for i in 0..self.derivative_columns.min(STRIDE - TAPS + 1) {
-            let mx = along::<F, FMA>(taps, &means[0], i);
-            let my = along::<F, FMA>(taps, &means[1], i);
-            let sq = along::<F, FMA>(taps, &means[2], i);
-            let xy = along::<F, FMA>(taps, &means[3], i);
+        let [start, end] = self.derivatives;
+        // Arrays and a length that the compiler knows to be within them: no bound is checked in the loop.
+        let n = (end - start).min(READ - TAPS + 1);
+        let [x, y, squares, cross] = means.each_ref().map(|row| read(row, start + SHIFT));
+        let [da, db, dc] = out.each_mut().map(|row| write(row, start));
+        let (weights, total) = (read(&s.weights.0, start), write(total, start));
+        for i in 0..n {
+            let mx = along::<F, FMA>(taps, x, i);
+            let my = along::<F, FMA>(taps, y, i);
+            let sq = along::<F, FMA>(taps, squares, i);
+            let xy = along::<F, FMA>(taps, cross, i);
             let mxy = mx * my;
             let m2 = mx.fma::<FMA>(mx, my * my);
-            let a1 = F::TWO.fma::<FMA>(mxy, c1);
-            let a2 = F::TWO.fma::<FMA>(xy - mxy, c2);
+            let half_a1 = mxy + c1 * F::HALF;
+            let half_a2 = (xy - mxy) + c2 * F::HALF;
             let b1 = m2 + c1;
             // Rounding can make a variance negative; b2 must not follow.
             let b2 = (sq - m2).max(F::ZERO) + c2;
-            let inv = F::ONE / (b1 * b2);
-            let ssim = a1 * a2 * inv;
-            let w = s.weights[i];
+            let inv = F::TWO / (b1 * b2);
+            let half_s = half_a1 * half_a2 * inv;
+            let w = weights[i];
             let wi = w * inv;
-            da[i] = F::TWO * wi * my.fma::<FMA>(a2 - a1, mx * ssim * (b1 - b2));
-            db[i] = -(ssim * b1 * wi);
-            dc[i] = F::TWO * a1 * wi;
-            map[i] = ssim * w;
+            da[i] = wi * my.fma::<FMA>(half_a2 - half_a1, mx * half_s * (b1 - b2));
+            db[i] = half_s * b1 * wi;
+            dc[i] = half_a1 * wi;
+            total[i] += half_s * (w * twice);
         }
-        let own = (REACH..self.rows + REACH).contains(&row);
-        if own { sum(&map[REACH..REACH + self.columns]) } else { 0.0 }
     }
 
-    /// Horizontal means of the derivatives of one row of a group, and the gradient; returns Σ w|x − y| and Σ w e².
+    /// Horizontal means of the derivatives of one row of a group, and the gradient.
     #[inline(always)]
-    fn gradient<const FMA: bool>(&self, s: &mut Scratch<F>, row: usize, in_group: usize, d: &mut [F]) -> [f64; 2] {
+    fn gradient<const FMA: bool>(&self, s: &mut Scratch<F>, row: usize, in_group: usize, d: &mut [F]) {
         if self.job.weight.is_some() {
             self.fill_weights(s, row + REACH);
         }
-        let (means, _) = s.means[in_group * DERIVATIVES..].split_first_chunk::<DERIVATIVES>().expect("a row of means");
-        let slot = (row + 2 * REACH) % RING * MOMENTS;
-        let (px, py) = (&s.products[slot], &s.products[slot + 1]);
-        let [out, l1, square] = s.row.first_chunk_mut::<3>().expect("three rows of results");
+        let means = &s.means.0[in_group];
+        let [px, py, ..] = &s.products.0[(row + 2 * REACH) % RING];
+        let [l1, _, square] = &mut s.totals.0;
+        let d = &mut d[row * self.job.width + self.x0..][..self.columns];
         let taps = &self.job.taps;
-        let (d_l1, d_ssim) = (self.job.d_l1, self.job.d_ssim);
-        for i in 0..self.columns.min(STRIDE - TAPS + 1 - REACH) {
-            let da = along::<F, FMA>(taps, &means[0], i);
-            let db = along::<F, FMA>(taps, &means[1], i);
-            let dc = along::<F, FMA>(taps, &means[2], i);
-            let (x, y, w) = (px[i + 2 * REACH], py[i + 2 * REACH], s.weights[i + REACH]);
+        let (d_l1, twice) = (self.job.d_l1, F::TWO * self.job.d_ssim);
+        let n = d.len().min(READ - TAPS + 1);
+        let [a, b, c] = means.each_ref().map(|row| read(row, SHIFT));
+        let d = &mut d[..n];
+        let (px, py) = (read(px, PRODUCT_HALO), read(py, PRODUCT_HALO));
+        let (weights, l1, square) = (read(&s.weights.0, DERIVATIVE_HALO), write(l1, 0), write(square, 0));
+        for i in 0..n {
+            let da = along::<F, FMA>(taps, a, i);
+            let db = along::<F, FMA>(taps, b, i);
+            let dc = along::<F, FMA>(taps, c, i);
+            let (x, y, w) = (px[i], py[i], weights[i]);
             let diff = x - y;
             let sign = if diff > F::ZERO { F::ONE } else { F::ZERO } - if diff < F::ZERO { F::ONE } else { F::ZERO };
-            let inside = if w > F::ZERO { d_ssim } else { F::ZERO };
-            let chain = (F::TWO * x).fma::<FMA>(db, y.fma::<FMA>(dc, da));
-            out[i] = chain.fma::<FMA>(inside, sign * w * d_l1);
-            l1[i] = diff.abs() * w;
+            let inside = if w > F::ZERO { twice } else { F::ZERO };
+            let chain = y.fma::<FMA>(dc, (-x).fma::<FMA>(db, da));
+            d[i] = chain.fma::<FMA>(inside, sign * w * d_l1);
+            l1[i] += diff.abs() * w;
             let shown = if x < F::ZERO { F::ZERO } else { x };
             let e = if shown > F::ONE { F::ONE } else { shown } - y;
-            square[i] = e * e * w;
+            square[i] += e * e * w;
         }
-        d[row * self.job.width + self.x0..][..self.columns].copy_from_slice(&out[..self.columns]);
-        [sum(&l1[..self.columns]), sum(&square[..self.columns])]
     }
+}
+
+/// The part of a row that a horizontal pass reads.
+#[inline(always)]
+fn read<F>(row: &[F; STRIDE], from: usize) -> &[F; READ] {
+    row[from..].first_chunk().expect("a row has room for the widest tile")
+}
+
+/// The part of a row that a horizontal pass writes.
+#[inline(always)]
+fn write<F>(row: &mut [F; STRIDE], from: usize) -> &mut [F; READ] {
+    row[from..].first_chunk_mut().expect("a row has room for the widest tile")
 }
 
 /// The windowed sum along a row; reads columns `i..i+11`.
 #[inline(always)]
-fn along<F: Real, const FMA: bool>(taps: &[F; TAPS], row: &[F; STRIDE], i: usize) -> F {
+fn along<F: Real, const FMA: bool>(taps: &[F; TAPS], row: &[F; READ], i: usize) -> F {
     weigh::<F, FMA>(taps, &row[i..i + TAPS], 0)
 }
 
-/// Windowed sums down the columns for [`GROUP`] rows of `MAPS` maps; the first reads ring rows `from..from+11`.
+/// The scratch columns that lie in the image, of `count` with this halo; the first is image column
+/// `x0 + start − halo`.
 #[inline(always)]
-fn vertical<F: Real, const FMA: bool, const MAPS: usize>(
-    taps: &[F; TAPS],
-    ring: &[[F; STRIDE]],
-    from: usize,
-    columns: usize,
-    out: &mut [[F; STRIDE]],
+fn inside(width: usize, x0: usize, halo: usize, count: usize) -> [usize; 2] {
+    [halo.saturating_sub(x0), count.min(width + halo - x0)]
+}
+
+/// Zeroes what is beside these columns.
+fn clear<F: Real, const MAPS: usize>(rows: &mut [[[F; STRIDE]; MAPS]], [start, end]: [usize; 2]) {
+    for part in rows.as_flattened_mut() {
+        part[..start].fill(F::ZERO);
+        part[end..].fill(F::ZERO);
+    }
+}
+
+/// x, y, xx + yy and xy of a row.
+#[inline(always)]
+fn products<F: Real, const FMA: bool>(x: &[F], y: &[F], a: &mut [F], b: &mut [F], c: &mut [F], e: &mut [F]) {
+    let n = x.len();
+    let (y, a, b, c, e) = (&y[..n], &mut a[..n], &mut b[..n], &mut c[..n], &mut e[..n]);
+    for i in 0..n {
+        (a[i], b[i]) = (x[i], y[i]);
+        c[i] = x[i].fma::<FMA>(x[i], y[i] * y[i]);
+        e[i] = x[i] * y[i];
+    }
+}
+
+/// The same, zero where the weight is zero.
+#[inline(always)]
+fn products_in<F: Real, const FMA: bool>(
+    weight: &[F],
+    x: &[F],
+    y: &[F],
+    a: &mut [F],
+    b: &mut [F],
+    c: &mut [F],
+    e: &mut [F],
 ) {
-    let ring = &ring[..RING * MAPS];
-    let (out, _) = out.as_chunks_mut::<MAPS>();
+    let n = x.len();
+    let (w, y, a, b, c, e) = (&weight[..n], &y[..n], &mut a[..n], &mut b[..n], &mut c[..n], &mut e[..n]);
+    for i in 0..n {
+        let x = if w[i] > F::ZERO { x[i] } else { F::ZERO };
+        let y = if w[i] > F::ZERO { y[i] } else { F::ZERO };
+        (a[i], b[i]) = (x, y);
+        c[i] = x.fma::<FMA>(x, y * y);
+        e[i] = x * y;
+    }
+}
+
+/// Windowed sums down these columns for [`GROUP`] rows of `MAPS` maps; the first reads ring rows
+/// `head + PHASE..head + PHASE + 11`, `head` whole groups.
+#[inline(always)]
+fn vertical<F: Real, const FMA: bool, const MAPS: usize, const PHASE: usize>(
+    taps: &[F; TAPS],
+    ring: &Rows<F, MAPS, RING>,
+    head: usize,
+    columns: [usize; 2],
+    out: &mut Rows<F, MAPS, GROUP>,
+) {
+    // Where the group stands in the ring is a constant of each copy of the loop, which then needs one pointer, not 14.
+    match head % RING / GROUP {
+        0 => vertical_at::<F, FMA, MAPS>(taps, ring, PHASE, columns, out),
+        1 => vertical_at::<F, FMA, MAPS>(taps, ring, GROUP + PHASE, columns, out),
+        2 => vertical_at::<F, FMA, MAPS>(taps, ring, 2 * GROUP + PHASE, columns, out),
+        _ => vertical_at::<F, FMA, MAPS>(taps, ring, 3 * GROUP + PHASE, columns, out),
+    }
+}
+
+/// The same from one place of the ring on.
+#[inline(always)]
+fn vertical_at<F: Real, const FMA: bool, const MAPS: usize>(
+    taps: &[F; TAPS],
+    ring: &Rows<F, MAPS, RING>,
+    from: usize,
+    [start, end]: [usize; 2],
+    out: &mut Rows<F, MAPS, GROUP>,
+) {
     for map in 0..MAPS {
-        let rows: [&[F; STRIDE]; SPAN] = std::array::from_fn(|t| &ring[(from + t) % RING * MAPS + map]);
-        let [o0, o1, o2, o3] = out.first_chunk_mut::<GROUP>().expect("a group of rows").each_mut().map(|m| &mut m[map]);
-        for i in 0..columns.min(STRIDE) {
-            let v: [F; SPAN] = std::array::from_fn(|t| rows[t][i]);
-            o0[i] = weigh::<F, FMA>(taps, &v, 0);
-            o1[i] = weigh::<F, FMA>(taps, &v, 1);
-            o2[i] = weigh::<F, FMA>(taps, &v, 2);
-            o3[i] = weigh::<F, FMA>(taps, &v, 3);
+        for i in start..end.min(STRIDE) {
+            let v: [F; SPAN] = each(|t| ring[(from + t) % RING][map][i]);
+            out[0][map][i] = weigh::<F, FMA>(taps, &v, 0);
+            out[1][map][i] = weigh::<F, FMA>(taps, &v, 1);
+            out[2][map][i] = weigh::<F, FMA>(taps, &v, 2);
+            out[3][map][i] = weigh::<F, FMA>(taps, &v, 3);
         }
     }
 }
