@@ -54,7 +54,7 @@ recipe! {
     /// Seed of every random choice.
     seed: u64 = 0,
     /// Training steps in all.
-    iterations: usize = 5500,
+    iterations: usize = 7000,
     /// Views a step.
     batch_size: usize = 1,
     /// Images are reduced by this factor (mean of k×k boxes).
