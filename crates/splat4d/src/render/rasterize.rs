@@ -1,7 +1,7 @@
 //! Rasterises sorted splats, a few channels at a time, and the way back.
 //!
-//! A bin of 32² pixels is one task: its splats are gathered once into records ([`super::gather`]), which pass through
-//! its tiles front to back ([`super::blend`]). Any number of channels is any number of passes over the same projection.
+//! A bin of 32² pixels is one task: its splats are gathered once into records (`gather.rs`), which pass through
+//! its tiles front to back (`blend.rs`). Any number of channels is any number of passes over the same projection.
 
 use super::RenderConfig;
 use super::bin::{BIN, Bins, Footprint, PAIR_BUDGET, id};
