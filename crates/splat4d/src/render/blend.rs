@@ -14,12 +14,11 @@
 mod tests;
 
 use super::RenderConfig;
-use super::gather::{Record, SIDE, TILE, TILES, greatest, least};
+use super::gather::{Record, SIDE, TILE, TILES};
 use super::project::ALPHA_FLOOR;
 use super::rasterize::{CHANNELS, PixelGrads};
-use super::simd::Kernel;
+use super::simd::{Kernel, each, greatest, least, select};
 use crate::math::Real;
-use crate::simd::each;
 use std::f64::consts::LN_2;
 use std::ops::Range;
 
@@ -88,13 +87,6 @@ impl<F: Real> Limits<F> {
             t_min: F::of(config.transmittance_min.max(T_FLOOR)),
         }
     }
-}
-
-/// One of two values that are both at hand. Without the hint LLVM makes a branch of it, and of the branch a masked
-/// store, which costs tens of cycles.
-#[inline(always)]
-fn select<F: Real>(condition: bool, yes: F, no: F) -> F {
-    std::hint::select_unpredictable(condition, yes, no)
 }
 
 /// What happens to a splat in a tile.

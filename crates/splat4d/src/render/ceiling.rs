@@ -5,10 +5,10 @@
 //! [`bandwidth`] is a triad over buffers far larger than any cache. Both are the best of several short runs, because
 //! everything that disturbs a measurement makes it slower.
 
-use super::simd::{Kernel, Simd, dispatch};
+use super::simd::{Kernel, Simd, dispatch, least, select};
 use crate::math::Real;
 use rayon::prelude::*;
-use std::hint::{black_box, select_unpredictable};
+use std::hint::black_box;
 use std::time::Instant;
 
 /// Splats that pass the pixels in one run: about a millisecond.
@@ -143,12 +143,12 @@ fn pass<const LANES: usize, const FMA: bool>(s: &Splat<LANES>, row: &mut Row<LAN
     let mut weight = [0.0; LANES];
     for l in 0..LANES {
         let power = least(q[l].fma::<FMA>(dy[l], s.ax[l]), s.top[l]);
-        let alpha = select_unpredictable(power >= s.log_min[l], power.blend_exp2::<FMA>(), 0.0);
+        let alpha = select(power >= s.log_min[l], power.blend_exp2::<FMA>(), 0.0);
         let full = alpha * t[l];
         let kept = t[l] - full;
         let open = kept >= s.t_min[l];
-        weight[l] = select_unpredictable(open, full, 0.0);
-        t[l] = select_unpredictable(open, kept, -t[l].abs());
+        weight[l] = select(open, full, 0.0);
+        t[l] = select(open, kept, -t[l].abs());
         q[l] -= s.step[0][l];
         dy[l] -= s.step[1][l];
     }
@@ -158,12 +158,6 @@ fn pass<const LANES: usize, const FMA: bool>(s: &Splat<LANES>, row: &mut Row<LAN
         }
     }
     *row = Row { q, dy, t, color };
-}
-
-/// The smaller, in one instruction.
-#[inline(always)]
-fn least(a: f32, b: f32) -> f32 {
-    if a < b { a } else { b }
 }
 
 #[cfg(test)]

@@ -4,7 +4,7 @@
 use super::bin::{BIN, id};
 use super::project::{Projected, TAU_MARGIN};
 use super::rasterize::CHANNELS;
-use super::simd::Kernel;
+use super::simd::{Kernel, greatest, least};
 use crate::math::Real;
 use crate::scene::BLOCK;
 use std::f64::consts::LOG2_E;
@@ -47,24 +47,6 @@ impl<F> Record<F> {
         let (top, [first, end]) = (ty * TILE, self.rows[tx % SIDE]);
         usize::from(first).saturating_sub(top)..usize::from(end).saturating_sub(top).min(TILE)
     }
-
-    /// Pixels that the blend loop evaluates.
-    pub fn work(&self) -> usize {
-        let touched = (0..TILES).filter(|t| self.mask >> t & 1 == 1);
-        touched.map(|t| self.tile_rows(t % SIDE, t / SIDE).len() * TILE).sum()
-    }
-}
-
-/// The smaller; unlike `f32::min` one instruction.
-#[inline(always)]
-pub(super) fn least<F: Real>(a: F, b: F) -> F {
-    if a < b { a } else { b }
-}
-
-/// The larger, in one instruction.
-#[inline(always)]
-pub(super) fn greatest<F: Real>(a: F, b: F) -> F {
-    if a > b { a } else { b }
 }
 
 /// Gathers the records of one bin.

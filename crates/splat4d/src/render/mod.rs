@@ -514,11 +514,6 @@ impl<F: Real> Renderer<F> {
         self.seconds
     }
 
-    /// Pixels that the blend loop evaluates for the last render's pairs, were no pixel to stop early.
-    pub fn blend_work(&self) -> usize {
-        self.raster.blend_work()
-    }
-
     /// Counts of the last render.
     pub fn stats(&self) -> RenderStats {
         RenderStats {

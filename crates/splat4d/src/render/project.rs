@@ -4,7 +4,7 @@
 //! in gsplat; no 3σ cap on the extent (SnugBox, Hanson et al. 2024).
 
 use super::bin::{BIN, Footprint, MASK_SIDE};
-use super::simd::{Kernel, Simd, dispatch};
+use super::simd::{Kernel, Simd, dispatch, greatest, least, select};
 use super::{Antialias, PartGrads, RenderConfig};
 use crate::math::Real;
 use crate::scene::splats::{COV, SPLAT_OPACITY};
@@ -159,24 +159,6 @@ fn sym_vec<F: Real>(s: [F; 6], v: [F; 3]) -> [F; 3] {
 fn in_camera<F: Real>(view: &View<F>, mean: [F; 3]) -> [F; 3] {
     let (r, t) = (&view.rotation, &view.translation);
     [dot(r[0], mean) + t[0], dot(r[1], mean) + t[1], dot(r[2], mean) + t[2]]
-}
-
-/// The smaller; unlike `f32::min` one instruction.
-#[inline(always)]
-fn least<F: Real>(a: F, b: F) -> F {
-    if a < b { a } else { b }
-}
-
-/// The larger, in one instruction.
-#[inline(always)]
-fn greatest<F: Real>(a: F, b: F) -> F {
-    if a > b { a } else { b }
-}
-
-/// One of two values that are both at hand.
-#[inline(always)]
-pub(super) fn select<F: Real>(condition: bool, yes: F, no: F) -> F {
-    std::hint::select_unpredictable(condition, yes, no)
 }
 
 #[inline(always)]

@@ -284,11 +284,6 @@ impl<F: Real> Raster<F> {
         self.bins.total as usize
     }
 
-    /// Pixels that the blend loop evaluates for the pairs that are held, were no pixel to stop early.
-    pub fn blend_work(&self) -> usize {
-        self.records.iter().map(Record::work).sum()
-    }
-
     /// Bytes held.
     pub fn memory_bytes(&self) -> usize {
         self.bins.memory_bytes()

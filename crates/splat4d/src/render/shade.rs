@@ -4,9 +4,9 @@
 //! where all rows are drawn, those that are alive elsewhere. The block's columns lie in as many cache lines as one row
 //! does, so that nothing is read for the others' sake.
 
-use super::project::{CHUNK_ROWS, Lanes, Projected, View, select};
+use super::project::{CHUNK_ROWS, Lanes, Projected, View};
 use super::rasterize::CHANNELS;
-use super::simd::{Kernel, Simd, dispatch};
+use super::simd::{Kernel, Simd, dispatch, select};
 use super::{PartGrads, project};
 use crate::math::{Real, sh};
 use crate::scene::splats::{Part, Rows};
