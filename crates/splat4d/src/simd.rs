@@ -6,8 +6,6 @@
 //! Everything that is fast goes through here: this is the one file of the workspace that says `unsafe`.
 #![allow(unsafe_code)] // calling a function that enables a target feature, after that feature was found present
 
-use crate::math::Real;
-
 /// An instruction level; a level that the machine lacks is lowered to the best that it has.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Simd {
@@ -111,20 +109,20 @@ pub fn each<T: Copy + Default, const N: usize>(f: impl Fn(usize) -> T) -> [T; N]
 
 /// The smaller; unlike `f32::min` one instruction.
 #[inline(always)]
-pub fn least<F: Real>(a: F, b: F) -> F {
+pub fn least<T: PartialOrd>(a: T, b: T) -> T {
     if a < b { a } else { b }
 }
 
 /// The larger, in one instruction.
 #[inline(always)]
-pub fn greatest<F: Real>(a: F, b: F) -> F {
+pub fn greatest<T: PartialOrd>(a: T, b: T) -> T {
     if a > b { a } else { b }
 }
 
 /// One of two values that are both at hand. Without the hint LLVM makes a branch of it, and of the branch a masked
 /// store, which costs tens of cycles.
 #[inline(always)]
-pub fn select<F: Real>(condition: bool, yes: F, no: F) -> F {
+pub fn select<T>(condition: bool, yes: T, no: T) -> T {
     std::hint::select_unpredictable(condition, yes, no)
 }
 
