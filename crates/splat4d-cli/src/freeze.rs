@@ -104,7 +104,7 @@ mod tests {
                 *geometry.get_mut(row, LOG_SCALE + k) -= 2.0;
             }
         }
-        let layer = Layer { name: "a".into(), params, motion, life, span: ALWAYS };
+        let layer = Layer { name: "a".into(), params, motion, life, span: ALWAYS, masks: None };
         Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 30.0, ..Scene::default() }
     }
 
@@ -123,7 +123,8 @@ mod tests {
         for time in [0.0, 0.37, 1.0] {
             let mut params = freeze(&scene, time);
             let motion = build(&Spec::Still, &mut params).unwrap();
-            let still = Layer { name: "still".into(), params, motion, life: LifeKind::Infinite, span: ALWAYS };
+            let still =
+                Layer { name: "still".into(), params, motion, life: LifeKind::Infinite, span: ALWAYS, masks: None };
             let frozen = Scene { layers: vec![still], ..Scene::default() };
             let (a, b) = (draw(&scene, time), draw(&frozen, 0.0));
             let worst = a.data.iter().zip(&b.data).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);

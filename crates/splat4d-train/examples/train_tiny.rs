@@ -68,7 +68,7 @@ fn truth() -> Result<Scene<f32>> {
         params[SH].write(i, 0, std::array::from_fn::<f32, 3, _>(|k| rgb_to_dc(r.uniform(10 + k as u64) as f32)));
         params[velocities].write(i, 0, place);
     }
-    let layer = Layer { name: "truth".into(), params, motion, life: LifeKind::Infinite, span: ALWAYS };
+    let layer = Layer { name: "truth".into(), params, motion, life: LifeKind::Infinite, span: ALWAYS, masks: None };
     Ok(Scene { layers: vec![layer], fps: FPS, up: [0.0, 1.0, 0.0], ..Scene::default() })
 }
 

@@ -96,8 +96,14 @@ fn scene() -> splat4d::Result<Scene<f32>> {
         params[SH].write(i, 0, [0.2 + 0.3 * y, 0.4 + 0.5 * y, 0.1].map(rgb_to_dc));
         params[motion.amplitudes].write(i, 0, [0.4 * y * y, 0.0, 0.0]);
     }
-    let layer =
-        Layer { name: "grass".into(), params, motion: Arc::new(motion), life: LifeKind::Infinite, span: ALWAYS };
+    let layer = Layer {
+        name: "grass".into(),
+        params,
+        motion: Arc::new(motion),
+        life: LifeKind::Infinite,
+        span: ALWAYS,
+        masks: None,
+    };
     Ok(Scene { layers: vec![layer], clip: [0.0, 2.0], fps: 30.0, up: [0.0, 1.0, 0.0], ..Scene::default() })
 }
 

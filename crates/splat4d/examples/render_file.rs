@@ -19,7 +19,14 @@ fn load(bytes: &[u8]) -> splat4d::Result<Scene<f32>> {
     }
     let (params, info) = format::ply::read(bytes)?;
     println!("{} Gaussians, spherical harmonics of degree {}", info.gaussians, info.sh_degree);
-    let layer = Layer { name: "ply".into(), params, motion: Arc::new(Still), life: LifeKind::Infinite, span: ALWAYS };
+    let layer = Layer {
+        name: "ply".into(),
+        params,
+        motion: Arc::new(Still),
+        life: LifeKind::Infinite,
+        span: ALWAYS,
+        masks: None,
+    };
     Ok(Scene { layers: vec![layer], fps: 30.0, up: [0.0, -1.0, 0.0], ..Scene::default() })
 }
 

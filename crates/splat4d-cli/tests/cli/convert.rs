@@ -30,7 +30,7 @@ fn moving() -> Scene<f32> {
         params[LIFE].set(row, 0, 0.5);
         params[LIFE].set(row, 1, 1.0);
     }
-    let layer = Layer { name: "birds".into(), params, motion, life, span: ALWAYS };
+    let layer = Layer { name: "birds".into(), params, motion, life, span: ALWAYS, masks: None };
     Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 4.0, up: [0.0, 0.0, 1.0], ..Scene::default() }
 }
 

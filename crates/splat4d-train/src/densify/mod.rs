@@ -256,7 +256,7 @@ mod tests {
             }
             g.write(r, LOG_SCALE, [-2.0; 3]);
         }
-        let layer = Layer { name: "a".into(), params, motion, life: LifeKind::Infinite, span: ALWAYS };
+        let layer = Layer { name: "a".into(), params, motion, life: LifeKind::Infinite, span: ALWAYS, masks: None };
         Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 30.0, ..Scene::default() }
     }
 

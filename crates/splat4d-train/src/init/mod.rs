@@ -156,7 +156,7 @@ pub fn scene(
         }
     }
     let motion = build(&program.spec(plan), &mut params)?;
-    let layer = Layer { name: "scene".into(), params, motion, life, span: ALWAYS };
+    let layer = Layer { name: "scene".into(), params, motion, life, span: ALWAYS, masks: None };
     Ok(Scene { layers: vec![layer], background, clip: plan.clip, fps: plan.fps, up, ..Scene::default() })
 }
 

@@ -227,7 +227,7 @@ mod tests {
                 }
             }
         }
-        let layer = Layer { name: "a".into(), params, motion, life: LifeKind::GaussHalf, span: ALWAYS };
+        let layer = Layer { name: "a".into(), params, motion, life: LifeKind::GaussHalf, span: ALWAYS, masks: None };
         Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 30.0, ..Scene::default() }
     }
 

@@ -100,7 +100,8 @@ mod tests {
             let mut params = Params::new(1, 1, kind.columns());
             let width = params[LIFE].width();
             (0..width).for_each(|k| params[LIFE].set(0, k, row[k]));
-            let layer = Layer { name: "a".into(), params, motion: Arc::new(Still), life: kind, span: ALWAYS };
+            let layer =
+                Layer { name: "a".into(), params, motion: Arc::new(Still), life: kind, span: ALWAYS, masks: None };
             let envelope = Lives::new(&layer).envelope(0);
             for i in 0..50 {
                 let t = -1.0 + 0.05 * f64::from(i);

@@ -39,7 +39,7 @@ fn wall(velocity: [f64; 3], life: LifeKind) -> Scene<f64> {
     let motion = build(&spec, &mut p).unwrap();
     let key = p.find("velocities").unwrap();
     (0..rows).for_each(|r| p[key].write(r, 0, velocity));
-    let layer = Layer { name: "wall".into(), params: p, motion, life, span: ALWAYS };
+    let layer = Layer { name: "wall".into(), params: p, motion, life, span: ALWAYS, masks: None };
     Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 10.0, ..Scene::default() }
 }
 

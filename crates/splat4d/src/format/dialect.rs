@@ -109,8 +109,14 @@ fn moving((scene, warnings): (Scene<f32>, Warnings)) -> Opened {
 
 /// A scene of one layer that stands still, in the axes of a dialect.
 pub fn still(params: Params, dialect: Dialect) -> Scene<f32> {
-    let layer =
-        Layer { name: "gaussians".into(), params, motion: Arc::new(Still), life: LifeKind::Infinite, span: ALWAYS };
+    let layer = Layer {
+        name: "gaussians".into(),
+        params,
+        motion: Arc::new(Still),
+        life: LifeKind::Infinite,
+        span: ALWAYS,
+        masks: None,
+    };
     Scene { layers: vec![layer], up: dialect.up(), fps: DEFAULT_FPS, ..Scene::default() }
 }
 

@@ -180,7 +180,7 @@ pub(super) fn scene(rows: &[Moving], clock: Clock) -> Result<Scene<f32>> {
         }
         rates.write(row, 0, m.turn.map(|w| (w / clock.duration) as f32));
     }
-    let layer = Layer { name: "moving".into(), params, motion, life: kind, span: ALWAYS };
+    let layer = Layer { name: "moving".into(), params, motion, life: kind, span: ALWAYS, masks: None };
     Ok(Scene { layers: vec![layer], clip: clock.clip, fps: clock.fps, up: UP, ..Scene::default() })
 }
 
@@ -214,7 +214,7 @@ pub(super) mod tests {
                 }
             }
         }
-        let layer = Layer { name: "flying".into(), params, motion, life, span: ALWAYS };
+        let layer = Layer { name: "flying".into(), params, motion, life, span: ALWAYS, masks: None };
         Scene { layers: vec![layer], clip: [2.0, 5.0], fps: 25.0, up: UP, ..Scene::default() }
     }
 

@@ -157,7 +157,7 @@ fn read_layer(file: &SafeTensors<'_>, meta: &Value, index: usize) -> Result<Laye
     if let Some(array) = params.unclaimed().first() {
         return Err(broken(format!("array `{}` belongs to no table of this layer", array.name)));
     }
-    Ok(Layer { name: text(meta, "name")?, params, motion, life, span: span(meta)? })
+    Ok(Layer { name: text(meta, "name")?, params, motion, life, span: span(meta)?, masks: None })
 }
 
 /// When the layer is seen; a side that is null is open, and so are both where nothing is said.
@@ -221,7 +221,7 @@ mod tests {
                 }
             }
             let span = if seed == 2 { [0.1, f64::INFINITY] } else { ALWAYS };
-            Layer { name: format!("layer {seed}"), params, motion, life, span }
+            Layer { name: format!("layer {seed}"), params, motion, life, span, masks: None }
         };
         let spacetime = Spec::Spacetime(SpacetimeSpec { order: 2, rotation: true, detach: true, origin: 0.25 });
         Scene {

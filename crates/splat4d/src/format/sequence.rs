@@ -40,7 +40,7 @@ pub fn join(frames: &[Params], fps: f64, up: [f64; 3]) -> Result<Scene<f32>> {
             row += 1;
         }
     }
-    let layer = Layer { name: "frames".into(), params, motion: Arc::new(Still), life: kind, span: ALWAYS };
+    let layer = Layer { name: "frames".into(), params, motion: Arc::new(Still), life: kind, span: ALWAYS, masks: None };
     let clip = [0.0, (frames.len() - 1) as f64 / fps];
     Ok(Scene { layers: vec![layer], clip, fps, up, ..Scene::default() })
 }

@@ -13,7 +13,7 @@ use crate::motion::{At, Cache, Motion, Tape};
 use crate::scene::GEOMETRY;
 use crate::scene::params::OPACITY;
 use crate::scene::{
-    Grads, LIFE, LifeBuckets, LifeKind, Params, Part, RowEdit, Rows, Space, SplatGrads, Splats, Table, Time,
+    Grads, KeyMasks, LIFE, LifeBuckets, LifeKind, Params, Part, RowEdit, Rows, Space, SplatGrads, Splats, Table, Time,
 };
 use std::sync::Arc;
 
@@ -35,6 +35,8 @@ pub struct Layer<F: Real = f32> {
     pub life: LifeKind,
     /// The layer is seen for from ≤ t < to, seconds; [`ALWAYS`] but for pages of a playback file.
     pub span: [f64; 2],
+    /// Who is worth drawing when; none: everybody alive.
+    pub masks: Option<Arc<KeyMasks>>,
 }
 
 impl<F: Real> Clone for Layer<F> {
@@ -45,6 +47,7 @@ impl<F: Real> Clone for Layer<F> {
             motion: self.motion.clone(),
             life: self.life,
             span: self.span,
+            masks: self.masks.clone(),
         }
     }
 }
@@ -134,9 +137,9 @@ impl<F: Real> Layer<F> {
         !(t.0 < self.span[0] || t.0 >= self.span[1])
     }
 
-    /// The rows alive at t into `ids` (strictly increasing): those whose opacity times life reaches [`ALPHA_MIN`], none
-    /// outside the layer's span.
-    /// Returns true, and leaves `ids` empty, where every row is meant (infinite life).
+    /// The rows alive at t into `ids` (strictly increasing): those whose opacity times life reaches [`ALPHA_MIN`] and whom
+    /// the masks admit, none outside the layer's span.
+    /// Returns true, and leaves `ids` empty, where every row is meant (infinite life, no masks).
     pub fn active(&self, t: Time, ids: &mut Vec<u32>) -> bool {
         ids.clear();
         if !self.spans_over(t) {
@@ -148,10 +151,14 @@ impl<F: Real> Layer<F> {
         } else {
             (&self.params[LIFE], self.life)
         };
-        if kind == LifeKind::Infinite {
-            return true;
+        match (kind, &self.masks) {
+            (LifeKind::Infinite, None) => return true,
+            (LifeKind::Infinite, Some(_)) => ids.extend(0..self.params.len() as u32),
+            _ => envelope::active(&self.params[GEOMETRY], table, kind, t, ids),
         }
-        envelope::active(&self.params[GEOMETRY], table, kind, t, ids);
+        if let Some(masks) = &self.masks {
+            masks.retain(t.0, ids);
+        }
         false
     }
 
@@ -237,6 +244,7 @@ impl<F: Real> Layer<F> {
     /// One row edit: gathers every table of its space, then lets the model mend what copying cannot.
     pub fn edit(&mut self, edit: &RowEdit, rng: &Rng) {
         self.params.apply(edit);
+        self.masks = self.masks.take().map(|m| Arc::new(m.edited(edit)));
         self.motion.clone().on_edit(&mut self.params, edit, rng);
     }
 

@@ -163,7 +163,14 @@ mod tests {
                 *params[GEOMETRY].get_mut(row, LOG_SCALE + k) -= 2.0;
             }
         }
-        let layer = Layer { name: "a".into(), params, motion, life: LifeKind::GaussOne, span: crate::layers::ALWAYS };
+        let layer = Layer {
+            name: "a".into(),
+            params,
+            motion,
+            life: LifeKind::GaussOne,
+            span: crate::layers::ALWAYS,
+            masks: None,
+        };
         Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 30.0, up: [0.0, 1.0, 0.0], ..Scene::default() }
     }
 

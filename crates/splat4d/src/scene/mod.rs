@@ -2,6 +2,7 @@
 
 pub mod camera;
 pub mod life;
+pub mod masks;
 pub mod params;
 pub mod planes;
 pub mod splats;
@@ -10,6 +11,7 @@ pub mod time;
 
 pub use camera::{Camera, Intrinsics, Lens};
 pub use life::{LifeBuckets, LifeKind};
+pub use masks::KeyMasks;
 pub use params::{Born, GEOMETRY, Grads, Key, LIFE, ParamInfo, Params, RowEdit, SH, Space};
 pub use planes::Planes;
 pub use splats::{Color, Part, Rows, SplatGrads, Splats};

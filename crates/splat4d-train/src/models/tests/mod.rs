@@ -243,7 +243,7 @@ fn cloud<F: Real>(rows: usize, life: LifeKind, seed: u64) -> Params<F> {
 }
 
 fn one_layer<F: Real>(params: Params<F>, motion: Arc<dyn Motion<F>>, life: LifeKind) -> Scene<F> {
-    let layer = Layer { name: "made up".into(), params, motion, life, span: ALWAYS };
+    let layer = Layer { name: "made up".into(), params, motion, life, span: ALWAYS, masks: None };
     Scene { layers: vec![layer], clip: [0.0, 0.2], fps: 10.0, background: [0.2, 0.3, 0.6], ..Scene::default() }
 }
 

@@ -57,6 +57,6 @@ impl Page {
                 colors.set(i, 3 + plane, palette.value(entry, plane));
             }
         }
-        Ok(Layer { name: "page".into(), params, motion: Arc::new(motion), life, span: self.span })
+        Ok(Layer { name: "page".into(), params, motion: Arc::new(motion), life, span: self.span, masks: None })
     }
 }
