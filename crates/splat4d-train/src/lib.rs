@@ -3,6 +3,7 @@
 //! The trainer only emits [`event::Event`]s; progress bars, logs and viewers listen.
 
 pub mod capture;
+pub mod compress;
 pub mod densify;
 pub mod eval;
 pub mod event;
