@@ -11,6 +11,7 @@ mod files;
 mod finish;
 mod freeze;
 mod interrupt;
+mod measure;
 mod paths;
 mod playable;
 mod report;
