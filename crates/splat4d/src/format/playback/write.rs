@@ -1,6 +1,7 @@
 //! Writes a playback file: tiers, order, palette, pages, and the index before them.
 
 use super::cluster::cluster;
+use super::deflate::deflate;
 use super::index::crc;
 use super::page::{encode_page, parse_page};
 use super::{
@@ -18,6 +19,8 @@ const SMALL_PALETTE: usize = 256;
 /// Share of a node's Gaussians in its first tier, and the least worth a page of its own.
 const FIRST_TIER: f64 = 0.25;
 const SMALLEST_TIER: usize = 4096;
+/// Bytes of a palette's ranges, before its planes.
+const RANGE_BYTES: usize = 12;
 /// A poster up to this size comes before everything else; a larger one would only delay the first picture.
 const SMALL_POSTER: usize = 64 << 10;
 /// The palette takes a Gaussian's importance for at least and at most this many times the mean.
@@ -266,14 +269,23 @@ fn entry(kind: Kind) -> Entry {
     }
 }
 
+/// How many bytes come before a section's byte planes, and how many a plane has.
+fn runs(entry: &Entry) -> (usize, usize) {
+    let count = entry.count as usize;
+    match entry.kind {
+        Kind::Page => (4 * BLOCK_HEADER * count.div_ceil(BLOCK_GAUSSIANS), count),
+        Kind::Palette => (RANGE_BYTES, count),
+        _ => (entry.bytes as usize, 1),
+    }
+}
+
 /// Deflates a section where that makes it smaller; pictures are compressed already.
 fn pack(mut entry: Entry, body: Vec<u8>, level: u32) -> (Entry, Vec<u8>) {
     entry.bytes = u32::try_from(body.len()).expect("a section has less than 4 GiB");
     let mut stored = body;
     if entry.kind != Kind::Poster {
-        let mut encoder = flate2::write::DeflateEncoder::new(Vec::new(), flate2::Compression::new(level.min(9)));
-        encoder.write_all(&stored).expect("a vector takes every byte");
-        let small = encoder.finish().expect("a vector takes every byte");
+        let (head, run) = runs(&entry);
+        let small = deflate(&stored, head, run, level.min(9));
         if small.len() < stored.len() {
             (stored, entry.codec) = (small, Codec::Deflate);
         }
