@@ -4,10 +4,11 @@ use super::cluster::cluster;
 use super::index::crc;
 use super::page::{encode_page, parse_page};
 use super::{
-    Codec, Depths, Draft, Entry, Index, Kind, MAX_PAGE_GAUSSIANS, MAX_PALETTE, Meta, Node, Page, Palette, VERSION,
-    order,
+    Codec, Depths, Draft, Entry, FIRST_VERSION, Index, Kind, MAX_PAGE_GAUSSIANS, MAX_PALETTE, Meta, Node, Page,
+    Palette, VERSION, mask, order,
 };
 use crate::math::{Rng, quat, sh};
+use crate::scene::KeyMasks;
 use crate::{Error, Result};
 use std::io::Write;
 
@@ -106,6 +107,8 @@ pub struct Summary {
     pub palette_entries: usize,
     /// Stored bytes of all pages.
     pub page_bytes: u64,
+    /// Stored bytes of all masks.
+    pub mask_bytes: u64,
     /// Stored bytes of the palette.
     pub palette_bytes: u64,
     /// Stored bytes of the poster.
@@ -136,7 +139,7 @@ impl Sections {
     pub(super) fn new(meta: Meta, poster: Option<&[u8]>, level: u32) -> Result<Self> {
         meta.check()?;
         let summary = Summary { gaussians: meta.gaussians, ..Summary::default() };
-        let file = Index { version: VERSION, file_len: 0, meta, sections: Vec::new() };
+        let file = Index { version: FIRST_VERSION, file_len: 0, meta, sections: Vec::new() };
         let mut out = Self { file, bodies: Vec::new(), level, late: None, summary };
         match poster.filter(|p| !p.is_empty()) {
             Some(p) if p.len() <= SMALL_POSTER => out.summary.poster_bytes = out.add(entry(Kind::Poster), p.to_vec()),
@@ -165,6 +168,18 @@ impl Sections {
     pub(super) fn page(&mut self, body: Vec<u8>, page: &PageEntry) {
         self.summary.page_bytes += self.add(page.entry(), body);
         self.summary.pages += 1;
+    }
+
+    /// Masks of the page that was added last. Errors: more key times than a file holds.
+    pub(super) fn masks(&mut self, masks: &KeyMasks) -> Result<()> {
+        let body = mask::bytes(masks)?;
+        let times = masks.times();
+        self.file.version = VERSION;
+        let page = Some(self.file.sections.len() as u32 - 1);
+        let span = [times[0], times[times.len() - 1]];
+        let e = Entry { count: masks.rows() as u32, span, page, ..entry(Kind::Masks) };
+        self.summary.mask_bytes += self.add(e, body);
+        Ok(())
     }
 
     /// Writes the file. Errors: the sink's.
@@ -263,6 +278,7 @@ fn entry(kind: Kind) -> Entry {
         count: 0,
         span: [0.0; 2],
         palette: None,
+        page: None,
     }
 }
 
