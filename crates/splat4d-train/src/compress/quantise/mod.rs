@@ -72,13 +72,7 @@ impl Quantised {
             return Err(Error::input("this scene has not been quantised yet").remedy("Run it through all stages"));
         };
         let palette = m.shared.as_mut().map(|s| s.packed().clone());
-        Ok(Pages {
-            meta,
-            layers: scene.layers.clone(),
-            labels: m.labels.clone(),
-            palette,
-            tiers: m.tiers.clone(),
-        })
+        Ok(Pages { meta, layers: scene.layers.clone(), labels: m.labels.clone(), palette, tiers: m.tiers.clone() })
     }
 
     fn memory(&self) -> MutexGuard<'_, Option<Memory>> {
