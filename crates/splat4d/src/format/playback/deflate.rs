@@ -80,7 +80,7 @@ mod tests {
         for (head, run) in [(0, 10_000), (96, 9_976), (0, 7_777), (50_000, 3), (1, 0), (40_000, 10)] {
             assert_eq!(inflate(&deflate(&body, head, run, 6), body.len()), body, "{head} {run}");
         }
-        assert_eq!(inflate(&deflate(&[], 0, 10, 6), 0), []);
+        assert!(inflate(&deflate(&[], 0, 10, 6), 0).is_empty());
         assert_eq!(inflate(&deflate(&body[..2], 0, 1, 0), 2), &body[..2]);
     }
 

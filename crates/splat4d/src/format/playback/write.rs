@@ -2,11 +2,11 @@
 
 use super::cluster::cluster;
 use super::deflate::deflate;
-use super::index::crc;
+use super::index::{MASK_HEAD, crc, mask_keys};
 use super::page::{encode_page, parse_page};
 use super::{
-    Codec, Depths, Draft, Entry, FIRST_VERSION, Index, Kind, MAX_PAGE_GAUSSIANS, MAX_PALETTE, Meta, Node, Page,
-    Palette, VERSION, mask, order,
+    BLOCK_GAUSSIANS, BLOCK_HEADER, Codec, Depths, Draft, Entry, FIRST_VERSION, Index, Kind, MAX_PAGE_GAUSSIANS,
+    MAX_PALETTE, Meta, Node, Page, Palette, VERSION, mask, order,
 };
 use crate::math::{Rng, quat, sh};
 use crate::scene::KeyMasks;
@@ -291,6 +291,10 @@ fn runs(entry: &Entry) -> (usize, usize) {
     match entry.kind {
         Kind::Page => (4 * BLOCK_HEADER * count.div_ceil(BLOCK_GAUSSIANS), count),
         Kind::Palette => (RANGE_BYTES, count),
+        Kind::Masks => {
+            let keys = mask_keys(count, entry.bytes as usize).expect("masks that were just written");
+            (MASK_HEAD + 8 * keys, count.div_ceil(8))
+        }
         _ => (entry.bytes as usize, 1),
     }
 }
