@@ -10,35 +10,48 @@ pub(super) struct Weighing {
     instant: Instant<f32>,
     shares: Vec<f32>,
     layers: Vec<Vec<f64>>,
+    pixels: Vec<Vec<f64>>,
 }
 
 impl Weighing {
     pub(super) fn new(antialias: Antialias) -> Self {
         let renderer = Renderer::new(RenderConfig { antialias, ..RenderConfig::default() });
-        Self { renderer, instant: Instant::default(), shares: Vec::new(), layers: Vec::new() }
+        Self { renderer, instant: Instant::default(), shares: Vec::new(), layers: Vec::new(), pixels: Vec::new() }
     }
 
     /// On to another time; nothing has been seen at it.
     pub(super) fn at(&mut self, scene: &Scene<f32>, t: Time) {
         scene.at(t, &mut self.instant);
-        self.layers.resize_with(scene.layers.len(), Vec::new);
-        for (layer, sums) in scene.layers.iter().zip(&mut self.layers) {
-            sums.clear();
-            sums.resize(layer.params.len(), 0.0);
+        for tables in [&mut self.layers, &mut self.pixels] {
+            tables.resize_with(scene.layers.len(), Vec::new);
+            for (layer, sums) in scene.layers.iter().zip(tables) {
+                sums.clear();
+                sums.resize(layer.params.len(), 0.0);
+            }
         }
     }
 
     /// Adds one view at that time.
     pub(super) fn add(&mut self, scene: &Scene<f32>, camera: &Camera) {
         self.renderer.weigh(&scene.splats(&self.instant), camera, &mut self.shares);
+        let size = [camera.width, camera.height];
         let mut first = 0;
-        for (tape, sums) in self.instant.tapes.iter().zip(&mut self.layers) {
+        for ((tape, sums), pixels) in self.instant.tapes.iter().zip(&mut self.layers).zip(&mut self.pixels) {
             let (rows, count) = (tape.rows(), tape.out().rows());
-            for (j, &share) in self.shares[first..first + count].iter().enumerate() {
+            let projected = &self.renderer.projected()[first..first + count];
+            let seen =
+                self.shares[first..first + count].iter().zip(projected).enumerate().filter(|(_, (s, _))| **s > 0.0);
+            for (j, (&share, projected)) in seen {
                 sums[rows.id(j)] += f64::from(share);
+                pixels[rows.id(j)] += projected.pixels(size);
             }
             first += count;
         }
+    }
+
+    /// Pixels that every row of a layer touches, in the views that show it.
+    pub(super) fn pixels(&self, layer: usize) -> &[f64] {
+        &self.pixels[layer]
     }
 
     /// Σ α T of every row of a layer, in pixels; 0: it was not seen.
