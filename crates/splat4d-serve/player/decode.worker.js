@@ -110,16 +110,17 @@ function mask(data, { count, from, to }) {
   for (let k = 0, at = 8 + 8 * number; k < number; k++) {
     const row = 4 * stride * k;
     for (let i = 0; i < packed; i++, at++) bytes[row + i] = data[at] ^ (k ? bytes[row - 4 * stride + i] : 0);
-    if (count % 8 && bytes[row + packed - 1] >> (count % 8)) throw new Error(`row ${k} shows Gaussians that are not there`);
+    const spare = count % 8 && bytes[row + packed - 1] >> (count % 8);
+    if (spare) throw new Error(`row ${k} shows Gaussians that are not there`);
   }
   return { count, keys, rows: new Uint32Array(bytes.buffer), stride };
 }
 
 /// Decodes one section.
 ///
-/// `job`: {kind 'PAGE' | 'PALT' | 'MASK' | other: bytes as they are, stored Uint8Array, crc, codec, bytes, count, degree,
-/// labels: entries of the page's palette, 0: none, from, to}. Its sizes have been checked against the file. Throws an
-/// Error that says why.
+/// `job`: {kind 'PAGE' | 'PALT' | 'MASK' | other: bytes as they are, stored Uint8Array, crc, codec, bytes, count,
+/// degree, labels: entries of the page's palette, 0: none, from, to}. Its sizes have been checked against the file.
+/// Throws an Error that says why.
 async function decode(job) {
   if (crc32(job.stored) !== job.crc) throw new Error('its bytes are damaged: the checksum differs');
   let data = job.stored;

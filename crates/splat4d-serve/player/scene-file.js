@@ -1,4 +1,4 @@
-// A playback file (docs/format.md), read in parts: index, pages, key masks, palettes, poster. Trusts no number of the file.
+// A playback file (docs/format.md), read in parts: index, pages, key masks, palettes, poster. Trusts no number of it.
 
 import { worker } from './assets.js';
 import './decode.worker.js';

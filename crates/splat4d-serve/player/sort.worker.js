@@ -48,7 +48,7 @@ function path(words, headers, i, span, out) {
   out[10] = reach;
 }
 
-/// The key times around `t` of rising `keys`, as their numbers: [last ≤ t, first ≥ t]; one of them twice outside of all.
+/// The numbers of the key times around `t`, of rising `keys`: [last ≤ t, first ≥ t]; outside of all, the outermost twice.
 function keysAround(keys, t) {
   let low = 0,
     high = keys.length;
@@ -168,8 +168,8 @@ class Sorter {
   }
 
   /// Writes the visible Gaussians (row·1024 + column) at `time` into `out`, the farthest first, by the camera's depth
-  /// z = a·x + b·y + c·z + d for `depth` [a, b, c, d]. Returns {count, active: Gaussians of this moment's pages that their key
-  /// masks admit}.
+  /// z = a·x + b·y + c·z + d for `depth` [a, b, c, d]. Returns {count, active: Gaussians of this moment's
+  /// pages that their key masks admit}.
   sort({ time, depth: [a, b, c, d], near }, out) {
     const total = this.total;
     if (this.#depths.length < total) {
