@@ -48,7 +48,7 @@ function path(words, headers, i, span, out) {
   out[10] = reach;
 }
 
-/// The numbers of the key times around `t`, of rising `keys`: [last ≤ t, first ≥ t]; outside of all, the outermost twice.
+/// The numbers of the key times around `t`, of rising `keys`: [last ≤ t, first ≥ t]; outside of all, the nearest twice.
 function keysAround(keys, t) {
   let low = 0,
     high = keys.length;
