@@ -110,8 +110,8 @@ function mask(data, { count, from, to }) {
   for (let k = 0, at = 8 + 8 * number; k < number; k++) {
     const row = 4 * stride * k;
     for (let i = 0; i < packed; i++, at++) bytes[row + i] = data[at] ^ (k ? bytes[row - 4 * stride + i] : 0);
-    const spare = count % 8 && bytes[row + packed - 1] >> (count % 8);
-    if (spare) throw new Error(`row ${k} shows Gaussians that are not there`);
+    // Bits beyond the last Gaussian mean nothing, and nobody shall count them.
+    if (count % 8) bytes[row + packed - 1] &= (1 << (count % 8)) - 1;
   }
   return { count, keys, rows: new Uint32Array(bytes.buffer), stride };
 }

@@ -277,7 +277,6 @@ test('hostile and foreign files are refused in words', async () => {
     ['do not rise', PAGE(), MASK({ data: changed(8, ...two.subarray(16, 24)), from: 3 })],
     ['not those', PAGE(), MASK({ from: 1 })],
     ['not those', PAGE(), MASK({ to: 4 })],
-    ['not there', PAGE(), MASK({ data: changed(25, 2) })],
     ['inflates to 26', PAGE(), MASK({ codec: 1, patch: patch(20, 35) })],
     ['checksum', PAGE(), MASK({ patch: patch(24, 1) })],
   ];

@@ -135,6 +135,8 @@ export function keyMasks(next, n, keys) {
       if (bit !== (k ? seen[k - 1][i] : false)) data[8 + 8 * keys.length + k * packed + (i >> 3)] |= 1 << (i & 7);
     }),
   );
+  // Bits beyond the last Gaussian mean nothing.
+  keys.forEach((_, k) => n % 8 && (data[8 + 8 * keys.length + (k + 1) * packed - 1] |= 0x100 - (1 << (n % 8))));
   return { data, seen };
 }
 
