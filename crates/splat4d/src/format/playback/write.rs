@@ -150,7 +150,10 @@ impl Sections {
 
     /// Adds a section; returns its stored bytes.
     fn add(&mut self, entry: Entry, body: Vec<u8>) -> u64 {
-        let (entry, stored) = pack(entry, body, self.level);
+        self.put(pack(entry, body, self.level))
+    }
+
+    fn put(&mut self, (entry, stored): (Entry, Vec<u8>)) -> u64 {
         let size = u64::from(entry.stored);
         self.file.sections.push(entry);
         self.bodies.push(stored);
@@ -167,6 +170,13 @@ impl Sections {
     /// A page of `count` Gaussians from its decoded bytes; `palette` is that one's number.
     pub(super) fn page(&mut self, body: Vec<u8>, page: &PageEntry) {
         self.summary.page_bytes += self.add(page.entry(), body);
+        self.summary.pages += 1;
+    }
+
+    /// The same with more effort to make it small.
+    pub(super) fn small_page(&mut self, body: Vec<u8>, page: &PageEntry) {
+        let packed = pack_planes(page.entry(), body, self.level);
+        self.summary.page_bytes += self.put(packed);
         self.summary.pages += 1;
     }
 
@@ -287,15 +297,42 @@ fn pack(mut entry: Entry, body: Vec<u8>, level: u32) -> (Entry, Vec<u8>) {
     entry.bytes = u32::try_from(body.len()).expect("a section has less than 4 GiB");
     let mut stored = body;
     if entry.kind != Kind::Poster {
-        let mut encoder = flate2::write::DeflateEncoder::new(Vec::new(), flate2::Compression::new(level.min(9)));
-        encoder.write_all(&stored).expect("a vector takes every byte");
-        let small = encoder.finish().expect("a vector takes every byte");
+        let small = deflate(&stored, usize::MAX, level);
         if small.len() < stored.len() {
             (stored, entry.codec) = (small, Codec::Deflate);
         }
     }
     (entry.stored, entry.crc) = (stored.len() as u32, crc(&stored));
     (entry, stored)
+}
+
+/// As [`pack`], but with codes of their own for every byte plane, or every word's four, where that is smaller: planes of
+/// coarse codes have few and different bytes, which one Huffman code for all of them does not show.
+fn pack_planes(entry: Entry, body: Vec<u8>, level: u32) -> (Entry, Vec<u8>) {
+    let count = entry.count as usize;
+    let best = [count, 4 * count].map(|run| deflate(&body, run, level)).into_iter().min_by_key(Vec::len);
+    let whole = pack(entry, body, level);
+    match best {
+        Some(stored) if stored.len() < whole.1.len() => {
+            let (stored_bytes, crc) = (stored.len() as u32, crc(&stored));
+            (Entry { stored: stored_bytes, crc, codec: Codec::Deflate, ..whole.0 }, stored)
+        }
+        _ => whole,
+    }
+}
+
+/// Deflates; after what stands before whole runs, and after every `run` bytes of them, a new block begins.
+fn deflate(body: &[u8], run: usize, level: u32) -> Vec<u8> {
+    let head = if run < body.len() { body.len() % run } else { 0 };
+    let mut encoder = flate2::write::DeflateEncoder::new(Vec::new(), flate2::Compression::new(level.min(9)));
+    let (head, runs) = body.split_at(head);
+    for part in std::iter::once(head).chain(runs.chunks(run.min(body.len().max(1)))).filter(|p| !p.is_empty()) {
+        encoder.write_all(part).expect("a vector takes every byte");
+        if part.len() < body.len() {
+            encoder.flush().expect("a vector takes every byte");
+        }
+    }
+    encoder.finish().expect("a vector takes every byte")
 }
 
 /// Refuses what cannot be written.
