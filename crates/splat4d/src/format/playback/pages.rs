@@ -1,6 +1,7 @@
 //! A playback file taken apart into layers that can be changed, and put together again: the same pages, rows in the same
 //! order, labels and palette as they are.
 
+use super::block::turn_over;
 use super::coder::{Encode, Rows};
 use super::layer::keys;
 use super::page::page_of;
@@ -135,7 +136,10 @@ fn encode(layer: &Layer<f32>, labels: &[u16], config: &WriteConfig) -> Vec<u8> {
         let (first, count) = (k * BLOCK_GAUSSIANS, words.len());
         let labels = labels.get(first..first + count).unwrap_or(&[]);
         let source = Rows { layer, keys, labels, first, count };
-        dispatch(Simd::detect(), Encode { source, depths: &config.depths, words })
+        let mut columns = [[0; BLOCK_GAUSSIANS]; PAGE_WORDS];
+        let header = dispatch(Simd::detect(), Encode { source, depths: &config.depths, words: &mut columns });
+        turn_over(&columns, words);
+        header
     };
     let headers: Vec<_> = words.par_chunks_mut(BLOCK_GAUSSIANS).enumerate().map(block).collect();
     page_of(&headers, &words)
