@@ -14,7 +14,7 @@ use std::path::{Path, PathBuf};
 /// Files that mark a folder as a run.
 const MARKERS: [&str; 4] = ["recipe.toml", "run.json", "scene.safetensors", "checkpoints"];
 /// What splat4d writes into a run; `--force` replaces these and nothing else.
-const OURS: [&str; 16] = [
+const OURS: [&str; 18] = [
     "recipe.toml",
     "run.json",
     "scene.safetensors",
@@ -31,6 +31,8 @@ const OURS: [&str; 16] = [
     "report.html",
     "baseline",
     "renders",
+    "compress.toml",
+    "compress.json",
 ];
 
 /// One row of `metrics.csv`.

@@ -12,6 +12,7 @@ pub mod knn;
 pub mod loss;
 pub mod models;
 pub mod optim;
+pub mod prune;
 pub mod recipe;
 pub mod sampler;
 pub mod train;

@@ -2,6 +2,7 @@
 
 mod ceilings;
 mod growth;
+mod playback;
 mod rows;
 mod scenes;
 mod stages;
@@ -9,6 +10,7 @@ mod training;
 
 use crate::console::Console;
 use crate::files;
+use crate::paths::parse_size;
 use ceilings::Ceiling;
 use growth::Axis;
 use rows::Row;
@@ -37,10 +39,13 @@ Examples:
   splat4d bench --save today.json
   splat4d bench --against today.json              ratios to an earlier result
   splat4d bench --growth all --plots docs/images  steps with more Gaussians, pixels and frames; memory
+  splat4d bench --playback runs/a runs/a-small    frames a second of runs and files, in turns
 
 Times are means over eight views of the best of several rounds. `of ceiling` is the least time in which the stage's
 compulsory work could be done (blending at the speed of its arithmetic alone, bytes at the speed of memory, both measured
-first), as a share of the time it took. Measure on an idle machine: docs/benchmarks.md.";
+first), as a share of the time it took. Playback is drawn from 24 of the first scene's own cameras over its clip with its
+vertical field of view, always by all threads: end to end is looking up who is alive, motion, drawing and 8-bit colours;
+the best of five rounds counts, picture by picture, and all files take turns. Measure on an idle machine: docs/benchmarks.md.";
 
 /// Measure how fast this machine draws and trains
 #[derive(Debug, clap::Args)]
@@ -67,6 +72,13 @@ pub(crate) struct Args {
     /// Folder for pictures of the growth
     #[arg(long, value_name = "FOLDER", requires = "growth")]
     plots: Option<PathBuf>,
+    /// Measure instead how these runs, scenes or .splat4d files play, in turns
+    #[arg(long, value_name = "FILE|RUN", num_args = 1.., conflicts_with_all = ["scenes", "growth", "simd", "rounds",
+        "against"])]
+    playback: Vec<PathBuf>,
+    /// Size of the pictures of --playback [default: 800x800]
+    #[arg(long, value_name = "WxH", value_parser = parse_size, requires = "playback")]
+    size: Option<[usize; 2]>,
     /// Print a table for Markdown pages
     #[arg(long)]
     markdown: bool,
@@ -110,6 +122,9 @@ impl Level {
 }
 
 pub(crate) fn run(args: &Args, threads: Option<u16>, console: &Console) -> anyhow::Result<()> {
+    if !args.playback.is_empty() {
+        return play(args, console);
+    }
     // What cannot work is said before anything takes time.
     let earlier = args.against.as_deref().map(rows::read).transpose()?;
     let levels: Vec<Simd> = match &args.simd[..] {
@@ -157,6 +172,21 @@ pub(crate) fn run(args: &Args, threads: Option<u16>, console: &Console) -> anyho
         _ if rows.is_empty() => {}
         _ => console.result(rows::table(&rows).trim_end()),
     }
+    Ok(())
+}
+
+/// Measures how files play.
+fn play(args: &Args, console: &Console) -> anyhow::Result<()> {
+    let rows = playback::measure(&args.playback, args.size.unwrap_or(crate::measure::SIZE), console)?;
+    if let Some(path) = &args.save {
+        files::write(path, playback::json(&rows).as_bytes())?;
+        console.aside(&format!("wrote {}", path.display()));
+    }
+    console.result(&match (console.json(), args.markdown) {
+        (true, _) => playback::json(&rows),
+        (_, true) => playback::markdown(&rows),
+        _ => playback::table(&rows),
+    });
     Ok(())
 }
 

@@ -72,11 +72,29 @@ pub struct Evaluation {
 impl Evaluation {
     /// A mean over the held-out views; `None` where it is not defined.
     pub fn held(&self, metric: &str) -> Option<f64> {
-        match self.report.test.means().0.get(metric) {
-            Some(Score::Value(value)) => Some(*value),
-            _ => None,
-        }
+        mean(&self.report.test, metric)
     }
+
+    /// A mean over the training views that were measured; `None` where it is not defined.
+    pub fn train(&self, metric: &str) -> Option<f64> {
+        self.report.train.as_ref().and_then(|split| mean(split, metric))
+    }
+}
+
+fn mean(split: &Split, metric: &str) -> Option<f64> {
+    match split.means().0.get(metric) {
+        Some(Score::Value(value)) => Some(*value),
+        _ => None,
+    }
+}
+
+/// What the pictures of a list are for.
+#[derive(Clone, Copy, Debug)]
+enum Views<'a> {
+    /// All that was kept from training, of which pictures may be written here.
+    Held(Option<&'a Path>),
+    /// Some that were trained on.
+    Train,
 }
 
 /// Draws and measures the held-out views of `capture` (and a few training views), and writes the files above.
@@ -90,16 +108,8 @@ pub fn evaluate(
     options: &EvalOptions,
     listen: &mut dyn FnMut(&Event),
 ) -> Result<Evaluation> {
-    let lpips = options.lpips_weights.as_deref().map(load_lpips).transpose()?;
-    let folder = options.folder.join("test").join(format!("ours_{iteration}"));
-    let mut judge = Judge::new(scene, capture, store, lpips, options.antialias);
-    let pictures = options.pictures.then_some(folder.as_path());
-    let test = judge.split(&capture.held, pictures, "evaluating held-out views", listen)?;
-    let dynamic_share = judge.dynamic_share();
-    let some = spread(&capture.train, options.train_views);
-    let train = judge.split(&some, None, "evaluating training views", listen)?;
-
-    let report = Report { iteration: iteration as u64, test, train: (!some.is_empty()).then_some(train) };
+    let evaluation = assess(scene, capture, store, iteration, options, listen)?;
+    let Evaluation { report, dynamic_share } = &evaluation;
     let (mut results, mut views) = (report.results(), report.per_view());
     let ours = report.method();
     results[&ours]["dynamic-share"] = json!(dynamic_share);
@@ -107,6 +117,29 @@ pub fn evaluate(
     views[&ours]["time"] = by_file(&capture.held, |f| json!(capture.frames[f].time.0));
     merge(&options.folder.join("results.json"), results)?;
     merge(&options.folder.join("per_view.json"), views)?;
+    Ok(evaluation)
+}
+
+/// The same without the two JSON files; pictures only if the options ask for them.
+///
+/// Errors: those of [`evaluate`].
+pub fn assess(
+    scene: &Scene<f32>,
+    capture: &Capture,
+    store: &ImageStore,
+    iteration: usize,
+    options: &EvalOptions,
+    listen: &mut dyn FnMut(&Event),
+) -> Result<Evaluation> {
+    let lpips = options.lpips_weights.as_deref().map(load_lpips).transpose()?;
+    let folder = options.folder.join("test").join(format!("ours_{iteration}"));
+    let mut judge = Judge::new(scene, capture, store, lpips, options.antialias);
+    let held = Views::Held(options.pictures.then_some(folder.as_path()));
+    let test = judge.split(&capture.held, held, "evaluating held-out views", listen)?;
+    let dynamic_share = judge.dynamic_share();
+    let some = spread(&capture.train, options.train_views);
+    let train = judge.split(&some, Views::Train, "evaluating training views", listen)?;
+    let report = Report { iteration: iteration as u64, test, train: (!some.is_empty()).then_some(train) };
     Ok(Evaluation { report, dynamic_share })
 }
 
@@ -153,17 +186,18 @@ impl<'a> Judge<'a> {
     fn split(
         &mut self,
         frames: &[usize],
-        pictures: Option<&Path>,
+        kind: Views<'_>,
         name: &str,
         listen: &mut dyn FnMut(&Event),
     ) -> Result<Split> {
         self.dynamic = [0; 2];
+        let held = matches!(kind, Views::Held(_));
         let mut views: Vec<Option<View>> = vec![None; frames.len()];
         let mut flicker: Vec<Flicker> = Vec::new();
         let mut done = 0;
         for camera in cameras(self.capture, frames) {
             // Temporal means and flicker are scores of new views: training views are a subset, out of order.
-            let fixed = pictures.is_some() && self.capture.cameras[camera.id].fixed && camera.places.len() > 1;
+            let fixed = held && self.capture.cameras[camera.id].fixed && camera.places.len() > 1;
             let mean = if fixed { Some(self.temporal_mean(frames, &camera.places)?) } else { None };
             let mut changes = Flicker::default();
             self.store.prefetch(&camera.places.iter().map(|&p| frames[p]).collect::<Vec<_>>());
@@ -173,7 +207,7 @@ impl<'a> Judge<'a> {
                     changes.push(&image, &truth);
                 }
                 views[place] = Some(view);
-                if let Some(folder) = pictures {
+                if let Views::Held(Some(folder)) = kind {
                     write_pictures(folder, place, &image, &truth)?;
                 }
                 done += 1;
@@ -182,7 +216,7 @@ impl<'a> Judge<'a> {
             flicker.push(changes);
         }
         let mut split = Split { views: views.into_iter().flatten().collect(), ..Split::default() };
-        if pictures.is_some() {
+        if held {
             let reason = "not defined: no held-out camera is fixed and has two frames";
             split.whole.insert("flicker".into(), Score::or(Flicker::over(&flicker), reason));
         }

@@ -9,6 +9,7 @@ mod tests;
 
 use crate::densify::Densify;
 use crate::loss::terms::{Codec, ParamLoss, ProbeLoss};
+use crate::prune::Periodic;
 use crate::recipe::Recipe;
 use crate::sampler::Sampler;
 use crate::{Error, Result};
@@ -128,6 +129,8 @@ pub struct Stage<F: Real = f32> {
     pub densify: Densify,
     /// First, last step of the stage that densifies, and the steps between.
     pub densify_steps: (usize, usize, usize),
+    /// Pruning by worth in space and time, beside densification.
+    pub prune: Option<Periodic>,
     /// Steps before each further SH degree; 0: all at once.
     pub sh_interval: usize,
     /// The first so many steps see pictures at half size: coarse things first, and four times faster.
@@ -155,6 +158,7 @@ impl<F: Real> Stage<F> {
             params: Vec::new(),
             densify: Densify::None,
             densify_steps: (0, 0, 0),
+            prune: None,
             sh_interval: 0,
             half_size_steps: 0,
             min_log_life: None,

@@ -7,6 +7,7 @@ use crate::densify::{self, Change, Densify, Limits, Stats, adc, mcmc, morton_edi
 use crate::loss::terms::Codec;
 use crate::models::{Hook, Stage, Tell};
 use crate::optim::{Floor, Moments};
+use crate::prune::prune;
 use crate::sampler::Timeline;
 use crate::{Error, ErrorKind, Result};
 use splat4d::layers::Scene;
@@ -282,7 +283,7 @@ impl<'a> Trainer<'a> {
             return Ok(Err(fault));
         }
         let clock = Clock::now();
-        out.change = self.maintain();
+        out.change = self.maintain()?;
         self.progress.iteration += 1;
         self.progress.stage_step += 1;
         if self.progress.stage_step == self.stages[self.progress.stage].iterations {
@@ -409,8 +410,8 @@ impl<'a> Trainer<'a> {
         Some(Fault(format!("`{column}` of Gaussian {row} of layer {layer} is not finite ({})", views())))
     }
 
-    /// Noise, densification, resets, memory order; clears the gradients.
-    fn maintain(&mut self) -> Change {
+    /// Noise, densification, pruning, resets, memory order; clears the gradients.
+    fn maintain(&mut self) -> Result<Change> {
         let stage = &self.stages[self.progress.stage];
         let (step, seed) = (self.progress.stage_step + 1, self.settings.seed);
         let address = self.progress.iteration as u64;
@@ -459,13 +460,29 @@ impl<'a> Trainer<'a> {
             self.stale = true;
             self.fit_grads();
         }
+        change.removed += self.prune(step)?;
         let stage = &self.stages[self.progress.stage];
         let reset = self.settings.opacity_reset_interval;
         if matches!(stage.densify, Densify::Adc(_)) && reset > 0 && step.is_multiple_of(reset) && step < until {
             adc::reset_opacity(&mut self.scene, &mut self.moments, 2.0 * self.settings.limits.min_opacity);
             self.stale = true;
         }
-        change
+        Ok(change)
+    }
+
+    /// Pruning after so many steps of the stage, if it is due; returns how many rows went.
+    fn prune(&mut self, step: usize) -> Result<usize> {
+        let stage = &self.stages[self.progress.stage];
+        let Some(periodic) = stage.prune.filter(|p| p.is_due(step, stage.iterations)) else { return Ok(0) };
+        let before = self.scene.len();
+        let scores = periodic.scores(&self.scene, self.frames.as_ref(), self.draw.config().antialias)?;
+        let rng = Rng::new(self.settings.seed, "prune", self.progress.iteration as u64);
+        for (layer, edit) in prune(&self.scene, &scores, periodic.ratio).iter().enumerate() {
+            densify::apply(&mut self.scene, &mut self.moments, &mut self.stats, layer, edit, &rng);
+        }
+        self.stages[self.progress.stage].params.iter().for_each(|l| l.on_edit());
+        self.fit_grads();
+        Ok(before - self.scene.len())
     }
 
     /// Errors if the scene is empty: nothing could be learnt.

@@ -7,6 +7,7 @@
 mod block;
 mod cluster;
 mod coder;
+mod deflate;
 mod depths;
 mod index;
 mod layer;

@@ -1,11 +1,12 @@
 //! Writes a playback file: tiers, order, palette, pages, and the index before them.
 
 use super::cluster::cluster;
-use super::index::crc;
+use super::deflate::deflate;
+use super::index::{MASK_HEAD, crc, mask_keys};
 use super::page::{encode_page, parse_page};
 use super::{
-    Codec, Depths, Draft, Entry, FIRST_VERSION, Index, Kind, MAX_PAGE_GAUSSIANS, MAX_PALETTE, Meta, Node, Page,
-    Palette, VERSION, mask, order,
+    BLOCK_GAUSSIANS, BLOCK_HEADER, Codec, Depths, Draft, Entry, FIRST_VERSION, Index, Kind, MAX_PAGE_GAUSSIANS,
+    MAX_PALETTE, Meta, Node, Page, Palette, VERSION, mask, order,
 };
 use crate::math::{Rng, quat, sh};
 use crate::scene::KeyMasks;
@@ -19,6 +20,8 @@ const SMALL_PALETTE: usize = 256;
 /// Share of a node's Gaussians in its first tier, and the least worth a page of its own.
 const FIRST_TIER: f64 = 0.25;
 const SMALLEST_TIER: usize = 4096;
+/// Bytes of a palette's ranges, before its planes.
+const RANGE_BYTES: usize = 12;
 /// A poster up to this size comes before everything else; a larger one would only delay the first picture.
 const SMALL_POSTER: usize = 64 << 10;
 /// The palette takes a Gaussian's importance for at least and at most this many times the mean.
@@ -282,14 +285,27 @@ fn entry(kind: Kind) -> Entry {
     }
 }
 
+/// How many bytes come before a section's byte planes, and how many a plane has.
+fn runs(entry: &Entry) -> (usize, usize) {
+    let count = entry.count as usize;
+    match entry.kind {
+        Kind::Page => (4 * BLOCK_HEADER * count.div_ceil(BLOCK_GAUSSIANS), count),
+        Kind::Palette => (RANGE_BYTES, count),
+        Kind::Masks => {
+            let keys = mask_keys(count, entry.bytes as usize).expect("masks that were just written");
+            (MASK_HEAD + 8 * keys, count.div_ceil(8))
+        }
+        _ => (entry.bytes as usize, 1),
+    }
+}
+
 /// Deflates a section where that makes it smaller; pictures are compressed already.
 fn pack(mut entry: Entry, body: Vec<u8>, level: u32) -> (Entry, Vec<u8>) {
     entry.bytes = u32::try_from(body.len()).expect("a section has less than 4 GiB");
     let mut stored = body;
     if entry.kind != Kind::Poster {
-        let mut encoder = flate2::write::DeflateEncoder::new(Vec::new(), flate2::Compression::new(level.min(9)));
-        encoder.write_all(&stored).expect("a vector takes every byte");
-        let small = encoder.finish().expect("a vector takes every byte");
+        let (head, run) = runs(&entry);
+        let small = deflate(&stored, head, run, level.min(9));
         if small.len() < stored.len() {
             (stored, entry.codec) = (small, Codec::Deflate);
         }
