@@ -169,8 +169,7 @@ fn paint(table: &mut Table<f32>, labels: &[u16], palette: &Palette, wanted: &[bo
     });
 }
 
-/// Rates with which a trained scene is tuned: those with which its training ended, times `share`, falling on. Without the
-/// groups of coefficients above degree 0 if `codec`: a palette has them then.
+/// Rates with which a trained scene is tuned: those with which its training ended, times `share`, falling on.
 pub fn tuned(groups: Vec<Group>, share: f64) -> Vec<Group> {
     let fall = |rate: Rate| Rate { start: share * rate.end, end: FALL * share * rate.end };
     groups.into_iter().map(|g| Group { rate: fall(g.rate), ..g }).collect()
