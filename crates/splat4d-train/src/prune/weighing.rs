@@ -1,11 +1,13 @@
 //! How much of the views at one time every Gaussian of a scene is.
 
+use super::temporal::Spatial;
 use splat4d::layers::{Instant, Scene};
 use splat4d::render::{Antialias, RenderConfig, Renderer};
 use splat4d::scene::{Camera, Time};
 
-/// Σ α T by layer and row over the views at one time, all memory reused.
+/// A number by layer and row, summed over the views at one time; all memory is reused.
 pub(super) struct Weighing {
+    spatial: Spatial,
     renderer: Renderer<f32>,
     instant: Instant<f32>,
     shares: Vec<f32>,
@@ -13,9 +15,9 @@ pub(super) struct Weighing {
 }
 
 impl Weighing {
-    pub(super) fn new(antialias: Antialias) -> Self {
+    pub(super) fn new(spatial: Spatial, antialias: Antialias) -> Self {
         let renderer = Renderer::new(RenderConfig { antialias, ..RenderConfig::default() });
-        Self { renderer, instant: Instant::default(), shares: Vec::new(), layers: Vec::new() }
+        Self { spatial, renderer, instant: Instant::default(), shares: Vec::new(), layers: Vec::new() }
     }
 
     /// On to another time; nothing has been seen at it.
@@ -30,7 +32,11 @@ impl Weighing {
 
     /// Adds one view at that time.
     pub(super) fn add(&mut self, scene: &Scene<f32>, camera: &Camera) {
-        self.renderer.weigh(&scene.splats(&self.instant), camera, &mut self.shares);
+        let splats = scene.splats(&self.instant);
+        match self.spatial {
+            Spatial::Share => self.renderer.weigh(&splats, camera, &mut self.shares),
+            Spatial::Change => self.renderer.removals(&splats, camera, scene.background, &mut self.shares),
+        }
         let mut first = 0;
         for (tape, sums) in self.instant.tapes.iter().zip(&mut self.layers) {
             let (rows, count) = (tape.rows(), tape.out().rows());
@@ -41,7 +47,7 @@ impl Weighing {
         }
     }
 
-    /// Σ α T of every row of a layer, in pixels; 0: it was not seen.
+    /// The sum of every row of a layer; 0: it was not seen.
     pub(super) fn layer(&self, layer: usize) -> &[f64] {
         &self.layers[layer]
     }
