@@ -11,13 +11,21 @@ pub(super) struct Weighing {
     renderer: Renderer<f32>,
     instant: Instant<f32>,
     shares: Vec<f32>,
+    changes: Vec<f32>,
     layers: Vec<Vec<f64>>,
 }
 
 impl Weighing {
     pub(super) fn new(spatial: Spatial, antialias: Antialias) -> Self {
         let renderer = Renderer::new(RenderConfig { antialias, ..RenderConfig::default() });
-        Self { spatial, renderer, instant: Instant::default(), shares: Vec::new(), layers: Vec::new() }
+        Self {
+            spatial,
+            renderer,
+            instant: Instant::default(),
+            shares: Vec::new(),
+            changes: Vec::new(),
+            layers: Vec::new(),
+        }
     }
 
     /// On to another time; nothing has been seen at it.
@@ -36,6 +44,13 @@ impl Weighing {
         match self.spatial {
             Spatial::Share => self.renderer.weigh(&splats, camera, &mut self.shares),
             Spatial::Change => self.renderer.removals(&splats, camera, scene.background, &mut self.shares),
+            Spatial::Both => {
+                self.renderer.removals(&splats, camera, scene.background, &mut self.changes);
+                self.renderer.contributions(&mut self.shares);
+                for (share, change) in self.shares.iter_mut().zip(&self.changes) {
+                    *share = (*share * *change).sqrt();
+                }
+            }
         }
         let mut first = 0;
         for (tape, sums) in self.instant.tapes.iter().zip(&mut self.layers) {

@@ -65,3 +65,36 @@ fn quality(scene: &Scene<f32>, held: &Dataset) -> [f64; 2] {
     assert!(counts.iter().all(|c| *c >= 20.0), "{counts:?} views");
     [0, 1].map(|k| sums[k] / counts[k])
 }
+
+/// Prunes in rounds, each with scores of its own.
+fn pruned(scene: &Scene<f32>, train: &Dataset, config: &ScoreConfig, ratio: f64, rounds: usize) -> Scene<f32> {
+    let mut scene = scene.clone();
+    for _ in 0..rounds {
+        let scores = scored(&scene, train, config);
+        let edits = prune(&scene, &scores, 1.0 - (1.0 - ratio).powf(1.0 / rounds as f64));
+        edit(&mut scene, &edits);
+    }
+    scene
+}
+
+#[test]
+fn the_orb_and_the_crate_survive() {
+    let place = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples");
+    let capture = Arc::new(Capture::open(&place.join("knight"), &CaptureOptions::default()).unwrap());
+    let store = Arc::new(ImageStore::new(capture.clone(), 1 << 28));
+    let (train, held) = (Dataset::new(store.clone(), capture.train.clone()), Dataset::new(store, capture.held.clone()));
+    let scene = splat4d::format::playback::read(&std::fs::read(place.join("knight.splat4d")).unwrap()).unwrap();
+    let before = quality(&scene, &held);
+    println!("before {before:?}");
+    for spatial in Spatial::ALL {
+        for temporal in [Temporal::InstantAbs, Temporal::None, Temporal::Width] {
+            for (ratio, rounds) in [(0.5, 1), (0.5, 4), (0.8, 1), (0.8, 6)] {
+                let config =
+                    ScoreConfig { spatial: *spatial, temporal, volume: false, every: 16, ..ScoreConfig::default() };
+                let clock = std::time::Instant::now();
+                let after = quality(&pruned(&scene, &train, &config, ratio, rounds), &held);
+                println!("{spatial} {temporal} {ratio} in {rounds}: {after:?} {:.2} s", clock.elapsed().as_secs_f64());
+            }
+        }
+    }
+}
