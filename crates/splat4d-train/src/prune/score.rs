@@ -2,7 +2,7 @@
 //!
 //! Source: 4DGS-1K (Yuan et al. 2025, §4.1); the volume as LightGaussian (Fan et al. 2024).
 
-use super::temporal::{Combine, Lives, Temporal};
+use super::temporal::{Combine, Lives, Spatial, Temporal};
 use super::weighing::Weighing;
 use crate::capture::frames::Frames;
 use crate::densify::covariances;
@@ -27,6 +27,8 @@ pub const UNIT_FRAMES: f64 = 30.0;
 /// How Gaussians are scored.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ScoreConfig {
+    /// What of a view counts.
+    pub spatial: Spatial,
     /// What becomes of the life.
     pub temporal: Temporal,
     /// How it meets the spatial score.
@@ -48,6 +50,7 @@ impl Default for ScoreConfig {
     /// Per-instant product of |p''| and the spatial score, with the volume, from all views.
     fn default() -> Self {
         Self {
+            spatial: Spatial::default(),
             temporal: Temporal::default(),
             combine: Combine::default(),
             volume: true,
@@ -64,7 +67,7 @@ impl Default for ScoreConfig {
 pub struct Scores {
     /// A score a row, by layer.
     pub layers: Vec<Vec<f64>>,
-    /// Σ over pixels of the views looked at of α·T, a row, by layer.
+    /// The spatial score over all views looked at, a row, by layer.
     pub spatial: Vec<Vec<f64>>,
     /// Views looked at.
     pub views: usize,
@@ -99,7 +102,7 @@ pub fn score(
     // Σ_t S(t), Σ_t S(t)·T(t) and Σ of T(t) over the instants at which S(t) > 0.
     let (mut spatial, mut product, mut served) = (zeros(), zeros(), zeros());
     let mut touched = zeros();
-    let (mut weighing, mut done) = (Weighing::new(config.antialias), 0);
+    let (mut weighing, mut done) = (Weighing::new(config.spatial, config.antialias), 0);
     let total = groups.iter().map(Vec::len).sum();
     for (group, &t) in groups.iter().zip(&times) {
         weighing.at(scene, t);

@@ -1,22 +1,33 @@
 //! How much of the views at one time every Gaussian of a scene is.
 
+use super::temporal::Spatial;
 use splat4d::layers::{Instant, Scene};
 use splat4d::render::{Antialias, RenderConfig, Renderer};
 use splat4d::scene::{Camera, Time};
 
-/// Σ α T by layer and row over the views at one time, all memory reused.
+/// A number by layer and row, summed over the views at one time; all memory is reused.
 pub(super) struct Weighing {
+    spatial: Spatial,
     renderer: Renderer<f32>,
     instant: Instant<f32>,
     shares: Vec<f32>,
+    changes: Vec<f32>,
     layers: Vec<Vec<f64>>,
     pixels: Vec<Vec<f64>>,
 }
 
 impl Weighing {
-    pub(super) fn new(antialias: Antialias) -> Self {
+    pub(super) fn new(spatial: Spatial, antialias: Antialias) -> Self {
         let renderer = Renderer::new(RenderConfig { antialias, ..RenderConfig::default() });
-        Self { renderer, instant: Instant::default(), shares: Vec::new(), layers: Vec::new(), pixels: Vec::new() }
+        Self {
+            spatial,
+            renderer,
+            instant: Instant::default(),
+            shares: Vec::new(),
+            changes: Vec::new(),
+            layers: Vec::new(),
+            pixels: Vec::new(),
+        }
     }
 
     /// On to another time; nothing has been seen at it.
@@ -33,7 +44,18 @@ impl Weighing {
 
     /// Adds one view at that time.
     pub(super) fn add(&mut self, scene: &Scene<f32>, camera: &Camera) {
-        self.renderer.weigh(&scene.splats(&self.instant), camera, &mut self.shares);
+        let splats = scene.splats(&self.instant);
+        match self.spatial {
+            Spatial::Share => self.renderer.weigh(&splats, camera, &mut self.shares),
+            Spatial::Change => self.renderer.removals(&splats, camera, scene.background, &mut self.shares),
+            Spatial::Both => {
+                self.renderer.removals(&splats, camera, scene.background, &mut self.changes);
+                self.renderer.contributions(&mut self.shares);
+                for (share, change) in self.shares.iter_mut().zip(&self.changes) {
+                    *share = (*share * *change).sqrt();
+                }
+            }
+        }
         let size = [camera.width, camera.height];
         let mut first = 0;
         for ((tape, sums), pixels) in self.instant.tapes.iter().zip(&mut self.layers).zip(&mut self.pixels) {
@@ -54,7 +76,7 @@ impl Weighing {
         &self.pixels[layer]
     }
 
-    /// Σ α T of every row of a layer, in pixels; 0: it was not seen.
+    /// The sum of every row of a layer; 0: it was not seen.
     pub(super) fn layer(&self, layer: usize) -> &[f64] {
         &self.layers[layer]
     }

@@ -583,6 +583,32 @@ fn contributions_do_not_disturb_the_way_back_and_know_no_threads() {
     assert_eq!(one.1, run(false).1);
 }
 
+/// A splat's removal is drawn: the same splats with its opacity at 0.
+#[test]
+fn removals_are_what_a_picture_loses_with_each_splat() {
+    let mut s = scene(12, 12, 0.15);
+    // No pixel stops early, since one that has would go on without the splat.
+    s.outs.iter_mut().for_each(|out| (0..out.rows()).for_each(|j| out.set(j, 9, 0.5 * out.get(j, 9))));
+    let view = camera(75, 41);
+    let whole = draw_oracle(&s, &view, complete());
+    let (mut renderer, mut losses) = (Renderer::new(complete()), Vec::new());
+    renderer.removals(&s.splats(), &view, BACKGROUND, &mut losses);
+    let (mut n, mut changes) = (0, 0);
+    for part in 0..3 {
+        for j in 0..s.outs[part].rows() {
+            let mut without = s.clone();
+            without.outs[part].set(j, 9, 0.0);
+            let picture = draw_oracle(&without, &view, complete());
+            let pairs = picture.color.data.iter().zip(&whole.color.data);
+            let expected: f64 = pairs.map(|(a, b)| (a - b) * (a - b)).sum();
+            assert!((losses[n] - expected).abs() <= 1e-8 * expected + 1e-12, "splat {n}: {} {expected}", losses[n]);
+            changes += usize::from(expected > 0.1);
+            n += 1;
+        }
+    }
+    assert!(changes > 20, "{changes} splats matter");
+}
+
 /// What f32 loses on the way back: behind many opaque splats, what is still to come is a small difference of large sums.
 #[test]
 fn f32_gradients_are_those_of_f64() {
