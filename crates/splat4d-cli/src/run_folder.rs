@@ -13,8 +13,10 @@ use std::path::{Path, PathBuf};
 
 /// Files that mark a folder as a run.
 const MARKERS: [&str; 4] = ["recipe.toml", "run.json", "scene.safetensors", "checkpoints"];
+/// What `compress` leaves beside the file that it writes, for the report and for machines.
+pub(crate) const COMPRESS: &str = "compress.json";
 /// What splat4d writes into a run; `--force` replaces these and nothing else.
-const OURS: [&str; 16] = [
+const OURS: [&str; 17] = [
     "recipe.toml",
     "run.json",
     "scene.safetensors",
@@ -23,6 +25,7 @@ const OURS: [&str; 16] = [
     "metrics.csv",
     "results.json",
     "per_view.json",
+    COMPRESS,
     "cameras.json",
     "test",
     "train",
@@ -71,6 +74,8 @@ pub(crate) struct Run {
     pub all_results: Value,
     /// Held-out views, from `per_view.json`.
     pub views: Vec<ViewScore>,
+    /// `compress.json`, where the run was made by compressing another.
+    pub compressed: Value,
     iteration: Option<usize>,
 }
 
@@ -116,6 +121,7 @@ impl Run {
             run.iteration = Some(iteration);
             run.results = Some(entry.clone());
         }
+        run.compressed = parse(COMPRESS)?;
         run.views = newest(&parse("per_view.json")?).map(|(_, entry)| view_scores(entry)).unwrap_or_default();
         Ok(run)
     }
