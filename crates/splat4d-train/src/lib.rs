@@ -3,6 +3,7 @@
 //! The trainer only emits [`event::Event`]s; progress bars, logs and viewers listen.
 
 pub mod capture;
+pub mod compress;
 pub mod densify;
 pub mod eval;
 pub mod event;
@@ -11,6 +12,7 @@ pub mod knn;
 pub mod loss;
 pub mod models;
 pub mod optim;
+pub mod prune;
 pub mod recipe;
 pub mod sampler;
 pub mod train;

@@ -145,6 +145,12 @@ recipe! {
     opacity_reset_interval: usize = 0,
     /// Opacity below which a Gaussian is dead; 0: 0.02 for adc, 0.005 for mcmc.
     min_opacity: f64 = 0.0,
+    /// Iterations between prunings by worth in space and time (4DGS-1K), whatever the strategy; 0: never.
+    prune_interval: usize = 0,
+    /// Share of the Gaussians that each such pruning removes.
+    prune_ratio: f64 = 0.3,
+    /// Training views that each such pruning looks at; never fewer than one at every moment of the capture.
+    prune_views: usize = 60,
     /// mcmc: growth a densification, up to the cap.
     growth: f64 = 1.05,
     /// mcmc: strength of the position noise.
@@ -280,6 +286,7 @@ impl Recipe {
             ("half_size_until", self.half_size_until),
             ("relocate_gradient", self.relocate_gradient),
             ("min_opacity", self.min_opacity),
+            ("prune_ratio", self.prune_ratio),
         ];
         for (knob, value) in shares {
             if !(0.0..=1.0).contains(&value) {

@@ -1,5 +1,7 @@
-//! The contracts of losses that do not look at a picture: on splats at several times, and on raw parameters.
+//! The contracts of losses that do not look at a picture: on splats at several times, and on raw parameters; and of what
+//! may stand between parameters and pictures, a [`Codec`].
 
+use crate::Result;
 use splat4d::layers::Scene;
 use splat4d::math::Real;
 use splat4d::scene::{Grads, Space, Table, Time};
@@ -54,4 +56,31 @@ pub trait ParamLoss<F: Real>: Send + Sync {
     }
     /// Takes back what [`state`](Self::state) gave.
     fn restore(&self, _state: &[u32]) {}
+}
+
+/// What stands between the parameters that learn and the pictures they are judged by: a file that will hold them
+/// coarsely. Pictures are drawn from what its reader would see, and the gradient goes to the parameters as if there were
+/// no difference (the straight-through estimator: Bengio et al. 2013).
+pub trait Codec<F: Real>: Send + Sync {
+    /// Its name, in messages.
+    fn name(&self) -> &str;
+    /// Brings `shown` up to date, as far as splats at the given times can tell: it is as the last call left it, or, after
+    /// [`reset`](Self::reset), a copy of `scene`.
+    fn show(&self, scene: &Scene<F>, times: &[Time], shown: &mut Scene<F>);
+    /// What a reader would see of all of `scene`. Changes nothing of what `show` remembers.
+    fn whole(&self, scene: &Scene<F>) -> Scene<F>;
+    /// After a step's gradients, before the parameters' own optimiser: learns what rows share and hears which rows are
+    /// about to change. `progress` is the share of the stage that is done; every rate is multiplied by `scale`. Returns
+    /// whether all numbers are finite.
+    fn learn(&self, d: &mut [Grads<F>], progress: f64, scale: f64) -> bool;
+    /// The scene changed in other ways than by a step: whatever was shown of it is stale.
+    fn reset(&self) {}
+    /// What a checkpoint must hold of it; nothing for a codec that has not begun.
+    fn state(&self) -> Vec<u32> {
+        Vec::new()
+    }
+    /// Takes back what [`state`](Self::state) gave. Errors: words that cannot be such a state.
+    fn restore(&self, _state: &[u32]) -> Result<()> {
+        Ok(())
+    }
 }

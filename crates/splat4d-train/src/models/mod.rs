@@ -8,7 +8,8 @@ pub mod still;
 mod tests;
 
 use crate::densify::Densify;
-use crate::loss::terms::{ParamLoss, ProbeLoss};
+use crate::loss::terms::{Codec, ParamLoss, ProbeLoss};
+use crate::prune::Periodic;
 use crate::recipe::Recipe;
 use crate::sampler::Sampler;
 use crate::{Error, Result};
@@ -16,6 +17,7 @@ use splat4d::layers::Scene;
 use splat4d::math::Real;
 use splat4d::motion::Spec;
 use splat4d::scene::LifeKind;
+use std::sync::Arc;
 
 /// What a program may know of the capture and of the user's wishes.
 #[derive(Clone, Debug)]
@@ -72,10 +74,13 @@ impl Recipe {
     }
 }
 
+/// A group of this layer is one of every layer that has its columns.
+pub const EVERY: usize = usize::MAX;
+
 /// A learnable group: one column group of one table. What no group names is frozen.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Group {
-    /// The layer.
+    /// The layer, or [`EVERY`].
     pub layer: usize,
     /// The column group's name; it is unique in a layer.
     pub column: String,
@@ -90,10 +95,19 @@ impl Group {
     pub fn new(column: &str, rate: Rate) -> Self {
         Self { layer: 0, column: column.to_owned(), part: None, rate }
     }
+
+    /// Whether it is a group of the layer with this number.
+    pub fn is_of(&self, layer: usize) -> bool {
+        self.layer == EVERY || self.layer == layer
+    }
 }
 
-/// What a stage does to the scene at its start or end: add pages, replace the cloud, build a graph.
-pub type Hook<F> = Box<dyn Fn(&mut Scene<F>) -> Result<()> + Send + Sync>;
+/// Hears how far something long is: what is done, how much of it, of how much (0 where not known).
+pub type Tell<'a> = dyn FnMut(&str, usize, usize) + 'a;
+
+/// What a stage does to the scene at its start or end: add pages, replace the cloud, build a graph. A layer that it
+/// replaces needs another name: rows of a layer that keeps its name and its shape keep their moments.
+pub type Hook<F> = Box<dyn Fn(&mut Scene<F>, &mut Tell<'_>) -> Result<()> + Send + Sync>;
 
 /// One stage of training.
 pub struct Stage<F: Real = f32> {
@@ -115,12 +129,16 @@ pub struct Stage<F: Real = f32> {
     pub densify: Densify,
     /// First, last step of the stage that densifies, and the steps between.
     pub densify_steps: (usize, usize, usize),
+    /// Pruning by worth in space and time, beside densification.
+    pub prune: Option<Periodic>,
     /// Steps before each further SH degree; 0: all at once.
     pub sh_interval: usize,
     /// The first so many steps see pictures at half size: coarse things first, and four times faster.
     pub half_size_steps: usize,
     /// Lower bound of log life widths, by layer; learnt values are lifted to it.
     pub min_log_life: Option<f64>,
+    /// What stands between the parameters and the pictures; none: nothing.
+    pub codec: Option<Arc<dyn Codec<F>>>,
     /// Before the first step.
     pub start: Option<Hook<F>>,
     /// After the last.
@@ -140,9 +158,11 @@ impl<F: Real> Stage<F> {
             params: Vec::new(),
             densify: Densify::None,
             densify_steps: (0, 0, 0),
+            prune: None,
             sh_interval: 0,
             half_size_steps: 0,
             min_log_life: None,
+            codec: None,
             start: None,
             end: None,
         }

@@ -3,6 +3,7 @@
 use super::{Group, Plan, Program, Rate, Stage, densify_of};
 use crate::loss::scene::{MeanOpacity, MeanScale};
 use crate::loss::terms::ParamLoss;
+use crate::prune::Periodic;
 use crate::recipe::Recipe;
 use splat4d::motion::Spec;
 use splat4d::scene::LifeKind;
@@ -66,6 +67,7 @@ pub fn stage(name: &str, plan: &Plan) -> Stage {
         params,
         densify,
         densify_steps,
+        prune: Periodic::of(r),
         sh_interval: r.sh_degree_interval,
         half_size_steps: (r.half_size_until * r.iterations as f64) as usize,
         ..Stage::new(name, r.iterations)

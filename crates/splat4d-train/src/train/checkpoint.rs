@@ -1,4 +1,4 @@
-//! Checkpoints hold everything: scene, moments, statistics, exposure, the losses' memory and how far the run is. Random
+//! Checkpoints hold everything: scene, moments, statistics, exposure, the losses' and codecs' memory, how far the run is. Random
 //! numbers and samplers are functions of the step and need no saving. A resumed run is bit for bit the unbroken one.
 //!
 //! The file is a scene file with more arrays (`moments.L.T`, `stats.L`, `exposure…`), so that every reader of scenes
@@ -57,7 +57,7 @@ pub fn write(trainer: &Trainer<'_>, identity: &Identity, state: &RunState) -> Re
         push("exposure".into(), &e.params[e.key()]);
         push("exposure.moments".into(), e.moments.table(e.key()));
     }
-    let memories: Vec<(String, Vec<u32>)> = trainer
+    let mut memories: Vec<(String, Vec<u32>)> = trainer
         .stages
         .iter()
         .enumerate()
@@ -66,6 +66,8 @@ pub fn write(trainer: &Trainer<'_>, identity: &Identity, state: &RunState) -> Re
         })
         .filter(|(_, state)| !state.is_empty())
         .collect();
+    let codecs = trainer.stages.iter().enumerate().filter_map(|(s, stage)| Some((s, stage.codec.as_ref()?.state())));
+    memories.extend(codecs.filter(|(_, state)| !state.is_empty()).map(|(s, state)| (codec_name(s), state)));
     let mut tensors: Vec<Tensor<'_>> =
         arrays.iter().map(|(n, shape, data)| Tensor::f32(n.clone(), shape, data)).collect();
     tensors.extend(memories.iter().map(|(n, data)| Tensor::u32(n.clone(), &[data.len()], data)));
@@ -124,6 +126,10 @@ pub fn read(bytes: &[u8], trainer: &mut Trainer<'_>, identity: &Identity) -> Res
                 None => loss.restore(&[]),
             }
         }
+        if let Some(codec) = &stage.codec {
+            let state = file.get(&codec_name(s)).map_or_else(|| Ok(Vec::new()), |t| t.as_u32())?;
+            codec.restore(&state)?;
+        }
     }
     let count = |key: &str| {
         let n = meta[key].as_u64().and_then(|n| usize::try_from(n).ok());
@@ -147,6 +153,11 @@ pub fn read(bytes: &[u8], trainer: &mut Trainer<'_>, identity: &Identity) -> Res
         seconds: number(&meta["seconds"], "seconds")?,
         smooth: [number(&meta["smooth"][0], "smooth")?, number(&meta["smooth"][1], "smooth")?],
     })
+}
+
+/// What a checkpoint calls the memory of a stage's codec.
+fn codec_name(stage: usize) -> String {
+    format!("codec.{stage}")
 }
 
 /// Steps that the checkpoint in these bytes has taken, without reading its arrays' values.

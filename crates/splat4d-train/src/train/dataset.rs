@@ -19,6 +19,11 @@ impl Dataset {
         Self { capture: store.capture().clone(), store, frames }
     }
 
+    /// The capture whose frames they are.
+    pub fn capture(&self) -> &Arc<Capture> {
+        &self.capture
+    }
+
     /// The capture's number of frame i.
     pub fn frame(&self, i: usize) -> usize {
         self.frames[i]

@@ -5,6 +5,7 @@ pub mod checkpoint;
 pub mod dataset;
 pub mod loss;
 pub mod minutes;
+pub mod refine;
 pub mod run;
 mod snapshot;
 pub mod trainer;
@@ -14,4 +15,5 @@ pub(crate) mod tests;
 
 pub use crate::capture::frames;
 pub use crate::sampler;
+pub use refine::{Refine, Refined, refine};
 pub use run::{Outcome, TrainOptions, resume, resume_with, train};

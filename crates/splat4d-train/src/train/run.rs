@@ -14,7 +14,7 @@ use crate::capture::{Capture, CaptureOptions, ImageStore};
 use crate::densify::Limits;
 use crate::event::Event;
 use crate::init::{self, Seeds};
-use crate::models::{Plan, program};
+use crate::models::{Plan, Stage, program};
 use crate::recipe::Recipe;
 use crate::{Error, ErrorKind, Result};
 use serde_json::json;
@@ -119,13 +119,17 @@ pub fn train(
     let scene = bench.initial_scene(&plan)?;
     let mut trainer = bench.trainer(&plan, scene)?;
     trainer.check_not_empty()?;
-    write_atomically(&run.join("recipe.toml"), recipe.to_toml().as_bytes())?;
-    let identity = bench.identity(&recipe);
-    let state = RunState::default();
-    save_checkpoint(run, &trainer, &identity, &state, &mut listen)?;
-    write_run_json(run, &bench, &recipe, &Totals::default(), &trainer, &state, false)?;
-    let snapshots = options.snapshots;
-    let session = Session { run, bench: &bench, recipe: &recipe, identity, estimate, snapshots, stop };
+    let session = Session {
+        run,
+        bench: &bench,
+        recipe: &recipe,
+        identity: bench.identity(&recipe, ""),
+        made_by: TRAIN,
+        estimate,
+        snapshots: options.snapshots,
+        stop,
+    };
+    let state = session.begin(&trainer, &mut listen)?;
     session.drive(&mut trainer, state, &mut listen)
 }
 
@@ -142,20 +146,28 @@ pub fn resume_with(
     listen: &mut dyn FnMut(&Event),
 ) -> Result<Outcome> {
     let (recipe, capture) = open_run(run)?;
+    if let Some(other) = made_by(run)?.filter(|m| m != TRAIN) {
+        return Err(Error::input(format!("this run was made by `{other}`"))
+            .at(run.display())
+            .remedy(format!("Continue it with `splat4d {other}` and the options it began with")));
+    }
     let bench = Bench::new(Arc::new(capture), &recipe)?;
     let plan = bench.plan(&recipe);
     let empty =
         init::scene(&plan, program(&recipe.motion)?.as_ref(), &Seeds::default(), bench.background(), bench.capture.up)?;
     let mut trainer = bench.trainer(&plan, empty)?;
-    let identity = bench.identity(&recipe);
-    let (state, from) = restore_newest(run, &mut trainer, &identity)?;
+    let session = Session {
+        run,
+        bench: &bench,
+        recipe: &recipe,
+        identity: bench.identity(&recipe, ""),
+        made_by: TRAIN,
+        estimate: memory_estimate(&bench.capture, &recipe),
+        snapshots: options.snapshots,
+        stop,
+    };
     let mut listen = listen;
-    if let Some(warning) = from {
-        listen(&Event::Warning { message: warning });
-    }
-    let estimate = memory_estimate(&bench.capture, &recipe);
-    let snapshots = options.snapshots;
-    let session = Session { run, bench: &bench, recipe: &recipe, identity, estimate, snapshots, stop };
+    let state = session.restore(&mut trainer, &mut listen)?;
     session.drive(&mut trainer, state, &mut listen)
 }
 
@@ -163,14 +175,24 @@ pub fn resume_with(
 pub fn open_run(run: &Path) -> Result<(Recipe, Capture)> {
     let text = read_text(&run.join("recipe.toml"))?;
     let recipe = Recipe::from_toml(&text).map_err(|e| e.at(run.join("recipe.toml").display()))?;
-    let info: serde_json::Value = serde_json::from_str(&read_text(&run.join("run.json"))?)
-        .map_err(|e| Error::input(format!("it is not JSON: {e}")).at(run.join("run.json").display()))?;
+    let info = read_info(run)?;
     let path = info["capture"].as_str().ok_or_else(|| {
         Error::input("it does not name its capture").at(run.join("run.json").display()).remedy("Train again")
     })?;
     let capture = open_capture(Path::new(path), &recipe)
         .map_err(|e| e.remedy("The run needs its capture where it was when it was trained"))?;
     Ok((recipe, capture))
+}
+
+fn read_info(run: &Path) -> Result<serde_json::Value> {
+    let path = run.join("run.json");
+    serde_json::from_str(&read_text(&path)?)
+        .map_err(|e| Error::input(format!("it is not JSON: {e}")).at(path.display()))
+}
+
+/// The verb that made a run. Errors: not a run.
+fn made_by(run: &Path) -> Result<Option<String>> {
+    Ok(read_info(run)?["made_by"].as_str().map(str::to_owned))
 }
 
 /// Opens a capture as a recipe wants it: scale, split, and the part of the take that is used.
@@ -224,32 +246,44 @@ pub(super) struct Bench {
     simd: Simd,
 }
 
+/// The training frames of a capture, with as much memory for pictures as the recipe grants. Errors: there are none.
+pub fn training_frames(capture: Arc<Capture>, recipe: &Recipe) -> Result<Arc<Dataset>> {
+    if capture.train.is_empty() {
+        return Err(Error::input("the capture has no training frames").remedy("Hold out fewer views with --hold-out"));
+    }
+    let store = Arc::new(ImageStore::new(capture.clone(), recipe.image_memory as usize));
+    Ok(Arc::new(Dataset::new(store, capture.train.clone())))
+}
+
+/// What programs may know of a capture and a recipe. Panics: the capture has no training frames.
+pub fn plan(capture: &Capture, recipe: &Recipe) -> Plan {
+    let mut times: Vec<f64> = capture.train.iter().map(|&i| capture.frames[i].time.0).collect();
+    times.sort_by(f64::total_cmp);
+    times.dedup();
+    let clip = [times[0], times[times.len() - 1]];
+    let centers: Vec<[f64; 3]> = capture.train.iter().map(|&i| capture.frames[i].view.center()).collect();
+    Plan {
+        recipe: recipe.resolve(),
+        extent: extent(&centers),
+        clip,
+        fps: capture.fps,
+        times: times.len(),
+        fixed_cameras: capture.cameras.iter().filter(|c| c.fixed).count(),
+    }
+}
+
 impl Bench {
-    fn new(capture: Arc<Capture>, recipe: &Recipe) -> Result<Self> {
-        if capture.train.is_empty() {
-            return Err(
-                Error::input("the capture has no training frames").remedy("Hold out fewer views with --hold-out")
-            );
-        }
-        let store = Arc::new(ImageStore::new(capture.clone(), recipe.image_memory as usize));
-        let frames = Arc::new(Dataset::new(store, capture.train.clone()));
-        Ok(Self { capture, frames, simd: Simd::detect() })
+    pub(super) fn new(capture: Arc<Capture>, recipe: &Recipe) -> Result<Self> {
+        Ok(Self::with(training_frames(capture, recipe)?))
+    }
+
+    /// With frames that somebody else looks at too.
+    pub(super) fn with(frames: Arc<Dataset>) -> Self {
+        Self { capture: frames.capture().clone(), frames, simd: Simd::detect() }
     }
 
     pub(super) fn plan(&self, recipe: &Recipe) -> Plan {
-        let mut times: Vec<f64> = self.capture.train.iter().map(|&i| self.capture.frames[i].time.0).collect();
-        times.sort_by(f64::total_cmp);
-        times.dedup();
-        let clip = [times[0], times[times.len() - 1]];
-        let centers: Vec<[f64; 3]> = self.capture.train.iter().map(|&i| self.capture.frames[i].view.center()).collect();
-        Plan {
-            recipe: recipe.resolve(),
-            extent: extent(&centers),
-            clip,
-            fps: self.capture.fps,
-            times: times.len(),
-            fixed_cameras: self.capture.cameras.iter().filter(|c| c.fixed).count(),
-        }
+        plan(&self.capture, recipe)
     }
 
     fn background(&self) -> [f32; 3] {
@@ -275,6 +309,11 @@ impl Bench {
     }
 
     pub(super) fn trainer(&self, plan: &Plan, scene: Scene<f32>) -> Result<Trainer<'static>> {
+        Ok(self.trainer_of(plan, scene, program(&plan.recipe.motion)?.stages(plan)))
+    }
+
+    /// A trainer with stages that no program made.
+    pub(super) fn trainer_of(&self, plan: &Plan, scene: Scene<f32>, stages: Vec<Stage>) -> Trainer<'static> {
         let r = &plan.recipe;
         let config = RenderConfig {
             antialias: if r.antialias { Antialias::On } else { Antialias::Off },
@@ -296,20 +335,15 @@ impl Bench {
             opacity_reset_interval: r.opacity_reset_interval,
             exposure_lr: r.exposure_lr,
         };
-        Ok(Trainer::new(
-            scene,
-            program(&r.motion)?.stages(plan),
-            self.frames.clone(),
-            Box::new(Renderer::new(config)),
-            TrainLoss::new(r.lambda_dssim, r.lambda_mask, exposure),
-            settings,
-        ))
+        let loss = TrainLoss::new(r.lambda_dssim, r.lambda_mask, exposure);
+        Trainer::new(scene, stages, self.frames.clone(), Box::new(Renderer::new(config)), loss, settings)
     }
 
-    fn identity(&self, recipe: &Recipe) -> Identity {
+    /// What a checkpoint is of: the recipe and, where there is more to say, `text`.
+    pub(super) fn identity(&self, recipe: &Recipe, text: &str) -> Identity {
         // Knobs that only say how memory is spent never reach a result and may change between resumes.
         let neutral = Recipe { image_memory: 0, memory_limit: 0, checkpoint_interval: 0, ..recipe.clone() };
-        Identity { capture: fingerprint(&self.capture), recipe: hash(&neutral.to_toml()) }
+        Identity { capture: fingerprint(&self.capture), recipe: hash(&(neutral.to_toml() + text)) }
     }
 }
 
@@ -391,6 +425,25 @@ struct Totals {
     steps: usize,
 }
 
+/// What steps of this session take, without what stages do at their start.
+#[derive(Clone, Copy, Debug, Default)]
+struct Steps {
+    seconds: f64,
+    count: usize,
+}
+
+impl Steps {
+    fn add(&mut self, time: Duration) {
+        self.seconds += time.as_secs_f64();
+        self.count += 1;
+    }
+
+    /// Seconds a step.
+    fn mean(&self) -> f64 {
+        self.seconds / self.count.max(1) as f64
+    }
+}
+
 /// Names of the columns that [`Totals`] holds.
 const STAGE_NAMES: [&str; 8] =
     ["motion", "render", "loss", "render_backward", "motion_backward", "adam", "load", "other"];
@@ -408,43 +461,6 @@ impl Totals {
             *sum += x;
         }
     }
-}
-
-fn write_run_json(
-    run: &Path,
-    bench: &Bench,
-    recipe: &Recipe,
-    totals: &Totals,
-    trainer: &Trainer<'_>,
-    state: &RunState,
-    finished: bool,
-) -> Result<()> {
-    let steps = totals.steps.max(1) as f64;
-    let ms: serde_json::Map<String, serde_json::Value> =
-        STAGE_NAMES.iter().zip(totals.seconds).map(|(n, s)| ((*n).to_owned(), json!(s * 1e3 / steps))).collect();
-    let root = std::fs::canonicalize(&bench.capture.root).unwrap_or_else(|_| bench.capture.root.clone());
-    let info = json!({
-        "version": env!("CARGO_PKG_VERSION"),
-        "capture": root,
-        "capture_name": bench.capture.name,
-        "capture_fingerprint": fingerprint(&bench.capture),
-        "motion": recipe.motion,
-        "seed": recipe.seed,
-        "simd": format!("{:?}", bench.simd).to_lowercase(),
-        "threads": rayon::current_num_threads(),
-        "iteration": trainer.progress.iteration,
-        "iterations": trainer.iterations(),
-        "gaussians": trainer.scene.len(),
-        "seconds": state.seconds,
-        "finished": finished,
-        "rollbacks": trainer.progress.strikes,
-        "peak_memory": peak_memory(),
-        "memory_estimate": memory_estimate(&bench.capture, recipe),
-        "ms_per_step": ms,
-        "warnings": bench.capture.warnings,
-    });
-    let text = serde_json::to_string_pretty(&info).expect("plain data is JSON");
-    write_atomically(&run.join("run.json"), text.as_bytes())
 }
 
 /// metrics.csv: kept in memory, written whole at every checkpoint, so that it never runs ahead of one.
@@ -498,18 +514,49 @@ fn psnr(mse: f64) -> f64 {
     -10.0 * mse.max(1e-10).log10()
 }
 
-struct Session<'a> {
-    run: &'a Path,
-    bench: &'a Bench,
-    recipe: &'a Recipe,
-    identity: Identity,
-    estimate: u64,
-    snapshots: Option<Duration>,
-    stop: &'a AtomicBool,
+/// The verb that makes runs from points.
+const TRAIN: &str = "train";
+
+/// A run while it is driven.
+pub(super) struct Session<'a> {
+    pub(super) run: &'a Path,
+    pub(super) bench: &'a Bench,
+    pub(super) recipe: &'a Recipe,
+    pub(super) identity: Identity,
+    /// The verb that made it, and that continues it.
+    pub(super) made_by: &'a str,
+    /// Bytes of memory, estimated.
+    pub(super) estimate: u64,
+    pub(super) snapshots: Option<Duration>,
+    pub(super) stop: &'a AtomicBool,
 }
 
 impl Session<'_> {
-    fn drive(&self, trainer: &mut Trainer<'_>, mut state: RunState, listen: &mut dyn FnMut(&Event)) -> Result<Outcome> {
+    /// Makes the folder of a run that has not taken a step.
+    pub(super) fn begin(&self, trainer: &Trainer<'_>, listen: &mut dyn FnMut(&Event)) -> Result<RunState> {
+        write_atomically(&self.run.join("recipe.toml"), self.recipe.to_toml().as_bytes())?;
+        let state = RunState::default();
+        save_checkpoint(self.run, trainer, &self.identity, &state, listen)?;
+        self.write_info(&Totals::default(), trainer, &state, false)?;
+        Ok(state)
+    }
+
+    /// Goes to the newest sound checkpoint, and warns of what was skipped.
+    pub(super) fn restore(&self, trainer: &mut Trainer<'_>, listen: &mut dyn FnMut(&Event)) -> Result<RunState> {
+        let (state, warning) = restore_newest(self.run, trainer, &self.identity)?;
+        if let Some(message) = warning {
+            listen(&Event::Warning { message });
+        }
+        Ok(state)
+    }
+
+    /// Steps until all stages are done or somebody says stop.
+    pub(super) fn drive(
+        &self,
+        trainer: &mut Trainer<'_>,
+        mut state: RunState,
+        listen: &mut dyn FnMut(&Event),
+    ) -> Result<Outcome> {
         let iterations = trainer.iterations();
         let first = trainer.progress.iteration;
         listen(&Event::Started {
@@ -523,7 +570,16 @@ impl Session<'_> {
         let mut totals = Totals::default();
         let mut snapshots = self.snapshots.map(|interval| Snapshots::new(interval, &self.bench.capture));
         let (mut clock, mut told) = (Clock::now(), Clock::now());
+        let mut steps = Steps::default();
         while !trainer.is_done() && !self.stop.load(Ordering::Relaxed) {
+            let from = (trainer.progress.stage, trainer.progress.iteration);
+            trainer.enter(&mut |name, done, total| listen(&Event::Phase { name: name.to_owned(), done, total }))?;
+            state.seconds += clock.elapsed().as_secs_f64();
+            clock = Clock::now();
+            if trainer.is_done() {
+                break;
+            }
+            let entered = from == (0, 0) || from.0 != trainer.progress.stage || trainer.progress.stage_step == 0;
             let step = match trainer.step()? {
                 Ok(step) => step,
                 Err(fault) => {
@@ -532,6 +588,7 @@ impl Session<'_> {
                     continue;
                 }
             };
+            steps.add(clock.elapsed());
             state.seconds += clock.elapsed().as_secs_f64();
             clock = Clock::now();
             let fresh = if trainer.progress.iteration <= 1 { 1.0 } else { SMOOTHING };
@@ -542,13 +599,15 @@ impl Session<'_> {
             metrics.push(trainer, &step, &state);
             if told.elapsed().as_secs_f64() > PROGRESS_SECONDS || trainer.is_done() {
                 told = Clock::now();
-                listen(&self.progress(trainer, &state, iterations));
+                listen(&self.progress(trainer, &state, &steps));
             }
             let i = trainer.progress.iteration;
-            if let Some(event) = snapshots.as_mut().and_then(|s| s.take(&trainer.scene, i)) {
+            if let Some(event) = snapshots.as_mut().and_then(|s| s.take(trainer)) {
                 listen(&event);
             }
-            if i.is_multiple_of(self.recipe.checkpoint_interval) && !trainer.is_done() {
+            // What the start of a later stage did may have taken long: it is not to be done twice.
+            let due = i.is_multiple_of(self.recipe.checkpoint_interval) || entered && i > 1;
+            if due && !trainer.is_done() {
                 self.save(trainer, &state, &metrics, &totals, false, listen)?;
             }
         }
@@ -557,19 +616,19 @@ impl Session<'_> {
         let gaussians = trainer.scene.len();
         let iteration = trainer.progress.iteration;
         if let Some(snapshots) = &mut snapshots {
-            listen(&snapshots.now(&trainer.scene, iteration));
+            listen(&snapshots.now(trainer));
         }
         if done {
             let mut bytes = Vec::new();
-            splat4d::format::scene::write(&trainer.scene, &mut bytes)?;
+            splat4d::format::scene::write(&trainer.shown(), &mut bytes)?;
             write_atomically(&self.run.join("scene.safetensors"), &bytes)?;
             listen(&Event::Finished { iteration, seconds: state.seconds, gaussians, peak_memory: peak_memory() });
         }
         Ok(Outcome { run: self.run.to_owned(), iteration, gaussians, seconds: state.seconds, interrupted: !done })
     }
 
-    fn progress(&self, trainer: &Trainer<'_>, state: &RunState, iterations: usize) -> Event {
-        let iteration = trainer.progress.iteration;
+    fn progress(&self, trainer: &Trainer<'_>, state: &RunState, steps: &Steps) -> Event {
+        let (iteration, iterations) = (trainer.progress.iteration, trainer.iterations());
         Event::Progress {
             iteration,
             iterations,
@@ -578,7 +637,7 @@ impl Session<'_> {
             psnr: psnr(state.smooth[1]),
             gaussians: trainer.scene.len(),
             seconds: state.seconds,
-            seconds_left: state.seconds / iteration.max(1) as f64 * (iterations - iteration) as f64,
+            seconds_left: steps.mean() * (iterations - iteration) as f64,
         }
     }
 
@@ -593,7 +652,39 @@ impl Session<'_> {
     ) -> Result<()> {
         metrics.write(self.run)?;
         save_checkpoint(self.run, trainer, &self.identity, state, listen)?;
-        write_run_json(self.run, self.bench, self.recipe, totals, trainer, state, finished)
+        self.write_info(totals, trainer, state, finished)
+    }
+
+    /// run.json: what the run is and how it went.
+    fn write_info(&self, totals: &Totals, trainer: &Trainer<'_>, state: &RunState, finished: bool) -> Result<()> {
+        let (capture, recipe) = (&self.bench.capture, self.recipe);
+        let steps = totals.steps.max(1) as f64;
+        let ms: serde_json::Map<String, serde_json::Value> =
+            STAGE_NAMES.iter().zip(totals.seconds).map(|(n, s)| ((*n).to_owned(), json!(s * 1e3 / steps))).collect();
+        let root = std::fs::canonicalize(&capture.root).unwrap_or_else(|_| capture.root.clone());
+        let info = json!({
+            "version": env!("CARGO_PKG_VERSION"),
+            "made_by": self.made_by,
+            "capture": root,
+            "capture_name": capture.name,
+            "capture_fingerprint": fingerprint(capture),
+            "motion": recipe.motion,
+            "seed": recipe.seed,
+            "simd": format!("{:?}", self.bench.simd).to_lowercase(),
+            "threads": rayon::current_num_threads(),
+            "iteration": trainer.progress.iteration,
+            "iterations": trainer.iterations(),
+            "gaussians": trainer.scene.len(),
+            "seconds": state.seconds,
+            "finished": finished,
+            "rollbacks": trainer.progress.strikes,
+            "peak_memory": peak_memory(),
+            "memory_estimate": self.estimate,
+            "ms_per_step": ms,
+            "warnings": capture.warnings,
+        });
+        let text = serde_json::to_string_pretty(&info).expect("plain data is JSON");
+        write_atomically(&self.run.join("run.json"), text.as_bytes())
     }
 
     /// Back to the last checkpoint with half the rates; the third time the run is given up.

@@ -102,15 +102,11 @@ impl Place {
         let plan = bench.plan(&recipe);
         let mut trainer = bench.trainer(&plan, bench.initial_scene(&plan)?)?;
         trainer.set_draw(draw);
-        write_atomically(&run.join("recipe.toml"), recipe.to_toml().as_bytes())?;
-        let (identity, state) = (bench.identity(&recipe), RunState::default());
-        save_checkpoint(&run, &trainer, &identity, &state, listen)?;
-        write_run_json(&run, &bench, &recipe, &Totals::default(), &trainer, &state, false)?;
-        Session { run: &run, bench: &bench, recipe: &recipe, identity, estimate: 0, snapshots: None, stop }.drive(
-            &mut trainer,
-            state,
-            listen,
-        )
+        let identity = bench.identity(&recipe, "");
+        let (bench, recipe, run, made_by) = (&bench, &recipe, run.as_path(), TRAIN);
+        let session = Session { run, bench, recipe, identity, made_by, estimate: 0, snapshots: None, stop };
+        let state = session.begin(&trainer, listen)?;
+        session.drive(&mut trainer, state, listen)
     }
 
     fn scene(&self, name: &str) -> Vec<u8> {
@@ -336,7 +332,7 @@ fn a_fault_rolls_back_with_smaller_steps_and_names_its_place() {
     let bench = Bench::new(place.open(&recipe), &recipe).unwrap();
     let plan = bench.plan(&recipe);
     let mut trainer = bench.trainer(&plan, bench.initial_scene(&plan).unwrap()).unwrap();
-    restore_newest(&place.run("once"), &mut trainer, &bench.identity(&recipe.resolve())).unwrap();
+    restore_newest(&place.run("once"), &mut trainer, &bench.identity(&recipe.resolve(), "")).unwrap();
     assert_eq!((trainer.progress.rate_scale, trainer.progress.strikes), (ROLLBACK_RATE, 1));
     let scene = splat4d::format::scene::read(&place.scene("once")).unwrap();
     assert!(scene.layers.iter().all(|l| l.params.first_non_finite().is_none()));

@@ -1,6 +1,7 @@
 //! The scene while it learns, as a playback file: for whoever watches. It only reads, so that the result stays the same
 //! to the bit.
 
+use super::trainer::Trainer;
 use crate::Result;
 use crate::capture::Capture;
 use crate::event::Event;
@@ -51,14 +52,14 @@ impl Snapshots {
     }
 
     /// The snapshot, where one is due. One that fails is a warning.
-    pub(super) fn take(&mut self, scene: &Scene<f32>, iteration: usize) -> Option<Event> {
-        (Instant::now() >= self.due).then(|| self.now(scene, iteration))
+    pub(super) fn take(&mut self, trainer: &Trainer<'_>) -> Option<Event> {
+        (Instant::now() >= self.due).then(|| self.now(trainer))
     }
 
     /// The snapshot, due or not.
-    pub(super) fn now(&mut self, scene: &Scene<f32>, iteration: usize) -> Event {
-        let started = Instant::now();
-        let event = match self.bytes(scene) {
+    pub(super) fn now(&mut self, trainer: &Trainer<'_>) -> Event {
+        let (started, iteration) = (Instant::now(), trainer.progress.iteration);
+        let event = match self.bytes(&trainer.shown()) {
             Ok(bytes) => Event::Snapshot { iteration, bytes: bytes.into() },
             Err(e) => Event::Warning { message: format!("step {iteration} cannot be shown: {e}") },
         };

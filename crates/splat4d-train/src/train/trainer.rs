@@ -4,14 +4,17 @@ use super::chain::{Chain, Draw, Losses, StepInfo, StepReport, View};
 use super::loss::TrainLoss;
 use crate::capture::frames::{Frames, Picture};
 use crate::densify::{self, Change, Densify, Limits, Stats, adc, mcmc, morton_edit};
-use crate::models::Stage;
+use crate::loss::terms::Codec;
+use crate::models::{Hook, Stage, Tell};
 use crate::optim::{Floor, Moments};
+use crate::prune::prune;
 use crate::sampler::Timeline;
 use crate::{Error, ErrorKind, Result};
 use splat4d::layers::Scene;
 use splat4d::math::Rng;
 use splat4d::scene::life::LOG_WIDTH;
-use splat4d::scene::{Camera, GEOMETRY, Grads, LIFE, Space};
+use splat4d::scene::{Camera, GEOMETRY, Grads, LIFE, SH, Space};
+use std::borrow::Cow;
 use std::sync::Arc;
 use std::time::{Duration, Instant as Clock};
 
@@ -88,6 +91,12 @@ pub struct Trainer<'a> {
     pub loss: TrainLoss,
     /// Settings that hold for all stages.
     pub settings: Settings,
+    /// What the stage's codec shows of the scene.
+    shown: Scene<f32>,
+    /// Whether `shown` is to be copied from the scene anew.
+    stale: bool,
+    /// Whether the current stage's start is over although it has taken no step.
+    entered: bool,
     frames: Arc<dyn Frames>,
     timeline: Timeline,
     draw: Box<dyn Draw<f32> + 'a>,
@@ -118,6 +127,9 @@ impl<'a> Trainer<'a> {
             progress: Progress { rate_scale: 1.0, ..Progress::default() },
             loss,
             settings,
+            shown: Scene::default(),
+            stale: true,
+            entered: false,
             frames,
             timeline,
             draw,
@@ -157,8 +169,23 @@ impl<'a> Trainer<'a> {
         self.stages.get(self.progress.stage).map_or("done", |s| &s.name)
     }
 
+    /// Runs a hook; what of the moments belongs to layers of other names is forgotten.
+    fn run_hook(&mut self, hook: impl Fn(&Stage) -> Option<&Hook<f32>>, tell: &mut Tell<'_>) -> Result<()> {
+        let Some(hook) = hook(&self.stages[self.progress.stage]) else { return Ok(()) };
+        let names: Vec<String> = self.scene.layers.iter().map(|l| l.name.clone()).collect();
+        hook(&mut self.scene, tell)?;
+        for ((moments, old), layer) in self.moments.iter_mut().zip(&names).zip(&self.scene.layers) {
+            if *old != layer.name {
+                *moments = Moments::default();
+            }
+        }
+        self.adapt();
+        Ok(())
+    }
+
     /// Fits gradients, moments and statistics to a scene that a hook changed; what still fits is kept.
     fn adapt(&mut self) {
+        self.stale = true;
         self.moments.resize_with(self.scene.layers.len(), Moments::default);
         self.moments.truncate(self.scene.layers.len());
         for (layer, moments) in self.scene.layers.iter().zip(&mut self.moments) {
@@ -177,35 +204,45 @@ impl<'a> Trainer<'a> {
     /// Takes over a checkpoint's state. The scene and all tables must belong together.
     pub fn restore(&mut self, scene: Scene<f32>, moments: Vec<Moments<f32>>, stats: Stats, progress: Progress) {
         (self.scene, self.moments, self.stats, self.progress) = (scene, moments, stats, progress);
+        (self.stale, self.entered) = (true, false);
         self.fit_grads();
     }
 
-    /// Whether a step is the first after a row of zero-step stages; runs the hooks that are due.
-    fn enter_stage(&mut self) -> Result<()> {
+    /// Runs the hooks that are due before the next step, through stages without steps. [`step`](Self::step) does so by
+    /// itself, but tells nobody.
+    pub fn enter(&mut self, tell: &mut Tell<'_>) -> Result<()> {
         while let Some(stage) = self.stages.get(self.progress.stage) {
             let empty = stage.iterations == 0;
-            if self.progress.stage_step == 0
-                && let Some(hook) = &stage.start
-            {
-                hook(&mut self.scene)?;
-                self.adapt();
+            if self.progress.stage_step == 0 && !self.entered {
+                self.run_hook(|s| s.start.as_ref(), tell)?;
+                (self.entered, self.stale) = (true, true);
             }
             if !empty {
                 return Ok(());
             }
-            self.leave_stage()?;
+            self.leave_stage(tell)?;
         }
         Ok(())
     }
 
-    fn leave_stage(&mut self) -> Result<()> {
-        if let Some(hook) = &self.stages[self.progress.stage].end {
-            hook(&mut self.scene)?;
-            self.adapt();
-        }
+    fn leave_stage(&mut self, tell: &mut Tell<'_>) -> Result<()> {
+        self.run_hook(|s| s.end.as_ref(), tell)?;
         self.progress.stage += 1;
         self.progress.stage_step = 0;
+        self.entered = false;
         Ok(())
+    }
+
+    /// The codec of the stage that runs, or of the last one when all is done.
+    fn codec(&self) -> Option<&Arc<dyn Codec<f32>>> {
+        let begun = self.progress.stage_step > 0 || self.entered || self.is_done();
+        let stage = self.progress.stage.min(self.stages.len() - 1);
+        self.stages[stage].codec.as_ref().filter(|_| begun)
+    }
+
+    /// The scene as pictures show it: as it will be read from its file, where the stage has a codec.
+    pub fn shown(&self) -> Cow<'_, Scene<f32>> {
+        self.codec().map_or(Cow::Borrowed(&self.scene), |c| Cow::Owned(c.whole(&self.scene)))
     }
 
     /// The frames that step `stage_step` of the current stage will see.
@@ -223,7 +260,7 @@ impl<'a> Trainer<'a> {
     }
 
     fn step_in_pool(&mut self) -> Result<std::result::Result<Stepped, Fault>> {
-        self.enter_stage()?;
+        self.enter(&mut |_, _, _| {})?;
         let mut out = Stepped::default();
         if self.is_done() {
             return Ok(Ok(out));
@@ -246,13 +283,13 @@ impl<'a> Trainer<'a> {
             return Ok(Err(fault));
         }
         let clock = Clock::now();
-        out.change = self.maintain();
+        out.change = self.maintain()?;
         self.progress.iteration += 1;
         self.progress.stage_step += 1;
         if self.progress.stage_step == self.stages[self.progress.stage].iterations {
-            self.leave_stage()?;
+            self.leave_stage(&mut |_, _, _| {})?;
         }
-        out.other = clock.elapsed();
+        out.other += clock.elapsed();
         Ok(Ok(out))
     }
 
@@ -298,11 +335,21 @@ impl<'a> Trainer<'a> {
             Some(unlocked) => unlocked.min(self.settings.sh_degree),
             None => self.settings.sh_degree,
         };
+        let clock = Clock::now();
+        if let Some(codec) = &stage.codec {
+            if std::mem::take(&mut self.stale) {
+                self.shown = self.scene.clone();
+                codec.reset();
+            }
+            codec.show(&self.scene, &info.times, &mut self.shown);
+        }
+        out.other += clock.elapsed();
+        let scene = if stage.codec.is_some() { &self.shown } else { &self.scene };
         let mut mse = Mse { inner: &mut self.loss, sum: 0.0 };
         let mut losses = Losses { image: &mut mse, probes: &stage.probes, params: &stage.params };
         let stats = &mut self.stats;
         out.report =
-            self.chain.step(&self.scene, &views, &info, self.draw.as_mut(), &mut losses, &mut self.grads, &mut |o| {
+            self.chain.step(scene, &views, &info, self.draw.as_mut(), &mut losses, &mut self.grads, &mut |o| {
                 stats.observe(o)
             });
         out.mse = mse.sum / views.len().max(1) as f64;
@@ -314,12 +361,17 @@ impl<'a> Trainer<'a> {
         let stage = &self.stages[self.progress.stage];
         let progress = self.progress.stage_step as f64 / stage.iterations as f64;
         let mut bad = Vec::new();
+        if let Some(codec) = &stage.codec
+            && !codec.learn(&mut self.grads, progress, self.progress.rate_scale)
+        {
+            bad.push((0, SH));
+        }
         self.rates.resize_with(self.scene.layers.len(), Vec::new);
         for (index, layer) in self.scene.layers.iter_mut().enumerate() {
             let rates = &mut self.rates[index];
             rates.resize(layer.params.keys().count(), None);
             rates.iter_mut().flatten().for_each(|table| table.fill(0.0));
-            for group in stage.groups.iter().filter(|g| g.layer == index) {
+            for group in stage.groups.iter().filter(|g| g.is_of(index)) {
                 let found = layer.params.keys().find_map(|k| layer.params[k].column(&group.column).map(|c| (k, c)));
                 let Some((key, (first, width))) = found else { continue };
                 let (from, count) = group.part.unwrap_or((0, width));
@@ -358,14 +410,14 @@ impl<'a> Trainer<'a> {
         Some(Fault(format!("`{column}` of Gaussian {row} of layer {layer} is not finite ({})", views())))
     }
 
-    /// Noise, densification, resets, memory order; clears the gradients.
-    fn maintain(&mut self) -> Change {
+    /// Noise, densification, pruning, resets, memory order; clears the gradients.
+    fn maintain(&mut self) -> Result<Change> {
         let stage = &self.stages[self.progress.stage];
         let (step, seed) = (self.progress.stage_step + 1, self.settings.seed);
         let address = self.progress.iteration as u64;
         if let Densify::Mcmc(m) = &stage.densify {
             let rate = |layer: usize| {
-                let group = stage.groups.iter().find(|g| g.layer == layer && g.column == "means")?;
+                let group = stage.groups.iter().find(|g| g.is_of(layer) && g.column == "means")?;
                 Some(group.rate.at(self.progress.stage_step as f64 / stage.iterations as f64))
             };
             for (index, layer) in self.scene.layers.iter_mut().enumerate() {
@@ -405,14 +457,32 @@ impl<'a> Trainer<'a> {
                 }
             }
             stage.params.iter().for_each(|l| l.on_edit());
+            self.stale = true;
             self.fit_grads();
         }
+        change.removed += self.prune(step)?;
         let stage = &self.stages[self.progress.stage];
         let reset = self.settings.opacity_reset_interval;
         if matches!(stage.densify, Densify::Adc(_)) && reset > 0 && step.is_multiple_of(reset) && step < until {
             adc::reset_opacity(&mut self.scene, &mut self.moments, 2.0 * self.settings.limits.min_opacity);
+            self.stale = true;
         }
-        change
+        Ok(change)
+    }
+
+    /// Pruning after so many steps of the stage, if it is due; returns how many rows went.
+    fn prune(&mut self, step: usize) -> Result<usize> {
+        let stage = &self.stages[self.progress.stage];
+        let Some(periodic) = stage.prune.filter(|p| p.is_due(step, stage.iterations)) else { return Ok(0) };
+        let before = self.scene.len();
+        let scores = periodic.scores(&self.scene, self.frames.as_ref(), self.draw.config().antialias)?;
+        let rng = Rng::new(self.settings.seed, "prune", self.progress.iteration as u64);
+        for (layer, edit) in prune(&self.scene, &scores, periodic.ratio).iter().enumerate() {
+            densify::apply(&mut self.scene, &mut self.moments, &mut self.stats, layer, edit, &rng);
+        }
+        self.stages[self.progress.stage].params.iter().for_each(|l| l.on_edit());
+        self.fit_grads();
+        Ok(before - self.scene.len())
     }
 
     /// Errors if the scene is empty: nothing could be learnt.

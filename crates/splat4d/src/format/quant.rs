@@ -9,11 +9,22 @@ use std::f64::consts::FRAC_1_SQRT_2;
 ///
 /// Error of the round trip: at most (max − min)/(2·levels). A range that is empty, or a NaN, gives code 0.
 pub fn linear_code(value: f64, min: f64, max: f64, levels: u32) -> u32 {
-    let (range, levels) = (max - min, f64::from(levels));
-    if range > 0.0 { ((value - min) / range * levels).round().clamp(0.0, levels) as u32 } else { 0 }
+    coarse_code(value, min, max, levels, 1)
+}
+
+/// As [`linear_code`], but only multiples of `step`, a power of two.
+///
+/// Error of the round trip: at most `step` times as large, and as much again above the largest multiple.
+#[inline(always)]
+pub fn coarse_code(value: f64, min: f64, max: f64, levels: u32, step: u32) -> u32 {
+    // A division by a power of two is exact: a step of 1 changes no bit.
+    let (range, each, last) = (max - min, 1.0 / f64::from(step), f64::from(levels / step));
+    let code = ((value - min) / range * f64::from(levels) * each).round().clamp(0.0, last) as u32 * step;
+    if range > 0.0 { code } else { 0 }
 }
 
 /// The number behind a [`linear_code`]: min + (max − min)·code/levels.
+#[inline(always)]
 pub fn linear(code: u32, min: f64, max: f64, levels: u32) -> f64 {
     min + (max - min) * (f64::from(code) / f64::from(levels))
 }
@@ -34,11 +45,21 @@ pub fn log(code: u32, min: f64, max: f64, levels: u32) -> f64 {
 ///
 /// Error of the round trip: at most most/(2·half).
 pub fn signed_code(value: f64, most: f64, half: u32) -> u32 {
-    let (share, half) = (if most > 0.0 { value / most } else { 0.0 }, f64::from(half));
-    ((share * half).round().clamp(-half, half) + half) as u32
+    coarse_signed_code(value, most, half, 1)
+}
+
+/// As [`signed_code`], but only `half` and what lies multiples of `step`, a power of two, beside it.
+#[inline(always)]
+pub fn coarse_signed_code(value: f64, most: f64, half: u32, step: u32) -> u32 {
+    let share = if most > 0.0 { value / most } else { 0.0 };
+    let (each, last) = (1.0 / f64::from(step), f64::from(half / step));
+    // A NaN is zero here as well, which 0 as its code would not be.
+    let steps = (share * f64::from(half) * each).round().clamp(-last, last) as i32;
+    (half as i32 + steps * step as i32) as u32
 }
 
 /// The number behind a [`signed_code`]: most·(code − half)/half.
+#[inline(always)]
 pub fn signed(code: u32, most: f64, half: u32) -> f64 {
     most * ((f64::from(code) - f64::from(half)) / f64::from(half))
 }
@@ -48,14 +69,26 @@ pub fn signed(code: u32, most: f64, half: u32) -> f64 {
 ///
 /// Error of the round trip: at most 1/(2√2·half) in each of the three, and so at most 2.5/half radians of rotation.
 pub fn quat_codes(q: [f64; 4], half: u32) -> (usize, [u32; 3]) {
+    coarse_quat_codes(q, half, 1)
+}
+
+/// As [`quat_codes`] with codes as those of [`coarse_signed_code`].
+#[inline(always)]
+pub fn coarse_quat_codes(q: [f64; 4], half: u32, step: u32) -> (usize, [u32; 3]) {
     let (q, _) = quat::normalize(q);
-    let largest = (1..4).fold(0, |best, i| if q[i].abs() > q[best].abs() { i } else { best });
+    let mut largest = 0;
+    for i in 1..4 {
+        largest = if q[i].abs() > q[largest].abs() { i } else { largest };
+    }
     let sign = if q[largest] < 0.0 { -1.0 } else { 1.0 };
-    (largest, others(largest).map(|i| signed_code(sign * q[i], FRAC_1_SQRT_2, half)))
+    let code = |i: usize| coarse_signed_code(sign * q[i], FRAC_1_SQRT_2, half, step);
+    let [a, b, c] = others(largest);
+    (largest, [code(a), code(b), code(c)])
 }
 
 /// The unit quaternion wxyz behind [`quat_codes`]. Three codes that together exceed 1 give the largest component 0, and
 /// are normalised. Panics: largest > 3.
+#[inline(always)]
 pub fn quat(largest: usize, codes: [u32; 3], half: u32) -> [f64; 4] {
     let mut q = [0.0; 4];
     let mut rest = 1.0;
@@ -68,8 +101,9 @@ pub fn quat(largest: usize, codes: [u32; 3], half: u32) -> [f64; 4] {
 }
 
 /// The components but one, in order.
+#[inline(always)]
 fn others(largest: usize) -> [usize; 3] {
-    std::array::from_fn(|i| i + usize::from(i >= largest))
+    [usize::from(largest == 0), 1 + usize::from(largest <= 1), 2 + usize::from(largest <= 2)]
 }
 
 /// Bits an axis of [`morton`].

@@ -162,25 +162,31 @@ impl<F: Real> Layer<F> {
         false
     }
 
-    /// [from, to] in seconds for every row: when its opacity times life is at least [`ALPHA_MIN`] within the layer's span;
-    /// (1, 0) for never.
-    pub fn spans(&self) -> Vec<[f64; 2]> {
+    /// What the life of every row is: centre, log width, log softness (seconds; columns that the kind lacks are zero). The
+    /// model's own where it has one, otherwise the layer's.
+    pub fn lives(&self) -> (LifeKind, Vec<[f64; 3]>) {
         let mut own = Table::new(&[("life", 2)], 0);
         let (table, kind) = if self.motion.life(&self.params, &mut own) {
             (&own, LifeKind::GaussHalf)
         } else {
             (&self.params[LIFE], self.life)
         };
+        (kind, (0..self.params.len()).map(|id| life_row(table, id).map(Real::f64)).collect())
+    }
+
+    /// [from, to] in seconds for every row: when its opacity times life is at least [`ALPHA_MIN`] within the layer's span;
+    /// (1, 0) for never.
+    pub fn spans(&self) -> Vec<[f64; 2]> {
+        let (kind, rows) = self.lives();
         let geometry = &self.params[GEOMETRY];
         // The span's end is not part of it, but an interval's is.
         let end = if self.span[1].is_finite() { self.span[1].next_down() } else { self.span[1] };
-        let span = |id: usize| {
-            let row: [f64; 3] = life_row(table, id).map(Real::f64);
-            let reach = kind.reach(row, geometry.get(id, OPACITY).sigmoid().f64(), ALPHA_MIN);
+        let span = |(id, row): (usize, &[f64; 3])| {
+            let reach = kind.reach(*row, geometry.get(id, OPACITY).sigmoid().f64(), ALPHA_MIN);
             let (from, to) = ((row[0] - reach).max(self.span[0]), (row[0] + reach).min(end));
             if reach < 0.0 || from > to { [1.0, 0.0] } else { [from, to] }
         };
-        (0..self.params.len()).map(span).collect()
+        rows.iter().enumerate().map(span).collect()
     }
 
     /// Buckets for playback over a clip.

@@ -23,7 +23,7 @@ use std::f64::consts::LN_2;
 use std::ops::Range;
 
 /// Splats whose bit maps are made at once: one a bit.
-const BATCH: usize = 64;
+pub(super) const BATCH: usize = 64;
 /// Splats of one transposition of bits.
 const GROUP: usize = 16;
 /// Splats between two tests whether all pixels of a tile have stopped.
@@ -34,11 +34,11 @@ const ALPHA_CEILING: f64 = 1.0 - 1e-6;
 const T_FLOOR: f64 = 1e-30;
 
 /// Lanes of a strip where a register holds one row of pixels, and where it holds two.
-const ROW: usize = TILE;
-const PAIR_OF_ROWS: usize = 2 * TILE;
+pub(super) const ROW: usize = TILE;
+pub(super) const PAIR_OF_ROWS: usize = 2 * TILE;
 
 /// A number of each of a tile's 64 pixels, row by row.
-type Plane<F> = [F; TILE * TILE];
+pub(super) type Plane<F> = [F; TILE * TILE];
 
 /// The pixels of a tile.
 #[repr(C, align(64))]
@@ -58,13 +58,13 @@ impl<F: Real> Default for Tile<F> {
 
 /// Strips of `N` lanes of a plane.
 #[inline(always)]
-fn strips<F, const N: usize>(plane: &mut Plane<F>, range: Range<usize>) -> &mut [[F; N]] {
+pub(super) fn strips<F, const N: usize>(plane: &mut Plane<F>, range: Range<usize>) -> &mut [[F; N]] {
     &mut plane.as_chunks_mut().0[range]
 }
 
 /// The strips that hold these rows.
 #[inline(always)]
-fn strip_range<const N: usize>(rows: Range<usize>) -> Range<usize> {
+pub(super) fn strip_range<const N: usize>(rows: Range<usize>) -> Range<usize> {
     rows.start / (N / TILE)..rows.end.div_ceil(N / TILE)
 }
 
@@ -162,7 +162,7 @@ fn bit_maps<F>(batch: &[Record<F>]) -> [u64; TILES] {
 }
 
 /// log₂ of o·g along the strips of one splat in one tile.
-struct Exponent<F, const N: usize> {
+pub(super) struct Exponent<F, const N: usize> {
     /// log₂ o + a dx².
     ax: [F; N],
     /// b dx + c dy of the strip in hand.
@@ -172,7 +172,7 @@ struct Exponent<F, const N: usize> {
     /// What q and dy fall by from strip to strip.
     steps: [F; 2],
     /// The exponent's ceiling: log₂ of min(o, α_max). Rounding may take a needle's above its top.
-    top: F,
+    pub top: F,
 }
 
 /// x offsets of a row's pixels from the splat's centre, strip after strip.
@@ -184,7 +184,7 @@ fn offsets<F: Real, const N: usize>(r: &Record<F>, tx: usize) -> [F; N] {
 impl<F: Real, const N: usize> Exponent<F, N> {
     /// At strip `strip` of the tile.
     #[inline(always)]
-    fn new<const FMA: bool>(r: &Record<F>, tx: usize, ty: usize, strip: usize, limits: &Limits<F>) -> Self {
+    pub fn new<const FMA: bool>(r: &Record<F>, tx: usize, ty: usize, strip: usize, limits: &Limits<F>) -> Self {
         let log_opacity = limits.log_min + r.log_ratio;
         let rows = N / TILE;
         let first = r.y - (F::of((ty * TILE + strip * rows) as f64) + F::HALF);
@@ -201,13 +201,13 @@ impl<F: Real, const N: usize> Exponent<F, N> {
 
     /// The exponent at lane `l`, not yet under its ceiling.
     #[inline(always)]
-    fn raw<const FMA: bool>(&self, l: usize) -> F {
+    pub fn raw<const FMA: bool>(&self, l: usize) -> F {
         self.q[l].fma::<FMA>(self.dy[l], self.ax[l])
     }
 
     /// On to the next strip.
     #[inline(always)]
-    fn step(&mut self, l: usize) {
+    pub fn step(&mut self, l: usize) {
         self.q[l] -= self.steps[0];
         self.dy[l] -= self.steps[1];
     }
@@ -215,14 +215,14 @@ impl<F: Real, const N: usize> Exponent<F, N> {
 
 /// α at an exponent that is under its ceiling: 0 below the cut-off.
 #[inline(always)]
-fn alpha<F: Real, const FMA: bool>(power: F, limits: &Limits<F>) -> F {
+pub(super) fn alpha<F: Real, const FMA: bool>(power: F, limits: &Limits<F>) -> F {
     select(power >= limits.log_min, power.blend_exp2::<FMA>(), F::ZERO)
 }
 
 /// T after a splat of this α, its weight α·T, and whether the pixel is still open. Both directions call this, so that
 /// they agree to the last bit.
 #[inline(always)]
-fn pass<F: Real>(t: F, alpha: F, limits: &Limits<F>) -> (F, F, bool) {
+pub(super) fn pass<F: Real>(t: F, alpha: F, limits: &Limits<F>) -> (F, F, bool) {
     let weight = alpha * t;
     // A pixel that has stopped has a negative T and stays below the limit.
     let kept = t - weight;
@@ -325,7 +325,7 @@ impl<F: Real, const N: usize> Visit<F> for Forward<'_, F, N> {
 
 /// The largest of 64 transmittances, lanes first.
 #[inline(always)]
-fn highest<F: Real>(plane: &Plane<F>) -> F {
+pub(super) fn highest<F: Real>(plane: &Plane<F>) -> F {
     let mut lanes = [-F::ONE; PAIR_OF_ROWS];
     for rows in plane.as_chunks::<PAIR_OF_ROWS>().0 {
         for l in 0..PAIR_OF_ROWS {
@@ -516,7 +516,7 @@ struct Behind<'a, F, const N: usize, const WITH_ABS: bool> {
 
 /// Sums of the lanes of one column.
 #[inline(always)]
-fn columns<F: Real, const N: usize>(lanes: [F; N]) -> [F; TILE] {
+pub(super) fn columns<F: Real, const N: usize>(lanes: [F; N]) -> [F; TILE] {
     let mut out = [F::ZERO; TILE];
     for (k, row) in lanes.as_chunks::<TILE>().0.iter().enumerate() {
         for l in 0..TILE {
@@ -632,6 +632,6 @@ impl<F: Real, const N: usize, const WITH_ABS: bool> Visit<F> for Behind<'_, F, N
 
 /// Sum of eight lanes, always by the same tree.
 #[inline(always)]
-fn sum_lanes<F: Real>(v: [F; TILE]) -> F {
+pub(super) fn sum_lanes<F: Real>(v: [F; TILE]) -> F {
     ((v[0] + v[4]) + (v[2] + v[6])) + ((v[1] + v[5]) + (v[3] + v[7]))
 }

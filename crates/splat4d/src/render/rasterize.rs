@@ -18,7 +18,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 /// Channels of one pass.
 pub const CHANNELS: usize = 3;
 /// Splats in a reduction task.
-const CHUNK: usize = 2048;
+pub(super) const CHUNK: usize = 2048;
 
 /// What a pass backward does with the gradient to centre, conic and opacity.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -47,11 +47,12 @@ pub struct Raster<F = f32> {
     pub(super) budget: Option<usize>,
     pub(super) width: usize,
     pub(super) height: usize,
-    simd: Option<Simd>,
+    pub(super) simd: Option<Simd>,
     pub(super) records: Vec<Record<F>>,
     tiles: Vec<Tile<F>>,
     pair_grads: Vec<Pair<F>>,
-    place: Vec<AtomicU32>,
+    pub(super) pair_weights: Vec<F>,
+    pub(super) place: Vec<AtomicU32>,
     backgrounds: Vec<[f64; CHANNELS]>,
 }
 
@@ -72,7 +73,7 @@ impl<F: Real> Raster<F> {
     }
 
     /// Sees to it that lists and records are those of run `run`.
-    fn hold(&mut self, projected: &[Projected<F>], footprints: &[Footprint], run: usize) {
+    pub(super) fn hold(&mut self, projected: &[Projected<F>], footprints: &[Footprint], run: usize) {
         if self.bins.current != run {
             self.bins.fill(footprints, run);
             self.gather(projected);
@@ -291,6 +292,7 @@ impl<F: Real> Raster<F> {
             + 4 * self.place.capacity()
             + self.tiles.capacity() * size_of::<Tile<F>>()
             + self.pair_grads.capacity() * size_of::<Pair<F>>()
+            + self.pair_weights.capacity() * size_of::<F>()
             + self.backgrounds.capacity() * size_of::<[f64; CHANNELS]>()
     }
 }

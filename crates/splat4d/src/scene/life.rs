@@ -93,6 +93,29 @@ impl LifeKind {
         }
     }
 
+    /// ∂²σ/∂t² at time t, for a `row` as [`LifeKind::eval`] takes it: how far from constant or fading evenly the life is.
+    /// Where an interval's flat top meets its tail it jumps; there it is the top's, 0.
+    pub fn d2_time<F: Real>(self, row: [F; 3], t: Time) -> F {
+        let (delta, sigma) = (F::of(t.0) - row[CENTER], self.eval(row, t).sigma);
+        // σ = exp(−h·x²), x in units of 1/inverse: σ'' = (4h²x² − 2h)·σ·inverse².
+        let (h, x, inverse) = match self {
+            Self::Infinite => return F::ZERO,
+            Self::GaussHalf | Self::GaussOne => {
+                let inverse = (-row[LOG_WIDTH]).exp();
+                (if self == Self::GaussHalf { F::HALF } else { F::ONE }, delta * inverse, inverse)
+            }
+            Self::Interval => {
+                let (over, inverse) = (delta.abs() - row[LOG_WIDTH].exp(), (-row[LOG_SOFTNESS]).exp());
+                if over <= F::ZERO {
+                    return F::ZERO;
+                }
+                (F::HALF, over * inverse, inverse)
+            }
+        };
+        let h2 = F::TWO * h;
+        (h2 * h2 * x * x - h2) * sigma * inverse * inverse
+    }
+
     /// The seconds before and after the centre at which σ·opacity falls to `alpha_min`; negative where it never reaches it.
     pub fn reach(self, row: [f64; 3], opacity: f64, alpha_min: f64) -> f64 {
         let level = (opacity / alpha_min).ln();
@@ -171,6 +194,9 @@ mod tests {
                 {
                     assert!((a - b).abs() < 1e-7, "{kind:?} t {t}: {a} {b}");
                 }
+                let slope = |t: f64| kind.eval(row, Time(t)).d_time;
+                let (a, b) = (kind.d2_time(row, Time(t)), (slope(t + h) - slope(t - h)) / (2.0 * h));
+                assert!((a - b).abs() < 1e-6, "{kind:?} t {t}, second derivative: {a} {b}");
             }
         }
     }

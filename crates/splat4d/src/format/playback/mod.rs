@@ -4,21 +4,29 @@
 //! [`Index::parse`] understands the start of a file, [`decode_page`] and [`decode_palette`] any section of it by itself,
 //! and [`read()`] a whole file as a scene of one layer a page.
 
+mod block;
 mod cluster;
+mod coder;
+mod depths;
 mod index;
 mod layer;
 mod meta;
 mod order;
 mod page;
+mod pages;
 mod palette;
 mod read;
 #[cfg(test)]
 mod tests;
 mod write;
 
+pub use coder::Coder;
+pub use depths::{Depths, LEAST_DEPTH};
 pub use index::{Codec, Entry, Index, Kind};
+pub use layer::primitives;
 pub use meta::{Meta, NamedCamera, PathKey, Viewpoint};
 pub use page::{Page, Record, decode_page};
+pub use pages::{Pages, PagesDraft, read_pages, write_pages};
 pub use palette::{Palette, decode_palette};
 pub use read::read;
 pub use write::{ErrorStat, Errors, Summary, WriteConfig, write};

@@ -31,7 +31,8 @@ pub(super) fn sort(rows: &mut [u32], primitives: &[Primitive], span: [f64; 2]) {
         let p = &primitives[i as usize];
         let seconds = TIME_WEIGHT / (span[1] - span[0]);
         let reach = p.half_width + TAILS * p.softness;
-        let [from, to] = if lives_through(p, span) { span } else { [p.center - reach, p.center + reach] };
+        let [from, to] =
+            if lives_through(p.center, p.half_width, span) { span } else { [p.center - reach, p.center + reach] };
         let place = p.mean.map(|x| x / spread);
         let size = p.scales.map(f64::from).into_iter().fold(f64::MIN_POSITIVE, f64::max).ln();
         let time = [from, to].map(|t| t.clamp(span[0], span[1]) * seconds);

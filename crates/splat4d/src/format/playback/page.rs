@@ -1,36 +1,35 @@
 //! A page: up to 65,536 Gaussians of one span of time in 32 bytes each, in blocks of 256 that share ranges.
-//! docs/format.md, "Page", has the layout; encoder and decoder stand here side by side.
+//! docs/format.md, "Page", has the layout; the encoder of a block is in block.rs, its decoder here.
 
+use super::block::{Header, encode_block};
 use super::index::{broken, crc};
-use super::{ALPHA_MIN, BLOCK_GAUSSIANS, BLOCK_HEADER, Codec, Entry, Kind, PAGE_WORDS, Primitive};
-use crate::math::quat as quaternion;
+use super::{ALPHA_MIN, BLOCK_GAUSSIANS, BLOCK_HEADER, Codec, Depths, Entry, Kind, PAGE_WORDS, Primitive};
+use crate::simd::least;
 use crate::{Result, format::quant};
 use rayon::prelude::*;
+use std::sync::LazyLock;
 
+/// Bits of the codes.
+pub(super) const FULL8: u32 = 8;
+pub(super) const FULL10: u32 = 10;
+pub(super) const FULL16: u32 = 16;
 /// Largest code of 8 and 16 bits, and half of 10 bits around a middle of their own.
-const LEVELS8: u32 = 255;
-const LEVELS16: u32 = 65_535;
-const HALF10: u32 = 511;
+pub(super) const LEVELS8: u32 = 255;
+pub(super) const LEVELS16: u32 = 65_535;
+pub(super) const HALF10: u32 = 511;
 /// Codes 1 to 254 are half-widths: 253 steps.
-const WIDTH_LEVELS: u32 = 253;
+pub(super) const WIDTH_LEVELS: u32 = 253;
 /// Code of a half-width that never ends.
-const FOR_EVER: u32 = 255;
+pub(super) const FOR_EVER: u32 = 255;
 /// Standard deviations of its tails that a life's reach holds (docs/format.md).
 const REACH: f64 = 3.0;
 /// Logarithms of a header lie within ± this (docs/format.md), so that squares of what they stand for fit an f32.
 pub(super) const MAX_LOG: f64 = 40.0;
 /// A scale below this share of the Gaussian's largest is raised to it: 1/1000 of what is seen is never seen, and the
 /// block's range of scales would pay for it.
-const THINNEST: f64 = 1e-3;
-/// Half-widths below this share of the softness are written as zero, for the same reason.
-const NO_WIDTH: f64 = 0.02;
-/// Shortest softness, seconds: a hundredth of a frame at 100 frames a second.
-const SHARPEST: f64 = 1e-4;
-/// Share by which a block's life is stretched, so that a reader in f32 does not cull what it would draw.
-const SLACK: f64 = 1e-6;
-
+pub(super) const THINNEST: f64 = 1e-3;
 /// Places of a block header (docs/format.md, "Page").
-mod at {
+pub(super) mod at {
     pub const BOX: usize = 0;
     pub const CENTER: usize = 6;
     pub const ALIVE: usize = 8;
@@ -138,81 +137,22 @@ pub(super) fn unpack<'a>(entry: &Entry, stored: &'a [u8]) -> Result<std::borrow:
 }
 
 /// The decoded bytes of a page whose blocks are the given ones, in order: Gaussians with their palette entries.
-pub(super) fn encode_page(rows: &[(&Primitive, u16)], span: [f64; 2]) -> Vec<u8> {
-    let blocks: Vec<_> = rows.par_chunks(BLOCK_GAUSSIANS).map(|b| encode_block(b, span)).collect();
-    let mut out = Vec::with_capacity(super::index::page_bytes(rows.len()));
-    blocks.iter().flat_map(|(header, _)| header).for_each(|f| out.extend_from_slice(&f.to_le_bytes()));
+pub(super) fn encode_page(rows: &[(&Primitive, u16)], span: [f64; 2], depths: &Depths) -> Vec<u8> {
+    let mut words = vec![[0; PAGE_WORDS]; rows.len()];
+    let blocks = rows.par_chunks(BLOCK_GAUSSIANS).zip(words.par_chunks_mut(BLOCK_GAUSSIANS));
+    let headers: Vec<Header> = blocks.map(|(rows, words)| encode_block(rows, span, depths, words)).collect();
+    page_of(&headers, &words)
+}
+
+/// The decoded bytes of a page: headers, then byte planes.
+pub(super) fn page_of(headers: &[Header], words: &[[u32; PAGE_WORDS]]) -> Vec<u8> {
+    let mut out = Vec::with_capacity(super::index::page_bytes(words.len()));
+    headers.iter().flatten().for_each(|f| out.extend_from_slice(&f.to_le_bytes()));
     for plane in 0..4 * PAGE_WORDS {
         let (word, shift) = (plane / 4, 8 * (plane % 4));
-        out.extend(blocks.iter().flat_map(|(_, words)| words).map(|w| (w[word] >> shift) as u8));
+        out.extend(words.iter().map(|w| (w[word] >> shift) as u8));
     }
     out
-}
-
-/// Smallest f32 range that holds all values; (0, 0) for none.
-fn range(values: impl Iterator<Item = f64>) -> [f32; 2] {
-    let [low, high] = values.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], x| [low.min(x), high.max(x)]);
-    if low > high { [0.0; 2] } else { [below(low), above(high)] }
-}
-
-fn below(x: f64) -> f32 {
-    let f = x as f32;
-    if f64::from(f) > x { f.next_down() } else { f }
-}
-
-fn above(x: f64) -> f32 {
-    let f = x as f32;
-    if f64::from(f) < x { f.next_up() } else { f }
-}
-
-fn log_range(values: impl Iterator<Item = f64>) -> [f32; 2] {
-    range(values.map(|x| x.ln().clamp(-MAX_LOG, MAX_LOG)))
-}
-
-/// A Gaussian on its way into a block.
-struct Row {
-    mean: [f64; 3],
-    center: f64,
-    /// None: for ever.
-    life: Option<[f64; 2]>,
-    quat: [f64; 4],
-    scales: [f64; 3],
-    velocity: [f64; 3],
-    turn: [f64; 3],
-}
-
-impl Row {
-    fn new(p: &Primitive, span: [f64; 2]) -> Self {
-        let mut row = Self {
-            mean: p.mean,
-            center: p.center,
-            life: None,
-            quat: quaternion::normalize(p.quat.map(f64::from)).0,
-            scales: scales(p),
-            velocity: p.velocity.map(f64::from),
-            turn: p.turn.map(f64::from),
-        };
-        if lives_through(p, span) {
-            // From the middle of the span the reach is shortest. A turn keeps its own centre: normalize(q₀ + ½Δ(0, ω)⊗q₀)
-            // is fastest there, and no other centre gives the same motion.
-            if row.turn == [0.0; 3] {
-                row.move_to(0.5 * (span[0] + span[1]));
-            }
-        } else {
-            let softness = p.softness.max(SHARPEST);
-            row.life = Some([if p.half_width < NO_WIDTH * softness { 0.0 } else { p.half_width }, softness]);
-        }
-        row
-    }
-
-    /// Takes another time as the centre: exact for the mean, and for a turn as near as that time is.
-    fn move_to(&mut self, center: f64) {
-        let delta = center - self.center;
-        self.center = center;
-        (0..3).for_each(|k| self.mean[k] += self.velocity[k] * delta);
-        let rate = rate(self.quat, self.turn);
-        self.quat = quaternion::normalize(std::array::from_fn(|i| self.quat[i] + delta * rate[i])).0;
-    }
 }
 
 /// Scales as they are written: positive, and none far below the largest.
@@ -223,106 +163,102 @@ pub(super) fn scales(p: &Primitive) -> [f64; 3] {
 }
 
 /// Whether a Gaussian is fully there during all of its node, and so may be written as living for ever.
-pub(super) fn lives_through(p: &Primitive, span: [f64; 2]) -> bool {
-    p.center - p.half_width <= span[0] && span[1] <= p.center + p.half_width
+#[inline(always)]
+pub(super) fn lives_through(center: f64, half_width: f64, span: [f64; 2]) -> bool {
+    center - half_width <= span[0] && span[1] <= center + half_width
 }
 
 /// ½(0, ω)⊗q: the rate at which a quaternion changes that turns at ω about the world's axes.
+#[inline(always)]
 pub(super) fn rate([w, x, y, z]: [f64; 4], [a, b, c]: [f64; 3]) -> [f64; 4] {
     [-a * x - b * y - c * z, a * w + b * z - c * y, b * w + c * x - a * z, c * w + a * y - b * x].map(|r| 0.5 * r)
 }
 
 /// Seconds over which shift and turn are measured (docs/format.md, "Page").
-fn reach(life: Option<[f64; 2]>, span: [f64; 2]) -> f64 {
+#[inline(always)]
+pub(super) fn reach(life: Option<[f64; 2]>, span: [f64; 2]) -> f64 {
     let length = span[1] - span[0];
-    life.map_or(0.5 * length, |[half_width, softness]| (half_width + REACH * softness).min(length))
+    match life {
+        Some([half_width, softness]) => least(half_width + REACH * softness, length),
+        None => 0.5 * length,
+    }
 }
 
-fn encode_block(rows: &[(&Primitive, u16)], span: [f64; 2]) -> ([f32; BLOCK_HEADER], Vec<[u32; PAGE_WORDS]>) {
-    let mut moved: Vec<Row> = rows.iter().map(|(p, _)| Row::new(p, span)).collect();
-    let mut h = [0.0f32; BLOCK_HEADER];
-    let mut words = vec![[0u32; PAGE_WORDS]; rows.len()];
-    fn put(h: &mut [f32; BLOCK_HEADER], at: usize, range: [f32; 2], step: usize) {
-        (h[at], h[at + step]) = (range[0], range[1]);
-    }
-    let get = |h: &[f32; BLOCK_HEADER], at: usize, step: usize| (f64::from(h[at]), f64::from(h[at + step]));
-
-    // Life first: mean and rotation are evaluated at the centre that a reader will see, and the reach of the motion
-    // follows from the life that a reader will see.
-    put(&mut h, at::CENTER, range(moved.iter().map(|r| r.center)), 1);
-    let lives = || moved.iter().filter_map(|r| r.life);
-    let widths = log_range(lives().map(|l| l[0]).filter(|&w| w > 0.0));
-    let softness = log_range(lives().map(|l| l[1]));
-    put(&mut h, at::WIDTH, widths, 1);
-    put(&mut h, at::SOFTNESS, softness, 1);
-    let mut alive = [f64::INFINITY, f64::NEG_INFINITY];
-    for ((r, w), (p, label)) in moved.iter_mut().zip(&mut words).zip(rows) {
-        let (low, high) = get(&h, at::CENTER, 1);
-        let center = quant::linear_code(r.center, low, high, LEVELS16);
-        r.move_to(quant::linear(center, low, high, LEVELS16));
-        let opacity = quant::linear_code(f64::from(p.opacity), 0.0, 1.0, LEVELS8);
-        let mut width = FOR_EVER;
-        let mut soft = 0;
-        if let Some(life) = &mut r.life {
-            let (low, high) = get(&h, at::WIDTH, 1);
-            width = if life[0] > 0.0 { 1 + quant::log_code(life[0], low, high, WIDTH_LEVELS) } else { 0 };
-            life[0] = half_width(width, low, high);
-            let (low, high) = get(&h, at::SOFTNESS, 1);
-            soft = quant::log_code(life[1], low, high, LEVELS8);
-            life[1] = quant::log(soft, low, high, LEVELS8);
-        }
-        let level = (f64::from(opacity) / f64::from(LEVELS8) / ALPHA_MIN).ln();
-        if level >= -SLACK {
-            let [from, to] = r.life.map_or(span, |[width, softness]| {
-                let seen = (width + softness * (2.0 * level.max(0.0)).sqrt()) * (1.0 + SLACK) + SLACK;
-                [r.center - seen, r.center + seen]
-            });
-            alive = [alive[0].min(from), alive[1].max(to)];
-        }
-        w[1] |= center << 16;
-        w[2] |= opacity << 24;
-        w[6] |= width << 24;
-        w[7] = u32::from(*label) | soft << 16;
-    }
-    // A block of which nothing is ever seen is alive at no more than an instant.
-    let alive = if alive[0] <= alive[1] { alive } else { [f64::from(h[at::CENTER]); 2] };
-    put(&mut h, at::ALIVE, [below(alive[0] - SLACK * alive[0].abs()), above(alive[1] + SLACK * alive[1].abs())], 1);
-
-    for k in 0..3 {
-        put(&mut h, at::BOX + k, range(moved.iter().map(|r| r.mean[k])), 3);
-        put(&mut h, at::COLOR + k, range(rows.iter().map(|(p, _)| f64::from(p.base_color[k]))), 3);
-    }
-    put(&mut h, at::SCALE, log_range(moved.iter().flat_map(|r| r.scales)), 1);
-    let most = |of: fn(&Row) -> [f64; 3]| {
-        let far = |r: &Row| of(r).map(|x| (x * reach(r.life, span)).abs());
-        above(moved.iter().flat_map(far).fold(0.0, f64::max))
-    };
-    (h[at::SHIFT], h[at::TURN]) = (most(|r| r.velocity), most(|r| r.turn));
-
-    for ((r, w), (p, _)) in moved.iter().zip(&mut words).zip(rows) {
-        let along = reach(r.life, span);
-        for k in 0..3 {
-            let (low, high) = get(&h, at::BOX + k, 3);
-            let mean = quant::linear_code(r.mean[k], low, high, LEVELS16);
-            w[k / 2] |= mean << (16 * (k % 2));
-            let (low, high) = get(&h, at::SCALE, 1);
-            w[2] |= quant::log_code(r.scales[k], low, high, LEVELS8) << (8 * k);
-            w[4] |= quant::signed_code(r.velocity[k] * along, f64::from(h[at::SHIFT]), HALF10) << (10 * k);
-            w[5] |= quant::signed_code(r.turn[k] * along, f64::from(h[at::TURN]), HALF10) << (10 * k);
-            let (low, high) = get(&h, at::COLOR + k, 3);
-            w[6] |= quant::linear_code(f64::from(p.base_color[k]), low, high, LEVELS8) << (8 * k);
-        }
-        let (largest, codes) = quant::quat_codes(r.quat, HALF10);
-        w[3] = (largest as u32) << 30 | codes[0] << 20 | codes[1] << 10 | codes[2];
-    }
-    (h, words)
+/// By code of the opacity o: how many standard deviations of its tails beyond its half-width a Gaussian is seen, which
+/// is √(2 ln(255·o)); −1 where it is never seen.
+#[inline(always)]
+pub(super) fn seen_widths() -> &'static [f64; 1 << FULL8] {
+    static WIDTHS: LazyLock<[f64; 1 << FULL8]> = LazyLock::new(|| {
+        std::array::from_fn(|code| {
+            let level = (code as f64 / f64::from(LEVELS8) / ALPHA_MIN).ln();
+            // 1/255 itself is seen, whatever the logarithm rounds to.
+            if level >= -1e-6 { (2.0 * level.max(0.0)).sqrt() } else { -1.0 }
+        })
+    });
+    &WIDTHS
 }
 
-fn half_width(code: u32, low: f64, high: f64) -> f64 {
+#[inline(always)]
+pub(super) fn half_width(code: u32, low: f64, high: f64) -> f64 {
     match code {
         0 => 0.0,
         FOR_EVER => f64::INFINITY,
         _ => quant::log(code - 1, low, high, WIDTH_LEVELS),
+    }
+}
+
+/// A Gaussian as its header and words say it, with logarithms where they have logarithms.
+pub(super) struct Coded {
+    pub mean: [f64; 3],
+    pub center: f64,
+    /// Half-width, seconds: 0, infinite, or the exponential of what the file has.
+    pub half_width: f64,
+    /// Its logarithm, where it is neither zero nor infinite.
+    pub log_width: f64,
+    pub log_softness: f64,
+    pub softness: f64,
+    pub quat: [f64; 4],
+    pub log_scales: [f64; 3],
+    /// Of 255.
+    pub opacity: u32,
+    pub velocity: [f64; 3],
+    pub turn: [f64; 3],
+    pub base_color: [f64; 3],
+    pub label: u16,
+}
+
+impl Coded {
+    #[inline(always)]
+    pub(super) fn new(h: &[f32; BLOCK_HEADER], w: &[u32; PAGE_WORDS], span: [f64; 2]) -> Self {
+        let bits = |word: usize, first: u32, count: u32| w[word] >> first & ((1 << count) - 1);
+        let line = |at: usize, step: usize, code: u32, levels: u32| {
+            quant::linear(code, f64::from(h[at]), f64::from(h[at + step]), levels)
+        };
+        let width = bits(6, 24, 8);
+        let half_width = half_width(width, f64::from(h[at::WIDTH]), f64::from(h[at::WIDTH + 1]));
+        let log_softness = line(at::SOFTNESS, 1, bits(7, 16, 8), LEVELS8);
+        let softness = log_softness.exp();
+        let reach = reach((width != FOR_EVER).then_some([half_width, softness]), span);
+        let motion =
+            |word: usize, at: usize, k: u32| quant::signed(bits(word, 10 * k, 10), f64::from(h[at]), HALF10) / reach;
+        let mean = |k: usize| line(at::BOX + k, 3, bits(k / 2, 16 * (k as u32 % 2), 16), LEVELS16);
+        let log_scale = |k: u32| line(at::SCALE, 1, bits(2, 8 * k, 8), LEVELS8);
+        let color = |k: usize| line(at::COLOR + k, 3, bits(6, 8 * k as u32, 8), LEVELS8);
+        Self {
+            mean: [mean(0), mean(1), mean(2)],
+            center: line(at::CENTER, 1, bits(1, 16, 16), LEVELS16),
+            half_width,
+            log_width: line(at::WIDTH, 1, width.saturating_sub(1), WIDTH_LEVELS),
+            log_softness,
+            softness,
+            quat: quant::quat(bits(3, 30, 2) as usize, [bits(3, 20, 10), bits(3, 10, 10), bits(3, 0, 10)], HALF10),
+            log_scales: [log_scale(0), log_scale(1), log_scale(2)],
+            opacity: bits(2, 24, 8),
+            velocity: [motion(4, at::SHIFT, 0), motion(4, at::SHIFT, 1), motion(4, at::SHIFT, 2)],
+            turn: [motion(5, at::TURN, 0), motion(5, at::TURN, 1), motion(5, at::TURN, 2)],
+            base_color: [color(0), color(1), color(2)],
+            label: bits(7, 0, 16) as u16,
+        }
     }
 }
 
@@ -339,29 +275,19 @@ impl Page {
 
     /// Gaussian i in numbers. Panics: there are fewer.
     pub fn record(&self, i: usize) -> Record {
-        let (h, w) = (&self.headers[i / BLOCK_GAUSSIANS], &self.words[i]);
-        let bits = |word: usize, first: u32, count: u32| w[word] >> first & ((1 << count) - 1);
-        let line = |at: usize, step: usize, code: u32, levels: u32| {
-            quant::linear(code, f64::from(h[at]), f64::from(h[at + step]), levels)
-        };
-        let half_width = half_width(bits(6, 24, 8), f64::from(h[at::WIDTH]), f64::from(h[at::WIDTH + 1]));
-        let softness = line(at::SOFTNESS, 1, bits(7, 16, 8), LEVELS8).exp();
-        let reach = reach(half_width.is_finite().then_some([half_width, softness]), self.span);
-        let motion = |word: usize, at: usize| {
-            std::array::from_fn(|k| quant::signed(bits(word, 10 * k as u32, 10), f64::from(h[at]), HALF10) / reach)
-        };
+        let c = Coded::new(&self.headers[i / BLOCK_GAUSSIANS], &self.words[i], self.span);
         Record {
-            mean: std::array::from_fn(|k| line(at::BOX + k, 3, bits(k / 2, 16 * (k as u32 % 2), 16), LEVELS16)),
-            center: line(at::CENTER, 1, bits(1, 16, 16), LEVELS16),
-            half_width,
-            softness,
-            quat: quant::quat(bits(3, 30, 2) as usize, [20, 10, 0].map(|first| bits(3, first, 10)), HALF10),
-            scales: std::array::from_fn(|k| line(at::SCALE, 1, bits(2, 8 * k as u32, 8), LEVELS8).exp()),
-            opacity: f64::from(bits(2, 24, 8)) / f64::from(LEVELS8),
-            velocity: motion(4, at::SHIFT),
-            turn: motion(5, at::TURN),
-            base_color: std::array::from_fn(|k| line(at::COLOR + k, 3, bits(6, 8 * k as u32, 8), LEVELS8)),
-            label: bits(7, 0, 16) as u16,
+            mean: c.mean,
+            center: c.center,
+            half_width: c.half_width,
+            softness: c.softness,
+            quat: c.quat,
+            scales: c.log_scales.map(f64::exp),
+            opacity: f64::from(c.opacity) / f64::from(LEVELS8),
+            velocity: c.velocity,
+            turn: c.turn,
+            base_color: c.base_color,
+            label: c.label,
         }
     }
 }

@@ -10,6 +10,17 @@ use crate::math::sh;
 const MIDDLE: i32 = 128;
 const HALF: f32 = 127.0;
 
+/// By code: its share of the range.
+const SHARES: [f32; 256] = {
+    let mut shares = [0.0; 256];
+    let mut code = 0;
+    while code < 256 {
+        shares[code] = (code as i32 - MIDDLE) as f32 / HALF;
+        code += 1;
+    }
+    shares
+};
+
 /// A decoded palette.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Palette {
@@ -41,8 +52,9 @@ fn degree_of_plane(plane: usize) -> usize {
 }
 
 impl Palette {
-    /// Quantises entries of `width` = 3(K − 1) coefficients each. Panics: no entry, or a width that no degree has.
-    pub(super) fn new(degree: usize, values: &[f32]) -> Self {
+    /// Quantises entries of `width` = 3(K − 1) coefficients each, entry after entry; within one, coefficient k = 1 … K − 1
+    /// of channel c is number 3(k − 1) + c. Panics: no entry, or a width that no degree has.
+    pub fn new(degree: usize, values: &[f32]) -> Self {
         let width = 3 * (sh::coeffs(degree) - 1);
         let entries = values.len() / width;
         assert!(entries > 0 && values.len() == entries * width, "entries of {width} coefficients, {}", values.len());
@@ -70,8 +82,16 @@ impl Palette {
     #[inline]
     pub fn value(&self, entry: usize, plane: usize) -> f32 {
         assert!(entry < self.entries, "entry {entry} of a palette of {}", self.entries);
-        let code = i32::from(self.codes[plane * self.entries + entry]);
-        self.ranges[degree_of_plane(plane) - 1] * ((code - MIDDLE) as f32 / HALF)
+        self.ranges[degree_of_plane(plane) - 1] * SHARES[usize::from(self.codes[plane * self.entries + entry])]
+    }
+
+    /// Coefficient `plane` of entries in turn. Panics: there is no such entry or plane.
+    pub(super) fn values(&self, plane: usize, entries: &[u16], mut each: impl FnMut(usize, f32)) {
+        let codes = &self.codes[plane * self.entries..(plane + 1) * self.entries];
+        let range = self.ranges[degree_of_plane(plane) - 1];
+        for (i, entry) in entries.iter().enumerate() {
+            each(i, range * SHARES[usize::from(codes[usize::from(*entry)])]);
+        }
     }
 
     /// The decoded bytes.

@@ -119,7 +119,7 @@ fn through(rows: &[(&Primitive, u16)], span: [f64; 2]) -> Page {
         span,
         palette: None,
     };
-    parse_page(&encode_page(rows, span), &entry).unwrap()
+    parse_page(&encode_page(rows, span, &Depths::default()), &entry).unwrap()
 }
 
 #[test]

@@ -3,7 +3,10 @@
 use super::cluster::cluster;
 use super::index::crc;
 use super::page::{encode_page, parse_page};
-use super::{Codec, Draft, Entry, Index, Kind, MAX_PAGE_GAUSSIANS, MAX_PALETTE, Node, Page, Palette, VERSION, order};
+use super::{
+    Codec, Depths, Draft, Entry, Index, Kind, MAX_PAGE_GAUSSIANS, MAX_PALETTE, Meta, Node, Page, Palette, VERSION,
+    order,
+};
 use crate::math::{Rng, quat, sh};
 use crate::{Error, Result};
 use std::io::Write;
@@ -33,11 +36,13 @@ pub struct WriteConfig {
     pub deflate_level: u32,
     /// Seed of the palette's start.
     pub seed: u64,
+    /// Bits of the codes.
+    pub depths: Depths,
 }
 
 impl Default for WriteConfig {
     fn default() -> Self {
-        Self { palette: 8192, kmeans_rounds: 8, tier: 0, deflate_level: 6, seed: 0 }
+        Self { palette: 8192, kmeans_rounds: 8, tier: 0, deflate_level: 6, seed: 0, depths: Depths::default() }
     }
 }
 
@@ -116,32 +121,93 @@ struct Piece {
     rows: Vec<u32>,
 }
 
+/// A file in the making: sections one by one, and what they weigh.
+pub(super) struct Sections {
+    pub file: Index,
+    bodies: Vec<Vec<u8>>,
+    level: u32,
+    /// A poster that is written last.
+    late: Option<Vec<u8>>,
+    pub summary: Summary,
+}
+
+impl Sections {
+    /// Begins a file: with its poster, where that is small. Errors: metadata out of range.
+    pub(super) fn new(meta: Meta, poster: Option<&[u8]>, level: u32) -> Result<Self> {
+        meta.check()?;
+        let summary = Summary { gaussians: meta.gaussians, ..Summary::default() };
+        let file = Index { version: VERSION, file_len: 0, meta, sections: Vec::new() };
+        let mut out = Self { file, bodies: Vec::new(), level, late: None, summary };
+        match poster.filter(|p| !p.is_empty()) {
+            Some(p) if p.len() <= SMALL_POSTER => out.summary.poster_bytes = out.add(entry(Kind::Poster), p.to_vec()),
+            p => out.late = p.map(<[u8]>::to_vec),
+        }
+        Ok(out)
+    }
+
+    /// Adds a section; returns its stored bytes.
+    fn add(&mut self, entry: Entry, body: Vec<u8>) -> u64 {
+        let (entry, stored) = pack(entry, body, self.level);
+        let size = u64::from(entry.stored);
+        self.file.sections.push(entry);
+        self.bodies.push(stored);
+        size
+    }
+
+    pub(super) fn palette(&mut self, p: &Palette) {
+        let degree = p.degree as u16;
+        let e = Entry { degree, count: p.entries as u32, required: true, ..entry(Kind::Palette) };
+        self.summary.palette_bytes = self.add(e, p.bytes());
+        self.summary.palette_entries = p.entries;
+    }
+
+    /// A page of `count` Gaussians from its decoded bytes; `palette` is that one's number.
+    pub(super) fn page(&mut self, body: Vec<u8>, page: &PageEntry) {
+        self.summary.page_bytes += self.add(page.entry(), body);
+        self.summary.pages += 1;
+    }
+
+    /// Writes the file. Errors: the sink's.
+    pub(super) fn finish(mut self, out: &mut dyn Write) -> Result<Summary> {
+        if let Some(p) = self.late.take() {
+            self.summary.poster_bytes = self.add(entry(Kind::Poster), p);
+        }
+        let head = self.file.bytes(concat!("splat4d ", env!("CARGO_PKG_VERSION")));
+        self.summary.bytes = self.file.file_len;
+        self.summary.errors.finish();
+        let mut write = |bytes: &[u8]| out.write_all(bytes).map_err(|e| Error::io("the scene could not be written", e));
+        write(&head)?;
+        self.bodies.iter().try_for_each(|b| write(b))?;
+        Ok(self.summary)
+    }
+}
+
+/// What the table says of a page.
+pub(super) struct PageEntry {
+    pub tier: u16,
+    pub count: usize,
+    pub span: [f64; 2],
+    pub palette: Option<u32>,
+}
+
+impl PageEntry {
+    fn entry(&self) -> Entry {
+        let &Self { tier, count, span, palette } = self;
+        Entry { required: true, tier, count: count as u32, span, palette, ..entry(Kind::Page) }
+    }
+}
+
 /// Writes a playback file. The order of a node's primitives does not matter, but decides between equals.
 ///
-/// Errors: numbers that are not finite, spans or metadata out of range, the sink's.
+/// Errors: numbers that are not finite, spans, depths or metadata out of range, the sink's.
 /// Panics: a node has more than 4 billion Gaussians.
 pub fn write(draft: &Draft, config: &WriteConfig, out: &mut dyn Write) -> Result<Summary> {
     let mut meta = draft.meta.clone();
     meta.gaussians = draft.nodes.iter().map(|n| n.primitives.len()).sum();
-    meta.check()?;
+    config.depths.check()?;
+    let mut file = Sections::new(meta, draft.poster.as_deref(), config.deflate_level)?;
     draft.nodes.iter().enumerate().try_for_each(|(i, n)| check(n).map_err(|e| e.at(format!("node {i}"))))?;
     let (palette, labels) = palette(draft, config);
-    let mut summary = Summary { gaussians: meta.gaussians, ..Summary::default() };
-    let mut file = Index { version: VERSION, file_len: 0, meta, sections: Vec::new() };
-    let mut bodies: Vec<Vec<u8>> = Vec::new();
-    let mut add = |entry: Entry, body: Vec<u8>, sections: &mut Vec<Entry>| {
-        let (entry, stored) = pack(entry, body, config.deflate_level);
-        let size = u64::from(entry.stored);
-        sections.push(entry);
-        bodies.push(stored);
-        size
-    };
-
-    let poster = draft.poster.as_ref().filter(|p| !p.is_empty());
-    let poster_first = poster.is_some_and(|p| p.len() <= SMALL_POSTER);
-    if let Some(p) = poster.filter(|_| poster_first) {
-        summary.poster_bytes = add(entry(Kind::Poster), p.clone(), &mut file.sections);
-    }
     // First what the first picture needs: the important Gaussians of the clip's start in their base colours, what
     // colours them, the rest of them; then time goes on.
     let start = draft.meta.clip[0];
@@ -156,16 +222,12 @@ pub fn write(draft: &Draft, config: &WriteConfig, out: &mut dyn Write) -> Result
         first_b.cmp(&first_a).then(if first_a && first_b { by_tier.then(by_time) } else { by_time.then(by_tier) })
     });
     let before = pieces.iter().take_while(|p| p.tier == 0 && holds(p)).count();
-    let palette_at = (file.sections.len() + before) as u32;
-    let mut page_number = 0;
+    let palette_at = (file.file.sections.len() + before) as u32;
     for place in 0..=pieces.len() {
         if place == before
             && let Some(p) = &palette
         {
-            let degree = p.degree as u16;
-            let e = Entry { degree, count: p.entries as u32, required: true, ..entry(Kind::Palette) };
-            summary.palette_bytes = add(e, p.bytes(), &mut file.sections);
-            summary.palette_entries = p.entries;
+            file.palette(p);
         }
         let Some(piece) = pieces.get_mut(place) else { break };
         let node = &draft.nodes[piece.node];
@@ -176,31 +238,14 @@ pub fn write(draft: &Draft, config: &WriteConfig, out: &mut dyn Write) -> Result
             .iter()
             .map(|&i| (&node.primitives[i as usize], labels.get(piece.node).map_or(0, |l| l[i as usize])))
             .collect();
-        let body = encode_page(&rows, span);
-        let e = Entry {
-            required: true,
-            tier: piece.tier,
-            count: rows.len() as u32,
-            span,
-            palette: palette.is_some().then_some(palette_at),
-            ..entry(Kind::Page)
-        };
-        let page = parse_page(&body, &e).expect("a page that was just written");
-        compare(&mut summary.errors, &page, &rows, palette.as_ref());
-        summary.page_bytes += add(e, body, &mut file.sections);
-        page_number += 1;
+        let body = encode_page(&rows, span, &config.depths);
+        let palette_at = palette.is_some().then_some(palette_at);
+        let entry = PageEntry { tier: piece.tier, count: rows.len(), span, palette: palette_at };
+        let page = parse_page(&body, &entry.entry()).expect("a page that was just written");
+        compare(&mut file.summary.errors, &page, &rows, palette.as_ref());
+        file.page(body, &entry);
     }
-    if let Some(p) = poster.filter(|_| !poster_first) {
-        summary.poster_bytes = add(entry(Kind::Poster), p.clone(), &mut file.sections);
-    }
-    summary.pages = page_number;
-    let head = file.bytes(concat!("splat4d ", env!("CARGO_PKG_VERSION")));
-    summary.bytes = file.file_len;
-    summary.errors.finish();
-    let mut write = |bytes: &[u8]| out.write_all(bytes).map_err(|e| Error::io("the scene could not be written", e));
-    write(&head)?;
-    bodies.iter().try_for_each(|b| write(b))?;
-    Ok(summary)
+    file.finish(out)
 }
 
 /// An entry of a kind, all else empty.

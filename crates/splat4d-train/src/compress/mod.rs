@@ -1,0 +1,142 @@
+//! Compression: a trained scene loses the Gaussians that matter least, becomes a playback file, and learns on as that file.
+//!
+//! 1. Rounds of pruning in floats, each followed by fine-tuning with the model's own losses (4DGS-1K, Yuan et al. 2025).
+//! 2. The scene is baked and written, and what a reader makes of it takes its place: a layer a page, rows in the file's
+//!    order, whatever model it came from. Masks say which of them the training views show around which key time.
+//! 3. Fine-tuning through the file's codes: pictures show what a reader would see, gradients go to the numbers behind them
+//!    (straight-through). What is written at the end is, bit for bit, what was shown.
+//!
+//! It is a run like any other: [`compress`] begins it or continues it, exactly.
+
+mod fit;
+pub mod quantise;
+mod settings;
+mod stages;
+
+pub use fit::{Trial, fit};
+pub use settings::{Compression, Level, MOST_PRUNED};
+
+use crate::capture::Capture;
+use crate::event::Event;
+use crate::prune::{Scores, score};
+use crate::recipe::Recipe;
+use crate::train::refine::{Refine, refine};
+use crate::train::run::{plan, training_frames};
+use crate::train::{Outcome, TrainOptions};
+use crate::{Error, Result};
+use splat4d::bake::{self, bake};
+use splat4d::format::playback::{Draft, Meta, Pages};
+use splat4d::layers::Scene;
+use splat4d::scene::Camera;
+use stages::Bench;
+use std::collections::BTreeSet;
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+/// The verb that makes and continues such runs.
+pub const VERB: &str = "compress";
+
+/// What is to be compressed.
+#[derive(Clone)]
+pub struct Job<'a> {
+    /// A trained scene.
+    pub source: &'a Scene<f32>,
+    /// What it was trained on.
+    pub capture: Arc<Capture>,
+    /// How it was trained.
+    pub recipe: &'a Recipe,
+    /// What to do.
+    pub settings: &'a Compression,
+}
+
+/// What became of it.
+#[derive(Debug)]
+pub struct Compressed {
+    /// How the run ended.
+    pub outcome: Outcome,
+    /// The file to write, once the last step is done; none where the settings have no codec.
+    pub pages: Option<Pages>,
+}
+
+/// Compresses into the run folder `dir`, or continues there. The folder's `scene.safetensors` is what a reader of the
+/// file sees.
+///
+/// Errors: settings out of range, a capture without training views, a folder that holds another run, a scene that cannot
+/// be baked.
+pub fn compress(
+    job: &Job<'_>,
+    dir: &Path,
+    options: &TrainOptions,
+    stop: &AtomicBool,
+    listen: &mut dyn FnMut(&Event),
+) -> Result<Compressed> {
+    job.settings.check()?;
+    let bench = bench(job)?;
+    let mut stages = stages::float_stages(&bench)?;
+    let file = job.settings.codec.then(|| stages::file_stage(&bench)).transpose()?;
+    let (stage, codec) = file.unzip();
+    stages.extend(stage);
+    if stages.is_empty() {
+        return Err(Error::input("nothing is to be done").remedy("Prune, filter or quantise."));
+    }
+    let refined = refine(
+        Refine {
+            made_by: VERB.into(),
+            scene: job.source.clone(),
+            stages,
+            frames: training_frames(job.capture.clone(), job.recipe)?,
+            recipe: Recipe { strategy: "none".into(), ..job.recipe.clone() },
+            identity: job.settings.to_toml(),
+        },
+        dir,
+        options,
+        stop,
+        listen,
+    )?;
+    let done = !refined.outcome.interrupted;
+    let pages = codec.filter(|_| done).map(|codec| codec.pages(&refined.scene, meta(&refined.scene))).transpose()?;
+    Ok(Compressed { outcome: refined.outcome, pages })
+}
+
+/// Scores all Gaussians of the job's scene, for [`fit`].
+pub fn scores(job: &Job<'_>, progress: &mut dyn FnMut(usize, usize)) -> Result<Scores> {
+    let bench = bench(job)?;
+    score(job.source, bench.frames.as_ref(), &bench.score_config()?, progress)
+}
+
+fn bench(job: &Job<'_>) -> Result<Bench> {
+    let frames = training_frames(job.capture.clone(), job.recipe)?;
+    Ok(Bench {
+        frames,
+        plan: plan(&job.capture, job.recipe),
+        cameras: cameras(&job.capture),
+        settings: job.settings.clone(),
+    })
+}
+
+/// The cameras of the training views, each once: whose pixels baking counts.
+pub fn cameras(capture: &Capture) -> Vec<Camera> {
+    let mut seen = BTreeSet::new();
+    let views = capture.train.iter().map(|&i| &capture.frames[i]);
+    views.filter(|f| seen.insert(f.camera)).map(|f| f.view.clone()).collect()
+}
+
+/// The scene as a file's draft. Progress: Gaussians done and in all.
+fn draft(
+    scene: &Scene<f32>,
+    settings: &Compression,
+    cameras: &[Camera],
+    progress: &mut dyn FnMut(usize, usize),
+) -> Result<Draft> {
+    let options = bake::Options { cameras: cameras.to_vec(), ..bake::Options::default() };
+    let baked = bake(scene, &options, progress)?;
+    let meta = Meta { clip: baked.clip, sh_degree: baked.sh_degree.min(settings.sh_degree), ..meta(scene) };
+    Ok(Draft { meta, nodes: baked.nodes, poster: None })
+}
+
+/// What a scene says of itself.
+fn meta(scene: &Scene<f32>) -> Meta {
+    let Scene { clip, fps, up, background, .. } = *scene;
+    Meta { clip, fps, up, background, ..Meta::default() }
+}

@@ -1,0 +1,246 @@
+//! What may be told of compression, and the three levels.
+
+use crate::prune::{Combine, Temporal};
+use crate::recipe::nearest;
+use crate::{Error, Result};
+use serde::{Deserialize, Serialize};
+use splat4d::format::playback::{Depths, MAX_PALETTE, WriteConfig};
+
+/// Largest share that may be pruned: beyond it nothing is left that fine-tuning could mend.
+pub const MOST_PRUNED: f64 = 0.98;
+/// Most rounds of pruning.
+const MOST_ROUNDS: usize = 20;
+
+macro_rules! settings {
+    ($($(#[$doc:meta])* $name:ident: $type:ty = $default:expr),* $(,)?) => {
+        /// Everything that decides what compression does to a trained scene.
+        #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+        #[serde(deny_unknown_fields, default)]
+        pub struct Compression {
+            $($(#[$doc])* pub $name: $type,)*
+        }
+
+        impl Default for Compression {
+            /// [`Level::Tuned`](Level): nothing is pruned, codes are full, all is fine-tuned.
+            fn default() -> Self {
+                Self { $($name: $default,)* }
+            }
+        }
+
+        /// Names of all settings.
+        const NAMES: &[&str] = &[$(stringify!($name)),*];
+    };
+}
+
+settings! {
+    /// Share of the Gaussians that is removed, 0 to 0.98.
+    prune: f64 = 0.0,
+    /// In so many rounds, each followed by its part of the fine-tuning.
+    rounds: usize = 1,
+    /// How lives count in the score: instant-abs, literal-signed-clamped, first-derivative, width, active-fraction, none.
+    temporal: String = "instant-abs".into(),
+    /// How spatial and temporal score become one: product or sum.
+    combine: String = "product".into(),
+    /// Whether large Gaussians count a little more.
+    volume: bool = true,
+    /// Scores look at every so many of the training views.
+    every: usize = 1,
+    /// Steps of fine-tuning in floats after pruning, all rounds together.
+    fine_tune: usize = 0,
+    /// Whether the scene is quantised at all; false only where a study wants to see the rest by itself.
+    codec: bool = true,
+    /// Steps of fine-tuning through the quantised scene.
+    quantise: usize = 0,
+    /// Frames between the key times of the visibility masks; 0: no masks.
+    mask_interval: usize = 0,
+    /// Highest degree of the spherical harmonics that is kept.
+    sh_degree: usize = 3,
+    /// Most entries of the palette.
+    palette: usize = WriteConfig::default().palette,
+    /// Bits of the codes.
+    depths: Depths = Depths::default(),
+}
+
+/// What `--level` names.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Level {
+    /// The plain playback file: quantised, not tuned.
+    Plain,
+    /// Quantised and fine-tuned so.
+    Tuned,
+    /// Pruned, filtered, with coarser codes and a smaller palette, and fine-tuned.
+    Pruned,
+}
+
+impl Level {
+    /// The level behind 0, 1, 2. Errors: another number.
+    pub fn new(level: u8) -> Result<Self> {
+        match level {
+            0 => Ok(Self::Plain),
+            1 => Ok(Self::Tuned),
+            2 => Ok(Self::Pruned),
+            _ => Err(Error::input(format!("there is no level {level}")).remedy("Give 0, 1 or 2.")),
+        }
+    }
+}
+
+impl Compression {
+    /// A level's settings for a scene that was trained for `iterations` steps.
+    pub fn level(level: Level, iterations: usize) -> Self {
+        let share = |part: f64| ((iterations as f64 * part) as usize).max(1);
+        let tuned = Self { quantise: share(TUNED_SHARE), ..Self::default() };
+        match level {
+            Level::Plain => Self::default(),
+            Level::Tuned => tuned,
+            Level::Pruned => Self {
+                prune: PRUNED_SHARE,
+                fine_tune: share(FINE_TUNED_SHARE),
+                mask_interval: MASK_INTERVAL,
+                palette: SMALL_PALETTE,
+                depths: COARSE,
+                ..tuned
+            },
+        }
+    }
+
+    /// Steps of all stages.
+    pub fn steps(&self) -> usize {
+        self.fine_tune + if self.codec { self.quantise } else { 0 }
+    }
+
+    /// Reads TOML. Errors: syntax, unknown names (with the nearest known one), ranges.
+    pub fn from_toml(text: &str) -> Result<Self> {
+        let table: toml::Table = toml::from_str(text)
+            .map_err(|e| Error::input(format!("the settings are not valid TOML: {}", e.message())))?;
+        if let Some(key) = table.keys().find(|k| !NAMES.contains(&k.as_str())) {
+            return Err(unknown(key));
+        }
+        let all: Self = table
+            .try_into()
+            .map_err(|e: toml::de::Error| Error::input(format!("a setting has a wrong value: {}", e.message())))?;
+        all.check()?;
+        Ok(all)
+    }
+
+    /// As TOML; reading it back gives the same settings.
+    pub fn to_toml(&self) -> String {
+        toml::to_string(self).expect("settings are plain numbers, flags and strings")
+    }
+
+    /// Applies one `key=value`. Errors: as [`from_toml`](Self::from_toml).
+    pub fn set(&mut self, assignment: &str) -> Result<()> {
+        let Some((key, text)) = assignment.split_once('=') else {
+            return Err(Error::input(format!("`{assignment}` is not of the form key=value"))
+                .remedy("For instance --set mask_interval=10"));
+        };
+        let (key, text) = (key.trim(), text.trim());
+        let value = toml::from_str::<toml::Table>(&format!("v = {text}"))
+            .ok()
+            .and_then(|mut t| t.remove("v"))
+            .unwrap_or_else(|| toml::Value::String(text.to_owned()));
+        let mut table = toml::Table::try_from(&*self).expect("settings are a TOML table");
+        // Whole numbers are welcome where a fraction is expected.
+        let value = match (table.get(key), value) {
+            (Some(toml::Value::Float(_)), toml::Value::Integer(i)) => toml::Value::Float(i as f64),
+            (_, v) => v,
+        };
+        match key.split_once('.') {
+            Some((group, name)) => {
+                let inner = table.get_mut(group).and_then(toml::Value::as_table_mut);
+                let inner = inner.filter(|t| t.contains_key(name)).ok_or_else(|| unknown(key))?;
+                inner.insert(name.to_owned(), value);
+            }
+            None => {
+                table.insert(key.to_owned(), value);
+            }
+        }
+        *self = Self::from_toml(&table.to_string())?;
+        Ok(())
+    }
+
+    /// Ranges. Errors name the setting.
+    pub fn check(&self) -> Result<()> {
+        let bad = |name: &str, value: String, need: &str| {
+            Err(Error::input(format!("setting `{name}` cannot be {value}")).remedy(format!("It must be {need}.")))
+        };
+        if !(0.0..=MOST_PRUNED).contains(&self.prune) {
+            return bad("prune", self.prune.to_string(), &format!("a share between 0 and {MOST_PRUNED}"));
+        }
+        if !(1..=MOST_ROUNDS).contains(&self.rounds) {
+            return bad("rounds", self.rounds.to_string(), &format!("1 to {MOST_ROUNDS}"));
+        }
+        if self.every == 0 {
+            return bad("every", "0".into(), "at least 1");
+        }
+        if self.sh_degree > 3 {
+            return bad("sh_degree", self.sh_degree.to_string(), "0, 1, 2 or 3");
+        }
+        if !(1..=MAX_PALETTE).contains(&self.palette) {
+            return bad("palette", self.palette.to_string(), &format!("1 to {MAX_PALETTE}"));
+        }
+        self.depths.check()?;
+        self.temporal.parse::<Temporal>()?;
+        self.combine.parse::<Combine>()?;
+        Ok(())
+    }
+}
+
+fn unknown(key: &str) -> Error {
+    let hint = nearest(key, NAMES).map_or(String::new(), |n| format!("Did you mean `{n}`? "));
+    Error::input(format!("`{key}` is not a setting of compression"))
+        .remedy(format!("{hint}They are: {}.", NAMES.join(", ")))
+}
+
+/// Share of a scene's training steps that fine-tuning through the quantised scene takes.
+const TUNED_SHARE: f64 = 0.15;
+/// Level 2: share of the training steps that fine-tuning in floats takes.
+const FINE_TUNED_SHARE: f64 = 0.25;
+/// Level 2: share of the Gaussians that goes.
+const PRUNED_SHARE: f64 = 0.6;
+/// Frames between key times (4DGS-1K, N3V).
+const MASK_INTERVAL: usize = 20;
+/// Level 2: bits of the codes.
+const COARSE: Depths = Depths {
+    position: 12,
+    center: 10,
+    scale: 6,
+    opacity: 6,
+    rotation: 7,
+    shift: 7,
+    turn: 7,
+    color: 6,
+    life: 6,
+};
+/// Level 2: entries of the palette.
+const SMALL_PALETTE: usize = 2048;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn settings_come_back_and_mistakes_are_named() {
+        for level in [Level::Plain, Level::Tuned, Level::Pruned] {
+            let all = Compression::level(level, 7000);
+            all.check().unwrap();
+            assert_eq!(Compression::from_toml(&all.to_toml()).unwrap(), all);
+        }
+        let mut c = Compression::default();
+        c.set("prune=0.5").unwrap();
+        c.set("temporal = width").unwrap();
+        c.set("rounds=2").unwrap();
+        c.set("depths.color=5").unwrap();
+        assert_eq!((c.prune, c.temporal.as_str(), c.rounds, c.depths.color), (0.5, "width", 2, 5));
+        let mut wrong = |s: &str| c.set(s).unwrap_err().to_string();
+        assert!(wrong("prun=0.5").contains("`prune`"));
+        assert!(wrong("prune=1.5").contains("0.98"));
+        assert!(wrong("prune=much").contains("prune") || wrong("prune=much").contains("wrong value"));
+        assert!(wrong("temporal=now").contains("now"));
+        assert!(wrong("rounds=0").contains("1 to"));
+        assert!(wrong("palette").contains("key=value"));
+        assert!(wrong("depths.colour=5").contains("depths.colour"));
+        assert!(wrong("depths.color=9").contains("color"));
+        assert_eq!(c.prune, 0.5, "a refused setting changes nothing");
+        assert!(Level::new(3).is_err());
+    }
+}

@@ -1,0 +1,132 @@
+//! The stages of a compression: rounds of pruning in floats, then the file itself.
+
+use super::{Compression, draft};
+use crate::capture::frames::Frames;
+use crate::densify::Densify;
+use super::quantise::{self, Quantised, palette_rate};
+use crate::models::{Hook, Plan, Rate, Stage, Tell, program};
+use crate::prune::{Keys, MaskConfig, ScoreConfig, key_masks, prune, score};
+use crate::{Error, Result};
+use splat4d::format::playback::{WriteConfig, read_pages, write};
+use splat4d::layers::Scene;
+use splat4d::math::Rng;
+use splat4d::render::Antialias;
+use splat4d::scene::Camera;
+use std::sync::Arc;
+
+/// Fine-tuning begins where a run's rates were after this share of it: what pruning left has its place already.
+const REWIND: f64 = 0.8;
+/// Rates that training keeps constant fall to this share of themselves, so that the scene comes to rest.
+const REST: f64 = 0.1;
+/// Rates of fine-tuning through the file, of those with which training ended.
+const FILE_RATES: f64 = 0.5;
+
+/// All that hooks need beside the scene; they outlive the call that makes them.
+#[derive(Clone)]
+pub(super) struct Bench {
+    pub frames: Arc<dyn Frames>,
+    pub plan: Plan,
+    pub cameras: Vec<Camera>,
+    pub settings: Compression,
+}
+
+impl Bench {
+    fn antialias(&self) -> Antialias {
+        if self.plan.recipe.antialias { Antialias::On } else { Antialias::Off }
+    }
+
+    /// How the settings want Gaussians scored. Errors: names that are none.
+    pub fn score_config(&self) -> Result<ScoreConfig> {
+        let s = &self.settings;
+        Ok(ScoreConfig {
+            temporal: s.temporal.parse()?,
+            combine: s.combine.parse()?,
+            volume: s.volume,
+            every: s.every,
+            antialias: self.antialias(),
+            ..ScoreConfig::default()
+        })
+    }
+}
+
+/// Rounds of pruning and fine-tuning in floats; none where there is nothing to do.
+pub(super) fn float_stages(bench: &Bench) -> Result<Vec<Stage>> {
+    let s = &bench.settings;
+    let filter = !s.codec && s.mask_interval > 0;
+    if s.prune == 0.0 && s.fine_tune == 0 && !filter {
+        return Ok(Vec::new());
+    }
+    (0..s.rounds)
+        .map(|round| {
+            let steps = s.fine_tune * (round + 1) / s.rounds - s.fine_tune * round / s.rounds;
+            let mut stage = host_stage(bench, steps)?;
+            stage.name = format!("pruned {}/{}", round + 1, s.rounds);
+            // Equal shares of what is left, so that the last round leaves what was asked for.
+            let share = 1.0 - (1.0 - s.prune).powf(1.0 / s.rounds as f64);
+            let last = round + 1 == s.rounds;
+            stage.start = Some(pruning(bench.clone(), share, filter && last));
+            Ok(stage)
+        })
+        .collect()
+}
+
+/// The last stage of the model's own training, without densification, at rates that settle.
+fn host_stage(bench: &Bench, steps: usize) -> Result<Stage> {
+    let mut stage = program(&bench.plan.recipe.motion)?.stages(&bench.plan).pop().expect("a program has a stage");
+    stage.iterations = steps;
+    stage.densify = Densify::None;
+    (stage.sh_interval, stage.half_size_steps) = (0, 0);
+    (stage.start, stage.end) = (None, None);
+    stage.groups.iter_mut().for_each(|g| g.rate = settling(g.rate));
+    Ok(stage)
+}
+
+/// A rate of training as fine-tuning has it.
+fn settling(rate: Rate) -> Rate {
+    let start = rate.at(REWIND);
+    Rate { start, end: rate.end.min(start * REST) }
+}
+
+/// Scores, prunes, and makes masks where they are wanted already.
+fn pruning(bench: Bench, share: f64, filter: bool) -> Hook<f32> {
+    Box::new(move |scene: &mut Scene<f32>, tell| {
+        if share > 0.0 {
+            let scores = score(scene, bench.frames.as_ref(), &bench.score_config()?, &mut |done, total| {
+                tell("scoring Gaussians", done, total);
+            })?;
+            // A zero-score Gaussian is in no picture; the count still goes by the share.
+            for (layer, edit) in prune(scene, &scores, share).into_iter().enumerate() {
+                scene.layers[layer].edit(&edit, &Rng::new(bench.plan.recipe.seed, "prune", layer as u64));
+            }
+            if scene.is_empty() {
+                return Err(Error::input("nothing is left").remedy("Prune less."));
+            }
+        }
+        if filter { masks(scene, &bench, tell) } else { Ok(()) }
+    })
+}
+
+/// Masks at the settings' interval.
+fn masks(scene: &mut Scene<f32>, bench: &Bench, tell: &mut Tell<'_>) -> Result<()> {
+    let config = MaskConfig { keys: Keys::Interval(bench.settings.mask_interval), antialias: bench.antialias() };
+    key_masks(scene, bench.frames.as_ref(), &config, &mut |done, total| tell("looking who is seen", done, total))
+}
+
+/// Fine-tuning through the file, and the codec that is it.
+pub(super) fn file_stage(bench: &Bench) -> Result<(Stage, Arc<Quantised>)> {
+    let s = &bench.settings;
+    let codec = Quantised::new(s.depths, palette_rate(&bench.plan.recipe, FILE_RATES))?;
+    let mut stage = quantise::stage(&bench.plan, s.quantise, FILE_RATES, codec.clone());
+    let (own, begun) = (bench.clone(), codec.clone());
+    stage.start = Some(Box::new(move |scene: &mut Scene<f32>, tell| {
+        let draft = draft(scene, &own.settings, &own.cameras, &mut |done, total| tell("baking", done, total))?;
+        let s = &own.settings;
+        let seed = own.plan.recipe.seed;
+        let config = WriteConfig { depths: s.depths, palette: s.palette, seed, ..WriteConfig::default() };
+        let mut bytes = Vec::new();
+        write(&draft, &config, &mut bytes)?;
+        begun.begin(read_pages(&bytes)?, scene);
+        if s.mask_interval > 0 { masks(scene, &own, tell) } else { Ok(()) }
+    }));
+    Ok((stage, codec))
+}

@@ -1,0 +1,150 @@
+//! How much of a picture each splat is, Σ over pixels of α_i Π_{j<i} (1 − α_j): a walk as forward's, without colours.
+//!
+//! It is the gradient of the sum of a channel to that channel, which the way back would compute, with twelve numbers a
+//! pixel and splat where one is wanted.
+
+use super::RenderConfig;
+use super::bin::{BIN, Footprint, id};
+use super::blend::{
+    BATCH, Exponent, Limits, PAIR_OF_ROWS, Plane, ROW, Tile, Visit, alpha, begin, columns, highest, pass, strip_range,
+    strips, sum_lanes, walk,
+};
+use super::gather::{Record, SIDE, TILE, TILES};
+use super::parallel::{Ragged, for_each_group};
+use super::project::Projected;
+use super::rasterize::{CHUNK, Raster};
+use super::simd::{Kernel, Simd, dispatch, least};
+use crate::math::Real;
+use rayon::prelude::*;
+use std::sync::atomic::Ordering;
+
+impl<F: Real> Raster<F> {
+    /// Σ α T over the picture of every splat that was prepared, into `out` [splats], which is overwritten.
+    pub(super) fn weigh(
+        &mut self,
+        projected: &[Projected<F>],
+        footprints: &[Footprint],
+        config: &RenderConfig,
+        out: &mut [F],
+    ) {
+        out.fill(F::ZERO);
+        for run in 0..self.bins.runs.len() {
+            self.hold(projected, footprints, run);
+            self.weigh_run(footprints, config, out);
+        }
+    }
+
+    /// [`Raster::weigh`] of the current run, added to `out`.
+    fn weigh_run(&mut self, footprints: &[Footprint], config: &RenderConfig, out: &mut [F]) {
+        let (simd, bins, limits) = (self.simd.unwrap_or(Simd::Scalar), &self.bins, Limits::new(config));
+        let (width, height, records) = (self.width, self.height, &self.records);
+        let pairs = bins.keys.len();
+        self.pair_weights.resize(pairs, F::ZERO);
+        self.place.resize_with(pairs, Default::default);
+        let (place, run) = (&self.place, &bins.runs[bins.current]);
+        for_each_group(&bins.starts, Ragged(&mut self.pair_weights), &|bin, weights| {
+            if !run.contains(&bin) {
+                return;
+            }
+            let (start, end) = (bins.starts[bin] as usize, bins.starts[bin + 1] as usize);
+            let (bx, by) = (bin % bins.across, bin / bins.across);
+            for (i, key) in bins.keys[start..end].iter().enumerate() {
+                let splat = id(*key);
+                // Every slot is written by exactly one task, so that the order of writes cannot matter.
+                let slot = bins.first[splat].wrapping_add(footprints[splat].rank(bx, by) as u32);
+                place[slot as usize].store((start + i) as u32, Ordering::Relaxed);
+            }
+            weights.0.fill(F::ZERO);
+            let inside = [width - bx * BIN, height - by * BIN];
+            dispatch(simd, Weigh { records: &records[start..end], inside, limits, out: weights.0 });
+        });
+        // Per splat: its pairs in the order of its bins.
+        let weights = &self.pair_weights;
+        out.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, out)| {
+            for (i, out) in out.iter_mut().enumerate() {
+                let splat = chunk * CHUNK + i;
+                for slot in &place[bins.slots(splat, &footprints[splat])] {
+                    *out += weights[slot.load(Ordering::Relaxed) as usize];
+                }
+            }
+        });
+    }
+}
+
+/// Weighs the splats of one bin.
+struct Weigh<'a, F> {
+    records: &'a [Record<F>],
+    /// Pixels from the bin's corner to the picture's right and lower ends.
+    inside: [usize; 2],
+    limits: Limits<F>,
+    /// One a record; those that no pixel meets are not written.
+    out: &'a mut [F],
+}
+
+impl<F: Real> Kernel for Weigh<'_, F> {
+    type Out = ();
+    #[inline(always)]
+    fn run<const FMA: bool>(self) {
+        self.walk::<FMA, ROW>();
+    }
+    #[inline(always)]
+    fn run_wide<const FMA: bool>(self) {
+        self.walk::<FMA, PAIR_OF_ROWS>();
+    }
+}
+
+impl<F: Real> Weigh<'_, F> {
+    #[inline(always)]
+    fn walk<const FMA: bool, const N: usize>(self) {
+        let mut tiles = [Tile::default(); TILES];
+        let open = begin(&mut tiles, self.inside);
+        let ts = tiles.map(|tile| tile.t);
+        let sums = [[F::ZERO; TILE]; BATCH];
+        let mut visit = Weighing::<F, N> { ts, limits: self.limits, sums, out: self.out };
+        walk::<F, _, FMA>(self.records, open, &mut visit);
+    }
+}
+
+struct Weighing<'a, F, const N: usize> {
+    ts: [Plane<F>; TILES],
+    limits: Limits<F>,
+    /// Sums of a batch's splats over all tiles, column by column.
+    sums: [[F; TILE]; BATCH],
+    out: &'a mut [F],
+}
+
+impl<F: Real, const N: usize> Visit<F> for Weighing<'_, F, N> {
+    #[inline(always)]
+    fn splat<const FMA: bool>(&mut self, t: usize, i: usize, r: &Record<F>) {
+        let (tx, ty, limits) = (t % SIDE, t / SIDE, self.limits);
+        let range = strip_range::<N>(r.tile_rows(tx, ty));
+        let mut e = Exponent::<F, N>::new::<FMA>(r, tx, ty, range.start, &limits);
+        let mut sum = [F::ZERO; N];
+        for ts in strips::<F, N>(&mut self.ts[t], range) {
+            let mut after = *ts;
+            for l in 0..N {
+                let power = least(e.raw::<FMA>(l), e.top);
+                let weight;
+                (after[l], weight, _) = pass(after[l], alpha::<F, FMA>(power, &limits), &limits);
+                sum[l] += weight;
+                e.step(l);
+            }
+            *ts = after;
+        }
+        for (total, v) in self.sums[i].iter_mut().zip(columns(sum)) {
+            *total += v;
+        }
+    }
+
+    #[inline(always)]
+    fn stopped(&self, t: usize) -> bool {
+        highest(&self.ts[t]) < F::ZERO
+    }
+
+    #[inline(always)]
+    fn passed(&mut self, first: usize, count: usize) {
+        for (out, sums) in self.out[first..].iter_mut().zip(&mut self.sums[..count]) {
+            *out = sum_lanes(std::mem::replace(sums, [F::ZERO; TILE]));
+        }
+    }
+}
