@@ -145,7 +145,11 @@ fn sides(out: &mut String, told: &Compressed) {
             &|s| Some(grouped(s.active_mean.round() as usize)),
             less(fair.active_mean, after.active_mean),
         ),
-        ("alive at a frame, most", &|s| Some(grouped(s.active_max)), less(fair.active_max as f64, after.active_max as f64)),
+        (
+            "alive at a frame, most",
+            &|s| Some(grouped(s.active_max)),
+            less(fair.active_max as f64, after.active_max as f64),
+        ),
         ("as 32-bit floats", &|s| Some(human_bytes(s.float_bytes)), None),
         (
             "file",

@@ -57,7 +57,11 @@ impl Score {
             Temporal::ALL.iter().map(|t| (named(t), Self { temporal: *t, ..Self::default() })).collect();
         out.push(("without the volume".into(), Self { volume: false, ..Self::default() }));
         let others = Combine::ALL.iter().filter(|c| **c != Combine::default());
-        out.extend(others.map(|c| (format!("combined: {}", c.name().replace('-', " ")), Self { combine: *c, ..Self::default() })));
+        out.extend(
+            others.map(|c| {
+                (format!("combined: {}", c.name().replace('-', " ")), Self { combine: *c, ..Self::default() })
+            }),
+        );
         out
     }
 }
@@ -228,7 +232,8 @@ mod tests {
             assert!(cells[..i].iter().all(|b| b.key() != a.key() && b != a));
         }
         let keys: Vec<String> = cells.iter().map(Cell::key).collect();
-        let needed = grid.shares.iter().flat_map(|s| grid.share(*s)).chain(grid.scores.iter().flat_map(|s| grid.score(s.1)));
+        let needed =
+            grid.shares.iter().flat_map(|s| grid.share(*s)).chain(grid.scores.iter().flat_map(|s| grid.score(s.1)));
         assert!(needed.into_iter().all(|c| keys.contains(&c.key())));
         assert_eq!(grid.scores[0].1, Score::default());
         assert!(Grid::quick(10).cells().len() < cells.len() / 2);

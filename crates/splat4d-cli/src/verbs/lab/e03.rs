@@ -74,7 +74,8 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     for bench in &benches {
         let grid = &bench.grid;
         let cells = grid.cells();
-        let work = args.output.join("work").join(&bench.name);
+        // A retrained run must not go on from what another scene has left.
+        let work = args.output.join("work").join(format!("{}-{}", bench.name, bench.print));
         let others: Vec<_> = study.runs.iter().filter(|f| f.run != bench.path).cloned().collect();
         let progress = |cell: &Cell, Place { number, of, left }: Place| {
             console.clear();
@@ -82,8 +83,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             console.note(&format!("{} {number}/{of}: {}{left}", bench.name, cell.words()));
         };
         let keep = |findings: &super::study::Findings, found: &Found| {
-            let mut whole = Study::default();
-            whole.runs = others.iter().cloned().chain([findings.clone()]).collect();
+            let whole = Study::of(others.iter().cloned().chain([findings.clone()]).collect());
             console.emit(&json!({"type": "cell", "run": bench.path, "cell": found}));
             whole.save(&file)
         };

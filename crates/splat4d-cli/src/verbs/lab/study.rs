@@ -44,19 +44,17 @@ pub(super) struct Found {
     pub seconds: f64,
 }
 
-impl Default for Study {
-    fn default() -> Self {
-        Self { version: VERSION, runs: Vec::new() }
-    }
-}
-
 impl Study {
+    pub(super) fn of(runs: Vec<Findings>) -> Self {
+        Self { version: VERSION, runs }
+    }
+
     /// Reads the file; an empty study where there is none yet.
     ///
     /// Errors: a file that is none of ours, or of another version.
     pub(super) fn open(path: &Path) -> Result<Self> {
         if !path.is_file() {
-            return Ok(Self::default());
+            return Ok(Self::of(Vec::new()));
         }
         let remedy = "Move it away, or choose another folder with -o.";
         let value = camera_file::json(&files::read_text(path)?).map_err(|e| e.at(path.display()).remedy(remedy))?;

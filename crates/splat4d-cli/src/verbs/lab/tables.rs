@@ -87,11 +87,17 @@ fn scores(out: &mut String, findings: &Findings, grid: &Grid) {
         let (pruned, tuned) = (both(findings.of(&pruned)), both(findings.of(&tuned)));
         std::iter::once(name.clone()).chain(pruned).chain(tuned).collect()
     };
-    table(out, &format!("Scores, at {:.0} %", 100.0 * grid.round(1).prune), &head, grid.scores.iter().map(line).collect());
+    table(
+        out,
+        &format!("Scores, at {:.0} %", 100.0 * grid.round(1).prune),
+        &head,
+        grid.scores.iter().map(line).collect(),
+    );
 }
 
 fn intervals(out: &mut String, findings: &Findings, grid: &Grid) {
-    let head = ["frames between keys", "alive at a frame", "filter: PSNR", "moving", "fine-tuned: PSNR", "moving", "frames/s"];
+    let head =
+        ["frames between keys", "alive at a frame", "filter: PSNR", "moving", "fine-tuned: PSNR", "moving", "frames/s"];
     let line = |interval: &usize| {
         let cells = grid.interval(*interval);
         let [plain, tuned] = [0, 1].map(|i| findings.of(&cells[i]));
@@ -146,7 +152,11 @@ pub(super) fn plots(findings: &Findings, grid: &Grid) -> Vec<(&'static str, Stri
     };
     let shares = |i: usize| grid.shares.iter().map(|s| (100.0 * s, grid.share(*s)[i].clone())).collect::<Vec<_>>();
     let by_share = |get: Get| {
-        ["pruned", "fine-tuned", "with filter"].iter().enumerate().map(|(i, name)| curve(name, get, &shares, i)).collect()
+        ["pruned", "fine-tuned", "with filter"]
+            .iter()
+            .enumerate()
+            .map(|(i, name)| curve(name, get, &shares, i))
+            .collect()
     };
     let keys = |i: usize| grid.intervals.iter().map(|k| (*k as f64, grid.interval(*k)[i].clone())).collect::<Vec<_>>();
     let by_interval: Vec<Series> =
@@ -183,12 +193,19 @@ mod tests {
         };
         let full = Findings { cells: grid.cells().iter().map(found).collect(), ..empty };
         let page = markdown(&full, &grid);
-        for text in ["150,000", "| 80 % | 30,000 | 28.80 | 27.00 | 29.30 | 27.00 | 3.20 |", "spatial score alone", "1.80x", "| 4 |"] {
+        for text in [
+            "150,000",
+            "| 80 % | 30,000 | 28.80 | 27.00 | 29.30 | 27.00 | 3.20 |",
+            "spatial score alone",
+            "1.80x",
+            "| 4 |",
+        ] {
             assert!(page.contains(text), "{text} is missing in {page}");
         }
         // Every table is a table: a line has as many cells as its head.
         for part in page.split("\n### ").skip(1) {
-            let counts: Vec<usize> = part.lines().filter(|l| l.starts_with('|')).map(|l| l.matches('|').count()).collect();
+            let counts: Vec<usize> =
+                part.lines().filter(|l| l.starts_with('|')).map(|l| l.matches('|').count()).collect();
             assert!(counts.len() > 2 && counts.windows(2).all(|w| w[0] == w[1]), "{part}");
         }
         assert!(!page.contains("|  |"), "no cell is empty: {page}");
