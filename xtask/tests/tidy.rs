@@ -42,6 +42,7 @@ const ORDER: [(&str, &[&str]); 4] = [
             "run_folder",
             "sequence",
             "source",
+            "measure",
             "baking",
             "playable",
             "serving",

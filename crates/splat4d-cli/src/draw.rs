@@ -48,8 +48,7 @@ pub(crate) struct Painter<'a> {
 impl<'a> Painter<'a> {
     /// `depth`: whether pictures of depth will be asked for.
     pub(crate) fn new(scene: &'a Scene<f32>, background: [f32; 3], antialias: bool, depth: bool) -> Self {
-        let antialias = if antialias { Antialias::On } else { Antialias::Off };
-        let config = RenderConfig { antialias, depth, ..RenderConfig::default() };
+        let config = RenderConfig { antialias: self::antialias(antialias), depth, ..RenderConfig::default() };
         let (player, brush, image) = (Player::of_scene(scene), Brush::cpu(config), Image::default());
         Self { player, background, config, brush, image }
     }
@@ -102,6 +101,11 @@ impl<'a> Painter<'a> {
         let n = depths.len();
         Some([depths[n / 100], depths[n - 1 - n / 100]])
     }
+}
+
+/// As recipes say it, for the renderer.
+pub(crate) fn antialias(on: bool) -> Antialias {
+    if on { Antialias::On } else { Antialias::Off }
 }
 
 /// Near is bright; even steps of disparity look even.

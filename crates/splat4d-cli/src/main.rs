@@ -48,6 +48,7 @@ Examples:
   splat4d convert scene.sog scene.spz      between the formats of other programs
   splat4d info my-take                     what is in a capture, run or file; is it healthy?
   splat4d bench                            how fast this machine draws and trains
+  splat4d lab e03 runs/knight              what pruning and the temporal filter gain and lose
 
 Exit codes: 0 done, 1 failed or interrupted, 2 bad input.";
 
@@ -90,6 +91,7 @@ enum Verb {
     Convert(verbs::convert::Args),
     Info(verbs::info::Args),
     Bench(verbs::bench::Args),
+    Lab(verbs::lab::Args),
     Completions(verbs::completions::Args),
 }
 
@@ -118,6 +120,7 @@ fn main() -> ExitCode {
         Verb::Convert(args) => verbs::convert::run(&args, &console),
         Verb::Info(args) => verbs::info::run(&args, &console),
         Verb::Bench(args) => verbs::bench::run(&args, cli.globals.threads, &console),
+        Verb::Lab(args) => verbs::lab::run(&args, &console),
         Verb::Completions(args) => verbs::completions::run(&args, &console),
     });
     match done {

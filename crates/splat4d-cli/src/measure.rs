@@ -50,7 +50,7 @@ pub(crate) struct Side {
     pub ssim: Option<f64>,
     /// Where things move, dB.
     pub psnr_dynamic: Option<f64>,
-    /// Mean change from frame to frame beyond the truth's, in 1/255.
+    /// Mean difference between the change from frame to frame and the truth's, in 1/255.
     pub flicker: Option<f64>,
     /// Mean over some training views, dB.
     pub psnr_train: Option<f64>,

@@ -13,8 +13,10 @@ use std::path::{Path, PathBuf};
 
 /// Files that mark a folder as a run.
 const MARKERS: [&str; 4] = ["recipe.toml", "run.json", "scene.safetensors", "checkpoints"];
+/// What `compress` leaves beside the file that it writes, for the report and for machines.
+pub(crate) const COMPRESS: &str = "compress.json";
 /// What splat4d writes into a run; `--force` replaces these and nothing else.
-const OURS: [&str; 18] = [
+const OURS: [&str; 19] = [
     "recipe.toml",
     "run.json",
     "scene.safetensors",
@@ -23,6 +25,7 @@ const OURS: [&str; 18] = [
     "metrics.csv",
     "results.json",
     "per_view.json",
+    COMPRESS,
     "cameras.json",
     "test",
     "train",
@@ -32,7 +35,7 @@ const OURS: [&str; 18] = [
     "baseline",
     "renders",
     "compress.toml",
-    "compress.json",
+    "unpruned",
 ];
 
 /// One row of `metrics.csv`.
@@ -42,6 +45,10 @@ pub(crate) struct Metrics {
     pub loss: f64,
     pub psnr: f64,
     pub gaussians: f64,
+    /// The stage of training.
+    pub stage: String,
+    /// Seconds of training so far.
+    pub seconds: f64,
     /// Milliseconds of each of [`Run::stages`].
     pub stages: Vec<f64>,
 }
@@ -73,6 +80,8 @@ pub(crate) struct Run {
     pub all_results: Value,
     /// Held-out views, from `per_view.json`.
     pub views: Vec<ViewScore>,
+    /// `compress.json`, where the run was made by compressing another.
+    pub compressed: Value,
     iteration: Option<usize>,
 }
 
@@ -118,6 +127,7 @@ impl Run {
             run.iteration = Some(iteration);
             run.results = Some(entry.clone());
         }
+        run.compressed = parse(COMPRESS)?;
         run.views = newest(&parse("per_view.json")?).map(|(_, entry)| view_scores(entry)).unwrap_or_default();
         Ok(run)
     }
@@ -133,12 +143,15 @@ impl Run {
             (column("iteration"), column("loss"), column("psnr"), column("gaussians"));
         for line in lines {
             let cells: Vec<f64> = line.split(',').map(|c| c.trim().parse().unwrap_or(f64::NAN)).collect();
+            let stage = column("stage").and_then(|i| line.split(',').nth(i)).unwrap_or_default().to_owned();
             let get = |i: Option<usize>| i.and_then(|i| cells.get(i).copied()).unwrap_or(f64::NAN);
             self.metrics.push(Metrics {
                 iteration: get(iteration),
                 loss: get(loss),
                 psnr: get(psnr),
                 gaussians: get(gaussians),
+                stage,
+                seconds: get(column("seconds")),
                 stages: stages.iter().map(|s| get(Some(s.0))).collect(),
             });
         }

@@ -4,6 +4,8 @@
 mod bench;
 #[path = "cli/convert.rs"]
 mod convert;
+#[path = "cli/lab.rs"]
+mod lab;
 #[path = "cli/sample.rs"]
 mod sample;
 
@@ -40,7 +42,8 @@ fn json_of(path: &Path) -> Value {
 #[test]
 fn help_teaches_and_completions_complete() {
     let help = splat4d(&["--help"]).run().ok();
-    for verb in ["train", "eval", "render", "bake", "view", "export", "convert", "info", "bench", "completions"] {
+    for verb in ["train", "eval", "render", "bake", "view", "export", "convert", "info", "bench", "lab", "completions"]
+    {
         assert!(help.contains(verb), "{verb} is missing");
         let own = splat4d(&[verb, "--help"]).run().ok();
         assert!(own.contains("Examples:") && own.contains(&format!("splat4d {verb}")), "{verb} --help teaches nothing");

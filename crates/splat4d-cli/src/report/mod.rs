@@ -3,6 +3,7 @@
 //! It is made from the run folder's files alone; what is missing there is missing in the page.
 
 pub(crate) mod chart;
+pub(crate) mod compress;
 mod pictures;
 
 use crate::files::{self, grouped, human_bytes, human_seconds};
@@ -33,6 +34,7 @@ fn page(run: &Run) -> String {
     header(&mut body, run);
     cards(&mut body, run);
     findings(&mut body, run);
+    compress::section(&mut body, run);
     film(&mut body, run);
     views(&mut body, run);
     curves(&mut body, run);

@@ -1,9 +1,13 @@
 //! Pictures inside the page: held-out views beside their truth and error, as small JPEGs in data URIs.
 
+use crate::draw::color_rgb;
 use crate::files::base64;
+use crate::video::Rgb;
 use image::RgbImage;
 use image::codecs::jpeg::JpegEncoder;
 use image::imageops::{FilterType, resize};
+use splat4d::scene::Planes;
+use splat4d_train::eval::metrics::error_map;
 use std::path::{Path, PathBuf};
 
 /// Width of a picture in the page, pixels: three stand side by side on a wide screen.
@@ -13,9 +17,33 @@ const QUALITY: u8 = 90;
 /// Largest film that is put inside the page, bytes; a larger one is linked.
 const FILM_BYTES: u64 = 6 << 20;
 
+/// A mean difference of the channels as large as this is the last colour of [`difference`]: compression changes less than
+/// training leaves wrong.
+const DIFFERENCE_FULL: f32 = 0.1;
+/// The same in words.
+pub(super) const DIFFERENCE_WORDS: &str = "a tenth";
+
 /// A JPEG data URI of a picture file, reduced; `None` where it cannot be read.
 pub(super) fn inline(path: &Path) -> Option<String> {
-    let picture = image::open(path).ok()?.to_rgb8();
+    reduced(image::open(path).ok()?.to_rgb8())
+}
+
+/// The same of where two pictures differ; `None` where one cannot be read or their sizes differ.
+pub(super) fn difference(a: &Path, b: &Path) -> Option<String> {
+    let read = |path: &Path| {
+        let picture = image::open(path).ok()?.to_rgb32f();
+        let (w, h) = picture.dimensions();
+        Some(Planes::from_interleaved(3, h as usize, w as usize, &picture.into_raw()))
+    };
+    let (a, b) = (read(a)?, read(b)?);
+    if (a.width, a.height) != (b.width, b.height) {
+        return None;
+    }
+    let Rgb { width, height, data } = color_rgb(&error_map(&a, &b, DIFFERENCE_FULL));
+    reduced(RgbImage::from_raw(width as u32, height as u32, data)?)
+}
+
+fn reduced(picture: RgbImage) -> Option<String> {
     let (w, h) = picture.dimensions();
     let picture: RgbImage = if w > WIDTH {
         let height = ((u64::from(h) * u64::from(WIDTH)) / u64::from(w)).max(1) as u32;

@@ -35,7 +35,7 @@ pub(crate) struct Args {
     output: Option<PathBuf>,
     /// Continue this compression exactly where its newest checkpoint is
     #[arg(long, value_name = "DIR", conflicts_with_all = ["run", "output", "level", "prune", "max_mb", "fine_tune",
-        "set", "force", "guard"])]
+        "set", "force", "guard", "unpruned"])]
     resume: Option<PathBuf>,
     /// Replace the run in the -o folder
     #[arg(long)]
@@ -55,6 +55,9 @@ pub(crate) struct Args {
     /// Most dB that training views may lose; beyond it half as much is pruned instead, at most twice. 0: no guard
     #[arg(long, value_name = "DB", default_value_t = GUARD, value_parser = natural)]
     guard: f64,
+    /// Train the unpruned scene on for as many steps too, and compare with that: fair, and takes as long again
+    #[arg(long)]
+    unpruned: bool,
     /// Change a setting of the level; may be repeated
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
@@ -90,6 +93,7 @@ fn begin(args: &Args, console: &Console) -> anyhow::Result<Work> {
         level: args.level,
         guard: args.guard,
         max_bytes: args.max_mb.map(|mb| (mb * 1e6) as u64),
+        unpruned: args.unpruned,
         free: args.set.is_empty() && args.fine_tune.is_none(),
         settings: settings(args, iterations)?,
         tried: Vec::new(),

@@ -1,12 +1,12 @@
 //! How scenes and files play, side by side: [`crate::measure`] by hand.
 
 use crate::console::Console;
+use crate::draw::antialias;
 use crate::files::{cannot_read, grouped, human_bytes};
 use crate::measure::{Side, Subject, What, in_turns, looks_of};
 use crate::source::{Source, not_empty};
 use serde::Serialize;
 use splat4d::Result;
-use splat4d::render::Antialias;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -28,13 +28,13 @@ pub(super) fn measure(files: &[PathBuf], size: [usize; 2], console: &Console) ->
     let first = sources.iter().position(|(s, _)| s.run.is_some() || s.playback.is_some()).unwrap_or(0);
     let looks = looks_of(&sources[first].0, size)?;
     let subject = |(source, bytes): &'_ (Source, Option<Arc<[u8]>>)| {
-        let antialias = source.run.as_ref().and_then(|r| r.recipe().ok()).is_some_and(|r| r.antialias);
-        (if antialias { Antialias::On } else { Antialias::Off }, bytes.clone())
+        let smooth = source.run.as_ref().and_then(|r| r.recipe().ok()).is_some_and(|r| r.antialias);
+        (bytes.clone(), antialias(smooth))
     };
     let subjects: Vec<Subject<'_>> = sources
         .iter()
         .map(|both| {
-            let (antialias, bytes) = subject(both);
+            let (bytes, antialias) = subject(both);
             Subject { what: bytes.map_or(What::Scene(&both.0.scene), What::File), antialias }
         })
         .collect();

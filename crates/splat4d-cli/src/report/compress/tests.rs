@@ -1,0 +1,118 @@
+use super::*;
+use image::RgbImage;
+use serde_json::json;
+
+fn side(gaussians: usize, bytes: u64, psnr: f64, fps: f64) -> Side {
+    Side {
+        gaussians,
+        bytes,
+        float_bytes: 56 * gaussians as u64,
+        psnr: Some(psnr),
+        fps,
+        raster_fps: 2.0 * fps,
+        ..Side::default()
+    }
+}
+
+fn told(source: &Path) -> Compressed {
+    Compressed {
+        source: source.to_owned(),
+        level: Some(2),
+        settings: json!({"prune": 0.5, "palette": 4096}),
+        before: side(150_000, 9_000_000, 31.0, 40.0),
+        unpruned: Some(side(150_000, 9_000_000, 31.2, 40.0)),
+        plain: None,
+        after: side(75_000, 400_000, 30.95, 110.0),
+        stages: vec![
+            Step { name: "prune".into(), seconds: 61.0, steps: 1000, gaussians: 75_000 },
+            Step { name: "quantise".into(), seconds: 59.0, steps: 500, gaussians: 75_000 },
+        ],
+        guard: Some(Guard { loss_db: 0.25, limit_db: 0.4, passed: true }),
+        tried: vec![
+            Tried { prune: 0.2, bytes: 2 << 20, psnr: 31.1 },
+            Tried { prune: 0.5, bytes: 1 << 20, psnr: 30.95 },
+        ],
+        warnings: vec!["the <orb> is thin.".into()],
+    }
+}
+
+/// A run with a picture of one colour.
+fn run(folder: &Path, colour: u8) {
+    std::fs::write(folder.join("recipe.toml"), "").unwrap();
+    let psnr = json!({"00000.png": 30.0});
+    std::fs::write(folder.join("per_view.json"), json!({"ours_10": {"PSNR": psnr}}).to_string()).unwrap();
+    std::fs::write(folder.join("results.json"), json!({"ours_10": {"PSNR": 30.0}}).to_string()).unwrap();
+    let renders = folder.join("test/ours_10/renders");
+    std::fs::create_dir_all(&renders).unwrap();
+    RgbImage::from_pixel(32, 24, image::Rgb([colour; 3])).save(renders.join("00000.png")).unwrap();
+}
+
+fn page(folder: &Path) -> String {
+    let mut out = String::new();
+    section(&mut out, &Run::open(folder).unwrap());
+    out
+}
+
+#[test]
+fn the_section_tells_both_sides_their_pictures_and_how() {
+    let (before, after) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    run(before.path(), 100);
+    run(after.path(), 120);
+    let told = told(before.path());
+    let text = serde_json::to_string_pretty(&told).unwrap();
+    assert_eq!(serde_json::from_str::<Compressed>(&text).unwrap(), told);
+    std::fs::write(after.path().join(FILE), text).unwrap();
+    let html = page(after.path());
+    for text in [
+        "level 2",
+        "not pruned, same steps",
+        "-0.25",
+        "2.75x",
+        "21.0x less than the source",
+        "2.0x less",
+        "within the 0.40 dB",
+        "&lt;orb&gt;",
+        "together",
+        "1,500",
+        "2:00",
+        "50 % pruned",
+        "palette = 4096",
+    ] {
+        assert!(html.contains(text), "{text} is missing in {html}");
+    }
+    assert!(!html.contains("plain file") && !html.contains("flicker"), "what was not measured is not there");
+    assert_eq!(html.matches("data:image/jpeg;base64,").count(), 3, "before, compressed, difference");
+    assert!(!html.contains("NaN") && !html.contains("inf"));
+}
+
+#[test]
+fn what_is_missing_or_strange_costs_no_page() {
+    let folder = tempfile::tempdir().unwrap();
+    run(folder.path(), 90);
+    assert_eq!(page(folder.path()), "", "a run that was not compressed");
+    std::fs::write(folder.path().join(FILE), "{}").unwrap();
+    let html = page(folder.path());
+    assert!(html.contains("<table>") && !html.contains("NaN") && !html.contains("Stages"), "{html}");
+    std::fs::write(folder.path().join(FILE), "{\"after\": 3}").unwrap();
+    assert!(page(folder.path()).contains("not as this version"));
+    std::fs::write(folder.path().join(FILE), "{\"after\":").unwrap();
+    assert!(Run::open(folder.path()).unwrap_err().to_string().contains(FILE));
+}
+
+#[test]
+fn the_guard_warns_where_too_much_is_lost() {
+    let failed = Guard { loss_db: 0.7, limit_db: 0.4, passed: false };
+    let mut out = String::new();
+    guard(&mut out, &Compressed { guard: Some(failed), ..Compressed::default() });
+    assert!(out.contains("class=\"warn\"") && out.contains("more than the 0.40 dB"), "{out}");
+}
+
+#[test]
+fn bytes_are_told_by_part() {
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/knight.splat4d");
+    let chart = parts(&file).unwrap();
+    for part in ["Gaussians", "palette", "poster", "index"] {
+        assert!(chart.contains(part), "{part}");
+    }
+    assert!(parts(Path::new("nothing")).is_none());
+}

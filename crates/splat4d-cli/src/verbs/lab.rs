@@ -1,0 +1,34 @@
+//! `lab`: studies that vary what methods leave open, on runs of one's own.
+
+mod cells;
+mod e03;
+mod study;
+mod tables;
+
+use crate::console::Console;
+
+const EXAMPLES: &str = "\
+Examples:
+  splat4d lab e03 runs/knight              how much can be pruned, by which score, and what does the filter cost?
+  splat4d lab e03 runs/knight --quick
+
+A study can be stopped at any time and goes on where it was.";
+
+/// Study methods on trained runs: tables and curves of what they gain and lose
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub(crate) struct Args {
+    #[command(subcommand)]
+    study: Study,
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum Study {
+    E03(e03::Args),
+}
+
+pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
+    match &args.study {
+        Study::E03(args) => e03::run(args, console),
+    }
+}

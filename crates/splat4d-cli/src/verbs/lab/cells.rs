@@ -1,0 +1,248 @@
+//! What is done to a trained scene: a point of the study, and the points that it consists of.
+
+use splat4d_train::compress::Compression;
+use splat4d_train::prune::{Combine, Temporal};
+
+/// Share of the Gaussians that goes where something else is varied, as 4DGS-1K on N3V.
+const AT: f64 = 0.8;
+/// Frames between key times where something else is varied, as there.
+const INTERVAL: usize = 20;
+/// Shares at which quality is measured.
+const SHARES: [f64; 9] = [0.0, 0.2, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95];
+const FEW_SHARES: [f64; 4] = [0.0, 0.5, 0.8, 0.95];
+/// Frames between key times; 4DGS-1K tried 10 to 60.
+const INTERVALS: [usize; 5] = [2, 5, 10, 20, 60];
+const FEW_INTERVALS: [usize; 2] = [5, 20];
+/// Rounds in which one share is pruned.
+const ROUNDS: [usize; 3] = [1, 2, 4];
+const FEW_ROUNDS: [usize; 1] = [1];
+/// What fine-tuning is taken to cost besides its steps (scoring, evaluation, playing), in steps; for the time that is left.
+const OVERHEAD: f64 = 300.0;
+
+/// One treatment of the source.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Cell {
+    /// Share of the Gaussians that goes, in so many rounds.
+    pub prune: f64,
+    pub rounds: usize,
+    pub score: Score,
+    /// Steps of fine-tuning.
+    pub steps: usize,
+    /// Frames between key times; 0: no filter.
+    pub interval: usize,
+}
+
+/// How Gaussians are ranked.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Score {
+    pub temporal: Temporal,
+    pub combine: Combine,
+    pub volume: bool,
+}
+
+impl Default for Score {
+    fn default() -> Self {
+        Self { temporal: Temporal::default(), combine: Combine::default(), volume: true }
+    }
+}
+
+impl Score {
+    /// All that are compared, the default first: the temporal variants, then without the volume, then the ways to combine.
+    pub(super) fn all() -> Vec<(String, Self)> {
+        let named = |t: &Temporal| match t {
+            Temporal::None => "spatial score alone".to_owned(),
+            t => t.name().replace('-', " "),
+        };
+        let mut out: Vec<(String, Self)> =
+            Temporal::ALL.iter().map(|t| (named(t), Self { temporal: *t, ..Self::default() })).collect();
+        out.push(("without the volume".into(), Self { volume: false, ..Self::default() }));
+        let others = Combine::ALL.iter().filter(|c| **c != Combine::default());
+        out.extend(
+            others.map(|c| {
+                (format!("combined: {}", c.name().replace('-', " ")), Self { combine: *c, ..Self::default() })
+            }),
+        );
+        out
+    }
+}
+
+impl Cell {
+    /// The source as it is.
+    pub(super) const fn source() -> Self {
+        let score = Score { temporal: Temporal::InstantAbs, combine: Combine::Product, volume: true };
+        Self { prune: 0.0, rounds: 1, score, steps: 0, interval: 0 }
+    }
+
+    /// Whether nothing is done at all.
+    pub(super) fn is_source(&self) -> bool {
+        self.prune == 0.0 && self.steps == 0 && self.interval == 0
+    }
+
+    /// Its name in files: what it depends on. Without pruning neither score nor rounds matter.
+    pub(super) fn key(&self) -> String {
+        let mut key = format!("prune{:03.0}", 1000.0 * self.prune);
+        if self.prune > 0.0 {
+            let Score { temporal, combine, volume } = self.score;
+            key += &format!("-{temporal}-{combine}-{}-rounds{}", if volume { "volume" } else { "flat" }, self.rounds);
+        }
+        key + &format!("-steps{}-interval{}", self.steps, self.interval)
+    }
+
+    /// For people who wait.
+    pub(super) fn words(&self) -> String {
+        if self.is_source() {
+            return "the source".into();
+        }
+        let mut words = match self.prune {
+            0.0 => "not pruned".to_owned(),
+            share => format!("{:.0} % pruned by {}", 100.0 * share, self.score.temporal),
+        };
+        if self.interval > 0 {
+            words += &format!(", filter every {} frames", self.interval);
+        }
+        if self.steps > 0 {
+            words += &format!(", {} steps", self.steps);
+        }
+        words
+    }
+
+    /// For the compression: floats throughout, so that only what is varied changes anything.
+    pub(super) fn settings(&self) -> Compression {
+        Compression {
+            prune: self.prune,
+            rounds: self.rounds,
+            temporal: self.score.temporal.name().into(),
+            combine: self.score.combine.name().into(),
+            volume: self.score.volume,
+            fine_tune: self.steps,
+            mask_interval: self.interval,
+            codec: false,
+            ..Compression::default()
+        }
+    }
+
+    /// What it takes, in steps of training.
+    pub(super) fn cost(&self) -> f64 {
+        OVERHEAD + self.steps as f64
+    }
+}
+
+/// What the study varies.
+#[derive(Clone, Debug)]
+pub(super) struct Grid {
+    pub shares: Vec<f64>,
+    pub intervals: Vec<usize>,
+    pub rounds: Vec<usize>,
+    pub scores: Vec<(String, Score)>,
+    /// Steps of fine-tuning, where there is any.
+    pub steps: usize,
+    /// Whether scores, intervals and rounds are fine-tuned too.
+    pub tune_all: bool,
+}
+
+impl Grid {
+    pub(super) fn full(steps: usize) -> Self {
+        Self {
+            shares: SHARES.to_vec(),
+            intervals: INTERVALS.to_vec(),
+            rounds: ROUNDS.to_vec(),
+            scores: Score::all(),
+            steps,
+            tune_all: true,
+        }
+    }
+
+    /// A glance: fewer points, and fine-tuning only of the main ones.
+    pub(super) fn quick(steps: usize) -> Self {
+        Self {
+            shares: FEW_SHARES.to_vec(),
+            intervals: FEW_INTERVALS.to_vec(),
+            rounds: FEW_ROUNDS.to_vec(),
+            tune_all: false,
+            ..Self::full(steps)
+        }
+    }
+
+    /// Pruned to a share: [not tuned, tuned, tuned with the filter on].
+    pub(super) fn share(&self, prune: f64) -> [Cell; 3] {
+        let cell = |steps, interval| Cell { prune, steps, interval, ..Cell::source() };
+        [cell(0, 0), cell(self.steps, 0), cell(self.steps, INTERVAL)]
+    }
+
+    /// What each part does, at one share: name and cell.
+    pub(super) fn parts(&self) -> Vec<(String, Cell)> {
+        let cell = |prune, interval, steps| Cell { prune, interval, steps, ..Cell::source() };
+        let pruned = format!("pruned by {:.0} %", 100.0 * AT);
+        vec![
+            ("source".into(), cell(0.0, 0, 0)),
+            ("trained on, nothing removed".into(), cell(0.0, 0, self.steps)),
+            ("filter".into(), cell(0.0, INTERVAL, 0)),
+            ("filter, fine-tuned".into(), cell(0.0, INTERVAL, self.steps)),
+            (pruned.clone(), cell(AT, 0, 0)),
+            (format!("{pruned}, fine-tuned"), cell(AT, 0, self.steps)),
+            (format!("{pruned}, filter"), cell(AT, INTERVAL, 0)),
+            (format!("{pruned}, filter, fine-tuned"), cell(AT, INTERVAL, self.steps)),
+        ]
+    }
+
+    /// [not tuned, tuned] of a score.
+    pub(super) fn score(&self, score: Score) -> [Cell; 2] {
+        [0, self.steps].map(|steps| Cell { prune: AT, score, steps, ..Cell::source() })
+    }
+
+    /// [not tuned, tuned] of an interval.
+    pub(super) fn interval(&self, interval: usize) -> [Cell; 2] {
+        [0, self.steps].map(|steps| Cell { prune: AT, interval, steps, ..Cell::source() })
+    }
+
+    /// Tuned, in so many rounds.
+    pub(super) fn round(&self, rounds: usize) -> Cell {
+        Cell { prune: AT, rounds, steps: self.steps, ..Cell::source() }
+    }
+
+    /// Every cell once: the source first, then what the main tables need.
+    pub(super) fn cells(&self) -> Vec<Cell> {
+        let mut all = vec![Cell::source()];
+        all.extend(self.parts().into_iter().map(|(_, cell)| cell));
+        all.extend(self.shares.iter().flat_map(|s| self.share(*s)));
+        let few = if self.tune_all { 2 } else { 1 };
+        all.extend(self.scores.iter().flat_map(|(_, s)| self.score(*s).into_iter().take(few)));
+        all.extend(self.intervals.iter().flat_map(|i| self.interval(*i).into_iter().take(few)));
+        if self.tune_all {
+            all.extend(self.rounds.iter().map(|r| self.round(*r)));
+        }
+        let mut seen = std::collections::BTreeSet::new();
+        all.retain(|c| seen.insert(c.key()));
+        all
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_cell_is_there_once_and_can_be_told_apart() {
+        let grid = Grid::full(1000);
+        let cells = grid.cells();
+        assert!(cells[0].is_source() && cells[1..].iter().all(|c| !c.is_source()));
+        for (i, a) in cells.iter().enumerate() {
+            assert!(a.settings().check().is_ok(), "{a:?}");
+            assert!(a.key().chars().all(|c| c.is_ascii_alphanumeric() || c == '-'), "{}", a.key());
+            assert!(cells[..i].iter().all(|b| b.key() != a.key() && b != a));
+        }
+        let keys: Vec<String> = cells.iter().map(Cell::key).collect();
+        let needed =
+            grid.shares.iter().flat_map(|s| grid.share(*s)).chain(grid.scores.iter().flat_map(|s| grid.score(s.1)));
+        assert!(needed.into_iter().all(|c| keys.contains(&c.key())));
+        assert_eq!(grid.scores[0].1, Score::default());
+        assert!(Grid::quick(10).cells().len() < cells.len() / 2);
+    }
+
+    #[test]
+    fn without_pruning_the_score_makes_no_cell_of_its_own() {
+        let plain = Cell { steps: 5, ..Cell::source() };
+        let other = Cell { score: Score { volume: false, ..Score::default() }, rounds: 3, ..plain.clone() };
+        assert_eq!(plain.key(), other.key());
+    }
+}

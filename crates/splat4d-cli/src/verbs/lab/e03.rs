@@ -1,0 +1,226 @@
+//! `lab e03`: how much may be removed from a trained scene, by which score, and what the temporal filter costs.
+
+use super::cells::{Cell, Grid};
+use super::study::{Found, Judged, Place, Study, fill};
+use super::tables;
+use crate::console::Console;
+use crate::draw::antialias;
+use crate::files::{self, human_seconds};
+use crate::interrupt;
+use crate::measure::{Look, SIZE, Side, Subject, What, in_turns, looks};
+use crate::run_folder::Run;
+use crate::source::{not_empty, read_scene};
+use serde_json::json;
+use splat4d::layers::Scene;
+use splat4d::{Error, ErrorKind, Result};
+use splat4d_train::capture::{Capture, ImageStore};
+use splat4d_train::compress::{Job, compress};
+use splat4d_train::eval::run::{EvalOptions, assess};
+use splat4d_train::event::Event;
+use splat4d_train::recipe::Recipe;
+use splat4d_train::train::TrainOptions;
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// Share of the source's own training steps that fine-tuning takes unless told: 4DGS-1K takes 5,000 after 30,000.
+const STEPS_SHARE: f64 = 1.0 / 6.0;
+/// The same with `--quick`.
+const QUICK_SHARE: f64 = 1.0 / 30.0;
+/// Longer side of the pictures that speed is measured on with `--quick`.
+const QUICK_SIZE: [usize; 2] = [400, 400];
+/// Prints that tell two scenes apart: FNV-1a, 64 bits.
+const FNV_OFFSET: u64 = 0xcbf2_9ce4_8422_2325;
+const FNV_PRIME: u64 = 0x0000_0100_0000_01b3;
+
+const EXAMPLES: &str = "\
+Examples:
+  splat4d lab e03 runs/knight                       all of it: about 45 cells, each a fine-tuning
+  splat4d lab e03 runs/knight --quick               a glance: fewer points, shorter fine-tuning
+  splat4d lab e03 runs/a runs/b -o studies/pruning  two scenes; every run has its own tables and pictures
+
+Every cell prunes a share of the run's Gaussians and measures what is left on the held-out views, on the CPU and in 32-bit
+floats: shares from 0 to 95 %, the temporal filter, fine-tuning, the scores of 4DGS-1K, frames between key times, rounds.
+What was found is in DIR/e03.json (after every cell: the same command goes on where it was stopped), DIR/e03.md and
+DIR/e03-*.svg. With --json every cell is a line.";
+
+/// Measure pruning and the temporal filter of 4DGS-1K on trained runs
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub(crate) struct Args {
+    /// Trained runs; their captures are opened again
+    #[arg(value_name = "RUN", required = true)]
+    runs: Vec<PathBuf>,
+    /// Folder for what is found
+    #[arg(short, long, value_name = "DIR", default_value = "runs/e03")]
+    output: PathBuf,
+    /// Fewer points, fine-tuned for a thirtieth of the run's steps
+    #[arg(long)]
+    quick: bool,
+    /// Steps of fine-tuning [default: a sixth of the run's]
+    #[arg(long, value_name = "STEPS")]
+    fine_tune: Option<usize>,
+}
+
+pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
+    // What cannot work is said before anything takes time.
+    let benches = args.runs.iter().map(|path| Bench::open(path, args)).collect::<anyhow::Result<Vec<_>>>()?;
+    check_names(&benches)?;
+    let file = args.output.join("e03.json");
+    let mut study = Study::open(&file)?;
+    files::make_folder(&args.output)?;
+    let stop = interrupt::flag("stopping: finished cells are kept");
+    for bench in &benches {
+        let grid = &bench.grid;
+        let cells = grid.cells();
+        // A retrained run must not go on from what another scene has left.
+        let work = args.output.join("work").join(format!("{}-{}", bench.name, bench.print));
+        let others: Vec<_> = study.runs.iter().filter(|f| f.run != bench.path).cloned().collect();
+        let progress = |cell: &Cell, Place { number, of, left }: Place| {
+            console.clear();
+            let left = left.map_or_else(String::new, |s| format!(", about {} left", human_seconds(s)));
+            console.note(&format!("{} {number}/{of}: {}{left}", bench.name, cell.words()));
+        };
+        let keep = |findings: &super::study::Findings, found: &Found| {
+            let whole = Study::of(others.iter().cloned().chain([findings.clone()]).collect());
+            console.emit(&json!({"type": "cell", "run": bench.path, "cell": found}));
+            whole.save(&file)
+        };
+        let mut make = |cell: &Cell| bench.judge(cell, &work, &stop, console);
+        let findings = study.on(&bench.path, &bench.name, &bench.print);
+        let all = fill(findings, &cells, &mut make, progress, keep)?;
+        console.clear();
+        if !all {
+            return Err(Error::new(ErrorKind::Interrupted, "the study is unfinished; finished cells are kept")
+                .at(args.output.display())
+                .remedy("The same command goes on with it.")
+                .into());
+        }
+        let _ = std::fs::remove_dir_all(&work);
+    }
+    let _ = std::fs::remove_dir(args.output.join("work"));
+    tell(&study, &benches, &args.output, console)
+}
+
+/// Tables and pictures of the runs that were asked for.
+fn tell(study: &Study, benches: &[Bench], folder: &Path, console: &Console) -> anyhow::Result<()> {
+    let mut page = String::from("# Pruning and the temporal filter\n");
+    for bench in benches {
+        let Some(findings) = study.runs.iter().find(|f| f.run == bench.path) else { continue };
+        page += &format!("\n{}", tables::markdown(findings, &bench.grid));
+        for (plot, svg) in tables::plots(findings, &bench.grid) {
+            let name = match benches.len() {
+                1 => format!("e03-{plot}.svg"),
+                _ => format!("e03-{plot}-{}.svg", bench.name),
+            };
+            page += &format!("\n![{plot}]({name})\n");
+            files::write(&folder.join(name), svg.as_bytes())?;
+        }
+    }
+    let file = folder.join("e03.md");
+    files::write(&file, page.as_bytes())?;
+    console.say(page.trim_end());
+    console.written(&file);
+    console.emit(&json!({"type": "done", "study": folder.join("e03.json")}));
+    Ok(())
+}
+
+/// A run, opened for all of its cells.
+struct Bench {
+    path: PathBuf,
+    name: String,
+    /// Of the scene file.
+    print: String,
+    scene: Scene<f32>,
+    capture: Arc<Capture>,
+    recipe: Recipe,
+    store: ImageStore,
+    looks: Vec<Look>,
+    grid: Grid,
+}
+
+impl Bench {
+    fn open(path: &Path, args: &Args) -> anyhow::Result<Self> {
+        let run = Run::open(path)?;
+        let file = run.scene_file()?;
+        let bytes = std::fs::read(&file).map_err(|e| files::cannot_read(&file, e))?;
+        let print = bytes.iter().fold(FNV_OFFSET, |h, b| (h ^ u64::from(*b)).wrapping_mul(FNV_PRIME));
+        drop(bytes);
+        let scene = read_scene(&file)?;
+        not_empty(&scene, path)?;
+        let (capture, recipe) = run.open_capture()?;
+        if capture.held.is_empty() {
+            return Err(Error::input("holds out no view, so that nothing can be measured")
+                .at(path.display())
+                .remedy("Train with --hold-out.")
+                .into());
+        }
+        let capture = Arc::new(capture);
+        let store = ImageStore::new(capture.clone(), usize::try_from(recipe.image_memory).unwrap_or(usize::MAX));
+        let share = if args.quick { QUICK_SHARE } else { STEPS_SHARE };
+        let own = run.iteration().unwrap_or(recipe.resolve().iterations);
+        let steps = args.fine_tune.unwrap_or(((own as f64 * share) as usize).max(1));
+        let looks = looks(&run.views()?, scene.clip, if args.quick { QUICK_SIZE } else { SIZE });
+        let grid = if args.quick { Grid::quick(steps) } else { Grid::full(steps) };
+        let folder = path.file_name().map_or_else(|| run.name(), |n| n.to_string_lossy().into_owned());
+        let print = format!("{print:016x}");
+        Ok(Self { path: path.to_owned(), name: plain(&folder), print, scene, capture, recipe, store, looks, grid })
+    }
+
+    /// Makes a cell's scene and measures it; None where it was stopped.
+    fn judge(&self, cell: &Cell, work: &Path, stop: &AtomicBool, console: &Console) -> anyhow::Result<Option<Judged>> {
+        let folder = work.join(cell.key());
+        let made = if cell.is_source() { None } else { Some(self.make(cell, &folder, stop, console)?) };
+        if stop.load(Ordering::SeqCst) {
+            return Ok(None);
+        }
+        let scene = made.as_ref().unwrap_or(&self.scene);
+        let options = EvalOptions { antialias: self.recipe.antialias, pictures: false, ..EvalOptions::default() };
+        let mut listen = |event: &Event| console.event(event);
+        let scores = assess(scene, &self.capture, &self.store, cell.steps, &options, &mut listen)?;
+        let antialias = antialias(self.recipe.antialias);
+        let subjects = [&self.scene, scene].map(|s| Subject { what: What::Scene(s), antialias });
+        let sides = in_turns(&subjects, &self.looks, &mut |done, total| console.phase("playing", done, total))?;
+        // A folder that stays costs room, not truth.
+        let _ = std::fs::remove_dir_all(&folder);
+        let [source, side] = <[Side; 2]>::try_from(sides).expect("two subjects give two sides");
+        let [speed, raster_speed] = [side.fps / source.fps, side.raster_fps / source.raster_fps];
+        Ok(Some(Judged { side: side.scored(&scores), speed, raster_speed }))
+    }
+
+    /// Compresses in floats; what a stopped cell has reached stays in its folder.
+    fn make(&self, cell: &Cell, folder: &Path, stop: &AtomicBool, console: &Console) -> anyhow::Result<Scene<f32>> {
+        files::make_folder(folder)?;
+        let settings = cell.settings();
+        let job = Job { source: &self.scene, capture: self.capture.clone(), recipe: &self.recipe, settings: &settings };
+        // The cell has been announced: that a run begins and ends is no news.
+        let mut listen = |event: &Event| {
+            if !matches!(event, Event::Started { .. } | Event::Finished { .. }) {
+                console.event(event);
+            }
+        };
+        let made = compress(&job, folder, &TrainOptions::default(), stop, &mut listen)?;
+        if made.outcome.interrupted {
+            stop.store(true, Ordering::SeqCst);
+            return Ok(Scene::default());
+        }
+        Ok(read_scene(&folder.join("scene.safetensors"))?)
+    }
+}
+
+/// A name that every file system takes.
+fn plain(name: &str) -> String {
+    name.chars().map(|c| if c.is_alphanumeric() || "-_.".contains(c) { c } else { '-' }).collect()
+}
+
+/// Refuses two runs whose results would go by one name.
+fn check_names(benches: &[Bench]) -> Result<()> {
+    let mut seen = BTreeSet::new();
+    match benches.iter().find(|b| !seen.insert(b.name.as_str())) {
+        None => Ok(()),
+        Some(twin) => Err(Error::input("has the name of another run here")
+            .at(twin.path.display())
+            .remedy("Study them one by one, each with a folder of its own (-o).")),
+    }
+}

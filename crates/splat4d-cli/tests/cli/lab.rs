@@ -1,0 +1,69 @@
+//! `lab e03` on a tiny run: every cell is measured once, and what is found can be trusted.
+
+use crate::sample::{Capture, splat4d};
+use crate::{json_of, str, train};
+use serde_json::Value;
+use std::collections::BTreeMap;
+
+#[test]
+fn a_study_of_pruning_measures_every_cell_once() {
+    let work = tempfile::tempdir().unwrap();
+    let run = work.path().join("run");
+    train(&Capture::new(work.path()).write(), &run).ok();
+    let folder = work.path().join("study");
+    let study = || splat4d(&["lab", "e03", str(&run), "-o", str(&folder), "--quick", "--fine-tune", "4"]);
+    let lines = study().args(&["--json"]).run().ok();
+    let events: Vec<Value> = lines.lines().map(|l| serde_json::from_str(l).unwrap()).collect();
+    let told = events.iter().filter(|e| e["type"] == "cell").count();
+
+    let file = folder.join("e03.json");
+    let found = json_of(&file);
+    let cells: BTreeMap<String, Value> = found["runs"][0]["cells"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|c| (c["key"].as_str().unwrap().to_owned(), c.clone()))
+        .collect();
+    assert_eq!(cells.len(), told, "every cell is a line, and none is there twice");
+    assert!(!folder.join("work").exists(), "what cells were made from is gone");
+    let psnr = |key: &str| cells[key]["side"]["psnr"].as_f64().unwrap();
+    let gaussians = |key: &str| cells[key]["side"]["gaussians"].as_u64().unwrap();
+    // The source is measured as `train` did, and what is removed is counted.
+    let own = json_of(&run.join("results.json"))["ours_20"]["PSNR"].as_f64().unwrap();
+    let source = "prune000-steps0-interval0";
+    assert!((psnr(source) - own).abs() < 1e-9, "{} and {own}", psnr(source));
+    let pruned = |share: usize, rest: &str| format!("prune{share:03}-instant-abs-product-volume-rounds1-{rest}");
+    for share in [500, 800, 950] {
+        let left = gaussians(source) as f64 * (1.0 - share as f64 / 1000.0);
+        let key = pruned(share, "steps0-interval0");
+        assert!((gaussians(&key) as f64 - left).abs() <= 1.0, "{share}: {} of {left}", gaussians(&key));
+    }
+    assert!(psnr(&pruned(950, "steps0-interval0")) < psnr(&pruned(500, "steps0-interval0")));
+    assert!(psnr("prune000-steps4-interval0") != psnr(source), "fine-tuning does something");
+    let alive = |key: &str| cells[key]["side"]["active_mean"].as_f64().unwrap();
+    assert!(alive("prune000-steps0-interval20") <= alive(source), "the filter adds nobody");
+    assert!(cells.values().all(|c| c["speed"].as_f64().is_some_and(|s| s > 0.0)));
+
+    // Tables and curves for people; a second call measures nothing.
+    for name in ["e03.md", "e03-prune.svg", "e03-prune-moving.svg", "e03-interval.svg"] {
+        assert!(folder.join(name).is_file(), "{name} is missing");
+    }
+    let before = std::fs::read(&file).unwrap();
+    let said = study().run().ok();
+    assert!(said.contains("| 95 % |") && said.contains("spatial score alone"), "{said}");
+    assert_eq!(std::fs::read(&file).unwrap(), before, "finished cells are kept");
+
+    // Half of it is lost: only that half is measured again.
+    let mut cut = found.clone();
+    cut["runs"][0]["cells"].as_array_mut().unwrap().truncate(told - 2);
+    std::fs::write(&file, cut.to_string()).unwrap();
+    let lines = study().args(&["--json"]).run().ok();
+    assert_eq!(lines.lines().filter(|l| l.contains("\"type\":\"cell\"")).count(), 2);
+
+    let twice = splat4d(&["lab", "e03", str(&run), str(&run), "-o", str(&folder)]).run().refused();
+    assert!(twice.contains("name of another run"), "{twice}");
+    std::fs::write(&file, "{}").unwrap();
+    assert!(study().run().refused().contains("e03.json"));
+    let none = splat4d(&["lab", "e03", str(&folder)]).run().refused();
+    assert!(none.contains("is not a run"), "{none}");
+}
