@@ -68,7 +68,7 @@ impl Keys {
 }
 
 /// Gives every layer of `scene` masks: at a key time, the Gaussians that any training view of that time shows (weight above
-/// 0, behind what hides them). One whose life lies between two key times and meets none is admitted at both. Masks that the
+/// 0, behind what hides them). One whose life lies between two key times and meets none is admitted at both; one that lives wholly before or after all training frames at none. Masks that the
 /// layers have count for nothing. `progress` hears of views done and in all.
 ///
 /// Errors: there is no frame.
@@ -111,8 +111,6 @@ pub fn key_masks(
             if l != r && to < keys[r] {
                 masks.set(l, row);
                 masks.set(r, row);
-            } else if l == r && (to < keys[l] || from > keys[l]) {
-                masks.set(l, row);
             }
         }
         layer.masks = Some(Arc::new(masks));

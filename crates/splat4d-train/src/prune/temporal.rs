@@ -174,11 +174,12 @@ mod tests {
     use super::*;
     use splat4d::layers::ALWAYS;
 
-    /// One life of this standard deviation (frames at 30 a second) in the middle of 300 frames, time in seconds.
+    /// One life of this standard deviation (frames at 30 a second) in the middle of 300 frames, between two of them, time
+    /// in seconds.
     fn life(frames: f64) -> (Lives, Vec<Time>) {
-        let row = [5.0, (frames / 30.0).ln(), 0.0];
+        let row = [149.5 / 30.0, (frames / 30.0).ln(), 0.0];
         let lives = Lives { kind: LifeKind::GaussHalf, rows: vec![row], span: ALWAYS, clip: 10.0, unit: 1.0 };
-        (lives, (0..=300).map(|i| Time(f64::from(i) / 30.0)).collect())
+        (lives, (0..300).map(|i| Time(f64::from(i) / 30.0)).collect())
     }
 
     const LIVES: [f64; 7] = [1.0, 3.0, 7.0, 15.0, 30.0, 67.0, 212.0];
@@ -193,9 +194,9 @@ mod tests {
         };
         let scores = LIVES.map(score);
         assert!(scores.windows(2).all(|w| w[0] < w[1]), "{scores:?}");
-        // Computed apart from this code, from the formula.
+        // Computed apart from this code, from the formula; where a short life lies between frames matters by 3 %.
         for (s, expected) in scores.iter().zip([2.5, 7.5, 18.2, 41.8, 106.0, 296.0, 545.0]) {
-            assert!((s / expected - 1.0).abs() < 0.02, "{scores:?}");
+            assert!((s / expected - 1.0).abs() < 0.04, "{scores:?}");
         }
     }
 
@@ -230,7 +231,10 @@ mod tests {
             assert!(scores.windows(2).all(|w| w[0] < w[1]), "{temporal}: {scores:?}");
         }
         let (lives, _) = life(30.0);
-        assert!((lives.instant(Temporal::FirstDerivative, 0, Time(5.0)) - 2.0).abs() < 1e-12, "flat at its peak");
+        assert!(
+            (lives.instant(Temporal::FirstDerivative, 0, Time(149.5 / 30.0)) - 2.0).abs() < 1e-12,
+            "flat at its peak"
+        );
         assert!(lives.instant(Temporal::FirstDerivative, 0, Time(6.0)) < 1.5);
         let endless = Lives { kind: LifeKind::Infinite, rows: vec![[0.0; 3]], span: ALWAYS, clip: 3.0, unit: 1.5 };
         assert_eq!((endless.instant(Temporal::InstantAbs, 0, Time(1.0)), endless.scale(0)), (2.0, 2.0));

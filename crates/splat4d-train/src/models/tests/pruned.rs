@@ -39,6 +39,7 @@ fn a_deformation_model_is_scored_pruned_masked_and_trained_on() {
     let old = scene.clone();
     densify::apply(&mut scene, &mut moments, &mut stats, 0, &edits[0], &Rng::new(0, "prune", 0));
     assert_eq!(scene.len(), 60);
+    assert!(edits[0].parent.iter().all(|&p| p >= 10), "those of a moment go first");
     assert!((0..60).all(|r| weights(&scene, r) == weights(&old, edits[0].parent[r] as usize)), "the skin goes along");
     let nodes = scene.layers[0].params.find("nodes").unwrap();
     assert_eq!(scene.layers[0].params[nodes].rows(), 3, "nodes stay");
@@ -47,7 +48,9 @@ fn a_deformation_model_is_scored_pruned_masked_and_trained_on() {
     key_masks(&mut scene, &made, &config, &mut |_, _| {}).unwrap();
     let mut active = Vec::new();
     scene.layers[0].active(Time(0.05), &mut active);
-    assert!(!active.is_empty() && active.len() < 60, "{} are drawn", active.len());
+    assert!(active.len() > 30, "{} are drawn", active.len());
+    let masks = scene.layers[0].masks.clone().expect("made above");
+    assert!((0..60).all(|r| masks.admits(0.05, r) == active.contains(&(r as u32))), "all of them live throughout");
 
     let mut stage = Stage::new("tune", 40);
     stage.groups = groups(&ORDINARY);
