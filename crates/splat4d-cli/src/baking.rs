@@ -9,10 +9,10 @@ use crate::source::Source;
 use image::codecs::jpeg::JpegEncoder;
 use serde_json::{Value, json};
 use splat4d::bake::{self, Options, Shown, bake};
-use splat4d::format::playback::{self, Draft, Meta, NamedCamera, Node, PathKey, Viewpoint, WriteConfig};
+use splat4d::format::playback::{self, Draft, Meta, NamedCamera, Pages, PathKey, Viewpoint, WriteConfig};
 use splat4d::layers::Scene;
 use splat4d::render::{Antialias, RenderConfig};
-use splat4d::scene::Camera;
+use splat4d::scene::{Camera, GEOMETRY};
 use std::path::Path;
 use std::time::Instant;
 
@@ -63,7 +63,7 @@ pub(crate) fn pack(source: &Source, title: &str, baking: &Baking, console: &Cons
     let options = Options { cameras: cameras.iter().map(|v| v.camera.clone()).collect(), ..baking.options.clone() };
     let mut baked = bake(scene, &options, &mut |done, total| console.phase("baking", done, total))?;
     let antialias = source.run.as_ref().and_then(|r| r.recipe().ok()).is_some_and(|r| r.antialias);
-    let meta = Meta { title: title.to_owned(), ..meta(scene, &baked, &stage, &cameras) };
+    let meta = Meta { title: title.to_owned(), ..meta(scene, &Outline::of_baked(&baked), &stage, &cameras) };
     let poster = baking.poster.then(|| poster(scene, &stage, antialias)).flatten();
     console.phase("writing", 0, 0);
     let draft = Draft { meta, nodes: std::mem::take(&mut baked.nodes), poster };
@@ -181,15 +181,38 @@ fn compare(
 }
 
 /// Every camera once, by name, spread over the rig where there are too many.
-fn distinct(views: &[View]) -> Vec<&View> {
+pub(crate) fn distinct(views: &[View]) -> Vec<&View> {
     let mut seen = std::collections::BTreeSet::new();
     let all: Vec<&View> = views.iter().filter(|v| seen.insert(v.name.as_str())).collect();
     let stride = all.len().div_ceil(NAMED_CAMERAS).max(1);
     all.into_iter().step_by(stride).collect()
 }
 
+/// What a file says of its Gaussians as a whole.
+pub(crate) struct Outline {
+    pub clip: [f64; 2],
+    pub sh_degree: usize,
+    /// Least and greatest corner of the means.
+    pub bounds: Option<[[f64; 3]; 2]>,
+}
+
+impl Outline {
+    fn of_baked(baked: &bake::Baked) -> Self {
+        let means = baked.nodes.iter().flat_map(|n| &n.primitives).map(|p| p.mean);
+        Self { clip: baked.clip, sh_degree: baked.sh_degree, bounds: bounds(means) }
+    }
+
+    /// Of pages that are to be written.
+    pub(crate) fn of_pages(pages: &Pages) -> Self {
+        let tables = pages.layers.iter().map(|l| &l.params[GEOMETRY]);
+        let means = tables.flat_map(|t| (0..t.rows()).map(|row| t.read::<3>(row, 0).map(f64::from)));
+        let sh_degree = pages.palette.as_ref().map_or(0, |p| p.degree);
+        Self { clip: pages.meta.clip, sh_degree, bounds: bounds(means) }
+    }
+}
+
 /// What the file says about the scene.
-fn meta(scene: &Scene<f32>, baked: &bake::Baked, stage: &Stage, views: &[&View]) -> Meta {
+pub(crate) fn meta(scene: &Scene<f32>, outline: &Outline, stage: &Stage, views: &[&View]) -> Meta {
     let look = |share: f64| {
         let camera = stage.orbit(share);
         let fov = 2.0 * (0.5 * camera.height as f64 / camera.intrinsics.fy).atan();
@@ -201,12 +224,12 @@ fn meta(scene: &Scene<f32>, baked: &bake::Baked, stage: &Stage, views: &[&View])
     };
     let fps = if scene.fps > 0.0 && scene.fps.is_finite() { scene.fps } else { splat4d::scene::time::DEFAULT_FPS };
     Meta {
-        clip: baked.clip,
+        clip: outline.clip,
         fps,
         up: scene.up,
         background: scene.background,
-        sh_degree: baked.sh_degree,
-        bounds: bounds(&baked.nodes),
+        sh_degree: outline.sh_degree,
+        bounds: outline.bounds,
         view: Some(look(0.0)),
         cameras: views.iter().map(|v| NamedCamera::new(&v.name, &v.camera)).collect(),
         // The last key is the first again, so that the orbit closes.
@@ -215,17 +238,16 @@ fn meta(scene: &Scene<f32>, baked: &bake::Baked, stage: &Stage, views: &[&View])
     }
 }
 
-/// Least and greatest corner of the means.
-fn bounds(nodes: &[Node]) -> Option<[[f64; 3]; 2]> {
-    let means = || nodes.iter().flat_map(|n| &n.primitives).map(|p| p.mean);
-    means().next()?;
-    let fold =
-        |start: f64, f: fn(f64, f64) -> f64| means().fold([start; 3], |b, m| std::array::from_fn(|k| f(b[k], m[k])));
-    Some([fold(f64::INFINITY, f64::min), fold(f64::NEG_INFINITY, f64::max)])
+/// Least and greatest corner.
+fn bounds(means: impl Iterator<Item = [f64; 3]>) -> Option<[[f64; 3]; 2]> {
+    means.fold(None, |b: Option<[[f64; 3]; 2]>, m| {
+        let [low, high] = b.unwrap_or([m, m]);
+        Some([std::array::from_fn(|k| low[k].min(m[k])), std::array::from_fn(|k| high[k].max(m[k]))])
+    })
 }
 
 /// The first view at the clip's start as a JPEG that is small enough.
-fn poster(scene: &Scene<f32>, stage: &Stage, antialias: bool) -> Option<Vec<u8>> {
+pub(crate) fn poster(scene: &Scene<f32>, stage: &Stage, antialias: bool) -> Option<Vec<u8>> {
     let mut painter = Painter::new(scene, scene.background, antialias, false);
     let camera = stage.orbit(0.0);
     POSTERS.iter().find_map(|&(side, quality)| {

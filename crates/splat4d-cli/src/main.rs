@@ -4,6 +4,7 @@
 
 mod baking;
 mod camera_file;
+mod compressing;
 mod console;
 mod device;
 mod draw;
@@ -40,6 +41,7 @@ Examples:
   splat4d eval runs/knight --baseline      measure again, next to a scene that stands still
   splat4d render runs/knight -o turn.mp4   film an orbit through space and time
   splat4d bake runs/knight -o knight.splat4d       one small, seekable file for players
+  splat4d compress runs/knight             the same many times smaller and faster, and measured
   splat4d view runs/knight                 play it in the browser
   splat4d export runs/knight -o now.ply --time 0.5
   splat4d export runs/knight --html -o knight.html
@@ -83,6 +85,7 @@ enum Verb {
     Eval(verbs::eval::Args),
     Render(verbs::render::Args),
     Bake(verbs::bake::Args),
+    Compress(verbs::compress::Args),
     Export(verbs::export::Args),
     View(verbs::view::Args),
     Convert(verbs::convert::Args),
@@ -111,6 +114,7 @@ fn main() -> ExitCode {
         Verb::Eval(args) => verbs::eval::run(&args, &console),
         Verb::Render(args) => verbs::render::run(&args, &console),
         Verb::Bake(args) => verbs::bake::run(&args, &console),
+        Verb::Compress(args) => verbs::compress::run(&args, &console),
         Verb::Export(args) => verbs::export::run(&args, &console),
         Verb::View(args) => verbs::view::run(&args, &console),
         Verb::Convert(args) => verbs::convert::run(&args, &console),

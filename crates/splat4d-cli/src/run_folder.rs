@@ -16,7 +16,7 @@ const MARKERS: [&str; 4] = ["recipe.toml", "run.json", "scene.safetensors", "che
 /// What `compress` leaves beside the file that it writes, for the report and for machines.
 pub(crate) const COMPRESS: &str = "compress.json";
 /// What splat4d writes into a run; `--force` replaces these and nothing else.
-const OURS: [&str; 17] = [
+const OURS: [&str; 19] = [
     "recipe.toml",
     "run.json",
     "scene.safetensors",
@@ -34,6 +34,8 @@ const OURS: [&str; 17] = [
     "report.html",
     "baseline",
     "renders",
+    "compress.toml",
+    "unpruned",
 ];
 
 /// One row of `metrics.csv`.
@@ -43,6 +45,10 @@ pub(crate) struct Metrics {
     pub loss: f64,
     pub psnr: f64,
     pub gaussians: f64,
+    /// The stage of training.
+    pub stage: String,
+    /// Seconds of training so far.
+    pub seconds: f64,
     /// Milliseconds of each of [`Run::stages`].
     pub stages: Vec<f64>,
 }
@@ -137,12 +143,15 @@ impl Run {
             (column("iteration"), column("loss"), column("psnr"), column("gaussians"));
         for line in lines {
             let cells: Vec<f64> = line.split(',').map(|c| c.trim().parse().unwrap_or(f64::NAN)).collect();
+            let stage = column("stage").and_then(|i| line.split(',').nth(i)).unwrap_or_default().to_owned();
             let get = |i: Option<usize>| i.and_then(|i| cells.get(i).copied()).unwrap_or(f64::NAN);
             self.metrics.push(Metrics {
                 iteration: get(iteration),
                 loss: get(loss),
                 psnr: get(psnr),
                 gaussians: get(gaussians),
+                stage,
+                seconds: get(column("seconds")),
                 stages: stages.iter().map(|s| get(Some(s.0))).collect(),
             });
         }

@@ -1,8 +1,8 @@
 // From the resident Gaussians of the pages at time t to a list of screen ellipses in the order of depth keys: the part
 // before the sort. Concatenated after resident.wgsl, project.wgsl and shade.wgsl.
 //
-//   cull            a workgroup owns a block of 256: tests the block, then each thread its Gaussian; what is visible
-//                   becomes a record at its own place and a bit of the block's mask
+//   cull            a workgroup owns a block of 256: tests the block, then each thread its Gaussian, if the page's key
+//                   masks admit it; what is visible becomes a record at its own place and a bit of the block's mask
 //   total           one workgroup: exclusive sums of the masks' bits, and the arguments of indirect dispatches and draw
 //   keys_of_depths  a workgroup owns a block again: 16-bit depth key and place of every record, without gaps
 //
@@ -52,6 +52,7 @@ struct Range {
 @group(0) @binding(9) var<storage, read_write> keys: array<u32>;
 @group(0) @binding(10) var<storage, read_write> places: array<u32>;
 @group(0) @binding(11) var<storage, read_write> firsts: array<u32>;      // records before a listed block
+@group(0) @binding(16) var<storage, read> admitted: array<u32>;          // 8 a resident block: key masks at this time
 
 const BLOCK: u32 = 256u;
 // Standard deviations to alpha = 1/255 of an opaque Gaussian, sqrt(2 ln 255), rounded up.
@@ -177,6 +178,9 @@ fn cull(
     let header = blocks[block].f;
     let span = blocks[block].span;
     if (thread >= blocks[block].count || block_hidden(header, span)) {
+        return;
+    }
+    if (((admitted[block * MASKS + thread / 32u] >> (thread % 32u)) & 1u) == 0u) {
         return;
     }
     let i = 2u * (block * BLOCK + thread);

@@ -1,5 +1,5 @@
 // From the stored bytes of a section to what a backend wants: checks the CRC, inflates, transposes byte planes into
-// words.
+// words, and key masks into rows of bits.
 //
 // A classic script that is also a module, and so without imports and exports: a page opened from a disk may start
 // classic workers from blob URLs, but no modules. What a page needs of it is in `globalThis.splat4dDecode`.
@@ -93,11 +93,34 @@ function palette(data, { count, degree }) {
   return { degree, count, ranges, bytes: data.slice(12) };
 }
 
+/// Key masks of a page: {count, keys: their times, rows: Uint32Array, `stride` words a key, bit i % 32 of word
+/// ⌊i / 32⌋ is Gaussian i}. In the file a row is the difference to the one before, bytes without padding.
+function mask(data, { count, from, to }) {
+  const view = new DataView(data.buffer, data.byteOffset, data.byteLength);
+  const packed = Math.ceil(count / 8),
+    stride = Math.ceil(count / 32),
+    number = data.length >= 8 ? view.getUint32(0, true) : 0;
+  const right = 8 + number * (8 + packed);
+  if (number < 1 || data.length !== right) throw new Error(`it is no mask of ${number} key times`);
+  const keys = Float64Array.from({ length: number }, (_, k) => view.getFloat64(8 + 8 * k, true));
+  finite(keys, 'key time');
+  if (keys.some((t, k) => k && !(keys[k - 1] < t))) throw new Error('its key times do not rise');
+  if (keys[0] !== from || keys[number - 1] !== to) throw new Error('its key times are not those of the index');
+  const bytes = new Uint8Array(4 * stride * number);
+  for (let k = 0, at = 8 + 8 * number; k < number; k++) {
+    const row = 4 * stride * k;
+    for (let i = 0; i < packed; i++, at++) bytes[row + i] = data[at] ^ (k ? bytes[row - 4 * stride + i] : 0);
+    // Bits beyond the last Gaussian mean nothing, and nobody shall count them.
+    if (count % 8) bytes[row + packed - 1] &= (1 << (count % 8)) - 1;
+  }
+  return { count, keys, rows: new Uint32Array(bytes.buffer), stride };
+}
+
 /// Decodes one section.
 ///
-/// `job`: {kind 'PAGE' | 'PALT' | other: bytes as they are, stored Uint8Array, crc, codec, bytes, count, degree,
-/// labels: entries of the page's palette, 0: none}. Its sizes have been checked against the file. Throws an Error that
-/// says why.
+/// `job`: {kind 'PAGE' | 'PALT' | 'MASK' | other: bytes as they are, stored Uint8Array, crc, codec, bytes, count,
+/// degree, labels: entries of the page's palette, 0: none, from, to}. Its sizes have been checked against the file.
+/// Throws an Error that says why.
 async function decode(job) {
   if (crc32(job.stored) !== job.crc) throw new Error('its bytes are damaged: the checksum differs');
   let data = job.stored;
@@ -111,6 +134,7 @@ async function decode(job) {
   }
   if (job.kind === 'PAGE') return page(data, job);
   if (job.kind === 'PALT') return palette(data, job);
+  if (job.kind === 'MASK') return mask(data, job);
   return { bytes: data };
 }
 
@@ -120,7 +144,8 @@ if (typeof WorkerGlobalScope !== 'undefined' && self instanceof WorkerGlobalScop
   self.onmessage = async ({ data: { ticket, job } }) => {
     try {
       const result = await decode(job);
-      const move = [result.words, result.headers, result.bytes, result.ranges].filter(Boolean).map((a) => a.buffer);
+      const arrays = Object.values(result).filter((a) => ArrayBuffer.isView(a));
+      const move = arrays.map((a) => a.buffer);
       self.postMessage({ ticket, result }, move);
     } catch (e) {
       self.postMessage({ ticket, error: e.message });

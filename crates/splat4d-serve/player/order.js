@@ -7,7 +7,7 @@ const { Sorter } = globalThis.splat4dSort;
 
 /// One order is on its way at a time; what is asked meanwhile waits for the next.
 export class Order {
-  /// Counts pages that came and went; an order carries the number it knew.
+  /// Counts pages that came and went, and masks; an order carries the number it knew.
   generation = 0;
   /// Whether an order is on its way.
   busy = false;
@@ -56,6 +56,12 @@ export class Order {
     this.#tell({ drop: id });
   }
 
+  /// Key masks of a page, whose arrays are the order's from now on.
+  mask(page, { keys, rows, stride }) {
+    this.generation++;
+    this.#tell({ page, mask: { keys, rows, stride } }, [keys.buffer, rows.buffer]);
+  }
+
   /// Asks for the order at `time` seen by `m` (camera from world, 3x4), where the last one asked for is not that one.
   /// Returns whether one is on its way.
   ask(time, m) {
@@ -93,9 +99,10 @@ export class Order {
     for (const [message] of this.#early.splice(0)) this.#answer(message);
   }
 
-  #answer({ add, drop, sort, generation, order }) {
+  #answer({ add, drop, page, mask, sort, generation, order }) {
     if (add) return this.#sorter.add(add);
     if (drop !== undefined) return this.#sorter.drop(drop);
+    if (mask) return this.#sorter.mask(page, mask);
     const begin = performance.now();
     const array = this.#sorter.room(order);
     const { count, active } = this.#sorter.sort(sort, array);

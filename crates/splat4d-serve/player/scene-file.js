@@ -1,4 +1,4 @@
-// A playback file (docs/format.md), read in parts: index, pages, palettes, poster. Trusts no number of the file.
+// A playback file (docs/format.md), read in parts: index, pages, key masks, palettes, poster. Trusts no number of it.
 
 import { worker } from './assets.js';
 import './decode.worker.js';
@@ -20,9 +20,13 @@ const MAJOR = 1;
 const MAX_INDEX = 64 << 20,
   MAX_SECTIONS = 1e6,
   MAX_COUNT = 65536,
+  MAX_KEYS = 65535,
   NO_PALETTE = 0xffffffff;
 /// Deflate shrinks at most 1 : 1032 (RFC 1951: 258 bytes from two bits).
 const DEFLATE_RATIO = 1032;
+/// Masks that unpack to more than this, and to more than this many times the file, are refused (docs/format.md).
+const SMALL_MASK = 64 << 20,
+  MASK_RATIO = 64;
 /// A poster larger than this is no preview, bytes.
 const MAX_POSTER = 32 << 20;
 /// Workers: inflating a page takes some ms, and the network is slower than two.
@@ -126,7 +130,8 @@ export class SceneFile {
   /// The JSON of the index, checked: every key of docs/format.md, those that are not there null or empty.
   meta;
   /// All sections: {id, kind, flags, offset, stored, bytes, crc, codec, tier, degree, count, words, from, to,
-  /// palette: id or -1, missing: behind the end of a file that was cut short}.
+  /// palette: id or -1, missing: behind the end of a file that was cut short; of a page: mask: id or -1, maskBytes: of
+  /// that mask when it is decoded}.
   sections = [];
   /// The sections of kind PAGE that are there.
   pages = [];
@@ -157,6 +162,12 @@ export class SceneFile {
     return { id, ...(await this.#decoded(this.sections[id], signal, 0)) };
   }
 
+  /// The same for the key masks of a page, `id` its `mask`: {id, count, keys: Float64Array, rows: Uint32Array,
+  /// stride: words a key}.
+  async mask(id, { signal } = {}) {
+    return { id, ...(await this.#decoded(this.sections[id], signal, 0)) };
+  }
+
   /// The poster as a Blob, or null.
   async poster({ signal } = {}) {
     const entry = this.sections.find((s) => s.kind === 'POST' && !s.missing);
@@ -183,14 +194,14 @@ export class SceneFile {
   }
 
   async #decoded(entry, signal, labels) {
-    const { kind, offset, stored, crc, codec, bytes, count, degree, id, missing } = entry;
+    const { kind, offset, stored, crc, codec, bytes, count, degree, id, missing, from, to } = entry;
     const where = `${this.#where}, section ${id}`;
     if (missing) throw new SceneError('The file was cut short before this part', where, DAMAGED);
     const data = await this.#bytes(offset, stored, signal);
     signal?.throwIfAborted();
     try {
       if (data.length !== stored) throw new Error('the file ends before it');
-      return await this.#decoder.run({ kind, stored: data, crc, codec, bytes, count, degree, labels });
+      return await this.#decoder.run({ kind, stored: data, crc, codec, bytes, count, degree, labels, from, to });
     } catch (e) {
       if (isAbort(e)) throw e;
       throw new SceneError(`A part of the scene cannot be read: ${e.message}`, where, DAMAGED, e);
@@ -268,6 +279,19 @@ export class SceneFile {
       if (palette?.missing) page.missing = true;
       if (!page.missing) this.pages.push(page);
     }
+    for (const mask of this.sections) {
+      if (mask.kind !== 'MASK') continue;
+      const page = this.sections[mask.page];
+      if (page?.kind !== 'PAGE') this.#refuse(`Mask ${mask.id} names no page`);
+      if (page.count !== mask.count) {
+        this.#refuse(`Mask ${mask.id} is of ${mask.count} Gaussians, its page ${page.id} of ${page.count}`);
+      }
+      if (page.mask !== -1) this.#refuse(`Page ${page.id} has two masks`);
+      // A file that was cut short behind a page shows the page without its mask.
+      if (mask.missing) continue;
+      page.mask = mask.id;
+      page.maskBytes = mask.keys * 4 * Math.ceil(mask.count / 32);
+    }
     // What the pages state is what will be drawn, whatever the description says.
     this.meta.gaussians = this.pages.reduce((n, p) => n + p.count, 0);
   }
@@ -283,7 +307,7 @@ export class SceneFile {
     section.missing = offset + stored > this.bytesTotal;
     const refuse = (what, remedy) => this.#refuse(`Section ${id} (${kind.replace(/[^ -~]/g, '?')}) ${what}`, remedy);
     if (!(offset >= begin && offset + stored <= length)) refuse('lies outside the file');
-    if (!['PAGE', 'PALT', 'POST'].includes(kind)) {
+    if (!['PAGE', 'PALT', 'POST', 'MASK'].includes(kind)) {
       if (section.flags & 1) refuse('is of a kind that this player does not know', 'Use a newer player.');
       return section;
     }
@@ -291,6 +315,11 @@ export class SceneFile {
     if (codec === 0 ? stored !== bytes : bytes > DEFLATE_RATIO * stored) refuse('cannot hold what it states');
     if (kind === 'POST') return section;
     if (count < 1 || count > MAX_COUNT) refuse(`states ${count} entries, not 1 to ${MAX_COUNT}`);
+    if (kind === 'MASK') {
+      this.#checkMask(section, u32(56), refuse);
+      return section;
+    }
+    if (kind === 'PAGE') Object.assign(section, { mask: -1, maskBytes: 0 });
     if (kind === 'PAGE' && section.words !== WORDS) {
       refuse(`has ${section.words} words a Gaussian, not ${WORDS}`, 'Use a newer player.');
     }
@@ -306,6 +335,19 @@ export class SceneFile {
       refuse('has no valid span of time');
     }
     return section;
+  }
+
+  /// Key masks: a row of bits each of as many key times as its size bears out.
+  #checkMask(section, page, refuse) {
+    const { count, bytes, stored, from, to } = section;
+    const keys = (bytes - 8) / (8 + Math.ceil(count / 8));
+    Object.assign(section, { page, palette: -1, keys });
+    if (!(Number.isInteger(keys) && keys >= 1 && keys <= MAX_KEYS)) {
+      refuse(`decodes to ${bytes} bytes, which no number of key times of ${count} Gaussians need`);
+    }
+    if (stored > 2 * bytes) refuse('is longer packed than unpacked');
+    if (bytes > SMALL_MASK && bytes > MASK_RATIO * this.bytesTotal) refuse(`unpacks to ${bytes} bytes`);
+    if (!(from <= to && Number.isFinite(to - from))) refuse('has no valid span of time');
   }
 
   #checkedMeta(json) {

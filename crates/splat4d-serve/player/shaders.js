@@ -468,6 +468,7 @@ far: atomic<u32>,
 @group(0) @binding(9) var<storage, read_write> keys: array<u32>;
 @group(0) @binding(10) var<storage, read_write> places: array<u32>;
 @group(0) @binding(11) var<storage, read_write> firsts: array<u32>;
+@group(0) @binding(16) var<storage, read> admitted: array<u32>;
 const BLOCK: u32 = 256u;
 const SIGMAS: f32 = 3.34;
 const LIFE_REACHES: f32 = 1.12;
@@ -567,6 +568,9 @@ let block = block_list[slot];
 let header = blocks[block].f;
 let span = blocks[block].span;
 if (thread >= blocks[block].count || block_hidden(header, span)) {
+return;
+}
+if (((admitted[block * MASKS + thread / 32u] >> (thread % 32u)) & 1u) == 0u) {
 return;
 }
 let i = 2u * (block * BLOCK + thread);

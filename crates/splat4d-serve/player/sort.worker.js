@@ -48,6 +48,67 @@ function path(words, headers, i, span, out) {
   out[10] = reach;
 }
 
+/// The numbers of the key times around `t`, of rising `keys`: [last ≤ t, first ≥ t]; outside of all, the nearest twice.
+function keysAround(keys, t) {
+  let low = 0,
+    high = keys.length;
+  while (low < high) {
+    const mid = (low + high) >> 1;
+    if (keys[mid] < t) low = mid + 1;
+    else high = mid;
+  }
+  if (low === keys.length) return [low - 1, low - 1];
+  return [keys[low] === t ? low : Math.max(low - 1, 0), low];
+}
+
+/// Key masks of a page at a time: a Gaussian is drawn if its bit is set at one of the two key times around it
+/// (docs/format.md). `at` is cheap as long as time stays between the same two.
+class KeyMask {
+  /// Bit i % 32 of word ⌊i / 32⌋: whether Gaussian i is drawn at the time of the last `at`; and how many are.
+  bits;
+  count = 0;
+  #mask;
+  #around = [-1, -1];
+
+  /// `mask`: of SceneFile.mask, whose arrays are kept.
+  constructor(mask) {
+    this.#mask = mask;
+    this.bits = new Uint32Array(mask.stride);
+  }
+
+  /// The numbers of the key times around `t`.
+  around(t) {
+    return keysAround(this.#mask.keys, t);
+  }
+
+  /// Second of key time `k`.
+  key(k) {
+    return this.#mask.keys[k];
+  }
+
+  /// Takes up the bits of time `t`; says whether they are others now.
+  at(t) {
+    const { rows, stride } = this.#mask,
+      [l, r] = this.around(t);
+    if (l === this.#around[0] && r === this.#around[1]) return false;
+    this.#around = [l, r];
+    this.count = 0;
+    for (let w = 0; w < stride; w++) {
+      const word = rows[l * stride + w] | rows[r * stride + w];
+      this.bits[w] = word;
+      this.count += ones(word);
+    }
+    return true;
+  }
+}
+
+/// Bits that are set in a word: sums of 2, 4, 8 bits side by side, then all four bytes at once.
+function ones(word) {
+  word -= (word >>> 1) & 0x55555555;
+  word = (word & 0x33333333) + ((word >>> 2) & 0x33333333);
+  return Math.imul((word + (word >>> 4)) & 0x0f0f0f0f, 0x01010101) >>> 24;
+}
+
 /// Holds what sorting needs of each resident page.
 class Sorter {
   #pages = [];
@@ -80,13 +141,19 @@ class Sorter {
       blocks[2 * b] = Math.min(blocks[2 * b], track[o + 6]);
       blocks[2 * b + 1] = Math.max(blocks[2 * b + 1], track[o + 7]);
     }
-    this.#pages.push({ id, row, count, from, to, track, blocks });
+    this.#pages.push({ id, row, count, from, to, track, blocks, mask: null });
     // The order of equal depths is that of numbers, whenever a page arrived.
     this.#pages.sort((a, b) => a.id - b.id);
   }
 
   drop(id) {
     this.#pages = this.#pages.filter((p) => p.id !== id);
+  }
+
+  /// Gives page `id` its key masks.
+  mask(id, mask) {
+    const page = this.#pages.find((p) => p.id === id);
+    if (page) page.mask = new KeyMask(mask);
   }
 
   /// `order` where it has room for everybody, else a new one: whole rows of ROW numbers.
@@ -101,7 +168,8 @@ class Sorter {
   }
 
   /// Writes the visible Gaussians (row·1024 + column) at `time` into `out`, the farthest first, by the camera's depth
-  /// z = a·x + b·y + c·z + d for `depth` [a, b, c, d]. Returns {count, active: Gaussians of this moment's pages}.
+  /// z = a·x + b·y + c·z + d for `depth` [a, b, c, d]. Returns {count, active: Gaussians of this moment's
+  /// pages that their key masks admit}.
   sort({ time, depth: [a, b, c, d], near }, out) {
     const total = this.total;
     if (this.#depths.length < total) {
@@ -119,15 +187,18 @@ class Sorter {
       active = 0,
       low = Infinity,
       high = 0;
-    for (const { row, count, from, to, track, blocks } of this.#pages) {
+    for (const { row, count, from, to, track, blocks, mask } of this.#pages) {
       if (!(from <= time && time < to)) continue;
-      active += count;
+      mask?.at(time);
+      active += mask?.count ?? count;
+      const admitted = mask?.bits ?? null;
       const t = time - from;
       for (let block = 0, first = 0; first < count; block++, first += BLOCK) {
         if (!(t >= blocks[2 * block] && t <= blocks[2 * block + 1])) continue;
         const end = Math.min(first + BLOCK, count);
         for (let i = first, o = TRACK * first; i < end; i++, o += TRACK) {
           if (t < track[o + 6] || t > track[o + 7]) continue;
+          if (admitted !== null && !((admitted[i >> 5] >>> (i & 31)) & 1)) continue;
           const z =
             a * (track[o] + track[o + 3] * t) +
             b * (track[o + 1] + track[o + 4] * t) +
@@ -166,13 +237,14 @@ class Sorter {
   }
 }
 
-globalThis.splat4dSort = { ALPHA_MIN, ROW, Sorter, lerp, path, signed10 };
+globalThis.splat4dSort = { ALPHA_MIN, KeyMask, ROW, Sorter, lerp, path, signed10 };
 
 if (typeof WorkerGlobalScope !== 'undefined' && self instanceof WorkerGlobalScope) {
   const sorter = new Sorter();
   self.onmessage = ({ data }) => {
     if (data.add) return sorter.add(data.add);
     if (data.drop !== undefined) return sorter.drop(data.drop);
+    if (data.mask) return sorter.mask(data.page, data.mask);
     const begin = performance.now();
     const order = sorter.room(data.order);
     const { count, active } = sorter.sort(data.sort, order);

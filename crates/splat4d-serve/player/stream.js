@@ -9,6 +9,8 @@ const BUDGET = 512 << 20,
   SMALL_MEMORY = 4;
 /// Bytes a Gaussian (docs/format.md: 8 words).
 const GAUSSIAN = 32;
+/// Bytes that a page and its key masks take.
+const cost = (page) => page.count * GAUSSIAN + (page.maskBytes ?? 0);
 /// Looked ahead while playing, s of the viewer's time; to both sides while not, s of the scene's.
 const AHEAD = 2,
   BESIDE = 0.5;
@@ -33,6 +35,8 @@ export class Stream {
   #onchange;
   #onerror;
   #resident = new Set();
+  /// Those of them whose key masks are in the backend.
+  #masked = new Set();
   /// id → AbortController of what is on its way.
   #flight = new Map();
   #bytes = 0;
@@ -66,7 +70,7 @@ export class Stream {
     this.#ends = Float64Array.from(file.pages, (p) => p.to).sort();
   }
 
-  /// Bytes of words that are resident.
+  /// Bytes of words and masks that are resident.
   get bytes() {
     return this.#bytes;
   }
@@ -153,7 +157,7 @@ export class Stream {
     now.sort((a, b) => a.tier - b.tier || a.id - b.id);
     later.sort((a, b) => a.wait - b.wait || a.tier - b.tier || a.id - b.id);
     let room = this.#budget;
-    const fits = (page) => (page.count * GAUSSIAN <= room ? ((room -= page.count * GAUSSIAN), true) : false);
+    const fits = (page) => (cost(page) <= room ? ((room -= cost(page)), true) : false);
     this.#now = now.filter(fits);
     // What is later may not push out more of itself than the budget has left.
     this.#later = later.filter(fits);
@@ -166,7 +170,7 @@ export class Stream {
   #shrink(wanted) {
     let missing = 0;
     for (const page of [...this.#now, ...this.#later]) {
-      if (!this.#resident.has(page.id)) missing += page.count * GAUSSIAN;
+      if (!this.#resident.has(page.id)) missing += cost(page);
     }
     if (this.#bytes + missing <= this.#budget) return;
     const { time, playing, speed } = this.#last;
@@ -181,14 +185,16 @@ export class Stream {
     for (const page of spare) {
       if (this.#bytes + missing <= this.#budget) break;
       this.#resident.delete(page.id);
-      this.#bytes -= page.count * GAUSSIAN;
+      this.#masked.delete(page.id);
+      this.#bytes -= cost(page);
       this.#backend.dropPage(page.id);
       this.#onchange();
     }
   }
 
   #wants(page) {
-    if (this.#resident.has(page.id) || this.#flight.has(page.id)) return false;
+    if (this.#flight.has(page.id)) return false;
+    if (this.#resident.has(page.id) && (!(page.mask >= 0) || this.#masked.has(page.id))) return false;
     const failed = this.#failed.get(page.id);
     return !failed || failed.tries < TRIES || performance.now() - failed.at >= REST;
   }
@@ -210,22 +216,40 @@ export class Stream {
     this.#wake();
   }
 
+  /// The page, unless it is there, and its mask, which is asked for at the same time: both lie together in the file.
+  /// Until the mask is there, the page is drawn without it.
   async #load(entry) {
-    const stop = new AbortController();
+    const stop = new AbortController(),
+      { signal } = stop;
     this.#flight.set(entry.id, stop);
     try {
-      const [page] = await Promise.all([
-        this.#file.page(entry.id, { signal: stop.signal }),
-        entry.palette < 0 ? null : this.#palette(entry.palette),
-      ]);
-      if (stop.signal.aborted) return;
-      this.#backend.addPage(page, entry);
-      this.#resident.add(entry.id);
-      this.#bytes += entry.count * GAUSSIAN;
+      const parts = this.#resident.has(entry.id)
+        ? null
+        : [
+            this.#file.page(entry.id, { signal }),
+            entry.palette < 0 ? null : this.#palette(entry.palette),
+          ];
+      const coming = entry.mask >= 0 ? this.#file.mask(entry.mask, { signal }) : null;
+      // Waited for below; a page that fails first must not leave it unheard.
+      coming?.catch(() => {});
+      if (parts) {
+        const [page] = await Promise.all(parts);
+        if (signal.aborted) return;
+        this.#backend.addPage(page, entry);
+        this.#resident.add(entry.id);
+        this.#bytes += cost(entry);
+        if (coming) this.#onchange();
+      }
+      if (coming) {
+        const mask = await coming;
+        if (signal.aborted) return;
+        this.#backend.addMask(entry.id, mask);
+        this.#masked.add(entry.id);
+      }
       this.#failed.delete(entry.id);
       this.#onchange();
     } catch (error) {
-      if (stop.signal.aborted || this.#over || isAbort(error)) return;
+      if (signal.aborted || this.#over || isAbort(error)) return;
       const failed = this.#failed.get(entry.id);
       const tries = (failed && performance.now() - failed.at < REST ? failed.tries : 0) + 1;
       this.#failed.set(entry.id, { tries, at: performance.now() });

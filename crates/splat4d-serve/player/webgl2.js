@@ -218,6 +218,13 @@ export class WebGL2Backend {
     this.#refresh();
   }
 
+  /// `mask`: of SceneFile.mask, the key masks of a resident page; its arrays are the backend's from now on.
+  addMask(id, mask) {
+    if (!this.#pages.has(id)) return;
+    this.#order.mask(id, mask);
+    this.#refresh();
+  }
+
   dropPage(id) {
     const page = this.#pages.get(id);
     if (!page) return;

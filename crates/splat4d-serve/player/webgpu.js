@@ -1,9 +1,12 @@
 // Draws a moving scene with WebGPU: pages stay on the GPU as the file's own words, and everything that depends on the
 // time or the view happens there (cull.wgsl, sort.wgsl, draw.wgsl). The CPU writes 160 bytes a frame, and the list of
-// blocks where the set of pages at this time changes.
+// blocks, with the bits of their key masks, where the set of pages or the key times around this time change.
 
 import { SceneError } from './errors.js';
 import { CULL, DRAW, PROJECT, RESIDENT, SHADE, SORT } from './shaders.js';
+import './sort.worker.js';
+
+const { KeyMask } = globalThis.splat4dSort;
 
 /// Gaussians of a block, and words of a Gaussian (docs/format.md).
 const BLOCK = 256;
@@ -14,8 +17,9 @@ const HEADER_BYTES = 128;
 /// Header numbers that are times on the scene clock: the GPU counts from the clip's start, where 32 bits are finest.
 const TIMES = [6, 7, 8, 9];
 const RECORD_BYTES = BLOCK * 32;
-/// Bytes of a listed block's mask of visible Gaussians.
+/// Bytes of a bit for each Gaussian of a block: a listed block's visible ones, and those that key masks admit.
 const MASK_BYTES = BLOCK / 8;
+const MASK_WORDS = MASK_BYTES / 4;
 /// Pairs that a workgroup of sort.wgsl takes, digits of a pass, and 8-bit passes for 16-bit keys.
 const SORT_BLOCK = 2048;
 const DIGITS = 256;
@@ -97,8 +101,8 @@ export class WebGPUBackend {
   #palettes = new Map();
   #pages = new Map();
   #meta = { clip: [0, 0], sh_degree: 0 };
-  // The blocks in the list hold for times in [from, to).
-  #list = { from: Infinity, to: -Infinity, blocks: 0 };
+  // The blocks in the list hold for the time `at`, and for times in [from, to) that are after `after`, a key time.
+  #list = { at: NaN, after: -Infinity, from: Infinity, to: -Infinity, blocks: 0 };
   #frame = new Float32Array(FRAME_WORDS);
   #frameBits = new Uint32Array(this.#frame.buffer);
   #last = new Uint32Array(FRAME_WORDS);
@@ -234,7 +238,8 @@ export class WebGPUBackend {
     let at = this.#runs.take(blocks);
     if (at < 0 && this.#roomForBlocks(this.#runs.size + blocks)) at = this.#runs.take(blocks);
     if (at < 0) return false;
-    const page = { id, count, blocks, at, from: entry.from, to: entry.to, tier: entry.tier, palette: entry.palette };
+    const { from, to, tier, palette } = entry;
+    const page = { id, count, blocks, at, from, to, tier, palette, mask: null };
     page.headers = new Float32Array(blocks * HEADER_BYTES / 4);
     for (let k = 0; k < blocks; k++) {
       page.headers.set(headers.subarray(24 * k, 24 * k + 24), 32 * k);
@@ -242,10 +247,21 @@ export class WebGPUBackend {
     }
     this.#writeHeaders(page);
     this.#queue.writeBuffer(this.#b.words, at * BLOCK_BYTES, words, 0, count * WORDS);
+    // All are admitted until a mask says otherwise; the place may have had one.
+    const all = new Uint32Array(blocks * MASK_WORDS).fill(0xffffffff);
+    this.#queue.writeBuffer(this.#b.admitted, at * MASK_BYTES, all);
     this.#pages.set(id, page);
     this.stats.resident += count;
     this.#changed();
     return true;
+  }
+
+  /// Key masks of a resident page: of SceneFile.mask, whose arrays are the backend's from now on.
+  addMask(id, mask) {
+    const page = this.#pages.get(id);
+    if (!page || this.#gone) return;
+    page.mask = new KeyMask(mask);
+    this.#changed();
   }
 
   /// Frees a page's place; nothing happens where it is not resident.
@@ -377,7 +393,7 @@ export class WebGPUBackend {
 
   /// The pages or their places are not what they were: the list and the picture are out of date.
   #changed() {
-    this.#list.from = Infinity;
+    this.#list = { ...this.#list, at: NaN, from: Infinity };
     this.#culled.valid = false;
   }
 
@@ -423,6 +439,7 @@ export class WebGPUBackend {
     const size = Math.min(Math.max(least, 2 * now), most);
     this.#b.words = this.#grown(this.#b.words, size * BLOCK_BYTES);
     this.#b.blocks = this.#grown(this.#b.blocks, size * HEADER_BYTES);
+    this.#b.admitted = this.#grown(this.#b.admitted, size * MASK_BYTES);
     this.#runs.grow(size);
     return true;
   }
@@ -475,15 +492,24 @@ export class WebGPUBackend {
 
   /// Makes the list of blocks of the resident pages at time t, where the one there is does not hold.
   #select(t) {
-    if (t >= this.#list.from && t < this.#list.to) return;
-    let from = -Infinity, to = Infinity;
+    const old = this.#list;
+    if (t === old.at || (t > old.after && t >= old.from && t < old.to)) return;
+    let from = -Infinity, to = Infinity, after = -Infinity;
     const active = [];
     for (const page of this.#pages.values()) {
       for (const edge of [page.from, page.to]) {
         if (edge <= t) from = Math.max(from, edge);
         else to = Math.min(to, edge);
       }
-      if (page.from <= t && t < page.to) active.push(page);
+      if (!(page.from <= t && t < page.to)) continue;
+      active.push(page);
+      if (!page.mask) continue;
+      const [l, r] = page.mask.around(t).map((k) => page.mask.key(k));
+      // On a key time its own bits count; between two, those of both.
+      if (l === t || r === t) after = Infinity;
+      else if (l < t) after = Math.max(after, l);
+      if (r > t) to = Math.min(to, r);
+      if (page.mask.at(t)) this.#queue.writeBuffer(this.#b.admitted, page.at * MASK_BYTES, page.mask.bits);
     }
     // Beyond what the device can list, the important tiers come first; the order of ids decides ties of depth.
     const most = Math.floor(this.#maxBytes / RECORD_BYTES);
@@ -494,12 +520,16 @@ export class WebGPUBackend {
     const list = new Uint32Array(blocks);
     let n = 0, gaussians = 0;
     for (const page of listed) {
-      for (let k = 0; k < page.blocks; k++) list[n++] = page.at + k;
-      gaussians += page.count;
+      const bits = page.mask?.bits;
+      for (let k = 0; k < page.blocks; k++) {
+        // A block of which nobody is admitted needs no look.
+        if (!bits || bits.subarray(MASK_WORDS * k, MASK_WORDS * (k + 1)).some((word) => word)) list[n++] = page.at + k;
+      }
+      gaussians += page.mask?.count ?? page.count;
     }
-    this.#roomForList(blocks);
-    if (blocks) this.#queue.writeBuffer(this.#b.list, 0, list);
-    this.#list = { from, to, blocks };
+    this.#roomForList(n);
+    if (n) this.#queue.writeBuffer(this.#b.list, 0, list, 0, n);
+    this.#list = { at: t, after, from, to, blocks: n };
     this.stats.active = gaussians;
     this.#culled.valid = false;
   }
@@ -648,6 +678,7 @@ export class WebGPUBackend {
     this.#groups = {
       cull: this.#group(p.cull, {
         0: b.frame, 1: b.words, 2: b.blocks, 3: b.list, 4: b.palette, 5: b.records, 6: b.masks, 7: b.range,
+        16: b.admitted,
       }),
       total: this.#group(p.total, { 0: b.frame, 6: b.masks, 8: b.arguments, 11: b.firsts }),
       keys: this.#group(p.keys, {

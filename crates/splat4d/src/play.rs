@@ -6,13 +6,15 @@
 #[cfg(test)]
 mod tests;
 
-use crate::format::playback::{Entry, Index, Kind, Meta, Palette, decode_page, decode_palette};
+use crate::format::playback::{Entry, Index, Kind, Meta, Palette, decode_masks, decode_page, decode_palette};
 use crate::layers::{ALWAYS, Layer, LayerTape, Scene};
 use crate::motion::Cache;
-use crate::scene::{Rows, Space, Splats, Time};
+use crate::scene::masks::WORD;
+use crate::scene::{KeyMasks, Rows, Space, Splats, Time};
 use crate::{Error, Result};
 use rayon::prelude::*;
 use std::borrow::Cow;
+use std::sync::Arc;
 
 /// Rows that share one test of whether any of them is alive: the blocks of the playback file.
 const BLOCK: usize = crate::format::playback::BLOCK_GAUSSIANS;
@@ -65,9 +67,12 @@ impl Alive {
         Self { all: false, spans, blocks }
     }
 
-    /// The rows alive at t, strictly increasing.
-    fn rows(&self, t: f64, ids: &mut Vec<u32>) {
+    /// The rows alive at t whom the masks admit, strictly increasing.
+    fn rows(&self, t: f64, masks: Option<&KeyMasks>, ids: &mut Vec<u32>) {
         ids.clear();
+        if let Some(masks) = masks {
+            return self.masked(t, masks, ids);
+        }
         for (b, _) in self.blocks.iter().enumerate().filter(|(_, [from, to])| *from <= t && t <= *to) {
             let first = b * BLOCK;
             let rows = &self.spans[first..self.spans.len().min(first + BLOCK)];
@@ -75,7 +80,30 @@ impl Alive {
             ids.extend(alive.map(|(i, _)| (first + i) as u32));
         }
     }
+
+    /// The same with masks: only rows whose bit is set are looked at, so that masks make the lookup faster.
+    fn masked(&self, t: f64, masks: &KeyMasks, ids: &mut Vec<u32>) {
+        let [left, right] = masks.words_at(t);
+        for (b, _) in self.blocks.iter().enumerate().filter(|(_, [from, to])| *from <= t && t <= *to) {
+            let words = b * BLOCK_WORDS..left.len().min((b + 1) * BLOCK_WORDS);
+            for w in words {
+                let mut bits = left[w] | right[w];
+                while bits != 0 {
+                    let row = w * WORD + bits.trailing_zeros() as usize;
+                    bits &= bits - 1;
+                    let [from, to] = self.spans[row];
+                    if from <= t && t <= to {
+                        ids.push(row as u32);
+                    }
+                }
+            }
+        }
+    }
 }
+
+/// Words of masks that a block of rows has.
+const BLOCK_WORDS: usize = BLOCK / WORD;
+const _: () = assert!(BLOCK.is_multiple_of(WORD));
 
 /// A layer in memory.
 #[derive(Debug)]
@@ -94,7 +122,8 @@ impl<'a> Held<'a> {
     fn new(section: usize, layer: Cow<'a, Layer>) -> Self {
         let alive = Alive::of(&layer);
         let numbers: usize = layer.params.keys().map(|k| layer.params[k].data().len()).sum();
-        let bytes = 4 * numbers + 16 * alive.spans.len();
+        let words = layer.masks.as_ref().map_or(0, |m| m.words().len() + 2 * m.times().len());
+        let bytes = 4 * (numbers + words) + 16 * alive.spans.len();
         Self { section, layer, alive, tape: LayerTape::default(), ids: Vec::new(), cache: Cache::default(), bytes }
     }
 
@@ -103,7 +132,7 @@ impl<'a> Held<'a> {
         if self.alive.all {
             return self.layer.params.len();
         }
-        self.alive.rows(t.0, &mut self.ids);
+        self.alive.rows(t.0, self.layer.masks.as_deref(), &mut self.ids);
         self.ids.len()
     }
 }
@@ -112,6 +141,8 @@ impl<'a> Held<'a> {
 struct File {
     source: Box<dyn ReadAt + Send>,
     index: Index,
+    /// Pages that have masks, and the sections of these, by page.
+    masks: Vec<(u32, usize)>,
     /// By section, read when a page first asks.
     palettes: Vec<(u32, Palette)>,
 }
@@ -171,7 +202,7 @@ impl<'a> Player<'a> {
         }
         let index = Index::parse(&prefix, Some(length))?;
         let meta = index.meta.clone();
-        let file = File { source, index, palettes: Vec::new() };
+        let file = File { source, masks: index.masks(), index, palettes: Vec::new() };
         let bytes_read = prefix.len() as u64;
         Ok(Self { file: Some(file), meta, held: Vec::new(), budget, shown: Vec::new(), bytes_read })
     }
@@ -225,7 +256,8 @@ impl<'a> Player<'a> {
             let stored = file.stored(&entry, &mut self.bytes_read)?;
             let palette = file.palette(entry.palette, &mut self.bytes_read)?;
             let page = decode_page(&entry, &stored).map_err(|e| e.at(format!("section {section}")))?;
-            let layer = page.layer(palette).map_err(|e| e.at(format!("section {section}")))?;
+            let mut layer = page.layer(palette).map_err(|e| e.at(format!("section {section}")))?;
+            layer.masks = file.masks(section, &mut self.bytes_read)?;
             self.held.insert(place, Held::new(section, Cow::Owned(layer)));
         }
         let distance = |h: &Held<'_>| (h.layer.span[0] - t.0).max(t.0 - h.layer.span[1]).max(0.0);
@@ -244,6 +276,15 @@ impl File {
         self.source.read_at(entry.offset, &mut bytes)?;
         *count += u64::from(entry.stored);
         Ok(bytes)
+    }
+
+    fn masks(&mut self, page: usize, count: &mut u64) -> Result<Option<Arc<KeyMasks>>> {
+        let Ok(at) = self.masks.binary_search_by_key(&(page as u32), |(page, _)| *page) else { return Ok(None) };
+        let section = self.masks[at].1;
+        let entry = self.index.sections[section].clone();
+        let bytes = self.stored(&entry, count)?;
+        let masks = decode_masks(&entry, &bytes).map_err(|e| e.at(format!("section {section}")))?;
+        Ok(Some(Arc::new(masks)))
     }
 
     fn palette(&mut self, section: Option<u32>, count: &mut u64) -> Result<Option<&Palette>> {

@@ -73,7 +73,7 @@ pub(crate) struct Tried {
 
 impl Compressed {
     /// What the quality and the speed of `after` are compared with.
-    fn fair(&self) -> &Side {
+    pub(crate) fn fair(&self) -> &Side {
         self.unpruned.as_ref().unwrap_or(&self.before)
     }
 

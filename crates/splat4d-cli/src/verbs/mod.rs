@@ -3,6 +3,7 @@
 pub(crate) mod bake;
 pub(crate) mod bench;
 pub(crate) mod completions;
+pub(crate) mod compress;
 pub(crate) mod convert;
 pub(crate) mod eval;
 pub(crate) mod export;

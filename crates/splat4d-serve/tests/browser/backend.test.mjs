@@ -131,12 +131,73 @@ for (const backend of ['webgl2', 'webgpu']) {
     });
   });
 
+  test(`${backend} draws whom key masks admit, and nobody else`, { skip }, () => {
+    const made = sample({ masks: 0.5 }),
+      bare = sample({ masks: 0.5, patch: (sections) => sections.filter((s) => s.kind !== 'MASK') });
+    return shown(backend, made, async (page) => {
+      // Between two key times and on one, forwards and backwards, before and behind a single one.
+      for (const time of [2, 2.2, 2.5, 2.3, 3, 5.6, 6, 3.74, 3.5]) {
+        const look = { time, view: view(0.2, -0.1, 0.3, 0.1) };
+        const db = await compare(page, made, look);
+        console.log(`${backend} with masks at ${time}: ${db.toFixed(1)} dB`);
+        assert.ok(db >= REACHED, `at ${time}: ${db} dB`);
+        const all = render(bare.truth.map((g) => ({ ...g, admitted: null })), time, look.view, look);
+        const some = render(made.truth, time, look.view, look);
+        assert.ok(psnr(all, some) < BOUND, `at ${time} the masks are to be seen: ${psnr(all, some)} dB`);
+      }
+      const { active, drawn } = await page.evaluate(() => ({ ...globalThis.shown.backend.stats }));
+      assert.equal(active, made.truth.filter((g) => g.span[0] <= 3.5 && 3.5 < g.span[1] && g.admitted(3.5)).length);
+      assert.ok(drawn > 0 && drawn <= active, `${drawn} of ${active}`);
+    });
+  });
+
+  test(`${backend} draws a page without its mask until that is there`, { skip }, () => {
+    const made = sample({ masks: 0.5 }),
+      unmasked = { truth: made.truth.map((g) => ({ ...g, admitted: null })) };
+    return shown(backend, made, async (page) => {
+      const look = { time: 3.2, view: view(0, 0, 0, 0) };
+      await page.evaluate(() => {
+        const { file, restart } = globalThis.shown,
+          mask = file.mask.bind(file);
+        const held = new Promise((go) => (globalThis.arrive = go));
+        file.mask = (...args) => held.then(() => mask(...args));
+        restart({});
+      });
+      await page.evaluate(async (time) => {
+        const { stream } = globalThis.shown;
+        stream.update(time);
+        while (stream.ready(time) < 1) await new Promise((done) => setTimeout(done, 10));
+        // The pages are there; what settles is only the masks.
+        stream.settled = () => {};
+      }, look.time);
+      assert.ok((await compare(page, unmasked, look)) >= REACHED, 'all are drawn');
+      await page.evaluate(async (time) => {
+        const { stream } = globalThis.shown;
+        delete stream.settled;
+        globalThis.arrive();
+        await stream.settled(time);
+      }, look.time);
+      assert.ok((await compare(page, made, look)) >= REACHED, 'the masks came');
+      // Places that are lent anew have forgotten their masks: every page is dropped and comes back without.
+      await page.evaluate(() => {
+        const { file, restart } = globalThis.shown;
+        for (const entry of file.pages) entry.mask = -1;
+        restart({});
+      });
+      assert.ok((await compare(page, unmasked, look)) >= REACHED, 'all are drawn again');
+    });
+  });
+
   test(`${backend} survives pages that come and go, sizes that change and its own end`, { skip }, () => {
-    const made = sample({ seed: 9 });
-    // What the fullest moment needs: every seek drops pages and lends their rows anew.
+    const made = sample({ seed: 9, masks: 0.3 });
+    // What the fullest moment needs, and no page more: every seek drops pages and lends their rows anew.
     const most = 700 + 1025 + 511;
     return shown(backend, made, async (page) => {
-      await page.evaluate((most) => globalThis.shown.restart({ budget: 32 * most }), most);
+      await page.evaluate((most) => {
+        const { file, restart } = globalThis.shown;
+        const masks = file.pages.reduce((n, p) => n + ([700, 1025, 511].includes(p.count) ? p.maskBytes : 0), 0);
+        restart({ budget: 32 * most + masks });
+      }, most);
       for (let i = 0; i < 12; i++) {
         const look = { time: 2.1 + ((i * 1.7) % 3.9), view: view(0.1 * i, 0, 0, 0, 96 + (i % 3) * 16, 64) };
         const db = await compare(page, made, look);
@@ -156,7 +217,7 @@ for (const backend of ['webgl2', 'webgpu']) {
 const skip = !browser;
 
 test('webgl2 without float targets, and without workers, draws the same', { skip }, async () => {
-  const made = sample();
+  const made = sample({ masks: 0.5 });
   const poor = [
     ['half floats', REACHED, { before: () => hide('EXT_color_buffer_float') }],
     ['bytes', EIGHT_BITS, { before: () => hide('EXT_color_buffer_float', 'EXT_color_buffer_half_float') }],

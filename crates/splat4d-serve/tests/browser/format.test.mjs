@@ -7,11 +7,11 @@ import { at, gaussian } from '../../player/motion.js';
 import { SceneError } from '../../player/errors.js';
 import { SceneFile } from '../../player/scene-file.js';
 import { moved } from './reference.mjs';
-import { layout, random, sample } from './sample.mjs';
+import { keyMasks, layout, random, sample } from './sample.mjs';
 import { serve } from './server.mjs';
 
 // Loaded by motion.js; a worker is a classic script and exports nothing.
-const { Sorter } = globalThis.splat4dSort;
+const { KeyMask, Sorter } = globalThis.splat4dSort;
 
 const near = (a, b, tolerance, what) =>
   a.forEach((v, k) => assert.ok(Math.abs(v - b[k]) <= tolerance * (1 + Math.abs(b[k])), `${what} ${k}: ${v} ${b[k]}`));
@@ -62,6 +62,37 @@ test('what was written is what is read, at any time', async () => {
   const poster = await file.poster();
   assert.equal(poster.type, 'image/png');
   assert.equal(poster.size, file.sections[2].bytes);
+});
+
+test('key masks say who is drawn when', async () => {
+  const { bytes, truth } = sample({ masks: 0.5 });
+  const file = await SceneFile.open(bytes);
+  let first = 0,
+    masked = 0;
+  for (const entry of file.pages) {
+    const mask = entry.mask < 0 ? null : new KeyMask(await file.mask(entry.mask));
+    if (mask) masked++;
+    // On key times, between them and outside of all, in an order that goes back and forth.
+    for (const t of [entry.from - 1, entry.from + 0.5, entry.from + 0.25, entry.to - 1e-9, entry.to + 1, entry.from]) {
+      const want = truth.slice(first, first + entry.count).map((g) => g.admitted(t));
+      const changed = mask?.at(t);
+      const got = want.map((_, i) => !mask || ((mask.bits[i >> 5] >>> (i & 31)) & 1) === 1);
+      assert.deepEqual(got, want, `page ${entry.id} at ${t}`);
+      assert.equal(mask?.count ?? entry.count, want.filter((b) => b).length);
+      assert.ok(!mask?.at(t) && changed !== null, 'the same time changes nothing');
+    }
+    first += entry.count;
+  }
+  assert.deepEqual([masked, file.pages.length], [5, 6]);
+});
+
+test('a file that was cut short behind a page shows it without its mask', async () => {
+  const { bytes } = sample({ masks: 0.5 }),
+    whole = await SceneFile.open(bytes);
+  const { mask } = whole.pages[0];
+  const file = await SceneFile.open(bytes.subarray(0, whole.sections[mask].offset + 5));
+  assert.deepEqual([file.pages.length, file.pages[0].mask], [1, -1]);
+  await file.page(file.pages[0].id);
 });
 
 test('spans say what is drawn, and time is held inside the clip', async () => {
@@ -172,6 +203,13 @@ test('hostile and foreign files are refused in words', async () => {
       to: 7,
       ...more,
     });
+  const two = keyMasks(() => 0, 1, [2, 3]).data,
+    MASK = (more) => ({ kind: 'MASK', data: two, codec: 0, count: 1, page: 0, from: 2, to: 3, ...more });
+  const changed = (at, ...bytes) => {
+    const data = Buffer.from(two);
+    Buffer.from(bytes).copy(data, at);
+    return data;
+  };
   const patch =
     (at, value, size = 4) =>
     (e) =>
@@ -198,6 +236,26 @@ test('hostile and foreign files are refused in words', async () => {
     ['span', layout(base, [PAGE({ from: NaN })])],
     ['no palette', layout(base, [PAGE({ palette: 0 })])],
     ['no palette', layout(base, [PAGE({ palette: 77 })])],
+    ['names no page', layout(base, [PAGE(), MASK({ page: 1 })])],
+    ['names no page', layout(base, [PAGE(), MASK({ page: 99 })])],
+    ['of 2 Gaussians, its page', layout(base, [PAGE(), MASK({ count: 2 })])],
+    ['two masks', layout(base, [PAGE(), MASK(), MASK()])],
+    ['entries', layout(base, [PAGE(), MASK({ count: 0 })])],
+    ['key times', layout(base, [PAGE(), MASK({ data: Buffer.alloc(8) })])],
+    ['key times', layout(base, [PAGE(), MASK({ data: Buffer.alloc(25) })])],
+    ['key times', layout(base, [PAGE(), MASK({ codec: 1, data: Buffer.alloc(8 + 9 * 65536) })])],
+    ['span', layout(base, [PAGE(), MASK({ from: 4 })])],
+    ['span', layout(base, [PAGE(), MASK({ to: Infinity })])],
+    ['cannot hold', layout(base, [PAGE(), MASK({ patch: patch(20, 35) })])],
+    ['cannot hold', layout(base, [PAGE(), MASK({ codec: 1, patch: patch(20, 4e9) })])],
+    ['method 2', layout(base, [PAGE(), MASK({ patch: patch(28, 2, 2) })])],
+    [
+      'unpacks to',
+      layout(base, [
+        PAGE({ count: 65536, data: Buffer.alloc(256 * 96 + 32 * 65536), codec: 1 }),
+        MASK({ count: 65536, codec: 1, data: Buffer.alloc(8 + 10_000 * 8200) }),
+      ]),
+    ],
     ['degree 4', layout(base, [{ kind: 'PALT', data: Buffer.alloc(12 + 72), count: 1, level: 4 }])],
     ['no .splat4d', Buffer.from('ply\nformat binary')],
     ['no .splat4d', Buffer.alloc(0)],
@@ -213,10 +271,19 @@ test('hostile and foreign files are refused in words', async () => {
       { kind: 'PALT', data: Buffer.alloc(12 + 9), count: 1, level: 1 },
     ],
     ['checksum', PAGE({ patch: patch(24, 1) })],
+    ['no mask of 3', PAGE(), MASK({ data: changed(0, 3) })],
+    ['no mask of 0', PAGE(), MASK({ data: changed(0, 0) })],
+    ['no finite', PAGE(), MASK({ data: changed(14, 255, 255) })],
+    ['do not rise', PAGE(), MASK({ data: changed(8, ...two.subarray(16, 24)), from: 3 })],
+    ['not those', PAGE(), MASK({ from: 1 })],
+    ['not those', PAGE(), MASK({ to: 4 })],
+    ['inflates to 26', PAGE(), MASK({ codec: 1, patch: patch(20, 35) })],
+    ['checksum', PAGE(), MASK({ patch: patch(24, 1) })],
   ];
   for (const [say, ...sections] of lazy) {
     const file = await SceneFile.open(layout(base, sections));
-    await assert.rejects(file.page(0), (e) => e instanceof SceneError && e.message.includes(say), say);
+    const read = sections[1]?.kind === 'MASK' ? file.mask(1) : file.page(0);
+    await assert.rejects(read, (e) => e instanceof SceneError && e.message.includes(say), say);
   }
 });
 
@@ -246,7 +313,7 @@ test('inflating stops at the stated size', async () => {
 });
 
 test('any changed byte is an error or the same picture, never a hang', async () => {
-  const { bytes } = sample({ scale: 0.02 }),
+  const { bytes } = sample({ scale: 0.02, masks: 0.5 }),
     next = random(3);
   for (let n = 0; n < 400; n++) {
     const broken = Buffer.from(bytes),
@@ -256,7 +323,10 @@ test('any changed byte is an error or the same picture, never a hang', async () 
     const cut = n % 16 === 5 ? broken.subarray(0, where) : broken;
     try {
       const file = await SceneFile.open(cut);
-      for (const p of file.pages) await file.page(p.id);
+      for (const p of file.pages) {
+        await file.page(p.id);
+        if (p.mask >= 0) new KeyMask(await file.mask(p.mask)).at(3);
+      }
     } catch (e) {
       assert.ok(e instanceof SceneError, `byte ${where}: ${e.stack}`);
     }
@@ -297,6 +367,20 @@ test('sorting finds everybody who is seen, the farthest first', async () => {
     }
     assert.ok(count > 100 && count < known.size);
   }
+  // Whom masks hide is gone, and nobody else.
+  const all = (time) => out.slice(0, sorter.sort({ time, depth, near: 0.01 }, out).count).sort();
+  const before = all(3.7),
+    { id } = file.activePages(3.7)[0],
+    n = file.sections[id].count,
+    seen = keyMasks(random(4), n, [3, 3.5, 4]).seen;
+  const stride = Math.ceil(n / 32),
+    rows = new Uint32Array(3 * stride);
+  seen.forEach((row, k) => row.forEach((bit, i) => bit && (rows[k * stride + (i >> 5)] |= 1 << (i & 31))));
+  sorter.mask(id, { keys: Float64Array.of(3, 3.5, 4), rows, stride });
+  const own = (at) => known.get(at)[1].id === id;
+  const admitted = (at) => !own(at) || seen[1][at] || seen[2][at];
+  assert.ok(before.filter(own).length > before.filter((at) => own(at) && admitted(at)).length);
+  assert.deepEqual(all(3.7), before.filter(admitted));
   sorter.drop(file.pages[0].id);
   assert.equal(sorter.total, known.size - file.pages[0].count);
 });

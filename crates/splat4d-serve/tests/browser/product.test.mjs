@@ -11,6 +11,7 @@ import test from 'node:test';
 import { fileURLToPath, pathToFileURL } from 'node:url';
 import { launch, open } from './browser.mjs';
 import { psnr } from './reference.mjs';
+import { sample } from './sample.mjs';
 
 /// Pictures against the CPU renderer, dB.
 const BOUND = 35;
@@ -84,29 +85,64 @@ const shot = async (page) =>
     'base64',
   );
 
+/// What the element shows from the camera `c` of a file at `time`, as RGBA.
+async function seen(page, c, time) {
+  const m = c.world_from_camera,
+    fov = (2 * Math.atan(c.height / 2 / c.fy) * 180) / Math.PI;
+  await page.evaluate(
+    async ([position, target, fov, time]) => {
+      const e = document.querySelector('splat-4d');
+      e.pause();
+      e.camera = { position, target, fov };
+      e.seek(time);
+      await e.settled();
+    },
+    [[m[3], m[7], m[11]], [m[3] + m[2], m[7] + m[6], m[11] + m[10]], fov, time],
+  );
+  return pixels(page, await shot(page));
+}
+
+/// What the CPU renderer makes of a file from its camera `name` at `time`, as RGBA; `picture` names a file to use.
+function rendered(page, scene, name, time, picture) {
+  // A film of one camera at one second is one picture.
+  run('render', scene, '--device', 'cpu', '--path', `camera=${name}`, '--freeze', String(time), '-o', picture);
+  return pixels(page, readFileSync(picture));
+}
+
 for (const backend of ['webgl2', 'webgpu']) {
+  test(`${backend} shows what the CPU renderer shows without those whom key masks hide`, options, async (t) => {
+    const camera = { name: 'front', world_from_camera: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0], width: 400, height: 300 };
+    const made = { masks: 0.5, json: { cameras: [{ ...camera, fx: 375, fy: 375, cx: 200, cy: 150 }] } };
+    const put = (name, options) => {
+      const file = path.join(work, `${backend}-${name}`);
+      writeFileSync(file, sample({ ...made, ...options }).bytes);
+      return file;
+    };
+    const url = await view(put('masked.splat4d', {}));
+    const { page, errors } = await bare(url, `backend="${backend}" resolution="1" controls="none"`);
+    const [c] = await page.evaluate(() => document.querySelector('splat-4d').player.meta.cameras);
+    const whole = put('whole.splat4d', { masks: 0 });
+    // Between two key times, and on one.
+    for (const time of [2.2, 3.5]) {
+      const mine = await seen(page, c, time);
+      const picture = path.join(work, `${backend}-masked.png`);
+      const db = psnr(mine, await rendered(page, put('without.splat4d', { without: time }), c.name, time, picture));
+      const unmasked = psnr(mine, await rendered(page, whole, c.name, time, picture));
+      t.diagnostic(`at ${time} s: ${db.toFixed(1)} dB, against all Gaussians ${unmasked.toFixed(1)} dB`);
+      assert.ok(db >= BOUND && unmasked < BOUND, `at ${time}: ${db} and ${unmasked} dB`);
+    }
+    assert.deepEqual(errors, []);
+    await page.close();
+  });
+
   test(`${backend} shows the bundled capture as the CPU renderer does`, options, async (t) => {
     const url = await view(KNIGHT);
     const { page, errors } = await bare(url, `backend="${backend}" resolution="1" controls="none"`);
     const named = await page.evaluate(() => document.querySelector('splat-4d').player.meta.cameras);
     for (const [name, time] of [['cam03', 0.2], ['cam11', 0.7]]) {
       const c = named.find((camera) => camera.name === name);
-      const m = c.world_from_camera;
-      await page.evaluate(
-        async ([position, target, fov, time]) => {
-          const e = document.querySelector('splat-4d');
-          e.pause();
-          e.camera = { position, target, fov };
-          e.seek(time);
-          await e.settled();
-        },
-        [[m[3], m[7], m[11]], [m[3] + m[2], m[7] + m[6], m[11] + m[10]], (2 * Math.atan(c.height / 2 / c.fy) * 180) / Math.PI, time],
-      );
-      const mine = await pixels(page, await shot(page));
-      const file = path.join(work, `${backend}-${name}.png`);
-      run('render', KNIGHT, '--device', 'cpu', '--path', `camera=${name}`, '--freeze', String(time), '-o', file);
-      // A film of one camera at one second is one picture, or a folder's first.
-      const truth = await pixels(page, readFileSync(file));
+      const mine = await seen(page, c, time);
+      const truth = await rendered(page, KNIGHT, name, time, path.join(work, `${backend}-${name}.png`));
       assert.equal(mine.length, truth.length);
       const db = psnr(mine, truth);
       t.diagnostic(`${name} at ${time} s: ${db.toFixed(1)} dB`);

@@ -19,9 +19,10 @@ const SH = [
 ];
 const dot = (a, b) => a.reduce((s, v, i) => s + v * b[i], 0);
 
-/// Where a Gaussian of sample.mjs is at `t`: {mean, rotation rows, opacity}, or null.
+/// Where a Gaussian of sample.mjs is at `t`: {mean, rotation rows, opacity}, or null. `admitted(t)`, where it has that,
+/// is what key masks say.
 export function moved(g, t) {
-  if (!(g.span[0] <= t && t < g.span[1])) return null;
+  if (!(g.span[0] <= t && t < g.span[1]) || g.admitted?.(t) === false) return null;
   const dt = t - g.center,
     out = g.half === Infinity ? 0 : Math.max(0, Math.abs(dt) - g.half) / g.soft;
   const opacity = g.opacity * Math.exp(-0.5 * out * out);

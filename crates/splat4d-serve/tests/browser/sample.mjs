@@ -118,8 +118,38 @@ function palette(next, degree, entries) {
   return { data, values };
 }
 
-/// Lays out a file. `sections`: [{kind, data, codec, level, count, words, from, to, palette, flags, patch}] in their
-/// order.
+/// Key masks of `n` Gaussians at `keys` seconds: {data: decoded bytes, seen: [key][Gaussian]}. Some blocks are hidden
+/// as a whole, as those of a writer that puts alike lives together.
+export function keyMasks(next, n, keys) {
+  const packed = Math.ceil(n / 8),
+    data = Buffer.alloc(8 + keys.length * (8 + packed));
+  data.writeUInt32LE(keys.length, 0);
+  keys.forEach((t, k) => data.writeDoubleLE(t, 8 + 8 * k));
+  const seen = keys.map(() => {
+    const hidden = Array.from({ length: Math.ceil(n / 256) }, () => next() < 0.3);
+    return Array.from({ length: n }, (_, i) => next() < 0.4 && !hidden[i >> 8]);
+  });
+  seen.forEach((row, k) =>
+    row.forEach((bit, i) => {
+      // A row is stored as the difference to the one before.
+      if (bit !== (k ? seen[k - 1][i] : false)) data[8 + 8 * keys.length + k * packed + (i >> 3)] |= 1 << (i & 7);
+    }),
+  );
+  // Bits beyond the last Gaussian mean nothing.
+  keys.forEach((_, k) => n % 8 && (data[8 + 8 * keys.length + (k + 1) * packed - 1] |= 0x100 - (1 << (n % 8))));
+  return { data, seen };
+}
+
+/// Whether key masks {keys, seen} admit Gaussian `i` at `t`.
+export function admits({ keys, seen }, i, t) {
+  const before = keys.filter((k) => k <= t).length - 1,
+    after = keys.findIndex((k) => k >= t);
+  const [l, r] = [Math.max(before, 0), after < 0 ? keys.length - 1 : after];
+  return seen[l][i] || seen[r][i];
+}
+
+/// Lays out a file. `sections`: [{kind, data, codec, level, count, words, from, to, palette, page, flags, patch}] in
+/// their order.
 export function layout(json, sections, { major = 1, minor = 0 } = {}) {
   let text = Buffer.from(JSON.stringify(json));
   text = Buffer.concat([text, Buffer.alloc((4 - (text.length % 4)) % 4, 32)]);
@@ -143,7 +173,7 @@ export function layout(json, sections, { major = 1, minor = 0 } = {}) {
     e.writeUInt32LE(s.words ?? 0, 36);
     e.writeDoubleLE(s.from ?? 0, 40);
     e.writeDoubleLE(s.to ?? 0, 48);
-    e.writeUInt32LE(s.kind === 'PAGE' ? (s.palette ?? 0xffffffff) : 0, 56);
+    e.writeUInt32LE(s.kind === 'PAGE' ? (s.palette ?? 0xffffffff) : (s.page ?? 0), 56);
     s.patch?.(e);
     at += bodies[i].length;
   });
@@ -164,9 +194,19 @@ const POSTER = Buffer.from(
   'base64',
 );
 
-/// The sample: {bytes, json, sections, truth: Gaussians with `span` and `sh`}. `scale` multiplies all counts, `codec`:
-/// of every section (default: some packed, some raw).
-export function sample({ seed = 7, scale = 1, codec, size = 0.05, patch = (s) => s, json: more = {} } = {}) {
+/// The sample: {bytes, json, sections, truth: Gaussians with `span`, `sh` and `admitted(t)`}. `scale` multiplies all
+/// counts, `codec`: of every section (default: some packed, some raw). `masks`: seconds between key times, 0: no masks.
+/// `without`: a second; no masks are written, but whom they hide then has no opacity.
+export function sample({
+  seed = 7,
+  scale = 1,
+  codec,
+  size = 0.05,
+  masks = 0,
+  without,
+  patch = (s) => s,
+  json: more = {},
+} = {}) {
   const next = random(seed),
     fps = 30,
     clip = [2, 6],
@@ -189,7 +229,19 @@ export function sample({ seed = 7, scale = 1, codec, size = 0.05, patch = (s) =>
       center: [0, 0, 4],
       extent: 0.9,
     });
-    for (const g of made.truth) truth.push({ ...g, sh: palettes[which]?.values[g.label] ?? [] });
+    // From random numbers of their own, so that the Gaussians are the same with and without masks. A page of one
+    // Gaussian has one key time only.
+    const number = masks && count > 1 ? Math.ceil((to - from) / masks) : 1,
+      keys = Array.from({ length: number }, (_, k) => from + k * masks);
+    const own = masks && tier === 0 ? keyMasks(random(seed + truth.length), count, keys) : null;
+    const admitted = (i, t) => !own || admits({ keys, seen: own.seen }, i, t);
+    made.truth.forEach((g, i) => {
+      truth.push({ ...g, sh: palettes[which]?.values[g.label] ?? [], admitted: (t) => admitted(i, t) });
+      // Plane 11 is the highest byte of word 2.
+      const opacity = Math.ceil(count / 256) * 96 + 11 * count + i;
+      if (without !== undefined && !admitted(i, without)) made.data[opacity] = 0;
+    });
+    const place = sections.length;
     sections.push({
       kind: 'PAGE',
       data: made.data,
@@ -201,6 +253,10 @@ export function sample({ seed = 7, scale = 1, codec, size = 0.05, patch = (s) =>
       to,
       palette: which < 0 ? undefined : which,
     });
+    if (own && without === undefined) {
+      const shape = { count, from: keys[0], to: keys.at(-1), page: place };
+      sections.push({ kind: 'MASK', data: own.data, codec: codec ?? (place >> 1) & 1, ...shape });
+    }
   };
   add(700, clip[0], end, 0, 0);
   add(1025, clip[0], end, 1, 0);

@@ -7,31 +7,40 @@ import { Stream } from '../../player/stream.js';
 import { sample } from './sample.mjs';
 import { serve } from './server.mjs';
 
-/// A file of `segments` one-second pages of 1,000 Gaussians and a root of two tiers; pages come when `let` says so.
-function recorded(segments = 20, root = 2) {
-  const entry = (id, from, to, tier) => ({ id, from, to, tier, count: 1000, palette: -1 });
+/// A file of `segments` one-second pages of 1,000 Gaussians and a root of two tiers; pages come when `arrive` says so.
+/// `masks`: page k has key masks, of 5,000 bytes, in section 100 + k.
+function recorded(segments = 20, root = 2, masks = false) {
+  const own = (id) => (masks ? { mask: 100 + id, maskBytes: 5000 } : {});
+  const entry = (id, from, to, tier) => ({ id, from, to, tier, count: 1000, palette: -1, ...own(id) });
   const pages = [...Array(root).keys()].map((i) => entry(i, 0, segments, i));
   for (let i = 0; i < segments; i++) pages.push(entry(root + i, i, i + 1, 0));
   const asked = [],
     open = new Map(),
     bad = new Set();
   const clamp = (t) => Math.min(Math.max(t, 0), segments - 1e-9);
+  const get = (id, { signal }) =>
+    new Promise((resolve, reject) => {
+      asked.push(id);
+      if (bad.has(id)) return reject(new Error(`section ${id}`));
+      open.set(id, () => (open.delete(id), resolve({ id })));
+      signal.addEventListener('abort', () => (open.delete(id), reject(signal.reason)));
+    });
   const file = {
     meta: { clip: [0, segments - 1e-9] },
     sections: pages,
     pages,
     clamp,
     activePages: (t) => pages.filter((p) => p.from <= clamp(t) && clamp(t) < p.to),
-    page: (id, { signal }) =>
-      new Promise((resolve, reject) => {
-        asked.push(id);
-        if (bad.has(id)) return reject(new Error(`page ${id}`));
-        open.set(id, () => (open.delete(id), resolve({ id })));
-        signal.addEventListener('abort', () => (open.delete(id), reject(signal.reason)));
-      }),
+    page: get,
+    mask: get,
   };
   const there = new Set();
-  const backend = { addPage: ({ id }) => there.add(id), dropPage: (id) => there.delete(id) };
+  // Of a page and its mask, only both together may go, and no mask may come before its page.
+  const backend = {
+    addPage: ({ id }) => there.add(id),
+    addMask: (id, mask) => (assert.ok(there.has(id) && mask.id === 100 + id), there.add(mask.id)),
+    dropPage: (id) => (there.delete(id), there.delete(100 + id)),
+  };
   const tick = () => new Promise((done) => setTimeout(done, 0));
   const arrive = async () => {
     for (const go of [...open.values()]) go();
@@ -127,10 +136,71 @@ test('a page that fails is tried again, then reported; the rest goes on', async 
   await r.tick();
   await r.all();
   await settled;
-  assert.deepEqual(errors, ['page 7']);
+  assert.deepEqual(errors, ['section 7']);
   assert.equal(r.asked.filter((id) => id === 7).length, 2);
   assert.ok(r.there.has(0) && r.there.has(1) && r.there.has(8));
   assert.equal(stream.ready(5.5), 2 / 3);
+});
+
+test('masks are asked for with their pages, which do not wait for them', async () => {
+  const r = recorded(20, 2, true),
+    stream = new Stream(r.file, r.backend);
+  stream.update(5.5);
+  assert.deepEqual(r.asked, [0, 100, 7, 107, 1, 101]);
+  let settled = false;
+  stream.settled(5.5).then(() => (settled = true));
+  // A mask before its page, a page before its mask.
+  for (const id of [107, 0, 1, 101]) r.open.get(id)();
+  await r.tick();
+  assert.deepEqual([...r.there], [0, 1, 101]);
+  assert.deepEqual([stream.ready(5.5), settled], [2 / 3, false]);
+  r.open.get(7)();
+  await r.tick();
+  assert.deepEqual([...r.there], [0, 1, 101, 7, 107]);
+  assert.deepEqual([stream.ready(5.5), settled], [1, false]);
+  assert.equal(r.asked.length, 6, 'this moment first');
+  r.open.get(100)();
+  await r.tick();
+  assert.ok(settled && r.there.has(100));
+  await r.all();
+  assert.equal(stream.bytes, 37_000 * (r.there.size / 2));
+  assert.equal(new Set(r.asked).size, r.asked.length);
+});
+
+test('a mask that was stopped or failed is asked for again, its page is not', async () => {
+  const r = recorded(20, 2, true),
+    errors = [],
+    stream = new Stream(r.file, r.backend, { onerror: (e) => errors.push(e.message) });
+  stream.update(5.5);
+  r.open.get(7)();
+  await r.tick();
+  // Elsewhere, and back.
+  stream.update(15.5);
+  await r.tick();
+  assert.ok(!r.open.has(107) && r.there.has(7));
+  stream.update(5.5);
+  assert.deepEqual(r.asked.slice(-1), [107]);
+  r.bad.add(117);
+  await r.all();
+  assert.ok(r.there.has(107) && !errors.length);
+  const settled = stream.settled(15.5);
+  await r.all();
+  await settled;
+  assert.deepEqual(errors, ['section 117']);
+  assert.equal(r.asked.filter((id) => id === 17).length, 2, 'once stopped, once fetched');
+  assert.equal(r.asked.filter((id) => id === 117).length, 3);
+  assert.equal(stream.ready(15.5), 1, 'the page is shown without it');
+});
+
+test('a budget holds pages with their masks', async () => {
+  const r = recorded(20, 2, true),
+    stream = new Stream(r.file, r.backend, { budget: 5 * 37_000 });
+  for (let t = 0.5; t < 20; t++) {
+    stream.update(t, { playing: true });
+    await r.all();
+    assert.equal(stream.ready(t), 1, `${t}`);
+    assert.ok(r.there.size <= 10 && stream.bytes <= 5 * 37_000);
+  }
 });
 
 test('a palette is there before its page, and asked for once', async () => {

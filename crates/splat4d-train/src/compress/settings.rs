@@ -43,6 +43,8 @@ settings! {
     combine: String = "product".into(),
     /// Whether large Gaussians count a little more.
     volume: bool = true,
+    /// Power of the mean share that a Gaussian has of the pixels it touches: above 0, what costs time goes first.
+    cost: f64 = 0.0,
     /// Scores look at every so many of the training views.
     every: usize = 1,
     /// Steps of fine-tuning in floats after pruning, all rounds together.
@@ -178,6 +180,9 @@ impl Compression {
         if !(1..=MAX_PALETTE).contains(&self.palette) {
             return bad("palette", self.palette.to_string(), &format!("1 to {MAX_PALETTE}"));
         }
+        if !(0.0..=10.0).contains(&self.cost) {
+            return bad("cost", self.cost.to_string(), "between 0 and 10");
+        }
         self.depths.check()?;
         self.temporal.parse::<Temporal>()?;
         self.combine.parse::<Combine>()?;
@@ -200,17 +205,8 @@ const PRUNED_SHARE: f64 = 0.6;
 /// Frames between key times (4DGS-1K, N3V).
 const MASK_INTERVAL: usize = 20;
 /// Level 2: bits of the codes.
-const COARSE: Depths = Depths {
-    position: 12,
-    center: 10,
-    scale: 6,
-    opacity: 6,
-    rotation: 7,
-    shift: 7,
-    turn: 7,
-    color: 6,
-    life: 6,
-};
+const COARSE: Depths =
+    Depths { position: 12, center: 10, scale: 6, opacity: 6, rotation: 7, shift: 7, turn: 7, color: 6, life: 6 };
 /// Level 2: entries of the palette.
 const SMALL_PALETTE: usize = 2048;
 

@@ -1,9 +1,9 @@
 //! The stages of a compression: rounds of pruning in floats, then the file itself.
 
+use super::quantise::{self, Quantised, palette_rate};
 use super::{Compression, draft};
 use crate::capture::frames::Frames;
 use crate::densify::Densify;
-use super::quantise::{self, Quantised, palette_rate};
 use crate::models::{Hook, Plan, Rate, Stage, Tell, program};
 use crate::prune::{Keys, MaskConfig, ScoreConfig, key_masks, prune, score};
 use crate::{Error, Result};
@@ -42,6 +42,7 @@ impl Bench {
             temporal: s.temporal.parse()?,
             combine: s.combine.parse()?,
             volume: s.volume,
+            cost: s.cost,
             every: s.every,
             antialias: self.antialias(),
             ..ScoreConfig::default()

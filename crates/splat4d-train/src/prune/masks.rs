@@ -1,6 +1,7 @@
 //! Which Gaussians are worth drawing around which key time: the temporal filter of 4DGS-1K (Yuan et al. 2025, §4.2), united
 //! with the lives that no key time meets.
 
+use super::temporal::Spatial;
 use super::weighing::Weighing;
 use crate::capture::frames::Frames;
 use crate::sampler::Timeline;
@@ -90,7 +91,7 @@ pub fn key_masks(
 
     let at: Vec<usize> = keys.iter().map(|k| times.partition_point(|t| t < k)).collect();
     let total = at.iter().map(|&k| timeline.at(k).len()).sum();
-    let (mut weighing, mut done) = (Weighing::new(config.antialias), 0);
+    let (mut weighing, mut done) = (Weighing::new(Spatial::Share, config.antialias), 0);
     for (key, &k) in at.iter().enumerate() {
         weighing.at(scene, Time(times[k]));
         for &frame in timeline.at(k) {

@@ -14,12 +14,12 @@ mod weighing;
 pub use masks::{Keys, MaskConfig, key_masks};
 pub use periodic::Periodic;
 pub use score::{ScoreConfig, Scores, UNIT_FRAMES, score};
-pub use temporal::{Combine, Temporal};
+pub use temporal::{Combine, Spatial, Temporal};
 
 use splat4d::layers::Scene;
 use splat4d::scene::{RowEdit, Space};
 
-/// One edit a layer that takes away the share `ratio` (rounded down) of all Gaussians: those with the lowest scores, the
+/// One edit a layer that takes away the share `ratio` (to the nearest whole number) of all Gaussians: those with the lowest scores, the
 /// earlier layer and row first among equals. One always stays.
 ///
 /// Apply it with `densify::apply`, which carries moments and statistics along, or with `Layer::edit`. Panics: scores of
@@ -30,7 +30,7 @@ pub fn prune(scene: &Scene<f32>, scores: &Scores, ratio: f64) -> Vec<RowEdit> {
         |rows: usize, layer: usize| assert_eq!(rows, scene.layers[layer].params.len(), "scores of layer {layer}");
     assert_eq!(scores.layers.len(), scene.layers.len(), "scores by layer");
     scores.layers.iter().enumerate().for_each(|(layer, s)| sizes(s.len(), layer));
-    let count = ((ratio * scene.len() as f64) as usize).min(scene.len().saturating_sub(1));
+    let count = ((ratio * scene.len() as f64).round() as usize).min(scene.len().saturating_sub(1));
     let mut order: Vec<(f64, usize, usize)> = Vec::with_capacity(scene.len());
     for (layer, scores) in scores.layers.iter().enumerate() {
         order.extend(scores.iter().enumerate().map(|(row, &s)| (s, layer, row)));

@@ -2,7 +2,7 @@
 //!
 //! Source: 4DGS-1K (Yuan et al. 2025, §4.1); the volume as LightGaussian (Fan et al. 2024).
 
-use super::temporal::{Combine, Lives, Temporal};
+use super::temporal::{Combine, Lives, Spatial, Temporal};
 use super::weighing::Weighing;
 use crate::capture::frames::Frames;
 use crate::densify::covariances;
@@ -27,12 +27,17 @@ pub const UNIT_FRAMES: f64 = 30.0;
 /// How Gaussians are scored.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ScoreConfig {
+    /// What of a view counts.
+    pub spatial: Spatial,
     /// What becomes of the life.
     pub temporal: Temporal,
     /// How it meets the spatial score.
     pub combine: Combine,
     /// Whether the temporal score is multiplied with a power of the volume in space and time.
     pub volume: bool,
+    /// Power of the mean share that a Gaussian has of the pixels it touches. Above 0, haze goes first: it costs a blend as
+    /// much a pixel as what is solid does, and gives less (our own addition; 0: as published).
+    pub cost: f64,
     /// Frames of a unit of time, in which derivatives of the life are measured ([`UNIT_FRAMES`]).
     pub unit: f64,
     /// Every so many of the views at a time are looked at, another choice at each time, and at least one.
@@ -45,9 +50,11 @@ impl Default for ScoreConfig {
     /// Per-instant product of |p''| and the spatial score, with the volume, from all views.
     fn default() -> Self {
         Self {
+            spatial: Spatial::default(),
             temporal: Temporal::default(),
             combine: Combine::default(),
             volume: true,
+            cost: 0.0,
             unit: UNIT_FRAMES,
             every: 1,
             antialias: Antialias::Off,
@@ -60,7 +67,7 @@ impl Default for ScoreConfig {
 pub struct Scores {
     /// A score a row, by layer.
     pub layers: Vec<Vec<f64>>,
-    /// Σ over pixels of the views looked at of α·T, a row, by layer.
+    /// The spatial score over all views looked at, a row, by layer.
     pub spatial: Vec<Vec<f64>>,
     /// Views looked at.
     pub views: usize,
@@ -77,7 +84,7 @@ pub fn score(
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<Scores> {
     assert!(
-        config.unit > 0.0 && config.every > 0,
+        config.unit > 0.0 && config.every > 0 && config.cost >= 0.0,
         "a unit of time is positive, and views are counted from one: {config:?}"
     );
     if frames.is_empty() {
@@ -94,7 +101,8 @@ pub fn score(
     let zeros = || -> Vec<Vec<f64>> { scene.layers.iter().map(|l| vec![0.0; l.params.len()]).collect() };
     // Σ_t S(t), Σ_t S(t)·T(t) and Σ of T(t) over the instants at which S(t) > 0.
     let (mut spatial, mut product, mut served) = (zeros(), zeros(), zeros());
-    let (mut weighing, mut done) = (Weighing::new(config.antialias), 0);
+    let mut touched = zeros();
+    let (mut weighing, mut done) = (Weighing::new(config.spatial, config.antialias), 0);
     let total = groups.iter().map(Vec::len).sum();
     for (group, &t) in groups.iter().zip(&times) {
         weighing.at(scene, t);
@@ -105,6 +113,7 @@ pub fn score(
         }
         for (layer, lives) in lives.iter().enumerate() {
             let seen = weighing.layer(layer);
+            touched[layer].iter_mut().zip(weighing.pixels(layer)).for_each(|(sum, pixels)| *sum += pixels);
             let sums = spatial[layer].par_iter_mut().zip(&mut product[layer]).zip(&mut served[layer]);
             sums.zip(seen).enumerate().with_min_len(4096).for_each(|(row, (((spatial, product), served), &s))| {
                 if s > 0.0 {
@@ -143,6 +152,13 @@ pub fn score(
             each(&|layer, row| lasting[layer][row] / by_time + spatial[layer][row] / by_space)
         }
     };
+    if config.cost > 0.0 {
+        for ((scores, spatial), touched) in layers.iter_mut().zip(&spatial).zip(&touched) {
+            for ((score, s), pixels) in scores.iter_mut().zip(spatial).zip(touched) {
+                *score *= (s / pixels.max(1.0)).min(1.0).powf(config.cost);
+            }
+        }
+    }
     // A Gaussian that is not finite is not drawn; its life may be anything.
     layers.iter_mut().flatten().filter(|s| s.is_nan()).for_each(|s| *s = 0.0);
     Ok(Scores { layers, spatial, views: total })

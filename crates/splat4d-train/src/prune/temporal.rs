@@ -35,6 +35,19 @@ pub enum Temporal {
     None,
 }
 
+/// What of a view becomes a spatial score.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Spatial {
+    /// Σ over pixels of α T: how much of the pictures it is (4DGS-1K).
+    #[default]
+    Share,
+    /// Σ over pixels and channels of the squared change that its removal alone would make. Neighbours of one colour stand
+    /// in for each other, and may all go.
+    Change,
+    /// The geometric mean of both in each view: neither what covers nor what differs from what lies behind goes first.
+    Both,
+}
+
 /// How spatial and temporal score become one.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Combine {
@@ -85,6 +98,7 @@ names!(
     InstantAbs "instant-abs", LiteralSignedClamped "literal-signed-clamped", FirstDerivative "first-derivative",
     Width "width", ActiveFraction "active-fraction", None "none"
 );
+names!(Spatial, "spatial score", Share "share", Change "change", Both "both");
 names!(Combine, "way to combine scores", Product "product", Sum "sum", TemporalAlone "temporal-alone");
 
 /// The lives of a layer's Gaussians on a clock of its own unit.

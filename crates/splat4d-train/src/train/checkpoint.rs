@@ -70,6 +70,7 @@ pub fn write(trainer: &Trainer<'_>, identity: &Identity, state: &RunState) -> Re
     memories.extend(codecs.filter(|(_, state)| !state.is_empty()).map(|(s, state)| (codec_name(s), state)));
     let mut tensors: Vec<Tensor<'_>> =
         arrays.iter().map(|(n, shape, data)| Tensor::f32(n.clone(), shape, data)).collect();
+    tensors.extend(scene::masks(&trainer.scene));
     tensors.extend(memories.iter().map(|(n, data)| Tensor::u32(n.clone(), &[data.len()], data)));
     let p = trainer.progress;
     let meta = json!({

@@ -1,5 +1,8 @@
 //! Runs that do not begin with points: a scene and a list of stages, driven as safely as training is.
 
+#[cfg(test)]
+mod tests;
+
 use super::checkpoint;
 use super::dataset::Dataset;
 use super::run::{Bench, Outcome, Session, TrainOptions, memory_estimate};
@@ -22,8 +25,8 @@ pub struct Refine {
     pub stages: Vec<Stage>,
     /// What the scene is compared with ([`training_frames`](super::run::training_frames)).
     pub frames: Arc<Dataset>,
-    /// Losses, background, SH degree, seed, thresholds. Its motion model and its iterations do not count: the scene and
-    /// the stages have theirs.
+    /// Losses, background, SH degree, seed, thresholds, steps between checkpoints. Its motion model and its iterations do
+    /// not count: the scene and the stages have theirs.
     pub recipe: Recipe,
     /// All else that the result depends on, as text: settings and a fingerprint of the scene. A run is only continued
     /// with the same.
@@ -56,8 +59,7 @@ pub fn refine(
         return Err(Error::input("there is not one stage to run").remedy("Ask for at least one step"));
     }
     let total: usize = job.stages.iter().map(|s| s.iterations).sum();
-    // Of so many steps, and not of those that the scene was trained for.
-    let recipe = Recipe { iterations: total.max(1), checkpoint_interval: 0, ..job.recipe }.resolve();
+    let recipe = Recipe { iterations: total.max(1), ..job.recipe }.resolve();
     let bench = Bench::with(job.frames);
     let plan = bench.plan(&recipe);
     let held = Recipe { max_cap: job.scene.len().max(1), ..recipe.clone() };

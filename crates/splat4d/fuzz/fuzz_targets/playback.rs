@@ -3,7 +3,7 @@
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
-use splat4d::format::playback::{HEADER_BYTES, Index, Kind, decode_page, decode_palette, read};
+use splat4d::format::playback::{HEADER_BYTES, Index, Kind, decode_masks, decode_page, decode_palette, read};
 
 /// Bytes of an entry of the table of sections, and the places of offset, stored bytes and checksum in it.
 const ENTRY: usize = 64;
@@ -25,6 +25,7 @@ fn look(bytes: &[u8]) {
             match e.kind {
                 Kind::Page => drop(decode_page(e, stored)),
                 Kind::Palette => drop(decode_palette(e, stored)),
+                Kind::Masks => drop(decode_masks(e, stored)),
                 Kind::Poster | Kind::Other(_) => {}
             }
         }

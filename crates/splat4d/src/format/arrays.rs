@@ -49,14 +49,20 @@ pub fn params_to_arrays(prefix: &str, params: &Params) -> Vec<Array> {
     out
 }
 
+/// Name of the array of masks in a layer: bits, no numbers of a table.
+pub(super) const MASKS: &str = "masks";
+
 /// The arrays of a file whose names begin with `prefix`, without it, as [`Params::build`] and [`Params::entry`] take
-/// them: the first axis is the rows, the others are one row.
+/// them: the first axis is the rows, the others are one row. A layer's masks (u32) are left out.
 ///
 /// Errors: an array is not of f32, or is a single number without rows.
 pub fn tensors_to_loaded(prefix: &str, file: &SafeTensors<'_>) -> Result<Vec<LoadedArray>> {
     let mut out = Vec::new();
     for tensor in file.tensors() {
         let Some(name) = tensor.name().strip_prefix(prefix) else { continue };
+        if name == MASKS && tensor.dtype() == Dtype::U32 {
+            continue;
+        }
         if tensor.dtype() != Dtype::F32 || tensor.shape().is_empty() {
             return Err(Error::input(format!(
                 "array `{}` is {} of shape {:?}, but f32 with a row per Gaussian is needed",

@@ -3,6 +3,7 @@
 //! They are shared by every compact format. Encoding clamps, so that no input gives a code out of range.
 
 use crate::math::quat;
+use crate::simd::greatest;
 use std::f64::consts::FRAC_1_SQRT_2;
 
 /// Code 0..=`levels` of a number in [min, max].
@@ -19,14 +20,15 @@ pub fn linear_code(value: f64, min: f64, max: f64, levels: u32) -> u32 {
 pub fn coarse_code(value: f64, min: f64, max: f64, levels: u32, step: u32) -> u32 {
     // A division by a power of two is exact: a step of 1 changes no bit.
     let (range, each, last) = (max - min, 1.0 / f64::from(step), f64::from(levels / step));
-    let code = ((value - min) / range * f64::from(levels) * each).round().clamp(0.0, last) as u32 * step;
+    // By way of i32, since vectors of f64 become nothing else in one instruction.
+    let code = ((value - min) / range * f64::from(levels) * each).round().clamp(0.0, last) as i32 as u32 * step;
     if range > 0.0 { code } else { 0 }
 }
 
-/// The number behind a [`linear_code`]: min + (max − min)·code/levels.
+/// The number behind a [`linear_code`]: min + (max − min)·code/levels. Codes are below 2³¹.
 #[inline(always)]
 pub fn linear(code: u32, min: f64, max: f64, levels: u32) -> f64 {
-    min + (max - min) * (f64::from(code) / f64::from(levels))
+    min + (max - min) * (f64::from(code as i32) / f64::from(levels))
 }
 
 /// Code 0..=`levels` of a positive number whose logarithm lies in [min, max].
@@ -61,7 +63,7 @@ pub fn coarse_signed_code(value: f64, most: f64, half: u32, step: u32) -> u32 {
 /// The number behind a [`signed_code`]: most·(code − half)/half.
 #[inline(always)]
 pub fn signed(code: u32, most: f64, half: u32) -> f64 {
-    most * ((f64::from(code) - f64::from(half)) / f64::from(half))
+    most * ((f64::from(code as i32) - f64::from(half)) / f64::from(half))
 }
 
 /// A rotation as (which of w x y z is largest, codes 0..=2·`half` of the three others in that order): "smallest three".
@@ -90,14 +92,27 @@ pub fn coarse_quat_codes(q: [f64; 4], half: u32, step: u32) -> (usize, [u32; 3])
 /// are normalised. Panics: largest > 3.
 #[inline(always)]
 pub fn quat(largest: usize, codes: [u32; 3], half: u32) -> [f64; 4] {
-    let mut q = [0.0; 4];
-    let mut rest = 1.0;
-    for (i, code) in others(largest).into_iter().zip(codes) {
-        q[i] = signed(code, FRAC_1_SQRT_2, half);
-        rest -= q[i] * q[i];
-    }
-    q[largest] = f64::max(rest, 0.0).sqrt();
-    quat::normalize(q).0
+    assert!(largest < 4, "a quaternion has four components");
+    let [a, b, c] = [
+        signed(codes[0], FRAC_1_SQRT_2, half),
+        signed(codes[1], FRAC_1_SQRT_2, half),
+        signed(codes[2], FRAC_1_SQRT_2, half),
+    ];
+    quat_of(largest as u32, a, b, c)
+}
+
+/// The unit quaternion of which component `largest` is missing, and positive.
+#[inline(always)]
+pub(super) fn quat_of(largest: u32, a: f64, b: f64, c: f64) -> [f64; 4] {
+    let rest = 1.0 - a * a - b * b - c * c;
+    let big = greatest(rest, 0.0).sqrt();
+    let w = if largest == 0 { big } else { a };
+    let x = if largest == 0 { a } else { b };
+    let x = if largest == 1 { big } else { x };
+    let y = if largest <= 1 { b } else { c };
+    let y = if largest == 2 { big } else { y };
+    let z = if largest == 3 { big } else { c };
+    quat::normalize([w, x, y, z]).0
 }
 
 /// The components but one, in order.

@@ -4,15 +4,18 @@
 //! coefficients, life and motion. Every column group of every table is one row-major array: `layers.0.means` `[N,3]`,
 //! `layers.0.quats` `[N,4]` wxyz, `layers.0.sh` `[N,K,3]`, `layers.0.velocities` `[N,3·order]` … Seconds and scene units.
 
+use super::arrays::MASKS;
 use super::safetensors::{SafeTensors, Tensor};
 use super::{params_to_arrays, tensors_to_loaded};
 use crate::layers::{ALWAYS, Head, Layer, Scene};
 use crate::motion::{SpacetimeSpec, Spec, build};
-use crate::scene::{LifeKind, Params, SH};
+use crate::scene::masks::WORD;
+use crate::scene::{KeyMasks, LifeKind, Params, SH};
 use crate::{Error, ErrorKind, Result};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::io::Write;
+use std::sync::Arc;
 
 /// Version of the metadata this library writes, and the newest it reads.
 pub const VERSION: u64 = 1;
@@ -35,6 +38,9 @@ pub fn metadata(scene: &Scene<f32>) -> Value {
             // JSON knows no infinity: a side that is open is null, and a layer that is always seen says nothing.
             if l.span != ALWAYS {
                 layer["span"] = json!(l.span.map(|t| t.is_finite().then_some(t)));
+            }
+            if let Some(masks) = &l.masks {
+                layer["mask_times"] = json!(masks.times());
             }
             layer
         })
@@ -94,10 +100,21 @@ pub fn arrays(scene: &Scene<f32>) -> Vec<super::arrays::Array> {
     scene.layers.iter().enumerate().flat_map(|(i, l)| params_to_arrays(&format!("layers.{i}."), &l.params)).collect()
 }
 
+/// The masks of a scene's layers, ready to be written (also into a checkpoint): `layers.i.masks`, u32 [keys, ⌈rows/32⌉],
+/// row i is bit i % 32 of word i / 32. Their times are in the metadata.
+pub fn masks(scene: &Scene<f32>) -> Vec<Tensor<'_>> {
+    fn of((i, layer): (usize, &Layer<f32>)) -> Option<Tensor<'_>> {
+        let m = layer.masks.as_deref()?;
+        Some(Tensor::u32(format!("layers.{i}.{MASKS}"), &[m.times().len(), m.rows().div_ceil(WORD)], m.words()))
+    }
+    scene.layers.iter().enumerate().filter_map(of).collect()
+}
+
 /// Writes a scene. Errors: the sink's.
 pub fn write(scene: &Scene<f32>, out: &mut impl Write) -> Result<()> {
     let arrays = arrays(scene);
-    let tensors: Vec<Tensor<'_>> = arrays.iter().map(|a| a.tensor()).collect();
+    let mut tensors: Vec<Tensor<'_>> = arrays.iter().map(|a| a.tensor()).collect();
+    tensors.extend(masks(scene));
     let metadata = BTreeMap::from([(METADATA.to_owned(), metadata(scene).to_string())]);
     super::safetensors::write(&tensors, &metadata, out)
 }
@@ -157,7 +174,27 @@ fn read_layer(file: &SafeTensors<'_>, meta: &Value, index: usize) -> Result<Laye
     if let Some(array) = params.unclaimed().first() {
         return Err(broken(format!("array `{}` belongs to no table of this layer", array.name)));
     }
-    Ok(Layer { name: text(meta, "name")?, params, motion, life, span: span(meta)?, masks: None })
+    let masks = read_masks(file, meta, &prefix, rows)?;
+    Ok(Layer { name: text(meta, "name")?, params, motion, life, span: span(meta)?, masks })
+}
+
+/// Who is worth drawing when; none where nothing is said.
+fn read_masks(file: &SafeTensors<'_>, meta: &Value, prefix: &str, rows: usize) -> Result<Option<Arc<KeyMasks>>> {
+    let array = file.get(&format!("{prefix}{MASKS}"));
+    if meta["mask_times"].is_null() && array.is_none() {
+        return Ok(None);
+    }
+    let times: Option<Vec<f64>> = meta["mask_times"].as_array().and_then(|l| l.iter().map(Value::as_f64).collect());
+    let rising = |t: &Vec<f64>| !t.is_empty() && t.windows(2).all(|w| w[0] < w[1]) && t.iter().all(|t| t.is_finite());
+    let times = times.filter(rising).ok_or_else(|| broken("`mask_times` are not times that rise".into()))?;
+    let array = array.ok_or_else(|| broken(format!("array `{prefix}{MASKS}` is missing")))?;
+    if array.shape() != [times.len(), rows.div_ceil(WORD)] {
+        let (keys, shape) = (times.len(), array.shape());
+        return Err(broken(format!("masks of shape {shape:?} for {keys} key times and {rows} Gaussians")));
+    }
+    let masks = KeyMasks::from_words(times, rows, array.as_u32()?);
+    let masks = masks.ok_or_else(|| broken(format!("the masks have bits beyond the {rows} Gaussians")))?;
+    Ok(Some(Arc::new(masks)))
 }
 
 /// When the layer is seen; a side that is null is open, and so are both where nothing is said.
@@ -221,7 +258,10 @@ mod tests {
                 }
             }
             let span = if seed == 2 { [0.1, f64::INFINITY] } else { ALWAYS };
-            Layer { name: format!("layer {seed}"), params, motion, life, span, masks: None }
+            let mut masks = KeyMasks::new(vec![0.0, 0.1, 0.1 + 0.2], 37);
+            (0..37).for_each(|row| masks.set((row as u64 * seed % 3) as usize, row));
+            let masks = (seed != 1).then(|| Arc::new(masks));
+            Layer { name: format!("layer {seed}"), params, motion, life, span, masks }
         };
         let spacetime = Spec::Spacetime(SpacetimeSpec { order: 2, rotation: true, detach: true, origin: 0.25 });
         Scene {
@@ -248,6 +288,7 @@ mod tests {
         for (a, b) in s.layers.iter().zip(&back.layers) {
             assert_eq!((&a.name, a.life, a.span, a.motion.spec()), (&b.name, b.life, b.span, b.motion.spec()));
             assert_eq!(a.params, b.params);
+            assert_eq!(a.masks, b.masks);
         }
         let mut again = Vec::new();
         write(&back, &mut again).unwrap();
@@ -269,6 +310,20 @@ mod tests {
         assert!(with("\\\"version\\\":1", "\\\"version\\\":9").contains("version 9"));
         assert!(with("\\\"rows\\\":37", "\\\"rows\\\":99").contains("99"));
         assert!(with("layers.1.velocities", "layers.1.velocitiez").contains("velocit"));
+        assert!(with("layers.1.masks", "layers.1.maskz").contains("maskz"));
+        assert!(with("mask_times\\\":[0.0", "mask_times\\\":[7.0").contains("mask_times"));
+        assert!(with("mask_times\\\":[0.0,", "mask_timez\\\":[0.0,").contains("mask_times"));
+        assert!(with("mask_times\\\":[0.0,0.1,", "mask_times\\\":[0.00001,").contains("[3, 2]"));
+        // A bit beyond the last row.
+        let (s, words) = (scene(), [0, 0, 0, 1 << 5, 0, 0]);
+        let arrays = arrays(&s);
+        let mut tensors: Vec<Tensor<'_>> = arrays.iter().map(|a| a.tensor()).collect();
+        tensors.extend(masks(&s).into_iter().filter(|t| t.name() != "layers.1.masks"));
+        tensors.push(Tensor::u32("layers.1.masks", &[3, 2], &words));
+        let metadata = BTreeMap::from([(METADATA.to_owned(), metadata(&s).to_string())]);
+        let mut damaged = Vec::new();
+        crate::format::safetensors::write(&tensors, &metadata, &mut damaged).unwrap();
+        assert!(read(&damaged).unwrap_err().to_string().contains("beyond the 37"));
     }
 
     #[test]

@@ -473,12 +473,33 @@ impl<F: Real> Renderer<F> {
     /// 4DGS-1K (Yuan et al. 2025).
     pub fn contributions(&mut self, out: &mut Vec<F>) {
         out.resize(self.projected.len(), F::ZERO);
-        self.raster.weigh(&self.projected, &self.footprints, &self.config, out);
+        self.raster.weigh(&self.projected, &self.footprints, None, &self.config, out);
     }
 
     /// As [`Renderer::render`] and [`Renderer::contributions`], without a picture: no colour is looked at. No backward may
     /// follow.
     pub fn weigh(&mut self, splats: &Splats<'_, F>, camera: &Camera, out: &mut Vec<F>) {
+        self.list(splats, camera);
+        self.contributions(out);
+    }
+
+    /// Σ over pixels and channels of the squared change that a splat's removal would make to the picture over `background`,
+    /// one a splat, exact for each alone: a splat before others of its colour has a large contribution and changes little.
+    ///
+    /// `out` is overwritten, [splats]. Draws by itself; no backward may follow.
+    pub fn removals(&mut self, splats: &Splats<'_, F>, camera: &Camera, background: [F; 3], out: &mut Vec<F>) {
+        let view = self.list(splats, camera);
+        self.channels.resize(splats.len(), [F::ZERO; CHANNELS]);
+        let simd = self.config.simd;
+        shade::forward(splats, &view, self.config.sh_degree, simd, &self.projected, &mut self.channels);
+        self.raster.blend(&self.projected, &self.footprints, &self.channels, &self.config);
+        out.resize(splats.len(), F::ZERO);
+        let light = Some((&self.channels[..], background));
+        self.raster.weigh(&self.projected, &self.footprints, light, &self.config, out);
+    }
+
+    /// Projects splats and makes their lists.
+    fn list(&mut self, splats: &Splats<'_, F>, camera: &Camera) -> View<F> {
         let (n, simd) = (splats.len(), self.config.simd);
         let view = View::new(camera, &self.config);
         // A picture of another size than any: a backward is refused.
@@ -486,13 +507,9 @@ impl<F: Real> Renderer<F> {
         self.projected.resize(n, Projected::default());
         self.footprints.resize(n, Footprint::default());
         self.radii.resize(n, F::ZERO);
-        let mut clock = Clock::start();
         project::forward(splats, &view, simd, &mut self.projected, &mut self.footprints, &mut self.radii);
-        self.seconds.project = clock.lap();
         self.raster.prepare(&self.projected, &self.footprints, camera.width, camera.height, simd);
-        self.seconds.bin = clock.lap();
-        self.contributions(out);
-        self.seconds.blend = clock.lap();
+        view
     }
 
     /// Screen ellipses of the last render, one a splat; radius 0: not drawn.

@@ -52,6 +52,23 @@ pub struct Projected<F = f32> {
     pub rho: F,
 }
 
+impl<F: Real> Projected<F> {
+    /// About how many pixels of a picture of this size (width, height) it may touch: its ellipse's area, times the share of
+    /// the ellipse's box that lies in the picture. 0: culled.
+    pub fn pixels(&self, size: [usize; 2]) -> f64 {
+        if self.radius <= F::ZERO {
+            return 0.0;
+        }
+        let [a, b, c] = self.conic.map(Real::f64);
+        let area = std::f64::consts::PI * self.tau.f64() / (a * c - b * b).sqrt();
+        let inside = (0..2).map(|k| {
+            let (at, half) = (self.mean2d[k].f64(), self.half[k].f64());
+            ((at + half).min(size[k] as f64) - (at - half).max(0.0)).max(0.0) / (2.0 * half)
+        });
+        area * inside.product::<f64>()
+    }
+}
+
 /// Gradient to one [`Projected`]. Plain old data.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq)]

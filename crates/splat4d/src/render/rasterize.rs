@@ -49,7 +49,7 @@ pub struct Raster<F = f32> {
     pub(super) height: usize,
     pub(super) simd: Option<Simd>,
     pub(super) records: Vec<Record<F>>,
-    tiles: Vec<Tile<F>>,
+    pub(super) tiles: Vec<Tile<F>>,
     pair_grads: Vec<Pair<F>>,
     pub(super) pair_weights: Vec<F>,
     pub(super) place: Vec<AtomicU32>,

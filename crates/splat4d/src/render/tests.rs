@@ -583,6 +583,32 @@ fn contributions_do_not_disturb_the_way_back_and_know_no_threads() {
     assert_eq!(one.1, run(false).1);
 }
 
+/// A splat's removal is drawn: the same splats with its opacity at 0.
+#[test]
+fn removals_are_what_a_picture_loses_with_each_splat() {
+    let mut s = scene(12, 12, 0.15);
+    // No pixel stops early, since one that has would go on without the splat.
+    s.outs.iter_mut().for_each(|out| (0..out.rows()).for_each(|j| out.set(j, 9, 0.5 * out.get(j, 9))));
+    let view = camera(75, 41);
+    let whole = draw_oracle(&s, &view, complete());
+    let (mut renderer, mut losses) = (Renderer::new(complete()), Vec::new());
+    renderer.removals(&s.splats(), &view, BACKGROUND, &mut losses);
+    let (mut n, mut changes) = (0, 0);
+    for part in 0..3 {
+        for j in 0..s.outs[part].rows() {
+            let mut without = s.clone();
+            without.outs[part].set(j, 9, 0.0);
+            let picture = draw_oracle(&without, &view, complete());
+            let pairs = picture.color.data.iter().zip(&whole.color.data);
+            let expected: f64 = pairs.map(|(a, b)| (a - b) * (a - b)).sum();
+            assert!((losses[n] - expected).abs() <= 1e-8 * expected + 1e-12, "splat {n}: {} {expected}", losses[n]);
+            changes += usize::from(expected > 0.1);
+            n += 1;
+        }
+    }
+    assert!(changes > 20, "{changes} splats matter");
+}
+
 /// What f32 loses on the way back: behind many opaque splats, what is still to come is a small difference of large sums.
 #[test]
 fn f32_gradients_are_those_of_f64() {
@@ -613,4 +639,33 @@ fn f32_gradients_are_those_of_f64() {
     let size: f64 = exact.iter().map(|v| v * v).sum::<f64>().sqrt();
     let error: f64 = exact.iter().zip(&fast).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt();
     assert!(size > 0.0 && error < 2e-4 * size, "{error} of {size}");
+}
+
+#[test]
+fn touched_pixels_are_those_of_the_ellipse_inside_the_picture() {
+    // One round splat of 10 px standard deviation: α = o·exp(−r²/200) is 1/255 on a circle of known radius.
+    let (mut out, mut colors) = (Table::<f64>::new(&SPLAT_COLUMNS, 1), Table::<f64>::new(&[("rgb", 3)], 1));
+    out.write(0, 3, [0.01, 0.0, 0.0, 0.01, 0.0, 0.01]);
+    out.set(0, 9, 0.5);
+    colors.write(0, 0, [1.0; 3]);
+    let mut view = camera(400, 300);
+    view.cam_from_world = Se3 { translation: [0.0, 0.0, 1.0], ..Se3::IDENTITY };
+    view.intrinsics = Intrinsics { fx: 100.0, fy: 100.0, cx: 200.0, cy: 150.0 };
+    let mut renderer = Renderer::<f64>::new(RenderConfig { low_pass: 0.0, ..smooth() });
+    let config = RenderConfig { alpha_min: 1.0 / 255.0, ..renderer.config };
+    renderer.config = config;
+    let mut image = Image::default();
+    let mut pixels = |cx: f64| {
+        let mut view = view.clone();
+        view.intrinsics.cx = cx;
+        let splats = Splats { parts: vec![Part { out: &out, color: Color::Direct { table: &colors } }] };
+        renderer.render(&splats, &view, [0.0; 3], None, &mut image);
+        let lit = image.alpha.data.iter().filter(|a| **a > 0.0).count() as f64;
+        (renderer.projected()[0].pixels([400, 300]), lit)
+    };
+    let (told, lit) = pixels(200.0);
+    assert!((told / lit - 1.0).abs() < 0.02, "{told} {lit}");
+    // Half of it beyond the edge.
+    let (told, lit) = pixels(0.0);
+    assert!((told / lit - 1.0).abs() < 0.03, "{told} {lit}");
 }

@@ -1,7 +1,9 @@
-//! How much of a picture each splat is, Σ over pixels of α_i Π_{j<i} (1 − α_j): a walk as forward's, without colours.
+//! What each splat is to a picture, in walks as forward's that sum one number a splat.
 //!
-//! It is the gradient of the sum of a channel to that channel, which the way back would compute, with twelve numbers a
-//! pixel and splat where one is wanted.
+//! Its share is Σ over pixels of α_i T_i, T_i = Π_{j<i} (1 − α_j): the gradient of a channel's sum to that channel, which
+//! the way back would compute together with eleven other numbers. The change that its removal makes is
+//! Σ over pixels and channels of (α_i T_i (b_i − c_i))², b_i being the colour of all that lies behind: exact for one splat
+//! alone (pixels that had stopped stay stopped). A splat before others of its colour has a large share and changes little.
 
 use super::RenderConfig;
 use super::bin::{BIN, Footprint, id};
@@ -12,51 +14,73 @@ use super::blend::{
 use super::gather::{Record, SIDE, TILE, TILES};
 use super::parallel::{Ragged, for_each_group};
 use super::project::Projected;
-use super::rasterize::{CHUNK, Raster};
-use super::simd::{Kernel, Simd, dispatch, least};
+use super::rasterize::{CHANNELS, CHUNK, Raster};
+use super::simd::{Kernel, Simd, dispatch, least, select};
 use crate::math::Real;
 use rayon::prelude::*;
 use std::sync::atomic::Ordering;
 
 impl<F: Real> Raster<F> {
-    /// Σ α T over the picture of every splat that was prepared, into `out` [splats], which is overwritten.
+    /// Σ α T over the picture of every splat that was prepared, into `out` [splats], which is overwritten. With `light`, the
+    /// channels of every splat and the background, of the last [`Raster::blend`]: the squared change if it were not there.
     pub(super) fn weigh(
         &mut self,
         projected: &[Projected<F>],
         footprints: &[Footprint],
+        light: Option<(&[[F; CHANNELS]], [F; CHANNELS])>,
         config: &RenderConfig,
         out: &mut [F],
     ) {
         out.fill(F::ZERO);
         for run in 0..self.bins.runs.len() {
             self.hold(projected, footprints, run);
-            self.weigh_run(footprints, config, out);
+            self.weigh_run(footprints, light, config, out);
         }
     }
 
     /// [`Raster::weigh`] of the current run, added to `out`.
-    fn weigh_run(&mut self, footprints: &[Footprint], config: &RenderConfig, out: &mut [F]) {
+    fn weigh_run(
+        &mut self,
+        footprints: &[Footprint],
+        light: Option<(&[[F; CHANNELS]], [F; CHANNELS])>,
+        config: &RenderConfig,
+        out: &mut [F],
+    ) {
         let (simd, bins, limits) = (self.simd.unwrap_or(Simd::Scalar), &self.bins, Limits::new(config));
-        let (width, height, records) = (self.width, self.height, &self.records);
+        let (width, height, tiles) = (self.width, self.height, &self.tiles);
         let pairs = bins.keys.len();
         self.pair_weights.resize(pairs, F::ZERO);
         self.place.resize_with(pairs, Default::default);
         let (place, run) = (&self.place, &bins.runs[bins.current]);
-        for_each_group(&bins.starts, Ragged(&mut self.pair_weights), &|bin, weights| {
+        let data = (Ragged(&mut self.records), Ragged(&mut self.pair_weights));
+        for_each_group(&bins.starts, data, &|bin, (records, weights)| {
             if !run.contains(&bin) {
                 return;
             }
             let (start, end) = (bins.starts[bin] as usize, bins.starts[bin + 1] as usize);
             let (bx, by) = (bin % bins.across, bin / bins.across);
-            for (i, key) in bins.keys[start..end].iter().enumerate() {
+            for (i, (r, key)) in records.0.iter_mut().zip(&bins.keys[start..end]).enumerate() {
                 let splat = id(*key);
+                if let Some((channels, _)) = light {
+                    r.channels = channels[splat];
+                }
                 // Every slot is written by exactly one task, so that the order of writes cannot matter.
                 let slot = bins.first[splat].wrapping_add(footprints[splat].rank(bx, by) as u32);
                 place[slot as usize].store((start + i) as u32, Ordering::Relaxed);
             }
             weights.0.fill(F::ZERO);
-            let inside = [width - bx * BIN, height - by * BIN];
-            dispatch(simd, Weigh { records: &records[start..end], inside, limits, out: weights.0 });
+            let (records, out) = (&*records.0, weights.0);
+            match light {
+                None => {
+                    let inside = [width - bx * BIN, height - by * BIN];
+                    dispatch(simd, Weigh { records, inside, limits, out });
+                }
+                Some((_, background)) => {
+                    let tiles = &tiles[bin * TILES..(bin + 1) * TILES];
+                    let inside = [width - bx * BIN, height - by * BIN];
+                    dispatch(simd, Remove { records, tiles, background, inside, limits, out });
+                }
+            }
         });
         // Per splat: its pairs in the order of its bins.
         let weights = &self.pair_weights;
@@ -139,6 +163,105 @@ impl<F: Real, const N: usize> Visit<F> for Weighing<'_, F, N> {
     #[inline(always)]
     fn stopped(&self, t: usize) -> bool {
         highest(&self.ts[t]) < F::ZERO
+    }
+
+    #[inline(always)]
+    fn passed(&mut self, first: usize, count: usize) {
+        for (out, sums) in self.out[first..].iter_mut().zip(&mut self.sums[..count]) {
+            *out = sum_lanes(std::mem::replace(sums, [F::ZERO; TILE]));
+        }
+    }
+}
+
+/// What the picture of one bin would lose with each of its splats.
+struct Remove<'a, F> {
+    records: &'a [Record<F>],
+    /// As the blend left them.
+    tiles: &'a [Tile<F>],
+    background: [F; CHANNELS],
+    /// Pixels from the bin's corner to the picture's right and lower ends.
+    inside: [usize; 2],
+    limits: Limits<F>,
+    /// One a record; those that no pixel meets are not written.
+    out: &'a mut [F],
+}
+
+impl<F: Real> Kernel for Remove<'_, F> {
+    type Out = ();
+    #[inline(always)]
+    fn run<const FMA: bool>(self) {
+        self.walk::<FMA, ROW>();
+    }
+    #[inline(always)]
+    fn run_wide<const FMA: bool>(self) {
+        self.walk::<FMA, PAIR_OF_ROWS>();
+    }
+}
+
+impl<F: Real> Remove<'_, F> {
+    #[inline(always)]
+    fn walk<const FMA: bool, const N: usize>(self) {
+        let mut tiles = [Tile::default(); TILES];
+        let open = begin(&mut tiles, self.inside);
+        // From here on a tile's colour is the light that is still to come.
+        for (tile, drawn) in tiles.iter_mut().zip(self.tiles) {
+            for (c, rest) in tile.color.iter_mut().enumerate() {
+                for (rest, (light, t)) in rest.iter_mut().zip(drawn.color[c].iter().zip(&drawn.t)) {
+                    *rest = *light + t.abs() * self.background[c];
+                }
+            }
+        }
+        let sums = [[F::ZERO; TILE]; BATCH];
+        let mut visit = Removing::<F, N> { tiles, limits: self.limits, sums, out: self.out };
+        walk::<F, _, FMA>(self.records, open, &mut visit);
+    }
+}
+
+struct Removing<'a, F, const N: usize> {
+    tiles: [Tile<F>; TILES],
+    limits: Limits<F>,
+    /// Sums of a batch's splats over all tiles, column by column.
+    sums: [[F; TILE]; BATCH],
+    out: &'a mut [F],
+}
+
+impl<F: Real, const N: usize> Visit<F> for Removing<'_, F, N> {
+    #[inline(always)]
+    fn splat<const FMA: bool>(&mut self, t: usize, i: usize, r: &Record<F>) {
+        let (tx, ty, limits) = (t % SIDE, t / SIDE, self.limits);
+        let range = strip_range::<N>(r.tile_rows(tx, ty));
+        let mut e = Exponent::<F, N>::new::<FMA>(r, tx, ty, range.start, &limits);
+        let channels = r.channels;
+        let Tile { t, color } = &mut self.tiles[t];
+        let [reds, greens, blues] = color.each_mut().map(|plane| strips::<F, N>(plane, range.clone()));
+        let ts = strips::<F, N>(t, range);
+        let mut sum = [F::ZERO; N];
+        for (((ts, reds), greens), blues) in ts.iter_mut().zip(reds).zip(greens).zip(blues) {
+            let (mut after, mut rest) = (*ts, [*reds, *greens, *blues]);
+            for l in 0..N {
+                let a = alpha::<F, FMA>(least(e.raw::<FMA>(l), e.top), &limits);
+                let (kept, weight, open) = pass(after[l], a, &limits);
+                after[l] = kept;
+                let odds = select(open, a / (F::ONE - a), F::ZERO);
+                for c in 0..CHANNELS {
+                    // Without it, what lies behind shines through: (1 − α) T b becomes T b.
+                    rest[c][l] -= weight * channels[c];
+                    let change = odds * rest[c][l] - weight * channels[c];
+                    sum[l] += change * change;
+                }
+                e.step(l);
+            }
+            *ts = after;
+            [*reds, *greens, *blues] = rest;
+        }
+        for (total, v) in self.sums[i].iter_mut().zip(columns(sum)) {
+            *total += v;
+        }
+    }
+
+    #[inline(always)]
+    fn stopped(&self, t: usize) -> bool {
+        highest(&self.tiles[t].t) < F::ZERO
     }
 
     #[inline(always)]

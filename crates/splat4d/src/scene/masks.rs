@@ -2,8 +2,8 @@
 
 use super::{RowEdit, Space};
 
-/// Bits of a word.
-const WORD: usize = u32::BITS as usize;
+/// Rows of a word.
+pub const WORD: usize = u32::BITS as usize;
 
 /// A bit a Gaussian and key time. Between two key times a Gaussian is drawn only if its bit is set at one of them; before
 /// the first and after the last, if it is set there.
@@ -85,9 +85,14 @@ impl KeyMasks {
         self.get(l, row) || self.get(r, row)
     }
 
+    /// The words of the two keys around t: a row may be drawn where either has its bit.
+    pub fn words_at(&self, t: f64) -> [&[u32]; 2] {
+        self.keys_at(t).map(|k| &self.words[k * self.stride()..][..self.stride()])
+    }
+
     /// Keeps those of `ids` (rows, in any order) that may be drawn at time t.
     pub fn retain(&self, t: f64, ids: &mut Vec<u32>) {
-        let [l, r] = self.keys_at(t).map(|k| &self.words[k * self.stride()..][..self.stride()]);
+        let [l, r] = self.words_at(t);
         ids.retain(|&i| (l[i as usize / WORD] | r[i as usize / WORD]) >> (i as usize % WORD) & 1 == 1);
     }
 

@@ -41,6 +41,7 @@ pub(super) fn of_index(index: &Index) -> ToldIndex {
     for (i, e) in sections.iter().enumerate().take(LISTED) {
         let (tier, span) = match e.kind {
             Kind::Page => (e.tier.to_string(), format!("{:.3} to {:.3}", e.span[0], e.span[1])),
+            Kind::Masks => (String::new(), format!("{:.3} to {:.3}", e.span[0], e.span[1])),
             _ => (String::new(), String::new()),
         };
         let (count, bytes) = (grouped(e.count as usize), grouped(e.stored as usize));
@@ -49,10 +50,11 @@ pub(super) fn of_index(index: &Index) -> ToldIndex {
     if sections.len() > LISTED {
         line(&mut text, "", &format!("and {} more", grouped(sections.len() - LISTED)));
     }
-    let sizes = [Kind::Page, Kind::Palette, Kind::Poster].map(|kind| (kind, stored(kind)));
+    let sizes = [Kind::Page, Kind::Palette, Kind::Poster, Kind::Masks].map(|kind| (kind, stored(kind)));
     let head = index.file_len.saturating_sub(known);
-    let parts: Vec<String> = [("pages", sizes[0].1), ("palettes", sizes[1].1), ("poster", sizes[2].1), ("index", head)]
-        .into_iter()
+    let parts = ["pages", "palettes", "poster", "masks"].iter().zip(&sizes).map(|(name, (_, bytes))| (*name, *bytes));
+    let parts: Vec<String> = parts
+        .chain([("index", head)])
         .filter(|(_, bytes)| *bytes > 0)
         .map(|(name, bytes)| format!("{name} {}", human_bytes(bytes)))
         .collect();
@@ -69,7 +71,7 @@ pub(super) fn of_index(index: &Index) -> ToldIndex {
     }
     let json = json!({
         "version": index.version, "meta": meta, "sections": sections.iter().map(section).collect::<Vec<_>>(),
-        "page_bytes": sizes[0].1, "palette_bytes": sizes[1].1, "poster_bytes": sizes[2].1, "index_bytes": head,
+        "page_bytes": sizes[0].1, "palette_bytes": sizes[1].1, "poster_bytes": sizes[2].1, "mask_bytes": sizes[3].1, "index_bytes": head,
         "first_picture_bytes": first_picture(index), "megabits_per_second": rate,
         "moments": moments.iter().map(|m| json!({"time": m.time, "gaussians": m.gaussians, "pages": m.pages,
             "bytes": m.bytes})).collect::<Vec<_>>(),
@@ -85,6 +87,11 @@ fn section(e: &Entry) -> Value {
         v["gaussians"] = json!(e.count);
         v["span"] = json!(e.span);
         v["palette"] = json!(e.palette);
+    }
+    if e.kind == Kind::Masks {
+        v["gaussians"] = json!(e.count);
+        v["span"] = json!(e.span);
+        v["page"] = json!(e.page);
     }
     if e.kind == Kind::Palette {
         v["degree"] = json!(e.degree);

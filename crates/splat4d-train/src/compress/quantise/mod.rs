@@ -72,13 +72,7 @@ impl Quantised {
             return Err(Error::input("this scene has not been quantised yet").remedy("Run it through all stages"));
         };
         let palette = m.shared.as_mut().map(|s| s.packed().clone());
-        Ok(Pages {
-            meta,
-            layers: scene.layers.clone(),
-            labels: m.labels.clone(),
-            palette,
-            tiers: m.tiers.clone(),
-        })
+        Ok(Pages { meta, layers: scene.layers.clone(), labels: m.labels.clone(), palette, tiers: m.tiers.clone() })
     }
 
     fn memory(&self) -> MutexGuard<'_, Option<Memory>> {
@@ -175,8 +169,7 @@ fn paint(table: &mut Table<f32>, labels: &[u16], palette: &Palette, wanted: &[bo
     });
 }
 
-/// Rates with which a trained scene is tuned: those with which its training ended, times `share`, falling on. Without the
-/// groups of coefficients above degree 0 if `codec`: a palette has them then.
+/// Rates with which a trained scene is tuned: those with which its training ended, times `share`, falling on.
 pub fn tuned(groups: Vec<Group>, share: f64) -> Vec<Group> {
     let fall = |rate: Rate| Rate { start: share * rate.end, end: FALL * share * rate.end };
     groups.into_iter().map(|g| Group { rate: fall(g.rate), ..g }).collect()

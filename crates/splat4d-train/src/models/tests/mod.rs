@@ -5,6 +5,7 @@ mod edits;
 mod layers;
 mod lobes;
 mod nodes;
+mod pruned;
 mod scan;
 mod triple;
 mod wrapper;

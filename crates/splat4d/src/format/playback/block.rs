@@ -53,6 +53,19 @@ pub(super) struct Columns {
     reach: Column,
 }
 
+/// The words of a block, word by word: word k of Gaussian i is [k][i]; zero behind the last Gaussian.
+pub(super) type Words = [[u32; BLOCK_GAUSSIANS]; PAGE_WORDS];
+
+/// Words Gaussian by Gaussian, as a page has them. `rows` are at most a block.
+#[inline(always)]
+pub(super) fn turn_over(words: &Words, rows: &mut [[u32; PAGE_WORDS]]) {
+    for (i, row) in rows.iter_mut().enumerate() {
+        for k in 0..PAGE_WORDS {
+            row[k] = words[k][i];
+        }
+    }
+}
+
 /// Codes in use: multiples of `step` up to `top`.
 #[derive(Clone, Copy)]
 struct Grid {
@@ -177,12 +190,11 @@ impl Columns {
         }
     }
 
-    /// Encodes the block: its header, and the words of its Gaussians into `words`, of which there are as many.
+    /// Encodes the block: its header, and its words into `words`, which are zero.
     #[inline(always)]
-    pub(super) fn encode(&mut self, span: [f64; 2], depths: &Depths, words: &mut [[u32; PAGE_WORDS]]) -> Header {
+    pub(super) fn encode(&mut self, span: [f64; 2], depths: &Depths, words: &mut Words) -> Header {
         let n = self.rows;
-        assert!(words.len() == n && n <= BLOCK_GAUSSIANS, "a Gaussian has {PAGE_WORDS} words");
-        words.fill([0; PAGE_WORDS]);
+        assert!(n <= BLOCK_GAUSSIANS, "a block has at most {BLOCK_GAUSSIANS} Gaussians");
         let mut h: Header = [0.0; BLOCK_HEADER];
         self.encode_life(span, depths, &mut h, words);
 
@@ -190,16 +202,16 @@ impl Columns {
         for k in 0..3 {
             let values = &self.mean[k][..n];
             let [low, high] = put(&mut h, at::BOX + k, 3, grid.range(extent(values)));
-            for (w, x) in words.iter_mut().zip(values) {
-                w[k / 2] |= grid.code(*x, low, high) << (16 * (k % 2));
+            for (w, x) in words[k / 2][..n].iter_mut().zip(values) {
+                *w |= grid.code(*x, low, high) << (16 * (k % 2));
             }
         }
         let grid = Grid::new(LEVELS8, FULL8, depths.color);
         for k in 0..3 {
             let values = &self.color[k][..n];
             let [low, high] = put(&mut h, at::COLOR + k, 3, grid.range(extent(values)));
-            for (w, x) in words.iter_mut().zip(values) {
-                w[6] |= grid.code(*x, low, high) << (8 * k);
+            for (w, x) in words[6][..n].iter_mut().zip(values) {
+                *w |= grid.code(*x, low, high) << (8 * k);
             }
         }
         let grid = Grid::new(LEVELS8, FULL8, depths.scale);
@@ -210,35 +222,38 @@ impl Columns {
         }
         let [low, high] = put(&mut h, at::SCALE, 1, grid.log_range(all));
         for k in 0..3 {
-            for (w, x) in words.iter_mut().zip(&self.log_scales[k][..n]) {
-                w[2] |= grid.code(*x, low, high) << (8 * k);
+            for (w, x) in words[2][..n].iter_mut().zip(&self.log_scales[k][..n]) {
+                *w |= grid.code(*x, low, high) << (8 * k);
             }
         }
         for (bits, place, word, columns) in
-            [(depths.shift, at::SHIFT, 4, &self.velocity), (depths.turn, at::TURN, 5, &self.turn)]
+            [(depths.shift, at::SHIFT, 4, &mut self.velocity), (depths.turn, at::TURN, 5, &mut self.turn)]
         {
             let grid = Signed::new(bits);
             let mut most = 0.0;
             for k in 0..3 {
-                for i in 0..n {
-                    most = greatest((columns[k][i] * self.reach[i]).abs(), most);
+                for (x, reach) in columns[k][..n].iter_mut().zip(&self.reach[..n]) {
+                    *x *= *reach;
                 }
+                let [low, high] = extent(&columns[k][..n]);
+                most = greatest(greatest(-low, high), most);
             }
             h[place] = above(most * grid.stretch);
             let most = f64::from(h[place]);
             for k in 0..3 {
-                for (i, w) in words.iter_mut().enumerate() {
-                    let code = coarse_signed_code(columns[k][i] * self.reach[i], most, HALF10, grid.step);
-                    w[word] |= code << (10 * k);
+                for (w, x) in words[word][..n].iter_mut().zip(&columns[k][..n]) {
+                    *w |= coarse_signed_code(*x, most, HALF10, grid.step) << (10 * k);
                 }
             }
         }
         let step = Signed::new(depths.rotation).step;
-        for (i, w) in words.iter_mut().enumerate() {
+        for i in 0..n {
             let q = [self.quat[0][i], self.quat[1][i], self.quat[2][i], self.quat[3][i]];
             let (largest, codes) = coarse_quat_codes(q, HALF10, step);
-            w[3] = (largest as u32) << 30 | codes[0] << 20 | codes[1] << 10 | codes[2];
-            w[7] |= u32::from(self.label[i]);
+            words[3][i] = (largest as u32) << 30 | codes[0] << 20 | codes[1] << 10 | codes[2];
+        }
+        for (w, label) in words[7][..n].iter_mut().zip(&self.label[..n]) {
+            *w |= u32::from(*label);
         }
         h
     }
@@ -246,7 +261,7 @@ impl Columns {
     /// Life first: mean and rotation are evaluated at the centre that a reader will see, and the reach of the motion
     /// follows from the life that a reader will see.
     #[inline(always)]
-    fn encode_life(&mut self, span: [f64; 2], depths: &Depths, h: &mut Header, words: &mut [[u32; PAGE_WORDS]]) {
+    fn encode_life(&mut self, span: [f64; 2], depths: &Depths, h: &mut Header, words: &mut Words) {
         let n = self.rows;
         // From the middle of the span the reach is shortest. A turn keeps its own centre: normalize(q₀ + ½Δ(0, ω)⊗q₀) is
         // fastest there, and no other centre gives the same motion.
@@ -273,11 +288,15 @@ impl Columns {
         let [first, last] = put(h, at::CENTER, 1, centers.range(extent(&self.center[..n])));
         let [narrow, wide] = put(h, at::WIDTH, 1, width_grid.log_range(widths));
         let [sharp, soft] = put(h, at::SOFTNESS, 1, soft_grid.log_range(softness));
+        // By way of their centres' codes all Gaussians move a little.
+        for i in 0..n {
+            let center = centers.code(self.center[i], first, last);
+            words[1][i] |= center << 16;
+            self.move_to(i, quant::linear(center, first, last, LEVELS16));
+        }
         let tails = seen_widths();
         let mut alive = NOTHING;
-        for (i, w) in words.iter_mut().enumerate() {
-            let center = centers.code(self.center[i], first, last);
-            self.move_to(i, quant::linear(center, first, last, LEVELS16));
+        for i in 0..n {
             let opacity = opacity_code(self.opacity[i], opacity_step);
             let (mut width, mut softness, mut life) = (FOR_EVER, 0, None);
             if self.log_width[i] < f64::INFINITY {
@@ -290,16 +309,18 @@ impl Columns {
             // A Gaussian that never reaches 1/255 is alive at no time.
             let tail = tails[opacity as usize];
             if tail >= 0.0 {
-                let [from, to] = life.map_or(span, |[width, softness]| {
-                    let seen = (width + softness * tail) * (1.0 + SLACK) + SLACK;
-                    [self.center[i] - seen, self.center[i] + seen]
-                });
-                alive = [alive[0].min(from), alive[1].max(to)];
+                let [from, to] = match life {
+                    Some([width, softness]) => {
+                        let seen = (width + softness * tail) * (1.0 + SLACK) + SLACK;
+                        [self.center[i] - seen, self.center[i] + seen]
+                    }
+                    None => span,
+                };
+                alive = [least(from, alive[0]), greatest(to, alive[1])];
             }
-            w[1] |= center << 16;
-            w[2] |= opacity << 24;
-            w[6] |= width << 24;
-            w[7] |= softness << 16;
+            words[2][i] |= opacity << 24;
+            words[6][i] |= width << 24;
+            words[7][i] |= softness << 16;
         }
         // A block of which nothing is ever seen is alive at no more than an instant.
         let alive = if alive[0] <= alive[1] { alive } else { [first; 2] };
@@ -374,7 +395,10 @@ impl Kernel for OfPrimitives<'_> {
 
     #[inline(always)]
     fn run<const FMA: bool>(self) -> Header {
-        Columns::of_primitives(self.rows, self.span).encode(self.span, self.depths, self.words)
+        let mut words = [[0; BLOCK_GAUSSIANS]; PAGE_WORDS];
+        let header = Columns::of_primitives(self.rows, self.span).encode(self.span, self.depths, &mut words);
+        turn_over(&words, self.words);
+        header
     }
 }
 

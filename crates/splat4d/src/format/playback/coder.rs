@@ -1,7 +1,7 @@
 //! What a reader would see of layers that are pages, without the way through a file: for training against the numbers
 //! that will be drawn (straight-through quantisation).
 
-use super::block::Header;
+use super::block::{Header, Words};
 use super::layer::{TABLES, columns, decode, keys, paint};
 use super::{BLOCK_GAUSSIANS, Depths, PAGE_WORDS, Palette};
 use crate::layers::Layer;
@@ -76,8 +76,8 @@ pub(super) struct Rows<'a> {
 pub(super) struct Encode<'a> {
     pub source: Rows<'a>,
     pub depths: &'a Depths,
-    /// As many as there are rows.
-    pub words: &'a mut [[u32; PAGE_WORDS]],
+    /// Zero before.
+    pub words: &'a mut Words,
 }
 
 impl Kernel for Encode<'_> {
@@ -102,11 +102,10 @@ impl Kernel for Show<'_, '_> {
 
     #[inline(always)]
     fn run<const FMA: bool>(self) {
-        let mut words = [[0; PAGE_WORDS]; BLOCK_GAUSSIANS];
-        let words = &mut words[..self.source.count];
-        let (span, first) = (self.source.layer.span, self.source.first);
-        let header = Encode { source: self.source, depths: self.depths, words }.run::<FMA>();
-        decode(&header, words, span, first, self.tables);
+        let mut words = [[0; BLOCK_GAUSSIANS]; PAGE_WORDS];
+        let Rows { layer, first, count, .. } = self.source;
+        let header = Encode { source: self.source, depths: self.depths, words: &mut words }.run::<FMA>();
+        decode(&header, &words, layer.span, first..first + count, self.tables);
     }
 }
 

@@ -14,6 +14,9 @@ pub(super) const MAX_SECTIONS: usize = 1_000_000;
 pub(super) const MAX_DEFLATE: u64 = 1032;
 /// A page that has base colours only.
 pub(super) const NO_PALETTE: u32 = u32::MAX;
+/// Bytes of masks before their key times, and most of these (docs/format.md, "Masks").
+pub(super) const MASK_HEAD: usize = 8;
+pub(super) const MAX_KEYS: usize = 65_535;
 /// Flag of an entry: who does not know the kind refuses the file.
 const REQUIRED: u32 = 1;
 
@@ -24,6 +27,8 @@ pub enum Kind {
     Page,
     /// Spherical harmonics above degree 0.
     Palette,
+    /// Which Gaussians of a page are worth drawing when.
+    Masks,
     /// A picture.
     Poster,
     /// Something newer, which is skipped.
@@ -35,13 +40,15 @@ impl Kind {
         match self {
             Kind::Page => *b"PAGE",
             Kind::Palette => *b"PALT",
+            Kind::Masks => *b"MASK",
             Kind::Poster => *b"POST",
             Kind::Other(tag) => tag,
         }
     }
 
     fn of(tag: [u8; 4]) -> Self {
-        [Kind::Page, Kind::Palette, Kind::Poster].into_iter().find(|k| k.tag() == tag).unwrap_or(Kind::Other(tag))
+        let known = [Kind::Page, Kind::Palette, Kind::Masks, Kind::Poster];
+        known.into_iter().find(|k| k.tag() == tag).unwrap_or(Kind::Other(tag))
     }
 
     /// The four characters that the file has, others as dots.
@@ -92,12 +99,14 @@ pub struct Entry {
     pub tier: u16,
     /// Palette: the degree of its spherical harmonics, 1 to 3.
     pub degree: u16,
-    /// Page: Gaussians. Palette: entries.
+    /// Page: Gaussians. Palette: entries. Masks: Gaussians of their page.
     pub count: u32,
-    /// Page: it is drawn for from ≤ t < to, seconds.
+    /// Page: it is drawn for from ≤ t < to, seconds. Masks: first and last key time.
     pub span: [f64; 2],
     /// Page: place of its palette in the table of sections; none: base colour only.
     pub palette: Option<u32>,
+    /// Masks: place of their page in the table of sections.
+    pub page: Option<u32>,
 }
 
 /// The start of a file, understood and checked.
@@ -181,6 +190,14 @@ impl Index {
         self.sections.iter().enumerate().filter(|(_, e)| e.kind == Kind::Page)
     }
 
+    /// Pages that have masks, and the sections of these, by page.
+    pub(crate) fn masks(&self) -> Vec<(u32, usize)> {
+        let sections = self.sections.iter().enumerate().filter(|(_, e)| e.kind == Kind::Masks);
+        let mut all: Vec<(u32, usize)> = sections.filter_map(|(i, e)| Some((e.page?, i))).collect();
+        all.sort_unstable();
+        all
+    }
+
     /// What ties sections to each other and to the file.
     fn check(&self, first_byte: u64) -> Result<()> {
         let mut order: Vec<usize> = (0..self.sections.len()).collect();
@@ -194,6 +211,17 @@ impl Index {
                 return Err(broken("it overlaps another".into()).at(format!("section {i}")));
             }
             free = end;
+        }
+        for pair in self.masks().windows(2).filter(|pair| pair[0].0 == pair[1].0) {
+            let what = format!("section {} has masks already", pair[0].0);
+            return Err(broken(what).at(format!("section {}", pair[1].1)));
+        }
+        for (page, i) in self.masks() {
+            let count = self.sections[i].count;
+            if self.sections.get(page as usize).is_none_or(|e| e.kind != Kind::Page || e.count != count) {
+                let what = format!("its page, section {page}, is none of {count} Gaussians");
+                return Err(broken(what).at(format!("section {i}")));
+            }
         }
         let mut gaussians = 0u64;
         for (i, page) in self.pages() {
@@ -308,6 +336,7 @@ impl Entry {
             count: u32_at(32),
             span: [f64::from_bits(u64_at(40)), f64::from_bits(u64_at(48))],
             palette: Some(u32_at(56)).filter(|&p| kind == Kind::Page && p != NO_PALETTE),
+            page: Some(u32_at(56)).filter(|_| kind == Kind::Masks),
         };
         if let Kind::Other(_) = kind {
             if required {
@@ -356,6 +385,15 @@ impl Entry {
                     return Err(broken(format!("a palette of {count} entries does not have {} bytes", self.bytes)));
                 }
             }
+            Kind::Masks => {
+                if !(1..=MAX_PAGE_GAUSSIANS).contains(&count) || mask_keys(count, self.bytes as usize).is_none() {
+                    return Err(broken(format!("masks of {count} Gaussians do not have {} bytes", self.bytes)));
+                }
+                if !(self.span.iter().all(|t| t.is_finite()) && self.span[0] <= self.span[1]) {
+                    let [from, to] = self.span;
+                    return Err(broken(format!("key times cannot go from {from} to {to} s")));
+                }
+            }
             Kind::Poster | Kind::Other(_) => {}
         }
         Ok(())
@@ -375,8 +413,12 @@ impl Entry {
         out.extend_from_slice(&self.count.to_le_bytes());
         out.extend_from_slice(&words.to_le_bytes());
         self.span.iter().for_each(|t| out.extend_from_slice(&t.to_le_bytes()));
-        let palette = if self.kind == Kind::Page { self.palette.unwrap_or(NO_PALETTE) } else { 0 };
-        out.extend_from_slice(&palette.to_le_bytes());
+        let other = match self.kind {
+            Kind::Page => self.palette.unwrap_or(NO_PALETTE),
+            Kind::Masks => self.page.expect("masks are those of a page"),
+            _ => 0,
+        };
+        out.extend_from_slice(&other.to_le_bytes());
         out.resize(start + ENTRY_BYTES, 0);
     }
 }
@@ -389,6 +431,12 @@ pub(super) fn page_bytes(gaussians: usize) -> usize {
 /// Decoded bytes of a palette.
 pub(super) fn palette_bytes(degree: usize, entries: usize) -> usize {
     12 + 3 * (sh::coeffs(degree) - 1) * entries
+}
+
+/// Key times of the masks of so many Gaussians, whose decoded bytes are so many; none where no number fits.
+pub(super) fn mask_keys(gaussians: usize, bytes: usize) -> Option<usize> {
+    let (rest, key) = (bytes.checked_sub(MASK_HEAD)?, 8 + gaussians.div_ceil(8));
+    (rest.is_multiple_of(key) && (1..=MAX_KEYS).contains(&(rest / key))).then_some(rest / key)
 }
 
 /// CRC-32 as in zip.

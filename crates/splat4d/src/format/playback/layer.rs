@@ -1,10 +1,12 @@
 //! A page as a layer of a scene, so that everything that draws scenes draws playback files; and such a layer as a page.
 
-use super::block::{Columns, Header, NO_WIDTH, SHARPEST};
+use super::block::{Columns, Header, NO_WIDTH, SHARPEST, Words};
 use super::index::broken;
-use super::page::{Coded, FULL8, LEVELS8, MAX_LOG, THINNEST, lives_through, rate};
+use super::page::{self, at, half_width, lives_through, reach};
+use super::page::{FOR_EVER as FULL_LIFE, FULL8, FULL10, HALF10, LEVELS8, LEVELS16, MAX_LOG, THINNEST, WIDTH_LEVELS};
 use super::{BLOCK_GAUSSIANS, PAGE_WORDS, Page, Palette, Primitive};
 use crate::Result;
+use crate::format::quant;
 use crate::layers::Layer;
 use crate::math::{Real, quat, sh};
 use crate::motion::spacetime::{ROTATION_RATES, VELOCITIES};
@@ -12,8 +14,10 @@ use crate::motion::{Spacetime, SpacetimeSpec, Spec};
 use crate::scene::life::{CENTER, LOG_SOFTNESS, LOG_WIDTH};
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::table::TableMut;
-use crate::scene::{GEOMETRY, Key, LIFE, LifeKind, Params, SH, Table};
-use crate::simd::{Kernel, Simd, dispatch, greatest};
+use crate::scene::{BLOCK, GEOMETRY, Key, LIFE, LifeKind, Params, SH, Table};
+use crate::simd::{Kernel, Simd, dispatch, each, greatest};
+use std::f64::consts::FRAC_1_SQRT_2;
+use std::ops::Range;
 use std::sync::{Arc, LazyLock};
 
 /// Half-width of Gaussians that live for ever, seconds: thirty years, in whose middle f32 is exact.
@@ -38,6 +42,7 @@ struct Constants {
     no_width: f64,
     sharpest: f64,
     thinnest: f64,
+    about: f64,
 }
 
 #[inline(always)]
@@ -54,6 +59,7 @@ fn constants() -> &'static Constants {
             no_width: NO_WIDTH.ln(),
             sharpest: SHARPEST.ln(),
             thinnest: THINNEST.ln(),
+            about: ABOUT.ln(),
         }
     });
     &CONSTANTS
@@ -94,7 +100,13 @@ impl Page {
         for (k, (header, words)) in self.headers.iter().zip(self.words.chunks(BLOCK_GAUSSIANS)).enumerate() {
             let first = k * BLOCK_GAUSSIANS;
             let labels = &labels[first..first + words.len()];
-            dispatch(Simd::detect(), Decode { header, words, span: self.span, first, tables: &mut tables });
+            let mut columns = [[0; BLOCK_GAUSSIANS]; PAGE_WORDS];
+            for (i, row) in words.iter().enumerate() {
+                (0..PAGE_WORDS).for_each(|k| columns[k][i] = row[k]);
+            }
+            let rows = first..first + words.len();
+            let decode = Decode { header, words: &columns, span: self.span, rows, tables: &mut tables };
+            dispatch(Simd::detect(), decode);
             paint(labels, palette, first, &mut tables[1]);
         }
         Ok(Layer { name: "page".into(), params, motion: Arc::new(motion), life, span: self.span, masks: None })
@@ -106,12 +118,12 @@ impl Page {
     }
 }
 
-/// Decodes a block into the tables of its layer, from row `first` on; all but what the palette gives.
+/// Decodes a block into rows of the tables of its layer; all but what the palette gives.
 struct Decode<'a, 'b> {
     header: &'a Header,
-    words: &'a [[u32; PAGE_WORDS]],
+    words: &'a Words,
     span: [f64; 2],
-    first: usize,
+    rows: Range<usize>,
     tables: &'a mut [TableMut<'b, f32>; TABLES],
 }
 
@@ -120,46 +132,112 @@ impl Kernel for Decode<'_, '_> {
 
     #[inline(always)]
     fn run<const FMA: bool>(self) {
-        decode(self.header, self.words, self.span, self.first, self.tables);
+        decode(self.header, self.words, self.span, self.rows, self.tables);
     }
 }
 
-/// See [`Decode`].
+/// A number of sixteen rows.
+type Lane = [f64; BLOCK];
+
+/// Writes sixteen numbers of a column, or as many as there are rows. `row` is the first of a block of the table.
+#[inline(always)]
+fn store(view: &mut TableMut<'_, f32>, row: usize, col: usize, count: usize, values: Lane) {
+    let first = ((row - view.first) / BLOCK * view.width + col) * BLOCK;
+    let values: [f32; BLOCK] = each(|l| values[l] as f32);
+    if count >= BLOCK {
+        view.data[first..first + BLOCK].copy_from_slice(&values);
+    } else {
+        view.data[first..first + count].copy_from_slice(&values[..count]);
+    }
+}
+
+/// See [`Decode`]. The numbers are those of [`Page::record`], sixteen Gaussians at a time, with logarithms where the
+/// layer has logarithms.
 #[inline(always)]
 pub(super) fn decode(
     header: &Header,
-    words: &[[u32; PAGE_WORDS]],
+    words: &Words,
     span: [f64; 2],
-    first: usize,
+    rows: Range<usize>,
     [geometry, colors, lives, velocities, rates]: &mut [TableMut<'_, f32>; TABLES],
 ) {
     let constants = constants();
-    for (i, w) in words.iter().enumerate() {
-        let (row, c) = (first + i, Coded::new(header, w, span));
-        let [x, y, z] = c.mean;
-        geometry.write(row, 0, [x as f32, y as f32, z as f32]);
-        let [qw, qx, qy, qz] = c.quat;
-        geometry.write(row, QUAT, [qw as f32, qx as f32, qy as f32, qz as f32]);
-        let [sx, sy, sz] = c.log_scales;
-        geometry.write(row, LOG_SCALE, [sx as f32, sy as f32, sz as f32]);
-        geometry.write(row, OPACITY, [constants.logits[c.opacity as usize & 255]]);
-        let [r, g, b] = c.base_color;
-        colors.write(row, 0, [sh::rgb_to_dc(r) as f32, sh::rgb_to_dc(g) as f32, sh::rgb_to_dc(b) as f32]);
-        let width = if c.half_width == 0.0 {
-            constants.instant
-        } else if c.half_width == f64::INFINITY {
-            constants.for_ever
-        } else {
-            c.log_width.clamp(constants.instant, constants.for_ever)
+    let range = |at: usize, step: usize| (f64::from(header[at]), f64::from(header[at + step]));
+    let most = |at: usize| f64::from(header[at]);
+    for row in rows.clone().step_by(BLOCK) {
+        let (at, count) = (row - rows.start, rows.end - row);
+        let word: [[u32; BLOCK]; PAGE_WORDS] = each(|k| each(|l| words[k][at + l]));
+        let eight = |word: &[u32; BLOCK], first: u32, (low, high): (f64, f64)| -> Lane {
+            each(|l| quant::linear(word[l] >> first & LEVELS8, low, high, LEVELS8))
         };
-        lives.write(row, 0, [c.center as f32, width as f32, c.log_softness as f32]);
-        let [vx, vy, vz] = c.velocity;
-        velocities.write(row, 0, [slow(vx) as f32, slow(vy) as f32, slow(vz) as f32]);
-        let [tx, ty, tz] = c.turn;
-        let [rw, rx, ry, rz] = rate(c.quat, [slow(tx), slow(ty), slow(tz)]);
-        rates.write(row, 0, [rw as f32, rx as f32, ry as f32, rz as f32]);
+        let sixteen = |word: &[u32; BLOCK], first: u32, (low, high): (f64, f64)| -> Lane {
+            each(|l| quant::linear(word[l] >> first & LEVELS16, low, high, LEVELS16))
+        };
+        let ten = |word: &[u32; BLOCK], first: u32, most: f64| -> Lane {
+            each(|l| quant::signed(word[l] >> first & TEN, most, HALF10))
+        };
+        store(geometry, row, 0, count, sixteen(&word[0], 0, range(at::BOX, 3)));
+        store(geometry, row, 1, count, sixteen(&word[0], 16, range(at::BOX + 1, 3)));
+        store(geometry, row, 2, count, sixteen(&word[1], 0, range(at::BOX + 2, 3)));
+        for k in 0..3 {
+            store(geometry, row, LOG_SCALE + k, count, eight(&word[2], 8 * k as u32, range(at::SCALE, 1)));
+            let color = eight(&word[6], 8 * k as u32, range(at::COLOR + k, 3));
+            store(colors, row, k, count, each(|l| sh::rgb_to_dc(color[l])));
+        }
+        let logits = each(|l| f64::from(constants.logits[(word[2][l] >> 24) as usize]));
+        store(geometry, row, OPACITY, count, logits);
+
+        // The life, and the reach that follows from it.
+        store(lives, row, CENTER, count, sixteen(&word[1], 16, range(at::CENTER, 1)));
+        let log_softness = eight(&word[7], 16, range(at::SOFTNESS, 1));
+        store(lives, row, LOG_SOFTNESS, count, log_softness);
+        let (narrow, wide) = range(at::WIDTH, 1);
+        let (mut log_width, mut along) = ([0.0; BLOCK], [0.0; BLOCK]);
+        for l in 0..BLOCK.min(count) {
+            let code = word[6][l] >> 24;
+            let life = match code {
+                FULL_LIFE => None,
+                _ => Some([half_width(code, narrow, wide), log_softness[l].exp()]),
+            };
+            along[l] = reach(life, span);
+            log_width[l] = match code {
+                0 => constants.instant,
+                FULL_LIFE => constants.for_ever,
+                _ => {
+                    let log = quant::linear(code - 1, narrow, wide, WIDTH_LEVELS);
+                    log.clamp(constants.instant, constants.for_ever)
+                }
+            };
+        }
+        store(lives, row, LOG_WIDTH, count, log_width);
+
+        let component = |first: u32| ten(&word[3], first, FRAC_1_SQRT_2);
+        let (a, b, c) = (component(20), component(10), component(0));
+        let motion = |word: &[u32; BLOCK], first: u32, at: usize| -> Lane {
+            let distance = ten(word, first, most(at));
+            each(|l| slow(distance[l] / along[l]))
+        };
+        let turn: [Lane; 3] = each(|k| motion(&word[5], 10 * k as u32, at::TURN));
+        let (mut quat, mut rate) = ([[0.0; BLOCK]; 4], [[0.0; BLOCK]; 4]);
+        for l in 0..BLOCK {
+            let q = quant::quat_of(word[3][l] >> 30, a[l], b[l], c[l]);
+            let r = page::rate(q, [turn[0][l], turn[1][l], turn[2][l]]);
+            for k in 0..4 {
+                (quat[k][l], rate[k][l]) = (q[k], r[k]);
+            }
+        }
+        for k in 0..3 {
+            store(velocities, row, k, count, motion(&word[4], 10 * k as u32, at::SHIFT));
+        }
+        for k in 0..4 {
+            store(geometry, row, QUAT + k, count, quat[k]);
+            store(rates, row, k, count, rate[k]);
+        }
     }
 }
+
+/// Ten bits.
+const TEN: u32 = (1 << FULL10) - 1;
 
 #[inline(always)]
 fn slow(x: f64) -> f64 {
@@ -188,46 +266,57 @@ pub(super) fn columns(
     let mut c = Columns::new(rows);
     let (geometry, colors, lives) = (&layer.params[GEOMETRY], &layer.params[SH], &layer.params[LIFE]);
     let (velocities, rates) = (&layer.params[velocities], &layer.params[rates]);
-    let about = ABOUT.ln();
-    for i in 0..rows {
-        let row = first + i;
-        let [x, y, z] = geometry.read::<3>(row, 0);
-        let [qw, qx, qy, qz] = geometry.read::<4>(row, QUAT);
-        let [w0, w1, w2, w3] = rates.read::<4>(row, 0);
-        let q = [f64::from(qw), f64::from(qx), f64::from(qy), f64::from(qz)];
-        let (q, norm) = quat::normalize(q);
-        // The layer turns a quaternion of any length, the file one of length 1.
-        let inverse = if norm > 0.0 { 1.0 / norm } else { 0.0 };
-        let turn = angular(q, [f64::from(w0), f64::from(w1), f64::from(w2), f64::from(w3)]);
-        for k in 0..4 {
-            c.quat[k][i] = q[k];
-        }
-        let (mean, v) = ([x, y, z], velocities.read::<3>(row, 0));
-        let [sx, sy, sz] = geometry.read::<3>(row, LOG_SCALE);
-        let scales = [f64::from(sx), f64::from(sy), f64::from(sz)];
-        let thin = greatest(scales[0], greatest(scales[1], scales[2])) + constants.thinnest;
-        let dc = colors.read::<3>(row, 0);
-        for k in 0..3 {
-            c.mean[k][i] = f64::from(mean[k]);
-            c.velocity[k][i] = f64::from(v[k]);
-            c.turn[k][i] = turn[k] * inverse;
-            c.log_scales[k][i] = greatest(scales[k], thin).clamp(-MAX_LOG, MAX_LOG);
-            c.color[k][i] = sh::dc_to_rgb(f64::from(dc[k]));
-        }
-        c.opacity[i] = f64::from(geometry.get(row, OPACITY)).sigmoid();
-        let life = lives.read::<3>(row, 0);
-        let (center, log_width) = (f64::from(life[CENTER]), f64::from(life[LOG_WIDTH]));
-        let softness = greatest(f64::from(life[LOG_SOFTNESS]), constants.sharpest).clamp(-MAX_LOG, MAX_LOG);
-        c.center[i] = center;
-        c.log_softness[i] = softness;
-        let always = log_width >= constants.for_ever - about || lives_through(center, log_width.exp(), layer.span);
-        c.log_width[i] = if always {
-            f64::INFINITY
-        } else if log_width < softness + constants.no_width || log_width <= constants.instant + about {
-            f64::NEG_INFINITY
-        } else {
-            log_width.clamp(-MAX_LOG, MAX_LOG)
+    let tables = [geometry, colors, lives, velocities, rates];
+    for at in (0..rows).step_by(BLOCK) {
+        // Numbers behind the last row are read as well, and not looked at again.
+        let [geometry, colors, lives, velocities, rates]: [&[f32]; TABLES] =
+            [0, 1, 2, 3, 4].map(|k| tables[k].block((first + at) / BLOCK));
+        let lane = |block: &[f32], col: usize| -> Lane {
+            let values = &block[col * BLOCK..(col + 1) * BLOCK];
+            each(|l| f64::from(values[l]))
         };
+        let raw: [Lane; 4] = each(|k| lane(geometry, QUAT + k));
+        let rate: [Lane; 4] = each(|k| lane(rates, k));
+        let scales: [Lane; 3] = each(|k| lane(geometry, LOG_SCALE + k));
+        for l in 0..BLOCK {
+            let (q, norm) = quat::normalize([raw[0][l], raw[1][l], raw[2][l], raw[3][l]]);
+            // The layer turns a quaternion of any length, the file one of length 1.
+            let inverse = if norm > 0.0 { 1.0 / norm } else { 0.0 };
+            let turn = angular(q, [rate[0][l], rate[1][l], rate[2][l], rate[3][l]]);
+            let thin = greatest(scales[0][l], greatest(scales[1][l], scales[2][l])) + constants.thinnest;
+            for k in 0..4 {
+                c.quat[k][at + l] = q[k];
+            }
+            for k in 0..3 {
+                c.turn[k][at + l] = turn[k] * inverse;
+                c.log_scales[k][at + l] = greatest(scales[k][l], thin).clamp(-MAX_LOG, MAX_LOG);
+            }
+        }
+        for k in 0..3 {
+            c.mean[k][at..at + BLOCK].copy_from_slice(&lane(geometry, k));
+            c.velocity[k][at..at + BLOCK].copy_from_slice(&lane(velocities, k));
+            let dc = lane(colors, k);
+            let color: Lane = each(|l| sh::dc_to_rgb(dc[l]));
+            c.color[k][at..at + BLOCK].copy_from_slice(&color);
+        }
+        let (centers, widths, softness) = (lane(lives, CENTER), lane(lives, LOG_WIDTH), lane(lives, LOG_SOFTNESS));
+        let logits = lane(geometry, OPACITY);
+        for l in 0..BLOCK.min(rows - at) {
+            c.opacity[at + l] = logits[l].sigmoid();
+            let softness = greatest(softness[l], constants.sharpest).clamp(-MAX_LOG, MAX_LOG);
+            c.center[at + l] = centers[l];
+            c.log_softness[at + l] = softness;
+            let width = widths[l];
+            let always =
+                width >= constants.for_ever - constants.about || lives_through(centers[l], width.exp(), layer.span);
+            c.log_width[at + l] = if always {
+                f64::INFINITY
+            } else if width < softness + constants.no_width || width <= constants.instant + constants.about {
+                f64::NEG_INFINITY
+            } else {
+                width.clamp(-MAX_LOG, MAX_LOG)
+            };
+        }
     }
     c.label[..labels.len()].copy_from_slice(labels);
     c

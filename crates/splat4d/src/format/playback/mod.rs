@@ -7,9 +7,11 @@
 mod block;
 mod cluster;
 mod coder;
+mod deflate;
 mod depths;
 mod index;
 mod layer;
+mod mask;
 mod meta;
 mod order;
 mod page;
@@ -24,6 +26,7 @@ pub use coder::Coder;
 pub use depths::{Depths, LEAST_DEPTH};
 pub use index::{Codec, Entry, Index, Kind};
 pub use layer::primitives;
+pub use mask::decode_masks;
 pub use meta::{Meta, NamedCamera, PathKey, Viewpoint};
 pub use page::{Page, Record, decode_page};
 pub use pages::{Pages, PagesDraft, read_pages, write_pages};
@@ -33,8 +36,10 @@ pub use write::{ErrorStat, Errors, Summary, WriteConfig, write};
 
 /// First bytes of a playback file.
 pub const MAGIC: [u8; 8] = *b"\x89S4D\r\n\x1a\n";
-/// The version that this library writes: major, minor.
-pub const VERSION: [u16; 2] = [1, 0];
+/// The version that this library knows: major, minor. A file states the least that has all it holds.
+pub const VERSION: [u16; 2] = [1, 1];
+/// The version of a file without masks.
+const FIRST_VERSION: [u16; 2] = [1, 0];
 /// Bytes of the header.
 pub const HEADER_BYTES: usize = 64;
 /// Gaussians in a block, which share ranges.

@@ -207,61 +207,6 @@ pub(super) fn half_width(code: u32, low: f64, high: f64) -> f64 {
     }
 }
 
-/// A Gaussian as its header and words say it, with logarithms where they have logarithms.
-pub(super) struct Coded {
-    pub mean: [f64; 3],
-    pub center: f64,
-    /// Half-width, seconds: 0, infinite, or the exponential of what the file has.
-    pub half_width: f64,
-    /// Its logarithm, where it is neither zero nor infinite.
-    pub log_width: f64,
-    pub log_softness: f64,
-    pub softness: f64,
-    pub quat: [f64; 4],
-    pub log_scales: [f64; 3],
-    /// Of 255.
-    pub opacity: u32,
-    pub velocity: [f64; 3],
-    pub turn: [f64; 3],
-    pub base_color: [f64; 3],
-    pub label: u16,
-}
-
-impl Coded {
-    #[inline(always)]
-    pub(super) fn new(h: &[f32; BLOCK_HEADER], w: &[u32; PAGE_WORDS], span: [f64; 2]) -> Self {
-        let bits = |word: usize, first: u32, count: u32| w[word] >> first & ((1 << count) - 1);
-        let line = |at: usize, step: usize, code: u32, levels: u32| {
-            quant::linear(code, f64::from(h[at]), f64::from(h[at + step]), levels)
-        };
-        let width = bits(6, 24, 8);
-        let half_width = half_width(width, f64::from(h[at::WIDTH]), f64::from(h[at::WIDTH + 1]));
-        let log_softness = line(at::SOFTNESS, 1, bits(7, 16, 8), LEVELS8);
-        let softness = log_softness.exp();
-        let reach = reach((width != FOR_EVER).then_some([half_width, softness]), span);
-        let motion =
-            |word: usize, at: usize, k: u32| quant::signed(bits(word, 10 * k, 10), f64::from(h[at]), HALF10) / reach;
-        let mean = |k: usize| line(at::BOX + k, 3, bits(k / 2, 16 * (k as u32 % 2), 16), LEVELS16);
-        let log_scale = |k: u32| line(at::SCALE, 1, bits(2, 8 * k, 8), LEVELS8);
-        let color = |k: usize| line(at::COLOR + k, 3, bits(6, 8 * k as u32, 8), LEVELS8);
-        Self {
-            mean: [mean(0), mean(1), mean(2)],
-            center: line(at::CENTER, 1, bits(1, 16, 16), LEVELS16),
-            half_width,
-            log_width: line(at::WIDTH, 1, width.saturating_sub(1), WIDTH_LEVELS),
-            log_softness,
-            softness,
-            quat: quant::quat(bits(3, 30, 2) as usize, [bits(3, 20, 10), bits(3, 10, 10), bits(3, 0, 10)], HALF10),
-            log_scales: [log_scale(0), log_scale(1), log_scale(2)],
-            opacity: bits(2, 24, 8),
-            velocity: [motion(4, at::SHIFT, 0), motion(4, at::SHIFT, 1), motion(4, at::SHIFT, 2)],
-            turn: [motion(5, at::TURN, 0), motion(5, at::TURN, 1), motion(5, at::TURN, 2)],
-            base_color: [color(0), color(1), color(2)],
-            label: bits(7, 0, 16) as u16,
-        }
-    }
-}
-
 impl Page {
     /// Gaussians.
     pub fn len(&self) -> usize {
@@ -275,19 +220,29 @@ impl Page {
 
     /// Gaussian i in numbers. Panics: there are fewer.
     pub fn record(&self, i: usize) -> Record {
-        let c = Coded::new(&self.headers[i / BLOCK_GAUSSIANS], &self.words[i], self.span);
+        let (h, w) = (&self.headers[i / BLOCK_GAUSSIANS], &self.words[i]);
+        let bits = |word: usize, first: u32, count: u32| w[word] >> first & ((1 << count) - 1);
+        let line = |at: usize, step: usize, code: u32, levels: u32| {
+            quant::linear(code, f64::from(h[at]), f64::from(h[at + step]), levels)
+        };
+        let half_width = half_width(bits(6, 24, 8), f64::from(h[at::WIDTH]), f64::from(h[at::WIDTH + 1]));
+        let softness = line(at::SOFTNESS, 1, bits(7, 16, 8), LEVELS8).exp();
+        let reach = reach(half_width.is_finite().then_some([half_width, softness]), self.span);
+        let motion = |word: usize, at: usize| {
+            std::array::from_fn(|k| quant::signed(bits(word, 10 * k as u32, 10), f64::from(h[at]), HALF10) / reach)
+        };
         Record {
-            mean: c.mean,
-            center: c.center,
-            half_width: c.half_width,
-            softness: c.softness,
-            quat: c.quat,
-            scales: c.log_scales.map(f64::exp),
-            opacity: f64::from(c.opacity) / f64::from(LEVELS8),
-            velocity: c.velocity,
-            turn: c.turn,
-            base_color: c.base_color,
-            label: c.label,
+            mean: std::array::from_fn(|k| line(at::BOX + k, 3, bits(k / 2, 16 * (k as u32 % 2), 16), LEVELS16)),
+            center: line(at::CENTER, 1, bits(1, 16, 16), LEVELS16),
+            half_width,
+            softness,
+            quat: quant::quat(bits(3, 30, 2) as usize, [20, 10, 0].map(|first| bits(3, first, 10)), HALF10),
+            scales: std::array::from_fn(|k| line(at::SCALE, 1, bits(2, 8 * k as u32, 8), LEVELS8).exp()),
+            opacity: f64::from(bits(2, 24, 8)) / f64::from(LEVELS8),
+            velocity: motion(4, at::SHIFT),
+            turn: motion(5, at::TURN),
+            base_color: std::array::from_fn(|k| line(at::COLOR + k, 3, bits(6, 8 * k as u32, 8), LEVELS8)),
+            label: bits(7, 0, 16) as u16,
         }
     }
 }

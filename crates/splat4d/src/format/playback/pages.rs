@@ -1,6 +1,7 @@
 //! A playback file taken apart into layers that can be changed, and put together again: the same pages, rows in the same
 //! order, labels and palette as they are.
 
+use super::block::turn_over;
 use super::coder::{Encode, Rows};
 use super::layer::keys;
 use super::page::page_of;
@@ -48,7 +49,8 @@ impl Pages {
 pub struct PagesDraft<'a> {
     /// About the scene; `gaussians` is counted by the writer.
     pub meta: &'a Meta,
-    /// One a page with its span, in the order of the file. A layer without rows is left out.
+    /// One a page with its span and, where it has some, its masks, in the order of the file. A layer without rows is left
+    /// out.
     pub layers: &'a [Layer<f32>],
     /// Of every layer its rows' entries of the palette.
     pub labels: &'a [Vec<u16>],
@@ -106,7 +108,8 @@ pub fn write_pages(draft: &PagesDraft<'_>, config: &WriteConfig, out: &mut dyn W
     let first =
         |i: &&usize| draft.tiers[**i] == 0 && draft.layers[**i].span[0] <= start && start < draft.layers[**i].span[1];
     let before = pages.iter().take_while(first).count();
-    let palette_at = draft.palette.map(|_| (file.file.sections.len() + before) as u32);
+    let masked = pages[..before].iter().filter(|i| draft.layers[**i].masks.is_some()).count();
+    let palette_at = draft.palette.map(|_| (file.file.sections.len() + before + masked) as u32);
     for place in 0..=pages.len() {
         if let Some(p) = draft.palette.filter(|_| place == before) {
             file.palette(p);
@@ -118,6 +121,9 @@ pub fn write_pages(draft: &PagesDraft<'_>, config: &WriteConfig, out: &mut dyn W
         let entry =
             PageEntry { tier: draft.tiers[i], count: layer.params.len(), span: layer.span, palette: palette_at };
         file.page(body, &entry);
+        if let Some(masks) = &layer.masks {
+            file.masks(masks).map_err(|e| e.at(format!("layer {i}")))?;
+        }
     }
     file.finish(out)
 }
@@ -130,7 +136,10 @@ fn encode(layer: &Layer<f32>, labels: &[u16], config: &WriteConfig) -> Vec<u8> {
         let (first, count) = (k * BLOCK_GAUSSIANS, words.len());
         let labels = labels.get(first..first + count).unwrap_or(&[]);
         let source = Rows { layer, keys, labels, first, count };
-        dispatch(Simd::detect(), Encode { source, depths: &config.depths, words })
+        let mut columns = [[0; BLOCK_GAUSSIANS]; PAGE_WORDS];
+        let header = dispatch(Simd::detect(), Encode { source, depths: &config.depths, words: &mut columns });
+        turn_over(&columns, words);
+        header
     };
     let headers: Vec<_> = words.par_chunks_mut(BLOCK_GAUSSIANS).enumerate().map(block).collect();
     page_of(&headers, &words)
@@ -145,6 +154,9 @@ fn check(layer: &Layer<f32>, draft: &PagesDraft<'_>, i: usize) -> Result<()> {
     if rows > MAX_PAGE_GAUSSIANS {
         return Err(Error::input(format!("{rows} Gaussians in one page"))
             .remedy(format!("A page holds {MAX_PAGE_GAUSSIANS}; bake the scene again")));
+    }
+    if let Some(masks) = layer.masks.as_ref().filter(|m| m.rows() != rows) {
+        return Err(Error::input(format!("masks of {} Gaussians for {rows}", masks.rows())));
     }
     for key in keys.into_iter().filter(|k| *k != SH) {
         if let Some((row, _)) = layer.params[key].first_non_finite() {

@@ -1,9 +1,10 @@
 //! A whole playback file as a scene.
 
 use super::index::broken;
-use super::{Index, Kind, Meta, Palette, decode_page, decode_palette};
+use super::{Index, Kind, Meta, Palette, decode_masks, decode_page, decode_palette};
 use crate::layers::{Head, Layer, Scene};
 use crate::{Error, ErrorKind, Result};
+use std::sync::Arc;
 
 /// A whole file may unpack to this many times its length, and [`SMALL`] more, before it is taken for a trap: what a
 /// scene is made of hardly shrinks, deflated zeros shrink a thousandfold.
@@ -55,12 +56,18 @@ impl Parts {
             let palette = decode_palette(entry, stored(bytes, entry)).map_err(|e| e.at(format!("section {i}")))?;
             palettes.push((i as u32, palette));
         }
+        let masks = index.masks();
         let mut pages = Vec::new();
         for (i, entry) in index.pages() {
             let palette = entry.palette.and_then(|p| palettes.iter().find(|(at, _)| *at == p)).map(|(_, p)| p);
             let page = decode_page(entry, stored(bytes, entry)).map_err(|e| e.at(format!("section {i}")))?;
             let mut layer = page.layer(palette).map_err(|e| e.at(format!("section {i}")))?;
             layer.name = format!("page {}", pages.len());
+            if let Ok(at) = masks.binary_search_by_key(&(i as u32), |(page, _)| *page) {
+                let (i, entry) = (masks[at].1, &index.sections[masks[at].1]);
+                let masks = decode_masks(entry, stored(bytes, entry)).map_err(|e| e.at(format!("section {i}")))?;
+                layer.masks = Some(Arc::new(masks));
+            }
             pages.push(PagePart { layer, labels: page.labels(), palette: entry.palette, tier: entry.tier });
         }
         Ok(Self { meta: index.meta, palettes, pages })

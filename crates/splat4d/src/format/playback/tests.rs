@@ -1,6 +1,8 @@
 //! Round trips, error bounds, partial and hostile files.
 
+mod coder;
 mod hostile;
+mod masks;
 
 use super::index::crc;
 use super::page::{encode_page, parse_page};
@@ -118,6 +120,7 @@ fn through(rows: &[(&Primitive, u16)], span: [f64; 2]) -> Page {
         count: rows.len() as u32,
         span,
         palette: None,
+        page: None,
     };
     parse_page(&encode_page(rows, span, &Depths::default()), &entry).unwrap()
 }

@@ -1,13 +1,15 @@
 //! Writes a playback file: tiers, order, palette, pages, and the index before them.
 
 use super::cluster::cluster;
-use super::index::crc;
+use super::deflate::deflate;
+use super::index::{MASK_HEAD, crc, mask_keys};
 use super::page::{encode_page, parse_page};
 use super::{
-    Codec, Depths, Draft, Entry, Index, Kind, MAX_PAGE_GAUSSIANS, MAX_PALETTE, Meta, Node, Page, Palette, VERSION,
-    order,
+    BLOCK_GAUSSIANS, BLOCK_HEADER, Codec, Depths, Draft, Entry, FIRST_VERSION, Index, Kind, MAX_PAGE_GAUSSIANS,
+    MAX_PALETTE, Meta, Node, Page, Palette, VERSION, mask, order,
 };
 use crate::math::{Rng, quat, sh};
+use crate::scene::KeyMasks;
 use crate::{Error, Result};
 use std::io::Write;
 
@@ -18,6 +20,8 @@ const SMALL_PALETTE: usize = 256;
 /// Share of a node's Gaussians in its first tier, and the least worth a page of its own.
 const FIRST_TIER: f64 = 0.25;
 const SMALLEST_TIER: usize = 4096;
+/// Bytes of a palette's ranges, before its planes.
+const RANGE_BYTES: usize = 12;
 /// A poster up to this size comes before everything else; a larger one would only delay the first picture.
 const SMALL_POSTER: usize = 64 << 10;
 /// The palette takes a Gaussian's importance for at least and at most this many times the mean.
@@ -106,6 +110,8 @@ pub struct Summary {
     pub palette_entries: usize,
     /// Stored bytes of all pages.
     pub page_bytes: u64,
+    /// Stored bytes of all masks.
+    pub mask_bytes: u64,
     /// Stored bytes of the palette.
     pub palette_bytes: u64,
     /// Stored bytes of the poster.
@@ -136,7 +142,7 @@ impl Sections {
     pub(super) fn new(meta: Meta, poster: Option<&[u8]>, level: u32) -> Result<Self> {
         meta.check()?;
         let summary = Summary { gaussians: meta.gaussians, ..Summary::default() };
-        let file = Index { version: VERSION, file_len: 0, meta, sections: Vec::new() };
+        let file = Index { version: FIRST_VERSION, file_len: 0, meta, sections: Vec::new() };
         let mut out = Self { file, bodies: Vec::new(), level, late: None, summary };
         match poster.filter(|p| !p.is_empty()) {
             Some(p) if p.len() <= SMALL_POSTER => out.summary.poster_bytes = out.add(entry(Kind::Poster), p.to_vec()),
@@ -165,6 +171,18 @@ impl Sections {
     pub(super) fn page(&mut self, body: Vec<u8>, page: &PageEntry) {
         self.summary.page_bytes += self.add(page.entry(), body);
         self.summary.pages += 1;
+    }
+
+    /// Masks of the page that was added last. Errors: more key times than a file holds.
+    pub(super) fn masks(&mut self, masks: &KeyMasks) -> Result<()> {
+        let body = mask::bytes(masks)?;
+        let times = masks.times();
+        self.file.version = VERSION;
+        let page = Some(self.file.sections.len() as u32 - 1);
+        let span = [times[0], times[times.len() - 1]];
+        let e = Entry { count: masks.rows() as u32, span, page, ..entry(Kind::Masks) };
+        self.summary.mask_bytes += self.add(e, body);
+        Ok(())
     }
 
     /// Writes the file. Errors: the sink's.
@@ -263,6 +281,21 @@ fn entry(kind: Kind) -> Entry {
         count: 0,
         span: [0.0; 2],
         palette: None,
+        page: None,
+    }
+}
+
+/// How many bytes come before a section's byte planes, and how many a plane has.
+fn runs(entry: &Entry) -> (usize, usize) {
+    let count = entry.count as usize;
+    match entry.kind {
+        Kind::Page => (4 * BLOCK_HEADER * count.div_ceil(BLOCK_GAUSSIANS), count),
+        Kind::Palette => (RANGE_BYTES, count),
+        Kind::Masks => {
+            let keys = mask_keys(count, entry.bytes as usize).expect("masks that were just written");
+            (MASK_HEAD + 8 * keys, count.div_ceil(8))
+        }
+        _ => (entry.bytes as usize, 1),
     }
 }
 
@@ -271,9 +304,8 @@ fn pack(mut entry: Entry, body: Vec<u8>, level: u32) -> (Entry, Vec<u8>) {
     entry.bytes = u32::try_from(body.len()).expect("a section has less than 4 GiB");
     let mut stored = body;
     if entry.kind != Kind::Poster {
-        let mut encoder = flate2::write::DeflateEncoder::new(Vec::new(), flate2::Compression::new(level.min(9)));
-        encoder.write_all(&stored).expect("a vector takes every byte");
-        let small = encoder.finish().expect("a vector takes every byte");
+        let (head, run) = runs(&entry);
+        let small = deflate(&stored, head, run, level.min(9));
         if small.len() < stored.len() {
             (stored, entry.codec) = (small, Codec::Deflate);
         }

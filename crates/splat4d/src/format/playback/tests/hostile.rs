@@ -12,7 +12,7 @@ fn table(bytes: &[u8]) -> usize {
 
 /// Makes all checksums right again, as far as the damage lets find what they are of, so that the checks behind them are
 /// reached.
-fn reseal(bytes: &mut [u8]) {
+pub(super) fn reseal(bytes: &mut [u8]) {
     let u32_at = |b: &[u8], at: usize| b.get(at..at + 4).map(|x| u32::from_le_bytes(x.try_into().unwrap()) as usize);
     let Some(index_bytes) = u32_at(bytes, 12) else { return };
     if 64usize.checked_add(index_bytes).is_none_or(|end| end > bytes.len()) {
@@ -32,7 +32,7 @@ fn reseal(bytes: &mut [u8]) {
 }
 
 /// Reads all that there is, in parts and as a whole; true if it was accepted.
-fn survive(bytes: &[u8]) -> bool {
+pub(super) fn survive(bytes: &[u8]) -> bool {
     if let Ok(needed) = Index::needed(&bytes[..bytes.len().min(64)]) {
         assert!(needed <= (64 << 20) + 64);
     }
@@ -45,6 +45,7 @@ fn survive(bytes: &[u8]) -> bool {
         match e.kind {
             Kind::Page => drop(decode_page(e, body)),
             Kind::Palette => drop(decode_palette(e, body)),
+            Kind::Masks => drop(decode_masks(e, body)),
             Kind::Poster | Kind::Other(_) => {}
         }
     }
@@ -92,7 +93,7 @@ fn bytes_of_headers_and_tables_are_each_tried() {
 }
 
 /// The sample with some bytes of entry `i` replaced, checksums mended.
-fn with_entry(sample: &[u8], i: usize, at: usize, bytes: &[u8]) -> Vec<u8> {
+pub(super) fn with_entry(sample: &[u8], i: usize, at: usize, bytes: &[u8]) -> Vec<u8> {
     let mut m = sample.to_vec();
     let first = table(sample) + 64 * i + at;
     m[first..first + bytes.len()].copy_from_slice(bytes);

@@ -1,0 +1,392 @@
+//! The work behind `compress`: rounds until size and guard are content, the file, scores, comparison and report.
+
+use crate::baking;
+use crate::console::Console;
+use crate::draw::antialias;
+use crate::finish::{self, Measure};
+use crate::measure::{SIZE, Side, Subject, What, in_turns, looks_of};
+use crate::report::compress::{Compressed, Guard, Step, Tried};
+use crate::run_folder::{self, COMPRESS, Run, cameras_json};
+use crate::source::{Source, not_empty, read_scene};
+use crate::{files, interrupt, report};
+use serde::{Deserialize, Serialize};
+use serde_json::json;
+use splat4d::format::playback::{Meta, PagesDraft, Summary, WriteConfig, write_pages};
+use splat4d::layers::Scene;
+use splat4d::{Error, ErrorKind, Result};
+use splat4d_train::capture::{Capture, ImageStore};
+use splat4d_train::compress::{self, Compression, Job};
+use splat4d_train::eval::run::{EvalOptions, Evaluation, assess};
+use splat4d_train::recipe::Recipe;
+use splat4d_train::train::TrainOptions;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+/// The order's file in the run folder.
+pub(crate) const ORDER: &str = "compress.toml";
+/// Times that the guard (or the size) may ask for another round.
+const MOST_TRIES: usize = 3;
+/// The guard takes back this share of the pruning.
+const GENTLER: f64 = 0.5;
+
+/// What the user wants; it lies in [`ORDER`], so that an interrupted compression knows it.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Order {
+    /// The run that is compressed.
+    pub source: PathBuf,
+    pub level: u8,
+    /// Most dB that training views may lose; 0: no guard.
+    pub guard: f64,
+    /// Most bytes of the file.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub max_bytes: Option<u64>,
+    /// Whether the unpruned scene is trained on for as many steps, to compare with.
+    pub unpruned: bool,
+    /// Whether settings are the level's own, so that a size may choose others.
+    pub free: bool,
+    /// Attempts that the guard or the size refused.
+    #[serde(default)]
+    pub tried: Vec<Tried>,
+    pub settings: Compression,
+}
+
+/// A compression in its folder.
+pub(crate) struct Work {
+    dir: PathBuf,
+    order: Order,
+}
+
+impl Work {
+    /// A new compression. Errors: the folder cannot be written.
+    pub(crate) fn begin(dir: PathBuf, order: Order) -> Result<Self> {
+        files::make_folder(&dir)?;
+        let work = Self { dir, order };
+        work.save()?;
+        Ok(work)
+    }
+
+    /// The compression in a folder, to continue it. Errors: there is none.
+    pub(crate) fn reopen(dir: &Path) -> Result<Self> {
+        let path = dir.join(ORDER);
+        if !path.is_file() {
+            return Err(Error::input("this folder holds no compression")
+                .at(dir.display())
+                .remedy("Give the folder that `splat4d compress` wrote, or begin anew: splat4d compress RUN."));
+        }
+        let order: Order = toml::from_str(&files::read_text(&path)?).map_err(|e| {
+            Error::input(format!("it is not readable: {}", e.message()))
+                .at(path.display())
+                .remedy("Begin anew: splat4d compress RUN.")
+        })?;
+        order.settings.check().map_err(|e| e.at(path.display()))?;
+        Ok(Self { dir: dir.to_owned(), order })
+    }
+
+    fn save(&self) -> Result<()> {
+        let text = toml::to_string(&self.order).expect("an order is plain data");
+        files::write(&self.dir.join(ORDER), text.as_bytes())
+    }
+
+    /// Compresses until size and guard are content, then measures and reports.
+    pub(crate) fn run(mut self, eval: bool, measure: &Measure, console: &Console) -> anyhow::Result<()> {
+        let stop = interrupt::flag("stopping: a checkpoint is being saved");
+        let source = Source::open(&self.order.source)?;
+        not_empty(&source.scene, &self.order.source)?;
+        let run = source.run.as_ref().ok_or_else(|| {
+            Error::input("is no run: compressing needs the pictures that a scene was trained on")
+                .at(self.order.source.display())
+                .remedy("Give a run folder, or make a plain file with `splat4d bake`.")
+        })?;
+        console.phase("reading the capture", 0, 0);
+        let (capture, recipe) = run.open_capture()?;
+        let original = Original { scene: &source.scene, recipe, capture: Arc::new(capture) };
+        let before = if eval { Some(original.scores(original.scene, console)?) } else { None };
+        self.choose_size(&original, console)?;
+        let (file, after) = loop {
+            let compressed = self.compress(&original, &stop, console)?;
+            let file = self.write_file(&compressed, console)?;
+            let Some(before) = &before else { break (file, None) };
+            let scene = read_scene(&self.dir.join("scene.safetensors"))?;
+            let after = finish::scores(&self.dir, &scene, measure, console)?;
+            if !self.refused(before, &after, file.bytes, console)? {
+                break (file, Some(after));
+            }
+        };
+        if let (Some(before), Some(after)) = (before, after) {
+            let told = self.compare(&source, &original, [&before, &after], &stop, console)?;
+            say(&told, console);
+            files::write(&self.dir.join(COMPRESS), serde_json::to_string_pretty(&told)?.as_bytes())?;
+            finish::amend(&self.dir, [("notes".into(), json!(console.warnings()))])?;
+            console.written(&report::write(&Run::open(&self.dir)?)?);
+        }
+        console.written(&self.dir.join("scene.splat4d"));
+        console.emit(&json!({"type": "compressed", "run": self.dir, "bytes": file.bytes}));
+        Ok(())
+    }
+
+    /// Everything before and after, measured in one go.
+    fn compare(
+        &self,
+        source: &Source,
+        original: &Original<'_>,
+        [before, after]: [&Evaluation; 2],
+        stop: &AtomicBool,
+        console: &Console,
+    ) -> anyhow::Result<Compressed> {
+        let unpruned = if self.order.unpruned { Some(self.train_unpruned(original, stop, console)?) } else { None };
+        let smooth = antialias(original.recipe.antialias);
+        let read = |path: &Path| -> Result<Arc<[u8]>> {
+            Ok(std::fs::read(path).map_err(|e| files::cannot_read(path, e))?.into())
+        };
+        let file = read(&self.dir.join("scene.splat4d"))?;
+        let plain = self.order.source.join("scene.splat4d");
+        let plain = if plain.is_file() { Some(read(&plain)?) } else { None };
+        let mut subjects = vec![What::Scene(original.scene), What::File(file)];
+        subjects.extend(plain.into_iter().map(What::File));
+        subjects.extend(unpruned.iter().map(|(scene, _)| What::Scene(scene)));
+        let subjects: Vec<Subject<'_>> = subjects.into_iter().map(|what| Subject { what, antialias: smooth }).collect();
+        let looks = looks_of(source, SIZE)?;
+        let sides = in_turns(&subjects, &looks, &mut |done, total| console.phase("playing", done, total))?;
+        console.clear();
+        let mut sides = sides.into_iter();
+        let mut next = || sides.next().expect("a side for every subject");
+        let order = &self.order;
+        let loss = before.train("PSNR").zip(after.train("PSNR")).map(|(was, is)| was - is);
+        Ok(Compressed {
+            source: order.source.clone(),
+            level: Some(order.level),
+            settings: serde_json::to_value(&order.settings)?,
+            before: next().scored(before),
+            after: next().scored(after),
+            plain: (subjects.len() - usize::from(unpruned.is_some()) > 2).then(&mut next),
+            unpruned: unpruned.as_ref().map(|(_, scores)| next().scored(scores)),
+            stages: steps(&Run::open(&self.dir)?),
+            guard: loss.filter(|_| order.guard > 0.0).map(|loss_db| Guard {
+                loss_db,
+                limit_db: order.guard,
+                passed: loss_db <= order.guard,
+            }),
+            tried: order.tried.clone(),
+            warnings: console.warnings(),
+        })
+    }
+
+    /// The original, trained on for as many steps as fine-tuning took, nothing removed and nothing quantised.
+    fn train_unpruned(
+        &self,
+        original: &Original<'_>,
+        stop: &AtomicBool,
+        console: &Console,
+    ) -> anyhow::Result<(Scene<f32>, Evaluation)> {
+        let settings = Compression {
+            prune: 0.0,
+            rounds: 1,
+            fine_tune: self.order.settings.steps(),
+            codec: false,
+            mask_interval: 0,
+            ..self.order.settings.clone()
+        };
+        let folder = self.dir.join(UNPRUNED);
+        files::make_folder(&folder)?;
+        console.say("training the unpruned scene on for as many steps, to compare");
+        let job = original.job(&settings);
+        let options = TrainOptions::default();
+        let done = compress::compress(&job, &folder, &options, stop, &mut |event| console.event(event))?;
+        console.clear();
+        if done.outcome.interrupted {
+            return Err(self.interrupted(done.outcome.iteration).into());
+        }
+        let scene = read_scene(&folder.join("scene.safetensors"))?;
+        let scores = original.scores(&scene, console)?;
+        Ok((scene, scores))
+    }
+
+    fn interrupted(&self, step: usize) -> Error {
+        Error::new(ErrorKind::Interrupted, format!("compressing was stopped after step {step} and saved"))
+            .remedy(format!("Continue with: splat4d compress --resume {}", self.dir.display()))
+    }
+
+    /// Where the file must stay within a size, the gentlest settings that do.
+    fn choose_size(&mut self, original: &Original<'_>, console: &Console) -> anyhow::Result<()> {
+        let begun = !splat4d_train::train::checkpoint::list(&self.dir).is_empty() || !self.order.tried.is_empty();
+        let Some(most) = self.order.max_bytes.filter(|_| !begun) else { return Ok(()) };
+        let settings = self.order.settings.clone();
+        let scores = compress::scores(&original.job(&settings), &mut |d, t| console.phase("scoring Gaussians", d, t))?;
+        let cameras = compress::cameras(&original.capture);
+        let (chosen, trials) = compress::fit(
+            original.scene,
+            &scores,
+            &settings,
+            self.order.free,
+            &cameras,
+            [most, BESIDES],
+            &mut |done, total| console.phase("looking for a size", done, total),
+        )?;
+        console.clear();
+        let last = trials.iter().rev().find(|t| t.prune == chosen.prune).expect("what was chosen was tried");
+        console.say(&format!(
+            "to fit into {}, {:.0} % of the Gaussians are pruned ({} before fine-tuning)",
+            files::human_bytes(most),
+            100.0 * chosen.prune,
+            files::human_bytes(last.bytes)
+        ));
+        self.order.settings = chosen;
+        Ok(self.save()?)
+    }
+
+    /// One attempt, or the rest of one.
+    fn compress(
+        &self,
+        original: &Original<'_>,
+        stop: &AtomicBool,
+        console: &Console,
+    ) -> anyhow::Result<compress::Compressed> {
+        files::write(&self.dir.join("cameras.json"), &serde_json::to_vec(&cameras_json(&original.capture))?)?;
+        let job = original.job(&self.order.settings);
+        let options = TrainOptions::default();
+        let compressed = compress::compress(&job, &self.dir, &options, stop, &mut |event| console.event(event))?;
+        console.clear();
+        if compressed.outcome.interrupted {
+            return Err(self.interrupted(compressed.outcome.iteration).into());
+        }
+        Ok(compressed)
+    }
+
+    /// Writes `scene.splat4d`.
+    fn write_file(&self, compressed: &compress::Compressed, console: &Console) -> anyhow::Result<Summary> {
+        console.phase("writing", 0, 0);
+        let source = Source::open(&self.dir)?;
+        let views = source.views()?;
+        let (stage, cameras) = (source.stage(&views), baking::distinct(&views));
+        let pages = compressed.pages.as_ref().expect("the command's settings have a codec");
+        let run = source.run.as_ref().expect("it was opened as a run");
+        let antialias = run.recipe().is_ok_and(|r| r.antialias);
+        let outline = baking::Outline::of_pages(pages);
+        let meta = Meta { title: run.name(), ..baking::meta(&source.scene, &outline, &stage, &cameras) };
+        let poster = baking::poster(&source.scene, &stage, antialias);
+        let draft = PagesDraft { meta: &meta, ..pages.draft(poster.as_deref()) };
+        let config = WriteConfig { depths: self.order.settings.depths, ..WriteConfig::default() };
+        let mut bytes = Vec::new();
+        let summary = write_pages(&draft, &config, &mut bytes)?;
+        files::write(&self.dir.join("scene.splat4d"), &bytes)?;
+        Ok(summary)
+    }
+
+    /// Whether size or guard want another attempt; then the order is changed, and the folder is ready for it.
+    fn refused(
+        &mut self,
+        before: &Evaluation,
+        after: &Evaluation,
+        bytes: u64,
+        console: &Console,
+    ) -> anyhow::Result<bool> {
+        let (Some(was), Some(is)) = (before.train("PSNR"), after.train("PSNR")) else { return Ok(false) };
+        let settings = &self.order.settings;
+        let (loss, prune) = (was - is, settings.prune);
+        let lost = self.order.guard > 0.0 && loss > self.order.guard;
+        let large = self.order.max_bytes.filter(|most| bytes > *most);
+        let gentler = self.order.max_bytes.is_none() && prune > 0.0;
+        let next = match large {
+            // What is left shrinks as the file must, and a little more.
+            Some(most) => 1.0 - (1.0 - prune) * (1.0 - AGAIN_MARGIN) * most as f64 / bytes as f64,
+            None if lost && gentler => prune * GENTLER,
+            None => prune,
+        };
+        if lost {
+            console.warn(&format!(
+                "training views lost {loss:.2} dB, more than the guard allows ({} dB)",
+                self.order.guard
+            ));
+        }
+        if next == prune || self.order.tried.len() + 1 >= MOST_TRIES {
+            if let Some(most) = large {
+                let over = format!("the file has {bytes} bytes, more than {most}");
+                return Err(Error::input(over).remedy("Give a smaller --max-mb.").into());
+            }
+            return Ok(false);
+        }
+        console.say(&format!("again, with {:.0} % pruned instead of {:.0} %", 100.0 * next, 100.0 * prune));
+        self.order.tried.push(Tried { prune, bytes, psnr: is });
+        self.order.settings.prune = next;
+        run_folder::clear(&self.dir)?;
+        self.save()?;
+        Ok(true)
+    }
+}
+
+/// What is compressed.
+struct Original<'a> {
+    scene: &'a Scene<f32>,
+    capture: Arc<Capture>,
+    recipe: Recipe,
+}
+
+impl Original<'_> {
+    fn job<'a>(&'a self, settings: &'a Compression) -> Job<'a> {
+        Job { source: self.scene, capture: self.capture.clone(), recipe: &self.recipe, settings }
+    }
+
+    /// The scores of a scene of this capture, without a trace in any folder.
+    fn scores(&self, scene: &Scene<f32>, console: &Console) -> anyhow::Result<Evaluation> {
+        let store = ImageStore::new(self.capture.clone(), self.recipe.image_memory as usize);
+        let options = EvalOptions { antialias: self.recipe.antialias, pictures: false, ..EvalOptions::default() };
+        let scores = assess(scene, &self.capture, &store, 0, &options, &mut |event| console.event(event))?;
+        console.clear();
+        Ok(scores)
+    }
+}
+
+/// Bytes of a file beside its Gaussians: a poster, cameras, a path.
+const BESIDES: u64 = 48 << 10;
+/// Room that another attempt leaves below the size.
+const AGAIN_MARGIN: f64 = 0.01;
+
+/// The folder, in that of a compression, of the unpruned scene that was trained on.
+const UNPRUNED: &str = "unpruned";
+
+/// What each stage took, from `metrics.csv`'s rows.
+fn steps(run: &Run) -> Vec<Step> {
+    let mut out: Vec<Step> = Vec::new();
+    let mut before = (0, 0.0);
+    for row in &run.metrics {
+        if out.last().is_none_or(|s| s.name != row.stage) {
+            before = out.iter().fold((0, 0.0), |b, s| (b.0 + s.steps, b.1 + s.seconds));
+            out.push(Step { name: row.stage.clone(), ..Step::default() });
+        }
+        let step = out.last_mut().expect("one was just pushed");
+        step.steps = row.iteration as usize - before.0;
+        step.seconds = row.seconds - before.1;
+        step.gaussians = row.gaussians as usize;
+    }
+    out
+}
+
+/// Before and after in a few lines.
+fn say(told: &Compressed, console: &Console) {
+    let fair = told.fair();
+    let name = if told.unpruned.is_some() { "unpruned, as many steps more" } else { "before" };
+    let line = |name: &str, side: &Side| {
+        let number = |value: Option<f64>, digits: usize| value.map_or("-".into(), |v| format!("{v:.digits$}"));
+        format!(
+            "{name}: {} Gaussians, {} ({} as floats), PSNR {} dB, where things move {} dB, SSIM {}, {:.0} frames/s at \
+             {}x{}",
+            files::grouped(side.gaussians),
+            files::human_bytes(side.bytes),
+            files::human_bytes(side.float_bytes),
+            number(side.psnr, 2),
+            number(side.psnr_dynamic, 2),
+            number(side.ssim, 4),
+            side.fps,
+            SIZE[0],
+            SIZE[1],
+        )
+    };
+    console.say(&line(name, fair));
+    console.say(&line("after", &told.after));
+    if let Some(times) = told.smaller() {
+        let faster = told.after.fps / fair.fps;
+        console.say(&format!("{times:.1} times smaller than 32-bit floats, {faster:.2} times as fast"));
+    }
+}

@@ -1,0 +1,184 @@
+//! `compress`: a trained run becomes one that is many times smaller and faster to play, measured before and after.
+
+use crate::compressing::{Order, Work};
+use crate::console::Console;
+use crate::finish;
+use crate::run_folder::{self, Run};
+use splat4d::{Error, Result};
+use splat4d_train::compress::{Compression, Level, MOST_PRUNED};
+use std::path::{Path, PathBuf};
+
+const EXAMPLES: &str = "\
+Examples:
+  splat4d compress runs/knight                     pruned, filtered, quantised, fine-tuned: runs/knight-compressed
+  splat4d compress runs/knight --prune 0.8         keep a fifth of the Gaussians
+  splat4d compress runs/knight --max-mb 0.5        as good as half a megabyte can be
+  splat4d compress runs/knight --level 1           only quantised, and fine-tuned so that nobody sees it
+  splat4d compress runs/knight --set rounds=3 --set temporal=width
+  splat4d compress --resume runs/knight-compressed continue exactly where it stopped
+
+The result is a run: DIR/scene.splat4d plays anywhere, DIR/report.html compares before and after, and view, render,
+eval, export and info take DIR like any other run. The original is not touched.";
+
+/// Default of `--guard`, dB: less is not seen in a moving picture.
+const GUARD: f64 = 0.5;
+
+/// Make a trained run smaller and faster to play: prune, filter, quantise, fine-tune; measured before and after
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES, after_long_help = long_help())]
+pub(crate) struct Args {
+    /// The run; its capture must still be where it was
+    #[arg(value_name = "RUN", required_unless_present = "resume")]
+    run: Option<PathBuf>,
+    /// Where the result is written [default: RUN-compressed, or RUN-compressed-2 ... if that is taken]
+    #[arg(short, long, value_name = "DIR")]
+    output: Option<PathBuf>,
+    /// Continue this compression exactly where its newest checkpoint is
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["run", "output", "level", "prune", "max_mb", "fine_tune",
+        "set", "force", "guard", "unpruned"])]
+    resume: Option<PathBuf>,
+    /// Replace the run in the -o folder
+    #[arg(long)]
+    force: bool,
+    /// 0: the plain file; 1: quantised and fine-tuned; 2: pruned and filtered too, coarser codes, a smaller palette
+    #[arg(long, value_name = "0|1|2", default_value_t = 2, value_parser = clap::value_parser!(u8).range(0..=2))]
+    level: u8,
+    /// Share of the Gaussians to remove, 0 to 0.98
+    #[arg(long, value_name = "SHARE", conflicts_with = "max_mb", value_parser = share)]
+    prune: Option<f64>,
+    /// Coarsen and prune until the file has at most so many megabytes (10⁶ bytes)
+    #[arg(long, value_name = "MB", value_parser = positive)]
+    max_mb: Option<f64>,
+    /// Steps of fine-tuning in all [default: by level, a share of the run's own steps]
+    #[arg(long, value_name = "STEPS")]
+    fine_tune: Option<usize>,
+    /// Most dB that training views may lose; beyond it half as much is pruned instead, at most twice. 0: no guard
+    #[arg(long, value_name = "DB", default_value_t = GUARD, value_parser = natural)]
+    guard: f64,
+    /// Train the unpruned scene on for as many steps too, and compare with that: fair, and takes as long again
+    #[arg(long)]
+    unpruned: bool,
+    /// Change a setting of the level; may be repeated
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// Only compress: no evaluation, no guard, no comparison, no report
+    #[arg(long)]
+    no_eval: bool,
+    #[command(flatten)]
+    measure: finish::Measure,
+}
+
+pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
+    args.measure.check()?;
+    let work = match &args.resume {
+        Some(dir) => Work::reopen(dir)?,
+        None => begin(args, console)?,
+    };
+    work.run(!args.no_eval, &args.measure, console)
+}
+
+/// Settles what is to be done, and where, before anything is computed.
+fn begin(args: &Args, console: &Console) -> anyhow::Result<Work> {
+    let source = args.run.as_ref().expect("clap asks for a run");
+    let run = Run::open(source)?;
+    if !Run::is_finished(source) {
+        return Err(Error::input("the run is unfinished")
+            .at(source.display())
+            .remedy(format!("Finish it first: splat4d train --resume {}", source.display()))
+            .into());
+    }
+    let iterations = run.iteration().or_else(|| run.recipe().ok().map(|r| r.iterations)).unwrap_or(1);
+    let order = Order {
+        source: std::path::absolute(source)?,
+        level: args.level,
+        guard: args.guard,
+        max_bytes: args.max_mb.map(|mb| (mb * 1e6) as u64),
+        unpruned: args.unpruned,
+        free: args.set.is_empty() && args.fine_tune.is_none(),
+        settings: settings(args, iterations)?,
+        tried: Vec::new(),
+    };
+    let dir = place(args, source, console)?;
+    Ok(Work::begin(dir, order)?)
+}
+
+/// The level, then the options, then every --set.
+fn settings(args: &Args, iterations: usize) -> Result<Compression> {
+    let mut settings = Compression::level(Level::new(args.level)?, iterations);
+    if let Some(share) = args.prune {
+        if args.level < 2 {
+            return Err(Error::input(format!("--prune belongs to level 2, not to level {}", args.level))
+                .remedy("Leave --level out."));
+        }
+        settings.prune = share;
+    }
+    if let Some(steps) = args.fine_tune {
+        // As the level shares its own steps.
+        let all = settings.steps();
+        settings.fine_tune = (settings.fine_tune * steps).checked_div(all).unwrap_or(0);
+        settings.quantise = steps - settings.fine_tune;
+    }
+    for assignment in &args.set {
+        settings.set(assignment).map_err(|e| e.at("--set"))?;
+    }
+    if !settings.codec {
+        return Err(Error::input("`codec` = false is for studies: it makes no file").remedy("Use `splat4d lab e03`."));
+    }
+    Ok(settings)
+}
+
+/// Where the result goes. A folder that the user named is never silently taken over.
+fn place(args: &Args, source: &Path, console: &Console) -> Result<PathBuf> {
+    let Some(dir) = &args.output else {
+        let name = source.file_name().map_or_else(|| "run".into(), |n| n.to_string_lossy().into_owned());
+        let dir = run_folder::free_folder(&source.with_file_name(format!("{name}-compressed")));
+        console.say(&format!("the result goes to {}", dir.display()));
+        return Ok(dir);
+    };
+    if same(dir, source) {
+        return Err(Error::input("is the run itself").at(dir.display()).remedy("Choose another folder with -o."));
+    }
+    let used = std::fs::read_dir(dir).is_ok_and(|mut d| d.next().is_some());
+    if used && args.force && Run::is(dir) {
+        run_folder::clear(dir)?;
+    } else if used {
+        let remedy = if Run::is(dir) {
+            format!("Continue it with --resume {}, replace it with --force, or choose another folder.", dir.display())
+        } else {
+            "Choose another folder with -o.".to_owned()
+        };
+        let what = if Run::is(dir) { "holds a run already" } else { "is not empty and is no run" };
+        return Err(Error::input(what).at(dir.display()).remedy(remedy));
+    }
+    Ok(dir.clone())
+}
+
+fn same(a: &Path, b: &Path) -> bool {
+    matches!((a.canonicalize(), b.canonicalize()), (Ok(a), Ok(b)) if a == b)
+}
+
+fn number(text: &str, fits: impl Fn(f64) -> bool, need: &str) -> Result<f64, String> {
+    let value: Option<f64> = text.parse().ok().filter(|v| fits(*v));
+    value.ok_or_else(|| format!("give {need}"))
+}
+
+fn share(text: &str) -> Result<f64, String> {
+    number(text, |v| (0.0..=MOST_PRUNED).contains(&v), &format!("a share from 0 to {MOST_PRUNED}, for instance 0.5"))
+}
+
+fn positive(text: &str) -> Result<f64, String> {
+    number(text, |v| v > 0.0 && v <= 1e6, "megabytes above 0, for instance 1.5")
+}
+
+fn natural(text: &str) -> Result<f64, String> {
+    number(text, |v| (0.0..=100.0).contains(&v), "decibels from 0 on, for instance 0.5")
+}
+
+/// The examples, and every setting with its default by level.
+fn long_help() -> String {
+    let mut text =
+        format!("{EXAMPLES}\n\nSettings (--set KEY=VALUE) as level 2 has them after 7,000 training steps:\n");
+    let all = Compression::level(Level::Pruned, 7000).to_toml();
+    all.lines().for_each(|line| text += &format!("  {line}\n"));
+    text
+}
