@@ -119,7 +119,8 @@ fn guard(out: &mut String, told: &Compressed) {
         let class = if passed { "note" } else { "warn" };
         let _ = writeln!(
             out,
-            "<p class=\"{class}\">{loss_db:.2} dB lost on the held-out views, {verdict} the {limit_db:.2} dB allowed.</p>"
+            "<p class=\"{class}\">{loss_db:.2} dB lost on the training views, {verdict} the {limit_db:.2} dB \
+             allowed.</p>"
         );
     }
     for warning in &told.warnings {
@@ -195,9 +196,9 @@ fn sides(out: &mut String, told: &Compressed) {
     let against = if told.unpruned.is_some() { "the scene trained as many steps without pruning" } else { "before" };
     let _ = write!(
         out,
-        "</table></div>\n<p class=\"note\">The change is against {against}. Frames a second are of this machine's CPU at the \
-         same size from the same cameras, all columns measured in turns; end to end is looking up who is alive, motion, \
-         drawing and 8-bit colours.</p>\n"
+        "</table></div>\n<p class=\"note\">The change is against {against}. Frames a second are of this \
+         machine's CPU at the same size from the same cameras, all columns measured in turns; end to end is looking up \
+         who is alive, motion, drawing and 8-bit colours.</p>\n"
     );
 }
 
@@ -277,8 +278,8 @@ fn both_pictures(out: &mut String, run: &Run, told: &Compressed) {
     if !shown.is_empty() {
         let _ = write!(
             out,
-            "<h2>Before and after</h2>\n<div class=\"views\">{shown}</div>\n<p class=\"note\">Difference: the mean of the \
-             channels, from none (dark) to {} of full scale and more (bright).</p>\n",
+            "<h2>Before and after</h2>\n<div class=\"views\">{shown}</div>\n<p class=\"note\">Difference: the \
+             mean of the channels, from none (dark) to {} of full scale and more (bright).</p>\n",
             pictures::DIFFERENCE_WORDS
         );
     }

@@ -17,8 +17,8 @@ const QUALITY: u8 = 90;
 /// Largest film that is put inside the page, bytes; a larger one is linked.
 const FILM_BYTES: u64 = 6 << 20;
 
-/// A mean difference of the channels as large as this is the last colour of [`difference`]: compression changes less than
-/// training leaves wrong.
+/// A mean difference of the channels as large as this is the last colour of [`difference`]: compression changes less
+/// than training leaves wrong.
 const DIFFERENCE_FULL: f32 = 0.1;
 /// The same in words.
 pub(super) const DIFFERENCE_WORDS: &str = "a tenth";

@@ -16,7 +16,8 @@ const FEW_INTERVALS: [usize; 2] = [5, 20];
 /// Rounds in which one share is pruned.
 const ROUNDS: [usize; 3] = [1, 2, 4];
 const FEW_ROUNDS: [usize; 1] = [1];
-/// What fine-tuning is taken to cost besides its steps (scoring, evaluation, playing), in steps; for the time that is left.
+/// What fine-tuning is taken to cost besides its steps (scoring, evaluation, playing), in steps; for the time
+/// that is left.
 const OVERHEAD: f64 = 300.0;
 
 /// One treatment of the source.
@@ -47,7 +48,8 @@ impl Default for Score {
 }
 
 impl Score {
-    /// All that are compared, the default first: the temporal variants, then without the volume, then the ways to combine.
+    /// All that are compared, the default first: the temporal variants, then without the volume, then the ways to
+    /// combine.
     pub(super) fn all() -> Vec<(String, Self)> {
         let named = |t: &Temporal| match t {
             Temporal::None => "spatial score alone".to_owned(),

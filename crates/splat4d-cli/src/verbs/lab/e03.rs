@@ -40,9 +40,9 @@ Examples:
   splat4d lab e03 runs/knight --quick               a glance: fewer points, shorter fine-tuning
   splat4d lab e03 runs/a runs/b -o studies/pruning  two scenes; every run has its own tables and pictures
 
-Every cell prunes a share of the run's Gaussians and measures what is left on the held-out views, on the CPU and in 32-bit
-floats: shares from 0 to 95 %, the temporal filter, fine-tuning, the scores of 4DGS-1K, frames between key times, rounds.
-What was found is in DIR/e03.json (after every cell: the same command goes on where it was stopped), DIR/e03.md and
+Every cell prunes a share of the run's Gaussians and measures what is left on the held-out views, on the CPU and in
+32-bit floats: shares from 0 to 95 %, the temporal filter, fine-tuning, the scores of 4DGS-1K, frames between key times,
+rounds. What was found is in DIR/e03.json (after every cell: the same command goes on where it was stopped), DIR/e03.md and
 DIR/e03-*.svg. With --json every cell is a line.";
 
 /// Measure pruning and the temporal filter of 4DGS-1K on trained runs

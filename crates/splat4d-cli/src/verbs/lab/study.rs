@@ -1,7 +1,6 @@
 //! What a study has found so far. It is written after every cell, so that nothing is measured twice.
 
 use super::cells::Cell;
-use crate::camera_file;
 use crate::files;
 use crate::measure::Side;
 use serde::{Deserialize, Serialize};
@@ -57,8 +56,7 @@ impl Study {
             return Ok(Self::of(Vec::new()));
         }
         let remedy = "Move it away, or choose another folder with -o.";
-        let value = camera_file::json(&files::read_text(path)?).map_err(|e| e.at(path.display()).remedy(remedy))?;
-        let study: Self = serde_json::from_value(value).map_err(|e| {
+        let study: Self = serde_json::from_str(&files::read_text(path)?).map_err(|e| {
             Error::input(format!("it is no study as splat4d writes it: {e}")).at(path.display()).remedy(remedy)
         })?;
         if study.version != VERSION {
@@ -99,8 +97,8 @@ pub(super) struct Judged {
     pub raster_speed: f64,
 }
 
-/// Makes and measures every cell that is missing. `make`: None where it was stopped. `keep` hears of every new cell, with
-/// the findings so far. Returns whether all are there now.
+/// Makes and measures every cell that is missing. `make`: None where it was stopped. `keep` hears of every new cell,
+/// with the findings so far. Returns whether all are there now.
 pub(super) fn fill(
     findings: &mut Findings,
     cells: &[Cell],

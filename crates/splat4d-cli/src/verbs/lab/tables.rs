@@ -13,9 +13,9 @@ pub(super) fn markdown(findings: &Findings, grid: &Grid) -> String {
     if let Some(source) = findings.of(&Cell::source()) {
         let _ = write!(
             out,
-            "\n{} Gaussians, {} as 32-bit floats; fine-tuning takes {} steps. PSNR is that of the held-out views, `moving` \
-             is where things move. Frames a second are the CPU's, end to end (blending alone), times those of the source, \
-             which were measured in turns with them.\n",
+            "\n{} Gaussians, {} as 32-bit floats; fine-tuning takes {} steps. PSNR is that of the held-out views, \
+             `moving` is where things move. Frames a second are the CPU's, end to end (blending alone), times those of \
+             the source, which were measured in turns with them.\n",
             grouped(source.side.gaussians),
             human_bytes(source.side.float_bytes),
             grouped(grid.steps)
@@ -183,9 +183,11 @@ mod tests {
         let found = |cell: &Cell| Found {
             key: cell.key(),
             side: Side {
-                gaussians: (150_000.0 * (1.0 - cell.prune)) as usize,
+                gaussians: (150_000.0 * (1.0 - cell.prune)).round() as usize,
                 psnr: Some(32.0 - 4.0 * cell.prune + if cell.steps > 0 { 0.5 } else { 0.0 }),
                 psnr_dynamic: Some(27.0),
+                ssim: Some(0.95),
+                flicker: Some(1.2),
                 ..Side::default()
             },
             speed: 1.0 + cell.prune,
