@@ -1,7 +1,7 @@
 //! Fewer Gaussians: which are worth keeping ([`score()`], [`prune`]) and which are worth drawing when ([`key_masks`]).
 //!
-//! After 4DGS-1K (Yuan et al. 2025), for every layer whatever its motion model: a Gaussian's worth is what it adds to the
-//! training pictures, and what is known of its life. Nothing is learnt here; a scene recovers by further training.
+//! After 4DGS-1K (Yuan et al. 2025), for every layer whatever its motion model: a Gaussian's worth is what it adds to
+//! the training pictures, and what is known of its life. Nothing is learnt here; a scene recovers by further training.
 
 mod masks;
 mod periodic;
@@ -19,8 +19,8 @@ pub use temporal::{Combine, Spatial, Temporal};
 use splat4d::layers::Scene;
 use splat4d::scene::{RowEdit, Space};
 
-/// One edit a layer that takes away the share `ratio` (to the nearest whole number) of all Gaussians: those with the lowest scores, the
-/// earlier layer and row first among equals. One always stays.
+/// One edit a layer that takes away the share `ratio` (to the nearest whole number) of all Gaussians: those with the
+/// lowest scores, the earlier layer and row first among equals. One always stays.
 ///
 /// Apply it with `densify::apply`, which carries moments and statistics along, or with `Layer::edit`. Panics: scores of
 /// another scene, a ratio outside of 0 to 1.

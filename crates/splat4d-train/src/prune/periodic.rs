@@ -25,8 +25,8 @@ impl Periodic {
         (r.prune_interval > 0).then_some(some)
     }
 
-    /// Whether it is time after so many steps of a stage of `iterations`: not if fewer than half an interval is left, in
-    /// which the scene would not recover.
+    /// Whether it is time after so many steps of a stage of `iterations`: not if fewer than half an interval is left,
+    /// in which the scene would not recover.
     pub fn is_due(&self, steps: usize, iterations: usize) -> bool {
         steps.is_multiple_of(self.interval) && iterations.saturating_sub(steps) >= self.interval.div_ceil(2)
     }

@@ -14,8 +14,8 @@ use splat4d::math::sym3;
 use splat4d::render::Antialias;
 use splat4d::scene::Time;
 
-/// The volume of this share of the Gaussians is below the one at which the volume stops to count (of two places that write
-/// it down differently, LightGaussian's paper).
+/// The volume of this share of the Gaussians is below the one at which the volume stops to count (of two places that
+/// write it down differently, LightGaussian's paper).
 const VOLUME_PERCENTILE: f64 = 0.9;
 /// Power of the relative volume (LightGaussian).
 const VOLUME_POWER: f64 = 0.1;
@@ -73,8 +73,8 @@ pub struct Scores {
     pub views: usize,
 }
 
-/// Scores all Gaussians of `scene` by the views of `frames`; no picture is loaded. `progress` hears of views done and in
-/// all. The same bits for any number of threads.
+/// Scores all Gaussians of `scene` by the views of `frames`; no picture is loaded. `progress` hears of views done and
+/// in all. The same bits for any number of threads.
 ///
 /// Errors: there is no frame.
 pub fn score(
@@ -171,7 +171,8 @@ fn views_at(group: &[u32], k: usize, every: usize) -> Vec<usize> {
     if some.is_empty() { vec![group[k % group.len()] as usize] } else { some }
 }
 
-/// min(V/V_90, 1)^0.1 of every row, V its volume in space and time: a Gaussian that fills much stays, even where it is faint.
+/// min(V/V_90, 1)^0.1 of every row, V its volume in space and time: a Gaussian that fills much stays, even where it is
+/// faint.
 fn volumes(scene: &Scene<f32>, lives: &[Lives]) -> Vec<Vec<f64>> {
     let of_layer = |layer: usize| -> Vec<f64> {
         let spatial = covariances(scene, layer);

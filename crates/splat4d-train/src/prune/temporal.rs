@@ -1,11 +1,11 @@
-//! How much of the clip a Gaussian's life serves: the temporal half of the score of 4DGS-1K (Yuan et al. 2025, §4.1), and
-//! its variants.
+//! How much of the clip a Gaussian's life serves: the temporal half of the score of 4DGS-1K (Yuan et al. 2025, §4.1),
+//! and its variants.
 //!
-//! The paper's S^TV = Σ_t 1/(½ tanh p''(t) + ½), p the life, summed over the whole clip, ranks the other way round than its
-//! text says: a term is 1 + exp(−2p''), so that it overflows at the peak of a short life, and an instant at which the
-//! Gaussian is not there counts 2, the most that |p''| could give. The reading that does what the text says takes the
-//! product with the spatial score instant by instant: absent instants vanish, and each present one weighs 1 (flickers) to 2
-//! (lasts). That is [`Temporal::InstantAbs`], the default; the others are kept for comparison.
+//! The paper's S^TV = Σ_t 1/(½ tanh p''(t) + ½), p the life, summed over the whole clip, ranks the other way round than
+//! its text says: a term is 1 + exp(−2p''), so that it overflows at the peak of a short life, and an instant at which
+//! the Gaussian is not there counts 2, the most that |p''| could give. The reading that does what the text says takes
+//! the product with the spatial score instant by instant: absent instants vanish, and each present one weighs 1
+//! (flickers) to 2 (lasts). That is [`Temporal::InstantAbs`], the default; the others are kept for comparison.
 
 use crate::recipe::nearest;
 use crate::{Error, Result};
@@ -41,8 +41,8 @@ pub enum Spatial {
     /// Σ over pixels of α T: how much of the pictures it is (4DGS-1K).
     #[default]
     Share,
-    /// Σ over pixels and channels of the squared change that its removal alone would make. Neighbours of one colour stand
-    /// in for each other, and may all go.
+    /// Σ over pixels and channels of the squared change that its removal alone would make. Neighbours of one colour
+    /// stand in for each other, and may all go.
     Change,
     /// The geometric mean of both in each view: neither what covers nor what differs from what lies behind goes first.
     Both,
@@ -152,8 +152,8 @@ impl Lives {
         }
     }
 
-    /// The life's scale in time, units, at most the clip: a Gaussian's standard deviation; of an interval its half plus its
-    /// softness.
+    /// The life's scale in time, units, at most the clip: a Gaussian's standard deviation; of an interval its half plus
+    /// its softness.
     pub(super) fn scale(&self, row: usize) -> f64 {
         self.deviation(self.rows[row])
     }
@@ -174,8 +174,8 @@ mod tests {
     use super::*;
     use splat4d::layers::ALWAYS;
 
-    /// One life of this standard deviation (frames at 30 a second) in the middle of 300 frames, between two of them, time
-    /// in seconds.
+    /// One life of this standard deviation (frames at 30 a second) in the middle of 300 frames, between two of them,
+    /// time in seconds.
     fn life(frames: f64) -> (Lives, Vec<Time>) {
         let row = [149.5 / 30.0, (frames / 30.0).ln(), 0.0];
         let lives = Lives { kind: LifeKind::GaussHalf, rows: vec![row], span: ALWAYS, clip: 10.0, unit: 1.0 };

@@ -162,8 +162,8 @@ impl<F: Real> Layer<F> {
         false
     }
 
-    /// What the life of every row is: centre, log width, log softness (seconds; columns that the kind lacks are zero). The
-    /// model's own where it has one, otherwise the layer's.
+    /// What the life of every row is: centre, log width, log softness (seconds; columns that the kind lacks are zero).
+    /// The model's own where it has one, otherwise the layer's.
     pub fn lives(&self) -> (LifeKind, Vec<[f64; 3]>) {
         let mut own = Table::new(&[("life", 2)], 0);
         let (table, kind) = if self.motion.life(&self.params, &mut own) {
@@ -174,8 +174,8 @@ impl<F: Real> Layer<F> {
         (kind, (0..self.params.len()).map(|id| life_row(table, id).map(Real::f64)).collect())
     }
 
-    /// [from, to] in seconds for every row: when its opacity times life is at least [`ALPHA_MIN`] within the layer's span;
-    /// (1, 0) for never.
+    /// [from, to] in seconds for every row: when its opacity times life is at least [`ALPHA_MIN`] within the layer's
+    /// span; (1, 0) for never.
     pub fn spans(&self) -> Vec<[f64; 2]> {
         let (kind, rows) = self.lives();
         let geometry = &self.params[GEOMETRY];

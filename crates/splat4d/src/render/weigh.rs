@@ -1,9 +1,10 @@
 //! What each splat is to a picture, in walks as forward's that sum one number a splat.
 //!
-//! Its share is Σ over pixels of α_i T_i, T_i = Π_{j<i} (1 − α_j): the gradient of a channel's sum to that channel, which
-//! the way back would compute together with eleven other numbers. The change that its removal makes is
-//! Σ over pixels and channels of (α_i T_i (b_i − c_i))², b_i being the colour of all that lies behind: exact for one splat
-//! alone (pixels that had stopped stay stopped). A splat before others of its colour has a large share and changes little.
+//! Its share is Σ over pixels of α_i T_i, T_i = Π_{j<i} (1 − α_j): the gradient of a channel's sum to that channel,
+//! which the way back would compute together with eleven other numbers. The change that its removal makes is Σ over
+//! pixels and channels of (α_i T_i (b_i − c_i))², b_i being the colour of all that lies behind: exact for one splat
+//! alone (pixels that had stopped stay stopped). A splat before others of its colour has a large share and changes
+//! little.
 
 use super::RenderConfig;
 use super::bin::{BIN, Footprint, id};
@@ -21,8 +22,9 @@ use rayon::prelude::*;
 use std::sync::atomic::Ordering;
 
 impl<F: Real> Raster<F> {
-    /// Σ α T over the picture of every splat that was prepared, into `out` [splats], which is overwritten. With `light`, the
-    /// channels of every splat and the background, of the last [`Raster::blend`]: the squared change if it were not there.
+    /// Σ α T over the picture of every splat that was prepared, into `out` [splats], which is overwritten. With
+    /// `light`, the channels of every splat and the background, of the last [`Raster::blend`]: the squared change if it
+    /// were not there.
     pub(super) fn weigh(
         &mut self,
         projected: &[Projected<F>],

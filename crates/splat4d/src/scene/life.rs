@@ -93,8 +93,8 @@ impl LifeKind {
         }
     }
 
-    /// ∂²σ/∂t² at time t, for a `row` as [`LifeKind::eval`] takes it: how far from constant or fading evenly the life is.
-    /// Where an interval's flat top meets its tail it jumps; there it is the top's, 0.
+    /// ∂²σ/∂t² at time t, for a `row` as [`LifeKind::eval`] takes it: how far from constant or fading evenly the life
+    /// is. Where an interval's flat top meets its tail it jumps; there it is the top's, 0.
     pub fn d2_time<F: Real>(self, row: [F; 3], t: Time) -> F {
         let (delta, sigma) = (F::of(t.0) - row[CENTER], self.eval(row, t).sigma);
         // σ = exp(−h·x²), x in units of 1/inverse: σ'' = (4h²x² − 2h)·σ·inverse².

@@ -130,7 +130,8 @@ fn a_flickering_copy_of_the_backdrop_goes_and_the_picture_stays() {
     assert!(random < after - 1.0, "{random} dB at random, {after} dB by score");
 }
 
-/// In training: rows go at the interval's steps, and a run that is taken up again from a checkpoint's state goes on alike.
+/// In training: rows go at the interval's steps, and a run that is taken up again from a checkpoint's state goes on
+/// alike.
 #[test]
 fn rows_go_while_a_scene_is_trained_and_the_run_repeats() {
     let start = || Scene { layers: vec![layer(200, LifeKind::GaussHalf, 7)], clip: [0.0, 0.8], fps: 10.0, ..scene(2) };

@@ -4,6 +4,7 @@ mod flicker;
 mod transient;
 
 use super::*;
+use crate::Result;
 use crate::capture::frames::{Frames, Picture};
 use crate::train::tests::Made;
 use splat4d::layers::{ALWAYS, Instant, Layer, LayerTape};
@@ -94,8 +95,6 @@ impl Frames for Again {
         self.inner.load(i / self.copies, out)
     }
 }
-
-use crate::Result;
 
 #[test]
 fn spatial_scores_sum_to_what_the_pictures_cover_and_double_with_them() {
@@ -267,7 +266,7 @@ fn masks_hold_what_key_views_show_and_lives_between_keys() {
     let mut left_out = 0;
     for i in 0..made.len() {
         let k = i / CAPTURE.0;
-        if k % 4 == 0 {
+        if k.is_multiple_of(4) {
             assert_eq!(drawn(&s, &made, i), drawn(&whole, &made, i), "at a key time nothing is missed: frame {i}");
         }
         let mut ids = [Vec::new(), Vec::new()];

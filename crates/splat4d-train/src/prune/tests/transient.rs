@@ -1,5 +1,5 @@
-//! What is there for a part of the clip only survives: the orb of the bundled capture, which appears at frame 9, and its
-//! painted crate, which is gone from frame 18 on (docs/bundled-capture.md). Without fine-tuning.
+//! What is there for a part of the clip only survives: the orb of the bundled capture, which appears at frame 9, and
+//! its painted crate, which is gone from frame 18 on (docs/bundled-capture.md). Without fine-tuning.
 
 use super::*;
 use crate::capture::{Capture, CaptureOptions, ImageStore};
@@ -52,7 +52,7 @@ fn quality(scene: &Scene<f32>, held: &Dataset) -> [f64; 2] {
     let (mut sums, mut counts) = ([0.0; 2], [0.0f64; 2]);
     for i in 0..held.len() {
         let frame = (held.time(i).0 * 30.0).round() as usize;
-        if frame % EVERY != 0 {
+        if !frame.is_multiple_of(EVERY) {
             continue;
         }
         held.load(i, &mut picture).unwrap();
