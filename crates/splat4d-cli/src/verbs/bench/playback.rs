@@ -23,39 +23,49 @@ pub(super) struct Played {
 
 /// Measures in turns, with all threads of the current pool.
 pub(super) fn measure(files: &[PathBuf], size: [usize; 2], console: &Console) -> Result<Vec<Played>> {
-    let sources = files.iter().map(|f| open(f)).collect::<Result<Vec<_>>>()?;
+    let sources = files.iter().map(|f| Opened::new(f)).collect::<Result<Vec<_>>>()?;
     // Frame rates compare only where the pictures do: all are seen from the first one's cameras that has some.
-    let first = sources.iter().position(|(s, _)| s.run.is_some() || s.playback.is_some()).unwrap_or(0);
-    let looks = looks_of(&sources[first].0, size)?;
-    let subject = |(source, bytes): &'_ (Source, Option<Arc<[u8]>>)| {
-        let smooth = source.run.as_ref().and_then(|r| r.recipe().ok()).is_some_and(|r| r.antialias);
-        (bytes.clone(), antialias(smooth))
-    };
+    let first = sources.iter().position(|s| s.source.run.is_some() || s.source.playback.is_some()).unwrap_or(0);
+    let looks = looks_of(&sources[first].source, size)?;
     let subjects: Vec<Subject<'_>> = sources
         .iter()
-        .map(|both| {
-            let (bytes, antialias) = subject(both);
-            Subject { what: bytes.map_or(What::Scene(&both.0.scene), What::File), antialias }
+        .map(|one| Subject {
+            what: one.bytes.clone().map_or(What::Scene(&one.source.scene), What::File),
+            antialias: antialias(one.smooth()),
         })
         .collect();
     let sides = in_turns(&subjects, &looks, &mut |done, total| console.phase("playing", done, total));
     console.clear();
-    let row = |(side, (file, (source, _))): (Side, (&PathBuf, &(Source, Option<Arc<[u8]>>)))| {
-        let side = source.run.iter().fold(side, |side, run| side.scored_by(run));
-        Played { file: file.clone(), threads: rayon::current_num_threads(), width: size[0], height: size[1], side }
-    };
-    Ok(sides?.into_iter().zip(files.iter().zip(&sources)).map(row).collect())
+    let rows = sides?.into_iter().zip(files).zip(&sources).map(|((side, file), one)| Played {
+        file: file.clone(),
+        threads: rayon::current_num_threads(),
+        width: size[0],
+        height: size[1],
+        side: one.source.run.iter().fold(side, |side, run| side.scored_by(run)),
+    });
+    Ok(rows.collect())
 }
 
-/// The source, and its bytes where it is a playback file.
-fn open(path: &Path) -> Result<(Source, Option<Arc<[u8]>>)> {
-    let source = Source::open(path)?;
-    not_empty(&source.scene, path)?;
-    let bytes = match &source.playback {
-        Some(_) => Some(std::fs::read(path).map_err(|e| cannot_read(path, e))?.into()),
-        None => None,
-    };
-    Ok((source, bytes))
+/// A source, and its bytes where it is a playback file.
+struct Opened {
+    source: Source,
+    bytes: Option<Arc<[u8]>>,
+}
+
+impl Opened {
+    fn new(path: &Path) -> Result<Self> {
+        let source = Source::open(path)?;
+        not_empty(&source.scene, path)?;
+        let bytes = match &source.playback {
+            Some(_) => Some(std::fs::read(path).map_err(|e| cannot_read(path, e))?.into()),
+            None => None,
+        };
+        Ok(Self { source, bytes })
+    }
+
+    fn smooth(&self) -> bool {
+        self.source.run.as_ref().and_then(|r| r.recipe().ok()).is_some_and(|r| r.antialias)
+    }
 }
 
 /// An array, a row a line.
@@ -64,10 +74,13 @@ pub(super) fn json(rows: &[Played]) -> String {
     format!("[\n{}\n]", lines.join(",\n"))
 }
 
+/// A quantity's name, and how a side tells it.
+type Quantity<'a> = (&'a str, &'a dyn Fn(&Side) -> String);
+
 /// A line for each quantity, a column for each file; the head first.
 fn cells(rows: &[Played]) -> Vec<Vec<String>> {
     let number = |v: Option<f64>, digits: usize| v.map_or_else(String::new, |v| format!("{v:.digits$}"));
-    let quantities: [(&str, &dyn Fn(&Side) -> String); 13] = [
+    let quantities: [Quantity<'_>; 13] = [
         ("Gaussians", &|s| grouped(s.gaussians)),
         ("alive, mean", &|s| grouped(s.active_mean.round() as usize)),
         ("alive, most", &|s| grouped(s.active_max)),

@@ -205,7 +205,10 @@ impl Bench {
             stop.store(true, Ordering::SeqCst);
             return Ok(Scene::default());
         }
-        Ok(read_scene(&folder.join("scene.safetensors"))?)
+        let scene = read_scene(&folder.join("scene.safetensors"))?;
+        let filtered = scene.layers.iter().any(|l| l.masks.is_some());
+        assert!(filtered == (cell.interval > 0), "a cell with a filter has masks, another has none: {}", cell.key());
+        Ok(scene)
     }
 }
 

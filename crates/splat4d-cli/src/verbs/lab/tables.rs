@@ -30,7 +30,7 @@ pub(super) fn markdown(findings: &Findings, grid: &Grid) -> String {
 }
 
 fn parts(out: &mut String, findings: &Findings, grid: &Grid) {
-    let head = ["", "Gaussians", "alive at a frame", "PSNR", "moving", "SSIM", "flicker", "frames/s"];
+    let head = ["scene", "Gaussians", "alive at a frame", "PSNR", "moving", "SSIM", "flicker", "frames/s"];
     let line = |(name, cell): (String, Cell)| {
         let found = findings.of(&cell);
         let side = |f: &dyn Fn(&Side) -> String| found.map_or_else(String::new, |found| f(&found.side));
