@@ -48,6 +48,7 @@ const ORDER: [(&str, &[&str]); 4] = [
             "serving",
             "report",
             "finish",
+            "compressing",
             "verbs",
             "main",
         ],

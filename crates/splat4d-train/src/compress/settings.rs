@@ -1,6 +1,6 @@
 //! What may be told of compression, and the three levels.
 
-use crate::prune::{Combine, Temporal};
+use crate::prune::{Combine, Spatial, Temporal};
 use crate::recipe::nearest;
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
@@ -37,12 +37,14 @@ settings! {
     prune: f64 = 0.0,
     /// In so many rounds, each followed by its part of the fine-tuning.
     rounds: usize = 1,
+    /// What of a view counts: share (what it is of the picture), change (what its removal would do) or both.
+    spatial: String = "share".into(),
     /// How lives count in the score: instant-abs, literal-signed-clamped, first-derivative, width, active-fraction, none.
     temporal: String = "instant-abs".into(),
-    /// How spatial and temporal score become one: product or sum.
+    /// How spatial and temporal score become one: product, sum or temporal-alone.
     combine: String = "product".into(),
     /// Whether large Gaussians count a little more.
-    volume: bool = true,
+    volume: bool = false,
     /// Power of the mean share that a Gaussian has of the pixels it touches: above 0, what costs time goes first.
     cost: f64 = 0.0,
     /// Scores look at every so many of the training views.
@@ -184,6 +186,7 @@ impl Compression {
             return bad("cost", self.cost.to_string(), "between 0 and 10");
         }
         self.depths.check()?;
+        self.spatial.parse::<Spatial>()?;
         self.temporal.parse::<Temporal>()?;
         self.combine.parse::<Combine>()?;
         Ok(())

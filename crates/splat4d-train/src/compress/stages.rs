@@ -39,6 +39,7 @@ impl Bench {
     pub fn score_config(&self) -> Result<ScoreConfig> {
         let s = &self.settings;
         Ok(ScoreConfig {
+            spatial: s.spatial.parse()?,
             temporal: s.temporal.parse()?,
             combine: s.combine.parse()?,
             volume: s.volume,

@@ -187,7 +187,8 @@ pub fn stage(plan: &Plan, iterations: usize, share: f64, codec: Arc<Quantised>) 
     let recipe = Recipe {
         motion: "spacetime".into(),
         motion_order: 1,
-        rotation_rate: true,
+        // A turn that no model asked for would cost two bytes a Gaussian.
+        rotation_rate: plan.recipe.rotation_rate || !["still", "spacetime"].contains(&plan.recipe.motion.as_str()),
         life: "interval".into(),
         strategy: "none".into(),
         sh_degree: 0,

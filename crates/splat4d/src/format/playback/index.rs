@@ -212,7 +212,7 @@ impl Index {
             }
             free = end;
         }
-        for pair in self.masks().windows(2).filter(|pair| pair[0].0 == pair[1].0) {
+        if let Some(pair) = self.masks().windows(2).find(|pair| pair[0].0 == pair[1].0) {
             let what = format!("section {} has masks already", pair[0].0);
             return Err(broken(what).at(format!("section {}", pair[1].1)));
         }
