@@ -18,7 +18,7 @@ use splat4d_train::capture::{Capture, ImageStore};
 use splat4d_train::compress::{self, Compression, Job};
 use splat4d_train::eval::run::{EvalOptions, Evaluation, assess};
 use splat4d_train::recipe::Recipe;
-use splat4d_train::train::TrainOptions;
+use splat4d_train::train::{TrainOptions, checkpoint};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -56,13 +56,15 @@ pub(crate) struct Order {
 pub(crate) struct Work {
     dir: PathBuf,
     order: Order,
+    /// Whether this call began it.
+    fresh: bool,
 }
 
 impl Work {
     /// A new compression. Errors: the folder cannot be written.
     pub(crate) fn begin(dir: PathBuf, order: Order) -> Result<Self> {
         files::make_folder(&dir)?;
-        let work = Self { dir, order };
+        let work = Self { dir, order, fresh: true };
         work.save()?;
         Ok(work)
     }
@@ -81,7 +83,7 @@ impl Work {
                 .remedy("Begin anew: splat4d compress RUN.")
         })?;
         order.settings.check().map_err(|e| e.at(path.display()))?;
-        Ok(Self { dir: dir.to_owned(), order })
+        Ok(Self { dir: dir.to_owned(), order, fresh: false })
     }
 
     fn save(&self) -> Result<()> {
@@ -89,8 +91,20 @@ impl Work {
         files::write(&self.dir.join(ORDER), text.as_bytes())
     }
 
-    /// Compresses until size and guard are content, then measures and reports.
-    pub(crate) fn run(mut self, eval: bool, measure: &Measure, console: &Console) -> anyhow::Result<()> {
+    /// Compresses, measures and reports. What fails before the first step leaves nothing behind.
+    pub(crate) fn run(self, eval: bool, measure: &Measure, console: &Console) -> anyhow::Result<()> {
+        let (dir, fresh) = (self.dir.clone(), self.fresh);
+        let done = self.work(eval, measure, console);
+        if done.is_err() && fresh && checkpoint::list(&dir).is_empty() {
+            run_folder::clear(&dir)?;
+            // Fails where the user keeps files of their own there, as it should.
+            let _ = std::fs::remove_dir(&dir);
+        }
+        done
+    }
+
+    /// Until size and guard are content.
+    fn work(mut self, eval: bool, measure: &Measure, console: &Console) -> anyhow::Result<()> {
         let stop = interrupt::flag("stopping: a checkpoint is being saved");
         let source = Source::open(&self.order.source)?;
         not_empty(&source.scene, &self.order.source)?;
@@ -210,7 +224,7 @@ impl Work {
 
     /// Where the file must stay within a size, the gentlest settings that do.
     fn choose_size(&mut self, original: &Original<'_>, console: &Console) -> anyhow::Result<()> {
-        let begun = !splat4d_train::train::checkpoint::list(&self.dir).is_empty() || !self.order.tried.is_empty();
+        let begun = !checkpoint::list(&self.dir).is_empty() || !self.order.tried.is_empty();
         let Some(most) = self.order.max_bytes.filter(|_| !begun) else { return Ok(()) };
         let settings = self.order.settings.clone();
         let scores = compress::scores(&original.job(&settings), &mut |d, t| console.phase("scoring Gaussians", d, t))?;

@@ -2,6 +2,8 @@
 
 #[path = "cli/bench.rs"]
 mod bench;
+#[path = "cli/compress.rs"]
+mod compress;
 #[path = "cli/convert.rs"]
 mod convert;
 #[path = "cli/lab.rs"]

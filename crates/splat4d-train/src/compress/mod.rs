@@ -12,6 +12,8 @@ mod fit;
 pub mod quantise;
 mod settings;
 mod stages;
+#[cfg(test)]
+mod tests;
 
 pub use fit::{Trial, fit};
 pub use settings::{Compression, Level, MOST_PRUNED};

@@ -2,7 +2,7 @@
 
 #[cfg(test)]
 #[path = "run_tests.rs"]
-pub(super) mod tests;
+pub(crate) mod tests;
 
 use super::checkpoint::{self, Identity, RunState, write_atomically};
 use super::dataset::Dataset;

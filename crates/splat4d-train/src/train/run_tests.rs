@@ -48,7 +48,7 @@ fn capture_on_disk() -> TempDir {
     folder
 }
 
-pub(in crate::train) fn recipe(changes: &[&str]) -> Recipe {
+pub(crate) fn recipe(changes: &[&str]) -> Recipe {
     let mut r = Recipe {
         iterations: STEPS,
         num_pts: 80,
@@ -65,25 +65,25 @@ pub(in crate::train) fn recipe(changes: &[&str]) -> Recipe {
 }
 
 /// A folder with the capture and room for runs.
-pub(in crate::train) struct Place {
+pub(crate) struct Place {
     capture: TempDir,
     runs: TempDir,
 }
 
 impl Place {
-    pub(in crate::train) fn new() -> Self {
+    pub(crate) fn new() -> Self {
         Self { capture: capture_on_disk(), runs: tempfile::tempdir().unwrap() }
     }
 
-    pub(in crate::train) fn run(&self, name: &str) -> PathBuf {
+    pub(crate) fn run(&self, name: &str) -> PathBuf {
         self.runs.path().join(name)
     }
 
-    pub(in crate::train) fn open(&self, recipe: &Recipe) -> Arc<Capture> {
+    pub(crate) fn open(&self, recipe: &Recipe) -> Arc<Capture> {
         Arc::new(open_capture(self.capture.path(), recipe).unwrap())
     }
 
-    pub(in crate::train) fn train(&self, name: &str, recipe: &Recipe) -> Result<Outcome> {
+    pub(crate) fn train(&self, name: &str, recipe: &Recipe) -> Result<Outcome> {
         let run = self.run(name);
         train(self.open(recipe), recipe.clone(), &run, &TrainOptions::default(), &AtomicBool::new(false), &mut |_| {})
     }
@@ -109,7 +109,7 @@ impl Place {
         session.drive(&mut trainer, state, listen)
     }
 
-    pub(in crate::train) fn scene(&self, name: &str) -> Vec<u8> {
+    pub(crate) fn scene(&self, name: &str) -> Vec<u8> {
         std::fs::read(self.run(name).join("scene.safetensors")).unwrap()
     }
 
@@ -124,7 +124,7 @@ fn resume_quietly(run: &Path) -> Result<Outcome> {
     resume(run, &AtomicBool::new(false), &mut |_| {})
 }
 
-pub(in crate::train) fn copy_folder(from: &Path, to: &Path) {
+pub(crate) fn copy_folder(from: &Path, to: &Path) {
     std::fs::create_dir_all(to).unwrap();
     for entry in std::fs::read_dir(from).unwrap() {
         let entry = entry.unwrap();

@@ -1,0 +1,110 @@
+//! `compress` on a tiny run: what it leaves, what it says, what it refuses.
+
+use crate::sample::{Capture, splat4d};
+use crate::{json_of, str, train};
+use serde_json::Value;
+
+#[test]
+fn a_run_becomes_a_smaller_run_and_is_measured_before_and_after() {
+    let work = tempfile::tempdir().unwrap();
+    let run = work.path().join("run");
+    train(&Capture::new(work.path()).write(), &run).ok();
+    let dir = work.path().join("small");
+    let steps = ["--fine-tune", "8", "--guard", "0"];
+    let compress = |extra: &[&str]| splat4d(&["compress", str(&run)]).args(&steps).args(extra);
+    let lines = compress(&["-o", str(&dir), "--prune", "0.5", "--unpruned", "--json"]).run().ok();
+    let last: Value = serde_json::from_str(lines.lines().last().unwrap()).unwrap();
+    assert_eq!(last["type"], "compressed");
+
+    let told = json_of(&dir.join("compress.json"));
+    let file = std::fs::read(dir.join("scene.splat4d")).unwrap();
+    assert_eq!(told["after"]["bytes"].as_u64(), Some(file.len() as u64), "the size told is the file's");
+    assert_eq!(last["bytes"].as_u64(), Some(file.len() as u64));
+    let gaussians = |side: &str| told[side]["gaussians"].as_u64().unwrap();
+    assert_eq!(gaussians("unpruned"), gaussians("before"));
+    assert!(gaussians("after") <= gaussians("before").div_ceil(2), "half is gone");
+    assert_eq!(told["settings"]["prune"], 0.5);
+    let stages: Vec<&str> = told["stages"].as_array().unwrap().iter().map(|s| s["name"].as_str().unwrap()).collect();
+    assert_eq!(stages, ["pruned 1/1", "quantised"]);
+    let spent: u64 = told["stages"].as_array().unwrap().iter().map(|s| s["steps"].as_u64().unwrap()).sum();
+    assert_eq!(spent, 8, "as many steps as were asked for");
+
+    // What was measured is the file: its scene scores as the folder's.
+    let scores = json_of(&dir.join("results.json"));
+    assert_eq!(scores["ours_8"]["PSNR"], told["after"]["psnr"]);
+    let scene = splat4d::format::scene::read(&std::fs::read(dir.join("scene.safetensors")).unwrap()).unwrap();
+    let played = splat4d::format::playback::read(&file).unwrap();
+    assert_eq!(scene.layers.len(), played.layers.len());
+    for (a, b) in scene.layers.iter().zip(&played.layers) {
+        assert!(a.params == b.params && a.masks == b.masks && a.span == b.span, "the file is what was learnt");
+    }
+    assert!(played.layers.iter().all(|l| l.masks.is_some()), "level 2 filters");
+
+    // It is a run like any other; the original is as it was.
+    let page = std::fs::read_to_string(dir.join("report.html")).unwrap();
+    assert!(page.contains("Compressed") && page.contains("unpruned"), "the report compares");
+    splat4d(&["info", str(&dir)]).run().ok();
+    splat4d(&["eval", str(&dir), "--no-film"]).run().ok();
+    assert_eq!(
+        json_of(&dir.join("results.json"))["ours_8"]["PSNR"],
+        told["after"]["psnr"],
+        "it measures the same again"
+    );
+    assert!(!run.join("compress.json").exists() && !run.join("unpruned").exists());
+
+    // A finished compression is told again without a step, and never taken over.
+    let again = splat4d(&["compress", "--resume", str(&dir)]).run().ok();
+    assert!(again.contains("times smaller"), "{again}");
+    assert_eq!(std::fs::read(dir.join("scene.splat4d")).unwrap(), file);
+    let taken = compress(&["-o", str(&dir)]).run().refused();
+    assert!(taken.contains("--resume") && taken.contains("--force"), "{taken}");
+    let train = splat4d(&["train", "--resume", str(&dir)]).run().refused();
+    assert!(train.contains("splat4d compress"), "{train}");
+}
+
+#[test]
+fn a_size_is_kept_or_refused_with_the_smallest_that_is_possible() {
+    let work = tempfile::tempdir().unwrap();
+    let run = work.path().join("run");
+    train(&Capture::new(work.path()).write(), &run).ok();
+    let compress = |mb: &str, dir: &str| {
+        let out = work.path().join(dir);
+        splat4d(&["compress", str(&run), "-o", str(&out), "--fine-tune", "4", "--max-mb", mb]).run()
+    };
+    let least = compress("0.001", "none").refused();
+    assert!(least.contains("Give --max-mb at least"), "{least}");
+    // What it names is enough.
+    let named = least.split("at least ").nth(1).unwrap().trim_end().trim_end_matches('.').to_owned();
+    compress(&named, "least").ok();
+    let bytes = std::fs::metadata(work.path().join("least/scene.splat4d")).unwrap().len();
+    assert!(bytes as f64 <= named.parse::<f64>().unwrap() * 1e6, "{bytes} bytes of {named} MB");
+}
+
+#[test]
+fn wrong_orders_are_refused_before_any_work() {
+    let work = tempfile::tempdir().unwrap();
+    let run = work.path().join("run");
+    let capture = Capture::new(work.path()).write();
+    train(&capture, &run).ok();
+    let refused = |args: &[&str]| splat4d(&["compress"]).args(args).run().refused();
+    let run_text = str(&run);
+    for (args, says) in [
+        (vec![run_text, "--prune", "1.5"], "0.98"),
+        (vec![run_text, "--level", "3"], "0..=2"),
+        (vec![run_text, "--level", "1", "--prune", "0.5"], "level 2"),
+        (vec![run_text, "--set", "prun=0.5"], "`prune`"),
+        (vec![run_text, "--set", "temporal=sometimes"], "sometimes"),
+        (vec![run_text, "--set", "depths.color=9"], "color"),
+        (vec![run_text, "--max-mb", "-1"], "megabytes"),
+        (vec![run_text, "-o", run_text], "the run itself"),
+        (vec![str(&capture)], "not a run"),
+        (vec!["nowhere"], "no such run"),
+        (vec!["--resume", run_text], "no compression"),
+    ] {
+        let said = refused(&args);
+        assert!(said.contains(says), "{args:?}: {said}");
+    }
+    std::fs::remove_file(run.join("scene.safetensors")).unwrap();
+    assert!(refused(&[run_text]).contains("train --resume"));
+    assert!(!work.path().join("run-compressed").exists(), "nothing was begun");
+}
