@@ -360,16 +360,20 @@ const AGAIN_MARGIN: f64 = 0.01;
 /// The folder, in that of a compression, of the unpruned scene that was trained on.
 const UNPRUNED: &str = "unpruned";
 
+/// What metrics.csv calls the time behind the last stage.
+const DONE: &str = "done";
+
 /// What each stage took, from `metrics.csv`'s rows.
 fn steps(run: &Run) -> Vec<Step> {
     let mut out: Vec<Step> = Vec::new();
     let mut before = (0, 0.0);
     for row in &run.metrics {
-        if out.last().is_none_or(|s| s.name != row.stage) {
+        // The row of the very last step stands behind the last stage.
+        if row.stage != DONE && out.last().is_none_or(|s| s.name != row.stage) {
             before = out.iter().fold((0, 0.0), |b, s| (b.0 + s.steps, b.1 + s.seconds));
             out.push(Step { name: row.stage.clone(), ..Step::default() });
         }
-        let step = out.last_mut().expect("one was just pushed");
+        let Some(step) = out.last_mut() else { continue };
         step.steps = row.iteration as usize - before.0;
         step.seconds = row.seconds - before.1;
         step.gaussians = row.gaussians as usize;

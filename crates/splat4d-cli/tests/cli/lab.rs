@@ -32,7 +32,7 @@ fn a_study_of_pruning_measures_every_cell_once() {
     let own = json_of(&run.join("results.json"))["ours_20"]["PSNR"].as_f64().unwrap();
     let source = "prune000-steps0-interval0";
     assert!((psnr(source) - own).abs() < 1e-9, "{} and {own}", psnr(source));
-    let pruned = |share: usize, rest: &str| format!("prune{share:03}-instant-abs-product-volume-rounds1-{rest}");
+    let pruned = |share: usize, rest: &str| format!("prune{share:03}-change-instant-abs-product-flat-rounds1-{rest}");
     for share in [500, 800, 950] {
         let left = gaussians(source) as f64 * (1.0 - share as f64 / 1000.0);
         let key = pruned(share, "steps0-interval0");
@@ -50,7 +50,7 @@ fn a_study_of_pruning_measures_every_cell_once() {
     }
     let before = std::fs::read(&file).unwrap();
     let said = study().run().ok();
-    assert!(said.contains("| 95 % |") && said.contains("spatial score alone"), "{said}");
+    assert!(said.contains("| 95 % |") && said.contains("4DGS-1K"), "{said}");
     assert_eq!(std::fs::read(&file).unwrap(), before, "finished cells are kept");
 
     // Half of it is lost: only that half is measured again.

@@ -38,7 +38,7 @@ settings! {
     /// In so many rounds, each followed by its part of the fine-tuning.
     rounds: usize = 1,
     /// What of a view counts: share (what it is of the picture), change (what its removal would do) or both.
-    spatial: String = "share".into(),
+    spatial: String = "change".into(),
     /// How lives count in the score: instant-abs, literal-signed-clamped, first-derivative, width, active-fraction, none.
     temporal: String = "instant-abs".into(),
     /// How spatial and temporal score become one: product, sum or temporal-alone.
@@ -51,6 +51,10 @@ settings! {
     every: usize = 1,
     /// Steps of fine-tuning in floats after pruning, all rounds together.
     fine_tune: usize = 0,
+    /// Fine-tuning begins at this share of the training's rates.
+    rates: f64 = 1.0,
+    /// Weight of the mean opacity while fine-tuning: what no view asks for fades, and does not veil views between them.
+    opacity_reg: f64 = 0.0,
     /// Whether the scene is quantised at all; false only where a study wants to see the rest by itself.
     codec: bool = true,
     /// Steps of fine-tuning through the quantised scene.
@@ -184,6 +188,12 @@ impl Compression {
         }
         if !(0.0..=10.0).contains(&self.cost) {
             return bad("cost", self.cost.to_string(), "between 0 and 10");
+        }
+        if !(self.rates > 0.0 && self.rates <= 10.0) {
+            return bad("rates", self.rates.to_string(), "above 0 and at most 10");
+        }
+        if !(0.0..=10.0).contains(&self.opacity_reg) {
+            return bad("opacity_reg", self.opacity_reg.to_string(), "between 0 and 10");
         }
         self.depths.check()?;
         self.spatial.parse::<Spatial>()?;

@@ -4,6 +4,8 @@ use super::quantise::{self, Quantised, palette_rate};
 use super::{Compression, draft};
 use crate::capture::frames::Frames;
 use crate::densify::Densify;
+use crate::loss::scene::MeanOpacity;
+use crate::loss::terms::ParamLoss;
 use crate::models::{Hook, Plan, Rate, Stage, Tell, program};
 use crate::prune::{Keys, MaskConfig, ScoreConfig, key_masks, prune, score};
 use crate::{Error, Result};
@@ -79,14 +81,21 @@ fn host_stage(bench: &Bench, steps: usize) -> Result<Stage> {
     stage.densify = Densify::None;
     (stage.sh_interval, stage.half_size_steps) = (0, 0);
     (stage.start, stage.end) = (None, None);
-    stage.groups.iter_mut().for_each(|g| g.rate = settling(g.rate));
+    stage.groups.iter_mut().for_each(|g| g.rate = settling(g.rate, bench.settings.rates));
+    stage.params.extend(fading(&bench.settings));
     Ok(stage)
 }
 
 /// A rate of training as fine-tuning has it.
-fn settling(rate: Rate) -> Rate {
-    let start = rate.at(REWIND);
-    Rate { start, end: rate.end.min(start * REST) }
+fn settling(rate: Rate, share: f64) -> Rate {
+    let start = share * rate.at(REWIND);
+    Rate { start, end: (share * rate.end).min(start * REST) }
+}
+
+/// What lets Gaussians fade that no view asks for.
+fn fading(settings: &Compression) -> Option<Box<dyn ParamLoss<f32>>> {
+    let weight = settings.opacity_reg;
+    (weight > 0.0).then(|| Box::new(MeanOpacity { weight }) as Box<dyn ParamLoss<f32>>)
 }
 
 /// Scores, prunes, and makes masks where they are wanted already.
@@ -117,8 +126,9 @@ fn masks(scene: &mut Scene<f32>, bench: &Bench, tell: &mut Tell<'_>) -> Result<(
 /// Fine-tuning through the file, and the codec that is it.
 pub(super) fn file_stage(bench: &Bench) -> Result<(Stage, Arc<Quantised>)> {
     let s = &bench.settings;
-    let codec = Quantised::new(s.depths, palette_rate(&bench.plan.recipe, FILE_RATES))?;
-    let mut stage = quantise::stage(&bench.plan, s.quantise, FILE_RATES, codec.clone());
+    let codec = Quantised::new(s.depths, palette_rate(&bench.plan.recipe, FILE_RATES * s.rates))?;
+    let mut stage = quantise::stage(&bench.plan, s.quantise, FILE_RATES * s.rates, codec.clone());
+    stage.params.extend(fading(s));
     let (own, begun) = (bench.clone(), codec.clone());
     stage.start = Some(Box::new(move |scene: &mut Scene<f32>, tell| {
         let draft = draft(scene, &own.settings, &own.cameras, &mut |done, total| tell("baking", done, total))?;

@@ -1,6 +1,6 @@
 //! Pruning while a scene is trained.
 
-use super::{ScoreConfig, Scores, score};
+use super::{ScoreConfig, Scores, Spatial, score};
 use crate::Result;
 use crate::capture::frames::Frames;
 use crate::recipe::Recipe;
@@ -34,6 +34,9 @@ impl Periodic {
     /// The scores that it goes by.
     pub fn scores(&self, scene: &Scene<f32>, frames: &dyn Frames, antialias: Antialias) -> Result<Scores> {
         let every = frames.len().div_ceil(self.views.max(1)).max(1);
-        score(scene, frames, &ScoreConfig { every, antialias, ..ScoreConfig::default() }, &mut |_, _| {})
+        // As `compress` does by default; docs/benchmarks.md has what it won.
+        let config =
+            ScoreConfig { spatial: Spatial::Change, volume: false, every, antialias, ..ScoreConfig::default() };
+        score(scene, frames, &config, &mut |_, _| {})
     }
 }

@@ -1,7 +1,7 @@
 //! What is done to a trained scene: a point of the study, and the points that it consists of.
 
 use splat4d_train::compress::Compression;
-use splat4d_train::prune::{Combine, Temporal};
+use splat4d_train::prune::{Combine, Spatial, Temporal};
 
 /// Share of the Gaussians that goes where something else is varied, as 4DGS-1K on N3V.
 const AT: f64 = 0.8;
@@ -36,34 +36,35 @@ pub(super) struct Cell {
 /// How Gaussians are ranked.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Score {
+    pub spatial: Spatial,
     pub temporal: Temporal,
     pub combine: Combine,
     pub volume: bool,
 }
 
-impl Default for Score {
-    fn default() -> Self {
-        Self { temporal: Temporal::default(), combine: Combine::default(), volume: true }
-    }
-}
+/// What `compress` does by default.
+const DEFAULT: Score =
+    Score { spatial: Spatial::Change, temporal: Temporal::InstantAbs, combine: Combine::Product, volume: false };
 
 impl Score {
-    /// All that are compared, the default first: the temporal variants, then without the volume, then the ways to
-    /// combine.
+    /// All that are compared, the default first: the spatial variants, the temporal ones, with the volume, the ways to
+    /// combine, and 4DGS-1K's own choice.
     pub(super) fn all() -> Vec<(String, Self)> {
-        let named = |t: &Temporal| match t {
-            Temporal::None => "spatial score alone".to_owned(),
-            t => t.name().replace('-', " "),
-        };
-        let mut out: Vec<(String, Self)> =
-            Temporal::ALL.iter().map(|t| (named(t), Self { temporal: *t, ..Self::default() })).collect();
-        out.push(("without the volume".into(), Self { volume: false, ..Self::default() }));
-        let others = Combine::ALL.iter().filter(|c| **c != Combine::default());
-        out.extend(
-            others.map(|c| {
-                (format!("combined: {}", c.name().replace('-', " ")), Self { combine: *c, ..Self::default() })
-            }),
-        );
+        let mut out = vec![("change, instant abs".to_owned(), DEFAULT)];
+        let spatial = Spatial::ALL.iter().filter(|s| **s != DEFAULT.spatial);
+        out.extend(spatial.map(|s| (format!("{s}, instant abs"), Self { spatial: *s, ..DEFAULT })));
+        let temporal = Temporal::ALL.iter().filter(|t| **t != DEFAULT.temporal);
+        out.extend(temporal.map(|t| match t {
+            Temporal::None => ("change alone".to_owned(), Self { temporal: *t, ..DEFAULT }),
+            t => (format!("change, {}", t.name().replace('-', " ")), Self { temporal: *t, ..DEFAULT }),
+        }));
+        out.push(("change, instant abs, volume".into(), Self { volume: true, ..DEFAULT }));
+        let combine = Combine::ALL.iter().filter(|c| **c != DEFAULT.combine);
+        let combined = |c: &Combine| format!("change, instant abs, {}", c.name().replace('-', " "));
+        out.extend(combine.map(|c| (combined(c), Self { combine: *c, ..DEFAULT })));
+        let share = Self { spatial: Spatial::Share, ..DEFAULT };
+        out.push(("share alone".into(), Self { temporal: Temporal::None, ..share }));
+        out.push(("share, instant abs, volume (4DGS-1K)".into(), Self { volume: true, ..share }));
         out
     }
 }
@@ -71,8 +72,7 @@ impl Score {
 impl Cell {
     /// The source as it is.
     pub(super) const fn source() -> Self {
-        let score = Score { temporal: Temporal::InstantAbs, combine: Combine::Product, volume: true };
-        Self { prune: 0.0, rounds: 1, score, steps: 0, interval: 0 }
+        Self { prune: 0.0, rounds: 1, score: DEFAULT, steps: 0, interval: 0 }
     }
 
     /// Whether nothing is done at all.
@@ -84,8 +84,12 @@ impl Cell {
     pub(super) fn key(&self) -> String {
         let mut key = format!("prune{:03.0}", 1000.0 * self.prune);
         if self.prune > 0.0 {
-            let Score { temporal, combine, volume } = self.score;
-            key += &format!("-{temporal}-{combine}-{}-rounds{}", if volume { "volume" } else { "flat" }, self.rounds);
+            let Score { spatial, temporal, combine, volume } = self.score;
+            key += &format!(
+                "-{spatial}-{temporal}-{combine}-{}-rounds{}",
+                if volume { "volume" } else { "flat" },
+                self.rounds
+            );
         }
         key + &format!("-steps{}-interval{}", self.steps, self.interval)
     }
@@ -97,7 +101,7 @@ impl Cell {
         }
         let mut words = match self.prune {
             0.0 => "not pruned".to_owned(),
-            share => format!("{:.0} % pruned by {}", 100.0 * share, self.score.temporal),
+            share => format!("{:.0} % pruned by {} and {}", 100.0 * share, self.score.spatial, self.score.temporal),
         };
         if self.interval > 0 {
             words += &format!(", filter every {} frames", self.interval);
@@ -113,6 +117,7 @@ impl Cell {
         Compression {
             prune: self.prune,
             rounds: self.rounds,
+            spatial: self.score.spatial.name().into(),
             temporal: self.score.temporal.name().into(),
             combine: self.score.combine.name().into(),
             volume: self.score.volume,
@@ -237,14 +242,14 @@ mod tests {
         let needed =
             grid.shares.iter().flat_map(|s| grid.share(*s)).chain(grid.scores.iter().flat_map(|s| grid.score(s.1)));
         assert!(needed.into_iter().all(|c| keys.contains(&c.key())));
-        assert_eq!(grid.scores[0].1, Score::default());
+        assert_eq!(grid.scores[0].1, DEFAULT);
         assert!(Grid::quick(10).cells().len() < cells.len() / 2);
     }
 
     #[test]
     fn without_pruning_the_score_makes_no_cell_of_its_own() {
         let plain = Cell { steps: 5, ..Cell::source() };
-        let other = Cell { score: Score { volume: false, ..Score::default() }, rounds: 3, ..plain.clone() };
+        let other = Cell { score: Score { volume: true, ..DEFAULT }, rounds: 3, ..plain.clone() };
         assert_eq!(plain.key(), other.key());
     }
 }
