@@ -6,7 +6,7 @@ use crate::draw::antialias;
 use crate::finish::{self, Measure};
 use crate::measure::{SIZE, Side, Subject, What, in_turns, looks_of};
 use crate::report::compress::{Compressed, Guard, Step, Tried};
-use crate::run_folder::{self, COMPRESS, Run, cameras_json};
+use crate::run_folder::{self, COMPRESS, ORDER, Run, cameras_json};
 use crate::source::{Source, not_empty, read_scene};
 use crate::{files, interrupt, report};
 use serde::{Deserialize, Serialize};
@@ -23,8 +23,6 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-/// The order's file in the run folder.
-pub(crate) const ORDER: &str = "compress.toml";
 /// Times that the guard (or the size) may ask for another round.
 const MOST_TRIES: usize = 3;
 /// The guard takes back this share of the pruning.

@@ -6,7 +6,7 @@ use crate::draw::{Channel, Painter};
 use crate::files;
 use crate::paths::{Clock, Route, Stage, shots};
 use crate::report;
-use crate::run_folder::Run;
+use crate::run_folder::{ORDER, Run};
 use crate::source::{Source, not_empty, read_scene};
 use crate::video::{Film, have_ffmpeg};
 use serde_json::{Value, json};
@@ -66,6 +66,10 @@ pub(crate) fn all(run: &Path, measure: &Measure, console: &Console) -> anyhow::R
 
 /// Bakes the run into `scene.splat4d`. What goes wrong is said and never costs the run.
 pub(crate) fn playback(run: &Path, console: &Console) -> Result<()> {
+    // The file of a compression is what was learnt: baking anew would lose its codes, palette and masks.
+    if run.join(ORDER).is_file() {
+        return Ok(());
+    }
     let baked = Source::open(run).map_err(anyhow::Error::from).and_then(|source| {
         not_empty(&source.scene, run)?;
         let title = Run::open(run)?.name();

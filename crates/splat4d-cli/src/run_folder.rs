@@ -15,6 +15,8 @@ use std::path::{Path, PathBuf};
 const MARKERS: [&str; 4] = ["recipe.toml", "run.json", "scene.safetensors", "checkpoints"];
 /// What `compress` leaves beside the file that it writes, for the report and for machines.
 pub(crate) const COMPRESS: &str = "compress.json";
+/// What `compress` was asked for.
+pub(crate) const ORDER: &str = "compress.toml";
 /// What splat4d writes into a run; `--force` replaces these and nothing else.
 const OURS: [&str; 19] = [
     "recipe.toml",
@@ -34,7 +36,7 @@ const OURS: [&str; 19] = [
     "report.html",
     "baseline",
     "renders",
-    "compress.toml",
+    ORDER,
     "unpruned",
 ];
 

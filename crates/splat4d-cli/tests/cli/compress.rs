@@ -42,9 +42,10 @@ fn a_run_becomes_a_smaller_run_and_is_measured_before_and_after() {
 
     // It is a run like any other; the original is as it was.
     let page = std::fs::read_to_string(dir.join("report.html")).unwrap();
-    assert!(page.contains("Compressed") && page.contains("unpruned"), "the report compares");
+    assert!(page.contains("Compressed") && page.contains("not pruned, same steps"), "the report compares");
     splat4d(&["info", str(&dir)]).run().ok();
-    splat4d(&["eval", str(&dir), "--no-film"]).run().ok();
+    splat4d(&["eval", str(&dir)]).run().ok();
+    assert_eq!(std::fs::read(dir.join("scene.splat4d")).unwrap(), file, "measuring does not bake anew");
     assert_eq!(
         json_of(&dir.join("results.json"))["ours_8"]["PSNR"],
         told["after"]["psnr"],

@@ -54,7 +54,7 @@ settings! {
     /// Fine-tuning begins at this share of the training's rates.
     rates: f64 = 1.0,
     /// Weight of the mean opacity while fine-tuning: what no view asks for fades, and does not veil views between them.
-    opacity_reg: f64 = 0.0,
+    opacity_reg: f64 = 0.01,
     /// Whether the scene is quantised at all; false only where a study wants to see the rest by itself.
     codec: bool = true,
     /// Steps of fine-tuning through the quantised scene.
@@ -214,7 +214,7 @@ const TUNED_SHARE: f64 = 0.15;
 /// Level 2: share of the training steps that fine-tuning in floats takes.
 const FINE_TUNED_SHARE: f64 = 0.25;
 /// Level 2: share of the Gaussians that goes.
-const PRUNED_SHARE: f64 = 0.6;
+const PRUNED_SHARE: f64 = 0.5;
 /// Frames between key times (4DGS-1K, N3V).
 const MASK_INTERVAL: usize = 20;
 /// Level 2: bits of the codes.
