@@ -51,8 +51,8 @@ settings! {
     every: usize = 1,
     /// Steps of fine-tuning in floats after pruning, all rounds together.
     fine_tune: usize = 0,
-    /// Fine-tuning begins at this share of the training's rates.
-    rates: f64 = 1.0,
+    /// Fine-tuning begins at this share of the training's rates; 0: 0.3 where up to a half is pruned, 1 from four fifths on.
+    rates: f64 = 0.0,
     /// Weight of the mean opacity while fine-tuning: what no view asks for fades, and does not veil views between them.
     opacity_reg: f64 = 0.01,
     /// Whether the scene is quantised at all; false only where a study wants to see the rest by itself.
@@ -114,6 +114,17 @@ impl Compression {
     /// Steps of all stages.
     pub fn steps(&self) -> usize {
         self.fine_tune + if self.codec { self.quantise } else { 0 }
+    }
+
+    /// The share of the training's rates at which fine-tuning begins. The more goes, the further has what is left to move;
+    /// where little goes, high rates only let unseen Gaussians drift (docs/benchmarks.md, "Compression").
+    pub fn first_rates(&self) -> f64 {
+        if self.rates > 0.0 {
+            return self.rates;
+        }
+        let [(least, low), (most, high)] = RATES_BY_PRUNING;
+        let t = ((self.prune - least) / (most - least)).clamp(0.0, 1.0);
+        low * f64::powf(high / low, t)
     }
 
     /// Reads TOML. Errors: syntax, unknown names (with the nearest known one), ranges.
@@ -189,8 +200,8 @@ impl Compression {
         if !(0.0..=10.0).contains(&self.cost) {
             return bad("cost", self.cost.to_string(), "between 0 and 10");
         }
-        if !(self.rates > 0.0 && self.rates <= 10.0) {
-            return bad("rates", self.rates.to_string(), "above 0 and at most 10");
+        if !(0.0..=10.0).contains(&self.rates) {
+            return bad("rates", self.rates.to_string(), "between 0 and 10");
         }
         if !(0.0..=10.0).contains(&self.opacity_reg) {
             return bad("opacity_reg", self.opacity_reg.to_string(), "between 0 and 10");
@@ -209,6 +220,8 @@ fn unknown(key: &str) -> Error {
         .remedy(format!("{hint}They are: {}.", NAMES.join(", ")))
 }
 
+/// Share that is pruned, and share of the training's rates that suited it; between them log-linear (measured).
+const RATES_BY_PRUNING: [(f64, f64); 2] = [(0.5, 0.3), (0.8, 1.0)];
 /// Share of a scene's training steps that fine-tuning through the quantised scene takes.
 const TUNED_SHARE: f64 = 0.15;
 /// Level 2: share of the training steps that fine-tuning in floats takes.
@@ -251,5 +264,9 @@ mod tests {
         assert!(wrong("depths.color=9").contains("color"));
         assert_eq!(c.prune, 0.5, "a refused setting changes nothing");
         assert!(Level::new(3).is_err());
+        let rates = |prune| Compression { prune, ..Compression::default() }.first_rates();
+        assert_eq!((rates(0.0), rates(0.5), rates(0.9)), (0.3, 0.3, 1.0));
+        assert!((rates(0.65) - 0.3f64.sqrt()).abs() < 1e-12);
+        assert_eq!(Compression { rates: 2.0, ..Compression::default() }.first_rates(), 2.0);
     }
 }

@@ -81,7 +81,7 @@ fn host_stage(bench: &Bench, steps: usize) -> Result<Stage> {
     stage.densify = Densify::None;
     (stage.sh_interval, stage.half_size_steps) = (0, 0);
     (stage.start, stage.end) = (None, None);
-    stage.groups.iter_mut().for_each(|g| g.rate = settling(g.rate, bench.settings.rates));
+    stage.groups.iter_mut().for_each(|g| g.rate = settling(g.rate, bench.settings.first_rates()));
     stage.params.extend(fading(&bench.settings));
     Ok(stage)
 }
@@ -126,8 +126,8 @@ fn masks(scene: &mut Scene<f32>, bench: &Bench, tell: &mut Tell<'_>) -> Result<(
 /// Fine-tuning through the file, and the codec that is it.
 pub(super) fn file_stage(bench: &Bench) -> Result<(Stage, Arc<Quantised>)> {
     let s = &bench.settings;
-    let codec = Quantised::new(s.depths, palette_rate(&bench.plan.recipe, FILE_RATES * s.rates))?;
-    let mut stage = quantise::stage(&bench.plan, s.quantise, FILE_RATES * s.rates, codec.clone());
+    let codec = Quantised::new(s.depths, palette_rate(&bench.plan.recipe, FILE_RATES * s.first_rates()))?;
+    let mut stage = quantise::stage(&bench.plan, s.quantise, FILE_RATES * s.first_rates(), codec.clone());
     stage.params.extend(fading(s));
     let (own, begun) = (bench.clone(), codec.clone());
     stage.start = Some(Box::new(move |scene: &mut Scene<f32>, tell| {
