@@ -37,6 +37,8 @@ pub(crate) struct Order {
     pub level: u8,
     /// Most dB that training views may lose; 0: no guard.
     pub guard: f64,
+    /// Whether the user said how much is to be pruned: then the guard only warns.
+    pub asked: bool,
     /// Most bytes of the file.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub max_bytes: Option<u64>,
@@ -299,7 +301,7 @@ impl Work {
         let (loss, prune) = (was - is, settings.prune);
         let lost = self.order.guard > 0.0 && loss > self.order.guard;
         let large = self.order.max_bytes.filter(|most| bytes > *most);
-        let gentler = self.order.max_bytes.is_none() && prune > 0.0;
+        let gentler = self.order.max_bytes.is_none() && !self.order.asked && prune > 0.0;
         let next = match large {
             // What is left shrinks as the file must, and a little more.
             Some(most) => 1.0 - (1.0 - prune) * (1.0 - AGAIN_MARGIN) * most as f64 / bytes as f64,

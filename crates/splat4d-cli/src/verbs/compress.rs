@@ -52,7 +52,8 @@ pub(crate) struct Args {
     /// Steps of fine-tuning in all [default: by level, a share of the run's own steps]
     #[arg(long, value_name = "STEPS")]
     fine_tune: Option<usize>,
-    /// Most dB that training views may lose; beyond it half as much is pruned instead, at most twice. 0: no guard
+    /// Most dB that training views may lose; beyond it half as much is pruned instead, at most twice (where --prune says how
+    /// much, it is only told). 0: no guard
     #[arg(long, value_name = "DB", default_value_t = GUARD, value_parser = natural)]
     guard: f64,
     /// Train the unpruned scene on for as many steps too, and compare with that: fair, and takes as long again
@@ -94,6 +95,7 @@ fn begin(args: &Args, console: &Console) -> anyhow::Result<Work> {
         guard: args.guard,
         max_bytes: args.max_mb.map(|mb| (mb * 1e6) as u64),
         unpruned: args.unpruned,
+        asked: args.prune.is_some() || args.set.iter().any(|s| s.trim_start().starts_with("prune")),
         free: args.set.is_empty() && args.fine_tune.is_none(),
         settings: settings(args, iterations)?,
         tried: Vec::new(),

@@ -468,7 +468,7 @@ impl<F: Real> Renderer<F> {
 
     /// Σ over pixels of α_i Π_{j<i} (1 − α_j) of every splat of the last render: how much of the picture it is.
     ///
-    /// `out` is overwritten, [splats]; exactly 0 where no pixel shows the splat. A backward may still follow. Costs
+    /// `out` is overwritten, one a splat; exactly 0 where no pixel shows the splat. A backward may still follow. Costs
     /// less than the render's blend. Source: the significance of LightGaussian (Fan et al. 2024) and the spatial score
     /// of 4DGS-1K (Yuan et al. 2025).
     pub fn contributions(&mut self, out: &mut Vec<F>) {
@@ -487,7 +487,7 @@ impl<F: Real> Renderer<F> {
     /// `background`, one a splat, exact for each alone: a splat before others of its colour has a large contribution
     /// and changes little.
     ///
-    /// `out` is overwritten, [splats]. Draws by itself; no backward may follow.
+    /// `out` is overwritten, one a splat. Draws by itself; no backward may follow.
     pub fn removals(&mut self, splats: &Splats<'_, F>, camera: &Camera, background: [F; 3], out: &mut Vec<F>) {
         let view = self.list(splats, camera);
         self.channels.resize(splats.len(), [F::ZERO; CHANNELS]);
