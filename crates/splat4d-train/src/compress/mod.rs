@@ -109,9 +109,11 @@ pub fn scores(job: &Job<'_>, progress: &mut dyn FnMut(usize, usize)) -> Result<S
 
 fn bench(job: &Job<'_>) -> Result<Bench> {
     let frames = training_frames(job.capture.clone(), job.recipe)?;
+    // Pruning is this run's own business: rows that went by themselves would leave the file's labels behind.
+    let recipe = Recipe { prune_interval: 0, ..job.recipe.clone() };
     Ok(Bench {
         frames,
-        plan: plan(&job.capture, job.recipe),
+        plan: plan(&job.capture, &recipe),
         cameras: cameras(&job.capture),
         settings: job.settings.clone(),
     })

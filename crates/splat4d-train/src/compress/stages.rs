@@ -2,13 +2,13 @@
 
 use super::quantise::{self, Quantised, palette_rate};
 use super::{Compression, draft};
+use crate::Result;
 use crate::capture::frames::Frames;
 use crate::densify::Densify;
 use crate::loss::scene::MeanOpacity;
 use crate::loss::terms::ParamLoss;
 use crate::models::{Hook, Plan, Rate, Stage, Tell, program};
 use crate::prune::{Keys, MaskConfig, ScoreConfig, key_masks, prune, score};
-use crate::{Error, Result};
 use splat4d::format::playback::{WriteConfig, read_pages, write};
 use splat4d::layers::Scene;
 use splat4d::math::Rng;
@@ -105,12 +105,8 @@ fn pruning(bench: Bench, share: f64, filter: bool) -> Hook<f32> {
             let scores = score(scene, bench.frames.as_ref(), &bench.score_config()?, &mut |done, total| {
                 tell("scoring Gaussians", done, total);
             })?;
-            // A zero-score Gaussian is in no picture; the count still goes by the share.
             for (layer, edit) in prune(scene, &scores, share).into_iter().enumerate() {
                 scene.layers[layer].edit(&edit, &Rng::new(bench.plan.recipe.seed, "prune", layer as u64));
-            }
-            if scene.is_empty() {
-                return Err(Error::input("nothing is left").remedy("Prune less."));
             }
         }
         if filter { masks(scene, &bench, tell) } else { Ok(()) }

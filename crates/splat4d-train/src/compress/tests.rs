@@ -14,7 +14,8 @@ struct Bed {
 impl Bed {
     fn new() -> Self {
         let place = Place::new();
-        let recipe = recipe(&[]);
+        // The source was pruned while it trained; its compression must not be.
+        let recipe = recipe(&["prune_interval=5", "prune_ratio=0.05"]);
         place.train("source", &recipe).unwrap();
         let source = splat4d::format::scene::read(&place.scene("source")).unwrap();
         Self { place, recipe, source }

@@ -2,7 +2,7 @@
 //!
 //! Planes of one section differ: the low bits of positions are noise, a label's high byte is nearly constant. One encoder
 //! over all of them begins blocks anywhere; blocks that begin with planes made the pages of the bundled capture 4 % and
-//! coarse ones 18 % smaller. To a reader it is one stream like any other (RFC 1951).
+//! coarse ones 17 % smaller. To a reader it is one stream like any other (RFC 1951).
 
 use miniz_oxide::deflate::core::{
     CompressionStrategy, CompressorOxide, TDEFLFlush, TDEFLStatus, compress_to_output,
