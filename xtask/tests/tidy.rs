@@ -19,8 +19,8 @@ const ORDER: [(&str, &[&str]); 4] = [
         // The recipe stands first because everything is told by it; losses before densification and both before
         // `models`, which choose among them; `init` needs a model's plan; `eval` writes as safely as `train` does.
         &[
-            "recipe", "event", "capture", "sampler", "knn", "optim", "loss", "densify", "prune", "models", "init",
-            "train", "eval", "compress", "dynamics", "dist",
+            "recipe", "event", "capture", "sampler", "optim", "loss", "densify", "prune", "models", "init", "train",
+            "eval", "compress", "dynamics", "dist",
         ],
     ),
     (

@@ -4,12 +4,12 @@
 use divan::Bencher;
 use splat4d::layers::{Layer, LayerTape};
 use splat4d::math::Rng;
+use splat4d::math::knn::knn;
 use splat4d::motion::{Cache, SpacetimeSpec, Spec, build};
 use splat4d::scene::life::LOG_WIDTH;
 use splat4d::scene::params::{LOG_SCALE, QUAT};
 use splat4d::scene::{GEOMETRY, Grads, LIFE, LifeKind, Params, Planes, Rows, SH, Space, SplatGrads, Table, Time};
 use splat4d_train::eval::{InputScaling, Lpips};
-use splat4d_train::knn::knn;
 use splat4d_train::loss::Photometric;
 use splat4d_train::optim::Moments;
 

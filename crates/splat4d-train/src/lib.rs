@@ -8,7 +8,6 @@ pub mod densify;
 pub mod eval;
 pub mod event;
 pub mod init;
-pub mod knn;
 pub mod loss;
 pub mod models;
 pub mod optim;

@@ -49,7 +49,7 @@ pub struct Knob {
 }
 
 recipe! {
-    /// Motion model: still or spacetime.
+    /// Motion model: still, spacetime, deform-mlp, hexplane, tracked, native4d, control or ssm.
     motion: String = "spacetime".into(),
     /// Seed of every random choice.
     seed: u64 = 0,
@@ -105,8 +105,8 @@ recipe! {
     motion_order: usize = 1,
     /// spacetime: whether quaternions turn with time.
     rotation_rate: bool = false,
-    /// spacetime: the life: infinite, gauss-half, gauss-one or interval.
-    life: String = "gauss-half".into(),
+    /// The life of a Gaussian: auto (spacetime gauss-half, others infinite), infinite, gauss-half, gauss-one, interval.
+    life: String = "auto".into(),
     /// spacetime: life's centre learns from opacity alone (STG).
     detach: bool = false,
     /// spacetime: rate of velocities at the start, extents a clip.
@@ -115,14 +115,30 @@ recipe! {
     velocity_lr_final: f64 = 1.6e-5,
     /// spacetime: rate of quaternion rates, 1/clip.
     rotation_rate_lr: f64 = 1e-3,
-    /// spacetime: rate of life centres, clips.
+    /// life: rate of life centres, clips.
     life_center_lr: f64 = 1e-3,
-    /// spacetime: rate of log life widths.
+    /// life: rate of log life widths.
     life_width_lr: f64 = 0.01,
-    /// spacetime: initial life width of moving points, clips; 0: twice the gap between keyframes.
+    /// life: initial life width of moving points, clips; 0: twice the gap between keyframes.
     init_life: f64 = 0.0,
-    /// spacetime: life widths never fall below this many frames.
+    /// life: life widths never fall below this many frames.
     min_life_frames: f64 = 0.5,
+    // deform-mlp.
+
+    // hexplane.
+
+    // tracked.
+
+    // native4d, spacetime.
+
+    // control.
+
+    // ssm.
+
+    // filtered.
+
+    // Losses.
+
     /// Weight of the σ-weighted opacity regulariser (FreeTimeGS).
     lambda_opacity_life: f64 = 0.0,
     /// Weight of the velocity smoothness over nearest neighbours.
@@ -151,6 +167,8 @@ recipe! {
     prune_ratio: f64 = 0.3,
     /// Training views that each such pruning looks at; never fewer than one at every moment of the capture.
     prune_views: usize = 60,
+    // Merging, splitting into layers.
+
     /// mcmc: growth a densification, up to the cap.
     growth: f64 = 1.05,
     /// mcmc: strength of the position noise.
@@ -259,26 +277,10 @@ impl Recipe {
                 return bad(knob, value.to_string(), "a positive number");
             }
         }
-        let natural = [
-            ("lambda_mask", self.lambda_mask),
-            ("lambda_opacity_life", self.lambda_opacity_life),
-            ("lambda_velocity", self.lambda_velocity),
-            ("noise_lr", self.noise_lr),
-            ("opacity_reg", self.opacity_reg),
-            ("scale_reg", self.scale_reg),
-            ("exposure_lr", self.exposure_lr),
-            ("rotation_rate_lr", self.rotation_rate_lr),
-            ("life_center_lr", self.life_center_lr),
-            ("life_width_lr", self.life_width_lr),
-            ("init_life", self.init_life),
-            ("min_life_frames", self.min_life_frames),
-            ("fps", self.fps),
-            ("percent_dense", self.percent_dense),
-            ("densify_grad_threshold", self.densify_grad_threshold),
-        ];
-        for (knob, value) in natural {
-            if !(value >= 0.0 && value.is_finite()) {
-                return bad(knob, value.to_string(), "zero or a positive number");
+        // No knob has a meaning below zero.
+        for (knob, value) in toml::Table::try_from(self).expect("a recipe is a TOML table") {
+            if value.as_float().is_some_and(|x| !(x >= 0.0 && x.is_finite())) {
+                return bad(&knob, value.to_string(), "zero or a positive number");
             }
         }
         let shares = [
@@ -314,7 +316,7 @@ impl Recipe {
         }
         for (knob, value, known) in [
             ("motion", &self.motion, &splat4d::motion::BUILT_IN[..]),
-            ("life", &self.life, &["infinite", "gauss-half", "gauss-one", "interval"][..]),
+            ("life", &self.life, &["auto", "infinite", "gauss-half", "gauss-one", "interval"][..]),
             ("strategy", &self.strategy, &["mcmc", "adc", "none"][..]),
         ] {
             if !known.contains(&value.as_str()) {

@@ -5,11 +5,11 @@ pub mod hull;
 pub mod volume;
 
 use crate::capture::frames::Frames;
-use crate::knn::mean_square_distance;
 use crate::models::{Plan, Program};
 use crate::{Error, Result};
 use splat4d::layers::{ALWAYS, Layer, Scene};
 use splat4d::math::Rng;
+use splat4d::math::knn::mean_square_distance;
 use splat4d::math::sh::rgb_to_dc;
 use splat4d::motion::build;
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};

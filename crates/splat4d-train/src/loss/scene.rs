@@ -1,9 +1,9 @@
 //! Losses on a scene's raw parameters. Each is a mean over the rows that are active in the step, and adds only to them.
 
 use super::terms::{ParamLoss, StepInfo};
-use crate::knn::knn;
 use splat4d::layers::Scene;
 use splat4d::math::Real;
+use splat4d::math::knn::knn;
 use splat4d::motion::for_rows;
 use splat4d::scene::params::{LOG_SCALE, OPACITY};
 use splat4d::scene::{GEOMETRY, Grads, LIFE, LifeKind, Rows, Space};

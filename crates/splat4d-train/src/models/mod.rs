@@ -2,10 +2,16 @@
 //!
 //! `splat4d::motion::x` holds a model's mathematics, `models::x` its stages, rates, losses and what it needs of a capture.
 
+pub mod control;
+pub mod deform;
+pub mod hexplane;
+pub mod native4d;
 pub mod spacetime;
+pub mod ssm;
 pub mod still;
 #[cfg(test)]
 mod tests;
+pub mod tracked;
 
 use crate::densify::Densify;
 use crate::loss::terms::{Codec, ParamLoss, ProbeLoss};
@@ -173,8 +179,10 @@ impl<F: Real> Stage<F> {
 pub trait Program: Send + Sync {
     /// The model that training starts with.
     fn spec(&self, plan: &Plan) -> Spec;
-    /// The life its Gaussians have.
-    fn life(&self, plan: &Plan) -> LifeKind;
+    /// The life its Gaussians have: the recipe's; for ever where it leaves the choice to the model.
+    fn life(&self, plan: &Plan) -> LifeKind {
+        LifeKind::from_name(&plan.recipe.life).unwrap_or(LifeKind::Infinite)
+    }
     /// Says before training, and not after an hour, that the model cannot work on a capture.
     fn check(&self, _plan: &Plan) -> Result<()> {
         Ok(())
@@ -188,6 +196,12 @@ pub fn program(motion: &str) -> Result<Box<dyn Program>> {
     match motion {
         "still" => Ok(Box::new(still::StillProgram)),
         "spacetime" => Ok(Box::new(spacetime::SpacetimeProgram)),
+        "deform-mlp" => Ok(Box::new(deform::DeformProgram)),
+        "hexplane" => Ok(Box::new(hexplane::HexplaneProgram)),
+        "tracked" => Ok(Box::new(tracked::TrackedProgram)),
+        "native4d" => Ok(Box::new(native4d::Native4dProgram)),
+        "control" => Ok(Box::new(control::ControlProgram)),
+        "ssm" => Ok(Box::new(ssm::SsmProgram)),
         other => Err(Error::input(format!("there is no motion model `{other}`"))
             .remedy(format!("Use one of: {}", splat4d::motion::BUILT_IN.join(", ")))),
     }

@@ -22,7 +22,7 @@ impl Program for SpacetimeProgram {
     }
 
     fn life(&self, plan: &Plan) -> LifeKind {
-        LifeKind::from_name(&plan.recipe.life).expect("the recipe was checked")
+        LifeKind::from_name(&plan.recipe.life).unwrap_or(LifeKind::GaussHalf)
     }
 
     fn stages(&self, plan: &Plan) -> Vec<Stage> {
@@ -38,15 +38,7 @@ impl Program for SpacetimeProgram {
         if r.rotation_rate {
             stage.groups.push(Group::new("rotation_rates", r.falling(r.rotation_rate_lr / clip)));
         }
-        let life = self.life(plan);
-        if life != LifeKind::Infinite {
-            stage.groups.push(Group::new("life_centers", r.falling(r.life_center_lr * clip)));
-            stage.groups.push(Group::new("life_log_widths", r.falling(r.life_width_lr)));
-            stage.min_log_life = Some((r.min_life_frames / plan.fps).max(1e-6).ln());
-        }
-        if life == LifeKind::Interval {
-            stage.groups.push(Group::new("life_log_softness", r.falling(r.life_width_lr)));
-        }
+        still::learn_life(&mut stage, plan, self.life(plan));
         if r.lambda_opacity_life > 0.0 {
             stage.params.push(Box::new(LivingOpacity { weight: r.lambda_opacity_life }));
         }

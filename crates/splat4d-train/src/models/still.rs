@@ -47,6 +47,19 @@ pub fn groups(r: &Recipe, extent: f64) -> Vec<Group> {
     groups
 }
 
+/// Lets a stage learn its Gaussians' lives: birth and death, for any model.
+pub fn learn_life(stage: &mut Stage, plan: &Plan, life: LifeKind) {
+    let r = &plan.recipe;
+    if life != LifeKind::Infinite {
+        stage.groups.push(Group::new("life_centers", r.falling(r.life_center_lr * plan.seconds())));
+        stage.groups.push(Group::new("life_log_widths", r.falling(r.life_width_lr)));
+        stage.min_log_life = Some((r.min_life_frames / plan.fps).max(1e-6).ln());
+    }
+    if life == LifeKind::Interval {
+        stage.groups.push(Group::new("life_log_softness", r.falling(r.life_width_lr)));
+    }
+}
+
 /// A stage with the recipe's densification and regularisers.
 pub fn stage(name: &str, plan: &Plan) -> Stage {
     let r = &plan.recipe;

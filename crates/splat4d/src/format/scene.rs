@@ -8,7 +8,7 @@ use super::arrays::MASKS;
 use super::safetensors::{SafeTensors, Tensor};
 use super::{params_to_arrays, tensors_to_loaded};
 use crate::layers::{ALWAYS, Head, Layer, Scene};
-use crate::motion::{SpacetimeSpec, Spec, build};
+use crate::motion::{BUILT_IN, Spec, build};
 use crate::scene::masks::WORD;
 use crate::scene::{KeyMasks, LifeKind, Params, SH};
 use crate::{Error, ErrorKind, Result};
@@ -61,38 +61,22 @@ pub fn metadata(scene: &Scene<f32>) -> Value {
 /// A motion model's spec as JSON.
 pub fn spec_to_json(spec: &Spec) -> Value {
     match spec {
-        Spec::Still => json!({ "model": "still" }),
-        Spec::Spacetime(s) => json!({
-            "model": "spacetime", "order": s.order, "rotation": s.rotation, "detach": s.detach, "origin": s.origin,
-        }),
         Spec::Custom(name) => json!({ "model": name, "custom": true }),
+        _ => serde_json::to_value(spec).expect("a spec is plain numbers, flags and names"),
     }
 }
 
-/// A motion model's spec from JSON. Errors: a model that this version does not know, or a field that is missing.
+/// A motion model's spec from JSON. Errors: a model that this version does not know, or a field that is missing or wrong.
 pub fn spec_from_json(v: &Value) -> Result<Spec> {
     let model = text(v, "model")?;
-    match model.as_str() {
-        "still" => Ok(Spec::Still),
-        "spacetime" => {
-            let order = count(v, "order")?;
-            if order > crate::motion::spacetime::MAX_ORDER {
-                return Err(broken(format!("motion order {order} is not 0 to 3")));
-            }
-            let flag = |key: &str| v[key].as_bool().ok_or_else(|| broken(format!("`{key}` is not a flag")));
-            Ok(Spec::Spacetime(SpacetimeSpec {
-                order,
-                rotation: flag("rotation")?,
-                detach: flag("detach")?,
-                origin: number(v, "origin")?,
-            }))
-        }
-        other => Err(Error::new(
+    if !BUILT_IN.contains(&model.as_str()) {
+        return Err(Error::new(
             ErrorKind::Unsupported,
-            format!("the scene moves by `{other}`, which this version does not know"),
+            format!("the scene moves by `{model}`, which this version does not know"),
         )
-        .remedy("Open it with the splat4d that wrote it, or a newer one")),
+        .remedy("Open it with the splat4d that wrote it, or a newer one"));
     }
+    serde_json::from_value(v.clone()).map_err(|e| broken(format!("its motion `{model}` is not as it should be: {e}")))
 }
 
 /// All arrays of a scene, ready to be written (also into a checkpoint).
@@ -243,6 +227,7 @@ fn numbers<const N: usize>(v: &Value, key: &str) -> Result<[f64; N]> {
 mod tests {
     use super::*;
     use crate::math::Rng;
+    use crate::motion::SpacetimeSpec;
     use crate::scene::Time;
 
     fn scene() -> Scene<f32> {

@@ -3,9 +3,16 @@
 //! A model has no hidden state. Sequential ones (state space, filters) do their scan in [`Motion::prepare`], add to the
 //! scan's gradient in [`Motion::backward`], and run the reverse scan in [`Motion::finish`]; pointwise ones leave those empty.
 
+pub mod control;
+pub mod deform;
+pub mod filtered;
+pub mod hexplane;
 pub mod lanes;
+pub mod native4d;
 pub mod spacetime;
+pub mod ssm;
 pub mod still;
+pub mod tracked;
 
 use crate::math::{Real, Rng};
 use crate::scene::params::LOG_SCALE;
@@ -13,6 +20,7 @@ use crate::scene::splats::SPLAT_COLUMNS;
 use crate::scene::table::{TableMut, halve};
 use crate::scene::{Color, GEOMETRY, Grads, Params, RowEdit, Rows, SH, Space, SplatGrads, Table, Time};
 use crate::{Error, Result};
+use serde::{Deserialize, Serialize};
 use std::any::Any;
 use std::sync::Arc;
 
@@ -93,14 +101,33 @@ impl<F: Real> Tape<F> {
 }
 
 /// A model as plain data: what files store, and all that [`build`] needs to make it again.
-#[derive(Clone, Debug, PartialEq)]
+///
+/// Its JSON form is an object whose `model` is the model's name, beside the fields of its spec.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "model", rename_all = "kebab-case")]
 #[non_exhaustive]
 pub enum Spec {
     /// Nothing moves.
     Still,
     /// Explicit kinematics around each Gaussian's life.
     Spacetime(SpacetimeSpec),
+    /// A perceptron or a hash grid deforms a canonical cloud.
+    DeformMlp(deform::DeformSpec),
+    /// Six feature planes deform a canonical cloud.
+    Hexplane(hexplane::HexplaneSpec),
+    /// Positions and rotations at every frame.
+    Tracked(tracked::TrackedSpec),
+    /// Gaussians of space and time.
+    #[serde(rename = "native4d")]
+    Native4d(native4d::Native4dSpec),
+    /// Gaussians skinned to control nodes.
+    Control(control::ControlSpec),
+    /// Control nodes driven by a state-space model.
+    Ssm(ssm::SsmSpec),
+    /// A temporal filter around any of them.
+    Filtered(filtered::FilteredSpec),
     /// A model from outside this library; it cannot be built from a file.
+    #[serde(skip)]
     Custom(String),
 }
 
@@ -110,13 +137,21 @@ impl Spec {
         match self {
             Spec::Still => "still",
             Spec::Spacetime(_) => "spacetime",
+            Spec::DeformMlp(_) => "deform-mlp",
+            Spec::Hexplane(_) => "hexplane",
+            Spec::Tracked(_) => "tracked",
+            Spec::Native4d(_) => "native4d",
+            Spec::Control(_) => "control",
+            Spec::Ssm(_) => "ssm",
+            Spec::Filtered(_) => "filtered",
             Spec::Custom(name) => name,
         }
     }
 }
 
 /// Every model of [`Spec`] that the library can build, by name.
-pub const BUILT_IN: [&str; 2] = ["still", "spacetime"];
+pub const BUILT_IN: [&str; 9] =
+    ["still", "spacetime", "deform-mlp", "hexplane", "tracked", "native4d", "control", "ssm", "filtered"];
 
 /// Makes the model, and in `p` the tables it needs (or claims the loaded ones).
 ///
@@ -125,6 +160,13 @@ pub fn build<F: Real>(spec: &Spec, p: &mut Params<F>) -> Result<Arc<dyn Motion<F
     match spec {
         Spec::Still => Ok(Arc::new(Still)),
         Spec::Spacetime(s) => Ok(Arc::new(Spacetime::new(*s, p)?)),
+        Spec::DeformMlp(s) => deform::build(s, p),
+        Spec::Hexplane(s) => hexplane::build(s, p),
+        Spec::Tracked(s) => tracked::build(s, p),
+        Spec::Native4d(s) => native4d::build(s, p),
+        Spec::Control(s) => control::build(s, p),
+        Spec::Ssm(s) => ssm::build(s, p),
+        Spec::Filtered(s) => filtered::build(s, p),
         Spec::Custom(name) => Err(Error::input(format!("motion model `{name}` is not one of this version's"))
             .remedy(format!("It knows: {}. A newer splat4d may know more", BUILT_IN.join(", ")))),
     }

@@ -8,18 +8,20 @@
 use super::lanes::{Batch, Lane, Work, fill, scatter};
 use super::still::{activate_backward_lanes, activate_lanes};
 use super::{At, Cache, Motion, Spec, Tape, fill_rows};
-use crate::Result;
 use crate::math::Real;
 use crate::scene::params::QUAT;
 use crate::scene::table::TableMut;
 use crate::scene::{BLOCK, GEOMETRY, Grads, Key, LIFE, Params, Space, SplatGrads, Table};
 use crate::simd::each;
+use crate::{Error, Result};
+use serde::{Deserialize, Serialize};
 
 /// Highest order of the polynomial.
 pub const MAX_ORDER: usize = 3;
 
 /// The model as plain data.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct SpacetimeSpec {
     /// Order of the polynomial in Δ, 0 to [`MAX_ORDER`].
     pub order: usize,
@@ -56,9 +58,12 @@ const VELOCITY_COLUMNS: [&[(&str, usize)]; MAX_ORDER + 1] =
     [&[], &[("velocities", 3)], &[("velocities", 6)], &[("velocities", 9)]];
 
 impl Spacetime {
-    /// Makes or claims the model's tables in `p`. Errors: loaded arrays of the wrong shape. Panics: order above 3.
+    /// Makes or claims the model's tables in `p`. Errors: an order above 3, loaded arrays of the wrong shape.
     pub fn new<F: Real>(spec: SpacetimeSpec, p: &mut Params<F>) -> Result<Self> {
-        assert!(spec.order <= MAX_ORDER, "the polynomial's order is at most {MAX_ORDER}");
+        if spec.order > MAX_ORDER {
+            return Err(Error::input(format!("motion order {} is not 0 to {MAX_ORDER}", spec.order))
+                .remedy("The file is damaged or was written by another program; export it again"));
+        }
         let rows = p.len();
         let velocities = p.entry(VELOCITIES, Space::Gaussians, VELOCITY_COLUMNS[spec.order], rows, |_| {})?;
         let columns: &[_] = if spec.rotation { &[("rotation_rates", 4)] } else { &[] };

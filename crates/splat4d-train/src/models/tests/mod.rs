@@ -27,7 +27,8 @@ use std::sync::Arc;
 
 #[test]
 fn every_built_in_model_has_a_program() {
-    for name in splat4d::motion::BUILT_IN {
+    // The filter wraps what another program learns.
+    for name in splat4d::motion::BUILT_IN.into_iter().filter(|&n| n != "filtered") {
         assert!(program(name).is_ok(), "{name} has mathematics but no program");
     }
     assert!(program("warp").is_err_and(|e| e.to_string().contains("spacetime")));

@@ -187,7 +187,7 @@ fn insert(best: &mut [Near], near: Near) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use splat4d::math::Rng;
+    use crate::math::Rng;
 
     fn cloud(n: usize, seed: u64) -> Vec<[f32; 3]> {
         let rng = Rng::new(seed, "cloud", 0);
