@@ -166,6 +166,10 @@ impl Console {
                     )
                 });
             }
+            Event::Chosen { motion, why } => {
+                self.clear();
+                self.say(&format!("motion model: {motion}, because {why}"));
+            }
             Event::Checkpoint { iteration, path } => {
                 self.detail(&format!("checkpoint of step {} in {}", grouped(*iteration), path.display()));
             }

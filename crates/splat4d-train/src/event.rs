@@ -49,6 +49,13 @@ pub enum Event {
         /// Seconds that are left, estimated.
         seconds_left: f64,
     },
+    /// The model that `motion = "auto"` has become.
+    Chosen {
+        /// Its name.
+        motion: String,
+        /// One sentence on what the capture is.
+        why: String,
+    },
     /// A checkpoint is on disk.
     Checkpoint {
         /// Steps taken.

@@ -49,7 +49,7 @@ pub struct Knob {
 }
 
 recipe! {
-    /// Motion model: still, spacetime, deform-mlp, hexplane, tracked, native4d, control or ssm.
+    /// Motion model: still, spacetime, deform-mlp, hexplane, tracked, native4d, control or ssm; auto: chosen by what the capture is.
     motion: String = "spacetime".into(),
     /// Seed of every random choice.
     seed: u64 = 0,
@@ -327,7 +327,7 @@ impl Recipe {
             return bad("motion_order", self.motion_order.to_string(), "0, 1, 2 or 3");
         }
         for (knob, value, known) in [
-            ("motion", &self.motion, &splat4d::motion::BUILT_IN[..]),
+            ("motion", &self.motion, &known_motions()[..]),
             ("life", &self.life, &["auto", "infinite", "gauss-half", "gauss-one", "interval"][..]),
             ("crowding", &self.crowding, &["none", "merge", "prune"][..]),
             ("strategy", &self.strategy, &["mcmc", "adc", "none"][..]),
@@ -359,6 +359,12 @@ impl Recipe {
         fill(&mut r.checkpoint_interval, (r.iterations / 10).max(50));
         r
     }
+}
+
+/// What `motion` may be: the models that train by themselves, and the choice among them.
+fn known_motions() -> Vec<&'static str> {
+    let own = splat4d::motion::BUILT_IN.into_iter().filter(|m| *m != "filtered");
+    std::iter::once("auto").chain(own).collect()
 }
 
 /// The known name closest to `name` (Damerau-free Levenshtein), if it is close enough to be meant.

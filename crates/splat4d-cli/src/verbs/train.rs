@@ -50,7 +50,8 @@ pub(crate) struct Args {
     /// Replace the run in the -o folder
     #[arg(long)]
     force: bool,
-    /// How Gaussians move: still or spacetime
+    /// How Gaussians move: auto (chosen by the capture), still, spacetime, deform-mlp, hexplane, tracked, native4d,
+    /// control or ssm
     #[arg(long, value_name = "MODEL", help_heading = "What is learned")]
     motion: Option<String>,
     /// Train for about M minutes: steps and schedules are fitted and saved in the recipe

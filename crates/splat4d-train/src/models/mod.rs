@@ -2,6 +2,7 @@
 //!
 //! `splat4d::motion::x` holds a model's mathematics, `models::x` its stages, rates, losses and what it needs of a capture.
 
+pub mod auto;
 pub mod control;
 pub mod deform;
 pub mod hexplane;

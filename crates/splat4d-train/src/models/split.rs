@@ -8,7 +8,7 @@ use splat4d::layers::{ALWAYS, Layer, LayerTape, Scene, freeze_rows};
 use splat4d::math::Rng;
 use splat4d::motion::{Cache, Spec, build};
 use splat4d::scene::splats::COV;
-use splat4d::scene::{GEOMETRY, LIFE, LifeKind, RowEdit, Rows, SH, Space, Time};
+use splat4d::scene::{LifeKind, RowEdit, Rows, Space, Time};
 
 /// Times at which rows are looked at, evenly over the clip: an odd number has the middle.
 const LOOKS: usize = 17;
@@ -136,6 +136,7 @@ mod tests {
     use crate::models::program;
     use crate::recipe::Recipe;
     use splat4d::motion::SpacetimeSpec;
+    use splat4d::scene::{GEOMETRY, LIFE, SH};
 
     fn plan(recipe: Recipe) -> Plan {
         Plan { recipe: recipe.resolve(), extent: 1.0, clip: [0.0, 1.0], fps: 30.0, times: 30, fixed_cameras: 4 }

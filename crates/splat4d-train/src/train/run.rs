@@ -14,6 +14,7 @@ use crate::capture::{Capture, CaptureOptions, ImageStore};
 use crate::densify::Limits;
 use crate::event::Event;
 use crate::init::{self, Seeds};
+use crate::models::auto::{self, AUTO};
 use crate::models::{Plan, Stage, program, split};
 use crate::recipe::Recipe;
 use crate::{Error, ErrorKind, Result};
@@ -96,13 +97,14 @@ pub fn train(
     }
     let bench = Bench::new(capture, &recipe)?;
     let mut listen = listen;
+    let recipe = if recipe.motion == AUTO { bench.choose(recipe, &mut listen)? } else { recipe };
+    program(&recipe.motion)?.check(&bench.plan(&recipe))?;
     let recipe = match options.minutes {
         Some(m) => minutes::plan(&bench, &recipe, m, &mut listen)?,
         None => recipe,
     }
     .resolve();
     let plan = bench.plan(&recipe);
-    program(&recipe.motion)?.check(&plan)?;
     let estimate = memory_estimate(&bench.capture, &recipe);
     if recipe.memory_limit > 0 && estimate > recipe.memory_limit {
         return Err(Error::new(
@@ -284,6 +286,14 @@ impl Bench {
 
     pub(super) fn plan(&self, recipe: &Recipe) -> Plan {
         plan(&self.capture, recipe)
+    }
+
+    /// The recipe with a motion model that suits the capture.
+    fn choose(&self, recipe: Recipe, listen: &mut dyn FnMut(&Event)) -> Result<Recipe> {
+        listen(&Event::Phase { name: "looking at the capture".into(), done: 0, total: 0 });
+        let choice = auto::choose(&self.plan(&recipe), self.frames.as_ref())?;
+        listen(&Event::Chosen { motion: choice.motion.into(), why: choice.why });
+        Ok(Recipe { motion: choice.motion.into(), ..recipe })
     }
 
     fn background(&self) -> [f32; 3] {

@@ -1,0 +1,171 @@
+//! `--motion auto`: looks at the capture, chooses a motion model and says why.
+
+use super::Plan;
+use crate::Result;
+use crate::capture::frames::{Frames, Picture};
+use splat4d::scene::Planes;
+
+/// The recipe's word for it.
+pub const AUTO: &str = "auto";
+/// Cameras of the rig that are looked at, and pairs of neighbouring frames of each.
+const LOOKS: (usize, usize) = (4, 8);
+/// A pixel that changes by more than this from frame to frame (mean of the channels, in [0, 1]) has moved: above the
+/// noise of ordinary cameras.
+const CHANGED: f32 = 0.06;
+/// A capture in which less than this share of the pixels moves is of a still scene.
+const MOVING: f64 = 2e-4;
+/// Cameras at a moment from which on a scene is seen from all sides at once.
+const MANY_CAMERAS: f64 = 3.0;
+/// Moments from which on a take is long.
+const LONG: usize = 600;
+
+/// A model and the reason for it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Choice {
+    /// The model's name.
+    pub motion: &'static str,
+    /// One sentence.
+    pub why: String,
+}
+
+/// Chooses for the training frames of a capture.
+pub fn choose(plan: &Plan, frames: &dyn Frames) -> Result<Choice> {
+    let choice = |motion, why: String| Ok(Choice { motion, why });
+    if plan.times <= 1 {
+        return choice("still", "all pictures are of one moment".into());
+    }
+    let energy = if plan.fixed_cameras > 0 { motion_energy(frames)? } else { None };
+    if let Some(share) = energy.filter(|e| *e < MOVING) {
+        let percent = 100.0 * share;
+        return choice("still", format!("cameras stand still and only {percent:.3} % of their pixels ever change"));
+    }
+    let cameras = frames.len() as f64 / plan.times as f64;
+    let moving = energy.map_or_else(String::new, |e| format!(", {:.1} % of the pixels move", 100.0 * e));
+    if cameras >= MANY_CAMERAS {
+        return choice(
+            "spacetime",
+            format!("{cameras:.0} cameras see every moment{moving}: explicit motion with lives needs no network"),
+        );
+    }
+    let seen = if cameras < 1.5 { "one camera sees".to_owned() } else { format!("{cameras:.1} cameras see") };
+    if frames.has_masks() && plan.times < LONG {
+        return choice("control", format!("{seen} a moment, and masks show one object: few nodes move all of it"));
+    }
+    let length = if plan.times >= LONG { format!(" of {}", plan.times) } else { String::new() };
+    choice("hexplane", format!("{seen} a moment{length}: planes over space and time share what every moment shows"))
+}
+
+/// Share of the pixels of fixed cameras that change from one of their frames to the next; `None`: no camera has two.
+fn motion_energy(frames: &dyn Frames) -> Result<Option<f64>> {
+    let mut rigs: std::collections::BTreeMap<usize, Vec<usize>> = std::collections::BTreeMap::new();
+    for i in 0..frames.len() {
+        rigs.entry(frames.rig(i)).or_default().push(i);
+    }
+    let mut rigs: Vec<Vec<usize>> = rigs.into_values().filter(|r| r.len() > 1).collect();
+    for rig in &mut rigs {
+        rig.sort_by(|&a, &b| frames.time(a).0.total_cmp(&frames.time(b).0));
+    }
+    let step = rigs.len().div_ceil(LOOKS.0).max(1);
+    let (mut changed, mut pixels) = (0usize, 0usize);
+    let mut pair = [Picture::default(), Picture::default()];
+    for rig in rigs.iter().step_by(step) {
+        let stride = (rig.len() - 1).div_ceil(LOOKS.1).max(1);
+        for n in (0..rig.len() - 1).step_by(stride) {
+            for (picture, &i) in pair.iter_mut().zip(&rig[n..n + 2]) {
+                frames.load(i, picture)?;
+                // Half the size and noise is half as strong.
+                picture.halve();
+            }
+            changed += changes(&pair[0].color, &pair[1].color);
+            pixels += pair[0].color.plane(0).len();
+        }
+    }
+    Ok((pixels > 0).then(|| changed as f64 / pixels as f64))
+}
+
+fn changes(a: &Planes<f32>, b: &Planes<f32>) -> usize {
+    let difference = |i: usize| (0..3).map(|c| (a.plane(c)[i] - b.plane(c)[i]).abs()).sum::<f32>() / 3.0;
+    (0..a.plane(0).len().min(b.plane(0).len())).filter(|&i| difference(i) > CHANGED).count()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::recipe::Recipe;
+    use splat4d::math::Se3;
+    use splat4d::scene::{Camera, Time};
+
+    /// Grey pictures with a bright square that moves, or does not.
+    struct Made {
+        cameras: usize,
+        times: usize,
+        speed: usize,
+        masks: bool,
+        camera: Camera,
+    }
+
+    impl Made {
+        fn new(cameras: usize, times: usize, speed: usize, masks: bool) -> Self {
+            let pose = Se3::look_at([0.0, 0.0, -4.0], [0.0; 3], [0.0, -1.0, 0.0]);
+            Self { cameras, times, speed, masks, camera: Camera::with_fov_y(pose, 0.9, 64, 48) }
+        }
+
+        fn choose(&self, fixed: bool) -> Choice {
+            let plan = Plan {
+                recipe: Recipe::default().resolve(),
+                extent: 1.0,
+                clip: [0.0, 1.0],
+                fps: 30.0,
+                times: self.times,
+                fixed_cameras: if fixed { self.cameras } else { 0 },
+            };
+            choose(&plan, self).unwrap()
+        }
+    }
+
+    impl Frames for Made {
+        fn len(&self) -> usize {
+            self.cameras * self.times
+        }
+        fn camera(&self, _: usize) -> &Camera {
+            &self.camera
+        }
+        fn time(&self, i: usize) -> Time {
+            Time((i / self.cameras) as f64 / 30.0)
+        }
+        fn rig(&self, i: usize) -> usize {
+            i % self.cameras
+        }
+        fn name(&self, i: usize) -> String {
+            i.to_string()
+        }
+        fn has_masks(&self) -> bool {
+            self.masks
+        }
+        fn load(&self, i: usize, out: &mut Picture) -> Result<()> {
+            out.color = Planes::new(3, 48, 64);
+            out.color.data.fill(0.4);
+            let left = 8 + self.speed * (i / self.cameras) % 40;
+            for c in 0..3 {
+                for y in 10..20 {
+                    (left..left + 10).for_each(|x| out.color.plane_mut(c)[64 * y + x] = 0.9);
+                }
+            }
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn the_capture_decides_and_the_reason_names_what_was_seen() {
+        let is = |made: Made, fixed: bool, motion: &str, word: &str| {
+            let choice = made.choose(fixed);
+            assert!(choice.motion == motion && choice.why.contains(word), "{choice:?}");
+        };
+        is(Made::new(6, 1, 4, true), true, "still", "one moment");
+        is(Made::new(6, 10, 0, true), true, "still", "0.000 %");
+        is(Made::new(6, 10, 4, true), true, "spacetime", "6 cameras");
+        is(Made::new(1, 50, 4, true), false, "control", "one camera");
+        is(Made::new(1, 50, 4, false), false, "hexplane", "one camera");
+        is(Made::new(2, 700, 4, true), true, "hexplane", "of 700");
+    }
+}
