@@ -56,6 +56,9 @@ pub(crate) struct Args {
     /// Reduce pictures by k
     #[arg(long, value_name = "K", default_value_t = 2)]
     downscale: usize,
+    /// Also replace what stands between `<!-- models -->` and `<!-- /models -->` in this page
+    #[arg(long, value_name = "FILE")]
+    into: Option<PathBuf>,
     /// Set a knob of every cell's recipe; may be repeated
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
@@ -79,6 +82,8 @@ struct Cell {
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let models = models(&args.only)?;
+    // A page that cannot take the table is found out before an hour of training.
+    let page = args.into.as_ref().map(|p| files::read_text(p).and_then(|t| parted(&t).map(|_| t))).transpose()?;
     if !(args.minutes > 0.0 && args.minutes.is_finite()) {
         let what = format!("--minutes cannot be {}", args.minutes);
         return Err(Error::input(what).remedy("Give a positive number, for instance 3").into());
@@ -111,12 +116,30 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let numbers = serde_json::to_string_pretty(&cells).context("cells are plain numbers")?;
     files::write(&args.output.join("models.json"), format!("{numbers}\n").as_bytes())?;
     let file = args.output.join("models.md");
-    let page = markdown(&cells, args);
-    files::write(&file, page.as_bytes())?;
-    console.say(page.trim_end());
+    let table = markdown(&cells, args);
+    files::write(&file, table.as_bytes())?;
+    if let (Some(path), Some(page)) = (&args.into, page) {
+        let [before, after] = parted(&page)?;
+        files::write(path, format!("{before}\n\n{}\n\n{after}", table.trim_end()).as_bytes())?;
+        console.written(path);
+    }
+    console.say(table.trim_end());
     console.written(&file);
     console.emit(&json!({"type": "done", "study": args.output.join("models.json")}));
     Ok(())
+}
+
+/// What marks the table's place in a page.
+const MARKS: [&str; 2] = ["<!-- models -->", "<!-- /models -->"];
+
+/// A page up to and with the first mark, and from the second on. Errors: it lacks one.
+fn parted(page: &str) -> splat4d::Result<[&str; 2]> {
+    let place = page.find(MARKS[0]).map(|i| i + MARKS[0].len());
+    let parts = place.and_then(|from| Some([&page[..from], &page[from + page[from..].find(MARKS[1])?..]]));
+    parts.ok_or_else(|| {
+        Error::input(format!("the page has no `{}` and `{}`", MARKS[0], MARKS[1]))
+            .remedy("Put both marks where the table belongs")
+    })
 }
 
 /// The models that are asked for, in the library's order.
@@ -251,6 +274,13 @@ mod tests {
     }
 
     #[test]
+    fn a_page_takes_the_table_between_its_marks() {
+        let [before, after] = parted("a <!-- models -->old<!-- /models --> b").unwrap();
+        assert_eq!((before, after), ("a <!-- models -->", "<!-- /models --> b"));
+        assert!(parted("<!-- models --> only").is_err());
+    }
+
+    #[test]
     fn every_line_has_as_many_cells_as_the_head() {
         let args = Args {
             captures: vec!["a".into()],
@@ -258,6 +288,7 @@ mod tests {
             only: Vec::new(),
             minutes: 3.0,
             downscale: 2,
+            into: None,
             set: Vec::new(),
         };
         let cell = Cell { capture: "a".into(), model: "still".into(), steps: 10, ..Cell::default() };
