@@ -16,9 +16,9 @@
 //! [`Skinned::bind`] now and then; among them the weights choose anew at every step, continuously.
 
 mod blend;
-mod weights;
 #[cfg(test)]
 mod tests;
+mod weights;
 
 pub use blend::node_frame;
 pub use weights::{Weights, farthest_points};
@@ -116,8 +116,10 @@ impl SkinSpec {
         ];
         for (name, value, low, high) in ranges {
             if !(low..=high).contains(&value) {
-                return Err(Error::input(format!("a skin with {name} = {value} cannot be: {low} to {high} is possible"))
-                    .remedy("The file is damaged or was written by another program; export it again"));
+                return Err(Error::input(format!(
+                    "a skin with {name} = {value} cannot be: {low} to {high} is possible"
+                ))
+                .remedy("The file is damaged or was written by another program; export it again"));
             }
         }
         Ok(())
