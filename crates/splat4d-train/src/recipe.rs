@@ -168,6 +168,17 @@ recipe! {
     /// Training views that each such pruning looks at; never fewer than one at every moment of the capture.
     prune_views: usize = 60,
     // Merging, splitting into layers.
+    /// What becomes of two Gaussians in one place: none (both stay), merge (one with the moments of both), prune (the
+    /// fainter one goes).
+    crowding: String = "none".into(),
+    /// Iterations between two looks for such pairs; 0: never.
+    crowding_interval: usize = 500,
+    /// Largest distance of such a pair, of the smaller one's standard deviation.
+    crowding_distance: f64 = 0.3,
+    /// Gaussians that move less than this become a still layer of their own, of the extent; 0: never.
+    static_split: f64 = 0.0,
+    /// When they do, as a share of the last stage.
+    static_split_from: f64 = 0.75,
 
     /// mcmc: growth a densification, up to the cap.
     growth: f64 = 1.05,
@@ -289,6 +300,7 @@ impl Recipe {
             ("relocate_gradient", self.relocate_gradient),
             ("min_opacity", self.min_opacity),
             ("prune_ratio", self.prune_ratio),
+            ("static_split_from", self.static_split_from),
         ];
         for (knob, value) in shares {
             if !(0.0..=1.0).contains(&value) {
@@ -317,6 +329,7 @@ impl Recipe {
         for (knob, value, known) in [
             ("motion", &self.motion, &splat4d::motion::BUILT_IN[..]),
             ("life", &self.life, &["auto", "infinite", "gauss-half", "gauss-one", "interval"][..]),
+            ("crowding", &self.crowding, &["none", "merge", "prune"][..]),
             ("strategy", &self.strategy, &["mcmc", "adc", "none"][..]),
         ] {
             if !known.contains(&value.as_str()) {

@@ -7,13 +7,14 @@ pub mod deform;
 pub mod hexplane;
 pub mod native4d;
 pub mod spacetime;
+pub mod split;
 pub mod ssm;
 pub mod still;
 #[cfg(test)]
 mod tests;
 pub mod tracked;
 
-use crate::densify::Densify;
+use crate::densify::{Crowding, Densify};
 use crate::loss::terms::{Codec, ParamLoss, ProbeLoss};
 use crate::prune::Periodic;
 use crate::recipe::Recipe;
@@ -137,6 +138,8 @@ pub struct Stage<F: Real = f32> {
     pub densify_steps: (usize, usize, usize),
     /// Pruning by worth in space and time, beside densification.
     pub prune: Option<Periodic>,
+    /// What becomes of Gaussians that stand in one place.
+    pub crowding: Option<Crowding>,
     /// Steps before each further SH degree; 0: all at once.
     pub sh_interval: usize,
     /// The first so many steps see pictures at half size: coarse things first, and four times faster.
@@ -165,6 +168,7 @@ impl<F: Real> Stage<F> {
             densify: Densify::None,
             densify_steps: (0, 0, 0),
             prune: None,
+            crowding: None,
             sh_interval: 0,
             half_size_steps: 0,
             min_log_life: None,

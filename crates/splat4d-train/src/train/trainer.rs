@@ -461,6 +461,7 @@ impl<'a> Trainer<'a> {
             self.fit_grads();
         }
         change.removed += self.prune(step)?;
+        change.removed += self.uncrowd(step);
         let stage = &self.stages[self.progress.stage];
         let reset = self.settings.opacity_reset_interval;
         if matches!(stage.densify, Densify::Adc(_)) && reset > 0 && step.is_multiple_of(reset) && step < until {
@@ -483,6 +484,27 @@ impl<'a> Trainer<'a> {
         self.stages[self.progress.stage].params.iter().for_each(|l| l.on_edit());
         self.fit_grads();
         Ok(before - self.scene.len())
+    }
+
+    /// Pairs in one place after so many steps of the stage, if that is due; returns how many rows went.
+    fn uncrowd(&mut self, step: usize) -> usize {
+        let stage = &self.stages[self.progress.stage];
+        let Some(rule) = stage.crowding.filter(|c| step.is_multiple_of(c.every) && step < stage.iterations) else {
+            return 0;
+        };
+        let before = self.scene.len();
+        let rng = Rng::new(self.settings.seed, "crowding", self.progress.iteration as u64);
+        for layer in 0..self.scene.layers.len() {
+            if let Some(edit) = rule.edit(&mut self.scene, layer) {
+                densify::apply(&mut self.scene, &mut self.moments, &mut self.stats, layer, &edit, &rng);
+                self.stale = true;
+            }
+        }
+        if self.scene.len() < before {
+            self.stages[self.progress.stage].params.iter().for_each(|l| l.on_edit());
+            self.fit_grads();
+        }
+        before - self.scene.len()
     }
 
     /// Errors if the scene is empty: nothing could be learnt.
