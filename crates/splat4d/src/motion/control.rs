@@ -6,9 +6,11 @@
 
 mod keys;
 mod low_rank;
+mod network;
 
 pub use keys::{Keys, Timeline};
 pub use low_rank::LowRank;
+pub use network::{Network, NetworkShape};
 
 use super::skin::{Skin, SkinSpec, Skinned, Trajectory};
 use super::{Motion, Spec};
@@ -56,6 +58,17 @@ pub enum TrajectorySpec {
         /// Keys of each, of a cubic curve: at least four.
         keys: usize,
     },
+    /// A perceptron of position and time (SC-GS).
+    Network {
+        /// Numbers in a hidden layer.
+        width: usize,
+        /// Hidden layers.
+        layers: usize,
+        /// Levels of the encoding of positions.
+        position_levels: usize,
+        /// Levels of the encoding of time.
+        time_levels: usize,
+    },
 }
 
 /// The model as plain data.
@@ -98,6 +111,11 @@ pub fn skinned<F: Real>(spec: &ControlSpec, p: &mut Params<F>) -> Result<Skinned
         TrajectorySpec::Keys { curve, keys } => Box::new(Keys::new(Timeline::new(curve, keys, spec.clip)?, &skin, p)?),
         TrajectorySpec::LowRank { bases, keys } => {
             Box::new(LowRank::new(Timeline::new(Curve::Cubic, keys, spec.clip)?, bases, &skin, p)?)
+        }
+        TrajectorySpec::Network { width, layers, position_levels, time_levels } => {
+            let shape = NetworkShape { width, layers, levels: [position_levels, time_levels] };
+            Timeline::new(Curve::Linear, 2, spec.clip)?;
+            Box::new(Network::new(shape, spec.clip, spec.seed, &skin, p)?)
         }
     };
     Ok(Skinned::new(skin, trajectory, Spec::Control(spec.clone())))

@@ -45,6 +45,7 @@ fn control() {
         (keys(Curve::Linear, 4), true),
         (keys(Curve::Slerp, 4), false),
         (TrajectorySpec::LowRank { bases: 3, keys: 5 }, true),
+        (TrajectorySpec::Network { width: 12, layers: 2, position_levels: 2, time_levels: 2 }, false),
     ];
     for (trajectory, mask) in trajectories {
         let spec =

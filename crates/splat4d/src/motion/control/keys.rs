@@ -92,7 +92,8 @@ fn cubic_slope(u: f64) -> [f64; REACH] {
     [-v * v, 3.0 * u2 - 4.0 * u, -3.0 * u2 + 2.0 * u + 1.0, u2].map(|x| 0.5 * x)
 }
 
-/// A trajectory of keys: table `node_keys` [nodes, 7·keys], column 7·key + number of the pose.
+/// A trajectory of keys: table `node_keys` with `node_shifts` [nodes, 3·keys] and `node_turns` [nodes, 4·keys], key after
+/// key.
 #[derive(Clone, Copy, Debug)]
 pub struct Keys {
     line: Timeline,
@@ -104,8 +105,25 @@ impl Keys {
     pub fn new<F: Real>(line: Timeline, skin: &Skin, p: &mut Params<F>) -> Result<Self> {
         let (rows, width) = (skin.count(p), POSE * line.keys);
         check_size("node_keys", rows, width)?;
-        let keys = p.entry("node_keys", Space::Nodes, &[("node_keys", width)], rows, |_| {})?;
+        let columns = [("node_shifts", 3 * line.keys), ("node_turns", 4 * line.keys)];
+        let keys = p.entry("node_keys", Space::Nodes, &columns, rows, |_| {})?;
         Ok(Self { line, keys })
+    }
+
+    /// The pose at a key.
+    #[inline(always)]
+    fn key<F: Real>(&self, p: &Params<F>, node: usize, key: usize) -> [F; POSE] {
+        let ([x, y, z], [a, b, c, d]) = (p[self.keys].read(node, 3 * key), p[self.keys].read(node, self.turn(key)));
+        [x, y, z, a, b, c, d]
+    }
+
+    /// First column of a key's turn.
+    fn turn(&self, key: usize) -> usize {
+        3 * self.line.keys + 4 * key
+    }
+
+    fn arc<F: Real>(&self, p: &Params<F>, node: usize, first: usize, u: f64) -> Arc<F> {
+        Arc::new([first, first + 1].map(|key| p[self.keys].read(node, self.turn(key))), u)
     }
 
     /// Key of the table.
@@ -120,11 +138,11 @@ impl<F: Real> Trajectory<F> for Keys {
         for node in 0..out.rows() {
             let mut pose = [F::ZERO; POSE];
             for (j, w) in w[..self.line.reach()].iter().enumerate() {
-                let key = p[self.keys].read::<POSE>(node, POSE * (first + j));
+                let key = self.key(p, node, first + j);
                 (0..POSE).for_each(|c| pose[c] += F::of(*w) * key[c]);
             }
             if self.line.curve == Curve::Slerp {
-                let arc = Arc::new(&p[self.keys], node, first, w[1]);
+                let arc = self.arc(p, node, first, w[1]);
                 pose[3..].copy_from_slice(&arc.residual());
             }
             out.write(node, 0, pose);
@@ -146,18 +164,19 @@ impl<F: Real> Trajectory<F> for Keys {
         for node in 0..d_out.rows() {
             let mut g = d_out.read::<POSE>(node, 0);
             if self.line.curve == Curve::Slerp {
-                let arc = Arc::new(&p[self.keys], node, first, w[1]);
+                let arc = self.arc(p, node, first, w[1]);
                 let (d_from, d_to, d_u) = arc.backward([g[3], g[4], g[5], g[6]]);
-                d_keys.add(node, POSE * first + 3, d_from);
-                d_keys.add(node, POSE * (first + 1) + 3, d_to);
+                d_keys.add(node, self.turn(first), d_from);
+                d_keys.add(node, self.turn(first + 1), d_to);
                 d_time += d_u.f64() * slopes[1];
                 g[3..].fill(F::ZERO);
             }
             for j in 0..self.line.reach() {
-                let at = POSE * (first + j);
-                let key = p[self.keys].read::<POSE>(node, at);
+                let key = self.key(p, node, first + j);
                 d_time += slopes[j] * (0..POSE).map(|c| (g[c] * key[c]).f64()).sum::<f64>();
-                d_keys.add(node, at, g.map(|x| F::of(w[j]) * x));
+                let g = g.map(|x| F::of(w[j]) * x);
+                d_keys.add(node, 3 * (first + j), [g[0], g[1], g[2]]);
+                d_keys.add(node, self.turn(first + j), [g[3], g[4], g[5], g[6]]);
             }
         }
         d_time
@@ -177,12 +196,9 @@ struct Arc<F> {
 }
 
 impl<F: Real> Arc<F> {
-    fn new(keys: &Table<F>, node: usize, first: usize, u: f64) -> Self {
-        let unit = |key: usize| {
-            let r = keys.read::<4>(node, POSE * key + 3);
-            quat::normalize([F::ONE + r[0], r[1], r[2], r[3]])
-        };
-        let (from, to) = (unit(first), unit(first + 1));
+    /// Between two quaternion residuals.
+    fn new(residuals: [[F; 4]; 2], u: f64) -> Self {
+        let [from, to] = residuals.map(|r| quat::normalize([F::ONE + r[0], r[1], r[2], r[3]]));
         let along: F = (0..4).map(|i| from.0[i] * to.0[i]).sum();
         let sign = if along < F::ZERO { -F::ONE } else { F::ONE };
         let cos = (along * sign).f64().min(1.0);

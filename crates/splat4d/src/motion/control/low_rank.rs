@@ -11,7 +11,8 @@ use crate::motion::Slot;
 use crate::scene::{Grads, Key, Params, Space, Table, Time};
 use std::f64::consts::PI;
 
-/// A trajectory of shared motions: `bases` [bases·keys, 1] (global), `node_coefficients` [nodes, 7·bases].
+/// A trajectory of shared motions: `bases` [bases·keys, 1] (global); a table with `shift_coefficients` [nodes, 3·bases] and
+/// `turn_coefficients` [nodes, 4·bases].
 #[derive(Clone, Copy, Debug)]
 pub struct LowRank {
     line: Timeline,
@@ -38,8 +39,17 @@ impl LowRank {
             }
         };
         let bases = p.entry("bases", Space::Fixed, &[("bases", 1)], count * keys, fill)?;
-        let coefficients = p.entry("node_coefficients", Space::Nodes, &[("node_coefficients", width)], rows, |_| {})?;
+        let columns = [("shift_coefficients", 3 * count), ("turn_coefficients", 4 * count)];
+        let coefficients = p.entry("node_coefficients", Space::Nodes, &columns, rows, |_| {})?;
         Ok(Self { line, count, bases, coefficients })
+    }
+
+    /// A node's seven coefficients of a motion.
+    #[inline(always)]
+    fn coefficients<F: Real>(&self, p: &Params<F>, node: usize, b: usize) -> [F; POSE] {
+        let table = &p[self.coefficients];
+        let ([x, y, z], [c, d, e, f]) = (table.read(node, 3 * b), table.read(node, 3 * self.count + 4 * b));
+        [x, y, z, c, d, e, f]
     }
 
     /// Value of every motion at t and its slope in t.
@@ -59,7 +69,7 @@ impl<F: Real> Trajectory<F> for LowRank {
         for node in 0..out.rows() {
             let mut pose = [F::ZERO; POSE];
             for (b, [f, _]) in values.iter().enumerate() {
-                let c = p[self.coefficients].read::<POSE>(node, POSE * b);
+                let c = self.coefficients(p, node, b);
                 (0..POSE).for_each(|i| pose[i] += *f * c[i]);
             }
             out.write(node, 0, pose);
@@ -82,8 +92,10 @@ impl<F: Real> Trajectory<F> for LowRank {
         for node in 0..d_out.rows() {
             let g = d_out.read::<POSE>(node, 0);
             for (b, ([f, _], d_value)) in values.iter().zip(&mut d_values).enumerate() {
-                let c = p[self.coefficients].read::<POSE>(node, POSE * b);
-                d_coefficients.add(node, POSE * b, g.map(|x| x * *f));
+                let c = self.coefficients(p, node, b);
+                let d_c = g.map(|x| x * *f);
+                d_coefficients.add(node, 3 * b, [d_c[0], d_c[1], d_c[2]]);
+                d_coefficients.add(node, 3 * self.count + 4 * b, [d_c[3], d_c[4], d_c[5], d_c[6]]);
                 *d_value += (0..POSE).map(|i| g[i] * c[i]).sum();
             }
         }
