@@ -48,8 +48,7 @@ fn a_frozen_moment_looks_like_the_scene_then() {
     for time in [0.0, 0.37, 1.0] {
         let mut params = freeze(&scene, Time(time));
         let motion = build(&Spec::Still, &mut params).unwrap();
-        let still =
-            Layer { name: "still".into(), params, motion, life: LifeKind::Infinite, span: ALWAYS, masks: None };
+        let still = Layer { name: "still".into(), params, motion, life: LifeKind::Infinite, span: ALWAYS, masks: None };
         let frozen = Scene { layers: vec![still], ..Scene::default() };
         let (a, b) = (draw(&scene, time), draw(&frozen, 0.0));
         let worst = a.data.iter().zip(&b.data).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);

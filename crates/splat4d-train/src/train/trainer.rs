@@ -430,6 +430,13 @@ impl<'a> Trainer<'a> {
         for (d, layer) in self.grads.iter_mut().zip(&self.scene.layers) {
             d.clear(&layer.params);
         }
+        if let Some(adapt) = stage.adapt.as_ref().filter(|a| a.is_due(step)) {
+            let rng = Rng::new(seed, "adapt", address);
+            adapt.run(&mut self.scene, &mut self.moments, &mut self.stats, step, rng);
+            stage.params.iter().for_each(|l| l.on_edit());
+            self.stale = true;
+            self.grads = self.scene.layers.iter().map(|l| Grads::new(&l.params)).collect();
+        }
         let (from, until, every) = stage.densify_steps;
         let mut change = Change::default();
         let due = every > 0 && step >= from && step <= until && step.is_multiple_of(every);
