@@ -13,6 +13,7 @@ pub mod gpu;
 pub mod layers;
 pub mod math;
 pub mod motion;
+pub mod nn;
 pub mod play;
 pub mod render;
 pub mod scene;

@@ -182,6 +182,15 @@ impl<F: Real> Params<F> {
         Ok(key)
     }
 
+    /// A `Fixed` table of one column of `numbers` rows, which lie one after the other: a weight, a grid. The table and its
+    /// column group share the name.
+    ///
+    /// Errors: the loaded array has another shape.
+    pub fn array(&mut self, name: &str, numbers: usize, init: impl FnOnce(&mut [F])) -> Result<Key> {
+        let column = vec![Column { name: name.to_owned().into(), width: 1 }];
+        self.claim(name.to_owned(), Space::Fixed, column, numbers, |table| init(&mut table.data_mut()[..numbers]))
+    }
+
     fn claim(
         &mut self,
         name: String,
