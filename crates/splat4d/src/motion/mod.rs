@@ -9,6 +9,7 @@ pub mod filtered;
 pub mod hexplane;
 pub mod lanes;
 pub mod native4d;
+pub mod skin;
 pub mod spacetime;
 pub mod ssm;
 pub mod still;
