@@ -58,7 +58,7 @@ pub fn weights(shape: Shape) -> usize {
 /// slowest channel remembers the whole grid, the fastest has ωΔ < π.
 pub fn init<F: Real>(shape: Shape, ticks: usize, rng: Rng, w: &mut [F]) {
     let (h, n) = (shape.channels, shape.states);
-    let mut s = Slices::of(shape, w);
+    let s = Slices::of(shape, w);
     for i in 0..h * n {
         s.log_decay[i] = F::of(FIRST_DECAY.ln());
         s.frequency[i] = F::of(std::f64::consts::PI * (i % n) as f64);
@@ -217,6 +217,11 @@ impl<F: Real> Discrete<F> {
             output: complex(n),
             skip: vec![F::ZERO; shape.channels],
         }
+    }
+
+    /// A gradient to this layer that nothing was added to.
+    pub fn none(&self) -> Self {
+        Self::zeros(self.shape, self.gaps)
     }
 
     /// Adds another gradient.
