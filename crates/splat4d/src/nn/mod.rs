@@ -4,7 +4,11 @@
 //! bits for any number of threads: work is cut by sizes alone, and partial gradients are added in a fixed order.
 
 pub mod encoding;
+pub mod frames;
 pub mod matmul;
 pub mod mlp;
+pub mod sequence;
+pub mod ssm;
+pub mod vector;
 
 pub use mlp::{Kept, Mlp, MlpShape};
