@@ -4,7 +4,9 @@
 //! bits for any number of threads: work is cut by sizes alone, and partial gradients are added in a fixed order.
 
 pub mod encoding;
+pub mod hashgrid;
 pub mod matmul;
 pub mod mlp;
 
+pub use hashgrid::{HashGrid, HashShape};
 pub use mlp::{Kept, Mlp, MlpShape};
