@@ -107,7 +107,8 @@ mod tests {
     fn gradient_equals_finite_differences_and_both_branches_meet() {
         for i in 0..40 {
             let scale = [1e-7, 1e-2, 0.57, 1.5][i as usize % 4];
-            let x: [f64; 9] = std::array::from_fn(|k| draw(10 + i + 7 * (k as u64 / 3))[k % 3] * [scale, 1.0, 1.0][k / 3]);
+            let x: [f64; 9] =
+                std::array::from_fn(|k| draw(10 + i + 7 * (k as u64 / 3))[k % 3] * [scale, 1.0, 1.0][k / 3]);
             let g = draw(500 + i);
             let split = |x: [f64; 9]| [0, 3, 6].map(|k| [x[k], x[k + 1], x[k + 2]]);
             let value = |x: [f64; 9]| {

@@ -185,13 +185,8 @@ impl Deform {
         p.info_mut(bounds).trainable = false;
         let seed = |part: u64| Rng::new(spec.seed, PURPOSE, part);
         let outputs = if spec.rigid { rows::HEADS + 3 } else { rows::HEADS };
-        let trunk_of = |inputs: usize| MlpShape {
-            inputs,
-            width: spec.width,
-            layers: spec.layers,
-            skip: spec.skip,
-            outputs,
-        };
+        let trunk_of =
+            |inputs: usize| MlpShape { inputs, width: spec.width, layers: spec.layers, skip: spec.skip, outputs };
         let (eyes, inputs) = match spec.input {
             Input::Encoded { x_levels, t_levels, time_net } => {
                 if x_levels.max(t_levels) > MAX_LEVELS {
@@ -437,8 +432,7 @@ impl<F: Real> Motion<F> for Deform {
         }
         own.d_rows.resize(n);
         let heads = own.moves.then_some(own.heads.as_slice());
-        let work =
-            Gradient { geometry: &q.p[GEOMETRY], heads, width, bounds: self.bounds(q.p), d_out: d_out.out };
+        let work = Gradient { geometry: &q.p[GEOMETRY], heads, width, bounds: self.bounds(q.p), d_out: d_out.out };
         fill(&work, [&mut own.d_rows], q.rows);
         let _ = scatter(&Spread(&own.d_rows), d.of([GEOMETRY]), q.rows);
         own.d_heads.resize(n * width, F::ZERO);

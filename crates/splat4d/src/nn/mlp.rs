@@ -389,15 +389,7 @@ impl<'a, F: Real> Run<'a, F> {
     }
 
     /// Adds a chunk's weight gradients; overwrites d_x unless it is empty.
-    fn chunk(
-        &mut self,
-        p: &Params<F>,
-        biases: &[Vec<F>],
-        x: &[F],
-        kept: Option<&[F]>,
-        d_out: &[F],
-        d_x: &mut [F],
-    ) {
+    fn chunk(&mut self, p: &Params<F>, biases: &[Vec<F>], x: &[F], kept: Option<&[F]>, d_out: &[F], d_x: &mut [F]) {
         let (mlp, simd) = (self.mlp, Simd::detect());
         let MlpShape { inputs: wide, width, layers, outputs, .. } = mlp.shape;
         let count = x.len() / wide;

@@ -218,7 +218,8 @@ fn learns_known_motions_better_than_the_static_mean_at_every_time() {
     let toy = DeformSpec { seed: 1, clip: [0.0, 1.0], input, width: 48, layers: 2, skip: None, rigid: false };
     let model = Deform::new(toy, &mut p).unwrap();
     let keys: Vec<Key> = model.network_columns().iter().map(|c| p.find(c).unwrap()).collect();
-    let mut moments: Vec<[Vec<f64>; 2]> = keys.iter().map(|&k| [vec![0.0; p[k].rows()], vec![0.0; p[k].rows()]]).collect();
+    let mut moments: Vec<[Vec<f64>; 2]> =
+        keys.iter().map(|&k| [vec![0.0; p[k].rows()], vec![0.0; p[k].rows()]]).collect();
     let error = |out: &Table<f32>, t: f64, d_out: &mut Table<f32>| {
         let mut sum = 0.0;
         for i in 0..POINTS {
