@@ -124,6 +124,31 @@ recipe! {
     /// life: life widths never fall below this many frames.
     min_life_frames: f64 = 0.5,
     // deform-mlp.
+    /// deform-mlp: network: mlp (8x256), small, hash (grids and a small network) or hash-linear.
+    deform_trunk: String = "small".into(),
+    /// deform-mlp: width of the small and hash networks.
+    deform_width: usize = 64,
+    /// deform-mlp: hidden layers of the small and hash networks.
+    deform_layers: usize = 2,
+    /// deform-mlp: levels of the positional encoding of places (the published 10 suits mlp).
+    deform_x_levels: usize = 6,
+    /// deform-mlp: levels of the positional encoding of time.
+    deform_t_levels: usize = 6,
+    /// deform-mlp: whether time goes through a small network of its own first (published for synthetic scenes).
+    deform_time_net: bool = true,
+    /// deform-mlp: positions move by screw motions (6 degrees of freedom) instead of offsets.
+    deform_rigid: bool = false,
+    /// deform-mlp: rate of networks at the start; hash grids learn 50 times faster.
+    deform_lr_init: f64 = 2e-3,
+    /// deform-mlp: rate of networks at the end.
+    deform_lr_final: f64 = 1e-4,
+    /// deform-mlp: share of the iterations that fit the cloud alone before networks learn.
+    deform_warmup: f64 = 0.05,
+    /// deform-mlp: share of the iterations after which every level of the hash grids learns; 0: all at once.
+    deform_unlock: f64 = 0.3,
+    /// deform-mlp: annealed smoothing noise on time at the start, frames; it is zero by half the iterations. 0.1 for real
+    /// captures with uncertain poses.
+    deform_time_noise: f64 = 0.0,
 
     // hexplane.
 
@@ -358,6 +383,8 @@ impl Recipe {
             ("min_opacity", self.min_opacity),
             ("prune_ratio", self.prune_ratio),
             ("static_split_from", self.static_split_from),
+            ("deform_warmup", self.deform_warmup),
+            ("deform_unlock", self.deform_unlock),
         ];
         for (knob, value) in shares {
             if !(0.0..=1.0).contains(&value) {
@@ -398,6 +425,7 @@ impl Recipe {
             ("crowding", &self.crowding, &["none", "merge", "prune"][..]),
             ("control_trajectory", &self.control_trajectory, &crate::models::control::TRAJECTORIES[..]),
             ("strategy", &self.strategy, &["mcmc", "adc", "none"][..]),
+            ("deform_trunk", &self.deform_trunk, &["mlp", "small", "hash", "hash-linear"][..]),
         ] {
             if !known.contains(&value.as_str()) {
                 let near = nearest(value, known).map(|n| format!("; did you mean `{n}`?")).unwrap_or_default();

@@ -121,6 +121,16 @@ pub fn seeds(plan: &Plan, frames: &dyn Frames, points: Option<Seeds>, moving: bo
     Ok(out)
 }
 
+/// Initial points for Gaussians that live through the whole clip: those of its middle, where what moves is on average
+/// nearest to where it will be.
+pub fn one_moment(plan: &Plan, frames: &dyn Frames, points: Option<Seeds>) -> Result<Seeds> {
+    let mut single = plan.clone();
+    single.recipe.init_keyframes = 1;
+    let mut out = seeds(&single, frames, points, true)?;
+    out.times.fill(None);
+    Ok(out)
+}
+
 /// One layer of Gaussians at the seeds: isotropic, as large as the distance to their neighbours of the same moment.
 pub fn scene(
     plan: &Plan,

@@ -1,7 +1,24 @@
-//! `deform-mlp`: how it is learnt.
+//! `deform-mlp`: a static warm-up, then the network learns beside geometry and colour.
 
-use super::{Plan, Program, Stage, still};
-use splat4d::motion::{Spec, deform::DeformSpec};
+use super::{Group, Plan, Program, Rate, Stage, TimeNoise, still};
+use crate::{Error, Result};
+use splat4d::motion::Spec;
+use splat4d::motion::deform::{Deform, DeformSpec, Input};
+use splat4d::nn::HashShape;
+use splat4d::scene::Params;
+
+/// Hidden layers and width of the large trunk, and the layer behind which its input stands again (Yang et al. 2024).
+const LARGE: (usize, usize, usize) = (8, 256, 4);
+/// Levels of places with the large trunk, at least (Yang et al. 2024).
+const LARGE_X_LEVELS: usize = 10;
+/// Grids learn so much faster than networks: an entry is met by few Gaussians.
+const GRID_SPEEDUP: f64 = 50.0;
+/// Share of the iterations until the noise on time is zero: 20,000 of 40,000 (Yang et al. 2024).
+const NOISE_STEPS: f64 = 0.5;
+/// The grid over space: a sixteenth of the published entries, since Gaussians are thousands and not millions of samples.
+const SPACE: HashShape = HashShape { levels: 8, features: 2, log2_size: 15, base: 8, finest: 256 };
+/// The grids over two axes and time.
+const TIME: HashShape = HashShape { levels: 6, features: 2, log2_size: 15, base: 4, finest: 128 };
 
 /// A canonical cloud that a perceptron or a hash grid deforms (Yang et al. 2024, "Deformable 3D Gaussians").
 #[derive(Clone, Copy, Debug)]
@@ -9,10 +26,119 @@ pub struct DeformProgram;
 
 impl Program for DeformProgram {
     fn spec(&self, plan: &Plan) -> Spec {
-        Spec::DeformMlp(DeformSpec { seed: plan.recipe.seed })
+        Spec::DeformMlp(spec(plan))
+    }
+
+    fn check(&self, plan: &Plan) -> Result<()> {
+        check(plan)
+    }
+
+    fn one_moment(&self, _plan: &Plan) -> bool {
+        true
     }
 
     fn stages(&self, plan: &Plan) -> Vec<Stage> {
-        vec![still::stage("deform-mlp", plan)]
+        let r = &plan.recipe;
+        let warmup = (r.deform_warmup * r.iterations as f64) as usize;
+        let mut out = Vec::new();
+        if warmup > 0 {
+            let mut first = stage(plan, 0, warmup);
+            first.name = "deform-mlp, still".into();
+            // A network that rests and learns nothing is not asked; nobody need wait for it.
+            first.start = Some(learns(false));
+            first.end = Some(learns(true));
+            out.push(first);
+        }
+        if warmup < r.iterations {
+            let mut second = stage(plan, warmup, r.iterations);
+            networks(&mut second, plan);
+            let noise = ((NOISE_STEPS * r.iterations as f64) as usize).saturating_sub(warmup);
+            second.time_noise = TimeNoise { start: r.deform_time_noise / plan.fps, steps: noise };
+            out.push(second);
+        }
+        out
     }
 }
+
+fn check(plan: &Plan) -> Result<()> {
+    if plan.times < 2 {
+        return Err(Error::input("every picture of the capture is of one moment: there is nothing to deform")
+            .remedy("Train it with --motion still"));
+    }
+    Deform::new(spec(plan), &mut Params::<f32>::new(0, 1, &[]))
+        .map(drop)
+        .map_err(|e| e.remedy("Change deform_width, deform_layers, deform_x_levels or deform_t_levels"))
+}
+
+fn spec(plan: &Plan) -> DeformSpec {
+    let r = &plan.recipe;
+    let encoded = |x_levels| Input::Encoded { x_levels, t_levels: r.deform_t_levels, time_net: r.deform_time_net };
+    let (input, layers, width, skip) = match r.deform_trunk.as_str() {
+        "mlp" => (encoded(LARGE_X_LEVELS.max(r.deform_x_levels)), LARGE.0, LARGE.1, Some(LARGE.2)),
+        "hash" => (Input::Hashed { space: SPACE, time: TIME }, r.deform_layers.max(1), r.deform_width, None),
+        "hash-linear" => (Input::Hashed { space: SPACE, time: TIME }, 0, r.deform_width, None),
+        _ => (encoded(r.deform_x_levels), r.deform_layers, r.deform_width, None),
+    };
+    DeformSpec { seed: r.seed, clip: plan.clip, input, width, layers, skip, rigid: r.deform_rigid }
+}
+
+/// Steps `from .. to` of the recipe's one schedule as a stage of its own.
+fn stage(plan: &Plan, from: usize, to: usize) -> Stage {
+    let total = plan.recipe.iterations as f64;
+    let mut stage = still::stage("deform-mlp", plan);
+    still::learn_life(&mut stage, plan, DeformProgram.life(plan));
+    for group in &mut stage.groups {
+        let rate = group.rate;
+        group.rate = Rate { start: rate.at(from as f64 / total), end: rate.at(to as f64 / total) };
+    }
+    let (first, last, every) = stage.densify_steps;
+    stage.densify_steps = (first.saturating_sub(from), last.saturating_sub(from), every);
+    stage.half_size_steps = stage.half_size_steps.saturating_sub(from);
+    // Degrees are unlocked from the stage's start on: the first one comes when it would have.
+    stage.sh_interval = stage.sh_interval.saturating_sub(from).max(1);
+    stage.iterations = to - from;
+    stage
+}
+
+/// Lets the networks of every deformable layer learn, or not.
+fn learns(learns: bool) -> super::Hook<f32> {
+    Box::new(move |scene, _| {
+        for layer in &mut scene.layers {
+            if let Spec::DeformMlp(spec) = layer.motion.spec() {
+                set_learns(&spec, &mut layer.params, learns)?;
+            }
+        }
+        Ok(())
+    })
+}
+
+fn set_learns(spec: &DeformSpec, p: &mut Params<f32>, learns: bool) -> Result<()> {
+    // The names are those of a model of this spec, wherever its tables lie.
+    for column in Deform::new(spec.clone(), &mut Params::<f32>::new(0, 1, &[]))?.network_columns() {
+        if let Some(key) = p.find(&column) {
+            p.info_mut(key).trainable = learns;
+        }
+    }
+    Ok(())
+}
+
+/// The groups of networks and grids.
+fn networks(stage: &mut Stage, plan: &Plan) {
+    let r = &plan.recipe;
+    let rate = Rate { start: r.deform_lr_init, end: r.deform_lr_final };
+    let made = Deform::new(spec(plan), &mut Params::<f32>::new(0, 1, &[]));
+    let model = made.expect("a recipe's network is one that can be made: its knobs were checked");
+    stage.groups.extend(model.network_columns().iter().map(|c| Group::new(c, rate)));
+    let fast = Rate { start: GRID_SPEEDUP * rate.start, end: GRID_SPEEDUP * rate.end };
+    let levels = model.grid_columns();
+    // The coarse half learns from the start, then level after level (SC-GS begins with 6 of 12 to 16).
+    let first = levels.len().div_ceil(2);
+    for (l, columns) in levels.iter().enumerate() {
+        let waits = (l + 1).saturating_sub(first) as f64 / (levels.len() - first).max(1) as f64;
+        let from = (waits * r.deform_unlock * r.iterations as f64) as usize;
+        stage.groups.extend(columns.iter().map(|c| Group { from, ..Group::new(c, fast) }));
+    }
+}
+
+#[cfg(test)]
+mod tests;

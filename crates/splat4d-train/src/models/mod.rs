@@ -97,12 +97,14 @@ pub struct Group {
     pub part: Option<(usize, usize)>,
     /// How fast.
     pub rate: Rate,
+    /// Frozen for so many steps of the stage (networks and fine grids that come in later).
+    pub from: usize,
 }
 
 impl Group {
     /// All columns of a group of layer 0.
     pub fn new(column: &str, rate: Rate) -> Self {
-        Self { layer: 0, column: column.to_owned(), part: None, rate }
+        Self { layer: 0, column: column.to_owned(), part: None, rate, from: 0 }
     }
 
     /// Whether it is a group of the layer with this number.
@@ -113,6 +115,23 @@ impl Group {
 
 /// Hears how far something long is: what is done, how much of it, of how much (0 where not known).
 pub type Tell<'a> = dyn FnMut(&str, usize, usize) + 'a;
+
+/// Annealed smoothing: one random shift of time a step, which keeps a network from learning the pose errors of single
+/// frames. t + N(0, 1)·β, β falling linearly to zero (Yang et al. 2024, §3.3); evaluation is never shifted.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct TimeNoise {
+    /// β at the first step, seconds; 0: none.
+    pub start: f64,
+    /// Steps until it is zero.
+    pub steps: usize,
+}
+
+impl TimeNoise {
+    /// β after so many steps of the stage.
+    pub fn width(&self, step: usize) -> f64 {
+        if step >= self.steps { 0.0 } else { self.start * (1.0 - step as f64 / self.steps as f64) }
+    }
+}
 
 /// What a stage does to the scene at its start or end: add pages, replace the cloud, build a graph. A layer that it
 /// replaces needs another name: rows of a layer that keeps its name and its shape keep their moments.
@@ -159,6 +178,8 @@ pub struct Stage<F: Real = f32> {
     pub half_size_steps: usize,
     /// Lower bound of log life widths, by layer; learnt values are lifted to it.
     pub min_log_life: Option<f64>,
+    /// Noise on the times of the step's views.
+    pub time_noise: TimeNoise,
     /// What stands between the parameters and the pictures; none: nothing.
     pub codec: Option<Arc<dyn Codec<F>>>,
     /// Before the first step.
@@ -186,6 +207,7 @@ impl<F: Real> Stage<F> {
             sh_interval: 0,
             half_size_steps: 0,
             min_log_life: None,
+            time_noise: TimeNoise::default(),
             codec: None,
             start: None,
             end: None,
@@ -204,6 +226,11 @@ pub trait Program: Send + Sync {
     /// Says before training, and not after an hour, that the model cannot work on a capture.
     fn check(&self, _plan: &Plan) -> Result<()> {
         Ok(())
+    }
+    /// Whether all Gaussians live through the whole clip, so that training should start from one moment's cloud and not
+    /// from the clouds of many moments together.
+    fn one_moment(&self, _plan: &Plan) -> bool {
+        false
     }
     /// The stages.
     fn stages(&self, plan: &Plan) -> Vec<Stage>;

@@ -314,7 +314,10 @@ impl Bench {
                 times: c.times.clone(),
             })
         };
-        let seeds = init::seeds(plan, self.frames.as_ref(), points, moving)?;
+        let seeds = match moving && program.one_moment(plan) {
+            true => init::one_moment(plan, self.frames.as_ref(), points)?,
+            false => init::seeds(plan, self.frames.as_ref(), points, moving)?,
+        };
         init::scene(plan, program.as_ref(), &seeds, self.background(), self.capture.up)
     }
 

@@ -13,7 +13,7 @@ use crate::{Error, ErrorKind, Result};
 use splat4d::layers::Scene;
 use splat4d::math::Rng;
 use splat4d::scene::life::LOG_WIDTH;
-use splat4d::scene::{Camera, GEOMETRY, Grads, LIFE, SH, Space};
+use splat4d::scene::{Camera, GEOMETRY, Grads, LIFE, SH, Space, Time};
 use std::borrow::Cow;
 use std::sync::Arc;
 use std::time::{Duration, Instant as Clock};
@@ -310,13 +310,18 @@ impl<'a> Trainer<'a> {
                 }
             })
             .collect();
+        let width = stage.time_noise.width(self.progress.stage_step);
+        let shift = match width > 0.0 {
+            true => width * Rng::new(self.settings.seed, "time noise", self.progress.iteration as u64).normal(0),
+            false => 0.0,
+        };
         let views: Vec<View<'_, f32>> = seen
             .iter()
             .zip(&self.pictures)
             .zip(&cameras)
             .map(|((&i, picture), camera)| View {
                 camera,
-                t: self.frames.time(i),
+                t: Time(self.frames.time(i).0 + shift),
                 background,
                 truth: &picture.color,
                 mask: picture.mask.as_ref(),
@@ -371,7 +376,8 @@ impl<'a> Trainer<'a> {
             let rates = &mut self.rates[index];
             rates.resize(layer.params.keys().count(), None);
             rates.iter_mut().flatten().for_each(|table| table.fill(0.0));
-            for group in stage.groups.iter().filter(|g| g.is_of(index)) {
+            let step = self.progress.stage_step;
+            for group in stage.groups.iter().filter(|g| g.is_of(index) && g.from <= step) {
                 let found = layer.params.keys().find_map(|k| layer.params[k].column(&group.column).map(|c| (k, c)));
                 let Some((key, (first, width))) = found else { continue };
                 let (from, count) = group.part.unwrap_or((0, width));

@@ -10,6 +10,7 @@ pub mod se3;
 pub mod sh;
 pub mod sh_turn;
 pub mod sym3;
+pub mod twist;
 
 pub use real::Real;
 pub use rng::Rng;

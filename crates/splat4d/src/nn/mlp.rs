@@ -158,7 +158,21 @@ impl Mlp {
 
     /// As [`forward`](Self::forward), and remembers activations for [`backward_of`](Self::backward_of).
     pub fn forward_keeping<F: Real>(&self, p: &Params<F>, x: &[F], out: &mut [F], kept: &mut Kept<F>) {
+        self.forward_shifted(p, x, &[], out, kept);
+    }
+
+    /// As [`forward_keeping`](Self::forward_keeping), where `shifts[i]`, unless absent or empty, is added to the bias of
+    /// map i: what all rows share (a time's features) need not stand in every row.
+    pub fn forward_shifted<F: Real>(
+        &self,
+        p: &Params<F>,
+        x: &[F],
+        shifts: &[Vec<F>],
+        out: &mut [F],
+        kept: &mut Kept<F>,
+    ) {
         let n = self.rows(x, out);
+        let biases = self.biases(p, shifts);
         let (rows, hidden) = (self.chunk_rows(), self.hidden());
         // `forward` asks for nothing to be kept by a count that no pass can have.
         let wanted = if kept.chunks == usize::MAX { 0 } else { n.div_ceil(rows) };
@@ -178,9 +192,9 @@ impl Mlp {
                 } else {
                     store
                 };
-                self.activate(p, x, hidden);
+                self.activate(p, &biases, x, hidden);
                 let last = self.shape.layers;
-                self.map(p, last, self.input(last, x, hidden), out, outputs, false);
+                self.map(p, &biases, last, self.input(last, x, hidden), out, outputs, false);
             },
         );
     }
@@ -200,7 +214,22 @@ impl Mlp {
         d_x: Option<&mut [F]>,
         d: &mut Grads<F>,
     ) {
+        let _ = self.backward_shifted(p, x, &[], kept, d_out, d_x, d);
+    }
+
+    /// The VJP of [`forward_shifted`](Self::forward_shifted); returns the gradient to every map's shift.
+    pub fn backward_shifted<F: Real>(
+        &self,
+        p: &Params<F>,
+        x: &[F],
+        shifts: &[Vec<F>],
+        kept: &Kept<F>,
+        d_out: &[F],
+        d_x: Option<&mut [F]>,
+        d: &mut Grads<F>,
+    ) -> Vec<Vec<F>> {
         let n = self.rows(x, d_out);
+        let biases = self.biases(p, shifts);
         let rows = self.chunk_rows();
         let chunks = n.div_ceil(rows);
         let runs = chunks.min(RUNS);
@@ -229,17 +258,18 @@ impl Mlp {
                     let d_x = if wanted { &mut d_x[from..from + count * inputs] } else { &mut [][..] };
                     let hidden = self.hidden();
                     let store = (first / rows < kept.chunks).then(|| &kept.data[first * hidden..][..count * hidden]);
-                    run.chunk(p, x, store, d_out, d_x);
+                    run.chunk(p, &biases, x, store, d_out, d_x);
                 }
                 run.d_weights
             })
             .collect();
-        self.reduce(&partial, d);
+        self.reduce(&partial, d)
     }
 
-    /// Adds the runs' gradients in their order.
-    fn reduce<F: Real>(&self, partial: &[Vec<F>], d: &mut Grads<F>) {
+    /// Adds the runs' gradients in their order; returns those to the biases alone.
+    fn reduce<F: Real>(&self, partial: &[Vec<F>], d: &mut Grads<F>) -> Vec<Vec<F>> {
         let mut first = 0;
+        let mut biases = Vec::new();
         for map in &self.maps {
             for (key, len) in [(map.weight, map.inputs * map.outputs), (map.bias, map.outputs)] {
                 let [table] = d.of([key]);
@@ -252,7 +282,33 @@ impl Mlp {
                 });
                 first += len;
             }
+            let from = first - map.outputs;
+            let sum = |o: usize| partial.iter().fold(F::ZERO, |sum, part| sum + part[from + o]);
+            biases.push((0..map.outputs).map(sum).collect());
         }
+        biases
+    }
+
+    /// The biases with what is added to them.
+    fn biases<F: Real>(&self, p: &Params<F>, shifts: &[Vec<F>]) -> Vec<Vec<F>> {
+        let biases = self.maps.iter().map(|m| p[m.bias].data()[..m.outputs].to_vec());
+        let mut biases: Vec<Vec<F>> = biases.collect();
+        for (bias, shift) in biases.iter_mut().zip(shifts) {
+            assert!(shift.is_empty() || shift.len() == bias.len(), "a shift has the shape of the bias it is added to");
+            bias.iter_mut().zip(shift).for_each(|(b, s)| *b += *s);
+        }
+        biases
+    }
+
+    /// Whether the last map is zero, so that everything that comes out is; nothing but it has a gradient then.
+    pub fn is_zero<F: Real>(&self, p: &Params<F>) -> bool {
+        let Map { weight, bias, .. } = self.maps[self.shape.layers];
+        [weight, bias].iter().all(|&key| p[key].data().iter().all(|x| *x == F::ZERO))
+    }
+
+    /// Keys of every table.
+    pub fn keys(&self) -> impl Iterator<Item = Key> + '_ {
+        self.maps.iter().flat_map(|m| [m.weight, m.bias])
     }
 
     fn rows<F>(&self, x: &[F], out: &[F]) -> usize {
@@ -283,13 +339,13 @@ impl Mlp {
     }
 
     /// Fills the activations of a chunk, map input after map input.
-    fn activate<F: Real>(&self, p: &Params<F>, x: &[F], hidden: &mut [F]) {
+    fn activate<F: Real>(&self, p: &Params<F>, biases: &[Vec<F>], x: &[F], hidden: &mut [F]) {
         let count = x.len() / self.shape.inputs;
         let (mut before, mut rest) = (x, hidden);
         for i in 0..self.shape.layers {
             let stride = self.maps[i + 1].inputs;
             let (next, tail) = rest.split_at_mut(count * stride);
-            self.map(p, i, before, next, stride, true);
+            self.map(p, biases, i, before, next, stride, true);
             if stride > self.shape.width {
                 for (row, x) in next.chunks_exact_mut(stride).zip(x.chunks_exact(self.shape.inputs)) {
                     row[self.shape.width..].copy_from_slice(x);
@@ -300,11 +356,20 @@ impl Mlp {
     }
 
     /// out = x Wᵢᵀ + bᵢ, clamped at zero if `relu`, in rows `stride` numbers apart.
-    fn map<F: Real>(&self, p: &Params<F>, i: usize, x: &[F], out: &mut [F], stride: usize, relu: bool) {
-        let Map { weight, bias, inputs, outputs } = self.maps[i];
+    fn map<F: Real>(
+        &self,
+        p: &Params<F>,
+        biases: &[Vec<F>],
+        i: usize,
+        x: &[F],
+        out: &mut [F],
+        stride: usize,
+        relu: bool,
+    ) {
+        let Map { weight, inputs, outputs, .. } = self.maps[i];
         let w = Matrix::new(p[weight].data(), outputs, inputs, inputs);
         product(Matrix::new(x, x.len() / inputs, inputs, inputs), w.t(), out, stride, false);
-        dispatch_pass(Simd::detect(), &Finish { bias: &p[bias].data()[..outputs], stride, relu }, &mut (), out);
+        dispatch_pass(Simd::detect(), &Finish { bias: &biases[i], stride, relu }, &mut (), out);
     }
 }
 
@@ -324,7 +389,7 @@ impl<'a, F: Real> Run<'a, F> {
     }
 
     /// Adds a chunk's weight gradients; overwrites d_x unless it is empty.
-    fn chunk(&mut self, p: &Params<F>, x: &[F], kept: Option<&[F]>, d_out: &[F], d_x: &mut [F]) {
+    fn chunk(&mut self, p: &Params<F>, biases: &[Vec<F>], x: &[F], kept: Option<&[F]>, d_out: &[F], d_x: &mut [F]) {
         let (mlp, simd) = (self.mlp, Simd::detect());
         let MlpShape { inputs: wide, width, layers, outputs, .. } = mlp.shape;
         let count = x.len() / wide;
@@ -332,7 +397,7 @@ impl<'a, F: Real> Run<'a, F> {
             Some(hidden) => hidden,
             None => {
                 self.hidden.resize(mlp.chunk_rows() * mlp.hidden(), F::ZERO);
-                mlp.activate(p, x, &mut self.hidden[..count * mlp.hidden()]);
+                mlp.activate(p, biases, x, &mut self.hidden[..count * mlp.hidden()]);
                 &self.hidden[..]
             }
         };

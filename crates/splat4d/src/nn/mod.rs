@@ -5,10 +5,12 @@
 
 pub mod encoding;
 pub mod frames;
+pub mod hashgrid;
 pub mod matmul;
 pub mod mlp;
 pub mod sequence;
 pub mod ssm;
 pub mod vector;
 
+pub use hashgrid::{HashGrid, HashShape};
 pub use mlp::{Kept, Mlp, MlpShape};

@@ -355,6 +355,21 @@ impl<F: Real> Grads<F> {
         self.tables.get_disjoint_mut(keys.map(|k| k.0 as usize)).expect("keys of one layer must be distinct")
     }
 
+    /// As [`of`](Self::of), of any number of keys, which must stand in increasing order.
+    pub fn many(&mut self, keys: &[Key]) -> Vec<&mut Table<F>> {
+        assert!(keys.is_sorted_by(|a, b| a < b), "keys must be increasing");
+        let mut wanted = keys.iter().peekable();
+        let mut out = Vec::with_capacity(keys.len());
+        for (i, table) in self.tables.iter_mut().enumerate() {
+            if wanted.next_if(|k| k.0 as usize == i).is_some() {
+                self.touched[i] = true;
+                out.push(table);
+            }
+        }
+        assert_eq!(out.len(), keys.len(), "every key names a table of the layer");
+        out
+    }
+
     /// One table, to read.
     pub fn table(&self, key: Key) -> &Table<F> {
         &self.tables[key.0 as usize]

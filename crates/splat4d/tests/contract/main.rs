@@ -5,7 +5,9 @@ mod check;
 use check::{model, starts_still};
 use splat4d::motion::control::{ControlSpec, Curve, TrajectorySpec};
 use splat4d::motion::skin::SkinSpec;
+use splat4d::motion::deform::{DeformSpec, Input};
 use splat4d::motion::{SpacetimeSpec, Spec};
+use splat4d::nn::HashShape;
 use splat4d::scene::{LifeKind, Space};
 
 /// Gaussians of a made-up layer: more than a block, and no multiple of one.
@@ -27,6 +29,25 @@ fn spacetime() {
 }
 
 // deform-mlp.
+
+#[test]
+fn deform_mlp() {
+    let grid = |levels, finest| HashShape { levels, features: 2, log2_size: 7, base: 2, finest };
+    for (input, layers, rigid) in [
+        (Input::Encoded { x_levels: 2, t_levels: 2, time_net: true }, 3, false),
+        (Input::Encoded { x_levels: 2, t_levels: 2, time_net: false }, 1, true),
+        (Input::Hashed { space: grid(3, 9), time: grid(2, 5) }, 2, false),
+        (Input::Hashed { space: grid(2, 6), time: grid(2, 5) }, 0, true),
+    ] {
+        let skip = (layers > 2).then_some(1);
+        let spec = DeformSpec { seed: 2, clip: [0.0, 1.0], input, width: 9, layers, skip, rigid };
+        let spec = Spec::DeformMlp(spec);
+        // The network's input is detached from the means.
+        model(&spec, ROWS, LifeKind::Infinite, &[Space::Gaussians], &["means"]);
+        model(&spec, ROWS, LifeKind::GaussHalf, &[Space::Gaussians], &["means"]);
+        starts_still(&spec, ROWS);
+    }
+}
 
 // hexplane.
 

@@ -154,6 +154,36 @@ fn any_number_of_threads_and_kept_activations_give_the_same_bits() {
 }
 
 #[test]
+fn a_shift_is_an_input_that_all_rows_share() {
+    // The same network with the shared input standing in every row.
+    let shape = MlpShape { inputs: 3, width: 6, layers: 2, skip: Some(0), outputs: 2 };
+    let (p, mlp) = made::<f64>(shape);
+    let x = numbers::<f64>(5 * 3, 1);
+    let shifts = [numbers::<f64>(6, 2), Vec::new(), numbers::<f64>(2, 3)];
+    let weights = numbers::<f64>(10, 4);
+    let value = |shifts: &[Vec<f64>]| {
+        let mut out = vec![0.0; 10];
+        mlp.forward_shifted(&p, &x, shifts, &mut out, &mut Kept::default());
+        out.iter().zip(&weights).map(|(a, b)| a * b).sum::<f64>()
+    };
+    let mut d = Grads::new(&p);
+    let d_shifts = mlp.backward_shifted(&p, &x, &shifts, &Kept::default(), &weights, None, &mut d);
+    for map in [0, 2] {
+        for i in 0..shifts[map].len() {
+            let moved = |h: f64| {
+                let mut shifts = shifts.clone();
+                shifts[map][i] += h;
+                value(&shifts)
+            };
+            let fd = (moved(H) - moved(-H)) / (2.0 * H);
+            assert!((fd - d_shifts[map][i]).abs() < 1e-6 * fd.abs().max(1e-2), "{fd} {}", d_shifts[map][i]);
+            let bias = d.table(mlp.maps[map].bias).get(i, 0);
+            assert!((bias - d_shifts[map][i]).abs() < 1e-12, "the bias has the same gradient");
+        }
+    }
+}
+
+#[test]
 fn hostile_shapes_are_refused() {
     let good = MlpShape { inputs: 3, width: 8, layers: 2, skip: None, outputs: 2 };
     for shape in [

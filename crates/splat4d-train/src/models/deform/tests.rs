@@ -1,0 +1,58 @@
+use super::*;
+use crate::recipe::Recipe;
+
+fn plan(settings: &[&str]) -> Plan {
+    let mut recipe = Recipe { motion: "deform-mlp".into(), iterations: 1000, ..Recipe::default() };
+    settings.iter().for_each(|s| recipe.set(s).unwrap());
+    let recipe = recipe.resolve();
+    Plan { recipe, extent: 2.0, clip: [0.0, 1.0], fps: 20.0, times: 21, fixed_cameras: 0 }
+}
+
+#[test]
+fn two_stages_make_one_schedule() {
+    let plan = plan(&["deform_warmup=0.1", "half_size_until=0.3"]);
+    let [still, moving]: [Stage; 2] = DeformProgram.stages(&plan).try_into().ok().unwrap();
+    assert_eq!((still.iterations, moving.iterations), (100, 900));
+    let rate = |s: &Stage, column: &str| s.groups.iter().find(|g| g.column == column).map(|g| g.rate);
+    let (a, b) = (rate(&still, "means").unwrap(), rate(&moving, "means").unwrap());
+    assert!((a.end - b.start).abs() < 1e-12 && a.start > a.end && b.start > b.end);
+    assert_eq!(rate(&still, "deform_trunk.0.weight"), None, "the warm-up does not know the network");
+    assert_eq!(rate(&moving, "deform_trunk.0.weight").unwrap().start, plan.recipe.deform_lr_init);
+    let whole = still::stage("x", &plan);
+    assert_eq!(moving.densify_steps.1 + 100, whole.densify_steps.1);
+    assert_eq!((still.half_size_steps, moving.half_size_steps), (300, 200));
+    assert_eq!(DeformProgram.stages(&self::plan(&["deform_warmup=0"])).len(), 1);
+}
+
+#[test]
+fn smoothing_noise_starts_at_its_share_of_a_frame_and_ends() {
+    let plan = plan(&["deform_time_noise=0.1", "deform_warmup=0"]);
+    let noise = DeformProgram.stages(&plan)[0].time_noise;
+    assert!((noise.width(0) - 0.1 / 20.0).abs() < 1e-15);
+    assert!((1..1000).all(|s| noise.width(s) <= noise.width(s - 1)));
+    assert_eq!((noise.width(500), noise.width(999)), (0.0, 0.0));
+    let off = DeformProgram.stages(&self::plan(&[]))[1].time_noise;
+    assert_eq!(off.width(0), 0.0, "captures with exact poses want none");
+}
+
+#[test]
+fn fine_levels_of_hash_grids_wait() {
+    let plan = plan(&["deform_trunk=hash", "deform_warmup=0", "deform_unlock=0.4"]);
+    let groups = DeformProgram.stages(&plan).remove(0).groups;
+    let from = |l: usize| groups.iter().find(|g| g.column == format!("deform_xyz.{l}")).unwrap().from;
+    let waits: Vec<usize> = (0..SPACE.levels).map(from).collect();
+    assert!(waits.is_sorted() && waits[0] == 0 && waits[3] == 0 && waits[4] > 0 && waits[7] == 400, "{waits:?}");
+    assert!(
+        groups.iter().any(|g| g.column == "deform_yzt.0") && groups.iter().any(|g| g.column == "deform_trunk.2.bias")
+    );
+}
+
+#[test]
+fn what_cannot_work_is_said_before_training() {
+    let mut single = plan(&[]);
+    single.times = 1;
+    assert!(DeformProgram.check(&single).unwrap_err().to_string().contains("still"));
+    let wide = plan(&["deform_width=100000"]);
+    assert!(DeformProgram.check(&wide).unwrap_err().to_string().contains("deform_width"));
+    assert!(DeformProgram.check(&plan(&["deform_trunk=mlp"])).is_ok());
+}
