@@ -4,6 +4,7 @@
 //! bits for any number of threads: work is cut by sizes alone, and partial gradients are added in a fixed order.
 
 pub mod encoding;
+pub mod hexplane;
 pub mod matmul;
 pub mod mlp;
 
