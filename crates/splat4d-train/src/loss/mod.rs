@@ -4,6 +4,7 @@
 
 mod kernel;
 pub mod photometric;
+pub mod planes;
 pub mod scene;
 pub mod terms;
 
