@@ -63,6 +63,10 @@ impl Program for HexplaneProgram {
         })
     }
 
+    fn is_canonical(&self) -> bool {
+        true
+    }
+
     fn check(&self, plan: &Plan) -> Result<()> {
         let Spec::Hexplane(spec) = self.spec(plan) else { unreachable!("this program is of one model") };
         spec.planes.check()
