@@ -152,6 +152,49 @@ recipe! {
 
     // hexplane.
 
+    /// hexplane: steps of the coarse stage, in which nothing moves; 0: iterations/10.
+    coarse_iterations: usize = 0,
+    /// hexplane: features a level of the planes; a multiple of 16.
+    plane_channels: usize = 32,
+    /// hexplane: grid points of a plane along a spatial axis, at multiple 1.
+    plane_resolution: usize = 64,
+    /// hexplane: grid points of a plane along time; 0: one every 4 frames, at least 8.
+    time_resolution: usize = 0,
+    /// hexplane: levels of the planes, as multiples of the resolution.
+    multires: Vec<usize> = vec![1, 2],
+    /// hexplane: steps of the fine stage before each further level is unlocked; 0: all at once.
+    unlock_interval: usize = 0,
+    /// hexplane: width of the networks.
+    net_width: usize = 64,
+    /// hexplane: linear maps between planes and heads; 0 is 1.
+    defor_depth: usize = 0,
+    /// hexplane: positions do not move.
+    no_dx: bool = false,
+    /// hexplane: scales do not change.
+    no_ds: bool = false,
+    /// hexplane: rotations do not change.
+    no_dr: bool = false,
+    /// hexplane: opacities do not change.
+    no_do: bool = true,
+    /// hexplane: colours do not change.
+    no_dshs: bool = true,
+    /// hexplane: rate of the planes at the start.
+    grid_lr_init: f64 = 6e-3,
+    /// hexplane: rate of the planes at the end.
+    grid_lr_final: f64 = 6e-4,
+    /// hexplane: rate of the networks at the start.
+    deformation_lr_init: f64 = 1e-3,
+    /// hexplane: rate of the networks at the end.
+    deformation_lr_final: f64 = 1e-4,
+    /// hexplane: weight of the squared second differences of the planes over space.
+    plane_tv_weight: f64 = 1e-4,
+    /// hexplane: weight of the squared second differences of the time planes along time.
+    time_smoothness_weight: f64 = 0.01,
+    /// hexplane: weight of the mean distance of the time planes from 1, where nothing depends on time.
+    l1_time_planes: f64 = 1e-4,
+    /// hexplane: weight of the squared first differences (total variation) of the planes over space.
+    plane_variation_weight: f64 = 0.0,
+
     // tracked.
 
     // native4d, spacetime.

@@ -7,6 +7,7 @@ pub mod graph;
 mod kernel;
 pub mod photometric;
 pub mod rigid;
+pub mod planes;
 pub mod scene;
 pub mod terms;
 

@@ -1,18 +1,215 @@
-//! `hexplane`: how it is learnt.
+//! `hexplane`: how it is learnt. A coarse stage in which nothing moves, then a fine one in which planes and networks learn
+//! with the canonical cloud. The box of the planes is that of the cloud when the fine stage begins.
+//!
+//! The original multiplies every rate by the scene's extent. Here the networks see the box as [0, 1]³ and answer in half
+//! boxes, so the rates of planes and networks have no unit; the cloud's positions keep theirs.
+//! Source: Wu et al. 2024 ("4DGaussians") §4 and the released configurations.
 
-use super::{Plan, Program, Stage, still};
-use splat4d::motion::{Spec, hexplane::HexplaneSpec};
+use super::{Group, Hook, Plan, Program, Rate, Stage, still};
+use crate::densify::Densify;
+use crate::loss::planes::{PlaneWeights, SmoothPlanes};
+use crate::recipe::Recipe;
+use crate::{Error, Result};
+use splat4d::layers::Scene;
+use splat4d::math::Real;
+use splat4d::motion::hexplane::{Heads, Hexplane, HexplaneSpec};
+use splat4d::motion::{Motion, Spec};
+use splat4d::nn::hexplane::PlaneShape;
+use splat4d::scene::{GEOMETRY, Table};
+use std::any::Any;
+use std::sync::Arc;
 
 /// A canonical cloud that six feature planes deform (Wu et al. 2024, "4DGaussians").
 #[derive(Clone, Copy, Debug)]
 pub struct HexplaneProgram;
 
+/// Frames a time step of the planes: half of the frames where the original reads half of its time axis.
+const FRAMES_PER_STEP: usize = 4;
+/// Fewest time steps, for short clips.
+const LEAST_STEPS: usize = 8;
+/// Share of the Gaussians that may lie outside the box on each side of an axis: strays must not coarsen the planes.
+const OUTSIDE: f64 = 0.002;
+/// The box is this much larger on every side than the cloud, of its longest side: things move.
+const MARGIN: f64 = 0.1;
+/// Smallest side of the box, of its longest: a flat cloud may still move out of its plane.
+const FLATTEST: f64 = 0.1;
+/// One of so many steps has a coarse stage's place if the recipe leaves it open.
+const COARSE_PART: usize = 10;
+
 impl Program for HexplaneProgram {
     fn spec(&self, plan: &Plan) -> Spec {
-        Spec::Hexplane(HexplaneSpec { seed: plan.recipe.seed })
+        let r = &plan.recipe;
+        let steps = match r.time_resolution {
+            0 => plan.times.div_ceil(FRAMES_PER_STEP).max(LEAST_STEPS),
+            n => n,
+        };
+        let planes = PlaneShape {
+            channels: r.plane_channels,
+            resolution: r.plane_resolution,
+            time_resolution: steps,
+            multires: r.multires.clone(),
+        };
+        Spec::Hexplane(HexplaneSpec {
+            seed: r.seed,
+            low: [-plan.extent; 3],
+            high: [plan.extent; 3],
+            clip: plan.clip,
+            unlocked: planes.multires.len(),
+            planes,
+            net_width: r.net_width,
+            defor_depth: r.defor_depth,
+            heads: Heads { position: !r.no_dx, scale: !r.no_ds, rotation: !r.no_dr, opacity: !r.no_do, sh: !r.no_dshs },
+            coarse: false,
+        })
+    }
+
+    fn is_canonical(&self) -> bool {
+        true
+    }
+
+    fn check(&self, plan: &Plan) -> Result<()> {
+        let Spec::Hexplane(spec) = self.spec(plan) else { unreachable!("this program is of one model") };
+        spec.planes.check()
     }
 
     fn stages(&self, plan: &Plan) -> Vec<Stage> {
-        vec![still::stage("hexplane", plan)]
+        let r = &plan.recipe;
+        let coarse = coarse_steps(r).min(r.iterations);
+        let mut stages = Vec::new();
+        if coarse > 0 {
+            let mut stage = part(plan, self.whole(plan), 0, coarse);
+            stage.name = "coarse".into();
+            stage.groups.retain(|g| !g.column.starts_with("hexplane."));
+            stage.params.retain(|l| l.name() != SmoothPlanes::NAME);
+            stage.start = Some(respecify(|spec, _| spec.coarse = true));
+            stages.push(stage);
+        }
+        let ends = unlocks(r, coarse);
+        for (i, end) in ends.windows(2).enumerate() {
+            let mut stage = part(plan, self.whole(plan), end[0], end[1]);
+            stage.name = if ends.len() > 2 { format!("fine {}", i + 1) } else { "fine".into() };
+            let levels = r.multires.len();
+            let unlocked = if ends.len() > 2 { i + 1 } else { levels };
+            let first = i == 0;
+            stage.start = Some(respecify(move |spec, scene| {
+                spec.coarse = false;
+                spec.unlocked = unlocked.min(levels);
+                if let (true, Some([low, high])) = (first, around(scene)) {
+                    (spec.low, spec.high) = (low, high);
+                }
+            }));
+            stages.push(stage);
+        }
+        stages
     }
+}
+
+/// Steps of the coarse stage.
+fn coarse_steps(r: &Recipe) -> usize {
+    if r.coarse_iterations == 0 { r.iterations / COARSE_PART } else { r.coarse_iterations }
+}
+
+/// First steps of the fine stages, and the end.
+fn unlocks(r: &Recipe, coarse: usize) -> Vec<usize> {
+    let mut ends = vec![coarse];
+    if r.unlock_interval > 0 {
+        let more = (1..r.multires.len()).map(|k| coarse + k * r.unlock_interval);
+        ends.extend(more.filter(|&step| step < r.iterations));
+    }
+    if coarse < r.iterations {
+        ends.push(r.iterations);
+    }
+    ends
+}
+
+impl HexplaneProgram {
+    /// Everything in one stage; the others are parts of it.
+    fn whole(self, plan: &Plan) -> Stage {
+        let r = &plan.recipe;
+        let mut stage = still::stage("hexplane", plan);
+        still::learn_life(&mut stage, plan, self.life(plan));
+        let Spec::Hexplane(spec) = self.spec(plan) else { unreachable!("this program is of one model") };
+        let grids = Rate { start: r.grid_lr_init, end: r.grid_lr_final };
+        for level in 0..spec.planes.multires.len() {
+            for plane in 0..6 {
+                stage.groups.push(Group::new(&PlaneShape::name(level, plane), grids));
+            }
+        }
+        let networks = Rate { start: r.deformation_lr_init, end: r.deformation_lr_final };
+        // The names follow from the spec; an empty layer is quickly made.
+        let mut empty = splat4d::scene::Params::<f32>::new(0, (r.sh_degree + 1) * (r.sh_degree + 1), &[]);
+        if let Ok(model) = Hexplane::new(spec.clone(), &mut empty) {
+            stage.groups.extend(model.network_columns().iter().map(|name| Group::new(name, networks)));
+        }
+        let weights = PlaneWeights {
+            smoothness: r.plane_tv_weight,
+            time_smoothness: r.time_smoothness_weight,
+            l1_time: r.l1_time_planes,
+            variation: r.plane_variation_weight,
+        };
+        if weights.any() {
+            stage.params.push(Box::new(SmoothPlanes::new(spec.planes, weights)));
+        }
+        stage
+    }
+}
+
+/// Steps `from..to` of the whole stage as a stage of its own: rates, densification and all else go on where they were.
+fn part(plan: &Plan, whole: Stage, from: usize, to: usize) -> Stage {
+    let r = &plan.recipe;
+    let share = |step: usize| step as f64 / r.iterations.max(1) as f64;
+    let mut stage = whole;
+    for group in &mut stage.groups {
+        group.rate = Rate { start: group.rate.at(share(from)), end: group.rate.at(share(to)) };
+    }
+    stage.iterations = to - from;
+    stage.half_size_steps = stage.half_size_steps.saturating_sub(from);
+    let (first, until, every) = stage.densify_steps;
+    stage.densify_steps = (first.saturating_sub(from).max(1), until.min(to).saturating_sub(from), every);
+    if until <= from {
+        stage.densify = Densify::None;
+    }
+    // A stage counts unlocked degrees from its own start; after the first one all are there.
+    if from > 0 {
+        stage.sh_interval = 0;
+    }
+    stage
+}
+
+/// A hook that changes the spec of every hexplane layer; tables stay as they are.
+fn respecify<F: Real>(change: impl Fn(&mut HexplaneSpec, &Table<F>) + Send + Sync + 'static) -> Hook<F> {
+    Box::new(move |scene: &mut Scene<F>, _| {
+        for layer in &mut scene.layers {
+            let model: &dyn Motion<F> = layer.motion.as_ref();
+            let Some(model) = (model as &dyn Any).downcast_ref::<Hexplane>() else { continue };
+            let Spec::Hexplane(mut spec) = Motion::<F>::spec(model) else { continue };
+            change(&mut spec, &layer.params[GEOMETRY]);
+            let model = model.respecified(spec).map_err(|e: Error| e.at("the cloud after the coarse stage"))?;
+            layer.motion = Arc::new(model);
+        }
+        Ok(())
+    })
+}
+
+/// The box of (nearly) all means, with a margin; `None` if there is none or it has no size.
+fn around<F: Real>(geometry: &Table<F>) -> Option<[[f64; 3]; 2]> {
+    let mut out = [[0.0; 3]; 2];
+    for axis in 0..3 {
+        let mut x: Vec<f64> =
+            (0..geometry.rows()).map(|row| geometry.get(row, axis).f64()).filter(|x| x.is_finite()).collect();
+        x.sort_by(f64::total_cmp);
+        let strays = (x.len() as f64 * OUTSIDE) as usize;
+        (out[0][axis], out[1][axis]) = (*x.get(strays)?, *x.get(x.len() - 1 - strays)?);
+    }
+    let [low, high] = out;
+    let longest = (0..3).map(|k| high[k] - low[k]).fold(0.0, f64::max);
+    if longest <= 0.0 {
+        return None;
+    }
+    for k in 0..3 {
+        let wider = MARGIN * longest + 0.5 * (FLATTEST * longest - (high[k] - low[k])).max(0.0);
+        out[0][k] -= wider;
+        out[1][k] += wider;
+    }
+    Some(out)
 }

@@ -223,6 +223,10 @@ pub trait Program: Send + Sync {
     fn life(&self, plan: &Plan) -> LifeKind {
         LifeKind::from_name(&plan.recipe.life).unwrap_or(LifeKind::Infinite)
     }
+    /// Whether one cloud stands for all moments: it then starts from the points of one, the middle of the clip.
+    fn is_canonical(&self) -> bool {
+        false
+    }
     /// Says before training, and not after an hour, that the model cannot work on a capture.
     fn check(&self, _plan: &Plan) -> Result<()> {
         Ok(())

@@ -318,6 +318,16 @@ impl Bench {
             true => init::one_moment(plan, self.frames.as_ref(), points)?,
             false => init::seeds(plan, self.frames.as_ref(), points, moving)?,
         };
+        let mut start = plan.clone();
+        let canonical = moving && program.is_canonical();
+        if canonical && start.recipe.init_keyframes == 0 {
+            start.recipe.init_keyframes = 1;
+        }
+        let mut seeds = init::seeds(&start, self.frames.as_ref(), points, moving)?;
+        if canonical {
+            // Whenever a point was seen, it is there all the time.
+            seeds.times.fill(None);
+        }
         init::scene(plan, program.as_ref(), &seeds, self.background(), self.capture.up)
     }
 

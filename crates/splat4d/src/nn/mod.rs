@@ -6,6 +6,7 @@
 pub mod encoding;
 pub mod frames;
 pub mod hashgrid;
+pub mod hexplane;
 pub mod matmul;
 pub mod mlp;
 pub mod sequence;

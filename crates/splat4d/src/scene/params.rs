@@ -368,6 +368,16 @@ impl<F: Real> Grads<F> {
         }
         assert_eq!(out.len(), keys.len(), "every key names a table of the layer");
         out
+    /// As [`of`](Self::of) for a number of keys that only the model's sizes tell. Panics: a key stands twice.
+    pub fn many(&mut self, keys: &[Key]) -> Vec<&mut Table<F>> {
+        let mut found: Vec<Option<&mut Table<F>>> = keys.iter().map(|_| None).collect();
+        for (i, table) in self.tables.iter_mut().enumerate() {
+            if let Some(k) = keys.iter().position(|k| k.0 as usize == i) {
+                self.touched[i] = true;
+                found[k] = Some(table);
+            }
+        }
+        found.into_iter().map(|table| table.expect("keys of one layer must be distinct")).collect()
     }
 
     /// One table, to read.

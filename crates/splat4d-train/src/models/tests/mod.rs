@@ -3,6 +3,7 @@
 
 mod edits;
 mod guests;
+mod hexplane;
 mod layers;
 mod lobes;
 mod nodes;
