@@ -17,6 +17,7 @@ use crate::densify::Densify;
 use crate::loss::terms::{Codec, ParamLoss, ProbeLoss};
 use crate::prune::Periodic;
 use crate::recipe::Recipe;
+pub use crate::train::loss::Segmentation;
 use crate::sampler::Sampler;
 use crate::{Error, Result};
 use splat4d::layers::Scene;
@@ -40,6 +41,10 @@ pub struct Plan {
     pub times: usize,
     /// Cameras that do not move.
     pub fixed_cameras: usize,
+    /// Distinct times, seconds, ascending, and how many fixed cameras have a training picture at each.
+    pub moments: Vec<(f64, usize)>,
+    /// Whether training pictures have masks.
+    pub masks: bool,
 }
 
 impl Plan {
@@ -143,6 +148,10 @@ pub struct Stage<F: Real = f32> {
     pub half_size_steps: usize,
     /// Lower bound of log life widths, by layer; learnt values are lifted to it.
     pub min_log_life: Option<f64>,
+    /// What masks are compared with, beside the pictures; none: nothing.
+    pub segmentation: Option<Segmentation>,
+    /// Whether the cameras' exposures stay as they are.
+    pub freeze_exposure: bool,
     /// What stands between the parameters and the pictures; none: nothing.
     pub codec: Option<Arc<dyn Codec<F>>>,
     /// Before the first step.
@@ -168,6 +177,8 @@ impl<F: Real> Stage<F> {
             sh_interval: 0,
             half_size_steps: 0,
             min_log_life: None,
+            segmentation: None,
+            freeze_exposure: false,
             codec: None,
             start: None,
             end: None,
@@ -182,6 +193,10 @@ pub trait Program: Send + Sync {
     /// The life its Gaussians have: the recipe's; for ever where it leaves the choice to the model.
     fn life(&self, plan: &Plan) -> LifeKind {
         LifeKind::from_name(&plan.recipe.life).unwrap_or(LifeKind::Infinite)
+    }
+    /// What initial points are of: the whole clip, or what of it is learnt first.
+    fn first(&self, plan: &Plan) -> Plan {
+        plan.clone()
     }
     /// Says before training, and not after an hour, that the model cannot work on a capture.
     fn check(&self, _plan: &Plan) -> Result<()> {

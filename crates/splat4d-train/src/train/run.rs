@@ -261,6 +261,9 @@ pub fn plan(capture: &Capture, recipe: &Recipe) -> Plan {
     times.sort_by(f64::total_cmp);
     times.dedup();
     let clip = [times[0], times[times.len() - 1]];
+    let fixed = |i: &usize| capture.cameras[capture.frames[*i].camera].fixed;
+    let views = |t: f64| capture.train.iter().filter(|i| capture.frames[**i].time.0 == t && fixed(i)).count();
+    let moments = times.iter().map(|&t| (t, views(t))).collect();
     let centers: Vec<[f64; 3]> = capture.train.iter().map(|&i| capture.frames[i].view.center()).collect();
     Plan {
         recipe: recipe.resolve(),
@@ -269,6 +272,8 @@ pub fn plan(capture: &Capture, recipe: &Recipe) -> Plan {
         fps: capture.fps,
         times: times.len(),
         fixed_cameras: capture.cameras.iter().filter(|c| c.fixed).count(),
+        moments,
+        masks: capture.background.is_some() || capture.train.iter().any(|&i| capture.frames[i].mask.is_some()),
     }
 }
 
@@ -304,7 +309,7 @@ impl Bench {
                 times: c.times.clone(),
             })
         };
-        let seeds = init::seeds(plan, self.frames.as_ref(), points, moving)?;
+        let seeds = init::seeds(&program.first(plan), self.frames.as_ref(), points, moving)?;
         init::scene(plan, program.as_ref(), &seeds, self.background(), self.capture.up)
     }
 

@@ -3,6 +3,7 @@
 mod check;
 
 use check::{model, starts_still};
+use splat4d::motion::tracked::TrackedSpec;
 use splat4d::motion::{SpacetimeSpec, Spec};
 use splat4d::scene::{LifeKind, Space};
 
@@ -29,6 +30,17 @@ fn spacetime() {
 // hexplane.
 
 // tracked.
+
+#[test]
+fn tracked() {
+    // One frame only; a frame on a moment that is asked, gaps, a late start and an early end.
+    for times in [vec![0.2], vec![0.0, 0.25, 0.5, 1.0], vec![0.3, 0.9, 1.1]] {
+        let spec = Spec::Tracked(TrackedSpec { times });
+        model(&spec, ROWS, LifeKind::Infinite, &[Space::Gaussians], &[]);
+        model(&spec, ROWS, LifeKind::GaussHalf, &[Space::Gaussians], &[]);
+        starts_still(&spec, ROWS);
+    }
+}
 
 // native4d.
 
