@@ -9,5 +9,6 @@ pub mod photometric;
 pub mod rigid;
 pub mod scene;
 pub mod terms;
+pub mod tracked;
 
 pub use photometric::{LossValue, Photometric};

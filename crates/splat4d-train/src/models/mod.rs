@@ -17,8 +17,8 @@ use crate::densify::Densify;
 use crate::loss::terms::{Codec, ParamLoss, ProbeLoss};
 use crate::prune::Periodic;
 use crate::recipe::Recipe;
-pub use crate::train::loss::Segmentation;
 use crate::sampler::Sampler;
+pub use crate::train::loss::Segmentation;
 use crate::{Error, Result};
 use splat4d::layers::Scene;
 use splat4d::math::Real;
@@ -113,7 +113,8 @@ impl Group {
     }
 }
 
-/// Hears how far something long is: what is done, how much of it, of how much (0 where not known).
+/// Hears how far something long is: what is done, how much of it, of how much (0 where not known). What begins with
+/// `warning: ` is one.
 pub type Tell<'a> = dyn FnMut(&str, usize, usize) + 'a;
 
 /// What a stage does to the scene at its start or end: add pages, replace the cloud, build a graph. A layer that it

@@ -79,7 +79,7 @@ impl<F: Real> Moments<F> {
 
     /// Bytes of all tables.
     pub fn bytes(&self) -> usize {
-        self.tables.iter().map(|t| std::mem::size_of_val(t.data())).sum()
+        self.tables.iter().map(|t| size_of_val(t.data())).sum()
     }
 
     /// Takes over the tables of `old` that have the same shape and stand at the same key; the rest stays new.

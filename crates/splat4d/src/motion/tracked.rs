@@ -27,6 +27,8 @@ pub const POSE: usize = 7;
 const PAGE: [(&str, usize); 2] = [("means", 3), ("quats", 4)];
 /// Name of the pages' tables.
 const PAGES: &str = "poses";
+/// Name of the table, and of its only column group, that says who is foreground: a logit.
+pub const FOREGROUND: &str = "foreground_logits";
 /// Most frames of a file that is believed: some nine hours at 30 a second.
 const MAX_FRAMES: usize = 1 << 20;
 /// Numbers of pages that are made and not loaded, at most: a gigabyte. A file whose specification asks for more has lost
@@ -39,6 +41,13 @@ const MAX_MADE: usize = 1 << 28;
 pub struct TrackedSpec {
     /// Seconds of every frame that has been tracked, strictly increasing. Frame 0 is the geometry, the others have pages.
     pub times: Vec<f64>,
+    /// Whether Gaussians have a [`FOREGROUND`] logit: what masks say of them. No picture depends on it.
+    pub foreground: bool,
+}
+
+/// The table whose first [`POSE`] columns are frame `frame`'s poses, if that frame has been tracked.
+pub fn page_of<F: Real>(p: &Params<F>, frame: usize) -> Option<Key> {
+    if frame == 0 { Some(GEOMETRY) } else { p.find(&page_name(PAGES, u32::try_from(frame).ok()?)) }
 }
 
 /// Makes the model, and in `p` the tables it needs (or claims the loaded ones).
@@ -77,7 +86,12 @@ impl Tracked {
         if loaded == 0 && p.len().saturating_mul(POSE).saturating_mul(times.len() - 1) > MAX_MADE {
             return Err(damaged(format!("the pages of {} tracked frames are missing", times.len())));
         }
-        let mut model = Self { spec: TrackedSpec { times: times[..1].to_vec() }, pages: vec![GEOMETRY] };
+        let first = TrackedSpec { times: times[..1].to_vec(), foreground: spec.foreground };
+        let mut model = Self { spec: first, pages: vec![GEOMETRY] };
+        if spec.foreground {
+            let rows = p.len();
+            p.entry(FOREGROUND, Space::Gaussians, &[(FOREGROUND, 1)], rows, |_| {})?;
+        }
         for &t in &times[1..] {
             model.push(p, t, |p, row| p[GEOMETRY].read::<POSE>(row, 0))?;
         }

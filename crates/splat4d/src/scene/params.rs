@@ -366,7 +366,7 @@ impl<F: Real> Grads<F> {
 
     /// Bytes of all tables.
     pub fn bytes(&self) -> usize {
-        self.tables.iter().map(|t| std::mem::size_of_val(t.data())).sum()
+        self.tables.iter().map(|t| size_of_val(t.data())).sum()
     }
 
     /// Whether anything was added to the table in this step.

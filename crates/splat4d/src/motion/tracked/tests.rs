@@ -10,7 +10,7 @@ fn start(rows: usize) -> (Params<f64>, Tracked) {
     for r in 0..rows {
         p[GEOMETRY].write::<11>(r, 0, std::array::from_fn(|c| rng.fork(r as u64).normal(c as u64)));
     }
-    let model = Tracked::new(&TrackedSpec { times: vec![0.0] }, &mut p).unwrap();
+    let model = Tracked::new(&TrackedSpec { times: vec![0.0], foreground: false }, &mut p).unwrap();
     (p, model)
 }
 
@@ -106,7 +106,8 @@ fn files_that_lost_pages_or_have_absurd_times_are_refused() {
     let with = |pages: &[u32], times: Vec<f64>| {
         let arrays = pages.iter().flat_map(|&k| page(k)).collect();
         let mut p = Params::<f32>::build(arrays, 2, 1, &[]).unwrap();
-        Tracked::new(&TrackedSpec { times }, &mut p).map(|m| (p[m.page(m.times().len() - 1)].get(1, 6), p))
+        Tracked::new(&TrackedSpec { times, foreground: false }, &mut p)
+            .map(|m| (p[m.page(m.times().len() - 1)].get(1, 6), p))
     };
     let (last, p) = with(&[1, 2], vec![0.0, 0.1, 0.2]).unwrap();
     assert!(last == 0.5 && p.unclaimed().is_empty() && p.info(Key(4)).page == Some(2), "pages are claimed");
@@ -116,5 +117,5 @@ fn files_that_lost_pages_or_have_absurd_times_are_refused() {
     }
     let mut p = Params::<f32>::new(100_000, 1, &[]);
     let times = (0..100_000).map(f64::from).collect();
-    assert!(Tracked::new(&TrackedSpec { times }, &mut p).is_err(), "280 GB are not made");
+    assert!(Tracked::new(&TrackedSpec { times, foreground: false }, &mut p).is_err(), "280 GB are not made");
 }
