@@ -8,6 +8,7 @@
 
 #[cfg(test)]
 mod tests;
+pub mod tracks;
 
 use crate::layers::{Instant, Scene};
 use crate::math::Real;

@@ -68,8 +68,8 @@ fn ball(rows: usize, standing: usize) -> Params<f32> {
         let size = if r < rows { 0.09f32 } else { 0.05 };
         p[GEOMETRY].write(r, LOG_SCALE, [size.ln(); 3]);
         p[GEOMETRY].set(r, OPACITY, 3.0);
-        let color = std::array::from_fn(|k| rng.uniform(10 + k as u64) as f32);
-        p[SH].write(r, 0, rgb_to_dc(color));
+        let color: [f32; 3] = std::array::from_fn(|k| rng.uniform(10 + k as u64) as f32);
+        p[SH].write(r, 0, color.map(rgb_to_dc));
     }
     p
 }
