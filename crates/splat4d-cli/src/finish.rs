@@ -12,8 +12,9 @@ use crate::video::{Film, have_ffmpeg};
 use serde_json::{Value, json};
 use splat4d::layers::Scene;
 use splat4d::{Error, Result};
-use splat4d_train::capture::ImageStore;
+use splat4d_train::capture::{Capture, ImageStore};
 use splat4d_train::eval::run::{EvalOptions, Evaluation, evaluate};
+use splat4d_train::eval::tracks::track_error;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
@@ -113,6 +114,7 @@ pub(crate) fn scores(
     let iteration = opened.iteration().unwrap_or(0);
     let evaluation = evaluate(scene, &capture, &store, iteration, &options, &mut |event| console.event(event))?;
     console.clear();
+    tracks(run, scene, &capture, console)?;
     if capture.held.is_empty() {
         console.warn(
             "no view was held out, so that quality on new views cannot be measured. Hold out a camera (--hold-out \
@@ -120,6 +122,25 @@ pub(crate) fn scores(
         );
     }
     Ok(evaluation)
+}
+
+/// Measures tracks in space where the capture comes with true ones.
+fn tracks(run: &Path, scene: &Scene<f32>, capture: &Capture, console: &Console) -> Result<()> {
+    let Some(e) = track_error(scene, capture)? else { return Ok(()) };
+    console.say(&format!(
+        "tracks of {} points in space: median error {:.4} units, {:.2} % of a character's height ({:.2} % of the \
+         moments followed; {:.4} units at the first frame)",
+        e.points,
+        e.median,
+        e.percent(),
+        100.0 * e.followed,
+        e.first
+    ));
+    let entry = json!({
+        "points": e.points, "median": e.median, "mean": e.mean, "first": e.first, "height": e.height,
+        "percent": e.percent(), "followed": e.followed,
+    });
+    amend(run, [("tracks".into(), entry)])
 }
 
 /// The report.

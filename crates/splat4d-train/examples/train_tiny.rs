@@ -102,6 +102,8 @@ fn main() -> Result<()> {
         fps: FPS,
         times: TIMES,
         fixed_cameras: CAMERAS,
+        moments: (0..TIMES).map(|k| (k as f64 / FPS, CAMERAS)).collect(),
+        masks: false,
     };
     let program = program(&plan.recipe.motion)?;
     let seeds = init::seeds(&plan, &made, None, true)?;

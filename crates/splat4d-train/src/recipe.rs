@@ -197,6 +197,39 @@ recipe! {
 
     // tracked.
 
+    /// tracked: share of the iterations that frame 0 gets; the other frames share the rest.
+    first_share: f64 = 0.25,
+    /// tracked: rate of a frame's positions at its first step, of the extent.
+    track_lr_init: f64 = 1e-3,
+    /// tracked: rate of a frame's positions at its last step, of the extent.
+    track_lr_final: f64 = 1.6e-4,
+    /// tracked: rate of a frame's quaternions.
+    track_rotation_lr: f64 = 2e-3,
+    /// tracked: rate of base colours after frame 0. Colours are shared: frames tracked before change with them.
+    track_feature_lr: f64 = 0.0,
+    /// tracked: longest step that a Gaussian carries on to the next frame, of the extent.
+    velocity_cap: f64 = 0.05,
+    /// tracked: neighbours that each Gaussian is tied to.
+    rigid_neighbours: usize = 20,
+    /// tracked: a neighbour at distance d counts exp(−β d²), β in 1/(scene units)²; 0: 1/median(d²).
+    rigid_beta: f64 = 0.0,
+    /// tracked: weight of neighbours keeping their offsets.
+    rigid: f64 = 4.0,
+    /// tracked: weight of neighbours turning alike.
+    rot: f64 = 4.0,
+    /// tracked: weight of neighbours keeping frame 0's distances.
+    iso: f64 = 2.0,
+    /// tracked: weight of the background staying (with masks).
+    bg: f64 = 20.0,
+    /// tracked: weight of masks against what Gaussians say of the foreground; 0: all is foreground.
+    seg: f64 = 3.0,
+    /// tracked: weight of colours staying as they were, where they learn.
+    soft_col_cons: f64 = 0.01,
+    /// tracked: weight of the foreground staying above the floor.
+    floor: f64 = 2.0,
+    /// tracked: height of the floor along the scene's up direction, scene units; empty: no floor.
+    floor_height: String = String::new(),
+
     // native4d, spacetime.
 
     // control.

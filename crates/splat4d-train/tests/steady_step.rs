@@ -89,8 +89,16 @@ fn trainer() -> Result<Trainer<'static>> {
     for knob in ["iterations=1000", "init=random", &points, "sh_degree=1", "half_size_until=0", "strategy=none"] {
         recipe.set(knob)?;
     }
-    let plan =
-        Plan { recipe: recipe.resolve(), extent: 3.3, clip: [0.0, 0.1], fps: 10.0, times: TIMES, fixed_cameras: 3 };
+    let plan = Plan {
+        recipe: recipe.resolve(),
+        extent: 3.3,
+        clip: [0.0, 0.1],
+        fps: 10.0,
+        times: TIMES,
+        fixed_cameras: 3,
+        moments: (0..TIMES).map(|k| (0.1 * k as f64, 3)).collect(),
+        masks: false,
+    };
     let program = program(&plan.recipe.motion)?;
     let seeds = init::seeds(&plan, &grey, None, true)?;
     let mut scene = init::scene(&plan, program.as_ref(), &seeds, [0.0; 3], [0.0, 1.0, 0.0])?;

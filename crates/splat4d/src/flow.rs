@@ -9,6 +9,7 @@
 pub mod lift;
 #[cfg(test)]
 mod tests;
+pub mod tracks;
 
 use crate::layers::{Instant, Scene};
 use crate::math::Real;

@@ -1,4 +1,5 @@
-//! `export`: moments of a scene as plain 3DGS .ply files, or the whole of it as one page with its player.
+//! `export`: moments of a scene as plain 3DGS .ply files, the whole of it as one page with its player, or where its
+//! Gaussians go as JSON or CSV.
 
 use crate::console::Console;
 use crate::files;
@@ -7,6 +8,8 @@ use crate::sequence;
 use crate::source::{Source, not_empty};
 use serde_json::json;
 use splat4d::layers::freeze;
+use splat4d::flow::tracks::{Tracks, every, nearest};
+use splat4d::layers::Scene;
 use splat4d::scene::Time;
 use splat4d::{Error, format};
 use splat4d_serve::{Page, SceneIn};
@@ -18,9 +21,12 @@ Examples:
   splat4d export runs/knight --sequence frames/            frames/frame_00000.ply ...; SuperSplat plays them
   splat4d export runs/knight --sequence frames/ --fps 10 --from 0.2 --to 0.8
   splat4d export runs/knight --html -o knight.html         player and scene in one page: send it, host it, open it
-  splat4d export runs/knight --html -o index.html --link knight.splat4d     for a web server: seeks, starts at once";
+  splat4d export runs/knight --html -o index.html --link knight.splat4d     for a web server: seeks, starts at once
+  splat4d export runs/knight --tracks tracks.csv           where every Gaussian is at every frame; .json too
+  splat4d export runs/knight --tracks tracks.json --every 50
+  splat4d export runs/knight --tracks hand.csv --near 0.3,1.2,-0.5 --count 20";
 
-/// Write moments of a scene as 3DGS .ply files, or all of it as a page
+/// Write moments of a scene as 3DGS .ply files, all of it as a page, or tracks of its Gaussians
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
@@ -28,7 +34,7 @@ pub(crate) struct Args {
     #[arg(value_name = "RUN|FILE", required_unless_present = "model")]
     source: Option<PathBuf>,
     /// The file of one moment, or the page
-    #[arg(short, long, value_name = "OUT", required_unless_present = "sequence")]
+    #[arg(short, long, value_name = "OUT", required_unless_present_any = ["sequence", "tracks"])]
     output: Option<PathBuf>,
     /// The moment, seconds of the scene [default: the clip's start]
     #[arg(long, value_name = "T", allow_negative_numbers = true, conflicts_with = "sequence")]
@@ -36,15 +42,36 @@ pub(crate) struct Args {
     /// A folder for one file a frame
     #[arg(long, value_name = "FOLDER", conflicts_with = "output")]
     sequence: Option<PathBuf>,
-    /// Files a second of a sequence [default: the capture's frames a second]
-    #[arg(long, value_name = "N", requires = "sequence")]
+    /// Files a second of a sequence, moments a second of tracks [default: the capture's frames a second]
+    #[arg(long, value_name = "N")]
     fps: Option<f64>,
-    /// First second of a sequence
-    #[arg(long, value_name = "S", requires = "sequence", allow_negative_numbers = true)]
+    /// First second of a sequence or of tracks
+    #[arg(long, value_name = "S", allow_negative_numbers = true)]
     from: Option<f64>,
-    /// Last second of a sequence
-    #[arg(long, value_name = "S", requires = "sequence", allow_negative_numbers = true)]
+    /// Last second of a sequence or of tracks
+    #[arg(long, value_name = "S", allow_negative_numbers = true)]
     to: Option<f64>,
+
+    /// Write positions of Gaussians over time (seconds, scene units) to this .csv or .json file
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["output", "sequence", "time", "html"])]
+    tracks: Option<PathBuf>,
+    /// Only every N-th Gaussian's track
+    #[arg(long, value_name = "N", requires = "tracks", conflicts_with = "near",
+          value_parser = clap::value_parser!(u32).range(1..))]
+    every: Option<u32>,
+    /// Only tracks of the Gaussians nearest to this point at the tracks' first moment
+    #[arg(
+        long,
+        value_name = "X,Y,Z",
+        requires = "tracks",
+        value_delimiter = ',',
+        num_args = 1,
+        allow_negative_numbers = true
+    )]
+    near: Vec<f64>,
+    /// How many those are [default: 1]
+    #[arg(long, value_name = "N", requires = "near", value_parser = clap::value_parser!(u32).range(1..))]
+    count: Option<u32>,
 
     /// Write one page with the player and the scene in it; it needs no network and no server
     #[arg(long, conflicts_with_all = ["time", "sequence"], requires = "output")]
@@ -66,6 +93,14 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
                 .into());
         }
     }
+    if args.sequence.is_none() && args.tracks.is_none() {
+        let given = [("--fps", args.fps), ("--from", args.from), ("--to", args.to)];
+        if let Some((name, _)) = given.iter().find(|(_, v)| v.is_some()) {
+            return Err(Error::input(format!("{name} is of a sequence or of tracks"))
+                .remedy("Add --sequence FOLDER or --tracks FILE, or choose one moment with --time.")
+                .into());
+        }
+    }
     if args.html {
         return page(path, args, console);
     }
@@ -79,6 +114,9 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         files::write(out, &bytes)?;
         Ok(params.len())
     };
+    if let Some(out) = &args.tracks {
+        return tracks(scene, args, out, console);
+    }
     if let Some(folder) = &args.sequence {
         let (fps, times) = sequence::moments(scene, args.fps, [args.from, args.to])?;
         let pattern = sequence::Pattern::in_folder(folder);
@@ -107,6 +145,53 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     }
     console.say(&format!("{} Gaussians at {time} s", files::grouped(n)));
     console.emit(&json!({"type": "exported", "gaussians": n, "time": time}));
+    console.written(out);
+    Ok(())
+}
+
+/// Numbers of a file of tracks, at most: three for a Gaussian and a moment. As text they are some gigabytes.
+const MOST_NUMBERS: usize = 300_000_000;
+/// Fainter Gaussians than this are not near anything.
+const LEAST_OPACITY: f64 = 0.1;
+
+/// Writes where Gaussians are over time.
+fn tracks(scene: &Scene<f32>, args: &Args, out: &Path, console: &Console) -> anyhow::Result<()> {
+    let json = match out.extension().map(|e| e.to_ascii_lowercase()) {
+        Some(e) if e == "json" => true,
+        Some(e) if e == "csv" => false,
+        _ => {
+            return Err(Error::input("tracks are written as .csv or .json")
+                .at(out.display())
+                .remedy("Use --tracks NAME.csv or --tracks NAME.json.")
+                .into());
+        }
+    };
+    let (_, times) = sequence::moments(scene, args.fps, [args.from, args.to])?;
+    let members = match args.near[..] {
+        [] => every(scene, args.every.unwrap_or(1) as usize),
+        [x, y, z] if [x, y, z].iter().all(|v| v.is_finite()) => {
+            let count = args.count.unwrap_or(1) as usize;
+            nearest(scene, Time(times[0]), &[[x, y, z]], count, LEAST_OPACITY).remove(0)
+        }
+        _ => {
+            return Err(Error::input("--near is not a point")
+                .remedy("Give three numbers in scene units, for instance --near 0.3,1.2,-0.5")
+                .into());
+        }
+    };
+    if members.len().saturating_mul(times.len()).saturating_mul(3) > MOST_NUMBERS {
+        return Err(Error::input(format!("{} tracks of {} moments are too many", members.len(), times.len()))
+            .remedy("Take fewer with --every N, --near X,Y,Z, --fps, --from or --to.")
+            .into());
+    }
+    if members.is_empty() {
+        console.warn(&format!("nothing is alive at {} s: the file holds no track", times[0]));
+    }
+    let followed = Tracks::follow(scene, &members, &times);
+    let text = if json { followed.to_json(scene) } else { followed.to_csv(scene) };
+    files::write(out, text.as_bytes())?;
+    console.say(&format!("{} tracks of {} moments", files::grouped(members.len()), times.len()));
+    console.emit(&json!({"type": "exported", "tracks": members.len(), "moments": times.len()}));
     console.written(out);
     Ok(())
 }

@@ -8,6 +8,7 @@ pub mod lpips;
 pub mod metrics;
 mod report;
 pub mod run;
+pub mod tracks;
 
 pub use lpips::{InputScaling, Lpips, Net};
 pub use report::{Report, Score, Split, View};

@@ -10,5 +10,6 @@ pub mod rigid;
 pub mod planes;
 pub mod scene;
 pub mod terms;
+pub mod tracked;
 
 pub use photometric::{LossValue, Photometric};

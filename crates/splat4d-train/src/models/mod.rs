@@ -21,6 +21,7 @@ use crate::optim::Moments;
 use crate::prune::Periodic;
 use crate::recipe::Recipe;
 use crate::sampler::Sampler;
+pub use crate::train::loss::Segmentation;
 use crate::{Error, Result};
 use splat4d::layers::Scene;
 use splat4d::math::{Real, Rng};
@@ -43,6 +44,10 @@ pub struct Plan {
     pub times: usize,
     /// Cameras that do not move.
     pub fixed_cameras: usize,
+    /// Distinct times, seconds, ascending, and how many fixed cameras have a training picture at each.
+    pub moments: Vec<(f64, usize)>,
+    /// Whether training pictures have masks.
+    pub masks: bool,
 }
 
 impl Plan {
@@ -113,7 +118,8 @@ impl Group {
     }
 }
 
-/// Hears how far something long is: what is done, how much of it, of how much (0 where not known).
+/// Hears how far something long is: what is done, how much of it, of how much (0 where not known). What begins with
+/// `warning: ` is one.
 pub type Tell<'a> = dyn FnMut(&str, usize, usize) + 'a;
 
 /// Annealed smoothing: one random shift of time a step, which keeps a network from learning the pose errors of single
@@ -180,6 +186,10 @@ pub struct Stage<F: Real = f32> {
     pub min_log_life: Option<f64>,
     /// Noise on the times of the step's views.
     pub time_noise: TimeNoise,
+    /// What masks are compared with, beside the pictures; none: nothing.
+    pub segmentation: Option<Segmentation>,
+    /// Whether the cameras' exposures stay as they are.
+    pub freeze_exposure: bool,
     /// What stands between the parameters and the pictures; none: nothing.
     pub codec: Option<Arc<dyn Codec<F>>>,
     /// Before the first step.
@@ -208,6 +218,8 @@ impl<F: Real> Stage<F> {
             half_size_steps: 0,
             min_log_life: None,
             time_noise: TimeNoise::default(),
+            segmentation: None,
+            freeze_exposure: false,
             codec: None,
             start: None,
             end: None,
@@ -226,6 +238,9 @@ pub trait Program: Send + Sync {
     /// Whether one cloud stands for all moments: it then starts from the points of one, the middle of the clip.
     fn is_canonical(&self) -> bool {
         false
+    /// What initial points are of: the whole clip, or what of it is learnt first.
+    fn first(&self, plan: &Plan) -> Plan {
+        plan.clone()
     }
     /// Says before training, and not after an hour, that the model cannot work on a capture.
     fn check(&self, _plan: &Plan) -> Result<()> {

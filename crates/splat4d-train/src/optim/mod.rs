@@ -11,9 +11,13 @@ use splat4d::scene::{Born, Grads, Key, Params, RowEdit, Space, Table};
 use splat4d::simd::{Simd, dispatch};
 
 /// First and second moments and step counts: for a table of width W one of width 2W + 1 and as many rows.
+///
+/// A page of one frame that has not learnt has none yet: its table has no rows before its first step.
 #[derive(Clone, Debug, Default)]
 pub struct Moments<F = f32> {
     tables: Vec<Table<F>>,
+    /// Rows of every table, those included that have none yet.
+    rows: Vec<usize>,
     /// By step count; made by the first step.
     corrections: Vec<[F; 2]>,
 }
@@ -42,25 +46,47 @@ impl<F: Real> Moments<F> {
         let table = |key: Key| {
             let columns = [("first", p[key].width()), ("second", p[key].width()), ("steps", 1)];
             let columns = columns.map(|(name, width)| Column { name: name.into(), width });
-            Table::with_columns(columns.to_vec(), p[key].rows())
+            Table::with_columns(columns.to_vec(), if p.info(key).page.is_some() { 0 } else { p[key].rows() })
         };
-        Self { tables: p.keys().map(table).collect(), corrections: Vec::new() }
+        let rows = p.keys().map(|k| p[k].rows()).collect();
+        Self { tables: p.keys().map(table).collect(), rows, corrections: Vec::new() }
     }
 
-    /// The moments of one table, [rows, 2W + 1].
+    /// The moments of one table, [rows, 2W + 1]; no rows for a page that has not learnt.
     pub fn table(&self, key: Key) -> &Table<F> {
         &self.tables[key.0 as usize]
     }
 
-    /// The same, to load a checkpoint or to reset.
+    /// The same with all its rows, to load a checkpoint or to reset.
     pub fn table_mut(&mut self, key: Key) -> &mut Table<F> {
-        &mut self.tables[key.0 as usize]
+        let (table, rows) = (&mut self.tables[key.0 as usize], self.rows[key.0 as usize]);
+        if table.rows() < rows {
+            table.resize(rows);
+        }
+        table
+    }
+
+    /// Forgets the moments of pages for which `learns` (of one of their column groups) does not hold: a frame that was
+    /// tracked does not learn again.
+    pub fn forget_pages(&mut self, p: &Params<F>, learns: impl Fn(&str) -> bool) {
+        for key in p.keys().filter(|&k| p.info(k).page.is_some()) {
+            let table = &mut self.tables[key.0 as usize];
+            if table.rows() > 0 && !p[key].columns().iter().any(|c| learns(&c.name)) {
+                *table = Table::with_columns(table.columns().to_vec(), 0);
+            }
+        }
+    }
+
+    /// Bytes of all tables.
+    pub fn bytes(&self) -> usize {
+        self.tables.iter().map(|t| size_of_val(t.data())).sum()
     }
 
     /// Takes over the tables of `old` that have the same shape and stand at the same key; the rest stays new.
     pub fn adopt(&mut self, old: Self) {
-        for (table, old) in self.tables.iter_mut().zip(old.tables) {
-            if (old.rows(), old.width()) == (table.rows(), table.width()) {
+        for ((table, &rows), old) in self.tables.iter_mut().zip(&self.rows).zip(old.tables) {
+            // A page without history has nothing to give, whatever its rows.
+            if (old.rows(), old.width()) == (rows, table.width()) {
                 *table = old;
             }
         }
@@ -70,6 +96,10 @@ impl<F: Real> Moments<F> {
     pub fn edit(&mut self, p: &Params<F>, edit: &RowEdit) {
         for key in p.keys().filter(|&k| p.info(k).space == edit.space) {
             let table = &mut self.tables[key.0 as usize];
+            self.rows[key.0 as usize] = edit.len();
+            if table.rows() == 0 {
+                continue;
+            }
             *table = table.gather(&edit.parent);
             for (row, born) in edit.born.iter().enumerate() {
                 if *born != Born::Kept {
@@ -111,6 +141,10 @@ impl<F: Real> Moments<F> {
                 active: (space != Space::Fixed).then_some(active),
                 corrections: &self.corrections,
             };
+            let rows = self.rows[key.0 as usize];
+            if self.tables[key.0 as usize].rows() < rows {
+                self.tables[key.0 as usize].resize(rows);
+            }
             let [table] = p.get_mut([key]);
             let views = [table.view_mut(), self.tables[key.0 as usize].view_mut(), gradient.view_mut()];
             let faults = halve(views, &|views| dispatch(simd, adam::Step { rule: &rule, views }));
@@ -213,6 +247,36 @@ mod tests {
         assert_eq!(m.table(LIFE).column_to_rows(0, 5), moments.column_to_rows(0, 5));
         assert!(expected.column_to_rows(1, 1).contains(&-0.01), "the floor was met");
         assert_eq!(d, Grads::new(&p));
+    }
+
+    #[test]
+    fn pages_cost_nothing_before_they_learn_and_after_they_are_forgotten() {
+        let (rows, frames) = (100, 5);
+        let mut p = Params::<f32>::new(rows, 1, &[]);
+        let mut m = Moments::new(&p);
+        let alone = (m.bytes(), Grads::new(&p).bytes());
+        let mut sizes = Vec::new();
+        for frame in 1..=frames {
+            let key = p.page("poses", frame, Space::Gaussians, &[("means", 3), ("quats", 4)], rows, |_| {}).unwrap();
+            let old = std::mem::replace(&mut m, Moments::new(&p));
+            m.adopt(old);
+            m.forget_pages(&p, |column| column == format!("means@{frame}"));
+            let mut d = Grads::new(&p);
+            assert_eq!(d.bytes(), alone.1);
+            for _ in 0..2 {
+                d.activate(Space::Gaussians, Rows::All);
+                d.of([key])[0].fill(1.0);
+                let mut rates = vec![None; key.0 as usize];
+                rates.push(Some(vec![0.1; 7]));
+                assert!(m.step(&mut p, &mut d, &rates, &[]).is_empty());
+                d.clear(&p);
+            }
+            assert_eq!(m.table(key).get(3, 14), 2.0, "steps are counted");
+            sizes.push((m.bytes(), d.bytes()));
+        }
+        assert!(sizes.iter().all(|&s| s == sizes[0]), "moments and gradients do not grow with frames: {sizes:?}");
+        m.forget_pages(&p, |_| false);
+        assert_eq!(m.bytes(), alone.0);
     }
 
     #[test]

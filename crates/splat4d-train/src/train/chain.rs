@@ -10,19 +10,27 @@ use splat4d::math::Real;
 use splat4d::motion::{At, Cache};
 use splat4d::render::{Image, ImageGrads, RenderConfig, RenderGrads, Renderer};
 use splat4d::scene::table::halve;
-use splat4d::scene::{Camera, Color, Grads, Planes, Rows, SH, Space, SplatGrads, Splats, Table, Time};
+use splat4d::scene::{Camera, Color, Grads, Key, Params, Planes, Rows, SH, Space, SplatGrads, Splats, Table, Time};
 use std::time::{Duration, Instant as Clock};
 
 /// Draws splats and takes gradients back; [`Renderer`] is the one in use, tests put the oracle here.
 pub trait Draw<F: Real>: Send {
-    /// Fills `out`.
-    fn render(&mut self, splats: &Splats<'_, F>, camera: &Camera, background: [F; 3], out: &mut Image<F>);
+    /// Fills `out`. `extra`: further channels, [all splats, C].
+    fn render(
+        &mut self,
+        splats: &Splats<'_, F>,
+        camera: &Camera,
+        background: [F; 3],
+        extra: Option<&Table<F>>,
+        out: &mut Image<F>,
+    );
     /// The VJP of the last `render`; see [`Renderer::backward`].
     fn backward(
         &mut self,
         splats: &Splats<'_, F>,
         camera: &Camera,
         background: [F; 3],
+        extra: Option<&Table<F>>,
         grads: &ImageGrads<'_, F>,
         d_sh: &mut [Option<&mut Table<F>>],
         d: &mut RenderGrads<F>,
@@ -34,8 +42,15 @@ pub trait Draw<F: Real>: Send {
 }
 
 impl<F: Real> Draw<F> for Renderer<F> {
-    fn render(&mut self, splats: &Splats<'_, F>, camera: &Camera, background: [F; 3], out: &mut Image<F>) {
-        Renderer::render(self, splats, camera, background, None, out);
+    fn render(
+        &mut self,
+        splats: &Splats<'_, F>,
+        camera: &Camera,
+        background: [F; 3],
+        extra: Option<&Table<F>>,
+        out: &mut Image<F>,
+    ) {
+        Renderer::render(self, splats, camera, background, extra, out);
     }
 
     fn backward(
@@ -43,11 +58,12 @@ impl<F: Real> Draw<F> for Renderer<F> {
         splats: &Splats<'_, F>,
         camera: &Camera,
         background: [F; 3],
+        extra: Option<&Table<F>>,
         grads: &ImageGrads<'_, F>,
         d_sh: &mut [Option<&mut Table<F>>],
         d: &mut RenderGrads<F>,
     ) {
-        Renderer::backward(self, splats, camera, background, None, grads, d_sh, d);
+        Renderer::backward(self, splats, camera, background, extra, grads, d_sh, d);
     }
 
     fn radii(&self) -> &[F] {
@@ -90,6 +106,15 @@ pub trait ImageLoss<F: Real> {
         d_color: &mut Planes<F>,
         d_alpha: &mut Planes<F>,
     ) -> (f64, bool);
+    /// A column group of one logit a Gaussian whose sigmoid is to be drawn as a further channel, where a layer has it
+    /// (elsewhere it is 0).
+    fn channel(&self) -> Option<&str> {
+        None
+    }
+    /// The loss of that channel as drawn, [1, h, w]; overwrites `d`, of like shape.
+    fn eval_channel(&mut self, _view: &View<'_, F>, _shown: &Planes<F>, _d: &mut Planes<F>) -> f64 {
+        0.0
+    }
 }
 
 /// Where a step's time went.
@@ -142,6 +167,7 @@ pub struct Chain<F: Real = f32> {
     image: Image<F>,
     d_color: Planes<F>,
     d_alpha: Planes<F>,
+    d_channel: Planes<F>,
     d_render: RenderGrads<F>,
     /// Number of `Motion::at` calls of the last step, for tests and reports.
     pub at_calls: usize,
@@ -156,6 +182,7 @@ impl<F: Real> Default for Chain<F> {
             image: Image::default(),
             d_color: Planes::default(),
             d_alpha: Planes::default(),
+            d_channel: Planes::default(),
             d_render: RenderGrads::default(),
             at_calls: 0,
         }
@@ -298,16 +325,30 @@ impl<F: Real> Chain<F> {
         let parts = asked.iter().enumerate().map(|(layer, &i)| scene.layers[layer].part(&self.asks[i].tape)).collect();
         let splats = Splats { parts };
         let clock = Clock::now();
-        draw.render(&splats, view.camera, view.background, &mut self.image);
+        let column = loss.channel().filter(|_| view.mask.is_some()).map(str::to_owned);
+        let keys: Vec<Option<(Key, usize)>> = match &column {
+            Some(column) => scene.layers.iter().map(|l| logit_of(&l.params, column)).collect(),
+            None => Vec::new(),
+        };
+        let channel = keys.iter().any(Option::is_some).then(|| self.channel(scene, &asked, &keys));
+        draw.render(&splats, view.camera, view.background, channel.as_ref(), &mut self.image);
         report.timings.render += clock.elapsed();
         let clock = Clock::now();
         let (value, alpha) = loss.eval(view, &self.image, &mut self.d_color, &mut self.d_alpha);
+        let value = match &channel {
+            Some(_) => value + loss.eval_channel(view, &self.image.extra, &mut self.d_channel),
+            None => value,
+        };
         report.loss += value;
         report.view_losses.push(value);
         report.timings.loss += clock.elapsed();
         let clock = Clock::now();
-        let grads =
-            ImageGrads { color: &self.d_color, alpha: alpha.then_some(&self.d_alpha), depth: None, extra: None };
+        let grads = ImageGrads {
+            color: &self.d_color,
+            alpha: alpha.then_some(&self.d_alpha),
+            depth: None,
+            extra: channel.as_ref().map(|_| &self.d_channel),
+        };
         let mut d_sh: Vec<Option<&mut Table<F>>> = d
             .iter_mut()
             .zip(&splats.parts)
@@ -319,7 +360,8 @@ impl<F: Real> Chain<F> {
                 _ => None,
             })
             .collect();
-        draw.backward(&splats, view.camera, view.background, &grads, &mut d_sh, &mut self.d_render);
+        let extra = channel.as_ref();
+        draw.backward(&splats, view.camera, view.background, extra, &grads, &mut d_sh, &mut self.d_render);
         report.d_cameras.push(self.d_render.camera);
         let mut first = 0;
         for (layer, &i) in asked.iter().enumerate() {
@@ -333,6 +375,21 @@ impl<F: Real> Chain<F> {
             first += count;
         }
         drop(splats);
+        if let (Some(channel), Some(d_channel)) = (&channel, &self.d_render.extra) {
+            let mut first = 0;
+            for ((&i, key), d) in asked.iter().zip(&keys).zip(d.iter_mut()) {
+                let rows = self.asks[i].tape.rows();
+                let count = self.asks[i].tape.out().rows();
+                if let Some((key, col)) = *key {
+                    let [d] = d.of([key]);
+                    for j in 0..count {
+                        let s = channel.get(first + j, 0);
+                        *d.get_mut(rows.id(j), col) += d_channel.get(first + j, 0) * s * (F::ONE - s);
+                    }
+                }
+                first += count;
+            }
+        }
         for (&i, part) in asked.iter().zip(&mut self.d_render.parts) {
             let ask = &mut self.asks[i];
             if ask.begun {
@@ -348,6 +405,21 @@ impl<F: Real> Chain<F> {
             }
         }
         report.timings.render_backward += clock.elapsed();
+    }
+
+    /// The sigmoid of a logit of every splat, [all splats, 1]; 0 where the layer has none.
+    fn channel(&self, scene: &Scene<F>, asked: &[usize], keys: &[Option<(Key, usize)>]) -> Table<F> {
+        let count = asked.iter().map(|&i| self.asks[i].tape.out().rows()).sum();
+        let mut out = Table::new(&[("channel", 1)], count);
+        let mut first = 0;
+        for ((&i, key), layer) in asked.iter().zip(keys).zip(&scene.layers) {
+            let (rows, count) = (self.asks[i].tape.rows(), self.asks[i].tape.out().rows());
+            if let Some((key, col)) = *key {
+                (0..count).for_each(|j| out.set(first + j, 0, layer.params[key].get(rows.id(j), col).sigmoid()));
+            }
+            first += count;
+        }
+        out
     }
 
     /// Shows a loss the rows it asked for and scatters its gradient back.
@@ -405,6 +477,11 @@ impl<F: Real> Ask<F> {
             d_time: 0.0,
         }
     }
+}
+
+/// The table and column of a layer's logit of that name.
+fn logit_of<F: Real>(params: &Params<F>, column: &str) -> Option<(Key, usize)> {
+    params.keys().find_map(|k| params[k].column(column).map(|(first, _)| (k, first)))
 }
 
 fn questions<'a, F: Real>(asks: &'a [Ask<F>], scene: &'a Scene<F>, layer: usize) -> Vec<At<'a, F>> {

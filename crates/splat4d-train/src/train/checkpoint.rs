@@ -43,7 +43,8 @@ pub fn write(trainer: &Trainer<'_>, identity: &Identity, state: &RunState) -> Re
     let mut arrays: Vec<(String, Vec<usize>, Vec<f32>)> =
         scene::arrays(&trainer.scene).into_iter().map(|a| (a.name, a.shape, a.data)).collect();
     let mut push = |name: String, table: &Table<f32>| {
-        if table.width() > 0 {
+        // Moments of a page that does not learn have no rows, and are not in the file.
+        if table.width() > 0 && (table.rows() > 0 || trainer.scene.is_empty()) {
             arrays.push((name, vec![table.rows(), table.width()], table.column_to_rows(0, table.width())));
         }
     };
@@ -110,7 +111,10 @@ pub fn read(bytes: &[u8], trainer: &mut Trainer<'_>, identity: &Identity) -> Res
     for (l, layer) in scene.layers.iter().enumerate() {
         let mut m = Moments::new(&layer.params);
         for key in layer.params.keys().collect::<Vec<Key>>() {
-            load(&file, &format!("moments.{l}.{}", key.0), m.table_mut(key))?;
+            let name = format!("moments.{l}.{}", key.0);
+            if layer.params.info(key).page.is_none() || file.get(&name).is_some() {
+                load(&file, &name, m.table_mut(key))?;
+            }
         }
         moments.push(m);
         load(&file, &format!("stats.{l}"), &mut stats.tables[l])?;

@@ -35,6 +35,11 @@ impl Exposure {
         self.key
     }
 
+    /// Forgets what the last views gave.
+    pub fn rest(&mut self) {
+        self.grads.clear(&self.params);
+    }
+
     /// One Adam step with what the last views gave. Returns whether all was finite.
     pub fn step(&mut self, rate: f64) -> bool {
         let mut rates = vec![None; self.key.0 as usize];
@@ -51,13 +56,27 @@ impl Exposure {
     }
 }
 
+/// A column of Gaussians that is drawn as masks show the foreground: its sigmoid, blended, against the mask with the same
+/// functional as colours (Luiten et al. 2024, "seg").
+#[derive(Clone, Debug, PartialEq)]
+pub struct Segmentation {
+    /// The column group, of one logit.
+    pub column: String,
+    /// Its weight beside the colours'.
+    pub weight: f64,
+}
+
 /// See the module's documentation.
 pub struct TrainLoss {
     photometric: Photometric,
+    /// Has scratch of its own, for one plane.
+    masks: Photometric,
     lambda_mask: f32,
     /// Where cameras learn an exposure.
     pub exposure: Option<Exposure>,
     exposed: Planes<f32>,
+    /// Where masks are compared with what Gaussians say of the foreground.
+    pub segmentation: Option<Segmentation>,
     /// L1 of the last view.
     pub l1: f64,
     /// SSIM of the last view.
@@ -71,9 +90,11 @@ impl TrainLoss {
     pub fn new(lambda_dssim: f64, lambda_mask: f64, exposure: Option<Exposure>) -> Self {
         Self {
             photometric: Photometric::new(lambda_dssim as f32),
+            masks: Photometric::new(lambda_dssim as f32),
             lambda_mask: lambda_mask as f32,
             exposure,
             exposed: Planes::default(),
+            segmentation: None,
             l1: 0.0,
             ssim: 0.0,
             mse: 0.0,
@@ -135,5 +156,17 @@ impl ImageLoss<f32> for TrainLoss {
             total += sum * f64::from(scale);
         }
         (total, alpha)
+    }
+
+    fn channel(&self) -> Option<&str> {
+        self.segmentation.as_ref().map(|s| s.column.as_str())
+    }
+
+    fn eval_channel(&mut self, view: &View<'_, f32>, shown: &Planes<f32>, d: &mut Planes<f32>) -> f64 {
+        let (Some(segmentation), Some(mask)) = (&self.segmentation, view.mask) else { return 0.0 };
+        let value = self.masks.loss_and_grad(shown, mask, view.weight, d);
+        let weight = segmentation.weight as f32;
+        d.data.iter_mut().for_each(|x| *x *= weight);
+        value.total * segmentation.weight
     }
 }

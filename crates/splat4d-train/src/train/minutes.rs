@@ -2,7 +2,9 @@
 //! iterations follow from the densification's own schedule, and are saved in the recipe, so that the run repeats.
 
 use super::run::Bench;
+use crate::densify::Densify;
 use crate::event::Event;
+use crate::models::{Stage, program};
 use crate::recipe::Recipe;
 use crate::{Error, ErrorKind, Result};
 use std::time::Instant as Clock;
@@ -54,14 +56,20 @@ pub(super) fn plan(bench: &Bench, recipe: &Recipe, minutes: f64, listen: &mut dy
     trainer.stages.iter_mut().for_each(|s| s.densify_steps = (0, 0, 0));
     let end = trainer.scene.len();
     let last = [time(&mut trainer, true)?, time(&mut trainer, false)?];
+    // Later stages are timed by the first of them, on the cloud at the cap.
+    let later = if trainer.stages.len() > 1 { later(&mut trainer)? } else { 0.0 };
     tell(listen, 2);
     let seconds = minutes * 60.0;
-    let cost =
-        |iterations: usize| schedule_cost(&Recipe { iterations, ..reset(recipe) }.resolve(), [start, end], first, last);
+    let cost = |iterations: usize| -> Result<f64> {
+        let r = Recipe { iterations, ..reset(recipe) }.resolve();
+        let stages = program(&r.motion)?.stages(&bench.plan(&r));
+        let rest: usize = stages[1..].iter().map(|s| s.iterations).sum();
+        Ok(schedule_cost(&stages[0], &r, [start, end], first, last) + later * rest as f64)
+    };
     let (mut low, mut high) = (*ITERATIONS.start(), *ITERATIONS.end());
     while low + 1 < high {
         let middle = low.midpoint(high);
-        if cost(middle) <= seconds { low = middle } else { high = middle }
+        if cost(middle)? <= seconds { low = middle } else { high = middle }
     }
     Ok(Recipe { iterations: low, ..reset(recipe) })
 }
@@ -93,6 +101,19 @@ fn time(trainer: &mut super::trainer::Trainer<'_>, half: bool) -> Result<f64> {
     Ok(clock.elapsed().as_secs_f64() / TIMED as f64)
 }
 
+/// Seconds a step of the second stage: what is left of the first is skipped.
+fn later(trainer: &mut super::trainer::Trainer<'_>) -> Result<f64> {
+    let now = trainer.progress.stage;
+    let Some(stage) = trainer.stages.get_mut(now) else { return Ok(0.0) };
+    if now == 0 {
+        stage.iterations = trainer.progress.stage_step + 1;
+        step(trainer)?;
+    }
+    let Some(stage) = trainer.stages.get_mut(trainer.progress.stage) else { return Ok(0.0) };
+    stage.iterations = stage.iterations.max(trainer.progress.stage_step + WARM_UP + TIMED + 1);
+    time(trainer, false)
+}
+
 fn step(trainer: &mut super::trainer::Trainer<'_>) -> Result<()> {
     match trainer.step()? {
         Ok(_) => Ok(()),
@@ -101,20 +122,20 @@ fn step(trainer: &mut super::trainer::Trainer<'_>) -> Result<()> {
     }
 }
 
-/// Seconds of a whole run: the cost of a step is linear in the number of Gaussians, which grows by the schedule. `first`
-/// and `last`: seconds a step [half size, full size] at the two numbers of Gaussians.
-fn schedule_cost(r: &Recipe, gaussians: [usize; 2], first: [f64; 2], last: [f64; 2]) -> f64 {
+/// Seconds of a stage that grows: the cost of a step is linear in the number of Gaussians, which grows by the schedule.
+/// `first` and `last`: seconds a step [half size, full size] at the two numbers of Gaussians.
+fn schedule_cost(stage: &Stage, r: &Recipe, gaussians: [usize; 2], first: [f64; 2], last: [f64; 2]) -> f64 {
     let [start, end] = gaussians.map(|n| n as f64);
-    let half_until = (r.half_size_until * r.iterations as f64) as usize;
+    let (from, until, every) = stage.densify_steps;
     let mut count = start;
     let mut total = 0.0;
-    for i in 0..r.iterations {
-        let size = usize::from(i >= half_until);
+    for i in 0..stage.iterations {
+        let size = usize::from(i >= stage.half_size_steps);
         let slope = if end > start { (last[size] - first[size]) / (end - start) } else { 0.0 };
         total += first[size] + slope * (count - start);
         let step = i + 1;
-        let densifies = r.strategy != "none" && step >= r.densify_from_iter && step <= r.densify_until_iter;
-        if densifies && step.is_multiple_of(r.densification_interval) {
+        let densifies = stage.densify != Densify::None && step >= from && step <= until;
+        if densifies && every > 0 && step.is_multiple_of(every) {
             // ADC reaches the cap within a few densifications; MCMC grows by its factor.
             count = (count * if r.strategy == "adc" { ADC_GROWTH } else { r.growth }).min(r.max_cap as f64);
         }
@@ -128,15 +149,18 @@ const ADC_GROWTH: f64 = 1.2;
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::models::densify_of;
 
     #[test]
     fn the_cost_follows_the_growth_and_the_size() {
         let r = Recipe { iterations: 1000, half_size_until: 0.0, max_cap: 2000, ..Recipe::default() }.resolve();
-        let flat = schedule_cost(&r, [1000, 1000], [0.01; 2], [0.01; 2]);
+        let (densify, densify_steps) = densify_of(&r);
+        let mut stage = Stage { densify, densify_steps, ..Stage::new("all", 1000) };
+        let flat = schedule_cost(&stage, &r, [1000, 1000], [0.01; 2], [0.01; 2]);
         assert!((flat - 10.0).abs() < 1e-9);
-        let grown = schedule_cost(&r, [1000, 2000], [0.01; 2], [0.02; 2]);
+        let grown = schedule_cost(&stage, &r, [1000, 2000], [0.01; 2], [0.02; 2]);
         assert!(grown > 12.0 && grown < 20.0, "{grown}");
-        let r = Recipe { half_size_until: 0.5, ..r };
-        assert!((schedule_cost(&r, [1000, 1000], [0.0, 0.01], [0.0, 0.01]) - 5.0).abs() < 1e-9);
+        stage.half_size_steps = 500;
+        assert!((schedule_cost(&stage, &r, [1000, 1000], [0.0, 0.01], [0.0, 0.01]) - 5.0).abs() < 1e-9);
     }
 }

@@ -65,6 +65,8 @@ const PROGRESS_SECONDS: f64 = 0.25;
 const BYTES_PER_NUMBER: u64 = 16;
 /// Bytes a Gaussian takes in the renderer: records, gradient records, projections (measured: about 1.2 kB).
 const RENDER_BYTES: u64 = 1200;
+/// Bytes a Gaussian's pose takes, a frame.
+const PAGE_BYTES: u64 = 28;
 /// Bytes a pixel takes in training: pictures, gradients and the loss's scratch, all f32.
 const PIXEL_BYTES: u64 = 200;
 
@@ -263,6 +265,9 @@ pub fn plan(capture: &Capture, recipe: &Recipe) -> Plan {
     times.sort_by(f64::total_cmp);
     times.dedup();
     let clip = [times[0], times[times.len() - 1]];
+    let fixed = |i: &usize| capture.cameras[capture.frames[*i].camera].fixed;
+    let views = |t: f64| capture.train.iter().filter(|i| capture.frames[**i].time.0 == t && fixed(i)).count();
+    let moments = times.iter().map(|&t| (t, views(t))).collect();
     let centers: Vec<[f64; 3]> = capture.train.iter().map(|&i| capture.frames[i].view.center()).collect();
     Plan {
         recipe: recipe.resolve(),
@@ -271,6 +276,8 @@ pub fn plan(capture: &Capture, recipe: &Recipe) -> Plan {
         fps: capture.fps,
         times: times.len(),
         fixed_cameras: capture.cameras.iter().filter(|c| c.fixed).count(),
+        moments,
+        masks: capture.background.is_some() || capture.train.iter().any(|&i| capture.frames[i].mask.is_some()),
     }
 }
 
@@ -328,6 +335,7 @@ impl Bench {
             // Whenever a point was seen, it is there all the time.
             seeds.times.fill(None);
         }
+        let seeds = init::seeds(&program.first(plan), self.frames.as_ref(), points, moving)?;
         init::scene(plan, program.as_ref(), &seeds, self.background(), self.capture.up)
     }
 
@@ -406,11 +414,19 @@ pub fn memory_estimate(capture: &Capture, recipe: &Recipe) -> u64 {
         3 * recipe.motion_order as u64 + 2 + 4 * u64::from(recipe.rotation_rate)
     };
     let gaussians = recipe.max_cap as u64 * ((11 + sh + motion) * BYTES_PER_NUMBER + RENDER_BYTES);
+    // The result itself: a pose a Gaussian and frame.
+    let pages = if recipe.motion == "tracked" {
+        let last = capture.train.iter().map(|&i| capture.frames[i].index as u64 + 1).max().unwrap_or(0);
+        let first = capture.train.iter().map(|&i| capture.frames[i].index as u64).min().unwrap_or(0);
+        recipe.max_cap as u64 * PAGE_BYTES * (last - first)
+    } else {
+        0
+    };
     let frame =
         capture.train.iter().map(|&i| (capture.frames[i].view.width * capture.frames[i].view.height) as u64).max();
     let pixels = frame.unwrap_or(0);
     let images = (pixels * 4 * capture.train.len() as u64).min(recipe.image_memory);
-    images + gaussians + pixels * PIXEL_BYTES * recipe.batch_size as u64
+    images + gaussians + pages + pixels * PIXEL_BYTES * recipe.batch_size as u64
 }
 
 /// Peak resident memory of this process, bytes; 0 where the system does not tell.
@@ -597,7 +613,12 @@ impl Session<'_> {
         let mut steps = Steps::default();
         while !trainer.is_done() && !self.stop.load(Ordering::Relaxed) {
             let from = (trainer.progress.stage, trainer.progress.iteration);
-            trainer.enter(&mut |name, done, total| listen(&Event::Phase { name: name.to_owned(), done, total }))?;
+            trainer.enter(&mut |name, done, total| {
+                listen(&match name.strip_prefix("warning: ") {
+                    Some(message) => Event::Warning { message: message.to_owned() },
+                    None => Event::Phase { name: name.to_owned(), done, total },
+                });
+            })?;
             state.seconds += clock.elapsed().as_secs_f64();
             clock = Clock::now();
             if trainer.is_done() {

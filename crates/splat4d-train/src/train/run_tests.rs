@@ -149,8 +149,15 @@ fn meddled(meddle: impl FnMut(usize, &mut Image<f32>) + Send + 'static) -> Box<d
 }
 
 impl<F: FnMut(usize, &mut Image<f32>) + Send> Draw<f32> for Meddled<F> {
-    fn render(&mut self, splats: &Splats<'_, f32>, camera: &Camera, background: [f32; 3], out: &mut Image<f32>) {
-        self.inner.render(splats, camera, background, None, out);
+    fn render(
+        &mut self,
+        splats: &Splats<'_, f32>,
+        camera: &Camera,
+        background: [f32; 3],
+        extra: Option<&Table<f32>>,
+        out: &mut Image<f32>,
+    ) {
+        self.inner.render(splats, camera, background, extra, out);
         self.drawn += 1;
         (self.meddle)(self.drawn, out);
     }
@@ -160,11 +167,12 @@ impl<F: FnMut(usize, &mut Image<f32>) + Send> Draw<f32> for Meddled<F> {
         splats: &Splats<'_, f32>,
         camera: &Camera,
         background: [f32; 3],
+        extra: Option<&Table<f32>>,
         grads: &ImageGrads<'_, f32>,
         d_sh: &mut [Option<&mut Table<f32>>],
         d: &mut RenderGrads<f32>,
     ) {
-        self.inner.backward(splats, camera, background, None, grads, d_sh, d);
+        self.inner.backward(splats, camera, background, extra, grads, d_sh, d);
     }
 
     fn radii(&self) -> &[f32] {
@@ -184,6 +192,7 @@ fn recipes() -> Vec<Recipe> {
         recipe(&["strategy=adc", "densify_grad_threshold=1e-5", "opacity_reset_interval=8", "batch_size=2"]),
         recipe(&["motion_order=2", "rotation_rate=true", "life=interval", "lambda_velocity=0.1", "strategy=none"]),
         recipe(&["motion=still", "sh_degree=2", "sh_degree_interval=7"]),
+        recipe(&["motion=tracked", "track_feature_lr=0.002", "exposure=true", "exposure_lr=0.01"]),
     ]
 }
 

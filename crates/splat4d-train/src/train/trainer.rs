@@ -14,6 +14,7 @@ use splat4d::layers::Scene;
 use splat4d::math::Rng;
 use splat4d::scene::life::LOG_WIDTH;
 use splat4d::scene::{Camera, GEOMETRY, Grads, LIFE, SH, Space, Time};
+use splat4d::scene::{Camera, GEOMETRY, Grads, LIFE, Planes, SH, Space};
 use std::borrow::Cow;
 use std::sync::Arc;
 use std::time::{Duration, Instant as Clock};
@@ -188,10 +189,12 @@ impl<'a> Trainer<'a> {
         self.stale = true;
         self.moments.resize_with(self.scene.layers.len(), Moments::default);
         self.moments.truncate(self.scene.layers.len());
-        for (layer, moments) in self.scene.layers.iter().zip(&mut self.moments) {
+        let groups = self.stages.get(self.progress.stage).map_or(&[][..], |s| &s.groups);
+        for (index, (layer, moments)) in self.scene.layers.iter().zip(&mut self.moments).enumerate() {
             let fresh = Moments::new(&layer.params);
             let old = std::mem::replace(moments, fresh);
             moments.adopt(old);
+            moments.forget_pages(&layer.params, |c| groups.iter().any(|g| g.is_of(index) && g.column == c));
         }
         self.fit_grads();
         self.stats.clear(&self.scene);
@@ -349,6 +352,7 @@ impl<'a> Trainer<'a> {
             codec.show(&self.scene, &info.times, &mut self.shown);
         }
         out.other += clock.elapsed();
+        self.loss.segmentation = stage.segmentation.clone();
         let scene = if stage.codec.is_some() { &self.shown } else { &self.scene };
         let mut mse = Mse { inner: &mut self.loss, sum: 0.0 };
         let mut losses = Losses { image: &mut mse, probes: &stage.probes, params: &stage.params };
@@ -393,7 +397,12 @@ impl<'a> Trainer<'a> {
             bad.extend(keys.into_iter().map(|k| (index, k)));
         }
         if let Some(exposure) = &mut self.loss.exposure {
-            let _ = exposure.step(self.settings.exposure_lr * self.progress.rate_scale);
+            match stage.freeze_exposure {
+                true => exposure.rest(),
+                false => {
+                    let _ = exposure.step(self.settings.exposure_lr * self.progress.rate_scale);
+                }
+            }
         }
         bad
     }
@@ -541,11 +550,19 @@ impl super::chain::ImageLoss<f32> for Mse<'_> {
         &mut self,
         view: &View<'_, f32>,
         image: &splat4d::render::Image<f32>,
-        d_color: &mut splat4d::scene::Planes<f32>,
-        d_alpha: &mut splat4d::scene::Planes<f32>,
+        d_color: &mut Planes<f32>,
+        d_alpha: &mut Planes<f32>,
     ) -> (f64, bool) {
         let out = self.inner.eval(view, image, d_color, d_alpha);
         self.sum += self.inner.mse;
         out
+    }
+
+    fn channel(&self) -> Option<&str> {
+        self.inner.channel()
+    }
+
+    fn eval_channel(&mut self, view: &View<'_, f32>, shown: &Planes<f32>, d: &mut Planes<f32>) -> f64 {
+        self.inner.eval_channel(view, shown, d)
     }
 }

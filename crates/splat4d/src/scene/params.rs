@@ -328,9 +328,14 @@ impl<F> std::ops::IndexMut<Key> for Params<F> {
 }
 
 /// Gradients to a [`Params`]. Only touched tables and active rows are ever cleared or stepped.
+///
+/// Pages of frames that nothing reaches cost nothing: their tables have no rows until something is added to them, so that
+/// memory does not grow with the frames that were tracked before.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Grads<F = f32> {
     tables: Vec<Table<F>>,
+    /// Rows of every table, those included that have none yet.
+    rows: Vec<usize>,
     touched: Vec<bool>,
     gaussians: Vec<bool>,
     nodes: Vec<bool>,
@@ -339,8 +344,13 @@ pub struct Grads<F = f32> {
 impl<F: Real> Grads<F> {
     /// Zeros in the shape of `p`, nothing touched.
     pub fn new(p: &Params<F>) -> Self {
+        let table = |(table, info): (&Table<F>, &ParamInfo)| match info.page {
+            Some(_) => Table::with_columns(table.columns().to_vec(), 0),
+            None => table.zeros_like(),
+        };
         Self {
-            tables: p.tables.iter().map(Table::zeros_like).collect(),
+            tables: p.tables.iter().zip(&p.infos).map(table).collect(),
+            rows: p.tables.iter().map(Table::rows).collect(),
             touched: vec![false; p.tables.len()],
             gaussians: vec![false; p.rows_of(Space::Gaussians)],
             nodes: vec![false; p.rows_of(Space::Nodes)],
@@ -349,8 +359,11 @@ impl<F: Real> Grads<F> {
 
     /// Several tables to add to at once; marks them touched. Panics: a key stands twice.
     pub fn of<const N: usize>(&mut self, keys: [Key; N]) -> [&mut Table<F>; N] {
-        for k in keys {
-            self.touched[k.0 as usize] = true;
+        for k in keys.map(|k| k.0 as usize) {
+            self.touched[k] = true;
+            if self.tables[k].rows() < self.rows[k] {
+                self.tables[k].resize(self.rows[k]);
+            }
         }
         self.tables.get_disjoint_mut(keys.map(|k| k.0 as usize)).expect("keys of one layer must be distinct")
     }
@@ -381,8 +394,14 @@ impl<F: Real> Grads<F> {
     }
 
     /// One table, to read.
+    /// One table, to read; a page that nothing was ever added to has no rows.
     pub fn table(&self, key: Key) -> &Table<F> {
         &self.tables[key.0 as usize]
+    }
+
+    /// Bytes of all tables.
+    pub fn bytes(&self) -> usize {
+        self.tables.iter().map(|t| size_of_val(t.data())).sum()
     }
 
     /// Whether anything was added to the table in this step.

@@ -6,6 +6,7 @@ use check::{model, starts_still};
 use splat4d::motion::control::{ControlSpec, Curve, TrajectorySpec};
 use splat4d::motion::skin::SkinSpec;
 use splat4d::motion::deform::{DeformSpec, Input};
+use splat4d::motion::tracked::TrackedSpec;
 use splat4d::motion::{SpacetimeSpec, Spec};
 use splat4d::nn::HashShape;
 use splat4d::motion::hexplane::{Heads, HexplaneSpec};
@@ -76,6 +77,17 @@ fn hexplane() {
 }
 
 // tracked.
+
+#[test]
+fn tracked() {
+    // One frame only; a frame on a moment that is asked, gaps, a late start and an early end.
+    for times in [vec![0.2], vec![0.0, 0.25, 0.5, 1.0], vec![0.3, 0.9, 1.1]] {
+        let spec = Spec::Tracked(TrackedSpec { times, foreground: false });
+        model(&spec, ROWS, LifeKind::Infinite, &[Space::Gaussians], &[]);
+        model(&spec, ROWS, LifeKind::GaussHalf, &[Space::Gaussians], &[]);
+        starts_still(&spec, ROWS);
+    }
+}
 
 // native4d.
 

@@ -129,6 +129,8 @@ fn stage(scene: &Scene<f32>, extent: f64) -> Result<Stage> {
         fps: scene.fps.max(1.0),
         times: 8,
         fixed_cameras: 8,
+        moments: vec![(scene.clip[0], 8)],
+        masks: false,
     };
     let mut stages = program(motion)?.stages(&plan);
     let mut stage = stages.swap_remove(0);

@@ -58,8 +58,15 @@ fn smooth() -> RenderConfig {
 struct Oracle(RenderConfig);
 
 impl Draw<f64> for Oracle {
-    fn render(&mut self, splats: &Splats<'_, f64>, camera: &Camera, background: [f64; 3], out: &mut Image<f64>) {
-        *out = oracle::render(splats, camera, background, None, &self.0);
+    fn render(
+        &mut self,
+        splats: &Splats<'_, f64>,
+        camera: &Camera,
+        background: [f64; 3],
+        extra: Option<&Table<f64>>,
+        out: &mut Image<f64>,
+    ) {
+        *out = oracle::render(splats, camera, background, extra, &self.0);
     }
 
     fn backward(
@@ -67,6 +74,7 @@ impl Draw<f64> for Oracle {
         splats: &Splats<'_, f64>,
         _: &Camera,
         _: [f64; 3],
+        _: Option<&Table<f64>>,
         _: &ImageGrads<'_, f64>,
         _: &mut [Option<&mut Table<f64>>],
         d: &mut RenderGrads<f64>,

@@ -1,0 +1,168 @@
+//! 3D error of tracks against known ones: captures that were drawn come with the true paths of points of their surfaces.
+//!
+//! `truth/tracks.npy` holds float32 [frames, points, 3], world positions. Every point is given the Gaussian that is
+//! nearest to it at the first frame; the error is the distance of the two at all later frames, their distance at the first
+//! included (the median trajectory error of Luiten et al. 2024). A moment at which that Gaussian is not alive is not
+//! counted, but the share that is counted is reported.
+
+use crate::capture::Capture;
+use crate::{Error, Result};
+use splat4d::flow::tracks::{Tracks, nearest};
+use splat4d::format::npy::Npy;
+use splat4d::layers::Scene;
+use splat4d::scene::Time;
+
+/// Where a capture keeps the truth.
+pub const FILE: &str = "truth/tracks.npy";
+/// Fainter Gaussians are not taken for a surface.
+const LEAST_OPACITY: f64 = 0.5;
+
+/// Seconds by which times of one frame may differ for rounding.
+const CLOCK_ERROR: f64 = 1e-4;
+
+/// How well surfaces are followed.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct TrackError {
+    /// Points that were followed.
+    pub points: usize,
+    /// Median over points and frames after the first, scene units.
+    pub median: f64,
+    /// Their mean, scene units.
+    pub mean: f64,
+    /// Median distance at the first frame, scene units: what any track begins with.
+    pub first: f64,
+    /// Height of all points together along the scene's up direction at the first frame: that of the tallest character.
+    pub height: f64,
+    /// Share of (point, later frame) at which the Gaussian is alive.
+    pub followed: f64,
+}
+
+impl TrackError {
+    /// The median error in percent of a character's height.
+    pub fn percent(&self) -> f64 {
+        100.0 * self.median / self.height.max(f64::MIN_POSITIVE)
+    }
+}
+
+/// The error of a scene on its capture; `None` where the capture has no true tracks, or no Gaussian is there to follow.
+///
+/// Errors: a file of tracks that is damaged.
+pub fn track_error(scene: &Scene<f32>, capture: &Capture) -> Result<Option<TrackError>> {
+    let path = capture.root.join(FILE);
+    if !path.is_file() {
+        return Ok(None);
+    }
+    let bytes = std::fs::read(&path).map_err(|e| Error::io("the true tracks cannot be read", e).at(path.display()))?;
+    let truth = Truth::read(&bytes).map_err(|e| e.at(path.display()))?;
+    Ok(truth.compare(scene, capture.fps))
+}
+
+/// True paths of points.
+struct Truth {
+    frames: usize,
+    points: usize,
+    /// [frames, points, 3]
+    data: Vec<f32>,
+}
+
+impl Truth {
+    fn read(bytes: &[u8]) -> Result<Self> {
+        let array = Npy::read(bytes)?;
+        match array.shape[..] {
+            [frames, points, 3] if frames > 1 && points > 0 => Ok(Self { frames, points, data: array.to_f32() }),
+            _ => Err(Error::input(format!("true tracks have shape {:?}, not [frames, points, 3]", array.shape))
+                .remedy("Delete the file; it is only used to measure")),
+        }
+    }
+
+    fn at(&self, frame: usize, point: usize) -> [f64; 3] {
+        let i = 3 * (frame * self.points + point);
+        [0, 1, 2].map(|k| f64::from(self.data[i + k]))
+    }
+
+    fn compare(&self, scene: &Scene<f32>, fps: f64) -> Option<TrackError> {
+        // A part of the take has a part of the frames.
+        let [from, to] = [scene.clip[0] - CLOCK_ERROR, scene.clip[1] + CLOCK_ERROR];
+        let frames: Vec<usize> = (0..self.frames).filter(|&k| (from..=to).contains(&(k as f64 / fps))).collect();
+        let times: Vec<f64> = frames.iter().map(|&k| k as f64 / fps).collect();
+        if frames.len() < 2 {
+            return None;
+        }
+        let start: Vec<[f64; 3]> = (0..self.points).map(|p| self.at(frames[0], p)).collect();
+        let near = nearest(scene, Time(times[0]), &start, 1, LEAST_OPACITY);
+        let chosen: Vec<_> = near.iter().filter_map(|n| n.first().copied()).collect();
+        if chosen.len() < self.points {
+            return None;
+        }
+        let tracks = Tracks::follow(scene, &chosen, &times);
+        let (mut errors, mut firsts) = (Vec::new(), Vec::new());
+        for (p, member) in chosen.iter().enumerate() {
+            let track = tracks.track(tracks.members.binary_search(member).expect("every chosen one is followed"));
+            for (k, x) in track.iter().enumerate() {
+                let Some(x) = x else { continue };
+                let to = self.at(frames[k], p);
+                let far = (0..3).map(|a| (f64::from(x[a]) - to[a]).powi(2)).sum::<f64>().sqrt();
+                if k == 0 { firsts.push(far) } else { errors.push(far) }
+            }
+        }
+        let up = |x: &[f64; 3]| (0..3).map(|k| x[k] * scene.up[k]).sum::<f64>();
+        let (low, high) =
+            start.iter().map(up).fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), x| (l.min(x), h.max(x)));
+        let asked = self.points * (frames.len() - 1);
+        Some(TrackError {
+            points: self.points,
+            followed: errors.len() as f64 / asked as f64,
+            mean: errors.iter().sum::<f64>() / errors.len().max(1) as f64,
+            median: median(&mut errors)?,
+            first: median(&mut firsts)?,
+            height: high - low,
+        })
+    }
+}
+
+fn median(values: &mut [f64]) -> Option<f64> {
+    let middle = values.len() / 2;
+    (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use splat4d::format::npy::write_f32;
+    use splat4d::layers::{ALWAYS, Layer};
+    use splat4d::motion::tracked::{Tracked, TrackedSpec};
+    use splat4d::scene::params::OPACITY;
+    use splat4d::scene::{GEOMETRY, LifeKind, Params};
+    use std::sync::Arc;
+
+    #[test]
+    fn the_error_is_the_distance_to_the_gaussian_that_was_nearest_at_first() {
+        let mut params = Params::new(3, 1, &[]);
+        let times = vec![0.0, 0.1, 0.2];
+        // The last one is faint and stands in the way.
+        for (r, o) in [(0, 3.0), (1, 3.0), (2, -3.0)] {
+            params[GEOMETRY].write(r, 0, [r as f32, 0.0, 0.0, 1.0]);
+            params[GEOMETRY].set(r, OPACITY, o);
+        }
+        let model = Tracked::new(&TrackedSpec { times: times.clone(), foreground: false }, &mut params).unwrap();
+        for k in 1..3 {
+            (0..2).for_each(|r| params[model.page(k)].set(r, 1, 0.3 * k as f32));
+        }
+        let motion = Arc::new(model);
+        let layer = Layer { name: "a".into(), params, motion, life: LifeKind::Infinite, span: ALWAYS, masks: None };
+        let scene = Scene { layers: vec![layer], clip: [0.0, 0.2], fps: 10.0, up: [1.0, 0.0, 0.0], ..Scene::default() };
+        // Two points that rise by 0.5 a frame, 0 and 0.1 beside Gaussians.
+        let data: Vec<f32> =
+            (0..3).flat_map(|k| [[0.0, 0.5 * k as f32, 0.0], [1.1, 0.5 * k as f32, 0.0]].concat()).collect();
+        let mut bytes = Vec::new();
+        write_f32(&[3, 2, 3], &data, &mut bytes).unwrap();
+        let error = Truth::read(&bytes).unwrap().compare(&scene, 10.0).unwrap();
+        assert!((error.height - 1.1).abs() < 1e-6 && error.followed == 1.0 && error.points == 2);
+        let expected: f64 = [0.2, 0.4, (0.2f64.powi(2) + 0.01).sqrt(), (0.4f64.powi(2) + 0.01).sqrt()].iter().sum();
+        assert!((error.mean - expected / 4.0).abs() < 1e-6 && (error.first - 0.1).abs() < 1e-6, "{error:?}");
+        assert!((error.median - 0.4).abs() < 1e-6 && (error.percent() - 100.0 * 0.4 / 1.1).abs() < 1e-3, "{error:?}");
+        bytes.clear();
+        write_f32(&[3, 6], &data, &mut bytes).unwrap();
+        assert!(Truth::read(&bytes).is_err());
+    }
+}

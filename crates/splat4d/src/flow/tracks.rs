@@ -1,0 +1,202 @@
+//! Tracks: where chosen Gaussians are over time, for any motion model, as data and as JSON or CSV text.
+//!
+//! A track is as honest as its Gaussian is lasting: a model whose Gaussians are born and die gives short ones, and
+//! moments at which a Gaussian is not alive have no position.
+
+use crate::layers::{Instant, LayerTape, Scene};
+use crate::math::Real;
+use crate::motion::Cache;
+use crate::scene::{Rows, Space, Time};
+use std::fmt::Write;
+
+/// One Gaussian.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Member {
+    /// Number of its layer.
+    pub layer: usize,
+    /// Its row.
+    pub row: u32,
+}
+
+/// Where some Gaussians are at some moments.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Tracks {
+    /// Seconds.
+    pub times: Vec<f64>,
+    /// In ascending order.
+    pub members: Vec<Member>,
+    /// [members, times, 3], scene units; `None` where the Gaussian is not alive.
+    pub points: Vec<Option<[f32; 3]>>,
+}
+
+impl Tracks {
+    /// Follows Gaussians over `times`. Panics: there is no such Gaussian.
+    pub fn follow<F: Real>(scene: &Scene<F>, members: &[Member], times: &[f64]) -> Self {
+        let mut members = members.to_vec();
+        members.sort_unstable();
+        members.dedup();
+        let mut points = vec![None; members.len() * times.len()];
+        let mut first = 0;
+        for (index, layer) in scene.layers.iter().enumerate() {
+            let count = members[first..].iter().take_while(|m| m.layer == index).count();
+            let rows: Vec<u32> = members[first..first + count].iter().map(|m| m.row).collect();
+            assert!(rows.last().is_none_or(|&r| (r as usize) < layer.params.len()), "layer {index} has no such row");
+            let spans = if count > 0 { layer.spans() } else { Vec::new() };
+            for (k, &t) in times.iter().enumerate().filter(|_| count > 0) {
+                let (mut tape, mut cache) = (LayerTape::default(), Cache::default());
+                tape.ask(Space::Gaussians, Rows::Some(&rows), Time(t));
+                layer.motion.prepare(&layer.params, &[tape.question(&layer.params)], &mut cache);
+                layer.at(&cache, &mut tape);
+                for (j, &row) in rows.iter().enumerate() {
+                    let [from, to] = spans[row as usize];
+                    let x = tape.out().read::<3>(j, 0);
+                    if t >= from && t <= to && x.iter().all(|x| x.is_finite()) {
+                        points[(first + j) * times.len() + k] = Some(x.map(|x| x.f64() as f32));
+                    }
+                }
+            }
+            first += count;
+        }
+        assert!(first == members.len(), "Gaussians belong to layers of the scene");
+        Self { times: times.to_vec(), members, points }
+    }
+
+    /// One member's positions, a moment each.
+    pub fn track(&self, member: usize) -> &[Option<[f32; 3]>] {
+        &self.points[member * self.times.len()..(member + 1) * self.times.len()]
+    }
+
+    /// As JSON: `{"version": 1, "times": [s], "tracks": [{"layer": name, "gaussian": row, "points": [[x, y, z] or null]}]}`.
+    pub fn to_json<F: Real>(&self, scene: &Scene<F>) -> String {
+        let mut out = format!("{{\"version\":1,\"times\":{:?},\"tracks\":[", self.times);
+        for (i, m) in self.members.iter().enumerate() {
+            let name = serde_json::Value::from(scene.layers[m.layer].name.as_str());
+            let comma = if i > 0 { "," } else { "" };
+            let _ = write!(out, "{comma}\n{{\"layer\":{name},\"gaussian\":{},\"points\":[", m.row);
+            for (k, point) in self.track(i).iter().enumerate() {
+                let comma = if k > 0 { "," } else { "" };
+                let _ = match point {
+                    Some([x, y, z]) => write!(out, "{comma}[{x},{y},{z}]"),
+                    None => write!(out, "{comma}null"),
+                };
+            }
+            out.push_str("]}");
+        }
+        out.push_str("\n]}\n");
+        out
+    }
+
+    /// As CSV: a header `layer,gaussian,time,x,y,z` and a line for every moment at which a Gaussian is alive.
+    pub fn to_csv<F: Real>(&self, scene: &Scene<F>) -> String {
+        let mut out = "layer,gaussian,time,x,y,z\n".to_owned();
+        for (i, m) in self.members.iter().enumerate() {
+            let name = quoted(&scene.layers[m.layer].name);
+            for (t, point) in self.times.iter().zip(self.track(i)) {
+                if let Some([x, y, z]) = point {
+                    let _ = writeln!(out, "{name},{},{t},{x},{y},{z}", m.row);
+                }
+            }
+        }
+        out
+    }
+}
+
+/// A field as CSV takes it (RFC 4180).
+fn quoted(text: &str) -> String {
+    let plain = !text.contains([',', '"', '\n', '\r']);
+    if plain { text.to_owned() } else { format!("\"{}\"", text.replace('"', "\"\"")) }
+}
+
+/// Every n-th Gaussian of a scene. Panics: `every` is 0.
+pub fn every<F: Real>(scene: &Scene<F>, every: usize) -> Vec<Member> {
+    let of = |(layer, l): (usize, &crate::layers::Layer<F>)| {
+        (0..l.params.len() as u32).step_by(every).map(move |row| Member { layer, row })
+    };
+    scene.layers.iter().enumerate().flat_map(of).collect()
+}
+
+/// For every point the `count` Gaussians nearest to it at time t, nearest first, of those alive then with at least
+/// `opacity`: [points, count], shorter where there are fewer.
+pub fn nearest<F: Real>(
+    scene: &Scene<F>,
+    t: Time,
+    points: &[[f64; 3]],
+    count: usize,
+    opacity: f64,
+) -> Vec<Vec<Member>> {
+    let mut instant = Instant::default();
+    scene.at(t, &mut instant);
+    let mut all: Vec<([f64; 3], Member)> = Vec::new();
+    for (layer, tape) in instant.tapes.iter().enumerate() {
+        for j in 0..tape.out().rows() {
+            let row = tape.out().read::<10>(j, 0).map(F::f64);
+            if row[crate::scene::splats::SPLAT_OPACITY] >= opacity && row[..3].iter().all(|x| x.is_finite()) {
+                all.push(([row[0], row[1], row[2]], Member { layer, row: tape.rows().id(j) as u32 }));
+            }
+        }
+    }
+    let near = |p: &[f64; 3]| {
+        let square = |x: &[f64; 3]| (0..3).map(|k| (x[k] - p[k]).powi(2)).sum::<f64>();
+        let mut order: Vec<(f64, Member)> = all.iter().map(|(x, m)| (square(x), *m)).collect();
+        let count = count.min(order.len());
+        let by = |a: &(f64, Member), b: &(f64, Member)| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1));
+        if count > 0 && count < order.len() {
+            order.select_nth_unstable_by(count - 1, by);
+        }
+        order.truncate(count);
+        order.sort_by(by);
+        order.into_iter().map(|o| o.1).collect()
+    };
+    points.iter().map(near).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::layers::{ALWAYS, Layer};
+    use crate::motion::{SpacetimeSpec, Spec, build};
+    use crate::scene::{GEOMETRY, LIFE, LifeKind, Params};
+
+    /// Five Gaussians in a row that drift; the last one lives only around 0.
+    fn scene() -> Scene<f32> {
+        let mut params = Params::new(5, 1, LifeKind::GaussHalf.columns());
+        let motion = build(&Spec::Spacetime(SpacetimeSpec::default()), &mut params).unwrap();
+        let key = params.find("velocities").unwrap();
+        for r in 0..5 {
+            params[GEOMETRY].write(r, 0, [r as f32, 0.0, 0.0, 1.0]);
+            params[GEOMETRY].set(r, 10, 2.0);
+            params[key].set(r, 1, 0.5);
+            params[LIFE].write(r, 0, [0.0, if r == 4 { -2.0 } else { 4.0 }]);
+        }
+        let layer = Layer { name: "a, b".into(), params, motion, life: LifeKind::GaussHalf, span: ALWAYS, masks: None };
+        Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 10.0, ..Scene::default() }
+    }
+
+    #[test]
+    fn gaussians_are_followed_while_they_live() {
+        let s = scene();
+        let tracks = Tracks::follow(&s, &every(&s, 2), &[0.0, 1.0]);
+        assert_eq!(tracks.members.iter().map(|m| m.row).collect::<Vec<_>>(), [0, 2, 4]);
+        assert_eq!(tracks.track(1), [Some([2.0, 0.0, 0.0]), Some([2.0, 0.5, 0.0])]);
+        assert_eq!(tracks.track(2), [Some([4.0, 0.0, 0.0]), None], "it is dead by then");
+        let csv = tracks.to_csv(&s);
+        assert_eq!(csv.lines().count(), 6, "{csv}");
+        assert!(csv.contains("\n\"a, b\",2,1,2,0.5,0\n"), "{csv}");
+        let json: serde_json::Value = serde_json::from_str(&tracks.to_json(&s)).unwrap();
+        assert_eq!(json["tracks"][1]["points"][1][1], 0.5);
+        assert_eq!(json["tracks"][2]["layer"], "a, b");
+        assert!(json["tracks"][2]["points"][1].is_null() && json["times"][1] == 1.0);
+    }
+
+    #[test]
+    fn the_nearest_are_the_nearest_of_the_living() {
+        let s = scene();
+        let rows = |t: f64, count| -> Vec<u32> {
+            nearest(&s, Time(t), &[[3.7, 0.0, 0.0]], count, 0.1)[0].iter().map(|m| m.row).collect()
+        };
+        assert_eq!(rows(0.0, 2), [4, 3]);
+        assert_eq!(rows(1.0, 3), [3, 2, 1]);
+        assert_eq!(rows(0.0, 9).len(), 5);
+        assert!(nearest(&s, Time(0.0), &[[0.0; 3]], 2, 0.99)[0].is_empty());
+    }
+}
