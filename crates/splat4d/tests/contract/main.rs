@@ -3,6 +3,7 @@
 mod check;
 
 use check::{model, starts_still};
+use splat4d::motion::native4d::Native4dSpec;
 use splat4d::motion::{SpacetimeSpec, Spec};
 use splat4d::scene::{LifeKind, Space};
 
@@ -31,6 +32,16 @@ fn spacetime() {
 // tracked.
 
 // native4d.
+
+#[test]
+fn native4d() {
+    for harmonics in [0, 2] {
+        let spec = Native4dSpec { speed: 1.4, harmonics, period: 0.9, ..Native4dSpec::default() };
+        model(&Spec::Native4d(spec), ROWS, LifeKind::Infinite, &[Space::Gaussians], &[]);
+    }
+    let spec = Spec::Native4d(Native4dSpec::default());
+    model(&spec, ROWS, LifeKind::GaussHalf, &[Space::Gaussians], &[]);
+}
 
 // control.
 
