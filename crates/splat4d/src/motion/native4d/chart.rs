@@ -120,8 +120,7 @@ pub(super) fn determinant(m: &[[f64; 4]; 4]) -> f64 {
     let minor = |skip: usize| {
         let c: Vec<usize> = (0..4).filter(|&c| c != skip).collect();
         let at = |r: usize, k: usize| m[r][c[k]];
-        at(1, 0) * (at(2, 1) * at(3, 2) - at(2, 2) * at(3, 1))
-            - at(1, 1) * (at(2, 0) * at(3, 2) - at(2, 2) * at(3, 0))
+        at(1, 0) * (at(2, 1) * at(3, 2) - at(2, 2) * at(3, 1)) - at(1, 1) * (at(2, 0) * at(3, 2) - at(2, 2) * at(3, 0))
             + at(1, 2) * (at(2, 0) * at(3, 1) - at(2, 1) * at(3, 0))
     };
     m[0][0] * minor(0) - m[0][1] * minor(1) + m[0][2] * minor(2) - m[0][3] * minor(3)

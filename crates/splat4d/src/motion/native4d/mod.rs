@@ -16,9 +16,7 @@ use super::lanes::{Batch, Lane, Work, fill, scatter};
 use super::{At, Cache, Motion, Spec, Tape, fill_rows};
 use crate::math::{Real, Rng};
 use crate::scene::table::TableMut;
-use crate::scene::{
-    BLOCK, Born, Color, GEOMETRY, Grads, Key, Params, RowEdit, SH, Space, SplatGrads, Table,
-};
+use crate::scene::{BLOCK, Born, Color, GEOMETRY, Grads, Key, Params, RowEdit, SH, Space, SplatGrads, Table};
 use crate::simd::each;
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
@@ -130,7 +128,10 @@ impl Native4d {
 fn widen<F: Real>(p: &mut Params<F>, blocks: usize) -> Result<()> {
     let (rows, width) = (p.len(), p[SH].width());
     let whole = |width: usize| matches!(width, 3 | 12 | 27 | 48);
-    if width == 0 || (blocks > 1 && width.is_multiple_of(blocks) && whole(width / blocks)) || blocks == 1 && whole(width) {
+    if width == 0
+        || (blocks > 1 && width.is_multiple_of(blocks) && whole(width / blocks))
+        || blocks == 1 && whole(width)
+    {
         return Ok(());
     }
     if !whole(width) {

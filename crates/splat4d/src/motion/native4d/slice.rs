@@ -163,8 +163,7 @@ fn quats<F: Real>(g: &[F; 11], own: &[F; OWN]) -> [[F; 4]; 2] {
 fn parts<F: Real>(g: &[F; 11], own: &[F; OWN], t: F, frame: &Frame<F>) -> Parts<F> {
     let [left, right] = quats(g, own).map(quat::normalize);
     let rotation = rotation4(left.0, right.0);
-    let scales =
-        [g[LOG_SCALE].exp(), g[LOG_SCALE + 1].exp(), g[LOG_SCALE + 2].exp(), time_scale(own, frame)];
+    let scales = [g[LOG_SCALE].exp(), g[LOG_SCALE + 1].exp(), g[LOG_SCALE + 2].exp(), time_scale(own, frame)];
     let l: [[F; 4]; 4] = each(|i| each(|k| rotation[i][k] * scales[k]));
     let e = l[3];
     let squares: [F; 4] = each(|k| e[k] * e[k]);
@@ -272,11 +271,7 @@ pub(super) fn slice_backward<F: Real>(
         let through = if free { column } else { [p.l[0][k], p.l[1][k], p.l[2][k]] };
         let shift = p.tau * p.inverse * e;
         for i in 0..4 {
-            let d_l = if i < 3 {
-                two * dot(m[i], column) + d_mean[i] * shift
-            } else {
-                dot(side, through) + along * e
-            };
+            let d_l = if i < 3 { two * dot(m[i], column) + d_mean[i] * shift } else { dot(side, through) + along * e };
             d_scales[k] += d_l * p.rotation[i][k];
             d_rotation[i][k] = d_l * p.scales[k];
         }

@@ -72,7 +72,8 @@ fn rotations_are_rotations_and_equal_quaternions_turn_space_alone() {
     }
 }
 
-/// The reference's matrices: M_l M_r with both axes reversed, from quaternions in its order.
+/// The reference's matrices: M_l M_r with both axes reversed. Its quaternions have x and z swapped and their signs changed,
+/// and, since it turns the conjugate of X, its left one is our right one.
 #[test]
 fn the_reference_writes_the_same_rotation_with_reversed_axes() {
     let m_l = |[a, b, c, d]: [f64; 4]| [[a, -b, -c, -d], [b, a, -d, c], [c, d, a, -b], [d, -c, b, a]];
@@ -81,7 +82,7 @@ fn the_reference_writes_the_same_rotation_with_reversed_axes() {
         let rng = Rng::new(2, "quats", i);
         let [l, r] = [0, 1].map(|s| quat::normalize(std::array::from_fn(|k| rng.normal(4 * s + k as u64))).0);
         let theirs = |[w, x, y, z]: [f64; 4]| [w, -z, -y, -x];
-        let (a, b) = (m_l(theirs(l)), m_r(theirs(r)));
+        let (a, b) = (m_l(theirs(r)), m_r(theirs(l)));
         let ours = rotation4(l, r);
         for i in 0..4 {
             for j in 0..4 {
@@ -98,9 +99,7 @@ fn whole(g: &[f64; 11], own: &[f64; OWN]) -> ([f64; 4], [[f64; 4]; 4]) {
     let r = quat::normalize([own[2], own[3], own[4], own[5]]).0;
     let m = rotation4(l, r);
     let s = [g[LOG_SCALE].exp(), g[LOG_SCALE + 1].exp(), g[LOG_SCALE + 2].exp(), SPEC.speed * own[1].exp()];
-    let cov = std::array::from_fn(|i| {
-        std::array::from_fn(|j| (0..4).map(|k| m[i][k] * m[j][k] * s[k] * s[k]).sum())
-    });
+    let cov = std::array::from_fn(|i| std::array::from_fn(|j| (0..4).map(|k| m[i][k] * m[j][k] * s[k] * s[k]).sum()));
     ([g[0], g[1], g[2], SPEC.speed * own[0]], cov)
 }
 
@@ -163,9 +162,8 @@ fn slices_are_covariances_in_single_precision_whatever_the_scales() {
 
 #[test]
 fn gradients_of_every_number_also_under_the_floor_and_over_the_ceiling() {
-    for (i, spec) in (0..40).zip([SPEC, Native4dSpec { min_life: 3.0, ..SPEC }, Native4dSpec { max_life: 0.7, ..SPEC }]
-        .into_iter()
-        .cycle())
+    for (i, spec) in (0..40)
+        .zip([SPEC, Native4dSpec { min_life: 3.0, ..SPEC }, Native4dSpec { max_life: 0.7, ..SPEC }].into_iter().cycle())
     {
         let (g, own) = draw(i);
         let t = own[0] + 0.4;
@@ -292,9 +290,8 @@ fn the_life_shown_is_the_life_drawn_and_its_integral_is_that_of_the_marginal() {
         assert!((center - own[0]).abs() < 1e-15 && (log_width.exp() - variance.sqrt() / SPEC.speed).abs() < 1e-12);
         let width = log_width.exp();
         let step = width / 50.0;
-        let sum: f64 = (-400..=400)
-            .map(|k| slice(&g, &own, center + step * f64::from(k), &frame())[SPLAT_OPACITY] * step)
-            .sum();
+        let sum: f64 =
+            (-400..=400).map(|k| slice(&g, &own, center + step * f64::from(k), &frame())[SPLAT_OPACITY] * step).sum();
         let expected = g[OPACITY].sigmoid() * (TAU * variance).sqrt() / SPEC.speed;
         assert!((sum / expected - 1.0).abs() < 1e-9, "{sum} {expected}");
     }
@@ -408,7 +405,14 @@ fn splits_keep_the_distribution_and_resizing_keeps_velocity_and_life() {
 #[test]
 fn far_from_its_life_everything_is_a_number() {
     let l = layer(20, SPEC);
-    let single = Layer { params: l.params.cast::<f32>(), motion: Arc::new(Native4d { spec: SPEC, own: l.params.find(TABLE).unwrap() }), name: "b".into(), life: LifeKind::Infinite, span: ALWAYS, masks: None };
+    let single = Layer {
+        params: l.params.cast::<f32>(),
+        motion: Arc::new(Native4d { spec: SPEC, own: l.params.find(TABLE).unwrap() }),
+        name: "b".into(),
+        life: LifeKind::Infinite,
+        span: ALWAYS,
+        masks: None,
+    };
     let single: Layer<f32> = single;
     for t in [-1e30, -1e4, 1e4, 1e30] {
         let mut tape = LayerTape::default();
