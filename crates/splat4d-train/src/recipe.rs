@@ -6,6 +6,7 @@
 
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
+use splat4d::motion::native4d::MAX_HARMONICS;
 
 macro_rules! recipe {
     ($($(#[$doc:meta])* $name:ident : $t:ty = $default:expr,)*) => {
@@ -231,6 +232,32 @@ recipe! {
     floor_height: String = String::new(),
 
     // native4d, spacetime.
+    /// native4d: rate at the start of the two quaternions of its rotation: they turn space, and against each other they are
+    /// the velocity (1 is two extents a clip).
+    rotation_4d_lr_init: f64 = 2.5e-3,
+    /// native4d: the same at the end.
+    rotation_4d_lr_final: f64 = 2.5e-4,
+    /// native4d: blocks of spherical harmonics that change with time as cos(2πn(centre − t)/clip), 0 to 2.
+    sh_harmonics: usize = 0,
+    /// native4d: whether the parts of a split also lie apart in time and live shorter.
+    split_time: bool = true,
+    /// adc: whether the centre of a clone's life is drawn anew from the clip (STG).
+    retime_clones: bool = false,
+    /// spacetime: share of the iterations after which Gaussians are added where pictures are worst, along the rays of
+    /// their worst patches (STG); 0: never.
+    guided_from: f64 = 0.0,
+    /// spacetime: times that this is done, up to the end of densification.
+    guided_times: usize = 3,
+    /// spacetime: most Gaussians that each of them adds, a share of those that are there.
+    guided_share: f64 = 0.03,
+    /// Iterations between relocations of the faintest Gaussians (FreeTimeGS takes 100), whatever the strategy; 0: never.
+    relocate_interval: usize = 0,
+    /// First iteration that relocates; 0: iterations/15.
+    relocate_from_iter: usize = 0,
+    /// Opacity below which a Gaussian is relocated.
+    relocate_opacity: f64 = 0.02,
+    /// Most of the Gaussians that are relocated at once, a share.
+    relocate_share: f64 = 0.015,
 
     // control.
 
@@ -342,7 +369,7 @@ recipe! {
     growth: f64 = 1.05,
     /// mcmc: strength of the position noise.
     noise_lr: f64 = 5e5,
-    /// mcmc: share of the 2D gradient (against opacity) in where relocated Gaussians go (FreeTimeGS).
+    /// Share of the 2D gradient (against opacity) in where relocated Gaussians go (FreeTimeGS).
     relocate_gradient: f64 = 0.5,
     /// Weight of the mean opacity.
     opacity_reg: f64 = 0.01,
@@ -438,6 +465,8 @@ impl Recipe {
             ("rotation_lr", self.rotation_lr),
             ("velocity_lr_init", self.velocity_lr_init),
             ("velocity_lr_final", self.velocity_lr_final),
+            ("rotation_4d_lr_init", self.rotation_4d_lr_init),
+            ("rotation_4d_lr_final", self.rotation_4d_lr_final),
             ("growth", self.growth),
             ("lr_decay", self.lr_decay),
         ];
@@ -461,6 +490,10 @@ impl Recipe {
             ("static_split_from", self.static_split_from),
             ("deform_warmup", self.deform_warmup),
             ("deform_unlock", self.deform_unlock),
+            ("relocate_opacity", self.relocate_opacity),
+            ("relocate_share", self.relocate_share),
+            ("guided_from", self.guided_from),
+            ("guided_share", self.guided_share),
         ];
         for (knob, value) in shares {
             if !(0.0..=1.0).contains(&value) {
@@ -491,6 +524,9 @@ impl Recipe {
         }
         if self.sh_degree > 3 {
             return bad("sh_degree", self.sh_degree.to_string(), "0, 1, 2 or 3");
+        }
+        if self.sh_harmonics > MAX_HARMONICS {
+            return bad("sh_harmonics", self.sh_harmonics.to_string(), "0, 1 or 2");
         }
         if self.motion_order > 3 {
             return bad("motion_order", self.motion_order.to_string(), "0, 1, 2 or 3");
@@ -527,6 +563,7 @@ impl Recipe {
         fill(&mut r.densification_interval, (r.iterations / 60).max(50));
         fill(&mut r.densify_from_iter, r.iterations / 20);
         fill(&mut r.densify_until_iter, r.iterations * 3 / 4);
+        fill(&mut r.relocate_from_iter, r.iterations / 15);
         fill(&mut r.checkpoint_interval, (r.iterations / 10).max(50));
         r
     }

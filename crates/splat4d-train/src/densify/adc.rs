@@ -6,11 +6,14 @@ use crate::optim::Moments;
 use rayon::prelude::*;
 use splat4d::layers::Scene;
 use splat4d::math::{Rng, sym3};
+use splat4d::scene::life::CENTER;
 use splat4d::scene::params::OPACITY;
-use splat4d::scene::{Born, GEOMETRY, RowEdit, Space};
+use splat4d::scene::{Born, GEOMETRY, LIFE, RowEdit, Space, Table};
 
 /// A split's parts are this much smaller than their parent.
 const SPLIT_SHRINK: f64 = 1.6;
+/// Address of the random numbers of [`retime`]; those of splits are addressed by row.
+const RETIME: u64 = u64::MAX;
 /// Gaussians larger than this share of the extent are removed (as after the first reset in the original).
 const HUGE: f64 = 0.1;
 
@@ -21,6 +24,8 @@ pub struct Adc {
     pub grad_threshold: f64,
     /// Gaussians larger than this share of the extent are split, smaller ones cloned.
     pub percent_dense: f64,
+    /// Whether the centre of a clone's life is drawn anew from the clip (Li et al. 2024, STG).
+    pub retime_clones: bool,
 }
 
 impl Adc {
@@ -63,7 +68,11 @@ impl Adc {
         }
         let old_opacity: Vec<f64> = edit.parent.iter().map(|&r| opacity(scene, layer, r as usize)).collect();
         apply(scene, moments, stats, layer, &edit, &rng);
+        let clip = scene.clip;
         let layer = &mut scene.layers[layer];
+        if self.retime_clones {
+            retime(&mut layer.params[LIFE], &edit, clip, rng.fork(RETIME));
+        }
         for (j, (&parent, born)) in edit.parent.iter().zip(&edit.born).enumerate() {
             let r = parent as usize;
             if *born == Born::Split {
@@ -77,6 +86,16 @@ impl Adc {
             }
         }
         Change { added: wanting.len(), moved: 0, removed }
+    }
+}
+
+/// Draws the centre of every clone's life from the clip, uniformly.
+fn retime(life: &mut Table, edit: &RowEdit, [first, last]: [f64; 2], rng: Rng) {
+    if life.width() == 0 {
+        return;
+    }
+    for (row, _) in edit.born.iter().enumerate().filter(|(_, b)| **b == Born::Clone) {
+        life.set(row, CENTER, (first + (last - first) * rng.uniform(row as u64)) as f32);
     }
 }
 
@@ -99,6 +118,7 @@ mod tests {
     use super::super::tests::scene;
     use super::*;
     use crate::densify::Densify;
+    use splat4d::scene::LifeKind;
 
     #[test]
     fn clones_the_small_splits_the_large_prunes_the_dead_under_the_cap() {
@@ -114,7 +134,7 @@ mod tests {
         for r in [0, 1, 2, 3] {
             stats.tables[0].write(r, 0, [1.0 + r as f32, 2.0, 5.0]);
         }
-        let adc = Densify::Adc(Adc { grad_threshold: 0.1, percent_dense: 0.05 });
+        let adc = Densify::Adc(Adc { grad_threshold: 0.1, percent_dense: 0.05, retime_clones: false });
         let mut capped = s.clone();
         let limits = Limits { cap: 100, extent: 4.0, min_opacity: 0.005 };
         let change = adc.run(&mut s, &mut moments, &mut stats.clone(), &limits, 1, 0);
@@ -124,5 +144,30 @@ mod tests {
         let mut moments: Vec<_> = capped.layers.iter().map(|l| Moments::new(&l.params)).collect();
         let change = adc.run(&mut capped, &mut moments, &mut stats, &Limits { cap: 21, ..limits }, 1, 0);
         assert_eq!((change.added, capped.len()), (2, 21));
+    }
+    #[test]
+    fn clones_are_born_anywhere_in_the_clip_and_nobody_else_is_moved_in_time() {
+        let mut s = scene(400);
+        s.clip = [2.0, 3.0];
+        let layer = &mut s.layers[0];
+        layer.life = LifeKind::GaussHalf;
+        layer.params[LIFE] = Table::new(LifeKind::GaussHalf.columns(), 400);
+        (0..400).for_each(|r| layer.params[LIFE].write(r, 0, [2.5, 0.0]));
+        (0..400).for_each(|r| layer.params[GEOMETRY].write(r, 7, [-6.0f32; 3]));
+        let mut moments: Vec<_> = s.layers.iter().map(|l| Moments::new(&l.params)).collect();
+        let mut stats = Stats::new(&s);
+        (0..400).for_each(|r| stats.tables[0].write(r, 0, [1.0, 2.0, 5.0]));
+        let adc = Densify::Adc(Adc { grad_threshold: 0.1, percent_dense: 0.05, retime_clones: true });
+        let limits = Limits { cap: 800, extent: 4.0, min_opacity: 0.005 };
+        assert_eq!(adc.run(&mut s, &mut moments, &mut stats, &limits, 1, 0).added, 400);
+        let life = &s.layers[0].params[LIFE];
+        assert!((0..400).all(|r| life.get(r, 0) == 2.5), "those who were there keep their time");
+        let times: Vec<f32> = (400..800).map(|r| life.get(r, 0)).collect();
+        assert!(times.iter().all(|t| (2.0..=3.0).contains(t)));
+        for quarter in 0..4 {
+            let from = 2.0 + 0.25 * quarter as f32;
+            let count = times.iter().filter(|t| (from..from + 0.25).contains(*t)).count();
+            assert!((60..140).contains(&count), "{count} of 400 in a quarter of the clip");
+        }
     }
 }

@@ -69,63 +69,92 @@ impl Mcmc {
         let grown = ((rows as f64 * self.growth).ceil() as usize).saturating_sub(rows);
         let added = grown.min(*spare);
         *spare -= added;
-        // Cumulative weights of live rows; both parts have mean 1.
+        let places = Places::new(scene, stats, layer, live, self.gradient_share);
+        let moves: Vec<u32> = (0..rows as u32).filter(|&r| dead[r as usize]).collect();
+        join(scene, moments, stats, layer, limits, &places, &moves, added, rng);
+        Change { added, moved: moves.len(), removed: 0 }
+    }
+}
+
+/// Where Gaussians go: rows drawn in proportion to share·gradient + (1 − share)·opacity, each over its mean.
+pub(super) struct Places {
+    live: Vec<usize>,
+    cumulative: Vec<f64>,
+}
+
+impl Places {
+    /// The `live` rows of a layer; where nothing was seen to have a gradient, opacity alone counts.
+    pub(super) fn new(scene: &Scene<f32>, stats: &Stats, layer: usize, live: Vec<usize>, share: f64) -> Self {
         let mean = |f: &dyn Fn(usize) -> f64| (live.iter().map(|&r| f(r)).sum::<f64>() / live.len() as f64).max(1e-30);
         let gradient = |r: usize| f64::from(stats.gradient(layer, r));
         let opaque = |r: usize| opacity(scene, layer, r);
         let (mean_gradient, mean_opacity) = (mean(&gradient), mean(&opaque));
-        let share = if mean_gradient > 1e-29 { self.gradient_share } else { 0.0 };
+        let share = if mean_gradient > 1e-29 { share } else { 0.0 };
         let mut total = 0.0;
-        let cumulative: Vec<f64> = live
+        let cumulative = live
             .iter()
             .map(|&r| {
                 total += share * gradient(r) / mean_gradient + (1.0 - share) * opaque(r) / mean_opacity;
                 total
             })
             .collect();
-        let draw = |i: u64| {
-            let u = rng.fork(1).uniform(i) * total;
-            live[cumulative.partition_point(|&c| c <= u).min(live.len() - 1)]
-        };
-        let mut edit = RowEdit { space: Space::Gaussians, parent: Vec::new(), born: Vec::new() };
-        let mut copies = vec![1usize; rows];
-        let mut draws = 0;
-        let mut next = |copies: &mut Vec<usize>| {
-            let r = draw(draws);
-            draws += 1;
-            copies[r] += 1;
-            r as u32
-        };
-        for r in 0..rows {
-            if dead[r] {
-                edit.push(next(&mut copies), Born::Moved);
-            } else {
-                edit.push(r as u32, Born::Kept);
-            }
+        Self { live, cumulative }
+    }
+
+    /// The i-th draw.
+    fn draw(&self, rng: Rng, i: u64) -> usize {
+        let u = rng.uniform(i) * self.cumulative.last().expect("somebody is alive");
+        self.live[self.cumulative.partition_point(|&c| c <= u).min(self.live.len() - 1)]
+    }
+}
+
+/// Moves the rows `moves` (increasing) onto drawn places and adds `added` more there; whoever shares a place then looks,
+/// with the others, as its one Gaussian did: [`relocated`].
+pub(super) fn join(
+    scene: &mut Scene<f32>,
+    moments: &mut [Moments<f32>],
+    stats: &mut Stats,
+    layer: usize,
+    limits: &Limits,
+    places: &Places,
+    moves: &[u32],
+    added: usize,
+    rng: Rng,
+) {
+    let rows = scene.layers[layer].params.len();
+    let mut copies = vec![1usize; rows];
+    let mut draws = 0;
+    let mut next = |copies: &mut Vec<usize>| {
+        let r = places.draw(rng.fork(1), draws);
+        draws += 1;
+        copies[r] += 1;
+        r as u32
+    };
+    let mut edit = RowEdit::identity(Space::Gaussians, rows);
+    for &r in moves {
+        edit.parent[r as usize] = next(&mut copies);
+        edit.born[r as usize] = Born::Moved;
+    }
+    for _ in 0..added {
+        edit.push(next(&mut copies), Born::Clone);
+    }
+    // The one that is joined changes as well: its moments start anew.
+    for j in 0..rows {
+        if copies[edit.parent[j] as usize] > 1 && edit.born[j] == Born::Kept {
+            edit.born[j] = Born::Moved;
         }
-        for _ in 0..added {
-            edit.push(next(&mut copies), Born::Clone);
+    }
+    let old: Vec<f64> = (0..rows).map(|r| opacity(scene, layer, r)).collect();
+    apply(scene, moments, stats, layer, &edit, &rng);
+    let layer = &mut scene.layers[layer];
+    for (j, &parent) in edit.parent.iter().enumerate() {
+        let n = copies[parent as usize];
+        if n > 1 {
+            let (o, factor) = relocated(old[parent as usize], n);
+            // Never below the dead opacity, or it would be moved again at once.
+            layer.params[GEOMETRY].set(j, OPACITY, logit(o.max(limits.min_opacity * 1.001)));
+            layer.resize(j, factor);
         }
-        let moved = rows - live.len();
-        // The one that is joined changes as well: its moments start anew.
-        for j in 0..rows {
-            if copies[edit.parent[j] as usize] > 1 && edit.born[j] == Born::Kept {
-                edit.born[j] = Born::Moved;
-            }
-        }
-        let old: Vec<f64> = (0..rows).map(|r| opacity(scene, layer, r)).collect();
-        apply(scene, moments, stats, layer, &edit, &rng);
-        let layer = &mut scene.layers[layer];
-        for (j, &parent) in edit.parent.iter().enumerate() {
-            let n = copies[parent as usize];
-            if n > 1 {
-                let (o, factor) = relocated(old[parent as usize], n);
-                // Never below the dead opacity, or it would be moved again at once.
-                layer.params[GEOMETRY].set(j, OPACITY, logit(o.max(limits.min_opacity * 1.001)));
-                layer.resize(j, factor);
-            }
-        }
-        Change { added, moved, removed: 0 }
     }
 }
 

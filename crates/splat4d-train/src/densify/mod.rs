@@ -4,8 +4,10 @@
 //! `Motion::on_edit`, so that it works for every motion model.
 
 pub mod adc;
+pub mod guided;
 pub mod mcmc;
 pub mod merge;
+pub mod relocate;
 
 use crate::optim::Moments;
 use splat4d::format::quant::{MORTON_BITS, morton};
@@ -17,8 +19,10 @@ use splat4d::scene::splats::COV;
 use splat4d::scene::{Born, GEOMETRY, RowEdit, Rows, Space, Table, Time};
 
 pub use adc::Adc;
+pub use guided::Guided;
 pub use mcmc::Mcmc;
 pub use merge::{Crowd, Crowding};
+pub use relocate::Relocate;
 
 /// What the densifier may know of one view of one layer.
 #[derive(Clone, Copy, Debug)]

@@ -6,7 +6,7 @@ use splat4d::math::Real;
 use splat4d::math::knn::knn;
 use splat4d::motion::for_rows;
 use splat4d::scene::params::{LOG_SCALE, OPACITY};
-use splat4d::scene::{GEOMETRY, Grads, LIFE, LifeKind, Rows, Space};
+use splat4d::scene::{GEOMETRY, Grads, Rows, Space};
 use std::sync::Mutex;
 
 /// Adds `f`'s gradient over the active rows of every layer's geometry, weighted `weight`/(active rows); returns the loss.
@@ -99,15 +99,11 @@ impl<F: Real> ParamLoss<F> for LivingOpacity {
     }
 
     fn eval(&self, scene: &Scene<F>, info: &StepInfo, d: &mut [Grads<F>]) -> f64 {
+        let lives: Vec<_> = scene.layers.iter().map(|l| l.lives()).collect();
         over_active(scene, d, self.weight, |layer, g, row| {
-            let l = &scene.layers[layer];
-            let life = &l.params[LIFE];
-            let columns = match l.life {
-                LifeKind::Infinite => [F::ZERO; 3],
-                LifeKind::Interval => life.read::<3>(row, 0),
-                _ => [life.get(row, 0), life.get(row, 1), F::ZERO],
-            };
-            let sigma: F = info.times.iter().map(|&t| l.life.eval(columns, t).sigma).sum();
+            let (kind, rows) = &lives[layer];
+            let columns = rows[row].map(F::of);
+            let sigma: F = info.times.iter().map(|&t| kind.eval(columns, t).sigma).sum();
             let sigma = sigma / F::of(info.times.len().max(1) as f64);
             let o = g[OPACITY].sigmoid();
             let mut d_row = [F::ZERO; 11];
@@ -214,7 +210,7 @@ mod tests {
     use splat4d::layers::{ALWAYS, Layer};
     use splat4d::math::Rng;
     use splat4d::motion::{SpacetimeSpec, Spec, build};
-    use splat4d::scene::{Key, Params, Time};
+    use splat4d::scene::{Key, LIFE, LifeKind, Params, Time};
 
     fn scene() -> Scene<f64> {
         let mut params = Params::new(40, 1, LifeKind::GaussHalf.columns());

@@ -16,6 +16,8 @@ mod tests;
 pub mod tracked;
 
 use crate::densify::{Crowding, Densify, Stats};
+use crate::densify::{Densify, Guided, Relocate};
+use crate::init::Seeds;
 use crate::loss::terms::{Codec, ParamLoss, ProbeLoss};
 use crate::optim::Moments;
 use crate::prune::Periodic;
@@ -26,7 +28,7 @@ use crate::{Error, Result};
 use splat4d::layers::Scene;
 use splat4d::math::{Real, Rng};
 use splat4d::motion::Spec;
-use splat4d::scene::LifeKind;
+use splat4d::scene::{LifeKind, Params};
 use std::sync::Arc;
 
 /// What a program may know of the capture and of the user's wishes.
@@ -178,6 +180,10 @@ pub struct Stage<F: Real = f32> {
     pub prune: Option<Periodic>,
     /// What becomes of Gaussians that stand in one place.
     pub crowding: Option<Crowding>,
+    /// Moving the faintest Gaussians where they are needed, beside densification.
+    pub relocate: Option<Relocate>,
+    /// New Gaussians where pictures are worst.
+    pub guided: Option<Guided>,
     /// Steps before each further SH degree; 0: all at once.
     pub sh_interval: usize,
     /// The first so many steps see pictures at half size: coarse things first, and four times faster.
@@ -214,6 +220,8 @@ impl<F: Real> Stage<F> {
             adapt: None,
             prune: None,
             crowding: None,
+            relocate: None,
+            guided: None,
             sh_interval: 0,
             half_size_steps: 0,
             min_log_life: None,
@@ -242,6 +250,8 @@ pub trait Program: Send + Sync {
     fn first(&self, plan: &Plan) -> Plan {
         plan.clone()
     }
+    /// Fills what the model's own tables start with from the points that the Gaussians start at, row by row.
+    fn init(&self, _plan: &Plan, _seeds: &Seeds, _params: &mut Params) {}
     /// Says before training, and not after an hour, that the model cannot work on a capture.
     fn check(&self, _plan: &Plan) -> Result<()> {
         Ok(())
@@ -282,6 +292,7 @@ pub fn densify_of(r: &Recipe) -> (Densify, (usize, usize, usize)) {
         "adc" => Densify::Adc(crate::densify::Adc {
             grad_threshold: r.densify_grad_threshold,
             percent_dense: r.percent_dense,
+            retime_clones: r.retime_clones,
         }),
         _ => Densify::None,
     };

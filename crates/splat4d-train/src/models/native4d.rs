@@ -1,7 +1,20 @@
-//! `native4d`: how it is learnt.
+//! `native4d`: one stage; both quaternions, scales and times learn beside geometry and colour.
+//!
+//! Rates follow those of `spacetime`, since the two are charts of the same Gaussians: a step of both quaternions changes
+//! the velocity by twice its size in extents a clip, which is the unit of the rotation (`Native4dSpec::speed`).
 
-use super::{Plan, Program, Stage, still};
-use splat4d::motion::{Spec, native4d::Native4dSpec};
+use super::{Group, Plan, Program, Rate, Stage, still};
+use crate::init::{Seeds, first_life};
+use crate::loss::scene::LivingOpacity;
+use crate::{Error, Result};
+use splat4d::motion::Spec;
+use splat4d::motion::native4d::{Native4dSpec, TABLE};
+use splat4d::scene::{LifeKind, Params};
+
+/// Scales in time count up to so many clips: a Gaussian is then as good as immortal (0.5 % fainter at the clip's ends).
+const LONGEST_CLIPS: f64 = 10.0;
+/// Colours beyond the base learn this much slower (Kerbl et al. 2023; Yang et al. 2024 for the blocks in time).
+const SH_REST_SLOWDOWN: f64 = 20.0;
 
 /// Gaussians of space and time, sliced at t (Yang et al. 2024, "Real-time 4DGS").
 #[derive(Clone, Copy, Debug)]
@@ -9,10 +22,54 @@ pub struct Native4dProgram;
 
 impl Program for Native4dProgram {
     fn spec(&self, plan: &Plan) -> Spec {
-        Spec::Native4d(Native4dSpec { seed: plan.recipe.seed })
+        let r = &plan.recipe;
+        Spec::Native4d(Native4dSpec {
+            speed: plan.extent / plan.seconds(),
+            min_life: r.min_life_frames / plan.fps,
+            max_life: (LONGEST_CLIPS * plan.seconds()).max(r.min_life_frames / plan.fps),
+            harmonics: r.sh_harmonics,
+            period: plan.seconds(),
+            split_time: r.split_time,
+        })
+    }
+
+    /// The life is in the model.
+    fn life(&self, _plan: &Plan) -> LifeKind {
+        LifeKind::Infinite
+    }
+
+    fn init(&self, plan: &Plan, seeds: &Seeds, params: &mut Params) {
+        let key = params.find(TABLE).expect("the model has made its table");
+        for (row, time) in seeds.times.iter().enumerate() {
+            let (center, width) = first_life(plan, *time);
+            params[key].write(row, 0, [center as f32, width.ln() as f32]);
+        }
+    }
+
+    fn check(&self, plan: &Plan) -> Result<()> {
+        if matches!(plan.recipe.life.as_str(), "auto" | "infinite") {
+            return Ok(());
+        }
+        Err(Error::input(format!("native4d has a life of its own and takes no life=\"{}\"", plan.recipe.life))
+            .remedy("Leave life at auto, or train spacetime with it"))
     }
 
     fn stages(&self, plan: &Plan) -> Vec<Stage> {
-        vec![still::stage("native4d", plan)]
+        let r = &plan.recipe;
+        let mut stage = still::stage("native4d", plan);
+        let turning = Rate { start: r.rotation_4d_lr_init, end: r.rotation_4d_lr_final };
+        stage.groups.iter_mut().filter(|g| g.column == "quats").for_each(|g| g.rate = turning);
+        stage.groups.push(Group::new("right_quats", turning));
+        stage.groups.push(Group::new("time_means", r.falling(r.life_center_lr * plan.seconds())));
+        stage.groups.push(Group::new("log_time_scales", r.falling(r.life_width_lr)));
+        if r.sh_harmonics > 0 {
+            let block = 3 * (r.sh_degree + 1) * (r.sh_degree + 1);
+            let rate = r.falling(r.feature_lr / SH_REST_SLOWDOWN);
+            stage.groups.push(Group { part: Some((block, block * r.sh_harmonics)), ..Group::new("sh", rate) });
+        }
+        if r.lambda_opacity_life > 0.0 {
+            stage.params.push(Box::new(LivingOpacity { weight: r.lambda_opacity_life }));
+        }
+        vec![stage]
     }
 }

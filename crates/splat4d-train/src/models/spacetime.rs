@@ -2,6 +2,7 @@
 
 use super::still;
 use super::{Group, Plan, Program, Rate, Stage};
+use crate::densify::Guided;
 use crate::loss::scene::{LivingOpacity, VelocitySmoothness};
 use splat4d::motion::{SpacetimeSpec, Spec};
 use splat4d::scene::LifeKind;
@@ -38,6 +39,7 @@ impl Program for SpacetimeProgram {
         if r.rotation_rate {
             stage.groups.push(Group::new("rotation_rates", r.falling(r.rotation_rate_lr / clip)));
         }
+        stage.guided = Guided::of(r);
         still::learn_life(&mut stage, plan, self.life(plan));
         if r.lambda_opacity_life > 0.0 {
             stage.params.push(Box::new(LivingOpacity { weight: r.lambda_opacity_life }));

@@ -2,6 +2,7 @@
 
 use super::{Group, Plan, Program, Rate, Stage, densify_of};
 use crate::densify::Crowding;
+use crate::densify::Relocate;
 use crate::loss::scene::{MeanOpacity, MeanScale};
 use crate::loss::terms::ParamLoss;
 use crate::prune::Periodic;
@@ -83,6 +84,7 @@ pub fn stage(name: &str, plan: &Plan) -> Stage {
         densify_steps,
         prune: Periodic::of(r),
         crowding: Crowding::of(r).expect("the recipe was checked"),
+        relocate: Relocate::of(r),
         sh_interval: r.sh_degree_interval,
         half_size_steps: (r.half_size_until * r.iterations as f64) as usize,
         ..Stage::new(name, r.iterations)

@@ -452,6 +452,9 @@ impl<'a> Trainer<'a> {
             self.stale = true;
             self.grads = self.scene.layers.iter().map(|l| Grads::new(&l.params)).collect();
         }
+        // Before densification, which begins the statistics anew.
+        let placed = self.place(step)?;
+        let stage = &self.stages[self.progress.stage];
         let (from, until, every) = stage.densify_steps;
         let mut change = Change::default();
         let due = every > 0 && step >= from && step <= until && step.is_multiple_of(every);
@@ -484,11 +487,38 @@ impl<'a> Trainer<'a> {
         }
         change.removed += self.prune(step)?;
         change.removed += self.uncrowd(step);
+        (change.added, change.moved) = (change.added + placed.added, change.moved + placed.moved);
         let stage = &self.stages[self.progress.stage];
         let reset = self.settings.opacity_reset_interval;
         if matches!(stage.densify, Densify::Adc(_)) && reset > 0 && step.is_multiple_of(reset) && step < until {
             adc::reset_opacity(&mut self.scene, &mut self.moments, 2.0 * self.settings.limits.min_opacity);
             self.stale = true;
+        }
+        Ok(change)
+    }
+
+    /// Relocation and guided sampling after so many steps of the stage, where they are due.
+    fn place(&mut self, step: usize) -> Result<Change> {
+        let stage = &self.stages[self.progress.stage];
+        let (seed, address, limits) = (self.settings.seed, self.progress.iteration as u64, &self.settings.limits);
+        let mut change = Change::default();
+        let (scene, moments, stats) = (&mut self.scene, &mut self.moments, &mut self.stats);
+        if let Some(relocate) = stage.relocate.filter(|r| r.is_due(step, stage.iterations)) {
+            change = relocate.run(scene, moments, stats, limits, seed, address);
+            let (_, until, every) = stage.densify_steps;
+            if every == 0 || step >= until {
+                stats.clear(scene);
+            }
+        }
+        if let Some(guided) = stage.guided.filter(|g| g.is_due(step, stage.iterations)) {
+            let antialias = self.draw.config().antialias;
+            let frames = self.frames.as_ref();
+            change.added = guided.run(scene, moments, stats, limits, frames, antialias, seed, address)?.added;
+        }
+        if change != Change::default() {
+            stage.params.iter().for_each(|l| l.on_edit());
+            self.stale = true;
+            self.fit_grads();
         }
         Ok(change)
     }

@@ -8,6 +8,7 @@ use super::arrays::MASKS;
 use super::safetensors::{SafeTensors, Tensor};
 use super::{params_to_arrays, tensors_to_loaded};
 use crate::layers::{ALWAYS, Head, Layer, Scene};
+use crate::motion::native4d::MAX_HARMONICS;
 use crate::motion::{BUILT_IN, Spec, build};
 use crate::scene::masks::WORD;
 use crate::scene::{KeyMasks, LifeKind, Params, SH};
@@ -147,14 +148,16 @@ fn read_layer(file: &SafeTensors<'_>, meta: &Value, index: usize) -> Result<Laye
     if means.shape() != [rows, 3] {
         return Err(broken(format!("the metadata claims {rows} Gaussians, the means have shape {:?}", means.shape())));
     }
-    if coefficients > crate::math::sh::MAX_COEFFS {
+    let motion = spec_from_json(&meta["motion"])?;
+    let blocks = if let Spec::Native4d(s) = motion { s.harmonics.min(MAX_HARMONICS) + 1 } else { 1 };
+    if coefficients > crate::math::sh::MAX_COEFFS * blocks {
         return Err(broken(format!("{coefficients} SH coefficients are more than degree 3 has")));
     }
     let life = text(meta, "life")?;
     let life = LifeKind::from_name(&life).ok_or_else(|| broken(format!("life `{life}` is not known")))?;
     let loaded = tensors_to_loaded(&prefix, file)?;
     let mut params = Params::build(loaded, rows, coefficients, life.columns())?;
-    let motion = build(&spec_from_json(&meta["motion"])?, &mut params)?;
+    let motion = build(&motion, &mut params)?;
     if let Some(array) = params.unclaimed().first() {
         return Err(broken(format!("array `{}` belongs to no table of this layer", array.name)));
     }

@@ -3,7 +3,7 @@
 use super::Scene;
 use crate::math::{quat, se3, sh, sh_rotation};
 use crate::motion::spacetime::{ROTATION_RATES, VELOCITIES};
-use crate::motion::{SpacetimeSpec, Spec};
+use crate::motion::{SpacetimeSpec, Spec, native4d};
 use crate::scene::params::QUAT;
 use crate::scene::{GEOMETRY, Params, SH, Table};
 use crate::{Error, ErrorKind, Result};
@@ -38,7 +38,8 @@ pub fn rotation_between(from: [f64; 3], to: [f64; 3]) -> Option<[[f64; 3]; 3]> {
 }
 
 impl Scene<f32> {
-    /// Turns everything by the rotation `r` (rows): means, quaternions, velocities, rotation rates, colours, `up`.
+    /// Turns everything by the rotation `r` (rows): means, quaternions (both of `native4d`), velocities, rotation rates,
+    /// colours, `up`.
     ///
     /// Errors: a layer moves by a model from outside this library, whose parameters nobody here can turn.
     pub fn turn(&mut self, r: &[[f64; 3]; 3]) -> Result<()> {
@@ -52,7 +53,17 @@ impl Scene<f32> {
         let (q, m) = (quat::from_rotation(r), sh_rotation(r));
         for layer in &mut self.layers {
             turn_geometry(&mut layer.params, r, q);
-            turn_colors(&mut layer.params[SH], &m);
+            let blocks = if let Spec::Native4d(s) = layer.motion.spec() { s.harmonics + 1 } else { 1 };
+            turn_colors(&mut layer.params[SH], blocks, &m);
+            if let Spec::Native4d(_) = layer.motion.spec() {
+                // Q(l X r̄)Q̄ = (Ql) X (Qr)̄: the right quaternion turns as the left one does.
+                let own = layer.params.find(native4d::TABLE).expect("a native4d layer has its table");
+                let (first, _) = native4d::RIGHT_QUATS;
+                let table = &mut layer.params[own];
+                for row in 0..table.rows() {
+                    table.write(row, first, product(q, or_identity(table.read(row, first))));
+                }
+            }
             if let Spec::Spacetime(SpacetimeSpec { order, rotation, .. }) = layer.motion.spec() {
                 let find = |name| layer.params.find(name).expect("a spacetime layer has its tables");
                 let (velocities, rates) = (find(VELOCITIES), find(ROTATION_RATES));
@@ -98,22 +109,26 @@ fn turn_geometry(params: &mut Params, r: &[[f64; 3]; 3], q: [f64; 4]) {
     let table = &mut params[GEOMETRY];
     for row in 0..table.rows() {
         table.write(row, 0, apply(r, table.read::<3>(row, 0)));
-        let own = table.read::<4>(row, QUAT);
-        // A zero quaternion stands for the identity wherever it is used, and must turn as the identity does.
-        let own = if own == [0.0; 4] { [1.0, 0.0, 0.0, 0.0] } else { own };
-        table.write(row, QUAT, product(q, own));
+        table.write(row, QUAT, product(q, or_identity(table.read(row, QUAT))));
     }
 }
 
-fn turn_colors(table: &mut Table, m: &[[f64; sh::MAX_COEFFS]; sh::MAX_COEFFS]) {
-    let count = (table.width() / 3).min(sh::MAX_COEFFS);
+/// A zero quaternion stands for the identity wherever it is used, and must turn as the identity does.
+fn or_identity(q: [f32; 4]) -> [f32; 4] {
+    if q == [0.0; 4] { [1.0, 0.0, 0.0, 0.0] } else { q }
+}
+
+/// `blocks`: how many blocks of coefficients stand side by side.
+fn turn_colors(table: &mut Table, blocks: usize, m: &[[f64; sh::MAX_COEFFS]; sh::MAX_COEFFS]) {
+    let count = (table.width() / 3 / blocks).min(sh::MAX_COEFFS);
     for row in 0..table.rows() {
-        for c in 0..3 {
+        for (b, c) in (0..blocks).flat_map(|b| (0..3).map(move |c| (b, c))) {
+            let col = |k: usize| 3 * (b * count + k) + c;
             let old: [f64; sh::MAX_COEFFS] =
-                std::array::from_fn(|k| if k < count { f64::from(table.get(row, 3 * k + c)) } else { 0.0 });
+                std::array::from_fn(|k| if k < count { f64::from(table.get(row, col(k))) } else { 0.0 });
             // Degree 0 is the same from everywhere; its bits stay.
             for k in 1..count {
-                table.set(row, 3 * k + c, (0..count).map(|l| m[k][l] * old[l]).sum::<f64>() as f32);
+                table.set(row, col(k), (0..count).map(|l| m[k][l] * old[l]).sum::<f64>() as f32);
             }
         }
     }

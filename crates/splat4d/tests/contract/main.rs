@@ -7,6 +7,7 @@ use splat4d::motion::control::{ControlSpec, Curve, TrajectorySpec};
 use splat4d::motion::skin::SkinSpec;
 use splat4d::motion::deform::{DeformSpec, Input};
 use splat4d::motion::tracked::TrackedSpec;
+use splat4d::motion::native4d::Native4dSpec;
 use splat4d::motion::{SpacetimeSpec, Spec};
 use splat4d::nn::HashShape;
 use splat4d::motion::hexplane::{Heads, HexplaneSpec};
@@ -90,6 +91,16 @@ fn tracked() {
 }
 
 // native4d.
+
+#[test]
+fn native4d() {
+    for harmonics in [0, 2] {
+        let spec = Native4dSpec { speed: 1.4, harmonics, period: 0.9, ..Native4dSpec::default() };
+        model(&Spec::Native4d(spec), ROWS, LifeKind::Infinite, &[Space::Gaussians], &[]);
+    }
+    let spec = Spec::Native4d(Native4dSpec::default());
+    model(&spec, ROWS, LifeKind::GaussHalf, &[Space::Gaussians], &[]);
+}
 
 // control.
 

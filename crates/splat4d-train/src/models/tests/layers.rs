@@ -6,7 +6,7 @@ use crate::densify::{Adc, Densify, Mcmc};
 /// Both strategies, eager enough for thirty steps.
 pub(super) fn strategies() -> [Densify; 2] {
     [
-        Densify::Adc(Adc { grad_threshold: 1e-6, percent_dense: 0.04 }),
+        Densify::Adc(Adc { grad_threshold: 1e-6, percent_dense: 0.04, retime_clones: false }),
         Densify::Mcmc(Mcmc { growth: 1.1, gradient_share: 0.5, noise_lr: 1.0 }),
     ]
 }

@@ -1,0 +1,267 @@
+//! Guided sampling: where pictures are worst and there are too few Gaussians to mend them, new ones are put along the rays
+//! of the worst patches. It finds what no initial point stood for, far backgrounds above all.
+//!
+//! Source: Li et al. 2024 (STG) §4.2 and its released settings: of the views that were looked at the two worst; patches of
+//! 16 pixels of which 85 % are among the worst 40 % of the pixels, a border of 10 % left out; every second pixel; depths
+//! between 0.7 and 7.5 times the largest seen, with 5 % of jitter; opacity 0.1.
+
+use super::{Change, Limits, Stats, apply, logit};
+use crate::Result;
+use crate::capture::frames::{Frames, Picture};
+use crate::optim::Moments;
+use crate::recipe::Recipe;
+use splat4d::layers::{Instant, Scene};
+use splat4d::math::Rng;
+use splat4d::math::sh::rgb_to_dc;
+use splat4d::motion::spacetime::{ROTATION_RATES, VELOCITIES};
+use splat4d::render::{Antialias, Image, RenderConfig, Renderer};
+use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
+use splat4d::scene::{Born, Camera, GEOMETRY, LIFE, Planes, RowEdit, SH, Space, Time};
+
+/// Views that are looked at each time.
+const LOOKS: usize = 24;
+/// Views in which Gaussians are added.
+const WORST_VIEWS: usize = 2;
+/// Side of a patch, pixels.
+const PATCH: usize = 16;
+/// Share of a picture's pixels that count as wrong: those with the largest errors.
+const WRONG: f64 = 0.4;
+/// Share of a patch's pixels that must be wrong.
+const WRONG_IN_PATCH: f64 = 0.85;
+/// Share of width and height that is left out at every side.
+const BORDER: f64 = 0.1;
+/// Pixels between two rays.
+const STRIDE: usize = 2;
+/// Nearest and farthest depth, of the largest that was seen.
+const DEPTHS: [f64; 2] = [0.7, 7.5];
+/// Depths at which rays are cut, evenly in their logarithm; neighbouring rays take turns.
+const SHELLS: usize = 3;
+/// Jitter of a depth.
+const JITTER: f64 = 0.05;
+/// A depth is seen where at least so much of a pixel is covered.
+const COVERED: f32 = 0.5;
+/// Opacity at the start.
+const OPACITY_START: f64 = 0.1;
+/// Share of the run at which the last of them are added: they must have time to learn.
+const LAST: f64 = 0.75;
+
+/// See the module's documentation.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Guided {
+    /// Share of the stage after which it is done first.
+    pub from: f64,
+    /// How often.
+    pub times: usize,
+    /// Most Gaussians that each time adds, a share of those that are there.
+    pub share: f64,
+}
+
+/// A view that was looked at.
+struct Look {
+    frame: usize,
+    error: f64,
+    /// Mean absolute error a pixel, [1, h, w].
+    errors: Planes<f32>,
+    truth: Planes<f32>,
+    farthest: f32,
+}
+
+impl Guided {
+    /// As the recipe has it; `None`: never.
+    pub fn of(r: &Recipe) -> Option<Self> {
+        let some = Self { from: r.guided_from, times: r.guided_times, share: r.guided_share };
+        (r.guided_from > 0.0 && r.guided_times > 0).then_some(some)
+    }
+
+    /// Whether it is time after so many steps of a stage of `iterations`.
+    pub fn is_due(&self, steps: usize, iterations: usize) -> bool {
+        let (first, last) = ((self.from * iterations as f64) as usize, (LAST * iterations as f64) as usize);
+        if steps < first.max(1) || steps > last {
+            return false;
+        }
+        let interval = (last - first).div_ceil(self.times).max(1);
+        (steps - first.max(1)).is_multiple_of(interval)
+    }
+
+    /// Adds Gaussians to the first layer (scene, moments and statistics alike). `step` addresses the random numbers.
+    /// Errors: a picture cannot be read.
+    pub fn run(
+        &self,
+        scene: &mut Scene<f32>,
+        moments: &mut [Moments<f32>],
+        stats: &mut Stats,
+        limits: &Limits,
+        frames: &dyn Frames,
+        antialias: Antialias,
+        seed: u64,
+        step: u64,
+    ) -> Result<Change> {
+        let rng = Rng::new(seed, "guided", step);
+        let room = limits.cap.saturating_sub(scene.len());
+        let budget = room.min((scene.len() as f64 * self.share) as usize);
+        if budget == 0 || scene.layers.first().is_none_or(|l| l.params.is_empty()) {
+            return Ok(Change::default());
+        }
+        let mut points = Vec::new();
+        for (k, look) in looks(scene, frames, antialias, rng.fork(1))?.iter().enumerate() {
+            let most = budget * (k + 1) / WORST_VIEWS;
+            rays(look, frames, most.saturating_sub(points.len()), rng.fork(2 + k as u64), &mut points);
+        }
+        let rows = scene.layers[0].params.len();
+        let mut edit = RowEdit::identity(Space::Gaussians, rows);
+        points.iter().for_each(|_| edit.push(0, Born::Clone));
+        apply(scene, moments, stats, 0, &edit, &rng);
+        let clip = scene.clip[1] - scene.clip[0] + 1.0 / scene.fps;
+        let p = &mut scene.layers[0].params;
+        let still = [VELOCITIES, ROTATION_RATES].map(|name| p.find(name));
+        for (row, point) in (rows..).zip(&points) {
+            for key in [SH, LIFE].into_iter().chain(still.into_iter().flatten()) {
+                p[key].clear_row(row);
+            }
+            let geometry = &mut p[GEOMETRY];
+            geometry.write(row, 0, point.mean.map(|x| x as f32));
+            geometry.write(row, QUAT, [1.0, 0.0, 0.0, 0.0]);
+            geometry.write(row, LOG_SCALE, [point.scale.ln() as f32; 3]);
+            geometry.set(row, OPACITY, logit(OPACITY_START));
+            p[SH].write(row, 0, point.color.map(rgb_to_dc));
+            if p[LIFE].width() >= 2 {
+                // As long as the clip, around the moment at which it was missed.
+                p[LIFE].write(row, 0, [point.time.0 as f32, clip.ln() as f32]);
+            }
+        }
+        Ok(Change { added: points.len(), moved: 0, removed: 0 })
+    }
+}
+
+/// The worst of some views, evenly chosen with a random start.
+fn looks(scene: &Scene<f32>, frames: &dyn Frames, antialias: Antialias, rng: Rng) -> Result<Vec<Look>> {
+    let mut renderer = Renderer::new(RenderConfig { antialias, depth: true, ..RenderConfig::default() });
+    let (mut instant, mut image, mut picture) = (Instant::default(), Image::default(), Picture::default());
+    let mut worst: Vec<Look> = Vec::new();
+    let count = LOOKS.min(frames.len());
+    for k in 0..count {
+        let frame = ((k as f64 + rng.uniform(0)) * frames.len() as f64 / count as f64) as usize;
+        let frame = frame.min(frames.len() - 1);
+        frames.load(frame, &mut picture)?;
+        scene.at(frames.time(frame), &mut instant);
+        renderer.render(&scene.splats(&instant), frames.camera(frame), scene.background, None, &mut image);
+        let (h, w) = (image.color.height, image.color.width);
+        let mut errors = Planes::new(1, h, w);
+        for (i, error) in errors.data.iter_mut().enumerate() {
+            let counts = picture.weight.as_ref().map_or(1.0, |m| m.data[i]);
+            let apart = |c: usize| (image.color.data[c * h * w + i] - picture.color.data[c * h * w + i]).abs();
+            *error = counts * (apart(0) + apart(1) + apart(2)) / 3.0;
+        }
+        let error = errors.data.iter().map(|&e| f64::from(e)).sum::<f64>() / (h * w).max(1) as f64;
+        let depth = image.expected_depth(COVERED);
+        let seen = depth.data.iter().zip(&image.alpha.data).filter(|(_, a)| **a >= COVERED);
+        let farthest = seen.map(|(d, _)| *d).fold(0.0, f32::max);
+        if farthest > 0.0 {
+            worst.push(Look { frame, error, errors, truth: picture.color.clone(), farthest });
+            worst.sort_by(|a, b| b.error.total_cmp(&a.error).then(a.frame.cmp(&b.frame)));
+            worst.truncate(WORST_VIEWS);
+        }
+    }
+    Ok(worst)
+}
+
+/// A Gaussian to be.
+struct Point {
+    mean: [f64; 3],
+    color: [f32; 3],
+    scale: f64,
+    time: Time,
+}
+
+/// Adds at most `most` points along the rays of a view's worst patches, the worst first.
+fn rays(look: &Look, frames: &dyn Frames, most: usize, rng: Rng, points: &mut Vec<Point>) {
+    let camera: &Camera = frames.camera(look.frame);
+    let (h, w) = (look.errors.height, look.errors.width);
+    let mut sorted = look.errors.data.clone();
+    sorted.sort_by(f32::total_cmp);
+    let limit = sorted[((1.0 - WRONG) * (sorted.len() - 1) as f64) as usize];
+    let (left, top) = ((BORDER * w as f64) as usize, (BORDER * h as f64) as usize);
+    let mut patches = Vec::new();
+    for y in (top..h.saturating_sub(top + PATCH - 1)).step_by(PATCH) {
+        for x in (left..w.saturating_sub(left + PATCH - 1)).step_by(PATCH) {
+            let pixels = (0..PATCH * PATCH).map(|i| look.errors.data[(y + i / PATCH) * w + x + i % PATCH]);
+            let (mut wrong, mut sum) = (0, 0.0);
+            for e in pixels {
+                wrong += usize::from(e > limit);
+                sum += f64::from(e);
+            }
+            if wrong as f64 >= WRONG_IN_PATCH * (PATCH * PATCH) as f64 {
+                patches.push((sum, x, y));
+            }
+        }
+    }
+    patches.sort_by(|a, b| b.0.total_cmp(&a.0).then((a.2, a.1).cmp(&(b.2, b.1))));
+    let pixels = patches.iter().flat_map(|&(_, x, y)| {
+        let side = PATCH / STRIDE;
+        (0..side * side).map(move |i| (x + i % side * STRIDE, y + i / side * STRIDE))
+    });
+    for (i, (x, y)) in pixels.take(most).enumerate() {
+        let shell = (i % SHELLS) as f64 / (SHELLS - 1) as f64;
+        let jitter = 1.0 + JITTER * (2.0 * rng.uniform(i as u64) - 1.0);
+        let z = f64::from(look.farthest) * DEPTHS[0] * (DEPTHS[1] / DEPTHS[0]).powf(shell) * jitter;
+        points.push(Point {
+            mean: camera.unproject([x as f64 + 0.5, y as f64 + 0.5], z),
+            color: std::array::from_fn(|c| look.truth.data[(c * h + y) * w + x]),
+            // As far apart as the rays.
+            scale: STRIDE as f64 * z / camera.intrinsics.fx,
+            time: frames.time(look.frame),
+        });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::scene;
+    use super::*;
+    use crate::train::tests::Made;
+
+    #[test]
+    fn gaussians_appear_along_the_rays_of_what_is_wrong_under_the_cap() {
+        let frames = Made::new(6, 2, 64);
+        let run = |cap: usize| {
+            let mut s = scene(200);
+            let mut moments: Vec<_> = s.layers.iter().map(|l| Moments::new(&l.params)).collect();
+            let mut stats = Stats::new(&s);
+            let guided = Guided { from: 0.2, times: 2, share: 0.5 };
+            let limits = Limits { cap, extent: 4.0, min_opacity: 0.005 };
+            let change = guided.run(&mut s, &mut moments, &mut stats, &limits, &frames, Antialias::Off, 3, 9).unwrap();
+            assert_eq!((s.len(), moments[0].table(GEOMETRY).rows()), (200 + change.added, s.len()));
+            s
+        };
+        let s = run(1000);
+        assert!(s.len() > 210, "{} Gaussians", s.len());
+        let g = &s.layers[0].params[GEOMETRY];
+        for row in 200..s.len() {
+            let mean = g.read::<3>(row, 0).map(f64::from);
+            // Somewhere it stands at the middle of a pixel of a frame, in that pixel's colour.
+            let dc = s.layers[0].params[SH].read::<3>(row, 0);
+            let found = (0..12).any(|i| {
+                let Some(([u, v], _)) = frames.camera(i).project(mean) else { return false };
+                let mut picture = Picture::default();
+                frames.load(i, &mut picture).unwrap();
+                let (x, y) = (u - 0.5, v - 0.5);
+                let inside = |a: f64| (a - a.round()).abs() < 1e-3 && (0.0..64.0).contains(&a.round());
+                inside(x) && inside(y) && {
+                    let at = |c: usize| picture.color.data[(c * 64 + y.round() as usize) * 64 + x.round() as usize];
+                    dc == [at(0), at(1), at(2)].map(rgb_to_dc)
+                }
+            });
+            assert!(found, "row {row}");
+            assert!((g.get(row, OPACITY) - logit(0.1)).abs() < 1e-6);
+        }
+        assert_eq!(run(205).len(), 205);
+        assert_eq!(run(1000).layers[0].params[GEOMETRY].data(), s.layers[0].params[GEOMETRY].data());
+    }
+
+    #[test]
+    fn it_is_due_as_often_as_was_asked() {
+        let guided = Guided { from: 0.25, times: 3, share: 0.1 };
+        let due: Vec<usize> = (1..=400).filter(|&s| guided.is_due(s, 400)).collect();
+        assert_eq!(due, [100, 167, 234]);
+    }
+}

@@ -1,0 +1,142 @@
+//! Periodic relocation, beside any strategy: the faintest Gaussians go where the picture still wants to change, a few at a
+//! time, so that none is wasted, also after densification has ended.
+//!
+//! Source: Wang et al. 2025 (FreeTimeGS) §3.3: every 100 steps, below a threshold of opacity, to places drawn from ½
+//! gradient and ½ opacity; the correction of opacity and scale is that of 3DGS as MCMC (Kheradmand et al. 2024).
+
+use super::mcmc::{Places, join};
+use super::{Change, Limits, Stats, is_dead, opacity};
+use crate::optim::Moments;
+use crate::recipe::Recipe;
+use splat4d::layers::Scene;
+use splat4d::math::Rng;
+
+/// See the module's documentation.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Relocate {
+    /// First step of the stage that relocates.
+    pub from: usize,
+    /// Steps between two times.
+    pub interval: usize,
+    /// Gaussians less opaque than this are moved; those that can never be seen are as well.
+    pub threshold: f64,
+    /// Most of a layer's Gaussians that are moved at once, a share.
+    pub share: f64,
+    /// Share of the gradient, against opacity, in where they go.
+    pub gradient_share: f64,
+}
+
+impl Relocate {
+    /// As the recipe has it; `None`: never.
+    pub fn of(r: &Recipe) -> Option<Self> {
+        let some = Self {
+            from: r.relocate_from_iter,
+            interval: r.relocate_interval,
+            threshold: r.relocate_opacity,
+            share: r.relocate_share,
+            gradient_share: r.relocate_gradient,
+        };
+        (r.relocate_interval > 0).then_some(some)
+    }
+
+    /// Whether it is time after so many steps of a stage of `iterations`: not in the last interval, in which those that
+    /// moved would learn nothing any more.
+    pub fn is_due(&self, steps: usize, iterations: usize) -> bool {
+        steps >= self.from && steps.is_multiple_of(self.interval) && iterations.saturating_sub(steps) >= self.interval
+    }
+
+    /// Moves rows of every layer (scene, moments and statistics alike); their number stays. `step` addresses the random
+    /// numbers.
+    pub fn run(
+        &self,
+        scene: &mut Scene<f32>,
+        moments: &mut [Moments<f32>],
+        stats: &mut Stats,
+        limits: &Limits,
+        seed: u64,
+        step: u64,
+    ) -> Change {
+        let mut moved = 0;
+        for layer in 0..scene.layers.len() {
+            let rows = scene.layers[layer].params.len();
+            let spans = scene.layers[layer].spans();
+            let faint = |r: usize| is_dead(scene, layer, r, self.threshold, spans[r]);
+            let (mut moves, live): (Vec<usize>, Vec<usize>) = (0..rows).partition(|&r| faint(r));
+            if live.is_empty() {
+                continue;
+            }
+            // The faintest first; equal ones in their order.
+            moves.sort_by(|&a, &b| opacity(scene, layer, a).total_cmp(&opacity(scene, layer, b)).then(a.cmp(&b)));
+            moves.truncate((rows as f64 * self.share) as usize);
+            moves.sort_unstable();
+            let moves: Vec<u32> = moves.into_iter().map(|r| r as u32).collect();
+            if moves.is_empty() {
+                continue;
+            }
+            moved += moves.len();
+            let places = Places::new(scene, stats, layer, live, self.gradient_share);
+            let rng = Rng::new(seed, "relocate", step).fork(layer as u64);
+            join(scene, moments, stats, layer, limits, &places, &moves, 0, rng);
+        }
+        Change { added: 0, moved, removed: 0 }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::scene;
+    use super::*;
+    use splat4d::layers::Instant;
+    use splat4d::math::Se3;
+    use splat4d::render::{Image, RenderConfig, Renderer};
+    use splat4d::scene::params::{LOG_SCALE, OPACITY};
+    use splat4d::scene::{Camera, GEOMETRY, Time};
+
+    const RELOCATE: Relocate = Relocate { from: 10, interval: 5, threshold: 0.02, share: 0.1, gradient_share: 0.5 };
+
+    fn picture(s: &Scene<f32>) -> Vec<f32> {
+        let pose = Se3::look_at([0.0, 0.5, -6.0], [0.0; 3], [0.0, 1.0, 0.0]);
+        let camera = Camera::with_fov_y(pose, 0.8, 64, 64);
+        let (mut instant, mut image) = (Instant::default(), Image::default());
+        s.at(Time(0.5), &mut instant);
+        Renderer::new(RenderConfig::default()).render(&s.splats(&instant), &camera, [0.1; 3], None, &mut image);
+        image.color.data
+    }
+
+    #[test]
+    fn the_faintest_move_a_few_at_a_time_and_the_picture_stays() {
+        let mut s = scene(200);
+        let g = &mut s.layers[0].params[GEOMETRY];
+        for r in 0..200 {
+            g.write(r, LOG_SCALE, [-1.5f32; 3]);
+            // Those that go are below what is drawn at all, so that only the arrival could be seen.
+            g.set(r, OPACITY, if r < 30 { -6.0 - 0.1 * r as f32 } else { -1.0 });
+        }
+        let before = picture(&s);
+        let mut moments: Vec<_> = s.layers.iter().map(|l| Moments::new(&l.params)).collect();
+        let mut stats = Stats::new(&s);
+        // Row 150 alone has a gradient: half of all draws are its.
+        stats.tables[0].write(150, 0, [1.0, 1.0, 3.0]);
+        let limits = Limits { cap: 300, extent: 4.0, min_opacity: 0.005 };
+        let change = RELOCATE.run(&mut s, &mut moments, &mut stats, &limits, 1, 7);
+        assert_eq!((change, s.len()), (Change { added: 0, moved: 20, removed: 0 }, 200));
+        let opaque = |r: usize| opacity(&s, 0, r);
+        assert!((0..10).all(|r| opaque(r) < 0.02), "the less faint stay");
+        assert!((10..30).all(|r| opaque(r) > 0.01));
+        let at = |r: usize| s.layers[0].params[GEOMETRY].get(r, 0);
+        let drawn = (10..30).filter(|&r| at(r) == at(150)).count();
+        assert!((5..=15).contains(&drawn), "{drawn} of 20 followed the gradient");
+        let after = picture(&s);
+        let mut sorted: Vec<f32> = before.iter().zip(&after).map(|(a, b)| (a - b).abs()).collect();
+        sorted.sort_by(f32::total_cmp);
+        assert!(before.iter().filter(|x| (**x - 0.1).abs() > 0.05).count() > 500, "the test must look at something");
+        let mean = sorted.iter().sum::<f32>() / sorted.len() as f32;
+        assert!(mean < 1.0 / 255.0, "mean change {mean}");
+    }
+
+    #[test]
+    fn it_is_due_at_its_interval_but_not_at_the_end() {
+        let due: Vec<usize> = (1..=30).filter(|&s| RELOCATE.is_due(s, 30)).collect();
+        assert_eq!(due, [10, 15, 20, 25]);
+    }
+}
