@@ -1,6 +1,7 @@
-//! `lab`: studies that vary what methods leave open, on runs of one's own.
+//! `lab`: studies that vary what methods leave open, on runs and captures of one's own.
 
 mod cells;
+mod e02;
 mod e03;
 mod study;
 mod tables;
@@ -9,12 +10,13 @@ use crate::console::Console;
 
 const EXAMPLES: &str = "\
 Examples:
+  splat4d lab e02 examples/knight          what do the temporal filter and the transport regularisers change?
   splat4d lab e03 runs/knight              how much can be pruned, by which score, and what does the filter cost?
   splat4d lab e03 runs/knight --quick
 
 A study can be stopped at any time and goes on where it was.";
 
-/// Study methods on trained runs: tables and curves of what they gain and lose
+/// Study methods on runs and captures: tables and curves of what they gain and lose
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
@@ -24,11 +26,13 @@ pub(crate) struct Args {
 
 #[derive(Debug, clap::Subcommand)]
 enum Study {
+    E02(e02::Args),
     E03(e03::Args),
 }
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     match &args.study {
+        Study::E02(args) => e02::run(args, console),
         Study::E03(args) => e03::run(args, console),
     }
 }

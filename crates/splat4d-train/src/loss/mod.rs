@@ -6,5 +6,6 @@ mod kernel;
 pub mod photometric;
 pub mod scene;
 pub mod terms;
+pub mod transport;
 
 pub use photometric::{LossValue, Photometric};

@@ -2,6 +2,7 @@
 //! ordinary trainer and checked against f64 finite differences through the whole chain, the oracle as the forward.
 
 mod edits;
+mod filtered;
 mod layers;
 mod lobes;
 mod nodes;

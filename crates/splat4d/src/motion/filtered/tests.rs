@@ -98,10 +98,14 @@ fn the_safe_form_shrinks_nothing_and_ends_at_its_ends() {
 fn gradients_of_a_row_equal_differences() {
     let mut faded = 0;
     for seed in 0..12 {
-        let at = [0, 1, 2].map(|i| normal(seed, i, 0.25));
         let w = normal(seed, 9, 1.0);
         for (_, fusion) in Fusion::ALL {
             for (_, predictor) in Predictor::ALL {
+                // Straight covariances that need no lift: its floor is a constant to the gradient.
+                let mut at = [0, 1, 2].map(|i| normal(seed, i, 0.25));
+                if predictor == Predictor::Euclidean {
+                    at[2].cov = mix(0.7, &at[1].cov, 0.3, &at[2].cov);
+                }
                 // Gates from never through half open to nearly closed.
                 for gate in [0.0, 0.3, 1.0, GATE] {
                     faded += check_row(at, &w, fusion, predictor, gate);
@@ -220,7 +224,7 @@ fn noise_around_a_steady_path_is_calmed_and_an_onset_is_not_lagged() {
         .map(|(i, x)| std::array::from_fn(|k| x[k] + NOISE * rng.fork(i as u64).normal(k as u64)))
         .collect();
     let off = followed(seen.clone(), |s| s.fusion = Fusion::Off);
-    assert_eq!(off, seen);
+    assert!(rmse(&off, &seen) < 1e-12);
     let raw = rmse(&seen, &truth);
     let calm = followed(seen.clone(), |s| (s.baseline, s.history, s.gain) = (4, 24, 0.4));
     assert!(rmse(&calm, &truth) < 0.7 * raw, "{} of {raw}", rmse(&calm, &truth));
@@ -283,9 +287,8 @@ fn filled<F: Real>(spec: &Spec, rows: usize) -> (Params<F>, Arc<dyn Motion<F>>) 
 #[test]
 fn with_the_gradient_stopped_only_the_observation_learns() {
     let around = FilteredSpec { fusion: Fusion::Geodesic, ..FilteredSpec::around(spacetime(), 0.05, 0.0) };
-    let (p, _) = filled::<f64>(&Spec::Filtered(around.clone()), 9);
     let of = |spec: FilteredSpec| {
-        let model = build_model::<f64>(&Spec::Filtered(spec), &mut p.clone()).unwrap();
+        let (p, model) = filled::<f64>(&Spec::Filtered(spec), 9);
         let q = At { p: &p, of: Space::Gaussians, rows: Rows::All, t: Time(0.62) };
         let (mut cache, mut tape, mut d_cache) = (Cache::default(), Tape::default(), Cache::default());
         model.prepare(&p, &[q], &mut cache);
@@ -301,12 +304,12 @@ fn with_the_gradient_stopped_only_the_observation_learns() {
     };
     let whole = of(FilteredSpec { stop_gradient: false, ..around.clone() });
     let stopped = of(around.clone());
+    let gains = filled::<f64>(&Spec::Filtered(around), 9).0.find(GAINS).unwrap();
     for j in 0..9 {
         // μ = κμₒ + (1−κ)(2μ₁−μ₂): all of it is one to the canonical mean, κ alone where earlier answers are constants.
         assert!((whole.table(GEOMETRY).get(j, 0) - 1.0).abs() < 1e-9);
         let kept = stopped.table(GEOMETRY).get(j, 0);
         assert!(kept > 0.2 && kept < 0.9, "{kept}");
-        let gains = p.find(GAINS).unwrap();
         assert_eq!(whole.table(gains).get(j, 0), stopped.table(gains).get(j, 0), "the gain learns in both");
     }
 }
@@ -386,7 +389,8 @@ fn a_filter_forwards_colour_life_and_size_while_it_fuses() {
     let around = FilteredSpec { fusion: Fusion::Geodesic, ..FilteredSpec::around(spacetime(), 0.05, 0.0) };
     let (p, model) = filled::<f64>(&Spec::Filtered(around), 12);
     let out = ask(model.as_ref(), &p, 0.7);
-    let plain = ask(build_model::<f64>(&spacetime(), &mut p.clone()).unwrap().as_ref(), &p, 0.7);
+    let (same, inner) = filled::<f64>(&spacetime(), 12);
+    let plain = ask(inner.as_ref(), &same, 0.7);
     for j in 0..12 {
         assert_eq!(out.get(j, SPLAT_OPACITY), plain.get(j, SPLAT_OPACITY));
         assert!(out.read::<3>(j, 0) != plain.read::<3>(j, 0), "something is filtered");
