@@ -5,6 +5,7 @@
 //! Iteration knobs left at 0 follow from `iterations` (see [`Recipe::resolve`]).
 
 use crate::{Error, Result};
+use splat4d::motion::filtered::{Fusion, MAX_BASELINE, MAX_HISTORY, Predictor};
 use serde::{Deserialize, Serialize};
 use splat4d::motion::native4d::MAX_HARMONICS;
 
@@ -321,6 +322,42 @@ recipe! {
     // ssm.
 
     // filtered.
+    /// filter: how prediction and the motion's answer merge: off, geodesic (a learnt share) or literal (as published).
+    filter: String = "off".into(),
+    /// filter, transport: how shapes go on: wasserstein (log and exp), euclidean (numbers go straight) or hold (stay).
+    filter_predictor: String = "wasserstein".into(),
+    /// filter: share of the iterations after which it is switched on.
+    filter_start: f64 = 0.2,
+    /// filter: share of the motion's answer that Gaussians start with; the rest is the prediction's.
+    filter_gain: f64 = 0.5,
+    /// filter: rate of the gains' logits.
+    filter_lr: f64 = 0.01,
+    /// filter: frames between the two states that a velocity is taken from.
+    filter_baseline: usize = 1,
+    /// filter: frames of history that it runs through before every answer; 0: it predicts from the motion's own answers.
+    filter_history: usize = 0,
+    /// filter: squared Mahalanobis distance at which a prediction is dropped; 0: never.
+    filter_gate: f64 = 11.3,
+    /// filter: whether the gradient stops at earlier frames.
+    filter_stop_gradient: bool = true,
+    /// filter: whether the finished scene keeps the filter; else the motion alone is saved, which plays faster.
+    filter_keep: bool = false,
+    /// transport: distances over time that training keeps small: off, linear (means) or wasserstein (Gaussians).
+    transport: String = "off".into(),
+    /// transport: weight of small motion (first order), per squared extent.
+    transport_temporal: f64 = 0.0,
+    /// transport: weight of constant velocity (second order), per squared extent.
+    transport_second: f64 = 10.0,
+    /// transport: weight of drawing what is seen to what was predicted, per squared extent.
+    transport_align: f64 = 0.0,
+    /// transport: what shapes count for, against positions.
+    transport_covariance: f64 = 100.0,
+    /// transport: share of the steps that look at three frames.
+    transport_every: f64 = 0.25,
+    /// transport: share of a stage after which it begins.
+    transport_start: f64 = 0.2,
+    /// transport: share of a stage over which it grows to its weight.
+    transport_ramp: f64 = 0.13,
 
     // Losses.
 
@@ -494,14 +531,26 @@ impl Recipe {
             ("relocate_share", self.relocate_share),
             ("guided_from", self.guided_from),
             ("guided_share", self.guided_share),
+            ("filter_start", self.filter_start),
+            ("transport_every", self.transport_every),
+            ("transport_start", self.transport_start),
+            ("transport_ramp", self.transport_ramp),
         ];
         for (knob, value) in shares {
             if !(0.0..=1.0).contains(&value) {
                 return bad(knob, value.to_string(), "between 0 and 1");
             }
         }
-        if !(self.init_opacity > 0.0 && self.init_opacity < 1.0) {
-            return bad("init_opacity", self.init_opacity.to_string(), "above 0 and below 1");
+        for (knob, value) in [("init_opacity", self.init_opacity), ("filter_gain", self.filter_gain)] {
+            if !(value > 0.0 && value < 1.0) {
+                return bad(knob, value.to_string(), "above 0 and below 1");
+            }
+        }
+        if !(1..=MAX_BASELINE).contains(&self.filter_baseline) {
+            return bad("filter_baseline", self.filter_baseline.to_string(), &format!("1 to {MAX_BASELINE}"));
+        }
+        if self.filter_history > MAX_HISTORY {
+            return bad("filter_history", self.filter_history.to_string(), &format!("at most {MAX_HISTORY}"));
         }
         for (knob, value) in [
             ("iterations", self.iterations),
@@ -538,6 +587,9 @@ impl Recipe {
             ("control_trajectory", &self.control_trajectory, &crate::models::control::TRAJECTORIES[..]),
             ("strategy", &self.strategy, &["mcmc", "adc", "none"][..]),
             ("deform_trunk", &self.deform_trunk, &["mlp", "small", "hash", "hash-linear"][..]),
+            ("filter", &self.filter, &Fusion::ALL.map(|(name, _)| name)[..]),
+            ("filter_predictor", &self.filter_predictor, &Predictor::ALL.map(|(name, _)| name)[..]),
+            ("transport", &self.transport, &["off", "linear", "wasserstein"][..]),
         ] {
             if !known.contains(&value.as_str()) {
                 let near = nearest(value, known).map(|n| format!("; did you mean `{n}`?")).unwrap_or_default();

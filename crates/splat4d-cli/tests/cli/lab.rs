@@ -1,4 +1,4 @@
-//! `lab e03` on a tiny run: every cell is measured once, and what is found can be trusted.
+//! `lab` on a tiny run and a tiny capture: every cell is measured once, and what is found can be trusted.
 
 use crate::sample::{Capture, splat4d};
 use crate::{json_of, str, train};
@@ -66,4 +66,47 @@ fn a_study_of_pruning_measures_every_cell_once() {
     assert!(study().run().refused().contains("e03.json"));
     let none = splat4d(&["lab", "e03", str(&folder)]).run().refused();
     assert!(none.contains("is not a run"), "{none}");
+}
+
+#[test]
+fn the_filter_is_studied_part_by_part() {
+    let work = tempfile::tempdir().unwrap();
+    let capture = Capture::new(work.path()).write();
+    let folder = work.path().join("study");
+    let study = || {
+        let small = ["--set=num_pts=120", "--set=max_cap=150", "--set=sh_degree=1", "--set=hold_out=camera=1"];
+        let order = ["lab", "e02", str(&capture), "-o", str(&folder), "--quick", "--motion", "spacetime"];
+        splat4d(&order).args(&["--iterations", "16", "--downscale", "1"]).args(&small)
+    };
+    let lines = study().args(&["--json"]).run().ok();
+    let cells = |lines: &str| -> Vec<Value> {
+        let all = lines.lines().map(|l| serde_json::from_str::<Value>(l).unwrap());
+        all.filter(|e| e["type"] == "cell").map(|e| e["cell"].clone()).collect()
+    };
+    let found = cells(&lines);
+    let keys: Vec<&str> = found.iter().map(|c| c["key"].as_str().unwrap()).collect();
+    assert_eq!(keys, ["alone", "filter", "linear", "w2", "both"]);
+    let psnr = |i: usize| found[i]["psnr"].as_f64().unwrap();
+    assert!((0..5).all(|i| psnr(i) > 5.0 && found[i]["minutes"].as_f64().unwrap() > 0.0));
+    // Every part changes something, and none of them everything.
+    assert!((1..5).all(|i| psnr(i) != psnr(0) && (psnr(i) - psnr(0)).abs() < 3.0), "{found:?}");
+    assert!(found[0]["flow"].is_null(), "the capture has no truth of flow");
+    assert!(!folder.join("work").exists());
+    let page = std::fs::read_to_string(folder.join("e02.md")).unwrap();
+    assert!(page.contains("| the motion alone |") && page.contains("| filter and W2 regulariser |"), "{page}");
+    assert!(folder.join("e02.svg").is_file());
+
+    // Nothing is measured twice; what is lost is measured again and is the same: seeds are fixed.
+    assert!(cells(&study().args(&["--json"]).run().ok()).is_empty());
+    let file = folder.join("e02.json");
+    let mut cut = json_of(&file);
+    cut["cells"].as_array_mut().unwrap().truncate(4);
+    std::fs::write(&file, cut.to_string()).unwrap();
+    let again = cells(&study().args(&["--json"]).run().ok());
+    assert_eq!(again.len(), 1);
+    assert_eq!(again[0]["psnr"], found[4]["psnr"]);
+    std::fs::write(&file, "{}").unwrap();
+    assert!(study().run().refused().contains("e02.json"));
+    let none = splat4d(&["lab", "e02", str(&folder)]).run().refused();
+    assert!(none.contains("study"), "{none}");
 }

@@ -11,5 +11,6 @@ pub mod planes;
 pub mod scene;
 pub mod terms;
 pub mod tracked;
+pub mod transport;
 
 pub use photometric::{LossValue, Photometric};

@@ -5,6 +5,7 @@
 pub mod auto;
 pub mod control;
 pub mod deform;
+pub mod filtered;
 pub mod hexplane;
 pub mod native4d;
 pub mod spacetime;
@@ -200,6 +201,9 @@ pub struct Stage<F: Real = f32> {
     pub codec: Option<Arc<dyn Codec<F>>>,
     /// Before the first step.
     pub start: Option<Hook<F>>,
+    /// Before the step with this number (the stage's first is 0), without ending the stage: its schedules go on. After a
+    /// resume it may run once more, and must then change nothing.
+    pub switch: Option<(usize, Hook<F>)>,
     /// After the last.
     pub end: Option<Hook<F>>,
 }
@@ -230,6 +234,7 @@ impl<F: Real> Stage<F> {
             freeze_exposure: false,
             codec: None,
             start: None,
+            switch: None,
             end: None,
         }
     }
@@ -276,9 +281,16 @@ pub fn program(motion: &str) -> Result<Box<dyn Program>> {
         "native4d" => Ok(Box::new(native4d::Native4dProgram)),
         "control" => Ok(Box::new(control::ControlProgram)),
         "ssm" => Ok(Box::new(ssm::SsmProgram)),
+        "filtered" => Err(Error::input("`filtered` is no motion of its own: it wraps another")
+            .remedy("Name the motion to be filtered, and add --set filter=geodesic")),
         other => Err(Error::input(format!("there is no motion model `{other}`"))
             .remedy(format!("Use one of: {}", splat4d::motion::BUILT_IN.join(", ")))),
     }
+}
+
+/// The program of a recipe: that of its motion, with the losses over time and the filter that the recipe asks for.
+pub fn program_of(recipe: &Recipe) -> Result<Box<dyn Program>> {
+    filtered::wrap(program(&recipe.motion)?, recipe)
 }
 
 /// The strategy and its steps as the recipe has them.

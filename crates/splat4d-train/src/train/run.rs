@@ -16,6 +16,7 @@ use crate::event::Event;
 use crate::init::{self, Seeds};
 use crate::models::auto::{self, AUTO};
 use crate::models::{Plan, Stage, program, split};
+use crate::models::{Plan, Stage, program_of};
 use crate::recipe::Recipe;
 use crate::{Error, ErrorKind, Result};
 use serde_json::json;
@@ -107,6 +108,7 @@ pub fn train(
     }
     .resolve();
     let plan = bench.plan(&recipe);
+    program_of(&recipe)?.check(&plan)?;
     let estimate = memory_estimate(&bench.capture, &recipe);
     if recipe.memory_limit > 0 && estimate > recipe.memory_limit {
         return Err(Error::new(
@@ -158,7 +160,7 @@ pub fn resume_with(
     let bench = Bench::new(Arc::new(capture), &recipe)?;
     let plan = bench.plan(&recipe);
     let empty =
-        init::scene(&plan, program(&recipe.motion)?.as_ref(), &Seeds::default(), bench.background(), bench.capture.up)?;
+        init::scene(&plan, program_of(&recipe)?.as_ref(), &Seeds::default(), bench.background(), bench.capture.up)?;
     let mut trainer = bench.trainer(&plan, empty)?;
     let session = Session {
         run,
@@ -308,7 +310,7 @@ impl Bench {
     }
 
     pub(super) fn initial_scene(&self, plan: &Plan) -> Result<Scene<f32>> {
-        let program = program(&plan.recipe.motion)?;
+        let program = program_of(&plan.recipe)?;
         let moving = plan.recipe.motion != "still" && plan.times > 1;
         let init = &plan.recipe.init;
         let points = if init.ends_with(".ply") {
@@ -342,6 +344,7 @@ impl Bench {
     pub(super) fn trainer(&self, plan: &Plan, scene: Scene<f32>) -> Result<Trainer<'static>> {
         let program = program(&plan.recipe.motion)?;
         Ok(self.trainer_of(plan, scene, split::stages(program.as_ref(), plan)))
+        Ok(self.trainer_of(plan, scene, program_of(&plan.recipe)?.stages(plan)))
     }
 
     /// A trainer with stages that no program made.

@@ -98,6 +98,8 @@ pub struct Trainer<'a> {
     stale: bool,
     /// Whether the current stage's start is over although it has taken no step.
     entered: bool,
+    /// Whether its switch is over.
+    switched: bool,
     frames: Arc<dyn Frames>,
     timeline: Timeline,
     draw: Box<dyn Draw<f32> + 'a>,
@@ -131,6 +133,7 @@ impl<'a> Trainer<'a> {
             shown: Scene::default(),
             stale: true,
             entered: false,
+            switched: false,
             frames,
             timeline,
             draw,
@@ -207,7 +210,7 @@ impl<'a> Trainer<'a> {
     /// Takes over a checkpoint's state. The scene and all tables must belong together.
     pub fn restore(&mut self, scene: Scene<f32>, moments: Vec<Moments<f32>>, stats: Stats, progress: Progress) {
         (self.scene, self.moments, self.stats, self.progress) = (scene, moments, stats, progress);
-        (self.stale, self.entered) = (true, false);
+        (self.stale, self.entered, self.switched) = (true, false, false);
         self.fit_grads();
     }
 
@@ -221,6 +224,10 @@ impl<'a> Trainer<'a> {
                 (self.entered, self.stale) = (true, true);
             }
             if !empty {
+                let due = stage.switch.as_ref().is_some_and(|(step, _)| *step == self.progress.stage_step);
+                if due && !std::mem::replace(&mut self.switched, true) {
+                    self.run_hook(|s| s.switch.as_ref().map(|(_, hook)| hook), tell)?;
+                }
                 return Ok(());
             }
             self.leave_stage(tell)?;
@@ -232,7 +239,7 @@ impl<'a> Trainer<'a> {
         self.run_hook(|s| s.end.as_ref(), tell)?;
         self.progress.stage += 1;
         self.progress.stage_step = 0;
-        self.entered = false;
+        (self.entered, self.switched) = (false, false);
         Ok(())
     }
 

@@ -44,7 +44,7 @@ impl Scene<f32> {
     /// Errors: a layer moves by a model from outside this library, whose parameters nobody here can turn.
     pub fn turn(&mut self, r: &[[f64; 3]; 3]) -> Result<()> {
         for layer in &self.layers {
-            if let Spec::Custom(name) = layer.motion.spec() {
+            if let Spec::Custom(name) = layer.motion.spec().core() {
                 let what = format!("layer `{}` moves by `{name}`, which cannot be turned", layer.name);
                 return Err(Error::new(ErrorKind::Unsupported, what)
                     .remedy("Take single moments (--time, --frames), or keep the axes as they are (--up keep)."));
@@ -65,6 +65,8 @@ impl Scene<f32> {
                 }
             }
             if let Spec::Spacetime(SpacetimeSpec { order, rotation, .. }) = layer.motion.spec() {
+            turn_colors(&mut layer.params[SH], &m);
+            if let Spec::Spacetime(SpacetimeSpec { order, rotation, .. }) = *layer.motion.spec().core() {
                 let find = |name| layer.params.find(name).expect("a spacetime layer has its tables");
                 let (velocities, rates) = (find(VELOCITIES), find(ROTATION_RATES));
                 let table = &mut layer.params[velocities];

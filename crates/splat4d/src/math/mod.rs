@@ -9,6 +9,7 @@ pub mod rng;
 pub mod se3;
 pub mod sh;
 pub mod sh_turn;
+pub mod spd;
 pub mod sym3;
 pub mod twist;
 

@@ -148,6 +148,14 @@ impl Spec {
             Spec::Custom(name) => name,
         }
     }
+
+    /// The model itself, without a filter around it.
+    pub fn core(&self) -> &Spec {
+        match self {
+            Spec::Filtered(f) => &f.inner,
+            other => other,
+        }
+    }
 }
 
 /// Every model of [`Spec`] that the library can build, by name.
@@ -222,18 +230,23 @@ pub trait Motion<F: Real = f32>: Any + Send + Sync {
 
     /// dμ/dt in scene units a second, [rows, 3]: central differences over ± [`VELOCITY_STEP`] unless a model knows better.
     fn velocity(&self, q: &At<'_, F>, out: &mut Table<F>) {
-        let sides = [-VELOCITY_STEP, VELOCITY_STEP].map(|h| {
-            let side = At { t: Time(q.t.0 + h), ..*q };
-            let (mut cache, mut tape) = (Cache::default(), Tape::default());
-            self.prepare(q.p, &[side], &mut cache);
-            self.at(&side, &cache, &mut tape);
-            tape.out
-        });
-        *out = Table::new(&[("velocity", 3)], q.len());
-        for j in 0..q.len() {
-            let (a, b) = (sides[0].read::<3>(j, 0), sides[1].read::<3>(j, 0));
-            out.write(j, 0, std::array::from_fn::<F, 3, _>(|k| (b[k] - a[k]) / F::of(2.0 * VELOCITY_STEP)));
-        }
+        central_velocity(self, q, out);
+    }
+}
+
+/// dμ/dt by central differences over ± [`VELOCITY_STEP`].
+pub fn central_velocity<F: Real, M: Motion<F> + ?Sized>(model: &M, q: &At<'_, F>, out: &mut Table<F>) {
+    let sides = [-VELOCITY_STEP, VELOCITY_STEP].map(|h| {
+        let side = At { t: Time(q.t.0 + h), ..*q };
+        let (mut cache, mut tape) = (Cache::default(), Tape::default());
+        model.prepare(q.p, &[side], &mut cache);
+        model.at(&side, &cache, &mut tape);
+        tape.out
+    });
+    *out = Table::new(&[("velocity", 3)], q.len());
+    for j in 0..q.len() {
+        let (a, b) = (sides[0].read::<3>(j, 0), sides[1].read::<3>(j, 0));
+        out.write(j, 0, std::array::from_fn::<F, 3, _>(|k| (b[k] - a[k]) / F::of(2.0 * VELOCITY_STEP)));
     }
 }
 

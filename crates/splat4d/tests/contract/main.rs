@@ -8,6 +8,7 @@ use splat4d::motion::skin::SkinSpec;
 use splat4d::motion::deform::{DeformSpec, Input};
 use splat4d::motion::tracked::TrackedSpec;
 use splat4d::motion::native4d::Native4dSpec;
+use splat4d::motion::filtered::{FilteredSpec, Fusion, Predictor};
 use splat4d::motion::{SpacetimeSpec, Spec};
 use splat4d::nn::HashShape;
 use splat4d::motion::hexplane::{Heads, HexplaneSpec};
@@ -126,3 +127,22 @@ fn control() {
 // ssm.
 
 // filtered.
+
+#[test]
+fn filtered() {
+    let inner = Spec::Spacetime(SpacetimeSpec { order: 2, rotation: true, detach: false, origin: 0.5 });
+    let around = FilteredSpec { stop_gradient: false, ..FilteredSpec::around(inner, 0.05, 0.0) };
+    for (fusion, predictor, baseline) in [
+        (Fusion::Geodesic, Predictor::Wasserstein, 1),
+        (Fusion::Geodesic, Predictor::Euclidean, 3),
+        (Fusion::Literal, Predictor::Hold, 1),
+        (Fusion::Literal, Predictor::Wasserstein, 2),
+        (Fusion::Off, Predictor::Wasserstein, 1),
+    ] {
+        let spec = Spec::Filtered(FilteredSpec { fusion, predictor, baseline, ..around.clone() });
+        model(&spec, ROWS, LifeKind::GaussHalf, &[Space::Gaussians], &[]);
+        if fusion != Fusion::Literal {
+            starts_still(&spec, ROWS);
+        }
+    }
+}

@@ -30,9 +30,6 @@ const STEPS_SHARE: f64 = 1.0 / 6.0;
 const QUICK_SHARE: f64 = 1.0 / 30.0;
 /// Width and height of the pictures that speed is measured on with `--quick`.
 const QUICK_SIZE: [usize; 2] = [200, 200];
-/// Prints that tell two scenes apart: FNV-1a, 64 bits.
-const FNV_OFFSET: u64 = 0xcbf2_9ce4_8422_2325;
-const FNV_PRIME: u64 = 0x0000_0100_0000_01b3;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -145,7 +142,7 @@ impl Bench {
         let run = Run::open(path)?;
         let file = run.scene_file()?;
         let bytes = std::fs::read(&file).map_err(|e| files::cannot_read(&file, e))?;
-        let print = bytes.iter().fold(FNV_OFFSET, |h, b| (h ^ u64::from(*b)).wrapping_mul(FNV_PRIME));
+        let print = files::fingerprint(&bytes);
         drop(bytes);
         let scene = read_scene(&file)?;
         not_empty(&scene, path)?;
@@ -164,7 +161,6 @@ impl Bench {
         let looks = looks(&run.views()?, scene.clip, if args.quick { QUICK_SIZE } else { SIZE });
         let grid = if args.quick { Grid::quick(steps) } else { Grid::full(steps) };
         let folder = path.file_name().map_or_else(|| run.name(), |n| n.to_string_lossy().into_owned());
-        let print = format!("{print:016x}");
         Ok(Self { path: path.to_owned(), name: plain(&folder), print, scene, capture, recipe, store, looks, grid })
     }
 

@@ -132,11 +132,11 @@ fn speed(found: Option<&Found>) -> String {
     found.map_or_else(String::new, |f| format!("{:.2}x ({:.2}x)", f.speed, f.raster_speed))
 }
 
-fn number(value: Option<f64>, digits: usize) -> String {
+pub(super) fn number(value: Option<f64>, digits: usize) -> String {
     value.map_or_else(String::new, |v| format!("{v:.digits$}"))
 }
 
-fn table(out: &mut String, title: &str, head: &[&str], lines: Vec<Vec<String>>) {
+pub(super) fn table(out: &mut String, title: &str, head: &[&str], lines: Vec<Vec<String>>) {
     let _ = write!(out, "\n### {title}\n\n| {} |\n|---|{}\n", head.join(" | "), "---:|".repeat(head.len() - 1));
     for line in lines {
         let _ = writeln!(out, "| {} |", line.join(" | "));

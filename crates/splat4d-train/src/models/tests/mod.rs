@@ -4,6 +4,7 @@
 mod edits;
 mod guests;
 mod hexplane;
+mod filtered;
 mod layers;
 mod lobes;
 mod nodes;

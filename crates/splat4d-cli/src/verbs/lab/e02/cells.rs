@@ -1,0 +1,73 @@
+//! The variants that are compared: what each sets in the recipe.
+
+use splat4d::Result;
+use splat4d_train::recipe::Recipe;
+
+/// One row of the table.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Variant {
+    /// In files.
+    pub key: &'static str,
+    /// For people.
+    pub name: &'static str,
+    knobs: &'static [&'static str],
+    /// Whether a glance looks at it too.
+    quick: bool,
+}
+
+const fn variant(key: &'static str, name: &'static str, knobs: &'static [&'static str], quick: bool) -> Variant {
+    Variant { key, name, knobs, quick }
+}
+
+/// The first is what all are compared with.
+const ALL: [Variant; 10] = [
+    variant("alone", "the motion alone", &[], true),
+    variant("filter-euclidean", "filter, Euclidean predictor", &["filter=geodesic", "filter_predictor=euclidean"], false),
+    variant("filter-hold", "filter, without log and exp", &["filter=geodesic", "filter_predictor=hold"], false),
+    variant("filter", "filter, Wasserstein predictor", &["filter=geodesic"], true),
+    variant("filter-literal", "filter, Kalman's formulas", &["filter=literal"], false),
+    variant("linear", "linear regulariser", &["transport=linear"], true),
+    variant("w2-hold", "W2 regulariser, without log and exp", &["transport=wasserstein", "filter_predictor=hold"], false),
+    variant("w2", "W2 regulariser", &["transport=wasserstein"], true),
+    variant(
+        "both-euclidean",
+        "both, Euclidean",
+        &["filter=geodesic", "transport=linear", "filter_predictor=euclidean"],
+        false,
+    ),
+    variant("both", "filter and W2 regulariser", &["filter=geodesic", "transport=wasserstein"], true),
+];
+
+/// All, or those of a glance.
+pub(super) fn variants(quick: bool) -> Vec<Variant> {
+    ALL.into_iter().filter(|v| v.quick || !quick).collect()
+}
+
+impl Variant {
+    /// The recipe with what the variant sets, and the seed.
+    pub(super) fn recipe(&self, base: &Recipe, seed: u64) -> Result<Recipe> {
+        let off = ["filter=off", "transport=off", "filter_predictor=wasserstein"];
+        let mut recipe = Recipe { seed, ..base.clone() };
+        off.iter().chain(self.knobs).try_for_each(|knob| recipe.set(knob))?;
+        Ok(recipe)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn variants_differ_in_what_they_set_alone() {
+        let base = Recipe { filter: "literal".into(), ..Recipe::default() };
+        let all = variants(false);
+        for (i, a) in all.iter().enumerate() {
+            let recipe = a.recipe(&base, 3).unwrap();
+            assert_eq!(recipe.seed, 3);
+            assert!(all[..i].iter().all(|b| b.key != a.key && b.recipe(&base, 3).unwrap() != recipe), "{}", a.key);
+        }
+        let alone = all[0].recipe(&base, base.seed).unwrap();
+        assert_eq!(alone, Recipe::default(), "what the base has of a filter does not count");
+        assert!(variants(true).len() >= 5 && variants(true)[0] == all[0]);
+    }
+}

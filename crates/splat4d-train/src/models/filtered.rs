@@ -1,0 +1,198 @@
+//! `filtered`: any program with a temporal filter around its model, and the transport losses on any model.
+//!
+//! The inner program's stages stay as they are; the filter is there from the start, switched off, and is switched on in
+//! the middle of whichever stage runs by then, so that no schedule notices. Hooks of the inner program see its own model:
+//! the filter is taken off around them. At the end the filter is disabled and the network kept, unless the recipe says
+//! otherwise: the filter has then taught the model to move steadily, and playing costs no more than without.
+
+use super::{Group, Hook, Plan, Program, Stage};
+use crate::Result;
+use crate::loss::transport::{Metric, Transport, TransportSettings};
+use crate::recipe::Recipe;
+use splat4d::layers::{Layer, Scene};
+use splat4d::motion::filtered::{Filtered, FilteredSpec, Fusion, GAINS, Predictor};
+use splat4d::motion::{Spec, build};
+use splat4d::scene::params::LoadedArray;
+use splat4d::scene::{LifeKind, Params, SH};
+use std::sync::Arc;
+
+/// The program with what the recipe puts around it; as it is where that is nothing.
+pub fn wrap(inner: Box<dyn Program>, recipe: &Recipe) -> Result<Box<dyn Program>> {
+    if fusion(recipe) == Fusion::Off && recipe.transport == "off" {
+        return Ok(inner);
+    }
+    Ok(Box::new(FilteredProgram { inner }))
+}
+
+fn fusion(recipe: &Recipe) -> Fusion {
+    Fusion::from_name(&recipe.filter).unwrap_or_default()
+}
+
+fn predictor(recipe: &Recipe) -> Predictor {
+    Predictor::from_name(&recipe.filter_predictor).unwrap_or_default()
+}
+
+/// See the module's documentation.
+pub struct FilteredProgram {
+    inner: Box<dyn Program>,
+}
+
+impl Program for FilteredProgram {
+    fn spec(&self, plan: &Plan) -> Spec {
+        let r = &plan.recipe;
+        let inner = self.inner.spec(plan);
+        if fusion(r) == Fusion::Off {
+            return inner;
+        }
+        Spec::Filtered(FilteredSpec {
+            predictor: predictor(r),
+            gain: r.filter_gain,
+            baseline: r.filter_baseline,
+            history: r.filter_history,
+            gate: r.filter_gate,
+            stop_gradient: r.filter_stop_gradient,
+            ..FilteredSpec::around(inner, 1.0 / plan.fps, plan.clip[0])
+        })
+    }
+
+    fn life(&self, plan: &Plan) -> LifeKind {
+        self.inner.life(plan)
+    }
+
+    fn check(&self, plan: &Plan) -> Result<()> {
+        let r = &plan.recipe;
+        if r.filter_history > 0 && !r.filter_stop_gradient && fusion(r) != Fusion::Off {
+            return Err(crate::Error::input("filter_history has no gradient to earlier frames")
+                .remedy("Set filter_stop_gradient=true, or filter_history=0"));
+        }
+        self.inner.check(plan)
+    }
+
+    fn stages(&self, plan: &Plan) -> Vec<Stage> {
+        let r = &plan.recipe;
+        let mut stages = self.inner.stages(plan);
+        if let Some(settings) = transport(plan) {
+            for stage in &mut stages {
+                stage.probes.push(Box::new(Transport::new(settings, 0)));
+            }
+        }
+        let fusion = fusion(r);
+        if fusion == Fusion::Off {
+            return stages;
+        }
+        for stage in &mut stages {
+            stage.groups.push(Group { layer: super::EVERY, ..Group::new(GAINS, r.falling(r.filter_lr)) });
+            stage.start = stage.start.take().map(around);
+            stage.switch = stage.switch.take().map(|(step, hook)| (step, around(hook)));
+            stage.end = stage.end.take().map(around);
+        }
+        switch_on(&mut stages, r.filter_start, fusion);
+        if let (Some(last), false) = (stages.last_mut(), r.filter_keep) {
+            let before = last.end.take();
+            last.end = Some(Box::new(move |scene, tell| {
+                if let Some(hook) = &before {
+                    hook(scene, tell)?;
+                }
+                scene.layers.iter_mut().try_for_each(take_off)
+            }));
+        }
+        stages
+    }
+}
+
+/// Switches the filter on after a share of all steps, in the stage that runs by then (or before one that has a switch of
+/// its own in it, at that stage's start).
+fn switch_on(stages: &mut [Stage], share: f64, fusion: Fusion) {
+    let total: usize = stages.iter().map(|s| s.iterations).sum();
+    let mut left = (share * total as f64).round() as usize;
+    for stage in stages {
+        if left >= stage.iterations.max(1) {
+            left -= stage.iterations;
+            continue;
+        }
+        let set: Hook<f32> = Box::new(move |scene, _| scene.layers.iter_mut().try_for_each(|l| set_fusion(l, fusion)));
+        if left > 0 && stage.switch.is_none() {
+            stage.switch = Some((left, set));
+        } else {
+            let before = stage.start.take();
+            stage.start = Some(Box::new(move |scene, tell| {
+                if let Some(hook) = &before {
+                    hook(scene, tell)?;
+                }
+                set(scene, tell)
+            }));
+        }
+        return;
+    }
+}
+
+/// The transport loss that a recipe asks for.
+fn transport(plan: &Plan) -> Option<TransportSettings> {
+    let r = &plan.recipe;
+    let metric = match r.transport.as_str() {
+        "linear" => Metric::Linear,
+        "wasserstein" => Metric::Wasserstein,
+        _ => return None,
+    };
+    Some(TransportSettings {
+        metric,
+        predictor: predictor(r),
+        temporal: r.transport_temporal,
+        second: r.transport_second,
+        align: r.transport_align,
+        covariance: r.transport_covariance,
+        extent: plan.extent,
+        clip: plan.clip,
+        frame: 1.0 / plan.fps,
+        every: r.transport_every,
+        start: r.transport_start,
+        ramp: r.transport_ramp,
+    })
+}
+
+fn set_fusion(layer: &mut Layer, fusion: Fusion) -> Result<()> {
+    let Some(filter) = Filtered::of(layer.motion.as_ref()) else { return Ok(()) };
+    let spec = FilteredSpec { fusion, ..filter.settings().clone() };
+    layer.motion = Arc::new(Filtered::around(filter.inner().clone(), spec, &mut layer.params)?);
+    Ok(())
+}
+
+/// A hook of the inner program: layers show it the model inside, and get their filter back.
+fn around(hook: Hook<f32>) -> Hook<f32> {
+    Box::new(move |scene: &mut Scene<f32>, tell| {
+        let mut kept = Vec::new();
+        for layer in &mut scene.layers {
+            let Some(filter) = Filtered::of(layer.motion.as_ref()) else { continue };
+            kept.push(filter.settings().clone());
+            layer.motion = filter.inner().clone();
+        }
+        hook(scene, tell)?;
+        // Layers that a hook adds or replaces are filtered as the others are.
+        let Some(spec) = kept.first() else { return Ok(()) };
+        for layer in &mut scene.layers {
+            let spec = FilteredSpec { inner: Box::new(layer.motion.spec()), ..spec.clone() };
+            layer.motion = Arc::new(Filtered::around(layer.motion.clone(), spec, &mut layer.params)?);
+        }
+        Ok(())
+    })
+}
+
+/// Leaves the model inside, and none of the filter's numbers, as if it had been read from a file without them.
+fn take_off(layer: &mut Layer) -> Result<()> {
+    let Some(filter) = Filtered::of(layer.motion.as_ref()) else { return Ok(()) };
+    let (spec, old) = (filter.inner().spec(), &layer.params);
+    let mut loaded = Vec::new();
+    for key in old.keys().filter(|&k| old.info(k).name != GAINS) {
+        let table = &old[key];
+        let mut first = 0;
+        for column in table.columns().iter().filter(|c| c.width > 0) {
+            let (name, width) = (column.name.to_string(), column.width);
+            loaded.push(LoadedArray { name, rows: table.rows(), width, data: table.column_to_rows(first, width) });
+            first += width;
+        }
+    }
+    let mut params = Params::build(loaded, old.len(), old[SH].width() / 3, layer.life.columns())?;
+    layer.motion = build(&spec, &mut params)?;
+    layer.params = params;
+    Ok(())
+}
