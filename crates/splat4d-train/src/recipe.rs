@@ -5,8 +5,8 @@
 //! Iteration knobs left at 0 follow from `iterations` (see [`Recipe::resolve`]).
 
 use crate::{Error, Result};
-use splat4d::motion::filtered::{Fusion, MAX_BASELINE, MAX_HISTORY, Predictor};
 use serde::{Deserialize, Serialize};
+use splat4d::motion::filtered::{Fusion, MAX_BASELINE, MAX_HISTORY, Predictor};
 use splat4d::motion::native4d::MAX_HARMONICS;
 
 macro_rules! recipe {

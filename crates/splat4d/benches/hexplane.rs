@@ -25,7 +25,8 @@ fn pool(threads: usize) -> rayon::ThreadPool {
 fn made() -> (Params<f32>, Hexplane) {
     let rng = Rng::new(1, "bench", 0);
     let mut p = Params::<f32>::new(GAUSSIANS, 4, &[]);
-    let mut means: Vec<[f32; 3]> = (0..GAUSSIANS as u64).map(|i| [0, 1, 2].map(|k| rng.normal(3 * i + k) as f32 * 0.3)).collect();
+    let mut means: Vec<[f32; 3]> =
+        (0..GAUSSIANS as u64).map(|i| [0, 1, 2].map(|k| rng.normal(3 * i + k) as f32 * 0.3)).collect();
     means.sort_by_key(|m| {
         let cell = m.map(|x| ((x + 1.0) * 128.0).clamp(0.0, 255.0) as u32);
         (0..8).fold(0, |key, bit| (0..3).fold(key, |key, k| key | (cell[k] >> bit & 1) << (3 * bit + k)))

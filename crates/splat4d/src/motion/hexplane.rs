@@ -116,7 +116,10 @@ impl HexplaneSpec {
         }
         let [width, depth] = MAX_NET;
         if !(1..=width).contains(&self.net_width) || self.defor_depth > depth {
-            return bad(format!("a network of {} x {} is not 1 to {width} wide and up to {depth} deep", self.net_width, self.defor_depth));
+            return bad(format!(
+                "a network of {} x {} is not 1 to {width} wide and up to {depth} deep",
+                self.net_width, self.defor_depth
+            ));
         }
         if self.unlocked == 0 || self.unlocked > self.planes.multires.len() {
             return bad(format!("{} of {} levels cannot be in use", self.unlocked, self.planes.multires.len()));

@@ -223,7 +223,10 @@ impl Planes {
         d: &mut Grads<F>,
     ) -> F {
         let width = self.shape.features();
-        assert!(d_out.len() == x.len() * width && d_x.len() == x.len(), "gradients have the shapes of what they are of");
+        assert!(
+            d_out.len() == x.len() * width && d_x.len() == x.len(),
+            "gradients have the shapes of what they are of"
+        );
         let (levels, blocks, simd) = (self.levels(p, lines, unlocked), self.blocks(), Simd::detect());
         let keys: Vec<Key> = self.keys[..levels.len()].as_flattened().to_vec();
         let mut tables = d.many(&keys);
@@ -235,11 +238,8 @@ impl Planes {
             let line = if v == 3 { vec![[F::ZERO; LANES]; side * blocks] } else { Vec::new() };
             let data = table.data_mut().as_chunks_mut().0;
             // Of a time plane only the two steps around t get anything.
-            let data = if v == 3 {
-                &mut data[lines.step * side * blocks..(lines.step + 2) * side * blocks]
-            } else {
-                data
-            };
+            let data =
+                if v == 3 { &mut data[lines.step * side * blocks..(lines.step + 2) * side * blocks] } else { data };
             sinks.push(Sink { level, plane, side, axes: [u, v], data, line });
         }
         let run = levels.len() * 6 * blocks;

@@ -4,15 +4,14 @@ mod check;
 
 use check::{model, starts_still};
 use splat4d::motion::control::{ControlSpec, Curve, TrajectorySpec};
-use splat4d::motion::skin::SkinSpec;
 use splat4d::motion::deform::{DeformSpec, Input};
-use splat4d::motion::tracked::TrackedSpec;
-use splat4d::motion::native4d::Native4dSpec;
 use splat4d::motion::filtered::{FilteredSpec, Fusion, Predictor};
+use splat4d::motion::hexplane::{Heads, HexplaneSpec};
+use splat4d::motion::native4d::Native4dSpec;
+use splat4d::motion::skin::SkinSpec;
+use splat4d::motion::tracked::TrackedSpec;
 use splat4d::motion::{SpacetimeSpec, Spec};
 use splat4d::nn::HashShape;
-use splat4d::motion::hexplane::{Heads, HexplaneSpec};
-use splat4d::motion::{SpacetimeSpec, Spec};
 use splat4d::nn::hexplane::PlaneShape;
 use splat4d::scene::{LifeKind, Space};
 

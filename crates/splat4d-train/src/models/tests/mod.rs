@@ -2,9 +2,9 @@
 //! ordinary trainer and checked against f64 finite differences through the whole chain, the oracle as the forward.
 
 mod edits;
+mod filtered;
 mod guests;
 mod hexplane;
-mod filtered;
 mod layers;
 mod lobes;
 mod nodes;

@@ -46,9 +46,11 @@ fn features(p: &Params<f64>, planes: &Planes, unlocked: usize, x: &[[f64; 3]], t
 #[test]
 fn affine_planes_are_met_exactly_and_the_border_goes_on() {
     let (mut p, planes) = planes(shape());
-    let affine = |plane: usize, [u, v]: [f64; 2], c: usize| 1.0 + 0.3 * plane as f64 + 0.5 * u - 0.2 * v + 0.01 * c as f64;
+    let affine =
+        |plane: usize, [u, v]: [f64; 2], c: usize| 1.0 + 0.3 * plane as f64 + 0.5 * u - 0.2 * v + 0.01 * c as f64;
     set(&mut p, &planes, affine);
-    for (x, t) in [([0.3, 0.77, 0.5], 0.4), ([0.0, 1.0, 0.123], 1.0), ([-3.0, 0.2, 7.0], -1.0), ([0.5, 0.9, 2.0], 3.0)] {
+    for (x, t) in [([0.3, 0.77, 0.5], 0.4), ([0.0, 1.0, 0.123], 1.0), ([-3.0, 0.2, 7.0], -1.0), ([0.5, 0.9, 2.0], 3.0)]
+    {
         let got = features(&p, &planes, 2, &[x], t);
         let at = [x[0], x[1], x[2], t].map(|a: f64| a.clamp(0.0, 1.0));
         assert_eq!(got.len(), 32, "levels stand one after the other");
