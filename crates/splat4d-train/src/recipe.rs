@@ -134,6 +134,32 @@ recipe! {
     // control.
 
     // ssm.
+    /// ssm: control nodes.
+    ssm_nodes: usize = 512,
+    /// ssm: ticks of the scan over the clip; 0: one every two distinct times, 16 to 96.
+    ssm_ticks: usize = 0,
+    /// ssm: channels.
+    ssm_width: usize = 32,
+    /// ssm: complex states a channel.
+    ssm_states: usize = 8,
+    /// ssm: residual blocks.
+    ssm_blocks: usize = 2,
+    /// ssm: bidirectional (to reconstruct) or causal (to forecast).
+    ssm_mode: String = "bidirectional".into(),
+    /// ssm: absolute (poses) or twist (rates of poses, composed from tick to tick).
+    ssm_output: String = "absolute".into(),
+    /// ssm: none, frames (the model turns with the scene) or vector (and mirrors with it).
+    ssm_equivariance: String = "none".into(),
+    /// ssm: share of the iterations, from the first, in which nothing moves; nodes are placed after it.
+    ssm_warm_up: f64 = 0.05,
+    /// ssm: rate of the network's maps at the start.
+    ssm_lr_init: f64 = 1e-3,
+    /// ssm: rate of the network's maps at the end.
+    ssm_lr_final: f64 = 1e-5,
+    /// ssm: rate of the state space's decays, frequencies and steps.
+    ssm_dynamics_lr: f64 = 1e-3,
+    /// ssm: rate of the nodes' embeddings.
+    ssm_embedding_lr: f64 = 5e-3,
 
     // filtered.
 
@@ -289,6 +315,7 @@ impl Recipe {
             ("relocate_gradient", self.relocate_gradient),
             ("min_opacity", self.min_opacity),
             ("prune_ratio", self.prune_ratio),
+            ("ssm_warm_up", self.ssm_warm_up),
         ];
         for (knob, value) in shares {
             if !(0.0..=1.0).contains(&value) {
@@ -318,6 +345,9 @@ impl Recipe {
             ("motion", &self.motion, &splat4d::motion::BUILT_IN[..]),
             ("life", &self.life, &["auto", "infinite", "gauss-half", "gauss-one", "interval"][..]),
             ("strategy", &self.strategy, &["mcmc", "adc", "none"][..]),
+            ("ssm_mode", &self.ssm_mode, &["bidirectional", "causal"][..]),
+            ("ssm_output", &self.ssm_output, &["absolute", "twist"][..]),
+            ("ssm_equivariance", &self.ssm_equivariance, &["none", "frames", "vector"][..]),
         ] {
             if !known.contains(&value.as_str()) {
                 let near = nearest(value, known).map(|n| format!("; did you mean `{n}`?")).unwrap_or_default();
