@@ -20,7 +20,7 @@ const ORDER: [(&str, &[&str]); 4] = [
         // `models`, which choose among them; `init` needs a model's plan; `eval` writes as safely as `train` does.
         &[
             "recipe", "event", "capture", "sampler", "optim", "loss", "densify", "prune", "models", "init", "train",
-            "eval", "compress", "dynamics", "dist",
+            "eval", "compress", "lab", "dynamics", "dist",
         ],
     ),
     (
@@ -37,7 +37,6 @@ const ORDER: [(&str, &[&str]); 4] = [
             "video",
             "device",
             "draw",
-            "freeze",
             "paths",
             "run_folder",
             "sequence",

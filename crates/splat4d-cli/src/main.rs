@@ -10,7 +10,6 @@ mod device;
 mod draw;
 mod files;
 mod finish;
-mod freeze;
 mod interrupt;
 mod measure;
 mod paths;

@@ -8,6 +8,7 @@ pub mod densify;
 pub mod eval;
 pub mod event;
 pub mod init;
+pub mod lab;
 pub mod loss;
 pub mod models;
 pub mod optim;

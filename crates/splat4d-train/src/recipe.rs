@@ -133,6 +133,63 @@ recipe! {
 
     // control.
 
+    /// control, ssm: control nodes at the start.
+    control_nodes: usize = 512,
+    /// control, ssm: nodes that pull each Gaussian, 1 to 8.
+    control_neighbours: usize = 3,
+    /// control, ssm: hyper coordinates, by which touching parts that move differently come apart.
+    control_hyper: usize = 2,
+    /// control, ssm: whether every Gaussian learns how far it follows its nodes.
+    control_mask: bool = false,
+    /// control: what drives the nodes: spline, linear, slerp, low-rank or network.
+    control_trajectory: String = "spline".into(),
+    /// control: keys of a trajectory in time; 0: about every 4 frames.
+    control_keys: usize = 0,
+    /// control: motions that nodes of a low-rank trajectory share.
+    control_bases: usize = 16,
+    /// control: width of the hidden layers of a network.
+    control_width: usize = 128,
+    /// control: hidden layers of a network.
+    control_layers: usize = 4,
+    /// control: rate of node shifts at the start, extents.
+    control_shift_lr_init: f64 = 5e-4,
+    /// control: rate of node shifts at the end, extents.
+    control_shift_lr_final: f64 = 1e-5,
+    /// control: rate of node quaternions at the start.
+    control_turn_lr_init: f64 = 2e-3,
+    /// control: rate of node quaternions at the end.
+    control_turn_lr_final: f64 = 5e-5,
+    /// control: rate of a network's weights at the start.
+    control_network_lr_init: f64 = 1e-3,
+    /// control: rate of a network's weights at the end.
+    control_network_lr_final: f64 = 2e-5,
+    /// control, ssm: rate of node positions at rest, extents.
+    control_node_lr: f64 = 1e-4,
+    /// control, ssm: rate of node log radii and weight logits.
+    control_weight_lr: f64 = 5e-3,
+    /// control, ssm: rate of hyper coordinates, extents.
+    control_hyper_lr: f64 = 1e-4,
+    /// control, ssm: rate of motion masks' logits.
+    control_mask_lr: f64 = 0.02,
+    /// control, ssm: iterations between refreshes of the lists of nearest nodes.
+    control_bind_interval: usize = 100,
+    /// control, ssm: iterations between additions and removals of nodes, while Gaussians densify; 0: never.
+    control_adapt_interval: usize = 0,
+    /// control, ssm: mean 2D gradient of a node's Gaussians above which it gets a second one (NDC units).
+    control_grad_threshold: f64 = 4e-4,
+    /// control, ssm: never more nodes than this.
+    control_max_nodes: usize = 1024,
+    /// control, ssm: weight of nodes moving as rigidly as possible.
+    lambda_node_arap: f64 = 0.0,
+    /// control, ssm: weight of neighbouring nodes keeping their distance.
+    lambda_node_elastic: f64 = 0.0,
+    /// control, ssm: weight of nodes' acceleration.
+    lambda_node_acceleration: f64 = 0.0,
+    /// control, ssm: weight of the mean motion mask.
+    lambda_motion_mask: f64 = 0.01,
+    /// control: weight of the sparsity of a low-rank trajectory.
+    lambda_sparse: f64 = 0.0,
+
     // ssm.
     /// ssm: control nodes.
     ssm_nodes: usize = 512,
@@ -194,6 +251,17 @@ recipe! {
     /// Training views that each such pruning looks at; never fewer than one at every moment of the capture.
     prune_views: usize = 60,
     // Merging, splitting into layers.
+    /// What becomes of two Gaussians in one place: none (both stay), merge (one with the moments of both), prune (the
+    /// fainter one goes).
+    crowding: String = "none".into(),
+    /// Iterations between two looks for such pairs; 0: never.
+    crowding_interval: usize = 500,
+    /// Largest distance of such a pair, of the smaller one's standard deviation.
+    crowding_distance: f64 = 0.3,
+    /// Gaussians that move less than this become a still layer of their own, of the extent; 0: never.
+    static_split: f64 = 0.0,
+    /// When they do, as a share of the last stage.
+    static_split_from: f64 = 0.75,
 
     /// mcmc: growth a densification, up to the cap.
     growth: f64 = 1.05,
@@ -316,6 +384,7 @@ impl Recipe {
             ("min_opacity", self.min_opacity),
             ("prune_ratio", self.prune_ratio),
             ("ssm_warm_up", self.ssm_warm_up),
+            ("static_split_from", self.static_split_from),
         ];
         for (knob, value) in shares {
             if !(0.0..=1.0).contains(&value) {
@@ -335,6 +404,15 @@ impl Recipe {
                 return bad(knob, "0".into(), "at least 1");
             }
         }
+        for (knob, value, high) in [
+            ("control_nodes", self.control_nodes, splat4d::motion::skin::MAX_NODES),
+            ("control_neighbours", self.control_neighbours, splat4d::motion::skin::MAX_NEIGHBOURS),
+            ("control_bind_interval", self.control_bind_interval, usize::MAX),
+        ] {
+            if !(1..=high).contains(&value) {
+                return bad(knob, value.to_string(), &format!("1 to {high}"));
+            }
+        }
         if self.sh_degree > 3 {
             return bad("sh_degree", self.sh_degree.to_string(), "0, 1, 2 or 3");
         }
@@ -344,6 +422,8 @@ impl Recipe {
         for (knob, value, known) in [
             ("motion", &self.motion, &splat4d::motion::BUILT_IN[..]),
             ("life", &self.life, &["auto", "infinite", "gauss-half", "gauss-one", "interval"][..]),
+            ("crowding", &self.crowding, &["none", "merge", "prune"][..]),
+            ("control_trajectory", &self.control_trajectory, &crate::models::control::TRAJECTORIES[..]),
             ("strategy", &self.strategy, &["mcmc", "adc", "none"][..]),
             ("ssm_mode", &self.ssm_mode, &["bidirectional", "causal"][..]),
             ("ssm_output", &self.ssm_output, &["absolute", "twist"][..]),

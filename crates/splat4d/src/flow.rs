@@ -6,6 +6,7 @@
 //!
 //! [`Motion::at`]: crate::motion::Motion::at
 
+pub mod lift;
 #[cfg(test)]
 mod tests;
 

@@ -3,16 +3,15 @@
 use crate::baking::{self, Baking};
 use crate::console::Console;
 use crate::files::{self, grouped, human_bytes};
-use crate::freeze::freeze;
 use crate::sequence::{self, Pattern};
 use crate::source::{Source, not_empty};
 use serde_json::json;
 use splat4d::format::{self, Dialect, Warnings, dialect, ply, spz};
-use splat4d::layers::{ALWAYS, Scene, rotation_between};
+use splat4d::layers::{ALWAYS, Scene, freeze, rotation_between};
 use splat4d::math::Se3;
 use splat4d::motion::Spec;
 use splat4d::scene::time::DEFAULT_FPS;
-use splat4d::scene::{Camera, LifeKind, Params};
+use splat4d::scene::{Camera, LifeKind, Params, Time};
 use splat4d::{Error, ErrorKind, Result};
 use std::path::{Path, PathBuf};
 
@@ -345,7 +344,7 @@ fn moment(scene: &Scene<f32>, time: f64) -> Params {
     match &scene.layers[..] {
         // What stands still anyway keeps its very bits.
         [only] if !is_moving(scene) => only.params.clone(),
-        _ => freeze(scene, time),
+        _ => freeze(scene, Time(time)),
     }
 }
 

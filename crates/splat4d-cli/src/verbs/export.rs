@@ -2,11 +2,12 @@
 
 use crate::console::Console;
 use crate::files;
-use crate::freeze::freeze;
 use crate::playable::Playable;
 use crate::sequence;
 use crate::source::{Source, not_empty};
 use serde_json::json;
+use splat4d::layers::freeze;
+use splat4d::scene::Time;
 use splat4d::{Error, format};
 use splat4d_serve::{Page, SceneIn};
 use std::path::{Path, PathBuf};
@@ -72,7 +73,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let scene = &source.scene;
     not_empty(scene, path)?;
     let write = |time: f64, out: &Path| -> anyhow::Result<usize> {
-        let params = freeze(scene, time);
+        let params = freeze(scene, Time(time));
         let mut bytes = Vec::new();
         format::ply::write(&params, &mut bytes)?;
         files::write(out, &bytes)?;

@@ -1,7 +1,10 @@
-//! `lab`: studies that vary what methods leave open, on runs of one's own.
+//! `lab`: studies that vary what methods leave open, on made-up motion or on runs of one's own.
 
 mod cells;
+mod e00;
+mod e01;
 mod e03;
+mod models;
 mod study;
 mod tables;
 
@@ -9,12 +12,15 @@ use crate::console::Console;
 
 const EXAMPLES: &str = "\
 Examples:
+  splat4d lab e00                          what does a deformation network learn, and where does it fail?
+  splat4d lab e01                          how far does lifted optical flow drift?
   splat4d lab e03 runs/knight              how much can be pruned, by which score, and what does the filter cost?
   splat4d lab e03 runs/knight --quick
+  splat4d lab models examples/knight       every motion model, three minutes each
 
 A study can be stopped at any time and goes on where it was.";
 
-/// Study methods on trained runs: tables and curves of what they gain and lose
+/// Study methods: tables and curves of what they gain and lose
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
@@ -24,11 +30,17 @@ pub(crate) struct Args {
 
 #[derive(Debug, clap::Subcommand)]
 enum Study {
+    E00(e00::Args),
+    E01(e01::Args),
     E03(e03::Args),
+    Models(models::Args),
 }
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     match &args.study {
+        Study::E00(args) => e00::run(args, console),
+        Study::E01(args) => e01::run(args, console),
         Study::E03(args) => e03::run(args, console),
+        Study::Models(args) => models::run(args, console),
     }
 }

@@ -5,6 +5,7 @@
 
 pub mod adc;
 pub mod mcmc;
+pub mod merge;
 
 use crate::optim::Moments;
 use splat4d::format::quant::{MORTON_BITS, morton};
@@ -17,6 +18,7 @@ use splat4d::scene::{Born, GEOMETRY, RowEdit, Rows, Space, Table, Time};
 
 pub use adc::Adc;
 pub use mcmc::Mcmc;
+pub use merge::{Crowd, Crowding};
 
 /// What the densifier may know of one view of one layer.
 #[derive(Clone, Copy, Debug)]

@@ -2,8 +2,11 @@
 //!
 //! Every function returns its value and writes or adds its gradient; none keeps state that a result depends on.
 
+pub mod arap;
+pub mod graph;
 mod kernel;
 pub mod photometric;
+pub mod rigid;
 pub mod scene;
 pub mod terms;
 

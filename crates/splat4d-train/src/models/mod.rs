@@ -7,20 +7,22 @@ pub mod deform;
 pub mod hexplane;
 pub mod native4d;
 pub mod spacetime;
+pub mod split;
 pub mod ssm;
 pub mod still;
 #[cfg(test)]
 mod tests;
 pub mod tracked;
 
-use crate::densify::Densify;
+use crate::densify::{Crowding, Densify, Stats};
 use crate::loss::terms::{Codec, ParamLoss, ProbeLoss};
+use crate::optim::Moments;
 use crate::prune::Periodic;
 use crate::recipe::Recipe;
 use crate::sampler::Sampler;
 use crate::{Error, Result};
 use splat4d::layers::Scene;
-use splat4d::math::Real;
+use splat4d::math::{Real, Rng};
 use splat4d::motion::Spec;
 use splat4d::scene::LifeKind;
 use std::sync::Arc;
@@ -115,6 +117,15 @@ pub type Tell<'a> = dyn FnMut(&str, usize, usize) + 'a;
 /// replaces needs another name: rows of a layer that keeps its name and its shape keep their moments.
 pub type Hook<F> = Box<dyn Fn(&mut Scene<F>, &mut Tell<'_>) -> Result<()> + Send + Sync>;
 
+/// Upkeep of what a model has besides Gaussians: nodes that are added, lists that go stale.
+pub trait Adapt: Send + Sync {
+    /// Whether something is to be done after so many steps of the stage.
+    fn is_due(&self, step: usize) -> bool;
+    /// Does it, before densification: edits rows through [`densify::apply`](crate::densify::apply). `stats` is what was
+    /// seen since the last densification.
+    fn run(&self, scene: &mut Scene<f32>, moments: &mut [Moments<f32>], stats: &mut Stats, step: usize, rng: Rng);
+}
+
 /// One stage of training.
 pub struct Stage<F: Real = f32> {
     /// What progress and metrics call it.
@@ -135,8 +146,12 @@ pub struct Stage<F: Real = f32> {
     pub densify: Densify,
     /// First, last step of the stage that densifies, and the steps between.
     pub densify_steps: (usize, usize, usize),
+    /// Upkeep of nodes and lists.
+    pub adapt: Option<Box<dyn Adapt>>,
     /// Pruning by worth in space and time, beside densification.
     pub prune: Option<Periodic>,
+    /// What becomes of Gaussians that stand in one place.
+    pub crowding: Option<Crowding>,
     /// Steps before each further SH degree; 0: all at once.
     pub sh_interval: usize,
     /// The first so many steps see pictures at half size: coarse things first, and four times faster.
@@ -164,7 +179,9 @@ impl<F: Real> Stage<F> {
             params: Vec::new(),
             densify: Densify::None,
             densify_steps: (0, 0, 0),
+            adapt: None,
             prune: None,
+            crowding: None,
             sh_interval: 0,
             half_size_steps: 0,
             min_log_life: None,

@@ -1,6 +1,7 @@
 //! `still`: one stage, every group of static 3DGS. Also the base that other programs add to.
 
 use super::{Group, Plan, Program, Rate, Stage, densify_of};
+use crate::densify::Crowding;
 use crate::loss::scene::{MeanOpacity, MeanScale};
 use crate::loss::terms::ParamLoss;
 use crate::prune::Periodic;
@@ -81,6 +82,7 @@ pub fn stage(name: &str, plan: &Plan) -> Stage {
         densify,
         densify_steps,
         prune: Periodic::of(r),
+        crowding: Crowding::of(r).expect("the recipe was checked"),
         sh_interval: r.sh_degree_interval,
         half_size_steps: (r.half_size_until * r.iterations as f64) as usize,
         ..Stage::new(name, r.iterations)

@@ -14,7 +14,7 @@ use crate::capture::{Capture, CaptureOptions, ImageStore};
 use crate::densify::Limits;
 use crate::event::Event;
 use crate::init::{self, Seeds};
-use crate::models::{Plan, Stage, program};
+use crate::models::{Plan, Stage, program, split};
 use crate::recipe::Recipe;
 use crate::{Error, ErrorKind, Result};
 use serde_json::json;
@@ -309,7 +309,8 @@ impl Bench {
     }
 
     pub(super) fn trainer(&self, plan: &Plan, scene: Scene<f32>) -> Result<Trainer<'static>> {
-        Ok(self.trainer_of(plan, scene, program(&plan.recipe.motion)?.stages(plan)))
+        let program = program(&plan.recipe.motion)?;
+        Ok(self.trainer_of(plan, scene, split::stages(program.as_ref(), plan)))
     }
 
     /// A trainer with stages that no program made.

@@ -430,6 +430,13 @@ impl<'a> Trainer<'a> {
         for (d, layer) in self.grads.iter_mut().zip(&self.scene.layers) {
             d.clear(&layer.params);
         }
+        if let Some(adapt) = stage.adapt.as_ref().filter(|a| a.is_due(step)) {
+            let rng = Rng::new(seed, "adapt", address);
+            adapt.run(&mut self.scene, &mut self.moments, &mut self.stats, step, rng);
+            stage.params.iter().for_each(|l| l.on_edit());
+            self.stale = true;
+            self.grads = self.scene.layers.iter().map(|l| Grads::new(&l.params)).collect();
+        }
         let (from, until, every) = stage.densify_steps;
         let mut change = Change::default();
         let due = every > 0 && step >= from && step <= until && step.is_multiple_of(every);
@@ -461,6 +468,7 @@ impl<'a> Trainer<'a> {
             self.fit_grads();
         }
         change.removed += self.prune(step)?;
+        change.removed += self.uncrowd(step);
         let stage = &self.stages[self.progress.stage];
         let reset = self.settings.opacity_reset_interval;
         if matches!(stage.densify, Densify::Adc(_)) && reset > 0 && step.is_multiple_of(reset) && step < until {
@@ -483,6 +491,27 @@ impl<'a> Trainer<'a> {
         self.stages[self.progress.stage].params.iter().for_each(|l| l.on_edit());
         self.fit_grads();
         Ok(before - self.scene.len())
+    }
+
+    /// Pairs in one place after so many steps of the stage, if that is due; returns how many rows went.
+    fn uncrowd(&mut self, step: usize) -> usize {
+        let stage = &self.stages[self.progress.stage];
+        let Some(rule) = stage.crowding.filter(|c| step.is_multiple_of(c.every) && step < stage.iterations) else {
+            return 0;
+        };
+        let before = self.scene.len();
+        let rng = Rng::new(self.settings.seed, "crowding", self.progress.iteration as u64);
+        for layer in 0..self.scene.layers.len() {
+            if let Some(edit) = rule.edit(&mut self.scene, layer) {
+                densify::apply(&mut self.scene, &mut self.moments, &mut self.stats, layer, &edit, &rng);
+                self.stale = true;
+            }
+        }
+        if self.scene.len() < before {
+            self.stages[self.progress.stage].params.iter().for_each(|l| l.on_edit());
+            self.fit_grads();
+        }
+        before - self.scene.len()
     }
 
     /// Errors if the scene is empty: nothing could be learnt.

@@ -1,10 +1,12 @@
 //! A scene is a sum of layers: each a set of Gaussians with one motion model and one kind of life, all splatted together.
 
 mod envelope;
+mod freeze;
 #[cfg(test)]
 mod tests;
 mod turn;
 
+pub use freeze::{freeze, freeze_rows};
 pub use turn::rotation_between;
 
 use crate::math::Real;

@@ -2,6 +2,7 @@
 //! numbers, and the [`Real`] trait that lets every kernel run in f32 and be checked in f64.
 
 pub mod knn;
+pub mod mat3;
 pub mod quat;
 pub mod real;
 pub mod rng;

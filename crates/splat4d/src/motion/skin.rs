@@ -16,9 +16,9 @@
 //! [`Skinned::bind`] now and then; among them the weights choose anew at every step, continuously.
 
 mod blend;
-mod weights;
 #[cfg(test)]
 mod tests;
+mod weights;
 
 pub use blend::node_frame;
 pub use weights::{Weights, farthest_points};
@@ -116,8 +116,10 @@ impl SkinSpec {
         ];
         for (name, value, low, high) in ranges {
             if !(low..=high).contains(&value) {
-                return Err(Error::input(format!("a skin with {name} = {value} cannot be: {low} to {high} is possible"))
-                    .remedy("The file is damaged or was written by another program; export it again"));
+                return Err(Error::input(format!(
+                    "a skin with {name} = {value} cannot be: {low} to {high} is possible"
+                ))
+                .remedy("The file is damaged or was written by another program; export it again"));
             }
         }
         Ok(())
@@ -163,7 +165,8 @@ impl Skin {
         let columns: &[_] = if spec.hyper > 0 { &[("hyper", spec.hyper)] } else { &[] };
         let hyper = p.entry("hyper", Space::Gaussians, columns, rows, |_| {})?;
         let columns: &[_] = if spec.mask { &[("motion_mask", 1)] } else { &[] };
-        let fill = |t: &mut Table<F>| t.fill(F::of(MASK_LOGIT));
+        let fill =
+            |t: &mut Table<F>| (0..if spec.mask { rows } else { 0 }).for_each(|r| t.set(r, 0, F::of(MASK_LOGIT)));
         let mask = p.entry("motion_mask", Space::Gaussians, columns, rows, fill)?;
         let width = spec.neighbours + SPARE_CANDIDATES;
         let mut fresh = false;
@@ -175,6 +178,20 @@ impl Skin {
             skin.bind(p);
         }
         Ok(skin)
+    }
+
+    /// The skin of a layer that has one, by its tables' names.
+    pub fn find<F: Real>(p: &Params<F>) -> Option<Self> {
+        let key = |name: &str| p.find(name);
+        let (nodes, hyper, mask) = (key("nodes")?, key("hyper")?, key("motion_mask")?);
+        let candidates = key("node_candidates")?;
+        let spec = SkinSpec {
+            nodes: p[nodes].rows(),
+            neighbours: p[candidates].width() - SPARE_CANDIDATES,
+            hyper: p[hyper].width(),
+            mask: p[mask].width() > 0,
+        };
+        Some(Self { spec, nodes, hyper, mask, candidates })
     }
 
     /// Refreshes every Gaussian's list of nearest nodes.

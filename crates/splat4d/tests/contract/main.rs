@@ -5,6 +5,8 @@ mod check;
 use check::{model, starts_still};
 use splat4d::motion::skin::SkinSpec;
 use splat4d::motion::ssm::{Equivariance, Mode, Output, SsmSpec};
+use splat4d::motion::control::{ControlSpec, Curve, TrajectorySpec};
+use splat4d::motion::skin::SkinSpec;
 use splat4d::motion::{SpacetimeSpec, Spec};
 use splat4d::scene::{LifeKind, Space};
 
@@ -35,6 +37,25 @@ fn spacetime() {
 // native4d.
 
 // control.
+
+#[test]
+fn control() {
+    let skin = SkinSpec { nodes: 7, neighbours: 3, hyper: 2, mask: false };
+    let keys = |curve, keys| TrajectorySpec::Keys { curve, keys };
+    let trajectories = [
+        (keys(Curve::Cubic, 6), false),
+        (keys(Curve::Linear, 4), true),
+        (keys(Curve::Slerp, 4), false),
+        (TrajectorySpec::LowRank { bases: 3, keys: 5 }, true),
+        (TrajectorySpec::Network { width: 12, layers: 2, position_levels: 2, time_levels: 2 }, false),
+    ];
+    for (trajectory, mask) in trajectories {
+        let spec =
+            Spec::Control(ControlSpec { seed: 3, clip: [0.0, 1.0], skin: SkinSpec { mask, ..skin }, trajectory });
+        model(&spec, ROWS, LifeKind::GaussHalf, &[Space::Gaussians, Space::Nodes], &[]);
+        starts_still(&spec, ROWS);
+    }
+}
 
 // ssm.
 #[test]

@@ -184,13 +184,7 @@ impl<F: Real> Ask<'_, F> {
     /// Adds gradients of geometry and mask to `d` and of weights to `d_weights`; returns those of frames, [nodes, 16].
     ///
     /// Tasks take rows in runs whose length depends on sizes alone, and their node gradients are added in order.
-    pub(super) fn backward(
-        &self,
-        asked: Rows<'_>,
-        d_out: &Table<F>,
-        d_weights: &mut [F],
-        d: &mut Grads<F>,
-    ) -> Vec<F> {
+    pub(super) fn backward(&self, asked: Rows<'_>, d_out: &Table<F>, d_weights: &mut [F], d: &mut Grads<F>) -> Vec<F> {
         let nodes = self.p[self.skin.nodes].rows();
         let blocks = task_rows(nodes) / BLOCK;
         let width = self.weights.neighbours();
@@ -259,8 +253,7 @@ impl<F: Real> Ask<'_, F> {
         }
         for (k, (&node, &a)) in nodes.iter().zip(a).enumerate() {
             let f = self.frames.of(node as usize);
-            let sum: &mut [F; LEARNT] =
-                sums[node as usize * LEARNT..].first_chunk_mut().expect("a gradient a node");
+            let sum: &mut [F; LEARNT] = sums[node as usize * LEARNT..].first_chunk_mut().expect("a gradient a node");
             let arm: [F; 3] = std::array::from_fn(|i| raw[i] - f[REST + i]);
             let pull = d_blend.map(|x| a * x);
             let mut d_a = F::ZERO;

@@ -204,14 +204,7 @@ impl<F: Real> Weights<F> {
 
 /// The nodes of least energy on a Gaussian's list, ordered; equal energies by number.
 #[inline(always)]
-fn strongest<F: Real>(
-    skin: &Skin,
-    p: &Params<F>,
-    nodes: &NodeRows<F>,
-    id: usize,
-    x: &[F],
-    best: &mut [(F, u32)],
-) {
+fn strongest<F: Real>(skin: &Skin, p: &Params<F>, nodes: &NodeRows<F>, id: usize, x: &[F], best: &mut [(F, u32)]) {
     let list = &p[skin.candidates];
     let count = p[skin.nodes].rows();
     for c in 0..list.width().min(count) {
@@ -361,10 +354,8 @@ impl<F: Real> Kernel for Search<'_, F> {
 /// At most `count` of the rows of a geometry table, each the farthest from all before it; the first is the one nearest to
 /// the centroid. Rows that are not finite are left out. Equal distances: the lower row.
 pub fn farthest_points<F: Real>(geometry: &Table<F>, count: usize) -> Vec<[F; 3]> {
-    let points: Vec<[F; 3]> = (0..geometry.rows())
-        .map(|r| geometry.read::<3>(r, 0))
-        .filter(|x| x.iter().all(|c| c.is_finite()))
-        .collect();
+    let points: Vec<[F; 3]> =
+        (0..geometry.rows()).map(|r| geometry.read::<3>(r, 0)).filter(|x| x.iter().all(|c| c.is_finite())).collect();
     let n = points.len();
     let center: [f64; 3] = each(|k| points.iter().map(|x| x[k].f64()).sum::<f64>() / n.max(1) as f64);
     let square = |a: &[F; 3], b: [f64; 3]| (0..3).map(|k| (a[k].f64() - b[k]).powi(2)).sum::<f64>();

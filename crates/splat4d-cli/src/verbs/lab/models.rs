@@ -1,0 +1,270 @@
+//! `lab models`: every motion model on the same captures, for the same minutes.
+
+use crate::console::Console;
+use crate::draw::antialias;
+use crate::files::{self, grouped, human_bytes, human_seconds};
+use crate::interrupt;
+use crate::measure::{SIZE, Side, Subject, What, in_turns, looks};
+use crate::run_folder::Run;
+use crate::source::read_scene;
+use anyhow::Context;
+use serde::{Deserialize, Serialize};
+use serde_json::json;
+use splat4d::motion::BUILT_IN;
+use splat4d::{Error, ErrorKind};
+use std::fmt::Write;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+/// Minutes of training a cell.
+const MINUTES: f64 = 3.0;
+/// What is wrapped around a model and trained by none.
+const WRAPPER: &str = "filtered";
+/// How often a cell that trains is looked at.
+const GLANCE: Duration = Duration::from_millis(100);
+/// What a cell costs besides its minutes (probes, evaluation, baking, playing), minutes; for the time that is left.
+const OVERHEAD: f64 = 0.6;
+
+const EXAMPLES: &str = "\
+Examples:
+  splat4d lab models examples/knight                         every model for three minutes each
+  splat4d lab models a-take b-take --only control,hexplane   some models on two captures
+  splat4d lab models examples/knight --minutes 1 -o quick
+
+Every cell is a run of its own (DIR/CAPTURE-MODEL), trained by `splat4d train` on pictures of half size, measured on the
+held-out views and played on the CPU at 800x800. A run that is there is not trained again: the same command goes on where
+it was stopped. The table is printed and written to DIR/models.md, the numbers to DIR/models.json.";
+
+/// Train every motion model on the same captures, and compare them
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub(crate) struct Args {
+    /// Captures
+    #[arg(value_name = "CAPTURE", required = true)]
+    captures: Vec<PathBuf>,
+    /// Folder for runs and tables
+    #[arg(short, long, value_name = "DIR", default_value = "runs/models")]
+    output: PathBuf,
+    /// Only these models [default: all]
+    #[arg(long, value_name = "MODEL,...", value_delimiter = ',')]
+    only: Vec<String>,
+    /// Minutes of training a cell
+    #[arg(long, value_name = "M", default_value_t = MINUTES)]
+    minutes: f64,
+    /// Reduce pictures by k
+    #[arg(long, value_name = "K", default_value_t = 2)]
+    downscale: usize,
+    /// Set a knob of every cell's recipe; may be repeated
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+}
+
+/// A model on a capture.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[serde(default)]
+struct Cell {
+    capture: String,
+    model: String,
+    /// Why there are no numbers.
+    refused: Option<String>,
+    side: Side,
+    /// What a player gets.
+    playback_bytes: Option<u64>,
+    steps: usize,
+    ms_per_step: f64,
+    peak_memory: Option<u64>,
+}
+
+pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
+    let models = models(&args.only)?;
+    if !(args.minutes > 0.0 && args.minutes.is_finite()) {
+        let what = format!("--minutes cannot be {}", args.minutes);
+        return Err(Error::input(what).remedy("Give a positive number, for instance 3").into());
+    }
+    files::make_folder(&args.output)?;
+    let stop = interrupt::flag("stopping: finished cells are kept");
+    let jobs: Vec<(&PathBuf, &str)> =
+        args.captures.iter().flat_map(|c| models.iter().map(move |m| (c, *m))).collect();
+    let mut cells = Vec::new();
+    for (i, (capture, model)) in jobs.iter().enumerate() {
+        let name = capture.canonicalize().unwrap_or_else(|_| (*capture).clone());
+        let name = name.file_name().map_or_else(|| "capture".into(), |n| n.to_string_lossy().into_owned());
+        let left = human_seconds(60.0 * (args.minutes + OVERHEAD) * (jobs.len() - i) as f64);
+        console.note(&format!("{name} by {model}, {}/{}: at most about {left} left", i + 1, jobs.len()));
+        let folder = args.output.join(format!("{name}-{model}"));
+        let refused = if Run::is_finished(&folder) { None } else { train(capture, model, &folder, args, &stop)? };
+        if stop.load(Ordering::SeqCst) {
+            return Err(Error::new(ErrorKind::Interrupted, "the comparison is unfinished; finished cells are kept")
+                .at(args.output.display())
+                .remedy("The same command goes on with it.")
+                .into());
+        }
+        let cell = match refused {
+            Some(why) => Cell { capture: name, model: (*model).into(), refused: Some(why), ..Cell::default() },
+            None => judge(&folder, &name, model, console)?,
+        };
+        console.emit(&json!({"type": "cell", "cell": cell}));
+        cells.push(cell);
+    }
+    let numbers = serde_json::to_string_pretty(&cells).context("cells are plain numbers")?;
+    files::write(&args.output.join("models.json"), format!("{numbers}\n").as_bytes())?;
+    let file = args.output.join("models.md");
+    let page = markdown(&cells, args);
+    files::write(&file, page.as_bytes())?;
+    console.say(page.trim_end());
+    console.written(&file);
+    console.emit(&json!({"type": "done", "study": args.output.join("models.json")}));
+    Ok(())
+}
+
+/// The models that are asked for, in the library's order.
+fn models(only: &[String]) -> splat4d::Result<Vec<&'static str>> {
+    let all = BUILT_IN.into_iter().filter(|m| *m != WRAPPER);
+    if let Some(unknown) = only.iter().find(|m| !all.clone().any(|a| a == m.as_str())) {
+        return Err(Error::input(format!("there is no motion model `{unknown}` that trains by itself"))
+            .remedy(format!("Use some of: {}", all.collect::<Vec<_>>().join(", "))));
+    }
+    Ok(all.filter(|m| only.is_empty() || only.iter().any(|o| o == m)).collect())
+}
+
+/// Trains one cell in a process of its own, so that its peak of memory is its own; says why where it refuses.
+fn train(
+    capture: &Path,
+    model: &str,
+    folder: &Path,
+    args: &Args,
+    stop: &AtomicBool,
+) -> anyhow::Result<Option<String>> {
+    let own = std::env::current_exe().context("this program does not know where it lies")?;
+    let log = args.output.join(format!("{}.log", folder.file_name().unwrap_or_default().to_string_lossy()));
+    let told = std::fs::File::create(&log).map_err(|e| files::cannot_write(&log, e))?;
+    let mut command = Command::new(own);
+    command.arg("train").arg(capture).args(["--motion", model, "--minutes", &args.minutes.to_string()]);
+    command.args(["--downscale", &args.downscale.to_string(), "--force", "-o"]).arg(folder);
+    for knob in &args.set {
+        command.args(["--set", knob]);
+    }
+    let mut child = command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(told).spawn()?;
+    let begun = Instant::now();
+    let status = loop {
+        if let Some(status) = child.try_wait()? {
+            break status;
+        }
+        // Ctrl-C reaches the child by itself: it saves a checkpoint and ends.
+        if stop.load(Ordering::SeqCst) {
+            child.wait()?;
+            return Ok(None);
+        }
+        std::thread::sleep(GLANCE.min(begun.elapsed()));
+    };
+    if status.success() {
+        return Ok(None);
+    }
+    let text = std::fs::read_to_string(&log).unwrap_or_default();
+    let error = text.lines().find_map(|l| l.strip_prefix("error: ")).unwrap_or("it ended without a word");
+    Ok(Some(error.to_owned()))
+}
+
+fn judge(folder: &Path, capture: &str, model: &str, console: &Console) -> anyhow::Result<Cell> {
+    let run = Run::open(folder)?;
+    let scene = read_scene(&run.scene_file()?)?;
+    let antialias = antialias(run.recipe()?.antialias);
+    let subjects = [Subject { what: What::Scene(&scene), antialias }];
+    let looks = looks(&run.views()?, scene.clip, SIZE);
+    let sides = in_turns(&subjects, &looks, &mut |done, total| console.phase("playing", done, total))?;
+    let [side] = <[Side; 1]>::try_from(sides).expect("one subject gives one side");
+    let steps = run.iteration().unwrap_or(0);
+    Ok(Cell {
+        capture: capture.into(),
+        model: model.into(),
+        refused: None,
+        side: side.scored_by(&run),
+        playback_bytes: run.number("playback_bytes").map(|b| b as u64),
+        steps,
+        ms_per_step: run.number("seconds").unwrap_or(0.0) * 1e3 / steps.max(1) as f64,
+        peak_memory: run.number("peak_memory").filter(|b| *b > 0.0).map(|b| b as u64),
+    })
+}
+
+fn markdown(cells: &[Cell], args: &Args) -> String {
+    let mut out = format!(
+        "Trained for {} minutes a cell on pictures reduced by {}, on this machine's CPU. PSNR, SSIM and flicker (mean \
+         difference between the change from frame to frame and the truth's, in 1/255) are means over the held-out views, \
+         `moving` is PSNR where things move. `scene` is the learnt state in 32-bit floats, `file` the playback file. \
+         Frames a second: the learnt state, end to end, 800x800.\n",
+        args.minutes, args.downscale
+    );
+    let mut captures: Vec<&str> = Vec::new();
+    for cell in cells.iter().filter(|c| !c.capture.is_empty()) {
+        if !captures.contains(&cell.capture.as_str()) {
+            captures.push(&cell.capture);
+        }
+    }
+    for capture in captures {
+        let _ = write!(
+            out,
+            "\n### {capture}\n\n| model | PSNR | SSIM | moving | flicker | Gaussians | scene | file | steps | ms/step | \
+             frames/s | memory |\n|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|\n"
+        );
+        for cell in cells.iter().filter(|c| c.capture == capture) {
+            let _ = writeln!(out, "{}", line(cell));
+        }
+    }
+    out
+}
+
+fn line(cell: &Cell) -> String {
+    if let Some(why) = &cell.refused {
+        return format!("| `{}` | {why} |{}", cell.model, " |".repeat(10));
+    }
+    let s = &cell.side;
+    let number = |v: Option<f64>, digits: usize| v.map_or_else(String::new, |v| format!("{v:.digits$}"));
+    let bytes = |b: Option<u64>| b.map_or_else(String::new, human_bytes);
+    format!(
+        "| `{}` | {} | {} | {} | {} | {} | {} | {} | {} | {:.1} | {:.1} | {} |",
+        cell.model,
+        number(s.psnr, 2),
+        number(s.ssim, 4),
+        number(s.psnr_dynamic, 2),
+        number(s.flicker, 2),
+        grouped(s.gaussians),
+        human_bytes(s.float_bytes),
+        bytes(cell.playback_bytes),
+        grouped(cell.steps),
+        cell.ms_per_step,
+        s.fps,
+        bytes(cell.peak_memory)
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_model_can_be_asked_for_and_others_are_named() {
+        assert_eq!(models(&[]).unwrap().len(), BUILT_IN.len() - 1);
+        assert_eq!(models(&["still".into()]).unwrap(), ["still"]);
+        assert!(models(&["stil".into()]).unwrap_err().to_string().contains("spacetime"));
+    }
+
+    #[test]
+    fn every_line_has_as_many_cells_as_the_head() {
+        let args = Args {
+            captures: vec!["a".into()],
+            output: "o".into(),
+            only: Vec::new(),
+            minutes: 3.0,
+            downscale: 2,
+            set: Vec::new(),
+        };
+        let cell = Cell { capture: "a".into(), model: "still".into(), steps: 10, ..Cell::default() };
+        let refused = Cell { refused: Some("one camera".into()), ..cell.clone() };
+        let page = markdown(&[cell, refused], &args);
+        let counts: Vec<usize> =
+            page.lines().filter(|l| l.starts_with('|')).map(|l| l.matches('|').count()).collect();
+        assert!(counts.len() == 4 && counts.windows(2).all(|w| w[0] == w[1]), "{page}");
+    }
+}

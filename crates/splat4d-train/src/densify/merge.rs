@@ -1,0 +1,206 @@
+//! Too many Gaussians in one place: near pairs become one (merging), or the fainter of a pair goes (spatial-proximity
+//! pruning). Pairs are mutual nearest neighbours, so that no row takes part twice.
+
+use super::{covariances, logit, opacity};
+use crate::{Error, Result};
+use splat4d::layers::Scene;
+use splat4d::math::knn::knn;
+use splat4d::math::sym3;
+use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
+use splat4d::scene::{Born, GEOMETRY, RowEdit, SH, Space};
+
+/// What becomes of a pair.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Crowd {
+    /// One Gaussian with the pair's mean, covariance (moments), colour and joint opacity.
+    Merge,
+    /// The fainter one goes, the other stays as it is.
+    Prune,
+}
+
+/// When and what.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Crowding {
+    /// What becomes of a pair.
+    pub what: Crowd,
+    /// Largest distance of a pair's means, of the smaller one's mean standard deviation.
+    pub distance: f64,
+    /// Steps between two rounds.
+    pub every: usize,
+}
+
+/// Largest difference of base colours (in SH coefficients, each channel) of a pair that is one thing.
+const SAME_COLOR: f32 = 0.15;
+/// Largest ratio of a pair's standard deviations.
+const SAME_SIZE: f64 = 2.0;
+/// Floor of merged standard deviations, of the larger one.
+const THINNEST: f64 = 1e-4;
+
+impl Crowding {
+    /// What the recipe asks for; none: nothing. Errors: an unknown name.
+    pub fn of(r: &crate::recipe::Recipe) -> Result<Option<Self>> {
+        let what = match r.crowding.as_str() {
+            "merge" => Crowd::Merge,
+            "prune" => Crowd::Prune,
+            "none" => return Ok(None),
+            other => {
+                return Err(Error::input(format!("knob `crowding` cannot be `{other}`"))
+                    .remedy("It must be none, merge or prune"));
+            }
+        };
+        Ok((r.crowding_interval > 0).then_some(Self {
+            what,
+            distance: r.crowding_distance,
+            every: r.crowding_interval,
+        }))
+    }
+
+    /// One round on one layer: changes the rows that stay, and says which do. `None`: there is no pair.
+    pub fn edit(&self, scene: &mut Scene<f32>, layer: usize) -> Option<RowEdit> {
+        let n = scene.layers[layer].params.len();
+        let pairs = self.pairs(scene, layer);
+        if pairs.is_empty() {
+            return None;
+        }
+        let covs = covariances(scene, layer);
+        let mut keep = vec![true; n];
+        for &(a, b) in &pairs {
+            let faint = if opacity(scene, layer, a) < opacity(scene, layer, b) { a } else { b };
+            let strong = a + b - faint;
+            if self.what == Crowd::Merge {
+                merge(scene, layer, strong, faint, [covs[strong], covs[faint]]);
+            }
+            keep[faint] = false;
+        }
+        let mut edit = RowEdit::prune(Space::Gaussians, keep.iter().copied());
+        if self.what == Crowd::Merge {
+            // Moments of what a merged row was would push it back.
+            let mut merged = vec![false; n];
+            pairs.iter().for_each(|&(a, b)| (merged[a], merged[b]) = (true, true));
+            for (born, row) in edit.born.iter_mut().zip(&edit.parent) {
+                if merged[*row as usize] {
+                    *born = Born::Moved;
+                }
+            }
+        }
+        Some(edit)
+    }
+
+    /// Pairs (a < b) of rows that are each other's nearest and alike in place, size, colour and life.
+    fn pairs(&self, scene: &Scene<f32>, layer: usize) -> Vec<(usize, usize)> {
+        let l = &scene.layers[layer];
+        let (n, g) = (l.params.len(), &l.params[GEOMETRY]);
+        if n < 2 {
+            return Vec::new();
+        }
+        let points: Vec<[f32; 3]> = (0..n).map(|r| g.read::<3>(r, 0)).collect();
+        let near = knn(&points, 1);
+        let size = |r: usize| {
+            let s = g.read::<3>(r, LOG_SCALE);
+            f64::from((s[0] + s[1] + s[2]) / 3.0).exp()
+        };
+        let spans = l.spans();
+        let alike = |a: usize, b: usize| {
+            let (sa, sb) = (size(a), size(b));
+            let (pa, pb) = (points[a], points[b]);
+            let far = f64::from((0..3).map(|k| (pa[k] - pb[k]).powi(2)).sum::<f32>()).sqrt();
+            let (ca, cb) = (l.params[SH].read::<3>(a, 0), l.params[SH].read::<3>(b, 0));
+            let overlap = spans[a][1].min(spans[b][1]) - spans[a][0].max(spans[b][0]);
+            let length = (spans[a][1] - spans[a][0]).min(spans[b][1] - spans[b][0]);
+            far <= self.distance * sa.min(sb)
+                && sa.max(sb) <= SAME_SIZE * sa.min(sb)
+                && (0..3).all(|k| (ca[k] - cb[k]).abs() <= SAME_COLOR)
+                && (overlap >= 0.5 * length || !length.is_finite())
+        };
+        let mutual = (0..n).map(|a| (a, near[a] as usize)).filter(|&(a, b)| a < b && near[b] as usize == a);
+        mutual.filter(|&(a, b)| alike(a, b)).collect()
+    }
+}
+
+/// Row `a` becomes the pair: moments weighted by opacity times volume, everything else by the same weights.
+fn merge(scene: &mut Scene<f32>, layer: usize, a: usize, b: usize, [ca, cb]: [[f64; 6]; 2]) {
+    let (oa, ob) = (opacity(scene, layer, a), opacity(scene, layer, b));
+    let params = &mut scene.layers[layer].params;
+    let volume = |p: &splat4d::scene::Params<f32>, r: usize| {
+        let s = p[GEOMETRY].read::<3>(r, LOG_SCALE);
+        f64::from(s[0] + s[1] + s[2]).exp()
+    };
+    let (wa, wb) = (oa * volume(params, a), ob * volume(params, b));
+    let u = wb / (wa + wb).max(f64::MIN_POSITIVE);
+    let (ma, mb) = (params[GEOMETRY].read::<3>(a, 0), params[GEOMETRY].read::<3>(b, 0));
+    let d: [f64; 3] = std::array::from_fn(|k| f64::from(mb[k] - ma[k]));
+    let cross = [d[0] * d[0], d[0] * d[1], d[0] * d[2], d[1] * d[1], d[1] * d[2], d[2] * d[2]];
+    let cov: [f64; 6] = std::array::from_fn(|k| (1.0 - u) * ca[k] + u * cb[k] + u * (1.0 - u) * cross[k]);
+    let largest = sym3::largest(cov).max(0.0).sqrt();
+    let (q, s) = sym3::to_quat_log_scales(cov, (THINNEST * largest).max(1e-12));
+    for key in params.keys().collect::<Vec<_>>() {
+        if params.info(key).space != Space::Gaussians || !params.info(key).trainable {
+            continue;
+        }
+        for col in 0..params[key].width() {
+            let (x, y) = (params[key].get(a, col), params[key].get(b, col));
+            params[key].set(a, col, x + u as f32 * (y - x));
+        }
+    }
+    let g = &mut params[GEOMETRY];
+    g.write(a, QUAT, q.map(|x| x as f32));
+    g.write(a, LOG_SCALE, s.map(|x| x as f32));
+    g.set(a, OPACITY, logit(1.0 - (1.0 - oa) * (1.0 - ob)));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::scene;
+    use super::*;
+
+    /// Fifty Gaussians far apart, each with a twin a tenth of its size away.
+    fn twins() -> Scene<f32> {
+        let mut s = scene(100);
+        let params = &mut s.layers[0].params;
+        for r in 0..50 {
+            let mut g = params[GEOMETRY].read::<11>(r, 0);
+            g[0] = r as f32;
+            g[OPACITY] = 0.0;
+            params[GEOMETRY].write(r, 0, g);
+            g[1] += 0.1 * (-2.0f32).exp();
+            g[OPACITY] = -1.0;
+            params[GEOMETRY].write(50 + r, 0, g);
+        }
+        s
+    }
+
+    #[test]
+    fn twins_become_one_and_strangers_stay() {
+        for what in [Crowd::Merge, Crowd::Prune] {
+            let rule = Crowding { what, distance: 0.5, every: 1 };
+            let mut s = twins();
+            let before = s.clone();
+            let edit = rule.edit(&mut s, 0).unwrap();
+            assert_eq!(edit.parent, (0..50).collect::<Vec<u32>>(), "the fainter one goes");
+            let changed = s.layers[0].params[GEOMETRY] != before.layers[0].params[GEOMETRY];
+            assert_eq!(changed, what == Crowd::Merge);
+            if what == Crowd::Merge {
+                let o = opacity(&s, 0, 3);
+                assert!((o - (1.0 - 0.5 * (1.0 - 1.0 / (1.0 + 1f64.exp())))).abs() < 1e-6, "{o}");
+                let [y0, y] = [&before, &s].map(|s| s.layers[0].params[GEOMETRY].get(3, 1));
+                assert!(y > y0 && y < y0 + 0.1 * (-2.0f32).exp());
+                assert!(edit.born.iter().all(|b| *b == Born::Moved));
+            }
+            let far = Crowding { distance: 0.01, ..rule };
+            assert!(far.edit(&mut twins(), 0).is_none());
+        }
+    }
+
+    #[test]
+    fn colours_and_sizes_that_differ_are_different_things() {
+        let rule = Crowding { what: Crowd::Merge, distance: 0.5, every: 1 };
+        let mut s = twins();
+        for r in 50..75 {
+            s.layers[0].params[SH].set(r, 1, 1.0);
+        }
+        for r in 75..100 {
+            s.layers[0].params[GEOMETRY].write(r, LOG_SCALE, [-0.5; 3]);
+        }
+        assert!(rule.edit(&mut s, 0).is_none());
+    }
+}

@@ -1,0 +1,127 @@
+//! Upkeep of control nodes: lists of nearest nodes are refreshed, nodes are added where Gaussians cannot follow, and nodes
+//! that nobody follows are removed.
+//!
+//! Source: Huang et al. 2024 (SC-GS), there every 5,000 of 80,000 steps from 1,000 to 25,000 with the gradient to
+//! positions in space; here with that to positions in the picture, which densification gathers anyway.
+
+use crate::densify::{self, Stats};
+use crate::models::Adapt;
+use crate::optim::Moments;
+use crate::recipe::Recipe;
+use splat4d::layers::Scene;
+use splat4d::math::Rng;
+use splat4d::motion::skin::{NODE_HYPER, Skin, Weights};
+use splat4d::scene::{Born, GEOMETRY, RowEdit, Space};
+
+/// Nodes are never fewer than this: a Gaussian's three and the one that cuts off.
+const LEAST_NODES: usize = 4;
+
+/// See the module's documentation.
+#[derive(Clone, Copy, Debug)]
+pub struct NodeAdapt {
+    /// Steps between two refreshes.
+    pub bind_interval: usize,
+    /// First and last step that adds or removes nodes, and the steps between.
+    pub steps: (usize, usize, usize),
+    /// Weighted mean gradient above which a node gets a second one (NDC units).
+    pub threshold: f64,
+    /// Never more nodes than this.
+    pub cap: usize,
+}
+
+impl NodeAdapt {
+    /// As the recipe says.
+    pub fn of(r: &Recipe) -> Self {
+        Self {
+            bind_interval: r.control_bind_interval,
+            steps: (r.densify_from_iter, r.densify_until_iter, r.control_adapt_interval),
+            threshold: r.control_grad_threshold,
+            cap: r.control_max_nodes,
+        }
+    }
+
+    fn edits_at(&self, step: usize) -> bool {
+        let (from, until, every) = self.steps;
+        every > 0 && step >= from && step <= until && step.is_multiple_of(every)
+    }
+}
+
+impl Adapt for NodeAdapt {
+    fn is_due(&self, step: usize) -> bool {
+        self.edits_at(step) || (self.bind_interval > 0 && step.is_multiple_of(self.bind_interval))
+    }
+
+    fn run(&self, scene: &mut Scene<f32>, moments: &mut [Moments<f32>], stats: &mut Stats, step: usize, rng: Rng) {
+        for layer in 0..scene.layers.len() {
+            let Some(skin) = Skin::find(&scene.layers[layer].params) else { continue };
+            if self.edits_at(step) {
+                self.edit(&skin, scene, moments, stats, layer, &rng);
+            }
+            skin.bind(&mut scene.layers[layer].params);
+        }
+    }
+}
+
+/// What the Gaussians that follow a node say of it.
+#[derive(Clone, Copy, Default)]
+struct Pull {
+    /// Σ a and Σ a g.
+    weight: f64,
+    gradient: f64,
+    /// Σ a g x.
+    place: [f64; 3],
+}
+
+impl NodeAdapt {
+    fn edit(
+        &self,
+        skin: &Skin,
+        scene: &mut Scene<f32>,
+        moments: &mut [Moments<f32>],
+        stats: &mut Stats,
+        layer: usize,
+        rng: &Rng,
+    ) {
+        let p = &scene.layers[layer].params;
+        let count = skin.count(p);
+        let mut weights = Weights::default();
+        skin.weigh(p, &mut weights);
+        let mut pulls = vec![Pull::default(); count];
+        let mut hyper = vec![0.0; count * skin.spec.hyper];
+        for i in 0..p.len() {
+            let g = f64::from(stats.gradient(layer, i));
+            let x = p[GEOMETRY].read::<3>(i, 0);
+            let (nodes, a) = weights.row(i);
+            for (&node, &a) in nodes.iter().zip(a) {
+                let (node, a) = (node as usize, f64::from(a));
+                let pull = &mut pulls[node];
+                pull.weight += a;
+                pull.gradient += a * g;
+                (0..3).for_each(|k| pull.place[k] += a * g * f64::from(x[k]));
+                for c in 0..skin.spec.hyper {
+                    hyper[node * skin.spec.hyper + c] += a * g * f64::from(p[skin.hyper].get(i, c));
+                }
+            }
+        }
+        let keep = |k: usize| pulls[k].weight > 0.0 || count <= LEAST_NODES;
+        let mut edit = RowEdit::prune(Space::Nodes, (0..count).map(keep));
+        let kept = edit.len();
+        let mean = |k: usize| pulls[k].gradient / pulls[k].weight.max(f64::MIN_POSITIVE);
+        let mut strained: Vec<usize> = (0..count).filter(|&k| keep(k) && mean(k) > self.threshold).collect();
+        strained.sort_by(|&a, &b| mean(b).total_cmp(&mean(a)).then(a.cmp(&b)));
+        strained.truncate(self.cap.saturating_sub(kept));
+        if kept < LEAST_NODES.min(count) || (kept == count && strained.is_empty()) {
+            return;
+        }
+        strained.iter().for_each(|&k| edit.push(k as u32, Born::Clone));
+        densify::apply(scene, moments, stats, layer, &edit, rng);
+        let nodes = &mut scene.layers[layer].params[skin.nodes];
+        for (j, &k) in strained.iter().enumerate() {
+            nodes.write(kept + j, 0, pulls[k].place.map(|x| (x / pulls[k].gradient) as f32));
+            for c in 0..skin.spec.hyper {
+                let mean = hyper[k * skin.spec.hyper + c] / pulls[k].gradient;
+                nodes.set(kept + j, NODE_HYPER + c, mean as f32);
+            }
+        }
+    }
+}
