@@ -191,8 +191,6 @@ recipe! {
     lambda_sparse: f64 = 0.0,
 
     // ssm.
-    /// ssm: control nodes.
-    ssm_nodes: usize = 512,
     /// ssm: ticks of the scan over the clip; 0: one every two distinct times, 16 to 96.
     ssm_ticks: usize = 0,
     /// ssm: channels.
@@ -208,7 +206,7 @@ recipe! {
     /// ssm: none, frames (the model turns with the scene) or vector (and mirrors with it).
     ssm_equivariance: String = "none".into(),
     /// ssm: share of the iterations, from the first, in which nothing moves; nodes are placed after it.
-    ssm_warm_up: f64 = 0.05,
+    ssm_warm_up: f64 = 0.0,
     /// ssm: rate of the network's maps at the start.
     ssm_lr_init: f64 = 1e-3,
     /// ssm: rate of the network's maps at the end.

@@ -1,15 +1,15 @@
-//! `ssm`: how it is learnt. A static warm-up; then nodes are placed on what became of the cloud, and all learns together.
+//! `ssm`: how it is learnt. One joint stage, as of `control`, whose nodes, losses on nodes and upkeep it shares; before it,
+//! if the recipe says so, a still warm-up, after which nodes are placed anew on what became of the cloud.
 
-use super::{Group, Hook, Plan, Program, Rate, Stage, still};
+use super::{Group, Hook, Plan, Program, Rate, Stage, control, still};
+use crate::{Error, Result};
 use splat4d::layers::Layer;
 use splat4d::math::knn::mean_square_distance;
-use splat4d::motion::skin::{NODE_LOG_RADIUS, SkinSpec, Skinned, farthest_points};
+use splat4d::motion::skin::{NODE_LOG_RADIUS, Skin, farthest_points};
 use splat4d::motion::ssm::{Equivariance, Mode, Output, SsmSpec, refresh};
-use splat4d::motion::{Motion, Spec};
+use splat4d::motion::Spec;
 use splat4d::scene::params::OPACITY;
-use splat4d::scene::{GEOMETRY, Params};
-use std::any::Any;
-use std::sync::Arc;
+use splat4d::scene::GEOMETRY;
 
 /// Control nodes driven by a diagonal state-space model.
 #[derive(Clone, Copy, Debug)]
@@ -17,12 +17,8 @@ pub struct SsmProgram;
 
 /// Ticks of a clip, where the recipe leaves the choice.
 const TICKS: std::ops::RangeInclusive<usize> = 16..=96;
-/// Hyper coordinates (SC-GS).
-const HYPER: usize = 8;
 /// Gaussians less opaque than this hold no node: what is about to die says nothing of the shape.
 const SOLID_LOGIT: f32 = -2.2;
-/// Nodes' positions learn this much slower than the Gaussians'.
-const NODE_SLOWDOWN: f64 = 5.0;
 
 impl Program for SsmProgram {
     fn spec(&self, plan: &Plan) -> Spec {
@@ -30,9 +26,8 @@ impl Program for SsmProgram {
         let ticks = if r.ssm_ticks > 0 { r.ssm_ticks } else { plan.times.div_ceil(2) };
         Spec::Ssm(SsmSpec {
             seed: r.seed,
-            skin: SkinSpec { nodes: r.ssm_nodes, hyper: HYPER, ..SkinSpec::default() },
-            // A still capture has one moment; the scan still needs a span.
-            clip: [plan.clip[0], plan.clip[1].max(plan.clip[0] + 1.0 / plan.fps)],
+            skin: control::skin(r),
+            clip: plan.clip,
             ticks: if r.ssm_ticks > 0 { ticks.max(2) } else { ticks.clamp(*TICKS.start(), *TICKS.end()) },
             width: r.ssm_width,
             states: r.ssm_states,
@@ -50,6 +45,14 @@ impl Program for SsmProgram {
         })
     }
 
+    fn check(&self, plan: &Plan) -> Result<()> {
+        if plan.times < 2 {
+            return Err(Error::input("a scan over time learns from motion, and the capture has one moment only")
+                .remedy("Use --motion still"));
+        }
+        Ok(())
+    }
+
     fn stages(&self, plan: &Plan) -> Vec<Stage> {
         let r = &plan.recipe;
         let warm = (r.ssm_warm_up * r.iterations as f64) as usize;
@@ -61,8 +64,11 @@ impl Program for SsmProgram {
         }
         let mut all = share_of(still::stage("ssm", plan), warm, r.iterations);
         still::learn_life(&mut all, plan, self.life(plan));
+        control::add_nodes(&mut all, plan);
         all.groups.extend(groups(self.spec(plan), plan));
-        all.start = Some(place_nodes());
+        if warm > 0 {
+            all.start = Some(place_nodes());
+        }
         stages.push(all);
         stages
     }
@@ -83,20 +89,11 @@ fn share_of(mut stage: Stage, from: usize, to: usize) -> Stage {
     stage
 }
 
-/// What the model adds to a still cloud's groups.
+/// The network's groups.
 fn groups(spec: Spec, plan: &Plan) -> Vec<Group> {
     let r = &plan.recipe;
     let maps = Rate { start: r.ssm_lr_init, end: r.ssm_lr_final };
-    let place = Rate { start: r.position_lr_init * plan.extent, end: r.position_lr_final * plan.extent };
-    let slow = Rate { start: place.start / NODE_SLOWDOWN, end: place.end / NODE_SLOWDOWN };
-    let mut groups = vec![
-        Group::new("node_means", slow),
-        Group::new("node_log_radii", maps),
-        Group::new("node_logits", maps),
-        Group::new("node_hyper", maps),
-        Group::new("hyper", maps),
-        Group::new("node_embeddings", r.falling(r.ssm_embedding_lr)),
-    ];
+    let mut groups = vec![Group::new("node_embeddings", r.falling(r.ssm_embedding_lr))];
     // A model of an empty layer has the same columns as any other.
     let Spec::Ssm(spec) = spec else { return groups };
     if let Ok((dynamics, others)) = splat4d::motion::ssm::columns(&spec) {
@@ -118,10 +115,9 @@ fn place_nodes() -> Hook<f32> {
 
 fn place(layer: &mut Layer) {
     let Spec::Ssm(spec) = layer.motion.spec() else { return };
-    let motion: Arc<dyn Motion<f32>> = layer.motion.clone();
-    let Some(skinned) = (&*motion as &dyn Any).downcast_ref::<Skinned<f32>>() else { return };
-    let p: &mut Params<f32> = &mut layer.params;
-    let count = skinned.skin.count(p);
+    let p = &mut layer.params;
+    let Some(skin) = Skin::find(p) else { return };
+    let count = skin.count(p);
     let solid: Vec<u32> =
         (0..p.len() as u32).filter(|&i| p[GEOMETRY].get(i as usize, OPACITY) > SOLID_LOGIT).collect();
     let centers = farthest_points(&p[GEOMETRY].gather(&solid), count);
@@ -130,11 +126,11 @@ fn place(layer: &mut Layer) {
         return;
     }
     let spacing = mean_square_distance(&centers);
-    let nodes = &mut p[skinned.skin.nodes];
+    let nodes = &mut p[skin.nodes];
     for (k, (center, square)) in centers.iter().zip(spacing).enumerate() {
         nodes.write(k, 0, *center);
         nodes.set(k, NODE_LOG_RADIUS, 0.5 * square.max(f32::MIN_POSITIVE).ln());
     }
-    skinned.bind(p);
+    skin.bind(p);
     refresh(spec.equivariance, p);
 }

@@ -3,10 +3,9 @@
 mod check;
 
 use check::{model, starts_still};
-use splat4d::motion::skin::SkinSpec;
-use splat4d::motion::ssm::{Equivariance, Mode, Output, SsmSpec};
 use splat4d::motion::control::{ControlSpec, Curve, TrajectorySpec};
 use splat4d::motion::skin::SkinSpec;
+use splat4d::motion::ssm::{Equivariance, Mode, Output, SsmSpec};
 use splat4d::motion::{SpacetimeSpec, Spec};
 use splat4d::scene::{LifeKind, Space};
 
