@@ -320,6 +320,30 @@ recipe! {
     lambda_sparse: f64 = 0.0,
 
     // ssm.
+    /// ssm: ticks of the scan over the clip; 0: one every two distinct times, 16 to 96.
+    ssm_ticks: usize = 0,
+    /// ssm: channels.
+    ssm_width: usize = 32,
+    /// ssm: complex states a channel.
+    ssm_states: usize = 8,
+    /// ssm: residual blocks.
+    ssm_blocks: usize = 2,
+    /// ssm: bidirectional (to reconstruct) or causal (to forecast).
+    ssm_mode: String = "bidirectional".into(),
+    /// ssm: absolute (poses) or twist (rates of poses, composed from tick to tick).
+    ssm_output: String = "absolute".into(),
+    /// ssm: none, frames (the model turns with the scene) or vector (and mirrors with it).
+    ssm_equivariance: String = "none".into(),
+    /// ssm: share of the iterations, from the first, in which nothing moves; nodes are placed after it.
+    ssm_warm_up: f64 = 0.0,
+    /// ssm: rate of the network's maps at the start.
+    ssm_lr_init: f64 = 1e-3,
+    /// ssm: rate of the network's maps at the end.
+    ssm_lr_final: f64 = 1e-5,
+    /// ssm: rate of the state space's decays, frequencies and steps.
+    ssm_dynamics_lr: f64 = 1e-3,
+    /// ssm: rate of the nodes' embeddings.
+    ssm_embedding_lr: f64 = 5e-3,
 
     // filtered.
     /// filter: how prediction and the motion's answer merge: off, geodesic (a learnt share) or literal (as published).
@@ -524,6 +548,7 @@ impl Recipe {
             ("relocate_gradient", self.relocate_gradient),
             ("min_opacity", self.min_opacity),
             ("prune_ratio", self.prune_ratio),
+            ("ssm_warm_up", self.ssm_warm_up),
             ("static_split_from", self.static_split_from),
             ("deform_warmup", self.deform_warmup),
             ("deform_unlock", self.deform_unlock),
@@ -590,6 +615,9 @@ impl Recipe {
             ("filter", &self.filter, &Fusion::ALL.map(|(name, _)| name)[..]),
             ("filter_predictor", &self.filter_predictor, &Predictor::ALL.map(|(name, _)| name)[..]),
             ("transport", &self.transport, &["off", "linear", "wasserstein"][..]),
+            ("ssm_mode", &self.ssm_mode, &["bidirectional", "causal"][..]),
+            ("ssm_output", &self.ssm_output, &["absolute", "twist"][..]),
+            ("ssm_equivariance", &self.ssm_equivariance, &["none", "frames", "vector"][..]),
         ] {
             if !known.contains(&value.as_str()) {
                 let near = nearest(value, known).map(|n| format!("; did you mean `{n}`?")).unwrap_or_default();

@@ -10,6 +10,7 @@ use splat4d::motion::hexplane::{Heads, HexplaneSpec};
 use splat4d::motion::native4d::Native4dSpec;
 use splat4d::motion::skin::SkinSpec;
 use splat4d::motion::tracked::TrackedSpec;
+use splat4d::motion::ssm::{Equivariance, Mode, Output, SsmSpec};
 use splat4d::motion::{SpacetimeSpec, Spec};
 use splat4d::nn::HashShape;
 use splat4d::nn::hexplane::PlaneShape;
@@ -124,6 +125,22 @@ fn control() {
 }
 
 // ssm.
+#[test]
+fn ssm() {
+    let skin = SkinSpec { nodes: 7, neighbours: 3, hyper: 2, mask: false };
+    let small = SsmSpec { skin, ticks: 9, width: 6, states: 2, embedding: 3, octaves: 2, ..SsmSpec::default() };
+    let kinds = [
+        (Mode::Bidirectional, Output::Absolute, Equivariance::None),
+        (Mode::Causal, Output::Twist, Equivariance::None),
+        (Mode::Bidirectional, Output::Twist, Equivariance::Frames),
+        (Mode::Bidirectional, Output::Absolute, Equivariance::Vector),
+    ];
+    for (mode, output, equivariance) in kinds {
+        let spec = Spec::Ssm(SsmSpec { mode, output, equivariance, ..small.clone() });
+        model(&spec, ROWS, LifeKind::Infinite, &[Space::Gaussians, Space::Nodes], &[]);
+        starts_still(&spec, ROWS);
+    }
+}
 
 // filtered.
 
