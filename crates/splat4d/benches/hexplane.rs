@@ -72,11 +72,12 @@ fn planes_forward_and_backward(bencher: Bencher<'_, '_>, threads: usize) {
     let (p, model) = made();
     let (x, mut d, pool) = (positions(&p), Grads::new(&p), pool(threads));
     let (mut f, mut d_x) = (vec![0.0f32; GAUSSIANS * 64], vec![[0.0f32; 3]; GAUSSIANS]);
+    let mut waiting = Vec::new();
     bencher.bench_local(|| {
         pool.install(|| {
             let lines = model.planes().lines(&p, 0.37f32);
             model.planes().forward(&p, &lines, 2, &x, &mut f);
-            model.planes().backward(&p, &lines, 2, &x, &f, &mut d_x, &mut d)
+            model.planes().backward(&p, &lines, 2, &x, &f, &mut d_x, &mut waiting, &mut d)
         })
     });
 }

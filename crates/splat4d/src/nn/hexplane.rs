@@ -211,7 +211,8 @@ impl Planes {
         });
     }
 
-    /// VJP of [`forward`](Self::forward) and [`lines`](Self::lines): adds to `d` and to `d_x`; returns dL/dt.
+    /// VJP of [`forward`](Self::forward) and [`lines`](Self::lines): adds to `d` and to `d_x`; returns dL/dt. `waiting` is
+    /// scratch, whatever is in it.
     pub fn backward<F: Real>(
         &self,
         p: &Params<F>,
@@ -220,6 +221,7 @@ impl Planes {
         x: &[[F; 3]],
         d_out: &[F],
         d_x: &mut [[F; 3]],
+        waiting: &mut Vec<[F; LANES]>,
         d: &mut Grads<F>,
     ) -> F {
         let width = self.shape.features();
@@ -243,7 +245,7 @@ impl Planes {
             sinks.push(Sink { level, plane, side, axes: [u, v], data, line });
         }
         let run = levels.len() * 6 * blocks;
-        let mut waiting = vec![[F::ZERO; LANES]; (PARTS * PART_ROWS).min(x.len()) * run];
+        waiting.resize((PARTS * PART_ROWS).min(x.len()) * run, [F::ZERO; LANES]);
         let some = PARTS * PART_ROWS;
         for ((x, d_out), d_x) in x.chunks(some).zip(d_out.chunks(some * width)).zip(d_x.chunks_mut(some)) {
             let parts = waiting.par_chunks_mut(PART_ROWS * run).zip(x.par_chunks(PART_ROWS));
@@ -252,7 +254,7 @@ impl Planes {
                 let d_out = lanes(d_out);
                 dispatch(simd, Backward { levels: &levels, x, d_out, width: width / LANES, waiting, d_x });
             });
-            let waiting = &waiting;
+            let waiting = &*waiting;
             sinks.par_iter_mut().with_max_len(1).for_each(|sink| {
                 dispatch(simd, Scatter { sink, x, waiting, run, blocks });
             });
