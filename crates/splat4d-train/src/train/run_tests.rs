@@ -149,8 +149,15 @@ fn meddled(meddle: impl FnMut(usize, &mut Image<f32>) + Send + 'static) -> Box<d
 }
 
 impl<F: FnMut(usize, &mut Image<f32>) + Send> Draw<f32> for Meddled<F> {
-    fn render(&mut self, splats: &Splats<'_, f32>, camera: &Camera, background: [f32; 3], out: &mut Image<f32>) {
-        self.inner.render(splats, camera, background, None, out);
+    fn render(
+        &mut self,
+        splats: &Splats<'_, f32>,
+        camera: &Camera,
+        background: [f32; 3],
+        extra: Option<&Table<f32>>,
+        out: &mut Image<f32>,
+    ) {
+        self.inner.render(splats, camera, background, extra, out);
         self.drawn += 1;
         (self.meddle)(self.drawn, out);
     }
@@ -160,11 +167,12 @@ impl<F: FnMut(usize, &mut Image<f32>) + Send> Draw<f32> for Meddled<F> {
         splats: &Splats<'_, f32>,
         camera: &Camera,
         background: [f32; 3],
+        extra: Option<&Table<f32>>,
         grads: &ImageGrads<'_, f32>,
         d_sh: &mut [Option<&mut Table<f32>>],
         d: &mut RenderGrads<f32>,
     ) {
-        self.inner.backward(splats, camera, background, None, grads, d_sh, d);
+        self.inner.backward(splats, camera, background, extra, grads, d_sh, d);
     }
 
     fn radii(&self) -> &[f32] {

@@ -2,6 +2,7 @@
 //! ordinary trainer and checked against f64 finite differences through the whole chain, the oracle as the forward.
 
 mod edits;
+mod further;
 mod layers;
 mod lobes;
 mod nodes;
@@ -12,7 +13,7 @@ mod wrapper;
 
 use super::*;
 use crate::densify::Limits;
-use crate::train::chain::{Chain, Draw, ImageLoss, Losses, StepInfo, StepReport, View};
+use crate::train::chain::{Chain, Draw, ImageLoss, Losses, PictureGrads, StepInfo, StepReport, View};
 use crate::train::frames::{Frames, Picture};
 use crate::train::loss::TrainLoss;
 use crate::train::tests::Made;
@@ -56,8 +57,15 @@ fn smooth() -> RenderConfig {
 struct Oracle(RenderConfig);
 
 impl Draw<f64> for Oracle {
-    fn render(&mut self, splats: &Splats<'_, f64>, camera: &Camera, background: [f64; 3], out: &mut Image<f64>) {
-        *out = oracle::render(splats, camera, background, None, &self.0);
+    fn render(
+        &mut self,
+        splats: &Splats<'_, f64>,
+        camera: &Camera,
+        background: [f64; 3],
+        extra: Option<&Table<f64>>,
+        out: &mut Image<f64>,
+    ) {
+        *out = oracle::render(splats, camera, background, extra, &self.0);
     }
 
     fn backward(
@@ -65,6 +73,7 @@ impl Draw<f64> for Oracle {
         splats: &Splats<'_, f64>,
         _: &Camera,
         _: [f64; 3],
+        _: Option<&Table<f64>>,
         _: &ImageGrads<'_, f64>,
         _: &mut [Option<&mut Table<f64>>],
         d: &mut RenderGrads<f64>,
@@ -88,19 +97,14 @@ impl Draw<f64> for Oracle {
 struct Squared;
 
 impl ImageLoss<f64> for Squared {
-    fn eval(
-        &mut self,
-        view: &View<'_, f64>,
-        image: &Image<f64>,
-        d_color: &mut Planes<f64>,
-        _: &mut Planes<f64>,
-    ) -> (f64, bool) {
+    fn eval(&mut self, view: &View<'_, f64>, image: &Image<f64>, d: &mut PictureGrads<f64>) -> f64 {
         let n = image.color.data.len() as f64;
+        let d_color = &mut d.color;
         d_color.clone_from(&image.color);
         for (d, t) in d_color.data.iter_mut().zip(&view.truth.data) {
             *d = (*d - t) * 2.0 / n;
         }
-        (d_color.data.iter().map(|d| d * d * n / 4.0).sum(), false)
+        d_color.data.iter().map(|d| d * d * n / 4.0).sum()
     }
 }
 
@@ -145,6 +149,7 @@ fn step(
             truth: &s.truth,
             mask: None,
             weight: None,
+            flow: None,
             frame: 0,
             rig: 0,
         })
