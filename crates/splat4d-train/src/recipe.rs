@@ -387,8 +387,34 @@ recipe! {
 
     /// Weight of the σ-weighted opacity regulariser (FreeTimeGS).
     lambda_opacity_life: f64 = 0.0,
-    /// Weight of the velocity smoothness over nearest neighbours.
+    /// Weight of the velocity smoothness over nearest neighbours, (extents a clip)²; any model that moves.
     lambda_velocity: f64 = 0.0,
+    /// Weight of local rigidity over a frame, extents: neighbours keep their offsets (Luiten et al.; they take 4).
+    lambda_rigid: f64 = 0.0,
+    /// Weight of the agreement of Gaussians' turns with their neighbourhood's over a frame (Luiten et al.; they take 4).
+    lambda_rot: f64 = 0.0,
+    /// Weight of isometry between two instants, extents: neighbours keep their distances (Luiten et al.; they take 2).
+    lambda_iso: f64 = 0.0,
+    /// Weight of the as-rigid-as-possible energy between two instants, extents² (SC-GS).
+    lambda_arap: f64 = 0.0,
+    /// Weight of the variance of neighbours' distances over four frames, over itself (SC-GS; 1e-3 there).
+    lambda_elastic: f64 = 0.0,
+    /// Weight of the third difference of positions over four frames, extents: against jitter.
+    lambda_jerk: f64 = 0.0,
+    /// Weight of the total variation of the picture's colours.
+    lambda_tv: f64 = 0.0,
+    /// Weight of the edge-aware total variation of depth, over its mean.
+    lambda_depth_tv: f64 = 0.0,
+    /// Weight of the agreement of depth with the splats' shortest axes (2DGS; 0.05 there).
+    lambda_depth_normal: f64 = 0.0,
+    /// Weight of the discrepancy of amplitudes and phases of the spectrum, coarse ones first (FreGS).
+    lambda_frequency: f64 = 0.0,
+    /// Weight of the entropy of the drawn alpha, nats: pixels decide between scene and background.
+    lambda_mask_entropy: f64 = 0.0,
+    /// Weight of the entropy of opacities, nats: Gaussians are there or not (SuGaR; 0.1 there).
+    lambda_opacity_entropy: f64 = 0.0,
+    /// Weight of the drawn flow against a known one, shares of the picture's longer side, where the capture has it.
+    lambda_flow: f64 = 0.0,
     /// Densification: adc, mcmc or none.
     strategy: String = "adc".into(),
     /// Never more Gaussians than this.

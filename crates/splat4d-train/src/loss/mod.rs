@@ -4,7 +4,10 @@
 
 pub mod arap;
 pub mod graph;
+pub mod image;
 mod kernel;
+pub mod motion;
+pub mod neighbourhood;
 pub mod photometric;
 pub mod planes;
 pub mod rigid;

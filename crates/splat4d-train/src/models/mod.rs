@@ -239,6 +239,14 @@ impl<F: Real> Stage<F> {
     }
 }
 
+impl<F: Real> Stage<F> {
+    /// Tells every loss that rows were edited.
+    pub fn on_edit(&self) {
+        self.params.iter().for_each(|l| l.on_edit());
+        self.probes.iter().for_each(|l| l.on_edit());
+    }
+}
+
 /// How one motion model is learnt.
 pub trait Program: Send + Sync {
     /// The model that training starts with.

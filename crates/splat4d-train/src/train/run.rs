@@ -16,6 +16,8 @@ use crate::event::Event;
 use crate::init::{self, Seeds};
 use crate::models::auto::{self, AUTO};
 use crate::models::{Plan, Stage, program_of, split};
+use crate::loss::image::ImageTerms;
+use crate::models::{Plan, Stage, program};
 use crate::recipe::Recipe;
 use crate::{Error, ErrorKind, Result};
 use serde_json::json;
@@ -356,7 +358,8 @@ impl Bench {
             opacity_reset_interval: r.opacity_reset_interval,
             exposure_lr: r.exposure_lr,
         };
-        let loss = TrainLoss::new(r.lambda_dssim, r.lambda_mask, exposure);
+        let mut loss = TrainLoss::new(r.lambda_dssim, r.lambda_mask, exposure);
+        loss.terms = ImageTerms::of(r);
         Trainer::new(scene, stages, self.frames.clone(), Box::new(Renderer::new(config)), loss, settings)
     }
 

@@ -337,6 +337,7 @@ impl<'a> Trainer<'a> {
                 truth: &picture.color,
                 mask: picture.mask.as_ref(),
                 weight: picture.weight.as_ref(),
+                flow: picture.flow.as_ref().map(|f| f.truth()),
                 frame: i,
                 rig: self.frames.rig(i),
             })
@@ -351,6 +352,7 @@ impl<'a> Trainer<'a> {
             Some(unlocked) => unlocked.min(self.settings.sh_degree),
             None => self.settings.sh_degree,
         };
+        self.loss.progress = info.progress;
         let clock = Clock::now();
         if let Some(codec) = &stage.codec {
             if std::mem::take(&mut self.stale) {
@@ -489,7 +491,7 @@ impl<'a> Trainer<'a> {
                     );
                 }
             }
-            stage.params.iter().for_each(|l| l.on_edit());
+            stage.on_edit();
             self.stale = true;
             self.fit_grads();
         }
@@ -541,7 +543,7 @@ impl<'a> Trainer<'a> {
         for (layer, edit) in prune(&self.scene, &scores, periodic.ratio).iter().enumerate() {
             densify::apply(&mut self.scene, &mut self.moments, &mut self.stats, layer, edit, &rng);
         }
-        self.stages[self.progress.stage].params.iter().for_each(|l| l.on_edit());
+        self.stages[self.progress.stage].on_edit();
         self.fit_grads();
         Ok(before - self.scene.len())
     }
@@ -584,6 +586,10 @@ struct Mse<'a> {
 }
 
 impl super::chain::ImageLoss<f32> for Mse<'_> {
+    fn wanted(&self) -> super::chain::Wanted {
+        self.inner.wanted()
+    }
+
     fn eval(
         &mut self,
         view: &View<'_, f32>,
@@ -592,6 +598,9 @@ impl super::chain::ImageLoss<f32> for Mse<'_> {
         d_alpha: &mut Planes<f32>,
     ) -> (f64, bool) {
         let out = self.inner.eval(view, image, d_color, d_alpha);
+        d: &mut super::chain::PictureGrads<f32>,
+    ) -> f64 {
+        let out = self.inner.eval(view, image, d);
         self.sum += self.inner.mse;
         out
     }
