@@ -105,7 +105,7 @@ fn cloud_and_box_moved_together_deform_alike() {
     }
 }
 
-/// Chunks of rows and what is computed again for them give the same splats and nearly the same sums of gradients.
+/// Chunks of rows and what is computed again for them give the same splats and gradients up to rounding.
 #[test]
 fn more_rows_than_are_kept_are_the_same_rows() {
     let rows = ROWS + 70;
@@ -115,7 +115,9 @@ fn more_rows_than_are_kept_are_the_same_rows() {
     tail.apply(&edit);
     let (all, some) = (splats(&p, &model, 3.3), splats(&tail, &model, 3.3));
     for j in 0..80 {
-        assert_eq!(all.read::<10>(ROWS - 10 + j, 0), some.read::<10>(j, 0));
+        let (a, b) = (all.read::<10>(ROWS - 10 + j, 0), some.read::<10>(j, 0));
+        // Matrix products round a row by where it stands in its chunk.
+        assert!((0..10).all(|c| (a[c] - b[c]).abs() <= 1e-5 * a[c].abs().max(1.0)), "{a:?} {b:?}");
     }
     let (all, some) = (gradient(&p, &model, 3.3), gradient(&tail, &model, 3.3));
     for j in 0..80 {
