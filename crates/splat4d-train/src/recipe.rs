@@ -129,15 +129,15 @@ recipe! {
     /// deform-mlp: network: mlp (8x256), small, hash (grids and a small network) or hash-linear.
     deform_trunk: String = "small".into(),
     /// deform-mlp: width of the small and hash networks.
-    deform_width: usize = 64,
+    deform_width: usize = 128,
     /// deform-mlp: hidden layers of the small and hash networks.
     deform_layers: usize = 2,
     /// deform-mlp: levels of the positional encoding of places (the published 10 suits mlp).
-    deform_x_levels: usize = 6,
-    /// deform-mlp: levels of the positional encoding of time.
-    deform_t_levels: usize = 6,
+    deform_x_levels: usize = 4,
+    /// deform-mlp: levels of the positional encoding of time (published: 6 with deform_time_net, else 10).
+    deform_t_levels: usize = 3,
     /// deform-mlp: whether time goes through a small network of its own first (published for synthetic scenes).
-    deform_time_net: bool = true,
+    deform_time_net: bool = false,
     /// deform-mlp: positions move by screw motions (6 degrees of freedom) instead of offsets.
     deform_rigid: bool = false,
     /// deform-mlp: rate of networks at the start; hash grids learn 50 times faster.
