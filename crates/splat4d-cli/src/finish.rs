@@ -128,16 +128,18 @@ pub(crate) fn scores(
 fn tracks(run: &Path, scene: &Scene<f32>, capture: &Capture, console: &Console) -> Result<()> {
     let Some(e) = track_error(scene, capture)? else { return Ok(()) };
     console.say(&format!(
-        "tracks of {} points in space: median error {:.4} units, {:.2} % of a character's height ({:.2} % of the \
-         moments followed; {:.4} units at the first frame)",
+        "tracks of {} points in space: median error {:.4} units, {:.2} % of a character's height ({:.1} % of the \
+         moments followed); the nearest Gaussian itself is {:.4} units away, {:.4} at the first frame",
         e.points,
         e.median,
         e.percent(),
         100.0 * e.followed,
+        e.nearest,
         e.first
     ));
     let entry = json!({
-        "points": e.points, "median": e.median, "mean": e.mean, "first": e.first, "height": e.height,
+        "points": e.points, "median": e.median, "mean": e.mean, "nearest": e.nearest, "first": e.first,
+        "height": e.height,
         "percent": e.percent(), "followed": e.followed,
     });
     amend(run, [("tracks".into(), entry)])

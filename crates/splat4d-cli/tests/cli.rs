@@ -141,6 +141,15 @@ fn a_capture_becomes_a_run_and_everything_follows() {
     splat4d(&["export", str(&run), "--sequence", str(&sequence)]).run().ok();
     assert!(sequence.join("frame_00003.ply").is_file() && !sequence.join("frame_00004.ply").exists());
     assert!(splat4d(&["info", str(&ply_file)]).run().ok().contains("3DGS .ply"));
+    let (csv, tracks) = (work.path().join("tracks.csv"), work.path().join("tracks.json"));
+    splat4d(&["export", str(&run), "--tracks", str(&csv), "--every", "3"]).run().ok();
+    let text = std::fs::read_to_string(&csv).unwrap();
+    assert!(text.starts_with("layer,gaussian,time,x,y,z\n") && text.contains("\nscene,3,"), "{text:.200}");
+    splat4d(&["export", str(&run), "--tracks", str(&tracks), "--near", "0,0,-0.5", "--count", "2"]).run().ok();
+    let json: Value = serde_json::from_str(&std::fs::read_to_string(&tracks).unwrap()).unwrap();
+    assert_eq!((json["tracks"].as_array().unwrap().len(), json["times"].as_array().unwrap().len()), (2, 4));
+    assert!(splat4d(&["export", str(&run), "--tracks", "tracks.txt"]).run().refused().contains(".csv or .json"));
+    assert!(splat4d(&["export", str(&run), "-o", "x.ply", "--fps", "3"]).run().refused().contains("--sequence"));
     assert!(splat4d(&["info", str(&run.join("scene.safetensors"))]).run().ok().contains("spacetime"));
 }
 

@@ -1,19 +1,23 @@
 //! 3D error of tracks against known ones: captures that were drawn come with the true paths of points of their surfaces.
 //!
-//! `truth/tracks.npy` holds float32 [frames, points, 3], world positions. Every point is given the Gaussian that is
-//! nearest to it at the first frame; the error is the distance of the two at all later frames, their distance at the first
-//! included (the median trajectory error of Luiten et al. 2024). A moment at which that Gaussian is not alive is not
-//! counted, but the share that is counted is reported.
+//! `truth/tracks.npy` holds float32 [frames, points, 3], world positions. Every point at the first frame is a question, as
+//! in benchmarks of point tracking: the few Gaussians nearest to it then carry it on by their mean displacement, and the
+//! error is its distance to the truth at all later frames. Beside it stands the error of the nearest Gaussian itself, its
+//! distance at the first frame included (the median trajectory error of Luiten et al. 2024). Moments at which none of a
+//! point's Gaussians is alive are not counted, but the share that is counted is reported.
 
 use crate::capture::Capture;
 use crate::{Error, Result};
 use splat4d::flow::tracks::{Tracks, nearest};
 use splat4d::format::npy::Npy;
 use splat4d::layers::Scene;
+use splat4d::math::se3::{norm, sub};
 use splat4d::scene::Time;
 
 /// Where a capture keeps the truth.
 pub const FILE: &str = "truth/tracks.npy";
+/// Gaussians that carry a point: one alone may be a floater.
+const CARRIERS: usize = 4;
 /// Fainter Gaussians are not taken for a surface.
 const LEAST_OPACITY: f64 = 0.5;
 
@@ -29,11 +33,13 @@ pub struct TrackError {
     pub median: f64,
     /// Their mean, scene units.
     pub mean: f64,
-    /// Median distance at the first frame, scene units: what any track begins with.
+    /// Median distance of the nearest Gaussian itself over points and frames after the first, scene units.
+    pub nearest: f64,
+    /// The same at the first frame.
     pub first: f64,
     /// Height of all points together along the scene's up direction at the first frame: that of the tallest character.
     pub height: f64,
-    /// Share of (point, later frame) at which the Gaussian is alive.
+    /// Share of (point, later frame) at which a Gaussian that carries the point is alive.
     pub followed: f64,
 }
 
@@ -89,20 +95,26 @@ impl Truth {
             return None;
         }
         let start: Vec<[f64; 3]> = (0..self.points).map(|p| self.at(frames[0], p)).collect();
-        let near = nearest(scene, Time(times[0]), &start, 1, LEAST_OPACITY);
-        let chosen: Vec<_> = near.iter().filter_map(|n| n.first().copied()).collect();
-        if chosen.len() < self.points {
+        let near = nearest(scene, Time(times[0]), &start, CARRIERS, LEAST_OPACITY);
+        if near.iter().any(Vec::is_empty) {
             return None;
         }
-        let tracks = Tracks::follow(scene, &chosen, &times);
-        let (mut errors, mut firsts) = (Vec::new(), Vec::new());
-        for (p, member) in chosen.iter().enumerate() {
-            let track = tracks.track(tracks.members.binary_search(member).expect("every chosen one is followed"));
-            for (k, x) in track.iter().enumerate() {
-                let Some(x) = x else { continue };
-                let to = self.at(frames[k], p);
-                let far = (0..3).map(|a| (f64::from(x[a]) - to[a]).powi(2)).sum::<f64>().sqrt();
-                if k == 0 { firsts.push(far) } else { errors.push(far) }
+        let tracks = Tracks::follow(scene, &near.concat(), &times);
+        let of = |m| tracks.track(tracks.members.binary_search(m).expect("every carrier is followed"));
+        let (mut carried, mut nearest, mut firsts) = (Vec::new(), Vec::new(), Vec::new());
+        for (p, carriers) in near.iter().enumerate() {
+            let far = |x: [f64; 3], k: usize| norm(sub(x, self.at(frames[k], p)));
+            let wide = |x: [f32; 3]| x.map(f64::from);
+            for k in 0..frames.len() {
+                if let Some(x) = of(&carriers[0])[k] {
+                    (if k == 0 { &mut firsts } else { &mut nearest }).push(far(wide(x), k));
+                }
+                let moved = |m| Some(sub(wide(of(m)[k]?), wide(of(m)[0]?)));
+                let moves: Vec<[f64; 3]> = carriers.iter().filter_map(moved).collect();
+                if k > 0 && !moves.is_empty() {
+                    let mean = |a: usize| moves.iter().map(|m| m[a]).sum::<f64>() / moves.len() as f64;
+                    carried.push(far([0, 1, 2].map(|a| start[p][a] + mean(a)), k));
+                }
             }
         }
         let up = |x: &[f64; 3]| (0..3).map(|k| x[k] * scene.up[k]).sum::<f64>();
@@ -111,9 +123,10 @@ impl Truth {
         let asked = self.points * (frames.len() - 1);
         Some(TrackError {
             points: self.points,
-            followed: errors.len() as f64 / asked as f64,
-            mean: errors.iter().sum::<f64>() / errors.len().max(1) as f64,
-            median: median(&mut errors)?,
+            followed: carried.len() as f64 / asked as f64,
+            mean: carried.iter().sum::<f64>() / carried.len().max(1) as f64,
+            median: median(&mut carried)?,
+            nearest: median(&mut nearest)?,
             first: median(&mut firsts)?,
             height: high - low,
         })
@@ -136,7 +149,7 @@ mod tests {
     use std::sync::Arc;
 
     #[test]
-    fn the_error_is_the_distance_to_the_gaussian_that_was_nearest_at_first() {
+    fn points_are_carried_by_the_gaussians_that_were_nearest_at_first() {
         let mut params = Params::new(3, 1, &[]);
         let times = vec![0.0, 0.1, 0.2];
         // The last one is faint and stands in the way.
@@ -158,9 +171,10 @@ mod tests {
         write_f32(&[3, 2, 3], &data, &mut bytes).unwrap();
         let error = Truth::read(&bytes).unwrap().compare(&scene, 10.0).unwrap();
         assert!((error.height - 1.1).abs() < 1e-6 && error.followed == 1.0 && error.points == 2);
-        let expected: f64 = [0.2, 0.4, (0.2f64.powi(2) + 0.01).sqrt(), (0.4f64.powi(2) + 0.01).sqrt()].iter().sum();
-        assert!((error.mean - expected / 4.0).abs() < 1e-6 && (error.first - 0.1).abs() < 1e-6, "{error:?}");
-        assert!((error.median - 0.4).abs() < 1e-6 && (error.percent() - 100.0 * 0.4 / 1.1).abs() < 1e-3, "{error:?}");
+        // Both Gaussians carry each point: 0.3 a frame, where 0.5 is true.
+        assert!((error.mean - 0.3).abs() < 1e-6 && (error.median - 0.4).abs() < 1e-6, "{error:?}");
+        assert!((error.first - 0.1).abs() < 1e-6 && (error.percent() - 100.0 * 0.4 / 1.1).abs() < 1e-3, "{error:?}");
+        assert!((error.nearest - 0.4).abs() < 1e-6, "{error:?}");
         bytes.clear();
         write_f32(&[3, 6], &data, &mut bytes).unwrap();
         assert!(Truth::read(&bytes).is_err());

@@ -43,14 +43,16 @@ pub fn write(trainer: &Trainer<'_>, identity: &Identity, state: &RunState) -> Re
     let mut arrays: Vec<(String, Vec<usize>, Vec<f32>)> =
         scene::arrays(&trainer.scene).into_iter().map(|a| (a.name, a.shape, a.data)).collect();
     let mut push = |name: String, table: &Table<f32>| {
-        // Moments of a page that does not learn have no rows, and are not in the file.
-        if table.width() > 0 && (table.rows() > 0 || trainer.scene.is_empty()) {
+        if table.width() > 0 {
             arrays.push((name, vec![table.rows(), table.width()], table.column_to_rows(0, table.width())));
         }
     };
     for (l, (layer, moments)) in trainer.scene.layers.iter().zip(&trainer.moments).enumerate() {
         for key in layer.params.keys() {
-            push(format!("moments.{l}.{}", key.0), moments.table(key));
+            // Moments of a page that does not learn have no rows, and are not in the file.
+            if moments.table(key).rows() == layer.params[key].rows() {
+                push(format!("moments.{l}.{}", key.0), moments.table(key));
+            }
         }
         push(format!("stats.{l}"), &trainer.stats.tables[l]);
     }

@@ -9,7 +9,7 @@ use splat4d::math::{Rng, Se3};
 use splat4d::motion::build;
 use splat4d::render::{Image, RenderConfig, Renderer};
 use splat4d::scene::params::{LOG_SCALE, OPACITY};
-use splat4d::scene::{Camera, LifeKind, Params, Planes, SH, Time};
+use splat4d::scene::{Camera, LifeKind, Params, SH, Table, Time};
 
 /// Frames a second.
 const FPS: f64 = 10.0;
@@ -107,16 +107,15 @@ fn truth(params: &Params<f32>, turning: usize, frames: usize, angle: f64) -> Sce
     s
 }
 
-/// Draws a scene from all cameras; masks are where `front` rows alone are seen.
+/// Draws a scene from all cameras; masks are where the first `masks` rows are what is seen.
 fn draw(s: &Scene<f32>, cameras: Vec<Camera>, frames: usize, masks: Option<usize>) -> Drawn {
     let mut renderer = Renderer::new(RenderConfig { sh_degree: 0, ..RenderConfig::default() });
     let (mut image, mut instant) = (Image::default(), Instant::default());
-    let mut front = s.clone();
-    if let Some(rows) = masks {
-        (rows..s.len()).for_each(|r| front.layers[0].params[GEOMETRY].set(r, OPACITY, -20.0));
-    }
+    let mut front = Table::new(&[("front", 1)], s.len());
+    (0..masks.unwrap_or(0)).for_each(|r| front.set(r, 0, 1.0));
     let mut pictures = Vec::new();
     for k in 0..frames {
+        s.at(Time(k as f64 / FPS), &mut instant);
         for camera in &cameras {
             s.at(Time(k as f64 / FPS), &mut instant);
             renderer.render(&s.splats(&instant), camera, [0.0; 3], None, &mut image);
@@ -131,6 +130,10 @@ fn draw(s: &Scene<f32>, cameras: Vec<Camera>, frames: usize, masks: Option<usize
                 mask
             });
             pictures.push(Picture { color, mask, ..Picture::default() });
+            renderer.render(&s.splats(&instant), camera, [0.0; 3], Some(&front), &mut image);
+            let mut mask = image.extra.clone();
+            mask.data.iter_mut().for_each(|x| *x = f32::from(u8::from(*x > 0.5)));
+            pictures.push(Picture { color: image.color.clone(), mask: masks.map(|_| mask), weight: None });
         }
     }
     Drawn { cameras, pictures }
@@ -291,7 +294,7 @@ fn exposures_are_learnt_on_frame_0_and_kept() {
         let [m, c] = known[i % 4];
         picture.color.data.iter_mut().for_each(|x| *x = *x * m.exp() + c);
     }
-    let knobs = ["iterations=700", "first_share=0.9", "exposure=true", "exposure_lr=1e-3"];
+    let knobs = ["iterations=1200", "first_share=0.95", "exposure=true", "exposure_lr=1e-3"];
     let plan = plan(2, 4, false, &knobs);
     let exposure = Exposure::new(4, vec![0, 1, 2, 3]);
     let mut t = trainer(scene(params, &first_frame(false)), &plan, Arc::new(frames), Some(exposure));
@@ -302,7 +305,7 @@ fn exposures_are_learnt_on_frame_0_and_kept() {
     };
     while t.progress.stage == 0 {
         // Adam's steps do not shrink by themselves.
-        t.settings.exposure_lr = if t.progress.stage_step < 400 { 1e-3 } else { 1e-5 };
+        t.settings.exposure_lr = [1e-3, 1e-3, 1e-4, 1e-4, 1e-5][t.progress.stage_step / 240];
         t.step().unwrap().expect("no fault");
     }
     let first = learnt(&t);
