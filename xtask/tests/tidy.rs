@@ -69,11 +69,8 @@ const MAX_LINES: usize = 800;
 
 /// Files that may say `unsafe`: run-time dispatch to SIMD instructions, which needs one file; the door to matrix products,
 /// which take pointers; and a test that counts allocations.
-const UNSAFE_FILES: [&str; 3] = [
-    "crates/splat4d/src/nn/matmul.rs",
-    "crates/splat4d/src/simd.rs",
-    "crates/splat4d-train/tests/steady_step.rs",
-];
+const UNSAFE_FILES: [&str; 3] =
+    ["crates/splat4d/src/nn/matmul.rs", "crates/splat4d/src/simd.rs", "crates/splat4d-train/tests/steady_step.rs"];
 
 /// Words that only the shells (the command and the chores) may say: libraries neither print nor exit nor look around.
 const SHELL_WORDS: [&str; 9] =

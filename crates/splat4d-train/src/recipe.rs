@@ -5,8 +5,8 @@
 //! Iteration knobs left at 0 follow from `iterations` (see [`Recipe::resolve`]).
 
 use crate::{Error, Result};
-use splat4d::motion::filtered::{Fusion, MAX_BASELINE, MAX_HISTORY, Predictor};
 use serde::{Deserialize, Serialize};
+use splat4d::motion::filtered::{Fusion, MAX_BASELINE, MAX_HISTORY, Predictor};
 use splat4d::motion::native4d::MAX_HARMONICS;
 
 macro_rules! recipe {
@@ -320,6 +320,30 @@ recipe! {
     lambda_sparse: f64 = 0.0,
 
     // ssm.
+    /// ssm: ticks of the scan over the clip; 0: one every two distinct times, 16 to 96.
+    ssm_ticks: usize = 0,
+    /// ssm: channels.
+    ssm_width: usize = 32,
+    /// ssm: complex states a channel.
+    ssm_states: usize = 8,
+    /// ssm: residual blocks.
+    ssm_blocks: usize = 2,
+    /// ssm: bidirectional (to reconstruct) or causal (to forecast).
+    ssm_mode: String = "bidirectional".into(),
+    /// ssm: absolute (poses) or twist (rates of poses, composed from tick to tick).
+    ssm_output: String = "absolute".into(),
+    /// ssm: none, frames (the model turns with the scene) or vector (and mirrors with it).
+    ssm_equivariance: String = "none".into(),
+    /// ssm: share of the iterations, from the first, in which nothing moves; nodes are placed after it.
+    ssm_warm_up: f64 = 0.0,
+    /// ssm: rate of the network's maps at the start.
+    ssm_lr_init: f64 = 1e-3,
+    /// ssm: rate of the network's maps at the end.
+    ssm_lr_final: f64 = 1e-5,
+    /// ssm: rate of the state space's decays, frequencies and steps.
+    ssm_dynamics_lr: f64 = 1e-3,
+    /// ssm: rate of the nodes' embeddings.
+    ssm_embedding_lr: f64 = 5e-3,
 
     // filtered.
     /// filter: how prediction and the motion's answer merge: off, geodesic (a learnt share) or literal (as published).
@@ -363,8 +387,34 @@ recipe! {
 
     /// Weight of the σ-weighted opacity regulariser (FreeTimeGS).
     lambda_opacity_life: f64 = 0.0,
-    /// Weight of the velocity smoothness over nearest neighbours.
+    /// Weight of the velocity smoothness over nearest neighbours, (extents a clip)²; any model that moves.
     lambda_velocity: f64 = 0.0,
+    /// Weight of local rigidity over a frame, extents: neighbours keep their offsets (Luiten et al.; they take 4).
+    lambda_rigid: f64 = 0.0,
+    /// Weight of the agreement of Gaussians' turns with their neighbourhood's over a frame (Luiten et al.; they take 4).
+    lambda_rot: f64 = 0.0,
+    /// Weight of isometry between two instants, extents: neighbours keep their distances (Luiten et al.; they take 2).
+    lambda_iso: f64 = 0.0,
+    /// Weight of the as-rigid-as-possible energy between two instants, extents² (SC-GS).
+    lambda_arap: f64 = 0.0,
+    /// Weight of the variance of neighbours' distances over four frames, over itself (SC-GS; 1e-3 there).
+    lambda_elastic: f64 = 0.0,
+    /// Weight of the third difference of positions over four frames, extents: against jitter.
+    lambda_jerk: f64 = 0.0,
+    /// Weight of the total variation of the picture's colours.
+    lambda_tv: f64 = 0.0,
+    /// Weight of the edge-aware total variation of depth, over its mean.
+    lambda_depth_tv: f64 = 0.0,
+    /// Weight of the agreement of depth with the splats' shortest axes (2DGS; 0.05 there).
+    lambda_depth_normal: f64 = 0.0,
+    /// Weight of the discrepancy of amplitudes and phases of the spectrum, coarse ones first (FreGS).
+    lambda_frequency: f64 = 0.0,
+    /// Weight of the entropy of the drawn alpha, nats: pixels decide between scene and background.
+    lambda_mask_entropy: f64 = 0.0,
+    /// Weight of the entropy of opacities, nats: Gaussians are there or not (SuGaR; 0.1 there).
+    lambda_opacity_entropy: f64 = 0.0,
+    /// Weight of the drawn flow against a known one, shares of the picture's longer side, where the capture has it.
+    lambda_flow: f64 = 0.0,
     /// Densification: adc, mcmc or none.
     strategy: String = "adc".into(),
     /// Never more Gaussians than this.
@@ -524,6 +574,7 @@ impl Recipe {
             ("relocate_gradient", self.relocate_gradient),
             ("min_opacity", self.min_opacity),
             ("prune_ratio", self.prune_ratio),
+            ("ssm_warm_up", self.ssm_warm_up),
             ("static_split_from", self.static_split_from),
             ("deform_warmup", self.deform_warmup),
             ("deform_unlock", self.deform_unlock),
@@ -590,6 +641,9 @@ impl Recipe {
             ("filter", &self.filter, &Fusion::ALL.map(|(name, _)| name)[..]),
             ("filter_predictor", &self.filter_predictor, &Predictor::ALL.map(|(name, _)| name)[..]),
             ("transport", &self.transport, &["off", "linear", "wasserstein"][..]),
+            ("ssm_mode", &self.ssm_mode, &["bidirectional", "causal"][..]),
+            ("ssm_output", &self.ssm_output, &["absolute", "twist"][..]),
+            ("ssm_equivariance", &self.ssm_equivariance, &["none", "frames", "vector"][..]),
         ] {
             if !known.contains(&value.as_str()) {
                 let near = nearest(value, known).map(|n| format!("; did you mean `{n}`?")).unwrap_or_default();

@@ -25,7 +25,8 @@ fn pool(threads: usize) -> rayon::ThreadPool {
 fn made() -> (Params<f32>, Hexplane) {
     let rng = Rng::new(1, "bench", 0);
     let mut p = Params::<f32>::new(GAUSSIANS, 4, &[]);
-    let mut means: Vec<[f32; 3]> = (0..GAUSSIANS as u64).map(|i| [0, 1, 2].map(|k| rng.normal(3 * i + k) as f32 * 0.3)).collect();
+    let mut means: Vec<[f32; 3]> =
+        (0..GAUSSIANS as u64).map(|i| [0, 1, 2].map(|k| rng.normal(3 * i + k) as f32 * 0.3)).collect();
     means.sort_by_key(|m| {
         let cell = m.map(|x| ((x + 1.0) * 128.0).clamp(0.0, 255.0) as u32);
         (0..8).fold(0, |key, bit| (0..3).fold(key, |key, k| key | (cell[k] >> bit & 1) << (3 * bit + k)))
@@ -71,11 +72,12 @@ fn planes_forward_and_backward(bencher: Bencher<'_, '_>, threads: usize) {
     let (p, model) = made();
     let (x, mut d, pool) = (positions(&p), Grads::new(&p), pool(threads));
     let (mut f, mut d_x) = (vec![0.0f32; GAUSSIANS * 64], vec![[0.0f32; 3]; GAUSSIANS]);
+    let mut waiting = Vec::new();
     bencher.bench_local(|| {
         pool.install(|| {
             let lines = model.planes().lines(&p, 0.37f32);
             model.planes().forward(&p, &lines, 2, &x, &mut f);
-            model.planes().backward(&p, &lines, 2, &x, &f, &mut d_x, &mut d)
+            model.planes().backward(&p, &lines, 2, &x, &f, &mut d_x, &mut waiting, &mut d)
         })
     });
 }

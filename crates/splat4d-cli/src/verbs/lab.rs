@@ -1,11 +1,8 @@
-//! `lab`: studies that vary what methods leave open, on made-up motion or on runs of one's own.
+//! `lab`: studies that vary what methods leave open, on made-up motion, and on runs and captures of one's own.
 
 mod cells;
 mod e00;
 mod e01;
-//! `lab`: studies that vary what methods leave open, on runs and captures of one's own.
-
-mod cells;
 mod e02;
 mod e03;
 mod models;
@@ -26,7 +23,6 @@ Examples:
 A study can be stopped at any time and goes on where it was.";
 
 /// Study methods: tables and curves of what they gain and lose
-/// Study methods on runs and captures: tables and curves of what they gain and lose
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {

@@ -1,6 +1,7 @@
 //! What initialisation and training need of a capture: posed pictures by number. Captures on disk and made-up ones in tests both serve.
 
 use crate::Result;
+use crate::loss::image::flow::FlowTruth;
 use splat4d::scene::{Camera, Planes, Time};
 
 /// One picture, loaded.
@@ -12,6 +13,34 @@ pub struct Picture {
     pub mask: Option<Planes<f32>>,
     /// 1 channel, 0 = a pixel that the lens never filled and that must not count.
     pub weight: Option<Planes<f32>>,
+    /// Where its pixels go, as far as that is known.
+    pub flow: Option<Flow>,
+}
+
+/// Known optical flow of a picture.
+#[derive(Clone, Debug)]
+pub struct Flow {
+    /// When the pixels arrive.
+    pub to: Time,
+    /// From where they are seen then.
+    pub camera: Camera,
+    /// [3, h, w]: u right, v down in pixels, and 1 where they are known.
+    pub vectors: Planes<f32>,
+}
+
+impl Flow {
+    /// As losses take it.
+    pub fn truth(&self) -> FlowTruth<'_> {
+        FlowTruth { to: self.to, camera: &self.camera, vectors: &self.vectors }
+    }
+
+    /// At half the size, pixels are twice as large.
+    fn halve(&mut self) {
+        halve(&mut self.vectors);
+        self.camera = self.camera.downscaled(2);
+        let n = self.vectors.pixels();
+        self.vectors.data[..2 * n].iter_mut().for_each(|v| *v *= 0.5);
+    }
 }
 
 impl Picture {
@@ -20,6 +49,7 @@ impl Picture {
         halve(&mut self.color);
         self.mask.as_mut().map(halve);
         self.weight.as_mut().map(halve);
+        self.flow.as_mut().map(Flow::halve);
     }
 }
 

@@ -125,7 +125,7 @@ pub fn seeds(plan: &Plan, frames: &dyn Frames, points: Option<Seeds>, moving: bo
 /// nearest to where it will be.
 pub fn one_moment(plan: &Plan, frames: &dyn Frames, points: Option<Seeds>) -> Result<Seeds> {
     let mut single = plan.clone();
-    single.recipe.init_keyframes = 1;
+    single.recipe.init_keyframes = single.recipe.init_keyframes.max(1);
     let mut out = seeds(&single, frames, points, true)?;
     out.times.fill(None);
     Ok(out)

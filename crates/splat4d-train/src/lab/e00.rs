@@ -100,9 +100,8 @@ pub fn run(scene: Scene, s: &Settings) -> Findings {
     assert!(s.points > 0 && s.frames > 3, "a third difference needs four times");
     let rng = Rng::new(s.seed, "e00", 0);
     let truth = truth(scene, s, rng);
-    let noisy = |i: usize, n: usize, k: usize| {
-        truth[i][n][k] + s.noise * rng.fork(100 + i as u64).normal((2 * n + k) as u64)
-    };
+    let noisy =
+        |i: usize, n: usize, k: usize| truth[i][n][k] + s.noise * rng.fork(100 + i as u64).normal((2 * n + k) as u64);
     let observed: Vec<Path> =
         (0..s.points).map(|i| (0..s.frames).map(|n| [noisy(i, n, 0), noisy(i, n, 1)]).collect()).collect();
     let (found, parameters) = learn(&start(s, rng), &observed, s);
@@ -160,11 +159,7 @@ fn truth(scene: Scene, s: &Settings, rng: Rng) -> Vec<Path> {
         Scene::Edge => [x[0], x[1] + if x[0] < 0.0 { 0.0 } else { WAY * t }],
         Scene::Jump => [x[0] + if i % 2 == 1 && t >= JUMP.0 { WAY } else { 0.0 }, x[1]],
     };
-    start(s, rng)
-        .iter()
-        .enumerate()
-        .map(|(i, x)| (0..s.frames).map(|n| place(i, *x, time(s, n))).collect())
-        .collect()
+    start(s, rng).iter().enumerate().map(|(i, x)| (0..s.frames).map(|n| place(i, *x, time(s, n))).collect()).collect()
 }
 
 /// Which (point, time) is at the scene's edge or jump.

@@ -4,10 +4,13 @@
 
 pub mod arap;
 pub mod graph;
+pub mod image;
 mod kernel;
+pub mod motion;
+pub mod neighbourhood;
 pub mod photometric;
-pub mod rigid;
 pub mod planes;
+pub mod rigid;
 pub mod scene;
 pub mod terms;
 pub mod tracked;

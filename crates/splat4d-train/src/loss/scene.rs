@@ -1,5 +1,6 @@
 //! Losses on a scene's raw parameters. Each is a mean over the rows that are active in the step, and adds only to them.
 
+use super::image::entropy::binary_entropy;
 use super::terms::{ParamLoss, StepInfo};
 use splat4d::layers::Scene;
 use splat4d::math::Real;
@@ -56,6 +57,31 @@ impl<F: Real> ParamLoss<F> for MeanOpacity {
             let mut d_row = [F::ZERO; 11];
             d_row[OPACITY] = o * (F::ONE - o);
             (o.f64(), d_row)
+        })
+    }
+}
+
+/// weight · mean entropy −o ln o − (1−o) ln(1−o) of opacities, nats: Gaussians are there or not.
+///
+/// Source: SuGaR (Guédon and Lepetit 2024).
+#[derive(Clone, Copy, Debug)]
+pub struct OpacityEntropy {
+    /// λ
+    pub weight: f64,
+}
+
+impl<F: Real> ParamLoss<F> for OpacityEntropy {
+    fn name(&self) -> &str {
+        "lambda_opacity_entropy"
+    }
+
+    fn eval(&self, scene: &Scene<F>, _info: &StepInfo, d: &mut [Grads<F>]) -> f64 {
+        over_active(scene, d, self.weight, |_, g, _| {
+            let (value, slope) = binary_entropy(g[OPACITY].sigmoid());
+            let o = g[OPACITY].sigmoid();
+            let mut d_row = [F::ZERO; 11];
+            d_row[OPACITY] = slope * o * (F::ONE - o);
+            (value.f64(), d_row)
         })
     }
 }
@@ -246,6 +272,7 @@ mod tests {
         let losses: Vec<(Box<dyn ParamLoss<f64>>, Key)> = vec![
             (Box::new(MeanOpacity { weight: 0.7 }), GEOMETRY),
             (Box::new(MeanScale { weight: 0.7 }), GEOMETRY),
+            (Box::new(OpacityEntropy { weight: 0.7 }), GEOMETRY),
             (Box::new(LivingOpacity { weight: 0.7 }), GEOMETRY),
             (Box::new(VelocitySmoothness::new(0.7, 2.0)), velocities),
         ];

@@ -40,6 +40,14 @@ pub trait ProbeLoss<F: Real>: Send + Sync {
     fn probes(&self, scene: &Scene<F>, info: &StepInfo) -> Vec<Probe>;
     /// The loss. `seen[i][k]` is [rows, 10] of probe i at its k-th time; adds its gradient to `d[i][k]`, of like shape.
     fn eval(&self, scene: &Scene<F>, probes: &[Probe], seen: &[Vec<Table<F>>], d: &mut [Vec<Table<F>>]) -> f64;
+    /// Rows were edited: whatever was remembered of rows is stale.
+    fn on_edit(&self) {}
+    /// What a checkpoint must hold of it, if it remembers anything from step to step.
+    fn state(&self) -> Vec<u32> {
+        Vec::new()
+    }
+    /// Takes back what [`state`](Self::state) gave.
+    fn restore(&self, _state: &[u32]) {}
 }
 
 /// A loss on raw parameters; must add only to rows that are active in `d`.

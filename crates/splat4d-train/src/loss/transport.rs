@@ -79,7 +79,13 @@ impl Transport {
     pub fn factor(&self, progress: f64) -> f64 {
         let s = &self.settings;
         let past = progress - s.start;
-        if past < 0.0 { 0.0 } else if s.ramp > 0.0 { (past / s.ramp).min(1.0) } else { 1.0 }
+        if past < 0.0 {
+            0.0
+        } else if s.ramp > 0.0 {
+            (past / s.ramp).min(1.0)
+        } else {
+            1.0
+        }
     }
 
     /// The three times of a step, if it has any.

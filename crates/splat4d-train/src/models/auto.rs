@@ -118,6 +118,8 @@ mod tests {
                 fps: 30.0,
                 times: self.times,
                 fixed_cameras: if fixed { self.cameras } else { 0 },
+                moments: Vec::new(),
+                masks: self.masks,
             };
             choose(&plan, self).unwrap()
         }

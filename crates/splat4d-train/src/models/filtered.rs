@@ -7,6 +7,7 @@
 
 use super::{Group, Hook, Plan, Program, Stage};
 use crate::Result;
+use crate::init::Seeds;
 use crate::loss::transport::{Metric, Transport, TransportSettings};
 use crate::recipe::Recipe;
 use splat4d::layers::{Layer, Scene};
@@ -68,6 +69,18 @@ impl Program for FilteredProgram {
         self.inner.check(plan)
     }
 
+    fn one_moment(&self, plan: &Plan) -> bool {
+        self.inner.one_moment(plan)
+    }
+
+    fn first(&self, plan: &Plan) -> Plan {
+        self.inner.first(plan)
+    }
+
+    fn init(&self, plan: &Plan, seeds: &Seeds, params: &mut Params) {
+        self.inner.init(plan, seeds, params);
+    }
+
     fn stages(&self, plan: &Plan) -> Vec<Stage> {
         let r = &plan.recipe;
         let mut stages = self.inner.stages(plan);
@@ -83,7 +96,8 @@ impl Program for FilteredProgram {
         for stage in &mut stages {
             stage.groups.push(Group { layer: super::EVERY, ..Group::new(GAINS, r.falling(r.filter_lr)) });
             stage.start = stage.start.take().map(around);
-            stage.switch = stage.switch.take().map(|(step, hook)| (step, around(hook)));
+            stage.switches =
+                std::mem::take(&mut stage.switches).into_iter().map(|(step, h)| (step, around(h))).collect();
             stage.end = stage.end.take().map(around);
         }
         switch_on(&mut stages, r.filter_start, fusion);
@@ -100,8 +114,7 @@ impl Program for FilteredProgram {
     }
 }
 
-/// Switches the filter on after a share of all steps, in the stage that runs by then (or before one that has a switch of
-/// its own in it, at that stage's start).
+/// Switches the filter on after a share of all steps, in the stage that runs by then.
 fn switch_on(stages: &mut [Stage], share: f64, fusion: Fusion) {
     let total: usize = stages.iter().map(|s| s.iterations).sum();
     let mut left = (share * total as f64).round() as usize;
@@ -111,17 +124,7 @@ fn switch_on(stages: &mut [Stage], share: f64, fusion: Fusion) {
             continue;
         }
         let set: Hook<f32> = Box::new(move |scene, _| scene.layers.iter_mut().try_for_each(|l| set_fusion(l, fusion)));
-        if left > 0 && stage.switch.is_none() {
-            stage.switch = Some((left, set));
-        } else {
-            let before = stage.start.take();
-            stage.start = Some(Box::new(move |scene, tell| {
-                if let Some(hook) = &before {
-                    hook(scene, tell)?;
-                }
-                set(scene, tell)
-            }));
-        }
+        stage.switches.push((left, set));
         return;
     }
 }

@@ -63,7 +63,7 @@ impl Program for HexplaneProgram {
         })
     }
 
-    fn is_canonical(&self) -> bool {
+    fn one_moment(&self, _plan: &Plan) -> bool {
         true
     }
 

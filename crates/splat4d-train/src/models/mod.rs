@@ -16,8 +16,7 @@ pub mod still;
 mod tests;
 pub mod tracked;
 
-use crate::densify::{Crowding, Densify, Stats};
-use crate::densify::{Densify, Guided, Relocate};
+use crate::densify::{Crowding, Densify, Guided, Relocate, Stats};
 use crate::init::Seeds;
 use crate::loss::terms::{Codec, ParamLoss, ProbeLoss};
 use crate::optim::Moments;
@@ -201,9 +200,9 @@ pub struct Stage<F: Real = f32> {
     pub codec: Option<Arc<dyn Codec<F>>>,
     /// Before the first step.
     pub start: Option<Hook<F>>,
-    /// Before the step with this number (the stage's first is 0), without ending the stage: its schedules go on. After a
-    /// resume it may run once more, and must then change nothing.
-    pub switch: Option<(usize, Hook<F>)>,
+    /// Before the steps with these numbers (the stage's first is 0), in this order, without ending the stage: its
+    /// schedules go on. After a resume one may run once more, and must then change nothing.
+    pub switches: Vec<(usize, Hook<F>)>,
     /// After the last.
     pub end: Option<Hook<F>>,
 }
@@ -234,9 +233,17 @@ impl<F: Real> Stage<F> {
             freeze_exposure: false,
             codec: None,
             start: None,
-            switch: None,
+            switches: Vec::new(),
             end: None,
         }
+    }
+}
+
+impl<F: Real> Stage<F> {
+    /// Tells every loss that rows were edited.
+    pub fn on_edit(&self) {
+        self.params.iter().for_each(|l| l.on_edit());
+        self.probes.iter().for_each(|l| l.on_edit());
     }
 }
 
@@ -248,9 +255,6 @@ pub trait Program: Send + Sync {
     fn life(&self, plan: &Plan) -> LifeKind {
         LifeKind::from_name(&plan.recipe.life).unwrap_or(LifeKind::Infinite)
     }
-    /// Whether one cloud stands for all moments: it then starts from the points of one, the middle of the clip.
-    fn is_canonical(&self) -> bool {
-        false
     /// What initial points are of: the whole clip, or what of it is learnt first.
     fn first(&self, plan: &Plan) -> Plan {
         plan.clone()

@@ -2,7 +2,7 @@
 //! cannot (as in Swift4D, Wu et al. 2025, and Ex4DGS, Lee et al. 2024). They are then free to play, cannot flicker, and
 //! what is left for the motion model is what moves.
 
-use super::{EVERY, Group, Plan, Program, Rate, Stage};
+use super::{EVERY, Group, Plan, Program, Stage};
 use crate::Result;
 use splat4d::layers::{ALWAYS, Layer, LayerTape, Scene, freeze_rows};
 use splat4d::math::Rng;
@@ -16,61 +16,24 @@ const LOOKS: usize = 17;
 const LASTING: f64 = 0.9;
 /// Change of the covariance, of its trace, from which on a shape counts as changed.
 const SAME_SHAPE: f64 = 0.05;
+/// Column groups that a still layer has.
+const COMMON: [&str; 5] = ["means", "quats", "log_scales", "opacity_logits", "sh"];
 /// What the layer is called.
 pub const STILL_LAYER: &str = "still";
 
-/// The stages of a program as the recipe has them: with `static_split`, the last one is cut in two, and its second part
-/// begins by moving still Gaussians into a layer of their own.
+/// The stages of a program as the recipe has them: with `static_split`, still Gaussians move into a layer of their own
+/// after that share of the last stage.
 pub fn stages(program: &dyn Program, plan: &Plan) -> Vec<Stage> {
     let r = &plan.recipe;
     let mut stages = program.stages(plan);
-    let Some(last) = stages.pop() else { return stages };
-    let at = (last.iterations as f64 * r.static_split_from) as usize;
-    if r.static_split <= 0.0 || r.motion == "still" || at == 0 || at >= last.iterations {
-        stages.push(last);
-        return stages;
-    }
-    // Losses belong to a stage: the second part needs its own.
-    let again = program.stages(plan).pop().expect("the same plan gives the same stages");
+    let Some(last) = stages.last_mut().filter(|_| r.static_split > 0.0 && r.motion != "still") else { return stages };
     let reach = r.static_split * plan.extent;
-    stages.push(first_part(last, at));
-    let mut rest = second_part(again, at);
-    rest.start = Some(Box::new(move |scene, _| split(scene, reach).map(|_| ())));
-    stages.push(rest);
+    let at = (last.iterations as f64 * r.static_split_from) as usize;
+    last.switches.push((at, Box::new(move |scene, _| split(scene, reach).map(|_| ()))));
+    // What every layer has learns in the new one too.
+    let common = |g: &&mut Group| COMMON.contains(&g.column.as_str());
+    last.groups.iter_mut().filter(common).for_each(|g| g.layer = EVERY);
     stages
-}
-
-fn cut_rate(rate: Rate, share: f64) -> [Rate; 2] {
-    let middle = rate.at(share);
-    [Rate { start: rate.start, end: middle }, Rate { start: middle, end: rate.end }]
-}
-
-fn first_part(mut stage: Stage, at: usize) -> Stage {
-    let share = at as f64 / stage.iterations as f64;
-    stage.groups.iter_mut().for_each(|g| g.rate = cut_rate(g.rate, share)[0]);
-    stage.iterations = at;
-    stage.end = None;
-    stage
-}
-
-fn second_part(mut stage: Stage, at: usize) -> Stage {
-    let share = at as f64 / stage.iterations as f64;
-    for group in &mut stage.groups {
-        group.rate = cut_rate(group.rate, share)[1];
-        // What every layer has learns in the new one too.
-        if ["means", "quats", "log_scales", "opacity_logits", "sh"].contains(&group.column.as_str()) {
-            *group = Group { layer: EVERY, ..group.clone() };
-        }
-    }
-    let later = |step: usize| step.saturating_sub(at);
-    let (from, until, every) = stage.densify_steps;
-    stage.densify_steps = if until > at { (later(from).max(1), later(until), every) } else { (0, 0, 0) };
-    stage.half_size_steps = later(stage.half_size_steps);
-    stage.iterations -= at;
-    stage.name += ", split";
-    // Degrees were unlocked by then, or all of them are now.
-    stage.sh_interval = 0;
-    stage
 }
 
 /// Moves rows whose mean stays within `reach` (scene units) of its middle, whose shape stays and whose life lasts, into a
@@ -139,30 +102,22 @@ mod tests {
     use splat4d::scene::{GEOMETRY, LIFE, SH};
 
     fn plan(recipe: Recipe) -> Plan {
-        Plan { recipe: recipe.resolve(), extent: 1.0, clip: [0.0, 1.0], fps: 30.0, times: 30, fixed_cameras: 4 }
+        Plan { recipe: recipe.resolve(), extent: 1.0, clip: [0.0, 1.0], fps: 30.0, times: 30, fixed_cameras: 4, moments: Vec::new(), masks: false }
     }
 
     #[test]
-    fn cutting_a_stage_changes_no_rate_and_no_schedule() {
-        let recipe = Recipe { iterations: 1000, static_split: 0.01, static_split_from: 0.6, ..Recipe::default() };
-        let plan = plan(recipe);
-        let whole = &program("spacetime").unwrap().stages(&plan)[0];
-        let parts = stages(program("spacetime").unwrap().as_ref(), &plan);
-        let [a, b] = [&parts[0], &parts[1]];
-        assert_eq!((a.iterations, b.iterations, parts.len()), (600, 400, 2));
-        for (i, group) in whole.groups.iter().enumerate() {
-            for step in [0, 300, 599, 600, 700, 999] {
-                let (part, at) = if step < 600 { (a, step) } else { (b, step - 600) };
-                let got = part.groups[i].rate.at(at as f64 / part.iterations as f64);
-                let expected = group.rate.at(step as f64 / 1000.0);
-                assert!((got / expected - 1.0).abs() < 1e-9, "{} at {step}", group.column);
-            }
-        }
-        let (_, until, every) = whole.densify_steps;
-        assert_eq!((b.densify_steps.1, b.densify_steps.2), (until - 600, every));
-        assert_eq!(a.half_size_steps.min(600) + b.half_size_steps, whole.half_size_steps);
-        let off = stages(program("spacetime").unwrap().as_ref(), &self::plan(Recipe::default()));
-        assert_eq!(off.len(), 1, "nothing is split unless it is asked for");
+    fn the_last_stage_splits_where_it_is_asked_to() {
+        let at = |static_split, motion: &str| {
+            let motion = motion.to_owned();
+            let plan = plan(Recipe { iterations: 1000, static_split, motion, ..Recipe::default() });
+            let stages = stages(program(&plan.recipe.motion).unwrap().as_ref(), &plan);
+            let last = stages.last().unwrap();
+            let shared = last.groups.iter().filter(|g| g.layer == EVERY).count();
+            (last.switches.iter().map(|s| s.0).collect::<Vec<_>>(), shared)
+        };
+        assert_eq!(at(0.01, "spacetime"), (vec![750], 6));
+        assert_eq!(at(0.0, "spacetime"), (vec![], 0));
+        assert_eq!(at(0.01, "still"), (vec![], 0), "nothing is left to split");
     }
 
     #[test]

@@ -1,18 +1,136 @@
-//! `ssm`: how it is learnt.
+//! `ssm`: how it is learnt. One joint stage, as of `control`, whose nodes, losses on nodes and upkeep it shares; before it,
+//! if the recipe says so, a still warm-up, after which nodes are placed anew on what became of the cloud.
 
-use super::{Plan, Program, Stage, still};
-use splat4d::motion::{Spec, ssm::SsmSpec};
+use super::{Group, Hook, Plan, Program, Rate, Stage, control, still};
+use crate::{Error, Result};
+use splat4d::layers::Layer;
+use splat4d::math::knn::mean_square_distance;
+use splat4d::motion::skin::{NODE_LOG_RADIUS, Skin, farthest_points};
+use splat4d::motion::ssm::{Equivariance, Mode, Output, SsmSpec, refresh};
+use splat4d::motion::Spec;
+use splat4d::scene::params::OPACITY;
+use splat4d::scene::GEOMETRY;
 
 /// Control nodes driven by a diagonal state-space model.
 #[derive(Clone, Copy, Debug)]
 pub struct SsmProgram;
 
+/// Ticks of a clip, where the recipe leaves the choice.
+const TICKS: std::ops::RangeInclusive<usize> = 16..=96;
+/// Gaussians less opaque than this hold no node: what is about to die says nothing of the shape.
+const SOLID_LOGIT: f32 = -2.2;
+
 impl Program for SsmProgram {
     fn spec(&self, plan: &Plan) -> Spec {
-        Spec::Ssm(SsmSpec { seed: plan.recipe.seed })
+        let r = &plan.recipe;
+        let ticks = if r.ssm_ticks > 0 { r.ssm_ticks } else { plan.times.div_ceil(2) };
+        Spec::Ssm(SsmSpec {
+            seed: r.seed,
+            skin: control::skin(r),
+            clip: plan.clip,
+            ticks: if r.ssm_ticks > 0 { ticks.max(2) } else { ticks.clamp(*TICKS.start(), *TICKS.end()) },
+            width: r.ssm_width,
+            states: r.ssm_states,
+            blocks: r.ssm_blocks,
+            extent: plan.extent,
+            mode: if r.ssm_mode == "causal" { Mode::Causal } else { Mode::Bidirectional },
+            octaves: if r.ssm_mode == "causal" { 0 } else { SsmSpec::default().octaves },
+            output: if r.ssm_output == "twist" { Output::Twist } else { Output::Absolute },
+            equivariance: match r.ssm_equivariance.as_str() {
+                "frames" => Equivariance::Frames,
+                "vector" => Equivariance::Vector,
+                _ => Equivariance::None,
+            },
+            ..SsmSpec::default()
+        })
+    }
+
+    fn check(&self, plan: &Plan) -> Result<()> {
+        if plan.times < 2 {
+            return Err(Error::input("a scan over time learns from motion, and the capture has one moment only")
+                .remedy("Use --motion still"));
+        }
+        Ok(())
     }
 
     fn stages(&self, plan: &Plan) -> Vec<Stage> {
-        vec![still::stage("ssm", plan)]
+        let r = &plan.recipe;
+        let warm = (r.ssm_warm_up * r.iterations as f64) as usize;
+        let mut stages = Vec::new();
+        if warm > 0 {
+            let mut first = share_of(still::stage("ssm warm-up", plan), 0, warm);
+            still::learn_life(&mut first, plan, self.life(plan));
+            stages.push(first);
+        }
+        let mut all = share_of(still::stage("ssm", plan), warm, r.iterations);
+        still::learn_life(&mut all, plan, self.life(plan));
+        control::add_nodes(&mut all, plan);
+        all.groups.extend(groups(self.spec(plan), plan));
+        if warm > 0 {
+            all.start = Some(place_nodes());
+        }
+        stages.push(all);
+        stages
     }
+}
+
+/// The steps `from..to` of a stage: its rates, densification and half-size steps are cut accordingly.
+fn share_of(mut stage: Stage, from: usize, to: usize) -> Stage {
+    let whole = stage.iterations.max(1) as f64;
+    for group in &mut stage.groups {
+        let rate = group.rate;
+        group.rate = Rate { start: rate.at(from as f64 / whole), end: rate.at(to as f64 / whole) };
+    }
+    let within = |step: usize| step.clamp(from, to) - from;
+    let (first, last, every) = stage.densify_steps;
+    stage.densify_steps = (within(first), within(last), every);
+    stage.half_size_steps = within(stage.half_size_steps);
+    stage.iterations = to - from;
+    stage
+}
+
+/// The network's groups.
+fn groups(spec: Spec, plan: &Plan) -> Vec<Group> {
+    let r = &plan.recipe;
+    let maps = Rate { start: r.ssm_lr_init, end: r.ssm_lr_final };
+    let mut groups = vec![Group::new("node_embeddings", r.falling(r.ssm_embedding_lr))];
+    // A model of an empty layer has the same columns as any other.
+    let Spec::Ssm(spec) = spec else { return groups };
+    if let Ok((dynamics, others)) = splat4d::motion::ssm::columns(&spec) {
+        groups.extend(dynamics.iter().map(|c| Group::new(c, Rate::constant(r.ssm_dynamics_lr))));
+        groups.extend(others.iter().map(|c| Group::new(c, maps)));
+    }
+    groups
+}
+
+/// Puts the nodes where the solid Gaussians are.
+fn place_nodes() -> Hook<f32> {
+    Box::new(|scene, _| {
+        for layer in &mut scene.layers {
+            place(layer);
+        }
+        Ok(())
+    })
+}
+
+fn place(layer: &mut Layer) {
+    let Spec::Ssm(spec) = layer.motion.spec() else { return };
+    let p = &mut layer.params;
+    let Some(skin) = Skin::find(p) else { return };
+    let count = skin.count(p);
+    let solid: Vec<u32> =
+        (0..p.len() as u32).filter(|&i| p[GEOMETRY].get(i as usize, OPACITY) > SOLID_LOGIT).collect();
+    let centers = farthest_points(&p[GEOMETRY].gather(&solid), count);
+    // A file and its moments have as many nodes as at the start: where the cloud is too small they stay where they are.
+    if centers.len() < count {
+        return;
+    }
+    let spacing = mean_square_distance(&centers);
+    let nodes = &mut p[skin.nodes];
+    for (k, (center, square)) in centers.iter().zip(spacing).enumerate() {
+        nodes.write(k, 0, *center);
+        nodes.set(k, NODE_LOG_RADIUS, 0.5 * square.max(f32::MIN_POSITIVE).ln());
+    }
+    skin.bind(p);
+    refresh(spec.equivariance, p);
 }

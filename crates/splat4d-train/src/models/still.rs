@@ -5,6 +5,9 @@ use crate::densify::Crowding;
 use crate::densify::Relocate;
 use crate::loss::scene::{MeanOpacity, MeanScale};
 use crate::loss::terms::ParamLoss;
+use crate::loss::neighbourhood::{MotionWeights, Neighbourhood};
+use crate::loss::scene::{MeanOpacity, MeanScale, OpacityEntropy};
+use crate::loss::terms::{ParamLoss, ProbeLoss};
 use crate::prune::Periodic;
 use crate::recipe::Recipe;
 use splat4d::motion::Spec;
@@ -62,6 +65,20 @@ pub fn learn_life(stage: &mut Stage, plan: &Plan, life: LifeKind) {
     }
 }
 
+/// What the recipe asks of how Gaussians move.
+pub fn motion_weights(r: &Recipe) -> MotionWeights {
+    MotionWeights {
+        rigid: r.lambda_rigid,
+        rot: r.lambda_rot,
+        iso: r.lambda_iso,
+        arap: r.lambda_arap,
+        elastic: r.lambda_elastic,
+        // `spacetime` has velocities to compare, which costs no further instant.
+        velocity: if r.motion == "spacetime" { 0.0 } else { r.lambda_velocity },
+        jerk: r.lambda_jerk,
+    }
+}
+
 /// A stage with the recipe's densification and regularisers.
 pub fn stage(name: &str, plan: &Plan) -> Stage {
     let r = &plan.recipe;
@@ -76,9 +93,18 @@ pub fn stage(name: &str, plan: &Plan) -> Stage {
             params.push(Box::new(MeanScale { weight: r.scale_reg }));
         }
     }
+    if r.lambda_opacity_entropy > 0.0 {
+        params.push(Box::new(OpacityEntropy { weight: r.lambda_opacity_entropy }));
+    }
+    let mut probes: Vec<Box<dyn ProbeLoss<f32>>> = Vec::new();
+    let weights = motion_weights(r);
+    if !weights.is_off() {
+        probes.push(Box::new(Neighbourhood::new(weights, plan)));
+    }
     Stage {
         batch: r.batch_size,
         groups: groups(r, plan.extent),
+        probes,
         params,
         densify,
         densify_steps,

@@ -3,7 +3,10 @@
 //! Views and the questions of losses that look at several times are merged: one `prepare`, one `at` and one `backward`
 //! for every distinct (layer, space, time), one `finish`.
 
+pub use super::channels::Wanted;
+use super::channels::{Channels, Later};
 pub use crate::densify::Observation;
+pub use crate::loss::image::flow::FlowTruth;
 pub use crate::loss::terms::{ParamLoss, Probe, ProbeLoss, StepInfo};
 use splat4d::layers::{LayerTape, Scene};
 use splat4d::math::Real;
@@ -16,6 +19,7 @@ use std::time::{Duration, Instant as Clock};
 /// Draws splats and takes gradients back; [`Renderer`] is the one in use, tests put the oracle here.
 pub trait Draw<F: Real>: Send {
     /// Fills `out`. `extra`: further channels, [all splats, C].
+    /// Fills `out`; `extra` [all splats, C] holds further channels.
     fn render(
         &mut self,
         splats: &Splats<'_, F>,
@@ -90,10 +94,47 @@ pub struct View<'a, F = f32> {
     pub mask: Option<&'a Planes<F>>,
     /// Pixels that count, 1 channel.
     pub weight: Option<&'a Planes<F>>,
+    /// Where its pixels go, as far as that is known.
+    pub flow: Option<FlowTruth<'a, F>>,
     /// The frame's number in the capture, for messages.
     pub frame: usize,
     /// The camera's number in the capture, for the exposure.
     pub rig: usize,
+}
+
+/// The gradient to a picture, as a loss fills it.
+#[derive(Clone, Debug, Default)]
+pub struct PictureGrads<F = f32> {
+    /// To colour, [3, h, w]: to be overwritten.
+    pub color: Planes<F>,
+    /// To alpha, [1, h, w]: begins as zeros.
+    pub alpha: Planes<F>,
+    /// To Σ z α T, [1, h, w]: begins as zeros, where depth is drawn.
+    pub depth: Planes<F>,
+    /// To the further channels, [C, h, w]: begins as zeros.
+    pub extra: Planes<F>,
+    /// Whether alpha takes part; to be set.
+    pub uses_alpha: bool,
+    /// Whether depth does.
+    pub uses_depth: bool,
+    /// Whether further channels do.
+    pub uses_extra: bool,
+    /// First further channel of the normals, where they are drawn.
+    pub normals: Option<usize>,
+    /// First further channel of the flow, where it is drawn.
+    pub flow: Option<usize>,
+}
+
+impl<F: Real> PictureGrads<F> {
+    /// Zeros in the shape of `image`, nothing used.
+    pub fn begin(&mut self, image: &Image<F>) {
+        let (h, w) = (image.color.height, image.color.width);
+        self.alpha.reset(1, h, w);
+        self.depth.reset(image.depth.channels, h, w);
+        self.extra.reset(image.extra.channels, h, w);
+        (self.uses_alpha, self.uses_depth, self.uses_extra) = (false, false, false);
+        (self.normals, self.flow) = (None, None);
+    }
 }
 
 /// Compares a picture with its truth.
@@ -115,6 +156,12 @@ pub trait ImageLoss<F: Real> {
     fn eval_channel(&mut self, _view: &View<'_, F>, _shown: &Planes<F>, _d: &mut Planes<F>) -> f64 {
         0.0
     }
+    /// What is to be drawn beside colour and alpha.
+    fn wanted(&self) -> Wanted {
+        Wanted::default()
+    }
+    /// The loss; overwrites `d.color`, adds to what else it uses and says so.
+    fn eval(&mut self, view: &View<'_, F>, image: &Image<F>, d: &mut PictureGrads<F>) -> f64;
 }
 
 /// Where a step's time went.
@@ -168,6 +215,7 @@ pub struct Chain<F: Real = f32> {
     d_color: Planes<F>,
     d_alpha: Planes<F>,
     d_channel: Planes<F>,
+    d_image: PictureGrads<F>,
     d_render: RenderGrads<F>,
     /// Number of `Motion::at` calls of the last step, for tests and reports.
     pub at_calls: usize,
@@ -183,6 +231,7 @@ impl<F: Real> Default for Chain<F> {
             d_color: Planes::default(),
             d_alpha: Planes::default(),
             d_channel: Planes::default(),
+            d_image: PictureGrads::default(),
             d_render: RenderGrads::default(),
             at_calls: 0,
         }
@@ -215,7 +264,7 @@ impl<F: Real> Chain<F> {
         let mut report = StepReport::default();
         let clock = Clock::now();
         let probes: Vec<Vec<Probe>> = losses.probes.iter().map(|l| l.probes(scene, info)).collect();
-        self.ask(scene, views, &probes);
+        self.ask(scene, views, losses.image.wanted(), &probes);
         self.caches.resize_with(scene.layers.len(), Default::default);
         for (layer, (cache, d_cache)) in self.caches.iter_mut().enumerate() {
             *d_cache = Cache::default();
@@ -266,7 +315,7 @@ impl<F: Real> Chain<F> {
     }
 
     /// Collects the distinct questions: what views see is what is alive, probes add their rows.
-    fn ask(&mut self, scene: &Scene<F>, views: &[View<'_, F>], probes: &[Vec<Probe>]) {
+    fn ask(&mut self, scene: &Scene<F>, views: &[View<'_, F>], wanted: Wanted, probes: &[Vec<Probe>]) {
         self.spare.append(&mut self.asks);
         for view in views {
             for (layer, l) in scene.layers.iter().enumerate() {
@@ -280,26 +329,39 @@ impl<F: Real> Chain<F> {
         }
         for probe in probes.iter().flatten() {
             for &t in &probe.times {
-                let wanted = probe.rows.as_deref().map_or(Rows::All, Rows::Some);
-                match self.find(probe.layer, probe.of, t) {
-                    Some(i) => {
-                        let tape = &mut self.asks[i].tape;
-                        match (tape.rows(), wanted) {
-                            (Rows::All, _) => {}
-                            (_, Rows::All) => tape.ask(probe.of, Rows::All, t),
-                            (Rows::Some(a), Rows::Some(b)) => {
-                                let both = union(a, b);
-                                tape.ask(probe.of, Rows::Some(&both), t);
-                            }
-                        }
-                    }
-                    None => {
-                        let mut ask = self.spare.pop().unwrap_or_else(Ask::new);
-                        ask.layer = probe.layer;
-                        ask.tape.ask(probe.of, wanted, t);
-                        self.asks.push(ask);
+                self.ask_rows(probe.layer, probe.of, probe.rows.as_deref().map_or(Rows::All, Rows::Some), t);
+            }
+        }
+        for (view, flow) in views.iter().filter_map(|v| Some((v, v.flow.as_ref().filter(|_| wanted.flow)?))) {
+            for layer in 0..scene.layers.len() {
+                let i = self.find(layer, Space::Gaussians, view.t).expect("every view's time was asked");
+                match self.asks[i].tape.rows() {
+                    Rows::All => self.ask_rows(layer, Space::Gaussians, Rows::All, flow.to),
+                    Rows::Some(ids) => {
+                        let ids = ids.to_vec();
+                        self.ask_rows(layer, Space::Gaussians, Rows::Some(&ids), flow.to);
                     }
                 }
+            }
+        }
+    }
+
+    /// Asks for rows at a time, beside those that are asked already.
+    fn ask_rows(&mut self, layer: usize, of: Space, wanted: Rows<'_>, t: Time) {
+        let Some(i) = self.find(layer, of, t) else {
+            let mut ask = self.spare.pop().unwrap_or_else(Ask::new);
+            ask.layer = layer;
+            ask.tape.ask(of, wanted, t);
+            self.asks.push(ask);
+            return;
+        };
+        let tape = &mut self.asks[i].tape;
+        match (tape.rows(), wanted) {
+            (Rows::All, _) => {}
+            (_, Rows::All) => tape.ask(of, Rows::All, t),
+            (Rows::Some(a), Rows::Some(b)) => {
+                let both = union(a, b);
+                tape.ask(of, Rows::Some(&both), t);
             }
         }
     }
@@ -339,6 +401,24 @@ impl<F: Real> Chain<F> {
             Some(_) => value + loss.eval_channel(view, &self.image.extra, &mut self.d_channel),
             None => value,
         };
+        let wanted = loss.wanted();
+        let ways = view.flow.as_ref().filter(|_| wanted.flow).map(|f| self.ways(f.to, &asked));
+        let channels = {
+            let parts: Vec<&Table<F>> = asked.iter().map(|&i| self.asks[i].tape.out()).collect();
+            let later: Vec<Later<'_, F>> = ways.iter().flatten().map(|w| w.later(&self.asks)).collect();
+            let flow = view.flow.as_ref().filter(|_| ways.is_some()).map(|f| (f, &later[..]));
+            Channels::new(wanted, view.camera, &parts, flow)
+        };
+        let extra = channels.as_ref().map(|c| &c.table);
+        draw.config().depth = wanted.depth;
+        draw.render(&splats, view.camera, view.background, extra, &mut self.image);
+        report.timings.render += clock.elapsed();
+        let clock = Clock::now();
+        let d_image = &mut self.d_image;
+        d_image.begin(&self.image);
+        d_image.normals = channels.as_ref().and_then(Channels::normals);
+        d_image.flow = channels.as_ref().and_then(Channels::flow);
+        let value = loss.eval(view, &self.image, d_image);
         report.loss += value;
         report.view_losses.push(value);
         report.timings.loss += clock.elapsed();
@@ -348,6 +428,10 @@ impl<F: Real> Chain<F> {
             alpha: alpha.then_some(&self.d_alpha),
             depth: None,
             extra: channel.as_ref().map(|_| &self.d_channel),
+            color: &d_image.color,
+            alpha: d_image.uses_alpha.then_some(&d_image.alpha),
+            depth: d_image.uses_depth.then_some(&d_image.depth),
+            extra: d_image.uses_extra.then_some(&d_image.extra),
         };
         let mut d_sh: Vec<Option<&mut Table<F>>> = d
             .iter_mut()
@@ -404,6 +488,11 @@ impl<F: Real> Chain<F> {
                 std::mem::swap(&mut ask.d_weights, &mut part.weights);
             }
         }
+        if let (Some(channels), Some(d_table)) = (&channels, &self.d_render.extra)
+            && self.d_image.uses_extra
+        {
+            Self::further(&mut self.asks, view, channels, d_table, &asked, ways.as_deref());
+        }
         report.timings.render_backward += clock.elapsed();
     }
 
@@ -420,6 +509,48 @@ impl<F: Real> Chain<F> {
             first += count;
         }
         out
+    /// Where the splats of a view are at another time: by layer an ask and its rows.
+    fn ways(&self, to: Time, asked: &[usize]) -> Vec<Way> {
+        let way = |(layer, &i): (usize, &usize)| {
+            let ask = self.find(layer, Space::Gaussians, to).expect("a flow's time was asked");
+            let (from, then) = (&self.asks[i].tape, &self.asks[ask].tape);
+            let row = |id: usize| match then.rows() {
+                Rows::All => id as u32,
+                Rows::Some(ids) => ids.binary_search(&(id as u32)).map_or(u32::MAX, |r| r as u32),
+            };
+            Way { ask, rows: (0..from.out().rows()).map(|j| row(from.rows().id(j))).collect() }
+        };
+        asked.iter().enumerate().map(way).collect()
+    }
+
+    /// The VJP of a view's further channels.
+    fn further(
+        asks: &mut [Ask<F>],
+        view: &View<'_, F>,
+        channels: &Channels<F>,
+        d_table: &Table<F>,
+        asked: &[usize],
+        ways: Option<&[Way]>,
+    ) {
+        let mut first = 0;
+        for (layer, &i) in asked.iter().enumerate() {
+            let way = ways.map(|w| &w[layer]).filter(|w| w.ask != i);
+            if let Some(way) = way.filter(|w| !asks[w.ask].begun) {
+                let ask = &mut asks[way.ask];
+                reset_like(&mut ask.d_out, ask.tape.out());
+                (ask.d_color, ask.d_weights, ask.begun) = (None, None, true);
+            }
+            let mut d_out = std::mem::take(&mut asks[i].d_out);
+            let mut d_later = way.map(|w| std::mem::take(&mut asks[w.ask].d_out));
+            let later = way.map(|w| w.later(asks));
+            let flow = view.flow.as_ref().zip(later.as_ref()).zip(d_later.as_mut()).map(|((f, l), d)| (f, l, d));
+            channels.backward(view.camera, asks[i].tape.out(), first, d_table, &mut d_out, flow);
+            first += d_out.rows();
+            asks[i].d_out = d_out;
+            if let (Some(way), Some(d)) = (way, d_later) {
+                asks[way.ask].d_out = d;
+            }
+        }
     }
 
     /// Shows a loss the rows it asked for and scatters its gradient back.
@@ -482,6 +613,16 @@ impl<F: Real> Ask<F> {
 /// The table and column of a layer's logit of that name.
 fn logit_of<F: Real>(params: &Params<F>, column: &str) -> Option<(Key, usize)> {
     params.keys().find_map(|k| params[k].column(column).map(|(first, _)| (k, first)))
+/// An ask, and its row of every splat of a view (`u32::MAX`: none).
+struct Way {
+    ask: usize,
+    rows: Vec<u32>,
+}
+
+impl Way {
+    fn later<'a, F: Real>(&'a self, asks: &'a [Ask<F>]) -> Later<'a, F> {
+        Later { out: asks[self.ask].tape.out(), rows: &self.rows }
+    }
 }
 
 fn questions<'a, F: Real>(asks: &'a [Ask<F>], scene: &'a Scene<F>, layer: usize) -> Vec<At<'a, F>> {

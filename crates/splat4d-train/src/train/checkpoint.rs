@@ -63,7 +63,9 @@ pub fn write(trainer: &Trainer<'_>, identity: &Identity, state: &RunState) -> Re
         .iter()
         .enumerate()
         .flat_map(|(s, stage)| {
-            stage.params.iter().enumerate().map(move |(k, l)| (format!("memory.{s}.{k}"), l.state()))
+            let params = stage.params.iter().enumerate().map(move |(k, l)| (format!("memory.{s}.{k}"), l.state()));
+            let probes = stage.probes.iter().enumerate().map(move |(k, l)| (probe_name(s, k), l.state()));
+            params.chain(probes)
         })
         .filter(|(_, state)| !state.is_empty())
         .collect();
@@ -131,6 +133,10 @@ pub fn read(bytes: &[u8], trainer: &mut Trainer<'_>, identity: &Identity) -> Res
                 None => loss.restore(&[]),
             }
         }
+        for (k, loss) in stage.probes.iter().enumerate() {
+            let state = file.get(&probe_name(s, k)).map_or_else(|| Ok(Vec::new()), |t| t.as_u32())?;
+            loss.restore(&state);
+        }
         if let Some(codec) = &stage.codec {
             let state = file.get(&codec_name(s)).map_or_else(|| Ok(Vec::new()), |t| t.as_u32())?;
             codec.restore(&state)?;
@@ -158,6 +164,11 @@ pub fn read(bytes: &[u8], trainer: &mut Trainer<'_>, identity: &Identity) -> Res
         seconds: number(&meta["seconds"], "seconds")?,
         smooth: [number(&meta["smooth"][0], "smooth")?, number(&meta["smooth"][1], "smooth")?],
     })
+}
+
+/// The array that holds what a stage's loss over several times remembers.
+fn probe_name(stage: usize, loss: usize) -> String {
+    format!("memory.{stage}.probe.{loss}")
 }
 
 /// What a checkpoint calls the memory of a stage's codec.

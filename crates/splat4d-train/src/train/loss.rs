@@ -1,6 +1,8 @@
 //! The trainer's image loss: photometric, mask, and a gain and offset a camera where exposures differ.
 
-use super::chain::{ImageLoss, View};
+use super::chain::{ImageLoss, PictureGrads, View, Wanted};
+use crate::loss::image::frequency::Frequency;
+use crate::loss::image::{ImageTerms, entropy, flow, normal, tv};
 use crate::loss::photometric::Photometric;
 use crate::optim::Moments;
 use splat4d::render::Image;
@@ -77,6 +79,11 @@ pub struct TrainLoss {
     exposed: Planes<f32>,
     /// Where masks are compared with what Gaussians say of the foreground.
     pub segmentation: Option<Segmentation>,
+    /// Further terms.
+    pub terms: ImageTerms,
+    /// Share of the stage that is done, in [0, 1).
+    pub progress: f64,
+    frequency: Frequency<f32>,
     /// L1 of the last view.
     pub l1: f64,
     /// SSIM of the last view.
@@ -95,6 +102,9 @@ impl TrainLoss {
             exposure,
             exposed: Planes::default(),
             segmentation: None,
+            terms: ImageTerms::default(),
+            progress: 0.0,
+            frequency: Frequency::default(),
             l1: 0.0,
             ssim: 0.0,
             mse: 0.0,
@@ -103,13 +113,12 @@ impl TrainLoss {
 }
 
 impl ImageLoss<f32> for TrainLoss {
-    fn eval(
-        &mut self,
-        view: &View<'_, f32>,
-        image: &Image<f32>,
-        d_color: &mut Planes<f32>,
-        d_alpha: &mut Planes<f32>,
-    ) -> (f64, bool) {
+    fn wanted(&self) -> Wanted {
+        let t = &self.terms;
+        Wanted { depth: t.depth_tv > 0.0 || t.depth_normal > 0.0, normals: t.depth_normal > 0.0, flow: t.flow > 0.0 }
+    }
+
+    fn eval(&mut self, view: &View<'_, f32>, image: &Image<f32>, d: &mut PictureGrads<f32>) -> f64 {
         let row = self.exposure.as_ref().map(|e| e.params[e.key].read::<6>(view.rig, 0));
         if let Some(row) = row {
             self.exposed.clone_from(&image.color);
@@ -119,30 +128,36 @@ impl ImageLoss<f32> for TrainLoss {
             }
         }
         let shown = if row.is_some() { &self.exposed } else { &image.color };
-        let value = self.photometric.loss_and_grad(shown, view.truth, view.weight, d_color);
+        let value = self.photometric.loss_and_grad(shown, view.truth, view.weight, &mut d.color);
+        let mut total = value.total;
+        let terms = self.terms;
+        if terms.tv > 0.0 {
+            total += tv::total_variation(shown, terms.tv, &mut d.color);
+        }
+        if terms.frequency > 0.0 {
+            let (progress, weight) = (self.progress, terms.frequency);
+            total += self.frequency.loss_and_grad(shown, view.truth, progress, weight, &mut d.color);
+        }
         (self.l1, self.ssim, self.mse) = (value.l1, value.ssim, value.mse);
         if let (Some(row), Some(e)) = (row, &mut self.exposure) {
-            let mut d = [0.0f32; 6];
+            let mut d_row = [0.0f32; 6];
             for c in 0..3 {
                 let gain = row[c].exp();
                 let (mut d_gain, mut d_offset) = (0.0f64, 0.0f64);
-                for (g, x) in d_color.plane_mut(c).iter_mut().zip(image.color.plane(c)) {
+                for (g, x) in d.color.plane_mut(c).iter_mut().zip(image.color.plane(c)) {
                     d_offset += f64::from(*g);
                     d_gain += f64::from(*g * x * gain);
                     *g *= gain;
                 }
-                (d[c], d[3 + c]) = (d_gain as f32, d_offset as f32);
+                (d_row[c], d_row[3 + c]) = (d_gain as f32, d_offset as f32);
             }
-            e.grads.of([e.key])[0].add(view.rig, 0, d);
+            e.grads.of([e.key])[0].add(view.rig, 0, d_row);
         }
-        let mut total = value.total;
-        let mut alpha = false;
         if let Some(mask) = view.mask.filter(|_| self.lambda_mask > 0.0) {
-            alpha = true;
-            d_alpha.reset(1, mask.height, mask.width);
+            d.uses_alpha = true;
             let scale = self.lambda_mask / mask.pixels() as f32;
             let mut sum = 0.0f64;
-            for ((d, a), m) in d_alpha.data.iter_mut().zip(&image.alpha.data).zip(&mask.data) {
+            for ((d, a), m) in d.alpha.data.iter_mut().zip(&image.alpha.data).zip(&mask.data) {
                 let e = a - m;
                 sum += f64::from(e.abs());
                 *d = if e > 0.0 {
@@ -155,7 +170,7 @@ impl ImageLoss<f32> for TrainLoss {
             }
             total += sum * f64::from(scale);
         }
-        (total, alpha)
+        total + self.beside(view, image, d)
     }
 
     fn channel(&self) -> Option<&str> {
@@ -169,4 +184,51 @@ impl ImageLoss<f32> for TrainLoss {
         d.data.iter_mut().for_each(|x| *x *= weight);
         value.total * segmentation.weight
     }
+}
+
+impl TrainLoss {
+    /// The terms that look at alpha, depth and further channels.
+    fn beside(&self, view: &View<'_, f32>, image: &Image<f32>, d: &mut PictureGrads<f32>) -> f64 {
+        let terms = &self.terms;
+        let mut total = 0.0;
+        if terms.mask_entropy > 0.0 {
+            d.uses_alpha = true;
+            total += entropy::mask_entropy(&image.alpha, terms.mask_entropy, &mut d.alpha);
+        }
+        if terms.depth_tv > 0.0 {
+            (d.uses_alpha, d.uses_depth) = (true, true);
+            let (depth, alpha) = (&image.depth, &image.alpha);
+            total += tv::depth_smoothness(depth, alpha, view.truth, terms.depth_tv, &mut d.depth, &mut d.alpha);
+        }
+        if let Some(first) = d.normals {
+            (d.uses_alpha, d.uses_depth, d.uses_extra) = (true, true, true);
+            let normals = part(&image.extra, first);
+            let mut d_normals = Planes::new(3, normals.height, normals.width);
+            let pictures = [&image.depth, &image.alpha, &normals];
+            let grads = [&mut d.depth, &mut d.alpha, &mut d_normals];
+            total += normal::depth_normal(view.camera, pictures, terms.depth_normal, grads);
+            put(&mut d.extra, first, &d_normals);
+        }
+        if let (Some(first), Some(truth)) = (d.flow, &view.flow) {
+            d.uses_extra = true;
+            let drawn = part(&image.extra, first);
+            let mut d_drawn = Planes::new(3, drawn.height, drawn.width);
+            total += flow::flow(&drawn, truth.vectors, terms.flow, &mut d_drawn);
+            put(&mut d.extra, first, &d_drawn);
+        }
+        total
+    }
+}
+
+/// Three channels from `first` on.
+fn part(planes: &Planes<f32>, first: usize) -> Planes<f32> {
+    let n = planes.pixels();
+    let data = planes.data[first * n..(first + 3) * n].to_vec();
+    Planes { channels: 3, height: planes.height, width: planes.width, data }
+}
+
+/// Puts three channels at `first`.
+fn put(planes: &mut Planes<f32>, first: usize, channels: &Planes<f32>) {
+    let n = planes.pixels();
+    planes.data[first * n..(first + 3) * n].copy_from_slice(&channels.data);
 }

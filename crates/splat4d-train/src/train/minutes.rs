@@ -62,7 +62,7 @@ pub(super) fn plan(bench: &Bench, recipe: &Recipe, minutes: f64, listen: &mut dy
     let seconds = minutes * 60.0;
     let cost = |iterations: usize| -> Result<f64> {
         let r = Recipe { iterations, ..reset(recipe) }.resolve();
-        let stages = program(&r.motion)?.stages(&bench.plan(&r));
+        let stages = split::stages(program_of(&r)?.as_ref(), &bench.plan(&r));
         let rest: usize = stages[1..].iter().map(|s| s.iterations).sum();
         Ok(schedule_cost(&stages[0], &r, [start, end], first, last) + later * rest as f64)
     };

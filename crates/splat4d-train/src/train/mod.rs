@@ -1,6 +1,7 @@
 //! Training: the fixed chain of a step, the trainer that repeats it, and the run that keeps it safe on disk.
 
 pub mod chain;
+mod channels;
 pub mod checkpoint;
 pub mod dataset;
 pub mod loss;

@@ -15,8 +15,9 @@ use crate::densify::Limits;
 use crate::event::Event;
 use crate::init::{self, Seeds};
 use crate::models::auto::{self, AUTO};
-use crate::models::{Plan, Stage, program, split};
-use crate::models::{Plan, Stage, program_of};
+use crate::models::{Plan, Stage, program_of, split};
+use crate::loss::image::ImageTerms;
+use crate::models::{Plan, Stage, program};
 use crate::recipe::Recipe;
 use crate::{Error, ErrorKind, Result};
 use serde_json::json;
@@ -101,14 +102,13 @@ pub fn train(
     let bench = Bench::new(capture, &recipe)?;
     let mut listen = listen;
     let recipe = if recipe.motion == AUTO { bench.choose(recipe, &mut listen)? } else { recipe };
-    program(&recipe.motion)?.check(&bench.plan(&recipe))?;
+    program_of(&recipe)?.check(&bench.plan(&recipe))?;
     let recipe = match options.minutes {
         Some(m) => minutes::plan(&bench, &recipe, m, &mut listen)?,
         None => recipe,
     }
     .resolve();
     let plan = bench.plan(&recipe);
-    program_of(&recipe)?.check(&plan)?;
     let estimate = memory_estimate(&bench.capture, &recipe);
     if recipe.memory_limit > 0 && estimate > recipe.memory_limit {
         return Err(Error::new(
@@ -323,28 +323,16 @@ impl Bench {
                 times: c.times.clone(),
             })
         };
+        let (first, frames) = (program.first(plan), self.frames.as_ref());
         let seeds = match moving && program.one_moment(plan) {
-            true => init::one_moment(plan, self.frames.as_ref(), points)?,
-            false => init::seeds(plan, self.frames.as_ref(), points, moving)?,
+            true => init::one_moment(&first, frames, points)?,
+            false => init::seeds(&first, frames, points, moving)?,
         };
-        let mut start = plan.clone();
-        let canonical = moving && program.is_canonical();
-        if canonical && start.recipe.init_keyframes == 0 {
-            start.recipe.init_keyframes = 1;
-        }
-        let mut seeds = init::seeds(&start, self.frames.as_ref(), points, moving)?;
-        if canonical {
-            // Whenever a point was seen, it is there all the time.
-            seeds.times.fill(None);
-        }
-        let seeds = init::seeds(&program.first(plan), self.frames.as_ref(), points, moving)?;
         init::scene(plan, program.as_ref(), &seeds, self.background(), self.capture.up)
     }
 
     pub(super) fn trainer(&self, plan: &Plan, scene: Scene<f32>) -> Result<Trainer<'static>> {
-        let program = program(&plan.recipe.motion)?;
-        Ok(self.trainer_of(plan, scene, split::stages(program.as_ref(), plan)))
-        Ok(self.trainer_of(plan, scene, program_of(&plan.recipe)?.stages(plan)))
+        Ok(self.trainer_of(plan, scene, split::stages(program_of(&plan.recipe)?.as_ref(), plan)))
     }
 
     /// A trainer with stages that no program made.
@@ -370,7 +358,8 @@ impl Bench {
             opacity_reset_interval: r.opacity_reset_interval,
             exposure_lr: r.exposure_lr,
         };
-        let loss = TrainLoss::new(r.lambda_dssim, r.lambda_mask, exposure);
+        let mut loss = TrainLoss::new(r.lambda_dssim, r.lambda_mask, exposure);
+        loss.terms = ImageTerms::of(r);
         Trainer::new(scene, stages, self.frames.clone(), Box::new(Renderer::new(config)), loss, settings)
     }
 

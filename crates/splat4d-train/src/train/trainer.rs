@@ -13,8 +13,7 @@ use crate::{Error, ErrorKind, Result};
 use splat4d::layers::Scene;
 use splat4d::math::Rng;
 use splat4d::scene::life::LOG_WIDTH;
-use splat4d::scene::{Camera, GEOMETRY, Grads, LIFE, SH, Space, Time};
-use splat4d::scene::{Camera, GEOMETRY, Grads, LIFE, Planes, SH, Space};
+use splat4d::scene::{Camera, GEOMETRY, Grads, LIFE, Planes, SH, Space, Time};
 use std::borrow::Cow;
 use std::sync::Arc;
 use std::time::{Duration, Instant as Clock};
@@ -98,8 +97,8 @@ pub struct Trainer<'a> {
     stale: bool,
     /// Whether the current stage's start is over although it has taken no step.
     entered: bool,
-    /// Whether its switch is over.
-    switched: bool,
+    /// The step whose switches are over.
+    switched: Option<usize>,
     frames: Arc<dyn Frames>,
     timeline: Timeline,
     draw: Box<dyn Draw<f32> + 'a>,
@@ -133,7 +132,7 @@ impl<'a> Trainer<'a> {
             shown: Scene::default(),
             stale: true,
             entered: false,
-            switched: false,
+            switched: None,
             frames,
             timeline,
             draw,
@@ -210,7 +209,7 @@ impl<'a> Trainer<'a> {
     /// Takes over a checkpoint's state. The scene and all tables must belong together.
     pub fn restore(&mut self, scene: Scene<f32>, moments: Vec<Moments<f32>>, stats: Stats, progress: Progress) {
         (self.scene, self.moments, self.stats, self.progress) = (scene, moments, stats, progress);
-        (self.stale, self.entered, self.switched) = (true, false, false);
+        (self.stale, self.entered, self.switched) = (true, false, None);
         self.fit_grads();
     }
 
@@ -218,15 +217,17 @@ impl<'a> Trainer<'a> {
     /// itself, but tells nobody.
     pub fn enter(&mut self, tell: &mut Tell<'_>) -> Result<()> {
         while let Some(stage) = self.stages.get(self.progress.stage) {
-            let empty = stage.iterations == 0;
+            let (empty, switches) = (stage.iterations == 0, stage.switches.len());
             if self.progress.stage_step == 0 && !self.entered {
                 self.run_hook(|s| s.start.as_ref(), tell)?;
                 (self.entered, self.stale) = (true, true);
             }
             if !empty {
-                let due = stage.switch.as_ref().is_some_and(|(step, _)| *step == self.progress.stage_step);
-                if due && !std::mem::replace(&mut self.switched, true) {
-                    self.run_hook(|s| s.switch.as_ref().map(|(_, hook)| hook), tell)?;
+                let step = self.progress.stage_step;
+                if self.switched.replace(step) != Some(step) {
+                    for i in 0..switches {
+                        self.run_hook(|s| s.switches.get(i).filter(|(due, _)| *due == step).map(|(_, h)| h), tell)?;
+                    }
                 }
                 return Ok(());
             }
@@ -239,7 +240,7 @@ impl<'a> Trainer<'a> {
         self.run_hook(|s| s.end.as_ref(), tell)?;
         self.progress.stage += 1;
         self.progress.stage_step = 0;
-        (self.entered, self.switched) = (false, false);
+        (self.entered, self.switched) = (false, None);
         Ok(())
     }
 
@@ -336,6 +337,7 @@ impl<'a> Trainer<'a> {
                 truth: &picture.color,
                 mask: picture.mask.as_ref(),
                 weight: picture.weight.as_ref(),
+                flow: picture.flow.as_ref().map(|f| f.truth()),
                 frame: i,
                 rig: self.frames.rig(i),
             })
@@ -350,6 +352,7 @@ impl<'a> Trainer<'a> {
             Some(unlocked) => unlocked.min(self.settings.sh_degree),
             None => self.settings.sh_degree,
         };
+        self.loss.progress = info.progress;
         let clock = Clock::now();
         if let Some(codec) = &stage.codec {
             if std::mem::take(&mut self.stale) {
@@ -488,7 +491,7 @@ impl<'a> Trainer<'a> {
                     );
                 }
             }
-            stage.params.iter().for_each(|l| l.on_edit());
+            stage.on_edit();
             self.stale = true;
             self.fit_grads();
         }
@@ -540,7 +543,7 @@ impl<'a> Trainer<'a> {
         for (layer, edit) in prune(&self.scene, &scores, periodic.ratio).iter().enumerate() {
             densify::apply(&mut self.scene, &mut self.moments, &mut self.stats, layer, edit, &rng);
         }
-        self.stages[self.progress.stage].params.iter().for_each(|l| l.on_edit());
+        self.stages[self.progress.stage].on_edit();
         self.fit_grads();
         Ok(before - self.scene.len())
     }
@@ -583,6 +586,10 @@ struct Mse<'a> {
 }
 
 impl super::chain::ImageLoss<f32> for Mse<'_> {
+    fn wanted(&self) -> super::chain::Wanted {
+        self.inner.wanted()
+    }
+
     fn eval(
         &mut self,
         view: &View<'_, f32>,
@@ -591,6 +598,9 @@ impl super::chain::ImageLoss<f32> for Mse<'_> {
         d_alpha: &mut Planes<f32>,
     ) -> (f64, bool) {
         let out = self.inner.eval(view, image, d_color, d_alpha);
+        d: &mut super::chain::PictureGrads<f32>,
+    ) -> f64 {
+        let out = self.inner.eval(view, image, d);
         self.sum += self.inner.mse;
         out
     }

@@ -53,9 +53,9 @@ impl Scene<f32> {
         let (q, m) = (quat::from_rotation(r), sh_rotation(r));
         for layer in &mut self.layers {
             turn_geometry(&mut layer.params, r, q);
-            let blocks = if let Spec::Native4d(s) = layer.motion.spec() { s.harmonics + 1 } else { 1 };
+            let blocks = if let Spec::Native4d(s) = layer.motion.spec().core() { s.harmonics + 1 } else { 1 };
             turn_colors(&mut layer.params[SH], blocks, &m);
-            if let Spec::Native4d(_) = layer.motion.spec() {
+            if let Spec::Native4d(_) = layer.motion.spec().core() {
                 // Q(l X r̄)Q̄ = (Ql) X (Qr)̄: the right quaternion turns as the left one does.
                 let own = layer.params.find(native4d::TABLE).expect("a native4d layer has its table");
                 let (first, _) = native4d::RIGHT_QUATS;
@@ -64,8 +64,6 @@ impl Scene<f32> {
                     table.write(row, first, product(q, or_identity(table.read(row, first))));
                 }
             }
-            if let Spec::Spacetime(SpacetimeSpec { order, rotation, .. }) = layer.motion.spec() {
-            turn_colors(&mut layer.params[SH], &m);
             if let Spec::Spacetime(SpacetimeSpec { order, rotation, .. }) = *layer.motion.spec().core() {
                 let find = |name| layer.params.find(name).expect("a spacetime layer has its tables");
                 let (velocities, rates) = (find(VELOCITIES), find(ROTATION_RATES));

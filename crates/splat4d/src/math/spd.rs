@@ -347,10 +347,7 @@ impl Geodesic {
         };
         let d_stretch = mix(2.0, &symmetric(&mul(&mul(d_point, stretch), &self.from)), 0.0, &IDENTITY);
         let (d_map, d_s) = match clamped {
-            None => (
-                mix(s, &d_stretch, 0.0, &IDENTITY),
-                inner(&d_stretch, &mix(1.0, &transport.map, -1.0, &IDENTITY)),
-            ),
+            None => (mix(s, &d_stretch, 0.0, &IDENTITY), inner(&d_stretch, &mix(1.0, &transport.map, -1.0, &IDENTITY))),
             // Derivative of a function of a matrix: divided differences (Daleckii & Krein 1965).
             Some(e) => (
                 e.weigh(&d_stretch, |x, y| divided(s, x, y)),

@@ -13,7 +13,7 @@ use super::lanes::{Batch, Lane, Work, fill, scatter};
 use super::still::{Still, activate_backward_lanes, activate_lanes};
 use super::{At, Cache, Motion, Spec, Tape};
 use crate::math::{Real, Rng};
-use crate::nn::hexplane::{Lines, PlaneShape, Planes};
+use crate::nn::hexplane::{LANES, Lines, PlaneShape, Planes};
 use crate::nn::{Kept, Mlp, MlpShape};
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::table::TableMut;
@@ -29,6 +29,8 @@ const MAX_NET: [usize; 2] = [1024, 16];
 const ROWS: usize = 1 << 16;
 /// Rows of a task that turns one layout into the other.
 const TASK_ROWS: usize = 1024;
+/// Numbers of a task that adds or masks: 128 kB in f32.
+const TASK_NUMBERS: usize = 1 << 15;
 
 /// What the planes may change.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -116,7 +118,10 @@ impl HexplaneSpec {
         }
         let [width, depth] = MAX_NET;
         if !(1..=width).contains(&self.net_width) || self.defor_depth > depth {
-            return bad(format!("a network of {} x {} is not 1 to {width} wide and up to {depth} deep", self.net_width, self.defor_depth));
+            return bad(format!(
+                "a network of {} x {} is not 1 to {width} wide and up to {depth} deep",
+                self.net_width, self.defor_depth
+            ));
         }
         if self.unlocked == 0 || self.unlocked > self.planes.multires.len() {
             return bad(format!("{} of {} levels cannot be in use", self.unlocked, self.planes.multires.len()));
@@ -222,7 +227,7 @@ impl Hexplane {
         w.hidden.resize(x.len() * self.spec.net_width, F::ZERO);
         self.planes.forward(p, lines, self.spec.unlocked, x, &mut w.features);
         self.trunk.forward_keeping(p, &w.features, &mut w.hidden, &mut w.trunk);
-        w.hidden.par_chunks_mut(TASK_ROWS).for_each(|h| h.iter_mut().for_each(|h| *h = h.max(F::ZERO)));
+        w.hidden.par_chunks_mut(TASK_NUMBERS).for_each(|h| h.iter_mut().for_each(|h| *h = h.max(F::ZERO)));
     }
 }
 
@@ -238,6 +243,15 @@ struct Activations<F> {
     sh: Kept<F>,
 }
 
+/// Scratch of the backward, by chunk of rows: fresh memory every step would cost as much as the products.
+#[derive(Default)]
+struct Back<F> {
+    d_hidden: Vec<F>,
+    d_head: Vec<F>,
+    d_features: Vec<F>,
+    waiting: Vec<[F; LANES]>,
+}
+
 /// What a tape remembers.
 #[derive(Default)]
 struct Own<F> {
@@ -245,6 +259,7 @@ struct Own<F> {
     x: Vec<[F; 3]>,
     /// Of the last chunk of rows; of all where there is one.
     work: Activations<F>,
+    back: Back<F>,
     /// Outputs of the heads, [n, 3], [n, 3], [n, 4], [n, 1]; empty where there is none.
     deltas: [Vec<F>; 4],
     /// The deformed geometry, [n, 11].
@@ -354,34 +369,42 @@ impl<F: Real> Motion<F> for Hexplane {
         let mut d_time = 0.0;
         for from in (0..n).step_by(ROWS) {
             let to = n.min(from + ROWS);
-            let Own { x, work, .. } = own;
+            let Own { x, work, back, .. } = own;
             let x = &x[from..to];
             if n > ROWS {
                 self.trunk(q.p, &lines, x, work);
                 // What is kept of the heads is of the last chunk alone.
                 (work.heads, work.sh) = Default::default();
             }
-            let mut d_hidden = vec![F::ZERO; work.hidden.len()];
-            let mut d_head = vec![F::ZERO; work.hidden.len()];
+            let Back { d_hidden, d_head, d_features, waiting } = back;
+            d_hidden.resize(work.hidden.len(), F::ZERO);
+            d_head.resize(work.hidden.len(), F::ZERO);
+            d_features.resize(work.features.len(), F::ZERO);
             let heads = self.heads.iter().zip(&d_deltas).zip(&work.heads);
             let heads = heads.map(|((head, d), kept)| (head, d, kept)).chain([(&self.sh, &d_sh, &work.sh)]);
+            let mut first = true;
             for (head, d_delta, kept) in heads {
-                if let (Some(head), false) = (head, d_delta.is_empty()) {
-                    let width = head.shape().outputs;
-                    let d_delta = &d_delta[from * width..to * width];
-                    head.backward_of(q.p, &work.hidden, kept, d_delta, Some(&mut d_head), d);
-                    let pairs = d_hidden.par_chunks_mut(TASK_ROWS).zip(d_head.par_chunks(TASK_ROWS));
+                let (Some(head), false) = (head, d_delta.is_empty()) else { continue };
+                let width = head.shape().outputs;
+                let d_delta = &d_delta[from * width..to * width];
+                let into = if first { &mut *d_hidden } else { &mut *d_head };
+                head.backward_of(q.p, &work.hidden, kept, d_delta, Some(into), d);
+                if !std::mem::take(&mut first) {
+                    let pairs = d_hidden.par_chunks_mut(TASK_NUMBERS).zip(d_head.par_chunks(TASK_NUMBERS));
                     pairs.for_each(|(sum, add)| sum.iter_mut().zip(add).for_each(|(sum, add)| *sum += *add));
                 }
             }
-            let pairs = d_hidden.par_chunks_mut(TASK_ROWS).zip(work.hidden.par_chunks(TASK_ROWS));
+            if first {
+                // Without heads nothing depends on the planes.
+                continue;
+            }
+            let pairs = d_hidden.par_chunks_mut(TASK_NUMBERS).zip(work.hidden.par_chunks(TASK_NUMBERS));
             pairs.for_each(|(d, h)| {
                 d.iter_mut().zip(h).for_each(|(d, h)| *d = if *h > F::ZERO { *d } else { F::ZERO });
             });
-            let mut d_features = vec![F::ZERO; work.features.len()];
-            self.trunk.backward_of(q.p, &work.features, &work.trunk, &d_hidden, Some(&mut d_features), d);
+            self.trunk.backward_of(q.p, &work.features, &work.trunk, d_hidden, Some(d_features), d);
             let d_x = &mut d_x[from..to];
-            d_time += self.planes.backward(q.p, &lines, self.spec.unlocked, x, &d_features, d_x, d).f64();
+            d_time += self.planes.backward(q.p, &lines, self.spec.unlocked, x, d_features, d_x, waiting, d).f64();
         }
         let sides = std::array::from_fn(|k| F::of(1.0 / (self.spec.high[k] - self.spec.low[k])));
         scatter(&Gather { d_rows: &d_rows, d_x: &d_x, sides }, d.of([GEOMETRY]), q.rows);

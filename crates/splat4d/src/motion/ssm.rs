@@ -139,7 +139,9 @@ impl SsmSpec {
         ];
         for (name, value, low, high) in ranges {
             if !(low..=high).contains(&value) {
-                return broken(format!("a state-space model of {name} = {value} cannot be: {low} to {high} is possible"));
+                return broken(format!(
+                    "a state-space model of {name} = {value} cannot be: {low} to {high} is possible"
+                ));
             }
         }
         let span = self.clip[1] - self.clip[0];
@@ -178,6 +180,12 @@ pub fn build<F: Real>(spec: &SsmSpec, p: &mut Params<F>) -> Result<Arc<dyn Motio
     Ok(Skinned::shared(skin, Box::new(field), Spec::Ssm(spec.clone())))
 }
 
+/// Names of the network's learnable column groups: those of Λ and Δ, and all others. Errors: as [`build`].
+pub fn columns(spec: &SsmSpec) -> Result<(Vec<String>, Vec<String>)> {
+    spec.check()?;
+    Ok(Net::new(spec, &mut Params::<f32>::new(0, 1, &[]))?.columns())
+}
+
 impl Field {
     /// Makes or claims the tables in `p`; `nodes` is the table of the skin. Errors: as [`build`].
     pub fn new<F: Real>(spec: &SsmSpec, nodes: Key, p: &mut Params<F>) -> Result<Self> {
@@ -205,11 +213,6 @@ impl Field {
             refresh(spec.equivariance, p);
         }
         Ok(Self { spec: spec.clone(), net, embeddings, context })
-    }
-
-    /// Names of the network's learnable column groups: those of Λ and Δ, and all others.
-    pub fn columns(&self) -> (Vec<String>, Vec<String>) {
-        self.net.columns()
     }
 
     /// Where t stands among the ticks.

@@ -211,7 +211,8 @@ impl Planes {
         });
     }
 
-    /// VJP of [`forward`](Self::forward) and [`lines`](Self::lines): adds to `d` and to `d_x`; returns dL/dt.
+    /// VJP of [`forward`](Self::forward) and [`lines`](Self::lines): adds to `d` and to `d_x`; returns dL/dt. `waiting` is
+    /// scratch, whatever is in it.
     pub fn backward<F: Real>(
         &self,
         p: &Params<F>,
@@ -220,10 +221,14 @@ impl Planes {
         x: &[[F; 3]],
         d_out: &[F],
         d_x: &mut [[F; 3]],
+        waiting: &mut Vec<[F; LANES]>,
         d: &mut Grads<F>,
     ) -> F {
         let width = self.shape.features();
-        assert!(d_out.len() == x.len() * width && d_x.len() == x.len(), "gradients have the shapes of what they are of");
+        assert!(
+            d_out.len() == x.len() * width && d_x.len() == x.len(),
+            "gradients have the shapes of what they are of"
+        );
         let (levels, blocks, simd) = (self.levels(p, lines, unlocked), self.blocks(), Simd::detect());
         let keys: Vec<Key> = self.keys[..levels.len()].as_flattened().to_vec();
         let mut tables = d.many(&keys);
@@ -235,15 +240,12 @@ impl Planes {
             let line = if v == 3 { vec![[F::ZERO; LANES]; side * blocks] } else { Vec::new() };
             let data = table.data_mut().as_chunks_mut().0;
             // Of a time plane only the two steps around t get anything.
-            let data = if v == 3 {
-                &mut data[lines.step * side * blocks..(lines.step + 2) * side * blocks]
-            } else {
-                data
-            };
+            let data =
+                if v == 3 { &mut data[lines.step * side * blocks..(lines.step + 2) * side * blocks] } else { data };
             sinks.push(Sink { level, plane, side, axes: [u, v], data, line });
         }
         let run = levels.len() * 6 * blocks;
-        let mut waiting = vec![[F::ZERO; LANES]; (PARTS * PART_ROWS).min(x.len()) * run];
+        waiting.resize((PARTS * PART_ROWS).min(x.len()) * run, [F::ZERO; LANES]);
         let some = PARTS * PART_ROWS;
         for ((x, d_out), d_x) in x.chunks(some).zip(d_out.chunks(some * width)).zip(d_x.chunks_mut(some)) {
             let parts = waiting.par_chunks_mut(PART_ROWS * run).zip(x.par_chunks(PART_ROWS));
@@ -252,7 +254,7 @@ impl Planes {
                 let d_out = lanes(d_out);
                 dispatch(simd, Backward { levels: &levels, x, d_out, width: width / LANES, waiting, d_x });
             });
-            let waiting = &waiting;
+            let waiting = &*waiting;
             sinks.par_iter_mut().with_max_len(1).for_each(|sink| {
                 dispatch(simd, Scatter { sink, x, waiting, run, blocks });
             });

@@ -87,6 +87,12 @@ impl<F: Real> Limits<F> {
             t_min: F::of(config.transmittance_min.max(T_FLOOR)),
         }
     }
+
+    /// α's ceiling as the blend computes it.
+    #[inline(always)]
+    pub fn ceiling<const FMA: bool>(&self) -> F {
+        self.log_max.blend_exp2::<FMA>()
+    }
 }
 
 /// What happens to a splat in a tile.
@@ -177,7 +183,7 @@ pub(super) struct Exponent<F, const N: usize> {
 
 /// x offsets of a row's pixels from the splat's centre, strip after strip.
 #[inline(always)]
-fn offsets<F: Real, const N: usize>(r: &Record<F>, tx: usize) -> [F; N] {
+pub(super) fn offsets<F: Real, const N: usize>(r: &Record<F>, tx: usize) -> [F; N] {
     each(|l| r.x - (F::of((tx * TILE + l % TILE) as f64) + F::HALF))
 }
 

@@ -18,6 +18,7 @@ pub mod oracle;
 mod parallel;
 pub mod project;
 pub mod rasterize;
+mod sense;
 pub mod shade;
 #[cfg(test)]
 mod tests;
@@ -26,6 +27,7 @@ mod weigh;
 pub use crate::simd::Simd;
 pub use count::PairCounts;
 pub use project::{Projected, ProjectedGrads, View};
+pub use sense::Sensitivity;
 
 use crate::math::Real;
 use crate::scene::{Camera, Planes, Splats, Table};

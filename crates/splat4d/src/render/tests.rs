@@ -609,6 +609,77 @@ fn removals_are_what_a_picture_loses_with_each_splat() {
     assert!(changes > 20, "{changes} splats matter");
 }
 
+/// Brute force: the oracle's picture with each mean and standard deviation moved, and with each opacity.
+#[test]
+fn sensitivities_are_sums_of_squared_differences() {
+    let mut s = scene(12, 4, 0.15);
+    s.outs.iter_mut().for_each(|out| (0..out.rows()).for_each(|j| out.set(j, 9, 0.5 * out.get(j, 9))));
+    let view = camera(45, 31);
+    // Colours that do not depend on the direction, and no thresholds.
+    let config = RenderConfig { sh_degree: 0, ..smooth() };
+    // A bare bell's tail counts as its middle does, as far as it is drawn.
+    let cut = RenderConfig { sh_degree: 0, ..complete() };
+    let [mut found, mut drawn] = [Vec::new(), Vec::new()];
+    Renderer::new(config).sensitivities(&s.splats(), &view, BACKGROUND, &mut found);
+    Renderer::new(cut).sensitivities(&s.splats(), &view, BACKGROUND, &mut drawn);
+    let (mut n, mut strong) = (0, 0);
+    for part in 0..3 {
+        for j in 0..s.outs[part].rows() {
+            let (values, axes) = sym3::eigen(s.outs[part].read::<6>(j, 3));
+            let moved = |k: usize, h: f64| {
+                let mut s = s.clone();
+                if k < 3 {
+                    *s.outs[part].get_mut(j, k) += h;
+                } else {
+                    let (n, deviation) = (k - 3, values[k - 3].sqrt());
+                    let grown = (deviation + h).powi(2) - deviation.powi(2);
+                    for (c, (p, q)) in [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)].into_iter().enumerate() {
+                        *s.outs[part].get_mut(j, 3 + c) += grown * axes[p][n] * axes[q][n];
+                    }
+                }
+                draw_oracle(&s, &view, config).color.data
+            };
+            let slopes: Vec<Vec<f64>> = (0..6)
+                .map(|k| moved(k, 1e-5).iter().zip(moved(k, -1e-5)).map(|(a, b)| (a - b) / 2e-5).collect())
+                .collect();
+            let size: f64 = (0..6).map(|k| slopes[k].iter().map(|x| x * x).sum::<f64>()).sum();
+            let mut at = 0;
+            for a in 0..6 {
+                for b in a..6 {
+                    let expected: f64 = slopes[a].iter().zip(&slopes[b]).map(|(x, y)| x * y).sum();
+                    let got = found[n].fisher[at];
+                    assert!((got - expected).abs() <= 1e-5 * size + 1e-9, "splat {n}, {a} {b}: {got} {expected}");
+                    at += 1;
+                }
+            }
+            // dI/dg = dI/do · o/g, pixel by pixel.
+            let mut expected = 0.0;
+            let out = &s.outs[part];
+            let seen = project::project(&View::new(&view, &cut), out.read(j, 0), out.read(j, 3), out.get(j, 9));
+            if let Some(p) = seen {
+                let with = |h: f64| {
+                    let mut s = s.clone();
+                    *s.outs[part].get_mut(j, 9) += h;
+                    draw_oracle(&s, &view, cut).color.data
+                };
+                let (up, down) = (with(1e-6), with(-1e-6));
+                for (i, (u, d)) in up.iter().zip(&down).enumerate() {
+                    let pixel = i % (45 * 31);
+                    let dx = p.mean2d[0] - (pixel % 45) as f64 - 0.5;
+                    let dy = p.mean2d[1] - (pixel / 45) as f64 - 0.5;
+                    let g = (-0.5 * (p.conic[0] * dx * dx + 2.0 * p.conic[1] * dx * dy + p.conic[2] * dy * dy)).exp();
+                    expected += ((u - d) / 2e-6 * out.get(j, 9) / g).powi(2);
+                }
+            }
+            let got = drawn[n].squared;
+            assert!((got - expected).abs() <= 1e-5 * expected + 1e-9, "splat {n}: {got} {expected}");
+            strong += usize::from(expected > 0.1 && size > 0.1);
+            n += 1;
+        }
+    }
+    assert!(strong > 6, "{strong} splats matter");
+}
+
 /// What f32 loses on the way back: behind many opaque splats, what is still to come is a small difference of large sums.
 #[test]
 fn f32_gradients_are_those_of_f64() {

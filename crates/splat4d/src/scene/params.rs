@@ -368,19 +368,6 @@ impl<F: Real> Grads<F> {
         self.tables.get_disjoint_mut(keys.map(|k| k.0 as usize)).expect("keys of one layer must be distinct")
     }
 
-    /// As [`of`](Self::of), of any number of keys, which must stand in increasing order.
-    pub fn many(&mut self, keys: &[Key]) -> Vec<&mut Table<F>> {
-        assert!(keys.is_sorted_by(|a, b| a < b), "keys must be increasing");
-        let mut wanted = keys.iter().peekable();
-        let mut out = Vec::with_capacity(keys.len());
-        for (i, table) in self.tables.iter_mut().enumerate() {
-            if wanted.next_if(|k| k.0 as usize == i).is_some() {
-                self.touched[i] = true;
-                out.push(table);
-            }
-        }
-        assert_eq!(out.len(), keys.len(), "every key names a table of the layer");
-        out
     /// As [`of`](Self::of) for a number of keys that only the model's sizes tell. Panics: a key stands twice.
     pub fn many(&mut self, keys: &[Key]) -> Vec<&mut Table<F>> {
         let mut found: Vec<Option<&mut Table<F>>> = keys.iter().map(|_| None).collect();

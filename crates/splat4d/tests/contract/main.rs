@@ -4,15 +4,15 @@ mod check;
 
 use check::{model, starts_still};
 use splat4d::motion::control::{ControlSpec, Curve, TrajectorySpec};
-use splat4d::motion::skin::SkinSpec;
 use splat4d::motion::deform::{DeformSpec, Input};
-use splat4d::motion::tracked::TrackedSpec;
-use splat4d::motion::native4d::Native4dSpec;
 use splat4d::motion::filtered::{FilteredSpec, Fusion, Predictor};
+use splat4d::motion::hexplane::{Heads, HexplaneSpec};
+use splat4d::motion::native4d::Native4dSpec;
+use splat4d::motion::skin::SkinSpec;
+use splat4d::motion::tracked::TrackedSpec;
+use splat4d::motion::ssm::{Equivariance, Mode, Output, SsmSpec};
 use splat4d::motion::{SpacetimeSpec, Spec};
 use splat4d::nn::HashShape;
-use splat4d::motion::hexplane::{Heads, HexplaneSpec};
-use splat4d::motion::{SpacetimeSpec, Spec};
 use splat4d::nn::hexplane::PlaneShape;
 use splat4d::scene::{LifeKind, Space};
 
@@ -125,6 +125,22 @@ fn control() {
 }
 
 // ssm.
+#[test]
+fn ssm() {
+    let skin = SkinSpec { nodes: 7, neighbours: 3, hyper: 2, mask: false };
+    let small = SsmSpec { skin, ticks: 9, width: 6, states: 2, embedding: 3, octaves: 2, ..SsmSpec::default() };
+    let kinds = [
+        (Mode::Bidirectional, Output::Absolute, Equivariance::None),
+        (Mode::Causal, Output::Twist, Equivariance::None),
+        (Mode::Bidirectional, Output::Twist, Equivariance::Frames),
+        (Mode::Bidirectional, Output::Absolute, Equivariance::Vector),
+    ];
+    for (mode, output, equivariance) in kinds {
+        let spec = Spec::Ssm(SsmSpec { mode, output, equivariance, ..small.clone() });
+        model(&spec, ROWS, LifeKind::Infinite, &[Space::Gaussians, Space::Nodes], &[]);
+        starts_still(&spec, ROWS);
+    }
+}
 
 // filtered.
 

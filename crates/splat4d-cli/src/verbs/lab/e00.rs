@@ -138,9 +138,9 @@ fn plots(s: &Settings, first: &Findings, sweep: &[(f64, Findings)]) -> Vec<(&'st
         points: sweep.iter().map(|(l, f)| (place(*l), of(f))).collect(),
     };
     let tradeoff = [curve("jerk", &|f| f.jerk), curve("root of MSE", &|f| f.mse.sqrt())];
-    let all = [("time", chart::file(&by_time, "time", "mean distance")), (
-        "penalty",
-        chart::file(&tradeoff, "log10 λ (left: 0)", "length"),
-    )];
+    let all = [
+        ("time", chart::file(&by_time, "time", "mean distance")),
+        ("penalty", chart::file(&tradeoff, "log10 λ (left: 0)", "length")),
+    ];
     all.into_iter().filter_map(|(name, svg)| Some((name, svg?))).collect()
 }

@@ -109,8 +109,7 @@ fn markdown(args: &Args, clean: &[Findings], noisy: &Findings) -> String {
         noisy.still_mse / noisy.fitted_mse
     );
     for s in &noisy.smoothing {
-        let _ =
-            writeln!(out, "| {} | {:.5} | {:.5} | {:.5} |", s.passes, s.step_rmse, s.first_rmse, s.last_mse);
+        let _ = writeln!(out, "| {} | {:.5} | {:.5} | {:.5} |", s.passes, s.step_rmse, s.first_rmse, s.last_mse);
     }
     out += "\nSmoothing calms single steps and leaves the end where it was: a sum does not care in which order its parts are \
             shared out. It is no remedy for drift.\n";

@@ -237,11 +237,11 @@ fn judge(
     let scene = read_scene(&Run::open(folder)?.scene_file()?)?;
     let recipe = &order.recipe;
     let store = ImageStore::new(capture.clone(), usize::try_from(recipe.image_memory).unwrap_or(usize::MAX));
-    let options = EvalOptions { antialias: recipe.antialias, pictures: false, train_views: 0, ..EvalOptions::default() };
+    let options =
+        EvalOptions { antialias: recipe.antialias, pictures: false, train_views: 0, ..EvalOptions::default() };
     let scores = assess(&scene, capture, &store, outcome.iteration, &options, &mut listen)?;
     let flow = flow::error(&scene, capture, truths, antialias(recipe.antialias))?;
-    let [psnr, psnr_dynamic, ssim, flicker] =
-        ["PSNR", "PSNR-dynamic", "SSIM", "flicker"].map(|name| scores.held(name));
+    let [psnr, psnr_dynamic, ssim, flicker] = ["PSNR", "PSNR-dynamic", "SSIM", "flicker"].map(|name| scores.held(name));
     Ok(Some(Found {
         key: order.variant.key.into(),
         seed: recipe.seed,

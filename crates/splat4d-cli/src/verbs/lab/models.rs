@@ -90,8 +90,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     }
     files::make_folder(&args.output)?;
     let stop = interrupt::flag("stopping: finished cells are kept");
-    let jobs: Vec<(&PathBuf, &str)> =
-        args.captures.iter().flat_map(|c| models.iter().map(move |m| (c, *m))).collect();
+    let jobs: Vec<(&PathBuf, &str)> = args.captures.iter().flat_map(|c| models.iter().map(move |m| (c, *m))).collect();
     let mut cells = Vec::new();
     for (i, (capture, model)) in jobs.iter().enumerate() {
         let name = capture.canonicalize().unwrap_or_else(|_| (*capture).clone());
@@ -153,13 +152,7 @@ fn models(only: &[String]) -> splat4d::Result<Vec<&'static str>> {
 }
 
 /// Trains one cell in a process of its own, so that its peak of memory is its own; says why where it refuses.
-fn train(
-    capture: &Path,
-    model: &str,
-    folder: &Path,
-    args: &Args,
-    stop: &AtomicBool,
-) -> anyhow::Result<Option<String>> {
+fn train(capture: &Path, model: &str, folder: &Path, args: &Args, stop: &AtomicBool) -> anyhow::Result<Option<String>> {
     let own = std::env::current_exe().context("this program does not know where it lies")?;
     let log = args.output.join(format!("{}.log", folder.file_name().unwrap_or_default().to_string_lossy()));
     let told = std::fs::File::create(&log).map_err(|e| files::cannot_write(&log, e))?;
@@ -294,8 +287,7 @@ mod tests {
         let cell = Cell { capture: "a".into(), model: "still".into(), steps: 10, ..Cell::default() };
         let refused = Cell { refused: Some("one camera".into()), ..cell.clone() };
         let page = markdown(&[cell, refused], &args);
-        let counts: Vec<usize> =
-            page.lines().filter(|l| l.starts_with('|')).map(|l| l.matches('|').count()).collect();
+        let counts: Vec<usize> = page.lines().filter(|l| l.starts_with('|')).map(|l| l.matches('|').count()).collect();
         assert!(counts.len() == 4 && counts.windows(2).all(|w| w[0] == w[1]), "{page}");
     }
 }

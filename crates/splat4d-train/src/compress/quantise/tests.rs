@@ -221,6 +221,7 @@ fn the_gradient_of_what_is_shown_moves_what_learns() {
             truth: &picture.color,
             mask: None,
             weight: None,
+            flow: None,
             frame: i,
             rig: 0,
         };

@@ -100,8 +100,7 @@ fn alignment_moves_the_observation_alone() {
 fn it_begins_when_it_should_and_looks_at_a_share_of_the_steps() {
     let loss = Transport::new(TransportSettings { start: 0.2, ramp: 0.1, every: 0.25, ..settings() }, 0);
     assert_eq!([0.0, 0.19, 0.25, 0.3, 0.9].map(|p| (100.0 * loss.factor(p)).round()), [0.0, 0.0, 50.0, 100.0, 100.0]);
-    let info =
-        |iteration, progress, t| StepInfo { iteration, times: vec![Time(t)], seed: 3, progress };
+    let info = |iteration, progress, t| StepInfo { iteration, times: vec![Time(t)], seed: 3, progress };
     let met = (0..2000).filter(|&i| loss.times(&info(i, 0.5, 0.5)).is_some()).count();
     assert!((420..580).contains(&met), "{met} of 2000");
     assert!((0..100).all(|i| loss.times(&info(i, 0.1, 0.5)).is_none()));

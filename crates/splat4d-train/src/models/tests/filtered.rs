@@ -68,7 +68,7 @@ fn stage(steps: usize) -> Stage {
 fn it_is_switched_on_in_the_middle_of_a_stage_and_trains() {
     let scene = filtered_scene::<f32>(|s| s.fusion = Fusion::Off);
     let mut stage = stage(30);
-    stage.switch = Some((
+    stage.switches.push((
         10,
         Box::new(|scene: &mut Scene<f32>, _: &mut Tell<'_>| {
             let layer = &mut scene.layers[0];
@@ -110,7 +110,7 @@ fn a_recipe_wraps_any_program_and_leaves_no_trace() {
         assert_eq!((spec.fusion, spec.frame, spec.inner.name()), (Fusion::Off, 0.05, "spacetime"));
         let mut stages = program.stages(&plan);
         assert!(stages[0].groups.iter().any(|g| g.column == "velocities") && stages[0].probes.len() == 1);
-        assert_eq!(stages[0].switch.as_ref().map(|s| s.0), Some(20));
+        assert_eq!(stages[0].switches.iter().map(|s| s.0).collect::<Vec<_>>(), [20]);
         stages[0].densify = Densify::None;
         let mut p = cloud::<f32>(40, LifeKind::GaussHalf, 4);
         let motion = build(&Spec::Filtered(spec), &mut p).unwrap();

@@ -2,9 +2,10 @@
 //! ordinary trainer and checked against f64 finite differences through the whole chain, the oracle as the forward.
 
 mod edits;
+mod filtered;
 mod guests;
 mod hexplane;
-mod filtered;
+mod further;
 mod layers;
 mod lobes;
 mod nodes;
@@ -15,7 +16,7 @@ mod wrapper;
 
 use super::*;
 use crate::densify::Limits;
-use crate::train::chain::{Chain, Draw, ImageLoss, Losses, StepInfo, StepReport, View};
+use crate::train::chain::{Chain, Draw, ImageLoss, Losses, PictureGrads, StepInfo, StepReport, View};
 use crate::train::frames::{Frames, Picture};
 use crate::train::loss::TrainLoss;
 use crate::train::tests::Made;
@@ -99,19 +100,14 @@ impl Draw<f64> for Oracle {
 struct Squared;
 
 impl ImageLoss<f64> for Squared {
-    fn eval(
-        &mut self,
-        view: &View<'_, f64>,
-        image: &Image<f64>,
-        d_color: &mut Planes<f64>,
-        _: &mut Planes<f64>,
-    ) -> (f64, bool) {
+    fn eval(&mut self, view: &View<'_, f64>, image: &Image<f64>, d: &mut PictureGrads<f64>) -> f64 {
         let n = image.color.data.len() as f64;
+        let d_color = &mut d.color;
         d_color.clone_from(&image.color);
         for (d, t) in d_color.data.iter_mut().zip(&view.truth.data) {
             *d = (*d - t) * 2.0 / n;
         }
-        (d_color.data.iter().map(|d| d * d * n / 4.0).sum(), false)
+        d_color.data.iter().map(|d| d * d * n / 4.0).sum()
     }
 }
 
@@ -156,6 +152,7 @@ fn step(
             truth: &s.truth,
             mask: None,
             weight: None,
+            flow: None,
             frame: 0,
             rig: 0,
         })

@@ -107,7 +107,8 @@ impl Prediction {
             Predictor::Euclidean => {
                 let straight = mix(1.0 + share, &last.cov, -share, &before.cov);
                 // As much as the clamp of Exp lets an axis shrink; a constant to the gradient.
-                let least = crate::math::spd::Eigen::of_covariance(&last.cov).values.into_iter().fold(f64::MAX, f64::min);
+                let least =
+                    crate::math::spd::Eigen::of_covariance(&last.cov).values.into_iter().fold(f64::MAX, f64::min);
                 let lifted = Lifted::new(&straight, STRETCH_MIN * STRETCH_MIN * least);
                 (lifted.matrix, Shape::Straight(lifted))
             }
@@ -129,7 +130,10 @@ impl Prediction {
                 (mix(1.0 + s, &g, 0.0, &g), mix(-s, &g, 0.0, &g))
             }
         };
-        (Normal { mean: d.mean.map(|x| (1.0 + s) * x), cov: last }, Normal { mean: d.mean.map(|x| -s * x), cov: before })
+        (
+            Normal { mean: d.mean.map(|x| (1.0 + s) * x), cov: last },
+            Normal { mean: d.mean.map(|x| -s * x), cov: before },
+        )
     }
 }
 
@@ -213,8 +217,7 @@ impl Fused {
         let innovation: f64 = (0..3).map(|k| delta[k] * weighed[k]).sum();
         let gate = gate_of(innovation, gate);
         let open = trust * gate[0];
-        let mut out =
-            Self { point: *seen, open, gain, trust, gate, delta, precision, weighed, rule: Rule::Closed };
+        let mut out = Self { point: *seen, open, gain, trust, gate, delta, precision, weighed, rule: Rule::Closed };
         if open <= 0.0 {
             return out;
         }
@@ -265,12 +268,7 @@ impl Fused {
                 let transposed: Mat3 = std::array::from_fn(|i| std::array::from_fn(|j| k[j][i]));
                 let to_mean = apply(&transposed, g.mean);
                 // dS from the mean (S⁻¹ in the gain) and from the covariance.
-                let d_s = mix(
-                    1.0,
-                    &symmetric(&mul(&mul(&transposed, &g.cov), k)),
-                    -1.0,
-                    &outer(to_mean, self.weighed),
-                );
+                let d_s = mix(1.0, &symmetric(&mul(&mul(&transposed, &g.cov), k)), -1.0, &outer(to_mean, self.weighed));
                 let own = mix(-2.0, &symmetric(&mul(&g.cov, k)), 1.0, &outer(g.mean, self.weighed));
                 out.seen.add(&Normal { mean: to_mean, cov: d_s });
                 out.predicted = Normal {

@@ -325,7 +325,8 @@ fn off_changes_nothing_around_any_model() {
         let name = inner.name().to_owned();
         let ids = [1u32, 4, 7, 19];
         for rows in [Rows::All, Rows::Some(&ids)] {
-            let both = [(&p, plain.as_ref()), (&held, &wrapped as &dyn Motion<f64>)].map(|(p, model)| whole(p, model, rows));
+            let both =
+                [(&p, plain.as_ref()), (&held, &wrapped as &dyn Motion<f64>)].map(|(p, model)| whole(p, model, rows));
             assert!(both[0] == both[1], "{name}: wrapping changed an answer or a gradient");
         }
         let (mut a, mut b) = (p.clone(), held.clone());

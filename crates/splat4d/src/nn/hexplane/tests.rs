@@ -46,9 +46,11 @@ fn features(p: &Params<f64>, planes: &Planes, unlocked: usize, x: &[[f64; 3]], t
 #[test]
 fn affine_planes_are_met_exactly_and_the_border_goes_on() {
     let (mut p, planes) = planes(shape());
-    let affine = |plane: usize, [u, v]: [f64; 2], c: usize| 1.0 + 0.3 * plane as f64 + 0.5 * u - 0.2 * v + 0.01 * c as f64;
+    let affine =
+        |plane: usize, [u, v]: [f64; 2], c: usize| 1.0 + 0.3 * plane as f64 + 0.5 * u - 0.2 * v + 0.01 * c as f64;
     set(&mut p, &planes, affine);
-    for (x, t) in [([0.3, 0.77, 0.5], 0.4), ([0.0, 1.0, 0.123], 1.0), ([-3.0, 0.2, 7.0], -1.0), ([0.5, 0.9, 2.0], 3.0)] {
+    for (x, t) in [([0.3, 0.77, 0.5], 0.4), ([0.0, 1.0, 0.123], 1.0), ([-3.0, 0.2, 7.0], -1.0), ([0.5, 0.9, 2.0], 3.0)]
+    {
         let got = features(&p, &planes, 2, &[x], t);
         let at = [x[0], x[1], x[2], t].map(|a: f64| a.clamp(0.0, 1.0));
         assert_eq!(got.len(), 32, "levels stand one after the other");
@@ -85,7 +87,7 @@ fn time_planes_of_ones_know_no_time() {
     assert_eq!(a, b);
     let mut d = Grads::new(&p);
     let lines = planes.lines(&p, 0.3);
-    let d_t = planes.backward(&p, &lines, 2, &x, &vec![1.0; a.len()], &mut vec![[0.0; 3]; 50], &mut d);
+    let d_t = planes.backward(&p, &lines, 2, &x, &vec![1.0; a.len()], &mut vec![[0.0; 3]; 50], &mut Vec::new(), &mut d);
     assert_eq!(d_t, 0.0);
     assert!(a.iter().all(|f| (0.001..0.125).contains(f)), "a product of three numbers of 0.1 to 0.5");
 }
@@ -111,7 +113,7 @@ fn gradients_equal_differences_also_where_factors_are_zero() {
         features(p, &planes, 2, x, t).iter().zip(&w).map(|(f, w)| f * w).sum()
     };
     let (mut d, mut d_x) = (Grads::new(&p), vec![[0.0; 3]; x.len()]);
-    let d_t = planes.backward(&p, &planes.lines(&p, t), 2, &x, &w, &mut d_x, &mut d);
+    let d_t = planes.backward(&p, &planes.lines(&p, t), 2, &x, &w, &mut d_x, &mut vec![[7.0; LANES]; 5], &mut d);
     let near = |fd: f64, got: f64, what: &str| {
         assert!((fd - got).abs() < 1e-6 * (1.0 + fd.abs()), "{what}: differences {fd}, gradient {got}");
     };
@@ -180,7 +182,7 @@ fn locked_levels_give_zeros_and_learn_nothing() {
         assert!(one[16..].iter().all(|f| *f == 0.0));
     }
     let mut d = Grads::new(&p);
-    planes.backward(&p, &planes.lines(&p, 0.4), 1, &x, &one, &mut vec![[0.0; 3]; 200], &mut d);
+    planes.backward(&p, &planes.lines(&p, 0.4), 1, &x, &one, &mut vec![[0.0; 3]; 200], &mut Vec::new(), &mut d);
     assert!((0..6).all(|k| d.touched(planes.keys()[0][k]) && !d.touched(planes.keys()[1][k])));
 }
 
@@ -222,7 +224,7 @@ fn bits_do_not_depend_on_the_number_of_threads() {
             let mut out = vec![0.0f32; n * 32];
             planes.forward(&p, &lines, 2, &x, &mut out);
             let (mut d, mut d_x) = (Grads::new(&p), vec![[0.0f32; 3]; n]);
-            let d_t = planes.backward(&p, &lines, 2, &x, &out, &mut d_x, &mut d);
+            let d_t = planes.backward(&p, &lines, 2, &x, &out, &mut d_x, &mut Vec::new(), &mut d);
             let tables: Vec<Table<f32>> = planes.keys().as_flattened().iter().map(|&k| d.table(k).clone()).collect();
             (out, d_x, d_t, tables)
         })

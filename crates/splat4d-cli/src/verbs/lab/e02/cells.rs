@@ -22,12 +22,22 @@ const fn variant(key: &'static str, name: &'static str, knobs: &'static [&'stati
 /// The first is what all are compared with.
 const ALL: [Variant; 10] = [
     variant("alone", "the motion alone", &[], true),
-    variant("filter-euclidean", "filter, Euclidean predictor", &["filter=geodesic", "filter_predictor=euclidean"], false),
+    variant(
+        "filter-euclidean",
+        "filter, Euclidean predictor",
+        &["filter=geodesic", "filter_predictor=euclidean"],
+        false,
+    ),
     variant("filter-hold", "filter, without log and exp", &["filter=geodesic", "filter_predictor=hold"], false),
     variant("filter", "filter, Wasserstein predictor", &["filter=geodesic"], true),
     variant("filter-literal", "filter, Kalman's formulas", &["filter=literal"], false),
     variant("linear", "linear regulariser", &["transport=linear"], true),
-    variant("w2-hold", "W2 regulariser, without log and exp", &["transport=wasserstein", "filter_predictor=hold"], false),
+    variant(
+        "w2-hold",
+        "W2 regulariser, without log and exp",
+        &["transport=wasserstein", "filter_predictor=hold"],
+        false,
+    ),
     variant("w2", "W2 regulariser", &["transport=wasserstein"], true),
     variant(
         "both-euclidean",

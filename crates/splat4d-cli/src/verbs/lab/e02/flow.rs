@@ -50,7 +50,12 @@ pub(super) fn truths(capture: &Capture) -> Vec<Truth> {
 /// The scene's error over all of them; `None` where there is no truth.
 ///
 /// Errors: a file that is no such picture, or of another size than its camera's.
-pub(super) fn error(scene: &Scene<f32>, capture: &Capture, truths: &[Truth], antialias: Antialias) -> Result<Option<FlowError>> {
+pub(super) fn error(
+    scene: &Scene<f32>,
+    capture: &Capture,
+    truths: &[Truth],
+    antialias: Antialias,
+) -> Result<Option<FlowError>> {
     let mut renderer = Renderer::new(RenderConfig { antialias, ..RenderConfig::default() });
     let mut sums = [[0.0f64; 2]; 2];
     for (i, path) in truths {

@@ -37,7 +37,16 @@ pub(super) fn markdown(study: &Study, variants: &[Variant], motion: &str) -> Str
         study.steps, study.seeds
     );
     let head = [
-        "variant", "PSNR", "moving", "SSIM", "flicker", "flow", "flow, moving", "flicker less, %", "flow less, %", "minutes",
+        "variant",
+        "PSNR",
+        "moving",
+        "SSIM",
+        "flicker",
+        "flow",
+        "flow, moving",
+        "flicker less, %",
+        "flow less, %",
+        "minutes",
     ];
     let base = variants.first().map(|v| study.of(v)).unwrap_or_default();
     let line = |v: &Variant| {

@@ -1,0 +1,83 @@
+//! Flow: what a pixel shows goes where the truth says.
+
+use super::{SEEN, over_rows};
+use splat4d::math::Real;
+use splat4d::scene::{Camera, Planes, Time};
+
+/// Known optical flow of one picture.
+#[derive(Clone, Copy, Debug)]
+pub struct FlowTruth<'a, F = f32> {
+    /// When the pixels arrive.
+    pub to: Time,
+    /// From where they are seen then.
+    pub camera: &'a Camera,
+    /// [3, h, w]: u right, v down in pixels, and 1 where they are known.
+    pub vectors: &'a Planes<F>,
+}
+
+/// Known flow is that of a whole pixel: of a mean of pixels all must be known.
+const KNOWN: f64 = 0.999;
+
+/// Mean over pixels of known flow that show something of ‖F − F*‖₁ over the picture's longer side; F = Σ α T f / Σ α T.
+///
+/// Shapes: `drawn` [3, h, w] holds Σ α T f (2) and Σ α T of the splats that have an f; `d` adds up its gradient.
+/// Source: SC-GS (Huang et al. 2024) and GaussianFlow (Gao et al. 2024).
+pub fn flow<F: Real>(drawn: &Planes<F>, truth: &Planes<F>, weight: f64, d: &mut Planes<F>) -> f64 {
+    let n = drawn.pixels();
+    assert!([drawn.data.len(), truth.data.len(), d.data.len()] == [3 * n; 3], "flow has three channels of {n} pixels");
+    let shows = |p: usize| drawn.plane(2)[p] >= F::of(SEEN) && truth.plane(2)[p] >= F::of(KNOWN);
+    let count = (0..n).filter(|&p| shows(p)).count();
+    if count == 0 {
+        return 0.0;
+    }
+    let scale = weight / (count * drawn.width.max(drawn.height)) as f64;
+    let factor = F::of(scale);
+    let mut g = vec![[F::ZERO; 3]; n];
+    let sum = over_rows(&mut g, drawn.width, |y, row| {
+        let mut sum = 0.0;
+        for (x, g) in row.iter_mut().enumerate() {
+            let p = y * drawn.width + x;
+            if !shows(p) {
+                continue;
+            }
+            let w = drawn.plane(2)[p];
+            for k in 0..2 {
+                let f = drawn.plane(k)[p] / w;
+                let e = f - truth.plane(k)[p];
+                sum += e.abs().f64();
+                let sign = if e > F::ZERO { F::ONE } else { -F::ONE };
+                g[k] = factor * sign / w;
+                g[2] -= factor * sign * f / w;
+            }
+        }
+        sum
+    });
+    for k in 0..3 {
+        d.plane_mut(k).iter_mut().zip(&g).for_each(|(d, g)| *d += g[k]);
+    }
+    scale * sum
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::check;
+    use super::*;
+
+    #[test]
+    fn gradient_equals_finite_differences_and_unknown_pixels_do_not_count() {
+        let mut drawn = check::planes("drawn", [3, 5, 8], -2.0, 2.0);
+        drawn.plane_mut(2).iter_mut().for_each(|w| *w = 0.7 + 0.1 * *w);
+        drawn.plane_mut(2)[7] = 0.3;
+        let mut truth = check::planes("truth", [3, 5, 8], -2.0, 2.0);
+        truth.plane_mut(2).iter_mut().enumerate().for_each(|(i, v)| *v = f64::from(u8::from(i % 3 > 0)));
+        let run = |p: &[Planes<f64>], d: &mut [Planes<f64>]| flow(&p[0], &truth, 0.7, &mut d[0]);
+        let value = check::gradients(&[drawn.clone()], run, |p| run(p, &mut [Planes::new(3, 5, 8)]));
+        assert!(value > 0.01);
+        // What is right costs nothing.
+        for p in 0..40 {
+            let w = drawn.plane(2)[p];
+            (0..2).for_each(|k| drawn.plane_mut(k)[p] = w * truth.plane(k)[p]);
+        }
+        assert!(run(&[drawn], &mut [Planes::new(3, 5, 8)]) < 1e-12);
+    }
+}

@@ -1,0 +1,116 @@
+//! Losses on a rendered picture beside the photometric one: entropy of its alpha, total variation, agreement of depth and
+//! normals, frequencies, flow.
+//!
+//! Each *adds* `weight` times its gradient and returns `weight` times its value, and gives the same bits with any number
+//! of threads. [`ImageTerms`] says which of them a run uses.
+
+pub mod entropy;
+mod fft;
+pub mod flow;
+pub mod frequency;
+pub mod normal;
+pub mod tv;
+
+use crate::recipe::Recipe;
+use rayon::prelude::*;
+use splat4d::math::Real;
+
+/// Alpha from which on a pixel shows something: below it depth, normal and flow are those of haze.
+pub const SEEN: f64 = 0.5;
+
+/// Weights of the picture losses; 0: off.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct ImageTerms {
+    /// [`tv::total_variation`] of the colours.
+    pub tv: f64,
+    /// [`tv::depth_smoothness`].
+    pub depth_tv: f64,
+    /// [`normal::depth_normal`].
+    pub depth_normal: f64,
+    /// [`frequency::Frequency`].
+    pub frequency: f64,
+    /// [`entropy::mask_entropy`], nats.
+    pub mask_entropy: f64,
+    /// [`flow::flow`], shares of the picture's longer side.
+    pub flow: f64,
+}
+
+impl ImageTerms {
+    /// As the recipe has them.
+    pub fn of(r: &Recipe) -> Self {
+        Self {
+            tv: r.lambda_tv,
+            depth_tv: r.lambda_depth_tv,
+            depth_normal: r.lambda_depth_normal,
+            frequency: r.lambda_frequency,
+            mask_entropy: r.lambda_mask_entropy,
+            flow: r.lambda_flow,
+        }
+    }
+}
+
+/// Calls `f(y, row)` for every row of a plane in parallel and returns the sum of the results in order.
+pub(crate) fn over_rows<T: Send>(plane: &mut [T], width: usize, f: impl Fn(usize, &mut [T]) -> f64 + Sync) -> f64 {
+    if width == 0 {
+        return 0.0;
+    }
+    let sums: Vec<f64> = plane.par_chunks_mut(width).enumerate().map(|(y, row)| f(y, row)).collect();
+    sums.iter().sum()
+}
+
+/// The VJP of expected depth D = S/max(A, `floor`), Σ z α T = S: adds to the gradients of S and A.
+pub(crate) fn expected_depth_backward<F: Real>(
+    expected: &[F],
+    alpha: &[F],
+    floor: F,
+    d_expected: &[F],
+    d_depth: &mut [F],
+    d_alpha: &mut [F],
+) {
+    for (p, &g) in d_expected.iter().enumerate() {
+        let a = alpha[p].max(floor);
+        d_depth[p] += g / a;
+        if alpha[p] > floor {
+            d_alpha[p] -= g * expected[p] / a;
+        }
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod check {
+    //! Finite differences of losses on planes.
+
+    use splat4d::math::Rng;
+    use splat4d::scene::Planes;
+
+    /// Uniform numbers in [low, high).
+    pub fn planes(purpose: &str, shape: [usize; 3], low: f64, high: f64) -> Planes<f64> {
+        let rng = Rng::new(13, purpose, 0);
+        let mut out = Planes::new(shape[0], shape[1], shape[2]);
+        out.data.iter_mut().enumerate().for_each(|(i, x)| *x = low + (high - low) * rng.uniform(i as u64));
+        out
+    }
+
+    /// Every seventh number of every plane; returns the value.
+    pub fn gradients(
+        inputs: &[Planes<f64>],
+        loss: impl Fn(&[Planes<f64>], &mut [Planes<f64>]) -> f64,
+        value: impl Fn(&[Planes<f64>]) -> f64,
+    ) -> f64 {
+        let mut d: Vec<Planes<f64>> = inputs.iter().map(|p| Planes::new(p.channels, p.height, p.width)).collect();
+        let out = loss(inputs, &mut d);
+        for k in 0..inputs.len() {
+            for i in (0..inputs[k].data.len()).step_by(7) {
+                let at = |h: f64| {
+                    let mut moved = inputs.to_vec();
+                    moved[k].data[i] += h;
+                    value(&moved)
+                };
+                let fd = (at(1e-6) - at(-1e-6)) / 2e-6;
+                let got = d[k].data[i];
+                assert!((fd - got).abs() < 1e-7 * (1.0 + fd.abs()), "input {k}, number {i}: {fd} {got}");
+            }
+        }
+        out
+    }
+}

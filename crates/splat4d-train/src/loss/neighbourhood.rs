@@ -1,0 +1,264 @@
+//! [`Neighbourhood`]: the losses on motion, switched by recipe on any model.
+
+use super::arap::{self, OWN_FLOOR};
+use super::graph::{Graph, Weigh};
+use super::motion;
+use super::terms::{Probe, ProbeLoss, StepInfo};
+use crate::models::Plan;
+use splat4d::layers::Scene;
+use splat4d::math::knn::knn;
+use splat4d::math::{Real, Rng};
+use splat4d::motion::Spec;
+use splat4d::scene::splats::COV;
+use splat4d::scene::{GEOMETRY, Space, Table, Time};
+use std::sync::Mutex;
+
+/// Neighbours a Gaussian is compared with; Luiten et al. 2024 take 20, SC-GS 10 and fewer: cost is in proportion.
+pub const NEIGHBOURS: usize = 8;
+/// Steps between two searches of the neighbours: they change slowly.
+const SEARCH_INTERVAL: usize = 200;
+/// Gaussians a step whose neighbourhoods are looked at, other ones in each: this bounds the cost.
+pub const CENTRES: usize = 1024;
+/// exp(−c d²/median) of an edge; 1 keeps the typical edge and drops the far ones.
+const FALLOFF: f64 = 1.0;
+
+/// Weights of the terms; 0: off.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct MotionWeights {
+    /// [`motion::rigidity`] over a frame, extents.
+    pub rigid: f64,
+    /// [`motion::rotation`] over a frame.
+    pub rot: f64,
+    /// [`motion::isometry`] between the view's time and any other of the clip, extents.
+    pub iso: f64,
+    /// [`arap::arap`] between the view's time and any other of the clip, extents².
+    pub arap: f64,
+    /// [`arap::elastic`] over four frames.
+    pub elastic: f64,
+    /// [`motion::velocity`], (extents a clip)².
+    pub velocity: f64,
+    /// [`motion::jerk`] of four frames, extents.
+    pub jerk: f64,
+}
+
+impl MotionWeights {
+    /// Whether nothing is to be done.
+    pub fn is_off(&self) -> bool {
+        *self == Self::default()
+    }
+}
+
+/// Rigidity, rotation, isometry, ARAP, elasticity, velocity and jerk of the Gaussians of every layer that moves, over
+/// random neighbourhoods of those alive at the view's time.
+///
+/// Neighbours are those of the raw means, searched anew every 200 steps and after every edit of rows; an edge counts
+/// only where both of its ends are alive. Which neighbourhoods a step looks at is a function of seed and step.
+pub struct Neighbourhood<F> {
+    weights: MotionWeights,
+    /// 1/extent
+    unit: f64,
+    /// Seconds of a frame.
+    frame: f64,
+    clip: [f64; 2],
+    /// Per layer: the epoch of the search and its result.
+    near: Mutex<Vec<(usize, Vec<u32>)>>,
+    /// Of the step that is under way: a graph over the rows of each probe.
+    graphs: Mutex<Vec<Graph<F>>>,
+}
+
+impl<F: Real> Neighbourhood<F> {
+    /// For a run with this plan.
+    pub fn new(weights: MotionWeights, plan: &Plan) -> Self {
+        Self {
+            weights,
+            unit: 1.0 / plan.extent,
+            frame: 1.0 / plan.fps,
+            clip: plan.clip,
+            near: Mutex::default(),
+            graphs: Mutex::default(),
+        }
+    }
+
+    /// Instants of a step: two a frame apart from the first view's time on; then, if asked for, one frame before and one
+    /// after them; then any other.
+    fn times(&self, info: &StepInfo, layer: usize) -> Option<Vec<Time>> {
+        let seconds = self.clip[1] - self.clip[0];
+        let t = info.times.first()?.0;
+        let w = &self.weights;
+        let wide = w.elastic > 0.0 || w.jerk > 0.0;
+        let (before, after) = if wide { (self.frame, 2.0 * self.frame) } else { (0.0, self.frame) };
+        if seconds < before + after {
+            return None;
+        }
+        let t = t.clamp(self.clip[0] + before, self.clip[1] - after);
+        let mut times = vec![Time(t), Time(t + self.frame)];
+        if wide {
+            times.extend([Time(t - self.frame), Time(t + 2.0 * self.frame)]);
+        }
+        if w.iso > 0.0 || w.arap > 0.0 {
+            let any = Rng::new(info.seed, "far instant", info.iteration as u64).uniform(layer as u64);
+            times.push(Time(self.clip[0] + any * seconds));
+        }
+        Some(times)
+    }
+}
+
+impl<F: Real> ProbeLoss<F> for Neighbourhood<F> {
+    fn name(&self) -> &str {
+        "motion"
+    }
+
+    fn probes(&self, scene: &Scene<F>, info: &StepInfo) -> Vec<Probe> {
+        let mut near = self.near.lock().expect("no thread panics while it holds the neighbours");
+        near.resize(scene.layers.len(), (usize::MAX, Vec::new()));
+        let mut graphs = self.graphs.lock().expect("no thread panics while it holds the graphs");
+        graphs.clear();
+        let mut probes = Vec::new();
+        for (layer, (l, (searched, near))) in scene.layers.iter().zip(near.iter_mut()).enumerate() {
+            let n = l.params.len();
+            let Some(times) = self.times(info, layer) else { continue };
+            if n <= NEIGHBOURS || l.motion.spec() == Spec::Still || !l.spans_over(times[0]) {
+                continue;
+            }
+            let means = &l.params[GEOMETRY];
+            let epoch = info.iteration / SEARCH_INTERVAL;
+            if *searched != epoch || near.len() != n * NEIGHBOURS {
+                let points: Vec<[f32; 3]> = (0..n).map(|r| means.read::<3>(r, 0).map(|x| x.f64() as f32)).collect();
+                *near = knn(&points, NEIGHBOURS);
+                *searched = epoch;
+            }
+            let mut alive = Vec::new();
+            if l.active(times[0], &mut alive) {
+                alive = (0..n as u32).collect();
+            }
+            let (rows, graph) = sample(means, near, &alive, Rng::new(info.seed, "neighbours", info.iteration as u64));
+            if graph.edges() > 0 {
+                probes.push(Probe { layer, of: Space::Gaussians, rows: Some(rows), times });
+                graphs.push(graph);
+            }
+        }
+        probes
+    }
+
+    fn eval(&self, _scene: &Scene<F>, probes: &[Probe], seen: &[Vec<Table<F>>], d: &mut [Vec<Table<F>>]) -> f64 {
+        let graphs = self.graphs.lock().expect("no thread panics while it holds the graphs");
+        assert_eq!(graphs.len(), probes.len(), "eval answers the probes of the same step");
+        let clip = (self.clip[1] - self.clip[0] + self.frame) / self.frame;
+        let mut loss = 0.0;
+        for ((graph, seen), d) in graphs.iter().zip(seen).zip(d) {
+            let x: Vec<Vec<[F; 3]>> = seen.iter().map(|t| (0..t.rows()).map(|r| t.read(r, 0)).collect()).collect();
+            let mut g: Vec<Vec<[F; 3]>> = x.iter().map(|x| vec![[F::ZERO; 3]; x.len()]).collect();
+            let (w, unit) = (&self.weights, self.unit);
+            let wide = w.elastic > 0.0 || w.jerk > 0.0;
+            if w.rigid > 0.0 || w.rot > 0.0 || w.velocity > 0.0 {
+                let rotations = arap::rotations(graph, &x[1], &x[0]);
+                let [before, now, ..] = &mut g[..] else { unreachable!("two instants are always asked for") };
+                if w.rigid > 0.0 {
+                    let way = [&x[1][..], &x[0][..]];
+                    loss += motion::rigidity(graph, &rotations, way, w.rigid * unit, [now, before]);
+                }
+                if w.velocity > 0.0 {
+                    // From scene units a frame to extents a clip.
+                    let weight = w.velocity * (unit * clip).powi(2);
+                    loss += motion::velocity(graph, [&x[1], &x[0]], weight, [now, before]);
+                }
+                if w.rot > 0.0 {
+                    let cov: [Vec<[F; 6]>; 2] =
+                        [1, 0].map(|t| (0..seen[t].rows()).map(|r| seen[t].read(r, COV)).collect());
+                    let mut d_cov = [0, 1].map(|_| vec![[F::ZERO; 6]; seen[0].rows()]);
+                    let [d_now, d_before] = &mut d_cov;
+                    loss += motion::rotation(graph, &rotations, [&cov[0], &cov[1]], w.rot, [d_now, d_before]);
+                    for (t, d_cov) in [1, 0].into_iter().zip(&d_cov) {
+                        d_cov.iter().enumerate().for_each(|(r, v)| d[t].add(r, COV, *v));
+                    }
+                }
+            }
+            if wide {
+                // In the order of time: before, at, after, after that.
+                let [at, after, before, last, ..] = &mut g[..] else { unreachable!("four instants were asked for") };
+                let x = [&x[2][..], &x[0][..], &x[1][..], &x[3][..]];
+                if w.jerk > 0.0 {
+                    loss += motion::jerk(x, w.jerk * unit, [before, at, after, last]);
+                }
+                if w.elastic > 0.0 {
+                    let mut d: [&mut [[F; 3]]; 4] = [before, at, after, last];
+                    loss += arap::elastic(graph, &x, OWN_FLOOR / (unit * unit), w.elastic, &mut d);
+                }
+            }
+            if w.iso > 0.0 || w.arap > 0.0 {
+                let (far, others) = g.split_last_mut().expect("instants were asked for");
+                let pair = [&x[0][..], &x[x.len() - 1][..]];
+                if w.iso > 0.0 {
+                    loss += motion::isometry(graph, pair, w.iso * unit, [&mut others[0], far]);
+                }
+                if w.arap > 0.0 {
+                    loss += arap::arap(graph, pair, w.arap * unit * unit, [&mut others[0], far]);
+                }
+            }
+            for (d, g) in d.iter_mut().zip(&g) {
+                g.iter().enumerate().for_each(|(r, v)| d.add(r, 0, *v));
+            }
+        }
+        loss
+    }
+
+    fn on_edit(&self) {
+        self.near.lock().expect("no thread panics while it holds the neighbours").clear();
+    }
+
+    fn state(&self) -> Vec<u32> {
+        // Per layer: the epoch of the search, the number of indices, the indices.
+        let near = self.near.lock().expect("no thread panics while it holds the neighbours");
+        let layer = |(epoch, near): &(usize, Vec<u32>)| {
+            [&[u32::try_from(*epoch).unwrap_or(u32::MAX), near.len() as u32], near.as_slice()].concat()
+        };
+        near.iter().flat_map(layer).collect()
+    }
+
+    fn restore(&self, state: &[u32]) {
+        let mut near = self.near.lock().expect("no thread panics while it holds the neighbours");
+        near.clear();
+        let mut rest = state;
+        while let [epoch, count, tail @ ..] = rest {
+            let (indices, tail) = tail.split_at((*count as usize).min(tail.len()));
+            let sound =
+                indices.len() == *count as usize && indices.iter().all(|&j| (j as usize) < indices.len() / NEIGHBOURS);
+            let epoch = if *epoch == u32::MAX || !sound { usize::MAX } else { *epoch as usize };
+            near.push((epoch, if sound { indices.to_vec() } else { Vec::new() }));
+            rest = tail;
+        }
+    }
+}
+
+/// Up to [`CENTRES`] of the rows `alive`, with their neighbours among them: the rows, ascending, and a graph in which only
+/// the centres' edges count.
+fn sample<F: Real>(means: &Table<F>, near: &[u32], alive: &[u32], rng: Rng) -> (Vec<u32>, Graph<F>) {
+    let count = alive.len().min(CENTRES);
+    // One of every stratum: sorted and never twice.
+    let pick = |s: usize| {
+        let at = (s as f64 + rng.uniform(s as u64)) * alive.len() as f64 / count as f64;
+        alive[(at as usize).min(alive.len() - 1)]
+    };
+    let mut centres: Vec<u32> = if count == alive.len() { alive.to_vec() } else { (0..count).map(pick).collect() };
+    centres.dedup();
+    let of = |c: u32| &near[c as usize * NEIGHBOURS..(c as usize + 1) * NEIGHBOURS];
+    let lives = |j: &u32| alive.binary_search(j).is_ok();
+    let mut rows: Vec<u32> = centres.iter().flat_map(|&c| of(c).iter().copied().filter(lives).chain([c])).collect();
+    rows.sort_unstable();
+    rows.dedup();
+    let place = |row: u32| rows.binary_search(&row).ok().map(|p| p as u32);
+    let mut local: Vec<u32> = (0..rows.len() as u32).flat_map(|i| [i; NEIGHBOURS]).collect();
+    for &c in &centres {
+        let at = place(c).expect("centres are among the rows") as usize * NEIGHBOURS;
+        for (slot, &j) in local[at..at + NEIGHBOURS].iter_mut().zip(of(c)) {
+            if lives(&j) {
+                *slot = place(j).expect("living neighbours are among the rows");
+            }
+        }
+    }
+    let points: Vec<[F; 3]> = rows.iter().map(|&r| means.read(r as usize, 0)).collect();
+    (rows, Graph::of(&points, local, Weigh::Median(FALLOFF)))
+}
+
+#[cfg(test)]
+mod tests;

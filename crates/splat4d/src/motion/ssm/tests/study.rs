@@ -1,0 +1,194 @@
+//! Against a perceptron: node paths of several frequencies, learnt by both with the same steps, rate and about as many
+//! weights; then both are asked for the 50 ticks after the last that they saw.
+
+use super::*;
+use crate::nn::encoding::{encode, encoded};
+use crate::nn::{Mlp, MlpShape};
+
+const SOURCES: usize = 16;
+/// Ticks past the end that are asked for.
+const AHEAD: usize = 50;
+/// Octaves of the perceptron's clock (SC-GS: 6 to 10).
+const OCTAVES: usize = 8;
+
+/// Two sinusoids along x, a circle in y and z; every node with its own phase. Amplitude 1.
+fn path(node: usize, second: f64) -> [f64; 3] {
+    let phase = 0.4 * node as f64;
+    let x = 0.6 * (1.3 * second + phase).sin() + 0.4 * (3.1 * second + 2.0 * phase).sin();
+    [x, (2.0 * second + phase).cos(), (2.0 * second + phase).sin()]
+}
+
+/// Adam over every learnable table.
+struct Adam {
+    moments: Vec<Vec<[f32; 2]>>,
+    step: i32,
+}
+
+impl Adam {
+    fn new(p: &Params<f32>) -> Self {
+        Self { moments: p.keys().map(|k| vec![[0.0; 2]; p[k].data().len()]).collect(), step: 0 }
+    }
+
+    fn step(&mut self, p: &mut Params<f32>, d: &Grads<f32>, rate: f32) {
+        self.step += 1;
+        let (a, b) = (1.0 - 0.9f32.powi(self.step), 1.0 - 0.999f32.powi(self.step));
+        for key in p.keys().skip(3).collect::<Vec<_>>() {
+            if !p.info(key).trainable {
+                continue;
+            }
+            let moments = &mut self.moments[key.0 as usize];
+            for ((x, g), [m, v]) in p[key].data_mut().iter_mut().zip(d.table(key).data()).zip(moments) {
+                *m = 0.9 * *m + 0.1 * g;
+                *v = 0.999 * *v + 0.001 * g * g;
+                *x -= rate * (*m / a) / ((*v / b).sqrt() + 1e-8);
+            }
+        }
+    }
+}
+
+/// Root mean square error within the take and in the ticks after it, and numbers that learn.
+#[derive(Debug)]
+struct Score {
+    within: f64,
+    ahead: f64,
+    numbers: usize,
+}
+
+fn numbers(p: &Params<f32>) -> usize {
+    p.keys().skip(3).filter(|&k| p.info(k).trainable).map(|k| p[k].rows() * p[k].width()).sum()
+}
+
+fn rms(squares: f64, count: usize) -> f64 {
+    (squares / (3 * count) as f64).sqrt()
+}
+
+/// Rates fall from 1e-2 to 3e-4.
+fn rate(step: usize, steps: usize) -> f32 {
+    1e-2 * 0.03f32.powf(step as f32 / steps as f32)
+}
+
+fn fit_ssm(spec: &SsmSpec, seconds: f64, steps: usize) -> Score {
+    let mut p = Params::<f32>::new(0, 1, &[]);
+    let columns = [("node_means", 3), ("node_log_radii", 1), ("node_logits", 1)];
+    let fill = |t: &mut Table<f32>| (0..SOURCES).for_each(|k| t.set(k, k % 3, k as f32));
+    let nodes = p.entry("nodes", Space::Nodes, &columns, SOURCES, fill).unwrap();
+    p.info_mut(nodes).trainable = false;
+    let of = Field::new(spec, nodes, &mut p).unwrap();
+    let second = |tick: usize| tick as f64 * seconds / (spec.ticks - 1) as f64;
+    let ask = |ticks: std::ops::Range<usize>| ticks.map(|t| Time(second(t))).collect::<Vec<_>>();
+    let mut adam = Adam::new(&p);
+    let mut out = Table::new(&POSE_COLUMNS, SOURCES);
+    for step in 0..steps {
+        let times = ask(0..spec.ticks);
+        let (mut cache, mut d_cache, mut d) = (Slot::default(), Slot::default(), Grads::new(&p));
+        of.prepare(&p, &times, &mut cache);
+        for t in &times {
+            of.poses(&p, *t, &cache, &mut out);
+            let mut d_out = out.zeros_like();
+            for k in 0..SOURCES {
+                let target = path(k, t.0);
+                for axis in 0..3 {
+                    let e = out.get(k, axis) - target[axis] as f32;
+                    d_out.set(k, axis, e / (times.len() * SOURCES) as f32);
+                }
+            }
+            of.poses_backward(&p, *t, &cache, &d_out, &mut d_cache, &mut d);
+        }
+        of.finish(&p, &times, &mut cache, &mut d_cache, &mut d);
+        adam.step(&mut p, &d, rate(step, steps));
+    }
+    let mut error = |times: Vec<Time>| {
+        let mut cache = Slot::default();
+        of.prepare(&p, &times, &mut cache);
+        let mut sum = 0.0;
+        for t in &times {
+            of.poses(&p, *t, &cache, &mut out);
+            sum += (0..SOURCES)
+                .map(|k| (0..3).map(|a| (f64::from(out.get(k, a)) - path(k, t.0)[a]).powi(2)).sum::<f64>())
+                .sum::<f64>();
+        }
+        rms(sum, times.len() * SOURCES)
+    };
+    let (within, ahead) = (error(ask(0..spec.ticks)), error(ask(spec.ticks..spec.ticks + AHEAD)));
+    Score { within, ahead, numbers: numbers(&p) }
+}
+
+fn fit_mlp(ticks: usize, seconds: f64, width: usize, steps: usize) -> Score {
+    let mut p = Params::<f32>::new(0, 1, &[]);
+    let inputs = encoded(1, OCTAVES) + SOURCES;
+    let shape = MlpShape { inputs, width, layers: 4, skip: None, outputs: 3 };
+    let mlp = Mlp::new("mlp", shape, 1.0, Rng::new(1, "mlp", 0), &mut p).unwrap();
+    // Which node is told by a one, which is an embedding that is learnt in the first layer.
+    let ask = |range: std::ops::Range<usize>| {
+        let (mut x, mut target) = (Vec::new(), Vec::new());
+        for t in range {
+            let share = t as f64 / (ticks - 1) as f64;
+            let mut gamma = vec![0.0f32; encoded(1, OCTAVES)];
+            encode(&[(std::f64::consts::PI * (share - 0.5)) as f32], OCTAVES, &mut gamma);
+            for k in 0..SOURCES {
+                x.extend_from_slice(&gamma);
+                x.extend((0..SOURCES).map(|j| if j == k { 1.0 } else { 0.0 }));
+                target.extend(path(k, share * seconds).map(|x| x as f32));
+            }
+        }
+        (x, target)
+    };
+    let (x, target) = ask(0..ticks);
+    let mut adam = Adam::new(&p);
+    let mut out = vec![0.0f32; target.len()];
+    for step in 0..steps {
+        mlp.forward(&p, &x, &mut out);
+        let count = (ticks * SOURCES) as f32;
+        let d_out: Vec<f32> = out.iter().zip(&target).map(|(a, b)| (a - b) / count).collect();
+        let mut d = Grads::new(&p);
+        mlp.backward(&p, &x, &d_out, None, &mut d);
+        adam.step(&mut p, &d, rate(step, steps));
+    }
+    let error = |(x, target): (Vec<f32>, Vec<f32>)| {
+        let mut out = vec![0.0f32; target.len()];
+        mlp.forward(&p, &x, &mut out);
+        let sum = out.iter().zip(&target).map(|(a, b)| f64::from(a - b).powi(2)).sum();
+        rms(sum, target.len() / 3)
+    };
+    let (within, ahead) = (error((x, target)), error(ask(ticks..ticks + AHEAD)));
+    Score { within, ahead, numbers: numbers(&p) }
+}
+
+fn causal(ticks: usize, seconds: f64) -> SsmSpec {
+    SsmSpec {
+        ticks,
+        clip: [0.0, seconds],
+        mode: Mode::Causal,
+        octaves: 0,
+        embedding: 16,
+        width: 24,
+        states: 12,
+        blocks: 2,
+        ..SsmSpec::default()
+    }
+}
+
+/// Ten seconds at thirty ticks a second.
+#[test]
+fn node_paths_are_learnt_and_carried_on_better_than_by_a_perceptron() {
+    let steps = 300;
+    let (ssm, mlp) = (fit_ssm(&causal(300, 10.0), 10.0, steps), fit_mlp(300, 10.0, 64, steps));
+    println!("10 s, {steps} steps: ssm {ssm:?}, mlp {mlp:?}");
+    assert!(ssm.within < 0.02, "{ssm:?}");
+    assert!(2.0 * ssm.ahead < mlp.ahead, "{ssm:?} {mlp:?}");
+}
+
+/// A minute at thirty ticks a second: figures for the documentation, too slow to run every time.
+#[test]
+#[ignore = "a study of minutes"]
+fn a_minute_of_node_paths() {
+    for steps in [300, 1000] {
+        let wide = SsmSpec { mode: Mode::Bidirectional, octaves: 6, ..causal(1800, 60.0) };
+        for (name, spec) in [("causal", causal(1800, 60.0)), ("bidirectional with a clock", wide)] {
+            let start = std::time::Instant::now();
+            println!("60 s, {steps} steps, {name}: {:?} in {:.1?}", fit_ssm(&spec, 60.0, steps), start.elapsed());
+        }
+        let start = std::time::Instant::now();
+        println!("60 s, {steps} steps, mlp: {:?} in {:.1?}", fit_mlp(1800, 60.0, 64, steps), start.elapsed());
+    }
+}
