@@ -32,7 +32,7 @@ use splat4d::scene::{LifeKind, Params};
 use std::sync::Arc;
 
 /// What a program may know of the capture and of the user's wishes.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct Plan {
     /// All knobs, resolved.
     pub recipe: Recipe,

@@ -102,7 +102,16 @@ mod tests {
     use splat4d::scene::{GEOMETRY, LIFE, SH};
 
     fn plan(recipe: Recipe) -> Plan {
-        Plan { recipe: recipe.resolve(), extent: 1.0, clip: [0.0, 1.0], fps: 30.0, times: 30, fixed_cameras: 4, moments: Vec::new(), masks: false }
+        Plan {
+            recipe: recipe.resolve(),
+            extent: 1.0,
+            clip: [0.0, 1.0],
+            fps: 30.0,
+            times: 30,
+            fixed_cameras: 4,
+            moments: Vec::new(),
+            masks: false,
+        }
     }
 
     #[test]

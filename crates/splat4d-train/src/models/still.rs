@@ -3,8 +3,6 @@
 use super::{Group, Plan, Program, Rate, Stage, densify_of};
 use crate::densify::Crowding;
 use crate::densify::Relocate;
-use crate::loss::scene::{MeanOpacity, MeanScale};
-use crate::loss::terms::ParamLoss;
 use crate::loss::neighbourhood::{MotionWeights, Neighbourhood};
 use crate::loss::scene::{MeanOpacity, MeanScale, OpacityEntropy};
 use crate::loss::terms::{ParamLoss, ProbeLoss};

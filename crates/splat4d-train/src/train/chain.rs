@@ -18,7 +18,6 @@ use std::time::{Duration, Instant as Clock};
 
 /// Draws splats and takes gradients back; [`Renderer`] is the one in use, tests put the oracle here.
 pub trait Draw<F: Real>: Send {
-    /// Fills `out`. `extra`: further channels, [all splats, C].
     /// Fills `out`; `extra` [all splats, C] holds further channels.
     fn render(
         &mut self,
@@ -123,6 +122,8 @@ pub struct PictureGrads<F = f32> {
     pub normals: Option<usize>,
     /// First further channel of the flow, where it is drawn.
     pub flow: Option<usize>,
+    /// The further channel of [`ImageLoss::share`], where it is drawn.
+    pub share: Option<usize>,
 }
 
 impl<F: Real> PictureGrads<F> {
@@ -133,32 +134,20 @@ impl<F: Real> PictureGrads<F> {
         self.depth.reset(image.depth.channels, h, w);
         self.extra.reset(image.extra.channels, h, w);
         (self.uses_alpha, self.uses_depth, self.uses_extra) = (false, false, false);
-        (self.normals, self.flow) = (None, None);
+        (self.normals, self.flow, self.share) = (None, None, None);
     }
 }
 
 /// Compares a picture with its truth.
 pub trait ImageLoss<F: Real> {
-    /// The loss; overwrites `d_color`, and `d_alpha` if it returns true (alpha takes part).
-    fn eval(
-        &mut self,
-        view: &View<'_, F>,
-        image: &Image<F>,
-        d_color: &mut Planes<F>,
-        d_alpha: &mut Planes<F>,
-    ) -> (f64, bool);
-    /// A column group of one logit a Gaussian whose sigmoid is to be drawn as a further channel, where a layer has it
-    /// (elsewhere it is 0).
-    fn channel(&self) -> Option<&str> {
-        None
-    }
-    /// The loss of that channel as drawn, [1, h, w]; overwrites `d`, of like shape.
-    fn eval_channel(&mut self, _view: &View<'_, F>, _shown: &Planes<F>, _d: &mut Planes<F>) -> f64 {
-        0.0
-    }
     /// What is to be drawn beside colour and alpha.
     fn wanted(&self) -> Wanted {
         Wanted::default()
+    }
+    /// A column group of one logit a Gaussian whose sigmoid is to be drawn as a further channel of views that have a mask
+    /// (0 in layers without that column).
+    fn share(&self) -> Option<&str> {
+        None
     }
     /// The loss; overwrites `d.color`, adds to what else it uses and says so.
     fn eval(&mut self, view: &View<'_, F>, image: &Image<F>, d: &mut PictureGrads<F>) -> f64;
@@ -212,9 +201,6 @@ pub struct Chain<F: Real = f32> {
     spare: Vec<Ask<F>>,
     caches: Vec<(Cache, Cache)>,
     image: Image<F>,
-    d_color: Planes<F>,
-    d_alpha: Planes<F>,
-    d_channel: Planes<F>,
     d_image: PictureGrads<F>,
     d_render: RenderGrads<F>,
     /// Number of `Motion::at` calls of the last step, for tests and reports.
@@ -228,9 +214,6 @@ impl<F: Real> Default for Chain<F> {
             spare: Vec::new(),
             caches: Vec::new(),
             image: Image::default(),
-            d_color: Planes::default(),
-            d_alpha: Planes::default(),
-            d_channel: Planes::default(),
             d_image: PictureGrads::default(),
             d_render: RenderGrads::default(),
             at_calls: 0,
@@ -387,27 +370,19 @@ impl<F: Real> Chain<F> {
         let parts = asked.iter().enumerate().map(|(layer, &i)| scene.layers[layer].part(&self.asks[i].tape)).collect();
         let splats = Splats { parts };
         let clock = Clock::now();
-        let column = loss.channel().filter(|_| view.mask.is_some()).map(str::to_owned);
+        let wanted = loss.wanted();
+        let column = loss.share().filter(|_| view.mask.is_some()).map(str::to_owned);
         let keys: Vec<Option<(Key, usize)>> = match &column {
             Some(column) => scene.layers.iter().map(|l| logit_of(&l.params, column)).collect(),
             None => Vec::new(),
         };
-        let channel = keys.iter().any(Option::is_some).then(|| self.channel(scene, &asked, &keys));
-        draw.render(&splats, view.camera, view.background, channel.as_ref(), &mut self.image);
-        report.timings.render += clock.elapsed();
-        let clock = Clock::now();
-        let (value, alpha) = loss.eval(view, &self.image, &mut self.d_color, &mut self.d_alpha);
-        let value = match &channel {
-            Some(_) => value + loss.eval_channel(view, &self.image.extra, &mut self.d_channel),
-            None => value,
-        };
-        let wanted = loss.wanted();
+        let share = keys.iter().any(Option::is_some).then(|| self.share(scene, &asked, &keys));
         let ways = view.flow.as_ref().filter(|_| wanted.flow).map(|f| self.ways(f.to, &asked));
         let channels = {
             let parts: Vec<&Table<F>> = asked.iter().map(|&i| self.asks[i].tape.out()).collect();
             let later: Vec<Later<'_, F>> = ways.iter().flatten().map(|w| w.later(&self.asks)).collect();
             let flow = view.flow.as_ref().filter(|_| ways.is_some()).map(|f| (f, &later[..]));
-            Channels::new(wanted, view.camera, &parts, flow)
+            Channels::new(wanted, view.camera, &parts, flow, share.as_deref())
         };
         let extra = channels.as_ref().map(|c| &c.table);
         draw.config().depth = wanted.depth;
@@ -418,16 +393,13 @@ impl<F: Real> Chain<F> {
         d_image.begin(&self.image);
         d_image.normals = channels.as_ref().and_then(Channels::normals);
         d_image.flow = channels.as_ref().and_then(Channels::flow);
+        d_image.share = channels.as_ref().and_then(Channels::share);
         let value = loss.eval(view, &self.image, d_image);
         report.loss += value;
         report.view_losses.push(value);
         report.timings.loss += clock.elapsed();
         let clock = Clock::now();
         let grads = ImageGrads {
-            color: &self.d_color,
-            alpha: alpha.then_some(&self.d_alpha),
-            depth: None,
-            extra: channel.as_ref().map(|_| &self.d_channel),
             color: &d_image.color,
             alpha: d_image.uses_alpha.then_some(&d_image.alpha),
             depth: d_image.uses_depth.then_some(&d_image.depth),
@@ -444,7 +416,6 @@ impl<F: Real> Chain<F> {
                 _ => None,
             })
             .collect();
-        let extra = channel.as_ref();
         draw.backward(&splats, view.camera, view.background, extra, &grads, &mut d_sh, &mut self.d_render);
         report.d_cameras.push(self.d_render.camera);
         let mut first = 0;
@@ -459,21 +430,6 @@ impl<F: Real> Chain<F> {
             first += count;
         }
         drop(splats);
-        if let (Some(channel), Some(d_channel)) = (&channel, &self.d_render.extra) {
-            let mut first = 0;
-            for ((&i, key), d) in asked.iter().zip(&keys).zip(d.iter_mut()) {
-                let rows = self.asks[i].tape.rows();
-                let count = self.asks[i].tape.out().rows();
-                if let Some((key, col)) = *key {
-                    let [d] = d.of([key]);
-                    for j in 0..count {
-                        let s = channel.get(first + j, 0);
-                        *d.get_mut(rows.id(j), col) += d_channel.get(first + j, 0) * s * (F::ONE - s);
-                    }
-                }
-                first += count;
-            }
-        }
         for (&i, part) in asked.iter().zip(&mut self.d_render.parts) {
             let ask = &mut self.asks[i];
             if ask.begun {
@@ -492,23 +448,47 @@ impl<F: Real> Chain<F> {
             && self.d_image.uses_extra
         {
             Self::further(&mut self.asks, view, channels, d_table, &asked, ways.as_deref());
+            if let (Some(share), Some(column)) = (&share, channels.share()) {
+                self.share_backward(&asked, &keys, share, (d_table, column), d);
+            }
         }
         report.timings.render_backward += clock.elapsed();
     }
 
-    /// The sigmoid of a logit of every splat, [all splats, 1]; 0 where the layer has none.
-    fn channel(&self, scene: &Scene<F>, asked: &[usize], keys: &[Option<(Key, usize)>]) -> Table<F> {
-        let count = asked.iter().map(|&i| self.asks[i].tape.out().rows()).sum();
-        let mut out = Table::new(&[("channel", 1)], count);
-        let mut first = 0;
+    /// The sigmoid of a logit of every splat; 0 where the layer has none.
+    fn share(&self, scene: &Scene<F>, asked: &[usize], keys: &[Option<(Key, usize)>]) -> Vec<F> {
+        let mut out = Vec::new();
         for ((&i, key), layer) in asked.iter().zip(keys).zip(&scene.layers) {
             let (rows, count) = (self.asks[i].tape.rows(), self.asks[i].tape.out().rows());
+            let value = |j: usize| key.map_or(F::ZERO, |(key, col)| layer.params[key].get(rows.id(j), col).sigmoid());
+            out.extend((0..count).map(value));
+        }
+        out
+    }
+
+    /// The VJP of [`share`](Self::share), from one column of the further channels' gradient.
+    fn share_backward(
+        &self,
+        asked: &[usize],
+        keys: &[Option<(Key, usize)>],
+        share: &[F],
+        (d_table, column): (&Table<F>, usize),
+        d: &mut [Grads<F>],
+    ) {
+        let mut first = 0;
+        for ((&i, key), d) in asked.iter().zip(keys).zip(d.iter_mut()) {
+            let (rows, count) = (self.asks[i].tape.rows(), self.asks[i].tape.out().rows());
             if let Some((key, col)) = *key {
-                (0..count).for_each(|j| out.set(first + j, 0, layer.params[key].get(rows.id(j), col).sigmoid()));
+                let [d] = d.of([key]);
+                for j in 0..count {
+                    let s = share[first + j];
+                    *d.get_mut(rows.id(j), col) += d_table.get(first + j, column) * s * (F::ONE - s);
+                }
             }
             first += count;
         }
-        out
+    }
+
     /// Where the splats of a view are at another time: by layer an ask and its rows.
     fn ways(&self, to: Time, asked: &[usize]) -> Vec<Way> {
         let way = |(layer, &i): (usize, &usize)| {
@@ -613,6 +593,8 @@ impl<F: Real> Ask<F> {
 /// The table and column of a layer's logit of that name.
 fn logit_of<F: Real>(params: &Params<F>, column: &str) -> Option<(Key, usize)> {
     params.keys().find_map(|k| params[k].column(column).map(|(first, _)| (k, first)))
+}
+
 /// An ask, and its row of every splat of a view (`u32::MAX`: none).
 struct Way {
     ask: usize,

@@ -34,25 +34,34 @@ pub(super) struct Channels<F> {
     pub(super) table: Table<F>,
     normals: bool,
     flow: bool,
+    /// Whether the last column is a share that was given.
+    share: bool,
 }
 
 impl<F: Real> Channels<F> {
-    /// Of the splats `parts` (a [rows, 10] table a layer). `None`: nothing is wanted.
+    /// Of the splats `parts` (a [rows, 10] table a layer). `share`: a number a splat that is blended as it is. `None`:
+    /// nothing is wanted.
     pub(super) fn new(
         wanted: Wanted,
         camera: &Camera,
         parts: &[&Table<F>],
         flow: Option<(&FlowTruth<'_, F>, &[Later<'_, F>])>,
+        share: Option<&[F]>,
     ) -> Option<Self> {
         let flow = flow.filter(|_| wanted.flow);
-        let columns: &[(&'static str, usize)] = match (wanted.normals, flow.is_some()) {
-            (false, false) => return None,
-            (true, false) => &[("normal", 3)],
-            (false, true) => &[("flow", 3)],
-            (true, true) => &[("normal", 3), ("flow", 3)],
-        };
+        let mut columns: Vec<(&'static str, usize)> = Vec::new();
+        columns.extend(wanted.normals.then_some(("normal", 3)));
+        columns.extend(flow.is_some().then_some(("flow", 3)));
+        columns.extend(share.is_some().then_some(("share", 1)));
+        if columns.is_empty() {
+            return None;
+        }
         let count = parts.iter().map(|p| p.rows()).sum();
-        let mut table = Table::new(columns, count);
+        let mut table = Table::new(&columns, count);
+        if let Some(share) = share {
+            let column = table.width() - 1;
+            share.iter().enumerate().for_each(|(j, s)| table.set(j, column, *s));
+        }
         let mut first = 0;
         for (layer, part) in parts.iter().enumerate() {
             if wanted.normals {
@@ -74,7 +83,7 @@ impl<F: Real> Channels<F> {
             }
             first += part.rows();
         }
-        Some(Self { table, normals: wanted.normals, flow: flow.is_some() })
+        Some(Self { table, normals: wanted.normals, flow: flow.is_some(), share: share.is_some() })
     }
 
     /// First channel of the normals.
@@ -85,6 +94,11 @@ impl<F: Real> Channels<F> {
     /// First channel of the flow.
     pub(super) fn flow(&self) -> Option<usize> {
         self.flow.then_some(if self.normals { 3 } else { 0 })
+    }
+
+    /// The channel of the share.
+    pub(super) fn share(&self) -> Option<usize> {
+        self.share.then(|| self.table.width() - 1)
     }
 
     /// From the gradient of the table to those of the splats of layer `layer`, whose first row is `first`: added to `d_out`,

@@ -118,6 +118,10 @@ impl ImageLoss<f32> for TrainLoss {
         Wanted { depth: t.depth_tv > 0.0 || t.depth_normal > 0.0, normals: t.depth_normal > 0.0, flow: t.flow > 0.0 }
     }
 
+    fn share(&self) -> Option<&str> {
+        self.segmentation.as_ref().map(|s| s.column.as_str())
+    }
+
     fn eval(&mut self, view: &View<'_, f32>, image: &Image<f32>, d: &mut PictureGrads<f32>) -> f64 {
         let row = self.exposure.as_ref().map(|e| e.params[e.key].read::<6>(view.rig, 0));
         if let Some(row) = row {
@@ -170,23 +174,24 @@ impl ImageLoss<f32> for TrainLoss {
             }
             total += sum * f64::from(scale);
         }
-        total + self.beside(view, image, d)
-    }
-
-    fn channel(&self) -> Option<&str> {
-        self.segmentation.as_ref().map(|s| s.column.as_str())
-    }
-
-    fn eval_channel(&mut self, view: &View<'_, f32>, shown: &Planes<f32>, d: &mut Planes<f32>) -> f64 {
-        let (Some(segmentation), Some(mask)) = (&self.segmentation, view.mask) else { return 0.0 };
-        let value = self.masks.loss_and_grad(shown, mask, view.weight, d);
-        let weight = segmentation.weight as f32;
-        d.data.iter_mut().for_each(|x| *x *= weight);
-        value.total * segmentation.weight
+        total + self.segment(view, image, d) + self.beside(view, image, d)
     }
 }
 
 impl TrainLoss {
+    /// What Gaussians say of the foreground, against the mask.
+    fn segment(&mut self, view: &View<'_, f32>, image: &Image<f32>, d: &mut PictureGrads<f32>) -> f64 {
+        let (Some(segmentation), Some(mask), Some(at)) = (&self.segmentation, view.mask, d.share) else { return 0.0 };
+        d.uses_extra = true;
+        let plane =
+            |values: &[f32]| Planes { channels: 1, height: mask.height, width: mask.width, data: values.to_vec() };
+        let (shown, mut d_shown) = (plane(image.extra.plane(at)), plane(d.extra.plane(at)));
+        let value = self.masks.loss_and_grad(&shown, mask, view.weight, &mut d_shown);
+        let weight = segmentation.weight as f32;
+        d.extra.plane_mut(at).iter_mut().zip(&d_shown.data).for_each(|(d, x)| *d = weight * x);
+        value.total * segmentation.weight
+    }
+
     /// The terms that look at alpha, depth and further channels.
     fn beside(&self, view: &View<'_, f32>, image: &Image<f32>, d: &mut PictureGrads<f32>) -> f64 {
         let terms = &self.terms;

@@ -4,7 +4,7 @@
 use super::run::Bench;
 use crate::densify::Densify;
 use crate::event::Event;
-use crate::models::{Stage, program};
+use crate::models::{Stage, program_of, split};
 use crate::recipe::Recipe;
 use crate::{Error, ErrorKind, Result};
 use std::time::Instant as Clock;

@@ -13,7 +13,7 @@ use crate::{Error, ErrorKind, Result};
 use splat4d::layers::Scene;
 use splat4d::math::Rng;
 use splat4d::scene::life::LOG_WIDTH;
-use splat4d::scene::{Camera, GEOMETRY, Grads, LIFE, Planes, SH, Space, Time};
+use splat4d::scene::{Camera, GEOMETRY, Grads, LIFE, SH, Space, Time};
 use std::borrow::Cow;
 use std::sync::Arc;
 use std::time::{Duration, Instant as Clock};
@@ -590,26 +590,18 @@ impl super::chain::ImageLoss<f32> for Mse<'_> {
         self.inner.wanted()
     }
 
+    fn share(&self) -> Option<&str> {
+        self.inner.share()
+    }
+
     fn eval(
         &mut self,
         view: &View<'_, f32>,
         image: &splat4d::render::Image<f32>,
-        d_color: &mut Planes<f32>,
-        d_alpha: &mut Planes<f32>,
-    ) -> (f64, bool) {
-        let out = self.inner.eval(view, image, d_color, d_alpha);
         d: &mut super::chain::PictureGrads<f32>,
     ) -> f64 {
         let out = self.inner.eval(view, image, d);
         self.sum += self.inner.mse;
         out
-    }
-
-    fn channel(&self) -> Option<&str> {
-        self.inner.channel()
-    }
-
-    fn eval_channel(&mut self, view: &View<'_, f32>, shown: &Planes<f32>, d: &mut Planes<f32>) -> f64 {
-        self.inner.eval_channel(view, shown, d)
     }
 }

@@ -8,7 +8,7 @@ const N: usize = 3000;
 
 fn plan() -> Plan {
     let recipe = crate::recipe::Recipe::default();
-    Plan { recipe, extent: 2.0, clip: [0.0, 1.0], fps: 10.0, times: 11, fixed_cameras: 4 }
+    Plan { recipe, extent: 2.0, clip: [0.0, 1.0], fps: 10.0, times: 11, fixed_cameras: 4, ..Plan::default() }
 }
 
 fn scene(life: LifeKind) -> Scene<f64> {

@@ -5,7 +5,7 @@ fn plan(settings: &[&str]) -> Plan {
     let mut recipe = Recipe { motion: "deform-mlp".into(), iterations: 1000, ..Recipe::default() };
     settings.iter().for_each(|s| recipe.set(s).unwrap());
     let recipe = recipe.resolve();
-    Plan { recipe, extent: 2.0, clip: [0.0, 1.0], fps: 20.0, times: 21, fixed_cameras: 0 }
+    Plan { recipe, extent: 2.0, clip: [0.0, 1.0], fps: 20.0, times: 21, fixed_cameras: 0, ..Plan::default() }
 }
 
 #[test]

@@ -90,7 +90,7 @@ fn it_is_switched_on_in_the_middle_of_a_stage_and_trains() {
 }
 
 fn made_plan(recipe: Recipe) -> Plan {
-    Plan { recipe, extent: 1.0, clip: [0.0, 0.3], fps: 20.0, times: 7, fixed_cameras: 3 }
+    Plan { recipe, extent: 1.0, clip: [0.0, 0.3], fps: 20.0, times: 7, fixed_cameras: 3, ..Plan::default() }
 }
 
 #[test]

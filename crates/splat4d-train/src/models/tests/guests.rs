@@ -2,7 +2,7 @@
 //! none of them leaves a ghost; without it the deformation alone has to hide them.
 
 use super::*;
-use crate::init;
+use crate::init::{self, Seeds};
 use crate::models::split::stages;
 use crate::recipe::Recipe;
 use splat4d::layers::Instant;
@@ -110,10 +110,19 @@ fn errors(motion: &str, life: &str) -> [f64; 2] {
     let party = Arc::new(Party::new());
     let recipe = recipe(motion, life);
     let clip = [0.0, (MOMENTS - 1) as f64 / FPS];
-    let plan = Plan { recipe, extent: 4.4, clip, fps: FPS, times: MOMENTS, fixed_cameras: CAMERAS, moments: Vec::new(), masks: false };
+    let plan = Plan {
+        recipe,
+        extent: 4.4,
+        clip,
+        fps: FPS,
+        times: MOMENTS,
+        fixed_cameras: CAMERAS,
+        moments: Vec::new(),
+        masks: false,
+    };
     let program = program(motion).unwrap();
     // Points on all guests: nobody knows yet who comes and goes.
-    let mut seeds = crate::init::Seeds::default();
+    let mut seeds = Seeds::default();
     let rng = Rng::new(8, "guests", 0);
     for i in 0..300usize {
         let (center, _, _) = GUESTS[i % 3];

@@ -22,7 +22,7 @@ fn plan() -> Plan {
         ..Recipe::default()
     }
     .resolve();
-    Plan { recipe, extent: 4.0, clip: [0.0, 0.2], fps: 10.0, times: 3, fixed_cameras: 4 }
+    Plan { recipe, extent: 4.0, clip: [0.0, 0.2], fps: 10.0, times: 3, fixed_cameras: 4, ..Plan::default() }
 }
 
 fn start(plan: &Plan) -> Trainer<'static> {

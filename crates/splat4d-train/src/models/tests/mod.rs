@@ -3,9 +3,9 @@
 
 mod edits;
 mod filtered;
+mod further;
 mod guests;
 mod hexplane;
-mod further;
 mod layers;
 mod lobes;
 mod nodes;

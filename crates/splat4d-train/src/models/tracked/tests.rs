@@ -130,7 +130,7 @@ fn draw(s: &Scene<f32>, cameras: Vec<Camera>, frames: usize, masks: Option<usize
                 }
                 mask
             });
-            pictures.push(Picture { color, mask, weight: None });
+            pictures.push(Picture { color, mask, ..Picture::default() });
         }
     }
     Drawn { cameras, pictures }

@@ -47,11 +47,16 @@ impl Adam {
 }
 
 /// Root mean square error within the take and in the ticks after it, and numbers that learn.
-#[derive(Debug)]
 struct Score {
     within: f64,
     ahead: f64,
     numbers: usize,
+}
+
+impl std::fmt::Display for Score {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{:.4} within, {:.4} ahead, {} weights", self.within, self.ahead, self.numbers)
+    }
 }
 
 fn numbers(p: &Params<f32>) -> usize {
@@ -173,9 +178,9 @@ fn causal(ticks: usize, seconds: f64) -> SsmSpec {
 fn node_paths_are_learnt_and_carried_on_better_than_by_a_perceptron() {
     let steps = 300;
     let (ssm, mlp) = (fit_ssm(&causal(300, 10.0), 10.0, steps), fit_mlp(300, 10.0, 64, steps));
-    println!("10 s, {steps} steps: ssm {ssm:?}, mlp {mlp:?}");
-    assert!(ssm.within < 0.02, "{ssm:?}");
-    assert!(2.0 * ssm.ahead < mlp.ahead, "{ssm:?} {mlp:?}");
+    println!("10 s, {steps} steps: ssm {ssm}, mlp {mlp}");
+    assert!(ssm.within < 0.02, "{ssm}");
+    assert!(2.0 * ssm.ahead < mlp.ahead, "{ssm}; {mlp}");
 }
 
 /// A minute at thirty ticks a second: figures for the documentation, too slow to run every time.
@@ -186,9 +191,9 @@ fn a_minute_of_node_paths() {
         let wide = SsmSpec { mode: Mode::Bidirectional, octaves: 6, ..causal(1800, 60.0) };
         for (name, spec) in [("causal", causal(1800, 60.0)), ("bidirectional with a clock", wide)] {
             let start = std::time::Instant::now();
-            println!("60 s, {steps} steps, {name}: {:?} in {:.1?}", fit_ssm(&spec, 60.0, steps), start.elapsed());
+            println!("60 s, {steps} steps, {name}: {} in {:.1?}", fit_ssm(&spec, 60.0, steps), start.elapsed());
         }
         let start = std::time::Instant::now();
-        println!("60 s, {steps} steps, mlp: {:?} in {:.1?}", fit_mlp(1800, 60.0, 64, steps), start.elapsed());
+        println!("60 s, {steps} steps, mlp: {} in {:.1?}", fit_mlp(1800, 60.0, 64, steps), start.elapsed());
     }
 }
