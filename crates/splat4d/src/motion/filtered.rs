@@ -228,14 +228,15 @@ impl<F: Real> Filtered<F> {
     /// Fuses all rows of a question at one time into `out`.
     fn fuse(&self, q: &At<'_, F>, [seen, last, before]: [&Table<F>; 3], out: &mut Table<F>) {
         let [trust, _] = self.trust(q.t.0);
+        // Opacities, and observations that stand as they are, stay so to the last bit.
+        out.data_mut().copy_from_slice(seen.data());
         halve([out.view_mut()], &|[mut view]| {
             for j in view.first..view.first + view.rows {
                 let [a, b, c] = [seen, last, before].map(|t| Normal::of_splat(t.read::<9>(j, 0)));
                 let state = self.row([&a, &b, &c], self.gain(q, j), trust).1;
-                // An observation that stands as it is stays so to the last bit.
-                let state = if state.open > 0.0 { state.point.splat() } else { seen.read::<9>(j, 0) };
-                view.write(j, 0, state);
-                view.write(j, SPLAT_OPACITY, [seen.get(j, SPLAT_OPACITY)]);
+                if state.open > 0.0 {
+                    view.write(j, 0, state.point.splat::<F>());
+                }
             }
             0.0
         });

@@ -4,6 +4,7 @@
 use splat4d::format::scene::{read, spec_from_json, spec_to_json, write};
 use splat4d::layers::{ALWAYS, Layer, Scene};
 use splat4d::math::Rng;
+use splat4d::motion::filtered::{Filtered, FilteredSpec, Fusion};
 use splat4d::motion::{At, BUILT_IN, Cache, Motion, Spec, Still, Tape, build};
 use splat4d::scene::{
     Born, Color, GEOMETRY, Grads, Key, LIFE, LifeKind, Params, RowEdit, Rows, SH, Space, SplatGrads, Table, Time,
@@ -325,6 +326,54 @@ pub fn any_threads(spec: &Spec, rows: usize) {
     assert!(run(1) == run(4), "the bits depend on the number of threads");
 }
 
+/// A filter around the model: switched off it changes nothing; switched on, a step along a random direction of all
+/// learnable numbers changes the answers as the gradient says.
+pub fn filtered(spec: &Spec, rows: usize, life: LifeKind, spaces: &[Space], frozen: &[&str]) {
+    let plain = subject(spec, rows, life, 0.1, 1);
+    let around = |fusion: Fusion| {
+        let mut p = plain.p.clone();
+        // The clip begins so early that every question has a past.
+        let own = FilteredSpec::around(spec.clone(), 0.05, -1.0);
+        let own = FilteredSpec { fusion, stop_gradient: false, ..own };
+        let motion = Arc::new(Filtered::around(plain.motion.clone(), own, &mut p).expect("settings are sound"));
+        Subject { p, motion }
+    };
+    let ids: Vec<u32> = (0..rows as u32).filter(|r| r % 3 != 1).collect();
+    let w = Weights(Rng::new(78, "weights", 0));
+    let off = around(Fusion::Off);
+    let (a, b) = (plain.gradient(spaces, &ids, &TIMES, &w), off.gradient(spaces, &ids, &TIMES, &w));
+    assert_eq!(a.1, b.1, "dL/dt");
+    for key in plain.p.keys() {
+        assert!(a.0.table(key).data() == b.0.table(key).data(), "gradient to {}", plain.p.info(key).name);
+    }
+    assert_eq!(plain.value(spaces, &ids, &TIMES, &w), off.value(spaces, &ids, &TIMES, &w));
+    let q = |s| At { p: s, of: Space::Gaussians, rows: Rows::All, t: Time(0.4) };
+    let (mut x, mut y) = (Table::default(), Table::default());
+    plain.motion.velocity(&q(&plain.p), &mut x);
+    off.motion.velocity(&q(&off.p), &mut y);
+    assert_eq!(x, y, "velocities");
+
+    let on = around(Fusion::Geodesic);
+    let (d, _) = on.gradient(spaces, &ids, &TIMES, &w);
+    let rng = Rng::new(79, "direction", 0);
+    let mut slope = 0.0;
+    let mut sides = [H, -H].map(|h| (h, Subject { p: on.p.clone(), motion: on.motion.clone() }));
+    for key in on.p.keys().filter(|&k| on.p.info(k).trainable && k != SH && k != LIFE) {
+        for row in 0..on.p[key].rows() {
+            for col in (0..on.p[key].width()).filter(|&c| !frozen.contains(&on.p.column_name(key, c))) {
+                let x = rng.fork(u64::from(key.0)).normal((row * on.p[key].width() + col) as u64);
+                slope += x * d.table(key).get(row, col);
+                for (h, side) in &mut sides {
+                    *side.p[key].get_mut(row, col) += *h * x;
+                }
+            }
+        }
+    }
+    let [up, down] = sides.map(|(_, s)| s.value(spaces, &ids, &TIMES, &w));
+    let fd = (up - down) / (2.0 * H);
+    assert!((fd - slope).abs() <= 1e-4 * fd.abs() + 1e-5, "through a filter: differences {fd}, gradient {slope}");
+}
+
 /// All of the above for one model.
 pub fn model(spec: &Spec, rows: usize, life: LifeKind, spaces: &[Space], frozen: &[&str]) {
     subject(spec, rows, life, 0.1, 1).gradients(spaces, frozen);
@@ -333,4 +382,7 @@ pub fn model(spec: &Spec, rows: usize, life: LifeKind, spaces: &[Space], frozen:
     subject(spec, rows, life, 0.1, 2).row_edits();
     files(spec, rows, life);
     any_threads(spec, 200);
+    if !matches!(spec, Spec::Filtered(_)) {
+        filtered(spec, rows, life, spaces, frozen);
+    }
 }
