@@ -5,11 +5,11 @@ use super::{Group, Hook, Plan, Program, Rate, Stage, control, still};
 use crate::{Error, Result};
 use splat4d::layers::Layer;
 use splat4d::math::knn::mean_square_distance;
+use splat4d::motion::Spec;
 use splat4d::motion::skin::{NODE_LOG_RADIUS, Skin, farthest_points};
 use splat4d::motion::ssm::{Equivariance, Mode, Output, SsmSpec, refresh};
-use splat4d::motion::Spec;
-use splat4d::scene::params::OPACITY;
 use splat4d::scene::GEOMETRY;
+use splat4d::scene::params::OPACITY;
 
 /// Control nodes driven by a diagonal state-space model.
 #[derive(Clone, Copy, Debug)]
@@ -118,8 +118,7 @@ fn place(layer: &mut Layer) {
     let p = &mut layer.params;
     let Some(skin) = Skin::find(p) else { return };
     let count = skin.count(p);
-    let solid: Vec<u32> =
-        (0..p.len() as u32).filter(|&i| p[GEOMETRY].get(i as usize, OPACITY) > SOLID_LOGIT).collect();
+    let solid: Vec<u32> = (0..p.len() as u32).filter(|&i| p[GEOMETRY].get(i as usize, OPACITY) > SOLID_LOGIT).collect();
     let centers = farthest_points(&p[GEOMETRY].gather(&solid), count);
     // A file and its moments have as many nodes as at the start: where the cloud is too small they stay where they are.
     if centers.len() < count {

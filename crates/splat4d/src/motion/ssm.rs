@@ -139,7 +139,9 @@ impl SsmSpec {
         ];
         for (name, value, low, high) in ranges {
             if !(low..=high).contains(&value) {
-                return broken(format!("a state-space model of {name} = {value} cannot be: {low} to {high} is possible"));
+                return broken(format!(
+                    "a state-space model of {name} = {value} cannot be: {low} to {high} is possible"
+                ));
             }
         }
         let span = self.clip[1] - self.clip[0];

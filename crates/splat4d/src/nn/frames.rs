@@ -251,7 +251,8 @@ mod tests {
 
     #[test]
     fn symmetric_and_degenerate_points_have_frames_too() {
-        for points in [vec![], vec![[1.0; 3]], vec![[0.5; 3]; 40], (0..30).map(|i| [f64::from(i), 0.0, 0.0]).collect()] {
+        for points in [vec![], vec![[1.0; 3]], vec![[0.5; 3]; 40], (0..30).map(|i| [f64::from(i), 0.0, 0.0]).collect()]
+        {
             for f in local_frames(&points) {
                 let pose = crate::math::Se3 { rotation: f, translation: [0.0; 3] };
                 assert!(pose.orthogonality_error() < 1e-9, "{f:?}");

@@ -90,13 +90,7 @@ pub fn linear_backward<F: Real>(
     let of = |x, rows| Matrix::new(x, rows, columns, columns);
     let (x, d_out) = (x.as_flattened(), d_out.as_flattened());
     product(of(d_out, outputs), of(x, inputs).t(), d_w, inputs, true);
-    product(
-        Matrix::new(w, outputs, inputs, inputs).t(),
-        of(d_out, outputs),
-        d_x.as_flattened_mut(),
-        columns,
-        true,
-    );
+    product(Matrix::new(w, outputs, inputs, inputs).t(), of(d_out, outputs), d_x.as_flattened_mut(), columns, true);
     for (row, d) in d_out.chunks_exact(columns).zip(d_bias) {
         *d += sum(row.as_chunks().0);
     }
@@ -304,14 +298,7 @@ pub fn clear<F: Real>(buffer: &mut Vec<Lane<F>>, len: usize) {
 
 impl Block {
     /// Appends a block's weights to the layout; its layers are the net's from number `first` on.
-    pub fn new(
-        name: &str,
-        width: usize,
-        states: usize,
-        ways: &[Direction],
-        first: usize,
-        layout: &mut Layout,
-    ) -> Self {
+    pub fn new(name: &str, width: usize, states: usize, ways: &[Direction], first: usize, layout: &mut Layout) -> Self {
         let norm = ["norm.scale", "norm.shift"].map(|part| layout.push(format!("{name}.{part}"), width));
         let shape = ssm::Shape { channels: width, states, copies: 1 };
         let scans = Scans::new(name, shape, ways, first, layout);
@@ -342,7 +329,8 @@ impl Block {
         clear(&mut tape.seen, inputs * ticks);
         norm(x, self.width, &mut tape.unit, &mut tape.inverse);
         let [scale, shift] = [0, 1].map(|k| &w[self.norm[k].clone()]);
-        for (row, (normed, unit)) in tape.normed.chunks_exact_mut(ticks).zip(tape.unit.chunks_exact(ticks)).enumerate() {
+        for (row, (normed, unit)) in tape.normed.chunks_exact_mut(ticks).zip(tape.unit.chunks_exact(ticks)).enumerate()
+        {
             affine(unit, scale[row], shift[row], normed);
         }
         self.scans.forward(layers, &tape.normed, &mut tape.seen, &mut tape.marks);
@@ -409,3 +397,6 @@ fn affine_backward<F: Real>(x: &[Lane<F>], scale: F, d: &mut [Lane<F>]) -> (F, F
     }
     (total(&by_scale), total(&by_shift))
 }
+
+#[cfg(test)]
+mod tests;

@@ -226,7 +226,8 @@ impl<F: Real> Discrete<F> {
 
     /// Adds another gradient.
     pub fn add(&mut self, other: &Self) {
-        let pairs = [(&mut self.decay, &other.decay), (&mut self.drive, &other.drive), (&mut self.output, &other.output)];
+        let pairs =
+            [(&mut self.decay, &other.decay), (&mut self.drive, &other.drive), (&mut self.output, &other.output)];
         for (to, from) in pairs {
             to.iter_mut().zip(from).for_each(|(a, b)| (0..2).for_each(|k| a[k] += b[k]));
         }
@@ -316,7 +317,10 @@ impl<F: Real> Discrete<F> {
 
     /// The VJP of [`scan`](Self::scan): adds to `d_u` and to the gradient `d`; `d_state` \[rows,N\] is the gradient to what
     /// stood after the last tick and becomes that to what stood before the first.
-    #[expect(clippy::too_many_arguments, reason = "a scan's backward has all that its forward has, and their gradients")]
+    #[expect(
+        clippy::too_many_arguments,
+        reason = "a scan's backward has all that its forward has, and their gradients"
+    )]
     pub fn scan_backward(
         &self,
         way: Direction,

@@ -83,9 +83,7 @@ pub fn of_block<F: Real>(e: Equivariance, table: &Table<F>, block: usize) -> Aro
     let part = |from: usize, to: usize| all[from..to].to_vec();
     match e {
         Equivariance::None => Around { scalars: part(0, 3), vectors: Vec::new(), frame: Vec::new() },
-        Equivariance::Frames => {
-            Around { scalars: part(FRAME, all.len()), vectors: Vec::new(), frame: part(0, FRAME) }
-        }
+        Equivariance::Frames => Around { scalars: part(FRAME, all.len()), vectors: Vec::new(), frame: part(0, FRAME) },
         Equivariance::Vector => Around { scalars: Vec::new(), vectors: part(0, all.len()), frame: Vec::new() },
     }
 }

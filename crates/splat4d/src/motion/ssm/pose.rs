@@ -157,11 +157,8 @@ pub fn compose_backward<F: Real>(rates: &[Lane<F>], share: f64, d_out: &[Lane<F>
             }
             (0..4).for_each(|k| d_q[k] += d_out[(3 + k) * ticks + t][l]);
             let theta: [F; 3] = each(|k| span * rates[(3 + k) * ticks + t][l]);
-            let before = if t == 0 {
-                [F::ONE, F::ZERO, F::ZERO, F::ZERO]
-            } else {
-                each(|k| out[(3 + k) * ticks + t - 1][l])
-            };
+            let before =
+                if t == 0 { [F::ONE, F::ZERO, F::ZERO, F::ZERO] } else { each(|k| out[(3 + k) * ticks + t - 1][l]) };
             // q = a ⊗ b: the gradients are g ⊗ b* to a and a* ⊗ g to b.
             let d_theta = exp_backward(theta, times(conjugate(before), d_q));
             (0..3).for_each(|k| d[(3 + k) * ticks + t][l] = span * d_theta[k]);

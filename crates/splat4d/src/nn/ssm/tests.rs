@@ -42,9 +42,8 @@ fn the_scan_is_the_recursion_and_the_convolution_with_its_response() {
         for (h, k) in (0..3).map(|h| (h, of.response(h, ticks))) {
             for t in 0..ticks {
                 let past = |m: usize| if way == Direction::Forward { t.checked_sub(m) } else { Some(t + m) };
-                let expected: f64 = (0..ticks)
-                    .filter_map(|m| past(m).filter(|&s| s < ticks).map(|s| k[m] * u[h * ticks + s][5]))
-                    .sum();
+                let expected: f64 =
+                    (0..ticks).filter_map(|m| past(m).filter(|&s| s < ticks).map(|s| k[m] * u[h * ticks + s][5])).sum();
                 assert!((y[h * ticks + t][5] - expected).abs() < 1e-10, "{way:?} channel {h} tick {t}");
             }
         }
@@ -131,7 +130,8 @@ fn a_scan_forward_never_sees_the_future() {
 fn the_gradient_equals_differences_everywhere() {
     let ticks = 37;
     let uneven: Vec<f64> = (0..ticks).map(|t| 0.6 + 0.05 * (t % 11) as f64).collect();
-    for (shape, gaps) in [(SHAPE, vec![1.0]), (SHAPE, uneven), (Shape { copies: 3, channels: 2, states: 2 }, vec![1.0])] {
+    for (shape, gaps) in [(SHAPE, vec![1.0]), (SHAPE, uneven), (Shape { copies: 3, channels: 2, states: 2 }, vec![1.0])]
+    {
         for way in [Direction::Forward, Direction::Backward] {
             let w = weights_of(shape, 9);
             let rows = shape.channels * shape.copies;
@@ -212,7 +212,7 @@ fn uneven_ticks_sample_the_same_response_to_first_order() {
 }
 
 #[test]
-fn slow_scans_are_not_needed_again() {
+fn chunks_and_ticks_without_a_gradient_change_nothing() {
     // Marks and chunks give the same gradient as one chunk would: a scan shorter than a chunk, and the same as a part of
     // a longer one whose rest has no gradient.
     let of = Discrete::new(SHAPE, &weights_of(SHAPE, 15), &[1.0]);
