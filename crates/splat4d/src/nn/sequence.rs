@@ -397,3 +397,6 @@ fn affine_backward<F: Real>(x: &[Lane<F>], scale: F, d: &mut [Lane<F>]) -> (F, F
     }
     (total(&by_scale), total(&by_shift))
 }
+
+#[cfg(test)]
+mod tests;

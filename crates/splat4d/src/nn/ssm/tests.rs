@@ -212,7 +212,7 @@ fn uneven_ticks_sample_the_same_response_to_first_order() {
 }
 
 #[test]
-fn slow_scans_are_not_needed_again() {
+fn chunks_and_ticks_without_a_gradient_change_nothing() {
     // Marks and chunks give the same gradient as one chunk would: a scan shorter than a chunk, and the same as a part of
     // a longer one whose rest has no gradient.
     let of = Discrete::new(SHAPE, &weights_of(SHAPE, 15), &[1.0]);
