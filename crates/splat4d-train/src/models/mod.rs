@@ -14,7 +14,6 @@ mod tests;
 pub mod tracked;
 
 use crate::densify::{Densify, Guided, Relocate};
-use crate::init::Seeds;
 use crate::loss::terms::{Codec, ParamLoss, ProbeLoss};
 use crate::prune::Periodic;
 use crate::recipe::Recipe;
@@ -190,8 +189,9 @@ pub trait Program: Send + Sync {
     fn life(&self, plan: &Plan) -> LifeKind {
         LifeKind::from_name(&plan.recipe.life).unwrap_or(LifeKind::Infinite)
     }
-    /// Fills what the model's own tables start with from the points that the Gaussians start at, row by row.
-    fn init(&self, _plan: &Plan, _seeds: &Seeds, _params: &mut Params) {}
+    /// Fills what the model's own tables start with, row by row; `lives`: centre and width (seconds) of the life that
+    /// suits the point at which a Gaussian starts.
+    fn init(&self, _lives: &[(f64, f64)], _params: &mut Params) {}
     /// Says before training, and not after an hour, that the model cannot work on a capture.
     fn check(&self, _plan: &Plan) -> Result<()> {
         Ok(())

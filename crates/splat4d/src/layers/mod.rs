@@ -1,10 +1,12 @@
 //! A scene is a sum of layers: each a set of Gaussians with one motion model and one kind of life, all splatted together.
 
+mod chart;
 mod envelope;
 #[cfg(test)]
 mod tests;
 mod turn;
 
+pub use chart::{to_native4d, to_spacetime};
 pub use turn::rotation_between;
 
 use crate::math::Real;
