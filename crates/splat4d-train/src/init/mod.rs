@@ -144,6 +144,7 @@ pub fn scene(
     let n = seeds.len();
     let mut params = Params::<f32>::new(n, (r.sh_degree + 1) * (r.sh_degree + 1), life.columns());
     let scales = scales(seeds, plan.extent);
+    let lives: Vec<(f64, f64)> = seeds.times.iter().map(|&t| first_life(plan, t)).collect();
     let logit = (r.init_opacity / (1.0 - r.init_opacity)).ln() as f32;
     for i in 0..n {
         let geometry = &mut params[GEOMETRY];
@@ -153,7 +154,7 @@ pub fn scene(
         geometry.set(i, OPACITY, logit);
         params[SH].write(i, 0, seeds.colors[i].map(rgb_to_dc));
         if life != LifeKind::Infinite {
-            let (center, width) = first_life(plan, seeds.times[i]);
+            let (center, width) = lives[i];
             params[LIFE].write(i, 0, [center as f32, width.ln() as f32]);
             if life == LifeKind::Interval {
                 params[LIFE].write(i, 2, [(INITIAL_SOFTNESS_FRAMES / plan.fps).ln() as f32]);
@@ -161,13 +162,13 @@ pub fn scene(
         }
     }
     let motion = build(&program.spec(plan), &mut params)?;
-    program.init(plan, seeds, &mut params);
+    program.init(&lives, &mut params);
     let layer = Layer { name: "scene".into(), params, motion, life, span: ALWAYS, masks: None };
     Ok(Scene { layers: vec![layer], background, clip: plan.clip, fps: plan.fps, up, ..Scene::default() })
 }
 
 /// Centre and width (seconds) of the life that a Gaussian at a point of this time starts with.
-pub fn first_life(plan: &Plan, time: Option<f64>) -> (f64, f64) {
+fn first_life(plan: &Plan, time: Option<f64>) -> (f64, f64) {
     let gap = plan.seconds() / keyframes(plan).len() as f64;
     let short = if plan.recipe.init_life > 0.0 { plan.recipe.init_life * plan.seconds() } else { 2.0 * gap };
     match time {

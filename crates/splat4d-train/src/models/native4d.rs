@@ -4,7 +4,6 @@
 //! the velocity by twice its size in extents a clip, which is the unit of the rotation (`Native4dSpec::speed`).
 
 use super::{Group, Plan, Program, Rate, Stage, still};
-use crate::init::{Seeds, first_life};
 use crate::loss::scene::LivingOpacity;
 use crate::{Error, Result};
 use splat4d::motion::Spec;
@@ -38,10 +37,9 @@ impl Program for Native4dProgram {
         LifeKind::Infinite
     }
 
-    fn init(&self, plan: &Plan, seeds: &Seeds, params: &mut Params) {
+    fn init(&self, lives: &[(f64, f64)], params: &mut Params) {
         let key = params.find(TABLE).expect("the model has made its table");
-        for (row, time) in seeds.times.iter().enumerate() {
-            let (center, width) = first_life(plan, *time);
+        for (row, &(center, width)) in lives.iter().enumerate() {
             params[key].write(row, 0, [center as f32, width.ln() as f32]);
         }
     }

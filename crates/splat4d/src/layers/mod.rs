@@ -1,5 +1,6 @@
 //! A scene is a sum of layers: each a set of Gaussians with one motion model and one kind of life, all splatted together.
 
+mod chart;
 mod envelope;
 mod freeze;
 #[cfg(test)]
@@ -7,6 +8,7 @@ mod tests;
 mod turn;
 
 pub use freeze::{freeze, freeze_rows};
+pub use chart::{to_native4d, to_spacetime};
 pub use turn::rotation_between;
 
 use crate::math::Real;

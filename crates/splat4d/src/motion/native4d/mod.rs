@@ -3,12 +3,12 @@
 //! A Gaussian has a mean (μ, μ_t), scales in space and time and a rotation of four dimensions, a pair of quaternions:
 //! X ↦ l X r̄ (`quats` holds l). Its slice at t is an ordinary Gaussian that moves at constant velocity; its opacity is
 //! o·exp(−½(t − μ_t)²/Σ_tt): the model has a life of its own, which [`Motion::life`] shows. Two quaternions that are equal
-//! turn space alone: it then stands still. See `slice` for the mathematics, [`chart`] for the way to and from `spacetime`.
+//! turn space alone: it then stands still. See `slice` for the mathematics, [`crate::layers::to_spacetime`] for the other chart.
 //!
 //! Colour may change with time: block n of the spherical harmonics counts cos(2πn(μ_t − t)/T) (the same source, §4.2).
 
-pub mod chart;
 mod slice;
+mod sliced;
 #[cfg(test)]
 mod tests;
 
@@ -25,6 +25,7 @@ use std::f64::consts::TAU;
 use std::sync::Arc;
 
 pub use slice::rotation4;
+pub(crate) use sliced::Sliced;
 
 /// Most blocks of spherical harmonics beyond the first (Yang et al. 2024 use n = 0, 1, 2).
 pub const MAX_HARMONICS: usize = 2;
@@ -37,9 +38,9 @@ pub const TABLE: &str = "native4d";
 /// The parts of a split live shorter by this factor: Kerbl et al. 2023 divide scales by 1.6, Yang et al. 2024 all four.
 const SPLIT_SHRINK: f64 = 1.6;
 /// The shortest life that numbers can stand, seconds.
-const SHORTEST: f64 = 1e-6;
+pub(crate) const SHORTEST: f64 = 1e-6;
 /// The longest: a day.
-const LONGEST: f64 = 86_400.0;
+pub(crate) const LONGEST: f64 = 86_400.0;
 /// κ is between the inverse of this and this, so that its square is a number in f32.
 const FASTEST: f64 = 1e9;
 
@@ -202,7 +203,7 @@ impl<F: Real> Motion<F> for Native4d {
             return;
         }
         for (row, _) in edit.born.iter().enumerate().filter(|(_, b)| **b == Born::Split) {
-            let mut g = chart::Sliced::of(&self.spec, p, self.own, row);
+            let mut g = Sliced::of(&self.spec, p, self.own, row);
             let shift = g.width * rng.fork(row as u64).normal(0);
             g.time += shift;
             for k in 0..3 {
@@ -215,7 +216,7 @@ impl<F: Real> Motion<F> for Native4d {
 
     /// The slice grows; velocity and life stay.
     fn resize(&self, p: &mut Params<F>, row: usize, factor: f64) {
-        let mut g = chart::Sliced::of(&self.spec, p, self.own, row);
+        let mut g = Sliced::of(&self.spec, p, self.own, row);
         g.cov = g.cov.map(|x| x * factor * factor);
         g.write(&self.spec, p, self.own, row);
     }

@@ -1,9 +1,9 @@
 //! The list of the method: rotations, slices, charts, colours, safeguards.
 
-use super::chart::{Sliced, determinant, from_spacetime, to_spacetime};
 use super::slice::{Frame, quaternions, rotation4, slice, slice_backward};
+use super::sliced::determinant;
 use super::*;
-use crate::layers::{ALWAYS, Layer, LayerTape};
+use crate::layers::{ALWAYS, Layer, LayerTape, to_native4d, to_spacetime};
 use crate::math::{quat, sym3};
 use crate::motion::{Spacetime, SpacetimeSpec};
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
@@ -201,7 +201,7 @@ fn gradients_of_every_number_also_under_the_floor_and_over_the_ceiling() {
 fn charts_agree_at_thirty_times_both_ways() {
     let native = layer(60, SPEC);
     let kinematic = to_spacetime(&native).unwrap();
-    let back = from_spacetime(&kinematic, SPEC).unwrap();
+    let back = to_native4d(&kinematic, SPEC).unwrap();
     for k in 0..30 {
         let t = -1.5 + 0.1 * f64::from(k);
         let [a, b, c] = [&native, &kinematic, &back].map(|l| splats(l, t));
@@ -216,15 +216,15 @@ fn charts_agree_at_thirty_times_both_ways() {
     }
     // A life of STG's is a shorter one of ours; what has no counterpart is refused.
     let stg = Layer { life: LifeKind::GaussOne, ..kinematic.clone() };
-    let same = from_spacetime(&stg, SPEC).unwrap();
+    let same = to_native4d(&stg, SPEC).unwrap();
     let (a, b) = (splats(&stg, 0.3), splats(&same, 0.3));
     assert!((0..60).all(|row| (a.get(row, SPLAT_OPACITY) - b.get(row, SPLAT_OPACITY)).abs() < 1e-10));
-    assert!(from_spacetime(&Layer { life: LifeKind::Interval, ..kinematic.clone() }, SPEC).is_err());
+    assert!(to_native4d(&Layer { life: LifeKind::Interval, ..kinematic.clone() }, SPEC).is_err());
     let mut curved = kinematic.params.clone();
     let mut p = Params::<f64>::new(60, 1, LifeKind::GaussHalf.columns());
     let motion = Spacetime::new(SpacetimeSpec { order: 2, ..SpacetimeSpec::default() }, &mut p).unwrap();
     curved[LIFE] = p[LIFE].clone();
-    assert!(from_spacetime(&Layer { params: p, motion: Arc::new(motion), ..kinematic }, SPEC).is_err());
+    assert!(to_native4d(&Layer { params: p, motion: Arc::new(motion), ..kinematic }, SPEC).is_err());
     assert!(to_spacetime(&layer(3, Native4dSpec { harmonics: 1, ..SPEC })).is_err());
 }
 
@@ -242,7 +242,7 @@ fn charts_agree_in_single_precision_for_thin_long_lived_fast_gaussians() {
     }
     let life = LifeKind::GaussHalf;
     let a = Layer { name: "a".into(), params: p, motion: Arc::new(motion), life, span: ALWAYS, masks: None };
-    let b = from_spacetime(&a, Native4dSpec { max_life: 100.0, ..SPEC }).unwrap();
+    let b = to_native4d(&a, Native4dSpec { max_life: 100.0, ..SPEC }).unwrap();
     for t in [-1.0, 0.0, 0.7, 2.0] {
         let (x, y) = (splats(&a, t), splats(&b, t));
         for row in 0..40 {
