@@ -193,6 +193,8 @@ recipe! {
     prune_ratio: f64 = 0.3,
     /// Training views that each such pruning looks at; never fewer than one at every moment of the capture.
     prune_views: usize = 60,
+    /// What such a pruning goes by: share, change, both, opacity, light-gaussian, pup or speedy.
+    prune_score: String = "change".into(),
     // Merging, splitting into layers.
 
     /// mcmc: growth a densification, up to the cap.
@@ -350,6 +352,7 @@ impl Recipe {
                 return bad(knob, format!("`{value}`"), &format!("one of {}{near}", known.join(", ")));
             }
         }
+        self.prune_score.parse::<crate::prune::Spatial>()?;
         Ok(())
     }
 

@@ -174,9 +174,9 @@ pub(super) struct Exponent<F, const N: usize> {
     /// b dx + c dy of the strip in hand.
     q: [F; N],
     /// dy of the strip in hand, once a lane: adding is cheaper than broadcasting.
-    dy: [F; N],
+    pub dy: [F; N],
     /// What q and dy fall by from strip to strip.
-    steps: [F; 2],
+    pub steps: [F; 2],
     /// The exponent's ceiling: log₂ of min(o, α_max). Rounding may take a needle's above its top.
     pub top: F,
 }

@@ -7,8 +7,8 @@
 
 use super::bin::{BIN, Footprint, id};
 use super::blend::{
-    BATCH, Exponent, Limits, PAIR_OF_ROWS, ROW, Tile, Visit, alpha, begin, columns, highest, offsets, pass, strip_range,
-    strips, sum_lanes, walk,
+    BATCH, Exponent, Limits, PAIR_OF_ROWS, ROW, Tile, Visit, alpha, begin, columns, highest, offsets, pass,
+    strip_range, strips, sum_lanes, walk,
 };
 use super::gather::{Record, SIDE, TILE, TILES};
 use super::parallel::{Ragged, for_each_group};
@@ -165,9 +165,7 @@ fn fisher<F: Real>(
     let mut at = 0;
     for i in 0..6 {
         for j in i..6 {
-            out[at] = (0..5)
-                .map(|p| (0..5).map(|q| jacobian[p][i] * inner[p][q] * jacobian[q][j]).sum::<f64>())
-                .sum();
+            out[at] = (0..5).map(|p| (0..5).map(|q| jacobian[p][i] * inner[p][q] * jacobian[q][j]).sum::<f64>()).sum();
             at += 1;
         }
     }
