@@ -439,6 +439,8 @@ recipe! {
     prune_ratio: f64 = 0.3,
     /// Training views that each such pruning looks at; never fewer than one at every moment of the capture.
     prune_views: usize = 60,
+    /// What such a pruning goes by: share, change, both, opacity, light-gaussian, pup or speedy.
+    prune_score: String = "change".into(),
     // Merging, splitting into layers.
     /// What becomes of two Gaussians in one place: none (both stay), merge (one with the moments of both), prune (the
     /// fainter one goes).
@@ -650,6 +652,7 @@ impl Recipe {
                 return bad(knob, format!("`{value}`"), &format!("one of {}{near}", known.join(", ")));
             }
         }
+        self.prune_score.parse::<crate::prune::Spatial>()?;
         Ok(())
     }
 

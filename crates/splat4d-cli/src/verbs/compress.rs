@@ -34,8 +34,8 @@ pub(crate) struct Args {
     #[arg(short, long, value_name = "DIR")]
     output: Option<PathBuf>,
     /// Continue this compression exactly where its newest checkpoint is
-    #[arg(long, value_name = "DIR", conflicts_with_all = ["run", "output", "level", "prune", "max_mb", "fine_tune",
-        "set", "force", "guard", "unpruned"])]
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["run", "output", "level", "prune", "score", "max_mb",
+        "fine_tune", "set", "force", "guard", "unpruned"])]
     resume: Option<PathBuf>,
     /// Replace the run in the -o folder
     #[arg(long)]
@@ -46,6 +46,9 @@ pub(crate) struct Args {
     /// Share of the Gaussians to remove, 0 to 0.98
     #[arg(long, value_name = "SHARE", conflicts_with = "max_mb", value_parser = share)]
     prune: Option<f64>,
+    /// What Gaussians are ranked by: change, share, both, opacity, light-gaussian, pup or speedy [default: change]
+    #[arg(long, value_name = "NAME")]
+    score: Option<String>,
     /// Coarsen and prune until the file has at most so many megabytes (10⁶ bytes)
     #[arg(long, value_name = "MB", value_parser = positive)]
     max_mb: Option<f64>,
@@ -119,6 +122,9 @@ fn settings(args: &Args, iterations: usize) -> Result<Compression> {
         let all = settings.steps();
         settings.fine_tune = (settings.fine_tune * steps).checked_div(all).unwrap_or(0);
         settings.quantise = steps - settings.fine_tune;
+    }
+    if let Some(name) = &args.score {
+        settings.set(&format!("spatial={name}")).map_err(|e| e.at("--score"))?;
     }
     for assignment in &args.set {
         settings.set(assignment).map_err(|e| e.at("--set"))?;

@@ -37,7 +37,7 @@ settings! {
     prune: f64 = 0.0,
     /// In so many rounds, each followed by its part of the fine-tuning.
     rounds: usize = 1,
-    /// What of a view counts: share (what it is of the picture), change (what its removal would do) or both.
+    /// What of a view counts: share of the picture, change by removal, both, opacity, light-gaussian, pup or speedy.
     spatial: String = "change".into(),
     /// How lives count in the score: instant-abs, literal-signed-clamped, first-derivative, width, active-fraction, none.
     temporal: String = "instant-abs".into(),

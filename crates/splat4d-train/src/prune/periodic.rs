@@ -16,12 +16,16 @@ pub struct Periodic {
     pub ratio: f64,
     /// About the most views looked at each time; never fewer than one at every moment of the capture.
     pub views: usize,
+    /// What of a view counts.
+    pub spatial: Spatial,
 }
 
 impl Periodic {
     /// As the recipe has it; `None`: never.
     pub fn of(r: &Recipe) -> Option<Self> {
-        let some = Self { interval: r.prune_interval, ratio: r.prune_ratio, views: r.prune_views };
+        // A recipe that was checked has a name that is one.
+        let spatial = r.prune_score.parse().unwrap_or(Spatial::Change);
+        let some = Self { interval: r.prune_interval, ratio: r.prune_ratio, views: r.prune_views, spatial };
         (r.prune_interval > 0).then_some(some)
     }
 
@@ -35,8 +39,7 @@ impl Periodic {
     pub fn scores(&self, scene: &Scene<f32>, frames: &dyn Frames, antialias: Antialias) -> Result<Scores> {
         let every = frames.len().div_ceil(self.views.max(1)).max(1);
         // As `compress` does by default; docs/benchmarks.md has what it won.
-        let config =
-            ScoreConfig { spatial: Spatial::Change, volume: false, every, antialias, ..ScoreConfig::default() };
+        let config = ScoreConfig { spatial: self.spatial, volume: false, every, antialias, ..ScoreConfig::default() };
         score(scene, frames, &config, &mut |_, _| {})
     }
 }

@@ -126,7 +126,20 @@ pub fn score(
         }
     }
 
-    let gamma = if config.volume { volumes(scene, &lives) } else { scene.layers.iter().map(|_| Vec::new()).collect() };
+    // A score of all views together takes the place of the sum; how its instants are served is as the views felt it.
+    for layer in 0..scene.layers.len() {
+        let Some(whole) = weighing.whole(layer) else { continue };
+        for ((spatial, product), whole) in spatial[layer].iter_mut().zip(&mut product[layer]).zip(whole) {
+            *product *= if *spatial > 0.0 { whole / *spatial } else { 0.0 };
+            *spatial = whole;
+        }
+    }
+
+    let gamma = if config.volume || config.spatial == Spatial::LightGaussian {
+        volumes(scene, &lives)
+    } else {
+        scene.layers.iter().map(|_| Vec::new()).collect()
+    };
     let temporal = |layer: usize, row: usize, instants: f64| {
         let gamma: f64 = gamma[layer].get(row).copied().unwrap_or(1.0);
         gamma * lives[layer].whole(config.temporal, row, &times) * instants

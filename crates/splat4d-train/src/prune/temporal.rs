@@ -46,6 +46,16 @@ pub enum Spatial {
     Change,
     /// The geometric mean of both in each view: neither what covers nor what differs from what lies behind goes first.
     Both,
+    /// Opacity at every instant at which a view shows it (3DGS).
+    Opacity,
+    /// The share, times min(V/V₉₀, 1)^0.1 of the volume: the global significance of LightGaussian (Fan et al. 2024).
+    LightGaussian,
+    /// The sixth root of the determinant of the 6x6 Fisher block of mean and scale over all views: the rank of its
+    /// logarithm, by which PUP 3D-GS (Hanson et al. 2025) prunes in rounds. What one view alone shows has no full block and
+    /// goes first.
+    Pup,
+    /// Σ over pixels and channels of the squared gradient to the bare bell (Speedy-Splat, Hanson et al. 2025).
+    Speedy,
 }
 
 /// How spatial and temporal score become one.
@@ -98,7 +108,11 @@ names!(
     InstantAbs "instant-abs", LiteralSignedClamped "literal-signed-clamped", FirstDerivative "first-derivative",
     Width "width", ActiveFraction "active-fraction", None "none"
 );
-names!(Spatial, "spatial score", Share "share", Change "change", Both "both");
+names!(
+    Spatial, "spatial score",
+    Share "share", Change "change", Both "both", Opacity "opacity", LightGaussian "light-gaussian", Pup "pup",
+    Speedy "speedy"
+);
 names!(Combine, "way to combine scores", Product "product", Sum "sum", TemporalAlone "temporal-alone");
 
 /// The lives of a layer's Gaussians on a clock of its own unit.

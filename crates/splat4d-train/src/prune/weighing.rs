@@ -2,8 +2,12 @@
 
 use super::temporal::Spatial;
 use splat4d::layers::{Instant, Scene};
-use splat4d::render::{Antialias, RenderConfig, Renderer};
+use splat4d::render::{Antialias, RenderConfig, Renderer, Sensitivity};
+use splat4d::scene::splats::SPLAT_OPACITY;
 use splat4d::scene::{Camera, Time};
+
+/// Pivots of a Fisher block, over its own diagonal, are not told from 0 below this: sums are made in f32.
+const LEAST_PIVOT: f64 = 1e-6;
 
 /// A number by layer and row, summed over the views at one time; all memory is reused.
 pub(super) struct Weighing {
@@ -14,6 +18,9 @@ pub(super) struct Weighing {
     changes: Vec<f32>,
     layers: Vec<Vec<f64>>,
     pixels: Vec<Vec<f64>>,
+    sensitivities: Vec<Sensitivity>,
+    /// Fisher blocks by layer and row, over all times.
+    blocks: Vec<Vec<[f64; 21]>>,
 }
 
 impl Weighing {
@@ -27,12 +34,17 @@ impl Weighing {
             changes: Vec::new(),
             layers: Vec::new(),
             pixels: Vec::new(),
+            sensitivities: Vec::new(),
+            blocks: Vec::new(),
         }
     }
 
     /// On to another time; nothing has been seen at it.
     pub(super) fn at(&mut self, scene: &Scene<f32>, t: Time) {
         scene.at(t, &mut self.instant);
+        if self.spatial == Spatial::Pup && self.blocks.is_empty() {
+            self.blocks = scene.layers.iter().map(|l| vec![[0.0; 21]; l.params.len()]).collect();
+        }
         for tables in [&mut self.layers, &mut self.pixels] {
             tables.resize_with(scene.layers.len(), Vec::new);
             for (layer, sums) in scene.layers.iter().zip(tables) {
@@ -46,7 +58,14 @@ impl Weighing {
     pub(super) fn add(&mut self, scene: &Scene<f32>, camera: &Camera) {
         let splats = scene.splats(&self.instant);
         match self.spatial {
-            Spatial::Share => self.renderer.weigh(&splats, camera, &mut self.shares),
+            Spatial::Share | Spatial::LightGaussian | Spatial::Opacity => {
+                self.renderer.weigh(&splats, camera, &mut self.shares);
+            }
+            Spatial::Pup | Spatial::Speedy => {
+                self.renderer.sensitivities(&splats, camera, scene.background, &mut self.sensitivities);
+                self.shares.clear();
+                self.shares.extend(self.sensitivities.iter().map(|s| s.squared as f32));
+            }
             Spatial::Change => self.renderer.removals(&splats, camera, scene.background, &mut self.shares),
             Spatial::Both => {
                 self.renderer.removals(&splats, camera, scene.background, &mut self.changes);
@@ -58,17 +77,31 @@ impl Weighing {
         }
         let size = [camera.width, camera.height];
         let mut first = 0;
-        for ((tape, sums), pixels) in self.instant.tapes.iter().zip(&mut self.layers).zip(&mut self.pixels) {
+        let tapes = self.instant.tapes.iter().zip(&mut self.layers).zip(&mut self.pixels);
+        for (layer, ((tape, sums), pixels)) in tapes.enumerate() {
             let (rows, count) = (tape.rows(), tape.out().rows());
             let projected = &self.renderer.projected()[first..first + count];
             let seen =
                 self.shares[first..first + count].iter().zip(projected).enumerate().filter(|(_, (s, _))| **s > 0.0);
             for (j, (&share, projected)) in seen {
-                sums[rows.id(j)] += f64::from(share);
+                match self.spatial {
+                    // How opaque it is does not depend on how many look.
+                    Spatial::Opacity => sums[rows.id(j)] = f64::from(tape.out().get(j, SPLAT_OPACITY)),
+                    _ => sums[rows.id(j)] += f64::from(share),
+                }
+                if let Some(blocks) = self.blocks.get_mut(layer) {
+                    let fisher = &self.sensitivities[first + j].fisher;
+                    blocks[rows.id(j)].iter_mut().zip(fisher).for_each(|(sum, x)| *sum += x);
+                }
                 pixels[rows.id(j)] += projected.pixels(size);
             }
             first += count;
         }
+    }
+
+    /// Where the score is one of all views together: what every row of a layer is worth.
+    pub(super) fn whole(&self, layer: usize) -> Option<Vec<f64>> {
+        Some(self.blocks.get(layer)?.iter().map(|b| root_of_determinant(b)).collect())
     }
 
     /// Pixels that every row of a layer touches, in the views that show it.
@@ -80,4 +113,40 @@ impl Weighing {
     pub(super) fn layer(&self, layer: usize) -> &[f64] {
         &self.layers[layer]
     }
+}
+
+/// det^(1/6) of a symmetric 6x6 block (upper triangle, row by row); 0 where it is not of full rank.
+pub(super) fn root_of_determinant(upper: &[f64; 21]) -> f64 {
+    let mut m = [[0.0; 6]; 6];
+    let mut at = 0;
+    for i in 0..6 {
+        for j in i..6 {
+            (m[i][j], m[j][i]) = (upper[at], upper[at]);
+            at += 1;
+        }
+    }
+    let diagonal: [f64; 6] = std::array::from_fn(|i| m[i][i]);
+    if !diagonal.iter().all(|d| *d > 0.0 && d.is_finite()) {
+        return 0.0;
+    }
+    // Over its own diagonal the block knows no unit, and its pivots lie between 0 and 1.
+    for (i, row) in m.iter_mut().enumerate() {
+        for (j, x) in row.iter_mut().enumerate() {
+            *x /= diagonal[i].sqrt() * diagonal[j].sqrt();
+        }
+    }
+    let mut log = diagonal.iter().map(|d| d.ln()).sum::<f64>();
+    for k in 0..6 {
+        let pivot = m[k][k];
+        if pivot.is_nan() || pivot <= LEAST_PIVOT {
+            return 0.0;
+        }
+        log += pivot.ln();
+        for i in k + 1..6 {
+            for j in k + 1..6 {
+                m[i][j] -= m[i][k] * m[k][j] / pivot;
+            }
+        }
+    }
+    (log / 6.0).exp()
 }

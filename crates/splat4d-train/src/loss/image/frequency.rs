@@ -76,7 +76,11 @@ impl<F: Real> Frequency<F> {
                             let t = [(im[p] + im[q]) * half, (re[q] - re[p]) * half];
                             let (cost, g) = discrepancy(x, t);
                             sum += cost.f64();
-                            let g = g.map(|g| g * F::of(scale * unit));
+                            let mut g = g.map(|g| g * F::of(scale * unit));
+                            if p == q {
+                                // Its own mirror is real: an imaginary slope would end up in the other channel.
+                                g[1] = F::ZERO;
+                            }
                             // i·(a + ib) = −b + ia for the second channel.
                             if part == 0 {
                                 g_re[v] += g[0];

@@ -4,7 +4,7 @@ use super::nodes::Skinned;
 use super::*;
 use crate::densify::{self, Stats};
 use crate::optim::Moments;
-use crate::prune::{Keys, MaskConfig, Periodic, ScoreConfig, key_masks, prune, score};
+use crate::prune::{Keys, MaskConfig, Periodic, ScoreConfig, Spatial, key_masks, prune, score};
 
 /// A deformation model whose nodes move between its two pages, and whose first ten Gaussians live for a moment.
 fn deformed(rows: usize) -> Scene<f32> {
@@ -54,7 +54,7 @@ fn a_deformation_model_is_scored_pruned_masked_and_trained_on() {
 
     let mut stage = Stage::new("tune", 40);
     stage.groups = groups(&ORDINARY);
-    stage.prune = Some(Periodic { interval: 20, ratio: 0.2, views: 12 });
+    stage.prune = Some(Periodic { interval: 20, ratio: 0.2, views: 12, spatial: Spatial::Change });
     let mut t = trainer(scene, vec![stage], 60);
     let losses = finish_stage(&mut t);
     assert_falls(&losses, 0.8, "with half and then fewer of its Gaussians");

@@ -142,7 +142,7 @@ fn rows_go_while_a_scene_is_trained_and_the_run_repeats() {
     let run = |resumed: bool| {
         let fresh = || {
             let mut t = trainer(start(), frames.clone());
-            t.stages[0].prune = Some(Periodic { interval: 10, ratio: 0.3, views: 9 });
+            t.stages[0].prune = Some(Periodic { interval: 10, ratio: 0.3, views: 9, spatial: Spatial::Change });
             t.stages[0].iterations = 34;
             t
         };
