@@ -272,7 +272,7 @@ recipe! {
     control_mask: bool = false,
     /// control: what drives the nodes: spline, linear, slerp, low-rank or network.
     control_trajectory: String = "spline".into(),
-    /// control: keys of a trajectory in time; 0: about every 4 frames.
+    /// control: keys of a trajectory in time; 0: about every 12 frames.
     control_keys: usize = 0,
     /// control: motions that nodes of a low-rank trajectory share.
     control_bases: usize = 16,

@@ -3,6 +3,7 @@
 //! A model has no hidden state. Sequential ones (state space, filters) do their scan in [`Motion::prepare`], add to the
 //! scan's gradient in [`Motion::backward`], and run the reverse scan in [`Motion::finish`]; pointwise ones leave those empty.
 
+pub mod arap;
 pub mod control;
 pub mod deform;
 pub mod filtered;

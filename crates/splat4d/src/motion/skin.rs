@@ -16,6 +16,7 @@
 //! [`Skinned::bind`] now and then; among them the weights choose anew at every step, continuously.
 
 mod blend;
+mod offset;
 #[cfg(test)]
 mod tests;
 mod weights;
@@ -232,7 +233,7 @@ fn start_nodes<F: Real>(t: &mut Table<F>, centers: &[[F; 3]], rng: Rng) {
 pub struct Skinned<F: Real> {
     /// Which Gaussian follows which nodes.
     pub skin: Skin,
-    trajectory: Box<dyn Trajectory<F>>,
+    trajectory: Arc<dyn Trajectory<F>>,
     spec: Spec,
 }
 
@@ -268,7 +269,16 @@ struct Pending<F> {
 impl<F: Real> Skinned<F> {
     /// `spec`: what files store of it. The trajectory must give as many poses as the skin has nodes.
     pub fn new(skin: Skin, trajectory: Box<dyn Trajectory<F>>, spec: Spec) -> Self {
-        Self { skin, trajectory, spec }
+        Self { skin, trajectory: trajectory.into(), spec }
+    }
+
+    /// The same motion with nodes displaced at all times, for editing: `offsets` [nodes, 7] are shifts to be added and
+    /// rotations to be done after the nodes' own, as [`arap`](super::arap) gives them. Files cannot hold it.
+    ///
+    /// Panics: not as many offsets as nodes, when it is asked.
+    pub fn with_offsets(&self, offsets: Table<F>) -> Self {
+        let trajectory = Arc::new(offset::Offset { of: self.trajectory.clone(), by: offsets });
+        Self { skin: self.skin, trajectory, spec: Spec::Custom(format!("{} with displaced nodes", self.spec.name())) }
     }
 
     /// The same, as a layer holds it.

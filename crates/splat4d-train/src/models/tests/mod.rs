@@ -1,6 +1,7 @@
 //! The contract of stages, layers and motion models, proven by made-up models: each is trained a few steps by the
 //! ordinary trainer and checked against f64 finite differences through the whole chain, the oracle as the forward.
 
+mod control;
 mod edits;
 mod filtered;
 mod further;

@@ -99,7 +99,7 @@ fn rows<F: Real, const N: usize>(f: &[F; N]) -> [[F; 3]; 3] {
 
 /// a ⊗ b
 #[inline(always)]
-fn product<F: Real>(a: [F; 4], b: [F; 4]) -> [F; 4] {
+pub(super) fn product<F: Real>(a: [F; 4], b: [F; 4]) -> [F; 4] {
     [
         a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
         a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],

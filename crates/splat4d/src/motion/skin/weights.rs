@@ -18,6 +18,8 @@ use rayon::prelude::*;
 
 /// ε: least weight of a node that counts, relative to the strongest.
 const FLOOR: f64 = 1e-6;
+/// Energy of what is infinitely far: finite also in f32, so that differences are.
+const FAR: f64 = 1e30;
 /// Coordinates of the metric at most: position and hyper coordinates.
 const MAX_COORDINATES: usize = 3 + MAX_HYPER;
 /// Numbers of a node before its coordinates: 1/(2r²), −ln sigmoid(w).
@@ -76,7 +78,7 @@ impl<F: Real> NodeRows<F> {
     fn energy(&self, node: usize, x: &[F]) -> F {
         let head = self.of(node);
         let e = self.square(node, x) * head[0] + head[1];
-        if e.is_finite() { e } else { F::of(f64::MAX) }
+        if e < F::of(FAR) { e } else { F::of(FAR) }
     }
 }
 
@@ -127,7 +129,7 @@ impl<F: Real> Weights<F> {
             let mut x = [F::ZERO; MAX_COORDINATES];
             for (i, (ids, values)) in ids.chunks_exact_mut(n).zip(values.chunks_exact_mut(k)).enumerate() {
                 let id = task * run + i;
-                let mut best = [(F::of(f64::MAX), u32::MAX); MAX_NEIGHBOURS + 1];
+                let mut best = [(F::of(FAR), u32::MAX); MAX_NEIGHBOURS + 1];
                 strongest(skin, p, &nodes, id, coordinates(skin, p, id, &mut x), &mut best[..n]);
                 let v = shares(&best[..n], k);
                 let sum: F = v[..k].iter().copied().sum();
@@ -162,7 +164,7 @@ impl<F: Real> Weights<F> {
                     }
                     let x = coordinates(skin, p, id, &mut x);
                     let ids = &self.nodes[id * n..(id + 1) * n];
-                    let mut best = [(F::of(f64::MAX), u32::MAX); MAX_NEIGHBOURS + 1];
+                    let mut best = [(F::of(FAR), u32::MAX); MAX_NEIGHBOURS + 1];
                     ids.iter().zip(&mut best).for_each(|(&i, b)| *b = (nodes.energy(i as usize, x), i));
                     let d_e = energies_backward(&best[..n], k, d_a);
                     let mut d_x = [F::ZERO; MAX_COORDINATES];
@@ -280,9 +282,9 @@ pub(super) fn nearest<F: Real>(skin: &Skin, p: &Params<F>, list: &mut Table<F>) 
     let views: Vec<_> = list.chunks_mut(TASK_BLOCKS).collect();
     views.into_par_iter().for_each(|mut view| {
         let mut x = [F::ZERO; MAX_COORDINATES];
-        let mut best = vec![(F::of(f64::MAX), u32::MAX); width];
+        let mut best = vec![(F::of(FAR), u32::MAX); width];
         for id in view.first..view.first + view.rows {
-            best.fill((F::of(f64::MAX), u32::MAX));
+            best.fill((F::of(FAR), u32::MAX));
             let x = coordinates(skin, p, id, &mut x);
             dispatch(simd, Search { nodes: &nodes, x, best: &mut best });
             let first = best[0].1;
