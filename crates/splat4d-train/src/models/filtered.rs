@@ -7,7 +7,6 @@
 
 use super::{Group, Hook, Plan, Program, Stage};
 use crate::Result;
-use crate::init::Seeds;
 use crate::loss::transport::{Metric, Transport, TransportSettings};
 use crate::recipe::Recipe;
 use splat4d::layers::{Layer, Scene};
@@ -77,8 +76,8 @@ impl Program for FilteredProgram {
         self.inner.first(plan)
     }
 
-    fn init(&self, plan: &Plan, seeds: &Seeds, params: &mut Params) {
-        self.inner.init(plan, seeds, params);
+    fn init(&self, lives: &[(f64, f64)], params: &mut Params) {
+        self.inner.init(lives, params);
     }
 
     fn stages(&self, plan: &Plan) -> Vec<Stage> {

@@ -17,8 +17,6 @@ mod tests;
 pub mod tracked;
 
 use crate::densify::{Crowding, Densify, Guided, Relocate, Stats};
-use crate::init::Seeds;
-use crate::densify::{Densify, Guided, Relocate};
 use crate::loss::terms::{Codec, ParamLoss, ProbeLoss};
 use crate::optim::Moments;
 use crate::prune::Periodic;
@@ -260,8 +258,6 @@ pub trait Program: Send + Sync {
     fn first(&self, plan: &Plan) -> Plan {
         plan.clone()
     }
-    /// Fills what the model's own tables start with from the points that the Gaussians start at, row by row.
-    fn init(&self, _plan: &Plan, _seeds: &Seeds, _params: &mut Params) {}
     /// Fills what the model's own tables start with, row by row; `lives`: centre and width (seconds) of the life that
     /// suits the point at which a Gaussian starts.
     fn init(&self, _lives: &[(f64, f64)], _params: &mut Params) {}

@@ -7,8 +7,8 @@ mod freeze;
 mod tests;
 mod turn;
 
-pub use freeze::{freeze, freeze_rows};
 pub use chart::{to_native4d, to_spacetime};
+pub use freeze::{freeze, freeze_rows};
 pub use turn::rotation_between;
 
 use crate::math::Real;

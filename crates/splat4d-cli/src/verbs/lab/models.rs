@@ -83,7 +83,8 @@ struct Cell {
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let models = models(&args.only)?;
     // A page that cannot take the table is found out before an hour of training.
-    let page = args.into.as_ref().map(|p| files::read_text(p).and_then(|t| parted(&t).map(|_| t))).transpose()?;
+    let page = args.into.as_ref().map(|p| files::read_text(p)).transpose()?;
+    page.as_deref().map(parted).transpose()?;
     if !(args.minutes > 0.0 && args.minutes.is_finite()) {
         let what = format!("--minutes cannot be {}", args.minutes);
         return Err(Error::input(what).remedy("Give a positive number, for instance 3").into());

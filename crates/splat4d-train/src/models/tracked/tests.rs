@@ -117,23 +117,10 @@ fn draw(s: &Scene<f32>, cameras: Vec<Camera>, frames: usize, masks: Option<usize
     for k in 0..frames {
         s.at(Time(k as f64 / FPS), &mut instant);
         for camera in &cameras {
-            s.at(Time(k as f64 / FPS), &mut instant);
-            renderer.render(&s.splats(&instant), camera, [0.0; 3], None, &mut image);
-            let color = image.color.clone();
-            let mask = masks.map(|_| {
-                front.at(Time(k as f64 / FPS), &mut instant);
-                renderer.render(&front.splats(&instant), camera, [0.0; 3], None, &mut image);
-                let mut mask = Planes::new(1, camera.height, camera.width);
-                for (m, a) in mask.data.iter_mut().zip(&image.alpha.data) {
-                    *m = f32::from(u8::from(*a > 0.5));
-                }
-                mask
-            });
-            pictures.push(Picture { color, mask, ..Picture::default() });
             renderer.render(&s.splats(&instant), camera, [0.0; 3], Some(&front), &mut image);
             let mut mask = image.extra.clone();
             mask.data.iter_mut().for_each(|x| *x = f32::from(u8::from(*x > 0.5)));
-            pictures.push(Picture { color: image.color.clone(), mask: masks.map(|_| mask), weight: None });
+            pictures.push(Picture { color: image.color.clone(), mask: masks.map(|_| mask), ..Picture::default() });
         }
     }
     Drawn { cameras, pictures }
