@@ -529,6 +529,9 @@ impl Recipe {
             (toml::Value::Integer(_), toml::Value::Float(f)) if f.fract() == 0.0 && f.abs() < 9e15 => {
                 toml::Value::Integer(f as i64)
             }
+            // A word may look like a number: `floor_height=0.3`.
+            (toml::Value::String(_), toml::Value::Integer(i)) => toml::Value::String(i.to_string()),
+            (toml::Value::String(_), toml::Value::Float(f)) => toml::Value::String(f.to_string()),
             (_, v) => v,
         };
         let expected = old.type_str();

@@ -80,6 +80,10 @@ const SMALLEST_SCALE: f64 = 1e-5;
 /// Softness of an interval life's ends at the start, frames.
 const INITIAL_SOFTNESS_FRAMES: f64 = 1.0;
 
+/// Half-width and softness of an interval life at the start where the point's moment is not known, clips: alive in the
+/// middle, three quarters there at the ends, and free to move both.
+const OPEN_LIFE: (f64, f64) = (0.3, 0.25);
+
 /// The keyframe times of the plan: evenly over the clip, at least one.
 pub fn keyframes(plan: &Plan) -> Vec<f64> {
     let count = match plan.recipe.init_keyframes {
@@ -154,10 +158,15 @@ pub fn scene(
         geometry.set(i, OPACITY, logit);
         params[SH].write(i, 0, seeds.colors[i].map(rgb_to_dc));
         if life != LifeKind::Infinite {
-            let (center, width) = lives[i];
+            let (center, mut width) = lives[i];
+            let mut softness = INITIAL_SOFTNESS_FRAMES / plan.fps;
+            if life == LifeKind::Interval && seeds.times[i].is_none() {
+                // Flat ends outside the clip would never be felt: nobody could learn to come or go.
+                (width, softness) = (OPEN_LIFE.0 * plan.seconds(), OPEN_LIFE.1 * plan.seconds());
+            }
             params[LIFE].write(i, 0, [center as f32, width.ln() as f32]);
             if life == LifeKind::Interval {
-                params[LIFE].write(i, 2, [(INITIAL_SOFTNESS_FRAMES / plan.fps).ln() as f32]);
+                params[LIFE].write(i, 2, [softness.ln() as f32]);
             }
         }
     }

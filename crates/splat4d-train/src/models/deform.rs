@@ -68,9 +68,10 @@ fn check(plan: &Plan) -> Result<()> {
         return Err(Error::input("every picture of the capture is of one moment: there is nothing to deform")
             .remedy("Train it with --motion still"));
     }
-    Deform::new(spec(plan), &mut Params::<f32>::new(0, 1, &[]))
-        .map(drop)
-        .map_err(|e| e.remedy("Change deform_width, deform_layers, deform_x_levels or deform_t_levels"))
+    Deform::new(spec(plan), &mut Params::<f32>::new(0, 1, &[])).map(drop).map_err(|e| {
+        Error::input(format!("the network that the recipe asks for cannot be made: {e}"))
+            .remedy("Change deform_width, deform_layers, deform_x_levels or deform_t_levels")
+    })
 }
 
 fn spec(plan: &Plan) -> DeformSpec {

@@ -663,7 +663,7 @@ fn sensitivities_are_sums_of_squared_differences() {
                     draw_oracle(&s, &view, cut).color.data
                 };
                 let (up, down) = (with(1e-6), with(-1e-6));
-                for (i, (u, d)) in up.iter().zip(&down).enumerate() {
+                for (i, (u, d)) in up.iter().zip(&down).enumerate().filter(|(_, (u, d))| u != d) {
                     let pixel = i % (45 * 31);
                     let dx = p.mean2d[0] - (pixel % 45) as f64 - 0.5;
                     let dy = p.mean2d[1] - (pixel / 45) as f64 - 0.5;

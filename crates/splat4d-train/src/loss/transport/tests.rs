@@ -25,7 +25,9 @@ fn settings() -> TransportSettings {
 
 fn normal(seed: u64, i: u64) -> Normal {
     let rng = Rng::new(seed, "transport test", 0).fork(i);
-    let x: [f64; 10] = std::array::from_fn(|k| rng.normal(k as u64));
+    // Neighbours in time are alike: a straight line through them stays a covariance.
+    let base = Rng::new(seed, "transport test", 1);
+    let x: [f64; 10] = std::array::from_fn(|k| base.normal(k as u64) + 0.1 * rng.normal(k as u64));
     let cov = sym3::from_quat_log_scales([2.0 + x[0], x[1], x[2], x[3]], [0.2 * x[4], 0.2 * x[5] - 0.4, 0.2 * x[6]]);
     Normal { mean: [x[7], x[8], x[9]], cov: spd::unpack(cov) }
 }

@@ -179,7 +179,7 @@ fn nobody_leaves_a_ghost() {
         assert!(ghost < GHOST, "{motion}: a ghost of {ghost}");
         assert!(there < OFF, "{motion}: who is there is {there} off");
     }
-    // Without lives a still cloud has nothing but ghosts.
-    let [ghost, _] = errors("still", "infinite");
-    assert!(ghost > 2.0 * GHOST, "{ghost}");
+    // Without lives a still cloud has ghosts, or nobody at all.
+    let [ghost, there] = errors("still", "infinite");
+    assert!(ghost > 2.0 * GHOST || there > 2.0 * OFF, "{ghost} {there}");
 }
