@@ -250,9 +250,9 @@ mod tests {
                 let mut picture = Picture::default();
                 frames.load(i, &mut picture).unwrap();
                 let (x, y) = (u - 0.5, v - 0.5);
-                let inside = |a: f64| (a - a.round()).abs() < 1e-3 && (0.0..64.0).contains(&a.round());
+                let inside = |a: f64| (a - a.round()).abs() < 1e-3 && (0.0..128.0).contains(&a.round());
                 inside(x) && inside(y) && {
-                    let at = |c: usize| picture.color.data[(c * 64 + y.round() as usize) * 64 + x.round() as usize];
+                    let at = |c: usize| picture.color.data[(c * 128 + y.round() as usize) * 128 + x.round() as usize];
                     dc == [at(0), at(1), at(2)].map(rgb_to_dc)
                 }
             });

@@ -44,6 +44,10 @@ impl Program for ControlProgram {
         Ok(())
     }
 
+    fn one_moment(&self, _plan: &Plan) -> bool {
+        true
+    }
+
     fn stages(&self, plan: &Plan) -> Vec<Stage> {
         let mut stage = still::stage("control", plan);
         still::learn_life(&mut stage, plan, self.life(plan));

@@ -53,6 +53,10 @@ impl Program for SsmProgram {
         Ok(())
     }
 
+    fn one_moment(&self, _plan: &Plan) -> bool {
+        true
+    }
+
     fn stages(&self, plan: &Plan) -> Vec<Stage> {
         let r = &plan.recipe;
         let warm = (r.ssm_warm_up * r.iterations as f64) as usize;

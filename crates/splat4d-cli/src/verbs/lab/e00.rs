@@ -35,7 +35,7 @@ pub(crate) struct Args {
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let base = Settings { steps: args.steps, noise: args.noise, ..Settings::default() };
-    let total = args.seeds as usize + LAMBDAS.len() + 2;
+    let total = args.seeds as usize * (1 + LAMBDAS.len()) + 2;
     let mut done = 0;
     let mut go = |scene: Scene, s: &Settings| {
         console.phase("learning", done, total);
@@ -44,9 +44,12 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     };
     let seeds: Vec<Findings> =
         (0..args.seeds).map(|seed| go(Scene::Mixed, &Settings { seed, ..base.clone() })).collect();
-    let sweep: Vec<(f64, Findings)> = LAMBDAS
+    let sweep: Vec<(f64, Vec<Findings>)> = LAMBDAS
         .iter()
-        .map(|&lambda_velocity| (lambda_velocity, go(Scene::Mixed, &Settings { lambda_velocity, ..base.clone() })))
+        .map(|&lambda_velocity| {
+            let of = |seed| Settings { lambda_velocity, seed, ..base.clone() };
+            (lambda_velocity, (0..args.seeds).map(|seed| go(Scene::Mixed, &of(seed))).collect())
+        })
         .collect();
     let dense = Settings { points: MANY_POINTS, ..base.clone() };
     let limits = [Scene::Edge, Scene::Jump].map(|scene| (scene, go(scene, &dense)));
@@ -59,7 +62,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     }
     let numbers = json!({
         "seeds": seeds.iter().map(to_json).collect::<Vec<_>>(),
-        "sweep": sweep.iter().map(|(l, f)| json!({"lambda": l, "jerk": f.jerk, "mse": f.mse})).collect::<Vec<_>>(),
+        "sweep": sweep.iter().map(|(l, f)| json!({"lambda": l, "jerk": over(f, |f| f.jerk), "mse": over(f, |f| f.mse)})).collect::<Vec<_>>(),
         "limits": limits.iter().map(|(s, f)| json!({"scene": format!("{s:?}"), "mse": f.parts})).collect::<Vec<_>>(),
     });
     files::write(&args.output.join("e00.json"), format!("{numbers:#}\n").as_bytes())?;
@@ -78,11 +81,16 @@ fn to_json(f: &Findings) -> Value {
     })
 }
 
+/// Mean over the seeds.
+fn over(found: &[Findings], of: impl Fn(&Findings) -> f64) -> f64 {
+    found.iter().map(of).sum::<f64>() / found.len().max(1) as f64
+}
+
 fn mean(values: &[f64]) -> f64 {
     values.iter().sum::<f64>() / values.len().max(1) as f64
 }
 
-fn markdown(s: &Settings, seeds: &[Findings], sweep: &[(f64, Findings)], limits: &[(Scene, Findings)]) -> String {
+fn markdown(s: &Settings, seeds: &[Findings], sweep: &[(f64, Vec<Findings>)], limits: &[(Scene, Findings)]) -> String {
     let mut out = format!(
         "# E00: a deformation network against standing still\n\n{} points (a third each: sinusoids, straight lines, \
          circles) at {} times, observed with noise of {}; a perceptron of {} numbers learns their displacement in {} steps \
@@ -107,9 +115,10 @@ fn markdown(s: &Settings, seeds: &[Findings], sweep: &[(f64, Findings)], limits:
     }
     out += "\n## A penalty on speed\n\n| λ | jerk | MSE |\n|---:|---:|---:|\n";
     for (lambda, f) in sweep {
-        let _ = writeln!(out, "| {lambda} | {:.5} | {:.5} |", f.jerk, f.mse);
+        let _ = writeln!(out, "| {lambda} | {:.5} | {:.5} |", over(f, |f| f.jerk), over(f, |f| f.mse));
     }
-    out += "\nA penalty on speed cannot tell motion from noise: what it makes smoother it also makes wrong.\n\n\
+    out += "\nMeans over the seeds. A penalty on speed calms the network, and as long as it is small that may even help against noise; \
+            a large one takes the motion for noise.\n\n\
             ## Where it fails\n\n| scene | MSE there | MSE elsewhere | times worse |\n|---|---:|---:|---:|\n";
     for (scene, f) in limits {
         let name = match scene {
@@ -125,7 +134,7 @@ fn markdown(s: &Settings, seeds: &[Findings], sweep: &[(f64, Findings)], limits:
     out
 }
 
-fn plots(s: &Settings, first: &Findings, sweep: &[(f64, Findings)]) -> Vec<(&'static str, String)> {
+fn plots(s: &Settings, first: &Findings, sweep: &[(f64, Vec<Findings>)]) -> Vec<(&'static str, String)> {
     let over_time = |name: &str, values: &[f64]| Series {
         name: name.into(),
         points: values.iter().enumerate().map(|(n, v)| (n as f64 / (s.frames - 1) as f64, *v)).collect(),
@@ -135,7 +144,7 @@ fn plots(s: &Settings, first: &Findings, sweep: &[(f64, Findings)]) -> Vec<(&'st
     let place = |l: f64| if l > 0.0 { l.log10() } else { LAMBDAS[1].log10() - 1.0 };
     let curve = |name: &str, of: &dyn Fn(&Findings) -> f64| Series {
         name: name.into(),
-        points: sweep.iter().map(|(l, f)| (place(*l), of(f))).collect(),
+        points: sweep.iter().map(|(l, f)| (place(*l), over(f, of))).collect(),
     };
     let tradeoff = [curve("jerk", &|f| f.jerk), curve("root of MSE", &|f| f.mse.sqrt())];
     let all = [
