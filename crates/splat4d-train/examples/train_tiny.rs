@@ -86,7 +86,7 @@ fn main() -> Result<()> {
         truth.at(Time(k as f64 / FPS), &mut instant);
         for camera in &made.cameras {
             renderer.render(&truth.splats(&instant), camera, [0.0; 3], None, &mut image);
-            made.pictures.push(Picture { color: image.color.clone(), mask: None, weight: None });
+            made.pictures.push(Picture { color: image.color.clone(), ..Picture::default() });
         }
     }
 

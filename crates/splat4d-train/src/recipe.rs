@@ -33,6 +33,10 @@ macro_rules! recipe {
     };
 }
 
+/// What `control_trajectory` may be.
+pub const TRAJECTORIES: [&str; 5] = ["spline", "linear", "slerp", "low-rank", "network"];
+/// What `prune_score` may be: the names of `prune::Spatial`.
+pub const PRUNE_SCORES: [&str; 7] = ["share", "change", "both", "opacity", "light-gaussian", "pup", "speedy"];
 /// Opacity below which MCMC relocates (Kheradmand et al. 2024).
 const MCMC_DEAD_OPACITY: f64 = 0.005;
 /// Opacity below which ADC prunes: four times the original's, +0.5 dB in a 1,500-step comparison on the bundled
@@ -640,7 +644,8 @@ impl Recipe {
             ("motion", &self.motion, &known_motions()[..]),
             ("life", &self.life, &["auto", "infinite", "gauss-half", "gauss-one", "interval"][..]),
             ("crowding", &self.crowding, &["none", "merge", "prune"][..]),
-            ("control_trajectory", &self.control_trajectory, &crate::models::control::TRAJECTORIES[..]),
+            ("prune_score", &self.prune_score, &PRUNE_SCORES[..]),
+            ("control_trajectory", &self.control_trajectory, &TRAJECTORIES[..]),
             ("strategy", &self.strategy, &["mcmc", "adc", "none"][..]),
             ("deform_trunk", &self.deform_trunk, &["mlp", "small", "hash", "hash-linear"][..]),
             ("filter", &self.filter, &Fusion::ALL.map(|(name, _)| name)[..]),
@@ -655,7 +660,6 @@ impl Recipe {
                 return bad(knob, format!("`{value}`"), &format!("one of {}{near}", known.join(", ")));
             }
         }
-        self.prune_score.parse::<crate::prune::Spatial>()?;
         Ok(())
     }
 

@@ -1,7 +1,6 @@
 //! What initialisation and training need of a capture: posed pictures by number. Captures on disk and made-up ones in tests both serve.
 
 use crate::Result;
-use crate::loss::image::flow::FlowTruth;
 use splat4d::scene::{Camera, Planes, Time};
 
 /// One picture, loaded.
@@ -15,6 +14,17 @@ pub struct Picture {
     pub weight: Option<Planes<f32>>,
     /// Where its pixels go, as far as that is known.
     pub flow: Option<Flow>,
+}
+
+/// Known optical flow of a picture, as a loss sees it.
+#[derive(Clone, Copy, Debug)]
+pub struct FlowTruth<'a, F = f32> {
+    /// When the pixels arrive.
+    pub to: Time,
+    /// From where they are seen then.
+    pub camera: &'a Camera,
+    /// [3, h, w]: u right, v down in pixels, and 1 where they are known.
+    pub vectors: &'a Planes<F>,
 }
 
 /// Known optical flow of a picture.

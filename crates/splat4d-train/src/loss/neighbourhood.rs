@@ -4,7 +4,6 @@ use super::arap::{self, OWN_FLOOR};
 use super::graph::{Graph, Weigh};
 use super::motion;
 use super::terms::{Probe, ProbeLoss, StepInfo};
-use crate::models::Plan;
 use splat4d::layers::Scene;
 use splat4d::math::knn::knn;
 use splat4d::math::{Real, Rng};
@@ -67,16 +66,9 @@ pub struct Neighbourhood<F> {
 }
 
 impl<F: Real> Neighbourhood<F> {
-    /// For a run with this plan.
-    pub fn new(weights: MotionWeights, plan: &Plan) -> Self {
-        Self {
-            weights,
-            unit: 1.0 / plan.extent,
-            frame: 1.0 / plan.fps,
-            clip: plan.clip,
-            near: Mutex::default(),
-            graphs: Mutex::default(),
-        }
+    /// For a scene of this extent (scene units), over a clip (seconds) of so many frames a second.
+    pub fn new(weights: MotionWeights, extent: f64, clip: [f64; 2], fps: f64) -> Self {
+        Self { weights, unit: 1.0 / extent, frame: 1.0 / fps, clip, near: Mutex::default(), graphs: Mutex::default() }
     }
 
     /// Instants of a step: two a frame apart from the first view's time on; then, if asked for, one frame before and one

@@ -14,8 +14,6 @@ use splat4d::motion::Spec;
 use splat4d::motion::control::{ControlSpec, Curve, TrajectorySpec};
 use splat4d::motion::skin::SkinSpec;
 
-/// Names of trajectories, as the knob `control_trajectory` takes them.
-pub const TRAJECTORIES: [&str; 5] = ["spline", "linear", "slerp", "low-rank", "network"];
 /// One key of a trajectory about every so many frames. Four is usual for B-splines on SE(3); with one moving camera fewer
 /// keys tell motion from shape sooner: 12 keys reach 31.9 dB on D-NeRF's mutant after 1,000 steps, 41 keys 29.0 dB.
 const FRAMES_PER_KEY: usize = 12;

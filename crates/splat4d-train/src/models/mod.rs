@@ -17,12 +17,12 @@ mod tests;
 pub mod tracked;
 
 use crate::densify::{Crowding, Densify, Guided, Relocate, Stats};
+pub use crate::loss::terms::Segmentation;
 use crate::loss::terms::{Codec, ParamLoss, ProbeLoss};
 use crate::optim::Moments;
 use crate::prune::Periodic;
 use crate::recipe::Recipe;
 use crate::sampler::Sampler;
-pub use crate::train::loss::Segmentation;
 use crate::{Error, Result};
 use splat4d::layers::Scene;
 use splat4d::math::{Real, Rng};

@@ -97,7 +97,7 @@ pub fn stage(name: &str, plan: &Plan) -> Stage {
     let mut probes: Vec<Box<dyn ProbeLoss<f32>>> = Vec::new();
     let weights = motion_weights(r);
     if !weights.is_off() {
-        probes.push(Box::new(Neighbourhood::new(weights, plan)));
+        probes.push(Box::new(Neighbourhood::new(weights, plan.extent, plan.clip, plan.fps)));
     }
     Stage {
         batch: r.batch_size,

@@ -101,7 +101,7 @@ impl Weighing {
 
     /// Where the score is one of all views together: what every row of a layer is worth.
     pub(super) fn whole(&self, layer: usize) -> Option<Vec<f64>> {
-        Some(self.blocks.get(layer)?.iter().map(|b| root_of_determinant(b)).collect())
+        Some(self.blocks.get(layer)?.iter().map(root_of_determinant).collect())
     }
 
     /// Pixels that every row of a layer touches, in the views that show it.

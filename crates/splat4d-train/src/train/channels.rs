@@ -1,6 +1,6 @@
 //! What is drawn beside colours so that losses can look at it: normals of splats and their way to another instant.
 
-use crate::loss::image::flow::FlowTruth;
+use crate::capture::frames::FlowTruth;
 use rayon::prelude::*;
 use splat4d::math::Real;
 use splat4d::scene::splats::COV;

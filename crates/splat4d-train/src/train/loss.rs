@@ -4,6 +4,7 @@ use super::chain::{ImageLoss, PictureGrads, View, Wanted};
 use crate::loss::image::frequency::Frequency;
 use crate::loss::image::{ImageTerms, entropy, flow, normal, tv};
 use crate::loss::photometric::Photometric;
+pub use crate::loss::terms::Segmentation;
 use crate::optim::Moments;
 use splat4d::render::Image;
 use splat4d::scene::{Grads, Key, Params, Planes, Space};
@@ -56,16 +57,6 @@ impl Exposure {
         }
         finite
     }
-}
-
-/// A column of Gaussians that is drawn as masks show the foreground: its sigmoid, blended, against the mask with the same
-/// functional as colours (Luiten et al. 2024, "seg").
-#[derive(Clone, Debug, PartialEq)]
-pub struct Segmentation {
-    /// The column group, of one logit.
-    pub column: String,
-    /// Its weight beside the colours'.
-    pub weight: f64,
 }
 
 /// See the module's documentation.

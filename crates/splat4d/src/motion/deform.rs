@@ -99,6 +99,7 @@ pub fn build<F: Real>(spec: &DeformSpec, p: &mut Params<F>) -> Result<Arc<dyn Mo
 
 /// How x̂ and t̂ reach the trunk.
 #[derive(Clone, Debug)]
+#[allow(clippy::large_enum_variant)] // one a model
 enum Eyes {
     Encoded {
         x_levels: usize,
@@ -260,10 +261,11 @@ impl Deform {
         let [from, to] = self.spec.clip;
         let length = to - from;
         // A NaN becomes 0 here; nothing else of the model knows the time.
-        if !(length > 0.0) || !(t.0 > from) {
-            return (0.0, 0.0);
+        if length > 0.0 && t.0 > from {
+            if t.0 >= to { (1.0, 0.0) } else { ((t.0 - from) / length, 1.0 / length) }
+        } else {
+            (0.0, 0.0)
         }
-        if t.0 >= to { (1.0, 0.0) } else { ((t.0 - from) / length, 1.0 / length) }
     }
 
     fn bounds<F: Real>(&self, p: &Params<F>) -> Bounds<F> {

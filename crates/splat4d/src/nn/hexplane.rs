@@ -78,7 +78,7 @@ impl PlaneShape {
         if self.multires.is_empty() || self.multires.len() > MAX_LEVELS {
             return bad(format!("{} levels are not 1 to {MAX_LEVELS}", self.multires.len()));
         }
-        let sides = self.multires.iter().map(|&m| self.resolution.checked_mul(m).unwrap_or(usize::MAX));
+        let sides = self.multires.iter().map(|&m| self.resolution.saturating_mul(m));
         for side in sides.chain([self.time_resolution]) {
             if !(2..=MAX_RESOLUTION).contains(&side) {
                 return bad(format!("an axis of {side} grid points is not 2 to {MAX_RESOLUTION}"));

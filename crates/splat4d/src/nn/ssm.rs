@@ -395,10 +395,10 @@ impl<'a, F: Real> Channel<'a, F> {
     }
 
     #[inline(always)]
-    fn held(&self, i: usize, ticks: usize) -> (&'a [Complex<F>], &'a [Complex<F>], &'a [Complex<F>]) {
+    fn held(&self, i: usize, ticks: usize) -> [&'a [Complex<F>]; 3] {
         let at = self.place(i, ticks);
         let own = at..at + self.n;
-        (&self.of.decay[own.clone()], &self.of.drive[own], &self.of.output[self.first..self.first + self.n])
+        [&self.of.decay[own.clone()], &self.of.drive[own], &self.of.output[self.first..self.first + self.n]]
     }
 }
 
@@ -436,7 +436,7 @@ impl<F: Real> Kernel for Scan<'_, F> {
             for l in 0..LANES {
                 y[l] = self.of.skip * u[l];
             }
-            let (decay, drive, output) = self.of.held(i, ticks);
+            let [decay, drive, output] = self.of.held(i, ticks);
             for (((h, &a), &b), &c) in self.state.iter_mut().zip(decay).zip(drive).zip(output) {
                 let next = advance::<F, FMA>(h, a, b, &u);
                 for l in 0..LANES {
@@ -476,7 +476,7 @@ impl<F: Real> Kernel for &mut Reverse<'_, '_, F> {
             self.states[..n].copy_from_slice(&self.marks[chunk * n..(chunk + 1) * n]);
             for i in first..end {
                 let u = self.u[self.of.tick(i, ticks)];
-                let (decay, drive, _) = self.of.held(i, ticks);
+                let [decay, drive, _] = self.of.held(i, ticks);
                 let (old, new) = self.states[(i - first) * n..].split_at_mut(n);
                 for (((h, next), &a), &b) in old.iter().zip(new.iter_mut()).zip(decay).zip(drive) {
                     *next = advance::<F, FMA>(h, a, b, &u);
@@ -485,7 +485,7 @@ impl<F: Real> Kernel for &mut Reverse<'_, '_, F> {
             for i in (first..end).rev() {
                 let t = self.of.tick(i, ticks);
                 let (u, g) = (self.u[t], self.d_y[t]);
-                let (decay, drive, output) = self.of.held(i, ticks);
+                let [decay, drive, output] = self.of.held(i, ticks);
                 let (old, new) = self.states[(i - first) * n..(i - first + 2) * n].split_at(n);
                 let mut d_u = self.d_u[t];
                 for l in 0..LANES {

@@ -201,7 +201,7 @@ fn orders(args: &Args, variants: &[Variant]) -> Result<Vec<Order>> {
     for seed in 1..=u64::from(seeds) {
         for variant in variants {
             let recipe = variant.recipe(&base, seed)?;
-            let print = files::fingerprint(&format!("{}\n{}", args.capture.display(), recipe.to_toml()));
+            let print = files::fingerprint(format!("{}\n{}", args.capture.display(), recipe.to_toml()));
             all.push(Order { variant: *variant, recipe, print });
         }
     }

@@ -2,18 +2,7 @@
 
 use super::{SEEN, over_rows};
 use splat4d::math::Real;
-use splat4d::scene::{Camera, Planes, Time};
-
-/// Known optical flow of one picture.
-#[derive(Clone, Copy, Debug)]
-pub struct FlowTruth<'a, F = f32> {
-    /// When the pixels arrive.
-    pub to: Time,
-    /// From where they are seen then.
-    pub camera: &'a Camera,
-    /// [3, h, w]: u right, v down in pixels, and 1 where they are known.
-    pub vectors: &'a Planes<F>,
-}
+use splat4d::scene::Planes;
 
 /// Known flow is that of a whole pixel: of a mean of pixels all must be known.
 const KNOWN: f64 = 0.999;

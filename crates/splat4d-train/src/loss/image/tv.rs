@@ -112,7 +112,7 @@ mod tests {
     fn gradients_equal_finite_differences() {
         let image = check::planes("image", [3, 5, 8], 0.0, 1.0);
         let run = |p: &[Planes<f64>], d: &mut [Planes<f64>]| total_variation(&p[0], 0.7, &mut d[0]);
-        check::gradients(&[image.clone()], run, |p| run(p, &mut [Planes::new(3, 5, 8)]));
+        check::gradients(std::slice::from_ref(&image), run, |p| run(p, &mut [Planes::new(3, 5, 8)]));
         let inputs = [check::planes("depth", [1, 5, 8], 1.0, 4.0), check::planes("alpha", [1, 5, 8], 0.3, 1.0)];
         let run = |p: &[Planes<f64>], d: &mut [Planes<f64>]| {
             let [d_depth, d_alpha] = d else { panic!("two inputs") };

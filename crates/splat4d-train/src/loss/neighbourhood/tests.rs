@@ -6,9 +6,10 @@ use splat4d::scene::{LifeKind, Params};
 
 const N: usize = 3000;
 
-fn plan() -> Plan {
-    let recipe = crate::recipe::Recipe::default();
-    Plan { recipe, extent: 2.0, clip: [0.0, 1.0], fps: 10.0, times: 11, fixed_cameras: 4, ..Plan::default() }
+const CLIP: [f64; 2] = [0.0, 1.0];
+
+fn made(weights: MotionWeights, clip: [f64; 2]) -> Neighbourhood<f64> {
+    Neighbourhood::new(weights, 2.0, clip, 10.0)
 }
 
 fn scene(life: LifeKind) -> Scene<f64> {
@@ -73,7 +74,7 @@ fn what_has_no_held_part_has_the_gradient_of_its_value() {
         MotionWeights { arap: 0.7, jerk: 0.4, ..MotionWeights::default() },
         MotionWeights { velocity: 0.02, ..MotionWeights::default() },
     ] {
-        let loss = Neighbourhood::new(weights, &plan());
+        let loss = made(weights, CLIP);
         let probes = ProbeLoss::probes(&loss, &scene, &info(0));
         let seen = answers(&probes);
         let (value, d) = eval(&loss, &scene, &seen, &probes);
@@ -99,7 +100,7 @@ fn what_has_no_held_part_has_the_gradient_of_its_value() {
 #[test]
 fn a_step_looks_at_few_rows_others_each_time_and_only_at_the_living() {
     let scene = scene(LifeKind::GaussHalf);
-    let loss = Neighbourhood::new(all(), &plan());
+    let loss = made(all(), CLIP);
     let rows = |iteration: usize| {
         let probes = ProbeLoss::probes(&loss, &scene, &info(iteration));
         assert_eq!((probes.len(), probes[0].times.len()), (1, 5));
@@ -116,7 +117,7 @@ fn a_step_looks_at_few_rows_others_each_time_and_only_at_the_living() {
 #[test]
 fn neighbours_survive_a_checkpoint_and_are_forgotten_after_an_edit() {
     let mut scene = scene(LifeKind::Infinite);
-    let loss = Neighbourhood::new(all(), &plan());
+    let loss = made(all(), CLIP);
     let look = |loss: &Neighbourhood<f64>, scene: &Scene<f64>| {
         let probes = ProbeLoss::probes(loss, scene, &info(7));
         let seen = answers(&probes);
@@ -131,12 +132,12 @@ fn neighbours_survive_a_checkpoint_and_are_forgotten_after_an_edit() {
         scene.layers[0].params[GEOMETRY].set(r, 0, -0.3 * x * x);
     }
     let truth = look(&loss, &scene);
-    let other = Neighbourhood::new(all(), &plan());
+    let other = made(all(), CLIP);
     ProbeLoss::<f64>::restore(&other, &state);
     assert!(look(&other, &scene) == truth);
     ProbeLoss::<f64>::on_edit(&loss);
     assert!(look(&loss, &scene) != truth);
-    assert!(look(&Neighbourhood::new(all(), &plan()), &scene) != truth);
+    assert!(look(&made(all(), CLIP), &scene) != truth);
     // A state that cannot be is as none.
     for bad in [vec![0, 5, 1], vec![0, 8, 1, 2, 3, 4, 5, 6, 7, 8]] {
         ProbeLoss::<f64>::restore(&other, &bad);
@@ -146,9 +147,9 @@ fn neighbours_survive_a_checkpoint_and_are_forgotten_after_an_edit() {
 
 #[test]
 fn still_layers_short_clips_and_lonely_gaussians_are_left_alone() {
-    let loss = Neighbourhood::new(all(), &Plan { clip: [0.0, 0.0], ..plan() });
+    let loss = made(all(), [0.0; 2]);
     assert!(ProbeLoss::probes(&loss, &scene(LifeKind::Infinite), &info(0)).is_empty());
-    let loss = Neighbourhood::new(all(), &plan());
+    let loss = made(all(), CLIP);
     let mut still = scene(LifeKind::Infinite);
     still.layers[0].motion = build(&Spec::Still, &mut still.layers[0].params).unwrap();
     assert!(ProbeLoss::probes(&loss, &still, &info(0)).is_empty());

@@ -112,7 +112,6 @@ fn nodes_are_added_where_gaussians_strain_and_removed_where_there_are_none() {
         })
         .collect();
     stats.observe(Observation { layer: 0, rows: Rows::All, mean2d: &mean2d, radii: &[1.0; 200] });
-    let adapt = NodeAdapt { bind_interval: 10, steps: (100, 1000, 100), threshold: 0.05, cap: 21 };
     let adapt = NodeAdapt { bind_interval: 10, steps: (100, 1000, 100), threshold: 0.2, cap: 21 };
     assert!(adapt.is_due(10) && !adapt.is_due(15) && adapt.is_due(500));
     adapt.run(&mut scene, &mut moments, &mut stats, 100, Rng::new(0, "adapt", 0));

@@ -9,6 +9,12 @@ fn of(spatial: Spatial) -> ScoreConfig {
 }
 
 #[test]
+fn the_recipe_knows_every_score() {
+    let names: Vec<&str> = Spatial::ALL.iter().map(|s| s.name()).collect();
+    assert_eq!(names, crate::recipe::PRUNE_SCORES);
+}
+
+#[test]
 fn every_score_is_finite_ranks_what_is_seen_above_what_is_not_and_knows_no_threads() {
     let (mut s, made) = (scene(120), made());
     // One behind every camera's back and one that is transparent.

@@ -108,7 +108,8 @@ impl<F: Real> Bounds<F> {
         for k in 0..3 {
             let s = g[LOG_SCALE + k].exp() + grow * h[first + 4 + k];
             // A NaN is not below: it stays one, so that the trainer's guard finds it.
-            free[k] = !(s < least);
+            let below = s < least;
+            free[k] = !below;
             log_s[k] = (if free[k] { s } else { least }).ln();
         }
         (q, log_s, free)

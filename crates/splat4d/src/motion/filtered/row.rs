@@ -87,6 +87,7 @@ pub struct Prediction {
 }
 
 #[derive(Clone, Copy, Debug)]
+#[allow(clippy::large_enum_variant)] // lives on the stack for one row
 enum Shape {
     Held,
     Straight(Lifted),
@@ -184,6 +185,7 @@ pub struct Fused {
 }
 
 #[derive(Clone, Copy, Debug)]
+#[allow(clippy::large_enum_variant)] // lives on the stack for one row
 enum Rule {
     /// The prediction counts for nothing.
     Closed,

@@ -420,8 +420,8 @@ fn hostile_filters_are_refused() {
         f(&mut s);
         refused(s)
     };
-    assert!(change(&|s| s.inner = Box::new(Spec::Filtered(sound.clone()))), "a filter in a filter");
-    assert!(change(&|s| s.inner = Box::new(Spec::Custom("mine".into()))));
+    assert!(change(&|s| *s.inner = Spec::Filtered(sound.clone())), "a filter in a filter");
+    assert!(change(&|s| *s.inner = Spec::Custom("mine".into())));
     for x in [0.0, 1.0, f64::NAN, -1.0] {
         assert!(change(&|s| s.gain = x));
     }
