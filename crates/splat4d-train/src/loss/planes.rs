@@ -1,10 +1,10 @@
 //! Regularisers of feature planes (the `hexplane` model): sums over levels of
 //!
-//! - smoothness: mean of (P[i−1] − 2P[i] + P[i+1])² along both axes of xy, xz and yz. The released code of 4DGaussians
+//! - smoothness: mean of (P[i−1] − 2P\[i\] + P[i+1])² along both axes of xy, xz and yz. The released code of 4DGaussians
 //!   calls it TV and takes the second axis alone; both make no axis special;
 //! - time smoothness: the same along time, of xt, yt and zt;
 //! - L1-time: mean |1 − P| of xt, yt and zt, which pulls towards features that do not depend on time;
-//! - variation: (P[i+1] − P[i])² along both axes of xy, xz and yz, each a mean over its pairs: the true (squared) total
+//! - variation: (P[i+1] − P\[i\])² along both axes of xy, xz and yz, each a mean over its pairs: the true (squared) total
 //!   variation, as an alternative to the first.
 //!
 //! Sources: Wu et al. 2024 ("4DGaussians") §4.3; Fridovich-Keil et al. 2023 (K-Planes) §3.2.

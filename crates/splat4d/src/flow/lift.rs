@@ -106,7 +106,7 @@ pub fn integrate(
     out
 }
 
-/// Root mean square distance at every step between tracks [points][steps] and the truth.
+/// Root mean square distance at every step between tracks \[points\]\[steps\] and the truth.
 pub fn drift(tracks: &[Vec<[f64; 3]>], truth: &[Vec<[f64; 3]>]) -> Vec<f64> {
     assert_eq!(tracks.len(), truth.len(), "a track a true track is needed");
     let steps = truth.iter().map(Vec::len).min().unwrap_or(0);

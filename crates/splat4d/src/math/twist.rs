@@ -1,6 +1,6 @@
 //! A point moved by a screw motion: exp([w; v]) applied to p, with its gradient. Generic, since it is learnt.
 //!
-//! p' = R p + V v, R = I + a[w] + b[w]², V = I + b[w] + c[w]², with s = |w|²: a = sin θ/θ, b = (1 − cos θ)/θ²,
+//! p' = R p + V v, R = I + a\[w\] + b\[w\]², V = I + b\[w\] + c\[w\]², with s = |w|²: a = sin θ/θ, b = (1 − cos θ)/θ²,
 //! c = (θ − sin θ)/θ³. Source: Murray, Li and Sastry 1994, §2.3; Park et al. 2021 (Nerfies) §3.2.
 
 use super::Real;

@@ -14,7 +14,7 @@ pub fn encoded(inputs: usize, levels: usize) -> usize {
     inputs * (2 * levels + 1)
 }
 
-/// γ_L of one point: x [d] → out [d·(2L + 1)], level after level: raw, sin of all d, cos of all d.
+/// γ_L of one point: x \[d\] → out [d·(2L + 1)], level after level: raw, sin of all d, cos of all d.
 ///
 /// Panics: `out` has another length.
 #[inline]
@@ -31,7 +31,7 @@ pub fn encode<F: Real>(x: &[F], levels: usize, out: &mut [F]) {
     }
 }
 
-/// VJP of [`encode`] at x: overwrites d_x [d] with Σ d_out·∂γ/∂x.
+/// VJP of [`encode`] at x: overwrites d_x \[d\] with Σ d_out·∂γ/∂x.
 ///
 /// d sin(2^k x) = 2^k cos(2^k x) dx, d cos(2^k x) = −2^k sin(2^k x) dx. Panics: lengths differ.
 #[inline]

@@ -198,7 +198,7 @@ impl Planes {
         (0..count.min(self.keys.len())).map(level).collect()
     }
 
-    /// Features at the lines' time: x [n] in [0, 1]³ → out [n, C·levels]. Levels from `unlocked` on give zeros.
+    /// Features at the lines' time: x \[n\] in [0, 1]³ → out [n, C·levels]. Levels from `unlocked` on give zeros.
     pub fn forward<F: Real>(&self, p: &Params<F>, lines: &Lines<F>, unlocked: usize, x: &[[F; 3]], out: &mut [F]) {
         let width = self.shape.features();
         assert_eq!(out.len(), x.len() * width, "features of {} points need as many rows of {width}", x.len());
