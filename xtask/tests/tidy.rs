@@ -81,7 +81,7 @@ const SHELLS: [&str; 2] = ["crates/splat4d-cli/", "xtask/"];
 const PATH_WORDS: [&str; 3] = ["std::fs", "std::path", "File::open"];
 
 /// Documents whose paths and flags are checked.
-const DOCS: [&str; 9] = [
+const DOCS: [&str; 10] = [
     "README.md",
     "ARCHITECTURE.md",
     "CONVENTIONS.md",
@@ -90,6 +90,7 @@ const DOCS: [&str; 9] = [
     "docs/bundled-capture.md",
     "docs/capture-format.md",
     "docs/formats.md",
+    "docs/models.md",
     "docs/recipe.md",
 ];
 

@@ -4,10 +4,10 @@ use super::quantise::{self, Quantised, palette_rate};
 use super::{Compression, draft};
 use crate::Result;
 use crate::capture::frames::Frames;
-use crate::densify::Densify;
+
 use crate::loss::scene::MeanOpacity;
 use crate::loss::terms::ParamLoss;
-use crate::models::{Hook, Plan, Rate, Stage, Tell, program};
+use crate::models::{Hook, Plan, Rate, Stage, Tell, tuning};
 use crate::prune::{Keys, MaskConfig, ScoreConfig, key_masks, prune, score};
 use splat4d::format::playback::{WriteConfig, read_pages, write};
 use splat4d::layers::Scene;
@@ -74,13 +74,10 @@ pub(super) fn float_stages(bench: &Bench) -> Result<Vec<Stage>> {
         .collect()
 }
 
-/// The last stage of the model's own training, without densification, at rates that settle.
+/// What the model learns by, at rates that settle.
 fn host_stage(bench: &Bench, steps: usize) -> Result<Stage> {
-    let mut stage = program(&bench.plan.recipe.motion)?.stages(&bench.plan).pop().expect("a program has a stage");
+    let mut stage = tuning(&bench.plan)?;
     stage.iterations = steps;
-    stage.densify = Densify::None;
-    (stage.sh_interval, stage.half_size_steps) = (0, 0);
-    (stage.start, stage.end) = (None, None);
     stage.groups.iter_mut().for_each(|g| g.rate = settling(g.rate, bench.settings.first_rates()));
     stage.params.extend(fading(&bench.settings));
     Ok(stage)

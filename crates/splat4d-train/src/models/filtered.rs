@@ -80,6 +80,10 @@ impl Program for FilteredProgram {
         self.inner.init(lives, params);
     }
 
+    fn tuning(&self, plan: &Plan) -> Stage {
+        self.inner.tuning(plan)
+    }
+
     fn stages(&self, plan: &Plan) -> Vec<Stage> {
         let r = &plan.recipe;
         let mut stages = self.inner.stages(plan);

@@ -272,6 +272,10 @@ pub trait Program: Send + Sync {
     }
     /// The stages.
     fn stages(&self, plan: &Plan) -> Vec<Stage>;
+    /// What learns when a trained scene is tuned further on all frames alike.
+    fn tuning(&self, plan: &Plan) -> Stage {
+        self.stages(plan).pop().expect("a program has a stage")
+    }
 }
 
 /// The program of a built-in motion model.
@@ -295,6 +299,19 @@ pub fn program(motion: &str) -> Result<Box<dyn Program>> {
 /// The program of a recipe: that of its motion, with the losses over time and the filter that the recipe asks for.
 pub fn program_of(recipe: &Recipe) -> Result<Box<dyn Program>> {
     filtered::wrap(program(&recipe.motion)?, recipe)
+}
+
+/// A stage that tunes a trained scene on all frames alike: the recipe's losses and rates, and nothing that adds, moves or
+/// replaces Gaussians.
+pub fn tuning(plan: &Plan) -> Result<Stage> {
+    let mut stage = program_of(&plan.recipe)?.tuning(plan);
+    split::share_groups(&mut stage);
+    stage.densify = Densify::None;
+    (stage.prune, stage.relocate, stage.guided, stage.crowding) = (None, None, None, None);
+    (stage.sh_interval, stage.half_size_steps) = (0, 0);
+    (stage.start, stage.end) = (None, None);
+    stage.switches.clear();
+    Ok(stage)
 }
 
 /// The strategy and its steps as the recipe has them.

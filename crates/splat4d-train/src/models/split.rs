@@ -30,10 +30,14 @@ pub fn stages(program: &dyn Program, plan: &Plan) -> Vec<Stage> {
     let reach = r.static_split * plan.extent;
     let at = (last.iterations as f64 * r.static_split_from) as usize;
     last.switches.push((at, Box::new(move |scene, _| split(scene, reach).map(|_| ()))));
-    // What every layer has learns in the new one too.
-    let common = |g: &&mut Group| COMMON.contains(&g.column.as_str());
-    last.groups.iter_mut().filter(common).for_each(|g| g.layer = EVERY);
+    share_groups(last);
     stages
+}
+
+/// Lets what every layer has learn in all of them.
+pub fn share_groups(stage: &mut Stage) {
+    let common = |g: &&mut Group| COMMON.contains(&g.column.as_str());
+    stage.groups.iter_mut().filter(common).for_each(|g| g.layer = EVERY);
 }
 
 /// Moves rows whose mean stays within `reach` (scene units) of its middle, whose shape stays and whose life lasts, into a

@@ -91,6 +91,18 @@ impl Program for TrackedProgram {
         }
         stages
     }
+
+    /// Every frame's page beside what all frames share; who is foreground is settled.
+    fn tuning(&self, plan: &Plan) -> Stage {
+        let r = &plan.recipe;
+        let mut stage = still::stage("tracked", plan);
+        let positions = Rate { start: r.track_lr_init * plan.extent, end: r.track_lr_final * plan.extent };
+        for k in 1..plan.moments.len() as u32 {
+            stage.groups.push(Group::new(&page_name("means", k), positions));
+            stage.groups.push(Group::new(&page_name("quats", k), Rate::constant(r.track_rotation_lr)));
+        }
+        stage
+    }
 }
 
 /// Whether Gaussians learn who is foreground.

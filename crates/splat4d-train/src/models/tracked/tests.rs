@@ -306,6 +306,19 @@ fn exposures_are_learnt_on_frame_0_and_kept() {
 }
 
 #[test]
+fn tuning_looks_at_every_frame_and_moves_every_page() {
+    let plan = plan(5, 4, false, &["static_split=0.01", "crowding=merge"]);
+    let stage = super::super::tuning(&plan).unwrap();
+    assert_eq!(stage.sampler, Sampler::Uniform);
+    let learns = |column: &str| stage.groups.iter().any(|g| g.column == column && g.rate.start > 0.0);
+    for k in 1..5 {
+        assert!(learns(&page_name("means", k)) && learns(&page_name("quats", k)), "page {k} rests");
+    }
+    assert!(learns("means") && learns("sh") && !learns(FOREGROUND));
+    assert!(stage.start.is_none() && stage.end.is_none() && stage.switches.is_empty() && stage.crowding.is_none());
+}
+
+#[test]
 fn captures_that_cannot_be_tracked_are_refused_with_those_that_can() {
     let good = plan(5, 4, false, &[]);
     assert!(TrackedProgram.check(&good).is_ok());
