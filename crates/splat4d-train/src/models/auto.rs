@@ -52,7 +52,10 @@ pub fn choose(plan: &Plan, frames: &dyn Frames) -> Result<Choice> {
         return choice("control", format!("{seen} a moment, and masks show one object: few nodes move all of it"));
     }
     let length = if plan.times >= LONG { format!(" of {}", plan.times) } else { String::new() };
-    choice("hexplane", format!("{seen} a moment{length}: planes over space and time share what every moment shows"))
+    choice(
+        "deform-mlp",
+        format!("{seen} a moment{length}: one cloud that a network moves shares what every moment shows"),
+    )
 }
 
 /// Share of the pixels of fixed cameras that change from one of their frames to the next; `None`: no camera has two.
@@ -167,7 +170,7 @@ mod tests {
         is(Made::new(6, 10, 0, true), true, "still", "0.000 %");
         is(Made::new(6, 10, 4, true), true, "spacetime", "6 cameras");
         is(Made::new(1, 50, 4, true), false, "control", "one camera");
-        is(Made::new(1, 50, 4, false), false, "hexplane", "one camera");
-        is(Made::new(2, 700, 4, true), true, "hexplane", "of 700");
+        is(Made::new(1, 50, 4, false), false, "deform-mlp", "one camera");
+        is(Made::new(2, 700, 4, true), true, "deform-mlp", "of 700");
     }
 }

@@ -311,6 +311,9 @@ pub fn tuning(plan: &Plan) -> Result<Stage> {
     (stage.sh_interval, stage.half_size_steps) = (0, 0);
     (stage.start, stage.end) = (None, None);
     stage.switches.clear();
+    stage.time_noise = TimeNoise::default();
+    // What came in late in training is there by now.
+    stage.groups.iter_mut().for_each(|g| g.from = 0);
     Ok(stage)
 }
 

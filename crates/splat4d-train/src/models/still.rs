@@ -1,8 +1,7 @@
 //! `still`: one stage, every group of static 3DGS. Also the base that other programs add to.
 
 use super::{Group, Plan, Program, Rate, Stage, densify_of};
-use crate::densify::Crowding;
-use crate::densify::Relocate;
+use crate::densify::{Crowding, Relocate};
 use crate::loss::neighbourhood::{MotionWeights, Neighbourhood};
 use crate::loss::scene::{MeanOpacity, MeanScale, OpacityEntropy};
 use crate::loss::terms::{ParamLoss, ProbeLoss};

@@ -266,8 +266,10 @@ pub fn plan(capture: &Capture, recipe: &Recipe) -> Plan {
     times.sort_by(f64::total_cmp);
     times.dedup();
     let clip = [times[0], times[times.len() - 1]];
-    let fixed = |i: &usize| capture.cameras[capture.frames[*i].camera].fixed;
-    let views = |t: f64| capture.train.iter().filter(|i| capture.frames[**i].time.0 == t && fixed(i)).count();
+    let fixed = |i: &&usize| capture.cameras[capture.frames[**i].camera].fixed;
+    let mut seen: Vec<f64> = capture.train.iter().filter(fixed).map(|&i| capture.frames[i].time.0).collect();
+    seen.sort_by(f64::total_cmp);
+    let views = |t: f64| seen.partition_point(|s| *s <= t) - seen.partition_point(|s| *s < t);
     let moments = times.iter().map(|&t| (t, views(t))).collect();
     let centers: Vec<[f64; 3]> = capture.train.iter().map(|&i| capture.frames[i].view.center()).collect();
     Plan {

@@ -202,6 +202,13 @@ impl<'a> Trainer<'a> {
         self.stats.clear(&self.scene);
     }
 
+    /// Rows of the scene were edited: every loss is told, and what is derived of rows is made anew.
+    fn edited(&mut self) {
+        self.stages[self.progress.stage].on_edit();
+        self.stale = true;
+        self.fit_grads();
+    }
+
     fn fit_grads(&mut self) {
         self.grads = self.scene.layers.iter().map(|l| Grads::new(&l.params)).collect();
     }
@@ -458,9 +465,7 @@ impl<'a> Trainer<'a> {
         if let Some(adapt) = stage.adapt.as_ref().filter(|a| a.is_due(step)) {
             let rng = Rng::new(seed, "adapt", address);
             adapt.run(&mut self.scene, &mut self.moments, &mut self.stats, step, rng);
-            stage.params.iter().for_each(|l| l.on_edit());
-            self.stale = true;
-            self.grads = self.scene.layers.iter().map(|l| Grads::new(&l.params)).collect();
+            self.edited();
         }
         // Before densification, which begins the statistics anew.
         let placed = self.place(step)?;
@@ -491,9 +496,7 @@ impl<'a> Trainer<'a> {
                     );
                 }
             }
-            stage.on_edit();
-            self.stale = true;
-            self.fit_grads();
+            self.edited();
         }
         change.removed += self.prune(step)?;
         change.removed += self.uncrowd(step);
@@ -526,9 +529,7 @@ impl<'a> Trainer<'a> {
             change.added = guided.run(scene, moments, stats, limits, frames, antialias, seed, address)?.added;
         }
         if change != Change::default() {
-            stage.params.iter().for_each(|l| l.on_edit());
-            self.stale = true;
-            self.fit_grads();
+            self.edited();
         }
         Ok(change)
     }
@@ -543,8 +544,7 @@ impl<'a> Trainer<'a> {
         for (layer, edit) in prune(&self.scene, &scores, periodic.ratio).iter().enumerate() {
             densify::apply(&mut self.scene, &mut self.moments, &mut self.stats, layer, edit, &rng);
         }
-        self.stages[self.progress.stage].on_edit();
-        self.fit_grads();
+        self.edited();
         Ok(before - self.scene.len())
     }
 
@@ -559,12 +559,10 @@ impl<'a> Trainer<'a> {
         for layer in 0..self.scene.layers.len() {
             if let Some(edit) = rule.edit(&mut self.scene, layer) {
                 densify::apply(&mut self.scene, &mut self.moments, &mut self.stats, layer, &edit, &rng);
-                self.stale = true;
             }
         }
         if self.scene.len() < before {
-            self.stages[self.progress.stage].params.iter().for_each(|l| l.on_edit());
-            self.fit_grads();
+            self.edited();
         }
         before - self.scene.len()
     }
