@@ -185,9 +185,9 @@ recipe! {
     /// hexplane: colours do not change.
     no_dshs: bool = true,
     /// hexplane: rate of the planes at the start.
-    grid_lr_init: f64 = 6e-3,
+    grid_lr_init: f64 = 2e-2,
     /// hexplane: rate of the planes at the end.
-    grid_lr_final: f64 = 6e-4,
+    grid_lr_final: f64 = 2e-3,
     /// hexplane: rate of the networks at the start.
     deformation_lr_init: f64 = 1e-3,
     /// hexplane: rate of the networks at the end.
