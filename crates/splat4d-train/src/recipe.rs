@@ -324,7 +324,7 @@ recipe! {
     lambda_sparse: f64 = 0.0,
 
     // ssm.
-    /// ssm: ticks of the scan over the clip; 0: one every two distinct times, 16 to 96.
+    /// ssm: ticks of the scan over the clip; 0: one every ten distinct times, 16 to 96.
     ssm_ticks: usize = 0,
     /// ssm: channels.
     ssm_width: usize = 32,
@@ -341,13 +341,13 @@ recipe! {
     /// ssm: share of the iterations, from the first, in which nothing moves; nodes are placed after it.
     ssm_warm_up: f64 = 0.0,
     /// ssm: rate of the network's maps at the start.
-    ssm_lr_init: f64 = 1e-3,
+    ssm_lr_init: f64 = 5e-4,
     /// ssm: rate of the network's maps at the end.
     ssm_lr_final: f64 = 1e-5,
     /// ssm: rate of the state space's decays, frequencies and steps.
-    ssm_dynamics_lr: f64 = 1e-3,
+    ssm_dynamics_lr: f64 = 5e-4,
     /// ssm: rate of the nodes' embeddings.
-    ssm_embedding_lr: f64 = 5e-3,
+    ssm_embedding_lr: f64 = 3e-2,
 
     // filtered.
     /// filter: how prediction and the motion's answer merge: off, geodesic (a learnt share) or literal (as published).
