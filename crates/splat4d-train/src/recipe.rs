@@ -206,11 +206,11 @@ recipe! {
     /// tracked: share of the iterations that frame 0 gets; the other frames share the rest.
     first_share: f64 = 0.25,
     /// tracked: rate of a frame's positions at its first step, of the extent.
-    track_lr_init: f64 = 1e-3,
+    track_lr_init: f64 = 3e-3,
     /// tracked: rate of a frame's positions at its last step, of the extent.
-    track_lr_final: f64 = 1.6e-4,
+    track_lr_final: f64 = 4e-4,
     /// tracked: rate of a frame's quaternions.
-    track_rotation_lr: f64 = 2e-3,
+    track_rotation_lr: f64 = 6e-3,
     /// tracked: rate of base colours after frame 0. Colours are shared: frames tracked before change with them.
     track_feature_lr: f64 = 0.0,
     /// tracked: longest step that a Gaussian carries on to the next frame, of the extent.
