@@ -227,24 +227,28 @@ impl<F: Real, W: Work<F, N>, const N: usize> Kernel for Scatter<'_, F, W, N> {
     #[inline(always)]
     fn run<const FMA: bool>(mut self) -> f64 {
         let (first, end) = (self.views[0].first, self.views[0].first + self.views[0].rows);
-        let Rows::Some(ids) = self.rows else {
-            let mut sum = 0.0;
-            for b in first / BLOCK..end.div_ceil(BLOCK) {
-                let span = Span::block(b);
-                let batch = Batch::new(span, span, each(|l| span.row(l) < end));
-                sum += self.work.run(&batch, &mut self.views);
-            }
-            return sum;
-        };
-        let mut j = ids.partition_point(|&i| (i as usize) < first);
-        let to = ids.partition_point(|&i| (i as usize) < end);
-        let dense = (to - j) * DENSE >= end - first;
         let mut sum = 0.0;
-        while j < to {
-            let batch = if dense { block_batch(&ids[..to], &mut j) } else { loose_batch(&ids[..to], &mut j) };
-            sum += self.work.run(&batch, &mut self.views);
-        }
+        each_batch(self.rows, first, end, |batch| sum += self.work.run(batch, &mut self.views));
         sum
+    }
+}
+
+/// Calls `work` with all batches of the asked rows among `first..end`, where `first` is that of a block.
+#[inline(always)]
+pub fn each_batch(rows: Rows<'_>, first: usize, end: usize, mut work: impl FnMut(&Batch)) {
+    let Rows::Some(ids) = rows else {
+        for b in first / BLOCK..end.div_ceil(BLOCK) {
+            let span = Span::block(b);
+            work(&Batch::new(span, span, each(|l| span.row(l) < end)));
+        }
+        return;
+    };
+    let mut j = ids.partition_point(|&i| (i as usize) < first);
+    let to = ids.partition_point(|&i| (i as usize) < end);
+    let dense = (to - j) * DENSE >= end - first;
+    while j < to {
+        let batch = if dense { block_batch(&ids[..to], &mut j) } else { loose_batch(&ids[..to], &mut j) };
+        work(&batch);
     }
 }
 

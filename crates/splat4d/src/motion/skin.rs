@@ -24,12 +24,13 @@ mod weights;
 pub use blend::node_frame;
 pub use weights::{Weights, farthest_points};
 
+use super::lanes::fill;
 use super::{At, Cache, Motion, Slot, Spec, Tape, fill_rows};
 use crate::math::knn::mean_square_distance;
 use crate::math::{Real, Rng};
 use crate::scene::{GEOMETRY, Grads, Key, Params, RowEdit, Rows, Space, SplatGrads, Table, Time};
 use crate::{Error, Result};
-use blend::{FRAME, Frames};
+use blend::Frames;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
@@ -344,7 +345,8 @@ impl<F: Real> Motion<F> for Skinned<F> {
             fill_rows(&mut tape.out, q.rows, |id| frames.splat(&q.p[self.skin.nodes], id));
             return;
         }
-        fill_rows(&mut tape.out, q.rows, |id| blend::forward(self.skin.mask, q.p, &c.weights, frames, id));
+        let ask = blend::Ask { skin: &self.skin, p: q.p, weights: &c.weights, frames };
+        fill(&ask, [&mut tape.out], q.rows);
     }
 
     fn backward(
@@ -378,7 +380,7 @@ impl<F: Real> Motion<F> for Skinned<F> {
             let [d_nodes] = d.of([self.skin.nodes]);
             frames.backward(&d_frames, &mut d_poses, d_nodes);
         }
-        debug_assert!(frames.len() == count * FRAME, "a frame a node");
+        debug_assert!(frames.len() == count, "a frame a node");
         self.trajectory.poses_backward(q.p, q.t, &c.trajectory, &d_poses, &mut pending.trajectory, d)
     }
 

@@ -1,31 +1,41 @@
 //! Linear blend skinning of a cloud at one time, and its VJP.
+//!
+//! A node's rigid motion is sixteen numbers, one register or two: R (9, rows), c = p + T − R p (3), and R's unit quaternion
+//! (4). A Gaussian blends the numbers of its nodes and goes to M x + c with the blend; it is node by node only that sums are
+//! made, and all else is done for sixteen Gaussians at a time.
 
 use super::{POSE, Skin, Weights};
 use crate::math::{Real, quat};
-use crate::motion::still::{activate, activate_backward};
+use crate::motion::lanes::{Batch, Lane, Work, each_batch};
+use crate::motion::still::{activate_backward_lanes, activate_lanes};
 use crate::scene::params::QUAT;
 use crate::scene::splats::COV;
 use crate::scene::table::TableMut;
-use crate::scene::{BLOCK, GEOMETRY, Grads, Key, Params, Rows, Table};
+use crate::scene::{BLOCK, GEOMETRY, Grads, Params, Rows, Table};
+use crate::simd::{Kernel, Simd, dispatch, each};
 use rayon::prelude::*;
 
-/// Numbers of a node's frame: R 9 (rows), p + T 3, unit quaternion 4, p 3, the raw quaternion's norm.
-pub(super) const FRAME: usize = 20;
-/// Where the parts of a frame begin.
-const TARGET: usize = 9;
+/// Numbers of a rigid motion.
+const FRAME: usize = 16;
+/// Where c begins.
+const SHIFT: usize = 9;
+/// Where the quaternion begins.
 const TURN: usize = 12;
-const REST: usize = 16;
-const NORM: usize = 19;
-/// Numbers of a frame that have a gradient of their own: R, p + T, quaternion.
-const LEARNT: usize = 16;
 /// Rows a task takes at least.
 const TASK_ROWS: usize = 1024;
 /// A task's rows a node at least: then adding up all tasks' gradients to nodes is a small part of the work.
 const TASK_ROWS_A_NODE: usize = 4;
 
-/// The nodes' rigid motions at one time, row-major [nodes, 20].
+/// A rigid motion.
+type Frame<F> = [F; FRAME];
+
+/// The nodes' rigid motions at one time.
 #[derive(Default)]
-pub(super) struct Frames<F>(Vec<F>);
+pub(super) struct Frames<F> {
+    of: Vec<Frame<F>>,
+    /// p, p + T, and the norm of the raw quaternion.
+    rest: Vec<([F; 3], [F; 3], F)>,
+}
 
 /// Position and rotation (rows) of a node of pose (shift 3, quaternion residual 4) at rest position `rest`.
 pub fn node_frame<F: Real>(rest: [F; 3], pose: [F; POSE]) -> ([F; 3], [[F; 3]; 3]) {
@@ -34,35 +44,34 @@ pub fn node_frame<F: Real>(rest: [F; 3], pose: [F; POSE]) -> ([F; 3], [[F; 3]; 3
 }
 
 impl<F: Real> Frames<F> {
-    /// Numbers held.
+    /// Nodes.
     pub(super) fn len(&self) -> usize {
-        self.0.len()
+        self.of.len()
     }
 
     pub(super) fn fill(&mut self, nodes: &Table<F>, poses: &Table<F>) {
-        self.0.clear();
+        self.of.clear();
+        self.rest.clear();
         for k in 0..nodes.rows() {
             let (pose, rest) = (poses.read::<POSE>(k, 0), nodes.read::<3>(k, 0));
             let (unit, norm) = quat::normalize([F::ONE + pose[3], pose[4], pose[5], pose[6]]);
-            self.0.extend(quat::to_rotation(unit).as_flattened());
-            self.0.extend((0..3).map(|a| rest[a] + pose[a]));
-            self.0.extend(unit);
-            self.0.extend(rest);
-            self.0.push(norm);
+            let r = quat::to_rotation(unit);
+            let target: [F; 3] = each(|a| rest[a] + pose[a]);
+            self.of.push(each(|i| match i {
+                TURN.. => unit[i - TURN],
+                SHIFT.. => target[i - SHIFT] - (0..3).map(|j| r[i - SHIFT][j] * rest[j]).sum(),
+                _ => r[i / 3][i % 3],
+            }));
+            self.rest.push((rest, target, norm));
         }
-    }
-
-    #[inline(always)]
-    fn of(&self, node: usize) -> &[F; FRAME] {
-        self.0[node * FRAME..].first_chunk().expect("a frame a node")
     }
 
     /// A node as a splat.
     pub(super) fn splat(&self, nodes: &Table<F>, id: usize) -> [F; 10] {
-        let f = self.of(id);
+        let (_, x, _) = self.rest[id];
         let [log_radius, logit] = nodes.read::<2>(id, super::NODE_LOG_RADIUS);
         let (v, z) = ((F::TWO * log_radius).exp(), F::ZERO);
-        [f[TARGET], f[TARGET + 1], f[TARGET + 2], v, z, z, v, z, v, logit.sigmoid()]
+        [x[0], x[1], x[2], v, z, z, v, z, v, logit.sigmoid()]
     }
 
     /// The gradient of [`splat`](Self::splat) to the node's first five columns; its shift gets that of the mean too.
@@ -73,28 +82,22 @@ impl<F: Real> Frames<F> {
         [g[0], g[1], g[2], F::TWO * v * (g[COV] + g[COV + 3] + g[COV + 5]), g[9] * o * (F::ONE - o)]
     }
 
-    /// From gradients of frames, [nodes, 16], to poses and rest positions.
-    pub(super) fn backward(&self, d_frames: &[F], d_poses: &mut Table<F>, d_nodes: &mut Table<F>) {
-        for (k, g) in d_frames.as_chunks::<LEARNT>().0.iter().enumerate() {
-            let f = self.of(k);
-            let unit: [F; 4] = std::array::from_fn(|i| f[TURN + i]);
-            let through = quat::to_rotation_backward(unit, rows(g));
-            let d_unit = std::array::from_fn(|i| g[TURN + i] + through[i]);
-            let d_turn = quat::normalize_backward(unit, f[NORM], d_unit);
-            let d_target: [F; 3] = std::array::from_fn(|i| g[TARGET + i]);
-            d_poses.add(k, 0, d_target);
-            d_poses.add(k, 3, d_turn);
-            // p stands in the target and, turned, in the arm x − p.
-            let r = rows(f);
-            let d_rest = |i: usize| d_target[i] - (0..3).map(|j| r[j][i] * d_target[j]).sum();
-            d_nodes.add(k, 0, std::array::from_fn::<F, 3, _>(d_rest));
+    /// From gradients of frames to poses and rest positions.
+    pub(super) fn backward(&self, d_frames: &[Frame<F>], d_poses: &mut Table<F>, d_nodes: &mut Table<F>) {
+        for (k, g) in d_frames.iter().enumerate() {
+            let (f, (rest, _, norm)) = (&self.of[k], self.rest[k]);
+            let d_shift: [F; 3] = each(|i| g[SHIFT + i]);
+            // c = p + T − R p
+            let d_r: [[F; 3]; 3] = each(|i| each(|j| g[3 * i + j] - d_shift[i] * rest[j]));
+            let unit: [F; 4] = each(|i| f[TURN + i]);
+            let through = quat::to_rotation_backward(unit, d_r);
+            let d_unit = each(|i| g[TURN + i] + through[i]);
+            d_poses.add(k, 0, d_shift);
+            d_poses.add(k, 3, quat::normalize_backward(unit, norm, d_unit));
+            let d_rest = |j: usize| d_shift[j] - (0..3).map(|i| f[3 * i + j] * d_shift[i]).sum();
+            d_nodes.add(k, 0, each::<F, 3>(d_rest));
         }
     }
-}
-
-#[inline(always)]
-fn rows<F: Real, const N: usize>(f: &[F; N]) -> [[F; 3]; 3] {
-    [[f[0], f[1], f[2]], [f[3], f[4], f[5]], [f[6], f[7], f[8]]]
 }
 
 /// a ⊗ b
@@ -113,65 +116,6 @@ fn conjugate<F: Real>(q: [F; 4]) -> [F; 4] {
     [q[0], -q[1], -q[2], -q[3]]
 }
 
-/// A Gaussian where its nodes bring it.
-struct Moved<F> {
-    /// The learnable row, moved.
-    row: [F; 11],
-    /// Where it would go without a mask.
-    mean: [F; 3],
-    /// The blended quaternion before it is masked, and the signs that aligned it.
-    turn: [F; 4],
-    signs: [F; super::MAX_NEIGHBOURS],
-    /// The quaternion that turns it, and the norm of what that was made from.
-    unit: [F; 4],
-    norm: F,
-    /// The mask.
-    mask: F,
-}
-
-#[inline(always)]
-fn moved<F: Real>(mask: Key, p: &Params<F>, w: &Weights<F>, frames: &Frames<F>, id: usize) -> Moved<F> {
-    let mut row = p[GEOMETRY].read::<11>(id, 0);
-    let x = [row[0], row[1], row[2]];
-    let (nodes, a) = w.row(id);
-    let (mut mean, mut turn) = ([F::ZERO; 3], [F::ZERO; 4]);
-    let mut signs = [F::ONE; super::MAX_NEIGHBOURS];
-    if nodes.is_empty() {
-        (mean, turn) = (x, [F::ONE, F::ZERO, F::ZERO, F::ZERO]);
-    }
-    for (k, (&node, &a)) in nodes.iter().zip(a).enumerate() {
-        let f = frames.of(node as usize);
-        let arm: [F; 3] = std::array::from_fn(|i| x[i] - f[REST + i]);
-        for i in 0..3 {
-            mean[i] += a * (f[3 * i] * arm[0] + f[3 * i + 1] * arm[1] + f[3 * i + 2] * arm[2] + f[TARGET + i]);
-        }
-        // q and −q are one rotation: all must point the way of the first.
-        let along: F = (0..4).map(|i| f[TURN + i] * turn[i]).sum();
-        signs[k] = if along < F::ZERO { -F::ONE } else { F::ONE };
-        for i in 0..4 {
-            turn[i] += signs[k] * a * f[TURN + i];
-        }
-    }
-    let (mut m, mut masked) = (F::ONE, turn);
-    if p[mask].width() > 0 {
-        m = p[mask].get(id, 0).sigmoid();
-        masked = turn.map(|t| m * t);
-        masked[0] += F::ONE - m;
-    }
-    let (unit, norm) = quat::normalize(masked);
-    for i in 0..3 {
-        row[i] = x[i] + m * (mean[i] - x[i]);
-    }
-    let q = product(unit, [row[QUAT], row[QUAT + 1], row[QUAT + 2], row[QUAT + 3]]);
-    row[QUAT..QUAT + 4].copy_from_slice(&q);
-    Moved { row, mean, turn, signs, unit, norm, mask: m }
-}
-
-/// Gaussian `id` as a splat.
-pub(super) fn forward<F: Real>(mask: Key, p: &Params<F>, w: &Weights<F>, frames: &Frames<F>, id: usize) -> [F; 10] {
-    activate(moved(mask, p, w, frames, id).row)
-}
-
 /// One question about Gaussians.
 pub(super) struct Ask<'a, F> {
     pub skin: &'a Skin,
@@ -180,12 +124,111 @@ pub(super) struct Ask<'a, F> {
     pub frames: &'a Frames<F>,
 }
 
+/// Sixteen Gaussians where their nodes bring them.
+struct Moved<F> {
+    /// The learnable rows as they rest, and moved.
+    rest: [Lane<F>; 11],
+    rows: [Lane<F>; 11],
+    /// The nodes' frames, blended, and the signs by which their quaternions were aligned.
+    blend: [Lane<F>; FRAME],
+    signs: [[F; super::MAX_NEIGHBOURS]; BLOCK],
+    /// How far they would go without a mask.
+    away: [Lane<F>; 3],
+    /// The quaternions that turn them, and the norms of what those were made from.
+    unit: [Lane<F>; 4],
+    norm: Lane<F>,
+    mask: Lane<F>,
+}
+
+/// What a node's numbers count in a blend: a, and s·a for the quaternion.
+#[inline(always)]
+fn counts<F: Real>(a: F, sign: F) -> Frame<F> {
+    each(|i| if i < TURN { a } else { sign * a })
+}
+
 impl<F: Real> Ask<'_, F> {
-    /// Adds gradients of geometry and mask to `d` and of weights to `d_weights`; returns those of frames, [nodes, 16].
+    /// The blend of one Gaussian's nodes, and the signs.
+    #[inline(always)]
+    fn blend(&self, id: usize) -> (Frame<F>, [F; super::MAX_NEIGHBOURS]) {
+        let (nodes, a) = self.weights.row(id);
+        let mut signs = [F::ONE; super::MAX_NEIGHBOURS];
+        let mut sum = [F::ZERO; FRAME];
+        if nodes.is_empty() {
+            // The identity.
+            for i in [0, 4, 8, TURN] {
+                sum[i] = F::ONE;
+            }
+        }
+        for (k, (&node, &a)) in nodes.iter().zip(a).enumerate() {
+            let f = &self.frames.of[node as usize];
+            // q and −q are one rotation: all must point the way of the first.
+            let along: F = (TURN..FRAME).map(|i| f[i] * sum[i]).sum();
+            signs[k] = if along < F::ZERO { -F::ONE } else { F::ONE };
+            let count = counts(a, signs[k]);
+            for i in 0..FRAME {
+                sum[i] += count[i] * f[i];
+            }
+        }
+        (sum, signs)
+    }
+
+    #[inline(always)]
+    fn moved(&self, batch: &Batch) -> Moved<F> {
+        let rest: [Lane<F>; 11] = batch.ids.read(&self.p[GEOMETRY], 0);
+        let mut blend = [[F::ZERO; BLOCK]; FRAME];
+        let mut signs = [[F::ONE; super::MAX_NEIGHBOURS]; BLOCK];
+        for l in 0..BLOCK {
+            if batch.live[l] {
+                let (frame, sign) = self.blend(batch.ids.row(l));
+                signs[l] = sign;
+                for i in 0..FRAME {
+                    blend[i][l] = frame[i];
+                }
+            }
+        }
+        let logits = &self.p[self.skin.mask];
+        let mut mask = [F::ONE; BLOCK];
+        if logits.width() > 0 {
+            let [logit] = batch.ids.read::<F, 1>(logits, 0);
+            mask = each(|l| logit[l].sigmoid());
+        }
+        let (mut rows, mut away) = (rest, [[F::ZERO; BLOCK]; 3]);
+        let (mut unit, mut norm) = ([[F::ZERO; BLOCK]; 4], [F::ZERO; BLOCK]);
+        for l in 0..BLOCK {
+            let (x, m) = ([rest[0][l], rest[1][l], rest[2][l]], mask[l]);
+            for i in 0..3 {
+                let row = [blend[3 * i][l], blend[3 * i + 1][l], blend[3 * i + 2][l]];
+                away[i][l] = row[0] * x[0] + row[1] * x[1] + row[2] * x[2] + blend[SHIFT + i][l] - x[i];
+                rows[i][l] = x[i] + m * away[i][l];
+            }
+            let turn = [
+                m * blend[TURN][l] + (F::ONE - m),
+                m * blend[TURN + 1][l],
+                m * blend[TURN + 2][l],
+                m * blend[TURN + 3][l],
+            ];
+            let (u, n) = quat::normalize(turn);
+            let q = product(u, [rest[QUAT][l], rest[QUAT + 1][l], rest[QUAT + 2][l], rest[QUAT + 3][l]]);
+            for i in 0..4 {
+                unit[i][l] = u[i];
+                rows[QUAT + i][l] = q[i];
+            }
+            norm[l] = n;
+        }
+        Moved { rest, rows, blend, signs, away, unit, norm, mask }
+    }
+
+    /// Adds gradients of geometry and mask to `d` and of weights to `d_weights`; returns those of frames.
     ///
     /// Tasks take rows in runs whose length depends on sizes alone, and their node gradients are added in order.
-    pub(super) fn backward(&self, asked: Rows<'_>, d_out: &Table<F>, d_weights: &mut [F], d: &mut Grads<F>) -> Vec<F> {
-        let nodes = self.p[self.skin.nodes].rows();
+    pub(super) fn backward(
+        &self,
+        asked: Rows<'_>,
+        d_out: &Table<F>,
+        d_weights: &mut [F],
+        d: &mut Grads<F>,
+    ) -> Vec<Frame<F>> {
+        let nodes = self.frames.len();
         let blocks = task_rows(nodes) / BLOCK;
         let width = self.weights.neighbours();
         let [d_geometry, d_mask] = d.of([GEOMETRY, self.skin.mask]);
@@ -193,89 +236,111 @@ impl<F: Real> Ask<'_, F> {
         // Without nodes there are no weights to share out.
         let mut shares: Vec<&mut [F]> = d_weights.chunks_mut((blocks * BLOCK * width).max(1)).collect();
         shares.resize_with(views.len(), Default::default);
-        let parts: Vec<Vec<F>> = views
+        let simd = Simd::detect();
+        let parts: Vec<Vec<Frame<F>>> = views
             .into_par_iter()
             .zip(shares)
-            .map(|(views, share)| self.task(asked, d_out, views, share, nodes))
+            .map(|(views, d_weights)| {
+                let mut sums = vec![[F::ZERO; FRAME]; nodes];
+                dispatch(simd, Back { ask: self, asked, d_out, views, d_weights, sums: &mut sums });
+                sums
+            })
             .collect();
-        sum_parts(parts, nodes * LEARNT)
+        sum_parts(parts, nodes)
     }
+}
 
-    fn task(
-        &self,
-        asked: Rows<'_>,
-        d_out: &Table<F>,
-        (mut d_geometry, mut d_mask): (TableMut<'_, F>, TableMut<'_, F>),
-        d_weights: &mut [F],
-        nodes: usize,
-    ) -> Vec<F> {
-        let mut sums = vec![F::ZERO; nodes * LEARNT];
-        let (first, end) = (d_geometry.first, d_geometry.first + d_geometry.rows);
-        let (from, to) = match asked {
-            Rows::All => (first, end),
-            Rows::Some(ids) => {
-                (ids.partition_point(|&i| (i as usize) < first), ids.partition_point(|&i| (i as usize) < end))
-            }
-        };
-        let width = self.weights.neighbours();
-        for j in from..to {
-            let id = asked.id(j);
-            let m = moved(self.skin.mask, self.p, self.weights, self.frames, id);
-            let own = (id - first) * width;
-            let (d_row, d_m) = self.row(id, &m, d_out.read(j, 0), &mut d_weights[own..own + width], &mut sums);
-            d_geometry.add(id, 0, d_row);
-            if d_mask.width > 0 {
-                d_mask.add(id, 0, [d_m]);
-            }
-        }
-        sums
-    }
-
-    /// The gradient of one Gaussian: to its learnable row and its mask's logit; adds to its weights and the nodes.
+impl<F: Real> Work<F, 1> for Ask<'_, F> {
     #[inline(always)]
-    fn row(&self, id: usize, m: &Moved<F>, g: [F; 10], d_weights: &mut [F], sums: &mut [F]) -> ([F; 11], F) {
-        let raw = self.p[GEOMETRY].read::<11>(id, 0);
-        let mut d = activate_backward(m.row, g);
-        // q(t) = u ⊗ q, so that dq = ū ⊗ g and du = g ⊗ q̄.
-        let d_q = [d[QUAT], d[QUAT + 1], d[QUAT + 2], d[QUAT + 3]];
-        let q = [raw[QUAT], raw[QUAT + 1], raw[QUAT + 2], raw[QUAT + 3]];
-        d[QUAT..QUAT + 4].copy_from_slice(&product(conjugate(m.unit), d_q));
-        let d_masked = quat::normalize_backward(m.unit, m.norm, product(d_q, conjugate(q)));
-        let d_turn = d_masked.map(|x| m.mask * x);
-        let d_mean = [d[0], d[1], d[2]];
-        let mut d_m: F = (0..3).map(|i| d_mean[i] * (m.mean[i] - raw[i])).sum();
-        d_m += (0..4).map(|i| d_masked[i] * m.turn[i]).sum::<F>() - d_masked[0];
-        let d_blend = d_mean.map(|x| m.mask * x);
-        let (nodes, a) = self.weights.row(id);
-        let mut d_x: [F; 3] = std::array::from_fn(|i| d_mean[i] - d_blend[i]);
-        if nodes.is_empty() {
-            d_x = d_mean;
-        }
-        for (k, (&node, &a)) in nodes.iter().zip(a).enumerate() {
-            let f = self.frames.of(node as usize);
-            let sum: &mut [F; LEARNT] = sums[node as usize * LEARNT..].first_chunk_mut().expect("a gradient a node");
-            let arm: [F; 3] = std::array::from_fn(|i| raw[i] - f[REST + i]);
-            let pull = d_blend.map(|x| a * x);
-            let mut d_a = F::ZERO;
-            for i in 0..3 {
-                let turned = f[3 * i] * arm[0] + f[3 * i + 1] * arm[1] + f[3 * i + 2] * arm[2];
-                d_a += d_blend[i] * (turned + f[TARGET + i]);
-                for c in 0..3 {
-                    sum[3 * i + c] += pull[i] * arm[c];
-                    d_x[c] += pull[i] * f[3 * i + c];
-                }
-                sum[TARGET + i] += pull[i];
-            }
-            for i in 0..4 {
-                let signed = m.signs[k] * d_turn[i];
-                d_a += signed * f[TURN + i];
-                sum[TURN + i] += a * signed;
-            }
-            d_weights[k] += d_a;
-        }
-        d[..3].copy_from_slice(&d_x);
-        (d, d_m * m.mask * (F::ONE - m.mask))
+    fn run(&self, batch: &Batch, [out]: &mut [TableMut<'_, F>; 1]) -> f64 {
+        batch.write(out, 0, &activate_lanes(&self.moved(batch).rows));
+        0.0
     }
+}
+
+/// The VJP of one task's rows.
+struct Back<'a, F> {
+    ask: &'a Ask<'a, F>,
+    asked: Rows<'a>,
+    d_out: &'a Table<F>,
+    /// Of the geometry and of the masks.
+    views: (TableMut<'a, F>, TableMut<'a, F>),
+    d_weights: &'a mut [F],
+    sums: &'a mut [Frame<F>],
+}
+
+impl<F: Real> Kernel for Back<'_, F> {
+    type Out = ();
+    #[inline(always)]
+    fn run<const FMA: bool>(mut self) {
+        let (first, end) = (self.views.0.first, self.views.0.first + self.views.0.rows);
+        each_batch(self.asked, first, end, |batch| {
+            let m = self.ask.moved(batch);
+            let mut d = activate_backward_lanes(&m.rows, &batch.at.read(self.d_out, 0));
+            let mut d_blend = [[F::ZERO; BLOCK]; FRAME];
+            let mut d_mask = [F::ZERO; BLOCK];
+            for l in 0..BLOCK {
+                // q(t) = u ⊗ q, so that dq = ū ⊗ g and du = g ⊗ q̄.
+                let d_q = [d[QUAT][l], d[QUAT + 1][l], d[QUAT + 2][l], d[QUAT + 3][l]];
+                let q = [m.rest[QUAT][l], m.rest[QUAT + 1][l], m.rest[QUAT + 2][l], m.rest[QUAT + 3][l]];
+                let unit = [m.unit[0][l], m.unit[1][l], m.unit[2][l], m.unit[3][l]];
+                let d_rest = product(conjugate(unit), d_q);
+                let d_turn = quat::normalize_backward(unit, m.norm[l], product(d_q, conjugate(q)));
+                let (mask, mut d_m) = (m.mask[l], -d_turn[0]);
+                for i in 0..4 {
+                    d[QUAT + i][l] = d_rest[i];
+                    d_m += d_turn[i] * m.blend[TURN + i][l];
+                    d_blend[TURN + i][l] = mask * d_turn[i];
+                }
+                let d_mean = [d[0][l], d[1][l], d[2][l]];
+                for i in 0..3 {
+                    d_m += d_mean[i] * m.away[i][l];
+                    let pull = mask * d_mean[i];
+                    d_blend[SHIFT + i][l] = pull;
+                    d[i][l] -= pull;
+                    for c in 0..3 {
+                        d_blend[3 * i + c][l] = pull * m.rest[c][l];
+                    }
+                }
+                for i in 0..3 {
+                    for c in 0..3 {
+                        d[c][l] += d_blend[SHIFT + i][l] * m.blend[3 * i + c][l];
+                    }
+                }
+                d_mask[l] = d_m * mask * (F::ONE - mask);
+            }
+            for l in (0..BLOCK).filter(|&l| batch.live[l]) {
+                let id = batch.ids.row(l);
+                let g: Frame<F> = each(|i| d_blend[i][l]);
+                let (nodes, a) = self.ask.weights.row(id);
+                let own = &mut self.d_weights[(id - first) * nodes.len()..][..nodes.len()];
+                for (k, (&node, &a)) in nodes.iter().zip(a).enumerate() {
+                    let (f, sum) = (&self.ask.frames.of[node as usize], &mut self.sums[node as usize]);
+                    let count = counts(a, m.signs[l][k]);
+                    for i in 0..FRAME {
+                        sum[i] += count[i] * g[i];
+                    }
+                    let sides = counts(F::ONE, m.signs[l][k]);
+                    own[k] += total(each(|i| sides[i] * f[i] * g[i]));
+                }
+            }
+            batch.add(&mut self.views.0, 0, &d);
+            if self.views.1.width > 0 {
+                batch.add(&mut self.views.1, 0, &[d_mask]);
+            }
+        });
+    }
+}
+
+/// The sum of sixteen numbers, as a tree.
+#[inline(always)]
+pub(super) fn total<F: Real>(mut x: [F; 16]) -> F {
+    for half in [8, 4, 2, 1] {
+        for i in 0..half {
+            x[i] += x[i + half];
+        }
+    }
+    x[0]
 }
 
 /// Rows of one task: a function of sizes alone.
@@ -284,11 +349,11 @@ pub(super) fn task_rows(nodes: usize) -> usize {
 }
 
 /// Adds up the tasks' results in order.
-pub(super) fn sum_parts<F: Real>(parts: Vec<Vec<F>>, len: usize) -> Vec<F> {
+pub(super) fn sum_parts<F: Real>(parts: Vec<Vec<[F; 16]>>, len: usize) -> Vec<[F; 16]> {
     let mut parts = parts.into_iter();
-    let mut sum = parts.next().unwrap_or_else(|| vec![F::ZERO; len]);
+    let mut sum = parts.next().unwrap_or_else(|| vec![[F::ZERO; 16]; len]);
     for part in parts {
-        sum.iter_mut().zip(part).for_each(|(s, x)| *s += x);
+        sum.as_flattened_mut().iter_mut().zip(part.as_flattened()).for_each(|(s, x)| *s += *x);
     }
     sum
 }

@@ -9,9 +9,10 @@
 //! (nearly) zero: no cracks open where neighbours switch (the reference cuts off sharply). Σ a = 1 exactly as the sum of
 //! quotients, and ε keeps the sum above zero where K + 1 nodes pull alike.
 
-use super::blend::{sum_parts, task_rows};
-use super::{MAX_HYPER, MAX_NEIGHBOURS, NODE_HYPER, NODE_LOG_RADIUS, Skin};
+use super::blend::{sum_parts, task_rows, total};
+use super::{MAX_HYPER, MAX_NEIGHBOURS, NODE_HYPER, NODE_LOG_RADIUS, SPARE_CANDIDATES, Skin};
 use crate::math::Real;
+use crate::scene::table::TableMut;
 use crate::scene::{BLOCK, GEOMETRY, Grads, Params, Table};
 use crate::simd::{Kernel, Simd, dispatch, each};
 use rayon::prelude::*;
@@ -20,10 +21,13 @@ use rayon::prelude::*;
 const FLOOR: f64 = 1e-6;
 /// Energy of what is infinitely far: finite also in f32, so that differences are.
 const FAR: f64 = 1e30;
-/// Coordinates of the metric at most: position and hyper coordinates.
-const MAX_COORDINATES: usize = 3 + MAX_HYPER;
-/// Numbers of a node before its coordinates: 1/(2r²), −ln sigmoid(w).
-const HEAD: usize = 2;
+/// Numbers that are worked on together; a node's and a Gaussian's coordinates are padded with zeros to whole runs.
+const RUN: usize = 16;
+/// Runs of coordinates at most: position and hyper coordinates.
+const MAX_RUNS: usize = (3 + MAX_HYPER).div_ceil(RUN);
+/// Candidates at most, and more.
+const MAX_LIST: usize = 16;
+const _: () = assert!(MAX_NEIGHBOURS + SPARE_CANDIDATES <= MAX_LIST, "a list fits into one run");
 
 /// The weights of all Gaussians.
 #[derive(Clone, Debug, Default)]
@@ -37,46 +41,50 @@ pub struct Weights<F> {
     values: Vec<F>,
 }
 
-/// Nodes as rows: 1/(2r²), −ln sigmoid(w), coordinates.
+/// Nodes as rows of runs: [1/(2r²), −ln sigmoid(w), 0 …], then their coordinates.
 struct NodeRows<F> {
+    coordinates: usize,
     width: usize,
-    data: Vec<F>,
+    data: Vec<[F; RUN]>,
 }
 
 impl<F: Real> NodeRows<F> {
     fn new(table: &Table<F>) -> Self {
-        let width = HEAD + 3 + table.width() - NODE_HYPER;
-        let mut data = Vec::with_capacity(width * table.rows());
-        for k in 0..table.rows() {
+        let coordinates = 3 + table.width() - NODE_HYPER;
+        let width = 1 + coordinates.div_ceil(RUN);
+        let mut data = vec![[F::ZERO; RUN]; width * table.rows()];
+        for (k, row) in data.chunks_exact_mut(width).enumerate() {
             let [log_radius, logit] = table.read::<2>(k, NODE_LOG_RADIUS);
-            data.push(F::HALF * (-F::TWO * log_radius).exp());
-            data.push(softplus(-logit));
-            data.extend((0..3).map(|c| table.get(k, c)));
-            data.extend((NODE_HYPER..table.width()).map(|c| table.get(k, c)));
+            row[0][0] = F::HALF * (-F::TWO * log_radius).exp();
+            row[0][1] = softplus(-logit);
+            for c in 0..coordinates {
+                row[1 + c / RUN][c % RUN] = table.get(k, if c < 3 { c } else { NODE_HYPER + c - 3 });
+            }
         }
-        Self { width, data }
+        Self { coordinates, width, data }
     }
 
     #[inline(always)]
-    fn of(&self, node: usize) -> &[F] {
+    fn of(&self, node: usize) -> &[[F; RUN]] {
         &self.data[node * self.width..(node + 1) * self.width]
     }
 
     /// d² of a point.
     #[inline(always)]
-    fn square(&self, node: usize, x: &[F]) -> F {
-        let coordinates = &self.of(node)[HEAD..];
-        let mut sum = F::ZERO;
-        for (a, b) in x.iter().zip(coordinates) {
-            sum += (*a - *b) * (*a - *b);
+    fn square(&self, node: usize, x: &[[F; RUN]]) -> F {
+        let mut sum = [F::ZERO; RUN];
+        for (x, p) in x.iter().zip(&self.of(node)[1..]) {
+            for c in 0..RUN {
+                sum[c] += (x[c] - p[c]) * (x[c] - p[c]);
+            }
         }
-        sum
+        total(sum)
     }
 
     /// e of a point; a number that is not finite counts as infinitely far.
     #[inline(always)]
-    fn energy(&self, node: usize, x: &[F]) -> F {
-        let head = self.of(node);
+    fn energy(&self, node: usize, x: &[[F; RUN]]) -> F {
+        let head = &self.of(node)[0];
         let e = self.square(node, x) * head[0] + head[1];
         if e < F::of(FAR) { e } else { F::of(FAR) }
     }
@@ -87,16 +95,26 @@ fn softplus<F: Real>(x: F) -> F {
     x.max(F::ZERO) + (F::ONE + (-x.abs()).exp()).ln()
 }
 
-/// Position and hyper coordinates of a Gaussian.
+/// Position and hyper coordinates of a Gaussian, in runs.
 #[inline(always)]
-fn coordinates<'a, F: Real>(skin: &Skin, p: &Params<F>, id: usize, into: &'a mut [F; MAX_COORDINATES]) -> &'a [F] {
-    into[..3].copy_from_slice(&p[GEOMETRY].read::<3>(id, 0));
+fn coordinates<'a, F: Real>(
+    skin: &Skin,
+    p: &Params<F>,
+    id: usize,
+    into: &'a mut [[F; RUN]; MAX_RUNS],
+) -> &'a [[F; RUN]] {
     let hyper = &p[skin.hyper];
+    let into = &mut into[..(3 + hyper.width()).div_ceil(RUN)];
+    let x = p[GEOMETRY].read::<3>(id, 0);
+    into[0][..3].copy_from_slice(&x);
     for c in 0..hyper.width() {
-        into[3 + c] = hyper.get(id, c);
+        into[(3 + c) / RUN][(3 + c) % RUN] = hyper.get(id, c);
     }
-    &into[..3 + hyper.width()]
+    into
 }
+
+/// The strongest nodes of a Gaussian: energies and numbers, ordered; more than are asked for mean nothing.
+type Best<F> = ([F; MAX_LIST], [u32; MAX_LIST]);
 
 impl<F: Real> Weights<F> {
     /// Nodes that count a Gaussian: K, or all where there are fewer.
@@ -122,20 +140,11 @@ impl<F: Real> Weights<F> {
         if count == 0 {
             return;
         }
-        let nodes = NodeRows::new(&p[skin.nodes]);
+        let (nodes, simd) = (NodeRows::new(&p[skin.nodes]), Simd::detect());
         let run = task_rows(count);
         let tasks = self.nodes.par_chunks_mut(run * n).zip(self.values.par_chunks_mut(run * k)).enumerate();
         tasks.for_each(|(task, (ids, values))| {
-            let mut x = [F::ZERO; MAX_COORDINATES];
-            for (i, (ids, values)) in ids.chunks_exact_mut(n).zip(values.chunks_exact_mut(k)).enumerate() {
-                let id = task * run + i;
-                let mut best = [(F::of(FAR), u32::MAX); MAX_NEIGHBOURS + 1];
-                strongest(skin, p, &nodes, id, coordinates(skin, p, id, &mut x), &mut best[..n]);
-                let v = shares(&best[..n], k);
-                let sum: F = v[..k].iter().copied().sum();
-                ids.iter_mut().zip(&best).for_each(|(id, b)| *id = b.1);
-                values.iter_mut().zip(v).for_each(|(value, v)| *value = v / sum);
-            }
+            dispatch(simd, Fill { skin, p, nodes: &nodes, first: task * run, ids, values, k, n });
         });
     }
 
@@ -145,117 +154,177 @@ impl<F: Real> Weights<F> {
         if count == 0 {
             return;
         }
-        let nodes = NodeRows::new(&p[skin.nodes]);
+        let (nodes, simd) = (NodeRows::new(&p[skin.nodes]), Simd::detect());
         let blocks = task_rows(count) / BLOCK;
         let [d_geometry, d_hyper, d_nodes] = d.of([GEOMETRY, skin.hyper, skin.nodes]);
         let views: Vec<_> = d_geometry.chunks_mut(blocks).zip(d_hyper.chunks_mut(blocks)).collect();
-        let width = nodes.width;
-        let (k, n) = (self.neighbours, self.neighbours + usize::from(self.cut));
-        let parts: Vec<Vec<F>> = views
+        let parts: Vec<Vec<[F; RUN]>> = views
             .into_par_iter()
-            .map(|(mut d_geometry, mut d_hyper)| {
-                let mut sums = vec![F::ZERO; count * width];
-                let mut x = [F::ZERO; MAX_COORDINATES];
-                for id in d_geometry.first..d_geometry.first + d_geometry.rows {
-                    let d_a = &d_values[id * k..(id + 1) * k];
-                    // Rows that took no part must not be touched.
-                    if d_a.iter().all(|&g| g == F::ZERO) {
-                        continue;
-                    }
-                    let x = coordinates(skin, p, id, &mut x);
-                    let ids = &self.nodes[id * n..(id + 1) * n];
-                    let mut best = [(F::of(FAR), u32::MAX); MAX_NEIGHBOURS + 1];
-                    ids.iter().zip(&mut best).for_each(|(&i, b)| *b = (nodes.energy(i as usize, x), i));
-                    let d_e = energies_backward(&best[..n], k, d_a);
-                    let mut d_x = [F::ZERO; MAX_COORDINATES];
-                    for (&node, &g) in ids.iter().zip(&d_e) {
-                        let row = nodes.of(node as usize);
-                        let sum = &mut sums[node as usize * width..(node as usize + 1) * width];
-                        // e = d² s + b: the sums are of dL/ds and dL/db.
-                        sum[0] += g * nodes.square(node as usize, x);
-                        sum[1] += g;
-                        let slope = F::TWO * g * row[0];
-                        for (c, &x) in x.iter().enumerate() {
-                            let part = slope * (x - row[HEAD + c]);
-                            d_x[c] += part;
-                            sum[HEAD + c] -= part;
-                        }
-                    }
-                    d_geometry.add(id, 0, [d_x[0], d_x[1], d_x[2]]);
-                    for c in 0..d_hyper.width {
-                        d_hyper.add(id, c, [d_x[3 + c]]);
-                    }
-                }
+            .map(|views| {
+                let mut sums = vec![[F::ZERO; RUN]; nodes.data.len()];
+                dispatch(simd, Back { of: self, skin, p, nodes: &nodes, d_values, views, sums: &mut sums });
                 sums
             })
             .collect();
-        let sums = sum_parts(parts, count * width);
-        for (node, sum) in sums.chunks_exact(width).enumerate() {
-            let row = nodes.of(node);
+        let sums = sum_parts(parts, nodes.data.len());
+        for (node, sum) in sums.chunks_exact(nodes.width).enumerate() {
+            let [s, b] = [sum[0][0], sum[0][1]];
             let logit = p[skin.nodes].get(node, super::NODE_LOGIT);
             // s = ½ e^(−2 log r), b = softplus(−w).
-            let d_log_radius = -F::TWO * row[0] * sum[0];
-            let d_logit = -(-logit).sigmoid() * sum[1];
-            d_nodes.add(node, 0, [sum[HEAD], sum[HEAD + 1], sum[HEAD + 2], d_log_radius, d_logit]);
-            for c in 3..width - HEAD {
-                d_nodes.add(node, NODE_HYPER + c - 3, [sum[HEAD + c]]);
+            let d_log_radius = -F::TWO * nodes.of(node)[0][0] * s;
+            let d_logit = -(-logit).sigmoid() * b;
+            d_nodes.add(node, 0, [sum[1][0], sum[1][1], sum[1][2], d_log_radius, d_logit]);
+            for c in 3..nodes.coordinates {
+                d_nodes.add(node, NODE_HYPER + c - 3, [sum[1 + c / RUN][c % RUN]]);
             }
         }
     }
 }
 
-/// The nodes of least energy on a Gaussian's list, ordered; equal energies by number.
+/// The weights of one task's rows.
+struct Fill<'a, F> {
+    skin: &'a Skin,
+    p: &'a Params<F>,
+    nodes: &'a NodeRows<F>,
+    first: usize,
+    ids: &'a mut [u32],
+    values: &'a mut [F],
+    k: usize,
+    n: usize,
+}
+
+impl<F: Real> Kernel for Fill<'_, F> {
+    type Out = ();
+    #[inline(always)]
+    fn run<const FMA: bool>(self) {
+        let Self { skin, p, nodes, first, ids, values, k, n } = self;
+        let mut x = [[F::ZERO; RUN]; MAX_RUNS];
+        for (i, (ids, values)) in ids.chunks_exact_mut(n).zip(values.chunks_exact_mut(k)).enumerate() {
+            let x = coordinates(skin, p, first + i, &mut x);
+            let (energies, numbers) = strongest(skin, p, nodes, first + i, x);
+            let [_, s] = shares(&energies, k, n);
+            let mut sum = F::ZERO;
+            for s in &s[..k] {
+                sum += *s;
+            }
+            ids.copy_from_slice(&numbers[..n]);
+            for (value, s) in values.iter_mut().zip(&s) {
+                *value = *s / sum;
+            }
+        }
+    }
+}
+
+/// The VJP of the weights of one task's rows.
+struct Back<'a, F> {
+    of: &'a Weights<F>,
+    skin: &'a Skin,
+    p: &'a Params<F>,
+    nodes: &'a NodeRows<F>,
+    d_values: &'a [F],
+    /// Of the geometry and of the hyper coordinates.
+    views: (TableMut<'a, F>, TableMut<'a, F>),
+    /// As [`NodeRows::data`]: dL/d(1/2r²), dL/d(−ln sigmoid(w)), and dL/d coordinates.
+    sums: &'a mut [[F; RUN]],
+}
+
+impl<F: Real> Kernel for Back<'_, F> {
+    type Out = ();
+    #[inline(always)]
+    fn run<const FMA: bool>(self) {
+        let Self { of, skin, p, nodes, d_values, views: (mut d_geometry, mut d_hyper), sums } = self;
+        let (k, n, width) = (of.neighbours, of.neighbours + usize::from(of.cut), nodes.width);
+        let mut x = [[F::ZERO; RUN]; MAX_RUNS];
+        for id in d_geometry.first..d_geometry.first + d_geometry.rows {
+            let d_a = &d_values[id * k..(id + 1) * k];
+            // Rows that took no part must not be touched.
+            if d_a.iter().all(|&g| g == F::ZERO) {
+                continue;
+            }
+            let x = coordinates(skin, p, id, &mut x);
+            let ids = &of.nodes[id * n..(id + 1) * n];
+            let (mut squares, mut energies) = ([F::ZERO; MAX_LIST], [F::of(FAR); MAX_LIST]);
+            for (i, &node) in ids.iter().enumerate() {
+                let head = &nodes.of(node as usize)[0];
+                squares[i] = nodes.square(node as usize, x);
+                let e = squares[i] * head[0] + head[1];
+                energies[i] = if e < F::of(FAR) { e } else { F::of(FAR) };
+            }
+            let d_e = energies_backward(&energies, k, n, d_a);
+            let mut d_x = [[F::ZERO; RUN]; MAX_RUNS];
+            for (i, &node) in ids.iter().enumerate() {
+                let (row, g) = (nodes.of(node as usize), d_e[i]);
+                let sum = &mut sums[node as usize * width..(node as usize + 1) * width];
+                // e = d² s + b: the sums are of dL/ds and dL/db.
+                sum[0][0] += g * squares[i];
+                sum[0][1] += g;
+                let slope = F::TWO * g * row[0][0];
+                for (r, x) in x.iter().enumerate() {
+                    for c in 0..RUN {
+                        let part = slope * (x[c] - row[1 + r][c]);
+                        d_x[r][c] += part;
+                        sum[1 + r][c] -= part;
+                    }
+                }
+            }
+            d_geometry.add(id, 0, [d_x[0][0], d_x[0][1], d_x[0][2]]);
+            for c in 0..d_hyper.width {
+                d_hyper.add(id, c, [d_x[(3 + c) / RUN][(3 + c) % RUN]]);
+            }
+        }
+    }
+}
+
+/// The nodes of a Gaussian's list by energy; equal energies in the list's order.
 #[inline(always)]
-fn strongest<F: Real>(skin: &Skin, p: &Params<F>, nodes: &NodeRows<F>, id: usize, x: &[F], best: &mut [(F, u32)]) {
+fn strongest<F: Real>(skin: &Skin, p: &Params<F>, nodes: &NodeRows<F>, id: usize, x: &[[F; RUN]]) -> Best<F> {
     let list = &p[skin.candidates];
     let count = p[skin.nodes].rows();
-    for c in 0..list.width().min(count) {
+    let len = list.width().min(count).min(MAX_LIST);
+    let (mut energies, mut numbers) = ([F::of(FAR); MAX_LIST], [0; MAX_LIST]);
+    for c in 0..len {
         // A damaged file may hold any number here.
         let node = (list.get(id, c).i32().max(0) as usize).min(count - 1);
-        insert(best, (nodes.energy(node, x), node as u32));
+        energies[c] = nodes.energy(node, x);
+        numbers[c] = node as u32;
     }
-    // Doublets of a damaged list leave places empty.
-    let first = best[0];
-    best.iter_mut().filter(|b| b.1 == u32::MAX).for_each(|b| *b = first);
+    // Places are counted and not swapped: a branch for every comparison would be mispredicted every other time.
+    let mut place = [0u32; MAX_LIST];
+    for c in 0..len {
+        let e = energies[c];
+        for i in 0..MAX_LIST {
+            place[i] += u32::from(e < energies[i] || (e == energies[i] && c < i));
+        }
+    }
+    let mut best = ([F::of(FAR); MAX_LIST], [0; MAX_LIST]);
+    for c in 0..len {
+        let to = place[c] as usize % MAX_LIST;
+        (best.0[to], best.1[to]) = (energies[c], numbers[c]);
+    }
+    best
 }
 
+/// v_i = exp(e_0 − e_i) and v_i − v_c + ε of ordered energies, of which the one after the first `k` cuts off if n > k.
 #[inline(always)]
-fn insert<F: Real>(best: &mut [(F, u32)], new: (F, u32)) {
-    let last = best.len() - 1;
-    let before = |a: (F, u32), b: (F, u32)| a.0 < b.0 || (a.0 == b.0 && a.1 < b.1);
-    if !before(new, best[last]) || best.iter().any(|b| b.1 == new.1) {
-        return;
-    }
-    let mut i = last;
-    while i > 0 && before(new, best[i - 1]) {
-        best[i] = best[i - 1];
-        i -= 1;
-    }
-    best[i] = new;
-}
-
-/// v_k − v_c + ε of ordered energies, of which the one after the first `k` cuts off.
-#[inline(always)]
-fn shares<F: Real>(best: &[(F, u32)], k: usize) -> [F; MAX_NEIGHBOURS] {
-    let v = |i: usize| (best[0].0 - best[i].0).exp();
-    let cut = if best.len() > k { v(k) } else { F::ZERO };
-    let mut out = [F::ZERO; MAX_NEIGHBOURS];
-    for (i, out) in out[..k].iter_mut().enumerate() {
-        *out = v(i) - cut + F::of(FLOOR);
-    }
-    out
+fn shares<F: Real>(energies: &[F; MAX_LIST], k: usize, n: usize) -> [[F; MAX_LIST]; 2] {
+    let v: [F; MAX_LIST] = each(|i| (energies[0] - energies[i]).exp());
+    let cut = if n > k { v[k] } else { F::ZERO };
+    [v, each(|i| v[i] - cut + F::of(FLOOR))]
 }
 
 /// dL/de of the weights a = shares / Σ shares.
 #[inline(always)]
-fn energies_backward<F: Real>(best: &[(F, u32)], k: usize, d_a: &[F]) -> [F; MAX_NEIGHBOURS + 1] {
-    let s = shares(best, k);
-    let sum: F = s[..k].iter().copied().sum();
-    let mean: F = s[..k].iter().zip(d_a).map(|(s, g)| *s * *g).sum::<F>() / sum;
-    let mut d_e = [F::ZERO; MAX_NEIGHBOURS + 1];
+fn energies_backward<F: Real>(energies: &[F; MAX_LIST], k: usize, n: usize, d_a: &[F]) -> [F; MAX_LIST] {
+    let [v, s] = shares(energies, k, n);
+    let (mut sum, mut mean) = (F::ZERO, F::ZERO);
+    for (s, g) in s.iter().zip(d_a) {
+        sum += *s;
+        mean += *s * *g;
+    }
+    mean = mean / sum;
+    let mut d_e = [F::ZERO; MAX_LIST];
     let mut d_cut = F::ZERO;
-    for i in 0..best.len() {
-        let v = (best[0].0 - best[i].0).exp();
+    for i in 0..n {
         let d_v = if i < k {
             let d_s = (d_a[i] - mean) / sum;
             d_cut -= d_s;
@@ -264,8 +333,8 @@ fn energies_backward<F: Real>(best: &[(F, u32)], k: usize, d_a: &[F]) -> [F; MAX
             d_cut
         };
         // v_i = exp(e_0 − e_i); v_0 is 1 whatever e_0.
-        d_e[i] -= v * d_v;
-        d_e[0] += v * d_v;
+        d_e[i] -= v[i] * d_v;
+        d_e[0] += v[i] * d_v;
     }
     d_e
 }
@@ -281,11 +350,11 @@ pub(super) fn nearest<F: Real>(skin: &Skin, p: &Params<F>, list: &mut Table<F>) 
     let simd = Simd::detect();
     let views: Vec<_> = list.chunks_mut(TASK_BLOCKS).collect();
     views.into_par_iter().for_each(|mut view| {
-        let mut x = [F::ZERO; MAX_COORDINATES];
+        let mut x = [[F::ZERO; RUN]; MAX_RUNS];
         let mut best = vec![(F::of(FAR), u32::MAX); width];
         for id in view.first..view.first + view.rows {
             best.fill((F::of(FAR), u32::MAX));
-            let x = coordinates(skin, p, id, &mut x);
+            let x = &coordinates(skin, p, id, &mut x).as_flattened()[..nodes.coordinates];
             dispatch(simd, Search { nodes: &nodes, x, best: &mut best });
             let first = best[0].1;
             for (c, b) in best.iter().enumerate() {
@@ -299,25 +368,46 @@ pub(super) fn nearest<F: Real>(skin: &Skin, p: &Params<F>, list: &mut Table<F>) 
 /// Blocks of rows of one task of the search.
 const TASK_BLOCKS: usize = 16;
 
+/// Numbers of a node before its coordinates: 1/(2r²), −ln sigmoid(w).
+const HEAD: usize = 2;
+
 /// Nodes sixteen at a time: [block][1/(2r²), −ln sigmoid(w), coordinates][16].
 struct NodeLanes<F> {
     count: usize,
-    width: usize,
+    coordinates: usize,
     data: Vec<[F; BLOCK]>,
 }
 
 impl<F: Real> NodeLanes<F> {
     fn new(table: &Table<F>) -> Self {
         let rows = NodeRows::new(table);
-        let (count, width) = (table.rows(), rows.width);
+        let (count, coordinates) = (table.rows(), rows.coordinates);
         let mut data = Vec::new();
         for b in 0..count.div_ceil(BLOCK) {
-            for c in 0..width {
-                data.push(each(|l| if b * BLOCK + l < count { rows.of(b * BLOCK + l)[c] } else { F::ZERO }));
+            for c in 0..HEAD + coordinates {
+                // The head lies in the first run of a row, coordinates in those after it.
+                let c = if c < HEAD { c } else { RUN + c - HEAD };
+                let of = |node: usize| rows.of(node).as_flattened()[c];
+                data.push(each(|l| if b * BLOCK + l < count { of(b * BLOCK + l) } else { F::ZERO }));
             }
         }
-        Self { count, width, data }
+        Self { count, coordinates, data }
     }
+}
+
+/// Keeps the least energies, ordered; equal ones by number.
+#[inline(always)]
+fn insert<F: Real>(best: &mut [(F, u32)], new: (F, u32)) {
+    let mut i = best.len() - 1;
+    let before = |a: (F, u32), b: (F, u32)| a.0 < b.0 || (a.0 == b.0 && a.1 < b.1);
+    if !before(new, best[i]) {
+        return;
+    }
+    while i > 0 && before(new, best[i - 1]) {
+        best[i] = best[i - 1];
+        i -= 1;
+    }
+    best[i] = new;
 }
 
 struct Search<'a, F> {
@@ -331,7 +421,7 @@ impl<F: Real> Kernel for Search<'_, F> {
     #[inline(always)]
     fn run<const FMA: bool>(self) {
         let last = self.best.len() - 1;
-        for (b, block) in self.nodes.data.chunks_exact(self.nodes.width).enumerate() {
+        for (b, block) in self.nodes.data.chunks_exact(HEAD + self.nodes.coordinates).enumerate() {
             let mut square = [F::ZERO; BLOCK];
             for (c, lane) in self.x.iter().zip(&block[HEAD..]) {
                 for l in 0..BLOCK {
