@@ -228,27 +228,55 @@ impl<F: Real, W: Work<F, N>, const N: usize> Kernel for Scatter<'_, F, W, N> {
     fn run<const FMA: bool>(mut self) -> f64 {
         let (first, end) = (self.views[0].first, self.views[0].first + self.views[0].rows);
         let mut sum = 0.0;
-        each_batch(self.rows, first, end, |batch| sum += self.work.run(batch, &mut self.views));
+        for batch in Batches::new(self.rows, first, end) {
+            sum += self.work.run(&batch, &mut self.views);
+        }
         sum
     }
 }
 
-/// Calls `work` with all batches of the asked rows among `first..end`, where `first` is that of a block.
-#[inline(always)]
-pub fn each_batch(rows: Rows<'_>, first: usize, end: usize, mut work: impl FnMut(&Batch)) {
-    let Rows::Some(ids) = rows else {
-        for b in first / BLOCK..end.div_ceil(BLOCK) {
-            let span = Span::block(b);
-            work(&Batch::new(span, span, each(|l| span.row(l) < end)));
+/// All batches of the asked rows among `first..end`, where `first` is that of a block. An iterator, since a closure would be
+/// compiled by itself and for the baseline alone.
+pub struct Batches<'a> {
+    rows: Rows<'a>,
+    /// The next block, or place in the list of rows; and the end of these.
+    next: usize,
+    to: usize,
+    end: usize,
+    dense: bool,
+}
+
+impl<'a> Batches<'a> {
+    /// Panics: a row that is asked for does not exist, when its batch is read.
+    #[inline(always)]
+    pub fn new(rows: Rows<'a>, first: usize, end: usize) -> Self {
+        let (next, to) = match rows {
+            Rows::All => (first / BLOCK, end.div_ceil(BLOCK)),
+            Rows::Some(ids) => {
+                (ids.partition_point(|&i| (i as usize) < first), ids.partition_point(|&i| (i as usize) < end))
+            }
+        };
+        Self { rows, next, to, end, dense: (to - next) * DENSE >= end - first }
+    }
+}
+
+impl Iterator for Batches<'_> {
+    type Item = Batch;
+
+    #[inline(always)]
+    fn next(&mut self) -> Option<Batch> {
+        if self.next >= self.to {
+            return None;
         }
-        return;
-    };
-    let mut j = ids.partition_point(|&i| (i as usize) < first);
-    let to = ids.partition_point(|&i| (i as usize) < end);
-    let dense = (to - j) * DENSE >= end - first;
-    while j < to {
-        let batch = if dense { block_batch(&ids[..to], &mut j) } else { loose_batch(&ids[..to], &mut j) };
-        work(&batch);
+        Some(match self.rows {
+            Rows::All => {
+                let span = Span::block(self.next);
+                self.next += 1;
+                Batch::new(span, span, each(|l| span.row(l) < self.end))
+            }
+            Rows::Some(ids) if self.dense => block_batch(&ids[..self.to], &mut self.next),
+            Rows::Some(ids) => loose_batch(&ids[..self.to], &mut self.next),
+        })
     }
 }
 

@@ -6,7 +6,7 @@
 
 use super::{POSE, Skin, Weights};
 use crate::math::{Real, quat};
-use crate::motion::lanes::{Batch, Lane, Work, each_batch};
+use crate::motion::lanes::{Batch, Batches, Lane, Work};
 use crate::motion::still::{activate_backward_lanes, activate_lanes};
 use crate::scene::params::QUAT;
 use crate::scene::splats::COV;
@@ -274,8 +274,8 @@ impl<F: Real> Kernel for Back<'_, F> {
     #[inline(always)]
     fn run<const FMA: bool>(mut self) {
         let (first, end) = (self.views.0.first, self.views.0.first + self.views.0.rows);
-        each_batch(self.asked, first, end, |batch| {
-            let m = self.ask.moved(batch);
+        for batch in Batches::new(self.asked, first, end) {
+            let m = self.ask.moved(&batch);
             let mut d = activate_backward_lanes(&m.rows, &batch.at.read(self.d_out, 0));
             let mut d_blend = [[F::ZERO; BLOCK]; FRAME];
             let mut d_mask = [F::ZERO; BLOCK];
@@ -328,7 +328,7 @@ impl<F: Real> Kernel for Back<'_, F> {
             if self.views.1.width > 0 {
                 batch.add(&mut self.views.1, 0, &[d_mask]);
             }
-        });
+        }
     }
 }
 

@@ -321,7 +321,7 @@ fn energies_backward<F: Real>(energies: &[F; MAX_LIST], k: usize, n: usize, d_a:
         sum += *s;
         mean += *s * *g;
     }
-    mean = mean / sum;
+    mean /= sum;
     let mut d_e = [F::ZERO; MAX_LIST];
     let mut d_cut = F::ZERO;
     for i in 0..n {
