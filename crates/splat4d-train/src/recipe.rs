@@ -131,7 +131,7 @@ recipe! {
     min_life_frames: f64 = 0.5,
     // deform-mlp.
     /// deform-mlp: network: mlp (8x256), small, hash (grids and a small network) or hash-linear.
-    deform_trunk: String = "small".into(),
+    deform_trunk: String = "hash".into(),
     /// deform-mlp: width of the small and hash networks.
     deform_width: usize = 128,
     /// deform-mlp: hidden layers of the small and hash networks.
