@@ -12,7 +12,7 @@ fn scene() -> Scene<f32> {
     let rng = Rng::new(5, "freeze", 0);
     let life = LifeKind::GaussHalf;
     let mut params = Params::new(60, 4, life.columns());
-    let spec = Spec::Spacetime(SpacetimeSpec { order: 1, rotation: true, detach: false, origin: 0.0 });
+    let spec = Spec::Spacetime(SpacetimeSpec { order: 1, rotation: true, detach: false, origin: 0.0, features: None });
     let motion = build(&spec, &mut params).unwrap();
     for key in params.keys() {
         let table = &mut params.get_mut([key])[0];

@@ -13,7 +13,7 @@ use std::path::Path;
 fn moving() -> Scene<f32> {
     let (rows, life) = (40, LifeKind::GaussHalf);
     let mut params = Params::new(rows, 4, life.columns());
-    let spec = Spec::Spacetime(SpacetimeSpec { order: 1, rotation: true, detach: false, origin: 0.5 });
+    let spec = Spec::Spacetime(SpacetimeSpec { order: 1, rotation: true, detach: false, origin: 0.5, features: None });
     let motion = build(&spec, &mut params).unwrap();
     let rng = Rng::new(2, "convert", 0);
     for key in params.keys().collect::<Vec<_>>() {

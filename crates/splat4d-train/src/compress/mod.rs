@@ -74,6 +74,7 @@ pub fn compress(
     listen: &mut dyn FnMut(&Event),
 ) -> Result<Compressed> {
     job.settings.check()?;
+    job.source.without_head("a playback file")?;
     let bench = bench(job)?;
     let mut stages = stages::float_stages(&bench)?;
     let file = job.settings.codec.then(|| stages::file_stage(&bench)).transpose()?;

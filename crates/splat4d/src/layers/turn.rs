@@ -161,7 +161,8 @@ mod tests {
     use crate::scene::{Camera, LifeKind, Time};
 
     fn moving() -> Scene<f32> {
-        let spec = Spec::Spacetime(SpacetimeSpec { order: 3, rotation: true, detach: true, origin: 0.0 });
+        let spec =
+            Spec::Spacetime(SpacetimeSpec { order: 3, rotation: true, detach: true, origin: 0.0, features: None });
         let mut params = Params::new(40, 16, LifeKind::GaussOne.columns());
         let motion = build(&spec, &mut params).unwrap();
         let rng = Rng::new(3, "turn", 0);

@@ -28,7 +28,7 @@ fn still() {
 #[test]
 fn spacetime() {
     for (order, rotation) in [(1, false), (3, true)] {
-        let spec = Spec::Spacetime(SpacetimeSpec { order, rotation, detach: false, origin: 0.5 });
+        let spec = Spec::Spacetime(SpacetimeSpec { order, rotation, detach: false, origin: 0.5, features: None });
         model(&spec, ROWS, LifeKind::GaussHalf, &[Space::Gaussians], &[]);
         starts_still(&spec, ROWS);
     }
@@ -146,7 +146,7 @@ fn ssm() {
 
 #[test]
 fn filtered() {
-    let inner = Spec::Spacetime(SpacetimeSpec { order: 2, rotation: true, detach: false, origin: 0.5 });
+    let inner = Spec::Spacetime(SpacetimeSpec { order: 2, rotation: true, detach: false, origin: 0.5, features: None });
     let around = FilteredSpec { stop_gradient: false, ..FilteredSpec::around(inner, 0.05, 0.0) };
     for (fusion, predictor, baseline) in [
         (Fusion::Geodesic, Predictor::Wasserstein, 1),

@@ -3,6 +3,7 @@
 
 mod control;
 mod edits;
+mod features;
 mod filtered;
 mod further;
 mod guests;
