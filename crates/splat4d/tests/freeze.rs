@@ -46,7 +46,7 @@ fn a_frozen_moment_looks_like_the_scene_then() {
         image.color
     };
     for time in [0.0, 0.37, 1.0] {
-        let mut params = freeze(&scene, Time(time));
+        let mut params = freeze(&scene, Time(time)).unwrap();
         let motion = build(&Spec::Still, &mut params).unwrap();
         let still = Layer { name: "still".into(), params, motion, life: LifeKind::Infinite, span: ALWAYS, masks: None };
         let frozen = Scene { layers: vec![still], ..Scene::default() };

@@ -303,6 +303,40 @@ mod tests {
     }
 
     #[test]
+    fn a_head_comes_back_and_must_fit_its_layers() {
+        let features = Some(crate::motion::spacetime::FeatureSpec { seed: 9 });
+        let spec = Spec::Spacetime(SpacetimeSpec { features, ..SpacetimeSpec::default() });
+        let mut params = Params::new(5, 1, LifeKind::GaussHalf.columns());
+        let motion = build(&spec, &mut params).unwrap();
+        let first = HeadKeys::of(&params).unwrap().first;
+        params[first].set(7, 0, 0.25);
+        let (life, name) = (LifeKind::GaussHalf, "a".to_owned());
+        let layer = Layer { name, params, motion, life, span: ALWAYS, masks: None };
+        let with = |head: Head, layers: Vec<Layer>| {
+            let mut bytes = Vec::new();
+            write(&Scene { layers, head, ..scene() }, &mut bytes).unwrap();
+            read(&bytes)
+        };
+        let still = scene().layers.remove(0);
+        let back = with(Head::Features, vec![still.clone(), layer.clone()]).unwrap();
+        assert_eq!((back.head, back.layers[1].motion.spec()), (Head::Features, spec));
+        assert_eq!(back.layers[1].params, layer.params);
+        assert_eq!(back.head_keys().unwrap().0, 1);
+        for (head, layer) in [(Head::Features, still), (Head::Identity, layer)] {
+            let error = with(head, vec![layer]).unwrap_err().to_string();
+            assert!(error.contains(head.name()), "{error}");
+        }
+        // Scenes without a head say nothing of features: older versions read them.
+        let mut bytes = Vec::new();
+        write(&scene(), &mut bytes).unwrap();
+        assert!(!String::from_utf8_lossy(&bytes).contains("features"));
+        let at = bytes.windows(8).position(|w| w == b"identity").unwrap();
+        bytes[at..at + 8].copy_from_slice(b"identitx");
+        let error = read(&bytes).unwrap_err();
+        assert!(error.kind() == ErrorKind::Unsupported && error.to_string().contains("identitx"), "{error}");
+    }
+
+    #[test]
     fn what_does_not_fit_is_named() {
         let mut bytes = Vec::new();
         write(&scene(), &mut bytes).unwrap();

@@ -1,5 +1,7 @@
 //! The fast renderer against the oracle and against finite differences, in f64 and f32.
 
+mod head;
+
 use super::*;
 use crate::math::{Rng, Se3, sym3};
 use crate::scene::splats::{Part, SPLAT_COLUMNS};

@@ -9,6 +9,7 @@ use splat4d::motion::filtered::{FilteredSpec, Fusion, Predictor};
 use splat4d::motion::hexplane::{Heads, HexplaneSpec};
 use splat4d::motion::native4d::Native4dSpec;
 use splat4d::motion::skin::SkinSpec;
+use splat4d::motion::spacetime::FeatureSpec;
 use splat4d::motion::ssm::{Equivariance, Mode, Output, SsmSpec};
 use splat4d::motion::tracked::TrackedSpec;
 use splat4d::motion::{SpacetimeSpec, Spec};
@@ -32,6 +33,17 @@ fn spacetime() {
         model(&spec, ROWS, LifeKind::GaussHalf, &[Space::Gaussians], &[]);
         starts_still(&spec, ROWS);
     }
+}
+
+#[test]
+fn spacetime_with_features() {
+    let features = Some(FeatureSpec { seed: 1 });
+    let spec = Spec::Spacetime(SpacetimeSpec { order: 1, rotation: false, detach: false, origin: 0.5, features });
+    // What the head does is the renderer's business.
+    for life in [LifeKind::GaussHalf, LifeKind::Infinite] {
+        model(&spec, ROWS, life, &[Space::Gaussians], &["head.in", "head.out"]);
+    }
+    starts_still(&spec, ROWS);
 }
 
 // deform-mlp.
