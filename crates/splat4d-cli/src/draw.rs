@@ -59,7 +59,11 @@ impl<'a> Painter<'a> {
     pub(crate) fn on(mut self, device: Device, console: &'a Console) -> Self {
         if self.headed && device != Device::Cpu {
             let line = "drawing on the CPU: a network makes the scene's colours (features = full)";
-            if device == Device::Gpu { console.warn(line) } else { console.detail(line) }
+            if device == Device::Gpu {
+                console.warn(line)
+            } else {
+                console.detail(line)
+            }
             return self;
         }
         self.brush = Brush::open(device, self.config, console);

@@ -343,7 +343,11 @@ fn of_scene(scene: &Scene<f32>) -> Told {
         line(&mut text, "layer", &format!("{name}: {} by {motion}, life {life}, SH degree {degree}", grouped(*rows)));
     }
     if scene.head != Head::Identity {
-        line(&mut text, "colours", "by a small network, pixel by pixel (features = full); only render and eval draw them");
+        line(
+            &mut text,
+            "colours",
+            "by a small network, pixel by pixel (features = full); only render and eval draw them",
+        );
     }
     if scene.clip[1] > scene.clip[0] {
         line(

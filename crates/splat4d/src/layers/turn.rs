@@ -4,8 +4,8 @@ use super::Scene;
 use crate::math::{quat, se3, sh, sh_rotation};
 use crate::motion::spacetime::{ROTATION_RATES, VELOCITIES};
 use crate::motion::{SpacetimeSpec, Spec, native4d};
-use crate::scene::params::QUAT;
 use crate::scene::head::{FURTHER, HIDDEN, INPUTS};
+use crate::scene::params::QUAT;
 use crate::scene::{GEOMETRY, HeadKeys, Params, SH, Table};
 use crate::{Error, ErrorKind, Result};
 

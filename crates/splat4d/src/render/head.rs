@@ -39,6 +39,8 @@ pub(super) struct Headed<F> {
     /// Blended further channels of the head, [6, h, w].
     further: Planes<F>,
     d_base: Planes<F>,
+    /// To [`Self::table`].
+    d_table: Option<Table<F>>,
     /// To the blended further channels, the caller's included, [6 + C, h, w].
     d_further: Planes<F>,
 }
@@ -140,11 +142,12 @@ impl<F: Real> Renderer<F> {
         d_sh: &mut [Option<&mut Table<F>>],
         d: &mut RenderGrads<F>,
     ) {
-        let clock = super::Clock::start();
+        let mut clock = super::Clock::start();
         let mut headed = std::mem::take(&mut self.headed);
         let (d_head, pose) = headed.backward(head, camera, self.config.simd, grads.color, grads.extra);
-        let seconds = { clock }.lap();
+        let seconds = clock.lap();
         let inner = super::ImageGrads { color: &headed.d_base, extra: Some(&headed.d_further), ..*grads };
+        d.extra = headed.d_table.take();
         self.backward_blended(splats, camera, background, Some(&headed.table), &inner, d_sh, d);
         self.seconds.blend_backward += seconds;
         d.camera.iter_mut().zip(pose).for_each(|(d, pose)| *d += pose);
@@ -164,6 +167,7 @@ impl<F: Real> Renderer<F> {
             }
             own
         });
+        headed.d_table = Some(table);
         self.headed = headed;
     }
 }

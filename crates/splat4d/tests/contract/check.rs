@@ -7,7 +7,8 @@ use splat4d::math::Rng;
 use splat4d::motion::filtered::{Filtered, FilteredSpec, Fusion};
 use splat4d::motion::{At, BUILT_IN, Cache, Motion, Spec, Still, Tape, build};
 use splat4d::scene::{
-    Born, Color, GEOMETRY, Grads, HeadKeys, Key, LIFE, LifeKind, Params, RowEdit, Rows, SH, Space, SplatGrads, Table, Time,
+    Born, Color, GEOMETRY, Grads, HeadKeys, Key, LIFE, LifeKind, Params, RowEdit, Rows, SH, Space, SplatGrads, Table,
+    Time,
 };
 use std::sync::Arc;
 

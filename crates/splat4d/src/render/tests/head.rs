@@ -1,8 +1,8 @@
 //! The feature head against the oracle, matrices written out, and finite differences.
 
 use super::*;
-use crate::scene::head::{BASE, FEATURES, FURTHER, HIDDEN, INPUTS};
 use crate::render::head::NEAREST;
+use crate::scene::head::{BASE, FEATURES, FURTHER, HIDDEN, INPUTS};
 use crate::scene::{HeadWeights, Params};
 
 /// The scene of the other tests, whose direct colours have features, and a network.
@@ -18,8 +18,12 @@ impl Headed {
         let mut scene = scene(33, n, size);
         let rng = Rng::new(5, "head", 0);
         scene.direct = noise(rng.fork(1), &[("channels", FEATURES)], n + 6, 0.5, 0.5);
-        let numbers = |k: u64, count: usize| (0..count).map(|i| 0.7 * rng.fork(k).normal(i as u64)).collect();
-        Self { scene, first: numbers(2, HIDDEN * INPUTS), second: numbers(3, 3 * HIDDEN) }
+        let numbers =
+            |k: u64, count: usize| -> Vec<f64> { (0..count).map(|i| 0.7 * rng.fork(k).normal(i as u64)).collect() };
+        let mut first: Vec<f64> = numbers(2, HIDDEN * INPUTS);
+        // The camera stands far down z: every hidden number is above zero somewhere.
+        first.iter_mut().skip(FURTHER + 2).step_by(INPUTS).for_each(|w| *w = -1.0);
+        Self { scene, first, second: numbers(3, 3 * HIDDEN) }
     }
 
     fn splats(&self) -> Splats<'_, f64> {
@@ -170,7 +174,8 @@ fn every_gradient_of_a_head_equals_finite_differences() {
 #[test]
 fn a_head_gives_the_same_bits_for_any_threads() {
     let s = Headed::new(60, 0.2);
-    let (scene, first, second) = (s.scene.cast::<f32>(), s.first.iter().map(|&x| x as f32).collect::<Vec<_>>(), s.second);
+    let (scene, first, second) =
+        (s.scene.cast::<f32>(), s.first.iter().map(|&x| x as f32).collect::<Vec<_>>(), s.second);
     let second: Vec<f32> = second.iter().map(|&x| x as f32).collect();
     let view = camera(83, 59);
     let bits = |threads: usize| {
