@@ -127,12 +127,12 @@ recipe! {
     /// full model of STG; takes the place of spherical harmonics, so that sh_degree becomes 0). Such scenes are drawn by
     /// splat4d alone: they have no playback file and no export.
     features: String = "none".into(),
-    /// spacetime: rate of view features, which depend on the ray through the network.
-    view_features_lr: f64 = 2.5e-3,
-    /// spacetime: rate of time features, 1/clip.
-    time_features_lr: f64 = 1e-3,
-    /// spacetime: rate of the network's weights.
-    head_lr: f64 = 1e-4,
+    /// spacetime: rate of view features (STG, 30,000 steps: 0.0025).
+    view_features_lr: f64 = 0.01,
+    /// spacetime: rate of time features, 1/clip (STG: 0.001).
+    time_features_lr: f64 = 0.02,
+    /// spacetime: rate of the network's weights (STG: 0.0001).
+    head_lr: f64 = 3e-3,
     /// life: rate of life centres, clips.
     life_center_lr: f64 = 1e-3,
     /// life: rate of log life widths.
