@@ -108,6 +108,7 @@ impl Work {
         let stop = interrupt::flag("stopping: a checkpoint is being saved");
         let source = Source::open(&self.order.source)?;
         not_empty(&source.scene, &self.order.source)?;
+        source.scene.without_head("a playback file")?;
         let run = source.run.as_ref().ok_or_else(|| {
             Error::input("is no run: compressing needs the pictures that a scene was trained on")
                 .at(self.order.source.display())

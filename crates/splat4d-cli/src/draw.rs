@@ -4,7 +4,7 @@ use crate::console::Console;
 use crate::device::{Brush, Device};
 use crate::video::Rgb;
 use rayon::prelude::*;
-use splat4d::layers::Scene;
+use splat4d::layers::{Head, Scene};
 use splat4d::play::Player;
 use splat4d::render::{Antialias, Image, RenderConfig};
 use splat4d::scene::{Camera, Planes, Time};
@@ -41,6 +41,8 @@ pub(crate) struct Painter<'a> {
     background: [f32; 3],
     config: RenderConfig,
     brush: Brush<'a>,
+    /// Whether a network makes colours, pixel by pixel.
+    headed: bool,
     /// The last picture.
     pub image: Image<f32>,
 }
@@ -50,11 +52,20 @@ impl<'a> Painter<'a> {
     pub(crate) fn new(scene: &'a Scene<f32>, background: [f32; 3], antialias: bool, depth: bool) -> Self {
         let config = RenderConfig { antialias: self::antialias(antialias), depth, ..RenderConfig::default() };
         let (player, brush, image) = (Player::of_scene(scene), Brush::cpu(config), Image::default());
-        Self { player, background, config, brush, image }
+        Self { player, background, config, brush, headed: scene.head != Head::Identity, image }
     }
 
-    /// The same on another device.
+    /// The same on another device, where that can draw the scene.
     pub(crate) fn on(mut self, device: Device, console: &'a Console) -> Self {
+        if self.headed && device != Device::Cpu {
+            let line = "drawing on the CPU: a network makes the scene's colours (features = full)";
+            if device == Device::Gpu {
+                console.warn(line)
+            } else {
+                console.detail(line)
+            }
+            return self;
+        }
         self.brush = Brush::open(device, self.config, console);
         self
     }

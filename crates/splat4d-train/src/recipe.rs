@@ -33,6 +33,8 @@ macro_rules! recipe {
     };
 }
 
+/// What `features` is where Gaussians have some.
+pub const FULL: &str = "full";
 /// What `control_trajectory` may be.
 pub const TRAJECTORIES: [&str; 5] = ["spline", "linear", "slerp", "low-rank", "network"];
 /// What `prune_score` may be: the names of `prune::Spatial`.
@@ -121,6 +123,16 @@ recipe! {
     velocity_lr_final: f64 = 1.6e-5,
     /// spacetime: rate of quaternion rates, 1/clip.
     rotation_rate_lr: f64 = 1e-3,
+    /// spacetime: features beside the base colour, which a small network turns into colour pixel by pixel: none or full (the
+    /// full model of STG; takes the place of spherical harmonics, so that sh_degree becomes 0). Such scenes are drawn by
+    /// splat4d alone: they have no playback file and no export.
+    features: String = "none".into(),
+    /// spacetime: rate of view features (STG, 30,000 steps: 0.0025).
+    view_features_lr: f64 = 0.01,
+    /// spacetime: rate of time features, 1/clip (STG: 0.001).
+    time_features_lr: f64 = 0.02,
+    /// spacetime: rate of the network's weights (STG: 0.0001).
+    head_lr: f64 = 3e-3,
     /// life: rate of life centres, clips.
     life_center_lr: f64 = 1e-3,
     /// life: rate of log life widths.
@@ -650,6 +662,7 @@ impl Recipe {
             ("deform_trunk", &self.deform_trunk, &["mlp", "small", "hash", "hash-linear"][..]),
             ("filter", &self.filter, &Fusion::ALL.map(|(name, _)| name)[..]),
             ("filter_predictor", &self.filter_predictor, &Predictor::ALL.map(|(name, _)| name)[..]),
+            ("features", &self.features, &["none", FULL][..]),
             ("transport", &self.transport, &["off", "linear", "wasserstein"][..]),
             ("ssm_mode", &self.ssm_mode, &["bidirectional", "causal"][..]),
             ("ssm_output", &self.ssm_output, &["absolute", "twist"][..]),
@@ -672,6 +685,9 @@ impl Recipe {
                 *knob = value.max(1);
             }
         };
+        if r.features == FULL {
+            r.sh_degree = 0;
+        }
         if r.min_opacity == 0.0 {
             r.min_opacity = if r.strategy == "mcmc" { MCMC_DEAD_OPACITY } else { ADC_DEAD_OPACITY };
         }

@@ -91,7 +91,7 @@ fn made_up() -> Scene<f32> {
     let rng = Rng::new(7, "balls", 0);
     let life = LifeKind::GaussHalf;
     let mut params = Params::new(COUNT, sh::MAX_COEFFS, life.columns());
-    let spec = SpacetimeSpec { order: 1, rotation: true, detach: false, origin: 0.5 };
+    let spec = SpacetimeSpec { order: 1, rotation: true, detach: false, origin: 0.5, features: None };
     let motion = Spacetime::new(spec, &mut params).expect("new tables");
     let [geometry, colors, lives, velocities, rates] =
         params.get_mut([GEOMETRY, SH, LIFE, motion.velocities(), motion.rates()]);

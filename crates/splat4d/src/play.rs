@@ -10,7 +10,7 @@ use crate::format::playback::{Entry, Index, Kind, Meta, Palette, decode_masks, d
 use crate::layers::{ALWAYS, Layer, LayerTape, Scene};
 use crate::motion::Cache;
 use crate::scene::masks::WORD;
-use crate::scene::{KeyMasks, Rows, Space, Splats, Time};
+use crate::scene::{HeadWeights, KeyMasks, Rows, Space, Splats, Time};
 use crate::{Error, Result};
 use rayon::prelude::*;
 use std::borrow::Cow;
@@ -152,6 +152,7 @@ pub struct Player<'a> {
     file: Option<File>,
     meta: Meta,
     held: Vec<Held<'a>>,
+    head: Option<HeadWeights<'a>>,
     budget: usize,
     /// Places in `held` of what the last [`at`](Self::at) shows.
     shown: Vec<usize>,
@@ -177,7 +178,8 @@ impl<'a> Player<'a> {
             ..Meta::default()
         };
         let held = scene.layers.par_iter().enumerate().map(|(i, layer)| Held::new(i, Cow::Borrowed(layer))).collect();
-        Self { file: None, meta, held, budget: usize::MAX, shown: Vec::new(), bytes_read: 0 }
+        let (head, shown) = (scene.head_weights(), Vec::new());
+        Self { file: None, meta, held, head, budget: usize::MAX, shown, bytes_read: 0 }
     }
 
     /// Plays a playback file of `length` bytes, of which only the index is read now. Pages stay in memory up to `budget`
@@ -204,7 +206,7 @@ impl<'a> Player<'a> {
         let meta = index.meta.clone();
         let file = File { source, masks: index.masks(), index, palettes: Vec::new() };
         let bytes_read = prefix.len() as u64;
-        Ok(Self { file: Some(file), meta, held: Vec::new(), budget, shown: Vec::new(), bytes_read })
+        Ok(Self { file: Some(file), meta, held: Vec::new(), head: None, budget, shown: Vec::new(), bytes_read })
     }
 
     /// What the scene says of itself.
@@ -244,7 +246,8 @@ impl<'a> Player<'a> {
             h.layer.motion.prepare(&h.layer.params, &[h.tape.question(&h.layer.params)], &mut h.cache);
             h.layer.at(&h.cache, &mut h.tape);
         });
-        Ok(Splats { parts: self.shown.iter().map(|&i| self.held[i].layer.part(&self.held[i].tape)).collect() })
+        let parts = self.shown.iter().map(|&i| self.held[i].layer.part(&self.held[i].tape)).collect();
+        Ok(Splats { parts, head: self.head })
     }
 
     /// Brings the pages of t into memory, and lets those farthest in time go where there is no room.

@@ -12,7 +12,7 @@ fn scene() -> Scene<f32> {
     let rng = Rng::new(5, "freeze", 0);
     let life = LifeKind::GaussHalf;
     let mut params = Params::new(60, 4, life.columns());
-    let spec = Spec::Spacetime(SpacetimeSpec { order: 1, rotation: true, detach: false, origin: 0.0 });
+    let spec = Spec::Spacetime(SpacetimeSpec { order: 1, rotation: true, detach: false, origin: 0.0, features: None });
     let motion = build(&spec, &mut params).unwrap();
     for key in params.keys() {
         let table = &mut params.get_mut([key])[0];
@@ -46,7 +46,7 @@ fn a_frozen_moment_looks_like_the_scene_then() {
         image.color
     };
     for time in [0.0, 0.37, 1.0] {
-        let mut params = freeze(&scene, Time(time));
+        let mut params = freeze(&scene, Time(time)).unwrap();
         let motion = build(&Spec::Still, &mut params).unwrap();
         let still = Layer { name: "still".into(), params, motion, life: LifeKind::Infinite, span: ALWAYS, masks: None };
         let frozen = Scene { layers: vec![still], ..Scene::default() };

@@ -334,16 +334,17 @@ fn is_moving(scene: &Scene<f32>) -> bool {
 
 /// A scene that stands still as `scene` does at `time`.
 fn one_moment(scene: &Scene<f32>, time: f64) -> Result<Scene<f32>> {
-    let mut still = dialect::still(moment(scene, time), Dialect::Ply);
+    let mut still = dialect::still(moment(scene, time)?, Dialect::Ply);
     still.up = scene.up;
     still.background = scene.background;
     Ok(still)
 }
 
-fn moment(scene: &Scene<f32>, time: f64) -> Params {
+fn moment(scene: &Scene<f32>, time: f64) -> Result<Params> {
+    scene.without_head("plain Gaussians")?;
     match &scene.layers[..] {
         // What stands still anyway keeps its very bits.
-        [only] if !is_moving(scene) => only.params.clone(),
+        [only] if !is_moving(scene) => Ok(only.params.clone()),
         _ => freeze(scene, Time(time)),
     }
 }
@@ -370,7 +371,7 @@ impl Writer {
             };
             return Ok((out, warnings));
         }
-        let params = moment(scene, scene.clip[0]);
+        let params = moment(scene, scene.clip[0])?;
         let warnings = match dialect {
             Dialect::Ply => ply::write(&params, &mut out).map(|()| Warnings::default())?,
             Dialect::CompressedPly => ply::write_compressed(&params, &mut out)?,

@@ -108,7 +108,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let scene = &source.scene;
     not_empty(scene, path)?;
     let write = |time: f64, out: &Path| -> anyhow::Result<usize> {
-        let params = freeze(scene, Time(time));
+        let params = freeze(scene, Time(time))?;
         let mut bytes = Vec::new();
         format::ply::write(&params, &mut bytes)?;
         files::write(out, &bytes)?;

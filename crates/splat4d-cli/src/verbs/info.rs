@@ -9,7 +9,7 @@ use crate::source::{Source, cloud};
 use serde_json::{Value, json};
 use splat4d::Error;
 use splat4d::format::Dialect;
-use splat4d::layers::Scene;
+use splat4d::layers::{Head, Scene};
 use splat4d::math::sh::degree_of;
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{GEOMETRY, SH};
@@ -342,6 +342,13 @@ fn of_scene(scene: &Scene<f32>) -> Told {
     for (name, motion, life, rows, degree) in layers.iter().filter(|_| layers.len() <= MANY_LAYERS) {
         line(&mut text, "layer", &format!("{name}: {} by {motion}, life {life}, SH degree {degree}", grouped(*rows)));
     }
+    if scene.head != Head::Identity {
+        line(
+            &mut text,
+            "colours",
+            "by a small network, pixel by pixel (features = full); only render and eval draw them",
+        );
+    }
     if scene.clip[1] > scene.clip[0] {
         line(
             &mut text,
@@ -363,7 +370,7 @@ fn of_scene(scene: &Scene<f32>) -> Told {
         "type": "scene", "gaussians": n, "damaged_rows": damaged, "zero_rotations": zero_quats,
         "layers": layers.iter().map(|l| json!({"name": l.0, "motion": l.1, "life": l.2, "gaussians": l.3,
             "sh_degree": l.4})).collect::<Vec<_>>(),
-        "clip": scene.clip, "fps": scene.fps, "bounds": finite.then_some([low, high]), "middle": center,
+        "head": scene.head.name(), "clip": scene.clip, "fps": scene.fps, "bounds": finite.then_some([low, high]), "middle": center,
         "radius": radius, "opacity_histogram": {"edges": OPACITY_EDGES, "counts": opacity},
         "scale_histogram": {"edges_log10_radii": SCALE_EDGES, "counts": scales},
     });

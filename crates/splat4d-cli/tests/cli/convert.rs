@@ -2,8 +2,9 @@
 
 use crate::sample::splat4d;
 use splat4d::format::{Dialect, dialect, ply, scene};
-use splat4d::layers::{ALWAYS, Layer, Scene};
+use splat4d::layers::{ALWAYS, Head, Layer, Scene};
 use splat4d::math::Rng;
+use splat4d::motion::spacetime::FeatureSpec;
 use splat4d::motion::{SpacetimeSpec, Spec, build};
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{GEOMETRY, LIFE, LifeKind, Params, SH};
@@ -11,13 +12,18 @@ use std::path::Path;
 
 /// Gaussians that fly for a second, z up.
 fn moving() -> Scene<f32> {
+    birds(None)
+}
+
+/// The same, or with colours that a network makes.
+fn birds(features: Option<FeatureSpec>) -> Scene<f32> {
     let (rows, life) = (40, LifeKind::GaussHalf);
     let mut params = Params::new(rows, 4, life.columns());
-    let spec = Spec::Spacetime(SpacetimeSpec { order: 1, rotation: true, detach: false, origin: 0.5 });
+    let spec = Spec::Spacetime(SpacetimeSpec { order: 1, rotation: true, detach: false, origin: 0.5, features });
     let motion = build(&spec, &mut params).unwrap();
     let rng = Rng::new(2, "convert", 0);
     for key in params.keys().collect::<Vec<_>>() {
-        for row in 0..rows {
+        for row in 0..params[key].rows() {
             for col in 0..params[key].width() {
                 let x = 0.4 * rng.fork(u64::from(key.0)).normal((row * 64 + col) as u64) as f32;
                 params[key].set(row, col, x);
@@ -31,7 +37,8 @@ fn moving() -> Scene<f32> {
         params[LIFE].set(row, 1, 1.0);
     }
     let layer = Layer { name: "birds".into(), params, motion, life, span: ALWAYS, masks: None };
-    Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 4.0, up: [0.0, 0.0, 1.0], ..Scene::default() }
+    let head = if features.is_some() { Head::Features } else { Head::Identity };
+    Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 4.0, up: [0.0, 0.0, 1.0], head, ..Scene::default() }
 }
 
 fn open(path: &Path) -> Scene<f32> {
@@ -86,6 +93,52 @@ fn a_moving_scene_goes_everywhere() {
     assert_eq!((joined.clip, joined.len(), joined.up), ([0.0, 1.0], 5 * 40, [0.0, 1.0, 0.0]));
     let refused = splat4d(&["convert", "frames", "x.splatv"]).run_in(work.path()).refused();
     assert!(refused.contains("interval") && refused.contains("--frames"), "{refused}");
+}
+
+#[test]
+fn a_scene_with_a_head_is_drawn_and_nothing_else_is_made_of_it() {
+    let work = tempfile::tempdir().unwrap();
+    let write = |name: &str, scene: &Scene<f32>| {
+        let mut bytes = Vec::new();
+        scene::write(scene, &mut bytes).unwrap();
+        std::fs::write(work.path().join(name), bytes).unwrap();
+    };
+    let full = birds(Some(FeatureSpec { seed: 3 }));
+    write("full.safetensors", &full);
+    write("plain.safetensors", &Scene { head: Head::Identity, layers: moving().layers, ..full });
+    let run = |args: &[&str]| splat4d(args).run_in(work.path());
+    assert!(run(&["info", "full.safetensors"]).ok().contains("features = full"));
+    let draw = |name: &str, out: &str, device: &str| {
+        let scene = format!("{name}.safetensors");
+        let said = run(&["render", &scene, "-o", out, "--size", "40x30", "--fps", "4", "--device", device]).told();
+        let mut pictures: Vec<_> =
+            std::fs::read_dir(work.path().join(out)).unwrap().map(|e| e.unwrap().path()).collect();
+        pictures.sort();
+        (said, pictures.into_iter().map(|p| std::fs::read(p).unwrap()).collect::<Vec<_>>())
+    };
+    let (_, drawn) = draw("full", "cpu", "cpu");
+    assert!(drawn.len() >= 4 && drawn != draw("plain", "plain", "cpu").1, "the head must matter");
+    let (said, again) = draw("full", "gpu", "gpu");
+    assert!(again == drawn && said.contains("on the CPU"), "{said}");
+    // A turned copy keeps its head.
+    run(&["convert", "full.safetensors", "turned.safetensors", "--up", "y"]).ok();
+    let turned = scene::read(&std::fs::read(work.path().join("turned.safetensors")).unwrap()).unwrap();
+    assert_eq!((turned.head, turned.up), (Head::Features, [0.0, 1.0, 0.0]));
+    for args in [
+        &["bake", "full.safetensors", "-o", "a.splat4d"][..],
+        &["convert", "full.safetensors", "a.splat4d"],
+        &["convert", "full.safetensors", "a.splatv"],
+        &["convert", "full.safetensors", "a.stg.ply"],
+        &["convert", "full.safetensors", "a.ply"],
+        &["convert", "full.safetensors", "f_%d.spz", "--frames"],
+        &["export", "full.safetensors", "-o", "a.ply"],
+        &["export", "full.safetensors", "-o", "a.html", "--html"],
+    ] {
+        let refused = run(args).refused();
+        assert!(refused.contains("features=none"), "{args:?}: {refused}");
+    }
+    // Where Gaussians go has nothing to do with colours.
+    run(&["export", "full.safetensors", "--tracks", "a.csv"]).ok();
 }
 
 #[test]

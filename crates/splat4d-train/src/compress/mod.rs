@@ -108,6 +108,7 @@ pub fn scores(job: &Job<'_>, progress: &mut dyn FnMut(usize, usize)) -> Result<S
 }
 
 fn bench(job: &Job<'_>) -> Result<Bench> {
+    job.source.without_head("a playback file")?;
     let frames = training_frames(job.capture.clone(), job.recipe)?;
     // Pruning is this run's own business: rows that went by themselves would leave the file's labels behind.
     let recipe = Recipe { prune_interval: 0, ..job.recipe.clone() };

@@ -13,7 +13,7 @@ use crate::recipe::Recipe;
 use splat4d::layers::{Instant, Scene};
 use splat4d::math::Rng;
 use splat4d::math::sh::rgb_to_dc;
-use splat4d::motion::spacetime::{ROTATION_RATES, VELOCITIES};
+use splat4d::motion::spacetime::{FEATURE_TABLE, ROTATION_RATES, VELOCITIES};
 use splat4d::render::{Antialias, Image, RenderConfig, Renderer};
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{Born, Camera, GEOMETRY, LIFE, Planes, RowEdit, SH, Space, Time};
@@ -113,7 +113,7 @@ impl Guided {
         apply(scene, moments, stats, 0, &edit, &rng);
         let clip = scene.clip[1] - scene.clip[0] + 1.0 / scene.fps;
         let p = &mut scene.layers[0].params;
-        let still = [VELOCITIES, ROTATION_RATES].map(|name| p.find(name));
+        let still = [VELOCITIES, ROTATION_RATES, FEATURE_TABLE].map(|name| p.find(name));
         for (row, point) in (rows..).zip(&points) {
             for key in [SH, LIFE].into_iter().chain(still.into_iter().flatten()) {
                 p[key].clear_row(row);

@@ -7,13 +7,13 @@ pub mod volume;
 use crate::capture::frames::Frames;
 use crate::models::{Plan, Program};
 use crate::{Error, Result};
-use splat4d::layers::{ALWAYS, Layer, Scene};
+use splat4d::layers::{ALWAYS, Head, Layer, Scene};
 use splat4d::math::Rng;
 use splat4d::math::knn::mean_square_distance;
 use splat4d::math::sh::rgb_to_dc;
 use splat4d::motion::build;
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
-use splat4d::scene::{GEOMETRY, LIFE, LifeKind, Params, SH};
+use splat4d::scene::{GEOMETRY, HeadKeys, LIFE, LifeKind, Params, SH};
 
 /// Points to start from.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -172,8 +172,9 @@ pub fn scene(
     }
     let motion = build(&program.spec(plan), &mut params)?;
     program.init(&lives, &mut params);
+    let head = if HeadKeys::of(&params).is_some() { Head::Features } else { Head::Identity };
     let layer = Layer { name: "scene".into(), params, motion, life, span: ALWAYS, masks: None };
-    Ok(Scene { layers: vec![layer], background, clip: plan.clip, fps: plan.fps, up, ..Scene::default() })
+    Ok(Scene { layers: vec![layer], background, clip: plan.clip, fps: plan.fps, up, head })
 }
 
 /// Centre and width (seconds) of the life that a Gaussian at a point of this time starts with.

@@ -21,7 +21,7 @@ pub use crate::loss::terms::Segmentation;
 use crate::loss::terms::{Codec, ParamLoss, ProbeLoss};
 use crate::optim::Moments;
 use crate::prune::Periodic;
-use crate::recipe::Recipe;
+use crate::recipe::{FULL, Recipe};
 use crate::sampler::Sampler;
 use crate::{Error, Result};
 use splat4d::layers::Scene;
@@ -298,6 +298,10 @@ pub fn program(motion: &str) -> Result<Box<dyn Program>> {
 
 /// The program of a recipe: that of its motion, with the losses over time and the filter that the recipe asks for.
 pub fn program_of(recipe: &Recipe) -> Result<Box<dyn Program>> {
+    if recipe.features == FULL && recipe.motion != "spacetime" {
+        return Err(Error::input(format!("motion `{}` has no features", recipe.motion))
+            .remedy("Use --motion spacetime, or --set features=none"));
+    }
     filtered::wrap(program(&recipe.motion)?, recipe)
 }
 

@@ -1,11 +1,15 @@
-//! `spacetime`: one stage; velocities, lives and rotation rates learn beside geometry and colour.
+//! `spacetime`: one stage; velocities, lives, rotation rates and, where the recipe has them, features and their head learn
+//! beside geometry and colour.
 
 use super::still;
 use super::{Group, Plan, Program, Rate, Stage};
 use crate::densify::Guided;
 use crate::loss::scene::{LivingOpacity, VelocitySmoothness};
+use crate::recipe::FULL;
+use splat4d::motion::spacetime::{FeatureSpec, TIME_FEATURES, VIEW_FEATURES};
 use splat4d::motion::{SpacetimeSpec, Spec};
 use splat4d::scene::LifeKind;
+use splat4d::scene::head::{HEAD_IN, HEAD_OUT};
 
 /// Explicit kinematics (STG, FreeTimeGS).
 #[derive(Clone, Copy, Debug)]
@@ -19,6 +23,7 @@ impl Program for SpacetimeProgram {
             rotation: r.rotation_rate,
             detach: r.detach,
             origin: 0.5 * (plan.clip[0] + plan.clip[1]),
+            features: (r.features == FULL).then_some(FeatureSpec { seed: r.seed }),
         })
     }
 
@@ -38,6 +43,13 @@ impl Program for SpacetimeProgram {
         }
         if r.rotation_rate {
             stage.groups.push(Group::new("rotation_rates", r.falling(r.rotation_rate_lr / clip)));
+        }
+        if r.features == FULL {
+            stage.groups.push(Group::new(VIEW_FEATURES, r.falling(r.view_features_lr)));
+            // Time features are per clip in the recipe, per second in the model.
+            stage.groups.push(Group::new(TIME_FEATURES, r.falling(r.time_features_lr / clip)));
+            stage.groups.push(Group::new(HEAD_IN, r.falling(r.head_lr)));
+            stage.groups.push(Group::new(HEAD_OUT, r.falling(r.head_lr)));
         }
         stage.guided = Guided::of(r);
         still::learn_life(&mut stage, plan, self.life(plan));

@@ -368,7 +368,7 @@ impl<F: Real> Chain<F> {
             .map(|layer| self.find(layer, Space::Gaussians, view.t).expect("every view's time was asked"))
             .collect();
         let parts = asked.iter().enumerate().map(|(layer, &i)| scene.layers[layer].part(&self.asks[i].tape)).collect();
-        let splats = Splats { parts };
+        let splats = Splats { parts, head: scene.head_weights() };
         let clock = Clock::now();
         let wanted = loss.wanted();
         let column = loss.share().filter(|_| view.mask.is_some()).map(str::to_owned);
@@ -418,6 +418,11 @@ impl<F: Real> Chain<F> {
             .collect();
         draw.backward(&splats, view.camera, view.background, extra, &grads, &mut d_sh, &mut self.d_render);
         report.d_cameras.push(self.d_render.camera);
+        if let (Some((layer, keys)), Some(head)) = (scene.head_keys(), &self.d_render.head) {
+            let [first, second] = d[layer].of([keys.first, keys.second]);
+            first.data_mut().iter_mut().zip(&head.first).for_each(|(d, x)| *d += *x);
+            second.data_mut().iter_mut().zip(&head.second).for_each(|(d, x)| *d += *x);
+        }
         let mut first = 0;
         for (layer, &i) in asked.iter().enumerate() {
             let count = splats.parts[layer].out.rows();

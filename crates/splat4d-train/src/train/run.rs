@@ -17,11 +17,12 @@ use crate::init::{self, Seeds};
 use crate::loss::image::ImageTerms;
 use crate::models::auto::{self, AUTO};
 use crate::models::{Plan, Stage, program_of, split};
-use crate::recipe::Recipe;
+use crate::recipe::{FULL, Recipe};
 use crate::{Error, ErrorKind, Result};
 use serde_json::json;
 use splat4d::layers::Scene;
 use splat4d::render::{Antialias, RenderConfig, Renderer, Simd};
+use splat4d::scene::head::FURTHER;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -404,7 +405,8 @@ pub fn memory_estimate(capture: &Capture, recipe: &Recipe) -> u64 {
     let motion = if recipe.motion == "still" {
         0
     } else {
-        3 * recipe.motion_order as u64 + 2 + 4 * u64::from(recipe.rotation_rate)
+        let features = if recipe.features == FULL { FURTHER as u64 } else { 0 };
+        3 * recipe.motion_order as u64 + 2 + 4 * u64::from(recipe.rotation_rate) + features
     };
     let gaussians = recipe.max_cap as u64 * ((11 + sh + motion) * BYTES_PER_NUMBER + RENDER_BYTES);
     // The result itself: a pose a Gaussian and frame.
@@ -601,7 +603,12 @@ impl Session<'_> {
         });
         let mut metrics = Metrics::open(self.run, first, iterations);
         let mut totals = Totals::default();
-        let mut snapshots = self.snapshots.map(|interval| Snapshots::new(interval, &self.bench.capture));
+        let shown = trainer.scene.without_head("the player");
+        if let (Some(_), Err(e)) = (self.snapshots, &shown) {
+            listen(&Event::Warning { message: format!("training cannot be watched: {e}") });
+        }
+        let interval = self.snapshots.filter(|_| shown.is_ok());
+        let mut snapshots = interval.map(|interval| Snapshots::new(interval, &self.bench.capture));
         let (mut clock, mut told) = (Clock::now(), Clock::now());
         let mut steps = Steps::default();
         while !trainer.is_done() && !self.stop.load(Ordering::Relaxed) {

@@ -184,6 +184,10 @@ impl<F: FnMut(usize, &mut Image<f32>) + Send> Draw<f32> for Meddled<F> {
     }
 }
 
+/// The full model of Spacetime Gaussians; its network learns fast enough to matter in a few steps.
+const STG: [&str; 6] =
+    ["features=full", "head_lr=0.01", "motion_order=3", "rotation_rate=true", "life=gauss-one", "detach=true"];
+
 /// What could go wrong in a resume: losses with a memory, exposures, both strategies, a reset of opacities, SH steps.
 fn recipes() -> Vec<Recipe> {
     vec![
@@ -193,6 +197,7 @@ fn recipes() -> Vec<Recipe> {
         recipe(&["motion_order=2", "rotation_rate=true", "life=interval", "lambda_velocity=0.1", "strategy=none"]),
         recipe(&["motion=still", "sh_degree=2", "sh_degree_interval=7"]),
         recipe(&["motion=tracked", "track_feature_lr=0.002", "exposure=true", "exposure_lr=0.01"]),
+        recipe(&[&STG[..], &["strategy=adc", "densify_grad_threshold=1e-5"]].concat()),
     ]
 }
 
@@ -483,4 +488,51 @@ fn who_watches_changes_nothing() {
     let learnt = splat4d::format::scene::read(&place.scene("watched")).unwrap();
     assert!(last.len() * 10 > learnt.len() * 9 && last.len() <= learnt.len(), "{} of {}", last.len(), learnt.len());
     assert_eq!(last.clip, learnt.clip);
+}
+
+#[test]
+fn scenes_with_a_head_are_judged_with_it_and_refuse_what_cannot_hold_it() {
+    use crate::eval::run::{EvalOptions, evaluate};
+    use splat4d::bake::{Options, bake};
+    use splat4d::layers::{Head, freeze};
+    use splat4d::scene::{HeadKeys, Time};
+    let place = Place::new();
+    let recipe = recipe(&[&STG[..], &["hold_out=camera=0"]].concat());
+    let (capture, run) = (place.open(&recipe), place.run("a"));
+    let mut warnings = Vec::new();
+    let options = TrainOptions { snapshots: Some(Duration::ZERO), ..TrainOptions::default() };
+    train(capture.clone(), recipe.clone(), &run, &options, &AtomicBool::new(false), &mut |e| {
+        assert!(!matches!(e, Event::Snapshot { .. }));
+        if let Event::Warning { message } = e {
+            warnings.push(message.clone());
+        }
+    })
+    .unwrap();
+    assert!(warnings.len() == 1 && warnings[0].contains("features=none"), "{warnings:?}");
+    assert_eq!(Recipe::from_toml(&read_text(&run.join("recipe.toml")).unwrap()).unwrap().sh_degree, 0);
+    let scene = splat4d::format::scene::read(&place.scene("a")).unwrap();
+    let (layer, keys) = scene.head_keys().unwrap();
+    let params = &scene.layers[layer].params;
+    assert_eq!(keys, HeadKeys::of(params).unwrap());
+    assert!((0..18).any(|i| params[keys.second].get(i, 0).abs() > 1e-3), "the network has learnt something");
+    // Evaluation draws what training drew: without its head the scene scores otherwise.
+    let store = ImageStore::new(capture.clone(), 1 << 20);
+    let psnr = |scene: &Scene<f32>, name: &str| {
+        let options = EvalOptions { folder: place.run(name), ..EvalOptions::default() };
+        let found = evaluate(scene, &capture, &store, 1, &options, &mut |_| {}).unwrap();
+        found.held("PSNR").unwrap()
+    };
+    let (with, without) = (psnr(&scene, "with"), psnr(&Scene { head: Head::Identity, ..scene.clone() }, "without"));
+    assert!(with > without + 0.05, "{with:.2} dB, without the head {without:.2} dB");
+    for error in [
+        bake(&scene, &Options::default(), &mut |_, _| {}).unwrap_err(),
+        freeze(&scene, Time(0.1)).unwrap_err(),
+        splat4d::format::ply::write_stg(&scene, &mut Vec::new()).unwrap_err(),
+        splat4d::format::splatv::write(&scene, &[], &mut Vec::new()).unwrap_err(),
+    ] {
+        assert!(error.kind() == ErrorKind::Unsupported && error.to_string().contains("features=none"), "{error}");
+    }
+    let other = Recipe { motion: "hexplane".into(), ..recipe };
+    let error = train(capture, other, &place.run("b"), &TrainOptions::default(), &AtomicBool::new(false), &mut |_| {});
+    assert!(error.unwrap_err().to_string().contains("`hexplane` has no features"));
 }

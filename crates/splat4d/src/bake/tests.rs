@@ -60,7 +60,7 @@ fn scene(layers: Vec<Layer<f32>>, last: f64) -> Scene<f32> {
 }
 
 fn spacetime(order: usize, rotation: bool) -> Spec {
-    Spec::Spacetime(SpacetimeSpec { order, rotation, detach: false, origin: 0.4 })
+    Spec::Spacetime(SpacetimeSpec { order, rotation, detach: false, origin: 0.4, features: None })
 }
 
 fn cameras() -> Vec<Camera> {

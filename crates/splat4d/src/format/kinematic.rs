@@ -87,6 +87,7 @@ impl Moving {
 ///
 /// Errors: a layer's motion or life is not of this kind; the message says what to do.
 pub(super) fn rows(scene: &Scene<f32>, clock: Clock, name: &str, warnings: &mut Warnings) -> Result<Vec<Moving>> {
+    scene.without_head(name)?;
     let mut out = Vec::with_capacity(scene.len());
     let mut shaded = 0;
     for layer in &scene.layers {
@@ -160,7 +161,7 @@ fn cannot_hold(layer: &Layer<f32>, name: &str, what: &str) -> Error {
 pub(super) fn scene(rows: &[Moving], clock: Clock) -> Result<Scene<f32>> {
     let kind = LifeKind::GaussOne;
     let origin = 0.5 * (clock.clip[0] + clock.clip[1]);
-    let spec = Spec::Spacetime(SpacetimeSpec { order: 3, rotation: true, detach: true, origin });
+    let spec = Spec::Spacetime(SpacetimeSpec { order: 3, rotation: true, detach: true, origin, features: None });
     let mut params = Params::new(rows.len(), 1, kind.columns());
     let motion = build(&spec, &mut params)?;
     let find = |p: &Params, name| p.find(name).expect("the model has just made its tables");
@@ -197,7 +198,7 @@ pub(super) mod tests {
     pub(in crate::format) fn moving(rows: usize, life: LifeKind, order: usize, rotation: bool) -> Scene<f32> {
         let base = gaussians(rows, 1);
         let mut params = Params::new(rows, 1, life.columns());
-        let spec = Spec::Spacetime(SpacetimeSpec { order, rotation, detach: true, origin: 3.5 });
+        let spec = Spec::Spacetime(SpacetimeSpec { order, rotation, detach: true, origin: 3.5, features: None });
         let motion = build(&spec, &mut params).unwrap();
         let rng = Rng::new(4, "kinematic", 0);
         for key in params.keys().collect::<Vec<_>>() {

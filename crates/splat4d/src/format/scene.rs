@@ -11,7 +11,7 @@ use crate::layers::{ALWAYS, Head, Layer, Scene};
 use crate::motion::native4d::MAX_HARMONICS;
 use crate::motion::{BUILT_IN, Spec, build};
 use crate::scene::masks::WORD;
-use crate::scene::{KeyMasks, LifeKind, Params, SH};
+use crate::scene::{HeadKeys, KeyMasks, LifeKind, Params, SH};
 use crate::{Error, ErrorKind, Result};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
@@ -54,7 +54,7 @@ pub fn metadata(scene: &Scene<f32>) -> Value {
         "fps": scene.fps,
         "up": scene.up,
         "background": scene.background,
-        "head": "identity",
+        "head": scene.head.name(),
         "layers": layers,
     })
 }
@@ -129,14 +129,32 @@ pub fn from_tensors(file: &SafeTensors<'_>) -> Result<Scene<f32>> {
         fps: number(&meta, "fps")?,
         up: numbers::<3>(&meta, "up")?,
         background: numbers::<3>(&meta, "background")?.map(|x| x as f32),
-        head: Head::Identity,
+        head: head(&meta)?,
         layers: Vec::new(),
     };
     let layers = meta["layers"].as_array().ok_or_else(|| broken("its metadata lists no layers".into()))?;
     for (i, layer) in layers.iter().enumerate() {
         scene.layers.push(read_layer(file, layer, i).map_err(|e| e.at(format!("layer {i}")))?);
     }
+    if scene.layers.iter().any(|l| HeadKeys::of(&l.params).is_some()) != (scene.head == Head::Features) {
+        return Err(broken(format!("its head is `{}`, which does not fit its layers", scene.head.name())));
+    }
     Ok(scene)
+}
+
+/// How blended channels become colour; files that do not say it have no head.
+fn head(meta: &Value) -> Result<Head> {
+    if meta["head"].is_null() {
+        return Ok(Head::Identity);
+    }
+    let name = text(meta, "head")?;
+    Head::from_name(&name).ok_or_else(|| {
+        Error::new(
+            ErrorKind::Unsupported,
+            format!("the scene has the pixel head `{name}`, which this version does not know"),
+        )
+        .remedy("Open it with the splat4d that wrote it, or a newer one")
+    })
 }
 
 fn read_layer(file: &SafeTensors<'_>, meta: &Value, index: usize) -> Result<Layer<f32>> {
@@ -251,7 +269,8 @@ mod tests {
             let masks = (seed != 1).then(|| Arc::new(masks));
             Layer { name: format!("layer {seed}"), params, motion, life, span, masks }
         };
-        let spacetime = Spec::Spacetime(SpacetimeSpec { order: 2, rotation: true, detach: true, origin: 0.25 });
+        let spacetime =
+            Spec::Spacetime(SpacetimeSpec { order: 2, rotation: true, detach: true, origin: 0.25, features: None });
         Scene {
             layers: vec![
                 layer(&Spec::Still, LifeKind::Infinite, 1),
@@ -281,6 +300,40 @@ mod tests {
         let mut again = Vec::new();
         write(&back, &mut again).unwrap();
         assert_eq!(bytes, again);
+    }
+
+    #[test]
+    fn a_head_comes_back_and_must_fit_its_layers() {
+        let features = Some(crate::motion::spacetime::FeatureSpec { seed: 9 });
+        let spec = Spec::Spacetime(SpacetimeSpec { features, ..SpacetimeSpec::default() });
+        let mut params = Params::new(5, 1, LifeKind::GaussHalf.columns());
+        let motion = build(&spec, &mut params).unwrap();
+        let first = HeadKeys::of(&params).unwrap().first;
+        params[first].set(7, 0, 0.25);
+        let (life, name) = (LifeKind::GaussHalf, "a".to_owned());
+        let layer = Layer { name, params, motion, life, span: ALWAYS, masks: None };
+        let with = |head: Head, layers: Vec<Layer>| {
+            let mut bytes = Vec::new();
+            write(&Scene { layers, head, ..scene() }, &mut bytes).unwrap();
+            read(&bytes)
+        };
+        let still = scene().layers.remove(0);
+        let back = with(Head::Features, vec![still.clone(), layer.clone()]).unwrap();
+        assert_eq!((back.head, back.layers[1].motion.spec()), (Head::Features, spec));
+        assert_eq!(back.layers[1].params, layer.params);
+        assert_eq!(back.head_keys().unwrap().0, 1);
+        for (head, layer) in [(Head::Features, still), (Head::Identity, layer)] {
+            let error = with(head, vec![layer]).unwrap_err().to_string();
+            assert!(error.contains(head.name()), "{error}");
+        }
+        // Scenes without a head say nothing of features: older versions read them.
+        let mut bytes = Vec::new();
+        write(&scene(), &mut bytes).unwrap();
+        assert!(!String::from_utf8_lossy(&bytes).contains("features"));
+        let at = bytes.windows(8).position(|w| w == b"identity").unwrap();
+        bytes[at..at + 8].copy_from_slice(b"identitx");
+        let error = read(&bytes).unwrap_err();
+        assert!(error.kind() == ErrorKind::Unsupported && error.to_string().contains("identitx"), "{error}");
     }
 
     #[test]

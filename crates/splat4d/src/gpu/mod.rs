@@ -140,7 +140,8 @@ impl GpuRenderer {
     /// Draws `splats` as `camera` (a pinhole) sees them over `background`, as [`crate::render::Renderer::render`] does;
     /// `out.extra` becomes empty.
     ///
-    /// Errors: the scene or the picture is too large for WebGPU's limits (the message says what), or the driver failed;
+    /// Errors: the scene has a head; it or the picture is too large for WebGPU's limits (the message says what), or the
+    /// driver failed;
     /// `out` means nothing then, and the CPU can draw instead.
     pub fn render(
         &mut self,
@@ -149,6 +150,10 @@ impl GpuRenderer {
         background: [f32; 3],
         out: &mut Image<f32>,
     ) -> Result<()> {
+        if splats.head.is_some() {
+            return Err(Error::new(ErrorKind::Unsupported, "the GPU does not draw scenes with a pixel head")
+                .remedy("Render on the CPU."));
+        }
         let start = Instant::now();
         self.timings = GpuTimings::default();
         let (n, w, h) = (splats.len(), camera.width, camera.height);

@@ -60,6 +60,9 @@ pub fn to_spacetime<F: Real>(layer: &Layer<F>) -> Result<Layer<F>> {
 /// Errors: the layer moves otherwise, along curves, turns, or its life is no Gaussian; a spec out of its ranges.
 pub fn to_native4d<F: Real>(layer: &Layer<F>, spec: Native4dSpec) -> Result<Layer<F>> {
     let own_spec = match layer.motion.spec() {
+        Spec::Spacetime(SpacetimeSpec { features: Some(_), .. }) => {
+            return Err(cannot("features have no place in native4d", "Train with features=none"));
+        }
         Spec::Spacetime(s) if s.order <= 1 && !s.rotation => s,
         _ => {
             return Err(cannot(

@@ -1,6 +1,7 @@
 //! A moving scene at one moment as plain Gaussians: what a 3DGS file can hold.
 
 use super::{Instant, Layer, LayerTape, Scene};
+use crate::Result;
 use crate::math::sh::MAX_COEFFS;
 use crate::math::{quat, sym3};
 use crate::motion::Cache;
@@ -18,7 +19,10 @@ const THINNEST: f64 = 1e-4;
 const OPACITY_MARGIN: f32 = 1e-6;
 
 /// The Gaussians that are alive at `time`, all layers together, as a still layer's parameters.
-pub fn freeze(scene: &Scene<f32>, time: Time) -> Params<f32> {
+///
+/// Errors: the scene has a head, without which its Gaussians look different.
+pub fn freeze(scene: &Scene<f32>, time: Time) -> Result<Params<f32>> {
+    scene.without_head("plain Gaussians")?;
     let mut instant = Instant::default();
     scene.at(time, &mut instant);
     let coefficients = scene.layers.iter().map(|l| l.params[SH].width() / 3).max().unwrap_or(1).clamp(1, MAX_COEFFS);
@@ -29,10 +33,11 @@ pub fn freeze(scene: &Scene<f32>, time: Time) -> Params<f32> {
         write(layer, tape, coefficients, first, &mut params);
         first += tape.out().rows();
     }
-    params
+    Ok(params)
 }
 
-/// These rows of a layer (strictly increasing) as they are at `time`, life included, as a still layer's parameters.
+/// These rows of a layer (strictly increasing) as they are at `time`, life included, as a still layer's parameters; of
+/// Gaussians with features only the base colour is left.
 pub fn freeze_rows(layer: &Layer<f32>, rows: &[u32], time: Time) -> Params<f32> {
     let mut tape = LayerTape::default();
     tape.ask(Space::Gaussians, Rows::Some(rows), time);

@@ -17,8 +17,10 @@ use crate::motion::{At, Cache, Motion, Tape};
 use crate::scene::GEOMETRY;
 use crate::scene::params::OPACITY;
 use crate::scene::{
-    Grads, KeyMasks, LIFE, LifeBuckets, LifeKind, Params, Part, RowEdit, Rows, Space, SplatGrads, Splats, Table, Time,
+    Grads, HeadKeys, HeadWeights, KeyMasks, LIFE, LifeBuckets, LifeKind, Params, Part, RowEdit, Rows, Space,
+    SplatGrads, Splats, Table, Time,
 };
+use crate::{Error, ErrorKind, Result};
 use std::sync::Arc;
 
 /// A splat fainter than this is not drawn, so that a Gaussian below it is not alive (1/255, Kerbl et al. 2023).
@@ -284,6 +286,24 @@ pub enum Head {
     /// They are the colour.
     #[default]
     Identity,
+    /// By the network of Spacetime Gaussians, whose weights lie in the first layer that has features. Layers without
+    /// features may stand beside it: theirs count as zero.
+    Features,
+}
+
+impl Head {
+    /// What files call it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Head::Identity => "identity",
+            Head::Features => "features",
+        }
+    }
+
+    /// The head of that name.
+    pub fn from_name(name: &str) -> Option<Self> {
+        [Head::Identity, Head::Features].into_iter().find(|h| h.name() == name)
+    }
 }
 
 /// A sum of layers on one clock.
@@ -340,6 +360,32 @@ impl<F: Real> Scene<F> {
 
     /// The splats that [`at`](Self::at) left in `instant`.
     pub fn splats<'a>(&'a self, instant: &'a Instant<F>) -> Splats<'a, F> {
-        Splats { parts: self.layers.iter().zip(&instant.tapes).map(|(l, t)| l.part(t)).collect() }
+        let parts = self.layers.iter().zip(&instant.tapes).map(|(l, t)| l.part(t)).collect();
+        Splats { parts, head: self.head_weights() }
+    }
+
+    /// The layer that holds the head's weights, and their places there; `None`: there is no head.
+    pub fn head_keys(&self) -> Option<(usize, HeadKeys)> {
+        match self.head {
+            Head::Identity => None,
+            Head::Features => self.layers.iter().enumerate().find_map(|(i, l)| Some((i, HeadKeys::of(&l.params)?))),
+        }
+    }
+
+    /// The head's weights; `None`: there is no head.
+    pub fn head_weights(&self) -> Option<HeadWeights<'_, F>> {
+        self.head_keys().map(|(layer, keys)| keys.weights(&self.layers[layer].params))
+    }
+
+    /// Errors where Gaussians alone do not say how the scene looks: `what` (a format, a way to play) has no pixel head.
+    pub fn without_head(&self, what: &str) -> Result<()> {
+        match self.head {
+            Head::Identity => Ok(()),
+            Head::Features => Err(Error::new(
+                ErrorKind::Unsupported,
+                format!("{what} cannot hold this scene: a network makes its colours, pixel by pixel (features = full)"),
+            )
+            .remedy("Train with --set features=none for that; `render` and `eval` draw the scene as it is")),
+        }
     }
 }

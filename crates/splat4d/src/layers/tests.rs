@@ -30,7 +30,9 @@ fn weight(j: usize, c: usize) -> f64 {
 }
 
 fn specs() -> Vec<(Spec, LifeKind)> {
-    let spacetime = |order, rotation, detach| Spec::Spacetime(SpacetimeSpec { order, rotation, detach, origin: 0.15 });
+    let spacetime = |order, rotation, detach| {
+        Spec::Spacetime(SpacetimeSpec { order, rotation, detach, origin: 0.15, features: None })
+    };
     vec![
         (Spec::Still, LifeKind::Infinite),
         (Spec::Still, LifeKind::Interval),
@@ -84,7 +86,7 @@ fn every_parameter_and_time_against_finite_differences() {
 
 #[test]
 fn detached_center_learns_from_opacity_alone() {
-    let spec = Spec::Spacetime(SpacetimeSpec { order: 3, rotation: true, detach: true, origin: 0.0 });
+    let spec = Spec::Spacetime(SpacetimeSpec { order: 3, rotation: true, detach: true, origin: 0.0, features: None });
     let base = layer(&spec, LifeKind::GaussOne, 20, 3);
     let mut tape = LayerTape::default();
     tape.ask(Space::Gaussians, Rows::All, Time(0.4));

@@ -4,8 +4,9 @@ use super::Scene;
 use crate::math::{quat, se3, sh, sh_rotation};
 use crate::motion::spacetime::{ROTATION_RATES, VELOCITIES};
 use crate::motion::{SpacetimeSpec, Spec, native4d};
+use crate::scene::head::{FURTHER, HIDDEN, INPUTS};
 use crate::scene::params::QUAT;
-use crate::scene::{GEOMETRY, Params, SH, Table};
+use crate::scene::{GEOMETRY, HeadKeys, Params, SH, Table};
 use crate::{Error, ErrorKind, Result};
 
 /// Vectors shorter than this name no direction.
@@ -39,7 +40,7 @@ pub fn rotation_between(from: [f64; 3], to: [f64; 3]) -> Option<[[f64; 3]; 3]> {
 
 impl Scene<f32> {
     /// Turns everything by the rotation `r` (rows): means, quaternions (both of `native4d`), velocities, rotation rates,
-    /// colours, `up`.
+    /// colours (and the rays that a head sees), `up`.
     ///
     /// Errors: a layer moves by a model from outside this library, whose parameters nobody here can turn.
     pub fn turn(&mut self, r: &[[f64; 3]; 3]) -> Result<()> {
@@ -80,6 +81,9 @@ impl Scene<f32> {
                 }
             }
         }
+        if let Some((layer, keys)) = self.head_keys() {
+            turn_head(&mut self.layers[layer].params, keys, r);
+        }
         self.up = std::array::from_fn(|k| (0..3).map(|l| r[k][l] * self.up[l]).sum());
         Ok(())
     }
@@ -102,6 +106,18 @@ impl Scene<f32> {
             }
         }
         highest
+    }
+}
+
+/// The network sees rays in world axes: W₁x is to be the same for turned rays, so that the rows of its columns for origin
+/// and direction turn as the rays do.
+fn turn_head(params: &mut Params, keys: HeadKeys, r: &[[f64; 3]; 3]) {
+    let table = &mut params[keys.first];
+    for row in (0..HIDDEN).map(|h| h * INPUTS) {
+        for first in [row + FURTHER, row + FURTHER + 3] {
+            let turned = apply(r, std::array::from_fn(|k| table.get(first + k, 0)));
+            (0..3).for_each(|k| table.set(first + k, 0, turned[k]));
+        }
     }
 }
 
@@ -153,15 +169,16 @@ fn product(a: [f64; 4], b: [f32; 4]) -> [f32; 4] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::layers::{Instant, Layer};
+    use crate::layers::{Head, Instant, Layer};
     use crate::math::{Rng, Se3};
     use crate::motion::build;
+    use crate::motion::spacetime::FeatureSpec;
     use crate::render::{Image, RenderConfig, Renderer};
     use crate::scene::params::LOG_SCALE;
     use crate::scene::{Camera, LifeKind, Time};
 
-    fn moving() -> Scene<f32> {
-        let spec = Spec::Spacetime(SpacetimeSpec { order: 3, rotation: true, detach: true, origin: 0.0 });
+    fn moving(features: Option<FeatureSpec>) -> Scene<f32> {
+        let spec = Spec::Spacetime(SpacetimeSpec { order: 3, rotation: true, detach: true, origin: 0.0, features });
         let mut params = Params::new(40, 16, LifeKind::GaussOne.columns());
         let motion = build(&spec, &mut params).unwrap();
         let rng = Rng::new(3, "turn", 0);
@@ -186,7 +203,8 @@ mod tests {
             span: crate::layers::ALWAYS,
             masks: None,
         };
-        Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 30.0, up: [0.0, 1.0, 0.0], ..Scene::default() }
+        let head = if features.is_some() { Head::Features } else { Head::Identity };
+        Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 30.0, up: [0.0, 1.0, 0.0], head, ..Scene::default() }
     }
 
     fn draw(scene: &Scene<f32>, pose: Se3, time: f64) -> Vec<f32> {
@@ -199,7 +217,16 @@ mod tests {
 
     #[test]
     fn a_turned_scene_seen_by_a_turned_camera_is_the_same_picture() {
-        let scene = moving();
+        the_same_picture(&moving(None));
+        let featured = moving(Some(FeatureSpec { seed: 3 }));
+        the_same_picture(&featured);
+        let plain = Scene { head: Head::Identity, ..featured.clone() };
+        let pose = Se3::look_at([0.5, 0.4, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
+        let pairs = draw(&featured, pose, 0.3).into_iter().zip(draw(&plain, pose, 0.3));
+        assert!(pairs.filter(|(a, b)| (a - b).abs() > 0.05).count() > 200, "the head must matter");
+    }
+
+    fn the_same_picture(scene: &Scene<f32>) {
         let r = quat::to_rotation(quat::normalize([0.4, -0.3, 0.8, 0.2]).0);
         let mut turned = scene.clone();
         turned.turn(&r).unwrap();
@@ -209,13 +236,13 @@ mod tests {
         });
         let turned_pose = Se3 { rotation, translation: pose.translation };
         for time in [0.0, 0.3, 0.9] {
-            let (a, b) = (draw(&scene, pose, time), draw(&turned, turned_pose, time));
+            let (a, b) = (draw(scene, pose, time), draw(&turned, turned_pose, time));
             let worst = a.iter().zip(&b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
             assert!(worst < 1e-3, "{time}: {worst}");
             assert!(a.iter().filter(|v| (**v - 0.2).abs() > 0.05).count() > 200, "the test must look at something");
         }
         let kept = draw(&turned, pose, 0.3);
-        let other = draw(&scene, pose, 0.3);
+        let other = draw(scene, pose, 0.3);
         assert!(kept.iter().zip(&other).any(|(a, b)| (a - b).abs() > 0.1), "a turn must be visible");
     }
 
@@ -240,7 +267,7 @@ mod tests {
 
     #[test]
     fn lower_degrees_keep_the_first_coefficients() {
-        let mut scene = moving();
+        let mut scene = moving(None);
         let before = scene.layers[0].params[SH].read::<12>(7, 0);
         assert_eq!(scene.limit_sh(1), 3);
         let table = &scene.layers[0].params[SH];

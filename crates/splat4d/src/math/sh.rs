@@ -12,8 +12,8 @@ pub const MAX_COEFFS: usize = 16;
 /// Added to the sum, so that all-zero coefficients are mid-grey.
 pub const COLOR_OFFSET: f64 = 0.5;
 
-/// ½√(1/π)
-const C0: f64 = 0.282_094_791_773_878_14;
+/// The basis function of degree 0: ½√(1/π).
+pub const C0: f64 = 0.282_094_791_773_878_14;
 /// √(3/4π)
 const C1: f64 = 0.488_602_511_902_919_9;
 /// Degree 2, in the order xy, yz, 2zz−xx−yy, xz, xx−yy.

@@ -2,16 +2,19 @@
 //! μ(t) = μ + v₁Δ + v₂Δ² + v₃Δ³ and q(t) = normalize(q + ωΔ).
 //!
 //! It covers static 3DGS (order 0), FreeTimeGS (order 1, life `GaussHalf`), STG-lite (order 3, rotation rate, life
-//! `GaussOne`, detached) and native 4D Gaussians in the Cholesky chart.
+//! `GaussOne`, detached) and native 4D Gaussians in the Cholesky chart. With [`FeatureSpec`] it is the full STG: a Gaussian
+//! has a base colour b (its SH coefficient of degree 0), view features f and time features g, and shows the nine channels
+//! [b, f, g·Δ], which the scene's head turns into colour pixel by pixel (`render/head.rs`).
 //! Source: Li et al. 2024 (STG) §3; Wang et al. 2025 (FreeTimeGS) §3.
 
 use super::lanes::{Batch, Lane, Work, fill, scatter};
 use super::still::{activate_backward_lanes, activate_lanes};
 use super::{At, Cache, Motion, Spec, Tape, fill_rows};
-use crate::math::Real;
+use crate::math::{Real, sh};
+use crate::scene::head::{BASE, FEATURES, FURTHER};
 use crate::scene::params::QUAT;
 use crate::scene::table::TableMut;
-use crate::scene::{BLOCK, GEOMETRY, Grads, Key, LIFE, Params, Space, SplatGrads, Table};
+use crate::scene::{BLOCK, Color, GEOMETRY, Grads, HeadKeys, Key, LIFE, Params, SH, Space, SplatGrads, Table};
 use crate::simd::each;
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
@@ -31,12 +34,24 @@ pub struct SpacetimeSpec {
     pub detach: bool,
     /// Origin of Δ for Gaussians that live for ever: the clip's centre, seconds.
     pub origin: f64,
+    /// Features for a head (STG's full model), of which spherical harmonics above degree 0 are no part; none: colours as
+    /// they are.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub features: Option<FeatureSpec>,
+}
+
+/// Features beside the base colour, and the head that reads them.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FeatureSpec {
+    /// Seed of what the head's weights start with.
+    pub seed: u64,
 }
 
 impl Default for SpacetimeSpec {
     /// Order 1, no rotation rate, not detached: FreeTimeGS.
     fn default() -> Self {
-        Self { order: 1, rotation: false, detach: false, origin: 0.0 }
+        Self { order: 1, rotation: false, detach: false, origin: 0.0, features: None }
     }
 }
 
@@ -46,8 +61,15 @@ pub struct Spacetime {
     spec: SpacetimeSpec,
     velocities: Key,
     rates: Key,
+    features: Option<Key>,
 }
 
+/// Name of the table of features, [N, 6].
+pub const FEATURE_TABLE: &str = "features";
+/// View features, 3 columns of [`FEATURE_TABLE`].
+pub const VIEW_FEATURES: &str = "view_features";
+/// Time features, 3 columns of [`FEATURE_TABLE`], 1/s.
+pub const TIME_FEATURES: &str = "time_features";
 /// Name of the table of polynomial coefficients, [N, 3·order]: column 3(k−1) + axis, scene units / s^k.
 pub const VELOCITIES: &str = "velocities";
 /// Name of the table of quaternion rates, [N, 4 or 0], 1/s.
@@ -68,7 +90,20 @@ impl Spacetime {
         let velocities = p.entry(VELOCITIES, Space::Gaussians, VELOCITY_COLUMNS[spec.order], rows, |_| {})?;
         let columns: &[_] = if spec.rotation { &[("rotation_rates", 4)] } else { &[] };
         let rates = p.entry(ROTATION_RATES, Space::Gaussians, columns, rows, |_| {})?;
-        Ok(Self { spec, velocities, rates })
+        let features = spec.features.map(|f| Self::featured(f, p)).transpose()?;
+        Ok(Self { spec, velocities, rates, features })
+    }
+
+    /// The table of features, and the head's weights.
+    fn featured<F: Real>(spec: FeatureSpec, p: &mut Params<F>) -> Result<Key> {
+        if p[SH].width() < BASE {
+            return Err(Error::input("a layer with features has no base colours")
+                .remedy("The file is damaged or was written by another program; export it again"));
+        }
+        let columns = [(VIEW_FEATURES, 3), (TIME_FEATURES, 3)];
+        let key = p.entry(FEATURE_TABLE, Space::Gaussians, &columns, p.len(), |_| {})?;
+        HeadKeys::new(spec.seed, p)?;
+        Ok(key)
     }
 
     /// Key of the table of polynomial coefficients.
@@ -110,6 +145,19 @@ impl<F: Real> Motion<F> for Spacetime {
     fn at(&self, q: &At<'_, F>, _cache: &Cache, tape: &mut Tape<F>) {
         tape.start(q.len());
         fill(&Forward(Reader::new(self, q)), [&mut tape.out], q.rows);
+        if let Some(key) = self.features {
+            let Channels(out) = tape.own.get_or_default::<Channels<F>>();
+            out.resize(q.len());
+            let (reader, features) = (Reader::new(self, q), &q.p[key]);
+            fill(&Paint { reader, base: &q.p[SH], features }, [out], q.rows);
+        }
+    }
+
+    fn color<'a>(&self, q: &At<'a, F>, tape: &'a Tape<F>) -> Color<'a, F> {
+        match self.features {
+            Some(_) => Color::Direct { table: &tape.own.get::<Channels<F>>().expect("`at` came first").0 },
+            None => Color::Sh { table: &q.p[SH], rows: q.rows, weights: None, base: true },
+        }
     }
 
     fn backward(
@@ -122,7 +170,12 @@ impl<F: Real> Motion<F> for Spacetime {
         d: &mut Grads<F>,
     ) -> f64 {
         let tables = d.of([GEOMETRY, self.velocities, self.rates, LIFE]);
-        scatter(&Backward { reader: Reader::new(self, q), d_out: d_out.out }, tables, q.rows)
+        let mut d_time = scatter(&Backward { reader: Reader::new(self, q), d_out: d_out.out }, tables, q.rows);
+        if let (Some(key), Some(d_color)) = (self.features, d_out.color) {
+            let work = PaintBack { reader: Reader::new(self, q), features: &q.p[key], d_color };
+            d_time += scatter(&work, d.of([SH, key, LIFE]), q.rows);
+        }
+        d_time
     }
 
     fn velocity(&self, q: &At<'_, F>, out: &mut Table<F>) {
@@ -241,6 +294,74 @@ impl<F: Real> Work<F, 4> for Backward<'_, F> {
             }
             batch.add(d_w, 0, &d_rate);
         }
+        if r.life.width() > 0 && !r.spec.detach {
+            batch.add(d_life, 0, &[each(|l| -d_delta[l])]);
+        }
+        batch.sum(d_delta)
+    }
+}
+
+/// What a Gaussian shows of itself, [splats, 9]: base colour, view features, time features times Δ.
+#[derive(Debug)]
+struct Channels<F>(Table<F>);
+
+impl<F: Real> Default for Channels<F> {
+    fn default() -> Self {
+        Self(Table::new(&[("channels", FEATURES)], 0))
+    }
+}
+
+struct Paint<'a, F> {
+    reader: Reader<'a, F>,
+    base: &'a Table<F>,
+    features: &'a Table<F>,
+}
+
+impl<F: Real> Work<F, 1> for Paint<'_, F> {
+    #[inline(always)]
+    fn run(&self, batch: &Batch, [out]: &mut [TableMut<'_, F>; 1]) -> f64 {
+        let delta = self.reader.delta(batch);
+        let base: [Lane<F>; BASE] = batch.ids.read(self.base, 0);
+        let features: [Lane<F>; FURTHER] = batch.ids.read(self.features, 0);
+        let mut channels = [[F::ZERO; BLOCK]; FEATURES];
+        for k in 0..3 {
+            for l in 0..BLOCK {
+                channels[k][l] = F::of(sh::C0) * base[k][l] + F::of(sh::COLOR_OFFSET);
+                channels[3 + k][l] = features[k][l];
+                channels[6 + k][l] = features[3 + k][l] * delta[l];
+            }
+        }
+        batch.write(out, 0, &channels);
+        0.0
+    }
+}
+
+struct PaintBack<'a, F> {
+    reader: Reader<'a, F>,
+    features: &'a Table<F>,
+    d_color: &'a Table<F>,
+}
+
+impl<F: Real> Work<F, 3> for PaintBack<'_, F> {
+    #[inline(always)]
+    fn run(&self, batch: &Batch, [d_base, d_features, d_life]: &mut [TableMut<'_, F>; 3]) -> f64 {
+        let r = &self.reader;
+        let delta = r.delta(batch);
+        let d: [Lane<F>; FEATURES] = batch.at.read(self.d_color, 0);
+        let time: [Lane<F>; 3] = batch.ids.read(self.features, 3);
+        let mut base = [[F::ZERO; BLOCK]; BASE];
+        let mut features = [[F::ZERO; BLOCK]; FURTHER];
+        let mut d_delta = [F::ZERO; BLOCK];
+        for k in 0..3 {
+            for l in 0..BLOCK {
+                base[k][l] = F::of(sh::C0) * d[k][l];
+                features[k][l] = d[3 + k][l];
+                features[3 + k][l] = d[6 + k][l] * delta[l];
+                d_delta[l] += d[6 + k][l] * time[k][l];
+            }
+        }
+        batch.add(d_base, 0, &base);
+        batch.add(d_features, 0, &features);
         if r.life.width() > 0 && !r.spec.detach {
             batch.add(d_life, 0, &[each(|l| -d_delta[l])]);
         }

@@ -8,12 +8,16 @@
 //!
 //! The same bits come out for any number of threads: every floating-point sum has a fixed order, and nothing is ever
 //! added atomically.
+//!
+//! Where [`Splats::head`] has a network, it makes colours of blended channels (`head.rs`), and its gradients come with
+//! the others.
 
 pub mod bin;
 mod blend;
 pub mod ceiling;
 mod count;
 mod gather;
+mod head;
 pub mod oracle;
 mod parallel;
 pub mod project;
@@ -30,9 +34,10 @@ pub use project::{Projected, ProjectedGrads, View};
 pub use sense::Sensitivity;
 
 use crate::math::Real;
-use crate::scene::{Camera, Planes, Splats, Table};
+use crate::scene::{Camera, HeadGrads, Planes, Splats, Table};
 use crate::simd;
 use bin::Footprint;
+use head::Headed;
 use rasterize::{CHANNELS, Geometry, PixelGrads, Raster};
 use rayon::prelude::*;
 use std::time::Instant;
@@ -93,7 +98,7 @@ impl Default for RenderConfig {
 /// A rendered picture.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Image<F = f32> {
-    /// Red, green, blue over the background, not clamped, [3, h, w].
+    /// Red, green, blue over the background, not clamped, after the head where there is one, [3, h, w].
     pub color: Planes<F>,
     /// 1 − final transmittance, [1, h, w].
     pub alpha: Planes<F>,
@@ -145,6 +150,8 @@ pub struct RenderGrads<F = f32> {
     pub parts: Vec<PartGrads<F>>,
     /// To the further channels, [all splats, C].
     pub extra: Option<Table<F>>,
+    /// To the weights of the head, where there is one.
+    pub head: Option<HeadGrads<F>>,
     /// To the background.
     pub background: [F; 3],
     /// To a left perturbation exp(ρ, θ)·cam_from_world: ρ 3, θ 3.
@@ -201,6 +208,7 @@ pub struct Renderer<F = f32> {
     d_channels: Vec<[F; CHANNELS]>,
     d_extra: Vec<[F; CHANNELS]>,
     radii: Vec<F>,
+    headed: Headed<F>,
     pose_partial: Vec<[f64; 6]>,
     center_partial: Vec<[f64; 3]>,
     seconds: StageSeconds,
@@ -221,6 +229,7 @@ impl<F: Real> Renderer<F> {
             d_channels: Vec::new(),
             d_extra: Vec::new(),
             radii: Vec::new(),
+            headed: Headed::default(),
             pose_partial: Vec::new(),
             center_partial: Vec::new(),
             seconds: StageSeconds::default(),
@@ -239,11 +248,30 @@ impl<F: Real> Renderer<F> {
         extra: Option<&Table<F>>,
         out: &mut Image<F>,
     ) {
+        if let Some(extra) = extra {
+            assert_eq!(extra.rows(), splats.len(), "further channels need one row a splat");
+        }
+        let Some(head) = splats.head else { return self.blend(splats, camera, background, extra, out) };
+        let mut headed = std::mem::take(&mut self.headed);
+        headed.gather(splats, extra);
+        self.blend(splats, camera, background, Some(&headed.table), out);
+        let mut clock = Clock::start();
+        headed.forward(head, camera, self.config.simd, out);
+        self.seconds.blend += clock.lap();
+        self.headed = headed;
+    }
+
+    /// [`Renderer::render`] without the head.
+    fn blend(
+        &mut self,
+        splats: &Splats<'_, F>,
+        camera: &Camera,
+        background: [F; 3],
+        extra: Option<&Table<F>>,
+        out: &mut Image<F>,
+    ) {
         let n = splats.len();
         let (w, h) = (camera.width, camera.height);
-        if let Some(extra) = extra {
-            assert_eq!(extra.rows(), n, "further channels need one row a splat");
-        }
         let simd = self.config.simd;
         let view = View::new(camera, &self.config);
         self.size = [w, h];
@@ -330,6 +358,25 @@ impl<F: Real> Renderer<F> {
         plane(grads.alpha, 1);
         plane(grads.depth, usize::from(self.config.depth));
         plane(grads.extra, widths);
+        d.head = None;
+        match splats.head {
+            None => self.backward_blended(splats, camera, background, extra, grads, d_sh, d),
+            Some(head) => self.backward_headed(head, (splats, camera, background), extra, grads, d_sh, d),
+        }
+    }
+
+    /// [`Renderer::backward`] without the head, after its checks.
+    fn backward_blended(
+        &mut self,
+        splats: &Splats<'_, F>,
+        camera: &Camera,
+        background: [F; 3],
+        extra: Option<&Table<F>>,
+        grads: &ImageGrads<'_, F>,
+        d_sh: &mut [Option<&mut Table<F>>],
+        d: &mut RenderGrads<F>,
+    ) {
+        let (n, size) = (splats.len(), [camera.width, camera.height]);
         let view = View::new(camera, &self.config);
         let simd = self.config.simd;
         self.d_projected.resize(n, ProjectedGrads::default());
@@ -489,7 +536,8 @@ impl<F: Real> Renderer<F> {
     /// `background`, one a splat, exact for each alone: a splat before others of its colour has a large contribution
     /// and changes little.
     ///
-    /// `out` is overwritten, one a splat. Draws by itself; no backward may follow.
+    /// A head is not looked at: it is the base colours' picture that changes. `out` is overwritten, one a splat. Draws by
+    /// itself; no backward may follow.
     pub fn removals(&mut self, splats: &Splats<'_, F>, camera: &Camera, background: [F; 3], out: &mut Vec<F>) {
         let view = self.list(splats, camera);
         self.channels.resize(splats.len(), [F::ZERO; CHANNELS]);

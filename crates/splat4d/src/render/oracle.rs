@@ -4,8 +4,9 @@
 
 use super::{Antialias, Image, RenderConfig};
 use crate::math::{Real, se3, sh};
+use crate::scene::head::{BASE, FEATURES, FURTHER, HIDDEN, INPUTS};
 use crate::scene::splats::{COV, SPLAT_OPACITY};
-use crate::scene::{Camera, Color, Part, Planes, Splats, Table};
+use crate::scene::{Camera, Color, HeadWeights, Part, Planes, Splats, Table};
 
 /// gsplat's margin for x/z and y/z inside J: 0.3 times the tangent of half the field of view.
 const MARGIN: f64 = 0.3;
@@ -19,6 +20,7 @@ struct Blob {
     opacity: f64,
     depth: f64,
     rgb: [f64; 3],
+    further: [f64; FURTHER],
     id: usize,
 }
 
@@ -55,6 +57,7 @@ pub fn render<F: Real>(
         for x in 0..w {
             let at = y * w + x;
             let mut t = 1.0;
+            let mut further = [0.0; FURTHER];
             for b in &blobs {
                 let d = [b.mean[0] - (x as f64 + 0.5), b.mean[1] - (y as f64 + 0.5)];
                 let q: f64 = (0..2).map(|i| (0..2).map(|j| d[i] * b.inverse[i][j] * d[j]).sum::<f64>()).sum();
@@ -69,6 +72,7 @@ pub fn render<F: Real>(
                     out.color.plane_mut(k)[at] += b.rgb[k] * alpha * t;
                 }
                 out.depth.data[at] += b.depth * alpha * t;
+                (0..FURTHER).for_each(|k| further[k] += b.further[k] * alpha * t);
                 if let Some(extra) = extra {
                     for k in 0..c {
                         out.extra.plane_mut(k)[at] += extra.get(b.id, k).f64() * alpha * t;
@@ -80,6 +84,10 @@ pub fn render<F: Real>(
                 out.color.plane_mut(k)[at] += t * background[k];
             }
             out.alpha.data[at] = 1.0 - t;
+            if let Some(head) = &splats.head {
+                let color = headed(head, [0, 1, 2].map(|k| out.color.plane(k)[at]), &further, ray(camera, x, y));
+                (0..3).for_each(|k| out.color.plane_mut(k)[at] = color[k]);
+            }
         }
     }
     out
@@ -125,6 +133,7 @@ fn blob<F: Real>(part: &Part<'_, F>, j: usize, id: usize, camera: &Camera, confi
         inverse: [[c / det, -b / det], [-b / det, a / det]],
         opacity,
         depth: p[2],
+        further: further(part, j),
         rgb: color(part, j, se3::normalize(se3::sub(mean, camera.center())), config.sh_degree),
         id,
     })
@@ -149,4 +158,33 @@ fn color<F: Real>(part: &Part<'_, F>, j: usize, direction: [f64; 3], degree: usi
             sh::evaluate(&f, direction)
         }
     }
+}
+
+/// What a head sees of a splat besides its colour.
+fn further<F: Real>(part: &Part<'_, F>, j: usize) -> [f64; FURTHER] {
+    match part.color {
+        Color::Direct { table } if table.width() == FEATURES => table.read::<FURTHER>(j, BASE).map(F::f64),
+        _ => [0.0; FURTHER],
+    }
+}
+
+/// Origin, squashed into the unit ball, and unit direction of a pixel's ray.
+fn ray(camera: &Camera, x: usize, y: usize) -> [f64; 6] {
+    let eye = camera.center();
+    let [a, b, c] = eye.map(|e| e / (1.0 + se3::norm(eye)));
+    let [p, q, r] = se3::normalize(se3::sub(camera.unproject([x as f64 + 0.5, y as f64 + 0.5], 1.0), eye));
+    [a, b, c, p, q, r]
+}
+
+/// σ(logit b + W₂ relu(W₁x)), the logit as far from 0 and 1 as 8 bits tell, and its tangents beyond.
+fn headed<F: Real>(head: &HeadWeights<'_, F>, base: [f64; 3], further: &[f64; FURTHER], ray: [f64; 6]) -> [f64; 3] {
+    let x: Vec<f64> = further.iter().copied().chain(ray).collect();
+    let row = |h: usize| (0..INPUTS).map(|i| head.first[h * INPUTS + i].f64() * x[i]).sum::<f64>().max(0.0);
+    let hidden: Vec<f64> = (0..HIDDEN).map(row).collect();
+    std::array::from_fn(|c| {
+        let z: f64 = (0..HIDDEN).map(|h| head.second[c * HIDDEN + h].f64() * hidden[h]).sum();
+        let near = base[c].clamp(1.0 / 255.0, 254.0 / 255.0);
+        let logit = (near / (1.0 - near)).ln() + (base[c] - near) / (near * (1.0 - near));
+        1.0 / (1.0 + (-(logit + z)).exp())
+    })
 }

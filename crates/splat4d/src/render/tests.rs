@@ -1,5 +1,7 @@
 //! The fast renderer against the oracle and against finite differences, in f64 and f32.
 
+mod head;
+
 use super::*;
 use crate::math::{Rng, Se3, sym3};
 use crate::scene::splats::{Part, SPLAT_COLUMNS};
@@ -31,7 +33,7 @@ impl<F: Real> Scene<F> {
         let own = Color::Sh { table: &self.own, rows: Rows::Some(&self.ids), weights: None, base: true };
         let foreign = Color::Sh { table: &self.foreign, rows: Rows::All, weights: Some(&self.weights), base: false };
         let colors = [own, foreign, Color::Direct { table: &self.direct }];
-        Splats { parts: self.outs.iter().zip(colors).map(|(out, color)| Part { out, color }).collect() }
+        Splats { parts: self.outs.iter().zip(colors).map(|(out, color)| Part { out, color }).collect(), head: None }
     }
 
     fn cast<G: Real>(&self) -> Scene<G> {
@@ -310,7 +312,7 @@ fn simple(rows: &[([f64; 3], f64, f64)]) -> (Table<f64>, Table<f64>) {
 }
 
 fn direct<'a>(out: &'a Table<f64>, rgb: &'a Table<f64>) -> Splats<'a, f64> {
-    Splats { parts: vec![Part { out, color: Color::Direct { table: rgb } }] }
+    Splats { parts: vec![Part { out, color: Color::Direct { table: rgb } }], head: None }
 }
 
 fn frontal(size: usize, f: f64) -> Camera {
@@ -729,7 +731,7 @@ fn touched_pixels_are_those_of_the_ellipse_inside_the_picture() {
     let mut pixels = |cx: f64| {
         let mut view = view.clone();
         view.intrinsics.cx = cx;
-        let splats = Splats { parts: vec![Part { out: &out, color: Color::Direct { table: &colors } }] };
+        let splats = Splats { parts: vec![Part { out: &out, color: Color::Direct { table: &colors } }], head: None };
         renderer.render(&splats, &view, [0.0; 3], None, &mut image);
         let lit = image.alpha.data.iter().filter(|a| **a > 0.0).count() as f64;
         (renderer.projected()[0].pixels([400, 300]), lit)

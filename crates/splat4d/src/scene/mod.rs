@@ -1,6 +1,7 @@
 //! What a scene is made of: tables of Gaussians, the instant they are looked at, and the cameras that look.
 
 pub mod camera;
+pub mod head;
 pub mod life;
 pub mod masks;
 pub mod params;
@@ -10,6 +11,7 @@ pub mod table;
 pub mod time;
 
 pub use camera::{Camera, Intrinsics, Lens};
+pub use head::{HeadGrads, HeadKeys, HeadWeights};
 pub use life::{LifeBuckets, LifeKind};
 pub use masks::KeyMasks;
 pub use params::{Born, GEOMETRY, Grads, Key, LIFE, ParamInfo, Params, RowEdit, SH, Space};

@@ -1,5 +1,6 @@
 //! [`Splats`]: the scene at one instant, activated: all the renderer ever sees.
 
+use super::head::HeadWeights;
 use super::table::Table;
 use crate::math::Real;
 
@@ -52,9 +53,10 @@ pub enum Color<'a, F = f32> {
         /// Whether the table is the layer's own SH, whose gradient goes straight to `Grads`.
         base: bool,
     },
-    /// One colour a splat, [splats, C].
+    /// One colour a splat.
     Direct {
-        /// [splats, C]
+        /// [splats, C]: red, green, blue, and where C is [`FEATURES`](super::head::FEATURES) the further channels that a head
+        /// sees.
         table: &'a Table<F>,
     },
 }
@@ -73,6 +75,8 @@ pub struct Part<'a, F = f32> {
 pub struct Splats<'a, F = f32> {
     /// One a layer.
     pub parts: Vec<Part<'a, F>>,
+    /// What turns blended channels into colour; none: they are the colour. To it, parts without features have zeros.
+    pub head: Option<HeadWeights<'a, F>>,
 }
 
 impl<F: Real> Splats<'_, F> {

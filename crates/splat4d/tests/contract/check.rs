@@ -2,12 +2,13 @@
 //! to every table and to t against central differences, compact rows, random access, files, row edits.
 
 use splat4d::format::scene::{read, spec_from_json, spec_to_json, write};
-use splat4d::layers::{ALWAYS, Layer, Scene};
+use splat4d::layers::{ALWAYS, Head, Layer, Scene};
 use splat4d::math::Rng;
 use splat4d::motion::filtered::{Filtered, FilteredSpec, Fusion};
 use splat4d::motion::{At, BUILT_IN, Cache, Motion, Spec, Still, Tape, build};
 use splat4d::scene::{
-    Born, Color, GEOMETRY, Grads, Key, LIFE, LifeKind, Params, RowEdit, Rows, SH, Space, SplatGrads, Table, Time,
+    Born, Color, GEOMETRY, Grads, HeadKeys, Key, LIFE, LifeKind, Params, RowEdit, Rows, SH, Space, SplatGrads, Table,
+    Time,
 };
 use std::sync::Arc;
 
@@ -162,6 +163,7 @@ impl Subject {
             for i in (0..numbers).step_by(numbers.div_ceil(PROBED).max(1)) {
                 let (row, col) = (i / width, i % width);
                 if frozen.contains(&self.p.column_name(key, col)) {
+                    met = true;
                     continue;
                 }
                 let old = self.p[key].get(row, col);
@@ -263,7 +265,9 @@ pub fn files(spec: &Spec, rows: usize, life: LifeKind) {
     let motion = build::<f32>(spec, &mut fresh).expect("the specification is sound");
     assert!(fresh.keys().eq(params.keys()), "a model makes the same tables in any precision");
     let layer = Layer { name: "a".into(), params: params.clone(), motion, life, span: ALWAYS, masks: None };
-    let scene = Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 30.0, up: [0.0, 0.0, 1.0], ..Scene::default() };
+    let head = if HeadKeys::of(&params).is_some() { Head::Features } else { Head::Identity };
+    let up = [0.0, 0.0, 1.0];
+    let scene = Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 30.0, up, head, ..Scene::default() };
     let mut bytes = Vec::new();
     write(&scene, &mut bytes).expect("memory takes every byte");
     let again = read(&bytes).expect("what was written can be read");

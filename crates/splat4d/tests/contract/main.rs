@@ -9,6 +9,7 @@ use splat4d::motion::filtered::{FilteredSpec, Fusion, Predictor};
 use splat4d::motion::hexplane::{Heads, HexplaneSpec};
 use splat4d::motion::native4d::Native4dSpec;
 use splat4d::motion::skin::SkinSpec;
+use splat4d::motion::spacetime::FeatureSpec;
 use splat4d::motion::ssm::{Equivariance, Mode, Output, SsmSpec};
 use splat4d::motion::tracked::TrackedSpec;
 use splat4d::motion::{SpacetimeSpec, Spec};
@@ -28,10 +29,21 @@ fn still() {
 #[test]
 fn spacetime() {
     for (order, rotation) in [(1, false), (3, true)] {
-        let spec = Spec::Spacetime(SpacetimeSpec { order, rotation, detach: false, origin: 0.5 });
+        let spec = Spec::Spacetime(SpacetimeSpec { order, rotation, detach: false, origin: 0.5, features: None });
         model(&spec, ROWS, LifeKind::GaussHalf, &[Space::Gaussians], &[]);
         starts_still(&spec, ROWS);
     }
+}
+
+#[test]
+fn spacetime_with_features() {
+    let features = Some(FeatureSpec { seed: 1 });
+    let spec = Spec::Spacetime(SpacetimeSpec { order: 1, rotation: false, detach: false, origin: 0.5, features });
+    // What the head does is the renderer's business.
+    for life in [LifeKind::GaussHalf, LifeKind::Infinite] {
+        model(&spec, ROWS, life, &[Space::Gaussians], &["head.in", "head.out"]);
+    }
+    starts_still(&spec, ROWS);
 }
 
 // deform-mlp.
@@ -146,7 +158,7 @@ fn ssm() {
 
 #[test]
 fn filtered() {
-    let inner = Spec::Spacetime(SpacetimeSpec { order: 2, rotation: true, detach: false, origin: 0.5 });
+    let inner = Spec::Spacetime(SpacetimeSpec { order: 2, rotation: true, detach: false, origin: 0.5, features: None });
     let around = FilteredSpec { stop_gradient: false, ..FilteredSpec::around(inner, 0.05, 0.0) };
     for (fusion, predictor, baseline) in [
         (Fusion::Geodesic, Predictor::Wasserstein, 1),

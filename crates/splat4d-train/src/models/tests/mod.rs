@@ -3,6 +3,7 @@
 
 mod control;
 mod edits;
+mod features;
 mod filtered;
 mod further;
 mod guests;
@@ -270,6 +271,10 @@ fn shake<F: Real>(p: &mut Params<F>, key: Key, size: f64, seed: u64) {
 
 /// An ordinary trainer on the made-up capture: 4 cameras, 3 moments, 16 pixels.
 fn trainer(scene: Scene<f32>, stages: Vec<Stage>, cap: usize) -> Trainer<'static> {
+    trainer_on(Arc::new(Made::new(4, 3, 16)), scene, stages, cap)
+}
+
+fn trainer_on(frames: Arc<dyn Frames>, scene: Scene<f32>, stages: Vec<Stage>, cap: usize) -> Trainer<'static> {
     let settings = Settings {
         seed: 5,
         limits: Limits { cap, extent: 4.0, min_opacity: 0.005 },
@@ -279,7 +284,7 @@ fn trainer(scene: Scene<f32>, stages: Vec<Stage>, cap: usize) -> Trainer<'static
         exposure_lr: 0.0,
     };
     let draw = Box::new(Renderer::new(RenderConfig::default()));
-    Trainer::new(scene, stages, Arc::new(Made::new(4, 3, 16)), draw, TrainLoss::new(0.2, 0.0, None), settings)
+    Trainer::new(scene, stages, frames, draw, TrainLoss::new(0.2, 0.0, None), settings)
 }
 
 /// Rates at which a tiny scene learns in tens of steps.

@@ -211,7 +211,7 @@ fn interval_buckets_lose_nothing() {
                 layer.at(&splat4d::motion::Cache::default(), tape);
             }
             let parts: Vec<Part<'_, f32>> = s.layers.iter().zip(&tapes).map(|(l, tape)| l.part(tape)).collect();
-            let (splats, mut image) = (Splats { parts }, Image::default());
+            let (splats, mut image) = (Splats { parts, head: None }, Image::default());
             let mut renderer = Renderer::new(RenderConfig::default());
             renderer.render(&splats, made.camera(i), [0.0; 3], None, &mut image);
             (splats.len(), image)

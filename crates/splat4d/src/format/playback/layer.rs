@@ -92,8 +92,13 @@ impl Page {
         }
         let life = LifeKind::Interval;
         let mut params = Params::new(self.len(), palette.map_or(1, |p| sh::coeffs(p.degree)), life.columns());
-        let spec =
-            SpacetimeSpec { order: 1, rotation: true, detach: false, origin: 0.5 * (self.span[0] + self.span[1]) };
+        let spec = SpacetimeSpec {
+            order: 1,
+            rotation: true,
+            detach: false,
+            origin: 0.5 * (self.span[0] + self.span[1]),
+            features: None,
+        };
         let motion = Spacetime::new(spec, &mut params)?;
         let keys = [GEOMETRY, SH, LIFE, motion.velocities(), motion.rates()];
         let mut tables = params.get_mut(keys).map(Table::view_mut);

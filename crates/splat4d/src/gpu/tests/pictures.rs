@@ -96,7 +96,7 @@ fn every_kind_of_colour_is_drawn() {
             // 24 columns without weights are eight coefficients a channel, of which degree 1 is whole.
             r.config.sh_degree = 1;
         }
-        let (mut splats, rest) = (Splats { parts: vec![Part { out: &scene.out, color }] }, small.splats());
+        let (mut splats, rest) = (Splats { parts: vec![Part { out: &scene.out, color }], head: None }, small.splats());
         compare(&mut r, &splats, &camera, &format!("colour {i}"));
         // A second layer, then an empty one.
         let none = Scenery::new(16, 0, 1.0, 1.0);
@@ -114,7 +114,9 @@ fn nothing_to_draw_is_the_background() {
     let behind = Scenery::new(18, 100, 1.0, 0.1);
     let mut away = camera.clone();
     away.cam_from_world = Se3::look_at([0.0, 0.0, -4.0], [0.0, 0.0, -9.0], [0.0, 1.0, 0.0]);
-    for (splats, camera) in [(Splats { parts: vec![] }, &camera), (empty.splats(), &camera), (behind.splats(), &away)] {
+    for (splats, camera) in
+        [(Splats { parts: vec![], head: None }, &camera), (empty.splats(), &camera), (behind.splats(), &away)]
+    {
         let mut image = Image::default();
         r.render(&splats, camera, BACKGROUND, &mut image).expect("it is drawn");
         for (c, b) in BACKGROUND.iter().enumerate() {
@@ -198,5 +200,5 @@ fn a_second_frame_is_the_same_and_allocates_nothing() {
     // Other colours at another address are seen, those of a table that changes too.
     let other = Scenery::new(22, 2000, 1.2, 0.05);
     let color = Color::Sh { table: &other.sh, rows: Rows::All, weights: None, base: true };
-    compare(&mut r, &Splats { parts: vec![Part { out: &scene.out, color }] }, &camera, "other colours");
+    compare(&mut r, &Splats { parts: vec![Part { out: &scene.out, color }], head: None }, &camera, "other colours");
 }

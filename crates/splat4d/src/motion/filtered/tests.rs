@@ -266,7 +266,7 @@ fn answers_are_continuous_in_time() {
 }
 
 fn spacetime() -> Spec {
-    Spec::Spacetime(SpacetimeSpec { order: 2, rotation: true, detach: false, origin: 0.5 })
+    Spec::Spacetime(SpacetimeSpec { order: 2, rotation: true, detach: false, origin: 0.5, features: None })
 }
 
 fn filled<F: Real>(spec: &Spec, rows: usize) -> (Params<F>, Arc<dyn Motion<F>>) {
