@@ -7,6 +7,7 @@ pub(crate) mod tests;
 use super::checkpoint::{self, Identity, RunState, write_atomically};
 use super::dataset::Dataset;
 use super::loss::{Exposure, TrainLoss};
+pub use super::memory::{memory_estimate, peak_memory};
 use super::minutes;
 use super::snapshot::Snapshots;
 use super::trainer::{Settings, Stepped, Trainer};
@@ -62,15 +63,6 @@ const SMOOTHING: f64 = 0.05;
 const METRIC_ROWS: usize = 600;
 /// Seconds between two progress events.
 const PROGRESS_SECONDS: f64 = 0.25;
-/// Bytes a Gaussian takes in training, per number: value, gradient, two moments.
-const BYTES_PER_NUMBER: u64 = 16;
-/// Bytes a Gaussian takes in the renderer: records, gradient records, projections (measured: about 1.2 kB).
-const RENDER_BYTES: u64 = 1200;
-/// Bytes a Gaussian's pose takes, a frame.
-const PAGE_BYTES: u64 = 28;
-/// Bytes a pixel takes in training: pictures, gradients and the loss's scratch, all f32.
-const PIXEL_BYTES: u64 = 200;
-
 /// The options with which a recipe opens its capture.
 pub fn capture_options(recipe: &Recipe) -> Result<CaptureOptions> {
     let hold_out = if recipe.hold_out.is_empty() { None } else { Some(recipe.hold_out.parse()?) };
@@ -99,6 +91,7 @@ pub fn train(
             .remedy("Continue it with `train --resume`, or give another folder with -o"));
     }
     let bench = Bench::new(capture, &recipe)?;
+    check_flow(&bench.capture, &recipe)?;
     let mut listen = listen;
     let recipe = if recipe.motion == AUTO { bench.choose(recipe, &mut listen)? } else { recipe };
     program_of(&recipe)?.check(&bench.plan(&recipe))?;
@@ -203,6 +196,10 @@ fn made_by(run: &Path) -> Result<Option<String>> {
 /// Opens a capture as a recipe wants it: scale, split, and the part of the take that is used.
 pub fn open_capture(path: &Path, recipe: &Recipe) -> Result<Capture> {
     let mut capture = Capture::open(path, &capture_options(recipe)?)?;
+    if recipe.lambda_flow == 0.0 {
+        // Nobody looks at it: it need not be decoded.
+        capture.frames.iter_mut().for_each(|f| f.flow = None);
+    }
     if recipe.first_frame > 0 || recipe.max_frames > 0 {
         let last =
             if recipe.max_frames == 0 { usize::MAX } else { recipe.first_frame.saturating_add(recipe.max_frames) };
@@ -217,6 +214,15 @@ pub fn open_capture(path: &Path, recipe: &Recipe) -> Result<Capture> {
         }
     }
     Ok(capture)
+}
+
+/// Errors: a loss on flow, and not one training picture has any.
+fn check_flow(capture: &Capture, recipe: &Recipe) -> Result<()> {
+    if recipe.lambda_flow == 0.0 || capture.train.iter().any(|&i| capture.frames[i].flow.is_some()) {
+        return Ok(());
+    }
+    Err(Error::input("lambda_flow compares flow, and the capture's training pictures have none")
+        .remedy("Give cameras a `flow` in capture.json (docs/capture-format.md), or leave lambda_flow at 0"))
 }
 
 fn read_text(path: &Path) -> Result<String> {
@@ -396,41 +402,6 @@ fn fingerprint(capture: &Capture) -> String {
 fn hash(text: &str) -> String {
     let h = text.bytes().fold(0xcbf2_9ce4_8422_2325u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3));
     format!("{h:016x}")
-}
-
-/// Estimated peak memory of training, bytes: images in the cache, Gaussians at the cap, pixels in flight.
-pub fn memory_estimate(capture: &Capture, recipe: &Recipe) -> u64 {
-    let sh = 3 * (recipe.sh_degree as u64 + 1).pow(2);
-    let motion = if recipe.motion == "still" {
-        0
-    } else {
-        3 * recipe.motion_order as u64 + 2 + 4 * u64::from(recipe.rotation_rate)
-    };
-    let gaussians = recipe.max_cap as u64 * ((11 + sh + motion) * BYTES_PER_NUMBER + RENDER_BYTES);
-    // The result itself: a pose a Gaussian and frame.
-    let pages = if recipe.motion == "tracked" {
-        let last = capture.train.iter().map(|&i| capture.frames[i].index as u64 + 1).max().unwrap_or(0);
-        let first = capture.train.iter().map(|&i| capture.frames[i].index as u64).min().unwrap_or(0);
-        recipe.max_cap as u64 * PAGE_BYTES * (last - first)
-    } else {
-        0
-    };
-    let frame =
-        capture.train.iter().map(|&i| (capture.frames[i].view.width * capture.frames[i].view.height) as u64).max();
-    let pixels = frame.unwrap_or(0);
-    let images = (pixels * 4 * capture.train.len() as u64).min(recipe.image_memory);
-    images + gaussians + pages + pixels * PIXEL_BYTES * recipe.batch_size as u64
-}
-
-/// Peak resident memory of this process, bytes; 0 where the system does not tell.
-pub fn peak_memory() -> u64 {
-    std::fs::read_to_string("/proc/self/status")
-        .ok()
-        .and_then(|s| {
-            let line = s.lines().find(|l| l.starts_with("VmHWM:"))?.to_owned();
-            line.split_whitespace().nth(1)?.parse::<u64>().ok()
-        })
-        .map_or(0, |kib| kib * 1024)
 }
 
 fn save_checkpoint(

@@ -9,6 +9,7 @@
 //! The same bits come out for any number of threads: every floating-point sum has a fixed order, and nothing is ever
 //! added atomically.
 
+mod behind;
 pub mod bin;
 mod blend;
 pub mod ceiling;
