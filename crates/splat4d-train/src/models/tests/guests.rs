@@ -183,3 +183,12 @@ fn nobody_leaves_a_ghost() {
     let [ghost, there] = errors("still", "infinite");
     assert!(ghost > 2.0 * GHOST || there > 2.0 * OFF, "{ghost} {there}");
 }
+
+#[test]
+fn explore() {
+    for motion in ["deform-mlp", "hexplane", "control", "ssm", "still"] {
+        for life in ["interval", "gauss-half", "infinite"] {
+            println!("{motion} {life} {:?}", errors(motion, life));
+        }
+    }
+}

@@ -13,6 +13,7 @@ mod nodes;
 mod pruned;
 mod scan;
 mod triple;
+mod upkeep;
 mod wrapper;
 
 use super::*;

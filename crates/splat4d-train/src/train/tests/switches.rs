@@ -23,6 +23,38 @@ fn sound(line: &str, ran: &Ran, share: f64) {
 }
 
 #[test]
+fn explore() {
+    let bed = Bed::new();
+    let base = "motion=control control_nodes=20 control_shift_lr_init=5e-3 strategy=none";
+    println!("plain {:?}", unease(&bed.run(base)));
+    for w in ["lambda_node_arap=", "lambda_node_elastic=", "lambda_node_acceleration="] {
+        for k in ["0.001", "0.01", "0.1", "1", "10", "100"] {
+            println!("{w}{k} {:?}", unease(&bed.run(&format!("{base} {w}{k}"))));
+        }
+    }
+    for motion in ["spacetime", "deform-mlp deform_width=16", "control control_nodes=10 control_adapt_interval=6", "hexplane coarse_iterations=10 plane_channels=16 plane_resolution=6 net_width=16", "ssm control_nodes=10 ssm_width=8 ssm_states=4", "tracked", "native4d"] {
+        for reach in [0.001, 0.003, 0.01, 0.03] {
+            let ran = bed.run(&format!("motion={motion} static_split={reach} static_split_from=0.5 lambda_rigid=1"));
+            println!("{motion} {reach} {:?} {}", ran.scene().layers.iter().map(|l| l.params.len()).collect::<Vec<_>>(), ran.left());
+        }
+    }
+    for rate in ["6e-3", "2e-2", "5e-2"] {
+        let ran = bed.run(&format!("motion=hexplane coarse_iterations=10 plane_channels=16 plane_resolution=6 net_width=16 grid_lr_init={rate} deformation_lr_init={rate}"));
+        let [a, b] = ran.scene().clip.map(|t| places(ran.scene(), 0, Space::Gaussians, t));
+        let far = |(a, b): (&[f32; 3], &[f32; 3])| (0..3).map(|k| (a[k] - b[k]).abs()).fold(0.0, f32::max);
+        println!("hexplane {rate} {} {}", ran.left(), a.iter().zip(&b).map(far).fold(0.0, f32::max));
+    }
+    for (rate, more) in [("2e-3", ""), ("8e-4", ""), ("2e-4", ""), ("8e-4", "deform_time_net=true"), ("8e-4", "deform_rigid=true"), ("8e-4", "deform_time_net=true deform_rigid=true")] {
+        let mut trainer = bed.start(&super::bed::knobs(&format!("motion=deform-mlp deform_trunk=mlp deform_lr_init={rate} {more}")));
+        let mut rows = Vec::new();
+        while !trainer.is_done() && trainer.step().unwrap().is_ok() {
+            rows.push(trainer.scene.len());
+        }
+        println!("mlp {rate} {more} {rows:?}");
+    }
+}
+
+#[test]
 fn every_network_learns() {
     let bed = Bed::new();
     for (line, share) in [
@@ -31,8 +63,10 @@ fn every_network_learns() {
         ("motion=deform-mlp deform_width=16 deform_time_net=true deform_rigid=true", 0.7),
         ("motion=deform-mlp deform_width=16 deform_trunk=hash deform_unlock=0.6", 0.7),
         ("motion=deform-mlp deform_width=16 deform_trunk=hash-linear", 0.7),
-        ("motion=hexplane coarse_iterations=10 plane_channels=16 plane_resolution=6 net_width=16 no_do=false", 0.7),
-        ("motion=hexplane coarse_iterations=5 plane_channels=16 plane_resolution=6 no_dshs=false defor_depth=2", 0.7),
+        ("motion=hexplane coarse_iterations=10 plane_channels=16 plane_resolution=6 net_width=16 no_do=false \
+         grid_lr_init=2e-2 deformation_lr_init=2e-2", 0.7),
+        ("motion=hexplane coarse_iterations=5 plane_channels=16 plane_resolution=6 no_dshs=false defor_depth=2 \
+         grid_lr_init=2e-2 deformation_lr_init=2e-2", 0.7),
     ] {
         sound(line, &bed.run(line), share);
     }
@@ -66,9 +100,9 @@ fn every_trajectory_of_nodes_learns() {
 fn nodes_that_nobody_follows_go_while_training() {
     let bed = Bed::new();
     // More nodes than Gaussians need; none is added.
-    let ran = bed.run("motion=control control_nodes=60 control_adapt_interval=6 control_grad_threshold=1e9 num_pts=30");
+    let ran = bed.run("motion=control control_nodes=60 control_adapt_interval=6 control_grad_threshold=1e9 num_pts=40");
     assert!(ran.nodes() < 60 && ran.nodes() >= 4, "{} nodes", ran.nodes());
-    sound("pruned nodes", &ran, 0.9);
+    sound("pruned nodes", &ran, 1.0);
 }
 
 /// How much the nodes' motion is bent, stretched and jerky.
@@ -155,7 +189,8 @@ fn crowds_are_thinned_and_the_rest_learns() {
         "crowding=merge motion=spacetime",
         "crowding=prune motion=spacetime",
         "crowding=merge motion=control control_nodes=10 control_adapt_interval=6",
-        "crowding=prune motion=hexplane coarse_iterations=10 plane_channels=16 plane_resolution=6 net_width=16",
+        "crowding=prune motion=hexplane coarse_iterations=10 plane_channels=16 plane_resolution=6 net_width=16 \
+         grid_lr_init=2e-2 deformation_lr_init=2e-2",
     ] {
         let line = format!("{line} crowding_interval=10 crowding_distance=1.5 strategy=none {losses}");
         let ran = bed.run(&line);
@@ -197,8 +232,8 @@ fn tracked_and_central_velocities_are_drawn_after_training() {
     for line in ["motion=tracked rigid_neighbours=5 track_lr_init=5e-3", hexplane] {
         let ran = bed.run(line);
         let scene = ran.scene();
-        // Between two frames of the model, where velocities are slopes.
-        let (t, h) = (0.05, 0.01);
+        // Between two frames of the one and two grid points of the other, where paths are straight.
+        let (t, h) = (0.043, 0.01);
         let mut renderer = Renderer::new(RenderConfig::default());
         let flow = render_velocity(scene, Shot { camera: &camera, t: Time(t) }, &mut renderer);
         assert!(flow.vectors.data.iter().all(|v| v.is_finite()), "{line}");
