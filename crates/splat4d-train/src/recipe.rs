@@ -185,9 +185,9 @@ recipe! {
     /// hexplane: colours do not change.
     no_dshs: bool = true,
     /// hexplane: rate of the planes at the start.
-    grid_lr_init: f64 = 6e-3,
+    grid_lr_init: f64 = 2e-2,
     /// hexplane: rate of the planes at the end.
-    grid_lr_final: f64 = 6e-4,
+    grid_lr_final: f64 = 2e-3,
     /// hexplane: rate of the networks at the start.
     deformation_lr_init: f64 = 1e-3,
     /// hexplane: rate of the networks at the end.
@@ -206,11 +206,11 @@ recipe! {
     /// tracked: share of the iterations that frame 0 gets; the other frames share the rest.
     first_share: f64 = 0.25,
     /// tracked: rate of a frame's positions at its first step, of the extent.
-    track_lr_init: f64 = 1e-3,
+    track_lr_init: f64 = 3e-3,
     /// tracked: rate of a frame's positions at its last step, of the extent.
-    track_lr_final: f64 = 1.6e-4,
+    track_lr_final: f64 = 4e-4,
     /// tracked: rate of a frame's quaternions.
-    track_rotation_lr: f64 = 2e-3,
+    track_rotation_lr: f64 = 6e-3,
     /// tracked: rate of base colours after frame 0. Colours are shared: frames tracked before change with them.
     track_feature_lr: f64 = 0.0,
     /// tracked: longest step that a Gaussian carries on to the next frame, of the extent.
@@ -324,7 +324,7 @@ recipe! {
     lambda_sparse: f64 = 0.0,
 
     // ssm.
-    /// ssm: ticks of the scan over the clip; 0: one every two distinct times, 16 to 96.
+    /// ssm: ticks of the scan over the clip; 0: one every ten distinct times, 16 to 96.
     ssm_ticks: usize = 0,
     /// ssm: channels.
     ssm_width: usize = 32,
@@ -341,13 +341,13 @@ recipe! {
     /// ssm: share of the iterations, from the first, in which nothing moves; nodes are placed after it.
     ssm_warm_up: f64 = 0.0,
     /// ssm: rate of the network's maps at the start.
-    ssm_lr_init: f64 = 1e-3,
+    ssm_lr_init: f64 = 5e-4,
     /// ssm: rate of the network's maps at the end.
     ssm_lr_final: f64 = 1e-5,
     /// ssm: rate of the state space's decays, frequencies and steps.
-    ssm_dynamics_lr: f64 = 1e-3,
+    ssm_dynamics_lr: f64 = 5e-4,
     /// ssm: rate of the nodes' embeddings.
-    ssm_embedding_lr: f64 = 5e-3,
+    ssm_embedding_lr: f64 = 3e-2,
 
     // filtered.
     /// filter: how prediction and the motion's answer merge: off, geodesic (a learnt share) or literal (as published).

@@ -152,6 +152,34 @@ pub(crate) fn over_points<T: Send>(out: &mut [T], node: impl Fn(usize, &mut T) -
     sums.iter().sum()
 }
 
+/// Every edge once, then both its ends. `near(i, &mut out[i], forces)` computes point i's edges, of which edge e·k + n has its
+/// place n in `forces`, and takes what they do to it; `far(&mut out[j], force)` takes what an edge does to its far end.
+/// Returns the sum of what `near` returned, in a fixed order.
+pub(crate) fn over_edges<F: Real, T: Send, const N: usize>(
+    graph: &Graph<F>,
+    out: &mut [T],
+    near: impl Fn(usize, &mut T, &mut [[F; N]]) -> f64 + Sync,
+    far: impl Fn(&mut T, [F; N]) + Sync,
+) -> f64 {
+    let k = graph.k();
+    if k == 0 {
+        return 0.0;
+    }
+    let mut forces = vec![[F::ZERO; N]; out.len() * k];
+    let parts = out.par_chunks_mut(CHUNK).zip(forces.par_chunks_mut(CHUNK * k)).enumerate();
+    let sums: Vec<f64> = parts
+        .map(|(c, (out, forces))| {
+            let points = out.iter_mut().zip(forces.chunks_exact_mut(k)).enumerate();
+            points.map(|(i, (out, forces))| near(c * CHUNK + i, out, forces)).sum()
+        })
+        .collect();
+    over_points(out, |j, out| {
+        graph.edges_to(j).for_each(|(e, _)| far(out, forces[e]));
+        0.0
+    });
+    sums.iter().sum()
+}
+
 #[inline(always)]
 pub(crate) fn sub<F: Real>(a: [F; 3], b: [F; 3]) -> [F; 3] {
     [a[0] - b[0], a[1] - b[1], a[2] - b[2]]

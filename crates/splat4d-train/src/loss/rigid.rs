@@ -11,7 +11,7 @@
 //! same bits with any number of threads.
 //! Source: Luiten et al. 2024, "Dynamic 3D Gaussians", equations 8 to 10.
 
-use super::graph::{Graph, add_to, length, over_points, square, sub, turn, turn_back};
+use super::graph::{Graph, add_to, length, over_edges, over_points, square, sub, turn, turn_back};
 use rayon::prelude::*;
 use splat4d::math::{Real, quat};
 
@@ -70,34 +70,30 @@ pub fn rigidity<F: Real>(
     let rotations: Vec<[[F; 3]; 3]> = turns(now, before).into_iter().map(quat::to_rotation).collect();
     let scale = weight / graph.edges().max(1) as f64;
     let (eps, factor) = (F::of(UNDER_ROOT), F::of(scale));
-    // Value, residual's gradient in the frame before, and the edge now.
-    let edge = |i: usize, e: usize, j: usize| {
-        let now_e = sub(now.x[j], now.x[i]);
-        let r = sub(turn_back(&rotations[i], now_e), sub(before.x[j], before.x[i]));
-        let w = graph.weights()[e];
-        let root = (w * square(r) + eps).sqrt();
-        (root, r.map(|x| factor * w * x / root), now_e)
-    };
     let mut d: Vec<(&mut [F; 3], &mut [F; 4])> = d_x.iter_mut().zip(d_q).collect();
-    scale
-        * over_points(&mut d, |i, (d_x, d_q)| {
-            let (mut sum, mut d_rotation) = (0.0, [[F::ZERO; 3]; 3]);
-            for (e, j) in graph.edges_from(i) {
-                let (value, g, now_e) = edge(i, e, j);
-                sum += value.f64();
-                add_to(d_x, turn(&rotations[i], g), -F::ONE);
-                for b in 0..3 {
-                    add_to(&mut d_rotation[b], g, now_e[b]);
-                }
+    let near = |i: usize, (d_x, d_q): &mut (&mut [F; 3], &mut [F; 4]), forces: &mut [[F; 3]]| {
+        let (mut sum, mut d_rotation) = (0.0, [[F::ZERO; 3]; 3]);
+        for (e, j) in graph.edges_from(i) {
+            let now_e = sub(now.x[j], now.x[i]);
+            let r = sub(turn_back(&rotations[i], now_e), sub(before.x[j], before.x[i]));
+            let w = graph.weights()[e];
+            let root = (w * square(r) + eps).sqrt();
+            sum += root.f64();
+            // The gradient to the residual, in the axes of the instant before.
+            let by = factor * w / root;
+            let g = r.map(|x| by * x);
+            let force = turn(&rotations[i], g);
+            add_to(d_x, force, -F::ONE);
+            forces[e - i * graph.k()] = force;
+            for b in 0..3 {
+                add_to(&mut d_rotation[b], g, now_e[b]);
             }
-            for (e, from) in graph.edges_to(i) {
-                let (_, g, _) = edge(from, e, i);
-                add_to(d_x, turn(&rotations[from], g), F::ONE);
-            }
-            let d_rel = quat::to_rotation_backward(relative(now.q[i], before.q[i]), d_rotation);
-            add_to(d_q, relative_backward(now.q[i], before.q[i], d_rel), F::ONE);
-            sum
-        })
+        }
+        let d_rel = quat::to_rotation_backward(relative(now.q[i], before.q[i]), d_rotation);
+        add_to(d_q, relative_backward(now.q[i], before.q[i], d_rel), F::ONE);
+        sum
+    };
+    scale * over_edges(graph, &mut d, near, |(d_x, _), force| add_to(d_x, force, F::ONE))
 }
 
 /// Rotation; see the module. Adds to `d_q`, the gradient of the quaternions now. Panics: numbers of points that differ.
@@ -107,29 +103,30 @@ pub fn rotation<F: Real>(graph: &Graph<F>, now: &[[F; 4]], before: &[[F; 4]], we
     let rel = turns(Poses { x: &[], q: now }, Poses { x: &[], q: before });
     let scale = weight / graph.edges().max(1) as f64;
     let (eps, factor) = (F::of(UNDER_ROOT), F::of(scale));
-    let edge = |i: usize, e: usize, j: usize| {
-        let (a, b) = (rel[i], rel[j]);
-        let dot = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3];
-        let sign = if dot < F::ZERO { -F::ONE } else { F::ONE };
-        let r: [F; 4] = std::array::from_fn(|k| b[k] - sign * a[k]);
-        let w = graph.weights()[e];
-        let root = (w * square(r) + eps).sqrt();
-        (root, r.map(|x| factor * w * x / root), sign)
+    let mut d_rel = vec![[F::ZERO; 4]; n];
+    let near = |i: usize, d_rel: &mut [F; 4], forces: &mut [[F; 4]]| {
+        let mut sum = 0.0;
+        for (e, j) in graph.edges_from(i) {
+            let (a, b) = (rel[i], rel[j]);
+            let dot = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3];
+            let sign = if dot < F::ZERO { -F::ONE } else { F::ONE };
+            let r: [F; 4] = std::array::from_fn(|k| b[k] - sign * a[k]);
+            let w = graph.weights()[e];
+            let root = (w * square(r) + eps).sqrt();
+            sum += root.f64();
+            let by = factor * w / root;
+            let g = r.map(|x| by * x);
+            add_to(d_rel, g, -sign);
+            forces[e - i * graph.k()] = g;
+        }
+        sum
     };
-    scale
-        * over_points(d_q, |i, d_q| {
-            let (mut sum, mut d_rel) = (0.0, [F::ZERO; 4]);
-            for (e, j) in graph.edges_from(i) {
-                let (value, g, sign) = edge(i, e, j);
-                sum += value.f64();
-                add_to(&mut d_rel, g, -sign);
-            }
-            for (e, from) in graph.edges_to(i) {
-                add_to(&mut d_rel, edge(from, e, i).1, F::ONE);
-            }
-            add_to(d_q, relative_backward(now[i], before[i], d_rel), F::ONE);
-            sum
-        })
+    let sum = over_edges(graph, &mut d_rel, near, |d_rel, g| add_to(d_rel, g, F::ONE));
+    over_points(d_q, |i, d_q| {
+        add_to(d_q, relative_backward(now[i], before[i], d_rel[i]), F::ONE);
+        0.0
+    });
+    scale * sum
 }
 
 /// Isometry; see the module. Adds to `d_x`, the gradient of the positions. Panics: numbers of points that differ.
@@ -138,28 +135,23 @@ pub fn isometry<F: Real>(graph: &Graph<F>, x: &[[F; 3]], weight: f64, d_x: &mut 
     assert!([x.len(), d_x.len()] == [n; 2], "{n} points");
     let scale = weight / graph.edges().max(1) as f64;
     let (eps, factor) = (F::of(UNDER_ROOT), F::of(scale));
-    let edge = |i: usize, e: usize, j: usize| {
-        let v = sub(x[j], x[i]);
-        let long = length(v);
-        let (stretch, w) = (long - graph.lengths()[e], graph.weights()[e]);
-        let root = (w * stretch * stretch + eps).sqrt();
-        // Where two points coincide no direction is better than another.
-        let along = if long > F::ZERO { factor * w * stretch / root / long } else { F::ZERO };
-        (root, v.map(|x| x * along))
+    let near = |i: usize, d_x: &mut [F; 3], forces: &mut [[F; 3]]| {
+        let mut sum = 0.0;
+        for (e, j) in graph.edges_from(i) {
+            let v = sub(x[j], x[i]);
+            let long = length(v);
+            let (stretch, w) = (long - graph.lengths()[e], graph.weights()[e]);
+            let root = (w * stretch * stretch + eps).sqrt();
+            sum += root.f64();
+            // Where two points coincide no direction is better than another.
+            let along = if long > F::ZERO { factor * w * stretch / (root * long) } else { F::ZERO };
+            let force = v.map(|x| x * along);
+            add_to(d_x, force, -F::ONE);
+            forces[e - i * graph.k()] = force;
+        }
+        sum
     };
-    scale
-        * over_points(d_x, |i, d_x| {
-            let mut sum = 0.0;
-            for (e, j) in graph.edges_from(i) {
-                let (value, g) = edge(i, e, j);
-                sum += value.f64();
-                add_to(d_x, g, -F::ONE);
-            }
-            for (e, from) in graph.edges_to(i) {
-                add_to(d_x, edge(from, e, i).1, F::ONE);
-            }
-            sum
-        })
+    scale * over_edges(graph, d_x, near, |d_x, force| add_to(d_x, force, F::ONE))
 }
 
 #[cfg(test)]

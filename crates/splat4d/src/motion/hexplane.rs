@@ -247,7 +247,6 @@ struct Activations<F> {
 #[derive(Default)]
 struct Back<F> {
     d_hidden: Vec<F>,
-    d_head: Vec<F>,
     d_features: Vec<F>,
     waiting: Vec<[F; LANES]>,
 }
@@ -376,9 +375,8 @@ impl<F: Real> Motion<F> for Hexplane {
                 // What is kept of the heads is of the last chunk alone.
                 (work.heads, work.sh) = Default::default();
             }
-            let Back { d_hidden, d_head, d_features, waiting } = back;
+            let Back { d_hidden, d_features, waiting } = back;
             d_hidden.resize(work.hidden.len(), F::ZERO);
-            d_head.resize(work.hidden.len(), F::ZERO);
             d_features.resize(work.features.len(), F::ZERO);
             let heads = self.heads.iter().zip(&d_deltas).zip(&work.heads);
             let heads = heads.map(|((head, d), kept)| (head, d, kept)).chain([(&self.sh, &d_sh, &work.sh)]);
@@ -387,11 +385,10 @@ impl<F: Real> Motion<F> for Hexplane {
                 let (Some(head), false) = (head, d_delta.is_empty()) else { continue };
                 let width = head.shape().outputs;
                 let d_delta = &d_delta[from * width..to * width];
-                let into = if first { &mut *d_hidden } else { &mut *d_head };
-                head.backward_of(q.p, &work.hidden, kept, d_delta, Some(into), d);
-                if !std::mem::take(&mut first) {
-                    let pairs = d_hidden.par_chunks_mut(TASK_NUMBERS).zip(d_head.par_chunks(TASK_NUMBERS));
-                    pairs.for_each(|(sum, add)| sum.iter_mut().zip(add).for_each(|(sum, add)| *sum += *add));
+                if std::mem::take(&mut first) {
+                    head.backward_of(q.p, &work.hidden, kept, d_delta, Some(d_hidden), d);
+                } else {
+                    head.backward_adding(q.p, &work.hidden, kept, d_delta, d_hidden, d);
                 }
             }
             if first {

@@ -214,7 +214,20 @@ impl Mlp {
         d_x: Option<&mut [F]>,
         d: &mut Grads<F>,
     ) {
-        let _ = self.backward_shifted(p, x, &[], kept, d_out, d_x, d);
+        let _ = self.backward_all(p, x, &[], kept, d_out, d_x, false, d);
+    }
+
+    /// As [`backward_of`](Self::backward_of), but adds to d_x: for several networks that read the same x.
+    pub fn backward_adding<F: Real>(
+        &self,
+        p: &Params<F>,
+        x: &[F],
+        kept: &Kept<F>,
+        d_out: &[F],
+        d_x: &mut [F],
+        d: &mut Grads<F>,
+    ) {
+        let _ = self.backward_all(p, x, &[], kept, d_out, Some(d_x), true, d);
     }
 
     /// The VJP of [`forward_shifted`](Self::forward_shifted); returns the gradient to every map's shift.
@@ -226,6 +239,20 @@ impl Mlp {
         kept: &Kept<F>,
         d_out: &[F],
         d_x: Option<&mut [F]>,
+        d: &mut Grads<F>,
+    ) -> Vec<Vec<F>> {
+        self.backward_all(p, x, shifts, kept, d_out, d_x, false, d)
+    }
+
+    fn backward_all<F: Real>(
+        &self,
+        p: &Params<F>,
+        x: &[F],
+        shifts: &[Vec<F>],
+        kept: &Kept<F>,
+        d_out: &[F],
+        d_x: Option<&mut [F]>,
+        add: bool,
         d: &mut Grads<F>,
     ) -> Vec<Vec<F>> {
         let n = self.rows(x, d_out);
@@ -256,6 +283,9 @@ impl Mlp {
                     let d_out = &d_out[first * self.shape.outputs..][..count * self.shape.outputs];
                     let from = (first - ends[r]) * inputs;
                     let d_x = if wanted { &mut d_x[from..from + count * inputs] } else { &mut [][..] };
+                    if !add {
+                        d_x.fill(F::ZERO);
+                    }
                     let hidden = self.hidden();
                     let store = (first / rows < kept.chunks).then(|| &kept.data[first * hidden..][..count * hidden]);
                     run.chunk(p, &biases, x, store, d_out, d_x);
@@ -388,7 +418,7 @@ impl<'a, F: Real> Run<'a, F> {
         Self { mlp, d_weights: vec![F::ZERO; mlp.weights()], hidden: Vec::new(), d_inputs: [Vec::new(), Vec::new()] }
     }
 
-    /// Adds a chunk's weight gradients; overwrites d_x unless it is empty.
+    /// Adds a chunk's weight gradients, and to d_x unless it is empty.
     fn chunk(&mut self, p: &Params<F>, biases: &[Vec<F>], x: &[F], kept: Option<&[F]>, d_out: &[F], d_x: &mut [F]) {
         let (mlp, simd) = (self.mlp, Simd::detect());
         let MlpShape { inputs: wide, width, layers, outputs, .. } = mlp.shape;
@@ -401,7 +431,6 @@ impl<'a, F: Real> Run<'a, F> {
                 &self.hidden[..]
             }
         };
-        d_x.fill(F::ZERO);
         let mut end = self.d_weights.len();
         let [even, odd] = &mut self.d_inputs;
         for i in (0..=layers).rev() {

@@ -31,8 +31,9 @@ pub struct Net {
 
 #[derive(Clone, Debug)]
 enum Body {
-    /// Blocks of scalars, and a head \[6, H\], \[6\].
-    Scalar { blocks: Vec<Block>, head: [Range<usize>; 2] },
+    /// Blocks of scalars, a gate \[H, own\] and a head \[6, H\], \[6\]. The gate is what a node multiplies the last channels by,
+    /// 1 + gate·own, so that nodes choose among the motions that all share.
+    Scalar { blocks: Vec<Block>, gate: Range<usize>, head: [Range<usize>; 2] },
     /// Coefficients \[C·VECTORS, H\], \[C·VECTORS\] that make C vectors of the node's, blocks of vectors, and a head: the shift
     /// and two vectors whose cross product is the rotation, \[C\] each.
     Vector { channels: usize, coefficients: [Range<usize>; 2], blocks: Vec<VectorBlock>, head: [Range<usize>; 3] },
@@ -57,6 +58,7 @@ pub struct NetTape<F> {
     first: Vec<Lane<F>>,
     bent: Vec<Lane<F>>,
     last: Vec<Lane<F>>,
+    gate: Vec<Lane<F>>,
     scalar: Vec<BlockTape<F>>,
     vector: Vec<VectorTape<F>>,
     /// The two vectors of the rotation's cross product, \[6, ticks\].
@@ -111,8 +113,9 @@ impl Net {
         } else {
             let blocks =
                 numbers.map(|(name, first)| Block::new(&name, width, spec.states, ways, first, &mut layout)).collect();
+            let gate = layout.push("ssm.gate".into(), width * own);
             let head = [("weight", 6 * width), ("bias", 6)].map(|(part, n)| layout.push(format!("ssm.head.{part}"), n));
-            Body::Scalar { blocks, head }
+            Body::Scalar { blocks, gate, head }
         };
         let mut net = Self { keys: Vec::new(), layout, width, own, clock, entry, body };
         let w = net.init::<F>(spec);
@@ -132,7 +135,8 @@ impl Net {
         uniform(&mut w[self.entry[0].clone()], self.clock, rng.fork(0));
         uniform(&mut w[self.entry[1].clone()], self.own, rng.fork(1));
         match &self.body {
-            Body::Scalar { blocks, .. } => {
+            Body::Scalar { blocks, gate, .. } => {
+                uniform(&mut w[gate.clone()], self.own, rng.fork(5));
                 blocks.iter().zip(10..).for_each(|(b, i)| b.init(spec.ticks, rng.fork(i), &mut w));
             }
             Body::Vector { blocks, coefficients, head, channels } => {
@@ -204,13 +208,18 @@ impl Net {
         }
         let mut out = vec![[F::ZERO; LANES]; 6 * ticks];
         match &self.body {
-            Body::Scalar { blocks, head } => {
+            Body::Scalar { blocks, gate, head } => {
                 tape.last.clone_from(&tape.first);
                 tape.scalar.resize_with(blocks.len(), BlockTape::default);
                 for (block, tape_of) in blocks.iter().zip(&mut tape.scalar) {
                     block.forward(w, &net.layers, &mut tape.last, tape_of);
                 }
-                linear(&w[head[0].clone()], &w[head[1].clone()], self.width, &tape.last, &mut out);
+                tape.gate.clear();
+                tape.gate.resize(self.width, [F::ZERO; LANES]);
+                linear(&w[gate.clone()], &[], self.own, &tape.own, &mut tape.gate);
+                tape.bent.clone_from(&tape.last);
+                by_row(&mut tape.bent, ticks, |x, row, _| (0..LANES).for_each(|l| x[l] *= F::ONE + tape.gate[row][l]));
+                linear(&w[head[0].clone()], &w[head[1].clone()], self.width, &tape.bent, &mut out);
             }
             Body::Vector { channels, coefficients, blocks, head } => {
                 clear(&mut tape.bent, tape.first.len());
@@ -271,11 +280,19 @@ impl Net {
         let (w, ticks, zero) = (&net.w, net.ticks, [F::ZERO; LANES]);
         let mut d = self.no_gradient(net);
         let mut d_first = vec![zero; tape.first.len()];
+        let mut d_features = vec![zero; self.own];
         match &self.body {
-            Body::Scalar { blocks, head } => {
+            Body::Scalar { blocks, gate, head } => {
                 let [d_weight, d_bias] = d.w.get_disjoint_mut(head.clone()).expect("a layout's parts are apart");
                 let weight = &w[head[0].clone()];
-                linear_backward(weight, self.width, &tape.last, d_out, (d_weight, d_bias), &mut d_first);
+                linear_backward(weight, self.width, &tape.bent, d_out, (d_weight, d_bias), &mut d_first);
+                let mut d_gate = vec![zero; self.width];
+                by_row(&mut d_first, ticks, |d, row, at| {
+                    (0..LANES).for_each(|l| d_gate[row][l] += d[l] * tape.last[at][l]);
+                    (0..LANES).for_each(|l| d[l] *= F::ONE + tape.gate[row][l]);
+                });
+                let d_w = (&mut d.w[gate.clone()], &mut [][..]);
+                linear_backward(&w[gate.clone()], self.own, &tape.own, &d_gate, d_w, &mut d_features);
                 for (block, tape) in blocks.iter().zip(&tape.scalar).rev() {
                     block.backward(w, &net.layers, tape, &mut d_first, (&mut d.w, &mut d.layers));
                 }
@@ -311,7 +328,6 @@ impl Net {
                 (0..LANES).for_each(|l| d_own[row][l] += x[l]);
             }
         }
-        let mut d_features = vec![zero; self.own];
         let [_, own, bias] = self.entry.clone();
         let [d_weight, d_bias] = d.w.get_disjoint_mut([own.clone(), bias]).expect("a layout's parts are apart");
         linear_backward(&w[own], self.own, &tape.own, &d_own, (d_weight, d_bias), &mut d_features);
@@ -334,6 +350,13 @@ impl Net {
             let [table] = d.of([*key]);
             table.data_mut()[..at.len()].iter_mut().zip(&sum.w[at.clone()]).for_each(|(a, b)| *a += *b);
         }
+    }
+}
+
+/// Calls `f(&mut x[at], row, at)` for x \[rows, ticks\].
+fn by_row<F: Real>(x: &mut [Lane<F>], ticks: usize, mut f: impl FnMut(&mut Lane<F>, usize, usize)) {
+    for (row, x) in x.chunks_exact_mut(ticks).enumerate() {
+        x.iter_mut().enumerate().for_each(|(t, x)| f(x, row, row * ticks + t));
     }
 }
 

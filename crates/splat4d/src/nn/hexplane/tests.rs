@@ -81,7 +81,12 @@ fn a_grid_point_gives_its_own_numbers() {
 
 #[test]
 fn time_planes_of_ones_know_no_time() {
-    let (p, planes) = planes(shape());
+    let (mut p, planes) = planes(shape());
+    set(
+        &mut p,
+        &planes,
+        |plane, [u, v], c| if TEMPORAL.contains(&plane) { 1.0 } else { 0.5 + u * v + 0.01 * c as f64 },
+    );
     let x = points(50);
     let (a, b) = (features(&p, &planes, 2, &x, 0.1), features(&p, &planes, 2, &x, 0.83));
     assert_eq!(a, b);
@@ -89,7 +94,26 @@ fn time_planes_of_ones_know_no_time() {
     let lines = planes.lines(&p, 0.3);
     let d_t = planes.backward(&p, &lines, 2, &x, &vec![1.0; a.len()], &mut vec![[0.0; 3]; 50], &mut Vec::new(), &mut d);
     assert_eq!(d_t, 0.0);
-    assert!(a.iter().all(|f| (0.001..0.125).contains(f)), "a product of three numbers of 0.1 to 0.5");
+}
+
+/// The most that neighbouring grid points differ by follows from how far apart the random ones are.
+#[test]
+fn planes_start_smooth_and_about_one() {
+    let (p, planes) = planes(PlaneShape { resolution: 33, time_resolution: 17, ..shape() });
+    for (level, keys) in planes.keys().iter().enumerate() {
+        for (plane, &key) in keys.iter().enumerate() {
+            let ([w, h], c, data) = (planes.shape().size(level, plane), planes.shape().channels, p[key].data());
+            let step = |n: usize| (START[1] - START[0]) * (START_POINTS * (level + 1) - 1) as f64 / (n - 1) as f64;
+            assert!(data.iter().all(|x| (START[0]..START[1]).contains(x)));
+            let beside = |i: usize, by: usize| (data[i + by * c] - data[i]).abs();
+            let far = |at: &dyn Fn(usize) -> bool, by: usize| {
+                (0..w * h * c).filter(|i| at(i / c)).map(|i| beside(i, by)).fold(0.0, f64::max)
+            };
+            let (along, above) = (far(&|cell| cell % w + 1 < w, 1), far(&|cell| cell / w + 1 < h, w));
+            assert!(along > 0.3 * step(w) && along <= step(w) + 1e-12, "{along} of {}", step(w));
+            assert!(above > 0.3 * step(h) && above <= step(h) + 1e-12, "{above} of {}", step(h));
+        }
+    }
 }
 
 /// Central differences of Σ w·f to every table, to x and to t.
