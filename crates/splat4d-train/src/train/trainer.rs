@@ -366,7 +366,7 @@ impl<'a> Trainer<'a> {
             seed: self.settings.seed,
             progress: self.progress.stage_step as f64 / stage.iterations as f64,
         };
-        self.draw.config().sh_degree = match self.progress.stage_step.checked_div(stage.sh_interval) {
+        self.draw.config().sh_degree = match (stage.sh_from + self.progress.stage_step).checked_div(stage.sh_interval) {
             Some(unlocked) => unlocked.min(self.settings.sh_degree),
             None => self.settings.sh_degree,
         };

@@ -107,7 +107,7 @@ fn what_is_no_flow_is_refused() {
     sample.edit("capture.json", |v| v["cameras"][1]["flow"] = json!([FLOW]));
     let capture = open(&sample, 1).unwrap();
     assert!(load(&capture, 2).unwrap().plane(2).iter().all(|&v| v == 1.0));
-    sample.edit("capture.json", |v| v["cameras"][1]["flow"] = json!([]));
+    sample.edit("capture.json", |v| (v["cameras"][1]["flow"], v["frames"]) = (json!([]), json!(2)));
     assert_says(&message(&sample), &["\"flow\" lists 0 files"]);
     sample.edit("capture.json", |v| v["cameras"][1]["flow"] = json!("flow.png"));
     assert_says(&message(&sample), &["flow.png", "%04d"]);

