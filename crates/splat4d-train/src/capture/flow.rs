@@ -53,7 +53,8 @@ pub(super) fn decode_into(codes: &[u16], width: usize, height: usize, out: &mut 
     (out.channels, out.height, out.width) = (3, height, width);
     out.data.clear();
     let (vectors, known) = codes.split_at(2 * width * height);
-    let vector = |(&code, &known): (&u16, &u16)| if known == 0 { 0.0 } else { ((f64::from(code) - ZERO) / PER_PIXEL) as f32 };
+    let vector =
+        |(&code, &known): (&u16, &u16)| if known == 0 { 0.0 } else { ((f64::from(code) - ZERO) / PER_PIXEL) as f32 };
     out.data.extend(vectors.iter().zip(known.iter().cycle()).map(vector));
     out.data.extend(known.iter().map(|&k| f32::from(k)));
 }

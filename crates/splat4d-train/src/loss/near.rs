@@ -24,13 +24,7 @@ impl Near {
     }
 
     /// Calls `f` with the neighbours of all rows of a layer, [rows, 8], whose `means` are the first columns of a table.
-    pub fn with<F: Real, R>(
-        &self,
-        layer: usize,
-        means: &Table<F>,
-        iteration: usize,
-        f: impl FnOnce(&[u32]) -> R,
-    ) -> R {
+    pub fn with<F: Real, R>(&self, layer: usize, means: &Table<F>, iteration: usize, f: impl FnOnce(&[u32]) -> R) -> R {
         let (mut found, epoch) = (self.lock(), iteration / SEARCH_INTERVAL);
         if found.len() <= layer {
             found.resize(layer + 1, (usize::MAX, Vec::new()));

@@ -128,9 +128,7 @@ fn scratch(plan: &Plan, spec: &Spec, rows: usize) -> u64 {
                 3 + 2 * (11 + colors)
             }
             Spec::Control(s) => skinned(s.skin.neighbours),
-            Spec::Ssm(s) => {
-                skinned(s.skin.neighbours) + (s.skin.nodes * s.ticks) as u64 * TICK / rows.max(1) as u64
-            }
+            Spec::Ssm(s) => skinned(s.skin.neighbours) + (s.skin.nodes * s.ticks) as u64 * TICK / rows.max(1) as u64,
             Spec::Filtered(f) => {
                 // The model's answers now and earlier; a state of each, and the gradients to them.
                 let earlier = 1 + f.history.max(f.baseline + 1) as u64;

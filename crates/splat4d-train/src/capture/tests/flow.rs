@@ -43,7 +43,11 @@ fn vectors_are_read_where_they_are_known() {
     for (x, y) in [(0, 0), (7, 3), (19, 15)] {
         let expected = [0.25 * (x as f32 + 0.5), -3.0 + y as f32, 1.0];
         for c in 0..3 {
-            assert!((vectors.get(c, y, x) - expected[c]).abs() < 0.5 / 64.0, "{c} at {x} {y}: {}", vectors.get(c, y, x));
+            assert!(
+                (vectors.get(c, y, x) - expected[c]).abs() < 0.5 / 64.0,
+                "{c} at {x} {y}: {}",
+                vectors.get(c, y, x)
+            );
         }
     }
     assert_eq!([0, 1, 2].map(|c| vectors.get(c, 4, 21)), [0.0; 3], "unknown is nothing at all");

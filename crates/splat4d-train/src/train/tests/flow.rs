@@ -55,7 +55,10 @@ fn known_flow_teaches_motion() {
     assert!(refused.contains("lambda_flow") && refused.contains("capture.json"), "{refused}");
     write(&place, &made);
     let error = |lambda: f64| {
-        let r = Recipe { lambda_flow: lambda, ..recipe(&["strategy=none", "num_pts=200", "half_size_until=0.3", "velocity_lr_init=0.03"]) };
+        let r = Recipe {
+            lambda_flow: lambda,
+            ..recipe(&["strategy=none", "num_pts=200", "half_size_until=0.3", "velocity_lr_init=0.03"])
+        };
         let name = format!("{lambda}");
         place.train(&name, &r).unwrap();
         let scene = splat4d::format::scene::read(&place.scene(&name)).unwrap();

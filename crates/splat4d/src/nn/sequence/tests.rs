@@ -60,6 +60,8 @@ fn a_blocks_gradient_equals_differences() {
         block.backward(&w, &layers, &tape, &mut d_x, (&mut d_w, &mut d_layers));
         block.scans().discrete_backward(&w, &[1.0], &d_layers, &mut d_w);
         check("w", &w, &d_w, |w| weighed(&run(w, &x, &mut BlockTape::default()), 99));
-        check("x", x.as_flattened(), d_x.as_flattened(), |x| weighed(&run(&w, lanes(x), &mut BlockTape::default()), 99));
+        check("x", x.as_flattened(), d_x.as_flattened(), |x| {
+            weighed(&run(&w, lanes(x), &mut BlockTape::default()), 99)
+        });
     }
 }
