@@ -429,7 +429,7 @@ recipe! {
     lambda_mask_entropy: f64 = 0.0,
     /// Weight of the entropy of opacities, nats: Gaussians are there or not (SuGaR; 0.1 there).
     lambda_opacity_entropy: f64 = 0.0,
-    /// Weight of the drawn flow against a known one, shares of the picture's longer side, where the capture has it.
+    /// Weight of the drawn flow against a known one, shares of the picture's longer side (capture.json: `flow`).
     lambda_flow: f64 = 0.0,
     /// Densification: adc, mcmc or none.
     strategy: String = "adc".into(),

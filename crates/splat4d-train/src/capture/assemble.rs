@@ -1,6 +1,6 @@
 //! From what the files say to a checked capture: poses, sizes, files, duplicates, split, clock.
 
-use super::{Capture, CaptureOptions, Frame, HoldOut, RawFrame, Rig, Split, Take};
+use super::{Capture, CaptureOptions, FlowFile, Frame, HoldOut, RawFrame, Rig, Split, Take};
 use super::{options, picture, pose};
 use splat4d::math::se3::{norm, normalize, sub};
 use splat4d::scene::{Camera, Lens, Time};
@@ -37,7 +37,9 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
     let background = options.background.or(take.background).or(has_alpha.then_some(WHITE)).filter(|_| has_alpha);
     let (train, held, validation) = split(&mut take, &cameras, options).map_err(located)?;
     let up = take.up.map(normalize).filter(|u| norm(*u) > 0.0).unwrap_or_else(|| estimate_up(&take.frames));
-    let frames: Vec<Frame> = take.frames.into_iter().map(|f| finish(f, options.downscale)).collect();
+    let flows = flows(&mut take.frames);
+    let finish = |(raw, flow)| Frame { flow, ..finish(raw, options.downscale) };
+    let frames: Vec<Frame> = take.frames.into_iter().zip(flows).map(finish).collect();
     let name = take.name.unwrap_or_else(|| {
         let full = std::path::absolute(&take.root).unwrap_or_else(|_| take.root.clone());
         full.file_name().map_or_else(|| "capture".into(), |n| n.to_string_lossy().into_owned())
@@ -71,7 +73,16 @@ fn finish(raw: RawFrame, downscale: usize) -> Frame {
         index: raw.index,
         image: raw.image,
         mask: raw.mask,
+        flow: None,
     }
+}
+
+/// The flows of all frames, each with the frame of its camera that comes next.
+fn flows(frames: &mut [RawFrame]) -> Vec<Option<FlowFile>> {
+    let numbers: BTreeMap<(usize, usize), usize> =
+        frames.iter().enumerate().map(|(i, f)| ((f.camera, f.index), i)).collect();
+    let next = |f: &RawFrame| numbers.get(&(f.camera, f.index + 1)).copied();
+    frames.iter_mut().map(|f| Some(FlowFile { to: next(f)?, path: f.flow.take()? })).collect()
 }
 
 fn check_frame(frame: &mut RawFrame, camera: &str, options: &CaptureOptions) -> Result<()> {
@@ -87,7 +98,7 @@ fn check_frame(frame: &mut RawFrame, camera: &str, options: &CaptureOptions) -> 
             format!("nothing of a {}x{} image is left at downscale {}", source.width, source.height, options.downscale);
         return Err(place(Error::input(what).remedy("Choose a smaller downscale.")));
     }
-    let files = [("picture", Some(&frame.image)), ("mask", frame.mask.as_ref())];
+    let files = [("picture", Some(&frame.image)), ("mask", frame.mask.as_ref()), ("flow", frame.flow.as_ref())];
     for (what, file) in files.into_iter().filter_map(|(what, file)| Some((what, file?))) {
         if !file.is_file() {
             return Err(Error::input(format!("the {what} of camera {camera}, frame {} is missing", frame.index))

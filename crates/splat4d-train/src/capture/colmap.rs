@@ -61,6 +61,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
             index,
             image: base.join(name),
             mask: mask_of(root, name),
+            flow: None,
             split: Split::Train,
         })
         .collect();

@@ -83,7 +83,16 @@ fn read_split(root: &Path, top: &Node<'_>, split: Split) -> Result<Vec<RawFrame>
         let cam_from_world = pose::from_opengl(&matrix.matrix4()?).map_err(|e| matrix.at(e))?;
         let time = frame.opt("time")?.map_or(Ok(0.0), |t| t.number())?;
         let source = Camera { cam_from_world, intrinsics, lens: Lens::Pinhole, width, height };
-        Ok(RawFrame { camera: 0, source, time, index: 0, image: image_path(root, frame)?, mask: None, split })
+        Ok(RawFrame {
+            camera: 0,
+            source,
+            time,
+            index: 0,
+            image: image_path(root, frame)?,
+            mask: None,
+            flow: None,
+            split,
+        })
     };
     list.iter().map(read_one).collect()
 }

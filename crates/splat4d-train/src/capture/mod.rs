@@ -10,6 +10,7 @@ mod assemble;
 mod colmap;
 mod colmap_files;
 mod dnerf;
+mod flow;
 pub mod frames;
 mod json;
 mod lens;
@@ -27,6 +28,7 @@ mod preflight;
 mod rig;
 mod store;
 
+pub use flow::FlowFile;
 pub use lens::Distortion;
 pub use options::{CaptureOptions, HoldOut, MAX_POINTS};
 pub use points::PointCloud;
@@ -73,6 +75,8 @@ pub struct Frame {
     pub image: PathBuf,
     /// The foreground mask file (white = foreground).
     pub mask: Option<PathBuf>,
+    /// Where its pixels go.
+    pub flow: Option<FlowFile>,
 }
 
 /// One camera of the rig, or one moving camera.
@@ -154,6 +158,7 @@ struct RawFrame {
     index: usize,
     image: PathBuf,
     mask: Option<PathBuf>,
+    flow: Option<PathBuf>,
     split: Split,
 }
 

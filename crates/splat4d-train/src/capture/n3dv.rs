@@ -56,6 +56,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
                 index,
                 image: image.clone(),
                 mask: None,
+                flow: None,
                 split: if camera == 0 && rows > 1 { Split::Held } else { Split::Train },
             });
         }

@@ -58,6 +58,7 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<T
             index,
             image: root.join(entry.name),
             mask: entry.mask.map(|m| root.join(m)),
+            flow: None,
             split: entry.split,
         });
     let points = top.opt("ply_file_path")?.map(|n| ply::read(&root.join(n.text()?))).transpose()?;

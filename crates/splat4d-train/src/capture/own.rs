@@ -39,6 +39,7 @@ const CAMERA_KEYS: &[&str] = &[
     "time_offset",
     "images",
     "masks",
+    "flow",
     "start",
     "frames",
     "comment",
@@ -186,19 +187,23 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
     let start = context.shared(node, "start")?.unwrap_or(0);
     let count = context.shared(node, "frames")?;
     let images = Files::read(&node.get("images")?)?;
-    let masks = node.opt("masks")?.map(|n| Files::read(&n)).transpose()?;
-    for (key, files) in [("images", Some(&images)), ("masks", masks.as_ref())] {
+    let [masks, flow] = ["masks", "flow"].map(|key| node.opt(key)?.map(|n| Files::read(&n)).transpose());
+    let (masks, flow) = (masks?, flow?);
+    for (key, files) in [("images", Some(&images)), ("masks", masks.as_ref()), ("flow", flow.as_ref())] {
         let Some(Files::List(names)) = files else { continue };
         let expected = match (&images, count) {
             (_, Some(count)) => count,
             (Files::List(images), None) => images.len(),
             (Files::Pattern { .. }, None) => continue,
         };
+        // The last frame leads nowhere.
+        let expected = if key == "flow" { expected.saturating_sub(1) } else { expected };
         if names.len() < expected {
             let what = format!("\"{key}\" lists {} files for {expected} frames", names.len());
             return Err(node.error(what).remedy("List one file per frame, or correct \"frames\"."));
         }
     }
+    let first = frames.len();
     for index in 0..count.unwrap_or(usize::MAX) {
         let Some(image) = images.name(context.root, start, index) else { break };
         if !image.is_file() {
@@ -221,8 +226,13 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
             index,
             image,
             mask: masks.as_ref().and_then(|m| m.name(context.root, start, index)),
+            flow: flow.as_ref().and_then(|f| f.name(context.root, start, index)),
             split: Split::Train,
         });
+    }
+    // Nobody knows where the pixels of the last frame go.
+    if let Some(last) = frames[first..].last_mut() {
+        last.flow = None;
     }
     Ok(())
 }

@@ -7,7 +7,7 @@
 
 use super::lens::Distortion;
 use super::picture::{self, Raster, Samples};
-use super::{Capture, Frame};
+use super::{Capture, Frame, flow};
 use rayon::prelude::*;
 use splat4d::Result;
 use splat4d::scene::{Camera, Planes};
@@ -27,6 +27,9 @@ pub struct Picture {
     /// [1, height, width] part of the pixel that the original picture covers, where undistortion left borders. Colour
     /// there is meaningless; losses and measurements must leave those pixels out.
     pub valid: Option<Planes<f32>>,
+    /// [3, height, width] where its pixels go by the next frame of its camera: u right, v down in pixels, and 1 where
+    /// they are known.
+    pub flow: Option<Planes<f32>>,
 }
 
 /// A loaded picture as it is kept: planes of 8 or 16 bits.
@@ -37,6 +40,8 @@ pub struct StoredPicture {
     color: Samples,
     mask: Option<Vec<u8>>,
     valid: Option<Vec<u8>>,
+    /// As [`flow::read`] gives it.
+    flow: Option<Vec<u16>>,
 }
 
 impl StoredPicture {
@@ -51,7 +56,8 @@ impl StoredPicture {
             Samples::Eight(s) => s.len(),
             Samples::Sixteen(s) => 2 * s.len(),
         };
-        color + [&self.mask, &self.valid].into_iter().flatten().map(Vec::len).sum::<usize>()
+        let weights = [&self.mask, &self.valid].into_iter().flatten().map(Vec::len).sum::<usize>();
+        color + weights + self.flow.as_ref().map_or(0, |f| 2 * f.len())
     }
 
     /// Writes the colour as [3, height, width] sRGB values from 0 to 1, reusing `out`'s memory.
@@ -70,6 +76,13 @@ impl StoredPicture {
     /// Writes the validity as [1, height, width] from 0 to 1; false (and `out` untouched) if all pixels are valid.
     pub fn valid_into(&self, out: &mut Planes<f32>) -> bool {
         self.weights_into(self.valid.as_deref(), out)
+    }
+
+    /// Writes the flow as [3, height, width]; false (and `out` untouched) if there is none.
+    pub fn flow_into(&self, out: &mut Planes<f32>) -> bool {
+        let Some(codes) = &self.flow else { return false };
+        flow::decode_into(codes, self.width, self.height, out);
+        true
     }
 
     fn weights_into(&self, weights: Option<&[u8]>, out: &mut Planes<f32>) -> bool {
@@ -95,7 +108,9 @@ impl StoredPicture {
             let mut out = Planes::default();
             self.weights_into(weights.as_deref(), &mut out).then_some(out)
         };
-        Picture { color, mask: plane(&self.mask), valid: plane(&self.valid) }
+        let mut vectors = Planes::default();
+        let flow = self.flow_into(&mut vectors).then_some(vectors);
+        Picture { color, mask: plane(&self.mask), valid: plane(&self.valid), flow }
     }
 }
 
@@ -121,10 +136,10 @@ impl<S: Copy + Into<f32>> Pass for Convert<'_, S> {
 impl std::fmt::Debug for StoredPicture {
     /// Size and kind; millions of samples help nobody.
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let (mask, valid) = (self.mask.is_some(), self.valid.is_some());
+        let (mask, valid, flow) = (self.mask.is_some(), self.valid.is_some(), self.flow.is_some());
         write!(
             f,
-            "StoredPicture {{ {}x{}, {} bytes, mask: {mask}, valid: {valid} }}",
+            "StoredPicture {{ {}x{}, {} bytes, mask: {mask}, valid: {valid}, flow: {flow} }}",
             self.width,
             self.height,
             self.bytes()
@@ -327,7 +342,7 @@ impl Shared {
 /// White: stands in where a picture has alpha although the capture's first pictures had none.
 const WHITE: [f32; 3] = [1.0; 3];
 
-/// Decodes a frame's picture and mask and brings both to the frame's view.
+/// Decodes a frame's picture, mask and flow and brings them to the frame's view.
 fn prepare(frame: &Frame, capture: &Capture) -> Result<StoredPicture> {
     let place = |e: splat4d::Error| {
         let camera = &capture.cameras[frame.camera].name;
@@ -337,12 +352,13 @@ fn prepare(frame: &Frame, capture: &Capture) -> Result<StoredPicture> {
     let background = capture.background.unwrap_or(WHITE);
     let mask = frame.mask.as_deref().map(|m| read_mask(m, &frame.source)).transpose().map_err(place)?;
     let mask = mask.or_else(|| raster.alpha().map(|_| picture::mask_values(&raster, true)));
+    let flow = frame.flow.as_ref().map(|f| flow::read(f, frame, capture)).transpose().map_err(place)?;
     let lens = Distortion::new(frame.source.lens);
     let opaque = raster.alpha().is_none_or(|a| (0..raster.width * raster.height).all(|p| raster.get(p, a) >= 1.0));
     if let (true, true, 1, Samples::Eight(samples)) = (opaque, lens.is_pinhole(), capture.downscale, &raster.samples) {
         let mask = mask.map(|m| m.iter().map(|&v| to_byte(v)).collect());
         let color = Samples::Eight(planar(samples, raster.channels));
-        return Ok(StoredPicture { width: raster.width, height: raster.height, color, mask, valid: None });
+        return Ok(StoredPicture { width: raster.width, height: raster.height, color, mask, valid: None, flow });
     }
     let (width, height) = (raster.width, raster.height);
     let mut planes = composite(&raster, background);
@@ -361,7 +377,7 @@ fn prepare(frame: &Frame, capture: &Capture) -> Result<StoredPicture> {
     // Any doubt about a pixel must not round to certainty.
     let valid = valid.map(|plane| plane.iter().map(|&v| (v.clamp(0.0, 1.0) * 255.0) as u8).collect());
     let color = planes.iter().flatten().map(|&v| (v.clamp(0.0, 1.0) * 65535.0).round() as u16).collect();
-    Ok(StoredPicture { width: width / k, height: height / k, color: Samples::Sixteen(color), mask, valid })
+    Ok(StoredPicture { width: width / k, height: height / k, color: Samples::Sixteen(color), mask, valid, flow })
 }
 
 fn to_byte(v: f32) -> u8 {

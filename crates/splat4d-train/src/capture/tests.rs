@@ -1,6 +1,7 @@
 //! Every reader on a made-up sample that the test writes; bad input; mutated files.
 
 mod bad_input;
+mod flow;
 mod layouts;
 mod mutants;
 mod pictures;

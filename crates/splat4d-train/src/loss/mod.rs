@@ -7,6 +7,7 @@ pub mod graph;
 pub mod image;
 mod kernel;
 pub mod motion;
+mod near;
 pub mod neighbourhood;
 pub mod photometric;
 pub mod planes;

@@ -3,19 +3,15 @@
 use super::arap::{self, OWN_FLOOR};
 use super::graph::{Graph, Weigh};
 use super::motion;
+use super::near::{NEIGHBOURS, Near};
 use super::terms::{Probe, ProbeLoss, StepInfo};
 use splat4d::layers::Scene;
-use splat4d::math::knn::knn;
 use splat4d::math::{Real, Rng};
 use splat4d::motion::Spec;
 use splat4d::scene::splats::COV;
 use splat4d::scene::{GEOMETRY, Space, Table, Time};
 use std::sync::Mutex;
 
-/// Neighbours a Gaussian is compared with; Luiten et al. 2024 take 20, SC-GS 10 and fewer: cost is in proportion.
-pub const NEIGHBOURS: usize = 8;
-/// Steps between two searches of the neighbours: they change slowly.
-const SEARCH_INTERVAL: usize = 200;
 /// Gaussians a step whose neighbourhoods are looked at, other ones in each: this bounds the cost.
 pub const CENTRES: usize = 1024;
 /// exp(−c d²/median) of an edge; 1 keeps the typical edge and drops the far ones.
@@ -59,8 +55,7 @@ pub struct Neighbourhood<F> {
     /// Seconds of a frame.
     frame: f64,
     clip: [f64; 2],
-    /// Per layer: the epoch of the search and its result.
-    near: Mutex<Vec<(usize, Vec<u32>)>>,
+    near: Near,
     /// Of the step that is under way: a graph over the rows of each probe.
     graphs: Mutex<Vec<Graph<F>>>,
 }
@@ -68,7 +63,7 @@ pub struct Neighbourhood<F> {
 impl<F: Real> Neighbourhood<F> {
     /// For a scene of this extent (scene units), over a clip (seconds) of so many frames a second.
     pub fn new(weights: MotionWeights, extent: f64, clip: [f64; 2], fps: f64) -> Self {
-        Self { weights, unit: 1.0 / extent, frame: 1.0 / fps, clip, near: Mutex::default(), graphs: Mutex::default() }
+        Self { weights, unit: 1.0 / extent, frame: 1.0 / fps, clip, near: Near::default(), graphs: Mutex::default() }
     }
 
     /// Instants of a step: two a frame apart from the first view's time on; then, if asked for, one frame before and one
@@ -101,29 +96,22 @@ impl<F: Real> ProbeLoss<F> for Neighbourhood<F> {
     }
 
     fn probes(&self, scene: &Scene<F>, info: &StepInfo) -> Vec<Probe> {
-        let mut near = self.near.lock().expect("no thread panics while it holds the neighbours");
-        near.resize(scene.layers.len(), (usize::MAX, Vec::new()));
         let mut graphs = self.graphs.lock().expect("no thread panics while it holds the graphs");
         graphs.clear();
         let mut probes = Vec::new();
-        for (layer, (l, (searched, near))) in scene.layers.iter().zip(near.iter_mut()).enumerate() {
+        for (layer, l) in scene.layers.iter().enumerate() {
             let n = l.params.len();
             let Some(times) = self.times(info, layer) else { continue };
             if n <= NEIGHBOURS || l.motion.spec() == Spec::Still || !l.spans_over(times[0]) {
                 continue;
             }
             let means = &l.params[GEOMETRY];
-            let epoch = info.iteration / SEARCH_INTERVAL;
-            if *searched != epoch || near.len() != n * NEIGHBOURS {
-                let points: Vec<[f32; 3]> = (0..n).map(|r| means.read::<3>(r, 0).map(|x| x.f64() as f32)).collect();
-                *near = knn(&points, NEIGHBOURS);
-                *searched = epoch;
-            }
             let mut alive = Vec::new();
             if l.active(times[0], &mut alive) {
                 alive = (0..n as u32).collect();
             }
-            let (rows, graph) = sample(means, near, &alive, Rng::new(info.seed, "neighbours", info.iteration as u64));
+            let rng = Rng::new(info.seed, "neighbours", info.iteration as u64);
+            let (rows, graph) = self.near.with(layer, means, info.iteration, |near| sample(means, near, &alive, rng));
             if graph.edges() > 0 {
                 probes.push(Probe { layer, of: Space::Gaussians, rows: Some(rows), times });
                 graphs.push(graph);
@@ -195,30 +183,15 @@ impl<F: Real> ProbeLoss<F> for Neighbourhood<F> {
     }
 
     fn on_edit(&self) {
-        self.near.lock().expect("no thread panics while it holds the neighbours").clear();
+        self.near.forget();
     }
 
     fn state(&self) -> Vec<u32> {
-        // Per layer: the epoch of the search, the number of indices, the indices.
-        let near = self.near.lock().expect("no thread panics while it holds the neighbours");
-        let layer = |(epoch, near): &(usize, Vec<u32>)| {
-            [&[u32::try_from(*epoch).unwrap_or(u32::MAX), near.len() as u32], near.as_slice()].concat()
-        };
-        near.iter().flat_map(layer).collect()
+        self.near.state()
     }
 
     fn restore(&self, state: &[u32]) {
-        let mut near = self.near.lock().expect("no thread panics while it holds the neighbours");
-        near.clear();
-        let mut rest = state;
-        while let [epoch, count, tail @ ..] = rest {
-            let (indices, tail) = tail.split_at((*count as usize).min(tail.len()));
-            let sound =
-                indices.len() == *count as usize && indices.iter().all(|&j| (j as usize) < indices.len() / NEIGHBOURS);
-            let epoch = if *epoch == u32::MAX || !sound { usize::MAX } else { *epoch as usize };
-            near.push((epoch, if sound { indices.to_vec() } else { Vec::new() }));
-            rest = tail;
-        }
+        self.near.restore(state);
     }
 }
 

@@ -1,14 +1,13 @@
 //! Losses on a scene's raw parameters. Each is a mean over the rows that are active in the step, and adds only to them.
 
 use super::image::entropy::binary_entropy;
+use super::near::{NEIGHBOURS, Near};
 use super::terms::{ParamLoss, StepInfo};
 use splat4d::layers::Scene;
 use splat4d::math::Real;
-use splat4d::math::knn::knn;
 use splat4d::motion::for_rows;
 use splat4d::scene::params::{LOG_SCALE, OPACITY};
 use splat4d::scene::{GEOMETRY, Grads, Rows, Space};
-use std::sync::Mutex;
 
 /// Adds `f`'s gradient over the active rows of every layer's geometry, weighted `weight`/(active rows); returns the loss.
 fn over_active<F: Real>(
@@ -139,23 +138,18 @@ impl<F: Real> ParamLoss<F> for LivingOpacity {
     }
 }
 
-/// Neighbours a Gaussian's velocity is compared with.
-const NEIGHBOURS: usize = 8;
-/// Steps between two searches of the neighbours: they change slowly.
-const SEARCH_INTERVAL: usize = 200;
-
 /// weight · mean over active Gaussians i and their neighbours j of ‖v_i − v_j‖² in (extents a clip)².
 /// j's gradient is included where j is active too.
 pub struct VelocitySmoothness {
     weight: f64,
     unit: f64,
-    neighbours: Mutex<Vec<(usize, Vec<u32>)>>,
+    neighbours: Near,
 }
 
 impl VelocitySmoothness {
     /// `unit` turns scene units a second into extents a clip.
     pub fn new(weight: f64, unit: f64) -> Self {
-        Self { weight, unit, neighbours: Mutex::new(Vec::new()) }
+        Self { weight, unit, neighbours: Near::default() }
     }
 }
 
@@ -166,67 +160,47 @@ impl<F: Real> ParamLoss<F> for VelocitySmoothness {
 
     fn eval(&self, scene: &Scene<F>, info: &StepInfo, d: &mut [Grads<F>]) -> f64 {
         let mut loss = 0.0;
-        let mut cache = self.neighbours.lock().expect("no thread panics while it holds the neighbours");
-        cache.resize(scene.layers.len(), (usize::MAX, Vec::new()));
-        for ((l, d), (searched, near)) in scene.layers.iter().zip(d).zip(cache.iter_mut()) {
+        for (layer, (l, d)) in scene.layers.iter().zip(d).enumerate() {
             let Some(key) = l.params.find(splat4d::motion::spacetime::VELOCITIES) else { continue };
             let n = l.params.len();
             if l.params[key].width() < 3 || n <= NEIGHBOURS {
                 continue;
-            }
-            let epoch = info.iteration / SEARCH_INTERVAL;
-            if *searched != epoch || near.len() != n * NEIGHBOURS {
-                let points: Vec<[f32; 3]> =
-                    (0..n).map(|r| l.params[GEOMETRY].read::<3>(r, 0).map(|x| x.f64() as f32)).collect();
-                *near = knn(&points, NEIGHBOURS);
-                *searched = epoch;
             }
             let active = d.active(Space::Gaussians).to_vec();
             let count = active.iter().filter(|a| **a).count().max(1);
             let scale = self.weight * self.unit * self.unit / (count * NEIGHBOURS) as f64;
             let velocities = &l.params[key];
             let [d_v] = d.of([key]);
-            for i in (0..n).filter(|&i| active[i]) {
-                let v = velocities.read::<3>(i, 0);
-                for &j in &near[i * NEIGHBOURS..(i + 1) * NEIGHBOURS] {
-                    let j = j as usize;
-                    let u = velocities.read::<3>(j, 0);
-                    let e: [F; 3] = std::array::from_fn(|k| v[k] - u[k]);
-                    loss += scale * (e[0] * e[0] + e[1] * e[1] + e[2] * e[2]).f64();
-                    let g = e.map(|x| x * F::of(2.0 * scale));
-                    d_v.add(i, 0, g);
-                    if active[j] {
-                        d_v.add(j, 0, g.map(|x| -x));
+            self.neighbours.with(layer, &l.params[GEOMETRY], info.iteration, |near| {
+                for i in (0..n).filter(|&i| active[i]) {
+                    let v = velocities.read::<3>(i, 0);
+                    for &j in &near[i * NEIGHBOURS..(i + 1) * NEIGHBOURS] {
+                        let j = j as usize;
+                        let u = velocities.read::<3>(j, 0);
+                        let e: [F; 3] = std::array::from_fn(|k| v[k] - u[k]);
+                        loss += scale * (e[0] * e[0] + e[1] * e[1] + e[2] * e[2]).f64();
+                        let g = e.map(|x| x * F::of(2.0 * scale));
+                        d_v.add(i, 0, g);
+                        if active[j] {
+                            d_v.add(j, 0, g.map(|x| -x));
+                        }
                     }
                 }
-            }
+            });
         }
         loss
     }
 
     fn on_edit(&self) {
-        self.neighbours.lock().expect("no thread panics while it holds the neighbours").clear();
+        self.neighbours.forget();
     }
 
     fn state(&self) -> Vec<u32> {
-        // Per layer: the epoch of the search, the number of indices, the indices.
-        let cache = self.neighbours.lock().expect("no thread panics while it holds the neighbours");
-        let layer = |(epoch, near): &(usize, Vec<u32>)| {
-            [&[u32::try_from(*epoch).unwrap_or(u32::MAX), near.len() as u32], near.as_slice()].concat()
-        };
-        cache.iter().flat_map(layer).collect()
+        self.neighbours.state()
     }
 
     fn restore(&self, state: &[u32]) {
-        let mut cache = self.neighbours.lock().expect("no thread panics while it holds the neighbours");
-        cache.clear();
-        let mut rest = state;
-        while let [epoch, count, tail @ ..] = rest {
-            let (near, tail) = tail.split_at((*count as usize).min(tail.len()));
-            let epoch = if *epoch == u32::MAX { usize::MAX } else { *epoch as usize };
-            cache.push((epoch, near.to_vec()));
-            rest = tail;
-        }
+        self.neighbours.restore(state);
     }
 }
 

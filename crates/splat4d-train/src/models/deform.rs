@@ -88,24 +88,13 @@ fn spec(plan: &Plan) -> DeformSpec {
 
 /// Steps `from .. to` of the recipe's one schedule as a stage of its own.
 fn stage(plan: &Plan, from: usize, to: usize) -> Stage {
-    let total = plan.recipe.iterations as f64;
     let mut stage = still::stage("deform-mlp", plan);
     still::learn_life(&mut stage, plan, DeformProgram.life(plan));
-    for group in &mut stage.groups {
-        let mut rate = group.rate;
-        if group.column == "means" {
-            rate.start /= CANONICAL_SLOWDOWN;
-            rate.end = rate.end.min(rate.start);
-        }
-        group.rate = Rate { start: rate.at(from as f64 / total), end: rate.at(to as f64 / total) };
+    for group in stage.groups.iter_mut().filter(|g| g.column == "means") {
+        group.rate.start /= CANONICAL_SLOWDOWN;
+        group.rate.end = group.rate.end.min(group.rate.start);
     }
-    let (first, last, every) = stage.densify_steps;
-    stage.densify_steps = (first.saturating_sub(from), last.saturating_sub(from), every);
-    stage.half_size_steps = stage.half_size_steps.saturating_sub(from);
-    // Degrees are unlocked from the stage's start on: the first one comes when it would have.
-    stage.sh_interval = stage.sh_interval.saturating_sub(from).max(1);
-    stage.iterations = to - from;
-    stage
+    stage.part(from, to)
 }
 
 /// Lets the networks of every deformable layer learn, or not.

@@ -6,7 +6,6 @@
 //! Source: Wu et al. 2024 ("4DGaussians") §4 and the released configurations.
 
 use super::{Group, Hook, Plan, Program, Rate, Stage, still};
-use crate::densify::Densify;
 use crate::loss::planes::{PlaneWeights, SmoothPlanes};
 use crate::recipe::Recipe;
 use crate::{Error, Result};
@@ -77,7 +76,7 @@ impl Program for HexplaneProgram {
         let coarse = coarse_steps(r).min(r.iterations);
         let mut stages = Vec::new();
         if coarse > 0 {
-            let mut stage = part(plan, self.whole(plan), 0, coarse);
+            let mut stage = self.whole(plan).part(0, coarse);
             stage.name = "coarse".into();
             stage.groups.retain(|g| !g.column.starts_with("hexplane."));
             stage.params.retain(|l| l.name() != SmoothPlanes::NAME);
@@ -86,7 +85,7 @@ impl Program for HexplaneProgram {
         }
         let ends = unlocks(r, coarse);
         for (i, end) in ends.windows(2).enumerate() {
-            let mut stage = part(plan, self.whole(plan), end[0], end[1]);
+            let mut stage = self.whole(plan).part(end[0], end[1]);
             stage.name = if ends.len() > 2 { format!("fine {}", i + 1) } else { "fine".into() };
             let levels = r.multires.len();
             let unlocked = if ends.len() > 2 { i + 1 } else { levels };
@@ -152,28 +151,6 @@ impl HexplaneProgram {
         }
         stage
     }
-}
-
-/// Steps `from..to` of the whole stage as a stage of its own: rates, densification and all else go on where they were.
-fn part(plan: &Plan, whole: Stage, from: usize, to: usize) -> Stage {
-    let r = &plan.recipe;
-    let share = |step: usize| step as f64 / r.iterations.max(1) as f64;
-    let mut stage = whole;
-    for group in &mut stage.groups {
-        group.rate = Rate { start: group.rate.at(share(from)), end: group.rate.at(share(to)) };
-    }
-    stage.iterations = to - from;
-    stage.half_size_steps = stage.half_size_steps.saturating_sub(from);
-    let (first, until, every) = stage.densify_steps;
-    stage.densify_steps = (first.saturating_sub(from).max(1), until.min(to).saturating_sub(from), every);
-    if until <= from {
-        stage.densify = Densify::None;
-    }
-    // A stage counts unlocked degrees from its own start; after the first one all are there.
-    if from > 0 {
-        stage.sh_interval = 0;
-    }
-    stage
 }
 
 /// A hook that changes the spec of every hexplane layer; tables stay as they are.

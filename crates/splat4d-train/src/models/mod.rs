@@ -185,6 +185,8 @@ pub struct Stage<F: Real = f32> {
     pub guided: Option<Guided>,
     /// Steps before each further SH degree; 0: all at once.
     pub sh_interval: usize,
+    /// Steps of earlier stages that count for it.
+    pub sh_from: usize,
     /// The first so many steps see pictures at half size: coarse things first, and four times faster.
     pub half_size_steps: usize,
     /// Lower bound of log life widths, by layer; learnt values are lifted to it.
@@ -225,6 +227,7 @@ impl<F: Real> Stage<F> {
             relocate: None,
             guided: None,
             sh_interval: 0,
+            sh_from: 0,
             half_size_steps: 0,
             min_log_life: None,
             time_noise: TimeNoise::default(),
@@ -239,6 +242,26 @@ impl<F: Real> Stage<F> {
 }
 
 impl<F: Real> Stage<F> {
+    /// The steps `from..to` as a stage of its own: rates, densification, degrees of SH and pictures at half size are as they
+    /// would have been then.
+    #[must_use]
+    pub fn part(mut self, from: usize, to: usize) -> Self {
+        let share = |step: usize| step as f64 / self.iterations.max(1) as f64;
+        let [start, end] = [from, to].map(share);
+        for group in &mut self.groups {
+            group.rate = Rate { start: group.rate.at(start), end: group.rate.at(end) };
+        }
+        let (first, until, every) = self.densify_steps;
+        self.densify_steps = (first.saturating_sub(from).max(1), until.min(to).saturating_sub(from), every);
+        if until <= from {
+            self.densify = Densify::None;
+        }
+        self.half_size_steps = self.half_size_steps.saturating_sub(from);
+        self.sh_from += from;
+        self.iterations = to - from;
+        self
+    }
+
     /// Tells every loss that rows were edited.
     pub fn on_edit(&self) {
         self.params.iter().for_each(|l| l.on_edit());

@@ -64,11 +64,11 @@ impl Program for SsmProgram {
         let warm = (r.ssm_warm_up * r.iterations as f64) as usize;
         let mut stages = Vec::new();
         if warm > 0 {
-            let mut first = share_of(still::stage("ssm warm-up", plan), 0, warm);
+            let mut first = still::stage("ssm warm-up", plan).part(0, warm);
             still::learn_life(&mut first, plan, self.life(plan));
             stages.push(first);
         }
-        let mut all = share_of(still::stage("ssm", plan), warm, r.iterations);
+        let mut all = still::stage("ssm", plan).part(warm, r.iterations);
         still::learn_life(&mut all, plan, self.life(plan));
         control::add_nodes(&mut all, plan);
         all.groups.extend(groups(self.spec(plan), plan));
@@ -78,21 +78,6 @@ impl Program for SsmProgram {
         stages.push(all);
         stages
     }
-}
-
-/// The steps `from..to` of a stage: its rates, densification and half-size steps are cut accordingly.
-fn share_of(mut stage: Stage, from: usize, to: usize) -> Stage {
-    let whole = stage.iterations.max(1) as f64;
-    for group in &mut stage.groups {
-        let rate = group.rate;
-        group.rate = Rate { start: rate.at(from as f64 / whole), end: rate.at(to as f64 / whole) };
-    }
-    let within = |step: usize| step.clamp(from, to) - from;
-    let (first, last, every) = stage.densify_steps;
-    stage.densify_steps = (within(first), within(last), every);
-    stage.half_size_steps = within(stage.half_size_steps);
-    stage.iterations = to - from;
-    stage
 }
 
 /// The network's groups.

@@ -1,7 +1,7 @@
 //! Checkpoints hold everything: scene, moments, statistics, exposure, the losses' and codecs' memory, how far the run is. Random
 //! numbers and samplers are functions of the step and need no saving. A resumed run is bit for bit the unbroken one.
 //!
-//! The file is a scene file with more arrays (`moments.L.T`, `stats.L`, `exposure…`), so that every reader of scenes
+//! The file is a scene file with more arrays (`moments.L.TABLE`, `stats.L`, `exposure…`), so that every reader of scenes
 //! opens it too.
 
 use super::trainer::{Progress, Trainer};
@@ -11,12 +11,13 @@ use crate::{Error, ErrorKind, Result};
 use serde_json::{Value, json};
 use splat4d::format::safetensors::{self, SafeTensors, Tensor};
 use splat4d::format::scene::{self, METADATA};
-use splat4d::scene::{Key, Table};
+use splat4d::layers::Layer;
+use splat4d::scene::{Key, Params, Table};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Version of the checkpoint's own metadata.
-const VERSION: u64 = 1;
+const VERSION: u64 = 2;
 /// The metadata's key.
 const CHECKPOINT: &str = "splat4d-checkpoint";
 
@@ -51,7 +52,7 @@ pub fn write(trainer: &Trainer<'_>, identity: &Identity, state: &RunState) -> Re
         for key in layer.params.keys() {
             // Moments of a page that does not learn have no rows, and are not in the file.
             if moments.table(key).rows() == layer.params[key].rows() {
-                push(format!("moments.{l}.{}", key.0), moments.table(key));
+                push(moments_name(l, &layer.params, key), moments.table(key));
             }
         }
         push(format!("stats.{l}"), &trainer.stats.tables[l]);
@@ -78,7 +79,12 @@ pub fn write(trainer: &Trainer<'_>, identity: &Identity, state: &RunState) -> Re
     tensors.extend(scene::masks(&trainer.scene));
     tensors.extend(memories.iter().map(|(n, data)| Tensor::u32(n.clone(), &[data.len()], data)));
     let p = trainer.progress;
+    let frozen = |l: &Layer<f32>| -> Vec<String> {
+        let infos = l.params.keys().map(|k| l.params.info(k));
+        infos.filter(|i| !i.trainable).map(|i| i.name.clone()).collect()
+    };
     let meta = json!({
+        "frozen": trainer.scene.layers.iter().map(frozen).collect::<Vec<_>>(),
         "version": VERSION,
         "iteration": p.iteration,
         "stage": p.stage,
@@ -109,13 +115,20 @@ pub fn read(bytes: &[u8], trainer: &mut Trainer<'_>, identity: &Identity) -> Res
                 .remedy(format!("Its {what} changed since the run began: put it back, or start a new run with -o")));
         }
     }
-    let scene = scene::from_tensors(&file)?;
+    let mut scene = scene::from_tensors(&file)?;
+    for (l, layer) in scene.layers.iter_mut().enumerate() {
+        for key in layer.params.keys() {
+            let info = layer.params.info_mut(key);
+            let frozen = meta["frozen"][l].as_array();
+            info.trainable = !frozen.is_some_and(|names| names.iter().any(|n| n.as_str() == Some(&info.name)));
+        }
+    }
     let mut moments = Vec::new();
     let mut stats = Stats::new(&scene);
     for (l, layer) in scene.layers.iter().enumerate() {
         let mut m = Moments::new(&layer.params);
         for key in layer.params.keys().collect::<Vec<Key>>() {
-            let name = format!("moments.{l}.{}", key.0);
+            let name = moments_name(l, &layer.params, key);
             if layer.params.info(key).page.is_none() || file.get(&name).is_some() {
                 load(&file, &name, m.table_mut(key))?;
             }
@@ -166,6 +179,11 @@ pub fn read(bytes: &[u8], trainer: &mut Trainer<'_>, identity: &Identity) -> Res
         seconds: number(&meta["seconds"], "seconds")?,
         smooth: [number(&meta["smooth"][0], "smooth")?, number(&meta["smooth"][1], "smooth")?],
     })
+}
+
+/// The array of a table's moments. Tables are told by name: a reader may make them in another order than training did.
+fn moments_name(layer: usize, params: &Params<f32>, key: Key) -> String {
+    format!("moments.{layer}.{}", params.info(key).name)
 }
 
 /// The array that holds what a stage's loss over several times remembers.

@@ -1,7 +1,7 @@
 //! A capture on disk as the trainer sees it: one of its splits, through the image store.
 
 use crate::Result;
-use crate::capture::frames::{Frames, Picture};
+use crate::capture::frames::{Flow, Frames, Picture};
 use crate::capture::{Capture, ImageStore};
 use splat4d::scene::{Camera, Planes, Time};
 use std::sync::Arc;
@@ -57,10 +57,16 @@ impl Frames for Dataset {
     }
 
     fn load(&self, i: usize, out: &mut Picture) -> Result<()> {
-        let stored = self.store.load(self.frames[i])?;
+        let frame = self.frames[i];
+        let stored = self.store.load(frame)?;
         stored.color_into(&mut out.color);
         fill(&mut out.mask, |plane| stored.mask_into(plane));
         fill(&mut out.weight, |plane| stored.valid_into(plane));
+        let mut vectors = out.flow.take().map(|f| f.vectors).unwrap_or_default();
+        if let (Some(file), true) = (&self.capture.frames[frame].flow, stored.flow_into(&mut vectors)) {
+            let to = &self.capture.frames[file.to];
+            out.flow = Some(Flow { to: to.time, camera: to.view.clone(), vectors });
+        }
         Ok(())
     }
 

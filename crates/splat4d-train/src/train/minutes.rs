@@ -2,6 +2,7 @@
 //! iterations follow from the densification's own schedule, and are saved in the recipe, so that the run repeats.
 
 use super::run::Bench;
+use super::trainer::Trainer;
 use crate::densify::Densify;
 use crate::event::Event;
 use crate::models::{Stage, program_of, split};
@@ -17,6 +18,8 @@ const TIMED: usize = 25;
 const HURRIED: usize = 20;
 /// See [`HURRIED`].
 const GROWTH_STEPS: usize = 400;
+/// Steps of a stage that is not to end while it is timed.
+const ENDLESS: usize = 1 << 40;
 /// Bounds of what is sensible.
 const ITERATIONS: std::ops::RangeInclusive<usize> = 50..=1_000_000;
 
@@ -31,13 +34,14 @@ pub(super) fn plan(bench: &Bench, recipe: &Recipe, minutes: f64, listen: &mut dy
         listen(&Event::Phase { name: "timing probes".into(), done, total: 2 });
     };
     tell(listen, 0);
-    let plan = bench.plan(recipe);
+    // A filter would be switched on later than the probes look.
+    let plan = bench.plan(&Recipe { filter_start: 0.0, ..recipe.clone() });
     let scene = bench.initial_scene(&plan)?;
     let start = scene.len();
     // A probe's rates do not matter, its number of Gaussians does: nothing of it is kept.
     let mut trainer = bench.trainer(&plan, scene)?;
     trainer.check_not_empty()?;
-    let first = [time(&mut trainer, true)?, time(&mut trainer, false)?];
+    let few = rates(&mut trainer)?;
     tell(listen, 1);
     // Copies of initial Gaussians would cost far more than trained ones, which are small: the probe grows by the
     // recipe's own strategy, in a hurry.
@@ -47,24 +51,22 @@ pub(super) fn plan(bench: &Bench, recipe: &Recipe, minutes: f64, listen: &mut dy
         stage.densify_steps = (HURRIED, usize::MAX, HURRIED);
         stage.half_size_steps = usize::MAX;
     }
+    trainer.stages[0].iterations = ENDLESS;
     for _ in 0..GROWTH_STEPS {
-        if trainer.is_done() || trainer.scene.len() >= recipe.max_cap {
+        if trainer.scene.len() >= recipe.max_cap {
             break;
         }
         step(&mut trainer)?;
     }
     trainer.stages.iter_mut().for_each(|s| s.densify_steps = (0, 0, 0));
-    let end = trainer.scene.len();
-    let last = [time(&mut trainer, true)?, time(&mut trainer, false)?];
-    // Later stages are timed by the first of them, on the cloud at the cap.
-    let later = if trainer.stages.len() > 1 { later(&mut trainer)? } else { 0.0 };
+    let gaussians = [start, trainer.scene.len()];
+    let many = rates(&mut trainer)?;
     tell(listen, 2);
+    let steps = [0, 1].map(|later| Steps { gaussians, seconds: [few[later], many[later]] });
     let seconds = minutes * 60.0;
     let cost = |iterations: usize| -> Result<f64> {
         let r = Recipe { iterations, ..reset(recipe) }.resolve();
-        let stages = split::stages(program_of(&r)?.as_ref(), &bench.plan(&r));
-        let rest: usize = stages[1..].iter().map(|s| s.iterations).sum();
-        Ok(schedule_cost(&stages[0], &r, [start, end], first, last) + later * rest as f64)
+        Ok(cost(&split::stages(program_of(&r)?.as_ref(), &bench.plan(&r)), &r, &steps))
     };
     let (mut low, mut high) = (*ITERATIONS.start(), *ITERATIONS.end());
     while low + 1 < high {
@@ -86,11 +88,27 @@ fn reset(recipe: &Recipe) -> Recipe {
     }
 }
 
-/// Seconds a step, at half or at full size.
-fn time(trainer: &mut super::trainer::Trainer<'_>, half: bool) -> Result<f64> {
-    for stage in &mut trainer.stages {
-        stage.half_size_steps = if half { usize::MAX } else { 0 };
+/// Seconds a step [half size, full size] in the first stage and, skipping what is left of it, in the second; a run of one
+/// stage has the first twice.
+fn rates(trainer: &mut Trainer<'_>) -> Result<[[f64; 2]; 2]> {
+    let first = [time(trainer, usize::MAX)?, time(trainer, 0)?];
+    if trainer.stages.len() == 1 {
+        return Ok([first; 2]);
     }
+    trainer.stages[0].iterations = trainer.progress.stage_step + 1;
+    step(trainer)?;
+    // Stages without a step are passed by.
+    trainer.enter(&mut |_, _, _| {})?;
+    if trainer.is_done() {
+        return Ok([first; 2]);
+    }
+    Ok([first, [time(trainer, usize::MAX)?, time(trainer, 0)?]])
+}
+
+/// Seconds a step of the current stage, the first `half_size_steps` of it at half size.
+fn time(trainer: &mut Trainer<'_>, half_size_steps: usize) -> Result<f64> {
+    let stage = &mut trainer.stages[trainer.progress.stage];
+    (stage.half_size_steps, stage.iterations) = (half_size_steps, ENDLESS);
     let mut clock = Clock::now();
     for i in 0..WARM_UP + TIMED {
         if i == WARM_UP {
@@ -101,20 +119,7 @@ fn time(trainer: &mut super::trainer::Trainer<'_>, half: bool) -> Result<f64> {
     Ok(clock.elapsed().as_secs_f64() / TIMED as f64)
 }
 
-/// Seconds a step of the second stage: what is left of the first is skipped.
-fn later(trainer: &mut super::trainer::Trainer<'_>) -> Result<f64> {
-    let now = trainer.progress.stage;
-    let Some(stage) = trainer.stages.get_mut(now) else { return Ok(0.0) };
-    if now == 0 {
-        stage.iterations = trainer.progress.stage_step + 1;
-        step(trainer)?;
-    }
-    let Some(stage) = trainer.stages.get_mut(trainer.progress.stage) else { return Ok(0.0) };
-    stage.iterations = stage.iterations.max(trainer.progress.stage_step + WARM_UP + TIMED + 1);
-    time(trainer, false)
-}
-
-fn step(trainer: &mut super::trainer::Trainer<'_>) -> Result<()> {
+fn step(trainer: &mut Trainer<'_>) -> Result<()> {
     match trainer.step()? {
         Ok(_) => Ok(()),
         Err(fault) => Err(Error::new(ErrorKind::Diverged, format!("the timing probe failed: {}", fault.0))
@@ -122,22 +127,34 @@ fn step(trainer: &mut super::trainer::Trainer<'_>) -> Result<()> {
     }
 }
 
-/// Seconds of a stage that grows: the cost of a step is linear in the number of Gaussians, which grows by the schedule.
-/// `first` and `last`: seconds a step [half size, full size] at the two numbers of Gaussians.
-fn schedule_cost(stage: &Stage, r: &Recipe, gaussians: [usize; 2], first: [f64; 2], last: [f64; 2]) -> f64 {
-    let [start, end] = gaussians.map(|n| n as f64);
-    let (from, until, every) = stage.densify_steps;
-    let mut count = start;
+/// What steps of a stage take: linear in the number of Gaussians.
+#[derive(Clone, Copy, Debug)]
+struct Steps {
+    /// The two numbers of Gaussians at which it was measured.
+    gaussians: [usize; 2],
+    /// Seconds a step [half size, full size] at either.
+    seconds: [[f64; 2]; 2],
+}
+
+/// Seconds of all stages, in which the number of Gaussians grows by their schedules; `steps`: of the first stage, and of
+/// those after it.
+fn cost(stages: &[Stage], r: &Recipe, steps: &[Steps; 2]) -> f64 {
+    let mut count = steps[0].gaussians[0] as f64;
     let mut total = 0.0;
-    for i in 0..stage.iterations {
-        let size = usize::from(i >= stage.half_size_steps);
-        let slope = if end > start { (last[size] - first[size]) / (end - start) } else { 0.0 };
-        total += first[size] + slope * (count - start);
-        let step = i + 1;
-        let densifies = stage.densify != Densify::None && step >= from && step <= until;
-        if densifies && every > 0 && step.is_multiple_of(every) {
-            // ADC reaches the cap within a few densifications; MCMC grows by its factor.
-            count = (count * if r.strategy == "adc" { ADC_GROWTH } else { r.growth }).min(r.max_cap as f64);
+    for (number, stage) in stages.iter().enumerate() {
+        let Steps { gaussians, seconds: [few, many] } = &steps[number.min(1)];
+        let [start, end] = gaussians.map(|n| n as f64);
+        let (from, until, every) = stage.densify_steps;
+        for i in 0..stage.iterations {
+            let size = usize::from(i >= stage.half_size_steps);
+            let slope = if end > start { (many[size] - few[size]) / (end - start) } else { 0.0 };
+            total += few[size] + slope * (count - start);
+            let step = i + 1;
+            let densifies = stage.densify != Densify::None && step >= from && step <= until;
+            if densifies && every > 0 && step.is_multiple_of(every) {
+                // ADC reaches the cap within a few densifications; MCMC grows by its factor.
+                count = (count * if r.strategy == "adc" { ADC_GROWTH } else { r.growth }).min(r.max_cap as f64);
+            }
         }
     }
     total
@@ -156,11 +173,19 @@ mod tests {
         let r = Recipe { iterations: 1000, half_size_until: 0.0, max_cap: 2000, ..Recipe::default() }.resolve();
         let (densify, densify_steps) = densify_of(&r);
         let mut stage = Stage { densify, densify_steps, ..Stage::new("all", 1000) };
-        let flat = schedule_cost(&stage, &r, [1000, 1000], [0.01; 2], [0.01; 2]);
+        let steps = |gaussians, few, many| [Steps { gaussians, seconds: [few, many] }; 2];
+        let flat = cost(std::slice::from_ref(&stage), &r, &steps([1000, 1000], [0.01; 2], [0.01; 2]));
         assert!((flat - 10.0).abs() < 1e-9);
-        let grown = schedule_cost(&stage, &r, [1000, 2000], [0.01; 2], [0.02; 2]);
+        let grown = cost(std::slice::from_ref(&stage), &r, &steps([1000, 2000], [0.01; 2], [0.02; 2]));
         assert!(grown > 12.0 && grown < 20.0, "{grown}");
         stage.half_size_steps = 500;
-        assert!((schedule_cost(&stage, &r, [1000, 1000], [0.0, 0.01], [0.0, 0.01]) - 5.0).abs() < 1e-9);
+        let halves = [0.0, 0.01];
+        let half = cost(std::slice::from_ref(&stage), &r, &steps([1000, 1000], halves, halves));
+        assert!((half - 5.0).abs() < 1e-9);
+        // A still warm-up of 100 free steps; then 900 of a network, a third of them at half size.
+        let stages = [Stage::new("still", 100), Stage { half_size_steps: 300, ..Stage::new("network", 900) }];
+        let mut steps = steps([1000, 1000], [0.0; 2], [0.0; 2]);
+        steps[1].seconds = [[0.01, 0.02]; 2];
+        assert!((cost(&stages, &r, &steps) - 15.0).abs() < 1e-9);
     }
 }

@@ -5,6 +5,7 @@ mod channels;
 pub mod checkpoint;
 pub mod dataset;
 pub mod loss;
+pub mod memory;
 pub mod minutes;
 pub mod refine;
 pub mod run;

@@ -7,6 +7,7 @@ pub(crate) mod tests;
 use super::checkpoint::{self, Identity, RunState, write_atomically};
 use super::dataset::Dataset;
 use super::loss::{Exposure, TrainLoss};
+pub use super::memory::{memory_estimate, peak_memory};
 use super::minutes;
 use super::snapshot::Snapshots;
 use super::trainer::{Settings, Stepped, Trainer};
@@ -63,15 +64,6 @@ const SMOOTHING: f64 = 0.05;
 const METRIC_ROWS: usize = 600;
 /// Seconds between two progress events.
 const PROGRESS_SECONDS: f64 = 0.25;
-/// Bytes a Gaussian takes in training, per number: value, gradient, two moments.
-const BYTES_PER_NUMBER: u64 = 16;
-/// Bytes a Gaussian takes in the renderer: records, gradient records, projections (measured: about 1.2 kB).
-const RENDER_BYTES: u64 = 1200;
-/// Bytes a Gaussian's pose takes, a frame.
-const PAGE_BYTES: u64 = 28;
-/// Bytes a pixel takes in training: pictures, gradients and the loss's scratch, all f32.
-const PIXEL_BYTES: u64 = 200;
-
 /// The options with which a recipe opens its capture.
 pub fn capture_options(recipe: &Recipe) -> Result<CaptureOptions> {
     let hold_out = if recipe.hold_out.is_empty() { None } else { Some(recipe.hold_out.parse()?) };
@@ -100,6 +92,7 @@ pub fn train(
             .remedy("Continue it with `train --resume`, or give another folder with -o"));
     }
     let bench = Bench::new(capture, &recipe)?;
+    check_flow(&bench.capture, &recipe)?;
     let mut listen = listen;
     let recipe = if recipe.motion == AUTO { bench.choose(recipe, &mut listen)? } else { recipe };
     program_of(&recipe)?.check(&bench.plan(&recipe))?;
@@ -204,6 +197,10 @@ fn made_by(run: &Path) -> Result<Option<String>> {
 /// Opens a capture as a recipe wants it: scale, split, and the part of the take that is used.
 pub fn open_capture(path: &Path, recipe: &Recipe) -> Result<Capture> {
     let mut capture = Capture::open(path, &capture_options(recipe)?)?;
+    if recipe.lambda_flow == 0.0 {
+        // Nobody looks at it: it need not be decoded.
+        capture.frames.iter_mut().for_each(|f| f.flow = None);
+    }
     if recipe.first_frame > 0 || recipe.max_frames > 0 {
         let last =
             if recipe.max_frames == 0 { usize::MAX } else { recipe.first_frame.saturating_add(recipe.max_frames) };
@@ -218,6 +215,15 @@ pub fn open_capture(path: &Path, recipe: &Recipe) -> Result<Capture> {
         }
     }
     Ok(capture)
+}
+
+/// Errors: a loss on flow, and not one training picture has any.
+fn check_flow(capture: &Capture, recipe: &Recipe) -> Result<()> {
+    if recipe.lambda_flow == 0.0 || capture.train.iter().any(|&i| capture.frames[i].flow.is_some()) {
+        return Ok(());
+    }
+    Err(Error::input("lambda_flow compares flow, and the capture's training pictures have none")
+        .remedy("Give cameras a `flow` in capture.json (docs/capture-format.md), or leave lambda_flow at 0"))
 }
 
 fn read_text(path: &Path) -> Result<String> {

@@ -385,7 +385,7 @@ fn foreign_checkpoints_are_refused_with_a_reason() {
     // Another version: the last number called `version` in the header is the checkpoint's own.
     let run = copy("version");
     let mut bytes = std::fs::read(newest(&run)).unwrap();
-    let needle = br#"\"version\":1"#;
+    let needle = br#"\"version\":2"#;
     let at = bytes.windows(needle.len()).rposition(|w| w == needle).unwrap();
     bytes[at + needle.len() - 1] = b'9';
     std::fs::write(newest(&run), &bytes).unwrap();

@@ -1,5 +1,11 @@
 //! A made-up capture: a ring of cameras around a shaded ball that moves in front of a striped sky.
 
+mod bed;
+mod flow;
+mod limits;
+mod resume;
+mod switches;
+
 use crate::Result;
 use crate::capture::frames::{Frames, Picture};
 use splat4d::math::Se3;

@@ -2,7 +2,7 @@
 
 use super::chain::{Chain, Draw, Losses, StepInfo, StepReport, View};
 use super::loss::TrainLoss;
-use crate::capture::frames::{Frames, Picture};
+use crate::capture::frames::{FlowTruth, Frames, Picture};
 use crate::densify::{self, Change, Densify, Limits, Stats, adc, mcmc, morton_edit};
 use crate::loss::terms::Codec;
 use crate::models::{Hook, Stage, Tell};
@@ -172,15 +172,23 @@ impl<'a> Trainer<'a> {
         self.stages.get(self.progress.stage).map_or("done", |s| &s.name)
     }
 
-    /// Runs a hook; what of the moments belongs to layers of other names is forgotten.
+    /// Runs a hook; what of the moments belongs to layers of other names is forgotten, and losses are told if rows came or
+    /// went.
     fn run_hook(&mut self, hook: impl Fn(&Stage) -> Option<&Hook<f32>>, tell: &mut Tell<'_>) -> Result<()> {
         let Some(hook) = hook(&self.stages[self.progress.stage]) else { return Ok(()) };
-        let names: Vec<String> = self.scene.layers.iter().map(|l| l.name.clone()).collect();
+        let rows = |scene: &Scene<f32>| -> Vec<(String, usize)> {
+            scene.layers.iter().map(|l| (l.name.clone(), l.params.len())).collect()
+        };
+        let before = rows(&self.scene);
         hook(&mut self.scene, tell)?;
-        for ((moments, old), layer) in self.moments.iter_mut().zip(&names).zip(&self.scene.layers) {
-            if *old != layer.name {
+        let after = rows(&self.scene);
+        for ((moments, old), new) in self.moments.iter_mut().zip(&before).zip(&after) {
+            if old.0 != new.0 {
                 *moments = Moments::default();
             }
+        }
+        if before != after {
+            self.stages[self.progress.stage].on_edit();
         }
         self.adapt();
         Ok(())
@@ -302,6 +310,9 @@ impl<'a> Trainer<'a> {
         }
         let clock = Clock::now();
         out.change = self.maintain()?;
+        if self.scene.is_empty() {
+            return Ok(Err(Fault("not one Gaussian is left: all of them became transparent or huge".into())));
+        }
         self.progress.iteration += 1;
         self.progress.stage_step += 1;
         if self.progress.stage_step == self.stages[self.progress.stage].iterations {
@@ -344,7 +355,7 @@ impl<'a> Trainer<'a> {
                 truth: &picture.color,
                 mask: picture.mask.as_ref(),
                 weight: picture.weight.as_ref(),
-                flow: picture.flow.as_ref().map(|f| f.truth()),
+                flow: picture.flow.as_ref().map(|f| FlowTruth { to: Time(f.to.0 + shift), ..f.truth() }),
                 frame: i,
                 rig: self.frames.rig(i),
             })
@@ -355,7 +366,7 @@ impl<'a> Trainer<'a> {
             seed: self.settings.seed,
             progress: self.progress.stage_step as f64 / stage.iterations as f64,
         };
-        self.draw.config().sh_degree = match self.progress.stage_step.checked_div(stage.sh_interval) {
+        self.draw.config().sh_degree = match (stage.sh_from + self.progress.stage_step).checked_div(stage.sh_interval) {
             Some(unlocked) => unlocked.min(self.settings.sh_degree),
             None => self.settings.sh_degree,
         };

@@ -243,12 +243,13 @@ impl<'a> SafeTensors<'a> {
 
 /// Writes a file: the same arrays and metadata always give the same bytes.
 ///
-/// Arrays are ordered by the size of their numbers, largest first, then as given, so that every array is aligned.
+/// Arrays are ordered by the size of their numbers, largest first, so that every array is aligned, then by name: how
+/// the tables came about does not show.
 ///
 /// Errors: the sink's. Panics: two arrays of one name, or one called `__metadata__`.
 pub fn write(tensors: &[Tensor<'_>], metadata: &BTreeMap<String, String>, out: &mut impl Write) -> Result<()> {
     let mut order: Vec<&Tensor<'_>> = tensors.iter().collect();
-    order.sort_by_key(|t| std::cmp::Reverse(t.dtype.size()));
+    order.sort_by(|a, b| b.dtype.size().cmp(&a.dtype.size()).then_with(|| a.name.cmp(&b.name)));
     let mut names = BTreeSet::from([METADATA]);
     let mut header = String::from("{");
     if !metadata.is_empty() {

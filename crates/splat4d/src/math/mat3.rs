@@ -1,5 +1,6 @@
 //! General 3x3 matrices: the rotation nearest to one.
 
+use super::jacobi::jacobi;
 use super::{Real, quat};
 
 /// Share of the matrix's size that is added along the identity, so that of several equally near rotations (points on a
@@ -42,39 +43,13 @@ pub fn procrustes<F: Real>(cov: [[F; 3]; 3]) -> [[F; 3]; 3] {
 }
 
 /// The unit eigenvector of the largest eigenvalue; the first of equals.
-fn top_eigenvector(mut a: [[f64; 4]; 4]) -> [f64; 4] {
-    let mut v: [[f64; 4]; 4] = std::array::from_fn(|i| std::array::from_fn(|j| f64::from(u8::from(i == j))));
-    for _ in 0..SWEEPS {
-        let mut turned = false;
-        for (p, q) in [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)] {
-            // An entry that rounding cannot see beside both of its diagonal's does not turn anything.
-            if a[p][q].abs() <= f64::EPSILON * 0.25 * a[p][p].abs().min(a[q][q].abs()) || a[p][q].abs() < 1e-300 {
-                continue;
-            }
-            turned = true;
-            let theta: f64 = (a[q][q] - a[p][p]) / (2.0 * a[p][q]);
-            let t = theta.signum() / (theta.abs() + (theta * theta + 1.0).sqrt());
-            let c = 1.0 / (t * t + 1.0).sqrt();
-            let s = t * c;
-            for row in &mut a {
-                let (x, y) = (row[p], row[q]);
-                (row[p], row[q]) = (c * x - s * y, s * x + c * y);
-            }
-            for j in 0..4 {
-                let (x, y) = (a[p][j], a[q][j]);
-                (a[p][j], a[q][j]) = (c * x - s * y, s * x + c * y);
-            }
-            for row in &mut v {
-                let (x, y) = (row[p], row[q]);
-                (row[p], row[q]) = (c * x - s * y, s * x + c * y);
-            }
-        }
-        if !turned {
-            break;
-        }
-    }
-    let best = (1..4).fold(0, |best, i| if a[i][i] > a[best][best] { i } else { best });
-    v.map(|row| row[best])
+fn top_eigenvector(a: [[f64; 4]; 4]) -> [f64; 4] {
+    // An entry that rounding cannot see beside both of its diagonal's does not turn anything.
+    let negligible =
+        |x: f64, [p, q]: [f64; 2]| x.abs() <= f64::EPSILON * 0.25 * p.abs().min(q.abs()) || x.abs() < 1e-300;
+    let (values, vectors) = jacobi(a, SWEEPS, negligible);
+    let best = (1..4).fold(0, |best, i| if values[i] > values[best] { i } else { best });
+    vectors.map(|row| row[best])
 }
 
 #[cfg(test)]

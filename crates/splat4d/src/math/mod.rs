@@ -1,6 +1,7 @@
 //! Small mathematics: quaternions, symmetric 3x3 matrices, rigid motions, spherical harmonics, counter-based random
 //! numbers, and the [`Real`] trait that lets every kernel run in f32 and be checked in f64.
 
+mod jacobi;
 pub mod knn;
 pub mod mat3;
 pub mod quat;

@@ -1,7 +1,7 @@
 //! Symmetric 3x3 matrices as six numbers (xx, xy, xz, yy, yz, zz).
 
-use super::Real;
-use super::quat;
+use super::jacobi::jacobi;
+use super::{Real, quat};
 
 /// Covariance Σ = R S S Rᵀ of a raw quaternion (wxyz) and log scales.
 ///
@@ -47,37 +47,17 @@ pub fn from_quat_log_scales_backward<F: Real>(q: [F; 4], log_scales: [F; 3], d_c
     (quat::normalize_backward(unit, norm, quat::to_rotation_backward(unit, d_r)), d_log)
 }
 
+/// Sweeps of the Jacobi iteration, at most: far more than 3x3 needs.
+const SWEEPS: usize = 10;
+/// An entry off the diagonal below this turns nothing.
+const NEGLIGIBLE: f64 = 1e-300;
+
 /// Eigenvalues (descending) and unit eigenvectors (columns, a right-handed frame) by cyclic Jacobi rotations.
 pub fn eigen(m: [f64; 6]) -> ([f64; 3], [[f64; 3]; 3]) {
-    let mut a = [[m[0], m[1], m[2]], [m[1], m[3], m[4]], [m[2], m[4], m[5]]];
-    let mut v = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
-    // Convergence is quadratic: ten sweeps are far more than 3x3 needs.
-    for _ in 0..10 {
-        for (p, q) in [(0, 1), (0, 2), (1, 2)] {
-            if a[p][q].abs() < 1e-300 {
-                continue;
-            }
-            let theta: f64 = (a[q][q] - a[p][p]) / (2.0 * a[p][q]);
-            let t = theta.signum() / (theta.abs() + (theta * theta + 1.0).sqrt());
-            let c = 1.0 / (t * t + 1.0).sqrt();
-            let s = t * c;
-            for row in &mut a {
-                let (x, y) = (row[p], row[q]);
-                (row[p], row[q]) = (c * x - s * y, s * x + c * y);
-            }
-            for k in 0..3 {
-                let (x, y) = (a[p][k], a[q][k]);
-                (a[p][k], a[q][k]) = (c * x - s * y, s * x + c * y);
-            }
-            for row in &mut v {
-                let (x, y) = (row[p], row[q]);
-                (row[p], row[q]) = (c * x - s * y, s * x + c * y);
-            }
-        }
-    }
+    let full = [[m[0], m[1], m[2]], [m[1], m[3], m[4]], [m[2], m[4], m[5]]];
+    let (a, v) = jacobi(full, SWEEPS, |x, _| x.abs() < NEGLIGIBLE);
     let mut order = [0, 1, 2];
-    order.sort_by(|&i, &j| a[j][j].total_cmp(&a[i][i]));
-    let values = order.map(|i| a[i][i]);
+    order.sort_by(|&i, &j| a[j].total_cmp(&a[i]));
     let mut vectors: [[f64; 3]; 3] = std::array::from_fn(|r| std::array::from_fn(|c| v[r][order[c]]));
     let pose = super::Se3 { rotation: vectors, translation: [0.0; 3] };
     if pose.det() < 0.0 {
@@ -85,7 +65,7 @@ pub fn eigen(m: [f64; 6]) -> ([f64; 3], [[f64; 3]; 3]) {
             row[2] = -row[2];
         }
     }
-    (values, vectors)
+    (order.map(|i| a[i]), vectors)
 }
 
 /// The largest eigenvalue, in closed form: some thirty times faster than [`eigen`].

@@ -11,6 +11,8 @@ pub mod matmul;
 pub mod mlp;
 pub mod sequence;
 pub mod ssm;
+#[cfg(test)]
+mod tests;
 pub mod vector;
 
 pub use hashgrid::{HashGrid, HashShape};

@@ -12,6 +12,7 @@
 //! Where [`Splats::head`] has a network, it makes colours of blended channels (`head.rs`), and its gradients come with
 //! the others.
 
+mod behind;
 pub mod bin;
 mod blend;
 pub mod ceiling;

@@ -5,20 +5,19 @@
 //! degree, so that Σ over pixels and channels of the products of gradients is known from the moments Σ_p (Σ_c v_c²) dx^i dy^j
 //! of degree 2 to 4: twelve sums a splat, exact. Slow and clear: it is meant for scores, not for steps.
 
+use super::behind::{Behind, Pixel, Tally};
 use super::bin::{BIN, Footprint, id};
-use super::blend::{
-    BATCH, Exponent, Limits, PAIR_OF_ROWS, ROW, Tile, Visit, alpha, begin, columns, highest, offsets, pass,
-    strip_range, strips, sum_lanes, walk,
-};
-use super::gather::{Record, SIDE, TILE, TILES};
+use super::blend::Limits;
+use super::gather::TILES;
 use super::parallel::{Ragged, for_each_group};
 use super::project::{Projected, ProjectedGrads, View, project_backward};
 use super::rasterize::{CHANNELS, Raster};
-use super::simd::{Kernel, Simd, dispatch, least, select};
+use super::simd::{Simd, dispatch, select};
 use crate::math::{Real, sym3};
 use crate::scene::Splats;
 use crate::scene::splats::{COV, SPLAT_OPACITY};
 use rayon::prelude::*;
+use std::marker::PhantomData;
 
 /// Powers of dx and dy whose products with Σ_c v_c² are summed.
 const POWERS: [[usize; 2]; 12] =
@@ -65,7 +64,8 @@ impl<F: Real> Raster<F> {
                 }
                 let inside = [width - bin % bins.across * BIN, height - bin / bins.across * BIN];
                 let tiles = &tiles[bin * TILES..(bin + 1) * TILES];
-                dispatch(simd, Sense { records: &*records.0, tiles, background, inside, limits, out: sums.0 });
+                let (records, out, tally) = (&*records.0, sums.0, PhantomData::<Sensed>);
+                dispatch(simd, Behind { records, tiles, background, inside, limits, out, tally });
             });
             // Pairs in the order of bins: the order of a sum does not depend on threads.
             for bin in held.clone() {
@@ -172,114 +172,25 @@ fn fisher<F: Real>(
     out
 }
 
-/// The sums of one bin.
-struct Sense<'a, F> {
-    records: &'a [Record<F>],
-    /// As the blend left them.
-    tiles: &'a [Tile<F>],
-    background: [F; CHANNELS],
-    /// Pixels from the bin's corner to the picture's right and lower ends.
-    inside: [usize; 2],
-    limits: Limits<F>,
-    /// One a record; those that no pixel meets are not written.
-    out: &'a mut [[F; NUMBERS]],
-}
+/// What a pixel adds to the moments.
+struct Sensed;
 
-impl<F: Real> Kernel for Sense<'_, F> {
-    type Out = ();
+impl<F: Real> Tally<F, NUMBERS> for Sensed {
     #[inline(always)]
-    fn run<const FMA: bool>(self) {
-        self.walk::<FMA, ROW>();
-    }
-    #[inline(always)]
-    fn run_wide<const FMA: bool>(self) {
-        self.walk::<FMA, PAIR_OF_ROWS>();
-    }
-}
-
-impl<F: Real> Sense<'_, F> {
-    #[inline(always)]
-    fn walk<const FMA: bool, const N: usize>(self) {
-        let mut tiles = [Tile::default(); TILES];
-        let open = begin(&mut tiles, self.inside);
-        // From here on a tile's colour is the light that is still to come.
-        for (tile, drawn) in tiles.iter_mut().zip(self.tiles) {
-            for (c, rest) in tile.color.iter_mut().enumerate() {
-                for (rest, (light, t)) in rest.iter_mut().zip(drawn.color[c].iter().zip(&drawn.t)) {
-                    *rest = *light + t.abs() * self.background[c];
-                }
-            }
+    fn of(pixel: &Pixel<F>) -> [F; NUMBERS] {
+        let mut square = F::ZERO;
+        for c in 0..CHANNELS {
+            let v = pixel.own[c] - pixel.hidden[c];
+            square += v * v;
         }
-        let sums = [[[F::ZERO; TILE]; NUMBERS]; BATCH];
-        let alpha_max = self.limits.ceiling::<FMA>();
-        let mut visit = Sensing::<F, N> { tiles, limits: self.limits, alpha_max, sums, out: self.out };
-        walk::<F, _, FMA>(self.records, open, &mut visit);
-    }
-}
-
-struct Sensing<'a, F, const N: usize> {
-    tiles: [Tile<F>; TILES],
-    limits: Limits<F>,
-    alpha_max: F,
-    /// Sums of a batch's splats over all tiles, column by column.
-    sums: [[[F; TILE]; NUMBERS]; BATCH],
-    out: &'a mut [[F; NUMBERS]],
-}
-
-impl<F: Real, const N: usize> Visit<F> for Sensing<'_, F, N> {
-    #[inline(always)]
-    fn splat<const FMA: bool>(&mut self, t: usize, i: usize, r: &Record<F>) {
-        let (tx, ty, limits) = (t % SIDE, t / SIDE, self.limits);
-        let range = strip_range::<N>(r.tile_rows(tx, ty));
-        let mut e = Exponent::<F, N>::new::<FMA>(r, tx, ty, range.start, &limits);
-        let (channels, mut dy, dx) = (r.channels, e.dy, offsets::<F, N>(r, tx));
-        let Tile { t, color } = &mut self.tiles[t];
-        let [reds, greens, blues] = color.each_mut().map(|plane| strips::<F, N>(plane, range.clone()));
-        let ts = strips::<F, N>(t, range);
-        let mut sums = [[F::ZERO; N]; NUMBERS];
-        for (((ts, reds), greens), blues) in ts.iter_mut().zip(reds).zip(greens).zip(blues) {
-            let (mut after, mut rest) = (*ts, [*reds, *greens, *blues]);
-            for l in 0..N {
-                let a = alpha::<F, FMA>(least(e.raw::<FMA>(l), e.top), &limits);
-                let (kept, weight, open) = pass(after[l], a, &limits);
-                after[l] = kept;
-                let odds = select(open, a / (F::ONE - a), F::ZERO);
-                let mut square = F::ZERO;
-                for c in 0..CHANNELS {
-                    rest[c][l] -= weight * channels[c];
-                    let v = weight * channels[c] - odds * rest[c][l];
-                    square += v * v;
-                }
-                // Nothing passes where α is 0 or at its ceiling.
-                let felt = open & (a > F::ZERO) & (a < self.alpha_max);
-                let square = select(felt, square, F::ZERO);
-                let power = |base: F, n: usize| (0..n).fold(F::ONE, |p, _| p * base);
-                for (sum, [m, n]) in sums.iter_mut().zip(POWERS) {
-                    sum[l] += square * power(dx[l], m) * power(dy[l], n);
-                }
-                sums[NUMBERS - 1][l] += select(felt, square / (a * a), F::ZERO);
-                dy[l] -= e.steps[1];
-                e.step(l);
-            }
-            *ts = after;
-            [*reds, *greens, *blues] = rest;
+        // Nothing passes where α is 0 or at its ceiling.
+        let (square, [dx, dy], a) = (select(pixel.felt, square, F::ZERO), pixel.offset, pixel.alpha);
+        let power = |base: F, n: usize| (0..n).fold(F::ONE, |p, _| p * base);
+        let mut out = [F::ZERO; NUMBERS];
+        for (out, [m, n]) in out.iter_mut().zip(POWERS) {
+            *out = square * power(dx, m) * power(dy, n);
         }
-        for (totals, sum) in self.sums[i].iter_mut().zip(sums) {
-            for (total, v) in totals.iter_mut().zip(columns(sum)) {
-                *total += v;
-            }
-        }
-    }
-
-    #[inline(always)]
-    fn stopped(&self, t: usize) -> bool {
-        highest(&self.tiles[t].t) < F::ZERO
-    }
-
-    #[inline(always)]
-    fn passed(&mut self, first: usize, count: usize) {
-        for (out, sums) in self.out[first..].iter_mut().zip(&mut self.sums[..count]) {
-            *out = std::mem::replace(sums, [[F::ZERO; TILE]; NUMBERS]).map(sum_lanes);
-        }
+        out[NUMBERS - 1] = select(pixel.felt, square / (a * a), F::ZERO);
+        out
     }
 }

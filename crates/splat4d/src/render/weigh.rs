@@ -7,6 +7,7 @@
 //! little.
 
 use super::RenderConfig;
+use super::behind::{Behind, Pixel, Tally};
 use super::bin::{BIN, Footprint, id};
 use super::blend::{
     BATCH, Exponent, Limits, PAIR_OF_ROWS, Plane, ROW, Tile, Visit, alpha, begin, columns, highest, pass, strip_range,
@@ -16,9 +17,10 @@ use super::gather::{Record, SIDE, TILE, TILES};
 use super::parallel::{Ragged, for_each_group};
 use super::project::Projected;
 use super::rasterize::{CHANNELS, CHUNK, Raster};
-use super::simd::{Kernel, Simd, dispatch, least, select};
+use super::simd::{Kernel, Simd, dispatch, least};
 use crate::math::Real;
 use rayon::prelude::*;
+use std::marker::PhantomData;
 use std::sync::atomic::Ordering;
 
 impl<F: Real> Raster<F> {
@@ -80,7 +82,8 @@ impl<F: Real> Raster<F> {
                 Some((_, background)) => {
                     let tiles = &tiles[bin * TILES..(bin + 1) * TILES];
                     let inside = [width - bx * BIN, height - by * BIN];
-                    dispatch(simd, Remove { records, tiles, background, inside, limits, out });
+                    let (out, tally) = (out.as_chunks_mut::<1>().0, PhantomData::<Removed>);
+                    dispatch(simd, Behind { records, tiles, background, inside, limits, out, tally });
                 }
             }
         });
@@ -175,101 +178,17 @@ impl<F: Real, const N: usize> Visit<F> for Weighing<'_, F, N> {
     }
 }
 
-/// What the picture of one bin would lose with each of its splats.
-struct Remove<'a, F> {
-    records: &'a [Record<F>],
-    /// As the blend left them.
-    tiles: &'a [Tile<F>],
-    background: [F; CHANNELS],
-    /// Pixels from the bin's corner to the picture's right and lower ends.
-    inside: [usize; 2],
-    limits: Limits<F>,
-    /// One a record; those that no pixel meets are not written.
-    out: &'a mut [F],
-}
+/// What a pixel would change by without a splat, squared: what lies behind shines through, (1 − α) T b becomes T b.
+struct Removed;
 
-impl<F: Real> Kernel for Remove<'_, F> {
-    type Out = ();
+impl<F: Real> Tally<F, 1> for Removed {
     #[inline(always)]
-    fn run<const FMA: bool>(self) {
-        self.walk::<FMA, ROW>();
-    }
-    #[inline(always)]
-    fn run_wide<const FMA: bool>(self) {
-        self.walk::<FMA, PAIR_OF_ROWS>();
-    }
-}
-
-impl<F: Real> Remove<'_, F> {
-    #[inline(always)]
-    fn walk<const FMA: bool, const N: usize>(self) {
-        let mut tiles = [Tile::default(); TILES];
-        let open = begin(&mut tiles, self.inside);
-        // From here on a tile's colour is the light that is still to come.
-        for (tile, drawn) in tiles.iter_mut().zip(self.tiles) {
-            for (c, rest) in tile.color.iter_mut().enumerate() {
-                for (rest, (light, t)) in rest.iter_mut().zip(drawn.color[c].iter().zip(&drawn.t)) {
-                    *rest = *light + t.abs() * self.background[c];
-                }
-            }
+    fn of(pixel: &Pixel<F>) -> [F; 1] {
+        let mut sum = F::ZERO;
+        for c in 0..CHANNELS {
+            let change = pixel.hidden[c] - pixel.own[c];
+            sum += change * change;
         }
-        let sums = [[F::ZERO; TILE]; BATCH];
-        let mut visit = Removing::<F, N> { tiles, limits: self.limits, sums, out: self.out };
-        walk::<F, _, FMA>(self.records, open, &mut visit);
-    }
-}
-
-struct Removing<'a, F, const N: usize> {
-    tiles: [Tile<F>; TILES],
-    limits: Limits<F>,
-    /// Sums of a batch's splats over all tiles, column by column.
-    sums: [[F; TILE]; BATCH],
-    out: &'a mut [F],
-}
-
-impl<F: Real, const N: usize> Visit<F> for Removing<'_, F, N> {
-    #[inline(always)]
-    fn splat<const FMA: bool>(&mut self, t: usize, i: usize, r: &Record<F>) {
-        let (tx, ty, limits) = (t % SIDE, t / SIDE, self.limits);
-        let range = strip_range::<N>(r.tile_rows(tx, ty));
-        let mut e = Exponent::<F, N>::new::<FMA>(r, tx, ty, range.start, &limits);
-        let channels = r.channels;
-        let Tile { t, color } = &mut self.tiles[t];
-        let [reds, greens, blues] = color.each_mut().map(|plane| strips::<F, N>(plane, range.clone()));
-        let ts = strips::<F, N>(t, range);
-        let mut sum = [F::ZERO; N];
-        for (((ts, reds), greens), blues) in ts.iter_mut().zip(reds).zip(greens).zip(blues) {
-            let (mut after, mut rest) = (*ts, [*reds, *greens, *blues]);
-            for l in 0..N {
-                let a = alpha::<F, FMA>(least(e.raw::<FMA>(l), e.top), &limits);
-                let (kept, weight, open) = pass(after[l], a, &limits);
-                after[l] = kept;
-                let odds = select(open, a / (F::ONE - a), F::ZERO);
-                for c in 0..CHANNELS {
-                    // Without it, what lies behind shines through: (1 − α) T b becomes T b.
-                    rest[c][l] -= weight * channels[c];
-                    let change = odds * rest[c][l] - weight * channels[c];
-                    sum[l] += change * change;
-                }
-                e.step(l);
-            }
-            *ts = after;
-            [*reds, *greens, *blues] = rest;
-        }
-        for (total, v) in self.sums[i].iter_mut().zip(columns(sum)) {
-            *total += v;
-        }
-    }
-
-    #[inline(always)]
-    fn stopped(&self, t: usize) -> bool {
-        highest(&self.tiles[t].t) < F::ZERO
-    }
-
-    #[inline(always)]
-    fn passed(&mut self, first: usize, count: usize) {
-        for (out, sums) in self.out[first..].iter_mut().zip(&mut self.sums[..count]) {
-            *out = sum_lanes(std::mem::replace(sums, [F::ZERO; TILE]));
-        }
+        [sum]
     }
 }

@@ -20,7 +20,7 @@ fn message_with(sample: &Sample, options: &CaptureOptions) -> String {
 }
 
 /// Asserts that the message is one paragraph with all of `parts`.
-fn assert_says(message: &str, parts: &[&str]) {
+pub(super) fn assert_says(message: &str, parts: &[&str]) {
     assert!(!message.contains('\n'), "one paragraph: {message}");
     for part in parts {
         assert!(message.contains(part), "\"{part}\" must be in: {message}");

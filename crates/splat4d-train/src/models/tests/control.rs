@@ -157,3 +157,50 @@ fn a_scene_on_nodes_learns_with_every_trajectory() {
         assert!(t.scene.layers[0].params.rows_of(Space::Nodes) > 12, "no node was added");
     }
 }
+
+/// Shaken nodes come to rest in training, whatever the pictures say.
+#[test]
+fn losses_on_nodes_calm_them() {
+    let clip = [0.0, 0.2];
+    type Make = fn([f64; 2]) -> Box<dyn ProbeLoss<f32>>;
+    let losses: [Make; 3] = [
+        |clip| Box::new(NodeArap { weight: 1e6, extent: 1.0, clip }),
+        |clip| Box::new(NodeElastic { weight: 10.0, clip }),
+        |clip| Box::new(NodeAcceleration { weight: 10.0, clip, step: 0.02 }),
+    ];
+    for (k, make) in losses.iter().enumerate() {
+        let mut scene = skinned::<f32>(40, 12, spline());
+        let keys = scene.layers[0].params.find("node_keys").unwrap();
+        shake(&mut scene.layers[0].params, keys, 0.1, 2);
+        let stage = Stage {
+            groups: vec![Group::new("node_shifts", Rate { start: 1e-2, end: 1e-4 })],
+            probes: vec![make(clip)],
+            ..Stage::new("calm", 120)
+        };
+        let unease = |scene: &Scene<f32>| {
+            let at = |t: f64| {
+                let (mut tape, mut cache) = (splat4d::layers::LayerTape::default(), Default::default());
+                let layer = &scene.layers[0];
+                tape.ask(Space::Nodes, Rows::All, Time(t));
+                layer.motion.prepare(&layer.params, &[tape.question(&layer.params)], &mut cache);
+                layer.at(&cache, &mut tape);
+                (0..tape.out().rows()).map(|r| tape.out().read::<3>(r, 0)).collect::<Vec<_>>()
+            };
+            let [a, b, c] = [0.04, 0.1, 0.16].map(at);
+            let graph = crate::loss::graph::Graph::new(&a, 4, crate::loss::graph::Weigh::Uniform);
+            let mut d = [0, 1, 2].map(|_| vec![[0.0; 3]; a.len()]);
+            let [d_a, d_b, d_c] = &mut d;
+            match k {
+                0 => crate::loss::arap::arap(&graph, [&a, &c], 1.0, [d_a, d_c]),
+                // A floor so high that the value is not divided by itself.
+                1 => crate::loss::arap::elastic(&graph, &[&a, &b, &c], 1.0, 1.0, &mut [d_a, d_b, d_c]),
+                _ => crate::loss::arap::acceleration([&a, &b, &c], 1.0, 1.0, [d_a, d_b, d_c]),
+            }
+        };
+        let before = unease(&scene);
+        let mut t = trainer(scene, vec![stage], 90);
+        finish_stage(&mut t);
+        let after = unease(&t.scene);
+        assert!(after < 0.5 * before, "loss {k} went from {before} to {after}");
+    }
+}

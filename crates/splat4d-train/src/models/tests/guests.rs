@@ -179,6 +179,11 @@ fn nobody_leaves_a_ghost() {
         assert!(ghost < GHOST, "{motion}: a ghost of {ghost}");
         assert!(there < OFF, "{motion}: who is there is {there} off");
     }
+    // Without lives a deformation has to hide who is not there, and does it worse.
+    for motion in ["deform-mlp", "hexplane"] {
+        let [ghost, _] = errors(motion, "infinite");
+        assert!(ghost > 1.3 * GHOST, "{motion} without lives: a ghost of {ghost}");
+    }
     // Without lives a still cloud has ghosts, or nobody at all.
     let [ghost, there] = errors("still", "infinite");
     assert!(ghost > 2.0 * GHOST || there > 2.0 * OFF, "{ghost} {there}");

@@ -14,6 +14,7 @@ mod nodes;
 mod pruned;
 mod scan;
 mod triple;
+mod upkeep;
 mod wrapper;
 
 use super::*;

@@ -1,37 +1,10 @@
 //! Every layer's gradient, and the whole block's, against central differences.
 
 use super::*;
+use crate::nn::tests::{check, lanes, random, weighed};
 
 const TICKS: usize = 6;
 const WIDTH: usize = 5;
-
-fn random(len: usize, seed: u64) -> Vec<Lane<f64>> {
-    let rng = Rng::new(seed, "numbers", 0);
-    (0..len).map(|i| std::array::from_fn(|l| rng.normal((i * LANES + l) as u64))).collect()
-}
-
-fn weighed(a: &[Lane<f64>]) -> f64 {
-    a.as_flattened().iter().zip(random(a.len(), 99).as_flattened()).map(|(a, b)| a * b).sum()
-}
-
-/// Differences at some of the numbers of x.
-fn check(name: &str, x: &[f64], d: &[f64], f: impl Fn(&[f64]) -> f64) {
-    let mut x = x.to_vec();
-    for i in (0..x.len()).step_by((x.len() / 80).max(1)) {
-        let old = x[i];
-        let mut at = |h: f64| {
-            x[i] = old + h;
-            f(&x)
-        };
-        let fd = (at(1e-6) - at(-1e-6)) / 2e-6;
-        x[i] = old;
-        assert!((fd - d[i]).abs() < 2e-6 * (1.0 + fd.abs()), "{name}[{i}]: differences {fd}, gradient {}", d[i]);
-    }
-}
-
-fn lanes(x: &[f64]) -> &[Lane<f64>] {
-    x.as_chunks().0
-}
 
 #[test]
 fn norms_have_mean_zero_and_variance_one_and_their_gradient() {
@@ -47,7 +20,7 @@ fn norms_have_mean_zero_and_variance_one_and_their_gradient() {
     assert!((column.iter().map(|u| u * u).sum::<f64>() / WIDTH as f64 - 1.0).abs() < 1e-3);
     let mut d_x = vec![[0.0; LANES]; x.len()];
     norm_backward(&unit, &inverse, &random(x.len(), 99), &mut d_x);
-    check("x", x.as_flattened(), d_x.as_flattened(), |x| weighed(&of(lanes(x)).0));
+    check("x", x.as_flattened(), d_x.as_flattened(), |x| weighed(&of(lanes(x)).0, 99));
 }
 
 #[test]
@@ -60,7 +33,7 @@ fn gelu_bends_and_has_its_gradient() {
     };
     let mut d = random(40, 99);
     gelu_backward(&x, &mut d);
-    check("x", x.as_flattened(), d.as_flattened(), |x| weighed(&of(lanes(x))));
+    check("x", x.as_flattened(), d.as_flattened(), |x| weighed(&of(lanes(x)), 99));
     let ends = of(&[[9.0; LANES], [-9.0; LANES], [0.0; LANES]]);
     assert!((ends[0][0] - 9.0).abs() < 1e-5 && ends[1][0].abs() < 1e-5 && ends[2][0] == 0.0);
 }
@@ -86,7 +59,9 @@ fn a_blocks_gradient_equals_differences() {
         let (mut d_x, mut d_w) = (random(x.len(), 99), vec![0.0; w.len()]);
         block.backward(&w, &layers, &tape, &mut d_x, (&mut d_w, &mut d_layers));
         block.scans().discrete_backward(&w, &[1.0], &d_layers, &mut d_w);
-        check("w", &w, &d_w, |w| weighed(&run(w, &x, &mut BlockTape::default())));
-        check("x", x.as_flattened(), d_x.as_flattened(), |x| weighed(&run(&w, lanes(x), &mut BlockTape::default())));
+        check("w", &w, &d_w, |w| weighed(&run(w, &x, &mut BlockTape::default()), 99));
+        check("x", x.as_flattened(), d_x.as_flattened(), |x| {
+            weighed(&run(&w, lanes(x), &mut BlockTape::default()), 99)
+        });
     }
 }

@@ -1,6 +1,7 @@
 //! The scan against its definition, the zero-order hold against exponentials, and every gradient against differences.
 
 use super::*;
+use crate::nn::tests::random;
 
 const SHAPE: Shape = Shape { channels: 3, states: 4, copies: 1 };
 
@@ -10,11 +11,6 @@ fn weights_of(shape: Shape, seed: u64) -> Vec<f64> {
     let rng = Rng::new(seed, "shake", 0);
     w.iter_mut().enumerate().for_each(|(i, w)| *w += 0.2 * rng.normal(i as u64));
     w
-}
-
-fn random(len: usize, seed: u64) -> Vec<Lane<f64>> {
-    let rng = Rng::new(seed, "u", 0);
-    (0..len).map(|i| std::array::from_fn(|l| rng.normal((i * LANES + l) as u64))).collect()
 }
 
 fn states(len: usize, seed: u64) -> Vec<Pair<f64>> {

@@ -2,13 +2,9 @@
 
 use super::*;
 use crate::math::quat;
+use crate::nn::tests::{check, lanes, random, weighed};
 
 const TICKS: usize = 5;
-
-fn random(len: usize, seed: u64) -> Vec<Lane<f64>> {
-    let rng = Rng::new(seed, "vectors", 0);
-    (0..len).map(|i| std::array::from_fn(|l| rng.normal((i * LANES + l) as u64))).collect()
-}
 
 /// An orthogonal matrix; every second one mirrors.
 fn orthogonal(i: u64) -> [[f64; 3]; 3] {
@@ -31,29 +27,6 @@ fn turned(r: &[[f64; 3]; 3], x: &[Lane<f64>]) -> Vec<Lane<f64>> {
 
 fn distance(a: &[Lane<f64>], b: &[Lane<f64>]) -> f64 {
     a.as_flattened().iter().zip(b.as_flattened()).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
-}
-
-fn weighed(a: &[Lane<f64>], seed: u64) -> f64 {
-    a.as_flattened().iter().zip(random(a.len(), seed).as_flattened()).map(|(a, b)| a * b).sum()
-}
-
-/// Central differences of f at some of the numbers of x against the gradient.
-fn check(name: &str, x: &[f64], d: &[f64], f: impl Fn(&[f64]) -> f64) {
-    let mut x = x.to_vec();
-    for i in (0..x.len()).step_by((x.len() / 60).max(1)) {
-        let old = x[i];
-        let mut at = |h: f64| {
-            x[i] = old + h;
-            f(&x)
-        };
-        let fd = (at(1e-6) - at(-1e-6)) / 2e-6;
-        x[i] = old;
-        assert!((fd - d[i]).abs() < 2e-6 * (1.0 + fd.abs()), "{name}[{i}]: differences {fd}, gradient {}", d[i]);
-    }
-}
-
-fn lanes(x: &[f64]) -> &[Lane<f64>] {
-    x.as_chunks().0
 }
 
 #[test]

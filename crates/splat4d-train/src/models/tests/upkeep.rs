@@ -1,0 +1,154 @@
+//! What adds, moves and removes rows in the middle of a stage: every loss hears of it, and guided sampling finds what no
+//! Gaussian stands for.
+
+use super::*;
+use crate::densify::{Adc, Crowd, Crowding, Guided, Mcmc, Relocate};
+use crate::models::control::adapt::NodeAdapt;
+use crate::prune::{Periodic, Spatial};
+use splat4d::motion::control::{ControlSpec, Curve, TrajectorySpec};
+use splat4d::motion::skin::SkinSpec;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+/// Counts what it hears.
+#[derive(Clone, Default)]
+struct Ear {
+    heard: Arc<AtomicUsize>,
+}
+
+impl ProbeLoss<f32> for Ear {
+    fn name(&self) -> &str {
+        "ear"
+    }
+    fn probes(&self, _: &Scene<f32>, _: &StepInfo) -> Vec<crate::train::chain::Probe> {
+        Vec::new()
+    }
+    fn eval(
+        &self,
+        _: &Scene<f32>,
+        _: &[crate::train::chain::Probe],
+        _: &[Vec<Table<f32>>],
+        _: &mut [Vec<Table<f32>>],
+    ) -> f64 {
+        0.0
+    }
+    fn on_edit(&self) {
+        self.heard.fetch_add(1, Ordering::Relaxed);
+    }
+}
+
+impl ParamLoss<f32> for Ear {
+    fn name(&self) -> &str {
+        "ear"
+    }
+    fn eval(&self, _: &Scene<f32>, _: &StepInfo, _: &mut [Grads<f32>]) -> f64 {
+        0.0
+    }
+    fn on_edit(&self) {
+        self.heard.fetch_add(1, Ordering::Relaxed);
+    }
+}
+
+fn on_nodes() -> Scene<f32> {
+    let mut p = cloud::<f32>(90, LifeKind::Infinite, 3);
+    let skin = SkinSpec { nodes: 12, neighbours: 3, hyper: 2, mask: false };
+    let trajectory = TrajectorySpec::Keys { curve: Curve::Cubic, keys: 5 };
+    let spec = Spec::Control(ControlSpec { seed: 1, clip: [0.0, 0.2], skin, trajectory });
+    let motion = build(&spec, &mut p).unwrap();
+    one_layer(p, motion, LifeKind::Infinite)
+}
+
+#[test]
+fn every_edit_of_rows_is_told_to_every_loss() {
+    type Change = fn(&mut Stage);
+    let edits: [(&str, Change); 8] = [
+        ("adc", |s| {
+            s.densify = Densify::Adc(Adc { grad_threshold: 1e-6, percent_dense: 0.01, retime_clones: false });
+            s.densify_steps = (5, 30, 5);
+        }),
+        ("mcmc", |s| {
+            s.densify = Densify::Mcmc(Mcmc { growth: 1.1, gradient_share: 0.5, noise_lr: 1.0 });
+            s.densify_steps = (5, 30, 5);
+        }),
+        ("prune", |s| s.prune = Some(Periodic { interval: 5, ratio: 0.1, views: 8, spatial: Spatial::Opacity })),
+        ("crowding", |s| s.crowding = Some(Crowding { what: Crowd::Prune, distance: 10.0, every: 5 })),
+        ("relocation", |s| {
+            let (from, interval, threshold, share) = (5, 5, 0.6, 0.1);
+            s.relocate = Some(Relocate { from, interval, threshold, share, gradient_share: 0.5 });
+        }),
+        ("guided sampling", |s| s.guided = Some(Guided { from: 0.2, times: 2, share: 0.3 })),
+        ("nodes", |s| {
+            let steps = (5, 30, 5);
+            s.adapt = Some(Box::new(NodeAdapt { bind_interval: 100, steps, threshold: 0.0, cap: 14 }));
+        }),
+        ("a hook", |s| {
+            s.switches.push((
+                5,
+                Box::new(|scene, _| {
+                    let edit = splat4d::scene::RowEdit::prune(Space::Gaussians, (0..90).map(|r| r % 2 == 0));
+                    scene.layers[0].edit(&edit, &Rng::new(0, "half", 0));
+                    Ok(())
+                }),
+            ));
+        }),
+    ];
+    for (name, change) in edits {
+        let (probe, param) = (Ear::default(), Ear::default());
+        let mut stage = Stage { batch: 2, groups: groups(&ORDINARY), ..Stage::new("edits", 40) };
+        stage.probes.push(Box::new(probe.clone()));
+        stage.params.push(Box::new(param.clone()));
+        change(&mut stage);
+        // Patches of guided sampling need a picture that is larger than they are.
+        let mut t = sized(on_nodes(), vec![stage], 48);
+        let mut edited = 0;
+        while !t.is_done() {
+            let (rows, nodes) = (t.scene.len(), t.scene.layers[0].params.rows_of(Space::Nodes));
+            let told = || [&probe, &param].map(|e| e.heard.load(Ordering::Relaxed));
+            let before = told();
+            let step = t.step().unwrap().expect("no fault");
+            let after = t.scene.layers[0].params.rows_of(Space::Nodes);
+            let moved = step.change.moved > 0 || (rows, nodes) != (t.scene.len(), after);
+            edited += usize::from(moved);
+            for (before, after) in before.into_iter().zip(told()) {
+                assert!(after > before || !moved, "{name}: rows were edited, and nobody said so");
+            }
+        }
+        assert!(edited > 0, "{name} edited nothing: the test must look at something");
+    }
+}
+
+/// As [`trainer`], at another size.
+fn sized(scene: Scene<f32>, stages: Vec<Stage>, size: usize) -> Trainer<'static> {
+    let settings = trainer(scene.clone(), vec![Stage::new("", 1)], 400).settings;
+    let draw = Box::new(Renderer::new(RenderConfig::default()));
+    Trainer::new(scene, stages, Arc::new(Made::new(4, 3, size)), draw, TrainLoss::new(0.2, 0.0, None), settings)
+}
+
+#[test]
+fn guided_sampling_finds_a_sky_that_no_gaussian_stands_for() {
+    let run = |guided: Option<Guided>| {
+        // All at the ball: the sky of the capture is not the background.
+        let mut p = cloud::<f32>(60, LifeKind::GaussHalf, 3);
+        let motion = build(&Spec::Spacetime(SpacetimeSpec::default()), &mut p).unwrap();
+        for r in 0..60 {
+            p[LIFE].write(r, 0, [0.1, 2.0]);
+            let mean = p[GEOMETRY].read::<3>(r, 0);
+            p[GEOMETRY].write(r, 0, mean.map(|x| 0.3 * x));
+            p[GEOMETRY].write(r, LOG_SCALE, [-2.3; 3]);
+        }
+        let mut scene = one_layer(p, motion, LifeKind::GaussHalf);
+        scene.background = [0.9, 0.1, 0.1];
+        let stage = Stage { batch: 2, groups: groups(&ORDINARY), guided, ..Stage::new("guided", 50) };
+        let mut t = sized(scene, vec![stage], 48);
+        t.settings.background = [0.9, 0.1, 0.1];
+        let (mut added, mut mse) = (0, Vec::new());
+        while !t.is_done() {
+            let step = t.step().unwrap().expect("no fault");
+            added += step.change.added;
+            mse.push(step.mse);
+        }
+        (added, mse[mse.len() - 8..].iter().sum::<f64>() / mse[..8].iter().sum::<f64>())
+    };
+    let [(none, left), (added, mended)] = [None, Some(Guided { from: 0.1, times: 3, share: 0.5 })].map(run);
+    assert!(none == 0 && added > 20, "{added} were added");
+    assert!(mended < 0.99 * left, "{mended} of the error is left, {left} without");
+}
