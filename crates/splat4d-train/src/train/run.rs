@@ -18,12 +18,11 @@ use crate::init::{self, Seeds};
 use crate::loss::image::ImageTerms;
 use crate::models::auto::{self, AUTO};
 use crate::models::{Plan, Stage, program_of, split};
-use crate::recipe::{FULL, Recipe};
+use crate::recipe::Recipe;
 use crate::{Error, ErrorKind, Result};
 use serde_json::json;
 use splat4d::layers::Scene;
 use splat4d::render::{Antialias, RenderConfig, Renderer, Simd};
-use splat4d::scene::head::FURTHER;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -403,42 +402,6 @@ fn fingerprint(capture: &Capture) -> String {
 fn hash(text: &str) -> String {
     let h = text.bytes().fold(0xcbf2_9ce4_8422_2325u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3));
     format!("{h:016x}")
-}
-
-/// Estimated peak memory of training, bytes: images in the cache, Gaussians at the cap, pixels in flight.
-pub fn memory_estimate(capture: &Capture, recipe: &Recipe) -> u64 {
-    let sh = 3 * (recipe.sh_degree as u64 + 1).pow(2);
-    let motion = if recipe.motion == "still" {
-        0
-    } else {
-        let features = if recipe.features == FULL { FURTHER as u64 } else { 0 };
-        3 * recipe.motion_order as u64 + 2 + 4 * u64::from(recipe.rotation_rate) + features
-    };
-    let gaussians = recipe.max_cap as u64 * ((11 + sh + motion) * BYTES_PER_NUMBER + RENDER_BYTES);
-    // The result itself: a pose a Gaussian and frame.
-    let pages = if recipe.motion == "tracked" {
-        let last = capture.train.iter().map(|&i| capture.frames[i].index as u64 + 1).max().unwrap_or(0);
-        let first = capture.train.iter().map(|&i| capture.frames[i].index as u64).min().unwrap_or(0);
-        recipe.max_cap as u64 * PAGE_BYTES * (last - first)
-    } else {
-        0
-    };
-    let frame =
-        capture.train.iter().map(|&i| (capture.frames[i].view.width * capture.frames[i].view.height) as u64).max();
-    let pixels = frame.unwrap_or(0);
-    let images = (pixels * 4 * capture.train.len() as u64).min(recipe.image_memory);
-    images + gaussians + pages + pixels * PIXEL_BYTES * recipe.batch_size as u64
-}
-
-/// Peak resident memory of this process, bytes; 0 where the system does not tell.
-pub fn peak_memory() -> u64 {
-    std::fs::read_to_string("/proc/self/status")
-        .ok()
-        .and_then(|s| {
-            let line = s.lines().find(|l| l.starts_with("VmHWM:"))?.to_owned();
-            line.split_whitespace().nth(1)?.parse::<u64>().ok()
-        })
-        .map_or(0, |kib| kib * 1024)
 }
 
 fn save_checkpoint(

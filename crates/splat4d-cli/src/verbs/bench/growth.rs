@@ -168,6 +168,7 @@ fn capture(pinned: &Pinned, root: &Path, pictures: &[PathBuf], count: usize) -> 
             time,
             index: i,
             image,
+            flow: None,
             mask: None,
         }
     };
