@@ -107,6 +107,18 @@ pub fn each<T: Copy + Default, const N: usize>(f: impl Fn(usize) -> T) -> [T; N]
     out
 }
 
+/// The sum of sixteen numbers, as a tree: the same for every level and thread.
+#[inline(always)]
+pub fn total<T: Copy + std::ops::AddAssign>(mut x: [T; 16]) -> T {
+    for half in [8, 4, 2, 1] {
+        for i in 0..half {
+            let other = x[i + half];
+            x[i] += other;
+        }
+    }
+    x[0]
+}
+
 /// The smaller; unlike `f32::min` one instruction.
 #[inline(always)]
 pub fn least<T: PartialOrd>(a: T, b: T) -> T {

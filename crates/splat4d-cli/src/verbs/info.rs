@@ -370,8 +370,8 @@ fn of_scene(scene: &Scene<f32>) -> Told {
         "type": "scene", "gaussians": n, "damaged_rows": damaged, "zero_rotations": zero_quats,
         "layers": layers.iter().map(|l| json!({"name": l.0, "motion": l.1, "life": l.2, "gaussians": l.3,
             "sh_degree": l.4})).collect::<Vec<_>>(),
-        "head": scene.head.name(), "clip": scene.clip, "fps": scene.fps, "bounds": finite.then_some([low, high]), "middle": center,
-        "radius": radius, "opacity_histogram": {"edges": OPACITY_EDGES, "counts": opacity},
+        "head": scene.head.name(), "clip": scene.clip, "fps": scene.fps, "bounds": finite.then_some([low, high]),
+        "middle": center, "radius": radius, "opacity_histogram": {"edges": OPACITY_EDGES, "counts": opacity},
         "scale_histogram": {"edges_log10_radii": SCALE_EDGES, "counts": scales},
     });
     Told { json, text, troubles }

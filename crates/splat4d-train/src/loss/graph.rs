@@ -152,8 +152,8 @@ pub(crate) fn over_points<T: Send>(out: &mut [T], node: impl Fn(usize, &mut T) -
     sums.iter().sum()
 }
 
-/// Every edge once, then both its ends. `near(i, &mut out[i], forces)` computes point i's edges, of which edge e·k + n has its
-/// place n in `forces`, and takes what they do to it; `far(&mut out[j], force)` takes what an edge does to its far end.
+/// Every edge once, then both its ends. `near(i, &mut out[i], forces)` computes point i's edges, of which edge i·k + n
+/// has its place n in `forces`, and takes what they do to it; `far(&mut out[j], force)` takes what an edge does to its far end.
 /// Returns the sum of what `near` returned, in a fixed order.
 pub(crate) fn over_edges<F: Real, T: Send, const N: usize>(
     graph: &Graph<F>,

@@ -316,7 +316,7 @@ mod tests {
         let shapes: Vec<[f64; 7]> = normals("shape", 0.5);
         let cov = |by: [f64; 4]| -> Vec<[f64; 6]> {
             let one = |x: &[f64; 7]| {
-                let own = crate::loss::rigid::multiply(by, [x[0], x[1], x[2], x[3]]);
+                let own = quat::product(by, [x[0], x[1], x[2], x[3]]);
                 from_quat_log_scales(own, [x[4], x[5], x[6]])
             };
             shapes.iter().map(one).collect()

@@ -27,27 +27,15 @@ pub struct Poses<'a, F> {
     pub q: &'a [[F; 4]],
 }
 
-/// Hamilton product a ⊗ b.
-#[inline(always)]
-pub(crate) fn multiply<F: Real>(a: [F; 4], b: [F; 4]) -> [F; 4] {
-    [
-        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
-        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
-        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
-        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
-    ]
-}
-
 /// The turn from one instant to the next.
 fn relative<F: Real>(now: [F; 4], before: [F; 4]) -> [F; 4] {
-    let [w, x, y, z] = quat::normalize(before).0;
-    multiply(quat::normalize(now).0, [w, -x, -y, -z])
+    quat::product(quat::normalize(now).0, quat::conjugate(quat::normalize(before).0))
 }
 
 /// From the gradient of q_rel to that of the raw quaternion now.
 fn relative_backward<F: Real>(now: [F; 4], before: [F; 4], d_rel: [F; 4]) -> [F; 4] {
     let (unit, norm) = quat::normalize(now);
-    quat::normalize_backward(unit, norm, multiply(d_rel, quat::normalize(before).0))
+    quat::normalize_backward(unit, norm, quat::product(d_rel, quat::normalize(before).0))
 }
 
 fn turns<F: Real>(now: Poses<'_, F>, before: Poses<'_, F>) -> Vec<[F; 4]> {

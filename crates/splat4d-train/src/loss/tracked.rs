@@ -13,13 +13,11 @@ use super::terms::{ParamLoss, StepInfo};
 use rayon::prelude::*;
 use splat4d::layers::{Layer, Scene};
 use splat4d::math::Real;
+use splat4d::math::sh::C0;
 use splat4d::motion::tracked::{FOREGROUND, POSE, page_of};
 use splat4d::scene::params::QUAT;
 use splat4d::scene::{GEOMETRY, Grads, Key, SH, Space};
 use std::sync::{Arc, Mutex, MutexGuard};
-
-/// Constant of the first spherical harmonic: what a base coefficient counts in the colour.
-const SH_0: f64 = 0.282_094_791_773_878_14;
 
 /// Weights, as the paper names them.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -217,7 +215,7 @@ impl<F: Real> Tied<F> {
         }
         let active = d.active(Space::Gaussians).to_vec();
         let [d_sh] = d.of([SH]);
-        let scale = weight * SH_0 / table.rows().max(1) as f64;
+        let scale = weight * C0 / table.rows().max(1) as f64;
         let mut loss = 0.0;
         for r in (0..table.rows()).filter(|&r| active[r]) {
             let (far, d_row) = l1(table.read::<3>(r, 0), memory.colors[r]);

@@ -1,6 +1,5 @@
 //! Baked against model: both drawn, from some cameras at some frames.
 
-use super::turn::product;
 use crate::format::playback::{Node, Primitive};
 use crate::layers::{ALPHA_MIN, Instant, Scene};
 use crate::math::quat;
@@ -58,7 +57,7 @@ impl Moment {
             let mean = std::array::from_fn::<f32, 3, _>(|k| (p.mean[k] + f64::from(p.velocity[k]) * delta) as f32);
             let half = p.turn.map(|w| 0.5 * delta * f64::from(w));
             let q = p.quat.map(f64::from);
-            let step = product([0.0, half[0], half[1], half[2]], q);
+            let step = quat::product([0.0, half[0], half[1], half[2]], q);
             let q = quat::normalize(std::array::from_fn(|i| q[i] + step[i])).0;
             let cov = sym3::from_quat_log_scales(q, p.scales.map(|s| f64::from(s).ln()));
             self.out.write(j, 0, mean);

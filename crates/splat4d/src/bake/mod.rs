@@ -120,7 +120,8 @@ pub struct Errors {
 
 /// Bakes a scene. `progress` hears how many Gaussians of how many are done.
 ///
-/// Errors: a scene with a pixel head; options out of range; a clip that is no clip; a model that would become too many primitives.
+/// Errors: a scene with a pixel head; options out of range; a clip that is no clip; a model that would become too many
+/// primitives.
 pub fn bake(scene: &Scene<f32>, options: &Options, progress: &mut dyn FnMut(usize, usize)) -> Result<Baked> {
     scene.without_head("a playback file")?;
     // An endless tolerance is allowed: nothing is split then.

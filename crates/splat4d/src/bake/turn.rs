@@ -26,7 +26,7 @@ impl Shape {
     /// The rotation after Δ seconds.
     pub(super) fn rotation(&self, delta: f64) -> [[f64; 3]; 3] {
         let half = self.turn.map(|w| 0.5 * delta * w);
-        let step = product([0.0, half[0], half[1], half[2]], self.quat);
+        let step = quat::product([0.0, half[0], half[1], half[2]], self.quat);
         quat::to_rotation(quat::normalize(std::array::from_fn(|i| self.quat[i] + step[i])).0)
     }
 
@@ -99,7 +99,7 @@ impl Shape {
             let grown = if lambda[i] > 0.0 { 0.5 * (size[i] / lambda[i] - 1.0) } else { 0.0 };
             out.scales[i] *= (pace * grown).clamp(-STRIDE, STRIDE).exp();
         }
-        out.quat = quat::normalize(product(self.quat, small(at_zero))).0;
+        out.quat = quat::normalize(quat::product(self.quat, small(at_zero))).0;
         let most = |v: [f64; 3]| v.iter().map(|x| x.abs()).fold(0.0, f64::max);
         (out, most(level) + most(rate) * reach)
     }
@@ -130,16 +130,6 @@ fn inside(r: &[[f64; 3]; 3], c: [f64; 6]) -> [f64; 6] {
         std::array::from_fn(|i| std::array::from_fn(|k| (0..3).map(|j| full[i][j] * r[j][k]).sum()));
     let entry = |a: usize, b: usize| (0..3).map(|i| r[i][a] * half[i][b]).sum();
     [entry(0, 0), entry(0, 1), entry(0, 2), entry(1, 1), entry(1, 2), entry(2, 2)]
-}
-
-/// Hamilton's product a ⊗ b, wxyz.
-pub(super) fn product(a: [f64; 4], b: [f64; 4]) -> [f64; 4] {
-    [
-        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
-        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
-        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
-        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
-    ]
 }
 
 /// The unit quaternion of a small rotation vector.

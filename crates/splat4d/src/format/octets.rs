@@ -5,7 +5,7 @@ use crate::scene::{GEOMETRY, LIFE, Params, SH};
 use crate::{Error, Result};
 
 /// SH basis function of degree 0, 1/(2√π): colour = ½ + C0·f_dc.
-pub(super) const SH_C0: f32 = 0.282_094_79;
+pub(super) const SH_C0: f32 = crate::math::sh::C0 as f32;
 
 /// Reads numbers from the front of bytes; the end is an error, not a panic.
 pub(super) struct Cursor<'a> {

@@ -10,7 +10,7 @@ use crate::scene::splats::{COV, SPLAT_OPACITY};
 use crate::scene::{Color, GEOMETRY, LifeKind, Params, Rows, SH, Space, Time};
 
 /// Y00, by which the base coefficient becomes colour; colour is ½ at coefficient 0 (Kerbl et al. 2023).
-const SH0: f32 = 0.282_094_79;
+const SH0: f32 = crate::math::sh::C0 as f32;
 /// Share of the trace by which a covariance may differ before it counts as turned or stretched: f32 rounding.
 const SAME: f64 = 1e-5;
 /// Smallest scale that comes out of a decomposition, as a share of the largest: below it f32 covariances hold no digit.

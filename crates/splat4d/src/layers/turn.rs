@@ -154,16 +154,9 @@ fn apply(r: &[[f64; 3]; 3], v: [f32; 3]) -> [f32; 3] {
     std::array::from_fn(|k| (0..3).map(|l| r[k][l] * f64::from(v[l])).sum::<f64>() as f32)
 }
 
-/// a ⊗ b, wxyz.
+/// a ⊗ b, wxyz, rounded once.
 fn product(a: [f64; 4], b: [f32; 4]) -> [f32; 4] {
-    let b = b.map(f64::from);
-    [
-        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
-        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
-        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
-        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
-    ]
-    .map(|x| x as f32)
+    quat::product(a, b.map(f64::from)).map(|x| x as f32)
 }
 
 #[cfg(test)]

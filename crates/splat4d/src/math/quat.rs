@@ -27,6 +27,23 @@ pub fn normalize_backward<F: Real>(unit: [F; 4], norm: F, d_unit: [F; 4]) -> [F;
     std::array::from_fn(|i| (d_unit[i] - unit[i] * along) / norm)
 }
 
+/// Hamilton's product a ⊗ b: of rotations, first b, then a.
+#[inline(always)]
+pub fn product<F: Real>(a: [F; 4], b: [F; 4]) -> [F; 4] {
+    [
+        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
+        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
+        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
+        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
+    ]
+}
+
+/// The conjugate: of a unit quaternion the inverse.
+#[inline(always)]
+pub fn conjugate<F: Real>(q: [F; 4]) -> [F; 4] {
+    [q[0], -q[1], -q[2], -q[3]]
+}
+
 /// Rotation matrix (rows) of a unit quaternion.
 #[inline(always)]
 pub fn to_rotation<F: Real>([w, x, y, z]: [F; 4]) -> [[F; 3]; 3] {

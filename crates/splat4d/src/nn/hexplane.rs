@@ -16,7 +16,7 @@
 
 use crate::math::{Real, Rng};
 use crate::scene::{Grads, Key, Params};
-use crate::simd::{Kernel, Simd, dispatch, each};
+use crate::simd::{Kernel, Simd, dispatch, each, total};
 use crate::{Error, Result};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -448,22 +448,11 @@ impl<F: Real> Kernel for Backward<'_, F> {
             for axis in 0..3 {
                 // Beyond the border nothing changes.
                 let inside = x[axis] > F::ZERO && x[axis] < F::ONE;
-                let sum = tree(slopes[axis]);
+                let sum = total(slopes[axis]);
                 d_x[axis] += if inside { sum } else { F::ZERO };
             }
         }
     }
-}
-
-/// The sum of all lanes.
-#[inline(always)]
-fn tree<F: Real>(mut lane: Lane<F>) -> F {
-    for half in [8, 4, 2, 1] {
-        for k in 0..half {
-            lane[k] += lane[k + half];
-        }
-    }
-    lane[0]
 }
 
 /// Where the gradient of one plane goes.
@@ -492,7 +481,7 @@ impl<F: Real> Sink<'_, F> {
                 slope[k] += d[k] * (high[i][k] - low[i][k]);
             }
         }
-        tree(slope) * lines.slope
+        total(slope) * lines.slope
     }
 }
 

@@ -6,9 +6,9 @@
 //! function says so.
 
 use super::matmul::{Matrix, product};
-use super::ssm::{self, Direction, Discrete, LANES, Lane, Pair, total};
+use super::ssm::{self, Direction, Discrete, LANES, Lane, Pair};
 use crate::math::{Real, Rng};
-use crate::simd::{Kernel, Simd, dispatch};
+use crate::simd::{Kernel, Simd, dispatch, total};
 use std::ops::Range;
 
 /// Keeps a norm from dividing by zero (the usual value).
@@ -104,7 +104,7 @@ pub fn sum<F: Real>(row: &[Lane<F>]) -> F {
             sums[l] += lane[l];
         }
     }
-    total(&sums)
+    total(sums)
 }
 
 /// x·σ(1.702x)
@@ -395,7 +395,7 @@ fn affine_backward<F: Real>(x: &[Lane<F>], scale: F, d: &mut [Lane<F>]) -> (F, F
             d[l] *= scale;
         }
     }
-    (total(&by_scale), total(&by_shift))
+    (total(by_scale), total(by_shift))
 }
 
 #[cfg(test)]

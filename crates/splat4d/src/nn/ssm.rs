@@ -9,7 +9,7 @@
 
 use crate::math::{Real, Rng};
 use crate::scene::BLOCK;
-use crate::simd::{Kernel, Simd, dispatch};
+use crate::simd::{Kernel, Simd, dispatch, total};
 
 /// Sequences that are scanned together.
 pub const LANES: usize = BLOCK;
@@ -525,7 +525,7 @@ impl<F: Real> Kernel for &mut Reverse<'_, '_, F> {
         if self.d.gaps == 1 {
             self.flush(self.of.first);
         }
-        self.d.skip[self.row / self.d.shape.copies] += total(&d_skip);
+        self.d.skip[self.row / self.d.shape.copies] += total(d_skip);
     }
 }
 
@@ -534,25 +534,13 @@ impl<F: Real> Reverse<'_, '_, F> {
     fn flush(&mut self, place: usize) {
         for (i, [d_a, d_b, d_c]) in self.sums.iter_mut().enumerate() {
             for k in 0..2 {
-                self.d.decay[place + i][k] += total(&d_a[k]);
-                self.d.drive[place + i][k] += total(&d_b[k]);
-                self.d.output[self.of.first + i][k] += total(&d_c[k]);
+                self.d.decay[place + i][k] += total(d_a[k]);
+                self.d.drive[place + i][k] += total(d_b[k]);
+                self.d.output[self.of.first + i][k] += total(d_c[k]);
             }
             [*d_a, *d_b, *d_c] = [[[F::ZERO; LANES]; 2]; 3];
         }
     }
-}
-
-/// The sum of a lane's numbers, as a tree.
-#[inline(always)]
-pub fn total<F: Real>(lane: &Lane<F>) -> F {
-    let mut sums = *lane;
-    for half in [8, 4, 2, 1] {
-        for l in 0..half {
-            sums[l] += sums[l + half];
-        }
-    }
-    sums[0]
 }
 
 #[cfg(test)]

@@ -7,8 +7,9 @@
 //! Source: Deng et al. 2021 (vector neurons); the equivariant state space is our own.
 
 use super::sequence::{Layout, Scans, add, clear, fast, linear, linear_backward, uniform};
-use super::ssm::{self, Direction, Discrete, LANES, Lane, Pair, total};
+use super::ssm::{self, Direction, Discrete, LANES, Lane, Pair};
 use crate::math::{Real, Rng};
+use crate::simd::total;
 use std::ops::Range;
 
 /// Keeps norms from zero, where they have no slope; squared units of normalised vectors.
@@ -128,8 +129,8 @@ pub fn gate_backward<F: Real>(
             }
             write(d, c, ticks, t, &g);
         }
-        d_alpha[c] += total(&by_alpha);
-        d_beta[c] += total(&by_beta);
+        d_alpha[c] += total(by_alpha);
+        d_beta[c] += total(by_beta);
     }
 }
 

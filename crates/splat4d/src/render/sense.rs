@@ -80,8 +80,9 @@ impl<F: Real> Raster<F> {
 
 impl<F: Real> super::Renderer<F> {
     /// How strongly the picture over `background` answers to each splat: exact sums over its pixels, for splats that stay in
-    /// front of and behind the same others. A head is not looked at: the picture is that of the base colours. `out` is overwritten, one a splat; zeros where no pixel shows it. Draws by
-    /// itself; no backward may follow.
+    /// front of and behind the same others. A head is not looked at: the picture is that of the base colours.
+    ///
+    /// `out` is overwritten, one a splat; zeros where no pixel shows it. Draws by itself; no backward may follow.
     pub fn sensitivities(
         &mut self,
         splats: &Splats<'_, F>,

@@ -26,7 +26,8 @@ fn rigid(turn_by: [f64; 4], shift: [f64; 3]) -> Case {
     let unit = quat::normalize(turn_by).0;
     let r = quat::to_rotation(unit);
     let moved = x.iter().map(|&p| std::array::from_fn(|k| turn(&r, p)[k] + shift[k])).collect();
-    let turned = q.iter().enumerate().map(|(i, &q)| multiply(unit, q).map(|v| v * (0.5 + 0.1 * i as f64))).collect();
+    let turned =
+        q.iter().enumerate().map(|(i, &q)| quat::product(unit, q).map(|v| v * (0.5 + 0.1 * i as f64))).collect();
     Case { graph: Graph::new(&x, 6, Weigh::Median(1.0)), before: (x, q), now: (moved, turned) }
 }
 
@@ -112,7 +113,7 @@ fn a_rotation_of_the_world_changes_nothing() {
     let mut turned = shaken();
     for side in [&mut turned.before, &mut turned.now] {
         side.0.iter_mut().for_each(|x| *x = turn(&r, *x));
-        side.1.iter_mut().for_each(|q| *q = multiply(world, *q));
+        side.1.iter_mut().for_each(|q| *q = quat::product(world, *q));
     }
     for (name, loss) in LOSSES {
         let (a, b) = (eval(loss, &case).0, eval(loss, &turned).0);

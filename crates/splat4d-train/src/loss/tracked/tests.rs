@@ -108,13 +108,7 @@ fn a_rigid_motion_costs_nothing_and_other_units_change_nothing() {
         let pose = s.layers[0].params[GEOMETRY].read::<POSE>(row, 0);
         s.layers[0].params[first].write(row, 0, pose);
         let (q, x) = ([pose[3], pose[4], pose[5], pose[6]], [pose[0], pose[1], pose[2]]);
-        let [a, b] = [turn, q];
-        let turned = [
-            a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
-            a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
-            a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
-            a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
-        ];
+        let turned = quat::product(turn, q);
         let moved: [f64; 3] = std::array::from_fn(|i| (0..3).map(|k| r[i][k] * x[k]).sum::<f64>() + 0.4);
         s.layers[0].params[page].write(row, 0, moved);
         // Any scale, either sign.

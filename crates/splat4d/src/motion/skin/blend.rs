@@ -12,7 +12,7 @@ use crate::scene::params::QUAT;
 use crate::scene::splats::COV;
 use crate::scene::table::TableMut;
 use crate::scene::{BLOCK, GEOMETRY, Grads, Params, Rows, Table};
-use crate::simd::{Kernel, Simd, dispatch, each};
+use crate::simd::{Kernel, Simd, dispatch, each, total};
 use rayon::prelude::*;
 
 /// Numbers of a rigid motion.
@@ -98,22 +98,6 @@ impl<F: Real> Frames<F> {
             d_nodes.add(k, 0, each::<F, 3>(d_rest));
         }
     }
-}
-
-/// a ⊗ b
-#[inline(always)]
-pub(super) fn product<F: Real>(a: [F; 4], b: [F; 4]) -> [F; 4] {
-    [
-        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
-        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
-        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
-        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
-    ]
-}
-
-#[inline(always)]
-fn conjugate<F: Real>(q: [F; 4]) -> [F; 4] {
-    [q[0], -q[1], -q[2], -q[3]]
 }
 
 /// One question about Gaussians.
@@ -208,7 +192,7 @@ impl<F: Real> Ask<'_, F> {
                 m * blend[TURN + 3][l],
             ];
             let (u, n) = quat::normalize(turn);
-            let q = product(u, [rest[QUAT][l], rest[QUAT + 1][l], rest[QUAT + 2][l], rest[QUAT + 3][l]]);
+            let q = quat::product(u, [rest[QUAT][l], rest[QUAT + 1][l], rest[QUAT + 2][l], rest[QUAT + 3][l]]);
             for i in 0..4 {
                 unit[i][l] = u[i];
                 rows[QUAT + i][l] = q[i];
@@ -284,8 +268,8 @@ impl<F: Real> Kernel for Back<'_, F> {
                 let d_q = [d[QUAT][l], d[QUAT + 1][l], d[QUAT + 2][l], d[QUAT + 3][l]];
                 let q = [m.rest[QUAT][l], m.rest[QUAT + 1][l], m.rest[QUAT + 2][l], m.rest[QUAT + 3][l]];
                 let unit = [m.unit[0][l], m.unit[1][l], m.unit[2][l], m.unit[3][l]];
-                let d_rest = product(conjugate(unit), d_q);
-                let d_turn = quat::normalize_backward(unit, m.norm[l], product(d_q, conjugate(q)));
+                let d_rest = quat::product(quat::conjugate(unit), d_q);
+                let d_turn = quat::normalize_backward(unit, m.norm[l], quat::product(d_q, quat::conjugate(q)));
                 let (mask, mut d_m) = (m.mask[l], -d_turn[0]);
                 for i in 0..4 {
                     d[QUAT + i][l] = d_rest[i];
@@ -330,17 +314,6 @@ impl<F: Real> Kernel for Back<'_, F> {
             }
         }
     }
-}
-
-/// The sum of sixteen numbers, as a tree.
-#[inline(always)]
-pub(super) fn total<F: Real>(mut x: [F; 16]) -> F {
-    for half in [8, 4, 2, 1] {
-        for i in 0..half {
-            x[i] += x[i + half];
-        }
-    }
-    x[0]
 }
 
 /// Rows of one task: a function of sizes alone.

@@ -1,6 +1,5 @@
 //! A trajectory on top of another: nodes that were dragged keep moving as they did.
 
-use super::blend::product;
 use super::{POSE, Trajectory};
 use crate::math::{Real, quat};
 use crate::motion::Slot;
@@ -33,7 +32,7 @@ impl<F: Real> Trajectory<F> for Offset<F> {
         for node in 0..out.rows() {
             let (pose, by) = (out.read::<POSE>(node, 0), self.by.read::<3>(node, 0));
             // Not normalised: its use does that, and this way the gradient is that of a product.
-            let q = product(self.turn(node), [F::ONE + pose[3], pose[4], pose[5], pose[6]]);
+            let q = quat::product(self.turn(node), [F::ONE + pose[3], pose[4], pose[5], pose[6]]);
             out.write(node, 0, std::array::from_fn::<F, 3, _>(|k| pose[k] + by[k]));
             out.write(node, 3, [q[0] - F::ONE, q[1], q[2], q[3]]);
         }
@@ -52,7 +51,7 @@ impl<F: Real> Trajectory<F> for Offset<F> {
         for node in 0..d_own.rows() {
             let [w, x, y, z] = self.turn(node);
             let g = d_out.read::<4>(node, 3);
-            d_own.write(node, 3, product([w, -x, -y, -z], g));
+            d_own.write(node, 3, quat::product([w, -x, -y, -z], g));
         }
         self.of.poses_backward(p, t, cache, &d_own, d_cache, d)
     }

@@ -9,12 +9,12 @@
 //! (nearly) zero: no cracks open where neighbours switch (the reference cuts off sharply). Σ a = 1 exactly as the sum of
 //! quotients, and ε keeps the sum above zero where K + 1 nodes pull alike.
 
-use super::blend::{sum_parts, task_rows, total};
+use super::blend::{sum_parts, task_rows};
 use super::{MAX_HYPER, MAX_NEIGHBOURS, NODE_HYPER, NODE_LOG_RADIUS, SPARE_CANDIDATES, Skin};
 use crate::math::Real;
 use crate::scene::table::TableMut;
 use crate::scene::{BLOCK, GEOMETRY, Grads, Params, Table};
-use crate::simd::{Kernel, Simd, dispatch, each};
+use crate::simd::{Kernel, Simd, dispatch, each, total};
 use rayon::prelude::*;
 
 /// ε: least weight of a node that counts, relative to the strongest.

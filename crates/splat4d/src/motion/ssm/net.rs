@@ -324,7 +324,7 @@ impl Net {
         let mut d_own = vec![zero; self.width];
         for (row, d_first) in d_first.chunks_exact(ticks).enumerate() {
             for (t, x) in d_first.iter().enumerate() {
-                d.beat[row * ticks + t] += crate::nn::ssm::total(x);
+                d.beat[row * ticks + t] += crate::simd::total(*x);
                 (0..LANES).for_each(|l| d_own[row][l] += x[l]);
             }
         }

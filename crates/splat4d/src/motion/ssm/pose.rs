@@ -1,6 +1,6 @@
 //! From what the network says at ticks to poses at any time: interpolation, rotation vectors, composed rates.
 
-use crate::math::Real;
+use crate::math::{Real, quat};
 use crate::nn::ssm::{LANES, Lane};
 use crate::simd::each;
 
@@ -106,22 +106,6 @@ pub fn exp_backward<F: Real>(theta: [F; 3], d: [F; 4]) -> [F; 3] {
     each(|k| s * d[k + 1] + F::TWO * theta[k] * d_square)
 }
 
-/// Hamilton product.
-#[inline(always)]
-fn times<F: Real>(a: [F; 4], b: [F; 4]) -> [F; 4] {
-    [
-        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
-        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
-        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
-        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
-    ]
-}
-
-#[inline(always)]
-fn conjugate<F: Real>(q: [F; 4]) -> [F; 4] {
-    [q[0], -q[1], -q[2], -q[3]]
-}
-
 /// Poses \[7, ticks\] of rates \[6, ticks\]: the first tick's is the first pose, the others last `share` of a clip each:
 /// ρₙ = ρₙ₋₁ + share·ξₙ, qₙ = qₙ₋₁ ⊗ exp(share·ωₙ).
 pub fn compose<F: Real>(rates: &[Lane<F>], share: f64) -> Vec<Lane<F>> {
@@ -135,7 +119,7 @@ pub fn compose<F: Real>(rates: &[Lane<F>], share: f64) -> Vec<Lane<F>> {
                 shift[k] += span * rates[k * ticks + t][l];
                 out[k * ticks + t][l] = shift[k];
             }
-            q = times(q, exp(each(|k| span * rates[(3 + k) * ticks + t][l])));
+            q = quat::product(q, exp(each(|k| span * rates[(3 + k) * ticks + t][l])));
             (0..4).for_each(|k| out[(3 + k) * ticks + t][l] = q[k]);
         }
     }
@@ -160,9 +144,9 @@ pub fn compose_backward<F: Real>(rates: &[Lane<F>], share: f64, d_out: &[Lane<F>
             let before =
                 if t == 0 { [F::ONE, F::ZERO, F::ZERO, F::ZERO] } else { each(|k| out[(3 + k) * ticks + t - 1][l]) };
             // q = a ⊗ b: the gradients are g ⊗ b* to a and a* ⊗ g to b.
-            let d_theta = exp_backward(theta, times(conjugate(before), d_q));
+            let d_theta = exp_backward(theta, quat::product(quat::conjugate(before), d_q));
             (0..3).for_each(|k| d[(3 + k) * ticks + t][l] = span * d_theta[k]);
-            d_q = times(d_q, conjugate(exp(theta)));
+            d_q = quat::product(d_q, quat::conjugate(exp(theta)));
         }
     }
     d

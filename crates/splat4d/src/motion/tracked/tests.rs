@@ -20,15 +20,6 @@ fn turn(axis: [f64; 3], angle: f64) -> [f64; 4] {
     [c, s * axis[0], s * axis[1], s * axis[2]]
 }
 
-fn product(a: [f64; 4], b: [f64; 4]) -> [f64; 4] {
-    [
-        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
-        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
-        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
-        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
-    ]
-}
-
 #[test]
 fn propagation_reproduces_constant_velocities_exactly() {
     let (mut p, mut model) = start(40);
@@ -60,10 +51,10 @@ fn propagation_turns_on_whatever_the_signs_and_scales_of_quaternions() {
     let first = quat::normalize(first).0;
     p[GEOMETRY].write(0, QUAT, first.map(|x| 3.0 * x));
     let model = model.propagate(&mut p, 0.1, 1.0).unwrap();
-    let second = product(turn(axis, angle), first);
+    let second = quat::product(turn(axis, angle), first);
     p[model.page(1)].write(0, QUAT, second.map(|x| -0.5 * x));
     let model = model.propagate(&mut p, 0.2, 1.0).unwrap();
-    let (third, got) = (product(turn(axis, 2.0 * angle), first), p[model.page(2)].read::<4>(0, QUAT));
+    let (third, got) = (quat::product(turn(axis, 2.0 * angle), first), p[model.page(2)].read::<4>(0, QUAT));
     let along: f64 = (0..4).map(|k| third[k] * got[k]).sum();
     // The chord overshoots the arc by the cube of the angle.
     assert!((along.abs() - 1.0).abs() < 1e-9, "{along}");
