@@ -74,7 +74,7 @@ fn parse(text: &str) -> Result<(Camera, [f32; 3])> {
             })?
         }
     };
-    Ok((Camera { cam_from_world, intrinsics, lens: Lens::Pinhole, width, height }, background))
+    Ok((Camera { cam_from_world, intrinsics, lens: Lens::Pinhole, width, height, near: Camera::NEAR }, background))
 }
 
 /// Parses JSON; the error says what is usually wrong.

@@ -296,6 +296,7 @@ pub(crate) fn cameras_json(capture: &Capture) -> Value {
         json!({
             "id": id, "img_name": view.name, "width": view.camera.width, "height": view.camera.height,
             "position": world.translation, "rotation": world.rotation, "fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy,
+            "near": view.camera.near,
             "time": view.time, "split": if view.held { "test" } else { "train" },
         })
     };
@@ -320,8 +321,9 @@ fn read_view(value: &Value) -> Option<View> {
         cx: number("cx").unwrap_or(0.5 * width as f64),
         cy: number("cy").unwrap_or(0.5 * height as f64),
     };
+    let near = number("near").unwrap_or(Camera::NEAR);
     Some(View {
-        camera: Camera { cam_from_world: world.inverse(), intrinsics, lens: Lens::Pinhole, width, height },
+        camera: Camera { cam_from_world: world.inverse(), intrinsics, lens: Lens::Pinhole, width, height, near },
         name: value.get("img_name").and_then(Value::as_str).unwrap_or_default().to_owned(),
         time: number("time").unwrap_or(0.0),
         held: value.get("split").and_then(Value::as_str) == Some("test"),

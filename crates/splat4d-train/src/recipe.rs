@@ -10,11 +10,11 @@ use splat4d::motion::filtered::{Fusion, MAX_BASELINE, MAX_HISTORY, Predictor};
 use splat4d::motion::native4d::MAX_HARMONICS;
 
 macro_rules! recipe {
-    ($($(#[$doc:meta])* $name:ident : $t:ty = $default:expr,)*) => {
+    ($($(#[doc = $doc:literal])* $name:ident : $t:ty = $default:expr,)*) => {
         /// All knobs. See the fields.
         #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
         #[serde(default, deny_unknown_fields)]
-        pub struct Recipe { $($(#[$doc])* pub $name: $t,)* }
+        pub struct Recipe { $($(#[doc = $doc])* pub $name: $t,)* }
 
         impl Default for Recipe {
             fn default() -> Self { Self { $($name: $default,)* } }
@@ -26,7 +26,7 @@ macro_rules! recipe {
                 vec![$(Knob {
                     name: stringify!($name),
                     default: toml::Value::try_from::<$t>($default).map(|v| v.to_string()).unwrap_or_default(),
-                    doc: knob_doc(stringify!($($doc)*)),
+                    doc: [$($doc),*].concat().trim().to_owned(),
                 }),*]
             }
         }
@@ -73,6 +73,8 @@ recipe! {
     fps: f64 = 0.0,
     /// Only this many frames of the take; 0: all.
     max_frames: usize = 0,
+    /// How near to a camera Gaussians are drawn, of the extent; less where the capture's points come nearer.
+    near: f64 = crate::capture::NEAR,
     /// First frame of the take that is used.
     first_frame: usize = 0,
     /// RGBA captures composite on white; false: on black.
@@ -89,7 +91,8 @@ recipe! {
     lambda_mask: f64 = 0.0,
     /// Where Gaussians start: "auto", "points", "hull", "random", or a .ply file.
     init: String = "auto".into(),
-    /// Initial Gaussians besides the capture's points.
+    /// Initial Gaussians. Points that a capture lacks to so many are laid between its own, along surfaces; the hull of masks and
+    /// random points bring as many of their own.
     num_pts: usize = 10_000,
     /// Initial opacity.
     init_opacity: f64 = 0.1,
@@ -724,12 +727,6 @@ pub fn nearest<'a>(name: &str, known: &[&'a str]) -> Option<&'a str> {
     };
     let best = known.iter().map(|k| (distance(&name.to_lowercase(), k), *k)).min()?;
     (best.0 <= 2.max(name.len() / 3)).then_some(best.1)
-}
-
-fn knob_doc(attributes: &str) -> String {
-    // stringify! gives `doc = r" text"` or `doc = " text"`; keep the text.
-    let text = attributes.split_once('"').map_or("", |(_, t)| t);
-    text.rsplit_once('"').map_or(text, |(t, _)| t).trim().to_owned()
 }
 
 #[cfg(test)]

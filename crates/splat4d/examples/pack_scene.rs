@@ -290,7 +290,7 @@ fn cameras(json: &Value) -> Vec<NamedCamera> {
         });
         let (width, height) = (number("width") as usize, number("height") as usize);
         let (fx, fy, cx, cy) = (number("fx"), number("fy"), number("cx"), number("cy"));
-        out.push(NamedCamera { name, world_from_camera, width, height, fx, fy, cx, cy });
+        out.push(NamedCamera { name, world_from_camera, width, height, fx, fy, cx, cy, ..NamedCamera::default() });
     }
     out
 }

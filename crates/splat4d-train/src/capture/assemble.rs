@@ -44,7 +44,8 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
         let full = std::path::absolute(&take.root).unwrap_or_else(|_| take.root.clone());
         full.file_name().map_or_else(|| "capture".into(), |n| n.to_string_lossy().into_owned())
     });
-    Ok(Capture {
+    let points = take.points.map(|p| p.voxel_downsample(options.max_points)).filter(|p| !p.points.is_empty());
+    let mut capture = Capture {
         name,
         root: take.root,
         kind: take.kind,
@@ -54,12 +55,45 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
         train,
         validation,
         fps: take.fps,
-        points: take.points.map(|p| p.voxel_downsample(options.max_points)).filter(|p| !p.points.is_empty()),
+        points,
         background,
         up,
         downscale: options.downscale,
         warnings: take.warnings,
-    })
+    };
+    let near = near(&capture, options.near);
+    capture.frames.iter_mut().for_each(|f| f.view.near = near);
+    Ok(capture)
+}
+
+/// Points nearer than this share of all that a training camera sees may be wrong ones.
+const STRAY_POINTS: f64 = 0.01;
+/// Of the distance of the nearest points: Gaussians in front of them are still drawn.
+const BEFORE_POINTS: f64 = 0.5;
+
+/// Some distance there must be, of the extent: the projection divides by it.
+const SMALLEST_NEAR: f64 = 1e-3;
+
+/// How near splats are drawn, scene units: this share of the extent, or half way to the nearest of the capture's points.
+fn near(capture: &Capture, share: f64) -> f64 {
+    let cloud = capture.points.as_ref().map_or(&[][..], |p| &p.points);
+    let mut depths: Vec<f64> = Vec::new();
+    let mut last: Option<&Camera> = None;
+    for view in capture.train.iter().map(|&i| &capture.frames[i].view) {
+        // A fixed camera's frames lie one behind the other, and all see the same points.
+        if last.is_some_and(|other| same_pose(other, view)) {
+            continue;
+        }
+        last = Some(view);
+        let inside = |&([u, v], _): &([f64; 2], f64)| {
+            (0.0..view.width as f64).contains(&u) && (0.0..view.height as f64).contains(&v)
+        };
+        depths.extend(cloud.iter().filter_map(|&x| view.project(x)).filter(inside).map(|(_, z)| z));
+    }
+    let at = (STRAY_POINTS * depths.len() as f64) as usize;
+    let nearest = if depths.is_empty() { f64::INFINITY } else { *depths.select_nth_unstable_by(at, f64::total_cmp).1 };
+    let extent = capture.center_and_radius().1;
+    (share * extent).min(BEFORE_POINTS * nearest).max(Camera::NEAR.min(SMALLEST_NEAR * extent))
 }
 
 /// The pinhole view of the picture as it will be loaded.

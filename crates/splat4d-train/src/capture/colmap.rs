@@ -40,6 +40,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
             lens: camera.lens,
             width: camera.width,
             height: camera.height,
+            near: Camera::NEAR,
         };
         shots.push((picture.name.clone(), source));
     }

@@ -82,7 +82,7 @@ fn read_split(root: &Path, top: &Node<'_>, split: Split) -> Result<Vec<RawFrame>
         let matrix = frame.get("transform_matrix")?;
         let cam_from_world = pose::from_opengl(&matrix.matrix4()?).map_err(|e| matrix.at(e))?;
         let time = frame.opt("time")?.map_or(Ok(0.0), |t| t.number())?;
-        let source = Camera { cam_from_world, intrinsics, lens: Lens::Pinhole, width, height };
+        let source = Camera { cam_from_world, intrinsics, lens: Lens::Pinhole, width, height, near: Camera::NEAR };
         Ok(RawFrame {
             camera: 0,
             source,

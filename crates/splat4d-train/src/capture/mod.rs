@@ -30,11 +30,12 @@ mod store;
 
 pub use flow::FlowFile;
 pub use lens::Distortion;
-pub use options::{CaptureOptions, HoldOut, MAX_POINTS};
+pub use options::{CaptureOptions, HoldOut, MAX_POINTS, NEAR};
 pub use points::PointCloud;
 pub use preflight::{Finding, Severity};
 pub use store::{ImageStore, Picture, StoredPicture};
 
+use splat4d::math::se3::{norm, sub};
 use splat4d::scene::{Camera, Time};
 use splat4d::{Error, ErrorKind, Result};
 use std::path::{Path, PathBuf};
@@ -269,7 +270,7 @@ impl Capture {
         for c in &centers {
             (0..3).for_each(|k| mean[k] += c[k] / n);
         }
-        let far = centers.iter().map(|&c| splat4d::math::se3::norm(splat4d::math::se3::sub(c, mean)));
+        let far = centers.iter().map(|&c| norm(sub(c, mean)));
         (mean, (MARGIN * far.fold(0.0, f64::max)).max(1e-6))
     }
 }

@@ -129,5 +129,5 @@ fn camera_of(row: &[f64], width: usize, height: usize) -> Result<Camera> {
     // Frames are often extracted at half the size that the calibration states.
     let focal = focal * width as f64 / stated_width;
     let intrinsics = Intrinsics { fx: focal, fy: focal, cx: 0.5 * width as f64, cy: 0.5 * height as f64 };
-    Ok(Camera { cam_from_world, intrinsics, lens: Lens::Pinhole, width, height })
+    Ok(Camera { cam_from_world, intrinsics, lens: Lens::Pinhole, width, height, near: Camera::NEAR })
 }

@@ -145,7 +145,8 @@ fn read_frame<'a>(root: &Path, top: &Node<'a>, node: &Node<'a>, splits: &Splits<
     let [p1, p2, ..] = terms(["p1", "p2", "p1", "p2"])?;
     let model = node.opt("camera_model")?.or(top.opt("camera_model")?).map(|n| n.text()).transpose()?;
     let lens = lens(model.unwrap_or("OPENCV"), k, [p1, p2]).map_err(|e| node.at(e))?;
-    let source = Camera { cam_from_world, intrinsics: Intrinsics { fx, fy, cx, cy }, lens, width, height };
+    let source =
+        Camera { cam_from_world, intrinsics: Intrinsics { fx, fy, cx, cy }, lens, width, height, near: Camera::NEAR };
     let time = node.opt("time")?.map(|n| n.number()).transpose()?;
     let mask = node.opt("mask_path")?.map(|n| n.text()).transpose()?;
     Ok(Entry { name, source, time, mask, split: splits.of(name) })

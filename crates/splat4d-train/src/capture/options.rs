@@ -55,7 +55,15 @@ pub struct CaptureOptions {
     pub unit_time_seconds: Option<f64>,
     /// Most points of the initial cloud; larger clouds are thinned by voxel.
     pub max_points: usize,
+    /// How near to a camera splats are drawn, as a share of the cameras' extent; less where the capture's points come
+    /// nearer.
+    pub near: f64,
 }
+
+/// Default of [`CaptureOptions::near`]. Kerbl et al. 2023 draw nothing nearer than 0.2 units, which is this share of the
+/// extent of a rig four units wide. Without it haze in front of places where no training camera stands costs nothing:
+/// a camera that is mounted in a wall looks through the wall's own splats.
+pub const NEAR: f64 = 0.05;
 
 /// Most points an initial cloud keeps by default.
 pub const MAX_POINTS: usize = 40_000;
@@ -69,6 +77,7 @@ impl Default for CaptureOptions {
             background: None,
             unit_time_seconds: None,
             max_points: MAX_POINTS,
+            near: NEAR,
         }
     }
 }
@@ -83,6 +92,11 @@ impl CaptureOptions {
             if let Some(value) = value {
                 check_rate(name, value)?;
             }
+        }
+        if !(0.0..1.0).contains(&self.near) {
+            return Err(
+                Error::input(format!("near is {}", self.near)).remedy("Give a share of the extent from 0 to below 1.")
+            );
         }
         if self.background.is_some_and(|b| b.iter().any(|v| !(0.0..=1.0).contains(v))) {
             return Err(Error::input("the background is outside [0,1]").remedy("Give three numbers from 0 to 1."));

@@ -221,7 +221,7 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
         };
         frames.push(RawFrame {
             camera: context.camera,
-            source: Camera { cam_from_world, intrinsics, lens, width, height },
+            source: Camera { cam_from_world, intrinsics, lens, width, height, near: Camera::NEAR },
             time: index as f64 / context.fps + offset,
             index,
             image,

@@ -72,6 +72,7 @@ fn read_meta(root: &Path, top: &Node<'_>, split: Split, fps: f64, out: &mut Vec<
                 lens: Lens::Pinhole,
                 width,
                 height,
+                near: Camera::NEAR,
             };
             let mask = Some(root.join(mask)).filter(|m| m.is_file());
             let image = root.join("ims").join(name);

@@ -1,6 +1,7 @@
 //! Where Gaussians start: the capture's points, the visual hull of the masks at several moments, or random points in the
 //! volume that the cameras share.
 
+pub mod fill;
 pub mod hull;
 pub mod volume;
 
@@ -115,6 +116,9 @@ pub fn seeds(plan: &Plan, frames: &dyn Frames, points: Option<Seeds>, moving: bo
     let use_hull = frames.has_masks() && matches!(r.init.as_str(), "auto" | "hull") && (moving || !have_points);
     if have_points && r.init != "random" && r.init != "hull" {
         out.append(points.expect("just seen"));
+        if r.init == "auto" && out.len() < r.num_pts {
+            out.append(fill::between(frames, &out.points, r.num_pts - out.len())?);
+        }
     }
     if use_hull {
         out.append(hull::carve(frames, &volume, &times, r.num_pts, moving, rng.fork(1))?);

@@ -50,7 +50,7 @@ pub fn common(frames: &dyn Frames) -> Volume {
 }
 
 /// Cramer's rule; `None` when singular.
-fn solve(a: [[f64; 3]; 3], b: [f64; 3]) -> Option<[f64; 3]> {
+pub(super) fn solve(a: [[f64; 3]; 3], b: [f64; 3]) -> Option<[f64; 3]> {
     use splat4d::math::se3::cross;
     let columns: [[f64; 3]; 3] = std::array::from_fn(|c| std::array::from_fn(|r| a[r][c]));
     let det = dot(columns[0], cross(columns[1], columns[2]));

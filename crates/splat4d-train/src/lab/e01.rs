@@ -171,7 +171,7 @@ fn camera() -> Camera {
     let [width, height] = SIZE;
     let intrinsics = Intrinsics { fx: FOCAL, fy: FOCAL, cx: 0.5 * width as f64, cy: 0.5 * height as f64 };
     let cam_from_world = Se3 { rotation: identity, translation: [0.0; 3] };
-    Camera { cam_from_world, intrinsics, lens: Lens::Pinhole, width, height }
+    Camera { cam_from_world, intrinsics, lens: Lens::Pinhole, width, height, near: Camera::NEAR }
 }
 
 /// Where every point is at every frame.

@@ -61,6 +61,8 @@ const ROLLBACK_RATE: f64 = 0.5;
 const SMOOTHING: f64 = 0.05;
 /// Rows of metrics.csv in a whole run, about.
 const METRIC_ROWS: usize = 600;
+/// Extent of cameras in a single place, scene units.
+const SINGLE_PLACE: f64 = 1e-6;
 /// Seconds between two progress events.
 const PROGRESS_SECONDS: f64 = 0.25;
 /// The options with which a recipe opens its capture.
@@ -71,6 +73,7 @@ pub fn capture_options(recipe: &Recipe) -> Result<CaptureOptions> {
         hold_out,
         fps: (recipe.fps > 0.0).then_some(recipe.fps),
         background: (!recipe.white_background).then_some([0.0; 3]),
+        near: recipe.near,
         ..CaptureOptions::default()
     })
 }
@@ -277,10 +280,11 @@ pub fn plan(capture: &Capture, recipe: &Recipe) -> Plan {
     seen.sort_by(f64::total_cmp);
     let views = |t: f64| seen.partition_point(|s| *s <= t) - seen.partition_point(|s| *s < t);
     let moments = times.iter().map(|&t| (t, views(t))).collect();
-    let centers: Vec<[f64; 3]> = capture.train.iter().map(|&i| capture.frames[i].view.center()).collect();
+    // Cameras that all stand in one place say nothing of the scene's size.
+    let radius = capture.center_and_radius().1;
     Plan {
         recipe: recipe.resolve(),
-        extent: extent(&centers),
+        extent: if radius > SINGLE_PLACE { radius } else { 1.0 },
         clip,
         fps: capture.fps,
         times: times.len(),
@@ -376,15 +380,6 @@ impl Bench {
         let neutral = Recipe { image_memory: 0, memory_limit: 0, checkpoint_interval: 0, ..recipe.clone() };
         Identity { capture: fingerprint(&self.capture), recipe: hash(&(neutral.to_toml() + text)) }
     }
-}
-
-/// 1.1 times the largest distance of a camera from the cameras' centroid (Kerbl et al. 2023); 1 for a single place.
-fn extent(centers: &[[f64; 3]]) -> f64 {
-    use splat4d::math::se3::{norm, sub};
-    let n = centers.len().max(1) as f64;
-    let centroid: [f64; 3] = std::array::from_fn(|k| centers.iter().map(|c| c[k]).sum::<f64>() / n);
-    let largest = centers.iter().map(|&c| norm(sub(c, centroid))).fold(0.0, f64::max);
-    if largest > 0.0 { 1.1 * largest } else { 1.0 }
 }
 
 /// Names, sizes, poses and times of a capture in 16 hexadecimal digits.

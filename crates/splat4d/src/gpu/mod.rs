@@ -404,7 +404,7 @@ fn view(camera: &Camera, config: &RenderConfig, splats: usize) -> [u32; 32] {
     }
     out[15] = 1f32.to_bits();
     let alpha_min = config.alpha_min.max(ALPHA_FLOOR);
-    let numbers = [k.fx, k.fy, k.cx, k.cy, camera.width as f64, camera.height as f64, config.near, config.low_pass];
+    let numbers = [k.fx, k.fy, k.cx, k.cy, camera.width as f64, camera.height as f64, camera.near, config.low_pass];
     for (to, v) in out[16..24].iter_mut().zip(numbers) {
         *to = (v as f32).to_bits();
     }

@@ -56,8 +56,6 @@ pub enum Antialias {
 /// What the renderer may be told.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RenderConfig {
-    /// Splats with z ≤ near are not drawn, scene units.
-    pub near: f64,
     /// α below this is skipped.
     pub alpha_min: f64,
     /// α is never above this.
@@ -79,10 +77,9 @@ pub struct RenderConfig {
 }
 
 impl Default for RenderConfig {
-    /// near as gsplat; the blend's limits as Kerbl et al. 2023; no depth; the best instructions of this machine.
+    /// The blend's limits as Kerbl et al. 2023; no depth; the best instructions of this machine.
     fn default() -> Self {
         Self {
-            near: 0.01,
             alpha_min: 1.0 / 255.0,
             alpha_max: 0.99,
             transmittance_min: 1e-4,

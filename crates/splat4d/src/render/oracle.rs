@@ -103,7 +103,7 @@ fn blob<F: Real>(part: &Part<'_, F>, j: usize, id: usize, camera: &Camera, confi
     let pose = &camera.cam_from_world;
     let k = &camera.intrinsics;
     let p = pose.apply(mean);
-    if p[2] <= config.near {
+    if p[2] <= camera.near {
         return None;
     }
     // J, with x/z and y/z held inside the picture and its margin.

@@ -129,7 +129,7 @@ impl<F: Real> View<F> {
             high: [F::of((w - k.cx) / k.fx + margin[0]), F::of((h - k.cy) / k.fy + margin[1])],
             width: camera.width,
             height: camera.height,
-            near: F::of(config.near),
+            near: F::of(camera.near),
             low_pass: F::of(config.low_pass),
             alpha_min: F::of(config.alpha_min.max(ALPHA_FLOOR)),
             antialias: config.antialias,

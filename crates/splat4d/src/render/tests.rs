@@ -92,7 +92,7 @@ fn camera(width: usize, height: usize) -> Camera {
     let pose = Se3::look_at([0.8, -0.5, -4.0], [0.0; 3], [0.1, -1.0, 0.0]);
     let f = 0.9 * width.max(height) as f64;
     let intrinsics = Intrinsics { fx: f, fy: 1.1 * f, cx: 0.47 * width as f64, cy: 0.52 * height as f64 };
-    Camera { cam_from_world: pose, intrinsics, lens: Lens::Pinhole, width, height }
+    Camera { cam_from_world: pose, intrinsics, lens: Lens::Pinhole, width, height, near: Camera::NEAR }
 }
 
 /// Draws and differentiates all that there is.
@@ -318,7 +318,14 @@ fn direct<'a>(out: &'a Table<f64>, rgb: &'a Table<f64>) -> Splats<'a, f64> {
 fn frontal(size: usize, f: f64) -> Camera {
     let c = 0.5 * size as f64;
     let intrinsics = Intrinsics { fx: f, fy: f, cx: c, cy: c };
-    Camera { cam_from_world: Se3::IDENTITY, intrinsics, lens: Lens::Pinhole, width: size, height: size }
+    Camera {
+        cam_from_world: Se3::IDENTITY,
+        intrinsics,
+        lens: Lens::Pinhole,
+        width: size,
+        height: size,
+        near: Camera::NEAR,
+    }
 }
 
 #[test]

@@ -51,14 +51,19 @@ pub struct Camera {
     pub width: usize,
     /// Pixels down.
     pub height: usize,
+    /// Splats with z ≤ near are not drawn, scene units.
+    pub near: f64,
 }
 
 impl Camera {
+    /// Where nothing else is known, splats nearer than this are not drawn (as gsplat).
+    pub const NEAR: f64 = 0.01;
+
     /// A pinhole camera with square pixels, its principal point in the middle. `fov_y` in radians.
     pub fn with_fov_y(cam_from_world: Se3, fov_y: f64, width: usize, height: usize) -> Self {
         let f = 0.5 * height as f64 / (0.5 * fov_y).tan();
         let intrinsics = Intrinsics { fx: f, fy: f, cx: 0.5 * width as f64, cy: 0.5 * height as f64 };
-        Self { cam_from_world, intrinsics, lens: Lens::Pinhole, width, height }
+        Self { cam_from_world, intrinsics, lens: Lens::Pinhole, width, height, near: Self::NEAR }
     }
 
     /// The camera's centre in the world.

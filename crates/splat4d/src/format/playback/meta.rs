@@ -72,6 +72,13 @@ pub struct NamedCamera {
     pub cx: f64,
     /// Principal point, pixels.
     pub cy: f64,
+    /// Nothing as near as this or nearer is drawn, scene units; readers that do not know it draw a little more.
+    #[serde(default = "nothing_nearer")]
+    pub near: f64,
+}
+
+fn nothing_nearer() -> f64 {
+    Camera::NEAR
 }
 
 /// A key of a camera path.
@@ -102,7 +109,8 @@ impl NamedCamera {
         let cell = |i: usize| if i % 4 < 3 { world.rotation[i / 4][i % 4] } else { world.translation[i / 4] };
         let Intrinsics { fx, fy, cx, cy } = camera.intrinsics;
         let (width, height) = (camera.width, camera.height);
-        Self { name: name.to_owned(), world_from_camera: std::array::from_fn(cell), width, height, fx, fy, cx, cy }
+        let (name, near) = (name.to_owned(), camera.near);
+        Self { name, world_from_camera: std::array::from_fn(cell), width, height, fx, fy, cx, cy, near }
     }
 
     /// As the renderer wants it; none where the numbers are no camera.
@@ -112,7 +120,7 @@ impl NamedCamera {
             rotation: std::array::from_fn(|i| std::array::from_fn(|j| m[4 * i + j])),
             translation: [m[3], m[7], m[11]],
         };
-        let finite = m.iter().chain([&self.fx, &self.fy, &self.cx, &self.cy]).all(|x| x.is_finite());
+        let finite = m.iter().chain([&self.fx, &self.fy, &self.cx, &self.cy, &self.near]).all(|x| x.is_finite());
         let rigid = world.orthogonality_error() <= NOT_A_ROTATION && world.det() > 0.0;
         let sound = finite && rigid && self.fx > 0.0 && self.fy > 0.0 && self.width > 0 && self.height > 0;
         sound.then(|| Camera {
@@ -121,6 +129,7 @@ impl NamedCamera {
             lens: Lens::Pinhole,
             width: self.width,
             height: self.height,
+            near: self.near,
         })
     }
 }

@@ -11,7 +11,7 @@ const EXACT: f64 = 1e3;
 fn view(width: usize, height: usize, antialias: Antialias) -> View<f32> {
     let intrinsics = Intrinsics { fx: 300.0, fy: 310.0, cx: 0.5 * width as f64, cy: 0.4 * height as f64 };
     let cam_from_world = Se3::look_at([0.5, -0.4, -4.0], [0.0; 3], [0.1, -1.0, 0.0]);
-    let camera = Camera { cam_from_world, intrinsics, lens: Lens::Pinhole, width, height };
+    let camera = Camera { cam_from_world, intrinsics, lens: Lens::Pinhole, width, height, near: Camera::NEAR };
     View::new(&camera, &RenderConfig { antialias, ..RenderConfig::default() })
 }
 
