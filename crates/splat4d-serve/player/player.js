@@ -5,7 +5,7 @@ import { Camera, bounds, clamp, datasetCamera, dot, add, firstCamera, linkText }
 import { Controls } from './controls.js';
 import { Pace } from './pace.js';
 import { SceneError } from './errors.js';
-import { SceneFile } from './scene-file.js';
+import { NEAR, SceneFile } from './scene-file.js';
 import { Stream } from './stream.js';
 import { Track } from './track.js';
 
@@ -29,6 +29,8 @@ const STEP_MAX = 0.25;
 const REFINE = [[300, 400], [1500, 4000]];
 /** A move of half the picture's height in a second shows at full strength in the flow view. */
 const FLOW_SHARE = 0.5;
+/** Beyond this share of the way to what is looked at nothing is cut off. */
+const NEAR_SHARE = 0.2;
 /** A device that is lost more often than this within a minute is given up. */
 const LOSSES = 3;
 /** Points of the clip at which the buffer bar asks what is there, and how often, ms. */
@@ -559,8 +561,11 @@ export class Player extends EventTarget {
   drawing(width, height, camera = this.camera) {
     const { center, radius } = bounds(this.meta);
     const middle = dot(add(center, camera.position, -1), camera.forward);
+    // The capture's cameras saw no haze right before them. Who comes closer to look at something wants to see it.
+    const least = this.meta.near ?? NEAR;
+    const near = camera.lens ? least : Math.min(least, NEAR_SHARE * camera.distance);
     return {
-      time: this.shown, view: camera.view(width, height), channel: this.channel,
+      time: this.shown, view: { ...camera.view(width, height), near }, channel: this.channel,
       background: this.background ?? this.meta.background,
       depthRange: [Math.max(middle - radius, 0.02 * radius), Math.max(middle, 0) + radius],
       flowScale: FLOW_SHARE * height,

@@ -362,6 +362,10 @@ export class SceneFile {
     need(Number.isSafeInteger(j.gaussians) && j.gaussians >= 0, 'gaussians');
     const box = Array.isArray(j.box) && j.box.length === 2 && j.box.every((c) => numbers(c, 3)) ? j.box : null;
     const up = j.up.map((v) => v / Math.hypot(...j.up));
+    const cameras = list(j.cameras)
+      .filter(camera)
+      .map((c, i) => ({ ...c, name: text(c.name) ?? `camera ${i + 1}` }));
+    const nears = cameras.map((c) => c.near).filter((v) => number(v) && v > 0);
     return {
       clip: [...j.clip],
       fps: j.fps,
@@ -374,15 +378,17 @@ export class SceneFile {
       generator: text(j.generator),
       box,
       view: look(j.view) ? j.view : null,
-      cameras: list(j.cameras)
-        .filter(camera)
-        .map((c, i) => ({ ...c, name: text(c.name) ?? `camera ${i + 1}` })),
+      cameras,
+      near: nears.length ? Math.min(...nears) : NEAR,
       path: list(j.path)
         .filter((k) => look(k) && number(k.at))
         .map((k) => ({ ...k, time: number(k.time) ? k.time : null })),
     };
   }
 }
+
+/// Nothing as near as this is drawn where the cameras do not say.
+export const NEAR = 0.01;
 
 const number = (v) => typeof v === 'number' && Number.isFinite(v);
 const numbers = (v, n) => Array.isArray(v) && v.length === n && v.every(number);

@@ -15,6 +15,7 @@ import {
   SHOW_VERTEX,
 } from './glsl.js';
 import { Order } from './order.js';
+import { NEAR } from './scene-file.js';
 import './sort.worker.js';
 
 const { ROW } = globalThis.splat4dSort;
@@ -29,10 +30,8 @@ const BLOCK = 256,
 const TIMES = [6, 7, 8, 9];
 /// Rows of the words' texture to begin with: 2 MiB each 64.
 const FIRST_ROWS = 256;
-/// z ≤ near is not drawn; x/z and y/z inside J may leave the picture by this share of its half-width's tangent
-/// (CONVENTIONS.md).
-const NEAR = 0.01,
-  J_MARGIN = 0.3;
+/// x/z and y/z inside J may leave the picture by this share of its half-width's tangent (CONVENTIONS.md).
+const J_MARGIN = 0.3;
 
 export class WebGL2Backend {
   /// Throws SceneError where WebGL2 is not to be had. `onlost(SceneError)` is called when the browser takes it away.
@@ -457,7 +456,7 @@ export class WebGL2Backend {
     gl.uniform2f(at.high, (width - cx) / fx + mx, (height - cy) / fy + my);
     gl.uniform2f(at.depth_range, depthRange[0], depthRange[1]);
     gl.uniform1f(at.time, time - this.#clip[0]);
-    gl.uniform1f(at.near, NEAR);
+    gl.uniform1f(at.near, view.near ?? NEAR);
     gl.uniform1f(at.flow_scale, flowScale);
     gl.uniform1i(at.channel, CHANNELS[channel]);
     if (at.count) gl.uniform1i(at.count, this.#count);

@@ -4,6 +4,7 @@
 
 import { SceneError } from './errors.js';
 import { CULL, DRAW, PROJECT, RESIDENT, SHADE, SORT } from './shaders.js';
+import { NEAR } from './scene-file.js';
 import './sort.worker.js';
 
 const { KeyMask } = globalThis.splat4dSort;
@@ -35,7 +36,6 @@ const TIME_BYTES = 32;
 const FRAME_WORDS = 40;
 const VIEW_WORDS = 32;
 /// Constants of the renderer (CONVENTIONS.md).
-const NEAR = 0.01;
 const LOW_PASS = 0.3;
 const ALPHA_MIN = 1 / 255;
 /// Workgroups along x; more go along y. WebGPU's default limit is 65,535.
@@ -547,7 +547,7 @@ export class WebGPUBackend {
     f[19] = view.cy;
     f[20] = view.width;
     f[21] = view.height;
-    f[22] = NEAR;
+    f[22] = view.near ?? NEAR;
     f[23] = LOW_PASS;
     for (let c = 0; c < 3; c++) f[24 + c] = -(m[c] * m[3] + m[4 + c] * m[7] + m[8 + c] * m[11]);
     f[27] = ALPHA_MIN;

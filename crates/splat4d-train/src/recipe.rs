@@ -73,7 +73,8 @@ recipe! {
     fps: f64 = 0.0,
     /// Only this many frames of the take; 0: all.
     max_frames: usize = 0,
-    /// How near to a camera Gaussians are drawn, of the extent; less where the capture's points come nearer.
+    /// How near to a camera Gaussians are drawn, of the extent; less where the capture's points come nearer, a quarter of it
+    /// where there are none.
     near: f64 = crate::capture::NEAR,
     /// First frame of the take that is used.
     first_frame: usize = 0,
@@ -483,10 +484,10 @@ recipe! {
     opacity_reg: f64 = 0.01,
     /// Weight of the mean scale.
     scale_reg: f64 = 0.01,
-    /// Learn a gain and an offset a camera and channel.
-    exposure: bool = false,
-    /// Rate of the exposure.
-    exposure_lr: f64 = 1e-4,
+    /// Learn a gain and an offset a camera and channel, where there is more than one camera; their mean stays the identity.
+    exposure: bool = true,
+    /// Rate of the exposure (Luiten et al., 10,000 steps: 1e-4).
+    exposure_lr: f64 = 1e-3,
     /// Antialiased mode (opacity compensation).
     antialias: bool = false,
     /// Iterations between checkpoints; 0: iterations/10.
@@ -620,6 +621,9 @@ impl Recipe {
             if !(value > 0.0 && value < 1.0) {
                 return bad(knob, value.to_string(), "above 0 and below 1");
             }
+        }
+        if !(0.0..1.0).contains(&self.near) {
+            return bad("near", self.near.to_string(), "from 0 to below 1");
         }
         if !(1..=MAX_BASELINE).contains(&self.filter_baseline) {
             return bad("filter_baseline", self.filter_baseline.to_string(), &format!("1 to {MAX_BASELINE}"));

@@ -74,6 +74,9 @@ const BEFORE_POINTS: f64 = 0.5;
 /// Some distance there must be, of the extent: the projection divides by it.
 const SMALLEST_NEAR: f64 = 1e-3;
 
+/// Of the wanted share, where no points say how near things come.
+const UNKNOWN_DEPTH: f64 = 0.25;
+
 /// How near splats are drawn, scene units: this share of the extent, or half way to the nearest of the capture's points.
 fn near(capture: &Capture, share: f64) -> f64 {
     let cloud = capture.points.as_ref().map_or(&[][..], |p| &p.points);
@@ -91,9 +94,12 @@ fn near(capture: &Capture, share: f64) -> f64 {
         depths.extend(cloud.iter().filter_map(|&x| view.project(x)).filter(inside).map(|(_, z)| z));
     }
     let at = (STRAY_POINTS * depths.len() as f64) as usize;
-    let nearest = if depths.is_empty() { f64::INFINITY } else { *depths.select_nth_unstable_by(at, f64::total_cmp).1 };
     let extent = capture.center_and_radius().1;
-    (share * extent).min(BEFORE_POINTS * nearest).max(Camera::NEAR.min(SMALLEST_NEAR * extent))
+    let farthest = match depths.is_empty() {
+        true => UNKNOWN_DEPTH * share * extent,
+        false => BEFORE_POINTS * *depths.select_nth_unstable_by(at, f64::total_cmp).1,
+    };
+    (share * extent).min(farthest).max(Camera::NEAR.min(SMALLEST_NEAR * extent))
 }
 
 /// The pinhole view of the picture as it will be loaded.

@@ -355,12 +355,11 @@ impl Bench {
             simd: self.simd,
             ..RenderConfig::default()
         };
-        let exposure = r.exposure.then(|| {
-            let mut trained: Vec<usize> = self.capture.train.iter().map(|&i| self.capture.frames[i].camera).collect();
-            trained.sort_unstable();
-            trained.dedup();
-            Exposure::new(self.capture.cameras.len(), trained)
-        });
+        let mut trained: Vec<usize> = self.capture.train.iter().map(|&i| self.capture.frames[i].camera).collect();
+        trained.sort_unstable();
+        trained.dedup();
+        // A single camera's gain is its own mean, which stays the identity.
+        let exposure = (r.exposure && trained.len() > 1).then(|| Exposure::new(self.capture.cameras.len(), trained));
         let settings = Settings {
             seed: r.seed,
             limits: Limits { cap: r.max_cap, extent: plan.extent, min_opacity: r.min_opacity },

@@ -276,3 +276,28 @@ fn preflight_speaks_of_few_cameras() {
     assert!(findings.iter().any(|f| f.severity == Severity::Warning && f.what.contains("extrapolated views")));
     assert!(findings.iter().any(|f| f.what.contains("unevenly spaced")), "offsets of 10 ms in a 100 ms grid");
 }
+
+#[test]
+fn near_is_a_share_of_the_extent_and_never_hides_points() {
+    let sample = samples::own();
+    let near = |share: f64| {
+        let capture = open_with(&sample, CaptureOptions { near: share, ..CaptureOptions::default() });
+        assert!(capture.frames.iter().all(|f| f.view.near == capture.frames[0].view.near), "held-out views, too");
+        (capture.frames[0].view.near, capture)
+    };
+    let (little, capture) = near(0.05);
+    let radius = capture.center_and_radius().1;
+    assert!((little - 0.05 * radius).abs() < 1e-12, "{little} of {radius}");
+    let close = capture.frames[capture.train[0]].view.unproject([12.0, 8.0], 0.6);
+    let ply = std::fs::read_to_string(sample.path("points.ply")).unwrap();
+    let moved = ply.replace("0 0 0.3 255", &format!("{} {} {} 255", close[0], close[1], close[2]));
+    sample.write("points.ply", moved.as_bytes());
+    assert!((near(0.9).0 - 0.3).abs() < 1e-6, "half way to the nearest point, not {}", near(0.9).0);
+    sample.edit("capture.json", |value| drop(value.as_object_mut().unwrap().remove("points")));
+    assert!((near(0.2).0 - 0.05 * radius).abs() < 1e-12, "a quarter where no points say how near things come");
+    assert!(near(0.0).0 > 0.0, "the projection divides by z");
+    for share in [-0.1, 1.0, f64::NAN] {
+        let error = Capture::open(sample.root(), &CaptureOptions { near: share, ..CaptureOptions::default() });
+        assert!(error.unwrap_err().to_string().contains("near is"));
+    }
+}
