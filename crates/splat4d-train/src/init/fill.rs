@@ -128,7 +128,7 @@ fn depth(marks: &[Mark], [u, v]: [f64; 2]) -> f64 {
                 b[r] += weight * trust * row[r] * inverse;
             }
         }
-        plane = super::volume::solve(a, b).unwrap_or([order_mean(&rows), 0.0, 0.0]);
+        plane = super::volume::solve(a, b).unwrap_or([rows[0].1, 0.0, 0.0]);
         for ((row, inverse, _), trust) in rows.iter().zip(&mut trust) {
             let off = inverse - (0..3).map(|k| row[k] * plane[k]).sum::<f64>();
             *trust = 1.0 / (1.0 + (off / (OUTLIER * plane[0].abs())).powi(2));
@@ -136,10 +136,6 @@ fn depth(marks: &[Mark], [u, v]: [f64; 2]) -> f64 {
     }
     let (low, high) = rows.iter().fold((f64::INFINITY, 0.0_f64), |(l, h), r| (l.min(r.1), h.max(r.1)));
     1.0 / plane[0].clamp(low, high)
-}
-
-fn order_mean(rows: &[([f64; 3], f64, f64)]) -> f64 {
-    rows.iter().map(|r| r.1).sum::<f64>() / rows.len() as f64
 }
 
 #[cfg(test)]
