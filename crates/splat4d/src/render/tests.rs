@@ -351,6 +351,21 @@ fn one_gaussian_has_the_profile_and_energy_of_its_equation() {
 }
 
 #[test]
+fn what_is_as_near_as_the_cameras_near_is_not_drawn() {
+    let (out, rgb) = simple(&[([0.0, 0.0, 0.5], 1e-3, 0.6), ([0.0, 0.0, 2.0], 0.01, 0.6)]);
+    let far = simple(&[([0.0, 0.0, 2.0], 0.01, 0.6)]);
+    for (near, alone) in [(0.49, false), (0.5, true), (1.0, true)] {
+        let view = Camera { near, ..frontal(33, 50.0) };
+        let (mut both, mut one) = (Image::default(), Image::default());
+        Renderer::new(smooth()).render(&direct(&out, &rgb), &view, [0.0; 3], None, &mut both);
+        Renderer::new(smooth()).render(&direct(&far.0, &far.1), &view, [0.0; 3], None, &mut one);
+        assert_eq!(both.alpha == one.alpha, alone, "near {near}");
+        let truth = oracle::render(&direct(&out, &rgb), &view, [0.0; 3], None, &smooth());
+        assert!(difference(&both, &truth, 1e-9).0 < 1e-9, "the oracle draws the same");
+    }
+}
+
+#[test]
 fn order_of_rows_does_not_matter_and_alpha_is_one_minus_transmittance() {
     let s = scene(3, 30, 0.2);
     let view = camera(50, 41);

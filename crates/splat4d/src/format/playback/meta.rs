@@ -54,7 +54,7 @@ pub struct Viewpoint {
 }
 
 /// A camera of the capture; its pictures are without distortion.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct NamedCamera {
     /// As the capture calls it.
     pub name: String,
@@ -79,6 +79,15 @@ pub struct NamedCamera {
 
 fn nothing_nearer() -> f64 {
     Camera::NEAR
+}
+
+impl Default for NamedCamera {
+    /// No camera, but for the near distance.
+    fn default() -> Self {
+        let (name, world_from_camera) = (String::new(), [0.0; 12]);
+        let [fx, fy, cx, cy] = [0.0; 4];
+        Self { name, world_from_camera, width: 0, height: 0, fx, fy, cx, cy, near: Camera::NEAR }
+    }
 }
 
 /// A key of a camera path.
@@ -183,6 +192,11 @@ mod tests {
         let (a, b) = (camera.cam_from_world.apply(x), back.cam_from_world.apply(x));
         assert!((0..3).all(|k| (a[k] - b[k]).abs() < 1e-12), "{a:?} {b:?}");
         assert_eq!((back.intrinsics, back.width, back.height), (camera.intrinsics, 320, 200));
+        let near = NamedCamera::new("near", &Camera { near: 0.3, ..camera.clone() });
+        let text = serde_json::to_string(&near).unwrap();
+        assert_eq!(serde_json::from_str::<NamedCamera>(&text).unwrap().camera().unwrap().near, 0.3);
+        let without = serde_json::from_str::<NamedCamera>(&text.replace(",\"near\":0.3", "")).unwrap();
+        assert_eq!(without.near, Camera::NEAR, "files of older writers say nothing of it");
         let mut flat = named.clone();
         flat.world_from_camera[0] += 0.1;
         assert!(flat.camera().is_none() && NamedCamera { fx: -1.0, ..named }.camera().is_none());
