@@ -2,6 +2,8 @@
 // OpenCV's (x right, y down, z forward), as everywhere in splat4d.
 
 export const DEGREE = Math.PI / 180;
+/** Nothing as near as this is drawn where cameras do not say, scene units. */
+export const NEAR = 0.01;
 /** Field of view where nobody states one: that of a normal lens. */
 const FOV_DEFAULT = 45;
 /** Widest and narrowest picture, degrees: wider is a fisheye's business, narrower shows single Gaussians. */

@@ -1,11 +1,11 @@
 // The player without a face: clock, camera, streaming, choice of the backend, resolution and figures. It draws only
 // when something has changed.
 
-import { Camera, bounds, clamp, datasetCamera, dot, add, firstCamera, linkText } from './camera.js';
+import { Camera, NEAR, bounds, clamp, datasetCamera, dot, add, firstCamera, linkText } from './camera.js';
 import { Controls } from './controls.js';
 import { Pace } from './pace.js';
 import { SceneError } from './errors.js';
-import { NEAR, SceneFile } from './scene-file.js';
+import { SceneFile } from './scene-file.js';
 import { Stream } from './stream.js';
 import { Track } from './track.js';
 

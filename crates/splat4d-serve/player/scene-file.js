@@ -1,6 +1,7 @@
 // A playback file (docs/format.md), read in parts: index, pages, key masks, palettes, poster. Trusts no number of it.
 
 import { worker } from './assets.js';
+import { NEAR } from './camera.js';
 import './decode.worker.js';
 import { SceneError, isAbort } from './errors.js';
 import { Local, Remote } from './ranges.js';
@@ -386,9 +387,6 @@ export class SceneFile {
     };
   }
 }
-
-/// Nothing as near as this is drawn where the cameras do not say.
-export const NEAR = 0.01;
 
 const number = (v) => typeof v === 'number' && Number.isFinite(v);
 const numbers = (v, n) => Array.isArray(v) && v.length === n && v.every(number);

@@ -1,5 +1,6 @@
 // The WebGL2 backend: words in textures, order from a worker, blending in half floats where that is to be had.
 
+import { NEAR } from './camera.js';
 import { SceneError } from './errors.js';
 import { Rows, Timer, check, program, texture } from './gl.js';
 import {
@@ -15,7 +16,6 @@ import {
   SHOW_VERTEX,
 } from './glsl.js';
 import { Order } from './order.js';
-import { NEAR } from './scene-file.js';
 import './sort.worker.js';
 
 const { ROW } = globalThis.splat4dSort;

@@ -2,9 +2,9 @@
 // time or the view happens there (cull.wgsl, sort.wgsl, draw.wgsl). The CPU writes 160 bytes a frame, and the list of
 // blocks, with the bits of their key masks, where the set of pages or the key times around this time change.
 
+import { NEAR } from './camera.js';
 import { SceneError } from './errors.js';
 import { CULL, DRAW, PROJECT, RESIDENT, SHADE, SORT } from './shaders.js';
-import { NEAR } from './scene-file.js';
 import './sort.worker.js';
 
 const { KeyMask } = globalThis.splat4dSort;
