@@ -60,11 +60,6 @@ pub struct CaptureOptions {
     pub near: f64,
 }
 
-/// Default of [`CaptureOptions::near`]: a camera that is mounted in a wall looks through the wall's own splats, and haze in
-/// front of places where no training camera stands costs nothing. PanopticSports basketball, four minutes, held-out
-/// cameras: 27.1 dB with 0.05 (Kerbl et al. 2023 draw nothing nearer than 0.2 units, about that share), 28.1 with this.
-pub const NEAR: f64 = 0.2;
-
 /// Most points an initial cloud keeps by default.
 pub const MAX_POINTS: usize = 40_000;
 
@@ -77,7 +72,7 @@ impl Default for CaptureOptions {
             background: None,
             unit_time_seconds: None,
             max_points: MAX_POINTS,
-            near: NEAR,
+            near: crate::recipe::NEAR,
         }
     }
 }
