@@ -14,7 +14,7 @@ use splat4d::{Error, Result};
 use splat4d_train::recipe::nearest;
 use std::path::Path;
 
-const KEYS: [&str; 8] = ["fx", "fy", "cx", "cy", "w", "h", "world_to_camera", "background"];
+const KEYS: [&str; 9] = ["fx", "fy", "cx", "cy", "w", "h", "world_to_camera", "near", "background"];
 /// Longest side of a picture that is drawn, pixels.
 pub(crate) const MAX_SIDE: usize = 16_384;
 /// Most pixels of a picture that is drawn: 8K video twice over; about 4 GiB of working memory.
@@ -74,7 +74,11 @@ fn parse(text: &str) -> Result<(Camera, [f32; 3])> {
             })?
         }
     };
-    Ok((Camera { cam_from_world, intrinsics, lens: Lens::Pinhole, width, height, near: Camera::NEAR }, background))
+    let near = if value.get("near").is_some() { number("near")? } else { Camera::NEAR };
+    if near <= 0.0 {
+        return Err(Error::input(format!("\"near\" is {near}")).remedy("Give a distance above zero, in scene units."));
+    }
+    Ok((Camera { cam_from_world, intrinsics, lens: Lens::Pinhole, width, height, near }, background))
 }
 
 /// Parses JSON; the error says what is usually wrong.
@@ -133,7 +137,7 @@ fn missing(key: &str) -> Error {
 }
 
 fn known_keys() -> String {
-    format!("A camera needs the keys {}; \"background\" may be left out.", KEYS.join(", "))
+    format!("A camera needs the keys {}; \"near\" and \"background\" may be left out.", KEYS.join(", "))
 }
 
 #[cfg(test)]
@@ -154,6 +158,8 @@ mod tests {
         let mut flat = good();
         flat["world_to_camera"] = json!([1, 0, 0, 0.5, 0, 1, 0, 0, 0, 0, 1, 4, 0, 0, 0, 1]);
         assert_eq!(parse(&flat.to_string()).unwrap().0, camera);
+        flat["near"] = json!(0.3);
+        assert_eq!((camera.near, parse(&flat.to_string()).unwrap().0.near), (Camera::NEAR, 0.3));
     }
 
     #[test]
@@ -177,6 +183,8 @@ mod tests {
             (change("world_to_camera", transposed), "transposed"),
             (change("world_to_camera", zero), "rigid"),
             (change("world_to_camera", json!([[1, 2], [3, 4]])), "4x4"),
+            (change("near", json!(-1)), "\"near\""),
+            (change("near", json!(null)), "\"near\""),
             (change("background", json!([1])), "background"),
             (change("backgroud", json!([1, 1, 1])), "\"background\""),
             (good().to_string().replace("0.5", "NaN"), "NaN"),

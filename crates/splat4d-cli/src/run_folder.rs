@@ -321,7 +321,8 @@ fn read_view(value: &Value) -> Option<View> {
         cx: number("cx").unwrap_or(0.5 * width as f64),
         cy: number("cy").unwrap_or(0.5 * height as f64),
     };
-    let near = number("near").unwrap_or(Camera::NEAR);
+    // Runs of older versions have none.
+    let near = if value.get("near").is_some() { number("near").filter(|n| *n > 0.0)? } else { Camera::NEAR };
     Some(View {
         camera: Camera { cam_from_world: world.inverse(), intrinsics, lens: Lens::Pinhole, width, height, near },
         name: value.get("img_name").and_then(Value::as_str).unwrap_or_default().to_owned(),

@@ -150,8 +150,9 @@ recipe! {
     /// life: life widths never fall below this many frames.
     min_life_frames: f64 = 0.5,
     // deform-mlp.
-    /// deform-mlp: network: mlp (8x256), small, hash (grids and a small network) or hash-linear.
-    deform_trunk: String = "hash".into(),
+    /// deform-mlp: network: mlp (8x256), small, hash (grids and a small network) or hash-linear; auto: hash where cameras
+    /// are fixed, small where all move and a moment is seen once.
+    deform_trunk: String = "auto".into(),
     /// deform-mlp: width of the small and hash networks.
     deform_width: usize = 128,
     /// deform-mlp: hidden layers of the small and hash networks.
@@ -670,7 +671,7 @@ impl Recipe {
             ("prune_score", &self.prune_score, &PRUNE_SCORES[..]),
             ("control_trajectory", &self.control_trajectory, &TRAJECTORIES[..]),
             ("strategy", &self.strategy, &["mcmc", "adc", "none"][..]),
-            ("deform_trunk", &self.deform_trunk, &["mlp", "small", "hash", "hash-linear"][..]),
+            ("deform_trunk", &self.deform_trunk, &["auto", "mlp", "small", "hash", "hash-linear"][..]),
             ("filter", &self.filter, &Fusion::ALL.map(|(name, _)| name)[..]),
             ("filter_predictor", &self.filter_predictor, &Predictor::ALL.map(|(name, _)| name)[..]),
             ("features", &self.features, &["none", FULL][..]),

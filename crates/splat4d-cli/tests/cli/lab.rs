@@ -74,11 +74,11 @@ fn the_filter_is_studied_part_by_part() {
     let capture = Capture::new(work.path()).write();
     let folder = work.path().join("study");
     let study = || {
-        let small = ["--set=num_pts=120", "--set=max_cap=150", "--set=sh_degree=1", "--set=hold_out=camera=1"];
-        // Straight paths have no second difference for the linear regulariser to act on.
-        let small = small.into_iter().chain(["--set=motion_order=2"]).collect::<Vec<_>>();
+        // Straight paths have no second difference for the linear regulariser to act on: order 2.
+        let small =
+            ["num_pts=120", "max_cap=150", "sh_degree=1", "hold_out=camera=1", "motion_order=2"].map(|s| ["--set", s]);
         let order = ["lab", "e02", str(&capture), "-o", str(&folder), "--quick", "--motion", "spacetime"];
-        splat4d(&order).args(&["--iterations", "16", "--downscale", "1"]).args(&small)
+        splat4d(&order).args(&["--iterations", "16", "--downscale", "1"]).args(small.as_flattened())
     };
     let lines = study().args(&["--json"]).run().ok();
     let cells = |lines: &str| -> Vec<Value> {

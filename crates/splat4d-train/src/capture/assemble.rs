@@ -38,8 +38,8 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
     let (train, held, validation) = split(&mut take, &cameras, options).map_err(located)?;
     let up = take.up.map(normalize).filter(|u| norm(*u) > 0.0).unwrap_or_else(|| estimate_up(&take.frames));
     let flows = flows(&mut take.frames);
-    let finish = |(raw, flow)| Frame { flow, ..finish(raw, options.downscale) };
-    let frames: Vec<Frame> = take.frames.into_iter().zip(flows).map(finish).collect();
+    let frames = take.frames.into_iter().zip(flows);
+    let frames: Vec<Frame> = frames.map(|(raw, flow)| Frame { flow, ..finish(raw, options.downscale) }).collect();
     let name = take.name.unwrap_or_else(|| {
         let full = std::path::absolute(&take.root).unwrap_or_else(|_| take.root.clone());
         full.file_name().map_or_else(|| "capture".into(), |n| n.to_string_lossy().into_owned())
@@ -81,13 +81,7 @@ const UNKNOWN_DEPTH: f64 = 0.25;
 fn near(capture: &Capture, share: f64) -> f64 {
     let cloud = capture.points.as_ref().map_or(&[][..], |p| &p.points);
     let mut depths: Vec<f64> = Vec::new();
-    let mut last: Option<&Camera> = None;
-    for view in capture.train.iter().map(|&i| &capture.frames[i].view) {
-        // A fixed camera's frames lie one behind the other, and all see the same points.
-        if last.is_some_and(|other| same_pose(other, view)) {
-            continue;
-        }
-        last = Some(view);
+    for view in capture.places() {
         let inside = |&([u, v], _): &([f64; 2], f64)| {
             (0.0..view.width as f64).contains(&u) && (0.0..view.height as f64).contains(&v)
         };

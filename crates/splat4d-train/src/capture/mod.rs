@@ -252,19 +252,20 @@ impl Capture {
         found
     }
 
+    /// The views of the training cameras: one of every fixed camera, all of moving ones.
+    pub(crate) fn places(&self) -> impl Iterator<Item = &Camera> {
+        let mut seen = vec![false; self.cameras.len()];
+        let frames = self.train.iter().map(|&i| &self.frames[i]);
+        let new = move |f: &&Frame| !(self.cameras[f.camera].fixed && std::mem::replace(&mut seen[f.camera], true));
+        frames.filter(new).map(|f| &f.view)
+    }
+
     /// The centroid of the training cameras' centres and 1.1 times the largest distance from it: the length scale that
     /// the field's learning rates refer to (Kerbl 2023, `getNerfppNorm`). At least 10⁻⁶.
     pub fn center_and_radius(&self) -> ([f64; 3], f64) {
         /// Margin around the outermost camera (Kerbl 2023).
         const MARGIN: f64 = 1.1;
-        let mut centers: Vec<[f64; 3]> = Vec::new();
-        let mut seen = vec![false; self.cameras.len()];
-        for &i in &self.train {
-            let frame = &self.frames[i];
-            if !(self.cameras[frame.camera].fixed && std::mem::replace(&mut seen[frame.camera], true)) {
-                centers.push(frame.view.center());
-            }
-        }
+        let centers: Vec<[f64; 3]> = self.places().map(Camera::center).collect();
         let n = centers.len().max(1) as f64;
         let mut mean = [0.0; 3];
         for c in &centers {

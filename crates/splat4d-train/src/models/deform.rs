@@ -77,7 +77,14 @@ fn check(plan: &Plan) -> Result<()> {
 fn spec(plan: &Plan) -> DeformSpec {
     let r = &plan.recipe;
     let encoded = |x_levels| Input::Encoded { x_levels, t_levels: r.deform_t_levels, time_net: r.deform_time_net };
-    let (input, layers, width, skip) = match r.deform_trunk.as_str() {
+    let trunk = match r.deform_trunk.as_str() {
+        // Grids follow more motion; where one view of a moment is all there is, the network generalises better
+        // (docs/models.md).
+        "auto" if plan.fixed_cameras > 0 => "hash",
+        "auto" => "small",
+        chosen => chosen,
+    };
+    let (input, layers, width, skip) = match trunk {
         "mlp" => (encoded(LARGE_X_LEVELS.max(r.deform_x_levels)), LARGE.0, LARGE.1, Some(LARGE.2)),
         "hash" => (Input::Hashed { space: SPACE, time: TIME }, r.deform_layers.max(1), r.deform_width, None),
         "hash-linear" => (Input::Hashed { space: SPACE, time: TIME }, 0, r.deform_width, None),

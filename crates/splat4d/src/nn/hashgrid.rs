@@ -9,6 +9,7 @@
 
 use crate::math::{Real, Rng};
 use crate::scene::{Grads, Key, Params};
+use crate::simd::{Kernel, Simd, dispatch};
 use crate::{Error, Result};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -19,8 +20,10 @@ const PRIMES: [u32; MAX_DIMS] = [1, 2_654_435_761, 805_459_861, 3_674_653_429];
 const INITIAL: f64 = 1e-4;
 /// Most axes of a grid.
 pub const MAX_DIMS: usize = 4;
+/// Most features of an entry.
+const MAX_FEATURES: usize = 8;
 /// Most levels, features an entry, cells a side and, as a power of two, entries a level.
-const LIMITS: [usize; 4] = [24, 8, 1 << 16, 22];
+const LIMITS: [usize; 4] = [24, MAX_FEATURES, 1 << 16, 22];
 /// Most numbers of a grid: 64 MB in f32.
 const MAX_NUMBERS: usize = 1 << 24;
 /// Rows that are looked up together, level by level, so that a level stays in the cache.
@@ -171,24 +174,13 @@ impl HashGrid {
         first: usize,
         width: usize,
     ) {
-        let features = self.shape.features;
         assert!(first + self.shape.outputs() <= width, "columns {first} and on do not fit into {width}");
         assert_eq!(points.len() / self.stride, out.len() / width, "a point has a row");
+        let simd = Simd::detect();
         points.par_chunks(ROWS * self.stride).zip(out.par_chunks_mut(ROWS * width)).for_each(|(points, out)| {
             for (l, (level, &key)) in self.levels.iter().zip(&self.keys).enumerate() {
-                let grid = p[key].data();
-                let from = first + l * features;
-                for (point, row) in points.chunks_exact(self.stride).zip(out.chunks_exact_mut(width)) {
-                    let to = &mut row[from..from + features];
-                    to.fill(F::ZERO);
-                    let cell = level.cell::<F, D>(&self.axes, point);
-                    for corner in 0..1 << D {
-                        let (at, w) = (level.entry(&cell, corner) * features, cell.weight(corner));
-                        for (to, x) in to.iter_mut().zip(&grid[at..at + features]) {
-                            *to += w * *x;
-                        }
-                    }
-                }
+                let rows = self.rows::<F, D>(level, points, l);
+                run(simd, Forward { rows, grid: p[key].data(), out: &mut *out, first, width });
             }
         });
     }
@@ -201,46 +193,170 @@ impl HashGrid {
         d_points: Option<&mut [F]>,
         d: &mut Grads<F>,
     ) {
-        let features = self.shape.features;
         assert_eq!(points.len() / self.stride, d_out.data.len() / d_out.width, "a point has a row");
+        let simd = Simd::detect();
         d.many(&self.keys).into_par_iter().zip(&self.levels).enumerate().for_each(|(l, (table, level))| {
-            let grid = table.data_mut();
-            let from = d_out.first + l * features;
-            for (point, row) in points.chunks_exact(self.stride).zip(d_out.data.chunks_exact(d_out.width)) {
-                let g = &row[from..from + features];
-                if g.iter().all(|g| *g == F::ZERO) {
-                    continue;
-                }
-                let cell = level.cell::<F, D>(&self.axes, point);
-                for corner in 0..1 << D {
-                    let (at, w) = (level.entry(&cell, corner) * features, cell.weight(corner));
-                    for (sum, g) in grid[at..at + features].iter_mut().zip(g) {
-                        *sum += w * *g;
-                    }
-                }
-            }
+            run(simd, Scatter { rows: self.rows::<F, D>(level, points, l), d_out, grid: table.data_mut() });
         });
         let Some(d_points) = d_points else { return };
         assert_eq!(d_points.len(), points.len(), "a gradient has the shape of what it is of");
         let chunks = points.par_chunks(ROWS * self.stride).zip(d_out.data.par_chunks(ROWS * d_out.width));
-        chunks.zip(d_points.par_chunks_mut(ROWS * self.stride)).for_each(|((points, d_out_rows), d_points)| {
+        chunks.zip(d_points.par_chunks_mut(ROWS * self.stride)).for_each(|((points, data), d_points)| {
             for (l, (level, &key)) in self.levels.iter().zip(&self.keys).enumerate() {
-                let grid = p[key].data();
-                let from = d_out.first + l * features;
-                let rows = points.chunks_exact(self.stride).zip(d_out_rows.chunks_exact(d_out.width));
-                for ((point, row), d_point) in rows.zip(d_points.chunks_exact_mut(self.stride)) {
-                    let g = &row[from..from + features];
-                    let cell = level.cell::<F, D>(&self.axes, point);
-                    for corner in 0..1 << D {
-                        let at = level.entry(&cell, corner) * features;
-                        let along = grid[at..at + features].iter().zip(g).map(|(x, g)| *x * *g).sum::<F>();
-                        for k in 0..D {
-                            d_point[self.axes[k]] += along * cell.slope(corner, k);
-                        }
-                    }
-                }
+                let (rows, d_out) = (self.rows::<F, D>(level, points, l), Columns { data, ..d_out });
+                run(simd, Slopes { rows, d_out, grid: p[key].data(), d_points: &mut *d_points });
             }
         });
+    }
+
+    fn rows<'a, F, const D: usize>(&'a self, level: &'a Level, points: &'a [F], l: usize) -> Points<'a, F, D> {
+        let axes = std::array::from_fn(|k| self.axes[k]);
+        Points {
+            level,
+            axes,
+            points,
+            stride: self.stride,
+            features: self.shape.features,
+            from: l * self.shape.features,
+        }
+    }
+}
+
+/// What is done with the rows of one level, with `N` features an entry; 0: as many as it says.
+trait Pass: Sized {
+    fn features(&self) -> usize;
+    fn pass<const N: usize>(self);
+}
+
+/// A pass as the SIMD dispatch takes it: a floor is an instruction there, and a call in baseline code.
+struct Fixed<P, const N: usize>(P);
+
+impl<P: Pass, const N: usize> Kernel for Fixed<P, N> {
+    type Out = ();
+    #[inline(always)]
+    fn run<const FMA: bool>(self) {
+        self.0.pass::<N>();
+    }
+}
+
+/// With two features an entry, as everyone has them, the compiler knows so.
+fn run(simd: Simd, pass: impl Pass) {
+    match pass.features() {
+        2 => dispatch(simd, Fixed::<_, 2>(pass)),
+        _ => dispatch(simd, Fixed::<_, 0>(pass)),
+    }
+}
+
+/// Points to look up in one level, whose features are columns `from ..` of the grid's.
+#[derive(Clone, Copy)]
+struct Points<'a, F, const D: usize> {
+    level: &'a Level,
+    axes: [usize; D],
+    points: &'a [F],
+    stride: usize,
+    features: usize,
+    from: usize,
+}
+
+/// A level's features of some points.
+struct Forward<'a, F, const D: usize> {
+    rows: Points<'a, F, D>,
+    grid: &'a [F],
+    /// Columns `first ..` of rows of `width`.
+    out: &'a mut [F],
+    first: usize,
+    width: usize,
+}
+
+impl<F: Real, const D: usize> Pass for Forward<'_, F, D> {
+    fn features(&self) -> usize {
+        self.rows.features
+    }
+
+    #[inline(always)]
+    fn pass<const N: usize>(self) {
+        let Self { rows: Points { level, axes, points, stride, features, from }, grid, out, first, width } = self;
+        let features = if N > 0 { N } else { features };
+        for (point, row) in points.chunks_exact(stride).zip(out.chunks_exact_mut(width)) {
+            let mut sum = [F::ZERO; MAX_FEATURES];
+            let cell = level.cell::<F, D>(&axes, point);
+            for corner in 0..1 << D {
+                let (at, w) = (level.entry(&cell, corner) * features, cell.weight(corner));
+                for (to, x) in sum[..features].iter_mut().zip(&grid[at..at + features]) {
+                    *to += w * *x;
+                }
+            }
+            row[first + from..first + from + features].copy_from_slice(&sum[..features]);
+        }
+    }
+}
+
+/// Adds a level's gradient to its entries.
+struct Scatter<'a, F, const D: usize> {
+    rows: Points<'a, F, D>,
+    d_out: Columns<'a, F>,
+    grid: &'a mut [F],
+}
+
+impl<F: Real, const D: usize> Pass for Scatter<'_, F, D> {
+    fn features(&self) -> usize {
+        self.rows.features
+    }
+
+    #[inline(always)]
+    fn pass<const N: usize>(self) {
+        let Self { rows: Points { level, axes, points, stride, features, from }, d_out, grid } = self;
+        let features = if N > 0 { N } else { features };
+        let from = d_out.first + from;
+        for (point, row) in points.chunks_exact(stride).zip(d_out.data.chunks_exact(d_out.width)) {
+            let g = &row[from..from + features];
+            if g.iter().all(|g| *g == F::ZERO) {
+                continue;
+            }
+            let cell = level.cell::<F, D>(&axes, point);
+            for corner in 0..1 << D {
+                let (at, w) = (level.entry(&cell, corner) * features, cell.weight(corner));
+                for (sum, g) in grid[at..at + features].iter_mut().zip(g) {
+                    *sum += w * *g;
+                }
+            }
+        }
+    }
+}
+
+/// Adds what a level says to the gradient of the points.
+struct Slopes<'a, F, const D: usize> {
+    rows: Points<'a, F, D>,
+    d_out: Columns<'a, F>,
+    grid: &'a [F],
+    d_points: &'a mut [F],
+}
+
+impl<F: Real, const D: usize> Pass for Slopes<'_, F, D> {
+    fn features(&self) -> usize {
+        self.rows.features
+    }
+
+    #[inline(always)]
+    fn pass<const N: usize>(self) {
+        let Self { rows: Points { level, axes, points, stride, features, from }, d_out, grid, d_points } = self;
+        let features = if N > 0 { N } else { features };
+        let from = d_out.first + from;
+        let rows = points.chunks_exact(stride).zip(d_out.data.chunks_exact(d_out.width));
+        for ((point, row), d_point) in rows.zip(d_points.chunks_exact_mut(stride)) {
+            let g = &row[from..from + features];
+            let cell = level.cell::<F, D>(&axes, point);
+            for corner in 0..1 << D {
+                let at = level.entry(&cell, corner) * features;
+                let mut along = F::ZERO;
+                for (x, g) in grid[at..at + features].iter().zip(g) {
+                    along += *x * *g;
+                }
+                for k in 0..D {
+                    d_point[axes[k]] += along * cell.slope(corner, k);
+                }
+            }
+        }
     }
 }
 
@@ -264,7 +380,7 @@ struct Cell<F, const D: usize> {
 
 impl Level {
     #[inline(always)]
-    fn cell<F: Real, const D: usize>(&self, axes: &[usize], point: &[F]) -> Cell<F, D> {
+    fn cell<F: Real, const D: usize>(&self, axes: &[usize; D], point: &[F]) -> Cell<F, D> {
         let mut cell = Cell { low: [0; D], share: [F::ZERO; D], scale: [F::ZERO; D] };
         let span = F::of((self.cells - 1) as f64);
         for k in 0..D {

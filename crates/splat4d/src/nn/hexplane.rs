@@ -527,10 +527,9 @@ fn add<F: Real>(to: &mut [Lane<F>], from: &[Lane<F>], s: F, weight: F) {
     let (near, next) = to.split_at_mut(from.len());
     let (a, b) = (weight * (F::ONE - s), weight * s);
     for ((near, next), from) in near.iter_mut().zip(next).zip(from) {
-        for k in 0..LANES {
-            near[k] += a * from[k];
-            next[k] += b * from[k];
-        }
+        // Whole lanes at once: two interleaved loops are compiled number by number.
+        *near = each(|k| near[k] + a * from[k]);
+        *next = each(|k| next[k] + b * from[k]);
     }
 }
 

@@ -48,6 +48,16 @@ fn fine_levels_of_hash_grids_wait() {
 }
 
 #[test]
+fn the_network_suits_the_cameras() {
+    let mut plan = plan(&[]);
+    assert!(matches!(spec(&plan).input, Input::Encoded { .. }));
+    plan.fixed_cameras = 4;
+    assert!(matches!(spec(&plan).input, Input::Hashed { .. }));
+    plan.recipe.set("deform_trunk=small").unwrap();
+    assert!(matches!(spec(&plan).input, Input::Encoded { .. }));
+}
+
+#[test]
 fn what_cannot_work_is_said_before_training() {
     let mut single = plan(&[]);
     single.times = 1;

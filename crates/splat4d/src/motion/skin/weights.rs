@@ -260,11 +260,10 @@ impl<F: Real> Kernel for Back<'_, F> {
                 sum[0][1] += g;
                 let slope = F::TWO * g * row[0][0];
                 for (r, x) in x.iter().enumerate() {
-                    for c in 0..RUN {
-                        let part = slope * (x[c] - row[1 + r][c]);
-                        d_x[r][c] += part;
-                        sum[1 + r][c] -= part;
-                    }
+                    // Whole runs at once: two sums in one loop are compiled number by number.
+                    let part: [F; RUN] = each(|c| slope * (x[c] - row[1 + r][c]));
+                    d_x[r] = each(|c| d_x[r][c] + part[c]);
+                    sum[1 + r] = each(|c| sum[1 + r][c] - part[c]);
                 }
             }
             d_geometry.add(id, 0, [d_x[0][0], d_x[0][1], d_x[0][2]]);
