@@ -246,9 +246,10 @@ fn describe(capture: &Capture, recipe: &Recipe, console: &Console) {
     let (first, last) = capture.time_range();
     let size = capture.frames.first().map_or([0, 0], |f| [f.view.width, f.view.height]);
     console.say(&format!(
-        "{}: {} cameras, {} pictures of {}x{} over {:.2} s; {} train, {} held out",
+        "{}: {} camera{}, {} pictures of {}x{} over {:.2} s; {} train, {} held out",
         capture.name,
         capture.cameras.len(),
+        if capture.cameras.len() == 1 { "" } else { "s" },
         capture.frames.len(),
         size[0],
         size[1],

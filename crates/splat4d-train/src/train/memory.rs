@@ -18,6 +18,13 @@ const RENDER_BYTES: u64 = 1200;
 const PAGE_BYTES: u64 = 28;
 /// Bytes a pixel takes in training: pictures, gradients and the loss's scratch, all f32.
 const PIXEL_BYTES: u64 = 200;
+/// Bytes a pixel takes in the picture store: colour of 8 bits, or of 16 where pictures are reduced, and a mask.
+const STORED_BYTES: [u64; 2] = [4, 7];
+/// Bytes that nothing below counts: the program, threads, what the allocator holds back. Chosen on the runs of
+/// docs/models.md.
+const PROCESS_BYTES: u64 = 80 << 20;
+/// While a checkpoint is written, values and moments stand twice more in memory: as rows, and as the file. Of the tables.
+const CHECKPOINT: [u64; 2] = [3, 2];
 /// Bytes of a number.
 const F32: u64 = 4;
 /// Numbers of a learnable number: itself, its gradient, two moments.
@@ -47,8 +54,9 @@ pub fn memory_estimate(capture: &Capture, recipe: &Recipe) -> u64 {
     let cap = recipe.max_cap as u64;
     let frame = frames().map(|f| (f.view.width * f.view.height) as u64).max();
     let pixels = frame.unwrap_or(0);
-    let images = (pixels * 4 * capture.train.len() as u64).min(recipe.image_memory);
-    let mut sum = images + pixels * PIXEL_BYTES * recipe.batch_size as u64 + cap * RENDER_BYTES;
+    let stored = STORED_BYTES[usize::from(capture.downscale > 1)];
+    let images = (pixels * stored * capture.train.len() as u64).min(recipe.image_memory);
+    let mut sum = PROCESS_BYTES + images + pixels * PIXEL_BYTES * recipe.batch_size as u64 + cap * RENDER_BYTES;
     if recipe.motion == "tracked" {
         // The result itself: a pose a Gaussian and frame.
         let first = frames().map(|f| f.index).min().unwrap_or(0);
@@ -66,7 +74,9 @@ pub fn memory_estimate(capture: &Capture, recipe: &Recipe) -> u64 {
 /// Bytes of a model's tables in training, and of what a step with it needs, at `rows` Gaussians.
 fn model(plan: &Plan, rows: usize) -> Result<u64> {
     let spec = program_of(&plan.recipe)?.spec(plan);
-    Ok(tables(plan, &spec, rows)? + rows as u64 * plan.recipe.batch_size as u64 * F32 * scratch(plan, &spec, rows))
+    let tables = tables(plan, &spec, rows)?;
+    let checkpoint = tables * CHECKPOINT[0] / CHECKPOINT[1];
+    Ok(tables + checkpoint + rows as u64 * plan.recipe.batch_size as u64 * F32 * scratch(plan, &spec, rows))
 }
 
 /// Bytes of all tables at `rows` Gaussians: values, gradients, two moments and the steps that a row has taken.
@@ -124,8 +134,10 @@ fn scratch(plan: &Plan, spec: &Spec, rows: usize) -> u64 {
             }
             Spec::Hexplane(s) => {
                 let colors = if s.heads.sh { 3 * (plan.recipe.sh_degree as u64 + 1).pow(2) } else { 0 };
-                // Place, what the heads said, what became of it.
-                3 + 2 * (11 + colors)
+                // Place, what the heads said, what became of it; features and trunk with their gradients, hidden layers.
+                let heads = [s.heads.position, s.heads.scale, s.heads.rotation, s.heads.opacity, s.heads.sh];
+                let hidden = heads.iter().filter(|on| **on).count() + s.defor_depth.max(1) - 1;
+                3 + 2 * (11 + colors) + (2 * (s.planes.features() + s.net_width) + hidden * s.net_width) as u64
             }
             Spec::Control(s) => skinned(s.skin.neighbours),
             Spec::Ssm(s) => skinned(s.skin.neighbours) + (s.skin.nodes * s.ticks) as u64 * TICK / rows.max(1) as u64,
