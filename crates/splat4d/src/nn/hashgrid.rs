@@ -180,7 +180,7 @@ impl HashGrid {
         points.par_chunks(ROWS * self.stride).zip(out.par_chunks_mut(ROWS * width)).for_each(|(points, out)| {
             for (l, (level, &key)) in self.levels.iter().zip(&self.keys).enumerate() {
                 let rows = self.rows::<F, D>(level, points, l);
-                run(simd, Forward { rows, grid: p[key].data(), out: &mut *out, first, width });
+                run(simd, self.shape.features, Forward { rows, grid: p[key].data(), out: &mut *out, first, width });
             }
         });
     }
@@ -196,7 +196,11 @@ impl HashGrid {
         assert_eq!(points.len() / self.stride, d_out.data.len() / d_out.width, "a point has a row");
         let simd = Simd::detect();
         d.many(&self.keys).into_par_iter().zip(&self.levels).enumerate().for_each(|(l, (table, level))| {
-            run(simd, Scatter { rows: self.rows::<F, D>(level, points, l), d_out, grid: table.data_mut() });
+            run(
+                simd,
+                self.shape.features,
+                Scatter { rows: self.rows::<F, D>(level, points, l), d_out, grid: table.data_mut() },
+            );
         });
         let Some(d_points) = d_points else { return };
         assert_eq!(d_points.len(), points.len(), "a gradient has the shape of what it is of");
@@ -204,7 +208,7 @@ impl HashGrid {
         chunks.zip(d_points.par_chunks_mut(ROWS * self.stride)).for_each(|((points, data), d_points)| {
             for (l, (level, &key)) in self.levels.iter().zip(&self.keys).enumerate() {
                 let (rows, d_out) = (self.rows::<F, D>(level, points, l), Columns { data, ..d_out });
-                run(simd, Slopes { rows, d_out, grid: p[key].data(), d_points: &mut *d_points });
+                run(simd, self.shape.features, Slopes { rows, d_out, grid: p[key].data(), d_points: &mut *d_points });
             }
         });
     }
@@ -223,15 +227,14 @@ impl HashGrid {
 }
 
 /// What is done with the rows of one level, with `N` features an entry; 0: as many as it says.
-trait Pass: Sized {
-    fn features(&self) -> usize;
+trait LevelPass: Sized {
     fn pass<const N: usize>(self);
 }
 
 /// A pass as the SIMD dispatch takes it: a floor is an instruction there, and a call in baseline code.
 struct Fixed<P, const N: usize>(P);
 
-impl<P: Pass, const N: usize> Kernel for Fixed<P, N> {
+impl<P: LevelPass, const N: usize> Kernel for Fixed<P, N> {
     type Out = ();
     #[inline(always)]
     fn run<const FMA: bool>(self) {
@@ -240,8 +243,8 @@ impl<P: Pass, const N: usize> Kernel for Fixed<P, N> {
 }
 
 /// With two features an entry, as everyone has them, the compiler knows so.
-fn run(simd: Simd, pass: impl Pass) {
-    match pass.features() {
+fn run(simd: Simd, features: usize, pass: impl LevelPass) {
+    match features {
         2 => dispatch(simd, Fixed::<_, 2>(pass)),
         _ => dispatch(simd, Fixed::<_, 0>(pass)),
     }
@@ -268,11 +271,7 @@ struct Forward<'a, F, const D: usize> {
     width: usize,
 }
 
-impl<F: Real, const D: usize> Pass for Forward<'_, F, D> {
-    fn features(&self) -> usize {
-        self.rows.features
-    }
-
+impl<F: Real, const D: usize> LevelPass for Forward<'_, F, D> {
     #[inline(always)]
     fn pass<const N: usize>(self) {
         let Self { rows: Points { level, axes, points, stride, features, from }, grid, out, first, width } = self;
@@ -298,11 +297,7 @@ struct Scatter<'a, F, const D: usize> {
     grid: &'a mut [F],
 }
 
-impl<F: Real, const D: usize> Pass for Scatter<'_, F, D> {
-    fn features(&self) -> usize {
-        self.rows.features
-    }
-
+impl<F: Real, const D: usize> LevelPass for Scatter<'_, F, D> {
     #[inline(always)]
     fn pass<const N: usize>(self) {
         let Self { rows: Points { level, axes, points, stride, features, from }, d_out, grid } = self;
@@ -332,11 +327,7 @@ struct Slopes<'a, F, const D: usize> {
     d_points: &'a mut [F],
 }
 
-impl<F: Real, const D: usize> Pass for Slopes<'_, F, D> {
-    fn features(&self) -> usize {
-        self.rows.features
-    }
-
+impl<F: Real, const D: usize> LevelPass for Slopes<'_, F, D> {
     #[inline(always)]
     fn pass<const N: usize>(self) {
         let Self { rows: Points { level, axes, points, stride, features, from }, d_out, grid, d_points } = self;
