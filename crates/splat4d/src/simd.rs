@@ -107,16 +107,13 @@ pub fn each<T: Copy + Default, const N: usize>(f: impl Fn(usize) -> T) -> [T; N]
     out
 }
 
-/// The sum of sixteen numbers, as a tree: the same for every level and thread.
+/// The sum of sixteen numbers, as a tree: the same for every level and thread. Its steps are written out, since a loop over
+/// them stays one under AVX-512.
 #[inline(always)]
-pub fn total<T: Copy + std::ops::AddAssign>(mut x: [T; 16]) -> T {
-    for half in [8, 4, 2, 1] {
-        for i in 0..half {
-            let other = x[i + half];
-            x[i] += other;
-        }
-    }
-    x[0]
+pub fn total<T: Copy + Default + std::ops::Add<Output = T>>(x: [T; 16]) -> T {
+    let eight: [T; 8] = each(|i| x[i] + x[i + 8]);
+    let [a, b, c, d]: [T; 4] = each(|i| eight[i] + eight[i + 4]);
+    (a + c) + (b + d)
 }
 
 /// The smaller; unlike `f32::min` one instruction.

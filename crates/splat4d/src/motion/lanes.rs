@@ -7,7 +7,7 @@
 use crate::math::Real;
 use crate::scene::table::{TableMut, halve};
 use crate::scene::{BLOCK, Rows, Table};
-use crate::simd::{Kernel, Simd, dispatch, each};
+use crate::simd::{Kernel, Simd, dispatch, each, total};
 
 /// One number of sixteen rows.
 pub type Lane<F> = [F; BLOCK];
@@ -114,13 +114,7 @@ impl Batch {
     /// The sum of the live lanes, as a tree.
     #[inline(always)]
     pub fn sum<F: Real>(&self, lane: Lane<F>) -> f64 {
-        let mut sums: [f64; BLOCK] = each(|l| if self.live[l] { lane[l].f64() } else { 0.0 });
-        for half in [BLOCK / 2, BLOCK / 4, BLOCK / 8, 1] {
-            for l in 0..half {
-                sums[l] += sums[l + half];
-            }
-        }
-        sums[0]
+        total(each(|l| if self.live[l] { lane[l].f64() } else { 0.0 }))
     }
 
     /// Writes neighbouring columns of one block of an answer; only [`fill`] has whole blocks.

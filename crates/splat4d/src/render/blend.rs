@@ -540,7 +540,7 @@ impl<F: Real, const N: usize, const WITH_ABS: bool> Visit<F> for Behind<'_, F, N
         let mut e = Exponent::<F, N>::new::<FMA>(r, tx, ty, range.start, &limits);
         // Copies, of which LLVM knows that no store changes them.
         let (channels, [a, b, c], alpha_max) = (r.channels, [r.a, r.b, r.c], self.alpha_max);
-        let mut dy = e.dy;
+        let (mut dy, dx) = (e.dy, offsets::<F, N>(r, tx));
         // In two loops: the second waits for T from splat to splat, and while it does the first, which waits for
         // nothing, fills the core's pipelines. In one loop a row's chain of operations is too long for that.
         let odds = strips::<F, N>(&mut self.odds, range.clone());
@@ -582,9 +582,8 @@ impl<F: Real, const N: usize, const WITH_ABS: bool> Visit<F> for Behind<'_, F, N
                 v1[l] += vy;
                 v2[l] = vy.fma::<FMA>(dy[l], v2[l]);
                 if WITH_ABS {
-                    let dx = offsets::<F, N>(r, tx)[l];
-                    let gx = F::TWO * a * dx + b * dy[l];
-                    let gy = b * dx + F::TWO * c * dy[l];
+                    let gx = F::TWO * a * dx[l] + b * dy[l];
+                    let gy = b * dx[l] + F::TWO * c * dy[l];
                     abs_x[l] += v.abs() * gx.abs();
                     abs_y[l] += v.abs() * gy.abs();
                 }
@@ -593,7 +592,8 @@ impl<F: Real, const N: usize, const WITH_ABS: bool> Visit<F> for Behind<'_, F, N
             (*ts, *rests) = (t, rest);
         }
         let (v0, v1, v2) = (columns(v0), columns(v1), columns(v2));
-        let (light, dx) = (light.map(columns), offsets::<F, TILE>(r, tx));
+        // Not `light.map`: see `each`.
+        let (light, dx): ([_; CHANNELS], _) = (each(|c| columns(light[c])), offsets::<F, TILE>(r, tx));
         let sums = &mut self.sums[i];
         for l in 0..TILE {
             let vx = v0[l] * dx[l];
