@@ -25,6 +25,8 @@ const FAR: f64 = 1e30;
 const RUN: usize = 16;
 /// Runs of coordinates at most: position and hyper coordinates.
 const MAX_RUNS: usize = (3 + MAX_HYPER).div_ceil(RUN);
+/// Gaussians that take each step together: exp is a long chain of operations, and those of several Gaussians overlap.
+const ABREAST: usize = 8;
 /// Candidates at most, and more.
 const MAX_LIST: usize = 16;
 const _: () = assert!(MAX_NEIGHBOURS + SPARE_CANDIDATES <= MAX_LIST, "a list fits into one run");
@@ -199,17 +201,25 @@ impl<F: Real> Kernel for Fill<'_, F> {
     fn run<const FMA: bool>(self) {
         let Self { skin, p, nodes, first, ids, values, k, n } = self;
         let mut x = [[F::ZERO; RUN]; MAX_RUNS];
-        for (i, (ids, values)) in ids.chunks_exact_mut(n).zip(values.chunks_exact_mut(k)).enumerate() {
-            let x = coordinates(skin, p, first + i, &mut x);
-            let (energies, numbers) = strongest(skin, p, nodes, first + i, x);
-            let [_, s] = shares(&energies, k, n);
-            let mut sum = F::ZERO;
-            for s in &s[..k] {
-                sum += *s;
+        let mut best = [([F::ZERO; MAX_LIST], [0; MAX_LIST]); ABREAST];
+        let groups = ids.chunks_mut(ABREAST * n).zip(values.chunks_mut(ABREAST * k)).enumerate();
+        for (g, (ids, values)) in groups {
+            let rows = ids.len() / n;
+            for (i, best) in best[..rows].iter_mut().enumerate() {
+                let id = first + g * ABREAST + i;
+                *best = strongest(skin, p, nodes, id, coordinates(skin, p, id, &mut x));
             }
-            ids.copy_from_slice(&numbers[..n]);
-            for (value, s) in values.iter_mut().zip(&s) {
-                *value = *s / sum;
+            let rows = best.iter().zip(ids.chunks_exact_mut(n).zip(values.chunks_exact_mut(k)));
+            for ((energies, numbers), (ids, values)) in rows {
+                let [_, s] = shares(energies, k, n);
+                let mut sum = F::ZERO;
+                for s in &s[..k] {
+                    sum += *s;
+                }
+                ids.copy_from_slice(&numbers[..n]);
+                for (value, s) in values.iter_mut().zip(&s) {
+                    *value = *s / sum;
+                }
             }
         }
     }
@@ -235,40 +245,53 @@ impl<F: Real> Kernel for Back<'_, F> {
         let Self { of, skin, p, nodes, d_values, views: (mut d_geometry, mut d_hyper), sums } = self;
         let (k, n, width) = (of.neighbours, of.neighbours + usize::from(of.cut), nodes.width);
         let mut x = [[F::ZERO; RUN]; MAX_RUNS];
-        for id in d_geometry.first..d_geometry.first + d_geometry.rows {
-            let d_a = &d_values[id * k..(id + 1) * k];
-            // Rows that took no part must not be touched.
-            if d_a.iter().all(|&g| g == F::ZERO) {
-                continue;
-            }
-            let x = coordinates(skin, p, id, &mut x);
-            let ids = &of.nodes[id * n..(id + 1) * n];
-            let (mut squares, mut energies) = ([F::ZERO; MAX_LIST], [F::of(FAR); MAX_LIST]);
-            for (i, &node) in ids.iter().enumerate() {
-                let head = &nodes.of(node as usize)[0];
-                squares[i] = nodes.square(node as usize, x);
-                let e = squares[i] * head[0] + head[1];
-                energies[i] = if e < F::of(FAR) { e } else { F::of(FAR) };
-            }
-            let d_e = energies_backward(&energies, k, n, d_a);
-            let mut d_x = [[F::ZERO; RUN]; MAX_RUNS];
-            for (i, &node) in ids.iter().enumerate() {
-                let (row, g) = (nodes.of(node as usize), d_e[i]);
-                let sum = &mut sums[node as usize * width..(node as usize + 1) * width];
-                // e = d² s + b: the sums are of dL/ds and dL/db.
-                sum[0][0] += g * squares[i];
-                sum[0][1] += g;
-                let slope = F::TWO * g * row[0][0];
-                for (r, x) in x.iter().enumerate() {
-                    // Whole runs at once: two sums in one loop are compiled number by number.
-                    let part: [F; RUN] = each(|c| slope * (x[c] - row[1 + r][c]));
-                    d_x[r] = each(|c| d_x[r][c] + part[c]);
-                    sum[1 + r] = each(|c| sum[1 + r][c] - part[c]);
+        let end = d_geometry.first + d_geometry.rows;
+        let mut asked = [(0, [F::ZERO; MAX_LIST], [F::ZERO; MAX_LIST]); ABREAST];
+        let mut next = d_geometry.first;
+        while next < end {
+            // Squared distances and energies of the next rows that took part; others must not be touched.
+            let mut count = 0;
+            while count < ABREAST && next < end {
+                let id = next;
+                next += 1;
+                if d_values[id * k..(id + 1) * k].iter().all(|&g| g == F::ZERO) {
+                    continue;
                 }
+                let x = coordinates(skin, p, id, &mut x);
+                let (mut squares, mut energies) = ([F::ZERO; MAX_LIST], [F::of(FAR); MAX_LIST]);
+                for (i, &node) in of.nodes[id * n..(id + 1) * n].iter().enumerate() {
+                    let head = &nodes.of(node as usize)[0];
+                    squares[i] = nodes.square(node as usize, x);
+                    let e = squares[i] * head[0] + head[1];
+                    energies[i] = if e < F::of(FAR) { e } else { F::of(FAR) };
+                }
+                asked[count] = (id, squares, energies);
+                count += 1;
             }
-            d_geometry.add(id, 0, [d_x[0][0], d_x[0][1], d_x[0][2]]);
-            for c in 0..d_hyper.width {
-                d_hyper.add(id, c, [d_x[(3 + c) / RUN][(3 + c) % RUN]]);
+            for (id, _, energies) in &mut asked[..count] {
+                *energies = energies_backward(energies, k, n, &d_values[*id * k..(*id + 1) * k]);
+            }
+            for &(id, squares, d_e) in &asked[..count] {
+                let x = coordinates(skin, p, id, &mut x);
+                let mut d_x = [[F::ZERO; RUN]; MAX_RUNS];
+                for (i, &node) in of.nodes[id * n..(id + 1) * n].iter().enumerate() {
+                    let (row, g) = (nodes.of(node as usize), d_e[i]);
+                    let sum = &mut sums[node as usize * width..(node as usize + 1) * width];
+                    // e = d² s + b: the sums are of dL/ds and dL/db.
+                    sum[0][0] += g * squares[i];
+                    sum[0][1] += g;
+                    let slope = F::TWO * g * row[0][0];
+                    for (r, x) in x.iter().enumerate() {
+                        // Whole runs at once: two sums in one loop are compiled number by number.
+                        let part: [F; RUN] = each(|c| slope * (x[c] - row[1 + r][c]));
+                        d_x[r] = each(|c| d_x[r][c] + part[c]);
+                        sum[1 + r] = each(|c| sum[1 + r][c] - part[c]);
+                    }
+                }
+                d_geometry.add(id, 0, [d_x[0][0], d_x[0][1], d_x[0][2]]);
+                for c in 0..d_hyper.width {
+                    d_hyper.add(id, c, [d_x[(3 + c) / RUN][(3 + c) % RUN]]);
+                }
             }
         }
     }
