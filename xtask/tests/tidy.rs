@@ -17,9 +17,9 @@ const ORDER: [(&str, &[&str]); 4] = [
     (
         "crates/splat4d-train",
         // The recipe stands first because everything is told by it; losses before densification and both before
-        // `models`, which choose among them; `init` needs a model's plan; `eval` writes as safely as `train` does.
+        // `methods`, which choose among them; `init` needs a model's plan; `eval` writes as safely as `train` does.
         &[
-            "recipe", "event", "capture", "sampler", "optim", "loss", "densify", "prune", "models", "init", "train",
+            "recipe", "event", "capture", "sampler", "optim", "loss", "densify", "prune", "methods", "init", "train",
             "eval", "compress", "lab", "dynamics", "dist",
         ],
     ),

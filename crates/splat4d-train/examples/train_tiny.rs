@@ -14,7 +14,7 @@ use splat4d::scene::{Camera, GEOMETRY, LifeKind, Params, SH, Time};
 use splat4d_train::capture::frames::{Frames, Picture};
 use splat4d_train::densify::Limits;
 use splat4d_train::init;
-use splat4d_train::models::{Plan, program};
+use splat4d_train::methods::{Plan, program};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::train::loss::TrainLoss;
 use splat4d_train::train::trainer::{Settings, Trainer};

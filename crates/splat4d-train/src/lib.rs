@@ -10,7 +10,7 @@ pub mod event;
 pub mod init;
 pub mod lab;
 pub mod loss;
-pub mod models;
+pub mod methods;
 pub mod optim;
 pub mod prune;
 pub mod recipe;

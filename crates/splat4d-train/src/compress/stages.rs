@@ -7,7 +7,7 @@ use crate::capture::frames::Frames;
 
 use crate::loss::scene::MeanOpacity;
 use crate::loss::terms::ParamLoss;
-use crate::models::{Hook, Plan, Rate, Stage, Tell, tuning};
+use crate::methods::{Hook, Plan, Rate, Stage, Tell, tuning};
 use crate::prune::{Keys, MaskConfig, ScoreConfig, key_masks, prune, score};
 use splat4d::format::playback::{WriteConfig, read_pages, write};
 use splat4d::layers::Scene;

@@ -6,7 +6,7 @@ pub mod hull;
 pub mod volume;
 
 use crate::capture::frames::Frames;
-use crate::models::{Plan, Program};
+use crate::methods::{Plan, Program};
 use crate::{Error, Result};
 use splat4d::layers::{ALWAYS, Head, Layer, Scene};
 use splat4d::math::Rng;

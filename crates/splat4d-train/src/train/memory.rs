@@ -3,7 +3,7 @@
 
 use crate::Result;
 use crate::capture::Capture;
-use crate::models::{Plan, program_of};
+use crate::methods::{Plan, program_of};
 use crate::recipe::Recipe;
 use splat4d::math::Rng;
 use splat4d::motion::deform::Input;

@@ -5,7 +5,7 @@ use super::run::Bench;
 use super::trainer::Trainer;
 use crate::densify::Densify;
 use crate::event::Event;
-use crate::models::{Stage, program_of, split};
+use crate::methods::{Stage, program_of, split};
 use crate::recipe::Recipe;
 use crate::{Error, ErrorKind, Result};
 use std::time::Instant as Clock;
@@ -166,7 +166,7 @@ const ADC_GROWTH: f64 = 1.2;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::models::densify_of;
+    use crate::methods::densify_of;
 
     #[test]
     fn the_cost_follows_the_growth_and_the_size() {

@@ -7,7 +7,7 @@ use super::checkpoint;
 use super::dataset::Dataset;
 use super::run::{Bench, Outcome, Session, TrainOptions, memory_estimate};
 use crate::event::Event;
-use crate::models::Stage;
+use crate::methods::Stage;
 use crate::recipe::Recipe;
 use crate::{Error, Result};
 use splat4d::layers::Scene;

@@ -5,7 +5,7 @@ use super::loss::TrainLoss;
 use crate::capture::frames::{FlowTruth, Frames, Picture};
 use crate::densify::{self, Change, Densify, Limits, Stats, adc, mcmc, morton_edit};
 use crate::loss::terms::Codec;
-use crate::models::{Hook, Stage, Tell};
+use crate::methods::{Hook, Stage, Tell};
 use crate::optim::{Floor, Moments};
 use crate::prune::prune;
 use crate::sampler::Timeline;

@@ -14,7 +14,7 @@ use splat4d::scene::{Camera, Planes, SH, Time};
 use splat4d::{Error, ErrorKind, Result};
 use splat4d_train::capture::frames::{Frames, Picture};
 use splat4d_train::densify::Limits;
-use splat4d_train::models::{Group, Plan, Stage, program};
+use splat4d_train::methods::{Group, Plan, Stage, program};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::train::loss::TrainLoss;
 use splat4d_train::train::run::peak_memory;

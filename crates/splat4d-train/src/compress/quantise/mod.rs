@@ -10,8 +10,8 @@ mod state;
 mod tests;
 
 use crate::loss::terms::Codec;
-use crate::models::spacetime::SpacetimeProgram;
-use crate::models::{EVERY, Group, Plan, Program, Rate, Stage};
+use crate::methods::spacetime::SpacetimeProgram;
+use crate::methods::{EVERY, Group, Plan, Program, Rate, Stage};
 use crate::recipe::Recipe;
 use crate::{Error, Result};
 use rayon::prelude::*;

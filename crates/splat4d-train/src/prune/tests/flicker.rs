@@ -3,7 +3,7 @@
 use super::*;
 use crate::densify::{self, Limits, Stats};
 use crate::eval::metrics::psnr;
-use crate::models::{Group, Rate, Stage};
+use crate::methods::{Group, Rate, Stage};
 use crate::optim::Moments;
 use crate::train::loss::TrainLoss;
 use crate::train::trainer::{Settings, Trainer};

@@ -5,7 +5,7 @@ use super::*;
 use crate::ErrorKind;
 use crate::compress::quantise::{self, Quantised};
 use crate::loss::terms::{Codec, ParamLoss, StepInfo};
-use crate::models::{Plan, Rate, program};
+use crate::methods::{Plan, Rate, program};
 use crate::train::run::tests::{Place, copy_folder, recipe};
 use crate::train::run::{plan, training_frames};
 use splat4d::bake::{self, bake};

@@ -2,7 +2,7 @@
 
 use crate::densify::Change;
 use crate::init::{self, Seeds};
-use crate::models::program_of;
+use crate::methods::program_of;
 use crate::recipe::Recipe;
 use crate::train::checkpoint::{self, Identity, RunState};
 use crate::train::dataset::Dataset;

@@ -100,7 +100,7 @@ fn still_rows(layer: &Layer<f32>, clip: [f64; 2], reach: f64) -> Vec<bool> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::models::program;
+    use crate::methods::program;
     use crate::recipe::Recipe;
     use splat4d::motion::SpacetimeSpec;
     use splat4d::scene::{GEOMETRY, LIFE, SH};

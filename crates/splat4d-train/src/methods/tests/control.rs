@@ -3,8 +3,8 @@
 
 use super::*;
 use crate::densify::{Observation, Stats};
-use crate::models::control::adapt::NodeAdapt;
-use crate::models::control::losses::{MaskSize, NodeAcceleration, NodeArap, NodeElastic, Sparse};
+use crate::methods::control::adapt::NodeAdapt;
+use crate::methods::control::losses::{MaskSize, NodeAcceleration, NodeArap, NodeElastic, Sparse};
 use crate::optim::Moments;
 use splat4d::motion::control::{ControlSpec, Curve, TrajectorySpec};
 use splat4d::motion::skin::{Skin, SkinSpec};

@@ -5,7 +5,7 @@
 //! positions in space; here with that to positions in the picture, which densification gathers anyway.
 
 use crate::densify::{self, Stats};
-use crate::models::Adapt;
+use crate::methods::Adapt;
 use crate::optim::Moments;
 use crate::recipe::Recipe;
 use splat4d::layers::Scene;

@@ -3,7 +3,7 @@
 
 use super::*;
 use crate::densify::{Adc, Crowd, Crowding, Guided, Mcmc, Relocate};
-use crate::models::control::adapt::NodeAdapt;
+use crate::methods::control::adapt::NodeAdapt;
 use crate::prune::{Periodic, Spatial};
 use splat4d::motion::control::{ControlSpec, Curve, TrajectorySpec};
 use splat4d::motion::skin::SkinSpec;

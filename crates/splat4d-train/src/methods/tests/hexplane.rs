@@ -1,7 +1,7 @@
 //! The stages of `hexplane`: what learns in which, and that they are one run.
 
 use super::*;
-use crate::models::hexplane::HexplaneProgram;
+use crate::methods::hexplane::HexplaneProgram;
 use crate::recipe::Recipe;
 use splat4d::nn::hexplane::PlaneShape;
 use std::ops::Range;

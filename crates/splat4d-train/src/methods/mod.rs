@@ -1,6 +1,6 @@
 //! How motion models are learnt: a [`Program`] a model, which makes the list of [`Stage`]s that the trainer runs.
 //!
-//! `splat4d::motion::x` holds a model's mathematics, `models::x` its stages, rates, losses and what it needs of a capture.
+//! `splat4d::motion::x` holds a model's mathematics, `methods::x` its stages, rates, losses and what it needs of a capture.
 
 pub mod auto;
 pub mod control;

@@ -3,7 +3,7 @@
 
 use super::*;
 use crate::init::{self, Seeds};
-use crate::models::split::stages;
+use crate::methods::split::stages;
 use crate::recipe::Recipe;
 use splat4d::layers::Instant;
 use splat4d::math::Se3;
