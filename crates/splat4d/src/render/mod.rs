@@ -12,6 +12,7 @@
 //! Where [`Splats::head`] has a network, it makes colours of blended channels (`head.rs`), and its gradients come with
 //! the others.
 
+mod backend;
 mod behind;
 pub mod bin;
 mod blend;
@@ -30,6 +31,7 @@ mod tests;
 mod weigh;
 
 pub use crate::simd::Simd;
+pub use backend::{Backend, Oracle, Shot, Wanted};
 pub use count::PairCounts;
 pub use project::{Projected, ProjectedGrads, View};
 pub use sense::Sensitivity;

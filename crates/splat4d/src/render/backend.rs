@@ -1,0 +1,167 @@
+//! The seam between a scene and whatever draws it: [`Backend`], implemented by the renderer of the CPU, by the oracle and
+//! (feature `gpu`) by the renderer of the GPU, so that training, evaluation and the command know none of them by name.
+
+use super::{Image, ImageGrads, RenderConfig, RenderGrads, Renderer, oracle};
+use crate::math::{Real, sh};
+use crate::scene::{Camera, Planes, Splats, Table};
+use crate::{Error, ErrorKind, Result};
+
+/// Abilities that not every backend has. Colour, alpha and depth over a background are drawn by all.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Wanted {
+    /// Further channels ([`Shot::extra`]).
+    pub extra: bool,
+    /// A pixel head ([`Splats::head`]).
+    pub head: bool,
+    /// The way back ([`Backend::vjp`]).
+    pub backward: bool,
+}
+
+/// A picture to draw.
+#[derive(Clone, Copy, Debug)]
+pub struct Shot<'a, F = f32> {
+    /// The scene at one instant.
+    pub splats: &'a Splats<'a, F>,
+    /// A pinhole; its size is the picture's.
+    pub camera: &'a Camera,
+    /// Colour behind the scene.
+    pub background: [F; 3],
+    /// Further channels to blend, [all splats, C].
+    pub extra: Option<&'a Table<F>>,
+    /// Highest degree of spherical harmonics drawn, lowered to what a table holds.
+    pub sh_degree: usize,
+    /// Whether [`Image::depth`] is drawn.
+    pub depth: bool,
+}
+
+impl<'a, F: Real> Shot<'a, F> {
+    /// Colour and alpha, with all spherical harmonics; neither depth nor further channels.
+    pub fn new(splats: &'a Splats<'a, F>, camera: &'a Camera, background: [F; 3]) -> Self {
+        Self { splats, camera, background, extra: None, sh_degree: sh::MAX_DEGREE, depth: false }
+    }
+
+    /// What a backend must be able to do to draw it.
+    pub fn wanted(&self) -> Wanted {
+        Wanted { extra: self.extra.is_some(), head: self.splats.head.is_some(), backward: false }
+    }
+}
+
+/// Draws splats and takes gradients back; memory is reused from picture to picture.
+pub trait Backend<F: Real = f32>: Send {
+    /// Whether it has these abilities. Errors: it lacks one; the message names it and says what can.
+    fn can(&self, wanted: &Wanted) -> Result<()>;
+
+    /// Draws into `out`, which is resized to the camera's picture. Rows that are NaN, infinite, behind the camera or
+    /// transparent are not drawn.
+    ///
+    /// Errors: what [`can`](Self::can) refuses; a picture too large for the device; a driver that failed. `out` means
+    /// nothing then. Panics: `extra` has not one row a splat.
+    fn render(&mut self, shot: &Shot<'_, F>, out: &mut Image<F>) -> Result<()>;
+
+    /// VJP of the last [`render`](Self::render), whose shot must be given again.
+    ///
+    /// `d_sh` has one entry a part: for a part whose colour is the layer's own SH, the gradient is *added* to rows
+    /// `rows.id(j)` of that table; `None` skips it. `d` is overwritten, its allocations are reused.
+    /// Errors: as of `render`. Panics: shapes are not those of the last render.
+    fn vjp(
+        &mut self,
+        shot: &Shot<'_, F>,
+        grads: &ImageGrads<'_, F>,
+        d_sh: &mut [Option<&mut Table<F>>],
+        d: &mut RenderGrads<F>,
+    ) -> Result<()>;
+
+    /// Radius of every splat of the last render: 3σ of the larger axis, pixels; 0: not drawn. Empty where the backend has
+    /// no way back.
+    fn radii(&self) -> &[F];
+
+    /// The limits that it draws with.
+    fn config(&self) -> &RenderConfig;
+
+    /// The device, in a word or two.
+    fn name(&self) -> &str;
+}
+
+/// The refusal of an ability.
+pub(crate) fn refusal(who: &str, what: &str) -> Error {
+    Error::new(ErrorKind::Unsupported, format!("{who} does not {what}")).remedy("Render on the CPU.")
+}
+
+impl<F: Real> Backend<F> for Renderer<F> {
+    fn can(&self, _: &Wanted) -> Result<()> {
+        Ok(())
+    }
+
+    fn render(&mut self, shot: &Shot<'_, F>, out: &mut Image<F>) -> Result<()> {
+        (self.config.sh_degree, self.config.depth) = (shot.sh_degree, shot.depth);
+        Renderer::render(self, shot.splats, shot.camera, shot.background, shot.extra, out);
+        Ok(())
+    }
+
+    fn vjp(
+        &mut self,
+        shot: &Shot<'_, F>,
+        grads: &ImageGrads<'_, F>,
+        d_sh: &mut [Option<&mut Table<F>>],
+        d: &mut RenderGrads<F>,
+    ) -> Result<()> {
+        self.backward(shot.splats, shot.camera, shot.background, shot.extra, grads, d_sh, d);
+        Ok(())
+    }
+
+    fn radii(&self) -> &[F] {
+        Renderer::radii(self)
+    }
+
+    fn config(&self) -> &RenderConfig {
+        &self.config
+    }
+
+    fn name(&self) -> &str {
+        "the CPU"
+    }
+}
+
+/// [`oracle::render`] as a backend: forward only.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Oracle {
+    /// Limits of the blend.
+    pub config: RenderConfig,
+}
+
+impl Backend<f64> for Oracle {
+    fn can(&self, wanted: &Wanted) -> Result<()> {
+        if wanted.backward { Err(refusal("the oracle", "take gradients back")) } else { Ok(()) }
+    }
+
+    fn render(&mut self, shot: &Shot<'_, f64>, out: &mut Image<f64>) -> Result<()> {
+        let config = RenderConfig { sh_degree: shot.sh_degree, ..self.config };
+        *out = oracle::render(shot.splats, shot.camera, shot.background, shot.extra, &config);
+        if !shot.depth {
+            out.depth = Planes::new(0, shot.camera.height, shot.camera.width);
+        }
+        Ok(())
+    }
+
+    fn vjp(
+        &mut self,
+        _: &Shot<'_, f64>,
+        _: &ImageGrads<'_, f64>,
+        _: &mut [Option<&mut Table<f64>>],
+        _: &mut RenderGrads<f64>,
+    ) -> Result<()> {
+        self.can(&Wanted { backward: true, ..Wanted::default() })
+    }
+
+    fn radii(&self) -> &[f64] {
+        &[]
+    }
+
+    fn config(&self) -> &RenderConfig {
+        &self.config
+    }
+
+    fn name(&self) -> &str {
+        "the oracle"
+    }
+}
