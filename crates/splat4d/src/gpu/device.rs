@@ -75,11 +75,6 @@ impl Gpu {
         &self.info.name
     }
 
-    /// Whether the adapter computes on the CPU.
-    pub fn is_software(&self) -> bool {
-        self.info.device_type == wgpu::DeviceType::Cpu
-    }
-
     /// Card, kind, interface and driver in one line.
     pub fn describe(&self) -> String {
         let i = &self.info;

@@ -46,6 +46,17 @@ impl<'a, F: Real> Shot<'a, F> {
     }
 }
 
+/// Whether a scene's tables change between renders.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Tables {
+    /// Everything is sent to a device for every picture.
+    Changing,
+    /// A layer's own SH table ([`crate::scene::Color::Sh`] with `base`) that lies at the same address and has the same
+    /// size as in the last render is the same table, and is not sent again: right for a scene that is played, wrong
+    /// for one that learns. Everything else of an instant is sent all the same.
+    Constant,
+}
+
 /// Draws splats and takes gradients back; memory is reused from picture to picture.
 pub trait Backend<F: Real = f32>: Send {
     /// Whether it has these abilities. Errors: it lacks one; the message names it and says what can.

@@ -15,7 +15,6 @@ mod tests;
 
 use super::RenderConfig;
 use super::gather::{Record, SIDE, TILE, TILES};
-use super::project::ALPHA_FLOOR;
 use super::rasterize::{CHANNELS, PixelGrads};
 use super::simd::{Kernel, each, greatest, least, select};
 use crate::math::Real;
@@ -28,8 +27,6 @@ pub(super) const BATCH: usize = 64;
 const GROUP: usize = 16;
 /// Splats between two tests whether all pixels of a tile have stopped.
 const EXIT_EVERY: usize = 16;
-/// α never reaches 1, whatever the configuration: T must stay recoverable.
-const ALPHA_CEILING: f64 = 1.0 - 1e-6;
 /// The smallest T that is told from 0: the way back divides by it.
 const T_FLOOR: f64 = 1e-30;
 
@@ -80,10 +77,10 @@ pub(super) struct Limits<F> {
 
 impl<F: Real> Limits<F> {
     pub fn new(config: &RenderConfig) -> Self {
-        let log_max = F::of(config.alpha_max.min(ALPHA_CEILING).log2());
+        let [least, most] = config.alpha_limits();
         Self {
-            log_min: F::of(config.alpha_min.max(ALPHA_FLOOR).log2()),
-            log_max,
+            log_min: F::of(least.log2()),
+            log_max: F::of(most.log2()),
             t_min: F::of(config.transmittance_min.max(T_FLOOR)),
         }
     }

@@ -12,7 +12,7 @@
 //! Where [`Splats::head`] has a network, it makes colours of blended channels (`head.rs`), and its gradients come with
 //! the others.
 
-mod backend;
+pub(crate) mod backend;
 mod behind;
 pub mod bin;
 mod blend;
@@ -31,7 +31,7 @@ mod tests;
 mod weigh;
 
 pub use crate::simd::Simd;
-pub use backend::{Backend, Oracle, Shot, Wanted};
+pub use backend::{Backend, Oracle, Shot, Tables, Wanted};
 pub use count::PairCounts;
 pub use project::{Projected, ProjectedGrads, View};
 pub use sense::Sensitivity;
@@ -76,6 +76,18 @@ pub struct RenderConfig {
     pub abs_grads: bool,
     /// Instructions to use; lowered to what the machine has.
     pub simd: Simd,
+}
+
+/// The smallest α cut-off that is told from 0: an extent must be finite.
+const ALPHA_FLOOR: f64 = 1e-30;
+/// α never reaches 1, whatever the configuration: T must stay recoverable.
+const ALPHA_CEILING: f64 = 1.0 - 1e-6;
+
+impl RenderConfig {
+    /// The cut-off and the ceiling of α that are drawn with.
+    pub(crate) fn alpha_limits(&self) -> [f64; 2] {
+        [self.alpha_min.max(ALPHA_FLOOR), self.alpha_max.min(ALPHA_CEILING)]
+    }
 }
 
 impl Default for RenderConfig {

@@ -20,8 +20,6 @@ const J_MARGIN: f64 = 0.3;
 const RHO_MIN: f64 = 0.005;
 /// Added to τ, so that rounding never loses a pixel at the α cut-off; the blend decides about each pixel itself.
 pub(super) const TAU_MARGIN: f64 = 1e-3;
-/// The smallest α cut-off that is told from 0: an extent must be finite.
-pub(super) const ALPHA_FLOOR: f64 = 1e-30;
 /// Radius in standard deviations that `radius` reports (Inria).
 const RADIUS_SIGMAS: f64 = 3.0;
 /// Rows in a task: whole blocks of a table.
@@ -131,7 +129,7 @@ impl<F: Real> View<F> {
             height: camera.height,
             near: F::of(camera.near),
             low_pass: F::of(config.low_pass),
-            alpha_min: F::of(config.alpha_min.max(ALPHA_FLOOR)),
+            alpha_min: F::of(config.alpha_limits()[0]),
             antialias: config.antialias,
         }
     }
