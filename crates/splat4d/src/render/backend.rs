@@ -104,8 +104,7 @@ impl<F: Real> Backend<F> for Renderer<F> {
     }
 
     fn render(&mut self, shot: &Shot<'_, F>, out: &mut Image<F>) -> Result<()> {
-        (self.config.sh_degree, self.config.depth) = (shot.sh_degree, shot.depth);
-        Renderer::render(self, shot.splats, shot.camera, shot.background, shot.extra, out);
+        self.draw(shot, out);
         Ok(())
     }
 
@@ -116,7 +115,7 @@ impl<F: Real> Backend<F> for Renderer<F> {
         d_sh: &mut [Option<&mut Table<F>>],
         d: &mut RenderGrads<F>,
     ) -> Result<()> {
-        self.backward(shot.splats, shot.camera, shot.background, shot.extra, grads, d_sh, d);
+        self.draw_backward(shot, grads, d_sh, d);
         Ok(())
     }
 

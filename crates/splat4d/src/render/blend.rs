@@ -14,8 +14,7 @@
 mod tests;
 
 use super::RenderConfig;
-use super::gather::{Record, SIDE, TILE, TILES};
-use super::rasterize::{CHANNELS, PixelGrads};
+use super::gather::{CHANNELS, Record, SIDE, TILE, TILES};
 use super::simd::{Kernel, each, greatest, least, select};
 use crate::math::Real;
 use std::f64::consts::LN_2;
@@ -353,6 +352,15 @@ const ABS: usize = LIGHT + CHANNELS;
 /// Numbers in a record.
 const NUMBERS: usize = ABS + 2;
 
+/// Gradients to the picture of one pass; `None` is zero.
+#[derive(Clone, Copy, Debug)]
+pub struct PixelGrads<'a, F = f32> {
+    /// To the channels with background, [height, width] each.
+    pub channels: [Option<&'a [F]>; CHANNELS],
+    /// To alpha = 1 − T.
+    pub alpha: Option<&'a [F]>,
+}
+
 /// Gradients of a (bin, splat) pair.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Pair<F>([F; NUMBERS]);
@@ -464,7 +472,7 @@ impl<F: Real> Backward<'_, F> {
         let alpha_max = limits.log_max.blend_exp2::<FMA>();
         let sums = [[[F::ZERO; TILE]; NUMBERS]; BATCH];
         let mut visit =
-            Behind::<F, N, WITH_ABS> { backs: &mut backs, limits, alpha_max, alphas: zero, odds: zero, sums, out };
+            Returning::<F, N, WITH_ABS> { backs: &mut backs, limits, alpha_max, alphas: zero, odds: zero, sums, out };
         walk::<F, _, FMA>(self.records, open, &mut visit);
         d_background
     }
@@ -504,7 +512,8 @@ impl<F: Real> Backward<'_, F> {
     }
 }
 
-struct Behind<'a, F, const N: usize, const WITH_ABS: bool> {
+/// The way back through the tiles.
+struct Returning<'a, F, const N: usize, const WITH_ABS: bool> {
     backs: &'a mut [Back<F>; TILES],
     limits: Limits<F>,
     /// α's ceiling as the blend computes it.
@@ -529,7 +538,7 @@ pub(super) fn columns<F: Real, const N: usize>(lanes: [F; N]) -> [F; TILE] {
     out
 }
 
-impl<F: Real, const N: usize, const WITH_ABS: bool> Visit<F> for Behind<'_, F, N, WITH_ABS> {
+impl<F: Real, const N: usize, const WITH_ABS: bool> Visit<F> for Returning<'_, F, N, WITH_ABS> {
     #[inline(always)]
     fn splat<const FMA: bool>(&mut self, t: usize, i: usize, r: &Record<F>) {
         let (tx, ty, limits) = (t % SIDE, t / SIDE, self.limits);

@@ -3,8 +3,8 @@
 use super::RenderConfig;
 use super::bin::BIN;
 use super::blend::{Forward, Limits, Tile, Visit, begin, walk};
-use super::gather::{Record, SIDE, TILE, TILES};
-use super::rasterize::{CHANNELS, Raster};
+use super::gather::{CHANNELS, Record, SIDE, TILE, TILES};
+use super::rasterize::Raster;
 use crate::math::Real;
 use rayon::prelude::*;
 

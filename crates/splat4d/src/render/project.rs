@@ -447,19 +447,30 @@ fn lane<F: Real>(p: &Projected<Lanes<F>>, l: usize) -> Projected<F> {
     }
 }
 
+/// Splats that were projected: what shading reads, and the ways back.
+#[derive(Clone, Copy, Debug)]
+pub struct Projection<'a, F = f32> {
+    /// What was projected.
+    pub splats: &'a Splats<'a, F>,
+    /// Where to.
+    pub view: &'a View<F>,
+    /// Instructions to use.
+    pub simd: Simd,
+    /// What came of it, one row a splat.
+    pub projected: &'a [Projected<F>],
+}
+
 /// VJP of [`forward`]: overwrites `parts[..].out` (culled rows get 0) and adds to the pose gradient.
 ///
 /// `partial` is scratch. Sums run in a fixed order: rows in a chunk, then chunks.
 pub fn backward<F: Real>(
-    splats: &Splats<'_, F>,
-    view: &View<F>,
-    simd: Simd,
-    projected: &[Projected<F>],
+    projection: &Projection<'_, F>,
     d: &[ProjectedGrads<F>],
     parts: &mut [PartGrads<F>],
     pose: &mut [f64; 6],
     partial: &mut Vec<[f64; 6]>,
 ) {
+    let Projection { splats, view, simd, projected } = *projection;
     assert_eq!(parts.len(), splats.parts.len(), "one gradient a part");
     let mut first = 0;
     for (part, out) in splats.parts.iter().zip(parts) {

@@ -1,7 +1,7 @@
 //! Times of training: whole steps of the trainer on a scene that is already good, against pictures of itself with noise,
 //! so that every gradient is small and none is zero.
 
-use super::ceilings::{Ceiling, bytes};
+use super::roofline::{Roofline, bytes};
 use super::rows::Row;
 use super::scenes::Pinned;
 use super::stages::{Way, simd_name};
@@ -231,7 +231,7 @@ pub(super) fn times(scene: Scene<f32>, held: &Arc<Held>, way: Way) -> Result<Tim
 }
 
 /// Steps at every view, in parts. Call it inside a pool of `way.threads` threads.
-pub(super) fn measure(pinned: &Pinned, held: &Arc<Held>, way: Way, ceiling: &Ceiling) -> Result<Vec<Row>> {
+pub(super) fn measure(pinned: &Pinned, held: &Arc<Held>, way: Way, roofline: &Roofline) -> Result<Vec<Row>> {
     forget_peak();
     let t = times(pinned.scene.clone(), held, way)?;
     let (mut alive, mut moment) = (0, Moment::default());
@@ -255,7 +255,7 @@ pub(super) fn measure(pinned: &Pinned, held: &Arc<Held>, way: Way, ceiling: &Cei
             threads: way.threads,
             simd: simd_name(way.simd).into(),
             ms,
-            ceiling_share: moved.map(|b| 1e3 * b / ceiling.bytes / ms),
+            ceiling_share: moved.map(|b| 1e3 * b / roofline.bytes / ms),
             gb_per_s: moved.map(|b| 1e-6 * b / ms),
             outside_share: whole.then(|| 1.0 - t.renderer / ms),
             peak_memory: whole.then(peak_memory),

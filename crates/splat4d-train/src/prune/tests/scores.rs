@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::prune::weighing::root_of_determinant;
-use splat4d::render::Sensitivity;
+use splat4d::render::{Sensitivity, Shot};
 
 fn of(spatial: Spatial) -> ScoreConfig {
     ScoreConfig { spatial, temporal: Temporal::None, volume: false, ..ScoreConfig::default() }
@@ -64,7 +64,8 @@ fn pup_is_the_determinant_of_the_blocks_of_all_views_and_speedy_their_sum() {
     let mut renderer = Renderer::new(RenderConfig::default());
     for i in 0..made.len() {
         s.at(made.time(i), &mut instant);
-        renderer.sensitivities(&s.splats(&instant), made.camera(i), s.background, &mut found);
+        let splats = s.splats(&instant);
+        renderer.sensitivities(&Shot::new(&splats, made.camera(i), s.background), &mut found);
         for (row, x) in found.iter().enumerate() {
             (0..21).for_each(|k| blocks[row][k] += x.fisher[k]);
             sums[row] += x.squared;

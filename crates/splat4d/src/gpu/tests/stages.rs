@@ -1,7 +1,8 @@
 //! Stage by stage.
 
 use super::*;
-use crate::render::{View, project, shade};
+use crate::render::project::{Projection, View};
+use crate::render::{project, shade};
 
 /// Relative difference of a depth, a colour, an extent or an opacity: a few roundings of f32.
 const RELATIVE: f32 = 2e-5;
@@ -82,7 +83,9 @@ fn colours_equal_the_cpus() {
         let (cpu, _) = on_cpu(&shot, &r.config);
         let mut expected = vec![[0.0; 3]; n];
         let view = View::new(&camera, &r.config);
-        shade::forward(&scene.splats(), &view, degree, r.config.simd, cpu.projected(), &mut expected);
+        let simd = r.config.simd;
+        let projection = Projection { splats: &splats, view: &view, simd, projected: cpu.projected() };
+        shade::forward(&projection, degree, &mut expected);
         let marks: Vec<u32> = read(&r.gpu, &r.buffers.marks, n);
         let both = (0..n).filter(|&j| marks[j] == 1 && cpu.projected()[j].radius > 0.0);
         let mut seen = 0;
