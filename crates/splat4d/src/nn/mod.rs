@@ -16,4 +16,4 @@ mod tests;
 pub mod vector;
 
 pub use hashgrid::{HashGrid, HashShape};
-pub use mlp::{Kept, Mlp, MlpShape};
+pub use mlp::{InputGrad, Kept, Mlp, MlpShape, Passed};
