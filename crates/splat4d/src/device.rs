@@ -1,5 +1,8 @@
 //! The device that draws: the GPU where there is one that can, else the CPU, and a sentence that says why.
 
+#[cfg(test)]
+mod tests;
+
 use crate::render::{Backend, Image, RenderConfig, Renderer, Shot, Tables, Wanted};
 use crate::{Error, Result};
 
@@ -69,95 +72,4 @@ fn gpu(device: Device, config: RenderConfig, wanted: &Wanted, tables: Tables) ->
     let mut renderer = GpuRenderer::new(gpu, config)?;
     renderer.tables = tables;
     Ok((Box::new(renderer), name))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::math::Se3;
-    use crate::render::{ImageGrads, RenderGrads};
-    use crate::scene::{Camera, Splats, Table};
-    use crate::{ErrorKind, Result};
-
-    fn view() -> Camera {
-        Camera::with_fov_y(Se3::look_at([0.0, 0.0, -1.0], [0.0; 3], [0.0, -1.0, 0.0]), 1.0, 3, 2)
-    }
-
-    const BACKGROUND: [f32; 3] = [0.25, 0.5, 0.75];
-
-    #[test]
-    fn the_cpu_is_always_there() {
-        for device in [Device::Cpu, Device::Auto, Device::Gpu] {
-            let mut opened = open(device, RenderConfig::default(), &Wanted::default(), Tables::Constant);
-            let (splats, camera, mut image) = (Splats::default(), view(), Image::default());
-            assert!(draw(&mut opened.backend, &Shot::new(&splats, &camera, BACKGROUND), &mut image).is_none());
-            assert_eq!(image.color.data[..7], [0.25, 0.25, 0.25, 0.25, 0.25, 0.25, 0.5]);
-            assert!(opened.why.starts_with("drawing on "), "{}", opened.why);
-            assert_eq!(opened.fell_back, device != Device::Cpu && opened.backend.name() == "the CPU");
-        }
-    }
-
-    #[test]
-    fn what_only_the_cpu_can_is_done_by_the_cpu() {
-        for wanted in [
-            Wanted { head: true, ..Wanted::default() },
-            Wanted { extra: true, ..Wanted::default() },
-            Wanted { backward: true, ..Wanted::default() },
-        ] {
-            let opened = open(Device::Gpu, RenderConfig::default(), &wanted, Tables::Changing);
-            assert!(opened.fell_back && opened.backend.can(&wanted).is_ok(), "{}", opened.why);
-        }
-    }
-
-    /// A device whose driver fails at its second picture.
-    struct Failing {
-        renderer: Renderer<f32>,
-        drawn: usize,
-    }
-
-    impl Backend for Failing {
-        fn can(&self, _: &Wanted) -> Result<()> {
-            Ok(())
-        }
-        fn render(&mut self, shot: &Shot<'_>, out: &mut Image) -> Result<()> {
-            self.drawn += 1;
-            if self.drawn > 1 {
-                return Err(Error::new(ErrorKind::Unsupported, "the driver is gone"));
-            }
-            Backend::render(&mut self.renderer, shot, out)
-        }
-        fn vjp(
-            &mut self,
-            _: &Shot<'_>,
-            _: &ImageGrads<'_>,
-            _: &mut [Option<&mut Table>],
-            _: &mut RenderGrads,
-        ) -> Result<()> {
-            Ok(())
-        }
-        fn radii(&self) -> &[f32] {
-            &[]
-        }
-        fn config(&self) -> &RenderConfig {
-            &self.renderer.config
-        }
-        fn name(&self) -> &str {
-            "failing"
-        }
-    }
-
-    #[test]
-    fn a_device_that_fails_on_the_way_is_left_for_the_cpu() {
-        let config = RenderConfig { low_pass: 0.5, ..RenderConfig::default() };
-        let mut backend: Box<dyn Backend> = Box::new(Failing { renderer: Renderer::new(config), drawn: 0 });
-        let (splats, camera, mut image) = (Splats::default(), view(), Image::default());
-        let shot = Shot::new(&splats, &camera, BACKGROUND);
-        assert!(draw(&mut backend, &shot, &mut image).is_none() && backend.name() == "failing");
-        image.color.data.fill(9.0);
-        let error = draw(&mut backend, &shot, &mut image).expect("the driver is gone");
-        assert!(error.to_string().contains("gone") && backend.name() == "the CPU");
-        assert!(image.color.plane(0).iter().all(|v| *v == BACKGROUND[0]), "the CPU has drawn instead");
-        assert_eq!(backend.config().low_pass, 0.5, "with the same limits");
-        assert!(draw(&mut backend, &shot, &mut image).is_none(), "and goes on");
-    }
 }
