@@ -21,9 +21,10 @@ use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
 use rayon::prelude::*;
 use serde_json::{Value, json};
+use splat4d::device;
 use splat4d::format::safetensors::SafeTensors;
 use splat4d::layers::{Instant, Scene};
-use splat4d::render::{Antialias, Image, RenderConfig, Renderer};
+use splat4d::render::{Antialias, Backend, Image, RenderConfig, Shot};
 use splat4d::scene::Planes;
 use std::path::{Path, PathBuf};
 
@@ -148,7 +149,7 @@ struct Judge<'a> {
     capture: &'a Capture,
     store: &'a ImageStore,
     lpips: Option<Lpips>,
-    renderer: Renderer<f32>,
+    backend: Box<dyn Backend>,
     instant: Instant<f32>,
     image: Image<f32>,
     /// Pixels seen and dynamic pixels among them.
@@ -165,13 +166,12 @@ impl<'a> Judge<'a> {
     ) -> Self {
         let antialias = if antialias { Antialias::On } else { Antialias::Off };
         let config = RenderConfig { antialias, ..RenderConfig::default() };
-        let renderer = Renderer::new(config);
         Self {
             scene,
             capture,
             store,
             lpips,
-            renderer,
+            backend: device::cpu(config),
             instant: Instant::default(),
             image: Image::default(),
             dynamic: [0; 2],
@@ -244,7 +244,7 @@ impl<'a> Judge<'a> {
         stored.color_into(&mut truth);
         self.scene.at(info.time, &mut self.instant);
         let splats = self.scene.splats(&self.instant);
-        self.renderer.render(&splats, &info.view, self.scene.background, None, &mut self.image);
+        self.backend.render(&Shot::new(&splats, &info.view, self.scene.background), &mut self.image)?;
         let mut render = self.image.color.clone();
         hide_unknown(&stored, &mut render, &truth);
         let foreground = foreground(&stored);

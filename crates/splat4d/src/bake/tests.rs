@@ -2,6 +2,7 @@
 //! every Gaussian once.
 
 use super::*;
+use crate::device;
 use crate::format::playback::{Draft, Meta, WriteConfig, read, write};
 use crate::layers::{ALPHA_MIN, ALWAYS, Instant};
 use crate::math::{Rng, Se3};
@@ -80,8 +81,8 @@ fn baked(scene: &Scene<f32>, options: &Options) -> Baked {
 fn likeness(scene: &Scene<f32>, baked: &Baked) -> Likeness {
     let frames = ((scene.clip[1] - scene.clip[0]) * FPS).round() as usize + 1;
     let times: Vec<f64> = (0..frames).step_by(frames.div_ceil(9)).map(|k| k as f64 / FPS).collect();
-    let config = RenderConfig::default();
-    compare(scene, Shown::Nodes(&baked.nodes), &cameras(), &times, &config, &mut |_, _| {}).unwrap()
+    let mut cpu = device::cpu(RenderConfig::default());
+    compare(scene, Shown::Nodes(&baked.nodes), &cameras(), &times, cpu.as_mut(), &mut |_, _| {}).unwrap().unwrap()
 }
 
 /// (mean, covariance, opacity) of everything that is visible, sorted by its mean.
@@ -328,8 +329,8 @@ fn a_file_is_as_good_and_can_be_baked_again() {
     };
     let like = |file: &Scene<f32>| {
         let times: Vec<f64> = (0..57).step_by(5).map(|k| f64::from(k) / FPS).collect();
-        let config = RenderConfig::default();
-        compare(&scene, Shown::File(file), &cameras(), &times, &config, &mut |_, _| {}).unwrap()
+        let mut cpu = device::cpu(RenderConfig::default());
+        compare(&scene, Shown::File(file), &cameras(), &times, cpu.as_mut(), &mut |_, _| {}).unwrap().unwrap()
     };
     let played = file(&first);
     assert!(like(&played).psnr > 40.0, "{:?} {:?}", like(&played), likeness(&scene, &first));
