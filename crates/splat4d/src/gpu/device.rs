@@ -1,4 +1,4 @@
-//! Which GPU, and how it is opened: nothing beyond WebGPU's default limits is asked for, so that what runs here runs in
+//! Choice and opening of the GPU: nothing beyond WebGPU's default limits is asked for, so that what runs here runs in
 //! a browser too.
 
 use crate::{Error, ErrorKind, Result};
@@ -7,7 +7,7 @@ use std::pin::pin;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::task::{Context, Poll, Waker};
 
-/// Which adapters will do.
+/// Kinds of adapters that will do.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Adapters {
     /// Only a GPU: a driver that computes on the CPU is no faster than the CPU renderer.

@@ -44,7 +44,7 @@ const FIRST_PAIRS: (usize, usize) = (4, 1 << 16);
 /// Workgroups of one dispatch in one direction (WebGPU's default limit).
 const MOST_GROUPS: usize = 65_535;
 
-/// What the last render did.
+/// Counts of the last render.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct GpuStats {
     /// Splats given.
@@ -64,7 +64,7 @@ pub struct GpuRenderer {
     pub config: RenderConfig,
     /// Whether tables are sent for every picture.
     pub tables: Tables,
-    /// What times the stages.
+    /// Source of the stages' times.
     pub clock: StageClock,
     gpu: Gpu,
     kernels: Kernels,
@@ -387,7 +387,7 @@ fn plane_bytes(band: Band, width: usize) -> u64 {
     (4 * PLANES * width * band.rows * TILE) as u64
 }
 
-/// Where the counts begin in what the CPU reads.
+/// First byte of the counts in the memory that the CPU reads.
 fn counts_at(planes: u64) -> u64 {
     planes.next_multiple_of(UNIFORM_STRIDE)
 }

@@ -88,7 +88,7 @@ pub struct Mlp {
     columns: Vec<String>,
 }
 
-/// What a forward pass remembers for its backward: the hidden activations of as many rows as [`Kept::BYTES`] hold. The
+/// Record of a forward pass for its backward: the hidden activations of as many rows as [`Kept::BYTES`] hold. The
 /// others are computed again, to the same bits.
 #[derive(Clone, Debug, Default)]
 pub struct Kept<F> {

@@ -40,7 +40,7 @@ impl<'a, F: Real> Shot<'a, F> {
         Self { splats, camera, background, extra: None, sh_degree: sh::MAX_DEGREE, depth: false }
     }
 
-    /// What a backend must be able to do to draw it.
+    /// Abilities that drawing it takes.
     pub fn wanted(&self) -> Wanted {
         Wanted { extra: self.extra.is_some(), head: self.splats.head.is_some(), backward: false }
     }

@@ -91,7 +91,7 @@ impl<F: Real> Limits<F> {
     }
 }
 
-/// What happens to a splat in a tile.
+/// Visitor of splats and tiles, front to back.
 pub(super) trait Visit<F: Real> {
     /// Blends record `i` of the batch into tile `t`.
     fn splat<const FMA: bool>(&mut self, t: usize, i: usize, record: &Record<F>);
@@ -442,7 +442,7 @@ impl<F: Real> Kernel for Backward<'_, F> {
     }
 }
 
-/// What the way back carries for the pixels of a tile.
+/// State of the way back in the pixels of a tile.
 #[repr(C, align(64))]
 #[derive(Clone, Copy)]
 struct Back<F> {

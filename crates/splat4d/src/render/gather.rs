@@ -33,7 +33,7 @@ pub(super) struct Record<F> {
     pub c: F,
     /// log₂ of o/α_min, of which τ is the multiple: no logarithm is taken here.
     pub log_ratio: F,
-    /// What is blended.
+    /// Channels to blend.
     pub channels: [F; CHANNELS],
     /// Bit 4·row + column: the tile may be touched.
     pub mask: u16,

@@ -29,7 +29,7 @@ const SUMS: usize = HIDDEN * (FURTHER + 3) + HIDDEN + 3 * HIDDEN + 3;
 
 type Lane<F> = [F; BLOCK];
 
-/// What a picture with a head keeps for its way back; all memory is reused.
+/// Record of a picture with a head for its way back; all memory is reused.
 #[derive(Debug, Default)]
 pub(super) struct Headed<F> {
     /// Further channels of every splat, the head's and then the caller's, [splats, 6 + C].

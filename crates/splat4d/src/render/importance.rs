@@ -36,7 +36,7 @@ const POWERS: [[usize; 2]; 12] =
 /// The moments, and Σ of (Σ_c v_c²)/α².
 const MOMENTS: usize = POWERS.len() + 1;
 
-/// How a picture answers to one splat.
+/// The answer of a picture to changes of one splat.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Sensitivity {
     /// Upper triangle, row by row, of the 6x6 block Σ over pixels and channels of ∇I ∇Iᵀ with respect to the mean (3, world) and
@@ -74,7 +74,7 @@ impl<F: Real> Renderer<F> {
         self.score_all::<Removal>(Some(shot.background), out);
     }
 
-    /// How strongly the picture answers to each splat: exact sums over its pixels, for splats that stay in front of and
+    /// The strength of the picture's answer to each splat: exact sums over its pixels, for splats that stay in front of and
     /// behind the same others. Neither head nor further channels are looked at: the picture is that of the base colours.
     ///
     /// `out` is overwritten, one a splat; zeros where no pixel shows it. Draws by itself; no backward may follow.

@@ -9,7 +9,7 @@
 //! The same bits come out for any number of threads: every floating-point sum has a fixed order, and nothing is ever
 //! added atomically.
 //!
-//! Where [`Splats::head`] has a network, it makes colours of blended channels (`head.rs`), and its gradients come with
+//! A network in [`Splats::head`] makes colours of blended channels (`head.rs`), and its gradients come with
 //! the others.
 
 pub(crate) mod backend;
@@ -55,7 +55,7 @@ pub enum Antialias {
     On,
 }
 
-/// What the renderer may be told.
+/// Settings of the renderer.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RenderConfig {
     /// α below this is skipped.
@@ -175,7 +175,7 @@ pub struct RenderGrads<F = f32> {
     pub mean2d_abs: Vec<F>,
 }
 
-/// What the last render did.
+/// Counts of the last render.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct RenderStats {
     /// Splats given.
@@ -534,7 +534,7 @@ impl<F: Real> Renderer<F> {
         &self.projected
     }
 
-    /// What the last render's blend loop did, counted again, slowly; only the last run of bins of an absurd scene.
+    /// Pairs of the last render's blend loop, counted again, slowly; only the last run of bins of an absurd scene.
     pub fn count_pairs(&self) -> PairCounts {
         self.raster.count_pairs(&self.config)
     }
@@ -551,7 +551,7 @@ impl<F: Real> Renderer<F> {
             + self.radii.capacity() * size_of::<F>()
     }
 
-    /// Where the time of the last render and the last backward went.
+    /// Seconds of the stages of the last render and the last backward.
     pub fn stage_seconds(&self) -> StageSeconds {
         self.seconds
     }

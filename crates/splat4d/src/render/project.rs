@@ -135,7 +135,7 @@ impl<F: Real> View<F> {
     }
 }
 
-/// What forward and backward both need of one Gaussian.
+/// The part of a projection that forward and backward share.
 struct Ellipse<F> {
     /// Mean in camera axes.
     p: [F; 3],
@@ -450,13 +450,13 @@ fn lane<F: Real>(p: &Projected<Lanes<F>>, l: usize) -> Projected<F> {
 /// Splats that were projected: what shading reads, and the ways back.
 #[derive(Clone, Copy, Debug)]
 pub struct Projection<'a, F = f32> {
-    /// What was projected.
+    /// The Gaussians.
     pub splats: &'a Splats<'a, F>,
-    /// Where to.
+    /// The camera, ready for the kernels.
     pub view: &'a View<F>,
     /// Instructions to use.
     pub simd: Simd,
-    /// What came of it, one row a splat.
+    /// Their ellipses, one row a splat.
     pub projected: &'a [Projected<F>],
 }
 

@@ -20,7 +20,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 /// Splats in a reduction task.
 pub(super) const CHUNK: usize = 2048;
 
-/// What a pass backward does with the gradient to centre, conic and opacity.
+/// Treatment of the gradient to centre, conic and opacity by a pass backward.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Geometry {
     /// The first pass.

@@ -422,7 +422,7 @@ impl<F: Real> Kernel for DirectionGrads<'_, F> {
     }
 }
 
-/// Where the gradients of colours go.
+/// Targets of the gradients of colours.
 #[derive(Debug)]
 pub struct ShadeGrads<'a, 't, F = f32> {
     /// Base SH by part, added to in rows `rows.id(j)`; `None` skips it.

@@ -706,7 +706,7 @@ fn sensitivities_are_sums_of_squared_differences() {
     assert!(strong > 6, "{strong} splats matter");
 }
 
-/// What f32 loses on the way back: behind many opaque splats, what is still to come is a small difference of large sums.
+/// Precision of f32 on the way back: behind many opaque splats, what is still to come is a small difference of large sums.
 #[test]
 fn f32_gradients_are_those_of_f64() {
     let mut s = scene(9, 150, 0.12);
