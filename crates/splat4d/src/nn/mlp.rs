@@ -228,7 +228,7 @@ impl Mlp {
                 };
                 self.activate(p, &biases, x, hidden);
                 let last = self.shape.layers;
-                self.map(p, &biases, last, self.input(last, x, hidden), out, outputs, false);
+                self.map(p, &biases, last, self.input(last, x, hidden), out);
             },
         );
     }
@@ -368,7 +368,7 @@ impl Mlp {
         for i in 0..self.shape.layers {
             let stride = self.maps[i + 1].inputs;
             let (next, tail) = rest.split_at_mut(count * stride);
-            self.map(p, biases, i, before, next, stride, true);
+            self.map(p, biases, i, before, next);
             if stride > self.shape.width {
                 for (row, x) in next.chunks_exact_mut(stride).zip(x.chunks_exact(self.shape.inputs)) {
                     row[self.shape.width..].copy_from_slice(x);
@@ -378,17 +378,10 @@ impl Mlp {
         }
     }
 
-    /// out = x Wᵢᵀ + bᵢ, clamped at zero if `relu`, in rows `stride` numbers apart.
-    fn map<F: Real>(
-        &self,
-        p: &Params<F>,
-        biases: &[Vec<F>],
-        i: usize,
-        x: &[F],
-        out: &mut [F],
-        stride: usize,
-        relu: bool,
-    ) {
+    /// out = x Wᵢᵀ + bᵢ: hidden layers are clamped at zero, in rows as far apart as the next map's inputs.
+    fn map<F: Real>(&self, p: &Params<F>, biases: &[Vec<F>], i: usize, x: &[F], out: &mut [F]) {
+        let next = self.maps.get(i + 1);
+        let (stride, relu) = (next.map_or(self.shape.outputs, |map| map.inputs), next.is_some());
         let Map { weight, inputs, outputs, .. } = self.maps[i];
         let w = Matrix::new(p[weight].data(), outputs, inputs, inputs);
         product(Matrix::new(x, x.len() / inputs, inputs, inputs), w.t(), out, stride, false);
