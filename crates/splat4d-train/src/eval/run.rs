@@ -22,7 +22,7 @@ use image::{ExtendedColorType, ImageEncoder};
 use rayon::prelude::*;
 use serde_json::{Value, json};
 use splat4d::format::safetensors::SafeTensors;
-use splat4d::layers::{Instant, Scene};
+use splat4d::layers::{Evaluation, Scene};
 use splat4d::render::{Antialias, Image, RenderConfig, Renderer};
 use splat4d::scene::Planes;
 use std::path::{Path, PathBuf};
@@ -60,16 +60,16 @@ impl EvalOptions {
     pub const STILL: &'static str = "still";
 }
 
-/// What an evaluation found.
+/// The scores of a scene on a capture.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Evaluation {
+pub struct Scores {
     /// Scores of the held-out views and of some training views.
     pub report: Report,
     /// Share of the held-out pixels that are dynamic; `None` without fixed held-out cameras.
     pub dynamic_share: Option<f64>,
 }
 
-impl Evaluation {
+impl Scores {
     /// A mean over the held-out views; `None` where it is not defined.
     pub fn held(&self, metric: &str) -> Option<f64> {
         mean(&self.report.test, metric)
@@ -107,9 +107,9 @@ pub fn evaluate(
     iteration: usize,
     options: &EvalOptions,
     listen: &mut dyn FnMut(&Event),
-) -> Result<Evaluation> {
+) -> Result<Scores> {
     let evaluation = assess(scene, capture, store, iteration, options, listen)?;
-    let Evaluation { report, dynamic_share } = &evaluation;
+    let Scores { report, dynamic_share } = &evaluation;
     let (mut results, mut views) = (report.results(), report.per_view());
     let ours = report.method();
     results[&ours]["dynamic-share"] = json!(dynamic_share);
@@ -130,7 +130,7 @@ pub fn assess(
     iteration: usize,
     options: &EvalOptions,
     listen: &mut dyn FnMut(&Event),
-) -> Result<Evaluation> {
+) -> Result<Scores> {
     let lpips = options.lpips_weights.as_deref().map(load_lpips).transpose()?;
     let folder = options.folder.join("test").join(format!("ours_{iteration}"));
     let mut judge = Judge::new(scene, capture, store, lpips, options.antialias);
@@ -140,7 +140,7 @@ pub fn assess(
     let some = spread(&capture.train, options.train_views);
     let train = judge.split(&some, Views::Train, "evaluating training views", listen)?;
     let report = Report { iteration: iteration as u64, test, train: (!some.is_empty()).then_some(train) };
-    Ok(Evaluation { report, dynamic_share })
+    Ok(Scores { report, dynamic_share })
 }
 
 struct Judge<'a> {
@@ -149,7 +149,7 @@ struct Judge<'a> {
     store: &'a ImageStore,
     lpips: Option<Lpips>,
     renderer: Renderer<f32>,
-    instant: Instant<f32>,
+    instant: Evaluation<f32>,
     image: Image<f32>,
     /// Pixels seen and dynamic pixels among them.
     dynamic: [usize; 2],
@@ -172,7 +172,7 @@ impl<'a> Judge<'a> {
             store,
             lpips,
             renderer,
-            instant: Instant::default(),
+            instant: Evaluation::default(),
             image: Image::default(),
             dynamic: [0; 2],
         }

@@ -8,12 +8,10 @@ use super::channels::{Channels, Later};
 pub use crate::capture::frames::FlowTruth;
 pub use crate::densify::Observation;
 pub use crate::loss::terms::{ParamLoss, Probe, ProbeLoss, StepInfo};
-use splat4d::layers::{LayerTape, Scene};
+use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::Real;
-use splat4d::motion::{At, Cache};
 use splat4d::render::{Image, ImageGrads, RenderConfig, RenderGrads, Renderer};
-use splat4d::scene::table::halve;
-use splat4d::scene::{Camera, Color, Grads, Key, Params, Planes, Rows, SH, Space, SplatGrads, Splats, Table, Time};
+use splat4d::scene::{Camera, Color, Grads, Key, Params, Planes, Rows, SH, Space, Splats, Table, Time};
 use std::time::{Duration, Instant as Clock};
 
 /// Draws splats and takes gradients back; [`Renderer`] is the one in use, tests put the oracle here.
@@ -183,42 +181,15 @@ pub struct StepReport {
     pub timings: Timings,
 }
 
-/// One distinct (layer, space, time) of a step.
-struct Ask<F: Real> {
-    layer: usize,
-    tape: LayerTape<F>,
-    /// Whether the gradients below are this step's.
-    begun: bool,
-    d_out: Table<F>,
-    d_color: Option<Table<F>>,
-    d_weights: Option<Table<F>>,
-    d_time: f64,
-}
-
 /// The chain's arena: reused from step to step.
+#[derive(Default)]
 pub struct Chain<F: Real = f32> {
-    asks: Vec<Ask<F>>,
-    spare: Vec<Ask<F>>,
-    caches: Vec<(Cache, Cache)>,
+    evaluation: Evaluation<F>,
     image: Image<F>,
     d_image: PictureGrads<F>,
     d_render: RenderGrads<F>,
     /// Number of `Motion::at` calls of the last step, for tests and reports.
     pub at_calls: usize,
-}
-
-impl<F: Real> Default for Chain<F> {
-    fn default() -> Self {
-        Self {
-            asks: Vec::new(),
-            spare: Vec::new(),
-            caches: Vec::new(),
-            image: Image::default(),
-            d_image: PictureGrads::default(),
-            d_render: RenderGrads::default(),
-            at_calls: 0,
-        }
-    }
 }
 
 /// The losses of a step.
@@ -248,27 +219,14 @@ impl<F: Real> Chain<F> {
         let clock = Clock::now();
         let probes: Vec<Vec<Probe>> = losses.probes.iter().map(|l| l.probes(scene, info)).collect();
         self.ask(scene, views, losses.image.wanted(), &probes);
-        self.caches.resize_with(scene.layers.len(), Default::default);
-        for (layer, (cache, d_cache)) in self.caches.iter_mut().enumerate() {
-            *d_cache = Cache::default();
-            let questions = questions(&self.asks, scene, layer);
-            scene.layers[layer].motion.prepare(&scene.layers[layer].params, &questions, cache);
-        }
-        self.at_calls = self.asks.len();
-        for ask in &mut self.asks {
-            scene.layers[ask.layer].at(&self.caches[ask.layer].0, &mut ask.tape);
-            (ask.begun, ask.d_time) = (false, 0.0);
-            d[ask.layer].activate(ask.tape.space(), ask.tape.rows());
-        }
+        self.evaluation.answer(&scene.layers);
+        self.evaluation.activate(d);
+        self.at_calls = self.evaluation.len();
         report.timings.motion = clock.elapsed();
         for view in views {
             self.view(scene, view, draw, losses.image, d, observe, &mut report);
         }
         let clock = Clock::now();
-        for ask in self.asks.iter_mut().filter(|a| !a.begun) {
-            reset_like(&mut ask.d_out, ask.tape.out());
-            (ask.d_color, ask.d_weights) = (None, None);
-        }
         for (loss, probes) in losses.probes.iter().zip(&probes) {
             if !probes.is_empty() {
                 report.loss += self.probe(scene, loss.as_ref(), probes);
@@ -279,78 +237,42 @@ impl<F: Real> Chain<F> {
         }
         report.timings.loss += clock.elapsed();
         let clock = Clock::now();
-        for ask in &mut self.asks {
-            let (cache, d_cache) = &mut self.caches[ask.layer];
-            let d_out = SplatGrads { out: &ask.d_out, color: ask.d_color.as_ref(), weights: ask.d_weights.as_ref() };
-            ask.d_time = scene.layers[ask.layer].backward(cache, &mut ask.tape, &d_out, d_cache, &mut d[ask.layer]);
-        }
-        for (layer, (cache, d_cache)) in self.caches.iter_mut().enumerate() {
-            let questions = questions(&self.asks, scene, layer);
-            let l = &scene.layers[layer];
-            l.motion.finish(&l.params, &questions, cache, d_cache, &mut d[layer]);
-        }
+        self.evaluation.backward(&scene.layers, d);
         report.timings.motion_backward = clock.elapsed();
-        for view in views {
-            let of_view = |a: &&Ask<F>| a.tape.space() == Space::Gaussians && a.tape.time() == view.t;
-            report.d_times.push(self.asks.iter().filter(of_view).map(|a| a.d_time).sum());
-        }
+        report.d_times.extend(views.iter().map(|view| self.evaluation.d_time(view.t)));
         report
     }
 
     /// Collects the distinct questions: what views see is what is alive, probes add their rows.
     fn ask(&mut self, scene: &Scene<F>, views: &[View<'_, F>], wanted: Wanted, probes: &[Vec<Probe>]) {
-        self.spare.append(&mut self.asks);
+        self.evaluation.begin();
         for view in views {
-            for (layer, l) in scene.layers.iter().enumerate() {
-                if self.find(layer, Space::Gaussians, view.t).is_none() {
-                    let mut ask = self.spare.pop().unwrap_or_else(Ask::new);
-                    ask.layer = layer;
-                    ask.tape.ask_active(l, view.t);
-                    self.asks.push(ask);
-                }
+            for (index, layer) in scene.layers.iter().enumerate() {
+                self.evaluation.ask_active(index, layer, view.t);
             }
         }
         for probe in probes.iter().flatten() {
             for &t in &probe.times {
-                self.ask_rows(probe.layer, probe.of, probe.rows.as_deref().map_or(Rows::All, Rows::Some), t);
+                let rows = probe.rows.as_deref().map_or(Rows::All, Rows::Some);
+                self.evaluation.ask(probe.layer, probe.of, rows, t);
             }
         }
         for (view, flow) in views.iter().filter_map(|v| Some((v, v.flow.as_ref().filter(|_| wanted.flow)?))) {
             for layer in 0..scene.layers.len() {
-                let i = self.find(layer, Space::Gaussians, view.t).expect("every view's time was asked");
-                match self.asks[i].tape.rows() {
-                    Rows::All => self.ask_rows(layer, Space::Gaussians, Rows::All, flow.to),
+                match self.evaluation.tape(self.asked(layer, view.t)).rows() {
+                    Rows::All => self.evaluation.ask(layer, Space::Gaussians, Rows::All, flow.to),
                     Rows::Some(ids) => {
                         let ids = ids.to_vec();
-                        self.ask_rows(layer, Space::Gaussians, Rows::Some(&ids), flow.to);
+                        self.evaluation.ask(layer, Space::Gaussians, Rows::Some(&ids), flow.to)
                     }
-                }
+                };
             }
         }
     }
 
-    /// Asks for rows at a time, beside those that are asked already.
-    fn ask_rows(&mut self, layer: usize, of: Space, wanted: Rows<'_>, t: Time) {
-        let Some(i) = self.find(layer, of, t) else {
-            let mut ask = self.spare.pop().unwrap_or_else(Ask::new);
-            ask.layer = layer;
-            ask.tape.ask(of, wanted, t);
-            self.asks.push(ask);
-            return;
-        };
-        let tape = &mut self.asks[i].tape;
-        match (tape.rows(), wanted) {
-            (Rows::All, _) => {}
-            (_, Rows::All) => tape.ask(of, Rows::All, t),
-            (Rows::Some(a), Rows::Some(b)) => {
-                let both = union(a, b);
-                tape.ask(of, Rows::Some(&both), t);
-            }
-        }
-    }
-
-    fn find(&self, layer: usize, of: Space, t: Time) -> Option<usize> {
-        self.asks.iter().position(|a| a.layer == layer && a.tape.space() == of && a.tape.time() == t)
+    /// The question for the Gaussians of a layer at a time of this step.
+    fn asked(&self, layer: usize, t: Time) -> usize {
+        self.evaluation.find(layer, Space::Gaussians, t).expect("every time of a step was asked")
     }
 
     /// Draws one view, compares it, and takes the gradient back to its splats.
@@ -364,11 +286,8 @@ impl<F: Real> Chain<F> {
         observe: &mut dyn FnMut(Observation<'_, F>),
         report: &mut StepReport,
     ) {
-        let asked: Vec<usize> = (0..scene.layers.len())
-            .map(|layer| self.find(layer, Space::Gaussians, view.t).expect("every view's time was asked"))
-            .collect();
-        let parts = asked.iter().enumerate().map(|(layer, &i)| scene.layers[layer].part(&self.asks[i].tape)).collect();
-        let splats = Splats { parts, head: scene.head_weights() };
+        let asked: Vec<usize> = (0..scene.layers.len()).map(|layer| self.asked(layer, view.t)).collect();
+        let splats = self.evaluation.splats(scene, view.t);
         let clock = Clock::now();
         let wanted = loss.wanted();
         let column = loss.share().filter(|_| view.mask.is_some()).map(str::to_owned);
@@ -379,8 +298,8 @@ impl<F: Real> Chain<F> {
         let share = keys.iter().any(Option::is_some).then(|| self.share(scene, &asked, &keys));
         let ways = view.flow.as_ref().filter(|_| wanted.flow).map(|f| self.ways(f.to, &asked));
         let channels = {
-            let parts: Vec<&Table<F>> = asked.iter().map(|&i| self.asks[i].tape.out()).collect();
-            let later: Vec<Later<'_, F>> = ways.iter().flatten().map(|w| w.later(&self.asks)).collect();
+            let parts: Vec<&Table<F>> = asked.iter().map(|&i| self.evaluation.tape(i).out()).collect();
+            let later: Vec<Later<'_, F>> = ways.iter().flatten().map(|w| w.later(&self.evaluation)).collect();
             let flow = view.flow.as_ref().filter(|_| ways.is_some()).map(|f| (f, &later[..]));
             Channels::new(wanted, view.camera, &parts, flow, share.as_deref())
         };
@@ -428,7 +347,7 @@ impl<F: Real> Chain<F> {
             let count = splats.parts[layer].out.rows();
             observe(Observation {
                 layer,
-                rows: self.asks[i].tape.rows(),
+                rows: self.evaluation.tape(i).rows(),
                 mean2d: &self.d_render.mean2d[first..first + count],
                 radii: &draw.radii()[first..first + count],
             });
@@ -436,23 +355,12 @@ impl<F: Real> Chain<F> {
         }
         drop(splats);
         for (&i, part) in asked.iter().zip(&mut self.d_render.parts) {
-            let ask = &mut self.asks[i];
-            if ask.begun {
-                add_table(&mut ask.d_out, &part.out);
-                add_optional(&mut ask.d_color, part.color.as_ref());
-                add_optional(&mut ask.d_weights, part.weights.as_ref());
-            } else {
-                // Nothing to add to: the renderer gets the ask's old tables to overwrite.
-                ask.begun = true;
-                std::mem::swap(&mut ask.d_out, &mut part.out);
-                std::mem::swap(&mut ask.d_color, &mut part.color);
-                std::mem::swap(&mut ask.d_weights, &mut part.weights);
-            }
+            self.evaluation.add_gradient(i, &mut part.out, &mut part.color, &mut part.weights);
         }
         if let (Some(channels), Some(d_table)) = (&channels, &self.d_render.extra)
             && self.d_image.uses_extra
         {
-            Self::further(&mut self.asks, view, channels, d_table, &asked, ways.as_deref());
+            Self::further(&mut self.evaluation, view, channels, d_table, &asked, ways.as_deref());
             if let (Some(share), Some(column)) = (&share, channels.share()) {
                 self.share_backward(&asked, &keys, share, (d_table, column), d);
             }
@@ -464,7 +372,8 @@ impl<F: Real> Chain<F> {
     fn share(&self, scene: &Scene<F>, asked: &[usize], keys: &[Option<(Key, usize)>]) -> Vec<F> {
         let mut out = Vec::new();
         for ((&i, key), layer) in asked.iter().zip(keys).zip(&scene.layers) {
-            let (rows, count) = (self.asks[i].tape.rows(), self.asks[i].tape.out().rows());
+            let tape = self.evaluation.tape(i);
+            let (rows, count) = (tape.rows(), tape.out().rows());
             let value = |j: usize| key.map_or(F::ZERO, |(key, col)| layer.params[key].get(rows.id(j), col).sigmoid());
             out.extend((0..count).map(value));
         }
@@ -482,7 +391,8 @@ impl<F: Real> Chain<F> {
     ) {
         let mut first = 0;
         for ((&i, key), d) in asked.iter().zip(keys).zip(d.iter_mut()) {
-            let (rows, count) = (self.asks[i].tape.rows(), self.asks[i].tape.out().rows());
+            let tape = self.evaluation.tape(i);
+            let (rows, count) = (tape.rows(), tape.out().rows());
             if let Some((key, col)) = *key {
                 let [d] = d.of([key]);
                 for j in 0..count {
@@ -497,8 +407,8 @@ impl<F: Real> Chain<F> {
     /// Where the splats of a view are at another time: by layer an ask and its rows.
     fn ways(&self, to: Time, asked: &[usize]) -> Vec<Way> {
         let way = |(layer, &i): (usize, &usize)| {
-            let ask = self.find(layer, Space::Gaussians, to).expect("a flow's time was asked");
-            let (from, then) = (&self.asks[i].tape, &self.asks[ask].tape);
+            let ask = self.asked(layer, to);
+            let (from, then) = (self.evaluation.tape(i), self.evaluation.tape(ask));
             let row = |id: usize| match then.rows() {
                 Rows::All => id as u32,
                 Rows::Some(ids) => ids.binary_search(&(id as u32)).map_or(u32::MAX, |r| r as u32),
@@ -510,7 +420,7 @@ impl<F: Real> Chain<F> {
 
     /// The VJP of a view's further channels.
     fn further(
-        asks: &mut [Ask<F>],
+        evaluation: &mut Evaluation<F>,
         view: &View<'_, F>,
         channels: &Channels<F>,
         d_table: &Table<F>,
@@ -520,20 +430,15 @@ impl<F: Real> Chain<F> {
         let mut first = 0;
         for (layer, &i) in asked.iter().enumerate() {
             let way = ways.map(|w| &w[layer]).filter(|w| w.ask != i);
-            if let Some(way) = way.filter(|w| !asks[w.ask].begun) {
-                let ask = &mut asks[way.ask];
-                reset_like(&mut ask.d_out, ask.tape.out());
-                (ask.d_color, ask.d_weights, ask.begun) = (None, None, true);
-            }
-            let mut d_out = std::mem::take(&mut asks[i].d_out);
-            let mut d_later = way.map(|w| std::mem::take(&mut asks[w.ask].d_out));
-            let later = way.map(|w| w.later(asks));
+            let mut d_out = std::mem::take(evaluation.d_out(i));
+            let mut d_later = way.map(|w| std::mem::take(evaluation.d_out(w.ask)));
+            let later = way.map(|w| w.later(evaluation));
             let flow = view.flow.as_ref().zip(later.as_ref()).zip(d_later.as_mut()).map(|((f, l), d)| (f, l, d));
-            channels.backward(view.camera, asks[i].tape.out(), first, d_table, &mut d_out, flow);
+            channels.backward(view.camera, evaluation.tape(i).out(), first, d_table, &mut d_out, flow);
             first += d_out.rows();
-            asks[i].d_out = d_out;
+            *evaluation.d_out(i) = d_out;
             if let (Some(way), Some(d)) = (way, d_later) {
-                asks[way.ask].d_out = d;
+                *evaluation.d_out(way.ask) = d;
             }
         }
     }
@@ -546,9 +451,9 @@ impl<F: Real> Chain<F> {
             let mut tables = Vec::new();
             let mut place = Vec::new();
             for &t in &probe.times {
-                let i = self.find(probe.layer, probe.of, t).expect("every probe's time was asked");
-                let out = self.asks[i].tape.out();
-                let index: Vec<u32> = match (self.asks[i].tape.rows(), &probe.rows) {
+                let i = self.evaluation.find(probe.layer, probe.of, t).expect("every probe's time was asked");
+                let out = self.evaluation.tape(i).out();
+                let index: Vec<u32> = match (self.evaluation.tape(i).rows(), &probe.rows) {
                     (_, None) => (0..out.rows() as u32).collect(),
                     (Rows::All, Some(rows)) => rows.clone(),
                     (Rows::Some(ids), Some(rows)) => rows
@@ -566,7 +471,7 @@ impl<F: Real> Chain<F> {
         let value = loss.eval(scene, probes, &seen, &mut d);
         for (place, tables) in places.iter().zip(&d) {
             for ((i, index), table) in place.iter().zip(tables) {
-                let d_out = &mut self.asks[*i].d_out;
+                let d_out = self.evaluation.d_out(*i);
                 for (j, &row) in index.iter().enumerate() {
                     d_out.add(row as usize, 0, table.read::<10>(j, 0));
                 }
@@ -578,20 +483,6 @@ impl<F: Real> Chain<F> {
     /// The last view drawn.
     pub fn image(&self) -> &Image<F> {
         &self.image
-    }
-}
-
-impl<F: Real> Ask<F> {
-    fn new() -> Self {
-        Self {
-            layer: 0,
-            tape: LayerTape::default(),
-            begun: false,
-            d_out: Table::default(),
-            d_color: None,
-            d_weights: None,
-            d_time: 0.0,
-        }
     }
 }
 
@@ -607,55 +498,7 @@ struct Way {
 }
 
 impl Way {
-    fn later<'a, F: Real>(&'a self, asks: &'a [Ask<F>]) -> Later<'a, F> {
-        Later { out: asks[self.ask].tape.out(), rows: &self.rows }
-    }
-}
-
-fn questions<'a, F: Real>(asks: &'a [Ask<F>], scene: &'a Scene<F>, layer: usize) -> Vec<At<'a, F>> {
-    asks.iter().filter(|a| a.layer == layer).map(|a| a.tape.question(&scene.layers[layer].params)).collect()
-}
-
-fn union(a: &[u32], b: &[u32]) -> Vec<u32> {
-    let mut out = Vec::with_capacity(a.len() + b.len());
-    let (mut i, mut j) = (0, 0);
-    while i < a.len() || j < b.len() {
-        let next = match (a.get(i), b.get(j)) {
-            (Some(&x), Some(&y)) => x.min(y),
-            (Some(&x), None) => x,
-            (None, Some(&y)) => y,
-            (None, None) => unreachable!("the loop's condition holds one of them"),
-        };
-        i += usize::from(a.get(i) == Some(&next));
-        j += usize::from(b.get(j) == Some(&next));
-        out.push(next);
-    }
-    out
-}
-
-/// Makes `d` an all-zero table in the shape of `like`, keeping the allocation.
-fn reset_like<F: Real>(d: &mut Table<F>, like: &Table<F>) {
-    if d.width() == like.width() {
-        d.resize(like.rows());
-        d.fill(F::ZERO);
-    } else {
-        *d = like.zeros_like();
-    }
-}
-
-fn add_table<F: Real>(to: &mut Table<F>, from: &Table<F>) {
-    assert_eq!((to.rows(), to.width()), (from.rows(), from.width()), "gradients of one ask have one shape");
-    halve([to.view_mut()], &|[to]| {
-        let from = &from.data()[to.first * to.width..];
-        to.data.iter_mut().zip(from).for_each(|(a, b)| *a += *b);
-        0.0
-    });
-}
-
-fn add_optional<F: Real>(to: &mut Option<Table<F>>, from: Option<&Table<F>>) {
-    match (to, from) {
-        (Some(to), Some(from)) => add_table(to, from),
-        (to @ None, Some(from)) => *to = Some(from.clone()),
-        (_, None) => {}
+    fn later<'a, F: Real>(&'a self, evaluation: &'a Evaluation<F>) -> Later<'a, F> {
+        Later { out: evaluation.tape(self.ask).out(), rows: &self.rows }
     }
 }

@@ -5,7 +5,7 @@ use super::*;
 use crate::init::{self, Seeds};
 use crate::methods::split::stages;
 use crate::recipe::Recipe;
-use splat4d::layers::Instant;
+use splat4d::layers::Evaluation;
 use splat4d::math::Se3;
 use splat4d::math::se3::{dot, normalize, sub};
 
@@ -146,7 +146,7 @@ fn errors(motion: &str, life: &str) -> [f64; 2] {
         trainer.step().unwrap().expect("no fault");
     }
     let (mut renderer, mut image, mut instant) =
-        (Renderer::<f32>::new(RenderConfig::default()), Image::default(), Instant::default());
+        (Renderer::<f32>::new(RenderConfig::default()), Image::default(), Evaluation::default());
     let (mut picture, mut sums) = (Picture::default(), [[0.0f64; 2]; 2]);
     for i in 0..party.len() {
         trainer.scene.at(party.time(i), &mut instant);
