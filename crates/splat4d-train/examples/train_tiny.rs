@@ -113,7 +113,7 @@ fn main() -> Result<()> {
         program.stages(&plan),
         Arc::new(made),
         Box::new(Renderer::new(RenderConfig { sh_degree: 0, ..RenderConfig::default() })),
-        TrainLoss::new(plan.recipe.lambda_dssim, 0.0, None),
+        TrainLoss::photometric(plan.recipe.lambda_dssim),
         Settings {
             seed: 0,
             limits: Limits { cap: plan.recipe.max_cap, extent: plan.extent, min_opacity: plan.recipe.min_opacity },

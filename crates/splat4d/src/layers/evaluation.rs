@@ -79,6 +79,19 @@ impl<F: Real> Evaluation<F> {
         i
     }
 
+    /// Asks for the rows of question i at another time. Returns the number of that question.
+    pub fn ask_again(&mut self, i: usize, t: Time) -> usize {
+        let Question { layer, tape, .. } = &self.questions[i];
+        let (layer, of) = (*layer, tape.space());
+        match tape.rows() {
+            Rows::All => self.ask(layer, of, Rows::All, t),
+            Rows::Some(ids) => {
+                let ids = ids.to_vec();
+                self.ask(layer, of, Rows::Some(&ids), t)
+            }
+        }
+    }
+
     fn push(&mut self, layer: usize, ask: impl FnOnce(&mut LayerTape<F>)) -> usize {
         let mut question = self.spare.pop().unwrap_or_default();
         (question.layer, question.alive) = (layer, false);

@@ -157,7 +157,7 @@ pub(super) fn trainer(scene: Scene<f32>, frames: Arc<dyn Frames>, way: Way) -> R
         exposure_lr: 0.0,
     };
     let renderer = Renderer::new(RenderConfig { simd: way.simd, ..RenderConfig::default() });
-    let loss = TrainLoss::new(LAMBDA_DSSIM, 0.0, None);
+    let loss = TrainLoss::photometric(LAMBDA_DSSIM);
     let mut trainer = Trainer::new(scene, vec![stage], frames, Box::new(renderer), loss, settings);
     trainer.progress.rate_scale = STANDSTILL;
     Ok(trainer)

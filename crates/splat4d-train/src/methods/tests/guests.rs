@@ -140,7 +140,7 @@ fn errors(motion: &str, life: &str) -> [f64; 2] {
         exposure_lr: 0.0,
     };
     let draw = Box::new(Renderer::new(RenderConfig::default()));
-    let loss = TrainLoss::new(0.0, 0.0, None);
+    let loss = TrainLoss::photometric(0.0);
     let mut trainer = Trainer::new(scene, stages(program.as_ref(), &plan), party.clone(), draw, loss, settings);
     while !trainer.is_done() {
         trainer.step().unwrap().expect("no fault");

@@ -152,7 +152,8 @@ fn trainer(s: Scene<f32>, plan: &Plan, frames: Arc<dyn Frames>, exposure: Option
         exposure_lr: plan.recipe.exposure_lr,
     };
     let draw = Box::new(Renderer::new(RenderConfig { sh_degree: 0, ..RenderConfig::default() }));
-    let loss = TrainLoss::new(0.2, 0.0, exposure);
+    let mut loss = TrainLoss::photometric(0.2);
+    loss.exposure = exposure;
     Trainer::new(s, TrackedProgram.stages(plan), frames, draw, loss, settings)
 }
 
