@@ -1,11 +1,11 @@
 //! The contract of stages, layers and motion models, proven by made-up models: each is trained a few steps by the
 //! ordinary trainer and checked against f64 finite differences through the whole chain, the oracle as the forward.
 
+mod channels;
 mod control;
 mod edits;
 mod features;
 mod filtered;
-mod further;
 mod guests;
 mod hexplane;
 mod layers;
@@ -19,7 +19,7 @@ mod wrapper;
 
 use super::*;
 use crate::densify::Limits;
-use crate::loss::image::{ImageTerm, Needs, PictureGrads, Shown};
+use crate::loss::image::{ImageTerm, PictureGrads, Shown};
 use crate::train::chain::{Chain, Losses, Step, StepInfo, StepReport, View};
 use crate::train::frames::{Frames, Picture};
 use crate::train::loss::TrainLoss;
@@ -106,10 +106,6 @@ impl Backend<f64> for Oracle {
 struct Squared;
 
 impl ImageTerm<f64> for Squared {
-    fn needs(&self, _: &View<'_, f64>) -> Needs {
-        Needs { depth: true, extra: Vec::new() }
-    }
-
     fn eval(&mut self, _: &StepInfo, view: &View<'_, f64>, shown: &Shown<'_, f64>, d: &mut PictureGrads<f64>) -> f64 {
         let n = shown.color.data.len() as f64;
         let d_color = d.color.overwrite().expect("there is one term");

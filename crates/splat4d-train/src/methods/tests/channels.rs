@@ -1,7 +1,7 @@
 //! Gradients through the whole chain of what is drawn beside colours: depth, normals, flow and a column's sigmoid.
 
 use super::*;
-use crate::loss::image::Channel;
+use crate::loss::image::{Channel, Needs};
 use crate::train::chain::FlowTruth;
 
 /// Random weights on every number of every picture but the colours.
