@@ -17,7 +17,7 @@ mod tests;
 pub mod tracked;
 
 use crate::densify::{Crowding, Densify, Guided, Relocate, Stats};
-pub use crate::loss::terms::Segmentation;
+use crate::loss::image::ImageTerm;
 use crate::loss::terms::{Codec, ParamLoss, ProbeLoss};
 use crate::optim::Moments;
 use crate::prune::Periodic;
@@ -193,8 +193,8 @@ pub struct Stage<F: Real = f32> {
     pub min_log_life: Option<f64>,
     /// Noise on the times of the step's views.
     pub time_noise: TimeNoise,
-    /// What masks are compared with, beside the pictures; none: nothing.
-    pub segmentation: Option<Segmentation>,
+    /// Losses on pictures, after the run's own.
+    pub pictures: Vec<Box<dyn ImageTerm<F>>>,
     /// Whether the cameras' exposures stay as they are.
     pub freeze_exposure: bool,
     /// What stands between the parameters and the pictures; none: nothing.
@@ -231,7 +231,7 @@ impl<F: Real> Stage<F> {
             half_size_steps: 0,
             min_log_life: None,
             time_noise: TimeNoise::default(),
-            segmentation: None,
+            pictures: Vec::new(),
             freeze_exposure: false,
             codec: None,
             start: None,

@@ -1,7 +1,7 @@
 //! How much of the views at one time every Gaussian of a scene is.
 
 use super::temporal::Spatial;
-use splat4d::layers::{Instant, Scene};
+use splat4d::layers::{Evaluation, Scene};
 use splat4d::render::{Antialias, RenderConfig, Renderer, Sensitivity, Shot};
 use splat4d::scene::splats::SPLAT_OPACITY;
 use splat4d::scene::{Camera, Time};
@@ -13,7 +13,7 @@ const LEAST_PIVOT: f64 = 1e-6;
 pub(super) struct Weighing {
     spatial: Spatial,
     renderer: Renderer<f32>,
-    instant: Instant<f32>,
+    instant: Evaluation<f32>,
     shares: Vec<f32>,
     changes: Vec<f32>,
     layers: Vec<Vec<f64>>,
@@ -29,7 +29,7 @@ impl Weighing {
         Self {
             spatial,
             renderer,
-            instant: Instant::default(),
+            instant: Evaluation::default(),
             shares: Vec::new(),
             changes: Vec::new(),
             layers: Vec::new(),
@@ -78,7 +78,7 @@ impl Weighing {
         }
         let size = [camera.width, camera.height];
         let mut first = 0;
-        let tapes = self.instant.tapes.iter().zip(&mut self.layers).zip(&mut self.pixels);
+        let tapes = self.instant.tapes().zip(&mut self.layers).zip(&mut self.pixels);
         for (layer, ((tape, sums), pixels)) in tapes.enumerate() {
             let (rows, count) = (tape.rows(), tape.out().rows());
             let projected = &self.renderer.projected()[first..first + count];

@@ -15,7 +15,7 @@ use crate::capture::{Capture, CaptureOptions, ImageStore};
 use crate::densify::Limits;
 use crate::event::Event;
 use crate::init::{self, Seeds};
-use crate::loss::image::ImageTerms;
+use crate::loss::image::terms;
 use crate::methods::auto::{self, AUTO};
 use crate::methods::{Plan, Stage, program_of, split};
 use crate::recipe::Recipe;
@@ -368,8 +368,7 @@ impl Bench {
             opacity_reset_interval: r.opacity_reset_interval,
             exposure_lr: r.exposure_lr,
         };
-        let mut loss = TrainLoss::new(r.lambda_dssim, r.lambda_mask, exposure);
-        loss.terms = ImageTerms::of(r);
+        let loss = TrainLoss::new(terms(r), exposure);
         Trainer::new(scene, stages, self.frames.clone(), Box::new(Renderer::new(config)), loss, settings)
     }
 

@@ -1,6 +1,6 @@
 //! [`Trainer`]: the state of a run and one step of it. Files, progress and clocks are the business of `run`.
 
-use super::chain::{Chain, Draw, Losses, StepInfo, StepReport, View};
+use super::chain::{Chain, Losses, Step, StepInfo, StepReport, View};
 use super::loss::TrainLoss;
 use crate::capture::frames::{FlowTruth, Frames, Picture};
 use crate::densify::{self, Change, Densify, Limits, Stats, adc, mcmc, morton_edit};
@@ -12,6 +12,7 @@ use crate::sampler::Timeline;
 use crate::{Error, ErrorKind, Result};
 use splat4d::layers::Scene;
 use splat4d::math::Rng;
+use splat4d::render::Backend;
 use splat4d::scene::life::LOG_WIDTH;
 use splat4d::scene::{Camera, GEOMETRY, Grads, LIFE, SH, Space, Time};
 use std::borrow::Cow;
@@ -101,7 +102,7 @@ pub struct Trainer<'a> {
     switched: Option<usize>,
     frames: Arc<dyn Frames>,
     timeline: Timeline,
-    draw: Box<dyn Draw<f32> + 'a>,
+    draw: Box<dyn Backend<f32> + 'a>,
     grads: Vec<Grads<f32>>,
     /// Scratch: a rate a column, by layer and table.
     rates: Vec<Vec<Option<Vec<f64>>>>,
@@ -115,7 +116,7 @@ impl<'a> Trainer<'a> {
         scene: Scene<f32>,
         stages: Vec<Stage>,
         frames: Arc<dyn Frames>,
-        draw: Box<dyn Draw<f32> + 'a>,
+        draw: Box<dyn Backend<f32> + 'a>,
         loss: TrainLoss,
         settings: Settings,
     ) -> Self {
@@ -147,7 +148,7 @@ impl<'a> Trainer<'a> {
 
     /// Draws with another device from now on.
     #[cfg(test)]
-    pub(super) fn set_draw(&mut self, draw: Box<dyn Draw<f32> + 'a>) {
+    pub(super) fn set_draw(&mut self, draw: Box<dyn Backend<f32> + 'a>) {
         self.draw = draw;
     }
 
@@ -301,7 +302,7 @@ impl<'a> Trainer<'a> {
             self.frames.prefetch(&self.draw_frames(self.progress.stage_step + 1));
         }
         out.load = clock.elapsed();
-        self.forward_backward(&seen, &mut out);
+        self.forward_backward(&seen, &mut out)?;
         let clock = Clock::now();
         let bad = self.learn();
         out.adam = clock.elapsed();
@@ -322,8 +323,8 @@ impl<'a> Trainer<'a> {
         Ok(Ok(out))
     }
 
-    fn forward_backward(&mut self, seen: &[usize], out: &mut Stepped) {
-        let stage = &self.stages[self.progress.stage];
+    fn forward_backward(&mut self, seen: &[usize], out: &mut Stepped) -> Result<()> {
+        let stage = &mut self.stages[self.progress.stage];
         let background = self.settings.background;
         let half = self.progress.stage_step < stage.half_size_steps;
         let cameras: Vec<Camera> = seen
@@ -366,11 +367,10 @@ impl<'a> Trainer<'a> {
             seed: self.settings.seed,
             progress: self.progress.stage_step as f64 / stage.iterations as f64,
         };
-        self.draw.config().sh_degree = match (stage.sh_from + self.progress.stage_step).checked_div(stage.sh_interval) {
+        let sh_degree = match (stage.sh_from + self.progress.stage_step).checked_div(stage.sh_interval) {
             Some(unlocked) => unlocked.min(self.settings.sh_degree),
             None => self.settings.sh_degree,
         };
-        self.loss.progress = info.progress;
         let clock = Clock::now();
         if let Some(codec) = &stage.codec {
             if std::mem::take(&mut self.stale) {
@@ -380,17 +380,15 @@ impl<'a> Trainer<'a> {
             codec.show(&self.scene, &info.times, &mut self.shown);
         }
         out.other += clock.elapsed();
-        self.loss.segmentation = stage.segmentation.clone();
         let scene = if stage.codec.is_some() { &self.shown } else { &self.scene };
-        let mut mse = Mse { inner: &mut self.loss, sum: 0.0 };
-        let mut losses = Losses { image: &mut mse, probes: &stage.probes, params: &stage.params };
+        let mut image = self.loss.of_step(&mut stage.pictures);
+        let mut losses = Losses { image: &mut image, probes: &stage.probes, params: &stage.params };
         let stats = &mut self.stats;
+        let step = Step { scene, views: &views, info: &info, sh_degree };
         out.report =
-            self.chain.step(scene, &views, &info, self.draw.as_mut(), &mut losses, &mut self.grads, &mut |o| {
-                stats.observe(o)
-            });
-        out.mse = mse.sum / views.len().max(1) as f64;
-        (out.l1, out.ssim) = (self.loss.l1, self.loss.ssim);
+            self.chain.step(&step, self.draw.as_mut(), &mut losses, &mut self.grads, &mut |o| stats.observe(o))?;
+        (out.l1, out.ssim, out.mse) = (self.loss.l1, self.loss.ssim, self.loss.mse());
+        Ok(())
     }
 
     /// Adam on every group of the stage. Returns what was not finite.
@@ -585,32 +583,5 @@ impl<'a> Trainer<'a> {
                 .remedy("Give points, masks or --set init=random --set num_pts=10000"));
         }
         Ok(())
-    }
-}
-
-/// Passes a loss through and sums the mean squared errors of the step's views.
-struct Mse<'a> {
-    inner: &'a mut TrainLoss,
-    sum: f64,
-}
-
-impl super::chain::ImageLoss<f32> for Mse<'_> {
-    fn wanted(&self) -> super::chain::Wanted {
-        self.inner.wanted()
-    }
-
-    fn share(&self) -> Option<&str> {
-        self.inner.share()
-    }
-
-    fn eval(
-        &mut self,
-        view: &View<'_, f32>,
-        image: &splat4d::render::Image<f32>,
-        d: &mut super::chain::PictureGrads<f32>,
-    ) -> f64 {
-        let out = self.inner.eval(view, image, d);
-        self.sum += self.inner.mse;
-        out
     }
 }

@@ -2,7 +2,7 @@
 
 use crate::Result;
 use crate::format::playback::{Node, Primitive};
-use crate::layers::{ALPHA_MIN, Instant, Scene};
+use crate::layers::{ALPHA_MIN, Evaluation, Scene};
 use crate::math::quat;
 use crate::math::sh::{MAX_COEFFS, rgb_to_dc};
 use crate::math::sym3;
@@ -104,9 +104,9 @@ pub fn compare(
     backend: &mut dyn Backend,
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<Option<Likeness>> {
-    let (mut instant, mut moment) = (Instant::default(), Moment::default());
+    let (mut instant, mut moment) = (Evaluation::default(), Moment::default());
     let (mut truth, mut copy) = (Image::default(), Image::default());
-    let mut played = Instant::default();
+    let mut played = Evaluation::default();
     let (mut sum, mut pixels, mut done) = (0.0, 0.0, 0);
     let mut worst = (f64::INFINITY, 0.0, 0);
     for &time in times {

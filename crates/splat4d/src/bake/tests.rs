@@ -4,7 +4,7 @@
 use super::*;
 use crate::device;
 use crate::format::playback::{Draft, Meta, WriteConfig, read, write};
-use crate::layers::{ALPHA_MIN, ALWAYS, Instant};
+use crate::layers::{ALPHA_MIN, ALWAYS, Evaluation};
 use crate::math::{Rng, Se3};
 use crate::motion::spacetime::VELOCITIES;
 use crate::motion::still::activate;
@@ -107,7 +107,7 @@ fn straight_motion_of_every_life_is_exact() {
         let baked = baked(&scene, &options(0.25));
         assert_eq!(baked.report.errors.worst, 0.0);
         assert_eq!(baked.report.split, 0, "one primitive a Gaussian");
-        let (mut instant, mut moment) = (Instant::default(), Moment::default());
+        let (mut instant, mut moment) = (Evaluation::default(), Moment::default());
         // Between frames too, and at both ends.
         for t in [0.0, 0.013, 0.7, 1.0, 1.33333, 2.0, 2.4] {
             scene.at(Time(t), &mut instant);

@@ -60,7 +60,7 @@ fn pup_is_the_determinant_of_the_blocks_of_all_views_and_speedy_their_sum() {
     let (pup, speedy) = (scored(&s, &made, &of(Spatial::Pup)), scored(&s, &made, &of(Spatial::Speedy)));
     let rows = s.layers[0].params.len();
     let (mut blocks, mut sums) = (vec![[0.0; 21]; rows], vec![0.0; rows]);
-    let (mut instant, mut found) = (Instant::default(), Vec::<Sensitivity>::new());
+    let (mut instant, mut found) = (Evaluation::default(), Vec::<Sensitivity>::new());
     let mut renderer = Renderer::new(RenderConfig::default());
     for i in 0..made.len() {
         s.at(made.time(i), &mut instant);
