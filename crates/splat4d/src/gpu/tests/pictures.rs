@@ -96,7 +96,7 @@ fn every_kind_of_colour_is_drawn() {
             // 24 columns without weights are eight coefficients a channel, of which degree 1 is whole.
             r.config.sh_degree = 1;
         }
-        let (mut splats, rest) = (Splats { parts: vec![Part { out: &scene.out, color }], head: None }, small.splats());
+        let (mut splats, rest) = (Splats { parts: vec![Part::new(&scene.out, color)], head: None }, small.splats());
         compare(&mut r, &splats, &camera, &format!("colour {i}"));
         // A second layer, then an empty one.
         let none = Scenery::new(16, 0, 1.0, 1.0);
@@ -200,5 +200,5 @@ fn a_second_frame_is_the_same_and_allocates_nothing() {
     // Other colours at another address are seen, those of a table that changes too.
     let other = Scenery::new(22, 2000, 1.2, 0.05);
     let color = Color::Sh { table: &other.sh, rows: Rows::All, weights: None, base: true };
-    compare(&mut r, &Splats { parts: vec![Part { out: &scene.out, color }], head: None }, &camera, "other colours");
+    compare(&mut r, &Splats { parts: vec![Part::new(&scene.out, color)], head: None }, &camera, "other colours");
 }
