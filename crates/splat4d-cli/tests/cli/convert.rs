@@ -188,8 +188,10 @@ fn other_axes_rotate_every_model_as_a_whole() {
         }
         let motion = build(&spec, &mut params).unwrap();
         // Moved from where training starts, so that everything moves.
-        for key in params.keys().skip(3).filter(|&k| params.info(k).trainable).collect::<Vec<_>>() {
-            for (row, col) in (0..params[key].rows()).flat_map(|r| (0..params[key].width()).map(move |c| (r, c))) {
+        let learnt: Vec<_> = params.keys().skip(3).filter(|&k| params.info(k).trainable).collect();
+        for key in learnt {
+            let (rows, width) = (params[key].rows(), params[key].width());
+            for (row, col) in (0..rows).flat_map(|r| (0..width).map(move |c| (r, c))) {
                 let x = rng.fork(100 + u64::from(key.0)).normal((row * 64 + col) as u64) as f32;
                 *params[key].get_mut(row, col) += 0.2 * x;
             }

@@ -76,7 +76,7 @@ pub struct LayerTape<F = f32> {
     all: bool,
     ids: Vec<u32>,
     tape: Tape<F>,
-    /// [splats, 4]: σ, ∂σ/∂t, ∂σ/∂log width, ∂σ/∂log softness; empty where σ is 1.
+    /// [splats, 5]: σ, ∂σ/∂t, ∂σ/∂log width, ∂σ/∂log softness, the model's opacity; empty where σ is 1.
     life: Table<F>,
     d_out: Table<F>,
     /// [splats, 10]: `tape.out` in the world; empty where the frame is the identity, and for nodes.
@@ -236,7 +236,7 @@ impl<F: Real> Layer<F> {
         }
         let table = &self.params[LIFE];
         if tape.life.width() == 0 {
-            tape.life = Table::new(&[("sigma", 4)], 0);
+            tape.life = Table::new(&[("sigma", 4), ("opacity", 1)], 0);
         }
         tape.life.resize(tape.tape.out.rows());
         let rows = if tape.all { Rows::All } else { Rows::Some(&tape.ids) };
@@ -287,7 +287,7 @@ impl<F: Real> Layer<F> {
             // o_eff = o·σ: the motion gets dL/do = σ·dL/do_eff, the life dL/dσ = o·dL/do_eff.
             envelope::to_motion(d_out.out, &tape.life, &mut d_motion);
             let [d_life] = d.of([LIFE]);
-            d_time += envelope::backward(&self.params, question.rows, d_out.out, &tape.life, d_life);
+            d_time += envelope::backward(question.rows, d_out.out, &tape.life, d_life);
             let scaled = SplatGrads { out: &d_motion, ..*d_out };
             d_time += self.motion.backward(&question, cache, &mut own, &scaled, d_cache, d);
         }
