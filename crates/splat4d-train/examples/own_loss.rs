@@ -4,7 +4,7 @@
 //! `cargo run --release -p splat4d-train --example own_loss`
 
 use splat4d::Result;
-use splat4d::layers::{ALWAYS, Evaluation, Layer, Scene};
+use splat4d::layers::{Evaluation, Layer, Scene};
 use splat4d::math::{Rng, Se3};
 use splat4d::motion::{Spec, build};
 use splat4d::render::{Image, RenderConfig, Renderer};
@@ -64,7 +64,7 @@ fn balls() -> Result<Scene<f32>> {
         params[GEOMETRY].set(i, OPACITY, 2.0);
         params[SH].write(i, 0, [0.3; 3]);
     }
-    let layer = Layer { name: "balls".into(), params, motion, life: LifeKind::Infinite, span: ALWAYS, masks: None };
+    let layer = Layer::new("balls", params, motion, LifeKind::Infinite);
     Ok(Scene { layers: vec![layer], fps: 1.0, up: [0.0, 1.0, 0.0], ..Scene::default() })
 }
 

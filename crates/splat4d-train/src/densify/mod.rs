@@ -242,7 +242,7 @@ pub fn morton_edit(scene: &Scene<f32>, layer: usize) -> RowEdit {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use splat4d::layers::{ALWAYS, Layer};
+    use splat4d::layers::Layer;
     use splat4d::motion::{Spec, build};
     use splat4d::scene::params::LOG_SCALE;
     use splat4d::scene::{LifeKind, Params};
@@ -259,7 +259,7 @@ mod tests {
             }
             g.write(r, LOG_SCALE, [-2.0; 3]);
         }
-        let layer = Layer { name: "a".into(), params, motion, life: LifeKind::Infinite, span: ALWAYS, masks: None };
+        let layer = Layer::new("a", params, motion, LifeKind::Infinite);
         Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 30.0, ..Scene::default() }
     }
 

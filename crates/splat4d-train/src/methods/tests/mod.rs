@@ -25,7 +25,7 @@ use crate::train::frames::{Frames, Picture};
 use crate::train::loss::TrainLoss;
 use crate::train::tests::Made;
 use crate::train::trainer::{Settings, Trainer};
-use splat4d::layers::{ALWAYS, Layer};
+use splat4d::layers::Layer;
 use splat4d::math::Rng;
 use splat4d::motion::{Motion, SpacetimeSpec, build};
 use splat4d::render::{
@@ -260,7 +260,7 @@ fn cloud<F: Real>(rows: usize, life: LifeKind, seed: u64) -> Params<F> {
 }
 
 fn one_layer<F: Real>(params: Params<F>, motion: Arc<dyn Motion<F>>, life: LifeKind) -> Scene<F> {
-    let layer = Layer { name: "made up".into(), params, motion, life, span: ALWAYS, masks: None };
+    let layer = Layer::new("made up", params, motion, life);
     Scene { layers: vec![layer], clip: [0.0, 0.2], fps: 10.0, background: [0.2, 0.3, 0.6], ..Scene::default() }
 }
 
