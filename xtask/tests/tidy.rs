@@ -413,3 +413,62 @@ fn flags_in_documents_exist() {
     }
     report(troubles, "Write the flag as `splat4d VERB --help` shows it.");
 }
+
+/// Where a motion model may be told by its name or its spec: the list and the models' own files, and how each is learnt.
+const MODEL_ROOMS: [&str; 2] = ["crates/splat4d/src/motion/", "crates/splat4d-train/src/methods/"];
+/// Besides these, each with its reason.
+const MODEL_NAMES: [(&str, &str); 2] = [
+    ("crates/splat4d/src/layers/chart.rs", "turns one model into another"),
+    ("crates/splat4d/src/layers/turn.rs", "turns the tables of each model"),
+];
+
+/// Names and variants of the list of motion models: lines like `Still = "still" => ...`.
+fn models() -> Vec<(String, String)> {
+    let list = read("crates/splat4d/src/motion/mod.rs");
+    let entry = |line: &str| {
+        let (head, rest) = line.trim().split_once(" = \"")?;
+        let (name, _) = rest.split_once("\" => ")?;
+        let variant = head.split('(').next()?;
+        Some((variant.to_owned(), name.to_owned()))
+    };
+    list.lines().filter_map(entry).collect()
+}
+
+/// Whether a line matches on one of the models: a pattern or a comparison, not the making of one.
+fn asks_which_model(line: &str, variant: &str, name: &str) -> bool {
+    let name = format!("\"{name}\"");
+    let compared = ["== ", "!= "].iter().any(|op| line.contains(&format!("{op}{name}")));
+    let behind = line.split(&name).skip(1).any(|rest| rest.trim_start().starts_with(['|', '=']));
+    let spec = format!("Spec::{variant}");
+    let told = line.split(&spec).skip(1).any(|rest| !rest.starts_with(is_word));
+    compared || behind || told
+}
+
+/// A new motion model is its own files and its entries: nobody else may ask which one it is. Capabilities answer what
+/// others need to know.
+#[test]
+fn nobody_asks_which_motion_model_it_is() {
+    let models = models();
+    assert!(models.len() >= 9, "the list of models is not read: {models:?}");
+    assert!(asks_which_model("if r.motion == \"still\" {", "Still", "still"));
+    assert!(asks_which_model("\"still\" | \"x\" => 1,", "Still", "still"));
+    assert!(asks_which_model("Spec::Still => 1,", "Still", "still"));
+    assert!(!asks_which_model("Recipe { motion: \"still\".into() }", "Still", "still"));
+    let mut troubles = Vec::new();
+    let mut used = BTreeSet::new();
+    let products = sources().into_iter().filter(|p| p.contains("/src/") && !is_test(p));
+    for path in products.filter(|p| !MODEL_ROOMS.iter().any(|room| p.starts_with(room))) {
+        for (number, line) in code(&read(&path)) {
+            let which = models.iter().find(|(variant, name)| asks_which_model(&line, variant, name));
+            let Some((_, name)) = which else { continue };
+            match MODEL_NAMES.iter().find(|(file, _)| *file == path) {
+                Some((file, _)) => drop(used.insert(*file)),
+                None => troubles.push(format!("{path}:{number}: asks whether a model is `{name}`")),
+            }
+        }
+    }
+    troubles.extend(
+        MODEL_NAMES.iter().filter(|(file, _)| !used.contains(file)).map(|(f, _)| format!("{f}: no exemption needed")),
+    );
+    report(troubles, "Ask for a capability (`Motion::capabilities`, `Program`) and not for a name.");
+}

@@ -42,6 +42,10 @@ impl<F: Real> Motion<F> for Sway {
         Spec::Custom("sway".into())
     }
 
+    fn scratch_bytes(&self, _p: &Params<F>, _rows: usize) -> u64 {
+        0
+    }
+
     /// Row `id` of the parameters becomes a splat: mean 3, covariance 6, opacity 1.
     fn at(&self, q: &At<'_, F>, _cache: &Cache, tape: &mut Tape<F>) {
         tape.start(q.len());

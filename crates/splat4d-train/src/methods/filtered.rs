@@ -17,11 +17,11 @@ use splat4d::scene::{LifeKind, Params, SH};
 use std::sync::Arc;
 
 /// The program with what the recipe puts around it; as it is where that is nothing.
-pub fn wrap(inner: Box<dyn Program>, recipe: &Recipe) -> Result<Box<dyn Program>> {
+pub fn wrap(inner: Box<dyn Program>, recipe: &Recipe) -> Box<dyn Program> {
     if fusion(recipe) == Fusion::Off && recipe.transport == "off" {
-        return Ok(inner);
+        return inner;
     }
-    Ok(Box::new(FilteredProgram { inner }))
+    Box::new(FilteredProgram { inner })
 }
 
 fn fusion(recipe: &Recipe) -> Fusion {
@@ -74,6 +74,18 @@ impl Program for FilteredProgram {
 
     fn first(&self, plan: &Plan) -> Plan {
         self.inner.first(plan)
+    }
+
+    fn has_features(&self) -> bool {
+        self.inner.has_features()
+    }
+
+    fn nodes(&self, plan: &Plan) -> usize {
+        self.inner.nodes(plan)
+    }
+
+    fn growth_bytes(&self, plan: &Plan, rows: usize) -> u64 {
+        self.inner.growth_bytes(plan, rows)
     }
 
     fn init(&self, lives: &[(f64, f64)], params: &mut Params) {

@@ -6,9 +6,10 @@ use super::{EVERY, Group, Plan, Program, Stage};
 use crate::Result;
 use splat4d::layers::{ALWAYS, Evaluation, Layer, Scene, freeze_rows};
 use splat4d::math::Rng;
-use splat4d::motion::{Spec, build};
+use splat4d::motion::Still;
 use splat4d::scene::splats::COV;
 use splat4d::scene::{LifeKind, RowEdit, Rows, Space, Time};
+use std::sync::Arc;
 
 /// Times at which rows are looked at, evenly over the clip: an odd number has the middle.
 const LOOKS: usize = 17;
@@ -26,7 +27,8 @@ pub const STILL_LAYER: &str = "still";
 pub fn stages(program: &dyn Program, plan: &Plan) -> Vec<Stage> {
     let r = &plan.recipe;
     let mut stages = program.stages(plan);
-    let Some(last) = stages.last_mut().filter(|_| r.static_split > 0.0 && r.motion != "still") else { return stages };
+    let splits = r.static_split > 0.0 && program.capabilities(plan).moves;
+    let Some(last) = stages.last_mut().filter(|_| splits) else { return stages };
     let reach = r.static_split * plan.extent;
     let at = (last.iterations as f64 * r.static_split_from) as usize;
     last.switches.push((at, Box::new(move |scene, _| split(scene, reach).map(|_| ()))));
@@ -45,7 +47,7 @@ pub fn share_groups(stage: &mut Stage) {
 pub fn split(scene: &mut Scene<f32>, reach: f64) -> Result<usize> {
     let mut moved = 0;
     for index in 0..scene.layers.len() {
-        if scene.layers[index].motion.spec() == Spec::Still {
+        if !scene.layers[index].motion.capabilities().moves {
             continue;
         }
         let still = still_rows(&scene.layers[index], scene.clip, reach);
@@ -55,10 +57,10 @@ pub fn split(scene: &mut Scene<f32>, reach: f64) -> Result<usize> {
         }
         let layer = &mut scene.layers[index];
         let rows: Vec<u32> = (0..still.len() as u32).filter(|&r| still[r as usize]).collect();
-        let mut params = freeze_rows(layer, &rows, Time(0.5 * (scene.clip[0] + scene.clip[1])));
-        let motion = build(&Spec::Still, &mut params)?;
+        let params = freeze_rows(layer, &rows, Time(0.5 * (scene.clip[0] + scene.clip[1])));
         let name = format!("{} {STILL_LAYER}", layer.name);
-        let part = Layer { span: layer.span, ..Layer::new(name, params, motion, LifeKind::Infinite) };
+        let fixed = Layer::new(name, params, Arc::new(Still), LifeKind::Infinite);
+        let part = Layer { span: layer.span, ..fixed };
         let edit = RowEdit::prune(Space::Gaussians, still.iter().map(|s| !s));
         layer.edit(&edit, &Rng::new(0, "split", index as u64));
         scene.layers.push(part);
@@ -96,7 +98,7 @@ mod tests {
     use super::*;
     use crate::methods::program;
     use crate::recipe::Recipe;
-    use splat4d::motion::SpacetimeSpec;
+    use splat4d::motion::{SpacetimeSpec, Spec, build};
     use splat4d::scene::{GEOMETRY, LIFE, SH};
 
     fn plan(recipe: Recipe) -> Plan {

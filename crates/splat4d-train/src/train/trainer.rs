@@ -238,6 +238,7 @@ impl<'a> Trainer<'a> {
             let (empty, switches) = (stage.iterations == 0, stage.switches.len());
             if self.progress.stage_step == 0 && !self.entered {
                 self.run_hook(|s| s.start.as_ref(), tell)?;
+                self.set_phase();
                 (self.entered, self.stale) = (true, true);
             }
             if !empty {
@@ -252,6 +253,15 @@ impl<'a> Trainer<'a> {
             self.leave_stage(tell)?;
         }
         Ok(())
+    }
+
+    fn set_phase(&mut self) {
+        let Some(phase) = self.stages[self.progress.stage].phase else { return };
+        for layer in &mut self.scene.layers {
+            if let Some(motion) = layer.motion.with_phase(&phase) {
+                layer.motion = motion;
+            }
+        }
     }
 
     fn leave_stage(&mut self, tell: &mut Tell<'_>) -> Result<()> {

@@ -25,8 +25,9 @@ mod tests;
 
 pub use row::{Fused, FusedGrads, Fusion, Normal, Prediction, Predictor};
 
-use super::{At, Cache, Motion, Spec, Tape};
+use super::{At, Cache, Capabilities, Model, Motion, Phase, Spec, Tape};
 use crate::math::{Real, Rng};
+use crate::scene::splats::SPLAT_COLUMNS;
 use crate::scene::splats::SPLAT_OPACITY;
 use crate::scene::table::halve;
 use crate::scene::{Color, Grads, Key, Params, RowEdit, Rows, Space, SplatGrads, Table, Time};
@@ -119,11 +120,18 @@ impl FilteredSpec {
     }
 }
 
-/// Makes the model inside, then the filter's own table.
-pub fn build<F: Real>(spec: &FilteredSpec, p: &mut Params<F>) -> Result<Arc<dyn Motion<F>>> {
-    spec.check()?;
-    let inner = super::build(&spec.inner, p)?;
-    Ok(Arc::new(Filtered::around(inner, spec.clone(), p)?))
+impl Model for FilteredSpec {
+    /// Makes the model inside, then the filter's own table.
+    fn build<F: Real>(&self, p: &mut Params<F>) -> Result<Arc<dyn Motion<F>>> {
+        self.check()?;
+        let inner = super::build(&self.inner, p)?;
+        Ok(Arc::new(Filtered::around(inner, self.clone(), p)?))
+    }
+
+    /// Those of the model inside: the filter looks back only.
+    fn capabilities(&self) -> Capabilities {
+        self.inner.capabilities().unwrap_or_default()
+    }
 }
 
 /// See the module's documentation.
@@ -291,6 +299,22 @@ fn inner_of<'a>(cache: &'a Cache, empty: &'a Cache) -> &'a Cache {
 impl<F: Real> Motion<F> for Filtered<F> {
     fn spec(&self) -> Spec {
         Spec::Filtered(FilteredSpec { inner: Box::new(self.inner.spec()), ..self.spec.clone() })
+    }
+
+    fn capabilities(&self) -> Capabilities {
+        self.inner.capabilities()
+    }
+
+    fn with_phase(&self, phase: &Phase) -> Option<Arc<dyn Motion<F>>> {
+        let inner = self.inner.with_phase(phase)?;
+        Some(Arc::new(Self { spec: self.spec.clone(), inner, gains: self.gains }))
+    }
+
+    /// The answers of the model inside, now and earlier; a state of each, and the gradients to them.
+    fn scratch_bytes(&self, p: &Params<F>, rows: usize) -> u64 {
+        let earlier = 1 + self.spec.history.max(self.spec.baseline + 1);
+        let numbers = 3 * SPLAT_COLUMNS.iter().map(|c| c.1).sum::<usize>();
+        earlier as u64 * (self.inner.scratch_bytes(p, rows) + (rows * numbers * size_of::<F>()) as u64)
     }
 
     fn prepare(&self, p: &Params<F>, q: &[At<'_, F>], cache: &mut Cache) {
