@@ -157,7 +157,7 @@ fn code(text: &str) -> Vec<(usize, String)> {
     let lines: Vec<&str> = text.lines().collect();
     for (i, line) in lines.iter().enumerate() {
         let next = lines.get(i + 1).map_or("", |l| l.trim_start());
-        if line.starts_with("#[cfg(test)]") && next.starts_with("mod ") && next.ends_with('{') {
+        if line.starts_with("#[cfg(test)]") && next.contains("mod ") && next.ends_with('{') {
             break;
         }
         let bare = line.split("//").next().unwrap_or("");

@@ -11,7 +11,7 @@ use crate::loss::transport::{Metric, Transport, TransportSettings};
 use crate::recipe::Recipe;
 use splat4d::layers::{Layer, Scene};
 use splat4d::motion::filtered::{Filtered, FilteredSpec, Fusion, GAINS, Predictor};
-use splat4d::motion::{Spec, build};
+use splat4d::motion::{Motion, Spec, build};
 use splat4d::scene::params::LoadedArray;
 use splat4d::scene::{LifeKind, Params, SH};
 use std::sync::Arc;
@@ -53,6 +53,14 @@ impl Program for FilteredProgram {
             stop_gradient: r.filter_stop_gradient,
             ..FilteredSpec::around(inner, 1.0 / plan.fps, plan.clip[0])
         })
+    }
+
+    fn build(&self, plan: &Plan, params: &mut Params) -> Result<Arc<dyn Motion>> {
+        let inner = self.inner.build(plan, params)?;
+        match self.spec(plan) {
+            Spec::Filtered(spec) => Ok(Arc::new(Filtered::around(inner, spec, params)?)),
+            _ => Ok(inner),
+        }
     }
 
     fn life(&self, plan: &Plan) -> LifeKind {

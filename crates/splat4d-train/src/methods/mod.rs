@@ -27,7 +27,7 @@ use crate::{Error, Result};
 use auto::Seen;
 use splat4d::layers::Scene;
 use splat4d::math::{Real, Rng};
-use splat4d::motion::{BUILT_IN, Capabilities, MODELS, Phase, Spec};
+use splat4d::motion::{BUILT_IN, Capabilities, MODELS, Motion, Phase, Spec, build};
 use splat4d::scene::{LifeKind, Params};
 use std::sync::Arc;
 
@@ -277,6 +277,10 @@ impl<F: Real> Stage<F> {
 pub trait Program: Send + Sync {
     /// The model that training starts with.
     fn spec(&self, plan: &Plan) -> Spec;
+    /// Makes it, and in `params` its tables: how a model from outside the library comes to be.
+    fn build(&self, plan: &Plan, params: &mut Params) -> Result<Arc<dyn Motion>> {
+        build(&self.spec(plan), params)
+    }
     /// The life its Gaussians have: the recipe's; for ever where it leaves the choice to the model.
     fn life(&self, plan: &Plan) -> LifeKind {
         LifeKind::from_name(&plan.recipe.life).unwrap_or(LifeKind::Infinite)

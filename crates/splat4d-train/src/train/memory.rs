@@ -6,7 +6,7 @@ use crate::capture::Capture;
 use crate::methods::{Plan, Program, program_of};
 use crate::recipe::Recipe;
 use splat4d::math::Rng;
-use splat4d::motion::{Motion, build};
+use splat4d::motion::Motion;
 use splat4d::scene::splats::SPLAT_COLUMNS;
 use splat4d::scene::{GEOMETRY, Params, Space};
 use std::sync::Arc;
@@ -86,7 +86,7 @@ impl Few {
             // Nodes start at different places.
             params[GEOMETRY].write(row, 0, [0, 1, 2].map(|k| rng.fork(k).uniform(row as u64) as f32));
         }
-        let motion = build(&program.spec(plan), &mut params)?;
+        let motion = program.build(plan, &mut params)?;
         Ok(Self { params, motion, nodes })
     }
 
