@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 /// The allowed order of a crate's top modules: a module may import those before it. Names that do not exist yet
 /// hold a place for what the design foresees.
-const ORDER: [(&str, &[&str]); 4] = [
+const ORDER: [(&str, &[&str]); 5] = [
     (
         "crates/splat4d",
         &[
@@ -20,7 +20,7 @@ const ORDER: [(&str, &[&str]); 4] = [
         // `methods`, which choose among them; `init` needs a model's plan; `eval` writes as safely as `train` does.
         &[
             "recipe", "event", "capture", "sampler", "optim", "loss", "densify", "prune", "methods", "init", "train",
-            "eval", "compress", "lab", "dynamics", "dist",
+            "eval", "compress", "dynamics", "dist",
         ],
     ),
     (
@@ -52,6 +52,7 @@ const ORDER: [(&str, &[&str]); 4] = [
             "main",
         ],
     ),
+    ("studies", &["cells", "study", "tables", "deformation", "lifting", "e00", "e01", "e02", "e03", "models", "main"]),
 ];
 
 /// What a module must not import although it stands before it: the design's first invariant.
@@ -75,7 +76,7 @@ const UNSAFE_FILES: [&str; 3] =
 /// Words that only the shells (the command and the chores) may say: libraries neither print nor exit nor look around.
 const SHELL_WORDS: [&str; 9] =
     ["println!", "eprintln!", "print!", "eprint!", "dbg!", "process::exit", "env::args", "env::var", "stdin()"];
-const SHELLS: [&str; 2] = ["crates/splat4d-cli/", "xtask/"];
+const SHELLS: [&str; 3] = ["crates/splat4d-cli/", "studies/", "xtask/"];
 
 /// Words that `splat4d` may not say: it reads bytes, not paths.
 const PATH_WORDS: [&str; 3] = ["std::fs", "std::path", "File::open"];
@@ -95,7 +96,7 @@ const DOCS: [&str; 10] = [
 ];
 
 /// Folders of the repository that a path in a document begins with.
-const ROOTS: [&str; 5] = ["crates/", "docs/", "examples/", "xtask/", ".ci/"];
+const ROOTS: [&str; 6] = ["crates/", "docs/", "examples/", "studies/", "xtask/", ".ci/"];
 
 /// Named in a document, and made by hand at release. Drop a line once its file is there.
 const PENDING: [&str; 0] = [];
@@ -137,7 +138,7 @@ fn files(folder: &str, ending: &str) -> Vec<String> {
 }
 
 fn sources() -> Vec<String> {
-    [files("crates", "rs"), files("xtask", "rs")].concat()
+    [files("crates", "rs"), files("studies", "rs"), files("xtask", "rs")].concat()
 }
 
 fn read(path: &str) -> String {
@@ -340,7 +341,8 @@ fn paths_in_documents_exist() {
 fn the_code_map_is_complete() {
     let map = read("ARCHITECTURE.md");
     let mut troubles = Vec::new();
-    for manifest in files("crates", "toml").into_iter().filter(|p| p.ends_with("/Cargo.toml")) {
+    let manifests = [files("crates", "toml"), files("studies", "toml")].concat();
+    for manifest in manifests.into_iter().filter(|p| p.ends_with("/Cargo.toml")) {
         let src = manifest.replace("Cargo.toml", "src/");
         for path in files(&src, "rs").into_iter().filter(|p| !is_test(p)) {
             let inside = path.strip_prefix(&src).expect("it lies below");
@@ -358,7 +360,7 @@ fn the_code_map_is_complete() {
 /// Long flags that the command declares: `long`, `long = "x"` and aliases in `#[arg(...)]`, with the field's name.
 fn declared_flags() -> BTreeSet<String> {
     let mut flags: BTreeSet<String> = ["--help", "--version"].map(str::to_owned).into();
-    for path in files("crates/splat4d-cli/src", "rs") {
+    for path in [files("crates/splat4d-cli/src", "rs"), files("studies/src", "rs")].concat() {
         let text = read(&path);
         for (at, _) in text.match_indices("#[arg(") {
             let end = at + text[at..].find(")]").expect("an attribute ends");

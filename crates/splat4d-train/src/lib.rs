@@ -8,7 +8,6 @@ pub mod densify;
 pub mod eval;
 pub mod event;
 pub mod init;
-pub mod lab;
 pub mod loss;
 pub mod methods;
 pub mod optim;
