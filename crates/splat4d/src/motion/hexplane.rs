@@ -164,7 +164,7 @@ impl Model for HexplaneSpec {
     }
 
     fn capabilities(&self) -> Capabilities {
-        Capabilities { rotates: self.heads.rotation, ..Capabilities::default() }
+        Capabilities::default()
     }
 }
 

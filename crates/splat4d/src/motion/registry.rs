@@ -22,9 +22,9 @@ pub trait Model {
 /// model from outside the library.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Capabilities {
-    /// Anything depends on time, beside the layer's life.
+    /// Something may depend on time, beside the layer's life.
     pub moves: bool,
-    /// Gaussians turn as they move.
+    /// Gaussians may turn as they move.
     pub rotates: bool,
     /// Birth and death are the model's own ([`Motion::life`]), and the layer needs no life table.
     pub own_life: bool,
