@@ -15,7 +15,7 @@ const CHANGED: f32 = 0.06;
 /// Moments from which on a take is long.
 const LONG: usize = 600;
 
-/// What a capture shows of its motion.
+/// The motion that a capture shows.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Seen {
     /// Moments.
@@ -46,8 +46,8 @@ impl Seen {
         self.times >= LONG
     }
 
-    /// How many cameras see a moment, in words.
-    pub fn who(&self) -> String {
+    /// The cameras that see a moment, in words.
+    pub fn cameras_in_words(&self) -> String {
         if self.cameras < 1.5 { "one camera sees".to_owned() } else { format!("{:.1} cameras see", self.cameras) }
     }
 }

@@ -49,7 +49,9 @@ impl Program for ControlProgram {
 
     fn suits(&self, seen: &Seen) -> Option<String> {
         let one = seen.masks && !seen.is_long();
-        one.then(|| format!("{} a moment, and masks show one object: few nodes move all of it", seen.who()))
+        one.then(|| {
+            format!("{} a moment, and masks show one object: few nodes move all of it", seen.cameras_in_words())
+        })
     }
 
     fn nodes(&self, plan: &Plan) -> usize {

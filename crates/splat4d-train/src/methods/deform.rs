@@ -43,7 +43,10 @@ impl Program for DeformProgram {
 
     fn suits(&self, seen: &Seen) -> Option<String> {
         let length = if seen.is_long() { format!(" of {}", seen.times) } else { String::new() };
-        Some(format!("{} a moment{length}: one cloud that a network moves shares what every moment shows", seen.who()))
+        Some(format!(
+            "{} a moment{length}: one cloud that a network moves shares what every moment shows",
+            seen.cameras_in_words()
+        ))
     }
 
     fn stages(&self, plan: &Plan) -> Vec<Stage> {

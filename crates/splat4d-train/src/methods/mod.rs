@@ -301,11 +301,11 @@ pub trait Program: Send + Sync {
     fn one_moment(&self, _plan: &Plan) -> bool {
         false
     }
-    /// What the model can do and needs.
+    /// Properties of the model.
     fn capabilities(&self, plan: &Plan) -> Capabilities {
         self.spec(plan).capabilities().unwrap_or_default()
     }
-    /// Why `auto` should take it for such a capture; none: who wants it asks for it.
+    /// The reason for which `auto` takes it for such a capture; none: it is taken where it is asked for.
     fn suits(&self, _seen: &Seen) -> Option<String> {
         None
     }

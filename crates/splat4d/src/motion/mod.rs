@@ -189,7 +189,7 @@ pub trait Motion<F: Real = f32>: Any + Send + Sync {
         false
     }
 
-    /// What others may rely on. A model from outside the library that says nothing promises nothing.
+    /// Properties that others act on. A model from outside the library that tells none promises nothing.
     fn capabilities(&self) -> Capabilities {
         self.spec().capabilities().unwrap_or_default()
     }

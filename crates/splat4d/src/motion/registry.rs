@@ -1,4 +1,4 @@
-//! The registry of motion models: what a model says of itself as plain data, and the macro that turns the list in
+//! The registry of motion models: the properties that a model tells of itself, and the macro that turns the list in
 //! [`motion`](super) into [`Spec`](super::Spec), its names and [`build`](super::build).
 
 use super::Motion;
@@ -14,7 +14,7 @@ pub trait Model {
     /// Errors: numbers that are out of their ranges, loaded arrays of the wrong shape.
     fn build<F: Real>(&self, p: &mut Params<F>) -> Result<Arc<dyn Motion<F>>>;
 
-    /// What the rest of the library may rely on.
+    /// The properties that the rest of the library may rely on.
     fn capabilities(&self) -> Capabilities;
 }
 
@@ -73,7 +73,7 @@ impl Polynomial {
     }
 }
 
-/// From the list of models: `Spec`, names, and what is asked of a model by its spec.
+/// Makes of the list of models `Spec`, the names, and all that is asked of a model by its spec.
 ///
 /// `models` train by themselves, `wrappers` around another one. An entry names the variant, what binds its payload and
 /// the payload's type, the model's name, and a reference to what implements [`Model`].
@@ -117,7 +117,7 @@ macro_rules! registry {
                 !matches!(self, Spec::Custom(_))
             }
 
-            /// What the model can do and needs; none for a model from outside, which says it itself
+            /// Properties of the model; none for one from outside, which tells them itself
             /// ([`Motion::capabilities`]).
             pub fn capabilities(&self) -> Option<Capabilities> {
                 match self {
