@@ -29,7 +29,7 @@ use super::{At, Cache, Capabilities, Model, Motion, Phase, Spec, Tape};
 use crate::math::{Real, Rng};
 use crate::scene::splats::SPLAT_COLUMNS;
 use crate::scene::splats::SPLAT_OPACITY;
-use crate::scene::table::halve;
+use crate::scene::table::par_split;
 use crate::scene::{Color, Grads, Key, Params, RowEdit, Rows, Space, SplatGrads, Table, Time};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
@@ -238,7 +238,7 @@ impl<F: Real> Filtered<F> {
         let [trust, _] = self.trust(q.t.0);
         // Opacities, and observations that stand as they are, stay so to the last bit.
         out.data_mut().copy_from_slice(seen.data());
-        halve([out.view_mut()], &|[mut view]| {
+        par_split([out.view_mut()], &|[mut view]| {
             for j in view.first..view.first + view.rows {
                 let [a, b, c] = [seen, last, before].map(|t| Normal::of_splat(t.read::<9>(j, 0)));
                 let state = self.row([&a, &b, &c], self.gain(q, j), trust).1;
@@ -397,7 +397,7 @@ impl<F: Real> Motion<F> for Filtered<F> {
         let back = self.learns_from_before();
         let [d_seen, d_last, d_before] = &mut d_states;
         let views = [d_seen, d_last, d_before, &mut d_gains].map(Table::view_mut);
-        let mut d_time = halve(views, &|[mut d_seen, mut d_last, mut d_before, mut d_gains]| {
+        let mut d_time = par_split(views, &|[mut d_seen, mut d_last, mut d_before, mut d_gains]| {
             let mut d_trust = 0.0;
             for j in d_seen.first..d_seen.first + d_seen.rows {
                 let [a, b, c] = [seen, last, before].map(|t| Normal::of_splat(t.read::<9>(j, 0)));

@@ -339,7 +339,7 @@ impl<F: Real> Motion<F> for Hexplane {
         if colors > 0 {
             start(&mut own.sh, "sh", colors, n);
             let base = &q.p[SH];
-            crate::scene::table::halve([own.sh.view_mut()], &|[mut view]| {
+            crate::scene::table::par_split([own.sh.view_mut()], &|[mut view]| {
                 for j in view.first..view.first + view.rows {
                     for c in 0..colors {
                         view.write(j, c, [base.get(q.rows.id(j), c) + d_sh[j * colors + c]]);

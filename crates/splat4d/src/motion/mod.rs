@@ -20,7 +20,7 @@ pub mod tracked;
 use crate::math::{Real, Rng};
 use crate::scene::params::LOG_SCALE;
 use crate::scene::splats::SPLAT_COLUMNS;
-use crate::scene::table::{TableMut, halve};
+use crate::scene::table::{TableMut, par_split};
 use crate::scene::{Color, GEOMETRY, Grads, Params, RowEdit, Rows, SH, Space, SplatGrads, Table, Time};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
@@ -240,7 +240,7 @@ pub fn for_rows<F: Real, const N: usize>(
     rows: Rows<'_>,
     f: impl Fn(usize, usize, &mut [TableMut<'_, F>; N]) -> f64 + Sync,
 ) -> f64 {
-    halve(tables.map(Table::view_mut), &|mut views| {
+    par_split(tables.map(Table::view_mut), &|mut views| {
         let (first, end) = (views[0].first, views[0].first + views[0].rows);
         let (from, to) = match rows {
             Rows::All => (first, end),
@@ -254,7 +254,7 @@ pub fn for_rows<F: Real, const N: usize>(
 
 /// Fills compact rows of `out` in parallel: `f(j, id)` gives row j's values from column 0 on.
 pub fn fill_rows<F: Real, const W: usize>(out: &mut Table<F>, rows: Rows<'_>, f: impl Fn(usize) -> [F; W] + Sync) {
-    halve([out.view_mut()], &|[mut view]| {
+    par_split([out.view_mut()], &|[mut view]| {
         for j in view.first..view.first + view.rows {
             view.write(j, 0, f(rows.id(j)));
         }
