@@ -96,7 +96,7 @@ fn read_points(root: &Path, warnings: &mut Vec<String>) -> Result<Option<PointCl
         [] => Ok(None),
         _ => {
             warnings.push(format!(
-                "Which of {} is the initial cloud? None is used: leave one of them there, or name it as the recipe's init.",
+                "Which of {} is the initial cloud? None is used: leave one there, or name it with --set init=FILE.",
                 plys.join(", ")
             ));
             Ok(None)

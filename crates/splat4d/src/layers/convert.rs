@@ -1,4 +1,4 @@
-//! `native4d` layers in the chart of `spacetime` and back. A Gaussian of space and time is a slice that moves at a constant
+//! Conversion of `native4d` layers to `spacetime` and back. A Gaussian of space and time is a slice that moves at a constant
 //! velocity, and a life: exactly a `spacetime` one of order 1 with a `GaussHalf` life.
 
 use super::Layer;
