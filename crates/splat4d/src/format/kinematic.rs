@@ -3,7 +3,7 @@
 
 use super::octets::sound_rows;
 use super::warnings::Warnings;
-use crate::layers::{ALWAYS, Layer, Scene};
+use crate::layers::{ALWAYS, Layer, Scene, with_polynomial};
 use crate::math::quat;
 use crate::motion::{Spacetime, SpacetimeSpec};
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
@@ -91,8 +91,10 @@ pub(super) fn rows(scene: &Scene<f32>, clock: Clock, name: &str, warnings: &mut 
     let mut out = Vec::with_capacity(scene.len());
     let mut shaded = 0;
     let powers: [f64; 3] = std::array::from_fn(|k| clock.duration.powi(k as i32 + 1));
-    for layer in scene.layers.iter().map(Layer::with_frame_absorbed) {
-        let layer = layer.as_ref();
+    for layer in &scene.layers {
+        let converted = with_polynomial(layer).map_err(|e| e.at(format_args!("layer `{}`", layer.name)))?;
+        let absorbed = converted.with_frame_absorbed();
+        let layer = absorbed.as_ref();
         let Some(motion) = layer.motion.polynomial() else {
             return Err(cannot_hold(layer, name, &format!("the motion `{}`", layer.motion.spec().name())));
         };
@@ -185,8 +187,9 @@ pub(super) fn scene(rows: &[Moving], clock: Clock) -> Result<Scene<f32>> {
 pub(super) mod tests {
     use super::*;
     use crate::format::samples::gaussians;
-    use crate::layers::Evaluation;
-    use crate::math::Rng;
+    use crate::layers::{Evaluation, to_native4d};
+    use crate::math::{Rng, Sim3};
+    use crate::motion::native4d::Native4dSpec;
     use crate::motion::{Spec, build};
     use crate::scene::Time;
     use crate::scene::splats::SPLAT_OPACITY;
@@ -255,6 +258,22 @@ pub(super) mod tests {
                 let [mean, cov, _] = apart(&scene, &super::scene(&shifted, clock).unwrap());
                 assert!(mean < 5e-5 && cov < 5e-5, "{life:?} {order}: {mean} {cov}");
             }
+        }
+    }
+
+    #[test]
+    fn gaussians_of_space_and_time_and_layers_with_a_frame_are_held() {
+        let clock = Clock { clip: [2.0, 5.0], fps: 25.0, duration: 3.0 };
+        let mut scene = moving(50, LifeKind::GaussHalf, 1, false);
+        let rotation = quat::to_rotation(quat::normalize([0.4, -0.3, 0.8, 0.2]).0);
+        scene.layers[0].frame = Sim3 { scale: 1.7, rotation, translation: [0.4, -0.7, 0.2] };
+        let spec = Native4dSpec { max_life: 1e3, min_life: 1e-6, ..Native4dSpec::default() };
+        let mut native = scene.clone();
+        native.layers[0] = to_native4d(&scene.layers[0], spec).unwrap();
+        for own in [scene, native] {
+            let rows = rows(&own, clock, "x", &mut Warnings::default()).unwrap();
+            let [mean, cov, opacity] = apart(&own, &super::scene(&rows, clock).unwrap());
+            assert!(mean < 2e-4 && cov < 2e-4 && opacity < 2e-4, "{:?}: {mean} {cov} {opacity}", own.layers[0]);
         }
     }
 

@@ -1,8 +1,9 @@
 //! What a reader would see of layers that are pages, without the way through a file: for training against the numbers
 //! that will be drawn (straight-through quantisation).
 
-use super::block::{Header, Words};
+use super::block::Words;
 use super::layer::{TABLES, columns, decode, keys, paint};
+use super::page::Header;
 use super::{BLOCK_GAUSSIANS, Depths, PAGE_WORDS, Palette};
 use crate::layers::Layer;
 use crate::scene::table::{TableMut, par_split};

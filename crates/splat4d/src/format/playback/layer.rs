@@ -1,8 +1,8 @@
 //! A page as a layer of a scene, so that everything that draws scenes draws playback files; and such a layer as a page.
 
-use super::block::{Columns, Header, NO_WIDTH, SHARPEST, Words};
+use super::block::{Columns, NO_WIDTH, SHARPEST, Words};
 use super::index::broken;
-use super::page::{self, at, half_width, lives_through, reach};
+use super::page::{self, Header, at, half_width, lives_through, reach};
 use super::page::{FOR_EVER as FULL_LIFE, FULL8, FULL10, HALF10, LEVELS8, LEVELS16, MAX_LOG, THINNEST, WIDTH_LEVELS};
 use super::{BLOCK_GAUSSIANS, PAGE_WORDS, Page, Palette, Primitive};
 use crate::Result;
