@@ -7,7 +7,7 @@ use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::sh::rgb_to_dc;
 use splat4d::math::{Rng, Se3};
 use splat4d::motion::build;
-use splat4d::render::{Image, RenderConfig, Renderer};
+use splat4d::render::{Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::params::{LOG_SCALE, OPACITY};
 use splat4d::scene::{Camera, LifeKind, Params, SH, Table, Time};
 
@@ -117,7 +117,8 @@ fn draw(s: &Scene<f32>, cameras: Vec<Camera>, frames: usize, masks: Option<usize
     for k in 0..frames {
         s.at(Time(k as f64 / FPS), &mut instant);
         for camera in &cameras {
-            renderer.render(&s.splats(&instant), camera, [0.0; 3], Some(&front), &mut image);
+            renderer
+                .render(&Shot { extra: Some(&front), ..Shot::new(&s.splats(&instant), camera, [0.0; 3]) }, &mut image);
             let mut mask = image.extra.clone();
             mask.data.iter_mut().for_each(|x| *x = f32::from(u8::from(*x > 0.5)));
             pictures.push(Picture { color: image.color.clone(), mask: masks.map(|_| mask), ..Picture::default() });
