@@ -32,7 +32,7 @@ mod tests;
 pub use crate::simd::Simd;
 pub use backend::{Backend, Oracle, Shot, Tables, Wanted};
 pub use count::PairCounts;
-pub use importance::Sensitivity;
+pub use importance::{Importance, Sensitivity};
 pub use project::{Projected, ProjectedGrads, View};
 
 use crate::math::Real;
