@@ -112,7 +112,7 @@ fn main() -> Result<()> {
         scene,
         program.stages(&plan),
         Arc::new(made),
-        Box::new(Renderer::new(RenderConfig { sh_degree: 0, ..RenderConfig::default() })),
+        Box::new(Renderer::new(RenderConfig::default())),
         TrainLoss::photometric(plan.recipe.lambda_dssim),
         Settings {
             seed: 0,
