@@ -254,7 +254,7 @@ fn compare(scene: &Scene<f32>, back: &Scene<f32>, draft: &Draft) {
             let (mut instant, mut image) = (Evaluation::default(), Image::default());
             scene.at(t, &mut instant);
             let splats = scene.splats(&instant);
-            Renderer::new(RenderConfig::default()).render(&splats, &camera, scene.background, None, &mut image);
+            Renderer::new(RenderConfig::default()).render(&Shot::new(&splats, &camera, scene.background), &mut image);
             image.color.data
         };
         let (a, b) = (draw(scene), draw(back));

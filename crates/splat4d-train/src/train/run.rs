@@ -21,8 +21,9 @@ use crate::methods::{Plan, Stage, program_of, split};
 use crate::recipe::Recipe;
 use crate::{Error, ErrorKind, Result};
 use serde_json::json;
+use splat4d::device;
 use splat4d::layers::Scene;
-use splat4d::render::{Antialias, RenderConfig, Renderer, Simd};
+use splat4d::render::{Antialias, RenderConfig, Simd};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -351,7 +352,6 @@ impl Bench {
         let r = &plan.recipe;
         let config = RenderConfig {
             antialias: if r.antialias { Antialias::On } else { Antialias::Off },
-            sh_degree: r.sh_degree,
             simd: self.simd,
             ..RenderConfig::default()
         };
@@ -369,7 +369,7 @@ impl Bench {
             exposure_lr: r.exposure_lr,
         };
         let loss = TrainLoss::new(terms(r), exposure);
-        Trainer::new(scene, stages, self.frames.clone(), Box::new(Renderer::new(config)), loss, settings)
+        Trainer::new(scene, stages, self.frames.clone(), device::cpu(config), loss, settings)
     }
 
     /// What a checkpoint is of: the recipe and, where there is more to say, `text`.

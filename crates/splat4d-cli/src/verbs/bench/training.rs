@@ -49,7 +49,7 @@ impl Held {
         let mut picture = |(v, view): (usize, &super::scenes::View)| {
             pinned.scene.at(view.time, &mut moment);
             let splats = pinned.scene.splats(&moment);
-            renderer.render(&splats, &view.camera, pinned.scene.background, None, &mut image);
+            renderer.render(&Shot::new(&splats, &view.camera, pinned.scene.background), &mut image);
             let own = rng.fork(v as u64);
             let mut truth = image.color.clone();
             for (i, x) in truth.data.iter_mut().enumerate() {
