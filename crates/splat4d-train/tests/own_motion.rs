@@ -4,11 +4,11 @@
 use splat4d::Result;
 use splat4d::bake::{Options, bake};
 use splat4d::format::playback::{self, Draft, Meta, WriteConfig};
-use splat4d::layers::Instant;
+use splat4d::layers::Evaluation;
 use splat4d::math::Se3;
 use splat4d::motion::{Motion, Spec};
 use splat4d::play::Player;
-use splat4d::render::{Image, RenderConfig, Renderer};
+use splat4d::render::{Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::{Camera, Params, Splats, Time};
 use splat4d_train::capture::frames::{Frames, Picture};
 use splat4d_train::densify::Limits;
@@ -81,7 +81,7 @@ impl Frames for Made {
 
 fn draw(splats: &Splats<'_>, camera: &Camera) -> Image {
     let mut image = Image::default();
-    Renderer::new(RenderConfig::default()).render(splats, camera, [1.0; 3], None, &mut image);
+    Renderer::new(RenderConfig::default()).render(&Shot::new(splats, camera, [1.0; 3]), &mut image);
     image
 }
 
@@ -99,7 +99,7 @@ fn a_model_from_outside_trains_and_its_file_plays() {
         Camera::with_fov_y(pose, 0.7, SIZE, SIZE)
     };
     let cameras: Vec<Camera> = (0..CAMERAS).map(camera).collect();
-    let mut instant = Instant::default();
+    let mut instant = Evaluation::default();
     let mut pictures = Vec::new();
     for k in 0..TIMES {
         truth.at(Time(k as f64 / FPS), &mut instant);
@@ -134,8 +134,8 @@ fn a_model_from_outside_trains_and_its_file_plays() {
         scene,
         SwayProgram.stages(&plan),
         made.clone(),
-        Box::new(Renderer::new(RenderConfig { sh_degree: 0, ..RenderConfig::default() })),
-        TrainLoss::new(plan.recipe.lambda_dssim, 0.0, None),
+        Box::new(Renderer::new(RenderConfig::default())),
+        TrainLoss::photometric(plan.recipe.lambda_dssim),
         Settings {
             seed: 0,
             limits: Limits { cap: 1000, extent: plan.extent, min_opacity: 0.005 },
@@ -148,7 +148,7 @@ fn a_model_from_outside_trains_and_its_file_plays() {
     // What is shown half a swing from rest, where things are farthest from where they start.
     let last = CAMERAS * (TIMES / 2);
     let shown = |trainer: &Trainer<'_>| {
-        let mut instant = Instant::default();
+        let mut instant = Evaluation::default();
         trainer.scene.at(made.time(last), &mut instant);
         draw(&trainer.scene.splats(&instant), made.camera(last))
     };

@@ -9,7 +9,7 @@ use splat4d::format::playback::{self, Draft, Meta, NamedCamera, Node, Primitive,
 use splat4d::layers::{ALPHA_MIN, Evaluation, Layer, Scene};
 use splat4d::math::{Rng, Se3, quat, sh};
 use splat4d::motion::{Spacetime, SpacetimeSpec, Still};
-use splat4d::render::{Image, RenderConfig, Renderer};
+use splat4d::render::{Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{Camera, GEOMETRY, LIFE, LifeKind, Params, SH, Time};
 use std::sync::Arc;

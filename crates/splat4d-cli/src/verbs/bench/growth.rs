@@ -16,7 +16,7 @@ use image::codecs::jpeg::JpegEncoder;
 use splat4d::layers::{Layer, Scene};
 use splat4d::math::{Rng, quat, sh};
 use splat4d::motion::{Spacetime, SpacetimeSpec};
-use splat4d::render::{Image, ImageGrads, RenderConfig, RenderGrads, Renderer};
+use splat4d::render::{Image, ImageGrads, RenderConfig, RenderGrads, Renderer, Shot};
 use splat4d::scene::life::{CENTER, LOG_WIDTH};
 use splat4d::scene::params::{LOG_SCALE, QUAT};
 use splat4d::scene::{Camera, GEOMETRY, LIFE, LifeKind, Params, Planes, SH, Table, Time};
