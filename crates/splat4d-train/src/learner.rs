@@ -127,9 +127,10 @@ impl Learner {
         &self.moments
     }
 
-    /// Adam's moments, to change numbers in place.
-    pub fn moments_mut(&mut self) -> &mut [Moments<f32>] {
-        &mut self.moments
+    /// Scene and moments, to change numbers in place; as [`scene_mut`](Self::scene_mut).
+    pub fn tables_mut(&mut self) -> (&mut Scene<f32>, &mut [Moments<f32>]) {
+        self.touch(Touched::Values);
+        (&mut self.scene, &mut self.moments)
     }
 
     /// What was seen of Gaussians since the last densification.
@@ -137,8 +138,9 @@ impl Learner {
         &self.stats
     }
 
-    /// Statistics, to add what a view has shown.
-    pub fn stats_mut(&mut self) -> &mut Stats {
+    /// Statistics, to make some up.
+    #[cfg(test)]
+    pub(crate) fn stats_mut(&mut self) -> &mut Stats {
         &mut self.stats
     }
 
@@ -253,7 +255,7 @@ mod tests {
     #[test]
     fn moments_of_a_layer_outlive_a_rebuild_and_those_of_another_do_not() {
         let mut learner = Learner::new(scene(20));
-        learner.moments_mut()[0].table_mut(GEOMETRY).fill(2.0);
+        learner.tables_mut().1[0].table_mut(GEOMETRY).fill(2.0);
         learner.rebuild(&|_, _| true, |_| Ok(())).unwrap();
         assert_eq!(learner.moments()[0].table(GEOMETRY).get(3, 3), 2.0);
         let rename = |s: &mut Scene<f32>| {

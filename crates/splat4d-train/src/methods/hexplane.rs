@@ -154,12 +154,12 @@ impl HexplaneProgram {
 }
 
 /// A hook that changes the spec of every hexplane layer; tables stay as they are.
-fn respecify<F: Real>(change: impl Fn(&mut HexplaneSpec, &Table<F>) + Send + Sync + 'static) -> Hook<F> {
-    Box::new(move |scene: &mut Scene<F>, _| {
+fn respecify(change: impl Fn(&mut HexplaneSpec, &Table<f32>) + Send + Sync + 'static) -> Hook {
+    Box::new(move |scene: &mut Scene<f32>, _| {
         for layer in &mut scene.layers {
-            let model: &dyn Motion<F> = layer.motion.as_ref();
+            let model: &dyn Motion<f32> = layer.motion.as_ref();
             let Some(model) = (model as &dyn Any).downcast_ref::<Hexplane>() else { continue };
-            let Spec::Hexplane(mut spec) = Motion::<F>::spec(model) else { continue };
+            let Spec::Hexplane(mut spec) = Motion::<f32>::spec(model) else { continue };
             change(&mut spec, &layer.params[GEOMETRY]);
             let model = model.respecified(spec).map_err(|e: Error| e.at("the cloud after the coarse stage"))?;
             layer.motion = Arc::new(model);

@@ -6,7 +6,7 @@
 pub use super::channels::Wanted;
 use super::channels::{Channels, Later};
 pub use crate::capture::frames::FlowTruth;
-pub use crate::densify::Observation;
+pub use crate::learner::Observation;
 pub use crate::loss::terms::{ParamLoss, Probe, ProbeLoss, StepInfo};
 use splat4d::layers::{LayerTape, Scene};
 use splat4d::math::Real;

@@ -191,11 +191,11 @@ mod tests {
             let bench = super::super::run::Bench::new(place.open(&r), &r).unwrap();
             let plan = bench.plan(&r);
             let trainer = bench.trainer(&plan, bench.initial_scene(&plan).unwrap()).unwrap();
-            let p = &trainer.scene.layers[0].params;
+            let p = &trainer.scene().layers[0].params;
             let values: usize = p.keys().map(|k| size_of_val(p[k].data())).sum();
-            let counted = values + splat4d::scene::Grads::new(p).bytes() + trainer.moments[0].bytes();
+            let counted = values + splat4d::scene::Grads::new(p).bytes() + trainer.learner.moments()[0].bytes();
             let spec = program_of(&r).unwrap().spec(&plan);
-            let estimated = tables(&plan, &spec, trainer.scene.len()).unwrap() as f64;
+            let estimated = tables(&plan, &spec, trainer.scene().len()).unwrap() as f64;
             let off = counted as f64 / estimated;
             assert!((1.0 / ROUNDED..ROUNDED).contains(&off), "{line}: {counted} bytes, estimated {estimated}");
         }

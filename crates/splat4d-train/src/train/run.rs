@@ -12,13 +12,13 @@ use super::minutes;
 use super::snapshot::Snapshots;
 use super::trainer::{Settings, Stepped, Trainer};
 use crate::capture::{Capture, CaptureOptions, ImageStore};
-use crate::densify::Limits;
-use crate::event::Event;
+use crate::event::{Event, Progress};
 use crate::init::{self, Seeds};
 use crate::loss::image::ImageTerms;
 use crate::methods::auto::{self, AUTO};
-use crate::methods::{Plan, Stage, program_of, split};
+use crate::methods::{Plan, Stage, program_of, stages};
 use crate::recipe::Recipe;
+use crate::upkeep::Limits;
 use crate::{Error, ErrorKind, Result};
 use serde_json::json;
 use splat4d::layers::Scene;
@@ -343,7 +343,7 @@ impl Bench {
     }
 
     pub(super) fn trainer(&self, plan: &Plan, scene: Scene<f32>) -> Result<Trainer<'static>> {
-        Ok(self.trainer_of(plan, scene, split::stages(program_of(&plan.recipe)?.as_ref(), plan)))
+        Ok(self.trainer_of(plan, scene, stages(program_of(&plan.recipe)?.as_ref(), plan)))
     }
 
     /// A trainer with stages that no program made.
@@ -365,7 +365,6 @@ impl Bench {
             limits: Limits { cap: r.max_cap, extent: plan.extent, min_opacity: r.min_opacity },
             background: self.background(),
             sh_degree: r.sh_degree,
-            opacity_reset_interval: r.opacity_reset_interval,
             exposure_lr: r.exposure_lr,
         };
         let mut loss = TrainLoss::new(r.lambda_dssim, r.lambda_mask, exposure);
@@ -491,7 +490,7 @@ impl Metrics {
             s.l1,
             s.ssim,
             psnr(s.mse),
-            trainer.scene.len(),
+            trainer.scene().len(),
             state.seconds,
             ms.join(",")
         );
@@ -561,12 +560,12 @@ impl Session<'_> {
             run: self.run.to_owned(),
             iteration: first,
             iterations,
-            gaussians: trainer.scene.len(),
+            gaussians: trainer.scene().len(),
             memory_estimate: self.estimate,
         });
         let mut metrics = Metrics::open(self.run, first, iterations);
         let mut totals = Totals::default();
-        let shown = trainer.scene.without_head("the player");
+        let shown = trainer.scene().without_head("the player");
         if let (Some(_), Err(e)) = (self.snapshots, &shown) {
             listen(&Event::Warning { message: format!("training cannot be watched: {e}") });
         }
@@ -576,12 +575,7 @@ impl Session<'_> {
         let mut steps = Steps::default();
         while !trainer.is_done() && !self.stop.load(Ordering::Relaxed) {
             let from = (trainer.progress.stage, trainer.progress.iteration);
-            trainer.enter(&mut |name, done, total| {
-                listen(&match name.strip_prefix("warning: ") {
-                    Some(message) => Event::Warning { message: message.to_owned() },
-                    None => Event::Phase { name: name.to_owned(), done, total },
-                });
-            })?;
+            trainer.enter(&mut Progress(listen))?;
             state.seconds += clock.elapsed().as_secs_f64();
             clock = Clock::now();
             if trainer.is_done() {
@@ -621,7 +615,7 @@ impl Session<'_> {
         }
         let done = trainer.is_done();
         self.save(trainer, &state, &metrics, &totals, done, listen)?;
-        let gaussians = trainer.scene.len();
+        let gaussians = trainer.scene().len();
         let iteration = trainer.progress.iteration;
         if let Some(snapshots) = &mut snapshots {
             listen(&snapshots.now(trainer));
@@ -643,7 +637,7 @@ impl Session<'_> {
             stage: trainer.stage_name().to_owned(),
             loss: state.smooth[0],
             psnr: psnr(state.smooth[1]),
-            gaussians: trainer.scene.len(),
+            gaussians: trainer.scene().len(),
             seconds: state.seconds,
             seconds_left: steps.mean() * (iterations - iteration) as f64,
         }
@@ -682,7 +676,7 @@ impl Session<'_> {
             "threads": rayon::current_num_threads(),
             "iteration": trainer.progress.iteration,
             "iterations": trainer.iterations(),
-            "gaussians": trainer.scene.len(),
+            "gaussians": trainer.scene().len(),
             "seconds": state.seconds,
             "finished": finished,
             "rollbacks": trainer.progress.strikes,

@@ -315,7 +315,7 @@ fn neither_prefetch_nor_image_memory_matters() {
         trainer.step().unwrap().unwrap();
     }
     let mut bytes = Vec::new();
-    splat4d::format::scene::write(&trainer.scene, &mut bytes).unwrap();
+    splat4d::format::scene::write(trainer.scene(), &mut bytes).unwrap();
     assert!(place.scene("plain") == bytes, "prefetch reached a result");
 }
 

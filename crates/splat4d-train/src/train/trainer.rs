@@ -3,17 +3,18 @@
 use super::chain::{Chain, Draw, Losses, StepInfo, StepReport, View};
 use super::loss::TrainLoss;
 use crate::capture::frames::{FlowTruth, Frames, Picture};
-use crate::densify::{self, Change, Densify, Limits, Stats, adc, mcmc, morton_edit};
+use crate::event::Progress;
+use crate::learner::{Learner, Touched};
 use crate::loss::terms::Codec;
-use crate::methods::{Hook, Stage, Tell};
-use crate::optim::{Floor, Moments};
-use crate::prune::prune;
+use crate::methods::{Group, Hook, Stage};
+use crate::optim::Floor;
 use crate::sampler::Timeline;
+use crate::upkeep::{At, Change, Context, Limits, Upkeep};
 use crate::{Error, ErrorKind, Result};
 use splat4d::layers::Scene;
 use splat4d::math::Rng;
 use splat4d::scene::life::LOG_WIDTH;
-use splat4d::scene::{Camera, GEOMETRY, Grads, LIFE, SH, Space, Time};
+use splat4d::scene::{Camera, GEOMETRY, Grads, LIFE, SH, Time};
 use std::borrow::Cow;
 use std::sync::Arc;
 use std::time::{Duration, Instant as Clock};
@@ -29,15 +30,13 @@ pub struct Settings {
     pub background: [f32; 3],
     /// Highest SH degree.
     pub sh_degree: usize,
-    /// adc: steps between opacity resets; 0: never.
-    pub opacity_reset_interval: usize,
     /// Rate of the exposure.
     pub exposure_lr: f64,
 }
 
 /// How far a run is. All of it is in every checkpoint.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Progress {
+pub struct Position {
     /// Steps taken.
     pub iteration: usize,
     /// Current stage.
@@ -77,16 +76,12 @@ pub struct Fault(pub String);
 
 /// The state of a run.
 pub struct Trainer<'a> {
-    /// The scene that learns.
-    pub scene: Scene<f32>,
+    /// What learns.
+    pub learner: Learner,
     /// What to do, in order.
     pub stages: Vec<Stage>,
     /// How far.
-    pub progress: Progress,
-    /// One a layer.
-    pub moments: Vec<Moments<f32>>,
-    /// What was seen since the last densification.
-    pub stats: Stats,
+    pub progress: Position,
     /// Compares pictures.
     pub loss: TrainLoss,
     /// Settings that hold for all stages.
@@ -95,10 +90,8 @@ pub struct Trainer<'a> {
     shown: Scene<f32>,
     /// Whether `shown` is to be copied from the scene anew.
     stale: bool,
-    /// Whether the current stage's start is over although it has taken no step.
+    /// Whether what comes before the step is done already.
     entered: bool,
-    /// The step whose switches are over.
-    switched: Option<usize>,
     frames: Arc<dyn Frames>,
     timeline: Timeline,
     draw: Box<dyn Draw<f32> + 'a>,
@@ -113,26 +106,24 @@ impl<'a> Trainer<'a> {
     /// A run that has not begun. Panics: no frames, no stages.
     pub fn new(
         scene: Scene<f32>,
-        stages: Vec<Stage>,
+        mut stages: Vec<Stage>,
         frames: Arc<dyn Frames>,
         draw: Box<dyn Draw<f32> + 'a>,
         loss: TrainLoss,
         settings: Settings,
     ) -> Self {
         assert!(!stages.is_empty(), "a program has at least one stage");
+        stages.iter_mut().for_each(|s| s.upkeep.sort_by_key(|u| u.order()));
         let timeline = Timeline::new(frames.as_ref());
         let mut trainer = Self {
-            moments: Vec::new(),
-            stats: Stats::new(&scene),
-            scene,
+            learner: Learner::new(scene),
             stages,
-            progress: Progress { rate_scale: 1.0, ..Progress::default() },
+            progress: Position { rate_scale: 1.0, ..Position::default() },
             loss,
             settings,
             shown: Scene::default(),
             stale: true,
             entered: false,
-            switched: None,
             frames,
             timeline,
             draw,
@@ -141,7 +132,7 @@ impl<'a> Trainer<'a> {
             chain: Chain::default(),
             pictures: Vec::new(),
         };
-        trainer.adapt();
+        trainer.spread();
         trainer
     }
 
@@ -172,90 +163,65 @@ impl<'a> Trainer<'a> {
         self.stages.get(self.progress.stage).map_or("done", |s| &s.name)
     }
 
-    /// Runs a hook; what of the moments belongs to layers of other names is forgotten, and losses are told if rows came or
-    /// went.
-    fn run_hook(&mut self, hook: impl Fn(&Stage) -> Option<&Hook<f32>>, tell: &mut Tell<'_>) -> Result<()> {
-        let Some(hook) = hook(&self.stages[self.progress.stage]) else { return Ok(()) };
-        let rows = |scene: &Scene<f32>| -> Vec<(String, usize)> {
-            scene.layers.iter().map(|l| (l.name.clone(), l.params.len())).collect()
-        };
-        let before = rows(&self.scene);
-        hook(&mut self.scene, tell)?;
-        let after = rows(&self.scene);
-        for ((moments, old), new) in self.moments.iter_mut().zip(&before).zip(&after) {
-            if old.0 != new.0 {
-                *moments = Moments::default();
-            }
-        }
-        if before != after {
-            self.stages[self.progress.stage].on_edit();
-        }
-        self.adapt();
-        Ok(())
-    }
-
-    /// Fits gradients, moments and statistics to a scene that a hook changed; what still fits is kept.
-    fn adapt(&mut self) {
-        self.stale = true;
-        self.moments.resize_with(self.scene.layers.len(), Moments::default);
-        self.moments.truncate(self.scene.layers.len());
-        let groups = self.stages.get(self.progress.stage).map_or(&[][..], |s| &s.groups);
-        for (index, (layer, moments)) in self.scene.layers.iter().zip(&mut self.moments).enumerate() {
-            let fresh = Moments::new(&layer.params);
-            let old = std::mem::replace(moments, fresh);
-            moments.adopt(old);
-            moments.forget_pages(&layer.params, |c| groups.iter().any(|g| g.is_of(index) && g.column == c));
-        }
-        self.fit_grads();
-        self.stats.clear(&self.scene);
-    }
-
-    /// Rows of the scene were edited: every loss is told, and what is derived of rows is made anew.
-    fn edited(&mut self) {
-        self.stages[self.progress.stage].on_edit();
-        self.stale = true;
-        self.fit_grads();
-    }
-
-    fn fit_grads(&mut self) {
-        self.grads = self.scene.layers.iter().map(|l| Grads::new(&l.params)).collect();
+    /// The scene that learns.
+    pub fn scene(&self) -> &Scene<f32> {
+        self.learner.scene()
     }
 
     /// Takes over a checkpoint's state. The scene and all tables must belong together.
-    pub fn restore(&mut self, scene: Scene<f32>, moments: Vec<Moments<f32>>, stats: Stats, progress: Progress) {
-        (self.scene, self.moments, self.stats, self.progress) = (scene, moments, stats, progress);
-        (self.stale, self.entered, self.switched) = (true, false, None);
-        self.fit_grads();
+    pub fn restore(&mut self, learner: Learner, progress: Position) {
+        (self.learner, self.progress, self.entered) = (learner, progress, false);
+        self.spread();
     }
 
-    /// Runs the hooks that are due before the next step, through stages without steps. [`step`](Self::step) does so by
-    /// itself, but tells nobody.
-    pub fn enter(&mut self, tell: &mut Tell<'_>) -> Result<()> {
-        while let Some(stage) = self.stages.get(self.progress.stage) {
-            let (empty, switches) = (stage.iterations == 0, stage.switches.len());
-            if self.progress.stage_step == 0 && !self.entered {
-                self.run_hook(|s| s.start.as_ref(), tell)?;
-                (self.entered, self.stale) = (true, true);
-            }
-            if !empty {
-                let step = self.progress.stage_step;
-                if self.switched.replace(step) != Some(step) {
-                    for i in 0..switches {
-                        self.run_hook(|s| s.switches.get(i).filter(|(due, _)| *due == step).map(|(_, h)| h), tell)?;
-                    }
-                }
-                return Ok(());
-            }
-            self.leave_stage(tell)?;
+    /// Tells those that remember something of the learner what was done to it, steps apart: the one place where that is
+    /// known.
+    fn spread(&mut self) {
+        let touched = self.learner.take_touched();
+        if let (Touched::Rows, Some(stage)) = (touched, self.stages.get(self.progress.stage)) {
+            stage.on_edit();
+        }
+        if touched != Touched::Nothing {
+            self.stale = true;
+            self.grads = self.scene().layers.iter().map(|l| Grads::new(&l.params)).collect();
+        }
+    }
+
+    /// Runs a hook of the current stage.
+    fn run_hook(&mut self, hook: impl Fn(&Stage) -> Option<&Hook>, progress: &mut Progress<'_>) -> Result<()> {
+        let stage = &self.stages[self.progress.stage];
+        if let Some(hook) = hook(stage) {
+            self.learner
+                .rebuild(&|layer, column| learns(&stage.groups, layer, column), |scene| hook(scene, progress))?;
+            self.spread();
         }
         Ok(())
     }
 
-    fn leave_stage(&mut self, tell: &mut Tell<'_>) -> Result<()> {
-        self.run_hook(|s| s.end.as_ref(), tell)?;
+    /// Does what is due before the next step, through stages without steps. [`step`](Self::step) does so by itself, but
+    /// tells nobody.
+    pub fn enter(&mut self, progress: &mut Progress<'_>) -> Result<()> {
+        while !self.entered && !self.is_done() {
+            if self.progress.stage_step == 0 {
+                self.run_hook(|s| s.start.as_ref(), progress)?;
+                // Of another stage's codec nothing is kept.
+                self.stale = true;
+            }
+            if self.stages[self.progress.stage].iterations == 0 {
+                self.leave_stage(progress)?;
+                continue;
+            }
+            self.keep_up(self.progress.stage_step, |u| u.once())?;
+            self.entered = true;
+        }
+        Ok(())
+    }
+
+    fn leave_stage(&mut self, progress: &mut Progress<'_>) -> Result<()> {
+        self.run_hook(|s| s.end.as_ref(), progress)?;
         self.progress.stage += 1;
         self.progress.stage_step = 0;
-        (self.entered, self.switched) = (false, None);
+        self.entered = false;
         Ok(())
     }
 
@@ -268,7 +234,7 @@ impl<'a> Trainer<'a> {
 
     /// The scene as pictures show it: as it will be read from its file, where the stage has a codec.
     pub fn shown(&self) -> Cow<'_, Scene<f32>> {
-        self.codec().map_or(Cow::Borrowed(&self.scene), |c| Cow::Owned(c.whole(&self.scene)))
+        self.codec().map_or(Cow::Borrowed(self.scene()), |c| Cow::Owned(c.whole(self.scene())))
     }
 
     /// The frames that step `stage_step` of the current stage will see.
@@ -286,7 +252,7 @@ impl<'a> Trainer<'a> {
     }
 
     fn step_in_pool(&mut self) -> Result<std::result::Result<Stepped, Fault>> {
-        self.enter(&mut |_, _, _| {})?;
+        self.enter(&mut Progress(&mut |_| {}))?;
         let mut out = Stepped::default();
         if self.is_done() {
             return Ok(Ok(out));
@@ -309,14 +275,18 @@ impl<'a> Trainer<'a> {
             return Ok(Err(fault));
         }
         let clock = Clock::now();
-        out.change = self.maintain()?;
-        if self.scene.is_empty() {
+        self.shake();
+        for (d, layer) in self.grads.iter_mut().zip(&self.learner.scene().layers) {
+            d.clear(&layer.params);
+        }
+        out.change = self.keep_up(self.progress.stage_step + 1, |_| true)?;
+        if self.scene().is_empty() {
             return Ok(Err(Fault("not one Gaussian is left: all of them became transparent or huge".into())));
         }
         self.progress.iteration += 1;
         self.progress.stage_step += 1;
         if self.progress.stage_step == self.stages[self.progress.stage].iterations {
-            self.leave_stage(&mut |_, _, _| {})?;
+            self.leave_stage(&mut Progress(&mut |_| {}))?;
         }
         out.other += clock.elapsed();
         Ok(Ok(out))
@@ -374,17 +344,17 @@ impl<'a> Trainer<'a> {
         let clock = Clock::now();
         if let Some(codec) = &stage.codec {
             if std::mem::take(&mut self.stale) {
-                self.shown = self.scene.clone();
+                self.shown = self.learner.scene().clone();
                 codec.reset();
             }
-            codec.show(&self.scene, &info.times, &mut self.shown);
+            codec.show(self.learner.scene(), &info.times, &mut self.shown);
         }
         out.other += clock.elapsed();
         self.loss.segmentation = stage.segmentation.clone();
-        let scene = if stage.codec.is_some() { &self.shown } else { &self.scene };
+        let (scene, _, stats) = self.learner.parts_mut();
+        let scene = if stage.codec.is_some() { &self.shown } else { &*scene };
         let mut mse = Mse { inner: &mut self.loss, sum: 0.0 };
         let mut losses = Losses { image: &mut mse, probes: &stage.probes, params: &stage.params };
-        let stats = &mut self.stats;
         out.report =
             self.chain.step(scene, &views, &info, self.draw.as_mut(), &mut losses, &mut self.grads, &mut |o| {
                 stats.observe(o)
@@ -403,8 +373,9 @@ impl<'a> Trainer<'a> {
         {
             bad.push((0, SH));
         }
-        self.rates.resize_with(self.scene.layers.len(), Vec::new);
-        for (index, layer) in self.scene.layers.iter_mut().enumerate() {
+        let (scene, moments, _) = self.learner.parts_mut();
+        self.rates.resize_with(scene.layers.len(), Vec::new);
+        for (index, layer) in scene.layers.iter_mut().enumerate() {
             let rates = &mut self.rates[index];
             rates.resize(layer.params.keys().count(), None);
             rates.iter_mut().flatten().for_each(|table| table.fill(0.0));
@@ -421,7 +392,7 @@ impl<'a> Trainer<'a> {
             let floor = stage.min_log_life.filter(|_| layer.params[LIFE].width() > LOG_WIDTH);
             let floor = floor.map(|least| Floor { key: LIFE, column: LOG_WIDTH, least });
             let floors = floor.as_slice();
-            let keys = self.moments[index].step(&mut layer.params, &mut self.grads[index], rates, floors);
+            let keys = moments[index].step(&mut layer.params, &mut self.grads[index], rates, floors);
             bad.extend(keys.into_iter().map(|k| (index, k)));
         }
         if let Some(exposure) = &mut self.loss.exposure {
@@ -443,7 +414,7 @@ impl<'a> Trainer<'a> {
             None if report.loss.is_finite() => return None,
             None => return Some(Fault(format!("the loss is {} ({})", report.loss, views()))),
         };
-        let params = &self.scene.layers[layer].params;
+        let params = &self.scene().layers[layer].params;
         let (row, col) = self.grads[layer]
             .table(key)
             .first_non_finite()
@@ -453,139 +424,53 @@ impl<'a> Trainer<'a> {
         Some(Fault(format!("`{column}` of Gaussian {row} of layer {layer} is not finite ({})", views())))
     }
 
-    /// Noise, densification, pruning, resets, memory order; clears the gradients.
-    fn maintain(&mut self) -> Result<Change> {
+    /// Noise on positions, where the stage has it.
+    fn shake(&mut self) {
         let stage = &self.stages[self.progress.stage];
-        let (step, seed) = (self.progress.stage_step + 1, self.settings.seed);
-        let address = self.progress.iteration as u64;
-        if let Densify::Mcmc(m) = &stage.densify {
-            let rate = |layer: usize| {
-                let group = stage.groups.iter().find(|g| g.is_of(layer) && g.column == "means")?;
-                Some(group.rate.at(self.progress.stage_step as f64 / stage.iterations as f64))
-            };
-            for (index, layer) in self.scene.layers.iter_mut().enumerate() {
-                let Some(rate) = rate(index) else { continue };
-                let rng = Rng::new(seed, "noise", address).fork(index as u64);
-                let active = self.grads[index].active(Space::Gaussians);
-                mcmc::add_noise(layer, active, rate * m.noise_lr, self.settings.limits.min_opacity, rng);
-            }
-        }
-        for (d, layer) in self.grads.iter_mut().zip(&self.scene.layers) {
-            d.clear(&layer.params);
-        }
-        if let Some(adapt) = stage.adapt.as_ref().filter(|a| a.is_due(step)) {
-            let rng = Rng::new(seed, "adapt", address);
-            adapt.run(&mut self.scene, &mut self.moments, &mut self.stats, step, rng);
-            self.edited();
-        }
-        // Before densification, which begins the statistics anew.
-        let placed = self.place(step)?;
-        let stage = &self.stages[self.progress.stage];
-        let (from, until, every) = stage.densify_steps;
-        let mut change = Change::default();
-        let due = every > 0 && step >= from && step <= until && step.is_multiple_of(every);
-        if due && stage.densify != Densify::None {
-            change = stage.densify.run(
-                &mut self.scene,
-                &mut self.moments,
-                &mut self.stats,
-                &self.settings.limits,
-                seed,
-                address,
-            );
-            // The last densification leaves rows in Morton order for the rest of the run.
-            if step + every > until {
-                for layer in 0..self.scene.layers.len() {
-                    let edit = morton_edit(&self.scene, layer);
-                    densify::apply(
-                        &mut self.scene,
-                        &mut self.moments,
-                        &mut self.stats,
-                        layer,
-                        &edit,
-                        &Rng::new(seed, "order", address),
-                    );
-                }
-            }
-            self.edited();
-        }
-        change.removed += self.prune(step)?;
-        change.removed += self.uncrowd(step);
-        (change.added, change.moved) = (change.added + placed.added, change.moved + placed.moved);
-        let stage = &self.stages[self.progress.stage];
-        let reset = self.settings.opacity_reset_interval;
-        if matches!(stage.densify, Densify::Adc(_)) && reset > 0 && step.is_multiple_of(reset) && step < until {
-            adc::reset_opacity(&mut self.scene, &mut self.moments, 2.0 * self.settings.limits.min_opacity);
-            self.stale = true;
-        }
-        Ok(change)
-    }
-
-    /// Relocation and guided sampling after so many steps of the stage, where they are due.
-    fn place(&mut self, step: usize) -> Result<Change> {
-        let stage = &self.stages[self.progress.stage];
-        let (seed, address, limits) = (self.settings.seed, self.progress.iteration as u64, &self.settings.limits);
-        let mut change = Change::default();
-        let (scene, moments, stats) = (&mut self.scene, &mut self.moments, &mut self.stats);
-        if let Some(relocate) = stage.relocate.filter(|r| r.is_due(step, stage.iterations)) {
-            change = relocate.run(scene, moments, stats, limits, seed, address);
-            let (_, until, every) = stage.densify_steps;
-            if every == 0 || step >= until {
-                stats.clear(scene);
-            }
-        }
-        if let Some(guided) = stage.guided.filter(|g| g.is_due(step, stage.iterations)) {
-            let antialias = self.draw.config().antialias;
-            let frames = self.frames.as_ref();
-            change.added = guided.run(scene, moments, stats, limits, frames, antialias, seed, address)?.added;
-        }
-        if change != Change::default() {
-            self.edited();
-        }
-        Ok(change)
-    }
-
-    /// Pruning after so many steps of the stage, if it is due; returns how many rows went.
-    fn prune(&mut self, step: usize) -> Result<usize> {
-        let stage = &self.stages[self.progress.stage];
-        let Some(periodic) = stage.prune.filter(|p| p.is_due(step, stage.iterations)) else { return Ok(0) };
-        let before = self.scene.len();
-        let scores = periodic.scores(&self.scene, self.frames.as_ref(), self.draw.config().antialias)?;
-        let rng = Rng::new(self.settings.seed, "prune", self.progress.iteration as u64);
-        for (layer, edit) in prune(&self.scene, &scores, periodic.ratio).iter().enumerate() {
-            densify::apply(&mut self.scene, &mut self.moments, &mut self.stats, layer, edit, &rng);
-        }
-        self.edited();
-        Ok(before - self.scene.len())
-    }
-
-    /// Pairs in one place after so many steps of the stage, if that is due; returns how many rows went.
-    fn uncrowd(&mut self, step: usize) -> usize {
-        let stage = &self.stages[self.progress.stage];
-        let Some(rule) = stage.crowding.filter(|c| step.is_multiple_of(c.every) && step < stage.iterations) else {
-            return 0;
+        let Some(noise) = stage.noise else { return };
+        let progress = self.progress.stage_step as f64 / stage.iterations as f64;
+        let rate = |layer: usize| {
+            let group = stage.groups.iter().find(|g| g.is_of(layer) && g.column == "means")?;
+            Some(group.rate.at(progress))
         };
-        let before = self.scene.len();
-        let rng = Rng::new(self.settings.seed, "crowding", self.progress.iteration as u64);
-        for layer in 0..self.scene.layers.len() {
-            if let Some(edit) = rule.edit(&mut self.scene, layer) {
-                densify::apply(&mut self.scene, &mut self.moments, &mut self.stats, layer, &edit, &rng);
-            }
+        let rng = Rng::new(self.settings.seed, "noise", self.progress.iteration as u64);
+        let (scene, ..) = self.learner.parts_mut();
+        noise.add(scene, &self.grads, rate, self.settings.limits.min_opacity, rng);
+    }
+
+    /// Runs the operations of `which` that are due after `step` steps of the stage, and tells losses what they did.
+    fn keep_up(&mut self, step: usize, which: impl Fn(&dyn Upkeep) -> bool) -> Result<Change> {
+        let Stage { upkeep, groups, iterations, .. } = &mut self.stages[self.progress.stage];
+        let context = Context {
+            at: At { step, steps: *iterations },
+            iteration: self.progress.iteration,
+            seed: self.settings.seed,
+            limits: self.settings.limits,
+            frames: self.frames.as_ref(),
+            antialias: self.draw.config().antialias,
+            learns: &|layer, column| learns(groups, layer, column),
+        };
+        let mut change = Change::default();
+        for operation in upkeep.iter_mut().filter(|u| which(u.as_ref()) && u.due(&context.at)) {
+            change += operation.run(&mut self.learner, &context)?;
         }
-        if self.scene.len() < before {
-            self.edited();
-        }
-        before - self.scene.len()
+        self.spread();
+        Ok(change)
     }
 
     /// Errors if the scene is empty: nothing could be learnt.
     pub fn check_not_empty(&self) -> Result<()> {
-        if self.scene.layers.iter().all(|l| l.params[GEOMETRY].rows() == 0) {
+        if self.scene().layers.iter().all(|l| l.params[GEOMETRY].rows() == 0) {
             return Err(Error::new(ErrorKind::BadInput, "there is not one Gaussian to start from")
                 .remedy("Give points, masks or --set init=random --set num_pts=10000"));
         }
         Ok(())
     }
+}
+
+/// Whether a column group of a layer is in one of the groups.
+fn learns(groups: &[Group], layer: usize, column: &str) -> bool {
+    groups.iter().any(|g| g.is_of(layer) && g.column == column)
 }
 
 /// Passes a loss through and sums the mean squared errors of the step's views.

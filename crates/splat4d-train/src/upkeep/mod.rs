@@ -1,95 +1,50 @@
-//! Densification: where Gaussians are added, moved and removed, always under one hard cap over all layers.
+//! Upkeep: what is done to a learner between steps. Gaussians are added, moved, merged and removed, the nodes that carry
+//! them follow, opacities are lowered, rows are put in order.
 //!
-//! A strategy looks at what [`Stats`] gathered and at activated covariances, and acts through one `RowEdit` a layer and
-//! `Motion::on_edit`, so that it works for every motion model.
+//! A stage has a list of [`Upkeep`] operations; after every step those that are due run, in the order of [`Order`]. An
+//! operation changes rows through [`Learner::apply`] alone, so that it works for every motion model and every loss hears
+//! of it. A new one is a file here, and a line where a program adds it to a stage.
 
 pub mod adc;
 pub mod guided;
 pub mod mcmc;
 pub mod merge;
+pub mod morton;
+pub mod nodes;
+pub mod once;
+pub mod opacity_reset;
+pub mod prune;
 pub mod relocate;
+pub mod split;
+#[cfg(test)]
+pub(crate) mod tests;
+pub mod worth;
 
-use crate::optim::Moments;
-use splat4d::format::quant::{MORTON_BITS, morton};
+pub use adc::{Adc, AdcSettings};
+pub use guided::{Guided, GuidedSettings};
+pub use mcmc::{Mcmc, McmcSettings};
+pub use merge::{Merge, MergeSettings, Pair};
+pub use morton::MortonOrder;
+pub use nodes::{AdaptNodes, NodeSettings};
+pub use once::Once;
+pub use opacity_reset::{OpacityReset, OpacityResetSettings};
+pub use prune::{Prune, PruneSettings};
+pub use relocate::{Relocate, RelocateSettings};
+pub use split::{Split, SplitSettings};
+
+use crate::Result;
+use crate::capture::frames::Frames;
+use crate::learner::Learner;
+use crate::recipe::Recipe;
 use splat4d::layers::{LayerTape, Scene};
 use splat4d::math::{Real, Rng, sym3};
-use splat4d::motion::{Cache, for_rows};
+use splat4d::motion::Cache;
+use splat4d::render::Antialias;
 use splat4d::scene::params::{OPACITY, QUAT};
 use splat4d::scene::splats::COV;
-use splat4d::scene::{Born, GEOMETRY, RowEdit, Rows, Space, Table, Time};
+use splat4d::scene::{GEOMETRY, Rows, Space, Time};
 
-pub use adc::Adc;
-pub use guided::Guided;
-pub use mcmc::Mcmc;
-pub use merge::{Crowd, Crowding};
-pub use relocate::Relocate;
-
-/// What the densifier may know of one view of one layer.
-#[derive(Clone, Copy, Debug)]
-pub struct Observation<'a, F> {
-    /// The layer.
-    pub layer: usize,
-    /// Its rows that were drawn: splat j is row `rows.id(j)`.
-    pub rows: Rows<'a>,
-    /// |dL/dmean2d| a splat, NDC units.
-    pub mean2d: &'a [F],
-    /// Pixel radius a splat, 0 where culled.
-    pub radii: &'a [F],
-}
-
-/// Columns of a layer's statistics.
-const STATS_COLUMNS: [(&str, usize); 3] = [("gradient_sum", 1), ("gradient_count", 1), ("radius_max", 1)];
-
-/// What was seen of every Gaussian since the last densification.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Stats {
-    /// One a layer, [N, 3]: sum of |dL/dmean2d| (NDC units), number of views that drew it, largest radius (pixels).
-    pub tables: Vec<Table<f32>>,
-}
-
-impl Stats {
-    /// Nothing seen.
-    pub fn new<F: Real>(scene: &Scene<F>) -> Self {
-        Self { tables: scene.layers.iter().map(|l| Table::new(&STATS_COLUMNS, l.params.len())).collect() }
-    }
-
-    /// Adds one view's news.
-    pub fn observe<F: Real>(&mut self, o: Observation<'_, F>) {
-        for_rows([&mut self.tables[o.layer]], o.rows, |j, id, [table]| {
-            let radius = o.radii[j];
-            if radius > F::ZERO {
-                let [sum, count, largest] = table.read::<3>(id, 0);
-                let next = [sum + o.mean2d[j].f64() as f32, count + 1.0, largest.max(radius.f64() as f32)];
-                table.write(id, 0, next);
-            }
-            0.0
-        });
-    }
-
-    /// Mean gradient of a row, 0 where never drawn.
-    pub fn gradient(&self, layer: usize, row: usize) -> f32 {
-        let [sum, count] = self.tables[layer].read::<2>(row, 0);
-        if count > 0.0 { sum / count } else { 0.0 }
-    }
-
-    /// Follows a row edit of a layer: rows that are not `Kept` have not been seen yet.
-    pub fn edit(&mut self, layer: usize, edit: &RowEdit) {
-        if edit.space == Space::Gaussians {
-            let table = &mut self.tables[layer];
-            *table = table.gather(&edit.parent);
-            for (row, _) in edit.born.iter().enumerate().filter(|(_, b)| **b != Born::Kept) {
-                table.clear_row(row);
-            }
-        }
-    }
-
-    /// Forgets everything; also takes over a changed number of rows.
-    pub fn clear<F: Real>(&mut self, scene: &Scene<F>) {
-        *self = Self::new(scene);
-    }
-}
-
-/// What every strategy needs to know of the run.
+/// Limits that hold for every operation of a run.
 #[derive(Clone, Copy, Debug)]
 pub struct Limits {
     /// Never more Gaussians than this in all layers together.
@@ -100,16 +55,50 @@ pub struct Limits {
     pub min_opacity: f64,
 }
 
-/// A strategy of densification.
-#[derive(Clone, Debug, PartialEq)]
-#[non_exhaustive]
-pub enum Densify {
-    /// Nothing is added or removed.
-    None,
-    /// Adaptive density control (Kerbl et al. 2023).
-    Adc(Adc),
-    /// Markov chain Monte Carlo (Kheradmand et al. 2024), relocation in space-time.
-    Mcmc(Mcmc),
+/// A place in a stage.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct At {
+    /// Steps of the stage that are done.
+    pub step: usize,
+    /// Steps of the stage in all.
+    pub steps: usize,
+}
+
+/// Steps of a stage at which something is done: the multiples of `interval` from `first` to `last`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Every {
+    /// Not before this step.
+    pub first: usize,
+    /// Not after this step.
+    pub last: usize,
+    /// Steps between two times; 0: never.
+    pub interval: usize,
+}
+
+impl Every {
+    /// At no step.
+    pub const NEVER: Self = Self { first: 0, last: 0, interval: 0 };
+
+    /// The steps at which a recipe densifies.
+    pub fn densification(r: &Recipe) -> Self {
+        Self { first: r.densify_from_iter, last: r.densify_until_iter, interval: r.densification_interval }
+    }
+
+    /// Whether it is time after so many steps.
+    pub fn is_due(&self, step: usize) -> bool {
+        self.interval > 0 && step >= self.first && step <= self.last && step.is_multiple_of(self.interval)
+    }
+
+    /// Whether it is time, and for the last time.
+    pub fn is_last(&self, step: usize) -> bool {
+        self.is_due(step) && step + self.interval > self.last
+    }
+
+    /// The same as the steps `from..to` of the stage see it, counted from `from`.
+    #[must_use]
+    pub fn part(self, from: usize, to: usize) -> Self {
+        Self { first: self.first.saturating_sub(from).max(1), last: self.last.min(to).saturating_sub(from), ..self }
+    }
 }
 
 /// How many rows were born and died.
@@ -123,58 +112,156 @@ pub struct Change {
     pub removed: usize,
 }
 
-impl Densify {
-    /// Edits every layer (scene, moments and statistics alike). `step` addresses the random numbers.
-    pub fn run(
-        &self,
-        scene: &mut Scene<f32>,
-        moments: &mut [Moments<f32>],
-        stats: &mut Stats,
-        limits: &Limits,
-        seed: u64,
-        step: u64,
-    ) -> Change {
-        let mut change = Change::default();
-        let mut spare = limits.cap.saturating_sub(scene.len());
-        let mut rest = scene.len();
-        for layer in 0..scene.layers.len() {
-            // What is left of the cap is shared by size, so that the first layer does not starve the others; what a
-            // layer does not use goes to the next.
-            let rows = scene.layers[layer].params.len();
-            let mut room = (spare * rows).div_ceil(rest.max(1));
-            (spare, rest) = (spare - room, rest - rows);
-            let rng = Rng::new(seed, "densify", step).fork(layer as u64);
-            let c = match self {
-                Densify::None => Change::default(),
-                Densify::Adc(adc) => adc.run(scene, moments, stats, limits, layer, &mut room, rng),
-                Densify::Mcmc(mcmc) => mcmc.run(scene, moments, stats, limits, layer, &mut room, rng),
-            };
-            spare += room;
-            change.added += c.added;
-            change.moved += c.moved;
-            change.removed += c.removed;
-        }
-        stats.clear(scene);
-        change
+impl std::ops::AddAssign for Change {
+    fn add_assign(&mut self, other: Self) {
+        self.added += other.added;
+        self.moved += other.moved;
+        self.removed += other.removed;
     }
 }
 
-/// Applies one edit to a layer, its moments and its statistics.
-pub fn apply(
-    scene: &mut Scene<f32>,
-    moments: &mut [Moments<f32>],
-    stats: &mut Stats,
-    layer: usize,
-    edit: &RowEdit,
-    rng: &Rng,
-) {
-    moments[layer].edit(&scene.layers[layer].params, edit);
-    stats.edit(layer, edit);
-    scene.layers[layer].edit(edit, rng);
+/// All that an operation may know besides the learner.
+#[derive(Clone, Copy)]
+pub struct Context<'a> {
+    /// Where in the stage.
+    pub at: At,
+    /// Steps of the run that were done before this one: it addresses the random numbers.
+    pub iteration: usize,
+    /// Seed of the run.
+    pub seed: u64,
+    /// Cap, extent and dead opacity.
+    pub limits: Limits,
+    /// What the scene is compared with.
+    pub frames: &'a dyn Frames,
+    /// As the scene is drawn.
+    pub antialias: Antialias,
+    /// Whether a column group of a layer learns in this stage.
+    pub learns: &'a dyn Fn(usize, &str) -> bool,
+}
+
+impl Context<'_> {
+    /// The random numbers of this step for a purpose.
+    pub fn rng(&self, purpose: &str) -> Rng {
+        Rng::new(self.seed, purpose, self.iteration as u64)
+    }
+}
+
+/// The order in which operations of one step run, whatever the order in which they were added; those of one place run in
+/// that one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Order {
+    /// Nodes, while statistics of the Gaussians that follow them are still there.
+    Nodes,
+    /// Gaussians are put where pictures want them; before densification, which begins the statistics anew.
+    Place,
+    /// The cloud grows.
+    Grow,
+    /// Rows are put in order.
+    Sort,
+    /// What is worth little goes.
+    Remove,
+    /// What stands in one place becomes one.
+    Merge,
+    /// Numbers are set back.
+    Reset,
+    /// All else.
+    Last,
+}
+
+/// Something that is done to a learner between steps.
+///
+/// `run` takes `&mut self`: what an operation remembers from time to time is its own, and goes into checkpoints by
+/// [`state`](Self::state).
+pub trait Upkeep: Send + Sync {
+    /// Its name, which is its own among the operations of a stage that remember anything: checkpoints use it.
+    fn name(&self) -> &str;
+
+    /// When it runs among those that are due at one step.
+    fn order(&self) -> Order {
+        Order::Last
+    }
+
+    /// Whether it is to run after so many steps of the stage; see [`once`](Self::once) for the time before the first one.
+    fn due(&self, at: &At) -> bool;
+
+    /// Does it.
+    fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change>;
+
+    /// Whether it is done once in a stage, perhaps before the first step (`at.step` is 0 then). After a resume at that
+    /// very step it runs again, and must then change nothing.
+    fn once(&self) -> bool {
+        false
+    }
+
+    /// The schedule of densification, where it follows that one: it goes on over the parts of a stage that is divided.
+    /// All other operations state their steps in the stage's own.
+    fn densification(&mut self) -> Option<&mut Every> {
+        None
+    }
+
+    /// The factor by which the cloud may grow at a place in the stage; 1: it does not.
+    fn growth(&self, _at: &At) -> f64 {
+        1.0
+    }
+
+    /// Whether it belongs into a stage that only tunes a trained scene: it keeps up what the model needs, and adds, moves
+    /// and removes no Gaussian.
+    fn in_tuning(&self) -> bool {
+        false
+    }
+
+    /// What a checkpoint must hold of it, if it remembers anything from time to time.
+    fn state(&self) -> Vec<u32> {
+        Vec::new()
+    }
+
+    /// Takes back what [`state`](Self::state) gave; nothing from a checkpoint that does not know the operation.
+    fn restore(&mut self, _state: &[u32]) {}
+}
+
+/// The operations that a recipe asks of every motion model.
+pub fn of(r: &Recipe) -> Vec<Box<dyn Upkeep>> {
+    let all = [
+        boxed(Adc::of(r)),
+        boxed(Mcmc::of(r)),
+        boxed(MortonOrder::of(r)),
+        boxed(Relocate::of(r)),
+        boxed(Prune::of(r)),
+        boxed(Merge::of(r)),
+        boxed(OpacityReset::of(r)),
+    ];
+    all.into_iter().flatten().collect()
+}
+
+fn boxed(operation: Option<impl Upkeep + 'static>) -> Option<Box<dyn Upkeep>> {
+    operation.map(|o| Box::new(o) as Box<dyn Upkeep>)
+}
+
+/// Lets every layer grow under the one cap: `layer` gets a layer's number, how many rows it may add (to be lowered by those
+/// it adds) and its random numbers. Statistics begin anew.
+fn grow(
+    learner: &mut Learner,
+    c: &Context<'_>,
+    layer: impl Fn(&mut Learner, usize, &mut usize, Rng) -> Change,
+) -> Change {
+    let mut change = Change::default();
+    let mut spare = c.limits.cap.saturating_sub(learner.scene().len());
+    let mut rest = learner.scene().len();
+    for index in 0..learner.scene().layers.len() {
+        // What is left of the cap is shared by size, so that the first layer does not starve the others; what a
+        // layer does not use goes to the next.
+        let rows = learner.scene().layers[index].params.len();
+        let mut room = (spare * rows).div_ceil(rest.max(1));
+        (spare, rest) = (spare - room, rest - rows);
+        change += layer(learner, index, &mut room, c.rng("densify").fork(index as u64));
+        spare += room;
+    }
+    learner.clear_stats();
+    change
 }
 
 /// Activated covariances [N, 6] of a layer's Gaussians at the clip's centre, whatever model made them.
-pub fn covariances(scene: &Scene<f32>, layer: usize) -> Vec<[f64; 6]> {
+fn covariances(scene: &Scene<f32>, layer: usize) -> Vec<[f64; 6]> {
     let l = &scene.layers[layer];
     let mut tape = LayerTape::default();
     tape.ask(Space::Gaussians, Rows::All, Time(0.5 * (scene.clip[0] + scene.clip[1])));
@@ -213,87 +300,4 @@ fn sample(cov: [f64; 6], rng: Rng) -> [f64; 3] {
     let (values, vectors) = sym3::eigen(cov);
     let z: [f64; 3] = std::array::from_fn(|k| rng.normal(k as u64) * values[k].max(0.0).sqrt());
     std::array::from_fn(|r| vectors[r][0] * z[0] + vectors[r][1] * z[1] + vectors[r][2] * z[2])
-}
-
-/// Shuffles the rows of a layer by the Morton order of their means: neighbours in space become neighbours in memory.
-pub fn morton_edit(scene: &Scene<f32>, layer: usize) -> RowEdit {
-    let geometry = &scene.layers[layer].params[GEOMETRY];
-    let rows = geometry.rows();
-    let mut low = [f32::INFINITY; 3];
-    let mut high = [f32::NEG_INFINITY; 3];
-    for r in 0..rows {
-        let m = geometry.read::<3>(r, 0);
-        for k in 0..3 {
-            low[k] = low[k].min(m[k]);
-            high[k] = high[k].max(m[k]);
-        }
-    }
-    let most = f64::from((1u32 << MORTON_BITS) - 1);
-    let code = |r: usize| {
-        let m = geometry.read::<3>(r, 0);
-        morton(std::array::from_fn(|k| {
-            let u = (m[k] - low[k]) / (high[k] - low[k]).max(f32::MIN_POSITIVE);
-            (f64::from(u.clamp(0.0, 1.0)) * most) as u32
-        }))
-    };
-    let mut order: Vec<(u64, u32)> = (0..rows).map(|r| (code(r), r as u32)).collect();
-    order.sort_unstable();
-    let parent: Vec<u32> = order.into_iter().map(|(_, r)| r).collect();
-    RowEdit { space: Space::Gaussians, born: vec![Born::Kept; parent.len()], parent }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use splat4d::layers::{ALWAYS, Layer};
-    use splat4d::motion::{Spec, build};
-    use splat4d::scene::params::LOG_SCALE;
-    use splat4d::scene::{LifeKind, Params};
-
-    /// One still layer of random Gaussians of opacity one half.
-    pub(super) fn scene(rows: usize) -> Scene<f32> {
-        let mut params = Params::new(rows, 1, &[]);
-        let motion = build(&Spec::Still, &mut params).unwrap();
-        let rng = Rng::new(1, "scene", 0);
-        for r in 0..rows {
-            let g = &mut params[GEOMETRY];
-            for c in 0..7 {
-                g.set(r, c, rng.fork(c as u64).normal(r as u64) as f32);
-            }
-            g.write(r, LOG_SCALE, [-2.0; 3]);
-        }
-        let layer = Layer { name: "a".into(), params, motion, life: LifeKind::Infinite, span: ALWAYS, masks: None };
-        Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 30.0, ..Scene::default() }
-    }
-
-    #[test]
-    fn morton_order_is_a_permutation_that_brings_neighbours_together() {
-        let mut s = scene(500);
-        let edit = morton_edit(&s, 0);
-        let mut sorted = edit.parent.clone();
-        sorted.sort_unstable();
-        assert!(sorted.iter().enumerate().all(|(i, &r)| i == r as usize));
-        let distance = |s: &Scene<f32>| {
-            let g = &s.layers[0].params[GEOMETRY];
-            (1..500).map(|r| (g.get(r, 0) - g.get(r - 1, 0)).abs() + (g.get(r, 1) - g.get(r - 1, 1)).abs()).sum::<f32>()
-        };
-        let before = distance(&s);
-        let mut moments: Vec<_> = s.layers.iter().map(|l| Moments::new(&l.params)).collect();
-        let mut stats = Stats::new(&s);
-        apply(&mut s, &mut moments, &mut stats, 0, &edit, &Rng::new(0, "m", 0));
-        assert!(distance(&s) < 0.6 * before);
-    }
-
-    #[test]
-    fn stats_count_what_was_drawn() {
-        let s = scene(20);
-        let mut stats = Stats::new(&s);
-        let ids = [4, 9];
-        for _ in 0..2 {
-            stats.observe(Observation { layer: 0, rows: Rows::Some(&ids), mean2d: &[1.0f32, 3.0], radii: &[2.0, 0.0] });
-        }
-        assert_eq!(stats.tables[0].read::<3>(4, 0), [2.0, 2.0, 2.0]);
-        assert_eq!(stats.gradient(0, 4), 1.0);
-        assert_eq!(stats.gradient(0, 9), 0.0, "a culled splat was not seen");
-    }
 }
