@@ -1,8 +1,8 @@
 use super::*;
 use crate::capture::frames::{Frames, Picture};
+use crate::event::Progress;
 use crate::train::loss::{Exposure, TrainLoss};
 use crate::train::trainer::{Settings, Trainer};
-use crate::event::Progress;
 use crate::upkeep::Limits;
 use splat4d::layers::{ALWAYS, Instant, Scene};
 use splat4d::math::sh::rgb_to_dc;
