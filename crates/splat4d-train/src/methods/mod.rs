@@ -231,6 +231,11 @@ impl Stage {
         self
     }
 
+    /// The highest SH degree that is drawn after so many steps, of `most`.
+    pub fn sh_degree(&self, step: usize, most: usize) -> usize {
+        (self.sh_from + step).checked_div(self.sh_interval).map_or(most, |unlocked| unlocked.min(most))
+    }
+
     /// Tells every loss that rows were edited.
     pub fn on_edit(&self) {
         self.params.iter().for_each(|l| l.on_edit());

@@ -3,6 +3,7 @@
 
 mod control;
 mod edits;
+mod engine;
 mod features;
 mod filtered;
 mod further;

@@ -4,6 +4,7 @@
 use super::*;
 use crate::learner::Learner;
 use crate::train::checkpoint;
+use crate::upkeep::Change as Rows;
 use crate::upkeep::worth::Spatial;
 use crate::upkeep::{
     AdaptNodes, Context, Every, Guided, GuidedSettings, Merge, MergeSettings, NodeSettings, Once, Pair, Prune,
@@ -170,7 +171,7 @@ impl Upkeep for Whiten {
     fn due(&self, at: &crate::upkeep::At) -> bool {
         at.step.is_multiple_of(7)
     }
-    fn run(&mut self, learner: &mut Learner, _: &Context<'_>) -> crate::Result<crate::upkeep::Change> {
+    fn run(&mut self, learner: &mut Learner, _: &Context<'_>) -> Result<Rows> {
         learner.scene_mut().layers[0].params[SH].write(self.next as usize, 0, [1.5f32; 3]);
         self.next += 1;
         Ok(Default::default())
