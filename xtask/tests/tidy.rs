@@ -10,8 +10,8 @@ const ORDER: [(&str, &[&str]); 4] = [
     (
         "crates/splat4d",
         &[
-            "error", "wgsl", "simd", "math", "scene", "nn", "motion", "layers", "render", "gpu", "flow", "format",
-            "bake", "play", "edit",
+            "error", "wgsl", "simd", "math", "scene", "nn", "motion", "layers", "render", "gpu", "device", "flow",
+            "format", "bake", "play", "edit",
         ],
     ),
     (

@@ -9,6 +9,7 @@ use crate::source::Source;
 use image::codecs::jpeg::JpegEncoder;
 use serde_json::{Value, json};
 use splat4d::bake::{self, Options, Shown, bake};
+use splat4d::device;
 use splat4d::format::playback::{self, Draft, Meta, NamedCamera, Pages, PathKey, Viewpoint, WriteConfig};
 use splat4d::layers::Scene;
 use splat4d::render::{Antialias, RenderConfig};
@@ -177,10 +178,10 @@ fn compare(
         (0..COMPARED_TIMES).map(|i| from + (to - from) * (i as f64 + 0.5) / COMPARED_TIMES as f64).collect();
     times.dedup();
     let antialias = if antialias { Antialias::On } else { Antialias::Off };
-    let config = RenderConfig { antialias, ..RenderConfig::default() };
-    Ok(bake::compare(scene, Shown::File(&played), &cameras, &times, &config, &mut |done, total| {
+    let mut cpu = device::cpu(RenderConfig { antialias, ..RenderConfig::default() });
+    Ok(bake::compare(scene, Shown::File(&played), &cameras, &times, cpu.as_mut(), &mut |done, total| {
         console.phase("comparing with the model", done, total);
-    }))
+    })?)
 }
 
 /// Every camera once, by name, spread over the rig where there are too many.

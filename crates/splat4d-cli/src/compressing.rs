@@ -16,7 +16,7 @@ use splat4d::layers::Scene;
 use splat4d::{Error, ErrorKind, Result};
 use splat4d_train::capture::{Capture, ImageStore};
 use splat4d_train::compress::{self, Compression, Job};
-use splat4d_train::eval::run::{EvalOptions, Evaluation, assess};
+use splat4d_train::eval::run::{EvalOptions, Scores, assess};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::train::{TrainOptions, checkpoint};
 use std::path::{Path, PathBuf};
@@ -146,7 +146,7 @@ impl Work {
         &self,
         source: &Source,
         original: &Original<'_>,
-        [before, after]: [&Evaluation; 2],
+        [before, after]: [&Scores; 2],
         stop: &AtomicBool,
         console: &Console,
     ) -> anyhow::Result<Compressed> {
@@ -194,7 +194,7 @@ impl Work {
         original: &Original<'_>,
         stop: &AtomicBool,
         console: &Console,
-    ) -> anyhow::Result<(Scene<f32>, Evaluation)> {
+    ) -> anyhow::Result<(Scene<f32>, Scores)> {
         let settings = Compression {
             prune: 0.0,
             rounds: 1,
@@ -290,13 +290,7 @@ impl Work {
     }
 
     /// Whether size or guard want another attempt; then the order is changed, and the folder is ready for it.
-    fn refused(
-        &mut self,
-        before: &Evaluation,
-        after: &Evaluation,
-        bytes: u64,
-        console: &Console,
-    ) -> anyhow::Result<bool> {
+    fn refused(&mut self, before: &Scores, after: &Scores, bytes: u64, console: &Console) -> anyhow::Result<bool> {
         let (Some(was), Some(is)) = (before.train("PSNR"), after.train("PSNR")) else { return Ok(false) };
         let settings = &self.order.settings;
         let (loss, prune) = (was - is, settings.prune);
@@ -344,7 +338,7 @@ impl Original<'_> {
     }
 
     /// The scores of a scene of this capture, without a trace in any folder.
-    fn scores(&self, scene: &Scene<f32>, console: &Console) -> anyhow::Result<Evaluation> {
+    fn scores(&self, scene: &Scene<f32>, console: &Console) -> anyhow::Result<Scores> {
         let store = ImageStore::new(self.capture.clone(), self.recipe.image_memory as usize);
         let options = EvalOptions { antialias: self.recipe.antialias, pictures: false, ..EvalOptions::default() };
         let scores = assess(scene, &self.capture, &store, 0, &options, &mut |event| console.event(event))?;

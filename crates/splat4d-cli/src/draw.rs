@@ -1,12 +1,13 @@
 //! The seam to the renderer: a scene, a camera and a time become a picture for people.
 
 use crate::console::Console;
-use crate::device::{Brush, Device};
+use crate::device::Device;
 use crate::video::Rgb;
 use rayon::prelude::*;
+use splat4d::device;
 use splat4d::layers::{Head, Scene};
 use splat4d::play::Player;
-use splat4d::render::{Antialias, Image, RenderConfig};
+use splat4d::render::{Antialias, Backend, Image, RenderConfig, Shot, Wanted};
 use splat4d::scene::{Camera, Planes, Time};
 
 /// What is shown.
@@ -39,10 +40,11 @@ const CHUNK: usize = 1 << 14;
 pub(crate) struct Painter<'a> {
     player: Player<'a>,
     background: [f32; 3],
-    config: RenderConfig,
-    brush: Brush<'a>,
-    /// Whether a network makes colours, pixel by pixel.
-    headed: bool,
+    depth: bool,
+    backend: Box<dyn Backend>,
+    /// Abilities that the scene needs of a device.
+    wanted: Wanted,
+    console: Option<&'a Console>,
     /// The last picture.
     pub image: Image<f32>,
 }
@@ -50,35 +52,33 @@ pub(crate) struct Painter<'a> {
 impl<'a> Painter<'a> {
     /// `depth`: whether pictures of depth will be asked for.
     pub(crate) fn new(scene: &'a Scene<f32>, background: [f32; 3], antialias: bool, depth: bool) -> Self {
-        let config = RenderConfig { antialias: self::antialias(antialias), depth, ..RenderConfig::default() };
-        let (player, brush, image) = (Player::of_scene(scene), Brush::cpu(config), Image::default());
-        Self { player, background, config, brush, headed: scene.head != Head::Identity, image }
+        let config = RenderConfig { antialias: self::antialias(antialias), ..RenderConfig::default() };
+        let (player, backend, image) = (Player::of_scene(scene), device::cpu(config), Image::default());
+        let wanted = Wanted { head: scene.head != Head::Identity, ..Wanted::default() };
+        Self { player, background, depth, backend, wanted, console: None, image }
     }
 
     /// The same on another device, where that can draw the scene.
     pub(crate) fn on(mut self, device: Device, console: &'a Console) -> Self {
-        if self.headed && device != Device::Cpu {
-            let line = "drawing on the CPU: a network makes the scene's colours (features = full)";
-            if device == Device::Gpu {
-                console.warn(line)
-            } else {
-                console.detail(line)
-            }
-            return self;
-        }
-        self.brush = Brush::open(device, self.config, console);
+        self.backend = crate::device::open(device, *self.backend.config(), &self.wanted, console).backend;
+        self.console = Some(console);
         self
     }
 
-    /// What draws, in words.
-    pub(crate) fn device(&self) -> String {
-        self.brush.name()
+    /// The device's name.
+    pub(crate) fn device(&self) -> &str {
+        self.backend.name()
     }
 
-    /// Draws into [`image`](Self::image).
+    /// Draws into [`image`](Self::image). A GPU that fails on the way is said, and left for the CPU.
     pub(crate) fn draw(&mut self, camera: &Camera, time: f64) {
         let splats = self.player.at(Time(time)).expect("nothing is read for a scene that is in memory");
-        self.brush.draw(&splats, camera, self.background, &mut self.image);
+        let shot = Shot { depth: self.depth, ..Shot::new(&splats, camera, self.background) };
+        if let Some(error) = device::draw(&mut self.backend, &shot, &mut self.image)
+            && let Some(console) = self.console
+        {
+            console.warn(&format!("drawing on the CPU: {error}"));
+        }
     }
 
     /// The last picture in 8 bits. `range`: nearest and farthest depth of the depth colours.

@@ -13,7 +13,7 @@ use serde_json::{Value, json};
 use splat4d::layers::Scene;
 use splat4d::{Error, Result};
 use splat4d_train::capture::{Capture, ImageStore};
-use splat4d_train::eval::run::{EvalOptions, Evaluation, evaluate};
+use splat4d_train::eval::run::{EvalOptions, Scores, evaluate};
 use splat4d_train::eval::tracks::track_error;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -94,12 +94,7 @@ pub(crate) fn playback(run: &Path, console: &Console) -> Result<()> {
 }
 
 /// Renders and scores the held-out views.
-pub(crate) fn scores(
-    run: &Path,
-    scene: &Scene<f32>,
-    measure: &Measure,
-    console: &Console,
-) -> anyhow::Result<Evaluation> {
+pub(crate) fn scores(run: &Path, scene: &Scene<f32>, measure: &Measure, console: &Console) -> anyhow::Result<Scores> {
     not_empty(scene, run)?;
     let opened = Run::open(run)?;
     let (capture, recipe) = opened.open_capture()?;

@@ -10,12 +10,12 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use splat4d::Result;
 use splat4d::format::{playback, scene as scene_file};
-use splat4d::layers::{Instant as Moment, Scene};
+use splat4d::layers::{Evaluation, Scene};
 use splat4d::play::{DEFAULT_BUDGET, Player, ReadAt};
 use splat4d::render::{Antialias, Image, RenderConfig, Renderer};
 use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::scene::{Camera, Time};
-use splat4d_train::eval::run::Evaluation;
+use splat4d_train::eval::run::Scores;
 use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Instant;
@@ -66,7 +66,7 @@ pub(crate) struct Side {
 
 impl Side {
     /// Takes over the scores of an evaluation.
-    pub(crate) fn scored(mut self, evaluation: &Evaluation) -> Self {
+    pub(crate) fn scored(mut self, evaluation: &Scores) -> Self {
         [self.psnr, self.ssim, self.psnr_dynamic, self.flicker] =
             ["PSNR", "SSIM", "PSNR-dynamic", "flicker"].map(|name| evaluation.held(name));
         self.psnr_train = evaluation.train("PSNR");
@@ -285,7 +285,7 @@ fn first_picture(subject: &Subject<'_>, stored: &Arc<[u8]>, look: &Look) -> Resu
     let (mut renderer, mut image, mut rgb) = (renderer(subject), Image::default(), Vec::new());
     match &subject.what {
         What::Scene(_) => {
-            let (scene, mut moment) = (scene_file::read(stored)?, Moment::default());
+            let (scene, mut moment) = (scene_file::read(stored)?, Evaluation::default());
             // A player would look up first when everybody lives, which pays from the second picture on.
             scene.at(look.time, &mut moment);
             renderer.render(&scene.splats(&moment), &look.camera, scene.background, None, &mut image);

@@ -4,7 +4,7 @@
 //! `cargo run --release -p splat4d-train --example train_tiny [OUT.safetensors]`
 
 use splat4d::Result;
-use splat4d::layers::{ALWAYS, Instant, Layer, Scene};
+use splat4d::layers::{ALWAYS, Evaluation, Layer, Scene};
 use splat4d::math::sh::rgb_to_dc;
 use splat4d::math::{Rng, Se3};
 use splat4d::motion::{SpacetimeSpec, Spec, build, spacetime::VELOCITIES};
@@ -81,7 +81,7 @@ fn main() -> Result<()> {
     };
     let mut made = Made { cameras: (0..CAMERAS).map(camera).collect(), pictures: Vec::new() };
     let mut renderer = Renderer::new(RenderConfig::default());
-    let (mut instant, mut image) = (Instant::default(), Image::default());
+    let (mut instant, mut image) = (Evaluation::default(), Image::default());
     for k in 0..TIMES {
         truth.at(Time(k as f64 / FPS), &mut instant);
         for camera in &made.cameras {
@@ -113,7 +113,7 @@ fn main() -> Result<()> {
         program.stages(&plan),
         Arc::new(made),
         Box::new(Renderer::new(RenderConfig { sh_degree: 0, ..RenderConfig::default() })),
-        TrainLoss::new(plan.recipe.lambda_dssim, 0.0, None),
+        TrainLoss::photometric(plan.recipe.lambda_dssim),
         Settings {
             seed: 0,
             limits: Limits { cap: plan.recipe.max_cap, extent: plan.extent, min_opacity: plan.recipe.min_opacity },

@@ -115,7 +115,7 @@ fn trainer() -> Result<Trainer<'static>> {
         program.stages(&plan),
         Arc::new(grey),
         Box::new(Renderer::new(RenderConfig { sh_degree: 1, ..RenderConfig::default() })),
-        TrainLoss::new(0.2, 0.0, None),
+        TrainLoss::photometric(0.2),
         Settings {
             seed: 0,
             limits: Limits { cap: GAUSSIANS, extent: 3.3, min_opacity: 0.005 },

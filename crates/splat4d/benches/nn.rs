@@ -7,7 +7,7 @@ use divan::counter::ItemsCount;
 use rayon::prelude::*;
 use splat4d::math::Rng;
 use splat4d::nn::matmul::{Matrix, product};
-use splat4d::nn::{HashGrid, HashShape, Kept, Mlp, MlpShape};
+use splat4d::nn::{HashGrid, HashShape, InputGrad, Kept, Mlp, MlpShape, Passed};
 use splat4d::scene::{Grads, Params};
 
 const ROWS: usize = 50_000;
@@ -46,7 +46,7 @@ fn network(bencher: Bencher<'_, '_>, threads: usize, shape: MlpShape) {
     bencher.counter(ItemsCount::new(flops)).bench_local(|| {
         pool.install(|| {
             mlp.forward_keeping(&p, &x, &mut out, &mut kept);
-            mlp.backward_of(&p, &x, &kept, &d_out, None, &mut d);
+            mlp.backward(&p, Passed::kept(&x, &kept), &d_out, InputGrad::Skip, &mut d);
         });
     });
 }

@@ -1,12 +1,13 @@
 //! The renderer's stages, one by one and together, on 30,000 made-up Gaussians with spherical harmonics of degree 3 at
-//! 400x400, on one and two threads: `cargo bench -p splat4d`. `splat4d bench` measures real scenes against ceilings.
+//! 400x400, on one and two threads: `cargo bench -p splat4d`. `splat4d bench` measures real scenes against the roofline.
 
 use divan::{Bencher, black_box};
 use splat4d::math::{Rng, Se3, sym3};
 use splat4d::render::bin::Footprint;
-use splat4d::render::rasterize::{CHANNELS, Geometry, PixelGrads, Raster};
+use splat4d::render::project::Projection;
+use splat4d::render::rasterize::{CHANNELS, Geometry, Pass, PassGrads, PixelGrads, Raster};
 use splat4d::render::{Image, ImageGrads, Projected, ProjectedGrads, RenderConfig, RenderGrads, Renderer, View};
-use splat4d::render::{ceiling, project, shade};
+use splat4d::render::{project, roofline, shade};
 use splat4d::scene::splats::{Part, SPLAT_COLUMNS};
 use splat4d::scene::{Camera, Color, Planes, Rows, Splats, Table};
 
@@ -104,7 +105,9 @@ impl Stages {
     fn shade(&mut self, made: &Made) {
         let view = View::new(&made.camera, &self.config);
         let (degree, simd) = (self.config.sh_degree, self.config.simd);
-        shade::forward(&made.splats(), &view, degree, simd, &self.projected, &mut self.channels);
+        let splats = made.splats();
+        let projection = Projection { splats: &splats, view: &view, simd, projected: &self.projected };
+        shade::forward(&projection, degree, &mut self.channels);
     }
 
     fn bin(&mut self) {
@@ -112,7 +115,8 @@ impl Stages {
     }
 
     fn blend(&mut self) {
-        self.raster.blend(&self.projected, &self.footprints, &self.channels, &self.config);
+        let Self { config, projected, footprints, channels, raster, .. } = self;
+        raster.blend(&Pass { projected, footprints, channels, background: [0.0; CHANNELS], config });
     }
 }
 
@@ -153,17 +157,10 @@ fn e_blend_backward(bencher: Bencher<'_, '_>, threads: usize) {
     let pixels = PixelGrads { channels, alpha: None };
     bencher.bench_local(|| {
         pool.install(|| {
-            stages.raster.backward(
-                &stages.projected,
-                &stages.footprints,
-                &stages.channels,
-                [0.0; CHANNELS],
-                &pixels,
-                &stages.config,
-                Geometry::Overwrite,
-                &mut d,
-                &mut d_channels,
-            )
+            let Stages { config, projected, footprints, channels, raster, .. } = &mut stages;
+            let pass = Pass { projected, footprints, channels, background: [0.0; CHANNELS], config };
+            let geometry = Geometry::Overwrite;
+            raster.backward(&pass, &pixels, &mut PassGrads { geometry, projected: &mut d, channels: &mut d_channels })
         })
     });
 }
@@ -193,6 +190,6 @@ fn g_forward_and_backward(bencher: Bencher<'_, '_>, threads: usize) {
 
 /// The yardstick itself: one measurement takes some 100 ms.
 #[divan::bench(sample_count = 3, sample_size = 1)]
-fn z_ceiling() -> f64 {
-    black_box(ceiling::blend(RenderConfig::default().simd))
+fn z_roofline() -> f64 {
+    black_box(roofline::blend(RenderConfig::default().simd))
 }

@@ -5,7 +5,7 @@
 //! runs. The scene keeps moving as it was trained; only its nodes are displaced.
 
 use splat4d::format;
-use splat4d::layers::{ALWAYS, Instant, Layer, Scene};
+use splat4d::layers::{ALWAYS, Evaluation, Layer, Scene};
 use splat4d::math::{Rng, Se3};
 use splat4d::motion::arap::{Handle, drag};
 use splat4d::motion::control::{ControlSpec, skinned};
@@ -36,7 +36,7 @@ fn sample() -> splat4d::Result<Scene<f32>> {
 }
 
 fn draw(scene: &Scene<f32>, t: Time, camera: &Camera) -> Vec<u8> {
-    let mut instant = Instant::default();
+    let mut instant = Evaluation::default();
     scene.at(t, &mut instant);
     let mut image = Image::default();
     let mut renderer = Renderer::new(RenderConfig::default());

@@ -4,9 +4,9 @@
 //! milliseconds of every stage, frames a second of the GPU's work alone and from tables in memory to a picture in
 //! memory, and how far the picture is from the CPU's. Works on a driver that computes on the CPU, too.
 
-use splat4d::gpu::{Adapters, Gpu, GpuRenderer, StageClock, Tables};
+use splat4d::gpu::{Adapters, Gpu, GpuRenderer, StageClock};
 use splat4d::math::{Rng, Se3, sym3};
-use splat4d::render::{Image, RenderConfig, Renderer};
+use splat4d::render::{Backend, Image, RenderConfig, Renderer, Shot, Tables};
 use splat4d::scene::splats::{Part, SPLAT_COLUMNS};
 use splat4d::scene::{Camera, Color, Rows, Splats, Table};
 use std::time::Instant;
@@ -40,6 +40,7 @@ fn main() -> splat4d::Result<()> {
     let pose = Se3::look_at([0.0, 0.0, -4.0], [0.0; 3], [0.0, -1.0, 0.0]);
     let camera = Camera::with_fov_y(pose, 0.55, width, height);
 
+    let shot = Shot { depth: true, ..Shot::new(&splats, &camera, [0.0; 3]) };
     let gpu = Gpu::open(Adapters::Any)?;
     println!("{}", gpu.describe());
     let start = Instant::now();
@@ -52,10 +53,10 @@ fn main() -> splat4d::Result<()> {
     for tables in [Tables::Constant, Tables::Changing] {
         renderer.tables = tables;
         // The first one makes room.
-        renderer.render(&splats, &camera, [0.0; 3], &mut image)?;
+        renderer.render(&shot, &mut image)?;
         let mut all: Vec<_> = Vec::new();
         for _ in 0..frames {
-            renderer.render(&splats, &camera, [0.0; 3], &mut image)?;
+            renderer.render(&shot, &mut image)?;
             all.push(renderer.timings());
         }
         let median = |f: &dyn Fn(&splat4d::gpu::GpuTimings) -> f64| {
@@ -92,7 +93,7 @@ fn main() -> splat4d::Result<()> {
     }
     let (mut cpu, mut expected) = (Renderer::new(RenderConfig::default()), Image::default());
     let start = Instant::now();
-    cpu.render(&splats, &camera, [0.0; 3], None, &mut expected);
+    Backend::render(&mut cpu, &shot, &mut expected)?;
     let ms = start.elapsed().as_secs_f64() * 1e3;
     let squares: f64 = image.color.data.iter().zip(&expected.color.data).map(|(a, b)| f64::from(a - b).powi(2)).sum();
     let db = -10.0 * (squares / image.color.data.len() as f64).log10();

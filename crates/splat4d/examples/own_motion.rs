@@ -4,7 +4,7 @@
 //! folder is given, writes the pictures there. Nothing else has to know the model: layers, the renderer, densification
 //! and training only call the trait.
 
-use splat4d::layers::{ALWAYS, Instant, Layer, Scene};
+use splat4d::layers::{ALWAYS, Evaluation, Layer, Scene};
 use splat4d::math::sh::rgb_to_dc;
 use splat4d::math::{Real, Rng, Se3};
 use splat4d::motion::still::{activate, activate_backward};
@@ -145,7 +145,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let pose = Se3::look_at([0.0, 1.0, -4.5], [0.0, 0.5, 0.0], scene.up);
     let camera = Camera::with_fov_y(pose, 0.7, 160, 120);
     let (mut renderer, mut instant, mut image) =
-        (Renderer::new(RenderConfig::default()), Instant::default(), Image::default());
+        (Renderer::new(RenderConfig::default()), Evaluation::default(), Image::default());
     for k in 0..4 {
         let t = 0.25 * f64::from(k);
         scene.at(Time(t), &mut instant);

@@ -6,7 +6,7 @@
 
 use serde_json::Value;
 use splat4d::format::playback::{self, Draft, Meta, NamedCamera, Node, Primitive, Viewpoint, WriteConfig};
-use splat4d::layers::{ALPHA_MIN, ALWAYS, Instant, Layer, Scene};
+use splat4d::layers::{ALPHA_MIN, ALWAYS, Evaluation, Layer, Scene};
 use splat4d::math::{Rng, Se3, quat, sh};
 use splat4d::motion::{Spacetime, SpacetimeSpec, Spec, Still};
 use splat4d::render::{Image, RenderConfig, Renderer};
@@ -259,7 +259,7 @@ fn compare(scene: &Scene<f32>, back: &Scene<f32>, draft: &Draft) {
         let eye = std::array::from_fn(|k| middle[k] + radius * (0.3 * scene.up[k] + 2.0 * flat[k]));
         let camera = Camera::with_fov_y(Se3::look_at(eye, middle, scene.up), 0.8, SIZE[0], SIZE[1]);
         let draw = |scene: &Scene<f32>| {
-            let (mut instant, mut image) = (Instant::default(), Image::default());
+            let (mut instant, mut image) = (Evaluation::default(), Image::default());
             scene.at(t, &mut instant);
             let splats = scene.splats(&instant);
             Renderer::new(RenderConfig::default()).render(&splats, &camera, scene.background, None, &mut image);

@@ -4,7 +4,7 @@
 //! that it has just written to memory, so that it always runs.
 
 use splat4d::format;
-use splat4d::layers::{ALWAYS, Instant, Layer, Scene};
+use splat4d::layers::{ALWAYS, Evaluation, Layer, Scene};
 use splat4d::math::{Rng, Se3};
 use splat4d::motion::Still;
 use splat4d::render::{Image, RenderConfig, Renderer};
@@ -54,7 +54,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let t = Time(args.get(2).map_or(Ok(scene.clip[0]), |s| s.parse())?);
 
     // The motion models answer for this instant; the renderer sees only splats.
-    let mut instant = Instant::default();
+    let mut instant = Evaluation::default();
     scene.at(t, &mut instant);
     let splats = scene.splats(&instant);
     let mean = |k: usize| {

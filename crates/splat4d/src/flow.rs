@@ -11,16 +11,15 @@ pub mod lift;
 mod tests;
 pub mod tracks;
 
-use crate::layers::{Instant, Scene};
+use crate::layers::{Evaluation, Scene};
 use crate::math::Real;
-use crate::motion::Cache;
 use crate::render::{Image, Renderer};
 use crate::scene::{Camera, Planes, Space, Splats, Table, Time};
 
 /// Less alpha than this does not carry a flow: dividing by it would only amplify rounding.
 pub const FLOW_ALPHA_MIN: f64 = 1e-3;
 
-/// An instant of a scene as a camera sees it.
+/// A scene at one time as a camera sees it.
 #[derive(Clone, Copy, Debug)]
 pub struct Shot<'a> {
     /// When.
@@ -43,10 +42,10 @@ pub struct Flow<F = f32> {
 /// dμ/dt of every splat of `scene.at(t, instant)`, in the order of the splats: [splats, 3], scene units a second.
 ///
 /// Panics: `instant` is not this scene's.
-pub fn velocities<F: Real>(scene: &Scene<F>, instant: &Instant<F>) -> Table<F> {
+pub fn velocities<F: Real>(scene: &Scene<F>, instant: &Evaluation<F>) -> Table<F> {
     let mut out = Table::new(&[("velocity", 3)], scene.splats(instant).len());
     let mut first = 0;
-    for (layer, tape) in scene.layers.iter().zip(&instant.tapes) {
+    for (layer, tape) in scene.layers.iter().zip(instant.tapes()) {
         let mut own = Table::default();
         layer.motion.velocity(&tape.question(&layer.params), &mut own);
         for j in 0..own.rows() {
@@ -59,7 +58,7 @@ pub fn velocities<F: Real>(scene: &Scene<F>, instant: &Instant<F>) -> Table<F> {
 
 /// The velocity of what each pixel shows, in scene units a second: [3, h, w] world axes.
 pub fn render_velocity<F: Real>(scene: &Scene<F>, shot: Shot<'_>, renderer: &mut Renderer<F>) -> Flow<F> {
-    let mut instant = Instant::default();
+    let mut instant = Evaluation::default();
     scene.at(shot.t, &mut instant);
     let moving = velocities(scene, &instant);
     let mut extra = Table::new(&[("velocity", 3), ("valid", 1)], moving.rows());
@@ -77,13 +76,13 @@ pub fn render_velocity<F: Real>(scene: &Scene<F>, shot: Shot<'_>, renderer: &mut
 /// Source: "F_simple" of rendered optical flow, Σ w Δμ_2D, as in Gao et al. 2024 (GaussianFlow) §3.2 without its
 /// covariance term.
 pub fn render_flow<F: Real>(scene: &Scene<F>, from: Shot<'_>, to: Shot<'_>, renderer: &mut Renderer<F>) -> Flow<F> {
-    let (mut start, mut end) = (Instant::default(), Instant::default());
+    let (mut start, mut end) = (Evaluation::default(), Evaluation::default());
     scene.at(from.t, &mut start);
     follow(scene, &start, to.t, &mut end);
     let splats = scene.splats(&start);
     let mut extra = Table::new(&[("flow", 2), ("valid", 1)], splats.len());
     let mut j = 0;
-    for (a, b) in start.tapes.iter().zip(&end.tapes) {
+    for (a, b) in start.tapes().zip(end.tapes()) {
         for r in 0..a.out().rows() {
             let [at, then] = [a, b].map(|t| t.out().read::<3>(r, 0).map(F::f64));
             if let (Some((p, _)), Some((q, _))) = (from.camera.project(at), to.camera.project(then)) {
@@ -96,14 +95,12 @@ pub fn render_flow<F: Real>(scene: &Scene<F>, from: Shot<'_>, to: Shot<'_>, rend
 }
 
 /// The same rows as in `of`, at time t.
-fn follow<F: Real>(scene: &Scene<F>, of: &Instant<F>, t: Time, out: &mut Instant<F>) {
-    out.tapes.resize_with(scene.layers.len(), Default::default);
-    for ((layer, from), tape) in scene.layers.iter().zip(&of.tapes).zip(&mut out.tapes) {
-        let mut cache = Cache::default();
-        tape.ask(Space::Gaussians, from.rows(), t);
-        layer.motion.prepare(&layer.params, &[tape.question(&layer.params)], &mut cache);
-        layer.at(&cache, tape);
+fn follow<F: Real>(scene: &Scene<F>, of: &Evaluation<F>, t: Time, out: &mut Evaluation<F>) {
+    out.begin();
+    for (layer, from) in of.tapes().enumerate() {
+        out.ask(layer, Space::Gaussians, from.rows(), t);
     }
+    out.answer(&scene.layers);
 }
 
 /// Blends vectors (all columns but the last) and divides by the blended last column, 1 where there is a vector.

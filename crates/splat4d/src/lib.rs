@@ -5,6 +5,7 @@
 //! This crate reads bytes, not paths; it knows no loss, no optimiser and no data set.
 
 pub mod bake;
+pub mod device;
 pub mod error;
 pub mod flow;
 pub mod format;

@@ -7,8 +7,7 @@
 mod tests;
 
 use crate::format::playback::{Entry, Index, Kind, Meta, Palette, decode_masks, decode_page, decode_palette};
-use crate::layers::{ALWAYS, Layer, LayerTape, Scene};
-use crate::motion::Cache;
+use crate::layers::{ALWAYS, Evaluation, Layer, Scene};
 use crate::scene::masks::WORD;
 use crate::scene::{HeadWeights, KeyMasks, Rows, Space, Splats, Time};
 use crate::{Error, Result};
@@ -112,9 +111,8 @@ struct Held<'a> {
     section: usize,
     layer: Cow<'a, Layer>,
     alive: Alive,
-    tape: LayerTape,
     ids: Vec<u32>,
-    cache: Cache,
+    evaluation: Evaluation,
     bytes: usize,
 }
 
@@ -124,7 +122,7 @@ impl<'a> Held<'a> {
         let numbers: usize = layer.params.keys().map(|k| layer.params[k].data().len()).sum();
         let words = layer.masks.as_ref().map_or(0, |m| m.words().len() + 2 * m.times().len());
         let bytes = 4 * (numbers + words) + 16 * alive.spans.len();
-        Self { section, layer, alive, tape: LayerTape::default(), ids: Vec::new(), cache: Cache::default(), bytes }
+        Self { section, layer, alive, ids: Vec::new(), evaluation: Evaluation::default(), bytes }
     }
 
     /// Looks up who is alive at t; returns how many.
@@ -241,12 +239,11 @@ impl<'a> Player<'a> {
         self.held.par_iter_mut().filter(|h| h.layer.spans_over(t)).for_each(|h| {
             h.look_up(t);
             let rows = if h.alive.all { Rows::All } else { Rows::Some(&h.ids) };
-            h.tape.ask(Space::Gaussians, rows, t);
-            h.cache = Cache::default();
-            h.layer.motion.prepare(&h.layer.params, &[h.tape.question(&h.layer.params)], &mut h.cache);
-            h.layer.at(&h.cache, &mut h.tape);
+            h.evaluation.begin();
+            h.evaluation.ask(0, Space::Gaussians, rows, t);
+            h.evaluation.answer(std::slice::from_ref(h.layer.as_ref()));
         });
-        let parts = self.shown.iter().map(|&i| self.held[i].layer.part(&self.held[i].tape)).collect();
+        let parts = self.shown.iter().map(|&i| self.held[i].layer.part(self.held[i].evaluation.tape(0))).collect();
         Ok(Splats { parts, head: self.head })
     }
 

@@ -19,7 +19,7 @@ pub const SCAN: &str = include_str!("gpu/scan.wgsl");
 pub const COMPACT: &str = include_str!("gpu/compact.wgsl");
 /// (tile, splat) pairs: `count`, `emit`. After [`PROJECT`].
 pub const TILES: &str = include_str!("gpu/tiles.wgsl");
-/// Where each tile's list begins and ends.
+/// Start and end of each tile's list.
 pub const RANGES: &str = include_str!("gpu/ranges.wgsl");
 /// Blends to colour, alpha and depth. After [`PROJECT`].
 pub const RASTERIZE: &str = include_str!("gpu/rasterize.wgsl");

@@ -1,6 +1,6 @@
 //! A moving scene at one moment as plain Gaussians.
 
-use splat4d::layers::{ALWAYS, Instant, Layer, Scene, freeze};
+use splat4d::layers::{ALWAYS, Evaluation, Layer, Scene, freeze};
 use splat4d::math::Rng;
 use splat4d::motion::{SpacetimeSpec, Spec, build};
 use splat4d::render::{Image, RenderConfig, Renderer};
@@ -39,7 +39,7 @@ fn a_frozen_moment_looks_like_the_scene_then() {
     let pose = splat4d::math::Se3::look_at([0.0, 0.0, -4.0], [0.0; 3], [0.0, -1.0, 0.0]);
     let camera = Camera::with_fov_y(pose, 0.9, 48, 40);
     let draw = |scene: &Scene<f32>, time: f64| {
-        let (mut instant, mut image) = (Instant::default(), Image::default());
+        let (mut instant, mut image) = (Evaluation::default(), Image::default());
         scene.at(Time(time), &mut instant);
         let mut renderer = Renderer::new(RenderConfig::default());
         renderer.render(&scene.splats(&instant), &camera, [0.2; 3], None, &mut image);

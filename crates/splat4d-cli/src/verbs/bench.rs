@@ -1,8 +1,8 @@
 //! `bench`: how long every stage takes on pinned scenes, and how far that is from what this machine could do.
 
-mod ceilings;
 mod growth;
 mod playback;
+mod roofline;
 mod rows;
 mod scenes;
 mod stages;
@@ -11,8 +11,8 @@ mod training;
 use crate::console::Console;
 use crate::files;
 use crate::paths::parse_size;
-use ceilings::Ceiling;
 use growth::Axis;
+use roofline::Roofline;
 use rows::Row;
 use scenes::{Name, Pinned, Places};
 use splat4d::render::Simd;
@@ -227,12 +227,12 @@ fn measure(
     console: &Console,
 ) -> anyhow::Result<Vec<Row>> {
     let mut rows = Vec::new();
-    // Without a scene there is nothing to compare the ceilings with.
+    // Without a scene there is nothing to compare the rooflines with.
     for &simd in levels.iter().filter(|_| !scenes.is_empty()) {
         let ways: Vec<Way> = threads.iter().map(|&threads| Way { threads, simd, rounds }).collect();
         let pools = ways.iter().map(|w| pool(w.threads)).collect::<anyhow::Result<Vec<_>>>()?;
-        let ceilings: Vec<Ceiling> = pools.iter().map(|p| Ceiling::measure(p, simd)).collect();
-        for (way, c) in ways.iter().zip(&ceilings) {
+        let rooflines: Vec<Roofline> = pools.iter().map(|p| Roofline::measure(p, simd)).collect();
+        for (way, c) in ways.iter().zip(&rooflines) {
             console.note(&format!(
                 "{}, {} thread(s): at best {:.2} G pairs/s and {:.1} GB/s",
                 stages::simd_name(simd),
@@ -243,12 +243,12 @@ fn measure(
         }
         for pinned in scenes {
             let held = Arc::new(training::Held::of(pinned, ways[0]));
-            for ((way, pool), ceiling) in ways.iter().zip(&pools).zip(&ceilings) {
+            for ((way, pool), roofline) in ways.iter().zip(&pools).zip(&rooflines) {
                 console.note(&format!("scene {}, {} thread(s) ...", pinned.name, way.threads));
                 let large = pinned.scene.len() >= LARGE;
                 let steps = Way { rounds: if large { rounds.min(FEW_ROUNDS) } else { rounds }, ..*way };
-                let mut drawn = pool.install(|| stages::measure(pinned, *way, ceiling))?;
-                let mut trained = pool.install(|| training::measure(pinned, &held, steps, ceiling))?;
+                let mut drawn = pool.install(|| stages::measure(pinned, *way, roofline))?;
+                let mut trained = pool.install(|| training::measure(pinned, &held, steps, roofline))?;
                 fill_in_step(&mut drawn, &mut trained);
                 rows.append(&mut drawn);
                 rows.append(&mut trained);

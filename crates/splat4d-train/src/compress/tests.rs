@@ -67,9 +67,9 @@ fn the_file_is_what_was_shown_at_every_level() {
             assert!(a.params == b.params && a.span == b.span && a.masks == b.masks, "level {name}");
         }
         let seen = |scene: &Scene<f32>| {
-            let mut instant = splat4d::layers::Instant::default();
+            let mut instant = splat4d::layers::Evaluation::default();
             scene.at(Time(scene.clip[0]), &mut instant);
-            instant.tapes.iter().map(|t| t.out().rows()).sum::<usize>()
+            instant.tapes().map(|t| t.out().rows()).sum::<usize>()
         };
         assert!(seen(&file) > 0 && file.len() <= bed.source.len());
         assert_eq!(file.layers.iter().all(|l| l.masks.is_some()), level == Level::Pruned);

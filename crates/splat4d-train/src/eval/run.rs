@@ -21,9 +21,10 @@ use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
 use rayon::prelude::*;
 use serde_json::{Value, json};
+use splat4d::device;
 use splat4d::format::safetensors::SafeTensors;
-use splat4d::layers::{Instant, Scene};
-use splat4d::render::{Antialias, Image, RenderConfig, Renderer};
+use splat4d::layers::{Evaluation, Scene};
+use splat4d::render::{Antialias, Backend, Image, RenderConfig, Shot};
 use splat4d::scene::Planes;
 use std::path::{Path, PathBuf};
 
@@ -60,16 +61,16 @@ impl EvalOptions {
     pub const STILL: &'static str = "still";
 }
 
-/// What an evaluation found.
+/// The scores of a scene on a capture.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Evaluation {
+pub struct Scores {
     /// Scores of the held-out views and of some training views.
     pub report: Report,
     /// Share of the held-out pixels that are dynamic; `None` without fixed held-out cameras.
     pub dynamic_share: Option<f64>,
 }
 
-impl Evaluation {
+impl Scores {
     /// A mean over the held-out views; `None` where it is not defined.
     pub fn held(&self, metric: &str) -> Option<f64> {
         mean(&self.report.test, metric)
@@ -107,9 +108,9 @@ pub fn evaluate(
     iteration: usize,
     options: &EvalOptions,
     listen: &mut dyn FnMut(&Event),
-) -> Result<Evaluation> {
+) -> Result<Scores> {
     let evaluation = assess(scene, capture, store, iteration, options, listen)?;
-    let Evaluation { report, dynamic_share } = &evaluation;
+    let Scores { report, dynamic_share } = &evaluation;
     let (mut results, mut views) = (report.results(), report.per_view());
     let ours = report.method();
     results[&ours]["dynamic-share"] = json!(dynamic_share);
@@ -130,7 +131,7 @@ pub fn assess(
     iteration: usize,
     options: &EvalOptions,
     listen: &mut dyn FnMut(&Event),
-) -> Result<Evaluation> {
+) -> Result<Scores> {
     let lpips = options.lpips_weights.as_deref().map(load_lpips).transpose()?;
     let folder = options.folder.join("test").join(format!("ours_{iteration}"));
     let mut judge = Judge::new(scene, capture, store, lpips, options.antialias);
@@ -140,7 +141,7 @@ pub fn assess(
     let some = spread(&capture.train, options.train_views);
     let train = judge.split(&some, Views::Train, "evaluating training views", listen)?;
     let report = Report { iteration: iteration as u64, test, train: (!some.is_empty()).then_some(train) };
-    Ok(Evaluation { report, dynamic_share })
+    Ok(Scores { report, dynamic_share })
 }
 
 struct Judge<'a> {
@@ -148,8 +149,8 @@ struct Judge<'a> {
     capture: &'a Capture,
     store: &'a ImageStore,
     lpips: Option<Lpips>,
-    renderer: Renderer<f32>,
-    instant: Instant<f32>,
+    backend: Box<dyn Backend>,
+    instant: Evaluation<f32>,
     image: Image<f32>,
     /// Pixels seen and dynamic pixels among them.
     dynamic: [usize; 2],
@@ -165,14 +166,13 @@ impl<'a> Judge<'a> {
     ) -> Self {
         let antialias = if antialias { Antialias::On } else { Antialias::Off };
         let config = RenderConfig { antialias, ..RenderConfig::default() };
-        let renderer = Renderer::new(config);
         Self {
             scene,
             capture,
             store,
             lpips,
-            renderer,
-            instant: Instant::default(),
+            backend: device::cpu(config),
+            instant: Evaluation::default(),
             image: Image::default(),
             dynamic: [0; 2],
         }
@@ -244,7 +244,7 @@ impl<'a> Judge<'a> {
         stored.color_into(&mut truth);
         self.scene.at(info.time, &mut self.instant);
         let splats = self.scene.splats(&self.instant);
-        self.renderer.render(&splats, &info.view, self.scene.background, None, &mut self.image);
+        self.backend.render(&Shot::new(&splats, &info.view, self.scene.background), &mut self.image)?;
         let mut render = self.image.color.clone();
         hide_unknown(&stored, &mut render, &truth);
         let foreground = foreground(&stored);

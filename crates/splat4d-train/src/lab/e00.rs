@@ -4,7 +4,7 @@
 
 use crate::optim::Moments;
 use splat4d::math::Rng;
-use splat4d::nn::mlp::{Mlp, MlpShape};
+use splat4d::nn::mlp::{InputGrad, Mlp, MlpShape, Passed};
 use splat4d::scene::{Grads, Params};
 
 /// What the experiment varies.
@@ -211,7 +211,7 @@ fn learn(start: &[[f64; 2]], observed: &[Path], s: &Settings) -> (Vec<Path>, usi
                 }
             }
         }
-        mlp.backward(&p, &x, &d_out, None, &mut d);
+        mlp.backward(&p, Passed::of(&x), &d_out, InputGrad::Skip, &mut d);
         let share = 0.5 * (1.0 + (std::f64::consts::PI * step as f64 / s.steps as f64).cos());
         let rate = RATES[1] + (RATES[0] - RATES[1]) * share;
         keys.iter().for_each(|k| rates[k.0 as usize] = Some(vec![rate]));

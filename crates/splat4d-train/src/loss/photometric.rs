@@ -1,6 +1,8 @@
 //! The picture loss of 3DGS, (1 − λ)·L1 + λ·(1 − SSIM), and its gradient, in one pass over the image.
 
+use super::image::{ImageTerm, PictureGrads, Shown, View};
 use super::kernel::{self, Scratch, Strip};
+use super::terms::StepInfo;
 use rayon::prelude::*;
 use splat4d::math::Real;
 use splat4d::scene::Planes;
@@ -37,6 +39,8 @@ pub struct Photometric<F = f32> {
     scratch: Vec<Mutex<Scratch<F>>>,
     /// [channels, strips] sums, added up in order.
     sums: Vec<[f64; 3]>,
+    /// Of the last view.
+    measured: LossValue,
 }
 
 impl<F: Real> Photometric<F> {
@@ -47,7 +51,14 @@ impl<F: Real> Photometric<F> {
 
     /// A loss with this λ at a given instruction set.
     pub fn with_simd(lambda_dssim: f32, simd: Simd) -> Self {
-        Self { lambda_dssim, simd, taps: kernel::window(), scratch: Vec::new(), sums: Vec::new() }
+        Self {
+            lambda_dssim,
+            simd,
+            taps: kernel::window(),
+            scratch: Vec::new(),
+            sums: Vec::new(),
+            measured: LossValue::default(),
+        }
     }
 
     /// (1 − λ)·L1 + λ·(1 − SSIM), and its gradient to `render`, which overwrites `d_render`.
@@ -122,6 +133,25 @@ impl<F: Real> Photometric<F> {
         }
         let [l1, ssim, mse] = total.map(|x| x / total_weight);
         LossValue { total: (1.0 - lambda) * l1 + lambda * (1.0 - ssim), l1, ssim, mse }
+    }
+}
+
+impl<F: Real> ImageTerm<F> for Photometric<F> {
+    fn eval(&mut self, _: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64 {
+        self.measured = match d.color.overwrite() {
+            Some(d_color) => self.loss_and_grad(shown.color, view.truth, view.weight, d_color),
+            None => {
+                let mut own = Planes::default();
+                let measured = self.loss_and_grad(shown.color, view.truth, view.weight, &mut own);
+                d.color.add().data.iter_mut().zip(&own.data).for_each(|(d, x)| *d += *x);
+                measured
+            }
+        };
+        self.measured.total
+    }
+
+    fn measured(&self) -> Option<LossValue> {
+        Some(self.measured)
     }
 }
 

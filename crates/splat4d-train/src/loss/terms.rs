@@ -92,13 +92,3 @@ pub trait Codec<F: Real>: Send + Sync {
         Ok(())
     }
 }
-
-/// A column of Gaussians that is drawn as masks show the foreground: its sigmoid, blended, against the mask with the same
-/// functional as colours (Luiten et al. 2024, "seg").
-#[derive(Clone, Debug, PartialEq)]
-pub struct Segmentation {
-    /// The column group, of one logit.
-    pub column: String,
-    /// Its weight beside the colours'.
-    pub weight: f64,
-}

@@ -16,7 +16,7 @@ mod tests;
 pub mod tracked;
 
 use crate::event::Progress;
-pub use crate::loss::terms::Segmentation;
+use crate::loss::image::ImageTerm;
 use crate::loss::terms::{Codec, ParamLoss, ProbeLoss};
 use crate::optim::Noise;
 use crate::recipe::{FULL, Recipe};
@@ -169,8 +169,8 @@ pub struct Stage {
     pub min_log_life: Option<f64>,
     /// Noise on the times of the step's views.
     pub time_noise: TimeNoise,
-    /// What masks are compared with, beside the pictures; none: nothing.
-    pub segmentation: Option<Segmentation>,
+    /// Losses on pictures, after the run's own.
+    pub pictures: Vec<Box<dyn ImageTerm>>,
     /// Whether the cameras' exposures stay as they are.
     pub freeze_exposure: bool,
     /// What stands between the parameters and the pictures; none: nothing.
@@ -199,7 +199,7 @@ impl Stage {
             half_size_steps: 0,
             min_log_life: None,
             time_noise: TimeNoise::default(),
-            segmentation: None,
+            pictures: Vec::new(),
             freeze_exposure: false,
             codec: None,
             start: None,

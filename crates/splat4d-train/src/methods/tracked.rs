@@ -4,8 +4,10 @@
 //! Source: Luiten et al. 2024 (Dynamic 3D Gaussians). Ours: who is foreground is learnt from frame 0's masks and not given;
 //! lengths are in shares of the rig, so that the weights hold in any unit; the neighbours' weights do not know the unit.
 
-use super::{Group, Hook, Plan, Program, Rate, Segmentation, Stage, still};
+use super::{Group, Hook, Plan, Program, Rate, Stage, still};
 use crate::loss::graph::{LEAST_MEAN_WEIGHT, Weigh};
+use crate::loss::image::ImageTerm;
+use crate::loss::image::segmentation::Segmentation;
 use crate::loss::tracked::{Ties, Tracking, Weights};
 use crate::recipe::Recipe;
 use crate::sampler::Sampler;
@@ -83,7 +85,7 @@ impl Program for TrackedProgram {
                 batch: r.batch_size,
                 groups,
                 params: vec![Box::new(tracking.frame(k))],
-                segmentation: segmentation(plan, 1.0),
+                pictures: segmentation(plan, 1.0),
                 freeze_exposure: true,
                 start: Some(next_frame(plan, k, &tracking)),
                 ..Stage::new(&format!("frame {k}"), steps)
@@ -111,8 +113,10 @@ fn segments(plan: &Plan) -> bool {
 }
 
 /// Masks against the foreground logit, at a share of the recipe's weight.
-fn segmentation(plan: &Plan, share: f64) -> Option<Segmentation> {
-    segments(plan).then(|| Segmentation { column: FOREGROUND.into(), weight: share * plan.recipe.seg })
+fn segmentation(plan: &Plan, share: f64) -> Vec<Box<dyn ImageTerm>> {
+    let r = &plan.recipe;
+    let term = || -> Box<dyn ImageTerm> { Box::new(Segmentation::new(FOREGROUND, share * r.seg, r.lambda_dssim)) };
+    segments(plan).then(term).into_iter().collect()
 }
 
 /// Steps of frame 0.
@@ -169,7 +173,7 @@ fn first_stage(plan: &Plan, steps: usize) -> Stage {
     still::learn_life(&mut stage, &plan, TrackedProgram.life(&plan));
     if segments(&plan) {
         stage.groups.push(Group::new(FOREGROUND, plan.recipe.falling(plan.recipe.opacity_lr)));
-        stage.segmentation = segmentation(&plan, FIRST_MASKS);
+        stage.pictures = segmentation(&plan, FIRST_MASKS);
     }
     stage
 }

@@ -1,141 +1,221 @@
-//! What is drawn beside colours so that losses can look at it: normals of splats and their way to another instant.
+//! Further channels of the splats of a view, so that losses can look at them: normals, the way to another time, a column of
+//! the Gaussians. Each has its forward and its VJP here.
 
-use crate::capture::frames::FlowTruth;
+use crate::loss::image::{Channel, View};
 use rayon::prelude::*;
+use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::Real;
 use splat4d::scene::splats::COV;
-use splat4d::scene::{Camera, Table};
-
-/// What a loss wants of a view beside colour and alpha.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Wanted {
-    /// Σ z α T.
-    pub depth: bool,
-    /// Σ α T n, n the shortest axis of a splat towards the camera, camera axes.
-    pub normals: bool,
-    /// Where the view knows its flow: Σ α T f, f the way of a splat's centre on the screen, pixels, and Σ α T.
-    pub flow: bool,
-}
+use splat4d::scene::{Camera, Grads, Key, Params, Rows, Space, Table};
 
 /// The least gap between the two smallest variances, as a share of the largest, at which the shortest axis is one.
 const LEAST_GAP: f64 = 1e-3;
 /// Splats in a task.
 const CHUNK: usize = 512;
 
-/// A splat's later place, if it was asked for: a table [rows, 10] and a row of it a splat; `u32::MAX`: none.
-pub(super) struct Later<'a, F> {
-    pub(super) out: &'a Table<F>,
-    pub(super) rows: &'a [u32],
+/// What channels are made of.
+#[derive(Clone, Copy)]
+pub(super) struct Source<'a, F: Real> {
+    pub(super) scene: &'a Scene<F>,
+    pub(super) view: &'a View<'a, F>,
+    /// By layer: the question that the view's splats answer.
+    pub(super) asked: &'a [usize],
+}
+
+/// The answers in which a layer's splats are at another time.
+struct Later {
+    question: usize,
+    /// A row a splat of the view; `None`: it was not asked for.
+    rows: Vec<Option<usize>>,
 }
 
 /// Further channels of the splats of one view.
 pub(super) struct Channels<F> {
     /// [all splats, C]
     pub(super) table: Table<F>,
-    normals: bool,
-    flow: bool,
-    /// Whether the last column is a share that was given.
-    share: bool,
+    /// What was drawn, each with its first column.
+    pub(super) places: Vec<(Channel, usize)>,
+    /// By layer, where the view's flow goes; empty: it is not drawn.
+    later: Vec<Later>,
 }
 
 impl<F: Real> Channels<F> {
-    /// Of the splats `parts` (a [rows, 10] table a layer). `share`: a number a splat that is blended as it is. `None`:
-    /// nothing is wanted.
-    pub(super) fn new(
-        wanted: Wanted,
-        camera: &Camera,
-        parts: &[&Table<F>],
-        flow: Option<(&FlowTruth<'_, F>, &[Later<'_, F>])>,
-        share: Option<&[F]>,
-    ) -> Option<Self> {
-        let flow = flow.filter(|_| wanted.flow);
-        let mut columns: Vec<(&'static str, usize)> = Vec::new();
-        columns.extend(wanted.normals.then_some(("normal", 3)));
-        columns.extend(flow.is_some().then_some(("flow", 3)));
-        columns.extend(share.is_some().then_some(("share", 1)));
-        if columns.is_empty() {
+    /// Of the splats that `evaluation` has of a view. `None`: there is nothing to draw.
+    pub(super) fn new(wanted: &[Channel], source: Source<'_, F>, evaluation: &Evaluation<F>) -> Option<Self> {
+        let drawn = wanted.iter().filter(|c| match c {
+            Channel::Sigmoid(column) => source.scene.layers.iter().any(|l| logit_of(&l.params, column).is_some()),
+            Channel::Normals | Channel::Flow => true,
+        });
+        let mut width = 0;
+        let place = |channel: &Channel| {
+            width += channel.width();
+            (channel.clone(), width - channel.width())
+        };
+        let places: Vec<(Channel, usize)> = drawn.map(place).collect();
+        if places.is_empty() {
             return None;
         }
-        let count = parts.iter().map(|p| p.rows()).sum();
-        let mut table = Table::new(&columns, count);
-        if let Some(share) = share {
-            let column = table.width() - 1;
-            share.iter().enumerate().for_each(|(j, s)| table.set(j, column, *s));
-        }
-        let mut first = 0;
-        for (layer, part) in parts.iter().enumerate() {
-            if wanted.normals {
-                let normals = each(part.rows(), |r| normal(camera, part.read(r, 0), part.read(r, COV)));
-                normals.iter().enumerate().for_each(|(r, n)| table.write(first + r, 0, *n));
+        let count = source.asked.iter().map(|&i| evaluation.tape(i).out().rows()).sum();
+        let mut out = Self { table: Table::new(&[("extra", width)], count), places, later: Vec::new() };
+        for (channel, column) in out.places.clone() {
+            match &channel {
+                Channel::Normals => out.normals(column, source, evaluation),
+                Channel::Flow => out.flow(column, source, evaluation),
+                Channel::Sigmoid(name) => out.sigmoid(column, name, source, evaluation),
             }
-            if let Some((truth, later)) = flow {
-                let column = if wanted.normals { 3 } else { 0 };
-                let way = |r: usize| {
-                    let then = later[layer].rows[r];
-                    let ends =
-                        (then != u32::MAX).then(|| [part.read::<3>(r, 0), later[layer].out.read(then as usize, 0)]);
-                    let [from, to] = ends?.map(|x| x.map(F::f64));
-                    let (p, q) = (camera.project(from)?.0, truth.camera.project(to)?.0);
-                    Some([F::of(q[0] - p[0]), F::of(q[1] - p[1]), F::ONE])
-                };
-                let ways = each(part.rows(), way);
-                ways.iter().enumerate().for_each(|(r, w)| table.write(first + r, column, w.unwrap_or([F::ZERO; 3])));
-            }
-            first += part.rows();
         }
-        Some(Self { table, normals: wanted.normals, flow: flow.is_some(), share: share.is_some() })
+        Some(out)
     }
 
-    /// First channel of the normals.
-    pub(super) fn normals(&self) -> Option<usize> {
-        self.normals.then_some(0)
-    }
-
-    /// First channel of the flow.
-    pub(super) fn flow(&self) -> Option<usize> {
-        self.flow.then_some(if self.normals { 3 } else { 0 })
-    }
-
-    /// The channel of the share.
-    pub(super) fn share(&self) -> Option<usize> {
-        self.share.then(|| self.table.width() - 1)
-    }
-
-    /// From the gradient of the table to those of the splats of layer `layer`, whose first row is `first`: added to `d_out`,
-    /// and for the flow to `d_later`, a row of the later place's table each.
+    /// From the gradient of the table to those of the answers, and of the layers' columns.
     pub(super) fn backward(
         &self,
-        camera: &Camera,
-        out: &Table<F>,
-        first: usize,
         d_table: &Table<F>,
-        d_out: &mut Table<F>,
-        flow: Option<(&FlowTruth<'_, F>, &Later<'_, F>, &mut Table<F>)>,
+        source: Source<'_, F>,
+        evaluation: &mut Evaluation<F>,
+        d: &mut [Grads<F>],
     ) {
-        if self.normals {
-            let back = |r: usize| {
-                let d: [F; 3] = d_table.read(first + r, 0);
-                (d != [F::ZERO; 3]).then(|| normal_backward(camera, out.read(r, 0), out.read(r, COV), d))
-            };
-            for (r, d) in each(out.rows(), back).into_iter().enumerate() {
-                if let Some(d) = d {
-                    d_out.add(r, COV, d);
-                }
+        for (channel, column) in &self.places {
+            match channel {
+                Channel::Normals => normals_backward((d_table, *column), source, evaluation),
+                Channel::Flow => self.flow_backward((d_table, *column), source, evaluation),
+                Channel::Sigmoid(name) => self.sigmoid_backward((d_table, *column), name, source, evaluation, d),
             }
-        }
-        let (Some(column), Some((truth, later, d_later))) = (self.flow(), flow) else { return };
-        for (r, &then) in later.rows.iter().enumerate() {
-            let d: [F; 2] = d_table.read(first + r, column);
-            if then == u32::MAX || self.table.get(first + r, column + 2) == F::ZERO || d == [F::ZERO; 2] {
-                continue;
-            }
-            let d = d.map(F::f64);
-            let from = project_backward(camera, out.read::<3>(r, 0).map(F::f64), d);
-            let to = project_backward(truth.camera, later.out.read::<3>(then as usize, 0).map(F::f64), d);
-            d_out.add(r, 0, from.map(|x| F::of(-x)));
-            d_later.add(then as usize, 0, to.map(F::of));
         }
     }
+
+    fn normals(&mut self, column: usize, source: Source<'_, F>, evaluation: &Evaluation<F>) {
+        let mut first = 0;
+        for &i in source.asked {
+            let out = evaluation.tape(i).out();
+            let normals = each(out.rows(), |r| normal(source.view.camera, out.read(r, 0), out.read(r, COV)));
+            normals.iter().enumerate().for_each(|(r, n)| self.table.write(first + r, column, *n));
+            first += out.rows();
+        }
+    }
+
+    fn flow(&mut self, column: usize, source: Source<'_, F>, evaluation: &Evaluation<F>) {
+        let truth = source.view.flow.as_ref().expect("only views that know their flow ask for it");
+        let mut first = 0;
+        for (layer, &i) in source.asked.iter().enumerate() {
+            let now = evaluation.tape(i);
+            let question = evaluation.find(layer, Space::Gaussians, truth.to).expect("a flow's time was asked");
+            let then = evaluation.tape(question);
+            let row = |id: usize| match then.rows() {
+                Rows::All => Some(id),
+                Rows::Some(ids) => ids.binary_search(&(id as u32)).ok(),
+            };
+            let rows: Vec<Option<usize>> = (0..now.out().rows()).map(|j| row(now.rows().id(j))).collect();
+            let way = |r: usize| {
+                let [from, to] =
+                    [now.out().read::<3>(r, 0), then.out().read(rows[r]?, 0)].map(|x: [F; 3]| x.map(F::f64));
+                let (p, q) = (source.view.camera.project(from)?.0, truth.camera.project(to)?.0);
+                Some([F::of(q[0] - p[0]), F::of(q[1] - p[1]), F::ONE])
+            };
+            let ways = each(rows.len(), way);
+            let values = ways.iter().map(|w| w.unwrap_or([F::ZERO; 3]));
+            values.enumerate().for_each(|(r, w)| self.table.write(first + r, column, w));
+            first += rows.len();
+            self.later.push(Later { question, rows });
+        }
+    }
+
+    fn flow_backward(
+        &self,
+        (d_table, column): (&Table<F>, usize),
+        source: Source<'_, F>,
+        evaluation: &mut Evaluation<F>,
+    ) {
+        let truth = source.view.flow.as_ref().expect("only views that know their flow ask for it");
+        let mut first = 0;
+        for (&i, later) in source.asked.iter().zip(&self.later) {
+            // Where the flow goes nowhere in time, it tells the splats nothing.
+            if later.question != i {
+                let (now, then) = (evaluation.tape(i).out(), evaluation.tape(later.question).out());
+                let back = |r: usize| {
+                    let (to, d): (usize, [F; 2]) = (later.rows[r]?, d_table.read(first + r, column));
+                    if self.table.get(first + r, column + 2) == F::ZERO || d == [F::ZERO; 2] {
+                        return None;
+                    }
+                    let d = d.map(F::f64);
+                    let d_now = project_backward(source.view.camera, now.read::<3>(r, 0).map(F::f64), d);
+                    let d_then = project_backward(truth.camera, then.read::<3>(to, 0).map(F::f64), d);
+                    Some((d_now.map(|x| F::of(-x)), d_then.map(F::of)))
+                };
+                let ways = each(later.rows.len(), back);
+                let ends = || ways.iter().enumerate().filter_map(|(r, ends)| Some((r, ends.as_ref()?)));
+                let d_now = evaluation.d_out(i);
+                ends().for_each(|(r, (d, _))| d_now.add(r, 0, *d));
+                let d_then = evaluation.d_out(later.question);
+                ends().for_each(|(r, (_, d))| d_then.add(later.rows[r].expect("it has an end"), 0, *d));
+            }
+            first += later.rows.len();
+        }
+    }
+
+    fn sigmoid(&mut self, column: usize, name: &str, source: Source<'_, F>, evaluation: &Evaluation<F>) {
+        let mut first = 0;
+        for (layer, &i) in source.scene.layers.iter().zip(source.asked) {
+            let tape = evaluation.tape(i);
+            if let Some((key, from)) = logit_of(&layer.params, name) {
+                for j in 0..tape.out().rows() {
+                    let logit = layer.params[key].get(tape.rows().id(j), from);
+                    self.table.set(first + j, column, logit.sigmoid());
+                }
+            }
+            first += tape.out().rows();
+        }
+    }
+
+    fn sigmoid_backward(
+        &self,
+        (d_table, column): (&Table<F>, usize),
+        name: &str,
+        source: Source<'_, F>,
+        evaluation: &Evaluation<F>,
+        d: &mut [Grads<F>],
+    ) {
+        let mut first = 0;
+        for ((layer, &i), d) in source.scene.layers.iter().zip(source.asked).zip(d) {
+            let tape = evaluation.tape(i);
+            if let Some((key, to)) = logit_of(&layer.params, name) {
+                let [d] = d.of([key]);
+                for j in 0..tape.out().rows() {
+                    let s = self.table.get(first + j, column);
+                    *d.get_mut(tape.rows().id(j), to) += d_table.get(first + j, column) * s * (F::ONE - s);
+                }
+            }
+            first += tape.out().rows();
+        }
+    }
+}
+
+fn normals_backward<F: Real>(
+    (d_table, column): (&Table<F>, usize),
+    source: Source<'_, F>,
+    evaluation: &mut Evaluation<F>,
+) {
+    let mut first = 0;
+    for &i in source.asked {
+        let out = evaluation.tape(i).out();
+        let back = |r: usize| {
+            let d: [F; 3] = d_table.read(first + r, column);
+            (d != [F::ZERO; 3]).then(|| normal_backward(source.view.camera, out.read(r, 0), out.read(r, COV), d))
+        };
+        let grads = each(out.rows(), back);
+        first += grads.len();
+        let d_out = evaluation.d_out(i);
+        for (r, d) in grads.into_iter().enumerate() {
+            if let Some(d) = d {
+                d_out.add(r, COV, d);
+            }
+        }
+    }
+}
+
+/// The table and column of a layer's logit of that name.
+fn logit_of<F: Real>(params: &Params<F>, column: &str) -> Option<(Key, usize)> {
+    params.keys().find_map(|k| params[k].column(column).map(|(first, _)| (k, first)))
 }
 
 fn each<T: Send>(rows: usize, f: impl Fn(usize) -> T + Send + Sync) -> Vec<T> {

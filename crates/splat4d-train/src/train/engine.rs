@@ -1,15 +1,16 @@
 //! [`Engine`]: takes steps on a learner. The processor's is [`CpuEngine`]; one whose tables stay on a device can stand in its
 //! place, since a plan says all that a step is of, and a learner says what happened to it between steps.
 
-use super::chain::{Chain, Draw, Losses, StepInfo, StepReport, View};
+use super::chain::{Chain, Losses, Step, StepInfo, StepReport, View};
 use super::loss::TrainLoss;
+use crate::Result;
 use crate::learner::Learner;
 use crate::methods::Stage;
 use crate::optim::Floor;
 use crate::upkeep::Change;
 use splat4d::layers::Scene;
 use splat4d::math::Rng;
-use splat4d::render::Antialias;
+use splat4d::render::{Antialias, Backend};
 use splat4d::scene::life::LOG_WIDTH;
 use splat4d::scene::{Grads, Key, LIFE, SH};
 use std::time::{Duration, Instant as Clock};
@@ -17,7 +18,7 @@ use std::time::{Duration, Instant as Clock};
 /// All that one step is of.
 pub struct StepPlan<'a> {
     /// What learns, how fast, by which losses.
-    pub stage: &'a Stage,
+    pub stage: &'a mut Stage,
     /// Compares pictures.
     pub loss: &'a mut TrainLoss,
     /// Pictures and their truth.
@@ -63,20 +64,20 @@ pub struct Fault(pub String);
 
 /// Takes steps on a learner.
 pub trait Engine: Send {
-    /// One step: evaluate, draw, compare, back, Adam, noise. Error: a number was not finite, and nothing of the learner is to
-    /// be trusted any more.
-    fn step(&mut self, learner: &mut Learner, plan: &mut StepPlan<'_>) -> Result<Stepped, Fault>;
+    /// One step: evaluate, draw, compare, back, Adam, noise. Inner error: a number was not finite, and nothing of the learner
+    /// is to be trusted any more. Errors: those of what draws.
+    fn step(&mut self, learner: &mut Learner, plan: &mut StepPlan<'_>) -> Result<Result<Stepped, Fault>>;
 
     /// The learner was changed in other ways than by a step, or another stage begins: what is remembered of it is stale.
     fn changed(&mut self, learner: &Learner);
 
     /// As it draws.
-    fn antialias(&mut self) -> Antialias;
+    fn antialias(&self) -> Antialias;
 }
 
 /// Steps on the processor, with whatever draws.
 pub struct CpuEngine<'a> {
-    draw: Box<dyn Draw<f32> + 'a>,
+    backend: Box<dyn Backend<f32> + 'a>,
     chain: Chain<f32>,
     grads: Vec<Grads<f32>>,
     /// Scratch: a rate a column, by layer and table.
@@ -88,10 +89,10 @@ pub struct CpuEngine<'a> {
 }
 
 impl<'a> CpuEngine<'a> {
-    /// An engine that draws with `draw`.
-    pub fn new(draw: Box<dyn Draw<f32> + 'a>) -> Self {
+    /// An engine that draws with `backend`.
+    pub fn new(backend: Box<dyn Backend<f32> + 'a>) -> Self {
         Self {
-            draw,
+            backend,
             chain: Chain::default(),
             grads: Vec::new(),
             rates: Vec::new(),
@@ -111,24 +112,22 @@ impl<'a> CpuEngine<'a> {
     }
 
     /// Evaluate, draw, compare, and all the way back: fills the gradients.
-    fn evaluate(&mut self, learner: &mut Learner, plan: &mut StepPlan<'_>, out: &mut Stepped) {
+    fn evaluate(&mut self, learner: &mut Learner, plan: &mut StepPlan<'_>, out: &mut Stepped) -> Result<()> {
         let (scene, _, stats) = learner.parts_mut();
         let scene = if plan.stage.codec.is_some() { &self.shown } else { &*scene };
-        self.draw.config().sh_degree = plan.sh_degree;
-        plan.loss.progress = plan.info.progress;
-        plan.loss.segmentation = plan.stage.segmentation.clone();
-        let mut mse = Mse { inner: plan.loss, sum: 0.0 };
-        let mut losses = Losses { image: &mut mse, probes: &plan.stage.probes, params: &plan.stage.params };
-        let observe = &mut |o: crate::learner::Observation<'_, f32>| stats.observe(o);
-        let draw = self.draw.as_mut();
-        out.report = self.chain.step(scene, plan.views, plan.info, draw, &mut losses, &mut self.grads, observe);
-        out.mse = mse.sum / plan.views.len().max(1) as f64;
-        (out.l1, out.ssim) = (plan.loss.l1, plan.loss.ssim);
+        let Stage { pictures, probes, params, .. } = &mut *plan.stage;
+        let mut image = plan.loss.of_step(pictures);
+        let mut losses = Losses { image: &mut image, probes, params };
+        let step = Step { scene, views: plan.views, info: plan.info, sh_degree: plan.sh_degree };
+        let (backend, grads) = (self.backend.as_mut(), &mut self.grads);
+        out.report = self.chain.step(&step, backend, &mut losses, grads, &mut |o| stats.observe(o))?;
+        (out.l1, out.ssim, out.mse) = (plan.loss.l1, plan.loss.ssim, plan.loss.mse());
+        Ok(())
     }
 
     /// Adam on every group of the stage. Returns what was not finite.
     fn adam(&mut self, learner: &mut Learner, plan: &mut StepPlan<'_>) -> Vec<(usize, Key)> {
-        let (stage, scale, progress) = (plan.stage, plan.rate_scale, plan.info.progress);
+        let (stage, scale, progress) = (&*plan.stage, plan.rate_scale, plan.info.progress);
         let mut bad = Vec::new();
         if let Some(codec) = &stage.codec
             && !codec.learn(&mut self.grads, progress, scale)
@@ -192,23 +191,25 @@ impl<'a> CpuEngine<'a> {
 }
 
 impl Engine for CpuEngine<'_> {
-    fn step(&mut self, learner: &mut Learner, plan: &mut StepPlan<'_>) -> Result<Stepped, Fault> {
+    fn step(&mut self, learner: &mut Learner, plan: &mut StepPlan<'_>) -> Result<Result<Stepped, Fault>> {
         let mut out = Stepped::default();
         let clock = Clock::now();
         self.show(learner.scene(), plan);
         out.other = clock.elapsed();
-        self.evaluate(learner, plan, &mut out);
+        self.evaluate(learner, plan, &mut out)?;
         let clock = Clock::now();
         let bad = self.adam(learner, plan);
         out.adam = clock.elapsed();
-        self.sound(learner.scene(), &out.report, &bad)?;
+        if let Err(fault) = self.sound(learner.scene(), &out.report, &bad) {
+            return Ok(Err(fault));
+        }
         let clock = Clock::now();
         self.shake(learner, plan);
         for (d, layer) in self.grads.iter_mut().zip(&learner.scene().layers) {
             d.clear(&layer.params);
         }
         out.other += clock.elapsed();
-        Ok(out)
+        Ok(Ok(out))
     }
 
     fn changed(&mut self, learner: &Learner) {
@@ -216,34 +217,7 @@ impl Engine for CpuEngine<'_> {
         self.grads = learner.scene().layers.iter().map(|l| Grads::new(&l.params)).collect();
     }
 
-    fn antialias(&mut self) -> Antialias {
-        self.draw.config().antialias
-    }
-}
-
-/// Passes a loss through and sums the mean squared errors of the step's views.
-struct Mse<'a> {
-    inner: &'a mut TrainLoss,
-    sum: f64,
-}
-
-impl super::chain::ImageLoss<f32> for Mse<'_> {
-    fn wanted(&self) -> super::chain::Wanted {
-        self.inner.wanted()
-    }
-
-    fn share(&self) -> Option<&str> {
-        self.inner.share()
-    }
-
-    fn eval(
-        &mut self,
-        view: &View<'_, f32>,
-        image: &splat4d::render::Image<f32>,
-        d: &mut super::chain::PictureGrads<f32>,
-    ) -> f64 {
-        let out = self.inner.eval(view, image, d);
-        self.sum += self.inner.mse;
-        out
+    fn antialias(&self) -> Antialias {
+        self.backend.config().antialias
     }
 }

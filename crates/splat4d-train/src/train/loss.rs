@@ -1,12 +1,9 @@
-//! The trainer's image loss: photometric, mask, and a gain and offset a camera where exposures differ.
+//! The trainer's picture loss: a list of terms, on pictures as their cameras expose them.
 
-use super::chain::{ImageLoss, PictureGrads, View, Wanted};
-use crate::loss::image::frequency::Frequency;
-use crate::loss::image::{ImageTerms, entropy, flow, normal, tv};
+use crate::loss::image::{ImageTerm, Needs, PictureGrads, Shown, View};
 use crate::loss::photometric::Photometric;
-pub use crate::loss::terms::Segmentation;
+use crate::loss::terms::StepInfo;
 use crate::optim::Moments;
-use splat4d::render::Image;
 use splat4d::scene::{Grads, Key, Params, Planes, Space};
 
 /// A gain exp(m) and an offset c a camera and channel: columns m 3, c 3. The cameras' mean is held at the identity, so that
@@ -43,6 +40,33 @@ impl Exposure {
         self.grads.clear(&self.params);
     }
 
+    /// Applies the gain and offset of camera `rig` to `color`.
+    fn respond(&self, rig: usize, color: &mut Planes<f32>) {
+        let row = self.params[self.key].read::<6>(rig, 0);
+        for c in 0..3 {
+            let gain = row[c].exp();
+            color.plane_mut(c).iter_mut().for_each(|x| *x = *x * gain + row[3 + c]);
+        }
+    }
+
+    /// The VJP of [`respond`](Self::respond) at what was drawn: turns the gradient to the exposed colours into that to the
+    /// drawn ones, and adds to the camera's.
+    fn respond_backward(&mut self, rig: usize, drawn: &Planes<f32>, d_color: &mut Planes<f32>) {
+        let row = self.params[self.key].read::<6>(rig, 0);
+        let mut d_row = [0.0f32; 6];
+        for c in 0..3 {
+            let gain = row[c].exp();
+            let (mut d_gain, mut d_offset) = (0.0f64, 0.0f64);
+            for (g, x) in d_color.plane_mut(c).iter_mut().zip(drawn.plane(c)) {
+                d_offset += f64::from(*g);
+                d_gain += f64::from(*g * x * gain);
+                *g *= gain;
+            }
+            (d_row[c], d_row[3 + c]) = (d_gain as f32, d_offset as f32);
+        }
+        self.grads.of([self.key])[0].add(rig, 0, d_row);
+    }
+
     /// One Adam step with what the last views gave. Returns whether all was finite.
     pub fn step(&mut self, rate: f64) -> bool {
         let mut rates = vec![None; self.key.0 as usize];
@@ -59,172 +83,208 @@ impl Exposure {
     }
 }
 
-/// See the module's documentation.
+/// What pictures are compared by: terms, in the order in which their values and gradients are summed. The exposure of the
+/// view's camera lies between the drawn picture and all of them.
 pub struct TrainLoss {
-    photometric: Photometric,
-    /// Has scratch of its own, for one plane.
-    masks: Photometric,
-    lambda_mask: f32,
+    terms: Vec<Box<dyn ImageTerm>>,
     /// Where cameras learn an exposure.
     pub exposure: Option<Exposure>,
     exposed: Planes<f32>,
-    /// Where masks are compared with what Gaussians say of the foreground.
-    pub segmentation: Option<Segmentation>,
-    /// Further terms.
-    pub terms: ImageTerms,
-    /// Share of the stage that is done, in [0, 1).
-    pub progress: f64,
-    frequency: Frequency<f32>,
     /// L1 of the last view.
     pub l1: f64,
     /// SSIM of the last view.
     pub ssim: f64,
-    /// Mean squared error of the last view, in [0, 1] colours, over the pixels that count.
-    pub mse: f64,
+    /// Sum over the step's views of the mean squared error, in [0, 1] colours, over the pixels that count.
+    squares: f64,
+    views: usize,
 }
 
 impl TrainLoss {
-    /// Shares of D-SSIM and of the mask loss.
-    pub fn new(lambda_dssim: f64, lambda_mask: f64, exposure: Option<Exposure>) -> Self {
-        Self {
-            photometric: Photometric::new(lambda_dssim as f32),
-            masks: Photometric::new(lambda_dssim as f32),
-            lambda_mask: lambda_mask as f32,
-            exposure,
-            exposed: Planes::default(),
-            segmentation: None,
-            terms: ImageTerms::default(),
-            progress: 0.0,
-            frequency: Frequency::default(),
-            l1: 0.0,
-            ssim: 0.0,
-            mse: 0.0,
-        }
+    /// These terms, such as a recipe's ([`loss::image::terms`](crate::loss::image::terms)).
+    pub fn new(terms: Vec<Box<dyn ImageTerm>>, exposure: Option<Exposure>) -> Self {
+        Self { terms, exposure, exposed: Planes::default(), l1: 0.0, ssim: 0.0, squares: 0.0, views: 0 }
+    }
+
+    /// The loss of 3DGS alone, with this share of D-SSIM.
+    pub fn photometric(dssim: f64) -> Self {
+        Self::new(vec![Box::new(Photometric::new(dssim as f32))], None)
+    }
+
+    /// Adds a term, of this library or of a caller's own.
+    pub fn push(&mut self, term: impl ImageTerm + 'static) {
+        self.terms.push(Box::new(term));
+    }
+
+    /// The loss of one step: these terms, then those of the stage.
+    pub fn of_step<'a>(&'a mut self, stage: &'a mut [Box<dyn ImageTerm>]) -> StepLoss<'a> {
+        (self.squares, self.views) = (0.0, 0);
+        StepLoss { run: self, stage }
+    }
+
+    /// Mean squared error over the views of the last step.
+    pub fn mse(&self) -> f64 {
+        self.squares / self.views.max(1) as f64
     }
 }
 
-impl ImageLoss<f32> for TrainLoss {
-    fn wanted(&self) -> Wanted {
-        let t = &self.terms;
-        Wanted { depth: t.depth_tv > 0.0 || t.depth_normal > 0.0, normals: t.depth_normal > 0.0, flow: t.flow > 0.0 }
-    }
-
-    fn share(&self) -> Option<&str> {
-        self.segmentation.as_ref().map(|s| s.column.as_str())
-    }
-
-    fn eval(&mut self, view: &View<'_, f32>, image: &Image<f32>, d: &mut PictureGrads<f32>) -> f64 {
-        let row = self.exposure.as_ref().map(|e| e.params[e.key].read::<6>(view.rig, 0));
-        if let Some(row) = row {
-            self.exposed.clone_from(&image.color);
-            for c in 0..3 {
-                let gain = row[c].exp();
-                self.exposed.plane_mut(c).iter_mut().for_each(|x| *x = *x * gain + row[3 + c]);
-            }
-        }
-        let shown = if row.is_some() { &self.exposed } else { &image.color };
-        let value = self.photometric.loss_and_grad(shown, view.truth, view.weight, &mut d.color);
-        let mut total = value.total;
-        let terms = self.terms;
-        if terms.tv > 0.0 {
-            total += tv::total_variation(shown, terms.tv, &mut d.color);
-        }
-        if terms.frequency > 0.0 {
-            let (progress, weight) = (self.progress, terms.frequency);
-            total += self.frequency.loss_and_grad(shown, view.truth, progress, weight, &mut d.color);
-        }
-        (self.l1, self.ssim, self.mse) = (value.l1, value.ssim, value.mse);
-        if let (Some(row), Some(e)) = (row, &mut self.exposure) {
-            let mut d_row = [0.0f32; 6];
-            for c in 0..3 {
-                let gain = row[c].exp();
-                let (mut d_gain, mut d_offset) = (0.0f64, 0.0f64);
-                for (g, x) in d.color.plane_mut(c).iter_mut().zip(image.color.plane(c)) {
-                    d_offset += f64::from(*g);
-                    d_gain += f64::from(*g * x * gain);
-                    *g *= gain;
-                }
-                (d_row[c], d_row[3 + c]) = (d_gain as f32, d_offset as f32);
-            }
-            e.grads.of([e.key])[0].add(view.rig, 0, d_row);
-        }
-        if let Some(mask) = view.mask.filter(|_| self.lambda_mask > 0.0) {
-            d.uses_alpha = true;
-            let scale = self.lambda_mask / mask.pixels() as f32;
-            let mut sum = 0.0f64;
-            for ((d, a), m) in d.alpha.data.iter_mut().zip(&image.alpha.data).zip(&mask.data) {
-                let e = a - m;
-                sum += f64::from(e.abs());
-                *d = if e > 0.0 {
-                    scale
-                } else if e < 0.0 {
-                    -scale
-                } else {
-                    0.0
-                };
-            }
-            total += sum * f64::from(scale);
-        }
-        total + self.segment(view, image, d) + self.beside(view, image, d)
-    }
+/// The picture loss of one step; see [`TrainLoss::of_step`].
+pub struct StepLoss<'a> {
+    run: &'a mut TrainLoss,
+    stage: &'a mut [Box<dyn ImageTerm>],
 }
 
-impl TrainLoss {
-    /// What Gaussians say of the foreground, against the mask.
-    fn segment(&mut self, view: &View<'_, f32>, image: &Image<f32>, d: &mut PictureGrads<f32>) -> f64 {
-        let (Some(segmentation), Some(mask), Some(at)) = (&self.segmentation, view.mask, d.share) else { return 0.0 };
-        d.uses_extra = true;
-        let plane =
-            |values: &[f32]| Planes { channels: 1, height: mask.height, width: mask.width, data: values.to_vec() };
-        let (shown, mut d_shown) = (plane(image.extra.plane(at)), plane(d.extra.plane(at)));
-        let value = self.masks.loss_and_grad(&shown, mask, view.weight, &mut d_shown);
-        let weight = segmentation.weight as f32;
-        d.extra.plane_mut(at).iter_mut().zip(&d_shown.data).for_each(|(d, x)| *d = weight * x);
-        value.total * segmentation.weight
+impl ImageTerm for StepLoss<'_> {
+    fn needs(&self, view: &View<'_>) -> Needs {
+        let mut needs = Needs::default();
+        self.run.terms.iter().chain(&*self.stage).for_each(|term| needs.join(term.needs(view)));
+        needs
     }
 
-    /// The terms that look at alpha, depth and further channels.
-    fn beside(&self, view: &View<'_, f32>, image: &Image<f32>, d: &mut PictureGrads<f32>) -> f64 {
-        let terms = &self.terms;
+    fn eval(&mut self, info: &StepInfo, view: &View<'_>, drawn: &Shown<'_>, d: &mut PictureGrads) -> f64 {
+        let run = &mut *self.run;
+        let mut shown = *drawn;
+        if let Some(exposure) = &run.exposure {
+            run.exposed.clone_from(drawn.color);
+            exposure.respond(view.rig, &mut run.exposed);
+            shown.color = &run.exposed;
+        }
         let mut total = 0.0;
-        if terms.mask_entropy > 0.0 {
-            d.uses_alpha = true;
-            total += entropy::mask_entropy(&image.alpha, terms.mask_entropy, &mut d.alpha);
+        for term in run.terms.iter_mut().chain(&mut *self.stage) {
+            total += term.eval(info, view, &shown, d);
+            if let Some(measured) = term.measured() {
+                (run.l1, run.ssim) = (measured.l1, measured.ssim);
+                run.squares += measured.mse;
+            }
         }
-        if terms.depth_tv > 0.0 {
-            (d.uses_alpha, d.uses_depth) = (true, true);
-            let (depth, alpha) = (&image.depth, &image.alpha);
-            total += tv::depth_smoothness(depth, alpha, view.truth, terms.depth_tv, &mut d.depth, &mut d.alpha);
-        }
-        if let Some(first) = d.normals {
-            (d.uses_alpha, d.uses_depth, d.uses_extra) = (true, true, true);
-            let normals = part(&image.extra, first);
-            let mut d_normals = Planes::new(3, normals.height, normals.width);
-            let pictures = [&image.depth, &image.alpha, &normals];
-            let grads = [&mut d.depth, &mut d.alpha, &mut d_normals];
-            total += normal::depth_normal(view.camera, pictures, terms.depth_normal, grads);
-            put(&mut d.extra, first, &d_normals);
-        }
-        if let (Some(first), Some(truth)) = (d.flow, &view.flow) {
-            d.uses_extra = true;
-            let drawn = part(&image.extra, first);
-            let mut d_drawn = Planes::new(3, drawn.height, drawn.width);
-            total += flow::flow(&drawn, truth.vectors, terms.flow, &mut d_drawn);
-            put(&mut d.extra, first, &d_drawn);
+        run.views += 1;
+        if let Some(exposure) = &mut run.exposure {
+            exposure.respond_backward(view.rig, drawn.color, d.color.add());
         }
         total
     }
 }
 
-/// Three channels from `first` on.
-fn part(planes: &Planes<f32>, first: usize) -> Planes<f32> {
-    let n = planes.pixels();
-    let data = planes.data[first * n..(first + 3) * n].to_vec();
-    Planes { channels: 3, height: planes.height, width: planes.width, data }
-}
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::loss::image::Channel;
+    use splat4d::math::{Rng, Se3};
+    use splat4d::render::Image;
+    use splat4d::scene::{Camera, Time};
 
-/// Puts three channels at `first`.
-fn put(planes: &mut Planes<f32>, first: usize, channels: &Planes<f32>) {
-    let n = planes.pixels();
-    planes.data[first * n..(first + 3) * n].copy_from_slice(&channels.data);
+    const SIZE: usize = 12;
+    const RIG: usize = 1;
+
+    /// A caller's own term: Σ w·picture with random weights, and what it saw.
+    struct Own {
+        seen: std::sync::Arc<std::sync::Mutex<Vec<f32>>>,
+    }
+
+    fn weight(i: usize) -> f32 {
+        Rng::new(2, "own", 0).normal(i as u64) as f32
+    }
+
+    impl ImageTerm for Own {
+        fn needs(&self, _: &View<'_>) -> Needs {
+            Needs { depth: false, extra: vec![Channel::Normals] }
+        }
+
+        fn eval(&mut self, _: &StepInfo, _: &View<'_>, shown: &Shown<'_>, d: &mut PictureGrads) -> f64 {
+            *self.seen.lock().unwrap() = shown.color.data.clone();
+            d.color.add().data.iter_mut().enumerate().for_each(|(i, d)| *d += weight(i));
+            shown.color.data.iter().enumerate().map(|(i, x)| f64::from(x * weight(i))).sum()
+        }
+    }
+
+    fn planes(purpose: &str) -> Planes<f32> {
+        let rng = Rng::new(1, purpose, 0);
+        let mut out = Planes::new(3, SIZE, SIZE);
+        out.data.iter_mut().enumerate().for_each(|(i, x)| *x = rng.uniform(i as u64) as f32);
+        out
+    }
+
+    fn exposure() -> Exposure {
+        let mut exposure = Exposure::new(2, vec![0, 1]);
+        let key = exposure.key();
+        exposure.params[key].write(RIG, 0, [0.2, -0.1, 0.05, 0.02, 0.0, -0.03]);
+        exposure
+    }
+
+    /// Value and gradient to the drawn colours of one view.
+    fn eval(loss: &mut TrainLoss, stage: &mut [Box<dyn ImageTerm>], color: &Planes<f32>) -> (f64, Vec<f32>) {
+        let (camera, truth) = (Camera::with_fov_y(Se3::IDENTITY, 0.8, SIZE, SIZE), planes("truth"));
+        let view = View {
+            camera: &camera,
+            t: Time(0.0),
+            background: [0.0; 3],
+            truth: &truth,
+            mask: None,
+            weight: None,
+            flow: None,
+            frame: 0,
+            rig: RIG,
+        };
+        let info = StepInfo { iteration: 0, times: vec![view.t], seed: 0, progress: 0.0 };
+        let image = Image { color: color.clone(), ..Image::default() };
+        let mut d = PictureGrads::default();
+        d.begin(&image);
+        let mut step = loss.of_step(stage);
+        assert!(!step.needs(&view).depth);
+        let value = step.eval(&info, &view, &Shown::new(&image, &[]), &mut d);
+        (value, d.grads().color.data.clone())
+    }
+
+    #[test]
+    fn a_callers_own_term_sees_the_exposed_picture_and_its_gradient_joins_the_others() {
+        let color = planes("color");
+        let seen = std::sync::Arc::<std::sync::Mutex<Vec<f32>>>::default();
+        let mut plain = TrainLoss::photometric(0.2);
+        plain.exposure = Some(exposure());
+        let (value, d) = eval(&mut plain, &mut [], &color);
+        for of_stage in [false, true] {
+            let mut loss = TrainLoss::photometric(0.2);
+            loss.exposure = Some(exposure());
+            let own = Own { seen: seen.clone() };
+            let mut stage: Vec<Box<dyn ImageTerm>> = Vec::new();
+            if of_stage {
+                stage.push(Box::new(own));
+            } else {
+                loss.push(own);
+            }
+            let (total, d_both) = eval(&mut loss, &mut stage, &color);
+            let seen = seen.lock().unwrap();
+            let row = exposure().params[exposure().key()].read::<6>(RIG, 0);
+            let (mut own_value, pixels) = (0.0, SIZE * SIZE);
+            for (i, (&x, &drawn)) in seen.iter().zip(&color.data).enumerate() {
+                let gain = row[i / pixels].exp();
+                assert!((x - (drawn * gain + row[3 + i / pixels])).abs() < 1e-6, "the camera's gain and offset");
+                assert!((d_both[i] - (d[i] + weight(i) * gain)).abs() < 1e-5 * (1.0 + weight(i).abs()), "{i}");
+                own_value += f64::from(x * weight(i));
+            }
+            assert!((total - value - own_value).abs() < 1e-4 * own_value.abs().max(1.0));
+            assert_eq!((loss.l1, loss.ssim, loss.mse()), (plain.l1, plain.ssim, plain.mse()));
+        }
+    }
+
+    #[test]
+    fn exposures_have_the_gradient_of_the_value() {
+        let color = planes("color");
+        let mut loss = TrainLoss::photometric(0.0);
+        loss.push(crate::loss::image::tv::TotalVariation(0.3));
+        loss.exposure = Some(exposure());
+        eval(&mut loss, &mut [], &color);
+        let e = loss.exposure.as_ref().unwrap();
+        let (key, h) = (e.key(), 1e-3f32);
+        let got = e.grads.table(key).read::<6>(RIG, 0);
+        for (col, got) in got.into_iter().enumerate() {
+            let mut at = |by: f32| {
+                let mut moved = exposure();
+                *moved.params[key].get_mut(RIG, col) += by;
+                loss.exposure = Some(moved);
+                eval(&mut loss, &mut [], &color).0
+            };
+            let fd = (at(h) - at(-h)) / f64::from(2.0 * h);
+            assert!((fd - f64::from(got)).abs() < 0.02 * (0.05 + fd.abs()), "column {col}: {fd} {got}");
+        }
+    }
 }

@@ -14,7 +14,7 @@ use super::trainer::{Settings, Stepped, Trainer};
 use crate::capture::{Capture, CaptureOptions, ImageStore};
 use crate::event::{Event, Progress};
 use crate::init::{self, Seeds};
-use crate::loss::image::ImageTerms;
+use crate::loss::image::terms;
 use crate::methods::auto::{self, AUTO};
 use crate::methods::{Plan, Stage, program_of, stages};
 use crate::recipe::Recipe;
@@ -367,8 +367,7 @@ impl Bench {
             sh_degree: r.sh_degree,
             exposure_lr: r.exposure_lr,
         };
-        let mut loss = TrainLoss::new(r.lambda_dssim, r.lambda_mask, exposure);
-        loss.terms = ImageTerms::of(r);
+        let loss = TrainLoss::new(terms(r), exposure);
         Trainer::new(scene, stages, self.frames.clone(), Box::new(Renderer::new(config)), loss, settings)
     }
 

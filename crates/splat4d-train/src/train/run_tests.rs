@@ -2,13 +2,12 @@
 //! that roll back; outputs, memory and checkpoints that are refused.
 
 use super::*;
-use crate::train::chain::Draw;
 use crate::train::frames::{Frames, Picture};
 use crate::train::tests::Made;
 use serde_json::Value;
 use splat4d::math::Rng;
-use splat4d::render::{Image, ImageGrads, RenderGrads};
-use splat4d::scene::{Camera, Splats, Table};
+use splat4d::render::{Backend, Image, ImageGrads, RenderGrads, Shot, Wanted};
+use splat4d::scene::{Camera, Table};
 use tempfile::TempDir;
 
 const SIZE: usize = 24;
@@ -93,7 +92,7 @@ impl Place {
         &self,
         name: &str,
         recipe: &Recipe,
-        draw: Box<dyn Draw<f32>>,
+        draw: Box<dyn Backend>,
         stop: &AtomicBool,
         listen: &mut dyn FnMut(&Event),
     ) -> Result<Outcome> {
@@ -143,44 +142,43 @@ struct Meddled<F: FnMut(usize, &mut Image<f32>) + Send> {
     meddle: F,
 }
 
-fn meddled(meddle: impl FnMut(usize, &mut Image<f32>) + Send + 'static) -> Box<dyn Draw<f32>> {
+fn meddled(meddle: impl FnMut(usize, &mut Image<f32>) + Send + 'static) -> Box<dyn Backend> {
     let config = RenderConfig { sh_degree: Recipe::default().sh_degree, simd: Simd::detect(), ..Default::default() };
     Box::new(Meddled { inner: Renderer::new(config), drawn: 0, meddle })
 }
 
-impl<F: FnMut(usize, &mut Image<f32>) + Send> Draw<f32> for Meddled<F> {
-    fn render(
-        &mut self,
-        splats: &Splats<'_, f32>,
-        camera: &Camera,
-        background: [f32; 3],
-        extra: Option<&Table<f32>>,
-        out: &mut Image<f32>,
-    ) {
-        self.inner.render(splats, camera, background, extra, out);
-        self.drawn += 1;
-        (self.meddle)(self.drawn, out);
+impl<F: FnMut(usize, &mut Image<f32>) + Send> Backend for Meddled<F> {
+    fn can(&self, wanted: &Wanted) -> Result<()> {
+        self.inner.can(wanted)
     }
 
-    fn backward(
+    fn render(&mut self, shot: &Shot<'_>, out: &mut Image) -> Result<()> {
+        Backend::render(&mut self.inner, shot, out)?;
+        self.drawn += 1;
+        (self.meddle)(self.drawn, out);
+        Ok(())
+    }
+
+    fn vjp(
         &mut self,
-        splats: &Splats<'_, f32>,
-        camera: &Camera,
-        background: [f32; 3],
-        extra: Option<&Table<f32>>,
-        grads: &ImageGrads<'_, f32>,
+        shot: &Shot<'_>,
+        grads: &ImageGrads<'_>,
         d_sh: &mut [Option<&mut Table<f32>>],
-        d: &mut RenderGrads<f32>,
-    ) {
-        self.inner.backward(splats, camera, background, extra, grads, d_sh, d);
+        d: &mut RenderGrads,
+    ) -> Result<()> {
+        self.inner.vjp(shot, grads, d_sh, d)
     }
 
     fn radii(&self) -> &[f32] {
         self.inner.radii()
     }
 
-    fn config(&mut self) -> &mut RenderConfig {
-        &mut self.inner.config
+    fn config(&self) -> &RenderConfig {
+        &self.inner.config
+    }
+
+    fn name(&self) -> &str {
+        "a renderer that something happens to"
     }
 }
 
@@ -226,8 +224,7 @@ fn a_run_stopped_at_any_step_resumes_to_the_same_bytes() {
             let at = 1 + Rng::new(8, "stop", k as u64).below(round, (STEPS - 2) * recipe.batch_size);
             let stop = Arc::new(AtomicBool::new(false));
             let (flag, steps) = (stop.clone(), at.div_ceil(recipe.batch_size));
-            let mut draw = meddled(move |n, _| flag.store(n >= at, Ordering::Relaxed));
-            draw.config().sh_degree = recipe.sh_degree;
+            let draw = meddled(move |n, _| flag.store(n >= at, Ordering::Relaxed));
             let outcome = place.train_with(&name, recipe, draw, &stop, &mut |_| {}).unwrap();
             assert!(outcome.interrupted && outcome.iteration == steps, "{outcome:?}");
             assert!(!place.run(&name).join("scene.safetensors").exists(), "a stopped run has no scene yet");

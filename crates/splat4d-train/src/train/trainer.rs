@@ -1,7 +1,7 @@
 //! [`Trainer`]: the state of a run and one step of it. Files, progress and clocks are the business of `run`.
 
 use super::batch::Batch;
-use super::chain::{Draw, StepInfo};
+use super::chain::StepInfo;
 use super::engine::{CpuEngine, Engine, StepPlan};
 pub use super::engine::{Fault, Stepped};
 use super::loss::TrainLoss;
@@ -15,6 +15,7 @@ use crate::upkeep::{At, Change, Context, Limits, Upkeep};
 use crate::{Error, ErrorKind, Result};
 use splat4d::layers::Scene;
 use splat4d::math::Rng;
+use splat4d::render::Backend;
 use splat4d::scene::GEOMETRY;
 use std::borrow::Cow;
 use std::sync::Arc;
@@ -76,7 +77,7 @@ impl<'a> Trainer<'a> {
         scene: Scene<f32>,
         mut stages: Vec<Stage>,
         frames: Arc<dyn Frames>,
-        draw: Box<dyn Draw<f32> + 'a>,
+        backend: Box<dyn Backend<f32> + 'a>,
         loss: TrainLoss,
         settings: Settings,
     ) -> Self {
@@ -92,7 +93,7 @@ impl<'a> Trainer<'a> {
             entered: false,
             frames,
             timeline,
-            engine: Box::new(CpuEngine::new(draw)),
+            engine: Box::new(CpuEngine::new(backend)),
             batch: Batch::default(),
         };
         trainer.spread();
@@ -221,7 +222,7 @@ impl<'a> Trainer<'a> {
         let clock = Clock::now();
         self.load()?;
         let load = clock.elapsed();
-        let mut out = match self.learn() {
+        let mut out = match self.learn()? {
             Ok(stepped) => Stepped { load, ..stepped },
             Err(fault) => {
                 let views = self.batch.names(self.frames.as_ref());
@@ -253,10 +254,10 @@ impl<'a> Trainer<'a> {
     }
 
     /// The engine's step on the pictures that were loaded.
-    fn learn(&mut self) -> std::result::Result<Stepped, Fault> {
+    fn learn(&mut self) -> Result<std::result::Result<Stepped, Fault>> {
         let (Settings { seed, limits, background, sh_degree, exposure_lr }, at) =
             (self.settings.clone(), self.progress);
-        let stage = &self.stages[at.stage];
+        let stage = &mut self.stages[at.stage];
         let width = stage.time_noise.width(at.stage_step);
         let shift = match width > 0.0 {
             true => width * Rng::new(seed, "time noise", at.iteration as u64).normal(0),
@@ -270,12 +271,12 @@ impl<'a> Trainer<'a> {
             progress: at.stage_step as f64 / stage.iterations as f64,
         };
         let mut plan = StepPlan {
+            sh_degree: stage.sh_degree(at.stage_step, sh_degree),
             stage,
             loss: &mut self.loss,
             views: &views,
             info: &info,
             stage_step: at.stage_step,
-            sh_degree: stage.sh_degree(at.stage_step, sh_degree),
             rate_scale: at.rate_scale,
             exposure_lr,
             min_opacity: limits.min_opacity,

@@ -11,7 +11,7 @@ use crate::capture::frames::{Frames, Picture};
 use crate::learner::Learner;
 use crate::recipe::Recipe;
 use serde::{Deserialize, Serialize};
-use splat4d::layers::{Instant, Scene};
+use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::Rng;
 use splat4d::math::sh::rgb_to_dc;
 use splat4d::motion::spacetime::{FEATURE_TABLE, ROTATION_RATES, VELOCITIES};
@@ -160,7 +160,7 @@ impl Upkeep for Guided {
 /// The worst of some views, evenly chosen with a random start.
 fn looks(scene: &Scene<f32>, frames: &dyn Frames, antialias: Antialias, rng: Rng) -> Result<Vec<Look>> {
     let mut renderer = Renderer::new(RenderConfig { antialias, depth: true, ..RenderConfig::default() });
-    let (mut instant, mut image, mut picture) = (Instant::default(), Image::default(), Picture::default());
+    let (mut instant, mut image, mut picture) = (Evaluation::default(), Image::default(), Picture::default());
     let mut worst: Vec<Look> = Vec::new();
     let count = LOOKS.min(frames.len());
     for k in 0..count {

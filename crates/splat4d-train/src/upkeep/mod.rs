@@ -36,9 +36,8 @@ use crate::Result;
 use crate::capture::frames::Frames;
 use crate::learner::Learner;
 use crate::recipe::Recipe;
-use splat4d::layers::{LayerTape, Scene};
+use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::{Real, Rng, sym3};
-use splat4d::motion::Cache;
 use splat4d::render::Antialias;
 use splat4d::scene::params::{OPACITY, QUAT};
 use splat4d::scene::splats::COV;
@@ -263,12 +262,9 @@ fn grow(
 /// Activated covariances [N, 6] of a layer's Gaussians at the clip's centre, whatever model made them.
 fn covariances(scene: &Scene<f32>, layer: usize) -> Vec<[f64; 6]> {
     let l = &scene.layers[layer];
-    let mut tape = LayerTape::default();
-    tape.ask(Space::Gaussians, Rows::All, Time(0.5 * (scene.clip[0] + scene.clip[1])));
-    let mut cache = Cache::default();
-    l.motion.prepare(&l.params, &[tape.question(&l.params)], &mut cache);
-    l.at(&cache, &mut tape);
-    (0..l.params.len()).map(|r| tape.out().read::<6>(r, COV).map(f64::from)).collect()
+    let center = Time(0.5 * (scene.clip[0] + scene.clip[1]));
+    let seen = Evaluation::of_layer(l, Space::Gaussians, Rows::All, center);
+    (0..l.params.len()).map(|r| seen.tape(0).out().read::<6>(r, COV).map(f64::from)).collect()
 }
 
 /// Opacity (activated, without life) of a row.

@@ -119,7 +119,7 @@ mod tests {
     use super::super::Limits;
     use super::super::tests::{context, due_steps, scene};
     use super::*;
-    use splat4d::layers::{Instant, Scene};
+    use splat4d::layers::{Evaluation, Scene};
     use splat4d::math::Se3;
     use splat4d::render::{Image, RenderConfig, Renderer};
     use splat4d::scene::params::{LOG_SCALE, OPACITY};
@@ -133,7 +133,7 @@ mod tests {
     fn picture(s: &Scene<f32>) -> Vec<f32> {
         let pose = Se3::look_at([0.0, 0.5, -6.0], [0.0; 3], [0.0, 1.0, 0.0]);
         let camera = Camera::with_fov_y(pose, 0.8, 64, 64);
-        let (mut instant, mut image) = (Instant::default(), Image::default());
+        let (mut instant, mut image) = (Evaluation::default(), Image::default());
         s.at(Time(0.5), &mut instant);
         Renderer::new(RenderConfig::default()).render(&s.splats(&instant), &camera, [0.1; 3], None, &mut image);
         image.color.data

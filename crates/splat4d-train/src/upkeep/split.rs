@@ -7,9 +7,9 @@ use crate::Result;
 use crate::learner::Learner;
 use crate::recipe::Recipe;
 use serde::{Deserialize, Serialize};
-use splat4d::layers::{ALWAYS, Layer, LayerTape, Scene, freeze_rows};
+use splat4d::layers::{ALWAYS, Evaluation, Layer, Scene, freeze_rows};
 use splat4d::math::Rng;
-use splat4d::motion::{Cache, Spec, build};
+use splat4d::motion::{Spec, build};
 use splat4d::scene::splats::COV;
 use splat4d::scene::{LifeKind, RowEdit, Rows, Space, Time};
 
@@ -117,19 +117,13 @@ fn still_rows(layer: &Layer<f32>, clip: [f64; 2], reach: f64) -> Vec<bool> {
     let mut still = vec![layer.span == ALWAYS && layer.masks.is_none(); n];
     let times: Vec<Time> =
         (0..LOOKS).map(|k| Time(clip[0] + (clip[1] - clip[0]) * k as f64 / (LOOKS - 1) as f64)).collect();
-    let look = |t: Time| {
-        let (mut tape, mut cache) = (LayerTape::default(), Cache::default());
-        tape.ask(Space::Gaussians, Rows::All, t);
-        layer.motion.prepare(&layer.params, &[tape.question(&layer.params)], &mut cache);
-        layer.at(&cache, &mut tape);
-        tape
-    };
+    let look = |t: Time| Evaluation::of_layer(layer, Space::Gaussians, Rows::All, t);
     let middle = look(times[LOOKS / 2]);
     let (kind, lives) = layer.lives();
     for t in times {
         let now = look(t);
         for (row, still) in still.iter_mut().enumerate() {
-            let (a, b) = (middle.out().read::<9>(row, 0), now.out().read::<9>(row, 0));
+            let (a, b) = (middle.tape(0).out().read::<9>(row, 0), now.tape(0).out().read::<9>(row, 0));
             let far: f32 = (0..3).map(|k| (a[k] - b[k]).powi(2)).sum();
             let trace = a[COV] + a[COV + 3] + a[COV + 5];
             let shape: f32 = (COV..9).map(|k| (a[k] - b[k]).powi(2)).sum();

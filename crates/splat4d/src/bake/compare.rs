@@ -1,11 +1,12 @@
 //! Baked against model: both drawn, from some cameras at some frames.
 
+use crate::Result;
 use crate::format::playback::{Node, Primitive};
-use crate::layers::{ALPHA_MIN, Instant, Scene};
+use crate::layers::{ALPHA_MIN, Evaluation, Scene};
 use crate::math::quat;
 use crate::math::sh::{MAX_COEFFS, rgb_to_dc};
 use crate::math::sym3;
-use crate::render::{Image, RenderConfig, Renderer};
+use crate::render::{Backend, Image, Shot};
 use crate::scene::splats::{SPLAT_COLUMNS, Splats};
 use crate::scene::{Camera, Color, Part, Rows, Table, Time};
 
@@ -94,18 +95,18 @@ pub enum Shown<'a> {
 }
 
 /// Draws the baked scene and the model as every camera sees them at every time, and compares. `None`: nothing to compare.
+/// Errors: the backend's.
 pub fn compare(
     scene: &Scene<f32>,
     baked: Shown<'_>,
     cameras: &[Camera],
     times: &[f64],
-    config: &RenderConfig,
+    backend: &mut dyn Backend,
     progress: &mut dyn FnMut(usize, usize),
-) -> Option<Likeness> {
-    let (mut instant, mut moment) = (Instant::default(), Moment::default());
+) -> Result<Option<Likeness>> {
+    let (mut instant, mut moment) = (Evaluation::default(), Moment::default());
     let (mut truth, mut copy) = (Image::default(), Image::default());
-    let mut played = Instant::default();
-    let mut renderer = Renderer::new(*config);
+    let mut played = Evaluation::default();
     let (mut sum, mut pixels, mut done) = (0.0, 0.0, 0);
     let mut worst = (f64::INFINITY, 0.0, 0);
     for &time in times {
@@ -118,9 +119,10 @@ pub fn compare(
             Shown::Nodes(_) => moment.splats(),
             Shown::File(file) => file.splats(&played),
         };
+        let model = scene.splats(&instant);
         for (i, camera) in cameras.iter().enumerate() {
-            renderer.render(&scene.splats(&instant), camera, scene.background, None, &mut truth);
-            renderer.render(&splats, camera, scene.background, None, &mut copy);
+            backend.render(&Shot::new(&model, camera, scene.background), &mut truth)?;
+            backend.render(&Shot::new(&splats, camera, scene.background), &mut copy)?;
             let square = |(a, b): (&f32, &f32)| f64::from(a.clamp(0.0, 1.0) - b.clamp(0.0, 1.0)).powi(2);
             let error: f64 = truth.color.data.iter().zip(&copy.color.data).map(square).sum();
             let count = truth.color.data.len() as f64;
@@ -132,13 +134,13 @@ pub fn compare(
             progress(done, times.len() * cameras.len());
         }
     }
-    (done > 0 && pixels > 0.0).then(|| Likeness {
+    Ok((done > 0 && pixels > 0.0).then(|| Likeness {
         psnr: psnr(sum / pixels),
         worst_psnr: worst.0,
         worst_time: worst.1,
         worst_camera: worst.2,
         pictures: done,
-    })
+    }))
 }
 
 fn psnr(mse: f64) -> f64 {

@@ -3,9 +3,8 @@
 //! Rows come in runs that are small enough for all frames of a run to lie in memory at once, however long the take is.
 
 use super::tree::{Span, Tree};
-use crate::layers::{Layer, LayerTape};
+use crate::layers::{Evaluation, Layer, sweep};
 use crate::math::sh::{MAX_COEFFS, rgb_to_dc};
-use crate::motion::{At, Cache};
 use crate::scene::{Color, Rows, SH, Space, Time};
 
 /// Numbers of a sample before its colour: mean 3, covariance 6, opacity 1 (life applied).
@@ -46,12 +45,8 @@ impl Samples {
 
 /// How many SH coefficients (all channels) a look must hold: 0 where the layer's own SH is the colour at all times.
 pub(super) fn color_width(layer: &Layer<f32>, time: f64) -> usize {
-    let mut tape = LayerTape::default();
-    tape.ask(Space::Gaussians, Rows::Some(&[0]), Time(time));
-    let mut cache = Cache::default();
-    layer.motion.prepare(&layer.params, &[tape.question(&layer.params)], &mut cache);
-    layer.at(&cache, &mut tape);
-    match layer.part(&tape).color {
+    let seen = Evaluation::of_layer(layer, Space::Gaussians, Rows::Some(&[0]), Time(time));
+    match layer.part(seen.tape(0)).color {
         Color::Sh { weights: None, base: true, .. } => 0,
         Color::Sh { table, weights, .. } => table.width() / weights.map_or(1, |w| w.width().max(1)),
         Color::Direct { .. } => 3,
@@ -86,27 +81,17 @@ pub(super) fn look(layer: &Layer<f32>, rows: &[(usize, [f64; 2])], tree: &Tree, 
     let last = rows.iter().map(|r| r.frames[1]).max().unwrap_or(0);
     let alive = |k: usize| rows.iter().filter(move |r| (r.frames[0]..=r.frames[1]).contains(&k));
     let ids: Vec<Vec<u32>> = (first..=last).map(|k| alive(k).map(|r| r.id as u32).collect()).collect();
-    let asked = |i: usize| At {
-        p: &layer.params,
-        of: Space::Gaussians,
-        rows: Rows::Some(&ids[i]),
-        t: Time(tree.time(first + i)),
-    };
-    // One preparation for all frames: a model that scans through time does so once a run.
-    let questions: Vec<At<'_, f32>> = (0..ids.len()).map(asked).collect();
-    let (mut cache, mut tape) = (Cache::default(), LayerTape::default());
-    layer.motion.prepare(&layer.params, &questions, &mut cache);
-    for (k, ids) in (first..).zip(&ids) {
-        tape.ask(Space::Gaussians, Rows::Some(ids), Time(tree.time(k)));
-        layer.at(&cache, &mut tape);
-        let part = layer.part(&tape);
+    let asked: Vec<(Rows<'_>, Time)> =
+        ids.iter().enumerate().map(|(i, ids)| (Rows::Some(ids), Time(tree.time(first + i)))).collect();
+    sweep(layer, &asked, |i, tape| {
+        let (k, part) = (first + i, layer.part(tape));
         for (j, row) in alive(k).enumerate() {
             let start = row.offset + (k - row.frames[0]) * width;
             let out = &mut data[start..start + width];
             out[..GEOMETRY].copy_from_slice(&part.out.read::<GEOMETRY>(j, 0));
             coefficients(&part.color, j, &mut out[GEOMETRY..]);
         }
-    }
+    });
     Samples { rows, width, data }
 }
 

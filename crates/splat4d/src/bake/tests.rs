@@ -2,8 +2,9 @@
 //! every Gaussian once.
 
 use super::*;
+use crate::device;
 use crate::format::playback::{Draft, Meta, WriteConfig, read, write};
-use crate::layers::{ALPHA_MIN, ALWAYS, Instant};
+use crate::layers::{ALPHA_MIN, ALWAYS, Evaluation};
 use crate::math::{Rng, Se3};
 use crate::motion::spacetime::VELOCITIES;
 use crate::motion::still::activate;
@@ -80,8 +81,8 @@ fn baked(scene: &Scene<f32>, options: &Options) -> Baked {
 fn likeness(scene: &Scene<f32>, baked: &Baked) -> Likeness {
     let frames = ((scene.clip[1] - scene.clip[0]) * FPS).round() as usize + 1;
     let times: Vec<f64> = (0..frames).step_by(frames.div_ceil(9)).map(|k| k as f64 / FPS).collect();
-    let config = RenderConfig::default();
-    compare(scene, Shown::Nodes(&baked.nodes), &cameras(), &times, &config, &mut |_, _| {}).unwrap()
+    let mut cpu = device::cpu(RenderConfig::default());
+    compare(scene, Shown::Nodes(&baked.nodes), &cameras(), &times, cpu.as_mut(), &mut |_, _| {}).unwrap().unwrap()
 }
 
 /// (mean, covariance, opacity) of everything that is visible, sorted by its mean.
@@ -106,7 +107,7 @@ fn straight_motion_of_every_life_is_exact() {
         let baked = baked(&scene, &options(0.25));
         assert_eq!(baked.report.errors.worst, 0.0);
         assert_eq!(baked.report.split, 0, "one primitive a Gaussian");
-        let (mut instant, mut moment) = (Instant::default(), Moment::default());
+        let (mut instant, mut moment) = (Evaluation::default(), Moment::default());
         // Between frames too, and at both ends.
         for t in [0.0, 0.013, 0.7, 1.0, 1.33333, 2.0, 2.4] {
             scene.at(Time(t), &mut instant);
@@ -328,8 +329,8 @@ fn a_file_is_as_good_and_can_be_baked_again() {
     };
     let like = |file: &Scene<f32>| {
         let times: Vec<f64> = (0..57).step_by(5).map(|k| f64::from(k) / FPS).collect();
-        let config = RenderConfig::default();
-        compare(&scene, Shown::File(file), &cameras(), &times, &config, &mut |_, _| {}).unwrap()
+        let mut cpu = device::cpu(RenderConfig::default());
+        compare(&scene, Shown::File(file), &cameras(), &times, cpu.as_mut(), &mut |_, _| {}).unwrap().unwrap()
     };
     let played = file(&first);
     assert!(like(&played).psnr > 40.0, "{:?} {:?}", like(&played), likeness(&scene, &first));

@@ -174,10 +174,10 @@ fn velocities_follow_the_order_of_the_splats_through_all_layers() {
         scene.layers[0].params[LIFE].write(r, 0, [9.0, -3.0]);
     }
     scene.layers.extend(wall([0.0, 0.25, 0.0], LifeKind::Infinite).layers);
-    let mut instant = Instant::default();
+    let mut instant = Evaluation::default();
     scene.at(Time(0.4), &mut instant);
     let v = velocities(&scene, &instant);
-    let first = instant.tapes[0].out().rows();
+    let first = instant.tape(0).out().rows();
     assert!(first > 0 && first < scene.layers[0].params.len());
     assert_eq!(v.rows(), scene.splats(&instant).len());
     assert!((0..v.rows()).all(|j| v.read::<3>(j, 0) == if j < first { [0.5, 0.0, 0.0] } else { [0.0, 0.25, 0.0] }));

@@ -3,9 +3,8 @@
 //! A track is as honest as its Gaussian is lasting: a model whose Gaussians are born and die gives short ones, and
 //! moments at which a Gaussian is not alive have no position.
 
-use crate::layers::{Instant, LayerTape, Scene};
+use crate::layers::{Evaluation, Scene};
 use crate::math::Real;
-use crate::motion::Cache;
 use crate::scene::{Rows, Space, Time};
 use std::fmt::Write;
 
@@ -43,13 +42,10 @@ impl Tracks {
             assert!(rows.last().is_none_or(|&r| (r as usize) < layer.params.len()), "layer {index} has no such row");
             let spans = if count > 0 { layer.spans() } else { Vec::new() };
             for (k, &t) in times.iter().enumerate().filter(|_| count > 0) {
-                let (mut tape, mut cache) = (LayerTape::default(), Cache::default());
-                tape.ask(Space::Gaussians, Rows::Some(&rows), Time(t));
-                layer.motion.prepare(&layer.params, &[tape.question(&layer.params)], &mut cache);
-                layer.at(&cache, &mut tape);
+                let seen = Evaluation::of_layer(layer, Space::Gaussians, Rows::Some(&rows), Time(t));
                 for (j, &row) in rows.iter().enumerate() {
                     let [from, to] = spans[row as usize];
-                    let x = tape.out().read::<3>(j, 0);
+                    let x = seen.tape(0).out().read::<3>(j, 0);
                     if t >= from && t <= to && x.iter().all(|x| x.is_finite()) {
                         points[(first + j) * times.len() + k] = Some(x.map(|x| x.f64() as f32));
                     }
@@ -124,10 +120,10 @@ pub fn nearest<F: Real>(
     count: usize,
     opacity: f64,
 ) -> Vec<Vec<Member>> {
-    let mut instant = Instant::default();
+    let mut instant = Evaluation::default();
     scene.at(t, &mut instant);
     let mut all: Vec<([f64; 3], Member)> = Vec::new();
-    for (layer, tape) in instant.tapes.iter().enumerate() {
+    for (layer, tape) in instant.tapes().enumerate() {
         for j in 0..tape.out().rows() {
             let row = tape.out().read::<10>(j, 0).map(F::f64);
             if row[crate::scene::splats::SPLAT_OPACITY] >= opacity && row[..3].iter().all(|x| x.is_finite()) {

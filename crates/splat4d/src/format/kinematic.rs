@@ -189,7 +189,7 @@ pub(super) fn scene(rows: &[Moving], clock: Clock) -> Result<Scene<f32>> {
 pub(super) mod tests {
     use super::*;
     use crate::format::samples::gaussians;
-    use crate::layers::Instant;
+    use crate::layers::Evaluation;
     use crate::math::Rng;
     use crate::scene::Time;
     use crate::scene::splats::SPLAT_OPACITY;
@@ -225,13 +225,11 @@ pub(super) mod tests {
         for i in 0..=10 {
             let t = Time(a.clip[0] + (a.clip[1] - a.clip[0]) * f64::from(i) / 10.0);
             let all = |scene: &Scene<f32>| {
-                let mut instant = Instant::default();
-                scene.at(t, &mut instant);
-                for (tape, layer) in instant.tapes.iter_mut().zip(&scene.layers) {
-                    tape.ask(crate::scene::Space::Gaussians, crate::scene::Rows::All, t);
-                    layer.at(&crate::motion::Cache::default(), tape);
-                }
-                instant.tapes[0].out().clone()
+                let layer = &scene.layers[0];
+                Evaluation::of_layer(layer, crate::scene::Space::Gaussians, crate::scene::Rows::All, t)
+                    .tape(0)
+                    .out()
+                    .clone()
             };
             let (p, q) = (all(a), all(b));
             assert_eq!(p.rows(), q.rows());

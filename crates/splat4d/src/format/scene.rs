@@ -383,7 +383,7 @@ mod tests {
             }
             if let Ok(s) = read(&b) {
                 // What is accepted must also be usable.
-                let mut instant = crate::layers::Instant::default();
+                let mut instant = crate::layers::Evaluation::default();
                 s.at(Time(0.1), &mut instant);
             }
         }

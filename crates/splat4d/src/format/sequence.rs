@@ -49,7 +49,7 @@ pub fn join(frames: &[Params], fps: f64, up: [f64; 3]) -> Result<Scene<f32>> {
 mod tests {
     use super::*;
     use crate::format::samples::gaussians;
-    use crate::layers::Instant;
+    use crate::layers::Evaluation;
     use crate::scene::Time;
     use crate::scene::params::OPACITY;
 
@@ -61,11 +61,11 @@ mod tests {
         }
         let scene = join(&frames, 25.0, [0.0, -1.0, 0.0]).unwrap();
         assert_eq!((scene.clip, scene.layers[0].params[SH].width()), ([0.0, 3.0 / 25.0], 27));
-        let mut instant = Instant::default();
+        let mut instant = Evaluation::default();
         for (i, frame) in frames.iter().enumerate() {
             for off in [-0.49, 0.0, 0.3, 0.49] {
                 scene.at(Time((i as f64 + off) / 25.0), &mut instant);
-                let out = instant.tapes[0].out();
+                let out = instant.tape(0).out();
                 assert_eq!(out.rows(), frame.len(), "frame {i} {off:+}");
                 if !frame.is_empty() {
                     assert_eq!(out.read::<3>(0, 0), frame[GEOMETRY].read::<3>(0, 0));

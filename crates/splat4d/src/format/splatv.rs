@@ -193,7 +193,7 @@ mod tests {
     use super::*;
     use crate::format::kinematic::tests::{apart, moving};
     use crate::format::mutate::mutants;
-    use crate::layers::Instant;
+    use crate::layers::Evaluation;
     use crate::scene::{LIFE, LifeKind, Time};
 
     /// One Gaussian at (1, 2, 3), moving by x = 1 + 2u, turned by nothing, with half its life at 0.5 and s = 0.25.
@@ -222,10 +222,10 @@ mod tests {
         let (scene, warnings) = read(&by_hand()).unwrap();
         assert_eq!((scene.len(), scene.clip), (1, [0.0, 1.0]));
         assert!(warnings.lines()[0].contains("one second"));
-        let mut instant = Instant::default();
+        let mut instant = Evaluation::default();
         // u = 0.75: Δ = 0.25, the fade exp(−1).
         scene.at(Time(0.75), &mut instant);
-        let out = instant.tapes[0].out();
+        let out = instant.tape(0).out();
         let row = out.read::<10>(0, 0);
         assert!((row[0] - 1.5).abs() < 1e-6 && row[1..3] == [2.0, 3.0], "{row:?}");
         assert!((row[3] - 0.25).abs() < 1e-6 && (row[8] - 4.0).abs() < 1e-5, "{row:?}");
@@ -276,7 +276,7 @@ mod tests {
         let hand = by_hand();
         for mutant in mutants(&file, 300, "splatv").chain(mutants(&hand, 1000, "splatv hand")) {
             if let Ok((scene, _)) = read(&mutant) {
-                scene.at(Time(0.1), &mut Instant::default());
+                scene.at(Time(0.1), &mut Evaluation::default());
             }
         }
         for cut in 0..hand.len() {

@@ -121,7 +121,7 @@ pub(super) struct Buffers {
     pub planes: Grown,
     /// Timestamps.
     pub times: Grown,
-    /// What the CPU reads.
+    /// Memory that the CPU reads.
     pub staging: Grown,
 }
 

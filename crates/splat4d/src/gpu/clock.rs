@@ -18,7 +18,7 @@ pub(super) enum Stage {
 /// Number of stages.
 pub(super) const STAGES: usize = 6;
 
-/// What tells the time of stages.
+/// Source of the stages' times.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum StageClock {
     /// Nothing: only whole frames are timed.

@@ -1,4 +1,4 @@
-//! Which GPU, and how it is opened: nothing beyond WebGPU's default limits is asked for, so that what runs here runs in
+//! Choice and opening of the GPU: nothing beyond WebGPU's default limits is asked for, so that what runs here runs in
 //! a browser too.
 
 use crate::{Error, ErrorKind, Result};
@@ -7,7 +7,7 @@ use std::pin::pin;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::task::{Context, Poll, Waker};
 
-/// Which adapters will do.
+/// Kinds of adapters that will do.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Adapters {
     /// Only a GPU: a driver that computes on the CPU is no faster than the CPU renderer.
@@ -73,11 +73,6 @@ impl Gpu {
     /// The card's name as its driver gives it.
     pub fn name(&self) -> &str {
         &self.info.name
-    }
-
-    /// Whether the adapter computes on the CPU.
-    pub fn is_software(&self) -> bool {
-        self.info.device_type == wgpu::DeviceType::Cpu
     }
 
     /// Card, kind, interface and driver in one line.

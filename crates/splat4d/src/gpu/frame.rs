@@ -165,7 +165,7 @@ impl Groups {
     }
 }
 
-/// How many workgroups a dispatch has: known here, or written by an earlier kernel, in this buffer of sizes and at this
+/// Number of workgroups of a dispatch: known here, or written by an earlier kernel, in this buffer of sizes and at this
 /// place.
 #[derive(Clone, Copy)]
 enum Size {
@@ -181,7 +181,7 @@ fn dispatch(pass: &mut ComputePass<'_>, kernel: &Kernel, entry: usize, buffers: 
     }
 }
 
-/// What a frame runs over.
+/// Items that a frame runs over.
 #[derive(Clone, Copy)]
 pub(super) struct Frame<'a> {
     /// The open GPU.
@@ -190,7 +190,7 @@ pub(super) struct Frame<'a> {
     pub kernels: &'a Kernels,
     /// Memory.
     pub buffers: &'a Buffers,
-    /// What is bound.
+    /// Bound resources.
     pub groups: &'a Groups,
 }
 

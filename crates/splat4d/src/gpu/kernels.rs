@@ -3,7 +3,7 @@
 use super::device::Gpu;
 use crate::wgsl;
 
-/// What a binding is.
+/// Kind of a binding.
 #[derive(Clone, Copy, Debug)]
 enum Kind {
     Uniform,

@@ -21,8 +21,9 @@ mod upload;
 pub use clock::{GpuTimings, StageClock};
 pub use device::{Adapters, Gpu};
 
-use crate::render::{Antialias, Image, RenderConfig};
-use crate::scene::{Camera, Planes, Splats};
+use crate::render::backend::refusal;
+use crate::render::{Antialias, Backend, Image, ImageGrads, RenderConfig, RenderGrads, Shot, Tables, Wanted};
+use crate::scene::{Planes, Table};
 use crate::{Error, ErrorKind, Result};
 use buffers::{Buffers, UNIFORM_STRIDE, largest_binding};
 use clock::{Queries, Recorder, TIMES_BYTES};
@@ -32,10 +33,6 @@ use rayon::prelude::*;
 use std::time::Instant;
 use upload::Upload;
 
-/// The smallest α cut-off that is told from 0, as on the CPU.
-const ALPHA_FLOOR: f64 = 1e-30;
-/// α never reaches 1, as on the CPU.
-const ALPHA_CEILING: f64 = 1.0 - 1e-6;
 /// Planes of a picture: red, green, blue, alpha, depth.
 const PLANES: usize = 5;
 /// Bit of the view's flags in project.wgsl.
@@ -47,18 +44,7 @@ const FIRST_PAIRS: (usize, usize) = (4, 1 << 16);
 /// Workgroups of one dispatch in one direction (WebGPU's default limit).
 const MOST_GROUPS: usize = 65_535;
 
-/// Whether a scene's tables change between renders.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Tables {
-    /// Everything is sent for every picture.
-    Changing,
-    /// A layer's own SH table ([`crate::scene::Color::Sh`] with `base`) that lies at the same address and has the same
-    /// size as in the last render is the same table, and is not sent again: right for a scene that is played, wrong
-    /// for one that learns. Everything else of an instant is sent all the same.
-    Constant,
-}
-
-/// What the last render did.
+/// Counts of the last render.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct GpuStats {
     /// Splats given.
@@ -78,7 +64,7 @@ pub struct GpuRenderer {
     pub config: RenderConfig,
     /// Whether tables are sent for every picture.
     pub tables: Tables,
-    /// What times the stages.
+    /// Source of the stages' times.
     pub clock: StageClock,
     gpu: Gpu,
     kernels: Kernels,
@@ -137,34 +123,20 @@ impl GpuRenderer {
         self.buffers.bytes() + self.upload.bytes()
     }
 
-    /// Draws `splats` as `camera` (a pinhole) sees them over `background`, as [`crate::render::Renderer::render`] does;
-    /// `out.extra` becomes empty.
-    ///
-    /// Errors: the scene has a head; it or the picture is too large for WebGPU's limits (the message says what), or the
-    /// driver failed;
-    /// `out` means nothing then, and the CPU can draw instead.
-    pub fn render(
-        &mut self,
-        splats: &Splats<'_, f32>,
-        camera: &Camera,
-        background: [f32; 3],
-        out: &mut Image<f32>,
-    ) -> Result<()> {
-        if splats.head.is_some() {
-            return Err(Error::new(ErrorKind::Unsupported, "the GPU does not draw scenes with a pixel head")
-                .remedy("Render on the CPU."));
-        }
+    /// Refuses what the shaders cannot do, without opening a GPU.
+    pub(crate) fn refuses(wanted: &Wanted) -> Result<()> {
+        let lacks = [
+            (wanted.head, "draw scenes with a pixel head"),
+            (wanted.extra, "blend further channels"),
+            (wanted.backward, "take gradients back"),
+        ];
+        lacks.iter().find(|(wanted, _)| *wanted).map_or(Ok(()), |(_, what)| Err(refusal("the GPU", what)))
+    }
+
+    /// Draws all bands of a picture that has pixels.
+    fn draw_bands(&mut self, shot: &Shot<'_, f32>, out: &mut Image<f32>) -> Result<()> {
         let start = Instant::now();
-        self.timings = GpuTimings::default();
-        let (n, w, h) = (splats.len(), camera.width, camera.height);
-        self.stats = GpuStats { splats: n, ..GpuStats::default() };
-        reshape(&mut out.color, 3, h, w);
-        reshape(&mut out.alpha, 1, h, w);
-        reshape(&mut out.depth, 1, h, w);
-        reshape(&mut out.extra, 0, h, w);
-        if w == 0 || h == 0 {
-            return Ok(());
-        }
+        let (n, w, h) = (self.stats.splats, shot.camera.width, shot.camera.height);
         let (across, down) = (w.div_ceil(TILE), h.div_ceil(TILE));
         // What is read back holds the planes and, behind them, a few numbers.
         let room = largest_binding(&self.gpu) - 4 * UNIFORM_STRIDE;
@@ -176,7 +148,7 @@ impl GpuRenderer {
             )
             .remedy("Render on the CPU."));
         }
-        self.upload.send(&self.gpu, splats, self.tables)?;
+        self.upload.send(&self.gpu, shot.splats, self.tables)?;
         let mut fresh = self.make_room_for_splats(n)?;
         self.timings.upload = start.elapsed().as_secs_f64() * 1e3;
         // Bands from the top: the last of the list comes first.
@@ -189,7 +161,7 @@ impl GpuRenderer {
                 self.groups = Some(Groups::new(&self.gpu, &self.kernels, &self.buffers));
                 fresh = false;
             }
-            self.write_uniforms(camera, background, band, across)?;
+            self.write_uniforms(shot, band, across)?;
             let pairs = self.draw(band, across, !projected, out)?;
             projected = true;
             if pairs <= self.pair_capacity() {
@@ -273,13 +245,13 @@ impl GpuRenderer {
     }
 
     /// Writes every uniform of a submission.
-    fn write_uniforms(&mut self, camera: &Camera, background: [f32; 3], band: Band, across: usize) -> Result<()> {
+    fn write_uniforms(&mut self, shot: &Shot<'_, f32>, band: Band, across: usize) -> Result<()> {
         let draws = &self.upload.draws;
         self.uniforms.clear();
         self.uniforms.resize((slot::PIECES + draws.len()) * UNIFORM_STRIDE as usize, 0);
         let capacity = self.pair_capacity() as u32;
         let out = &mut self.uniforms;
-        put(out, slot::VIEW, &view(camera, &self.config, self.stats.splats));
+        put(out, slot::VIEW, &view(shot, &self.config, self.stats.splats));
         put(out, slot::SCAN_VISIBLE, &[count::SPLATS as u32, count::VISIBLE as u32, 0, u32::MAX]);
         put(out, slot::SCAN_PAIRS, &[count::VISIBLE as u32, count::PAIRS as u32, 0, capacity]);
         for (pass, slot) in (slot::SORT_DEPTH..slot::SORT_TILE).enumerate() {
@@ -291,9 +263,9 @@ impl GpuRenderer {
         let [first, rows, across] = [band.first, band.rows, across].map(|v| v as u32);
         put(out, slot::BAND, &[first, rows, across, 0]);
         let c = &self.config;
-        let pixel_rows = pixel_rows(band, camera.height) as u32;
-        let limits = [c.alpha_max.min(ALPHA_CEILING) as f32, c.transmittance_min.max(0.0) as f32].map(f32::to_bits);
-        let [r, g, b] = background.map(f32::to_bits);
+        let pixel_rows = pixel_rows(band, shot.camera.height) as u32;
+        let limits = [c.alpha_limits()[1] as f32, c.transmittance_min.max(0.0) as f32].map(f32::to_bits);
+        let [r, g, b] = shot.background.map(f32::to_bits);
         put(out, slot::BLEND, &[r, g, b, limits[0], limits[1], first, pixel_rows, 0]);
         for (i, draw) in draws.iter().enumerate() {
             put(out, slot::PIECES + i, std::slice::from_ref(&draw.piece));
@@ -350,12 +322,53 @@ impl GpuRenderer {
     }
 }
 
-/// Copies the planes of a band into the picture, from pixel row `first` on.
+impl Backend<f32> for GpuRenderer {
+    fn can(&self, wanted: &Wanted) -> Result<()> {
+        Self::refuses(wanted)
+    }
+
+    /// Errors besides those of every backend: the scene or the picture is too large for WebGPU's limits.
+    fn render(&mut self, shot: &Shot<'_, f32>, out: &mut Image<f32>) -> Result<()> {
+        self.can(&shot.wanted())?;
+        let (n, w, h) = (shot.splats.len(), shot.camera.width, shot.camera.height);
+        self.timings = GpuTimings::default();
+        self.stats = GpuStats { splats: n, ..GpuStats::default() };
+        reshape(&mut out.color, 3, h, w);
+        reshape(&mut out.alpha, 1, h, w);
+        reshape(&mut out.depth, usize::from(shot.depth), h, w);
+        reshape(&mut out.extra, 0, h, w);
+        if w == 0 || h == 0 { Ok(()) } else { self.draw_bands(shot, out) }
+    }
+
+    fn vjp(
+        &mut self,
+        _: &Shot<'_, f32>,
+        _: &ImageGrads<'_, f32>,
+        _: &mut [Option<&mut Table<f32>>],
+        _: &mut RenderGrads<f32>,
+    ) -> Result<()> {
+        self.can(&Wanted { backward: true, ..Wanted::default() })
+    }
+
+    fn radii(&self) -> &[f32] {
+        &[]
+    }
+
+    fn config(&self) -> &RenderConfig {
+        &self.config
+    }
+
+    fn name(&self) -> &str {
+        self.gpu.name()
+    }
+}
+
+/// Copies the planes of a band into the picture, from pixel row `first` on; the depth only where it is drawn.
 fn read_planes(bytes: &[u8], first: usize, rows: usize, out: &mut Image<f32>) {
     let width = out.alpha.width;
     let Image { color, alpha, depth, .. } = out;
     let pixels = color.height * width;
-    let targets = color.data.chunks_mut(pixels).chain([&mut alpha.data[..], &mut depth.data[..]]);
+    let targets = color.data.chunks_mut(pixels).chain([&mut alpha.data[..]]).chain(depth.data.chunks_mut(pixels));
     let sources = bytes.chunks(4 * width * rows);
     let pairs: Vec<_> = targets.zip(sources).collect();
     pairs.into_par_iter().for_each(|(target, source)| {
@@ -374,7 +387,7 @@ fn plane_bytes(band: Band, width: usize) -> u64 {
     (4 * PLANES * width * band.rows * TILE) as u64
 }
 
-/// Where the counts begin in what the CPU reads.
+/// First byte of the counts in the memory that the CPU reads.
 fn counts_at(planes: u64) -> u64 {
     planes.next_multiple_of(UNIFORM_STRIDE)
 }
@@ -391,7 +404,8 @@ fn put<T: bytemuck::NoUninit>(out: &mut [u8], slot: usize, data: &[T]) {
 }
 
 /// `struct View` of project.wgsl, as the bits of its 32 numbers.
-fn view(camera: &Camera, config: &RenderConfig, splats: usize) -> [u32; 32] {
+fn view(shot: &Shot<'_, f32>, config: &RenderConfig, splats: usize) -> [u32; 32] {
+    let camera = shot.camera;
     let pose = &camera.cam_from_world;
     let (r, t, k, center) = (&pose.rotation, &pose.translation, &camera.intrinsics, camera.center());
     let mut out = [0; 32];
@@ -403,13 +417,12 @@ fn view(camera: &Camera, config: &RenderConfig, splats: usize) -> [u32; 32] {
         out[24 + column] = (center[column] as f32).to_bits();
     }
     out[15] = 1f32.to_bits();
-    let alpha_min = config.alpha_min.max(ALPHA_FLOOR);
     let numbers = [k.fx, k.fy, k.cx, k.cy, camera.width as f64, camera.height as f64, camera.near, config.low_pass];
     for (to, v) in out[16..24].iter_mut().zip(numbers) {
         *to = (v as f32).to_bits();
     }
-    out[27] = (alpha_min as f32).to_bits();
-    out[28] = config.sh_degree.min(crate::math::sh::MAX_DEGREE) as u32;
+    out[27] = (config.alpha_limits()[0] as f32).to_bits();
+    out[28] = shot.sh_degree.min(crate::math::sh::MAX_DEGREE) as u32;
     out[29] = splats as u32;
     out[31] = if config.antialias == Antialias::On { FLAG_ANTIALIAS } else { 0 };
     out

@@ -8,7 +8,7 @@ use super::*;
 use crate::math::{Rng, Se3, sym3};
 use crate::render::Renderer;
 use crate::scene::splats::{Part, SPLAT_COLUMNS};
-use crate::scene::{Color, Rows, Table};
+use crate::scene::{Camera, Color, Rows, Splats};
 use buffers::Grown;
 use std::ops::{Deref, DerefMut};
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -126,10 +126,14 @@ fn skewed(width: usize, height: usize) -> Camera {
     camera
 }
 
-fn on_cpu(splats: &Splats<'_, f32>, camera: &Camera, config: &RenderConfig) -> (Renderer<f32>, Image<f32>) {
-    let config = RenderConfig { depth: true, ..*config };
-    let (mut renderer, mut image) = (Renderer::new(config), Image::default());
-    renderer.render(splats, camera, BACKGROUND, None, &mut image);
+/// Everything that the GPU draws.
+fn shot<'a>(splats: &'a Splats<'a, f32>, camera: &'a Camera) -> Shot<'a> {
+    Shot { depth: true, ..Shot::new(splats, camera, BACKGROUND) }
+}
+
+fn on_cpu(shot: &Shot<'_>, config: &RenderConfig) -> (Renderer<f32>, Image<f32>) {
+    let (mut renderer, mut image) = (Renderer::new(*config), Image::default());
+    Backend::render(&mut renderer, shot, &mut image).expect("the CPU draws everything");
     (renderer, image)
 }
 

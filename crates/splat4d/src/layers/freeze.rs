@@ -1,10 +1,9 @@
 //! A moving scene at one moment as plain Gaussians: what a 3DGS file can hold.
 
-use super::{Instant, Layer, LayerTape, Scene};
+use super::{Evaluation, Layer, LayerTape, Scene};
 use crate::Result;
 use crate::math::sh::MAX_COEFFS;
 use crate::math::{quat, sym3};
-use crate::motion::Cache;
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::splats::{COV, SPLAT_OPACITY};
 use crate::scene::{Color, GEOMETRY, LifeKind, Params, Rows, SH, Space, Time};
@@ -23,13 +22,13 @@ const OPACITY_MARGIN: f32 = 1e-6;
 /// Errors: the scene has a head, without which its Gaussians look different.
 pub fn freeze(scene: &Scene<f32>, time: Time) -> Result<Params<f32>> {
     scene.without_head("plain Gaussians")?;
-    let mut instant = Instant::default();
+    let mut instant = Evaluation::default();
     scene.at(time, &mut instant);
     let coefficients = scene.layers.iter().map(|l| l.params[SH].width() / 3).max().unwrap_or(1).clamp(1, MAX_COEFFS);
-    let rows = instant.tapes.iter().map(|t| t.out().rows()).sum();
+    let rows = instant.tapes().map(|t| t.out().rows()).sum();
     let mut params = Params::new(rows, coefficients, LifeKind::Infinite.columns());
     let mut first = 0;
-    for (layer, tape) in scene.layers.iter().zip(&instant.tapes) {
+    for (layer, tape) in scene.layers.iter().zip(instant.tapes()) {
         write(layer, tape, coefficients, first, &mut params);
         first += tape.out().rows();
     }
@@ -39,14 +38,10 @@ pub fn freeze(scene: &Scene<f32>, time: Time) -> Result<Params<f32>> {
 /// These rows of a layer (strictly increasing) as they are at `time`, life included, as a still layer's parameters; of
 /// Gaussians with features only the base colour is left.
 pub fn freeze_rows(layer: &Layer<f32>, rows: &[u32], time: Time) -> Params<f32> {
-    let mut tape = LayerTape::default();
-    tape.ask(Space::Gaussians, Rows::Some(rows), time);
-    let mut cache = Cache::default();
-    layer.motion.prepare(&layer.params, &[tape.question(&layer.params)], &mut cache);
-    layer.at(&cache, &mut tape);
+    let seen = Evaluation::of_layer(layer, Space::Gaussians, Rows::Some(rows), time);
     let coefficients = (layer.params[SH].width() / 3).clamp(1, MAX_COEFFS);
     let mut params = Params::new(rows.len(), coefficients, LifeKind::Infinite.columns());
-    write(layer, &tape, coefficients, 0, &mut params);
+    write(layer, seen.tape(0), coefficients, 0, &mut params);
     params
 }
 

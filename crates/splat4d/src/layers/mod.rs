@@ -2,12 +2,14 @@
 
 mod chart;
 mod envelope;
+mod evaluation;
 mod freeze;
 #[cfg(test)]
 mod tests;
 mod turn;
 
 pub use chart::{to_native4d, to_spacetime};
+pub use evaluation::{Evaluation, sweep};
 pub use freeze::{freeze, freeze_rows};
 pub use turn::rotation_between;
 
@@ -323,19 +325,6 @@ pub struct Scene<F: Real = f32> {
     pub head: Head,
 }
 
-/// A scene at one instant: a tape a layer, reused from frame to frame.
-#[derive(Debug)]
-pub struct Instant<F = f32> {
-    /// One a layer.
-    pub tapes: Vec<LayerTape<F>>,
-}
-
-impl<F: Real> Default for Instant<F> {
-    fn default() -> Self {
-        Self { tapes: Vec::new() }
-    }
-}
-
 impl<F: Real> Scene<F> {
     /// Gaussians in all layers.
     pub fn len(&self) -> usize {
@@ -347,21 +336,18 @@ impl<F: Real> Scene<F> {
         self.len() == 0
     }
 
-    /// The scene at time t, for playback: only Gaussians alive then.
-    pub fn at(&self, t: Time, instant: &mut Instant<F>) {
-        instant.tapes.resize_with(self.layers.len(), LayerTape::default);
-        for (layer, tape) in self.layers.iter().zip(&mut instant.tapes) {
-            let mut cache = Cache::default();
-            tape.ask_active(layer, t);
-            layer.motion.prepare(&layer.params, &[tape.question(&layer.params)], &mut cache);
-            layer.at(&cache, tape);
+    /// The scene at time t, for playback: only Gaussians alive then. Question i of `evaluation` becomes layer i.
+    pub fn at(&self, t: Time, evaluation: &mut Evaluation<F>) {
+        evaluation.begin();
+        for (index, layer) in self.layers.iter().enumerate() {
+            evaluation.ask_active(index, layer, t);
         }
+        evaluation.answer(&self.layers);
     }
 
-    /// The splats that [`at`](Self::at) left in `instant`.
-    pub fn splats<'a>(&'a self, instant: &'a Instant<F>) -> Splats<'a, F> {
-        let parts = self.layers.iter().zip(&instant.tapes).map(|(l, t)| l.part(t)).collect();
-        Splats { parts, head: self.head_weights() }
+    /// The splats that [`at`](Self::at) left in `evaluation`.
+    pub fn splats<'a>(&'a self, evaluation: &'a Evaluation<F>) -> Splats<'a, F> {
+        evaluation.splats(self, evaluation.tapes().next().map_or(Time(0.0), |tape| tape.time()))
     }
 
     /// The layer that holds the head's weights, and their places there; `None`: there is no head.

@@ -217,7 +217,7 @@ fn a_layer_is_seen_in_its_span_only() {
     }
     // A scene's splats at a time outside are those of the other layers.
     let scene = Scene { layers: vec![a, layer(&Spec::Still, LifeKind::Infinite, 3, 4)], ..Scene::default() };
-    let mut instant = Instant::default();
+    let mut instant = Evaluation::default();
     scene.at(Time(0.6), &mut instant);
     assert_eq!(scene.splats(&instant).len(), 3);
     scene.at(Time(0.3), &mut instant);

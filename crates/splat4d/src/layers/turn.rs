@@ -162,7 +162,7 @@ fn product(a: [f64; 4], b: [f32; 4]) -> [f32; 4] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::layers::{Head, Instant, Layer};
+    use crate::layers::{Evaluation, Head, Layer};
     use crate::math::{Rng, Se3};
     use crate::motion::build;
     use crate::motion::spacetime::FeatureSpec;
@@ -202,7 +202,7 @@ mod tests {
 
     fn draw(scene: &Scene<f32>, pose: Se3, time: f64) -> Vec<f32> {
         let camera = Camera::with_fov_y(pose, 0.9, 48, 40);
-        let (mut instant, mut image) = (Instant::default(), Image::default());
+        let (mut instant, mut image) = (Evaluation::default(), Image::default());
         scene.at(Time(time), &mut instant);
         Renderer::new(RenderConfig::default()).render(&scene.splats(&instant), &camera, [0.2; 3], None, &mut image);
         image.color.data

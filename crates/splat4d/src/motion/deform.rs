@@ -21,7 +21,7 @@ use super::still::Still;
 use super::{At, Cache, Motion, Slot, Spec, Tape};
 use crate::math::{Real, Rng};
 use crate::nn::encoding::{MAX_LEVELS, encode, encode_backward, encoded};
-use crate::nn::{HashGrid, HashShape, Kept, Mlp, MlpShape};
+use crate::nn::{HashGrid, HashShape, InputGrad, Kept, Mlp, MlpShape, Passed};
 use crate::scene::{GEOMETRY, Grads, Key, Params, Space, SplatGrads, Table, Time};
 use crate::{Error, Result};
 use rayon::prelude::*;
@@ -337,17 +337,19 @@ impl Deform {
         let Own { x, shifts, kept, d_heads, .. } = &*own;
         match &self.eyes {
             Eyes::Encoded { t_levels, time, enter, again, .. } => {
-                let d_shifts = self.trunk.backward_shifted(q.p, x, shifts, kept, d_heads, None, d);
+                let passed = Passed { x, shifts, kept: Some(kept) };
+                let d_shifts = self.trunk.backward(q.p, passed, d_heads, InputGrad::Skip, d);
                 let mut d_made = vec![F::ZERO; own.time[1].len()];
                 let parts = [Some((enter, 0)), again.as_ref().map(|(map, at)| (map, *at))];
                 for (map, at) in parts.into_iter().flatten() {
                     let mut part = vec![F::ZERO; d_made.len()];
-                    map.backward(q.p, &own.time[1], &d_shifts[at], Some(&mut part), d);
+                    map.backward(q.p, Passed::of(&own.time[1]), &d_shifts[at], InputGrad::Overwrite(&mut part), d);
                     d_made.iter_mut().zip(part).for_each(|(sum, x)| *sum += x);
                 }
                 if let Some(time) = time {
                     let mut d_seen = vec![F::ZERO; own.time[0].len()];
-                    time.backward_of(q.p, &own.time[0], &own.time_kept, &d_made, Some(&mut d_seen), d);
+                    let passed = Passed::kept(&own.time[0], &own.time_kept);
+                    time.backward(q.p, passed, &d_made, InputGrad::Overwrite(&mut d_seen), d);
                     d_made = d_seen;
                 }
                 let mut d_t = [F::ZERO];
@@ -357,8 +359,8 @@ impl Deform {
             Eyes::Hashed { grids } => {
                 let inputs = self.trunk.shape().inputs;
                 own.d_x.resize(own.x.len(), F::ZERO);
-                let d_x = Some(own.d_x.as_mut_slice());
-                let _ = self.trunk.backward_shifted(q.p, &own.x, &[], &own.kept, &own.d_heads, d_x, d);
+                let d_input = InputGrad::Overwrite(&mut own.d_x);
+                self.trunk.backward(q.p, Passed::kept(&own.x, &own.kept), &own.d_heads, d_input, d);
                 own.d_points.clear();
                 own.d_points.resize(own.points.len(), F::ZERO);
                 let mut first = 0;

@@ -14,7 +14,7 @@ use super::still::{Still, activate_backward_lanes, activate_lanes};
 use super::{At, Cache, Motion, Spec, Tape};
 use crate::math::{Real, Rng};
 use crate::nn::hexplane::{LANES, Lines, PlaneShape, Planes};
-use crate::nn::{Kept, Mlp, MlpShape};
+use crate::nn::{InputGrad, Kept, Mlp, MlpShape, Passed};
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::table::TableMut;
 use crate::scene::{BLOCK, Color, GEOMETRY, Grads, Params, Rows, SH, SplatGrads, Table};
@@ -385,11 +385,8 @@ impl<F: Real> Motion<F> for Hexplane {
                 let (Some(head), false) = (head, d_delta.is_empty()) else { continue };
                 let width = head.shape().outputs;
                 let d_delta = &d_delta[from * width..to * width];
-                if std::mem::take(&mut first) {
-                    head.backward_of(q.p, &work.hidden, kept, d_delta, Some(d_hidden), d);
-                } else {
-                    head.backward_adding(q.p, &work.hidden, kept, d_delta, d_hidden, d);
-                }
+                let d_input = if std::mem::take(&mut first) { InputGrad::Overwrite } else { InputGrad::Add };
+                head.backward(q.p, Passed::kept(&work.hidden, kept), d_delta, d_input(d_hidden), d);
             }
             if first {
                 // Without heads nothing depends on the planes.
@@ -399,7 +396,8 @@ impl<F: Real> Motion<F> for Hexplane {
             pairs.for_each(|(d, h)| {
                 d.iter_mut().zip(h).for_each(|(d, h)| *d = if *h > F::ZERO { *d } else { F::ZERO });
             });
-            self.trunk.backward_of(q.p, &work.features, &work.trunk, d_hidden, Some(d_features), d);
+            let d_input = InputGrad::Overwrite(d_features);
+            self.trunk.backward(q.p, Passed::kept(&work.features, &work.trunk), d_hidden, d_input, d);
             let d_x = &mut d_x[from..to];
             d_time += self.planes.backward(q.p, &lines, self.spec.unlocked, x, d_features, d_x, waiting, d).f64();
         }

@@ -105,7 +105,7 @@ impl PartialEq for Edge {
 
 impl Eq for Edge {}
 
-/// What a neighbourhood knows of its axes.
+/// Axes of a neighbourhood and their certainty.
 struct Axes {
     /// Unit eigenvectors, of the largest moment first.
     vectors: [[f64; 3]; 3],
@@ -143,7 +143,7 @@ impl Axes {
         Self { vectors, gaps: [gap(values[0], values[1]), gap(values[1], values[2])], skews }
     }
 
-    /// How far the least certain thing is from being ill-defined.
+    /// Distance of the least certain part from being ill-defined.
     fn certainty(&self) -> f64 {
         self.gaps[0].min(self.gaps[1]).min(self.skews[0].abs()).min(self.skews[1].abs())
     }

@@ -226,7 +226,7 @@ impl HashGrid {
     }
 }
 
-/// What is done with the rows of one level, with `N` features an entry; 0: as many as it says.
+/// Work on the rows of one level, with `N` features an entry; 0: as many as it says.
 trait LevelPass: Sized {
     fn pass<const N: usize>(self);
 }
@@ -359,7 +359,7 @@ struct Columns<'a, F> {
     width: usize,
 }
 
-/// Where a point lies in a level.
+/// Place of a point in a level.
 struct Cell<F, const D: usize> {
     /// Its lowest corner.
     low: [u32; D],

@@ -23,7 +23,7 @@ use serde::{Deserialize, Serialize};
 
 /// The two axes of every plane, first axis contiguous; axis 3 is time.
 pub const AXES: [[usize; 2]; 6] = [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]];
-/// What the planes are called, in the order of [`AXES`].
+/// Names of the planes, in the order of [`AXES`].
 pub const NAMES: [&str; 6] = ["xy", "xz", "xt", "yz", "yt", "zt"];
 /// The planes without time.
 pub const SPATIAL: [usize; 3] = [0, 1, 3];
@@ -455,7 +455,7 @@ impl<F: Real> Kernel for Backward<'_, F> {
     }
 }
 
-/// Where the gradient of one plane goes.
+/// Target of the gradient of one plane.
 struct Sink<'a, F> {
     level: usize,
     plane: usize,

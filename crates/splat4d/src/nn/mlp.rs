@@ -88,7 +88,7 @@ pub struct Mlp {
     columns: Vec<String>,
 }
 
-/// What a forward pass remembers for its backward: the hidden activations of as many rows as [`Kept::BYTES`] hold. The
+/// Record of a forward pass for its backward: the hidden activations of as many rows as [`Kept::BYTES`] hold. The
 /// others are computed again, to the same bits.
 #[derive(Clone, Debug, Default)]
 pub struct Kept<F> {
@@ -99,6 +99,40 @@ pub struct Kept<F> {
 impl<F> Kept<F> {
     /// Memory for activations: 65,000 rows of 8x256. Writing and reading them costs a fifth of computing them again.
     pub const BYTES: usize = 512 << 20;
+}
+
+/// A forward pass, for its backward.
+#[derive(Clone, Copy, Debug)]
+pub struct Passed<'a, F> {
+    /// Its input, [n, inputs].
+    pub x: &'a [F],
+    /// Its shifts; see [`Mlp::forward_shifted`].
+    pub shifts: &'a [Vec<F>],
+    /// The activations that it kept, of the same input, shifts and weights; without them they are computed again.
+    pub kept: Option<&'a Kept<F>>,
+}
+
+impl<'a, F> Passed<'a, F> {
+    /// A pass without shifts, of which nothing was kept.
+    pub fn of(x: &'a [F]) -> Self {
+        Self { x, shifts: &[], kept: None }
+    }
+
+    /// A pass without shifts, of which activations were kept.
+    pub fn kept(x: &'a [F], kept: &'a Kept<F>) -> Self {
+        Self { x, shifts: &[], kept: Some(kept) }
+    }
+}
+
+/// The gradient to a network's input, [n, inputs].
+#[derive(Debug)]
+pub enum InputGrad<'a, F> {
+    /// Not wanted.
+    Skip,
+    /// Written.
+    Overwrite(&'a mut [F]),
+    /// Added to: for several networks that read the same input.
+    Add(&'a mut [F]),
 }
 
 /// Numbers in one layer's activations of a chunk: half of a 1 MB second-level cache in f32, where weights and gradients
@@ -156,7 +190,7 @@ impl Mlp {
         self.forward_keeping(p, x, out, &mut Kept { data: Vec::new(), chunks: usize::MAX });
     }
 
-    /// As [`forward`](Self::forward), and remembers activations for [`backward_of`](Self::backward_of).
+    /// As [`forward`](Self::forward), and remembers activations for [`backward`](Self::backward).
     pub fn forward_keeping<F: Real>(&self, p: &Params<F>, x: &[F], out: &mut [F], kept: &mut Kept<F>) {
         self.forward_shifted(p, x, &[], out, kept);
     }
@@ -194,67 +228,21 @@ impl Mlp {
                 };
                 self.activate(p, &biases, x, hidden);
                 let last = self.shape.layers;
-                self.map(p, &biases, last, self.input(last, x, hidden), out, outputs, false);
+                self.map(p, &biases, last, self.input(last, x, hidden), out);
             },
         );
     }
 
-    /// The VJP of [`forward`](Self::forward): adds weight gradients to `d`, overwrites d_x [n, inputs] if wanted.
-    pub fn backward<F: Real>(&self, p: &Params<F>, x: &[F], d_out: &[F], d_x: Option<&mut [F]>, d: &mut Grads<F>) {
-        self.backward_of(p, x, &Kept::default(), d_out, d_x, d);
-    }
-
-    /// The VJP of [`forward_keeping`](Self::forward_keeping), with what it kept of the same x and weights.
-    pub fn backward_of<F: Real>(
+    /// The VJP of a forward pass: adds weight gradients to `d` and returns the gradient to every map's shift.
+    pub fn backward<F: Real>(
         &self,
         p: &Params<F>,
-        x: &[F],
-        kept: &Kept<F>,
+        passed: Passed<'_, F>,
         d_out: &[F],
-        d_x: Option<&mut [F]>,
-        d: &mut Grads<F>,
-    ) {
-        let _ = self.backward_all(p, x, &[], kept, d_out, d_x, false, d);
-    }
-
-    /// As [`backward_of`](Self::backward_of), but adds to d_x: for several networks that read the same x.
-    pub fn backward_adding<F: Real>(
-        &self,
-        p: &Params<F>,
-        x: &[F],
-        kept: &Kept<F>,
-        d_out: &[F],
-        d_x: &mut [F],
-        d: &mut Grads<F>,
-    ) {
-        let _ = self.backward_all(p, x, &[], kept, d_out, Some(d_x), true, d);
-    }
-
-    /// The VJP of [`forward_shifted`](Self::forward_shifted); returns the gradient to every map's shift.
-    pub fn backward_shifted<F: Real>(
-        &self,
-        p: &Params<F>,
-        x: &[F],
-        shifts: &[Vec<F>],
-        kept: &Kept<F>,
-        d_out: &[F],
-        d_x: Option<&mut [F]>,
+        d_x: InputGrad<'_, F>,
         d: &mut Grads<F>,
     ) -> Vec<Vec<F>> {
-        self.backward_all(p, x, shifts, kept, d_out, d_x, false, d)
-    }
-
-    fn backward_all<F: Real>(
-        &self,
-        p: &Params<F>,
-        x: &[F],
-        shifts: &[Vec<F>],
-        kept: &Kept<F>,
-        d_out: &[F],
-        d_x: Option<&mut [F]>,
-        add: bool,
-        d: &mut Grads<F>,
-    ) -> Vec<Vec<F>> {
+        let Passed { x, shifts, kept } = passed;
         let n = self.rows(x, d_out);
         let biases = self.biases(p, shifts);
         let rows = self.chunk_rows();
@@ -263,7 +251,11 @@ impl Mlp {
         let inputs = self.shape.inputs;
         // Every run is so many whole chunks, whoever works on it.
         let ends: Vec<usize> = (0..=runs).map(|r| (r * chunks / runs.max(1) * rows).min(n)).collect();
-        let mut rest = d_x.unwrap_or(&mut []);
+        let (mut rest, overwrite) = match d_x {
+            InputGrad::Skip => (&mut [][..], false),
+            InputGrad::Overwrite(d_x) => (d_x, true),
+            InputGrad::Add(d_x) => (d_x, false),
+        };
         let wanted = !rest.is_empty();
         assert!(!wanted || rest.len() == x.len(), "a gradient has the shape of what it is of");
         let mut parts: Vec<&mut [F]> = Vec::new();
@@ -283,11 +275,12 @@ impl Mlp {
                     let d_out = &d_out[first * self.shape.outputs..][..count * self.shape.outputs];
                     let from = (first - ends[r]) * inputs;
                     let d_x = if wanted { &mut d_x[from..from + count * inputs] } else { &mut [][..] };
-                    if !add {
+                    if overwrite {
                         d_x.fill(F::ZERO);
                     }
                     let hidden = self.hidden();
-                    let store = (first / rows < kept.chunks).then(|| &kept.data[first * hidden..][..count * hidden]);
+                    let store = kept.filter(|kept| first / rows < kept.chunks);
+                    let store = store.map(|kept| &kept.data[first * hidden..][..count * hidden]);
                     run.chunk(p, &biases, x, store, d_out, d_x);
                 }
                 run.d_weights
@@ -375,7 +368,7 @@ impl Mlp {
         for i in 0..self.shape.layers {
             let stride = self.maps[i + 1].inputs;
             let (next, tail) = rest.split_at_mut(count * stride);
-            self.map(p, biases, i, before, next, stride, true);
+            self.map(p, biases, i, before, next);
             if stride > self.shape.width {
                 for (row, x) in next.chunks_exact_mut(stride).zip(x.chunks_exact(self.shape.inputs)) {
                     row[self.shape.width..].copy_from_slice(x);
@@ -385,17 +378,10 @@ impl Mlp {
         }
     }
 
-    /// out = x Wᵢᵀ + bᵢ, clamped at zero if `relu`, in rows `stride` numbers apart.
-    fn map<F: Real>(
-        &self,
-        p: &Params<F>,
-        biases: &[Vec<F>],
-        i: usize,
-        x: &[F],
-        out: &mut [F],
-        stride: usize,
-        relu: bool,
-    ) {
+    /// out = x Wᵢᵀ + bᵢ: hidden layers are clamped at zero, in rows as far apart as the next map's inputs.
+    fn map<F: Real>(&self, p: &Params<F>, biases: &[Vec<F>], i: usize, x: &[F], out: &mut [F]) {
+        let next = self.maps.get(i + 1);
+        let (stride, relu) = (next.map_or(self.shape.outputs, |map| map.inputs), next.is_some());
         let Map { weight, inputs, outputs, .. } = self.maps[i];
         let w = Matrix::new(p[weight].data(), outputs, inputs, inputs);
         product(Matrix::new(x, x.len() / inputs, inputs, inputs), w.t(), out, stride, false);

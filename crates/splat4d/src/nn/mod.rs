@@ -1,4 +1,4 @@
-//! What learns functions: perceptrons, positional encodings and hash grids, each with its hand-written backward.
+//! Learnable functions: perceptrons, positional encodings and hash grids, each with its hand-written backward.
 //!
 //! Weights are `Space::Fixed` tables of one column, so that matrix products read them as they lie. Results are the same
 //! bits for any number of threads: work is cut by sizes alone, and partial gradients are added in a fixed order.
@@ -16,4 +16,4 @@ mod tests;
 pub mod vector;
 
 pub use hashgrid::{HashGrid, HashShape};
-pub use mlp::{Kept, Mlp, MlpShape};
+pub use mlp::{InputGrad, Kept, Mlp, MlpShape, Passed};

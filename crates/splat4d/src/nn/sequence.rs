@@ -209,7 +209,7 @@ pub struct Scans {
     shape: ssm::Shape,
     /// One of the past, or one of the past and one of the future.
     ways: Vec<(Direction, Range<usize>)>,
-    /// Which of the net's discretised layers is the first one's.
+    /// Index of the first one among the net's discretised layers.
     first: usize,
 }
 
@@ -224,7 +224,7 @@ impl Scans {
         Self { shape, ways: ways.iter().map(|&w| place(w)).collect(), first }
     }
 
-    /// How many there are.
+    /// Number of scans.
     pub fn count(&self) -> usize {
         self.ways.len()
     }
@@ -280,7 +280,7 @@ impl Scans {
     }
 }
 
-/// What a block's backward needs of its forward.
+/// Record of a block's forward for its backward.
 #[derive(Clone, Debug, Default)]
 pub struct BlockTape<F> {
     unit: Vec<Lane<F>>,

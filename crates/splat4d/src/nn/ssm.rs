@@ -99,7 +99,7 @@ impl<'a, F> Slices<'a, F> {
     }
 }
 
-/// Which way a scan goes.
+/// Direction of a scan.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Direction {
     /// From the first tick to the last: sees the past.
@@ -108,7 +108,7 @@ pub enum Direction {
     Backward,
 }
 
-/// What the scan needs of a layer, for all ticks: Ā and B̄ \[gaps,H,N\], C \[H,N\], D \[H\]; also the gradient to it.
+/// Discretised parameters of a layer, for all ticks: Ā and B̄ \[gaps,H,N\], C \[H,N\], D \[H\]; also the gradient to it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Discrete<F> {
     shape: Shape,
@@ -120,7 +120,7 @@ pub struct Discrete<F> {
     skip: Vec<F>,
 }
 
-/// What zero-order hold makes of one state over one gap, in f64.
+/// Zero-order hold of one state over one gap, in f64.
 struct Hold {
     step: f64,
     z: Complex<f64>,

@@ -1,4 +1,4 @@
-//! What tests of layers share: numbers to feed them, and differences to check their gradients.
+//! Shared parts of the tests of layers: numbers to feed them, and differences to check their gradients.
 
 use super::ssm::{LANES, Lane};
 use crate::math::Rng;

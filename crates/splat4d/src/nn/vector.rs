@@ -183,7 +183,7 @@ pub struct VectorBlock {
     gates: [Range<usize>; 2],
 }
 
-/// What a block's backward needs of its forward.
+/// Record of a block's forward for its backward.
 #[derive(Clone, Debug, Default)]
 pub struct VectorTape<F> {
     unit: Vec<Lane<F>>,

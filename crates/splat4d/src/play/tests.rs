@@ -1,6 +1,6 @@
 use super::*;
 use crate::format::playback::{Draft, Node, Primitive, WriteConfig, read, write};
-use crate::layers::Instant;
+use crate::layers::Evaluation;
 use crate::math::Rng;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -65,7 +65,7 @@ fn a_player_shows_exactly_what_the_scene_holds() {
     let mut whole = Player::of_scene(&scene);
     let length = file.len() as u64;
     let mut streamed = Player::open(Box::new(Counted(file, Arc::default())), length, 1).unwrap();
-    let mut instant = Instant::default();
+    let mut instant = Evaluation::default();
     let mut shown = 0;
     for t in [0.0, 0.999, 1.0, 5.5, 5.99, 2.2, CLIP, 0.1] {
         scene.at(Time(t), &mut instant);

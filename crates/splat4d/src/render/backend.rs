@@ -40,10 +40,21 @@ impl<'a, F: Real> Shot<'a, F> {
         Self { splats, camera, background, extra: None, sh_degree: sh::MAX_DEGREE, depth: false }
     }
 
-    /// What a backend must be able to do to draw it.
+    /// Abilities that drawing it takes.
     pub fn wanted(&self) -> Wanted {
         Wanted { extra: self.extra.is_some(), head: self.splats.head.is_some(), backward: false }
     }
+}
+
+/// Whether a scene's tables change between renders.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Tables {
+    /// Everything is sent to a device for every picture.
+    Changing,
+    /// A layer's own SH table ([`crate::scene::Color::Sh`] with `base`) that lies at the same address and has the same
+    /// size as in the last render is the same table, and is not sent again: right for a scene that is played, wrong
+    /// for one that learns. Everything else of an instant is sent all the same.
+    Constant,
 }
 
 /// Draws splats and takes gradients back; memory is reused from picture to picture.
@@ -93,8 +104,7 @@ impl<F: Real> Backend<F> for Renderer<F> {
     }
 
     fn render(&mut self, shot: &Shot<'_, F>, out: &mut Image<F>) -> Result<()> {
-        (self.config.sh_degree, self.config.depth) = (shot.sh_degree, shot.depth);
-        Renderer::render(self, shot.splats, shot.camera, shot.background, shot.extra, out);
+        self.draw(shot, out);
         Ok(())
     }
 
@@ -105,7 +115,7 @@ impl<F: Real> Backend<F> for Renderer<F> {
         d_sh: &mut [Option<&mut Table<F>>],
         d: &mut RenderGrads<F>,
     ) -> Result<()> {
-        self.backward(shot.splats, shot.camera, shot.background, shot.extra, grads, d_sh, d);
+        self.draw_backward(shot, grads, d_sh, d);
         Ok(())
     }
 

@@ -1,4 +1,4 @@
-//! Which splats touch which 32² bin of the picture, nearest first.
+//! Lists of the splats that touch each 32² bin of the picture, nearest first.
 //!
 //! A deterministic two-pass count over fixed chunks of splats, then one sort a bin: a bin's keys stay in cache, where a
 //! global sort would scatter. Order inside a bin is (depth, number of the splat).
@@ -25,7 +25,7 @@ const LARGE: u16 = 1 << 15;
 /// gradients, so this is about 2 GiB; ordinary scenes of a million splats have a fifth of it.
 pub const PAIR_BUDGET: usize = 1 << 24;
 
-/// What the lists need of one splat: the bins that it can touch, and its depth. Plain old data, 16 bytes.
+/// One splat's entry for the lists: the bins that it can touch, and its depth. Plain old data, 16 bytes.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Footprint {
@@ -75,7 +75,7 @@ impl Footprint {
         }
     }
 
-    /// How many touched bins come before bin (x, y), which is one of them.
+    /// Number of touched bins that come before bin (x, y), which is one of them.
     #[inline(always)]
     pub fn rank(&self, x: usize, y: usize) -> usize {
         match self.large() {
@@ -87,7 +87,7 @@ impl Footprint {
         }
     }
 
-    /// How many touched bins have a number below `bin`, bins being numbered by rows of `across`.
+    /// Number of touched bins that have a number below `bin`, bins being numbered by rows of `across`.
     #[inline(always)]
     fn below(&self, bin: usize, across: usize) -> usize {
         let y0 = usize::from(self.y0);

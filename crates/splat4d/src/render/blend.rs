@@ -14,9 +14,7 @@
 mod tests;
 
 use super::RenderConfig;
-use super::gather::{Record, SIDE, TILE, TILES};
-use super::project::ALPHA_FLOOR;
-use super::rasterize::{CHANNELS, PixelGrads};
+use super::gather::{CHANNELS, Record, SIDE, TILE, TILES};
 use super::simd::{Kernel, each, greatest, least, select};
 use crate::math::Real;
 use std::f64::consts::LN_2;
@@ -28,8 +26,6 @@ pub(super) const BATCH: usize = 64;
 const GROUP: usize = 16;
 /// Splats between two tests whether all pixels of a tile have stopped.
 const EXIT_EVERY: usize = 16;
-/// α never reaches 1, whatever the configuration: T must stay recoverable.
-const ALPHA_CEILING: f64 = 1.0 - 1e-6;
 /// The smallest T that is told from 0: the way back divides by it.
 const T_FLOOR: f64 = 1e-30;
 
@@ -80,10 +76,10 @@ pub(super) struct Limits<F> {
 
 impl<F: Real> Limits<F> {
     pub fn new(config: &RenderConfig) -> Self {
-        let log_max = F::of(config.alpha_max.min(ALPHA_CEILING).log2());
+        let [least, most] = config.alpha_limits();
         Self {
-            log_min: F::of(config.alpha_min.max(ALPHA_FLOOR).log2()),
-            log_max,
+            log_min: F::of(least.log2()),
+            log_max: F::of(most.log2()),
             t_min: F::of(config.transmittance_min.max(T_FLOOR)),
         }
     }
@@ -95,7 +91,7 @@ impl<F: Real> Limits<F> {
     }
 }
 
-/// What happens to a splat in a tile.
+/// Visitor of splats and tiles, front to back.
 pub(super) trait Visit<F: Real> {
     /// Blends record `i` of the batch into tile `t`.
     fn splat<const FMA: bool>(&mut self, t: usize, i: usize, record: &Record<F>);
@@ -356,6 +352,15 @@ const ABS: usize = LIGHT + CHANNELS;
 /// Numbers in a record.
 const NUMBERS: usize = ABS + 2;
 
+/// Gradients to the picture of one pass; `None` is zero.
+#[derive(Clone, Copy, Debug)]
+pub struct PixelGrads<'a, F = f32> {
+    /// To the channels with background, [height, width] each.
+    pub channels: [Option<&'a [F]>; CHANNELS],
+    /// To alpha = 1 − T.
+    pub alpha: Option<&'a [F]>,
+}
+
 /// Gradients of a (bin, splat) pair.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Pair<F>([F; NUMBERS]);
@@ -437,7 +442,7 @@ impl<F: Real> Kernel for Backward<'_, F> {
     }
 }
 
-/// What the way back carries for the pixels of a tile.
+/// State of the way back in the pixels of a tile.
 #[repr(C, align(64))]
 #[derive(Clone, Copy)]
 struct Back<F> {
@@ -467,7 +472,7 @@ impl<F: Real> Backward<'_, F> {
         let alpha_max = limits.log_max.blend_exp2::<FMA>();
         let sums = [[[F::ZERO; TILE]; NUMBERS]; BATCH];
         let mut visit =
-            Behind::<F, N, WITH_ABS> { backs: &mut backs, limits, alpha_max, alphas: zero, odds: zero, sums, out };
+            Returning::<F, N, WITH_ABS> { backs: &mut backs, limits, alpha_max, alphas: zero, odds: zero, sums, out };
         walk::<F, _, FMA>(self.records, open, &mut visit);
         d_background
     }
@@ -507,7 +512,8 @@ impl<F: Real> Backward<'_, F> {
     }
 }
 
-struct Behind<'a, F, const N: usize, const WITH_ABS: bool> {
+/// The way back through the tiles.
+struct Returning<'a, F, const N: usize, const WITH_ABS: bool> {
     backs: &'a mut [Back<F>; TILES],
     limits: Limits<F>,
     /// α's ceiling as the blend computes it.
@@ -532,7 +538,7 @@ pub(super) fn columns<F: Real, const N: usize>(lanes: [F; N]) -> [F; TILE] {
     out
 }
 
-impl<F: Real, const N: usize, const WITH_ABS: bool> Visit<F> for Behind<'_, F, N, WITH_ABS> {
+impl<F: Real, const N: usize, const WITH_ABS: bool> Visit<F> for Returning<'_, F, N, WITH_ABS> {
     #[inline(always)]
     fn splat<const FMA: bool>(&mut self, t: usize, i: usize, r: &Record<F>) {
         let (tx, ty, limits) = (t % SIDE, t / SIDE, self.limits);

@@ -3,8 +3,8 @@
 use super::RenderConfig;
 use super::bin::BIN;
 use super::blend::{Forward, Limits, Tile, Visit, begin, walk};
-use super::gather::{Record, SIDE, TILE, TILES};
-use super::rasterize::{CHANNELS, Raster};
+use super::gather::{CHANNELS, Record, SIDE, TILE, TILES};
+use super::rasterize::Raster;
 use crate::math::Real;
 use rayon::prelude::*;
 
@@ -18,7 +18,7 @@ pub struct PairCounts {
 }
 
 impl<F: Real> Raster<F> {
-    /// What [`Raster::blend`] does with the pairs that are held (all of them, but for absurd scenes).
+    /// Counts of what [`Raster::blend`] does with the pairs that are held (all of them, but for absurd scenes).
     pub fn count_pairs(&self, config: &RenderConfig) -> PairCounts {
         let limits = Limits::new(config);
         let counts = self.bins.starts.par_windows(2).enumerate().map(|(bin, pair)| {

@@ -3,13 +3,14 @@
 
 use super::bin::{BIN, id};
 use super::project::{Projected, TAU_MARGIN};
-use super::rasterize::CHANNELS;
 use super::simd::{Kernel, greatest, least};
 use crate::math::Real;
 use crate::scene::BLOCK;
 use std::f64::consts::LOG2_E;
 use std::ops::Range;
 
+/// Channels of one pass.
+pub const CHANNELS: usize = 3;
 /// Pixels across and down a tile: one row is one vector.
 pub(super) const TILE: usize = 8;
 /// Tiles in a row of a bin.
@@ -32,7 +33,7 @@ pub(super) struct Record<F> {
     pub c: F,
     /// log₂ of o/α_min, of which τ is the multiple: no logarithm is taken here.
     pub log_ratio: F,
-    /// What is blended.
+    /// Channels to blend.
     pub channels: [F; CHANNELS],
     /// Bit 4·row + column: the tile may be touched.
     pub mask: u16,

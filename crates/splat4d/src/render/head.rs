@@ -9,7 +9,7 @@
 //! background needs no logit; and origins are squashed, so that the unit of length matters little.
 
 use super::simd::{Kernel, Simd, dispatch, select};
-use super::{Image, RenderGrads, Renderer};
+use super::{Image, RenderGrads, Renderer, Shot};
 use crate::math::{Real, se3};
 use crate::scene::head::{BASE, FEATURES, FURTHER, HIDDEN, INPUTS};
 use crate::scene::{BLOCK, Camera, Color, HeadGrads, HeadWeights, Planes, Splats, Table};
@@ -29,7 +29,7 @@ const SUMS: usize = HIDDEN * (FURTHER + 3) + HIDDEN + 3 * HIDDEN + 3;
 
 type Lane<F> = [F; BLOCK];
 
-/// What a picture with a head keeps for its way back; all memory is reused.
+/// Record of a picture with a head for its way back; all memory is reused.
 #[derive(Debug, Default)]
 pub(super) struct Headed<F> {
     /// Further channels of every splat, the head's and then the caller's, [splats, 6 + C].
@@ -136,31 +136,30 @@ impl<F: Real> Renderer<F> {
     pub(super) fn backward_headed(
         &mut self,
         head: HeadWeights<'_, F>,
-        (splats, camera, background): (&Splats<'_, F>, &Camera, [F; 3]),
-        extra: Option<&Table<F>>,
+        shot: &Shot<'_, F>,
         grads: &super::ImageGrads<'_, F>,
         d_sh: &mut [Option<&mut Table<F>>],
         d: &mut RenderGrads<F>,
     ) {
         let mut clock = super::Clock::start();
         let mut headed = std::mem::take(&mut self.headed);
-        let (d_head, pose) = headed.backward(head, camera, self.config.simd, grads.color, grads.extra);
+        let (d_head, pose) = headed.backward(head, shot.camera, self.config.simd, grads.color, grads.extra);
         let seconds = clock.lap();
         let inner = super::ImageGrads { color: &headed.d_base, extra: Some(&headed.d_further), ..*grads };
         d.extra = headed.d_table.take();
-        self.backward_blended(splats, camera, background, Some(&headed.table), &inner, d_sh, d);
+        self.backward_blended(&Shot { extra: Some(&headed.table), ..*shot }, &inner, d_sh, d);
         self.seconds.blend_backward += seconds;
         d.camera.iter_mut().zip(pose).for_each(|(d, pose)| *d += pose);
         d.head = Some(d_head);
         let table = d.extra.take().expect("further channels were drawn");
         let mut first = 0;
-        for (part, grads) in splats.parts.iter().zip(&mut d.parts) {
+        for (part, grads) in shot.splats.parts.iter().zip(&mut d.parts) {
             if let (Some(_), Some(color)) = (features_of(&part.color), &mut grads.color) {
                 (0..part.out.rows()).for_each(|j| color.write(j, BASE, table.read::<FURTHER>(first + j, 0)));
             }
             first += part.out.rows();
         }
-        d.extra = extra.map(|like| {
+        d.extra = shot.extra.map(|like| {
             let mut own = Table::with_columns(like.columns().to_vec(), like.rows());
             for c in 0..like.width() {
                 (0..like.rows()).for_each(|j| own.set(j, c, table.get(j, FURTHER + c)));

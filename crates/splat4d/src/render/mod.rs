@@ -9,40 +9,40 @@
 //! The same bits come out for any number of threads: every floating-point sum has a fixed order, and nothing is ever
 //! added atomically.
 //!
-//! Where [`Splats::head`] has a network, it makes colours of blended channels (`head.rs`), and its gradients come with
+//! A network in [`Splats::head`] makes colours of blended channels (`head.rs`), and its gradients come with
 //! the others.
 
-mod backend;
-mod behind;
+pub(crate) mod backend;
 pub mod bin;
 mod blend;
-pub mod ceiling;
 mod count;
 mod gather;
 mod head;
+mod importance;
 pub mod oracle;
 mod parallel;
 pub mod project;
 pub mod rasterize;
-mod sense;
+pub mod roofline;
 pub mod shade;
 #[cfg(test)]
 mod tests;
-mod weigh;
 
 pub use crate::simd::Simd;
-pub use backend::{Backend, Oracle, Shot, Wanted};
+pub use backend::{Backend, Oracle, Shot, Tables, Wanted};
 pub use count::PairCounts;
+pub use importance::Sensitivity;
 pub use project::{Projected, ProjectedGrads, View};
-pub use sense::Sensitivity;
 
 use crate::math::Real;
 use crate::scene::{Camera, HeadGrads, Planes, Splats, Table};
 use crate::simd;
 use bin::Footprint;
 use head::Headed;
-use rasterize::{CHANNELS, Geometry, PixelGrads, Raster};
+use project::Projection;
+use rasterize::{CHANNELS, Geometry, Pass, PassGrads, PixelGrads, Raster};
 use rayon::prelude::*;
+use shade::ShadeGrads;
 use std::time::Instant;
 
 /// Whether thin splats are dimmed for the low-pass that widens them.
@@ -55,7 +55,7 @@ pub enum Antialias {
     On,
 }
 
-/// What the renderer may be told.
+/// Settings of the renderer.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RenderConfig {
     /// α below this is skipped.
@@ -76,6 +76,18 @@ pub struct RenderConfig {
     pub abs_grads: bool,
     /// Instructions to use; lowered to what the machine has.
     pub simd: Simd,
+}
+
+/// The smallest α cut-off that is told from 0: an extent must be finite.
+const ALPHA_FLOOR: f64 = 1e-30;
+/// α never reaches 1, whatever the configuration: T must stay recoverable.
+const ALPHA_CEILING: f64 = 1.0 - 1e-6;
+
+impl RenderConfig {
+    /// The cut-off and the ceiling of α that are drawn with.
+    pub(crate) fn alpha_limits(&self) -> [f64; 2] {
+        [self.alpha_min.max(ALPHA_FLOOR), self.alpha_max.min(ALPHA_CEILING)]
+    }
 }
 
 impl Default for RenderConfig {
@@ -163,7 +175,7 @@ pub struct RenderGrads<F = f32> {
     pub mean2d_abs: Vec<F>,
 }
 
-/// What the last render did.
+/// Counts of the last render.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct RenderStats {
     /// Splats given.
@@ -248,28 +260,28 @@ impl<F: Real> Renderer<F> {
         extra: Option<&Table<F>>,
         out: &mut Image<F>,
     ) {
-        if let Some(extra) = extra {
-            assert_eq!(extra.rows(), splats.len(), "further channels need one row a splat");
+        let (sh_degree, depth) = (self.config.sh_degree, self.config.depth);
+        self.draw(&Shot { splats, camera, background, extra, sh_degree, depth }, out);
+    }
+
+    /// Draws a shot.
+    fn draw(&mut self, shot: &Shot<'_, F>, out: &mut Image<F>) {
+        if let Some(extra) = shot.extra {
+            assert_eq!(extra.rows(), shot.splats.len(), "further channels need one row a splat");
         }
-        let Some(head) = splats.head else { return self.blend(splats, camera, background, extra, out) };
+        let Some(head) = shot.splats.head else { return self.blend(shot, out) };
         let mut headed = std::mem::take(&mut self.headed);
-        headed.gather(splats, extra);
-        self.blend(splats, camera, background, Some(&headed.table), out);
+        headed.gather(shot.splats, shot.extra);
+        self.blend(&Shot { extra: Some(&headed.table), ..*shot }, out);
         let mut clock = Clock::start();
-        headed.forward(head, camera, self.config.simd, out);
+        headed.forward(head, shot.camera, self.config.simd, out);
         self.seconds.blend += clock.lap();
         self.headed = headed;
     }
 
-    /// [`Renderer::render`] without the head.
-    fn blend(
-        &mut self,
-        splats: &Splats<'_, F>,
-        camera: &Camera,
-        background: [F; 3],
-        extra: Option<&Table<F>>,
-        out: &mut Image<F>,
-    ) {
+    /// Draws a shot without its head.
+    fn blend(&mut self, shot: &Shot<'_, F>, out: &mut Image<F>) {
+        let Shot { splats, camera, background, extra, sh_degree, .. } = *shot;
         let n = splats.len();
         let (w, h) = (camera.width, camera.height);
         let simd = self.config.simd;
@@ -282,12 +294,13 @@ impl<F: Real> Renderer<F> {
         self.radii.resize(n, F::ZERO);
         project::forward(splats, &view, simd, &mut self.projected, &mut self.footprints, &mut self.radii);
         self.seconds.project = clock.lap();
-        shade::forward(splats, &view, self.config.sh_degree, simd, &self.projected, &mut self.channels);
+        let projection = Projection { splats, view: &view, simd, projected: &self.projected };
+        shade::forward(&projection, sh_degree, &mut self.channels);
         self.seconds.shade = clock.lap();
         self.raster.prepare(&self.projected, &self.footprints, w, h, simd);
         self.seconds.bin = clock.lap();
-        self.raster.blend(&self.projected, &self.footprints, &self.channels, &self.config);
-        let (depths, widths) = (usize::from(self.config.depth), extra.map_or(0, Table::width));
+        self.blend_colors(background);
+        let (depths, widths) = (usize::from(shot.depth), extra.map_or(0, Table::width));
         reshape(&mut out.color, 3, h, w);
         reshape(&mut out.alpha, 1, h, w);
         reshape(&mut out.depth, depths, h, w);
@@ -295,9 +308,9 @@ impl<F: Real> Renderer<F> {
         let (red, rest) = out.color.data.split_at_mut(w * h);
         let (green, blue) = rest.split_at_mut(w * h);
         self.raster.picture(background, [red, green, blue], out.alpha.plane_mut(0));
-        for first in self.passes(extra) {
-            self.pack(extra, first);
-            self.raster.blend(&self.projected, &self.footprints, &self.extra, &self.config);
+        for first in passes(shot) {
+            self.pack(shot, first);
+            self.blend_extra();
             for c in first..(depths + widths).min(first + CHANNELS) {
                 let plane = if c < depths { out.depth.plane_mut(c) } else { out.extra.plane_mut(c - depths) };
                 self.raster.channel(c - first, plane);
@@ -306,21 +319,37 @@ impl<F: Real> Renderer<F> {
         self.seconds.blend = clock.lap();
     }
 
-    /// First channels of the passes after that of the colours: depth, if it is drawn, then what the caller gave.
-    fn passes(&self, extra: Option<&Table<F>>) -> impl DoubleEndedIterator<Item = usize> + use<F> {
-        let count = usize::from(self.config.depth) + extra.map_or(0, Table::width);
-        (0..count.div_ceil(CHANNELS)).map(|pass| pass * CHANNELS)
+    /// Blends the colours' pass.
+    fn blend_colors(&mut self, background: [F; CHANNELS]) {
+        self.raster.blend(&Pass {
+            projected: &self.projected,
+            footprints: &self.footprints,
+            channels: &self.channels,
+            background,
+            config: &self.config,
+        });
+    }
+
+    /// Blends the pass that was [packed](Self::pack).
+    fn blend_extra(&mut self) {
+        self.raster.blend(&Pass {
+            projected: &self.projected,
+            footprints: &self.footprints,
+            channels: &self.extra,
+            background: [F::ZERO; CHANNELS],
+            config: &self.config,
+        });
     }
 
     /// Fills [`Self::extra`] for the pass that begins with channel `first`; channels that there are not are 0.
-    fn pack(&mut self, extra: Option<&Table<F>>, first: usize) {
-        let depths = usize::from(self.config.depth);
+    fn pack(&mut self, shot: &Shot<'_, F>, first: usize) {
+        let depths = usize::from(shot.depth);
         self.extra.resize(self.projected.len(), [F::ZERO; CHANNELS]);
         let rows = self.extra.par_iter_mut().zip(&self.projected).with_min_len(4096).enumerate();
         rows.for_each(|(j, (row, projected))| {
             *row = std::array::from_fn(|k| match (first + k).checked_sub(depths) {
                 None => projected.depth,
-                Some(c) => extra.filter(|table| c < table.width()).map_or(F::ZERO, |table| table.get(j, c)),
+                Some(c) => shot.extra.filter(|table| c < table.width()).map_or(F::ZERO, |table| table.get(j, c)),
             });
         });
     }
@@ -340,8 +369,20 @@ impl<F: Real> Renderer<F> {
         d_sh: &mut [Option<&mut Table<F>>],
         d: &mut RenderGrads<F>,
     ) {
-        let n = splats.len();
-        let size = [camera.width, camera.height];
+        let (sh_degree, depth) = (self.config.sh_degree, self.config.depth);
+        self.draw_backward(&Shot { splats, camera, background, extra, sh_degree, depth }, grads, d_sh, d);
+    }
+
+    /// VJP of [`Self::draw`].
+    fn draw_backward(
+        &mut self,
+        shot: &Shot<'_, F>,
+        grads: &ImageGrads<'_, F>,
+        d_sh: &mut [Option<&mut Table<F>>],
+        d: &mut RenderGrads<F>,
+    ) {
+        let n = shot.splats.len();
+        let size = [shot.camera.width, shot.camera.height];
         assert!(
             self.size == size && self.projected.len() == n,
             "backward must follow the render of the same splats and camera: {n} splats now, {} then",
@@ -353,56 +394,50 @@ impl<F: Real> Renderer<F> {
                 assert_eq!(shape, [channels, size[1], size[0]], "a picture's gradient has the picture's shape");
             }
         };
-        let widths = extra.map_or(0, Table::width);
         plane(Some(grads.color), 3);
         plane(grads.alpha, 1);
-        plane(grads.depth, usize::from(self.config.depth));
-        plane(grads.extra, widths);
+        plane(grads.depth, usize::from(shot.depth));
+        plane(grads.extra, shot.extra.map_or(0, Table::width));
         d.head = None;
-        match splats.head {
-            None => self.backward_blended(splats, camera, background, extra, grads, d_sh, d),
-            Some(head) => self.backward_headed(head, (splats, camera, background), extra, grads, d_sh, d),
+        match shot.splats.head {
+            None => self.backward_blended(shot, grads, d_sh, d),
+            Some(head) => self.backward_headed(head, shot, grads, d_sh, d),
         }
     }
 
-    /// [`Renderer::backward`] without the head, after its checks.
+    /// VJP of [`Self::blend`].
     fn backward_blended(
         &mut self,
-        splats: &Splats<'_, F>,
-        camera: &Camera,
-        background: [F; 3],
-        extra: Option<&Table<F>>,
+        shot: &Shot<'_, F>,
         grads: &ImageGrads<'_, F>,
         d_sh: &mut [Option<&mut Table<F>>],
         d: &mut RenderGrads<F>,
     ) {
-        let (n, size) = (splats.len(), [camera.width, camera.height]);
-        let view = View::new(camera, &self.config);
-        let simd = self.config.simd;
+        let (splats, simd) = (shot.splats, self.config.simd);
+        let (n, size) = (splats.len(), [shot.camera.width, shot.camera.height]);
+        let view = View::new(shot.camera, &self.config);
         self.d_projected.resize(n, ProjectedGrads::default());
         self.d_channels.resize(n, [F::ZERO; CHANNELS]);
 
         let mut clock = Clock::start();
         // The tiles hold the last pass; the colours' come last, and are blended again if that was another.
-        let geometry = self.backward_further(extra, grads, &mut d.extra);
-        if self.passes(extra).next().is_some() {
-            self.raster.blend(&self.projected, &self.footprints, &self.channels, &self.config);
+        let geometry = self.backward_extra(shot, grads, &mut d.extra);
+        if passes(shot).next().is_some() {
+            self.blend_colors(shot.background);
         }
         let pixels = PixelGrads {
             channels: std::array::from_fn(|c| Some(grads.color.plane(c))),
             alpha: grads.alpha.map(|p| p.plane(0)),
         };
-        let d_background = self.raster.backward(
-            &self.projected,
-            &self.footprints,
-            &self.channels,
-            background,
-            &pixels,
-            &self.config,
-            geometry,
-            &mut self.d_projected,
-            &mut self.d_channels,
-        );
+        let pass = Pass {
+            projected: &self.projected,
+            footprints: &self.footprints,
+            channels: &self.channels,
+            background: shot.background,
+            config: &self.config,
+        };
+        let mut d_pass = PassGrads { geometry, projected: &mut self.d_projected, channels: &mut self.d_channels };
+        let d_background = self.raster.backward(&pass, &pixels, &mut d_pass);
         d.background = std::array::from_fn(|c| F::of(d_background[c]));
 
         self.seconds.blend_backward = clock.lap();
@@ -425,42 +460,23 @@ impl<F: Real> Renderer<F> {
             project::reshape(&mut out.out, part.out);
         }
         d.camera = [0.0; 6];
-        let partial = &mut self.pose_partial;
-        project::backward(
-            splats,
-            &view,
-            simd,
-            &self.projected,
-            &self.d_projected,
-            &mut d.parts,
-            &mut d.camera,
-            partial,
-        );
-        shade::backward(
-            splats,
-            &view,
-            self.config.sh_degree,
-            simd,
-            &self.projected,
-            &self.channels,
-            &self.d_channels,
-            d_sh,
-            &mut d.parts,
-            &mut d.camera,
-            &mut self.center_partial,
-        );
+        let projection = Projection { splats, view: &view, simd, projected: &self.projected };
+        project::backward(&projection, &self.d_projected, &mut d.parts, &mut d.camera, &mut self.pose_partial);
+        let (parts, pose, partial) = (&mut d.parts[..], &mut d.camera, &mut self.center_partial);
+        let mut d_colors = ShadeGrads { sh: d_sh, parts, pose, partial };
+        shade::backward(&projection, shot.sh_degree, &self.channels, &self.d_channels, &mut d_colors);
         self.seconds.splats_backward = clock.lap();
     }
 
     /// The passes of depth and further channels, last one first: overwrites the geometry's gradient and `d_extra`.
     /// Returns what the colours' pass is to do with the former.
-    fn backward_further(
+    fn backward_extra(
         &mut self,
-        extra: Option<&Table<F>>,
+        shot: &Shot<'_, F>,
         grads: &ImageGrads<'_, F>,
         d_extra: &mut Option<Table<F>>,
     ) -> Geometry {
-        match extra {
+        match shot.extra {
             None => *d_extra = None,
             Some(table) => {
                 let out = d_extra.get_or_insert_with(|| Table::with_columns(table.columns().to_vec(), 0));
@@ -468,34 +484,32 @@ impl<F: Real> Renderer<F> {
                 out.fill(F::ZERO);
             }
         }
-        let (depths, widths) = (usize::from(self.config.depth), extra.map_or(0, Table::width));
+        let (depths, widths) = (usize::from(shot.depth), shot.extra.map_or(0, Table::width));
         let plane = |c: usize| match c.checked_sub(depths) {
             None => grads.depth.map(|p| p.plane(0)),
             Some(c) => grads.extra.filter(|_| c < widths).map(|p| p.plane(c)),
         };
         self.d_extra.resize(self.projected.len(), [F::ZERO; CHANNELS]);
-        let last = self.passes(extra).next_back();
+        let last = passes(shot).next_back();
         let mut geometry = Geometry::Overwrite;
-        for first in self.passes(extra).rev() {
+        for first in passes(shot).rev() {
             let pixels = PixelGrads { channels: std::array::from_fn(|k| plane(first + k)), alpha: None };
             if pixels.channels.iter().all(Option::is_none) {
                 continue;
             }
-            self.pack(extra, first);
+            self.pack(shot, first);
             if Some(first) != last {
-                self.raster.blend(&self.projected, &self.footprints, &self.extra, &self.config);
+                self.blend_extra();
             }
-            self.raster.backward(
-                &self.projected,
-                &self.footprints,
-                &self.extra,
-                [F::ZERO; CHANNELS],
-                &pixels,
-                &self.config,
-                geometry,
-                &mut self.d_projected,
-                &mut self.d_extra,
-            );
+            let pass = Pass {
+                projected: &self.projected,
+                footprints: &self.footprints,
+                channels: &self.extra,
+                background: [F::ZERO; CHANNELS],
+                config: &self.config,
+            };
+            let mut d_pass = PassGrads { geometry, projected: &mut self.d_projected, channels: &mut self.d_extra };
+            self.raster.backward(&pass, &pixels, &mut d_pass);
             geometry = Geometry::Add;
             for (j, d) in self.d_extra.iter().enumerate() {
                 for (k, &d) in d.iter().enumerate() {
@@ -515,60 +529,12 @@ impl<F: Real> Renderer<F> {
         &self.radii
     }
 
-    /// Σ over pixels of α_i Π_{j<i} (1 − α_j) of every splat of the last render: how much of the picture it is.
-    ///
-    /// `out` is overwritten, one a splat; exactly 0 where no pixel shows the splat. A backward may still follow. Costs
-    /// less than the render's blend. Source: the significance of LightGaussian (Fan et al. 2024) and the spatial score
-    /// of 4DGS-1K (Yuan et al. 2025).
-    pub fn contributions(&mut self, out: &mut Vec<F>) {
-        out.resize(self.projected.len(), F::ZERO);
-        self.raster.weigh(&self.projected, &self.footprints, None, &self.config, out);
-    }
-
-    /// As [`Renderer::render`] and [`Renderer::contributions`], without a picture: no colour is looked at. No backward
-    /// may follow.
-    pub fn weigh(&mut self, splats: &Splats<'_, F>, camera: &Camera, out: &mut Vec<F>) {
-        self.list(splats, camera);
-        self.contributions(out);
-    }
-
-    /// Σ over pixels and channels of the squared change that a splat's removal would make to the picture over
-    /// `background`, one a splat, exact for each alone: a splat before others of its colour has a large contribution
-    /// and changes little.
-    ///
-    /// A head is not looked at: it is the base colours' picture that changes. `out` is overwritten, one a splat. Draws by
-    /// itself; no backward may follow.
-    pub fn removals(&mut self, splats: &Splats<'_, F>, camera: &Camera, background: [F; 3], out: &mut Vec<F>) {
-        let view = self.list(splats, camera);
-        self.channels.resize(splats.len(), [F::ZERO; CHANNELS]);
-        let simd = self.config.simd;
-        shade::forward(splats, &view, self.config.sh_degree, simd, &self.projected, &mut self.channels);
-        self.raster.blend(&self.projected, &self.footprints, &self.channels, &self.config);
-        out.resize(splats.len(), F::ZERO);
-        let light = Some((&self.channels[..], background));
-        self.raster.weigh(&self.projected, &self.footprints, light, &self.config, out);
-    }
-
-    /// Projects splats and makes their lists.
-    fn list(&mut self, splats: &Splats<'_, F>, camera: &Camera) -> View<F> {
-        let (n, simd) = (splats.len(), self.config.simd);
-        let view = View::new(camera, &self.config);
-        // A picture of another size than any: a backward is refused.
-        self.size = [0; 2];
-        self.projected.resize(n, Projected::default());
-        self.footprints.resize(n, Footprint::default());
-        self.radii.resize(n, F::ZERO);
-        project::forward(splats, &view, simd, &mut self.projected, &mut self.footprints, &mut self.radii);
-        self.raster.prepare(&self.projected, &self.footprints, camera.width, camera.height, simd);
-        view
-    }
-
     /// Screen ellipses of the last render, one a splat; radius 0: not drawn.
     pub fn projected(&self) -> &[Projected<F>] {
         &self.projected
     }
 
-    /// What the last render's blend loop did, counted again, slowly; only the last run of bins of an absurd scene.
+    /// Pairs of the last render's blend loop, counted again, slowly; only the last run of bins of an absurd scene.
     pub fn count_pairs(&self) -> PairCounts {
         self.raster.count_pairs(&self.config)
     }
@@ -585,7 +551,7 @@ impl<F: Real> Renderer<F> {
             + self.radii.capacity() * size_of::<F>()
     }
 
-    /// Where the time of the last render and the last backward went.
+    /// Seconds of the stages of the last render and the last backward.
     pub fn stage_seconds(&self) -> StageSeconds {
         self.seconds
     }
@@ -598,6 +564,12 @@ impl<F: Real> Renderer<F> {
             pairs: self.raster.pairs(),
         }
     }
+}
+
+/// First channels of the passes after that of the colours: depth, if it is drawn, then what the caller gave.
+fn passes<F: Real>(shot: &Shot<'_, F>) -> impl DoubleEndedIterator<Item = usize> + use<F> {
+    let count = usize::from(shot.depth) + shot.extra.map_or(0, Table::width);
+    (0..count.div_ceil(CHANNELS)).map(|pass| pass * CHANNELS)
 }
 
 /// Times consecutive stages.

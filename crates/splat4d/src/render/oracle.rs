@@ -160,7 +160,7 @@ fn color<F: Real>(part: &Part<'_, F>, j: usize, direction: [f64; 3], degree: usi
     }
 }
 
-/// What a head sees of a splat besides its colour.
+/// Channels of a splat that a head sees besides its colour.
 fn further<F: Real>(part: &Part<'_, F>, j: usize) -> [f64; FURTHER] {
     match part.color {
         Color::Direct { table } if table.width() == FEATURES => table.read::<FURTHER>(j, BASE).map(F::f64),

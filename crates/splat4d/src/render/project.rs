@@ -20,8 +20,6 @@ const J_MARGIN: f64 = 0.3;
 const RHO_MIN: f64 = 0.005;
 /// Added to τ, so that rounding never loses a pixel at the α cut-off; the blend decides about each pixel itself.
 pub(super) const TAU_MARGIN: f64 = 1e-3;
-/// The smallest α cut-off that is told from 0: an extent must be finite.
-pub(super) const ALPHA_FLOOR: f64 = 1e-30;
 /// Radius in standard deviations that `radius` reports (Inria).
 const RADIUS_SIGMAS: f64 = 3.0;
 /// Rows in a task: whole blocks of a table.
@@ -131,13 +129,13 @@ impl<F: Real> View<F> {
             height: camera.height,
             near: F::of(camera.near),
             low_pass: F::of(config.low_pass),
-            alpha_min: F::of(config.alpha_min.max(ALPHA_FLOOR)),
+            alpha_min: F::of(config.alpha_limits()[0]),
             antialias: config.antialias,
         }
     }
 }
 
-/// What forward and backward both need of one Gaussian.
+/// The part of a projection that forward and backward share.
 struct Ellipse<F> {
     /// Mean in camera axes.
     p: [F; 3],
@@ -449,19 +447,30 @@ fn lane<F: Real>(p: &Projected<Lanes<F>>, l: usize) -> Projected<F> {
     }
 }
 
+/// Splats that were projected: what shading reads, and the ways back.
+#[derive(Clone, Copy, Debug)]
+pub struct Projection<'a, F = f32> {
+    /// The Gaussians.
+    pub splats: &'a Splats<'a, F>,
+    /// The camera, ready for the kernels.
+    pub view: &'a View<F>,
+    /// Instructions to use.
+    pub simd: Simd,
+    /// Their ellipses, one row a splat.
+    pub projected: &'a [Projected<F>],
+}
+
 /// VJP of [`forward`]: overwrites `parts[..].out` (culled rows get 0) and adds to the pose gradient.
 ///
 /// `partial` is scratch. Sums run in a fixed order: rows in a chunk, then chunks.
 pub fn backward<F: Real>(
-    splats: &Splats<'_, F>,
-    view: &View<F>,
-    simd: Simd,
-    projected: &[Projected<F>],
+    projection: &Projection<'_, F>,
     d: &[ProjectedGrads<F>],
     parts: &mut [PartGrads<F>],
     pose: &mut [f64; 6],
     partial: &mut Vec<[f64; 6]>,
 ) {
+    let Projection { splats, view, simd, projected } = *projection;
     assert_eq!(parts.len(), splats.parts.len(), "one gradient a part");
     let mut first = 0;
     for (part, out) in splats.parts.iter().zip(parts) {

@@ -5,7 +5,9 @@
 
 use super::RenderConfig;
 use super::bin::{BIN, Bins, Footprint, PAIR_BUDGET, id};
+pub use super::blend::PixelGrads;
 use super::blend::{Backward, Blend, Limits, Pair, Tile};
+pub use super::gather::CHANNELS;
 use super::gather::{Gather, Record, SIDE, TILE, TILES};
 use super::parallel::{Even, Ragged, for_each_group};
 use super::project::{Projected, ProjectedGrads};
@@ -15,12 +17,10 @@ use rayon::prelude::*;
 use std::ops::Range;
 use std::sync::atomic::{AtomicU32, Ordering};
 
-/// Channels of one pass.
-pub const CHANNELS: usize = 3;
 /// Splats in a reduction task.
 pub(super) const CHUNK: usize = 2048;
 
-/// What a pass backward does with the gradient to centre, conic and opacity.
+/// Treatment of the gradient to centre, conic and opacity by a pass backward.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Geometry {
     /// The first pass.
@@ -29,13 +29,30 @@ pub enum Geometry {
     Add,
 }
 
-/// Gradients to the picture of one pass; `None` is zero.
+/// One pass over the pixels: what is blended, and over which projection. One row a splat.
 #[derive(Clone, Copy, Debug)]
-pub struct PixelGrads<'a, F = f32> {
-    /// To the channels with background, [height, width] each.
-    pub channels: [Option<&'a [F]>; CHANNELS],
-    /// To alpha = 1 − T.
-    pub alpha: Option<&'a [F]>,
+pub struct Pass<'a, F = f32> {
+    /// As they were prepared.
+    pub projected: &'a [Projected<F>],
+    /// As they were prepared.
+    pub footprints: &'a [Footprint],
+    /// Blended.
+    pub channels: &'a [[F; CHANNELS]],
+    /// Behind all splats; [`Raster::blend`] does not look at it.
+    pub background: [F; CHANNELS],
+    /// Limits of the blend.
+    pub config: &'a RenderConfig,
+}
+
+/// Gradients to a pass, one row a splat.
+#[derive(Debug)]
+pub struct PassGrads<'a, F = f32> {
+    /// Whether `projected` is overwritten or added to.
+    pub geometry: Geometry,
+    /// To centre, conic and opacity.
+    pub projected: &'a mut [ProjectedGrads<F>],
+    /// To the channels; overwritten.
+    pub channels: &'a mut [[F; CHANNELS]],
 }
 
 /// The rasteriser with all its memory.
@@ -51,7 +68,8 @@ pub struct Raster<F = f32> {
     pub(super) records: Vec<Record<F>>,
     pub(super) tiles: Vec<Tile<F>>,
     pair_grads: Vec<Pair<F>>,
-    pub(super) pair_weights: Vec<F>,
+    /// Scores of pairs of bin and splat.
+    pub(super) pair_scores: Vec<F>,
     pub(super) place: Vec<AtomicU32>,
     backgrounds: Vec<[f64; CHANNELS]>,
 }
@@ -92,22 +110,18 @@ impl<F: Real> Raster<F> {
         });
     }
 
-    /// Blends four channels; one row of `channels` a splat, the other rows as they were prepared.
-    pub fn blend(
-        &mut self,
-        projected: &[Projected<F>],
-        footprints: &[Footprint],
-        channels: &[[F; CHANNELS]],
-        config: &RenderConfig,
-    ) {
+    /// Blends the channels of a pass.
+    pub fn blend(&mut self, pass: &Pass<'_, F>) {
         for run in 0..self.bins.runs.len() {
-            self.hold(projected, footprints, run);
-            self.blend_run(channels, config);
+            self.hold(pass.projected, pass.footprints, run);
+            self.blend_run(pass);
         }
     }
 
-    fn blend_run(&mut self, channels: &[[F; CHANNELS]], config: &RenderConfig) {
-        let (simd, bins, limits) = (self.simd.unwrap_or(Simd::Scalar), &self.bins, Limits::new(config));
+    /// [`Raster::blend`] of the bins of the current run.
+    fn blend_run(&mut self, pass: &Pass<'_, F>) {
+        let (simd, bins, limits) = (self.simd.unwrap_or(Simd::Scalar), &self.bins, Limits::new(pass.config));
+        let channels = pass.channels;
         let (width, height) = (self.width, self.height);
         let data = (Ragged(&mut self.records), Even(&mut self.tiles, TILES));
         let run = &bins.runs[bins.current];
@@ -170,31 +184,23 @@ impl<F: Real> Raster<F> {
         }
     }
 
-    /// VJP of the last [`Raster::blend`], which must have been of the same `channels`.
-    ///
-    /// `d` and `d_channels` have one row a splat. `geometry` says whether `d` is overwritten or added to;
-    /// `d_channels` is overwritten. Returns the gradient to the background.
+    /// VJP of the last [`Raster::blend`], which must have been of the same pass. Returns the gradient to the background.
     pub fn backward(
         &mut self,
-        projected: &[Projected<F>],
-        footprints: &[Footprint],
-        channels: &[[F; CHANNELS]],
-        background: [F; CHANNELS],
+        pass: &Pass<'_, F>,
         grads: &PixelGrads<'_, F>,
-        config: &RenderConfig,
-        geometry: Geometry,
-        d: &mut [ProjectedGrads<F>],
-        d_channels: &mut [[F; CHANNELS]],
+        d: &mut PassGrads<'_, F>,
     ) -> [f64; CHANNELS] {
-        if geometry == Geometry::Overwrite {
-            d.par_chunks_mut(CHUNK).for_each(|d| d.fill(ProjectedGrads::default()));
+        if d.geometry == Geometry::Overwrite {
+            d.projected.par_chunks_mut(CHUNK).for_each(|d| d.fill(ProjectedGrads::default()));
         }
-        d_channels.fill([F::ZERO; CHANNELS]);
+        d.channels.fill([F::ZERO; CHANNELS]);
         self.backgrounds.clear();
         self.backgrounds.resize(self.bins.bins(), [0.0; CHANNELS]);
         for run in 0..self.bins.runs.len() {
-            self.hold(projected, footprints, run);
-            self.backward_run(projected, footprints, channels, background, grads, config, d, d_channels);
+            self.hold(pass.projected, pass.footprints, run);
+            self.backward_run(pass, grads);
+            self.collect(pass, d);
         }
         let mut total = [0.0; CHANNELS];
         for bin in &self.backgrounds {
@@ -205,19 +211,11 @@ impl<F: Real> Raster<F> {
         total
     }
 
-    /// [`Raster::backward`] of the current run, added to `d` and `d_channels`.
-    fn backward_run(
-        &mut self,
-        projected: &[Projected<F>],
-        footprints: &[Footprint],
-        channels: &[[F; CHANNELS]],
-        background: [F; CHANNELS],
-        grads: &PixelGrads<'_, F>,
-        config: &RenderConfig,
-        d: &mut [ProjectedGrads<F>],
-        d_channels: &mut [[F; CHANNELS]],
-    ) {
-        let (simd, bins, limits) = (self.simd.unwrap_or(Simd::Scalar), &self.bins, Limits::new(config));
+    /// Gradients to the pairs of the current run.
+    fn backward_run(&mut self, pass: &Pass<'_, F>, grads: &PixelGrads<'_, F>) {
+        let (simd, bins, limits) = (self.simd.unwrap_or(Simd::Scalar), &self.bins, Limits::new(pass.config));
+        let (footprints, channels, background, abs) =
+            (pass.footprints, pass.channels, pass.background, pass.config.abs_grads);
         let (width, height, tiles) = (self.width, self.height, &self.tiles);
         let pairs = bins.keys.len();
         self.pair_grads.resize(pairs, Pair::default());
@@ -247,14 +245,19 @@ impl<F: Real> Raster<F> {
                 corner: [bx * BIN, by * BIN],
                 size: [width, height],
                 limits,
-                abs: config.abs_grads,
+                abs,
                 out: out.0,
             };
             background_out.0[0] = dispatch(simd, kernel);
         });
-        // Per splat: its pairs in the order of its bins.
-        let pair_grads = &self.pair_grads;
-        d.par_chunks_mut(CHUNK).zip(d_channels.par_chunks_mut(CHUNK)).enumerate().for_each(|(chunk, (d, d_ch))| {
+    }
+
+    /// Adds each splat's pairs of the current run, in the order of its bins.
+    fn collect(&self, pass: &Pass<'_, F>, d: &mut PassGrads<'_, F>) {
+        let (place, bins, pair_grads) = (&self.place, &self.bins, &self.pair_grads);
+        let (projected, footprints) = (pass.projected, pass.footprints);
+        let rows = d.projected.par_chunks_mut(CHUNK).zip(d.channels.par_chunks_mut(CHUNK));
+        rows.enumerate().for_each(|(chunk, (d, d_ch))| {
             for (i, (d, d_ch)) in d.iter_mut().zip(d_ch).enumerate() {
                 let splat = chunk * CHUNK + i;
                 let mut sum = Pair::default();
@@ -292,7 +295,7 @@ impl<F: Real> Raster<F> {
             + 4 * self.place.capacity()
             + self.tiles.capacity() * size_of::<Tile<F>>()
             + self.pair_grads.capacity() * size_of::<Pair<F>>()
-            + self.pair_weights.capacity() * size_of::<F>()
+            + self.pair_scores.capacity() * size_of::<F>()
             + self.backgrounds.capacity() * size_of::<[f64; CHANNELS]>()
     }
 }

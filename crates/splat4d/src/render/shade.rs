@@ -4,13 +4,13 @@
 //! where all rows are drawn, those that are alive elsewhere. The block's columns lie in as many cache lines as one row
 //! does, so that nothing is read for the others' sake.
 
-use super::project::{CHUNK_ROWS, Lanes, Projected, View};
-use super::rasterize::CHANNELS;
-use super::simd::{Kernel, Simd, dispatch, select};
+use super::gather::CHANNELS;
+use super::project::{CHUNK_ROWS, Lanes, Projected, Projection};
+use super::simd::{Kernel, dispatch, select};
 use super::{PartGrads, project};
 use crate::math::{Real, sh};
 use crate::scene::splats::{Part, Rows};
-use crate::scene::{BLOCK, Color, Splats, Table};
+use crate::scene::{BLOCK, Color, Table};
 use rayon::prelude::*;
 use std::ops::Range;
 
@@ -207,16 +207,10 @@ impl<F: Real> Kernel for Forward<'_, F> {
 
 /// Colours of all splats: red, green, blue; culled splats get zeros.
 ///
-/// Shapes: `projected`, `channels` [all splats]. SH of `degree` at most, clamped at 0 from below; direct colours are
+/// Shapes: `channels` [all splats]. SH of `degree` at most, clamped at 0 from below; direct colours are
 /// taken as they are, columns beyond the third are not drawn.
-pub fn forward<F: Real>(
-    splats: &Splats<'_, F>,
-    view: &View<F>,
-    degree: usize,
-    simd: Simd,
-    projected: &[Projected<F>],
-    channels: &mut [[F; CHANNELS]],
-) {
+pub fn forward<F: Real>(projection: &Projection<'_, F>, degree: usize, channels: &mut [[F; CHANNELS]]) {
+    let Projection { splats, view, simd, projected } = *projection;
     let (mut first, mut rest) = (0, channels);
     for part in &splats.parts {
         let n = part.out.rows();
@@ -428,100 +422,159 @@ impl<F: Real> Kernel for DirectionGrads<'_, F> {
     }
 }
 
-/// VJP of [`forward`].
-///
-/// Adds to `parts[..].out` (means, through the direction), to `d_sh` (base SH, rows `rows.id(j)`) and to the pose
-/// gradient; overwrites `parts[..].color` and `.weights`. `partial` is scratch.
+/// Targets of the gradients of colours.
+#[derive(Debug)]
+pub struct ShadeGrads<'a, 't, F = f32> {
+    /// Base SH by part, added to in rows `rows.id(j)`; `None` skips it.
+    pub sh: &'a mut [Option<&'t mut Table<F>>],
+    /// `out` is added to (means, through the direction), `color` and `weights` are overwritten.
+    pub parts: &'a mut [PartGrads<F>],
+    /// Added to.
+    pub pose: &'a mut [f64; 6],
+    /// Scratch.
+    pub partial: &'a mut Vec<[f64; 3]>,
+}
+
+/// VJP of [`forward`], which made `channels`; `d` is the gradient to them.
 pub fn backward<F: Real>(
-    splats: &Splats<'_, F>,
-    view: &View<F>,
+    projection: &Projection<'_, F>,
     degree: usize,
-    simd: Simd,
-    projected: &[Projected<F>],
     channels: &[[F; CHANNELS]],
     d: &[[F; CHANNELS]],
-    d_sh: &mut [Option<&mut Table<F>>],
-    parts: &mut [PartGrads<F>],
-    pose: &mut [f64; 6],
-    partial: &mut Vec<[f64; 3]>,
+    out: &mut ShadeGrads<'_, '_, F>,
 ) {
-    assert!(d_sh.len() == splats.parts.len(), "one SH gradient (or None) a part");
+    let Projection { splats, view, .. } = *projection;
+    assert!(out.sh.len() == splats.parts.len(), "one SH gradient (or None) a part");
     let mut first = 0;
     for (p, part) in splats.parts.iter().enumerate() {
-        let n = part.out.rows();
-        let (projected, channels) = (&projected[first..first + n], &channels[first..first + n]);
-        let d = &d[first..first + n];
-        first += n;
-        let grads = &mut parts[p];
-        match color_width(part) {
-            None => grads.color = None,
-            Some(like) => {
-                let like_rows = if matches!(part.color, Color::Sh { .. }) { n } else { like.rows() };
-                let table = grads.color.get_or_insert_with(|| Table::with_columns(like.columns().to_vec(), 0));
-                if table.width() != like.width() {
-                    *table = Table::with_columns(like.columns().to_vec(), 0);
-                }
-                table.resize(like_rows);
-                table.fill(F::ZERO);
-            }
-        }
+        let all = first..first + part.out.rows();
+        first = all.end;
+        let grads = &mut out.parts[p];
+        reset_colors(part, grads);
+        let shaded = Shaded {
+            projection,
+            part,
+            projected: &projection.projected[all.clone()],
+            channels: &channels[all.clone()],
+            d: &d[all],
+        };
         let (table, rows, weights, base) = match part.color {
             Color::Direct { .. } => {
-                grads.weights = None;
-                let table = grads.color.as_mut().expect("a direct colour's gradient was made above");
-                let width = table.width();
-                if width > 0 {
-                    table.data_mut().par_chunks_mut(CHUNK_ROWS * width).enumerate().for_each(|(chunk, data)| {
-                        let j0 = chunk * CHUNK_ROWS;
-                        for j in j0..(j0 + CHUNK_ROWS).min(n) {
-                            let at = (j - j0) / BLOCK * width * BLOCK + j % BLOCK;
-                            for c in 0..width.min(3) {
-                                data[at + c * BLOCK] = if projected[j].radius > F::ZERO { d[j][c] } else { F::ZERO };
-                            }
-                        }
-                    });
-                }
+                shaded.direct_backward(grads.color.as_mut().expect("a direct colour's gradient was made above"));
                 continue;
             }
             Color::Sh { table, rows, weights, base } => (table, rows, weights, base),
         };
         let layout = Layout::new(table.width(), weights.map_or(1, Table::width), degree);
-        match weights {
-            None => grads.weights = None,
-            Some(like) => {
-                let table = grads.weights.get_or_insert_with(|| Table::with_columns(like.columns().to_vec(), 0));
-                project::reshape(table, like);
-                table.fill(F::ZERO);
-            }
-        }
-        if n == 0 || layout.used == 0 {
+        if part.out.rows() == 0 || layout.used == 0 {
             continue;
         }
         // Coefficients: the layer's own rows are added to, foreign ones are compact.
-        let (target, rows_out) = if base { (d_sh[p].as_deref_mut(), rows) } else { (grads.color.as_mut(), Rows::All) };
+        let (target, rows_out) =
+            if base { (out.sh[p].as_deref_mut(), rows) } else { (grads.color.as_mut(), Rows::All) };
         if let Some(target) = target {
-            let width = target.width();
-            assert_eq!(width, table.width(), "the SH gradient has the SH table's columns");
-            target.data_mut().par_chunks_mut(CHUNK_ROWS * width).enumerate().for_each(|(chunk, data)| {
-                let kernel = ShGrads {
-                    part,
-                    rows: rows_out,
-                    weights,
-                    layout,
-                    center: view.center,
-                    projected,
-                    channels,
-                    d,
-                    first: chunk * CHUNK_ROWS,
-                    data,
-                };
-                dispatch(simd, kernel);
-            });
+            assert_eq!(target.width(), table.width(), "the SH gradient has the SH table's columns");
+            shaded.coefficients_backward(layout, rows_out, weights, target);
         }
         if layout.used <= 1 && weights.is_none() {
             continue;
         }
-        // Direction and weights.
+        shaded.directions_backward(layout, (table, rows, weights), grads, out.partial);
+        // The camera's centre moves by −Rᵀρ, so that a direction moves like its mean: dL/dρ = R Σ d_mean.
+        let mut sum = [0.0; 3];
+        for v in out.partial.iter() {
+            for i in 0..3 {
+                sum[i] += v[i];
+            }
+        }
+        for k in 0..3 {
+            let r = view.rotation[k];
+            out.pose[k] += r[0].f64() * sum[0] + r[1].f64() * sum[1] + r[2].f64() * sum[2];
+        }
+    }
+}
+
+/// Zeros in the shapes of a part's colours and weights, where they have gradients of their own.
+fn reset_colors<F: Real>(part: &Part<'_, F>, grads: &mut PartGrads<F>) {
+    match color_width(part) {
+        None => grads.color = None,
+        Some(like) => {
+            let like_rows = if matches!(part.color, Color::Sh { .. }) { part.out.rows() } else { like.rows() };
+            let table = grads.color.get_or_insert_with(|| Table::with_columns(like.columns().to_vec(), 0));
+            if table.width() != like.width() {
+                *table = Table::with_columns(like.columns().to_vec(), 0);
+            }
+            table.resize(like_rows);
+            table.fill(F::ZERO);
+        }
+    }
+    match part.color {
+        Color::Sh { weights: Some(like), .. } => {
+            let table = grads.weights.get_or_insert_with(|| Table::with_columns(like.columns().to_vec(), 0));
+            project::reshape(table, like);
+            table.fill(F::ZERO);
+        }
+        _ => grads.weights = None,
+    }
+}
+
+/// One part after [`forward`], and the gradient to its colours.
+struct Shaded<'a, F> {
+    projection: &'a Projection<'a, F>,
+    part: &'a Part<'a, F>,
+    projected: &'a [Projected<F>],
+    channels: &'a [[F; CHANNELS]],
+    d: &'a [[F; CHANNELS]],
+}
+
+impl<F: Real> Shaded<'_, F> {
+    /// To colours that are given directly.
+    fn direct_backward(&self, table: &mut Table<F>) {
+        let (n, width) = (self.projected.len(), table.width());
+        if width == 0 {
+            return;
+        }
+        table.data_mut().par_chunks_mut(CHUNK_ROWS * width).enumerate().for_each(|(chunk, data)| {
+            let j0 = chunk * CHUNK_ROWS;
+            for j in j0..(j0 + CHUNK_ROWS).min(n) {
+                let at = (j - j0) / BLOCK * width * BLOCK + j % BLOCK;
+                for c in 0..width.min(3) {
+                    data[at + c * BLOCK] = if self.projected[j].radius > F::ZERO { self.d[j][c] } else { F::ZERO };
+                }
+            }
+        });
+    }
+
+    /// To SH coefficients, added to rows `rows` of `target`.
+    fn coefficients_backward(&self, layout: Layout, rows: Rows<'_>, weights: Option<&Table<F>>, target: &mut Table<F>) {
+        let width = target.width();
+        target.data_mut().par_chunks_mut(CHUNK_ROWS * width).enumerate().for_each(|(chunk, data)| {
+            let kernel = ShGrads {
+                part: self.part,
+                rows,
+                weights,
+                layout,
+                center: self.projection.view.center,
+                projected: self.projected,
+                channels: self.channels,
+                d: self.d,
+                first: chunk * CHUNK_ROWS,
+                data,
+            };
+            dispatch(self.projection.simd, kernel);
+        });
+    }
+
+    /// To means, through the direction, and to the weights of SH blocks. `partial`: the sums of the means' gradients, a
+    /// task each.
+    fn directions_backward(
+        &self,
+        layout: Layout,
+        (table, rows, weights): (&Table<F>, Rows<'_>, Option<&Table<F>>),
+        grads: &mut PartGrads<F>,
+        partial: &mut Vec<[f64; 3]>,
+    ) {
+        let n = self.projected.len();
         let out_width = grads.out.width();
         let mut none = Vec::new();
         let weight_data = grads.weights.as_mut().map_or(none.as_mut_slice(), |w| w.data_mut());
@@ -530,21 +583,21 @@ pub fn backward<F: Real>(
         let task = |chunk: usize, out: &mut [F], d_weights: &mut [F]| {
             let first = chunk * CHUNK_ROWS;
             let kernel = DirectionGrads {
-                part,
+                part: self.part,
                 table,
                 rows,
                 weights,
                 layout,
-                center: view.center,
+                center: self.projection.view.center,
                 splats: first..(first + CHUNK_ROWS).min(n),
-                projected,
-                channels,
-                d,
+                projected: self.projected,
+                channels: self.channels,
+                d: self.d,
                 out,
                 out_width,
                 d_weights,
             };
-            dispatch(simd, kernel)
+            dispatch(self.projection.simd, kernel)
         };
         if weights.is_some() {
             chunks
@@ -554,17 +607,6 @@ pub fn backward<F: Real>(
                 .collect_into_vec(partial);
         } else {
             chunks.enumerate().map(|(chunk, out)| task(chunk, out, &mut [])).collect_into_vec(partial);
-        }
-        // The camera's centre moves by −Rᵀρ, so that a direction moves like its mean: dL/dρ = R Σ d_mean.
-        let mut sum = [0.0; 3];
-        for v in partial.iter() {
-            for i in 0..3 {
-                sum[i] += v[i];
-            }
-        }
-        for k in 0..3 {
-            let r = view.rotation[k];
-            pose[k] += r[0].f64() * sum[0] + r[1].f64() * sum[1] + r[2].f64() * sum[2];
         }
     }
 }

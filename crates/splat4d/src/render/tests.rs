@@ -564,7 +564,7 @@ fn contributions_are_the_oracles_and_sum_to_alpha() {
     let (mut renderer, mut image) = (Renderer::new(complete()), Image::default());
     renderer.render(&s.splats(), &view, [0.0; 3], None, &mut image);
     let mut share = Vec::new();
-    renderer.contributions(&mut share);
+    renderer.last_contributions(&mut share);
     for (j, &share) in share.iter().enumerate() {
         let expected: f64 = oracle.extra.plane(j).iter().sum();
         assert!((share - expected).abs() <= 1e-9 * expected, "splat {j}: {share}, {expected} by the oracle");
@@ -577,10 +577,10 @@ fn contributions_are_the_oracles_and_sum_to_alpha() {
     // Without a picture, and a run of bins at a time: the same bits.
     let mut again = Vec::new();
     let mut blind = Renderer::new(complete());
-    blind.weigh(&s.splats(), &view, &mut again);
+    blind.contributions(&s.splats(), &view, &mut again);
     assert_eq!(again, share);
     blind.raster.budget = Some(40);
-    blind.weigh(&s.splats(), &view, &mut again);
+    blind.contributions(&s.splats(), &view, &mut again);
     assert_eq!(again, share);
     assert!(blind.raster.bins.runs.len() > 1);
 }
@@ -595,7 +595,7 @@ fn contributions_do_not_disturb_the_way_back_and_know_no_threads() {
         let (mut share, mut d) = (Vec::new(), RenderGrads::default());
         renderer.render(&s.splats(), &view, [0.5; 3], None, &mut image);
         if weigh {
-            renderer.contributions(&mut share);
+            renderer.last_contributions(&mut share);
         }
         let ones = Planes { channels: 3, height: 90, width: 150, data: vec![1.0; 3 * 150 * 90] };
         let grads = ImageGrads { color: &ones, alpha: None, depth: None, extra: None };
@@ -616,7 +616,7 @@ fn removals_are_what_a_picture_loses_with_each_splat() {
     let view = camera(75, 41);
     let whole = draw_oracle(&s, &view, complete());
     let (mut renderer, mut losses) = (Renderer::new(complete()), Vec::new());
-    renderer.removals(&s.splats(), &view, BACKGROUND, &mut losses);
+    renderer.removals(&Shot::new(&s.splats(), &view, BACKGROUND), &mut losses);
     let (mut n, mut changes) = (0, 0);
     for part in 0..3 {
         for j in 0..s.outs[part].rows() {
@@ -644,8 +644,10 @@ fn sensitivities_are_sums_of_squared_differences() {
     // A bare bell's tail counts as its middle does, as far as it is drawn.
     let cut = RenderConfig { sh_degree: 0, ..complete() };
     let [mut found, mut drawn] = [Vec::new(), Vec::new()];
-    Renderer::new(config).sensitivities(&s.splats(), &view, BACKGROUND, &mut found);
-    Renderer::new(cut).sensitivities(&s.splats(), &view, BACKGROUND, &mut drawn);
+    let splats = s.splats();
+    let shot = Shot { sh_degree: 0, ..Shot::new(&splats, &view, BACKGROUND) };
+    Renderer::new(config).sensitivities(&shot, &mut found);
+    Renderer::new(cut).sensitivities(&shot, &mut drawn);
     let (mut n, mut strong) = (0, 0);
     for part in 0..3 {
         for j in 0..s.outs[part].rows() {
@@ -704,7 +706,7 @@ fn sensitivities_are_sums_of_squared_differences() {
     assert!(strong > 6, "{strong} splats matter");
 }
 
-/// What f32 loses on the way back: behind many opaque splats, what is still to come is a small difference of large sums.
+/// Precision of f32 on the way back: behind many opaque splats, what is still to come is a small difference of large sums.
 #[test]
 fn f32_gradients_are_those_of_f64() {
     let mut s = scene(9, 150, 0.12);

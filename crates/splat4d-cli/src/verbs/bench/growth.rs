@@ -248,7 +248,7 @@ fn memory(base: &Pinned, count: usize, degree: usize, side: usize, way: Way) -> 
 fn renderer_bytes(pinned: &Pinned, way: Way) -> u64 {
     let mut renderer = Renderer::new(RenderConfig { simd: way.simd, ..RenderConfig::default() });
     let (mut image, mut d) = (Image::default(), RenderGrads::default());
-    let mut moment = splat4d::layers::Instant::default();
+    let mut moment = splat4d::layers::Evaluation::default();
     let mut most = 0;
     for view in &pinned.views {
         pinned.scene.at(view.time, &mut moment);

@@ -1,6 +1,6 @@
 //! Times of drawing: the motion at a time, the renderer's stages, and their way back.
 
-use super::ceilings::{Ceiling, bytes};
+use super::roofline::{Roofline, bytes};
 use super::rows::Row;
 use super::scenes::{Pinned, View};
 use splat4d::Result;
@@ -71,7 +71,7 @@ fn zeros(splats: &Splats<'_, f32>) -> Vec<Option<Table<f32>>> {
 }
 
 /// Draws every view again and again. Call it inside a pool of `way.threads` threads.
-pub(super) fn measure(pinned: &Pinned, way: Way, ceiling: &Ceiling) -> Result<Vec<Row>> {
+pub(super) fn measure(pinned: &Pinned, way: Way, roofline: &Roofline) -> Result<Vec<Row>> {
     let config = RenderConfig { simd: way.simd, ..RenderConfig::default() };
     let (mut renderer, mut image) = (Renderer::new(config), Image::default());
     let (mut d, mut d_sh) = (RenderGrads::default(), Vec::new());
@@ -94,7 +94,7 @@ pub(super) fn measure(pinned: &Pinned, way: Way, ceiling: &Ceiling) -> Result<Ve
             if round == 0 {
                 let counts = renderer.count_pairs();
                 (seen.tested, seen.contributing) = (counts.tested, counts.contributing);
-                seen.floor = floor(pinned, &splats, &renderer, counts.tested, ceiling);
+                seen.floor = floor(pinned, &splats, &renderer, counts.tested, roofline);
             }
             let grad = gradient(view);
             if d_sh.len() != splats.parts.len() {
@@ -121,11 +121,11 @@ fn floor(
     splats: &Splats<'_, f32>,
     renderer: &Renderer,
     tested: usize,
-    ceiling: &Ceiling,
+    roofline: &Roofline,
 ) -> [f64; STAGES.len()] {
     let stats = renderer.stats();
-    let moved = |bytes: usize| bytes as f64 / ceiling.bytes;
-    let blend = tested as f64 / ceiling.pairs;
+    let moved = |bytes: usize| bytes as f64 / roofline.bytes;
+    let blend = tested as f64 / roofline.pairs;
     let motion = moved(bytes::motion(&pinned.scene, splats.len()));
     let project = moved(bytes::project(stats.splats));
     let shade = moved(bytes::shade(splats, stats.visible));

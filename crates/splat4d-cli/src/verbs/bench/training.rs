@@ -1,11 +1,11 @@
 //! Times of training: whole steps of the trainer on a scene that is already good, against pictures of itself with noise,
 //! so that every gradient is small and none is zero.
 
-use super::ceilings::{Ceiling, bytes};
+use super::roofline::{Roofline, bytes};
 use super::rows::Row;
 use super::scenes::Pinned;
 use super::stages::{Way, simd_name};
-use splat4d::layers::{Instant as Moment, Scene};
+use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::Rng;
 use splat4d::math::sh::degree_of;
 use splat4d::motion::Spec;
@@ -45,7 +45,7 @@ impl Held {
     /// What the scene looks like from its views, with noise.
     pub(super) fn of(pinned: &Pinned, way: Way) -> Self {
         let mut renderer = Renderer::new(RenderConfig { simd: way.simd, ..RenderConfig::default() });
-        let (mut image, mut moment) = (Image::default(), Moment::default());
+        let (mut image, mut moment) = (Image::default(), Evaluation::default());
         let rng = Rng::new(1, "noise on the truth", 0);
         let mut picture = |(v, view): (usize, &super::scenes::View)| {
             pinned.scene.at(view.time, &mut moment);
@@ -156,7 +156,7 @@ pub(super) fn trainer(scene: Scene<f32>, frames: Arc<dyn Frames>, way: Way) -> R
         exposure_lr: 0.0,
     };
     let renderer = Renderer::new(RenderConfig { simd: way.simd, ..RenderConfig::default() });
-    let loss = TrainLoss::new(LAMBDA_DSSIM, 0.0, None);
+    let loss = TrainLoss::photometric(LAMBDA_DSSIM);
     let mut trainer = Trainer::new(scene, vec![stage], frames, Box::new(renderer), loss, settings);
     trainer.progress.rate_scale = STANDSTILL;
     Ok(trainer)
@@ -230,10 +230,10 @@ pub(super) fn times(scene: Scene<f32>, held: &Arc<Held>, way: Way) -> Result<Tim
 }
 
 /// Steps at every view, in parts. Call it inside a pool of `way.threads` threads.
-pub(super) fn measure(pinned: &Pinned, held: &Arc<Held>, way: Way, ceiling: &Ceiling) -> Result<Vec<Row>> {
+pub(super) fn measure(pinned: &Pinned, held: &Arc<Held>, way: Way, roofline: &Roofline) -> Result<Vec<Row>> {
     forget_peak();
     let t = times(pinned.scene.clone(), held, way)?;
-    let (mut alive, mut moment) = (0, Moment::default());
+    let (mut alive, mut moment) = (0, Evaluation::default());
     for view in &pinned.views {
         pinned.scene.at(view.time, &mut moment);
         alive += pinned.scene.splats(&moment).len();
@@ -254,7 +254,7 @@ pub(super) fn measure(pinned: &Pinned, held: &Arc<Held>, way: Way, ceiling: &Cei
             threads: way.threads,
             simd: simd_name(way.simd).into(),
             ms,
-            ceiling_share: moved.map(|b| 1e3 * b / ceiling.bytes / ms),
+            ceiling_share: moved.map(|b| 1e3 * b / roofline.bytes / ms),
             gb_per_s: moved.map(|b| 1e-6 * b / ms),
             outside_share: whole.then(|| 1.0 - t.renderer / ms),
             peak_memory: whole.then(peak_memory),

@@ -3,7 +3,7 @@
 
 use super::*;
 use crate::loss::terms::StepInfo;
-use crate::train::chain::{Chain, ImageLoss, Losses, View};
+use crate::train::chain::{Chain, Losses, Step, View};
 use crate::train::frames::{Frames, Picture};
 use crate::train::loss::TrainLoss;
 use crate::train::tests::Made;
@@ -178,7 +178,7 @@ fn trainer(scene: Scene<f32>, stages: Vec<Stage>) -> Trainer<'static> {
         exposure_lr: 0.0,
     };
     let draw = Box::new(Renderer::new(RenderConfig::default()));
-    Trainer::new(scene, stages, Arc::new(Made::new(4, 3, 24)), draw, TrainLoss::new(0.2, 0.0, None), settings)
+    Trainer::new(scene, stages, Arc::new(Made::new(4, 3, 24)), draw, TrainLoss::photometric(0.2), settings)
 }
 
 const COLUMNS: [(&str, f64); 6] = [
@@ -209,7 +209,7 @@ fn the_gradient_of_what_is_shown_moves_what_learns() {
     t.step().unwrap().unwrap();
     // The same view of what a reader would see, without any codec.
     let frames = Made::new(4, 3, 24);
-    let (mut picture, mut loss) = (Picture::default(), TrainLoss::new(0.2, 0.0, None));
+    let (mut picture, mut loss) = (Picture::default(), TrainLoss::photometric(0.2));
     let mut found = 0;
     for i in 0..frames.len() {
         frames.load(i, &mut picture).unwrap();
@@ -226,10 +226,11 @@ fn the_gradient_of_what_is_shown_moves_what_learns() {
         };
         let info = StepInfo { iteration: 0, times: vec![view.t], seed: 5, progress: 0.0 };
         let mut d: Vec<Grads<f32>> = whole.layers.iter().map(|l| Grads::new(&l.params)).collect();
-        let image: &mut dyn ImageLoss<f32> = &mut loss;
-        let mut losses = Losses { image, probes: &[], params: &[] };
+        let mut image = loss.of_step(&mut []);
+        let mut losses = Losses { image: &mut image, probes: &[], params: &[] };
         let mut renderer = Renderer::new(RenderConfig { sh_degree: 1, ..RenderConfig::default() });
-        Chain::default().step(&whole, &[view], &info, &mut renderer, &mut losses, &mut d, &mut |_| {});
+        let step = Step { scene: &whole, views: &[view], info: &info, sh_degree: 1 };
+        Chain::default().step(&step, &mut renderer, &mut losses, &mut d, &mut |_| {}).unwrap();
         // Adam's first step goes against the gradient's sign: of one of the views in every number.
         let mut right = true;
         let mut count = 0;

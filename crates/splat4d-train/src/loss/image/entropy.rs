@@ -1,7 +1,19 @@
 //! Entropy of what is half there: opacities and masks that decide for one side.
 
+use super::{ImageTerm, PictureGrads, Shown, View};
+use crate::loss::terms::StepInfo;
 use splat4d::math::Real;
 use splat4d::scene::Planes;
+
+/// [`mask_entropy`] of alpha, times a weight.
+#[derive(Clone, Copy, Debug)]
+pub struct MaskEntropy(pub f64);
+
+impl<F: Real> ImageTerm<F> for MaskEntropy {
+    fn eval(&mut self, _: &StepInfo, _: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64 {
+        mask_entropy(shown.alpha, self.0, d.alpha.add())
+    }
+}
 
 /// Probabilities are kept this far from 0 and 1, where the slope would be infinite.
 const MARGIN: f64 = 1e-4;

@@ -1,8 +1,27 @@
 //! Flow: what a pixel shows goes where the truth says.
 
-use super::{SEEN, over_rows};
+use super::{Channel, ImageTerm, Needs, PictureGrads, SEEN, Shown, View, over_rows};
+use crate::loss::terms::StepInfo;
 use splat4d::math::Real;
 use splat4d::scene::Planes;
+
+/// [`flow()`] of views that know theirs, times a weight.
+#[derive(Clone, Copy, Debug)]
+pub struct Flow(pub f64);
+
+impl<F: Real> ImageTerm<F> for Flow {
+    fn needs(&self, view: &View<'_, F>) -> Needs {
+        Needs { depth: false, extra: view.flow.map(|_| Channel::Flow).into_iter().collect() }
+    }
+
+    fn eval(&mut self, _: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64 {
+        let (Some(truth), Some((first, drawn))) = (&view.flow, shown.channel(&Channel::Flow)) else { return 0.0 };
+        let mut d_drawn = Planes::new(3, drawn.height, drawn.width);
+        let value = flow(&drawn, truth.vectors, self.0, &mut d_drawn);
+        d.add_extra(first, &d_drawn);
+        value
+    }
+}
 
 /// Known flow is that of a whole pixel: of a mean of pixels all must be known.
 const KNOWN: f64 = 0.999;

@@ -1,9 +1,31 @@
 //! Frequencies: amplitude and phase of the picture's spectrum, coarse ones first.
 
 use super::fft::Spectrum;
+use super::{ImageTerm, PictureGrads, Shown, View};
+use crate::loss::terms::StepInfo;
 use rayon::prelude::*;
 use splat4d::math::Real;
 use splat4d::scene::Planes;
+
+/// [`Frequency`] of the colours, times a weight.
+#[derive(Clone, Debug)]
+pub struct FrequencyTerm<F = f32> {
+    weight: f64,
+    frequency: Frequency<F>,
+}
+
+impl<F: Real> FrequencyTerm<F> {
+    /// With this weight.
+    pub fn new(weight: f64) -> Self {
+        Self { weight, frequency: Frequency::default() }
+    }
+}
+
+impl<F: Real> ImageTerm<F> for FrequencyTerm<F> {
+    fn eval(&mut self, info: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64 {
+        self.frequency.loss_and_grad(shown.color, view.truth, info.progress, self.weight, d.color.add())
+    }
+}
 
 /// The band begins at this share of the highest frequency and reaches all of it at [`FULL`]: fine detail is compared once
 /// coarse shape is there.

@@ -1,16 +1,24 @@
-//! Losses on a rendered picture beside the photometric one: entropy of its alpha, total variation, agreement of depth and
-//! normals, frequencies, flow.
+//! Losses on a rendered picture, each an [`ImageTerm`]: photometric, total variation, frequencies, masks, entropy of alpha,
+//! agreement of depth and normals, flow.
 //!
 //! Each *adds* `weight` times its gradient and returns `weight` times its value, and gives the same bits with any number
-//! of threads. [`ImageTerms`] says which of them a run uses.
+//! of threads. [`terms`] is the list of those that a recipe asks for.
 
 pub mod entropy;
 mod fft;
 pub mod flow;
 pub mod frequency;
+pub mod mask;
 pub mod normal;
+pub mod segmentation;
+mod term;
+#[cfg(test)]
+mod tests;
 pub mod tv;
 
+pub use term::{Channel, Gradient, ImageTerm, Needs, PictureGrads, Shown, View};
+
+use super::Photometric;
 use crate::recipe::Recipe;
 use rayon::prelude::*;
 use splat4d::math::Real;
@@ -18,35 +26,22 @@ use splat4d::math::Real;
 /// Alpha from which on a pixel shows something: below it depth, normal and flow are those of haze.
 pub const SEEN: f64 = 0.5;
 
-/// Weights of the picture losses; 0: off.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct ImageTerms {
-    /// [`tv::total_variation`] of the colours.
-    pub tv: f64,
-    /// [`tv::depth_smoothness`].
-    pub depth_tv: f64,
-    /// [`normal::depth_normal`].
-    pub depth_normal: f64,
-    /// [`frequency::Frequency`].
-    pub frequency: f64,
-    /// [`entropy::mask_entropy`], nats.
-    pub mask_entropy: f64,
-    /// [`flow::flow`], shares of the picture's longer side.
-    pub flow: f64,
-}
-
-impl ImageTerms {
-    /// As the recipe has them.
-    pub fn of(r: &Recipe) -> Self {
-        Self {
-            tv: r.lambda_tv,
-            depth_tv: r.lambda_depth_tv,
-            depth_normal: r.lambda_depth_normal,
-            frequency: r.lambda_frequency,
-            mask_entropy: r.lambda_mask_entropy,
-            flow: r.lambda_flow,
-        }
-    }
+/// The terms of a recipe, in the order in which values and gradients are summed: colours as 3DGS compares them, then what
+/// has a weight.
+pub fn terms(r: &Recipe) -> Vec<Box<dyn ImageTerm>> {
+    type Make = fn(f64) -> Box<dyn ImageTerm>;
+    let weighted: [(f64, Make); 7] = [
+        (r.lambda_tv, |w| Box::new(tv::TotalVariation(w))),
+        (r.lambda_frequency, |w| Box::new(frequency::FrequencyTerm::new(w))),
+        (r.lambda_mask, |w| Box::new(mask::Mask(w))),
+        (r.lambda_mask_entropy, |w| Box::new(entropy::MaskEntropy(w))),
+        (r.lambda_depth_tv, |w| Box::new(tv::DepthSmoothness(w))),
+        (r.lambda_depth_normal, |w| Box::new(normal::DepthNormal(w))),
+        (r.lambda_flow, |w| Box::new(flow::Flow(w))),
+    ];
+    let photometric: Box<dyn ImageTerm> = Box::new(Photometric::new(r.lambda_dssim as f32));
+    let weighted = weighted.into_iter().filter(|(weight, _)| *weight > 0.0).map(|(weight, make)| make(weight));
+    std::iter::once(photometric).chain(weighted).collect()
 }
 
 /// Calls `f(y, row)` for every row of a plane in parallel and returns the sum of the results in order.

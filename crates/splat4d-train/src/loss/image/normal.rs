@@ -1,8 +1,28 @@
 //! Agreement of depth and normals: splats lie flat on the surface that their depth draws.
 
-use super::{SEEN, expected_depth_backward, over_rows};
+use super::{Channel, ImageTerm, Needs, PictureGrads, SEEN, Shown, View, expected_depth_backward, over_rows};
+use crate::loss::terms::StepInfo;
 use splat4d::math::Real;
 use splat4d::scene::{Camera, Planes};
+
+/// [`depth_normal`], times a weight.
+#[derive(Clone, Copy, Debug)]
+pub struct DepthNormal(pub f64);
+
+impl<F: Real> ImageTerm<F> for DepthNormal {
+    fn needs(&self, _: &View<'_, F>) -> Needs {
+        Needs { depth: true, extra: vec![Channel::Normals] }
+    }
+
+    fn eval(&mut self, _: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64 {
+        let (first, normals) = shown.channel(&Channel::Normals).expect("normals are drawn where they are needed");
+        let mut d_normals = Planes::new(3, normals.height, normals.width);
+        let pictures = [shown.depth, shown.alpha, &normals];
+        let value = depth_normal(view.camera, pictures, self.0, [d.depth.add(), d.alpha.add(), &mut d_normals]);
+        d.add_extra(first, &d_normals);
+        value
+    }
+}
 
 /// A cross product shorter than this share of the squared depth has no direction.
 const DEGENERATE: f64 = 1e-12;

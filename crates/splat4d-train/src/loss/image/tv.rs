@@ -1,8 +1,33 @@
 //! Total variation: pictures and depths without speckle.
 
-use super::{SEEN, expected_depth_backward, over_rows};
+use super::{ImageTerm, Needs, PictureGrads, SEEN, Shown, View, expected_depth_backward, over_rows};
+use crate::loss::terms::StepInfo;
 use splat4d::math::Real;
 use splat4d::scene::Planes;
+
+/// [`total_variation`] of the colours, times a weight.
+#[derive(Clone, Copy, Debug)]
+pub struct TotalVariation(pub f64);
+
+impl<F: Real> ImageTerm<F> for TotalVariation {
+    fn eval(&mut self, _: &StepInfo, _: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64 {
+        total_variation(shown.color, self.0, d.color.add())
+    }
+}
+
+/// [`depth_smoothness`] beside the view's truth, times a weight.
+#[derive(Clone, Copy, Debug)]
+pub struct DepthSmoothness(pub f64);
+
+impl<F: Real> ImageTerm<F> for DepthSmoothness {
+    fn needs(&self, _: &View<'_, F>) -> Needs {
+        Needs { depth: true, extra: Vec::new() }
+    }
+
+    fn eval(&mut self, _: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64 {
+        depth_smoothness(shown.depth, shown.alpha, view.truth, self.0, d.depth.add(), d.alpha.add())
+    }
+}
 
 /// How fast an edge of the picture frees the depth beside it: a difference of a tenth of the colour range counts e⁻¹.
 const EDGE: f64 = 10.0;

@@ -6,6 +6,7 @@ use crate::learner::{Learner, Observation};
 use crate::methods::control::losses::{MaskSize, NodeAcceleration, NodeArap, NodeElastic, Sparse};
 use crate::upkeep::tests::context;
 use crate::upkeep::{AdaptNodes, At, Context, NodeSettings, Upkeep};
+use splat4d::layers::Evaluation;
 use splat4d::motion::control::{ControlSpec, Curve, TrajectorySpec};
 use splat4d::motion::skin::{Skin, SkinSpec};
 use splat4d::scene::Rows;
@@ -181,12 +182,9 @@ fn losses_on_nodes_calm_them() {
         };
         let unease = |scene: &Scene<f32>| {
             let at = |t: f64| {
-                let (mut tape, mut cache) = (splat4d::layers::LayerTape::default(), Default::default());
-                let layer = &scene.layers[0];
-                tape.ask(Space::Nodes, Rows::All, Time(t));
-                layer.motion.prepare(&layer.params, &[tape.question(&layer.params)], &mut cache);
-                layer.at(&cache, &mut tape);
-                (0..tape.out().rows()).map(|r| tape.out().read::<3>(r, 0)).collect::<Vec<_>>()
+                let seen = Evaluation::of_layer(&scene.layers[0], Space::Nodes, Rows::All, Time(t));
+                let out = seen.tape(0).out();
+                (0..out.rows()).map(|r| out.read::<3>(r, 0)).collect::<Vec<_>>()
             };
             let [a, b, c] = [0.04, 0.1, 0.16].map(at);
             let graph = crate::loss::graph::Graph::new(&a, 4, crate::loss::graph::Weigh::Uniform);

@@ -14,14 +14,14 @@ struct Counting {
 }
 
 impl Engine for Counting {
-    fn step(&mut self, learner: &mut Learner, plan: &mut StepPlan<'_>) -> Result<Stepped, Fault> {
+    fn step(&mut self, learner: &mut Learner, plan: &mut StepPlan<'_>) -> Result<Result<Stepped, Fault>> {
         self.steps.fetch_add(1, Ordering::Relaxed);
         self.inner.step(learner, plan)
     }
     fn changed(&mut self, learner: &Learner) {
         self.inner.changed(learner);
     }
-    fn antialias(&mut self) -> Antialias {
+    fn antialias(&self) -> Antialias {
         self.inner.antialias()
     }
 }

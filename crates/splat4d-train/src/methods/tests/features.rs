@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::Result;
-use splat4d::layers::{Head, Instant, LayerTape};
+use splat4d::layers::{Evaluation, Head, LayerTape};
 use splat4d::motion::spacetime::FeatureSpec;
 use splat4d::motion::{At, Cache};
 use splat4d::scene::{HeadKeys, Rows, SplatGrads};
@@ -99,7 +99,7 @@ impl Frames for Changing {
 /// Mean squared error over all frames.
 fn error_of(scene: &Scene<f32>, frames: &dyn Frames) -> f64 {
     let (mut renderer, mut image) = (Renderer::new(RenderConfig::default()), Image::default());
-    let (mut picture, mut instant, mut sum) = (Picture::default(), Instant::default(), 0.0);
+    let (mut picture, mut instant, mut sum) = (Picture::default(), Evaluation::default(), 0.0);
     for i in 0..frames.len() {
         frames.load(i, &mut picture).unwrap();
         scene.at(frames.time(i), &mut instant);

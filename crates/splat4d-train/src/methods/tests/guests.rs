@@ -5,7 +5,7 @@ use super::*;
 use crate::init::{self, Seeds};
 use crate::methods::stages;
 use crate::recipe::Recipe;
-use splat4d::layers::Instant;
+use splat4d::layers::Evaluation;
 use splat4d::math::Se3;
 use splat4d::math::se3::{dot, normalize, sub};
 
@@ -139,13 +139,13 @@ fn errors(motion: &str, life: &str) -> [f64; 2] {
         exposure_lr: 0.0,
     };
     let draw = Box::new(Renderer::new(RenderConfig::default()));
-    let loss = TrainLoss::new(0.0, 0.0, None);
+    let loss = TrainLoss::photometric(0.0);
     let mut trainer = Trainer::new(scene, stages(program.as_ref(), &plan), party.clone(), draw, loss, settings);
     while !trainer.is_done() {
         trainer.step().unwrap().expect("no fault");
     }
     let (mut renderer, mut image, mut instant) =
-        (Renderer::<f32>::new(RenderConfig::default()), Image::default(), Instant::default());
+        (Renderer::<f32>::new(RenderConfig::default()), Image::default(), Evaluation::default());
     let (mut picture, mut sums) = (Picture::default(), [[0.0f64; 2]; 2]);
     for i in 0..party.len() {
         trainer.scene().at(party.time(i), &mut instant);

@@ -1,12 +1,12 @@
 //! The contract of stages, layers and motion models, proven by made-up models: each is trained a few steps by the
 //! ordinary trainer and checked against f64 finite differences through the whole chain, the oracle as the forward.
 
+mod channels;
 mod control;
 mod edits;
 mod engine;
 mod features;
 mod filtered;
-mod further;
 mod guests;
 mod hexplane;
 mod layers;
@@ -20,7 +20,8 @@ mod upkeep;
 mod wrapper;
 
 use super::*;
-use crate::train::chain::{Chain, Draw, ImageLoss, Losses, PictureGrads, StepInfo, StepReport, View};
+use crate::loss::image::{ImageTerm, PictureGrads, Shown};
+use crate::train::chain::{Chain, Losses, Step, StepInfo, StepReport, View};
 use crate::train::frames::{Frames, Picture};
 use crate::train::loss::TrainLoss;
 use crate::train::tests::Made;
@@ -29,9 +30,11 @@ use crate::upkeep::Limits;
 use splat4d::layers::{ALWAYS, Layer};
 use splat4d::math::{Real, Rng};
 use splat4d::motion::{Motion, SpacetimeSpec, build};
-use splat4d::render::{Image, ImageGrads, PartGrads, RenderConfig, RenderGrads, Renderer, oracle};
+use splat4d::render::{
+    self, Backend, Image, ImageGrads, PartGrads, RenderConfig, RenderGrads, Renderer, Wanted, oracle,
+};
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
-use splat4d::scene::{Camera, GEOMETRY, Grads, Key, LIFE, Params, Planes, SH, Space, Splats, Table, Time};
+use splat4d::scene::{Camera, GEOMETRY, Grads, Key, LIFE, Params, Planes, SH, Space, Table, Time};
 use std::sync::Arc;
 
 #[test]
@@ -64,51 +67,51 @@ fn smooth() -> RenderConfig {
 /// The oracle as a drawing device: a forward without gradients.
 struct Oracle(RenderConfig);
 
-impl Draw<f64> for Oracle {
-    fn render(
-        &mut self,
-        splats: &Splats<'_, f64>,
-        camera: &Camera,
-        background: [f64; 3],
-        extra: Option<&Table<f64>>,
-        out: &mut Image<f64>,
-    ) {
-        *out = oracle::render(splats, camera, background, extra, &self.0);
+impl Backend<f64> for Oracle {
+    fn can(&self, _: &Wanted) -> Result<()> {
+        Ok(())
     }
 
-    fn backward(
+    fn render(&mut self, shot: &render::Shot<'_, f64>, out: &mut Image<f64>) -> Result<()> {
+        *out = oracle::render(shot.splats, shot.camera, shot.background, shot.extra, &self.0);
+        Ok(())
+    }
+
+    fn vjp(
         &mut self,
-        splats: &Splats<'_, f64>,
-        _: &Camera,
-        _: [f64; 3],
-        _: Option<&Table<f64>>,
+        shot: &render::Shot<'_, f64>,
         _: &ImageGrads<'_, f64>,
         _: &mut [Option<&mut Table<f64>>],
         d: &mut RenderGrads<f64>,
-    ) {
+    ) -> Result<()> {
         let part = |out: &Table<f64>| PartGrads { out: out.zeros_like(), color: None, weights: None };
-        d.parts = splats.parts.iter().map(|p| part(p.out)).collect();
-        d.mean2d = vec![0.0; splats.len()];
+        d.parts = shot.splats.parts.iter().map(|p| part(p.out)).collect();
+        d.mean2d = vec![0.0; shot.splats.len()];
+        Ok(())
     }
 
     fn radii(&self) -> &[f64] {
-        // Nobody observes a finite difference; enough zeros for every test scene.
+        // Finite differences are not observed; enough zeros for every test scene.
         &[0.0; 512]
     }
 
-    fn config(&mut self) -> &mut RenderConfig {
-        &mut self.0
+    fn config(&self) -> &RenderConfig {
+        &self.0
+    }
+
+    fn name(&self) -> &str {
+        "the oracle, with gradients of zero"
     }
 }
 
 /// Mean squared error.
 struct Squared;
 
-impl ImageLoss<f64> for Squared {
-    fn eval(&mut self, view: &View<'_, f64>, image: &Image<f64>, d: &mut PictureGrads<f64>) -> f64 {
-        let n = image.color.data.len() as f64;
-        let d_color = &mut d.color;
-        d_color.clone_from(&image.color);
+impl ImageTerm<f64> for Squared {
+    fn eval(&mut self, _: &StepInfo, view: &View<'_, f64>, shown: &Shown<'_, f64>, d: &mut PictureGrads<f64>) -> f64 {
+        let n = shown.color.data.len() as f64;
+        let d_color = d.color.overwrite().expect("there is one term");
+        d_color.clone_from(shown.color);
         for (d, t) in d_color.data.iter_mut().zip(&view.truth.data) {
             *d = (*d - t) * 2.0 / n;
         }
@@ -146,7 +149,7 @@ fn step(
     scene: &Scene<f64>,
     shots: &[Shot],
     probes: &Probes,
-    draw: &mut dyn Draw<f64>,
+    backend: &mut dyn Backend<f64>,
 ) -> (StepReport, Vec<Grads<f64>>, usize) {
     let views: Vec<View<'_, f64>> = shots
         .iter()
@@ -166,7 +169,8 @@ fn step(
     let mut d: Vec<Grads<f64>> = scene.layers.iter().map(|l| Grads::new(&l.params)).collect();
     let mut chain = Chain::default();
     let mut losses = Losses { image: &mut Squared, probes, params: &[] };
-    let report = chain.step(scene, &views, &info, draw, &mut losses, &mut d, &mut |_| {});
+    let step = Step { scene, views: &views, info: &info, sh_degree: smooth().sh_degree };
+    let report = chain.step(&step, backend, &mut losses, &mut d, &mut |_| {}).unwrap();
     (report, d, chain.at_calls)
 }
 
@@ -286,7 +290,7 @@ fn trainer_on(frames: Arc<dyn Frames>, scene: Scene<f32>, stages: Vec<Stage>, ca
         exposure_lr: 0.0,
     };
     let draw = Box::new(Renderer::new(RenderConfig::default()));
-    Trainer::new(scene, stages, frames, draw, TrainLoss::new(0.2, 0.0, None), settings)
+    Trainer::new(scene, stages, frames, draw, TrainLoss::photometric(0.2), settings)
 }
 
 /// Rates at which a tiny scene learns in tens of steps.

@@ -123,7 +123,7 @@ fn every_edit_of_rows_is_told_to_every_loss() {
 fn sized(scene: Scene<f32>, stages: Vec<Stage>, size: usize) -> Trainer<'static> {
     let settings = trainer(scene.clone(), vec![Stage::new("", 1)], 400).settings;
     let draw = Box::new(Renderer::new(RenderConfig::default()));
-    Trainer::new(scene, stages, Arc::new(Made::new(4, 3, size)), draw, TrainLoss::new(0.2, 0.0, None), settings)
+    Trainer::new(scene, stages, Arc::new(Made::new(4, 3, size)), draw, TrainLoss::photometric(0.2), settings)
 }
 
 #[test]

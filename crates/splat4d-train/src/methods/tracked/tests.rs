@@ -4,7 +4,7 @@ use crate::event::Progress;
 use crate::train::loss::{Exposure, TrainLoss};
 use crate::train::trainer::{Settings, Trainer};
 use crate::upkeep::Limits;
-use splat4d::layers::{ALWAYS, Instant, Scene};
+use splat4d::layers::{ALWAYS, Evaluation, Scene};
 use splat4d::math::sh::rgb_to_dc;
 use splat4d::math::{Rng, Se3};
 use splat4d::motion::build;
@@ -111,7 +111,7 @@ fn truth(params: &Params<f32>, turning: usize, frames: usize, angle: f64) -> Sce
 /// Draws a scene from all cameras; masks are where the first `masks` rows are what is seen.
 fn draw(s: &Scene<f32>, cameras: Vec<Camera>, frames: usize, masks: Option<usize>) -> Drawn {
     let mut renderer = Renderer::new(RenderConfig { sh_degree: 0, ..RenderConfig::default() });
-    let (mut image, mut instant) = (Image::default(), Instant::default());
+    let (mut image, mut instant) = (Image::default(), Evaluation::default());
     let mut front = Table::new(&[("front", 1)], s.len());
     (0..masks.unwrap_or(0)).for_each(|r| front.set(r, 0, 1.0));
     let mut pictures = Vec::new();
@@ -152,7 +152,8 @@ fn trainer(s: Scene<f32>, plan: &Plan, frames: Arc<dyn Frames>, exposure: Option
         exposure_lr: plan.recipe.exposure_lr,
     };
     let draw = Box::new(Renderer::new(RenderConfig { sh_degree: 0, ..RenderConfig::default() }));
-    let loss = TrainLoss::new(0.2, 0.0, exposure);
+    let mut loss = TrainLoss::photometric(0.2);
+    loss.exposure = exposure;
     Trainer::new(s, TrackedProgram.stages(plan), frames, draw, loss, settings)
 }
 

@@ -10,8 +10,7 @@ use crate::train::run::{Bench, training_frames};
 use crate::train::trainer::Trainer;
 use crate::upkeep::Change;
 use splat4d::format::scene;
-use splat4d::layers::{LayerTape, Scene};
-use splat4d::motion::Cache;
+use splat4d::layers::{Evaluation, Scene};
 use splat4d::scene::{Rows, Space, Time};
 use std::sync::Arc;
 
@@ -66,11 +65,9 @@ pub(super) fn bytes(scene: &Scene<f32>) -> Vec<u8> {
 /// Positions of a layer's Gaussians or nodes at a time.
 pub(super) fn places(scene: &Scene<f32>, layer: usize, of: Space, t: f64) -> Vec<[f32; 3]> {
     let layer = &scene.layers[layer];
-    let (mut tape, mut cache) = (LayerTape::default(), Cache::default());
-    tape.ask(of, Rows::All, Time(t));
-    layer.motion.prepare(&layer.params, &[tape.question(&layer.params)], &mut cache);
-    layer.at(&cache, &mut tape);
-    (0..tape.out().rows()).map(|r| tape.out().read(r, 0)).collect()
+    let seen = Evaluation::of_layer(layer, of, Rows::All, Time(t));
+    let out = seen.tape(0).out();
+    (0..out.rows()).map(|r| out.read(r, 0)).collect()
 }
 
 impl Bed {

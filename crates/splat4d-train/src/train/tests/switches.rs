@@ -204,7 +204,7 @@ fn tracked_and_central_velocities_are_drawn_after_training() {
         let flow = render_velocity(scene, Shot { camera: &camera, t: Time(t) }, &mut renderer);
         assert!(flow.vectors.data.iter().all(|v| v.is_finite()), "{line}");
         assert!(flow.vectors.data.iter().any(|v| v.abs() > 1e-4), "{line}: nothing moves");
-        let mut instant = splat4d::layers::Instant::default();
+        let mut instant = splat4d::layers::Evaluation::default();
         scene.at(Time(t), &mut instant);
         let velocities = splat4d::flow::velocities(scene, &instant);
         let [a, b] = [t - h, t + h].map(|t| places(scene, 0, Space::Gaussians, t));

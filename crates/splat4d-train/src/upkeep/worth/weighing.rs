@@ -1,8 +1,8 @@
 //! How much of the views at one time every Gaussian of a scene is.
 
 use super::temporal::Spatial;
-use splat4d::layers::{Instant, Scene};
-use splat4d::render::{Antialias, RenderConfig, Renderer, Sensitivity};
+use splat4d::layers::{Evaluation, Scene};
+use splat4d::render::{Antialias, RenderConfig, Renderer, Sensitivity, Shot};
 use splat4d::scene::splats::SPLAT_OPACITY;
 use splat4d::scene::{Camera, Time};
 
@@ -13,7 +13,7 @@ const LEAST_PIVOT: f64 = 1e-6;
 pub(super) struct Weighing {
     spatial: Spatial,
     renderer: Renderer<f32>,
-    instant: Instant<f32>,
+    instant: Evaluation<f32>,
     shares: Vec<f32>,
     changes: Vec<f32>,
     layers: Vec<Vec<f64>>,
@@ -29,7 +29,7 @@ impl Weighing {
         Self {
             spatial,
             renderer,
-            instant: Instant::default(),
+            instant: Evaluation::default(),
             shares: Vec::new(),
             changes: Vec::new(),
             layers: Vec::new(),
@@ -57,19 +57,20 @@ impl Weighing {
     /// Adds one view at that time.
     pub(super) fn add(&mut self, scene: &Scene<f32>, camera: &Camera) {
         let splats = scene.splats(&self.instant);
+        let shot = Shot::new(&splats, camera, scene.background);
         match self.spatial {
             Spatial::Share | Spatial::LightGaussian | Spatial::Opacity => {
-                self.renderer.weigh(&splats, camera, &mut self.shares);
+                self.renderer.contributions(&splats, camera, &mut self.shares);
             }
             Spatial::Pup | Spatial::Speedy => {
-                self.renderer.sensitivities(&splats, camera, scene.background, &mut self.sensitivities);
+                self.renderer.sensitivities(&shot, &mut self.sensitivities);
                 self.shares.clear();
                 self.shares.extend(self.sensitivities.iter().map(|s| s.squared as f32));
             }
-            Spatial::Change => self.renderer.removals(&splats, camera, scene.background, &mut self.shares),
+            Spatial::Change => self.renderer.removals(&shot, &mut self.shares),
             Spatial::Both => {
-                self.renderer.removals(&splats, camera, scene.background, &mut self.changes);
-                self.renderer.contributions(&mut self.shares);
+                self.renderer.removals(&shot, &mut self.changes);
+                self.renderer.last_contributions(&mut self.shares);
                 for (share, change) in self.shares.iter_mut().zip(&self.changes) {
                     *share = (*share * *change).sqrt();
                 }
@@ -77,7 +78,7 @@ impl Weighing {
         }
         let size = [camera.width, camera.height];
         let mut first = 0;
-        let tapes = self.instant.tapes.iter().zip(&mut self.layers).zip(&mut self.pixels);
+        let tapes = self.instant.tapes().zip(&mut self.layers).zip(&mut self.pixels);
         for (layer, ((tape, sums), pixels)) in tapes.enumerate() {
             let (rows, count) = (tape.rows(), tape.out().rows());
             let projected = &self.renderer.projected()[first..first + count];

@@ -7,7 +7,7 @@ mod masks;
 use super::index::crc;
 use super::page::{encode_page, parse_page};
 use super::*;
-use crate::layers::{Instant, Scene};
+use crate::layers::{Evaluation, Scene};
 use crate::math::{Rng, Se3, quat};
 use crate::render::{Image, RenderConfig, Renderer};
 use crate::scene::{Camera, Time};
@@ -226,7 +226,7 @@ fn a_block_is_alive_whenever_one_of_its_gaussians_is_seen() {
 /// A picture from in front at time t.
 fn picture(scene: &Scene<f32>, t: f64) -> Vec<f32> {
     let camera = Camera::with_fov_y(Se3::look_at([0.5, -1.0, -4.0], [0.0; 3], scene.up), 0.8, 96, 80);
-    let (mut instant, mut image) = (Instant::default(), Image::default());
+    let (mut instant, mut image) = (Evaluation::default(), Image::default());
     scene.at(Time(t), &mut instant);
     Renderer::new(RenderConfig::default()).render(&scene.splats(&instant), &camera, scene.background, None, &mut image);
     image.color.data

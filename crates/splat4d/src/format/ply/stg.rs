@@ -152,7 +152,7 @@ mod tests {
     use super::*;
     use crate::format::kinematic::tests::{apart, moving};
     use crate::format::mutate::mutants;
-    use crate::layers::Instant;
+    use crate::layers::Evaluation;
     use crate::scene::{LifeKind, Time};
 
     #[test]
@@ -193,9 +193,9 @@ mod tests {
         let (scene, warnings) = read_stg(text.as_bytes()).unwrap();
         let said = warnings.lines().join("\n");
         assert!(said.contains("one second") && said.contains("network"), "{said}");
-        let mut instant = Instant::default();
+        let mut instant = Evaluation::default();
         scene.at(Time(0.75), &mut instant);
-        let row = instant.tapes[0].out().read::<10>(0, 0);
+        let row = instant.tape(0).out().read::<10>(0, 0);
         // x = 1 + 4Δ + 4Δ² at Δ = ¼; opacity ½·exp(−(¼/½)²).
         assert!((row[0] - 2.25).abs() < 1e-5 && (row[9] - 0.5 * (-0.25f32).exp()).abs() < 1e-6, "{row:?}");
         let dc = scene.layers[0].params[crate::scene::SH].read::<3>(0, 0);
@@ -209,7 +209,7 @@ mod tests {
         for mutant in mutants(&file, 1500, "stg") {
             let _ = is_stg(&mutant);
             if let Ok((scene, _)) = read_stg(&mutant) {
-                scene.at(Time(0.1), &mut Instant::default());
+                scene.at(Time(0.1), &mut Evaluation::default());
             }
         }
         let message = read_stg(&file[..file.len() - 1]).unwrap_err().to_string();

@@ -22,10 +22,10 @@ fn psnr(a: &[f32], b: &[f32]) -> f64 {
 }
 
 /// Asserts that both draw the same, and returns the PSNR.
-fn compare(r: &mut GpuRenderer, splats: &Splats<'_, f32>, camera: &Camera, what: &str) -> (f64, RenderStats) {
+fn compare(r: &mut GpuRenderer, shot: &Shot<'_>, what: &str) -> (f64, RenderStats) {
     let mut image = Image::default();
-    r.render(splats, camera, BACKGROUND, &mut image).expect("it is drawn");
-    let (cpu, expected) = on_cpu(splats, camera, &r.config);
+    r.render(shot, &mut image).expect("it is drawn");
+    let (cpu, expected) = on_cpu(shot, &r.config);
     let far = cpu.projected().iter().filter(|p| p.radius > 0.0).map(|p| p.depth).fold(1.0, f32::max);
     let (color, alpha) =
         (worst(&image.color.data, &expected.color.data), worst(&image.alpha.data, &expected.alpha.data));
@@ -54,7 +54,7 @@ fn pictures_equal_the_cpus() {
         for (c, camera) in cameras.iter().enumerate() {
             for antialias in [Antialias::Off, Antialias::On] {
                 r.config.antialias = antialias;
-                compare(&mut r, &scene.splats(), camera, &format!("scene {s}, camera {c}, {antialias:?}"));
+                compare(&mut r, &shot(&scene.splats(), camera), &format!("scene {s}, camera {c}, {antialias:?}"));
             }
         }
     }
@@ -92,17 +92,15 @@ fn every_kind_of_colour_is_drawn() {
         sh(&large, Rows::Some(&ids), None),
     ];
     for (i, color) in colors.into_iter().enumerate() {
-        if i == 3 {
-            // 24 columns without weights are eight coefficients a channel, of which degree 1 is whole.
-            r.config.sh_degree = 1;
-        }
+        // 24 columns without weights are eight coefficients a channel, of which degree 1 is whole.
+        let sh_degree = if i == 3 { 1 } else { 3 };
         let (mut splats, rest) = (Splats { parts: vec![Part { out: &scene.out, color }], head: None }, small.splats());
-        compare(&mut r, &splats, &camera, &format!("colour {i}"));
+        compare(&mut r, &Shot { sh_degree, ..shot(&splats, &camera) }, &format!("colour {i}"));
         // A second layer, then an empty one.
         let none = Scenery::new(16, 0, 1.0, 1.0);
         splats.parts.push(rest.parts[0]);
         splats.parts.push(none.splats().parts[0]);
-        compare(&mut r, &splats, &camera, &format!("colour {i} with a second layer"));
+        compare(&mut r, &Shot { sh_degree, ..shot(&splats, &camera) }, &format!("colour {i} with a second layer"));
     }
 }
 
@@ -118,7 +116,7 @@ fn nothing_to_draw_is_the_background() {
         [(Splats { parts: vec![], head: None }, &camera), (empty.splats(), &camera), (behind.splats(), &away)]
     {
         let mut image = Image::default();
-        r.render(&splats, camera, BACKGROUND, &mut image).expect("it is drawn");
+        r.render(&shot(&splats, camera), &mut image).expect("it is drawn");
         for (c, b) in BACKGROUND.iter().enumerate() {
             assert!(image.color.plane(c).iter().all(|v| v == b));
         }
@@ -127,7 +125,7 @@ fn nothing_to_draw_is_the_background() {
     }
     let mut image = Image::default();
     let flat = Camera { width: 0, ..camera };
-    r.render(&behind.splats(), &flat, BACKGROUND, &mut image).expect("a picture without pixels");
+    r.render(&shot(&behind.splats(), &flat), &mut image).expect("a picture without pixels");
     assert!(image.color.data.is_empty());
 }
 
@@ -148,17 +146,17 @@ fn absurd_numbers_are_not_drawn() {
     let Some(mut r) = renderer() else { return };
     let camera = camera([0.0, 0.5, -4.0], 90, 70);
     let scene = spoilt(&[f32::NAN, f32::INFINITY, f32::NEG_INFINITY]);
-    compare(&mut r, &scene.splats(), &camera, "NaN and infinities");
+    compare(&mut r, &shot(&scene.splats(), &camera), "NaN and infinities");
     // Numbers of which squares overflow mean nothing on either side, but they end, and in a finite picture.
     let scene = spoilt(&[1e38, -1e38, 1e30, -1e30, 1e-38]);
     let mut image = Image::default();
-    r.render(&scene.splats(), &camera, BACKGROUND, &mut image).expect("it is drawn");
+    r.render(&shot(&scene.splats(), &camera), &mut image).expect("it is drawn");
     assert!(image.color.data.iter().chain(&image.alpha.data).all(|v| v.is_finite()));
     // And cameras that are no cameras: neither hang nor failure.
     for broken in [f64::NAN, f64::INFINITY, 0.0, -1.0, 1e300] {
         let mut camera = camera.clone();
         camera.intrinsics.fx = broken;
-        r.render(&scene.splats(), &camera, BACKGROUND, &mut image).expect("it ends");
+        r.render(&shot(&scene.splats(), &camera), &mut image).expect("it ends");
     }
 }
 
@@ -167,18 +165,18 @@ fn bands_make_the_same_picture() {
     let Some(mut r) = own_renderer() else { return };
     let (scene, camera) = (Scenery::new(20, 20_000, 1.2, 0.05), camera([0.0, 0.5, -4.0], 300, 210));
     let (mut whole, mut bands) = (Image::default(), Image::default());
-    r.render(&scene.splats(), &camera, BACKGROUND, &mut whole).expect("it is drawn");
+    r.render(&shot(&scene.splats(), &camera), &mut whole).expect("it is drawn");
     let (pairs, one) = (r.stats().pairs, r.stats().bands);
     assert!(one == 1 && pairs > 1 << 16, "{pairs} pairs must be more than there was room for at first");
     // A renderer without memory yet, so that there is little room.
     let Some(mut r) = own_renderer() else { return };
     r.most_pairs = pairs / 4;
-    r.render(&scene.splats(), &camera, BACKGROUND, &mut bands).expect("it is drawn");
+    r.render(&shot(&scene.splats(), &camera), &mut bands).expect("it is drawn");
     assert!(r.stats().bands > 1 && r.stats().pairs == pairs);
     assert!(whole == bands, "a picture in bands is the same, bit for bit");
     // A row of tiles holds more than that.
     let mut r = GpuRenderer { most_pairs: 10, buffers: Buffers::new(), groups: None, ..r };
-    let error = r.render(&scene.splats(), &camera, BACKGROUND, &mut bands);
+    let error = r.render(&shot(&scene.splats(), &camera), &mut bands);
     assert!(error.is_err_and(|e| e.to_string().contains("too many")), "too many pairs are an error");
 }
 
@@ -188,17 +186,18 @@ fn a_second_frame_is_the_same_and_allocates_nothing() {
     let (scene, camera) = (Scenery::new(21, 2000, 1.2, 0.05), camera([0.0, 0.5, -4.0], 150, 110));
     let (mut first, mut second) = (Image::default(), Image::default());
     r.tables = Tables::Constant;
-    r.render(&scene.splats(), &camera, BACKGROUND, &mut first).expect("it is drawn");
+    r.render(&shot(&scene.splats(), &camera), &mut first).expect("it is drawn");
     let bytes = r.memory_bytes();
-    r.render(&scene.splats(), &camera, BACKGROUND, &mut second).expect("it is drawn");
+    r.render(&shot(&scene.splats(), &camera), &mut second).expect("it is drawn");
     assert!(first == second && r.memory_bytes() == bytes);
     let t = r.timings();
     assert!(t.total > 0.0 && t.wait > 0.0 && (t.gpu() > 0.0) == (r.clock == StageClock::Gpu));
     r.clock = StageClock::Wall;
-    r.render(&scene.splats(), &camera, BACKGROUND, &mut second).expect("it is drawn");
+    r.render(&shot(&scene.splats(), &camera), &mut second).expect("it is drawn");
     assert!(first == second && r.timings().rasterize > 0.0 && r.timings().project > 0.0);
     // Other colours at another address are seen, those of a table that changes too.
     let other = Scenery::new(22, 2000, 1.2, 0.05);
     let color = Color::Sh { table: &other.sh, rows: Rows::All, weights: None, base: true };
-    compare(&mut r, &Splats { parts: vec![Part { out: &scene.out, color }], head: None }, &camera, "other colours");
+    let splats = Splats { parts: vec![Part { out: &scene.out, color }], head: None };
+    compare(&mut r, &shot(&splats, &camera), "other colours");
 }

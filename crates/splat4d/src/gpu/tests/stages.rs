@@ -1,7 +1,8 @@
 //! Stage by stage.
 
 use super::*;
-use crate::render::{View, project, shade};
+use crate::render::project::{Projection, View};
+use crate::render::{project, shade};
 
 /// Relative difference of a depth, a colour, an extent or an opacity: a few roundings of f32.
 const RELATIVE: f32 = 2e-5;
@@ -17,8 +18,8 @@ fn close(a: f32, b: f32, relative: f32, absolute: f32) -> bool {
 }
 
 /// Renders, so that every buffer holds what its stage wrote.
-fn drawn(r: &mut GpuRenderer, splats: &Splats<'_, f32>, camera: &Camera) {
-    r.render(splats, camera, BACKGROUND, &mut Image::default()).expect("a small scene is drawn");
+fn drawn(r: &mut GpuRenderer, shot: &Shot<'_>) {
+    r.render(shot, &mut Image::default()).expect("a small scene is drawn");
 }
 
 #[test]
@@ -31,7 +32,7 @@ fn projection_equals_the_cpus() {
         (camera([0.3, 0.0, 0.2], 64, 64), Antialias::Off),
     ] {
         r.config.antialias = antialias;
-        drawn(&mut r, &scene.splats(), &camera);
+        drawn(&mut r, &shot(&scene.splats(), &camera));
         let n = scene.out.rows();
         let shapes: Vec<[f32; 8]> = read(&r.gpu, &r.buffers.shapes, n);
         let colors: Vec<[f32; 4]> = read(&r.gpu, &r.buffers.colors, n);
@@ -74,14 +75,17 @@ fn colours_equal_the_cpus() {
     let Some(mut r) = renderer() else { return };
     let (scene, camera) = (Scenery::new(2, 1000, 1.0, 0.05), camera([0.0, 0.5, -4.0], 131, 77));
     for degree in 0..=3 {
-        r.config.sh_degree = degree;
-        drawn(&mut r, &scene.splats(), &camera);
+        let splats = scene.splats();
+        let shot = Shot { sh_degree: degree, ..shot(&splats, &camera) };
+        drawn(&mut r, &shot);
         let n = scene.out.rows();
         let colors: Vec<[f32; 4]> = read(&r.gpu, &r.buffers.colors, n);
-        let (cpu, _) = on_cpu(&scene.splats(), &camera, &r.config);
+        let (cpu, _) = on_cpu(&shot, &r.config);
         let mut expected = vec![[0.0; 3]; n];
         let view = View::new(&camera, &r.config);
-        shade::forward(&scene.splats(), &view, degree, r.config.simd, cpu.projected(), &mut expected);
+        let simd = r.config.simd;
+        let projection = Projection { splats: &splats, view: &view, simd, projected: cpu.projected() };
+        shade::forward(&projection, degree, &mut expected);
         let marks: Vec<u32> = read(&r.gpu, &r.buffers.marks, n);
         let both = (0..n).filter(|&j| marks[j] == 1 && cpu.projected()[j].radius > 0.0);
         let mut seen = 0;
@@ -230,7 +234,7 @@ fn lists_of_tiles_are_complete_and_in_the_cpus_order() {
         (Scenery::new(6, 200, 1.0, 0.4), skewed(331, 90)),
         (twins, skewed(97, 145)),
     ] {
-        drawn(&mut r, &scene.splats(), &camera);
+        drawn(&mut r, &shot(&scene.splats(), &camera));
         let n = scene.out.rows();
         let (across, down) = (camera.width.div_ceil(TILE), camera.height.div_ceil(TILE));
         let shapes: Vec<[f32; 8]> = read(&r.gpu, &r.buffers.shapes, n);

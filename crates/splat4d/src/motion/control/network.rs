@@ -10,7 +10,7 @@ use crate::Result;
 use crate::math::{Real, Rng};
 use crate::motion::Slot;
 use crate::nn::encoding::{MAX_LEVELS, encode, encode_backward, encoded};
-use crate::nn::{Kept, Mlp, MlpShape};
+use crate::nn::{InputGrad, Kept, Mlp, MlpShape, Passed};
 use crate::scene::{Grads, Key, Params, Space, Table, Time};
 
 /// From so many hidden layers on the input comes in again in the middle (Mildenhall et al. 2020: after the fourth of
@@ -159,7 +159,7 @@ impl<F: Real> Trajectory<F> for Network {
         let pass = pass_of::<F>(cache, t);
         let d_poses = d_out.column_to_rows(0, POSE);
         let mut d_x = vec![F::ZERO; pass.x.len()];
-        self.mlp.backward_of(p, &pass.x, &pass.kept, &d_poses, Some(&mut d_x), d);
+        self.mlp.backward(p, Passed::kept(&pass.x, &pass.kept), &d_poses, InputGrad::Overwrite(&mut d_x), d);
         let (width, split) = (self.mlp.shape().inputs, encoded(3, self.levels[0]));
         let (now, slope) = self.time(t);
         let scale = p[self.units].get(3, 0);

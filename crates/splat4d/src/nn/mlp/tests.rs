@@ -47,7 +47,7 @@ fn every_weight_and_input_equals_finite_differences() {
         let weights = numbers::<f64>(n * shape.outputs, 2);
         let mut d = Grads::new(&p);
         let mut d_x = vec![9.0; x.len()];
-        mlp.backward(&p, &x, &weights, Some(&mut d_x), &mut d);
+        mlp.backward(&p, Passed::of(&x), &weights, InputGrad::Overwrite(&mut d_x), &mut d);
         let near = |fd: f64, got: f64| (fd - got).abs() < 1e-5 * fd.abs().max(1e-3);
         let mut met = 0;
         for key in p.keys().skip(3).collect::<Vec<_>>() {
@@ -137,7 +137,7 @@ fn any_number_of_threads_and_kept_activations_give_the_same_bits() {
             } else {
                 mlp.forward(&p, &x, &mut out);
             }
-            mlp.backward_of(&p, &x, &kept, &d_out, Some(&mut d_x), &mut d);
+            mlp.backward(&p, Passed::kept(&x, &kept), &d_out, InputGrad::Overwrite(&mut d_x), &mut d);
             (out, d_x, d)
         })
     };
@@ -150,7 +150,7 @@ fn any_number_of_threads_and_kept_activations_give_the_same_bits() {
     assert!(worst < 1e-4, "{worst}");
     let none: [f32; 0] = [];
     mlp.forward(&p, &none, &mut []);
-    mlp.backward(&p, &none, &none, Some(&mut []), &mut Grads::new(&p));
+    mlp.backward(&p, Passed::of(&none), &none, InputGrad::Overwrite(&mut []), &mut Grads::new(&p));
 }
 
 #[test]
@@ -167,7 +167,8 @@ fn a_shift_is_an_input_that_all_rows_share() {
         out.iter().zip(&weights).map(|(a, b)| a * b).sum::<f64>()
     };
     let mut d = Grads::new(&p);
-    let d_shifts = mlp.backward_shifted(&p, &x, &shifts, &Kept::default(), &weights, None, &mut d);
+    let passed = Passed { shifts: &shifts, ..Passed::of(&x) };
+    let d_shifts = mlp.backward(&p, passed, &weights, InputGrad::Skip, &mut d);
     for map in [0, 2] {
         for i in 0..shifts[map].len() {
             let moved = |h: f64| {

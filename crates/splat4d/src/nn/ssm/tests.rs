@@ -17,7 +17,7 @@ fn states(len: usize, seed: u64) -> Vec<Pair<f64>> {
     random(2 * len, seed).as_chunks().0.to_vec()
 }
 
-/// What a scan gives: outputs, last states, marks.
+/// Result of a scan: outputs, last states, marks.
 fn scan(of: &Discrete<f64>, way: Direction, u: &[Lane<f64>], first: &[Pair<f64>]) -> (Vec<Lane<f64>>, Vec<Pair<f64>>) {
     let (mut y, mut state) = (vec![[0.0; LANES]; u.len()], first.to_vec());
     of.scan(way, u, &mut y, &mut state, &mut Vec::new());

@@ -57,7 +57,7 @@ fn trainer(scene: Scene<f32>, frames: Arc<Drawn>) -> Trainer<'static> {
     };
     let draw = Box::new(Renderer::new(RenderConfig::default()));
     let stage = Stage { groups, ..Stage::new("tune", STEPS) };
-    Trainer::new(scene, vec![stage], frames, draw, TrainLoss::new(0.2, 0.0, None), settings)
+    Trainer::new(scene, vec![stage], frames, draw, TrainLoss::photometric(0.2), settings)
 }
 
 fn tune(scene: Scene<f32>, frames: Arc<Drawn>) -> Scene<f32> {

@@ -8,7 +8,7 @@ use super::*;
 use crate::Result;
 use crate::capture::frames::{Frames, Picture};
 use crate::train::tests::Made;
-use splat4d::layers::{ALWAYS, Instant, Layer, LayerTape};
+use splat4d::layers::{ALWAYS, Evaluation, Layer, LayerTape};
 use splat4d::math::Rng;
 use splat4d::motion::{SpacetimeSpec, Spec, build};
 use splat4d::render::{Image, RenderConfig, Renderer};
@@ -56,7 +56,7 @@ fn scored(scene: &Scene<f32>, frames: &dyn Frames, config: &ScoreConfig) -> Scor
 
 /// Draws frame i of a capture.
 fn drawn(scene: &Scene<f32>, frames: &dyn Frames, i: usize) -> Image<f32> {
-    let (mut instant, mut image) = (Instant::default(), Image::default());
+    let (mut instant, mut image) = (Evaluation::default(), Image::default());
     scene.at(frames.time(i), &mut instant);
     let mut renderer = Renderer::new(RenderConfig::default());
     renderer.render(&scene.splats(&instant), frames.camera(i), [0.1, 0.2, 0.3], None, &mut image);

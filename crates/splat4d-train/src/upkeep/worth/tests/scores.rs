@@ -2,7 +2,7 @@
 
 use super::super::weighing::root_of_determinant;
 use super::*;
-use splat4d::render::Sensitivity;
+use splat4d::render::{Sensitivity, Shot};
 
 fn of(spatial: Spatial) -> ScoreConfig {
     ScoreConfig { spatial, temporal: Temporal::None, volume: false, ..ScoreConfig::default() }
@@ -60,11 +60,12 @@ fn pup_is_the_determinant_of_the_blocks_of_all_views_and_speedy_their_sum() {
     let (pup, speedy) = (scored(&s, &made, &of(Spatial::Pup)), scored(&s, &made, &of(Spatial::Speedy)));
     let rows = s.layers[0].params.len();
     let (mut blocks, mut sums) = (vec![[0.0; 21]; rows], vec![0.0; rows]);
-    let (mut instant, mut found) = (Instant::default(), Vec::<Sensitivity>::new());
+    let (mut instant, mut found) = (Evaluation::default(), Vec::<Sensitivity>::new());
     let mut renderer = Renderer::new(RenderConfig::default());
     for i in 0..made.len() {
         s.at(made.time(i), &mut instant);
-        renderer.sensitivities(&s.splats(&instant), made.camera(i), s.background, &mut found);
+        let splats = s.splats(&instant);
+        renderer.sensitivities(&Shot::new(&splats, made.camera(i), s.background), &mut found);
         for (row, x) in found.iter().enumerate() {
             (0..21).for_each(|k| blocks[row][k] += x.fisher[k]);
             sums[row] += x.squared;

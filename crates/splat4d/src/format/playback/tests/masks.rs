@@ -63,7 +63,7 @@ fn a_player_draws_whom_the_masks_admit() {
     let mut memory = Player::of_scene(&scene);
     let copy: &'static [u8] = bytes.clone().leak();
     let mut streamed = Player::open(Box::new(copy), copy.len() as u64, 1 << 30).unwrap();
-    let mut instant = Instant::default();
+    let mut instant = Evaluation::default();
     let (mut drawn, mut alive) = (0, 0);
     for step in 0..=40 {
         let t = Time(f64::from(step) / 40.0);

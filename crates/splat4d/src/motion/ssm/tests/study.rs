@@ -3,7 +3,7 @@
 
 use super::*;
 use crate::nn::encoding::{encode, encoded};
-use crate::nn::{Mlp, MlpShape};
+use crate::nn::{InputGrad, Mlp, MlpShape, Passed};
 
 const SOURCES: usize = 16;
 /// Ticks past the end that are asked for.
@@ -146,7 +146,7 @@ fn fit_mlp(ticks: usize, seconds: f64, width: usize, steps: usize) -> Score {
         let count = (ticks * SOURCES) as f32;
         let d_out: Vec<f32> = out.iter().zip(&target).map(|(a, b)| (a - b) / count).collect();
         let mut d = Grads::new(&p);
-        mlp.backward(&p, &x, &d_out, None, &mut d);
+        mlp.backward(&p, Passed::of(&x), &d_out, InputGrad::Skip, &mut d);
         adam.step(&mut p, &d, rate(step, steps));
     }
     let error = |(x, target): (Vec<f32>, Vec<f32>)| {

@@ -1,27 +1,27 @@
-//! The machine's ceilings, and the work that a stage cannot do without.
+//! The machine's roofline, and the work that a stage cannot do without.
 //!
-//! A stage's floor is the time in which its compulsory work is done at the ceilings: pairs of pixel and Gaussian at the
+//! A stage's floor is the time in which its compulsory work is done at the roofline: pairs of pixel and Gaussian at the
 //! speed of the blend's arithmetic alone, bytes at the speed of memory. Bytes are those that a stage must read and write
 //! once if it starts and ends in memory; small scenes stay in the caches, and may beat it.
 
 use splat4d::layers::{Layer, Scene};
-use splat4d::render::ceiling;
+use splat4d::render::roofline;
 use splat4d::render::{Simd, bin::Footprint};
 use splat4d::scene::Splats;
 
 /// What a number of threads can do at best.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Ceiling {
+pub(super) struct Roofline {
     /// Pairs of pixel and Gaussian a second, all threads together.
     pub pairs: f64,
     /// Bytes a second.
     pub bytes: f64,
 }
 
-impl Ceiling {
+impl Roofline {
     /// Measured on every thread of the pool at once, as the stages run.
     pub(super) fn measure(pool: &rayon::ThreadPool, simd: Simd) -> Self {
-        Self { pairs: pool.broadcast(|_| ceiling::blend(simd)).iter().sum(), bytes: pool.install(ceiling::bandwidth) }
+        Self { pairs: pool.broadcast(|_| roofline::blend(simd)).iter().sum(), bytes: pool.install(roofline::bandwidth) }
     }
 }
 

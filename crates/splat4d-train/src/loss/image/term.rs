@@ -1,0 +1,203 @@
+//! The contract of losses on rendered pictures, [`ImageTerm`]: it says which channels it needs, looks at a picture and its
+//! truth, and adds its gradient.
+
+use crate::capture::frames::FlowTruth;
+use crate::loss::LossValue;
+use crate::loss::terms::StepInfo;
+use splat4d::math::Real;
+use splat4d::render::{Image, ImageGrads};
+use splat4d::scene::{Camera, Planes, Time};
+
+/// One picture that the scene is compared with.
+#[derive(Clone, Copy, Debug)]
+pub struct View<'a, F = f32> {
+    /// From where.
+    pub camera: &'a Camera,
+    /// When.
+    pub t: Time,
+    /// Colour behind the scene.
+    pub background: [F; 3],
+    /// The truth, 3 channels.
+    pub truth: &'a Planes<F>,
+    /// Foreground mask, 1 channel.
+    pub mask: Option<&'a Planes<F>>,
+    /// Pixels that count, 1 channel.
+    pub weight: Option<&'a Planes<F>>,
+    /// Where its pixels go, as far as that is known.
+    pub flow: Option<FlowTruth<'a, F>>,
+    /// The frame's number in the capture, for messages.
+    pub frame: usize,
+    /// The camera's number in the capture, for the exposure.
+    pub rig: usize,
+}
+
+/// A further channel: a number or a few of every splat, blended as colours are, over nothing. The declared order is the
+/// order in which they are drawn.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Channel {
+    /// Σ α T n, n the shortest axis of a splat towards the camera, camera axes, 3 planes.
+    Normals,
+    /// Σ α T f, f the way of a splat's centre on the screen to where the view's flow goes, pixels, 2 planes, and Σ α T of
+    /// the splats that have an f. Only views that know their flow may ask for it.
+    Flow,
+    /// Σ α T s, s the sigmoid of this column of the Gaussians, 1 plane; 0 in layers without that column, and not drawn where
+    /// no layer has it.
+    Sigmoid(String),
+}
+
+impl Channel {
+    /// Its planes.
+    pub fn width(&self) -> usize {
+        match self {
+            Channel::Normals | Channel::Flow => 3,
+            Channel::Sigmoid(_) => 1,
+        }
+    }
+
+    /// The other time at which it looks at the view's splats.
+    pub fn other_time<F>(&self, view: &View<'_, F>) -> Option<Time> {
+        match self {
+            Channel::Flow => Some(view.flow.as_ref()?.to),
+            Channel::Normals | Channel::Sigmoid(_) => None,
+        }
+    }
+}
+
+/// What is to be drawn of a view beside colour and alpha.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Needs {
+    /// Σ z α T.
+    pub depth: bool,
+    /// Further channels, in order, none twice.
+    pub extra: Vec<Channel>,
+}
+
+impl Needs {
+    /// Adds what another term needs.
+    pub fn join(&mut self, other: Needs) {
+        self.depth |= other.depth;
+        self.extra.extend(other.extra);
+        self.extra.sort_unstable();
+        self.extra.dedup();
+    }
+}
+
+/// A picture as terms see it.
+#[derive(Clone, Copy, Debug)]
+pub struct Shown<'a, F = f32> {
+    /// Red, green, blue over the background, as the view's camera exposes them, [3, h, w].
+    pub color: &'a Planes<F>,
+    /// 1 − final transmittance, [1, h, w].
+    pub alpha: &'a Planes<F>,
+    /// Σ z α T, [1, h, w]; no plane where no term needs it.
+    pub depth: &'a Planes<F>,
+    /// Further channels, [C, h, w].
+    pub extra: &'a Planes<F>,
+    /// What these are, each with its first plane.
+    pub channels: &'a [(Channel, usize)],
+}
+
+impl<'a, F: Real> Shown<'a, F> {
+    /// What was drawn, with these further channels.
+    pub fn new(image: &'a Image<F>, channels: &'a [(Channel, usize)]) -> Self {
+        Self { color: &image.color, alpha: &image.alpha, depth: &image.depth, extra: &image.extra, channels }
+    }
+
+    /// First plane of a channel, and a copy of its planes; `None`: it was not drawn.
+    pub fn channel(&self, channel: &Channel) -> Option<(usize, Planes<F>)> {
+        let first = self.channels.iter().find(|(c, _)| c == channel)?.1;
+        let (n, channels) = (self.extra.pixels(), channel.width());
+        let data = self.extra.data[first * n..(first + channels) * n].to_vec();
+        Some((first, Planes { channels, height: self.extra.height, width: self.extra.width, data }))
+    }
+}
+
+/// The gradient to some planes of a picture: zero until a term touches it.
+#[derive(Clone, Debug, Default)]
+pub struct Gradient<F = f32> {
+    planes: Planes<F>,
+    shape: [usize; 3],
+    touched: bool,
+}
+
+impl<F: Real> Gradient<F> {
+    fn begin(&mut self, like: &Planes<F>) {
+        (self.shape, self.touched) = ([like.channels, like.height, like.width], false);
+    }
+
+    /// The planes, to be added to.
+    pub fn add(&mut self) -> &mut Planes<F> {
+        if !std::mem::replace(&mut self.touched, true) {
+            let [channels, height, width] = self.shape;
+            self.planes.reset(channels, height, width);
+        }
+        &mut self.planes
+    }
+
+    /// The planes, of any shape and content, to be overwritten as a whole; `None`: a term has added to them already.
+    pub fn overwrite(&mut self) -> Option<&mut Planes<F>> {
+        (!std::mem::replace(&mut self.touched, true)).then_some(&mut self.planes)
+    }
+
+    /// The planes, if a term has touched them.
+    pub fn get(&self) -> Option<&Planes<F>> {
+        self.touched.then_some(&self.planes)
+    }
+}
+
+/// The gradient to a picture.
+#[derive(Clone, Debug, Default)]
+pub struct PictureGrads<F = f32> {
+    /// To colour, [3, h, w].
+    pub color: Gradient<F>,
+    /// To alpha, [1, h, w].
+    pub alpha: Gradient<F>,
+    /// To Σ z α T, [1, h, w].
+    pub depth: Gradient<F>,
+    /// To the further channels, [C, h, w].
+    pub extra: Gradient<F>,
+}
+
+impl<F: Real> PictureGrads<F> {
+    /// Zeros in the shape of `image`.
+    pub fn begin(&mut self, image: &Image<F>) {
+        self.color.begin(&image.color);
+        self.alpha.begin(&image.alpha);
+        self.depth.begin(&image.depth);
+        self.extra.begin(&image.extra);
+    }
+
+    /// Adds to the gradient of further channels, from plane `first` on.
+    pub fn add_extra(&mut self, first: usize, planes: &Planes<F>) {
+        let n = planes.pixels();
+        let to = &mut self.extra.add().data[first * n..first * n + planes.data.len()];
+        to.iter_mut().zip(&planes.data).for_each(|(d, x)| *d += *x);
+    }
+
+    /// As the renderer takes it.
+    pub fn grads(&mut self) -> ImageGrads<'_, F> {
+        self.color.add();
+        ImageGrads {
+            color: &self.color.planes,
+            alpha: self.alpha.get(),
+            depth: self.depth.get(),
+            extra: self.extra.get(),
+        }
+    }
+}
+
+/// A loss on rendered pictures.
+pub trait ImageTerm<F: Real = f32>: Send {
+    /// What it needs of this view beside colour and alpha.
+    fn needs(&self, _view: &View<'_, F>) -> Needs {
+        Needs::default()
+    }
+
+    /// Its value for one view; adds its gradient to `d`.
+    fn eval(&mut self, info: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64;
+
+    /// What it measured of the last view, for progress and metrics.
+    fn measured(&self) -> Option<LossValue> {
+        None
+    }
+}

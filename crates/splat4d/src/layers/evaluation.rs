@@ -1,0 +1,297 @@
+//! [`Evaluation`]: the scene at these times, forth and back.
+//!
+//! A motion model wants all questions of a step at once (`prepare`), then answers them one by one (`at`); on the way back it
+//! takes a gradient a question (`backward`) and hears when that was the last one (`finish`). That order is written here,
+//! once, for training, playback, freezing, flow and baking.
+
+#[cfg(test)]
+mod tests;
+
+use super::{Layer, LayerTape, Scene};
+use crate::math::Real;
+use crate::motion::{At, Cache};
+use crate::scene::table::halve;
+use crate::scene::{Grads, Rows, Space, SplatGrads, Splats, Table, Time};
+
+/// Questions to the layers of a scene, their answers, and the gradients to these. No two questions have the same layer,
+/// space and time. All memory is used again after [`begin`](Self::begin).
+#[derive(Debug, Default)]
+pub struct Evaluation<F: Real = f32> {
+    questions: Vec<Question<F>>,
+    spare: Vec<Question<F>>,
+    /// By layer: what the motion model prepared, and the gradient to it.
+    caches: Vec<(Cache, Cache)>,
+}
+
+#[derive(Debug, Default)]
+struct Question<F: Real> {
+    layer: usize,
+    tape: LayerTape<F>,
+    /// Whether the rows alive at that time are among those asked for.
+    alive: bool,
+    /// Whether the gradients below belong to the answer; what they hold otherwise is of an earlier one.
+    begun: bool,
+    d_out: Table<F>,
+    d_color: Option<Table<F>>,
+    d_weights: Option<Table<F>>,
+    d_time: f64,
+}
+
+impl<F: Real> Evaluation<F> {
+    /// These rows of one layer at one time, answered.
+    pub fn of_layer(layer: &Layer<F>, of: Space, rows: Rows<'_>, t: Time) -> Self {
+        let mut out = Self::default();
+        out.ask(0, of, rows, t);
+        out.answer(std::slice::from_ref(layer));
+        out
+    }
+
+    /// Forgets all questions.
+    pub fn begin(&mut self) {
+        self.spare.append(&mut self.questions);
+    }
+
+    /// Asks for rows of a layer at a time, beside those that were asked for already. Returns the question's number.
+    pub fn ask(&mut self, layer: usize, of: Space, rows: Rows<'_>, t: Time) -> usize {
+        match self.find(layer, of, t) {
+            Some(i) => {
+                self.widen(i, rows);
+                i
+            }
+            None => self.push(layer, |tape| tape.ask(of, rows, t)),
+        }
+    }
+
+    /// Asks for the Gaussians of a layer that are alive at t, beside those that were asked for already. `of` is that layer.
+    /// Returns the question's number.
+    pub fn ask_active(&mut self, layer: usize, of: &Layer<F>, t: Time) -> usize {
+        let i = match self.find(layer, Space::Gaussians, t) {
+            Some(i) if self.questions[i].alive => i,
+            Some(i) => {
+                let mut ids = Vec::new();
+                let all = of.active(t, &mut ids);
+                self.widen(i, if all { Rows::All } else { Rows::Some(&ids) });
+                i
+            }
+            None => self.push(layer, |tape| tape.ask_active(of, t)),
+        };
+        self.questions[i].alive = true;
+        i
+    }
+
+    /// Asks for the rows of question i at another time. Returns the number of that question.
+    pub fn ask_again(&mut self, i: usize, t: Time) -> usize {
+        let Question { layer, tape, .. } = &self.questions[i];
+        let (layer, of) = (*layer, tape.space());
+        match tape.rows() {
+            Rows::All => self.ask(layer, of, Rows::All, t),
+            Rows::Some(ids) => {
+                let ids = ids.to_vec();
+                self.ask(layer, of, Rows::Some(&ids), t)
+            }
+        }
+    }
+
+    fn push(&mut self, layer: usize, ask: impl FnOnce(&mut LayerTape<F>)) -> usize {
+        let mut question = self.spare.pop().unwrap_or_default();
+        (question.layer, question.alive) = (layer, false);
+        ask(&mut question.tape);
+        self.questions.push(question);
+        self.questions.len() - 1
+    }
+
+    /// Adds rows to a question.
+    fn widen(&mut self, i: usize, rows: Rows<'_>) {
+        let tape = &mut self.questions[i].tape;
+        match (tape.rows(), rows) {
+            (Rows::All, _) => {}
+            (_, Rows::All) => tape.ask(tape.space(), Rows::All, tape.time()),
+            (Rows::Some(a), Rows::Some(b)) => {
+                let both = union(a, b);
+                tape.ask(tape.space(), Rows::Some(&both), tape.time());
+            }
+        }
+    }
+
+    /// Answers all questions: `prepare` once a layer, `at` once a question. Gradients begin anew.
+    pub fn answer(&mut self, layers: &[Layer<F>]) {
+        self.caches.resize_with(layers.len(), Default::default);
+        for (index, (layer, (cache, d_cache))) in layers.iter().zip(&mut self.caches).enumerate() {
+            *d_cache = Cache::default();
+            layer.motion.prepare(&layer.params, &of_layer(&self.questions, index, layer), cache);
+        }
+        for q in &mut self.questions {
+            layers[q.layer].at(&self.caches[q.layer].0, &mut q.tape);
+            (q.begun, q.d_time) = (false, 0.0);
+        }
+    }
+
+    /// How many distinct questions were asked.
+    pub fn len(&self) -> usize {
+        self.questions.len()
+    }
+
+    /// Whether nothing was asked.
+    pub fn is_empty(&self) -> bool {
+        self.questions.is_empty()
+    }
+
+    /// The number of the question for a layer, a space and a time.
+    pub fn find(&self, layer: usize, of: Space, t: Time) -> Option<usize> {
+        self.questions.iter().position(|q| q.layer == layer && q.tape.space() == of && same(q.tape.time(), t))
+    }
+
+    /// Question i and its answer.
+    pub fn tape(&self, i: usize) -> &LayerTape<F> {
+        &self.questions[i].tape
+    }
+
+    /// All questions and answers, in the order in which they were first asked.
+    pub fn tapes(&self) -> impl ExactSizeIterator<Item = &LayerTape<F>> {
+        self.questions.iter().map(|q| &q.tape)
+    }
+
+    /// The splats of a time at which all layers of `scene` were asked.
+    pub fn splats<'a>(&'a self, scene: &'a Scene<F>, t: Time) -> Splats<'a, F> {
+        let part = |(index, layer): (usize, &'a Layer<F>)| {
+            let i = self.find(index, Space::Gaussians, t).expect("every layer was asked at the time of these splats");
+            layer.part(&self.questions[i].tape)
+        };
+        Splats { parts: scene.layers.iter().enumerate().map(part).collect(), head: scene.head_weights() }
+    }
+
+    /// Marks the rows asked for as active in `d`, the gradients of the layers.
+    pub fn activate(&self, d: &mut [Grads<F>]) {
+        for q in &self.questions {
+            d[q.layer].activate(q.tape.space(), q.tape.rows());
+        }
+    }
+
+    /// The gradient to answer i, [splats, 10], to be added to.
+    pub fn d_out(&mut self, i: usize) -> &mut Table<F> {
+        let q = &mut self.questions[i];
+        q.begin_gradient();
+        &mut q.d_out
+    }
+
+    /// Adds to the gradient of answer i: that of [`Part::out`](crate::scene::Part::out), of direct colours, and of weights
+    /// of colours. Tables may come back exchanged for others, whose numbers mean nothing.
+    pub fn add_gradient(
+        &mut self,
+        i: usize,
+        out: &mut Table<F>,
+        color: &mut Option<Table<F>>,
+        weights: &mut Option<Table<F>>,
+    ) {
+        let q = &mut self.questions[i];
+        if q.begun {
+            add_table(&mut q.d_out, out);
+            add_optional(&mut q.d_color, color.as_ref());
+            add_optional(&mut q.d_weights, weights.as_ref());
+        } else {
+            // Nothing to add to: the caller gets the old tables to overwrite.
+            q.begun = true;
+            std::mem::swap(&mut q.d_out, out);
+            std::mem::swap(&mut q.d_color, color);
+            std::mem::swap(&mut q.d_weights, weights);
+        }
+    }
+
+    /// The VJP of [`answer`](Self::answer): `backward` once a question, `finish` once a layer. Adds to `d`, one a layer.
+    pub fn backward(&mut self, layers: &[Layer<F>], d: &mut [Grads<F>]) {
+        assert_eq!(d.len(), layers.len(), "a gradient a layer is needed");
+        for q in &mut self.questions {
+            q.begin_gradient();
+            let (cache, d_cache) = &mut self.caches[q.layer];
+            let d_out = SplatGrads { out: &q.d_out, color: q.d_color.as_ref(), weights: q.d_weights.as_ref() };
+            q.d_time = layers[q.layer].backward(cache, &mut q.tape, &d_out, d_cache, &mut d[q.layer]);
+        }
+        for (index, (layer, (cache, d_cache))) in layers.iter().zip(&mut self.caches).enumerate() {
+            let questions = of_layer(&self.questions, index, layer);
+            layer.motion.finish(&layer.params, &questions, cache, d_cache, &mut d[index]);
+        }
+    }
+
+    /// dL/dt of a time at which Gaussians were asked for, all layers together, after [`backward`](Self::backward).
+    pub fn d_time(&self, t: Time) -> f64 {
+        let at_t = |q: &&Question<F>| q.tape.space() == Space::Gaussians && same(q.tape.time(), t);
+        self.questions.iter().filter(at_t).map(|q| q.d_time).sum()
+    }
+}
+
+impl<F: Real> Question<F> {
+    /// Zeros, unless there is a gradient already.
+    fn begin_gradient(&mut self) {
+        if !self.begun {
+            reset_like(&mut self.d_out, self.tape.out());
+            (self.d_color, self.d_weights, self.begun) = (None, None, true);
+        }
+    }
+}
+
+/// Shows the answers to many questions for the Gaussians of one layer, of which one is held at a time, however many there are. The motion
+/// model hears of all of them first, so that one that scans through time does so once.
+pub fn sweep<F: Real>(layer: &Layer<F>, asked: &[(Rows<'_>, Time)], mut show: impl FnMut(usize, &LayerTape<F>)) {
+    let (p, of) = (&layer.params, Space::Gaussians);
+    let (mut cache, mut tape) = (Cache::default(), LayerTape::default());
+    let questions: Vec<At<'_, F>> = asked.iter().map(|&(rows, t)| At { p, of, rows, t }).collect();
+    layer.motion.prepare(p, &questions, &mut cache);
+    for (i, &(rows, t)) in asked.iter().enumerate() {
+        tape.ask(of, rows, t);
+        layer.at(&cache, &mut tape);
+        show(i, &tape);
+    }
+}
+
+/// Whether two times are one, NaN included.
+fn same(a: Time, b: Time) -> bool {
+    a == b || (a.0.is_nan() && b.0.is_nan())
+}
+
+fn of_layer<'a, F: Real>(questions: &'a [Question<F>], index: usize, layer: &'a Layer<F>) -> Vec<At<'a, F>> {
+    questions.iter().filter(|q| q.layer == index).map(|q| q.tape.question(&layer.params)).collect()
+}
+
+fn union(a: &[u32], b: &[u32]) -> Vec<u32> {
+    let mut out = Vec::with_capacity(a.len() + b.len());
+    let (mut i, mut j) = (0, 0);
+    while i < a.len() || j < b.len() {
+        let next = match (a.get(i), b.get(j)) {
+            (Some(&x), Some(&y)) => x.min(y),
+            (Some(&x), None) => x,
+            (None, Some(&y)) => y,
+            (None, None) => unreachable!("the loop's condition holds one of them"),
+        };
+        i += usize::from(a.get(i) == Some(&next));
+        j += usize::from(b.get(j) == Some(&next));
+        out.push(next);
+    }
+    out
+}
+
+/// Makes `d` an all-zero table in the shape of `like`, keeping the allocation.
+fn reset_like<F: Real>(d: &mut Table<F>, like: &Table<F>) {
+    if d.width() == like.width() {
+        d.resize(like.rows());
+        d.fill(F::ZERO);
+    } else {
+        *d = like.zeros_like();
+    }
+}
+
+fn add_table<F: Real>(to: &mut Table<F>, from: &Table<F>) {
+    assert_eq!((to.rows(), to.width()), (from.rows(), from.width()), "gradients of one answer have one shape");
+    halve([to.view_mut()], &|[to]| {
+        let from = &from.data()[to.first * to.width..];
+        to.data.iter_mut().zip(from).for_each(|(a, b)| *a += *b);
+        0.0
+    });
+}
+
+fn add_optional<F: Real>(to: &mut Option<Table<F>>, from: Option<&Table<F>>) {
+    match (to, from) {
+        (Some(to), Some(from)) => add_table(to, from),
+        (to @ None, Some(from)) => *to = Some(from.clone()),
+        (_, None) => {}
+    }
+}
