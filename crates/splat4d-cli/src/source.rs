@@ -9,8 +9,8 @@ use splat4d::format::playback::{self, Index};
 use splat4d::format::ply::PlyInfo;
 use splat4d::format::{Dialect, Warnings, dialect, sog};
 use splat4d::layers::{Layer, Scene};
+use splat4d::scene::Camera;
 use splat4d::scene::time::DEFAULT_FPS;
-use splat4d::scene::{Camera, GEOMETRY};
 use splat4d::{Error, ErrorKind, Result, format};
 use std::borrow::Cow;
 use std::path::Path;
@@ -201,11 +201,7 @@ pub(crate) fn not_empty(scene: &Scene<f32>, path: &Path) -> Result<()> {
 
 /// All means that are numbers.
 fn means(scene: &Scene<f32>) -> Vec<[f64; 3]> {
-    let of = |layer: &'_ Layer<f32>| {
-        let table = &layer.params[GEOMETRY];
-        (0..table.rows()).map(|i| table.read::<3>(i, 0).map(f64::from)).collect::<Vec<_>>()
-    };
-    scene.layers.iter().flat_map(of).filter(|m| m.iter().all(|x| x.is_finite())).collect()
+    scene.layers.iter().flat_map(Layer::means).filter(|m| m.iter().all(|x| x.is_finite())).collect()
 }
 
 /// Middle and half the diagonal of the box of all means but the outermost.

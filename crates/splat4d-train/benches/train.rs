@@ -59,7 +59,7 @@ fn layer() -> Layer {
         params.get_mut([GEOMETRY])[0].write(row, LOG_SCALE, [-4.0; 3]);
         params.get_mut([LIFE])[0].set(row, LOG_WIDTH, 0.0);
     }
-    Layer { name: "made".into(), params, motion, life: LifeKind::GaussHalf, span: splat4d::layers::ALWAYS, masks: None }
+    Layer::new("made", params, motion, LifeKind::GaussHalf)
 }
 
 #[divan::bench(args = THREADS, sample_count = SAMPLES)]

@@ -4,19 +4,19 @@
 //! `cargo run --release -p splat4d-train --example own_loss`
 
 use splat4d::Result;
-use splat4d::layers::{ALWAYS, Evaluation, Layer, Scene};
+use splat4d::layers::{Evaluation, Layer, Scene};
 use splat4d::math::{Rng, Se3};
 use splat4d::motion::{Spec, build};
 use splat4d::render::{Image, RenderConfig, Renderer};
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{Camera, GEOMETRY, LifeKind, Params, Planes, SH, Space, Table, Time};
 use splat4d_train::capture::frames::{Frames, Picture};
-use splat4d_train::upkeep::Limits;
 use splat4d_train::loss::image::{Channel, ImageTerm, Needs, PictureGrads, Shown, View};
 use splat4d_train::loss::terms::StepInfo;
 use splat4d_train::methods::{Group, Rate, Stage};
 use splat4d_train::train::loss::TrainLoss;
 use splat4d_train::train::trainer::{Settings, Trainer};
+use splat4d_train::upkeep::Limits;
 use std::sync::Arc;
 
 /// The column of a logit a Gaussian: does it belong to the ball on the right?
@@ -64,7 +64,7 @@ fn balls() -> Result<Scene<f32>> {
         params[GEOMETRY].set(i, OPACITY, 2.0);
         params[SH].write(i, 0, [0.3; 3]);
     }
-    let layer = Layer { name: "balls".into(), params, motion, life: LifeKind::Infinite, span: ALWAYS, masks: None };
+    let layer = Layer::new("balls", params, motion, LifeKind::Infinite);
     Ok(Scene { layers: vec![layer], fps: 1.0, up: [0.0, 1.0, 0.0], ..Scene::default() })
 }
 

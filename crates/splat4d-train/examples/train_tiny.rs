@@ -4,7 +4,7 @@
 //! `cargo run --release -p splat4d-train --example train_tiny [OUT.safetensors]`
 
 use splat4d::Result;
-use splat4d::layers::{ALWAYS, Evaluation, Layer, Scene};
+use splat4d::layers::{Evaluation, Layer, Scene};
 use splat4d::math::sh::rgb_to_dc;
 use splat4d::math::{Rng, Se3};
 use splat4d::motion::{SpacetimeSpec, Spec, build, spacetime::VELOCITIES};
@@ -68,7 +68,7 @@ fn truth() -> Result<Scene<f32>> {
         params[SH].write(i, 0, std::array::from_fn::<f32, 3, _>(|k| rgb_to_dc(r.uniform(10 + k as u64) as f32)));
         params[velocities].write(i, 0, place);
     }
-    let layer = Layer { name: "truth".into(), params, motion, life: LifeKind::Infinite, span: ALWAYS, masks: None };
+    let layer = Layer::new("truth", params, motion, LifeKind::Infinite);
     Ok(Scene { layers: vec![layer], fps: FPS, up: [0.0, 1.0, 0.0], ..Scene::default() })
 }
 

@@ -63,7 +63,7 @@ impl Made {
 
     fn splats(&self) -> Splats<'_> {
         let color = Color::Sh { table: &self.sh, rows: Rows::All, weights: None, base: true };
-        Splats { parts: vec![Part { out: &self.out, color }], head: None }
+        Splats { parts: vec![Part::new(&self.out, color)], head: None }
     }
 }
 

@@ -5,7 +5,7 @@
 //! runs. The scene keeps moving as it was trained; only its nodes are displaced.
 
 use splat4d::format;
-use splat4d::layers::{ALWAYS, Evaluation, Layer, Scene};
+use splat4d::layers::{Evaluation, Layer, Scene};
 use splat4d::math::{Rng, Se3};
 use splat4d::motion::arap::{Handle, drag};
 use splat4d::motion::control::{ControlSpec, skinned};
@@ -31,7 +31,7 @@ fn sample() -> splat4d::Result<Scene<f32>> {
     }
     let motion = Arc::new(skinned::<f32>(&ControlSpec::default(), &mut params)?);
     let life = LifeKind::Infinite;
-    let layer = Layer { name: "rod".into(), params, motion, life, span: ALWAYS, masks: None };
+    let layer = Layer::new("rod", params, motion, life);
     Ok(Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 30.0, up: [0.0, 0.0, 1.0], ..Scene::default() })
 }
 

@@ -36,7 +36,7 @@ fn main() -> splat4d::Result<()> {
         }
     }
     let color = Color::Sh { table: &sh, rows: Rows::All, weights: None, base: true };
-    let splats = Splats { parts: vec![Part { out: &out, color }], head: None };
+    let splats = Splats { parts: vec![Part::new(&out, color)], head: None };
     let pose = Se3::look_at([0.0, 0.0, -4.0], [0.0; 3], [0.0, -1.0, 0.0]);
     let camera = Camera::with_fov_y(pose, 0.55, width, height);
 

@@ -4,7 +4,7 @@
 //! folder is given, writes the pictures there. Nothing else has to know the model: layers, the renderer, densification
 //! and training only call the trait.
 
-use splat4d::layers::{ALWAYS, Evaluation, Layer, Scene};
+use splat4d::layers::{Evaluation, Layer, Scene};
 use splat4d::math::sh::rgb_to_dc;
 use splat4d::math::{Real, Rng, Se3};
 use splat4d::motion::still::{activate, activate_backward};
@@ -96,14 +96,7 @@ fn scene() -> splat4d::Result<Scene<f32>> {
         params[SH].write(i, 0, [0.2 + 0.3 * y, 0.4 + 0.5 * y, 0.1].map(rgb_to_dc));
         params[motion.amplitudes].write(i, 0, [0.4 * y * y, 0.0, 0.0]);
     }
-    let layer = Layer {
-        name: "grass".into(),
-        params,
-        motion: Arc::new(motion),
-        life: LifeKind::Infinite,
-        span: ALWAYS,
-        masks: None,
-    };
+    let layer = Layer::new("grass", params, Arc::new(motion), LifeKind::Infinite);
     Ok(Scene { layers: vec![layer], clip: [0.0, 2.0], fps: 30.0, up: [0.0, 1.0, 0.0], ..Scene::default() })
 }
 

@@ -6,7 +6,7 @@
 
 use serde_json::Value;
 use splat4d::format::playback::{self, Draft, Meta, NamedCamera, Node, Primitive, Viewpoint, WriteConfig};
-use splat4d::layers::{ALPHA_MIN, ALWAYS, Evaluation, Layer, Scene};
+use splat4d::layers::{ALPHA_MIN, Evaluation, Layer, Scene};
 use splat4d::math::{Rng, Se3, quat, sh};
 use splat4d::motion::{Spacetime, SpacetimeSpec, Spec, Still};
 use splat4d::render::{Image, RenderConfig, Renderer};
@@ -70,14 +70,7 @@ fn load(bytes: &[u8]) -> splat4d::Result<Scene<f32>> {
         return splat4d::format::scene::read(bytes);
     }
     let (params, _) = splat4d::format::ply::read(bytes)?;
-    let layer = Layer {
-        name: "ply".into(),
-        params,
-        motion: Arc::new(Still),
-        life: LifeKind::Infinite,
-        span: ALWAYS,
-        masks: None,
-    };
+    let layer = Layer::new("ply", params, Arc::new(Still), LifeKind::Infinite);
     Ok(Scene { layers: vec![layer], up: [0.0, -1.0, 0.0], ..Scene::default() })
 }
 
@@ -131,7 +124,7 @@ fn made_up() -> Scene<f32> {
         );
         rates.write(i, 0, std::array::from_fn::<f32, 4, _>(|k| 0.3 * r.normal(86 + k as u64) as f32));
     }
-    let layer = Layer { name: "balls".into(), params, motion: Arc::new(motion), life, span: ALWAYS, masks: None };
+    let layer = Layer::new("balls", params, Arc::new(motion), life);
     Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 30.0, up: [0.0, -1.0, 0.0], ..Scene::default() }
 }
 

@@ -4,7 +4,7 @@
 //! that it has just written to memory, so that it always runs.
 
 use splat4d::format;
-use splat4d::layers::{ALWAYS, Evaluation, Layer, Scene};
+use splat4d::layers::{Evaluation, Layer, Scene};
 use splat4d::math::{Rng, Se3};
 use splat4d::motion::Still;
 use splat4d::render::{Image, RenderConfig, Renderer};
@@ -19,14 +19,7 @@ fn load(bytes: &[u8]) -> splat4d::Result<Scene<f32>> {
     }
     let (params, info) = format::ply::read(bytes)?;
     println!("{} Gaussians, spherical harmonics of degree {}", info.gaussians, info.sh_degree);
-    let layer = Layer {
-        name: "ply".into(),
-        params,
-        motion: Arc::new(Still),
-        life: LifeKind::Infinite,
-        span: ALWAYS,
-        masks: None,
-    };
+    let layer = Layer::new("ply", params, Arc::new(Still), LifeKind::Infinite);
     Ok(Scene { layers: vec![layer], fps: 30.0, up: [0.0, -1.0, 0.0], ..Scene::default() })
 }
 

@@ -49,7 +49,9 @@ pub fn velocities<F: Real>(scene: &Scene<F>, instant: &Evaluation<F>) -> Table<F
         let mut own = Table::default();
         layer.motion.velocity(&tape.question(&layer.params), &mut own);
         for j in 0..own.rows() {
-            out.write(first + j, 0, own.read::<3>(j, 0));
+            let v = own.read::<3>(j, 0);
+            let framed = || layer.frame.vector(v.map(F::f64)).map(F::of);
+            out.write(first + j, 0, if layer.frame.is_identity() { v } else { framed() });
         }
         first += own.rows();
     }

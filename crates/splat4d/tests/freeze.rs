@@ -1,6 +1,6 @@
 //! A moving scene at one moment as plain Gaussians.
 
-use splat4d::layers::{ALWAYS, Evaluation, Layer, Scene, freeze};
+use splat4d::layers::{Evaluation, Layer, Scene, freeze};
 use splat4d::math::Rng;
 use splat4d::motion::{SpacetimeSpec, Spec, build};
 use splat4d::render::{Image, RenderConfig, Renderer};
@@ -29,7 +29,7 @@ fn scene() -> Scene<f32> {
             *geometry.get_mut(row, LOG_SCALE + k) -= 2.0;
         }
     }
-    let layer = Layer { name: "a".into(), params, motion, life, span: ALWAYS, masks: None };
+    let layer = Layer::new("a", params, motion, life);
     Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 30.0, ..Scene::default() }
 }
 
@@ -48,7 +48,7 @@ fn a_frozen_moment_looks_like_the_scene_then() {
     for time in [0.0, 0.37, 1.0] {
         let mut params = freeze(&scene, Time(time)).unwrap();
         let motion = build(&Spec::Still, &mut params).unwrap();
-        let still = Layer { name: "still".into(), params, motion, life: LifeKind::Infinite, span: ALWAYS, masks: None };
+        let still = Layer::new("still", params, motion, LifeKind::Infinite);
         let frozen = Scene { layers: vec![still], ..Scene::default() };
         let (a, b) = (draw(&scene, time), draw(&frozen, 0.0));
         let worst = a.data.iter().zip(&b.data).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);

@@ -1,5 +1,5 @@
 use super::*;
-use splat4d::layers::{ALWAYS, Layer};
+use splat4d::layers::Layer;
 use splat4d::math::{Rng, Se3};
 use splat4d::motion::Still;
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
@@ -20,7 +20,7 @@ fn small(rows: usize) -> Scene<f32> {
         // Centre, log half width and log softness: hard edges, the first half or the second.
         lives.write(i, 0, [0.25 + 0.5 * (i % 2) as f32, 0.2f32.ln(), 1e-3f32.ln()]);
     }
-    let layer = Layer { name: "x".into(), params, motion: Arc::new(Still), life, span: ALWAYS, masks: None };
+    let layer = Layer::new("x", params, Arc::new(Still), life);
     Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 10.0, up: [0.0, 1.0, 0.0], ..Scene::default() }
 }
 

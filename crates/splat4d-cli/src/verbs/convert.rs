@@ -15,9 +15,9 @@ use splat4d::scene::{Camera, LifeKind, Params, Time};
 use splat4d::{Error, ErrorKind, Result};
 use std::path::{Path, PathBuf};
 
-/// Turns by less than this (cosine to the identity's trace) are rounding, and are not made.
-const NO_TURN: f64 = 1e-12;
-/// No turn.
+/// Rotations by less than this (cosine to the identity's trace) are rounding, and are not made.
+const NO_ROTATION: f64 = 1e-12;
+/// No rotation.
 const IDENTITY: [[f64; 3]; 3] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
 /// Warnings of a sequence are those of its first frame; the rest would be the same with other numbers.
 const FIRST: &str = "first frame";
@@ -179,10 +179,10 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         }
     }
     let cameras = first_camera(&source);
-    let turn = turn(&mut source.scene, args.up, target, console)?;
-    let cameras: Vec<Camera> = cameras.into_iter().map(|c| turned(c, &turn)).collect();
+    let rotation = rotate(&mut source.scene, args.up, target, console);
+    let cameras: Vec<Camera> = cameras.into_iter().map(|c| rotated(c, &rotation)).collect();
     if target == Target::Playback {
-        return bake(source, args, turn != IDENTITY, console);
+        return bake(source, args, rotation != IDENTITY, console);
     }
     let scene = &source.scene;
     let writer = Writer { target, spz_version: args.spz_version, cameras };
@@ -227,10 +227,10 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// A playback file. The capture's cameras belong to the old axes: a scene that was turned goes without them.
-fn bake(mut source: Source, args: &Args, turned: bool, console: &Console) -> anyhow::Result<()> {
+/// A playback file. The capture's cameras belong to the old axes: a scene that was rotated goes without them.
+fn bake(mut source: Source, args: &Args, rotated: bool, console: &Console) -> anyhow::Result<()> {
     let title = baking::title(&source, &args.input);
-    if turned {
+    if rotated {
         (source.run, source.playback) = (None, None);
     }
     baking::bake_into(&source, &title, &args.output, &Baking::default(), console)?;
@@ -296,25 +296,25 @@ fn write_frames(
     Ok(())
 }
 
-/// Turns the scene so that the wanted axis is up, and returns the rotation that was made.
-fn turn(scene: &mut Scene<f32>, up: Option<Up>, target: Target, console: &Console) -> Result<[[f64; 3]; 3]> {
+/// Rotates the scene so that the wanted axis is up, and returns the rotation that was made.
+fn rotate(scene: &mut Scene<f32>, up: Option<Up>, target: Target, console: &Console) -> [[f64; 3]; 3] {
     let custom = match target {
         Target::Dialect(d) => Some(d.up()),
         Target::Scene | Target::Playback => None,
     };
-    let Some(wanted) = up.map_or(custom, Up::direction) else { return Ok(IDENTITY) };
+    let Some(wanted) = up.map_or(custom, Up::direction) else { return IDENTITY };
     let Some(r) = rotation_between(scene.up, wanted) else {
         console.warn("the scene does not say which way is up: its axes stay as they are.");
-        return Ok(IDENTITY);
+        return IDENTITY;
     };
-    if 3.0 - (r[0][0] + r[1][1] + r[2][2]) <= NO_TURN {
-        return Ok(IDENTITY);
+    if 3.0 - (r[0][0] + r[1][1] + r[2][2]) <= NO_ROTATION {
+        return IDENTITY;
     }
     let axis = |v: [f64; 3]| format!("({:.3} {:.3} {:.3})", v[0], v[1], v[2]);
     let old = axis(scene.up);
-    scene.turn(&r)?;
+    scene.rotate(&r);
     console.say(&format!("turned: up was {old}, is {}; --up keep leaves axes as they are", axis(wanted)));
-    Ok(r)
+    r
 }
 
 /// The first camera of the data set, if it is at hand: a place from which the scene looks right.
@@ -322,7 +322,7 @@ fn first_camera(source: &Source) -> Option<Camera> {
     Some(source.views().ok()?.into_iter().next()?.camera)
 }
 
-fn turned(camera: Camera, r: &[[f64; 3]; 3]) -> Camera {
+fn rotated(camera: Camera, r: &[[f64; 3]; 3]) -> Camera {
     let old = camera.cam_from_world.rotation;
     let rotation = std::array::from_fn(|i| std::array::from_fn(|j| (0..3).map(|k| old[i][k] * r[j][k]).sum::<f64>()));
     Camera { cam_from_world: Se3 { rotation, ..camera.cam_from_world }, ..camera }
@@ -344,7 +344,7 @@ fn moment(scene: &Scene<f32>, time: f64) -> Result<Params> {
     scene.without_head("plain Gaussians")?;
     match &scene.layers[..] {
         // What stands still anyway keeps its very bits.
-        [only] if !is_moving(scene) => Ok(only.params.clone()),
+        [only] if !is_moving(scene) && only.frame.is_identity() => Ok(only.params.clone()),
         _ => freeze(scene, Time(time)),
     }
 }
@@ -402,12 +402,12 @@ mod tests {
     }
 
     #[test]
-    fn a_turned_camera_sees_the_turned_point_where_it_was() {
+    fn a_rotated_camera_sees_the_rotated_point_where_it_was() {
         let camera = Camera::with_fov_y(Se3::look_at([1.0, 2.0, 5.0], [0.0; 3], [0.0, 1.0, 0.0]), 0.8, 40, 30);
         let r = rotation_between([0.0, 1.0, 0.0], [0.3, -0.2, 0.9]).unwrap();
         let x = [0.3, -0.2, 0.4];
         let there = std::array::from_fn(|k| (0..3).map(|l| r[k][l] * x[l]).sum());
-        let (a, b) = (camera.project(x).unwrap(), turned(camera, &r).project(there).unwrap());
+        let (a, b) = (camera.project(x).unwrap(), rotated(camera, &r).project(there).unwrap());
         assert!((a.0[0] - b.0[0]).abs() < 1e-9 && (a.0[1] - b.0[1]).abs() < 1e-9 && (a.1 - b.1).abs() < 1e-9);
     }
 }

@@ -305,12 +305,13 @@ fn of_scene(scene: &Scene<f32>) -> Told {
                 damaged += 1;
                 continue;
             }
-            let mean = table.read::<3>(row, 0).map(f64::from);
+            let mean = layer.frame.apply(table.read::<3>(row, 0).map(f64::from));
             (0..3).for_each(|k| (low[k], high[k]) = (low[k].min(mean[k]), high[k].max(mean[k])));
             zero_quats += usize::from(table.read::<4>(row, QUAT).iter().all(|q| *q == 0.0));
             let o = 1.0 / (1.0 + (-f64::from(table.get(row, OPACITY))).exp());
             opacity[bucket(&OPACITY_EDGES, o)] += 1;
             let largest = table.read::<3>(row, LOG_SCALE).into_iter().map(f64::from).fold(f64::NEG_INFINITY, f64::max);
+            let largest = largest + layer.frame.scale.ln();
             let decades = (largest - radius.ln()) / std::f64::consts::LN_10;
             scales[bucket(&SCALE_EDGES, decades)] += 1;
             huge += usize::from(largest.exp() > HUGE * radius);

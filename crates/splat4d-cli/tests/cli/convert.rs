@@ -2,10 +2,18 @@
 
 use crate::sample::splat4d;
 use splat4d::format::{Dialect, dialect, ply, scene};
-use splat4d::layers::{ALWAYS, Head, Layer, Scene};
-use splat4d::math::Rng;
+use splat4d::layers::{Head, Layer, Scene, rotation_between};
+use splat4d::math::{Rng, Sim3, quat, sym3};
+use splat4d::motion::control::{ControlSpec, Curve, TrajectorySpec};
+use splat4d::motion::deform::{DeformSpec, Input};
+use splat4d::motion::filtered::FilteredSpec;
+use splat4d::motion::hexplane::{Heads, HexplaneSpec};
+use splat4d::motion::skin::SkinSpec;
 use splat4d::motion::spacetime::FeatureSpec;
+use splat4d::motion::ssm::SsmSpec;
+use splat4d::motion::tracked::TrackedSpec;
 use splat4d::motion::{SpacetimeSpec, Spec, build};
+use splat4d::nn::hexplane::PlaneShape;
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{GEOMETRY, LIFE, LifeKind, Params, SH};
 use std::path::Path;
@@ -36,7 +44,7 @@ fn birds(features: Option<FeatureSpec>) -> Scene<f32> {
         params[LIFE].set(row, 0, 0.5);
         params[LIFE].set(row, 1, 1.0);
     }
-    let layer = Layer { name: "birds".into(), params, motion, life, span: ALWAYS, masks: None };
+    let layer = Layer::new("birds", params, motion, life);
     let head = if features.is_some() { Head::Features } else { Head::Identity };
     Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 4.0, up: [0.0, 0.0, 1.0], head, ..Scene::default() }
 }
@@ -140,6 +148,90 @@ fn a_scene_with_a_head_is_drawn_and_nothing_else_is_made_of_it() {
     }
     // Where Gaussians go has nothing to do with colours.
     run(&["export", "full.safetensors", "--tracks", "a.csv"]).ok();
+}
+
+/// A model of every kind whose tables cannot be rotated, in a small box.
+fn models_with_frames() -> Vec<Spec> {
+    let skin = SkinSpec { nodes: 6, neighbours: 3, hyper: 2, mask: false };
+    let planes = PlaneShape { channels: 16, resolution: 4, time_resolution: 5, multires: vec![1, 2] };
+    let heads = Heads { position: true, scale: true, rotation: true, opacity: true, sh: true };
+    let hexplane = HexplaneSpec { low: [-1.5; 3], high: [1.5; 3], planes, net_width: 8, heads, ..Default::default() };
+    let trajectory = TrajectorySpec::Keys { curve: Curve::Cubic, keys: 6 };
+    let input = Input::Encoded { x_levels: 2, t_levels: 2, time_net: true };
+    let flying =
+        Spec::Spacetime(SpacetimeSpec { order: 2, rotation: true, detach: false, origin: 0.5, features: None });
+    vec![
+        Spec::Hexplane(hexplane),
+        Spec::Tracked(TrackedSpec { times: vec![0.0, 0.4, 1.0], foreground: false }),
+        Spec::Control(ControlSpec { seed: 3, clip: [0.0, 1.0], skin, trajectory }),
+        Spec::Ssm(SsmSpec { skin, ticks: 9, width: 6, states: 2, embedding: 3, octaves: 2, ..SsmSpec::default() }),
+        Spec::DeformMlp(DeformSpec { seed: 2, clip: [0.0, 1.0], input, width: 9, layers: 2, skip: None, rigid: true }),
+        Spec::Filtered(FilteredSpec::around(flying, 0.05, 0.0)),
+    ]
+}
+
+/// Whatever a scene moves by, its file in other axes is the same cloud, rotated.
+#[test]
+fn other_axes_rotate_every_model_as_a_whole() {
+    let work = tempfile::tempdir().unwrap();
+    for spec in models_with_frames() {
+        let (rows, name) = (40, spec.name().to_owned());
+        let mut params = Params::new(rows, 4, &[]);
+        let rng = Rng::new(4, "axes", 0);
+        for row in 0..rows {
+            let draw = |k: u64| rng.fork(row as u64).normal(k) as f32;
+            params[GEOMETRY].write::<3>(row, 0, std::array::from_fn(|k| 0.5 * draw(k as u64)));
+            params[GEOMETRY].write::<4>(row, QUAT, std::array::from_fn(|k| draw(3 + k as u64)));
+            params[GEOMETRY].write::<3>(row, LOG_SCALE, std::array::from_fn(|k| -2.0 + 0.5 * draw(7 + k as u64)));
+            params[GEOMETRY].set(row, OPACITY, 2.0);
+            params[SH].write::<12>(row, 0, std::array::from_fn(|k| 0.3 * draw(10 + k as u64)));
+        }
+        let motion = build(&spec, &mut params).unwrap();
+        // Moved from where training starts, so that everything moves.
+        let learnt: Vec<_> = params.keys().skip(3).filter(|&k| params.info(k).trainable).collect();
+        for key in learnt {
+            let (rows, width) = (params[key].rows(), params[key].width());
+            for (row, col) in (0..rows).flat_map(|r| (0..width).map(move |c| (r, c))) {
+                let x = rng.fork(100 + u64::from(key.0)).normal((row * 64 + col) as u64) as f32;
+                *params[key].get_mut(row, col) += 0.2 * x;
+            }
+        }
+        let layer = Layer::new(name.as_str(), params, motion, LifeKind::Infinite);
+        let scene = Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 4.0, up: [0.1, 0.3, 0.9], ..Scene::default() };
+        let mut bytes = Vec::new();
+        scene::write(&scene, &mut bytes).unwrap();
+        std::fs::write(work.path().join("a.safetensors"), bytes).unwrap();
+        let convert = |from: &str, to: &str, more: &[&str]| {
+            splat4d(&["convert", from, to]).args(more).run_in(work.path()).ok();
+        };
+        convert("a.safetensors", "kept.ply", &["--time", "0.5", "--up", "keep"]);
+        convert("a.safetensors", "default.ply", &["--time", "0.5"]);
+        // By way of a scene file, which keeps the model and its frame.
+        convert("a.safetensors", "rotated.safetensors", &["--up=-y"]);
+        convert("rotated.safetensors", "later.ply", &["--time", "0.5"]);
+        let r = rotation_between(scene.up, [0.0, -1.0, 0.0]).unwrap();
+        let kept = open(&work.path().join("kept.ply"));
+        for other in ["default.ply", "later.ply"] {
+            let other = open(&work.path().join(other));
+            let (a, b) = (&kept.layers[0].params, &other.layers[0].params);
+            let mut rotated = kept.layers[0].clone();
+            rotated.frame = Sim3::from_rotation(r);
+            rotated.absorb_frame();
+            let shape = |p: &Params, row: usize| {
+                let q = quat::normalize(p[GEOMETRY].read::<4>(row, QUAT).map(f64::from)).0;
+                sym3::from_quat_log_scales(q, p[GEOMETRY].read::<3>(row, LOG_SCALE).map(f64::from))
+            };
+            assert_eq!((a.len(), b.len()), (rows, rows), "{name}");
+            for row in 0..rows {
+                let (x, y) = (rotated.params[GEOMETRY].read::<3>(row, 0), b[GEOMETRY].read::<3>(row, 0));
+                assert!((0..3).all(|k| (x[k] - y[k]).abs() < 1e-5), "{name}, mean {row}: {x:?} {y:?}");
+                let (x, y) = (shape(&rotated.params, row), shape(b, row));
+                assert!((0..6).all(|k| (x[k] - y[k]).abs() < 1e-4), "{name}, shape {row}: {x:?} {y:?}");
+                let (x, y) = (rotated.params[SH].read::<12>(row, 0), b[SH].read::<12>(row, 0));
+                assert!((0..12).all(|k| (x[k] - y[k]).abs() < 1e-5), "{name}, colour {row}: {x:?} {y:?}");
+            }
+        }
+    }
 }
 
 #[test]

@@ -142,7 +142,7 @@ fn median(values: &mut [f64]) -> Option<f64> {
 mod tests {
     use super::*;
     use splat4d::format::npy::write_f32;
-    use splat4d::layers::{ALWAYS, Layer};
+    use splat4d::layers::Layer;
     use splat4d::motion::tracked::{Tracked, TrackedSpec};
     use splat4d::scene::params::OPACITY;
     use splat4d::scene::{GEOMETRY, LifeKind, Params};
@@ -162,7 +162,7 @@ mod tests {
             (0..2).for_each(|r| params[model.page(k)].set(r, 1, 0.3 * k as f32));
         }
         let motion = Arc::new(model);
-        let layer = Layer { name: "a".into(), params, motion, life: LifeKind::Infinite, span: ALWAYS, masks: None };
+        let layer = Layer::new("a", params, motion, LifeKind::Infinite);
         let scene = Scene { layers: vec![layer], clip: [0.0, 0.2], fps: 10.0, up: [1.0, 0.0, 0.0], ..Scene::default() };
         // Two points that rise by 0.5 a frame, 0 and 0.1 beside Gaussians.
         let data: Vec<f32> =

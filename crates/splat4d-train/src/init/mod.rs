@@ -8,7 +8,7 @@ pub mod volume;
 use crate::capture::frames::Frames;
 use crate::methods::{Plan, Program};
 use crate::{Error, Result};
-use splat4d::layers::{ALWAYS, Head, Layer, Scene};
+use splat4d::layers::{Head, Layer, Scene};
 use splat4d::math::Rng;
 use splat4d::math::knn::mean_square_distance;
 use splat4d::math::sh::rgb_to_dc;
@@ -177,7 +177,7 @@ pub fn scene(
     let motion = build(&program.spec(plan), &mut params)?;
     program.init(&lives, &mut params);
     let head = if HeadKeys::of(&params).is_some() { Head::Features } else { Head::Identity };
-    let layer = Layer { name: "scene".into(), params, motion, life, span: ALWAYS, masks: None };
+    let layer = Layer::new("scene", params, motion, life);
     Ok(Scene { layers: vec![layer], background, clip: plan.clip, fps: plan.fps, up, head })
 }
 

@@ -207,7 +207,7 @@ impl<F: Real> ParamLoss<F> for VelocitySmoothness {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use splat4d::layers::{ALWAYS, Layer};
+    use splat4d::layers::Layer;
     use splat4d::math::Rng;
     use splat4d::motion::{SpacetimeSpec, Spec, build};
     use splat4d::scene::{Key, LIFE, LifeKind, Params, Time};
@@ -223,7 +223,7 @@ mod tests {
                 }
             }
         }
-        let layer = Layer { name: "a".into(), params, motion, life: LifeKind::GaussHalf, span: ALWAYS, masks: None };
+        let layer = Layer::new("a", params, motion, LifeKind::GaussHalf);
         Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 30.0, ..Scene::default() }
     }
 

@@ -9,7 +9,7 @@ use splat4d::bake::{Options, bake};
 use splat4d::format::playback::{Draft, Meta, NamedCamera, Viewpoint, WriteConfig, write};
 use splat4d::layers::Scene;
 use splat4d::math::se3::{dot, sub};
-use splat4d::scene::{Camera, GEOMETRY, time::DEFAULT_FPS};
+use splat4d::scene::{Camera, time::DEFAULT_FPS};
 use std::time::{Duration, Instant};
 
 /// Training goes on for so many times as long as the last snapshot took: at most 2.5 % of the time.
@@ -93,10 +93,11 @@ impl Snapshots {
 /// What the camera sees, and the depth of the scene's middle as the distance of its target.
 fn view(camera: &Camera, scene: &Scene<f32>) -> Viewpoint {
     let (eye, forward) = (camera.center(), camera.forward());
-    let tables = scene.layers.iter().map(|l| &l.params[GEOMETRY]);
     let stride = scene.len().div_ceil(ROWS).max(1);
-    let mut depths: Vec<f64> = tables
-        .flat_map(|t| (0..t.rows()).step_by(stride).map(|i| t.read::<3>(i, 0).map(f64::from)))
+    let mut depths: Vec<f64> = scene
+        .layers
+        .iter()
+        .flat_map(|layer| layer.means().step_by(stride))
         .map(|mean| dot(sub(mean, eye), forward))
         .filter(|z| *z > 0.0)
         .collect();

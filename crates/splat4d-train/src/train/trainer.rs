@@ -82,6 +82,8 @@ impl<'a> Trainer<'a> {
         settings: Settings,
     ) -> Self {
         assert!(!stages.is_empty(), "a program has at least one stage");
+        let unframed = scene.layers.iter().all(|l| l.frame.is_identity());
+        assert!(unframed, "training moves rows in the layers' own axes, which must be the world's");
         stages.iter_mut().for_each(|s| s.upkeep.sort_by_key(|u| u.order()));
         let timeline = Timeline::new(frames.as_ref());
         let mut trainer = Self {

@@ -102,7 +102,7 @@ pub fn split(scene: &mut Scene<f32>, reach: f64) -> Result<usize> {
         let mut params = freeze_rows(layer, &rows, Time(0.5 * (scene.clip[0] + scene.clip[1])));
         let motion = build(&Spec::Still, &mut params)?;
         let name = format!("{} {STILL_LAYER}", layer.name);
-        let part = Layer { name, params, motion, life: LifeKind::Infinite, span: layer.span, masks: None };
+        let part = Layer { span: layer.span, ..Layer::new(name, params, motion, LifeKind::Infinite) };
         let edit = RowEdit::prune(Space::Gaussians, still.iter().map(|s| !s));
         layer.edit(&edit, &Rng::new(0, "split", index as u64));
         scene.layers.push(part);
@@ -157,7 +157,7 @@ mod tests {
             params[LIFE].write(row, 0, [0.5, if row % 3 == 1 { -2.0 } else { 2.0 }]);
             params[SH].write(row, 0, [row as f32, 1.0, 2.0]);
         }
-        let layer = Layer { name: "scene".into(), params, motion, life, span: ALWAYS, masks: None };
+        let layer = Layer::new("scene", params, motion, life);
         let mut scene = Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 30.0, ..Scene::default() };
         assert_eq!(split(&mut scene, 0.01).unwrap(), 13);
         assert_eq!(scene.layers.iter().map(|l| l.params.len()).collect::<Vec<_>>(), [27, 13]);

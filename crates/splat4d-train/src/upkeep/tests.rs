@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::capture::frames::Picture;
-use splat4d::layers::{ALWAYS, Layer};
+use splat4d::layers::Layer;
 use splat4d::motion::{Spec, build};
 use splat4d::scene::params::LOG_SCALE;
 use splat4d::scene::{Camera, LifeKind, Params};
@@ -19,7 +19,7 @@ pub(crate) fn scene(rows: usize) -> Scene<f32> {
         }
         g.write(r, LOG_SCALE, [-2.0; 3]);
     }
-    let layer = Layer { name: "a".into(), params, motion, life: LifeKind::Infinite, span: ALWAYS, masks: None };
+    let layer = Layer::new("a", params, motion, LifeKind::Infinite);
     Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 30.0, ..Scene::default() }
 }
 

@@ -72,7 +72,7 @@ impl Moment {
     /// What [`fill`](Self::fill) took.
     pub fn splats(&self) -> Splats<'_> {
         let color = Color::Sh { table: &self.sh, rows: Rows::All, weights: None, base: false };
-        Splats { parts: vec![Part { out: &self.out, color }], head: None }
+        Splats { parts: vec![Part::new(&self.out, color)], head: None }
     }
 }
 

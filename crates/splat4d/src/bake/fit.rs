@@ -3,8 +3,8 @@
 use super::life::Envelope;
 use super::lookout::Lookout;
 use super::sample::{GEOMETRY, Row, Samples};
+use super::shape::{Shape, decompose, difference};
 use super::tree::{Span, Tree};
-use super::turn::{Shape, decompose, difference};
 use crate::format::playback::Primitive;
 use crate::layers::ALPHA_MIN;
 use crate::math::se3::{norm, sub};

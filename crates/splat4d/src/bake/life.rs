@@ -88,7 +88,6 @@ impl<'a> Lives<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::layers::ALWAYS;
     use crate::motion::Still;
     use crate::scene::{Params, Time};
     use std::sync::Arc;
@@ -100,8 +99,7 @@ mod tests {
             let mut params = Params::new(1, 1, kind.columns());
             let width = params[LIFE].width();
             (0..width).for_each(|k| params[LIFE].set(0, k, row[k]));
-            let layer =
-                Layer { name: "a".into(), params, motion: Arc::new(Still), life: kind, span: ALWAYS, masks: None };
+            let layer = Layer::new("a", params, Arc::new(Still), kind);
             let envelope = Lives::new(&layer).envelope(0);
             for i in 0..50 {
                 let t = -1.0 + 0.05 * f64::from(i);

@@ -15,11 +15,11 @@ mod life;
 mod lookout;
 mod repeat;
 mod sample;
+mod shape;
 mod straight;
 #[cfg(test)]
 mod tests;
 mod tree;
-mod turn;
 
 use crate::format::playback::{Node, Primitive};
 pub use compare::{Likeness, Moment, Shown, compare};
@@ -137,10 +137,10 @@ pub fn bake(scene: &Scene<f32>, options: &Options, progress: &mut dyn FnMut(usiz
     let total = scene.len();
     let mut tally = Tally::default();
     progress(0, total);
-    for layer in &scene.layers {
-        match Line::of(layer) {
-            Some(line) => copy(layer, &line, &fitter, &mut tally, &mut |n| progress(n, total))?,
-            None => follow(layer, &fitter, &mut tally, &mut |n| progress(n, total))?,
+    for layer in scene.layers.iter().map(Layer::with_frame_absorbed) {
+        match Line::of(&layer) {
+            Some(line) => copy(&layer, &line, &fitter, &mut tally, &mut |n| progress(n, total))?,
+            None => follow(&layer, &fitter, &mut tally, &mut |n| progress(n, total))?,
         }
     }
     let key_states = tally.spans.iter().filter(|(s, _)| s[1] - s[0] == 1 && tree.frames() > 1).map(|s| s.1.len()).sum();
@@ -253,19 +253,20 @@ fn follow(layer: &Layer<f32>, fitter: &Fitter<'_>, tally: &mut Tally, progress: 
         return Ok(());
     }
     let colors = sample::color_width(layer, fitter.tree.clip()[0]);
+    let frame = sample::Framed::of(layer);
     let mut rest = rows.as_slice();
     while !rest.is_empty() {
         let (run, later) = rest.split_at(sample::run_length(rest, fitter.tree, colors));
         rest = later;
-        let samples = sample::look(layer, run, fitter.tree, colors);
+        let samples = sample::look(layer, &frame, run, fitter.tree, colors);
         let pieces = |row: &sample::Row| {
             let subject = Subject {
                 samples: &samples,
                 row,
                 window: layer.span,
                 life: lives.envelope(row.id),
-                own: learnt(&layer.params[GEOMETRY].read::<11>(row.id, 0)),
-                colors: (colors == 0).then(|| sample::own_colors(layer, row.id)),
+                own: frame.shape(&learnt(&layer.params[GEOMETRY].read::<11>(row.id, 0))),
+                colors: (colors == 0).then(|| frame.colors(sample::own_colors(layer, row.id))),
             };
             // Colours that are no numbers would show as black; what cannot be drawn is left out.
             let sound = subject.colors.is_none_or(|c| c.iter().all(|x| x.is_finite()));
@@ -282,11 +283,7 @@ fn follow(layer: &Layer<f32>, fitter: &Fitter<'_>, tally: &mut Tally, progress: 
 
 /// All finite means.
 fn means(scene: &Scene<f32>) -> Vec<[f64; 3]> {
-    let of = |layer: &'_ Layer<f32>| {
-        let table = &layer.params[GEOMETRY];
-        (0..table.rows()).map(|i| table.read::<3>(i, 0).map(f64::from)).collect::<Vec<_>>()
-    };
-    scene.layers.iter().flat_map(of).filter(|m| m.iter().all(|x| x.is_finite())).collect()
+    scene.layers.iter().flat_map(Layer::means).filter(|m| m.iter().all(|x| x.is_finite())).collect()
 }
 
 /// The highest degree with a coefficient that is not zero.

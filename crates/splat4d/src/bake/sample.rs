@@ -2,9 +2,13 @@
 //!
 //! Rows come in runs that are small enough for all frames of a run to lie in memory at once, however long the take is.
 
+use super::shape::Shape;
 use super::tree::{Span, Tree};
 use crate::layers::{Evaluation, Layer, sweep};
+use crate::math::se3::mat_vec;
 use crate::math::sh::{MAX_COEFFS, rgb_to_dc};
+use crate::math::sh_rotation::{rotate_coefficients, sh_rotation};
+use crate::math::{Sim3, quat};
 use crate::scene::{Color, Rows, SH, Space, Time};
 
 /// Numbers of a sample before its colour: mean 3, covariance 6, opacity 1 (life applied).
@@ -23,6 +27,40 @@ pub(super) struct Row {
     pub frames: Span,
     /// Where its samples begin.
     offset: usize,
+}
+
+/// What a layer's frame makes of learnt shapes and colours.
+pub(super) struct Framed {
+    frame: Sim3,
+    colors: Option<[[f64; MAX_COEFFS]; MAX_COEFFS]>,
+}
+
+impl Framed {
+    pub(super) fn of(layer: &Layer<f32>) -> Self {
+        let frame = layer.frame;
+        Self { frame, colors: (!frame.is_identity()).then(|| sh_rotation(&frame.rotation)) }
+    }
+
+    /// A shape in the world.
+    pub(super) fn shape(&self, own: &Shape) -> Shape {
+        if self.frame.is_identity() {
+            return *own;
+        }
+        let quat = quat::product(quat::from_rotation(&self.frame.rotation), own.quat);
+        Shape { quat, scales: own.scales.map(|s| s * self.frame.scale), turn: mat_vec(&self.frame.rotation, own.turn) }
+    }
+
+    /// SH coefficients in the world's axes.
+    pub(super) fn colors<const N: usize>(&self, mut own: [f32; N]) -> [f32; N] {
+        self.rotate(&mut own);
+        own
+    }
+
+    fn rotate(&self, coefficients: &mut [f32]) {
+        if let Some(m) = &self.colors {
+            rotate_coefficients(m, coefficients);
+        }
+    }
 }
 
 /// All looks at one run of rows.
@@ -66,7 +104,13 @@ pub(super) fn run_length(rows: &[(usize, [f64; 2])], tree: &Tree, colors: usize)
 }
 
 /// Looks at the rows at every frame at which they can be seen, and at one frame before and after.
-pub(super) fn look(layer: &Layer<f32>, rows: &[(usize, [f64; 2])], tree: &Tree, colors: usize) -> Samples {
+pub(super) fn look(
+    layer: &Layer<f32>,
+    frame: &Framed,
+    rows: &[(usize, [f64; 2])],
+    tree: &Tree,
+    colors: usize,
+) -> Samples {
     let width = GEOMETRY + colors;
     let mut offset = 0;
     let place = |&(id, seen): &(usize, [f64; 2])| {
@@ -90,6 +134,7 @@ pub(super) fn look(layer: &Layer<f32>, rows: &[(usize, [f64; 2])], tree: &Tree, 
             let out = &mut data[start..start + width];
             out[..GEOMETRY].copy_from_slice(&part.out.read::<GEOMETRY>(j, 0));
             coefficients(&part.color, j, &mut out[GEOMETRY..]);
+            frame.rotate(&mut out[GEOMETRY..]);
         }
     });
     Samples { rows, width, data }

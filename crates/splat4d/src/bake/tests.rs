@@ -4,7 +4,7 @@
 use super::*;
 use crate::device;
 use crate::format::playback::{Draft, Meta, WriteConfig, read, write};
-use crate::layers::{ALPHA_MIN, ALWAYS, Evaluation};
+use crate::layers::{ALPHA_MIN, Evaluation};
 use crate::math::{Rng, Se3};
 use crate::motion::spacetime::VELOCITIES;
 use crate::motion::still::activate;
@@ -40,7 +40,7 @@ fn layer(spec: &Spec, life: LifeKind, n: usize, pace: f32, clip: f64) -> Layer<f
             (1..params[LIFE].width()).for_each(|k| params[LIFE].set(i, k, (-1.6 + rng.normal(k as u64)) as f32));
         }
     }
-    Layer { name: "cloud".into(), params, motion, life, span: ALWAYS, masks: None }
+    Layer::new("cloud", params, motion, life)
 }
 
 /// Fills geometry and colour.
@@ -160,14 +160,7 @@ fn curves_and_turns_are_split_and_stay_within_the_tolerance() {
 fn leaps_become_key_states() {
     let mut params = Params::new(60, 4, LifeKind::Infinite.columns());
     cloud(&mut params, 60);
-    let leaping = Layer {
-        name: "leaps".into(),
-        params,
-        motion: Arc::new(Leaps),
-        life: LifeKind::Infinite,
-        span: ALWAYS,
-        masks: None,
-    };
+    let leaping = Layer::new("leaps", params, Arc::new(Leaps), LifeKind::Infinite);
     let scene = scene(vec![leaping], 19.0 / FPS);
     let baked = baked(&scene, &options(0.25));
     let visible = 60 - baked.report.unseen;
@@ -264,14 +257,7 @@ fn rounds_keep_what_stands_still_once() {
 fn colours_that_change_are_followed() {
     let mut params = Params::new(40, 4, LifeKind::Infinite.columns());
     cloud(&mut params, 40);
-    let layer = Layer {
-        name: "lamps".into(),
-        params,
-        motion: Arc::new(Lamps),
-        life: LifeKind::Infinite,
-        span: ALWAYS,
-        masks: None,
-    };
+    let layer = Layer::new("lamps", params, Arc::new(Lamps), LifeKind::Infinite);
     let scene = scene(vec![layer], 1.0);
     let baked = baked(&scene, &options(0.25));
     assert!(baked.report.split > 10, "{:?}", baked.report);

@@ -156,10 +156,7 @@ impl<F: Real> Scene<F> {
     /// The picture of a backend, if it can draw it.
     fn drawn(&self, backend: &mut dyn Backend<F>, camera: &Camera, sh_degree: usize, depth: bool) -> Option<Image<F>> {
         let sh = Color::Sh { table: &self.sh, rows: Rows::All, weights: None, base: true };
-        let parts = vec![
-            Part { out: &self.outs[0], color: sh },
-            Part { out: &self.outs[1], color: Color::Direct { table: &self.direct } },
-        ];
+        let parts = vec![Part::new(&self.outs[0], sh), Part::new(&self.outs[1], Color::Direct { table: &self.direct })];
         let head = self.head.as_ref().map(|[first, second]| HeadWeights { first, second });
         let splats = Splats { parts, head };
         let background = BACKGROUND.map(|v| F::of(f64::from(v)));

@@ -1,7 +1,7 @@
 //! Flow of scenes whose flow is known exactly, in f64.
 
 use super::*;
-use crate::layers::{ALWAYS, Layer};
+use crate::layers::Layer;
 use crate::math::Se3;
 use crate::motion::{SpacetimeSpec, Spec, build};
 use crate::render::RenderConfig;
@@ -39,7 +39,7 @@ fn wall(velocity: [f64; 3], life: LifeKind) -> Scene<f64> {
     let motion = build(&spec, &mut p).unwrap();
     let key = p.find("velocities").unwrap();
     (0..rows).for_each(|r| p[key].write(r, 0, velocity));
-    let layer = Layer { name: "wall".into(), params: p, motion, life, span: ALWAYS, masks: None };
+    let layer = Layer::new("wall", p, motion, life);
     Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 10.0, ..Scene::default() }
 }
 

@@ -149,7 +149,7 @@ pub fn nearest<F: Real>(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::layers::{ALWAYS, Layer};
+    use crate::layers::Layer;
     use crate::motion::{SpacetimeSpec, Spec, build};
     use crate::scene::{GEOMETRY, LIFE, LifeKind, Params};
 
@@ -164,7 +164,7 @@ mod tests {
             params[key].set(r, 1, 0.5);
             params[LIFE].write(r, 0, [0.0, if r == 4 { -2.0 } else { 4.0 }]);
         }
-        let layer = Layer { name: "a, b".into(), params, motion, life: LifeKind::GaussHalf, span: ALWAYS, masks: None };
+        let layer = Layer::new("a, b", params, motion, LifeKind::GaussHalf);
         Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 10.0, ..Scene::default() }
     }
 

@@ -3,7 +3,7 @@
 use super::warnings::Warnings;
 use super::{ply, sog, splat, splatv, spz};
 use crate::Result;
-use crate::layers::{ALWAYS, Layer, Scene};
+use crate::layers::{Layer, Scene};
 use crate::motion::Still;
 use crate::scene::{LifeKind, Params, time::DEFAULT_FPS};
 use std::sync::Arc;
@@ -109,14 +109,7 @@ fn moving((scene, warnings): (Scene<f32>, Warnings)) -> Opened {
 
 /// A scene of one layer that stands still, in the axes of a dialect.
 pub fn still(params: Params, dialect: Dialect) -> Scene<f32> {
-    let layer = Layer {
-        name: "gaussians".into(),
-        params,
-        motion: Arc::new(Still),
-        life: LifeKind::Infinite,
-        span: ALWAYS,
-        masks: None,
-    };
+    let layer = Layer::new("gaussians", params, Arc::new(Still), LifeKind::Infinite);
     Scene { layers: vec![layer], up: dialect.up(), fps: DEFAULT_FPS, ..Scene::default() }
 }
 

@@ -90,7 +90,8 @@ pub(super) fn rows(scene: &Scene<f32>, clock: Clock, name: &str, warnings: &mut 
     scene.without_head(name)?;
     let mut out = Vec::with_capacity(scene.len());
     let mut shaded = 0;
-    for layer in &scene.layers {
+    for layer in scene.layers.iter().map(Layer::with_frame_absorbed) {
+        let layer = layer.as_ref();
         let spec = match layer.motion.spec() {
             Spec::Still => SpacetimeSpec { order: 0, ..SpacetimeSpec::default() },
             Spec::Spacetime(spec) => spec,
@@ -181,7 +182,7 @@ pub(super) fn scene(rows: &[Moving], clock: Clock) -> Result<Scene<f32>> {
         }
         rates.write(row, 0, m.turn.map(|w| (w / clock.duration) as f32));
     }
-    let layer = Layer { name: "moving".into(), params, motion, life: kind, span: ALWAYS, masks: None };
+    let layer = Layer::new("moving", params, motion, kind);
     Ok(Scene { layers: vec![layer], clip: clock.clip, fps: clock.fps, up: UP, ..Scene::default() })
 }
 
@@ -215,7 +216,7 @@ pub(super) mod tests {
                 }
             }
         }
-        let layer = Layer { name: "flying".into(), params, motion, life, span: ALWAYS, masks: None };
+        let layer = Layer::new("flying", params, motion, life);
         Scene { layers: vec![layer], clip: [2.0, 5.0], fps: 25.0, up: UP, ..Scene::default() }
     }
 

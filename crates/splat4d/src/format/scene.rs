@@ -1,13 +1,14 @@
 //! `scene.safetensors`: the lossless learnable state of a scene.
 //!
 //! Metadata `splat4d` holds JSON: version, clip, fps, up, background, head, and a list of layers with name, rows, SH
-//! coefficients, life and motion. Every column group of every table is one row-major array: `layers.0.means` `[N,3]`,
+//! coefficients, life and motion, and `frame` where the layer's axes are not the world's. Every column group of every table is one row-major array: `layers.0.means` `[N,3]`,
 //! `layers.0.quats` `[N,4]` wxyz, `layers.0.sh` `[N,K,3]`, `layers.0.velocities` `[N,3·order]` … Seconds and scene units.
 
 use super::arrays::MASKS;
 use super::safetensors::{SafeTensors, Tensor};
 use super::{params_to_arrays, tensors_to_loaded};
 use crate::layers::{ALWAYS, Head, Layer, Scene};
+use crate::math::Sim3;
 use crate::motion::native4d::MAX_HARMONICS;
 use crate::motion::{BUILT_IN, Spec, build};
 use crate::scene::masks::WORD;
@@ -18,8 +19,10 @@ use std::collections::BTreeMap;
 use std::io::Write;
 use std::sync::Arc;
 
-/// Version of the metadata this library writes, and the newest it reads.
-pub const VERSION: u64 = 1;
+/// The newest version of the metadata that this library reads and writes.
+pub const VERSION: u64 = 2;
+/// The version of scenes whose layers have no frame: programs that know no frames may read them.
+const UNFRAMED: u64 = 1;
 /// The metadata's key.
 pub const METADATA: &str = "splat4d";
 
@@ -43,11 +46,15 @@ pub fn metadata(scene: &Scene<f32>) -> Value {
             if let Some(masks) = &l.masks {
                 layer["mask_times"] = json!(masks.times());
             }
+            if !l.frame.is_identity() {
+                let Sim3 { scale, rotation, translation } = l.frame;
+                layer["frame"] = json!({ "scale": scale, "rotation": rotation, "translation": translation });
+            }
             layer
         })
         .collect();
     json!({
-        "version": VERSION,
+        "version": if scene.layers.iter().all(|l| l.frame.is_identity()) { UNFRAMED } else { VERSION },
         "units": "scene units, seconds, colours in [0, 1]",
         "axes": "OpenCV: x right, y down, z forward in the camera",
         "clip": scene.clip,
@@ -180,7 +187,8 @@ fn read_layer(file: &SafeTensors<'_>, meta: &Value, index: usize) -> Result<Laye
         return Err(broken(format!("array `{}` belongs to no table of this layer", array.name)));
     }
     let masks = read_masks(file, meta, &prefix, rows)?;
-    Ok(Layer { name: text(meta, "name")?, params, motion, life, span: span(meta)?, masks })
+    let (name, span, frame) = (text(meta, "name")?, span(meta)?, frame(meta)?);
+    Ok(Layer { span, masks, frame, ..Layer::new(name, params, motion, life) })
 }
 
 /// Who is worth drawing when; none where nothing is said.
@@ -214,6 +222,26 @@ fn span(meta: &Value) -> Result<[f64; 2]> {
         *o = side.as_f64().ok_or_else(|| broken("`span` is not a first and a last second".into()))?;
     }
     Ok(out)
+}
+
+/// The similarity from the layer's axes to the world's; the identity where nothing is said.
+fn frame(meta: &Value) -> Result<Sim3> {
+    let frame = &meta["frame"];
+    if frame.is_null() {
+        return Ok(Sim3::IDENTITY);
+    }
+    let row = |row: &Value| numbers::<3>(&json!({ "rotation": row }), "rotation");
+    let rows = frame["rotation"].as_array().filter(|rows| rows.len() == 3);
+    let rows = rows.ok_or_else(|| broken("its `frame` has no rotation of three rows".into()))?;
+    let sim = Sim3 {
+        scale: number(frame, "scale")?,
+        rotation: [row(&rows[0])?, row(&rows[1])?, row(&rows[2])?],
+        translation: numbers(frame, "translation")?,
+    };
+    if !sim.is_sound() {
+        return Err(broken("its `frame` is no rotation with a scale above zero".into()));
+    }
+    Ok(sim)
 }
 
 fn broken(what: String) -> Error {
@@ -267,7 +295,7 @@ mod tests {
             let mut masks = KeyMasks::new(vec![0.0, 0.1, 0.1 + 0.2], 37);
             (0..37).for_each(|row| masks.set((row as u64 * seed % 3) as usize, row));
             let masks = (seed != 1).then(|| Arc::new(masks));
-            Layer { name: format!("layer {seed}"), params, motion, life, span, masks }
+            Layer { span, masks, ..Layer::new(format!("layer {seed}"), params, motion, life) }
         };
         let spacetime =
             Spec::Spacetime(SpacetimeSpec { order: 2, rotation: true, detach: true, origin: 0.25, features: None });
@@ -311,7 +339,7 @@ mod tests {
         let first = HeadKeys::of(&params).unwrap().first;
         params[first].set(7, 0, 0.25);
         let (life, name) = (LifeKind::GaussHalf, "a".to_owned());
-        let layer = Layer { name, params, motion, life, span: ALWAYS, masks: None };
+        let layer = Layer::new(name, params, motion, life);
         let with = |head: Head, layers: Vec<Layer>| {
             let mut bytes = Vec::new();
             write(&Scene { layers, head, ..scene() }, &mut bytes).unwrap();

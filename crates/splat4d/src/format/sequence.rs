@@ -1,6 +1,6 @@
 //! Frames of plain Gaussians, one file each, as one moving scene: every Gaussian lives for its own frame.
 
-use crate::layers::{ALWAYS, Layer, Scene};
+use crate::layers::{Layer, Scene};
 use crate::math::sh;
 use crate::motion::Still;
 use crate::scene::{GEOMETRY, LIFE, LifeKind, Params, SH};
@@ -40,7 +40,7 @@ pub fn join(frames: &[Params], fps: f64, up: [f64; 3]) -> Result<Scene<f32>> {
             row += 1;
         }
     }
-    let layer = Layer { name: "frames".into(), params, motion: Arc::new(Still), life: kind, span: ALWAYS, masks: None };
+    let layer = Layer::new("frames", params, Arc::new(Still), kind);
     let clip = [0.0, (frames.len() - 1) as f64 / fps];
     Ok(Scene { layers: vec![layer], clip, fps, up, ..Scene::default() })
 }

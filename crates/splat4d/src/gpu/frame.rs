@@ -70,7 +70,7 @@ fn uniform(buffers: &Buffers, slot: usize, size: u64) -> BindingResource<'_> {
 
 /// Bytes of the structures in WGSL.
 const VIEW_BYTES: u64 = 128;
-const PIECE_BYTES: u64 = 32;
+const PIECE_BYTES: u64 = 80;
 const SCAN_BYTES: u64 = 16;
 const SORT_BYTES: u64 = 8;
 const BAND_BYTES: u64 = 16;

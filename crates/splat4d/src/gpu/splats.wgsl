@@ -24,6 +24,7 @@ struct Piece {
     flags: u32,
     first_id: u32,    // row of the colour table with which the buffer begins
     spare: u32,
+    layer_from_world: mat3x3<f32>, // of directions, to the axes of the SH; the identity where they are the world's
 }
 
 @group(0) @binding(0) var<uniform> view: View;
@@ -56,7 +57,7 @@ fn color_of(j: u32, mean: vec3<f32>) -> vec3<f32> {
     }
     let block = piece.width / piece.blocks;
     let used = sh_used(block / 3u, view.sh_degree);
-    var basis = sh_basis(normalize(mean - view.camera));
+    var basis = sh_basis(piece.layer_from_world * normalize(mean - view.camera));
     var rgb = vec3<f32>(0.0);
     for (var b = 0u; b < piece.blocks; b++) {
         var sum = vec3<f32>(0.0);

@@ -109,7 +109,7 @@ impl Scenery {
 
     fn splats(&self) -> Splats<'_, f32> {
         let color = Color::Sh { table: &self.sh, rows: Rows::All, weights: None, base: true };
-        Splats { parts: vec![Part { out: &self.out, color }], head: None }
+        Splats { parts: vec![Part::new(&self.out, color)], head: None }
     }
 }
 

@@ -28,6 +28,14 @@ pub(super) struct Piece {
     flags: u32,
     first_id: u32,
     spare: u32,
+    /// Columns of the rotation of directions to the axes of the SH, each padded to a vec4.
+    layer_from_world: [[f32; 4]; 3],
+}
+
+/// Columns of a rotation (rows), as a uniform's mat3x3 has them.
+fn columns(r: Option<[[f32; 3]; 3]>) -> [[f32; 4]; 3] {
+    let r = r.unwrap_or([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]);
+    std::array::from_fn(|c| [r[0][c], r[1][c], r[2][c], 0.0])
 }
 
 /// One dispatch: its uniform, and which buffers it reads.
@@ -179,6 +187,7 @@ impl Upload {
                     flags,
                     first_id: first_id as u32,
                     spare: 0,
+                    layer_from_world: columns(part.layer_from_world),
                 };
                 self.draws.push(Draw { piece, part: i, cut });
             }

@@ -6,7 +6,7 @@ use crate::motion::lanes::{Batch, Lane, Work, fill, scatter};
 use crate::scene::params::OPACITY;
 use crate::scene::splats::SPLAT_OPACITY;
 use crate::scene::table::TableMut;
-use crate::scene::{BLOCK, GEOMETRY, LifeKind, Params, Rows, Table, Time};
+use crate::scene::{BLOCK, LifeKind, Rows, Table, Time};
 use crate::simd::{Kernel, Simd, dispatch, each};
 
 /// Rows a task looks at.
@@ -116,7 +116,7 @@ impl<F: Real> Kernel for Find<'_, F> {
     }
 }
 
-/// Multiplies the opacity of `out` by the life and fills `life`: [splats, 4], σ and its derivatives.
+/// Multiplies the opacity of `out` by the life and fills `life`: [splats, 5], σ, its derivatives, the model's opacity.
 pub(super) fn forward<F: Real>(
     p: &Table<F>,
     kind: LifeKind,
@@ -138,8 +138,9 @@ impl<F: Real> Work<F, 2> for Forward<'_, F> {
     #[inline(always)]
     fn run(&self, batch: &Batch, [out, life]: &mut [TableMut<'_, F>; 2]) -> f64 {
         let value = eval(self.kind, &read_life(batch, self.p), self.t);
-        batch.write(life, 0, &value);
         let [opacity] = batch.lanes(out, SPLAT_OPACITY);
+        let [sigma, by_time, by_width, by_softness] = value;
+        batch.write(life, 0, &[sigma, by_time, by_width, by_softness, opacity]);
         batch.write(out, SPLAT_OPACITY, &[each(|l| opacity[l] * value[0][l])]);
         0.0
     }
@@ -173,19 +174,13 @@ impl<F: Real> Work<F, 1> for ToMotion<'_, F> {
     }
 }
 
-/// Adds dL/dσ = o·dL/d(o·σ) times σ's derivatives to the life's gradient `d_life`; returns dL/dt.
-pub(super) fn backward<F: Real>(
-    p: &Params<F>,
-    rows: Rows<'_>,
-    d_out: &Table<F>,
-    life: &Table<F>,
-    d_life: &mut Table<F>,
-) -> f64 {
-    scatter(&Backward { geometry: &p[GEOMETRY], d_out, life }, [d_life], rows)
+/// Adds dL/dσ = o·dL/d(o·σ) times σ's derivatives to the life's gradient `d_life`; returns dL/dt. o is the model's opacity,
+/// which need not be the learnt one alone.
+pub(super) fn backward<F: Real>(rows: Rows<'_>, d_out: &Table<F>, life: &Table<F>, d_life: &mut Table<F>) -> f64 {
+    scatter(&Backward { d_out, life }, [d_life], rows)
 }
 
 struct Backward<'a, F> {
-    geometry: &'a Table<F>,
     d_out: &'a Table<F>,
     life: &'a Table<F>,
 }
@@ -193,13 +188,12 @@ struct Backward<'a, F> {
 impl<F: Real> Work<F, 1> for Backward<'_, F> {
     #[inline(always)]
     fn run(&self, batch: &Batch, [d_life]: &mut [TableMut<'_, F>; 1]) -> f64 {
-        let [logit] = batch.ids.read::<F, 1>(self.geometry, OPACITY);
         let [d_opacity] = batch.at.read::<F, 1>(self.d_out, SPLAT_OPACITY);
-        let [_, by_time, by_width, by_softness] = batch.at.read::<F, 4>(self.life, 0);
+        let [_, by_time, by_width, by_softness, opacity] = batch.at.read::<F, 5>(self.life, 0);
         let mut d = [[F::ZERO; BLOCK]; 3];
         let mut d_time = [F::ZERO; BLOCK];
         for l in 0..BLOCK {
-            let g = d_opacity[l] * logit[l].sigmoid();
+            let g = d_opacity[l] * opacity[l];
             d_time[l] = g * by_time[l];
             (d[0][l], d[1][l], d[2][l]) = (-d_time[l], g * by_width[l], g * by_softness[l]);
         }

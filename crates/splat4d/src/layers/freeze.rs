@@ -3,7 +3,8 @@
 use super::{Evaluation, Layer, LayerTape, Scene};
 use crate::Result;
 use crate::math::sh::MAX_COEFFS;
-use crate::math::{quat, sym3};
+use crate::math::sh_rotation::{rotate_coefficients, sh_rotation};
+use crate::math::{Sim3, quat, sym3};
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::splats::{COV, SPLAT_OPACITY};
 use crate::scene::{Color, GEOMETRY, LifeKind, Params, Rows, SH, Space, Time};
@@ -17,7 +18,7 @@ const THINNEST: f64 = 1e-4;
 /// Opacities are kept this far from 0 and 1, where logits are infinite.
 const OPACITY_MARGIN: f32 = 1e-6;
 
-/// The Gaussians that are alive at `time`, all layers together, as a still layer's parameters.
+/// The Gaussians that are alive at `time`, all layers together, in the world, as a still layer's parameters.
 ///
 /// Errors: the scene has a head, without which its Gaussians look different.
 pub fn freeze(scene: &Scene<f32>, time: Time) -> Result<Params<f32>> {
@@ -35,8 +36,8 @@ pub fn freeze(scene: &Scene<f32>, time: Time) -> Result<Params<f32>> {
     Ok(params)
 }
 
-/// These rows of a layer (strictly increasing) as they are at `time`, life included, as a still layer's parameters; of
-/// Gaussians with features only the base colour is left.
+/// These rows of a layer (strictly increasing) as they are at `time`, life and frame included, as a still layer's
+/// parameters; of Gaussians with features only the base colour is left.
 pub fn freeze_rows(layer: &Layer<f32>, rows: &[u32], time: Time) -> Params<f32> {
     let seen = Evaluation::of_layer(layer, Space::Gaussians, Rows::Some(rows), time);
     let coefficients = (layer.params[SH].width() / 3).clamp(1, MAX_COEFFS);
@@ -48,12 +49,13 @@ pub fn freeze_rows(layer: &Layer<f32>, rows: &[u32], time: Time) -> Params<f32> 
 /// Writes what a tape holds into rows of a still layer, from `first` on.
 fn write(layer: &Layer<f32>, tape: &LayerTape<f32>, coefficients: usize, first: usize, params: &mut Params<f32>) {
     let (raw, part) = (&layer.params[GEOMETRY], layer.part(tape));
+    let sh_matrix = part.layer_from_world.map(|_| sh_rotation(&layer.frame.rotation));
     for j in 0..part.out.rows() {
         let (id, row) = (tape.rows().id(j), first + j);
         let mean = part.out.read::<3>(j, 0);
         let cov = part.out.read::<6>(j, COV).map(f64::from);
         let opacity = part.out.get(j, SPLAT_OPACITY).clamp(OPACITY_MARGIN, 1.0 - OPACITY_MARGIN);
-        let own = (raw.read::<4>(id, QUAT).map(f64::from), raw.read::<3>(id, LOG_SCALE).map(f64::from));
+        let own = framed_shape(&layer.frame, raw.read(id, QUAT), raw.read(id, LOG_SCALE));
         // Most motion leaves shapes alone: then the learnt numbers are exact and a decomposition is not.
         let (q, s) = if unchanged(own, cov) { own } else { decomposed(cov) };
         let [geometry, sh] = params.get_mut([GEOMETRY, SH]);
@@ -61,10 +63,23 @@ fn write(layer: &Layer<f32>, tape: &LayerTape<f32>, coefficients: usize, first: 
         geometry.write(row, QUAT, q.map(|x| x as f32));
         geometry.write(row, LOG_SCALE, s.map(|x| x as f32));
         geometry.set(row, OPACITY, (opacity / (1.0 - opacity)).ln());
-        for (k, value) in coefficients_of(&part.color, j).into_iter().enumerate().take(3 * coefficients) {
+        let mut colors = coefficients_of(&part.color, j);
+        if let Some(m) = &sh_matrix {
+            rotate_coefficients(m, &mut colors);
+        }
+        for (k, value) in colors.into_iter().enumerate().take(3 * coefficients) {
             sh.set(row, k, value);
         }
     }
+}
+
+/// A learnt shape (raw quaternion and log scales) as the frame shows it.
+pub(crate) fn framed_shape(frame: &Sim3, q: [f32; 4], log_scales: [f32; 3]) -> ([f64; 4], [f64; 3]) {
+    let own = (q.map(f64::from), log_scales.map(f64::from));
+    if frame.is_identity() {
+        return own;
+    }
+    (quat::product(quat::from_rotation(&frame.rotation), own.0), own.1.map(|s| s + frame.scale.ln()))
 }
 
 fn unchanged((q, s): ([f64; 4], [f64; 3]), cov: [f64; 6]) -> bool {

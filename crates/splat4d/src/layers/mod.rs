@@ -3,18 +3,18 @@
 mod chart;
 mod envelope;
 mod evaluation;
+mod frame;
 mod freeze;
+mod rotate;
 #[cfg(test)]
 mod tests;
-mod turn;
 
 pub use chart::{to_native4d, to_spacetime};
 pub use evaluation::{Evaluation, sweep};
 pub use freeze::{freeze, freeze_rows};
-pub use turn::rotation_between;
+pub use rotate::rotation_between;
 
-use crate::math::Real;
-use crate::math::Rng;
+use crate::math::{Real, Rng, Sim3};
 use crate::motion::{At, Cache, Motion, Tape};
 use crate::scene::GEOMETRY;
 use crate::scene::params::OPACITY;
@@ -45,6 +45,9 @@ pub struct Layer<F: Real = f32> {
     pub span: [f64; 2],
     /// Who is worth drawing when; none: everybody alive.
     pub masks: Option<Arc<KeyMasks>>,
+    /// Where the layer stands: `world_from_layer`, applied to Gaussians after motion and life. Tables, the motion model and
+    /// nodes keep the layer's own axes and unit of length.
+    pub frame: Sim3,
 }
 
 impl<F: Real> Clone for Layer<F> {
@@ -56,6 +59,7 @@ impl<F: Real> Clone for Layer<F> {
             life: self.life,
             span: self.span,
             masks: self.masks.clone(),
+            frame: self.frame,
         }
     }
 }
@@ -74,9 +78,13 @@ pub struct LayerTape<F = f32> {
     all: bool,
     ids: Vec<u32>,
     tape: Tape<F>,
-    /// [splats, 4]: σ, ∂σ/∂t, ∂σ/∂log width, ∂σ/∂log softness; empty where σ is 1.
+    /// [splats, 5]: σ, ∂σ/∂t, ∂σ/∂log width, ∂σ/∂log softness, the model's opacity; empty where σ is 1.
     life: Table<F>,
     d_out: Table<F>,
+    /// [splats, 10]: `tape.out` in the world; empty where the frame is the identity, and for nodes.
+    world: Table<F>,
+    /// Gradient to `tape.out` of a framed answer.
+    d_layer: Table<F>,
 }
 
 impl<F: Real> Default for LayerTape<F> {
@@ -89,6 +97,8 @@ impl<F: Real> Default for LayerTape<F> {
             tape: Tape::default(),
             life: Table::default(),
             d_out: Table::default(),
+            world: Table::default(),
+            d_layer: Table::default(),
         }
     }
 }
@@ -128,9 +138,9 @@ impl<F: Real> LayerTape<F> {
         self.t
     }
 
-    /// [splats, 10], life applied.
+    /// [splats, 10], life and frame applied; nodes are in the layer's own axes.
     pub fn out(&self) -> &Table<F> {
-        &self.tape.out
+        if self.world.width() > 0 { &self.world } else { &self.tape.out }
     }
 
     /// The question as the motion model sees it.
@@ -140,6 +150,11 @@ impl<F: Real> LayerTape<F> {
 }
 
 impl<F: Real> Layer<F> {
+    /// A layer that may be seen at any time, without masks, whose axes are the world's.
+    pub fn new(name: impl Into<String>, params: Params<F>, motion: Arc<dyn Motion<F>>, life: LifeKind) -> Self {
+        Self { name: name.into(), params, motion, life, span: ALWAYS, masks: None, frame: Sim3::IDENTITY }
+    }
+
     /// Whether t lies in the layer's span. A NaN does, so that the trainer's guard finds it.
     pub fn spans_over(&self, t: Time) -> bool {
         !(t.0 < self.span[0] || t.0 >= self.span[1])
@@ -202,18 +217,28 @@ impl<F: Real> Layer<F> {
         LifeBuckets::new(self.spans(), clip, count)
     }
 
-    /// Answers the question in `tape`: the motion model, then the life.
+    /// Answers the question in `tape`: the motion model, then the life, then the frame. Nodes have neither life nor frame.
     pub fn at(&self, cache: &Cache, tape: &mut LayerTape<F>) {
         let mut own = std::mem::take(&mut tape.tape);
         self.motion.at(&tape.question(&self.params), cache, &mut own);
         tape.tape = own;
+        self.fade(tape);
+        if self.frame.is_identity() || tape.of != Space::Gaussians {
+            tape.world = Table::default();
+        } else {
+            frame::forward(&self.frame, &tape.tape.out, &mut tape.world);
+        }
+    }
+
+    /// Multiplies the opacities of the answer in `tape` by the life.
+    fn fade(&self, tape: &mut LayerTape<F>) {
         if self.life == LifeKind::Infinite || tape.of != Space::Gaussians {
             tape.life = Table::default();
             return;
         }
         let table = &self.params[LIFE];
         if tape.life.width() == 0 {
-            tape.life = Table::new(&[("sigma", 4)], 0);
+            tape.life = Table::new(&[("sigma", 4), ("opacity", 1)], 0);
         }
         tape.life.resize(tape.tape.out.rows());
         let rows = if tape.all { Rows::All } else { Rows::Some(&tape.ids) };
@@ -223,7 +248,16 @@ impl<F: Real> Layer<F> {
     /// The splats that the last [`at`](Self::at) left in `tape`.
     pub fn part<'a>(&'a self, tape: &'a LayerTape<F>) -> Part<'a, F> {
         let color = self.motion.color(&tape.question(&self.params), &tape.tape);
-        Part { out: &tape.tape.out, color }
+        Part { out: tape.out(), color, layer_from_world: self.frame.directions() }
+    }
+
+    /// Means as the tables have them, before any motion, in the world.
+    pub fn means(&self) -> impl Iterator<Item = [f64; 3]> + '_ {
+        let table = &self.params[GEOMETRY];
+        (0..table.rows()).map(|row| {
+            let mean = table.read::<3>(row, 0).map(F::f64);
+            if self.frame.is_identity() { mean } else { self.frame.apply(mean) }
+        })
     }
 
     /// The VJP of [`at`](Self::at): adds to `d` and `d_cache`, returns dL/dt. `d_out.out` is to what `at` returned.
@@ -238,7 +272,16 @@ impl<F: Real> Layer<F> {
         d.activate(tape.of, if tape.all { Rows::All } else { Rows::Some(&tape.ids) });
         let mut own = std::mem::take(&mut tape.tape);
         let mut d_motion = std::mem::take(&mut tape.d_out);
+        let mut d_layer = std::mem::take(&mut tape.d_layer);
         let mut d_time = 0.0;
+        let unframed;
+        let d_out = if tape.world.width() == 0 {
+            d_out
+        } else {
+            frame::backward(&self.frame, d_out.out, &mut d_layer);
+            unframed = SplatGrads { out: &d_layer, ..*d_out };
+            &unframed
+        };
         let question = tape.question(&self.params);
         if tape.life.width() == 0 {
             d_time += self.motion.backward(&question, cache, &mut own, d_out, d_cache, d);
@@ -246,12 +289,13 @@ impl<F: Real> Layer<F> {
             // o_eff = o·σ: the motion gets dL/do = σ·dL/do_eff, the life dL/dσ = o·dL/do_eff.
             envelope::to_motion(d_out.out, &tape.life, &mut d_motion);
             let [d_life] = d.of([LIFE]);
-            d_time += envelope::backward(&self.params, question.rows, d_out.out, &tape.life, d_life);
+            d_time += envelope::backward(question.rows, d_out.out, &tape.life, d_life);
             let scaled = SplatGrads { out: &d_motion, ..*d_out };
             d_time += self.motion.backward(&question, cache, &mut own, &scaled, d_cache, d);
         }
         tape.tape = own;
         tape.d_out = d_motion;
+        tape.d_layer = d_layer;
         d_time
     }
 

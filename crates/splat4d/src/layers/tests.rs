@@ -15,7 +15,7 @@ fn layer(spec: &Spec, life: LifeKind, rows: usize, seed: u64) -> Layer<f64> {
             }
         }
     }
-    Layer { name: "test".into(), params, motion, life, span: ALWAYS, masks: None }
+    Layer::new("test", params, motion, life)
 }
 
 fn loss(layer: &Layer<f64>, t: f64) -> f64 {

@@ -1,4 +1,4 @@
-//! Small mathematics: quaternions, symmetric 3x3 matrices, rigid motions, spherical harmonics, counter-based random
+//! Small mathematics: quaternions, symmetric 3x3 matrices, rigid motions, similarities, spherical harmonics, counter-based random
 //! numbers, and the [`Real`] trait that lets every kernel run in f32 and be checked in f64.
 
 mod jacobi;
@@ -9,7 +9,8 @@ pub mod real;
 pub mod rng;
 pub mod se3;
 pub mod sh;
-pub mod sh_turn;
+pub mod sh_rotation;
+pub mod sim3;
 pub mod spd;
 pub mod sym3;
 pub mod twist;
@@ -17,4 +18,5 @@ pub mod twist;
 pub use real::Real;
 pub use rng::Rng;
 pub use se3::Se3;
-pub use sh_turn::sh_rotation;
+pub use sh_rotation::sh_rotation;
+pub use sim3::Sim3;

@@ -86,7 +86,7 @@ fn a_layer_that_lives_for_ever_is_shown_whole() {
     params[crate::scene::GEOMETRY].set(1, crate::scene::params::OPACITY, -20.0);
     let life = crate::scene::LifeKind::Infinite;
     for span in [ALWAYS, [0.5, 2.0]] {
-        let layer = Layer { name: "a".into(), params: params.clone(), motion: motion.clone(), life, span, masks: None };
+        let layer = Layer { span, ..Layer::new("a", params.clone(), motion.clone(), life) };
         let scene = Scene { layers: vec![layer], clip: [0.0, 1.0], ..Scene::default() };
         let mut player = Player::of_scene(&scene);
         assert_eq!(player.at(Time(0.7)).unwrap().len(), 3);

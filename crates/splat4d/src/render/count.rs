@@ -87,7 +87,7 @@ mod tests {
             out.set(j, 9, (0.1 + 0.89 * r.uniform(4)) as f32);
             colors.write(j, 0, [0.5; 3]);
         }
-        let splats = Splats { parts: vec![Part { out: &out, color: Color::Direct { table: &colors } }], head: None };
+        let splats = Splats { parts: vec![Part::new(&out, Color::Direct { table: &colors })], head: None };
         let pose = Se3::look_at([0.0, 0.0, -4.0], [0.0; 3], [0.0, -1.0, 0.0]);
         // Odd sizes: tiles and bins that the picture's edges cut.
         let camera = Camera::with_fov_y(pose, 0.5, 77, 61);

@@ -134,9 +134,15 @@ fn blob<F: Real>(part: &Part<'_, F>, j: usize, id: usize, camera: &Camera, confi
         opacity,
         depth: p[2],
         further: further(part, j),
-        rgb: color(part, j, se3::normalize(se3::sub(mean, camera.center())), config.sh_degree),
+        rgb: color(part, j, direction(part, se3::sub(mean, camera.center())), config.sh_degree),
         id,
     })
+}
+
+/// The unit vector along `v` in the axes of the part's SH.
+fn direction<F: Real>(part: &Part<'_, F>, v: [f64; 3]) -> [f64; 3] {
+    let unit = se3::normalize(v);
+    part.layer_from_world.map_or(unit, |r| se3::mat_vec(&r.map(|row| row.map(F::f64)), unit))
 }
 
 fn color<F: Real>(part: &Part<'_, F>, j: usize, direction: [f64; 3], degree: usize) -> [f64; 3] {

@@ -113,9 +113,9 @@ impl Group {
     }
 }
 
-/// Unit directions [3][16] from the camera, and 1/length.
+/// Unit directions [3][16] from the camera, in the axes of the part's SH (rows; none: the world's), and 1/length.
 #[inline(always)]
-fn directions<F: Real>(means: &[Lanes<F>; 3], center: [F; 3]) -> ([Lanes<F>; 3], Lanes<F>) {
+fn directions<F: Real>(means: &[Lanes<F>; 3], center: [F; 3], axes: &Option<[[F; 3]; 3]>) -> ([Lanes<F>; 3], Lanes<F>) {
     let mut d = [[F::ZERO; BLOCK]; 3];
     let mut inverse = [F::ZERO; BLOCK];
     for l in 0..BLOCK {
@@ -123,7 +123,21 @@ fn directions<F: Real>(means: &[Lanes<F>; 3], center: [F; 3]) -> ([Lanes<F>; 3],
         let i = F::ONE / (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt();
         (d[0][l], d[1][l], d[2][l], inverse[l]) = (v[0] * i, v[1] * i, v[2] * i, i);
     }
+    if let Some(axes) = axes {
+        rotate(axes, &mut d);
+    }
     (d, inverse)
+}
+
+/// Rotates sixteen vectors.
+#[inline(always)]
+fn rotate<F: Real>(r: &[[F; 3]; 3], v: &mut [Lanes<F>; 3]) {
+    for l in 0..BLOCK {
+        let [x, y, z] = [v[0][l], v[1][l], v[2][l]];
+        for i in 0..3 {
+            v[i][l] = r[i][0] * x + r[i][1] * y + r[i][2] * z;
+        }
+    }
 }
 
 /// Adds w·Σ_k Y_k(d) f_k to the colour. One loop over lanes, so that the basis stays in registers.
@@ -183,7 +197,8 @@ impl<F: Real> Kernel for Forward<'_, F> {
                         channels.fill([F::ZERO; CHANNELS]);
                         continue;
                     }
-                    let (d, _) = directions(&group.read::<F, 3>(self.part.out, 0), self.center);
+                    let (d, _) =
+                        directions(&group.read::<F, 3>(self.part.out, 0), self.center, &self.part.layer_from_world);
                     let columns = table.block(group.block).as_chunks().0;
                     let mut rgb = [[F::ZERO; BLOCK]; 3];
                     for b in 0..layout.blocks {
@@ -208,7 +223,7 @@ impl<F: Real> Kernel for Forward<'_, F> {
 /// Colours of all splats: red, green, blue; culled splats get zeros.
 ///
 /// Shapes: `channels` [all splats]. SH of `degree` at most, clamped at 0 from below; direct colours are
-/// taken as they are, columns beyond the third are not drawn.
+/// taken as they are, columns beyond the third are not drawn. The direction of view is taken to the axes of each part's SH.
 pub fn forward<F: Real>(projection: &Projection<'_, F>, degree: usize, channels: &mut [[F; CHANNELS]]) {
     let Projection { splats, view, simd, projected } = *projection;
     let (mut first, mut rest) = (0, channels);
@@ -300,7 +315,8 @@ impl<F: Real> Kernel for ShGrads<'_, F> {
             if v.iter().flatten().all(|&x| x == F::ZERO) {
                 continue;
             }
-            let (mut d, _) = directions(&group.read::<F, 3>(self.part.out, 0), self.center);
+            let (mut d, _) =
+                directions(&group.read::<F, 3>(self.part.out, 0), self.center, &self.part.layer_from_world);
             let at = (group.block - self.first / BLOCK) * width;
             for b in 0..self.layout.blocks {
                 let mut w = group.weights(self.weights, b);
@@ -385,7 +401,8 @@ impl<F: Real> Kernel for DirectionGrads<'_, F> {
             if v.iter().flatten().all(|&x| x == F::ZERO) {
                 continue;
             }
-            let (d, inverse) = directions(&group.read::<F, 3>(self.part.out, 0), self.center);
+            let (d, inverse) =
+                directions(&group.read::<F, 3>(self.part.out, 0), self.center, &self.part.layer_from_world);
             let columns = self.table.block(group.block).as_chunks().0;
             let mut d_direction = [[F::ZERO; BLOCK]; 3];
             for b in 0..self.layout.blocks {
@@ -409,6 +426,10 @@ impl<F: Real> Kernel for DirectionGrads<'_, F> {
                 let d_dir = [d_direction[0][l], d_direction[1][l], d_direction[2][l]];
                 let back = sh::direction_backward(unit, inverse[l], d_dir);
                 (d_mean[0][l], d_mean[1][l], d_mean[2][l]) = (back[0], back[1], back[2]);
+            }
+            if let Some(axes) = &self.part.layer_from_world {
+                let world_from_layer = std::array::from_fn(|i| std::array::from_fn(|j| axes[j][i]));
+                rotate(&world_from_layer, &mut d_mean);
             }
             for (j, l) in group.each().filter(|&(j, _)| self.projected[j].radius > F::ZERO) {
                 let row = j - first;

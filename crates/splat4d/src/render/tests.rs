@@ -16,7 +16,11 @@ const FD_TOLERANCE: f64 = 2e-5;
 /// Share of pixels that may sit within rounding of the 1/255 skip or the early stop in f32.
 const THRESHOLD_SHARE: f64 = 2e-3;
 
-/// Three layers: the layer's own SH through a row list, foreign SH of two weighted blocks, and direct colours.
+/// A rotation: the axes of the foreign SH.
+const AXES: [[f64; 3]; 3] = [[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]];
+
+/// Three layers: the layer's own SH through a row list, foreign SH of two weighted blocks in axes of their own, and direct
+/// colours.
 #[derive(Clone)]
 struct Scene<F> {
     outs: [Table<F>; 3],
@@ -33,7 +37,9 @@ impl<F: Real> Scene<F> {
         let own = Color::Sh { table: &self.own, rows: Rows::Some(&self.ids), weights: None, base: true };
         let foreign = Color::Sh { table: &self.foreign, rows: Rows::All, weights: Some(&self.weights), base: false };
         let colors = [own, foreign, Color::Direct { table: &self.direct }];
-        Splats { parts: self.outs.iter().zip(colors).map(|(out, color)| Part { out, color }).collect(), head: None }
+        let mut parts: Vec<_> = self.outs.iter().zip(colors).map(|(out, color)| Part::new(out, color)).collect();
+        parts[1].layer_from_world = Some(AXES.map(|row| row.map(F::of)));
+        Splats { parts, head: None }
     }
 
     fn cast<G: Real>(&self) -> Scene<G> {
@@ -312,7 +318,7 @@ fn simple(rows: &[([f64; 3], f64, f64)]) -> (Table<f64>, Table<f64>) {
 }
 
 fn direct<'a>(out: &'a Table<f64>, rgb: &'a Table<f64>) -> Splats<'a, f64> {
-    Splats { parts: vec![Part { out, color: Color::Direct { table: rgb } }], head: None }
+    Splats { parts: vec![Part::new(out, Color::Direct { table: rgb })], head: None }
 }
 
 fn frontal(size: usize, f: f64) -> Camera {
@@ -755,7 +761,7 @@ fn touched_pixels_are_those_of_the_ellipse_inside_the_picture() {
     let mut pixels = |cx: f64| {
         let mut view = view.clone();
         view.intrinsics.cx = cx;
-        let splats = Splats { parts: vec![Part { out: &out, color: Color::Direct { table: &colors } }], head: None };
+        let splats = Splats { parts: vec![Part::new(&out, Color::Direct { table: &colors })], head: None };
         renderer.render(&splats, &view, [0.0; 3], None, &mut image);
         let lit = image.alpha.data.iter().filter(|a| **a > 0.0).count() as f64;
         (renderer.projected()[0].pixels([400, 300]), lit)

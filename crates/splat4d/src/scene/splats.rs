@@ -68,6 +68,15 @@ pub struct Part<'a, F = f32> {
     pub out: &'a Table<F>,
     /// Colour.
     pub color: Color<'a, F>,
+    /// Rotation (rows) that takes directions of the world to the axes of the spherical harmonics; none: they are the same.
+    pub layer_from_world: Option<[[F; 3]; 3]>,
+}
+
+impl<'a, F: Real> Part<'a, F> {
+    /// A part whose colours are in the axes of the world.
+    pub fn new(out: &'a Table<F>, color: Color<'a, F>) -> Self {
+        Self { out, color, layer_from_world: None }
+    }
 }
 
 /// A scene at one instant: a part a layer. Splats are numbered through all parts in order.

@@ -2,7 +2,7 @@
 //! to every table and to t against central differences, compact rows, random access, files, row edits.
 
 use splat4d::format::scene::{read, spec_from_json, spec_to_json, write};
-use splat4d::layers::{ALWAYS, Head, Layer, Scene};
+use splat4d::layers::{Head, Layer, Scene};
 use splat4d::math::Rng;
 use splat4d::motion::filtered::{Filtered, FilteredSpec, Fusion};
 use splat4d::motion::{At, BUILT_IN, Cache, Motion, Spec, Still, Tape, build};
@@ -264,7 +264,7 @@ pub fn files(spec: &Spec, rows: usize, life: LifeKind) {
     let mut fresh = Params::<f32>::new(rows, 4, life.columns());
     let motion = build::<f32>(spec, &mut fresh).expect("the specification is sound");
     assert!(fresh.keys().eq(params.keys()), "a model makes the same tables in any precision");
-    let layer = Layer { name: "a".into(), params: params.clone(), motion, life, span: ALWAYS, masks: None };
+    let layer = Layer::new("a", params.clone(), motion, life);
     let head = if HeadKeys::of(&params).is_some() { Head::Features } else { Head::Identity };
     let up = [0.0, 0.0, 1.0];
     let scene = Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 30.0, up, head, ..Scene::default() };
@@ -385,6 +385,7 @@ pub fn model(spec: &Spec, rows: usize, life: LifeKind, spaces: &[Space], frozen:
     subject(spec, rows, life, 0.1, 2).random_access();
     subject(spec, rows, life, 0.1, 2).row_edits();
     files(spec, rows, life);
+    super::frame::framed(spec, rows, life, frozen);
     any_threads(spec, 200);
     if !matches!(spec, Spec::Filtered(_)) {
         filtered(spec, rows, life, spaces, frozen);

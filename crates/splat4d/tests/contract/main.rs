@@ -1,6 +1,7 @@
 //! The contract of motion models: one test a model, all with the same checks (see `check`).
 
 mod check;
+mod frame;
 
 use check::{model, starts_still};
 use splat4d::motion::control::{ControlSpec, Curve, TrajectorySpec};

@@ -13,7 +13,7 @@ use super::training::{self, Held};
 use crate::report::chart::{self, Series};
 use image::ExtendedColorType;
 use image::codecs::jpeg::JpegEncoder;
-use splat4d::layers::{ALWAYS, Layer, Scene};
+use splat4d::layers::{Layer, Scene};
 use splat4d::math::{Rng, quat, sh};
 use splat4d::motion::{SpacetimeSpec, Spec, build};
 use splat4d::render::{Image, ImageGrads, RenderConfig, RenderGrads, Renderer};
@@ -324,7 +324,7 @@ fn split(from: &Scene<f32>, count: usize, degree: usize) -> Scene<f32> {
             speeds.write(child, 0, p[v].read::<3>(row, 0));
         }
     }
-    let layer = Layer { name: "grown".into(), params, motion, life: LifeKind::GaussHalf, span: ALWAYS, masks: None };
+    let layer = Layer::new("grown", params, motion, LifeKind::GaussHalf);
     Scene { layers: vec![layer], ..from.clone() }
 }
 
@@ -373,7 +373,7 @@ mod tests {
             geometry.write(i, LOG_SCALE, [-2.0, -2.5, -1.7]);
             lives.write(i, 0, [0.5, 1.0, -3.0]);
         }
-        let layer = Layer { name: "x".into(), params, motion, life: LifeKind::Interval, span: ALWAYS, masks: None };
+        let layer = Layer::new("x", params, motion, LifeKind::Interval);
         let scene = Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 10.0, up: [0.0, 1.0, 0.0], ..Scene::default() };
         let pose = Se3::look_at([0.0, 0.0, -3.0], [0.0; 3], [0.0, 1.0, 0.0]);
         let view = |k: usize| View { camera: Camera::with_fov_y(pose, 0.6, 40, 40), time: Time(0.1 * k as f64) };

@@ -1,5 +1,5 @@
 use super::*;
-use splat4d::layers::{ALWAYS, Layer};
+use splat4d::layers::Layer;
 use splat4d::motion::{SpacetimeSpec, build};
 use splat4d::scene::splats::SPLAT_COLUMNS;
 use splat4d::scene::{LifeKind, Params};
@@ -23,7 +23,7 @@ fn scene(life: LifeKind) -> Scene<f64> {
             }
         }
     }
-    let layer = Layer { name: "a".into(), params, motion, life, span: ALWAYS, masks: None };
+    let layer = Layer::new("a", params, motion, life);
     Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 10.0, ..Scene::default() }
 }
 

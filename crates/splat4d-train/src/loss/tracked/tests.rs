@@ -1,5 +1,4 @@
 use super::*;
-use splat4d::layers::ALWAYS;
 use splat4d::math::{Rng, quat};
 use splat4d::motion::tracked::{Tracked, TrackedSpec};
 use splat4d::scene::{LifeKind, Params, Rows, Time};
@@ -33,14 +32,7 @@ fn scene(rows: usize) -> Scene<f64> {
         let key = p.find(FOREGROUND).unwrap();
         p[key].set(r, 0, if r < 2 * rows / 3 { 1.0 } else { -1.0 });
     }
-    let layer = Layer {
-        name: "a".into(),
-        params: p,
-        motion: Arc::new(model),
-        life: LifeKind::Infinite,
-        span: ALWAYS,
-        masks: None,
-    };
+    let layer = Layer::new("a", p, Arc::new(model), LifeKind::Infinite);
     Scene { layers: vec![layer], clip: [0.0, 0.2], fps: 10.0, up: [0.0, 0.6, 0.8], ..Scene::default() }
 }
 

@@ -27,7 +27,7 @@ use crate::train::loss::TrainLoss;
 use crate::train::tests::Made;
 use crate::train::trainer::{Settings, Trainer};
 use crate::upkeep::Limits;
-use splat4d::layers::{ALWAYS, Layer};
+use splat4d::layers::Layer;
 use splat4d::math::{Real, Rng};
 use splat4d::motion::{Motion, SpacetimeSpec, build};
 use splat4d::render::{
@@ -262,7 +262,7 @@ fn cloud<F: Real>(rows: usize, life: LifeKind, seed: u64) -> Params<F> {
 }
 
 fn one_layer<F: Real>(params: Params<F>, motion: Arc<dyn Motion<F>>, life: LifeKind) -> Scene<F> {
-    let layer = Layer { name: "made up".into(), params, motion, life, span: ALWAYS, masks: None };
+    let layer = Layer::new("made up", params, motion, life);
     Scene { layers: vec![layer], clip: [0.0, 0.2], fps: 10.0, background: [0.2, 0.3, 0.6], ..Scene::default() }
 }
 

@@ -351,14 +351,7 @@ fn warm_up_then_nodes_then_frame_by_frame_tracking() {
         let mut params = old.clone();
         params.apply(&edit);
         let model = Skinned::new(&mut params, &centers);
-        let layer = Layer {
-            name: "skinned".into(),
-            params,
-            motion: Arc::new(model),
-            life: LifeKind::Infinite,
-            span: ALWAYS,
-            masks: None,
-        };
+        let layer = Layer::new("skinned", params, Arc::new(model), LifeKind::Infinite);
         scene.layers = vec![layer];
         Ok(())
     });

@@ -4,7 +4,7 @@ use crate::event::Progress;
 use crate::train::loss::{Exposure, TrainLoss};
 use crate::train::trainer::{Settings, Trainer};
 use crate::upkeep::Limits;
-use splat4d::layers::{ALWAYS, Evaluation, Scene};
+use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::sh::rgb_to_dc;
 use splat4d::math::{Rng, Se3};
 use splat4d::motion::build;
@@ -78,7 +78,7 @@ fn ball(rows: usize, standing: usize) -> Params<f32> {
 fn scene(mut params: Params<f32>, spec: &TrackedSpec) -> Scene<f32> {
     let motion = build(&Spec::Tracked(spec.clone()), &mut params).unwrap();
     let life = LifeKind::Infinite;
-    let layer = Layer { name: "ball".into(), params, motion, life, span: ALWAYS, masks: None };
+    let layer = Layer::new("ball", params, motion, life);
     Scene { layers: vec![layer], clip: [0.0, 1.0], fps: FPS, up: [0.0, 1.0, 0.0], ..Scene::default() }
 }
 

@@ -73,7 +73,9 @@ pub(super) fn keys(layer: &Layer<f32>) -> [Key; TABLES] {
     let find = |name| layer.params.find(name);
     let moves = matches!(layer.motion.spec(), Spec::Spacetime(SpacetimeSpec { order: 1, rotation: true, .. }));
     match (find(VELOCITIES), find(ROTATION_RATES)) {
-        (Some(v), Some(w)) if moves && layer.life == LifeKind::Interval => [GEOMETRY, SH, LIFE, v, w],
+        (Some(v), Some(w)) if moves && layer.life == LifeKind::Interval && layer.frame.is_identity() => {
+            [GEOMETRY, SH, LIFE, v, w]
+        }
         _ => panic!("only a layer that moves and lives as those of a page can be one: {layer:?}"),
     }
 }
@@ -114,7 +116,7 @@ impl Page {
             dispatch(Simd::detect(), decode);
             paint(labels, palette, first, &mut tables[1]);
         }
-        Ok(Layer { name: "page".into(), params, motion: Arc::new(motion), life, span: self.span, masks: None })
+        Ok(Layer { span: self.span, ..Layer::new("page", params, Arc::new(motion), life) })
     }
 
     /// Entries of the palette, a Gaussian each.

@@ -257,14 +257,7 @@ fn floats(draft: &Draft) -> Scene<f32> {
             rates.write(i, 0, page::rate(q.map(f64::from), p.turn.map(f64::from)).map(|x| x as f32));
         }
         let span = [node.from, node.to];
-        crate::layers::Layer {
-            name: String::new(),
-            params,
-            motion: std::sync::Arc::new(motion),
-            life,
-            span,
-            masks: None,
-        }
+        crate::layers::Layer { span, ..crate::layers::Layer::new("", params, std::sync::Arc::new(motion), life) }
     };
     Scene {
         layers: draft.nodes.iter().map(layer).collect(),

@@ -94,7 +94,7 @@ fn every_kind_of_colour_is_drawn() {
     for (i, color) in colors.into_iter().enumerate() {
         // 24 columns without weights are eight coefficients a channel, of which degree 1 is whole.
         let sh_degree = if i == 3 { 1 } else { 3 };
-        let (mut splats, rest) = (Splats { parts: vec![Part { out: &scene.out, color }], head: None }, small.splats());
+        let (mut splats, rest) = (Splats { parts: vec![Part::new(&scene.out, color)], head: None }, small.splats());
         compare(&mut r, &Shot { sh_degree, ..shot(&splats, &camera) }, &format!("colour {i}"));
         // A second layer, then an empty one.
         let none = Scenery::new(16, 0, 1.0, 1.0);
@@ -198,6 +198,6 @@ fn a_second_frame_is_the_same_and_allocates_nothing() {
     // Other colours at another address are seen, those of a table that changes too.
     let other = Scenery::new(22, 2000, 1.2, 0.05);
     let color = Color::Sh { table: &other.sh, rows: Rows::All, weights: None, base: true };
-    let splats = Splats { parts: vec![Part { out: &scene.out, color }], head: None };
+    let splats = Splats { parts: vec![Part::new(&scene.out, color)], head: None };
     compare(&mut r, &shot(&splats, &camera), "other colours");
 }

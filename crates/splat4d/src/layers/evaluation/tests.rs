@@ -1,7 +1,6 @@
 //! Which questions are one, and that the way there and back is that of the motion models.
 
 use super::*;
-use crate::layers::ALWAYS;
 use crate::math::Rng;
 use crate::motion::control::{ControlSpec, Curve, TrajectorySpec};
 use crate::motion::skin::SkinSpec;
@@ -34,7 +33,7 @@ fn layer(spec: &Spec, life: LifeKind, seed: u64) -> Layer<f64> {
             (0..table.width()).for_each(|c| *table.get_mut(r, c) += 0.05 * lane.normal((64 * r + c) as u64))
         });
     }
-    Layer { name: "made".into(), params, motion, life, span: ALWAYS, masks: None }
+    Layer::new("made", params, motion, life)
 }
 
 /// One layer with lives, and one whose motion model prepares and finishes.

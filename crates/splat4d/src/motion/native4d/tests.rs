@@ -3,7 +3,7 @@
 use super::slice::{Frame, quaternions, rotation4, slice, slice_backward};
 use super::sliced::determinant;
 use super::*;
-use crate::layers::{ALWAYS, Layer, LayerTape, to_native4d, to_spacetime};
+use crate::layers::{Layer, LayerTape, to_native4d, to_spacetime};
 use crate::math::{quat, sym3};
 use crate::motion::{Spacetime, SpacetimeSpec};
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
@@ -33,7 +33,7 @@ fn layer(rows: usize, spec: Native4dSpec) -> Layer<f64> {
         params[motion.own()].write(row, 0, own);
     }
     let (name, motion) = ("a".to_owned(), Arc::new(motion) as Arc<dyn Motion<f64>>);
-    Layer { name, params, motion, life: LifeKind::Infinite, span: ALWAYS, masks: None }
+    Layer::new(name, params, motion, LifeKind::Infinite)
 }
 
 fn splats<F: Real>(layer: &Layer<F>, t: f64) -> Table<F> {
@@ -241,7 +241,7 @@ fn charts_agree_in_single_precision_for_thin_long_lived_fast_gaussians() {
         p[LIFE].write(row, 0, [n(25), n(26) + 0.5]);
     }
     let life = LifeKind::GaussHalf;
-    let a = Layer { name: "a".into(), params: p, motion: Arc::new(motion), life, span: ALWAYS, masks: None };
+    let a = Layer::new("a", p, Arc::new(motion), life);
     let b = to_native4d(&a, Native4dSpec { max_life: 100.0, ..SPEC }).unwrap();
     for t in [-1.0, 0.0, 0.7, 2.0] {
         let (x, y) = (splats(&a, t), splats(&b, t));
@@ -405,14 +405,12 @@ fn splits_keep_the_distribution_and_resizing_keeps_velocity_and_life() {
 #[test]
 fn far_from_its_life_everything_is_a_number() {
     let l = layer(20, SPEC);
-    let single = Layer {
-        params: l.params.cast::<f32>(),
-        motion: Arc::new(Native4d { spec: SPEC, own: l.params.find(TABLE).unwrap() }),
-        name: "b".into(),
-        life: LifeKind::Infinite,
-        span: ALWAYS,
-        masks: None,
-    };
+    let single = Layer::new(
+        "b",
+        l.params.cast::<f32>(),
+        Arc::new(Native4d { spec: SPEC, own: l.params.find(TABLE).unwrap() }),
+        LifeKind::Infinite,
+    );
     let single: Layer<f32> = single;
     for t in [-1e30, -1e4, 1e4, 1e30] {
         let mut tape = LayerTape::default();

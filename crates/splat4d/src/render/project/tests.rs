@@ -37,7 +37,7 @@ fn cloud(n: usize) -> Table<f32> {
 fn blocks_are_projected_as_single_rows_are() {
     let out = cloud(1500);
     let table = Table::new(&[("rgb", 3)], 1500);
-    let splats = Splats { parts: vec![Part { out: &out, color: Color::Direct { table: &table } }], head: None };
+    let splats = Splats { parts: vec![Part::new(&out, Color::Direct { table: &table })], head: None };
     for antialias in [Antialias::Off, Antialias::On] {
         let view = view(500, 333, antialias);
         for simd in [Simd::Scalar, Simd::Avx2, Simd::Avx512] {

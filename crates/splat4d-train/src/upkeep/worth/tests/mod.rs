@@ -8,7 +8,7 @@ use super::*;
 use crate::Result;
 use crate::capture::frames::{Frames, Picture};
 use crate::train::tests::Made;
-use splat4d::layers::{ALWAYS, Evaluation, Layer, LayerTape};
+use splat4d::layers::{Evaluation, Layer, LayerTape};
 use splat4d::math::Rng;
 use splat4d::motion::{SpacetimeSpec, Spec, build};
 use splat4d::render::{Image, RenderConfig, Renderer};
@@ -37,7 +37,7 @@ fn layer(rows: usize, life: LifeKind, seed: u64) -> Layer<f32> {
     }
     let spec = Spec::Spacetime(SpacetimeSpec::default());
     let motion = build(&spec, &mut params).unwrap();
-    Layer { name: "made up".into(), params, motion, life, span: ALWAYS, masks: None }
+    Layer::new("made up", params, motion, life)
 }
 
 /// Two layers, of which one lives for ever.

@@ -1,13 +1,9 @@
-//! A whole scene turned in space, and its colours simplified: what it takes to move between programs' axes.
+//! A whole scene rotated in space, and its colours simplified: what it takes to move between programs' axes.
 
 use super::Scene;
-use crate::math::{quat, se3, sh, sh_rotation};
-use crate::motion::spacetime::{ROTATION_RATES, VELOCITIES};
-use crate::motion::{SpacetimeSpec, Spec, native4d};
+use crate::math::{Sim3, quat, se3, sh};
 use crate::scene::head::{FURTHER, HIDDEN, INPUTS};
-use crate::scene::params::QUAT;
-use crate::scene::{GEOMETRY, HeadKeys, Params, SH, Table};
-use crate::{Error, ErrorKind, Result};
+use crate::scene::{HeadKeys, Params, SH, Table};
 
 /// Vectors shorter than this name no direction.
 const NO_DIRECTION: f64 = 1e-6;
@@ -39,53 +35,17 @@ pub fn rotation_between(from: [f64; 3], to: [f64; 3]) -> Option<[[f64; 3]; 3]> {
 }
 
 impl Scene<f32> {
-    /// Turns everything by the rotation `r` (rows): means, quaternions (both of `native4d`), velocities, rotation rates,
-    /// colours (and the rays that a head sees), `up`.
-    ///
-    /// Errors: a layer moves by a model from outside this library, whose parameters nobody here can turn.
-    pub fn turn(&mut self, r: &[[f64; 3]; 3]) -> Result<()> {
-        for layer in &self.layers {
-            if let Spec::Custom(name) = layer.motion.spec().core() {
-                let what = format!("layer `{}` moves by `{name}`, which cannot be turned", layer.name);
-                return Err(Error::new(ErrorKind::Unsupported, what)
-                    .remedy("Take single moments (--time, --frames), or keep the axes as they are (--up keep)."));
-            }
-        }
-        let (q, m) = (quat::from_rotation(r), sh_rotation(r));
+    /// Rotates everything by `r` (rows): the layers' frames, into the tables of models that can take them in
+    /// ([`Layer::absorb_frame`](super::Layer::absorb_frame)), the rays that a head sees, and `up`.
+    pub fn rotate(&mut self, r: &[[f64; 3]; 3]) {
         for layer in &mut self.layers {
-            turn_geometry(&mut layer.params, r, q);
-            let blocks = if let Spec::Native4d(s) = layer.motion.spec().core() { s.harmonics + 1 } else { 1 };
-            turn_colors(&mut layer.params[SH], blocks, &m);
-            if let Spec::Native4d(_) = layer.motion.spec().core() {
-                // Q(l X r̄)Q̄ = (Ql) X (Qr)̄: the right quaternion turns as the left one does.
-                let own = layer.params.find(native4d::TABLE).expect("a native4d layer has its table");
-                let (first, _) = native4d::RIGHT_QUATS;
-                let table = &mut layer.params[own];
-                for row in 0..table.rows() {
-                    table.write(row, first, product(q, or_identity(table.read(row, first))));
-                }
-            }
-            if let Spec::Spacetime(SpacetimeSpec { order, rotation, .. }) = *layer.motion.spec().core() {
-                let find = |name| layer.params.find(name).expect("a spacetime layer has its tables");
-                let (velocities, rates) = (find(VELOCITIES), find(ROTATION_RATES));
-                let table = &mut layer.params[velocities];
-                for row in 0..table.rows() {
-                    for k in 0..order {
-                        table.write(row, 3 * k, apply(r, table.read::<3>(row, 3 * k)));
-                    }
-                }
-                let table = &mut layer.params[rates];
-                // q(t) = q + ωΔ is linear, so that a rate turns as the quaternion does.
-                for row in 0..if rotation { table.rows() } else { 0 } {
-                    table.write(row, 0, product(q, table.read::<4>(row, 0)));
-                }
-            }
+            layer.frame = Sim3::from_rotation(*r).after(&layer.frame);
+            layer.absorb_frame();
         }
         if let Some((layer, keys)) = self.head_keys() {
-            turn_head(&mut self.layers[layer].params, keys, r);
+            rotate_head(&mut self.layers[layer].params, keys, r);
         }
-        self.up = std::array::from_fn(|k| (0..3).map(|l| r[k][l] * self.up[l]).sum());
-        Ok(())
+        self.up = se3::mat_vec(r, self.up);
     }
 
     /// Leaves out spherical harmonics above `degree` (0-3). Returns the highest degree that any layer had.
@@ -109,54 +69,16 @@ impl Scene<f32> {
     }
 }
 
-/// The network sees rays in world axes: W₁x is to be the same for turned rays, so that the rows of its columns for origin
-/// and direction turn as the rays do.
-fn turn_head(params: &mut Params, keys: HeadKeys, r: &[[f64; 3]; 3]) {
+/// The network sees rays in world axes: W₁x is to be the same for rotated rays, so that the rows of its columns for origin
+/// and direction rotate as the rays do.
+fn rotate_head(params: &mut Params, keys: HeadKeys, r: &[[f64; 3]; 3]) {
     let table = &mut params[keys.first];
     for row in (0..HIDDEN).map(|h| h * INPUTS) {
         for first in [row + FURTHER, row + FURTHER + 3] {
-            let turned = apply(r, std::array::from_fn(|k| table.get(first + k, 0)));
-            (0..3).for_each(|k| table.set(first + k, 0, turned[k]));
+            let rotated = se3::mat_vec(r, std::array::from_fn(|k| f64::from(table.get(first + k, 0))));
+            (0..3).for_each(|k| table.set(first + k, 0, rotated[k] as f32));
         }
     }
-}
-
-fn turn_geometry(params: &mut Params, r: &[[f64; 3]; 3], q: [f64; 4]) {
-    let table = &mut params[GEOMETRY];
-    for row in 0..table.rows() {
-        table.write(row, 0, apply(r, table.read::<3>(row, 0)));
-        table.write(row, QUAT, product(q, or_identity(table.read(row, QUAT))));
-    }
-}
-
-/// A zero quaternion stands for the identity wherever it is used, and must turn as the identity does.
-fn or_identity(q: [f32; 4]) -> [f32; 4] {
-    if q == [0.0; 4] { [1.0, 0.0, 0.0, 0.0] } else { q }
-}
-
-/// `blocks`: how many blocks of coefficients stand side by side.
-fn turn_colors(table: &mut Table, blocks: usize, m: &[[f64; sh::MAX_COEFFS]; sh::MAX_COEFFS]) {
-    let count = (table.width() / 3 / blocks).min(sh::MAX_COEFFS);
-    for row in 0..table.rows() {
-        for (b, c) in (0..blocks).flat_map(|b| (0..3).map(move |c| (b, c))) {
-            let col = |k: usize| 3 * (b * count + k) + c;
-            let old: [f64; sh::MAX_COEFFS] =
-                std::array::from_fn(|k| if k < count { f64::from(table.get(row, col(k))) } else { 0.0 });
-            // Degree 0 is the same from everywhere; its bits stay.
-            for k in 1..count {
-                table.set(row, col(k), (0..count).map(|l| m[k][l] * old[l]).sum::<f64>() as f32);
-            }
-        }
-    }
-}
-
-fn apply(r: &[[f64; 3]; 3], v: [f32; 3]) -> [f32; 3] {
-    std::array::from_fn(|k| (0..3).map(|l| r[k][l] * f64::from(v[l])).sum::<f64>() as f32)
-}
-
-/// a ⊗ b, wxyz, rounded once.
-fn product(a: [f64; 4], b: [f32; 4]) -> [f32; 4] {
-    quat::product(a, b.map(f64::from)).map(|x| x as f32)
 }
 
 #[cfg(test)]
@@ -164,11 +86,11 @@ mod tests {
     use super::*;
     use crate::layers::{Evaluation, Head, Layer};
     use crate::math::{Rng, Se3};
-    use crate::motion::build;
     use crate::motion::spacetime::FeatureSpec;
+    use crate::motion::{SpacetimeSpec, Spec, build};
     use crate::render::{Image, RenderConfig, Renderer};
     use crate::scene::params::LOG_SCALE;
-    use crate::scene::{Camera, LifeKind, Time};
+    use crate::scene::{Camera, GEOMETRY, LifeKind, Time};
 
     fn moving(features: Option<FeatureSpec>) -> Scene<f32> {
         let spec = Spec::Spacetime(SpacetimeSpec { order: 3, rotation: true, detach: true, origin: 0.0, features });
@@ -188,14 +110,7 @@ mod tests {
                 *params[GEOMETRY].get_mut(row, LOG_SCALE + k) -= 2.0;
             }
         }
-        let layer = Layer {
-            name: "a".into(),
-            params,
-            motion,
-            life: LifeKind::GaussOne,
-            span: crate::layers::ALWAYS,
-            masks: None,
-        };
+        let layer = Layer::new("a", params, motion, LifeKind::GaussOne);
         let head = if features.is_some() { Head::Features } else { Head::Identity };
         Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 30.0, up: [0.0, 1.0, 0.0], head, ..Scene::default() }
     }
@@ -222,7 +137,7 @@ mod tests {
     fn the_same_picture(scene: &Scene<f32>) {
         let r = quat::to_rotation(quat::normalize([0.4, -0.3, 0.8, 0.2]).0);
         let mut turned = scene.clone();
-        turned.turn(&r).unwrap();
+        turned.rotate(&r);
         let pose = Se3::look_at([0.5, 0.4, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
         let rotation = std::array::from_fn(|i| {
             std::array::from_fn(|j| (0..3).map(|k| pose.rotation[i][k] * r[j][k]).sum::<f64>())
@@ -236,7 +151,7 @@ mod tests {
         }
         let kept = draw(&turned, pose, 0.3);
         let other = draw(scene, pose, 0.3);
-        assert!(kept.iter().zip(&other).any(|(a, b)| (a - b).abs() > 0.1), "a turn must be visible");
+        assert!(kept.iter().zip(&other).any(|(a, b)| (a - b).abs() > 0.1), "a rotation must be visible");
     }
 
     #[test]

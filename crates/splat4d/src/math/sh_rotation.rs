@@ -36,6 +36,18 @@ pub fn sh_rotation(r: &[[f64; 3]; 3]) -> [[f64; MAX_COEFFS]; MAX_COEFFS] {
     m
 }
 
+/// Rotates the coefficients of one Gaussian by the matrix of [`sh_rotation`]: `block` holds coefficient k of channel c at
+/// 3k + c. Degree 0 is the same from everywhere; its bits stay.
+pub fn rotate_coefficients(m: &[[f64; MAX_COEFFS]; MAX_COEFFS], block: &mut [f32]) {
+    let count = (block.len() / 3).min(MAX_COEFFS);
+    for c in 0..3 {
+        let old: [f64; MAX_COEFFS] = std::array::from_fn(|k| if k < count { f64::from(block[3 * k + c]) } else { 0.0 });
+        for k in 1..count {
+            block[3 * k + c] = (0..count).map(|l| m[k][l] * old[l]).sum::<f64>() as f32;
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
