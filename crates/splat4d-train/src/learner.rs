@@ -4,6 +4,10 @@
 //! scene, opacities are lowered) goes through the methods here, so that scene, moments and statistics cannot come apart,
 //! and whoever remembers something of rows hears of it: the learner notes how far it was [`Touched`].
 
+mod exposure;
+
+pub use exposure::Exposure;
+
 use crate::Result;
 use crate::optim::Moments;
 use splat4d::layers::Scene;
@@ -89,20 +93,30 @@ pub struct Learner {
     moments: Vec<Moments<f32>>,
     stats: Stats,
     touched: Touched,
+    /// What learns of the cameras; none: they show what is drawn.
+    pub exposure: Option<Exposure>,
+}
+
+/// All parts of a learner, for a step.
+pub(crate) struct Parts<'a> {
+    pub scene: &'a mut Scene<f32>,
+    pub moments: &'a mut [Moments<f32>],
+    pub stats: &'a mut Stats,
+    pub exposure: Option<&'a mut Exposure>,
 }
 
 impl Learner {
     /// A scene that has learnt nothing yet.
     pub fn new(scene: Scene<f32>) -> Self {
         let moments = scene.layers.iter().map(|l| Moments::new(&l.params)).collect();
-        Self { stats: Stats::new(&scene), moments, scene, touched: Touched::Values }
+        Self { stats: Stats::new(&scene), moments, scene, touched: Touched::Values, exposure: None }
     }
 
     /// A learner as a checkpoint has it. Panics: moments and statistics of another scene.
     pub fn resumed(scene: Scene<f32>, moments: Vec<Moments<f32>>, stats: Stats) -> Self {
         let layers = scene.layers.len();
         assert_eq!([moments.len(), stats.tables.len()], [layers; 2], "moments and statistics by layer");
-        Self { scene, moments, stats, touched: Touched::Values }
+        Self { scene, moments, stats, touched: Touched::Values, exposure: None }
     }
 
     /// The scene that learns.
@@ -198,8 +212,9 @@ impl Learner {
     }
 
     /// All parts at once, for a step: it changes numbers as steps do, and nothing is noted.
-    pub(crate) fn parts_mut(&mut self) -> (&mut Scene<f32>, &mut [Moments<f32>], &mut Stats) {
-        (&mut self.scene, &mut self.moments, &mut self.stats)
+    pub(crate) fn parts_mut(&mut self) -> Parts<'_> {
+        let Self { scene, moments, stats, exposure, .. } = self;
+        Parts { scene, moments, stats, exposure: exposure.as_mut() }
     }
 
     fn touch(&mut self, how: Touched) {

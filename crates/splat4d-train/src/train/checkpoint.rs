@@ -58,7 +58,7 @@ pub fn write(trainer: &Trainer<'_>, identity: &Identity, state: &RunState) -> Re
         }
         push(format!("stats.{l}"), &trainer.learner.stats().tables[l]);
     }
-    if let Some(e) = &trainer.loss.exposure {
+    if let Some(e) = &trainer.learner.exposure {
         push("exposure".into(), &e.params[e.key()]);
         push("exposure.moments".into(), e.moments.table(e.key()));
     }
@@ -138,7 +138,7 @@ pub fn read(bytes: &[u8], trainer: &mut Trainer<'_>, identity: &Identity) -> Res
         moments.push(m);
         load(&file, &format!("stats.{l}"), &mut stats.tables[l])?;
     }
-    if let Some(e) = &mut trainer.loss.exposure {
+    if let Some(e) = &mut trainer.learner.exposure {
         let key = e.key();
         load(&file, "exposure", &mut e.params[key])?;
         load(&file, "exposure.moments", e.moments.table_mut(key))?;
@@ -180,7 +180,9 @@ pub fn read(bytes: &[u8], trainer: &mut Trainer<'_>, identity: &Identity) -> Res
     if !fits {
         return Err(damaged("it stands beyond the recipe's last step".into()));
     }
-    trainer.restore(Learner::resumed(scene, moments, stats), progress);
+    let mut learner = Learner::resumed(scene, moments, stats);
+    learner.exposure = trainer.learner.exposure.take();
+    trainer.restore(learner, progress);
     Ok(RunState {
         seconds: number(&meta["seconds"], "seconds")?,
         smooth: [number(&meta["smooth"][0], "smooth")?, number(&meta["smooth"][1], "smooth")?],

@@ -4,7 +4,7 @@
 use super::chain::{Chain, Losses, Step, StepInfo, StepReport, View};
 use super::loss::TrainLoss;
 use crate::Result;
-use crate::learner::Learner;
+use crate::learner::{Learner, Parts};
 use crate::methods::Stage;
 use crate::optim::Floor;
 use crate::upkeep::Change;
@@ -113,10 +113,10 @@ impl<'a> CpuEngine<'a> {
 
     /// Evaluate, draw, compare, and all the way back: fills the gradients.
     fn evaluate(&mut self, learner: &mut Learner, plan: &mut StepPlan<'_>, out: &mut Stepped) -> Result<()> {
-        let (scene, _, stats) = learner.parts_mut();
+        let Parts { scene, stats, exposure, .. } = learner.parts_mut();
         let scene = if plan.stage.codec.is_some() { &self.shown } else { &*scene };
         let Stage { pictures, probes, params, .. } = &mut *plan.stage;
-        let mut image = plan.loss.of_step(pictures);
+        let mut image = plan.loss.of_step(pictures, exposure);
         let mut losses = Losses { image: &mut image, probes, params };
         let step = Step { scene, views: plan.views, info: plan.info, sh_degree: plan.sh_degree };
         let (backend, grads) = (self.backend.as_mut(), &mut self.grads);
@@ -126,7 +126,7 @@ impl<'a> CpuEngine<'a> {
     }
 
     /// Adam on every group of the stage. Returns what was not finite.
-    fn adam(&mut self, learner: &mut Learner, plan: &mut StepPlan<'_>) -> Vec<(usize, Key)> {
+    fn adam(&mut self, learner: &mut Learner, plan: &StepPlan<'_>) -> Vec<(usize, Key)> {
         let (stage, scale, progress) = (&*plan.stage, plan.rate_scale, plan.info.progress);
         let mut bad = Vec::new();
         if let Some(codec) = &stage.codec
@@ -134,7 +134,7 @@ impl<'a> CpuEngine<'a> {
         {
             bad.push((0, SH));
         }
-        let (scene, moments, _) = learner.parts_mut();
+        let Parts { scene, moments, exposure, .. } = learner.parts_mut();
         self.rates.resize_with(scene.layers.len(), Vec::new);
         for (index, layer) in scene.layers.iter_mut().enumerate() {
             let rates = &mut self.rates[index];
@@ -154,7 +154,7 @@ impl<'a> CpuEngine<'a> {
             let keys = moments[index].step(&mut layer.params, &mut self.grads[index], rates, floor.as_slice());
             bad.extend(keys.into_iter().map(|k| (index, k)));
         }
-        if let Some(exposure) = &mut plan.loss.exposure {
+        if let Some(exposure) = exposure {
             match stage.freeze_exposure {
                 true => exposure.rest(),
                 false => {
@@ -185,8 +185,7 @@ impl<'a> CpuEngine<'a> {
             Some(group.rate.at(plan.info.progress))
         };
         let rng = Rng::new(plan.info.seed, "noise", plan.info.iteration as u64);
-        let (scene, ..) = learner.parts_mut();
-        noise.add(scene, &self.grads, rate, plan.min_opacity, rng);
+        noise.add(learner.parts_mut().scene, &self.grads, rate, plan.min_opacity, rng);
     }
 }
 

@@ -6,7 +6,7 @@ pub(crate) mod tests;
 
 use super::checkpoint::{self, Identity, RunState, write_atomically};
 use super::dataset::Dataset;
-use super::loss::{Exposure, TrainLoss};
+use super::loss::TrainLoss;
 pub use super::memory::{memory_estimate, peak_memory};
 use super::minutes;
 use super::snapshot::Snapshots;
@@ -14,6 +14,7 @@ use super::trainer::{Settings, Stepped, Trainer};
 use crate::capture::{Capture, CaptureOptions, ImageStore};
 use crate::event::{Event, Progress};
 use crate::init::{self, Seeds};
+use crate::learner::Exposure;
 use crate::loss::image::terms;
 use crate::methods::auto::{self, AUTO};
 use crate::methods::{Plan, Stage, program_of, stages};
@@ -367,8 +368,11 @@ impl Bench {
             sh_degree: r.sh_degree,
             exposure_lr: r.exposure_lr,
         };
-        let loss = TrainLoss::new(terms(r), exposure);
-        Trainer::new(scene, stages, self.frames.clone(), Box::new(Renderer::new(config)), loss, settings)
+        let loss = TrainLoss::new(terms(r));
+        let backend = Box::new(Renderer::new(config));
+        let mut trainer = Trainer::new(scene, stages, self.frames.clone(), backend, loss, settings);
+        trainer.learner.exposure = exposure;
+        trainer
     }
 
     /// What a checkpoint is of: the recipe and, where there is more to say, `text`.

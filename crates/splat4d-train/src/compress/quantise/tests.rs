@@ -226,7 +226,7 @@ fn the_gradient_of_what_is_shown_moves_what_learns() {
         };
         let info = StepInfo { iteration: 0, times: vec![view.t], seed: 5, progress: 0.0 };
         let mut d: Vec<Grads<f32>> = whole.layers.iter().map(|l| Grads::new(&l.params)).collect();
-        let mut image = loss.of_step(&mut []);
+        let mut image = loss.of_step(&mut [], None);
         let mut losses = Losses { image: &mut image, probes: &[], params: &[] };
         let mut renderer = Renderer::new(RenderConfig { sh_degree: 1, ..RenderConfig::default() });
         let step = Step { scene: &whole, views: &[view], info: &info, sh_degree: 1 };

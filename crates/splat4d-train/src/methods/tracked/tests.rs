@@ -1,7 +1,8 @@
 use super::*;
 use crate::capture::frames::{Frames, Picture};
 use crate::event::Progress;
-use crate::train::loss::{Exposure, TrainLoss};
+use crate::learner::Exposure;
+use crate::train::loss::TrainLoss;
 use crate::train::trainer::{Settings, Trainer};
 use crate::upkeep::Limits;
 use splat4d::layers::{Evaluation, Scene};
@@ -152,9 +153,10 @@ fn trainer(s: Scene<f32>, plan: &Plan, frames: Arc<dyn Frames>, exposure: Option
         exposure_lr: plan.recipe.exposure_lr,
     };
     let draw = Box::new(Renderer::new(RenderConfig { sh_degree: 0, ..RenderConfig::default() }));
-    let mut loss = TrainLoss::photometric(0.2);
-    loss.exposure = exposure;
-    Trainer::new(s, TrackedProgram.stages(plan), frames, draw, loss, settings)
+    let loss = TrainLoss::photometric(0.2);
+    let mut trainer = Trainer::new(s, TrackedProgram.stages(plan), frames, draw, loss, settings);
+    trainer.learner.exposure = exposure;
+    trainer
 }
 
 fn run(t: &mut Trainer<'_>) {
@@ -288,7 +290,7 @@ fn exposures_are_learnt_on_frame_0_and_kept() {
     let mut t = trainer(scene(params, &first_frame(false)), &plan, Arc::new(frames), Some(exposure));
     t.stages[0].groups.clear();
     let learnt = |t: &Trainer<'_>| {
-        let e = t.loss.exposure.as_ref().unwrap();
+        let e = t.learner.exposure.as_ref().unwrap();
         (0..4).map(|c| e.params[e.key()].read::<6>(c, 0)).collect::<Vec<_>>()
     };
     while t.progress.stage == 0 {
