@@ -12,7 +12,7 @@ use splat4d::Result;
 use splat4d::format::{playback, scene as scene_file};
 use splat4d::layers::{Evaluation, Scene};
 use splat4d::play::{DEFAULT_BUDGET, Player, ReadAt};
-use splat4d::render::{Antialias, Image, RenderConfig, Renderer};
+use splat4d::render::{Antialias, Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::scene::{Camera, Time};
 use splat4d_train::eval::run::Scores;
@@ -228,7 +228,7 @@ impl<'a> Seat<'a> {
     fn draw(&mut self, look: &Look) -> Result<[f64; 2]> {
         let clock = Instant::now();
         let splats = self.player.at(look.time)?;
-        self.renderer.render(&splats, &look.camera, self.background, None, &mut self.image);
+        self.renderer.render(&Shot::new(&splats, &look.camera, self.background), &mut self.image);
         color_into(&self.image.color, &mut self.rgb);
         let all = clock.elapsed().as_secs_f64();
         Ok([self.renderer.stage_seconds().blend, all])
@@ -288,12 +288,12 @@ fn first_picture(subject: &Subject<'_>, stored: &Arc<[u8]>, look: &Look) -> Resu
             let (scene, mut moment) = (scene_file::read(stored)?, Evaluation::default());
             // A player would look up first when everybody lives, which pays from the second picture on.
             scene.at(look.time, &mut moment);
-            renderer.render(&scene.splats(&moment), &look.camera, scene.background, None, &mut image);
+            renderer.render(&Shot::new(&scene.splats(&moment), &look.camera, scene.background), &mut image);
         }
         What::File(_) => {
             let mut player = open(stored)?;
             let background = player.meta().background;
-            renderer.render(&player.at(look.time)?, &look.camera, background, None, &mut image);
+            renderer.render(&Shot::new(&player.at(look.time)?, &look.camera, background), &mut image);
         }
     }
     color_into(&image.color, &mut rgb);

@@ -7,7 +7,7 @@ use splat4d::Result;
 use splat4d::layers::{Evaluation, Layer, Scene};
 use splat4d::math::{Rng, Se3};
 use splat4d::motion::{Spec, build};
-use splat4d::render::{Image, RenderConfig, Renderer};
+use splat4d::render::{Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{Camera, GEOMETRY, LifeKind, Params, Planes, SH, Space, Table, Time};
 use splat4d_train::capture::frames::{Frames, Picture};
@@ -116,7 +116,10 @@ fn main() -> Result<()> {
     let (mut evaluation, mut image) = (Evaluation::default(), Image::default());
     scene.at(Time(0.0), &mut evaluation);
     for camera in &pictures.cameras {
-        renderer.render(&scene.splats(&evaluation), camera, [0.0; 3], Some(&labels), &mut image);
+        renderer.render(
+            &Shot { extra: Some(&labels), ..Shot::new(&scene.splats(&evaluation), camera, [0.0; 3]) },
+            &mut image,
+        );
         pictures.colors.push(image.color.clone());
         term.truth.push(image.extra.clone());
     }

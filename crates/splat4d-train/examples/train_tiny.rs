@@ -8,7 +8,7 @@ use splat4d::layers::{Evaluation, Layer, Scene};
 use splat4d::math::sh::rgb_to_dc;
 use splat4d::math::{Rng, Se3};
 use splat4d::motion::{SpacetimeSpec, Spec, build, spacetime::VELOCITIES};
-use splat4d::render::{Image, RenderConfig, Renderer};
+use splat4d::render::{Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{Camera, GEOMETRY, LifeKind, Params, SH, Time};
 use splat4d_train::capture::frames::{Frames, Picture};
@@ -85,7 +85,7 @@ fn main() -> Result<()> {
     for k in 0..TIMES {
         truth.at(Time(k as f64 / FPS), &mut instant);
         for camera in &made.cameras {
-            renderer.render(&truth.splats(&instant), camera, [0.0; 3], None, &mut image);
+            renderer.render(&Shot::new(&truth.splats(&instant), camera, [0.0; 3]), &mut image);
             made.pictures.push(Picture { color: image.color.clone(), ..Picture::default() });
         }
     }
@@ -112,7 +112,7 @@ fn main() -> Result<()> {
         scene,
         program.stages(&plan),
         Arc::new(made),
-        Box::new(Renderer::new(RenderConfig { sh_degree: 0, ..RenderConfig::default() })),
+        Box::new(Renderer::new(RenderConfig::default())),
         TrainLoss::photometric(plan.recipe.lambda_dssim),
         Settings {
             seed: 0,

@@ -114,7 +114,7 @@ fn trainer() -> Result<Trainer<'static>> {
         scene,
         program.stages(&plan),
         Arc::new(grey),
-        Box::new(Renderer::new(RenderConfig { sh_degree: 1, ..RenderConfig::default() })),
+        Box::new(Renderer::new(RenderConfig::default())),
         TrainLoss::photometric(0.2),
         Settings {
             seed: 0,

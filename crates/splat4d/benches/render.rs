@@ -2,11 +2,11 @@
 //! 400x400, on one and two threads: `cargo bench -p splat4d`. `splat4d bench` measures real scenes against the roofline.
 
 use divan::{Bencher, black_box};
-use splat4d::math::{Rng, Se3, sym3};
+use splat4d::math::{Rng, Se3, sh, sym3};
 use splat4d::render::bin::Footprint;
 use splat4d::render::project::Projection;
 use splat4d::render::rasterize::{CHANNELS, Geometry, Pass, PassGrads, PixelGrads, Raster};
-use splat4d::render::{Image, ImageGrads, Projected, ProjectedGrads, RenderConfig, RenderGrads, Renderer, View};
+use splat4d::render::{Image, ImageGrads, Projected, ProjectedGrads, RenderConfig, RenderGrads, Renderer, Shot, View};
 use splat4d::render::{project, roofline, shade};
 use splat4d::scene::splats::{Part, SPLAT_COLUMNS};
 use splat4d::scene::{Camera, Color, Planes, Rows, Splats, Table};
@@ -104,7 +104,7 @@ impl Stages {
 
     fn shade(&mut self, made: &Made) {
         let view = View::new(&made.camera, &self.config);
-        let (degree, simd) = (self.config.sh_degree, self.config.simd);
+        let (degree, simd) = (sh::MAX_DEGREE, self.config.simd);
         let splats = made.splats();
         let projection = Projection { splats: &splats, view: &view, simd, projected: &self.projected };
         shade::forward(&projection, degree, &mut self.channels);
@@ -170,7 +170,7 @@ fn f_forward(bencher: Bencher<'_, '_>, threads: usize) {
     let (made, pool) = (Made::new(), pool(threads));
     let (mut renderer, mut image) = (Renderer::new(RenderConfig::default()), Image::default());
     let splats = made.splats();
-    bencher.bench_local(|| pool.install(|| renderer.render(&splats, &made.camera, [0.0; 3], None, &mut image)));
+    bencher.bench_local(|| pool.install(|| renderer.render(&Shot::new(&splats, &made.camera, [0.0; 3]), &mut image)));
 }
 
 #[divan::bench(args = THREADS, sample_count = SAMPLES)]
@@ -182,8 +182,8 @@ fn g_forward_and_backward(bencher: Bencher<'_, '_>, threads: usize) {
     let grads = ImageGrads { color: &made.grad, alpha: None, depth: None, extra: None };
     bencher.bench_local(|| {
         pool.install(|| {
-            renderer.render(&splats, &made.camera, [0.0; 3], None, &mut image);
-            renderer.backward(&splats, &made.camera, [0.0; 3], None, &grads, &mut [Some(&mut d_sh)], &mut d);
+            renderer.render(&Shot::new(&splats, &made.camera, [0.0; 3]), &mut image);
+            renderer.backward(&Shot::new(&splats, &made.camera, [0.0; 3]), &grads, &mut [Some(&mut d_sh)], &mut d);
         })
     });
 }

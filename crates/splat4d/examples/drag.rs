@@ -10,7 +10,7 @@ use splat4d::math::{Rng, Se3};
 use splat4d::motion::arap::{Handle, drag};
 use splat4d::motion::control::{ControlSpec, skinned};
 use splat4d::motion::skin::{Skinned, node_frame};
-use splat4d::render::{Image, RenderConfig, Renderer};
+use splat4d::render::{Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::params::{LOG_SCALE, QUAT};
 use splat4d::scene::{Camera, GEOMETRY, LifeKind, Params, Time};
 use std::any::Any;
@@ -40,7 +40,7 @@ fn draw(scene: &Scene<f32>, t: Time, camera: &Camera) -> Vec<u8> {
     scene.at(t, &mut instant);
     let mut image = Image::default();
     let mut renderer = Renderer::new(RenderConfig::default());
-    renderer.render(&scene.splats(&instant), camera, [1.0; 3], None, &mut image);
+    renderer.render(&Shot::new(&scene.splats(&instant), camera, [1.0; 3]), &mut image);
     let bytes: Vec<u8> = image.color.interleaved().iter().map(|c| (c.clamp(0.0, 1.0) * 255.0) as u8).collect();
     [format!("P6\n{} {}\n255\n", camera.width, camera.height).into_bytes(), bytes].concat()
 }

@@ -93,7 +93,7 @@ fn main() -> splat4d::Result<()> {
     }
     let (mut cpu, mut expected) = (Renderer::new(RenderConfig::default()), Image::default());
     let start = Instant::now();
-    Backend::render(&mut cpu, &shot, &mut expected)?;
+    cpu.render(&shot, &mut expected);
     let ms = start.elapsed().as_secs_f64() * 1e3;
     let squares: f64 = image.color.data.iter().zip(&expected.color.data).map(|(a, b)| f64::from(a - b).powi(2)).sum();
     let db = -10.0 * (squares / image.color.data.len() as f64).log10();

@@ -9,7 +9,7 @@ use splat4d::math::sh::rgb_to_dc;
 use splat4d::math::{Real, Rng, Se3};
 use splat4d::motion::still::{activate, activate_backward};
 use splat4d::motion::{At, Cache, Motion, Spec, Tape, fill_rows, for_rows};
-use splat4d::render::{Image, RenderConfig, Renderer};
+use splat4d::render::{Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::splats::SPLAT_COLUMNS;
 use splat4d::scene::{Camera, GEOMETRY, Grads, Key, LifeKind, Params, SH, Space, SplatGrads, Table, Time};
@@ -142,7 +142,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     for k in 0..4 {
         let t = 0.25 * f64::from(k);
         scene.at(Time(t), &mut instant);
-        renderer.render(&scene.splats(&instant), &camera, [1.0; 3], None, &mut image);
+        renderer.render(&Shot::new(&scene.splats(&instant), &camera, [1.0; 3]), &mut image);
         println!("t = {t:.2} s: {} splats drawn", renderer.stats().visible);
         if let Some(folder) = std::env::args().nth(1) {
             std::fs::create_dir_all(&folder)?;

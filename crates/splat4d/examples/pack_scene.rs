@@ -9,7 +9,7 @@ use splat4d::format::playback::{self, Draft, Meta, NamedCamera, Node, Primitive,
 use splat4d::layers::{ALPHA_MIN, Evaluation, Layer, Scene};
 use splat4d::math::{Rng, Se3, quat, sh};
 use splat4d::motion::{Spacetime, SpacetimeSpec, Spec, Still};
-use splat4d::render::{Image, RenderConfig, Renderer};
+use splat4d::render::{Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{Camera, GEOMETRY, LIFE, LifeKind, Params, SH, Time};
 use std::sync::Arc;
@@ -255,7 +255,7 @@ fn compare(scene: &Scene<f32>, back: &Scene<f32>, draft: &Draft) {
             let (mut instant, mut image) = (Evaluation::default(), Image::default());
             scene.at(t, &mut instant);
             let splats = scene.splats(&instant);
-            Renderer::new(RenderConfig::default()).render(&splats, &camera, scene.background, None, &mut image);
+            Renderer::new(RenderConfig::default()).render(&Shot::new(&splats, &camera, scene.background), &mut image);
             image.color.data
         };
         let (a, b) = (draw(scene), draw(back));

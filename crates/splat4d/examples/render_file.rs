@@ -7,7 +7,7 @@ use splat4d::format;
 use splat4d::layers::{Evaluation, Layer, Scene};
 use splat4d::math::{Rng, Se3};
 use splat4d::motion::Still;
-use splat4d::render::{Image, RenderConfig, Renderer};
+use splat4d::render::{Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::params::{LOG_SCALE, QUAT};
 use splat4d::scene::{Camera, GEOMETRY, LifeKind, Params, Time};
 use std::sync::Arc;
@@ -61,7 +61,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let camera = Camera::with_fov_y(Se3::look_at(eye, center, scene.up), 0.8, 320, 240);
     let mut image = Image::default();
     let mut renderer = Renderer::new(RenderConfig::default());
-    renderer.render(&splats, &camera, scene.background, None, &mut image);
+    renderer.render(&Shot::new(&splats, &camera, scene.background), &mut image);
     println!("{} of {} splats drawn at {} s", renderer.stats().visible, splats.len(), t.0);
     if let Some(out) = args.get(1) {
         let bytes: Vec<u8> = image.color.interleaved().iter().map(|c| (c.clamp(0.0, 1.0) * 255.0) as u8).collect();

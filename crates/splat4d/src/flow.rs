@@ -13,7 +13,7 @@ pub mod tracks;
 
 use crate::layers::{Evaluation, Scene};
 use crate::math::Real;
-use crate::render::{Image, Renderer};
+use crate::render::{self, Image, Renderer};
 use crate::scene::{Camera, Planes, Space, Splats, Table, Time};
 
 /// Less alpha than this does not carry a flow: dividing by it would only amplify rounding.
@@ -114,7 +114,9 @@ fn draw<F: Real>(
     renderer: &mut Renderer<F>,
 ) -> Flow<F> {
     let mut image = Image::default();
-    renderer.render(splats, camera, background.map(|b| F::of(f64::from(b))), Some(extra), &mut image);
+    let background = background.map(|b| F::of(f64::from(b)));
+    let shot = render::Shot { extra: Some(extra), depth: true, ..render::Shot::new(splats, camera, background) };
+    renderer.render(&shot, &mut image);
     let count = extra.width() - 1;
     let mut vectors = Planes::new(count, camera.height, camera.width);
     let mut weight = Planes::new(1, camera.height, camera.width);

@@ -3,7 +3,7 @@
 use splat4d::layers::{Evaluation, Layer, Scene, freeze};
 use splat4d::math::Rng;
 use splat4d::motion::{SpacetimeSpec, Spec, build};
-use splat4d::render::{Image, RenderConfig, Renderer};
+use splat4d::render::{Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::params::LOG_SCALE;
 use splat4d::scene::{Camera, GEOMETRY, LifeKind, Params, Time};
 
@@ -42,7 +42,7 @@ fn a_frozen_moment_looks_like_the_scene_then() {
         let (mut instant, mut image) = (Evaluation::default(), Image::default());
         scene.at(Time(time), &mut instant);
         let mut renderer = Renderer::new(RenderConfig::default());
-        renderer.render(&scene.splats(&instant), &camera, [0.2; 3], None, &mut image);
+        renderer.render(&Shot::new(&scene.splats(&instant), &camera, [0.2; 3]), &mut image);
         image.color
     };
     for time in [0.0, 0.37, 1.0] {

@@ -22,8 +22,9 @@ use crate::recipe::Recipe;
 use crate::upkeep::Limits;
 use crate::{Error, ErrorKind, Result};
 use serde_json::json;
+use splat4d::device;
 use splat4d::layers::Scene;
-use splat4d::render::{Antialias, RenderConfig, Renderer, Simd};
+use splat4d::render::{Antialias, RenderConfig, Simd};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -352,7 +353,6 @@ impl Bench {
         let r = &plan.recipe;
         let config = RenderConfig {
             antialias: if r.antialias { Antialias::On } else { Antialias::Off },
-            sh_degree: r.sh_degree,
             simd: self.simd,
             ..RenderConfig::default()
         };
@@ -369,8 +369,7 @@ impl Bench {
             exposure_lr: r.exposure_lr,
         };
         let loss = TrainLoss::new(terms(r));
-        let backend = Box::new(Renderer::new(config));
-        let mut trainer = Trainer::new(scene, stages, self.frames.clone(), backend, loss, settings);
+        let mut trainer = Trainer::new(scene, stages, self.frames.clone(), device::cpu(config), loss, settings);
         trainer.learner.exposure = exposure;
         trainer
     }

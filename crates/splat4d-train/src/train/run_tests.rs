@@ -6,7 +6,7 @@ use crate::train::frames::{Frames, Picture};
 use crate::train::tests::Made;
 use serde_json::Value;
 use splat4d::math::Rng;
-use splat4d::render::{Backend, Image, ImageGrads, RenderGrads, Shot, Wanted};
+use splat4d::render::{Backend, Image, ImageGrads, RenderGrads, Renderer, Shot, Wanted};
 use splat4d::scene::{Camera, Table};
 use tempfile::TempDir;
 
@@ -143,8 +143,7 @@ struct Meddled<F: FnMut(usize, &mut Image<f32>) + Send> {
 }
 
 fn meddled(meddle: impl FnMut(usize, &mut Image<f32>) + Send + 'static) -> Box<dyn Backend> {
-    let config = RenderConfig { sh_degree: Recipe::default().sh_degree, simd: Simd::detect(), ..Default::default() };
-    Box::new(Meddled { inner: Renderer::new(config), drawn: 0, meddle })
+    Box::new(Meddled { inner: Renderer::new(RenderConfig::default()), drawn: 0, meddle })
 }
 
 impl<F: FnMut(usize, &mut Image<f32>) + Send> Backend for Meddled<F> {

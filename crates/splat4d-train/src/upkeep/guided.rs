@@ -11,11 +11,12 @@ use crate::capture::frames::{Frames, Picture};
 use crate::learner::Learner;
 use crate::recipe::Recipe;
 use serde::{Deserialize, Serialize};
+use splat4d::device;
 use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::Rng;
 use splat4d::math::sh::rgb_to_dc;
 use splat4d::motion::spacetime::{FEATURE_TABLE, ROTATION_RATES, VELOCITIES};
-use splat4d::render::{Antialias, Image, RenderConfig, Renderer};
+use splat4d::render::{Antialias, Image, RenderConfig, Shot};
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{Born, Camera, GEOMETRY, LIFE, Planes, RowEdit, SH, Space, Time};
 
@@ -159,7 +160,7 @@ impl Upkeep for Guided {
 
 /// The worst of some views, evenly chosen with a random start.
 fn looks(scene: &Scene<f32>, frames: &dyn Frames, antialias: Antialias, rng: Rng) -> Result<Vec<Look>> {
-    let mut renderer = Renderer::new(RenderConfig { antialias, depth: true, ..RenderConfig::default() });
+    let mut backend = device::cpu(RenderConfig { antialias, ..RenderConfig::default() });
     let (mut instant, mut image, mut picture) = (Evaluation::default(), Image::default(), Picture::default());
     let mut worst: Vec<Look> = Vec::new();
     let count = LOOKS.min(frames.len());
@@ -168,7 +169,9 @@ fn looks(scene: &Scene<f32>, frames: &dyn Frames, antialias: Antialias, rng: Rng
         let frame = frame.min(frames.len() - 1);
         frames.load(frame, &mut picture)?;
         scene.at(frames.time(frame), &mut instant);
-        renderer.render(&scene.splats(&instant), frames.camera(frame), scene.background, None, &mut image);
+        let splats = scene.splats(&instant);
+        let shot = Shot { depth: true, ..Shot::new(&splats, frames.camera(frame), scene.background) };
+        backend.render(&shot, &mut image)?;
         let (h, w) = (image.color.height, image.color.width);
         let mut errors = Planes::new(1, h, w);
         for (i, error) in errors.data.iter_mut().enumerate() {

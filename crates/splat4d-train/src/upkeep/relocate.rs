@@ -121,7 +121,7 @@ mod tests {
     use super::*;
     use splat4d::layers::{Evaluation, Scene};
     use splat4d::math::Se3;
-    use splat4d::render::{Image, RenderConfig, Renderer};
+    use splat4d::render::{Image, RenderConfig, Renderer, Shot};
     use splat4d::scene::params::{LOG_SCALE, OPACITY};
     use splat4d::scene::{Camera, GEOMETRY, Time};
 
@@ -135,7 +135,7 @@ mod tests {
         let camera = Camera::with_fov_y(pose, 0.8, 64, 64);
         let (mut instant, mut image) = (Evaluation::default(), Image::default());
         s.at(Time(0.5), &mut instant);
-        Renderer::new(RenderConfig::default()).render(&s.splats(&instant), &camera, [0.1; 3], None, &mut image);
+        Renderer::new(RenderConfig::default()).render(&Shot::new(&s.splats(&instant), &camera, [0.1; 3]), &mut image);
         image.color.data
     }
 

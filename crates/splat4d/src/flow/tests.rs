@@ -44,7 +44,7 @@ fn wall(velocity: [f64; 3], life: LifeKind) -> Scene<f64> {
 }
 
 fn renderer() -> Renderer<f64> {
-    Renderer::new(RenderConfig { depth: true, ..RenderConfig::default() })
+    Renderer::new(RenderConfig::default())
 }
 
 /// Calls `f(x, y, flow)` for every pixel that shows the wall.

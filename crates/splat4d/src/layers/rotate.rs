@@ -88,7 +88,7 @@ mod tests {
     use crate::math::{Rng, Se3};
     use crate::motion::spacetime::FeatureSpec;
     use crate::motion::{SpacetimeSpec, Spec, build};
-    use crate::render::{Image, RenderConfig, Renderer};
+    use crate::render::{Image, RenderConfig, Renderer, Shot};
     use crate::scene::params::LOG_SCALE;
     use crate::scene::{Camera, GEOMETRY, LifeKind, Time};
 
@@ -119,7 +119,8 @@ mod tests {
         let camera = Camera::with_fov_y(pose, 0.9, 48, 40);
         let (mut instant, mut image) = (Evaluation::default(), Image::default());
         scene.at(Time(time), &mut instant);
-        Renderer::new(RenderConfig::default()).render(&scene.splats(&instant), &camera, [0.2; 3], None, &mut image);
+        Renderer::new(RenderConfig::default())
+            .render(&Shot::new(&scene.splats(&instant), &camera, [0.2; 3]), &mut image);
         image.color.data
     }
 

@@ -3,7 +3,7 @@
 
 use super::{Image, ImageGrads, RenderConfig, RenderGrads, Renderer, oracle};
 use crate::math::{Real, sh};
-use crate::scene::{Camera, Planes, Splats, Table};
+use crate::scene::{Camera, Splats, Table};
 use crate::{Error, ErrorKind, Result};
 
 /// Abilities that not every backend has. Colour, alpha and depth over a background are drawn by all.
@@ -30,7 +30,7 @@ pub struct Shot<'a, F = f32> {
     pub extra: Option<&'a Table<F>>,
     /// Highest degree of spherical harmonics drawn, lowered to what a table holds.
     pub sh_degree: usize,
-    /// Whether [`Image::depth`] is drawn.
+    /// Whether [`Image::depth`] is drawn; on the CPU it takes a further pass over the pixels.
     pub depth: bool,
 }
 
@@ -104,7 +104,7 @@ impl<F: Real> Backend<F> for Renderer<F> {
     }
 
     fn render(&mut self, shot: &Shot<'_, F>, out: &mut Image<F>) -> Result<()> {
-        self.draw(shot, out);
+        Renderer::render(self, shot, out);
         Ok(())
     }
 
@@ -115,7 +115,7 @@ impl<F: Real> Backend<F> for Renderer<F> {
         d_sh: &mut [Option<&mut Table<F>>],
         d: &mut RenderGrads<F>,
     ) -> Result<()> {
-        self.draw_backward(shot, grads, d_sh, d);
+        self.backward(shot, grads, d_sh, d);
         Ok(())
     }
 
@@ -145,11 +145,7 @@ impl Backend<f64> for Oracle {
     }
 
     fn render(&mut self, shot: &Shot<'_, f64>, out: &mut Image<f64>) -> Result<()> {
-        let config = RenderConfig { sh_degree: shot.sh_degree, ..self.config };
-        *out = oracle::render(shot.splats, shot.camera, shot.background, shot.extra, &config);
-        if !shot.depth {
-            out.depth = Planes::new(0, shot.camera.height, shot.camera.width);
-        }
+        *out = oracle::render(shot, &self.config);
         Ok(())
     }
 

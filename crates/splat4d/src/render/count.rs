@@ -70,7 +70,7 @@ impl<F: Real> Visit<F> for Counting<'_, F> {
 #[cfg(test)]
 mod tests {
     use crate::math::{Rng, Se3, sym3};
-    use crate::render::{Image, RenderConfig, Renderer, Simd};
+    use crate::render::{Image, RenderConfig, Renderer, Shot, Simd};
     use crate::scene::splats::{Part, SPLAT_COLUMNS};
     use crate::scene::{Camera, Color, Splats, Table};
 
@@ -93,7 +93,7 @@ mod tests {
         let camera = Camera::with_fov_y(pose, 0.5, 77, 61);
         let config = RenderConfig { simd: Simd::Scalar, ..RenderConfig::default() };
         let mut renderer = Renderer::new(config);
-        renderer.render(&splats, &camera, [0.0; 3], None, &mut Image::default());
+        renderer.render(&Shot::new(&splats, &camera, [0.0; 3]), &mut Image::default());
         let counts = renderer.count_pairs();
 
         let mut order: Vec<_> = renderer.projected().iter().filter(|p| p.radius > 0.0).collect();

@@ -22,7 +22,7 @@ use super::parallel::{Ragged, for_each_group};
 use super::project::{Projected, ProjectedGrads, Projection, View, project_backward};
 use super::rasterize::{CHUNK, Pass, Raster};
 use super::simd::{Kernel, Simd, dispatch, least, select};
-use super::{Shot, project, shade};
+use super::{RenderConfig, Shot, project, shade};
 use crate::math::{Real, sym3};
 use crate::scene::splats::{COV, SPLAT_OPACITY};
 use crate::scene::{Camera, Splats};
@@ -46,6 +46,44 @@ pub struct Sensitivity {
     /// Σ over pixels and channels of (dI/dg)², g the splat's bare bell e^(−½ dᵀ Q d). Source: Speedy-Splat (Hanson et al.
     /// 2025), its efficient pruning score.
     pub squared: f64,
+}
+
+/// The scores in f32. Nothing of it is generic, so that it is compiled here and not again in every crate that scores.
+#[derive(Debug)]
+pub struct Importance {
+    renderer: Renderer<f32>,
+}
+
+impl Importance {
+    /// A renderer of its own, without memory yet.
+    pub fn new(config: RenderConfig) -> Self {
+        Self { renderer: Renderer::new(config) }
+    }
+
+    /// See [`Renderer::contributions`].
+    pub fn contributions(&mut self, splats: &Splats<'_>, camera: &Camera, out: &mut Vec<f32>) {
+        self.renderer.contributions(splats, camera, out);
+    }
+
+    /// See [`Renderer::last_contributions`].
+    pub fn last_contributions(&mut self, out: &mut Vec<f32>) {
+        self.renderer.last_contributions(out);
+    }
+
+    /// See [`Renderer::removals`].
+    pub fn removals(&mut self, shot: &Shot<'_>, out: &mut Vec<f32>) {
+        self.renderer.removals(shot, out);
+    }
+
+    /// See [`Renderer::sensitivities`].
+    pub fn sensitivities(&mut self, shot: &Shot<'_>, out: &mut Vec<Sensitivity>) {
+        self.renderer.sensitivities(shot, out);
+    }
+
+    /// See [`Renderer::projected`].
+    pub fn projected(&self) -> &[Projected] {
+        self.renderer.projected()
+    }
 }
 
 impl<F: Real> Renderer<F> {

@@ -1,5 +1,6 @@
-//! The differentiable renderer: [`Splats`] and a [`Camera`] become colour, alpha, depth and any further channels, and
-//! gradients to a picture become gradients to every input and to the camera's pose.
+//! The differentiable renderer: [`Splats`](crate::scene::Splats) and a [`Camera`](crate::scene::Camera) become colour,
+//! alpha, depth and any further channels, and gradients to a picture become gradients to every input and to the camera's
+//! pose.
 //!
 //! Four stages, each public with its VJP beside it: [`project`] (Gaussian → screen ellipse and the bins it touches),
 //! [`shade`] (colour along the viewing direction), [`bin`] (sorted lists), [`rasterize`] (blending). [`Renderer`] runs
@@ -9,8 +10,8 @@
 //! The same bits come out for any number of threads: every floating-point sum has a fixed order, and nothing is ever
 //! added atomically.
 //!
-//! A network in [`Splats::head`] makes colours of blended channels (`head.rs`), and its gradients come with
-//! the others.
+//! A network in [`Splats::head`](crate::scene::Splats::head) makes colours of blended channels (`head.rs`), and its
+//! gradients come with the others.
 
 pub(crate) mod backend;
 pub mod bin;
@@ -31,11 +32,11 @@ mod tests;
 pub use crate::simd::Simd;
 pub use backend::{Backend, Oracle, Shot, Tables, Wanted};
 pub use count::PairCounts;
-pub use importance::Sensitivity;
+pub use importance::{Importance, Sensitivity};
 pub use project::{Projected, ProjectedGrads, View};
 
 use crate::math::Real;
-use crate::scene::{Camera, HeadGrads, Planes, Splats, Table};
+use crate::scene::{HeadGrads, Planes, Table};
 use crate::simd;
 use bin::Footprint;
 use head::Headed;
@@ -68,10 +69,6 @@ pub struct RenderConfig {
     pub low_pass: f64,
     /// Compensation for the low-pass.
     pub antialias: Antialias,
-    /// Highest degree of spherical harmonics drawn, lowered to what a table holds.
-    pub sh_degree: usize,
-    /// Whether [`Image::depth`] is drawn, which takes a further pass over the pixels.
-    pub depth: bool,
     /// Whether the way back sums absolute gradients ([`RenderGrads::mean2d_abs`]).
     pub abs_grads: bool,
     /// Instructions to use; lowered to what the machine has.
@@ -91,7 +88,7 @@ impl RenderConfig {
 }
 
 impl Default for RenderConfig {
-    /// The blend's limits as Kerbl et al. 2023; no depth; the best instructions of this machine.
+    /// The blend's limits as Kerbl et al. 2023; the best instructions of this machine.
     fn default() -> Self {
         Self {
             alpha_min: 1.0 / 255.0,
@@ -99,8 +96,6 @@ impl Default for RenderConfig {
             transmittance_min: 1e-4,
             low_pass: 0.3,
             antialias: Antialias::Off,
-            sh_degree: crate::math::sh::MAX_DEGREE,
-            depth: false,
             abs_grads: false,
             simd: Simd::detect(),
         }
@@ -114,7 +109,7 @@ pub struct Image<F = f32> {
     pub color: Planes<F>,
     /// 1 − final transmittance, [1, h, w].
     pub alpha: Planes<F>,
-    /// Σ z α T, z in camera axes, [1, h, w]; [0, h, w] where [`RenderConfig::depth`] is off.
+    /// Σ z α T, z in camera axes, [1, h, w]; [0, h, w] where [`Shot::depth`] is off.
     pub depth: Planes<F>,
     /// Further channels, without background, [C, h, w].
     pub extra: Planes<F>,
@@ -248,24 +243,8 @@ impl<F: Real> Renderer<F> {
         }
     }
 
-    /// Draws `splats` as `camera` (a pinhole) sees them over `background`.
-    ///
-    /// Shapes: `extra` [all splats, C]; `out` is resized to the camera's picture. Rows that are NaN, infinite, behind
-    /// the camera or transparent are not drawn. Panics: `extra` has not one row a splat.
-    pub fn render(
-        &mut self,
-        splats: &Splats<'_, F>,
-        camera: &Camera,
-        background: [F; 3],
-        extra: Option<&Table<F>>,
-        out: &mut Image<F>,
-    ) {
-        let (sh_degree, depth) = (self.config.sh_degree, self.config.depth);
-        self.draw(&Shot { splats, camera, background, extra, sh_degree, depth }, out);
-    }
-
-    /// Draws a shot.
-    fn draw(&mut self, shot: &Shot<'_, F>, out: &mut Image<F>) {
+    /// Draws a shot; see [`Backend::render`], which never fails here.
+    pub fn render(&mut self, shot: &Shot<'_, F>, out: &mut Image<F>) {
         if let Some(extra) = shot.extra {
             assert_eq!(extra.rows(), shot.splats.len(), "further channels need one row a splat");
         }
@@ -354,27 +333,8 @@ impl<F: Real> Renderer<F> {
         });
     }
 
-    /// VJP of the last [`Renderer::render`], whose arguments must be given again.
-    ///
-    /// `d_sh` has one entry a part: for a part whose colour is the layer's own SH, the gradient is *added* to rows
-    /// `rows.id(j)` of that table; `None` skips it. `d` is overwritten, its allocations are reused.
-    /// Panics: shapes are not those of the last render.
+    /// VJP of the last [`Renderer::render`]; see [`Backend::vjp`], which never fails here.
     pub fn backward(
-        &mut self,
-        splats: &Splats<'_, F>,
-        camera: &Camera,
-        background: [F; 3],
-        extra: Option<&Table<F>>,
-        grads: &ImageGrads<'_, F>,
-        d_sh: &mut [Option<&mut Table<F>>],
-        d: &mut RenderGrads<F>,
-    ) {
-        let (sh_degree, depth) = (self.config.sh_degree, self.config.depth);
-        self.draw_backward(&Shot { splats, camera, background, extra, sh_degree, depth }, grads, d_sh, d);
-    }
-
-    /// VJP of [`Self::draw`].
-    fn draw_backward(
         &mut self,
         shot: &Shot<'_, F>,
         grads: &ImageGrads<'_, F>,

@@ -2,11 +2,11 @@
 //!
 //! Shares no code with the fast path but the spherical-harmonics constants. For tests, goldens and doubts.
 
-use super::{Antialias, Image, RenderConfig};
+use super::{Antialias, Image, RenderConfig, Shot};
 use crate::math::{Real, se3, sh};
 use crate::scene::head::{BASE, FEATURES, FURTHER, HIDDEN, INPUTS};
 use crate::scene::splats::{COV, SPLAT_OPACITY};
-use crate::scene::{Camera, Color, HeadWeights, Part, Planes, Splats, Table};
+use crate::scene::{Camera, Color, HeadWeights, Part, Planes, Table};
 
 /// gsplat's margin for x/z and y/z inside J: 0.3 times the tangent of half the field of view.
 const MARGIN: f64 = 0.3;
@@ -24,16 +24,12 @@ struct Blob {
     id: usize,
 }
 
-/// Draws `splats` exactly as [`super::Renderer`] should, O(splats · pixels), in f64 whatever the input.
+/// Draws a shot exactly as [`super::Renderer`] should, O(splats · pixels), in f64 whatever the input.
 ///
 /// Shapes as in [`super::Renderer::render`]. Panics: `extra` has not one row a splat.
-pub fn render<F: Real>(
-    splats: &Splats<'_, F>,
-    camera: &Camera,
-    background: [f64; 3],
-    extra: Option<&Table<F>>,
-    config: &RenderConfig,
-) -> Image<f64> {
+pub fn render<F: Real>(shot: &Shot<'_, F>, config: &RenderConfig) -> Image<f64> {
+    let Shot { splats, camera, background, extra, .. } = *shot;
+    let background = background.map(F::f64);
     if let Some(extra) = extra {
         assert_eq!(extra.rows(), splats.len(), "further channels need one row a splat");
     }
@@ -41,7 +37,7 @@ pub fn render<F: Real>(
     let mut id = 0;
     for part in &splats.parts {
         for j in 0..part.out.rows() {
-            blobs.extend(blob(part, j, id, camera, config));
+            blobs.extend(blob(part, j, id, shot, config));
             id += 1;
         }
     }
@@ -50,7 +46,7 @@ pub fn render<F: Real>(
     let mut out = Image {
         color: Planes::new(3, h, w),
         alpha: Planes::new(1, h, w),
-        depth: Planes::new(1, h, w),
+        depth: Planes::new(usize::from(shot.depth), h, w),
         extra: Planes::new(c, h, w),
     };
     for y in 0..h {
@@ -71,7 +67,9 @@ pub fn render<F: Real>(
                 for k in 0..3 {
                     out.color.plane_mut(k)[at] += b.rgb[k] * alpha * t;
                 }
-                out.depth.data[at] += b.depth * alpha * t;
+                if shot.depth {
+                    out.depth.data[at] += b.depth * alpha * t;
+                }
                 (0..FURTHER).for_each(|k| further[k] += b.further[k] * alpha * t);
                 if let Some(extra) = extra {
                     for k in 0..c {
@@ -93,7 +91,8 @@ pub fn render<F: Real>(
     out
 }
 
-fn blob<F: Real>(part: &Part<'_, F>, j: usize, id: usize, camera: &Camera, config: &RenderConfig) -> Option<Blob> {
+fn blob<F: Real>(part: &Part<'_, F>, j: usize, id: usize, shot: &Shot<'_, F>, config: &RenderConfig) -> Option<Blob> {
+    let camera = shot.camera;
     let mean: [f64; 3] = part.out.read::<3>(j, 0).map(F::f64);
     let [xx, xy, xz, yy, yz, zz] = part.out.read::<6>(j, COV).map(F::f64);
     let opacity = part.out.get(j, SPLAT_OPACITY).f64();
@@ -134,7 +133,7 @@ fn blob<F: Real>(part: &Part<'_, F>, j: usize, id: usize, camera: &Camera, confi
         opacity,
         depth: p[2],
         further: further(part, j),
-        rgb: color(part, j, direction(part, se3::sub(mean, camera.center())), config.sh_degree),
+        rgb: color(part, j, direction(part, se3::sub(mean, camera.center())), shot.sh_degree),
         id,
     })
 }

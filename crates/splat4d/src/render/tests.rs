@@ -5,7 +5,7 @@ mod head;
 use super::*;
 use crate::math::{Rng, Se3, sym3};
 use crate::scene::splats::{Part, SPLAT_COLUMNS};
-use crate::scene::{Color, Intrinsics, Lens, Rows};
+use crate::scene::{Camera, Color, Intrinsics, Lens, Rows, Splats};
 
 /// f32 against the f64 oracle, where no pixel is at a threshold.
 const F32_TOLERANCE: f64 = 2e-5;
@@ -101,9 +101,9 @@ fn camera(width: usize, height: usize) -> Camera {
     Camera { cam_from_world: pose, intrinsics, lens: Lens::Pinhole, width, height, near: Camera::NEAR }
 }
 
-/// Draws and differentiates all that there is.
+/// Differentiates all that there is.
 fn complete() -> RenderConfig {
-    RenderConfig { depth: true, abs_grads: true, ..RenderConfig::default() }
+    RenderConfig { abs_grads: true, ..RenderConfig::default() }
 }
 
 /// No pixel can be at a threshold.
@@ -113,14 +113,24 @@ fn smooth() -> RenderConfig {
 
 const BACKGROUND: [f64; 3] = [0.2, 0.5, 0.9];
 
+/// Depth too.
+fn shot<'a, F: Real>(
+    splats: &'a Splats<'a, F>,
+    camera: &'a Camera,
+    background: [F; 3],
+    extra: Option<&'a Table<F>>,
+) -> Shot<'a, F> {
+    Shot { extra, depth: true, ..Shot::new(splats, camera, background) }
+}
+
 fn draw<F: Real>(scene: &Scene<F>, camera: &Camera, config: RenderConfig) -> Image<F> {
     let mut out = Image::default();
-    Renderer::new(config).render(&scene.splats(), camera, BACKGROUND.map(F::of), Some(&scene.extra), &mut out);
+    Renderer::new(config).render(&shot(&scene.splats(), camera, BACKGROUND.map(F::of), Some(&scene.extra)), &mut out);
     out
 }
 
 fn draw_oracle<F: Real>(scene: &Scene<F>, camera: &Camera, config: RenderConfig) -> Image<f64> {
-    oracle::render(&scene.splats(), camera, BACKGROUND, Some(&scene.extra), &config)
+    oracle::render(&shot(&scene.splats(), camera, BACKGROUND.map(F::of), Some(&scene.extra)), &config)
 }
 
 /// Largest difference, relative where values are above 1, and the share of values beyond `tolerance`.
@@ -209,9 +219,9 @@ fn gradients(s: &Scene<f64>, view: &Camera, config: RenderConfig, loss: &Loss) -
     let mut renderer = Renderer::new(config);
     let (splats, mut out, mut d) = (s.splats(), Image::default(), RenderGrads::default());
     let mut own = s.own.zeros_like();
-    renderer.render(&splats, view, BACKGROUND, Some(&s.extra), &mut out);
+    renderer.render(&shot(&splats, view, BACKGROUND, Some(&s.extra)), &mut out);
     let mut d_sh = [Some(&mut own), None, None];
-    renderer.backward(&splats, view, BACKGROUND, Some(&s.extra), &loss.grads(), &mut d_sh, &mut d);
+    renderer.backward(&shot(&splats, view, BACKGROUND, Some(&s.extra)), &loss.grads(), &mut d_sh, &mut d);
     (d, own)
 }
 
@@ -286,7 +296,7 @@ fn every_gradient_equals_finite_differences() {
             let over = |h: f64| {
                 let (mut b, mut out) = (BACKGROUND, Image::default());
                 b[c] += h;
-                Renderer::new(config).render(&s.splats(), &view, b, Some(&s.extra), &mut out);
+                Renderer::new(config).render(&shot(&s.splats(), &view, b, Some(&s.extra)), &mut out);
                 loss.of(&out)
             };
             close((over(1e-5) - over(-1e-5)) / 2e-5, d.background[c], "background");
@@ -339,7 +349,7 @@ fn one_gaussian_has_the_profile_and_energy_of_its_equation() {
     let (out, rgb) = simple(&[([0.0, 0.0, 2.0], 0.01, 0.6)]);
     let view = frontal(65, 100.0);
     let mut image = Image::default();
-    Renderer::new(smooth()).render(&direct(&out, &rgb), &view, [0.0; 3], None, &mut image);
+    Renderer::new(smooth()).render(&shot(&direct(&out, &rgb), &view, [0.0; 3], None), &mut image);
     let variance = 0.01 * (100.0f64 / 2.0).powi(2) + 0.3;
     let (mut sum, mut worst) = (0.0, 0.0f64);
     for y in 0..65 {
@@ -363,10 +373,10 @@ fn what_is_as_near_as_the_cameras_near_is_not_drawn() {
     for (near, alone) in [(0.49, false), (0.5, true), (1.0, true)] {
         let view = Camera { near, ..frontal(33, 50.0) };
         let (mut both, mut one) = (Image::default(), Image::default());
-        Renderer::new(smooth()).render(&direct(&out, &rgb), &view, [0.0; 3], None, &mut both);
-        Renderer::new(smooth()).render(&direct(&far.0, &far.1), &view, [0.0; 3], None, &mut one);
+        Renderer::new(smooth()).render(&shot(&direct(&out, &rgb), &view, [0.0; 3], None), &mut both);
+        Renderer::new(smooth()).render(&shot(&direct(&far.0, &far.1), &view, [0.0; 3], None), &mut one);
         assert_eq!(both.alpha == one.alpha, alone, "near {near}");
-        let truth = oracle::render(&direct(&out, &rgb), &view, [0.0; 3], None, &smooth());
+        let truth = oracle::render(&shot(&direct(&out, &rgb), &view, [0.0; 3], None), &smooth());
         assert!(difference(&both, &truth, 1e-9).0 < 1e-9, "the oracle draws the same");
     }
 }
@@ -380,9 +390,9 @@ fn order_of_rows_does_not_matter_and_alpha_is_one_minus_transmittance() {
     let (out, rgb) = (s.outs[2].gather(&reverse), s.direct.gather(&reverse));
     let (mut a, mut b, mut white) = (Image::default(), Image::default(), Image::default());
     let mut renderer = Renderer::new(complete());
-    renderer.render(&direct(&s.outs[2], &s.direct), &view, [0.0; 3], None, &mut a);
-    renderer.render(&direct(&out, &rgb), &view, [0.0; 3], None, &mut b);
-    renderer.render(&direct(&out, &rgb), &view, [1.0; 3], None, &mut white);
+    renderer.render(&shot(&direct(&s.outs[2], &s.direct), &view, [0.0; 3], None), &mut a);
+    renderer.render(&shot(&direct(&out, &rgb), &view, [0.0; 3], None), &mut b);
+    renderer.render(&shot(&direct(&out, &rgb), &view, [1.0; 3], None), &mut white);
     assert_eq!(a, b);
     for i in 0..a.alpha.data.len() {
         let t = white.color.data[i] - b.color.data[i];
@@ -407,8 +417,8 @@ fn moving_scene_and_camera_together_changes_nothing() {
     let moved = Camera { cam_from_world: view.cam_from_world.after(&motion.inverse()), ..view.clone() };
     let (mut a, mut b) = (Image::default(), Image::default());
     let mut renderer = Renderer::new(smooth());
-    renderer.render(&direct(&s.outs[2], &s.direct), &view, BACKGROUND, None, &mut a);
-    renderer.render(&direct(&out, &s.direct), &moved, BACKGROUND, None, &mut b);
+    renderer.render(&shot(&direct(&s.outs[2], &s.direct), &view, BACKGROUND, None), &mut a);
+    renderer.render(&shot(&direct(&out, &s.direct), &moved, BACKGROUND, None), &mut b);
     let (worst, _) = difference(&a, &b, 0.0);
     assert!(worst < 1e-9, "{worst}");
 }
@@ -438,18 +448,18 @@ fn degenerate_splats_draw_what_the_oracle_draws() {
             let (mut image, mut d) = (Image::default(), RenderGrads::default());
             let mut renderer = Renderer::new(complete());
             let splats = direct(&out, &rgb);
-            renderer.render(&splats, &view, BACKGROUND, None, &mut image);
-            let truth = oracle::render(&splats, &view, BACKGROUND, None, &complete());
+            renderer.render(&shot(&splats, &view, BACKGROUND, None), &mut image);
+            let truth = oracle::render(&shot(&splats, &view, BACKGROUND, None), &complete());
             let (worst, _) = difference(&image, &truth, 0.0);
             assert!(worst < 1e-9, "case {i}, {size} px: {worst}");
             let ones = ImageGrads { color: &image.color.clone(), alpha: None, depth: None, extra: None };
-            renderer.backward(&splats, &view, BACKGROUND, None, &ones, &mut [None], &mut d);
+            renderer.backward(&shot(&splats, &view, BACKGROUND, None), &ones, &mut [None], &mut d);
             assert!(d.parts[0].out.first_non_finite().is_none(), "case {i}: a gradient is not finite");
             assert!(d.mean2d.iter().all(|v| v.is_finite()) && d.camera.iter().all(|v| v.is_finite()));
         }
     }
     let (mut image, nothing) = (Image::default(), Splats::<f64>::default());
-    Renderer::new(complete()).render(&nothing, &frontal(9, 9.0), BACKGROUND, None, &mut image);
+    Renderer::new(complete()).render(&shot(&nothing, &frontal(9, 9.0), BACKGROUND, None), &mut image);
     assert!(image.color.plane(1).iter().all(|&v| v == BACKGROUND[1]), "an empty scene is its background");
 }
 
@@ -461,10 +471,10 @@ fn no_gradient_passes_a_ceiling() {
     let config = RenderConfig { alpha_max: 0.5, ..complete() };
     let (mut image, mut d) = (Image::default(), RenderGrads::default());
     let mut renderer = Renderer::new(config);
-    renderer.render(&direct(&out, &rgb), &view, BACKGROUND, None, &mut image);
+    renderer.render(&shot(&direct(&out, &rgb), &view, BACKGROUND, None), &mut image);
     let g = image.color.clone();
     let grads = ImageGrads { color: &g, alpha: None, depth: None, extra: None };
-    renderer.backward(&direct(&out, &rgb), &view, BACKGROUND, None, &grads, &mut [None], &mut d);
+    renderer.backward(&shot(&direct(&out, &rgb), &view, BACKGROUND, None), &grads, &mut [None], &mut d);
     assert!((0..10).all(|c| d.parts[0].out.get(0, c) == 0.0), "{:?}", d.parts[0].out.read::<10>(0, 0));
     assert!(d.parts[0].color.as_ref().unwrap().get(0, 0) > 0.0 && d.background[0] > 0.0);
 }
@@ -475,7 +485,7 @@ fn tight_boxes_lose_nothing_that_a_three_sigma_circle_would() {
     let (out, rgb) = simple(&[([0.0, 0.0, 2.0], 0.04, 1.0)]);
     let view = frontal(101, 100.0);
     let mut image = Image::default();
-    Renderer::new(complete()).render(&direct(&out, &rgb), &view, [0.0; 3], None, &mut image);
+    Renderer::new(complete()).render(&shot(&direct(&out, &rgb), &view, [0.0; 3], None), &mut image);
     let sigma = (0.04f64 * 2500.0 + 0.3).sqrt();
     let at = (3.25 * sigma) as usize;
     assert!(image.alpha.get(0, 50, 50 + at) > 1.0 / 255.0, "α at 3.25σ is {}", image.alpha.get(0, 50, 50 + at));
@@ -496,12 +506,12 @@ fn threads_change_no_bit() {
             let mut own = s.own.zeros_like();
             for _ in 0..2 {
                 own.fill(0.0);
-                renderer.render(&splats, &view, [0.1; 3], Some(&s.extra), &mut image);
+                renderer.render(&shot(&splats, &view, [0.1; 3], Some(&s.extra)), &mut image);
                 let (c, a) = (image.color.clone(), image.alpha.clone());
                 let e = image.extra.clone();
                 let grads = ImageGrads { color: &c, alpha: Some(&a), depth: None, extra: Some(&e) };
                 let d_sh = &mut [Some(&mut own), None, None];
-                renderer.backward(&splats, &view, [0.1; 3], Some(&s.extra), &grads, d_sh, &mut d);
+                renderer.backward(&shot(&splats, &view, [0.1; 3], Some(&s.extra)), &grads, d_sh, &mut d);
             }
             (image, d.parts, d.extra, d.mean2d, d.mean2d_abs, d.camera, d.background, own)
         })
@@ -523,9 +533,9 @@ fn a_picture_of_too_many_pairs_is_drawn_in_runs_of_bins() {
             renderer.raster.budget = Some(budget);
             let (splats, mut image, mut d) = (s.splats(), Image::default(), RenderGrads::default());
             let mut own = s.own.zeros_like();
-            renderer.render(&splats, &view, BACKGROUND, Some(&s.extra), &mut image);
+            renderer.render(&shot(&splats, &view, BACKGROUND, Some(&s.extra)), &mut image);
             let d_sh = &mut [Some(&mut own), None, None];
-            renderer.backward(&splats, &view, BACKGROUND, Some(&s.extra), &loss.grads(), d_sh, &mut d);
+            renderer.backward(&shot(&splats, &view, BACKGROUND, Some(&s.extra)), &loss.grads(), d_sh, &mut d);
             let (runs, held) = (renderer.raster.bins.runs.len(), renderer.raster.bins.keys.capacity());
             (runs, held, renderer.stats().pairs, image, d)
         };
@@ -568,7 +578,7 @@ fn contributions_are_the_oracles_and_sum_to_alpha() {
     let view = camera(75, 41);
     let oracle = draw_oracle(&s, &view, complete());
     let (mut renderer, mut image) = (Renderer::new(complete()), Image::default());
-    renderer.render(&s.splats(), &view, [0.0; 3], None, &mut image);
+    renderer.render(&shot(&s.splats(), &view, [0.0; 3], None), &mut image);
     let mut share = Vec::new();
     renderer.last_contributions(&mut share);
     for (j, &share) in share.iter().enumerate() {
@@ -599,13 +609,13 @@ fn contributions_do_not_disturb_the_way_back_and_know_no_threads() {
     let run = |weigh: bool| {
         let (mut renderer, mut image) = (Renderer::new(complete()), Image::default());
         let (mut share, mut d) = (Vec::new(), RenderGrads::default());
-        renderer.render(&s.splats(), &view, [0.5; 3], None, &mut image);
+        renderer.render(&shot(&s.splats(), &view, [0.5; 3], None), &mut image);
         if weigh {
             renderer.last_contributions(&mut share);
         }
         let ones = Planes { channels: 3, height: 90, width: 150, data: vec![1.0; 3 * 150 * 90] };
         let grads = ImageGrads { color: &ones, alpha: None, depth: None, extra: None };
-        renderer.backward(&s.splats(), &view, [0.5; 3], None, &grads, &mut [None, None, None], &mut d);
+        renderer.backward(&shot(&s.splats(), &view, [0.5; 3], None), &grads, &mut [None, None, None], &mut d);
         (share, d.mean2d)
     };
     let one = pool(1).install(|| run(true));
@@ -646,9 +656,12 @@ fn sensitivities_are_sums_of_squared_differences() {
     s.outs.iter_mut().for_each(|out| (0..out.rows()).for_each(|j| out.set(j, 9, 0.5 * out.get(j, 9))));
     let view = camera(45, 31);
     // Colours that do not depend on the direction, and no thresholds.
-    let config = RenderConfig { sh_degree: 0, ..smooth() };
+    let config = smooth();
     // A bare bell's tail counts as its middle does, as far as it is drawn.
-    let cut = RenderConfig { sh_degree: 0, ..complete() };
+    let cut = complete();
+    let plain = |s: &Scene<f64>, config: &RenderConfig| {
+        oracle::render(&Shot { sh_degree: 0, ..Shot::new(&s.splats(), &view, BACKGROUND) }, config).color.data
+    };
     let [mut found, mut drawn] = [Vec::new(), Vec::new()];
     let splats = s.splats();
     let shot = Shot { sh_degree: 0, ..Shot::new(&splats, &view, BACKGROUND) };
@@ -669,7 +682,7 @@ fn sensitivities_are_sums_of_squared_differences() {
                         *s.outs[part].get_mut(j, 3 + c) += grown * axes[p][n] * axes[q][n];
                     }
                 }
-                draw_oracle(&s, &view, config).color.data
+                plain(&s, &config)
             };
             let slopes: Vec<Vec<f64>> = (0..6)
                 .map(|k| moved(k, 1e-5).iter().zip(moved(k, -1e-5)).map(|(a, b)| (a - b) / 2e-5).collect())
@@ -692,7 +705,7 @@ fn sensitivities_are_sums_of_squared_differences() {
                 let with = |h: f64| {
                     let mut s = s.clone();
                     *s.outs[part].get_mut(j, 9) += h;
-                    draw_oracle(&s, &view, cut).color.data
+                    plain(&s, &cut)
                 };
                 let (up, down) = (with(1e-6), with(-1e-6));
                 for (i, (u, d)) in up.iter().zip(&down).enumerate().filter(|(_, (u, d))| u != d) {
@@ -731,9 +744,10 @@ fn f32_gradients_are_those_of_f64() {
         let mut renderer = Renderer::new(config);
         let (splats, mut out, mut d) = (s.splats(), Image::default(), RenderGrads::default());
         let background = BACKGROUND.map(F::of);
-        renderer.render(&splats, view, background, None, &mut out);
+        let shot = Shot::new(&splats, view, background);
+        renderer.render(&shot, &mut out);
         let grads = ImageGrads { color: g, alpha: None, depth: None, extra: None };
-        renderer.backward(&splats, view, background, None, &grads, &mut [None, None, None], &mut d);
+        renderer.backward(&shot, &grads, &mut [None, None, None], &mut d);
         d.parts.iter().flat_map(|p| (0..p.out.rows()).flat_map(|j| p.out.read::<10>(j, 0))).map(F::f64).collect()
     }
     let exact = run(&s, &view, config, &g);
@@ -762,7 +776,7 @@ fn touched_pixels_are_those_of_the_ellipse_inside_the_picture() {
         let mut view = view.clone();
         view.intrinsics.cx = cx;
         let splats = Splats { parts: vec![Part::new(&out, Color::Direct { table: &colors })], head: None };
-        renderer.render(&splats, &view, [0.0; 3], None, &mut image);
+        renderer.render(&shot(&splats, &view, [0.0; 3], None), &mut image);
         let lit = image.alpha.data.iter().filter(|a| **a > 0.0).count() as f64;
         (renderer.projected()[0].pixels([400, 300]), lit)
     };

@@ -7,7 +7,7 @@ use splat4d::format::scene::{METADATA, metadata, read, write};
 use splat4d::layers::{Evaluation, Layer, LayerTape, Scene, freeze};
 use splat4d::math::{Real, Rng, Se3, Sim3, quat, se3};
 use splat4d::motion::{Cache, Spec, build};
-use splat4d::render::{Image, RenderConfig, Renderer};
+use splat4d::render::{Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::splats::COV;
 use splat4d::scene::{Camera, Grads, LifeKind, Rows, SH, Space, SplatGrads, Table, Time};
 
@@ -47,7 +47,7 @@ fn draw<F: Real>(scene: &Scene<F>, pose: Se3, scale: f64, t: f64) -> Vec<F> {
     let (mut instant, mut image) = (Evaluation::default(), Image::default());
     scene.at(Time(t), &mut instant);
     let background = [F::of(0.2); 3];
-    Renderer::new(RenderConfig::default()).render(&scene.splats(&instant), &camera, background, None, &mut image);
+    Renderer::new(RenderConfig::default()).render(&Shot::new(&scene.splats(&instant), &camera, background), &mut image);
     image.color.data
 }
 

@@ -16,7 +16,7 @@ use image::codecs::jpeg::JpegEncoder;
 use splat4d::layers::{Layer, Scene};
 use splat4d::math::{Rng, quat, sh};
 use splat4d::motion::{SpacetimeSpec, Spec, build};
-use splat4d::render::{Image, ImageGrads, RenderConfig, RenderGrads, Renderer};
+use splat4d::render::{Image, ImageGrads, RenderConfig, RenderGrads, Renderer, Shot};
 use splat4d::scene::life::{CENTER, LOG_WIDTH};
 use splat4d::scene::params::{LOG_SCALE, QUAT};
 use splat4d::scene::{Camera, GEOMETRY, LIFE, LifeKind, Params, Planes, SH, Table, Time};
@@ -253,10 +253,10 @@ fn renderer_bytes(pinned: &Pinned, way: Way) -> u64 {
     for view in &pinned.views {
         pinned.scene.at(view.time, &mut moment);
         let splats = pinned.scene.splats(&moment);
-        renderer.render(&splats, &view.camera, pinned.scene.background, None, &mut image);
+        renderer.render(&Shot::new(&splats, &view.camera, pinned.scene.background), &mut image);
         let grads = ImageGrads { color: &image.color.clone(), alpha: None, depth: None, extra: None };
         let mut d_sh: Vec<Option<&mut Table>> = splats.parts.iter().map(|_| None).collect();
-        renderer.backward(&splats, &view.camera, pinned.scene.background, None, &grads, &mut d_sh, &mut d);
+        renderer.backward(&Shot::new(&splats, &view.camera, pinned.scene.background), &grads, &mut d_sh, &mut d);
         most = most.max(renderer.memory_bytes());
     }
     most as u64

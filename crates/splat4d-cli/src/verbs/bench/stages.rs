@@ -5,7 +5,7 @@ use super::rows::Row;
 use super::scenes::{Pinned, View};
 use splat4d::Result;
 use splat4d::play::Player;
-use splat4d::render::{Image, ImageGrads, RenderConfig, RenderGrads, Renderer, Simd};
+use splat4d::render::{Image, ImageGrads, RenderConfig, RenderGrads, Renderer, Shot, Simd};
 use splat4d::scene::{Color, Planes, Splats, Table};
 use std::time::Instant;
 
@@ -89,7 +89,7 @@ pub(super) fn measure(pinned: &Pinned, way: Way, roofline: &Roofline) -> Result<
             let splats = player.at(view.time)?;
             let motion = clock.elapsed().as_secs_f64();
             let clock = Instant::now();
-            renderer.render(&splats, &view.camera, background, None, &mut image);
+            renderer.render(&Shot::new(&splats, &view.camera, background), &mut image);
             let forward = clock.elapsed().as_secs_f64();
             if round == 0 {
                 let counts = renderer.count_pairs();
@@ -103,7 +103,7 @@ pub(super) fn measure(pinned: &Pinned, way: Way, roofline: &Roofline) -> Result<
             let mut d_sh: Vec<Option<&mut Table<f32>>> = d_sh.iter_mut().map(Option::as_mut).collect();
             let grads = ImageGrads { color: &grad, alpha: None, depth: None, extra: None };
             let clock = Instant::now();
-            renderer.backward(&splats, &view.camera, background, None, &grads, &mut d_sh, &mut d);
+            renderer.backward(&Shot::new(&splats, &view.camera, background), &grads, &mut d_sh, &mut d);
             let backward = clock.elapsed().as_secs_f64();
             if round > 0 {
                 let s = renderer.stage_seconds();

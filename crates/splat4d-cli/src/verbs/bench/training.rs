@@ -9,7 +9,7 @@ use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::Rng;
 use splat4d::math::sh::degree_of;
 use splat4d::motion::Spec;
-use splat4d::render::{Image, RenderConfig, Renderer};
+use splat4d::render::{Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::{Camera, Planes, SH, Time};
 use splat4d::{Error, ErrorKind, Result};
 use splat4d_train::capture::frames::{Frames, Picture};
@@ -50,7 +50,7 @@ impl Held {
         let mut picture = |(v, view): (usize, &super::scenes::View)| {
             pinned.scene.at(view.time, &mut moment);
             let splats = pinned.scene.splats(&moment);
-            renderer.render(&splats, &view.camera, pinned.scene.background, None, &mut image);
+            renderer.render(&Shot::new(&splats, &view.camera, pinned.scene.background), &mut image);
             let own = rng.fork(v as u64);
             let mut truth = image.color.clone();
             for (i, x) in truth.data.iter_mut().enumerate() {

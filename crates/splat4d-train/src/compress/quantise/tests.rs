@@ -228,7 +228,7 @@ fn the_gradient_of_what_is_shown_moves_what_learns() {
         let mut d: Vec<Grads<f32>> = whole.layers.iter().map(|l| Grads::new(&l.params)).collect();
         let mut image = loss.of_step(&mut [], None);
         let mut losses = Losses { image: &mut image, probes: &[], params: &[] };
-        let mut renderer = Renderer::new(RenderConfig { sh_degree: 1, ..RenderConfig::default() });
+        let mut renderer = Renderer::new(RenderConfig::default());
         let step = Step { scene: &whole, views: &[view], info: &info, sh_degree: 1 };
         Chain::default().step(&step, &mut renderer, &mut losses, &mut d, &mut |_| {}).unwrap();
         // Adam's first step goes against the gradient's sign: of one of the views in every number.

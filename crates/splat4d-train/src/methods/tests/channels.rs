@@ -62,7 +62,7 @@ fn run(scene: &Scene<f64>, needs: &Needs, backend: &mut dyn Backend<f64>) -> (f6
     let mut image = Weighted(needs.clone());
     let mut d: Vec<Grads<f64>> = scene.layers.iter().map(|l| Grads::new(&l.params)).collect();
     let mut losses = Losses { image: &mut image, probes: &[], params: &[] };
-    let step = Step { scene, views: &views, info: &info, sh_degree: smooth().sh_degree };
+    let step = Step { scene, views: &views, info: &info, sh_degree: MAX_DEGREE };
     let report = Chain::default().step(&step, backend, &mut losses, &mut d, &mut |_| {}).unwrap();
     (report.loss, d)
 }

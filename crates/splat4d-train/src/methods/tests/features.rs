@@ -103,7 +103,7 @@ fn error_of(scene: &Scene<f32>, frames: &dyn Frames) -> f64 {
     for i in 0..frames.len() {
         frames.load(i, &mut picture).unwrap();
         scene.at(frames.time(i), &mut instant);
-        renderer.render(&scene.splats(&instant), frames.camera(i), scene.background, None, &mut image);
+        renderer.render(&render::Shot::new(&scene.splats(&instant), frames.camera(i), scene.background), &mut image);
         let square = |(a, b): (&f32, &f32)| f64::from(a - b).powi(2);
         let pairs = image.color.data.iter().zip(&picture.color.data);
         sum += pairs.map(square).sum::<f64>() / image.color.data.len() as f64;

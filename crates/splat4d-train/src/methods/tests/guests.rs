@@ -149,7 +149,7 @@ fn errors(motion: &str, life: &str) -> [f64; 2] {
     let (mut picture, mut sums) = (Picture::default(), [[0.0f64; 2]; 2]);
     for i in 0..party.len() {
         trainer.scene().at(party.time(i), &mut instant);
-        renderer.render(&trainer.scene().splats(&instant), party.camera(i), SKY, None, &mut image);
+        renderer.render(&render::Shot::new(&trainer.scene().splats(&instant), party.camera(i), SKY), &mut image);
         party.load(i, &mut picture).unwrap();
         for p in 0..SIZE * SIZE {
             let seen = party.hit(i % CAMERAS, p, &|g| GUESTS[g].2(i / CAMERAS));

@@ -28,6 +28,7 @@ use crate::train::tests::Made;
 use crate::train::trainer::{Settings, Trainer};
 use crate::upkeep::Limits;
 use splat4d::layers::Layer;
+use splat4d::math::sh::MAX_DEGREE;
 use splat4d::math::{Real, Rng};
 use splat4d::motion::{Motion, SpacetimeSpec, build};
 use splat4d::render::{
@@ -60,8 +61,7 @@ const FD_TOLERANCE: (f64, f64) = (2e-6, 2e-9);
 
 /// No thresholds: the picture is a smooth function of every parameter.
 fn smooth() -> RenderConfig {
-    let all = RenderConfig { depth: true, ..RenderConfig::default() };
-    RenderConfig { alpha_min: 1e-14, alpha_max: 1.0 - 1e-9, transmittance_min: 0.0, ..all }
+    RenderConfig { alpha_min: 1e-14, alpha_max: 1.0 - 1e-9, transmittance_min: 0.0, ..RenderConfig::default() }
 }
 
 /// The oracle as a drawing device: a forward without gradients.
@@ -73,7 +73,7 @@ impl Backend<f64> for Oracle {
     }
 
     fn render(&mut self, shot: &render::Shot<'_, f64>, out: &mut Image<f64>) -> Result<()> {
-        *out = oracle::render(shot.splats, shot.camera, shot.background, shot.extra, &self.0);
+        *out = oracle::render(shot, &self.0);
         Ok(())
     }
 
@@ -169,7 +169,7 @@ fn step(
     let mut d: Vec<Grads<f64>> = scene.layers.iter().map(|l| Grads::new(&l.params)).collect();
     let mut chain = Chain::default();
     let mut losses = Losses { image: &mut Squared, probes, params: &[] };
-    let step = Step { scene, views: &views, info: &info, sh_degree: smooth().sh_degree };
+    let step = Step { scene, views: &views, info: &info, sh_degree: MAX_DEGREE };
     let report = chain.step(&step, backend, &mut losses, &mut d, &mut |_| {}).unwrap();
     (report, d, chain.at_calls)
 }

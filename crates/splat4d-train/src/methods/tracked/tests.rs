@@ -9,7 +9,7 @@ use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::sh::rgb_to_dc;
 use splat4d::math::{Rng, Se3};
 use splat4d::motion::build;
-use splat4d::render::{Image, RenderConfig, Renderer};
+use splat4d::render::{Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::params::{LOG_SCALE, OPACITY};
 use splat4d::scene::{Camera, LifeKind, Params, SH, Table, Time};
 
@@ -111,7 +111,7 @@ fn truth(params: &Params<f32>, turning: usize, frames: usize, angle: f64) -> Sce
 
 /// Draws a scene from all cameras; masks are where the first `masks` rows are what is seen.
 fn draw(s: &Scene<f32>, cameras: Vec<Camera>, frames: usize, masks: Option<usize>) -> Drawn {
-    let mut renderer = Renderer::new(RenderConfig { sh_degree: 0, ..RenderConfig::default() });
+    let mut renderer = Renderer::new(RenderConfig::default());
     let (mut image, mut instant) = (Image::default(), Evaluation::default());
     let mut front = Table::new(&[("front", 1)], s.len());
     (0..masks.unwrap_or(0)).for_each(|r| front.set(r, 0, 1.0));
@@ -119,7 +119,9 @@ fn draw(s: &Scene<f32>, cameras: Vec<Camera>, frames: usize, masks: Option<usize
     for k in 0..frames {
         s.at(Time(k as f64 / FPS), &mut instant);
         for camera in &cameras {
-            renderer.render(&s.splats(&instant), camera, [0.0; 3], Some(&front), &mut image);
+            let splats = s.splats(&instant);
+            let shot = Shot { extra: Some(&front), sh_degree: 0, ..Shot::new(&splats, camera, [0.0; 3]) };
+            renderer.render(&shot, &mut image);
             let mut mask = image.extra.clone();
             mask.data.iter_mut().for_each(|x| *x = f32::from(u8::from(*x > 0.5)));
             pictures.push(Picture { color: image.color.clone(), mask: masks.map(|_| mask), ..Picture::default() });
@@ -152,7 +154,7 @@ fn trainer(s: Scene<f32>, plan: &Plan, frames: Arc<dyn Frames>, exposure: Option
         sh_degree: 0,
         exposure_lr: plan.recipe.exposure_lr,
     };
-    let draw = Box::new(Renderer::new(RenderConfig { sh_degree: 0, ..RenderConfig::default() }));
+    let draw = Box::new(Renderer::new(RenderConfig::default()));
     let loss = TrainLoss::photometric(0.2);
     let mut trainer = Trainer::new(s, TrackedProgram.stages(plan), frames, draw, loss, settings);
     trainer.learner.exposure = exposure;

@@ -2,7 +2,7 @@
 
 use super::temporal::Spatial;
 use splat4d::layers::{Evaluation, Scene};
-use splat4d::render::{Antialias, RenderConfig, Renderer, Sensitivity, Shot};
+use splat4d::render::{Antialias, Importance, RenderConfig, Sensitivity, Shot};
 use splat4d::scene::splats::SPLAT_OPACITY;
 use splat4d::scene::{Camera, Time};
 
@@ -12,7 +12,7 @@ const LEAST_PIVOT: f64 = 1e-6;
 /// A number by layer and row, summed over the views at one time; all memory is reused.
 pub(super) struct Weighing {
     spatial: Spatial,
-    renderer: Renderer<f32>,
+    importance: Importance,
     instant: Evaluation<f32>,
     shares: Vec<f32>,
     changes: Vec<f32>,
@@ -25,10 +25,10 @@ pub(super) struct Weighing {
 
 impl Weighing {
     pub(super) fn new(spatial: Spatial, antialias: Antialias) -> Self {
-        let renderer = Renderer::new(RenderConfig { antialias, ..RenderConfig::default() });
+        let importance = Importance::new(RenderConfig { antialias, ..RenderConfig::default() });
         Self {
             spatial,
-            renderer,
+            importance,
             instant: Evaluation::default(),
             shares: Vec::new(),
             changes: Vec::new(),
@@ -60,17 +60,17 @@ impl Weighing {
         let shot = Shot::new(&splats, camera, scene.background);
         match self.spatial {
             Spatial::Share | Spatial::LightGaussian | Spatial::Opacity => {
-                self.renderer.contributions(&splats, camera, &mut self.shares);
+                self.importance.contributions(&splats, camera, &mut self.shares);
             }
             Spatial::Pup | Spatial::Speedy => {
-                self.renderer.sensitivities(&shot, &mut self.sensitivities);
+                self.importance.sensitivities(&shot, &mut self.sensitivities);
                 self.shares.clear();
                 self.shares.extend(self.sensitivities.iter().map(|s| s.squared as f32));
             }
-            Spatial::Change => self.renderer.removals(&shot, &mut self.shares),
+            Spatial::Change => self.importance.removals(&shot, &mut self.shares),
             Spatial::Both => {
-                self.renderer.removals(&shot, &mut self.changes);
-                self.renderer.last_contributions(&mut self.shares);
+                self.importance.removals(&shot, &mut self.changes);
+                self.importance.last_contributions(&mut self.shares);
                 for (share, change) in self.shares.iter_mut().zip(&self.changes) {
                     *share = (*share * *change).sqrt();
                 }
@@ -81,7 +81,7 @@ impl Weighing {
         let tapes = self.instant.tapes().zip(&mut self.layers).zip(&mut self.pixels);
         for (layer, ((tape, sums), pixels)) in tapes.enumerate() {
             let (rows, count) = (tape.rows(), tape.out().rows());
-            let projected = &self.renderer.projected()[first..first + count];
+            let projected = &self.importance.projected()[first..first + count];
             let seen =
                 self.shares[first..first + count].iter().zip(projected).enumerate().filter(|(_, (s, _))| **s > 0.0);
             for (j, (&share, projected)) in seen {

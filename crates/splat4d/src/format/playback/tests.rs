@@ -9,7 +9,7 @@ use super::page::{encode_page, parse_page};
 use super::*;
 use crate::layers::{Evaluation, Scene};
 use crate::math::{Rng, Se3, quat};
-use crate::render::{Image, RenderConfig, Renderer};
+use crate::render::{Image, RenderConfig, Renderer, Shot};
 use crate::scene::{Camera, Time};
 
 /// A file that version 1.0 of the writer made from [`tiny`], byte for byte.
@@ -228,7 +228,8 @@ fn picture(scene: &Scene<f32>, t: f64) -> Vec<f32> {
     let camera = Camera::with_fov_y(Se3::look_at([0.5, -1.0, -4.0], [0.0; 3], scene.up), 0.8, 96, 80);
     let (mut instant, mut image) = (Evaluation::default(), Image::default());
     scene.at(Time(t), &mut instant);
-    Renderer::new(RenderConfig::default()).render(&scene.splats(&instant), &camera, scene.background, None, &mut image);
+    Renderer::new(RenderConfig::default())
+        .render(&Shot::new(&scene.splats(&instant), &camera, scene.background), &mut image);
     image.color.data
 }
 

@@ -33,7 +33,7 @@ impl Headed {
 
     fn draw(&self, view: &Camera, background: [f64; 3]) -> Image<f64> {
         let mut out = Image::default();
-        Renderer::new(smooth()).render(&self.splats(), view, background, Some(&self.scene.extra), &mut out);
+        Renderer::new(smooth()).render(&shot(&self.splats(), view, background, Some(&self.scene.extra)), &mut out);
         out
     }
 }
@@ -43,11 +43,11 @@ fn pictures_with_a_head_equal_the_oracle() {
     // Odd sizes end in the middle of sixteen pixels and of eight rows.
     for (w, h) in [(1, 1), (17, 3), (33, 21), (64, 40)] {
         let (s, view) = (Headed::new(20, 0.3), camera(w, h));
-        let mut truth = oracle::render(&s.splats(), &view, BACKGROUND, Some(&s.scene.extra), &smooth());
+        let mut truth = oracle::render(&shot(&s.splats(), &view, BACKGROUND, Some(&s.scene.extra)), &smooth());
         let (worst, _) = difference(&s.draw(&view, BACKGROUND), &truth, 0.0);
         assert!(worst < F64_TOLERANCE, "{w}x{h}: {worst}");
         let mut plain = Image::default();
-        Renderer::new(smooth()).render(&s.splats(), &view, BACKGROUND, None, &mut plain);
+        Renderer::new(smooth()).render(&shot(&s.splats(), &view, BACKGROUND, None), &mut plain);
         assert_eq!((plain.extra.channels, plain.extra.data.len()), (0, 0), "the head's channels are its own");
         truth.extra = Planes::new(0, h, w);
         assert!(difference(&plain, &truth, 0.0).0 < F64_TOLERANCE);
@@ -66,7 +66,7 @@ fn the_network_is_a_matrix_product_a_pixel() {
         channels.write(n - s.scene.direct.rows() + j, 0, s.scene.direct.read::<FURTHER>(j, BASE));
     }
     let mut blended = Image::default();
-    Renderer::new(smooth()).render(&s.scene.splats(), &view, BACKGROUND, Some(&channels), &mut blended);
+    Renderer::new(smooth()).render(&shot(&s.scene.splats(), &view, BACKGROUND, Some(&channels)), &mut blended);
     let eye = view.center();
     let squashed = eye.map(|x| x / (1.0 + crate::math::se3::norm(eye)));
     for (x, y) in [(0, 0), (16, 9), (32, 20), (5, 14)] {
@@ -102,7 +102,7 @@ fn a_head_at_its_start_gives_the_picture_without_one() {
     }
     let view = camera(40, 33);
     let mut plain = Image::default();
-    Renderer::new(smooth()).render(&s.scene.splats(), &view, BACKGROUND, None, &mut plain);
+    Renderer::new(smooth()).render(&shot(&s.scene.splats(), &view, BACKGROUND, None), &mut plain);
     let got = s.draw(&view, BACKGROUND);
     let (mut inside, mut worst) = (0, 0.0f64);
     for (a, b) in got.color.data.iter().zip(&plain.color.data) {
@@ -123,9 +123,9 @@ fn every_gradient_of_a_head_equals_finite_differences() {
     let mut renderer = Renderer::new(smooth());
     let (mut out, mut d, mut own) = (Image::default(), RenderGrads::default(), s.scene.own.zeros_like());
     let extra = Some(&s.scene.extra);
-    renderer.render(&s.splats(), &view, BACKGROUND, extra, &mut out);
+    renderer.render(&shot(&s.splats(), &view, BACKGROUND, extra), &mut out);
     let mut d_sh = [Some(&mut own), None, None];
-    renderer.backward(&s.splats(), &view, BACKGROUND, extra, &loss.grads(), &mut d_sh, &mut d);
+    renderer.backward(&shot(&s.splats(), &view, BACKGROUND, extra), &loss.grads(), &mut d_sh, &mut d);
     let check = |pick: &dyn Fn(&mut Headed) -> &mut f64, got: f64, what: &str| {
         let mut moved = s.clone();
         *pick(&mut moved) += 1e-5;
@@ -166,8 +166,13 @@ fn every_gradient_of_a_head_equals_finite_differences() {
         close((at(1e-6) - at(-1e-6)) / 2e-6, d.camera[k], &format!("pose {k}"));
     }
     // A picture without a head leaves no gradient of one behind.
-    renderer.render(&s.scene.splats(), &view, BACKGROUND, extra, &mut out);
-    renderer.backward(&s.scene.splats(), &view, BACKGROUND, extra, &loss.grads(), &mut [None, None, None], &mut d);
+    renderer.render(&shot(&s.scene.splats(), &view, BACKGROUND, extra), &mut out);
+    renderer.backward(
+        &shot(&s.scene.splats(), &view, BACKGROUND, extra),
+        &loss.grads(),
+        &mut [None, None, None],
+        &mut d,
+    );
     assert!(d.head.is_none());
 }
 
@@ -185,14 +190,11 @@ fn a_head_gives_the_same_bits_for_any_threads() {
             let splats = Splats { head, ..scene.splats() };
             let (mut out, mut d) = (Image::default(), RenderGrads::default());
             let mut renderer = Renderer::new(complete());
-            renderer.render(&splats, &view, BACKGROUND.map(|b| b as f32), None, &mut out);
+            renderer.render(&shot(&splats, &view, BACKGROUND.map(|b| b as f32), None), &mut out);
             let color = out.color.clone();
             let grads = ImageGrads { color: &color, alpha: None, depth: None, extra: None };
             renderer.backward(
-                &splats,
-                &view,
-                BACKGROUND.map(|b| b as f32),
-                None,
+                &shot(&splats, &view, BACKGROUND.map(|b| b as f32), None),
                 &grads,
                 &mut [None, None, None],
                 &mut d,

@@ -11,7 +11,7 @@ use crate::train::tests::Made;
 use splat4d::layers::{Evaluation, Layer, LayerTape};
 use splat4d::math::Rng;
 use splat4d::motion::{SpacetimeSpec, Spec, build};
-use splat4d::render::{Image, RenderConfig, Renderer};
+use splat4d::render::{Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{Camera, GEOMETRY, LIFE, LifeKind, Params, Part, Rows, SH, Splats, Time};
 
@@ -59,7 +59,7 @@ fn drawn(scene: &Scene<f32>, frames: &dyn Frames, i: usize) -> Image<f32> {
     let (mut instant, mut image) = (Evaluation::default(), Image::default());
     scene.at(frames.time(i), &mut instant);
     let mut renderer = Renderer::new(RenderConfig::default());
-    renderer.render(&scene.splats(&instant), frames.camera(i), [0.1, 0.2, 0.3], None, &mut image);
+    renderer.render(&Shot::new(&scene.splats(&instant), frames.camera(i), [0.1, 0.2, 0.3]), &mut image);
     image
 }
 
@@ -213,7 +213,7 @@ fn interval_buckets_lose_nothing() {
             let parts: Vec<Part<'_, f32>> = s.layers.iter().zip(&tapes).map(|(l, tape)| l.part(tape)).collect();
             let (splats, mut image) = (Splats { parts, head: None }, Image::default());
             let mut renderer = Renderer::new(RenderConfig::default());
-            renderer.render(&splats, made.camera(i), [0.0; 3], None, &mut image);
+            renderer.render(&Shot::new(&splats, made.camera(i), [0.0; 3]), &mut image);
             (splats.len(), image)
         };
         let ((few, culled), (all, whole)) = (draw(false), draw(true));
