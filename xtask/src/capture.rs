@@ -1,6 +1,7 @@
 //! `capture`: draws the bundled capture with its poses, masks and ground truth; the same bits every time.
 
 use crate::camera::Camera;
+use crate::files::{png, write_file};
 use crate::metrics::Motion;
 use crate::picture::shade;
 use crate::raster::{Visibility, rasterize};
@@ -8,8 +9,7 @@ use crate::scene::{FPS, FRAMES, Frame, Stage};
 use crate::truth;
 use crate::vector::{V3, sin_cos, v3};
 use anyhow::{Context, Result, bail, ensure};
-use image::codecs::png::{CompressionType, FilterType, PngEncoder};
-use image::{ExtendedColorType, ImageEncoder};
+use image::ExtendedColorType;
 use jpeg_encoder::QuantizationTableType;
 use rayon::prelude::*;
 use serde_json::json;
@@ -158,15 +158,6 @@ fn encode(rgb: &[u8], mask: &[u8]) -> Result<(Vec<u8>, Vec<u8>)> {
     Ok((out, png(mask, WIDTH, HEIGHT, ExtendedColorType::L8)?))
 }
 
-/// A PNG file of `width` x `height` pixels; 16-bit samples in the machine's byte order.
-pub fn png(data: &[u8], width: usize, height: usize, color: ExtendedColorType) -> Result<Vec<u8>> {
-    let mut out = Vec::new();
-    let filter = if color == ExtendedColorType::L8 { FilterType::NoFilter } else { FilterType::Adaptive };
-    let encoder = PngEncoder::new_with_quality(&mut out, CompressionType::Level(9), filter);
-    encoder.write_image(data, width as u32, height as u32, color)?;
-    Ok(out)
-}
-
 fn write_truth(folder: &Path, camera: &Camera, seen: &Visibility, t: usize, frame: &Frame, next: &Frame) -> Result<()> {
     let bytes = |codes: Vec<u16>| -> Vec<u8> { codes.iter().flat_map(|c| c.to_ne_bytes()).collect() };
     let file = |kind: &str| folder.join(format!("truth/{kind}/{}_{t:04}.png", camera.name));
@@ -228,17 +219,6 @@ fn report(frames: &[(Vec<View>, Vec<V3>)]) {
     println!("held out {:8.2}   {:8.2}", held_out.coverage(), held_out.mean_psnr());
     let size = |kind: usize| frames.iter().flat_map(|(v, _)| v).map(|v| v.bytes[kind]).sum::<usize>() as f64 / 1e6;
     println!("images {:.2} MB, masks {:.2} MB", size(0), size(1));
-}
-
-/// Writes under a temporary name in the same folder, then renames; makes the folder if need be.
-pub fn write_file(path: &Path, bytes: &[u8]) -> Result<()> {
-    let place = || path.display().to_string();
-    if let Some(folder) = path.parent() {
-        std::fs::create_dir_all(folder).with_context(place)?;
-    }
-    let temporary = path.with_extension("part");
-    std::fs::write(&temporary, bytes).with_context(place)?;
-    std::fs::rename(&temporary, path).with_context(place)
 }
 
 #[cfg(test)]

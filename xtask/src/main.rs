@@ -2,6 +2,7 @@
 
 mod camera;
 mod capture;
+mod files;
 mod glb;
 mod light;
 mod material;
@@ -61,7 +62,7 @@ fn strip_character(arguments: &[String]) -> Result<()> {
     let bytes = std::fs::read(&paths[0]).with_context(|| paths[0].clone())?;
     let stripped = strip::strip(&glb::Glb::parse(&bytes)?, clips, drop)?.to_bytes();
     skin::Character::load(&glb::Glb::parse(&stripped)?).context("the stripped file cannot be read back")?;
-    capture::write_file(Path::new(&paths[1]), &stripped)?;
+    files::write_file(Path::new(&paths[1]), &stripped)?;
     println!("{}: {} KB, was {} KB", paths[1], stripped.len() / 1000, bytes.len() / 1000);
     Ok(())
 }

@@ -2,7 +2,7 @@
 //! every time. It is the static object of docs/benchmarks.md.
 
 use crate::camera::Camera;
-use crate::capture::{png, write_file};
+use crate::files::{png, write_file};
 use crate::glb::Glb;
 use crate::light::Light;
 use crate::material::KNIGHT;

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 /// The allowed order of a crate's top modules: a module may import those before it. Names that do not exist yet
 /// hold a place for what the design foresees.
-const ORDER: [(&str, &[&str]); 4] = [
+const ORDER: [(&str, &[&str]); 5] = [
     (
         "crates/splat4d",
         &[
@@ -20,7 +20,7 @@ const ORDER: [(&str, &[&str]); 4] = [
         // `methods`, which choose among them; `init` needs a model's plan; `eval` writes as safely as `train` does.
         &[
             "recipe", "event", "capture", "sampler", "optim", "loss", "learner", "upkeep", "methods", "init", "train",
-            "eval", "compress", "lab", "dynamics", "dist",
+            "eval", "compress", "dynamics", "dist",
         ],
     ),
     (
@@ -52,6 +52,7 @@ const ORDER: [(&str, &[&str]); 4] = [
             "main",
         ],
     ),
+    ("studies", &["cells", "study", "tables", "deformation", "lifting", "e00", "e01", "e02", "e03", "models", "main"]),
 ];
 
 /// What a module must not import although it stands before it: the design's first invariant.
@@ -75,7 +76,7 @@ const UNSAFE_FILES: [&str; 3] =
 /// Words that only the shells (the command and the chores) may say: libraries neither print nor exit nor look around.
 const SHELL_WORDS: [&str; 9] =
     ["println!", "eprintln!", "print!", "eprint!", "dbg!", "process::exit", "env::args", "env::var", "stdin()"];
-const SHELLS: [&str; 2] = ["crates/splat4d-cli/", "xtask/"];
+const SHELLS: [&str; 3] = ["crates/splat4d-cli/", "studies/", "xtask/"];
 
 /// Words that `splat4d` may not say: it reads bytes, not paths.
 const PATH_WORDS: [&str; 3] = ["std::fs", "std::path", "File::open"];
@@ -95,7 +96,7 @@ const DOCS: [&str; 10] = [
 ];
 
 /// Folders of the repository that a path in a document begins with.
-const ROOTS: [&str; 5] = ["crates/", "docs/", "examples/", "xtask/", ".ci/"];
+const ROOTS: [&str; 6] = ["crates/", "docs/", "examples/", "studies/", "xtask/", ".ci/"];
 
 /// Named in a document, and made by hand at release. Drop a line once its file is there.
 const PENDING: [&str; 0] = [];
@@ -137,7 +138,7 @@ fn files(folder: &str, ending: &str) -> Vec<String> {
 }
 
 fn sources() -> Vec<String> {
-    [files("crates", "rs"), files("xtask", "rs")].concat()
+    [files("crates", "rs"), files("studies", "rs"), files("xtask", "rs")].concat()
 }
 
 fn read(path: &str) -> String {
@@ -157,7 +158,7 @@ fn code(text: &str) -> Vec<(usize, String)> {
     let lines: Vec<&str> = text.lines().collect();
     for (i, line) in lines.iter().enumerate() {
         let next = lines.get(i + 1).map_or("", |l| l.trim_start());
-        if line.starts_with("#[cfg(test)]") && next.starts_with("mod ") && next.ends_with('{') {
+        if line.starts_with("#[cfg(test)]") && next.contains("mod ") && next.ends_with('{') {
             break;
         }
         let bare = line.split("//").next().unwrap_or("");
@@ -340,7 +341,8 @@ fn paths_in_documents_exist() {
 fn the_code_map_is_complete() {
     let map = read("ARCHITECTURE.md");
     let mut troubles = Vec::new();
-    for manifest in files("crates", "toml").into_iter().filter(|p| p.ends_with("/Cargo.toml")) {
+    let manifests = [files("crates", "toml"), files("studies", "toml")].concat();
+    for manifest in manifests.into_iter().filter(|p| p.ends_with("/Cargo.toml")) {
         let src = manifest.replace("Cargo.toml", "src/");
         for path in files(&src, "rs").into_iter().filter(|p| !is_test(p)) {
             let inside = path.strip_prefix(&src).expect("it lies below");
@@ -358,7 +360,7 @@ fn the_code_map_is_complete() {
 /// Long flags that the command declares: `long`, `long = "x"` and aliases in `#[arg(...)]`, with the field's name.
 fn declared_flags() -> BTreeSet<String> {
     let mut flags: BTreeSet<String> = ["--help", "--version"].map(str::to_owned).into();
-    for path in files("crates/splat4d-cli/src", "rs") {
+    for path in [files("crates/splat4d-cli/src", "rs"), files("studies/src", "rs")].concat() {
         let text = read(&path);
         for (at, _) in text.match_indices("#[arg(") {
             let end = at + text[at..].find(")]").expect("an attribute ends");
@@ -412,4 +414,63 @@ fn flags_in_documents_exist() {
         }
     }
     report(troubles, "Write the flag as `splat4d VERB --help` shows it.");
+}
+
+/// Where a motion model may be told by its name or its spec: the list and the models' own files, and how each is learnt.
+const MODEL_ROOMS: [&str; 2] = ["crates/splat4d/src/motion/", "crates/splat4d-train/src/methods/"];
+/// Besides these, each with its reason.
+const MODEL_NAMES: [(&str, &str); 2] = [
+    ("crates/splat4d/src/layers/chart.rs", "turns one model into another"),
+    ("crates/splat4d/src/layers/turn.rs", "turns the tables of each model"),
+];
+
+/// Names and variants of the list of motion models: lines like `Still = "still" => ...`.
+fn models() -> Vec<(String, String)> {
+    let list = read("crates/splat4d/src/motion/mod.rs");
+    let entry = |line: &str| {
+        let (head, rest) = line.trim().split_once(" = \"")?;
+        let (name, _) = rest.split_once("\" => ")?;
+        let variant = head.split('(').next()?;
+        Some((variant.to_owned(), name.to_owned()))
+    };
+    list.lines().filter_map(entry).collect()
+}
+
+/// Whether a line matches on one of the models: a pattern or a comparison, not the making of one.
+fn asks_which_model(line: &str, variant: &str, name: &str) -> bool {
+    let name = format!("\"{name}\"");
+    let compared = ["== ", "!= "].iter().any(|op| line.contains(&format!("{op}{name}")));
+    let behind = line.split(&name).skip(1).any(|rest| rest.trim_start().starts_with(['|', '=']));
+    let spec = format!("Spec::{variant}");
+    let told = line.split(&spec).skip(1).any(|rest| !rest.starts_with(is_word));
+    compared || behind || told
+}
+
+/// A new motion model is its own files and its entries: nobody else may ask which one it is. Capabilities answer what
+/// others need to know.
+#[test]
+fn nobody_asks_which_motion_model_it_is() {
+    let models = models();
+    assert!(models.len() >= 9, "the list of models is not read: {models:?}");
+    assert!(asks_which_model("if r.motion == \"still\" {", "Still", "still"));
+    assert!(asks_which_model("\"still\" | \"x\" => 1,", "Still", "still"));
+    assert!(asks_which_model("Spec::Still => 1,", "Still", "still"));
+    assert!(!asks_which_model("Recipe { motion: \"still\".into() }", "Still", "still"));
+    let mut troubles = Vec::new();
+    let mut used = BTreeSet::new();
+    let products = sources().into_iter().filter(|p| p.contains("/src/") && !is_test(p));
+    for path in products.filter(|p| !MODEL_ROOMS.iter().any(|room| p.starts_with(room))) {
+        for (number, line) in code(&read(&path)) {
+            let which = models.iter().find(|(variant, name)| asks_which_model(&line, variant, name));
+            let Some((_, name)) = which else { continue };
+            match MODEL_NAMES.iter().find(|(file, _)| *file == path) {
+                Some((file, _)) => drop(used.insert(*file)),
+                None => troubles.push(format!("{path}:{number}: asks whether a model is `{name}`")),
+            }
+        }
+    }
+    troubles.extend(
+        MODEL_NAMES.iter().filter(|(file, _)| !used.contains(file)).map(|(f, _)| format!("{f}: no exemption needed")),
+    );
+    report(troubles, "Ask for a capability (`Motion::capabilities`, `Program`) and not for a name.");
 }

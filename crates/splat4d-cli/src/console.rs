@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 /// How much is said.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) enum Loudness {
+pub enum Loudness {
     /// Warnings and errors only.
     Quiet,
     /// Progress and results.
@@ -27,7 +27,7 @@ const BAR_RATE: u8 = 8;
 
 /// The one place that prints.
 #[derive(Debug)]
-pub(crate) struct Console {
+pub struct Console {
     loudness: Loudness,
     json: bool,
     terminal: bool,
@@ -45,7 +45,7 @@ struct State {
 }
 
 impl Console {
-    pub(crate) fn new(loudness: Loudness, json: bool) -> Self {
+    pub fn new(loudness: Loudness, json: bool) -> Self {
         let terminal = std::io::stderr().is_terminal() && std::env::var_os("TERM").is_none_or(|t| t != "dumb");
         Self { loudness, json, terminal, state: RefCell::default() }
     }
@@ -61,7 +61,7 @@ impl Console {
     }
 
     /// A result, on stdout; not with `--json`, not when quiet.
-    pub(crate) fn say(&self, text: &str) {
+    pub fn say(&self, text: &str) {
         if !self.json && self.loudness > Loudness::Quiet {
             self.above_bar(|| print(text));
         }
@@ -80,14 +80,14 @@ impl Console {
     }
 
     /// One JSON line; only with `--json`.
-    pub(crate) fn emit(&self, value: &Value) {
+    pub fn emit(&self, value: &Value) {
         if self.json {
             print(&value.to_string());
         }
     }
 
     /// A file was written.
-    pub(crate) fn written(&self, path: &std::path::Path) {
+    pub fn written(&self, path: &std::path::Path) {
         self.say(&format!("wrote {}", path.display()));
         self.emit(&json!({"type": "written", "path": path}));
     }
@@ -108,7 +108,7 @@ impl Console {
     }
 
     /// The same, but of progress: not when quiet, not with `--json`.
-    pub(crate) fn note(&self, text: &str) {
+    pub fn note(&self, text: &str) {
         if !self.json && self.loudness > Loudness::Quiet {
             self.aside(text);
         }
@@ -129,7 +129,7 @@ impl Console {
     }
 
     /// Shows an event of the trainer.
-    pub(crate) fn event(&self, event: &Event) {
+    pub fn event(&self, event: &Event) {
         if let Event::Warning { message } = event {
             return self.warn(message);
         }
@@ -195,7 +195,7 @@ impl Console {
     }
 
     /// Progress of a preparation or of rendering.
-    pub(crate) fn phase(&self, name: &str, done: usize, total: usize) {
+    pub fn phase(&self, name: &str, done: usize, total: usize) {
         if self.json {
             return self.emit(&json!({"type": "phase", "name": name, "done": done, "total": total}));
         }
@@ -238,7 +238,7 @@ impl Console {
     }
 
     /// Ends the bar.
-    pub(crate) fn clear(&self) {
+    pub fn clear(&self) {
         let mut state = self.state.borrow_mut();
         if let Some(bar) = state.bar.take() {
             bar.finish_and_clear();

@@ -115,7 +115,7 @@ impl<'a> Painter<'a> {
 }
 
 /// As recipes say it, for the renderer.
-pub(crate) fn antialias(on: bool) -> Antialias {
+pub fn antialias(on: bool) -> Antialias {
     if on { Antialias::On } else { Antialias::Off }
 }
 

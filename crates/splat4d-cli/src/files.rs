@@ -10,7 +10,7 @@ pub(crate) const WRITE_REMEDY: &str =
     "Check that the folder exists, that you may write there and that the disk is not full.";
 
 /// Writes a file: to a temporary name in the same folder, then renamed. Devices and pipes are written directly.
-pub(crate) fn write(path: &Path, bytes: &[u8]) -> Result<()> {
+pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
     let out = Output::new(path)?;
     let fail = |e| cannot_write(path, e);
     let mut file = std::fs::File::create(out.path()).map_err(fail)?;
@@ -21,24 +21,24 @@ pub(crate) fn write(path: &Path, bytes: &[u8]) -> Result<()> {
 }
 
 /// Makes a folder and its parents.
-pub(crate) fn make_folder(path: &Path) -> Result<()> {
+pub fn make_folder(path: &Path) -> Result<()> {
     std::fs::create_dir_all(path).map_err(|e| Error::io("the folder cannot be made", e).at(path.display())).map_err(
         |e| e.remedy("Choose another place with -o: one where you may write, below a folder and not below a file."),
     )
 }
 
 /// The error of a failed write.
-pub(crate) fn cannot_write(path: &Path, error: std::io::Error) -> Error {
+pub fn cannot_write(path: &Path, error: std::io::Error) -> Error {
     Error::io("cannot be written", error).at(path.display()).remedy(WRITE_REMEDY)
 }
 
 /// Reads a text file.
-pub(crate) fn read_text(path: &Path) -> Result<String> {
+pub fn read_text(path: &Path) -> Result<String> {
     std::fs::read_to_string(path).map_err(|e| cannot_read(path, e))
 }
 
 /// The error of a failed read.
-pub(crate) fn cannot_read(path: &Path, error: std::io::Error) -> Error {
+pub fn cannot_read(path: &Path, error: std::io::Error) -> Error {
     Error::io("cannot be read", error).at(path.display()).remedy("Check that the file exists and may be read by you.")
 }
 
@@ -110,7 +110,7 @@ pub(crate) fn base64(bytes: &[u8]) -> String {
 }
 
 /// Tells two contents apart, in 16 hexadecimal digits: FNV-1a, against mistakes and not against malice.
-pub(crate) fn fingerprint(bytes: impl AsRef<[u8]>) -> String {
+pub fn fingerprint(bytes: impl AsRef<[u8]>) -> String {
     const OFFSET: u64 = 0xcbf2_9ce4_8422_2325;
     const PRIME: u64 = 0x0000_0100_0000_01b3;
     let h = bytes.as_ref().iter().fold(OFFSET, |h, b| (h ^ u64::from(*b)).wrapping_mul(PRIME));
@@ -118,7 +118,7 @@ pub(crate) fn fingerprint(bytes: impl AsRef<[u8]>) -> String {
 }
 
 /// `1.5 GiB` for people.
-pub(crate) fn human_bytes(bytes: u64) -> String {
+pub fn human_bytes(bytes: u64) -> String {
     const UNITS: [&str; 5] = ["B", "KiB", "MiB", "GiB", "TiB"];
     let mut value = bytes as f64;
     let mut unit = 0;
@@ -151,7 +151,7 @@ pub(crate) fn parse_bytes(text: &str) -> Result<u64, String> {
 }
 
 /// `1:23` or `1:02:03`.
-pub(crate) fn human_seconds(seconds: f64) -> String {
+pub fn human_seconds(seconds: f64) -> String {
     let s = seconds.max(0.0).round() as u64;
     if s >= 3600 {
         format!("{}:{:02}:{:02}", s / 3600, s / 60 % 60, s % 60)
@@ -161,7 +161,7 @@ pub(crate) fn human_seconds(seconds: f64) -> String {
 }
 
 /// `30,000`
-pub(crate) fn grouped(n: usize) -> String {
+pub fn grouped(n: usize) -> String {
     let digits = n.to_string();
     let mut out = String::new();
     for (i, c) in digits.chars().enumerate() {

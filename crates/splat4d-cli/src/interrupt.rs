@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 const ENDED_BY_INTERRUPT: i32 = 130;
 
 /// A flag that the first Ctrl-C (or SIGTERM) raises. `first` is then said on stderr.
-pub(crate) fn flag(first: &'static str) -> Arc<AtomicBool> {
+pub fn flag(first: &'static str) -> Arc<AtomicBool> {
     let flag = Arc::new(AtomicBool::new(false));
     let raised = flag.clone();
     // Where no handler can be set, Ctrl-C simply ends the program; checkpoints on disk stay valid.

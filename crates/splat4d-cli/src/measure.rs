@@ -21,7 +21,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 /// Width and height of the pictures unless told: the frame rates of docs/benchmarks.md are at this size.
-pub(crate) const SIZE: [usize; 2] = [800, 800];
+pub const SIZE: [usize; 2] = [800, 800];
 /// Pictures of a round: enough that every side of the scene and all parts of the clip take part.
 const LOOKS: usize = 24;
 /// Rounds of which the best of every picture counts, after one that makes room.
@@ -34,7 +34,7 @@ const COUNTED: usize = 300;
 /// One side of a comparison. Its JSON is part of `compress.json` and of what `bench --playback` prints.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
-pub(crate) struct Side {
+pub struct Side {
     pub gaussians: usize,
     /// Gaussians alive (and admitted by masks) at a frame of the clip, mean and most.
     pub active_mean: f64,
@@ -66,7 +66,7 @@ pub(crate) struct Side {
 
 impl Side {
     /// Takes over the scores of an evaluation.
-    pub(crate) fn scored(mut self, evaluation: &Scores) -> Self {
+    pub fn scored(mut self, evaluation: &Scores) -> Self {
         [self.psnr, self.ssim, self.psnr_dynamic, self.flicker] =
             ["PSNR", "SSIM", "PSNR-dynamic", "flicker"].map(|name| evaluation.held(name));
         self.psnr_train = evaluation.train("PSNR");
@@ -74,7 +74,7 @@ impl Side {
     }
 
     /// Takes over the newest scores that a run's files hold.
-    pub(crate) fn scored_by(mut self, run: &Run) -> Self {
+    pub fn scored_by(mut self, run: &Run) -> Self {
         [self.psnr, self.ssim, self.psnr_dynamic, self.flicker] =
             ["PSNR", "SSIM", "PSNR-dynamic", "flicker"].map(|name| run.score(name));
         let train = run.all_results.get("train").and_then(Value::as_object);
@@ -86,7 +86,7 @@ impl Side {
 
 /// What is measured.
 #[derive(Clone, Debug)]
-pub(crate) enum What<'a> {
+pub enum What<'a> {
     /// A scene in memory, with its 32-bit floats; played as it is.
     Scene(&'a Scene<f32>),
     /// The bytes of a playback file; played page by page.
@@ -95,14 +95,14 @@ pub(crate) enum What<'a> {
 
 /// What is measured, and how it must be drawn.
 #[derive(Clone, Debug)]
-pub(crate) struct Subject<'a> {
+pub struct Subject<'a> {
     pub what: What<'a>,
     pub antialias: Antialias,
 }
 
 /// A camera and a time.
 #[derive(Clone, Debug)]
-pub(crate) struct Look {
+pub struct Look {
     pub camera: Camera,
     pub time: Time,
 }
@@ -121,7 +121,7 @@ pub(crate) fn looks_of(source: &Source, size: [usize; 2]) -> Result<Vec<Look>> {
 
 /// Moments in the middle of equal parts of the clip, each from another camera: pictures of this size with the camera's
 /// vertical field of view. Panics: no views.
-pub(crate) fn looks(views: &[View], clip: [f64; 2], [width, height]: [usize; 2]) -> Vec<Look> {
+pub fn looks(views: &[View], clip: [f64; 2], [width, height]: [usize; 2]) -> Vec<Look> {
     let mut seen = BTreeSet::new();
     let cameras: Vec<&Camera> = views.iter().filter(|v| seen.insert(v.name.as_str())).map(|v| &v.camera).collect();
     let step = stride(cameras.len());
@@ -152,11 +152,7 @@ fn stride(cameras: usize) -> usize {
 /// Panics: no looks.
 ///
 /// Errors: those of the file.
-pub(crate) fn in_turns(
-    subjects: &[Subject<'_>],
-    looks: &[Look],
-    progress: &mut dyn FnMut(usize, usize),
-) -> Result<Vec<Side>> {
+pub fn in_turns(subjects: &[Subject<'_>], looks: &[Look], progress: &mut dyn FnMut(usize, usize)) -> Result<Vec<Side>> {
     assert!(!looks.is_empty(), "a measurement needs something to look at");
     let mut seats = subjects.iter().map(|s| Seat::new(s, looks.len())).collect::<Result<Vec<_>>>()?;
     let total = DECODES + ROUNDS + 1;

@@ -42,7 +42,7 @@ const OURS: [&str; 19] = [
 
 /// One row of `metrics.csv`.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Metrics {
+pub struct Metrics {
     pub iteration: f64,
     pub loss: f64,
     pub psnr: f64,
@@ -57,7 +57,7 @@ pub(crate) struct Metrics {
 
 /// The scores of one held-out view.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct ViewScore {
+pub struct ViewScore {
     /// `00000.png`
     pub file: String,
     pub camera: Option<String>,
@@ -67,7 +67,7 @@ pub(crate) struct ViewScore {
 
 /// A run folder's files.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Run {
+pub struct Run {
     pub path: PathBuf,
     /// `recipe.toml`
     pub recipe: Option<String>,
@@ -94,12 +94,12 @@ impl Run {
     }
 
     /// Whether this run has trained to its end.
-    pub(crate) fn is_finished(path: &Path) -> bool {
+    pub fn is_finished(path: &Path) -> bool {
         path.join("scene.safetensors").is_file()
     }
 
     /// Reads the folder. Errors: it is no run; a file in it is damaged.
-    pub(crate) fn open(path: &Path) -> Result<Self> {
+    pub fn open(path: &Path) -> Result<Self> {
         if !path.exists() {
             return Err(Error::input("there is no such run")
                 .at(path.display())
@@ -160,14 +160,14 @@ impl Run {
     }
 
     /// The capture's name.
-    pub(crate) fn name(&self) -> String {
+    pub fn name(&self) -> String {
         let told = self.info.get("capture_name").and_then(Value::as_str).map(str::to_owned);
         let folder = || self.path.file_name().map(|n| n.to_string_lossy().into_owned());
         told.or_else(folder).unwrap_or_else(|| "run".into())
     }
 
     /// A number of `run.json`.
-    pub(crate) fn number(&self, key: &str) -> Option<f64> {
+    pub fn number(&self, key: &str) -> Option<f64> {
         self.info.get(key).and_then(Value::as_f64)
     }
 
@@ -178,7 +178,7 @@ impl Run {
     }
 
     /// The recipe.
-    pub(crate) fn recipe(&self) -> Result<Recipe> {
+    pub fn recipe(&self) -> Result<Recipe> {
         let path = self.path.join("recipe.toml");
         let text = self.recipe.as_deref().ok_or_else(|| {
             Error::input("the run has no recipe.toml")
@@ -189,7 +189,7 @@ impl Run {
     }
 
     /// Steps taken, where something tells.
-    pub(crate) fn iteration(&self) -> Option<usize> {
+    pub fn iteration(&self) -> Option<usize> {
         let told = self.number("iteration").map(|n| n as usize);
         told.or(self.iteration).or_else(|| self.metrics.last().map(|m| m.iteration as usize))
     }
@@ -236,7 +236,7 @@ impl Run {
     }
 
     /// The newest scene: `scene.safetensors`, or else the newest checkpoint.
-    pub(crate) fn scene_file(&self) -> Result<PathBuf> {
+    pub fn scene_file(&self) -> Result<PathBuf> {
         let scene = self.path.join("scene.safetensors");
         if scene.is_file() {
             return Ok(scene);
@@ -249,13 +249,13 @@ impl Run {
     }
 
     /// Opens the capture again, as the run saw it.
-    pub(crate) fn open_capture(&self) -> Result<(Capture, Recipe)> {
+    pub fn open_capture(&self) -> Result<(Capture, Recipe)> {
         let (recipe, capture) = splat4d_train::train::run::open_run(&self.path)?;
         Ok((capture, recipe))
     }
 
     /// The cameras of the data set: from `cameras.json`, or else from the capture.
-    pub(crate) fn views(&self) -> Result<Vec<View>> {
+    pub fn views(&self) -> Result<Vec<View>> {
         let file = self.path.join("cameras.json");
         if file.is_file() {
             let value = crate::camera_file::json(&read_text(&file)?).map_err(|e| e.at(file.display()))?;
@@ -342,7 +342,7 @@ pub(crate) fn free_folder(wanted: &Path) -> PathBuf {
 }
 
 /// Removes what splat4d wrote into a run, and nothing else.
-pub(crate) fn clear(run: &Path) -> Result<()> {
+pub fn clear(run: &Path) -> Result<()> {
     for name in OURS {
         let path = run.join(name);
         let removed = if path.is_dir() && !path.is_symlink() {

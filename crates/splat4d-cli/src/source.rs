@@ -184,13 +184,13 @@ fn open_sequence(path: &Path, fps: f64) -> Result<Source> {
 }
 
 /// Reads a scene file.
-pub(crate) fn read_scene(path: &Path) -> Result<Scene<f32>> {
+pub fn read_scene(path: &Path) -> Result<Scene<f32>> {
     let bytes = std::fs::read(path).map_err(|e| cannot_read(path, e))?;
     format::scene::read(&bytes).map_err(|e| e.at(path.display()))
 }
 
 /// Refuses a scene without Gaussians.
-pub(crate) fn not_empty(scene: &Scene<f32>, path: &Path) -> Result<()> {
+pub fn not_empty(scene: &Scene<f32>, path: &Path) -> Result<()> {
     if scene.is_empty() {
         return Err(Error::input("holds no Gaussians")
             .at(path.display())

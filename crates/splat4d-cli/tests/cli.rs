@@ -6,8 +6,6 @@ mod bench;
 mod compress;
 #[path = "cli/convert.rs"]
 mod convert;
-#[path = "cli/lab.rs"]
-mod lab;
 #[path = "cli/sample.rs"]
 mod sample;
 
@@ -44,8 +42,7 @@ fn json_of(path: &Path) -> Value {
 #[test]
 fn help_teaches_and_completions_complete() {
     let help = splat4d(&["--help"]).run().ok();
-    for verb in ["train", "eval", "render", "bake", "view", "export", "convert", "info", "bench", "lab", "completions"]
-    {
+    for verb in ["train", "eval", "render", "bake", "view", "export", "convert", "info", "bench", "completions"] {
         assert!(help.contains(verb), "{verb} is missing");
         let own = splat4d(&[verb, "--help"]).run().ok();
         assert!(own.contains("Examples:") && own.contains(&format!("splat4d {verb}")), "{verb} --help teaches nothing");
@@ -54,6 +51,8 @@ fn help_teaches_and_completions_complete() {
     for knob in ["position_lr_init", "densify_until_iter", "lambda_dssim", "max_cap"] {
         assert!(train.contains(knob), "{knob} is missing");
     }
+    // The studies are a program of their own.
+    assert!(splat4d(&["lab", "e00"]).run().refused().contains("lab"));
     for shell in ["bash", "zsh", "fish"] {
         assert!(splat4d(&["completions", shell]).run().ok().contains("image-memory"), "{shell}");
     }

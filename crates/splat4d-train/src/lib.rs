@@ -7,7 +7,6 @@ pub mod compress;
 pub mod eval;
 pub mod event;
 pub mod init;
-pub mod lab;
 pub mod learner;
 pub mod loss;
 pub mod methods;

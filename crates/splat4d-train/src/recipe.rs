@@ -715,8 +715,7 @@ impl Recipe {
 
 /// What `motion` may be: the models that train by themselves, and the choice among them.
 fn known_motions() -> Vec<&'static str> {
-    let own = splat4d::motion::BUILT_IN.into_iter().filter(|m| *m != "filtered");
-    std::iter::once("auto").chain(own).collect()
+    std::iter::once("auto").chain(splat4d::motion::MODELS.iter().copied()).collect()
 }
 
 /// The known name closest to `name` (Damerau-free Levenshtein), if it is close enough to be meant.

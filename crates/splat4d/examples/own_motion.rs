@@ -2,7 +2,7 @@
 //!
 //! `cargo run --release -p splat4d --example own_motion [FOLDER]` checks its gradient, draws it at several times and, if a
 //! folder is given, writes the pictures there. Nothing else has to know the model: layers, the renderer, densification
-//! and training only call the trait.
+//! and training only call the trait (`tests/own_motion.rs` of `splat4d-train` trains it, bakes it and plays the file).
 
 use splat4d::layers::{Evaluation, Layer, Scene};
 use splat4d::math::sh::rgb_to_dc;
@@ -17,7 +17,7 @@ use std::f64::consts::TAU;
 use std::sync::Arc;
 
 /// Immutable, like every model: plain data and the keys of its tables. What it learns lies in the layer's parameters.
-struct Sway {
+pub struct Sway {
     /// Seconds of one swing.
     period: f64,
     /// [N, 3], scene units.
@@ -25,7 +25,8 @@ struct Sway {
 }
 
 impl Sway {
-    fn new<F: Real>(period: f64, p: &mut Params<F>) -> splat4d::Result<Self> {
+    /// Makes or claims the model's table in `p`.
+    pub fn new<F: Real>(period: f64, p: &mut Params<F>) -> splat4d::Result<Self> {
         // One constructor for a fresh scene and for a loaded one: `entry` claims the array of this name, if there is one.
         let rows = p.len();
         let amplitudes = p.entry("amplitudes", Space::Gaussians, &[("amplitudes", 3)], rows, |_| {})?;
@@ -40,6 +41,10 @@ impl Sway {
 impl<F: Real> Motion<F> for Sway {
     fn spec(&self) -> Spec {
         Spec::Custom("sway".into())
+    }
+
+    fn scratch_bytes(&self, _p: &Params<F>, _rows: usize) -> u64 {
+        0
     }
 
     /// Row `id` of the parameters becomes a splat: mean 3, covariance 6, opacity 1.
@@ -82,7 +87,7 @@ impl<F: Real> Motion<F> for Sway {
 }
 
 /// A field of grass-like blobs; those further up sway more.
-fn scene() -> splat4d::Result<Scene<f32>> {
+pub fn scene() -> splat4d::Result<Scene<f32>> {
     const ROWS: usize = 400;
     let mut params = Params::<f32>::new(ROWS, 1, LifeKind::Infinite.columns());
     let motion = Sway::new(2.0, &mut params)?;

@@ -8,7 +8,7 @@ use serde_json::Value;
 use splat4d::format::playback::{self, Draft, Meta, NamedCamera, Node, Primitive, Viewpoint, WriteConfig};
 use splat4d::layers::{ALPHA_MIN, Evaluation, Layer, Scene};
 use splat4d::math::{Rng, Se3, quat, sh};
-use splat4d::motion::{Spacetime, SpacetimeSpec, Spec, Still};
+use splat4d::motion::{Spacetime, SpacetimeSpec, Still};
 use splat4d::render::{Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{Camera, GEOMETRY, LIFE, LifeKind, Params, SH, Time};
@@ -177,11 +177,10 @@ fn primitive(layer: &Layer<f32>, row: usize) -> Result<Primitive, String> {
     let geometry = &p[GEOMETRY];
     let column = |name: &str| p.find(name).map(|k| &p[k]).filter(|t| t.width() > 0);
     let (velocities, rates) = (column("velocities"), column("rotation_rates"));
-    let origin = match layer.motion.spec() {
-        Spec::Still => 0.0,
-        Spec::Spacetime(s) if s.order <= 1 => s.origin,
-        other => return Err(format!("{} of this kind is not a straight line", other.name())),
+    let Some(path) = layer.motion.polynomial().filter(|path| path.order <= 1) else {
+        return Err(format!("{} of this kind is not a straight line", layer.motion.spec().name()));
     };
+    let origin = path.origin;
     let life = &p[LIFE];
     let (center, half_width, softness) = match layer.life {
         LifeKind::Infinite => (origin, f64::INFINITY, 1.0),

@@ -6,6 +6,8 @@
 //! Everything that is fast goes through here: this is the one file of the workspace that says `unsafe`.
 #![allow(unsafe_code)] // calling a function that enables a target feature, after that feature was found present
 
+use std::sync::atomic::{AtomicU8, Ordering};
+
 /// An instruction level; a level that the machine lacks is lowered to the best that it has.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Simd {
@@ -17,9 +19,26 @@ pub enum Simd {
     Avx512,
 }
 
+/// The level above which [`Simd::detect`] answers nothing.
+static LIMIT: AtomicU8 = AtomicU8::new(Simd::Avx512 as u8);
+
 impl Simd {
-    /// The best level of this machine.
+    /// Lowers what [`detect`](Self::detect) answers from now on, in the whole process: tests and measurements of what lesser
+    /// machines compute. Matrix products (`nn::matmul`) choose their instructions themselves.
+    pub fn limit(level: Self) {
+        LIMIT.store(level as u8, Ordering::Relaxed);
+    }
+
+    /// The best level of this machine, at most [`limit`](Self::limit).
     pub fn detect() -> Self {
+        match LIMIT.load(Ordering::Relaxed) {
+            0 => Simd::Scalar,
+            1 => Self::of_machine().min(Simd::Avx2),
+            _ => Self::of_machine(),
+        }
+    }
+
+    fn of_machine() -> Self {
         #[cfg(target_arch = "x86_64")]
         {
             let avx2 = is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");

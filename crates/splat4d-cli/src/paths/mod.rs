@@ -21,7 +21,7 @@ pub(crate) struct Shot {
 
 /// A camera of the data set that the scene was trained on.
 #[derive(Clone, Debug)]
-pub(crate) struct View {
+pub struct View {
     /// The camera.
     pub camera: Camera,
     /// The camera's name in the data set.

@@ -19,7 +19,7 @@ const COLORS: usize = 6;
 type Points = Vec<(f64, f64)>;
 
 /// One curve.
-pub(crate) struct Series {
+pub struct Series {
     /// Shown in the legend; empty: none.
     pub name: String,
     /// (x, y), x rising.
@@ -138,7 +138,7 @@ const STYLE: &str = "svg{--c0:#b4501e;--c1:#2463a8;--c2:#3d8a4d;--c3:#8a56ac;--c
 const NAME: f64 = 118.0;
 
 /// The same curves as a file of their own, with a mark at every point and the names below.
-pub(crate) fn file(series: &[Series], x_label: &str, unit: &str) -> Option<String> {
+pub fn file(series: &[Series], x_label: &str, unit: &str) -> Option<String> {
     let page = lines(series, x_label, unit)?;
     let svg = page
         .split_inclusive("</svg>")

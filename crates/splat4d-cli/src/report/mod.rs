@@ -2,7 +2,7 @@
 //! truth and error, curves, scores by camera and time, timings, memory, findings, the recipe and how to do it again.
 //! It is made from the run folder's files alone; what is missing there is missing in the page.
 
-pub(crate) mod chart;
+pub mod chart;
 pub(crate) mod compress;
 mod pictures;
 

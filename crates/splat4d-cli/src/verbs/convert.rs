@@ -9,7 +9,6 @@ use serde_json::json;
 use splat4d::format::{self, Dialect, Warnings, dialect, ply, spz};
 use splat4d::layers::{ALWAYS, Scene, freeze, rotation_between};
 use splat4d::math::Se3;
-use splat4d::motion::Spec;
 use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::scene::{Camera, LifeKind, Params, Time};
 use splat4d::{Error, ErrorKind, Result};
@@ -329,7 +328,7 @@ fn rotated(camera: Camera, r: &[[f64; 3]; 3]) -> Camera {
 }
 
 fn is_moving(scene: &Scene<f32>) -> bool {
-    scene.layers.iter().any(|l| l.motion.spec() != Spec::Still || l.life != LifeKind::Infinite || l.span != ALWAYS)
+    scene.layers.iter().any(|l| l.motion.capabilities().moves || l.life != LifeKind::Infinite || l.span != ALWAYS)
 }
 
 /// A scene that stands still as `scene` does at `time`.

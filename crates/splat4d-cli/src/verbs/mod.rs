@@ -8,7 +8,6 @@ pub(crate) mod convert;
 pub(crate) mod eval;
 pub(crate) mod export;
 pub(crate) mod info;
-pub(crate) mod lab;
 pub(crate) mod render;
-pub(crate) mod train;
+pub mod train;
 pub(crate) mod view;

@@ -36,7 +36,7 @@ poses_bounds.npy (N3DV). `splat4d info CAPTURE` checks one. `--help` lists every
 /// Train a scene from a capture, then measure it, film it and write a report
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, after_long_help = long_help())]
-pub(crate) struct Args {
+pub struct Args {
     /// The capture: a folder, or its marker file
     #[arg(value_name = "CAPTURE", required_unless_present_any = ["resume", "source"])]
     capture: Option<PathBuf>,
@@ -106,7 +106,7 @@ pub(crate) struct Args {
     _eval: bool,
 }
 
-pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
+pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     args.measure.check()?;
     if !args.view && args.place.is_told() {
         return Err(Error::input("--port, --host and --no-open belong to --view").remedy("Add --view.").into());

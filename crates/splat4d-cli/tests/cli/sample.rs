@@ -12,6 +12,12 @@ const CAMERAS: usize = 4;
 const FRAMES: usize = 4;
 const SIZE: [u32; 2] = [32, 24];
 
+/// The program that is tested: the command, or the studies, which share this file.
+const PROGRAM: Option<&str> = match option_env!("CARGO_BIN_EXE_splat4d") {
+    Some(program) => Some(program),
+    None => option_env!("CARGO_BIN_EXE_studies"),
+};
+
 /// What is written, and how it is spoilt.
 pub struct Capture {
     folder: PathBuf,
@@ -139,7 +145,7 @@ pub struct Answer {
     stderr: String,
 }
 
-/// `splat4d ARGS`
+/// The program with these arguments.
 pub fn splat4d(args: &[&str]) -> Call {
     Call { args: args.iter().map(OsString::from).collect() }
 }
@@ -158,7 +164,11 @@ impl Call {
 
     /// Runs in a folder.
     pub fn run_in(self, folder: &Path) -> Answer {
-        let output = Command::new(env!("CARGO_BIN_EXE_splat4d")).args(&self.args).current_dir(folder).output().unwrap();
+        let output = Command::new(PROGRAM.expect("cargo builds the program"))
+            .args(&self.args)
+            .current_dir(folder)
+            .output()
+            .unwrap();
         Answer {
             call: format!("{:?}", self.args),
             code: output.status.code(),

@@ -16,12 +16,10 @@ mod json;
 mod lens;
 mod n3dv;
 mod nerfstudio;
-mod npy;
 mod options;
 mod own;
 mod panoptic;
 mod picture;
-mod ply;
 mod points;
 mod pose;
 mod preflight;
@@ -245,13 +243,6 @@ impl Capture {
         }
     }
 
-    /// Indices of the frames of one camera, in time.
-    pub fn frames_of(&self, camera: usize) -> Vec<usize> {
-        let mut found: Vec<usize> = (0..self.frames.len()).filter(|&i| self.frames[i].camera == camera).collect();
-        found.sort_by(|&a, &b| self.frames[a].time.0.total_cmp(&self.frames[b].time.0));
-        found
-    }
-
     /// The views of the training cameras: one of every fixed camera, all of moving ones.
     pub(crate) fn places(&self) -> impl Iterator<Item = &Camera> {
         let mut seen = vec![false; self.cameras.len()];
@@ -321,5 +312,5 @@ mod tests;
 
 /// A coloured point cloud from a .ply file. Errors: not a point cloud, damage, absurd counts.
 pub fn read_points(path: &Path) -> Result<PointCloud> {
-    ply::read(path)
+    points::read_ply(path)
 }

@@ -1,7 +1,9 @@
 //! N3DV captures (Li 2022): `poses_bounds.npy`, one row per camera, and a folder of frames per camera.
 
+use super::points::read_ply;
 use super::{CaptureKind, CaptureOptions, RawFrame, Split, Take};
-use super::{ffmpeg_command, json, npy, picture, ply, pose, rig, videos};
+use super::{ffmpeg_command, json, picture, pose, rig, videos};
+use splat4d::format::npy::Npy;
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::scene::{Camera, Intrinsics, Lens};
@@ -30,7 +32,7 @@ pub(super) fn applies(root: &Path) -> bool {
 pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
     let fps = options.fps.unwrap_or(DEFAULT_FPS);
     let place = |e: Error| e.at(marker.display());
-    let array = npy::parse(&json::read_bytes(marker)?).map_err(place)?;
+    let array = Npy::read(&json::read_bytes(marker)?).map_err(place)?;
     let rows = match array.shape[..] {
         [n, ROW] => n,
         _ => {
@@ -44,7 +46,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         return Err(place(mismatch(rows, &folders, &films)));
     }
     let mut frames = Vec::new();
-    for (camera, (folder, row)) in folders.iter().zip(array.data.chunks_exact(ROW)).enumerate() {
+    for (camera, (folder, row)) in folders.iter().zip(array.to_f64().chunks_exact(ROW)).enumerate() {
         let in_row = |e: Error| e.at(format!("{} row {camera} (camera {})", marker.display(), folder.name));
         let header = picture::header(&folder.images[0])?;
         let source = camera_of(row, header.width, header.height).map_err(in_row)?;
@@ -71,7 +73,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         named: true,
         hold_out: None,
         fps,
-        points: points.map(|p| ply::read(&p)).transpose()?,
+        points: points.map(|p| read_ply(&p)).transpose()?,
         background: None,
         up: None,
         warnings: Vec::new(),

@@ -4,7 +4,8 @@
 //! the file's own world.
 
 use super::json::{self, Node};
-use super::{CaptureKind, CaptureOptions, RawFrame, Split, Take, picture, ply, pose, rig};
+use super::points::read_ply;
+use super::{CaptureKind, CaptureOptions, RawFrame, Split, Take, picture, pose, rig};
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::scene::{Camera, Intrinsics, Lens};
@@ -61,7 +62,7 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<T
             flow: None,
             split: entry.split,
         });
-    let points = top.opt("ply_file_path")?.map(|n| ply::read(&root.join(n.text()?))).transpose()?;
+    let points = top.opt("ply_file_path")?.map(|n| read_ply(&root.join(n.text()?))).transpose()?;
     Ok(Take {
         name: None,
         root: root.to_path_buf(),

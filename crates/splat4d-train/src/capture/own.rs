@@ -1,7 +1,8 @@
 //! Our own `capture.json`: what a user with a rig writes by hand. docs/capture-format.md is its specification.
 
 use super::json::{self, Node};
-use super::{CaptureKind, CaptureOptions, HoldOut, RawFrame, Split, Take, ply, pose};
+use super::points::read_ply;
+use super::{CaptureKind, CaptureOptions, HoldOut, RawFrame, Split, Take, pose};
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::scene::{Camera, Intrinsics, Lens};
@@ -95,7 +96,7 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<T
         named: true,
         hold_out: top.opt("hold_out")?.map(|n| read_hold_out(&n)).transpose()?,
         fps,
-        points: top.opt("points")?.map(|n| ply::read(&root.join(n.text()?))).transpose()?,
+        points: top.opt("points")?.map(|n| read_ply(&root.join(n.text()?))).transpose()?,
         background: read_background(top)?,
         up: top.opt("up")?.map(|n| n.numbers::<3>()).transpose()?,
         warnings: Vec::new(),

@@ -2,7 +2,9 @@
 //! axes, world to camera.
 
 use super::json::{self, Node};
-use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Split, Take, npy, ply, rig};
+use super::points::read_ply;
+use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Split, Take, rig};
+use splat4d::format::npy::Npy;
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::scene::{Camera, Intrinsics, Lens};
@@ -83,20 +85,23 @@ fn read_meta(root: &Path, top: &Node<'_>, split: Split, fps: f64, out: &mut Vec<
     Ok(())
 }
 
-/// The cloud: the .ply beside the metadata (`points3d_f0_sift.ply` if there are several), else [`ARCHIVE`].
+/// The cloud: the one .ply beside the metadata, else [`ARCHIVE`].
 fn read_points(root: &Path, warnings: &mut Vec<String>) -> Result<Option<PointCloud>> {
     let names = rig::file_names(root);
-    let plys: Vec<&String> = names.iter().filter(|n| n.to_ascii_lowercase().ends_with(".ply")).collect();
-    let chosen =
-        plys.iter().find(|n| n.as_str() == "points3d_f0_sift.ply").or(plys.first().filter(|_| plys.len() == 1));
-    if chosen.is_none() {
-        if plys.len() > 1 {
-            warnings.push("Several .ply files lie beside train_meta.json; none is used as the initial cloud.".into());
-        } else if names.iter().any(|n| n == ARCHIVE) {
-            return read_archive(&root.join(ARCHIVE)).map(Some);
+    let plys: Vec<&str> =
+        names.iter().map(String::as_str).filter(|n| n.to_ascii_lowercase().ends_with(".ply")).collect();
+    match plys[..] {
+        [only] => read_ply(&root.join(only)).map(Some),
+        _ if names.iter().any(|n| n == ARCHIVE) => read_archive(&root.join(ARCHIVE)).map(Some),
+        [] => Ok(None),
+        _ => {
+            warnings.push(format!(
+                "Which of {} is the initial cloud? None is used: leave one there, or name it with --set init=FILE.",
+                plys.join(", ")
+            ));
+            Ok(None)
         }
     }
-    chosen.map(|name| ply::read(&root.join(name))).transpose()
 }
 
 /// Luiten's own cloud: `data` of shape `[N, 7]`: position, sRGB from 0 to 1, foreground.
@@ -104,7 +109,7 @@ const ARCHIVE: &str = "init_pt_cld.npz";
 
 fn read_archive(path: &Path) -> Result<PointCloud> {
     let bytes = json::read_bytes(path)?;
-    let array = npy::member(&bytes, "data").and_then(npy::parse).map_err(|e| e.at(path.display()))?;
+    let array = Npy::read_member(&bytes, "data").map_err(|e| e.at(path.display()))?;
     let columns = match array.shape[..] {
         [_, columns] if columns >= 6 => columns,
         _ => {
@@ -113,7 +118,7 @@ fn read_archive(path: &Path) -> Result<PointCloud> {
         }
     };
     let mut cloud = PointCloud::default();
-    for row in array.data.chunks_exact(columns).filter(|r| r[..6].iter().all(|v| v.is_finite())) {
+    for row in array.to_f64().chunks_exact(columns).filter(|r| r[..6].iter().all(|v| v.is_finite())) {
         cloud.points.push([row[0], row[1], row[2]]);
         cloud.colors.push([row[3], row[4], row[5]].map(|v| v.clamp(0.0, 1.0) as f32));
         cloud.times.push(None);

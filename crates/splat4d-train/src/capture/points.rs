@@ -1,6 +1,35 @@
 //! Initial point clouds.
 
+use super::json::read_bytes;
 use rayon::prelude::*;
+use splat4d::Result;
+use splat4d::format::ply;
+use std::path::Path;
+
+/// Colour of points that have none.
+const GREY: f32 = 0.5;
+
+/// Reads the points of a .ply file with their colours and, where it says them, their times. Points that are not finite are
+/// left out.
+pub(super) fn read_ply(path: &Path) -> Result<PointCloud> {
+    cloud(&read_bytes(path)?).map_err(|e| e.at(path.display()))
+}
+
+fn cloud(bytes: &[u8]) -> Result<PointCloud> {
+    let read = ply::read_points(bytes)?;
+    let mut cloud = PointCloud::default();
+    for (i, point) in read.positions.iter().enumerate() {
+        let seen = read.times.get(i).copied();
+        if point.iter().chain(&seen).all(|v| v.is_finite()) {
+            let color = read.colors.get(i).copied().unwrap_or([GREY; 3]);
+            cloud.points.push(*point);
+            // A colour that is no number must not spread.
+            cloud.colors.push(color.map(|v| if v.is_nan() { GREY } else { v.clamp(0.0, 1.0) }));
+            cloud.times.push(seen);
+        }
+    }
+    Ok(cloud)
+}
 
 /// Coloured points, some with the time at which they were seen.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -85,6 +114,59 @@ type Cell = (u64, Option<u64>);
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn ascii_and_binary_agree_whatever_the_order() {
+        let ascii = "ply\nformat ascii 1.0\ncomment made up\nelement vertex 3\nproperty uchar red\n\
+                     property uchar green\n\
+                     property uchar blue\nproperty double x\nproperty float y\nproperty int z\nproperty float time\n\
+                     end_header\n255 0 51 1.5 -2 3 0.5\n0 255 0 nan 0 0 0\n9 9 9 0 0 0 inf\n";
+        let read = cloud(ascii.as_bytes()).unwrap();
+        assert_eq!((read.points.as_slice(), read.times[0]), (&[[1.5, -2.0, 3.0]][..], Some(0.5)));
+        assert_eq!(read.colors, [[1.0, 0.0, 0.2]]);
+        let mut binary = ascii[..ascii.find("255 0").unwrap()].replace("ascii", "binary_little_endian").into_bytes();
+        for (x, time) in [(1.5, 0.5), (f64::NAN, 0.0), (0.0, f32::INFINITY)] {
+            binary.extend([255, 0, 51]);
+            binary.extend(f64::to_le_bytes(x));
+            binary.extend(f32::to_le_bytes(-2.0));
+            binary.extend(i32::to_le_bytes(3));
+            binary.extend(f32::to_le_bytes(time));
+        }
+        assert_eq!(cloud(&binary).unwrap(), read);
+        let message = cloud(&binary[..binary.len() - 1]).unwrap_err().to_string();
+        assert!(message.contains("claims 3 rows"), "{message}");
+    }
+
+    #[test]
+    fn colours_are_grey_where_there_are_none_and_never_outside_their_range() {
+        let points = |properties: &str, row: &str| {
+            let text = format!(
+                "ply\nformat ascii 1.0\nelement vertex 1\nproperty double x\nproperty double y\nproperty double z\n\
+                 {properties}end_header\n1e-9 1 2 {row}\n"
+            );
+            cloud(text.as_bytes()).unwrap()
+        };
+        let plain = points("", "");
+        assert_eq!((plain.points[0][0], plain.colors[0], plain.times[0]), (1e-9, [GREY; 3], None));
+        let floats = "property float r\nproperty float g\nproperty float b\nproperty double t\n";
+        let seen = points(floats, "nan 1.5 0.25 7");
+        assert_eq!((seen.colors[0], seen.times[0]), ([GREY, 1.0, 0.25], Some(7.0)));
+        let wide = "property ushort red\nproperty ushort green\nproperty ushort blue\n";
+        assert_eq!(points(wide, "65535 0 13107").colors[0], [1.0, 0.0, 0.2]);
+    }
+
+    #[test]
+    fn absurd_counts_are_refused_without_reserving() {
+        for format in ["ascii", "binary_little_endian"] {
+            let text = format!(
+                "ply\nformat {format} 1.0\nelement vertex 18446744073709551615\nproperty float x\nproperty float y\n\
+                 property float z\nend_header\n"
+            );
+            assert!(cloud(text.as_bytes()).unwrap_err().to_string().contains("cut short"));
+        }
+        assert!(cloud(b"ply\nformat ascii 1.0\n").is_err());
+        assert!(cloud(b"").is_err());
+    }
     use splat4d::math::Rng;
 
     #[test]

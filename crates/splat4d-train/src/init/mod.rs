@@ -12,7 +12,6 @@ use splat4d::layers::{Head, Layer, Scene};
 use splat4d::math::Rng;
 use splat4d::math::knn::mean_square_distance;
 use splat4d::math::sh::rgb_to_dc;
-use splat4d::motion::build;
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{GEOMETRY, HeadKeys, LIFE, LifeKind, Params, SH};
 
@@ -174,7 +173,7 @@ pub fn scene(
             }
         }
     }
-    let motion = build(&program.spec(plan), &mut params)?;
+    let motion = program.build(plan, &mut params)?;
     program.init(&lives, &mut params);
     let head = if HeadKeys::of(&params).is_some() { Head::Features } else { Head::Identity };
     let layer = Layer::new("scene", params, motion, life);

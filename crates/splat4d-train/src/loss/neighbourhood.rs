@@ -7,7 +7,6 @@ use super::near::{NEIGHBOURS, Near};
 use super::terms::{Probe, ProbeLoss, StepInfo};
 use splat4d::layers::Scene;
 use splat4d::math::{Real, Rng};
-use splat4d::motion::Spec;
 use splat4d::scene::splats::COV;
 use splat4d::scene::{GEOMETRY, Space, Table, Time};
 use std::sync::Mutex;
@@ -102,7 +101,7 @@ impl<F: Real> ProbeLoss<F> for Neighbourhood<F> {
         for (layer, l) in scene.layers.iter().enumerate() {
             let n = l.params.len();
             let Some(times) = self.times(info, layer) else { continue };
-            if n <= NEIGHBOURS || l.motion.spec() == Spec::Still || !l.spans_over(times[0]) {
+            if n <= NEIGHBOURS || !l.motion.capabilities().moves || !l.spans_over(times[0]) {
                 continue;
             }
             let means = &l.params[GEOMETRY];

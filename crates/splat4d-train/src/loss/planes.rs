@@ -13,7 +13,6 @@ use super::terms::{ParamLoss, StepInfo};
 use rayon::prelude::*;
 use splat4d::layers::Scene;
 use splat4d::math::Real;
-use splat4d::motion::Spec;
 use splat4d::nn::hexplane::{PlaneShape, SPATIAL, TEMPORAL};
 use splat4d::scene::{Grads, Key, Params};
 use splat4d::simd::{Pass, Simd, dispatch_pass};
@@ -45,6 +44,7 @@ const EVERY: usize = 4;
 /// All of the module's regularisers on every layer that has such planes.
 pub struct SmoothPlanes {
     shape: PlaneShape,
+    levels: usize,
     weights: PlaneWeights,
 }
 
@@ -52,15 +52,15 @@ impl SmoothPlanes {
     /// Its name, in metrics.
     pub const NAME: &'static str = "planes";
 
-    /// For planes of one shape.
-    pub fn new(shape: PlaneShape, weights: PlaneWeights) -> Self {
-        Self { shape, weights }
+    /// For planes of one shape, of which so many levels are in use.
+    pub fn new(shape: PlaneShape, levels: usize, weights: PlaneWeights) -> Self {
+        Self { shape, levels, weights }
     }
 
-    /// The loss of one layer's unlocked levels, and `factor` times its gradient added to `d`; 0 without planes.
-    pub fn of_layer<F: Real>(&self, p: &Params<F>, unlocked: usize, factor: f64, d: &mut Grads<F>) -> f64 {
+    /// The loss of one layer's levels in use, and `factor` times its gradient added to `d`; 0 without planes.
+    pub fn of_layer<F: Real>(&self, p: &Params<F>, factor: f64, d: &mut Grads<F>) -> f64 {
         let mut loss = 0.0;
-        for level in 0..self.shape.multires.len().min(unlocked) {
+        for level in 0..self.shape.multires.len().min(self.levels) {
             let keys: Option<Vec<Key>> = (0..6).map(|plane| p.find(&PlaneShape::name(level, plane))).collect();
             let Some(keys) = keys else { continue };
             let tables = d.many(&keys);
@@ -131,18 +131,7 @@ impl<F: Real> ParamLoss<F> for SmoothPlanes {
         if !info.iteration.is_multiple_of(EVERY) {
             return 0.0;
         }
-        scene
-            .layers
-            .iter()
-            .zip(d)
-            .map(|(layer, d)| {
-                let unlocked = match layer.motion.spec() {
-                    Spec::Hexplane(spec) => spec.unlocked,
-                    _ => usize::MAX,
-                };
-                EVERY as f64 * self.of_layer(&layer.params, unlocked, EVERY as f64, d)
-            })
-            .sum()
+        scene.layers.iter().zip(d).map(|(layer, d)| EVERY as f64 * self.of_layer(&layer.params, EVERY as f64, d)).sum()
     }
 }
 

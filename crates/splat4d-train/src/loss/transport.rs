@@ -18,7 +18,7 @@ use splat4d::layers::Scene;
 use splat4d::math::spd::{Mat3, bures};
 use splat4d::math::{Real, Rng};
 use splat4d::motion::filtered::{Normal, Prediction, Predictor};
-use splat4d::scene::table::halve;
+use splat4d::scene::table::par_split;
 use splat4d::scene::{Space, Table, Time};
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -186,7 +186,7 @@ impl<F: Real> ProbeLoss<F> for Transport {
         let factor = f64::from_bits(self.now.load(Ordering::Relaxed));
         let weight = factor / (self.settings.every.min(1.0) * a.rows() as f64);
         let [d_a, d_b, d_c] = &mut d[0][..] else { unreachable!("a gradient has its answers' shape") };
-        halve([d_a, d_b, d_c].map(Table::view_mut), &|mut views| {
+        par_split([d_a, d_b, d_c].map(Table::view_mut), &|mut views| {
             let mut sum = 0.0;
             for j in views[0].first..views[0].first + views[0].rows {
                 let normals = [a, b, c].map(|t| Normal::of_splat(t.read::<9>(j, 0)));

@@ -1,6 +1,6 @@
-//! `--motion auto`: looks at the capture, chooses a motion model and says why.
+//! `--motion auto`: looks at the capture, and takes the first program that says why it suits.
 
-use super::Plan;
+use super::{PROGRAMS, Plan};
 use crate::Result;
 use crate::capture::frames::{Frames, Picture};
 use splat4d::scene::Planes;
@@ -12,12 +12,45 @@ const LOOKS: (usize, usize) = (4, 8);
 /// A pixel that changes by more than this from frame to frame (mean of the channels, in [0, 1]) has moved: above the
 /// noise of ordinary cameras.
 const CHANGED: f32 = 0.06;
-/// A capture in which less than this share of the pixels moves is of a still scene.
-const MOVING: f64 = 2e-4;
-/// Cameras at a moment from which on a scene is seen from all sides at once.
-const MANY_CAMERAS: f64 = 3.0;
 /// Moments from which on a take is long.
 const LONG: usize = 600;
+
+/// The motion that a capture shows.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Seen {
+    /// Moments.
+    pub times: usize,
+    /// Training pictures a moment.
+    pub cameras: f64,
+    /// Share of the pixels of fixed cameras that change from one of their frames to the next; none where that cannot be
+    /// told.
+    pub changing: Option<f64>,
+    /// Pictures have masks.
+    pub masks: bool,
+}
+
+impl Seen {
+    /// Looks at the training frames of a capture.
+    pub fn of(plan: &Plan, frames: &dyn Frames) -> Result<Self> {
+        let looks = plan.times > 1 && plan.fixed_cameras > 0;
+        Ok(Self {
+            times: plan.times,
+            cameras: frames.len() as f64 / plan.times.max(1) as f64,
+            changing: if looks { motion_energy(frames)? } else { None },
+            masks: frames.has_masks(),
+        })
+    }
+
+    /// Whether the take is a long one.
+    pub fn is_long(&self) -> bool {
+        self.times >= LONG
+    }
+
+    /// The cameras that see a moment, in words.
+    pub fn cameras_in_words(&self) -> String {
+        if self.cameras < 1.5 { "one camera sees".to_owned() } else { format!("{:.1} cameras see", self.cameras) }
+    }
+}
 
 /// A model and the reason for it.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -28,34 +61,11 @@ pub struct Choice {
     pub why: String,
 }
 
-/// Chooses for the training frames of a capture.
+/// Chooses for the training frames of a capture: the first program that says why it suits.
 pub fn choose(plan: &Plan, frames: &dyn Frames) -> Result<Choice> {
-    let choice = |motion, why: String| Ok(Choice { motion, why });
-    if plan.times <= 1 {
-        return choice("still", "all pictures are of one moment".into());
-    }
-    let energy = if plan.fixed_cameras > 0 { motion_energy(frames)? } else { None };
-    if let Some(share) = energy.filter(|e| *e < MOVING) {
-        let percent = 100.0 * share;
-        return choice("still", format!("cameras stand still and only {percent:.3} % of their pixels ever change"));
-    }
-    let cameras = frames.len() as f64 / plan.times as f64;
-    let moving = energy.map_or_else(String::new, |e| format!(", {:.1} % of the pixels move", 100.0 * e));
-    if cameras >= MANY_CAMERAS {
-        return choice(
-            "spacetime",
-            format!("{cameras:.0} cameras see every moment{moving}: explicit motion with lives needs no network"),
-        );
-    }
-    let seen = if cameras < 1.5 { "one camera sees".to_owned() } else { format!("{cameras:.1} cameras see") };
-    if frames.has_masks() && plan.times < LONG {
-        return choice("control", format!("{seen} a moment, and masks show one object: few nodes move all of it"));
-    }
-    let length = if plan.times >= LONG { format!(" of {}", plan.times) } else { String::new() };
-    choice(
-        "deform-mlp",
-        format!("{seen} a moment{length}: one cloud that a network moves shares what every moment shows"),
-    )
+    let seen = Seen::of(plan, frames)?;
+    let choice = PROGRAMS.into_iter().find_map(|(motion, make)| Some(Choice { motion, why: make().suits(&seen)? }));
+    Ok(choice.expect("one program suits whatever no other does"))
 }
 
 /// Share of the pixels of fixed cameras that change from one of their frames to the next; `None`: no camera has two.

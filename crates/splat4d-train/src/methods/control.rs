@@ -4,6 +4,7 @@
 
 pub mod losses;
 
+use super::auto::Seen;
 use super::{Group, Plan, Program, Rate, Stage, still};
 use crate::recipe::Recipe;
 use crate::upkeep::AdaptNodes;
@@ -45,6 +46,17 @@ impl Program for ControlProgram {
         true
     }
 
+    fn suits(&self, seen: &Seen) -> Option<String> {
+        let one = seen.masks && !seen.is_long();
+        one.then(|| {
+            format!("{} a moment, and masks show one object: few nodes move all of it", seen.cameras_in_words())
+        })
+    }
+
+    fn nodes(&self, plan: &Plan) -> usize {
+        most_nodes(&plan.recipe)
+    }
+
     fn stages(&self, plan: &Plan) -> Vec<Stage> {
         let mut stage = still::stage("control", plan);
         still::learn_life(&mut stage, plan, self.life(plan));
@@ -52,6 +64,11 @@ impl Program for ControlProgram {
         add_trajectory(&mut stage, plan);
         vec![stage]
     }
+}
+
+/// Most nodes that training may have.
+pub fn most_nodes(r: &Recipe) -> usize {
+    if r.control_adapt_interval > 0 { r.control_max_nodes.max(r.control_nodes) } else { r.control_nodes }
 }
 
 /// The skin that the recipe asks for.

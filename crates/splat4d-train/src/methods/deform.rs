@@ -1,5 +1,6 @@
 //! `deform-mlp`: a static warm-up, then the network learns beside geometry and colour.
 
+use super::auto::Seen;
 use super::{Group, Plan, Program, Rate, Stage, TimeNoise, still};
 use crate::{Error, Result};
 use splat4d::motion::Spec;
@@ -38,6 +39,14 @@ impl Program for DeformProgram {
 
     fn one_moment(&self, _plan: &Plan) -> bool {
         true
+    }
+
+    fn suits(&self, seen: &Seen) -> Option<String> {
+        let length = if seen.is_long() { format!(" of {}", seen.times) } else { String::new() };
+        Some(format!(
+            "{} a moment{length}: one cloud that a network moves shares what every moment shows",
+            seen.cameras_in_words()
+        ))
     }
 
     fn stages(&self, plan: &Plan) -> Vec<Stage> {

@@ -12,17 +12,17 @@ use crate::recipe::Recipe;
 use crate::upkeep::Once;
 use splat4d::layers::{Layer, Scene};
 use splat4d::motion::filtered::{Filtered, FilteredSpec, Fusion, GAINS, Predictor};
-use splat4d::motion::{Spec, build};
+use splat4d::motion::{Motion, Spec, build};
 use splat4d::scene::params::LoadedArray;
 use splat4d::scene::{LifeKind, Params, SH};
 use std::sync::Arc;
 
 /// The program with what the recipe puts around it; as it is where that is nothing.
-pub fn wrap(inner: Box<dyn Program>, recipe: &Recipe) -> Result<Box<dyn Program>> {
+pub fn wrap(inner: Box<dyn Program>, recipe: &Recipe) -> Box<dyn Program> {
     if fusion(recipe) == Fusion::Off && recipe.transport == "off" {
-        return Ok(inner);
+        return inner;
     }
-    Ok(Box::new(FilteredProgram { inner }))
+    Box::new(FilteredProgram { inner })
 }
 
 fn fusion(recipe: &Recipe) -> Fusion {
@@ -56,6 +56,14 @@ impl Program for FilteredProgram {
         })
     }
 
+    fn build(&self, plan: &Plan, params: &mut Params) -> Result<Arc<dyn Motion>> {
+        let inner = self.inner.build(plan, params)?;
+        match self.spec(plan) {
+            Spec::Filtered(spec) => Ok(Arc::new(Filtered::around(inner, spec, params)?)),
+            _ => Ok(inner),
+        }
+    }
+
     fn life(&self, plan: &Plan) -> LifeKind {
         self.inner.life(plan)
     }
@@ -75,6 +83,18 @@ impl Program for FilteredProgram {
 
     fn first(&self, plan: &Plan) -> Plan {
         self.inner.first(plan)
+    }
+
+    fn has_features(&self) -> bool {
+        self.inner.has_features()
+    }
+
+    fn nodes(&self, plan: &Plan) -> usize {
+        self.inner.nodes(plan)
+    }
+
+    fn growth_bytes(&self, plan: &Plan, rows: usize) -> u64 {
+        self.inner.growth_bytes(plan, rows)
     }
 
     fn init(&self, lives: &[(f64, f64)], params: &mut Params) {

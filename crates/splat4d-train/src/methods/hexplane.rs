@@ -12,7 +12,7 @@ use crate::{Error, Result};
 use splat4d::layers::Scene;
 use splat4d::math::Real;
 use splat4d::motion::hexplane::{Heads, Hexplane, HexplaneSpec};
-use splat4d::motion::{Motion, Spec};
+use splat4d::motion::{Phase, Spec};
 use splat4d::nn::hexplane::PlaneShape;
 use splat4d::scene::{GEOMETRY, Table};
 use std::any::Any;
@@ -37,29 +37,7 @@ const COARSE_PART: usize = 10;
 
 impl Program for HexplaneProgram {
     fn spec(&self, plan: &Plan) -> Spec {
-        let r = &plan.recipe;
-        let steps = match r.time_resolution {
-            0 => plan.times.div_ceil(FRAMES_PER_STEP).max(LEAST_STEPS),
-            n => n,
-        };
-        let planes = PlaneShape {
-            channels: r.plane_channels,
-            resolution: r.plane_resolution,
-            time_resolution: steps,
-            multires: r.multires.clone(),
-        };
-        Spec::Hexplane(HexplaneSpec {
-            seed: r.seed,
-            low: [-plan.extent; 3],
-            high: [plan.extent; 3],
-            clip: plan.clip,
-            unlocked: planes.multires.len(),
-            planes,
-            net_width: r.net_width,
-            defor_depth: r.defor_depth,
-            heads: Heads { position: !r.no_dx, scale: !r.no_ds, rotation: !r.no_dr, opacity: !r.no_do, sh: !r.no_dshs },
-            coarse: false,
-        })
+        Spec::Hexplane(spec(plan))
     }
 
     fn one_moment(&self, _plan: &Plan) -> bool {
@@ -67,8 +45,7 @@ impl Program for HexplaneProgram {
     }
 
     fn check(&self, plan: &Plan) -> Result<()> {
-        let Spec::Hexplane(spec) = self.spec(plan) else { unreachable!("this program is of one model") };
-        spec.planes.check()
+        planes(plan).check()
     }
 
     fn stages(&self, plan: &Plan) -> Vec<Stage> {
@@ -76,30 +53,53 @@ impl Program for HexplaneProgram {
         let coarse = coarse_steps(r).min(r.iterations);
         let mut stages = Vec::new();
         if coarse > 0 {
-            let mut stage = self.whole(plan).part(0, coarse);
+            let mut stage = self.whole(plan, r.multires.len()).part(0, coarse);
             stage.name = "coarse".into();
             stage.groups.retain(|g| !g.column.starts_with("hexplane."));
             stage.params.retain(|l| l.name() != SmoothPlanes::NAME);
-            stage.start = Some(respecify(|spec, _| spec.coarse = true));
+            stage.phase = Some(Phase { rests: true, levels: None });
             stages.push(stage);
         }
         let ends = unlocks(r, coarse);
         for (i, end) in ends.windows(2).enumerate() {
-            let mut stage = self.whole(plan).part(end[0], end[1]);
+            let all = r.multires.len();
+            let levels = if ends.len() > 2 { all.min(i + 1) } else { all };
+            let mut stage = self.whole(plan, levels).part(end[0], end[1]);
             stage.name = if ends.len() > 2 { format!("fine {}", i + 1) } else { "fine".into() };
-            let levels = r.multires.len();
-            let unlocked = if ends.len() > 2 { i + 1 } else { levels };
-            let first = i == 0;
-            stage.start = Some(respecify(move |spec, scene| {
-                spec.coarse = false;
-                spec.unlocked = unlocked.min(levels);
-                if let (true, Some([low, high])) = (first, around(scene)) {
-                    (spec.low, spec.high) = (low, high);
-                }
-            }));
+            stage.phase = Some(Phase { rests: false, levels: Some(levels) });
+            stage.start = (i == 0).then(place_box);
             stages.push(stage);
         }
         stages
+    }
+}
+
+fn planes(plan: &Plan) -> PlaneShape {
+    let r = &plan.recipe;
+    let time_resolution = match r.time_resolution {
+        0 => plan.times.div_ceil(FRAMES_PER_STEP).max(LEAST_STEPS),
+        n => n,
+    };
+    PlaneShape {
+        channels: r.plane_channels,
+        resolution: r.plane_resolution,
+        time_resolution,
+        multires: r.multires.clone(),
+    }
+}
+
+fn spec(plan: &Plan) -> HexplaneSpec {
+    let r = &plan.recipe;
+    HexplaneSpec {
+        seed: r.seed,
+        low: [-plan.extent; 3],
+        high: [plan.extent; 3],
+        clip: plan.clip,
+        planes: planes(plan),
+        net_width: r.net_width,
+        defor_depth: r.defor_depth,
+        heads: Heads { position: !r.no_dx, scale: !r.no_ds, rotation: !r.no_dr, opacity: !r.no_do, sh: !r.no_dshs },
+        ..HexplaneSpec::default()
     }
 }
 
@@ -122,12 +122,12 @@ fn unlocks(r: &Recipe, coarse: usize) -> Vec<usize> {
 }
 
 impl HexplaneProgram {
-    /// Everything in one stage; the others are parts of it.
-    fn whole(self, plan: &Plan) -> Stage {
+    /// Everything in one stage, with so many levels; the others are parts of it.
+    fn whole(self, plan: &Plan, levels: usize) -> Stage {
         let r = &plan.recipe;
         let mut stage = still::stage("hexplane", plan);
         still::learn_life(&mut stage, plan, self.life(plan));
-        let Spec::Hexplane(spec) = self.spec(plan) else { unreachable!("this program is of one model") };
+        let spec = spec(plan);
         let grids = Rate { start: r.grid_lr_init, end: r.grid_lr_final };
         for level in 0..spec.planes.multires.len() {
             for plane in 0..6 {
@@ -147,21 +147,22 @@ impl HexplaneProgram {
             variation: r.plane_variation_weight,
         };
         if weights.any() {
-            stage.params.push(Box::new(SmoothPlanes::new(spec.planes, weights)));
+            stage.params.push(Box::new(SmoothPlanes::new(spec.planes, levels, weights)));
         }
         stage
     }
 }
 
-/// A hook that changes the spec of every hexplane layer; tables stay as they are.
-fn respecify(change: impl Fn(&mut HexplaneSpec, &Table<f32>) + Send + Sync + 'static) -> Hook {
-    Box::new(move |scene: &mut Scene<f32>, _| {
+/// A hook that lays the box of every hexplane layer around its cloud.
+fn place_box() -> Hook {
+    Box::new(|scene: &mut Scene<f32>, _| {
         for layer in &mut scene.layers {
-            let model: &dyn Motion<f32> = layer.motion.as_ref();
-            let Some(model) = (model as &dyn Any).downcast_ref::<Hexplane>() else { continue };
-            let Spec::Hexplane(mut spec) = Motion::<f32>::spec(model) else { continue };
-            change(&mut spec, &layer.params[GEOMETRY]);
-            let model = model.respecified(spec).map_err(|e: Error| e.at("the cloud after the coarse stage"))?;
+            let model: &dyn Any = layer.motion.as_ref();
+            let (Some(model), Some(corners)) = (model.downcast_ref::<Hexplane>(), around(&layer.params[GEOMETRY]))
+            else {
+                continue;
+            };
+            let model = model.with_box(corners).map_err(|e: Error| e.at("the cloud after the coarse stage"))?;
             layer.motion = Arc::new(model);
         }
         Ok(())

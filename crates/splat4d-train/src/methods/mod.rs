@@ -24,8 +24,9 @@ use crate::sampler::Sampler;
 use crate::upkeep::split::STILL_COLUMNS;
 use crate::upkeep::{Split, Upkeep};
 use crate::{Error, Result};
+use auto::Seen;
 use splat4d::layers::Scene;
-use splat4d::motion::Spec;
+use splat4d::motion::{BUILT_IN, Capabilities, MODELS, Motion, Phase, Spec, build};
 use splat4d::scene::{LifeKind, Params};
 use std::sync::Arc;
 
@@ -175,6 +176,8 @@ pub struct Stage {
     pub freeze_exposure: bool,
     /// What stands between the parameters and the pictures; none: nothing.
     pub codec: Option<Arc<dyn Codec<f32>>>,
+    /// The phase in which it puts the models of all layers; none: as they are.
+    pub phase: Option<Phase>,
     /// Before the first step.
     pub start: Option<Hook>,
     /// After the last.
@@ -202,6 +205,7 @@ impl Stage {
             pictures: Vec::new(),
             freeze_exposure: false,
             codec: None,
+            phase: None,
             start: None,
             end: None,
         }
@@ -247,6 +251,10 @@ impl Stage {
 pub trait Program: Send + Sync {
     /// The model that training starts with.
     fn spec(&self, plan: &Plan) -> Spec;
+    /// Makes it, and in `params` its tables: how a model from outside the library comes to be.
+    fn build(&self, plan: &Plan, params: &mut Params) -> Result<Arc<dyn Motion>> {
+        build(&self.spec(plan), params)
+    }
     /// The life its Gaussians have: the recipe's; for ever where it leaves the choice to the model.
     fn life(&self, plan: &Plan) -> LifeKind {
         LifeKind::from_name(&plan.recipe.life).unwrap_or(LifeKind::Infinite)
@@ -267,6 +275,26 @@ pub trait Program: Send + Sync {
     fn one_moment(&self, _plan: &Plan) -> bool {
         false
     }
+    /// Properties of the model.
+    fn capabilities(&self, plan: &Plan) -> Capabilities {
+        self.spec(plan).capabilities().unwrap_or_default()
+    }
+    /// The reason for which `auto` takes it for such a capture; none: it is taken where it is asked for.
+    fn suits(&self, _seen: &Seen) -> Option<String> {
+        None
+    }
+    /// Whether its Gaussians can have features for a pixel head.
+    fn has_features(&self) -> bool {
+        false
+    }
+    /// Most nodes that training will have.
+    fn nodes(&self, _plan: &Plan) -> usize {
+        0
+    }
+    /// Bytes that stages add to the tables of the model that training starts with.
+    fn growth_bytes(&self, _plan: &Plan, _rows: usize) -> u64 {
+        0
+    }
     /// The stages.
     fn stages(&self, plan: &Plan) -> Vec<Stage>;
     /// What learns when a trained scene is tuned further on all frames alike.
@@ -275,31 +303,43 @@ pub trait Program: Send + Sync {
     }
 }
 
+/// Makes a program.
+type Make = fn() -> Box<dyn Program>;
+
+/// The programs by the names of their models: how a model is learnt is its file and an entry here. `auto` asks them in
+/// this order.
+pub const PROGRAMS: [(&str, Make); 8] = [
+    ("still", || Box::new(still::StillProgram)),
+    ("spacetime", || Box::new(spacetime::SpacetimeProgram)),
+    ("control", || Box::new(control::ControlProgram)),
+    ("deform-mlp", || Box::new(deform::DeformProgram)),
+    ("hexplane", || Box::new(hexplane::HexplaneProgram)),
+    ("tracked", || Box::new(tracked::TrackedProgram)),
+    ("native4d", || Box::new(native4d::Native4dProgram)),
+    ("ssm", || Box::new(ssm::SsmProgram)),
+];
+
 /// The program of a built-in motion model.
 pub fn program(motion: &str) -> Result<Box<dyn Program>> {
-    match motion {
-        "still" => Ok(Box::new(still::StillProgram)),
-        "spacetime" => Ok(Box::new(spacetime::SpacetimeProgram)),
-        "deform-mlp" => Ok(Box::new(deform::DeformProgram)),
-        "hexplane" => Ok(Box::new(hexplane::HexplaneProgram)),
-        "tracked" => Ok(Box::new(tracked::TrackedProgram)),
-        "native4d" => Ok(Box::new(native4d::Native4dProgram)),
-        "control" => Ok(Box::new(control::ControlProgram)),
-        "ssm" => Ok(Box::new(ssm::SsmProgram)),
-        "filtered" => Err(Error::input("`filtered` is no motion of its own: it wraps another")
-            .remedy("Name the motion to be filtered, and add --set filter=geodesic")),
-        other => Err(Error::input(format!("there is no motion model `{other}`"))
-            .remedy(format!("Use one of: {}", splat4d::motion::BUILT_IN.join(", ")))),
+    if let Some((_, make)) = PROGRAMS.into_iter().find(|(name, _)| *name == motion) {
+        return Ok(make());
     }
+    if BUILT_IN.contains(&motion) {
+        return Err(Error::input(format!("`{motion}` is no motion of its own: it wraps another"))
+            .remedy("Name the motion to be filtered, and add --set filter=geodesic"));
+    }
+    Err(Error::input(format!("there is no motion model `{motion}`"))
+        .remedy(format!("Use one of: {}", MODELS.join(", "))))
 }
 
 /// The program of a recipe: that of its motion, with the losses over time and the filter that the recipe asks for.
 pub fn program_of(recipe: &Recipe) -> Result<Box<dyn Program>> {
-    if recipe.features == FULL && recipe.motion != "spacetime" {
+    let program = program(&recipe.motion)?;
+    if recipe.features == FULL && !program.has_features() {
         return Err(Error::input(format!("motion `{}` has no features", recipe.motion))
             .remedy("Use --motion spacetime, or --set features=none"));
     }
-    filtered::wrap(program(&recipe.motion)?, recipe)
+    Ok(filtered::wrap(program, recipe))
 }
 
 /// The stages of a program as the recipe has them: with `static_split`, still Gaussians move into a layer of their own
@@ -307,6 +347,7 @@ pub fn program_of(recipe: &Recipe) -> Result<Box<dyn Program>> {
 pub fn stages(program: &dyn Program, plan: &Plan) -> Vec<Stage> {
     let mut stages = program.stages(plan);
     if let Some(last) = stages.last_mut()
+        && program.capabilities(plan).moves
         && let Some(split) = Split::of(&plan.recipe, plan.extent, last.iterations)
     {
         last.keep(split);

@@ -1,15 +1,19 @@
 //! `spacetime`: one stage; velocities, lives, rotation rates and, where the recipe has them, features and their head learn
 //! beside geometry and colour.
 
+use super::auto::Seen;
 use super::still;
 use super::{Group, Plan, Program, Rate, Stage};
 use crate::loss::scene::{LivingOpacity, VelocitySmoothness};
-use crate::recipe::FULL;
+use crate::recipe::{FULL, Recipe};
 use crate::upkeep::Guided;
 use splat4d::motion::spacetime::{FeatureSpec, TIME_FEATURES, VIEW_FEATURES};
 use splat4d::motion::{SpacetimeSpec, Spec};
 use splat4d::scene::LifeKind;
 use splat4d::scene::head::{HEAD_IN, HEAD_OUT};
+
+/// Cameras at a moment from which on a scene is seen from all sides at once.
+const MANY_CAMERAS: f64 = 3.0;
 
 /// Explicit kinematics (STG, FreeTimeGS).
 #[derive(Clone, Copy, Debug)]
@@ -31,10 +35,25 @@ impl Program for SpacetimeProgram {
         LifeKind::from_name(&plan.recipe.life).unwrap_or(LifeKind::GaussHalf)
     }
 
+    fn has_features(&self) -> bool {
+        true
+    }
+
+    fn suits(&self, seen: &Seen) -> Option<String> {
+        let moving =
+            seen.changing.map_or_else(String::new, |share| format!(", {:.1} % of the pixels move", 100.0 * share));
+        (seen.cameras >= MANY_CAMERAS).then(|| {
+            let cameras = seen.cameras;
+            format!("{cameras:.0} cameras see every moment{moving}: explicit motion with lives needs no network")
+        })
+    }
+
     fn stages(&self, plan: &Plan) -> Vec<Stage> {
         let r = &plan.recipe;
         let clip = plan.seconds();
-        let mut stage = still::stage("spacetime", plan);
+        // Velocities are there to compare (`VelocitySmoothness`), which costs no further instant.
+        let base = Recipe { lambda_velocity: 0.0, ..r.clone() };
+        let mut stage = still::stage("spacetime", &Plan { recipe: base, ..plan.clone() });
         // Rates of v_k are extents per clip^k: in seconds they shrink by clip^k.
         for k in 0..r.motion_order {
             let unit = plan.extent / clip.powi(k as i32 + 1);

@@ -59,6 +59,10 @@ impl Program for SsmProgram {
         true
     }
 
+    fn nodes(&self, plan: &Plan) -> usize {
+        control::most_nodes(&plan.recipe)
+    }
+
     fn stages(&self, plan: &Plan) -> Vec<Stage> {
         let r = &plan.recipe;
         let warm = (r.ssm_warm_up * r.iterations as f64) as usize;

@@ -1,5 +1,6 @@
 //! `still`: one stage, every group of static 3DGS. Also the base that other programs add to.
 
+use super::auto::Seen;
 use super::{Group, Plan, Program, Rate, Stage};
 use crate::loss::neighbourhood::{MotionWeights, Neighbourhood};
 use crate::loss::scene::{MeanOpacity, MeanScale, OpacityEntropy};
@@ -13,6 +14,9 @@ use splat4d::scene::LifeKind;
 /// The higher SH degrees learn this much slower than the base colour (Kerbl et al. 2023).
 const SH_REST_SLOWDOWN: f64 = 20.0;
 
+/// A capture in which less than this share of the pixels moves is of a still scene.
+const MOVING: f64 = 2e-4;
+
 /// Static 3D Gaussian Splatting.
 #[derive(Clone, Copy, Debug)]
 pub struct StillProgram;
@@ -24,6 +28,14 @@ impl Program for StillProgram {
 
     fn life(&self, _plan: &Plan) -> LifeKind {
         LifeKind::Infinite
+    }
+
+    fn suits(&self, seen: &Seen) -> Option<String> {
+        if seen.times <= 1 {
+            return Some("all pictures are of one moment".into());
+        }
+        let percent = 100.0 * seen.changing.filter(|share| *share < MOVING)?;
+        Some(format!("cameras stand still and only {percent:.3} % of their pixels ever change"))
     }
 
     fn stages(&self, plan: &Plan) -> Vec<Stage> {
@@ -70,8 +82,7 @@ pub fn motion_weights(r: &Recipe) -> MotionWeights {
         iso: r.lambda_iso,
         arap: r.lambda_arap,
         elastic: r.lambda_elastic,
-        // `spacetime` has velocities to compare, which costs no further instant.
-        velocity: if r.motion == "spacetime" { 0.0 } else { r.lambda_velocity },
+        velocity: r.lambda_velocity,
         jerk: r.lambda_jerk,
     }
 }

@@ -4,7 +4,7 @@
 //! Source: Luiten et al. 2024 (Dynamic 3D Gaussians). Ours: who is foreground is learnt from frame 0's masks and not given;
 //! lengths are in shares of the rig, so that the weights hold in any unit; the neighbours' weights do not know the unit.
 
-use super::{Group, Hook, Plan, Program, Rate, Stage, still};
+use super::{Group, Hook, PROGRAMS, Plan, Program, Rate, Stage, still};
 use crate::loss::graph::{LEAST_MEAN_WEIGHT, Weigh};
 use crate::loss::image::ImageTerm;
 use crate::loss::image::segmentation::Segmentation;
@@ -14,15 +14,13 @@ use crate::sampler::Sampler;
 use crate::{Error, Result};
 use splat4d::layers::Layer;
 use splat4d::math::quat;
-use splat4d::motion::tracked::{FOREGROUND, Tracked, TrackedSpec};
-use splat4d::motion::{BUILT_IN, Spec};
+use splat4d::motion::Spec;
+use splat4d::motion::tracked::{FOREGROUND, POSE, Tracked, TrackedSpec};
 use splat4d::scene::GEOMETRY;
 use splat4d::scene::params::{QUAT, page_name};
 use std::any::Any;
 use std::sync::Arc;
 
-/// Cameras that must see every moment: with two, what moves along a line between them is not seen to move.
-const LEAST_CAMERAS: usize = 3;
 /// The extent, in metres, of the rig that the paper's weights are for (CMU Panoptic Studio).
 const PAPER_EXTENT: f64 = 3.0;
 /// Share of the masks' weight that frame 0 has. Nobody is known to be foreground yet, and at full weight opacities fall to
@@ -36,7 +34,8 @@ pub struct TrackedProgram;
 
 impl Program for TrackedProgram {
     fn spec(&self, plan: &Plan) -> Spec {
-        Spec::Tracked(TrackedSpec { times: vec![plan.moments[0].0], foreground: segments(plan) })
+        let first = plan.moments.first().map_or(plan.clip[0], |m| m.0);
+        Spec::Tracked(TrackedSpec { times: vec![first], foreground: segments(plan) })
     }
 
     fn first(&self, plan: &Plan) -> Plan {
@@ -45,11 +44,13 @@ impl Program for TrackedProgram {
     }
 
     fn check(&self, plan: &Plan) -> Result<()> {
-        let others: Vec<&str> = BUILT_IN.into_iter().filter(|&m| m != "tracked" && m != "filtered").collect();
+        let least = self.capabilities(plan).fixed_cameras;
         let fewest = plan.moments.iter().min_by_key(|m| m.1).copied().unwrap_or_default();
-        if fewest.1 < LEAST_CAMERAS {
+        if fewest.1 < least {
+            let others = PROGRAMS.into_iter().filter(|(_, make)| make().capabilities(plan).fixed_cameras < least);
+            let others: Vec<&str> = others.map(|(name, _)| name).collect();
             return Err(Error::input(format!(
-                "`tracked` needs at least {LEAST_CAMERAS} fixed cameras that take their pictures together: it follows \
+                "`tracked` needs at least {least} fixed cameras that take their pictures together: it follows \
                  every Gaussian from one moment to the next, and what fewer cameras see of one moment does not say where \
                  things are. At {:.3} s this capture has {} training pictures of fixed cameras",
                 fewest.0, fewest.1
@@ -92,6 +93,12 @@ impl Program for TrackedProgram {
             });
         }
         stages
+    }
+
+    /// The result itself: a page a frame.
+    fn growth_bytes(&self, plan: &Plan, rows: usize) -> u64 {
+        let pages = plan.moments.len().saturating_sub(1);
+        (rows * pages * POSE * size_of::<f32>()) as u64
     }
 
     /// Every frame's page beside what all frames share; who is foreground is settled.

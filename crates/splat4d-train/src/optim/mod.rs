@@ -9,7 +9,7 @@ mod noise;
 pub use noise::Noise;
 
 use splat4d::math::Real;
-use splat4d::scene::table::{Column, halve};
+use splat4d::scene::table::{Column, par_split};
 use splat4d::scene::{Born, Grads, Key, Params, RowEdit, Space, Table};
 use splat4d::simd::{Simd, dispatch};
 
@@ -150,7 +150,7 @@ impl<F: Real> Moments<F> {
             }
             let [table] = p.get_mut([key]);
             let views = [table.view_mut(), self.tables[key.0 as usize].view_mut(), gradient.view_mut()];
-            let faults = halve(views, &|views| dispatch(simd, adam::Step { rule: &rule, views }));
+            let faults = par_split(views, &|views| dispatch(simd, adam::Step { rule: &rule, views }));
             if faults > 0.0 {
                 // Whoever asks what went wrong looks at the gradient.
                 let _ = d.of([key]);

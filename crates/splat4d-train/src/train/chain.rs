@@ -7,13 +7,13 @@ use super::channels::{Channels, Source};
 use crate::Result;
 pub use crate::capture::frames::FlowTruth;
 pub use crate::learner::Observation;
+use crate::loss::image::{Channel, PictureGrads, Shown};
 pub use crate::loss::image::{ImageTerm, View};
-use crate::loss::image::{PictureGrads, Shown};
 pub use crate::loss::terms::{ParamLoss, Probe, ProbeLoss, StepInfo};
 use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::Real;
 use splat4d::render::{Backend, Image, RenderGrads, Shot};
-use splat4d::scene::{Color, Grads, HeadGrads, Part, Rows, SH, Space, Splats, Table, Time};
+use splat4d::scene::{Color, Grads, Part, Rows, SH, Space, Splats, Table, Time};
 use std::time::{Duration, Instant as Clock};
 
 /// Where a step's time went.
@@ -73,11 +73,19 @@ pub struct Losses<'a, F: Real> {
 #[derive(Default)]
 pub struct Chain<F: Real = f32> {
     evaluation: Evaluation<F>,
-    image: Image<F>,
-    d_image: PictureGrads<F>,
-    d_render: RenderGrads<F>,
+    picture: Compared<F>,
     /// Number of `Motion::at` calls of the last step, for tests and reports.
     pub at_calls: usize,
+}
+
+/// What a step works with, view after view.
+struct Work<'a, F: Real> {
+    backend: &'a mut dyn Backend<F>,
+    image: &'a mut dyn ImageTerm<F>,
+    /// Gradients of the layers.
+    d: &'a mut [Grads<F>],
+    observe: &'a mut dyn FnMut(Observation<'_, F>),
+    report: StepReport,
 }
 
 impl<F: Real> Chain<F> {
@@ -93,16 +101,17 @@ impl<F: Real> Chain<F> {
         observe: &mut dyn FnMut(Observation<'_, F>),
     ) -> Result<StepReport> {
         let Step { scene, views, info, .. } = *step;
-        let mut report = StepReport::default();
+        let mut work = Work { backend, image: &mut *losses.image, d, observe, report: StepReport::default() };
         let mut clock = Clock::now();
         let probes: Vec<Vec<Probe>> = losses.probes.iter().map(|l| l.probes(scene, info)).collect();
-        self.ask(step, losses.image, &probes);
+        self.ask(step, work.image, &probes);
         self.evaluation.answer(&scene.layers);
-        self.evaluation.activate(d);
-        report.timings.motion = lap(&mut clock);
+        self.evaluation.activate(work.d);
+        work.report.timings.motion = lap(&mut clock);
         for view in views {
-            self.view(step, view, backend, losses.image, d, observe, &mut report)?;
+            self.view(step, view, &mut work)?;
         }
+        let Work { d, mut report, .. } = work;
         clock = Clock::now();
         for (loss, probes) in losses.probes.iter().zip(&probes).filter(|(_, probes)| !probes.is_empty()) {
             report.loss += self.probe(scene, loss.as_ref(), probes);
@@ -149,21 +158,12 @@ impl<F: Real> Chain<F> {
     }
 
     /// Draws one view, compares it, and takes the gradient back to its splats.
-    fn view(
-        &mut self,
-        step: &Step<'_, F>,
-        view: &View<'_, F>,
-        backend: &mut dyn Backend<F>,
-        image: &mut dyn ImageTerm<F>,
-        d: &mut [Grads<F>],
-        observe: &mut dyn FnMut(Observation<'_, F>),
-        report: &mut StepReport,
-    ) -> Result<()> {
+    fn view(&mut self, step: &Step<'_, F>, view: &View<'_, F>, work: &mut Work<'_, F>) -> Result<()> {
         let mut clock = Clock::now();
         let scene = step.scene;
         let asked = self.asked(scene, view.t);
         let source = Source { scene, view, asked: &asked };
-        let needs = image.needs(view);
+        let needs = work.image.needs(view);
         let channels = Channels::new(&needs.extra, source, &self.evaluation);
         let splats = self.evaluation.splats(scene, view.t);
         let shot = Shot {
@@ -172,39 +172,20 @@ impl<F: Real> Chain<F> {
             depth: needs.depth,
             ..Shot::new(&splats, view.camera, view.background)
         };
-        backend.render(&shot, &mut self.image)?;
-        report.timings.render += lap(&mut clock);
-
-        self.d_image.begin(&self.image);
-        let shown = Shown::new(&self.image, channels.as_ref().map_or(&[], |c| &c.places));
-        let value = image.eval(step.info, view, &shown, &mut self.d_image);
-        report.loss += value;
-        report.view_losses.push(value);
-        report.timings.loss += lap(&mut clock);
-
-        let mut d_sh = own_sh(&splats, d);
-        backend.vjp(&shot, &self.d_image.grads(), &mut d_sh, &mut self.d_render)?;
-        report.d_cameras.push(self.d_render.camera);
-        add_head(scene, self.d_render.head.as_ref(), d);
-        let mut first = 0;
-        for (layer, (part, &i)) in splats.parts.iter().zip(&asked).enumerate() {
-            let splats = first..first + part.out.rows();
-            first = splats.end;
-            observe(Observation {
-                layer,
-                rows: self.evaluation.tape(i).rows(),
-                mean2d: &self.d_render.mean2d[splats.clone()],
-                radii: &backend.radii()[splats],
-            });
-        }
+        work.backend.render(&shot, &mut self.picture.image)?;
+        work.report.timings.render += lap(&mut clock);
+        self.picture.compare(step.info, view, channels.as_ref().map_or(&[], |c| &c.places), work);
+        work.report.timings.loss += lap(&mut clock);
+        self.picture.backward(scene, &shot, work)?;
+        self.picture.tell(&self.evaluation, &asked, work);
         drop(splats);
-        for (&i, part) in asked.iter().zip(&mut self.d_render.parts) {
+        for (&i, part) in asked.iter().zip(&mut self.picture.d_splats.parts) {
             self.evaluation.add_gradient(i, &mut part.out, &mut part.color, &mut part.weights);
         }
-        if let (Some(channels), Some(d_table), Some(_)) = (&channels, &self.d_render.extra, self.d_image.extra.get()) {
-            channels.backward(d_table, source, &mut self.evaluation, d);
+        if let (Some(channels), Some(d_table)) = (&channels, self.picture.d_channels()) {
+            channels.backward(d_table, source, &mut self.evaluation, work.d);
         }
-        report.timings.render_backward += lap(&mut clock);
+        work.report.timings.render_backward += lap(&mut clock);
         Ok(())
     }
 
@@ -247,7 +228,56 @@ impl<F: Real> Chain<F> {
 
     /// The last view drawn.
     pub fn image(&self) -> &Image<F> {
-        &self.image
+        &self.picture.image
+    }
+}
+
+/// A picture, and the gradients to it and to its splats.
+#[derive(Default)]
+struct Compared<F> {
+    image: Image<F>,
+    d_image: PictureGrads<F>,
+    d_splats: RenderGrads<F>,
+}
+
+impl<F: Real> Compared<F> {
+    /// The picture loss and its gradient.
+    fn compare(&mut self, info: &StepInfo, view: &View<'_, F>, drawn: &[(Channel, usize)], work: &mut Work<'_, F>) {
+        self.d_image.begin(&self.image);
+        let value = work.image.eval(info, view, &Shown::new(&self.image, drawn), &mut self.d_image);
+        work.report.loss += value;
+        work.report.view_losses.push(value);
+    }
+
+    /// The backend's VJP; what belongs to no question goes to the layers: their own SH and the head's weights.
+    fn backward(&mut self, scene: &Scene<F>, shot: &Shot<'_, F>, work: &mut Work<'_, F>) -> Result<()> {
+        let mut d_sh = own_sh(shot.splats, work.d);
+        work.backend.vjp(shot, &self.d_image.grads(), &mut d_sh, &mut self.d_splats)?;
+        work.report.d_cameras.push(self.d_splats.camera);
+        if let (Some((layer, keys)), Some(head)) = (scene.head_keys(), &self.d_splats.head) {
+            let [first, second] = work.d[layer].of([keys.first, keys.second]);
+            first.data_mut().iter_mut().zip(&head.first).for_each(|(d, x)| *d += *x);
+            second.data_mut().iter_mut().zip(&head.second).for_each(|(d, x)| *d += *x);
+        }
+        Ok(())
+    }
+
+    /// Tells the observer what the view saw of every layer.
+    fn tell(&self, evaluation: &Evaluation<F>, asked: &[usize], work: &mut Work<'_, F>) {
+        let mut first = 0;
+        for (layer, &i) in asked.iter().enumerate() {
+            let tape = evaluation.tape(i);
+            let splats = first..first + tape.out().rows();
+            first = splats.end;
+            let mean2d = &self.d_splats.mean2d[splats.clone()];
+            let radii = &work.backend.radii()[splats];
+            (work.observe)(Observation { layer, rows: tape.rows(), mean2d, radii });
+        }
+    }
+
+    /// The gradient to the further channels, if a term has looked at them.
+    fn d_channels(&self) -> Option<&Table<F>> {
+        self.d_splats.extra.as_ref().filter(|_| self.d_image.extra.get().is_some())
     }
 }
 
@@ -267,13 +297,4 @@ fn own_sh<'a, F: Real>(splats: &Splats<'_, F>, d: &'a mut [Grads<F>]) -> Vec<Opt
         _ => None,
     };
     d.iter_mut().zip(&splats.parts).map(own).collect()
-}
-
-/// Adds the gradient of the head's weights, where there is a head.
-fn add_head<F: Real>(scene: &Scene<F>, head: Option<&HeadGrads<F>>, d: &mut [Grads<F>]) {
-    if let (Some((layer, keys)), Some(head)) = (scene.head_keys(), head) {
-        let [first, second] = d[layer].of([keys.first, keys.second]);
-        first.data_mut().iter_mut().zip(&head.first).for_each(|(d, x)| *d += *x);
-        second.data_mut().iter_mut().zip(&head.second).for_each(|(d, x)| *d += *x);
-    }
 }

@@ -3,19 +3,16 @@
 
 use crate::Result;
 use crate::capture::Capture;
-use crate::methods::{Plan, program_of};
+use crate::methods::{Plan, Program, program_of};
 use crate::recipe::Recipe;
 use splat4d::math::Rng;
-use splat4d::motion::deform::Input;
-use splat4d::motion::{Spec, build};
-use splat4d::nn::{HashShape, Kept, encoding};
+use splat4d::motion::Motion;
 use splat4d::scene::splats::SPLAT_COLUMNS;
 use splat4d::scene::{GEOMETRY, Params, Space};
+use std::sync::Arc;
 
 /// Bytes a Gaussian takes in the renderer: records, gradient records, projections (measured: about 1.2 kB).
 const RENDER_BYTES: u64 = 1200;
-/// Bytes a Gaussian's pose takes, a frame.
-const PAGE_BYTES: u64 = 28;
 /// Bytes a pixel takes in training: pictures, gradients and the loss's scratch, all f32.
 const PIXEL_BYTES: u64 = 200;
 /// Bytes a pixel takes in the picture store: colour of 8 bits, or of 16 where pictures are reduced, and a mask.
@@ -31,10 +28,6 @@ const F32: u64 = 4;
 const LEARNT: u64 = 4;
 /// Numbers a splat has in an answer, and as many in its gradient.
 const ANSWER: u64 = 2 * splat_numbers();
-/// Numbers a node has at a tick of a scan: its pose and the gradient to it.
-const TICK: u64 = 32;
-/// Heads of a deformation: position (or screw), rotation, scale.
-const DEFORM_HEADS: u64 = 13;
 /// Rows on which a model without nodes is made.
 const FEW: usize = 16;
 
@@ -56,13 +49,7 @@ pub fn memory_estimate(capture: &Capture, recipe: &Recipe) -> u64 {
     let pixels = frame.unwrap_or(0);
     let stored = STORED_BYTES[usize::from(capture.downscale > 1)];
     let images = (pixels * stored * capture.train.len() as u64).min(recipe.image_memory);
-    let mut sum = PROCESS_BYTES + images + pixels * PIXEL_BYTES * recipe.batch_size as u64 + cap * RENDER_BYTES;
-    if recipe.motion == "tracked" {
-        // The result itself: a pose a Gaussian and frame.
-        let first = frames().map(|f| f.index).min().unwrap_or(0);
-        let last = frames().map(|f| f.index).max().unwrap_or(0);
-        sum += cap * PAGE_BYTES * (last - first) as u64;
-    }
+    let sum = PROCESS_BYTES + images + pixels * PIXEL_BYTES * recipe.batch_size as u64 + cap * RENDER_BYTES;
     if capture.train.is_empty() {
         return sum;
     }
@@ -73,86 +60,49 @@ pub fn memory_estimate(capture: &Capture, recipe: &Recipe) -> u64 {
 
 /// Bytes of a model's tables in training, and of what a step with it needs, at `rows` Gaussians.
 fn model(plan: &Plan, rows: usize) -> Result<u64> {
-    let spec = program_of(&plan.recipe)?.spec(plan);
-    let tables = tables(plan, &spec, rows)?;
+    let program = program_of(&plan.recipe)?;
+    let few = Few::new(program.as_ref(), plan, rows)?;
+    let tables = few.tables(rows);
     let checkpoint = tables * CHECKPOINT[0] / CHECKPOINT[1];
-    Ok(tables + checkpoint + rows as u64 * plan.recipe.batch_size as u64 * F32 * scratch(plan, &spec, rows))
+    let question = rows as u64 * ANSWER * F32 + few.motion.scratch_bytes(&few.params, rows);
+    Ok(tables + checkpoint + program.growth_bytes(plan, rows) + plan.recipe.batch_size as u64 * question)
 }
 
-/// Bytes of all tables at `rows` Gaussians: values, gradients, two moments and the steps that a row has taken.
-fn tables(plan: &Plan, spec: &Spec, rows: usize) -> Result<u64> {
-    let r = &plan.recipe;
-    let nodes = matches!(innermost(spec), Spec::Control(_) | Spec::Ssm(_));
-    let most = if r.control_adapt_interval > 0 { r.control_max_nodes.max(r.control_nodes) } else { r.control_nodes };
-    let few = if nodes { most.min(rows) } else { FEW };
-    let life = program_of(r)?.life(plan);
-    let mut p = Params::<f32>::new(few, (r.sh_degree + 1) * (r.sh_degree + 1), life.columns());
-    let rng = Rng::new(0, "memory", 0);
-    for row in 0..few {
-        // Nodes start at different places.
-        p[GEOMETRY].write(row, 0, [0, 1, 2].map(|k| rng.fork(k).uniform(row as u64) as f32));
-    }
-    build::<f32>(&with_nodes(spec.clone(), few), &mut p)?;
-    let bytes = |key| {
-        let count = if p.info(key).space == Space::Gaussians { rows } else { p[key].rows() };
-        count as u64 * (LEARNT * p[key].width() as u64 + 1) * F32
-    };
-    Ok(p.keys().map(bytes).sum())
+/// A program's model on few rows: as many as it needs for its nodes.
+struct Few {
+    params: Params<f32>,
+    motion: Arc<dyn Motion<f32>>,
+    /// Most nodes.
+    nodes: usize,
 }
 
-fn innermost(spec: &Spec) -> &Spec {
-    match spec {
-        Spec::Filtered(f) => innermost(&f.inner),
-        other => other,
-    }
-}
-
-/// The same model with another number of nodes, where it has any.
-fn with_nodes(mut spec: Spec, nodes: usize) -> Spec {
-    match &mut spec {
-        Spec::Control(s) => s.skin.nodes = nodes,
-        Spec::Ssm(s) => s.skin.nodes = nodes,
-        Spec::Filtered(f) => *f.inner = with_nodes((*f.inner).clone(), nodes),
-        _ => {}
-    }
-    spec
-}
-
-/// Numbers that a Gaussian takes in the answer to one question: the answer, its gradient, and what the model remembers
-/// for its backward.
-fn scratch(plan: &Plan, spec: &Spec, rows: usize) -> u64 {
-    ANSWER
-        + match spec {
-            Spec::DeformMlp(s) => {
-                let hash = |s: &HashShape| s.levels * s.features;
-                let inputs = match &s.input {
-                    Input::Encoded { x_levels, .. } => encoding::encoded(3, *x_levels),
-                    Input::Hashed { space, time } => hash(space) + 3 * hash(time),
-                };
-                let most = (Kept::<f32>::BYTES / rows.max(1)) as u64 / F32;
-                2 * (inputs as u64 + DEFORM_HEADS) + ((s.layers * s.width) as u64).min(most)
-            }
-            Spec::Hexplane(s) => {
-                let colors = if s.heads.sh { 3 * (plan.recipe.sh_degree as u64 + 1).pow(2) } else { 0 };
-                // Place, what the heads said, what became of it; features and trunk with their gradients, hidden layers.
-                let heads = [s.heads.position, s.heads.scale, s.heads.rotation, s.heads.opacity, s.heads.sh];
-                let hidden = heads.iter().filter(|on| **on).count() + s.defor_depth.max(1) - 1;
-                3 + 2 * (11 + colors) + (2 * (s.planes.features() + s.net_width) + hidden * s.net_width) as u64
-            }
-            Spec::Control(s) => skinned(s.skin.neighbours),
-            Spec::Ssm(s) => skinned(s.skin.neighbours) + (s.skin.nodes * s.ticks) as u64 * TICK / rows.max(1) as u64,
-            Spec::Filtered(f) => {
-                // The model's answers now and earlier; a state of each, and the gradients to them.
-                let earlier = 1 + f.history.max(f.baseline + 1) as u64;
-                earlier * (scratch(plan, &f.inner, rows) + splat_numbers())
-            }
-            _ => 0,
+impl Few {
+    fn new(program: &dyn Program, plan: &Plan, rows: usize) -> Result<Self> {
+        let nodes = program.nodes(plan).min(rows);
+        let (few, coefficients) = (FEW.max(nodes), (plan.recipe.sh_degree + 1).pow(2));
+        let mut params = Params::<f32>::new(few, coefficients, program.life(plan).columns());
+        let rng = Rng::new(0, "memory", 0);
+        for row in 0..few {
+            // Nodes start at different places.
+            params[GEOMETRY].write(row, 0, [0, 1, 2].map(|k| rng.fork(k).uniform(row as u64) as f32));
         }
-}
+        let motion = program.build(plan, &mut params)?;
+        Ok(Self { params, motion, nodes })
+    }
 
-/// Weights of the nodes that pull a Gaussian, their gradients, and its blended frame.
-fn skinned(neighbours: usize) -> u64 {
-    4 * neighbours as u64 + 2 * 12
+    /// Bytes of all tables at `rows` Gaussians: values, gradients, two moments and the steps that a row has taken.
+    fn tables(&self, rows: usize) -> u64 {
+        let p = &self.params;
+        let bytes = |key| {
+            let count = match p.info(key).space {
+                Space::Gaussians => rows,
+                Space::Nodes => self.nodes,
+                _ => p[key].rows(),
+            };
+            count as u64 * (LEARNT * p[key].width() as u64 + 1) * F32
+        };
+        p.keys().map(bytes).sum()
+    }
 }
 
 /// Peak resident memory of this process, bytes; 0 where the system does not tell.
@@ -194,8 +144,9 @@ mod tests {
             let p = &trainer.scene().layers[0].params;
             let values: usize = p.keys().map(|k| size_of_val(p[k].data())).sum();
             let counted = values + splat4d::scene::Grads::new(p).bytes() + trainer.learner.moments()[0].bytes();
-            let spec = program_of(&r).unwrap().spec(&plan);
-            let estimated = tables(&plan, &spec, trainer.scene().len()).unwrap() as f64;
+            let rows = trainer.scene().len();
+            let few = Few::new(program_of(&r).unwrap().as_ref(), &plan, rows).unwrap();
+            let estimated = few.tables(rows) as f64;
             let off = counted as f64 / estimated;
             assert!((1.0 / ROUNDED..ROUNDED).contains(&off), "{line}: {counted} bytes, estimated {estimated}");
         }

@@ -324,7 +324,7 @@ impl Bench {
 
     pub(super) fn initial_scene(&self, plan: &Plan) -> Result<Scene<f32>> {
         let program = program_of(&plan.recipe)?;
-        let moving = plan.recipe.motion != "still" && plan.times > 1;
+        let moving = program.capabilities(plan).moves && plan.times > 1;
         let init = &plan.recipe.init;
         let points = if init.ends_with(".ply") {
             let cloud = crate::capture::read_points(Path::new(init))?;

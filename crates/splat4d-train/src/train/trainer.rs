@@ -169,6 +169,7 @@ impl<'a> Trainer<'a> {
         while !self.entered && !self.is_done() {
             if self.progress.stage_step == 0 {
                 self.run_hook(|s| s.start.as_ref(), progress)?;
+                self.set_phase();
                 // Of another stage's codec nothing is kept.
                 self.engine.changed(&self.learner);
             }
@@ -180,6 +181,16 @@ impl<'a> Trainer<'a> {
             self.entered = true;
         }
         Ok(())
+    }
+
+    /// Puts the models of all layers into the stage's phase.
+    fn set_phase(&mut self) {
+        let Some(phase) = self.stages[self.progress.stage].phase else { return };
+        for layer in &mut self.learner.scene_mut().layers {
+            if let Some(motion) = layer.motion.with_phase(&phase) {
+                layer.motion = motion;
+            }
+        }
     }
 
     fn leave_stage(&mut self, progress: &mut Progress<'_>) -> Result<()> {

@@ -9,9 +9,10 @@ use crate::recipe::Recipe;
 use serde::{Deserialize, Serialize};
 use splat4d::layers::{ALWAYS, Evaluation, Layer, Scene, freeze_rows};
 use splat4d::math::Rng;
-use splat4d::motion::{Spec, build};
+use splat4d::motion::Still;
 use splat4d::scene::splats::COV;
 use splat4d::scene::{LifeKind, RowEdit, Rows, Space, Time};
+use std::sync::Arc;
 
 /// Times at which rows are looked at, evenly over the clip: an odd number has the middle.
 const LOOKS: usize = 17;
@@ -57,11 +58,11 @@ pub struct Split {
 }
 
 impl Split {
-    /// As a recipe has it for a last stage of `steps`; `None`: never.
+    /// As a recipe has it for a last stage of `steps`, in which Gaussians move; `None`: never.
     pub fn of(r: &Recipe, extent: f64, steps: usize) -> Option<Self> {
         let s = SplitSettings::of(r);
         let some = || Self { at: (steps as f64 * s.from) as usize, reach: s.reach * extent };
-        (s.reach > 0.0 && r.motion != "still").then(some)
+        (s.reach > 0.0).then(some)
     }
 }
 
@@ -89,7 +90,7 @@ impl Upkeep for Split {
 pub fn split(scene: &mut Scene<f32>, reach: f64) -> Result<usize> {
     let mut moved = 0;
     for index in 0..scene.layers.len() {
-        if scene.layers[index].motion.spec() == Spec::Still {
+        if !scene.layers[index].motion.capabilities().moves {
             continue;
         }
         let still = still_rows(&scene.layers[index], scene.clip, reach);
@@ -99,10 +100,10 @@ pub fn split(scene: &mut Scene<f32>, reach: f64) -> Result<usize> {
         }
         let layer = &mut scene.layers[index];
         let rows: Vec<u32> = (0..still.len() as u32).filter(|&r| still[r as usize]).collect();
-        let mut params = freeze_rows(layer, &rows, Time(0.5 * (scene.clip[0] + scene.clip[1])));
-        let motion = build(&Spec::Still, &mut params)?;
+        let params = freeze_rows(layer, &rows, Time(0.5 * (scene.clip[0] + scene.clip[1])));
         let name = format!("{} {STILL_LAYER}", layer.name);
-        let part = Layer { span: layer.span, ..Layer::new(name, params, motion, LifeKind::Infinite) };
+        let fixed = Layer::new(name, params, Arc::new(Still), LifeKind::Infinite);
+        let part = Layer { span: layer.span, ..fixed };
         let edit = RowEdit::prune(Space::Gaussians, still.iter().map(|s| !s));
         layer.edit(&edit, &Rng::new(0, "split", index as u64));
         scene.layers.push(part);
@@ -138,7 +139,7 @@ fn still_rows(layer: &Layer<f32>, clip: [f64; 2], reach: f64) -> Vec<bool> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use splat4d::motion::SpacetimeSpec;
+    use splat4d::motion::{SpacetimeSpec, Spec, build};
     use splat4d::scene::{GEOMETRY, LIFE, SH};
 
     #[test]

@@ -8,8 +8,7 @@ use super::shape::Shape;
 use super::tree::{Span, Tree};
 use crate::layers::Layer;
 use crate::math::quat;
-use crate::motion::Spec;
-use crate::motion::spacetime::VELOCITIES;
+use crate::motion::Polynomial;
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::{GEOMETRY, Key};
 
@@ -24,14 +23,8 @@ pub(super) struct Line {
 impl Line {
     /// The layer's motion, where it is straight.
     pub(super) fn of(layer: &Layer<f32>) -> Option<Self> {
-        match layer.motion.spec() {
-            Spec::Still => Some(Self { velocities: None, origin: 0.0 }),
-            Spec::Spacetime(s) if s.order <= 1 && !s.rotation => {
-                let velocities = if s.order == 1 { Some(layer.params.find(VELOCITIES)?) } else { None };
-                Some(Self { velocities, origin: s.origin })
-            }
-            _ => None,
-        }
+        let motion = layer.motion.polynomial().filter(Polynomial::is_straight)?;
+        Some(Self { velocities: motion.velocities, origin: motion.origin })
     }
 
     /// The primitive of row `id`, one for every span in `window` (the layer's span); none where it is never seen in the

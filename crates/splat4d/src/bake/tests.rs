@@ -334,6 +334,10 @@ impl Motion<f32> for Hidden {
         Spec::Custom("hidden".into())
     }
 
+    fn scratch_bytes(&self, _p: &Params<f32>, _rows: usize) -> u64 {
+        0
+    }
+
     fn at(&self, q: &At<'_, f32>, cache: &Cache, tape: &mut Tape<f32>) {
         self.0.at(q, cache, tape);
     }
@@ -357,6 +361,10 @@ struct Leaps;
 impl Motion<f32> for Leaps {
     fn spec(&self) -> Spec {
         Spec::Custom("leaps".into())
+    }
+
+    fn scratch_bytes(&self, _p: &Params<f32>, _rows: usize) -> u64 {
+        0
     }
 
     fn at(&self, q: &At<'_, f32>, _cache: &Cache, tape: &mut Tape<f32>) {
@@ -390,6 +398,10 @@ struct Lamps;
 impl Motion<f32> for Lamps {
     fn spec(&self) -> Spec {
         Spec::Custom("lamps".into())
+    }
+
+    fn scratch_bytes(&self, _p: &Params<f32>, _rows: usize) -> u64 {
+        0
     }
 
     fn at(&self, q: &At<'_, f32>, _cache: &Cache, tape: &mut Tape<f32>) {

@@ -106,6 +106,8 @@ struct Scene<F> {
     extra: Option<Table<F>>,
 }
 
+/// A rotation.
+const AXES: [[f64; 3]; 3] = [[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]];
 /// Splats in each part.
 const EACH: usize = 300;
 
@@ -156,7 +158,12 @@ impl<F: Real> Scene<F> {
     /// The picture of a backend, if it can draw it.
     fn drawn(&self, backend: &mut dyn Backend<F>, camera: &Camera, sh_degree: usize, depth: bool) -> Option<Image<F>> {
         let sh = Color::Sh { table: &self.sh, rows: Rows::All, weights: None, base: true };
-        let parts = vec![Part::new(&self.outs[0], sh), Part::new(&self.outs[1], Color::Direct { table: &self.direct })];
+        // Harmonics in axes of their own, and in the world's.
+        let layer_from_world = self.extra.is_none().then_some(AXES.map(|row| row.map(F::of)));
+        let parts = vec![
+            Part { layer_from_world, ..Part::new(&self.outs[0], sh) },
+            Part::new(&self.outs[1], Color::Direct { table: &self.direct }),
+        ];
         let head = self.head.as_ref().map(|[first, second]| HeadWeights { first, second });
         let splats = Splats { parts, head };
         let background = BACKGROUND.map(|v| F::of(f64::from(v)));

@@ -3,13 +3,13 @@
 
 use super::octets::sound_rows;
 use super::warnings::Warnings;
-use crate::layers::{ALWAYS, Layer, Scene};
+use crate::layers::{ALWAYS, Layer, Scene, with_polynomial};
 use crate::math::quat;
-use crate::motion::spacetime::{ROTATION_RATES, VELOCITIES};
-use crate::motion::{SpacetimeSpec, Spec, build};
+use crate::motion::{Spacetime, SpacetimeSpec};
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::{GEOMETRY, LIFE, LifeKind, Params, SH};
 use crate::{Error, ErrorKind, Result};
+use std::sync::Arc;
 
 /// Width, in clips, of a fade that stands for "lives for ever": over the clip it dims by 1e-8.
 pub(super) const FOREVER: f64 = 1e4;
@@ -90,12 +90,13 @@ pub(super) fn rows(scene: &Scene<f32>, clock: Clock, name: &str, warnings: &mut 
     scene.without_head(name)?;
     let mut out = Vec::with_capacity(scene.len());
     let mut shaded = 0;
-    for layer in scene.layers.iter().map(Layer::with_frame_absorbed) {
-        let layer = layer.as_ref();
-        let spec = match layer.motion.spec() {
-            Spec::Still => SpacetimeSpec { order: 0, ..SpacetimeSpec::default() },
-            Spec::Spacetime(spec) => spec,
-            other => return Err(cannot_hold(layer, name, &format!("the motion `{}`", other.name()))),
+    let powers: [f64; 3] = std::array::from_fn(|k| clock.duration.powi(k as i32 + 1));
+    for layer in &scene.layers {
+        let converted = with_polynomial(layer).map_err(|e| e.at(format_args!("layer `{}`", layer.name)))?;
+        let absorbed = converted.with_frame_absorbed();
+        let layer = absorbed.as_ref();
+        let Some(motion) = layer.motion.polynomial() else {
+            return Err(cannot_hold(layer, name, &format!("the motion `{}`", layer.motion.spec().name())));
         };
         if layer.life == LifeKind::Interval {
             return Err(cannot_hold(layer, name, "lives of the kind `interval`, which have a flat top"));
@@ -103,8 +104,6 @@ pub(super) fn rows(scene: &Scene<f32>, clock: Clock, name: &str, warnings: &mut 
         if layer.span != ALWAYS {
             return Err(cannot_hold(layer, name, "a span of time outside of which it is not drawn"));
         }
-        let find = |name| layer.params.find(name);
-        let (path, rates) = (find(VELOCITIES), find(ROTATION_RATES));
         shaded += if layer.params[SH].width() > 3 { layer.params.len() } else { 0 };
         let p = &layer.params;
         for row in sound_rows(p, warnings) {
@@ -113,7 +112,7 @@ pub(super) fn rows(scene: &Scene<f32>, clock: Clock, name: &str, warnings: &mut 
             let (quat, norm) = quat::normalize(geometry.read::<4>(row, QUAT).map(f64::from));
             let norm = if norm > 0.0 { norm } else { 1.0 };
             let (center, width) = match layer.life {
-                LifeKind::Infinite => (spec.origin, FOREVER * clock.duration),
+                LifeKind::Infinite => (motion.origin, FOREVER * clock.duration),
                 // exp(−½(Δ/w)²) = exp(−(Δ/s)²) at s = √2·w.
                 LifeKind::GaussHalf => (life(p, row, 0), life(p, row, 1).exp() * std::f64::consts::SQRT_2),
                 _ => (life(p, row, 0), life(p, row, 1).exp()),
@@ -129,13 +128,13 @@ pub(super) fn rows(scene: &Scene<f32>, clock: Clock, name: &str, warnings: &mut 
                 center: (center - clock.clip[0]) / clock.duration,
                 width: (width / clock.duration).clamp(NARROWEST, FOREVER),
             };
-            for k in 0..spec.order {
-                let power = clock.duration.powi(k as i32 + 1);
-                let v = p[path.expect("a spacetime layer has its tables")].read::<3>(row, 3 * k);
-                moving.path[k] = v.map(|v| f64::from(v) * power);
+            if let Some(path) = motion.velocities {
+                for (k, power) in powers.iter().enumerate().take(motion.order) {
+                    moving.path[k] = p[path].read::<3>(row, 3 * k).map(|v| f64::from(v) * power);
+                }
             }
-            if spec.rotation {
-                let rate = p[rates.expect("a spacetime layer has its tables")].read::<4>(row, 0);
+            if let Some(rates) = motion.rotation_rates {
+                let rate = p[rates].read::<4>(row, 0);
                 moving.turn = rate.map(|w| f64::from(w) * clock.duration / norm);
             }
             out.push(moving);
@@ -162,12 +161,10 @@ fn cannot_hold(layer: &Layer<f32>, name: &str, what: &str) -> Error {
 pub(super) fn scene(rows: &[Moving], clock: Clock) -> Result<Scene<f32>> {
     let kind = LifeKind::GaussOne;
     let origin = 0.5 * (clock.clip[0] + clock.clip[1]);
-    let spec = Spec::Spacetime(SpacetimeSpec { order: 3, rotation: true, detach: true, origin, features: None });
+    let spec = SpacetimeSpec { order: 3, rotation: true, detach: true, origin, features: None };
     let mut params = Params::new(rows.len(), 1, kind.columns());
-    let motion = build(&spec, &mut params)?;
-    let find = |p: &Params, name| p.find(name).expect("the model has just made its tables");
-    let (path, rates) = (find(&params, VELOCITIES), find(&params, ROTATION_RATES));
-    let [geometry, sh, life, path, rates] = params.get_mut([GEOMETRY, SH, LIFE, path, rates]);
+    let motion = Spacetime::new(spec, &mut params)?;
+    let [geometry, sh, life, path, rates] = params.get_mut([GEOMETRY, SH, LIFE, motion.velocities(), motion.rates()]);
     for (row, m) in rows.iter().enumerate() {
         geometry.write(row, 0, m.mean.map(|x| x as f32));
         geometry.write(row, QUAT, m.quat.map(|x| x as f32));
@@ -182,7 +179,7 @@ pub(super) fn scene(rows: &[Moving], clock: Clock) -> Result<Scene<f32>> {
         }
         rates.write(row, 0, m.turn.map(|w| (w / clock.duration) as f32));
     }
-    let layer = Layer::new("moving", params, motion, kind);
+    let layer = Layer::new("moving", params, Arc::new(motion), kind);
     Ok(Scene { layers: vec![layer], clip: clock.clip, fps: clock.fps, up: UP, ..Scene::default() })
 }
 
@@ -190,8 +187,10 @@ pub(super) fn scene(rows: &[Moving], clock: Clock) -> Result<Scene<f32>> {
 pub(super) mod tests {
     use super::*;
     use crate::format::samples::gaussians;
-    use crate::layers::Evaluation;
-    use crate::math::Rng;
+    use crate::layers::{Evaluation, to_native4d};
+    use crate::math::{Rng, Sim3};
+    use crate::motion::native4d::Native4dSpec;
+    use crate::motion::{Spec, build};
     use crate::scene::Time;
     use crate::scene::splats::SPLAT_OPACITY;
 
@@ -259,6 +258,22 @@ pub(super) mod tests {
                 let [mean, cov, _] = apart(&scene, &super::scene(&shifted, clock).unwrap());
                 assert!(mean < 5e-5 && cov < 5e-5, "{life:?} {order}: {mean} {cov}");
             }
+        }
+    }
+
+    #[test]
+    fn gaussians_of_space_and_time_and_layers_with_a_frame_are_held() {
+        let clock = Clock { clip: [2.0, 5.0], fps: 25.0, duration: 3.0 };
+        let mut scene = moving(50, LifeKind::GaussHalf, 1, false);
+        let rotation = quat::to_rotation(quat::normalize([0.4, -0.3, 0.8, 0.2]).0);
+        scene.layers[0].frame = Sim3 { scale: 1.7, rotation, translation: [0.4, -0.7, 0.2] };
+        let spec = Native4dSpec { max_life: 1e3, min_life: 1e-6, ..Native4dSpec::default() };
+        let mut native = scene.clone();
+        native.layers[0] = to_native4d(&scene.layers[0], spec).unwrap();
+        for own in [scene, native] {
+            let rows = rows(&own, clock, "x", &mut Warnings::default()).unwrap();
+            let [mean, cov, opacity] = apart(&own, &super::scene(&rows, clock).unwrap());
+            assert!(mean < 2e-4 && cov < 2e-4 && opacity < 2e-4, "{:?}: {mean} {cov} {opacity}", own.layers[0]);
         }
     }
 

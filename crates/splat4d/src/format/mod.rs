@@ -25,6 +25,7 @@ pub mod splat;
 pub mod splatv;
 pub mod spz;
 pub mod warnings;
+mod zip;
 
 pub use arrays::{params_to_arrays, tensors_to_loaded};
 pub use dialect::Dialect;

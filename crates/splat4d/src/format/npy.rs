@@ -82,6 +82,19 @@ impl Npy {
         Ok(Self { shape: header.shape, values })
     }
 
+    /// Reads the array `name` of an `.npz` archive, as `numpy.savez` and `savez_compressed` write them.
+    ///
+    /// Errors: no zip archive, damaged, or without that array; those of [`read`](Self::read).
+    pub fn read_member(archive: &[u8], name: &str) -> Result<Self> {
+        let files = super::zip::read(archive)?;
+        let file = files.get(&format!("{name}.npy")).ok_or_else(|| {
+            let have: Vec<&str> = files.keys().map(|n| n.trim_end_matches(".npy")).collect();
+            Error::input(format!("the archive has no array `{name}`, but {}", have.join(", ")))
+                .remedy(format!("Save it with numpy.savez(path, {name}=...)"))
+        })?;
+        Self::read(file)
+    }
+
     /// How many numbers the array holds.
     pub fn len(&self) -> usize {
         match &self.values {

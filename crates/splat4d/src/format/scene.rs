@@ -9,7 +9,6 @@ use super::safetensors::{SafeTensors, Tensor};
 use super::{params_to_arrays, tensors_to_loaded};
 use crate::layers::{ALWAYS, Head, Layer, Scene};
 use crate::math::Sim3;
-use crate::motion::native4d::MAX_HARMONICS;
 use crate::motion::{BUILT_IN, Spec, build};
 use crate::scene::masks::WORD;
 use crate::scene::{HeadKeys, KeyMasks, LifeKind, Params, SH};
@@ -68,9 +67,9 @@ pub fn metadata(scene: &Scene<f32>) -> Value {
 
 /// A motion model's spec as JSON.
 pub fn spec_to_json(spec: &Spec) -> Value {
-    match spec {
-        Spec::Custom(name) => json!({ "model": name, "custom": true }),
-        _ => serde_json::to_value(spec).expect("a spec is plain numbers, flags and names"),
+    match spec.is_built_in() {
+        true => serde_json::to_value(spec).expect("a spec is plain numbers, flags and names"),
+        false => json!({ "model": spec.name(), "custom": true }),
     }
 }
 
@@ -174,7 +173,7 @@ fn read_layer(file: &SafeTensors<'_>, meta: &Value, index: usize) -> Result<Laye
         return Err(broken(format!("the metadata claims {rows} Gaussians, the means have shape {:?}", means.shape())));
     }
     let motion = spec_from_json(&meta["motion"])?;
-    let blocks = if let Spec::Native4d(s) = motion { s.harmonics.min(MAX_HARMONICS) + 1 } else { 1 };
+    let blocks = motion.capabilities().unwrap_or_default().color_blocks;
     if coefficients > crate::math::sh::MAX_COEFFS * blocks {
         return Err(broken(format!("{coefficients} SH coefficients are more than degree 3 has")));
     }

@@ -10,7 +10,7 @@ mod tests;
 use super::{Layer, LayerTape, Scene};
 use crate::math::Real;
 use crate::motion::{At, Cache};
-use crate::scene::table::halve;
+use crate::scene::table::par_split;
 use crate::scene::{Grads, Rows, Space, SplatGrads, Splats, Table, Time};
 
 /// Questions to the layers of a scene, their answers, and the gradients to these. No two questions have the same layer,
@@ -281,7 +281,7 @@ fn reset_like<F: Real>(d: &mut Table<F>, like: &Table<F>) {
 
 fn add_table<F: Real>(to: &mut Table<F>, from: &Table<F>) {
     assert_eq!((to.rows(), to.width()), (from.rows(), from.width()), "gradients of one answer have one shape");
-    halve([to.view_mut()], &|[to]| {
+    par_split([to.view_mut()], &|[to]| {
         let from = &from.data()[to.first * to.width..];
         to.data.iter_mut().zip(from).for_each(|(a, b)| *a += *b);
         0.0

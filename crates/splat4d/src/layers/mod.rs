@@ -1,6 +1,6 @@
 //! A scene is a sum of layers: each a set of Gaussians with one motion model and one kind of life, all splatted together.
 
-mod chart;
+mod convert;
 mod envelope;
 mod evaluation;
 mod frame;
@@ -9,7 +9,7 @@ mod rotate;
 #[cfg(test)]
 mod tests;
 
-pub use chart::{to_native4d, to_spacetime};
+pub use convert::{to_native4d, to_spacetime, with_polynomial};
 pub use evaluation::{Evaluation, sweep};
 pub use freeze::{freeze, freeze_rows};
 pub use rotate::rotation_between;

@@ -136,6 +136,10 @@ fn default_velocity_agrees_with_the_analytic_one() {
         fn spec(&self) -> Spec {
             Spec::Custom("plain".into())
         }
+
+        fn scratch_bytes(&self, _p: &Params<f64>, _rows: usize) -> u64 {
+            0
+        }
         fn at(&self, q: &At<'_, f64>, cache: &Cache, tape: &mut Tape<f64>) {
             self.0.at(q, cache, tape);
         }

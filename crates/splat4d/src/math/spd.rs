@@ -208,26 +208,9 @@ fn rotate(a: &mut Mat3, v: &mut Mat3, p: usize, q: usize) {
     }
 }
 
-/// The square root S of a covariance A.
-pub fn sqrt(a: &Eigen) -> Mat3 {
-    a.map(f64::sqrt)
-}
-
-/// VJP of [`sqrt`]: dS solves S dS + dS S = dA, so that the gradient to A is d_S divided by √λᵢ + √λⱼ in A's eigenbasis.
-pub fn sqrt_backward(a: &Eigen, d_root: &Mat3) -> Mat3 {
-    a.weigh(d_root, |x, y| 1.0 / (x.sqrt() + y.sqrt()))
-}
-
 /// The Γ with ΓΣ + ΣΓ = V (Lyapunov's equation).
 pub fn lyapunov(sigma: &Eigen, v: &Mat3) -> Mat3 {
     sigma.weigh(v, |x, y| 1.0 / (x + y))
-}
-
-/// VJP of [`lyapunov`] with its result Γ: gradients to Σ and to V.
-pub fn lyapunov_backward(sigma: &Eigen, gamma: &Mat3, d_gamma: &Mat3) -> (Mat3, Mat3) {
-    let d_v = lyapunov(sigma, d_gamma);
-    let product = mul(gamma, &d_v);
-    (mix(-2.0, &symmetric(&product), 0.0, &IDENTITY), d_v)
 }
 
 /// The optimal map between two covariances, and what its gradient needs.
@@ -276,12 +259,6 @@ pub fn bures(a: &Mat3, b: &Mat3) -> (f64, Mat3, Mat3) {
     // tr (T−I)Σ₁(T−I) = ‖(T−I)Σ₁^½‖²: the trace formula would cancel for neighbours.
     let m = mul(&mix(1.0, &t.map, -1.0, &IDENTITY), &t.half[0]);
     (inner(&m, &m), mix(1.0, &IDENTITY, -1.0, &t.map), mix(1.0, &IDENTITY, -1.0, &t.back()))
-}
-
-/// W₂² of two Gaussians (mean, covariance).
-pub fn w2_squared(a: ([f64; 3], &Mat3), b: ([f64; 3], &Mat3)) -> f64 {
-    let means: f64 = (0..3).map(|k| (a.0[k] - b.0[k]).powi(2)).sum();
-    means + bures(a.1, b.1).0
 }
 
 /// The covariances' part of the logarithm at Σ₁ of Σ₂: V = TΣ₁ + Σ₁T − 2Σ₁. The means' part is μ₂ − μ₁.

@@ -13,7 +13,7 @@ pub use low_rank::LowRank;
 pub use network::{Network, NetworkShape};
 
 use super::skin::{Skin, SkinSpec, Skinned, Trajectory};
-use super::{Motion, Spec};
+use super::{Capabilities, Model, Motion, Spec};
 use crate::math::Real;
 use crate::scene::Params;
 use crate::{Error, Result};
@@ -97,14 +97,19 @@ impl Default for ControlSpec {
     }
 }
 
-/// Makes the model, and in `p` the tables it needs (or claims the loaded ones).
-///
-/// Errors: numbers of the spec out of range, loaded arrays of the wrong shape.
-pub fn build<F: Real>(spec: &ControlSpec, p: &mut Params<F>) -> Result<Arc<dyn Motion<F>>> {
-    Ok(Arc::new(skinned(spec, p)?))
+impl Model for ControlSpec {
+    fn build<F: Real>(&self, p: &mut Params<F>) -> Result<Arc<dyn Motion<F>>> {
+        Ok(Arc::new(skinned(self, p)?))
+    }
+
+    fn capabilities(&self) -> Capabilities {
+        Capabilities::default()
+    }
 }
 
-/// As [`build`], for who wants more of it than motion: node poses, the skin.
+/// The model with more than motion: node poses, the skin.
+///
+/// Errors: as [`Model::build`].
 pub fn skinned<F: Real>(spec: &ControlSpec, p: &mut Params<F>) -> Result<Skinned<F>> {
     let skin = Skin::new(spec.skin, spec.seed, p)?;
     let trajectory: Box<dyn Trajectory<F>> = match spec.trajectory {

@@ -18,7 +18,7 @@ mod tests;
 
 use super::lanes::{fill, scatter};
 use super::still::Still;
-use super::{At, Cache, Motion, Slot, Spec, Tape};
+use super::{At, Cache, Capabilities, Model, Motion, Slot, Spec, Tape};
 use crate::math::{Real, Rng};
 use crate::nn::encoding::{MAX_LEVELS, encode, encode_backward, encoded};
 use crate::nn::{HashGrid, HashShape, InputGrad, Kept, Mlp, MlpShape, Passed};
@@ -90,11 +90,14 @@ const PURPOSE: &str = "deform";
 /// Rows of a task that encodes points.
 const ROWS: usize = 256;
 
-/// Makes the model, and in `p` the tables it needs (or claims the loaded ones).
-///
-/// Errors: a clip, levels or sizes that are not possible; loaded arrays of the wrong shape.
-pub fn build<F: Real>(spec: &DeformSpec, p: &mut Params<F>) -> Result<Arc<dyn Motion<F>>> {
-    Ok(Arc::new(Deform::new(spec.clone(), p)?))
+impl Model for DeformSpec {
+    fn build<F: Real>(&self, p: &mut Params<F>) -> Result<Arc<dyn Motion<F>>> {
+        Ok(Arc::new(Deform::new(self.clone(), p)?))
+    }
+
+    fn capabilities(&self) -> Capabilities {
+        Capabilities::default()
+    }
 }
 
 /// How x̂ and t̂ reach the trunk.
@@ -385,6 +388,14 @@ impl Deform {
 impl<F: Real> Motion<F> for Deform {
     fn spec(&self) -> Spec {
         Spec::DeformMlp(self.spec.clone())
+    }
+
+    /// What the trunk sees and what comes out, each with its gradient; of the hidden layers what [`Kept`] keeps.
+    fn scratch_bytes(&self, _p: &Params<F>, rows: usize) -> u64 {
+        let shape = self.trunk.shape();
+        let number = size_of::<F>();
+        let hidden = (rows * shape.layers * shape.width * number).min(Kept::<F>::BYTES);
+        (rows * 2 * (shape.inputs + shape.outputs) * number + hidden) as u64
     }
 
     fn at(&self, q: &At<'_, F>, cache: &Cache, tape: &mut Tape<F>) {

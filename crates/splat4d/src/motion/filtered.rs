@@ -25,10 +25,11 @@ mod tests;
 
 pub use row::{Fused, FusedGrads, Fusion, Normal, Prediction, Predictor};
 
-use super::{At, Cache, Motion, Spec, Tape};
+use super::{At, Cache, Capabilities, Model, Motion, Phase, Spec, Tape};
 use crate::math::{Real, Rng};
+use crate::scene::splats::SPLAT_COLUMNS;
 use crate::scene::splats::SPLAT_OPACITY;
-use crate::scene::table::halve;
+use crate::scene::table::par_split;
 use crate::scene::{Color, Grads, Key, Params, RowEdit, Rows, Space, SplatGrads, Table, Time};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
@@ -119,11 +120,18 @@ impl FilteredSpec {
     }
 }
 
-/// Makes the model inside, then the filter's own table.
-pub fn build<F: Real>(spec: &FilteredSpec, p: &mut Params<F>) -> Result<Arc<dyn Motion<F>>> {
-    spec.check()?;
-    let inner = super::build(&spec.inner, p)?;
-    Ok(Arc::new(Filtered::around(inner, spec.clone(), p)?))
+impl Model for FilteredSpec {
+    /// Makes the model inside, then the filter's own table.
+    fn build<F: Real>(&self, p: &mut Params<F>) -> Result<Arc<dyn Motion<F>>> {
+        self.check()?;
+        let inner = super::build(&self.inner, p)?;
+        Ok(Arc::new(Filtered::around(inner, self.clone(), p)?))
+    }
+
+    /// Those of the model inside: the filter looks back only.
+    fn capabilities(&self) -> Capabilities {
+        self.inner.capabilities().unwrap_or_default()
+    }
 }
 
 /// See the module's documentation.
@@ -230,7 +238,7 @@ impl<F: Real> Filtered<F> {
         let [trust, _] = self.trust(q.t.0);
         // Opacities, and observations that stand as they are, stay so to the last bit.
         out.data_mut().copy_from_slice(seen.data());
-        halve([out.view_mut()], &|[mut view]| {
+        par_split([out.view_mut()], &|[mut view]| {
             for j in view.first..view.first + view.rows {
                 let [a, b, c] = [seen, last, before].map(|t| Normal::of_splat(t.read::<9>(j, 0)));
                 let state = self.row([&a, &b, &c], self.gain(q, j), trust).1;
@@ -291,6 +299,22 @@ fn inner_of<'a>(cache: &'a Cache, empty: &'a Cache) -> &'a Cache {
 impl<F: Real> Motion<F> for Filtered<F> {
     fn spec(&self) -> Spec {
         Spec::Filtered(FilteredSpec { inner: Box::new(self.inner.spec()), ..self.spec.clone() })
+    }
+
+    fn capabilities(&self) -> Capabilities {
+        self.inner.capabilities()
+    }
+
+    fn with_phase(&self, phase: &Phase) -> Option<Arc<dyn Motion<F>>> {
+        let inner = self.inner.with_phase(phase)?;
+        Some(Arc::new(Self { spec: self.spec.clone(), inner, gains: self.gains }))
+    }
+
+    /// The answers of the model inside, now and earlier; a state of each, and the gradients to them.
+    fn scratch_bytes(&self, p: &Params<F>, rows: usize) -> u64 {
+        let earlier = 1 + self.spec.history.max(self.spec.baseline + 1);
+        let numbers = 3 * SPLAT_COLUMNS.iter().map(|c| c.1).sum::<usize>();
+        earlier as u64 * (self.inner.scratch_bytes(p, rows) + (rows * numbers * size_of::<F>()) as u64)
     }
 
     fn prepare(&self, p: &Params<F>, q: &[At<'_, F>], cache: &mut Cache) {
@@ -373,7 +397,7 @@ impl<F: Real> Motion<F> for Filtered<F> {
         let back = self.learns_from_before();
         let [d_seen, d_last, d_before] = &mut d_states;
         let views = [d_seen, d_last, d_before, &mut d_gains].map(Table::view_mut);
-        let mut d_time = halve(views, &|[mut d_seen, mut d_last, mut d_before, mut d_gains]| {
+        let mut d_time = par_split(views, &|[mut d_seen, mut d_last, mut d_before, mut d_gains]| {
             let mut d_trust = 0.0;
             for j in d_seen.first..d_seen.first + d_seen.rows {
                 let [a, b, c] = [seen, last, before].map(|t| Normal::of_splat(t.read::<9>(j, 0)));

@@ -7,11 +7,11 @@
 //!
 //! The canonical positions are not detached: dL/dx has the planes' Jacobian too. The box [low, high] is stretched to the
 //! planes' [0, 1]³, the clip to [0, 1]; points and times outside see the border. Heads start as zero, so the deformation
-//! starts as the identity, whatever the planes are. While [`coarse`](HexplaneSpec::coarse), it is not even asked.
+//! starts as the identity, whatever the planes are. In a [`Phase`] that rests, it is not even asked.
 
 use super::lanes::{Batch, Lane, Work, fill, scatter};
 use super::still::{Still, activate_backward_lanes, activate_lanes};
-use super::{At, Cache, Motion, Spec, Tape};
+use super::{At, Cache, Capabilities, Model, Motion, Phase, Spec, Tape};
 use crate::math::{Real, Rng};
 use crate::nn::hexplane::{LANES, Lines, PlaneShape, Planes};
 use crate::nn::{InputGrad, Kept, Mlp, MlpShape, Passed};
@@ -75,9 +75,11 @@ pub struct HexplaneSpec {
     pub defor_depth: usize,
     /// What the planes may change.
     pub heads: Heads,
-    /// Levels of the planes in use, the coarsest first; the others' features are zero.
-    pub unlocked: usize,
-    /// The deformation rests: every splat is its canonical one, and only those learn.
+    /// [`Phase::levels`] of a scene whose training is not over; the features of the other levels are zero.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub unlocked: Option<usize>,
+    /// [`Phase::rests`] of a scene whose training is not over.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub coarse: bool,
 }
 
@@ -93,7 +95,7 @@ impl Default for HexplaneSpec {
             net_width: 64,
             defor_depth: 0,
             heads: Heads::default(),
-            unlocked: 2,
+            unlocked: None,
             coarse: false,
         }
     }
@@ -123,10 +125,16 @@ impl HexplaneSpec {
                 self.net_width, self.defor_depth
             ));
         }
-        if self.unlocked == 0 || self.unlocked > self.planes.multires.len() {
-            return bad(format!("{} of {} levels cannot be in use", self.unlocked, self.planes.multires.len()));
+        let levels = self.planes.multires.len();
+        if self.levels() == 0 || self.levels() > levels {
+            return bad(format!("{} of {levels} levels cannot be in use", self.levels()));
         }
         Ok(())
+    }
+
+    /// Levels of the planes in use.
+    fn levels(&self) -> usize {
+        self.unlocked.unwrap_or(self.planes.multires.len())
     }
 
     /// What a head's output 1 moves a position by, scene units: half the longest side of the box.
@@ -150,15 +158,18 @@ pub struct Hexplane {
     sh: Option<Mlp>,
 }
 
-/// Makes the model, and in `p` the tables it needs (or claims the loaded ones).
-///
-/// Errors: numbers of the spec that cannot be, loaded arrays of the wrong shape.
-pub fn build<F: Real>(spec: &HexplaneSpec, p: &mut Params<F>) -> Result<Arc<dyn Motion<F>>> {
-    Ok(Arc::new(Hexplane::new(spec.clone(), p)?))
+impl Model for HexplaneSpec {
+    fn build<F: Real>(&self, p: &mut Params<F>) -> Result<Arc<dyn Motion<F>>> {
+        Ok(Arc::new(Hexplane::new(self.clone(), p)?))
+    }
+
+    fn capabilities(&self) -> Capabilities {
+        Capabilities::default()
+    }
 }
 
 impl Hexplane {
-    /// As [`build`].
+    /// As its [`Model::build`].
     pub fn new<F: Real>(spec: HexplaneSpec, p: &mut Params<F>) -> Result<Self> {
         spec.check()?;
         let rng = Rng::new(spec.seed, "hexplane", 0);
@@ -194,13 +205,10 @@ impl Hexplane {
         Ok(Self { spec, planes, trunk, heads, sh })
     }
 
-    /// The same tables under a spec that differs in its box, clip, unlocked levels or coarseness.
-    ///
-    /// Errors: numbers that cannot be. Panics: it differs in what tables depend on.
-    pub fn respecified(&self, spec: HexplaneSpec) -> Result<Self> {
+    /// The same tables over another box. Errors: corners that are none.
+    pub fn with_box(&self, [low, high]: [[f64; 3]; 2]) -> Result<Self> {
+        let spec = HexplaneSpec { low, high, ..self.spec.clone() };
         spec.check()?;
-        let shape = |s: &HexplaneSpec| (s.planes.clone(), s.net_width, s.defor_depth, s.heads);
-        assert!(shape(&spec) == shape(&self.spec), "tables that are there keep their shape");
         Ok(Self { spec, ..self.clone() })
     }
 
@@ -225,7 +233,7 @@ impl Hexplane {
     fn trunk<F: Real>(&self, p: &Params<F>, lines: &Lines<F>, x: &[[F; 3]], w: &mut Activations<F>) {
         w.features.resize(x.len() * self.spec.planes.features(), F::ZERO);
         w.hidden.resize(x.len() * self.spec.net_width, F::ZERO);
-        self.planes.forward(p, lines, self.spec.unlocked, x, &mut w.features);
+        self.planes.forward(p, lines, self.spec.levels(), x, &mut w.features);
         self.trunk.forward_keeping(p, &w.features, &mut w.hidden, &mut w.trunk);
         w.hidden.par_chunks_mut(TASK_NUMBERS).for_each(|h| h.iter_mut().for_each(|h| *h = h.max(F::ZERO)));
     }
@@ -280,6 +288,23 @@ impl<F: Real> Motion<F> for Hexplane {
         Spec::Hexplane(self.spec.clone())
     }
 
+    fn with_phase(&self, phase: &Phase) -> Option<Arc<dyn Motion<F>>> {
+        let levels = self.spec.planes.multires.len();
+        let unlocked = phase.levels.filter(|&n| n < levels).map(|n| n.max(1));
+        let spec = HexplaneSpec { unlocked, coarse: phase.rests, ..self.spec.clone() };
+        Some(Arc::new(Self { spec, ..self.clone() }))
+    }
+
+    /// Place, outputs of the heads and what became of them; features and trunk with their gradients, hidden layers.
+    fn scratch_bytes(&self, p: &Params<F>, rows: usize) -> u64 {
+        let colors = self.sh.as_ref().map_or(0, |h| h.shape().outputs);
+        let heads = self.heads.iter().flatten().chain(&self.sh).count();
+        let (width, features) = (self.spec.net_width, self.spec.planes.features());
+        let hidden = heads + self.trunk.shape().layers;
+        let numbers = 3 + 2 * (p[GEOMETRY].width() + colors) + 2 * (features + width) + hidden * width;
+        (rows * numbers * size_of::<F>()) as u64
+    }
+
     fn at(&self, q: &At<'_, F>, cache: &Cache, tape: &mut Tape<F>) {
         if self.spec.coarse {
             return Still.at(q, cache, tape);
@@ -314,7 +339,7 @@ impl<F: Real> Motion<F> for Hexplane {
         if colors > 0 {
             start(&mut own.sh, "sh", colors, n);
             let base = &q.p[SH];
-            crate::scene::table::halve([own.sh.view_mut()], &|[mut view]| {
+            crate::scene::table::par_split([own.sh.view_mut()], &|[mut view]| {
                 for j in view.first..view.first + view.rows {
                     for c in 0..colors {
                         view.write(j, c, [base.get(q.rows.id(j), c) + d_sh[j * colors + c]]);
@@ -399,7 +424,7 @@ impl<F: Real> Motion<F> for Hexplane {
             let d_input = InputGrad::Overwrite(d_features);
             self.trunk.backward(q.p, Passed::kept(&work.features, &work.trunk), d_hidden, d_input, d);
             let d_x = &mut d_x[from..to];
-            d_time += self.planes.backward(q.p, &lines, self.spec.unlocked, x, d_features, d_x, waiting, d).f64();
+            d_time += self.planes.backward(q.p, &lines, self.spec.levels(), x, d_features, d_x, waiting, d).f64();
         }
         let sides = std::array::from_fn(|k| F::of(1.0 / (self.spec.high[k] - self.spec.low[k])));
         scatter(&Gather { d_rows: &d_rows, d_x: &d_x, sides }, d.of([GEOMETRY]), q.rows);

@@ -5,7 +5,7 @@
 //! nothing here uses fused multiply-add, every level gives the same bits.
 
 use crate::math::Real;
-use crate::scene::table::{TableMut, halve};
+use crate::scene::table::{TableMut, par_split};
 use crate::scene::{BLOCK, Rows, Table};
 use crate::simd::{Kernel, Simd, dispatch, each, total};
 
@@ -172,13 +172,13 @@ pub trait Work<F: Real, const N: usize>: Sync {
 /// last row, which mean nothing.
 pub fn fill<F: Real, const N: usize>(work: &impl Work<F, N>, tables: [&mut Table<F>; N], rows: Rows<'_>) {
     let simd = Simd::detect();
-    halve(tables.map(Table::view_mut), &|views| dispatch(simd, Fill { work, views, rows }));
+    par_split(tables.map(Table::view_mut), &|views| dispatch(simd, Fill { work, views, rows }));
 }
 
 /// Does `work` for the asked rows of a layer's tables; returns the sum of what it returns, in a fixed order.
 pub fn scatter<F: Real, const N: usize>(work: &impl Work<F, N>, tables: [&mut Table<F>; N], rows: Rows<'_>) -> f64 {
     let simd = Simd::detect();
-    halve(tables.map(Table::view_mut), &|views| dispatch(simd, Scatter { work, views, rows }))
+    par_split(tables.map(Table::view_mut), &|views| dispatch(simd, Scatter { work, views, rows }))
 }
 
 struct Fill<'a, F, W, const N: usize> {

@@ -10,6 +10,7 @@ pub mod filtered;
 pub mod hexplane;
 pub mod lanes;
 pub mod native4d;
+pub mod registry;
 pub mod skin;
 pub mod spacetime;
 pub mod ssm;
@@ -19,13 +20,16 @@ pub mod tracked;
 use crate::math::{Real, Rng};
 use crate::scene::params::LOG_SCALE;
 use crate::scene::splats::SPLAT_COLUMNS;
-use crate::scene::table::{TableMut, halve};
+use crate::scene::table::{TableMut, par_split};
 use crate::scene::{Color, GEOMETRY, Grads, Params, RowEdit, Rows, SH, Space, SplatGrads, Table, Time};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use std::any::Any;
 use std::sync::Arc;
 
+use registry::registry;
+
+pub use registry::{Capabilities, Model, Phase, Polynomial};
 pub use spacetime::{Spacetime, SpacetimeSpec};
 pub use still::Still;
 
@@ -102,83 +106,39 @@ impl<F: Real> Tape<F> {
     }
 }
 
-/// A model as plain data: what files store, and all that [`build`] needs to make it again.
-///
-/// Its JSON form is an object whose `model` is the model's name, beside the fields of its spec.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(tag = "model", rename_all = "kebab-case")]
-#[non_exhaustive]
-pub enum Spec {
-    /// Nothing moves.
-    Still,
-    /// Explicit kinematics around each Gaussian's life.
-    Spacetime(SpacetimeSpec),
-    /// A perceptron or a hash grid deforms a canonical cloud.
-    DeformMlp(deform::DeformSpec),
-    /// Six feature planes deform a canonical cloud.
-    Hexplane(hexplane::HexplaneSpec),
-    /// Positions and rotations at every frame.
-    Tracked(tracked::TrackedSpec),
-    /// Gaussians of space and time.
-    #[serde(rename = "native4d")]
-    Native4d(native4d::Native4dSpec),
-    /// Gaussians skinned to control nodes.
-    Control(control::ControlSpec),
-    /// Control nodes driven by a state-space model.
-    Ssm(ssm::SsmSpec),
-    /// A temporal filter around any of them.
-    Filtered(filtered::FilteredSpec),
-    /// A model from outside this library; it cannot be built from a file.
-    #[serde(skip)]
-    Custom(String),
+// The list of models: a model is its file and an entry here.
+registry! {
+    models {
+        /// Nothing moves.
+        Still = "still" => &Still;
+        /// Explicit kinematics around each Gaussian's life.
+        Spacetime(s: SpacetimeSpec) = "spacetime" => s;
+        /// A perceptron or a hash grid deforms a canonical cloud.
+        DeformMlp(s: deform::DeformSpec) = "deform-mlp" => s;
+        /// Six feature planes deform a canonical cloud.
+        Hexplane(s: hexplane::HexplaneSpec) = "hexplane" => s;
+        /// Positions and rotations at every frame.
+        Tracked(s: tracked::TrackedSpec) = "tracked" => s;
+        /// Gaussians of space and time.
+        Native4d(s: native4d::Native4dSpec) = "native4d" => s;
+        /// Gaussians skinned to control nodes.
+        Control(s: control::ControlSpec) = "control" => s;
+        /// Control nodes driven by a state-space model.
+        Ssm(s: ssm::SsmSpec) = "ssm" => s;
+    }
+    wrappers {
+        /// A temporal filter around any of them.
+        Filtered(s: filtered::FilteredSpec) = "filtered" => s;
+    }
 }
 
 impl Spec {
-    /// The name that `--motion` takes and files store.
-    pub fn name(&self) -> &str {
-        match self {
-            Spec::Still => "still",
-            Spec::Spacetime(_) => "spacetime",
-            Spec::DeformMlp(_) => "deform-mlp",
-            Spec::Hexplane(_) => "hexplane",
-            Spec::Tracked(_) => "tracked",
-            Spec::Native4d(_) => "native4d",
-            Spec::Control(_) => "control",
-            Spec::Ssm(_) => "ssm",
-            Spec::Filtered(_) => "filtered",
-            Spec::Custom(name) => name,
-        }
-    }
-
     /// The model itself, without a filter around it.
     pub fn core(&self) -> &Spec {
         match self {
             Spec::Filtered(f) => &f.inner,
             other => other,
         }
-    }
-}
-
-/// Every model of [`Spec`] that the library can build, by name.
-pub const BUILT_IN: [&str; 9] =
-    ["still", "spacetime", "deform-mlp", "hexplane", "tracked", "native4d", "control", "ssm", "filtered"];
-
-/// Makes the model, and in `p` the tables it needs (or claims the loaded ones).
-///
-/// Errors: `Spec::Custom`; loaded arrays of the wrong shape.
-pub fn build<F: Real>(spec: &Spec, p: &mut Params<F>) -> Result<Arc<dyn Motion<F>>> {
-    match spec {
-        Spec::Still => Ok(Arc::new(Still)),
-        Spec::Spacetime(s) => Ok(Arc::new(Spacetime::new(*s, p)?)),
-        Spec::DeformMlp(s) => deform::build(s, p),
-        Spec::Hexplane(s) => hexplane::build(s, p),
-        Spec::Tracked(s) => tracked::build(s, p),
-        Spec::Native4d(s) => native4d::build(s, p),
-        Spec::Control(s) => control::build(s, p),
-        Spec::Ssm(s) => ssm::build(s, p),
-        Spec::Filtered(s) => filtered::build(s, p),
-        Spec::Custom(name) => Err(Error::input(format!("motion model `{name}` is not one of this version's"))
-            .remedy(format!("It knows: {}. A newer splat4d may know more", BUILT_IN.join(", ")))),
     }
 }
 
@@ -229,6 +189,25 @@ pub trait Motion<F: Real = f32>: Any + Send + Sync {
         false
     }
 
+    /// Properties that others act on. A model from outside the library that tells none promises nothing.
+    fn capabilities(&self) -> Capabilities {
+        self.spec().capabilities().unwrap_or_default()
+    }
+
+    /// The motion as a polynomial in time, if it is one.
+    fn polynomial(&self) -> Option<Polynomial> {
+        None
+    }
+
+    /// Bytes that training keeps of one question about `rows` Gaussians until its backward, beside the answer and its
+    /// gradient: what an estimate of memory must know.
+    fn scratch_bytes(&self, p: &Params<F>, rows: usize) -> u64;
+
+    /// The same model in a phase of training; tables stay as they are. `None`: the model has no phases.
+    fn with_phase(&self, _phase: &Phase) -> Option<Arc<dyn Motion<F>>> {
+        None
+    }
+
     /// dμ/dt in scene units a second, [rows, 3]: central differences over ± [`VELOCITY_STEP`] unless a model knows better.
     fn velocity(&self, q: &At<'_, F>, out: &mut Table<F>) {
         central_velocity(self, q, out);
@@ -261,7 +240,7 @@ pub fn for_rows<F: Real, const N: usize>(
     rows: Rows<'_>,
     f: impl Fn(usize, usize, &mut [TableMut<'_, F>; N]) -> f64 + Sync,
 ) -> f64 {
-    halve(tables.map(Table::view_mut), &|mut views| {
+    par_split(tables.map(Table::view_mut), &|mut views| {
         let (first, end) = (views[0].first, views[0].first + views[0].rows);
         let (from, to) = match rows {
             Rows::All => (first, end),
@@ -275,7 +254,7 @@ pub fn for_rows<F: Real, const N: usize>(
 
 /// Fills compact rows of `out` in parallel: `f(j, id)` gives row j's values from column 0 on.
 pub fn fill_rows<F: Real, const W: usize>(out: &mut Table<F>, rows: Rows<'_>, f: impl Fn(usize) -> [F; W] + Sync) {
-    halve([out.view_mut()], &|[mut view]| {
+    par_split([out.view_mut()], &|[mut view]| {
         for j in view.first..view.first + view.rows {
             view.write(j, 0, f(rows.id(j)));
         }

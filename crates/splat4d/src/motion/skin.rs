@@ -46,6 +46,8 @@ const SPARE_CANDIDATES: usize = 5;
 const HYPER_NOISE: f64 = 1e-2;
 /// The motion mask's logit at the start: Gaussians follow their nodes nearly all the way.
 const MASK_LOGIT: f64 = 3.0;
+/// Numbers of a frame: a 3 × 4 matrix.
+const FRAME: usize = 12;
 /// Radius of nodes that have no neighbours, scene units.
 const LONE_RADIUS: f64 = 1.0;
 
@@ -82,6 +84,9 @@ pub trait Trajectory<F: Real>: Send + Sync {
 
     /// Once a step: the VJP of `prepare`.
     fn finish(&self, _p: &Params<F>, _times: &[Time], _cache: &mut Slot, _d_cache: &mut Slot, _d: &mut Grads<F>) {}
+
+    /// Bytes that a step keeps of `prepare` for [`finish`](Self::finish).
+    fn scratch_bytes(&self, p: &Params<F>) -> u64;
 
     /// After a node edit (densify, prune) has gathered every table of the nodes.
     fn on_edit(&self, _p: &mut Params<F>, _edit: &RowEdit) {}
@@ -316,6 +321,12 @@ fn same(a: Time, b: Time) -> bool {
 impl<F: Real> Motion<F> for Skinned<F> {
     fn spec(&self) -> Spec {
         self.spec.clone()
+    }
+
+    /// Weights of the nodes that pull a Gaussian, their gradients, and its blended frame.
+    fn scratch_bytes(&self, p: &Params<F>, rows: usize) -> u64 {
+        let numbers = 4 * self.skin.spec.neighbours + 2 * FRAME;
+        (rows * numbers * size_of::<F>()) as u64 + self.trajectory.scratch_bytes(p)
     }
 
     fn prepare(&self, p: &Params<F>, q: &[At<'_, F>], cache: &mut Cache) {

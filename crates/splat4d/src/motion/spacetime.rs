@@ -9,7 +9,7 @@
 
 use super::lanes::{Batch, Lane, Work, fill, scatter};
 use super::still::{activate_backward_lanes, activate_lanes};
-use super::{At, Cache, Motion, Spec, Tape, fill_rows};
+use super::{At, Cache, Capabilities, Model, Motion, Polynomial, Spec, Tape, fill_rows};
 use crate::math::{Real, sh};
 use crate::scene::head::{BASE, FEATURES, FURTHER};
 use crate::scene::params::QUAT;
@@ -18,6 +18,7 @@ use crate::scene::{BLOCK, Color, GEOMETRY, Grads, HeadKeys, Key, LIFE, Params, S
 use crate::simd::each;
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
+use std::sync::Arc;
 
 /// Highest order of the polynomial.
 pub const MAX_ORDER: usize = 3;
@@ -52,6 +53,16 @@ impl Default for SpacetimeSpec {
     /// Order 1, no rotation rate, not detached: FreeTimeGS.
     fn default() -> Self {
         Self { order: 1, rotation: false, detach: false, origin: 0.0, features: None }
+    }
+}
+
+impl Model for SpacetimeSpec {
+    fn build<F: Real>(&self, p: &mut Params<F>) -> Result<Arc<dyn Motion<F>>> {
+        Ok(Arc::new(Spacetime::new(*self, p)?))
+    }
+
+    fn capabilities(&self) -> Capabilities {
+        Capabilities { rotates: self.rotation, ..Capabilities::default() }
     }
 }
 
@@ -140,6 +151,19 @@ impl Spacetime {
 impl<F: Real> Motion<F> for Spacetime {
     fn spec(&self) -> Spec {
         Spec::Spacetime(self.spec)
+    }
+
+    fn polynomial(&self) -> Option<Polynomial> {
+        Some(Polynomial {
+            order: self.spec.order,
+            velocities: (self.spec.order > 0).then_some(self.velocities),
+            rotation_rates: self.spec.rotation.then_some(self.rates),
+            origin: self.spec.origin,
+        })
+    }
+
+    fn scratch_bytes(&self, _p: &Params<F>, _rows: usize) -> u64 {
+        0
     }
 
     fn at(&self, q: &At<'_, F>, _cache: &Cache, tape: &mut Tape<F>) {

@@ -21,7 +21,7 @@ mod pose;
 mod tests;
 
 use super::skin::{Skin, SkinSpec, Skinned, Trajectory};
-use super::{Motion, Slot, Spec};
+use super::{Capabilities, Model, Motion, Slot, Spec};
 use crate::math::{Real, Rng};
 use crate::nn::ssm::{LANES, Lane};
 use crate::scene::{BLOCK, Grads, Key, Params, RowEdit, Space, Table, Time};
@@ -167,20 +167,25 @@ pub struct Field {
 pub const EMBEDDINGS: &str = "node_embeddings";
 /// Name of the table of what nodes know of their surroundings.
 pub const CONTEXT: &str = "node_context";
+/// Numbers a node has at a tick of a scan: its pose and the gradient to it, as they are and on their way.
+const TICK: usize = 32;
 /// Spread of the embeddings at the start.
 const EMBEDDING_NOISE: f64 = 0.1;
 
-/// Makes the model, and in `p` the tables it needs (or claims the loaded ones).
-///
-/// Errors: numbers of the spec out of range, loaded arrays of the wrong shape.
-pub fn build<F: Real>(spec: &SsmSpec, p: &mut Params<F>) -> Result<Arc<dyn Motion<F>>> {
-    spec.check()?;
-    let skin = Skin::new(spec.skin, spec.seed, p)?;
-    let field = Field::new(spec, skin.nodes, p)?;
-    Ok(Skinned::shared(skin, Box::new(field), Spec::Ssm(spec.clone())))
+impl Model for SsmSpec {
+    fn build<F: Real>(&self, p: &mut Params<F>) -> Result<Arc<dyn Motion<F>>> {
+        self.check()?;
+        let skin = Skin::new(self.skin, self.seed, p)?;
+        let field = Field::new(self, skin.nodes, p)?;
+        Ok(Skinned::shared(skin, Box::new(field), Spec::Ssm(self.clone())))
+    }
+
+    fn capabilities(&self) -> Capabilities {
+        Capabilities { causal: self.mode == Mode::Causal && self.octaves == 0, ..Capabilities::default() }
+    }
 }
 
-/// Names of the network's learnable column groups: those of Λ and Δ, and all others. Errors: as [`build`].
+/// Names of the network's learnable column groups: those of Λ and Δ, and all others. Errors: as [`Model::build`].
 pub fn columns(spec: &SsmSpec) -> Result<(Vec<String>, Vec<String>)> {
     spec.check()?;
     Ok(Net::new(spec, &mut Params::<f32>::new(0, 1, &[]))?.columns())
@@ -299,6 +304,11 @@ struct Pending<F>(Vec<F>);
 impl<F: Real> Trajectory<F> for Field {
     fn prepare(&self, p: &Params<F>, times: &[Time], cache: &mut Slot) {
         *cache.get_or_default::<Scan<F>>() = self.scan(p, self.needed(times));
+    }
+
+    /// The scan's poses at all ticks, and the gradients to them.
+    fn scratch_bytes(&self, p: &Params<F>) -> u64 {
+        (p[self.embeddings].rows() * self.spec.ticks * TICK * size_of::<F>()) as u64
     }
 
     fn poses(&self, _p: &Params<F>, t: Time, cache: &Slot, out: &mut Table<F>) {

@@ -2,21 +2,41 @@
 //! stands here, for every model that ends in an ordinary Gaussian.
 
 use super::lanes::{Batch, Lane, Work, fill, scatter};
-use super::{At, Cache, Motion, Spec, Tape};
+use super::{At, Cache, Capabilities, Model, Motion, Polynomial, Spec, Tape};
+use crate::Result;
 use crate::math::{Real, sym3};
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::splats::{COV, SPLAT_OPACITY};
 use crate::scene::table::TableMut;
-use crate::scene::{BLOCK, GEOMETRY, Grads, SplatGrads, Table};
+use crate::scene::{BLOCK, GEOMETRY, Grads, Params, SplatGrads, Table};
 use crate::simd::each;
+use std::sync::Arc;
 
 /// Nothing moves; dL/dt is zero.
 #[derive(Clone, Copy, Debug)]
 pub struct Still;
 
+impl Model for Still {
+    fn build<F: Real>(&self, _p: &mut Params<F>) -> Result<Arc<dyn Motion<F>>> {
+        Ok(Arc::new(Still))
+    }
+
+    fn capabilities(&self) -> Capabilities {
+        Capabilities { moves: false, rotates: false, causal: true, ..Capabilities::default() }
+    }
+}
+
 impl<F: Real> Motion<F> for Still {
     fn spec(&self) -> Spec {
         Spec::Still
+    }
+
+    fn polynomial(&self) -> Option<Polynomial> {
+        Some(Polynomial { order: 0, velocities: None, rotation_rates: None, origin: 0.0 })
+    }
+
+    fn scratch_bytes(&self, _p: &Params<F>, _rows: usize) -> u64 {
+        0
     }
 
     fn at(&self, q: &At<'_, F>, _cache: &Cache, tape: &mut Tape<F>) {

@@ -11,7 +11,7 @@ mod tests;
 
 use super::lanes::{Batch, Lane, Work, fill, scatter};
 use super::still::{activate_backward_lanes, activate_lanes};
-use super::{At, Cache, Motion, Spec, Tape, fill_rows};
+use super::{At, Cache, Capabilities, Model, Motion, Spec, Tape, fill_rows};
 use crate::math::{Real, quat};
 use crate::scene::params::{QUAT, page_name};
 use crate::scene::table::TableMut;
@@ -29,6 +29,8 @@ const PAGE: [(&str, usize); 2] = [("means", 3), ("quats", 4)];
 const PAGES: &str = "poses";
 /// Name of the table, and of its only column group, that says who is foreground: a logit.
 pub const FOREGROUND: &str = "foreground_logits";
+/// Cameras that must see every moment: with two, what moves along a line between them is not seen to move.
+const LEAST_CAMERAS: usize = 3;
 /// Most frames of a file that is believed: some nine hours at 30 a second.
 const MAX_FRAMES: usize = 1 << 20;
 /// Numbers of pages that are made and not loaded, at most: a gigabyte. A file whose specification asks for more has lost
@@ -50,12 +52,14 @@ pub fn page_of<F: Real>(p: &Params<F>, frame: usize) -> Option<Key> {
     if frame == 0 { Some(GEOMETRY) } else { p.find(&page_name(PAGES, u32::try_from(frame).ok()?)) }
 }
 
-/// Makes the model, and in `p` the tables it needs (or claims the loaded ones).
-///
-/// Pages that are not loaded start where frame 0 stands. Errors: times that do not increase; pages that are missing or
-/// have another shape.
-pub fn build<F: Real>(spec: &TrackedSpec, p: &mut Params<F>) -> Result<Arc<dyn Motion<F>>> {
-    Ok(Arc::new(Tracked::new(spec, p)?))
+impl Model for TrackedSpec {
+    fn build<F: Real>(&self, p: &mut Params<F>) -> Result<Arc<dyn Motion<F>>> {
+        Ok(Arc::new(Tracked::new(self, p)?))
+    }
+
+    fn capabilities(&self) -> Capabilities {
+        Capabilities { causal: true, fixed_cameras: LEAST_CAMERAS, ..Capabilities::default() }
+    }
 }
 
 /// See the module's documentation.
@@ -67,7 +71,8 @@ pub struct Tracked {
 }
 
 impl Tracked {
-    /// As [`build`].
+    /// Pages that are not loaded start where frame 0 stands. Errors: times that do not increase; pages that are missing
+    /// or have another shape.
     pub fn new<F: Real>(spec: &TrackedSpec, p: &mut Params<F>) -> Result<Self> {
         let times = &spec.times;
         let increase = times.windows(2).all(|w| w[0] < w[1]) && times.iter().all(|t| t.is_finite());
@@ -198,6 +203,10 @@ fn align<F: Real>(a: [F; 4], b: [F; 4]) -> F {
 impl<F: Real> Motion<F> for Tracked {
     fn spec(&self) -> Spec {
         Spec::Tracked(self.spec.clone())
+    }
+
+    fn scratch_bytes(&self, _p: &Params<F>, _rows: usize) -> u64 {
+        0
     }
 
     fn at(&self, q: &At<'_, F>, _cache: &Cache, tape: &mut Tape<F>) {

@@ -1,7 +1,12 @@
-//! Matrix products on one thread, in f32 and f64: the one door to `gemm`, with every bound checked.
-#![allow(unsafe_code)] // gemm takes pointers; every matrix that reaches it was checked to lie in its slice
+//! Matrix products on one thread, in f32 and f64: the one door to `gemm`'s kernels, with every bound checked.
+//!
+//! `gemm-f32` and `gemm-f64` are the two parts of `gemm` that are used: the crate of that name also builds its kernels for
+//! complex numbers and half floats, which is a third of a clean build of everything that is not ours.
+#![allow(unsafe_code)] // the kernels take pointers; every matrix that reaches it was checked to lie in its slice
 
 use crate::math::Real;
+use gemm_common::Parallelism;
+use std::any::TypeId;
 
 /// A matrix in a slice: element (i, j) is `data[i·row + j·column]`.
 #[derive(Clone, Copy, Debug)]
@@ -42,30 +47,43 @@ pub fn product<F: Real>(a: Matrix<'_, F>, b: Matrix<'_, F>, out: &mut [F], strid
     if a.rows == 0 || b.columns == 0 {
         return;
     }
+    // The kernels are fastest where columns of `out` are contiguous: out = a·b is then made as outᵀ = bᵀ·aᵀ.
+    let (a, b, [row, column]) = if stride > 1 { (b.t(), a.t(), [1, stride]) } else { (a, b, [stride, 1]) };
     let distance = |n: usize| isize::try_from(n).expect("a slice is no longer than isize can tell");
-    // SAFETY: `fits` has found all three matrices inside their slices; `out` is borrowed alone, so nothing overlaps.
-    unsafe {
-        gemm::gemm(
-            a.rows,
-            b.columns,
-            a.columns,
-            out.as_mut_ptr(),
-            1,
-            distance(stride),
-            add,
-            a.data.as_ptr(),
-            distance(a.column),
-            distance(a.row),
-            b.data.as_ptr(),
-            distance(b.column),
-            distance(b.row),
-            F::ONE,
-            F::ONE,
-            false,
-            false,
-            false,
-            gemm::Parallelism::None,
-        );
+    macro_rules! run {
+        ($kernel:expr, $one:expr) => {
+            // SAFETY: `fits` has found all three matrices inside their slices; `out` is borrowed alone, so nothing
+            // overlaps; the pointers are of the type that they are cast to.
+            unsafe {
+                $kernel(
+                    a.rows,
+                    b.columns,
+                    a.columns,
+                    out.as_mut_ptr().cast(),
+                    distance(column),
+                    distance(row),
+                    add,
+                    a.data.as_ptr().cast(),
+                    distance(a.column),
+                    distance(a.row),
+                    b.data.as_ptr().cast(),
+                    distance(b.column),
+                    distance(b.row),
+                    $one,
+                    $one,
+                    false,
+                    false,
+                    false,
+                    Parallelism::None,
+                )
+            }
+        };
+    }
+    if TypeId::of::<F>() == TypeId::of::<f32>() {
+        run!(gemm_f32::gemm::f32::get_gemm_fn(), 1.0f32);
+    } else {
+        assert_eq!(TypeId::of::<F>(), TypeId::of::<f64>(), "matrix products are of f32 or f64");
+        run!(gemm_f64::gemm::f64::get_gemm_fn(), 1.0f64);
     }
 }
 

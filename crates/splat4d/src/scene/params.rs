@@ -380,7 +380,6 @@ impl<F: Real> Grads<F> {
         found.into_iter().map(|table| table.expect("keys of one layer must be distinct")).collect()
     }
 
-    /// One table, to read.
     /// One table, to read; a page that nothing was ever added to has no rows.
     pub fn table(&self, key: Key) -> &Table<F> {
         &self.tables[key.0 as usize]

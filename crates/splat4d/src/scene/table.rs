@@ -185,7 +185,7 @@ impl<F: Real> Table<F> {
         if width == 0 {
             return out;
         }
-        halve([out.view_mut()], &|[view]| {
+        par_split([out.view_mut()], &|[view]| {
             for (j, &parent) in parents[view.first..view.first + view.rows].iter().enumerate() {
                 let i = parent as usize;
                 assert!(i < self.rows, "a row's parent is one of the {} rows", self.rows);
@@ -308,15 +308,18 @@ impl<F: Real> TableMut<'_, F> {
     }
 }
 
+/// Work on runs of the blocks of `N` tables, for [`par_split`].
+pub type SplitFn<'f, F, const N: usize> = dyn Fn([TableMut<'_, F>; N]) -> f64 + Sync + 'f;
+
 /// Blocks of rows a task takes: 1024 rows are some hundreds of kilobytes of parameters, enough to hide task costs.
 const TASK_BLOCKS: usize = 64;
 
-/// Calls `f` with runs of the blocks of tables that have as many rows, in parallel and without allocating. Returns the
-/// sum of its results, added up in a tree that depends on the number of rows alone.
-pub fn halve<F: Real, const N: usize>(
-    views: [TableMut<'_, F>; N],
-    f: &(impl Fn([TableMut<'_, F>; N]) -> f64 + Sync),
-) -> f64 {
+/// Splits tables that have as many rows into runs of blocks and calls `f` with each run, in parallel and without
+/// allocating. Returns the sum of its results, added up in a tree that depends on the number of rows alone.
+///
+/// `f` is called through a pointer, once for a thousand rows: the splitting is then compiled once, and not for each of
+/// its some hundred callers.
+pub fn par_split<F: Real, const N: usize>(views: [TableMut<'_, F>; N], f: &SplitFn<'_, F, N>) -> f64 {
     let tasks = views[0].blocks().div_ceil(TASK_BLOCKS);
     if tasks <= 1 {
         return if tasks == 0 { 0.0 } else { f(views) };
@@ -327,7 +330,7 @@ pub fn halve<F: Real, const N: usize>(
     });
     let left: [_; N] = std::array::from_fn(|i| parts[i].0.take().expect("every view was cut in two"));
     let right: [_; N] = std::array::from_fn(|i| parts[i].1.take().expect("every view was cut in two"));
-    let (a, b) = rayon::join(|| halve(left, f), || halve(right, f));
+    let (a, b) = rayon::join(|| par_split(left, f), || par_split(right, f));
     a + b
 }
 

@@ -257,6 +257,37 @@ impl Subject {
     }
 }
 
+/// The model is as it says: what moves and lives by itself, the SH table, scratch, and the polynomial of its path.
+pub fn capabilities(spec: &Spec, rows: usize, life: LifeKind) {
+    let s = subject(spec, rows, life, 0.1, 4);
+    let told = s.motion.capabilities();
+    assert_eq!(spec.capabilities(), Some(told), "the spec and the model say the same");
+    assert_eq!(told.own_life, s.motion.life(&s.p, &mut Table::new(&[("center", 1), ("log_width", 1)], rows)));
+    let mut plain = Params::<f64>::new(rows, 4, &[]);
+    build(spec, &mut plain).expect("the specification is sound");
+    assert_eq!(plain[SH].width(), 12 * told.color_blocks);
+    let [few, many] = [rows, 10 * rows].map(|n| s.motion.scratch_bytes(&s.p, n));
+    assert!(few <= many, "more rows take more: {few}, {many}");
+    let [a, b] = [0.2, 0.7].map(|t| s.splats(Space::Gaussians, Rows::All, t));
+    assert!(told.moves || a.data() == b.data(), "what does not move stays to the bit");
+    let Some(path) = s.motion.polynomial() else { return };
+    for row in 0..rows {
+        let center = if life == LifeKind::Infinite { path.origin } else { s.p[LIFE].get(row, 0) };
+        for (t, splats) in [(0.2, &a), (0.7, &b)] {
+            let mut mean = s.p[GEOMETRY].read::<3>(row, 0);
+            for k in 0..path.order {
+                let v = s.p[path.velocities.expect("an order has coefficients")].read::<3>(row, 3 * k);
+                (0..3).for_each(|i| mean[i] += v[i] * (t - center).powi(k as i32 + 1));
+            }
+            let shown = splats.read::<3>(row, 0);
+            assert!((0..3).all(|i| (mean[i] - shown[i]).abs() < 1e-9), "row {row} at {t}: {mean:?} {shown:?}");
+        }
+    }
+    if path.rotation_rates.is_none() {
+        assert!((0..rows).all(|row| (3..9).all(|c| (a.get(row, c) - b.get(row, c)).abs() < 1e-12)), "nothing turns");
+    }
+}
+
 /// The scene file gives back the same model and the same numbers; files with a wrong specification are refused.
 pub fn files(spec: &Spec, rows: usize, life: LifeKind) {
     let s = subject(spec, rows, life, 0.1, 3);
@@ -386,6 +417,7 @@ pub fn model(spec: &Spec, rows: usize, life: LifeKind, spaces: &[Space], frozen:
     subject(spec, rows, life, 0.1, 2).row_edits();
     files(spec, rows, life);
     super::frame::framed(spec, rows, life, frozen);
+    capabilities(spec, rows, life);
     any_threads(spec, 200);
     if !matches!(spec, Spec::Filtered(_)) {
         filtered(spec, rows, life, spaces, frozen);

@@ -87,7 +87,7 @@ fn hexplane() {
     let spec = Spec::Hexplane(hexplane_spec());
     model(&spec, ROWS, LifeKind::Infinite, &[Space::Gaussians], &[]);
     starts_still(&spec, ROWS);
-    let spec = HexplaneSpec { defor_depth: 2, heads: Heads::default(), unlocked: 2, ..hexplane_spec() };
+    let spec = HexplaneSpec { defor_depth: 2, heads: Heads::default(), unlocked: Some(2), ..hexplane_spec() };
     model(&Spec::Hexplane(spec), ROWS, LifeKind::GaussHalf, &[Space::Gaussians], &[]);
 }
 

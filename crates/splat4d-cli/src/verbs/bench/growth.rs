@@ -15,7 +15,7 @@ use image::ExtendedColorType;
 use image::codecs::jpeg::JpegEncoder;
 use splat4d::layers::{Layer, Scene};
 use splat4d::math::{Rng, quat, sh};
-use splat4d::motion::{SpacetimeSpec, Spec, build};
+use splat4d::motion::{Spacetime, SpacetimeSpec};
 use splat4d::render::{Image, ImageGrads, RenderConfig, RenderGrads, Renderer, Shot};
 use splat4d::scene::life::{CENTER, LOG_WIDTH};
 use splat4d::scene::params::{LOG_SCALE, QUAT};
@@ -277,9 +277,8 @@ fn split(from: &Scene<f32>, count: usize, degree: usize) -> Scene<f32> {
     let had = from.len();
     assert!(had > 0 && count > 0, "a scene of {had} Gaussians cannot become one of {count}");
     let mut params = Params::new(count, sh::coeffs(degree), LifeKind::GaussHalf.columns());
-    let spec = Spec::Spacetime(SpacetimeSpec::default());
-    let motion = build(&spec, &mut params).expect("a built-in model fits new parameters");
-    let velocities = params.find(splat4d::motion::spacetime::VELOCITIES).expect("the model has just made its table");
+    let motion = Spacetime::new(SpacetimeSpec::default(), &mut params).expect("a built-in model fits new parameters");
+    let velocities = motion.velocities();
     let rng = Rng::new(1, "split", 0);
     let parents: Vec<(&Layer, usize)> =
         from.layers.iter().flat_map(|l| (0..l.params.len()).map(move |row| (l, row))).collect();
@@ -324,7 +323,7 @@ fn split(from: &Scene<f32>, count: usize, degree: usize) -> Scene<f32> {
             speeds.write(child, 0, p[v].read::<3>(row, 0));
         }
     }
-    let layer = Layer::new("grown", params, motion, LifeKind::GaussHalf);
+    let layer = Layer::new("grown", params, Arc::new(motion), LifeKind::GaussHalf);
     Scene { layers: vec![layer], ..from.clone() }
 }
 
@@ -356,6 +355,7 @@ mod tests {
     use super::*;
     use splat4d::math::Se3;
     use splat4d::math::sym3;
+    use splat4d::motion::{Spec, build};
     use splat4d::render::Simd;
 
     /// 40 Gaussians in front of one camera.

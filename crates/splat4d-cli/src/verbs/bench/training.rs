@@ -8,7 +8,6 @@ use super::stages::{Way, simd_name};
 use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::Rng;
 use splat4d::math::sh::degree_of;
-use splat4d::motion::Spec;
 use splat4d::render::{Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::{Camera, Planes, SH, Time};
 use splat4d::{Error, ErrorKind, Result};
@@ -104,18 +103,15 @@ impl Frames for Held {
 /// The stage in which a scene of this kind is trained, without densification and at full size.
 fn stage(scene: &Scene<f32>, extent: f64) -> Result<Stage> {
     let first = &scene.layers[0];
-    let (motion, order, rotation) = match first.motion.spec() {
-        Spec::Still => ("still", 0, false),
-        Spec::Spacetime(s) => ("spacetime", s.order, s.rotation),
-        _ => {
-            return Err(Error::new(ErrorKind::Unsupported, "training steps of this motion model are not measured")
-                .remedy("Give a scene of the model `still` or `spacetime`."));
-        }
+    let Some(path) = first.motion.polynomial() else {
+        return Err(Error::new(ErrorKind::Unsupported, "training steps of this motion model are not measured")
+            .remedy("Give a scene of the model `still` or `spacetime`."));
     };
+    let motion = first.motion.spec();
     let recipe = Recipe {
-        motion: motion.into(),
-        motion_order: order,
-        rotation_rate: rotation,
+        motion: motion.name().into(),
+        motion_order: path.order,
+        rotation_rate: path.rotation_rates.is_some(),
         life: first.life.name().into(),
         sh_degree: degree_of(first.params[SH].width() / 3).unwrap_or(0),
         strategy: "none".into(),
@@ -132,7 +128,7 @@ fn stage(scene: &Scene<f32>, extent: f64) -> Result<Stage> {
         moments: vec![(scene.clip[0], 8)],
         masks: false,
     };
-    let mut stages = program(motion)?.stages(&plan);
+    let mut stages = program(motion.name())?.stages(&plan);
     let mut stage = stages.swap_remove(0);
     (stage.iterations, stage.sh_interval, stage.half_size_steps) = (FOR_EVER, 0, 0);
     // Programs speak of layer 0; here all layers learn.

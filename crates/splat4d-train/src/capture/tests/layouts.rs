@@ -127,6 +127,11 @@ fn panoptic_sports() {
     let capture = open_with(&sample, CaptureOptions { hold_out: Some(other), ..CaptureOptions::default() });
     assert_eq!(capture.held.len(), 4, "3 is a name, 0 a position");
     assert!(capture.train.iter().all(|&i| capture.frames[i].camera == 1));
+    // Of several clouds none is guessed.
+    sample.write("other.ply", samples::PLY.as_bytes());
+    let capture = open(&sample);
+    let asks = |w: &String| w.contains("cloud.ply, other.ply") && w.contains('?');
+    assert!(capture.points.is_none() && capture.warnings.iter().any(asks), "{:?}", capture.warnings);
 }
 
 #[test]

@@ -87,7 +87,8 @@ pub fn opengl(i: usize) -> Value {
     rows(&p)
 }
 
-const PLY: &str = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n\
+/// Two coloured points.
+pub const PLY: &str = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n\
                    property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n\
                    0 0 0.3 255 0 0\n0.5 0 0 0 0 255\n";
 
@@ -137,7 +138,7 @@ pub fn dnerf() -> Sample {
 
 /// Cameras 1, 3 train, 2 is measured; two frames.
 pub fn panoptic() -> Sample {
-    let sample = Sample::new(&["train_meta.json", "test_meta.json", "points3d_f0_sift.ply"]);
+    let sample = Sample::new(&["train_meta.json", "test_meta.json", "cloud.ply"]);
     for (name, ids) in [("train_meta.json", &[1usize, 3][..]), ("test_meta.json", &[2])] {
         let per = |value: &dyn Fn(usize, usize) -> Value| -> Value {
             (0..2).map(|t| ids.iter().map(|&c| value(c, t)).collect::<Vec<_>>()).collect::<Vec<_>>().into()
@@ -157,7 +158,7 @@ pub fn panoptic() -> Sample {
         });
         sample.write(name, value.to_string().as_bytes());
     }
-    sample.write("points3d_f0_sift.ply", PLY.as_bytes());
+    sample.write("cloud.ply", PLY.as_bytes());
     sample
 }
 

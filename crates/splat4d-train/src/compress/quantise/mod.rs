@@ -11,7 +11,7 @@ mod tests;
 
 use crate::loss::terms::Codec;
 use crate::methods::spacetime::SpacetimeProgram;
-use crate::methods::{EVERY, Group, Plan, Program, Rate, Stage};
+use crate::methods::{EVERY, Group, Plan, Program, Rate, Stage, program_of};
 use crate::recipe::Recipe;
 use crate::{Error, Result};
 use rayon::prelude::*;
@@ -184,11 +184,11 @@ pub fn palette_rate(recipe: &Recipe, share: f64) -> Rate {
 /// A stage on the pages of a file, whatever model they were baked from: all groups of kinematic primitives with a life,
 /// in every layer. Its `start` is still to be told: it ends with [`Quantised::begin`].
 pub fn stage(plan: &Plan, iterations: usize, share: f64, codec: Arc<Quantised>) -> Stage {
+    let rotates = program_of(&plan.recipe).is_ok_and(|p| p.capabilities(plan).rotates);
     let recipe = Recipe {
-        motion: "spacetime".into(),
         motion_order: 1,
         // A turn that no model asked for would cost two bytes a Gaussian.
-        rotation_rate: plan.recipe.rotation_rate || !["still", "spacetime"].contains(&plan.recipe.motion.as_str()),
+        rotation_rate: plan.recipe.rotation_rate || rotates,
         life: "interval".into(),
         strategy: "none".into(),
         sh_degree: 0,

@@ -71,7 +71,7 @@ fn the_mask_pulls_alpha_where_there_is_a_mask() {
     };
     let masked = |p: &[Planes<f64>], d: &mut [Planes<f64>]| run(&p[0], &mut d[0], Some(&mask));
     let value = |p: &[Planes<f64>]| masked(p, &mut [Planes::new(1, SIZE[0], SIZE[1])]);
-    assert!(check::gradients(&[image.alpha.clone()], masked, value) > 0.1);
+    assert!(check::gradients(std::slice::from_ref(&image.alpha), masked, value) > 0.1);
     let mut d = Planes::new(1, SIZE[0], SIZE[1]);
     assert_eq!(run(&image.alpha, &mut d, None), 0.0);
     assert!(d.data.iter().all(|d| *d == 0.0));

@@ -1,6 +1,6 @@
 use super::*;
 use splat4d::layers::Layer;
-use splat4d::motion::{SpacetimeSpec, build};
+use splat4d::motion::{SpacetimeSpec, Spec, build};
 use splat4d::scene::splats::SPLAT_COLUMNS;
 use splat4d::scene::{LifeKind, Params};
 

@@ -27,7 +27,7 @@ fn set(p: &mut Params<f64>, planes: &Planes, f: impl Fn(usize, usize, usize, usi
 }
 
 fn loss(p: &Params<f64>, weights: PlaneWeights) -> f64 {
-    SmoothPlanes::new(shape(), weights).of_layer(p, usize::MAX, 1.0, &mut Grads::new(p))
+    SmoothPlanes::new(shape(), usize::MAX, weights).of_layer(p, 1.0, &mut Grads::new(p))
 }
 
 #[test]
@@ -66,9 +66,9 @@ fn gradients_equal_differences_and_locked_levels_rest() {
     let rng = Rng::new(4, "planes", 0);
     set(&mut p, &planes, |plane, u, v, c| rng.fork(plane as u64).normal((u * 1000 + v * 100 + c) as u64));
     for (unlocked, weights) in [(2, ALL), (1, ALL), (2, PlaneWeights { l1_time: 0.0, smoothness: 0.0, ..ALL })] {
-        let smooth = SmoothPlanes::new(shape(), weights);
+        let smooth = SmoothPlanes::new(shape(), unlocked, weights);
         let mut d = Grads::new(&p);
-        let value = smooth.of_layer(&p, unlocked, 3.0, &mut d);
+        let value = smooth.of_layer(&p, 3.0, &mut d);
         assert!(value > 0.0);
         for (level, keys) in planes.keys().iter().enumerate() {
             for &key in keys {
@@ -77,7 +77,7 @@ fn gradients_equal_differences_and_locked_levels_rest() {
                     let mut side = |h: f64| {
                         let old = p[key].get(i, 0);
                         p[key].set(i, 0, old + h);
-                        let value = smooth.of_layer(&p, unlocked, 1.0, &mut Grads::new(&p));
+                        let value = smooth.of_layer(&p, 1.0, &mut Grads::new(&p));
                         p[key].set(i, 0, old);
                         value
                     };

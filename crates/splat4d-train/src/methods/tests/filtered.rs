@@ -88,7 +88,7 @@ fn it_is_switched_on_in_the_middle_of_a_stage_and_trains() {
     assert_falls(&losses, 0.8, "filtered");
 }
 
-fn made_plan(recipe: Recipe) -> Plan {
+pub(super) fn made_plan(recipe: Recipe) -> Plan {
     Plan { recipe, extent: 1.0, clip: [0.0, 0.3], fps: 20.0, times: 7, fixed_cameras: 3, ..Plan::default() }
 }
 
@@ -162,7 +162,7 @@ fn hooks_of_the_program_inside_see_its_own_model() {
     }
     let r = Recipe { iterations: 6, filter: "geodesic".into(), filter_start: 0.5, ..Recipe::default() };
     let plan = made_plan(r.resolve());
-    let program = super::super::filtered::wrap(Box::new(Hooked), &plan.recipe).unwrap();
+    let program = super::super::filtered::wrap(Box::new(Hooked), &plan.recipe);
     let mut p = cloud::<f32>(20, LifeKind::Infinite, 4);
     let motion = build(&program.spec(&plan), &mut p).unwrap();
     let mut t = trainer(one_layer(p, motion, LifeKind::Infinite), program.stages(&plan), 200);

@@ -37,6 +37,10 @@ impl<F: Real> Motion<F> for Lobes {
         Spec::Custom("lobes".into())
     }
 
+    fn scratch_bytes(&self, _p: &Params<F>, _rows: usize) -> u64 {
+        0
+    }
+
     fn at(&self, q: &At<'_, F>, _: &Cache, tape: &mut Tape<F>) {
         tape.start(q.len());
         for j in 0..q.len() {

@@ -40,9 +40,14 @@ use std::sync::Arc;
 
 #[test]
 fn every_built_in_model_has_a_program() {
-    // The filter wraps what another program learns.
-    for name in splat4d::motion::BUILT_IN.into_iter().filter(|&n| n != "filtered") {
-        assert!(program(name).is_ok(), "{name} has mathematics but no program");
+    let mut all: Vec<&str> = PROGRAMS.iter().map(|p| p.0).collect();
+    all.sort_unstable();
+    let mut models = MODELS.to_vec();
+    models.sort_unstable();
+    assert_eq!(all, models, "a model has mathematics and a program");
+    let plan = filtered::made_plan(Recipe::default().resolve());
+    for (name, make) in PROGRAMS {
+        assert_eq!(make().spec(&plan).name(), name, "a program is listed under its model's name");
     }
     assert!(program("warp").is_err_and(|e| e.to_string().contains("spacetime")));
 }

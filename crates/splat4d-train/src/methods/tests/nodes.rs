@@ -119,6 +119,10 @@ impl<F: Real> Motion<F> for Skinned {
         Spec::Custom("skinned".into())
     }
 
+    fn scratch_bytes(&self, _p: &Params<F>, _rows: usize) -> u64 {
+        0
+    }
+
     fn at(&self, q: &At<'_, F>, _: &Cache, tape: &mut Tape<F>) {
         tape.start(q.len());
         for j in 0..q.len() {

@@ -46,6 +46,10 @@ impl<F: Real> Motion<F> for Recurrence {
         Spec::Custom("recurrence".into())
     }
 
+    fn scratch_bytes(&self, _p: &Params<F>, _rows: usize) -> u64 {
+        0
+    }
+
     fn prepare(&self, p: &Params<F>, _: &[At<'_, F>], cache: &mut Cache) {
         let states = &mut cache.get_or_default::<States<F>>().0;
         *states = Table::new(&[("states", 3 * (STEPS + 1))], p.len());

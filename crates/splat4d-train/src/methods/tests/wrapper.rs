@@ -2,7 +2,7 @@
 
 use super::*;
 use scan::scan_scene;
-use splat4d::motion::{At, Cache, Tape};
+use splat4d::motion::{At, Cache, Capabilities, Phase, Polynomial, Tape};
 use splat4d::scene::{Born, Color, RowEdit, Rows, SplatGrads};
 
 /// Does nothing to what it holds. An omitted method would silently lose gradients.
@@ -11,6 +11,22 @@ struct Wrapped<F: Real>(Arc<dyn Motion<F>>);
 impl<F: Real> Motion<F> for Wrapped<F> {
     fn spec(&self) -> Spec {
         self.0.spec()
+    }
+
+    fn scratch_bytes(&self, p: &Params<F>, rows: usize) -> u64 {
+        self.0.scratch_bytes(p, rows)
+    }
+
+    fn with_phase(&self, phase: &Phase) -> Option<Arc<dyn Motion<F>>> {
+        Some(Arc::new(Wrapped(self.0.with_phase(phase)?)))
+    }
+
+    fn capabilities(&self) -> Capabilities {
+        self.0.capabilities()
+    }
+
+    fn polynomial(&self) -> Option<Polynomial> {
+        self.0.polynomial()
     }
 
     fn prepare(&self, p: &Params<F>, q: &[At<'_, F>], cache: &mut Cache) {
@@ -77,6 +93,10 @@ const GLOW_SECONDS: f64 = 0.4;
 impl<F: Real> Motion<F> for Glow {
     fn spec(&self) -> Spec {
         Spec::Custom("glow".into())
+    }
+
+    fn scratch_bytes(&self, _p: &Params<F>, _rows: usize) -> u64 {
+        0
     }
 
     fn at(&self, q: &At<'_, F>, cache: &Cache, tape: &mut Tape<F>) {

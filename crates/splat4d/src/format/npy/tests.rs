@@ -74,3 +74,31 @@ fn mutants_are_read_or_refused() {
     let read = read.inspect(|a| assert_eq!(a.len(), a.shape.iter().product::<usize>())).count();
     assert!(0 < read && read < 1000, "{read} of 1000 mutants were readable");
 }
+
+#[test]
+fn arrays_of_an_archive_are_found() {
+    let mut body = Vec::new();
+    write_f32(&[2, 3], &[0.0, 0.5, 1.0, 1.5, 2.0, 2.5], &mut body).unwrap();
+    let size = (body.len() as u32).to_le_bytes();
+    let mut zip = b"PK\x03\x04".to_vec();
+    zip.extend([0; 22]);
+    zip.extend([8, 0, 0, 0]);
+    zip.extend(b"data.npy");
+    zip.extend(&body);
+    let directory = zip.len() as u32;
+    zip.extend(b"PK\x01\x02");
+    zip.extend([0; 16]);
+    zip.extend(size);
+    zip.extend(size);
+    zip.extend([8, 0]);
+    zip.extend([0; 16]);
+    zip.extend(b"data.npy");
+    zip.extend(b"PK\x05\x06\0\0\0\0\x01\0\x01\0");
+    zip.extend((zip.len() as u32 - directory).to_le_bytes());
+    zip.extend(directory.to_le_bytes());
+    zip.extend([0; 2]);
+    assert_eq!(Npy::read_member(&zip, "data").unwrap(), Npy::read(&body).unwrap());
+    let error = Npy::read_member(&zip, "other").unwrap_err().to_string();
+    assert!(error.contains("`other`") && error.contains("data"), "{error}");
+    assert!((0..zip.len() - 2).all(|n| Npy::read_member(&zip[..n], "data").is_err()));
+}

@@ -3,12 +3,13 @@
 //! Both sources of Gaussians end here: primitives in floats, and layers that are pages already. What is written as a
 //! logarithm arrives as one, so that a layer, which holds logarithms, need not leave them.
 
-use super::page::{FOR_EVER, FULL8, FULL10, FULL16, HALF10, LEVELS8, LEVELS16, MAX_LOG, WIDTH_LEVELS, at};
-use super::page::{half_width, lives_through, rate, reach, scales, seen_widths};
+use super::page::{FOR_EVER, FULL8, FULL10, FULL16, HALF10, Header, LEVELS8, LEVELS16, MAX_LOG, WIDTH_LEVELS, at};
+use super::page::{half_width, lives_through, page_of, rate, reach, scales, seen_widths};
 use super::{BLOCK_GAUSSIANS, BLOCK_HEADER, Depths, PAGE_WORDS, Primitive};
 use crate::format::quant::{self, coarse_code, coarse_quat_codes, coarse_signed_code};
 use crate::math::quat as quaternion;
 use crate::simd::{Kernel, Simd, dispatch, greatest, least};
+use rayon::prelude::*;
 
 /// Half-widths below this share of the softness are written as zero: what is never seen need not widen a range.
 pub(super) const NO_WIDTH: f64 = 0.02;
@@ -19,9 +20,6 @@ const SLACK: f64 = 1e-6;
 
 /// One number of every Gaussian of a block.
 type Column = [f64; BLOCK_GAUSSIANS];
-
-/// Header of a block.
-pub(super) type Header = [f32; BLOCK_HEADER];
 
 /// Up to 256 Gaussians on their way into a block.
 pub(super) struct Columns {
@@ -402,8 +400,16 @@ impl Kernel for OfPrimitives<'_> {
     }
 }
 
+/// The decoded bytes of a page whose blocks are the given ones, in order: Gaussians with their palette entries.
+pub(super) fn encode_page(rows: &[(&Primitive, u16)], span: [f64; 2], depths: &Depths) -> Vec<u8> {
+    let mut words = vec![[0; PAGE_WORDS]; rows.len()];
+    let blocks = rows.par_chunks(BLOCK_GAUSSIANS).zip(words.par_chunks_mut(BLOCK_GAUSSIANS));
+    let headers: Vec<Header> = blocks.map(|(rows, words)| encode_block(rows, span, depths, words)).collect();
+    page_of(&headers, &words)
+}
+
 /// A block of primitives with their entries of the palette: its header, and a Gaussian's words into each of `words`.
-pub(super) fn encode_block(
+fn encode_block(
     rows: &[(&Primitive, u16)],
     span: [f64; 2],
     depths: &Depths,

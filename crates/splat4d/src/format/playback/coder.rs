@@ -1,11 +1,12 @@
 //! What a reader would see of layers that are pages, without the way through a file: for training against the numbers
 //! that will be drawn (straight-through quantisation).
 
-use super::block::{Header, Words};
+use super::block::Words;
 use super::layer::{TABLES, columns, decode, keys, paint};
+use super::page::Header;
 use super::{BLOCK_GAUSSIANS, Depths, PAGE_WORDS, Palette};
 use crate::layers::Layer;
-use crate::scene::table::{TableMut, halve};
+use crate::scene::table::{TableMut, par_split};
 use crate::scene::{BLOCK, Key, SH, Table};
 use crate::simd::{Kernel, Simd, dispatch};
 
@@ -39,7 +40,7 @@ impl Coder {
         assert!(shown.params[SH].width() >= 3 + width, "room for {width} coefficients above degree 0");
         let tables = shown.params.get_mut(keys).map(Table::view_mut);
         // Runs of table blocks begin where blocks of the file begin: 1024 rows are four of them.
-        halve(tables, &|mut views| {
+        par_split(tables, &|mut views| {
             let [first, end] = [views[0].first, views[0].first + views[0].rows];
             assert!(first.is_multiple_of(BLOCK_GAUSSIANS), "a task begins with a block");
             for from in (first..end).step_by(BLOCK_GAUSSIANS) {

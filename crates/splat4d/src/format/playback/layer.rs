@@ -1,16 +1,15 @@
 //! A page as a layer of a scene, so that everything that draws scenes draws playback files; and such a layer as a page.
 
-use super::block::{Columns, Header, NO_WIDTH, SHARPEST, Words};
+use super::block::{Columns, NO_WIDTH, SHARPEST, Words};
 use super::index::broken;
-use super::page::{self, at, half_width, lives_through, reach};
+use super::page::{self, Header, at, half_width, lives_through, reach};
 use super::page::{FOR_EVER as FULL_LIFE, FULL8, FULL10, HALF10, LEVELS8, LEVELS16, MAX_LOG, THINNEST, WIDTH_LEVELS};
 use super::{BLOCK_GAUSSIANS, PAGE_WORDS, Page, Palette, Primitive};
 use crate::Result;
 use crate::format::quant;
 use crate::layers::Layer;
 use crate::math::{Real, quat, sh};
-use crate::motion::spacetime::{ROTATION_RATES, VELOCITIES};
-use crate::motion::{Spacetime, SpacetimeSpec, Spec};
+use crate::motion::{Polynomial, Spacetime, SpacetimeSpec};
 use crate::scene::life::{CENTER, LOG_SOFTNESS, LOG_WIDTH};
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::table::TableMut;
@@ -70,10 +69,10 @@ pub(super) const TABLES: usize = 5;
 
 /// Geometry, colours, lives, velocities, rotation rates. Panics: the layer is none that a page gives.
 pub(super) fn keys(layer: &Layer<f32>) -> [Key; TABLES] {
-    let find = |name| layer.params.find(name);
-    let moves = matches!(layer.motion.spec(), Spec::Spacetime(SpacetimeSpec { order: 1, rotation: true, .. }));
-    match (find(VELOCITIES), find(ROTATION_RATES)) {
-        (Some(v), Some(w)) if moves && layer.life == LifeKind::Interval && layer.frame.is_identity() => {
+    match layer.motion.polynomial() {
+        Some(Polynomial { order: 1, velocities: Some(v), rotation_rates: Some(w), .. })
+            if layer.life == LifeKind::Interval && layer.frame.is_identity() =>
+        {
             [GEOMETRY, SH, LIFE, v, w]
         }
         _ => panic!("only a layer that moves and lives as those of a page can be one: {layer:?}"),

@@ -1,12 +1,10 @@
 //! A page: up to 65,536 Gaussians of one span of time in 32 bytes each, in blocks of 256 that share ranges.
-//! docs/format.md, "Page", has the layout; the encoder of a block is in block.rs, its decoder here.
+//! docs/format.md, "Page", has the layout; the encoder is in block.rs, the decoder here.
 
-use super::block::{Header, encode_block};
 use super::index::{broken, crc};
-use super::{ALPHA_MIN, BLOCK_GAUSSIANS, BLOCK_HEADER, Codec, Depths, Entry, Kind, PAGE_WORDS, Primitive};
+use super::{ALPHA_MIN, BLOCK_GAUSSIANS, BLOCK_HEADER, Codec, Entry, Kind, PAGE_WORDS, Primitive};
 use crate::simd::least;
 use crate::{Result, format::quant};
-use rayon::prelude::*;
 use std::sync::LazyLock;
 
 /// Bits of the codes.
@@ -40,6 +38,9 @@ pub(super) mod at {
     pub const SOFTNESS: usize = 16;
     pub const COLOR: usize = 18;
 }
+
+/// Header of a block.
+pub(super) type Header = [f32; BLOCK_HEADER];
 
 /// A decoded page: headers and words as the file's bits have them.
 #[derive(Clone, Debug, PartialEq)]
@@ -134,14 +135,6 @@ pub(super) fn unpack<'a>(entry: &Entry, stored: &'a [u8]) -> Result<std::borrow:
         }
         codec => Err(broken(format!("a section stored as {codec:?} does not have {wanted} bytes"))),
     }
-}
-
-/// The decoded bytes of a page whose blocks are the given ones, in order: Gaussians with their palette entries.
-pub(super) fn encode_page(rows: &[(&Primitive, u16)], span: [f64; 2], depths: &Depths) -> Vec<u8> {
-    let mut words = vec![[0; PAGE_WORDS]; rows.len()];
-    let blocks = rows.par_chunks(BLOCK_GAUSSIANS).zip(words.par_chunks_mut(BLOCK_GAUSSIANS));
-    let headers: Vec<Header> = blocks.map(|(rows, words)| encode_block(rows, span, depths, words)).collect();
-    page_of(&headers, &words)
 }
 
 /// The decoded bytes of a page: headers, then byte planes.

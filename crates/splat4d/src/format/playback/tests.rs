@@ -4,8 +4,9 @@ mod coder;
 mod hostile;
 mod masks;
 
+use super::block::encode_page;
 use super::index::crc;
-use super::page::{encode_page, parse_page};
+use super::page::parse_page;
 use super::*;
 use crate::layers::{Evaluation, Scene};
 use crate::math::{Rng, Se3, quat};

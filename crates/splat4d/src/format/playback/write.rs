@@ -1,9 +1,10 @@
 //! Writes a playback file: tiers, order, palette, pages, and the index before them.
 
+use super::block::encode_page;
 use super::cluster::cluster;
 use super::deflate::deflate;
 use super::index::{MASK_HEAD, crc, mask_keys};
-use super::page::{encode_page, parse_page};
+use super::page::parse_page;
 use super::{
     BLOCK_GAUSSIANS, BLOCK_HEADER, Codec, Depths, Draft, Entry, FIRST_VERSION, Index, Kind, MAX_PAGE_GAUSSIANS,
     MAX_PALETTE, Meta, Node, Page, Palette, VERSION, mask, order,

@@ -82,9 +82,14 @@ impl Element {
         self.properties.iter().position(|p| p.name == name && matches!(p.kind, Kind::Scalar(_)))
     }
 
-    /// Whether a property is a floating-point number.
-    pub(super) fn is_floating(&self, property: usize) -> bool {
-        matches!(self.properties[property].kind, Kind::Scalar(Scalar::F32 | Scalar::F64))
+    /// The number that stands for full colour in a property: 1 in floating point (nobody writes another range), the
+    /// type's range in integers.
+    pub(super) fn white(&self, property: usize) -> f64 {
+        match self.properties[property].kind {
+            Kind::Scalar(Scalar::F32 | Scalar::F64) => 1.0,
+            Kind::Scalar(Scalar::U16 | Scalar::I16) => 65_535.0,
+            _ => 255.0,
+        }
     }
 }
 

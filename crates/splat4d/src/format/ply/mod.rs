@@ -34,6 +34,8 @@ const DC_NAMES: [&str; 3] = ["f_dc_0", "f_dc_1", "f_dc_2"];
 const NORMAL_NAMES: [&str; 3] = ["nx", "ny", "nz"];
 /// Colours of point clouds.
 const RGB_NAMES: [&str; 3] = ["red", "green", "blue"];
+/// The same, as some tools shorten them.
+const SHORT_RGB_NAMES: [&str; 3] = ["r", "g", "b"];
 /// Blocks of rows that one task converts.
 const BLOCKS_PER_TASK: usize = 64;
 /// Rows that the writer formats at a time.
@@ -61,9 +63,12 @@ pub struct PlyInfo {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PlyPoints {
     /// Positions, in the file's units.
-    pub positions: Vec<[f32; 3]>,
-    /// Red, green, blue of each point in [0, 1] (in sRGB, as cameras give it); empty where the file has no colours.
+    pub positions: Vec<[f64; 3]>,
+    /// Red, green, blue of each point, from 0 to 1 in files that keep to their format (in sRGB, as cameras give it); empty
+    /// where the file has no colours.
     pub colors: Vec<[f32; 3]>,
+    /// Seconds at which each point was seen (`time` or `t`); empty where the file does not say it.
+    pub times: Vec<f64>,
 }
 
 /// Reads Gaussians: any order and type of properties, binary of either byte order or text, any other elements.
@@ -104,8 +109,8 @@ pub fn is_compressed(bytes: &[u8]) -> bool {
     Header::read(bytes).is_ok_and(|h| h.elements.iter().any(packed))
 }
 
-/// Reads the positions of any PLY file and the colours of its points: `red green blue`, or the base colour of
-/// Gaussians.
+/// Reads the positions of any PLY file, the times of its points, and their colours: `red green blue`, `r g b`, or the base
+/// colour of Gaussians.
 ///
 /// Errors: not a PLY file, truncated, or without positions.
 pub fn read_points(bytes: &[u8]) -> Result<PlyPoints> {
@@ -113,31 +118,28 @@ pub fn read_points(bytes: &[u8]) -> Result<PlyPoints> {
     let Some(vertex) = header.elements.iter().find(|e| e.name == "vertex") else {
         return Err(broken("the file has no element `vertex`"));
     };
-    let all = |names: [&str; 3]| names.map(|n| vertex.find(n));
-    let [Some(x), Some(y), Some(z)] = all(["x", "y", "z"]) else {
+    let all = |names: [&str; 3]| -> Option<[usize; 3]> {
+        let [a, b, c] = names.map(|n| vertex.find(n));
+        Some([a?, b?, c?])
+    };
+    let Some(xyz) = all(["x", "y", "z"]) else {
         return Err(broken("the file has no positions: its points lack x, y or z"));
     };
     let [rows] = rows::find(&header, bytes, ["vertex"])?;
     let rows = rows.expect("the element was found above");
-    let column = |i: usize, of: fn(f32) -> f32| {
-        let mut out = vec![0.0; rows.len()];
-        rows.read(i, 0, &mut out);
-        out.iter_mut().for_each(|v| *v = of(*v));
-        out
-    };
-    let join = |i: [usize; 3], of: fn(f32) -> f32| -> Vec<[f32; 3]> {
-        let [a, b, c] = i.map(|i| column(i, of));
-        a.into_iter().zip(b).zip(c).map(|((a, b), c)| [a, b, c]).collect()
-    };
-    let colors = if let [Some(r), Some(g), Some(b)] = all(RGB_NAMES) {
-        // Bytes span 0..255, and nobody writes floating-point colours in any range but 0..1.
-        join([r, g, b], if vertex.is_floating(r) { |v| v } else { |v| v / 255.0 })
-    } else if let [Some(r), Some(g), Some(b)] = all(DC_NAMES) {
-        join([r, g, b], |v| 0.5 + super::octets::SH_C0 * v)
+    let join = |columns: [usize; 3]| (0..rows.len()).map(move |row| columns.map(|c| (row, c)));
+    let positions = join(xyz).map(|row| row.map(|(row, c)| rows.get(row, c))).collect();
+    let colors = if let Some(rgb) = all(RGB_NAMES).or(all(SHORT_RGB_NAMES)) {
+        let color = |(row, c): (usize, usize)| (rows.get(row, c) / vertex.white(c)) as f32;
+        join(rgb).map(|row| row.map(color)).collect()
+    } else if let Some(dc) = all(DC_NAMES) {
+        join(dc).map(|row| row.map(|(row, c)| 0.5 + super::octets::SH_C0 * rows.get(row, c) as f32)).collect()
     } else {
         Vec::new()
     };
-    Ok(PlyPoints { positions: join([x, y, z], |v| v), colors })
+    let time = vertex.find("time").or(vertex.find("t"));
+    let times = time.map_or(Vec::new(), |c| (0..rows.len()).map(|row| rows.get(row, c)).collect());
+    Ok(PlyPoints { positions, colors, times })
 }
 
 /// Writes Gaussians in the plain layout, little-endian; normals are zero and other tables are left out.

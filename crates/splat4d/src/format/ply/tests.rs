@@ -189,7 +189,7 @@ fn a_point_cloud_is_named_as_one_and_read_as_points() {
     assert_eq!(points.colors, [[1.0, 0.0, 51.0 / 255.0], [0.0; 3]]);
     let p = random(3, 4);
     let points = read_points(&written(&p)).unwrap();
-    assert_eq!(points.positions[2], p[GEOMETRY].read::<3>(2, 0));
+    assert_eq!(points.positions[2], p[GEOMETRY].read::<3>(2, 0).map(f64::from));
     assert!((points.colors[2][1] - (0.5 + 0.282_094_79 * p[SH].get(2, 1))).abs() < 1e-6);
 }
 

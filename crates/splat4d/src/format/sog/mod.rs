@@ -10,19 +10,17 @@
 mod pictures;
 #[cfg(test)]
 mod tests;
-mod zip;
 
 use super::octets::logit_of_byte;
 use super::warnings::Warnings;
+use super::zip;
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::{GEOMETRY, Params, SH};
 use crate::{Error, ErrorKind, Result};
 use pictures::{Needs, Picture};
 use serde_json::Value;
-use std::borrow::Cow;
-use std::collections::BTreeMap;
 
-pub use zip::MAGIC as ZIP_MAGIC;
+pub use super::zip::{Files, MAGIC as ZIP_MAGIC};
 
 /// The version this library reads.
 pub const VERSION: u64 = 2;
@@ -39,13 +37,17 @@ const LARGEST_W: u8 = 252;
 /// Centroids in a row of their picture.
 const ROW_OF_CENTROIDS: usize = 64;
 
-/// The files of a scene: name → bytes.
-pub type Files<'a> = BTreeMap<String, Cow<'a, [u8]>>;
-
 /// The files in a `.sog` file, which is a zip. Errors: damaged, encrypted, or files that claim to be larger than
 /// deflate can make them.
 pub fn unzip(bytes: &[u8]) -> Result<Files<'_>> {
-    zip::read(bytes)
+    Ok(beside_meta(zip::read(bytes)?))
+}
+
+/// Some zip a whole folder: names lose what stands before `meta.json`.
+fn beside_meta(files: Files<'_>) -> Files<'_> {
+    let folder = files.keys().find_map(|n| n.strip_suffix(META).filter(|f| f.ends_with('/')).map(str::to_owned));
+    let Some(folder) = folder.filter(|_| !files.contains_key(META)) else { return files };
+    files.into_iter().filter_map(|(name, f)| Some((name.strip_prefix(&folder)?.to_owned(), f))).collect()
 }
 
 /// Names of the pictures that a `meta.json` speaks of: what a folder's reader must fetch.

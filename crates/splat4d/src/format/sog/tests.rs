@@ -1,6 +1,7 @@
 use super::*;
 use crate::format::mutate::mutants;
 use image_webp::{ColorType, WebPEncoder};
+use std::borrow::Cow;
 
 fn webp(width: u32, height: u32, pixels: &[u8]) -> Vec<u8> {
     let mut out = Vec::new();

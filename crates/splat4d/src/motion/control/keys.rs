@@ -133,6 +133,10 @@ impl Keys {
 }
 
 impl<F: Real> Trajectory<F> for Keys {
+    fn scratch_bytes(&self, _p: &Params<F>) -> u64 {
+        0
+    }
+
     fn poses(&self, p: &Params<F>, t: Time, _cache: &Slot, out: &mut Table<F>) {
         let (first, w, _) = self.line.weights(t);
         for node in 0..out.rows() {

@@ -64,6 +64,10 @@ impl LowRank {
 }
 
 impl<F: Real> Trajectory<F> for LowRank {
+    fn scratch_bytes(&self, _p: &Params<F>) -> u64 {
+        0
+    }
+
     fn poses(&self, p: &Params<F>, t: Time, _cache: &Slot, out: &mut Table<F>) {
         let values = self.values(p, t);
         for node in 0..out.rows() {

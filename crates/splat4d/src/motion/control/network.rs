@@ -140,6 +140,10 @@ impl<F: Real> Trajectory<F> for Network {
         passes.0 = times.iter().map(|&t| self.pass(p, t)).collect();
     }
 
+    fn scratch_bytes(&self, _p: &Params<F>) -> u64 {
+        0
+    }
+
     fn poses(&self, _p: &Params<F>, t: Time, cache: &Slot, out: &mut Table<F>) {
         let pass = pass_of::<F>(cache, t);
         for (node, pose) in pass.out.as_chunks::<POSE>().0.iter().enumerate() {

@@ -46,10 +46,10 @@ fn wrong_specs_are_refused() {
     ];
     for trajectory in trajectories {
         let spec = ControlSpec { trajectory, ..ControlSpec::default() };
-        assert!(build(&spec, &mut Params::<f32>::new(8, 1, &[])).is_err(), "{trajectory:?}");
+        assert!(spec.build(&mut Params::<f32>::new(8, 1, &[])).is_err(), "{trajectory:?}");
     }
     for clip in [[1.0, 0.0], [f64::NAN, 1.0], [0.0, f64::INFINITY]] {
         let spec = ControlSpec { clip, ..ControlSpec::default() };
-        assert!(build(&spec, &mut Params::<f32>::new(8, 1, &[])).is_err(), "{clip:?}");
+        assert!(spec.build(&mut Params::<f32>::new(8, 1, &[])).is_err(), "{clip:?}");
     }
 }

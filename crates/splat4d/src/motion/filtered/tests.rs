@@ -164,6 +164,10 @@ impl<F: Real> Motion<F> for Watched {
         Spec::Custom("watched".into())
     }
 
+    fn scratch_bytes(&self, _p: &Params<F>, _rows: usize) -> u64 {
+        0
+    }
+
     fn at(&self, q: &At<'_, F>, cache: &Cache, tape: &mut Tape<F>) {
         crate::motion::Still.at(q, cache, tape);
         let x = (q.t.0 / FRAME).clamp(0.0, (self.frames.len() - 1) as f64);

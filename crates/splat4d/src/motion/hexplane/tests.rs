@@ -55,11 +55,29 @@ fn time_outside_the_clip_is_its_end_and_within_it_things_move() {
 #[test]
 fn while_coarse_the_cloud_is_as_it_is_and_planes_learn_nothing() {
     let (p, model) = cloud::<f64>(spec(), 20);
-    let coarse = model.respecified(HexplaneSpec { coarse: true, ..spec() }).unwrap();
+    let coarse = Hexplane::new(HexplaneSpec { coarse: true, ..spec() }, &mut p.clone()).unwrap();
+    let phase = Phase { rests: true, ..Phase::default() };
+    let same = Motion::<f64>::with_phase(&model, &phase).expect("the model has phases");
+    assert_eq!(same.spec(), Motion::<f64>::spec(&coarse));
     assert_eq!(splats(&p, &coarse, 3.0), splats(&p, &Still, 3.0));
     let d = gradient(&p, &coarse, 3.0);
     assert!(d.touched(GEOMETRY) && p.keys().skip(1).all(|k| !d.touched(k)));
     assert_ne!(splats(&p, &model, 3.0), splats(&p, &Still, 3.0));
+}
+
+/// A finished scene's file says nothing of phases; files from before said both numbers always.
+#[test]
+fn files_hold_a_phase_only_while_training_is_not_over() {
+    let (_, model) = cloud::<f64>(spec(), 20);
+    let whole = serde_json::to_value(Motion::<f64>::spec(&model)).unwrap();
+    assert!(whole.get("unlocked").is_none() && whole.get("coarse").is_none(), "{whole}");
+    let phase = Phase { rests: false, levels: Some(1) };
+    let half = Motion::<f64>::with_phase(&model, &phase).expect("the model has phases").spec();
+    let mut old = whole.clone();
+    (old["unlocked"], old["coarse"]) = (1.into(), false.into());
+    assert_eq!(serde_json::from_value::<Spec>(old).unwrap(), half);
+    let json = serde_json::to_value(&half).unwrap();
+    assert_eq!((&json["unlocked"], serde_json::from_value::<Spec>(json.clone()).unwrap()), (&1.into(), half));
 }
 
 #[test]
@@ -96,7 +114,7 @@ fn cloud_and_box_moved_together_deform_alike() {
     }
     let s = spec();
     let corner = |x: [f64; 3]| [0, 1, 2].map(|k| place(x[k], k));
-    let other = model.respecified(HexplaneSpec { low: corner(s.low), high: corner(s.high), ..s }).unwrap();
+    let other = model.with_box([corner(s.low), corner(s.high)]).unwrap();
     let (a, b) = (splats(&p, &model, 2.7), splats(&moved, &other, 2.7));
     for row in 0..30 {
         let (a, b) = (a.read::<10>(row, 0), b.read::<10>(row, 0));
@@ -138,9 +156,13 @@ fn hostile_specs_are_refused() {
         HexplaneSpec { net_width: 0, ..spec() },
         HexplaneSpec { net_width: usize::MAX, ..spec() },
         HexplaneSpec { defor_depth: usize::MAX, ..spec() },
-        HexplaneSpec { unlocked: 0, ..spec() },
-        HexplaneSpec { unlocked: 3, ..spec() },
-        HexplaneSpec { planes: PlaneShape { multires: vec![usize::MAX], ..spec().planes }, unlocked: 1, ..spec() },
+        HexplaneSpec { unlocked: Some(0), ..spec() },
+        HexplaneSpec { unlocked: Some(3), ..spec() },
+        HexplaneSpec {
+            planes: PlaneShape { multires: vec![usize::MAX], ..spec().planes },
+            unlocked: Some(1),
+            ..spec()
+        },
     ] {
         assert!(refused(bad.clone()), "{bad:?}");
     }

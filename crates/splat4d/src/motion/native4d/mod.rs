@@ -3,7 +3,7 @@
 //! A Gaussian has a mean (μ, μ_t), scales in space and time and a rotation of four dimensions, a pair of quaternions:
 //! X ↦ l X r̄ (`quats` holds l). Its slice at t is an ordinary Gaussian that moves at constant velocity; its opacity is
 //! o·exp(−½(t − μ_t)²/Σ_tt): the model has a life of its own, which [`Motion::life`] shows. Two quaternions that are equal
-//! turn space alone: it then stands still. See `slice` for the mathematics, [`crate::layers::to_spacetime`] for the other chart.
+//! turn space alone: it then stands still. See `slice` for the mathematics, [`crate::layers::to_spacetime`] for the same motion in other numbers.
 //!
 //! Colour may change with time: block n of the spherical harmonics counts cos(2πn(μ_t − t)/T) (the same source, §4.2).
 
@@ -13,7 +13,7 @@ mod sliced;
 mod tests;
 
 use super::lanes::{Batch, Lane, Work, fill, scatter};
-use super::{At, Cache, Motion, Spec, Tape, fill_rows};
+use super::{At, Cache, Capabilities, Model, Motion, Spec, Tape, fill_rows};
 use crate::math::{Real, Rng};
 use crate::scene::table::TableMut;
 use crate::scene::{BLOCK, Born, Color, GEOMETRY, Grads, Key, Params, RowEdit, SH, Space, SplatGrads, Table};
@@ -97,16 +97,22 @@ pub struct Native4d {
     own: Key,
 }
 
-/// Makes the model, and in `p` the tables it needs (or claims the loaded ones). New Gaussians stand still and live for a
-/// second around t = 0. With harmonics, the layer's SH table grows by their blocks, which start at zero.
-///
-/// Errors: numbers of the spec out of their ranges; loaded arrays of the wrong shape.
-pub fn build<F: Real>(spec: &Native4dSpec, p: &mut Params<F>) -> Result<Arc<dyn Motion<F>>> {
-    Ok(Arc::new(Native4d::new(*spec, p)?))
+impl Model for Native4dSpec {
+    fn build<F: Real>(&self, p: &mut Params<F>) -> Result<Arc<dyn Motion<F>>> {
+        Ok(Arc::new(Native4d::new(*self, p)?))
+    }
+
+    fn capabilities(&self) -> Capabilities {
+        let color_blocks = self.harmonics.min(MAX_HARMONICS) + 1;
+        Capabilities { own_life: true, color_blocks, ..Capabilities::default() }
+    }
 }
 
 impl Native4d {
-    /// As [`build`].
+    /// New Gaussians stand still and live for a second around t = 0. With harmonics, the layer's SH table grows by their
+    /// blocks, which start at zero.
+    ///
+    /// Errors: numbers of the spec out of their ranges; loaded arrays of the wrong shape.
     pub fn new<F: Real>(spec: Native4dSpec, p: &mut Params<F>) -> Result<Self> {
         spec.check()?;
         let rows = p.len();
@@ -159,6 +165,10 @@ const WEIGHT_COLUMNS: [[(&str, usize); 1]; MAX_HARMONICS + 1] = [[("weights", 1)
 impl<F: Real> Motion<F> for Native4d {
     fn spec(&self) -> Spec {
         Spec::Native4d(self.spec)
+    }
+
+    fn scratch_bytes(&self, _p: &Params<F>, _rows: usize) -> u64 {
+        0
     }
 
     fn at(&self, q: &At<'_, F>, _cache: &Cache, tape: &mut Tape<F>) {

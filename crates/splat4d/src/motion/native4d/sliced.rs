@@ -1,5 +1,5 @@
 //! A Gaussian of space and time as its slice: mean, covariance, velocity and life, and the way back to scales and
-//! quaternions. In f64, a row at a time: for edits and for other charts.
+//! quaternions. In f64, a row at a time: for edits and for conversions.
 
 use super::Native4dSpec;
 use super::slice::{self, LOG_TIME_SCALE, OWN, RIGHT};

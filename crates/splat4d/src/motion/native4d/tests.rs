@@ -1,4 +1,4 @@
-//! The list of the method: rotations, slices, charts, colours, safeguards.
+//! The list of the method: rotations, slices, conversions, colours, safeguards.
 
 use super::slice::{Frame, quaternions, rotation4, slice, slice_backward};
 use super::sliced::determinant;
@@ -198,7 +198,7 @@ fn gradients_of_every_number_also_under_the_floor_and_over_the_ceiling() {
 }
 
 #[test]
-fn charts_agree_at_thirty_times_both_ways() {
+fn conversions_agree_at_thirty_times_both_ways() {
     let native = layer(60, SPEC);
     let kinematic = to_spacetime(&native).unwrap();
     let back = to_native4d(&kinematic, SPEC).unwrap();
@@ -229,7 +229,7 @@ fn charts_agree_at_thirty_times_both_ways() {
 }
 
 #[test]
-fn charts_agree_in_single_precision_for_thin_long_lived_fast_gaussians() {
+fn conversions_agree_in_single_precision_for_thin_long_lived_fast_gaussians() {
     let mut p = Params::<f32>::new(40, 1, LifeKind::GaussHalf.columns());
     let motion = Spacetime::new(SpacetimeSpec::default(), &mut p).unwrap();
     for row in 0..40 {

@@ -26,6 +26,10 @@ impl<F: Real> Trajectory<F> for Offset<F> {
         self.of.prepare(p, times, cache);
     }
 
+    fn scratch_bytes(&self, p: &Params<F>) -> u64 {
+        self.of.scratch_bytes(p)
+    }
+
     fn poses(&self, p: &Params<F>, t: Time, cache: &Slot, out: &mut Table<F>) {
         self.of.poses(p, t, cache, out);
         assert_eq!(out.rows(), self.by.rows(), "there must be as many offsets as nodes");

@@ -9,6 +9,10 @@ use std::time::Instant;
 struct Held(Table<f64>);
 
 impl Trajectory<f64> for Held {
+    fn scratch_bytes(&self, _p: &Params<f64>) -> u64 {
+        0
+    }
+
     fn poses(&self, _: &Params<f64>, _: Time, _: &Slot, out: &mut Table<f64>) {
         *out = self.0.clone();
     }

@@ -226,7 +226,7 @@ fn hostile_specs_are_refused() {
         SsmSpec { skin: SkinSpec { neighbours: 0, ..good.skin }, ..good.clone() },
     ];
     for spec in bad {
-        assert!(build::<f32>(&spec, &mut Params::new(30, 1, &[])).is_err(), "{spec:?}");
+        assert!(spec.build::<f32>(&mut Params::new(30, 1, &[])).is_err(), "{spec:?}");
     }
-    assert!(build::<f32>(&good, &mut Params::new(0, 1, &[])).is_ok(), "a layer without Gaussians is a layer");
+    assert!(good.build::<f32>(&mut Params::new(0, 1, &[])).is_ok(), "a layer without Gaussians is a layer");
 }

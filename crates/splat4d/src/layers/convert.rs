@@ -1,4 +1,4 @@
-//! `native4d` layers in the chart of `spacetime` and back. A Gaussian of space and time is a slice that moves at a constant
+//! Conversion of `native4d` layers to `spacetime` and back. A Gaussian of space and time is a slice that moves at a constant
 //! velocity, and a life: exactly a `spacetime` one of order 1 with a `GaussHalf` life.
 
 use super::Layer;
@@ -10,6 +10,7 @@ use crate::scene::life::{CENTER, LOG_WIDTH};
 use crate::scene::params::{LOG_SCALE, QUAT};
 use crate::scene::{GEOMETRY, LIFE, LifeKind, Params, SH};
 use crate::{Error, Result};
+use std::borrow::Cow;
 use std::f64::consts::FRAC_1_SQRT_2;
 use std::sync::Arc;
 
@@ -18,6 +19,16 @@ const SMALLEST: f64 = 1e-12;
 
 fn cannot(what: &str, remedy: &str) -> Error {
     Error::input(what.to_owned()).remedy(remedy.to_owned())
+}
+
+/// The layer as a polynomial of time where its model is one in other numbers (`native4d`); else the layer as it is.
+///
+/// Errors: those of [`to_spacetime`].
+pub fn with_polynomial<F: Real>(layer: &Layer<F>) -> Result<Cow<'_, Layer<F>>> {
+    match layer.motion.spec() {
+        Spec::Native4d(_) => to_spacetime(layer).map(Cow::Owned),
+        _ => Ok(Cow::Borrowed(layer)),
+    }
 }
 
 /// A `native4d` layer as a `spacetime` one of order 1 with a `GaussHalf` life: the same picture at every time.

@@ -20,7 +20,7 @@ const OPAQUE: f32 = 0.5;
 
 /// Mean end-point errors, pixels.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub(super) struct FlowError {
+pub(crate) struct FlowError {
     /// Over all pixels that have a truth.
     pub all: f64,
     /// Where the truth is at least a pixel long.
@@ -28,10 +28,10 @@ pub(super) struct FlowError {
 }
 
 /// A frame of the capture and the file with its flow.
-pub(super) type Truth = (usize, PathBuf);
+pub(crate) type Truth = (usize, PathBuf);
 
 /// The frames whose flow is known: a frame a picture, whatever split it belongs to.
-pub(super) fn truths(capture: &Capture) -> Vec<Truth> {
+pub(crate) fn truths(capture: &Capture) -> Vec<Truth> {
     let folder = capture.root.join("truth").join("flow");
     if !folder.is_dir() {
         return Vec::new();
@@ -50,7 +50,7 @@ pub(super) fn truths(capture: &Capture) -> Vec<Truth> {
 /// The scene's error over all of them; `None` where there is no truth.
 ///
 /// Errors: a file that is no such picture, or of another size than its camera's.
-pub(super) fn error(
+pub(crate) fn error(
     scene: &Scene<f32>,
     capture: &Capture,
     truths: &[Truth],

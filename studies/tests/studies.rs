@@ -1,17 +1,39 @@
-//! `lab` on a tiny run and a tiny capture: every cell is measured once, and what is found can be trusted.
+//! The studies on a tiny run and a tiny capture: every cell is measured once, and what is found can be trusted.
 
-use crate::sample::{Capture, splat4d};
-use crate::{json_of, str, train};
+#[allow(dead_code)] // what the command's tests alone need
+#[path = "../../crates/splat4d-cli/tests/cli/sample.rs"]
+mod sample;
+
+use sample::{Capture, splat4d as studies};
 use serde_json::Value;
 use std::collections::BTreeMap;
+use std::path::Path;
+
+/// A run that takes a second.
+const TINY: [&str; 6] = [
+    "--set=iterations=20",
+    "--set=num_pts=120",
+    "--set=max_cap=150",
+    "--set=sh_degree=1",
+    "--set=checkpoint_interval=10",
+    "--seed=3",
+];
+
+fn str(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+fn json_of(path: &Path) -> Value {
+    serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap()
+}
 
 #[test]
 fn a_study_of_pruning_measures_every_cell_once() {
     let work = tempfile::tempdir().unwrap();
     let run = work.path().join("run");
-    train(&Capture::new(work.path()).write(), &run).ok();
+    studies(&["train", str(&Capture::new(work.path()).write()), "-o", str(&run)]).args(&TINY).run().ok();
     let folder = work.path().join("study");
-    let study = || splat4d(&["lab", "e03", str(&run), "-o", str(&folder), "--quick", "--fine-tune", "4"]);
+    let study = || studies(&["e03", str(&run), "-o", str(&folder), "--quick", "--fine-tune", "4"]);
     let lines = study().args(&["--json"]).run().ok();
     let events: Vec<Value> = lines.lines().map(|l| serde_json::from_str(l).unwrap()).collect();
     let told = events.iter().filter(|e| e["type"] == "cell").count();
@@ -60,11 +82,11 @@ fn a_study_of_pruning_measures_every_cell_once() {
     let lines = study().args(&["--json"]).run().ok();
     assert_eq!(lines.lines().filter(|l| l.contains("\"type\":\"cell\"")).count(), 2);
 
-    let twice = splat4d(&["lab", "e03", str(&run), str(&run), "-o", str(&folder)]).run().refused();
+    let twice = studies(&["e03", str(&run), str(&run), "-o", str(&folder)]).run().refused();
     assert!(twice.contains("name of another run"), "{twice}");
     std::fs::write(&file, "{}").unwrap();
     assert!(study().run().refused().contains("e03.json"));
-    let none = splat4d(&["lab", "e03", str(&folder)]).run().refused();
+    let none = studies(&["e03", str(&folder)]).run().refused();
     assert!(none.contains("is not a run"), "{none}");
 }
 
@@ -77,8 +99,8 @@ fn the_filter_is_studied_part_by_part() {
         // Straight paths have no second difference for the linear regulariser to act on: order 2.
         let small =
             ["num_pts=120", "max_cap=150", "sh_degree=1", "hold_out=camera=1", "motion_order=2"].map(|s| ["--set", s]);
-        let order = ["lab", "e02", str(&capture), "-o", str(&folder), "--quick", "--motion", "spacetime"];
-        splat4d(&order).args(&["--iterations", "16", "--downscale", "1"]).args(small.as_flattened())
+        let order = ["e02", str(&capture), "-o", str(&folder), "--quick", "--motion", "spacetime"];
+        studies(&order).args(&["--iterations", "16", "--downscale", "1"]).args(small.as_flattened())
     };
     let lines = study().args(&["--json"]).run().ok();
     let cells = |lines: &str| -> Vec<Value> {
@@ -109,6 +131,20 @@ fn the_filter_is_studied_part_by_part() {
     assert_eq!(again[0]["psnr"], found[4]["psnr"]);
     std::fs::write(&file, "{}").unwrap();
     assert!(study().run().refused().contains("e02.json"));
-    let none = splat4d(&["lab", "e02", str(&folder)]).run().refused();
+    let none = studies(&["e02", str(&folder)]).run().refused();
     assert!(none.contains("study"), "{none}");
+}
+
+#[test]
+fn help_teaches() {
+    let help = studies(&["--help"]).run().ok();
+    for study in ["e00", "e01", "e02", "e03", "models"] {
+        assert!(help.contains(study), "{study} is missing");
+        let own = studies(&[study, "--help"]).run().ok();
+        assert!(
+            own.contains("Examples:") && own.contains(&format!("studies {study}")),
+            "{study} --help teaches nothing"
+        );
+    }
+    assert!(!help.contains("train"), "what cells are made with is no study");
 }

@@ -1,14 +1,14 @@
 //! What a study found, as tables for Markdown pages and as curves.
 
-use super::cells::{Cell, Grid};
-use super::study::{Findings, Found};
-use crate::files::{grouped, human_bytes};
-use crate::measure::Side;
-use crate::report::chart::{self, Series};
+use crate::cells::{Cell, Grid};
+use crate::study::{Findings, Found};
+use splat4d_cli::files::{grouped, human_bytes};
+use splat4d_cli::measure::Side;
+use splat4d_cli::report::chart::{self, Series};
 use std::fmt::Write;
 
 /// All tables of one run. Cells that are missing are empty.
-pub(super) fn markdown(findings: &Findings, grid: &Grid) -> String {
+pub(crate) fn markdown(findings: &Findings, grid: &Grid) -> String {
     let mut out = format!("## {}\n", findings.name);
     if let Some(source) = findings.of(&Cell::source()) {
         let _ = write!(
@@ -82,7 +82,7 @@ fn shares(out: &mut String, findings: &Findings, grid: &Grid) {
 
 fn scores(out: &mut String, findings: &Findings, grid: &Grid) {
     let head = ["score", "pruned: PSNR", "moving", "fine-tuned: PSNR", "moving"];
-    let line = |(name, score): &(String, super::cells::Score)| {
+    let line = |(name, score): &(String, crate::cells::Score)| {
         let [pruned, tuned] = grid.score(*score);
         let (pruned, tuned) = (both(findings.of(&pruned)), both(findings.of(&tuned)));
         std::iter::once(name.clone()).chain(pruned).chain(tuned).collect()
@@ -132,11 +132,11 @@ fn speed(found: Option<&Found>) -> String {
     found.map_or_else(String::new, |f| format!("{:.2}x ({:.2}x)", f.speed, f.raster_speed))
 }
 
-pub(super) fn number(value: Option<f64>, digits: usize) -> String {
+pub(crate) fn number(value: Option<f64>, digits: usize) -> String {
     value.map_or_else(String::new, |v| format!("{v:.digits$}"))
 }
 
-pub(super) fn table(out: &mut String, title: &str, head: &[&str], lines: Vec<Vec<String>>) {
+pub(crate) fn table(out: &mut String, title: &str, head: &[&str], lines: Vec<Vec<String>>) {
     let _ = write!(out, "\n### {title}\n\n| {} |\n|---|{}\n", head.join(" | "), "---:|".repeat(head.len() - 1));
     for line in lines {
         let _ = writeln!(out, "| {} |", line.join(" | "));
@@ -144,7 +144,7 @@ pub(super) fn table(out: &mut String, title: &str, head: &[&str], lines: Vec<Vec
 }
 
 /// Curves: their names behind `e03-` and the SVGs.
-pub(super) fn plots(findings: &Findings, grid: &Grid) -> Vec<(&'static str, String)> {
+pub(crate) fn plots(findings: &Findings, grid: &Grid) -> Vec<(&'static str, String)> {
     type Get = fn(&Side) -> Option<f64>;
     let curve = |name: &str, get: Get, cells: &dyn Fn(usize) -> Vec<(f64, Cell)>, i: usize| {
         let point = |(x, cell): (f64, Cell)| Some((x, get(&findings.of(&cell)?.side)?));

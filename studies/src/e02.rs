@@ -1,20 +1,20 @@
-//! `lab e02`: what the temporal filter and the transport regularisers change, part by part.
+//! `studies e02`: what the temporal filter and the transport regularisers change, part by part.
 
 mod cells;
 mod flow;
 mod page;
 
-use crate::console::Console;
-use crate::draw::antialias;
-use crate::files::{self, human_seconds};
-use crate::interrupt;
-use crate::run_folder::{self, Run};
-use crate::source::read_scene;
 use cells::{Variant, variants};
 use flow::{FlowError, Truth, truths};
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 use splat4d::{Error, ErrorKind, Result};
+use splat4d_cli::console::Console;
+use splat4d_cli::draw::antialias;
+use splat4d_cli::files::{self, human_seconds};
+use splat4d_cli::interrupt;
+use splat4d_cli::run_folder::{self, Run};
+use splat4d_cli::source::read_scene;
 use splat4d_train::capture::{Capture, ImageStore};
 use splat4d_train::eval::run::{EvalOptions, assess};
 use splat4d_train::event::Event;
@@ -39,9 +39,9 @@ const VERSION: u32 = 1;
 
 const EXAMPLES: &str = "\
 Examples:
-  splat4d lab e02 examples/knight                        ten variants, three seeds each
-  splat4d lab e02 examples/knight --quick                a glance: five variants, one seed, few steps
-  splat4d lab e02 my-take --motion spacetime -o studies/filter --set transport_second=30
+  studies e02 examples/knight                        ten variants, three seeds each
+  studies e02 examples/knight --quick                a glance: five variants, one seed, few steps
+  studies e02 my-take --motion spacetime -o studies/filter --set transport_second=30
 
 Every variant is trained from the same recipe and measured on the held-out views: the filter on and off, predicting in
 Euclidean or in Wasserstein geometry, with and without log and exp, Kalman's own formulas, the linear and the W2 regulariser,

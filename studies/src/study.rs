@@ -1,10 +1,10 @@
 //! What a study has found so far. It is written after every cell, so that nothing is measured twice.
 
-use super::cells::Cell;
-use crate::files;
-use crate::measure::Side;
+use crate::cells::Cell;
 use serde::{Deserialize, Serialize};
 use splat4d::{Error, Result};
+use splat4d_cli::files;
+use splat4d_cli::measure::Side;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -13,14 +13,14 @@ const VERSION: u32 = 1;
 
 /// All runs of a study.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(super) struct Study {
+pub(crate) struct Study {
     version: u32,
     pub runs: Vec<Findings>,
 }
 
 /// What was found on one run.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub(super) struct Findings {
+pub(crate) struct Findings {
     pub run: PathBuf,
     /// For people, and in the names of pictures.
     pub name: String,
@@ -31,7 +31,7 @@ pub(super) struct Findings {
 
 /// One measured cell.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub(super) struct Found {
+pub(crate) struct Found {
     pub key: String,
     pub words: String,
     pub side: Side,
@@ -44,14 +44,14 @@ pub(super) struct Found {
 }
 
 impl Study {
-    pub(super) fn of(runs: Vec<Findings>) -> Self {
+    pub(crate) fn of(runs: Vec<Findings>) -> Self {
         Self { version: VERSION, runs }
     }
 
     /// Reads the file; an empty study where there is none yet.
     ///
     /// Errors: a file that is none of ours, or of another version.
-    pub(super) fn open(path: &Path) -> Result<Self> {
+    pub(crate) fn open(path: &Path) -> Result<Self> {
         if !path.is_file() {
             return Ok(Self::of(Vec::new()));
         }
@@ -66,13 +66,13 @@ impl Study {
         Ok(study)
     }
 
-    pub(super) fn save(&self, path: &Path) -> Result<()> {
+    pub(crate) fn save(&self, path: &Path) -> Result<()> {
         let text = serde_json::to_string_pretty(self).expect("a study is plain data");
         files::write(path, text.as_bytes())
     }
 
     /// The findings on a run; those on an earlier state of it are forgotten.
-    pub(super) fn on(&mut self, run: &Path, name: &str, scene: &str) -> &mut Findings {
+    pub(crate) fn on(&mut self, run: &Path, name: &str, scene: &str) -> &mut Findings {
         self.runs.retain(|f| f.run != run || f.scene == scene);
         if let Some(i) = self.runs.iter().position(|f| f.run == run) {
             return &mut self.runs[i];
@@ -84,14 +84,14 @@ impl Study {
 }
 
 impl Findings {
-    pub(super) fn of(&self, cell: &Cell) -> Option<&Found> {
+    pub(crate) fn of(&self, cell: &Cell) -> Option<&Found> {
         let key = cell.key();
         self.cells.iter().find(|f| f.key == key)
     }
 }
 
 /// A cell that someone made and measured.
-pub(super) struct Judged {
+pub(crate) struct Judged {
     pub side: Side,
     pub speed: f64,
     pub raster_speed: f64,
@@ -99,7 +99,7 @@ pub(super) struct Judged {
 
 /// Makes and measures every cell that is missing. `make`: None where it was stopped. `keep` hears of every new cell,
 /// with the findings so far. Returns whether all are there now.
-pub(super) fn fill(
+pub(crate) fn fill(
     findings: &mut Findings,
     cells: &[Cell],
     make: &mut dyn FnMut(&Cell) -> anyhow::Result<Option<Judged>>,
@@ -124,7 +124,7 @@ pub(super) fn fill(
 
 /// How far a study is.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Place {
+pub(crate) struct Place {
     pub number: usize,
     pub of: usize,
     /// Seconds, estimated from the cells so far; None before the first.
@@ -133,8 +133,8 @@ pub(super) struct Place {
 
 #[cfg(test)]
 mod tests {
-    use super::super::cells::Grid;
     use super::*;
+    use crate::cells::Grid;
 
     fn judged(cell: &Cell) -> Judged {
         Judged { side: Side { psnr: Some(30.0 - cell.prune), ..Side::default() }, speed: 1.0, raster_speed: 1.0 }

@@ -5,7 +5,7 @@ use splat4d_train::recipe::Recipe;
 
 /// One row of the table.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Variant {
+pub(crate) struct Variant {
     /// In files.
     pub key: &'static str,
     /// For people.
@@ -49,13 +49,13 @@ const ALL: [Variant; 10] = [
 ];
 
 /// All, or those of a glance.
-pub(super) fn variants(quick: bool) -> Vec<Variant> {
+pub(crate) fn variants(quick: bool) -> Vec<Variant> {
     ALL.into_iter().filter(|v| v.quick || !quick).collect()
 }
 
 impl Variant {
     /// The recipe with what the variant sets, and the seed.
-    pub(super) fn recipe(&self, base: &Recipe, seed: u64) -> Result<Recipe> {
+    pub(crate) fn recipe(&self, base: &Recipe, seed: u64) -> Result<Recipe> {
         let off = ["filter=off", "transport=off", "filter_predictor=wasserstein"];
         let mut recipe = Recipe { seed, ..base.clone() };
         off.iter().chain(self.knobs).try_for_each(|knob| recipe.set(knob))?;

@@ -1,14 +1,17 @@
-//! Just enough of zip to open a `.sog` file: stored and deflated files, named in the central directory.
+//! Just enough of zip for `.sog` and `.npz`: stored and deflated files, named in the central directory.
 //!
 //! Source: PKWARE's APPNOTE 6.3.10, sections 4.3 and 4.4. Own code, because a general crate brings ciphers and ten other
 //! compressions, and this is a page.
 
-use super::{Files, META, damaged};
-use crate::format::octets::Cursor;
+use super::octets::Cursor;
 use crate::{Error, ErrorKind, Result};
 use flate2::read::DeflateDecoder;
 use std::borrow::Cow;
+use std::collections::BTreeMap;
 use std::io::Read;
+
+/// The files of an archive: name → bytes.
+pub type Files<'a> = BTreeMap<String, Cow<'a, [u8]>>;
 
 /// First bytes of a zip file with something in it.
 pub const MAGIC: [u8; 4] = *b"PK\x03\x04";
@@ -23,10 +26,10 @@ const MOST_COMMENT: usize = 65_535;
 const ZIP64: u32 = u32::MAX;
 /// Deflate shrinks 1032:1 at the very most (zlib technical details).
 const MOST_RATIO: usize = 1032;
-/// Most files that are looked at: a SOG scene has eight.
+/// Most files that are looked at: a SOG scene has eight, an archive of arrays an array each.
 const MOST_FILES: u16 = 4096;
 
-/// All files, by the name they have beside `meta.json`.
+/// All files. Errors: damaged, encrypted, or files that claim to be larger than deflate can make them.
 pub(super) fn read(bytes: &[u8]) -> Result<Files<'_>> {
     let tail = bytes.len().saturating_sub(END_LENGTH + MOST_COMMENT);
     let end = bytes[tail..].windows(END.len()).rposition(|w| w == END);
@@ -37,7 +40,7 @@ pub(super) fn read(bytes: &[u8]) -> Result<Files<'_>> {
     let (length, offset) = (c.u32()?, c.u32()?);
     if count == u16::MAX || length == ZIP64 || offset == ZIP64 || count > MOST_FILES {
         return Err(Error::new(ErrorKind::Unsupported, format!("the zip file holds {count} files or is a zip64"))
-            .remedy("A SOG scene has eight files and less than 4 GiB; export it again."));
+            .remedy("Fewer files and less than 4 GiB are read; save it again."));
     }
     let directory = bytes.get(offset as usize..end);
     let mut c = Cursor::new(directory.ok_or_else(|| damaged("the zip's directory lies outside"))?, "zip directory");
@@ -58,7 +61,7 @@ pub(super) fn read(bytes: &[u8]) -> Result<Files<'_>> {
         let file = body(bytes, offset, packed).and_then(|b| unpack(b, plain, flags, method));
         files.insert(name.clone(), file.map_err(|e| e.at(name))?);
     }
-    Ok(beside_meta(files))
+    Ok(files)
 }
 
 /// The packed bytes of the file whose local header stands at `offset`.
@@ -93,13 +96,10 @@ fn unpack(body: &[u8], plain: usize, flags: u16, method: u16) -> Result<Cow<'_, 
             Ok(Cow::Owned(out))
         }
         other => Err(Error::new(ErrorKind::Unsupported, format!("the file is compressed by zip method {other}"))
-            .remedy("Zip it again with deflate, or export the scene again.")),
+            .remedy("Zip it again with deflate, or save it again.")),
     }
 }
 
-/// Some zip a whole folder: names lose what stands before `meta.json`.
-fn beside_meta(files: Files<'_>) -> Files<'_> {
-    let folder = files.keys().find_map(|n| n.strip_suffix(META).filter(|f| f.ends_with('/')).map(str::to_owned));
-    let Some(folder) = folder.filter(|_| !files.contains_key(META)) else { return files };
-    files.into_iter().filter_map(|(name, f)| Some((name.strip_prefix(&folder)?.to_owned(), f))).collect()
+fn damaged(what: impl std::fmt::Display) -> Error {
+    Error::input(format!("the zip archive is damaged: {what}")).remedy("Copy or save it again.")
 }

@@ -1,17 +1,17 @@
-//! `lab models`: every motion model on the same captures, for the same minutes.
+//! `studies models`: every motion model on the same captures, for the same minutes.
 
-use crate::console::Console;
-use crate::draw::antialias;
-use crate::files::{self, grouped, human_bytes, human_seconds};
-use crate::interrupt;
-use crate::measure::{SIZE, Side, Subject, What, in_turns, looks};
-use crate::run_folder::Run;
-use crate::source::read_scene;
 use anyhow::Context;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
-use splat4d::motion::BUILT_IN;
+use splat4d::motion::MODELS;
 use splat4d::{Error, ErrorKind};
+use splat4d_cli::console::Console;
+use splat4d_cli::draw::antialias;
+use splat4d_cli::files::{self, grouped, human_bytes, human_seconds};
+use splat4d_cli::interrupt;
+use splat4d_cli::measure::{SIZE, Side, Subject, What, in_turns, looks};
+use splat4d_cli::run_folder::Run;
+use splat4d_cli::source::read_scene;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -20,8 +20,6 @@ use std::time::{Duration, Instant};
 
 /// Minutes of training a cell.
 const MINUTES: f64 = 3.0;
-/// What is wrapped around a model and trained by none.
-const WRAPPER: &str = "filtered";
 /// How often a cell that trains is looked at.
 const GLANCE: Duration = Duration::from_millis(100);
 /// What a cell costs besides its minutes (probes, evaluation, baking, playing), minutes; for the time that is left.
@@ -29,9 +27,9 @@ const OVERHEAD: f64 = 0.6;
 
 const EXAMPLES: &str = "\
 Examples:
-  splat4d lab models examples/knight                         every model for three minutes each
-  splat4d lab models a-take b-take --only control,hexplane   some models on two captures
-  splat4d lab models examples/knight --minutes 1 -o quick
+  studies models examples/knight                         every model for three minutes each
+  studies models a-take b-take --only control,hexplane   some models on two captures
+  studies models examples/knight --minutes 1 -o quick
 
 Every cell is a run of its own (DIR/CAPTURE-MODEL), trained by `splat4d train` on pictures of half size, measured on the
 held-out views and played on the CPU at 800x800. A run that is there is not trained again: the same command goes on where
@@ -144,7 +142,7 @@ fn parted(page: &str) -> splat4d::Result<[&str; 2]> {
 
 /// The models that are asked for, in the library's order.
 fn models(only: &[String]) -> splat4d::Result<Vec<&'static str>> {
-    let all = BUILT_IN.into_iter().filter(|m| *m != WRAPPER);
+    let all = MODELS.iter().copied();
     if let Some(unknown) = only.iter().find(|m| !all.clone().any(|a| a == m.as_str())) {
         return Err(Error::input(format!("there is no motion model `{unknown}` that trains by itself"))
             .remedy(format!("Use some of: {}", all.collect::<Vec<_>>().join(", "))));
@@ -262,7 +260,7 @@ mod tests {
 
     #[test]
     fn every_model_can_be_asked_for_and_others_are_named() {
-        assert_eq!(models(&[]).unwrap().len(), BUILT_IN.len() - 1);
+        assert_eq!(models(&[]).unwrap(), MODELS);
         assert_eq!(models(&["still".into()]).unwrap(), ["still"]);
         assert!(models(&["stil".into()]).unwrap_err().to_string().contains("spacetime"));
     }

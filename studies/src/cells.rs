@@ -22,7 +22,7 @@ const OVERHEAD: f64 = 300.0;
 
 /// One treatment of the source.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Cell {
+pub(crate) struct Cell {
     /// Share of the Gaussians that goes, in so many rounds.
     pub prune: f64,
     pub rounds: usize,
@@ -35,7 +35,7 @@ pub(super) struct Cell {
 
 /// How Gaussians are ranked.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Score {
+pub(crate) struct Score {
     pub spatial: Spatial,
     pub temporal: Temporal,
     pub combine: Combine,
@@ -49,7 +49,7 @@ const DEFAULT: Score =
 impl Score {
     /// All that are compared, the default first: the spatial variants, the temporal ones, with the volume, the ways to
     /// combine, and 4DGS-1K's own choice.
-    pub(super) fn all() -> Vec<(String, Self)> {
+    pub(crate) fn all() -> Vec<(String, Self)> {
         let mut out = vec![("change, instant abs".to_owned(), DEFAULT)];
         // Those of other systems' pruning can be asked for; here they would add a run each.
         let spatial = [Spatial::Share, Spatial::Both].iter();
@@ -72,17 +72,17 @@ impl Score {
 
 impl Cell {
     /// The source as it is.
-    pub(super) const fn source() -> Self {
+    pub(crate) const fn source() -> Self {
         Self { prune: 0.0, rounds: 1, score: DEFAULT, steps: 0, interval: 0 }
     }
 
     /// Whether nothing is done at all.
-    pub(super) fn is_source(&self) -> bool {
+    pub(crate) fn is_source(&self) -> bool {
         self.prune == 0.0 && self.steps == 0 && self.interval == 0
     }
 
     /// Its name in files: what it depends on. Without pruning neither score nor rounds matter.
-    pub(super) fn key(&self) -> String {
+    pub(crate) fn key(&self) -> String {
         let mut key = format!("prune{:03.0}", 1000.0 * self.prune);
         if self.prune > 0.0 {
             let Score { spatial, temporal, combine, volume } = self.score;
@@ -96,7 +96,7 @@ impl Cell {
     }
 
     /// For people who wait.
-    pub(super) fn words(&self) -> String {
+    pub(crate) fn words(&self) -> String {
         if self.is_source() {
             return "the source".into();
         }
@@ -114,7 +114,7 @@ impl Cell {
     }
 
     /// For the compression: floats throughout, so that only what is varied changes anything.
-    pub(super) fn settings(&self) -> Compression {
+    pub(crate) fn settings(&self) -> Compression {
         Compression {
             prune: self.prune,
             rounds: self.rounds,
@@ -130,14 +130,14 @@ impl Cell {
     }
 
     /// What it takes, in steps of training.
-    pub(super) fn cost(&self) -> f64 {
+    pub(crate) fn cost(&self) -> f64 {
         OVERHEAD + self.steps as f64
     }
 }
 
 /// What the study varies.
 #[derive(Clone, Debug)]
-pub(super) struct Grid {
+pub(crate) struct Grid {
     pub shares: Vec<f64>,
     pub intervals: Vec<usize>,
     pub rounds: Vec<usize>,
@@ -149,7 +149,7 @@ pub(super) struct Grid {
 }
 
 impl Grid {
-    pub(super) fn full(steps: usize) -> Self {
+    pub(crate) fn full(steps: usize) -> Self {
         Self {
             shares: SHARES.to_vec(),
             intervals: INTERVALS.to_vec(),
@@ -161,7 +161,7 @@ impl Grid {
     }
 
     /// A glance: fewer points, and fine-tuning only of the main ones.
-    pub(super) fn quick(steps: usize) -> Self {
+    pub(crate) fn quick(steps: usize) -> Self {
         Self {
             shares: FEW_SHARES.to_vec(),
             intervals: FEW_INTERVALS.to_vec(),
@@ -172,13 +172,13 @@ impl Grid {
     }
 
     /// Pruned to a share: [not tuned, tuned, tuned with the filter on].
-    pub(super) fn share(&self, prune: f64) -> [Cell; 3] {
+    pub(crate) fn share(&self, prune: f64) -> [Cell; 3] {
         let cell = |steps, interval| Cell { prune, steps, interval, ..Cell::source() };
         [cell(0, 0), cell(self.steps, 0), cell(self.steps, INTERVAL)]
     }
 
     /// What each part does, at one share: name and cell.
-    pub(super) fn parts(&self) -> Vec<(String, Cell)> {
+    pub(crate) fn parts(&self) -> Vec<(String, Cell)> {
         let cell = |prune, interval, steps| Cell { prune, interval, steps, ..Cell::source() };
         let pruned = format!("pruned by {:.0} %", 100.0 * AT);
         vec![
@@ -194,22 +194,22 @@ impl Grid {
     }
 
     /// [not tuned, tuned] of a score.
-    pub(super) fn score(&self, score: Score) -> [Cell; 2] {
+    pub(crate) fn score(&self, score: Score) -> [Cell; 2] {
         [0, self.steps].map(|steps| Cell { prune: AT, score, steps, ..Cell::source() })
     }
 
     /// [not tuned, tuned] of an interval.
-    pub(super) fn interval(&self, interval: usize) -> [Cell; 2] {
+    pub(crate) fn interval(&self, interval: usize) -> [Cell; 2] {
         [0, self.steps].map(|steps| Cell { prune: AT, interval, steps, ..Cell::source() })
     }
 
     /// Tuned, in so many rounds.
-    pub(super) fn round(&self, rounds: usize) -> Cell {
+    pub(crate) fn round(&self, rounds: usize) -> Cell {
         Cell { prune: AT, rounds, steps: self.steps, ..Cell::source() }
     }
 
     /// Every cell once: the source first, then what the main tables need.
-    pub(super) fn cells(&self) -> Vec<Cell> {
+    pub(crate) fn cells(&self) -> Vec<Cell> {
         let mut all = vec![Cell::source()];
         all.extend(self.parts().into_iter().map(|(_, cell)| cell));
         all.extend(self.shares.iter().flat_map(|s| self.share(*s)));

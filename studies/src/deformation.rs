@@ -2,10 +2,10 @@
 //! numbers learns their displacement from noisy positions, against the best that standing still can do. A penalty on
 //! speed trades fidelity for smoothness; a sharp edge between two motions and a jump in time are what it cannot follow.
 
-use crate::optim::Moments;
 use splat4d::math::Rng;
 use splat4d::nn::mlp::{InputGrad, Mlp, MlpShape, Passed};
 use splat4d::scene::{Grads, Params};
+use splat4d_train::optim::Moments;
 
 /// What the experiment varies.
 #[derive(Clone, Debug, PartialEq)]

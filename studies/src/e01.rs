@@ -1,17 +1,17 @@
-//! `lab e01`: scene flow lifted from optical flow: what it gains, how it drifts, and what helps.
+//! `studies e01`: scene flow lifted from optical flow: what it gains, how it drifts, and what helps.
 
-use crate::console::Console;
-use crate::files;
-use crate::report::chart::{self, Series};
+use crate::lifting::{Findings, Settings, run as study};
 use serde_json::{Value, json};
-use splat4d_train::lab::e01::{Findings, Settings, run as study};
+use splat4d_cli::console::Console;
+use splat4d_cli::files;
+use splat4d_cli::report::chart::{self, Series};
 use std::fmt::Write;
 use std::path::PathBuf;
 
 const EXAMPLES: &str = "\
 Examples:
-  splat4d lab e01                     a sphere, a cube and a wall over 20 frames
-  splat4d lab e01 -o e01 --noise 1
+  studies e01                     a sphere, a cube and a wall over 20 frames
+  studies e01 -o e01 --noise 1
 
 Tables are printed and written to DIR/e01.md, the drift to DIR/e01-drift.svg, all numbers to DIR/e01.json.";
 

@@ -1,17 +1,17 @@
-//! `lab e00`: what a deformation network learns, on points whose true motion is known.
+//! `studies e00`: what a deformation network learns, on points whose true motion is known.
 
-use crate::console::Console;
-use crate::files;
-use crate::report::chart::{self, Series};
+use crate::deformation::{Findings, LAMBDAS, MANY_POINTS, Scene, Settings, run as study};
 use serde_json::{Value, json};
-use splat4d_train::lab::e00::{Findings, LAMBDAS, MANY_POINTS, Scene, Settings, run as study};
+use splat4d_cli::console::Console;
+use splat4d_cli::files;
+use splat4d_cli::report::chart::{self, Series};
 use std::fmt::Write;
 use std::path::PathBuf;
 
 const EXAMPLES: &str = "\
 Examples:
-  splat4d lab e00                     fifty points, three kinds of motion, a network of 4,546 numbers
-  splat4d lab e00 --seeds 3 -o e00
+  studies e00                     fifty points, three kinds of motion, a network of 4,546 numbers
+  studies e00 --seeds 3 -o e00
 
 Tables are printed and written to DIR/e00.md, curves to DIR/e00-*.svg, all numbers to DIR/e00.json.";
 

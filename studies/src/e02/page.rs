@@ -1,9 +1,9 @@
 //! What the ablation found, as a table and a curve.
 
-use super::super::tables::{number, table};
 use super::cells::Variant;
 use super::{Found, Study};
-use crate::report::chart::{self, Series};
+use crate::tables::{number, table};
+use splat4d_cli::report::chart::{self, Series};
 
 type Get = fn(&Found) -> Option<f64>;
 
@@ -29,7 +29,7 @@ fn saved(value: Option<(f64, Option<f64>)>, base: Option<(f64, Option<f64>)>) ->
 }
 
 /// The page.
-pub(super) fn markdown(study: &Study, variants: &[Variant], motion: &str) -> String {
+pub(crate) fn markdown(study: &Study, variants: &[Variant], motion: &str) -> String {
     let mut out = format!(
         "# The temporal filter around `{motion}`\n\n{} steps, means over {} seed(s), ± half the spread. PSNR is that of \
          the held-out views, `moving` is where things move; flicker in 1/255; flow: end-point error in pixels, over all \
@@ -71,7 +71,7 @@ pub(super) fn markdown(study: &Study, variants: &[Variant], motion: &str) -> Str
 }
 
 /// Every variant's flicker, flow error and loss of quality against the motion alone, by row of the table.
-pub(super) fn plot(study: &Study, variants: &[Variant]) -> Option<String> {
+pub(crate) fn plot(study: &Study, variants: &[Variant]) -> Option<String> {
     let base = study.of(variants.first()?);
     let curve = |name: &str, get: Get| {
         let point = |(i, v): (usize, &Variant)| {

@@ -1,18 +1,18 @@
-//! `lab e03`: how much may be removed from a trained scene, by which score, and what the temporal filter costs.
+//! `studies e03`: how much may be removed from a trained scene, by which score, and what the temporal filter costs.
 
-use super::cells::{Cell, Grid};
-use super::study::{Found, Judged, Place, Study, fill};
-use super::tables;
-use crate::console::Console;
-use crate::draw::antialias;
-use crate::files::{self, human_seconds};
-use crate::interrupt;
-use crate::measure::{Look, SIZE, Side, Subject, What, in_turns, looks};
-use crate::run_folder::Run;
-use crate::source::{not_empty, read_scene};
+use crate::cells::{Cell, Grid};
+use crate::study::{Found, Judged, Place, Study, fill};
+use crate::tables;
 use serde_json::json;
 use splat4d::layers::Scene;
 use splat4d::{Error, ErrorKind, Result};
+use splat4d_cli::console::Console;
+use splat4d_cli::draw::antialias;
+use splat4d_cli::files::{self, human_seconds};
+use splat4d_cli::interrupt;
+use splat4d_cli::measure::{Look, SIZE, Side, Subject, What, in_turns, looks};
+use splat4d_cli::run_folder::Run;
+use splat4d_cli::source::{not_empty, read_scene};
 use splat4d_train::capture::{Capture, ImageStore};
 use splat4d_train::compress::{Job, compress};
 use splat4d_train::eval::run::{EvalOptions, assess};
@@ -33,9 +33,9 @@ const QUICK_SIZE: [usize; 2] = [200, 200];
 
 const EXAMPLES: &str = "\
 Examples:
-  splat4d lab e03 runs/knight                       all of it: about 45 cells, each a fine-tuning
-  splat4d lab e03 runs/knight --quick               a glance: fewer points, shorter fine-tuning
-  splat4d lab e03 runs/a runs/b -o studies/pruning  two scenes; every run has its own tables and pictures
+  studies e03 runs/knight                       all of it: about 45 cells, each a fine-tuning
+  studies e03 runs/knight --quick               a glance: fewer points, shorter fine-tuning
+  studies e03 runs/a runs/b -o studies/pruning  two scenes; every run has its own tables and pictures
 
 Every cell prunes a share of the run's Gaussians and measures what is left on the held-out views, on the CPU and in
 32-bit floats: shares from 0 to 95 %, the temporal filter, fine-tuning, the scores of 4DGS-1K, frames between key times,
@@ -79,7 +79,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             let left = left.map_or_else(String::new, |s| format!(", about {} left", human_seconds(s)));
             console.note(&format!("{} {number}/{of}: {}{left}", bench.name, cell.words()));
         };
-        let keep = |findings: &super::study::Findings, found: &Found| {
+        let keep = |findings: &crate::study::Findings, found: &Found| {
             let whole = Study::of(others.iter().cloned().chain([findings.clone()]).collect());
             console.emit(&json!({"type": "cell", "run": bench.path, "cell": found}));
             whole.save(&file)

@@ -1,0 +1,206 @@
+//! The `splat4d` command: posed, moving captures become trained, measured and rendered 4D scenes on a plain CPU.
+//!
+//! Each verb is a file in `verbs`. Only the shells print, parse arguments or exit: 0 done, 1 failed, 2 bad input. A library
+//! for the sake of the workspace's studies, which share the console, run folders and measurements: no published interface.
+
+#![allow(missing_docs)] // nobody outside the workspace reads it
+
+mod baking;
+mod camera_file;
+mod compressing;
+pub mod console;
+mod device;
+pub mod draw;
+pub mod files;
+mod finish;
+pub mod interrupt;
+pub mod measure;
+pub mod paths;
+mod playable;
+pub mod report;
+pub mod run_folder;
+mod sequence;
+mod serving;
+pub mod source;
+pub mod verbs;
+mod video;
+
+use clap::{Parser, Subcommand};
+use console::{Console, Loudness};
+use splat4d::{Error, ErrorKind};
+use std::process::ExitCode;
+
+/// Exit code of work that failed.
+const FAILED: u8 = 1;
+/// Exit code of bad input: the user's files or options.
+const BAD_INPUT: u8 = 2;
+
+const EXAMPLES: &str = "\
+Examples:
+  splat4d train examples/knight            train, measure, report and film the bundled capture
+  splat4d train my-take --minutes 10       fit the steps of training into ten minutes
+  splat4d train --resume runs/my-take      continue exactly where a run stopped
+  splat4d eval runs/knight --baseline      measure again, next to a scene that stands still
+  splat4d render runs/knight -o turn.mp4   film an orbit through space and time
+  splat4d bake runs/knight -o knight.splat4d       one small, seekable file for players
+  splat4d compress runs/knight             the same many times smaller and faster, and measured
+  splat4d view runs/knight                 play it in the browser
+  splat4d export runs/knight -o now.ply --time 0.5
+  splat4d export runs/knight --html -o knight.html
+  splat4d convert scene.sog scene.spz      between the formats of other programs
+  splat4d info my-take                     what is in a capture, run or file; is it healthy?
+  splat4d bench                            how fast this machine draws and trains
+
+Exit codes: 0 done, 1 failed or interrupted, 2 bad input.";
+
+/// 4D Gaussian splatting on a plain CPU: a posed, moving capture becomes a scene to look at from anywhere, at any time.
+#[derive(Debug, Parser)]
+#[command(name = "splat4d", version, after_help = EXAMPLES, max_term_width = 110)]
+struct Cli {
+    #[command(flatten)]
+    globals: Globals,
+    #[command(subcommand)]
+    verb: Verb,
+}
+
+/// Options of every verb.
+#[derive(Debug, clap::Args)]
+pub struct Globals {
+    /// Print events and results for machines: one JSON object a line
+    #[arg(long, global = true)]
+    json: bool,
+    /// Say more
+    #[arg(short, long, global = true, conflicts_with = "quiet")]
+    verbose: bool,
+    /// Say only warnings and errors
+    #[arg(short, long, global = true)]
+    quiet: bool,
+    /// Threads to work with [default: all cores]; the result does not depend on it
+    #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    threads: Option<u16>,
+}
+
+#[derive(Debug, Subcommand)]
+enum Verb {
+    Train(Box<verbs::train::Args>),
+    Eval(verbs::eval::Args),
+    Render(verbs::render::Args),
+    Bake(verbs::bake::Args),
+    Compress(verbs::compress::Args),
+    Export(verbs::export::Args),
+    View(verbs::view::Args),
+    Convert(verbs::convert::Args),
+    Info(verbs::info::Args),
+    Bench(verbs::bench::Args),
+    Completions(verbs::completions::Args),
+}
+
+/// The command: parses the arguments, runs the verb and says how it went.
+pub fn main() -> ExitCode {
+    parsed(|cli: Cli| {
+        let threads = cli.globals.threads;
+        (cli.globals, move |console: &Console| match cli.verb {
+            Verb::Train(args) => verbs::train::run(&args, console),
+            Verb::Eval(args) => verbs::eval::run(&args, console),
+            Verb::Render(args) => verbs::render::run(&args, console),
+            Verb::Bake(args) => verbs::bake::run(&args, console),
+            Verb::Compress(args) => verbs::compress::run(&args, console),
+            Verb::Export(args) => verbs::export::run(&args, console),
+            Verb::View(args) => verbs::view::run(&args, console),
+            Verb::Convert(args) => verbs::convert::run(&args, console),
+            Verb::Info(args) => verbs::info::run(&args, console),
+            Verb::Bench(args) => verbs::bench::run(&args, threads, console),
+            Verb::Completions(args) => verbs::completions::run(&args, console),
+        })
+    })
+}
+
+/// Parses the arguments of a program with the command's manners, does what `work` makes of them, and tells errors.
+pub fn parsed<C, W>(work: impl FnOnce(C) -> (Globals, W)) -> ExitCode
+where
+    C: Parser,
+    W: FnOnce(&Console) -> anyhow::Result<()>,
+{
+    let (globals, work) = match C::try_parse() {
+        Ok(cli) => work(cli),
+        Err(error) => {
+            let _ = error.print();
+            return if error.use_stderr() { BAD_INPUT.into() } else { ExitCode::SUCCESS };
+        }
+    };
+    let loudness = match (globals.quiet, globals.verbose) {
+        (true, _) => Loudness::Quiet,
+        (_, true) => Loudness::Verbose,
+        _ => Loudness::Normal,
+    };
+    let console = Console::new(loudness, globals.json);
+    match threads(globals.threads).and_then(|()| work(&console)) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            let code = exit_code(&error);
+            console.error(&told(&error), code);
+            code.into()
+        }
+    }
+}
+
+fn threads(count: Option<u16>) -> anyhow::Result<()> {
+    if let Some(count) = count {
+        rayon::ThreadPoolBuilder::new()
+            .num_threads(count.into())
+            .build_global()
+            .map_err(|e| anyhow::anyhow!("{count} threads could not be started ({e}). Ask for fewer."))?;
+    }
+    Ok(())
+}
+
+/// The error and its causes, but no cause whose words were said already.
+fn told(error: &anyhow::Error) -> String {
+    error.chain().map(ToString::to_string).fold(String::new(), |mut said, cause| {
+        if said.is_empty() {
+            said = cause;
+        } else if !said.contains(&cause) {
+            said += &format!(": {cause}");
+        }
+        said
+    })
+}
+
+/// 2 where the user's data, files or options are at fault, 1 for everything else.
+fn exit_code(error: &anyhow::Error) -> u8 {
+    match error.downcast_ref::<Error>().map(Error::kind) {
+        Some(ErrorKind::BadInput | ErrorKind::Io | ErrorKind::Unsupported) => BAD_INPUT,
+        _ => FAILED,
+    }
+}
+
+/// The whole command, for completions and help.
+fn command() -> clap::Command {
+    <Cli as clap::CommandFactory>::command()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        command().debug_assert();
+    }
+
+    #[test]
+    fn causes_are_told_once() {
+        let io = std::io::Error::other("disk on fire");
+        let error = anyhow::Error::from(Error::io("cannot be read", io)).context("the report");
+        let text = told(&error);
+        assert!(text.starts_with("the report: ") && text.matches("disk on fire").count() == 1, "{text}");
+    }
+
+    #[test]
+    fn errors_of_the_users_data_are_two_and_failures_one() {
+        assert_eq!(exit_code(&Error::input("x").into()), 2);
+        assert_eq!(exit_code(&Error::new(ErrorKind::Unsupported, "x").into()), 2);
+        assert_eq!(exit_code(&Error::new(ErrorKind::Diverged, "x").into()), 1);
+        assert_eq!(exit_code(&anyhow::anyhow!("ffmpeg died")), 1);
+    }
+}

@@ -1,0 +1,144 @@
+//! The registry of motion models: the properties that a model tells of itself, and the macro that turns the list in
+//! [`motion`](super) into [`Spec`](super::Spec), its names and [`build`](super::build).
+
+use super::Motion;
+use crate::Result;
+use crate::math::Real;
+use crate::scene::{Key, Params};
+use std::sync::Arc;
+
+/// A built-in model as plain data: the payload of its entry in the list.
+pub trait Model {
+    /// Makes the model, and in `p` the tables it needs (or claims the loaded ones).
+    ///
+    /// Errors: numbers that are out of their ranges, loaded arrays of the wrong shape.
+    fn build<F: Real>(&self, p: &mut Params<F>) -> Result<Arc<dyn Motion<F>>>;
+
+    /// The properties that the rest of the library may rely on.
+    fn capabilities(&self) -> Capabilities;
+}
+
+/// Properties of a motion model that others act on, in place of its name. The default promises nothing: it is that of a
+/// model from outside the library.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Capabilities {
+    /// Something may depend on time, beside the layer's life.
+    pub moves: bool,
+    /// Gaussians may turn as they move.
+    pub rotates: bool,
+    /// Birth and death are the model's own ([`Motion::life`]), and the layer needs no life table.
+    pub own_life: bool,
+    /// State runs forward in time: an answer at t depends on no number that stands for a later time, so that what follows
+    /// can be learnt or cut off without a change of what was.
+    pub causal: bool,
+    /// Fixed cameras that must see every moment for the model to be learnt.
+    pub fixed_cameras: usize,
+    /// Blocks of spherical harmonics in the layer's SH table.
+    pub color_blocks: usize,
+}
+
+impl Default for Capabilities {
+    fn default() -> Self {
+        Self { moves: true, rotates: true, own_life: false, causal: false, fixed_cameras: 0, color_blocks: 1 }
+    }
+}
+
+/// A phase of training, which a stage gives to its models: parts that are not in use yet.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Phase {
+    /// The canonical Gaussians are all there is, and only they learn.
+    pub rests: bool,
+    /// Levels of detail in use, the coarsest first; none: all.
+    pub levels: Option<usize>,
+}
+
+/// Motion as a polynomial in time around the centre of each Gaussian's life: what files of kinematic Gaussians hold, and
+/// what bakes without a fit where it is [straight](Self::is_straight).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Polynomial {
+    /// Order in Δ, seconds from the centre; 0: positions stay.
+    pub order: usize,
+    /// Table of the coefficients of position, [N, 3·order], scene units / s^k; none where the order is 0.
+    pub velocities: Option<Key>,
+    /// Table of quaternion rates, [N, 4], 1/s; none: rotations stay.
+    pub rotation_rates: Option<Key>,
+    /// Centre for Gaussians that live for ever, seconds.
+    pub origin: f64,
+}
+
+impl Polynomial {
+    /// Whether everything goes along straight lines and nothing turns.
+    pub fn is_straight(&self) -> bool {
+        self.order <= 1 && self.rotation_rates.is_none()
+    }
+}
+
+/// Makes of the list of models `Spec`, the names, and all that is asked of a model by its spec.
+///
+/// `models` train by themselves, `wrappers` around another one. An entry names the variant, what binds its payload and
+/// the payload's type, the model's name, and a reference to what implements [`Model`].
+macro_rules! registry {
+    (
+        models { $($(#[$doc:meta])* $variant:ident $(($bound:ident: $spec:ty))? = $name:literal => $model:expr;)* }
+        wrappers { $($(#[$w_doc:meta])* $w_variant:ident($w_bound:ident: $w_spec:ty) = $w_name:literal => $wrapper:expr;)* }
+    ) => {
+        /// A model as plain data: what files store, and all that [`build`] needs to make it again.
+        ///
+        /// Its JSON form is an object whose `model` is the model's name, beside the fields of its spec.
+        #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+        #[serde(tag = "model")]
+        #[non_exhaustive]
+        pub enum Spec {
+            $($(#[$doc])* #[serde(rename = $name)] $variant $(($spec))?,)*
+            $($(#[$w_doc])* #[serde(rename = $w_name)] $w_variant($w_spec),)*
+            /// A model from outside this library; it cannot be built from a file.
+            #[serde(skip)]
+            Custom(String),
+        }
+
+        /// Names of the models that train by themselves.
+        pub const MODELS: &[&str] = &[$($name),*];
+
+        /// Names of all models that the library can build, with those that wrap another.
+        pub const BUILT_IN: &[&str] = &[$($name,)* $($w_name),*];
+
+        impl Spec {
+            /// The name that `--motion` takes and files store.
+            pub fn name(&self) -> &str {
+                match self {
+                    $(Spec::$variant $(($bound))? => { $(let _ = $bound;)? $name })*
+                    $(Spec::$w_variant(_) => $w_name,)*
+                    Spec::Custom(name) => name,
+                }
+            }
+
+            /// Whether [`build`] can make it.
+            pub fn is_built_in(&self) -> bool {
+                !matches!(self, Spec::Custom(_))
+            }
+
+            /// Properties of the model; none for one from outside, which tells them itself
+            /// ([`Motion::capabilities`]).
+            pub fn capabilities(&self) -> Option<Capabilities> {
+                match self {
+                    $(Spec::$variant $(($bound))? => Some(Model::capabilities($model)),)*
+                    $(Spec::$w_variant($w_bound) => Some(Model::capabilities($wrapper)),)*
+                    Spec::Custom(_) => None,
+                }
+            }
+        }
+
+        /// Makes the model, and in `p` the tables it needs (or claims the loaded ones).
+        ///
+        /// Errors: `Spec::Custom`; numbers out of their ranges; loaded arrays of the wrong shape.
+        pub fn build<F: Real>(spec: &Spec, p: &mut Params<F>) -> Result<Arc<dyn Motion<F>>> {
+            match spec {
+                $(Spec::$variant $(($bound))? => Model::build($model, p),)*
+                $(Spec::$w_variant($w_bound) => Model::build($wrapper, p),)*
+                Spec::Custom(name) => Err(Error::input(format!("motion model `{name}` is not one of this version's"))
+                    .remedy(format!("It knows: {}. A newer splat4d may know more", BUILT_IN.join(", ")))),
+            }
+        }
+    };
+}
+pub(super) use registry;

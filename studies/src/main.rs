@@ -1,0 +1,64 @@
+//! Studies that vary what methods leave open, on made-up motion, and on runs and captures of one's own. A program of the
+//! workspace that is not shipped: `cargo run --release -p splat4d-studies -- e00`.
+
+mod cells;
+mod deformation;
+mod e00;
+mod e01;
+mod e02;
+mod e03;
+mod lifting;
+mod models;
+mod study;
+mod tables;
+
+use clap::{Parser, Subcommand};
+use splat4d_cli::{Globals, verbs};
+use std::process::ExitCode;
+
+const EXAMPLES: &str = "\
+Examples:
+  studies e00                          what does a deformation network learn, and where does it fail?
+  studies e01                          how far does lifted optical flow drift?
+  studies e02 examples/knight          what do the temporal filter and the transport regularisers change?
+  studies e03 runs/knight              how much can be pruned, by which score, and what does the filter cost?
+  studies e03 runs/knight --quick
+  studies models examples/knight       every motion model, three minutes each
+
+A study can be stopped at any time and goes on where it was.";
+
+/// Studies of the methods: tables and curves of what they gain and lose
+#[derive(Debug, Parser)]
+#[command(name = "studies", version, after_help = EXAMPLES, max_term_width = 110)]
+struct Cli {
+    #[command(flatten)]
+    globals: Globals,
+    #[command(subcommand)]
+    study: Study,
+}
+
+#[derive(Debug, Subcommand)]
+enum Study {
+    E00(e00::Args),
+    E01(e01::Args),
+    E02(e02::Args),
+    E03(e03::Args),
+    Models(models::Args),
+    /// `splat4d train`, for `models`: a cell is a process, so that its peak of memory is its own.
+    #[command(hide = true)]
+    Train(Box<verbs::train::Args>),
+}
+
+fn main() -> ExitCode {
+    splat4d_cli::parsed(|cli: Cli| {
+        let study = cli.study;
+        (cli.globals, move |console: &_| match study {
+            Study::E00(args) => e00::run(&args, console),
+            Study::E01(args) => e01::run(&args, console),
+            Study::E02(args) => e02::run(&args, console),
+            Study::E03(args) => e03::run(&args, console),
+            Study::Models(args) => models::run(&args, console),
+            Study::Train(args) => verbs::train::run(&args, console),
+        })
+    })
+}

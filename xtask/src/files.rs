@@ -1,0 +1,26 @@
+//! Files that the chores write.
+
+use anyhow::{Context, Result};
+use image::codecs::png::{CompressionType, FilterType, PngEncoder};
+use image::{ExtendedColorType, ImageEncoder};
+use std::path::Path;
+
+/// A PNG file of `width` x `height` pixels; 16-bit samples in the machine's byte order.
+pub fn png(data: &[u8], width: usize, height: usize, color: ExtendedColorType) -> Result<Vec<u8>> {
+    let mut out = Vec::new();
+    let filter = if color == ExtendedColorType::L8 { FilterType::NoFilter } else { FilterType::Adaptive };
+    let encoder = PngEncoder::new_with_quality(&mut out, CompressionType::Level(9), filter);
+    encoder.write_image(data, width as u32, height as u32, color)?;
+    Ok(out)
+}
+
+/// Writes under a temporary name in the same folder, then renames; makes the folder if need be.
+pub fn write_file(path: &Path, bytes: &[u8]) -> Result<()> {
+    let place = || path.display().to_string();
+    if let Some(folder) = path.parent() {
+        std::fs::create_dir_all(folder).with_context(place)?;
+    }
+    let temporary = path.with_extension("part");
+    std::fs::write(&temporary, bytes).with_context(place)?;
+    std::fs::rename(&temporary, path).with_context(place)
+}
