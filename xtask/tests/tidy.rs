@@ -16,10 +16,10 @@ const ORDER: [(&str, &[&str]); 5] = [
     ),
     (
         "crates/splat4d-train",
-        // The recipe stands first because everything is told by it; losses before densification and both before
+        // The recipe stands first because everything is told by it; losses and upkeep before
         // `methods`, which choose among them; `init` needs a model's plan; `eval` writes as safely as `train` does.
         &[
-            "recipe", "event", "capture", "sampler", "optim", "loss", "densify", "prune", "methods", "init", "train",
+            "recipe", "event", "capture", "sampler", "optim", "loss", "learner", "upkeep", "methods", "init", "train",
             "eval", "compress", "dynamics", "dist",
         ],
     ),

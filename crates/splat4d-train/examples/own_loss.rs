@@ -11,12 +11,12 @@ use splat4d::render::{Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{Camera, GEOMETRY, LifeKind, Params, Planes, SH, Space, Table, Time};
 use splat4d_train::capture::frames::{Frames, Picture};
-use splat4d_train::densify::Limits;
 use splat4d_train::loss::image::{Channel, ImageTerm, Needs, PictureGrads, Shown, View};
 use splat4d_train::loss::terms::StepInfo;
 use splat4d_train::methods::{Group, Rate, Stage};
 use splat4d_train::train::loss::TrainLoss;
 use splat4d_train::train::trainer::{Settings, Trainer};
+use splat4d_train::upkeep::Limits;
 use std::sync::Arc;
 
 /// The column of a logit a Gaussian: does it belong to the ball on the right?
@@ -135,14 +135,13 @@ fn main() -> Result<()> {
         limits: Limits { cap: GAUSSIANS, extent: 3.3, min_opacity: 0.005 },
         background: [0.0; 3],
         sh_degree: 0,
-        opacity_reset_interval: 0,
         exposure_lr: 0.0,
     };
     let mut trainer = Trainer::new(scene, vec![stage], Arc::new(pictures), Box::new(renderer), loss, settings);
     while !trainer.is_done() {
         trainer.step()?.map_err(|fault| splat4d::Error::input(fault.0))?;
     }
-    let params = &trainer.scene.layers[0].params;
+    let params = &trainer.scene().layers[0].params;
     let learnt = &params[params.find(LABEL).expect("the column was added above")];
     let right = (0..GAUSSIANS).filter(|&i| (learnt.get(i, 0) > 0.0) == is_right(i)).count();
     println!("{right} of {GAUSSIANS} Gaussians know which ball they belong to");

@@ -12,12 +12,12 @@ use splat4d::render::{Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{Camera, GEOMETRY, LifeKind, Params, SH, Time};
 use splat4d_train::capture::frames::{Frames, Picture};
-use splat4d_train::densify::Limits;
 use splat4d_train::init;
 use splat4d_train::methods::{Plan, program};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::train::loss::TrainLoss;
 use splat4d_train::train::trainer::{Settings, Trainer};
+use splat4d_train::upkeep::Limits;
 use std::sync::Arc;
 
 const CAMERAS: usize = 8;
@@ -119,7 +119,6 @@ fn main() -> Result<()> {
             limits: Limits { cap: plan.recipe.max_cap, extent: plan.extent, min_opacity: plan.recipe.min_opacity },
             background: [0.0; 3],
             sh_degree: 0,
-            opacity_reset_interval: 0,
             exposure_lr: 0.0,
         },
     );
@@ -130,12 +129,12 @@ fn main() -> Result<()> {
         mse = if mse == 0.0 { step.mse } else { 0.95 * mse + 0.05 * step.mse };
         if trainer.progress.iteration.is_multiple_of(100) {
             let psnr = -10.0 * f64::log10(mse);
-            println!("step {}: {psnr:.2} dB, {} Gaussians", trainer.progress.iteration, trainer.scene.len());
+            println!("step {}: {psnr:.2} dB, {} Gaussians", trainer.progress.iteration, trainer.scene().len());
         }
     }
     if let Some(path) = std::env::args().nth(1) {
         let mut bytes = Vec::new();
-        splat4d::format::scene::write(&trainer.scene, &mut bytes)?;
+        splat4d::format::scene::write(trainer.scene(), &mut bytes)?;
         std::fs::write(&path, bytes).map_err(|e| splat4d::Error::io("the scene cannot be written", e).at(&path))?;
     }
     Ok(())

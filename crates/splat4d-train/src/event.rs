@@ -3,6 +3,21 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
+/// Where something long tells how far it is, and what the user should know.
+pub struct Progress<'a>(pub &'a mut dyn FnMut(&Event));
+
+impl Progress<'_> {
+    /// What is being done, how much of it is done, and of how much (0: not known).
+    pub fn phase(&mut self, name: &str, done: usize, total: usize) {
+        (self.0)(&Event::Phase { name: name.to_owned(), done, total });
+    }
+
+    /// Something the user should know: what, and what to do.
+    pub fn warn(&mut self, message: String) {
+        (self.0)(&Event::Warning { message });
+    }
+}
+
 /// One piece of news. Serialised (with `type`) it is what `--json` prints, a line each.
 #[derive(Clone, Debug, serde::Serialize)]
 #[serde(tag = "type", rename_all = "snake_case")]

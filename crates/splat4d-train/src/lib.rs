@@ -4,16 +4,16 @@
 
 pub mod capture;
 pub mod compress;
-pub mod densify;
 pub mod eval;
 pub mod event;
 pub mod init;
+pub mod learner;
 pub mod loss;
 pub mod methods;
 pub mod optim;
-pub mod prune;
 pub mod recipe;
 pub mod sampler;
 pub mod train;
+pub mod upkeep;
 
 pub use splat4d::{Error, ErrorKind, Result};

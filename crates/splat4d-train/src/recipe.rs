@@ -41,7 +41,7 @@ pub const NEAR: f64 = 0.2;
 pub const FULL: &str = "full";
 /// What `control_trajectory` may be.
 pub const TRAJECTORIES: [&str; 5] = ["spline", "linear", "slerp", "low-rank", "network"];
-/// What `prune_score` may be: the names of `prune::Spatial`.
+/// What `prune_score` may be: the names of `upkeep::worth::Spatial`.
 pub const PRUNE_SCORES: [&str; 7] = ["share", "change", "both", "opacity", "light-gaussian", "pup", "speedy"];
 /// Opacity below which MCMC relocates (Kheradmand et al. 2024).
 const MCMC_DEAD_OPACITY: f64 = 0.005;

@@ -11,12 +11,12 @@ use splat4d::play::Player;
 use splat4d::render::{Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::{Camera, Params, Splats, Time};
 use splat4d_train::capture::frames::{Frames, Picture};
-use splat4d_train::densify::Limits;
 use splat4d_train::init::{self, Seeds};
 use splat4d_train::methods::{Group, Plan, Program, Rate, Stage, still};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::train::loss::TrainLoss;
 use splat4d_train::train::trainer::{Settings, Trainer};
+use splat4d_train::upkeep::Limits;
 use std::sync::Arc;
 
 #[allow(dead_code)] // its own `main` and what that checks
@@ -141,7 +141,6 @@ fn a_model_from_outside_trains_and_its_file_plays() {
             limits: Limits { cap: 1000, extent: plan.extent, min_opacity: 0.005 },
             background: [1.0; 3],
             sh_degree: 0,
-            opacity_reset_interval: 0,
             exposure_lr: 0.0,
         },
     );
@@ -149,8 +148,8 @@ fn a_model_from_outside_trains_and_its_file_plays() {
     let last = CAMERAS * (TIMES / 2);
     let shown = |trainer: &Trainer<'_>| {
         let mut instant = Evaluation::default();
-        trainer.scene.at(made.time(last), &mut instant);
-        draw(&trainer.scene.splats(&instant), made.camera(last))
+        trainer.scene().at(made.time(last), &mut instant);
+        draw(&trainer.scene().splats(&instant), made.camera(last))
     };
     let before = psnr(&shown(&trainer), &made.pictures[last]);
     while !trainer.is_done() {
@@ -159,11 +158,11 @@ fn a_model_from_outside_trains_and_its_file_plays() {
     let learnt = shown(&trainer);
     let after = psnr(&learnt, &made.pictures[last]);
     assert!(after > before + 3.0, "{before:.1} dB before, {after:.1} after");
-    let p = &trainer.scene.layers[0].params;
+    let p = &trainer.scene().layers[0].params;
     let amplitudes = &p[p.find("amplitudes").expect("the model has made its table")];
     assert!((0..p.len()).any(|row| amplitudes.get(row, 0).abs() > 0.05), "something sways");
 
-    let baked = bake(&trainer.scene, &Options::default(), &mut |_, _| {}).unwrap();
+    let baked = bake(trainer.scene(), &Options::default(), &mut |_, _| {}).unwrap();
     let meta = Meta { clip: baked.clip, fps: FPS, up: truth.up, sh_degree: baked.sh_degree, ..Meta::default() };
     let mut file = Vec::new();
     playback::write(&Draft { meta, nodes: baked.nodes, poster: None }, &WriteConfig::default(), &mut file).unwrap();

@@ -7,12 +7,12 @@ use splat4d::render::{RenderConfig, Renderer};
 use splat4d::scene::params::{LOG_SCALE, QUAT};
 use splat4d::scene::{Camera, GEOMETRY, LIFE, Planes, Time};
 use splat4d_train::capture::frames::{Frames, Picture};
-use splat4d_train::densify::Limits;
 use splat4d_train::init;
 use splat4d_train::methods::{Plan, program};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::train::loss::TrainLoss;
 use splat4d_train::train::trainer::{Settings, Trainer};
+use splat4d_train::upkeep::Limits;
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -121,7 +121,6 @@ fn trainer() -> Result<Trainer<'static>> {
             limits: Limits { cap: GAUSSIANS, extent: 3.3, min_opacity: 0.005 },
             background: [0.0; 3],
             sh_degree: 1,
-            opacity_reset_interval: 0,
             exposure_lr: 0.0,
         },
     ))

@@ -20,11 +20,11 @@ pub use settings::{Compression, Level, MOST_PRUNED};
 
 use crate::capture::Capture;
 use crate::event::Event;
-use crate::prune::{Scores, score};
 use crate::recipe::Recipe;
 use crate::train::refine::{Refine, refine};
 use crate::train::run::{plan, training_frames};
 use crate::train::{Outcome, TrainOptions};
+use crate::upkeep::worth::{Scores, score};
 use crate::{Error, Result};
 use splat4d::bake::{self, bake};
 use splat4d::format::playback::{Draft, Meta, Pages};
@@ -110,11 +110,9 @@ pub fn scores(job: &Job<'_>, progress: &mut dyn FnMut(usize, usize)) -> Result<S
 fn bench(job: &Job<'_>) -> Result<Bench> {
     job.source.without_head("a playback file")?;
     let frames = training_frames(job.capture.clone(), job.recipe)?;
-    // Pruning is this run's own business: rows that went by themselves would leave the file's labels behind.
-    let recipe = Recipe { prune_interval: 0, ..job.recipe.clone() };
     Ok(Bench {
         frames,
-        plan: plan(&job.capture, &recipe),
+        plan: plan(&job.capture, job.recipe),
         cameras: cameras(&job.capture),
         settings: job.settings.clone(),
     })

@@ -1,7 +1,7 @@
 //! What may be told of compression, and the three levels.
 
-use crate::prune::{Combine, Spatial, Temporal};
 use crate::recipe::nearest;
+use crate::upkeep::worth::{Combine, Spatial, Temporal};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use splat4d::format::playback::{Depths, MAX_PALETTE, WriteConfig};

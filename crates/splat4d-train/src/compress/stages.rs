@@ -5,10 +5,11 @@ use super::{Compression, draft};
 use crate::Result;
 use crate::capture::frames::Frames;
 
+use crate::event::Progress;
 use crate::loss::scene::MeanOpacity;
 use crate::loss::terms::ParamLoss;
-use crate::methods::{Hook, Plan, Rate, Stage, Tell, tuning};
-use crate::prune::{Keys, MaskConfig, ScoreConfig, key_masks, prune, score};
+use crate::methods::{Hook, Plan, Rate, Stage, tuning};
+use crate::upkeep::worth::{Keys, MaskConfig, ScoreConfig, key_masks, prune, score};
 use splat4d::format::playback::{WriteConfig, read_pages, write};
 use splat4d::layers::Scene;
 use splat4d::math::Rng;
@@ -96,24 +97,26 @@ fn fading(settings: &Compression) -> Option<Box<dyn ParamLoss<f32>>> {
 }
 
 /// Scores, prunes, and makes masks where they are wanted already.
-fn pruning(bench: Bench, share: f64, filter: bool) -> Hook<f32> {
-    Box::new(move |scene: &mut Scene<f32>, tell| {
+fn pruning(bench: Bench, share: f64, filter: bool) -> Hook {
+    Box::new(move |scene: &mut Scene<f32>, progress| {
         if share > 0.0 {
             let scores = score(scene, bench.frames.as_ref(), &bench.score_config()?, &mut |done, total| {
-                tell("scoring Gaussians", done, total);
+                progress.phase("scoring Gaussians", done, total);
             })?;
             for (layer, edit) in prune(scene, &scores, share).into_iter().enumerate() {
                 scene.layers[layer].edit(&edit, &Rng::new(bench.plan.recipe.seed, "prune", layer as u64));
             }
         }
-        if filter { masks(scene, &bench, tell) } else { Ok(()) }
+        if filter { masks(scene, &bench, progress) } else { Ok(()) }
     })
 }
 
 /// Masks at the settings' interval.
-fn masks(scene: &mut Scene<f32>, bench: &Bench, tell: &mut Tell<'_>) -> Result<()> {
+fn masks(scene: &mut Scene<f32>, bench: &Bench, progress: &mut Progress<'_>) -> Result<()> {
     let config = MaskConfig { keys: Keys::Interval(bench.settings.mask_interval), antialias: bench.antialias() };
-    key_masks(scene, bench.frames.as_ref(), &config, &mut |done, total| tell("looking who is seen", done, total))
+    key_masks(scene, bench.frames.as_ref(), &config, &mut |done, total| {
+        progress.phase("looking which are seen", done, total);
+    })
 }
 
 /// Fine-tuning through the file, and the codec that is it.
@@ -123,15 +126,17 @@ pub(super) fn file_stage(bench: &Bench) -> Result<(Stage, Arc<Quantised>)> {
     let mut stage = quantise::stage(&bench.plan, s.quantise, FILE_RATES * s.first_rates(), codec.clone());
     stage.params.extend(fading(s));
     let (own, begun) = (bench.clone(), codec.clone());
-    stage.start = Some(Box::new(move |scene: &mut Scene<f32>, tell| {
-        let draft = draft(scene, &own.settings, &own.cameras, &mut |done, total| tell("baking", done, total))?;
+    stage.start = Some(Box::new(move |scene: &mut Scene<f32>, progress| {
+        let draft = draft(scene, &own.settings, &own.cameras, &mut |done, total| {
+            progress.phase("baking", done, total);
+        })?;
         let s = &own.settings;
         let seed = own.plan.recipe.seed;
         let config = WriteConfig { depths: s.depths, palette: s.palette, seed, ..WriteConfig::default() };
         let mut bytes = Vec::new();
         write(&draft, &config, &mut bytes)?;
         begun.begin(read_pages(&bytes)?, scene);
-        if s.mask_interval > 0 { masks(scene, &own, tell) } else { Ok(()) }
+        if s.mask_interval > 0 { masks(scene, &own, progress) } else { Ok(()) }
     }));
     Ok((stage, codec))
 }

@@ -2,14 +2,13 @@
 //! own, then Gaussians on nodes); in a run of minutes the half-size pictures of the first steps do what those stages are
 //! for, and nodes start at farthest points of the initial cloud.
 
-pub mod adapt;
 pub mod losses;
 
 use super::auto::Seen;
 use super::{Group, Plan, Program, Rate, Stage, still};
 use crate::recipe::Recipe;
+use crate::upkeep::AdaptNodes;
 use crate::{Error, Result};
-use adapt::NodeAdapt;
 use losses::{MaskSize, NodeAcceleration, NodeArap, NodeElastic, Sparse};
 use splat4d::motion::Spec;
 use splat4d::motion::control::{ControlSpec, Curve, TrajectorySpec};
@@ -102,7 +101,7 @@ pub fn add_nodes(stage: &mut Stage, plan: &Plan) {
     if r.lambda_motion_mask > 0.0 && r.control_mask {
         stage.params.push(Box::new(MaskSize { weight: r.lambda_motion_mask }));
     }
-    stage.adapt = Some(Box::new(NodeAdapt::of(r)));
+    stage.keep(AdaptNodes::of(r));
 }
 
 fn trajectory(plan: &Plan) -> TrajectorySpec {

@@ -114,7 +114,7 @@ fn stage(plan: &Plan, from: usize, to: usize) -> Stage {
 }
 
 /// Lets the networks of every deformable layer learn, or not.
-fn learns(learns: bool) -> super::Hook<f32> {
+fn learns(learns: bool) -> super::Hook {
     Box::new(move |scene, _| {
         for layer in &mut scene.layers {
             if let Spec::DeformMlp(spec) = layer.motion.spec() {

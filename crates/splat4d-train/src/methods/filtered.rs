@@ -9,6 +9,7 @@ use super::{Group, Hook, Plan, Program, Stage};
 use crate::Result;
 use crate::loss::transport::{Metric, Transport, TransportSettings};
 use crate::recipe::Recipe;
+use crate::upkeep::Once;
 use splat4d::layers::{Layer, Scene};
 use splat4d::motion::filtered::{Filtered, FilteredSpec, Fusion, GAINS, Predictor};
 use splat4d::motion::{Motion, Spec, build};
@@ -119,16 +120,14 @@ impl Program for FilteredProgram {
         for stage in &mut stages {
             stage.groups.push(Group { layer: super::EVERY, ..Group::new(GAINS, r.falling(r.filter_lr)) });
             stage.start = stage.start.take().map(around);
-            stage.switches =
-                std::mem::take(&mut stage.switches).into_iter().map(|(step, h)| (step, around(h))).collect();
             stage.end = stage.end.take().map(around);
         }
         switch_on(&mut stages, r.filter_start, fusion);
         if let (Some(last), false) = (stages.last_mut(), r.filter_keep) {
             let before = last.end.take();
-            last.end = Some(Box::new(move |scene, tell| {
+            last.end = Some(Box::new(move |scene, progress| {
                 if let Some(hook) = &before {
-                    hook(scene, tell)?;
+                    hook(scene, progress)?;
                 }
                 scene.layers.iter_mut().try_for_each(take_off)
             }));
@@ -146,8 +145,8 @@ fn switch_on(stages: &mut [Stage], share: f64, fusion: Fusion) {
             left -= stage.iterations;
             continue;
         }
-        let set: Hook<f32> = Box::new(move |scene, _| scene.layers.iter_mut().try_for_each(|l| set_fusion(l, fusion)));
-        stage.switches.push((left, set));
+        let set = move |scene: &mut Scene<f32>| scene.layers.iter_mut().try_for_each(|l| set_fusion(l, fusion));
+        stage.keep(Once { at: left, change: set });
         return;
     }
 }
@@ -184,15 +183,15 @@ fn set_fusion(layer: &mut Layer, fusion: Fusion) -> Result<()> {
 }
 
 /// A hook of the inner program: layers show it the model inside, and get their filter back.
-fn around(hook: Hook<f32>) -> Hook<f32> {
-    Box::new(move |scene: &mut Scene<f32>, tell| {
+fn around(hook: Hook) -> Hook {
+    Box::new(move |scene: &mut Scene<f32>, progress| {
         let mut kept = Vec::new();
         for layer in &mut scene.layers {
             let Some(filter) = Filtered::of(layer.motion.as_ref()) else { continue };
             kept.push(filter.settings().clone());
             layer.motion = filter.inner().clone();
         }
-        hook(scene, tell)?;
+        hook(scene, progress)?;
         // Layers that a hook adds or replaces are filtered as the others are.
         let Some(spec) = kept.first() else { return Ok(()) };
         for layer in &mut scene.layers {

@@ -154,8 +154,8 @@ impl HexplaneProgram {
 }
 
 /// A hook that lays the box of every hexplane layer around its cloud.
-fn place_box<F: Real>() -> Hook<F> {
-    Box::new(|scene: &mut Scene<F>, _| {
+fn place_box() -> Hook {
+    Box::new(|scene: &mut Scene<f32>, _| {
         for layer in &mut scene.layers {
             let model: &dyn Any = layer.motion.as_ref();
             let (Some(model), Some(corners)) = (model.downcast_ref::<Hexplane>(), around(&layer.params[GEOMETRY]))

@@ -9,24 +9,23 @@ pub mod filtered;
 pub mod hexplane;
 pub mod native4d;
 pub mod spacetime;
-pub mod split;
 pub mod ssm;
 pub mod still;
 #[cfg(test)]
 mod tests;
 pub mod tracked;
 
-use crate::densify::{Crowding, Densify, Guided, Relocate, Stats};
+use crate::event::Progress;
 use crate::loss::image::ImageTerm;
 use crate::loss::terms::{Codec, ParamLoss, ProbeLoss};
-use crate::optim::Moments;
-use crate::prune::Periodic;
+use crate::optim::Noise;
 use crate::recipe::{FULL, Recipe};
 use crate::sampler::Sampler;
+use crate::upkeep::split::STILL_COLUMNS;
+use crate::upkeep::{Split, Upkeep};
 use crate::{Error, Result};
 use auto::Seen;
 use splat4d::layers::Scene;
-use splat4d::math::{Real, Rng};
 use splat4d::motion::{BUILT_IN, Capabilities, MODELS, Motion, Phase, Spec, build};
 use splat4d::scene::{LifeKind, Params};
 use std::sync::Arc;
@@ -120,10 +119,6 @@ impl Group {
     }
 }
 
-/// Hears how far something long is: what is done, how much of it, of how much (0 where not known). What begins with
-/// `warning: ` is one.
-pub type Tell<'a> = dyn FnMut(&str, usize, usize) + 'a;
-
 /// Annealed smoothing: one random shift of time a step, which keeps a network from learning the pose errors of single
 /// frames. t + N(0, 1)·β, β falling linearly to zero (Yang et al. 2024, §3.3); evaluation is never shifted.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -143,19 +138,10 @@ impl TimeNoise {
 
 /// What a stage does to the scene at its start or end: add pages, replace the cloud, build a graph. A layer that it
 /// replaces needs another name: rows of a layer that keeps its name and its shape keep their moments.
-pub type Hook<F> = Box<dyn Fn(&mut Scene<F>, &mut Tell<'_>) -> Result<()> + Send + Sync>;
-
-/// Upkeep of what a model has besides Gaussians: nodes that are added, lists that go stale.
-pub trait Adapt: Send + Sync {
-    /// Whether something is to be done after so many steps of the stage.
-    fn is_due(&self, step: usize) -> bool;
-    /// Does it, before densification: edits rows through [`densify::apply`](crate::densify::apply). `stats` is what was
-    /// seen since the last densification.
-    fn run(&self, scene: &mut Scene<f32>, moments: &mut [Moments<f32>], stats: &mut Stats, step: usize, rng: Rng);
-}
+pub type Hook = Box<dyn Fn(&mut Scene<f32>, &mut Progress<'_>) -> Result<()> + Send + Sync>;
 
 /// One stage of training.
-pub struct Stage<F: Real = f32> {
+pub struct Stage {
     /// What progress and metrics call it.
     pub name: String,
     /// Steps.
@@ -167,23 +153,13 @@ pub struct Stage<F: Real = f32> {
     /// What learns, and how fast.
     pub groups: Vec<Group>,
     /// Losses over several times.
-    pub probes: Vec<Box<dyn ProbeLoss<F>>>,
+    pub probes: Vec<Box<dyn ProbeLoss<f32>>>,
     /// Losses on raw parameters.
-    pub params: Vec<Box<dyn ParamLoss<F>>>,
-    /// Where Gaussians are added and removed.
-    pub densify: Densify,
-    /// First, last step of the stage that densifies, and the steps between.
-    pub densify_steps: (usize, usize, usize),
-    /// Upkeep of nodes and lists.
-    pub adapt: Option<Box<dyn Adapt>>,
-    /// Pruning by worth in space and time, beside densification.
-    pub prune: Option<Periodic>,
-    /// What becomes of Gaussians that stand in one place.
-    pub crowding: Option<Crowding>,
-    /// Moving the faintest Gaussians where they are needed, beside densification.
-    pub relocate: Option<Relocate>,
-    /// New Gaussians where pictures are worst.
-    pub guided: Option<Guided>,
+    pub params: Vec<Box<dyn ParamLoss<f32>>>,
+    /// What is done between steps, in any order: it runs in that of [`Order`](crate::upkeep::Order).
+    pub upkeep: Vec<Box<dyn Upkeep>>,
+    /// Noise on positions after every step; none: positions only learn.
+    pub noise: Option<Noise>,
     /// Steps before each further SH degree; 0: all at once.
     pub sh_interval: usize,
     /// Steps of earlier stages that count for it.
@@ -195,23 +171,20 @@ pub struct Stage<F: Real = f32> {
     /// Noise on the times of the step's views.
     pub time_noise: TimeNoise,
     /// Losses on pictures, after the run's own.
-    pub pictures: Vec<Box<dyn ImageTerm<F>>>,
+    pub pictures: Vec<Box<dyn ImageTerm>>,
     /// Whether the cameras' exposures stay as they are.
     pub freeze_exposure: bool,
     /// What stands between the parameters and the pictures; none: nothing.
-    pub codec: Option<Arc<dyn Codec<F>>>,
+    pub codec: Option<Arc<dyn Codec<f32>>>,
     /// The phase in which it puts the models of all layers; none: as they are.
     pub phase: Option<Phase>,
     /// Before the first step.
-    pub start: Option<Hook<F>>,
-    /// Before the steps with these numbers (the stage's first is 0), in this order, without ending the stage: its
-    /// schedules go on. After a resume one may run once more, and must then change nothing.
-    pub switches: Vec<(usize, Hook<F>)>,
+    pub start: Option<Hook>,
     /// After the last.
-    pub end: Option<Hook<F>>,
+    pub end: Option<Hook>,
 }
 
-impl<F: Real> Stage<F> {
+impl Stage {
     /// A stage that learns nothing yet.
     pub fn new(name: &str, iterations: usize) -> Self {
         Self {
@@ -222,13 +195,8 @@ impl<F: Real> Stage<F> {
             groups: Vec::new(),
             probes: Vec::new(),
             params: Vec::new(),
-            densify: Densify::None,
-            densify_steps: (0, 0, 0),
-            adapt: None,
-            prune: None,
-            crowding: None,
-            relocate: None,
-            guided: None,
+            upkeep: Vec::new(),
+            noise: None,
             sh_interval: 0,
             sh_from: 0,
             half_size_steps: 0,
@@ -239,13 +207,15 @@ impl<F: Real> Stage<F> {
             codec: None,
             phase: None,
             start: None,
-            switches: Vec::new(),
             end: None,
         }
     }
-}
 
-impl<F: Real> Stage<F> {
+    /// Adds an operation of upkeep.
+    pub fn keep(&mut self, operation: impl Upkeep + 'static) {
+        self.upkeep.push(Box::new(operation));
+    }
+
     /// The steps `from..to` as a stage of its own: rates, densification, degrees of SH and pictures at half size are as they
     /// would have been then.
     #[must_use]
@@ -255,15 +225,19 @@ impl<F: Real> Stage<F> {
         for group in &mut self.groups {
             group.rate = Rate { start: group.rate.at(start), end: group.rate.at(end) };
         }
-        let (first, until, every) = self.densify_steps;
-        self.densify_steps = (first.saturating_sub(from).max(1), until.min(to).saturating_sub(from), every);
-        if until <= from {
-            self.densify = Densify::None;
+        for schedule in self.upkeep.iter_mut().filter_map(|u| u.densification()) {
+            *schedule = schedule.part(from, to);
         }
+        self.noise = self.noise.and_then(|n| n.part(from, to));
         self.half_size_steps = self.half_size_steps.saturating_sub(from);
         self.sh_from += from;
         self.iterations = to - from;
         self
+    }
+
+    /// The highest SH degree that is drawn after so many steps, of `most`.
+    pub fn sh_degree(&self, step: usize, most: usize) -> usize {
+        (self.sh_from + step).checked_div(self.sh_interval).map_or(most, |unlocked| unlocked.min(most))
     }
 
     /// Tells every loss that rows were edited.
@@ -368,36 +342,37 @@ pub fn program_of(recipe: &Recipe) -> Result<Box<dyn Program>> {
     Ok(filtered::wrap(program, recipe))
 }
 
+/// The stages of a program as the recipe has them: with `static_split`, still Gaussians move into a layer of their own
+/// after that share of the last stage.
+pub fn stages(program: &dyn Program, plan: &Plan) -> Vec<Stage> {
+    let mut stages = program.stages(plan);
+    if let Some(last) = stages.last_mut()
+        && program.capabilities(plan).moves
+        && let Some(split) = Split::of(&plan.recipe, plan.extent, last.iterations)
+    {
+        last.keep(split);
+        share_groups(last);
+    }
+    stages
+}
+
+/// Lets what a still layer has learn in all layers.
+fn share_groups(stage: &mut Stage) {
+    let common = |g: &&mut Group| STILL_COLUMNS.contains(&g.column.as_str());
+    stage.groups.iter_mut().filter(common).for_each(|g| g.layer = EVERY);
+}
+
 /// A stage that tunes a trained scene on all frames alike: the recipe's losses and rates, and nothing that adds, moves or
 /// replaces Gaussians.
 pub fn tuning(plan: &Plan) -> Result<Stage> {
     let mut stage = program_of(&plan.recipe)?.tuning(plan);
-    split::share_groups(&mut stage);
-    stage.densify = Densify::None;
-    (stage.prune, stage.relocate, stage.guided, stage.crowding) = (None, None, None, None);
+    share_groups(&mut stage);
+    stage.upkeep.retain(|u| u.in_tuning());
+    stage.noise = None;
     (stage.sh_interval, stage.half_size_steps) = (0, 0);
     (stage.start, stage.end) = (None, None);
-    stage.switches.clear();
     stage.time_noise = TimeNoise::default();
     // What came in late in training is there by now.
     stage.groups.iter_mut().for_each(|g| g.from = 0);
     Ok(stage)
-}
-
-/// The strategy and its steps as the recipe has them.
-pub fn densify_of(r: &Recipe) -> (Densify, (usize, usize, usize)) {
-    let densify = match r.strategy.as_str() {
-        "mcmc" => Densify::Mcmc(crate::densify::Mcmc {
-            growth: r.growth,
-            gradient_share: r.relocate_gradient,
-            noise_lr: r.noise_lr,
-        }),
-        "adc" => Densify::Adc(crate::densify::Adc {
-            grad_threshold: r.densify_grad_threshold,
-            percent_dense: r.percent_dense,
-            retime_clones: r.retime_clones,
-        }),
-        _ => Densify::None,
-    };
-    (densify, (r.densify_from_iter, r.densify_until_iter, r.densification_interval))
 }

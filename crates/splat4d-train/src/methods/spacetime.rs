@@ -4,9 +4,9 @@
 use super::auto::Seen;
 use super::still;
 use super::{Group, Plan, Program, Rate, Stage};
-use crate::densify::Guided;
 use crate::loss::scene::{LivingOpacity, VelocitySmoothness};
 use crate::recipe::{FULL, Recipe};
+use crate::upkeep::Guided;
 use splat4d::motion::spacetime::{FeatureSpec, TIME_FEATURES, VIEW_FEATURES};
 use splat4d::motion::{SpacetimeSpec, Spec};
 use splat4d::scene::LifeKind;
@@ -70,7 +70,9 @@ impl Program for SpacetimeProgram {
             stage.groups.push(Group::new(HEAD_IN, r.falling(r.head_lr)));
             stage.groups.push(Group::new(HEAD_OUT, r.falling(r.head_lr)));
         }
-        stage.guided = Guided::of(r);
+        if let Some(guided) = Guided::of(r) {
+            stage.keep(guided);
+        }
         still::learn_life(&mut stage, plan, self.life(plan));
         if r.lambda_opacity_life > 0.0 {
             stage.params.push(Box::new(LivingOpacity { weight: r.lambda_opacity_life }));

@@ -99,7 +99,7 @@ fn groups(spec: Spec, plan: &Plan) -> Vec<Group> {
 }
 
 /// Puts the nodes where the solid Gaussians are.
-fn place_nodes() -> Hook<f32> {
+fn place_nodes() -> Hook {
     Box::new(|scene, _| {
         for layer in &mut scene.layers {
             place(layer);

@@ -1,13 +1,13 @@
 //! `still`: one stage, every group of static 3DGS. Also the base that other programs add to.
 
 use super::auto::Seen;
-use super::{Group, Plan, Program, Rate, Stage, densify_of};
-use crate::densify::{Crowding, Relocate};
+use super::{Group, Plan, Program, Rate, Stage};
 use crate::loss::neighbourhood::{MotionWeights, Neighbourhood};
 use crate::loss::scene::{MeanOpacity, MeanScale, OpacityEntropy};
 use crate::loss::terms::{ParamLoss, ProbeLoss};
-use crate::prune::Periodic;
+use crate::optim::Noise;
 use crate::recipe::Recipe;
+use crate::upkeep;
 use splat4d::motion::Spec;
 use splat4d::scene::LifeKind;
 
@@ -87,10 +87,9 @@ pub fn motion_weights(r: &Recipe) -> MotionWeights {
     }
 }
 
-/// A stage with the recipe's densification and regularisers.
+/// A stage with the recipe's upkeep and regularisers.
 pub fn stage(name: &str, plan: &Plan) -> Stage {
     let r = &plan.recipe;
-    let (densify, densify_steps) = densify_of(r);
     let mut params: Vec<Box<dyn ParamLoss<f32>>> = Vec::new();
     // These two belong to MCMC: they make room; under ADC they only dim.
     if r.strategy == "mcmc" {
@@ -114,11 +113,8 @@ pub fn stage(name: &str, plan: &Plan) -> Stage {
         groups: groups(r, plan.extent),
         probes,
         params,
-        densify,
-        densify_steps,
-        prune: Periodic::of(r),
-        crowding: Crowding::of(r).expect("the recipe was checked"),
-        relocate: Relocate::of(r),
+        upkeep: upkeep::of(r),
+        noise: Noise::of(r),
         sh_interval: r.sh_degree_interval,
         half_size_steps: (r.half_size_until * r.iterations as f64) as usize,
         ..Stage::new(name, r.iterations)

@@ -186,23 +186,19 @@ fn first_stage(plan: &Plan, steps: usize) -> Stage {
 }
 
 /// Adds frame k where everything goes on as it went.
-fn next_frame(plan: &Plan, k: usize, tracking: &Tracking<f32>) -> Hook<f32> {
+fn next_frame(plan: &Plan, k: usize, tracking: &Tracking<f32>) -> Hook {
     let (t, cap) = (plan.moments[k].0, plan.recipe.velocity_cap * plan.extent);
     let tracking = tracking.clone();
-    Box::new(move |scene, tell| {
+    Box::new(move |scene, progress| {
         let layer = &mut scene.layers[0];
         if k == 1 {
             unit_quaternions(layer);
             let mean = tracking.frame0(layer).graph.mean_weight();
             if mean < LEAST_MEAN_WEIGHT {
-                tell(
-                    &format!(
-                        "warning: neighbours hold together with a mean weight of {mean:.3} only; lower rigid_beta, or \
-                         set it to 0 to fit it to the scene"
-                    ),
-                    0,
-                    0,
-                );
+                progress.warn(format!(
+                    "neighbours hold together with a mean weight of {mean:.3} only; lower rigid_beta, or set it to 0 to \
+                     fit it to the scene"
+                ));
             }
         }
         let model: &dyn Any = layer.motion.as_ref();

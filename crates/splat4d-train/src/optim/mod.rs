@@ -4,6 +4,9 @@
 //! A step reads every active number's gradient once and leaves zero in its place, so that no other pass clears it.
 
 mod adam;
+mod noise;
+
+pub use noise::Noise;
 
 use splat4d::math::Real;
 use splat4d::scene::table::{Column, par_split};

@@ -6,7 +6,7 @@
 use super::channels::{Channels, Source};
 use crate::Result;
 pub use crate::capture::frames::FlowTruth;
-pub use crate::densify::Observation;
+pub use crate::learner::Observation;
 use crate::loss::image::{Channel, PictureGrads, Shown};
 pub use crate::loss::image::{ImageTerm, View};
 pub use crate::loss::terms::{ParamLoss, Probe, ProbeLoss, StepInfo};

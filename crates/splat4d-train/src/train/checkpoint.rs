@@ -1,11 +1,12 @@
-//! Checkpoints hold everything: scene, moments, statistics, exposure, the losses' and codecs' memory, how far the run is. Random
+//! Checkpoints hold everything: scene, moments, statistics, exposure, the memory of
+//! losses, codecs and upkeep, how far the run is. Random
 //! numbers and samplers are functions of the step and need no saving. A resumed run is bit for bit the unbroken one.
 //!
 //! The file is a scene file with more arrays (`moments.L.TABLE`, `stats.L`, `exposure…`), so that every reader of scenes
 //! opens it too.
 
-use super::trainer::{Progress, Trainer};
-use crate::densify::Stats;
+use super::trainer::{Position, Trainer};
+use crate::learner::{Learner, Stats};
 use crate::optim::Moments;
 use crate::{Error, ErrorKind, Result};
 use serde_json::{Value, json};
@@ -42,22 +43,22 @@ pub struct RunState {
 /// A run's checkpoint as bytes.
 pub fn write(trainer: &Trainer<'_>, identity: &Identity, state: &RunState) -> Result<Vec<u8>> {
     let mut arrays: Vec<(String, Vec<usize>, Vec<f32>)> =
-        scene::arrays(&trainer.scene).into_iter().map(|a| (a.name, a.shape, a.data)).collect();
+        scene::arrays(trainer.scene()).into_iter().map(|a| (a.name, a.shape, a.data)).collect();
     let mut push = |name: String, table: &Table<f32>| {
         if table.width() > 0 {
             arrays.push((name, vec![table.rows(), table.width()], table.column_to_rows(0, table.width())));
         }
     };
-    for (l, (layer, moments)) in trainer.scene.layers.iter().zip(&trainer.moments).enumerate() {
+    for (l, (layer, moments)) in trainer.scene().layers.iter().zip(trainer.learner.moments()).enumerate() {
         for key in layer.params.keys() {
             // Moments of a page that does not learn have no rows, and are not in the file.
             if moments.table(key).rows() == layer.params[key].rows() {
                 push(moments_name(l, &layer.params, key), moments.table(key));
             }
         }
-        push(format!("stats.{l}"), &trainer.stats.tables[l]);
+        push(format!("stats.{l}"), &trainer.learner.stats().tables[l]);
     }
-    if let Some(e) = &trainer.loss.exposure {
+    if let Some(e) = &trainer.learner.exposure {
         push("exposure".into(), &e.params[e.key()]);
         push("exposure.moments".into(), e.moments.table(e.key()));
     }
@@ -68,7 +69,8 @@ pub fn write(trainer: &Trainer<'_>, identity: &Identity, state: &RunState) -> Re
         .flat_map(|(s, stage)| {
             let params = stage.params.iter().enumerate().map(move |(k, l)| (format!("memory.{s}.{k}"), l.state()));
             let probes = stage.probes.iter().enumerate().map(move |(k, l)| (probe_name(s, k), l.state()));
-            params.chain(probes)
+            let upkeep = stage.upkeep.iter().map(move |u| (upkeep_name(s, u.name()), u.state()));
+            params.chain(probes).chain(upkeep)
         })
         .filter(|(_, state)| !state.is_empty())
         .collect();
@@ -76,7 +78,7 @@ pub fn write(trainer: &Trainer<'_>, identity: &Identity, state: &RunState) -> Re
     memories.extend(codecs.filter(|(_, state)| !state.is_empty()).map(|(s, state)| (codec_name(s), state)));
     let mut tensors: Vec<Tensor<'_>> =
         arrays.iter().map(|(n, shape, data)| Tensor::f32(n.clone(), shape, data)).collect();
-    tensors.extend(scene::masks(&trainer.scene));
+    tensors.extend(scene::masks(trainer.scene()));
     tensors.extend(memories.iter().map(|(n, data)| Tensor::u32(n.clone(), &[data.len()], data)));
     let p = trainer.progress;
     let frozen = |l: &Layer<f32>| -> Vec<String> {
@@ -84,7 +86,7 @@ pub fn write(trainer: &Trainer<'_>, identity: &Identity, state: &RunState) -> Re
         infos.filter(|i| !i.trainable).map(|i| i.name.clone()).collect()
     };
     let meta = json!({
-        "frozen": trainer.scene.layers.iter().map(frozen).collect::<Vec<_>>(),
+        "frozen": trainer.scene().layers.iter().map(frozen).collect::<Vec<_>>(),
         "version": VERSION,
         "iteration": p.iteration,
         "stage": p.stage,
@@ -97,7 +99,7 @@ pub fn write(trainer: &Trainer<'_>, identity: &Identity, state: &RunState) -> Re
         "recipe": identity.recipe,
     });
     let metadata = BTreeMap::from([
-        (METADATA.to_owned(), scene::metadata(&trainer.scene).to_string()),
+        (METADATA.to_owned(), scene::metadata(trainer.scene()).to_string()),
         (CHECKPOINT.to_owned(), meta.to_string()),
     ]);
     let mut bytes = Vec::new();
@@ -136,12 +138,12 @@ pub fn read(bytes: &[u8], trainer: &mut Trainer<'_>, identity: &Identity) -> Res
         moments.push(m);
         load(&file, &format!("stats.{l}"), &mut stats.tables[l])?;
     }
-    if let Some(e) = &mut trainer.loss.exposure {
+    if let Some(e) = &mut trainer.learner.exposure {
         let key = e.key();
         load(&file, "exposure", &mut e.params[key])?;
         load(&file, "exposure.moments", e.moments.table_mut(key))?;
     }
-    for (s, stage) in trainer.stages.iter().enumerate() {
+    for (s, stage) in trainer.stages.iter_mut().enumerate() {
         for (k, loss) in stage.params.iter().enumerate() {
             match file.get(&format!("memory.{s}.{k}")) {
                 Some(t) => loss.restore(&t.as_u32()?),
@@ -151,6 +153,10 @@ pub fn read(bytes: &[u8], trainer: &mut Trainer<'_>, identity: &Identity) -> Res
         for (k, loss) in stage.probes.iter().enumerate() {
             let state = file.get(&probe_name(s, k)).map_or_else(|| Ok(Vec::new()), |t| t.as_u32())?;
             loss.restore(&state);
+        }
+        for operation in &mut stage.upkeep {
+            let state = file.get(&upkeep_name(s, operation.name())).map_or_else(|| Ok(Vec::new()), |t| t.as_u32())?;
+            operation.restore(&state);
         }
         if let Some(codec) = &stage.codec {
             let state = file.get(&codec_name(s)).map_or_else(|| Ok(Vec::new()), |t| t.as_u32())?;
@@ -162,7 +168,7 @@ pub fn read(bytes: &[u8], trainer: &mut Trainer<'_>, identity: &Identity) -> Res
         n.ok_or_else(|| damaged(format!("`{key}` is missing")))
     };
     let number = |v: &Value, key: &str| v.as_f64().ok_or_else(|| damaged(format!("`{key}` is missing")));
-    let progress = Progress {
+    let progress = Position {
         iteration: count("iteration")?,
         stage: count("stage")?,
         stage_step: count("stage_step")?,
@@ -174,7 +180,9 @@ pub fn read(bytes: &[u8], trainer: &mut Trainer<'_>, identity: &Identity) -> Res
     if !fits {
         return Err(damaged("it stands beyond the recipe's last step".into()));
     }
-    trainer.restore(scene, moments, stats, progress);
+    let mut learner = Learner::resumed(scene, moments, stats);
+    learner.exposure = trainer.learner.exposure.take();
+    trainer.restore(learner, progress);
     Ok(RunState {
         seconds: number(&meta["seconds"], "seconds")?,
         smooth: [number(&meta["smooth"][0], "smooth")?, number(&meta["smooth"][1], "smooth")?],
@@ -189,6 +197,11 @@ fn moments_name(layer: usize, params: &Params<f32>, key: Key) -> String {
 /// The array that holds what a stage's loss over several times remembers.
 fn probe_name(stage: usize, loss: usize) -> String {
     format!("memory.{stage}.probe.{loss}")
+}
+
+/// The array that holds what a stage's operation of upkeep remembers.
+fn upkeep_name(stage: usize, operation: &str) -> String {
+    format!("upkeep.{stage}.{operation}")
 }
 
 /// What a checkpoint calls the memory of a stage's codec.

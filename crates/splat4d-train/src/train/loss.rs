@@ -1,94 +1,15 @@
 //! The trainer's picture loss: a list of terms, on pictures as their cameras expose them.
 
+use crate::learner::Exposure;
 use crate::loss::image::{ImageTerm, Needs, PictureGrads, Shown, View};
 use crate::loss::photometric::Photometric;
 use crate::loss::terms::StepInfo;
-use crate::optim::Moments;
-use splat4d::scene::{Grads, Key, Params, Planes, Space};
-
-/// A gain exp(m) and an offset c a camera and channel: columns m 3, c 3. The cameras' mean is held at the identity, so that
-/// the scene keeps the rig's mean exposure and held-out cameras are drawn with it.
-/// Source: Luiten et al. 2024 (gain and offset a camera); the fixed mean is ours.
-#[derive(Debug)]
-pub struct Exposure {
-    /// One table [cameras, 6].
-    pub params: Params<f32>,
-    /// Its moments.
-    pub moments: Moments<f32>,
-    key: Key,
-    grads: Grads<f32>,
-    trained: Vec<usize>,
-}
-
-impl Exposure {
-    /// The identity for every camera; only the `trained` ones ever change.
-    pub fn new(cameras: usize, trained: Vec<usize>) -> Self {
-        let mut params = Params::new(0, 0, &[]);
-        let key = params
-            .entry("exposure", Space::Fixed, &[("exposure", 6)], cameras, |_| {})
-            .expect("a new table fits itself");
-        Self { moments: Moments::new(&params), grads: Grads::new(&params), params, key, trained }
-    }
-
-    /// The table's key.
-    pub fn key(&self) -> Key {
-        self.key
-    }
-
-    /// Forgets what the last views gave.
-    pub fn rest(&mut self) {
-        self.grads.clear(&self.params);
-    }
-
-    /// Applies the gain and offset of camera `rig` to `color`.
-    fn respond(&self, rig: usize, color: &mut Planes<f32>) {
-        let row = self.params[self.key].read::<6>(rig, 0);
-        for c in 0..3 {
-            let gain = row[c].exp();
-            color.plane_mut(c).iter_mut().for_each(|x| *x = *x * gain + row[3 + c]);
-        }
-    }
-
-    /// The VJP of [`respond`](Self::respond) at what was drawn: turns the gradient to the exposed colours into that to the
-    /// drawn ones, and adds to the camera's.
-    fn respond_backward(&mut self, rig: usize, drawn: &Planes<f32>, d_color: &mut Planes<f32>) {
-        let row = self.params[self.key].read::<6>(rig, 0);
-        let mut d_row = [0.0f32; 6];
-        for c in 0..3 {
-            let gain = row[c].exp();
-            let (mut d_gain, mut d_offset) = (0.0f64, 0.0f64);
-            for (g, x) in d_color.plane_mut(c).iter_mut().zip(drawn.plane(c)) {
-                d_offset += f64::from(*g);
-                d_gain += f64::from(*g * x * gain);
-                *g *= gain;
-            }
-            (d_row[c], d_row[3 + c]) = (d_gain as f32, d_offset as f32);
-        }
-        self.grads.of([self.key])[0].add(rig, 0, d_row);
-    }
-
-    /// One Adam step with what the last views gave. Returns whether all was finite.
-    pub fn step(&mut self, rate: f64) -> bool {
-        let mut rates = vec![None; self.key.0 as usize];
-        rates.push(Some(vec![rate; 6]));
-        let finite = self.moments.step(&mut self.params, &mut self.grads, &rates, &[]).is_empty();
-        self.grads.clear(&self.params);
-        let table = &mut self.params[self.key];
-        for col in 0..6 {
-            let sum: f64 = self.trained.iter().map(|&c| f64::from(table.get(c, col))).sum();
-            let mean = (sum / self.trained.len().max(1) as f64) as f32;
-            self.trained.iter().for_each(|&c| *table.get_mut(c, col) -= mean);
-        }
-        finite
-    }
-}
+use splat4d::scene::Planes;
 
 /// What pictures are compared by: terms, in the order in which their values and gradients are summed. The exposure of the
 /// view's camera lies between the drawn picture and all of them.
 pub struct TrainLoss {
     terms: Vec<Box<dyn ImageTerm>>,
-    /// Where cameras learn an exposure.
-    pub exposure: Option<Exposure>,
     exposed: Planes<f32>,
     /// L1 of the last view.
     pub l1: f64,
@@ -101,13 +22,13 @@ pub struct TrainLoss {
 
 impl TrainLoss {
     /// These terms, such as a recipe's ([`loss::image::terms`](crate::loss::image::terms)).
-    pub fn new(terms: Vec<Box<dyn ImageTerm>>, exposure: Option<Exposure>) -> Self {
-        Self { terms, exposure, exposed: Planes::default(), l1: 0.0, ssim: 0.0, squares: 0.0, views: 0 }
+    pub fn new(terms: Vec<Box<dyn ImageTerm>>) -> Self {
+        Self { terms, exposed: Planes::default(), l1: 0.0, ssim: 0.0, squares: 0.0, views: 0 }
     }
 
     /// The loss of 3DGS alone, with this share of D-SSIM.
     pub fn photometric(dssim: f64) -> Self {
-        Self::new(vec![Box::new(Photometric::new(dssim as f32))], None)
+        Self::new(vec![Box::new(Photometric::new(dssim as f32))])
     }
 
     /// Adds a term, of this library or of a caller's own.
@@ -115,10 +36,14 @@ impl TrainLoss {
         self.terms.push(Box::new(term));
     }
 
-    /// The loss of one step: these terms, then those of the stage.
-    pub fn of_step<'a>(&'a mut self, stage: &'a mut [Box<dyn ImageTerm>]) -> StepLoss<'a> {
+    /// The loss of one step: these terms, then those of the stage, on pictures as their cameras expose them.
+    pub fn of_step<'a>(
+        &'a mut self,
+        stage: &'a mut [Box<dyn ImageTerm>],
+        exposure: Option<&'a mut Exposure>,
+    ) -> StepLoss<'a> {
         (self.squares, self.views) = (0.0, 0);
-        StepLoss { run: self, stage }
+        StepLoss { run: self, stage, exposure }
     }
 
     /// Mean squared error over the views of the last step.
@@ -131,6 +56,7 @@ impl TrainLoss {
 pub struct StepLoss<'a> {
     run: &'a mut TrainLoss,
     stage: &'a mut [Box<dyn ImageTerm>],
+    exposure: Option<&'a mut Exposure>,
 }
 
 impl ImageTerm for StepLoss<'_> {
@@ -143,7 +69,7 @@ impl ImageTerm for StepLoss<'_> {
     fn eval(&mut self, info: &StepInfo, view: &View<'_>, drawn: &Shown<'_>, d: &mut PictureGrads) -> f64 {
         let run = &mut *self.run;
         let mut shown = *drawn;
-        if let Some(exposure) = &run.exposure {
+        if let Some(exposure) = &self.exposure {
             run.exposed.clone_from(drawn.color);
             exposure.respond(view.rig, &mut run.exposed);
             shown.color = &run.exposed;
@@ -157,7 +83,7 @@ impl ImageTerm for StepLoss<'_> {
             }
         }
         run.views += 1;
-        if let Some(exposure) = &mut run.exposure {
+        if let Some(exposure) = &mut self.exposure {
             exposure.respond_backward(view.rig, drawn.color, d.color.add());
         }
         total
@@ -211,7 +137,12 @@ mod tests {
     }
 
     /// Value and gradient to the drawn colours of one view.
-    fn eval(loss: &mut TrainLoss, stage: &mut [Box<dyn ImageTerm>], color: &Planes<f32>) -> (f64, Vec<f32>) {
+    fn eval(
+        loss: &mut TrainLoss,
+        stage: &mut [Box<dyn ImageTerm>],
+        color: &Planes<f32>,
+        exposure: &mut Exposure,
+    ) -> (f64, Vec<f32>) {
         let (camera, truth) = (Camera::with_fov_y(Se3::IDENTITY, 0.8, SIZE, SIZE), planes("truth"));
         let view = View {
             camera: &camera,
@@ -228,7 +159,7 @@ mod tests {
         let image = Image { color: color.clone(), ..Image::default() };
         let mut d = PictureGrads::default();
         d.begin(&image);
-        let mut step = loss.of_step(stage);
+        let mut step = loss.of_step(stage, Some(exposure));
         assert!(!step.needs(&view).depth);
         let value = step.eval(&info, &view, &Shown::new(&image, &[]), &mut d);
         (value, d.grads().color.data.clone())
@@ -239,11 +170,9 @@ mod tests {
         let color = planes("color");
         let seen = std::sync::Arc::<std::sync::Mutex<Vec<f32>>>::default();
         let mut plain = TrainLoss::photometric(0.2);
-        plain.exposure = Some(exposure());
-        let (value, d) = eval(&mut plain, &mut [], &color);
+        let (value, d) = eval(&mut plain, &mut [], &color, &mut exposure());
         for of_stage in [false, true] {
             let mut loss = TrainLoss::photometric(0.2);
-            loss.exposure = Some(exposure());
             let own = Own { seen: seen.clone() };
             let mut stage: Vec<Box<dyn ImageTerm>> = Vec::new();
             if of_stage {
@@ -251,7 +180,7 @@ mod tests {
             } else {
                 loss.push(own);
             }
-            let (total, d_both) = eval(&mut loss, &mut stage, &color);
+            let (total, d_both) = eval(&mut loss, &mut stage, &color, &mut exposure());
             let seen = seen.lock().unwrap();
             let row = exposure().params[exposure().key()].read::<6>(RIG, 0);
             let (mut own_value, pixels) = (0.0, SIZE * SIZE);
@@ -271,17 +200,15 @@ mod tests {
         let color = planes("color");
         let mut loss = TrainLoss::photometric(0.0);
         loss.push(crate::loss::image::tv::TotalVariation(0.3));
-        loss.exposure = Some(exposure());
-        eval(&mut loss, &mut [], &color);
-        let e = loss.exposure.as_ref().unwrap();
+        let mut e = exposure();
+        eval(&mut loss, &mut [], &color, &mut e);
         let (key, h) = (e.key(), 1e-3f32);
         let got = e.grads.table(key).read::<6>(RIG, 0);
         for (col, got) in got.into_iter().enumerate() {
             let mut at = |by: f32| {
                 let mut moved = exposure();
                 *moved.params[key].get_mut(RIG, col) += by;
-                loss.exposure = Some(moved);
-                eval(&mut loss, &mut [], &color).0
+                eval(&mut loss, &mut [], &color, &mut moved).0
             };
             let fd = (at(h) - at(-h)) / f64::from(2.0 * h);
             assert!((fd - f64::from(got)).abs() < 0.02 * (0.05 + fd.abs()), "column {col}: {fd} {got}");

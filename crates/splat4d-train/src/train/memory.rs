@@ -141,10 +141,10 @@ mod tests {
             let bench = super::super::run::Bench::new(place.open(&r), &r).unwrap();
             let plan = bench.plan(&r);
             let trainer = bench.trainer(&plan, bench.initial_scene(&plan).unwrap()).unwrap();
-            let p = &trainer.scene.layers[0].params;
+            let p = &trainer.scene().layers[0].params;
             let values: usize = p.keys().map(|k| size_of_val(p[k].data())).sum();
-            let counted = values + splat4d::scene::Grads::new(p).bytes() + trainer.moments[0].bytes();
-            let rows = trainer.scene.len();
+            let counted = values + splat4d::scene::Grads::new(p).bytes() + trainer.learner.moments()[0].bytes();
+            let rows = trainer.scene().len();
             let few = Few::new(program_of(&r).unwrap().as_ref(), &plan, rows).unwrap();
             let estimated = few.tables(rows) as f64;
             let off = counted as f64 / estimated;

@@ -3,10 +3,10 @@
 
 use super::run::Bench;
 use super::trainer::Trainer;
-use crate::densify::Densify;
-use crate::event::Event;
-use crate::methods::{Stage, program_of, split};
+use crate::event::{Event, Progress};
+use crate::methods::{Stage, program_of, stages};
 use crate::recipe::Recipe;
+use crate::upkeep::{At, Every};
 use crate::{Error, ErrorKind, Result};
 use std::time::Instant as Clock;
 
@@ -47,26 +47,24 @@ pub(super) fn plan(bench: &Bench, recipe: &Recipe, minutes: f64, listen: &mut dy
     // recipe's own strategy, in a hurry.
     let scene = bench.initial_scene(&plan)?;
     let mut trainer = bench.trainer(&plan, scene)?;
-    for stage in &mut trainer.stages {
-        stage.densify_steps = (HURRIED, usize::MAX, HURRIED);
-        stage.half_size_steps = usize::MAX;
-    }
+    densify(&mut trainer, Every { first: HURRIED, last: usize::MAX, interval: HURRIED });
+    trainer.stages.iter_mut().for_each(|s| s.half_size_steps = usize::MAX);
     trainer.stages[0].iterations = ENDLESS;
     for _ in 0..GROWTH_STEPS {
-        if trainer.scene.len() >= recipe.max_cap {
+        if trainer.scene().len() >= recipe.max_cap {
             break;
         }
         step(&mut trainer)?;
     }
-    trainer.stages.iter_mut().for_each(|s| s.densify_steps = (0, 0, 0));
-    let gaussians = [start, trainer.scene.len()];
+    densify(&mut trainer, Every::NEVER);
+    let gaussians = [start, trainer.scene().len()];
     let many = rates(&mut trainer)?;
     tell(listen, 2);
     let steps = [0, 1].map(|later| Steps { gaussians, seconds: [few[later], many[later]] });
     let seconds = minutes * 60.0;
     let cost = |iterations: usize| -> Result<f64> {
         let r = Recipe { iterations, ..reset(recipe) }.resolve();
-        Ok(cost(&split::stages(program_of(&r)?.as_ref(), &bench.plan(&r)), &r, &steps))
+        Ok(cost(&stages(program_of(&r)?.as_ref(), &bench.plan(&r)), r.max_cap, &steps))
     };
     let (mut low, mut high) = (*ITERATIONS.start(), *ITERATIONS.end());
     while low + 1 < high {
@@ -74,6 +72,13 @@ pub(super) fn plan(bench: &Bench, recipe: &Recipe, minutes: f64, listen: &mut dy
         if cost(middle)? <= seconds { low = middle } else { high = middle }
     }
     Ok(Recipe { iterations: low, ..reset(recipe) })
+}
+
+/// Lets all stages densify at other steps.
+fn densify(trainer: &mut Trainer<'_>, steps: Every) {
+    for stage in &mut trainer.stages {
+        stage.upkeep.iter_mut().filter_map(|u| u.densification()).for_each(|s| *s = steps);
+    }
 }
 
 /// Schedules that followed from another number of iterations are derived anew.
@@ -98,7 +103,7 @@ fn rates(trainer: &mut Trainer<'_>) -> Result<[[f64; 2]; 2]> {
     trainer.stages[0].iterations = trainer.progress.stage_step + 1;
     step(trainer)?;
     // Stages without a step are passed by.
-    trainer.enter(&mut |_, _, _| {})?;
+    trainer.enter(&mut Progress(&mut |_| {}))?;
     if trainer.is_done() {
         return Ok([first; 2]);
     }
@@ -138,54 +143,47 @@ struct Steps {
 
 /// Seconds of all stages, in which the number of Gaussians grows by their schedules; `steps`: of the first stage, and of
 /// those after it.
-fn cost(stages: &[Stage], r: &Recipe, steps: &[Steps; 2]) -> f64 {
+fn cost(stages: &[Stage], cap: usize, steps: &[Steps; 2]) -> f64 {
     let mut count = steps[0].gaussians[0] as f64;
     let mut total = 0.0;
     for (number, stage) in stages.iter().enumerate() {
         let Steps { gaussians, seconds: [few, many] } = &steps[number.min(1)];
         let [start, end] = gaussians.map(|n| n as f64);
-        let (from, until, every) = stage.densify_steps;
         for i in 0..stage.iterations {
             let size = usize::from(i >= stage.half_size_steps);
             let slope = if end > start { (many[size] - few[size]) / (end - start) } else { 0.0 };
             total += few[size] + slope * (count - start);
-            let step = i + 1;
-            let densifies = stage.densify != Densify::None && step >= from && step <= until;
-            if densifies && every > 0 && step.is_multiple_of(every) {
-                // ADC reaches the cap within a few densifications; MCMC grows by its factor.
-                count = (count * if r.strategy == "adc" { ADC_GROWTH } else { r.growth }).min(r.max_cap as f64);
+            let at = At { step: i + 1, steps: stage.iterations };
+            for growth in stage.upkeep.iter().map(|u| u.growth(&at)).filter(|g| *g != 1.0) {
+                count = (count * growth).min(cap as f64);
             }
         }
     }
     total
 }
 
-/// About how much a densification by gradients adds on real captures, until the cap.
-const ADC_GROWTH: f64 = 1.2;
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::methods::densify_of;
+    use crate::upkeep;
 
     #[test]
     fn the_cost_follows_the_growth_and_the_size() {
         let r = Recipe { iterations: 1000, half_size_until: 0.0, max_cap: 2000, ..Recipe::default() }.resolve();
-        let (densify, densify_steps) = densify_of(&r);
-        let mut stage = Stage { densify, densify_steps, ..Stage::new("all", 1000) };
+        let mut stage = Stage { upkeep: upkeep::of(&r), ..Stage::new("all", 1000) };
         let steps = |gaussians, few, many| [Steps { gaussians, seconds: [few, many] }; 2];
-        let flat = cost(std::slice::from_ref(&stage), &r, &steps([1000, 1000], [0.01; 2], [0.01; 2]));
+        let flat = cost(std::slice::from_ref(&stage), r.max_cap, &steps([1000, 1000], [0.01; 2], [0.01; 2]));
         assert!((flat - 10.0).abs() < 1e-9);
-        let grown = cost(std::slice::from_ref(&stage), &r, &steps([1000, 2000], [0.01; 2], [0.02; 2]));
+        let grown = cost(std::slice::from_ref(&stage), r.max_cap, &steps([1000, 2000], [0.01; 2], [0.02; 2]));
         assert!(grown > 12.0 && grown < 20.0, "{grown}");
         stage.half_size_steps = 500;
         let halves = [0.0, 0.01];
-        let half = cost(std::slice::from_ref(&stage), &r, &steps([1000, 1000], halves, halves));
+        let half = cost(std::slice::from_ref(&stage), r.max_cap, &steps([1000, 1000], halves, halves));
         assert!((half - 5.0).abs() < 1e-9);
         // A still warm-up of 100 free steps; then 900 of a network, a third of them at half size.
         let stages = [Stage::new("still", 100), Stage { half_size_steps: 300, ..Stage::new("network", 900) }];
         let mut steps = steps([1000, 1000], [0.0; 2], [0.0; 2]);
         steps[1].seconds = [[0.01, 0.02]; 2];
-        assert!((cost(&stages, &r, &steps) - 15.0).abs() < 1e-9);
+        assert!((cost(&stages, r.max_cap, &steps) - 15.0).abs() < 1e-9);
     }
 }

@@ -1,9 +1,11 @@
 //! Training: the fixed chain of a step, the trainer that repeats it, and the run that keeps it safe on disk.
 
+mod batch;
 pub mod chain;
 mod channels;
 pub mod checkpoint;
 pub mod dataset;
+pub mod engine;
 pub mod loss;
 pub mod memory;
 pub mod minutes;

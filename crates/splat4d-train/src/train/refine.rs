@@ -81,5 +81,5 @@ pub fn refine(
         session.restore(&mut trainer, listen)?
     };
     let outcome = session.drive(&mut trainer, state, listen)?;
-    Ok(Refined { outcome, scene: trainer.scene })
+    Ok(Refined { outcome, scene: trainer.learner.into_scene() })
 }

@@ -6,19 +6,20 @@ pub(crate) mod tests;
 
 use super::checkpoint::{self, Identity, RunState, write_atomically};
 use super::dataset::Dataset;
-use super::loss::{Exposure, TrainLoss};
+use super::loss::TrainLoss;
 pub use super::memory::{memory_estimate, peak_memory};
 use super::minutes;
 use super::snapshot::Snapshots;
 use super::trainer::{Settings, Stepped, Trainer};
 use crate::capture::{Capture, CaptureOptions, ImageStore};
-use crate::densify::Limits;
-use crate::event::Event;
+use crate::event::{Event, Progress};
 use crate::init::{self, Seeds};
+use crate::learner::Exposure;
 use crate::loss::image::terms;
 use crate::methods::auto::{self, AUTO};
-use crate::methods::{Plan, Stage, program_of, split};
+use crate::methods::{Plan, Stage, program_of, stages};
 use crate::recipe::Recipe;
+use crate::upkeep::Limits;
 use crate::{Error, ErrorKind, Result};
 use serde_json::json;
 use splat4d::device;
@@ -344,7 +345,7 @@ impl Bench {
     }
 
     pub(super) fn trainer(&self, plan: &Plan, scene: Scene<f32>) -> Result<Trainer<'static>> {
-        Ok(self.trainer_of(plan, scene, split::stages(program_of(&plan.recipe)?.as_ref(), plan)))
+        Ok(self.trainer_of(plan, scene, stages(program_of(&plan.recipe)?.as_ref(), plan)))
     }
 
     /// A trainer with stages that no program made.
@@ -365,11 +366,12 @@ impl Bench {
             limits: Limits { cap: r.max_cap, extent: plan.extent, min_opacity: r.min_opacity },
             background: self.background(),
             sh_degree: r.sh_degree,
-            opacity_reset_interval: r.opacity_reset_interval,
             exposure_lr: r.exposure_lr,
         };
-        let loss = TrainLoss::new(terms(r), exposure);
-        Trainer::new(scene, stages, self.frames.clone(), device::cpu(config), loss, settings)
+        let loss = TrainLoss::new(terms(r));
+        let mut trainer = Trainer::new(scene, stages, self.frames.clone(), device::cpu(config), loss, settings);
+        trainer.learner.exposure = exposure;
+        trainer
     }
 
     /// What a checkpoint is of: the recipe and, where there is more to say, `text`.
@@ -490,7 +492,7 @@ impl Metrics {
             s.l1,
             s.ssim,
             psnr(s.mse),
-            trainer.scene.len(),
+            trainer.scene().len(),
             state.seconds,
             ms.join(",")
         );
@@ -560,12 +562,12 @@ impl Session<'_> {
             run: self.run.to_owned(),
             iteration: first,
             iterations,
-            gaussians: trainer.scene.len(),
+            gaussians: trainer.scene().len(),
             memory_estimate: self.estimate,
         });
         let mut metrics = Metrics::open(self.run, first, iterations);
         let mut totals = Totals::default();
-        let shown = trainer.scene.without_head("the player");
+        let shown = trainer.scene().without_head("the player");
         if let (Some(_), Err(e)) = (self.snapshots, &shown) {
             listen(&Event::Warning { message: format!("training cannot be watched: {e}") });
         }
@@ -575,12 +577,7 @@ impl Session<'_> {
         let mut steps = Steps::default();
         while !trainer.is_done() && !self.stop.load(Ordering::Relaxed) {
             let from = (trainer.progress.stage, trainer.progress.iteration);
-            trainer.enter(&mut |name, done, total| {
-                listen(&match name.strip_prefix("warning: ") {
-                    Some(message) => Event::Warning { message: message.to_owned() },
-                    None => Event::Phase { name: name.to_owned(), done, total },
-                });
-            })?;
+            trainer.enter(&mut Progress(listen))?;
             state.seconds += clock.elapsed().as_secs_f64();
             clock = Clock::now();
             if trainer.is_done() {
@@ -620,7 +617,7 @@ impl Session<'_> {
         }
         let done = trainer.is_done();
         self.save(trainer, &state, &metrics, &totals, done, listen)?;
-        let gaussians = trainer.scene.len();
+        let gaussians = trainer.scene().len();
         let iteration = trainer.progress.iteration;
         if let Some(snapshots) = &mut snapshots {
             listen(&snapshots.now(trainer));
@@ -642,7 +639,7 @@ impl Session<'_> {
             stage: trainer.stage_name().to_owned(),
             loss: state.smooth[0],
             psnr: psnr(state.smooth[1]),
-            gaussians: trainer.scene.len(),
+            gaussians: trainer.scene().len(),
             seconds: state.seconds,
             seconds_left: steps.mean() * (iterations - iteration) as f64,
         }
@@ -681,7 +678,7 @@ impl Session<'_> {
             "threads": rayon::current_num_threads(),
             "iteration": trainer.progress.iteration,
             "iterations": trainer.iterations(),
-            "gaussians": trainer.scene.len(),
+            "gaussians": trainer.scene().len(),
             "seconds": state.seconds,
             "finished": finished,
             "rollbacks": trainer.progress.strikes,

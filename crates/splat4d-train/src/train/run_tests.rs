@@ -100,7 +100,7 @@ impl Place {
         let bench = Bench::new(self.open(&recipe), &recipe)?;
         let plan = bench.plan(&recipe);
         let mut trainer = bench.trainer(&plan, bench.initial_scene(&plan)?)?;
-        trainer.set_draw(draw);
+        trainer.set_engine(crate::train::engine::CpuEngine::new(draw));
         let identity = bench.identity(&recipe, "");
         let (bench, recipe, run, made_by) = (&bench, &recipe, run.as_path(), TRAIN);
         let session = Session { run, bench, recipe, identity, made_by, estimate: 0, snapshots: None, stop };
@@ -311,7 +311,7 @@ fn neither_prefetch_nor_image_memory_matters() {
         trainer.step().unwrap().unwrap();
     }
     let mut bytes = Vec::new();
-    splat4d::format::scene::write(&trainer.scene, &mut bytes).unwrap();
+    splat4d::format::scene::write(trainer.scene(), &mut bytes).unwrap();
     assert!(place.scene("plain") == bytes, "prefetch reached a result");
 }
 

@@ -12,12 +12,12 @@ use splat4d::render::{Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::{Camera, Planes, SH, Time};
 use splat4d::{Error, ErrorKind, Result};
 use splat4d_train::capture::frames::{Frames, Picture};
-use splat4d_train::densify::Limits;
 use splat4d_train::methods::{Group, Plan, Stage, program};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::train::loss::TrainLoss;
 use splat4d_train::train::run::peak_memory;
 use splat4d_train::train::trainer::{Settings, Stepped, Trainer};
+use splat4d_train::upkeep::Limits;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
@@ -149,7 +149,6 @@ pub(super) fn trainer(scene: Scene<f32>, frames: Arc<dyn Frames>, way: Way) -> R
         limits: Limits { cap: scene.len(), extent, min_opacity: 0.0 },
         background: scene.background,
         sh_degree: splat4d::math::sh::MAX_DEGREE,
-        opacity_reset_interval: 0,
         exposure_lr: 0.0,
     };
     let renderer = Renderer::new(RenderConfig { simd: way.simd, ..RenderConfig::default() });

@@ -206,6 +206,8 @@ pub fn stage(plan: &Plan, iterations: usize, share: f64, codec: Arc<Quantised>) 
         min_log_life: None,
         half_size_steps: 0,
         sh_interval: 0,
+        // Rows that came or went would leave the file's labels behind.
+        upkeep: Vec::new(),
         codec: Some(codec),
         ..base
     }

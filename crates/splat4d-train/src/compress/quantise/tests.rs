@@ -2,13 +2,13 @@
 //! memory that comes back.
 
 use super::*;
-use crate::densify::Limits;
 use crate::loss::terms::StepInfo;
 use crate::train::chain::{Chain, Losses, Step, View};
 use crate::train::frames::{Frames, Picture};
 use crate::train::loss::TrainLoss;
 use crate::train::tests::Made;
 use crate::train::trainer::{Settings, Trainer};
+use crate::upkeep::Limits;
 use splat4d::format::playback::{Draft, Node, Primitive, WriteConfig, read, read_pages, write, write_pages};
 use splat4d::math::Rng;
 use splat4d::render::{RenderConfig, Renderer};
@@ -175,7 +175,6 @@ fn trainer(scene: Scene<f32>, stages: Vec<Stage>) -> Trainer<'static> {
         limits: Limits { cap: 10_000, extent: 4.0, min_opacity: 0.005 },
         background: SKY,
         sh_degree: 1,
-        opacity_reset_interval: 0,
         exposure_lr: 0.0,
     };
     let draw = Box::new(Renderer::new(RenderConfig::default()));
@@ -227,7 +226,7 @@ fn the_gradient_of_what_is_shown_moves_what_learns() {
         };
         let info = StepInfo { iteration: 0, times: vec![view.t], seed: 5, progress: 0.0 };
         let mut d: Vec<Grads<f32>> = whole.layers.iter().map(|l| Grads::new(&l.params)).collect();
-        let mut image = loss.of_step(&mut []);
+        let mut image = loss.of_step(&mut [], None);
         let mut losses = Losses { image: &mut image, probes: &[], params: &[] };
         let mut renderer = Renderer::new(RenderConfig::default());
         let step = Step { scene: &whole, views: &[view], info: &info, sh_degree: 1 };
@@ -235,7 +234,7 @@ fn the_gradient_of_what_is_shown_moves_what_learns() {
         // Adam's first step goes against the gradient's sign: of one of the views in every number.
         let mut right = true;
         let mut count = 0;
-        for ((before, after), d) in scene.layers.iter().zip(&t.scene.layers).zip(&d) {
+        for ((before, after), d) in scene.layers.iter().zip(&t.scene().layers).zip(&d) {
             for row in 0..before.params.len() {
                 for c in 0..11 {
                     let moved = after.params[GEOMETRY].get(row, c) - before.params[GEOMETRY].get(row, c);
@@ -267,7 +266,7 @@ fn tuning_makes_up_for_coarse_codes() {
     let floats = mean(&losses[losses.len() - 12..]);
     let codec = Quantised::new(coarse(), Rate { start: 5e-3, end: 5e-4 }).unwrap();
     let mut scene = Scene::default();
-    codec.begin(Pages { layers: plain.scene.layers, ..pages }, &mut scene);
+    codec.begin(Pages { layers: plain.learner.into_scene().layers, ..pages }, &mut scene);
     let mut t = trainer(scene, vec![tuning(200, Some(codec))]);
     let mut losses = Vec::new();
     while !t.is_done() {

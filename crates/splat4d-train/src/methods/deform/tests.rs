@@ -11,15 +11,16 @@ fn plan(settings: &[&str]) -> Plan {
 #[test]
 fn two_stages_make_one_schedule() {
     let plan = plan(&["deform_warmup=0.1", "half_size_until=0.3"]);
-    let [still, moving]: [Stage; 2] = DeformProgram.stages(&plan).try_into().ok().unwrap();
+    let [still, mut moving]: [Stage; 2] = DeformProgram.stages(&plan).try_into().ok().unwrap();
     assert_eq!((still.iterations, moving.iterations), (100, 900));
     let rate = |s: &Stage, column: &str| s.groups.iter().find(|g| g.column == column).map(|g| g.rate);
     let (a, b) = (rate(&still, "means").unwrap(), rate(&moving, "means").unwrap());
     assert!((a.end - b.start).abs() < 1e-12 && a.start > a.end && b.start > b.end);
     assert_eq!(rate(&still, "deform_trunk.0.weight"), None, "the warm-up does not know the network");
     assert_eq!(rate(&moving, "deform_trunk.0.weight").unwrap().start, plan.recipe.deform_lr_init);
-    let whole = still::stage("x", &plan);
-    assert_eq!(moving.densify_steps.1 + 100, whole.densify_steps.1);
+    let mut whole = still::stage("x", &plan);
+    let last = |s: &mut Stage| s.upkeep.iter_mut().find_map(|u| u.densification().map(|e| e.last)).unwrap();
+    assert_eq!(last(&mut moving) + 100, last(&mut whole));
     assert_eq!((still.half_size_steps, moving.half_size_steps), (300, 200));
     assert_eq!(DeformProgram.stages(&self::plan(&["deform_warmup=0"])).len(), 1);
 }

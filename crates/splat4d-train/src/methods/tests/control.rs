@@ -2,10 +2,10 @@
 //! and a scene on nodes learns.
 
 use super::*;
-use crate::densify::{Observation, Stats};
-use crate::methods::control::adapt::NodeAdapt;
+use crate::learner::{Learner, Observation};
 use crate::methods::control::losses::{MaskSize, NodeAcceleration, NodeArap, NodeElastic, Sparse};
-use crate::optim::Moments;
+use crate::upkeep::tests::context;
+use crate::upkeep::{AdaptNodes, At, Context, NodeSettings, Upkeep};
 use splat4d::layers::Evaluation;
 use splat4d::motion::control::{ControlSpec, Curve, TrajectorySpec};
 use splat4d::motion::skin::{Skin, SkinSpec};
@@ -97,8 +97,6 @@ fn losses_on_parameters_have_the_gradients_of_their_values() {
 #[test]
 fn nodes_are_added_where_gaussians_strain_and_removed_where_there_are_none() {
     let mut scene = skinned::<f32>(200, 20, spline());
-    let mut moments: Vec<_> = scene.layers.iter().map(|l| Moments::new(&l.params)).collect();
-    let mut stats = Stats::new(&scene);
     let p = &mut scene.layers[0].params;
     let skin = Skin::find(p).unwrap();
     // Node 5 leaves for where no Gaussian is; Gaussians near node 2 strain.
@@ -112,11 +110,15 @@ fn nodes_are_added_where_gaussians_strain_and_removed_where_there_are_none() {
             if square < 0.09 { 1.0 } else { 0.0 }
         })
         .collect();
-    stats.observe(Observation { layer: 0, rows: Rows::All, mean2d: &mean2d, radii: &[1.0; 200] });
-    let adapt = NodeAdapt { bind_interval: 10, steps: (100, 1000, 100), threshold: 0.2, cap: 21 };
-    assert!(adapt.is_due(10) && !adapt.is_due(15) && adapt.is_due(500));
-    adapt.run(&mut scene, &mut moments, &mut stats, 100, Rng::new(0, "adapt", 0));
-    let p = &scene.layers[0].params;
+    let mut learner = Learner::new(scene);
+    learner.stats_mut().observe(Observation { layer: 0, rows: Rows::All, mean2d: &mean2d, radii: &[1.0; 200] });
+    let settings = NodeSettings { bind_interval: 10, adapt_interval: 100, threshold: 0.2, cap: 21 };
+    let mut adapt = AdaptNodes { settings, span: (100, 1000) };
+    let at = |step: usize| At { step, steps: 2000 };
+    assert!(adapt.due(&at(10)) && !adapt.due(&at(15)) && adapt.due(&at(500)));
+    let limits = Limits { cap: 200, extent: 1.0, min_opacity: 0.0 };
+    adapt.run(&mut learner, &Context { at: at(100), ..context(limits, 0, 0) }).unwrap();
+    let (p, moments) = (&learner.scene().layers[0].params, learner.moments());
     assert!(skin.count(p) > 19 && skin.count(p) <= 21, "{} nodes", skin.count(p));
     assert!((0..skin.count(p)).all(|k| p[skin.nodes].get(k, 0) < 49.0), "a node without Gaussians stays");
     // The strongest strain comes first: the node that was born for it stands among its Gaussians.
@@ -127,8 +129,8 @@ fn nodes_are_added_where_gaussians_strain_and_removed_where_there_are_none() {
     assert!(moments[0].table(skin.nodes).read::<3>(19, 0) == [0.0; 3], "a new node starts without momentum");
     // Lists of nearest nodes are those of the new nodes.
     let list = p[skin.candidates].clone();
-    skin.bind(&mut scene.layers[0].params);
-    assert_eq!(list, scene.layers[0].params[skin.candidates]);
+    skin.bind(&mut learner.scene_mut().layers[0].params);
+    assert_eq!(list, learner.scene().layers[0].params[skin.candidates]);
 }
 
 #[test]
@@ -144,18 +146,18 @@ fn a_scene_on_nodes_learns_with_every_trajectory() {
         all.extend(driven.map(|c| Group::new(c, Rate::constant(5e-3))));
         let network = (0..3).flat_map(|i| ["weight", "bias"].map(|w| format!("trajectory.{i}.{w}")));
         all.extend(network.map(|c| Group::new(&c, Rate::constant(2e-3))));
-        let adapt = NodeAdapt { bind_interval: 10, steps: (20, 60, 20), threshold: 1e-4, cap: 16 };
+        let settings = NodeSettings { bind_interval: 10, adapt_interval: 20, threshold: 1e-4, cap: 16 };
         let probe: Box<dyn ProbeLoss<f32>> = Box::new(NodeArap { weight: 0.1, extent: 4.0, clip: [0.0, 0.2] });
         let stage = Stage {
             batch: 4,
             groups: all,
             probes: vec![probe],
-            adapt: Some(Box::new(adapt)),
+            upkeep: vec![Box::new(AdaptNodes { settings, span: (20, 60) })],
             ..Stage::new("nodes", 80)
         };
         let mut t = trainer(scene, vec![stage], 90);
         assert_falls(&finish_stage(&mut t), 0.6, &format!("{trajectory:?}"));
-        assert!(t.scene.layers[0].params.rows_of(Space::Nodes) > 12, "no node was added");
+        assert!(t.scene().layers[0].params.rows_of(Space::Nodes) > 12, "no node was added");
     }
 }
 
@@ -198,7 +200,7 @@ fn losses_on_nodes_calm_them() {
         let before = unease(&scene);
         let mut t = trainer(scene, vec![stage], 90);
         finish_stage(&mut t);
-        let after = unease(&t.scene);
+        let after = unease(t.scene());
         assert!(after < 0.5 * before, "loss {k} went from {before} to {after}");
     }
 }

@@ -2,7 +2,7 @@
 //! tables in which every number says from which row and column it came.
 
 use super::*;
-use crate::densify::{self, Stats};
+use crate::learner::{Learner, Stats};
 use crate::optim::Moments;
 use splat4d::scene::{Born, RowEdit};
 
@@ -103,7 +103,8 @@ fn one_edit_moves_every_table_alike() {
     for round in 0..60 {
         let rng = Rng::new(17, "edits", round);
         let rows = 20 + rng.below(50, 40);
-        let (mut scene, mut moments, mut stats) = tagged(rows);
+        let (scene, moments, stats) = tagged(rows);
+        let mut learner = Learner::resumed(scene, moments, stats);
         // Several edits in a row, Gaussians and nodes in turn: where every row came from, and whether it is as old.
         let mut origin: Vec<Vec<(u32, bool)>> = [rows, 19].map(|n| (0..n as u32).map(|r| (r, true)).collect()).to_vec();
         for turn in 0..4 {
@@ -113,7 +114,7 @@ fn one_edit_moves_every_table_alike() {
             if edit.len() < 14 {
                 continue;
             }
-            densify::apply(&mut scene, &mut moments, &mut stats, 0, &edit, &rng);
+            learner.apply(0, &edit, &rng);
             origin[which] = edit
                 .parent
                 .iter()
@@ -121,6 +122,7 @@ fn one_edit_moves_every_table_alike() {
                 .map(|(&p, &b)| (origin[which][p as usize].0, b == Born::Kept && origin[which][p as usize].1))
                 .collect();
         }
+        let (scene, moments, stats) = (learner.scene(), learner.moments(), learner.stats());
         let layer = &scene.layers[0];
         for key in layer.params.keys() {
             let info = layer.params.info(key);

@@ -128,7 +128,7 @@ fn colours_that_change_with_time_and_view_are_learnt_better_with_a_head() {
         let stage = Stage { groups: groups(&columns), ..Stage::new("colours", 400) };
         let mut t = trainer_on(frames.clone(), scene, vec![stage], 160);
         finish_stage(&mut t);
-        -10.0 * error_of(&t.scene, frames.as_ref()).log10()
+        -10.0 * error_of(t.scene(), frames.as_ref()).log10()
     };
     let (plain, full) = (learn(None), learn(Some(FeatureSpec { seed: 4 })));
     println!("plain {plain:.2} dB, full {full:.2} dB");

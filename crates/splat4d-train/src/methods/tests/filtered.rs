@@ -3,6 +3,7 @@
 
 use super::*;
 use crate::loss::transport::{Metric, Transport, TransportSettings};
+use crate::upkeep::{At, Once};
 use splat4d::format::scene;
 use splat4d::motion::filtered::{Filtered, FilteredSpec, Fusion, GAINS, Predictor};
 
@@ -68,23 +69,21 @@ fn stage(steps: usize) -> Stage {
 fn it_is_switched_on_in_the_middle_of_a_stage_and_trains() {
     let scene = filtered_scene::<f32>(|s| s.fusion = Fusion::Off);
     let mut stage = stage(30);
-    stage.switches.push((
-        10,
-        Box::new(|scene: &mut Scene<f32>, _: &mut Tell<'_>| {
-            let layer = &mut scene.layers[0];
-            let filter = Filtered::of(layer.motion.as_ref()).expect("it is one");
-            let spec = FilteredSpec { fusion: Fusion::Geodesic, ..filter.settings().clone() };
-            layer.motion = Arc::new(Filtered::around(filter.inner().clone(), spec, &mut layer.params)?);
-            Ok(())
-        }),
-    ));
+    let on = |scene: &mut Scene<f32>| {
+        let layer = &mut scene.layers[0];
+        let filter = Filtered::of(layer.motion.as_ref()).expect("it is one");
+        let spec = FilteredSpec { fusion: Fusion::Geodesic, ..filter.settings().clone() };
+        layer.motion = Arc::new(Filtered::around(filter.inner().clone(), spec, &mut layer.params)?);
+        Ok(())
+    };
+    stage.keep(Once { at: 10, change: on });
     let mut t = trainer(scene, vec![stage], 200);
-    let gains = t.scene.layers[0].params.find(GAINS).unwrap();
-    let start = t.scene.layers[0].params[gains].clone();
+    let gains = t.scene().layers[0].params.find(GAINS).unwrap();
+    let start = t.scene().layers[0].params[gains].clone();
     let mut losses = Vec::new();
     for step in 0..30 {
         losses.push(t.step().unwrap().expect("no fault").report.loss);
-        assert_eq!(t.scene.layers[0].params[gains] == start, step < 10, "gains learn from step 10 on, not at {step}");
+        assert_eq!(t.scene().layers[0].params[gains] == start, step < 10, "gains learn from step 10 on, not at {step}");
     }
     assert_falls(&losses, 0.8, "filtered");
 }
@@ -110,14 +109,15 @@ fn a_recipe_wraps_any_program_and_leaves_no_trace() {
         assert_eq!((spec.fusion, spec.frame, spec.inner.name()), (Fusion::Off, 0.05, "spacetime"));
         let mut stages = program.stages(&plan);
         assert!(stages[0].groups.iter().any(|g| g.column == "velocities") && stages[0].probes.len() == 1);
-        assert_eq!(stages[0].switches.iter().map(|s| s.0).collect::<Vec<_>>(), [20]);
-        stages[0].densify = Densify::None;
+        stages[0].upkeep.retain(|u| u.once());
+        let due = |step: &usize| stages[0].upkeep.iter().any(|u| u.due(&At { step: *step, steps: 40 }));
+        assert_eq!((0..40).filter(due).collect::<Vec<_>>(), [20]);
         let mut p = cloud::<f32>(40, LifeKind::GaussHalf, 4);
         let motion = build(&Spec::Filtered(spec), &mut p).unwrap();
         let mut t = trainer(one_layer(p, motion, LifeKind::GaussHalf), stages, 200);
         for step in 0..40 {
             t.step().unwrap().expect("no fault");
-            let on = Filtered::of(t.scene.layers[0].motion.as_ref()).map(|f| f.settings().fusion);
+            let on = Filtered::of(t.scene().layers[0].motion.as_ref()).map(|f| f.settings().fusion);
             let expected = match step {
                 0..20 => Some(Fusion::Off),
                 39 if !keep => None,
@@ -125,10 +125,10 @@ fn a_recipe_wraps_any_program_and_leaves_no_trace() {
             };
             assert_eq!(on, expected, "after step {step}");
         }
-        let layer = &t.scene.layers[0];
+        let layer = &t.scene().layers[0];
         assert_eq!(layer.params.find(GAINS).is_some(), keep);
         let mut bytes = Vec::new();
-        scene::write(&t.scene, &mut bytes).unwrap();
+        scene::write(t.scene(), &mut bytes).unwrap();
         let back = scene::read(&bytes).expect("no array is left over");
         assert_eq!(back.layers[0].motion.spec(), layer.motion.spec());
         assert_eq!(back.layers[0].params[GEOMETRY], layer.params[GEOMETRY]);
@@ -150,7 +150,7 @@ fn hooks_of_the_program_inside_see_its_own_model() {
             inner()
         }
         fn stages(&self, plan: &Plan) -> Vec<Stage> {
-            let hook = || -> Option<Hook<f32>> {
+            let hook = || -> Option<Hook> {
                 Some(Box::new(|scene, _| {
                     assert_eq!(scene.layers[0].motion.spec(), inner(), "the filter is taken off");
                     Ok(())
@@ -169,7 +169,7 @@ fn hooks_of_the_program_inside_see_its_own_model() {
     let mut on = Vec::new();
     while !t.is_done() {
         t.step().unwrap().expect("no fault");
-        on.push(Filtered::of(t.scene.layers[0].motion.as_ref()).is_some_and(|f| f.settings().fusion != Fusion::Off));
+        on.push(Filtered::of(t.scene().layers[0].motion.as_ref()).is_some_and(|f| f.settings().fusion != Fusion::Off));
     }
     // Half of two stages of six: switched on at the second's start, after its hook; off at the very end.
     assert_eq!(on, [vec![false; 6], vec![true; 5], vec![false]].concat());

@@ -3,7 +3,7 @@
 
 use super::*;
 use crate::init::{self, Seeds};
-use crate::methods::split::stages;
+use crate::methods::stages;
 use crate::recipe::Recipe;
 use splat4d::layers::Evaluation;
 use splat4d::math::Se3;
@@ -136,7 +136,6 @@ fn errors(motion: &str, life: &str) -> [f64; 2] {
         limits: Limits { cap: 1000, extent: plan.extent, min_opacity: 0.005 },
         background: SKY,
         sh_degree: 0,
-        opacity_reset_interval: 0,
         exposure_lr: 0.0,
     };
     let draw = Box::new(Renderer::new(RenderConfig::default()));
@@ -149,8 +148,8 @@ fn errors(motion: &str, life: &str) -> [f64; 2] {
         (Renderer::<f32>::new(RenderConfig::default()), Image::default(), Evaluation::default());
     let (mut picture, mut sums) = (Picture::default(), [[0.0f64; 2]; 2]);
     for i in 0..party.len() {
-        trainer.scene.at(party.time(i), &mut instant);
-        renderer.render(&render::Shot::new(&trainer.scene.splats(&instant), party.camera(i), SKY), &mut image);
+        trainer.scene().at(party.time(i), &mut instant);
+        renderer.render(&render::Shot::new(&trainer.scene().splats(&instant), party.camera(i), SKY), &mut image);
         party.load(i, &mut picture).unwrap();
         for p in 0..SIZE * SIZE {
             let seen = party.hit(i % CAMERAS, p, &|g| GUESTS[g].2(i / CAMERAS));

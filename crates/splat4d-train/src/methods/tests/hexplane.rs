@@ -33,7 +33,7 @@ fn start(plan: &Plan) -> Trainer<'static> {
 
 /// Numbers of the planes of some levels, or of the networks.
 fn numbers(t: &Trainer<'_>, levels: Range<usize>, networks: bool) -> Vec<f32> {
-    let p = &t.scene.layers[0].params;
+    let p = &t.scene().layers[0].params;
     let planes: Vec<String> = levels.flat_map(|l| (0..6).map(move |k| PlaneShape::name(l, k))).collect();
     let wanted = |name: &str| {
         let plane = name.as_bytes().get(9).is_some_and(u8::is_ascii_digit);
@@ -43,7 +43,7 @@ fn numbers(t: &Trainer<'_>, levels: Range<usize>, networks: bool) -> Vec<f32> {
 }
 
 fn spec(t: &Trainer<'_>) -> splat4d::motion::hexplane::HexplaneSpec {
-    match t.scene.layers[0].motion.spec() {
+    match t.scene().layers[0].motion.spec() {
         Spec::Hexplane(spec) => spec,
         other => panic!("a hexplane layer became {}", other.name()),
     }
@@ -65,7 +65,7 @@ fn each_stage_learns_its_part_and_together_they_follow_the_ball() {
     finish_stage(&mut t);
     let s = spec(&t);
     assert!(!s.coarse && s.unlocked == Some(1));
-    let p = &t.scene.layers[0].params;
+    let p = &t.scene().layers[0].params;
     let inside = |row: usize| {
         let x = p[GEOMETRY].read::<3>(row, 0).map(f64::from);
         (0..3).all(|k| s.low[k] <= x[k] && x[k] <= s.high[k])
@@ -97,8 +97,9 @@ fn rates_and_densification_go_on_over_the_stages() {
     let ends = |column: &str, rate_: f64| (rate(2, column).unwrap().end / rate_ - 1.0).abs() < 1e-9;
     assert!(ends("hexplane.1.zt", plan.recipe.grid_lr_final));
     assert!(ends("hexplane.position.1.bias", plan.recipe.deformation_lr_final));
-    let steps: Vec<_> = stages.iter().map(|s| (s.densify_steps.0, s.densify_steps.1)).collect();
-    assert_eq!(steps, [(20, 40), (1, 50), (1, 10)]);
+    let mut stages = stages;
+    let steps = stages.iter_mut().map(|s| s.upkeep.iter_mut().find_map(|u| u.densification().copied()).unwrap());
+    assert_eq!(steps.map(|e| (e.first, e.last)).collect::<Vec<_>>(), [(20, 40), (1, 50), (1, 10)]);
     plan.recipe.unlock_interval = 0;
     assert_eq!(HexplaneProgram.stages(&plan).iter().map(|s| s.iterations).collect::<Vec<_>>(), [40, 110]);
 }

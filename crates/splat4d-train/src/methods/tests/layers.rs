@@ -1,14 +1,25 @@
 //! Two layers with different models, both densified under one cap over all layers.
 
 use super::*;
-use crate::densify::{Adc, Densify, Mcmc};
+use crate::optim::Noise;
+use crate::upkeep::{Adc, AdcSettings, Every, Mcmc, McmcSettings, MortonOrder};
+
+/// What a strategy adds to a stage.
+pub(super) type Strategy = fn(&mut Stage, Every);
 
 /// Both strategies, eager enough for thirty steps.
-pub(super) fn strategies() -> [Densify; 2] {
-    [
-        Densify::Adc(Adc { grad_threshold: 1e-6, percent_dense: 0.04, retime_clones: false }),
-        Densify::Mcmc(Mcmc { growth: 1.1, gradient_share: 0.5, noise_lr: 1.0 }),
-    ]
+pub(super) const STRATEGIES: [(&str, Strategy); 2] = [("adc", adc), ("mcmc", mcmc)];
+
+fn adc(stage: &mut Stage, steps: Every) {
+    let settings = AdcSettings { grad_threshold: 1e-6, percent_dense: 0.04, retime_clones: false };
+    stage.keep(Adc { settings, steps });
+    stage.keep(MortonOrder { densification: steps });
+}
+
+fn mcmc(stage: &mut Stage, steps: Every) {
+    stage.keep(Mcmc { settings: McmcSettings { growth: 1.1, gradient_share: 0.5 }, steps });
+    stage.keep(MortonOrder { densification: steps });
+    stage.noise = Some(Noise { strength: 1.0, until: steps.last });
 }
 
 fn two_layers<F: Real>(rows: usize) -> Scene<F> {
@@ -36,32 +47,27 @@ fn every_layer_is_densified_under_one_cap() {
         .flat_map(|layer| ORDINARY.iter().map(move |&(c, rate)| (layer, c, rate)))
         .chain([(1, "controls", 0.01), (1, "decay", 0.01), (2, "factor", 0.02), (2, "lobe", 0.01)])
         .collect();
-    for densify in strategies() {
+    for (name, densify) in STRATEGIES {
         let groups =
             columns.iter().map(|&(layer, c, rate)| Group { layer, ..Group::new(c, Rate::constant(rate)) }).collect();
-        let stage = Stage {
-            batch: 12,
-            groups,
-            densify: densify.clone(),
-            densify_steps: (4, 24, 4),
-            ..Stage::new("layers", 30)
-        };
+        let mut stage = Stage { batch: 12, groups, ..Stage::new("layers", 30) };
+        densify(&mut stage, Every { first: 4, last: 24, interval: 4 });
         let mut t = trainer(two_layers(40), vec![stage], CAP);
         let (mut losses, mut largest) = (Vec::new(), [40; 3]);
         while !t.is_done() {
             losses.push(t.step().unwrap().expect("no fault").report.loss);
-            assert!(t.scene.len() <= CAP, "{densify:?}: {} Gaussians", t.scene.len());
-            for (layer, most) in t.scene.layers.iter().zip(&mut largest) {
+            assert!(t.scene().len() <= CAP, "{name}: {} Gaussians", t.scene().len());
+            for (layer, most) in t.scene().layers.iter().zip(&mut largest) {
                 *most = layer.params.len().max(*most);
             }
-            for (layer, moments) in t.scene.layers.iter().zip(&t.moments) {
+            for (layer, moments) in t.scene().layers.iter().zip(t.learner.moments()) {
                 let n = layer.params.len();
                 let ok = layer.params.keys().all(|k| layer.params[k].rows() == n && moments.table(k).rows() == n);
-                assert!(ok, "{densify:?}: tables of a layer have one length");
+                assert!(ok, "{name}: tables of a layer have one length");
             }
         }
-        assert_falls(&losses, 0.85, &format!("{densify:?}"));
-        assert!(largest.iter().all(|&n| n > 40), "{densify:?}: every layer grows, {largest:?}");
-        assert_eq!(t.scene.len(), CAP, "{densify:?}: the cap is reached");
+        assert_falls(&losses, 0.85, name);
+        assert!(largest.iter().all(|&n| n > 40), "{name}: every layer grows, {largest:?}");
+        assert_eq!(t.scene().len(), CAP, "{name}: the cap is reached");
     }
 }

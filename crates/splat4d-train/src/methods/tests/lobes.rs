@@ -168,18 +168,13 @@ fn relocation_resizes_what_the_model_is_made_of() {
 #[test]
 fn lobes_learn_while_they_are_split_and_relocated() {
     let columns = [("means", 0.01), ("opacity_logits", 0.05), ("sh", 0.02), ("factor", 0.02), ("lobe", 0.01)];
-    for densify in layers::strategies() {
-        let stage = Stage {
-            batch: 4,
-            sampler: Sampler::Frame(1),
-            groups: groups(&columns),
-            densify: densify.clone(),
-            densify_steps: (5, 15, 5),
-            ..Stage::new("lobes", 30)
-        };
+    for (name, densify) in layers::STRATEGIES {
+        let mut stage =
+            Stage { batch: 4, sampler: Sampler::Frame(1), groups: groups(&columns), ..Stage::new("lobes", 30) };
+        densify(&mut stage, crate::upkeep::Every { first: 5, last: 15, interval: 5 });
         let mut t = trainer(lobes_scene(60).0, vec![stage], 90);
         let losses = finish_stage(&mut t);
-        assert_falls(&losses, 0.85, &format!("{densify:?}"));
-        assert!(t.scene.len() > 60 && t.scene.len() <= 90, "{densify:?}: {}", t.scene.len());
+        assert_falls(&losses, 0.85, name);
+        assert!(t.scene().len() > 60 && t.scene().len() <= 90, "{name}: {}", t.scene().len());
     }
 }

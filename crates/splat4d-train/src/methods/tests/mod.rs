@@ -4,6 +4,7 @@
 mod channels;
 mod control;
 mod edits;
+mod engine;
 mod features;
 mod filtered;
 mod guests;
@@ -13,21 +14,22 @@ mod lobes;
 mod nodes;
 mod pruned;
 mod scan;
+mod split;
 mod triple;
 mod upkeep;
 mod wrapper;
 
 use super::*;
-use crate::densify::Limits;
 use crate::loss::image::{ImageTerm, PictureGrads, Shown};
 use crate::train::chain::{Chain, Losses, Step, StepInfo, StepReport, View};
 use crate::train::frames::{Frames, Picture};
 use crate::train::loss::TrainLoss;
 use crate::train::tests::Made;
 use crate::train::trainer::{Settings, Trainer};
+use crate::upkeep::Limits;
 use splat4d::layers::Layer;
-use splat4d::math::Rng;
 use splat4d::math::sh::MAX_DEGREE;
+use splat4d::math::{Real, Rng};
 use splat4d::motion::{Motion, SpacetimeSpec, build};
 use splat4d::render::{
     self, Backend, Image, ImageGrads, PartGrads, RenderConfig, RenderGrads, Renderer, Wanted, oracle,
@@ -290,7 +292,6 @@ fn trainer_on(frames: Arc<dyn Frames>, scene: Scene<f32>, stages: Vec<Stage>, ca
         limits: Limits { cap, extent: 4.0, min_opacity: 0.005 },
         background: [0.2, 0.3, 0.6],
         sh_degree: 1,
-        opacity_reset_interval: 0,
         exposure_lr: 0.0,
     };
     let draw = Box::new(Renderer::new(RenderConfig::default()));

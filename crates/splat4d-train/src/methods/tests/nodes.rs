@@ -347,7 +347,7 @@ fn warm_up_then_nodes_then_frame_by_frame_tracking() {
     let warm_up =
         Stage { sampler: Sampler::Frame(0), batch: 4, groups: groups(&ORDINARY), ..Stage::new("warm-up", 20) };
     // Every third Gaussian becomes a node; two new ones a node replace the cloud.
-    let replace: Hook<f32> = Box::new(|scene, _| {
+    let replace: Hook = Box::new(|scene, _| {
         let old = &scene.layers[0].params;
         let centers: Vec<[f32; 3]> = (0..old.len()).step_by(3).map(|r| old[GEOMETRY].read::<3>(r, 0)).collect();
         let mut edit = RowEdit { space: Space::Gaussians, parent: Vec::new(), born: Vec::new() };
@@ -370,7 +370,7 @@ fn warm_up_then_nodes_then_frame_by_frame_tracking() {
     };
     let mut stages = vec![warm_up, nodes];
     for frame in 1..3u32 {
-        let track: Hook<f32> = Box::new(move |scene, _| {
+        let track: Hook = Box::new(move |scene, _| {
             let layer = &mut scene.layers[0];
             // The model is plain keys: find them again, add a page, put the new model in place.
             let key = |name: &str| layer.params.find(name).expect("the node stage made it");
@@ -390,17 +390,17 @@ fn warm_up_then_nodes_then_frame_by_frame_tracking() {
     }
     let mut t = trainer(scene, stages, 200);
     assert_falls(&finish_stage(&mut t), 0.8, "warm-up");
-    assert_eq!(t.scene.layers[0].params.len(), 90);
-    let before = t.scene.layers[0].params.clone();
+    assert_eq!(t.scene().layers[0].params.len(), 90);
+    let before = t.scene().layers[0].params.clone();
     assert_falls(&finish_stage(&mut t), 0.9, "nodes");
-    assert_eq!(t.scene.layers[0].params.len(), 60, "the cloud was replaced");
-    let nodes = t.scene.layers[0].params.find("nodes").unwrap();
-    let moved = (0..30).any(|b| t.scene.layers[0].params[nodes].get(b, 0) != before[GEOMETRY].get(3 * b, 0));
+    assert_eq!(t.scene().layers[0].params.len(), 60, "the cloud was replaced");
+    let nodes = t.scene().layers[0].params.find("nodes").unwrap();
+    let moved = (0..30).any(|b| t.scene().layers[0].params[nodes].get(b, 0) != before[GEOMETRY].get(3 * b, 0));
     assert!(moved, "nodes learn");
     for frame in 1..3 {
-        let before = t.scene.layers[0].params.clone();
+        let before = t.scene().layers[0].params.clone();
         assert_falls(&finish_stage(&mut t), 0.97, "tracking");
-        let after = &t.scene.layers[0].params;
+        let after = &t.scene().layers[0].params;
         for key in before.keys() {
             assert_eq!(before[key], after[key], "`{}` is frozen in frame {frame}", after.info(key).name);
         }

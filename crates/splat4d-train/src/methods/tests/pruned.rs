@@ -2,9 +2,9 @@
 
 use super::nodes::Skinned;
 use super::*;
-use crate::densify::{self, Stats};
-use crate::optim::Moments;
-use crate::prune::{Keys, MaskConfig, Periodic, ScoreConfig, Spatial, key_masks, prune, score};
+use crate::learner::Learner;
+use crate::upkeep::worth::{Keys, MaskConfig, ScoreConfig, Spatial, key_masks, prune, score};
+use crate::upkeep::{Prune, PruneSettings};
 
 /// A deformation model whose nodes move between its two pages, and whose first ten Gaussians live for a moment.
 fn deformed(rows: usize) -> Scene<f32> {
@@ -21,7 +21,7 @@ fn deformed(rows: usize) -> Scene<f32> {
 #[test]
 fn a_deformation_model_is_scored_pruned_masked_and_trained_on() {
     let made = Made::new(4, 3, 16);
-    let mut scene = deformed(120);
+    let scene = deformed(120);
     let scores = score(&scene, &made, &ScoreConfig::default(), &mut |_, _| {}).unwrap();
     assert!(scores.layers[0].iter().filter(|s| **s > 0.0).count() > 60);
     // Its instants are looked at with the nodes where they are then, not at rest.
@@ -31,13 +31,14 @@ fn a_deformation_model_is_scored_pruned_masked_and_trained_on() {
     assert_ne!(score(&rested, &made, &ScoreConfig::default(), &mut |_, _| {}).unwrap().spatial, scores.spatial);
 
     let edits = prune(&scene, &scores, 0.5);
-    let (mut moments, mut stats) = (vec![Moments::new(&scene.layers[0].params)], Stats::new(&scene));
     let weights = |s: &Scene<f32>, row: usize| {
         let skin = s.layers[0].params.find("skin").unwrap();
         s.layers[0].params[skin].read::<4>(row, 0)
     };
     let old = scene.clone();
-    densify::apply(&mut scene, &mut moments, &mut stats, 0, &edits[0], &Rng::new(0, "prune", 0));
+    let mut learner = Learner::new(scene);
+    learner.apply(0, &edits[0], &Rng::new(0, "prune", 0));
+    let mut scene = learner.into_scene();
     assert_eq!(scene.len(), 60);
     assert!(edits[0].parent.iter().all(|&p| p >= 10), "those of a moment go first");
     assert!((0..60).all(|r| weights(&scene, r) == weights(&old, edits[0].parent[r] as usize)), "the skin goes along");
@@ -54,10 +55,10 @@ fn a_deformation_model_is_scored_pruned_masked_and_trained_on() {
 
     let mut stage = Stage::new("tune", 40);
     stage.groups = groups(&ORDINARY);
-    stage.prune = Some(Periodic { interval: 20, ratio: 0.2, views: 12, spatial: Spatial::Change });
+    stage.keep(Prune { settings: PruneSettings { interval: 20, ratio: 0.2, views: 12, spatial: Spatial::Change } });
     let mut t = trainer(scene, vec![stage], 60);
     let losses = finish_stage(&mut t);
     assert_falls(&losses, 0.8, "with half and then fewer of its Gaussians");
-    assert_eq!(t.scene.len(), 48);
-    assert_eq!(t.scene.layers[0].masks.as_ref().unwrap().rows(), 48, "masks follow pruning");
+    assert_eq!(t.scene().len(), 48);
+    assert_eq!(t.scene().layers[0].masks.as_ref().unwrap().rows(), 48, "masks follow pruning");
 }

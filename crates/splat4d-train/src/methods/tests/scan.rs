@@ -144,10 +144,10 @@ fn a_sequential_model_learns() {
         ..Stage::new("scan", 25)
     };
     let mut t = trainer(scan_scene(80), vec![stage], 200);
-    let before = t.scene.layers[0].params.clone();
+    let before = t.scene().layers[0].params.clone();
     assert_falls(&finish_stage(&mut t), 0.85, "scan");
     for name in ["controls", "decay"] {
         let key = before.find(name).unwrap();
-        assert_ne!(before[key], t.scene.layers[0].params[key], "`{name}` learns");
+        assert_ne!(before[key], t.scene().layers[0].params[key], "`{name}` learns");
     }
 }

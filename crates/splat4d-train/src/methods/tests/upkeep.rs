@@ -2,9 +2,14 @@
 //! Gaussian stands for.
 
 use super::*;
-use crate::densify::{Adc, Crowd, Crowding, Guided, Mcmc, Relocate};
-use crate::methods::control::adapt::NodeAdapt;
-use crate::prune::{Periodic, Spatial};
+use crate::learner::Learner;
+use crate::train::checkpoint;
+use crate::upkeep::Change as Rows;
+use crate::upkeep::worth::Spatial;
+use crate::upkeep::{
+    AdaptNodes, Context, Every, Guided, GuidedSettings, Merge, MergeSettings, NodeSettings, Once, Pair, Prune,
+    PruneSettings, Relocate, RelocateSettings, Upkeep,
+};
 use splat4d::motion::control::{ControlSpec, Curve, TrajectorySpec};
 use splat4d::motion::skin::SkinSpec;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -60,35 +65,33 @@ fn on_nodes() -> Scene<f32> {
 #[test]
 fn every_edit_of_rows_is_told_to_every_loss() {
     type Change = fn(&mut Stage);
+    const STEPS: Every = Every { first: 5, last: 30, interval: 5 };
     let edits: [(&str, Change); 8] = [
-        ("adc", |s| {
-            s.densify = Densify::Adc(Adc { grad_threshold: 1e-6, percent_dense: 0.01, retime_clones: false });
-            s.densify_steps = (5, 30, 5);
+        ("adc", |s| (layers::STRATEGIES[0].1)(s, STEPS)),
+        ("mcmc", |s| (layers::STRATEGIES[1].1)(s, STEPS)),
+        ("prune", |s| {
+            s.keep(Prune { settings: PruneSettings { interval: 5, ratio: 0.1, views: 8, spatial: Spatial::Opacity } });
         }),
-        ("mcmc", |s| {
-            s.densify = Densify::Mcmc(Mcmc { growth: 1.1, gradient_share: 0.5, noise_lr: 1.0 });
-            s.densify_steps = (5, 30, 5);
+        ("merging", |s| {
+            s.keep(Merge { settings: MergeSettings { pair: Pair::Prune, distance: 10.0, interval: 5 } });
         }),
-        ("prune", |s| s.prune = Some(Periodic { interval: 5, ratio: 0.1, views: 8, spatial: Spatial::Opacity })),
-        ("crowding", |s| s.crowding = Some(Crowding { what: Crowd::Prune, distance: 10.0, every: 5 })),
         ("relocation", |s| {
             let (from, interval, threshold, share) = (5, 5, 0.6, 0.1);
-            s.relocate = Some(Relocate { from, interval, threshold, share, gradient_share: 0.5 });
+            let settings = RelocateSettings { from, interval, threshold, share, gradient_share: 0.5 };
+            s.keep(Relocate { settings, densification: Every::NEVER });
         }),
-        ("guided sampling", |s| s.guided = Some(Guided { from: 0.2, times: 2, share: 0.3 })),
+        ("guided sampling", |s| s.keep(Guided { settings: GuidedSettings { from: 0.2, times: 2, share: 0.3 } })),
         ("nodes", |s| {
-            let steps = (5, 30, 5);
-            s.adapt = Some(Box::new(NodeAdapt { bind_interval: 100, steps, threshold: 0.0, cap: 14 }));
+            let settings = NodeSettings { bind_interval: 100, adapt_interval: 5, threshold: 0.0, cap: 14 };
+            s.keep(AdaptNodes { settings, span: (5, 30) });
         }),
-        ("a hook", |s| {
-            s.switches.push((
-                5,
-                Box::new(|scene, _| {
-                    let edit = splat4d::scene::RowEdit::prune(Space::Gaussians, (0..90).map(|r| r % 2 == 0));
-                    scene.layers[0].edit(&edit, &Rng::new(0, "half", 0));
-                    Ok(())
-                }),
-            ));
+        ("a change of the scene", |s| {
+            let halve = |scene: &mut Scene<f32>| {
+                let edit = splat4d::scene::RowEdit::prune(Space::Gaussians, (0..90).map(|r| r % 2 == 0));
+                scene.layers[0].edit(&edit, &Rng::new(0, "half", 0));
+                Ok(())
+            };
+            s.keep(Once { at: 5, change: halve });
         }),
     ];
     for (name, change) in edits {
@@ -101,15 +104,15 @@ fn every_edit_of_rows_is_told_to_every_loss() {
         let mut t = sized(on_nodes(), vec![stage], 48);
         let mut edited = 0;
         while !t.is_done() {
-            let (rows, nodes) = (t.scene.len(), t.scene.layers[0].params.rows_of(Space::Nodes));
+            let (rows, nodes) = (t.scene().len(), t.scene().layers[0].params.rows_of(Space::Nodes));
             let told = || [&probe, &param].map(|e| e.heard.load(Ordering::Relaxed));
             let before = told();
             let step = t.step().unwrap().expect("no fault");
-            let after = t.scene.layers[0].params.rows_of(Space::Nodes);
-            let moved = step.change.moved > 0 || (rows, nodes) != (t.scene.len(), after);
+            let after = t.scene().layers[0].params.rows_of(Space::Nodes);
+            let moved = step.change.moved > 0 || (rows, nodes) != (t.scene().len(), after);
             edited += usize::from(moved);
             for (before, after) in before.into_iter().zip(told()) {
-                assert!(after > before || !moved, "{name}: rows were edited, and nobody said so");
+                assert!(after > before || !moved, "{name}: rows were edited, and losses were not told");
             }
         }
         assert!(edited > 0, "{name} edited nothing: the test must look at something");
@@ -125,7 +128,7 @@ fn sized(scene: Scene<f32>, stages: Vec<Stage>, size: usize) -> Trainer<'static>
 
 #[test]
 fn guided_sampling_finds_a_sky_that_no_gaussian_stands_for() {
-    let run = |guided: Option<Guided>| {
+    let run = |guided: Option<GuidedSettings>| {
         // All at the ball: the sky of the capture is not the background.
         let mut p = cloud::<f32>(60, LifeKind::GaussHalf, 3);
         let motion = build(&Spec::Spacetime(SpacetimeSpec::default()), &mut p).unwrap();
@@ -137,7 +140,10 @@ fn guided_sampling_finds_a_sky_that_no_gaussian_stands_for() {
         }
         let mut scene = one_layer(p, motion, LifeKind::GaussHalf);
         scene.background = [0.9, 0.1, 0.1];
-        let stage = Stage { batch: 2, groups: groups(&ORDINARY), guided, ..Stage::new("guided", 50) };
+        let mut stage = Stage { batch: 2, groups: groups(&ORDINARY), ..Stage::new("guided", 50) };
+        if let Some(settings) = guided {
+            stage.keep(Guided { settings });
+        }
         let mut t = sized(scene, vec![stage], 48);
         t.settings.background = [0.9, 0.1, 0.1];
         let (mut added, mut mse) = (0, Vec::new());
@@ -148,7 +154,64 @@ fn guided_sampling_finds_a_sky_that_no_gaussian_stands_for() {
         }
         (added, mse[mse.len() - 8..].iter().sum::<f64>() / mse[..8].iter().sum::<f64>())
     };
-    let [(none, left), (added, mended)] = [None, Some(Guided { from: 0.1, times: 3, share: 0.5 })].map(run);
+    let [(none, left), (added, mended)] = [None, Some(GuidedSettings { from: 0.1, times: 3, share: 0.5 })].map(run);
     assert!(none == 0 && added > 20, "{added} were added");
     assert!(mended < 0.99 * left, "{mended} of the error is left, {left} without");
+}
+
+/// An operation of a caller's own: every seven steps the next Gaussian turns white. It remembers which one is next.
+struct Whiten {
+    next: u32,
+}
+
+impl Upkeep for Whiten {
+    fn name(&self) -> &str {
+        "whiten"
+    }
+    fn due(&self, at: &crate::upkeep::At) -> bool {
+        at.step.is_multiple_of(7)
+    }
+    fn run(&mut self, learner: &mut Learner, _: &Context<'_>) -> Result<Rows> {
+        learner.scene_mut().layers[0].params[SH].write(self.next as usize, 0, [1.5f32; 3]);
+        self.next += 1;
+        Ok(Default::default())
+    }
+    fn state(&self) -> Vec<u32> {
+        vec![self.next]
+    }
+    fn restore(&mut self, state: &[u32]) {
+        self.next = state.first().copied().unwrap_or(0);
+    }
+}
+
+/// One file and one line add an operation: it runs, is in checkpoints, and goes on where it was.
+#[test]
+fn an_operation_of_ones_own_runs_and_resumes_to_the_bit() {
+    let start = || {
+        let still = build(&Spec::Still, &mut Params::<f32>::new(0, 1, &[])).unwrap();
+        let scene = one_layer(cloud(30, LifeKind::Infinite, 3), still, LifeKind::Infinite);
+        let mut stage = Stage { groups: groups(&ORDINARY), ..Stage::new("whiten", 30) };
+        stage.keep(Whiten { next: 0 });
+        trainer(scene, vec![stage], 30)
+    };
+    let identity = checkpoint::Identity::default();
+    let saved = |t: &Trainer<'_>| checkpoint::write(t, &identity, &Default::default()).unwrap();
+    let mut whole = start();
+    let mut kept = Vec::new();
+    while !whole.is_done() {
+        whole.step().unwrap().expect("no fault");
+        if whole.progress.iteration == 16 {
+            kept = saved(&whole);
+        }
+        if whole.progress.iteration == 14 {
+            assert_eq!(whole.scene().layers[0].params[SH].read::<3>(1, 0), [1.5; 3], "the second one's turn");
+        }
+    }
+    let mut again = start();
+    checkpoint::read(&kept, &mut again, &identity).unwrap();
+    while !again.is_done() {
+        again.step().unwrap().expect("no fault");
+    }
+    assert!(saved(&again) == saved(&whole), "resumed, it ends elsewhere");
+    assert_eq!(again.stages[0].upkeep[0].state(), [4]);
 }

@@ -1,8 +1,10 @@
 use super::*;
 use crate::capture::frames::{Frames, Picture};
-use crate::densify::{Densify, Limits};
-use crate::train::loss::{Exposure, TrainLoss};
+use crate::event::Progress;
+use crate::learner::Exposure;
+use crate::train::loss::TrainLoss;
 use crate::train::trainer::{Settings, Trainer};
+use crate::upkeep::Limits;
 use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::sh::rgb_to_dc;
 use splat4d::math::{Rng, Se3};
@@ -150,13 +152,13 @@ fn trainer(s: Scene<f32>, plan: &Plan, frames: Arc<dyn Frames>, exposure: Option
         limits: Limits { cap: 2000, extent: plan.extent, min_opacity: 0.005 },
         background: [0.0; 3],
         sh_degree: 0,
-        opacity_reset_interval: 0,
         exposure_lr: plan.recipe.exposure_lr,
     };
     let draw = Box::new(Renderer::new(RenderConfig::default()));
-    let mut loss = TrainLoss::photometric(0.2);
-    loss.exposure = exposure;
-    Trainer::new(s, TrackedProgram.stages(plan), frames, draw, loss, settings)
+    let loss = TrainLoss::photometric(0.2);
+    let mut trainer = Trainer::new(s, TrackedProgram.stages(plan), frames, draw, loss, settings);
+    trainer.learner.exposure = exposure;
+    trainer
 }
 
 fn run(t: &mut Trainer<'_>) {
@@ -190,7 +192,7 @@ fn a_turning_ball_is_followed_and_without_ties_it_is_not() {
         // Frame 0 is known: what is measured is the tracking.
         t.stages[0].groups.clear();
         run(&mut t);
-        error(&t.scene, &world, FRAMES - 1, 0..260) / (2.0 * RADIUS)
+        error(t.scene(), &world, FRAMES - 1, 0..260) / (2.0 * RADIUS)
     };
     let tied = track(&[]);
     let free = track(&["rigid=0", "rot=0", "iso=0"]);
@@ -206,7 +208,7 @@ fn what_goes_on_evenly_needs_no_steps() {
     let mut stages = TrackedProgram.stages(&plan);
     let mut s = scene(params, &first_frame(false));
     for (k, stage) in stages.iter_mut().enumerate().skip(1) {
-        stage.start.take().unwrap()(&mut s, &mut |_, _, _| {}).unwrap();
+        stage.start.take().unwrap()(&mut s, &mut Progress(&mut |_| {})).unwrap();
         let page = |s: &Scene<f32>| splat4d::motion::tracked::page_of(&s.layers[0].params, k).unwrap();
         if k == 1 {
             // The first step is to be seen; all others follow.
@@ -228,12 +230,12 @@ fn masks_tell_what_stands_and_it_stays() {
     while t.progress.stage == 0 {
         t.step().unwrap().expect("no fault");
     }
-    let p = &t.scene.layers[0].params;
+    let p = &t.scene().layers[0].params;
     let logits = &p[p.find(FOREGROUND).unwrap()];
     let right = (0..260).filter(|&r| (logits.get(r, 0) > 0.0) == (r < 200)).count();
     assert!(right >= 250, "{right} of 260 Gaussians are on their side");
     run(&mut t);
-    let p = &t.scene.layers[0].params;
+    let p = &t.scene().layers[0].params;
     let logits = &p[p.find(FOREGROUND).unwrap()];
     let page = splat4d::motion::tracked::page_of(p, 2).unwrap();
     let mut moved: Vec<f32> = (0..260)
@@ -256,14 +258,14 @@ fn only_the_newest_page_learns_and_memory_does_not_grow() {
         t.step().unwrap().expect("no fault");
     }
     for stage in 1..6 {
-        let before = t.scene.layers[0].params.clone();
+        let before = t.scene().layers[0].params.clone();
         while t.progress.stage == stage && !t.is_done() {
             t.step().unwrap().expect("no fault");
             if t.progress.stage_step == 3 {
-                sizes.push(t.moments[0].bytes());
+                sizes.push(t.learner.moments()[0].bytes());
             }
         }
-        let after = &t.scene.layers[0].params;
+        let after = &t.scene().layers[0].params;
         for key in before.keys().filter(|&k| k != GEOMETRY || stage > 1) {
             assert_eq!(before[key], after[key], "`{}` rests while frame {stage} learns", after.info(key).name);
         }
@@ -290,7 +292,7 @@ fn exposures_are_learnt_on_frame_0_and_kept() {
     let mut t = trainer(scene(params, &first_frame(false)), &plan, Arc::new(frames), Some(exposure));
     t.stages[0].groups.clear();
     let learnt = |t: &Trainer<'_>| {
-        let e = t.loss.exposure.as_ref().unwrap();
+        let e = t.learner.exposure.as_ref().unwrap();
         (0..4).map(|c| e.params[e.key()].read::<6>(c, 0)).collect::<Vec<_>>()
     };
     while t.progress.stage == 0 {
@@ -318,7 +320,7 @@ fn tuning_looks_at_every_frame_and_moves_every_page() {
         assert!(learns(&page_name("means", k)) && learns(&page_name("quats", k)), "page {k} rests");
     }
     assert!(learns("means") && learns("sh") && !learns(FOREGROUND));
-    assert!(stage.start.is_none() && stage.end.is_none() && stage.switches.is_empty() && stage.crowding.is_none());
+    assert!(stage.start.is_none() && stage.end.is_none() && stage.upkeep.is_empty());
 }
 
 #[test]
@@ -349,6 +351,6 @@ fn steps_are_shared_out_and_every_frame_has_its_stage() {
         let later: Vec<usize> = stages[1..].iter().map(|s| s.iterations).collect();
         let (low, high) = (later.iter().min().copied(), later.iter().max().copied());
         assert!(high.unwrap_or(0) - low.unwrap_or(0) <= 1, "{later:?}");
-        assert!(stages[1..].iter().all(|s| s.densify == Densify::None && s.params.len() == 1));
+        assert!(stages[1..].iter().all(|s| s.upkeep.is_empty() && s.params.len() == 1));
     }
 }

@@ -80,11 +80,12 @@ impl Bed {
             name: "pruned".into(),
             iterations: FLOATS,
             groups: quantise::tuned(base.groups.clone(), 0.5),
-            densify_steps: (0, 0, 0),
+            upkeep: Vec::new(),
+            noise: None,
             half_size_steps: 0,
-            start: Some(Box::new(move |scene, tell| {
+            start: Some(Box::new(move |scene, progress| {
                 count.fetch_add(1, Ordering::Relaxed);
-                tell("pruning", 0, 1);
+                progress.phase("pruning", 0, 1);
                 for layer in &mut scene.layers {
                     let edit = RowEdit::prune(Space::Gaussians, (0..layer.params.len()).map(|i| i % 3 != 0));
                     layer.edit(&edit, &Rng::new(0, "prune", 0));

@@ -1,6 +1,5 @@
 //! Short training in memory, on the tiny capture of the tests of runs.
 
-use crate::densify::Change;
 use crate::init::{self, Seeds};
 use crate::methods::program_of;
 use crate::recipe::Recipe;
@@ -9,6 +8,7 @@ use crate::train::dataset::Dataset;
 use crate::train::run::tests::{Place, recipe};
 use crate::train::run::{Bench, training_frames};
 use crate::train::trainer::Trainer;
+use crate::upkeep::Change;
 use splat4d::format::scene;
 use splat4d::layers::{Evaluation, Scene};
 use splat4d::scene::{Rows, Space, Time};
@@ -40,7 +40,7 @@ impl Ran {
     }
 
     pub(super) fn scene(&self) -> &Scene<f32> {
-        &self.trainer.scene
+        self.trainer.scene()
     }
 
     /// Nodes of the first layer.
@@ -105,7 +105,7 @@ impl Bed {
             let step = trainer.step().unwrap().unwrap_or_else(|fault| panic!("{line}: {}", fault.0));
             look(&trainer, step.change);
             mse.push(step.mse);
-            rows.push(trainer.scene.len());
+            rows.push(trainer.scene().len());
             change.added += step.change.added;
             change.moved += step.change.moved;
             change.removed += step.change.removed;

@@ -20,7 +20,7 @@ fn check(lines: &[&str]) {
             }
             trainer.step().unwrap().unwrap_or_else(|fault| panic!("{line}: {}", fault.0));
         }
-        let whole = bytes(&trainer.scene);
+        let whole = bytes(trainer.scene());
         // Every other one: what goes wrong goes wrong at more than one place.
         for (iteration, checkpoint) in kept.iter().step_by(2) {
             let again = pool.install(|| {
@@ -30,7 +30,7 @@ fn check(lines: &[&str]) {
                 while !trainer.is_done() {
                     trainer.step().unwrap().unwrap_or_else(|fault| panic!("{line}: {}", fault.0));
                 }
-                bytes(&trainer.scene)
+                bytes(trainer.scene())
             });
             assert!(again == whole, "{line}: resumed after step {iteration}, it ends elsewhere");
         }

@@ -123,14 +123,14 @@ fn clones_get_a_time_of_their_own() {
     for (retime, twins) in [(false, true), (true, false)] {
         let (mut seen, mut before) = (0, 80);
         bed.watch(&format!("retime_clones={retime} percent_dense=1"), |trainer, change| {
-            let p = &trainer.scene.layers[0].params;
+            let p = &trainer.scene().layers[0].params;
             if change.added > 0 && change.removed == 0 && seen == 0 {
                 // Clones stand behind those that were there; no step has moved them yet.
                 let centers: Vec<f32> = (0..p.len()).map(|r| p[LIFE].get(r, 0)).collect();
                 let (old, new) = centers.split_at(before);
                 assert_eq!(new.len(), change.added);
                 assert_eq!(new.iter().all(|c| old.contains(c)), twins, "retime_clones={retime}");
-                let [first, last] = trainer.scene.clip.map(|t| t as f32);
+                let [first, last] = trainer.scene().clip.map(|t| t as f32);
                 assert!(twins || new.iter().all(|c| (first..=last).contains(c)));
                 seen += 1;
             }
@@ -170,9 +170,9 @@ fn what_stands_still_becomes_a_layer_and_both_layers_learn() {
         let line = format!("motion={motion} static_split={reach} static_split_from=0.5 lambda_rigid=1");
         let mut at_the_split: Option<Vec<[f32; 3]>> = None;
         let ran = bed.watch(&line, |trainer, _| {
-            if let (Some(still), None) = (trainer.scene.layers.get(1), &at_the_split) {
+            if let (Some(still), None) = (trainer.scene().layers.get(1), &at_the_split) {
                 assert!(!still.params.is_empty());
-                at_the_split = Some(places(&trainer.scene, 1, Space::Gaussians, 0.0));
+                at_the_split = Some(places(trainer.scene(), 1, Space::Gaussians, 0.0));
             }
         });
         let layers = &ran.scene().layers;

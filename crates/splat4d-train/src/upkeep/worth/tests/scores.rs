@@ -1,7 +1,7 @@
 //! Every spatial score, whatever it is made of.
 
+use super::super::weighing::root_of_determinant;
 use super::*;
-use crate::prune::weighing::root_of_determinant;
 use splat4d::render::{Sensitivity, Shot};
 
 fn of(spatial: Spatial) -> ScoreConfig {

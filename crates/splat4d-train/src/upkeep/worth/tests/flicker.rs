@@ -1,12 +1,12 @@
 //! A still backdrop that every short life repeats: four of five Gaussians are superfluous, and the score finds them.
 
 use super::*;
-use crate::densify::{self, Limits, Stats};
 use crate::eval::metrics::psnr;
+use crate::learner::Learner;
 use crate::methods::{Group, Rate, Stage};
-use crate::optim::Moments;
 use crate::train::loss::TrainLoss;
 use crate::train::trainer::{Settings, Trainer};
+use crate::upkeep::{Limits, Prune, PruneSettings};
 use std::sync::Arc;
 
 /// Gaussians of the truth, and for each of them so many that only flicker.
@@ -53,7 +53,6 @@ fn trainer(scene: Scene<f32>, frames: Arc<Drawn>) -> Trainer<'static> {
         limits: Limits { cap: 10_000, extent: 4.0, min_opacity: 0.005 },
         background: [0.1, 0.2, 0.3],
         sh_degree: 0,
-        opacity_reset_interval: 0,
         exposure_lr: 0.0,
     };
     let draw = Box::new(Renderer::new(RenderConfig::default()));
@@ -66,7 +65,7 @@ fn tune(scene: Scene<f32>, frames: Arc<Drawn>) -> Scene<f32> {
     while !t.is_done() {
         t.step().unwrap().expect("no fault");
     }
-    t.scene
+    t.learner.into_scene()
 }
 
 fn quality(scene: &Scene<f32>, frames: &Drawn) -> f64 {
@@ -116,10 +115,9 @@ fn a_flickering_copy_of_the_backdrop_goes_and_the_picture_stays() {
     assert_eq!(edits[0].len(), TRUTH);
     let lasting = edits[0].parent.iter().filter(|&&p| (p as usize) < TRUTH).count();
     assert!(lasting * 10 >= TRUTH * 9, "{lasting} of {TRUTH} that last are kept");
-    let mut pruned = trained.clone();
-    let (mut moments, mut stats) = (vec![Moments::new(&pruned.layers[0].params)], Stats::new(&pruned));
-    densify::apply(&mut pruned, &mut moments, &mut stats, 0, &edits[0], &Rng::new(0, "prune", 0));
-    let after = quality(&tune(pruned, frames.clone()), &frames);
+    let mut pruned = Learner::new(trained.clone());
+    pruned.apply(0, &edits[0], &Rng::new(0, "prune", 0));
+    let after = quality(&tune(pruned.into_scene(), frames.clone()), &frames);
     assert!(after >= before - BOUND, "{before} dB before, {after} dB with a fifth of the Gaussians");
 
     // At random the same share costs far more.
@@ -142,7 +140,8 @@ fn rows_go_while_a_scene_is_trained_and_the_run_repeats() {
     let run = |resumed: bool| {
         let fresh = || {
             let mut t = trainer(start(), frames.clone());
-            t.stages[0].prune = Some(Periodic { interval: 10, ratio: 0.3, views: 9, spatial: Spatial::Change });
+            let settings = PruneSettings { interval: 10, ratio: 0.3, views: 9, spatial: Spatial::Change };
+            t.stages[0].keep(Prune { settings });
             t.stages[0].iterations = 34;
             t
         };
@@ -150,16 +149,16 @@ fn rows_go_while_a_scene_is_trained_and_the_run_repeats() {
         while !t.is_done() {
             let stepped = t.step().unwrap().expect("no fault");
             if stepped.change.removed > 0 {
-                sizes.push((t.progress.stage_step, t.scene.len()));
+                sizes.push((t.progress.stage_step, t.scene().len()));
             }
             if resumed && t.progress.stage_step == 15 {
                 let old = std::mem::replace(&mut t, fresh());
-                t.restore(old.scene, old.moments, old.stats, old.progress);
+                t.restore(old.learner, old.progress);
             }
         }
         assert_eq!(sizes, [(10, 140), (20, 98)], "none at step 30: too few steps are left");
-        assert_eq!(t.stats.tables[0].rows(), 98);
-        let rows: Vec<[f32; 11]> = (0..98).map(|r| t.scene.layers[0].params[GEOMETRY].read::<11>(r, 0)).collect();
+        assert_eq!(t.learner.stats().tables[0].rows(), 98);
+        let rows: Vec<[f32; 11]> = (0..98).map(|r| t.scene().layers[0].params[GEOMETRY].read::<11>(r, 0)).collect();
         rows
     };
     assert!(run(false) == run(true), "the same bits");

@@ -4,30 +4,84 @@
 //! Where they go is drawn in space-time from opacity and screen gradient (FreeTimeGS): a row carries its life with it.
 //! Source: Kheradmand et al. 2024 (3DGS as MCMC) §3; Wang et al. 2025 (FreeTimeGS) §3.3.
 
-use super::{Change, Limits, Stats, apply, is_dead, logit, opacity};
-use crate::optim::Moments;
-use splat4d::layers::{Layer, Scene};
-use splat4d::math::{Real, Rng, sym3};
-use splat4d::motion::for_rows;
-use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
-use splat4d::scene::{Born, GEOMETRY, RowEdit, Rows, Space};
+use super::{At, Change, Context, Every, Limits, Order, Upkeep, grow, is_dead, logit, opacity};
+use crate::Result;
+use crate::learner::Learner;
+use crate::recipe::Recipe;
+use serde::{Deserialize, Serialize};
+use splat4d::math::Rng;
+use splat4d::scene::params::OPACITY;
+use splat4d::scene::{Born, GEOMETRY, RowEdit, Space};
 
 /// More copies than this on one place are not told apart (as in gsplat).
 const MAX_COPIES: usize = 51;
-/// Opaque Gaussians get less than a ten-thousandth of the noise: not worth three normal numbers.
-const LEAST_GATE: f64 = 1e-4;
-/// Slope of the sigmoid that ends the noise above the dead opacity (Kheradmand et al. 2024).
-const NOISE_SLOPE: f64 = 100.0;
 
-/// The strategy's settings.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Mcmc {
+/// Settings of growth by Markov chain Monte Carlo.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct McmcSettings {
     /// Growth a densification.
     pub growth: f64,
     /// Share of the 2D gradient, against opacity, in where Gaussians go.
     pub gradient_share: f64,
-    /// Strength of the position noise (times the rate of positions).
-    pub noise_lr: f64,
+}
+
+impl McmcSettings {
+    /// As a recipe has them.
+    pub fn of(r: &Recipe) -> Self {
+        Self { growth: r.growth, gradient_share: r.relocate_gradient }
+    }
+}
+
+impl Default for McmcSettings {
+    fn default() -> Self {
+        Self::of(&Recipe::default())
+    }
+}
+
+/// Markov chain Monte Carlo (Kheradmand et al. 2024), relocation in space-time. Its noise on positions is part of the
+/// step: [`Noise`](crate::optim::Noise).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Mcmc {
+    /// How.
+    pub settings: McmcSettings,
+    /// When.
+    pub steps: Every,
+}
+
+impl Mcmc {
+    /// As a recipe has it; `None`: another strategy.
+    pub fn of(r: &Recipe) -> Option<Self> {
+        let some = || Self { settings: McmcSettings::of(r), steps: Every::densification(r) };
+        (r.strategy == "mcmc").then(some)
+    }
+}
+
+impl Upkeep for Mcmc {
+    fn name(&self) -> &str {
+        "mcmc"
+    }
+
+    fn order(&self) -> Order {
+        Order::Grow
+    }
+
+    fn due(&self, at: &At) -> bool {
+        self.steps.is_due(at.step)
+    }
+
+    fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
+        let settings = self.settings;
+        Ok(grow(learner, c, |learner, layer, spare, rng| settings.layer(learner, &c.limits, layer, spare, rng)))
+    }
+
+    fn densification(&mut self) -> Option<&mut Every> {
+        Some(&mut self.steps)
+    }
+
+    fn growth(&self, at: &At) -> f64 {
+        if self.due(at) { self.settings.growth } else { 1.0 }
+    }
 }
 
 /// Opacity and scale factor of each of `copies` Gaussians that together look like one of opacity `o`.
@@ -48,17 +102,9 @@ pub fn relocated(o: f64, copies: usize) -> (f64, f64) {
     (each, o / sum)
 }
 
-impl Mcmc {
-    pub(super) fn run(
-        &self,
-        scene: &mut Scene<f32>,
-        moments: &mut [Moments<f32>],
-        stats: &mut Stats,
-        limits: &Limits,
-        layer: usize,
-        spare: &mut usize,
-        rng: Rng,
-    ) -> Change {
+impl McmcSettings {
+    fn layer(&self, learner: &mut Learner, limits: &Limits, layer: usize, spare: &mut usize, rng: Rng) -> Change {
+        let scene = learner.scene();
         let rows = scene.layers[layer].params.len();
         let spans = scene.layers[layer].spans();
         let dead: Vec<bool> = (0..rows).map(|r| is_dead(scene, layer, r, limits.min_opacity, spans[r])).collect();
@@ -69,25 +115,26 @@ impl Mcmc {
         let grown = ((rows as f64 * self.growth).ceil() as usize).saturating_sub(rows);
         let added = grown.min(*spare);
         *spare -= added;
-        let places = Places::new(scene, stats, layer, live, self.gradient_share);
+        let places = Places::new(learner, layer, live, self.gradient_share);
         let moves: Vec<u32> = (0..rows as u32).filter(|&r| dead[r as usize]).collect();
-        join(scene, moments, stats, layer, limits, &places, &moves, added, rng);
+        join(learner, limits, &places, &moves, added, rng);
         Change { added, moved: moves.len(), removed: 0 }
     }
 }
 
 /// Where Gaussians go: rows drawn in proportion to share·gradient + (1 − share)·opacity, each over its mean.
 pub(super) struct Places {
+    layer: usize,
     live: Vec<usize>,
     cumulative: Vec<f64>,
 }
 
 impl Places {
     /// The `live` rows of a layer; where nothing was seen to have a gradient, opacity alone counts.
-    pub(super) fn new(scene: &Scene<f32>, stats: &Stats, layer: usize, live: Vec<usize>, share: f64) -> Self {
+    pub(super) fn new(learner: &Learner, layer: usize, live: Vec<usize>, share: f64) -> Self {
         let mean = |f: &dyn Fn(usize) -> f64| (live.iter().map(|&r| f(r)).sum::<f64>() / live.len() as f64).max(1e-30);
-        let gradient = |r: usize| f64::from(stats.gradient(layer, r));
-        let opaque = |r: usize| opacity(scene, layer, r);
+        let gradient = |r: usize| f64::from(learner.stats().gradient(layer, r));
+        let opaque = |r: usize| opacity(learner.scene(), layer, r);
         let (mean_gradient, mean_opacity) = (mean(&gradient), mean(&opaque));
         let share = if mean_gradient > 1e-29 { share } else { 0.0 };
         let mut total = 0.0;
@@ -98,29 +145,20 @@ impl Places {
                 total
             })
             .collect();
-        Self { live, cumulative }
+        Self { layer, live, cumulative }
     }
 
     /// The i-th draw.
     fn draw(&self, rng: Rng, i: u64) -> usize {
-        let u = rng.uniform(i) * self.cumulative.last().expect("somebody is alive");
+        let u = rng.uniform(i) * self.cumulative.last().expect("a live row is there to be drawn");
         self.live[self.cumulative.partition_point(|&c| c <= u).min(self.live.len() - 1)]
     }
 }
 
-/// Moves the rows `moves` (increasing) onto drawn places and adds `added` more there; whoever shares a place then looks,
-/// with the others, as its one Gaussian did: [`relocated`].
-pub(super) fn join(
-    scene: &mut Scene<f32>,
-    moments: &mut [Moments<f32>],
-    stats: &mut Stats,
-    layer: usize,
-    limits: &Limits,
-    places: &Places,
-    moves: &[u32],
-    added: usize,
-    rng: Rng,
-) {
+/// Moves the rows `moves` (increasing) onto drawn places of the same layer and adds `added` more there; those that share a
+/// place then look together as its one Gaussian did: [`relocated`].
+pub(super) fn join(learner: &mut Learner, limits: &Limits, places: &Places, moves: &[u32], added: usize, rng: Rng) {
+    let (scene, layer) = (learner.scene(), places.layer);
     let rows = scene.layers[layer].params.len();
     let mut copies = vec![1usize; rows];
     let mut draws = 0;
@@ -145,8 +183,8 @@ pub(super) fn join(
         }
     }
     let old: Vec<f64> = (0..rows).map(|r| opacity(scene, layer, r)).collect();
-    apply(scene, moments, stats, layer, &edit, &rng);
-    let layer = &mut scene.layers[layer];
+    learner.apply(layer, &edit, &rng);
+    let layer = &mut learner.scene_mut().layers[layer];
     for (j, &parent) in edit.parent.iter().enumerate() {
         let n = copies[parent as usize];
         if n > 1 {
@@ -158,42 +196,10 @@ pub(super) fn join(
     }
 }
 
-/// Shakes the means of the active rows: Σ·ε·σ(−100(o − o_dead))·`strength`, ε ~ N(0, I).
-pub fn add_noise(layer: &mut Layer<f32>, active: &[bool], strength: f64, min_opacity: f64, rng: Rng) {
-    if strength == 0.0 {
-        return;
-    }
-    let [geometry] = layer.params.get_mut([GEOMETRY]);
-    // The opacity, and its logit, from which the gate is below the least one: most Gaussians are told by one number.
-    let opaque = min_opacity + (1.0 / LEAST_GATE - 1.0).ln() / NOISE_SLOPE;
-    let limit = if opaque < 1.0 { (opaque / (1.0 - opaque)).ln() as f32 } else { f32::INFINITY };
-    for_rows([geometry], Rows::All, |_, row, [geometry]| {
-        if !active[row] || geometry.read::<1>(row, OPACITY)[0] > limit {
-            return 0.0;
-        }
-        let g = geometry.read::<11>(row, 0);
-        let gate = (-NOISE_SLOPE * (f64::from(g[OPACITY]).sigmoid() - min_opacity)).sigmoid();
-        let c = sym3::from_quat_log_scales(
-            [g[QUAT], g[QUAT + 1], g[QUAT + 2], g[QUAT + 3]],
-            [g[LOG_SCALE], g[LOG_SCALE + 1], g[LOG_SCALE + 2]],
-        )
-        .map(f64::from);
-        let e: [f64; 3] = std::array::from_fn(|k| rng.fork(row as u64).normal(k as u64) * gate * strength);
-        let shift = [
-            c[0] * e[0] + c[1] * e[1] + c[2] * e[2],
-            c[1] * e[0] + c[3] * e[1] + c[4] * e[2],
-            c[2] * e[0] + c[4] * e[1] + c[5] * e[2],
-        ];
-        geometry.add(row, 0, shift.map(|x| x as f32));
-        0.0
-    });
-}
-
 #[cfg(test)]
 mod tests {
-    use super::super::tests::scene;
+    use super::super::tests::{context, scene};
     use super::*;
-    use crate::densify::Densify;
 
     #[test]
     fn one_copy_is_the_identity_and_copies_keep_center_alpha_and_line_integral() {
@@ -214,28 +220,14 @@ mod tests {
     fn the_dead_move_counts_are_conserved_and_the_cap_holds() {
         let mut s = scene(100);
         (0..10).for_each(|r| s.layers[0].params[GEOMETRY].set(r, OPACITY, -9.0));
-        let mut moments: Vec<_> = s.layers.iter().map(|l| Moments::new(&l.params)).collect();
-        let mut stats = Stats::new(&s);
-        let mcmc = Densify::Mcmc(Mcmc { growth: 1.05, gradient_share: 0.5, noise_lr: 5e5 });
+        let mut learner = Learner::new(s);
+        let mut mcmc = Mcmc { settings: McmcSettings { growth: 1.05, gradient_share: 0.5 }, steps: Every::NEVER };
         let limits = Limits { cap: 103, extent: 1.0, min_opacity: 0.005 };
-        let change = mcmc.run(&mut s, &mut moments, &mut stats, &limits, 7, 0);
-        assert_eq!((change.added, change.moved, s.len()), (3, 10, 103));
-        assert_eq!(moments[0].table(GEOMETRY).rows(), 103);
-        assert!((0..103).all(|r| opacity(&s, 0, r) > 0.005));
-        let again = mcmc.run(&mut s, &mut moments, &mut stats, &limits, 7, 1);
+        let change = mcmc.run(&mut learner, &context(limits, 7, 0)).unwrap();
+        assert_eq!((change.added, change.moved, learner.scene().len()), (3, 10, 103));
+        assert_eq!(learner.moments()[0].table(GEOMETRY).rows(), 103);
+        assert!((0..103).all(|r| opacity(learner.scene(), 0, r) > 0.005));
+        let again = mcmc.run(&mut learner, &context(limits, 7, 1)).unwrap();
         assert_eq!(again, Change::default());
-    }
-
-    #[test]
-    fn noise_spares_the_opaque_and_the_resting() {
-        let mut s = scene(20);
-        (0..20).for_each(|r| s.layers[0].params[GEOMETRY].set(r, OPACITY, if r < 10 { -5.5 } else { 2.0 }));
-        let before = s.layers[0].params[GEOMETRY].clone();
-        let active: Vec<bool> = (0..20).map(|r| r % 2 == 0).collect();
-        add_noise(&mut s.layers[0], &active, 1.0, 0.005, Rng::new(0, "noise", 0));
-        for r in 0..20 {
-            let moved = s.layers[0].params[GEOMETRY].get(r, 0) != before.get(r, 0);
-            assert_eq!(moved, r < 10 && r % 2 == 0, "row {r}");
-        }
     }
 }

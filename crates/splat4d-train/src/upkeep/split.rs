@@ -2,8 +2,11 @@
 //! cannot (as in Swift4D, Wu et al. 2025, and Ex4DGS, Lee et al. 2024). They are then free to play, cannot flicker, and
 //! what is left for the motion model is what moves.
 
-use super::{EVERY, Group, Plan, Program, Stage};
+use super::{At, Change, Context, Upkeep};
 use crate::Result;
+use crate::learner::Learner;
+use crate::recipe::Recipe;
+use serde::{Deserialize, Serialize};
 use splat4d::layers::{ALWAYS, Evaluation, Layer, Scene, freeze_rows};
 use splat4d::math::Rng;
 use splat4d::motion::Still;
@@ -18,28 +21,68 @@ const LASTING: f64 = 0.9;
 /// Change of the covariance, of its trace, from which on a shape counts as changed.
 const SAME_SHAPE: f64 = 0.05;
 /// Column groups that a still layer has.
-const COMMON: [&str; 5] = ["means", "quats", "log_scales", "opacity_logits", "sh"];
+pub const STILL_COLUMNS: [&str; 5] = ["means", "quats", "log_scales", "opacity_logits", "sh"];
 /// What the layer is called.
 pub const STILL_LAYER: &str = "still";
 
-/// The stages of a program as the recipe has them: with `static_split`, still Gaussians move into a layer of their own
-/// after that share of the last stage.
-pub fn stages(program: &dyn Program, plan: &Plan) -> Vec<Stage> {
-    let r = &plan.recipe;
-    let mut stages = program.stages(plan);
-    let splits = r.static_split > 0.0 && program.capabilities(plan).moves;
-    let Some(last) = stages.last_mut().filter(|_| splits) else { return stages };
-    let reach = r.static_split * plan.extent;
-    let at = (last.iterations as f64 * r.static_split_from) as usize;
-    last.switches.push((at, Box::new(move |scene, _| split(scene, reach).map(|_| ()))));
-    share_groups(last);
-    stages
+/// Settings of the split.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct SplitSettings {
+    /// Gaussians that move less than this become a still layer, of the extent; 0: never.
+    pub reach: f64,
+    /// When they do, as a share of the last stage.
+    pub from: f64,
 }
 
-/// Lets what every layer has learn in all of them.
-pub fn share_groups(stage: &mut Stage) {
-    let common = |g: &&mut Group| COMMON.contains(&g.column.as_str());
-    stage.groups.iter_mut().filter(common).for_each(|g| g.layer = EVERY);
+impl SplitSettings {
+    /// As a recipe has them.
+    pub fn of(r: &Recipe) -> Self {
+        Self { reach: r.static_split, from: r.static_split_from }
+    }
+}
+
+impl Default for SplitSettings {
+    fn default() -> Self {
+        Self::of(&Recipe::default())
+    }
+}
+
+/// See the module's documentation.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Split {
+    /// The number of the step before which it is done.
+    pub at: usize,
+    /// Rows that stay within this of their middle are still, scene units.
+    pub reach: f64,
+}
+
+impl Split {
+    /// As a recipe has it for a last stage of `steps`, in which Gaussians move; `None`: never.
+    pub fn of(r: &Recipe, extent: f64, steps: usize) -> Option<Self> {
+        let s = SplitSettings::of(r);
+        let some = || Self { at: (steps as f64 * s.from) as usize, reach: s.reach * extent };
+        (s.reach > 0.0).then(some)
+    }
+}
+
+impl Upkeep for Split {
+    fn name(&self) -> &str {
+        "split"
+    }
+
+    fn due(&self, at: &At) -> bool {
+        at.step == self.at && at.step < at.steps
+    }
+
+    fn once(&self) -> bool {
+        true
+    }
+
+    fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
+        learner.rebuild(c.learns, |scene| split(scene, self.reach).map(drop))?;
+        Ok(Change::default())
+    }
 }
 
 /// Moves rows whose mean stays within `reach` (scene units) of its middle, whose shape stays and whose life lasts, into a
@@ -96,38 +139,8 @@ fn still_rows(layer: &Layer<f32>, clip: [f64; 2], reach: f64) -> Vec<bool> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::methods::program;
-    use crate::recipe::Recipe;
     use splat4d::motion::{SpacetimeSpec, Spec, build};
     use splat4d::scene::{GEOMETRY, LIFE, SH};
-
-    fn plan(recipe: Recipe) -> Plan {
-        Plan {
-            recipe: recipe.resolve(),
-            extent: 1.0,
-            clip: [0.0, 1.0],
-            fps: 30.0,
-            times: 30,
-            fixed_cameras: 4,
-            moments: Vec::new(),
-            masks: false,
-        }
-    }
-
-    #[test]
-    fn the_last_stage_splits_where_it_is_asked_to() {
-        let at = |static_split, motion: &str| {
-            let motion = motion.to_owned();
-            let plan = plan(Recipe { iterations: 1000, static_split, motion, ..Recipe::default() });
-            let stages = stages(program(&plan.recipe.motion).unwrap().as_ref(), &plan);
-            let last = stages.last().unwrap();
-            let shared = last.groups.iter().filter(|g| g.layer == EVERY).count();
-            (last.switches.iter().map(|s| s.0).collect::<Vec<_>>(), shared)
-        };
-        assert_eq!(at(0.01, "spacetime"), (vec![750], 6));
-        assert_eq!(at(0.0, "spacetime"), (vec![], 0));
-        assert_eq!(at(0.01, "still"), (vec![], 0), "nothing is left to split");
-    }
 
     #[test]
     fn what_stands_still_gets_a_layer_of_its_own_and_looks_the_same() {

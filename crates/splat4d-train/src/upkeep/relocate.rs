@@ -5,15 +5,16 @@
 //! gradient and ½ opacity; the correction of opacity and scale is that of 3DGS as MCMC (Kheradmand et al. 2024).
 
 use super::mcmc::{Places, join};
-use super::{Change, Limits, Stats, is_dead, opacity};
-use crate::optim::Moments;
+use super::{At, Change, Context, Every, Order, Upkeep, is_dead, opacity};
+use crate::Result;
+use crate::learner::Learner;
 use crate::recipe::Recipe;
-use splat4d::layers::Scene;
-use splat4d::math::Rng;
+use serde::{Deserialize, Serialize};
 
-/// See the module's documentation.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Relocate {
+/// Settings of periodic relocation.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct RelocateSettings {
     /// First step of the stage that relocates.
     pub from: usize,
     /// Steps between two times.
@@ -26,73 +27,108 @@ pub struct Relocate {
     pub gradient_share: f64,
 }
 
-impl Relocate {
-    /// As the recipe has it; `None`: never.
-    pub fn of(r: &Recipe) -> Option<Self> {
-        let some = Self {
+impl RelocateSettings {
+    /// As a recipe has them.
+    pub fn of(r: &Recipe) -> Self {
+        Self {
             from: r.relocate_from_iter,
             interval: r.relocate_interval,
             threshold: r.relocate_opacity,
             share: r.relocate_share,
             gradient_share: r.relocate_gradient,
-        };
-        (r.relocate_interval > 0).then_some(some)
+        }
+    }
+}
+
+impl Default for RelocateSettings {
+    fn default() -> Self {
+        Self::of(&Recipe::default())
+    }
+}
+
+/// See the module's documentation.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Relocate {
+    /// How, and when.
+    pub settings: RelocateSettings,
+    /// When statistics begin anew with densification; from its last time on they do so here.
+    pub densification: Every,
+}
+
+impl Relocate {
+    /// As a recipe has it; `None`: never.
+    pub fn of(r: &Recipe) -> Option<Self> {
+        let some = || Self { settings: RelocateSettings::of(r), densification: Every::densification(r) };
+        (r.relocate_interval > 0).then(some)
+    }
+}
+
+impl Upkeep for Relocate {
+    fn name(&self) -> &str {
+        "relocate"
     }
 
-    /// Whether it is time after so many steps of a stage of `iterations`: not in the last interval, in which those that
-    /// moved would learn nothing any more.
-    pub fn is_due(&self, steps: usize, iterations: usize) -> bool {
-        steps >= self.from && steps.is_multiple_of(self.interval) && iterations.saturating_sub(steps) >= self.interval
+    fn order(&self) -> Order {
+        Order::Place
     }
 
-    /// Moves rows of every layer (scene, moments and statistics alike); their number stays. `step` addresses the random
-    /// numbers.
-    pub fn run(
-        &self,
-        scene: &mut Scene<f32>,
-        moments: &mut [Moments<f32>],
-        stats: &mut Stats,
-        limits: &Limits,
-        seed: u64,
-        step: u64,
-    ) -> Change {
+    /// Not in the last interval: what moved then would learn nothing any more.
+    fn due(&self, at: &At) -> bool {
+        let s = &self.settings;
+        at.step >= s.from && at.step.is_multiple_of(s.interval) && at.steps.saturating_sub(at.step) >= s.interval
+    }
+
+    /// Moves rows of every layer; their number stays.
+    fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
+        let settings = &self.settings;
         let mut moved = 0;
-        for layer in 0..scene.layers.len() {
+        for layer in 0..learner.scene().layers.len() {
+            let scene = learner.scene();
             let rows = scene.layers[layer].params.len();
             let spans = scene.layers[layer].spans();
-            let faint = |r: usize| is_dead(scene, layer, r, self.threshold, spans[r]);
+            let faint = |r: usize| is_dead(scene, layer, r, settings.threshold, spans[r]);
             let (mut moves, live): (Vec<usize>, Vec<usize>) = (0..rows).partition(|&r| faint(r));
             if live.is_empty() {
                 continue;
             }
             // The faintest first; equal ones in their order.
             moves.sort_by(|&a, &b| opacity(scene, layer, a).total_cmp(&opacity(scene, layer, b)).then(a.cmp(&b)));
-            moves.truncate((rows as f64 * self.share) as usize);
+            moves.truncate((rows as f64 * settings.share) as usize);
             moves.sort_unstable();
             let moves: Vec<u32> = moves.into_iter().map(|r| r as u32).collect();
             if moves.is_empty() {
                 continue;
             }
             moved += moves.len();
-            let places = Places::new(scene, stats, layer, live, self.gradient_share);
-            let rng = Rng::new(seed, "relocate", step).fork(layer as u64);
-            join(scene, moments, stats, layer, limits, &places, &moves, 0, rng);
+            let places = Places::new(learner, layer, live, settings.gradient_share);
+            join(learner, &c.limits, &places, &moves, 0, c.rng("relocate").fork(layer as u64));
         }
-        Change { added: 0, moved, removed: 0 }
+        if self.densification.interval == 0 || c.at.step >= self.densification.last {
+            learner.clear_stats();
+        }
+        Ok(Change { added: 0, moved, removed: 0 })
+    }
+
+    fn densification(&mut self) -> Option<&mut Every> {
+        Some(&mut self.densification)
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::tests::scene;
+    use super::super::Limits;
+    use super::super::tests::{context, due_steps, scene};
     use super::*;
-    use splat4d::layers::Evaluation;
+    use splat4d::layers::{Evaluation, Scene};
     use splat4d::math::Se3;
     use splat4d::render::{Image, RenderConfig, Renderer, Shot};
     use splat4d::scene::params::{LOG_SCALE, OPACITY};
     use splat4d::scene::{Camera, GEOMETRY, Time};
 
-    const RELOCATE: Relocate = Relocate { from: 10, interval: 5, threshold: 0.02, share: 0.1, gradient_share: 0.5 };
+    const RELOCATE: Relocate = Relocate {
+        settings: RelocateSettings { from: 10, interval: 5, threshold: 0.02, share: 0.1, gradient_share: 0.5 },
+        densification: Every::NEVER,
+    };
 
     fn picture(s: &Scene<f32>) -> Vec<f32> {
         let pose = Se3::look_at([0.0, 0.5, -6.0], [0.0; 3], [0.0, 1.0, 0.0]);
@@ -113,12 +149,13 @@ mod tests {
             g.set(r, OPACITY, if r < 30 { -6.0 - 0.1 * r as f32 } else { -1.0 });
         }
         let before = picture(&s);
-        let mut moments: Vec<_> = s.layers.iter().map(|l| Moments::new(&l.params)).collect();
-        let mut stats = Stats::new(&s);
+        let mut learner = Learner::new(s);
         // Row 150 alone has a gradient: half of all draws are its.
-        stats.tables[0].write(150, 0, [1.0, 1.0, 3.0]);
+        learner.stats_mut().tables[0].write(150, 0, [1.0, 1.0, 3.0]);
         let limits = Limits { cap: 300, extent: 4.0, min_opacity: 0.005 };
-        let change = RELOCATE.run(&mut s, &mut moments, &mut stats, &limits, 1, 7);
+        let mut relocate = RELOCATE;
+        let change = relocate.run(&mut learner, &context(limits, 1, 7)).unwrap();
+        let s = learner.into_scene();
         assert_eq!((change, s.len()), (Change { added: 0, moved: 20, removed: 0 }, 200));
         let opaque = |r: usize| opacity(&s, 0, r);
         assert!((0..10).all(|r| opaque(r) < 0.02), "the less faint stay");
@@ -136,7 +173,6 @@ mod tests {
 
     #[test]
     fn it_is_due_at_its_interval_but_not_at_the_end() {
-        let due: Vec<usize> = (1..=30).filter(|&s| RELOCATE.is_due(s, 30)).collect();
-        assert_eq!(due, [10, 15, 20, 25]);
+        assert_eq!(due_steps(&RELOCATE, 30), [10, 15, 20, 25]);
     }
 }

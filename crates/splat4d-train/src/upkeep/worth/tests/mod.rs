@@ -290,11 +290,3 @@ fn no_views_is_an_error_that_says_so() {
     assert!(error.contains("no training views") && error.contains("hold_out"), "{error}");
     assert!(key_masks(&mut scene(4), &none, &MaskConfig::default(), &mut |_, _| {}).is_err());
 }
-
-#[test]
-fn periodic_pruning_leaves_time_to_recover() {
-    let p = Periodic { interval: 10, ratio: 0.3, views: 60, spatial: Spatial::Change };
-    let due: Vec<usize> = (1..=36).filter(|&s| p.is_due(s, 36)).collect();
-    assert_eq!(due, [10, 20, 30]);
-    assert_eq!((1..=34).filter(|&s| p.is_due(s, 34)).collect::<Vec<_>>(), [10, 20]);
-}

@@ -18,7 +18,8 @@ use std::str::FromStr;
 const LITERAL_LIMIT: f64 = 8.0;
 
 /// How a life becomes a temporal score.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(try_from = "String", into = "String")]
 pub enum Temporal {
     /// 1/(½ tanh|p''(t)| + ½) at every instant.
     #[default]
@@ -36,7 +37,8 @@ pub enum Temporal {
 }
 
 /// What of a view becomes a spatial score.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(try_from = "String", into = "String")]
 pub enum Spatial {
     /// Σ over pixels of α T: how much of the pictures it is (4DGS-1K).
     #[default]
@@ -59,7 +61,8 @@ pub enum Spatial {
 }
 
 /// How spatial and temporal score become one.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(try_from = "String", into = "String")]
 pub enum Combine {
     /// Their product, instant by instant.
     #[default]
@@ -92,6 +95,20 @@ macro_rules! names {
                     Error::input(format!(concat!("there is no ", $what, " `{}`"), name))
                         .remedy(format!("Use one of {}{near}", names.join(", ")))
                 })
+            }
+        }
+
+        impl TryFrom<String> for $type {
+            type Error = Error;
+
+            fn try_from(name: String) -> Result<Self> {
+                name.parse()
+            }
+        }
+
+        impl From<$type> for String {
+            fn from(value: $type) -> Self {
+                value.name().to_owned()
             }
         }
 

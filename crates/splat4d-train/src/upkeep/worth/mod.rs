@@ -1,10 +1,9 @@
-//! Fewer Gaussians: which are worth keeping ([`score()`], [`prune`]) and which are worth drawing when ([`key_masks`]).
+//! Worth: which Gaussians are worth keeping ([`score()`], [`prune`]) and which are worth drawing when ([`key_masks`]).
 //!
 //! After 4DGS-1K (Yuan et al. 2025), for every layer whatever its motion model: a Gaussian's worth is what it adds to
 //! the training pictures, and what is known of its life. Nothing is learnt here; a scene recovers by further training.
 
 mod masks;
-mod periodic;
 mod score;
 mod temporal;
 #[cfg(test)]
@@ -12,7 +11,6 @@ mod tests;
 mod weighing;
 
 pub use masks::{Keys, MaskConfig, key_masks};
-pub use periodic::Periodic;
 pub use score::{ScoreConfig, Scores, UNIT_FRAMES, score};
 pub use temporal::{Combine, Spatial, Temporal};
 
@@ -22,7 +20,8 @@ use splat4d::scene::{RowEdit, Space};
 /// One edit a layer that takes away the share `ratio` (to the nearest whole number) of all Gaussians: those with the
 /// lowest scores, the earlier layer and row first among equals. One always stays.
 ///
-/// Apply it with `densify::apply`, which carries moments and statistics along, or with `Layer::edit`. Panics: scores of
+/// Apply it with [`Learner::apply`](crate::learner::Learner::apply), which carries moments and statistics along, or with
+/// `Layer::edit`. Panics: scores of
 /// another scene, a ratio outside of 0 to 1.
 pub fn prune(scene: &Scene<f32>, scores: &Scores, ratio: f64) -> Vec<RowEdit> {
     assert!((0.0..=1.0).contains(&ratio), "a share lies between 0 and 1, not at {ratio}");

@@ -1,14 +1,14 @@
-//! Upkeep of control nodes: lists of nearest nodes are refreshed, nodes are added where Gaussians cannot follow, and nodes
-//! that nobody follows are removed.
+//! Nodes of a skin: lists of nearest nodes are refreshed, nodes are added where Gaussians cannot follow, and nodes
+//! that no Gaussian follows are removed.
 //!
 //! Source: Huang et al. 2024 (SC-GS), there every 5,000 of 80,000 steps from 1,000 to 25,000 with the gradient to
 //! positions in space; here with that to positions in the picture, which densification gathers anyway.
 
-use crate::densify::{self, Stats};
-use crate::methods::Adapt;
-use crate::optim::Moments;
+use super::{At, Change, Context, Every, Order, Upkeep};
+use crate::Result;
+use crate::learner::Learner;
 use crate::recipe::Recipe;
-use splat4d::layers::Scene;
+use serde::{Deserialize, Serialize};
 use splat4d::math::Rng;
 use splat4d::motion::skin::{NODE_HYPER, Skin, Weights};
 use splat4d::scene::{Born, GEOMETRY, RowEdit, Space};
@@ -16,49 +16,87 @@ use splat4d::scene::{Born, GEOMETRY, RowEdit, Space};
 /// Nodes are never fewer than this: a Gaussian's three and the one that cuts off.
 const LEAST_NODES: usize = 4;
 
-/// See the module's documentation.
-#[derive(Clone, Copy, Debug)]
-pub struct NodeAdapt {
-    /// Steps between two refreshes.
+/// Settings of the upkeep of nodes.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct NodeSettings {
+    /// Steps between two refreshes of the lists of nearest nodes; 0: only where nodes were added or removed.
     pub bind_interval: usize,
-    /// First and last step that adds or removes nodes, and the steps between.
-    pub steps: (usize, usize, usize),
+    /// Steps between additions and removals of nodes, while Gaussians densify; 0: never.
+    pub adapt_interval: usize,
     /// Weighted mean gradient above which a node gets a second one (NDC units).
     pub threshold: f64,
     /// Never more nodes than this.
     pub cap: usize,
 }
 
-impl NodeAdapt {
-    /// As the recipe says.
+impl NodeSettings {
+    /// As a recipe has them.
     pub fn of(r: &Recipe) -> Self {
         Self {
             bind_interval: r.control_bind_interval,
-            steps: (r.densify_from_iter, r.densify_until_iter, r.control_adapt_interval),
+            adapt_interval: r.control_adapt_interval,
             threshold: r.control_grad_threshold,
             cap: r.control_max_nodes,
         }
     }
+}
 
-    fn edits_at(&self, step: usize) -> bool {
-        let (from, until, every) = self.steps;
-        every > 0 && step >= from && step <= until && step.is_multiple_of(every)
+impl Default for NodeSettings {
+    fn default() -> Self {
+        Self::of(&Recipe::default())
     }
 }
 
-impl Adapt for NodeAdapt {
-    fn is_due(&self, step: usize) -> bool {
-        self.edits_at(step) || (self.bind_interval > 0 && step.is_multiple_of(self.bind_interval))
+/// See the module's documentation.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct AdaptNodes {
+    /// How, and how often.
+    pub settings: NodeSettings,
+    /// First and last step that adds or removes nodes.
+    pub span: (usize, usize),
+}
+
+impl AdaptNodes {
+    /// As a recipe has it.
+    pub fn of(r: &Recipe) -> Self {
+        Self { settings: NodeSettings::of(r), span: (r.densify_from_iter, r.densify_until_iter) }
     }
 
-    fn run(&self, scene: &mut Scene<f32>, moments: &mut [Moments<f32>], stats: &mut Stats, step: usize, rng: Rng) {
-        for layer in 0..scene.layers.len() {
-            let Some(skin) = Skin::find(&scene.layers[layer].params) else { continue };
-            if self.edits_at(step) {
-                self.edit(&skin, scene, moments, stats, layer, &rng);
+    fn edits_at(&self, step: usize) -> bool {
+        let (first, last) = self.span;
+        Every { first, last, interval: self.settings.adapt_interval }.is_due(step)
+    }
+}
+
+impl Upkeep for AdaptNodes {
+    fn name(&self) -> &str {
+        "nodes"
+    }
+
+    fn order(&self) -> Order {
+        Order::Nodes
+    }
+
+    fn due(&self, at: &At) -> bool {
+        let interval = self.settings.bind_interval;
+        self.edits_at(at.step) || (interval > 0 && at.step.is_multiple_of(interval))
+    }
+
+    fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
+        for layer in 0..learner.scene().layers.len() {
+            let Some(skin) = Skin::find(&learner.scene().layers[layer].params) else { continue };
+            if self.edits_at(c.at.step) {
+                self.settings.edit(&skin, learner, layer, &c.rng("adapt"));
             }
-            skin.bind(&mut scene.layers[layer].params);
+            skin.bind(&mut learner.scene_mut().layers[layer].params);
         }
+        learner.neighbours_changed();
+        Ok(Change::default())
+    }
+
+    fn in_tuning(&self) -> bool {
+        true
     }
 }
 
@@ -72,17 +110,9 @@ struct Pull {
     place: [f64; 3],
 }
 
-impl NodeAdapt {
-    fn edit(
-        &self,
-        skin: &Skin,
-        scene: &mut Scene<f32>,
-        moments: &mut [Moments<f32>],
-        stats: &mut Stats,
-        layer: usize,
-        rng: &Rng,
-    ) {
-        let p = &scene.layers[layer].params;
+impl NodeSettings {
+    fn edit(&self, skin: &Skin, learner: &mut Learner, layer: usize, rng: &Rng) {
+        let (p, stats) = (&learner.scene().layers[layer].params, learner.stats());
         let count = skin.count(p);
         let mut weights = Weights::default();
         skin.weigh(p, &mut weights);
@@ -114,8 +144,8 @@ impl NodeAdapt {
             return;
         }
         strained.iter().for_each(|&k| edit.push(k as u32, Born::Clone));
-        densify::apply(scene, moments, stats, layer, &edit, rng);
-        let nodes = &mut scene.layers[layer].params[skin.nodes];
+        learner.apply(layer, &edit, rng);
+        let nodes = &mut learner.scene_mut().layers[layer].params[skin.nodes];
         for (j, &k) in strained.iter().enumerate() {
             nodes.write(kept + j, 0, pulls[k].place.map(|x| (x / pulls[k].gradient) as f32));
             for c in 0..skin.spec.hyper {

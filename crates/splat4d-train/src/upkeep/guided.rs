@@ -5,11 +5,12 @@
 //! 16 pixels of which 85 % are among the worst 40 % of the pixels, a border of 10 % left out; every second pixel; depths
 //! between 0.7 and 7.5 times the largest seen, with 5 % of jitter; opacity 0.1.
 
-use super::{Change, Limits, Stats, apply, logit};
+use super::{At, Change, Context, Order, Upkeep, logit};
 use crate::Result;
 use crate::capture::frames::{Frames, Picture};
-use crate::optim::Moments;
+use crate::learner::Learner;
 use crate::recipe::Recipe;
+use serde::{Deserialize, Serialize};
 use splat4d::device;
 use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::Rng;
@@ -46,10 +47,11 @@ const OPACITY_START: f64 = 0.1;
 /// Share of the run at which the last of them are added: they must have time to learn.
 const LAST: f64 = 0.75;
 
-/// See the module's documentation.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Guided {
-    /// Share of the stage after which it is done first.
+/// Settings of guided sampling.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct GuidedSettings {
+    /// Share of the stage after which it is done first; 0: never.
     pub from: f64,
     /// How often.
     pub times: usize,
@@ -67,51 +69,73 @@ struct Look {
     farthest: f32,
 }
 
+impl GuidedSettings {
+    /// As a recipe has them.
+    pub fn of(r: &Recipe) -> Self {
+        Self { from: r.guided_from, times: r.guided_times, share: r.guided_share }
+    }
+}
+
+impl Default for GuidedSettings {
+    fn default() -> Self {
+        Self::of(&Recipe::default())
+    }
+}
+
+/// See the module's documentation.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Guided {
+    /// How, and when.
+    pub settings: GuidedSettings,
+}
+
 impl Guided {
-    /// As the recipe has it; `None`: never.
+    /// As a recipe has it; `None`: never.
     pub fn of(r: &Recipe) -> Option<Self> {
-        let some = Self { from: r.guided_from, times: r.guided_times, share: r.guided_share };
-        (r.guided_from > 0.0 && r.guided_times > 0).then_some(some)
+        (r.guided_from > 0.0 && r.guided_times > 0).then(|| Self { settings: GuidedSettings::of(r) })
+    }
+}
+
+impl Upkeep for Guided {
+    fn name(&self) -> &str {
+        "guided sampling"
     }
 
-    /// Whether it is time after so many steps of a stage of `iterations`.
-    pub fn is_due(&self, steps: usize, iterations: usize) -> bool {
-        let (first, last) = ((self.from * iterations as f64) as usize, (LAST * iterations as f64) as usize);
-        if steps < first.max(1) || steps > last {
+    fn order(&self) -> Order {
+        Order::Place
+    }
+
+    fn due(&self, at: &At) -> bool {
+        let Self { settings: s } = self;
+        let (first, last) = ((s.from * at.steps as f64) as usize, (LAST * at.steps as f64) as usize);
+        if at.step < first.max(1) || at.step > last {
             return false;
         }
-        let interval = (last - first).div_ceil(self.times).max(1);
-        (steps - first.max(1)).is_multiple_of(interval)
+        let interval = (last - first).div_ceil(s.times).max(1);
+        (at.step - first.max(1)).is_multiple_of(interval)
     }
 
-    /// Adds Gaussians to the first layer (scene, moments and statistics alike). `step` addresses the random numbers.
-    /// Errors: a picture cannot be read.
-    pub fn run(
-        &self,
-        scene: &mut Scene<f32>,
-        moments: &mut [Moments<f32>],
-        stats: &mut Stats,
-        limits: &Limits,
-        frames: &dyn Frames,
-        antialias: Antialias,
-        seed: u64,
-        step: u64,
-    ) -> Result<Change> {
-        let rng = Rng::new(seed, "guided", step);
-        let room = limits.cap.saturating_sub(scene.len());
-        let budget = room.min((scene.len() as f64 * self.share) as usize);
+    /// Adds Gaussians to the first layer. Errors: a picture cannot be read.
+    fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
+        let (rng, scene) = (c.rng("guided"), learner.scene());
+        let room = c.limits.cap.saturating_sub(scene.len());
+        let budget = room.min((scene.len() as f64 * self.settings.share) as usize);
         if budget == 0 || scene.layers.first().is_none_or(|l| l.params.is_empty()) {
             return Ok(Change::default());
         }
         let mut points = Vec::new();
-        for (k, look) in looks(scene, frames, antialias, rng.fork(1))?.iter().enumerate() {
+        for (k, look) in looks(scene, c.frames, c.antialias, rng.fork(1))?.iter().enumerate() {
             let most = budget * (k + 1) / WORST_VIEWS;
-            rays(look, frames, most.saturating_sub(points.len()), rng.fork(2 + k as u64), &mut points);
+            rays(look, c.frames, most.saturating_sub(points.len()), rng.fork(2 + k as u64), &mut points);
+        }
+        if points.is_empty() {
+            return Ok(Change::default());
         }
         let rows = scene.layers[0].params.len();
         let mut edit = RowEdit::identity(Space::Gaussians, rows);
         points.iter().for_each(|_| edit.push(0, Born::Clone));
-        apply(scene, moments, stats, 0, &edit, &rng);
+        learner.apply(0, &edit, &rng);
+        let scene = learner.scene_mut();
         let clip = scene.clip[1] - scene.clip[0] + 1.0 / scene.fps;
         let p = &mut scene.layers[0].params;
         let still = [VELOCITIES, ROTATION_RATES, FEATURE_TABLE].map(|name| p.find(name));
@@ -219,7 +243,8 @@ fn rays(look: &Look, frames: &dyn Frames, most: usize, rng: Rng, points: &mut Ve
 
 #[cfg(test)]
 mod tests {
-    use super::super::tests::scene;
+    use super::super::Limits;
+    use super::super::tests::{context, due_steps, scene};
     use super::*;
     use crate::train::tests::Made;
 
@@ -233,13 +258,14 @@ mod tests {
                 let mean = s.layers[0].params[GEOMETRY].read::<3>(row, 0);
                 s.layers[0].params[GEOMETRY].write(row, 0, mean.map(|x| 0.3 * x));
             }
-            let mut moments: Vec<_> = s.layers.iter().map(|l| Moments::new(&l.params)).collect();
-            let mut stats = Stats::new(&s);
-            let guided = Guided { from: 0.2, times: 2, share: 0.5 };
+            let mut learner = Learner::new(s);
+            let mut guided = Guided { settings: GuidedSettings { from: 0.2, times: 2, share: 0.5 } };
             let limits = Limits { cap, extent: 4.0, min_opacity: 0.005 };
-            let change = guided.run(&mut s, &mut moments, &mut stats, &limits, &frames, Antialias::Off, 3, 9).unwrap();
-            assert_eq!((s.len(), moments[0].table(GEOMETRY).rows()), (200 + change.added, s.len()));
-            s
+            let c = Context { frames: &frames, ..context(limits, 3, 9) };
+            let change = guided.run(&mut learner, &c).unwrap();
+            let rows = [learner.scene().len(), learner.moments()[0].table(GEOMETRY).rows()];
+            assert_eq!(rows, [200 + change.added; 2]);
+            learner.into_scene()
         };
         let s = run(1000);
         assert!(s.len() > 210, "{} Gaussians", s.len());
@@ -268,8 +294,7 @@ mod tests {
 
     #[test]
     fn it_is_due_as_often_as_was_asked() {
-        let guided = Guided { from: 0.25, times: 3, share: 0.1 };
-        let due: Vec<usize> = (1..=400).filter(|&s| guided.is_due(s, 400)).collect();
-        assert_eq!(due, [100, 167, 234]);
+        let guided = Guided { settings: GuidedSettings { from: 0.25, times: 3, share: 0.1 } };
+        assert_eq!(due_steps(&guided, 400), [100, 167, 234]);
     }
 }

@@ -1,32 +1,40 @@
 //! Too many Gaussians in one place: near pairs become one (merging), or the fainter of a pair goes (spatial-proximity
 //! pruning). Pairs are mutual nearest neighbours, so that no row takes part twice.
 
-use super::{covariances, logit, opacity};
-use crate::{Error, Result};
+use super::{At, Change, Context, Order, Upkeep, covariances, logit, opacity};
+use crate::Result;
+use crate::learner::Learner;
+use crate::recipe::Recipe;
+use serde::{Deserialize, Serialize};
 use splat4d::layers::Scene;
 use splat4d::math::knn::knn;
 use splat4d::math::sym3;
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{Born, GEOMETRY, RowEdit, SH, Space};
 
-/// What becomes of a pair.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Crowd {
+/// What becomes of a pair in one place.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Pair {
+    /// Both stay.
+    #[default]
+    None,
     /// One Gaussian with the pair's mean, covariance (moments), colour and joint opacity.
     Merge,
     /// The fainter one goes, the other stays as it is.
     Prune,
 }
 
-/// When and what.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Crowding {
+/// Settings of merging.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct MergeSettings {
     /// What becomes of a pair.
-    pub what: Crowd,
+    pub pair: Pair,
     /// Largest distance of a pair's means, of the smaller one's mean standard deviation.
     pub distance: f64,
-    /// Steps between two rounds.
-    pub every: usize,
+    /// Steps between two rounds; 0: never.
+    pub interval: usize,
 }
 
 /// Largest difference of base colours (in SH coefficients, each channel) of a pair that is one thing.
@@ -36,44 +44,84 @@ const SAME_SIZE: f64 = 2.0;
 /// Floor of merged standard deviations, of the larger one.
 const THINNEST: f64 = 1e-4;
 
-impl Crowding {
-    /// What the recipe asks for; none: nothing. Errors: an unknown name.
-    pub fn of(r: &crate::recipe::Recipe) -> Result<Option<Self>> {
-        let what = match r.crowding.as_str() {
-            "merge" => Crowd::Merge,
-            "prune" => Crowd::Prune,
-            "none" => return Ok(None),
-            other => {
-                return Err(Error::input(format!("knob `crowding` cannot be `{other}`"))
-                    .remedy("It must be none, merge or prune"));
-            }
+impl MergeSettings {
+    /// As a recipe has them.
+    pub fn of(r: &Recipe) -> Self {
+        let pair = match r.crowding.as_str() {
+            "merge" => Pair::Merge,
+            "prune" => Pair::Prune,
+            _ => Pair::None,
         };
-        Ok((r.crowding_interval > 0).then_some(Self {
-            what,
-            distance: r.crowding_distance,
-            every: r.crowding_interval,
-        }))
+        Self { pair, distance: r.crowding_distance, interval: r.crowding_interval }
+    }
+}
+
+impl Default for MergeSettings {
+    fn default() -> Self {
+        Self::of(&Recipe::default())
+    }
+}
+
+/// See the module's documentation.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Merge {
+    /// How, and when.
+    pub settings: MergeSettings,
+}
+
+impl Upkeep for Merge {
+    fn name(&self) -> &str {
+        "merge"
     }
 
+    fn order(&self) -> Order {
+        Order::Merge
+    }
+
+    fn due(&self, at: &At) -> bool {
+        at.step.is_multiple_of(self.settings.interval) && at.step < at.steps
+    }
+
+    fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
+        let before = learner.scene().len();
+        for layer in 0..learner.scene().layers.len() {
+            if let Some(edit) = self.settings.edit(learner, layer) {
+                learner.apply(layer, &edit, &c.rng("crowding"));
+            }
+        }
+        Ok(Change { removed: before - learner.scene().len(), ..Change::default() })
+    }
+}
+
+impl Merge {
+    /// As a recipe has it; `None`: never.
+    pub fn of(r: &Recipe) -> Option<Self> {
+        let settings = MergeSettings::of(r);
+        (settings.pair != Pair::None && settings.interval > 0).then_some(Self { settings })
+    }
+}
+
+impl MergeSettings {
     /// One round on one layer: changes the rows that stay, and says which do. `None`: there is no pair.
-    pub fn edit(&self, scene: &mut Scene<f32>, layer: usize) -> Option<RowEdit> {
-        let n = scene.layers[layer].params.len();
-        let pairs = self.pairs(scene, layer);
+    fn edit(&self, learner: &mut Learner, layer: usize) -> Option<RowEdit> {
+        let n = learner.scene().layers[layer].params.len();
+        let pairs = self.pairs(learner.scene(), layer);
         if pairs.is_empty() {
             return None;
         }
+        let scene = learner.scene_mut();
         let covs = covariances(scene, layer);
         let mut keep = vec![true; n];
         for &(a, b) in &pairs {
             let faint = if opacity(scene, layer, a) < opacity(scene, layer, b) { a } else { b };
             let strong = a + b - faint;
-            if self.what == Crowd::Merge {
+            if self.pair == Pair::Merge {
                 merge(scene, layer, strong, faint, [covs[strong], covs[faint]]);
             }
             keep[faint] = false;
         }
         let mut edit = RowEdit::prune(Space::Gaussians, keep.iter().copied());
-        if self.what == Crowd::Merge {
+        if self.pair == Pair::Merge {
             // Moments of what a merged row was would push it back.
             let mut merged = vec![false; n];
             pairs.iter().for_each(|&(a, b)| (merged[a], merged[b]) = (true, true));
@@ -150,7 +198,8 @@ fn merge(scene: &mut Scene<f32>, layer: usize, a: usize, b: usize, [ca, cb]: [[f
 
 #[cfg(test)]
 mod tests {
-    use super::super::tests::scene;
+    use super::super::Limits;
+    use super::super::tests::{context, due_steps, scene};
     use super::*;
 
     /// Fifty Gaussians far apart, each with a twin a tenth of its size away.
@@ -171,29 +220,41 @@ mod tests {
 
     #[test]
     fn twins_become_one_and_strangers_stay() {
-        for what in [Crowd::Merge, Crowd::Prune] {
-            let rule = Crowding { what, distance: 0.5, every: 1 };
-            let mut s = twins();
-            let before = s.clone();
-            let edit = rule.edit(&mut s, 0).unwrap();
+        for pair in [Pair::Merge, Pair::Prune] {
+            let rule = MergeSettings { pair, distance: 0.5, interval: 1 };
+            let before = twins();
+            let mut learner = Learner::new(twins());
+            let edit = rule.edit(&mut learner, 0).unwrap();
             assert_eq!(edit.parent, (0..50).collect::<Vec<u32>>(), "the fainter one goes");
+            let s = learner.scene();
             let changed = s.layers[0].params[GEOMETRY] != before.layers[0].params[GEOMETRY];
-            assert_eq!(changed, what == Crowd::Merge);
-            if what == Crowd::Merge {
-                let o = opacity(&s, 0, 3);
+            assert_eq!(changed, pair == Pair::Merge);
+            if pair == Pair::Merge {
+                let o = opacity(s, 0, 3);
                 assert!((o - (1.0 - 0.5 * (1.0 - 1.0 / (1.0 + 1f64.exp())))).abs() < 1e-6, "{o}");
-                let [y0, y] = [&before, &s].map(|s| s.layers[0].params[GEOMETRY].get(3, 1));
+                let [y0, y] = [&before, s].map(|s| s.layers[0].params[GEOMETRY].get(3, 1));
                 assert!(y > y0 && y < y0 + 0.1 * (-2.0f32).exp());
                 assert!(edit.born.iter().all(|b| *b == Born::Moved));
             }
-            let far = Crowding { distance: 0.01, ..rule };
-            assert!(far.edit(&mut twins(), 0).is_none());
+            let far = MergeSettings { distance: 0.01, ..rule };
+            assert!(far.edit(&mut Learner::new(twins()), 0).is_none());
         }
     }
 
     #[test]
+    fn rounds_come_at_their_interval_but_not_at_the_end() {
+        let settings = MergeSettings { pair: Pair::Prune, distance: 0.5, interval: 10 };
+        let mut merge = Merge { settings };
+        assert_eq!(due_steps(&merge, 30), [10, 20]);
+        let mut learner = Learner::new(twins());
+        let limits = Limits { cap: 100, extent: 1.0, min_opacity: 0.0 };
+        let change = merge.run(&mut learner, &context(limits, 0, 0)).unwrap();
+        assert_eq!((change.removed, learner.scene().len()), (50, 50));
+    }
+
+    #[test]
     fn colours_and_sizes_that_differ_are_different_things() {
-        let rule = Crowding { what: Crowd::Merge, distance: 0.5, every: 1 };
+        let rule = MergeSettings { pair: Pair::Merge, distance: 0.5, interval: 1 };
         let mut s = twins();
         for r in 50..75 {
             s.layers[0].params[SH].set(r, 1, 1.0);
@@ -201,6 +262,6 @@ mod tests {
         for r in 75..100 {
             s.layers[0].params[GEOMETRY].write(r, LOG_SCALE, [-0.5; 3]);
         }
-        assert!(rule.edit(&mut s, 0).is_none());
+        assert!(rule.edit(&mut Learner::new(s), 0).is_none());
     }
 }

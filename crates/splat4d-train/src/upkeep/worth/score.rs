@@ -2,10 +2,10 @@
 //!
 //! Source: 4DGS-1K (Yuan et al. 2025, §4.1); the volume as LightGaussian (Fan et al. 2024).
 
+use super::super::covariances;
 use super::temporal::{Combine, Lives, Spatial, Temporal};
 use super::weighing::Weighing;
 use crate::capture::frames::Frames;
-use crate::densify::covariances;
 use crate::sampler::Timeline;
 use crate::{Error, Result};
 use rayon::prelude::*;

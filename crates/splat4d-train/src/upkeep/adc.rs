@@ -1,10 +1,12 @@
 //! Adaptive density control: clone small and split large Gaussians whose screen position still wants to move; prune the
 //! transparent and the huge. Source: Kerbl et al. 2023 §5.2 and appendix B; the split's opacity as revised by Bulò 2024.
 
-use super::{Change, Limits, Stats, apply, covariances, is_dead, logit, opacity, sample};
-use crate::optim::Moments;
+use super::{At, Change, Context, Every, Limits, Order, Upkeep, covariances, grow, is_dead, logit, opacity, sample};
+use crate::Result;
+use crate::learner::Learner;
+use crate::recipe::Recipe;
 use rayon::prelude::*;
-use splat4d::layers::Scene;
+use serde::{Deserialize, Serialize};
 use splat4d::math::{Rng, sym3};
 use splat4d::scene::life::CENTER;
 use splat4d::scene::params::OPACITY;
@@ -17,9 +19,13 @@ const RETIME: u64 = u64::MAX;
 /// Gaussians larger than this share of the extent are removed (as after the first reset in the original).
 const HUGE: f64 = 0.1;
 
-/// The strategy's settings.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Adc {
+/// About how much a densification by gradients adds on real captures, until the cap.
+const GROWTH: f64 = 1.2;
+
+/// Settings of adaptive density control.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct AdcSettings {
     /// Mean 2D gradient (NDC units) above which a Gaussian is cloned or split.
     pub grad_threshold: f64,
     /// Gaussians larger than this share of the extent are split, smaller ones cloned.
@@ -28,17 +34,70 @@ pub struct Adc {
     pub retime_clones: bool,
 }
 
+impl AdcSettings {
+    /// As a recipe has them.
+    pub fn of(r: &Recipe) -> Self {
+        Self {
+            grad_threshold: r.densify_grad_threshold,
+            percent_dense: r.percent_dense,
+            retime_clones: r.retime_clones,
+        }
+    }
+}
+
+impl Default for AdcSettings {
+    fn default() -> Self {
+        Self::of(&Recipe::default())
+    }
+}
+
+/// Adaptive density control (Kerbl et al. 2023).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Adc {
+    /// How.
+    pub settings: AdcSettings,
+    /// When.
+    pub steps: Every,
+}
+
+impl Upkeep for Adc {
+    fn name(&self) -> &str {
+        "adc"
+    }
+
+    fn order(&self) -> Order {
+        Order::Grow
+    }
+
+    fn due(&self, at: &At) -> bool {
+        self.steps.is_due(at.step)
+    }
+
+    fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
+        let settings = self.settings;
+        Ok(grow(learner, c, |learner, layer, spare, rng| settings.layer(learner, &c.limits, layer, spare, rng)))
+    }
+
+    fn densification(&mut self) -> Option<&mut Every> {
+        Some(&mut self.steps)
+    }
+
+    fn growth(&self, at: &At) -> f64 {
+        if self.due(at) { GROWTH } else { 1.0 }
+    }
+}
+
 impl Adc {
-    pub(super) fn run(
-        &self,
-        scene: &mut Scene<f32>,
-        moments: &mut [Moments<f32>],
-        stats: &mut Stats,
-        limits: &Limits,
-        layer: usize,
-        spare: &mut usize,
-        rng: Rng,
-    ) -> Change {
+    /// As a recipe has it; `None`: another strategy.
+    pub fn of(r: &Recipe) -> Option<Self> {
+        let some = || Self { settings: AdcSettings::of(r), steps: Every::densification(r) };
+        (r.strategy == "adc").then(some)
+    }
+}
+
+impl AdcSettings {
+    fn layer(&self, learner: &mut Learner, limits: &Limits, layer: usize, spare: &mut usize, rng: Rng) -> Change {
+        let (scene, stats) = (learner.scene(), learner.stats());
         let rows = scene.layers[layer].params.len();
         let covs = covariances(scene, layer);
         let spans = scene.layers[layer].spans();
@@ -67,7 +126,8 @@ impl Adc {
             edit.push(r as u32, if splits[r] { Born::Split } else { Born::Clone });
         }
         let old_opacity: Vec<f64> = edit.parent.iter().map(|&r| opacity(scene, layer, r as usize)).collect();
-        apply(scene, moments, stats, layer, &edit, &rng);
+        learner.apply(layer, &edit, &rng);
+        let scene = learner.scene_mut();
         let clip = scene.clip;
         let layer = &mut scene.layers[layer];
         if self.retime_clones {
@@ -99,26 +159,23 @@ fn retime(life: &mut Table, edit: &RowEdit, [first, last]: [f64; 2], rng: Rng) {
     }
 }
 
-/// Lowers every opacity to at most `ceiling`, and forgets its moments (Kerbl et al. 2023).
-pub fn reset_opacity(scene: &mut Scene<f32>, moments: &mut [Moments<f32>], ceiling: f64) {
-    for (layer, moments) in scene.layers.iter_mut().zip(moments) {
-        let geometry = &mut layer.params[GEOMETRY];
-        let width = geometry.width();
-        for row in 0..geometry.rows() {
-            let o = geometry.get(row, OPACITY);
-            geometry.set(row, OPACITY, o.min(logit(ceiling)));
-            moments.table_mut(GEOMETRY).set(row, OPACITY, 0.0);
-            moments.table_mut(GEOMETRY).set(row, width + OPACITY, 0.0);
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
-    use super::super::tests::scene;
+    use super::super::tests::{context, scene};
     use super::*;
-    use crate::densify::Densify;
+    use splat4d::layers::Scene;
     use splat4d::scene::LifeKind;
+
+    /// Runs it on a scene whose rows `seen` have the gradient 0.5, 1, ….
+    fn run(s: Scene<f32>, settings: AdcSettings, seen: std::ops::Range<usize>, limits: Limits) -> (Change, Scene<f32>) {
+        let mut learner = Learner::new(s);
+        for (k, row) in seen.enumerate() {
+            learner.stats_mut().tables[0].write(row, 0, [1.0 + k as f32, 2.0, 5.0]);
+        }
+        let mut adc = Adc { settings, steps: Every::NEVER };
+        let change = adc.run(&mut learner, &context(limits, 1, 0)).unwrap();
+        (change, learner.into_scene())
+    }
 
     #[test]
     fn clones_the_small_splits_the_large_prunes_the_dead_under_the_cap() {
@@ -129,24 +186,18 @@ mod tests {
             g.write(1, 7, [-1.0f32; 3]); // large: split
             g.set(2, OPACITY, -9.0); // dead
         }
-        let mut moments: Vec<_> = s.layers.iter().map(|l| Moments::new(&l.params)).collect();
-        let mut stats = Stats::new(&s);
-        for r in [0, 1, 2, 3] {
-            stats.tables[0].write(r, 0, [1.0 + r as f32, 2.0, 5.0]);
-        }
-        let adc = Densify::Adc(Adc { grad_threshold: 0.1, percent_dense: 0.05, retime_clones: false });
-        let mut capped = s.clone();
+        let settings = AdcSettings { grad_threshold: 0.1, percent_dense: 0.05, retime_clones: false };
         let limits = Limits { cap: 100, extent: 4.0, min_opacity: 0.005 };
-        let change = adc.run(&mut s, &mut moments, &mut stats.clone(), &limits, 1, 0);
-        assert_eq!((change.added, change.removed, s.len()), (3, 1, 22));
-        let g = &s.layers[0].params[GEOMETRY];
+        let (change, all) = run(s.clone(), settings, 0..4, limits);
+        assert_eq!((change.added, change.removed, all.len()), (3, 1, 22));
+        let g = &all.layers[0].params[GEOMETRY];
         assert!((g.get(1, 7) - (-1.0 - 1.6f32.ln())).abs() < 1e-5, "the split parent shrinks");
-        let mut moments: Vec<_> = capped.layers.iter().map(|l| Moments::new(&l.params)).collect();
-        let change = adc.run(&mut capped, &mut moments, &mut stats, &Limits { cap: 21, ..limits }, 1, 0);
+        let (change, capped) = run(s, settings, 0..4, Limits { cap: 21, ..limits });
         assert_eq!((change.added, capped.len()), (2, 21));
     }
+
     #[test]
-    fn clones_are_born_anywhere_in_the_clip_and_nobody_else_is_moved_in_time() {
+    fn clones_are_born_anywhere_in_the_clip_and_no_other_row_moves_in_time() {
         let mut s = scene(400);
         s.clip = [2.0, 3.0];
         let layer = &mut s.layers[0];
@@ -154,14 +205,11 @@ mod tests {
         layer.params[LIFE] = Table::new(LifeKind::GaussHalf.columns(), 400);
         (0..400).for_each(|r| layer.params[LIFE].write(r, 0, [2.5, 0.0]));
         (0..400).for_each(|r| layer.params[GEOMETRY].write(r, 7, [-6.0f32; 3]));
-        let mut moments: Vec<_> = s.layers.iter().map(|l| Moments::new(&l.params)).collect();
-        let mut stats = Stats::new(&s);
-        (0..400).for_each(|r| stats.tables[0].write(r, 0, [1.0, 2.0, 5.0]));
-        let adc = Densify::Adc(Adc { grad_threshold: 0.1, percent_dense: 0.05, retime_clones: true });
-        let limits = Limits { cap: 800, extent: 4.0, min_opacity: 0.005 };
-        assert_eq!(adc.run(&mut s, &mut moments, &mut stats, &limits, 1, 0).added, 400);
+        let settings = AdcSettings { grad_threshold: 0.1, percent_dense: 0.05, retime_clones: true };
+        let (change, s) = run(s, settings, 0..400, Limits { cap: 800, extent: 4.0, min_opacity: 0.005 });
+        assert_eq!(change.added, 400);
         let life = &s.layers[0].params[LIFE];
-        assert!((0..400).all(|r| life.get(r, 0) == 2.5), "those who were there keep their time");
+        assert!((0..400).all(|r| life.get(r, 0) == 2.5), "those that were there keep their time");
         let times: Vec<f32> = (400..800).map(|r| life.get(r, 0)).collect();
         assert!(times.iter().all(|t| (2.0..=3.0).contains(t)));
         for quarter in 0..4 {

@@ -1,0 +1,22 @@
+//! The split into still and moving is asked for by a recipe, in the last stage of any program.
+
+use super::*;
+use crate::upkeep::At;
+
+#[test]
+fn the_last_stage_splits_where_it_is_asked_to() {
+    let at = |static_split: f64, motion: &str| {
+        let mut recipe = Recipe { iterations: 1000, motion: motion.into(), ..Recipe::default() };
+        recipe.set(&format!("static_split={static_split}")).unwrap();
+        let plan =
+            Plan { recipe: recipe.resolve(), extent: 1.0, clip: [0.0, 1.0], fps: 30.0, times: 30, ..Plan::default() };
+        let stages = stages(program(motion).unwrap().as_ref(), &plan);
+        let last = stages.last().unwrap();
+        let shared = last.groups.iter().filter(|g| g.layer == EVERY).count();
+        let splits = |step: &usize| last.upkeep.iter().any(|u| u.once() && u.due(&At { step: *step, steps: 1000 }));
+        ((0..1000).filter(splits).collect::<Vec<_>>(), shared)
+    };
+    assert_eq!(at(0.01, "spacetime"), (vec![750], 6));
+    assert_eq!(at(0.0, "spacetime"), (vec![], 0));
+    assert_eq!(at(0.01, "still"), (vec![], 0), "nothing is left to split");
+}

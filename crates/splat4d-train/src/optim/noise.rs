@@ -1,0 +1,103 @@
+//! Position noise: after every step nearly transparent Gaussians are shaken, so that they find where they are of use.
+//! Source: Kheradmand et al. 2024 (3DGS as MCMC) §3.
+
+use crate::recipe::Recipe;
+use splat4d::layers::{Layer, Scene};
+use splat4d::math::{Real, Rng, sym3};
+use splat4d::motion::for_rows;
+use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
+use splat4d::scene::{GEOMETRY, Grads, Rows, Space};
+
+/// Opaque Gaussians get less than a ten-thousandth of the noise: not worth three normal numbers.
+const LEAST_GATE: f64 = 1e-4;
+/// Slope of the sigmoid that ends the noise above the dead opacity (Kheradmand et al. 2024).
+const NOISE_SLOPE: f64 = 100.0;
+
+/// Noise on the positions of the Gaussians that took part in a step.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Noise {
+    /// Its strength, times the rate of positions.
+    pub strength: f64,
+    /// Stages that begin after so many steps, where densification has ended, have none.
+    pub until: usize,
+}
+
+impl Noise {
+    /// As a recipe has it; `None`: its strategy takes none.
+    pub fn of(r: &Recipe) -> Option<Self> {
+        (r.strategy == "mcmc").then(|| Self { strength: r.noise_lr, until: r.densify_until_iter })
+    }
+
+    /// The same as the steps `from..to` of a stage see it.
+    #[must_use]
+    pub fn part(self, from: usize, to: usize) -> Option<Self> {
+        let until = self.until.min(to).saturating_sub(from);
+        (self.until > from).then_some(Self { until, ..self })
+    }
+
+    /// Shakes the rows that are active in `d`; `rate`: that of a layer's positions, where they learn. `rng` is the step's.
+    pub fn add(
+        &self,
+        scene: &mut Scene<f32>,
+        d: &[Grads<f32>],
+        rate: impl Fn(usize) -> Option<f64>,
+        min_opacity: f64,
+        rng: Rng,
+    ) {
+        for (index, (layer, d)) in scene.layers.iter_mut().zip(d).enumerate() {
+            let Some(rate) = rate(index) else { continue };
+            let active = d.active(Space::Gaussians);
+            shake(layer, active, rate * self.strength, min_opacity, rng.fork(index as u64));
+        }
+    }
+}
+
+/// Adds the noise to the means of the active rows: Σ·ε·σ(−100(o − o_dead))·`strength`, ε ~ N(0, I).
+fn shake(layer: &mut Layer<f32>, active: &[bool], strength: f64, min_opacity: f64, rng: Rng) {
+    if strength == 0.0 {
+        return;
+    }
+    let [geometry] = layer.params.get_mut([GEOMETRY]);
+    // The opacity, and its logit, from which the gate is below the least one: most Gaussians are told by one number.
+    let opaque = min_opacity + (1.0 / LEAST_GATE - 1.0).ln() / NOISE_SLOPE;
+    let limit = if opaque < 1.0 { (opaque / (1.0 - opaque)).ln() as f32 } else { f32::INFINITY };
+    for_rows([geometry], Rows::All, |_, row, [geometry]| {
+        if !active[row] || geometry.read::<1>(row, OPACITY)[0] > limit {
+            return 0.0;
+        }
+        let g = geometry.read::<11>(row, 0);
+        let gate = (-NOISE_SLOPE * (f64::from(g[OPACITY]).sigmoid() - min_opacity)).sigmoid();
+        let c = sym3::from_quat_log_scales(
+            [g[QUAT], g[QUAT + 1], g[QUAT + 2], g[QUAT + 3]],
+            [g[LOG_SCALE], g[LOG_SCALE + 1], g[LOG_SCALE + 2]],
+        )
+        .map(f64::from);
+        let e: [f64; 3] = std::array::from_fn(|k| rng.fork(row as u64).normal(k as u64) * gate * strength);
+        let shift = [
+            c[0] * e[0] + c[1] * e[1] + c[2] * e[2],
+            c[1] * e[0] + c[3] * e[1] + c[4] * e[2],
+            c[2] * e[0] + c[4] * e[1] + c[5] * e[2],
+        ];
+        geometry.add(row, 0, shift.map(|x| x as f32));
+        0.0
+    });
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::upkeep::tests::scene;
+
+    #[test]
+    fn noise_spares_the_opaque_and_the_resting() {
+        let mut s = scene(20);
+        (0..20).for_each(|r| s.layers[0].params[GEOMETRY].set(r, OPACITY, if r < 10 { -5.5 } else { 2.0 }));
+        let before = s.layers[0].params[GEOMETRY].clone();
+        let active: Vec<bool> = (0..20).map(|r| r % 2 == 0).collect();
+        shake(&mut s.layers[0], &active, 1.0, 0.005, Rng::new(0, "noise", 0));
+        for r in 0..20 {
+            let moved = s.layers[0].params[GEOMETRY].get(r, 0) != before.get(r, 0);
+            assert_eq!(moved, r < 10 && r % 2 == 0, "row {r}");
+        }
+    }
+}

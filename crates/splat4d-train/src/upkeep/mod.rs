@@ -1,0 +1,299 @@
+//! Upkeep: what is done to a learner between steps. Gaussians are added, moved, merged and removed, the nodes that carry
+//! them follow, opacities are lowered, rows are put in order.
+//!
+//! A stage has a list of [`Upkeep`] operations; after every step those that are due run, in the order of [`Order`]. An
+//! operation changes rows through [`Learner::apply`] alone, so that it works for every motion model and every loss hears
+//! of it. A new one is a file here, and a line where a program adds it to a stage.
+
+pub mod adc;
+pub mod guided;
+pub mod mcmc;
+pub mod merge;
+pub mod morton;
+pub mod nodes;
+pub mod once;
+pub mod opacity_reset;
+pub mod prune;
+pub mod relocate;
+pub mod split;
+#[cfg(test)]
+pub(crate) mod tests;
+pub mod worth;
+
+pub use adc::{Adc, AdcSettings};
+pub use guided::{Guided, GuidedSettings};
+pub use mcmc::{Mcmc, McmcSettings};
+pub use merge::{Merge, MergeSettings, Pair};
+pub use morton::MortonOrder;
+pub use nodes::{AdaptNodes, NodeSettings};
+pub use once::Once;
+pub use opacity_reset::{OpacityReset, OpacityResetSettings};
+pub use prune::{Prune, PruneSettings};
+pub use relocate::{Relocate, RelocateSettings};
+pub use split::{Split, SplitSettings};
+
+use crate::Result;
+use crate::capture::frames::Frames;
+use crate::learner::Learner;
+use crate::recipe::Recipe;
+use splat4d::layers::{Evaluation, Scene};
+use splat4d::math::{Real, Rng, sym3};
+use splat4d::render::Antialias;
+use splat4d::scene::params::{OPACITY, QUAT};
+use splat4d::scene::splats::COV;
+use splat4d::scene::{GEOMETRY, Rows, Space, Time};
+
+/// Limits that hold for every operation of a run.
+#[derive(Clone, Copy, Debug)]
+pub struct Limits {
+    /// Never more Gaussians than this in all layers together.
+    pub cap: usize,
+    /// The scene's extent, scene units.
+    pub extent: f64,
+    /// Opacity below which a Gaussian is dead.
+    pub min_opacity: f64,
+}
+
+/// A place in a stage.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct At {
+    /// Steps of the stage that are done.
+    pub step: usize,
+    /// Steps of the stage in all.
+    pub steps: usize,
+}
+
+/// Steps of a stage at which something is done: the multiples of `interval` from `first` to `last`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Every {
+    /// Not before this step.
+    pub first: usize,
+    /// Not after this step.
+    pub last: usize,
+    /// Steps between two times; 0: never.
+    pub interval: usize,
+}
+
+impl Every {
+    /// At no step.
+    pub const NEVER: Self = Self { first: 0, last: 0, interval: 0 };
+
+    /// The steps at which a recipe densifies.
+    pub fn densification(r: &Recipe) -> Self {
+        Self { first: r.densify_from_iter, last: r.densify_until_iter, interval: r.densification_interval }
+    }
+
+    /// Whether it is time after so many steps.
+    pub fn is_due(&self, step: usize) -> bool {
+        self.interval > 0 && step >= self.first && step <= self.last && step.is_multiple_of(self.interval)
+    }
+
+    /// Whether it is time, and for the last time.
+    pub fn is_last(&self, step: usize) -> bool {
+        self.is_due(step) && step + self.interval > self.last
+    }
+
+    /// The same as the steps `from..to` of the stage see it, counted from `from`.
+    #[must_use]
+    pub fn part(self, from: usize, to: usize) -> Self {
+        Self { first: self.first.saturating_sub(from).max(1), last: self.last.min(to).saturating_sub(from), ..self }
+    }
+}
+
+/// How many rows were born and died.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Change {
+    /// New rows.
+    pub added: usize,
+    /// Rows moved onto another.
+    pub moved: usize,
+    /// Rows removed.
+    pub removed: usize,
+}
+
+impl std::ops::AddAssign for Change {
+    fn add_assign(&mut self, other: Self) {
+        self.added += other.added;
+        self.moved += other.moved;
+        self.removed += other.removed;
+    }
+}
+
+/// All that an operation may know besides the learner.
+#[derive(Clone, Copy)]
+pub struct Context<'a> {
+    /// Where in the stage.
+    pub at: At,
+    /// Steps of the run that were done before this one: it addresses the random numbers.
+    pub iteration: usize,
+    /// Seed of the run.
+    pub seed: u64,
+    /// Cap, extent and dead opacity.
+    pub limits: Limits,
+    /// What the scene is compared with.
+    pub frames: &'a dyn Frames,
+    /// As the scene is drawn.
+    pub antialias: Antialias,
+    /// Whether a column group of a layer learns in this stage.
+    pub learns: &'a dyn Fn(usize, &str) -> bool,
+}
+
+impl Context<'_> {
+    /// The random numbers of this step for a purpose.
+    pub fn rng(&self, purpose: &str) -> Rng {
+        Rng::new(self.seed, purpose, self.iteration as u64)
+    }
+}
+
+/// The order in which operations of one step run, whatever the order in which they were added; those of one place run in
+/// that one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Order {
+    /// Nodes, while statistics of the Gaussians that follow them are still there.
+    Nodes,
+    /// Gaussians are put where pictures want them; before densification, which begins the statistics anew.
+    Place,
+    /// The cloud grows.
+    Grow,
+    /// Rows are put in order.
+    Sort,
+    /// What is worth little goes.
+    Remove,
+    /// What stands in one place becomes one.
+    Merge,
+    /// Numbers are set back.
+    Reset,
+    /// All else.
+    Last,
+}
+
+/// Something that is done to a learner between steps.
+///
+/// `run` takes `&mut self`: what an operation remembers from time to time is its own, and goes into checkpoints by
+/// [`state`](Self::state).
+pub trait Upkeep: Send + Sync {
+    /// Its name, which is its own among the operations of a stage that remember anything: checkpoints use it.
+    fn name(&self) -> &str;
+
+    /// When it runs among those that are due at one step.
+    fn order(&self) -> Order {
+        Order::Last
+    }
+
+    /// Whether it is to run after so many steps of the stage; see [`once`](Self::once) for the time before the first one.
+    fn due(&self, at: &At) -> bool;
+
+    /// Does it.
+    fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change>;
+
+    /// Whether it is done once in a stage, perhaps before the first step (`at.step` is 0 then). After a resume at that
+    /// very step it runs again, and must then change nothing.
+    fn once(&self) -> bool {
+        false
+    }
+
+    /// The schedule of densification, where it follows that one: it goes on over the parts of a stage that is divided.
+    /// All other operations state their steps in the stage's own.
+    fn densification(&mut self) -> Option<&mut Every> {
+        None
+    }
+
+    /// The factor by which the cloud may grow at a place in the stage; 1: it does not.
+    fn growth(&self, _at: &At) -> f64 {
+        1.0
+    }
+
+    /// Whether it belongs into a stage that only tunes a trained scene: it keeps up what the model needs, and adds, moves
+    /// and removes no Gaussian.
+    fn in_tuning(&self) -> bool {
+        false
+    }
+
+    /// What a checkpoint must hold of it, if it remembers anything from time to time.
+    fn state(&self) -> Vec<u32> {
+        Vec::new()
+    }
+
+    /// Takes back what [`state`](Self::state) gave; nothing from a checkpoint that does not know the operation.
+    fn restore(&mut self, _state: &[u32]) {}
+}
+
+/// The operations that a recipe asks of every motion model.
+pub fn of(r: &Recipe) -> Vec<Box<dyn Upkeep>> {
+    let all = [
+        boxed(Adc::of(r)),
+        boxed(Mcmc::of(r)),
+        boxed(MortonOrder::of(r)),
+        boxed(Relocate::of(r)),
+        boxed(Prune::of(r)),
+        boxed(Merge::of(r)),
+        boxed(OpacityReset::of(r)),
+    ];
+    all.into_iter().flatten().collect()
+}
+
+fn boxed(operation: Option<impl Upkeep + 'static>) -> Option<Box<dyn Upkeep>> {
+    operation.map(|o| Box::new(o) as Box<dyn Upkeep>)
+}
+
+/// Lets every layer grow under the one cap: `layer` gets a layer's number, how many rows it may add (to be lowered by those
+/// it adds) and its random numbers. Statistics begin anew.
+fn grow(
+    learner: &mut Learner,
+    c: &Context<'_>,
+    layer: impl Fn(&mut Learner, usize, &mut usize, Rng) -> Change,
+) -> Change {
+    let mut change = Change::default();
+    let mut spare = c.limits.cap.saturating_sub(learner.scene().len());
+    let mut rest = learner.scene().len();
+    for index in 0..learner.scene().layers.len() {
+        // What is left of the cap is shared by size, so that the first layer does not starve the others; what a
+        // layer does not use goes to the next.
+        let rows = learner.scene().layers[index].params.len();
+        let mut room = (spare * rows).div_ceil(rest.max(1));
+        (spare, rest) = (spare - room, rest - rows);
+        change += layer(learner, index, &mut room, c.rng("densify").fork(index as u64));
+        spare += room;
+    }
+    learner.clear_stats();
+    change
+}
+
+/// Activated covariances [N, 6] of a layer's Gaussians at the clip's centre, whatever model made them.
+fn covariances(scene: &Scene<f32>, layer: usize) -> Vec<[f64; 6]> {
+    let l = &scene.layers[layer];
+    let center = Time(0.5 * (scene.clip[0] + scene.clip[1]));
+    let seen = Evaluation::of_layer(l, Space::Gaussians, Rows::All, center);
+    (0..l.params.len()).map(|r| seen.tape(0).out().read::<6>(r, COV).map(f64::from)).collect()
+}
+
+/// Opacity (activated, without life) of a row.
+fn opacity(scene: &Scene<f32>, layer: usize, row: usize) -> f64 {
+    f64::from(scene.layers[layer].params[GEOMETRY].get(row, OPACITY)).sigmoid()
+}
+
+/// The logit of an opacity, kept finite.
+fn logit(o: f64) -> f32 {
+    // Just inside (0, 1): beyond it the logit's gradient is lost in f32.
+    let o = o.clamp(1e-6, 1.0 - 1e-6);
+    (o / (1.0 - o)).ln() as f32
+}
+
+/// Whether nothing of the row can ever be seen, or would only do harm: dead opacity, a life outside the clip, a row that
+/// is not finite or a zero quaternion.
+fn is_dead(scene: &Scene<f32>, layer: usize, row: usize, min_opacity: f64, span: [f64; 2]) -> bool {
+    let g = scene.layers[layer].params[GEOMETRY].read::<11>(row, 0);
+    let quat: f32 = (QUAT..QUAT + 4).map(|i| g[i] * g[i]).sum();
+    opacity(scene, layer, row) <= min_opacity
+        || span[1] < scene.clip[0]
+        || span[0] > scene.clip[1]
+        || !g.iter().all(|x| x.is_finite())
+        || quat == 0.0
+}
+
+/// A point drawn from N(0, Σ).
+fn sample(cov: [f64; 6], rng: Rng) -> [f64; 3] {
+    let (values, vectors) = sym3::eigen(cov);
+    let z: [f64; 3] = std::array::from_fn(|k| rng.normal(k as u64) * values[k].max(0.0).sqrt());
+    std::array::from_fn(|r| vectors[r][0] * z[0] + vectors[r][1] * z[1] + vectors[r][2] * z[2])
+}

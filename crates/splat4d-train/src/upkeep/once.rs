@@ -1,0 +1,58 @@
+//! Once: a change of the scene in the middle of a stage, whose schedules go on: a filter that is switched on, a model that
+//! becomes another.
+
+use super::{At, Change, Context, Upkeep};
+use crate::Result;
+use crate::learner::Learner;
+use splat4d::layers::Scene;
+
+/// A change of the scene before one step of a stage. Done twice it must be as if it had been done once: it is repeated
+/// where a run is resumed at that very step.
+pub struct Once<C> {
+    /// The number of the step, from 0.
+    pub at: usize,
+    /// What is done.
+    pub change: C,
+}
+
+impl<C: Fn(&mut Scene<f32>) -> Result<()> + Send + Sync> Upkeep for Once<C> {
+    fn name(&self) -> &str {
+        "once"
+    }
+
+    fn due(&self, at: &At) -> bool {
+        at.step == self.at && at.step < at.steps
+    }
+
+    fn once(&self) -> bool {
+        true
+    }
+
+    fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
+        learner.rebuild(c.learns, &self.change)?;
+        Ok(Change::default())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::Limits;
+    use super::super::tests::{context, scene};
+    use super::*;
+
+    #[test]
+    fn it_is_due_before_its_step_and_never_behind_the_last() {
+        let darker = |s: &mut Scene<f32>| {
+            s.background = [0.5; 3];
+            Ok(())
+        };
+        let mut once = Once { at: 4, change: darker };
+        let due = |at: usize| (0..=10).filter(|&step| Once { at, change: darker }.due(&At { step, steps: 10 })).count();
+        assert!(once.due(&At { step: 4, steps: 10 }) && due(4) == 1);
+        assert_eq!([due(0), due(10)], [1, 0]);
+        let mut learner = Learner::new(scene(3));
+        let limits = Limits { cap: 3, extent: 1.0, min_opacity: 0.0 };
+        once.run(&mut learner, &context(limits, 0, 0)).unwrap();
+        assert_eq!(learner.scene().background, [0.5; 3]);
+    }
+}

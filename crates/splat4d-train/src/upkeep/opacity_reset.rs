@@ -1,0 +1,117 @@
+//! Opacity reset: every so many steps all opacities are lowered, so that what the pictures do not ask for stays faint and
+//! is pruned. Source: Kerbl et al. 2023 §5.2.
+
+use super::{At, Change, Context, Every, Order, Upkeep, logit};
+use crate::Result;
+use crate::learner::Learner;
+use crate::recipe::Recipe;
+use serde::{Deserialize, Serialize};
+use splat4d::scene::GEOMETRY;
+use splat4d::scene::params::OPACITY;
+
+/// Opacities are lowered to so many times the dead one (Kerbl et al. 2023: 0.01 where 0.005 is dead).
+const ABOVE_DEAD: f64 = 2.0;
+
+/// Settings of the opacity reset.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct OpacityResetSettings {
+    /// Steps between two resets; 0: never (a reset destroys temporal models).
+    pub interval: usize,
+}
+
+impl OpacityResetSettings {
+    /// As a recipe has them.
+    pub fn of(r: &Recipe) -> Self {
+        Self { interval: r.opacity_reset_interval }
+    }
+}
+
+impl Default for OpacityResetSettings {
+    fn default() -> Self {
+        Self::of(&Recipe::default())
+    }
+}
+
+/// Lowers opacities while the cloud is densified by gradients.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct OpacityReset {
+    /// How often.
+    pub settings: OpacityResetSettings,
+    /// When the cloud is densified: nothing is reset at the last time or after it.
+    pub densification: Every,
+}
+
+impl OpacityReset {
+    /// As a recipe has it; `None`: never.
+    pub fn of(r: &Recipe) -> Option<Self> {
+        let some = || Self { settings: OpacityResetSettings::of(r), densification: Every::densification(r) };
+        (r.strategy == "adc" && r.opacity_reset_interval > 0).then(some)
+    }
+}
+
+impl Upkeep for OpacityReset {
+    fn name(&self) -> &str {
+        "opacity reset"
+    }
+
+    fn order(&self) -> Order {
+        Order::Reset
+    }
+
+    fn due(&self, at: &At) -> bool {
+        at.step.is_multiple_of(self.settings.interval) && at.step < self.densification.last
+    }
+
+    fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
+        let ceiling = logit(ABOVE_DEAD * c.limits.min_opacity);
+        let (scene, moments) = learner.tables_mut();
+        for (layer, moments) in scene.layers.iter_mut().zip(moments) {
+            let geometry = &mut layer.params[GEOMETRY];
+            let width = geometry.width();
+            for row in 0..geometry.rows() {
+                let o = geometry.get(row, OPACITY);
+                geometry.set(row, OPACITY, o.min(ceiling));
+                moments.table_mut(GEOMETRY).set(row, OPACITY, 0.0);
+                moments.table_mut(GEOMETRY).set(row, width + OPACITY, 0.0);
+            }
+        }
+        Ok(Change::default())
+    }
+
+    fn densification(&mut self) -> Option<&mut Every> {
+        Some(&mut self.densification)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::Limits;
+    use super::super::tests::{context, due_steps, scene};
+    use super::*;
+    use crate::learner::Touched;
+
+    fn reset() -> OpacityReset {
+        let densification = Every { first: 1, last: 30, interval: 7 };
+        OpacityReset { settings: OpacityResetSettings { interval: 10 }, densification }
+    }
+
+    #[test]
+    fn opacities_above_twice_the_dead_one_are_lowered_and_their_moments_forgotten() {
+        let mut learner = Learner::new(scene(20));
+        learner.scene_mut().layers[0].params[GEOMETRY].set(3, OPACITY, -9.0);
+        learner.tables_mut().1[0].table_mut(GEOMETRY).fill(1.0);
+        learner.take_touched();
+        let limits = Limits { cap: 20, extent: 1.0, min_opacity: 0.005 };
+        reset().run(&mut learner, &context(limits, 0, 0)).unwrap();
+        let (g, m) = (&learner.scene().layers[0].params[GEOMETRY], learner.moments()[0].table(GEOMETRY));
+        assert_eq!([3, 4].map(|r| g.get(r, OPACITY)), [-9.0, logit(0.01)]);
+        assert_eq!([OPACITY, g.width() + OPACITY, 0].map(|c| m.get(4, c)), [0.0, 0.0, 1.0]);
+        assert_eq!(learner.take_touched(), Touched::Values);
+    }
+
+    #[test]
+    fn it_is_due_until_densification_ends() {
+        assert_eq!(due_steps(&reset(), 100), [10, 20]);
+    }
+}

@@ -1,0 +1,112 @@
+//! Pruning by worth while a scene is trained: again and again a share of the Gaussians goes, and what remains learns on.
+//! Source: 4DGS-1K (Yuan et al. 2025), there once, after training.
+
+use super::worth::{ScoreConfig, Scores, Spatial, prune, score};
+use super::{At, Change, Context, Order, Upkeep};
+use crate::Result;
+use crate::learner::Learner;
+use crate::recipe::Recipe;
+use serde::{Deserialize, Serialize};
+
+/// Settings of periodic pruning.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct PruneSettings {
+    /// Steps of the stage between two times; 0: never.
+    pub interval: usize,
+    /// Share of the Gaussians that goes each time.
+    pub ratio: f64,
+    /// About the most views looked at each time; never fewer than one at every moment of the capture.
+    pub views: usize,
+    /// What of a view counts.
+    pub spatial: Spatial,
+}
+
+impl PruneSettings {
+    /// As a recipe that was checked has them.
+    pub fn of(r: &Recipe) -> Self {
+        let spatial = r.prune_score.parse().expect("the recipe was checked");
+        Self { interval: r.prune_interval, ratio: r.prune_ratio, views: r.prune_views, spatial }
+    }
+}
+
+impl Default for PruneSettings {
+    fn default() -> Self {
+        Self::of(&Recipe::default())
+    }
+}
+
+/// See the module's documentation.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Prune {
+    /// How, and when.
+    pub settings: PruneSettings,
+}
+
+impl Prune {
+    /// As a recipe has it; `None`: never.
+    pub fn of(r: &Recipe) -> Option<Self> {
+        (r.prune_interval > 0).then(|| Self { settings: PruneSettings::of(r) })
+    }
+
+    /// The scores that it goes by.
+    fn scores(&self, learner: &Learner, c: &Context<'_>) -> Result<Scores> {
+        let PruneSettings { views, spatial, .. } = self.settings;
+        let every = c.frames.len().div_ceil(views.max(1)).max(1);
+        // As `compress` does by default; docs/benchmarks.md has what it won.
+        let config = ScoreConfig { spatial, volume: false, every, antialias: c.antialias, ..ScoreConfig::default() };
+        score(learner.scene(), c.frames, &config, &mut |_, _| {})
+    }
+}
+
+impl Upkeep for Prune {
+    fn name(&self) -> &str {
+        "prune"
+    }
+
+    fn order(&self) -> Order {
+        Order::Remove
+    }
+
+    /// Not if fewer than half an interval is left, in which the scene would not recover.
+    fn due(&self, at: &At) -> bool {
+        let interval = self.settings.interval;
+        at.step.is_multiple_of(interval) && at.steps.saturating_sub(at.step) >= interval.div_ceil(2)
+    }
+
+    fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
+        let before = learner.scene().len();
+        let scores = self.scores(learner, c)?;
+        for (layer, edit) in prune(learner.scene(), &scores, self.settings.ratio).iter().enumerate() {
+            learner.apply(layer, edit, &c.rng("prune"));
+        }
+        Ok(Change { removed: before - learner.scene().len(), ..Change::default() })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::Limits;
+    use super::super::tests::{context, due_steps, scene};
+    use super::*;
+    use crate::train::tests::Made;
+
+    fn pruning() -> Prune {
+        Prune { settings: PruneSettings { interval: 20, ratio: 0.25, views: 4, spatial: Spatial::Opacity } }
+    }
+
+    #[test]
+    fn a_share_of_the_gaussians_goes() {
+        let (frames, mut learner) = (Made::new(4, 1, 16), Learner::new(scene(40)));
+        let limits = Limits { cap: 40, extent: 4.0, min_opacity: 0.005 };
+        let c = Context { frames: &frames, ..context(limits, 0, 0) };
+        let change = pruning().run(&mut learner, &c).unwrap();
+        assert_eq!((change, learner.scene().len()), (Change { removed: 10, ..Change::default() }, 30));
+    }
+
+    #[test]
+    fn it_leaves_time_to_recover() {
+        assert_eq!(due_steps(&pruning(), 70), [20, 40, 60]);
+        assert_eq!(due_steps(&pruning(), 69), [20, 40]);
+    }
+}
