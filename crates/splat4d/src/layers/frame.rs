@@ -8,8 +8,6 @@ use super::Layer;
 use crate::math::sh_rotation::{rotate_coefficients, sh_rotation};
 use crate::math::{Real, Sim3, quat};
 use crate::motion::lanes::{Batch, Lane, Work, fill};
-use crate::motion::spacetime::{ROTATION_RATES, VELOCITIES};
-use crate::motion::{SpacetimeSpec, Spec, native4d};
 use crate::scene::params::{LOG_SCALE, QUAT};
 use crate::scene::splats::{COV, SPLAT_OPACITY};
 use crate::scene::table::TableMut;
@@ -116,22 +114,18 @@ impl Layer<f32> {
         Cow::Owned(own)
     }
 
-    /// Writes the frame into the tables, after which it is the identity, where the motion model's can take it in: `still`
-    /// and `spacetime` any, `native4d` any without a scale. Other layers (planes, grids, networks) keep their frame.
+    /// Writes the frame into the tables, after which it is the identity, where the motion model's can take it in
+    /// ([`Motion::absorb_frame`](crate::motion::Motion::absorb_frame)). Other layers (planes, grids, networks) keep theirs.
     pub fn absorb_frame(&mut self) {
         if self.frame.is_identity() {
             return;
         }
         let frame = self.frame;
-        match self.motion.spec() {
-            Spec::Still => {}
-            Spec::Spacetime(spec) => absorb_path(&mut self.params, &frame, spec),
-            Spec::Native4d(_) if frame.scale == 1.0 => absorb_right_quats(&mut self.params, &frame),
-            _ => return,
+        if !self.motion.absorb_frame(&mut self.params, &frame) {
+            return;
         }
         absorb_geometry(&mut self.params, &frame);
-        let blocks = if let Spec::Native4d(s) = self.motion.spec() { s.harmonics + 1 } else { 1 };
-        absorb_colors(&mut self.params[SH], blocks, &frame.rotation);
+        absorb_colors(&mut self.params[SH], self.motion.capabilities().color_blocks, &frame.rotation);
         self.frame = Sim3::IDENTITY;
     }
 }
@@ -140,37 +134,10 @@ fn absorb_geometry(params: &mut Params, frame: &Sim3) {
     let (table, q) = (&mut params[GEOMETRY], quat::from_rotation(&frame.rotation));
     for row in 0..table.rows() {
         table.write(row, 0, frame.apply(table.read::<3>(row, 0).map(f64::from)).map(|x| x as f32));
-        table.write(row, QUAT, product(q, or_identity(table.read(row, QUAT))));
+        table.write(row, QUAT, quat::rotated(q, table.read(row, QUAT)));
         if frame.scale != 1.0 {
             table.add(row, LOG_SCALE, [frame.scale.ln() as f32; 3]);
         }
-    }
-}
-
-fn absorb_path(params: &mut Params, frame: &Sim3, spec: SpacetimeSpec) {
-    let find = |name| params.find(name).expect("a spacetime layer has its tables");
-    let (velocities, rates) = (find(VELOCITIES), find(ROTATION_RATES));
-    let table = &mut params[velocities];
-    for row in 0..table.rows() {
-        for k in 0..spec.order {
-            let v = frame.vector(table.read::<3>(row, 3 * k).map(f64::from));
-            table.write(row, 3 * k, v.map(|x| x as f32));
-        }
-    }
-    // q(t) = q + ωΔ is linear, so that a rate rotates as the quaternion does.
-    let (table, q) = (&mut params[rates], quat::from_rotation(&frame.rotation));
-    for row in 0..if spec.rotation { table.rows() } else { 0 } {
-        table.write(row, 0, product(q, table.read::<4>(row, 0)));
-    }
-}
-
-/// Q(l X r̄)Q̄ = (Ql) X (Qr)̄: the right quaternion of a rotation of four dimensions rotates as the left one does.
-fn absorb_right_quats(params: &mut Params, frame: &Sim3) {
-    let own = params.find(native4d::TABLE).expect("a native4d layer has its table");
-    let (first, _) = native4d::RIGHT_QUATS;
-    let (table, q) = (&mut params[own], quat::from_rotation(&frame.rotation));
-    for row in 0..table.rows() {
-        table.write(row, first, product(q, or_identity(table.read(row, first))));
     }
 }
 
@@ -184,14 +151,4 @@ fn absorb_colors(table: &mut Table, blocks: usize, r: &[[f64; 3]; 3]) {
         row.chunks_exact_mut(block.max(1)).for_each(|block| rotate_coefficients(&m, block));
         row.iter().enumerate().for_each(|(col, x)| table.set(id, col, *x));
     }
-}
-
-/// A zero quaternion stands for the identity wherever it is used, and must rotate as the identity does.
-fn or_identity(q: [f32; 4]) -> [f32; 4] {
-    if q == [0.0; 4] { [1.0, 0.0, 0.0, 0.0] } else { q }
-}
-
-/// a ⊗ b, wxyz, rounded once.
-fn product(a: [f64; 4], b: [f32; 4]) -> [f32; 4] {
-    quat::product(a, b.map(f64::from)).map(|x| x as f32)
 }

@@ -248,7 +248,8 @@ impl<F: Real> Layer<F> {
     /// The splats that the last [`at`](Self::at) left in `tape`.
     pub fn part<'a>(&'a self, tape: &'a LayerTape<F>) -> Part<'a, F> {
         let color = self.motion.color(&tape.question(&self.params), &tape.tape);
-        Part { out: tape.out(), color, layer_from_world: self.frame.directions() }
+        let layer_from_world = if tape.of == Space::Gaussians { self.frame.directions() } else { None };
+        Part { out: tape.out(), color, layer_from_world }
     }
 
     /// Means as the tables have them, before any motion, in the world.

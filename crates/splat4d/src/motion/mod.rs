@@ -17,7 +17,7 @@ pub mod ssm;
 pub mod still;
 pub mod tracked;
 
-use crate::math::{Real, Rng};
+use crate::math::{Real, Rng, Sim3};
 use crate::scene::params::LOG_SCALE;
 use crate::scene::splats::SPLAT_COLUMNS;
 use crate::scene::table::{TableMut, par_split};
@@ -192,6 +192,12 @@ pub trait Motion<F: Real = f32>: Any + Send + Sync {
     /// Properties that others act on. A model from outside the library that tells none promises nothing.
     fn capabilities(&self) -> Capabilities {
         self.spec().capabilities().unwrap_or_default()
+    }
+
+    /// Takes a similarity into the model's own tables, as the layer takes it into geometry and colours. False: it cannot,
+    /// and nothing has changed.
+    fn absorb_frame(&self, _p: &mut Params<F>, _frame: &Sim3) -> bool {
+        false
     }
 
     /// The motion as a polynomial in time, if it is one.

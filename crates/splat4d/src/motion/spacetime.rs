@@ -10,7 +10,7 @@
 use super::lanes::{Batch, Lane, Work, fill, scatter};
 use super::still::{activate_backward_lanes, activate_lanes};
 use super::{At, Cache, Capabilities, Model, Motion, Polynomial, Spec, Tape, fill_rows};
-use crate::math::{Real, sh};
+use crate::math::{Real, Sim3, quat, sh};
 use crate::scene::head::{BASE, FEATURES, FURTHER};
 use crate::scene::params::QUAT;
 use crate::scene::table::TableMut;
@@ -151,6 +151,23 @@ impl Spacetime {
 impl<F: Real> Motion<F> for Spacetime {
     fn spec(&self) -> Spec {
         Spec::Spacetime(self.spec)
+    }
+
+    fn absorb_frame(&self, p: &mut Params<F>, frame: &Sim3) -> bool {
+        let table = &mut p[self.velocities];
+        for row in 0..table.rows() {
+            for k in 0..self.spec.order {
+                let v = frame.vector(table.read::<3>(row, 3 * k).map(|x| x.f64()));
+                table.write(row, 3 * k, v.map(F::of));
+            }
+        }
+        // q(t) = q + ωΔ is linear, so that a rate rotates as the quaternion does.
+        let (table, q) = (&mut p[self.rates], quat::from_rotation(&frame.rotation));
+        for row in 0..if self.spec.rotation { table.rows() } else { 0 } {
+            let rate = quat::product(q, table.read::<4>(row, 0).map(|x| x.f64()));
+            table.write(row, 0, rate.map(F::of));
+        }
+        true
     }
 
     fn polynomial(&self) -> Option<Polynomial> {

@@ -4,7 +4,7 @@
 use super::lanes::{Batch, Lane, Work, fill, scatter};
 use super::{At, Cache, Capabilities, Model, Motion, Polynomial, Spec, Tape};
 use crate::Result;
-use crate::math::{Real, sym3};
+use crate::math::{Real, Sim3, sym3};
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::splats::{COV, SPLAT_OPACITY};
 use crate::scene::table::TableMut;
@@ -29,6 +29,10 @@ impl Model for Still {
 impl<F: Real> Motion<F> for Still {
     fn spec(&self) -> Spec {
         Spec::Still
+    }
+
+    fn absorb_frame(&self, _p: &mut Params<F>, _frame: &Sim3) -> bool {
+        true
     }
 
     fn polynomial(&self) -> Option<Polynomial> {

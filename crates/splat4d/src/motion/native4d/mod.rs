@@ -14,7 +14,7 @@ mod tests;
 
 use super::lanes::{Batch, Lane, Work, fill, scatter};
 use super::{At, Cache, Capabilities, Model, Motion, Spec, Tape, fill_rows};
-use crate::math::{Real, Rng};
+use crate::math::{Real, Rng, Sim3, quat};
 use crate::scene::table::TableMut;
 use crate::scene::{BLOCK, Born, Color, GEOMETRY, Grads, Key, Params, RowEdit, SH, Space, SplatGrads, Table};
 use crate::simd::each;
@@ -31,8 +31,6 @@ pub(crate) use sliced::Sliced;
 pub const MAX_HARMONICS: usize = 2;
 /// Columns of the model's own table.
 pub const COLUMNS: [(&str, usize); 3] = [("time_means", 1), ("log_time_scales", 1), ("right_quats", 4)];
-/// First column and number of columns of the right quaternions in it.
-pub const RIGHT_QUATS: (usize, usize) = (RIGHT, 4);
 /// Its name.
 pub const TABLE: &str = "native4d";
 /// The parts of a split live shorter by this factor: Kerbl et al. 2023 divide scales by 1.6, Yang et al. 2024 all four.
@@ -165,6 +163,19 @@ const WEIGHT_COLUMNS: [[(&str, usize); 1]; MAX_HARMONICS + 1] = [[("weights", 1)
 impl<F: Real> Motion<F> for Native4d {
     fn spec(&self) -> Spec {
         Spec::Native4d(self.spec)
+    }
+
+    /// Q(l X r̄)Q̄ = (Ql) X (Qr)̄: the right quaternion of a rotation of four dimensions rotates as the left one does. A scale
+    /// has no place, since it would change κ.
+    fn absorb_frame(&self, p: &mut Params<F>, frame: &Sim3) -> bool {
+        if frame.scale != 1.0 {
+            return false;
+        }
+        let (table, q) = (&mut p[self.own], quat::from_rotation(&frame.rotation));
+        for row in 0..table.rows() {
+            table.write(row, RIGHT, quat::rotated(q, table.read(row, RIGHT)));
+        }
+        true
     }
 
     fn scratch_bytes(&self, _p: &Params<F>, _rows: usize) -> u64 {
