@@ -6,10 +6,12 @@
 #[cfg(test)]
 mod tests;
 
+use crate::device;
 use crate::format::playback::{Entry, Index, Kind, Meta, Palette, decode_masks, decode_page, decode_palette};
 use crate::layers::{ALWAYS, Evaluation, Layer, Scene};
+use crate::render::{Image, RenderConfig, Shot};
 use crate::scene::masks::WORD;
-use crate::scene::{HeadWeights, KeyMasks, Rows, Space, Splats, Time};
+use crate::scene::{Camera, HeadWeights, KeyMasks, Rows, Space, Splats, Time};
 use crate::{Error, Result};
 use rayon::prelude::*;
 use std::borrow::Cow;
@@ -19,6 +21,17 @@ use std::sync::Arc;
 const BLOCK: usize = crate::format::playback::BLOCK_GAUSSIANS;
 /// Memory for unpacked pages unless told, bytes.
 pub const DEFAULT_BUDGET: usize = 1 << 30;
+
+/// A picture of a scene at a time, on the CPU, over the scene's own background. Whoever draws many keeps a [`Player`], a
+/// [`Backend`](crate::render::Backend) and an [`Image`].
+///
+/// Errors: a driver's; the CPU has none.
+pub fn draw(scene: &Scene<f32>, camera: &Camera, t: Time) -> Result<Image> {
+    let (mut player, mut image) = (Player::of_scene(scene), Image::default());
+    let splats = player.at(t)?;
+    device::cpu(RenderConfig::default()).render(&Shot::new(&splats, camera, scene.background), &mut image)?;
+    Ok(image)
+}
 
 /// Bytes at an offset of something long, such as a file.
 pub trait ReadAt {

@@ -30,3 +30,44 @@ mod zip;
 pub use arrays::{params_to_arrays, tensors_to_loaded};
 pub use dialect::Dialect;
 pub use warnings::Warnings;
+
+use crate::layers::Scene;
+use crate::{Error, Result};
+
+/// The scene in a file of any kind that says by its first bytes what it is: `.splat4d`, .ply (3DGS, compressed, Spacetime
+/// Gaussians), .spz, .splatv, zipped SOG, `scene.safetensors` and checkpoints. A .splat has no mark: [`dialect::open`] it.
+///
+/// What had to be assumed is not told; [`dialect::open`] tells. Errors: no such kind; the reader's.
+pub fn open(bytes: &[u8]) -> Result<Scene<f32>> {
+    if bytes.starts_with(&playback::MAGIC) {
+        return playback::read(bytes);
+    }
+    if let Some(kind) = Dialect::of(bytes) {
+        return dialect::open(kind, bytes).map(|opened| opened.scene);
+    }
+    // A safetensors file begins with the length of its JSON header.
+    if bytes.get(8) != Some(&b'{') {
+        return Err(Error::input("its first bytes are of no format that splat4d reads")
+            .remedy("Give a .splat4d, .ply, .spz, .splatv, SOG or scene.safetensors"));
+    }
+    scene::read(bytes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn files_are_opened_by_their_first_bytes() {
+        let moving = kinematic::tests::moving(20, crate::scene::LifeKind::GaussOne, 1, false);
+        let (mut own, mut foreign) = (Vec::new(), Vec::new());
+        scene::write(&moving, &mut own).unwrap();
+        splatv::write(&moving, &[], &mut foreign).unwrap();
+        for bytes in [&own, &foreign] {
+            assert_eq!(open(bytes).unwrap().len(), 20);
+        }
+        for bytes in [&b""[..], b"GIF89a and more bytes", &own[..40]] {
+            assert!(open(bytes).is_err());
+        }
+    }
+}
