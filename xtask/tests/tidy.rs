@@ -20,7 +20,7 @@ const ORDER: [(&str, &[&str]); 5] = [
         // `methods`, which choose among them; `init` needs a model's plan; `eval` writes as safely as `train` does.
         &[
             "recipe", "event", "capture", "sampler", "optim", "loss", "learner", "upkeep", "methods", "init", "train",
-            "eval", "compress", "dynamics", "dist",
+            "eval", "training", "compress", "dynamics", "dist",
         ],
     ),
     (

@@ -33,6 +33,7 @@ pub mod optim;
 pub mod recipe;
 pub mod sampler;
 pub mod train;
+pub mod training;
 pub mod upkeep;
 
 pub use splat4d::{Error, ErrorKind, Result};
