@@ -151,7 +151,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     files::make_folder(&args.output)?;
     let wanted = |f: &Found| orders.iter().any(|o| o.variant.key == f.key && o.print == f.print);
     study.cells.retain(wanted);
-    (study.steps, study.seeds) = (orders[0].recipe.iterations, orders.len() / variants.len());
+    (study.steps, study.seeds) = (orders[0].recipe.run.iterations, orders.len() / variants.len());
     let stop = interrupt::flag("stopping: finished runs are kept, this one goes on next time");
     let missing: Vec<&Order> =
         orders.iter().filter(|o| !study.cells.iter().any(|f| f.print == o.print && f.key == o.variant.key)).collect();
@@ -165,7 +165,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             }
         };
         let number = orders.len() - missing.len() + i + 1;
-        let (name, seed) = (order.variant.name, order.recipe.seed);
+        let (name, seed) = (order.variant.name, order.recipe.run.seed);
         console.clear();
         console.note(&format!("{number}/{}: {name}, seed {seed}{left}", orders.len()));
         let folder = args.output.join("work").join(format!("{}-{seed}-{}", order.variant.key, order.print));
@@ -189,9 +189,9 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
 
 /// Every run of the study: variants one after the other within a seed, so that a stopped study has compared something.
 fn orders(args: &Args, variants: &[Variant]) -> Result<Vec<Order>> {
-    let mut base = Recipe { downscale: args.downscale, ..Recipe::default() };
+    let mut base = Recipe::default().with(|r| r.capture.downscale = args.downscale);
     base.set(&format!("motion={}", toml::Value::String(args.motion.clone())))?;
-    base.iterations = args.iterations.unwrap_or(if args.quick { QUICK_STEPS } else { STEPS });
+    base.run.iterations = args.iterations.unwrap_or(if args.quick { QUICK_STEPS } else { STEPS });
     for assignment in &args.set {
         base.set(assignment).map_err(|e| e.at("--set"))?;
     }
@@ -201,7 +201,7 @@ fn orders(args: &Args, variants: &[Variant]) -> Result<Vec<Order>> {
     for seed in 1..=u64::from(seeds) {
         for variant in variants {
             let recipe = variant.recipe(&base, seed)?;
-            let print = files::fingerprint(format!("{}\n{}", args.capture.display(), recipe.to_toml()));
+            let print = files::fingerprint(format!("{}\n{}", args.capture.display(), recipe.flat_toml()));
             all.push(Order { variant: *variant, recipe, print });
         }
     }
@@ -236,15 +236,19 @@ fn judge(
     }
     let scene = read_scene(&Run::open(folder)?.scene_file()?)?;
     let recipe = &order.recipe;
-    let store = ImageStore::new(capture.clone(), usize::try_from(recipe.image_memory).unwrap_or(usize::MAX));
-    let options =
-        EvalOptions { antialias: recipe.antialias, pictures: false, train_views: 0, ..EvalOptions::default() };
+    let store = ImageStore::new(capture.clone(), usize::try_from(recipe.run.image_memory).unwrap_or(usize::MAX));
+    let options = EvalOptions {
+        antialias: recipe.appearance.antialias,
+        pictures: false,
+        train_views: 0,
+        ..EvalOptions::default()
+    };
     let scores = assess(&scene, capture, &store, outcome.iteration, &options, &mut listen)?;
-    let flow = flow::error(&scene, capture, truths, antialias(recipe.antialias))?;
+    let flow = flow::error(&scene, capture, truths, antialias(recipe.appearance.antialias))?;
     let [psnr, psnr_dynamic, ssim, flicker] = ["PSNR", "PSNR-dynamic", "SSIM", "flicker"].map(|name| scores.held(name));
     Ok(Some(Found {
         key: order.variant.key.into(),
-        seed: recipe.seed,
+        seed: recipe.run.seed,
         print: order.print.clone(),
         psnr,
         psnr_dynamic,

@@ -154,9 +154,9 @@ impl Bench {
                 .into());
         }
         let capture = Arc::new(capture);
-        let store = ImageStore::new(capture.clone(), usize::try_from(recipe.image_memory).unwrap_or(usize::MAX));
+        let store = ImageStore::new(capture.clone(), usize::try_from(recipe.run.image_memory).unwrap_or(usize::MAX));
         let share = if args.quick { QUICK_SHARE } else { STEPS_SHARE };
-        let own = run.iteration().unwrap_or(recipe.resolve().iterations);
+        let own = run.iteration().unwrap_or(recipe.resolve().run.iterations);
         let steps = args.fine_tune.unwrap_or(((own as f64 * share) as usize).max(1));
         let looks = looks(&run.views()?, scene.clip, if args.quick { QUICK_SIZE } else { SIZE });
         let grid = if args.quick { Grid::quick(steps) } else { Grid::full(steps) };
@@ -172,10 +172,11 @@ impl Bench {
             return Ok(None);
         }
         let scene = made.as_ref().unwrap_or(&self.scene);
-        let options = EvalOptions { antialias: self.recipe.antialias, pictures: false, ..EvalOptions::default() };
+        let options =
+            EvalOptions { antialias: self.recipe.appearance.antialias, pictures: false, ..EvalOptions::default() };
         let mut listen = |event: &Event| console.event(event);
         let scores = assess(scene, &self.capture, &self.store, cell.steps, &options, &mut listen)?;
-        let antialias = antialias(self.recipe.antialias);
+        let antialias = antialias(self.recipe.appearance.antialias);
         let subjects = [&self.scene, scene].map(|s| Subject { what: What::Scene(s), antialias });
         let sides = in_turns(&subjects, &self.looks, &mut |done, total| console.phase("playing", done, total))?;
         // A folder that stays costs room, not truth.

@@ -185,7 +185,7 @@ fn train(capture: &Path, model: &str, folder: &Path, args: &Args, stop: &AtomicB
 fn judge(folder: &Path, capture: &str, model: &str, console: &Console) -> anyhow::Result<Cell> {
     let run = Run::open(folder)?;
     let scene = read_scene(&run.scene_file()?)?;
-    let antialias = antialias(run.recipe()?.antialias);
+    let antialias = antialias(run.recipe()?.appearance.antialias);
     let subjects = [Subject { what: What::Scene(&scene), antialias }];
     let looks = looks(&run.views()?, scene.clip, SIZE);
     let sides = in_turns(&subjects, &looks, &mut |done, total| console.phase("playing", done, total))?;

@@ -66,7 +66,7 @@ pub(crate) fn pack(source: &Source, title: &str, baking: &Baking, console: &Cons
     if scene.layers.iter().any(|l| l.masks.is_some()) {
         console.warn("the scene's masks are not baked along: whom they leave out is drawn. Its own .splat4d has them.");
     }
-    let antialias = source.run.as_ref().and_then(|r| r.recipe().ok()).is_some_and(|r| r.antialias);
+    let antialias = source.run.as_ref().and_then(|r| r.recipe().ok()).is_some_and(|r| r.appearance.antialias);
     let meta = Meta { title: title.to_owned(), ..meta(scene, &Outline::of_baked(&baked), &stage, &cameras) };
     let poster = baking.poster.then(|| poster(scene, &stage, antialias)).flatten();
     console.phase("writing", 0, 0);

@@ -11,7 +11,7 @@ use serde_json::Value;
 use splat4d::math::Se3;
 use splat4d::scene::{Camera, Intrinsics, Lens};
 use splat4d::{Error, Result};
-use splat4d_train::recipe::nearest;
+use splat4d_train::settings::nearest;
 use std::path::Path;
 
 const KEYS: [&str; 9] = ["fx", "fy", "cx", "cy", "w", "h", "world_to_camera", "near", "background"];

@@ -151,7 +151,7 @@ impl Work {
         console: &Console,
     ) -> anyhow::Result<Compressed> {
         let unpruned = if self.order.unpruned { Some(self.train_unpruned(original, stop, console)?) } else { None };
-        let smooth = antialias(original.recipe.antialias);
+        let smooth = antialias(original.recipe.appearance.antialias);
         let read = |path: &Path| -> Result<Arc<[u8]>> {
             Ok(std::fs::read(path).map_err(|e| files::cannot_read(path, e))?.into())
         };
@@ -277,7 +277,7 @@ impl Work {
         let (stage, cameras) = (source.stage(&views), baking::distinct(&views));
         let pages = compressed.pages.as_ref().expect("the command's settings have a codec");
         let run = source.run.as_ref().expect("it was opened as a run");
-        let antialias = run.recipe().is_ok_and(|r| r.antialias);
+        let antialias = run.recipe().is_ok_and(|r| r.appearance.antialias);
         let outline = baking::Outline::of_pages(pages);
         let meta = Meta { title: run.name(), ..baking::meta(&source.scene, &outline, &stage, &cameras) };
         let poster = baking::poster(&source.scene, &stage, antialias);
@@ -339,8 +339,9 @@ impl Original<'_> {
 
     /// The scores of a scene of this capture, without a trace in any folder.
     fn scores(&self, scene: &Scene<f32>, console: &Console) -> anyhow::Result<Scores> {
-        let store = ImageStore::new(self.capture.clone(), self.recipe.image_memory as usize);
-        let options = EvalOptions { antialias: self.recipe.antialias, pictures: false, ..EvalOptions::default() };
+        let store = ImageStore::new(self.capture.clone(), self.recipe.run.image_memory as usize);
+        let options =
+            EvalOptions { antialias: self.recipe.appearance.antialias, pictures: false, ..EvalOptions::default() };
         let scores = assess(scene, &self.capture, &store, 0, &options, &mut |event| console.event(event))?;
         console.clear();
         Ok(scores)

@@ -99,10 +99,10 @@ pub(crate) fn scores(run: &Path, scene: &Scene<f32>, measure: &Measure, console:
     let opened = Run::open(run)?;
     let (capture, recipe) = opened.open_capture()?;
     let capture = Arc::new(capture);
-    let store = ImageStore::new(capture.clone(), usize::try_from(recipe.image_memory).unwrap_or(usize::MAX));
+    let store = ImageStore::new(capture.clone(), usize::try_from(recipe.run.image_memory).unwrap_or(usize::MAX));
     let options = EvalOptions {
         folder: run.to_owned(),
-        antialias: recipe.antialias,
+        antialias: recipe.appearance.antialias,
         lpips_weights: measure.lpips_weights.clone(),
         ..EvalOptions::default()
     };
@@ -189,7 +189,7 @@ fn orbit(run: &Path, scene: &Scene<f32>, console: &Console) -> anyhow::Result<Pa
     let clock = Clock { from: scene.clip[0], to: scene.clip[1], freeze: None, slow_motion: None, fps };
     let size = (!mp4).then(|| small([stage.template.width, stage.template.height]));
     let shots = shots(&Route::Orbit, &clock, &views, &stage, size)?;
-    let antialias = opened.recipe().is_ok_and(|r| r.antialias);
+    let antialias = opened.recipe().is_ok_and(|r| r.appearance.antialias);
     let mut painter = Painter::new(scene, scene.background, antialias, false);
     let path = run.join(name);
     let first = &shots[0].camera;

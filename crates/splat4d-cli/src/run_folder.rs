@@ -171,10 +171,9 @@ impl Run {
         self.info.get(key).and_then(Value::as_f64)
     }
 
-    /// A knob of the recipe, as text.
+    /// The knob `table.field` of the recipe, as text.
     pub(crate) fn recipe_text(&self, knob: &str) -> Option<String> {
-        let table: toml::Table = self.recipe.as_deref()?.parse().ok()?;
-        table.get(knob).map(|v| v.as_str().map_or_else(|| v.to_string(), str::to_owned))
+        self.recipe().ok()?.get(knob).map(|v| v.as_str().map_or_else(|| v.to_string(), str::to_owned))
     }
 
     /// The recipe.

@@ -47,9 +47,9 @@ fn help_teaches_and_completions_complete() {
         let own = splat4d(&[verb, "--help"]).run().ok();
         assert!(own.contains("Examples:") && own.contains(&format!("splat4d {verb}")), "{verb} --help teaches nothing");
     }
-    let train = splat4d(&["train", "--help"]).run().ok();
-    for knob in ["position_lr_init", "densify_until_iter", "lambda_dssim", "max_cap"] {
-        assert!(train.contains(knob), "{knob} is missing");
+    let knobs = splat4d(&["train", "--help-knobs"]).run().ok();
+    for knob in ["position_lr_init", "densify_until_iter", "lambda_dssim", "densify.max_cap"] {
+        assert!(knobs.contains(knob), "{knob} is missing");
     }
     // The studies are a program of their own.
     assert!(splat4d(&["lab", "e00"]).run().refused().contains("lab"));

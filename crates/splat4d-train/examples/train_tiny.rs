@@ -105,7 +105,7 @@ fn main() -> Result<()> {
         moments: (0..TIMES).map(|k| (k as f64 / FPS, CAMERAS)).collect(),
         masks: false,
     };
-    let program = program(&plan.recipe.motion)?;
+    let program = program(plan.recipe.run.motion.as_str())?;
     let seeds = init::seeds(&plan, &made, None, true)?;
     let scene = init::scene(&plan, program.as_ref(), &seeds, [0.0; 3], truth.up)?;
     let mut trainer = Trainer::new(
@@ -113,10 +113,14 @@ fn main() -> Result<()> {
         program.stages(&plan),
         Arc::new(made),
         Box::new(Renderer::new(RenderConfig::default())),
-        TrainLoss::photometric(plan.recipe.lambda_dssim),
+        TrainLoss::photometric(plan.recipe.loss.dssim),
         Settings {
             seed: 0,
-            limits: Limits { cap: plan.recipe.max_cap, extent: plan.extent, min_opacity: plan.recipe.min_opacity },
+            limits: Limits {
+                cap: plan.recipe.densify.max_cap,
+                extent: plan.extent,
+                min_opacity: plan.recipe.densify.min_opacity,
+            },
             background: [0.0; 3],
             sh_degree: 0,
             exposure_lr: 0.0,

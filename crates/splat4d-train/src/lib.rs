@@ -32,6 +32,7 @@ pub mod methods;
 pub mod optim;
 pub mod recipe;
 pub mod sampler;
+pub mod settings;
 pub mod train;
 pub mod training;
 pub mod upkeep;

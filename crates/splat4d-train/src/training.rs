@@ -61,7 +61,7 @@ impl<'a> Training<'a> {
         let never = AtomicBool::new(false);
         let stop = self.stop.unwrap_or(&never);
         let (capture, run) = (self.capture, run.as_ref());
-        let antialias = self.recipe.antialias;
+        let antialias = self.recipe.appearance.antialias;
         let outcome = train(capture.clone(), self.recipe, run, &self.options, stop, &mut self.listen)?;
         Ok(Trained { outcome, capture, antialias })
     }

@@ -135,7 +135,7 @@ fn a_model_from_outside_trains_and_its_file_plays() {
         SwayProgram.stages(&plan),
         made.clone(),
         Box::new(Renderer::new(RenderConfig::default())),
-        TrainLoss::photometric(plan.recipe.lambda_dssim),
+        TrainLoss::photometric(plan.recipe.loss.dssim),
         Settings {
             seed: 0,
             limits: Limits { cap: 1000, extent: plan.extent, min_opacity: 0.005 },

@@ -1,30 +1,63 @@
 //! `docs/recipe.md` is written by this test from the recipe itself, so that the document cannot lag behind the code.
 
-use splat4d_train::recipe::{Knob, Recipe};
+use splat4d_train::recipe::Recipe;
+use splat4d_train::settings::{Knob, Range, When};
 use std::path::Path;
 
 const HEAD: &str = "\
 # The recipe
 
-Every knob of a run, its default and its meaning. Set one with `--set KEY=VALUE` (may be repeated), or write lines such
-as `iterations = 3000` into a TOML file for `--recipe FILE`. The effective recipe is saved with every run as
-`recipe.toml`; training again from that file repeats the run.
+Every knob of a run, its default and its meaning. Set one with `--set TABLE.NAME=VALUE` (may be repeated), or write a TOML
+file for `--recipe FILE`:
 
-Knobs that count iterations and are 0 follow from `iterations`. Rates of positions are in units of the scene's extent
+```toml
+[run]
+iterations = 3000
+
+[densify]
+max_cap = 60000
+```
+
+Recipes had no tables once: the names of then, in the last column, still work alone (`--set max_cap=60000`, or
+`max_cap = 60000` at the top of the file). The effective recipe is saved with every run as `recipe.toml`; training again
+from that file repeats the run.
+
+A knob without effect in the recipe that it is set in (`mcmc.growth` where `densify.strategy` is adc) is refused by `--set`
+and warned about where it comes from a file; a value that switches off what is off anyhow is warned about too.
+
+Knobs that count iterations and are 0 follow from `run.iterations`. Rates of positions are in units of the scene's extent
 (1.1 times the largest distance of a training camera from the cameras' centroid), everything with time in it is per clip
 length: a recipe carries over from a scene of centimetres and seconds to one of metres and minutes.
 
-This file is generated: `UPDATE_GOLDEN=1 cargo test --release -p splat4d-train --test recipe_doc`.
-
+This file is generated: `UPDATE_GOLDEN=1 cargo test -p splat4d-train --test recipe_doc`.
 ";
 
 fn page() -> String {
-    let row = |k: &Knob| {
-        let default = if k.default == "\"\"" { "(empty)".to_owned() } else { format!("`{}`", k.default) };
-        format!("| `{}` | {default} | {} |\n", k.name, k.doc.replace('|', "\\|"))
-    };
-    let rows: String = Recipe::knobs().iter().map(row).collect();
-    format!("{HEAD}| knob | default | meaning |\n|---|---|---|\n{rows}")
+    let mut text = HEAD.to_owned();
+    let mut table = "";
+    for knob in Recipe::knobs() {
+        if knob.table != table {
+            table = knob.table;
+            let needs = Recipe::needs(table).map_or_else(String::new, |n| format!(" In effect with {n}."));
+            text += &format!(
+                "\n## `[{table}]`\n\n{}{needs}\n\n| knob | default | range, unit | meaning | alone |\n|---|---|---|---|---|\n",
+                Recipe::about(table)
+            );
+        }
+        text += &row(&knob);
+    }
+    text
+}
+
+fn row(k: &Knob) -> String {
+    let default = if k.default == "\"\"" { "(empty)".to_owned() } else { format!("`{}`", k.default) };
+    // What nearly every number is need not be said of each.
+    let range = if k.rule.range == Range::NotNegative { String::new() } else { k.rule.range.to_string() };
+    let kind: Vec<&str> = [range.as_str(), k.rule.unit].into_iter().filter(|s| !s.is_empty()).collect();
+    let alone = Recipe::flat_name(&k.key()).map_or_else(String::new, |name| format!("`{name}`"));
+    let needs = if k.rule.when == When::Always { String::new() } else { format!(" In effect with {}.", k.rule.when) };
+    let doc = (k.doc.clone() + &needs).replace('|', "\\|");
+    format!("| `{}` | {default} | {} | {doc} | {alone} |\n", k.field, kind.join("; "))
 }
 
 #[test]
@@ -38,7 +71,7 @@ fn the_document_says_what_the_recipe_does() {
     assert!(
         found == page(),
         "docs/recipe.md is out of date (first difference: {}). Write it again with\n    \
-         UPDATE_GOLDEN=1 cargo test --release -p splat4d-train --test recipe_doc",
+         UPDATE_GOLDEN=1 cargo test -p splat4d-train --test recipe_doc",
         differs.unwrap_or_else(|| "its length".into())
     );
 }

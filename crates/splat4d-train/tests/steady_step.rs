@@ -99,7 +99,7 @@ fn trainer() -> Result<Trainer<'static>> {
         moments: (0..TIMES).map(|k| (0.1 * k as f64, 3)).collect(),
         masks: false,
     };
-    let program = program(&plan.recipe.motion)?;
+    let program = program(plan.recipe.run.motion.as_str())?;
     let seeds = init::seeds(&plan, &grey, None, true)?;
     let mut scene = init::scene(&plan, program.as_ref(), &seeds, [0.0; 3], [0.0, 1.0, 0.0])?;
     // Some are alive at one of the times only, so that the active set is a list and not everything.

@@ -57,7 +57,7 @@ impl Variant {
     /// The recipe with what the variant sets, and the seed.
     pub(crate) fn recipe(&self, base: &Recipe, seed: u64) -> Result<Recipe> {
         let off = ["filter=off", "transport=off", "filter_predictor=wasserstein"];
-        let mut recipe = Recipe { seed, ..base.clone() };
+        let mut recipe = base.clone().with(|r| r.run.seed = seed);
         off.iter().chain(self.knobs).try_for_each(|knob| recipe.set(knob))?;
         Ok(recipe)
     }
@@ -69,14 +69,15 @@ mod tests {
 
     #[test]
     fn variants_differ_in_what_they_set_alone() {
-        let base = Recipe { filter: "literal".into(), ..Recipe::default() };
+        use splat4d::motion::filtered::Fusion;
+        let base = Recipe::default().with(|r| r.filter.fusion = Fusion::Literal);
         let all = variants(false);
         for (i, a) in all.iter().enumerate() {
             let recipe = a.recipe(&base, 3).unwrap();
-            assert_eq!(recipe.seed, 3);
+            assert_eq!(recipe.run.seed, 3);
             assert!(all[..i].iter().all(|b| b.key != a.key && b.recipe(&base, 3).unwrap() != recipe), "{}", a.key);
         }
-        let alone = all[0].recipe(&base, base.seed).unwrap();
+        let alone = all[0].recipe(&base, base.run.seed).unwrap();
         assert_eq!(alone, Recipe::default(), "what the base has of a filter does not count");
         assert!(variants(true).len() >= 5 && variants(true)[0] == all[0]);
     }

@@ -19,7 +19,7 @@ use splat4d::math::quat;
 use splat4d::math::se3::{mat_vec, norm, sub};
 use splat4d::scene::Camera;
 use splat4d::{Error, Result};
-use splat4d_train::recipe::nearest;
+use splat4d_train::settings::nearest;
 use std::path::Path;
 
 const KEYS: [&str; 7] = ["time", "scene_time", "position", "look_at", "up", "fov_y", "world_to_camera"];

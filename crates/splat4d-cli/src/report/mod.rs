@@ -51,7 +51,7 @@ fn page(run: &Run) -> String {
 
 fn header(out: &mut String, run: &Run) {
     let mut words = Vec::new();
-    if let Some(motion) = run.recipe_text("motion") {
+    if let Some(motion) = run.recipe_text("run.motion") {
         words.push(format!("motion model {motion}"));
     }
     if let Some(n) = run.iteration() {
@@ -289,7 +289,7 @@ fn again(out: &mut String, run: &Run) {
             _ => {}
         }
     }
-    if let Some(seed) = run.recipe_text("seed") {
+    if let Some(seed) = run.recipe_text("run.seed") {
         let _ = writeln!(lines, "# seed: {seed}");
     }
     if !lines.is_empty() {

@@ -91,7 +91,7 @@ fn begin(args: &Args, console: &Console) -> anyhow::Result<Work> {
             .remedy(format!("Finish it first: splat4d train --resume {}", source.display()))
             .into());
     }
-    let iterations = run.iteration().or_else(|| run.recipe().ok().map(|r| r.iterations)).unwrap_or(1);
+    let iterations = run.iteration().or_else(|| run.recipe().ok().map(|r| r.run.iterations)).unwrap_or(1);
     let order = Order {
         source: std::path::absolute(source)?,
         level: args.level,

@@ -7,7 +7,7 @@ use crate::source::read_scene;
 use serde_json::{Value, json};
 use splat4d::ErrorKind;
 use splat4d_train::eval::run::EvalOptions;
-use splat4d_train::recipe::Recipe;
+use splat4d_train::recipe::MotionName;
 use splat4d_train::train::{self, TrainOptions};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -59,7 +59,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
 /// Trains the still scene unless it is there, and measures it.
 fn baseline(path: &Path, run: &Run, args: &Args, console: &Console) -> anyhow::Result<()> {
     let folder = path.join("baseline");
-    let recipe = Recipe { motion: "still".into(), ..run.recipe()? };
+    let recipe = run.recipe()?.with(|r| r.run.motion = MotionName::of("still"));
     let cached = Run::is_finished(&folder)
         && Run::open(&folder).and_then(|b| b.recipe()).is_ok_and(|b| b.resolve() == recipe.resolve());
     if !cached {

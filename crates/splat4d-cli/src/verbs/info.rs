@@ -183,21 +183,12 @@ fn of_run(path: &Path) -> anyhow::Result<Told> {
                 .push("The capture has moved away: the run can be rendered, but neither resumed nor measured.".into());
         }
     }
-    let defaults: toml::Table = Recipe::default().to_toml().parse()?;
-    let own: toml::Table = run.recipe()?.to_toml().parse()?;
-    let resolved: toml::Table = Recipe::from_toml(&own.to_string())
-        .map(|r| Recipe { iterations: r.iterations, ..Recipe::default() }.resolve().to_toml())?
-        .parse()?;
-    // Schedules that follow from the iterations are no choice of the user's.
-    let changed: Vec<String> = own
-        .iter()
-        .filter(|(k, v)| defaults.get(*k) != Some(*v) && (*k == "iterations" || resolved.get(*k) != Some(*v)))
-        .map(|(k, v)| format!("{k}={v}"))
-        .collect();
-    let recipe = run.recipe_text("motion").unwrap_or_default();
+    let recipe = run.recipe()?;
+    let changed: Vec<String> = recipe.choices().iter().map(|(key, value)| format!("{key}={value}")).collect();
+    let recipe = recipe.run.motion;
     let choices = if changed.is_empty() { "all defaults".to_owned() } else { changed.join(" ") };
     line(&mut text, "recipe", &format!("{recipe}; {choices}"));
-    let total = run.number("iterations").or_else(|| run.recipe().ok().map(|r| r.iterations as f64));
+    let total = run.number("iterations").or_else(|| run.recipe().ok().map(|r| r.run.iterations as f64));
     let done = run.iteration().unwrap_or(0);
     let finished = Run::is_finished(path);
     let state = if finished { "finished" } else { "unfinished" };

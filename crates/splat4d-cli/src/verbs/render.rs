@@ -240,7 +240,7 @@ fn depth_range(painter: &mut Painter<'_>, shots: &[paths::Shot]) -> [f32; 2] {
 }
 
 fn antialias(source: &Source) -> bool {
-    source.run.as_ref().and_then(|r| r.recipe().ok()).is_some_and(|r| r.antialias)
+    source.run.as_ref().and_then(|r| r.recipe().ok()).is_some_and(|r| r.appearance.antialias)
 }
 
 fn default_output(path: &Path, route: &Route, run: bool) -> PathBuf {

@@ -10,6 +10,7 @@ use splat4d::{Error, ErrorKind};
 use splat4d_train::capture::{Capture, Severity};
 use splat4d_train::event::Event;
 use splat4d_train::recipe::Recipe;
+use splat4d_train::settings::{Knob, nearest};
 use splat4d_train::train::run::{memory_estimate, open_capture};
 use splat4d_train::train::{self, Outcome, TrainOptions, checkpoint};
 use std::path::{Path, PathBuf};
@@ -31,14 +32,30 @@ Examples:
 
 A capture is a folder with one of these: capture.json (write it by hand for your own rig), transforms_train.json
 (D-NeRF, Blender), transforms.json (Nerfstudio), sparse/ (COLMAP), train_meta.json (PanopticSports) or
-poses_bounds.npy (N3DV). `splat4d info CAPTURE` checks one. `--help` lists every knob of the recipe.";
+poses_bounds.npy (N3DV). `splat4d info CAPTURE` checks one. `--help-knobs` lists every knob of the recipe.";
+
+/// The knobs that most runs are told by, for `--help`.
+const IMPORTANT: [&str; 12] = [
+    "run.iterations",
+    "run.half_size_until",
+    "densify.max_cap",
+    "densify.strategy",
+    "appearance.sh_degree",
+    "appearance.exposure",
+    "init.source",
+    "init.count",
+    "life.kind",
+    "capture.max_frames",
+    "capture.white_background",
+    "loss.dssim",
+];
 
 /// Train a scene from a capture, then measure it, film it and write a report
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, after_long_help = long_help())]
 pub struct Args {
     /// The capture: a folder, or its marker file
-    #[arg(value_name = "CAPTURE", required_unless_present_any = ["resume", "source"])]
+    #[arg(value_name = "CAPTURE", required_unless_present_any = ["resume", "source", "help_knobs"])]
     capture: Option<PathBuf>,
     /// Where the run is written [default: runs/NAME, or runs/NAME-2 ... if that is taken]
     #[arg(short, long, value_name = "RUN", short_alias = 'm', alias = "model_path", alias = "model-path")]
@@ -60,6 +77,9 @@ pub struct Args {
     /// Start from this recipe (TOML); a run's own recipe.toml repeats it
     #[arg(long, value_name = "FILE", help_heading = "What is learned")]
     recipe: Option<PathBuf>,
+    /// List the knobs of the recipe: all, or those of a table or with a word in their name
+    #[arg(long, value_name = "TOPIC", num_args = 0..=1, default_missing_value = "", help_heading = "What is learned")]
+    help_knobs: Option<String>,
     /// Set a knob of the recipe; may be repeated
     #[arg(long, value_name = "KEY=VALUE", help_heading = "What is learned")]
     set: Vec<String>,
@@ -107,6 +127,10 @@ pub struct Args {
 }
 
 pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
+    if let Some(topic) = &args.help_knobs {
+        console.result(knob_list(topic)?.trim_end());
+        return Ok(());
+    }
     args.measure.check()?;
     if !args.view && args.place.is_told() {
         return Err(Error::input("--port, --host and --no-open belong to --view").remedy("Add --view.").into());
@@ -127,6 +151,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         (run.clone(), watch, trained)
     } else {
         let recipe = recipe(args)?;
+        refuse_idle(args, &recipe)?;
         let source = args.capture.as_ref().or(args.source.as_ref()).expect("clap asks for a capture");
         console.phase("reading the capture", 0, 0);
         let capture = open_capture(source, &recipe)?;
@@ -274,13 +299,79 @@ fn minutes(text: &str) -> Result<f64, String> {
     if value > 0.0 && value <= MOST { Ok(value) } else { Err(format!("give minutes above 0, at most {MOST}")) }
 }
 
-/// The examples, and every knob with its default.
-fn long_help() -> String {
-    let mut text =
-        format!("{EXAMPLES}\n\nKnobs of the recipe (--set KEY=VALUE, or lines of a TOML file for --recipe):\n");
-    for knob in Recipe::knobs() {
-        let default = if knob.default == "\"\"" { "empty" } else { &knob.default };
-        text.push_str(&format!("  {:<24} {} [{}]\n", knob.name, knob.doc.trim_end_matches('.'), default));
+/// Errors: a knob of `--set` that does nothing in the recipe. Where it says that something is not to be, training warns.
+fn refuse_idle(args: &Args, recipe: &Recipe) -> Result<(), Error> {
+    let set: Vec<&str> =
+        args.set.iter().filter_map(|a| a.split_once('=')).map(|(name, _)| Recipe::key_of(name.trim())).collect();
+    match recipe.without_effect().into_iter().find(|idle| !idle.off && set.contains(&idle.key.as_str())) {
+        Some(idle) => {
+            Err(Error::input(idle.to_string()).at("--set").remedy("Set what it needs as well, or leave it out"))
+        }
+        None => Ok(()),
     }
-    text
+}
+
+/// The examples, and the knobs that most runs are told by.
+fn long_help() -> String {
+    let knobs = Recipe::knobs();
+    let lines: String = IMPORTANT
+        .iter()
+        .map(|key| line(knobs.iter().find(|k| k.key() == *key).expect("IMPORTANT names knobs of the recipe")))
+        .collect();
+    format!(
+        "{EXAMPLES}\n\nKnobs of the recipe (--set KEY=VALUE, or a TOML file for --recipe; --help-knobs: all):\n{lines}"
+    )
+}
+
+/// Every knob, those of a table, or those with the topic in their name. Errors: there is none.
+fn knob_list(topic: &str) -> Result<String, Error> {
+    let knobs = Recipe::knobs();
+    let named = |k: &Knob| k.key().contains(topic) || Recipe::flat_name(&k.key()).is_some_and(|n| n.contains(topic));
+    let of_table = knobs.iter().any(|k| k.table == topic);
+    let mut text = String::new();
+    let mut table = "";
+    for knob in knobs.iter().filter(|k| if of_table { k.table == topic } else { named(k) }) {
+        if knob.table != table {
+            table = knob.table;
+            let needs = Recipe::needs(table).map_or_else(String::new, |n| format!(" In effect with {n}."));
+            text += &format!("[{table}] {}{needs}\n", Recipe::about(table));
+        }
+        text += &line(knob);
+    }
+    if text.is_empty() {
+        let mut tables: Vec<&str> = knobs.iter().map(|k| k.table).collect();
+        tables.dedup();
+        let near = nearest(topic, &tables).map_or_else(String::new, |n| format!("Did you mean `{n}`? "));
+        return Err(Error::input(format!("no knob is called after `{topic}`"))
+            .at("--help-knobs")
+            .remedy(format!("{near}Tables are: {}", tables.join(", "))));
+    }
+    Ok(text)
+}
+
+/// A knob in a line of help: its names, meaning, unit and default.
+fn line(knob: &Knob) -> String {
+    let default = if knob.default == "\"\"" { "empty" } else { &knob.default };
+    let unit = if knob.rule.unit.is_empty() { String::new() } else { format!(" {}", knob.rule.unit) };
+    let alone =
+        Recipe::flat_name(&knob.key()).filter(|n| *n != knob.field).map_or_else(String::new, |n| format!(" ({n})"));
+    let name = format!("{}{alone}", knob.key());
+    format!("  {name:<42} {} [{default}{unit}]\n", knob.doc.trim_end_matches('.'))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn knobs_are_listed_by_topic() {
+        let all = knob_list("").unwrap();
+        assert!(Recipe::knobs().iter().all(|k| all.contains(&k.key())));
+        let merge = knob_list("merge").unwrap();
+        assert!(merge.starts_with("[merge]") && merge.lines().count() == 4, "{merge}");
+        assert!(knob_list("velocity").unwrap().contains("spacetime.velocity_lr_init"));
+        assert!(knob_list("crowding").unwrap().contains("merge.pair (crowding)"));
+        assert!(knob_list("spacetme").unwrap_err().to_string().contains("`spacetime`"));
+        assert!(long_help().contains("densify.max_cap"));
+    }
 }

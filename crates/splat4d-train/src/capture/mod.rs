@@ -28,7 +28,7 @@ mod store;
 
 pub use flow::FlowFile;
 pub use lens::Distortion;
-pub use options::{CaptureOptions, HoldOut, MAX_POINTS};
+pub use options::{CaptureOptions, CaptureSettings, HoldOut, MAX_POINTS};
 pub use points::PointCloud;
 pub use preflight::{Finding, Severity};
 pub use store::{ImageStore, Picture, StoredPicture};

@@ -24,6 +24,7 @@ use crate::recipe::Recipe;
 use crate::train::refine::{Refine, refine};
 use crate::train::run::{plan, training_frames};
 use crate::train::{Outcome, TrainOptions};
+use crate::upkeep::Strategy;
 use crate::upkeep::worth::{Scores, score};
 use crate::{Error, Result};
 use splat4d::bake::{self, bake};
@@ -88,7 +89,7 @@ pub fn compress(
             scene: job.source.clone(),
             stages,
             frames: training_frames(job.capture.clone(), job.recipe)?,
-            recipe: Recipe { strategy: "none".into(), ..job.recipe.clone() },
+            recipe: job.recipe.clone().with(|r| r.densify.strategy = Strategy::None),
             identity: job.settings.to_toml(),
         },
         dir,

@@ -1,6 +1,6 @@
 //! What may be told of compression, and the three levels.
 
-use crate::recipe::nearest;
+use crate::settings::nearest;
 use crate::upkeep::worth::{Combine, Spatial, Temporal};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};

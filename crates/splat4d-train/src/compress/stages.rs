@@ -35,7 +35,7 @@ pub(super) struct Bench {
 
 impl Bench {
     fn antialias(&self) -> Antialias {
-        if self.plan.recipe.antialias { Antialias::On } else { Antialias::Off }
+        if self.plan.recipe.appearance.antialias { Antialias::On } else { Antialias::Off }
     }
 
     /// How the settings want Gaussians scored. Errors: names that are none.
@@ -104,7 +104,7 @@ fn pruning(bench: Bench, share: f64, filter: bool) -> Hook {
                 progress.phase("scoring Gaussians", done, total);
             })?;
             for (layer, edit) in prune(scene, &scores, share).into_iter().enumerate() {
-                scene.layers[layer].edit(&edit, &Rng::new(bench.plan.recipe.seed, "prune", layer as u64));
+                scene.layers[layer].edit(&edit, &Rng::new(bench.plan.recipe.run.seed, "prune", layer as u64));
             }
         }
         if filter { masks(scene, &bench, progress) } else { Ok(()) }
@@ -131,7 +131,7 @@ pub(super) fn file_stage(bench: &Bench) -> Result<(Stage, Arc<Quantised>)> {
             progress.phase("baking", done, total);
         })?;
         let s = &own.settings;
-        let seed = own.plan.recipe.seed;
+        let seed = own.plan.recipe.run.seed;
         let config = WriteConfig { depths: s.depths, palette: s.palette, seed, ..WriteConfig::default() };
         let mut bytes = Vec::new();
         write(&draft, &config, &mut bytes)?;

@@ -7,6 +7,7 @@ pub mod volume;
 
 use crate::capture::frames::Frames;
 use crate::methods::{Plan, Program};
+use crate::settings::{Value, among, settings};
 use crate::{Error, Result};
 use splat4d::layers::{Head, Layer, Scene};
 use splat4d::math::Rng;
@@ -14,6 +15,7 @@ use splat4d::math::knn::mean_square_distance;
 use splat4d::math::sh::rgb_to_dc;
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{GEOMETRY, HeadKeys, LIFE, LifeKind, Params, SH};
+use std::path::PathBuf;
 
 /// Points to start from.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -67,6 +69,65 @@ impl Seeds {
     }
 }
 
+settings! {
+    /// The first Gaussians.
+    pub struct InitSettings {
+        /// Where Gaussians start: "auto", "points", "hull", "random", or a .ply file.
+        source: Source = Source::Auto;
+        /// Initial Gaussians. Points that a capture lacks to so many are laid between its own, along surfaces; the hull
+        /// of masks and random points bring as many of their own.
+        count: usize = 10_000 => any().when(IsNot("init.source", &["points"]));
+        /// Initial opacity.
+        opacity: f64 = 0.1 => inside_share();
+        /// Moments at which initial points are spread over the clip; 0: about every 5 frames.
+        keyframes: usize = 0;
+        /// Initial life width of moving points, clips; 0: twice the gap between keyframes.
+        life: f64 = 0.0
+            => any().unit("clips").when(Any(&[Is("run.motion", &["spacetime", "native4d"]), Is("life.kind", &["gauss-half", "gauss-one", "interval"])]));
+    }
+}
+
+/// Where the first Gaussians are.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Source {
+    /// The capture's points, and more between them; else the hull of masks; else at random.
+    Auto,
+    /// The capture's points.
+    Points,
+    /// The visual hull of masks.
+    Hull,
+    /// At random in the cameras' common volume.
+    Random,
+    /// The points of a .ply file.
+    File(PathBuf),
+}
+
+impl Source {
+    const WORDS: [(&'static str, Self); 4] =
+        [("auto", Self::Auto), ("points", Self::Points), ("hull", Self::Hull), ("random", Self::Random)];
+}
+
+impl Value for Source {
+    fn to_toml(&self) -> toml::Value {
+        let word = || Self::WORDS.iter().find(|(_, source)| source == self).map_or("", |(word, _)| word);
+        toml::Value::String(match self {
+            Self::File(path) => path.to_string_lossy().into_owned(),
+            _ => word().to_owned(),
+        })
+    }
+
+    fn from_toml(value: &toml::Value) -> std::result::Result<Self, String> {
+        let word = value.as_str().unwrap_or_default();
+        if word.ends_with(".ply") {
+            return Ok(Self::File(word.into()));
+        }
+        let known = Self::WORDS.into_iter().find(|(name, _)| *name == word);
+        known
+            .map(|(_, source)| source)
+            .ok_or_else(|| among(value, &[&Self::WORDS.map(|(word, _)| word)[..], &["a .ply file"]].concat()))
+    }
+}
+
 /// A random colour would have to be unlearnt; grey is the least wrong.
 const UNKNOWN_COLOR: [f32; 3] = [0.5; 3];
 /// A life this many clips wide is practically for ever: at the clip's ends σ is still above 0.96.
@@ -86,7 +147,7 @@ const OPEN_LIFE: (f64, f64) = (0.3, 0.25);
 
 /// The keyframe times of the plan: evenly over the clip, at least one.
 pub fn keyframes(plan: &Plan) -> Vec<f64> {
-    let count = match plan.recipe.init_keyframes {
+    let count = match plan.recipe.init.keyframes {
         0 => plan.times.div_ceil(FRAMES_PER_KEYFRAME).max(1),
         k => k.min(plan.times.max(1)),
     };
@@ -96,35 +157,36 @@ pub fn keyframes(plan: &Plan) -> Vec<f64> {
 /// Chooses initial points as the recipe says. `points`: the capture's own.
 pub fn seeds(plan: &Plan, frames: &dyn Frames, points: Option<Seeds>, moving: bool) -> Result<Seeds> {
     let r = &plan.recipe;
-    let rng = Rng::new(r.seed, "init", 0);
+    let rng = Rng::new(r.run.seed, "init", 0);
     let volume = volume::common(frames);
     let times = if moving { keyframes(plan) } else { vec![0.5 * (plan.clip[0] + plan.clip[1])] };
     let have_points = points.as_ref().is_some_and(|p| !p.is_empty());
     let mut out = Seeds::default();
-    match r.init.as_str() {
-        "points" if !have_points => {
+    match r.init.source {
+        Source::Points if !have_points => {
             return Err(Error::input("the capture has no points to start from")
                 .remedy("Add a points file to the capture, or use --set init=random"));
         }
-        "hull" if !frames.has_masks() => {
+        Source::Hull if !frames.has_masks() => {
             return Err(Error::input("the visual hull needs masks, and the capture has none")
                 .remedy("Add masks to the capture, or use --set init=random"));
         }
         _ => {}
     }
-    let use_hull = frames.has_masks() && matches!(r.init.as_str(), "auto" | "hull") && (moving || !have_points);
-    if have_points && r.init != "random" && r.init != "hull" {
+    let use_hull =
+        frames.has_masks() && matches!(r.init.source, Source::Auto | Source::Hull) && (moving || !have_points);
+    if have_points && !matches!(r.init.source, Source::Random | Source::Hull) {
         out.append(points.expect("just seen"));
-        if r.init == "auto" && out.len() < r.num_pts {
-            out.append(fill::between(frames, &out.points, r.num_pts - out.len())?);
+        if r.init.source == Source::Auto && out.len() < r.init.count {
+            out.append(fill::between(frames, &out.points, r.init.count - out.len())?);
         }
     }
     if use_hull {
-        out.append(hull::carve(frames, &volume, &times, r.num_pts, moving, rng.fork(1))?);
-    } else if r.init == "random" || !have_points {
-        out.append(volume::random(frames, &volume, r.num_pts, moving.then_some(plan.clip), rng.fork(2)));
+        out.append(hull::carve(frames, &volume, &times, r.init.count, moving, rng.fork(1))?);
+    } else if r.init.source == Source::Random || !have_points {
+        out.append(volume::random(frames, &volume, r.init.count, moving.then_some(plan.clip), rng.fork(2)));
     }
-    out.truncate_evenly(r.max_cap, rng.fork(3));
+    out.truncate_evenly(r.densify.max_cap, rng.fork(3));
     Ok(out)
 }
 
@@ -132,7 +194,7 @@ pub fn seeds(plan: &Plan, frames: &dyn Frames, points: Option<Seeds>, moving: bo
 /// nearest to where it will be.
 pub fn one_moment(plan: &Plan, frames: &dyn Frames, points: Option<Seeds>) -> Result<Seeds> {
     let mut single = plan.clone();
-    single.recipe.init_keyframes = single.recipe.init_keyframes.max(1);
+    single.recipe.init.keyframes = single.recipe.init.keyframes.max(1);
     let mut out = seeds(&single, frames, points, true)?;
     out.times.fill(None);
     Ok(out)
@@ -149,10 +211,10 @@ pub fn scene(
     let r = &plan.recipe;
     let life = program.life(plan);
     let n = seeds.len();
-    let mut params = Params::<f32>::new(n, (r.sh_degree + 1) * (r.sh_degree + 1), life.columns());
+    let mut params = Params::<f32>::new(n, (r.appearance.sh_degree + 1) * (r.appearance.sh_degree + 1), life.columns());
     let scales = scales(seeds, plan.extent);
     let lives: Vec<(f64, f64)> = seeds.times.iter().map(|&t| first_life(plan, t)).collect();
-    let logit = (r.init_opacity / (1.0 - r.init_opacity)).ln() as f32;
+    let logit = (r.init.opacity / (1.0 - r.init.opacity)).ln() as f32;
     for i in 0..n {
         let geometry = &mut params[GEOMETRY];
         geometry.write(i, 0, seeds.points[i].map(|x| x as f32));
@@ -183,7 +245,7 @@ pub fn scene(
 /// Centre and width (seconds) of the life that a Gaussian at a point of this time starts with.
 fn first_life(plan: &Plan, time: Option<f64>) -> (f64, f64) {
     let gap = plan.seconds() / keyframes(plan).len() as f64;
-    let short = if plan.recipe.init_life > 0.0 { plan.recipe.init_life * plan.seconds() } else { 2.0 * gap };
+    let short = if plan.recipe.init.life > 0.0 { plan.recipe.init.life * plan.seconds() } else { 2.0 * gap };
     match time {
         Some(t) => (t, short),
         None => (0.5 * (plan.clip[0] + plan.clip[1]), LONG_LIFE_CLIPS * plan.seconds()),

@@ -14,6 +14,7 @@
 //! Source: Deng et al. 2024 ("Wasserstein 4DGS"); second order and normalisation are ours.
 
 use super::terms::{Probe, ProbeLoss, StepInfo};
+use crate::settings::{Choice, settings};
 use splat4d::layers::Scene;
 use splat4d::math::spd::{Mat3, bures};
 use splat4d::math::{Real, Rng};
@@ -21,6 +22,29 @@ use splat4d::motion::filtered::{Normal, Prediction, Predictor};
 use splat4d::scene::table::par_split;
 use splat4d::scene::{Space, Table, Time};
 use std::sync::atomic::{AtomicU64, Ordering};
+
+settings! {
+    /// Settings of the transport losses: distances over time that training keeps small.
+    pub struct TransportSettings
+    when (On("transport.metric")) {
+        /// Distances over time that training keeps small: off, linear (means) or wasserstein (Gaussians).
+        metric: Option<Metric> = None => any().switch();
+        /// Weight of small motion (first order), per squared extent.
+        temporal: f64 = 0.0 => any().unit("1/extents²");
+        /// Weight of constant velocity (second order), per squared extent.
+        second: f64 = 10.0 => any().unit("1/extents²");
+        /// Weight of drawing what is seen to what was predicted, per squared extent.
+        align: f64 = 0.0 => any().unit("1/extents²");
+        /// What shapes count for, against positions.
+        covariance: f64 = 100.0;
+        /// Share of the steps that look at three frames.
+        every: f64 = 0.25 => share();
+        /// Share of a stage after which it begins.
+        start: f64 = 0.2 => share();
+        /// Share of a stage over which it grows to its weight.
+        ramp: f64 = 0.13 => share();
+    }
+}
 
 /// What distances are between.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -31,9 +55,14 @@ pub enum Metric {
     Wasserstein,
 }
 
+impl Choice for Option<Metric> {
+    const NAMES: &'static [(&'static str, Self)] =
+        &[("off", None), ("linear", Some(Metric::Linear)), ("wasserstein", Some(Metric::Wasserstein))];
+}
+
 /// Weights, metric and schedule.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct TransportSettings {
+pub struct TransportConfig {
     /// What distances are between.
     pub metric: Metric,
     /// How shapes go on at constant velocity.
@@ -63,7 +92,7 @@ pub struct TransportSettings {
 /// The loss; see the module's documentation.
 #[derive(Debug)]
 pub struct Transport {
-    settings: TransportSettings,
+    settings: TransportConfig,
     layer: usize,
     /// The schedule's factor in the step whose probes were asked last, as bits.
     now: AtomicU64,
@@ -71,7 +100,7 @@ pub struct Transport {
 
 impl Transport {
     /// On the layer of this number.
-    pub fn new(settings: TransportSettings, layer: usize) -> Self {
+    pub fn new(settings: TransportConfig, layer: usize) -> Self {
         Self { settings, layer, now: AtomicU64::new(0) }
     }
 

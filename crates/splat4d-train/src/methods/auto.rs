@@ -5,8 +5,6 @@ use crate::Result;
 use crate::capture::frames::{Frames, Picture};
 use splat4d::scene::Planes;
 
-/// The recipe's word for it.
-pub const AUTO: &str = "auto";
 /// Cameras of the rig that are looked at, and pairs of neighbouring frames of each.
 const LOOKS: (usize, usize) = (4, 8);
 /// A pixel that changes by more than this from frame to frame (mean of the channels, in [0, 1]) has moved: above the

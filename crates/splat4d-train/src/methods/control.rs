@@ -7,12 +7,13 @@ pub mod losses;
 use super::auto::Seen;
 use super::{Group, Plan, Program, Rate, Stage, still};
 use crate::recipe::Recipe;
+use crate::settings::{choices, settings};
 use crate::upkeep::AdaptNodes;
 use crate::{Error, Result};
 use losses::{MaskSize, NodeAcceleration, NodeArap, NodeElastic, Sparse};
 use splat4d::motion::Spec;
 use splat4d::motion::control::{ControlSpec, Curve, TrajectorySpec};
-use splat4d::motion::skin::SkinSpec;
+use splat4d::motion::skin::{MAX_NEIGHBOURS, MAX_NODES, SkinSpec};
 
 /// One key of a trajectory about every so many frames. Four is usual for B-splines on SE(3); with one moving camera fewer
 /// keys tell motion from shape sooner: 12 keys reach 31.9 dB on D-NeRF's mutant after 1,000 steps, 41 keys 29.0 dB.
@@ -24,6 +25,88 @@ const MOST_KEYS: usize = 512;
 /// Levels of the encoding of node positions and of time (SC-GS: 10 and 6; nodes are few, so that fewer suffice).
 const LEVELS: (usize, usize) = (4, 6);
 
+choices! {
+    /// What drives control nodes.
+    pub enum Trajectory {
+        /// Cubic B-splines on SE(3).
+        Spline = "spline",
+        /// Straight lines between keys.
+        Linear = "linear",
+        /// Great arcs between keys.
+        Slerp = "slerp",
+        /// Shares of a few common motions.
+        LowRank = "low-rank",
+        /// A network, as in SC-GS.
+        Network = "network",
+    }
+}
+
+settings! {
+    /// Settings of control nodes, and of their trajectories in `control`.
+    pub struct ControlSettings
+    when (Is("run.motion", &["control", "ssm"])) {
+        /// Control nodes at the start.
+        nodes: usize = 512 => within(1, MAX_NODES);
+        /// Nodes that pull each Gaussian, 1 to 8.
+        neighbours: usize = 3 => within(1, MAX_NEIGHBOURS);
+        /// Hyper coordinates, by which touching parts that move differently come apart.
+        hyper: usize = 2;
+        /// Whether every Gaussian learns how far it follows its nodes.
+        mask: bool = false;
+        /// What drives the nodes: spline, linear, slerp, low-rank or network.
+        trajectory: Trajectory = Trajectory::Spline => any().when(Is("run.motion", &["control"]));
+        /// Keys of a trajectory in time; 0: about every 12 frames.
+        keys: usize = 0
+            => any().when(All(&[Is("run.motion", &["control"]), IsNot("control.trajectory", &["network"])]));
+        /// Motions that nodes of a low-rank trajectory share.
+        bases: usize = 16
+            => any().when(All(&[Is("run.motion", &["control"]), Is("control.trajectory", &["low-rank"])]));
+        /// Width of the hidden layers of a network.
+        width: usize = 128
+            => any().when(All(&[Is("run.motion", &["control"]), Is("control.trajectory", &["network"])]));
+        /// Hidden layers of a network.
+        layers: usize = 4
+            => any().when(All(&[Is("run.motion", &["control"]), Is("control.trajectory", &["network"])]));
+        /// Rate of node shifts at the start, extents.
+        shift_lr_init: f64 = 5e-4
+            => any().unit("extents").when(All(&[Is("run.motion", &["control"]), IsNot("control.trajectory", &["network"])]));
+        /// Rate of node shifts at the end, extents.
+        shift_lr_final: f64 = 1e-5
+            => any().unit("extents").when(All(&[Is("run.motion", &["control"]), IsNot("control.trajectory", &["network"])]));
+        /// Rate of node quaternions at the start.
+        turn_lr_init: f64 = 2e-3
+            => any().when(All(&[Is("run.motion", &["control"]), IsNot("control.trajectory", &["network"])]));
+        /// Rate of node quaternions at the end.
+        turn_lr_final: f64 = 5e-5
+            => any().when(All(&[Is("run.motion", &["control"]), IsNot("control.trajectory", &["network"])]));
+        /// Rate of a network's weights at the start.
+        network_lr_init: f64 = 1e-3
+            => any().when(All(&[Is("run.motion", &["control"]), Is("control.trajectory", &["network"])]));
+        /// Rate of a network's weights at the end.
+        network_lr_final: f64 = 2e-5
+            => any().when(All(&[Is("run.motion", &["control"]), Is("control.trajectory", &["network"])]));
+        /// Rate of node positions at rest, extents.
+        node_lr: f64 = 1e-4 => any().unit("extents");
+        /// Rate of node log radii and weight logits.
+        weight_lr: f64 = 5e-3;
+        /// Rate of hyper coordinates, extents.
+        hyper_lr: f64 = 1e-4 => any().unit("extents").when(On("control.hyper"));
+        /// Rate of motion masks' logits.
+        mask_lr: f64 = 0.02 => any().when(On("control.mask"));
+        /// Weight of nodes moving as rigidly as possible.
+        arap: f64 = 0.0;
+        /// Weight of neighbouring nodes keeping their distance.
+        elastic: f64 = 0.0;
+        /// Weight of nodes' acceleration.
+        acceleration: f64 = 0.0;
+        /// Weight of the mean motion mask.
+        motion_mask: f64 = 0.01 => any().when(On("control.mask"));
+        /// Weight of the sparsity of a low-rank trajectory.
+        sparse: f64 = 0.0
+            => any().when(All(&[Is("run.motion", &["control"]), Is("control.trajectory", &["low-rank"])]));
+    }
+}
+
 /// Gaussians skinned to sparse control nodes (Huang et al. 2024, "SC-GS").
 #[derive(Clone, Copy, Debug)]
 pub struct ControlProgram;
@@ -31,7 +114,7 @@ pub struct ControlProgram;
 impl Program for ControlProgram {
     fn spec(&self, plan: &Plan) -> Spec {
         let r = &plan.recipe;
-        Spec::Control(ControlSpec { seed: r.seed, clip: plan.clip, skin: skin(r), trajectory: trajectory(plan) })
+        Spec::Control(ControlSpec { seed: r.run.seed, clip: plan.clip, skin: skin(r), trajectory: trajectory(plan) })
     }
 
     fn check(&self, plan: &Plan) -> Result<()> {
@@ -68,38 +151,38 @@ impl Program for ControlProgram {
 
 /// Most nodes that training may have.
 pub fn most_nodes(r: &Recipe) -> usize {
-    if r.control_adapt_interval > 0 { r.control_max_nodes.max(r.control_nodes) } else { r.control_nodes }
+    if r.nodes.adapt_interval > 0 { r.nodes.cap.max(r.control.nodes) } else { r.control.nodes }
 }
 
 /// The skin that the recipe asks for.
 pub fn skin(r: &Recipe) -> SkinSpec {
-    SkinSpec { nodes: r.control_nodes, neighbours: r.control_neighbours, hyper: r.control_hyper, mask: r.control_mask }
+    SkinSpec { nodes: r.control.nodes, neighbours: r.control.neighbours, hyper: r.control.hyper, mask: r.control.mask }
 }
 
 /// What every model of control nodes learns of them, and how they adapt: groups of the skin, losses on nodes, upkeep.
 pub fn add_nodes(stage: &mut Stage, plan: &Plan) {
     let r = &plan.recipe;
-    let positions = r.falling(r.control_node_lr * plan.extent);
+    let positions = r.falling(r.control.node_lr * plan.extent);
     stage.groups.push(Group::new("node_means", positions));
-    stage.groups.push(Group::new("node_log_radii", r.falling(r.control_weight_lr)));
-    stage.groups.push(Group::new("node_logits", r.falling(r.control_weight_lr)));
-    let hyper = r.falling(r.control_hyper_lr * plan.extent);
+    stage.groups.push(Group::new("node_log_radii", r.falling(r.control.weight_lr)));
+    stage.groups.push(Group::new("node_logits", r.falling(r.control.weight_lr)));
+    let hyper = r.falling(r.control.hyper_lr * plan.extent);
     stage.groups.push(Group::new("node_hyper", hyper));
     stage.groups.push(Group::new("hyper", hyper));
-    stage.groups.push(Group::new("motion_mask", r.falling(r.control_mask_lr)));
+    stage.groups.push(Group::new("motion_mask", r.falling(r.control.mask_lr)));
     let extent = plan.extent;
-    if r.lambda_node_arap > 0.0 {
-        stage.probes.push(Box::new(NodeArap { weight: r.lambda_node_arap, extent, clip: plan.clip }));
+    if r.control.arap > 0.0 {
+        stage.probes.push(Box::new(NodeArap { weight: r.control.arap, extent, clip: plan.clip }));
     }
-    if r.lambda_node_elastic > 0.0 {
-        stage.probes.push(Box::new(NodeElastic { weight: r.lambda_node_elastic, clip: plan.clip }));
+    if r.control.elastic > 0.0 {
+        stage.probes.push(Box::new(NodeElastic { weight: r.control.elastic, clip: plan.clip }));
     }
-    if r.lambda_node_acceleration > 0.0 {
+    if r.control.acceleration > 0.0 {
         let step = 1.0 / plan.fps;
-        stage.probes.push(Box::new(NodeAcceleration { weight: r.lambda_node_acceleration, clip: plan.clip, step }));
+        stage.probes.push(Box::new(NodeAcceleration { weight: r.control.acceleration, clip: plan.clip, step }));
     }
-    if r.lambda_motion_mask > 0.0 && r.control_mask {
-        stage.params.push(Box::new(MaskSize { weight: r.lambda_motion_mask }));
+    if r.control.motion_mask > 0.0 && r.control.mask {
+        stage.params.push(Box::new(MaskSize { weight: r.control.motion_mask }));
     }
     stage.keep(AdaptNodes::of(r));
 }
@@ -107,35 +190,35 @@ pub fn add_nodes(stage: &mut Stage, plan: &Plan) {
 fn trajectory(plan: &Plan) -> TrajectorySpec {
     let r = &plan.recipe;
     let auto = plan.times.div_ceil(FRAMES_PER_KEY).clamp(1, MOST_KEYS);
-    let straight = if r.control_keys == 0 { auto + 1 } else { r.control_keys };
-    let cubic = if r.control_keys == 0 { auto + CUBIC_EXTRA } else { r.control_keys };
-    match r.control_trajectory.as_str() {
-        "linear" => TrajectorySpec::Keys { curve: Curve::Linear, keys: straight },
-        "slerp" => TrajectorySpec::Keys { curve: Curve::Slerp, keys: straight },
-        "low-rank" => TrajectorySpec::LowRank { bases: r.control_bases, keys: cubic },
-        "network" => TrajectorySpec::Network {
-            width: r.control_width,
-            layers: r.control_layers,
+    let straight = if r.control.keys == 0 { auto + 1 } else { r.control.keys };
+    let cubic = if r.control.keys == 0 { auto + CUBIC_EXTRA } else { r.control.keys };
+    match r.control.trajectory {
+        Trajectory::Linear => TrajectorySpec::Keys { curve: Curve::Linear, keys: straight },
+        Trajectory::Slerp => TrajectorySpec::Keys { curve: Curve::Slerp, keys: straight },
+        Trajectory::LowRank => TrajectorySpec::LowRank { bases: r.control.bases, keys: cubic },
+        Trajectory::Network => TrajectorySpec::Network {
+            width: r.control.width,
+            layers: r.control.layers,
             position_levels: LEVELS.0,
             time_levels: LEVELS.1,
         },
-        _ => TrajectorySpec::Keys { curve: Curve::Cubic, keys: cubic },
+        Trajectory::Spline => TrajectorySpec::Keys { curve: Curve::Cubic, keys: cubic },
     }
 }
 
 /// The trajectory's groups.
 fn add_trajectory(stage: &mut Stage, plan: &Plan) {
     let r = &plan.recipe;
-    let shifts = Rate { start: r.control_shift_lr_init * plan.extent, end: r.control_shift_lr_final * plan.extent };
-    let turns = Rate { start: r.control_turn_lr_init, end: r.control_turn_lr_final };
-    let network = Rate { start: r.control_network_lr_init, end: r.control_network_lr_final };
+    let shifts = Rate { start: r.control.shift_lr_init * plan.extent, end: r.control.shift_lr_final * plan.extent };
+    let turns = Rate { start: r.control.turn_lr_init, end: r.control.turn_lr_final };
+    let network = Rate { start: r.control.network_lr_init, end: r.control.network_lr_final };
     match trajectory(plan) {
         TrajectorySpec::LowRank { .. } => {
             stage.groups.push(Group::new("shift_coefficients", shifts));
             stage.groups.push(Group::new("turn_coefficients", turns));
             stage.groups.push(Group::new("bases", turns));
-            if r.lambda_sparse > 0.0 {
-                stage.params.push(Box::new(Sparse { weight: r.lambda_sparse, table: "node_coefficients" }));
+            if r.control.sparse > 0.0 {
+                stage.params.push(Box::new(Sparse { weight: r.control.sparse, table: "node_coefficients" }));
             }
         }
         TrajectorySpec::Network { layers, .. } => {

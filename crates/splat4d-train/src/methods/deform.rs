@@ -2,6 +2,7 @@
 
 use super::auto::Seen;
 use super::{Group, Plan, Program, Rate, Stage, TimeNoise, still};
+use crate::settings::{choices, settings};
 use crate::{Error, Result};
 use splat4d::motion::Spec;
 use splat4d::motion::deform::{Deform, DeformSpec, Input};
@@ -23,6 +24,55 @@ const NOISE_STEPS: f64 = 0.5;
 const SPACE: HashShape = HashShape { levels: 8, features: 2, log2_size: 15, base: 8, finest: 256 };
 /// The grids over two axes and time.
 const TIME: HashShape = HashShape { levels: 6, features: 2, log2_size: 15, base: 4, finest: 128 };
+
+choices! {
+    /// The network that deforms.
+    pub enum Trunk {
+        /// Hash where cameras are fixed, small where all move and a moment is seen once.
+        Auto = "auto",
+        /// The published perceptron, 8x256.
+        Mlp = "mlp",
+        /// A small perceptron.
+        Small = "small",
+        /// Hash grids and a small network.
+        Hash = "hash",
+        /// Hash grids and one linear map.
+        HashLinear = "hash-linear",
+    }
+}
+
+settings! {
+    /// Settings of `deform-mlp`.
+    pub struct DeformSettings
+    when (Is("run.motion", &["deform-mlp"])) {
+        /// Network: mlp (8x256), small, hash (grids and a small network) or hash-linear; auto: hash where cameras are
+        /// fixed, small where all move and a moment is seen once.
+        trunk: Trunk = Trunk::Auto;
+        /// Width of the small and hash networks.
+        width: usize = 128 => any().when(IsNot("deform.trunk", &["mlp"]));
+        /// Hidden layers of the small and hash networks.
+        layers: usize = 2 => any().when(IsNot("deform.trunk", &["mlp", "hash-linear"]));
+        /// Levels of the positional encoding of places (the published 10 suits mlp).
+        x_levels: usize = 4 => any().when(Is("deform.trunk", &["auto", "mlp", "small"]));
+        /// Levels of the positional encoding of time (published: 6 with deform_time_net, else 10).
+        t_levels: usize = 3 => any().when(Is("deform.trunk", &["auto", "mlp", "small"]));
+        /// Whether time goes through a small network of its own first (published for synthetic scenes).
+        time_net: bool = false => any().when(Is("deform.trunk", &["auto", "mlp", "small"]));
+        /// Positions move by screw motions (6 degrees of freedom) instead of offsets.
+        rigid: bool = false;
+        /// Rate of networks at the start; hash grids learn 50 times faster.
+        lr_init: f64 = 2e-3;
+        /// Rate of networks at the end.
+        lr_final: f64 = 1e-4;
+        /// Share of the iterations that fit the cloud alone before networks learn.
+        warmup: f64 = 0.05 => share();
+        /// Share of the iterations after which every level of the hash grids learns; 0: all at once.
+        unlock: f64 = 0.3 => share().when(Is("deform.trunk", &["auto", "hash", "hash-linear"]));
+        /// Annealed smoothing noise on time at the start, frames; it is zero by half the iterations. 0.1 for real
+        /// captures with uncertain poses.
+        time_noise: f64 = 0.0 => any().unit("frames");
+    }
+}
 
 /// A canonical cloud that a perceptron or a hash grid deforms (Yang et al. 2024, "Deformable 3D Gaussians").
 #[derive(Clone, Copy, Debug)]
@@ -51,7 +101,7 @@ impl Program for DeformProgram {
 
     fn stages(&self, plan: &Plan) -> Vec<Stage> {
         let r = &plan.recipe;
-        let warmup = (r.deform_warmup * r.iterations as f64) as usize;
+        let warmup = (r.deform.warmup * r.run.iterations as f64) as usize;
         let mut out = Vec::new();
         if warmup > 0 {
             let mut first = stage(plan, 0, warmup);
@@ -61,11 +111,11 @@ impl Program for DeformProgram {
             first.end = Some(learns(true));
             out.push(first);
         }
-        if warmup < r.iterations {
-            let mut second = stage(plan, warmup, r.iterations);
+        if warmup < r.run.iterations {
+            let mut second = stage(plan, warmup, r.run.iterations);
             networks(&mut second, plan);
-            let noise = ((NOISE_STEPS * r.iterations as f64) as usize).saturating_sub(warmup);
-            second.time_noise = TimeNoise { start: r.deform_time_noise / plan.fps, steps: noise };
+            let noise = ((NOISE_STEPS * r.run.iterations as f64) as usize).saturating_sub(warmup);
+            second.time_noise = TimeNoise { start: r.deform.time_noise / plan.fps, steps: noise };
             out.push(second);
         }
         out
@@ -85,21 +135,21 @@ fn check(plan: &Plan) -> Result<()> {
 
 fn spec(plan: &Plan) -> DeformSpec {
     let r = &plan.recipe;
-    let encoded = |x_levels| Input::Encoded { x_levels, t_levels: r.deform_t_levels, time_net: r.deform_time_net };
-    let trunk = match r.deform_trunk.as_str() {
+    let encoded = |x_levels| Input::Encoded { x_levels, t_levels: r.deform.t_levels, time_net: r.deform.time_net };
+    let trunk = match r.deform.trunk {
         // Grids follow more motion; where one view of a moment is all there is, the network generalises better
         // (docs/models.md).
-        "auto" if plan.fixed_cameras > 0 => "hash",
-        "auto" => "small",
+        Trunk::Auto if plan.fixed_cameras > 0 => Trunk::Hash,
+        Trunk::Auto => Trunk::Small,
         chosen => chosen,
     };
     let (input, layers, width, skip) = match trunk {
-        "mlp" => (encoded(LARGE_X_LEVELS.max(r.deform_x_levels)), LARGE.0, LARGE.1, Some(LARGE.2)),
-        "hash" => (Input::Hashed { space: SPACE, time: TIME }, r.deform_layers.max(1), r.deform_width, None),
-        "hash-linear" => (Input::Hashed { space: SPACE, time: TIME }, 0, r.deform_width, None),
-        _ => (encoded(r.deform_x_levels), r.deform_layers, r.deform_width, None),
+        Trunk::Mlp => (encoded(LARGE_X_LEVELS.max(r.deform.x_levels)), LARGE.0, LARGE.1, Some(LARGE.2)),
+        Trunk::Hash => (Input::Hashed { space: SPACE, time: TIME }, r.deform.layers.max(1), r.deform.width, None),
+        Trunk::HashLinear => (Input::Hashed { space: SPACE, time: TIME }, 0, r.deform.width, None),
+        Trunk::Small | Trunk::Auto => (encoded(r.deform.x_levels), r.deform.layers, r.deform.width, None),
     };
-    DeformSpec { seed: r.seed, clip: plan.clip, input, width, layers, skip, rigid: r.deform_rigid }
+    DeformSpec { seed: r.run.seed, clip: plan.clip, input, width, layers, skip, rigid: r.deform.rigid }
 }
 
 /// Steps `from .. to` of the recipe's one schedule as a stage of its own.
@@ -138,7 +188,7 @@ fn set_learns(spec: &DeformSpec, p: &mut Params<f32>, learns: bool) -> Result<()
 /// The groups of networks and grids.
 fn networks(stage: &mut Stage, plan: &Plan) {
     let r = &plan.recipe;
-    let rate = Rate { start: r.deform_lr_init, end: r.deform_lr_final };
+    let rate = Rate { start: r.deform.lr_init, end: r.deform.lr_final };
     let made = Deform::new(spec(plan), &mut Params::<f32>::new(0, 1, &[]));
     let model = made.expect("a recipe's network is one that can be made: its knobs were checked");
     stage.groups.extend(model.network_columns().iter().map(|c| Group::new(c, rate)));
@@ -148,7 +198,7 @@ fn networks(stage: &mut Stage, plan: &Plan) {
     let first = levels.len().div_ceil(2);
     for (l, columns) in levels.iter().enumerate() {
         let waits = (l + 1).saturating_sub(first) as f64 / (levels.len() - first).max(1) as f64;
-        let from = (waits * r.deform_unlock * r.iterations as f64) as usize;
+        let from = (waits * r.deform.unlock * r.run.iterations as f64) as usize;
         stage.groups.extend(columns.iter().map(|c| Group { from, ..Group::new(c, fast) }));
     }
 }

@@ -7,30 +7,59 @@
 
 use super::{Group, Hook, Plan, Program, Stage};
 use crate::Result;
-use crate::loss::transport::{Metric, Transport, TransportSettings};
+use crate::loss::transport::{Transport, TransportConfig};
 use crate::recipe::Recipe;
+use crate::settings::{Choice, settings};
 use crate::upkeep::Once;
 use splat4d::layers::{Layer, Scene};
-use splat4d::motion::filtered::{Filtered, FilteredSpec, Fusion, GAINS, Predictor};
+use splat4d::motion::filtered::{Filtered, FilteredSpec, Fusion, GAINS, MAX_BASELINE, MAX_HISTORY, Predictor};
 use splat4d::motion::{Motion, Spec, build};
 use splat4d::scene::params::LoadedArray;
 use splat4d::scene::{LifeKind, Params, SH};
 use std::sync::Arc;
 
+settings! {
+    /// Settings of the temporal filter around a motion model.
+    pub struct FilterSettings
+    when (On("filter.fusion")) {
+        /// How prediction and the motion's answer merge: off, geodesic (a learnt share) or literal (as published).
+        fusion: Fusion = Fusion::Off => any().switch();
+        /// How shapes go on: wasserstein (log and exp), euclidean (numbers go straight) or hold (stay).
+        predictor: Predictor = Predictor::Wasserstein
+            => any().switch().when(Any(&[On("filter.fusion"), On("transport.metric")]));
+        /// Share of the iterations after which it is switched on.
+        start: f64 = 0.2 => share();
+        /// Share of the motion's answer that Gaussians start with; the rest is the prediction's.
+        gain: f64 = 0.5 => inside_share();
+        /// Rate of the gains' logits.
+        lr: f64 = 0.01;
+        /// Frames between the two states that a velocity is taken from.
+        baseline: usize = 1 => within(1, MAX_BASELINE).unit("frames");
+        /// Frames of history that it runs through before every answer; 0: it predicts from the motion's own answers.
+        history: usize = 0 => within(0, MAX_HISTORY).unit("frames");
+        /// Squared Mahalanobis distance at which a prediction is dropped; 0: never.
+        gate: f64 = 11.3;
+        /// Whether the gradient stops at earlier frames.
+        stop_gradient: bool = true;
+        /// Whether the finished scene keeps the filter; else the motion alone is saved, which plays faster.
+        keep: bool = false;
+    }
+}
+
+impl Choice for Fusion {
+    const NAMES: &'static [(&'static str, Self)] = &Self::ALL;
+}
+
+impl Choice for Predictor {
+    const NAMES: &'static [(&'static str, Self)] = &Self::ALL;
+}
+
 /// The program with what the recipe puts around it; as it is where that is nothing.
 pub fn wrap(inner: Box<dyn Program>, recipe: &Recipe) -> Box<dyn Program> {
-    if fusion(recipe) == Fusion::Off && recipe.transport == "off" {
+    if recipe.filter.fusion == Fusion::Off && recipe.transport.metric.is_none() {
         return inner;
     }
     Box::new(FilteredProgram { inner })
-}
-
-fn fusion(recipe: &Recipe) -> Fusion {
-    Fusion::from_name(&recipe.filter).unwrap_or_default()
-}
-
-fn predictor(recipe: &Recipe) -> Predictor {
-    Predictor::from_name(&recipe.filter_predictor).unwrap_or_default()
 }
 
 /// See the module's documentation.
@@ -42,16 +71,16 @@ impl Program for FilteredProgram {
     fn spec(&self, plan: &Plan) -> Spec {
         let r = &plan.recipe;
         let inner = self.inner.spec(plan);
-        if fusion(r) == Fusion::Off {
+        if r.filter.fusion == Fusion::Off {
             return inner;
         }
         Spec::Filtered(FilteredSpec {
-            predictor: predictor(r),
-            gain: r.filter_gain,
-            baseline: r.filter_baseline,
-            history: r.filter_history,
-            gate: r.filter_gate,
-            stop_gradient: r.filter_stop_gradient,
+            predictor: r.filter.predictor,
+            gain: r.filter.gain,
+            baseline: r.filter.baseline,
+            history: r.filter.history,
+            gate: r.filter.gate,
+            stop_gradient: r.filter.stop_gradient,
             ..FilteredSpec::around(inner, 1.0 / plan.fps, plan.clip[0])
         })
     }
@@ -70,7 +99,7 @@ impl Program for FilteredProgram {
 
     fn check(&self, plan: &Plan) -> Result<()> {
         let r = &plan.recipe;
-        if r.filter_history > 0 && !r.filter_stop_gradient && fusion(r) != Fusion::Off {
+        if r.filter.history > 0 && !r.filter.stop_gradient && r.filter.fusion != Fusion::Off {
             return Err(crate::Error::input("filter_history has no gradient to earlier frames")
                 .remedy("Set filter_stop_gradient=true, or filter_history=0"));
         }
@@ -113,17 +142,17 @@ impl Program for FilteredProgram {
                 stage.probes.push(Box::new(Transport::new(settings, 0)));
             }
         }
-        let fusion = fusion(r);
+        let fusion = r.filter.fusion;
         if fusion == Fusion::Off {
             return stages;
         }
         for stage in &mut stages {
-            stage.groups.push(Group { layer: super::EVERY, ..Group::new(GAINS, r.falling(r.filter_lr)) });
+            stage.groups.push(Group { layer: super::EVERY, ..Group::new(GAINS, r.falling(r.filter.lr)) });
             stage.start = stage.start.take().map(around);
             stage.end = stage.end.take().map(around);
         }
-        switch_on(&mut stages, r.filter_start, fusion);
-        if let (Some(last), false) = (stages.last_mut(), r.filter_keep) {
+        switch_on(&mut stages, r.filter.start, fusion);
+        if let (Some(last), false) = (stages.last_mut(), r.filter.keep) {
             let before = last.end.take();
             last.end = Some(Box::new(move |scene, progress| {
                 if let Some(hook) = &before {
@@ -152,26 +181,21 @@ fn switch_on(stages: &mut [Stage], share: f64, fusion: Fusion) {
 }
 
 /// The transport loss that a recipe asks for.
-fn transport(plan: &Plan) -> Option<TransportSettings> {
+fn transport(plan: &Plan) -> Option<TransportConfig> {
     let r = &plan.recipe;
-    let metric = match r.transport.as_str() {
-        "linear" => Metric::Linear,
-        "wasserstein" => Metric::Wasserstein,
-        _ => return None,
-    };
-    Some(TransportSettings {
-        metric,
-        predictor: predictor(r),
-        temporal: r.transport_temporal,
-        second: r.transport_second,
-        align: r.transport_align,
-        covariance: r.transport_covariance,
+    Some(TransportConfig {
+        metric: r.transport.metric?,
+        predictor: r.filter.predictor,
+        temporal: r.transport.temporal,
+        second: r.transport.second,
+        align: r.transport.align,
+        covariance: r.transport.covariance,
         extent: plan.extent,
         clip: plan.clip,
         frame: 1.0 / plan.fps,
-        every: r.transport_every,
-        start: r.transport_start,
-        ramp: r.transport_ramp,
+        every: r.transport.every,
+        start: r.transport.start,
+        ramp: r.transport.ramp,
     })
 }
 

@@ -8,6 +8,7 @@
 use super::{Group, Hook, Plan, Program, Rate, Stage, still};
 use crate::loss::planes::{PlaneWeights, SmoothPlanes};
 use crate::recipe::Recipe;
+use crate::settings::settings;
 use crate::{Error, Result};
 use splat4d::layers::Scene;
 use splat4d::math::Real;
@@ -17,6 +18,55 @@ use splat4d::nn::hexplane::PlaneShape;
 use splat4d::scene::{GEOMETRY, Table};
 use std::any::Any;
 use std::sync::Arc;
+
+settings! {
+    /// Settings of `hexplane`.
+    pub struct HexplaneSettings
+    when (Is("run.motion", &["hexplane"])) {
+        /// Steps of the coarse stage, in which nothing moves; 0: iterations/10.
+        coarse_iterations: usize = 0 => any().unit("iterations");
+        /// Features a level of the planes; a multiple of 16.
+        plane_channels: usize = 32;
+        /// Grid points of a plane along a spatial axis, at multiple 1.
+        plane_resolution: usize = 64;
+        /// Grid points of a plane along time; 0: one every 4 frames, at least 8.
+        time_resolution: usize = 0;
+        /// Levels of the planes, as multiples of the resolution.
+        multires: Vec<usize> = vec![1, 2];
+        /// Steps of the fine stage before each further level is unlocked; 0: all at once.
+        unlock_interval: usize = 0 => any().unit("iterations");
+        /// Width of the networks.
+        net_width: usize = 64;
+        /// Linear maps between planes and heads; 0 is 1.
+        defor_depth: usize = 0;
+        /// Positions do not move.
+        no_dx: bool = false;
+        /// Scales do not change.
+        no_ds: bool = false;
+        /// Rotations do not change.
+        no_dr: bool = false;
+        /// Opacities do not change.
+        no_do: bool = true;
+        /// Colours do not change.
+        no_dshs: bool = true;
+        /// Rate of the planes at the start.
+        grid_lr_init: f64 = 2e-2;
+        /// Rate of the planes at the end.
+        grid_lr_final: f64 = 2e-3;
+        /// Rate of the networks at the start.
+        deformation_lr_init: f64 = 1e-3;
+        /// Rate of the networks at the end.
+        deformation_lr_final: f64 = 1e-4;
+        /// Weight of the squared second differences of the planes over space.
+        plane_tv_weight: f64 = 1e-4;
+        /// Weight of the squared second differences of the time planes along time.
+        time_smoothness_weight: f64 = 0.01;
+        /// Weight of the mean distance of the time planes from 1, where nothing depends on time.
+        l1_time_planes: f64 = 1e-4;
+        /// Weight of the squared first differences (total variation) of the planes over space.
+        plane_variation_weight: f64 = 0.0;
+    }
+}
 
 /// A canonical cloud that six feature planes deform (Wu et al. 2024, "4DGaussians").
 #[derive(Clone, Copy, Debug)]
@@ -50,10 +100,10 @@ impl Program for HexplaneProgram {
 
     fn stages(&self, plan: &Plan) -> Vec<Stage> {
         let r = &plan.recipe;
-        let coarse = coarse_steps(r).min(r.iterations);
+        let coarse = coarse_steps(r).min(r.run.iterations);
         let mut stages = Vec::new();
         if coarse > 0 {
-            let mut stage = self.whole(plan, r.multires.len()).part(0, coarse);
+            let mut stage = self.whole(plan, r.hexplane.multires.len()).part(0, coarse);
             stage.name = "coarse".into();
             stage.groups.retain(|g| !g.column.starts_with("hexplane."));
             stage.params.retain(|l| l.name() != SmoothPlanes::NAME);
@@ -62,7 +112,7 @@ impl Program for HexplaneProgram {
         }
         let ends = unlocks(r, coarse);
         for (i, end) in ends.windows(2).enumerate() {
-            let all = r.multires.len();
+            let all = r.hexplane.multires.len();
             let levels = if ends.len() > 2 { all.min(i + 1) } else { all };
             let mut stage = self.whole(plan, levels).part(end[0], end[1]);
             stage.name = if ends.len() > 2 { format!("fine {}", i + 1) } else { "fine".into() };
@@ -76,47 +126,53 @@ impl Program for HexplaneProgram {
 
 fn planes(plan: &Plan) -> PlaneShape {
     let r = &plan.recipe;
-    let time_resolution = match r.time_resolution {
+    let time_resolution = match r.hexplane.time_resolution {
         0 => plan.times.div_ceil(FRAMES_PER_STEP).max(LEAST_STEPS),
         n => n,
     };
     PlaneShape {
-        channels: r.plane_channels,
-        resolution: r.plane_resolution,
+        channels: r.hexplane.plane_channels,
+        resolution: r.hexplane.plane_resolution,
         time_resolution,
-        multires: r.multires.clone(),
+        multires: r.hexplane.multires.clone(),
     }
 }
 
 fn spec(plan: &Plan) -> HexplaneSpec {
     let r = &plan.recipe;
     HexplaneSpec {
-        seed: r.seed,
+        seed: r.run.seed,
         low: [-plan.extent; 3],
         high: [plan.extent; 3],
         clip: plan.clip,
         planes: planes(plan),
-        net_width: r.net_width,
-        defor_depth: r.defor_depth,
-        heads: Heads { position: !r.no_dx, scale: !r.no_ds, rotation: !r.no_dr, opacity: !r.no_do, sh: !r.no_dshs },
+        net_width: r.hexplane.net_width,
+        defor_depth: r.hexplane.defor_depth,
+        heads: Heads {
+            position: !r.hexplane.no_dx,
+            scale: !r.hexplane.no_ds,
+            rotation: !r.hexplane.no_dr,
+            opacity: !r.hexplane.no_do,
+            sh: !r.hexplane.no_dshs,
+        },
         ..HexplaneSpec::default()
     }
 }
 
 /// Steps of the coarse stage.
 fn coarse_steps(r: &Recipe) -> usize {
-    if r.coarse_iterations == 0 { r.iterations / COARSE_PART } else { r.coarse_iterations }
+    if r.hexplane.coarse_iterations == 0 { r.run.iterations / COARSE_PART } else { r.hexplane.coarse_iterations }
 }
 
 /// First steps of the fine stages, and the end.
 fn unlocks(r: &Recipe, coarse: usize) -> Vec<usize> {
     let mut ends = vec![coarse];
-    if r.unlock_interval > 0 {
-        let more = (1..r.multires.len()).map(|k| coarse + k * r.unlock_interval);
-        ends.extend(more.filter(|&step| step < r.iterations));
+    if r.hexplane.unlock_interval > 0 {
+        let more = (1..r.hexplane.multires.len()).map(|k| coarse + k * r.hexplane.unlock_interval);
+        ends.extend(more.filter(|&step| step < r.run.iterations));
     }
-    if coarse < r.iterations {
-        ends.push(r.iterations);
+    if coarse < r.run.iterations {
+        ends.push(r.run.iterations);
     }
     ends
 }
@@ -128,23 +184,24 @@ impl HexplaneProgram {
         let mut stage = still::stage("hexplane", plan);
         still::learn_life(&mut stage, plan, self.life(plan));
         let spec = spec(plan);
-        let grids = Rate { start: r.grid_lr_init, end: r.grid_lr_final };
+        let grids = Rate { start: r.hexplane.grid_lr_init, end: r.hexplane.grid_lr_final };
         for level in 0..spec.planes.multires.len() {
             for plane in 0..6 {
                 stage.groups.push(Group::new(&PlaneShape::name(level, plane), grids));
             }
         }
-        let networks = Rate { start: r.deformation_lr_init, end: r.deformation_lr_final };
+        let networks = Rate { start: r.hexplane.deformation_lr_init, end: r.hexplane.deformation_lr_final };
         // The names follow from the spec; an empty layer is quickly made.
-        let mut empty = splat4d::scene::Params::<f32>::new(0, (r.sh_degree + 1) * (r.sh_degree + 1), &[]);
+        let mut empty =
+            splat4d::scene::Params::<f32>::new(0, (r.appearance.sh_degree + 1) * (r.appearance.sh_degree + 1), &[]);
         if let Ok(model) = Hexplane::new(spec.clone(), &mut empty) {
             stage.groups.extend(model.network_columns().iter().map(|name| Group::new(name, networks)));
         }
         let weights = PlaneWeights {
-            smoothness: r.plane_tv_weight,
-            time_smoothness: r.time_smoothness_weight,
-            l1_time: r.l1_time_planes,
-            variation: r.plane_variation_weight,
+            smoothness: r.hexplane.plane_tv_weight,
+            time_smoothness: r.hexplane.time_smoothness_weight,
+            l1_time: r.hexplane.l1_time_planes,
+            variation: r.hexplane.plane_variation_weight,
         };
         if weights.any() {
             stage.params.push(Box::new(SmoothPlanes::new(spec.planes, levels, weights)));

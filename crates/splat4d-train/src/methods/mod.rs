@@ -15,11 +15,21 @@ pub mod still;
 mod tests;
 pub mod tracked;
 
+pub use control::ControlSettings;
+pub use deform::DeformSettings;
+pub use filtered::FilterSettings;
+pub use hexplane::HexplaneSettings;
+pub use native4d::Native4dSettings;
+pub use spacetime::{Features, SpacetimeSettings};
+pub use ssm::SsmSettings;
+pub use still::{AppearanceSettings, LifeSettings, RateSettings};
+pub use tracked::TrackedSettings;
+
 use crate::event::Progress;
 use crate::loss::image::ImageTerm;
 use crate::loss::terms::{Codec, ParamLoss, ProbeLoss};
 use crate::optim::Noise;
-use crate::recipe::{FULL, Recipe};
+use crate::recipe::Recipe;
 use crate::sampler::Sampler;
 use crate::upkeep::split::STILL_COLUMNS;
 use crate::upkeep::{Split, Upkeep};
@@ -85,7 +95,7 @@ impl Rate {
 impl Recipe {
     /// A rate that falls to `lr_decay` of itself over the stage.
     pub fn falling(&self, rate: f64) -> Rate {
-        Rate { start: rate, end: rate * self.lr_decay }
+        Rate { start: rate, end: rate * self.rates.decay }
     }
 }
 
@@ -257,7 +267,7 @@ pub trait Program: Send + Sync {
     }
     /// The life its Gaussians have: the recipe's; for ever where it leaves the choice to the model.
     fn life(&self, plan: &Plan) -> LifeKind {
-        LifeKind::from_name(&plan.recipe.life).unwrap_or(LifeKind::Infinite)
+        plan.recipe.life.kind.unwrap_or(LifeKind::Infinite)
     }
     /// What initial points are of: the whole clip, or what of it is learnt first.
     fn first(&self, plan: &Plan) -> Plan {
@@ -334,9 +344,9 @@ pub fn program(motion: &str) -> Result<Box<dyn Program>> {
 
 /// The program of a recipe: that of its motion, with the losses over time and the filter that the recipe asks for.
 pub fn program_of(recipe: &Recipe) -> Result<Box<dyn Program>> {
-    let program = program(&recipe.motion)?;
-    if recipe.features == FULL && !program.has_features() {
-        return Err(Error::input(format!("motion `{}` has no features", recipe.motion))
+    let program = program(recipe.run.motion.as_str())?;
+    if recipe.spacetime.has_features() && !program.has_features() {
+        return Err(Error::input(format!("motion `{}` has no features", recipe.run.motion))
             .remedy("Use --motion spacetime, or --set features=none"));
     }
     Ok(filtered::wrap(program, recipe))

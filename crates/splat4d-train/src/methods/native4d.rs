@@ -5,15 +5,32 @@
 
 use super::{Group, Plan, Program, Rate, Stage, still};
 use crate::loss::scene::LivingOpacity;
+use crate::settings::{Choice, settings};
 use crate::{Error, Result};
 use splat4d::motion::Spec;
-use splat4d::motion::native4d::{Native4dSpec, TABLE};
+use splat4d::motion::native4d::{MAX_HARMONICS, Native4dSpec, TABLE};
 use splat4d::scene::{LifeKind, Params};
 
 /// Scales in time count up to so many clips: a Gaussian is then as good as immortal (0.5 % fainter at the clip's ends).
 const LONGEST_CLIPS: f64 = 10.0;
 /// Colours beyond the base learn this much slower (Kerbl et al. 2023; Yang et al. 2024 for the blocks in time).
 const SH_REST_SLOWDOWN: f64 = 20.0;
+
+settings! {
+    /// Settings of `native4d`.
+    pub struct Native4dSettings
+    when (Is("run.motion", &["native4d"])) {
+        /// Rate at the start of the two quaternions of its rotation: they turn space, and against each other they are
+        /// the velocity (1 is two extents a clip).
+        rotation_lr_init: f64 = 2.5e-3 => positive();
+        /// The same at the end.
+        rotation_lr_final: f64 = 2.5e-4 => positive();
+        /// Blocks of spherical harmonics that change with time as cos(2πn(centre − t)/clip), 0 to 2.
+        harmonics: usize = 0 => within(0, MAX_HARMONICS);
+        /// Whether the parts of a split also lie apart in time and live shorter.
+        split_time: bool = true;
+    }
+}
 
 /// Gaussians of space and time, sliced at t (Yang et al. 2024, "Real-time 4DGS").
 #[derive(Clone, Copy, Debug)]
@@ -24,11 +41,11 @@ impl Program for Native4dProgram {
         let r = &plan.recipe;
         Spec::Native4d(Native4dSpec {
             speed: plan.extent / plan.seconds(),
-            min_life: r.min_life_frames / plan.fps,
-            max_life: (LONGEST_CLIPS * plan.seconds()).max(r.min_life_frames / plan.fps),
-            harmonics: r.sh_harmonics,
+            min_life: r.life.min_frames / plan.fps,
+            max_life: (LONGEST_CLIPS * plan.seconds()).max(r.life.min_frames / plan.fps),
+            harmonics: r.native4d.harmonics,
             period: plan.seconds(),
-            split_time: r.split_time,
+            split_time: r.native4d.split_time,
         })
     }
 
@@ -45,28 +62,31 @@ impl Program for Native4dProgram {
     }
 
     fn check(&self, plan: &Plan) -> Result<()> {
-        if matches!(plan.recipe.life.as_str(), "auto" | "infinite") {
+        if matches!(plan.recipe.life.kind, None | Some(LifeKind::Infinite)) {
             return Ok(());
         }
-        Err(Error::input(format!("native4d has a life of its own and takes no life=\"{}\"", plan.recipe.life))
-            .remedy("Leave life at auto, or train spacetime with it"))
+        Err(Error::input(format!(
+            "native4d has a life of its own and takes no life=\"{}\"",
+            plan.recipe.life.kind.word()
+        ))
+        .remedy("Leave life at auto, or train spacetime with it"))
     }
 
     fn stages(&self, plan: &Plan) -> Vec<Stage> {
         let r = &plan.recipe;
         let mut stage = still::stage("native4d", plan);
-        let turning = Rate { start: r.rotation_4d_lr_init, end: r.rotation_4d_lr_final };
+        let turning = Rate { start: r.native4d.rotation_lr_init, end: r.native4d.rotation_lr_final };
         stage.groups.iter_mut().filter(|g| g.column == "quats").for_each(|g| g.rate = turning);
         stage.groups.push(Group::new("right_quats", turning));
-        stage.groups.push(Group::new("time_means", r.falling(r.life_center_lr * plan.seconds())));
-        stage.groups.push(Group::new("log_time_scales", r.falling(r.life_width_lr)));
-        if r.sh_harmonics > 0 {
-            let block = 3 * (r.sh_degree + 1) * (r.sh_degree + 1);
-            let rate = r.falling(r.feature_lr / SH_REST_SLOWDOWN);
-            stage.groups.push(Group { part: Some((block, block * r.sh_harmonics)), ..Group::new("sh", rate) });
+        stage.groups.push(Group::new("time_means", r.falling(r.life.center_lr * plan.seconds())));
+        stage.groups.push(Group::new("log_time_scales", r.falling(r.life.width_lr)));
+        if r.native4d.harmonics > 0 {
+            let block = 3 * (r.appearance.sh_degree + 1) * (r.appearance.sh_degree + 1);
+            let rate = r.falling(r.rates.feature / SH_REST_SLOWDOWN);
+            stage.groups.push(Group { part: Some((block, block * r.native4d.harmonics)), ..Group::new("sh", rate) });
         }
-        if r.lambda_opacity_life > 0.0 {
-            stage.params.push(Box::new(LivingOpacity { weight: r.lambda_opacity_life }));
+        if r.loss.opacity_life > 0.0 {
+            stage.params.push(Box::new(LivingOpacity { weight: r.loss.opacity_life }));
         }
         vec![stage]
     }

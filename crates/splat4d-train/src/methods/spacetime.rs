@@ -5,7 +5,7 @@ use super::auto::Seen;
 use super::still;
 use super::{Group, Plan, Program, Rate, Stage};
 use crate::loss::scene::{LivingOpacity, VelocitySmoothness};
-use crate::recipe::{FULL, Recipe};
+use crate::settings::{choices, settings};
 use crate::upkeep::Guided;
 use splat4d::motion::spacetime::{FeatureSpec, TIME_FEATURES, VIEW_FEATURES};
 use splat4d::motion::{SpacetimeSpec, Spec};
@@ -15,6 +15,52 @@ use splat4d::scene::head::{HEAD_IN, HEAD_OUT};
 /// Cameras at a moment from which on a scene is seen from all sides at once.
 const MANY_CAMERAS: f64 = 3.0;
 
+choices! {
+    /// Features of Gaussians beside their base colour.
+    pub enum Features {
+        /// None.
+        None = "none",
+        /// Those of STG's full model.
+        Full = "full",
+    }
+}
+
+settings! {
+    /// Settings of `spacetime`.
+    pub struct SpacetimeSettings
+    when (Is("run.motion", &["spacetime"])) {
+        /// Order of the motion polynomial, 0 to 3.
+        order: usize = 1 => within(0, 3);
+        /// Whether quaternions turn with time.
+        rotation_rate: bool = false;
+        /// Life's centre learns from opacity alone (STG).
+        detach: bool = false => any().when(IsNot("life.kind", &["infinite"]));
+        /// Rate of velocities at the start, extents a clip.
+        velocity_lr_init: f64 = 5e-3 => positive().unit("extents/clip").when(On("spacetime.order"));
+        /// Rate of velocities at the end, extents a clip.
+        velocity_lr_final: f64 = 1.6e-5 => positive().unit("extents/clip").when(On("spacetime.order"));
+        /// Rate of quaternion rates, 1/clip.
+        rotation_rate_lr: f64 = 1e-3 => any().unit("1/clip").when(On("spacetime.rotation_rate"));
+        /// Features beside the base colour, which a small network turns into colour pixel by pixel: none or full (the
+        /// full model of STG; takes the place of spherical harmonics, so that sh_degree becomes 0). Such scenes are
+        /// drawn by splat4d alone: they have no playback file and no export.
+        features: Features = Features::None;
+        /// Rate of view features (STG, 30,000 steps: 0.0025).
+        view_features_lr: f64 = 0.01 => any().when(On("spacetime.features"));
+        /// Rate of time features, 1/clip (STG: 0.001).
+        time_features_lr: f64 = 0.02 => any().unit("1/clip").when(On("spacetime.features"));
+        /// Rate of the network's weights (STG: 0.0001).
+        head_lr: f64 = 3e-3 => any().when(On("spacetime.features"));
+    }
+}
+
+impl SpacetimeSettings {
+    /// Whether a network makes colour of features, in place of spherical harmonics.
+    pub fn has_features(&self) -> bool {
+        self.features == Features::Full
+    }
+}
+
 /// Explicit kinematics (STG, FreeTimeGS).
 #[derive(Clone, Copy, Debug)]
 pub struct SpacetimeProgram;
@@ -23,16 +69,16 @@ impl Program for SpacetimeProgram {
     fn spec(&self, plan: &Plan) -> Spec {
         let r = &plan.recipe;
         Spec::Spacetime(SpacetimeSpec {
-            order: r.motion_order,
-            rotation: r.rotation_rate,
-            detach: r.detach,
+            order: r.spacetime.order,
+            rotation: r.spacetime.rotation_rate,
+            detach: r.spacetime.detach,
             origin: 0.5 * (plan.clip[0] + plan.clip[1]),
-            features: (r.features == FULL).then_some(FeatureSpec { seed: r.seed }),
+            features: (r.spacetime.has_features()).then_some(FeatureSpec { seed: r.run.seed }),
         })
     }
 
     fn life(&self, plan: &Plan) -> LifeKind {
-        LifeKind::from_name(&plan.recipe.life).unwrap_or(LifeKind::GaussHalf)
+        plan.recipe.life.kind.unwrap_or(LifeKind::GaussHalf)
     }
 
     fn has_features(&self) -> bool {
@@ -52,33 +98,33 @@ impl Program for SpacetimeProgram {
         let r = &plan.recipe;
         let clip = plan.seconds();
         // Velocities are there to compare (`VelocitySmoothness`), which costs no further instant.
-        let base = Recipe { lambda_velocity: 0.0, ..r.clone() };
+        let base = r.clone().with(|r| r.loss.velocity = 0.0);
         let mut stage = still::stage("spacetime", &Plan { recipe: base, ..plan.clone() });
         // Rates of v_k are extents per clip^k: in seconds they shrink by clip^k.
-        for k in 0..r.motion_order {
+        for k in 0..r.spacetime.order {
             let unit = plan.extent / clip.powi(k as i32 + 1);
-            let rate = Rate { start: r.velocity_lr_init * unit, end: r.velocity_lr_final * unit };
+            let rate = Rate { start: r.spacetime.velocity_lr_init * unit, end: r.spacetime.velocity_lr_final * unit };
             stage.groups.push(Group { part: Some((3 * k, 3)), ..Group::new("velocities", rate) });
         }
-        if r.rotation_rate {
-            stage.groups.push(Group::new("rotation_rates", r.falling(r.rotation_rate_lr / clip)));
+        if r.spacetime.rotation_rate {
+            stage.groups.push(Group::new("rotation_rates", r.falling(r.spacetime.rotation_rate_lr / clip)));
         }
-        if r.features == FULL {
-            stage.groups.push(Group::new(VIEW_FEATURES, r.falling(r.view_features_lr)));
+        if r.spacetime.has_features() {
+            stage.groups.push(Group::new(VIEW_FEATURES, r.falling(r.spacetime.view_features_lr)));
             // Time features are per clip in the recipe, per second in the model.
-            stage.groups.push(Group::new(TIME_FEATURES, r.falling(r.time_features_lr / clip)));
-            stage.groups.push(Group::new(HEAD_IN, r.falling(r.head_lr)));
-            stage.groups.push(Group::new(HEAD_OUT, r.falling(r.head_lr)));
+            stage.groups.push(Group::new(TIME_FEATURES, r.falling(r.spacetime.time_features_lr / clip)));
+            stage.groups.push(Group::new(HEAD_IN, r.falling(r.spacetime.head_lr)));
+            stage.groups.push(Group::new(HEAD_OUT, r.falling(r.spacetime.head_lr)));
         }
         if let Some(guided) = Guided::of(r) {
             stage.keep(guided);
         }
         still::learn_life(&mut stage, plan, self.life(plan));
-        if r.lambda_opacity_life > 0.0 {
-            stage.params.push(Box::new(LivingOpacity { weight: r.lambda_opacity_life }));
+        if r.loss.opacity_life > 0.0 {
+            stage.params.push(Box::new(LivingOpacity { weight: r.loss.opacity_life }));
         }
-        if r.lambda_velocity > 0.0 && r.motion_order > 0 {
-            stage.params.push(Box::new(VelocitySmoothness::new(r.lambda_velocity, clip / plan.extent)));
+        if r.loss.velocity > 0.0 && r.spacetime.order > 0 {
+            stage.params.push(Box::new(VelocitySmoothness::new(r.loss.velocity, clip / plan.extent)));
         }
         vec![stage]
     }

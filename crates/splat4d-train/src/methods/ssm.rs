@@ -2,6 +2,7 @@
 //! if the recipe says so, a still warm-up, after which nodes are placed anew on what became of the cloud.
 
 use super::{Group, Hook, Plan, Program, Rate, Stage, control, still};
+use crate::settings::{Choice, settings};
 use crate::{Error, Result};
 use splat4d::layers::Layer;
 use splat4d::math::knn::mean_square_distance;
@@ -10,6 +11,50 @@ use splat4d::motion::skin::{NODE_LOG_RADIUS, Skin, farthest_points};
 use splat4d::motion::ssm::{Equivariance, Mode, Output, SsmSpec, refresh};
 use splat4d::scene::GEOMETRY;
 use splat4d::scene::params::OPACITY;
+
+settings! {
+    /// Settings of `ssm`, whose nodes are those of `[control]`.
+    pub struct SsmSettings
+    when (Is("run.motion", &["ssm"])) {
+        /// Ticks of the scan over the clip; 0: one every ten distinct times, 16 to 96.
+        ticks: usize = 0;
+        /// Channels.
+        width: usize = 32;
+        /// Complex states a channel.
+        states: usize = 8;
+        /// Residual blocks.
+        blocks: usize = 2;
+        /// Bidirectional (to reconstruct) or causal (to forecast).
+        mode: Mode = Mode::Bidirectional;
+        /// Absolute (poses) or twist (rates of poses, composed from tick to tick).
+        output: Output = Output::Absolute;
+        /// None, frames (the model turns with the scene) or vector (and mirrors with it).
+        equivariance: Equivariance = Equivariance::None;
+        /// Share of the iterations, from the first, in which nothing moves; nodes are placed after it.
+        warm_up: f64 = 0.0 => share();
+        /// Rate of the network's maps at the start.
+        lr_init: f64 = 5e-4;
+        /// Rate of the network's maps at the end.
+        lr_final: f64 = 1e-5;
+        /// Rate of the state space's decays, frequencies and steps.
+        dynamics_lr: f64 = 5e-4;
+        /// Rate of the nodes' embeddings.
+        embedding_lr: f64 = 3e-2;
+    }
+}
+
+impl Choice for Mode {
+    const NAMES: &'static [(&'static str, Self)] = &[("bidirectional", Self::Bidirectional), ("causal", Self::Causal)];
+}
+
+impl Choice for Output {
+    const NAMES: &'static [(&'static str, Self)] = &[("absolute", Self::Absolute), ("twist", Self::Twist)];
+}
+
+impl Choice for Equivariance {
+    const NAMES: &'static [(&'static str, Self)] =
+        &[("none", Self::None), ("frames", Self::Frames), ("vector", Self::Vector)];
+}
 
 /// Control nodes driven by a diagonal state-space model.
 #[derive(Clone, Copy, Debug)]
@@ -25,24 +70,20 @@ const SOLID_LOGIT: f32 = -2.2;
 impl Program for SsmProgram {
     fn spec(&self, plan: &Plan) -> Spec {
         let r = &plan.recipe;
-        let ticks = if r.ssm_ticks > 0 { r.ssm_ticks } else { plan.times.div_ceil(TIMES_PER_TICK) };
+        let ticks = if r.ssm.ticks > 0 { r.ssm.ticks } else { plan.times.div_ceil(TIMES_PER_TICK) };
         Spec::Ssm(SsmSpec {
-            seed: r.seed,
+            seed: r.run.seed,
             skin: control::skin(r),
             clip: plan.clip,
-            ticks: if r.ssm_ticks > 0 { ticks.max(2) } else { ticks.clamp(*TICKS.start(), *TICKS.end()) },
-            width: r.ssm_width,
-            states: r.ssm_states,
-            blocks: r.ssm_blocks,
+            ticks: if r.ssm.ticks > 0 { ticks.max(2) } else { ticks.clamp(*TICKS.start(), *TICKS.end()) },
+            width: r.ssm.width,
+            states: r.ssm.states,
+            blocks: r.ssm.blocks,
             extent: plan.extent,
-            mode: if r.ssm_mode == "causal" { Mode::Causal } else { Mode::Bidirectional },
-            octaves: if r.ssm_mode == "causal" { 0 } else { SsmSpec::default().octaves },
-            output: if r.ssm_output == "twist" { Output::Twist } else { Output::Absolute },
-            equivariance: match r.ssm_equivariance.as_str() {
-                "frames" => Equivariance::Frames,
-                "vector" => Equivariance::Vector,
-                _ => Equivariance::None,
-            },
+            mode: r.ssm.mode,
+            octaves: if r.ssm.mode == Mode::Causal { 0 } else { SsmSpec::default().octaves },
+            output: r.ssm.output,
+            equivariance: r.ssm.equivariance,
             ..SsmSpec::default()
         })
     }
@@ -65,14 +106,14 @@ impl Program for SsmProgram {
 
     fn stages(&self, plan: &Plan) -> Vec<Stage> {
         let r = &plan.recipe;
-        let warm = (r.ssm_warm_up * r.iterations as f64) as usize;
+        let warm = (r.ssm.warm_up * r.run.iterations as f64) as usize;
         let mut stages = Vec::new();
         if warm > 0 {
             let mut first = still::stage("ssm warm-up", plan).part(0, warm);
             still::learn_life(&mut first, plan, self.life(plan));
             stages.push(first);
         }
-        let mut all = still::stage("ssm", plan).part(warm, r.iterations);
+        let mut all = still::stage("ssm", plan).part(warm, r.run.iterations);
         still::learn_life(&mut all, plan, self.life(plan));
         control::add_nodes(&mut all, plan);
         all.groups.extend(groups(self.spec(plan), plan));
@@ -87,12 +128,12 @@ impl Program for SsmProgram {
 /// The network's groups.
 fn groups(spec: Spec, plan: &Plan) -> Vec<Group> {
     let r = &plan.recipe;
-    let maps = Rate { start: r.ssm_lr_init, end: r.ssm_lr_final };
-    let mut groups = vec![Group::new("node_embeddings", r.falling(r.ssm_embedding_lr))];
+    let maps = Rate { start: r.ssm.lr_init, end: r.ssm.lr_final };
+    let mut groups = vec![Group::new("node_embeddings", r.falling(r.ssm.embedding_lr))];
     // A model of an empty layer has the same columns as any other.
     let Spec::Ssm(spec) = spec else { return groups };
     if let Ok((dynamics, others)) = splat4d::motion::ssm::columns(&spec) {
-        groups.extend(dynamics.iter().map(|c| Group::new(c, Rate::constant(r.ssm_dynamics_lr))));
+        groups.extend(dynamics.iter().map(|c| Group::new(c, Rate::constant(r.ssm.dynamics_lr))));
         groups.extend(others.iter().map(|c| Group::new(c, maps)));
     }
     groups

@@ -7,7 +7,9 @@ use crate::loss::scene::{MeanOpacity, MeanScale, OpacityEntropy};
 use crate::loss::terms::{ParamLoss, ProbeLoss};
 use crate::optim::Noise;
 use crate::recipe::Recipe;
+use crate::settings::{Choice, settings};
 use crate::upkeep;
+use crate::upkeep::Strategy;
 use splat4d::motion::Spec;
 use splat4d::scene::LifeKind;
 
@@ -16,6 +18,70 @@ const SH_REST_SLOWDOWN: f64 = 20.0;
 
 /// A capture in which less than this share of the pixels moves is of a still scene.
 const MOVING: f64 = 2e-4;
+
+settings! {
+    /// Colour of Gaussians and of cameras' pictures.
+    pub struct AppearanceSettings {
+        /// Highest degree of the spherical harmonics, 0 to 3.
+        sh_degree: usize = 1 => within(0, 3);
+        /// Iterations before each further SH degree is unlocked; 0: iterations/10.
+        sh_degree_interval: usize = 0 => any().unit("iterations").when(On("appearance.sh_degree"));
+        /// Learn a gain and an offset a camera and channel, where there is more than one camera; their mean stays the
+        /// identity.
+        exposure: bool = true;
+        /// Rate of the exposure (Luiten et al., 10,000 steps: 1e-4).
+        exposure_lr: f64 = 1e-3 => any().when(On("appearance.exposure"));
+        /// Antialiased mode (opacity compensation).
+        antialias: bool = false;
+    }
+}
+
+settings! {
+    /// Learning rates of what all Gaussians have.
+    pub struct RateSettings {
+        /// Rate of positions at the start, of the extent.
+        position_init: f64 = 2e-3 => positive().unit("extents");
+        /// Rate of positions at the end, of the extent.
+        position_final: f64 = 5e-5 => positive().unit("extents");
+        /// Rates that are not given two ends (colour, opacity, scale, rotation, life) fall to this share of themselves.
+        decay: f64 = 1.0 => positive();
+        /// Rate of base colour; the higher SH degrees learn 20 times slower.
+        feature: f64 = 6e-3 => positive();
+        /// Rate of opacity logits.
+        opacity: f64 = 0.05 => positive();
+        /// Rate of log scales.
+        scaling: f64 = 0.015 => positive();
+        /// Rate of quaternions.
+        rotation: f64 = 1e-3 => positive();
+    }
+}
+
+settings! {
+    /// The envelope of a Gaussian in time.
+    pub struct LifeSettings
+    when (Any(&[Is("run.motion", &["spacetime", "native4d"]), Is("life.kind", &["gauss-half", "gauss-one", "interval"])])) {
+        /// The life of a Gaussian: auto (spacetime gauss-half, others infinite), infinite, gauss-half, gauss-one,
+        /// interval.
+        kind: Option<LifeKind> = None => any().switch().when(IsNot("run.motion", &["still"]));
+        /// Rate of life centres, clips.
+        center_lr: f64 = 1e-3 => any().unit("clips");
+        /// Rate of log life widths.
+        width_lr: f64 = 0.01;
+        /// Life widths never fall below this many frames.
+        min_frames: f64 = 0.5 => any().unit("frames");
+    }
+}
+
+/// `auto`, the first, is the motion model's own choice.
+impl Choice for Option<LifeKind> {
+    const NAMES: &'static [(&'static str, Self)] = &[
+        ("auto", None),
+        ("infinite", Some(LifeKind::Infinite)),
+        ("gauss-half", Some(LifeKind::GaussHalf)),
+        ("gauss-one", Some(LifeKind::GaussOne)),
+        ("interval", Some(LifeKind::Interval)),
+    ];
+}
 
 /// Static 3D Gaussian Splatting.
 #[derive(Clone, Copy, Debug)]
@@ -45,17 +111,17 @@ impl Program for StillProgram {
 
 /// The groups of geometry and colour.
 pub fn groups(r: &Recipe, extent: f64) -> Vec<Group> {
-    let positions = Rate { start: r.position_lr_init * extent, end: r.position_lr_final * extent };
+    let positions = Rate { start: r.rates.position_init * extent, end: r.rates.position_final * extent };
     let mut groups = vec![
         Group::new("means", positions),
-        Group::new("quats", r.falling(r.rotation_lr)),
-        Group::new("log_scales", r.falling(r.scaling_lr)),
-        Group::new("opacity_logits", r.falling(r.opacity_lr)),
-        Group { part: Some((0, 3)), ..Group::new("sh", r.falling(r.feature_lr)) },
+        Group::new("quats", r.falling(r.rates.rotation)),
+        Group::new("log_scales", r.falling(r.rates.scaling)),
+        Group::new("opacity_logits", r.falling(r.rates.opacity)),
+        Group { part: Some((0, 3)), ..Group::new("sh", r.falling(r.rates.feature)) },
     ];
-    let rest = 3 * ((r.sh_degree + 1) * (r.sh_degree + 1) - 1);
+    let rest = 3 * ((r.appearance.sh_degree + 1) * (r.appearance.sh_degree + 1) - 1);
     if rest > 0 {
-        let rate = r.falling(r.feature_lr / SH_REST_SLOWDOWN);
+        let rate = r.falling(r.rates.feature / SH_REST_SLOWDOWN);
         groups.push(Group { part: Some((3, rest)), ..Group::new("sh", rate) });
     }
     groups
@@ -65,25 +131,25 @@ pub fn groups(r: &Recipe, extent: f64) -> Vec<Group> {
 pub fn learn_life(stage: &mut Stage, plan: &Plan, life: LifeKind) {
     let r = &plan.recipe;
     if life != LifeKind::Infinite {
-        stage.groups.push(Group::new("life_centers", r.falling(r.life_center_lr * plan.seconds())));
-        stage.groups.push(Group::new("life_log_widths", r.falling(r.life_width_lr)));
-        stage.min_log_life = Some((r.min_life_frames / plan.fps).max(1e-6).ln());
+        stage.groups.push(Group::new("life_centers", r.falling(r.life.center_lr * plan.seconds())));
+        stage.groups.push(Group::new("life_log_widths", r.falling(r.life.width_lr)));
+        stage.min_log_life = Some((r.life.min_frames / plan.fps).max(1e-6).ln());
     }
     if life == LifeKind::Interval {
-        stage.groups.push(Group::new("life_log_softness", r.falling(r.life_width_lr)));
+        stage.groups.push(Group::new("life_log_softness", r.falling(r.life.width_lr)));
     }
 }
 
 /// What the recipe asks of how Gaussians move.
 pub fn motion_weights(r: &Recipe) -> MotionWeights {
     MotionWeights {
-        rigid: r.lambda_rigid,
-        rot: r.lambda_rot,
-        iso: r.lambda_iso,
-        arap: r.lambda_arap,
-        elastic: r.lambda_elastic,
-        velocity: r.lambda_velocity,
-        jerk: r.lambda_jerk,
+        rigid: r.loss.rigid,
+        rot: r.loss.rot,
+        iso: r.loss.iso,
+        arap: r.loss.arap,
+        elastic: r.loss.elastic,
+        velocity: r.loss.velocity,
+        jerk: r.loss.jerk,
     }
 }
 
@@ -92,16 +158,16 @@ pub fn stage(name: &str, plan: &Plan) -> Stage {
     let r = &plan.recipe;
     let mut params: Vec<Box<dyn ParamLoss<f32>>> = Vec::new();
     // These two belong to MCMC: they make room; under ADC they only dim.
-    if r.strategy == "mcmc" {
-        if r.opacity_reg > 0.0 {
-            params.push(Box::new(MeanOpacity { weight: r.opacity_reg }));
+    if r.densify.strategy == Strategy::Mcmc {
+        if r.mcmc.opacity_reg > 0.0 {
+            params.push(Box::new(MeanOpacity { weight: r.mcmc.opacity_reg }));
         }
-        if r.scale_reg > 0.0 {
-            params.push(Box::new(MeanScale { weight: r.scale_reg }));
+        if r.mcmc.scale_reg > 0.0 {
+            params.push(Box::new(MeanScale { weight: r.mcmc.scale_reg }));
         }
     }
-    if r.lambda_opacity_entropy > 0.0 {
-        params.push(Box::new(OpacityEntropy { weight: r.lambda_opacity_entropy }));
+    if r.loss.opacity_entropy > 0.0 {
+        params.push(Box::new(OpacityEntropy { weight: r.loss.opacity_entropy }));
     }
     let mut probes: Vec<Box<dyn ProbeLoss<f32>>> = Vec::new();
     let weights = motion_weights(r);
@@ -109,14 +175,14 @@ pub fn stage(name: &str, plan: &Plan) -> Stage {
         probes.push(Box::new(Neighbourhood::new(weights, plan.extent, plan.clip, plan.fps)));
     }
     Stage {
-        batch: r.batch_size,
+        batch: r.run.batch_size,
         groups: groups(r, plan.extent),
         probes,
         params,
         upkeep: upkeep::of(r),
         noise: Noise::of(r),
-        sh_interval: r.sh_degree_interval,
-        half_size_steps: (r.half_size_until * r.iterations as f64) as usize,
-        ..Stage::new(name, r.iterations)
+        sh_interval: r.appearance.sh_degree_interval,
+        half_size_steps: (r.run.half_size_until * r.run.iterations as f64) as usize,
+        ..Stage::new(name, r.run.iterations)
     }
 }

@@ -11,6 +11,7 @@ use crate::loss::image::segmentation::Segmentation;
 use crate::loss::tracked::{Ties, Tracking, Weights};
 use crate::recipe::Recipe;
 use crate::sampler::Sampler;
+use crate::settings::settings;
 use crate::{Error, Result};
 use splat4d::layers::Layer;
 use splat4d::math::quat;
@@ -27,6 +28,45 @@ const PAPER_EXTENT: f64 = 3.0;
 /// make up for it: 18.3 dB instead of 29.5 on frame 0 of the bundled capture after 800 steps. The logits, which see nothing
 /// but masks, learn as fast with any weight, since Adam does not know the scale of a gradient.
 const FIRST_MASKS: f64 = 1e-3;
+
+settings! {
+    /// Settings of `tracked`.
+    pub struct TrackedSettings
+    when (Is("run.motion", &["tracked"])) {
+        /// Share of the iterations that frame 0 gets; the other frames share the rest.
+        first_share: f64 = 0.25;
+        /// Rate of a frame's positions at its first step, of the extent.
+        lr_init: f64 = 3e-3 => any().unit("extents");
+        /// Rate of a frame's positions at its last step, of the extent.
+        lr_final: f64 = 4e-4 => any().unit("extents");
+        /// Rate of a frame's quaternions.
+        rotation_lr: f64 = 6e-3;
+        /// Rate of base colours after frame 0. Colours are shared: frames tracked before change with them.
+        feature_lr: f64 = 0.0;
+        /// Longest step that a Gaussian carries on to the next frame, of the extent.
+        velocity_cap: f64 = 0.05 => any().unit("extents");
+        /// Neighbours that each Gaussian is tied to.
+        neighbours: usize = 20;
+        /// A neighbour at distance d counts exp(−β d²), β in 1/(scene units)²; 0: 1/median(d²).
+        beta: f64 = 0.0 => any().unit("1/units²");
+        /// Weight of neighbours keeping their offsets.
+        rigid: f64 = 4.0;
+        /// Weight of neighbours turning alike.
+        rot: f64 = 4.0;
+        /// Weight of neighbours keeping frame 0's distances.
+        iso: f64 = 2.0;
+        /// Weight of the background staying (with masks).
+        bg: f64 = 20.0;
+        /// Weight of masks against what Gaussians say of the foreground; 0: all is foreground.
+        seg: f64 = 3.0;
+        /// Weight of colours staying as they were, where they learn.
+        soft_col_cons: f64 = 0.01 => any().when(On("tracked.feature_lr"));
+        /// Weight of the foreground staying above the floor.
+        floor: f64 = 2.0 => any().when(On("tracked.floor_height"));
+        /// Height of the floor along the scene's up direction, scene units; empty: no floor.
+        floor_height: Option<f64> = None => finite().unit("units");
+    }
+}
 
 /// Positions and rotations of the same Gaussians at every frame (Luiten et al. 2024, "Dynamic 3D Gaussians").
 #[derive(Clone, Copy, Debug)]
@@ -57,11 +97,11 @@ impl Program for TrackedProgram {
             ))
             .remedy(format!("Use another --motion: {}", others.join(", "))));
         }
-        if plan.recipe.prune_interval > 0 {
+        if plan.recipe.prune.interval > 0 {
             return Err(Error::input("`tracked` cannot prune while it trains: it does not know the frames to come")
                 .remedy("Leave prune_interval at 0, or prune afterwards with `splat4d compress`"));
         }
-        floor(&plan.recipe).map(|_| ())
+        Ok(())
     }
 
     fn stages(&self, plan: &Plan) -> Vec<Stage> {
@@ -70,20 +110,20 @@ impl Program for TrackedProgram {
         let first = first_steps(r, frames);
         let tracking = Tracking::new(ties(plan));
         let mut stages = vec![first_stage(plan, first)];
-        let rest = r.iterations - first;
+        let rest = r.run.iterations - first;
         for k in 1..frames {
             let steps = rest * k / (frames - 1) - rest * (k - 1) / (frames - 1);
-            let positions = Rate { start: r.track_lr_init * plan.extent, end: r.track_lr_final * plan.extent };
+            let positions = Rate { start: r.tracked.lr_init * plan.extent, end: r.tracked.lr_final * plan.extent };
             let mut groups = vec![
                 Group::new(&page_name("means", k as u32), positions),
-                Group::new(&page_name("quats", k as u32), Rate::constant(r.track_rotation_lr)),
+                Group::new(&page_name("quats", k as u32), Rate::constant(r.tracked.rotation_lr)),
             ];
-            if r.track_feature_lr > 0.0 {
-                groups.push(Group { part: Some((0, 3)), ..Group::new("sh", Rate::constant(r.track_feature_lr)) });
+            if r.tracked.feature_lr > 0.0 {
+                groups.push(Group { part: Some((0, 3)), ..Group::new("sh", Rate::constant(r.tracked.feature_lr)) });
             }
             stages.push(Stage {
                 sampler: Sampler::Frame(k),
-                batch: r.batch_size,
+                batch: r.run.batch_size,
                 groups,
                 params: vec![Box::new(tracking.frame(k))],
                 pictures: segmentation(plan, 1.0),
@@ -105,10 +145,10 @@ impl Program for TrackedProgram {
     fn tuning(&self, plan: &Plan) -> Stage {
         let r = &plan.recipe;
         let mut stage = still::stage("tracked", plan);
-        let positions = Rate { start: r.track_lr_init * plan.extent, end: r.track_lr_final * plan.extent };
+        let positions = Rate { start: r.tracked.lr_init * plan.extent, end: r.tracked.lr_final * plan.extent };
         for k in 1..plan.moments.len() as u32 {
             stage.groups.push(Group::new(&page_name("means", k), positions));
-            stage.groups.push(Group::new(&page_name("quats", k), Rate::constant(r.track_rotation_lr)));
+            stage.groups.push(Group::new(&page_name("quats", k), Rate::constant(r.tracked.rotation_lr)));
         }
         stage
     }
@@ -116,70 +156,61 @@ impl Program for TrackedProgram {
 
 /// Whether Gaussians learn who is foreground.
 fn segments(plan: &Plan) -> bool {
-    plan.masks && plan.recipe.seg > 0.0
+    plan.masks && plan.recipe.tracked.seg > 0.0
 }
 
 /// Masks against the foreground logit, at a share of the recipe's weight.
 fn segmentation(plan: &Plan, share: f64) -> Vec<Box<dyn ImageTerm>> {
     let r = &plan.recipe;
-    let term = || -> Box<dyn ImageTerm> { Box::new(Segmentation::new(FOREGROUND, share * r.seg, r.lambda_dssim)) };
+    let term =
+        || -> Box<dyn ImageTerm> { Box::new(Segmentation::new(FOREGROUND, share * r.tracked.seg, r.loss.dssim)) };
     segments(plan).then(term).into_iter().collect()
 }
 
 /// Steps of frame 0.
 fn first_steps(r: &Recipe, frames: usize) -> usize {
-    if frames <= 1 { r.iterations } else { ((r.iterations as f64 * r.first_share.min(1.0)) as usize).max(1) }
-}
-
-/// Height of the floor, if there is one. Errors: not a number.
-fn floor(r: &Recipe) -> Result<Option<f64>> {
-    if r.floor_height.is_empty() {
-        return Ok(None);
-    }
-    match r.floor_height.parse::<f64>() {
-        Ok(height) if height.is_finite() => Ok(Some(height)),
-        _ => Err(Error::input(format!("knob `floor_height` cannot be `{}`", r.floor_height))
-            .remedy("Give a number of scene units along the scene's up direction, or nothing")),
+    if frames <= 1 {
+        r.run.iterations
+    } else {
+        ((r.run.iterations as f64 * r.tracked.first_share.min(1.0)) as usize).max(1)
     }
 }
 
 fn ties(plan: &Plan) -> Ties {
     let r = &plan.recipe;
-    let floor = floor(r).ok().flatten();
     Ties {
-        neighbours: r.rigid_neighbours,
-        weigh: if r.rigid_beta > 0.0 { Weigh::Beta(r.rigid_beta) } else { Weigh::Median(1.0) },
+        neighbours: r.tracked.neighbours,
+        weigh: if r.tracked.beta > 0.0 { Weigh::Beta(r.tracked.beta) } else { Weigh::Median(1.0) },
         weights: Weights {
-            rigid: r.rigid,
-            rot: r.rot,
-            iso: r.iso,
-            bg: r.bg,
-            soft_col: if r.track_feature_lr > 0.0 { r.soft_col_cons } else { 0.0 },
-            floor: if floor.is_some() { r.floor } else { 0.0 },
+            rigid: r.tracked.rigid,
+            rot: r.tracked.rot,
+            iso: r.tracked.iso,
+            bg: r.tracked.bg,
+            soft_col: if r.tracked.feature_lr > 0.0 { r.tracked.soft_col_cons } else { 0.0 },
+            floor: if r.tracked.floor_height.is_some() { r.tracked.floor } else { 0.0 },
         },
-        floor: floor.unwrap_or(0.0),
+        floor: r.tracked.floor_height.unwrap_or(0.0),
         unit: plan.extent / PAPER_EXTENT,
     }
 }
 
 /// Frame 0 is a still scene; what the recipe schedules over all steps happens in this stage's.
 fn first_stage(plan: &Plan, steps: usize) -> Stage {
-    let share = steps as f64 / plan.recipe.iterations as f64;
+    let share = steps as f64 / plan.recipe.run.iterations as f64;
     let part = |steps: usize| ((steps as f64 * share) as usize).max(1);
-    let r = Recipe {
-        iterations: steps,
-        sh_degree_interval: part(plan.recipe.sh_degree_interval),
-        densification_interval: part(plan.recipe.densification_interval),
-        densify_from_iter: part(plan.recipe.densify_from_iter),
-        densify_until_iter: part(plan.recipe.densify_until_iter),
-        ..plan.recipe.clone()
-    };
+    let r = plan.recipe.clone().with(|r| {
+        r.run.iterations = steps;
+        r.appearance.sh_degree_interval = part(plan.recipe.appearance.sh_degree_interval);
+        r.densify.interval = part(plan.recipe.densify.interval);
+        r.densify.from = part(plan.recipe.densify.from);
+        r.densify.until = part(plan.recipe.densify.until);
+    });
     let plan = Plan { recipe: r, ..plan.clone() };
     let mut stage = still::stage("frame 0", &plan);
     stage.sampler = Sampler::Frame(0);
     still::learn_life(&mut stage, &plan, TrackedProgram.life(&plan));
     if segments(&plan) {
-        stage.groups.push(Group::new(FOREGROUND, plan.recipe.falling(plan.recipe.opacity_lr)));
+        stage.groups.push(Group::new(FOREGROUND, plan.recipe.falling(plan.recipe.rates.opacity)));
         stage.pictures = segmentation(&plan, FIRST_MASKS);
     }
     stage
@@ -187,7 +218,7 @@ fn first_stage(plan: &Plan, steps: usize) -> Stage {
 
 /// Adds frame k where everything goes on as it went.
 fn next_frame(plan: &Plan, k: usize, tracking: &Tracking<f32>) -> Hook {
-    let (t, cap) = (plan.moments[k].0, plan.recipe.velocity_cap * plan.extent);
+    let (t, cap) = (plan.moments[k].0, plan.recipe.tracked.velocity_cap * plan.extent);
     let tracking = tracking.clone();
     Box::new(move |scene, progress| {
         let layer = &mut scene.layers[0];

@@ -44,18 +44,18 @@ const fn splat_numbers() -> u64 {
 /// their model has beside them: networks, planes, nodes, the state of a filter.
 pub fn memory_estimate(capture: &Capture, recipe: &Recipe) -> u64 {
     let frames = || capture.train.iter().map(|&i| &capture.frames[i]);
-    let cap = recipe.max_cap as u64;
+    let cap = recipe.densify.max_cap as u64;
     let frame = frames().map(|f| (f.view.width * f.view.height) as u64).max();
     let pixels = frame.unwrap_or(0);
     let stored = STORED_BYTES[usize::from(capture.downscale > 1)];
-    let images = (pixels * stored * capture.train.len() as u64).min(recipe.image_memory);
-    let sum = PROCESS_BYTES + images + pixels * PIXEL_BYTES * recipe.batch_size as u64 + cap * RENDER_BYTES;
+    let images = (pixels * stored * capture.train.len() as u64).min(recipe.run.image_memory);
+    let sum = PROCESS_BYTES + images + pixels * PIXEL_BYTES * recipe.run.batch_size as u64 + cap * RENDER_BYTES;
     if capture.train.is_empty() {
         return sum;
     }
     let plan = super::run::plan(capture, recipe);
     // A recipe that no model can be made of has an error of its own.
-    sum + model(&plan, recipe.max_cap).unwrap_or(0)
+    sum + model(&plan, recipe.densify.max_cap).unwrap_or(0)
 }
 
 /// Bytes of a model's tables in training, and of what a step with it needs, at `rows` Gaussians.
@@ -65,7 +65,7 @@ fn model(plan: &Plan, rows: usize) -> Result<u64> {
     let tables = few.tables(rows);
     let checkpoint = tables * CHECKPOINT[0] / CHECKPOINT[1];
     let question = rows as u64 * ANSWER * F32 + few.motion.scratch_bytes(&few.params, rows);
-    Ok(tables + checkpoint + program.growth_bytes(plan, rows) + plan.recipe.batch_size as u64 * question)
+    Ok(tables + checkpoint + program.growth_bytes(plan, rows) + plan.recipe.run.batch_size as u64 * question)
 }
 
 /// A program's model on few rows: as many as it needs for its nodes.
@@ -79,7 +79,7 @@ struct Few {
 impl Few {
     fn new(program: &dyn Program, plan: &Plan, rows: usize) -> Result<Self> {
         let nodes = program.nodes(plan).min(rows);
-        let (few, coefficients) = (FEW.max(nodes), (plan.recipe.sh_degree + 1).pow(2));
+        let (few, coefficients) = (FEW.max(nodes), (plan.recipe.appearance.sh_degree + 1).pow(2));
         let mut params = Params::<f32>::new(few, coefficients, program.life(plan).columns());
         let rng = Rng::new(0, "memory", 0);
         for row in 0..few {

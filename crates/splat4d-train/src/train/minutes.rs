@@ -35,7 +35,7 @@ pub(super) fn plan(bench: &Bench, recipe: &Recipe, minutes: f64, listen: &mut dy
     };
     tell(listen, 0);
     // A filter would be switched on later than the probes look.
-    let plan = bench.plan(&Recipe { filter_start: 0.0, ..recipe.clone() });
+    let plan = bench.plan(&recipe.clone().with(|r| r.filter.start = 0.0));
     let scene = bench.initial_scene(&plan)?;
     let start = scene.len();
     // A probe's rates do not matter, its number of Gaussians does: nothing of it is kept.
@@ -51,7 +51,7 @@ pub(super) fn plan(bench: &Bench, recipe: &Recipe, minutes: f64, listen: &mut dy
     trainer.stages.iter_mut().for_each(|s| s.half_size_steps = usize::MAX);
     trainer.stages[0].iterations = ENDLESS;
     for _ in 0..GROWTH_STEPS {
-        if trainer.scene().len() >= recipe.max_cap {
+        if trainer.scene().len() >= recipe.densify.max_cap {
             break;
         }
         step(&mut trainer)?;
@@ -63,15 +63,15 @@ pub(super) fn plan(bench: &Bench, recipe: &Recipe, minutes: f64, listen: &mut dy
     let steps = [0, 1].map(|later| Steps { gaussians, seconds: [few[later], many[later]] });
     let seconds = minutes * 60.0;
     let cost = |iterations: usize| -> Result<f64> {
-        let r = Recipe { iterations, ..reset(recipe) }.resolve();
-        Ok(cost(&stages(program_of(&r)?.as_ref(), &bench.plan(&r)), r.max_cap, &steps))
+        let r = reset(recipe).with(|r| r.run.iterations = iterations).resolve();
+        Ok(cost(&stages(program_of(&r)?.as_ref(), &bench.plan(&r)), r.densify.max_cap, &steps))
     };
     let (mut low, mut high) = (*ITERATIONS.start(), *ITERATIONS.end());
     while low + 1 < high {
         let middle = low.midpoint(high);
         if cost(middle)? <= seconds { low = middle } else { high = middle }
     }
-    Ok(Recipe { iterations: low, ..reset(recipe) })
+    Ok(reset(recipe).with(|r| r.run.iterations = low))
 }
 
 /// Lets all stages densify at other steps.
@@ -83,14 +83,13 @@ fn densify(trainer: &mut Trainer<'_>, steps: Every) {
 
 /// Schedules that followed from another number of iterations are derived anew.
 fn reset(recipe: &Recipe) -> Recipe {
-    Recipe {
-        sh_degree_interval: 0,
-        densification_interval: 0,
-        densify_from_iter: 0,
-        densify_until_iter: 0,
-        checkpoint_interval: 0,
-        ..recipe.clone()
-    }
+    recipe.clone().with(|r| {
+        r.appearance.sh_degree_interval = 0;
+        r.densify.interval = 0;
+        r.densify.from = 0;
+        r.densify.until = 0;
+        r.run.checkpoint_interval = 0;
+    })
 }
 
 /// Seconds a step [half size, full size] in the first stage and, skipping what is left of it, in the second; a run of one
@@ -169,21 +168,27 @@ mod tests {
 
     #[test]
     fn the_cost_follows_the_growth_and_the_size() {
-        let r = Recipe { iterations: 1000, half_size_until: 0.0, max_cap: 2000, ..Recipe::default() }.resolve();
+        let r = Recipe::default()
+            .with(|r| {
+                r.run.iterations = 1000;
+                r.run.half_size_until = 0.0;
+                r.densify.max_cap = 2000;
+            })
+            .resolve();
         let mut stage = Stage { upkeep: upkeep::of(&r), ..Stage::new("all", 1000) };
         let steps = |gaussians, few, many| [Steps { gaussians, seconds: [few, many] }; 2];
-        let flat = cost(std::slice::from_ref(&stage), r.max_cap, &steps([1000, 1000], [0.01; 2], [0.01; 2]));
+        let flat = cost(std::slice::from_ref(&stage), r.densify.max_cap, &steps([1000, 1000], [0.01; 2], [0.01; 2]));
         assert!((flat - 10.0).abs() < 1e-9);
-        let grown = cost(std::slice::from_ref(&stage), r.max_cap, &steps([1000, 2000], [0.01; 2], [0.02; 2]));
+        let grown = cost(std::slice::from_ref(&stage), r.densify.max_cap, &steps([1000, 2000], [0.01; 2], [0.02; 2]));
         assert!(grown > 12.0 && grown < 20.0, "{grown}");
         stage.half_size_steps = 500;
         let halves = [0.0, 0.01];
-        let half = cost(std::slice::from_ref(&stage), r.max_cap, &steps([1000, 1000], halves, halves));
+        let half = cost(std::slice::from_ref(&stage), r.densify.max_cap, &steps([1000, 1000], halves, halves));
         assert!((half - 5.0).abs() < 1e-9);
         // A still warm-up of 100 free steps; then 900 of a network, a third of them at half size.
         let stages = [Stage::new("still", 100), Stage { half_size_steps: 300, ..Stage::new("network", 900) }];
         let mut steps = steps([1000, 1000], [0.0; 2], [0.0; 2]);
         steps[1].seconds = [[0.01, 0.02]; 2];
-        assert!((cost(&stages, r.max_cap, &steps) - 15.0).abs() < 1e-9);
+        assert!((cost(&stages, r.densify.max_cap, &steps) - 15.0).abs() < 1e-9);
     }
 }

@@ -59,10 +59,10 @@ pub fn refine(
         return Err(Error::input("there is not one stage to run").remedy("Ask for at least one step"));
     }
     let total: usize = job.stages.iter().map(|s| s.iterations).sum();
-    let recipe = Recipe { iterations: total.max(1), ..job.recipe }.resolve();
+    let recipe = job.recipe.with(|r| r.run.iterations = total.max(1)).resolve();
     let bench = Bench::with(job.frames);
     let plan = bench.plan(&recipe);
-    let held = Recipe { max_cap: job.scene.len().max(1), ..recipe.clone() };
+    let held = recipe.clone().with(|r| r.densify.max_cap = job.scene.len().max(1));
     let session = Session {
         run,
         bench: &bench,

@@ -13,12 +13,12 @@ use super::snapshot::Snapshots;
 use super::trainer::{Settings, Stepped, Trainer};
 use crate::capture::{Capture, CaptureOptions, ImageStore};
 use crate::event::{Event, Progress};
-use crate::init::{self, Seeds};
+use crate::init::{self, Seeds, Source};
 use crate::learner::Exposure;
 use crate::loss::image::terms;
-use crate::methods::auto::{self, AUTO};
+use crate::methods::auto;
 use crate::methods::{Plan, Stage, program_of, stages};
-use crate::recipe::Recipe;
+use crate::recipe::{MotionName, Recipe};
 use crate::upkeep::Limits;
 use crate::{Error, ErrorKind, Result};
 use serde_json::json;
@@ -69,13 +69,12 @@ const SINGLE_PLACE: f64 = 1e-6;
 const PROGRESS_SECONDS: f64 = 0.25;
 /// The options with which a recipe opens its capture.
 pub fn capture_options(recipe: &Recipe) -> Result<CaptureOptions> {
-    let hold_out = if recipe.hold_out.is_empty() { None } else { Some(recipe.hold_out.parse()?) };
     Ok(CaptureOptions {
-        downscale: recipe.downscale,
-        hold_out,
-        fps: (recipe.fps > 0.0).then_some(recipe.fps),
-        background: (!recipe.white_background).then_some([0.0; 3]),
-        near: recipe.near,
+        downscale: recipe.capture.downscale,
+        hold_out: recipe.capture.hold_out.clone(),
+        fps: (recipe.capture.fps > 0.0).then_some(recipe.capture.fps),
+        background: (!recipe.capture.white_background).then_some([0.0; 3]),
+        near: recipe.capture.near,
         ..CaptureOptions::default()
     })
 }
@@ -98,8 +97,9 @@ pub fn train(
     let bench = Bench::new(capture, &recipe)?;
     check_flow(&bench.capture, &recipe)?;
     let mut listen = listen;
-    let recipe = if recipe.motion == AUTO { bench.choose(recipe, &mut listen)? } else { recipe };
+    let recipe = if recipe.run.motion.is_auto() { bench.choose(recipe, &mut listen)? } else { recipe };
     program_of(&recipe)?.check(&bench.plan(&recipe))?;
+    recipe.without_effect().iter().for_each(|idle| listen(&Event::Warning { message: idle.to_string() }));
     let recipe = match options.minutes {
         Some(m) => minutes::plan(&bench, &recipe, m, &mut listen)?,
         None => recipe,
@@ -107,13 +107,13 @@ pub fn train(
     .resolve();
     let plan = bench.plan(&recipe);
     let estimate = memory_estimate(&bench.capture, &recipe);
-    if recipe.memory_limit > 0 && estimate > recipe.memory_limit {
+    if recipe.run.memory_limit > 0 && estimate > recipe.run.memory_limit {
         return Err(Error::new(
             ErrorKind::Memory,
             format!(
                 "training would take about {} MiB, and memory_limit is {} MiB",
                 estimate >> 20,
-                recipe.memory_limit >> 20
+                recipe.run.memory_limit >> 20
             ),
         )
         .remedy("Lower max_cap or image_memory, or use --downscale 2"));
@@ -201,21 +201,27 @@ fn made_by(run: &Path) -> Result<Option<String>> {
 /// Opens a capture as a recipe wants it: scale, split, and the part of the take that is used.
 pub fn open_capture(path: &Path, recipe: &Recipe) -> Result<Capture> {
     let mut capture = Capture::open(path, &capture_options(recipe)?)?;
-    if recipe.lambda_flow == 0.0 {
+    if recipe.loss.flow == 0.0 {
         // Nobody looks at it: it need not be decoded.
         capture.frames.iter_mut().for_each(|f| f.flow = None);
     }
-    if recipe.first_frame > 0 || recipe.max_frames > 0 {
-        let last =
-            if recipe.max_frames == 0 { usize::MAX } else { recipe.first_frame.saturating_add(recipe.max_frames) };
-        let keep = |i: &usize| (recipe.first_frame..last).contains(&capture.frames[*i].index);
+    if recipe.capture.first_frame > 0 || recipe.capture.max_frames > 0 {
+        let last = if recipe.capture.max_frames == 0 {
+            usize::MAX
+        } else {
+            recipe.capture.first_frame.saturating_add(recipe.capture.max_frames)
+        };
+        let keep = |i: &usize| (recipe.capture.first_frame..last).contains(&capture.frames[*i].index);
         let (train, held) =
             (capture.train.iter().copied().filter(keep).collect(), capture.held.iter().copied().filter(keep).collect());
         let validation = capture.validation.iter().copied().filter(keep).collect();
         (capture.train, capture.held, capture.validation) = (train, held, validation);
         if capture.train.is_empty() {
-            return Err(Error::input(format!("no training frame is left of frames {}..{last}", recipe.first_frame))
-                .remedy("Change first_frame or max_frames"));
+            return Err(Error::input(format!(
+                "no training frame is left of frames {}..{last}",
+                recipe.capture.first_frame
+            ))
+            .remedy("Change first_frame or max_frames"));
         }
     }
     Ok(capture)
@@ -223,7 +229,7 @@ pub fn open_capture(path: &Path, recipe: &Recipe) -> Result<Capture> {
 
 /// Errors: a loss on flow, and not one training picture has any.
 fn check_flow(capture: &Capture, recipe: &Recipe) -> Result<()> {
-    if recipe.lambda_flow == 0.0 || capture.train.iter().any(|&i| capture.frames[i].flow.is_some()) {
+    if recipe.loss.flow == 0.0 || capture.train.iter().any(|&i| capture.frames[i].flow.is_some()) {
         return Ok(());
     }
     Err(Error::input("lambda_flow compares flow, and the capture's training pictures have none")
@@ -267,7 +273,7 @@ pub fn training_frames(capture: Arc<Capture>, recipe: &Recipe) -> Result<Arc<Dat
     if capture.train.is_empty() {
         return Err(Error::input("the capture has no training frames").remedy("Hold out fewer views with --hold-out"));
     }
-    let store = Arc::new(ImageStore::new(capture.clone(), recipe.image_memory as usize));
+    let store = Arc::new(ImageStore::new(capture.clone(), recipe.run.image_memory as usize));
     Ok(Arc::new(Dataset::new(store, capture.train.clone())))
 }
 
@@ -315,7 +321,7 @@ impl Bench {
         listen(&Event::Phase { name: "looking at the capture".into(), done: 0, total: 0 });
         let choice = auto::choose(&self.plan(&recipe), self.frames.as_ref())?;
         listen(&Event::Chosen { motion: choice.motion.into(), why: choice.why });
-        Ok(Recipe { motion: choice.motion.into(), ..recipe })
+        Ok(recipe.with(|r| r.run.motion = MotionName::of(choice.motion)))
     }
 
     fn background(&self) -> [f32; 3] {
@@ -325,9 +331,8 @@ impl Bench {
     pub(super) fn initial_scene(&self, plan: &Plan) -> Result<Scene<f32>> {
         let program = program_of(&plan.recipe)?;
         let moving = program.capabilities(plan).moves && plan.times > 1;
-        let init = &plan.recipe.init;
-        let points = if init.ends_with(".ply") {
-            let cloud = crate::capture::read_points(Path::new(init))?;
+        let points = if let Source::File(path) = &plan.recipe.init.source {
+            let cloud = crate::capture::read_points(path)?;
             Some(Seeds { points: cloud.points, colors: cloud.colors, times: cloud.times })
         } else {
             self.capture.points.as_ref().map(|c| Seeds {
@@ -352,7 +357,7 @@ impl Bench {
     pub(super) fn trainer_of(&self, plan: &Plan, scene: Scene<f32>, stages: Vec<Stage>) -> Trainer<'static> {
         let r = &plan.recipe;
         let config = RenderConfig {
-            antialias: if r.antialias { Antialias::On } else { Antialias::Off },
+            antialias: if r.appearance.antialias { Antialias::On } else { Antialias::Off },
             simd: self.simd,
             ..RenderConfig::default()
         };
@@ -360,13 +365,14 @@ impl Bench {
         trained.sort_unstable();
         trained.dedup();
         // A single camera's gain is its own mean, which stays the identity.
-        let exposure = (r.exposure && trained.len() > 1).then(|| Exposure::new(self.capture.cameras.len(), trained));
+        let exposure =
+            (r.appearance.exposure && trained.len() > 1).then(|| Exposure::new(self.capture.cameras.len(), trained));
         let settings = Settings {
-            seed: r.seed,
-            limits: Limits { cap: r.max_cap, extent: plan.extent, min_opacity: r.min_opacity },
+            seed: r.run.seed,
+            limits: Limits { cap: r.densify.max_cap, extent: plan.extent, min_opacity: r.densify.min_opacity },
             background: self.background(),
-            sh_degree: r.sh_degree,
-            exposure_lr: r.exposure_lr,
+            sh_degree: r.appearance.sh_degree,
+            exposure_lr: r.appearance.exposure_lr,
         };
         let loss = TrainLoss::new(terms(r));
         let mut trainer = Trainer::new(scene, stages, self.frames.clone(), device::cpu(config), loss, settings);
@@ -376,10 +382,19 @@ impl Bench {
 
     /// What a checkpoint is of: the recipe and, where there is more to say, `text`.
     pub(super) fn identity(&self, recipe: &Recipe, text: &str) -> Identity {
-        // Knobs that only say how memory is spent never reach a result and may change between resumes.
-        let neutral = Recipe { image_memory: 0, memory_limit: 0, checkpoint_interval: 0, ..recipe.clone() };
-        Identity { capture: fingerprint(&self.capture), recipe: hash(&(neutral.to_toml() + text)) }
+        Identity { capture: fingerprint(&self.capture), recipe: recipe_print(recipe, text) }
     }
+}
+
+/// A recipe in 16 hexadecimal digits, as it was written before it had tables: runs of then go on.
+fn recipe_print(recipe: &Recipe, text: &str) -> String {
+    // Knobs that only say how memory is spent never reach a result and may change between resumes.
+    let neutral = recipe.clone().with(|r| {
+        r.run.image_memory = 0;
+        r.run.memory_limit = 0;
+        r.run.checkpoint_interval = 0;
+    });
+    hash(&(neutral.flat_toml() + text))
 }
 
 /// Names, sizes, poses and times of a capture in 16 hexadecimal digits.
@@ -610,7 +625,7 @@ impl Session<'_> {
                 listen(&event);
             }
             // What the start of a later stage did may have taken long: it is not to be done twice.
-            let due = i.is_multiple_of(self.recipe.checkpoint_interval) || entered && i > 1;
+            let due = i.is_multiple_of(self.recipe.run.checkpoint_interval) || entered && i > 1;
             if due && !trainer.is_done() {
                 self.save(trainer, &state, &metrics, &totals, false, listen)?;
             }
@@ -672,8 +687,8 @@ impl Session<'_> {
             "capture": root,
             "capture_name": capture.name,
             "capture_fingerprint": fingerprint(capture),
-            "motion": recipe.motion,
-            "seed": recipe.seed,
+            "motion": recipe.run.motion.as_str(),
+            "seed": recipe.run.seed,
             "simd": format!("{:?}", self.bench.simd).to_lowercase(),
             "threads": rayon::current_num_threads(),
             "iteration": trainer.progress.iteration,

@@ -48,17 +48,16 @@ fn capture_on_disk() -> TempDir {
 }
 
 pub(crate) fn recipe(changes: &[&str]) -> Recipe {
-    let mut r = Recipe {
-        iterations: STEPS,
-        num_pts: 80,
-        max_cap: 130,
-        densification_interval: 6,
-        densify_from_iter: 6,
-        densify_until_iter: 30,
-        checkpoint_interval: 10,
-        init: "random".into(),
-        ..Recipe::default()
-    };
+    let mut r = Recipe::default().with(|r| {
+        r.run.iterations = STEPS;
+        r.init.count = 80;
+        r.densify.max_cap = 130;
+        r.densify.interval = 6;
+        r.densify.from = 6;
+        r.densify.until = 30;
+        r.run.checkpoint_interval = 10;
+        r.init.source = Source::Random;
+    });
     changes.iter().for_each(|c| r.set(c).unwrap());
     r
 }
@@ -220,9 +219,9 @@ fn a_run_stopped_at_any_step_resumes_to_the_same_bytes() {
         place.train(&whole, recipe).unwrap();
         for round in 0..2 {
             let name = format!("{k}-{round}");
-            let at = 1 + Rng::new(8, "stop", k as u64).below(round, (STEPS - 2) * recipe.batch_size);
+            let at = 1 + Rng::new(8, "stop", k as u64).below(round, (STEPS - 2) * recipe.run.batch_size);
             let stop = Arc::new(AtomicBool::new(false));
-            let (flag, steps) = (stop.clone(), at.div_ceil(recipe.batch_size));
+            let (flag, steps) = (stop.clone(), at.div_ceil(recipe.run.batch_size));
             let draw = meddled(move |n, _| flag.store(n >= at, Ordering::Relaxed));
             let outcome = place.train_with(&name, recipe, draw, &stop, &mut |_| {}).unwrap();
             assert!(outcome.interrupted && outcome.iteration == steps, "{outcome:?}");
@@ -390,14 +389,21 @@ fn foreign_checkpoints_are_refused_with_a_reason() {
     assert!(error.to_string().contains("version 9"), "{error}");
     // Another recipe.
     let run = copy("recipe");
-    let other = Recipe { feature_lr: 0.004, ..base.resolve() };
+    let other = base.resolve().with(|r| r.rates.feature = 0.004);
     std::fs::write(run.join("recipe.toml"), other.to_toml()).unwrap();
     let error = resume_quietly(&run).unwrap_err().to_string();
     assert!(error.contains("another recipe") && error.contains("start a new run"), "{error}");
     // What only says how memory is spent may change.
     let run = copy("memory");
-    let other = Recipe { image_memory: 1 << 20, checkpoint_interval: 7, ..base.resolve() };
+    let other = base.resolve().with(|r| {
+        r.run.image_memory = 1 << 20;
+        r.run.checkpoint_interval = 7;
+    });
     std::fs::write(run.join("recipe.toml"), other.to_toml()).unwrap();
+    resume_quietly(&run).unwrap();
+    // A recipe of before there were tables.
+    let run = copy("flat");
+    std::fs::write(run.join("recipe.toml"), base.resolve().flat_toml()).unwrap();
     resume_quietly(&run).unwrap();
     // No checkpoint, no run.
     let run = copy("none");
@@ -444,15 +450,19 @@ fn unwritable_outputs_and_too_little_memory_are_refused() {
 #[test]
 fn minutes_fix_a_recipe_that_repeats() {
     let place = Place::new();
-    let base = Recipe { init: "random".into(), num_pts: 80, max_cap: 120, ..Recipe::default() };
+    let base = Recipe::default().with(|r| {
+        r.init.source = Source::Random;
+        r.init.count = 80;
+        r.densify.max_cap = 120;
+    });
     let options = TrainOptions { minutes: Some(0.005), ..TrainOptions::default() };
     let run = place.run("timed");
     train(place.open(&base), base.clone(), &run, &options, &AtomicBool::new(false), &mut |_| {}).unwrap();
     let fixed = Recipe::from_toml(&read_text(&run.join("recipe.toml")).unwrap()).unwrap();
     assert_eq!(fixed.resolve(), fixed, "every schedule is set");
-    assert!(fixed.iterations >= 50 && fixed.iterations != base.iterations);
-    let schedules = [fixed.densify_from_iter, fixed.densify_until_iter, fixed.densification_interval];
-    assert!(schedules.iter().all(|&s| s > 0 && s <= fixed.iterations), "{schedules:?}");
+    assert!(fixed.run.iterations >= 50 && fixed.run.iterations != base.run.iterations);
+    let schedules = [fixed.densify.from, fixed.densify.until, fixed.densify.interval];
+    assert!(schedules.iter().all(|&s| s > 0 && s <= fixed.run.iterations), "{schedules:?}");
     place.train("again", &fixed).unwrap();
     assert!(place.scene("timed") == place.scene("again"));
     for minutes in [0.0, -1.0, f64::NAN, f64::INFINITY] {
@@ -506,7 +516,7 @@ fn scenes_with_a_head_are_judged_with_it_and_refuse_what_cannot_hold_it() {
     })
     .unwrap();
     assert!(warnings.len() == 1 && warnings[0].contains("features=none"), "{warnings:?}");
-    assert_eq!(Recipe::from_toml(&read_text(&run.join("recipe.toml")).unwrap()).unwrap().sh_degree, 0);
+    assert_eq!(Recipe::from_toml(&read_text(&run.join("recipe.toml")).unwrap()).unwrap().appearance.sh_degree, 0);
     let scene = splat4d::format::scene::read(&place.scene("a")).unwrap();
     let (layer, keys) = scene.head_keys().unwrap();
     let params = &scene.layers[layer].params;
@@ -534,7 +544,13 @@ fn scenes_with_a_head_are_judged_with_it_and_refuse_what_cannot_hold_it() {
     ] {
         assert!(error.kind() == ErrorKind::Unsupported && error.to_string().contains("features=none"), "{error}");
     }
-    let other = Recipe { motion: "hexplane".into(), ..recipe };
+    let other = recipe.with(|r| r.run.motion = MotionName::of("hexplane"));
     let error = train(capture, other, &place.run("b"), &TrainOptions::default(), &AtomicBool::new(false), &mut |_| {});
     assert!(error.unwrap_err().to_string().contains("`hexplane` has no features"));
+}
+
+#[test]
+fn checkpoints_of_before_recipes_had_tables_know_their_recipe() {
+    let recipe = Recipe::from_toml(include_str!("../recipe/tests/flat-changed.toml")).unwrap();
+    assert_eq!(recipe_print(&recipe, ""), "c963d9ac12b354b3", "what the code of then made of it");
 }

@@ -1,12 +1,14 @@
 //! Adaptive density control: clone small and split large Gaussians whose screen position still wants to move; prune the
 //! transparent and the huge. Source: Kerbl et al. 2023 §5.2 and appendix B; the split's opacity as revised by Bulò 2024.
 
-use super::{At, Change, Context, Every, Limits, Order, Upkeep, covariances, grow, is_dead, logit, opacity, sample};
+use super::{
+    At, Change, Context, Every, Limits, Order, Strategy, Upkeep, covariances, grow, is_dead, logit, opacity, sample,
+};
 use crate::Result;
 use crate::learner::Learner;
 use crate::recipe::Recipe;
+use crate::settings::settings;
 use rayon::prelude::*;
-use serde::{Deserialize, Serialize};
 use splat4d::math::{Rng, sym3};
 use splat4d::scene::life::CENTER;
 use splat4d::scene::params::OPACITY;
@@ -22,32 +24,17 @@ const HUGE: f64 = 0.1;
 /// About how much a densification by gradients adds on real captures, until the cap.
 const GROWTH: f64 = 1.2;
 
-/// Settings of adaptive density control.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct AdcSettings {
-    /// Mean 2D gradient (NDC units) above which a Gaussian is cloned or split.
-    pub grad_threshold: f64,
-    /// Gaussians larger than this share of the extent are split, smaller ones cloned.
-    pub percent_dense: f64,
-    /// Whether the centre of a clone's life is drawn anew from the clip (Li et al. 2024, STG).
-    pub retime_clones: bool,
-}
-
-impl AdcSettings {
-    /// As a recipe has them.
-    pub fn of(r: &Recipe) -> Self {
-        Self {
-            grad_threshold: r.densify_grad_threshold,
-            percent_dense: r.percent_dense,
-            retime_clones: r.retime_clones,
-        }
-    }
-}
-
-impl Default for AdcSettings {
-    fn default() -> Self {
-        Self::of(&Recipe::default())
+settings! {
+    /// Settings of adaptive density control (Kerbl et al. 2023).
+    #[derive(Copy)]
+    pub struct AdcSettings
+    when (Is("densify.strategy", &["adc"])) {
+        /// Whether the centre of a clone's life is drawn anew from the clip (STG).
+        retime_clones: bool = false;
+        /// Mean 2D gradient above which a Gaussian is cloned or split (NDC units).
+        grad_threshold: f64 = 2e-4;
+        /// Gaussians larger than this share of the extent are split, smaller ones cloned.
+        percent_dense: f64 = 0.01 => any().unit("extents");
     }
 }
 
@@ -90,8 +77,8 @@ impl Upkeep for Adc {
 impl Adc {
     /// As a recipe has it; `None`: another strategy.
     pub fn of(r: &Recipe) -> Option<Self> {
-        let some = || Self { settings: AdcSettings::of(r), steps: Every::densification(r) };
-        (r.strategy == "adc").then(some)
+        let some = || Self { settings: r.adc, steps: r.densify.steps() };
+        (r.densify.strategy == Strategy::Adc).then(some)
     }
 }
 

@@ -10,7 +10,7 @@ use crate::Result;
 use crate::capture::frames::{Frames, Picture};
 use crate::learner::Learner;
 use crate::recipe::Recipe;
-use serde::{Deserialize, Serialize};
+use crate::settings::settings;
 use splat4d::device;
 use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::Rng;
@@ -47,16 +47,19 @@ const OPACITY_START: f64 = 0.1;
 /// Share of the run at which the last of them are added: they must have time to learn.
 const LAST: f64 = 0.75;
 
-/// Settings of guided sampling.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct GuidedSettings {
-    /// Share of the stage after which it is done first; 0: never.
-    pub from: f64,
-    /// How often.
-    pub times: usize,
-    /// Most Gaussians that each time adds, a share of those that are there.
-    pub share: f64,
+settings! {
+    /// Settings of guided sampling: new Gaussians along the rays of the worst patches.
+    #[derive(Copy)]
+    pub struct GuidedSettings
+    when (All(&[Is("run.motion", &["spacetime"]), On("guided.from")])) {
+        /// Share of the iterations after which Gaussians are added where pictures are worst, along the rays of their
+        /// worst patches (STG); 0: never.
+        from: f64 = 0.0 => share().switch().when(Is("run.motion", &["spacetime"]));
+        /// Times that this is done, up to the end of densification.
+        times: usize = 3;
+        /// Most Gaussians that each of them adds, a share of those that are there.
+        share: f64 = 0.03 => share();
+    }
 }
 
 /// A view that was looked at.
@@ -69,19 +72,6 @@ struct Look {
     farthest: f32,
 }
 
-impl GuidedSettings {
-    /// As a recipe has them.
-    pub fn of(r: &Recipe) -> Self {
-        Self { from: r.guided_from, times: r.guided_times, share: r.guided_share }
-    }
-}
-
-impl Default for GuidedSettings {
-    fn default() -> Self {
-        Self::of(&Recipe::default())
-    }
-}
-
 /// See the module's documentation.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Guided {
@@ -92,7 +82,7 @@ pub struct Guided {
 impl Guided {
     /// As a recipe has it; `None`: never.
     pub fn of(r: &Recipe) -> Option<Self> {
-        (r.guided_from > 0.0 && r.guided_times > 0).then(|| Self { settings: GuidedSettings::of(r) })
+        (r.guided.from > 0.0 && r.guided.times > 0).then(|| Self { settings: r.guided })
     }
 }
 

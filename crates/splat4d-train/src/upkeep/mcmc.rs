@@ -4,11 +4,11 @@
 //! Where they go is drawn in space-time from opacity and screen gradient (FreeTimeGS): a row carries its life with it.
 //! Source: Kheradmand et al. 2024 (3DGS as MCMC) §3; Wang et al. 2025 (FreeTimeGS) §3.3.
 
-use super::{At, Change, Context, Every, Limits, Order, Upkeep, grow, is_dead, logit, opacity};
+use super::{At, Change, Context, Every, Limits, Order, Strategy, Upkeep, grow, is_dead, logit, opacity};
 use crate::Result;
 use crate::learner::Learner;
 use crate::recipe::Recipe;
-use serde::{Deserialize, Serialize};
+use crate::settings::settings;
 use splat4d::math::Rng;
 use splat4d::scene::params::OPACITY;
 use splat4d::scene::{Born, GEOMETRY, RowEdit, Space};
@@ -16,26 +16,19 @@ use splat4d::scene::{Born, GEOMETRY, RowEdit, Space};
 /// More copies than this on one place are not told apart (as in gsplat).
 const MAX_COPIES: usize = 51;
 
-/// Settings of growth by Markov chain Monte Carlo.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct McmcSettings {
-    /// Growth a densification.
-    pub growth: f64,
-    /// Share of the 2D gradient, against opacity, in where Gaussians go.
-    pub gradient_share: f64,
-}
-
-impl McmcSettings {
-    /// As a recipe has them.
-    pub fn of(r: &Recipe) -> Self {
-        Self { growth: r.growth, gradient_share: r.relocate_gradient }
-    }
-}
-
-impl Default for McmcSettings {
-    fn default() -> Self {
-        Self::of(&Recipe::default())
+settings! {
+    /// Settings of MCMC (Kheradmand et al. 2024).
+    #[derive(Copy)]
+    pub struct McmcSettings
+    when (Is("densify.strategy", &["mcmc"])) {
+        /// Growth a densification, up to the cap.
+        growth: f64 = 1.05 => positive();
+        /// Strength of the position noise.
+        noise_lr: f64 = 5e5;
+        /// Weight of the mean opacity.
+        opacity_reg: f64 = 0.01;
+        /// Weight of the mean scale.
+        scale_reg: f64 = 0.01;
     }
 }
 
@@ -45,6 +38,8 @@ impl Default for McmcSettings {
 pub struct Mcmc {
     /// How.
     pub settings: McmcSettings,
+    /// Share of the 2D gradient, against opacity, in where Gaussians go.
+    pub gradient_share: f64,
     /// When.
     pub steps: Every,
 }
@@ -52,8 +47,8 @@ pub struct Mcmc {
 impl Mcmc {
     /// As a recipe has it; `None`: another strategy.
     pub fn of(r: &Recipe) -> Option<Self> {
-        let some = || Self { settings: McmcSettings::of(r), steps: Every::densification(r) };
-        (r.strategy == "mcmc").then(some)
+        let some = || Self { settings: r.mcmc, gradient_share: r.relocate.gradient_share, steps: r.densify.steps() };
+        (r.densify.strategy == Strategy::Mcmc).then(some)
     }
 }
 
@@ -71,8 +66,8 @@ impl Upkeep for Mcmc {
     }
 
     fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
-        let settings = self.settings;
-        Ok(grow(learner, c, |learner, layer, spare, rng| settings.layer(learner, &c.limits, layer, spare, rng)))
+        let this = *self;
+        Ok(grow(learner, c, |learner, layer, spare, rng| this.layer(learner, &c.limits, layer, spare, rng)))
     }
 
     fn densification(&mut self) -> Option<&mut Every> {
@@ -102,7 +97,7 @@ pub fn relocated(o: f64, copies: usize) -> (f64, f64) {
     (each, o / sum)
 }
 
-impl McmcSettings {
+impl Mcmc {
     fn layer(&self, learner: &mut Learner, limits: &Limits, layer: usize, spare: &mut usize, rng: Rng) -> Change {
         let scene = learner.scene();
         let rows = scene.layers[layer].params.len();
@@ -112,7 +107,7 @@ impl McmcSettings {
         if live.is_empty() {
             return Change::default();
         }
-        let grown = ((rows as f64 * self.growth).ceil() as usize).saturating_sub(rows);
+        let grown = ((rows as f64 * self.settings.growth).ceil() as usize).saturating_sub(rows);
         let added = grown.min(*spare);
         *spare -= added;
         let places = Places::new(learner, layer, live, self.gradient_share);
@@ -221,7 +216,7 @@ mod tests {
         let mut s = scene(100);
         (0..10).for_each(|r| s.layers[0].params[GEOMETRY].set(r, OPACITY, -9.0));
         let mut learner = Learner::new(s);
-        let mut mcmc = Mcmc { settings: McmcSettings { growth: 1.05, gradient_share: 0.5 }, steps: Every::NEVER };
+        let mut mcmc = Mcmc { settings: McmcSettings::default(), gradient_share: 0.5, steps: Every::NEVER };
         let limits = Limits { cap: 103, extent: 1.0, min_opacity: 0.005 };
         let change = mcmc.run(&mut learner, &context(limits, 7, 0)).unwrap();
         assert_eq!((change.added, change.moved, learner.scene().len()), (3, 10, 103));

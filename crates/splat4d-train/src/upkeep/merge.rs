@@ -5,7 +5,7 @@ use super::{At, Change, Context, Order, Upkeep, covariances, logit, opacity};
 use crate::Result;
 use crate::learner::Learner;
 use crate::recipe::Recipe;
-use serde::{Deserialize, Serialize};
+use crate::settings::{Choice, settings};
 use splat4d::layers::Scene;
 use splat4d::math::knn::knn;
 use splat4d::math::sym3;
@@ -13,8 +13,7 @@ use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{Born, GEOMETRY, RowEdit, SH, Space};
 
 /// What becomes of a pair in one place.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Pair {
     /// Both stay.
     #[default]
@@ -25,16 +24,24 @@ pub enum Pair {
     Prune,
 }
 
-/// Settings of merging.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct MergeSettings {
-    /// What becomes of a pair.
-    pub pair: Pair,
-    /// Largest distance of a pair's means, of the smaller one's mean standard deviation.
-    pub distance: f64,
-    /// Steps between two rounds; 0: never.
-    pub interval: usize,
+settings! {
+    /// What becomes of two Gaussians in one place.
+    #[derive(Copy)]
+    pub struct MergeSettings
+    when (On("merge.pair")) {
+        /// What becomes of two Gaussians in one place: none (both stay), merge (one with the moments of both), prune
+        /// (the fainter one goes).
+        pair: Pair = Pair::None => any().switch();
+        /// Iterations between two looks for such pairs; 0: never.
+        interval: usize = 500 => any().unit("iterations");
+        /// Largest distance of such a pair, of the smaller one's standard deviation.
+        distance: f64 = 0.3;
+    }
+}
+
+impl Choice for Pair {
+    const NAMES: &'static [(&'static str, Self)] =
+        &[("none", Self::None), ("merge", Self::Merge), ("prune", Self::Prune)];
 }
 
 /// Largest difference of base colours (in SH coefficients, each channel) of a pair that is one thing.
@@ -43,24 +50,6 @@ const SAME_COLOR: f32 = 0.15;
 const SAME_SIZE: f64 = 2.0;
 /// Floor of merged standard deviations, of the larger one.
 const THINNEST: f64 = 1e-4;
-
-impl MergeSettings {
-    /// As a recipe has them.
-    pub fn of(r: &Recipe) -> Self {
-        let pair = match r.crowding.as_str() {
-            "merge" => Pair::Merge,
-            "prune" => Pair::Prune,
-            _ => Pair::None,
-        };
-        Self { pair, distance: r.crowding_distance, interval: r.crowding_interval }
-    }
-}
-
-impl Default for MergeSettings {
-    fn default() -> Self {
-        Self::of(&Recipe::default())
-    }
-}
 
 /// See the module's documentation.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -96,7 +85,7 @@ impl Upkeep for Merge {
 impl Merge {
     /// As a recipe has it; `None`: never.
     pub fn of(r: &Recipe) -> Option<Self> {
-        let settings = MergeSettings::of(r);
+        let settings = r.merge;
         (settings.pair != Pair::None && settings.interval > 0).then_some(Self { settings })
     }
 }

@@ -6,6 +6,7 @@
 //! of it. A new one is a file here, and a line where a program adds it to a stage.
 
 pub mod adc;
+pub mod densify;
 pub mod guided;
 pub mod mcmc;
 pub mod merge;
@@ -21,6 +22,7 @@ pub(crate) mod tests;
 pub mod worth;
 
 pub use adc::{Adc, AdcSettings};
+pub use densify::{DensifySettings, Strategy};
 pub use guided::{Guided, GuidedSettings};
 pub use mcmc::{Mcmc, McmcSettings};
 pub use merge::{Merge, MergeSettings, Pair};
@@ -77,11 +79,6 @@ pub struct Every {
 impl Every {
     /// At no step.
     pub const NEVER: Self = Self { first: 0, last: 0, interval: 0 };
-
-    /// The steps at which a recipe densifies.
-    pub fn densification(r: &Recipe) -> Self {
-        Self { first: r.densify_from_iter, last: r.densify_until_iter, interval: r.densification_interval }
-    }
 
     /// Whether it is time after so many steps.
     pub fn is_due(&self, step: usize) -> bool {

@@ -1,7 +1,7 @@
 //! Morton order: after the last densification rows are sorted by the places of their means, for the rest of the run.
 //! Neighbours in space become neighbours in memory, which every later step reads faster.
 
-use super::{At, Change, Context, Every, Order, Upkeep};
+use super::{At, Change, Context, Every, Order, Strategy, Upkeep};
 use crate::Result;
 use crate::learner::Learner;
 use crate::recipe::Recipe;
@@ -19,7 +19,7 @@ pub struct MortonOrder {
 impl MortonOrder {
     /// As a recipe has it; `None`: nothing is densified.
     pub fn of(r: &Recipe) -> Option<Self> {
-        (r.strategy != "none").then(|| Self { densification: Every::densification(r) })
+        (r.densify.strategy != Strategy::None).then(|| Self { densification: r.densify.steps() })
     }
 }
 

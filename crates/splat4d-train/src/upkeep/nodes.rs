@@ -8,7 +8,7 @@ use super::{At, Change, Context, Every, Order, Upkeep};
 use crate::Result;
 use crate::learner::Learner;
 use crate::recipe::Recipe;
-use serde::{Deserialize, Serialize};
+use crate::settings::settings;
 use splat4d::math::Rng;
 use splat4d::motion::skin::{NODE_HYPER, Skin, Weights};
 use splat4d::scene::{Born, GEOMETRY, RowEdit, Space};
@@ -16,35 +16,19 @@ use splat4d::scene::{Born, GEOMETRY, RowEdit, Space};
 /// Nodes are never fewer than this: a Gaussian's three and the one that cuts off.
 const LEAST_NODES: usize = 4;
 
-/// Settings of the upkeep of nodes.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct NodeSettings {
-    /// Steps between two refreshes of the lists of nearest nodes; 0: only where nodes were added or removed.
-    pub bind_interval: usize,
-    /// Steps between additions and removals of nodes, while Gaussians densify; 0: never.
-    pub adapt_interval: usize,
-    /// Weighted mean gradient above which a node gets a second one (NDC units).
-    pub threshold: f64,
-    /// Never more nodes than this.
-    pub cap: usize,
-}
-
-impl NodeSettings {
-    /// As a recipe has them.
-    pub fn of(r: &Recipe) -> Self {
-        Self {
-            bind_interval: r.control_bind_interval,
-            adapt_interval: r.control_adapt_interval,
-            threshold: r.control_grad_threshold,
-            cap: r.control_max_nodes,
-        }
-    }
-}
-
-impl Default for NodeSettings {
-    fn default() -> Self {
-        Self::of(&Recipe::default())
+settings! {
+    /// Settings of the upkeep of control nodes.
+    #[derive(Copy)]
+    pub struct NodeSettings
+    when (Is("run.motion", &["control", "ssm"])) {
+        /// Iterations between refreshes of the lists of nearest nodes.
+        bind_interval: usize = 100 => at_least(1).unit("iterations");
+        /// Iterations between additions and removals of nodes, while Gaussians densify; 0: never.
+        adapt_interval: usize = 0 => any().unit("iterations");
+        /// Mean 2D gradient of a node's Gaussians above which it gets a second one (NDC units).
+        threshold: f64 = 4e-4 => any().when(On("nodes.adapt_interval"));
+        /// Never more nodes than this.
+        cap: usize = 1024 => any().when(On("nodes.adapt_interval"));
     }
 }
 
@@ -60,7 +44,7 @@ pub struct AdaptNodes {
 impl AdaptNodes {
     /// As a recipe has it.
     pub fn of(r: &Recipe) -> Self {
-        Self { settings: NodeSettings::of(r), span: (r.densify_from_iter, r.densify_until_iter) }
+        Self { settings: r.nodes, span: (r.densify.from, r.densify.until) }
     }
 
     fn edits_at(&self, step: usize) -> bool {

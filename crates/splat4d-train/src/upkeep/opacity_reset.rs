@@ -1,40 +1,29 @@
 //! Opacity reset: every so many steps all opacities are lowered, so that what the pictures do not ask for stays faint and
 //! is pruned. Source: Kerbl et al. 2023 §5.2.
 
-use super::{At, Change, Context, Every, Order, Upkeep, logit};
+use super::{At, Change, Context, Every, Order, Strategy, Upkeep, logit};
 use crate::Result;
 use crate::learner::Learner;
 use crate::recipe::Recipe;
-use serde::{Deserialize, Serialize};
+use crate::settings::settings;
 use splat4d::scene::GEOMETRY;
 use splat4d::scene::params::OPACITY;
 
 /// Opacities are lowered to so many times the dead one (Kerbl et al. 2023: 0.01 where 0.005 is dead).
 const ABOVE_DEAD: f64 = 2.0;
 
-/// Settings of the opacity reset.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct OpacityResetSettings {
-    /// Steps between two resets; 0: never (a reset destroys temporal models).
-    pub interval: usize,
-}
-
-impl OpacityResetSettings {
-    /// As a recipe has them.
-    pub fn of(r: &Recipe) -> Self {
-        Self { interval: r.opacity_reset_interval }
-    }
-}
-
-impl Default for OpacityResetSettings {
-    fn default() -> Self {
-        Self::of(&Recipe::default())
+settings! {
+    /// Settings of the opacity reset under adaptive density control.
+    #[derive(Copy)]
+    pub struct OpacityResetSettings
+    when (Is("densify.strategy", &["adc"])) {
+        /// Iterations between opacity resets; 0: never (a reset destroys temporal models).
+        interval: usize = 0 => any().unit("iterations");
     }
 }
 
 /// Lowers opacities while the cloud is densified by gradients.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct OpacityReset {
     /// How often.
     pub settings: OpacityResetSettings,
@@ -45,8 +34,8 @@ pub struct OpacityReset {
 impl OpacityReset {
     /// As a recipe has it; `None`: never.
     pub fn of(r: &Recipe) -> Option<Self> {
-        let some = || Self { settings: OpacityResetSettings::of(r), densification: Every::densification(r) };
-        (r.strategy == "adc" && r.opacity_reset_interval > 0).then(some)
+        let some = || Self { settings: r.opacity_reset, densification: r.densify.steps() };
+        (r.densify.strategy == Strategy::Adc && r.opacity_reset.interval > 0).then(some)
     }
 }
 

@@ -6,33 +6,33 @@ use super::{At, Change, Context, Order, Upkeep};
 use crate::Result;
 use crate::learner::Learner;
 use crate::recipe::Recipe;
-use serde::{Deserialize, Serialize};
+use crate::settings::{Choice, settings};
 
-/// Settings of periodic pruning.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct PruneSettings {
-    /// Steps of the stage between two times; 0: never.
-    pub interval: usize,
-    /// Share of the Gaussians that goes each time.
-    pub ratio: f64,
-    /// About the most views looked at each time; never fewer than one at every moment of the capture.
-    pub views: usize,
-    /// What of a view counts.
-    pub spatial: Spatial,
+impl Choice for Spatial {
+    const NAMES: &'static [(&'static str, Self)] = &[
+        ("share", Self::Share),
+        ("change", Self::Change),
+        ("both", Self::Both),
+        ("opacity", Self::Opacity),
+        ("light-gaussian", Self::LightGaussian),
+        ("pup", Self::Pup),
+        ("speedy", Self::Speedy),
+    ];
 }
 
-impl PruneSettings {
-    /// As a recipe that was checked has them.
-    pub fn of(r: &Recipe) -> Self {
-        let spatial = r.prune_score.parse().expect("the recipe was checked");
-        Self { interval: r.prune_interval, ratio: r.prune_ratio, views: r.prune_views, spatial }
-    }
-}
-
-impl Default for PruneSettings {
-    fn default() -> Self {
-        Self::of(&Recipe::default())
+settings! {
+    /// Settings of pruning by worth in space and time while training.
+    #[derive(Copy)]
+    pub struct PruneSettings
+    when (On("prune.interval")) {
+        /// Iterations between prunings by worth in space and time (4DGS-1K), whatever the strategy; 0: never.
+        interval: usize = 0 => any().unit("iterations").switch();
+        /// Share of the Gaussians that each such pruning removes.
+        ratio: f64 = 0.3 => share();
+        /// Training views that each such pruning looks at; never fewer than one at every moment of the capture.
+        views: usize = 60;
+        /// What such a pruning goes by: share, change, both, opacity, light-gaussian, pup or speedy.
+        spatial: Spatial = Spatial::Change;
     }
 }
 
@@ -46,7 +46,7 @@ pub struct Prune {
 impl Prune {
     /// As a recipe has it; `None`: never.
     pub fn of(r: &Recipe) -> Option<Self> {
-        (r.prune_interval > 0).then(|| Self { settings: PruneSettings::of(r) })
+        (r.prune.interval > 0).then(|| Self { settings: r.prune })
     }
 
     /// The scores that it goes by.

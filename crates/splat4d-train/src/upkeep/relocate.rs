@@ -9,40 +9,25 @@ use super::{At, Change, Context, Every, Order, Upkeep, is_dead, opacity};
 use crate::Result;
 use crate::learner::Learner;
 use crate::recipe::Recipe;
-use serde::{Deserialize, Serialize};
+use crate::settings::settings;
 
-/// Settings of periodic relocation.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct RelocateSettings {
-    /// First step of the stage that relocates.
-    pub from: usize,
-    /// Steps between two times.
-    pub interval: usize,
-    /// Gaussians less opaque than this are moved; those that can never be seen are as well.
-    pub threshold: f64,
-    /// Most of a layer's Gaussians that are moved at once, a share.
-    pub share: f64,
-    /// Share of the gradient, against opacity, in where they go.
-    pub gradient_share: f64,
-}
-
-impl RelocateSettings {
-    /// As a recipe has them.
-    pub fn of(r: &Recipe) -> Self {
-        Self {
-            from: r.relocate_from_iter,
-            interval: r.relocate_interval,
-            threshold: r.relocate_opacity,
-            share: r.relocate_share,
-            gradient_share: r.relocate_gradient,
-        }
-    }
-}
-
-impl Default for RelocateSettings {
-    fn default() -> Self {
-        Self::of(&Recipe::default())
+settings! {
+    /// Settings of the relocation of the faintest Gaussians, whatever the strategy.
+    #[derive(Copy)]
+    pub struct RelocateSettings
+    when (On("relocate.interval")) {
+        /// Iterations between relocations of the faintest Gaussians (FreeTimeGS takes 100), whatever the strategy; 0:
+        /// never.
+        interval: usize = 0 => any().unit("iterations").switch();
+        /// First iteration that relocates; 0: iterations/15.
+        from: usize = 0 => any().unit("iterations");
+        /// Opacity below which a Gaussian is relocated.
+        threshold: f64 = 0.02 => share();
+        /// Most of the Gaussians that are relocated at once, a share.
+        share: f64 = 0.015 => share();
+        /// Share of the 2D gradient (against opacity) in where relocated Gaussians go (FreeTimeGS).
+        gradient_share: f64 = 0.5
+            => share().switch().when(Any(&[On("relocate.interval"), Is("densify.strategy", &["mcmc"])]));
     }
 }
 
@@ -58,8 +43,8 @@ pub struct Relocate {
 impl Relocate {
     /// As a recipe has it; `None`: never.
     pub fn of(r: &Recipe) -> Option<Self> {
-        let some = || Self { settings: RelocateSettings::of(r), densification: Every::densification(r) };
-        (r.relocate_interval > 0).then(some)
+        let some = || Self { settings: r.relocate, densification: r.densify.steps() };
+        (r.relocate.interval > 0).then(some)
     }
 }
 

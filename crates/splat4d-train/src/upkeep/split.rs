@@ -6,7 +6,7 @@ use super::{At, Change, Context, Upkeep};
 use crate::Result;
 use crate::learner::Learner;
 use crate::recipe::Recipe;
-use serde::{Deserialize, Serialize};
+use crate::settings::settings;
 use splat4d::layers::{ALWAYS, Evaluation, Layer, Scene, freeze_rows};
 use splat4d::math::Rng;
 use splat4d::motion::Still;
@@ -25,26 +25,15 @@ pub const STILL_COLUMNS: [&str; 5] = ["means", "quats", "log_scales", "opacity_l
 /// What the layer is called.
 pub const STILL_LAYER: &str = "still";
 
-/// Settings of the split.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct SplitSettings {
-    /// Gaussians that move less than this become a still layer, of the extent; 0: never.
-    pub reach: f64,
-    /// When they do, as a share of the last stage.
-    pub from: f64,
-}
-
-impl SplitSettings {
-    /// As a recipe has them.
-    pub fn of(r: &Recipe) -> Self {
-        Self { reach: r.static_split, from: r.static_split_from }
-    }
-}
-
-impl Default for SplitSettings {
-    fn default() -> Self {
-        Self::of(&Recipe::default())
+settings! {
+    /// The split of what stands still into a layer of its own.
+    #[derive(Copy)]
+    pub struct SplitSettings
+    when (On("split.reach")) {
+        /// Gaussians that move less than this become a still layer of their own, of the extent; 0: never.
+        reach: f64 = 0.0 => any().unit("extents").switch().when(IsNot("run.motion", &["still"]));
+        /// When they do, as a share of the last stage.
+        from: f64 = 0.75 => share();
     }
 }
 
@@ -60,7 +49,7 @@ pub struct Split {
 impl Split {
     /// As a recipe has it for a last stage of `steps`, in which Gaussians move; `None`: never.
     pub fn of(r: &Recipe, extent: f64, steps: usize) -> Option<Self> {
-        let s = SplitSettings::of(r);
+        let s = r.split;
         let some = || Self { at: (steps as f64 * s.from) as usize, reach: s.reach * extent };
         (s.reach > 0.0).then(some)
     }

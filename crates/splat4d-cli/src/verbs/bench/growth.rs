@@ -138,7 +138,7 @@ fn frames(base: &Pinned, count: usize, side: usize, way: Way) -> Result<Vec<Row>
     let pictures = write_pictures(&folder.0, Held::of(&pinned, way).pictures())?;
     let capture = capture(&pinned, &folder.0, &pictures, count);
     let train = capture.train.clone();
-    let store = Arc::new(ImageStore::new(Arc::new(capture), Recipe::default().image_memory as usize));
+    let store = Arc::new(ImageStore::new(Arc::new(capture), Recipe::default().run.image_memory as usize));
     let mut trainer = training::trainer(pinned.scene.clone(), Arc::new(Dataset::new(store, train)), way)?;
     let mut all = Vec::with_capacity(STEPS);
     for i in 0..WARM_UP + STEPS {

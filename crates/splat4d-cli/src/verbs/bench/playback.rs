@@ -64,7 +64,7 @@ impl Opened {
     }
 
     fn smooth(&self) -> bool {
-        self.source.run.as_ref().and_then(|r| r.recipe().ok()).is_some_and(|r| r.antialias)
+        self.source.run.as_ref().and_then(|r| r.recipe().ok()).is_some_and(|r| r.appearance.antialias)
     }
 }
 

@@ -13,11 +13,12 @@ use splat4d::scene::{Camera, Planes, SH, Time};
 use splat4d::{Error, ErrorKind, Result};
 use splat4d_train::capture::frames::{Frames, Picture};
 use splat4d_train::methods::{Group, Plan, Stage, program};
-use splat4d_train::recipe::Recipe;
+use splat4d_train::recipe::{MotionName, Recipe};
 use splat4d_train::train::loss::TrainLoss;
 use splat4d_train::train::run::peak_memory;
 use splat4d_train::train::trainer::{Settings, Stepped, Trainer};
 use splat4d_train::upkeep::Limits;
+use splat4d_train::upkeep::Strategy;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
@@ -108,16 +109,15 @@ fn stage(scene: &Scene<f32>, extent: f64) -> Result<Stage> {
             .remedy("Give a scene of the model `still` or `spacetime`."));
     };
     let motion = first.motion.spec();
-    let recipe = Recipe {
-        motion: motion.name().into(),
-        motion_order: path.order,
-        rotation_rate: path.rotation_rates.is_some(),
-        life: first.life.name().into(),
-        sh_degree: degree_of(first.params[SH].width() / 3).unwrap_or(0),
-        strategy: "none".into(),
-        half_size_until: 0.0,
-        ..Recipe::default()
-    };
+    let recipe = Recipe::default().with(|r| {
+        r.run.motion = MotionName::of(motion.name());
+        r.spacetime.order = path.order;
+        r.spacetime.rotation_rate = path.rotation_rates.is_some();
+        r.life.kind = Some(first.life);
+        r.appearance.sh_degree = degree_of(first.params[SH].width() / 3).unwrap_or(0);
+        r.densify.strategy = Strategy::None;
+        r.run.half_size_until = 0.0;
+    });
     let plan = Plan {
         recipe: recipe.resolve(),
         extent,

@@ -13,11 +13,13 @@ use crate::loss::terms::Codec;
 use crate::methods::spacetime::SpacetimeProgram;
 use crate::methods::{EVERY, Group, Plan, Program, Rate, Stage, program_of};
 use crate::recipe::Recipe;
+use crate::upkeep::Strategy;
 use crate::{Error, Result};
 use rayon::prelude::*;
 use shared::Shared;
 use splat4d::format::playback::{BLOCK_GAUSSIANS, Coder, Depths, Meta, Pages, Palette};
 use splat4d::layers::{Layer, Scene};
+use splat4d::scene::LifeKind;
 use splat4d::scene::{BLOCK, Grads, SH, Space, Table, Time};
 use std::sync::{Arc, Mutex, MutexGuard};
 
@@ -177,7 +179,7 @@ pub fn tuned(groups: Vec<Group>, share: f64) -> Vec<Group> {
 
 /// The rate of a palette that goes with [`tuned`].
 pub fn palette_rate(recipe: &Recipe, share: f64) -> Rate {
-    let rate = share * recipe.feature_lr * recipe.lr_decay / SH_SLOWDOWN;
+    let rate = share * recipe.rates.feature * recipe.rates.decay / SH_SLOWDOWN;
     Rate { start: rate, end: FALL * rate }
 }
 
@@ -185,18 +187,17 @@ pub fn palette_rate(recipe: &Recipe, share: f64) -> Rate {
 /// in every layer. Its `start` is still to be told: it ends with [`Quantised::begin`].
 pub fn stage(plan: &Plan, iterations: usize, share: f64, codec: Arc<Quantised>) -> Stage {
     let rotates = program_of(&plan.recipe).is_ok_and(|p| p.capabilities(plan).rotates);
-    let recipe = Recipe {
-        motion_order: 1,
+    let recipe = plan.recipe.clone().with(|r| {
+        r.spacetime.order = 1;
         // A turn that no model asked for would cost two bytes a Gaussian.
-        rotation_rate: plan.recipe.rotation_rate || rotates,
-        life: "interval".into(),
-        strategy: "none".into(),
-        sh_degree: 0,
-        iterations,
-        lambda_opacity_life: 0.0,
-        lambda_velocity: 0.0,
-        ..plan.recipe.clone()
-    };
+        r.spacetime.rotation_rate = plan.recipe.spacetime.rotation_rate || rotates;
+        r.life.kind = Some(LifeKind::Interval);
+        r.densify.strategy = Strategy::None;
+        r.appearance.sh_degree = 0;
+        r.run.iterations = iterations;
+        r.loss.opacity_life = 0.0;
+        r.loss.velocity = 0.0;
+    });
     let base = SpacetimeProgram.stages(&Plan { recipe, ..plan.clone() }).remove(0);
     Stage {
         name: "quantised".into(),

@@ -31,15 +31,15 @@ pub const SEEN: f64 = 0.5;
 pub fn terms(r: &Recipe) -> Vec<Box<dyn ImageTerm>> {
     type Make = fn(f64) -> Box<dyn ImageTerm>;
     let weighted: [(f64, Make); 7] = [
-        (r.lambda_tv, |w| Box::new(tv::TotalVariation(w))),
-        (r.lambda_frequency, |w| Box::new(frequency::FrequencyTerm::new(w))),
-        (r.lambda_mask, |w| Box::new(mask::Mask(w))),
-        (r.lambda_mask_entropy, |w| Box::new(entropy::MaskEntropy(w))),
-        (r.lambda_depth_tv, |w| Box::new(tv::DepthSmoothness(w))),
-        (r.lambda_depth_normal, |w| Box::new(normal::DepthNormal(w))),
-        (r.lambda_flow, |w| Box::new(flow::Flow(w))),
+        (r.loss.tv, |w| Box::new(tv::TotalVariation(w))),
+        (r.loss.frequency, |w| Box::new(frequency::FrequencyTerm::new(w))),
+        (r.loss.mask, |w| Box::new(mask::Mask(w))),
+        (r.loss.mask_entropy, |w| Box::new(entropy::MaskEntropy(w))),
+        (r.loss.depth_tv, |w| Box::new(tv::DepthSmoothness(w))),
+        (r.loss.depth_normal, |w| Box::new(normal::DepthNormal(w))),
+        (r.loss.flow, |w| Box::new(flow::Flow(w))),
     ];
-    let photometric: Box<dyn ImageTerm> = Box::new(Photometric::new(r.lambda_dssim as f32));
+    let photometric: Box<dyn ImageTerm> = Box::new(Photometric::new(r.loss.dssim as f32));
     let weighted = weighted.into_iter().filter(|(weight, _)| *weight > 0.0).map(|(weight, make)| make(weight));
     std::iter::once(photometric).chain(weighted).collect()
 }

@@ -6,8 +6,8 @@ use splat4d::math::{spd, sym3};
 const H: f64 = 1e-6;
 const FD: f64 = 1e-6;
 
-fn settings() -> TransportSettings {
-    TransportSettings {
+fn settings() -> TransportConfig {
+    TransportConfig {
         metric: Metric::Wasserstein,
         predictor: Predictor::Wasserstein,
         temporal: 0.7,
@@ -37,7 +37,7 @@ fn gradients_equal_differences() {
     for metric in [Metric::Linear, Metric::Wasserstein] {
         for (_, predictor) in Predictor::ALL {
             for seed in 0..6 {
-                let loss = Transport::new(TransportSettings { metric, predictor, ..settings() }, 0);
+                let loss = Transport::new(TransportConfig { metric, predictor, ..settings() }, 0);
                 let at = [0, 1, 2].map(|i| normal(seed, i));
                 let (_, d) = loss.row([&at[0], &at[1], &at[2]]);
                 for i in 0..3 {
@@ -70,7 +70,7 @@ fn steady_motion_costs_the_second_order_nothing_and_the_first_its_length() {
         Normal { mean: [3.0 * t, 0.0, -t], cov: spd::IDENTITY.map(|r| r.map(|x| x * s * s)) }
     };
     let at = [0.0, 1.0, 2.0].map(grown);
-    let of = |change: &dyn Fn(&mut TransportSettings)| {
+    let of = |change: &dyn Fn(&mut TransportConfig)| {
         let mut s = settings();
         change(&mut s);
         Transport::new(s, 0).row([&at[0], &at[1], &at[2]])
@@ -89,7 +89,7 @@ fn steady_motion_costs_the_second_order_nothing_and_the_first_its_length() {
 fn alignment_moves_the_observation_alone() {
     let at = [0, 1, 2].map(|i| normal(3, i));
     let row = |temporal, second, align| {
-        Transport::new(TransportSettings { temporal, second, align, ..settings() }, 0).row([&at[0], &at[1], &at[2]])
+        Transport::new(TransportConfig { temporal, second, align, ..settings() }, 0).row([&at[0], &at[1], &at[2]])
     };
     let (second, d_second) = row(0.0, 1.0, 0.0);
     let (align, d_align) = row(0.0, 0.0, 1.0);
@@ -100,7 +100,7 @@ fn alignment_moves_the_observation_alone() {
 
 #[test]
 fn it_begins_when_it_should_and_looks_at_a_share_of_the_steps() {
-    let loss = Transport::new(TransportSettings { start: 0.2, ramp: 0.1, every: 0.25, ..settings() }, 0);
+    let loss = Transport::new(TransportConfig { start: 0.2, ramp: 0.1, every: 0.25, ..settings() }, 0);
     assert_eq!([0.0, 0.19, 0.25, 0.3, 0.9].map(|p| (100.0 * loss.factor(p)).round()), [0.0, 0.0, 50.0, 100.0, 100.0]);
     let info = |iteration, progress, t| StepInfo { iteration, times: vec![Time(t)], seed: 3, progress };
     let met = (0..2000).filter(|&i| loss.times(&info(i, 0.5, 0.5)).is_some()).count();
@@ -111,8 +111,8 @@ fn it_begins_when_it_should_and_looks_at_a_share_of_the_steps() {
     assert_eq!(times(0.37)[1], 0.37, "a view's own time is shared");
     assert_eq!([times(0.0)[0], times(0.0)[1]], [0.0, 0.1], "triples stay in the clip");
     assert!((times(1.0)[2] - 1.0).abs() < 1e-12);
-    let short = Transport::new(TransportSettings { clip: [0.0, 0.1], ..settings() }, 0);
+    let short = Transport::new(TransportConfig { clip: [0.0, 0.1], ..settings() }, 0);
     assert!(short.times(&info(0, 0.5, 0.0)).is_none(), "two frames make no triple");
-    let idle = Transport::new(TransportSettings { temporal: 0.0, second: 0.0, ..settings() }, 0);
+    let idle = Transport::new(TransportConfig { temporal: 0.0, second: 0.0, ..settings() }, 0);
     assert!(idle.times(&info(0, 0.5, 0.5)).is_none());
 }

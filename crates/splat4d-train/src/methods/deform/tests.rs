@@ -1,8 +1,12 @@
 use super::*;
+use crate::recipe::MotionName;
 use crate::recipe::Recipe;
 
 fn plan(settings: &[&str]) -> Plan {
-    let mut recipe = Recipe { motion: "deform-mlp".into(), iterations: 1000, ..Recipe::default() };
+    let mut recipe = Recipe::default().with(|r| {
+        r.run.motion = MotionName::of("deform-mlp");
+        r.run.iterations = 1000;
+    });
     settings.iter().for_each(|s| recipe.set(s).unwrap());
     let recipe = recipe.resolve();
     Plan { recipe, extent: 2.0, clip: [0.0, 1.0], fps: 20.0, times: 21, fixed_cameras: 0, ..Plan::default() }
@@ -17,7 +21,7 @@ fn two_stages_make_one_schedule() {
     let (a, b) = (rate(&still, "means").unwrap(), rate(&moving, "means").unwrap());
     assert!((a.end - b.start).abs() < 1e-12 && a.start > a.end && b.start > b.end);
     assert_eq!(rate(&still, "deform_trunk.0.weight"), None, "the warm-up does not know the network");
-    assert_eq!(rate(&moving, "deform_trunk.0.weight").unwrap().start, plan.recipe.deform_lr_init);
+    assert_eq!(rate(&moving, "deform_trunk.0.weight").unwrap().start, plan.recipe.deform.lr_init);
     let mut whole = still::stage("x", &plan);
     let last = |s: &mut Stage| s.upkeep.iter_mut().find_map(|u| u.densification().map(|e| e.last)).unwrap();
     assert_eq!(last(&mut moving) + 100, last(&mut whole));

@@ -2,7 +2,8 @@
 //! model inside, and a scene without a trace of it at the end.
 
 use super::*;
-use crate::loss::transport::{Metric, Transport, TransportSettings};
+use crate::loss::transport::{Metric, Transport, TransportConfig};
+use crate::recipe::MotionName;
 use crate::upkeep::{At, Once};
 use splat4d::format::scene;
 use splat4d::motion::filtered::{Filtered, FilteredSpec, Fusion, GAINS, Predictor};
@@ -22,8 +23,8 @@ fn filtered_scene<F: Real>(change: impl Fn(&mut FilteredSpec)) -> Scene<F> {
     one_layer(p, motion, LifeKind::GaussHalf)
 }
 
-fn transport() -> TransportSettings {
-    TransportSettings {
+fn transport() -> TransportConfig {
+    TransportConfig {
         metric: Metric::Wasserstein,
         predictor: Predictor::Wasserstein,
         temporal: 0.5,
@@ -95,7 +96,10 @@ pub(super) fn made_plan(recipe: Recipe) -> Plan {
 #[test]
 fn a_recipe_wraps_any_program_and_leaves_no_trace() {
     let recipe = |text: &str| {
-        let mut r = Recipe { iterations: 40, motion: "spacetime".into(), ..Recipe::default() };
+        let mut r = Recipe::default().with(|r| {
+            r.run.iterations = 40;
+            r.run.motion = MotionName::of("spacetime");
+        });
         text.split_whitespace().for_each(|s| r.set(s).unwrap());
         r.resolve()
     };
@@ -156,11 +160,15 @@ fn hooks_of_the_program_inside_see_its_own_model() {
                     Ok(())
                 }))
             };
-            let one = || Stage { start: hook(), end: hook(), ..stage(plan.recipe.iterations) };
+            let one = || Stage { start: hook(), end: hook(), ..stage(plan.recipe.run.iterations) };
             vec![one(), one()]
         }
     }
-    let r = Recipe { iterations: 6, filter: "geodesic".into(), filter_start: 0.5, ..Recipe::default() };
+    let r = Recipe::default().with(|r| {
+        r.run.iterations = 6;
+        r.filter.fusion = Fusion::Geodesic;
+        r.filter.start = 0.5;
+    });
     let plan = made_plan(r.resolve());
     let program = super::super::filtered::wrap(Box::new(Hooked), &plan.recipe);
     let mut p = cloud::<f32>(20, LifeKind::Infinite, 4);

@@ -2,9 +2,12 @@
 //! none of them leaves a ghost; without it the deformation alone has to hide them.
 
 use super::*;
+use crate::init::Source;
 use crate::init::{self, Seeds};
 use crate::methods::stages;
+use crate::recipe::MotionName;
 use crate::recipe::Recipe;
+use crate::upkeep::Strategy;
 use splat4d::layers::Evaluation;
 use splat4d::math::Se3;
 use splat4d::math::se3::{dot, normalize, sub};
@@ -88,20 +91,19 @@ impl Frames for Party {
 }
 
 fn recipe(motion: &str, life: &str) -> Recipe {
-    let small = Recipe {
-        motion: motion.into(),
-        life: life.into(),
-        iterations: 400,
-        batch_size: 2,
-        sh_degree: 0,
-        half_size_until: 0.0,
-        strategy: "none".into(),
-        num_pts: 400,
-        max_cap: 1000,
-        init: "points".into(),
-        init_opacity: 0.3,
-        ..Recipe::default()
-    };
+    let small = Recipe::default().with(|r| {
+        r.run.motion = MotionName::of(motion);
+        r.life.kind = LifeKind::from_name(life);
+        r.run.iterations = 400;
+        r.run.batch_size = 2;
+        r.appearance.sh_degree = 0;
+        r.run.half_size_until = 0.0;
+        r.densify.strategy = Strategy::None;
+        r.init.count = 400;
+        r.densify.max_cap = 1000;
+        r.init.source = Source::Points;
+        r.init.opacity = 0.3;
+    });
     small.resolve()
 }
 

@@ -17,7 +17,7 @@ fn adc(stage: &mut Stage, steps: Every) {
 }
 
 fn mcmc(stage: &mut Stage, steps: Every) {
-    stage.keep(Mcmc { settings: McmcSettings { growth: 1.1, gradient_share: 0.5 }, steps });
+    stage.keep(Mcmc { settings: McmcSettings { growth: 1.1, ..McmcSettings::default() }, gradient_share: 0.5, steps });
     stage.keep(MortonOrder { densification: steps });
     stage.noise = Some(Noise { strength: 1.0, until: steps.last });
 }

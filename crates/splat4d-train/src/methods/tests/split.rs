@@ -1,12 +1,16 @@
 //! The split into still and moving is asked for by a recipe, in the last stage of any program.
 
 use super::*;
+use crate::recipe::MotionName;
 use crate::upkeep::At;
 
 #[test]
 fn the_last_stage_splits_where_it_is_asked_to() {
     let at = |static_split: f64, motion: &str| {
-        let mut recipe = Recipe { iterations: 1000, motion: motion.into(), ..Recipe::default() };
+        let mut recipe = Recipe::default().with(|r| {
+            r.run.iterations = 1000;
+            r.run.motion = MotionName::of(motion);
+        });
         recipe.set(&format!("static_split={static_split}")).unwrap();
         let plan =
             Plan { recipe: recipe.resolve(), extent: 1.0, clip: [0.0, 1.0], fps: 30.0, times: 30, ..Plan::default() };

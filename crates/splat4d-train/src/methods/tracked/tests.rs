@@ -2,9 +2,11 @@ use super::*;
 use crate::capture::frames::{Frames, Picture};
 use crate::event::Progress;
 use crate::learner::Exposure;
+use crate::recipe::MotionName;
 use crate::train::loss::TrainLoss;
 use crate::train::trainer::{Settings, Trainer};
 use crate::upkeep::Limits;
+use crate::upkeep::Strategy;
 use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::sh::rgb_to_dc;
 use splat4d::math::{Rng, Se3};
@@ -131,8 +133,12 @@ fn draw(s: &Scene<f32>, cameras: Vec<Camera>, frames: usize, masks: Option<usize
 }
 
 fn plan(frames: usize, cameras: usize, masks: bool, knobs: &[&str]) -> Plan {
-    let mut recipe = Recipe { motion: "tracked".into(), sh_degree: 0, half_size_until: 0.0, ..Recipe::default() };
-    recipe.strategy = "none".into();
+    let mut recipe = Recipe::default().with(|r| {
+        r.run.motion = MotionName::of("tracked");
+        r.appearance.sh_degree = 0;
+        r.run.half_size_until = 0.0;
+    });
+    recipe.densify.strategy = Strategy::None;
     knobs.iter().for_each(|k| recipe.set(k).unwrap());
     Plan {
         recipe: recipe.resolve(),
@@ -152,7 +158,7 @@ fn trainer(s: Scene<f32>, plan: &Plan, frames: Arc<dyn Frames>, exposure: Option
         limits: Limits { cap: 2000, extent: plan.extent, min_opacity: 0.005 },
         background: [0.0; 3],
         sh_degree: 0,
-        exposure_lr: plan.recipe.exposure_lr,
+        exposure_lr: plan.recipe.appearance.exposure_lr,
     };
     let draw = Box::new(Renderer::new(RenderConfig::default()));
     let loss = TrainLoss::photometric(0.2);

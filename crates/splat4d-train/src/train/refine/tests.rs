@@ -74,7 +74,7 @@ impl Bed {
             quantise::palette_rate(&self.recipe, 0.5),
         )
         .unwrap();
-        let base = program(&self.recipe.motion).unwrap().stages(&self.plan).remove(0);
+        let base = program(self.recipe.run.motion.as_str()).unwrap().stages(&self.plan).remove(0);
         let count = begun.clone();
         let floats = Stage {
             name: "pruned".into(),
@@ -116,7 +116,7 @@ impl Bed {
         }));
         let mut stages = vec![floats, nothing, coded];
         stages.iter_mut().for_each(|s| s.params.extend(meddle()));
-        let (frames, recipe) = (self.frames.clone(), Recipe { checkpoint_interval: 10, ..self.recipe.clone() });
+        let (frames, recipe) = (self.frames.clone(), self.recipe.clone().with(|r| r.run.checkpoint_interval = 10));
         let (scene, made_by, identity) = (self.source.clone(), "compress".into(), "a third".into());
         Job { refine: Refine { made_by, scene, stages, frames, recipe, identity }, codec, begun }
     }
@@ -233,7 +233,7 @@ fn only_the_same_run_is_continued() {
     };
     let error = refused(&|job| job.identity = "a half".into()).to_string();
     assert!(error.contains("another recipe"), "{error}");
-    let error = refused(&|job| job.recipe.lambda_dssim = 0.3).to_string();
+    let error = refused(&|job| job.recipe.loss.dssim = 0.3).to_string();
     assert!(error.contains("another recipe"), "{error}");
     assert_eq!(refused(&|job| job.stages.clear()).kind(), ErrorKind::BadInput);
     let error = crate::train::resume(&bed.place.run("run"), &stop, &mut |_| {}).unwrap_err().to_string();

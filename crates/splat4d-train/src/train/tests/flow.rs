@@ -1,7 +1,6 @@
 //! Known flow of a capture on disk reaches the motion.
 
 use crate::capture::frames::{Frames, Picture};
-use crate::recipe::Recipe;
 use crate::train::run::tests::{Place, recipe};
 use crate::train::run::training_frames;
 use crate::train::tests::Made;
@@ -55,10 +54,8 @@ fn known_flow_teaches_motion() {
     assert!(refused.contains("lambda_flow") && refused.contains("capture.json"), "{refused}");
     write(&place, &made);
     let error = |lambda: f64| {
-        let r = Recipe {
-            lambda_flow: lambda,
-            ..recipe(&["strategy=none", "num_pts=200", "half_size_until=0.3", "velocity_lr_init=0.03"])
-        };
+        let r = recipe(&["strategy=none", "num_pts=200", "half_size_until=0.3", "velocity_lr_init=0.03"])
+            .with(|r| r.loss.flow = lambda);
         let name = format!("{lambda}");
         place.train(&name, &r).unwrap();
         let scene = splat4d::format::scene::read(&place.scene(&name)).unwrap();

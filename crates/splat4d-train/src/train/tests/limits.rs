@@ -19,19 +19,18 @@ const MODELS: [&str; 6] = [
 fn minutes_fix_a_run_of_any_model() {
     let place = Place::new();
     for (k, line) in MODELS.iter().enumerate() {
-        let asked = crate::recipe::Recipe {
-            iterations: 7000,
-            densify_from_iter: 0,
-            densify_until_iter: 0,
-            densification_interval: 0,
-            ..knobs(line)
-        };
+        let asked = knobs(line).with(|r| {
+            r.run.iterations = 7000;
+            r.densify.from = 0;
+            r.densify.until = 0;
+            r.densify.interval = 0;
+        });
         let run = place.run(&k.to_string());
         let options = TrainOptions { minutes: Some(0.001), ..TrainOptions::default() };
         train(place.open(&asked), asked.clone(), &run, &options, &AtomicBool::new(false), &mut |_| {}).unwrap();
         let text = std::fs::read_to_string(run.join("recipe.toml")).unwrap();
         let fixed = crate::recipe::Recipe::from_toml(&text).unwrap();
-        assert!((50..7000).contains(&fixed.iterations), "{line}: {} steps in 0.06 s", fixed.iterations);
+        assert!((50..7000).contains(&fixed.run.iterations), "{line}: {} steps in 0.06 s", fixed.run.iterations);
         let again = format!("{k} again");
         place.train(&again, &fixed).unwrap();
         assert!(place.scene(&again) == place.scene(&k.to_string()), "{line}: the recipe does not repeat");

@@ -7,7 +7,7 @@
 //! the product with the spatial score instant by instant: absent instants vanish, and each present one weighs 1
 //! (flickers) to 2 (lasts). That is [`Temporal::InstantAbs`], the default; the others are kept for comparison.
 
-use crate::recipe::nearest;
+use crate::settings::nearest;
 use crate::{Error, Result};
 use splat4d::layers::Layer;
 use splat4d::math::Real;

@@ -11,7 +11,7 @@ fn of(spatial: Spatial) -> ScoreConfig {
 #[test]
 fn the_recipe_knows_every_score() {
     let names: Vec<&str> = Spatial::ALL.iter().map(|s| s.name()).collect();
-    assert_eq!(names, crate::recipe::PRUNE_SCORES);
+    assert_eq!(names, <Spatial as crate::settings::Value>::choices());
 }
 
 #[test]

@@ -1,0 +1,81 @@
+//! The settings of a run as a whole.
+
+use crate::settings::{Value, among, settings};
+use splat4d::motion::MODELS;
+
+settings! {
+    /// A run: its model, its length, what it may take.
+    pub struct RunSettings {
+        /// Motion model: still, spacetime, deform-mlp, hexplane, tracked, native4d, control or ssm; auto: chosen by
+        /// what the capture is.
+        motion: MotionName = MotionName::of("spacetime");
+        /// Seed of every random choice.
+        seed: u64 = 0;
+        /// Training steps in all.
+        iterations: usize = 7000 => at_least(1);
+        /// Views a step.
+        batch_size: usize = 1 => at_least(1);
+        /// Share of the iterations, from the first, that see pictures at half size.
+        half_size_until: f64 = 0.4 => share();
+        /// Iterations between checkpoints; 0: iterations/10.
+        checkpoint_interval: usize = 0 => any().unit("iterations");
+        /// Bytes of decoded images kept.
+        image_memory: u64 = 1 << 30 => any().unit("bytes");
+        /// Bytes that training may take in all; 0: no limit. Checked before the start, then kept by the cap.
+        memory_limit: u64 = 0 => any().unit("bytes");
+    }
+}
+
+/// The name of a motion model that trains by itself, or `auto`: chosen by what the capture is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct MotionName(&'static str);
+
+/// The word that leaves the choice to the capture.
+const AUTO: &str = "auto";
+
+impl MotionName {
+    /// The model with this name. Panics: there is none.
+    pub fn of(name: &str) -> Self {
+        Self::find(name).unwrap_or_else(|| panic!("there is no motion model `{name}`"))
+    }
+
+    /// Whether the capture has yet to choose.
+    pub fn is_auto(self) -> bool {
+        self.0 == AUTO
+    }
+
+    /// The name.
+    pub fn as_str(self) -> &'static str {
+        self.0
+    }
+
+    fn find(name: &str) -> Option<Self> {
+        Self::choices().into_iter().find(|known| *known == name).map(Self)
+    }
+}
+
+impl PartialEq<&str> for MotionName {
+    fn eq(&self, name: &&str) -> bool {
+        self.0 == *name
+    }
+}
+
+impl std::fmt::Display for MotionName {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(self.0)
+    }
+}
+
+impl Value for MotionName {
+    fn to_toml(&self) -> toml::Value {
+        toml::Value::String(self.0.to_owned())
+    }
+
+    fn from_toml(value: &toml::Value) -> Result<Self, String> {
+        value.as_str().and_then(Self::find).ok_or_else(|| among(value, &Self::choices()))
+    }
+
+    fn choices() -> Vec<&'static str> {
+        std::iter::once(AUTO).chain(MODELS.iter().copied()).collect()
+    }
+}
