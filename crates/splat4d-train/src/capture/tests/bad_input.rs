@@ -202,7 +202,7 @@ fn absurd_counts() {
     let sample = samples::own();
     let ply = std::fs::read_to_string(sample.path("points.ply")).unwrap().replace("vertex 2", "vertex 99999999999");
     sample.write("points.ply", ply.as_bytes());
-    assert_says(&message(&sample), &["points.ply", "claims 99999999999 points"]);
+    assert_says(&message(&sample), &["points.ply", "claims 99999999999 rows"]);
     // A PNG header that claims 60000x60000 pixels.
     let sample = samples::own();
     let mut png = std::fs::read(sample.path("images/cam00/0005.png")).unwrap();
