@@ -4,7 +4,7 @@
 //! Source: Luiten et al. 2024 (Dynamic 3D Gaussians). Ours: who is foreground is learnt from frame 0's masks and not given;
 //! lengths are in shares of the rig, so that the weights hold in any unit; the neighbours' weights do not know the unit.
 
-use super::{Group, Hook, PROGRAMS, Plan, Program, Rate, Stage, still};
+use super::{Group, Hook, Plan, Program, Rate, Stage, program, still};
 use crate::loss::graph::{LEAST_MEAN_WEIGHT, Weigh};
 use crate::loss::image::ImageTerm;
 use crate::loss::image::segmentation::Segmentation;
@@ -15,8 +15,8 @@ use crate::settings::settings;
 use crate::{Error, Result};
 use splat4d::layers::Layer;
 use splat4d::math::quat;
-use splat4d::motion::Spec;
 use splat4d::motion::tracked::{FOREGROUND, POSE, Tracked, TrackedSpec};
+use splat4d::motion::{MODELS, Spec};
 use splat4d::scene::GEOMETRY;
 use splat4d::scene::params::{QUAT, page_name};
 use std::any::Any;
@@ -87,8 +87,8 @@ impl Program for TrackedProgram {
         let least = self.capabilities(plan).fixed_cameras;
         let fewest = plan.moments.iter().min_by_key(|m| m.1).copied().unwrap_or_default();
         if fewest.1 < least {
-            let others = PROGRAMS.into_iter().filter(|(_, make)| make().capabilities(plan).fixed_cameras < least);
-            let others: Vec<&str> = others.map(|(name, _)| name).collect();
+            let learns = |name: &&str| program(name).is_ok_and(|p| p.capabilities(plan).fixed_cameras < least);
+            let others: Vec<&str> = MODELS.iter().copied().filter(learns).collect();
             return Err(Error::input(format!(
                 "`tracked` needs at least {least} fixed cameras that take their pictures together: it follows \
                  every Gaussian from one moment to the next, and what fewer cameras see of one moment does not say where \
