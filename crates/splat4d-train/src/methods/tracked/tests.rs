@@ -339,7 +339,7 @@ fn captures_that_cannot_be_tracked_are_refused_with_those_that_can() {
     staggered.moments[3].1 = 2;
     for bad in [moving, staggered] {
         let text = TrackedProgram.check(&bad).unwrap_err().to_string();
-        assert!(text.contains("3 fixed cameras") && text.contains("spacetime, control, deform-mlp"), "{text}");
+        assert!(text.contains("3 fixed cameras") && text.contains("spacetime, deform-mlp"), "{text}");
     }
     let with = |knob: &str| TrackedProgram.check(&plan(5, 4, false, &[knob]));
     assert!(with("floor_height=-0.3").is_ok());
