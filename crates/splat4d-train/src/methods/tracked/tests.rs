@@ -343,7 +343,7 @@ fn captures_that_cannot_be_tracked_are_refused_with_those_that_can() {
     }
     let with = |knob: &str| TrackedProgram.check(&plan(5, 4, false, &[knob]));
     assert!(with("floor_height=-0.3").is_ok());
-    assert!(with("floor_height=low").unwrap_err().to_string().contains("floor_height"));
+    assert!(Recipe::default().set("floor_height=low").unwrap_err().to_string().contains("floor_height"));
     assert!(with("prune_interval=100").is_err());
 }
 

@@ -3,7 +3,6 @@ use crate::math::{quat, se3};
 use crate::motion::control::{ControlSpec, Curve, Keys, Timeline, TrajectorySpec, skinned};
 use crate::motion::still::activate;
 use crate::scene::splats::COV;
-use std::time::Instant;
 
 /// The same poses at all times.
 struct Held(Table<f64>);
@@ -274,42 +273,4 @@ fn damaged_files_and_wrong_specs_are_no_panic() {
     p[skin.nodes].write(3, 0, [f64::NAN; 3]);
     let poses = Table::new(&POSE_COLUMNS, 9);
     assert_eq!(ask(&Skinned::new(skin, Box::new(Held(poses)), Spec::Still), &p, 0.0).rows(), 30);
-}
-
-#[test]
-fn a_hundred_thousand_gaussians_follow_quickly() {
-    let mut p = cloud::<f32>(100_000, 9);
-    let motion = skinned(&ControlSpec::default(), &mut p).unwrap();
-    let clock = Instant::now();
-    motion.bind(&mut p);
-    let bound = clock.elapsed();
-    let q = At { p: &p, of: Space::Gaussians, rows: Rows::All, t: Time(0.4) };
-    let (mut cache, mut tape) = (Cache::default(), Tape::default());
-    let mut d = Grads::new(&p);
-    let mut best = [f64::INFINITY; 3];
-    for _ in 0..4 {
-        let mut d_cache = Cache::default();
-        let clock = Instant::now();
-        motion.prepare(&p, &[q], &mut cache);
-        let prepared = clock.elapsed().as_secs_f64();
-        motion.at(&q, &cache, &mut tape);
-        let forward = clock.elapsed().as_secs_f64();
-        let d_out = tape.out.clone();
-        let clock = Instant::now();
-        let grads = SplatGrads { out: &d_out, color: None, weights: None };
-        motion.backward(&q, &cache, &mut tape, &grads, &mut d_cache, &mut d);
-        motion.finish(&p, &[q], &mut cache, &mut d_cache, &mut d);
-        let backward = clock.elapsed().as_secs_f64();
-        for (best, now) in best.iter_mut().zip([prepared, forward - prepared, backward]) {
-            *best = best.min(now);
-        }
-    }
-    println!(
-        "bind {bound:?}; weights {:.1}, blend {:.1}, backward {:.1} ms",
-        1e3 * best[0],
-        1e3 * best[1],
-        1e3 * best[2]
-    );
-    // Thirty milliseconds are the aim on a quiet machine of two cores.
-    assert!(best.iter().sum::<f64>() < 0.4, "{best:?}");
 }
