@@ -25,7 +25,7 @@ pub struct Noise {
 impl Noise {
     /// As a recipe has it; `None`: its strategy takes none.
     pub fn of(r: &Recipe) -> Option<Self> {
-        (r.densify.is_mcmc()).then(|| Self { strength: r.mcmc.noise_lr, until: r.densify.until })
+        (r.densify.is_mcmc()).then_some(Self { strength: r.mcmc.noise_lr, until: r.densify.until })
     }
 
     /// The same as the steps `from..to` of a stage see it.

@@ -82,7 +82,7 @@ pub struct Guided {
 impl Guided {
     /// As a recipe has it; `None`: never.
     pub fn of(r: &Recipe) -> Option<Self> {
-        (r.guided.from > 0.0 && r.guided.times > 0).then(|| Self { settings: r.guided })
+        (r.guided.from > 0.0 && r.guided.times > 0).then_some(Self { settings: r.guided })
     }
 }
 

@@ -46,7 +46,7 @@ pub struct Prune {
 impl Prune {
     /// As a recipe has it; `None`: never.
     pub fn of(r: &Recipe) -> Option<Self> {
-        (r.prune.interval > 0).then(|| Self { settings: r.prune })
+        (r.prune.interval > 0).then_some(Self { settings: r.prune })
     }
 
     /// The scores that it goes by.
