@@ -62,30 +62,30 @@ pub(crate) struct Args {
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     // What cannot work is said before anything takes time.
-    let benches = args.runs.iter().map(|path| Bench::open(path, args)).collect::<anyhow::Result<Vec<_>>>()?;
-    check_names(&benches)?;
+    let trials = args.runs.iter().map(|path| Trial::open(path, args)).collect::<anyhow::Result<Vec<_>>>()?;
+    check_names(&trials)?;
     let file = args.output.join("e03.json");
     let mut study = Study::open(&file)?;
     files::make_folder(&args.output)?;
     let stop = interrupt::flag("stopping: finished cells are kept");
-    for bench in &benches {
-        let grid = &bench.grid;
+    for trial in &trials {
+        let grid = &trial.grid;
         let cells = grid.cells();
         // A retrained run must not go on from what another scene has left.
-        let work = args.output.join("work").join(format!("{}-{}", bench.name, bench.print));
-        let others: Vec<_> = study.runs.iter().filter(|f| f.run != bench.path).cloned().collect();
+        let work = args.output.join("work").join(format!("{}-{}", trial.name, trial.print));
+        let others: Vec<_> = study.runs.iter().filter(|f| f.run != trial.path).cloned().collect();
         let progress = |cell: &Cell, Place { number, of, left }: Place| {
             console.clear();
             let left = left.map_or_else(String::new, |s| format!(", about {} left", human_seconds(s)));
-            console.note(&format!("{} {number}/{of}: {}{left}", bench.name, cell.words()));
+            console.note(&format!("{} {number}/{of}: {}{left}", trial.name, cell.words()));
         };
         let keep = |findings: &crate::study::Findings, found: &Found| {
             let whole = Study::of(others.iter().cloned().chain([findings.clone()]).collect());
-            console.emit(&json!({"type": "cell", "run": bench.path, "cell": found}));
+            console.emit(&json!({"type": "cell", "run": trial.path, "cell": found}));
             whole.save(&file)
         };
-        let mut make = |cell: &Cell| bench.judge(cell, &work, &stop, console);
-        let findings = study.on(&bench.path, &bench.name, &bench.print);
+        let mut make = |cell: &Cell| trial.judge(cell, &work, &stop, console);
+        let findings = study.on(&trial.path, &trial.name, &trial.print);
         let all = fill(findings, &cells, &mut make, progress, keep)?;
         console.clear();
         if !all {
@@ -97,19 +97,19 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         let _ = std::fs::remove_dir_all(&work);
     }
     let _ = std::fs::remove_dir(args.output.join("work"));
-    tell(&study, &benches, &args.output, console)
+    tell(&study, &trials, &args.output, console)
 }
 
 /// Tables and pictures of the runs that were asked for.
-fn tell(study: &Study, benches: &[Bench], folder: &Path, console: &Console) -> anyhow::Result<()> {
+fn tell(study: &Study, trials: &[Trial], folder: &Path, console: &Console) -> anyhow::Result<()> {
     let mut page = String::from("# Pruning and the temporal filter\n");
-    for bench in benches {
-        let Some(findings) = study.runs.iter().find(|f| f.run == bench.path) else { continue };
-        page += &format!("\n{}", tables::markdown(findings, &bench.grid));
-        for (plot, svg) in tables::plots(findings, &bench.grid) {
-            let name = match benches.len() {
+    for trial in trials {
+        let Some(findings) = study.runs.iter().find(|f| f.run == trial.path) else { continue };
+        page += &format!("\n{}", tables::markdown(findings, &trial.grid));
+        for (plot, svg) in tables::plots(findings, &trial.grid) {
+            let name = match trials.len() {
                 1 => format!("e03-{plot}.svg"),
-                _ => format!("e03-{plot}-{}.svg", bench.name),
+                _ => format!("e03-{plot}-{}.svg", trial.name),
             };
             page += &format!("\n![{plot}]({name})\n");
             files::write(&folder.join(name), svg.as_bytes())?;
@@ -124,7 +124,7 @@ fn tell(study: &Study, benches: &[Bench], folder: &Path, console: &Console) -> a
 }
 
 /// A run, opened for all of its cells.
-struct Bench {
+struct Trial {
     path: PathBuf,
     name: String,
     /// Of the scene file.
@@ -137,7 +137,7 @@ struct Bench {
     grid: Grid,
 }
 
-impl Bench {
+impl Trial {
     fn open(path: &Path, args: &Args) -> anyhow::Result<Self> {
         let run = Run::open(path)?;
         let file = run.scene_file()?;
@@ -215,9 +215,9 @@ fn plain(name: &str) -> String {
 }
 
 /// Refuses two runs whose results would go by one name.
-fn check_names(benches: &[Bench]) -> Result<()> {
+fn check_names(trials: &[Trial]) -> Result<()> {
     let mut seen = BTreeSet::new();
-    match benches.iter().find(|b| !seen.insert(b.name.as_str())) {
+    match trials.iter().find(|b| !seen.insert(b.name.as_str())) {
         None => Ok(()),
         Some(twin) => Err(Error::input("has the name of another run here")
             .at(twin.path.display())

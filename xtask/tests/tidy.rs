@@ -25,7 +25,7 @@ const ORDER: [(&str, &[&str]); 5] = [
     ),
     (
         "crates/splat4d-serve",
-        &["patience", "body", "range", "guard", "scene", "assets", "page", "events", "answer", "server"],
+        &["write_timeout", "body", "range", "guard", "scene", "assets", "page", "events", "answer", "server"],
     ),
     (
         "crates/splat4d-cli",

@@ -4,7 +4,7 @@
 //! a slow reader costs nothing but its socket, and one that joins late or returns gets what it missed from the same log.
 
 use crate::body::Body;
-use crate::patience::{Either, either};
+use crate::write_timeout::{Either, either};
 use hyper::body::Bytes;
 use serde_json::{Value, json};
 use std::collections::VecDeque;

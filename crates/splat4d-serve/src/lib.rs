@@ -31,10 +31,10 @@ mod body;
 mod events;
 mod guard;
 mod page;
-mod patience;
 mod range;
 mod scene;
 mod server;
+mod write_timeout;
 
 pub use assets::{Asset, asset, assets};
 pub use events::News;

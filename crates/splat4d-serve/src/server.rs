@@ -3,8 +3,8 @@
 use crate::answer::{Shared, answer};
 use crate::events::News;
 use crate::guard::Guard;
-use crate::patience::{Either, Patient, either};
 use crate::scene::{Content, Scene};
+use crate::write_timeout::{Either, WriteTimeout, either};
 use hyper::server::conn::http1;
 use hyper::service::service_fn;
 use hyper_util::rt::{TokioIo, TokioTimer};
@@ -302,7 +302,7 @@ async fn serve(stream: TcpStream, shared: Arc<Shared>, slot: OwnedSemaphorePermi
             .header_read_timeout(HEAD_TIME)
             .max_buf_size(MAX_HEAD)
             .max_headers(MAX_HEADERS)
-            .serve_connection(TokioIo::new(Patient::new(stream)), service)
+            .serve_connection(TokioIo::new(WriteTimeout::new(stream)), service)
     );
     let mut stop = pin!(stopped.changed());
     let mut stopping = false;

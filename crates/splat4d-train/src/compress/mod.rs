@@ -31,7 +31,7 @@ use splat4d::bake::{self, bake};
 use splat4d::format::playback::{Draft, Meta, Pages};
 use splat4d::layers::Scene;
 use splat4d::scene::Camera;
-use stages::Bench;
+use stages::Prepared;
 use std::collections::BTreeSet;
 use std::path::Path;
 use std::sync::Arc;
@@ -75,9 +75,9 @@ pub fn compress(
     listen: &mut dyn FnMut(&Event),
 ) -> Result<Compressed> {
     job.settings.check()?;
-    let bench = bench(job)?;
-    let mut stages = stages::float_stages(&bench)?;
-    let file = job.settings.codec.then(|| stages::file_stage(&bench)).transpose()?;
+    let prepared = prepared(job)?;
+    let mut stages = stages::float_stages(&prepared)?;
+    let file = job.settings.codec.then(|| stages::file_stage(&prepared)).transpose()?;
     let (stage, codec) = file.unzip();
     stages.extend(stage);
     if stages.is_empty() {
@@ -104,14 +104,14 @@ pub fn compress(
 
 /// Scores all Gaussians of the job's scene, for [`fit`].
 pub fn scores(job: &Job<'_>, progress: &mut dyn FnMut(usize, usize)) -> Result<Scores> {
-    let bench = bench(job)?;
-    score(job.source, bench.frames.as_ref(), &bench.score_config()?, progress)
+    let prepared = prepared(job)?;
+    score(job.source, prepared.frames.as_ref(), &prepared.score_config()?, progress)
 }
 
-fn bench(job: &Job<'_>) -> Result<Bench> {
+fn prepared(job: &Job<'_>) -> Result<Prepared> {
     job.source.without_head("a playback file")?;
     let frames = training_frames(job.capture.clone(), job.recipe)?;
-    Ok(Bench {
+    Ok(Prepared {
         frames,
         plan: plan(&job.capture, job.recipe),
         cameras: cameras(&job.capture),

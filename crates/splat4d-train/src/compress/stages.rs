@@ -26,14 +26,14 @@ const FILE_RATES: f64 = 0.5;
 
 /// All that hooks need beside the scene; they outlive the call that makes them.
 #[derive(Clone)]
-pub(super) struct Bench {
+pub(super) struct Prepared {
     pub frames: Arc<dyn Frames>,
     pub plan: Plan,
     pub cameras: Vec<Camera>,
     pub settings: Compression,
 }
 
-impl Bench {
+impl Prepared {
     fn antialias(&self) -> Antialias {
         if self.plan.recipe.appearance.antialias { Antialias::On } else { Antialias::Off }
     }
@@ -55,8 +55,8 @@ impl Bench {
 }
 
 /// Rounds of pruning and fine-tuning in floats; none where there is nothing to do.
-pub(super) fn float_stages(bench: &Bench) -> Result<Vec<Stage>> {
-    let s = &bench.settings;
+pub(super) fn float_stages(prepared: &Prepared) -> Result<Vec<Stage>> {
+    let s = &prepared.settings;
     let filter = !s.codec && s.mask_interval > 0;
     if s.prune == 0.0 && s.fine_tune == 0 && !filter {
         return Ok(Vec::new());
@@ -64,23 +64,23 @@ pub(super) fn float_stages(bench: &Bench) -> Result<Vec<Stage>> {
     (0..s.rounds)
         .map(|round| {
             let steps = s.fine_tune * (round + 1) / s.rounds - s.fine_tune * round / s.rounds;
-            let mut stage = host_stage(bench, steps)?;
+            let mut stage = host_stage(prepared, steps)?;
             stage.name = format!("pruned {}/{}", round + 1, s.rounds);
             // Equal shares of what is left, so that the last round leaves what was asked for.
             let share = 1.0 - (1.0 - s.prune).powf(1.0 / s.rounds as f64);
             let last = round + 1 == s.rounds;
-            stage.start = Some(pruning(bench.clone(), share, filter && last));
+            stage.start = Some(pruning(prepared.clone(), share, filter && last));
             Ok(stage)
         })
         .collect()
 }
 
 /// What the model learns by, at rates that settle.
-fn host_stage(bench: &Bench, steps: usize) -> Result<Stage> {
-    let mut stage = tuning(&bench.plan)?;
+fn host_stage(prepared: &Prepared, steps: usize) -> Result<Stage> {
+    let mut stage = tuning(&prepared.plan)?;
     stage.iterations = steps;
-    stage.groups.iter_mut().for_each(|g| g.rate = settling(g.rate, bench.settings.first_rates()));
-    stage.params.extend(fading(&bench.settings));
+    stage.groups.iter_mut().for_each(|g| g.rate = settling(g.rate, prepared.settings.first_rates()));
+    stage.params.extend(fading(&prepared.settings));
     Ok(stage)
 }
 
@@ -97,35 +97,35 @@ fn fading(settings: &Compression) -> Option<Box<dyn ParamLoss<f32>>> {
 }
 
 /// Scores, prunes, and makes masks where they are wanted already.
-fn pruning(bench: Bench, share: f64, filter: bool) -> Hook {
+fn pruning(prepared: Prepared, share: f64, filter: bool) -> Hook {
     Box::new(move |scene: &mut Scene<f32>, progress| {
         if share > 0.0 {
-            let scores = score(scene, bench.frames.as_ref(), &bench.score_config()?, &mut |done, total| {
+            let scores = score(scene, prepared.frames.as_ref(), &prepared.score_config()?, &mut |done, total| {
                 progress.phase("scoring Gaussians", done, total);
             })?;
             for (layer, edit) in prune(scene, &scores, share).into_iter().enumerate() {
-                scene.layers[layer].edit(&edit, &Rng::new(bench.plan.recipe.run.seed, "prune", layer as u64));
+                scene.layers[layer].edit(&edit, &Rng::new(prepared.plan.recipe.run.seed, "prune", layer as u64));
             }
         }
-        if filter { masks(scene, &bench, progress) } else { Ok(()) }
+        if filter { masks(scene, &prepared, progress) } else { Ok(()) }
     })
 }
 
 /// Masks at the settings' interval.
-fn masks(scene: &mut Scene<f32>, bench: &Bench, progress: &mut Progress<'_>) -> Result<()> {
-    let config = MaskConfig { keys: Keys::Interval(bench.settings.mask_interval), antialias: bench.antialias() };
-    key_masks(scene, bench.frames.as_ref(), &config, &mut |done, total| {
+fn masks(scene: &mut Scene<f32>, prepared: &Prepared, progress: &mut Progress<'_>) -> Result<()> {
+    let config = MaskConfig { keys: Keys::Interval(prepared.settings.mask_interval), antialias: prepared.antialias() };
+    key_masks(scene, prepared.frames.as_ref(), &config, &mut |done, total| {
         progress.phase("looking which are seen", done, total);
     })
 }
 
 /// Fine-tuning through the file, and the codec that is it.
-pub(super) fn file_stage(bench: &Bench) -> Result<(Stage, Arc<Quantised>)> {
-    let s = &bench.settings;
-    let codec = Quantised::new(s.depths, palette_rate(&bench.plan.recipe, FILE_RATES * s.first_rates()))?;
-    let mut stage = quantise::stage(&bench.plan, s.quantise, FILE_RATES * s.first_rates(), codec.clone());
+pub(super) fn file_stage(prepared: &Prepared) -> Result<(Stage, Arc<Quantised>)> {
+    let s = &prepared.settings;
+    let codec = Quantised::new(s.depths, palette_rate(&prepared.plan.recipe, FILE_RATES * s.first_rates()))?;
+    let mut stage = quantise::stage(&prepared.plan, s.quantise, FILE_RATES * s.first_rates(), codec.clone());
     stage.params.extend(fading(s));
-    let (own, begun) = (bench.clone(), codec.clone());
+    let (own, begun) = (prepared.clone(), codec.clone());
     stage.start = Some(Box::new(move |scene: &mut Scene<f32>, progress| {
         let draft = draft(scene, &own.settings, &own.cameras, &mut |done, total| {
             progress.phase("baking", done, total);

@@ -138,9 +138,9 @@ mod tests {
             "motion=control control_nodes=64 filter=geodesic",
         ] {
             let r = recipe(&line.split(' ').chain(["num_pts=4096", "max_cap=4096"]).collect::<Vec<_>>()).resolve();
-            let bench = super::super::run::Bench::new(place.open(&r), &r).unwrap();
-            let plan = bench.plan(&r);
-            let trainer = bench.trainer(&plan, bench.initial_scene(&plan).unwrap()).unwrap();
+            let opened = super::super::run::OpenCapture::new(place.open(&r), &r).unwrap();
+            let plan = opened.plan(&r);
+            let trainer = opened.trainer(&plan, opened.initial_scene(&plan).unwrap()).unwrap();
             let p = &trainer.scene().layers[0].params;
             let values: usize = p.keys().map(|k| size_of_val(p[k].data())).sum();
             let counted = values + splat4d::scene::Grads::new(p).bytes() + trainer.learner.moments()[0].bytes();

@@ -1,7 +1,7 @@
 //! `--minutes M`: how many iterations fit. A few steps are timed at the initial and at the capped number of Gaussians; the
 //! iterations follow from the densification's own schedule, and are saved in the recipe, so that the run repeats.
 
-use super::run::Bench;
+use super::run::OpenCapture;
 use super::trainer::Trainer;
 use crate::event::{Event, Progress};
 use crate::methods::{Stage, program_of, stages};
@@ -24,7 +24,12 @@ const ENDLESS: usize = 1 << 40;
 const ITERATIONS: std::ops::RangeInclusive<usize> = 50..=1_000_000;
 
 /// The recipe with its iterations fixed so that training takes `minutes`.
-pub(super) fn plan(bench: &Bench, recipe: &Recipe, minutes: f64, listen: &mut dyn FnMut(&Event)) -> Result<Recipe> {
+pub(super) fn plan(
+    opened: &OpenCapture,
+    recipe: &Recipe,
+    minutes: f64,
+    listen: &mut dyn FnMut(&Event),
+) -> Result<Recipe> {
     if !(minutes > 0.0 && minutes.is_finite()) {
         return Err(
             Error::input(format!("--minutes cannot be {minutes}")).remedy("Give a positive number, for instance 3")
@@ -35,18 +40,18 @@ pub(super) fn plan(bench: &Bench, recipe: &Recipe, minutes: f64, listen: &mut dy
     };
     tell(listen, 0);
     // A filter would be switched on later than the probes look.
-    let plan = bench.plan(&recipe.clone().with(|r| r.filter.start = 0.0));
-    let scene = bench.initial_scene(&plan)?;
+    let plan = opened.plan(&recipe.clone().with(|r| r.filter.start = 0.0));
+    let scene = opened.initial_scene(&plan)?;
     let start = scene.len();
     // A probe's rates do not matter, its number of Gaussians does: nothing of it is kept.
-    let mut trainer = bench.trainer(&plan, scene)?;
+    let mut trainer = opened.trainer(&plan, scene)?;
     trainer.check_not_empty()?;
     let few = rates(&mut trainer)?;
     tell(listen, 1);
     // Copies of initial Gaussians would cost far more than trained ones, which are small: the probe grows by the
     // recipe's own strategy, in a hurry.
-    let scene = bench.initial_scene(&plan)?;
-    let mut trainer = bench.trainer(&plan, scene)?;
+    let scene = opened.initial_scene(&plan)?;
+    let mut trainer = opened.trainer(&plan, scene)?;
     densify(&mut trainer, Every { first: HURRIED, last: usize::MAX, interval: HURRIED });
     trainer.stages.iter_mut().for_each(|s| s.half_size_steps = usize::MAX);
     trainer.stages[0].iterations = ENDLESS;
@@ -64,7 +69,7 @@ pub(super) fn plan(bench: &Bench, recipe: &Recipe, minutes: f64, listen: &mut dy
     let seconds = minutes * 60.0;
     let cost = |iterations: usize| -> Result<f64> {
         let r = reset(recipe).with(|r| r.run.iterations = iterations).resolve();
-        Ok(cost(&stages(program_of(&r)?.as_ref(), &bench.plan(&r)), r.densify.max_cap, &steps))
+        Ok(cost(&stages(program_of(&r)?.as_ref(), &opened.plan(&r)), r.densify.max_cap, &steps))
     };
     let (mut low, mut high) = (*ITERATIONS.start(), *ITERATIONS.end());
     while low + 1 < high {

@@ -5,7 +5,7 @@ mod tests;
 
 use super::checkpoint;
 use super::dataset::Dataset;
-use super::run::{Bench, Outcome, Session, TrainOptions, memory_estimate};
+use super::run::{OpenCapture, Outcome, Session, TrainOptions, memory_estimate};
 use crate::event::Event;
 use crate::methods::Stage;
 use crate::recipe::Recipe;
@@ -60,20 +60,20 @@ pub fn refine(
     }
     let total: usize = job.stages.iter().map(|s| s.iterations).sum();
     let recipe = job.recipe.with(|r| r.run.iterations = total.max(1)).resolve();
-    let bench = Bench::with(job.frames);
-    let plan = bench.plan(&recipe);
+    let opened = OpenCapture::with(job.frames);
+    let plan = opened.plan(&recipe);
     let held = recipe.clone().with(|r| r.densify.max_cap = job.scene.len().max(1));
     let session = Session {
         run,
-        bench: &bench,
+        opened: &opened,
         recipe: &recipe,
-        identity: bench.identity(&recipe, &format!("\n{}\n{}", job.made_by, job.identity)),
+        identity: opened.identity(&recipe, &format!("\n{}\n{}", job.made_by, job.identity)),
         made_by: &job.made_by,
-        estimate: memory_estimate(&bench.capture, &held),
+        estimate: memory_estimate(&opened.capture, &held),
         snapshots: options.snapshots,
         stop,
     };
-    let mut trainer = bench.trainer_of(&plan, job.scene, job.stages);
+    let mut trainer = opened.trainer_of(&plan, job.scene, job.stages);
     let state = if checkpoint::list(run).is_empty() {
         trainer.check_not_empty()?;
         session.begin(&trainer, listen)?

@@ -94,19 +94,19 @@ pub fn train(
             .at(run.display())
             .remedy("Continue it with `train --resume`, or give another folder with -o"));
     }
-    let bench = Bench::new(capture, &recipe)?;
-    check_flow(&bench.capture, &recipe)?;
+    let opened = OpenCapture::new(capture, &recipe)?;
+    check_flow(&opened.capture, &recipe)?;
     let mut listen = listen;
-    let recipe = if recipe.run.motion.is_auto() { bench.choose(recipe, &mut listen)? } else { recipe };
-    program_of(&recipe)?.check(&bench.plan(&recipe))?;
+    let recipe = if recipe.run.motion.is_auto() { opened.choose(recipe, &mut listen)? } else { recipe };
+    program_of(&recipe)?.check(&opened.plan(&recipe))?;
     recipe.without_effect().iter().for_each(|idle| listen(&Event::Warning { message: idle.to_string() }));
     let recipe = match options.minutes {
-        Some(m) => minutes::plan(&bench, &recipe, m, &mut listen)?,
+        Some(m) => minutes::plan(&opened, &recipe, m, &mut listen)?,
         None => recipe,
     }
     .resolve();
-    let plan = bench.plan(&recipe);
-    let estimate = memory_estimate(&bench.capture, &recipe);
+    let plan = opened.plan(&recipe);
+    let estimate = memory_estimate(&opened.capture, &recipe);
     if recipe.run.memory_limit > 0 && estimate > recipe.run.memory_limit {
         return Err(Error::new(
             ErrorKind::Memory,
@@ -119,14 +119,14 @@ pub fn train(
         .remedy("Lower max_cap or image_memory, or use --downscale 2"));
     }
     listen(&Event::Phase { name: "initial points".into(), done: 0, total: 0 });
-    let scene = bench.initial_scene(&plan)?;
-    let mut trainer = bench.trainer(&plan, scene)?;
+    let scene = opened.initial_scene(&plan)?;
+    let mut trainer = opened.trainer(&plan, scene)?;
     trainer.check_not_empty()?;
     let session = Session {
         run,
-        bench: &bench,
+        opened: &opened,
         recipe: &recipe,
-        identity: bench.identity(&recipe, ""),
+        identity: opened.identity(&recipe, ""),
         made_by: TRAIN,
         estimate,
         snapshots: options.snapshots,
@@ -154,18 +154,18 @@ pub fn resume_with(
             .at(run.display())
             .remedy(format!("Continue it with `splat4d {other}` and the options it began with")));
     }
-    let bench = Bench::new(Arc::new(capture), &recipe)?;
-    let plan = bench.plan(&recipe);
+    let opened = OpenCapture::new(Arc::new(capture), &recipe)?;
+    let plan = opened.plan(&recipe);
     let empty =
-        init::scene(&plan, program_of(&recipe)?.as_ref(), &Seeds::default(), bench.background(), bench.capture.up)?;
-    let mut trainer = bench.trainer(&plan, empty)?;
+        init::scene(&plan, program_of(&recipe)?.as_ref(), &Seeds::default(), opened.background(), opened.capture.up)?;
+    let mut trainer = opened.trainer(&plan, empty)?;
     let session = Session {
         run,
-        bench: &bench,
+        opened: &opened,
         recipe: &recipe,
-        identity: bench.identity(&recipe, ""),
+        identity: opened.identity(&recipe, ""),
         made_by: TRAIN,
-        estimate: memory_estimate(&bench.capture, &recipe),
+        estimate: memory_estimate(&opened.capture, &recipe),
         snapshots: options.snapshots,
         stop,
     };
@@ -262,7 +262,7 @@ fn restore_newest(run: &Path, trainer: &mut Trainer<'_>, identity: &Identity) ->
 }
 
 /// A capture opened for training: what fresh runs, resumes and probes share.
-pub(super) struct Bench {
+pub(super) struct OpenCapture {
     pub(super) capture: Arc<Capture>,
     frames: Arc<Dataset>,
     simd: Simd,
@@ -302,7 +302,7 @@ pub fn plan(capture: &Capture, recipe: &Recipe) -> Plan {
     }
 }
 
-impl Bench {
+impl OpenCapture {
     pub(super) fn new(capture: Arc<Capture>, recipe: &Recipe) -> Result<Self> {
         Ok(Self::with(training_frames(capture, recipe)?))
     }
@@ -534,7 +534,7 @@ const TRAIN: &str = "train";
 /// A run while it is driven.
 pub(super) struct Session<'a> {
     pub(super) run: &'a Path,
-    pub(super) bench: &'a Bench,
+    pub(super) opened: &'a OpenCapture,
     pub(super) recipe: &'a Recipe,
     pub(super) identity: Identity,
     /// The verb that made it, and that continues it.
@@ -587,7 +587,7 @@ impl Session<'_> {
             listen(&Event::Warning { message: format!("training cannot be watched: {e}") });
         }
         let interval = self.snapshots.filter(|_| shown.is_ok());
-        let mut snapshots = interval.map(|interval| Snapshots::new(interval, &self.bench.capture));
+        let mut snapshots = interval.map(|interval| Snapshots::new(interval, &self.opened.capture));
         let (mut clock, mut told) = (Clock::now(), Clock::now());
         let mut steps = Steps::default();
         while !trainer.is_done() && !self.stop.load(Ordering::Relaxed) {
@@ -676,7 +676,7 @@ impl Session<'_> {
 
     /// run.json: what the run is and how it went.
     fn write_info(&self, totals: &Totals, trainer: &Trainer<'_>, state: &RunState, finished: bool) -> Result<()> {
-        let (capture, recipe) = (&self.bench.capture, self.recipe);
+        let (capture, recipe) = (&self.opened.capture, self.recipe);
         let steps = totals.steps.max(1) as f64;
         let ms: serde_json::Map<String, serde_json::Value> =
             STAGE_NAMES.iter().zip(totals.seconds).map(|(n, s)| ((*n).to_owned(), json!(s * 1e3 / steps))).collect();
@@ -689,7 +689,7 @@ impl Session<'_> {
             "capture_fingerprint": fingerprint(capture),
             "motion": recipe.run.motion.as_str(),
             "seed": recipe.run.seed,
-            "simd": format!("{:?}", self.bench.simd).to_lowercase(),
+            "simd": format!("{:?}", self.opened.simd).to_lowercase(),
             "threads": rayon::current_num_threads(),
             "iteration": trainer.progress.iteration,
             "iterations": trainer.iterations(),

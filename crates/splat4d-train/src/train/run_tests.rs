@@ -96,13 +96,13 @@ impl Place {
         listen: &mut dyn FnMut(&Event),
     ) -> Result<Outcome> {
         let (run, recipe) = (self.run(name), recipe.resolve());
-        let bench = Bench::new(self.open(&recipe), &recipe)?;
-        let plan = bench.plan(&recipe);
-        let mut trainer = bench.trainer(&plan, bench.initial_scene(&plan)?)?;
+        let opened = OpenCapture::new(self.open(&recipe), &recipe)?;
+        let plan = opened.plan(&recipe);
+        let mut trainer = opened.trainer(&plan, opened.initial_scene(&plan)?)?;
         trainer.set_engine(crate::train::engine::CpuEngine::new(draw));
-        let identity = bench.identity(&recipe, "");
-        let (bench, recipe, run, made_by) = (&bench, &recipe, run.as_path(), TRAIN);
-        let session = Session { run, bench, recipe, identity, made_by, estimate: 0, snapshots: None, stop };
+        let identity = opened.identity(&recipe, "");
+        let (opened, recipe, run, made_by) = (&opened, &recipe, run.as_path(), TRAIN);
+        let session = Session { run, opened, recipe, identity, made_by, estimate: 0, snapshots: None, stop };
         let state = session.begin(&trainer, listen)?;
         session.drive(&mut trainer, state, listen)
     }
@@ -302,10 +302,10 @@ fn neither_prefetch_nor_image_memory_matters() {
     place.train("starved", &recipe(&["image_memory=1"])).unwrap();
     assert!(place.scene("plain") == place.scene("starved"), "the image cache reached a result");
     let r = plain.resolve();
-    let bench = Bench::new(place.open(&r), &r).unwrap();
-    let plan = bench.plan(&r);
-    let mut trainer = bench.trainer(&plan, bench.initial_scene(&plan).unwrap()).unwrap();
-    trainer.set_frames(Arc::new(Plain(bench.frames.clone())));
+    let opened = OpenCapture::new(place.open(&r), &r).unwrap();
+    let plan = opened.plan(&r);
+    let mut trainer = opened.trainer(&plan, opened.initial_scene(&plan).unwrap()).unwrap();
+    trainer.set_frames(Arc::new(Plain(opened.frames.clone())));
     while !trainer.is_done() {
         trainer.step().unwrap().unwrap();
     }
@@ -338,10 +338,10 @@ fn a_fault_rolls_back_with_smaller_steps_and_names_its_place() {
     let info: Value = serde_json::from_str(&read_text(&place.run("once").join("run.json")).unwrap()).unwrap();
     assert_eq!(info["rollbacks"], 1);
     // Half the rates, and they stay so in the checkpoint.
-    let bench = Bench::new(place.open(&recipe), &recipe).unwrap();
-    let plan = bench.plan(&recipe);
-    let mut trainer = bench.trainer(&plan, bench.initial_scene(&plan).unwrap()).unwrap();
-    restore_newest(&place.run("once"), &mut trainer, &bench.identity(&recipe.resolve(), "")).unwrap();
+    let opened = OpenCapture::new(place.open(&recipe), &recipe).unwrap();
+    let plan = opened.plan(&recipe);
+    let mut trainer = opened.trainer(&plan, opened.initial_scene(&plan).unwrap()).unwrap();
+    restore_newest(&place.run("once"), &mut trainer, &opened.identity(&recipe.resolve(), "")).unwrap();
     assert_eq!((trainer.progress.rate_scale, trainer.progress.strikes), (ROLLBACK_RATE, 1));
     let scene = splat4d::format::scene::read(&place.scene("once")).unwrap();
     assert!(scene.layers.iter().all(|l| l.params.first_non_finite().is_none()));

@@ -1,7 +1,7 @@
 //! What the two moving dialects, .splatv and STG's .ply, can say of a Gaussian: a cubic path, a quaternion with a rate, and
 //! a fade exp(−u²) **without the ½**, all on a clock of their own that runs from 0 to 1.
 
-use super::octets::sound_rows;
+use super::bytes::sound_rows;
 use super::warnings::Warnings;
 use crate::layers::{ALWAYS, Layer, Scene, with_polynomial};
 use crate::math::quat;

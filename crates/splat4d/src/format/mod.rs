@@ -5,13 +5,13 @@
 //! bytes say: counts and lengths are compared with what is really there before anything is allocated.
 
 pub mod arrays;
+mod bytes;
 pub mod dialect;
 mod half;
 mod kinematic;
 #[cfg(test)]
 mod mutate;
 pub mod npy;
-mod octets;
 pub mod playback;
 pub mod ply;
 pub mod quant;

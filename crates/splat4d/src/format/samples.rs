@@ -1,6 +1,6 @@
 //! Gaussians for the dialects' tests, and how far two sets of them are apart.
 
-use super::octets::SH_C0;
+use super::bytes::SH_C0;
 use crate::math::{Rng, quat};
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::{GEOMETRY, Params, SH};

@@ -3,7 +3,7 @@
 //! position 3×f32, **linear** scale 3×f32, colour rgb u8 (½ + C0·f_dc, no view dependence), opacity u8, quaternion wxyz
 //! 4×u8 with (b − 128)/128. World axes as in .ply: y down. Source: antimatter15/splat (MIT).
 
-use super::octets::{byte_of_dc, byte_of_logit, dc_of_byte, f32_at, logit_of_byte, sound_rows};
+use super::bytes::{byte_of_dc, byte_of_logit, dc_of_byte, f32_at, logit_of_byte, sound_rows};
 use super::warnings::Warnings;
 use crate::math::quat;
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
@@ -92,7 +92,7 @@ mod tests {
         assert!((0.5 + SH_C0 * r).abs() < 1e-6 && (0.5 + SH_C0 * b - 1.0).abs() < 1e-6);
         assert!(warnings.lines().is_empty());
     }
-    use crate::format::octets::SH_C0;
+    use crate::format::bytes::SH_C0;
 
     #[test]
     fn a_round_trip_stays_within_the_steps() {

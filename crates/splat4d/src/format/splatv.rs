@@ -7,9 +7,9 @@
 //! No spherical harmonics. We add the key `splat4d` with clip and frame rate, which other programs pass over.
 //! Source: antimatter15/splaTV and gsplat.js (MIT), their shaders.
 
+use super::bytes::{Cursor, byte_of_dc, byte_of_logit, dc_of_byte, f32_at, logit_of_byte};
 use super::half::{f16_to_f32, f32_to_f16};
 use super::kinematic::{Clock, Moving, rows, scene};
-use super::octets::{Cursor, byte_of_dc, byte_of_logit, dc_of_byte, f32_at, logit_of_byte};
 use super::warnings::Warnings;
 use crate::layers::Scene;
 use crate::scene::Camera;

@@ -3,7 +3,7 @@
 //! Source: PKWARE's APPNOTE 6.3.10, sections 4.3 and 4.4. Own code, because a general crate brings ciphers and ten other
 //! compressions, and this is a page.
 
-use super::octets::Cursor;
+use super::bytes::Cursor;
 use crate::{Error, ErrorKind, Result};
 use flate2::read::DeflateDecoder;
 use std::borrow::Cow;

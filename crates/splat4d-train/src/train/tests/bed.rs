@@ -6,7 +6,7 @@ use crate::recipe::Recipe;
 use crate::train::checkpoint::{self, Identity, RunState};
 use crate::train::dataset::Dataset;
 use crate::train::run::tests::{Place, recipe};
-use crate::train::run::{Bench, training_frames};
+use crate::train::run::{OpenCapture, training_frames};
 use crate::train::trainer::Trainer;
 use crate::upkeep::Change;
 use splat4d::format::scene;
@@ -80,19 +80,19 @@ impl Bed {
 
     /// A run that has not begun.
     pub(super) fn start(&self, recipe: &Recipe) -> Trainer<'static> {
-        let bench = Bench::with(self.frames.clone());
-        let plan = bench.plan(recipe);
+        let opened = OpenCapture::with(self.frames.clone());
+        let plan = opened.plan(recipe);
         program_of(recipe).unwrap().check(&plan).unwrap();
-        bench.trainer(&plan, bench.initial_scene(&plan).unwrap()).unwrap()
+        opened.trainer(&plan, opened.initial_scene(&plan).unwrap()).unwrap()
     }
 
     /// As a resume does: an empty scene, and everything from the checkpoint.
     pub(super) fn resumed(&self, recipe: &Recipe, checkpoint: &[u8]) -> Trainer<'static> {
-        let bench = Bench::with(self.frames.clone());
-        let plan = bench.plan(recipe);
+        let opened = OpenCapture::with(self.frames.clone());
+        let plan = opened.plan(recipe);
         let program = program_of(recipe).unwrap();
         let empty = init::scene(&plan, program.as_ref(), &Seeds::default(), [0.0; 3], [0.0, 1.0, 0.0]).unwrap();
-        let mut trainer = bench.trainer(&plan, empty).unwrap();
+        let mut trainer = opened.trainer(&plan, empty).unwrap();
         checkpoint::read(checkpoint, &mut trainer, &Identity::default()).unwrap();
         trainer
     }

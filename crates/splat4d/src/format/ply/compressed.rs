@@ -7,7 +7,7 @@
 
 use super::header::{Element, Header, broken};
 use super::{PlyInfo, degree, f_rest_columns, non_finite, rows};
-use crate::format::octets::{SH_C0, logit_of_byte};
+use crate::format::bytes::{SH_C0, logit_of_byte};
 use crate::scene::params::{GEOMETRY, LOG_SCALE, OPACITY, Params, QUAT, SH};
 use crate::scene::table::Table;
 use crate::{Error, ErrorKind, Result};

@@ -133,7 +133,7 @@ pub fn read_points(bytes: &[u8]) -> Result<PlyPoints> {
         let color = |(row, c): (usize, usize)| (rows.get(row, c) / vertex.white(c)) as f32;
         join(rgb).map(|row| row.map(color)).collect()
     } else if let Some(dc) = all(DC_NAMES) {
-        join(dc).map(|row| row.map(|(row, c)| 0.5 + super::octets::SH_C0 * rows.get(row, c) as f32)).collect()
+        join(dc).map(|row| row.map(|(row, c)| 0.5 + super::bytes::SH_C0 * rows.get(row, c) as f32)).collect()
     } else {
         Vec::new()
     };

@@ -1,7 +1,7 @@
 //! Writes PlayCanvas' compressed `.ply`; the layout is told where it is read, in `compressed.rs`.
 
 use super::compressed::{BOUNDS, CHUNK, COLOR_BOUNDS, SH_RANGE, WORDS};
-use crate::format::octets::{SH_C0, sound_rows};
+use crate::format::bytes::{SH_C0, sound_rows};
 use crate::format::warnings::Warnings;
 use crate::math::quat;
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};

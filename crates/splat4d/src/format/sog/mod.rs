@@ -11,7 +11,7 @@ mod pictures;
 #[cfg(test)]
 mod tests;
 
-use super::octets::logit_of_byte;
+use super::bytes::logit_of_byte;
 use super::warnings::Warnings;
 use super::zip;
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};

@@ -2,7 +2,7 @@
 
 use super::streams::{STREAMS, Streams, lengths};
 use super::{EXTENDED, GZIP_MAGIC, Header, MAGIC, damaged};
-use crate::format::octets::Cursor;
+use crate::format::bytes::Cursor;
 use crate::format::warnings::Warnings;
 use crate::{Error, Result};
 use flate2::Compression;

@@ -13,7 +13,7 @@ mod streams;
 #[cfg(test)]
 mod tests;
 
-use super::octets::sound_rows;
+use super::bytes::sound_rows;
 use super::warnings::Warnings;
 use crate::math::sh::degree_of;
 use crate::scene::{Params, SH};

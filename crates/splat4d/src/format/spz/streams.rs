@@ -2,7 +2,7 @@
 
 use super::Header;
 use crate::Result;
-use crate::format::octets::{byte_of_logit, logit_of_byte, to_byte};
+use crate::format::bytes::{byte_of_logit, logit_of_byte, to_byte};
 use crate::format::warnings::Warnings;
 use crate::math::{quat, sh};
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};

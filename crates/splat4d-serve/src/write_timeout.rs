@@ -17,7 +17,7 @@ const LEAST: usize = 64 << 10;
 
 /// A stream that fails where its reader stalls.
 #[derive(Debug)]
-pub(crate) struct Patient {
+pub(crate) struct WriteTimeout {
     stream: TcpStream,
     window: Duration,
     /// Runs while bytes wait; none where the client has taken everything.
@@ -25,7 +25,7 @@ pub(crate) struct Patient {
     taken: usize,
 }
 
-impl Patient {
+impl WriteTimeout {
     pub(crate) fn new(stream: TcpStream) -> Self {
         Self::with_window(stream, WINDOW)
     }
@@ -77,13 +77,13 @@ pub(crate) async fn either<A: Future, B: Future>(a: A, b: B) -> Either<A::Output
     .await
 }
 
-impl AsyncRead for Patient {
+impl AsyncRead for WriteTimeout {
     fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
         Pin::new(&mut self.stream).poll_read(cx, buf)
     }
 }
 
-impl AsyncWrite for Patient {
+impl AsyncWrite for WriteTimeout {
     fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &[u8]) -> Poll<io::Result<usize>> {
         let written = Pin::new(&mut self.stream).poll_write(cx, buf);
         self.judge(cx, written)
@@ -123,18 +123,18 @@ mod tests {
             let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
             let mut client = std::net::TcpStream::connect(listener.local_addr().unwrap()).unwrap();
             let (stream, _) = listener.accept().await.unwrap();
-            let mut patient = Patient::with_window(stream, Duration::from_millis(50));
+            let mut timed = WriteTimeout::with_window(stream, Duration::from_millis(50));
             let bytes = vec![7u8; 1 << 20];
             let mut sent = 0;
             let error = loop {
-                match poll_fn(|cx| Pin::new(&mut patient).poll_write(cx, &bytes)).await {
+                match poll_fn(|cx| Pin::new(&mut timed).poll_write(cx, &bytes)).await {
                     Ok(n) => sent += n,
                     Err(error) => break error,
                 }
                 assert!(sent < 1 << 30, "a socket's buffer ends somewhere");
             };
             assert_eq!(error.kind(), io::ErrorKind::TimedOut);
-            drop(patient);
+            drop(timed);
             let mut got = Vec::new();
             client.read_to_end(&mut got).unwrap();
             assert_eq!(got.len(), sent);
