@@ -1,6 +1,6 @@
 //! Settings: typed knobs, each declared once and beside what it sets.
 //!
-//! [`settings!`](crate::settings::settings) makes a struct of one table of the recipe, and from the same lines its
+//! `settings!` makes a struct of one table of the recipe, and from the same lines its
 //! defaults, documentation, ranges and units; [`Recipe`](crate::recipe::Recipe) puts the tables together.
 
 mod value;
@@ -164,7 +164,7 @@ pub const fn within(low: usize, high: usize) -> Rule {
     Rule::of(Range::Within(low, high))
 }
 
-/// One table of settings; [`settings!`](crate::settings::settings) writes it.
+/// One table of settings; `settings!` writes it.
 pub trait Table {
     /// What it is about, in a sentence.
     fn about(&self) -> &'static str;

@@ -178,7 +178,7 @@ fn refused(what: &str) -> Error {
 }
 
 impl Deform {
-    /// Makes or claims the model's tables in `p`. Errors: see [`build`].
+    /// Makes or claims the model's tables in `p`. Errors: see [`build`](super::build).
     pub fn new<F: Real>(spec: DeformSpec, p: &mut Params<F>) -> Result<Self> {
         let [from, to] = spec.clip;
         if !(from.is_finite() && to.is_finite() && from <= to) {

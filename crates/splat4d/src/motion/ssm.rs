@@ -192,7 +192,7 @@ pub fn columns(spec: &SsmSpec) -> Result<(Vec<String>, Vec<String>)> {
 }
 
 impl Field {
-    /// Makes or claims the tables in `p`; `nodes` is the table of the skin. Errors: as [`build`].
+    /// Makes or claims the tables in `p`; `nodes` is the table of the skin. Errors: as [`build`](super::build).
     pub fn new<F: Real>(spec: &SsmSpec, nodes: Key, p: &mut Params<F>) -> Result<Self> {
         spec.check()?;
         let count = p[nodes].rows();
