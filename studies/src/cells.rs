@@ -16,7 +16,7 @@ const FEW_INTERVALS: [usize; 2] = [5, 20];
 /// Rounds in which one share is pruned.
 const ROUNDS: [usize; 3] = [1, 2, 4];
 const FEW_ROUNDS: [usize; 1] = [1];
-/// What fine-tuning is taken to cost besides its steps (scoring, evaluation, playing), in steps; for the time
+/// Assumed cost of fine-tuning besides its steps (scoring, evaluation, playing), in steps; for the time
 /// that is left.
 const OVERHEAD: f64 = 300.0;
 
@@ -42,7 +42,7 @@ pub(crate) struct Score {
     pub volume: bool,
 }
 
-/// What `compress` does by default.
+/// Score that `compress` uses by default.
 const DEFAULT: Score =
     Score { spatial: Spatial::Change, temporal: Temporal::InstantAbs, combine: Combine::Product, volume: false };
 
@@ -129,13 +129,13 @@ impl Cell {
         }
     }
 
-    /// What it takes, in steps of training.
+    /// Cost of the cell, in steps of training.
     pub(crate) fn cost(&self) -> f64 {
         OVERHEAD + self.steps as f64
     }
 }
 
-/// What the study varies.
+/// Parameters that the study varies.
 #[derive(Clone, Debug)]
 pub(crate) struct Grid {
     pub shares: Vec<f64>,
@@ -177,7 +177,7 @@ impl Grid {
         [cell(0, 0), cell(self.steps, 0), cell(self.steps, INTERVAL)]
     }
 
-    /// What each part does, at one share: name and cell.
+    /// Ablation of the parts, at one share: name and cell.
     pub(crate) fn parts(&self) -> Vec<(String, Cell)> {
         let cell = |prune, interval, steps| Cell { prune, interval, steps, ..Cell::source() };
         let pruned = format!("pruned by {:.0} %", 100.0 * AT);

@@ -7,7 +7,7 @@ use splat4d::nn::mlp::{InputGrad, Mlp, MlpShape, Passed};
 use splat4d::scene::{Grads, Params};
 use splat4d_train::optim::Moments;
 
-/// What the experiment varies.
+/// Parameters that the experiment varies.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Settings {
     /// Points.
@@ -62,7 +62,7 @@ pub enum Scene {
     Jump,
 }
 
-/// What came out.
+/// Results of the experiment.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Findings {
     /// Numbers of the network.

@@ -7,7 +7,7 @@ use splat4d::math::{Rng, Se3};
 use splat4d::scene::Camera;
 use splat4d::scene::camera::{Intrinsics, Lens};
 
-/// What the experiment varies.
+/// Parameters that the experiment varies.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Settings {
     /// Frames.
@@ -44,7 +44,7 @@ const WALL: (usize, f64, [f64; 2]) = (10, 8.0, [3.0, 2.0]);
 /// Highest power of t in the curve that is fitted to every point's positions: that of the spacetime model.
 const FITTED_ORDER: usize = 3;
 
-/// What came out.
+/// Results of the experiment.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Findings {
     /// Mean squared error at the last frame of repeating frame 0, units².

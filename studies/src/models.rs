@@ -22,7 +22,7 @@ use std::time::{Duration, Instant};
 const MINUTES: f64 = 3.0;
 /// How often a cell that trains is looked at.
 const GLANCE: Duration = Duration::from_millis(100);
-/// What a cell costs besides its minutes (probes, evaluation, baking, playing), minutes; for the time that is left.
+/// Cost of a cell besides its minutes (probes, evaluation, baking, playing), minutes; for the time that is left.
 const OVERHEAD: f64 = 0.6;
 
 const EXAMPLES: &str = "\
@@ -71,7 +71,7 @@ struct Cell {
     /// Why there are no numbers.
     refused: Option<String>,
     side: Side,
-    /// What a player gets.
+    /// Size of the file that a player gets, bytes.
     playback_bytes: Option<u64>,
     steps: usize,
     ms_per_step: f64,
@@ -127,7 +127,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// What marks the table's place in a page.
+/// Comments that mark the table's place in a page.
 const MARKS: [&str; 2] = ["<!-- models -->", "<!-- /models -->"];
 
 /// A page up to and with the first mark, and from the second on. Errors: it lacks one.

@@ -18,7 +18,7 @@ pub(crate) struct Study {
     pub runs: Vec<Findings>,
 }
 
-/// What was found on one run.
+/// Results of the study on one run.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Findings {
     pub run: PathBuf,
@@ -39,7 +39,7 @@ pub(crate) struct Found {
     pub speed: f64,
     /// The same of the blend stage alone.
     pub raster_speed: f64,
-    /// What making and measuring it took.
+    /// Time that making and measuring it took, seconds.
     pub seconds: f64,
 }
 

@@ -70,7 +70,7 @@ fn rig() -> Vec<Camera> {
     (0..CAMERAS).map(camera).collect()
 }
 
-/// What one picture leaves behind for the figures and the ground truth.
+/// Data that one picture leaves behind for the figures and the ground truth.
 struct View {
     rgb: Vec<u8>,
     bytes: [usize; 2],

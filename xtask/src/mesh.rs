@@ -9,7 +9,7 @@ pub struct Triangle {
     pub vertices: [u32; 3],
     /// Index into the scene's materials.
     pub material: u16,
-    /// What it belongs to, for masks and flow; 0 is the static set.
+    /// Index of the object it belongs to, for masks and flow; 0 is the static set.
     pub object: u8,
 }
 

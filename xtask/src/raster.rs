@@ -45,7 +45,7 @@ impl Edges {
     }
 }
 
-/// What every sample of one picture sees.
+/// Visible triangle and inverse depth at every sample of one picture.
 pub struct Visibility {
     /// Samples across.
     pub width: usize,

@@ -29,14 +29,14 @@ const ELEVATION_SINES: [f64; 2] = [0.035, 0.97];
 const GOLDEN_ANGLE: f64 = 2.399_963_229_728_653;
 /// Every how many views one is kept out of training.
 const HOLD_EVERY: usize = 8;
-/// What the character counts as, for masks; 0 would be the static set.
+/// Object index of the character, for masks; 0 would be the static set.
 const OBJECT: u8 = 1;
 /// Bounds of what is sensible.
 const SIZES: std::ops::RangeInclusive<usize> = 16..=4096;
 /// See [`SIZES`].
 const VIEWS: std::ops::RangeInclusive<usize> = 2..=10_000;
 
-/// What is drawn.
+/// Settings of the capture that is drawn.
 #[derive(Debug, PartialEq)]
 struct Wish {
     character: PathBuf,

@@ -58,7 +58,7 @@ const ORDER: [(&str, &[&str]); 5] = [
 /// Module that puts together what others declare: of modules that stand above it it may import names with this ending.
 const COMPOSES: (&str, &str, &str) = ("crates/splat4d-train", "recipe", "Settings");
 
-/// What a module must not import although it stands before it: the design's first invariant.
+/// Modules that a module must not import although they stand before it: the design's first invariant.
 const NEVER: [(&str, &str, &[&str]); 1] = [
     // The renderer knows no time: it sees splats, not the models and layers that make them.
     ("crates/splat4d", "render", &["motion", "layers"]),

@@ -32,7 +32,7 @@ const NAMED_CAMERAS: usize = 200;
 const PATH_KEYS: usize = 16;
 const PATH_STEP: f64 = 0.75;
 
-/// What may be told.
+/// Settings of baking and packing a scene.
 #[derive(Clone, Debug)]
 pub(crate) struct Baking {
     pub options: Options,
@@ -192,7 +192,7 @@ pub(crate) fn distinct(views: &[View]) -> Vec<&View> {
     all.into_iter().step_by(stride).collect()
 }
 
-/// What a file says of its Gaussians as a whole.
+/// Properties that a file states of its Gaussians as a whole.
 pub(crate) struct Outline {
     pub clip: [f64; 2],
     pub sh_degree: usize,
@@ -215,7 +215,7 @@ impl Outline {
     }
 }
 
-/// What the file says about the scene.
+/// Metadata of the scene, as the file states it.
 pub(crate) fn meta(scene: &Scene<f32>, outline: &Outline, stage: &Stage, views: &[&View]) -> Meta {
     let look = |share: f64| {
         let camera = stage.orbit(share);
@@ -265,7 +265,7 @@ pub(crate) fn poster(scene: &Scene<f32>, stage: &Stage, antialias: bool) -> Opti
     })
 }
 
-/// What people call the scene: the capture's name, or the file's.
+/// Title of the scene for people: the capture's name, or the file's.
 pub(crate) fn title(source: &Source, path: &Path) -> String {
     let stem = || path.file_stem().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
     source.run.as_ref().map_or_else(stem, Run::name)

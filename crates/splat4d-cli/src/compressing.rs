@@ -28,7 +28,7 @@ const MOST_TRIES: usize = 3;
 /// The guard takes back this share of the pruning.
 const GENTLER: f64 = 0.5;
 
-/// What the user wants; it lies in [`ORDER`], so that an interrupted compression knows it.
+/// Settings that the user asked for; they lie in [`ORDER`], so that an interrupted compression knows them.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Order {
@@ -325,7 +325,7 @@ impl Work {
     }
 }
 
-/// What is compressed.
+/// Scene that is compressed, with its capture and recipe.
 struct Original<'a> {
     scene: &'a Scene<f32>,
     capture: Arc<Capture>,
@@ -356,10 +356,10 @@ const AGAIN_MARGIN: f64 = 0.01;
 /// The folder, in that of a compression, of the unpruned scene that was trained on.
 const UNPRUNED: &str = "unpruned";
 
-/// What metrics.csv calls the time behind the last stage.
+/// Name in metrics.csv of the time behind the last stage.
 const DONE: &str = "done";
 
-/// What each stage took, from `metrics.csv`'s rows.
+/// Training steps and seconds of each stage, from `metrics.csv`'s rows.
 fn steps(run: &Run) -> Vec<Step> {
     let mut out: Vec<Step> = Vec::new();
     let mut before = (0, 0.0);

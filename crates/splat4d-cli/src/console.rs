@@ -74,7 +74,7 @@ impl Console {
         }
     }
 
-    /// What the verb was asked for: on stdout whatever the loudness.
+    /// Prints the result that the verb was asked for: on stdout whatever the loudness.
     pub(crate) fn result(&self, text: &str) {
         self.above_bar(|| print(text));
     }

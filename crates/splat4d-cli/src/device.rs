@@ -4,7 +4,7 @@ use crate::console::Console;
 use splat4d::device::{self, Opened};
 use splat4d::render::{RenderConfig, Tables, Wanted};
 
-/// What draws.
+/// Device that renders.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub(crate) enum Device {
     /// The GPU if there is one, else the CPU

@@ -10,7 +10,7 @@ use splat4d::play::Player;
 use splat4d::render::{Antialias, Backend, Image, RenderConfig, Shot, Wanted};
 use splat4d::scene::{Camera, Planes, Time};
 
-/// What is shown.
+/// Channel of the rendering that is shown.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub(crate) enum Channel {
     /// Colour over the background

@@ -5,7 +5,7 @@ use std::ffi::OsString;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-/// What to do when a file cannot be written.
+/// Remedy when a file cannot be written.
 pub(crate) const WRITE_REMEDY: &str =
     "Check that the folder exists, that you may write there and that the disk is not full.";
 

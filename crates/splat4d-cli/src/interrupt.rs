@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// What shells expect of a program ended by Ctrl-C: 128 + SIGINT.
+/// Exit code that shells expect of a program ended by Ctrl-C: 128 + SIGINT.
 const ENDED_BY_INTERRUPT: i32 = 130;
 
 /// A flag that the first Ctrl-C (or SIGTERM) raises. `first` is then said on stderr.

@@ -84,7 +84,7 @@ impl Side {
     }
 }
 
-/// What is measured.
+/// Scene or file that is measured.
 #[derive(Clone, Debug)]
 pub enum What<'a> {
     /// A scene in memory, with its 32-bit floats; played as it is.
@@ -93,7 +93,7 @@ pub enum What<'a> {
     File(Arc<[u8]>),
 }
 
-/// What is measured, and how it must be drawn.
+/// Scene or file that is measured, and how it must be drawn.
 #[derive(Clone, Debug)]
 pub struct Subject<'a> {
     pub what: What<'a>,
@@ -183,7 +183,7 @@ pub fn in_turns(subjects: &[Subject<'_>], looks: &[Look], progress: &mut dyn FnM
 struct Seat<'a> {
     side: Side,
     player: Player<'a>,
-    /// What a first picture is drawn from.
+    /// Stored bytes that a first picture is drawn from.
     stored: Arc<[u8]>,
     background: [f32; 3],
     renderer: Renderer<f32>,
@@ -249,7 +249,7 @@ impl<'a> Seat<'a> {
     }
 }
 
-/// What can be told without drawing.
+/// Sizes and counts that can be told without drawing.
 fn weighed(scene: &Scene<f32>, bytes: usize) -> Side {
     let numbers = |l: &splat4d::layers::Layer| l.params.keys().map(|k| l.params[k].data().len()).sum::<usize>();
     let seconds = scene.clip[1] - scene.clip[0];

@@ -13,11 +13,11 @@ use std::path::{Path, PathBuf};
 
 /// Files that mark a folder as a run.
 const MARKERS: [&str; 4] = ["recipe.toml", "run.json", "scene.safetensors", "checkpoints"];
-/// What `compress` leaves beside the file that it writes, for the report and for machines.
+/// File of results that `compress` leaves beside the file that it writes, for the report and for machines.
 pub(crate) const COMPRESS: &str = "compress.json";
-/// What `compress` was asked for.
+/// File that holds the settings `compress` was asked for.
 pub(crate) const ORDER: &str = "compress.toml";
-/// What splat4d writes into a run; `--force` replaces these and nothing else.
+/// Files and folders that splat4d writes into a run; `--force` replaces these and nothing else.
 const OURS: [&str; 19] = [
     "recipe.toml",
     "run.json",
@@ -208,7 +208,7 @@ impl Run {
         self.info.get("capture").and_then(Value::as_str).map(PathBuf::from)
     }
 
-    /// What the capture's reader noticed, and the warnings since, in that order.
+    /// Warnings and notes about the run: those of the capture's reader, and those since, in that order.
     pub(crate) fn findings(&self) -> Vec<String> {
         let mut out: Vec<String> = Vec::new();
         for key in ["warnings", "notes"] {

@@ -22,7 +22,7 @@ const BEYOND: f64 = 0.01;
 /// Room around that box.
 const ROOM: f64 = 1.1;
 
-/// What can be opened, for errors.
+/// Remedy that lists the files that can be opened, for errors.
 const REMEDY: &str =
     "Give a run folder, a scene.safetensors, a checkpoint, a .splat4d, or a .ply, .spz, .splat, .splatv or SOG file.";
 
@@ -36,13 +36,13 @@ pub(crate) struct Source {
     pub scene: Scene<f32>,
     /// The run, where it is one.
     pub run: Option<Run>,
-    /// What the .ply said, where it is one.
+    /// Information that the .ply gave, where it is one.
     pub ply: Option<PlyInfo>,
     /// The start of the playback file, where it is one.
     pub playback: Option<Index>,
     /// Whose format it is, where it is not our own.
     pub dialect: Option<Dialect>,
-    /// What could not be read, or had to be assumed.
+    /// Warnings about parts that could not be read, or had to be assumed.
     pub warnings: Warnings,
 }
 

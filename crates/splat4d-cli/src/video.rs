@@ -10,10 +10,10 @@ use std::process::{Child, ChildStdin, Command, Stdio};
 
 /// x264's quality: 18 is visually lossless for most material (FFmpeg's H.264 guide).
 const CRF: &str = "18";
-/// What films may end in.
+/// File name endings that films may have.
 const ENDINGS: &str =
     "Use .mp4, .mkv or .mov (needs ffmpeg), .png (animated), or a name without ending for a folder of pictures.";
-/// What to do without ffmpeg.
+/// Remedy where ffmpeg is missing.
 const INSTEAD: &str =
     "Install ffmpeg, or write an animated .png or a folder of pictures instead (-o NAME.png, -o FOLDER).";
 /// Most bytes kept of what ffmpeg says.

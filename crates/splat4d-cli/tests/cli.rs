@@ -293,7 +293,7 @@ fn a_scene_becomes_a_page_alone_or_beside_its_file() {
     assert!(refused.contains("--link"), "{refused}");
 }
 
-/// What a server at `url` answers.
+/// Body of the answer of a server at `url`.
 fn get(url: &str, path: &str) -> Vec<u8> {
     use std::io::{Read, Write};
     let address = url.strip_prefix("http://").unwrap().trim_end_matches('/');

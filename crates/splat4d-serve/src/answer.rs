@@ -28,13 +28,13 @@ const HEADERS: [(HeaderName, &str); 5] = [
     (HeaderName::from_static("cross-origin-resource-policy"), "same-origin"),
 ];
 
-/// What all connections share.
+/// State that all connections share.
 #[derive(Debug)]
 pub(crate) struct Shared {
     pub scene: Scene,
     pub hub: Arc<Hub>,
     pub guard: Guard,
-    /// What `/config.json` says besides.
+    /// Further entries of `/config.json`.
     pub about: Value,
     pub live: bool,
     /// A scene elsewhere, and its origin.
@@ -61,7 +61,8 @@ impl Shared {
     }
 }
 
-/// What the page may do: run the player's modules and workers, fetch from here, and from the one origin that was named.
+/// Content security policy of the page: it may run the player's modules and workers, fetch from here, and from the
+/// one origin that was named.
 /// Styles may be inline because an element of the player carries its own.
 fn policy(origin: &str) -> String {
     format!(
@@ -108,7 +109,7 @@ async fn route(shared: &Arc<Shared>, request: &Parts) -> Response<Body> {
     }
 }
 
-/// What the page is to show.
+/// Configuration of the page: the scene that it is to show.
 fn config(shared: &Shared) -> Value {
     let mut config = if shared.about.is_object() { shared.about.clone() } else { json!({}) };
     let version = shared.scene.version(None).map(|v| v.number).ok();

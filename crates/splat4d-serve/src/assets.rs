@@ -55,7 +55,7 @@ pub(crate) const INDEX: &str = "index.html";
 pub struct Asset {
     /// Its name; there are no folders.
     pub name: Cow<'static, str>,
-    /// What it says, UTF-8.
+    /// Content, UTF-8.
     pub text: Cow<'static, str>,
     /// The same, as gzip.
     pub gzip: Vec<u8>,

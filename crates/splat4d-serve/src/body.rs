@@ -10,7 +10,7 @@ use tokio::sync::mpsc;
 /// Chunks that wait for a client: one on its way and one behind it.
 const WAITING: usize = 1;
 
-/// What is sent.
+/// Body of an answer.
 #[derive(Debug)]
 pub(crate) enum Body {
     /// Bytes that are there.

@@ -1,6 +1,6 @@
 //! The `Range` header of a request (RFC 9110, section 14).
 
-/// What of a file of known length is wanted.
+/// Part of a file of known length that is wanted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Wanted {
     /// All of it: no range, another unit, several ranges or nonsense, all of which a server may ignore.

@@ -15,7 +15,7 @@ const CHUNK: u64 = 128 << 10;
 /// Live versions kept: the newest, and the one that a page may still be reading.
 const VERSIONS: usize = 2;
 
-/// What the server shows.
+/// Scene that the server shows.
 #[derive(Clone, Debug, Default)]
 #[non_exhaustive]
 pub enum Content {

@@ -41,7 +41,7 @@ const MAX_HEAD: usize = 16 << 10;
 const MAX_HEADERS: usize = 64;
 /// Threads that read files.
 const READERS: usize = 2;
-/// What answers on their way are given to finish when the server stops.
+/// Time that answers on their way are given to finish when the server stops.
 const GRACE: Duration = Duration::from_millis(500);
 /// Pause after the system had no room for a connection.
 const NO_ROOM: Duration = Duration::from_millis(100);
@@ -49,7 +49,7 @@ const NO_ROOM: Duration = Duration::from_millis(100);
 #[cfg(target_os = "linux")]
 const NICE: i32 = 10;
 
-/// What to serve, and where.
+/// Settings of the server: what to serve, and where.
 #[derive(Clone, Debug)]
 pub struct Config {
     /// A name or address of this machine to listen on. Anything but loopback lets others in.

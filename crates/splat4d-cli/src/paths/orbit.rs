@@ -24,7 +24,7 @@ const SMALL_SWAY: f64 = 0.1;
 /// Middle, distance, height and arc of an orbit.
 #[derive(Clone, Debug)]
 pub(crate) struct Stage {
-    /// What is looked at.
+    /// Point that is looked at.
     pub center: [f64; 3],
     /// Upwards (unit).
     pub up: [f64; 3],

@@ -36,7 +36,7 @@ pub(crate) struct Compressed {
     pub after: Side,
     pub stages: Vec<Step>,
     pub guard: Option<Guard>,
-    /// What a search for a size tried.
+    /// Attempts of a search for a size.
     pub tried: Vec<Tried>,
     pub warnings: Vec<String>,
 }
@@ -72,7 +72,7 @@ pub(crate) struct Tried {
 }
 
 impl Compressed {
-    /// What the quality and the speed of `after` are compared with.
+    /// Baseline that the quality and the speed of `after` are compared with.
     pub(crate) fn fair(&self) -> &Side {
         self.unpruned.as_ref().unwrap_or(&self.before)
     }

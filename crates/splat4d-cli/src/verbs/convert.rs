@@ -104,7 +104,7 @@ impl Up {
     }
 }
 
-/// What is written.
+/// Format of the file that is written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Target {
     Dialect(Dialect),

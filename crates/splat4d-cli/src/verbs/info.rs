@@ -57,7 +57,7 @@ pub(crate) struct Args {
     hold_out: Option<String>,
 }
 
-/// What is told: a JSON object, and the same for people.
+/// Output of the verb: a JSON object, and the same for people.
 struct Told {
     json: Value,
     text: String,

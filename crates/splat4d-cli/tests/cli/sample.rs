@@ -18,7 +18,7 @@ const PROGRAM: Option<&str> = match option_env!("CARGO_BIN_EXE_splat4d") {
     None => option_env!("CARGO_BIN_EXE_studies"),
 };
 
-/// What is written, and how it is spoilt.
+/// Sample capture that is written, and how it is spoilt.
 pub struct Capture {
     folder: PathBuf,
     pub distance: f64,

@@ -28,7 +28,7 @@ use splat4d_train::train::run::peak_memory;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// What grows.
+/// Quantity that grows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub(super) enum Axis {
     /// 10,000 to 1,000,000 Gaussians, 800x800

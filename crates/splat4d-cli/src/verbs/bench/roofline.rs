@@ -9,7 +9,7 @@ use splat4d::render::roofline;
 use splat4d::render::{Simd, bin::Footprint};
 use splat4d::scene::Splats;
 
-/// What a number of threads can do at best.
+/// Peak throughput of a number of threads.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Roofline {
     /// Pairs of pixel and Gaussian a second, all threads together.

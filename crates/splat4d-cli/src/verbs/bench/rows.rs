@@ -34,7 +34,7 @@ pub(super) struct Row {
     /// Most memory that the process held while this was measured, bytes.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub peak_memory: Option<u64>,
-    /// What was varied: Gaussians, pixels or frames.
+    /// Value of the quantity that was varied: Gaussians, pixels or frames.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub x: Option<f64>,
     /// Bytes, for rows that tell where memory is.

@@ -33,7 +33,7 @@ const STAGES: [&str; 10] = [
     "forward+backward",
 ];
 
-/// What one view took at best, seconds, and the work in it.
+/// Best time of each stage for one view, seconds, and the work in it.
 #[derive(Clone, Copy)]
 struct Seen {
     best: [f64; STAGES.len()],

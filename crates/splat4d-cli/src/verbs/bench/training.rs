@@ -42,7 +42,7 @@ pub(super) struct Held {
 }
 
 impl Held {
-    /// What the scene looks like from its views, with noise.
+    /// Renders the scene from its views, with noise.
     pub(super) fn of(pinned: &Pinned, way: Way) -> Self {
         let mut renderer = Renderer::new(RenderConfig { simd: way.simd, ..RenderConfig::default() });
         let (mut image, mut moment) = (Image::default(), Evaluation::default());
