@@ -9,7 +9,7 @@ use splat4d_train::optim::Moments;
 
 /// Parameters that the experiment varies.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Settings {
+pub(crate) struct Settings {
     /// Points.
     pub points: usize,
     /// Times, evenly over [0, 1].
@@ -41,19 +41,19 @@ const LAST_LAYER: f64 = 0.05;
 /// Adam's rate at the start and at the end of a cosine.
 const RATES: [f64; 2] = [1e-2, 1e-4];
 /// Values of λ in the sweep.
-pub const LAMBDAS: [f64; 6] = [0.0, 1e-3, 1e-2, 0.1, 1.0, 10.0];
+pub(crate) const LAMBDAS: [f64; 6] = [0.0, 1e-3, 1e-2, 0.1, 1.0, 10.0];
 /// Points nearer to the edge between two motions than this count as at it.
 const NEAR_EDGE: f64 = 0.03;
 /// When the jump is; times from this much before it on count as at it, for a smooth network begins early.
 const JUMP: (f64, f64) = (0.5, 0.1);
 /// Points that it takes to see an edge or a jump: fewer can be learnt by heart.
-pub const MANY_POINTS: usize = 200;
+pub(crate) const MANY_POINTS: usize = 200;
 
 type Path = Vec<[f64; 2]>;
 
 /// How the points of a scene move.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Scene {
+pub(crate) enum Scene {
     /// A third each: sinusoids along x, straight lines, circles.
     Mixed,
     /// Points left of x = 0 stand still, those right of it move up: the edge of an occluding object.
@@ -64,7 +64,7 @@ pub enum Scene {
 
 /// Results of the experiment.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Findings {
+pub(crate) struct Findings {
     /// Numbers of the network.
     pub parameters: usize,
     /// Mean squared distance to the noise-free truth at every time: of every point's mean position.
@@ -85,18 +85,18 @@ pub struct Findings {
 
 impl Findings {
     /// 1 − e/e_still at every time.
-    pub fn improvements(&self) -> Vec<f64> {
+    pub(crate) fn improvements(&self) -> Vec<f64> {
         self.moving_mse.iter().zip(&self.still_mse).map(|(a, b)| 1.0 - a / b).collect()
     }
 
     /// The smallest of them.
-    pub fn worst(&self) -> f64 {
+    pub(crate) fn worst(&self) -> f64 {
         self.improvements().into_iter().fold(f64::INFINITY, f64::min)
     }
 }
 
 /// Runs it.
-pub fn run(scene: Scene, s: &Settings) -> Findings {
+pub(crate) fn run(scene: Scene, s: &Settings) -> Findings {
     assert!(s.points > 0 && s.frames > 3, "a third difference needs four times");
     let rng = Rng::new(s.seed, "e00", 0);
     let truth = truth(scene, s, rng);

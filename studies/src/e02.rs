@@ -19,8 +19,8 @@ use splat4d_train::capture::{Capture, ImageStore};
 use splat4d_train::eval::run::{EvalOptions, assess};
 use splat4d_train::event::Event;
 use splat4d_train::recipe::Recipe;
-use splat4d_train::train::run::open_capture;
-use splat4d_train::train::{self, TrainOptions, checkpoint};
+use splat4d_train::run::open_capture;
+use splat4d_train::run::{self, TrainOptions, checkpoint};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -227,9 +227,9 @@ fn judge(
     let outcome = if checkpoint::list(folder).is_empty() {
         run_folder::clear(folder)?;
         let recipe = order.recipe.clone();
-        train::train(capture.clone(), recipe, folder, &TrainOptions::default(), stop, &mut listen)?
+        run::train(capture.clone(), recipe, folder, &TrainOptions::default(), stop, &mut listen)?
     } else {
-        train::resume_with(folder, &TrainOptions::default(), stop, &mut listen)?
+        run::resume_with(folder, &TrainOptions::default(), stop, &mut listen)?
     };
     if outcome.interrupted || stop.load(Ordering::SeqCst) {
         return Ok(None);

@@ -18,7 +18,7 @@ use splat4d_train::compress::{Job, compress};
 use splat4d_train::eval::run::{EvalOptions, assess};
 use splat4d_train::event::Event;
 use splat4d_train::recipe::Recipe;
-use splat4d_train::train::TrainOptions;
+use splat4d_train::run::TrainOptions;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;

@@ -9,7 +9,7 @@ use splat4d::scene::camera::{Intrinsics, Lens};
 
 /// Parameters that the experiment varies.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Settings {
+pub(crate) struct Settings {
     /// Frames.
     pub frames: usize,
     /// The sphere's speed along x, units a frame.
@@ -46,7 +46,7 @@ const FITTED_ORDER: usize = 3;
 
 /// Results of the experiment.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Findings {
+pub(crate) struct Findings {
     /// Mean squared error at the last frame of repeating frame 0, units².
     pub still_mse: f64,
     /// Of following the flow lifted with the depth of the first of two frames.
@@ -71,14 +71,14 @@ pub struct Findings {
 
 impl Findings {
     /// How many times worse repeating frame 0 is at the last frame.
-    pub fn ratio(&self) -> f64 {
+    pub(crate) fn ratio(&self) -> f64 {
         self.still_mse / self.lifted_mse
     }
 }
 
 /// A moving average of every point's flow over three frames.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Smoothed {
+pub(crate) struct Smoothed {
     /// Times that it was applied.
     pub passes: usize,
     /// Root mean square error of a single step's flow, units.
@@ -90,7 +90,7 @@ pub struct Smoothed {
 }
 
 /// Runs it.
-pub fn run(s: &Settings) -> Findings {
+pub(crate) fn run(s: &Settings) -> Findings {
     assert!(s.frames >= 2, "flow needs two frames");
     let camera = camera();
     let truth = truth(s);

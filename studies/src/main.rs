@@ -8,8 +8,10 @@ mod e01;
 mod e02;
 mod e03;
 mod lifting;
+mod made;
 mod models;
 mod study;
+mod suite;
 mod tables;
 
 use clap::{Parser, Subcommand};
@@ -24,6 +26,8 @@ Examples:
   studies e03 runs/knight              how much can be pruned, by which score, and what does the filter cost?
   studies e03 runs/knight --quick
   studies models examples/knight       every motion model, three minutes each
+  studies suite --data sets            the recipe on captures of every kind
+  studies make one-wall runs/one-wall  a made-up capture that is hard for one reason
 
 A study can be stopped at any time and goes on where it was.";
 
@@ -44,6 +48,9 @@ enum Study {
     E02(e02::Args),
     E03(e03::Args),
     Models(models::Args),
+    Suite(suite::Args),
+    /// Draw a made-up capture that is hard for one reason
+    Make(made::Args),
     /// `splat4d train`, for `models`: a cell is a process, so that its peak of memory is its own.
     #[command(hide = true)]
     Train(Box<verbs::train::Args>),
@@ -58,6 +65,8 @@ fn main() -> ExitCode {
             Study::E02(args) => e02::run(&args, console),
             Study::E03(args) => e03::run(&args, console),
             Study::Models(args) => models::run(&args, console),
+            Study::Suite(args) => suite::run(&args, console),
+            Study::Make(args) => made::run(&args, console),
             Study::Train(args) => verbs::train::run(&args, console),
         })
     })

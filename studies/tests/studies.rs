@@ -136,9 +136,60 @@ fn the_filter_is_studied_part_by_part() {
 }
 
 #[test]
+fn the_suite_measures_every_capture_once_and_compares() {
+    let work = tempfile::tempdir().unwrap();
+    Capture::new(work.path()).write();
+    let list = work.path().join("list.toml");
+    let text = "[quick]\nsteps = 20\n[full]\nsteps = 30\n[[capture]]\nname = \"square\"\ndata = \"capture\"\n\
+        hold_out = \"camera=1\"\n[[capture]]\nname = \"elsewhere\"\ndata = \"elsewhere\"\n\
+        [[capture]]\nname = \"whole\"\ndata = \"capture\"\nhold_out = \"none\"\n";
+    std::fs::write(&list, text).unwrap();
+    let suite = |output: &str, more: &[&str]| {
+        let output = work.path().join(output);
+        let knobs = ["num_pts=120", "max_cap=150", "sh_degree=1", "motion=spacetime"].map(|s| ["--set", s]);
+        studies(&["suite", "--data", str(work.path()), "--list", str(&list), "-o", str(&output)])
+            .args(knobs.as_flattened())
+            .args(more)
+            .run()
+            .ok()
+    };
+    let said = suite("before", &["--rule"]);
+    let results = json_of(&work.path().join("before/results.json"));
+    let cells = results["cells"].as_array().unwrap();
+    let of = |name: &str, steps: u64| {
+        cells.iter().find(|c| c["capture"] == name && c["steps"] == steps).unwrap_or_else(|| panic!("{name} {steps}"))
+    };
+    assert_eq!(cells.len(), 4, "two captures are there, in two lengths: {said}");
+    for steps in [20, 80] {
+        let cell = of("square", steps);
+        assert!(cell["psnr"].as_f64().unwrap() > 5.0 && cell["psnr_train"].as_f64().unwrap() > 5.0);
+        let probes = cell["probes"].as_array().unwrap();
+        assert_eq!(probes.first().unwrap()["step"].as_u64().unwrap(), 0);
+        assert!(probes.len() >= 20, "{} looks at the training views", probes.len());
+        assert!(cell["fall"]["db"].as_f64().unwrap() >= 0.0);
+        assert!(of("whole", steps)["refused"].as_str().unwrap().contains("no view"));
+    }
+    assert!(said.contains("The rule ") && said.contains("| square |"), "{said}");
+
+    // Nothing is measured twice, and the same program and recipe give the same figures.
+    let results = std::fs::read(work.path().join("before/results.json")).unwrap();
+    suite("before", &["--rule"]);
+    assert_eq!(std::fs::read(work.path().join("before/results.json")).unwrap(), results);
+    let baseline = work.path().join("before/results.json");
+    let again = suite("after", &["--only", "square", "--playback", "--baseline", str(&baseline)]);
+    assert!(again.contains("PSNR: +0.00 dB in the mean"), "{again}");
+    let cell = &json_of(&work.path().join("after/results.json"))["cells"][0];
+    assert!(cell["playback_psnr"].as_f64().unwrap() > 20.0);
+    let run = work.path().join("after/runs/square-20");
+    assert!(run.join("scene.safetensors").is_file() && !run.join("checkpoints/00000020.safetensors").exists());
+    let none = studies(&["suite", "--list", str(&list), "--only", "squares"]).run().refused();
+    assert!(none.contains("squares") && none.contains("elsewhere"), "{none}");
+}
+
+#[test]
 fn help_teaches() {
     let help = studies(&["--help"]).run().ok();
-    for study in ["e00", "e01", "e02", "e03", "models"] {
+    for study in ["e00", "e01", "e02", "e03", "models", "suite", "make"] {
         assert!(help.contains(study), "{study} is missing");
         let own = studies(&[study, "--help"]).run().ok();
         assert!(

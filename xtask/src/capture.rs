@@ -35,7 +35,7 @@ const TRUTH_CAMERAS: [usize; 4] = [2, 8, 11, 17];
 const TRUTH_FRAMES: [usize; 4] = [3, 10, 17, 24];
 
 /// `capture [FOLDER]`, `capture --check [N]` and `capture --still CHARACTER.glb FOLDER ...`.
-pub fn command(arguments: &[String]) -> Result<()> {
+pub(crate) fn command(arguments: &[String]) -> Result<()> {
     let home = bundled_folder();
     match arguments {
         [flag, rest @ ..] if flag == "--check" => {

@@ -6,7 +6,7 @@ use image::{ExtendedColorType, ImageEncoder};
 use std::path::Path;
 
 /// A PNG file of `width` x `height` pixels; 16-bit samples in the machine's byte order.
-pub fn png(data: &[u8], width: usize, height: usize, color: ExtendedColorType) -> Result<Vec<u8>> {
+pub(crate) fn png(data: &[u8], width: usize, height: usize, color: ExtendedColorType) -> Result<Vec<u8>> {
     let mut out = Vec::new();
     let filter = if color == ExtendedColorType::L8 { FilterType::NoFilter } else { FilterType::Adaptive };
     let encoder = PngEncoder::new_with_quality(&mut out, CompressionType::Level(9), filter);
@@ -15,7 +15,7 @@ pub fn png(data: &[u8], width: usize, height: usize, color: ExtendedColorType) -
 }
 
 /// Writes under a temporary name in the same folder, then renames; makes the folder if need be.
-pub fn write_file(path: &Path, bytes: &[u8]) -> Result<()> {
+pub(crate) fn write_file(path: &Path, bytes: &[u8]) -> Result<()> {
     let place = || path.display().to_string();
     if let Some(folder) = path.parent() {
         std::fs::create_dir_all(folder).with_context(place)?;

@@ -12,7 +12,7 @@ const UNSIGNED_SHORT: u64 = 5123;
 const UNSIGNED_INT: u64 = 5125;
 
 /// A parsed .glb file.
-pub struct Glb {
+pub(crate) struct Glb {
     /// The JSON chunk.
     pub json: Value,
     /// The binary chunk.
@@ -21,7 +21,7 @@ pub struct Glb {
 
 impl Glb {
     /// Parses the container. Errors: not a glTF 2 binary, truncated chunks, broken JSON.
-    pub fn parse(bytes: &[u8]) -> Result<Glb> {
+    pub(crate) fn parse(bytes: &[u8]) -> Result<Glb> {
         let word = |at: usize| -> Result<u32> {
             let four = bytes.get(at..at + 4).with_context(|| format!("GLB ends before byte {}", at + 4))?;
             Ok(u32::from_le_bytes(four.try_into().expect("four bytes")))
@@ -42,7 +42,7 @@ impl Glb {
     }
 
     /// The file's bytes; both chunks padded to four bytes as the format asks.
-    pub fn to_bytes(&self) -> Vec<u8> {
+    pub(crate) fn to_bytes(&self) -> Vec<u8> {
         let mut json = self.json.to_string().into_bytes();
         json.resize(json.len().next_multiple_of(4), b' ');
         let mut bin = self.bin.clone();
@@ -60,12 +60,12 @@ impl Glb {
     }
 
     /// The array `name` of the JSON; empty if absent.
-    pub fn list(&self, name: &str) -> &[Value] {
+    pub(crate) fn list(&self, name: &str) -> &[Value] {
         self.json.get(name).and_then(Value::as_array).map_or(&[], Vec::as_slice)
     }
 
     /// The bytes of one buffer view.
-    pub fn view(&self, index: usize) -> Result<&[u8]> {
+    pub(crate) fn view(&self, index: usize) -> Result<&[u8]> {
         let view = self.list("bufferViews").get(index).with_context(|| format!("no bufferView {index}"))?;
         let start = number(view, "byteOffset").unwrap_or(0);
         let length = number(view, "byteLength").with_context(|| format!("bufferView {index} without byteLength"))?;
@@ -75,7 +75,7 @@ impl Glb {
 
     /// One accessor as numbers, row by row, with its components per row. Errors: sparse or strided accessors,
     /// normalised integers, data beyond the buffer view.
-    pub fn accessor(&self, index: usize) -> Result<(Vec<f64>, usize)> {
+    pub(crate) fn accessor(&self, index: usize) -> Result<(Vec<f64>, usize)> {
         let accessor = self.list("accessors").get(index).with_context(|| format!("no accessor {index}"))?;
         ensure!(accessor.get("sparse").is_none(), "accessor {index} is sparse, which this reader does not know");
         let width = match accessor["type"].as_str() {
@@ -116,7 +116,7 @@ impl Glb {
 }
 
 /// A non-negative integer member of a JSON object.
-pub fn number(value: &Value, name: &str) -> Option<usize> {
+pub(crate) fn number(value: &Value, name: &str) -> Option<usize> {
     value.get(name)?.as_u64().and_then(|n| usize::try_from(n).ok())
 }
 

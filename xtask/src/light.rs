@@ -23,7 +23,7 @@ const SHADOW_SOFTNESS: i64 = 3;
 const SHADOW_OFFSET: f64 = 0.035;
 
 /// The light of one instant.
-pub struct Light {
+pub(crate) struct Light {
     key: V3,
     fill: V3,
     right: V3,
@@ -35,7 +35,7 @@ pub struct Light {
 
 impl Light {
     /// Draws the shadow map of `casters`; `glow` is the orb's centre while it exists.
-    pub fn new(casters: &Mesh, glow: Option<V3>) -> Light {
+    pub(crate) fn new(casters: &Mesh, glow: Option<V3>) -> Light {
         let key = KEY_DIRECTION.unit();
         let right = v3(0.0, 1.0, 0.0).cross(key).unit();
         let up = key.cross(right);
@@ -113,7 +113,7 @@ impl Light {
     }
 
     /// Light that arrives at a matt surface with unit `normal`; `open` in `[0,1]` is how much of the sky it sees.
-    pub fn arriving(&self, point: V3, normal: V3, open: f64) -> V3 {
+    pub(crate) fn arriving(&self, point: V3, normal: V3, open: f64) -> V3 {
         let sky = SKY_COLOR * (0.5 + 0.5 * normal.y) + GROUND_COLOR * (0.5 - 0.5 * normal.y);
         let mut sum = sky * open + FILL_COLOR * normal.dot(self.fill).max(0.0);
         let facing = normal.dot(self.key);

@@ -2,6 +2,7 @@
 
 mod camera;
 mod capture;
+mod count;
 mod files;
 mod glb;
 mod light;
@@ -32,7 +33,8 @@ chores:
                              draws a character frozen in one pose, cut out, from N (default 100) cameras on a
                              hemisphere, PIXELS (default 400) wide and high; every 8th is held out
   strip-character IN.glb OUT.glb CLIP... [--drop NODE...]
-                             keeps the named animation clips of a character, drops the named nodes' meshes";
+                             keeps the named animation clips of a character, drops the named nodes' meshes
+  count [FOLDER]             counts lines of code, without tests, comments and blank lines, of the repository FOLDER";
 
 fn main() -> ExitCode {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
@@ -49,6 +51,7 @@ fn run(arguments: &[String]) -> Result<()> {
     let (chore, rest) = arguments.split_first().context(USAGE)?;
     match chore.as_str() {
         "capture" => capture::command(rest),
+        "count" => count::command(rest),
         "strip-character" => strip_character(rest),
         _ => bail!("unknown chore {chore}\n{USAGE}"),
     }

@@ -7,35 +7,35 @@ use crate::texture::{Texture, srgb};
 use crate::vector::{V3, smooth_step};
 
 /// The knight's texture.
-pub const KNIGHT: u16 = 0;
+pub(crate) const KNIGHT: u16 = 0;
 /// The mage's texture.
-pub const MAGE: u16 = 1;
+pub(crate) const MAGE: u16 = 1;
 /// Tiles and a round carpet; uv = world (x, z).
-pub const FLOOR: u16 = 2;
+pub(crate) const FLOOR: u16 = 2;
 /// Stone base, plaster and banners; uv = (along, height).
-pub const WALL: u16 = 3;
+pub(crate) const WALL: u16 = 3;
 /// Stone drums; uv = (turn, height).
-pub const COLUMN: u16 = 4;
+pub(crate) const COLUMN: u16 = 4;
 /// Wooden crate; uv in `[0,1]`² per face.
-pub const CRATE: u16 = 5;
+pub(crate) const CRATE: u16 = 5;
 /// Painted crate, as above.
-pub const PAINTED_CRATE: u16 = 6;
+pub(crate) const PAINTED_CRATE: u16 = 6;
 /// Barrel; uv = (turn, height).
-pub const BARREL: u16 = 7;
+pub(crate) const BARREL: u16 = 7;
 /// The glowing orb; uv = (turn, polar).
-pub const ORB: u16 = 8;
+pub(crate) const ORB: u16 = 8;
 /// Striped ball; uv = (turn, polar).
-pub const BALL: u16 = 9;
+pub(crate) const BALL: u16 = 9;
 
 /// Side of a floor tile, scene units.
 const TILE: f64 = 2.2;
 /// Distance between banners, scene units.
-pub const BAY: f64 = 4.0;
+pub(crate) const BAY: f64 = 4.0;
 /// Height of the stone base of the walls, scene units.
 const BASE: f64 = 0.85;
 
 /// Linear colour of `material` at `uv`.
-pub fn albedo(material: u16, uv: [f64; 2], textures: [&Texture; 2]) -> V3 {
+pub(crate) fn albedo(material: u16, uv: [f64; 2], textures: [&Texture; 2]) -> V3 {
     match material {
         KNIGHT | MAGE => textures[material as usize].sample(uv),
         FLOOR => floor(uv[0], uv[1]),
@@ -50,7 +50,7 @@ pub fn albedo(material: u16, uv: [f64; 2], textures: [&Texture; 2]) -> V3 {
 }
 
 /// Light that a material gives off by itself.
-pub fn glow(material: u16) -> V3 {
+pub(crate) fn glow(material: u16) -> V3 {
     if material == ORB { srgb(70, 190, 200) } else { V3::default() }
 }
 

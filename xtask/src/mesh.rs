@@ -4,7 +4,7 @@ use crate::vector::{Affine, V3, sin_cos, v3};
 
 /// One triangle.
 #[derive(Clone, Copy, Debug)]
-pub struct Triangle {
+pub(crate) struct Triangle {
     /// Vertex indices.
     pub vertices: [u32; 3],
     /// Index into the scene's materials.
@@ -15,7 +15,7 @@ pub struct Triangle {
 
 /// Vertices (position, normal, uv) and triangles.
 #[derive(Clone, Debug, Default)]
-pub struct Mesh {
+pub(crate) struct Mesh {
     /// World positions.
     pub positions: Vec<V3>,
     /// Unit normals.
@@ -28,19 +28,19 @@ pub struct Mesh {
 
 impl Mesh {
     /// Appends a vertex.
-    pub fn push_vertex(&mut self, position: V3, normal: V3, uv: [f64; 2]) {
+    pub(crate) fn push_vertex(&mut self, position: V3, normal: V3, uv: [f64; 2]) {
         self.positions.push(position);
         self.normals.push(normal);
         self.uvs.push(uv);
     }
 
     /// Appends a triangle.
-    pub fn push_triangle(&mut self, vertices: [u32; 3], material: u16, object: u8) {
+    pub(crate) fn push_triangle(&mut self, vertices: [u32; 3], material: u16, object: u8) {
         self.triangles.push(Triangle { vertices, material, object });
     }
 
     /// Appends another mesh.
-    pub fn append(&mut self, other: &Mesh) {
+    pub(crate) fn append(&mut self, other: &Mesh) {
         let first = self.positions.len() as u32;
         self.positions.extend_from_slice(&other.positions);
         self.normals.extend_from_slice(&other.normals);
@@ -50,7 +50,7 @@ impl Mesh {
     }
 
     /// A parallelogram from `corner` along `u` and `v`; uv runs in scene units from `uv0`.
-    pub fn quad(&mut self, corner: V3, u: V3, v: V3, uv0: [f64; 2], material: u16, object: u8) {
+    pub(crate) fn quad(&mut self, corner: V3, u: V3, v: V3, uv0: [f64; 2], material: u16, object: u8) {
         let first = self.positions.len() as u32;
         let normal = u.cross(v).unit();
         let (lu, lv) = (u.length(), v.length());
@@ -62,7 +62,7 @@ impl Mesh {
     }
 
     /// A box standing on the origin of `place`; each face has uv in `[0,1]`².
-    pub fn crate_box(&mut self, place: &Affine, size: V3, material: u16, object: u8) {
+    pub(crate) fn crate_box(&mut self, place: &Affine, size: V3, material: u16, object: u8) {
         let (hx, hz) = (0.5 * size.x, 0.5 * size.z);
         let corner = |x: f64, y: f64, z: f64| v3(x * hx, y * size.y, z * hz);
         let faces = [
@@ -85,7 +85,7 @@ impl Mesh {
     }
 
     /// A solid of revolution about the y axis of `place`: `profile` holds (radius, height), uv = (turn, height).
-    pub fn lathe(&mut self, place: &Affine, profile: &[(f64, f64)], sides: u32, material: u16, object: u8) {
+    pub(crate) fn lathe(&mut self, place: &Affine, profile: &[(f64, f64)], sides: u32, material: u16, object: u8) {
         for pair in profile.windows(2) {
             let [(r0, h0), (r1, h1)] = [pair[0], pair[1]];
             let first = self.positions.len() as u32;
@@ -106,7 +106,7 @@ impl Mesh {
     }
 
     /// A ball about the origin of `place` with smooth normals; uv = (turn, polar angle / π).
-    pub fn ball(&mut self, place: &Affine, radius: f64, sides: u32, material: u16, object: u8) {
+    pub(crate) fn ball(&mut self, place: &Affine, radius: f64, sides: u32, material: u16, object: u8) {
         let first = self.positions.len() as u32;
         let rings = sides / 2;
         for ring in 0..=rings {

@@ -5,7 +5,7 @@ const DYNAMIC_THRESHOLD: f64 = 0.05;
 
 /// One camera's figures, or the sum over several.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Motion {
+pub(crate) struct Motion {
     pixels: u64,
     dynamic: u64,
     squares: f64,
@@ -13,7 +13,7 @@ pub struct Motion {
 
 impl Motion {
     /// Measures a camera's frames (sRGB codes, three per pixel, all of one size).
-    pub fn of_frames(frames: &[&[u8]]) -> Motion {
+    pub(crate) fn of_frames(frames: &[&[u8]]) -> Motion {
         let length = frames.first().map_or(0, |f| f.len());
         let mean: Vec<f64> = (0..length)
             .map(|i| frames.iter().map(|f| f64::from(f[i])).sum::<f64>() / (255.0 * frames.len() as f64))
@@ -33,17 +33,17 @@ impl Motion {
     }
 
     /// The figures of both.
-    pub fn plus(self, o: Motion) -> Motion {
+    pub(crate) fn plus(self, o: Motion) -> Motion {
         Motion { pixels: self.pixels + o.pixels, dynamic: self.dynamic + o.dynamic, squares: self.squares + o.squares }
     }
 
     /// Share of dynamic pixels, percent.
-    pub fn coverage(&self) -> f64 {
+    pub(crate) fn coverage(&self) -> f64 {
         100.0 * self.dynamic as f64 / self.pixels as f64
     }
 
     /// PSNR of the temporal mean within the dynamic region, dB.
-    pub fn mean_psnr(&self) -> f64 {
+    pub(crate) fn mean_psnr(&self) -> f64 {
         -10.0 * (self.squares / (3 * self.dynamic) as f64).log10()
     }
 }

@@ -9,7 +9,7 @@ use crate::texture::{Texture, srgb_from_linear};
 use crate::vector::{V3, smooth_step, v3};
 
 /// A rendered picture.
-pub struct Picture {
+pub(crate) struct Picture {
     /// sRGB codes, rows from the top, three per pixel.
     pub rgb: Vec<u8>,
     /// 255 where moving objects cover at least half a pixel, else 0.
@@ -26,7 +26,7 @@ const REACH: usize = LENS.len() / 2;
 const _: () = assert!(SUPERSAMPLING == 3);
 
 /// The picture, black where nothing is seen. `textures`: the characters', knight first.
-pub fn shade(textures: [&Texture; 2], frame: &Frame, camera: &Camera, seen: &Visibility) -> Picture {
+pub(crate) fn shade(textures: [&Texture; 2], frame: &Frame, camera: &Camera, seen: &Visibility) -> Picture {
     let pixels = camera.width * camera.height;
     let mut out = Picture { rgb: Vec::with_capacity(3 * pixels), mask: Vec::with_capacity(pixels) };
     each_pixel(textures, frame, camera, seen, |color, moving| {
@@ -38,7 +38,7 @@ pub fn shade(textures: [&Texture; 2], frame: &Frame, camera: &Camera, seen: &Vis
 
 /// The picture of moving objects alone: sRGB codes of their own colour (not dimmed by their coverage) and coverage, four
 /// per pixel.
-pub fn cut_out(textures: [&Texture; 2], frame: &Frame, camera: &Camera, seen: &Visibility) -> Vec<u8> {
+pub(crate) fn cut_out(textures: [&Texture; 2], frame: &Frame, camera: &Camera, seen: &Visibility) -> Vec<u8> {
     let mut out = Vec::with_capacity(4 * camera.width * camera.height);
     each_pixel(textures, frame, camera, seen, |color, covered| {
         let own = if covered > 0.0 { color * (1.0 / covered) } else { V3::default() };
@@ -149,14 +149,14 @@ fn openness(frame: &Frame, point: V3, normal: V3, object: u8) -> f64 {
 
 /// The last few triangles' edge functions: neighbouring samples mostly see the same triangle.
 #[derive(Default)]
-pub struct EdgeCache {
+pub(crate) struct EdgeCache {
     slots: [Option<(u32, Edges)>; 4],
     next: usize,
 }
 
 impl EdgeCache {
     /// The edge functions of triangle `index`, which must be visible (so not edge-on).
-    pub fn get(&mut self, mesh: &Mesh, camera: &Camera, index: u32) -> Edges {
+    pub(crate) fn get(&mut self, mesh: &Mesh, camera: &Camera, index: u32) -> Edges {
         if let Some((_, edges)) = self.slots.iter().flatten().find(|(i, _)| *i == index) {
             return *edges;
         }
@@ -168,7 +168,13 @@ impl EdgeCache {
 }
 
 /// World position of what the middle sample of pixel (x, y) sees, with its triangle, weights and depth.
-pub fn surface(frame: &Frame, camera: &Camera, seen: &Visibility, x: usize, y: usize) -> Option<(u32, [f64; 3], f64)> {
+pub(crate) fn surface(
+    frame: &Frame,
+    camera: &Camera,
+    seen: &Visibility,
+    x: usize,
+    y: usize,
+) -> Option<(u32, [f64; 3], f64)> {
     let (column, row) = (x * SUPERSAMPLING + SUPERSAMPLING / 2, y * SUPERSAMPLING + SUPERSAMPLING / 2);
     let index = seen.triangles[row * seen.width + column];
     if index == NOTHING {
@@ -180,7 +186,7 @@ pub fn surface(frame: &Frame, camera: &Camera, seen: &Visibility, x: usize, y: u
 }
 
 /// The point of triangle `index` of `mesh` at `weights`.
-pub fn point_at(mesh: &Mesh, vertices: [u32; 3], weights: [f64; 3]) -> V3 {
+pub(crate) fn point_at(mesh: &Mesh, vertices: [u32; 3], weights: [f64; 3]) -> V3 {
     let mut point = v3(0.0, 0.0, 0.0);
     for (vertex, weight) in vertices.iter().zip(weights) {
         point = point + mesh.positions[*vertex as usize] * weight;

@@ -10,22 +10,22 @@ use crate::mesh::Mesh;
 use crate::vector::V3;
 
 /// Samples per pixel in each direction. Odd, so that the middle sample is the pixel's centre.
-pub const SUPERSAMPLING: usize = 3;
+pub(crate) const SUPERSAMPLING: usize = 3;
 /// Nothing nearer than this is drawn (scene units).
 const NEAR: f64 = 0.05;
 /// Marks a sample that sees nothing.
-pub const NOTHING: u32 = u32::MAX;
+pub(crate) const NOTHING: u32 = u32::MAX;
 
 /// The linear function that gives a triangle's perspective-correct weights at a sample.
 #[derive(Clone, Copy, Debug)]
-pub struct Edges {
+pub(crate) struct Edges {
     /// V⁻¹, rows.
     inverse: [V3; 3],
 }
 
 impl Edges {
     /// From camera-space corners; `None` for a triangle seen edge-on.
-    pub fn new(corners: [V3; 3]) -> Option<Edges> {
+    pub(crate) fn new(corners: [V3; 3]) -> Option<Edges> {
         let [a, b, c] = corners;
         let rows = [b.cross(c), c.cross(a), a.cross(b)];
         let det = a.dot(rows[0]);
@@ -38,7 +38,7 @@ impl Edges {
     }
 
     /// Weights (sum 1) and depth of the point of the triangle's plane on the ray.
-    pub fn weights(&self, d: V3) -> ([f64; 3], f64) {
+    pub(crate) fn weights(&self, d: V3) -> ([f64; 3], f64) {
         let e = self.at(d);
         let z = 1.0 / (e[0] + e[1] + e[2]);
         (e.map(|v| v * z), z)
@@ -46,7 +46,7 @@ impl Edges {
 }
 
 /// Visible triangle and inverse depth at every sample of one picture.
-pub struct Visibility {
+pub(crate) struct Visibility {
     /// Samples across.
     pub width: usize,
     /// Samples down.
@@ -58,7 +58,7 @@ pub struct Visibility {
 }
 
 /// The ray through sample (column, row), z = 1.
-pub fn sample_ray(camera: &Camera, column: usize, row: usize) -> V3 {
+pub(crate) fn sample_ray(camera: &Camera, column: usize, row: usize) -> V3 {
     let scale = 1.0 / (SUPERSAMPLING as f64 * camera.focal);
     let half = 0.5 * SUPERSAMPLING as f64;
     V3 {
@@ -69,12 +69,12 @@ pub fn sample_ray(camera: &Camera, column: usize, row: usize) -> V3 {
 }
 
 /// Camera-space corners of triangle `index`.
-pub fn corners(mesh: &Mesh, camera: &Camera, index: usize) -> [V3; 3] {
+pub(crate) fn corners(mesh: &Mesh, camera: &Camera, index: usize) -> [V3; 3] {
     mesh.triangles[index].vertices.map(|v| camera.to_camera_axes(mesh.positions[v as usize]))
 }
 
 /// Draws the whole mesh.
-pub fn rasterize(mesh: &Mesh, camera: &Camera) -> Visibility {
+pub(crate) fn rasterize(mesh: &Mesh, camera: &Camera) -> Visibility {
     let (width, height) = (camera.width * SUPERSAMPLING, camera.height * SUPERSAMPLING);
     let mut out = Visibility {
         width,

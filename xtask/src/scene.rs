@@ -14,22 +14,22 @@ use std::ops::Range;
 use std::path::Path;
 
 /// Frames of the take.
-pub const FRAMES: usize = 30;
+pub(crate) const FRAMES: usize = 30;
 /// Frames per second.
-pub const FPS: f64 = 30.0;
+pub(crate) const FPS: f64 = 30.0;
 /// First frame in which the orb exists.
-pub const ORB_APPEARS: usize = 9;
+pub(crate) const ORB_APPEARS: usize = 9;
 /// First frame in which the painted crate is gone.
-pub const CRATE_LEAVES: usize = 18;
+pub(crate) const CRATE_LEAVES: usize = 18;
 /// Number of objects, the static set (0) included: knight 1, mage 2, ball 3, crate 4, orb 5.
-pub const OBJECTS: usize = 6;
+pub(crate) const OBJECTS: usize = 6;
 
 /// The hall: back wall, side walls and the wall behind the cameras, all seen from inside.
-pub const BACK: f64 = -4.2;
+pub(crate) const BACK: f64 = -4.2;
 /// See [`BACK`].
-pub const FRONT: f64 = 7.8;
+pub(crate) const FRONT: f64 = 7.8;
 /// Side walls at ±this.
-pub const SIDE: f64 = 7.5;
+pub(crate) const SIDE: f64 = 7.5;
 const HEIGHT: f64 = 7.2;
 
 const ORB_RADIUS: f64 = 0.32;
@@ -41,7 +41,7 @@ const BALL_RADIUS: f64 = 0.34;
 const GRAVITY: f64 = 14.0;
 
 /// Everything that does not depend on time.
-pub struct Stage {
+pub(crate) struct Stage {
     knight: Character,
     mage: Character,
     fixed: Mesh,
@@ -49,7 +49,7 @@ pub struct Stage {
 }
 
 /// One instant of the scene.
-pub struct Frame {
+pub(crate) struct Frame {
     /// All triangles, the static set first.
     pub mesh: Mesh,
     /// First vertex of each object, `None` while it does not exist.
@@ -64,7 +64,7 @@ pub struct Frame {
 
 impl Stage {
     /// Loads both characters from `folder`.
-    pub fn load(folder: &Path) -> Result<Stage> {
+    pub(crate) fn load(folder: &Path) -> Result<Stage> {
         let character = |name: &str| -> Result<Character> {
             let path = folder.join(name);
             let bytes = std::fs::read(&path).with_context(|| path.display().to_string())?;
@@ -77,12 +77,12 @@ impl Stage {
     }
 
     /// The characters' textures, knight first.
-    pub fn textures(&self) -> [&Texture; 2] {
+    pub(crate) fn textures(&self) -> [&Texture; 2] {
         [&self.knight.texture, &self.mage.texture]
     }
 
     /// The scene at frame `t`.
-    pub fn frame(&self, t: usize) -> Result<Frame> {
+    pub(crate) fn frame(&self, t: usize) -> Result<Frame> {
         let seconds = t as f64 / FPS;
         let mut moving = Mesh::default();
         let fixed = self.fixed.positions.len();

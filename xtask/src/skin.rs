@@ -9,14 +9,14 @@ use serde_json::Value;
 
 /// Local transform of one node.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Trs {
+pub(crate) struct Trs {
     translation: V3,
     rotation: Quat,
     scale: V3,
 }
 
 /// Local transforms of all nodes.
-pub type Pose = Vec<Trs>;
+pub(crate) type Pose = Vec<Trs>;
 
 #[derive(Clone, Copy, PartialEq)]
 enum Path {
@@ -52,7 +52,7 @@ struct Part {
 }
 
 /// A loaded character.
-pub struct Character {
+pub(crate) struct Character {
     names: Vec<String>,
     parents: Vec<Option<usize>>,
     rest: Pose,
@@ -66,7 +66,7 @@ pub struct Character {
 
 impl Character {
     /// Loads the first skin, all meshes and all clips. Errors: features this small reader does not know.
-    pub fn load(glb: &Glb) -> Result<Character> {
+    pub(crate) fn load(glb: &Glb) -> Result<Character> {
         let nodes = glb.list("nodes");
         let mut parents = vec![None; nodes.len()];
         for (i, node) in nodes.iter().enumerate() {
@@ -105,17 +105,17 @@ impl Character {
     }
 
     /// Index of the node `name`.
-    pub fn node(&self, name: &str) -> Result<usize> {
+    pub(crate) fn node(&self, name: &str) -> Result<usize> {
         self.names.iter().position(|n| n == name).with_context(|| format!("no node is named {name}"))
     }
 
     /// The pose that the file rests in.
-    pub fn rest(&self) -> &Pose {
+    pub(crate) fn rest(&self) -> &Pose {
         &self.rest
     }
 
     /// The pose of `clip` at `seconds`, repeated beyond its end.
-    pub fn sample(&self, clip: &str, seconds: f64) -> Result<Pose> {
+    pub(crate) fn sample(&self, clip: &str, seconds: f64) -> Result<Pose> {
         let clip = self.clips.iter().find(|c| c.name == clip).with_context(|| format!("no clip is named {clip}"))?;
         let t = if clip.seconds > 0.0 { seconds - (seconds / clip.seconds).floor() * clip.seconds } else { 0.0 };
         let mut pose = self.rest.clone();
@@ -126,7 +126,7 @@ impl Character {
     }
 
     /// `a` at s = 0, `b` at s = 1.
-    pub fn blend(a: &Pose, b: &Pose, s: f64) -> Pose {
+    pub(crate) fn blend(a: &Pose, b: &Pose, s: f64) -> Pose {
         let mix = |(a, b): (&Trs, &Trs)| Trs {
             translation: a.translation.lerp(b.translation, s),
             rotation: nlerp(a.rotation, b.rotation, s),
@@ -136,7 +136,7 @@ impl Character {
     }
 
     /// `lower` with the subtree under node `root` taken from `upper` (walk and cast at once).
-    pub fn combine(&self, lower: &Pose, upper: &Pose, root: &str) -> Result<Pose> {
+    pub(crate) fn combine(&self, lower: &Pose, upper: &Pose, root: &str) -> Result<Pose> {
         let root = self.node(root)?;
         let under = |mut i: usize| loop {
             match self.parents[i] {
@@ -149,7 +149,7 @@ impl Character {
     }
 
     /// Node-to-character maps of all nodes.
-    pub fn globals(&self, pose: &Pose) -> Vec<Affine> {
+    pub(crate) fn globals(&self, pose: &Pose) -> Vec<Affine> {
         let local = |i: usize| Affine::from_trs(pose[i].translation, pose[i].rotation, pose[i].scale);
         let up_to_root = |i: usize| {
             let (mut map, mut at) = (local(i), self.parents[i]);
@@ -163,7 +163,7 @@ impl Character {
     }
 
     /// Appends the posed character to `mesh`, skinned parts first, and returns the number of skinned vertices.
-    pub fn draw(&self, pose: &Pose, world: &Affine, material: u16, object: u8, mesh: &mut Mesh) -> usize {
+    pub(crate) fn draw(&self, pose: &Pose, world: &Affine, material: u16, object: u8, mesh: &mut Mesh) -> usize {
         let globals = self.globals(pose);
         let skinning: Vec<Affine> = self
             .joints

@@ -89,7 +89,7 @@ fn whole(text: &str, range: &std::ops::RangeInclusive<usize>) -> Result<usize> {
 }
 
 /// `capture --still CHARACTER.glb FOLDER ...`.
-pub fn command(arguments: &[String]) -> Result<()> {
+pub(crate) fn command(arguments: &[String]) -> Result<()> {
     let wish = Wish::parse(arguments)?;
     let start = std::time::Instant::now();
     let (frame, texture) = posed(&wish)?;

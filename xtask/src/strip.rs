@@ -6,7 +6,7 @@ use anyhow::{Context, Result, ensure};
 use serde_json::{Value, json};
 
 /// The stripped file. Errors: a clip or node that the file does not have.
-pub fn strip(glb: &Glb, clips: &[String], drop: &[String]) -> Result<Glb> {
+pub(crate) fn strip(glb: &Glb, clips: &[String], drop: &[String]) -> Result<Glb> {
     let mut json = glb.json.clone();
     for clip in clips {
         ensure!(glb.list("animations").iter().any(|a| a["name"] == clip.as_str()), "no clip is named {clip}");

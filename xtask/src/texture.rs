@@ -5,7 +5,7 @@ use anyhow::{Context, Result};
 use std::sync::LazyLock;
 
 /// Linear value of each of the 256 sRGB codes (IEC 61966-2-1).
-pub static LINEAR_FROM_SRGB: LazyLock<[f64; 256]> = LazyLock::new(|| {
+pub(crate) static LINEAR_FROM_SRGB: LazyLock<[f64; 256]> = LazyLock::new(|| {
     std::array::from_fn(|code| {
         let s = code as f64 / 255.0;
         if s <= 0.04045 { s / 12.92 } else { power_2_4((s + 0.055) / 1.055) }
@@ -21,12 +21,12 @@ static CODE_STEPS: LazyLock<[f64; 255]> = LazyLock::new(|| {
 });
 
 /// The nearest sRGB code of a linear value, clamped to 0..255.
-pub fn srgb_from_linear(linear: f64) -> u8 {
+pub(crate) fn srgb_from_linear(linear: f64) -> u8 {
     CODE_STEPS.partition_point(|step| *step < linear) as u8
 }
 
 /// A linear colour from sRGB codes.
-pub fn srgb(r: u8, g: u8, b: u8) -> V3 {
+pub(crate) fn srgb(r: u8, g: u8, b: u8) -> V3 {
     let table = &*LINEAR_FROM_SRGB;
     v3(table[r as usize], table[g as usize], table[b as usize])
 }
@@ -45,7 +45,7 @@ fn power_2_4(x: f64) -> f64 {
 }
 
 /// A texture in linear light, rows from the top.
-pub struct Texture {
+pub(crate) struct Texture {
     width: usize,
     height: usize,
     texels: Vec<V3>,
@@ -53,7 +53,7 @@ pub struct Texture {
 
 impl Texture {
     /// Decodes an embedded PNG.
-    pub fn from_png(bytes: &[u8]) -> Result<Texture> {
+    pub(crate) fn from_png(bytes: &[u8]) -> Result<Texture> {
         let picture =
             image::load_from_memory_with_format(bytes, image::ImageFormat::Png).context("embedded texture")?;
         let rgb = picture.to_rgb8();
@@ -62,7 +62,7 @@ impl Texture {
     }
 
     /// Bilinear look-up, repeated outside [0,1)² (the files' sampler: linear, repeat).
-    pub fn sample(&self, uv: [f64; 2]) -> V3 {
+    pub(crate) fn sample(&self, uv: [f64; 2]) -> V3 {
         let x = uv[0] * self.width as f64 - 0.5;
         let y = uv[1] * self.height as f64 - 0.5;
         let (fx, fy) = (x - x.floor(), y - y.floor());

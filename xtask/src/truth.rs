@@ -8,11 +8,11 @@ use crate::scene::Frame;
 use crate::vector::{V3, hash01};
 
 /// Depth codes per scene unit in the 16-bit pictures; code 0 means "nothing".
-pub const DEPTH_SCALE: f64 = 2048.0;
+pub(crate) const DEPTH_SCALE: f64 = 2048.0;
 /// Flow codes per pixel; code 32768 is no motion (the KITTI 2012 convention).
-pub const FLOW_SCALE: f64 = 64.0;
+pub(crate) const FLOW_SCALE: f64 = 64.0;
 /// Vertex tracks.
-pub const TRACKS: usize = 200;
+pub(crate) const TRACKS: usize = 200;
 /// A vertex counts as seen when it lies at most this far behind what its pixel shows, scene units.
 const SEEN_TOLERANCE: f64 = 0.03;
 /// Points of the sparse cloud.
@@ -23,14 +23,14 @@ const CLOUD_NOISE: f64 = 0.005;
 const CLOUD_VIEWS: usize = 3;
 
 /// Depth (z in camera axes) at pixel centres, one code per pixel.
-pub fn depth(camera: &Camera, seen: &Visibility, frame: &Frame) -> Vec<u16> {
+pub(crate) fn depth(camera: &Camera, seen: &Visibility, frame: &Frame) -> Vec<u16> {
     pixels(camera)
         .map(|(x, y)| surface(frame, camera, seen, x, y).map_or(0, |(_, _, z)| (z * DEPTH_SCALE).round() as u16))
         .collect()
 }
 
 /// Flow to the next frame at pixel centres: (u, v, valid) codes per pixel. Not valid: what no longer exists.
-pub fn flow(camera: &Camera, seen: &Visibility, frame: &Frame, next: &Frame) -> Vec<u16> {
+pub(crate) fn flow(camera: &Camera, seen: &Visibility, frame: &Frame, next: &Frame) -> Vec<u16> {
     let mut out = Vec::with_capacity(3 * camera.width * camera.height);
     for (x, y) in pixels(camera) {
         let moved = surface(frame, camera, seen, x, y).and_then(|(index, weights, _)| {
@@ -53,7 +53,7 @@ fn pixels(camera: &Camera) -> impl Iterator<Item = (usize, usize)> + '_ {
 
 /// The tracked vertices: evenly strided over those skinned vertices that at least [`CLOUD_VIEWS`] of the views see in
 /// `frame` (most others are inside helmets and sleeves), half of them on each character.
-pub fn tracked_vertices(frame: &Frame, views: &[(&Camera, &Visibility)]) -> Vec<usize> {
+pub(crate) fn tracked_vertices(frame: &Frame, views: &[(&Camera, &Visibility)]) -> Vec<usize> {
     let seen = |vertex: &usize| {
         let point = frame.mesh.positions[*vertex];
         views.iter().filter(|(camera, seen)| is_seen(camera, seen, point)).count() >= CLOUD_VIEWS
@@ -69,7 +69,7 @@ pub fn tracked_vertices(frame: &Frame, views: &[(&Camera, &Visibility)]) -> Vec<
 }
 
 /// 1 for each of `points` that the camera sees.
-pub fn seen_points(camera: &Camera, seen: &Visibility, points: &[V3]) -> Vec<u8> {
+pub(crate) fn seen_points(camera: &Camera, seen: &Visibility, points: &[V3]) -> Vec<u8> {
     points.iter().map(|p| u8::from(is_seen(camera, seen, *p))).collect()
 }
 
@@ -87,11 +87,11 @@ fn is_seen(camera: &Camera, seen: &Visibility, point: V3) -> bool {
 }
 
 /// A point of the sparse cloud: position and sRGB colour.
-pub type CloudPoint = ([f32; 3], [u8; 3]);
+pub(crate) type CloudPoint = ([f32; 3], [u8; 3]);
 
 /// Stands in for structure from motion: random pixels of the first frame, kept when enough cameras see the point,
 /// with noise. `views` are the training cameras with what they see and their pictures.
-pub fn sparse_cloud(frame: &Frame, views: &[(&Camera, &Visibility, &[u8])]) -> Vec<CloudPoint> {
+pub(crate) fn sparse_cloud(frame: &Frame, views: &[(&Camera, &Visibility, &[u8])]) -> Vec<CloudPoint> {
     let mut cloud = Vec::with_capacity(CLOUD_POINTS);
     let mut caches: Vec<EdgeCache> = views.iter().map(|_| EdgeCache::default()).collect();
     let mut draw = 0;
@@ -121,12 +121,12 @@ pub fn sparse_cloud(frame: &Frame, views: &[(&Camera, &Visibility, &[u8])]) -> V
 }
 
 /// World positions of the tracked vertices.
-pub fn track_points(mesh: &Mesh, vertices: &[usize]) -> Vec<V3> {
+pub(crate) fn track_points(mesh: &Mesh, vertices: &[usize]) -> Vec<V3> {
     vertices.iter().map(|v| mesh.positions[*v]).collect()
 }
 
 /// A C-ordered .npy file, version 1.0. `kind` is NumPy's name of the element ("<f4", "|u1").
-pub fn npy(kind: &str, shape: &[usize], data: &[u8]) -> Vec<u8> {
+pub(crate) fn npy(kind: &str, shape: &[usize], data: &[u8]) -> Vec<u8> {
     let shape: String = shape.iter().map(|n| format!("{n}, ")).collect();
     let mut header = format!("{{'descr': '{kind}', 'fortran_order': False, 'shape': ({}), }}", shape.trim_end());
     // Magic, version and length take ten bytes; the whole header is a multiple of 64 and ends with a newline.
@@ -141,7 +141,7 @@ pub fn npy(kind: &str, shape: &[usize], data: &[u8]) -> Vec<u8> {
 }
 
 /// A binary little-endian .ply file of the cloud.
-pub fn ply(cloud: &[CloudPoint]) -> Vec<u8> {
+pub(crate) fn ply(cloud: &[CloudPoint]) -> Vec<u8> {
     let mut out = format!("ply\nformat binary_little_endian 1.0\nelement vertex {}\n", cloud.len());
     for axis in ["x", "y", "z"] {
         out.push_str(&format!("property float {axis}\n"));

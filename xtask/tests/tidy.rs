@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 /// The allowed order of a crate's top modules: a module may import those before it. Names that do not exist yet
 /// hold a place for what the design foresees.
-const ORDER: [(&str, &[&str]); 5] = [
+const ORDER: [(&str, &[&str]); 6] = [
     (
         "crates/splat4d",
         &[
@@ -17,12 +17,13 @@ const ORDER: [(&str, &[&str]); 5] = [
     (
         "crates/splat4d-train",
         // The recipe stands first because everything is told by it; losses and upkeep before
-        // `methods`, which choose among them; `init` needs a model's plan; `eval` writes as safely as `train` does.
+        // `methods`, which choose among them; `init` needs a model's plan; `eval` writes as safely as `run` does.
         &[
-            "settings", "recipe", "event", "capture", "sampler", "optim", "loss", "learner", "upkeep", "methods",
-            "init", "train", "eval", "training", "compress", "dynamics", "dist",
+            "settings", "recipe", "event", "capture", "vision", "sampler", "optim", "loss", "learner", "upkeep",
+            "methods", "step", "init", "run", "eval", "training", "compress", "dynamics", "dist",
         ],
     ),
+    ("crates/splat4d-import", &["video", "sync", "sfm", "corrections", "write"]),
     (
         "crates/splat4d-serve",
         &["write_timeout", "body", "range", "guard", "scene", "assets", "page", "events", "answer", "server"],
@@ -52,7 +53,24 @@ const ORDER: [(&str, &[&str]); 5] = [
             "main",
         ],
     ),
-    ("studies", &["cells", "study", "tables", "deformation", "lifting", "e00", "e01", "e02", "e03", "models", "main"]),
+    (
+        "studies",
+        &[
+            "cells",
+            "study",
+            "tables",
+            "deformation",
+            "lifting",
+            "made",
+            "e00",
+            "e01",
+            "e02",
+            "e03",
+            "models",
+            "suite",
+            "main",
+        ],
+    ),
 ];
 
 /// Module that puts together what others declare: of modules that stand above it it may import names with this ending.
@@ -84,7 +102,7 @@ const SHELLS: [&str; 3] = ["crates/splat4d-cli/", "studies/", "xtask/"];
 const PATH_WORDS: [&str; 3] = ["std::fs", "std::path", "File::open"];
 
 /// Documents whose paths and flags are checked.
-const DOCS: [&str; 10] = [
+const DOCS: [&str; 11] = [
     "README.md",
     "ARCHITECTURE.md",
     "CONVENTIONS.md",
@@ -95,6 +113,7 @@ const DOCS: [&str; 10] = [
     "docs/formats.md",
     "docs/models.md",
     "docs/recipe.md",
+    "docs/suite.md",
 ];
 
 /// Folders of the repository that a path in a document begins with.
@@ -496,4 +515,25 @@ fn nobody_asks_which_motion_model_it_is() {
         MODEL_NAMES.iter().filter(|(file, _)| !used.contains(file)).map(|(f, _)| format!("{f}: no exemption needed")),
     );
     report(troubles, "Ask for a capability (`Motion::capabilities`, `Program`) and not for a name.");
+}
+
+/// The list of file dialects, in whose folder each declares itself.
+const DIALECT_LIST: &str = "crates/splat4d/src/format/mod.rs";
+/// Files elsewhere that may name one of them, each with its reason.
+const DIALECT_NAMES: [(&str, &str); 1] = [("crates/splat4d-cli/src/source.rs", "a SOG scene may lie in a folder")];
+
+/// A new dialect is its own file and its entry in the list: nobody else may name one. Its properties answer what others
+/// need to know.
+#[test]
+fn nobody_names_a_file_dialect() {
+    let list = read(DIALECT_LIST);
+    let (_, list) = list.split_once("pub const DIALECTS").expect("the list has this name");
+    // `: &[Dialect] = &[ply::DIALECT, ...];`
+    let list = list.split(['[', ']']).nth(3).expect("the list stands in the second brackets");
+    let dialects: Vec<&str> = list.split(',').map(str::trim).filter(|d| !d.is_empty()).collect();
+    assert!(dialects.len() >= 7 && dialects.iter().all(|d| d.contains("::")), "the list is not read: {dialects:?}");
+    let says = |path: &str| code(&read(path)).iter().any(|(_, line)| dialects.iter().any(|d| line.contains(d)));
+    let products = sources().into_iter().filter(|p| p.contains("/src/") && !is_test(p) && p != DIALECT_LIST);
+    let found: Vec<String> = products.filter(|p| says(p)).collect();
+    assert_eq!(found, DIALECT_NAMES.map(|(path, _)| path), "files that name a dialect (left) are those listed (right)");
 }

@@ -18,7 +18,7 @@ use splat4d_train::capture::{Capture, ImageStore};
 use splat4d_train::compress::{self, Compression, Job};
 use splat4d_train::eval::run::{EvalOptions, Scores, assess};
 use splat4d_train::recipe::Recipe;
-use splat4d_train::train::{TrainOptions, checkpoint};
+use splat4d_train::run::{TrainOptions, checkpoint};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;

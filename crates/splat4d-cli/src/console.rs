@@ -151,6 +151,23 @@ impl Console {
                     run.display()
                 ));
             }
+            Event::Predicted { iterations, gaussians, size: [width, height], seconds, memory_estimate } => {
+                self.clear();
+                self.say(&format!(
+                    "{} steps on pictures of {width}x{height}, at most {} Gaussians: about {} minutes in all and {} of memory",
+                    grouped(*iterations),
+                    grouped(*gaussians),
+                    human_seconds(*seconds),
+                    human_bytes(*memory_estimate)
+                ));
+            }
+            Event::Replanned { iteration, iterations, seconds, minutes } => self.detail(&format!(
+                "step {}: at this speed it would end after {} and not {}; from here on it is {} steps in all",
+                grouped(*iteration),
+                human_seconds(*seconds),
+                human_seconds(60.0 * minutes),
+                grouped(*iterations)
+            )),
             Event::Progress { iteration, iterations, stage, loss, psnr, gaussians, seconds, seconds_left } => {
                 let words = format!(
                     "PSNR {psnr:.2} dB  {} Gaussians  {} left",

@@ -160,6 +160,14 @@ pub fn human_seconds(seconds: f64) -> String {
     }
 }
 
+/// A choice for people: "a, b or c".
+pub(crate) fn either(words: &[&str]) -> String {
+    match words {
+        [rest @ .., last] if !rest.is_empty() => format!("{} or {last}", rest.join(", ")),
+        _ => words.concat(),
+    }
+}
+
 /// `30,000`
 pub fn grouped(n: usize) -> String {
     let digits = n.to_string();
@@ -195,6 +203,11 @@ mod tests {
         assert_eq!(human_bytes(3 << 29), "1.5 GiB");
         assert_eq!(human_seconds(3723.4), "1:02:03");
         assert_eq!((grouped(999), grouped(1234567)), ("999".into(), "1,234,567".into()));
+    }
+
+    #[test]
+    fn choices_are_read_as_sentences() {
+        assert_eq!([either(&["a"]), either(&["a", "b"]), either(&["a", "b", "c"])], ["a", "a or b", "a, b or c"]);
     }
 
     #[test]

@@ -4,7 +4,7 @@ use crate::baking::{Baking, bake_into};
 use crate::console::Console;
 use crate::draw::{Channel, Painter};
 use crate::files;
-use crate::paths::{Clock, Route, Stage, shots};
+use crate::paths::{Clock, Route, Stage, orbit_seconds, shots};
 use crate::report;
 use crate::run_folder::{ORDER, Run};
 use crate::source::{Source, not_empty, read_scene};
@@ -13,8 +13,9 @@ use serde_json::{Value, json};
 use splat4d::layers::Scene;
 use splat4d::{Error, Result};
 use splat4d_train::capture::{Capture, ImageStore};
-use splat4d_train::eval::run::{EvalOptions, Scores, evaluate};
+use splat4d_train::eval::run::{EvalOptions, Measured, Scores, evaluate};
 use splat4d_train::eval::tracks::track_error;
+use splat4d_train::recipe::Recipe;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
@@ -25,6 +26,25 @@ const ORBIT_FPS: f64 = 24.0;
 const ORBIT_FPS_PNG: f64 = 10.0;
 /// Longer side of an animated PNG, pixels.
 const ORBIT_SIDE_PNG: usize = 400;
+
+/// Training steps that take as long as what follows training: a held-out view drawn, measured and written; a frame of the
+/// film; the playback file, baked and compared with the scene. By the knight's 120 held-out views and 144 frames: 8 s where a
+/// step takes 25 ms (docs/benchmarks.md), and the same shares on a machine that hardly got any time.
+const HELD_STEPS: f64 = 1.5;
+/// See [`HELD_STEPS`].
+const FILM_STEPS: f64 = 0.5;
+/// See [`HELD_STEPS`].
+const BAKE_STEPS: f64 = 60.0;
+
+/// The time of what follows training, in training steps at full size: `--minutes` leaves room for it.
+pub(crate) fn steps(capture: &Capture, only_playback: bool) -> f64 {
+    if only_playback {
+        return BAKE_STEPS;
+    }
+    let (first, last) = capture.time_range();
+    let fps = if have_ffmpeg() { ORBIT_FPS } else { ORBIT_FPS_PNG };
+    capture.held.len() as f64 * HELD_STEPS + orbit_seconds(last - first) * fps * FILM_STEPS + BAKE_STEPS
+}
 
 /// Options of measuring.
 #[derive(Debug, Default, clap::Args)]
@@ -66,7 +86,7 @@ pub(crate) fn all(run: &Path, measure: &Measure, console: &Console) -> anyhow::R
 }
 
 /// Bakes the run into `scene.splat4d`. What goes wrong is said and never costs the run.
-pub(crate) fn playback(run: &Path, console: &Console) -> Result<()> {
+pub fn playback(run: &Path, console: &Console) -> Result<()> {
     // The file of a compression is what was learnt: baking anew would lose its codes, palette and masks.
     if run.join(ORDER).is_file() {
         return Ok(());
@@ -95,20 +115,11 @@ pub(crate) fn playback(run: &Path, console: &Console) -> Result<()> {
 
 /// Renders and scores the held-out views.
 pub(crate) fn scores(run: &Path, scene: &Scene<f32>, measure: &Measure, console: &Console) -> anyhow::Result<Scores> {
-    not_empty(scene, run)?;
     let opened = Run::open(run)?;
     let (capture, recipe) = opened.open_capture()?;
     let capture = Arc::new(capture);
-    let store = ImageStore::new(capture.clone(), usize::try_from(recipe.run.image_memory).unwrap_or(usize::MAX));
-    let options = EvalOptions {
-        folder: run.to_owned(),
-        antialias: recipe.appearance.antialias,
-        lpips_weights: measure.lpips_weights.clone(),
-        ..EvalOptions::default()
-    };
-    let iteration = opened.iteration().unwrap_or(0);
-    let evaluation = evaluate(scene, &capture, &store, iteration, &options, &mut |event| console.event(event))?;
-    console.clear();
+    let measuring = Measuring { opened: &opened, recipe: &recipe, measure };
+    let evaluation = measuring.evaluate(scene, &capture, Measured::Test, None, console)?;
     tracks(run, scene, &capture, console)?;
     if capture.held.is_empty() {
         console.warn(
@@ -117,6 +128,98 @@ pub(crate) fn scores(run: &Path, scene: &Scene<f32>, measure: &Measure, console:
         );
     }
     Ok(evaluation)
+}
+
+/// Scores one split of a run's capture on some backgrounds, says them, and writes them beside those that the run is judged
+/// by. `backgrounds` with their names; none: the run's own.
+///
+/// Errors: the capture has no such views; pictures without alpha, which are composited on nothing; those of measuring.
+pub(crate) fn scores_on(
+    run: &Path,
+    measured: Measured,
+    backgrounds: &[(&str, [f32; 3])],
+    measure: &Measure,
+    console: &Console,
+) -> anyhow::Result<()> {
+    let opened = Run::open(run)?;
+    let mut scene = read_scene(&opened.scene_file()?)?;
+    let (capture, recipe) = opened.open_capture()?;
+    let split = measured.name();
+    if measured.frames(&capture).is_empty() {
+        return Err(Error::input(format!("the run's capture has no views of the split `{split}`"))
+            .at(run.display())
+            .remedy("A data set has `val` where it brings a list of them, such as transforms_val.json.")
+            .into());
+    }
+    if !backgrounds.is_empty() && capture.background.is_none() {
+        return Err(Error::input("the run's pictures have no transparent pixels, and so no background to choose")
+            .at(run.display())
+            .remedy("Leave --background out.")
+            .into());
+    }
+    let own = capture.background;
+    let all: Vec<(&str, Option<[f32; 3]>)> = match backgrounds {
+        [] => vec![("", own)],
+        chosen => chosen.iter().map(|(name, color)| (*name, Some(*color))).collect(),
+    };
+    let measuring = Measuring { opened: &opened, recipe: &recipe, measure };
+    for (name, background) in all {
+        let place = if background == own { split.to_owned() } else { format!("{split}-{name}") };
+        let judged = measured == Measured::Test && background == own;
+        if let Some(background) = background {
+            scene.background = background;
+        }
+        let capture = Arc::new(Capture { background, ..capture.clone() });
+        let place = (!judged).then_some(place);
+        let scores = measuring.evaluate(&scene, &capture, measured, place, console)?;
+        let on = if name.is_empty() { String::new() } else { format!(" on {name}") };
+        let views = match measured {
+            Measured::Test => "held-out views",
+            Measured::Validation => "validation views",
+            Measured::Train => "training views",
+        };
+        console.say(&format!("{views}{on}: {}", in_words(|key| scores.held(key))));
+        let entry = &scores.report.results()[scores.report.method()];
+        console.emit(&json!({
+            "type": "results", "iteration": scores.report.iteration, "conditions": scores.report.conditions, "results": entry,
+        }));
+    }
+    Ok(())
+}
+
+/// A run that is measured, and how.
+struct Measuring<'a> {
+    opened: &'a Run,
+    recipe: &'a Recipe,
+    measure: &'a Measure,
+}
+
+impl Measuring<'_> {
+    /// Measures and writes under the entry `place` ([`EvalOptions::place`]).
+    fn evaluate(
+        &self,
+        scene: &Scene<f32>,
+        capture: &Arc<Capture>,
+        measured: Measured,
+        place: Option<String>,
+        console: &Console,
+    ) -> anyhow::Result<Scores> {
+        not_empty(scene, &self.opened.path)?;
+        let memory = usize::try_from(self.recipe.run.image_memory).unwrap_or(usize::MAX);
+        let store = ImageStore::new(capture.clone(), memory);
+        let options = EvalOptions {
+            folder: self.opened.path.clone(),
+            antialias: self.recipe.appearance.antialias,
+            lpips_weights: self.measure.lpips_weights.clone(),
+            measured,
+            place,
+            ..EvalOptions::default()
+        };
+        let iteration = self.opened.iteration().unwrap_or(0);
+        let scores = evaluate(scene, capture, &store, iteration, &options, &mut |event| console.event(event))?;
+        console.clear();
+        Ok(scores)
+    }
 }
 
 /// Measures tracks in space where the capture comes with true ones.
@@ -140,19 +243,24 @@ fn tracks(run: &Path, scene: &Scene<f32>, capture: &Capture, console: &Console) 
     amend(run, [("tracks".into(), entry)])
 }
 
-/// The report.
+/// The report, and the scores on the console.
 pub(crate) fn write_report(run: &Path, console: &Console) -> anyhow::Result<()> {
-    let run = Run::open(run)?;
-    say_scores(&run, console);
-    console.written(&report::write(&run)?);
+    say_scores(&Run::open(run)?, console);
+    write_page(run, console)
+}
+
+/// The report alone.
+pub(crate) fn write_page(run: &Path, console: &Console) -> anyhow::Result<()> {
+    console.written(&report::write(&Run::open(run)?)?);
     Ok(())
 }
 
-/// The scores in one line.
-fn say_scores(run: &Run, console: &Console) {
+/// Scores in one line.
+fn in_words(score: impl Fn(&str) -> Option<f64>) -> String {
     let mut words = Vec::new();
     for (key, name, digits, unit) in [
         ("PSNR", "PSNR", 2, " dB"),
+        ("PSNR-cc", "colour-corrected", 2, " dB"),
         ("PSNR-dynamic", "where things move", 2, " dB"),
         ("PSNR-foreground", "foreground", 2, " dB"),
         ("SSIM", "SSIM", 4, ""),
@@ -161,12 +269,18 @@ fn say_scores(run: &Run, console: &Console) {
         ("LPIPS-alex", "LPIPS (AlexNet)", 4, ""),
         ("flicker", "flicker", 3, "/255"),
     ] {
-        if let Some(value) = run.score(key) {
+        if let Some(value) = score(key) {
             words.push(format!("{name} {value:.digits$}{unit}"));
         }
     }
+    words.join(", ")
+}
+
+/// The scores in one line.
+fn say_scores(run: &Run, console: &Console) {
+    let words = in_words(|key| run.score(key));
     if !words.is_empty() {
-        console.say(&format!("held-out views: {}", words.join(", ")));
+        console.say(&format!("held-out views: {words}"));
     }
     if let (Some(ours), Some(still)) = (run.score("PSNR-dynamic"), run.baseline("PSNR-dynamic")) {
         console.say(&format!("where things move: {:+.2} dB over a still scene ({still:.2} dB)", ours - still));

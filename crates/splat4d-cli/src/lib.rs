@@ -12,7 +12,7 @@ pub mod console;
 mod device;
 pub mod draw;
 pub mod files;
-mod finish;
+pub mod finish;
 pub mod interrupt;
 pub mod measure;
 pub mod paths;

@@ -18,7 +18,7 @@ pub(crate) const COMPRESS: &str = "compress.json";
 /// File that holds the settings `compress` was asked for.
 pub(crate) const ORDER: &str = "compress.toml";
 /// Files and folders that splat4d writes into a run; `--force` replaces these and nothing else.
-const OURS: [&str; 19] = [
+const OURS: [&str; 26] = [
     "recipe.toml",
     "run.json",
     "scene.safetensors",
@@ -30,7 +30,14 @@ const OURS: [&str; 19] = [
     COMPRESS,
     "cameras.json",
     "test",
+    "test-white",
+    "test-black",
+    "val",
+    "val-white",
+    "val-black",
     "train",
+    "train-white",
+    "train-black",
     "orbit.mp4",
     "orbit.png",
     "report.html",
@@ -63,6 +70,8 @@ pub struct ViewScore {
     pub camera: Option<String>,
     pub time: Option<f64>,
     pub psnr: Option<f64>,
+    /// After the camera's colour matrix; runs of older versions have none.
+    pub corrected: Option<f64>,
 }
 
 /// A run folder's files.
@@ -240,7 +249,7 @@ impl Run {
         if scene.is_file() {
             return Ok(scene);
         }
-        splat4d_train::train::checkpoint::list(&self.path).pop().ok_or_else(|| {
+        splat4d_train::run::checkpoint::list(&self.path).pop().ok_or_else(|| {
             Error::input("the run holds no scene and no checkpoint yet")
                 .at(self.path.display())
                 .remedy("Let it train, or continue it with `splat4d train --resume`.")
@@ -249,7 +258,7 @@ impl Run {
 
     /// Opens the capture again, as the run saw it.
     pub fn open_capture(&self) -> Result<(Capture, Recipe)> {
-        let (recipe, capture) = splat4d_train::train::run::open_run(&self.path)?;
+        let (recipe, capture) = splat4d_train::run::open_run(&self.path)?;
         Ok((capture, recipe))
     }
 
@@ -357,6 +366,21 @@ pub fn clear(run: &Path) -> Result<()> {
     Ok(())
 }
 
+/// An entry `ours_N` of `results.json` beside the one that the run is judged by.
+#[derive(Clone, Debug)]
+pub struct Beside<'a> {
+    /// What it is called: a split, and a background where it is not the run's own.
+    pub name: &'a str,
+    pub step: usize,
+    pub scores: &'a Value,
+}
+
+/// The newest of each, by name.
+pub(crate) fn beside(results: &Value) -> Vec<Beside<'_>> {
+    let entries = results.as_object().into_iter().flatten();
+    entries.filter_map(|(name, entry)| newest(entry).map(|(step, scores)| Beside { name, step, scores })).collect()
+}
+
 /// The entry `ours_N` with the largest N.
 fn newest(results: &Value) -> Option<(usize, &Value)> {
     results.as_object()?.iter().filter_map(|(k, v)| Some((step_of(k)?, v))).max_by_key(|e| e.0)
@@ -376,6 +400,7 @@ fn view_scores(entry: &Value) -> Vec<ViewScore> {
             camera: entry.get("camera").and_then(|c| c.get(file)).and_then(Value::as_str).map(str::to_owned),
             time: entry.get("time").and_then(|c| c.get(file)).and_then(Value::as_f64),
             psnr: value.as_f64(),
+            corrected: entry.get("PSNR-cc").and_then(|c| c.get(file)).and_then(Value::as_f64),
         })
         .collect();
     views.sort_by(|a, b| a.file.cmp(&b.file));

@@ -1,6 +1,7 @@
 //! Numbered files, one a frame: finding them, naming them, and the moments they stand for.
 
-use crate::files::cannot_read;
+use crate::files::{cannot_read, either};
+use splat4d::format::dialect;
 use splat4d::layers::Scene;
 use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::{Error, Result};
@@ -8,8 +9,6 @@ use std::path::{Path, PathBuf};
 
 /// Most files of a sequence.
 const MAX_FILES: f64 = 100_000.0;
-/// Endings of files that may be frames.
-const ENDINGS: [&str; 3] = ["ply", "spz", "splat"];
 /// Most digits of a padded number in a pattern.
 const MAX_DIGITS: usize = 9;
 /// The name of a frame in a folder, without a pattern.
@@ -81,17 +80,23 @@ pub(crate) fn frames(path: &Path) -> Result<Vec<PathBuf>> {
             .remedy("Give a pattern, for instance 'FOLDER/frame_%05d.ply'."));
     }
     if found.is_empty() {
-        return Err(Error::input("holds neither a run, nor a SOG scene, nor numbered .ply, .spz or .splat files")
+        let kinds = either(&endings());
+        return Err(Error::input(format!("holds neither a run, nor a SOG scene, nor numbered {kinds} files"))
             .at(path.display())
             .remedy("Give a run folder, a scene file, or a folder with frame_00000.ply and so on."));
     }
     Ok(found.into_iter().map(|(_, name)| folder.join(name)).collect())
 }
 
+/// Endings of files that may be frames: those of one moment, of the kinds that `--frames` writes.
+pub(crate) fn endings() -> Vec<&'static str> {
+    dialect::extensions(|d| !d.moves && d.is_written())
+}
+
 /// The last number in the name of a file that may be a frame.
 fn number_in(name: &str) -> Option<u64> {
-    let (stem, ending) = name.rsplit_once('.')?;
-    if name.starts_with('.') || !ENDINGS.iter().any(|e| ending.eq_ignore_ascii_case(e)) {
+    let (stem, ending) = name.split_at(name.rfind('.')?);
+    if name.starts_with('.') || !endings().iter().any(|e| ending.eq_ignore_ascii_case(e)) {
         return None;
     }
     // `frame_12.compressed.ply` is a frame too.

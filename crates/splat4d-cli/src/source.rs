@@ -1,7 +1,7 @@
 //! Anything that holds a scene: a run folder, a scene file (`.safetensors`, checkpoints too), a playback file
 //! (`.splat4d`), a file or folder of another program's Gaussians, or a sequence of such files.
 
-use crate::files::cannot_read;
+use crate::files::{cannot_read, either};
 use crate::paths::{Stage, View};
 use crate::run_folder::Run;
 use crate::sequence;
@@ -23,8 +23,10 @@ const BEYOND: f64 = 0.01;
 const ROOM: f64 = 1.1;
 
 /// Remedy that lists the files that can be opened, for errors.
-const REMEDY: &str =
-    "Give a run folder, a scene.safetensors, a checkpoint, a .splat4d, or a .ply, .spz, .splat, .splatv or SOG file.";
+fn remedy() -> String {
+    let others = either(&dialect::extensions(|_| true));
+    format!("Give a run folder, a scene.safetensors, a checkpoint, a .splat4d, or a {others} file.")
+}
 
 /// Marks a folder of SOG scenes, one for each level of detail.
 const SOG_LEVELS: &str = "lod-meta.json";
@@ -75,7 +77,7 @@ impl Source {
             return Ok(Self { playback: Some(index), ..Self::own(scene) });
         }
         let opened = match dialect_of(path, &bytes) {
-            Some(kind) => dialect::open(kind, &bytes).map(|o| Self {
+            Some(kind) => kind.open(&bytes).map(|o| Self {
                 ply: o.ply,
                 dialect: Some(kind),
                 warnings: o.warnings,
@@ -86,9 +88,9 @@ impl Source {
                     .remedy("Convert it to .ply first, for instance with splat-transform."))
             }
             None if path.extension().is_some_and(|e| e != "safetensors") && !looks_own(&bytes) => {
-                Err(Error::input("its first bytes are of no format that splat4d reads").remedy(REMEDY))
+                Err(Error::input("its first bytes are of no format that splat4d reads").remedy(remedy()))
             }
-            None => format::scene::read(&bytes).map(Self::own).map_err(|e| e.remedy(REMEDY)),
+            None => format::scene::read(&bytes).map(Self::own).map_err(|e| e.remedy(remedy())),
         };
         opened.map_err(|e| e.at(path.display()))
     }
@@ -128,8 +130,8 @@ fn looks_own(bytes: &[u8]) -> bool {
 
 /// By content; by its ending only where there is nothing in the content to know it by.
 fn dialect_of(path: &Path, bytes: &[u8]) -> Option<Dialect> {
-    let splat = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("splat"));
-    Dialect::of(bytes).or(splat.then_some(Dialect::Splat))
+    let name = path.file_name().map(|n| n.to_string_lossy()).unwrap_or_default();
+    Dialect::of_file(&name, bytes)
 }
 
 /// A SOG scene whose files lie in a folder.
@@ -152,8 +154,8 @@ fn open_sog(folder: &Path) -> Result<Source> {
     }
     files.insert(sog::META.into(), Cow::Owned(meta));
     let (params, warnings) = sog::read(&files).map_err(|e| e.at(folder.display()))?;
-    let scene = dialect::still(params, Dialect::Sog);
-    Ok(Source { dialect: Some(Dialect::Sog), warnings, ..Source::own(scene) })
+    let scene = Scene { up: sog::DIALECT.up, ..dialect::still(params) };
+    Ok(Source { dialect: Some(sog::DIALECT), warnings, ..Source::own(scene) })
 }
 
 /// Files of one frame each.
@@ -167,18 +169,18 @@ fn open_sequence(path: &Path, fps: f64) -> Result<Source> {
     let (mut frames, mut kind, mut warnings) = (Vec::with_capacity(files.len()), None, Warnings::default());
     for file in &files {
         let bytes = std::fs::read(file).map_err(|e| cannot_read(file, e))?;
-        let own = dialect_of(file, &bytes).filter(|d| !d.moves());
-        let Some(own) = own.filter(|d| kind.is_none_or(|k: Dialect| k.up() == d.up())) else {
+        let own = dialect_of(file, &bytes).filter(|d| !d.moves);
+        let Some(own) = own.filter(|d| kind.is_none_or(|k: Dialect| k.up == d.up)) else {
             return Err(Error::input("is no frame of a sequence like the others")
                 .at(file.display())
-                .remedy("Frames are .ply, .spz or .splat files of one kind."));
+                .remedy(format!("Frames are {} files of one kind.", either(&sequence::endings()))));
         };
         kind = Some(own);
-        let mut opened = dialect::open(own, &bytes).map_err(|e| e.at(file.display()))?;
+        let mut opened = own.open(&bytes).map_err(|e| e.at(file.display()))?;
         warnings.append(opened.warnings);
         frames.push(std::mem::take(&mut opened.scene.layers[0].params));
     }
-    let up = kind.map_or([0.0, -1.0, 0.0], Dialect::up);
+    let up = kind.map_or(dialect::Y_DOWN, |d| d.up);
     let scene = format::sequence::join(&frames, fps, up).map_err(|e| e.at(path.display()))?;
     Ok(Source { dialect: kind, warnings, ..Source::own(scene) })
 }

@@ -107,6 +107,20 @@ fn a_capture_becomes_a_run_and_everything_follows() {
     let cached = splat4d(&["eval", str(&run), "--baseline", "--no-film", "--json"]).run().ok();
     assert!(!cached.contains("\"started\""), "the baseline is trained once");
 
+    // eval of other views; what the capture does not have is refused.
+    let lines = splat4d(&["eval", str(&run), "--split", "train", "--json"]).run().ok();
+    let lines: Vec<Value> = lines.lines().map(|l| serde_json::from_str(l).unwrap()).collect();
+    let scores = lines.iter().find(|e| e["type"] == "results").unwrap();
+    assert!(scores["conditions"]["split"] == "train" && scores["results"]["PSNR-cc"].is_f64(), "{scores}");
+    assert_eq!(
+        json_of(&run.join("results.json"))["ours_20"]["PSNR"].as_f64(),
+        Some(psnr),
+        "the run's own figures stay"
+    );
+    let refused = |args: &[&str]| splat4d(&[&["eval", str(&run)], args].concat()).run().refused();
+    assert!(refused(&["--background", "both"]).contains("no transparent pixels"));
+    assert!(refused(&["--split", "val"]).contains("transforms_val.json"));
+
     // info
     let told: Value = serde_json::from_str(&splat4d(&["info", str(&run), "--json"]).run().ok()).unwrap();
     assert_eq!((&told["finished"], &told["iteration"]), (&json!(true), &json!(20)));
@@ -381,6 +395,8 @@ fn options_are_checked_before_any_work() {
         (&["train", capture, "--hold-out", "cams=1"], "every=N"),
         (&["train", capture, "--downscale", "100"], "100"),
         (&["train", capture, "--minutes", "0"], "minutes"),
+        (&["train", capture, "--quality", "good"], "draft, standard, best"),
+        (&["train", capture, "--set", "run.replans=[[9,3]]"], "replans"),
         (&["train", capture, "--image-memory", "much"], "512MiB"),
         (&["train", capture, "--lpips-weights", "/nowhere.safetensors"], "/nowhere.safetensors"),
         (&["train", "/nowhere"], "/nowhere"),
@@ -420,7 +436,7 @@ fn bad_captures_are_refused_with_name_and_remedy() {
     let cases: &[Change<'_>] = &[
         ("missing", &|c| c.missing = Some((2, 1)), "0001.png"),
         ("truncated", &|c| c.truncated = Some((2, 1)), "0001.png"),
-        ("size", &|c| c.pictures = [40, 30], "40x30"),
+        ("size", &|c| c.pictures = [40, 32], "40x32"),
         ("focal", &|c| c.focal = 0.0, "focal"),
         ("mirrored", &|c| c.mirrored = true, "mirrored"),
         ("twins", &|c| c.twins = true, "pose"),

@@ -14,8 +14,8 @@ use splat4d_train::capture::frames::{Frames, Picture};
 use splat4d_train::loss::image::{Channel, ImageTerm, Needs, PictureGrads, Shown, View};
 use splat4d_train::loss::terms::StepInfo;
 use splat4d_train::methods::{Group, Rate, Stage};
-use splat4d_train::train::loss::TrainLoss;
-use splat4d_train::train::trainer::{Settings, Trainer};
+use splat4d_train::step::loss::TrainLoss;
+use splat4d_train::step::trainer::{Settings, Trainer};
 use splat4d_train::upkeep::Limits;
 use std::sync::Arc;
 

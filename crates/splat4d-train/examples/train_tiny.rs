@@ -15,8 +15,8 @@ use splat4d_train::capture::frames::{Frames, Picture};
 use splat4d_train::init;
 use splat4d_train::methods::{Plan, program};
 use splat4d_train::recipe::Recipe;
-use splat4d_train::train::loss::TrainLoss;
-use splat4d_train::train::trainer::{Settings, Trainer};
+use splat4d_train::step::loss::TrainLoss;
+use splat4d_train::step::trainer::{Settings, Trainer};
 use splat4d_train::upkeep::Limits;
 use std::sync::Arc;
 

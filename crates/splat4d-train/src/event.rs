@@ -1,4 +1,4 @@
-//! What the trainer tells whoever listens: progress bar, log, live viewer, Python.
+//! Events of the trainer for its listeners: progress bar, log, live viewer, Python.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -7,7 +7,7 @@ use std::sync::Arc;
 pub struct Progress<'a>(pub &'a mut dyn FnMut(&Event));
 
 impl Progress<'_> {
-    /// What is being done, how much of it is done, and of how much (0: not known).
+    /// Reports the work in progress, how much of it is done, and of how much (0: not known).
     pub fn phase(&mut self, name: &str, done: usize, total: usize) {
         (self.0)(&Event::Phase { name: name.to_owned(), done, total });
     }
@@ -25,7 +25,7 @@ impl Progress<'_> {
 pub enum Event {
     /// A long preparation began or moved on (reading, initial points, probes, evaluation).
     Phase {
-        /// What is being done.
+        /// Name of the work in progress.
         name: String,
         /// Done so far.
         done: usize,
@@ -44,6 +44,30 @@ pub enum Event {
         gaussians: usize,
         /// Estimated peak memory of training, bytes.
         memory_estimate: u64,
+    },
+    /// What a run will take, from steps that were timed before it.
+    Predicted {
+        /// Its steps.
+        iterations: usize,
+        /// Gaussians at most.
+        gaussians: usize,
+        /// Width and height of its pictures, pixels.
+        size: [usize; 2],
+        /// Seconds from the command's start to its end, about.
+        seconds: f64,
+        /// Estimated peak memory of training, bytes.
+        memory_estimate: u64,
+    },
+    /// The run was given another length, because it would have ended at another time than was asked for.
+    Replanned {
+        /// Steps taken.
+        iteration: usize,
+        /// Steps in all from now on.
+        iterations: usize,
+        /// Seconds after the command's start at which it would have ended.
+        seconds: f64,
+        /// The minutes that were asked for.
+        minutes: f64,
     },
     /// A step was taken; sent every so many iterations.
     Progress {
@@ -80,7 +104,7 @@ pub enum Event {
     },
     /// Something the user should know.
     Warning {
-        /// What and what to do.
+        /// The finding and its remedy.
         message: String,
     },
     /// A number was not finite; training went back to the last checkpoint with smaller steps.

@@ -2,11 +2,11 @@
 //!
 //! A step changes numbers. Everything else that happens to a learner (rows come, go and change places, a hook replaces the
 //! scene, opacities are lowered) goes through the methods here, so that scene, moments and statistics cannot come apart,
-//! and whoever remembers something of rows hears of it: the learner notes how far it was [`Touched`].
+//! and whoever remembers something of rows hears of it: the learner notes how far it was `Touched`.
 
 mod exposure;
 
-pub use exposure::Exposure;
+pub(crate) use exposure::Exposure;
 
 use crate::Result;
 use crate::optim::Moments;
@@ -15,9 +15,9 @@ use splat4d::math::{Real, Rng};
 use splat4d::motion::for_rows;
 use splat4d::scene::{Born, RowEdit, Rows, Space, Table};
 
-/// What may be known of one view of one layer.
+/// The observable quantities of one view of one layer.
 #[derive(Clone, Copy, Debug)]
-pub struct Observation<'a, F> {
+pub(crate) struct Observation<'a, F> {
     /// The layer.
     pub layer: usize,
     /// Its rows that were drawn: splat j is row `rows.id(j)`.
@@ -31,7 +31,7 @@ pub struct Observation<'a, F> {
 /// Columns of a layer's statistics.
 const STATS_COLUMNS: [(&str, usize); 3] = [("gradient_sum", 1), ("gradient_count", 1), ("radius_max", 1)];
 
-/// What was seen of every Gaussian since the last densification.
+/// Statistics of every Gaussian since the last densification.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Stats {
     /// One a layer, [N, 3]: sum of |dL/dmean2d| (NDC units), number of views that drew it, largest radius (pixels).
@@ -40,12 +40,12 @@ pub struct Stats {
 
 impl Stats {
     /// Nothing seen.
-    pub fn new<F: Real>(scene: &Scene<F>) -> Self {
+    pub(crate) fn new<F: Real>(scene: &Scene<F>) -> Self {
         Self { tables: scene.layers.iter().map(|l| Table::new(&STATS_COLUMNS, l.params.len())).collect() }
     }
 
     /// Adds one view's news.
-    pub fn observe<F: Real>(&mut self, o: Observation<'_, F>) {
+    pub(crate) fn observe<F: Real>(&mut self, o: Observation<'_, F>) {
         for_rows([&mut self.tables[o.layer]], o.rows, |j, id, [table]| {
             let radius = o.radii[j];
             if radius > F::ZERO {
@@ -77,7 +77,7 @@ impl Stats {
 
 /// How far a learner was changed in other ways than by steps.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Touched {
+pub(crate) enum Touched {
     /// Not at all.
     #[default]
     Nothing,
@@ -93,7 +93,7 @@ pub struct Learner {
     moments: Vec<Moments<f32>>,
     stats: Stats,
     touched: Touched,
-    /// What learns of the cameras; none: they show what is drawn.
+    /// Learnable exposures of the cameras; none: they show what is drawn.
     pub exposure: Option<Exposure>,
 }
 
@@ -107,13 +107,13 @@ pub(crate) struct Parts<'a> {
 
 impl Learner {
     /// A scene that has learnt nothing yet.
-    pub fn new(scene: Scene<f32>) -> Self {
+    pub(crate) fn new(scene: Scene<f32>) -> Self {
         let moments = scene.layers.iter().map(|l| Moments::new(&l.params)).collect();
         Self { stats: Stats::new(&scene), moments, scene, touched: Touched::Values, exposure: None }
     }
 
     /// A learner as a checkpoint has it. Panics: moments and statistics of another scene.
-    pub fn resumed(scene: Scene<f32>, moments: Vec<Moments<f32>>, stats: Stats) -> Self {
+    pub(crate) fn resumed(scene: Scene<f32>, moments: Vec<Moments<f32>>, stats: Stats) -> Self {
         let layers = scene.layers.len();
         assert_eq!([moments.len(), stats.tables.len()], [layers; 2], "moments and statistics by layer");
         Self { scene, moments, stats, touched: Touched::Values, exposure: None }
@@ -125,29 +125,29 @@ impl Learner {
     }
 
     /// The scene, to change numbers in place. Its layers, tables and rows stay as they are: rows change through
-    /// [`apply`](Self::apply), all else through [`rebuild`](Self::rebuild).
+    /// [`apply`](Self::apply), all else through `rebuild`.
     pub fn scene_mut(&mut self) -> &mut Scene<f32> {
         self.touch(Touched::Values);
         &mut self.scene
     }
 
     /// The scene alone; all else is forgotten.
-    pub fn into_scene(self) -> Scene<f32> {
+    pub(crate) fn into_scene(self) -> Scene<f32> {
         self.scene
     }
 
     /// Adam's moments, by layer.
-    pub fn moments(&self) -> &[Moments<f32>] {
+    pub(crate) fn moments(&self) -> &[Moments<f32>] {
         &self.moments
     }
 
     /// Scene and moments, to change numbers in place; as [`scene_mut`](Self::scene_mut).
-    pub fn tables_mut(&mut self) -> (&mut Scene<f32>, &mut [Moments<f32>]) {
+    pub(crate) fn tables_mut(&mut self) -> (&mut Scene<f32>, &mut [Moments<f32>]) {
         self.touch(Touched::Values);
         (&mut self.scene, &mut self.moments)
     }
 
-    /// What was seen of Gaussians since the last densification.
+    /// Statistics of Gaussians since the last densification.
     pub fn stats(&self) -> &Stats {
         &self.stats
     }
@@ -159,7 +159,7 @@ impl Learner {
     }
 
     /// Forgets what was seen of Gaussians.
-    pub fn clear_stats(&mut self) {
+    pub(crate) fn clear_stats(&mut self) {
         self.stats = Stats::new(&self.scene);
     }
 
@@ -174,7 +174,7 @@ impl Learner {
     /// Changes the scene at will: layers, models, tables. Moments that still fit are kept, but for layers of another name;
     /// those of pages for which `learns` (of a layer and one of its column groups) does not hold are forgotten, and
     /// statistics begin anew.
-    pub fn rebuild(
+    pub(crate) fn rebuild(
         &mut self,
         learns: &dyn Fn(usize, &str) -> bool,
         change: impl FnOnce(&mut Scene<f32>) -> Result<()>,
@@ -202,12 +202,12 @@ impl Learner {
     }
 
     /// Notes that who is near whom was looked up anew, although no row was edited.
-    pub fn neighbours_changed(&mut self) {
+    pub(crate) fn neighbours_changed(&mut self) {
         self.touch(Touched::Rows);
     }
 
     /// How far it was changed since this was last asked.
-    pub fn take_touched(&mut self) -> Touched {
+    pub(crate) fn take_touched(&mut self) -> Touched {
         std::mem::take(&mut self.touched)
     }
 

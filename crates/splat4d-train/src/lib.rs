@@ -31,11 +31,13 @@ pub mod loss;
 pub mod methods;
 pub mod optim;
 pub mod recipe;
+pub mod run;
 pub mod sampler;
 pub mod settings;
-pub mod train;
+pub mod step;
 pub mod training;
 pub mod upkeep;
+pub mod vision;
 
 pub use splat4d::{Error, ErrorKind, Result};
 
@@ -45,7 +47,7 @@ pub mod prelude {
     pub use crate::eval::run::Scores;
     pub use crate::event::Event;
     pub use crate::recipe::Recipe;
-    pub use crate::train::{Outcome, TrainOptions, resume};
+    pub use crate::run::{Outcome, TrainOptions, resume};
     pub use crate::training::{Trained, Training};
     pub use crate::{Error, ErrorKind, Result};
 }

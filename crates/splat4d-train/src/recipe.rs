@@ -7,6 +7,8 @@
 //! recipes had before they had tables, are read as well.
 
 mod flat;
+mod quality;
+mod replans;
 mod run;
 #[cfg(test)]
 mod tests;
@@ -24,6 +26,8 @@ use crate::upkeep::{
     AdcSettings, DensifySettings, GuidedSettings, McmcSettings, MergeSettings, NodeSettings, OpacityResetSettings,
     PruneSettings, RelocateSettings, SplitSettings,
 };
+pub use quality::Quality;
+pub use replans::{Replan, Replans};
 pub use run::{MotionName, RunSettings};
 pub use text::Idle;
 
@@ -85,6 +89,34 @@ impl Recipe {
     pub fn with(mut self, change: impl FnOnce(&mut Self)) -> Self {
         change(&mut self);
         self
+    }
+
+    /// Lets schedules that stand as they follow from the length follow from another one: what a run saved of them is set
+    /// back, what was chosen otherwise stays.
+    #[must_use]
+    pub fn unresolved(&self) -> Self {
+        let follows = Self {
+            appearance: AppearanceSettings { sh_degree_interval: 0, ..self.appearance.clone() },
+            densify: DensifySettings { interval: 0, from: 0, until: 0, ..self.densify.clone() },
+            relocate: RelocateSettings { from: 0, ..self.relocate },
+            run: RunSettings { checkpoint_interval: 0, ..self.run.clone() },
+            ..self.clone()
+        }
+        .resolve();
+        let mut r = self.clone();
+        let back = |knob: &mut usize, follows: usize| {
+            if *knob == follows {
+                *knob = 0;
+            }
+        };
+        back(&mut r.appearance.sh_degree_interval, follows.appearance.sh_degree_interval);
+        back(&mut r.densify.interval, follows.densify.interval);
+        back(&mut r.densify.from, follows.densify.from);
+        back(&mut r.densify.until, follows.densify.until);
+        back(&mut r.relocate.from, follows.relocate.from);
+        back(&mut r.run.checkpoint_interval, follows.run.checkpoint_interval);
+        r.run.replans = Replans::default();
+        r
     }
 
     /// Fills every knob that is 0 and follows from others, so that the saved recipe says all.

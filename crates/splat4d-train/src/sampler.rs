@@ -22,12 +22,27 @@ pub enum Sampler {
     Tuple(usize),
 }
 
+/// A step, as samplers see it.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Draw {
+    /// Seed of the run.
+    pub seed: u64,
+    /// Number of the stage.
+    pub stage: usize,
+    /// Steps taken in it: they address what is drawn.
+    pub taken: usize,
+    /// Steps of its schedule that are behind it.
+    pub place: usize,
+    /// Steps of its schedule.
+    pub steps: usize,
+}
+
 /// Share of a window sampler's frames that come from its window; the rest replays the take.
 const WINDOW_SHARE: f64 = 0.8;
 
 /// Frame numbers sorted by distinct time.
 #[derive(Clone, Debug)]
-pub struct Timeline {
+pub(crate) struct Timeline {
     frames: Vec<Vec<u32>>,
     count: usize,
     /// The permutation looked at last: seed, address, length and the order itself. Without it every step would shuffle
@@ -37,7 +52,7 @@ pub struct Timeline {
 
 impl Timeline {
     /// Groups the frames by time.
-    pub fn new(frames: &dyn Frames) -> Self {
+    pub(crate) fn new(frames: &dyn Frames) -> Self {
         let mut order: Vec<usize> = (0..frames.len()).collect();
         order.sort_by(|&a, &b| frames.time(a).0.total_cmp(&frames.time(b).0).then(a.cmp(&b)));
         let mut groups: Vec<Vec<u32>> = Vec::new();
@@ -53,12 +68,12 @@ impl Timeline {
     }
 
     /// Number of distinct times.
-    pub fn times(&self) -> usize {
+    pub(crate) fn times(&self) -> usize {
         self.frames.len()
     }
 
     /// The frames at the k-th time.
-    pub fn at(&self, k: usize) -> &[u32] {
+    pub(crate) fn at(&self, k: usize) -> &[u32] {
         &self.frames[k]
     }
 
@@ -71,16 +86,9 @@ impl Timeline {
         last.2[i] as usize
     }
 
-    /// The frames of step `step` of a stage of `steps` steps. Panics: no frames; a frame number beyond the clip.
-    pub fn draw(
-        &self,
-        sampler: &Sampler,
-        batch: usize,
-        seed: u64,
-        stage: usize,
-        step: usize,
-        steps: usize,
-    ) -> Vec<usize> {
+    /// The frames of a step. Panics: no frames; a frame number beyond the clip.
+    pub(crate) fn draw(&self, sampler: &Sampler, batch: usize, draw: Draw) -> Vec<usize> {
+        let Draw { seed, stage, taken: step, place, steps } = draw;
         assert!(self.count > 0, "a capture without frames cannot be trained on");
         let rng = Rng::new(seed, "frames", stage as u64);
         let step_rng = rng.fork(step as u64 + 1);
@@ -100,7 +108,7 @@ impl Timeline {
             }
             Sampler::Window(width) => {
                 let width = width.clamp(1, times);
-                let first = ((times - width) as f64 * step as f64 / steps.max(1) as f64) as usize;
+                let first = ((times - width) as f64 * place as f64 / steps.max(1) as f64) as usize;
                 (0..batch as u64)
                     .map(|b| {
                         let inside = step_rng.uniform(3 * b) < WINDOW_SHARE;
@@ -130,17 +138,18 @@ impl Timeline {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::train::tests::Made;
+    use crate::step::tests::Made;
 
     #[test]
     fn every_frame_comes_once_an_epoch_and_the_draw_is_a_pure_function() {
         let frames = Made::new(3, 5, 4);
         let line = Timeline::new(&frames);
         assert_eq!(line.times(), 5);
-        let mut seen: Vec<usize> = (0..15).flat_map(|s| line.draw(&Sampler::Uniform, 1, 7, 0, s, 100)).collect();
+        let at = |seed, step, steps| Draw { seed, stage: 0, taken: step, place: step, steps };
+        let mut seen: Vec<usize> = (0..15).flat_map(|s| line.draw(&Sampler::Uniform, 1, at(7, s, 100))).collect();
         seen.sort_unstable();
         assert_eq!(seen, (0..15).collect::<Vec<_>>());
-        let again = |s| line.draw(&Sampler::Window(2), 4, 7, 0, s, 100);
+        let again = |s| line.draw(&Sampler::Window(2), 4, at(7, s, 100));
         assert_eq!(again(13), again(13));
         assert_ne!(again(13), again(14));
     }
@@ -150,11 +159,12 @@ mod tests {
         let frames = Made::new(3, 5, 4);
         let line = Timeline::new(&frames);
         for step in 0..50 {
+            let at = Draw { seed: 1, stage: 0, taken: step, place: step, steps: 50 };
             let time = |i: &usize| frames.time(*i).0;
-            let same = line.draw(&Sampler::SameTime, 2, 1, 0, step, 50);
+            let same = line.draw(&Sampler::SameTime, 2, at);
             assert!(same.len() == 2 && time(&same[0]) == time(&same[1]) && same[0] != same[1]);
-            assert!(line.draw(&Sampler::Frame(3), 2, 1, 0, step, 50).iter().all(|i| line.at(3).contains(&(*i as u32))));
-            let tuple = line.draw(&Sampler::Tuple(3), 1, 1, 0, step, 50);
+            assert!(line.draw(&Sampler::Frame(3), 2, at).iter().all(|i| line.at(3).contains(&(*i as u32))));
+            let tuple = line.draw(&Sampler::Tuple(3), 1, at);
             assert!(tuple.len() == 3 && time(&tuple[0]) < time(&tuple[1]) && time(&tuple[1]) < time(&tuple[2]));
         }
     }

@@ -6,7 +6,7 @@
 mod value;
 mod when;
 
-pub use value::{Choice, Value, among};
+pub(crate) use value::{Choice, Value, among};
 pub use when::{When, is_off};
 
 /// One knob, for help, documents and checks.
@@ -18,9 +18,9 @@ pub struct Knob {
     pub field: &'static str,
     /// Its default, as TOML.
     pub default: String,
-    /// What it does.
+    /// Its effect.
     pub doc: String,
-    /// What it may be, in which unit.
+    /// The permitted values and their unit.
     pub rule: Rule,
     /// The words that it may be; none: it is no word.
     pub choices: Vec<&'static str>,
@@ -56,7 +56,7 @@ pub enum Range {
 
 impl Range {
     /// Whether a number lies in it.
-    pub fn holds(self, x: f64) -> bool {
+    pub(crate) fn holds(self, x: f64) -> bool {
         x.is_finite()
             && match self {
                 Self::NotNegative => x >= 0.0,
@@ -87,7 +87,7 @@ impl std::fmt::Display for Range {
     }
 }
 
-/// What a knob may be, its unit, and when it has an effect.
+/// The permitted values of a knob, its unit, and when it has an effect.
 #[derive(Clone, Copy, Debug)]
 pub struct Rule {
     /// Numbers that it takes.
@@ -112,61 +112,61 @@ impl Rule {
     }
 
     /// Whatever its table's condition says.
-    pub const fn switch(mut self) -> Self {
+    pub(crate) const fn switch(mut self) -> Self {
         self.switch = true;
         self
     }
 
     /// With this unit.
-    pub const fn unit(mut self, unit: &'static str) -> Self {
+    pub(crate) const fn unit(mut self, unit: &'static str) -> Self {
         self.unit = unit;
         self
     }
 }
 
 /// Zero or above, or no number.
-pub const fn any() -> Rule {
+pub(crate) const fn any() -> Rule {
     Rule::of(Range::NotNegative)
 }
 
 /// Any finite number.
-pub const fn finite() -> Rule {
+pub(crate) const fn finite() -> Rule {
     Rule::of(Range::Finite)
 }
 
 /// Above zero.
-pub const fn positive() -> Rule {
+pub(crate) const fn positive() -> Rule {
     Rule::of(Range::Positive)
 }
 
 /// From 0 to 1.
-pub const fn share() -> Rule {
+pub(crate) const fn share() -> Rule {
     Rule::of(Range::Share)
 }
 
 /// Above 0 and below 1.
-pub const fn inside_share() -> Rule {
+pub(crate) const fn inside_share() -> Rule {
     Rule::of(Range::InsideShare)
 }
 
 /// From 0 to below 1.
-pub const fn below_one() -> Rule {
+pub(crate) const fn below_one() -> Rule {
     Rule::of(Range::BelowOne)
 }
 
 /// From `low` on.
-pub const fn at_least(low: usize) -> Rule {
+pub(crate) const fn at_least(low: usize) -> Rule {
     Rule::of(Range::AtLeast(low))
 }
 
 /// From `low` to `high`.
-pub const fn within(low: usize, high: usize) -> Rule {
+pub(crate) const fn within(low: usize, high: usize) -> Rule {
     Rule::of(Range::Within(low, high))
 }
 
 /// One table of settings; `settings!` writes it.
-pub trait Table {
-    /// What it is about, in a sentence.
+pub(crate) trait Table {
+    /// Its subject, in a sentence.
     fn about(&self) -> &'static str;
     /// When its knobs have an effect.
     fn when(&self) -> When;
@@ -181,14 +181,14 @@ pub trait Table {
 }
 
 /// Reads a value and holds it against its rule.
-pub fn read<T: Value>(value: &toml::Value, rule: Rule) -> Result<T, String> {
+pub(crate) fn read<T: Value>(value: &toml::Value, rule: Rule) -> Result<T, String> {
     let read = T::from_toml(value)?;
     hold(&read, rule)?;
     Ok(read)
 }
 
 /// Errors: a number out of its range.
-pub fn hold<T: Value>(value: &T, rule: Rule) -> Result<(), String> {
+pub(crate) fn hold<T: Value>(value: &T, rule: Rule) -> Result<(), String> {
     match value.number() {
         Some(x) if !rule.range.holds(x) => Err(rule.range.to_string()),
         _ => Ok(()),

@@ -1,13 +1,13 @@
 //! Training from a program: a capture becomes a run folder, and the run is measured, in a few calls. The command's verbs
-//! `train` and `eval` stand on the same functions of [`train`](crate::train) and [`eval`](crate::eval).
+//! `train` and `eval` stand on the same functions of [`train`](crate::run) and [`eval`](crate::eval).
 
 use crate::Result;
 use crate::capture::{Capture, ImageStore};
 use crate::eval::run::{EvalOptions, Scores, evaluate};
 use crate::event::Event;
 use crate::recipe::Recipe;
-use crate::train::run::open_capture;
-use crate::train::{Outcome, TrainOptions, train};
+use crate::run::open_capture;
+use crate::run::{Outcome, TrainOptions, train, with_found};
 use splat4d::format;
 use splat4d::layers::Scene;
 use std::path::{Path, PathBuf};
@@ -33,7 +33,7 @@ impl<'a> Training<'a> {
         Ok(Self { capture, recipe, options: TrainOptions::default(), listen: Box::new(|_| {}), stop: None })
     }
 
-    /// Fixes the iterations so that training takes so many minutes on this machine.
+    /// Keeps training to so many minutes from its opening, on a machine that turns slower or faster as well.
     #[must_use]
     pub fn minutes(mut self, minutes: f64) -> Self {
         self.options.minutes = Some(minutes);
@@ -62,7 +62,8 @@ impl<'a> Training<'a> {
         let stop = self.stop.unwrap_or(&never);
         let (capture, run) = (self.capture, run.as_ref());
         let antialias = self.recipe.appearance.antialias;
-        let outcome = train(capture.clone(), self.recipe, run, &self.options, stop, &mut self.listen)?;
+        let outcome = train(capture.clone(), self.recipe.clone(), run, &self.options, stop, &mut self.listen)?;
+        let capture = Arc::new(with_found(Capture::clone(&capture), &self.recipe, run)?);
         Ok(Trained { outcome, capture, antialias })
     }
 }

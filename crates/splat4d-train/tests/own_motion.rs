@@ -14,8 +14,8 @@ use splat4d_train::capture::frames::{Frames, Picture};
 use splat4d_train::init::{self, Seeds};
 use splat4d_train::methods::{Group, Plan, Program, Rate, Stage, still};
 use splat4d_train::recipe::Recipe;
-use splat4d_train::train::loss::TrainLoss;
-use splat4d_train::train::trainer::{Settings, Trainer};
+use splat4d_train::step::loss::TrainLoss;
+use splat4d_train::step::trainer::{Settings, Trainer};
 use splat4d_train::upkeep::Limits;
 use std::sync::Arc;
 

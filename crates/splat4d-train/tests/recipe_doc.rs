@@ -25,6 +25,26 @@ from that file repeats the run.
 A knob without effect in the recipe that it is set in (`mcmc.growth` where `densify.strategy` is adc) is refused by `--set`
 and warned about where it comes from a file; a value that switches off what is off anyhow is warned about too.
 
+`--quality` sets a few knobs at once; those that are typed win over it, and the recipe records what was in effect:
+
+| | `run.iterations` | `densify.max_cap` | `capture.downscale` |
+|---|---|---|---|
+| `draft` | 2,500 | 15,000 | twice the recipe's |
+| `standard` (the default) | 7,000 | 30,000 | the recipe's |
+| `best` | 20,000 | 60,000 | the recipe's |
+
+`--minutes M` wins over the steps of either. It covers the command from its start to the report: reading, initial points, a
+few timed steps (about 6 % of the time, more where a step takes a second), training, and measuring, filming and baking as far
+as they can be foretold.
+`run.iterations` are the steps that fit by the timed ones. They are the run's *schedule*: rates, densification, degrees of
+SH, pictures at half size and stages are stated in its steps. When the machine turns out to be slower or faster, the run is
+planned anew: `run.replans` gets a row [step, steps in all], and from that step on what is left of the schedule is spread
+evenly over the steps that are left. Where a step passes over several steps of the schedule, what was due at any of them is
+done once; where several steps share one, it is not repeated. So rates go on from where they were, down to the same end, and
+nothing that is past changes its meaning. A row is in the run's recipe.toml before it is used: a resumed run, and one that
+is trained from that recipe, have the same bits. A resumed run keeps to what was left of its minutes. No step ever stands
+for more than eight of the schedule, so that on a machine that stalls the time is missed and not the scene.
+
 Knobs that count iterations and are 0 follow from `run.iterations`. Rates of positions are in units of the scene's extent
 (1.1 times the largest distance of a training camera from the cameras' centroid), everything with time in it is per clip
 length: a recipe carries over from a scene of centimetres and seconds to one of metres and minutes.

@@ -17,7 +17,7 @@ use std::f64::consts::TAU;
 use std::sync::Arc;
 
 /// Immutable, like every model: plain data and the keys of its tables. What it learns lies in the layer's parameters.
-pub struct Sway {
+pub(crate) struct Sway {
     /// Seconds of one swing.
     period: f64,
     /// [N, 3], scene units.
@@ -26,7 +26,7 @@ pub struct Sway {
 
 impl Sway {
     /// Makes or claims the model's table in `p`.
-    pub fn new<F: Real>(period: f64, p: &mut Params<F>) -> splat4d::Result<Self> {
+    pub(crate) fn new<F: Real>(period: f64, p: &mut Params<F>) -> splat4d::Result<Self> {
         // One constructor for a fresh scene and for a loaded one: `entry` claims the array of this name, if there is one.
         let rows = p.len();
         let amplitudes = p.entry("amplitudes", Space::Gaussians, &[("amplitudes", 3)], rows, |_| {})?;
@@ -87,7 +87,7 @@ impl<F: Real> Motion<F> for Sway {
 }
 
 /// A field of grass-like blobs; those further up sway more.
-pub fn scene() -> splat4d::Result<Scene<f32>> {
+pub(crate) fn scene() -> splat4d::Result<Scene<f32>> {
     const ROWS: usize = 400;
     let mut params = Params::<f32>::new(ROWS, 1, LifeKind::Infinite.columns());
     let motion = Sway::new(2.0, &mut params)?;

@@ -5,7 +5,7 @@ use std::fmt;
 /// Result with this crate's [`Error`].
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
-/// What class of trouble an [`Error`] is; shells map it to an exit code.
+/// Class of an [`Error`]; shells map it to an exit code.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum ErrorKind {
@@ -23,7 +23,7 @@ pub enum ErrorKind {
     Interrupted,
 }
 
-/// What happened, where (file, frame, camera, byte) and what to do.
+/// An error: its cause, its place (file, frame, camera, byte) and the remedy.
 #[derive(Debug)]
 pub struct Error {
     kind: ErrorKind,

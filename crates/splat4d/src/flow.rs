@@ -17,7 +17,7 @@ use crate::render::{self, Image, Renderer};
 use crate::scene::{Camera, Planes, Space, Splats, Table, Time};
 
 /// Less alpha than this does not carry a flow: dividing by it would only amplify rounding.
-pub const FLOW_ALPHA_MIN: f64 = 1e-3;
+pub(crate) const FLOW_ALPHA_MIN: f64 = 1e-3;
 
 /// A scene at one time as a camera sees it.
 #[derive(Clone, Copy, Debug)]
@@ -31,7 +31,7 @@ pub struct Shot<'a> {
 /// A rendered vector field.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Flow<F = f32> {
-    /// [C, h, w]: Σ w_i s_i / max(Σ w_i, [`FLOW_ALPHA_MIN`]).
+    /// [C, h, w]: Σ w_i s_i / max(Σ w_i, `FLOW_ALPHA_MIN`).
     pub vectors: Planes<F>,
     /// Σ w_i over splats that have a vector, [1, h, w]; where it is small the vector means nothing.
     pub weight: Planes<F>,

@@ -220,18 +220,19 @@ impl<'a> Player<'a> {
         Ok(Self { file: Some(file), meta, held: Vec::new(), head: None, budget, shown: Vec::new(), bytes_read })
     }
 
-    /// What the scene says of itself.
+    /// The scene's metadata.
     pub fn meta(&self) -> &Meta {
         &self.meta
     }
 
     /// Bytes read so far, the index included.
-    pub fn bytes_read(&self) -> u64 {
+    #[cfg(test)]
+    pub(crate) fn bytes_read(&self) -> u64 {
         self.bytes_read
     }
 
     /// Bytes of the layers in memory.
-    pub fn held_bytes(&self) -> usize {
+    pub(crate) fn held_bytes(&self) -> usize {
         self.held.iter().map(|h| h.bytes).sum()
     }
 

@@ -11,7 +11,7 @@ use std::sync::atomic::{AtomicU8, Ordering};
 /// An instruction level; a level that the machine lacks is lowered to the best that it has.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Simd {
-    /// What the compiler was told every machine of the target has.
+    /// The instructions that the compiler may use on every machine of the target.
     Scalar,
     /// x86-64 with AVX2 and FMA.
     Avx2,
@@ -38,6 +38,16 @@ impl Simd {
         }
     }
 
+    /// What files and reports call it. NEON is what every 64-bit ARM machine has.
+    pub fn name(self) -> &'static str {
+        match self {
+            Simd::Scalar if cfg!(target_arch = "aarch64") => "neon",
+            Simd::Scalar => "scalar",
+            Simd::Avx2 => "avx2",
+            Simd::Avx512 => "avx512",
+        }
+    }
+
     fn of_machine() -> Self {
         #[cfg(target_arch = "x86_64")]
         {
@@ -59,7 +69,7 @@ impl Simd {
 
 /// Work that is compiled once for each level. `run` must be `#[inline(always)]`, or it would be compiled once only.
 pub trait Kernel {
-    /// What it returns.
+    /// Its result.
     type Out;
     /// Does the work; `FMA` says whether fused multiply-add is an instruction here.
     fn run<const FMA: bool>(self) -> Self::Out;
@@ -81,7 +91,7 @@ pub trait Pass {
     type Scratch: ?Sized;
     /// Where results go.
     type Into: ?Sized;
-    /// What it returns.
+    /// Its result.
     type Out;
     /// Does the work; `FMA` says whether fused multiply-add is an instruction here.
     fn run<const FMA: bool>(&self, scratch: &mut Self::Scratch, into: &mut Self::Into) -> Self::Out;
@@ -129,7 +139,7 @@ pub fn each<T: Copy + Default, const N: usize>(f: impl Fn(usize) -> T) -> [T; N]
 /// The sum of sixteen numbers, as a tree: the same for every level and thread. Its steps are written out, since a loop over
 /// them stays one under AVX-512.
 #[inline(always)]
-pub fn total<T: Copy + Default + std::ops::Add<Output = T>>(x: [T; 16]) -> T {
+pub(crate) fn total<T: Copy + Default + std::ops::Add<Output = T>>(x: [T; 16]) -> T {
     let eight: [T; 8] = each(|i| x[i] + x[i + 8]);
     let [a, b, c, d]: [T; 4] = each(|i| eight[i] + eight[i + 4]);
     (a + c) + (b + d)
@@ -137,20 +147,20 @@ pub fn total<T: Copy + Default + std::ops::Add<Output = T>>(x: [T; 16]) -> T {
 
 /// The smaller; unlike `f32::min` one instruction.
 #[inline(always)]
-pub fn least<T: PartialOrd>(a: T, b: T) -> T {
+pub(crate) fn least<T: PartialOrd>(a: T, b: T) -> T {
     if a < b { a } else { b }
 }
 
 /// The larger, in one instruction.
 #[inline(always)]
-pub fn greatest<T: PartialOrd>(a: T, b: T) -> T {
+pub(crate) fn greatest<T: PartialOrd>(a: T, b: T) -> T {
     if a > b { a } else { b }
 }
 
 /// One of two values that are both at hand. Without the hint LLVM makes a branch of it, and of the branch a masked
 /// store, which costs tens of cycles.
 #[inline(always)]
-pub fn select<T>(condition: bool, yes: T, no: T) -> T {
+pub(crate) fn select<T>(condition: bool, yes: T, no: T) -> T {
     std::hint::select_unpredictable(condition, yes, no)
 }
 

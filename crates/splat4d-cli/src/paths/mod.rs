@@ -81,6 +81,11 @@ pub(crate) struct Clock {
 const ORBIT_SECONDS: f64 = 6.0;
 /// Longest film of an orbit unless slow motion is asked for, seconds.
 const ORBIT_SECONDS_MAX: f64 = 20.0;
+/// Seconds of an orbit's film of a clip that plays for so long.
+pub(crate) fn orbit_seconds(playing: f64) -> f64 {
+    playing.clamp(ORBIT_SECONDS, ORBIT_SECONDS_MAX)
+}
+
 /// Most frames of a film: an hour at 60 frames a second would be a slip.
 const MAX_FRAMES: f64 = 200_000.0;
 
@@ -119,7 +124,7 @@ pub(crate) fn shots(
         Route::Orbit => {
             let seconds = match (clock.freeze, clock.slow_motion) {
                 (None, Some(_)) => clock.playing(),
-                _ => clock.playing().clamp(ORBIT_SECONDS, ORBIT_SECONDS_MAX),
+                _ => orbit_seconds(clock.playing()),
             };
             let frames = clock.frames(seconds)?;
             let shot = |i: usize| {

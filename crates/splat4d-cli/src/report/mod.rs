@@ -7,7 +7,7 @@ pub(crate) mod compress;
 mod pictures;
 
 use crate::files::{self, grouped, human_bytes, human_seconds};
-use crate::run_folder::{Metrics, Run, ViewScore};
+use crate::run_folder::{Beside, Metrics, Run, ViewScore, beside};
 use chart::{Series, bars, escape, lines, short};
 use serde_json::Value;
 use splat4d::Result;
@@ -39,6 +39,7 @@ fn page(run: &Run) -> String {
     views(&mut body, run);
     curves(&mut body, run);
     scores(&mut body, run);
+    conditions(&mut body, run);
     costs(&mut body, run);
     again(&mut body, run);
     let title = escape(&run.name());
@@ -76,6 +77,7 @@ fn cards(out: &mut String, run: &Run) {
     };
     for (class, key, digits, unit, name) in [
         ("main", "PSNR", 2, "dB", "PSNR, held-out views"),
+        ("", "PSNR-cc", 2, "dB", "PSNR, each camera's colours corrected"),
         ("main", "PSNR-dynamic", 2, "dB", "PSNR where things move"),
         ("", "PSNR-foreground", 2, "dB", "PSNR of the foreground"),
         ("", "SSIM", 4, "", "SSIM"),
@@ -195,8 +197,16 @@ fn scores(out: &mut String, run: &Run) {
         }
     }
     let mean = |views: &[&ViewScore]| views.iter().filter_map(|v| v.psnr).sum::<f64>() / views.len().max(1) as f64;
+    // What its colours cost a camera stands beside its score.
+    let label = |views: &[&ViewScore]| {
+        let all: Vec<f64> = views.iter().filter_map(|v| v.corrected).collect();
+        let corrected = all.iter().sum::<f64>() / all.len() as f64;
+        let beside = if all.is_empty() { String::new() } else { format!(" ({corrected:.2})") };
+        format!("{:.2} dB{beside}", mean(views))
+    };
     let mut rows: Vec<(String, f64, String)> =
-        cameras.iter().map(|(name, views)| (name.clone(), mean(views), format!("{:.2} dB", mean(views)))).collect();
+        cameras.iter().map(|(name, views)| (name.clone(), mean(views), label(views))).collect();
+    let corrected = run.views.iter().any(|v| v.corrected.is_some());
     let all = rows.len();
     if all > CAMERA_BARS {
         rows.sort_by(|a, b| a.1.total_cmp(&b.1));
@@ -225,6 +235,52 @@ fn scores(out: &mut String, run: &Run) {
     }
     let by_time = if times.len() > 1 { lines(&series, "seconds", "dB") } else { None };
     panels(out, "Where and when it is good", [(title, by_camera), ("PSNR by time, dB", by_time)]);
+    if corrected {
+        out.push_str(
+            "<p class=\"note\">In brackets: after the one affine colour matrix that suits all held-out views of the \
+             camera best. The rest of the error is no matter of white balance.</p>\n",
+        );
+    }
+}
+
+/// What the figures hold for, and what else was measured: other views, another background.
+fn conditions(out: &mut String, run: &Run) {
+    let own = run.results.as_ref().map(|scores| Beside { name: "", step: run.iteration().unwrap_or(0), scores });
+    let mut rows = String::new();
+    for entry in own.into_iter().chain(beside(&run.all_results)) {
+        // Runs of older versions do not say.
+        let Some(told) = entry.scores.get("conditions") else { continue };
+        let text = |key: &str| told.get(key).and_then(Value::as_str).unwrap_or_default().to_owned();
+        let score = |key: &str, digits: usize| {
+            entry.scores.get(key).and_then(Value::as_f64).map(|x| format!("{x:.digits$}")).unwrap_or_default()
+        };
+        let cells = [
+            text("split"),
+            background(&told["background"]),
+            grouped(entry.step),
+            score("PSNR", 2),
+            score("PSNR-cc", 2),
+            score("SSIM", 4),
+            text("simd"),
+            text("device"),
+        ];
+        rows += &format!("<tr>{}</tr>", cells.map(|c| format!("<td>{}</td>", escape(&c))).concat());
+    }
+    if !rows.is_empty() {
+        let head = ["views", "background", "step", "PSNR", "corrected", "SSIM", "instructions", "device"];
+        let head = head.map(|h| format!("<th>{h}</th>")).concat();
+        let _ = write!(out, "<h2>What was measured</h2>\n<table><tr>{head}</tr>{rows}</table>\n");
+    }
+}
+
+/// A background's name.
+fn background(value: &Value) -> String {
+    match crate::camera_file::numbers(value).as_deref() {
+        Some([r, g, b]) if r == g && g == b && *r == 1.0 => "white".into(),
+        Some([r, g, b]) if r == g && g == b && *r == 0.0 => "black".into(),
+        Some(color) => color.iter().map(|c| format!("{c:.2}")).collect::<Vec<_>>().join(" "),
+        None => "none".into(),
+    }
 }
 
 fn costs(out: &mut String, run: &Run) {

@@ -23,10 +23,18 @@ fn fill(run: &Path) {
     let map = |f: &dyn Fn(usize) -> Value| -> Value { (0..24).map(|i| (files[i].clone(), f(i))).collect() };
     let psnr = map(&|i| json!(30.0 + (i % 7) as f64 * 0.3 + (i / 12) as f64));
     let camera = map(&|i| json!(format!("cam{:02}", i / 12)));
+    let corrected = map(&|i| json!(33.0 + (i / 12) as f64));
     let time = map(&|i| json!((i % 12) as f64 / 30.0));
-    write("per_view.json", &json!({"ours_6000": {"PSNR": psnr, "camera": camera, "time": time}}).to_string());
-    let ours = json!({"PSNR": 31.25, "SSIM": 0.952, "PSNR-dynamic": 26.1, "flicker": 1.2});
-    write("results.json", &json!({"ours_6000": ours, "still": {"PSNR-dynamic": 18.6}}).to_string());
+    write(
+        "per_view.json",
+        &json!({"ours_6000": {"PSNR": psnr, "PSNR-cc": corrected, "camera": camera, "time": time}}).to_string(),
+    );
+    let mut ours = json!({"PSNR": 31.25, "PSNR-cc": 33.75, "SSIM": 0.952, "PSNR-dynamic": 26.1, "flicker": 1.2});
+    let told = |background: f64| json!({"split": "test", "background": vec![background; 3], "step": 6000, "simd": "avx2", "device": "CPU"});
+    ours["conditions"] = told(1.0);
+    let black = json!({"ours_4000": {}, "ours_6000": {"PSNR": 32.5, "conditions": told(0.0)}});
+    let all = json!({"ours_6000": ours, "still": {"PSNR-dynamic": 18.6}, "test-black": black});
+    write("results.json", &all.to_string());
     for kind in ["renders", "gt", "errors"] {
         let folder = run.join("test/ours_6000").join(kind);
         std::fs::create_dir_all(&folder).unwrap();
@@ -44,9 +52,22 @@ fn the_page_tells_everything_and_needs_nothing() {
     fill(folder.path());
     let path = write(&Run::open(folder.path()).unwrap()).unwrap();
     let html = std::fs::read_to_string(path).unwrap();
-    for text in
-        ["31.25", "26.10", "+7.50", "cam01", "&lt;odd&gt;", "all knobs", "avx2", "3:01", "30,000", "LPIPS was not"]
-    {
+    for text in [
+        "31.25",
+        "33.75",
+        "dB (34.00)",
+        "26.10",
+        "+7.50",
+        "cam01",
+        "&lt;odd&gt;",
+        "all knobs",
+        "avx2",
+        "3:01",
+        "30,000",
+        "LPIPS was not",
+        "<td>test</td><td>white</td><td>6,000</td><td>31.25</td><td>33.75</td>",
+        "<td>black</td><td>6,000</td><td>32.50</td>",
+    ] {
         assert!(html.contains(text), "{text} is missing");
     }
     assert_eq!(html.matches("data:image/jpeg;base64,").count(), 3 * VIEWS);

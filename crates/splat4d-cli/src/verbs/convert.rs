@@ -2,15 +2,16 @@
 
 use crate::baking::{self, Baking};
 use crate::console::Console;
-use crate::files::{self, grouped, human_bytes};
+use crate::files::{self, either, grouped, human_bytes};
 use crate::sequence::{self, Pattern};
 use crate::source::{Source, not_empty};
 use serde_json::json;
-use splat4d::format::{self, Dialect, Warnings, dialect, ply, spz};
-use splat4d::layers::{ALWAYS, Scene, freeze, rotation_between};
+use splat4d::format::dialect::{self, WriteOptions};
+use splat4d::format::{self, DIALECTS, Dialect, Warnings, spz};
+use splat4d::layers::{self, Scene, rotation_between};
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
-use splat4d::scene::{Camera, LifeKind, Params, Time};
+use splat4d::scene::{Camera, Time};
 use splat4d::{Error, ErrorKind, Result};
 use std::path::{Path, PathBuf};
 
@@ -29,17 +30,30 @@ Examples:
   splat4d convert runs/knight knight.splatv           moving: splaTV and gsplat.js play it
   splat4d convert runs/knight now.spz --time 0.5      one moment
   splat4d convert runs/knight 'frames/f_%04d.spz' --frames
-  splat4d convert frames/ all.safetensors --fps 25    numbered files become one moving scene
+  splat4d convert frames/ all.safetensors --fps 25    numbered files become one moving scene";
 
-Written: .splat4d .ply .compressed.ply .stg.ply .spz .splat .splatv .safetensors.
-Read as well: SOG version 2 (.sog or a folder). docs/formats.md tells what each can hold and which axes it assumes.";
+/// What stands under the help: examples, and the formats of the list.
+fn after_help() -> String {
+    let read = DIALECTS.iter().filter(|d| !d.is_written()).map(|d| format!("{} ({})", d.name, d.ending));
+    format!(
+        "{EXAMPLES}\n\nWritten: .splat4d {} .safetensors.\nRead as well: {}, folders of SOG. docs/formats.md tells what each \
+         can hold and which axes it assumes.",
+        written(|_| true).join(" "),
+        read.collect::<Vec<_>>().join(", ")
+    )
+}
+
+/// Endings of the dialects that can be written and for which `which` holds.
+fn written(which: impl Fn(&Dialect) -> bool) -> Vec<&'static str> {
+    DIALECTS.iter().filter(|d| d.is_written() && which(d)).map(|d| d.ending).collect()
+}
 
 /// Convert between Gaussian file formats, and say what is lost
 #[derive(Debug, clap::Args)]
-#[command(after_help = EXAMPLES)]
+#[command(after_help = after_help())]
 pub(crate) struct Args {
-    /// A run, scene, .ply, .spz, .splat, .splatv or SOG file, a SOG folder, or a folder of numbered files
-    #[arg(value_name = "IN")]
+    #[arg(value_name = "IN", help = format!("A run, scene, {} file, a SOG folder, or a folder of numbered files",
+          either(&dialect::extensions(|_| true))))]
     input: PathBuf,
     /// The file to write, known by its ending; with --frames a folder, or a pattern such as f_%04d.spz
     #[arg(value_name = "OUT")]
@@ -117,39 +131,29 @@ enum Target {
 impl Target {
     fn of(path: &Path) -> Result<Self> {
         let name = path.file_name().map(|n| n.to_string_lossy().to_ascii_lowercase()).unwrap_or_default();
-        let table = [
-            (".compressed.ply", Self::Dialect(Dialect::CompressedPly)),
-            (".stg.ply", Self::Dialect(Dialect::StgPly)),
-            (".ply", Self::Dialect(Dialect::Ply)),
-            (".spz", Self::Dialect(Dialect::Spz)),
-            (".splatv", Self::Dialect(Dialect::Splatv)),
-            (".splat", Self::Dialect(Dialect::Splat)),
-            (".safetensors", Self::Scene),
-            (".splat4d", Self::Playback),
-        ];
-        if let Some((_, target)) = table.iter().find(|(ending, _)| name.ends_with(ending)) {
-            return Ok(*target);
+        if let Some(dialect) = Dialect::by_ending(&name) {
+            dialect.check_written().map_err(|e| e.at(path.display()))?;
+            return Ok(Self::Dialect(dialect));
         }
         let (what, remedy) = match name.rsplit_once('.').map(|n| n.1) {
-            Some("sog") => {
-                ("SOG is read, but not written", "Write .compressed.ply or .spz; splat-transform makes SOG of either.")
-            }
-            Some("ksplat" | "glb" | "4dgs") => ("this format is not written", "Write .ply or .spz."),
-            _ => ("has no ending that names a format", "Use .ply .compressed.ply .stg.ply .spz .splat .splatv."),
+            Some("safetensors") => return Ok(Self::Scene),
+            Some("splat4d") => return Ok(Self::Playback),
+            Some("ksplat" | "glb" | "4dgs") => ("this format is not written", "Write .ply or .spz.".into()),
+            _ => ("has no ending that names a format", format!("Use {}.", written(|_| true).join(" "))),
         };
         Err(Error::new(ErrorKind::Unsupported, what).at(path.display()).remedy(remedy))
     }
 
     fn moves(self) -> bool {
         match self {
-            Self::Dialect(d) => d.moves(),
+            Self::Dialect(d) => d.moves,
             Self::Scene | Self::Playback => true,
         }
     }
 
     fn name(self) -> &'static str {
         match self {
-            Self::Dialect(d) => d.name(),
+            Self::Dialect(d) => d.name,
             Self::Scene => "scene.safetensors",
             Self::Playback => "playback file",
         }
@@ -184,19 +188,19 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         return bake(source, args, rotation != IDENTITY, console);
     }
     let scene = &source.scene;
-    let writer = Writer { target, spz_version: args.spz_version, cameras };
+    let writer = Writer { target, options: WriteOptions { spz_version: args.spz_version, cameras } };
     if let Some((pattern, _)) = pattern {
         return write_frames(args, scene, &pattern, &writer, console);
     }
     let moment = match args.time {
         Some(time) => Some(time),
-        None if target.moves() || !is_moving(scene) => None,
+        None if target.moves() || !scene.is_moving() => None,
         None => {
             let start = scene.clip[0];
             console.warn(&format!(
-                "{} holds one moment: {start} s, the clip's start, is taken. Choose with --time, or use --frames, \
-                 .splatv or .stg.ply.",
-                target.name()
+                "{} holds one moment: {start} s, the clip's start, is taken. Choose with --time, or use {}.",
+                target.name(),
+                either(&[&["--frames"], &written(|d| d.moves)[..]].concat())
             ));
             Some(start)
         }
@@ -298,7 +302,7 @@ fn write_frames(
 /// Rotates the scene so that the wanted axis is up, and returns the rotation that was made.
 fn rotate(scene: &mut Scene<f32>, up: Option<Up>, target: Target, console: &Console) -> [[f64; 3]; 3] {
     let custom = match target {
-        Target::Dialect(d) => Some(d.up()),
+        Target::Dialect(d) => Some(d.up),
         Target::Scene | Target::Playback => None,
     };
     let Some(wanted) = up.map_or(custom, Up::direction) else { return IDENTITY };
@@ -327,56 +331,25 @@ fn rotated(camera: Camera, r: &[[f64; 3]; 3]) -> Camera {
     Camera { cam_from_world: Se3 { rotation, ..camera.cam_from_world }, ..camera }
 }
 
-fn is_moving(scene: &Scene<f32>) -> bool {
-    scene.layers.iter().any(|l| l.motion.capabilities().moves || l.life != LifeKind::Infinite || l.span != ALWAYS)
-}
-
 /// A scene that stands still as `scene` does at `time`.
 fn one_moment(scene: &Scene<f32>, time: f64) -> Result<Scene<f32>> {
-    let mut still = dialect::still(moment(scene, time)?, Dialect::Ply);
-    still.up = scene.up;
-    still.background = scene.background;
-    Ok(still)
-}
-
-fn moment(scene: &Scene<f32>, time: f64) -> Result<Params> {
-    scene.without_head("plain Gaussians")?;
-    match &scene.layers[..] {
-        // What stands still anyway keeps its very bits.
-        [only] if !is_moving(scene) && only.frame.is_identity() => Ok(only.params.clone()),
-        _ => freeze(scene, Time(time)),
-    }
+    let still = dialect::still(layers::moment(scene, Time(time))?);
+    Ok(Scene { up: scene.up, background: scene.background, ..still })
 }
 
 /// Writes one file of a kind.
 struct Writer {
     target: Target,
-    spz_version: u32,
-    cameras: Vec<Camera>,
+    options: WriteOptions,
 }
 
 impl Writer {
     /// A scene as a file; where the format holds one moment, the scene stands still.
     fn bytes(&self, scene: &Scene<f32>) -> Result<(Vec<u8>, Warnings)> {
         let mut out = Vec::new();
-        let Target::Dialect(dialect) = self.target else {
-            format::scene::write(scene, &mut out)?;
-            return Ok((out, Warnings::default()));
-        };
-        if dialect.moves() {
-            let warnings = match dialect {
-                Dialect::StgPly => ply::write_stg(scene, &mut out)?,
-                _ => format::splatv::write(scene, &self.cameras, &mut out)?,
-            };
-            return Ok((out, warnings));
-        }
-        let params = moment(scene, scene.clip[0])?;
-        let warnings = match dialect {
-            Dialect::Ply => ply::write(&params, &mut out).map(|()| Warnings::default())?,
-            Dialect::CompressedPly => ply::write_compressed(&params, &mut out)?,
-            Dialect::Spz => spz::write(&params, self.spz_version, &mut out)?,
-            Dialect::Splat => format::splat::write(&params, &mut out)?,
-            other => unreachable!("{} has no writer, and `Target::of` never names it", other.name()),
+        let warnings = match self.target {
+            Target::Dialect(dialect) => dialect.write(scene, &self.options, &mut out)?,
+            Target::Scene | Target::Playback => format::scene::write(scene, &mut out).map(|()| Warnings::default())?,
         };
         Ok((out, warnings))
     }
@@ -385,15 +358,16 @@ impl Writer {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use splat4d::format::{ply, splat, splatv};
 
     #[test]
     fn formats_are_known_by_their_endings() {
         let of = |name: &str| Target::of(Path::new(name));
-        assert_eq!(of("a.PLY").unwrap(), Target::Dialect(Dialect::Ply));
-        assert_eq!(of("a.compressed.ply").unwrap(), Target::Dialect(Dialect::CompressedPly));
-        assert_eq!(of("a.stg.ply").unwrap(), Target::Dialect(Dialect::StgPly));
-        assert_eq!(of("x/a.splatv").unwrap(), Target::Dialect(Dialect::Splatv));
-        assert_eq!(of("a.splat").unwrap(), Target::Dialect(Dialect::Splat));
+        assert_eq!(of("a.PLY").unwrap(), Target::Dialect(ply::DIALECT));
+        assert_eq!(of("a.compressed.ply").unwrap(), Target::Dialect(ply::COMPRESSED));
+        assert_eq!(of("a.stg.ply").unwrap(), Target::Dialect(ply::STG));
+        assert_eq!(of("x/a.splatv").unwrap(), Target::Dialect(splatv::DIALECT));
+        assert_eq!(of("a.splat").unwrap(), Target::Dialect(splat::DIALECT));
         assert_eq!(of("scene.safetensors").unwrap(), Target::Scene);
         for (name, word) in [("a.sog", "not written"), ("a.glb", ".ply"), ("a", "ending")] {
             assert!(of(name).unwrap_err().to_string().contains(word), "{name}");

@@ -6,9 +6,9 @@ use crate::run_folder::{Run, cameras_json};
 use crate::source::read_scene;
 use serde_json::{Value, json};
 use splat4d::ErrorKind;
-use splat4d_train::eval::run::EvalOptions;
+use splat4d_train::eval::run::{EvalOptions, Measured};
 use splat4d_train::recipe::MotionName;
-use splat4d_train::train::{self, TrainOptions};
+use splat4d_train::run::{self, TrainOptions};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -17,8 +17,55 @@ Examples:
   splat4d eval runs/knight                 scores, pictures, film and report again
   splat4d eval runs/knight --baseline      how much does motion gain over a still scene?
   splat4d eval runs/knight --lpips-weights vgg.safetensors --json
+  splat4d eval runs/mutant --background both   on white and on black
+  splat4d eval runs/mutant --split val         on views to choose by; the test views are for the end
 
-Results are in RUN/results.json and RUN/per_view.json (keys as 3DGS writes them), pictures in RUN/test/ours_N.";
+Results are in RUN/results.json and RUN/per_view.json (keys as 3DGS writes them), pictures in RUN/test/ours_N. With --split
+or --background only scores are made; what is not the test split on the run's own background stands under an entry and in a
+folder of its own, such as `val` or `test-black`.";
+
+/// What transparent pixels are composited on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum Background {
+    /// Black
+    Black,
+    /// White
+    White,
+    /// White, then black
+    Both,
+}
+
+impl Background {
+    fn colors(self) -> &'static [(&'static str, [f32; 3])] {
+        const ALL: [(&str, [f32; 3]); 2] = [("white", [1.0; 3]), ("black", [0.0; 3])];
+        match self {
+            Self::White => &ALL[..1],
+            Self::Black => &ALL[1..],
+            Self::Both => &ALL,
+        }
+    }
+}
+
+/// The views to measure.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum Split {
+    /// The views that were held out
+    Test,
+    /// The data set's validation views
+    Val,
+    /// All views that were trained on
+    Train,
+}
+
+impl Split {
+    fn measured(self) -> Measured {
+        match self {
+            Self::Test => Measured::Test,
+            Self::Val => Measured::Validation,
+            Self::Train => Measured::Train,
+        }
+    }
+}
 
 /// Measure a run on the views that training never saw
 #[derive(Debug, clap::Args)]
@@ -33,6 +80,12 @@ pub(crate) struct Args {
     /// Only scores and report, no orbit film
     #[arg(long)]
     no_film: bool,
+    /// Measure these views, and make nothing but scores [default: test]
+    #[arg(long, value_enum, conflicts_with = "baseline", help_heading = "What is measured")]
+    split: Option<Split>,
+    /// Composite transparent pixels of pictures and renders on this, and make nothing but scores [default: as the run]
+    #[arg(long, value_enum, conflicts_with = "baseline", help_heading = "What is measured")]
+    background: Option<Background>,
     #[command(flatten)]
     measure: finish::Measure,
 
@@ -45,6 +98,12 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let path = args.run.as_ref().or(args.model.as_ref()).expect("clap asks for a run");
     let run = Run::open(path)?;
     run.scene_file()?;
+    if args.split.is_some() || args.background.is_some() {
+        let split = args.split.unwrap_or(Split::Test).measured();
+        let backgrounds = args.background.map_or(&[][..], Background::colors);
+        finish::scores_on(path, split, backgrounds, &args.measure, console)?;
+        return finish::write_page(path, console);
+    }
     if args.baseline {
         baseline(path, &run, args, console)?;
     }
@@ -71,7 +130,7 @@ fn baseline(path: &Path, run: &Run, args: &Args, console: &Console) -> anyhow::R
         let stop = crate::interrupt::flag("stopping");
         let options = TrainOptions::default();
         let outcome =
-            train::train(Arc::new(capture), recipe, &folder, &options, &stop, &mut |event| console.event(event))?;
+            run::train(Arc::new(capture), recipe, &folder, &options, &stop, &mut |event| console.event(event))?;
         console.clear();
         if outcome.interrupted {
             return Err(splat4d::Error::new(ErrorKind::Interrupted, "the still scene is unfinished")

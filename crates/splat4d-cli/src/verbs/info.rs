@@ -8,14 +8,14 @@ use crate::run_folder::Run;
 use crate::source::{Source, cloud};
 use serde_json::{Value, json};
 use splat4d::Error;
-use splat4d::format::Dialect;
+use splat4d::format::sog;
 use splat4d::layers::{Head, Scene};
 use splat4d::math::sh::degree_of;
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{GEOMETRY, SH};
-use splat4d_train::capture::{Capture, Severity};
+use splat4d_train::capture::{Capture, Severity, Timing};
 use splat4d_train::recipe::Recipe;
-use splat4d_train::train::run::{memory_estimate, open_capture};
+use splat4d_train::run::{memory_estimate, open_capture};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
@@ -55,6 +55,9 @@ pub(crate) struct Args {
     /// Read a capture with these views held out: camera=0,10 or every=8 or none
     #[arg(long, value_name = "RULE")]
     hold_out: Option<String>,
+    /// Read a capture with a knob of the recipe set, such as capture.sequence=photos; may be repeated
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
 }
 
 /// Output of the verb: a JSON object, and the same for people.
@@ -73,10 +76,11 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             .remedy("Give a capture, a run or a scene file.")
             .into());
     }
-    let marker = path.extension().is_some_and(|e| e == "json");
+    let marker = path.extension().is_some_and(|e| e == "json" || e == "npy");
+    let sog = path.join(sog::META).is_file() || path.file_name().is_some_and(|name| name == sog::META);
     let mut told = if Run::is(path) {
         of_run(path)?
-    } else if path.is_dir() || marker {
+    } else if !sog && (path.is_dir() || marker) {
         of_capture(path, args)?
     } else {
         of_file(path)?
@@ -107,6 +111,9 @@ fn of_capture(path: &Path, args: &Args) -> anyhow::Result<Told> {
     if let Some(rule) = &args.hold_out {
         recipe.set(&format!("hold_out={}", toml::Value::String(rule.clone())))?;
     }
+    for assignment in &args.set {
+        recipe.set(assignment).map_err(|e| e.at("--set"))?;
+    }
     let capture = open_capture(path, &recipe)?;
     let (first, last) = capture.time_range();
     let (times, sizes) = (capture.times(), sizes(&capture));
@@ -120,10 +127,21 @@ fn of_capture(path: &Path, args: &Args) -> anyhow::Result<Told> {
     let mut text = String::new();
     line(&mut text, "capture", &format!("{} ({:?})", capture.name, capture.kind));
     line(&mut text, "cameras", &format!("{fixed} fixed, {moving} moving"));
-    line(&mut text, "pictures", &format!("{} at {} moments", grouped(capture.frames.len()), grouped(times.len())));
+    let plural = if times.len() == 1 { "" } else { "s" };
+    let pictures = format!("{} at {} moment{plural}", grouped(capture.frames.len()), grouped(times.len()));
+    line(&mut text, "pictures", &pictures);
     let all: Vec<String> = sizes.iter().map(|s| format!("{}x{}", s[0], s[1])).collect();
     line(&mut text, "size", &all.join(", "));
-    line(&mut text, "time", &format!("{first:.3} to {last:.3} s, {} frames a second", capture.fps));
+    let span = format!("{first:.3} to {last:.3} s, {} frames a second", capture.fps);
+    line(
+        &mut text,
+        "time",
+        &match capture.timing {
+            Timing::Moment => "one moment: a photo set, no times are stated".to_owned(),
+            Timing::Numbers => format!("{span}; by the numbers in picture names, no times are stated"),
+            _ => span,
+        },
+    );
     let mut split = format!("{} to train on, {} held out", grouped(capture.train.len()), grouped(capture.held.len()));
     if !capture.validation.is_empty() {
         let _ = write!(split, ", {} for validation", capture.validation.len());
@@ -140,13 +158,14 @@ fn of_capture(path: &Path, args: &Args) -> anyhow::Result<Told> {
     for finding in &findings {
         match finding.severity {
             Severity::Warning => troubles.push(format!("{} {}", finding.what, finding.remedy)),
-            Severity::Note => line(&mut text, "note", &format!("{} {}", finding.what, finding.remedy)),
+            Severity::Note => line(&mut text, "note", format!("{} {}", finding.what, finding.remedy).trim_end()),
         }
     }
     let json = json!({
         "type": "capture", "name": capture.name, "layout": format!("{:?}", capture.kind),
         "fixed_cameras": fixed, "moving_cameras": moving, "pictures": capture.frames.len(), "moments": times.len(),
         "sizes": sizes, "first_second": first, "last_second": last, "fps": capture.fps,
+        "timing": format!("{:?}", capture.timing).to_lowercase(),
         "train": capture.train.len(), "held_out": capture.held.len(), "validation": capture.validation.len(),
         "held_out_cameras": held, "masks": masks, "points": capture.points.as_ref().map(|p| p.points.len()),
         "memory_estimate": memory,
@@ -235,7 +254,7 @@ fn of_file(path: &Path) -> anyhow::Result<Told> {
     let mut text = String::new();
     line(&mut text, "file", &format!("{}, {}", path.display(), human_bytes(bytes)));
     let kind = match source.dialect {
-        Some(dialect) => dialect.name(),
+        Some(dialect) => dialect.name,
         None if source.playback.is_some() => "playback file",
         None => "splat4d scene",
     };
@@ -256,7 +275,7 @@ fn of_file(path: &Path) -> anyhow::Result<Told> {
     let inner = of_scene(&source.scene);
     text.push_str(&inner.text);
     let mut json = inner.json;
-    json["dialect"] = json!(source.dialect.map(Dialect::name));
+    json["dialect"] = json!(source.dialect.map(|d| d.name));
     json["type"] = json!(if source.ply.is_some() { "ply" } else { "scene" });
     json["bytes"] = json!(bytes);
     if let Some(told) = told {

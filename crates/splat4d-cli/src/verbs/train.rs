@@ -7,12 +7,12 @@ use crate::serving::{self, Place, Watch};
 use crate::{finish, interrupt};
 use serde_json::json;
 use splat4d::{Error, ErrorKind};
-use splat4d_train::capture::{Capture, Severity};
+use splat4d_train::capture::{Capture, Severity, Timing};
 use splat4d_train::event::Event;
-use splat4d_train::recipe::Recipe;
+use splat4d_train::recipe::{MotionName, Quality, Recipe};
+use splat4d_train::run::{self, Outcome, Stopwatch, TrainOptions, checkpoint};
+use splat4d_train::run::{memory_estimate, open_capture};
 use splat4d_train::settings::{Knob, nearest};
-use splat4d_train::train::run::{memory_estimate, open_capture};
-use splat4d_train::train::{self, Outcome, TrainOptions, checkpoint};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
@@ -24,6 +24,7 @@ const EXAMPLES: &str = "\
 Examples:
   splat4d train examples/knight                     default recipe, into runs/knight
   splat4d train my-take -o runs/first --minutes 10  as many steps as fit into ten minutes
+  splat4d train my-take --quality draft             a first look, after minutes
   splat4d train my-take --view                      watch it learn in the browser
   splat4d train my-take --motion still              one scene for all times: a calibration check
   splat4d train my-take --downscale 4 --set iterations=1000 --set sh_degree=0
@@ -61,19 +62,24 @@ pub struct Args {
     #[arg(short, long, value_name = "RUN", short_alias = 'm', alias = "model_path", alias = "model-path")]
     output: Option<PathBuf>,
     /// Continue this run exactly where its newest checkpoint is
-    #[arg(long, value_name = "RUN", conflicts_with_all = ["capture", "output", "motion", "minutes", "recipe", "set",
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["capture", "output", "motion", "minutes", "quality", "recipe", "set",
         "downscale", "hold_out", "image_memory", "seed", "source", "iterations", "force"])]
     resume: Option<PathBuf>,
     /// Replace the run in the -o folder
     #[arg(long)]
     force: bool,
     /// How Gaussians move: auto (chosen by the capture), still, spacetime, deform-mlp, hexplane, tracked, native4d,
-    /// control or ssm
+    /// control or ssm [default: auto, or the recipe's]
     #[arg(long, value_name = "MODEL", help_heading = "What is learned")]
     motion: Option<String>,
-    /// Train for about M minutes: steps and schedules are fitted and saved in the recipe
+    /// Be done in M minutes, from reading the capture to the report: steps are fitted, and fitted anew while it goes; the
+    /// recipe says what they became
     #[arg(long, value_name = "M", value_parser = minutes, help_heading = "What is learned")]
     minutes: Option<f64>,
+    /// How much it may take: draft (half-size pictures, 2,500 steps), standard (the default: 7,000 steps) or best (20,000
+    /// steps, 60,000 Gaussians). Says first how long that takes here. Knobs that are set win over it, --minutes over its steps
+    #[arg(long, value_name = "QUALITY", help_heading = "What is learned")]
+    quality: Option<Quality>,
     /// Start from this recipe (TOML); a run's own recipe.toml repeats it
     #[arg(long, value_name = "FILE", help_heading = "What is learned")]
     recipe: Option<PathBuf>,
@@ -131,6 +137,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         console.result(knob_list(topic)?.trim_end());
         return Ok(());
     }
+    let clock = Stopwatch::start();
     args.measure.check()?;
     if !args.view && args.place.is_told() {
         return Err(Error::input("--port, --host and --no-open belong to --view").remedy("Add --view.").into());
@@ -146,8 +153,8 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     };
     let (run, watch, trained) = if let Some(run) = &args.resume {
         let watch = watch(&Run::open(run)?.name());
-        let options = TrainOptions { snapshots: snapshots(&watch), ..TrainOptions::default() };
-        let trained = train::resume_with(run, &options, &stop, &mut |event| listen(event, &watch));
+        let options = TrainOptions { snapshots: snapshots(&watch), clock, ..TrainOptions::default() };
+        let trained = run::resume_with(run, &options, &stop, &mut |event| listen(event, &watch));
         (run.clone(), watch, trained)
     } else {
         let recipe = recipe(args)?;
@@ -161,9 +168,15 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         let cameras = serde_json::to_vec(&cameras_json(&capture))?;
         files::write(&run.join("cameras.json"), &cameras)?;
         let watch = watch(&capture.name);
-        let options = TrainOptions { minutes: args.minutes, snapshots: snapshots(&watch) };
+        let options = TrainOptions {
+            minutes: args.minutes,
+            finish: finish::steps(&capture, args.no_eval),
+            predict: args.quality.is_some(),
+            clock,
+            snapshots: snapshots(&watch),
+        };
         let capture = Arc::new(capture);
-        let trained = train::train(capture, recipe, &run, &options, &stop, &mut |event| listen(event, &watch));
+        let trained = run::train(capture, recipe, &run, &options, &stop, &mut |event| listen(event, &watch));
         if trained.is_err() {
             leave_nothing(&run)?;
         }
@@ -195,12 +208,23 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The recipe file, then the options, then every --set.
+/// The recipe file, then the quality, then the options, then every --set.
 fn recipe(args: &Args) -> anyhow::Result<Recipe> {
     let mut recipe = match &args.recipe {
-        None => Recipe::default(),
+        // What the capture is, is seen better than guessed: the library's default is one model.
+        None => Recipe::default().with(|r| r.run.motion = MotionName::AUTO),
         Some(path) => Recipe::from_toml(&files::read_text(path)?).map_err(|e| e.at(path.display()))?,
     };
+    if let Some(quality) = args.quality {
+        recipe = recipe.of_quality(quality);
+    }
+    let typed = |name: &str| {
+        args.set.iter().any(|a| a.split_once('=').is_some_and(|(key, _)| Recipe::key_of(key.trim()) == name))
+    };
+    // Another length than the file's is gone through in its own way.
+    if (args.iterations.is_some() || typed("run.iterations")) && args.quality.is_none() {
+        recipe = recipe.unresolved();
+    }
     let mut set = |knob: &str, value: Option<String>| value.map_or(Ok(()), |v| recipe.set(&format!("{knob}={v}")));
     let quoted = |text: &String| toml::Value::String(text.clone()).to_string();
     set("motion", args.motion.as_ref().map(quoted))?;
@@ -270,21 +294,24 @@ fn leave_nothing(run: &Path) -> anyhow::Result<()> {
 fn describe(capture: &Capture, recipe: &Recipe, console: &Console) {
     let (first, last) = capture.time_range();
     let size = capture.frames.first().map_or([0, 0], |f| [f.view.width, f.view.height]);
+    let span = match capture.timing {
+        Timing::Moment => "at one moment".to_owned(),
+        _ => format!("over {:.2} s", last - first),
+    };
     console.say(&format!(
-        "{}: {} camera{}, {} pictures of {}x{} over {:.2} s; {} train, {} held out",
+        "{}: {} camera{}, {} pictures of {}x{} {span}; {} train, {} held out",
         capture.name,
         capture.cameras.len(),
         if capture.cameras.len() == 1 { "" } else { "s" },
         capture.frames.len(),
         size[0],
         size[1],
-        last - first,
         capture.train.len(),
         capture.held.len()
     ));
     console.detail(&format!("memory estimate: {}", human_bytes(memory_estimate(capture, recipe))));
     for finding in capture.preflight() {
-        let text = format!("{} {}", finding.what, finding.remedy);
+        let text = format!("{} {}", finding.what, finding.remedy).trim_end().to_owned();
         match finding.severity {
             Severity::Warning => console.warn(&text),
             Severity::Note => console.detail(&text),
@@ -362,6 +389,38 @@ fn line(knob: &Knob) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use clap::Parser;
+
+    #[derive(clap::Parser)]
+    struct Typed {
+        #[command(flatten)]
+        args: Args,
+    }
+
+    /// What the recipe becomes with these words.
+    fn typed(words: &[&str]) -> Recipe {
+        recipe(&Typed::parse_from([&["train", "take"], words].concat()).args).unwrap()
+    }
+
+    #[test]
+    fn typed_knobs_win_over_the_quality_and_another_length_has_its_own_schedules() {
+        let steps = |r: &Recipe| [r.run.iterations, r.densify.max_cap, r.capture.downscale];
+        let draft = steps(&typed(&["--quality", "draft"]));
+        assert_eq!(draft, steps(&Recipe::default().of_quality(Quality::Draft)));
+        let own = typed(&["--set", "iterations=90", "--downscale", "1", "--quality", "draft"]);
+        assert_eq!(steps(&own), [90, draft[1], 1]);
+        assert_eq!(steps(&typed(&[])), steps(&Recipe::default()));
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("recipe.toml");
+        std::fs::write(&file, "[run]\niterations = 300\nreplans = [[7, 200]]\n[densify]\nuntil = 225\nfrom = 9\n")
+            .unwrap();
+        let of_file = |words: &[&str]| typed(&[&["--recipe", file.to_str().unwrap()], words].concat());
+        assert_eq!((of_file(&[]).run.replans.rows().len(), of_file(&[]).densify.until), (1, 225));
+        for words in [&["--set", "iterations=600"][..], &["--iterations", "600"], &["--set", "run.iterations=600"]] {
+            let r = of_file(words).resolve();
+            assert_eq!((r.run.replans.rows().len(), r.densify.until, r.densify.from), (0, 450, 9));
+        }
+    }
 
     #[test]
     fn knobs_are_listed_by_topic() {

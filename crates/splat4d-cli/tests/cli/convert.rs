@@ -1,7 +1,7 @@
 //! Files go between the formats of other programs, and what is lost is said.
 
 use crate::sample::splat4d;
-use splat4d::format::{Dialect, dialect, ply, scene};
+use splat4d::format::{Dialect, ply, scene, splatv};
 use splat4d::layers::{Head, Layer, Scene, rotation_between};
 use splat4d::math::{Rng, Sim3, quat, sym3};
 use splat4d::motion::control::{ControlSpec, Curve, TrajectorySpec};
@@ -51,8 +51,8 @@ fn birds(features: Option<FeatureSpec>) -> Scene<f32> {
 
 fn open(path: &Path) -> Scene<f32> {
     let bytes = std::fs::read(path).unwrap();
-    let kind = Dialect::of(&bytes).unwrap_or(Dialect::Splat);
-    dialect::open(kind, &bytes).unwrap().scene
+    let kind = Dialect::of_file(path.to_str().unwrap(), &bytes).unwrap();
+    kind.open(&bytes).unwrap().scene
 }
 
 #[test]
@@ -67,11 +67,11 @@ fn a_moving_scene_goes_everywhere() {
     };
 
     // Moving targets keep the motion, turned to their axes; single moments say which one was taken.
-    for (name, dialect) in [("birds.splatv", Dialect::Splatv), ("birds.stg.ply", Dialect::StgPly)] {
+    for (name, dialect) in [("birds.splatv", splatv::DIALECT), ("birds.stg.ply", ply::STG)] {
         let said = convert("birds.safetensors", name, &[]);
         assert!(said.contains("view dependence"), "{said}");
         let back = open(&at(name));
-        assert_eq!((back.len(), back.clip, back.fps, back.up), (40, [0.0, 1.0], 4.0, dialect.up()));
+        assert_eq!((back.len(), back.clip, back.fps, back.up), (40, [0.0, 1.0], 4.0, dialect.up));
     }
     for name in ["a.ply", "a.compressed.ply", "a.spz", "a.splat"] {
         let said = convert("birds.safetensors", name, &[]);

@@ -19,7 +19,7 @@ const PROGRAM: Option<&str> = match option_env!("CARGO_BIN_EXE_splat4d") {
 };
 
 /// Sample capture that is written, and how it is spoilt.
-pub struct Capture {
+pub(crate) struct Capture {
     folder: PathBuf,
     pub distance: f64,
     pub focal: f64,
@@ -37,7 +37,7 @@ pub struct Capture {
 }
 
 impl Capture {
-    pub fn new(work: &Path) -> Self {
+    pub(crate) fn new(work: &Path) -> Self {
         Self {
             folder: work.join("capture"),
             distance: 3.0,
@@ -53,7 +53,7 @@ impl Capture {
     }
 
     /// Writes the folder and returns it.
-    pub fn write(&self) -> PathBuf {
+    pub(crate) fn write(&self) -> PathBuf {
         let cameras: Vec<Value> = (0..CAMERAS).map(|c| self.camera(c)).collect();
         let text = json!({"version": 1, "fps": 30, "cameras": cameras}).to_string();
         let text = if self.cut_json { text[..text.len() / 2].to_owned() } else { text };
@@ -133,12 +133,12 @@ impl Capture {
 }
 
 /// A call of the binary.
-pub struct Call {
+pub(crate) struct Call {
     args: Vec<OsString>,
 }
 
 /// How it went.
-pub struct Answer {
+pub(crate) struct Answer {
     call: String,
     code: Option<i32>,
     stdout: String,
@@ -146,24 +146,24 @@ pub struct Answer {
 }
 
 /// The program with these arguments.
-pub fn splat4d(args: &[&str]) -> Call {
+pub(crate) fn splat4d(args: &[&str]) -> Call {
     Call { args: args.iter().map(OsString::from).collect() }
 }
 
 impl Call {
     /// More arguments.
-    pub fn args(mut self, args: &[&str]) -> Self {
+    pub(crate) fn args(mut self, args: &[&str]) -> Self {
         self.args.extend(args.iter().map(OsString::from));
         self
     }
 
     /// Runs in the current folder.
-    pub fn run(self) -> Answer {
+    pub(crate) fn run(self) -> Answer {
         self.run_in(Path::new("."))
     }
 
     /// Runs in a folder.
-    pub fn run_in(self, folder: &Path) -> Answer {
+    pub(crate) fn run_in(self, folder: &Path) -> Answer {
         let output = Command::new(PROGRAM.expect("cargo builds the program"))
             .args(&self.args)
             .current_dir(folder)
@@ -180,19 +180,19 @@ impl Call {
 
 impl Answer {
     /// Standard output of a call that worked.
-    pub fn ok(self) -> String {
+    pub(crate) fn ok(self) -> String {
         assert_eq!(self.code, Some(0), "{}: {}", self.call, self.stderr);
         self.stdout
     }
 
     /// Standard error of a call that worked.
-    pub fn told(self) -> String {
+    pub(crate) fn told(self) -> String {
         assert_eq!(self.code, Some(0), "{}: {}", self.call, self.stderr);
         self.stderr
     }
 
     /// The one-paragraph error of a call that was refused for bad input.
-    pub fn refused(self) -> String {
+    pub(crate) fn refused(self) -> String {
         assert_eq!(self.code, Some(2), "{}: {}{}", self.call, self.stdout, self.stderr);
         let errors: Vec<&str> = self.stderr.lines().filter(|l| l.starts_with("error: ")).collect();
         assert_eq!(errors.len(), 1, "{}: one paragraph, not {:?}", self.call, self.stderr);

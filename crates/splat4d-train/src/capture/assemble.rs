@@ -1,6 +1,6 @@
 //! From what the files say to a checked capture: poses, sizes, files, duplicates, split, clock.
 
-use super::{Capture, CaptureOptions, FlowFile, Frame, HoldOut, RawFrame, Rig, Split, Take};
+use super::{Capture, CaptureOptions, FlowFile, Frame, HoldOut, RawFrame, Rig, Split, Take, Timing};
 use super::{options, picture, pose};
 use splat4d::math::se3::{norm, normalize, sub};
 use splat4d::scene::{Camera, Lens, Time};
@@ -30,9 +30,9 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
     }
     drop_unused_cameras(&mut take);
     let cameras = rigs(&take);
-    check_poses(&take, &cameras)?;
+    check_poses(&mut take, &cameras)?;
     check_duplicates(&mut take, &cameras).map_err(located)?;
-    let has_alpha = check_headers(&take)?;
+    let has_alpha = fit_pictures(&mut take)?;
     check_masks(&take, has_alpha)?;
     let background = options.background.or(take.background).or(has_alpha.then_some(WHITE)).filter(|_| has_alpha);
     let (train, held, validation) = split(&mut take, &cameras, options).map_err(located)?;
@@ -54,12 +54,14 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
         held,
         train,
         validation,
+        timing: take.timing,
         fps: take.fps,
         points,
         background,
         up,
         downscale: options.downscale,
         warnings: take.warnings,
+        notes: take.notes,
     };
     let near = near(&capture, options.near);
     capture.frames.iter_mut().for_each(|f| f.view.near = near);
@@ -78,7 +80,7 @@ const SMALLEST_NEAR: f64 = 1e-3;
 const UNKNOWN_DEPTH: f64 = 0.25;
 
 /// How near splats are drawn, scene units: this share of the extent, or half way to the nearest of the capture's points.
-fn near(capture: &Capture, share: f64) -> f64 {
+pub(super) fn near(capture: &Capture, share: f64) -> f64 {
     let cloud = capture.points.as_ref().map_or(&[][..], |p| &p.points);
     let mut depths: Vec<f64> = Vec::new();
     for view in capture.places() {
@@ -175,12 +177,15 @@ pub(super) fn same_pose(a: &Camera, b: &Camera) -> bool {
     turn.fold(0.0, f64::max) <= SAME_POSE && moved <= SAME_POSE * (1.0 + norm(p.translation))
 }
 
-/// Two fixed cameras with one pose are a slip of the hand: a copied matrix.
-fn check_poses(take: &Take, cameras: &[Rig]) -> Result<()> {
+/// Two fixed cameras with one pose are a slip of the hand: a copied matrix. Photos may be taken twice from one place,
+/// but what is measured then was learnt.
+fn check_poses(take: &mut Take, cameras: &[Rig]) -> Result<()> {
     let mut first: BTreeMap<usize, &RawFrame> = BTreeMap::new();
     for frame in take.frames.iter().filter(|f| cameras[f.camera].fixed) {
         first.entry(frame.camera).or_insert(frame);
     }
+    let photos = take.timing == Timing::Moment && !take.named;
+    let mut shared = 0;
     // Sorting by one coordinate leaves only neighbours to compare, so that huge rigs stay cheap.
     let mut sorted: Vec<&RawFrame> = first.into_values().collect();
     sorted.sort_by(|a, b| a.source.cam_from_world.translation[0].total_cmp(&b.source.cam_from_world.translation[0]));
@@ -188,21 +193,36 @@ fn check_poses(take: &Take, cameras: &[Rig]) -> Result<()> {
         let x = a.source.cam_from_world.translation[0];
         let reach = 2.0 * SAME_POSE * (1.0 + norm(a.source.cam_from_world.translation));
         for b in sorted[i + 1..].iter().take_while(|b| b.source.cam_from_world.translation[0] - x <= reach) {
-            if same_pose(&a.source, &b.source) {
-                let (a, b) = (a.camera.min(b.camera), a.camera.max(b.camera));
-                let what = format!("cameras {} and {} have one pose", cameras[a].name, cameras[b].name);
-                return Err(Error::input(what).at(take.root.display()).remedy(
-                    "A matrix was probably copied from one to the other: correct it, or remove one of the cameras.",
-                ));
+            if !same_pose(&a.source, &b.source) {
+                continue;
             }
+            if photos {
+                shared += usize::from(a.split != b.split);
+                continue;
+            }
+            let (a, b) = (a.camera.min(b.camera), a.camera.max(b.camera));
+            let what = format!("cameras {} and {} have one pose", cameras[a].name, cameras[b].name);
+            return Err(Error::input(what).at(take.root.display()).remedy(
+                "A matrix was probably copied from one to the other: correct it, or remove one of the cameras.",
+            ));
         }
     }
+    warn_of_shared(shared, &mut take.warnings);
     Ok(())
 }
 
-/// One camera takes one picture at a time. Where the data set
-/// names none, one "camera" may stand for several, so that the pose counts too; a
-/// frame that training and measuring share is reported, not refused (published data sets do it).
+/// What training and measuring share is reported, not refused: published data sets do it.
+fn warn_of_shared(shared: usize, warnings: &mut Vec<String>) {
+    if shared > 0 {
+        warnings.push(format!(
+            "{shared} frames of the training, validation and test sets agree in camera and time: figures measured on \
+             them do not tell how new views look."
+        ));
+    }
+}
+
+/// One camera takes one picture at a time. Where the data set names none, one "camera" may stand for several, so that
+/// the pose counts too.
 fn check_duplicates(take: &mut Take, cameras: &[Rig]) -> Result<()> {
     let mut groups: BTreeMap<(usize, u64), Vec<usize>> = BTreeMap::new();
     let mut shared = 0;
@@ -229,26 +249,41 @@ fn check_duplicates(take: &mut Take, cameras: &[Rig]) -> Result<()> {
         }
         earlier.push(i);
     }
-    if shared > 0 {
-        take.warnings.push(format!(
-            "{shared} frames of the training, validation and test sets agree in camera and time: figures measured on \
-             them do not tell how new views look."
-        ));
-    }
+    warn_of_shared(shared, &mut take.warnings);
     Ok(())
 }
 
-/// Compares the size of one picture per camera with its intrinsics; returns whether any has an alpha channel.
-fn check_headers(take: &Take) -> Result<bool> {
-    let mut seen = vec![false; take.cameras.len()];
+/// Compares the sizes of the pictures with their intrinsics, and scales those where pictures were resized; returns
+/// whether any picture has an alpha channel.
+fn fit_pictures(take: &mut Take) -> Result<bool> {
     let mut alpha = false;
-    for frame in &take.frames {
-        if !std::mem::replace(&mut seen[frame.camera], true) {
-            let header = picture::header(&frame.image)?;
-            picture::check_size(&frame.image, (header.width, header.height), &frame.source)
-                .map_err(|e| e.at(format!("camera {}", take.cameras[frame.camera])))?;
-            alpha |= header.alpha;
+    let mut resized = Vec::new();
+    for frame in &mut take.frames {
+        let header = picture::header(&frame.image)?;
+        alpha |= header.alpha;
+        let (size, source) = ((header.width, header.height), &mut frame.source);
+        let stated = (source.width, source.height);
+        if size != stated && picture::is_resized(size, source) {
+            let (x, y) = (size.0 as f64 / stated.0 as f64, size.1 as f64 / stated.1 as f64);
+            let k = &mut source.intrinsics;
+            (k.fx, k.cx, k.fy, k.cy) = (k.fx * x, k.cx * x, k.fy * y, k.cy * y);
+            (source.width, source.height) = size;
+            resized.push((&frame.image, size, stated));
         }
+        picture::check_size(&frame.image, size, source)
+            .map_err(|e| e.at(format!("camera {}", take.cameras[frame.camera])))?;
+    }
+    if let Some((image, size, stated)) = resized.first() {
+        take.warnings.push(format!(
+            "{} pictures are of another size than their intrinsics are for, which are scaled to them: {} is {}x{}, not \
+             {}x{}.",
+            resized.len(),
+            image.display(),
+            size.0,
+            size.1,
+            stated.0,
+            stated.1
+        ));
     }
     Ok(alpha)
 }
@@ -286,6 +321,8 @@ fn split(take: &mut Take, cameras: &[Rig], options: &CaptureOptions) -> Result<(
             let train = of(Split::Train);
             return non_empty(train, by_convention, validation);
         }
+        // Photos of one moment are no rig: one of them is too few to measure on.
+        None if take.timing == Timing::Moment && !take.named => HoldOut::Every(HOLD_EVERY),
         None if cameras.len() >= 2 && cameras.iter().all(|c| c.fixed) => {
             HoldOut::Cameras(vec![cameras[0].name.clone()])
         }

@@ -5,7 +5,7 @@
 //! fixed rig is to reconstruct one instant.
 
 use super::colmap_files::{self, Point, Registered};
-use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Split, Take, rig};
+use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Split, Take, beside, rig, sequence};
 use splat4d::math::{Se3, quat};
 use splat4d::scene::Camera;
 use splat4d::scene::time::DEFAULT_FPS;
@@ -13,6 +13,10 @@ use splat4d::{Error, Result};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
+/// The folder of models: the marker.
+pub(super) const SPARSE: &str = "sparse";
+/// Where a model may lie beside poses of another layout: COLMAP's habit and Nerfstudio's.
+const BESIDE: [&str; 2] = [SPARSE, "colmap/sparse"];
 /// Below this part of registered pictures the reconstruction is probably incomplete, and below the second broken.
 const FEW_REGISTERED: [f64; 2] = [0.9, 0.7];
 /// Mean reprojection error above which poses blur the result, pixels.
@@ -51,14 +55,16 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
     }
     check_errors(&points, &mut warnings);
     let names: Vec<&str> = shots.iter().map(|(name, _)| name.as_str()).collect();
-    let naming = rig::naming(&names);
+    let poses: Vec<Se3> = shots.iter().map(|(_, source)| source.cam_from_world).collect();
+    let mut notes = Vec::new();
+    let order = sequence::order(&names, &poses, options.sequence, fps, &mut warnings, &mut notes);
     let mut frames: Vec<RawFrame> = shots
         .iter()
-        .zip(&naming.frames)
-        .map(|((name, source), &(camera, index))| RawFrame {
+        .zip(&order.frames)
+        .map(|((name, source), &(camera, index, time))| RawFrame {
             camera,
             source: source.clone(),
-            time: index as f64 / fps,
+            time,
             index,
             image: base.join(name),
             mask: mask_of(root, name),
@@ -71,23 +77,34 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         name: None,
         root: root.to_path_buf(),
         kind: CaptureKind::Colmap,
-        cameras: naming.cameras,
+        cameras: order.cameras,
         frames,
-        named: naming.told,
+        named: order.named,
+        timing: order.timing,
         hold_out: None,
         fps,
         points: cloud(&points),
         background: None,
         up: None,
         warnings,
+        notes,
     })
+}
+
+/// Whether a folder is a model, or holds some.
+pub(super) fn is_model(folder: &Path) -> bool {
+    has_cameras(folder) || rig::file_names(folder).iter().any(|n| has_cameras(&folder.join(n)))
+}
+
+fn has_cameras(folder: &Path) -> bool {
+    ["cameras.bin", "cameras.txt"].iter().any(|n| folder.join(n).is_file())
 }
 
 /// The model folder (`sparse` itself or a numbered one in it) with the most registered pictures.
 fn best_model(sparse: &Path, warnings: &mut Vec<String>) -> Result<(PathBuf, Vec<Registered>)> {
     let mut candidates = vec![sparse.to_path_buf()];
     candidates.extend(rig::file_names(sparse).iter().filter(|n| n.parse::<u32>().is_ok()).map(|n| sparse.join(n)));
-    candidates.retain(|c| ["cameras.bin", "cameras.txt"].iter().any(|n| c.join(n).is_file()));
+    candidates.retain(|c| has_cameras(c));
     let mut models = Vec::new();
     for folder in candidates {
         let images = colmap_files::images(&folder)?;
@@ -171,6 +188,48 @@ fn check_errors(points: &[Point], warnings: &mut Vec<String>) {
         warnings
             .push(format!("COLMAP's mean reprojection error is {mean:.2} px: poses are inexact, results will blur."));
     }
+}
+
+/// The points of a COLMAP model that lies beside `marker`, whose frames are `frames`: in their world, if the cameras
+/// agree. What came of it is told.
+pub(super) fn points_beside(
+    root: &Path,
+    marker: &Path,
+    frames: &[RawFrame],
+    warnings: &mut Vec<String>,
+    notes: &mut Vec<String>,
+) -> Option<PointCloud> {
+    let sparse = BESIDE.iter().map(|name| root.join(name)).find(|folder| is_model(folder))?;
+    let poses = marker.file_name().unwrap_or_default().to_string_lossy();
+    match aligned_points(root, &sparse, frames) {
+        Ok((cloud, how)) => {
+            let count = cloud.points.len();
+            notes.push(format!("The {count} initial points are those of {}, {how} {poses}.", sparse.display()));
+            Some(cloud)
+        }
+        Err(why) => {
+            warnings.push(format!("{} is not used for initial points: {why}", sparse.display()));
+            None
+        }
+    }
+}
+
+fn aligned_points(root: &Path, sparse: &Path, frames: &[RawFrame]) -> Result<(PointCloud, &'static str)> {
+    let (folder, registered) = best_model(sparse, &mut Vec::new())?;
+    let mut cloud = cloud(&colmap_files::points(&folder)?)
+        .ok_or_else(|| Error::input("it has no points").remedy("Triangulate them (colmap point_triangulator)."))?;
+    let model: BTreeMap<String, Se3> =
+        registered.iter().map(|r| Ok((beside::key(Path::new(&r.name)), pose_of(r)?))).collect::<Result<_>>()?;
+    let key = |frame: &RawFrame| beside::key(frame.image.strip_prefix(root).unwrap_or(&frame.image));
+    let pairs: Vec<(Se3, Se3)> =
+        frames.iter().filter_map(|f| Some((f.source.cam_from_world, *model.get(&key(f))?))).collect();
+    let world_from_model = beside::align(&pairs)?;
+    cloud.points.iter_mut().for_each(|p| *p = world_from_model.apply(*p));
+    let how = match world_from_model.is_identity() {
+        true => "whose cameras agree with",
+        false => "turned, moved and scaled to the cameras of",
+    };
+    Ok((cloud, how))
 }
 
 fn cloud(points: &[Point]) -> Option<PointCloud> {

@@ -1,4 +1,5 @@
-//! What initialisation and training need of a capture: posed pictures by number. Captures on disk and made-up ones in tests both serve.
+//! Posed pictures by number, the input of initialisation and training. Captures on disk and made-up ones in tests both
+//! serve.
 
 use crate::Result;
 use splat4d::scene::{Camera, Planes, Time};
@@ -40,7 +41,7 @@ pub struct Flow {
 
 impl Flow {
     /// As losses take it.
-    pub fn truth(&self) -> FlowTruth<'_> {
+    pub(crate) fn truth(&self) -> FlowTruth<'_> {
         FlowTruth { to: self.to, camera: &self.camera, vectors: &self.vectors }
     }
 
@@ -55,7 +56,7 @@ impl Flow {
 
 impl Picture {
     /// Half the size: the mean of 2x2 boxes, an odd last row or column left out (as `Camera::downscaled`).
-    pub fn halve(&mut self) {
+    pub(crate) fn halve(&mut self) {
         halve(&mut self.color);
         self.mask.as_mut().map(halve);
         self.weight.as_mut().map(halve);
@@ -95,7 +96,7 @@ pub trait Frames: Send + Sync {
     fn time(&self, i: usize) -> Time;
     /// By which camera of the rig.
     fn rig(&self, i: usize) -> usize;
-    /// What messages call it.
+    /// The frame's name in messages.
     fn name(&self, i: usize) -> String;
     /// Whether frames have foreground masks.
     fn has_masks(&self) -> bool {

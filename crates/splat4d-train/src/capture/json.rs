@@ -47,17 +47,17 @@ pub(super) struct Node<'a> {
 
 impl<'a> Node<'a> {
     /// The top of a document.
-    pub fn root(value: &'a Value) -> Self {
+    pub(crate) fn root(value: &'a Value) -> Self {
         Self { value, path: String::new() }
     }
 
     /// An error at this place: `what` is a clause without a final full stop.
-    pub fn error(&self, what: impl Into<String>) -> Error {
+    pub(crate) fn error(&self, what: impl Into<String>) -> Error {
         self.at(Error::input(what))
     }
 
     /// Puts this place in front of an error from elsewhere.
-    pub fn at(&self, error: Error) -> Error {
+    pub(crate) fn at(&self, error: Error) -> Error {
         if self.path.is_empty() { error } else { error.at(&self.path) }
     }
 
@@ -71,30 +71,30 @@ impl<'a> Node<'a> {
     }
 
     /// The value of `key`; `None` where it is missing or null. An error unless this is an object.
-    pub fn opt(&self, key: &str) -> Result<Option<Node<'a>>> {
+    pub(crate) fn opt(&self, key: &str) -> Result<Option<Node<'a>>> {
         let object = self.value.as_object().ok_or_else(|| self.wrong("an object { ... }"))?;
         let path = if self.path.is_empty() { key.to_string() } else { format!("{}.{key}", self.path) };
         Ok(object.get(key).filter(|v| !v.is_null()).map(|value| Node { value, path }))
     }
 
     /// The value of `key`, which must be there.
-    pub fn get(&self, key: &str) -> Result<Node<'a>> {
+    pub(crate) fn get(&self, key: &str) -> Result<Node<'a>> {
         self.opt(key)?.ok_or_else(|| self.error(format!("the key \"{key}\" is missing")).remedy("Add it."))
     }
 
     /// The elements of an array.
-    pub fn list(&self) -> Result<Vec<Node<'a>>> {
+    pub(crate) fn list(&self) -> Result<Vec<Node<'a>>> {
         let array = self.value.as_array().ok_or_else(|| self.wrong("a list [ ... ]"))?;
         Ok(array.iter().enumerate().map(|(i, value)| Node { value, path: format!("{}[{i}]", self.path) }).collect())
     }
 
     /// A finite number.
-    pub fn number(&self) -> Result<f64> {
+    pub(crate) fn number(&self) -> Result<f64> {
         self.value.as_f64().filter(|x| x.is_finite()).ok_or_else(|| self.wrong("a finite number"))
     }
 
     /// A whole number ≥ 0 (some tools write 640.0).
-    pub fn count(&self) -> Result<usize> {
+    pub(crate) fn count(&self) -> Result<usize> {
         let x = self.number()?;
         if x < 0.0 || x.fract() != 0.0 || x > 9e15 {
             return Err(self.wrong("a whole number that is not negative"));
@@ -103,12 +103,12 @@ impl<'a> Node<'a> {
     }
 
     /// A string.
-    pub fn text(&self) -> Result<&'a str> {
+    pub(crate) fn text(&self) -> Result<&'a str> {
         self.value.as_str().ok_or_else(|| self.wrong("a text \"...\""))
     }
 
     /// Exactly N numbers.
-    pub fn numbers<const N: usize>(&self) -> Result<[f64; N]> {
+    pub(crate) fn numbers<const N: usize>(&self) -> Result<[f64; N]> {
         let list = self.value.as_array().filter(|l| l.len() == N);
         let list = list.ok_or_else(|| self.wrong(&format!("a list of {N} numbers")))?;
         let mut out = [0.0; N];
@@ -139,13 +139,13 @@ impl<'a> Node<'a> {
     }
 
     /// A 3x3 matrix.
-    pub fn matrix3(&self) -> Result<[[f64; 3]; 3]> {
+    pub(crate) fn matrix3(&self) -> Result<[[f64; 3]; 3]> {
         let rows = self.rows::<3>(3..=3)?;
         Ok([rows[0], rows[1], rows[2]])
     }
 
     /// A 4x4 matrix, or the upper 3x4 of one.
-    pub fn matrix4(&self) -> Result<[[f64; 4]; 4]> {
+    pub(crate) fn matrix4(&self) -> Result<[[f64; 4]; 4]> {
         let rows = self.rows::<4>(3..=4)?;
         let last = rows.get(3).copied().unwrap_or([0.0, 0.0, 0.0, 1.0]);
         if last != [0.0, 0.0, 0.0, 1.0] {
@@ -157,7 +157,7 @@ impl<'a> Node<'a> {
     }
 
     /// An error for every key that is not in `known`, with the nearest known one.
-    pub fn only(&self, known: &[&str]) -> Result<()> {
+    pub(crate) fn only(&self, known: &[&str]) -> Result<()> {
         let object = self.value.as_object().ok_or_else(|| self.wrong("an object { ... }"))?;
         match object.keys().find(|key| !known.contains(&key.as_str())) {
             None => Ok(()),

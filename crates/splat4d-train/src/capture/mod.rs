@@ -7,15 +7,15 @@
 //! `assemble` alone turns takes into captures, so that all layouts are checked alike.
 
 mod assemble;
+mod beside;
 mod colmap;
 mod colmap_files;
-mod dnerf;
 mod flow;
 pub mod frames;
 mod json;
+mod layout;
 mod lens;
 mod n3dv;
-mod nerfstudio;
 mod options;
 mod own;
 mod panoptic;
@@ -23,19 +23,23 @@ mod picture;
 mod points;
 mod pose;
 mod preflight;
+mod rgb8;
 mod rig;
+mod sequence;
 mod store;
+mod transforms;
 
-pub use flow::FlowFile;
-pub use lens::Distortion;
-pub use options::{CaptureOptions, CaptureSettings, HoldOut, MAX_POINTS};
-pub use points::PointCloud;
+pub(crate) use flow::FlowFile;
+pub use options::{CaptureOptions, CaptureSettings, HoldOut, MAX_POINTS, Sequence};
+pub(crate) use points::PointCloud;
 pub use preflight::{Finding, Severity};
+pub use rgb8::Rgb8;
+pub use sequence::Timing;
 pub use store::{ImageStore, Picture, StoredPicture};
 
+use splat4d::Result;
 use splat4d::math::se3::{norm, sub};
 use splat4d::scene::{Camera, Time};
-use splat4d::{Error, ErrorKind, Result};
 use std::path::{Path, PathBuf};
 
 /// Which layout a capture was read from.
@@ -44,11 +48,11 @@ use std::path::{Path, PathBuf};
 pub enum CaptureKind {
     /// Our own `capture.json`.
     Own,
-    /// D-NeRF / Blender `transforms_{train,val,test}.json`.
+    /// `transforms_{train,val,test}.json`: D-NeRF, Blender and whoever writes like them.
     DNerf,
     /// PanopticSports `train_meta.json` and `test_meta.json`.
     Panoptic,
-    /// Nerfstudio `transforms.json`.
+    /// `transforms.json`: Nerfstudio, instant-ngp.
     Nerfstudio,
     /// A COLMAP reconstruction in `sparse/`.
     Colmap,
@@ -87,7 +91,7 @@ pub struct Rig {
     pub fixed: bool,
 }
 
-/// What a frame is for.
+/// The purpose of a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Split {
     /// Trained on.
@@ -117,21 +121,25 @@ pub struct Capture {
     pub train: Vec<usize>,
     /// Indices of the data set's own validation frames.
     pub validation: Vec<usize>,
+    /// Where the times are from.
+    pub timing: Timing,
     /// Frames per second.
     pub fps: f64,
     /// The initial cloud, in the scene's units, already thinned to [`CaptureOptions::max_points`].
     pub points: Option<PointCloud>,
-    /// What transparent pixels are composited on, sRGB from 0 to 1; `None`: the pictures have no alpha.
+    /// The background of transparent pixels, sRGB from 0 to 1; `None`: the pictures have no alpha.
     pub background: Option<[f32; 3]>,
     /// Upwards in the world (unit); estimated from the cameras where the data set states none.
     pub up: [f64; 3],
     /// The k of [`CaptureOptions::downscale`].
     pub downscale: usize,
-    /// What the reader noticed, one sentence each.
+    /// The reader's warnings, a sentence or two each.
     pub warnings: Vec<String>,
+    /// What the reader chose or assumed that is no cause for worry, a sentence or two each.
+    pub notes: Vec<String>,
 }
 
-/// What a reader found in the files, before any check.
+/// A reader's findings in the files, before any check.
 struct Take {
     name: Option<String>,
     root: PathBuf,
@@ -139,6 +147,7 @@ struct Take {
     cameras: Vec<String>,
     /// Whether the data set tells cameras apart; else one entry may stand for many.
     named: bool,
+    timing: Timing,
     frames: Vec<RawFrame>,
     /// The data set's convention, where it is not told by the frames' splits.
     hold_out: Option<HoldOut>,
@@ -147,6 +156,7 @@ struct Take {
     background: Option<[f32; 3]>,
     up: Option<[f64; 3]>,
     warnings: Vec<String>,
+    notes: Vec<String>,
 }
 
 /// A frame as a reader found it.
@@ -161,28 +171,6 @@ struct RawFrame {
     split: Split,
 }
 
-/// A reader: the capture's folder and the marker file that was found, to what the files say.
-type Reader = fn(&Path, &Path, &CaptureOptions) -> Result<Take>;
-
-/// Marker files (or folders) in the order in which they are looked for, with their readers.
-const READERS: &[(&str, Reader)] = &[
-    ("capture.json", own::read),
-    ("transforms_train.json", dnerf::read),
-    ("train_meta.json", panoptic::read),
-    ("transforms.json", nerfstudio::read),
-    ("poses_bounds.npy", n3dv::read),
-    ("sparse", colmap::read),
-];
-
-/// Markers of layouts that this version does not read, and what to do.
-const FOREIGN: &[(&str, &str)] = &[
-    ("dataset.json", "HyperNeRF and Nerfies captures"),
-    ("reconstruction.json", "OpenSfM reconstructions"),
-    ("sfm_data.json", "OpenMVG reconstructions"),
-];
-
-const VIDEO_ENDINGS: &[&str] = &["mp4", "mov", "mkv", "avi", "webm"];
-
 impl Capture {
     /// Opens the capture in a folder, or that of a marker file.
     ///
@@ -190,27 +178,7 @@ impl Capture {
     /// file, frame or camera and what to do.
     pub fn open(path: &Path, options: &CaptureOptions) -> Result<Self> {
         options.check()?;
-        if !path.exists() {
-            return Err(Error::input("there is no such file or folder")
-                .at(path.display())
-                .remedy("Give the folder that holds the capture."));
-        }
-        let file_name = path.file_name().and_then(|n| n.to_str()).unwrap_or_default();
-        if path.is_file() {
-            let root = path.parent().unwrap_or(Path::new("."));
-            let known = READERS.iter().find(|(marker, _)| *marker == file_name);
-            let (_, reader) = known.ok_or_else(|| unknown_layout(root, path))?;
-            return assemble::assemble(reader(root, path, options)?, options);
-        }
-        for (marker, reader) in READERS {
-            let found = path.join(marker);
-            // Single-camera LLFF folders have the same marker, and are read from their COLMAP model.
-            let llff = *marker == "poses_bounds.npy" && path.join("sparse").is_dir() && !n3dv::applies(path);
-            if found.exists() && !llff {
-                return assemble::assemble(reader(path, &found, options)?, options);
-            }
-        }
-        Err(unknown_layout(path, path))
+        assemble::assemble(layout::read(path, options)?, options)
     }
 
     /// The first and last time of all frames, seconds.
@@ -227,12 +195,25 @@ impl Capture {
         times
     }
 
+    /// Adds points to its own, and draws as near as they come; `near`: as [`CaptureOptions::near`].
+    pub(crate) fn add_points(&mut self, mut more: PointCloud, near: f64) {
+        let points = self.points.get_or_insert_default();
+        points.points.append(&mut more.points);
+        points.colors.append(&mut more.colors);
+        points.times.append(&mut more.times);
+        if points.points.is_empty() {
+            self.points = None;
+        }
+        let near = assemble::near(self, near);
+        self.frames.iter_mut().for_each(|f| f.view.near = near);
+    }
+
     /// Whether every camera keeps one pose for the whole take.
-    pub fn fixed_cameras(&self) -> bool {
+    pub(crate) fn fixed_cameras(&self) -> bool {
         self.cameras.iter().all(|c| c.fixed)
     }
 
-    /// What `frame` is for.
+    /// The purpose of `frame`.
     pub fn split(&self, frame: usize) -> Split {
         if self.held.binary_search(&frame).is_ok() {
             Split::Held
@@ -253,7 +234,7 @@ impl Capture {
 
     /// The centroid of the training cameras' centres and 1.1 times the largest distance from it: the length scale that
     /// the field's learning rates refer to (Kerbl 2023, `getNerfppNorm`). At least 10⁻⁶.
-    pub fn center_and_radius(&self) -> ([f64; 3], f64) {
+    pub(crate) fn center_and_radius(&self) -> ([f64; 3], f64) {
         /// Margin around the outermost camera (Kerbl 2023).
         const MARGIN: f64 = 1.1;
         let centers: Vec<[f64; 3]> = self.places().map(Camera::center).collect();
@@ -267,50 +248,10 @@ impl Capture {
     }
 }
 
-/// Why a folder is no capture, and what to do about it.
-fn unknown_layout(root: &Path, named: &Path) -> Error {
-    for (marker, what) in FOREIGN {
-        if root.join(marker).exists() {
-            return Error::new(ErrorKind::Unsupported, format!("{what} ({marker}) are not read"))
-                .at(named.display())
-                .remedy("Export the poses as COLMAP or Nerfstudio, or write a capture.json (docs/capture-format.md).");
-        }
-    }
-    let markers: Vec<&str> = READERS.iter().map(|(marker, _)| *marker).collect();
-    let mut error =
-        Error::input(format!("is not a capture: none of {} is there", markers.join(", "))).at(named.display());
-    if let Some(video) = videos(root).first() {
-        error = error.remedy(format!(
-            "It holds videos, but no camera poses. Extract frames with `{}`, then calibrate the cameras (COLMAP on the \
-             first frames will do) or write a capture.json (docs/capture-format.md).",
-            ffmpeg_command(video)
-        ));
-    }
-    error.remedy(
-        "Write a capture.json with your cameras (docs/capture-format.md), or give the folder of a known layout.",
-    )
-}
-
-/// Names of the video files in a folder, sorted.
-fn videos(folder: &Path) -> Vec<String> {
-    let mut found: Vec<String> = rig::file_names(folder)
-        .into_iter()
-        .filter(|n| Path::new(n).extension().is_some_and(|e| VIDEO_ENDINGS.iter().any(|v| e.eq_ignore_ascii_case(v))))
-        .collect();
-    found.sort();
-    found
-}
-
-/// The command that turns one video into a folder of frames named as the readers expect.
-fn ffmpeg_command(video: &str) -> String {
-    let stem = Path::new(video).file_stem().and_then(|s| s.to_str()).unwrap_or("cam00");
-    format!("mkdir -p images/{stem} && ffmpeg -i {video} -start_number 0 -qscale:v 2 images/{stem}/%06d.jpg")
-}
-
 #[cfg(test)]
 mod tests;
 
 /// A coloured point cloud from a .ply file. Errors: not a point cloud, damage, absurd counts.
-pub fn read_points(path: &Path) -> Result<PointCloud> {
+pub(crate) fn read_points(path: &Path) -> Result<PointCloud> {
     points::read_ply(path)
 }

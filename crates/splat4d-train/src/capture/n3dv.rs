@@ -1,8 +1,9 @@
 //! N3DV captures (Li 2022): `poses_bounds.npy`, one row per camera, and a folder of frames per camera.
 
+use super::layout::{ffmpeg_command, videos};
 use super::points::read_ply;
-use super::{CaptureKind, CaptureOptions, RawFrame, Split, Take};
-use super::{ffmpeg_command, json, picture, pose, rig, videos};
+use super::{CaptureKind, CaptureOptions, RawFrame, Split, Take, Timing};
+use super::{json, picture, pose, rig};
 use splat4d::format::npy::Npy;
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
@@ -71,12 +72,14 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         cameras: folders.into_iter().map(|f| f.name).collect(),
         frames,
         named: true,
+        timing: Timing::Told,
         hold_out: None,
         fps,
         points: points.map(|p| read_ply(&p)).transpose()?,
         background: None,
         up: None,
         warnings: Vec::new(),
+        notes: Vec::new(),
     })
 }
 

@@ -1,6 +1,6 @@
-//! What a user may say about a capture besides where it lies.
+//! Options of a capture besides where it lies.
 
-use crate::settings::{Value, settings};
+use crate::settings::{Value, choices, settings};
 use splat4d::{Error, Result};
 use std::str::FromStr;
 
@@ -70,6 +70,18 @@ impl Value for Option<HoldOut> {
 /// cameras: 27.1 dB with 0.05 (Kerbl et al. 2023 draw nothing nearer than 0.2 units, about that share), 28.1 with this.
 const NEAR: f64 = 0.2;
 
+choices! {
+    /// What pictures are that state no times.
+    pub enum Sequence {
+        /// As their names tell: a film where they are numbered like its frames, else photos.
+        Auto = "auto",
+        /// Photos of one moment.
+        Photos = "photos",
+        /// The frames of a film, or of one for each camera of a rig.
+        Video = "video",
+    }
+}
+
 settings! {
     /// The capture: what of it is read, and how.
     pub struct CaptureSettings {
@@ -79,6 +91,8 @@ settings! {
         hold_out: Option<HoldOut> = None;
         /// Frames a second; 0: as the capture says.
         fps: f64 = 0.0 => any().unit("frames/s");
+        /// Pictures that state no times: photos of one moment, frames of a video, or auto: as their names tell.
+        sequence: Sequence = Sequence::Auto;
         /// Only this many frames of the take; 0: all.
         max_frames: usize = 0 => any().unit("frames");
         /// How near to a camera Gaussians are drawn, of the extent; less where the capture's points come nearer, a
@@ -100,7 +114,9 @@ pub struct CaptureOptions {
     pub hold_out: Option<HoldOut>,
     /// Frames per second; `None` takes what the capture states, else 30. Scales the clock of D-NeRF captures too.
     pub fps: Option<f64>,
-    /// What transparent pixels are composited on, sRGB from 0 to 1; `None` takes the capture's own, else white.
+    /// What pictures are that state no times.
+    pub sequence: Sequence,
+    /// The background of transparent pixels, sRGB from 0 to 1; `None` takes the capture's own, else white.
     pub background: Option<[f32; 3]>,
     /// Length in seconds of captures that count time from 0 to 1 (D-NeRF, Nerfstudio); `None`: (N − 1)/fps for N
     /// training frames.
@@ -121,6 +137,7 @@ impl Default for CaptureOptions {
             downscale: 1,
             hold_out: None,
             fps: None,
+            sequence: Sequence::Auto,
             background: None,
             unit_time_seconds: None,
             max_points: MAX_POINTS,

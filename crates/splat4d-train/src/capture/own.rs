@@ -2,7 +2,7 @@
 
 use super::json::{self, Node};
 use super::points::read_ply;
-use super::{CaptureKind, CaptureOptions, HoldOut, RawFrame, Split, Take, pose};
+use super::{CaptureKind, CaptureOptions, HoldOut, RawFrame, Split, Take, Timing, pose};
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::scene::{Camera, Intrinsics, Lens};
@@ -38,6 +38,7 @@ const CAMERA_KEYS: &[&str] = &[
     "world_to_camera",
     "camera_to_world",
     "time_offset",
+    "times",
     "images",
     "masks",
     "flow",
@@ -94,12 +95,14 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<T
         cameras,
         frames,
         named: true,
+        timing: Timing::Told,
         hold_out: top.opt("hold_out")?.map(|n| read_hold_out(&n)).transpose()?,
         fps,
         points: top.opt("points")?.map(|n| read_ply(&root.join(n.text()?))).transpose()?,
         background: read_background(top)?,
         up: top.opt("up")?.map(|n| n.numbers::<3>()).transpose()?,
         warnings: Vec::new(),
+        notes: Vec::new(),
     })
 }
 
@@ -185,6 +188,7 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
         vec![context.pose(&poses, inverted)?]
     };
     let offset = node.opt("time_offset")?.map_or(Ok(0.0), |n| n.number())?;
+    let times = node.opt("times")?.map(|n| read_times(&n)).transpose()?;
     let start = context.shared(node, "start")?.unwrap_or(0);
     let count = context.shared(node, "frames")?;
     let images = Files::read(&node.get("images")?)?;
@@ -220,10 +224,19 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
             let what = format!("there are {} poses, but a picture of frame {index}", poses.len());
             return Err(node.error(what).remedy("Give one pose per frame, or \"count\"."));
         };
+        let time = match times.as_ref().map(|t| t.get(index)) {
+            None => index as f64 / context.fps,
+            Some(Some(&time)) => time,
+            Some(None) => {
+                let what =
+                    format!("there are {} times, but a picture of frame {index}", times.as_ref().map_or(0, Vec::len));
+                return Err(node.error(what).remedy("Give one time per frame, in seconds, or \"frames\"."));
+            }
+        };
         frames.push(RawFrame {
             camera: context.camera,
             source: Camera { cam_from_world, intrinsics, lens, width, height, near: Camera::NEAR },
-            time: index as f64 / context.fps + offset,
+            time: time + offset,
             index,
             image,
             mask: masks.as_ref().and_then(|m| m.name(context.root, start, index)),
@@ -236,6 +249,16 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
         last.flow = None;
     }
     Ok(())
+}
+
+/// When a camera took its frames: seconds on its own clock, each later than the one before.
+fn read_times(node: &Node<'_>) -> Result<Vec<f64>> {
+    let times = node.list()?.iter().map(|n| n.number()).collect::<Result<Vec<f64>>>()?;
+    if let Some(k) = times.windows(2).position(|w| w[0] >= w[1]) {
+        let what = format!("time {} ({} s) is not later than the one before ({} s)", k + 1, times[k + 1], times[k]);
+        return Err(node.error(what).remedy("Give the times in seconds, in the order of the pictures."));
+    }
+    Ok(times)
 }
 
 fn read_lens(node: &Node<'_>) -> Result<Lens> {

@@ -3,7 +3,7 @@
 
 use super::json::{self, Node};
 use super::points::read_ply;
-use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Split, Take, rig};
+use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Split, Take, Timing, rig};
 use splat4d::format::npy::Npy;
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
@@ -41,12 +41,14 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         cameras: ids.iter().map(ToString::to_string).collect(),
         frames: found.into_iter().map(|(_, f)| f).collect(),
         named: true,
+        timing: Timing::Told,
         hold_out: None,
         fps,
         points,
         background: None,
         up: Some(UP),
         warnings,
+        notes: Vec::new(),
     })
 }
 

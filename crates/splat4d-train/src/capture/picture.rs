@@ -5,13 +5,14 @@ use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageReader};
 use splat4d::scene::Camera;
 use splat4d::{Error, Result};
-use std::io::Cursor;
+use std::fs::File;
+use std::io::{BufRead, BufReader, Cursor, Seek};
 use std::path::Path;
 use zune_core::colorspace::ColorSpace;
 use zune_core::options::DecoderOptions;
 use zune_jpeg::JpegDecoder;
 
-/// What a header tells.
+/// Contents of a picture's header.
 pub(super) struct Header {
     /// Pixels across, upright.
     pub width: usize,
@@ -44,7 +45,7 @@ pub(super) struct Raster {
 
 impl Raster {
     /// One sample from 0 to 1.
-    pub fn get(&self, pixel: usize, channel: usize) -> f32 {
+    pub(crate) fn get(&self, pixel: usize, channel: usize) -> f32 {
         let i = pixel * self.channels + channel;
         match &self.samples {
             Samples::Eight(s) => f32::from(s[i]) / 255.0,
@@ -53,7 +54,7 @@ impl Raster {
     }
 
     /// The channel that holds alpha.
-    pub fn alpha(&self) -> Option<usize> {
+    pub(crate) fn alpha(&self) -> Option<usize> {
         self.channels.is_multiple_of(2).then(|| self.channels - 1)
     }
 }
@@ -70,17 +71,21 @@ fn broken(path: &Path, detail: impl std::fmt::Display) -> Error {
         .remedy("Copy or extract it again, or take the frame out of the capture.")
 }
 
-/// Reads size and channels without decoding pixels.
+/// Reads size and channels; of the file no more than it takes.
 pub(super) fn header(path: &Path) -> Result<Header> {
-    let bytes = json::read_bytes(path)?;
-    let (width, height, alpha, orientation) = if is_jpeg(&bytes) {
-        let mut decoder = JpegDecoder::new(Cursor::new(bytes.as_slice()));
+    let fail = |e| {
+        Error::io("cannot be read", e).at(path.display()).remedy("Check that the file exists and may be read by you.")
+    };
+    let mut file = BufReader::new(File::open(path).map_err(fail)?);
+    let jpeg = is_jpeg(file.fill_buf().map_err(fail)?);
+    let (width, height, alpha, orientation) = if jpeg {
+        let mut decoder = JpegDecoder::new(file);
         decoder.decode_headers().map_err(|e| broken(path, e))?;
         let info = decoder.info().ok_or_else(|| broken(path, "no header"))?;
         let orientation = decoder.exif().and_then(|e| Orientation::from_exif_chunk(e));
         (usize::from(info.width), usize::from(info.height), false, orientation)
     } else {
-        let mut decoder = open(&bytes, path)?;
+        let mut decoder = open(file, path)?;
         let (width, height) = decoder.dimensions();
         let orientation = decoder.orientation().ok();
         (width as usize, height as usize, decoder.color_type().has_alpha(), orientation)
@@ -95,9 +100,20 @@ fn swaps_sides(orientation: Orientation) -> bool {
     matches!(orientation, Rotate90 | Rotate270 | Rotate90FlipH | Rotate270FlipH)
 }
 
-fn open<'a>(bytes: &'a [u8], path: &Path) -> Result<impl ImageDecoder + 'a> {
-    let reader = ImageReader::new(Cursor::new(bytes)).with_guessed_format().map_err(|e| broken(path, e))?;
+fn open<'a>(source: impl BufRead + Seek + 'a, path: &Path) -> Result<impl ImageDecoder + 'a> {
+    let reader = ImageReader::new(source).with_guessed_format().map_err(|e| broken(path, e))?;
     reader.into_decoder().map_err(|e| broken(path, e))
+}
+
+/// How far the shape of a resized picture may be from the one that its intrinsics are for; more was cropped or padded.
+const MAX_ASPECT_CHANGE: f64 = 0.01;
+
+/// Whether a picture of `size` is one of the camera's size that was made smaller or larger: of the same shape, but for
+/// the rounding of its shorter side.
+pub(super) fn is_resized(size: (usize, usize), camera: &Camera) -> bool {
+    let (width, height) = (size.0 as f64 / camera.width as f64, size.1 as f64 / camera.height as f64);
+    let rounding = 1.0 / size.0.min(size.1).max(1) as f64;
+    (width / height - 1.0).abs() <= rounding.min(MAX_ASPECT_CHANGE)
 }
 
 /// An error unless a picture of `size` is what its camera describes.
@@ -117,8 +133,12 @@ pub(super) fn check_size(path: &Path, size: (usize, usize), camera: &Camera) -> 
 /// Decodes a picture, upright. Fails before any large allocation if its size is impossible or, where given, not
 /// `expected`.
 pub(super) fn decode(path: &Path, expected: Option<&Camera>) -> Result<Raster> {
-    let bytes = json::read_bytes(path)?;
-    if is_jpeg(&bytes) { decode_jpeg(&bytes, path, expected) } else { decode_other(&bytes, path, expected) }
+    decode_bytes(&json::read_bytes(path)?, path, expected)
+}
+
+/// [`decode`] of a file's bytes; errors name `path`.
+pub(super) fn decode_bytes(bytes: &[u8], path: &Path, expected: Option<&Camera>) -> Result<Raster> {
+    if is_jpeg(bytes) { decode_jpeg(bytes, path, expected) } else { decode_other(bytes, path, expected) }
 }
 
 fn admit(path: &Path, size: (usize, usize), turned: bool, expected: Option<&Camera>) -> Result<()> {
@@ -174,7 +194,7 @@ fn jpeg_ends(bytes: &[u8]) -> bool {
 }
 
 fn decode_other(bytes: &[u8], path: &Path, expected: Option<&Camera>) -> Result<Raster> {
-    let mut decoder = open(bytes, path)?;
+    let mut decoder = open(Cursor::new(bytes), path)?;
     let (width, height) = decoder.dimensions();
     let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
     admit(path, (width as usize, height as usize), swaps_sides(orientation), expected)?;

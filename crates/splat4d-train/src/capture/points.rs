@@ -20,6 +20,8 @@ fn cloud(bytes: &[u8]) -> Result<PointCloud> {
     let mut cloud = PointCloud::default();
     for (i, point) in read.positions.iter().enumerate() {
         let seen = read.times.get(i).copied();
+        // No number: the point was not seen at one time.
+        let seen = seen.filter(|t| !t.is_nan());
         if point.iter().chain(&seen).all(|v| v.is_finite()) {
             let color = read.colors.get(i).copied().unwrap_or([GREY; 3]);
             cloud.points.push(*point);
@@ -49,10 +51,26 @@ const MAX_CELLS: f64 = (1u64 << 20) as f64;
 const STEPS: usize = 16;
 
 impl PointCloud {
+    /// All of it as a binary .ply file, from which it comes back bit by bit; `comment`: lines for its header.
+    pub(crate) fn to_ply(&self, comment: &str) -> Vec<u8> {
+        let mut out = format!(
+            "ply\nformat binary_little_endian 1.0\n{comment}\nelement vertex {}\nproperty double x\nproperty double y\n\
+             property double z\nproperty float r\nproperty float g\nproperty float b\nproperty double time\nend_header\n",
+            self.points.len()
+        )
+        .into_bytes();
+        for ((point, color), time) in self.points.iter().zip(&self.colors).zip(&self.times) {
+            point.iter().for_each(|v| out.extend(v.to_le_bytes()));
+            color.iter().for_each(|v| out.extend(v.to_le_bytes()));
+            out.extend(time.unwrap_or(f64::NAN).to_le_bytes());
+        }
+        out
+    }
+
     /// Thins the cloud to at most `max_points`: the finest voxel grid that leaves few enough cells, and the mean of
     /// position and colour in each. The same cloud always gives the same result; small clouds come back unchanged.
     /// Points of different time stay apart (a cell holds one time, taken from its first point, per time value).
-    pub fn voxel_downsample(&self, max_points: usize) -> Self {
+    pub(crate) fn voxel_downsample(&self, max_points: usize) -> Self {
         let n = self.points.len();
         if n <= max_points || max_points == 0 {
             return if max_points == 0 { Self::default() } else { self.clone() };
@@ -135,6 +153,18 @@ mod tests {
         assert_eq!(cloud(&binary).unwrap(), read);
         let message = cloud(&binary[..binary.len() - 1]).unwrap_err().to_string();
         assert!(message.contains("claims 3 rows"), "{message}");
+    }
+
+    #[test]
+    fn a_cloud_comes_back_from_its_file_bit_by_bit() {
+        let cloud = PointCloud {
+            points: vec![[0.1, -2e-9, 3e7], [1.0 / 3.0, 0.0, -0.7]],
+            colors: vec![[0.1, 0.2, 1.0], [0.0, 0.7, 1.0 / 3.0]],
+            times: vec![None, Some(0.3)],
+        };
+        assert_eq!(super::cloud(&cloud.to_ply("comment made up")).unwrap(), cloud);
+        let none = PointCloud::default();
+        assert_eq!(super::cloud(&none.to_ply("comment made up")).unwrap(), none);
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! What to tell a user before hours of training: few cameras, narrow coverage, uneven clocks.
+//! Checks of a capture before hours of training: few cameras, narrow coverage, uneven clocks.
 
 use super::{Capture, Frame};
 use splat4d::math::se3::{dot, norm, normalize, sub};
@@ -17,9 +17,9 @@ pub enum Severity {
 pub struct Finding {
     /// How bad it is.
     pub severity: Severity,
-    /// What was found, a sentence.
+    /// The finding, a sentence.
     pub what: String,
-    /// What to do about it, a sentence.
+    /// The remedy, a sentence; empty where the finding says all.
     pub remedy: String,
 }
 
@@ -43,6 +43,7 @@ impl Capture {
                 "docs/capture-format.md says what the layout expects.",
             ));
         }
+        findings.extend(self.notes.iter().map(|note| finding(Severity::Note, note.clone(), "")));
         let views = self.training_views();
         self.check_views(&views, &mut findings);
         self.check_clock(&mut findings);
@@ -50,7 +51,7 @@ impl Capture {
         if self.points.is_none() {
             findings.push(finding(
                 Severity::Note,
-                "The capture has no initial points: training starts from random ones.".into(),
+                "The capture has no initial points: training looks for some in its pictures.".into(),
                 "A sparse cloud (COLMAP, or any coloured .ply) gives a better start.",
             ));
         }

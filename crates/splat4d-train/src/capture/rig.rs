@@ -32,7 +32,7 @@ pub(super) fn trailing_number(name: &str) -> Option<usize> {
     stem[stem.len() - digits..].parse().ok()
 }
 
-/// What the names of all pictures say together.
+/// The cameras and frames that the names of all pictures give together.
 pub(super) struct Naming {
     /// Camera names, sorted.
     pub cameras: Vec<String>,
@@ -47,15 +47,17 @@ const MAX_SPAN: usize = 1_000_000;
 /// Folders that hold pictures but name no camera.
 const PLAIN_FOLDERS: &[&str] = &["images", "image", "frames", "rgb", "input", "train", "test", "val", "."];
 
+/// Whether a folder holds pictures but names no camera.
+pub(super) fn is_plain(folder: &str) -> bool {
+    // ns-process-data writes reduced copies to images_2, images_4, images_8.
+    let reduced = folder.strip_prefix("images_").is_some_and(|n| n.parse::<usize>().is_ok());
+    reduced || folder.is_empty() || PLAIN_FOLDERS.contains(&folder)
+}
+
 /// The camera in `cam/frame.png`, `cam/images/frame.png` or `cam_frame12.png`.
 fn camera_of(name: &str) -> Option<&str> {
     let (folders, file) = name.rsplit_once('/').unwrap_or(("", name));
-    let named = |f: &&str| {
-        // ns-process-data writes reduced copies to images_2, images_4, images_8.
-        let plain = f.strip_prefix("images_").is_some_and(|n| n.parse::<usize>().is_ok());
-        !f.is_empty() && !plain && !PLAIN_FOLDERS.contains(f)
-    };
-    if let Some(folder) = folders.rsplit('/').find(named) {
+    if let Some(folder) = folders.rsplit('/').find(|folder| !is_plain(folder)) {
         return Some(folder);
     }
     let stem = file.rsplit_once('.').map_or(file, |(stem, _)| stem);

@@ -45,13 +45,8 @@ pub struct StoredPicture {
 }
 
 impl StoredPicture {
-    /// Pixels across and down.
-    pub fn size(&self) -> (usize, usize) {
-        (self.width, self.height)
-    }
-
     /// Bytes of the samples.
-    pub fn bytes(&self) -> usize {
+    pub(crate) fn bytes(&self) -> usize {
         let color = match &self.color {
             Samples::Eight(s) => s.len(),
             Samples::Sixteen(s) => 2 * s.len(),
@@ -61,7 +56,7 @@ impl StoredPicture {
     }
 
     /// Writes the colour as [3, height, width] sRGB values from 0 to 1, reusing `out`'s memory.
-    pub fn color_into(&self, out: &mut Planes<f32>) {
+    pub(crate) fn color_into(&self, out: &mut Planes<f32>) {
         match &self.color {
             Samples::Eight(s) => self.convert(s, 255.0, 3, out),
             Samples::Sixteen(s) => self.convert(s, 65535.0, 3, out),
@@ -69,17 +64,17 @@ impl StoredPicture {
     }
 
     /// Writes the mask as [1, height, width] from 0 to 1; false (and `out` untouched) if there is none.
-    pub fn mask_into(&self, out: &mut Planes<f32>) -> bool {
+    pub(crate) fn mask_into(&self, out: &mut Planes<f32>) -> bool {
         self.weights_into(self.mask.as_deref(), out)
     }
 
     /// Writes the validity as [1, height, width] from 0 to 1; false (and `out` untouched) if all pixels are valid.
-    pub fn valid_into(&self, out: &mut Planes<f32>) -> bool {
+    pub(crate) fn valid_into(&self, out: &mut Planes<f32>) -> bool {
         self.weights_into(self.valid.as_deref(), out)
     }
 
     /// Writes the flow as [3, height, width]; false (and `out` untouched) if there is none.
-    pub fn flow_into(&self, out: &mut Planes<f32>) -> bool {
+    pub(crate) fn flow_into(&self, out: &mut Planes<f32>) -> bool {
         let Some(codes) = &self.flow else { return false };
         flow::decode_into(codes, self.width, self.height, out);
         true
@@ -203,7 +198,7 @@ impl ImageStore {
     /// Decodes these frames in the background, in this order; replaces what an earlier call left undone. Stops at half
     /// the budget so that it cannot push out what it just brought. Errors are reported by [`Self::load`].
     /// Panics: a frame out of range.
-    pub fn prefetch(&self, frames: &[usize]) {
+    pub(crate) fn prefetch(&self, frames: &[usize]) {
         let count = self.shared.capture.frames.len();
         assert!(frames.iter().all(|&f| f < count), "prefetched frames must be the capture's frames");
         let mut state = self.shared.lock();
@@ -225,17 +220,20 @@ impl ImageStore {
     }
 
     /// Bytes of the pictures kept now.
-    pub fn bytes(&self) -> usize {
+    #[cfg(test)]
+    pub(crate) fn bytes(&self) -> usize {
         self.shared.lock().bytes
     }
 
     /// Most bytes of pictures kept at any time so far; at most the budget.
-    pub fn peak_bytes(&self) -> usize {
+    #[cfg(test)]
+    pub(crate) fn peak_bytes(&self) -> usize {
         self.shared.lock().peak
     }
 
     /// How many pictures were decoded so far.
-    pub fn decoded(&self) -> usize {
+    #[cfg(test)]
+    pub(crate) fn decoded(&self) -> usize {
         self.shared.lock().loads
     }
 }

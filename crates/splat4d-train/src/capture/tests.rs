@@ -2,6 +2,7 @@
 
 mod bad_input;
 mod flow;
+mod forgiving;
 mod layouts;
 mod mutants;
 mod pictures;

@@ -9,7 +9,7 @@
 //! It is a run like any other: [`compress`] begins it or continues it, exactly.
 
 mod fit;
-pub mod quantise;
+pub(crate) mod quantise;
 mod settings;
 mod stages;
 #[cfg(test)]
@@ -21,9 +21,9 @@ pub use settings::{Compression, Level, MOST_PRUNED};
 use crate::capture::Capture;
 use crate::event::Event;
 use crate::recipe::Recipe;
-use crate::train::refine::{Refine, refine};
-use crate::train::run::{plan, training_frames};
-use crate::train::{Outcome, TrainOptions};
+use crate::run::{Outcome, TrainOptions};
+use crate::run::{Refine, refine};
+use crate::run::{plan, training_frames};
 use crate::upkeep::Strategy;
 use crate::upkeep::worth::{Scores, score};
 use crate::{Error, Result};
@@ -38,22 +38,22 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 /// The verb that makes and continues such runs.
-pub const VERB: &str = "compress";
+pub(crate) const VERB: &str = "compress";
 
-/// What is to be compressed.
+/// The inputs of a compression.
 #[derive(Clone)]
 pub struct Job<'a> {
     /// A trained scene.
     pub source: &'a Scene<f32>,
-    /// What it was trained on.
+    /// The capture it was trained on.
     pub capture: Arc<Capture>,
     /// How it was trained.
     pub recipe: &'a Recipe,
-    /// What to do.
+    /// The settings of compression.
     pub settings: &'a Compression,
 }
 
-/// What became of it.
+/// The result of a compression.
 #[derive(Debug)]
 pub struct Compressed {
     /// How the run ended.
@@ -139,7 +139,7 @@ fn draft(
     Ok(Draft { meta, nodes: baked.nodes, poster: None })
 }
 
-/// What a scene says of itself.
+/// The scene's own metadata.
 fn meta(scene: &Scene<f32>) -> Meta {
     let Scene { clip, fps, up, background, .. } = *scene;
     Meta { clip, fps, up, background, ..Meta::default() }

@@ -1,4 +1,4 @@
-//! What may be told of compression, and the three levels.
+//! Settings of compression, and the three levels.
 
 use crate::settings::nearest;
 use crate::upkeep::worth::{Combine, Spatial, Temporal};
@@ -69,7 +69,7 @@ settings! {
     depths: Depths = Depths::default(),
 }
 
-/// What `--level` names.
+/// The levels that `--level` names.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Level {
     /// The plain playback file: quantised, not tuned.
@@ -118,7 +118,7 @@ impl Compression {
 
     /// The share of the training's rates at which fine-tuning begins. The more goes, the further has what is left to move;
     /// where little goes, high rates only let unseen Gaussians drift (docs/benchmarks.md, "Compression").
-    pub fn first_rates(&self) -> f64 {
+    pub(crate) fn first_rates(&self) -> f64 {
         if self.rates > 0.0 {
             return self.rates;
         }
@@ -128,7 +128,7 @@ impl Compression {
     }
 
     /// Reads TOML. Errors: syntax, unknown names (with the nearest known one), ranges.
-    pub fn from_toml(text: &str) -> Result<Self> {
+    pub(crate) fn from_toml(text: &str) -> Result<Self> {
         let table: toml::Table = toml::from_str(text)
             .map_err(|e| Error::input(format!("the settings are not valid TOML: {}", e.message())))?;
         if let Some(key) = table.keys().find(|k| !NAMES.contains(&k.as_str())) {
@@ -146,7 +146,7 @@ impl Compression {
         toml::to_string(self).expect("settings are plain numbers, flags and strings")
     }
 
-    /// Applies one `key=value`. Errors: as [`from_toml`](Self::from_toml).
+    /// Applies one `key=value`. Errors: as `from_toml`.
     pub fn set(&mut self, assignment: &str) -> Result<()> {
         let Some((key, text)) = assignment.split_once('=') else {
             return Err(Error::input(format!("`{assignment}` is not of the form key=value"))

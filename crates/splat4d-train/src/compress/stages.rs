@@ -9,7 +9,7 @@ use crate::event::Progress;
 use crate::loss::scene::MeanOpacity;
 use crate::loss::terms::ParamLoss;
 use crate::methods::{Hook, Plan, Rate, Stage, tuning};
-use crate::upkeep::worth::{Keys, MaskConfig, ScoreConfig, key_masks, prune, score};
+use crate::upkeep::worth::{MaskConfig, ScoreConfig, key_masks, prune, score};
 use splat4d::format::playback::{WriteConfig, read_pages, write};
 use splat4d::layers::Scene;
 use splat4d::math::Rng;
@@ -39,7 +39,7 @@ impl Prepared {
     }
 
     /// How the settings want Gaussians scored. Errors: names that are none.
-    pub fn score_config(&self) -> Result<ScoreConfig> {
+    pub(super) fn score_config(&self) -> Result<ScoreConfig> {
         let s = &self.settings;
         Ok(ScoreConfig {
             spatial: s.spatial.parse()?,
@@ -75,7 +75,7 @@ pub(super) fn float_stages(prepared: &Prepared) -> Result<Vec<Stage>> {
         .collect()
 }
 
-/// What the model learns by, at rates that settle.
+/// The stage that the model learns by, at rates that settle.
 fn host_stage(prepared: &Prepared, steps: usize) -> Result<Stage> {
     let mut stage = tuning(&prepared.plan)?;
     stage.iterations = steps;
@@ -90,7 +90,7 @@ fn settling(rate: Rate, share: f64) -> Rate {
     Rate { start, end: (share * rate.end).min(start * REST) }
 }
 
-/// What lets Gaussians fade that no view asks for.
+/// The loss that lets Gaussians fade that no view asks for.
 fn fading(settings: &Compression) -> Option<Box<dyn ParamLoss<f32>>> {
     let weight = settings.opacity_reg;
     (weight > 0.0).then(|| Box::new(MeanOpacity { weight }) as Box<dyn ParamLoss<f32>>)
@@ -113,7 +113,7 @@ fn pruning(prepared: Prepared, share: f64, filter: bool) -> Hook {
 
 /// Masks at the settings' interval.
 fn masks(scene: &mut Scene<f32>, prepared: &Prepared, progress: &mut Progress<'_>) -> Result<()> {
-    let config = MaskConfig { keys: Keys::Interval(prepared.settings.mask_interval), antialias: prepared.antialias() };
+    let config = MaskConfig { interval: prepared.settings.mask_interval, antialias: prepared.antialias() };
     key_masks(scene, prepared.frames.as_ref(), &config, &mut |done, total| {
         progress.phase("looking which are seen", done, total);
     })

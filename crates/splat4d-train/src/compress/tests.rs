@@ -1,7 +1,7 @@
 //! A whole compression on a made-up capture: rounds, the file, sizes.
 
 use super::*;
-use crate::train::run::tests::{Place, recipe};
+use crate::run::tests::{Place, recipe};
 use splat4d::format::playback::{WriteConfig, read, write_pages};
 use splat4d::scene::Time;
 

@@ -31,7 +31,7 @@ pub(super) struct Conv {
 
 impl Conv {
     /// max(0, conv(input) + bias), [outputs, H', W']; `None` where the image is smaller than the kernel.
-    pub fn relu(&self, simd: Simd, input: &Planes<f32>) -> Option<Planes<f32>> {
+    pub(crate) fn relu(&self, simd: Simd, input: &Planes<f32>) -> Option<Planes<f32>> {
         assert_eq!(input.channels, self.inputs, "an image with other channels than the convolution's");
         let (ph, pw) = (input.height + 2 * self.pad, input.width + 2 * self.pad);
         let size = |n: usize| Some(n.checked_sub(self.side)? / self.stride + 1);

@@ -23,7 +23,7 @@ const SHIFT: [f32; 3] = [-0.030, -0.088, -0.188];
 const SCALE: [f32; 3] = [0.458, 0.448, 0.450];
 /// Keeps the norm of a feature that is all zero from dividing by zero (`lpips` `normalize_tensor`).
 const NORM_FLOOR: f32 = 1e-10;
-/// What to do about a weight file that does not fit.
+/// The remedy for a weight file that does not fit.
 const REMEDY: &str = "Give a safetensors file with torchvision's `features.*` tensors of AlexNet or VGG16 and the \
                       `lin*.model.1.weight` tensors of the `lpips` package";
 
@@ -104,7 +104,7 @@ const VGG: [Layer; 22] = [
 
 impl Net {
     /// The key under which users know the result.
-    pub fn label(self) -> &'static str {
+    pub(crate) fn label(self) -> &'static str {
         match self {
             Net::Alex => "LPIPS-alex",
             Net::Vgg => "LPIPS-vgg",

@@ -8,11 +8,11 @@ use rayon::prelude::*;
 use splat4d::scene::Planes;
 
 /// A pixel is dynamic where a channel is further than this from its camera's temporal mean.
-pub const DYNAMIC_THRESHOLD: f32 = 0.05;
+pub(crate) const DYNAMIC_THRESHOLD: f32 = 0.05;
 /// Exponents of the five scales (Wang 2003).
 const SCALE_WEIGHTS: [f64; 5] = [0.0448, 0.2856, 0.3001, 0.2363, 0.1333];
 /// Shorter side below which MS-SSIM is not defined: at the fifth scale (÷16) an 11-pixel window must still fit.
-pub const MS_SSIM_MIN_SIDE: usize = 176;
+pub(crate) const MS_SSIM_MIN_SIDE: usize = 176;
 /// Window and constants of SSIM (Wang 2004).
 const TAPS: usize = 11;
 const SIGMA: f64 = 1.5;
@@ -32,14 +32,14 @@ fn assert_same(render: &Planes<f32>, truth: &Planes<f32>) {
 /// −10 log₁₀ of the mean squared error in dB; infinite for equal images, `None` for one without pixels.
 ///
 /// Shapes: `[C,H,W]` both. Panics: shapes differ.
-pub fn psnr(render: &Planes<f32>, truth: &Planes<f32>) -> Option<f64> {
+pub(crate) fn psnr(render: &Planes<f32>, truth: &Planes<f32>) -> Option<f64> {
     psnr_where(render, truth, |_| true)
 }
 
 /// [`psnr`] over the pixels p (row-major) with `region[p]`; `None` where there are none.
 ///
 /// Panics: shapes differ, or the region is not `[H·W]`.
-pub fn psnr_region(render: &Planes<f32>, truth: &Planes<f32>, region: &[bool]) -> Option<f64> {
+pub(crate) fn psnr_region(render: &Planes<f32>, truth: &Planes<f32>, region: &[bool]) -> Option<f64> {
     assert_eq!(region.len(), render.pixels(), "a region holds one value a pixel");
     psnr_where(render, truth, |p| region[p])
 }
@@ -61,7 +61,7 @@ fn psnr_where(render: &Planes<f32>, truth: &Planes<f32>, inside: impl Fn(usize) 
 /// Mean SSIM as 3DGS measures it: 11x11 Gaussian, zero padding, per channel. `None` for an image without pixels.
 ///
 /// Source: Wang 2004; the training loss is the same function.
-pub fn ssim(render: &Planes<f32>, truth: &Planes<f32>) -> Option<f64> {
+pub(crate) fn ssim(render: &Planes<f32>, truth: &Planes<f32>) -> Option<f64> {
     assert_same(render, truth);
     if render.data.is_empty() {
         return None;
@@ -72,7 +72,7 @@ pub fn ssim(render: &Planes<f32>, truth: &Planes<f32>) -> Option<f64> {
 }
 
 /// (1 − SSIM)/2
-pub fn d_ssim(ssim: f64) -> f64 {
+pub(crate) fn d_ssim(ssim: f64) -> f64 {
     (1.0 - ssim) / 2.0
 }
 
@@ -86,7 +86,7 @@ fn clamped(p: &Planes<f32>) -> Planes<f32> {
 /// Windows lie wholly inside the image; between scales 2x2 pixels are averaged (an odd last row or column is dropped);
 /// a negative contrast·structure term counts as 0. `None` where the shorter side is below [`MS_SSIM_MIN_SIDE`].
 /// Source: Wang 2003.
-pub fn ms_ssim(render: &Planes<f32>, truth: &Planes<f32>) -> Option<f64> {
+pub(crate) fn ms_ssim(render: &Planes<f32>, truth: &Planes<f32>) -> Option<f64> {
     assert_same(render, truth);
     if render.channels == 0 || render.height.min(render.width) < MS_SSIM_MIN_SIDE {
         return None;
@@ -169,7 +169,7 @@ fn halved(a: &[f64], h: usize, w: usize) -> Vec<f64> {
 
 /// The mean over time of one fixed camera's images, taken one by one.
 #[derive(Clone, Debug, Default)]
-pub struct TemporalMean {
+pub(crate) struct TemporalMean {
     sum: Vec<f64>,
     size: (usize, usize, usize),
     frames: usize,
@@ -177,7 +177,7 @@ pub struct TemporalMean {
 
 impl TemporalMean {
     /// Adds an image. Panics: its size differs from the first one's.
-    pub fn push(&mut self, image: &Planes<f32>) {
+    pub(crate) fn push(&mut self, image: &Planes<f32>) {
         let size = (image.channels, image.height, image.width);
         if self.frames == 0 {
             (self.size, self.sum) = (size, vec![0.0; image.data.len()]);
@@ -188,12 +188,13 @@ impl TemporalMean {
     }
 
     /// Images so far.
-    pub fn frames(&self) -> usize {
+    #[cfg(test)]
+    pub(crate) fn frames(&self) -> usize {
         self.frames
     }
 
     /// The mean; `None` before the first image.
-    pub fn mean(&self) -> Option<Planes<f32>> {
+    pub(crate) fn mean(&self) -> Option<Planes<f32>> {
         let (channels, height, width) = self.size;
         let data = self.sum.iter().map(|s| (s / self.frames as f64) as f32).collect();
         (self.frames > 0).then_some(Planes { channels, height, width, data })
@@ -203,7 +204,7 @@ impl TemporalMean {
 /// The pixels that move: `[H·W]`, true where any channel is more than [`DYNAMIC_THRESHOLD`] from the temporal mean.
 ///
 /// Only a fixed camera has a temporal mean. Panics: sizes differ.
-pub fn dynamic_region(truth: &Planes<f32>, temporal_mean: &Planes<f32>) -> Vec<bool> {
+pub(crate) fn dynamic_region(truth: &Planes<f32>, temporal_mean: &Planes<f32>) -> Vec<bool> {
     assert_same(truth, temporal_mean);
     let mut region = vec![false; truth.pixels()];
     for c in 0..truth.channels {
@@ -216,7 +217,7 @@ pub fn dynamic_region(truth: &Planes<f32>, temporal_mean: &Planes<f32>) -> Vec<b
 
 /// Flicker of one fixed camera: mean |(R_{t+1} − R_t) − (G_{t+1} − G_t)|·255, frames taken one by one in order of time.
 #[derive(Clone, Debug, Default)]
-pub struct Flicker {
+pub(crate) struct Flicker {
     last: Vec<f32>,
     sum: f64,
     pairs: usize,
@@ -224,7 +225,7 @@ pub struct Flicker {
 
 impl Flicker {
     /// Adds the next frame. Panics: render, truth or the last frame differ in size.
-    pub fn push(&mut self, render: &Planes<f32>, truth: &Planes<f32>) {
+    pub(crate) fn push(&mut self, render: &Planes<f32>, truth: &Planes<f32>) {
         assert_same(render, truth);
         let error: Vec<f32> =
             render.data.iter().zip(&truth.data).map(|(r, g)| r.clamp(0.0, 1.0) - g.clamp(0.0, 1.0)).collect();
@@ -238,12 +239,12 @@ impl Flicker {
     }
 
     /// The mean over pairs of neighbouring frames in 8-bit steps; `None` with fewer than two frames.
-    pub fn value(&self) -> Option<f64> {
+    pub(crate) fn value(&self) -> Option<f64> {
         (self.pairs > 0).then(|| self.sum / self.pairs as f64)
     }
 
     /// The mean over all pairs of several cameras.
-    pub fn over<'a>(cameras: impl IntoIterator<Item = &'a Flicker>) -> Option<f64> {
+    pub(crate) fn over<'a>(cameras: impl IntoIterator<Item = &'a Flicker>) -> Option<f64> {
         let mut all = Flicker::default();
         for camera in cameras {
             all.sum += camera.sum;

@@ -1,32 +1,34 @@
 //! Measures how good a render is, and writes it down in the files that 3DGS users know.
 //!
 //! [`score_view`] measures one image, a [`Split`] holds the images of the held-out or the training cameras, and
-//! [`Report::write`] writes `results.json` (means) and `per_view.json` in the layout of the 3DGS scripts.
+//! [`run::evaluate`] writes `results.json` (means) and `per_view.json` in the layout of the 3DGS scripts.
 
+mod colour;
 mod conv;
-pub mod lpips;
+pub(crate) mod lpips;
 pub mod metrics;
 mod report;
 pub mod run;
 pub mod tracks;
 
+pub use colour::ColourMatrix;
 pub use lpips::{InputScaling, Lpips, Net};
-pub use report::{Report, Score, Split, View};
+pub use report::{CameraScores, Conditions, Report, Score, Split, View};
 
 use splat4d::scene::Planes;
 
-/// What is known about a view besides its two images.
+/// The context of a view besides its two images.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct ViewContext<'a> {
     /// The pixels `[H·W]` that a mask calls foreground; `None` where the capture has no masks.
     pub foreground: Option<&'a [bool]>,
-    /// The pixels `[H·W]` that move ([`metrics::dynamic_region`]); `None` where the camera is not fixed.
+    /// The pixels `[H·W]` that move (`metrics::dynamic_region`); `None` where the camera is not fixed.
     pub dynamic: Option<&'a [bool]>,
     /// A network, and how images enter it; `None` where the user named no weights.
     pub lpips: Option<(&'a Lpips, InputScaling)>,
 }
 
-/// All metrics of one view.
+/// All metrics of one view but `PSNR-cc`, which its camera's other views have a say in ([`run::assess`]).
 ///
 /// Keys: `PSNR`, `SSIM`, `MS-SSIM`, `D-SSIM`, `PSNR-dynamic`, with masks `PSNR-foreground`, with a network `LPIPS-alex`
 /// or `LPIPS-vgg` (with ` (input 0..1)` behind it for [`InputScaling::Unit`]). Shapes: `[3,H,W]` both; the name is the

@@ -1,11 +1,11 @@
 //! `results.json` and `per_view.json`.
 
-use serde_json::{Map, Value};
-use splat4d::{Error, Result};
+use super::ColourMatrix;
+use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
-use std::fs;
-use std::io::Write;
-use std::path::Path;
+
+/// What the names of our own entries begin with, as 3DGS does; the steps follow.
+pub(super) const METHOD: &str = "ours_";
 
 /// A number, or why there is none.
 #[derive(Clone, Debug, PartialEq)]
@@ -18,7 +18,7 @@ pub enum Score {
 
 impl Score {
     /// The number if it is there and finite, else the reason.
-    pub fn or(value: Option<f64>, reason: impl Into<String>) -> Self {
+    pub(crate) fn or(value: Option<f64>, reason: impl Into<String>) -> Self {
         match value {
             Some(v) if v.is_finite() => Score::Value(v),
             Some(v) if v == f64::INFINITY => Score::Undefined("infinite: the images are equal there".into()),
@@ -46,7 +46,7 @@ pub struct View {
 
 impl View {
     /// A view without scores.
-    pub fn new(name: &str) -> Self {
+    pub(crate) fn new(name: &str) -> Self {
         Self { name: name.into(), scores: BTreeMap::new() }
     }
 
@@ -56,11 +56,25 @@ impl View {
     }
 }
 
+/// The views of one camera in a [`Split`], and what its colours have in common.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct CameraScores {
+    /// The camera's name in the capture.
+    pub name: String,
+    /// Its views, by their place in [`Split::views`].
+    pub places: Vec<usize>,
+    /// The affine map of colours, render to truth, with the least squared error over all these views; `None` where they
+    /// tell none (grey pictures), and the identity stands for it.
+    pub colour: Option<ColourMatrix>,
+}
+
 /// The images of some cameras.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Split {
     /// In the order of the images' names.
     pub views: Vec<View>,
+    /// The same by camera, in the order in which they were measured.
+    pub cameras: Vec<CameraScores>,
     /// Scores of the split as a whole, such as `flicker`.
     pub whole: BTreeMap<String, Score>,
 }
@@ -104,7 +118,24 @@ impl Split {
         let (means, notes) = self.means();
         let mut out: Map<String, Value> = means.iter().map(|(k, v)| (k.clone(), v.json())).collect();
         add_notes(&mut out, notes.into_iter().map(|(k, v)| (k, Value::from(v))).collect());
+        if !self.cameras.is_empty() {
+            let cameras = self.cameras.iter().map(|c| (c.name.clone(), self.camera_json(c))).collect();
+            out.insert("cameras".into(), Value::Object(cameras));
+        }
         Value::Object(out)
+    }
+
+    /// Mean PSNR of a camera's views, plain and colour-corrected, and the matrix (null: the identity was taken).
+    fn camera_json(&self, camera: &CameraScores) -> Value {
+        let mean = |metric: &str| {
+            let score = |place: &usize| match self.views[*place].scores.get(metric) {
+                Some(Score::Value(value)) => Some(*value),
+                _ => None,
+            };
+            let values: Vec<f64> = camera.places.iter().filter_map(score).collect();
+            (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+        };
+        json!({"PSNR": mean("PSNR"), "PSNR-cc": mean("PSNR-cc"), "colour": camera.colour})
     }
 
     fn per_view_json(&self) -> Value {
@@ -132,12 +163,27 @@ fn add_notes(to: &mut Map<String, Value>, notes: Map<String, Value>) {
     }
 }
 
+/// What figures hold for, beside the steps of training: without it they do not compare.
+#[derive(Clone, Debug, Default, PartialEq, serde::Serialize)]
+pub struct Conditions {
+    /// `test`, `val` or `train`.
+    pub split: &'static str,
+    /// What transparent pixels are composited on, sRGB from 0 to 1, in renders and truth; null: pictures have no alpha.
+    pub background: Option<[f32; 3]>,
+    /// Instructions of the kernels: `scalar`, `avx2`, `avx512` or `neon`. Levels round differently.
+    pub simd: &'static str,
+    /// What drew.
+    pub device: &'static str,
+}
+
 /// An evaluation after some steps of training.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Report {
     /// Steps of training; the method is called `ours_{iteration}`, as 3DGS does.
     pub iteration: u64,
-    /// Held-out cameras.
+    /// What the figures hold for.
+    pub conditions: Conditions,
+    /// The views that were asked for: those held out, unless told otherwise.
     pub test: Split,
     /// Training cameras, written apart under `train`; `None` where they were not evaluated.
     pub train: Option<Split>,
@@ -146,18 +192,18 @@ pub struct Report {
 impl Report {
     /// The method's name in the files.
     pub fn method(&self) -> String {
-        format!("ours_{}", self.iteration)
+        format!("{METHOD}{}", self.iteration)
     }
 
-    /// `results.json`: `{"ours_7000": {"SSIM": …, "PSNR": …, "notes": {…}}, "train": {"ours_7000": {…}}}`.
+    /// `results.json`: `{"ours_7000": {"SSIM": …, "PSNR": …, "notes": {…}, "cameras": {…}}, "train": {"ours_7000": {…}}}`.
     ///
-    /// A metric that is not defined is null, and `notes` says why.
+    /// `cameras` holds for every camera `{"PSNR": …, "PSNR-cc": …, "colour": [[m, m, m, offset] × 3]}`. A metric that is not defined is null, and `notes` says why.
     pub fn results(&self) -> Value {
         self.nested(Split::results_json)
     }
 
     /// `per_view.json`: `{"ours_7000": {"PSNR": {"00000.png": …}, "notes": {…}}, "train": {…}}`.
-    pub fn per_view(&self) -> Value {
+    pub(crate) fn per_view(&self) -> Value {
         self.nested(Split::per_view_json)
     }
 
@@ -171,30 +217,6 @@ impl Report {
         }
         Value::Object(out)
     }
-
-    /// Writes `results.json` and `per_view.json` into `folder`, each whole or not at all.
-    ///
-    /// Errors: the folder cannot be written to, or the disk is full.
-    pub fn write(&self, folder: &Path) -> Result<()> {
-        write_json(&folder.join("results.json"), &self.results())?;
-        write_json(&folder.join("per_view.json"), &self.per_view())
-    }
-}
-
-/// Writes to a temporary name in the same folder, then renames.
-fn write_json(path: &Path, value: &Value) -> Result<()> {
-    let temporary = path.with_extension(format!("json.{}.tmp", std::process::id()));
-    let text = format!("{value:#}\n");
-    let written = fs::File::create(&temporary)
-        .and_then(|mut file| file.write_all(text.as_bytes()).and_then(|()| file.sync_all()))
-        .and_then(|()| fs::rename(&temporary, path));
-    written.map_err(|e| {
-        // The file may never have come into being; the first error is the one to tell.
-        let _ = fs::remove_file(&temporary);
-        Error::io("the evaluation cannot be written", e)
-            .at(path.display())
-            .remedy("Check that the folder exists, may be written to and has room")
-    })
 }
 
 #[cfg(test)]
@@ -221,18 +243,17 @@ mod tests {
             views: vec![score_view("00000.png", &flat(0.5, 200), &flat(0.5, 200), &ViewContext::default())],
             ..Split::default()
         };
-        Report { iteration: 7000, test: Split { views, whole }, train: Some(train) }
+        Report {
+            iteration: 7000,
+            conditions: Conditions::default(),
+            test: Split { views, whole, ..Split::default() },
+            train: Some(train),
+        }
     }
 
     #[test]
-    fn files_have_the_keys_that_3dgs_users_know() {
-        let folder = tempfile::tempdir().expect("a temporary folder");
-        report().write(folder.path()).expect("the folder can be written to");
-        let read = |name: &str| -> Value {
-            let text = fs::read_to_string(folder.path().join(name)).expect("it was written");
-            serde_json::from_str(&text).expect("it is JSON")
-        };
-        let results = read("results.json");
+    fn results_have_the_keys_that_3dgs_users_know() {
+        let results = report().results();
         let ours = &results["ours_7000"];
         let number = |v: &Value| v.as_f64().expect("a number");
         assert!((number(&ours["PSNR"]) - 30.0).abs() < 1e-3, "the mean of 20 and 40 dB, not the dB of the mean");
@@ -246,18 +267,9 @@ mod tests {
         assert!(train["PSNR"].is_null() && train["notes"]["PSNR"].as_str().is_some_and(|n| n.contains("equal")));
         assert!(train["notes"]["PSNR-dynamic"].as_str().is_some_and(|n| n.contains("not fixed")));
         assert!((number(&train["MS-SSIM"]) - 1.0).abs() < 1e-9 && train.get("PSNR-foreground").is_none());
-        let per_view = read("per_view.json");
+        let per_view = report().per_view();
         assert!((number(&per_view["ours_7000"]["PSNR"]["00001.png"]) - 40.0).abs() < 1e-3);
         assert!(per_view["ours_7000"]["PSNR-dynamic"]["00001.png"].is_null());
         assert!(per_view["ours_7000"]["notes"]["PSNR-dynamic"]["00001.png"].is_string());
-        let left: Vec<_> = fs::read_dir(folder.path()).expect("it is there").collect();
-        assert_eq!(left.len(), 2, "no temporary file may stay behind");
-    }
-
-    #[test]
-    fn an_unwritable_folder_is_an_error_with_a_place() {
-        let folder = tempfile::tempdir().expect("a temporary folder");
-        let error = report().write(&folder.path().join("missing")).expect_err("there is no such folder");
-        assert!(error.to_string().contains("results.json"), "{error}");
     }
 }

@@ -3,19 +3,26 @@
 //!
 //! | file | content |
 //! |---|---|
-//! | `results.json` | [`Report::results`], with `dynamic-share` besides; other entries are kept |
-//! | `per_view.json` | [`Report::per_view`], with `camera` and `time` of every picture besides |
+//! | `results.json` | [`Report::results`], with `dynamic-share` and `conditions` (split, background, step, instructions, device) besides; other entries are kept |
+//! | `per_view.json` | `Report::per_view`, with `camera` and `time` of every picture besides |
 //! | `test/ours_N/{renders,gt,errors}/00000.png` | held-out views, in the capture's order |
 //!
-//! PSNR is clamped to `[0,1]`, not rounded, per picture, then the mean. The dynamic region (pixels that leave their
+//! Other views or another background than the run's own ([`EvalOptions::place`]) stand beside: in both files under an
+//! entry of that name, as `train` does, and their pictures in a folder of that name.
+//!
+//! PSNR is clamped to `[0,1]`, not rounded, per picture, then the mean. `PSNR-cc` is the same after the affine colour matrix
+//! that suits all measured views of the picture's camera best: what remains is not a matter of white balance. It is
+//! told beside the plain one and never in its place, for it has seen the truth. The dynamic region (pixels that leave their
 //! camera's temporal mean) and flicker are defined for fixed cameras only. Where a picture was undistorted, pixels
 //! without an original take the truth's colour, so that they count as right in every metric.
 
+use super::colour::{ColourSums, IDENTITY};
 use super::metrics::{self, Flicker, TemporalMean};
-use super::{InputScaling, Lpips, Report, Score, Split, View, ViewContext, score_view};
+use super::report::METHOD;
+use super::{CameraScores, Conditions, InputScaling, Lpips, Report, Score, Split, View, ViewContext, score_view};
 use crate::capture::{Capture, ImageStore, StoredPicture};
 use crate::event::Event;
-use crate::train::checkpoint::write_atomically;
+use crate::run::checkpoint::write_atomically;
 use crate::{Error, Result};
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
@@ -24,7 +31,7 @@ use serde_json::{Value, json};
 use splat4d::device;
 use splat4d::format::safetensors::SafeTensors;
 use splat4d::layers::{Evaluation, Scene};
-use splat4d::render::{Antialias, Backend, Image, RenderConfig, Shot};
+use splat4d::render::{Antialias, Backend, Image, RenderConfig, Shot, Simd};
 use splat4d::scene::Planes;
 use std::path::{Path, PathBuf};
 
@@ -32,10 +39,44 @@ use std::path::{Path, PathBuf};
 const TRAIN_VIEWS: usize = 24;
 /// A mean difference of the channels as large as this is the last colour of an error picture.
 const ERROR_FULL: f32 = 0.25;
+/// What draws: figures are the CPU renderer's, which defines what others draw.
+const DEVICE: &str = "CPU";
 /// Mask values above this are foreground.
 const FOREGROUND: f32 = 0.5;
 
-/// What is measured, and where it is written.
+/// Which of a capture's views are measured.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Measured {
+    /// All that were held out to measure; some training views too.
+    #[default]
+    Test,
+    /// The data set's own validation views.
+    Validation,
+    /// All training views.
+    Train,
+}
+
+impl Measured {
+    /// `test`, `val` or `train`.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Test => "test",
+            Self::Validation => "val",
+            Self::Train => "train",
+        }
+    }
+
+    /// Its frames in a capture.
+    pub fn frames(self, capture: &Capture) -> &[usize] {
+        match self {
+            Self::Test => &capture.held,
+            Self::Validation => &capture.validation,
+            Self::Train => &capture.train,
+        }
+    }
+}
+
+/// Options of an evaluation.
 #[derive(Clone, Debug)]
 pub struct EvalOptions {
     /// The run's folder.
@@ -46,13 +87,26 @@ pub struct EvalOptions {
     pub lpips_weights: Option<PathBuf>,
     /// Whether pictures are written.
     pub pictures: bool,
-    /// Most training views measured.
+    /// Most training views measured beside the held-out ones.
     pub train_views: usize,
+    /// The views that are measured.
+    pub measured: Measured,
+    /// Where results and pictures go in their files: `None` for the held-out views on the run's own background, which are
+    /// what a run is judged by; otherwise the name of an entry, such as `val` or `test-black`.
+    pub place: Option<String>,
 }
 
 impl Default for EvalOptions {
     fn default() -> Self {
-        Self { folder: PathBuf::new(), antialias: false, lpips_weights: None, pictures: true, train_views: TRAIN_VIEWS }
+        Self {
+            folder: PathBuf::new(),
+            antialias: false,
+            lpips_weights: None,
+            pictures: true,
+            train_views: TRAIN_VIEWS,
+            measured: Measured::Test,
+            place: None,
+        }
     }
 }
 
@@ -89,11 +143,11 @@ fn mean(split: &Split, metric: &str) -> Option<f64> {
     }
 }
 
-/// What the pictures of a list are for.
+/// The purpose of a list's pictures.
 #[derive(Clone, Copy, Debug)]
 enum Views<'a> {
-    /// All that was kept from training, of which pictures may be written here.
-    Held(Option<&'a Path>),
+    /// All of a split, of which pictures may be written here.
+    Whole(Option<&'a Path>),
     /// Some that were trained on.
     Train,
 }
@@ -112,10 +166,15 @@ pub fn evaluate(
     let evaluation = assess(scene, capture, store, iteration, options, listen)?;
     let Scores { report, dynamic_share } = &evaluation;
     let (mut results, mut views) = (report.results(), report.per_view());
-    let ours = report.method();
+    let (ours, frames) = (report.method(), options.measured.frames(capture));
     results[&ours]["dynamic-share"] = json!(dynamic_share);
-    views[&ours]["camera"] = by_file(&capture.held, |f| json!(capture.cameras[capture.frames[f].camera].name));
-    views[&ours]["time"] = by_file(&capture.held, |f| json!(capture.frames[f].time.0));
+    results[&ours]["conditions"] = json!(report.conditions);
+    results[&ours]["conditions"]["step"] = json!(report.iteration);
+    views[&ours]["camera"] = by_file(frames, |f| json!(capture.cameras[capture.frames[f].camera].name));
+    views[&ours]["time"] = by_file(frames, |f| json!(capture.frames[f].time.0));
+    if let Some(place) = &options.place {
+        (results, views) = (json!({ place: results }), json!({ place: views }));
+    }
     merge(&options.folder.join("results.json"), results)?;
     merge(&options.folder.join("per_view.json"), views)?;
     Ok(evaluation)
@@ -133,14 +192,28 @@ pub fn assess(
     listen: &mut dyn FnMut(&Event),
 ) -> Result<Scores> {
     let lpips = options.lpips_weights.as_deref().map(load_lpips).transpose()?;
-    let folder = options.folder.join("test").join(format!("ours_{iteration}"));
+    let place = options.place.as_deref().unwrap_or(Measured::Test.name());
+    let folder = options.folder.join(place).join(format!("ours_{iteration}"));
     let mut judge = Judge::new(scene, capture, store, lpips, options.antialias);
-    let held = Views::Held(options.pictures.then_some(folder.as_path()));
-    let test = judge.split(&capture.held, held, "evaluating held-out views", listen)?;
+    let whole = Views::Whole(options.pictures.then_some(folder.as_path()));
+    let name = match options.measured {
+        Measured::Test => "evaluating held-out views",
+        Measured::Validation => "evaluating validation views",
+        Measured::Train => "evaluating all training views",
+    };
+    let test = judge.split(options.measured.frames(capture), whole, name, listen)?;
     let dynamic_share = judge.dynamic_share();
-    let some = spread(&capture.train, options.train_views);
+    let some =
+        if options.measured == Measured::Test { spread(&capture.train, options.train_views) } else { Vec::new() };
     let train = judge.split(&some, Views::Train, "evaluating training views", listen)?;
-    let report = Report { iteration: iteration as u64, test, train: (!some.is_empty()).then_some(train) };
+    let conditions = Conditions {
+        split: options.measured.name(),
+        background: capture.background.map(|_| scene.background),
+        simd: Simd::detect().name(),
+        device: DEVICE,
+    };
+    let train = (!some.is_empty()).then_some(train);
+    let report = Report { iteration: iteration as u64, conditions, test, train };
     Ok(Scores { report, dynamic_share })
 }
 
@@ -191,31 +264,35 @@ impl<'a> Judge<'a> {
         listen: &mut dyn FnMut(&Event),
     ) -> Result<Split> {
         self.dynamic = [0; 2];
-        let held = matches!(kind, Views::Held(_));
+        let held = matches!(kind, Views::Whole(_));
         let mut views: Vec<Option<View>> = vec![None; frames.len()];
-        let mut flicker: Vec<Flicker> = Vec::new();
+        let (mut flicker, mut by_camera): (Vec<Flicker>, Vec<CameraScores>) = (Vec::new(), Vec::new());
         let mut done = 0;
         for camera in cameras(self.capture, frames) {
             // Temporal means and flicker are scores of new views: training views are a subset, out of order.
             let fixed = held && self.capture.cameras[camera.id].fixed && camera.places.len() > 1;
             let mean = if fixed { Some(self.temporal_mean(frames, &camera.places)?) } else { None };
-            let mut changes = Flicker::default();
+            let (mut changes, mut colours) = (Flicker::default(), Vec::with_capacity(camera.places.len()));
             self.store.prefetch(&camera.places.iter().map(|&p| frames[p]).collect::<Vec<_>>());
             for &place in &camera.places {
-                let (view, image, truth) = self.view(&file_name(place), frames[place], mean.as_ref())?;
+                let Drawn { view, image, truth, sums } = self.view(&file_name(place), frames[place], mean.as_ref())?;
+                colours.push(sums);
                 if fixed {
                     changes.push(&image, &truth);
                 }
                 views[place] = Some(view);
-                if let Views::Held(Some(folder)) = kind {
+                if let Views::Whole(Some(folder)) = kind {
                     write_pictures(folder, place, &image, &truth)?;
                 }
                 done += 1;
                 listen(&Event::Phase { name: name.into(), done, total: frames.len() });
             }
             flicker.push(changes);
+            let name = &self.capture.cameras[camera.id].name;
+            by_camera.push(correct_colours(name, &camera.places, &colours, &mut views));
         }
-        let mut split = Split { views: views.into_iter().flatten().collect(), ..Split::default() };
+        let views = views.into_iter().flatten().collect();
+        let mut split = Split { views, cameras: by_camera, ..Split::default() };
         if held {
             let reason = "not defined: no held-out camera is fixed and has two frames";
             split.whole.insert("flicker".into(), Score::or(Flicker::over(&flicker), reason));
@@ -232,21 +309,21 @@ impl<'a> Judge<'a> {
         Ok(mean.mean().expect("a camera has at least one frame"))
     }
 
-    /// Draws one frame and measures it. Returns the render (clean of pixels without truth) and the truth.
-    fn view(
-        &mut self,
-        name: &str,
-        frame: usize,
-        mean: Option<&Planes<f32>>,
-    ) -> Result<(View, Planes<f32>, Planes<f32>)> {
+    /// Draws one frame and measures it.
+    fn view(&mut self, name: &str, frame: usize, mean: Option<&Planes<f32>>) -> Result<Drawn> {
         let stored = self.store.load(frame)?;
         let (info, mut truth) = (&self.capture.frames[frame], Planes::default());
         stored.color_into(&mut truth);
         self.scene.at(info.time, &mut self.instant);
         let splats = self.scene.splats(&self.instant);
         self.backend.render(&Shot::new(&splats, &info.view, self.scene.background), &mut self.image)?;
-        let mut render = self.image.color.clone();
-        hide_unknown(&stored, &mut render, &truth);
+        let mut image = self.image.color.clone();
+        let mut known = Planes::default();
+        let known = stored.valid_into(&mut known).then_some(&known);
+        let sums = ColourSums::of(&image, &truth, known);
+        if let Some(known) = known {
+            hide_unknown(&mut image, &truth, known);
+        }
         let foreground = foreground(&stored);
         let dynamic = mean.map(|m| metrics::dynamic_region(&truth, m));
         if let Some(region) = &dynamic {
@@ -258,8 +335,31 @@ impl<'a> Judge<'a> {
             dynamic: dynamic.as_deref(),
             lpips: self.lpips.as_ref().map(|l| (l, InputScaling::Signed)),
         };
-        Ok((score_view(name, &render, &truth, &context), render, truth))
+        Ok(Drawn { view: score_view(name, &image, &truth, &context), image, truth, sums })
     }
+}
+
+/// A frame that was drawn and measured.
+struct Drawn {
+    view: View,
+    /// The render, clean of pixels without truth.
+    image: Planes<f32>,
+    truth: Planes<f32>,
+    /// Of the render and the truth.
+    sums: ColourSums,
+}
+
+/// Fits a camera's colours over all its views (`sums`, one a place), and tells `PSNR-cc` of each of them.
+fn correct_colours(name: &str, places: &[usize], sums: &[ColourSums], views: &mut [Option<View>]) -> CameraScores {
+    let mut all = ColourSums::default();
+    sums.iter().for_each(|view| all.add(view));
+    let colour = all.fit();
+    let matrix = colour.unwrap_or(IDENTITY);
+    for (&place, sums) in places.iter().zip(sums) {
+        let view = views[place].as_mut().expect("a camera's views are measured before its colours");
+        view.set("PSNR-cc", Score::or(sums.psnr(&matrix), "the image has no pixels"));
+    }
+    CameraScores { name: name.into(), places: places.to_vec(), colour }
 }
 
 /// A camera and the places of its frames in a list, in time.
@@ -284,13 +384,9 @@ fn cameras(capture: &Capture, frames: &[usize]) -> Vec<CameraFrames> {
 }
 
 /// Pixels that the original picture does not cover take the truth's colour.
-fn hide_unknown(stored: &StoredPicture, render: &mut Planes<f32>, truth: &Planes<f32>) {
-    let mut valid = Planes::default();
-    if !stored.valid_into(&mut valid) {
-        return;
-    }
+fn hide_unknown(render: &mut Planes<f32>, truth: &Planes<f32>, known: &Planes<f32>) {
     for c in 0..render.channels {
-        for ((r, t), v) in render.plane_mut(c).iter_mut().zip(truth.plane(c)).zip(&valid.data) {
+        for ((r, t), v) in render.plane_mut(c).iter_mut().zip(truth.plane(c)).zip(&known.data) {
             *r = *r * v + t * (1.0 - v);
         }
     }
@@ -344,7 +440,13 @@ fn merge(path: &Path, entries: Value) -> Result<()> {
     let old = std::fs::read_to_string(path).ok().and_then(|text| serde_json::from_str::<Value>(&text).ok());
     let mut all = old.filter(Value::is_object).unwrap_or_else(|| json!({}));
     if let (Value::Object(all), Value::Object(entries)) = (&mut all, entries) {
-        all.extend(entries);
+        for (name, entry) in entries {
+            match (all.get_mut(&name), entry) {
+                // Entries beside the run's own hold one for each step, of which the others stay.
+                (Some(Value::Object(old)), Value::Object(new)) if !name.starts_with(METHOD) => old.extend(new),
+                (_, entry) => drop(all.insert(name, entry)),
+            }
+        }
     }
     write_atomically(path, format!("{all:#}\n").as_bytes())
 }

@@ -28,7 +28,7 @@ const VIEWS: usize = 100;
 const FOREGROUND: f32 = 0.5;
 
 /// About `count` points on the surfaces that `known` suggests; none where no camera sees enough of them.
-pub fn between(frames: &dyn Frames, known: &[[f64; 3]], count: usize) -> Result<Seeds> {
+pub(crate) fn between(frames: &dyn Frames, known: &[[f64; 3]], count: usize) -> Result<Seeds> {
     let mut out = Seeds::default();
     let views = views(frames);
     if views.is_empty() || known.len() < NEIGHBOURS {
@@ -173,7 +173,7 @@ mod tests {
 
     #[test]
     fn too_few_points_or_a_cloud_behind_the_cameras_give_none() {
-        let frames = crate::train::tests::Made::new(6, 2, 8);
+        let frames = crate::step::tests::Made::new(6, 2, 8);
         assert!(between(&frames, &[[0.0; 3]; NEIGHBOURS - 1], 100).unwrap().is_empty());
         let many = between(&frames, &vec![[0.0, 0.0, 0.0]; NEIGHBOURS], 100).unwrap();
         assert!(many.points.iter().all(|x| x.iter().all(|v| v.is_finite())));
@@ -182,7 +182,7 @@ mod tests {
 
     #[test]
     fn fixed_cameras_are_asked_once() {
-        let frames = crate::train::tests::Made::new(6, 2, 8);
+        let frames = crate::step::tests::Made::new(6, 2, 8);
         assert_eq!(views(&frames).len(), 6);
     }
 }

@@ -21,7 +21,7 @@ const MIN_VIEWS: usize = 2;
 const MONOCULAR_PICTURES: usize = 60;
 
 /// About `count` points over all `times`. For a still scene (`moving` false) masks of the first time stand for all.
-pub fn carve(
+pub(crate) fn carve(
     frames: &dyn Frames,
     volume: &Volume,
     times: &[f64],
@@ -94,7 +94,7 @@ fn carve_moment(frames: &dyn Frames, pictures: &[usize], volume: &Volume, wanted
     Ok(out)
 }
 
-/// What the pictures so far say of one point.
+/// The pictures' votes so far on one point.
 #[derive(Clone, Default)]
 struct Votes {
     views: usize,
@@ -151,7 +151,7 @@ fn median(colors: &mut [[f32; 3]]) -> [f32; 3] {
 mod tests {
     use super::*;
     use crate::init::volume::common;
-    use crate::train::tests::Made;
+    use crate::step::tests::Made;
 
     #[test]
     fn hull_points_lie_in_the_object_that_moves() {

@@ -1,9 +1,9 @@
 //! Where Gaussians start: the capture's points, the visual hull of the masks at several moments, or random points in the
 //! volume that the cameras share.
 
-pub mod fill;
-pub mod hull;
-pub mod volume;
+pub(crate) mod fill;
+pub(crate) mod hull;
+pub(crate) mod volume;
 
 use crate::capture::frames::Frames;
 use crate::methods::{Plan, Program};
@@ -30,12 +30,12 @@ pub struct Seeds {
 
 impl Seeds {
     /// Number of points.
-    pub fn len(&self) -> usize {
+    pub(crate) fn len(&self) -> usize {
         self.points.len()
     }
 
     /// Whether there is none.
-    pub fn is_empty(&self) -> bool {
+    pub(crate) fn is_empty(&self) -> bool {
         self.points.is_empty()
     }
 
@@ -47,14 +47,14 @@ impl Seeds {
     }
 
     /// Adds all of another set.
-    pub fn append(&mut self, mut other: Self) {
+    pub(crate) fn append(&mut self, mut other: Self) {
         self.points.append(&mut other.points);
         self.colors.append(&mut other.colors);
         self.times.append(&mut other.times);
     }
 
     /// At most `count` of them, evenly chosen.
-    pub fn truncate_evenly(&mut self, count: usize, rng: Rng) {
+    pub(crate) fn truncate_evenly(&mut self, count: usize, rng: Rng) {
         if self.len() <= count {
             return;
         }
@@ -72,7 +72,7 @@ impl Seeds {
 settings! {
     /// The first Gaussians.
     pub struct InitSettings {
-        /// Where Gaussians start: "auto", "points", "hull", "random", or a .ply file.
+        /// Where Gaussians start: "auto", "points", "pictures", "hull", "random", or a .ply file.
         source: Source = Source::Auto;
         /// Initial Gaussians. Points that a capture lacks to so many are laid between its own, along surfaces; the hull
         /// of masks and random points bring as many of their own.
@@ -90,10 +90,13 @@ settings! {
 /// Where the first Gaussians are.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Source {
-    /// The capture's points, and more between them; else the hull of masks; else at random.
+    /// The capture's points or, where they are few, those that its pictures show, and more between them; the hull of masks; else
+    /// at random.
     Auto,
     /// The capture's points.
     Points,
+    /// Points that the pictures show, whatever the capture brings, and more between them.
+    Pictures,
     /// The visual hull of masks.
     Hull,
     /// At random in the cameras' common volume.
@@ -103,8 +106,13 @@ pub enum Source {
 }
 
 impl Source {
-    const WORDS: [(&'static str, Self); 4] =
-        [("auto", Self::Auto), ("points", Self::Points), ("hull", Self::Hull), ("random", Self::Random)];
+    const WORDS: [(&'static str, Self); 5] = [
+        ("auto", Self::Auto),
+        ("points", Self::Points),
+        ("pictures", Self::Pictures),
+        ("hull", Self::Hull),
+        ("random", Self::Random),
+    ];
 }
 
 impl Value for Source {
@@ -146,7 +154,7 @@ const INITIAL_SOFTNESS_FRAMES: f64 = 1.0;
 const OPEN_LIFE: (f64, f64) = (0.3, 0.25);
 
 /// The keyframe times of the plan: evenly over the clip, at least one.
-pub fn keyframes(plan: &Plan) -> Vec<f64> {
+pub(crate) fn keyframes(plan: &Plan) -> Vec<f64> {
     let count = match plan.recipe.init.keyframes {
         0 => plan.times.div_ceil(FRAMES_PER_KEYFRAME).max(1),
         k => k.min(plan.times.max(1)),
@@ -167,6 +175,10 @@ pub fn seeds(plan: &Plan, frames: &dyn Frames, points: Option<Seeds>, moving: bo
             return Err(Error::input("the capture has no points to start from")
                 .remedy("Add a points file to the capture, or use --set init=random"));
         }
+        Source::Pictures if !have_points => {
+            return Err(Error::input("no points were found in the pictures")
+                .remedy("Check the poses with `splat4d info CAPTURE`, or use --set init=random"));
+        }
         Source::Hull if !frames.has_masks() => {
             return Err(Error::input("the visual hull needs masks, and the capture has none")
                 .remedy("Add masks to the capture, or use --set init=random"));
@@ -177,8 +189,12 @@ pub fn seeds(plan: &Plan, frames: &dyn Frames, points: Option<Seeds>, moving: bo
         frames.has_masks() && matches!(r.init.source, Source::Auto | Source::Hull) && (moving || !have_points);
     if have_points && !matches!(r.init.source, Source::Random | Source::Hull) {
         out.append(points.expect("just seen"));
-        if r.init.source == Source::Auto && out.len() < r.init.count {
-            out.append(fill::between(frames, &out.points, r.init.count - out.len())?);
+        let filled = matches!(r.init.source, Source::Auto | Source::Pictures);
+        if filled && out.len() < r.init.count {
+            // Surfaces that move are elsewhere at other times.
+            let still = (0..out.len()).filter(|&i| out.times[i].is_none());
+            let known: Vec<[f64; 3]> = still.map(|i| out.points[i]).collect();
+            out.append(fill::between(frames, &known, r.init.count - out.len())?);
         }
     }
     if use_hull {
@@ -192,7 +208,7 @@ pub fn seeds(plan: &Plan, frames: &dyn Frames, points: Option<Seeds>, moving: bo
 
 /// Initial points for Gaussians that live through the whole clip: those of its middle, where what moves is on average
 /// nearest to where it will be.
-pub fn one_moment(plan: &Plan, frames: &dyn Frames, points: Option<Seeds>) -> Result<Seeds> {
+pub(crate) fn one_moment(plan: &Plan, frames: &dyn Frames, points: Option<Seeds>) -> Result<Seeds> {
     let mut single = plan.clone();
     single.recipe.init.keyframes = single.recipe.init.keyframes.max(1);
     let mut out = seeds(&single, frames, points, true)?;

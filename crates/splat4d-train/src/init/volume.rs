@@ -8,7 +8,7 @@ use splat4d::scene::Camera;
 
 /// Where the cameras look.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Volume {
+pub(crate) struct Volume {
     /// The point nearest to all optical axes.
     pub center: [f64; 3],
     /// Half the edge of the box around it, scene units.
@@ -21,7 +21,7 @@ const REACH: f64 = 0.75;
 /// The least-squares meeting point of the optical axes, and a box around it that stops short of the cameras.
 ///
 /// Where axes are nearly parallel the depth is taken from the spread of the cameras.
-pub fn common(frames: &dyn Frames) -> Volume {
+pub(crate) fn common(frames: &dyn Frames) -> Volume {
     // Σ (I − d dᵀ) x = Σ (I − d dᵀ) c, slightly pulled to a point in front of the cameras so that parallel axes meet.
     let mut a = [[0.0; 3]; 3];
     let mut b = [0.0; 3];
@@ -74,7 +74,7 @@ const CANDIDATES: usize = 32;
 
 /// Uniform points of the box where cameras look; with `clip`, each at a random moment of it. Fewer than `count` if
 /// cameras see hardly any of the box.
-pub fn random(frames: &dyn Frames, volume: &Volume, count: usize, clip: Option<[f64; 2]>, rng: Rng) -> Seeds {
+pub(crate) fn random(frames: &dyn Frames, volume: &Volume, count: usize, clip: Option<[f64; 2]>, rng: Rng) -> Seeds {
     let asked = frames.len().min(ASKED);
     let cameras: Vec<&Camera> = (0..asked).map(|k| frames.camera(k * frames.len() / asked)).collect();
     let sees = |camera: &Camera, x: [f64; 3]| {
@@ -98,7 +98,7 @@ pub fn random(frames: &dyn Frames, volume: &Volume, count: usize, clip: Option<[
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::train::tests::Made;
+    use crate::step::tests::Made;
 
     #[test]
     fn a_ring_of_cameras_meets_at_its_center() {

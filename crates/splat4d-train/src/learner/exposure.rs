@@ -19,7 +19,7 @@ pub struct Exposure {
 
 impl Exposure {
     /// The identity for every camera; only the `trained` ones ever change.
-    pub fn new(cameras: usize, trained: Vec<usize>) -> Self {
+    pub(crate) fn new(cameras: usize, trained: Vec<usize>) -> Self {
         let mut params = Params::new(0, 0, &[]);
         let key = params
             .entry("exposure", Space::Fixed, &[("exposure", 6)], cameras, |_| {})
@@ -28,17 +28,17 @@ impl Exposure {
     }
 
     /// The table's key.
-    pub fn key(&self) -> Key {
+    pub(crate) fn key(&self) -> Key {
         self.key
     }
 
     /// Forgets what the last views gave.
-    pub fn rest(&mut self) {
+    pub(crate) fn rest(&mut self) {
         self.grads.clear(&self.params);
     }
 
     /// Applies the gain and offset of camera `rig` to `color`.
-    pub fn respond(&self, rig: usize, color: &mut Planes<f32>) {
+    pub(crate) fn respond(&self, rig: usize, color: &mut Planes<f32>) {
         let row = self.params[self.key].read::<6>(rig, 0);
         for c in 0..3 {
             let gain = row[c].exp();
@@ -48,7 +48,7 @@ impl Exposure {
 
     /// The VJP of [`respond`](Self::respond) at what was drawn: turns the gradient to the exposed colours into that to the
     /// drawn ones, and adds to the camera's.
-    pub fn respond_backward(&mut self, rig: usize, drawn: &Planes<f32>, d_color: &mut Planes<f32>) {
+    pub(crate) fn respond_backward(&mut self, rig: usize, drawn: &Planes<f32>, d_color: &mut Planes<f32>) {
         let row = self.params[self.key].read::<6>(rig, 0);
         let mut d_row = [0.0f32; 6];
         for c in 0..3 {
@@ -65,7 +65,7 @@ impl Exposure {
     }
 
     /// One Adam step with what the last views gave. Returns whether all was finite.
-    pub fn step(&mut self, rate: f64) -> bool {
+    pub(crate) fn step(&mut self, rate: f64) -> bool {
         let mut rates = vec![None; self.key.0 as usize];
         rates.push(Some(vec![rate; 6]));
         let finite = self.moments.step(&mut self.params, &mut self.grads, &rates, &[]).is_empty();

@@ -9,12 +9,12 @@ use splat4d::math::Real;
 use splat4d::math::mat3::procrustes;
 
 /// Added to a value before it divides itself (SC-GS).
-pub const OWN_FLOOR: f64 = 1e-5;
+pub(crate) const OWN_FLOOR: f64 = 1e-5;
 
 /// The rotation of every point's neighbourhood from `second` to `first`: R_i = argmin Σ_j w ‖e¹_ij − R e²_ij‖².
 ///
 /// A neighbourhood that has not moved, or is alone, gives the identity.
-pub fn rotations<F: Real>(graph: &Graph<F>, first: &[[F; 3]], second: &[[F; 3]]) -> Vec<[[F; 3]; 3]> {
+pub(crate) fn rotations<F: Real>(graph: &Graph<F>, first: &[[F; 3]], second: &[[F; 3]]) -> Vec<[[F; 3]; 3]> {
     let n = graph.len();
     assert!([first.len(), second.len()] == [n; 2], "{n} points");
     let one = |i: usize| {
@@ -34,7 +34,7 @@ pub fn rotations<F: Real>(graph: &Graph<F>, first: &[[F; 3]], second: &[[F; 3]])
 /// [`rotations`]; being the best, it needs no derivative (the envelope theorem). Adds to the gradients of both instants.
 ///
 /// Source: Sorkine and Alexa 2007; SC-GS (Huang et al. 2024).
-pub fn arap<F: Real>(
+pub(crate) fn arap<F: Real>(
     graph: &Graph<F>,
     [first, second]: [&[[F; 3]]; 2],
     weight: f64,
@@ -74,7 +74,13 @@ pub fn arap<F: Real>(
 /// units)²: its gradient is that of ln V, whatever the unit. Adds to the gradients of every instant.
 ///
 /// Source: SC-GS (Huang et al. 2024), with `floor` = [`OWN_FLOOR`] and eight instants.
-pub fn elastic<F: Real>(graph: &Graph<F>, at: &[&[[F; 3]]], floor: f64, weight: f64, d: &mut [&mut [[F; 3]]]) -> f64 {
+pub(crate) fn elastic<F: Real>(
+    graph: &Graph<F>,
+    at: &[&[[F; 3]]],
+    floor: f64,
+    weight: f64,
+    d: &mut [&mut [[F; 3]]],
+) -> f64 {
     let (n, times) = (graph.len(), at.len());
     assert!(d.len() == times && at.iter().all(|x| x.len() == n) && d.iter().all(|x| x.len() == n), "{n} points");
     if times == 0 || graph.edges() == 0 {
@@ -112,7 +118,7 @@ pub fn elastic<F: Real>(graph: &Graph<F>, at: &[&[[F; 3]]], floor: f64, weight: 
 /// unit. Adds to the gradients of the three instants.
 ///
 /// Source: SC-GS (Huang et al. 2024), with `floor` = [`OWN_FLOOR`] and δ = 3 frames.
-pub fn acceleration<F: Real>(at: [&[[F; 3]]; 3], floor: f64, weight: f64, d: [&mut [[F; 3]]; 3]) -> f64 {
+pub(crate) fn acceleration<F: Real>(at: [&[[F; 3]]; 3], floor: f64, weight: f64, d: [&mut [[F; 3]]; 3]) -> f64 {
     let n = at[0].len();
     assert!(at.iter().all(|x| x.len() == n) && d.iter().all(|x| x.len() == n), "{n} points");
     let second = |i: usize| -> [F; 3] { std::array::from_fn(|k| at[0][i][k] - F::TWO * at[1][i][k] + at[2][i][k]) };

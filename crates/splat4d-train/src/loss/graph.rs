@@ -1,15 +1,15 @@
-//! Who is near whom: the graph of neighbours that the losses on rigid motion share.
+//! The graph of nearest neighbours that the losses on rigid motion share.
 
 use rayon::prelude::*;
 use splat4d::math::Real;
 use splat4d::math::knn::knn;
 
 /// Below this mean weight a graph ties almost nothing: its β does not fit the scene's unit.
-pub const LEAST_MEAN_WEIGHT: f64 = 0.05;
+pub(crate) const LEAST_MEAN_WEIGHT: f64 = 0.05;
 
-/// What an edge counts, given its length at rest d0.
+/// The weight of an edge, given its length at rest d0.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Weigh {
+pub(crate) enum Weigh {
     /// All alike.
     Uniform,
     /// exp(−c d0²/median(d0²)): whatever the scene's unit, the median edge counts e^−c.
@@ -24,7 +24,7 @@ pub enum Weigh {
 /// itself: it weighs nothing and is not counted.
 /// Source: Luiten et al. 2024 (w = exp(−β d0²)); β from the median is ours, for scenes in any unit.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Graph<F = f32> {
+pub(crate) struct Graph<F = f32> {
     k: usize,
     near: Vec<u32>,
     d0: Vec<F>,
@@ -37,13 +37,13 @@ pub struct Graph<F = f32> {
 
 impl<F: Real> Graph<F> {
     /// Of the `k` nearest other points. Panics: more than u32 edges.
-    pub fn new(points: &[[F; 3]], k: usize, weigh: Weigh) -> Self {
+    pub(crate) fn new(points: &[[F; 3]], k: usize, weigh: Weigh) -> Self {
         let rounded: Vec<[f32; 3]> = points.iter().map(|p| p.map(|x| x.f64() as f32)).collect();
         Self::of(points, knn(&rounded, k), weigh)
     }
 
     /// Of given neighbours, row-major [points, k]; a point's own index fills up. Panics: neighbours that are no points.
-    pub fn of(points: &[[F; 3]], near: Vec<u32>, weigh: Weigh) -> Self {
+    pub(crate) fn of(points: &[[F; 3]], near: Vec<u32>, weigh: Weigh) -> Self {
         let n = points.len();
         let k = near.len().checked_div(n).unwrap_or(0);
         assert!(near.len() == n * k && u32::try_from(near.len()).is_ok(), "{} edges of {n} points", near.len());
@@ -86,54 +86,50 @@ impl<F: Real> Graph<F> {
     }
 
     /// Points.
-    pub fn len(&self) -> usize {
+    pub(crate) fn len(&self) -> usize {
         self.first.len().saturating_sub(1)
     }
 
     /// Whether there is no point.
-    pub fn is_empty(&self) -> bool {
+    #[cfg(test)]
+    pub(crate) fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
     /// Neighbours a point.
-    pub fn k(&self) -> usize {
+    pub(crate) fn k(&self) -> usize {
         self.k
     }
 
     /// Edges that tie two points.
-    pub fn edges(&self) -> usize {
+    pub(crate) fn edges(&self) -> usize {
         self.edges
     }
 
-    /// Row-major [points, k].
-    pub fn neighbours(&self) -> &[u32] {
-        &self.near
-    }
-
     /// Lengths at rest, scene units, an edge.
-    pub fn lengths(&self) -> &[F] {
+    pub(crate) fn lengths(&self) -> &[F] {
         &self.d0
     }
 
     /// Weights in [0, 1], an edge.
-    pub fn weights(&self) -> &[F] {
+    pub(crate) fn weights(&self) -> &[F] {
         &self.weights
     }
 
     /// Mean weight of the edges that tie two points; below [`LEAST_MEAN_WEIGHT`] nothing is held together. 0 without any.
-    pub fn mean_weight(&self) -> f64 {
+    pub(crate) fn mean_weight(&self) -> f64 {
         self.weights.iter().map(|w| w.f64()).sum::<f64>() / self.edges.max(1) as f64
     }
 
     /// Numbers of the edges that lead from point i, with the points they lead to; fill-ups are left out.
     #[inline]
-    pub fn edges_from(&self, i: usize) -> impl Iterator<Item = (usize, usize)> + '_ {
+    pub(crate) fn edges_from(&self, i: usize) -> impl Iterator<Item = (usize, usize)> + '_ {
         (i * self.k..(i + 1) * self.k).map(|e| (e, self.near[e] as usize)).filter(move |&(_, j)| j != i)
     }
 
     /// Numbers of the edges that lead to point j, with the points they come from.
     #[inline]
-    pub fn edges_to(&self, j: usize) -> impl Iterator<Item = (usize, usize)> + '_ {
+    pub(crate) fn edges_to(&self, j: usize) -> impl Iterator<Item = (usize, usize)> + '_ {
         let k = self.k;
         self.back[self.first[j] as usize..self.first[j + 1] as usize].iter().map(move |&e| (e as usize, e as usize / k))
     }

@@ -110,13 +110,13 @@ pub(super) struct Scratch<F> {
     means: Box<Lines<Rows<F, DERIVATIVES, GROUP>>>,
     /// Weights of a row of derivatives, 0 outside the image, `[STRIDE]`.
     weights: Box<Lines<[F; STRIDE]>>,
-    /// What is summed, by column: |x − y|, S and squared error, with weights.
+    /// The sums, by column: |x − y|, S and squared error, with weights.
     totals: Box<Lines<[[F; STRIDE]; 3]>>,
 }
 
 impl<F: Real> Scratch<F> {
     /// Rows for any strip.
-    pub fn new() -> Self {
+    pub(crate) fn new() -> Self {
         Self {
             products: Box::new(Lines([[[F::ZERO; STRIDE]; MOMENTS]; RING])),
             derivatives: Box::new(Lines([[[F::ZERO; STRIDE]; DERIVATIVES]; RING])),

@@ -1,24 +1,24 @@
-//! What training minimises: the picture loss and the regularisers, each with its gradient.
+//! Losses that training minimises: the picture loss and the regularisers, each with its gradient.
 //!
 //! Every function returns its value and writes or adds its gradient; none keeps state that a result depends on.
 
-pub mod arap;
-pub mod graph;
+pub(crate) mod arap;
+pub(crate) mod graph;
 pub mod image;
 mod kernel;
-pub mod motion;
+pub(crate) mod motion;
 mod near;
-pub mod neighbourhood;
-pub mod photometric;
-pub mod planes;
-pub mod rigid;
-pub mod scene;
+pub(crate) mod neighbourhood;
+pub(crate) mod photometric;
+pub(crate) mod planes;
+pub(crate) mod rigid;
+pub(crate) mod scene;
 pub mod terms;
-pub mod tracked;
-pub mod transport;
+pub(crate) mod tracked;
+pub(crate) mod transport;
 
 pub use photometric::{LossValue, Photometric};
-pub use transport::TransportSettings;
+pub(crate) use transport::TransportSettings;
 
 use crate::settings::settings;
 

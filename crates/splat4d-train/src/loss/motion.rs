@@ -1,6 +1,6 @@
 //! Losses on how the splats of any motion model move: from means and covariances at several instants, without quaternions.
 //!
-//! What [`rigid`](super::rigid) reads from a Gaussian's own quaternion is here the turn of its neighbourhood, the best
+//! The rotation that [`rigid`](super::rigid) reads from a Gaussian's quaternion is here its neighbourhood's, the best
 //! rotation of its neighbours' offsets ([`arap::rotations`](super::arap::rotations)), held constant in the gradient: for
 //! the sum of squares that is exact (the envelope theorem), for the robust forms below it is one step of reweighting.
 //! Every function adds `weight` times its gradient to all instants and returns `weight` times its value; the same bits
@@ -15,7 +15,7 @@ const UNDER_ROOT: f64 = 1e-20;
 /// Rigidity: mean over edges of √(w ‖e − R_i e⁰‖² + ε), scene units; e now, e⁰ before, R_i the turn of i's neighbours.
 ///
 /// Source: Luiten et al. 2024, equation 8, with the neighbourhood's turn in place of the Gaussian's own.
-pub fn rigidity<F: Real>(
+pub(crate) fn rigidity<F: Real>(
     graph: &Graph<F>,
     rotations: &[[[F; 3]; 3]],
     [now, before]: [&[[F; 3]]; 2],
@@ -60,7 +60,7 @@ fn full<F: Real>([xx, xy, xz, yy, yz, zz]: [F; 6]) -> [[F; 3]; 3] {
 /// nothing is gained by growing.
 ///
 /// Source: ours; Luiten et al. 2024, equation 9, for models that answer with covariances.
-pub fn rotation<F: Real>(
+pub(crate) fn rotation<F: Real>(
     graph: &Graph<F>,
     rotations: &[[[F; 3]; 3]],
     [now, before]: [&[[F; 6]]; 2],
@@ -103,7 +103,7 @@ pub fn rotation<F: Real>(
 /// Isometry: mean over edges of √(w (‖e‖ − ‖e*‖)² + ε), scene units: distances are alike at any two instants.
 ///
 /// Source: Luiten et al. 2024, equation 10, with another instant in place of the first frame.
-pub fn isometry<F: Real>(
+pub(crate) fn isometry<F: Real>(
     graph: &Graph<F>,
     [one, other]: [&[[F; 3]]; 2],
     weight: f64,
@@ -142,7 +142,7 @@ pub fn isometry<F: Real>(
 
 /// Velocity: mean over edges of ‖v_i − v_j‖², (scene units)², v = x − x⁰ the way from one instant to the next: neighbours
 /// move alike. Edges count alike, whatever the graph's weights say.
-pub fn velocity<F: Real>(
+pub(crate) fn velocity<F: Real>(
     graph: &Graph<F>,
     [now, before]: [&[[F; 3]]; 2],
     weight: f64,
@@ -173,7 +173,7 @@ pub fn velocity<F: Real>(
 
 /// Jerk: mean over points of ‖x₃ − 3 x₂ + 3 x₁ − x₀‖, scene units, of four instants one step apart: steady acceleration
 /// is free, jitter is not.
-pub fn jerk<F: Real>(at: [&[[F; 3]]; 4], weight: f64, d: [&mut [[F; 3]]; 4]) -> f64 {
+pub(crate) fn jerk<F: Real>(at: [&[[F; 3]]; 4], weight: f64, d: [&mut [[F; 3]]; 4]) -> f64 {
     let n = at[0].len();
     assert!(at.iter().all(|x| x.len() == n) && d.iter().all(|x| x.len() == n), "{n} points");
     const BINOMIAL: [f64; 4] = [-1.0, 3.0, -3.0, 1.0];

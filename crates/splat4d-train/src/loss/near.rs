@@ -1,4 +1,4 @@
-//! Who is near whom, remembered from step to step: neighbours change slowly, and searching them is dear.
+//! Nearest neighbours, cached from step to step: they change slowly, and searching them is dear.
 
 use splat4d::math::Real;
 use splat4d::math::knn::knn;
@@ -6,7 +6,7 @@ use splat4d::scene::Table;
 use std::sync::{Mutex, MutexGuard};
 
 /// Neighbours a Gaussian is compared with; Luiten et al. 2024 take 20, SC-GS 10 and fewer: cost is in proportion.
-pub const NEIGHBOURS: usize = 8;
+pub(crate) const NEIGHBOURS: usize = 8;
 /// Steps between two searches.
 const SEARCH_INTERVAL: usize = 200;
 
@@ -16,7 +16,7 @@ type Found = (usize, Vec<u32>);
 /// The nearest neighbours of the rows of every layer, by raw means, searched anew every 200 steps and after every edit of
 /// rows.
 #[derive(Debug, Default)]
-pub struct Near(Mutex<Vec<Found>>);
+pub(crate) struct Near(Mutex<Vec<Found>>);
 
 impl Near {
     fn lock(&self) -> MutexGuard<'_, Vec<Found>> {
@@ -24,7 +24,13 @@ impl Near {
     }
 
     /// Calls `f` with the neighbours of all rows of a layer, [rows, 8], whose `means` are the first columns of a table.
-    pub fn with<F: Real, R>(&self, layer: usize, means: &Table<F>, iteration: usize, f: impl FnOnce(&[u32]) -> R) -> R {
+    pub(crate) fn with<F: Real, R>(
+        &self,
+        layer: usize,
+        means: &Table<F>,
+        iteration: usize,
+        f: impl FnOnce(&[u32]) -> R,
+    ) -> R {
         let (mut found, epoch) = (self.lock(), iteration / SEARCH_INTERVAL);
         if found.len() <= layer {
             found.resize(layer + 1, (usize::MAX, Vec::new()));
@@ -39,12 +45,12 @@ impl Near {
     }
 
     /// Rows were edited.
-    pub fn forget(&self) {
+    pub(crate) fn forget(&self) {
         self.lock().clear();
     }
 
     /// Per layer: the epoch of the search, the number of indices, the indices.
-    pub fn state(&self) -> Vec<u32> {
+    pub(crate) fn state(&self) -> Vec<u32> {
         let layer = |(epoch, near): &Found| {
             [&[u32::try_from(*epoch).unwrap_or(u32::MAX), near.len() as u32], near.as_slice()].concat()
         };
@@ -52,7 +58,7 @@ impl Near {
     }
 
     /// Takes back what [`state`](Self::state) gave; what cannot be neighbours is searched anew.
-    pub fn restore(&self, state: &[u32]) {
+    pub(crate) fn restore(&self, state: &[u32]) {
         let mut found = self.lock();
         found.clear();
         let mut rest = state;

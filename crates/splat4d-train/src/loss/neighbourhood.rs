@@ -12,13 +12,13 @@ use splat4d::scene::{GEOMETRY, Space, Table, Time};
 use std::sync::Mutex;
 
 /// Gaussians a step whose neighbourhoods are looked at, other ones in each: this bounds the cost.
-pub const CENTRES: usize = 1024;
+pub(crate) const CENTRES: usize = 1024;
 /// exp(−c d²/median) of an edge; 1 keeps the typical edge and drops the far ones.
 const FALLOFF: f64 = 1.0;
 
 /// Weights of the terms; 0: off.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct MotionWeights {
+pub(crate) struct MotionWeights {
     /// [`motion::rigidity`] over a frame, extents.
     pub rigid: f64,
     /// [`motion::rotation`] over a frame.
@@ -37,7 +37,7 @@ pub struct MotionWeights {
 
 impl MotionWeights {
     /// Whether nothing is to be done.
-    pub fn is_off(&self) -> bool {
+    pub(crate) fn is_off(&self) -> bool {
         *self == Self::default()
     }
 }
@@ -47,7 +47,7 @@ impl MotionWeights {
 ///
 /// Neighbours are those of the raw means, searched anew every 200 steps and after every edit of rows; an edge counts
 /// only where both of its ends are alive. Which neighbourhoods a step looks at is a function of seed and step.
-pub struct Neighbourhood<F> {
+pub(crate) struct Neighbourhood<F> {
     weights: MotionWeights,
     /// 1/extent
     unit: f64,
@@ -61,7 +61,7 @@ pub struct Neighbourhood<F> {
 
 impl<F: Real> Neighbourhood<F> {
     /// For a scene of this extent (scene units), over a clip (seconds) of so many frames a second.
-    pub fn new(weights: MotionWeights, extent: f64, clip: [f64; 2], fps: f64) -> Self {
+    pub(crate) fn new(weights: MotionWeights, extent: f64, clip: [f64; 2], fps: f64) -> Self {
         Self { weights, unit: 1.0 / extent, frame: 1.0 / fps, clip, near: Near::default(), graphs: Mutex::default() }
     }
 

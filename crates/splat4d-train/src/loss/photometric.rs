@@ -50,7 +50,7 @@ impl<F: Real> Photometric<F> {
     }
 
     /// A loss with this λ at a given instruction set.
-    pub fn with_simd(lambda_dssim: f32, simd: Simd) -> Self {
+    pub(crate) fn with_simd(lambda_dssim: f32, simd: Simd) -> Self {
         Self {
             lambda_dssim,
             simd,

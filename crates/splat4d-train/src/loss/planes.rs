@@ -19,7 +19,7 @@ use splat4d::simd::{Pass, Simd, dispatch_pass};
 
 /// How strong; each is a factor of a mean, 0: none.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct PlaneWeights {
+pub(crate) struct PlaneWeights {
     /// Second differences of the spatial planes.
     pub smoothness: f64,
     /// Second differences of the time planes along time.
@@ -32,7 +32,7 @@ pub struct PlaneWeights {
 
 impl PlaneWeights {
     /// Whether there is anything to do.
-    pub fn any(&self) -> bool {
+    pub(crate) fn any(&self) -> bool {
         [self.smoothness, self.time_smoothness, self.l1_time, self.variation].iter().any(|w| *w > 0.0)
     }
 }
@@ -42,7 +42,7 @@ impl PlaneWeights {
 const EVERY: usize = 4;
 
 /// All of the module's regularisers on every layer that has such planes.
-pub struct SmoothPlanes {
+pub(crate) struct SmoothPlanes {
     shape: PlaneShape,
     levels: usize,
     weights: PlaneWeights,
@@ -50,15 +50,15 @@ pub struct SmoothPlanes {
 
 impl SmoothPlanes {
     /// Its name, in metrics.
-    pub const NAME: &'static str = "planes";
+    pub(crate) const NAME: &'static str = "planes";
 
     /// For planes of one shape, of which so many levels are in use.
-    pub fn new(shape: PlaneShape, levels: usize, weights: PlaneWeights) -> Self {
+    pub(crate) fn new(shape: PlaneShape, levels: usize, weights: PlaneWeights) -> Self {
         Self { shape, levels, weights }
     }
 
     /// The loss of one layer's levels in use, and `factor` times its gradient added to `d`; 0 without planes.
-    pub fn of_layer<F: Real>(&self, p: &Params<F>, factor: f64, d: &mut Grads<F>) -> f64 {
+    pub(crate) fn of_layer<F: Real>(&self, p: &Params<F>, factor: f64, d: &mut Grads<F>) -> f64 {
         let mut loss = 0.0;
         for level in 0..self.shape.multires.len().min(self.levels) {
             let keys: Option<Vec<Key>> = (0..6).map(|plane| p.find(&PlaneShape::name(level, plane))).collect();

@@ -20,7 +20,7 @@ const UNDER_ROOT: f64 = 1e-20;
 
 /// Where points are and how they are turned at an instant.
 #[derive(Clone, Copy, Debug)]
-pub struct Poses<'a, F> {
+pub(crate) struct Poses<'a, F> {
     /// Positions, scene units.
     pub x: &'a [[F; 3]],
     /// Raw quaternions, wxyz.
@@ -45,7 +45,7 @@ fn turns<F: Real>(now: Poses<'_, F>, before: Poses<'_, F>) -> Vec<[F; 4]> {
 /// Rigidity; see the module. Adds to `d_x` and `d_q`, the gradients of the poses now.
 ///
 /// Panics: numbers of points that differ.
-pub fn rigidity<F: Real>(
+pub(crate) fn rigidity<F: Real>(
     graph: &Graph<F>,
     now: Poses<'_, F>,
     before: Poses<'_, F>,
@@ -85,7 +85,13 @@ pub fn rigidity<F: Real>(
 }
 
 /// Rotation; see the module. Adds to `d_q`, the gradient of the quaternions now. Panics: numbers of points that differ.
-pub fn rotation<F: Real>(graph: &Graph<F>, now: &[[F; 4]], before: &[[F; 4]], weight: f64, d_q: &mut [[F; 4]]) -> f64 {
+pub(crate) fn rotation<F: Real>(
+    graph: &Graph<F>,
+    now: &[[F; 4]],
+    before: &[[F; 4]],
+    weight: f64,
+    d_q: &mut [[F; 4]],
+) -> f64 {
     let n = graph.len();
     assert!([now.len(), before.len(), d_q.len()] == [n; 3], "{n} points");
     let rel = turns(Poses { x: &[], q: now }, Poses { x: &[], q: before });
@@ -118,7 +124,7 @@ pub fn rotation<F: Real>(graph: &Graph<F>, now: &[[F; 4]], before: &[[F; 4]], we
 }
 
 /// Isometry; see the module. Adds to `d_x`, the gradient of the positions. Panics: numbers of points that differ.
-pub fn isometry<F: Real>(graph: &Graph<F>, x: &[[F; 3]], weight: f64, d_x: &mut [[F; 3]]) -> f64 {
+pub(crate) fn isometry<F: Real>(graph: &Graph<F>, x: &[[F; 3]], weight: f64, d_x: &mut [[F; 3]]) -> f64 {
     let n = graph.len();
     assert!([x.len(), d_x.len()] == [n; 2], "{n} points");
     let scale = weight / graph.edges().max(1) as f64;

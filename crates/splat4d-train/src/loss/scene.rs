@@ -40,7 +40,7 @@ fn over_active<F: Real>(
 
 /// weight · mean opacity (3DGS as MCMC): makes room for relocation.
 #[derive(Clone, Copy, Debug)]
-pub struct MeanOpacity {
+pub(crate) struct MeanOpacity {
     /// λ
     pub weight: f64,
 }
@@ -64,7 +64,7 @@ impl<F: Real> ParamLoss<F> for MeanOpacity {
 ///
 /// Source: SuGaR (Guédon and Lepetit 2024).
 #[derive(Clone, Copy, Debug)]
-pub struct OpacityEntropy {
+pub(crate) struct OpacityEntropy {
     /// λ
     pub weight: f64,
 }
@@ -87,7 +87,7 @@ impl<F: Real> ParamLoss<F> for OpacityEntropy {
 
 /// weight · mean scale, scene units (3DGS as MCMC).
 #[derive(Clone, Copy, Debug)]
-pub struct MeanScale {
+pub(crate) struct MeanScale {
     /// λ
     pub weight: f64,
 }
@@ -113,7 +113,7 @@ impl<F: Real> ParamLoss<F> for MeanScale {
 /// weight · mean over Gaussians and views of o·stopgrad[σ(t)] (FreeTimeGS §3.4): against opaque long-lived blockers.
 /// The gradient goes to the opacity alone.
 #[derive(Clone, Copy, Debug)]
-pub struct LivingOpacity {
+pub(crate) struct LivingOpacity {
     /// λ_reg
     pub weight: f64,
 }
@@ -140,7 +140,7 @@ impl<F: Real> ParamLoss<F> for LivingOpacity {
 
 /// weight · mean over active Gaussians i and their neighbours j of ‖v_i − v_j‖² in (extents a clip)².
 /// j's gradient is included where j is active too.
-pub struct VelocitySmoothness {
+pub(crate) struct VelocitySmoothness {
     weight: f64,
     unit: f64,
     neighbours: Near,
@@ -148,7 +148,7 @@ pub struct VelocitySmoothness {
 
 impl VelocitySmoothness {
     /// `unit` turns scene units a second into extents a clip.
-    pub fn new(weight: f64, unit: f64) -> Self {
+    pub(crate) fn new(weight: f64, unit: f64) -> Self {
         Self { weight, unit, neighbours: Near::default() }
     }
 }
@@ -209,12 +209,12 @@ mod tests {
     use super::*;
     use splat4d::layers::Layer;
     use splat4d::math::Rng;
-    use splat4d::motion::{SpacetimeSpec, Spec, build};
+    use splat4d::motion::{SpacetimeSpec, Spec, build_as};
     use splat4d::scene::{Key, LIFE, LifeKind, Params, Time};
 
     fn scene() -> Scene<f64> {
         let mut params = Params::new(40, 1, LifeKind::GaussHalf.columns());
-        let motion = build(&Spec::Spacetime(SpacetimeSpec::default()), &mut params).unwrap();
+        let motion = build_as(&Spec::Spacetime(SpacetimeSpec::default()), &mut params).unwrap();
         let rng = Rng::new(4, "losses", 0);
         for key in params.keys().collect::<Vec<_>>() {
             for r in 0..40 {

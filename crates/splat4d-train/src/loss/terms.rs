@@ -19,7 +19,7 @@ pub struct StepInfo {
     pub progress: f64,
 }
 
-/// What a loss over several times wants to see.
+/// The rows and times that a loss over several times wants to see.
 #[derive(Clone, Debug)]
 pub struct Probe {
     /// Which layer.
@@ -36,13 +36,13 @@ pub struct Probe {
 pub trait ProbeLoss<F: Real>: Send + Sync {
     /// Its name, in recipes and metrics.
     fn name(&self) -> &str;
-    /// What it looks at in this step; empty: nothing.
+    /// The probes of this step; empty: nothing.
     fn probes(&self, scene: &Scene<F>, info: &StepInfo) -> Vec<Probe>;
     /// The loss. `seen[i][k]` is [rows, 10] of probe i at its k-th time; adds its gradient to `d[i][k]`, of like shape.
     fn eval(&self, scene: &Scene<F>, probes: &[Probe], seen: &[Vec<Table<F>>], d: &mut [Vec<Table<F>>]) -> f64;
     /// Rows were edited: whatever was remembered of rows is stale.
     fn on_edit(&self) {}
-    /// What a checkpoint must hold of it, if it remembers anything from step to step.
+    /// The state for a checkpoint, if it remembers anything from step to step.
     fn state(&self) -> Vec<u32> {
         Vec::new()
     }
@@ -58,7 +58,7 @@ pub trait ParamLoss<F: Real>: Send + Sync {
     fn eval(&self, scene: &Scene<F>, info: &StepInfo, d: &mut [Grads<F>]) -> f64;
     /// Rows were edited: whatever was remembered of rows is stale.
     fn on_edit(&self) {}
-    /// What a checkpoint must hold of it, if it remembers anything from step to step.
+    /// The state for a checkpoint, if it remembers anything from step to step.
     fn state(&self) -> Vec<u32> {
         Vec::new()
     }
@@ -66,7 +66,7 @@ pub trait ParamLoss<F: Real>: Send + Sync {
     fn restore(&self, _state: &[u32]) {}
 }
 
-/// What stands between the parameters that learn and the pictures they are judged by: a file that will hold them
+/// A codec between the parameters that learn and the pictures they are judged by: a file that will hold them
 /// coarsely. Pictures are drawn from what its reader would see, and the gradient goes to the parameters as if there were
 /// no difference (the straight-through estimator: Bengio et al. 2013).
 pub trait Codec<F: Real>: Send + Sync {
@@ -75,7 +75,7 @@ pub trait Codec<F: Real>: Send + Sync {
     /// Brings `shown` up to date, as far as splats at the given times can tell: it is as the last call left it, or, after
     /// [`reset`](Self::reset), a copy of `scene`.
     fn show(&self, scene: &Scene<F>, times: &[Time], shown: &mut Scene<F>);
-    /// What a reader would see of all of `scene`. Changes nothing of what `show` remembers.
+    /// All of `scene` as a reader would see it. Changes nothing of what `show` remembers.
     fn whole(&self, scene: &Scene<F>) -> Scene<F>;
     /// After a step's gradients, before the parameters' own optimiser: learns what rows share and hears which rows are
     /// about to change. `progress` is the share of the stage that is done; every rate is multiplied by `scale`. Returns
@@ -83,7 +83,7 @@ pub trait Codec<F: Real>: Send + Sync {
     fn learn(&self, d: &mut [Grads<F>], progress: f64, scale: f64) -> bool;
     /// The scene changed in other ways than by a step: whatever was shown of it is stale.
     fn reset(&self) {}
-    /// What a checkpoint must hold of it; nothing for a codec that has not begun.
+    /// The state for a checkpoint; nothing for a codec that has not begun.
     fn state(&self) -> Vec<u32> {
         Vec::new()
     }

@@ -1,4 +1,4 @@
-//! What ties the poses of a frame that is tracked to those before: the losses of Luiten et al. 2024 on pages.
+//! Losses that tie the poses of a tracked frame to those before: the losses of Luiten et al. 2024 on pages.
 //!
 //! Over the foreground (all Gaussians where there are no masks), with the graph of its neighbours in frame 0: rigidity,
 //! rotation and isometry (see [`super::rigid`]), and a floor, mean max(h − up·x, 0). Over the background: the mean of
@@ -21,7 +21,7 @@ use std::sync::{Arc, Mutex, MutexGuard};
 
 /// Weights, as the paper names them.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Weights {
+pub(crate) struct Weights {
     /// Neighbours keep their offsets, turned with each Gaussian.
     pub rigid: f64,
     /// Neighbours turn alike.
@@ -36,14 +36,14 @@ pub struct Weights {
     pub floor: f64,
 }
 
-/// What does not change while frames are tracked.
+/// The settings that do not change while frames are tracked.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Ties {
+pub(crate) struct Ties {
     /// Neighbours a Gaussian.
     pub neighbours: usize,
-    /// What an edge counts.
+    /// The weight of an edge.
     pub weigh: Weigh,
-    /// What the weights are.
+    /// The weights of the losses.
     pub weights: Weights,
     /// Height of the floor along the scene's up direction, scene units.
     pub floor: f64,
@@ -51,9 +51,9 @@ pub struct Ties {
     pub unit: f64,
 }
 
-/// Who is foreground and who is near whom in frame 0.
+/// Foreground, background and the graph of neighbours in frame 0.
 #[derive(Debug)]
-pub struct Frame0<F> {
+pub(crate) struct Frame0<F> {
     foreground: Vec<u32>,
     background: Vec<u32>,
     /// Of the foreground.
@@ -71,7 +71,7 @@ impl<F: Real> Frame0<F> {
     }
 }
 
-/// What the frames' losses share: the graph, and the colours that the newest frame began with.
+/// The shared memory of the frames' losses: the graph, and the colours that the newest frame began with.
 #[derive(Debug)]
 struct Memory<F> {
     frame0: Option<Arc<Frame0<F>>>,
@@ -81,25 +81,25 @@ struct Memory<F> {
 
 /// The losses of all frames of a run; [`frame`](Self::frame) gives those of one.
 #[derive(Clone, Debug)]
-pub struct Tracking<F> {
+pub(crate) struct Tracking<F> {
     ties: Ties,
     memory: Arc<Mutex<Memory<F>>>,
 }
 
 impl<F: Real> Tracking<F> {
     /// Nothing is remembered yet.
-    pub fn new(ties: Ties) -> Self {
+    pub(crate) fn new(ties: Ties) -> Self {
         Self { ties, memory: Arc::new(Mutex::new(Memory { frame0: None, frame: 0, colors: Vec::new() })) }
     }
 
     /// The losses on frame `frame`, from 1 on.
-    pub fn frame(&self, frame: usize) -> Tied<F> {
+    pub(crate) fn frame(&self, frame: usize) -> Tied<F> {
         assert!(frame > 0, "frame 0 is tied to nothing");
         Tied { of: self.clone(), frame }
     }
 
-    /// Who is foreground and near whom, made anew where nothing was remembered.
-    pub fn frame0(&self, layer: &Layer<F>) -> Arc<Frame0<F>> {
+    /// The foreground and its graph of neighbours, made anew where nothing was cached.
+    pub(crate) fn frame0(&self, layer: &Layer<F>) -> Arc<Frame0<F>> {
         let mut memory = self.lock();
         memory.frame0.get_or_insert_with(|| Arc::new(Frame0::new(layer, &self.ties))).clone()
     }
@@ -111,7 +111,7 @@ impl<F: Real> Tracking<F> {
 
 /// The losses on one frame.
 #[derive(Clone, Debug)]
-pub struct Tied<F> {
+pub(crate) struct Tied<F> {
     of: Tracking<F>,
     frame: usize,
 }

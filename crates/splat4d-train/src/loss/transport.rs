@@ -46,7 +46,7 @@ settings! {
     }
 }
 
-/// What distances are between.
+/// The quantities that distances are between.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Metric {
     /// Means alone.
@@ -62,8 +62,8 @@ impl Choice for Option<Metric> {
 
 /// Weights, metric and schedule.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct TransportConfig {
-    /// What distances are between.
+pub(crate) struct TransportConfig {
+    /// The quantities that distances are between.
     pub metric: Metric,
     /// How shapes go on at constant velocity.
     pub predictor: Predictor,
@@ -91,7 +91,7 @@ pub struct TransportConfig {
 
 /// The loss; see the module's documentation.
 #[derive(Debug)]
-pub struct Transport {
+pub(crate) struct Transport {
     settings: TransportConfig,
     layer: usize,
     /// The schedule's factor in the step whose probes were asked last, as bits.
@@ -100,12 +100,12 @@ pub struct Transport {
 
 impl Transport {
     /// On the layer of this number.
-    pub fn new(settings: TransportConfig, layer: usize) -> Self {
+    pub(crate) fn new(settings: TransportConfig, layer: usize) -> Self {
         Self { settings, layer, now: AtomicU64::new(0) }
     }
 
     /// The weight's factor after the share `progress` of the stage.
-    pub fn factor(&self, progress: f64) -> f64 {
+    pub(crate) fn factor(&self, progress: f64) -> f64 {
         let s = &self.settings;
         let past = progress - s.start;
         if past < 0.0 {
@@ -135,7 +135,7 @@ impl Transport {
     }
 
     /// The loss of one row in three frames, before weights by schedule and rows: value and gradients.
-    pub fn row(&self, [a, b, c]: [&Normal; 3]) -> (f64, [Normal; 3]) {
+    pub(crate) fn row(&self, [a, b, c]: [&Normal; 3]) -> (f64, [Normal; 3]) {
         let s = &self.settings;
         let mut value = 0.0;
         let mut d = [Normal::ZERO; 3];

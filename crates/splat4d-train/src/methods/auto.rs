@@ -29,7 +29,7 @@ pub struct Seen {
 
 impl Seen {
     /// Looks at the training frames of a capture.
-    pub fn of(plan: &Plan, frames: &dyn Frames) -> Result<Self> {
+    pub(crate) fn of(plan: &Plan, frames: &dyn Frames) -> Result<Self> {
         let looks = plan.times > 1 && plan.fixed_cameras > 0;
         Ok(Self {
             times: plan.times,
@@ -40,19 +40,19 @@ impl Seen {
     }
 
     /// Whether the take is a long one.
-    pub fn is_long(&self) -> bool {
+    pub(crate) fn is_long(&self) -> bool {
         self.times >= LONG
     }
 
     /// The cameras that see a moment, in words.
-    pub fn cameras_in_words(&self) -> String {
+    pub(crate) fn cameras_in_words(&self) -> String {
         if self.cameras < 1.5 { "one camera sees".to_owned() } else { format!("{:.1} cameras see", self.cameras) }
     }
 }
 
 /// A model and the reason for it.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Choice {
+pub(crate) struct Choice {
     /// The model's name.
     pub motion: &'static str,
     /// One sentence.
@@ -60,7 +60,7 @@ pub struct Choice {
 }
 
 /// Chooses for the training frames of a capture: the first program that says why it suits.
-pub fn choose(plan: &Plan, frames: &dyn Frames) -> Result<Choice> {
+pub(crate) fn choose(plan: &Plan, frames: &dyn Frames) -> Result<Choice> {
     let seen = Seen::of(plan, frames)?;
     let choice = PROGRAMS.into_iter().find_map(|(motion, make)| Some(Choice { motion, why: make().suits(&seen)? }));
     Ok(choice.expect("one program suits whatever no other does"))

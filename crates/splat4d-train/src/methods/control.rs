@@ -2,7 +2,7 @@
 //! own, then Gaussians on nodes); in a run of minutes the half-size pictures of the first steps do what those stages are
 //! for, and nodes start at farthest points of the initial cloud.
 
-pub mod losses;
+pub(crate) mod losses;
 
 use super::auto::Seen;
 use super::{Group, Plan, Program, Rate, Stage, still};
@@ -109,7 +109,7 @@ settings! {
 
 /// Gaussians skinned to sparse control nodes (Huang et al. 2024, "SC-GS").
 #[derive(Clone, Copy, Debug)]
-pub struct ControlProgram;
+pub(crate) struct ControlProgram;
 
 impl Program for ControlProgram {
     fn spec(&self, plan: &Plan) -> Spec {
@@ -150,17 +150,17 @@ impl Program for ControlProgram {
 }
 
 /// Most nodes that training may have.
-pub fn most_nodes(r: &Recipe) -> usize {
+pub(crate) fn most_nodes(r: &Recipe) -> usize {
     if r.nodes.adapt_interval > 0 { r.nodes.cap.max(r.control.nodes) } else { r.control.nodes }
 }
 
 /// The skin that the recipe asks for.
-pub fn skin(r: &Recipe) -> SkinSpec {
+pub(crate) fn skin(r: &Recipe) -> SkinSpec {
     SkinSpec { nodes: r.control.nodes, neighbours: r.control.neighbours, hyper: r.control.hyper, mask: r.control.mask }
 }
 
-/// What every model of control nodes learns of them, and how they adapt: groups of the skin, losses on nodes, upkeep.
-pub fn add_nodes(stage: &mut Stage, plan: &Plan) {
+/// Adds the parts that every model of control nodes shares: groups of the skin, losses on nodes, upkeep.
+pub(crate) fn add_nodes(stage: &mut Stage, plan: &Plan) {
     let r = &plan.recipe;
     let positions = r.falling(r.control.node_lr * plan.extent);
     stage.groups.push(Group::new("node_means", positions));

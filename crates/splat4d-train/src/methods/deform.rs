@@ -20,6 +20,12 @@ const GRID_SPEEDUP: f64 = 50.0;
 const CANONICAL_SLOWDOWN: f64 = 4.0;
 /// Share of the iterations until the noise on time is zero: 20,000 of 40,000 (Yang et al. 2024).
 const NOISE_STEPS: f64 = 0.5;
+/// Steps over which the rates of networks and grids rise. Adam's first step is as long as the rate whatever the gradient, and
+/// at once it threw a settled cloud 25 pixels about: training views of a hand-held take fell by 4.6 dB in one step. With
+/// it 0.2 dB more are held out there (docs/suite.md). Source of linear warm-up: Goyal et al. 2017, §2.2.
+const WARM_UP: usize = 50;
+/// Short runs have no time for it: at most this part of the iterations.
+const WARM_UP_SHARE: usize = 20;
 /// The grid over space: a sixteenth of the published entries, since Gaussians are thousands and not millions of samples.
 const SPACE: HashShape = HashShape { levels: 8, features: 2, log2_size: 15, base: 8, finest: 256 };
 /// The grids over two axes and time.
@@ -28,7 +34,7 @@ const TIME: HashShape = HashShape { levels: 6, features: 2, log2_size: 15, base:
 choices! {
     /// The network that deforms.
     pub enum Trunk {
-        /// Hash where cameras are fixed, small where all move and a moment is seen once.
+        /// Small where all cameras move and masks show one object; else hash.
         Auto = "auto",
         /// The published perceptron, 8x256.
         Mlp = "mlp",
@@ -45,8 +51,8 @@ settings! {
     /// Settings of `deform-mlp`.
     pub struct DeformSettings
     when (Is("run.motion", &["deform-mlp"])) {
-        /// Network: mlp (8x256), small, hash (grids and a small network) or hash-linear; auto: hash where cameras are
-        /// fixed, small where all move and a moment is seen once.
+        /// Network: mlp (8x256), small, hash (grids and a small network) or hash-linear; auto: small where all cameras
+        /// move and masks show one object, else hash.
         trunk: Trunk = Trunk::Auto;
         /// Width of the small and hash networks.
         width: usize = 128 => any().when(IsNot("deform.trunk", &["mlp"]));
@@ -76,7 +82,7 @@ settings! {
 
 /// A canonical cloud that a perceptron or a hash grid deforms (Yang et al. 2024, "Deformable 3D Gaussians").
 #[derive(Clone, Copy, Debug)]
-pub struct DeformProgram;
+pub(crate) struct DeformProgram;
 
 impl Program for DeformProgram {
     fn spec(&self, plan: &Plan) -> Spec {
@@ -137,10 +143,10 @@ fn spec(plan: &Plan) -> DeformSpec {
     let r = &plan.recipe;
     let encoded = |x_levels| Input::Encoded { x_levels, t_levels: r.deform.t_levels, time_net: r.deform.time_net };
     let trunk = match r.deform.trunk {
-        // Grids follow more motion; where one view of a moment is all there is, the network generalises better
-        // (docs/models.md).
-        Trunk::Auto if plan.fixed_cameras > 0 => Trunk::Hash,
-        Trunk::Auto => Trunk::Small,
+        // Grids follow more motion: by a small network a ball before a wall is lost, and a hand-held take has 1.9 dB less
+        // (docs/suite.md). Of one object alone, seen once a moment, the network generalises better (docs/models.md).
+        Trunk::Auto if plan.masks && plan.fixed_cameras == 0 => Trunk::Small,
+        Trunk::Auto => Trunk::Hash,
         chosen => chosen,
     };
     let (input, layers, width, skip) = match trunk {
@@ -189,9 +195,10 @@ fn set_learns(spec: &DeformSpec, p: &mut Params<f32>, learns: bool) -> Result<()
 fn networks(stage: &mut Stage, plan: &Plan) {
     let r = &plan.recipe;
     let rate = Rate { start: r.deform.lr_init, end: r.deform.lr_final };
+    let warm_up = WARM_UP.min(r.run.iterations / WARM_UP_SHARE);
     let made = Deform::new(spec(plan), &mut Params::<f32>::new(0, 1, &[]));
     let model = made.expect("a recipe's network is one that can be made: its knobs were checked");
-    stage.groups.extend(model.network_columns().iter().map(|c| Group::new(c, rate)));
+    stage.groups.extend(model.network_columns().iter().map(|c| Group { warm_up, ..Group::new(c, rate) }));
     let fast = Rate { start: GRID_SPEEDUP * rate.start, end: GRID_SPEEDUP * rate.end };
     let levels = model.grid_columns();
     // The coarse half learns from the start, then level after level (SC-GS begins with 6 of 12 to 16).
@@ -199,7 +206,7 @@ fn networks(stage: &mut Stage, plan: &Plan) {
     for (l, columns) in levels.iter().enumerate() {
         let waits = (l + 1).saturating_sub(first) as f64 / (levels.len() - first).max(1) as f64;
         let from = (waits * r.deform.unlock * r.run.iterations as f64) as usize;
-        stage.groups.extend(columns.iter().map(|c| Group { from, ..Group::new(c, fast) }));
+        stage.groups.extend(columns.iter().map(|c| Group { from, warm_up, ..Group::new(c, fast) }));
     }
 }
 

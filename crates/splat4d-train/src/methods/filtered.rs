@@ -55,7 +55,7 @@ impl Choice for Predictor {
 }
 
 /// The program with what the recipe puts around it; as it is where that is nothing.
-pub fn wrap(inner: Box<dyn Program>, recipe: &Recipe) -> Box<dyn Program> {
+pub(crate) fn wrap(inner: Box<dyn Program>, recipe: &Recipe) -> Box<dyn Program> {
     if recipe.filter.fusion == Fusion::Off && recipe.transport.metric.is_none() {
         return inner;
     }
@@ -63,7 +63,7 @@ pub fn wrap(inner: Box<dyn Program>, recipe: &Recipe) -> Box<dyn Program> {
 }
 
 /// See the module's documentation.
-pub struct FilteredProgram {
+pub(crate) struct FilteredProgram {
     inner: Box<dyn Program>,
 }
 

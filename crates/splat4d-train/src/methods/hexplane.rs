@@ -70,7 +70,7 @@ settings! {
 
 /// A canonical cloud that six feature planes deform (Wu et al. 2024, "4DGaussians").
 #[derive(Clone, Copy, Debug)]
-pub struct HexplaneProgram;
+pub(crate) struct HexplaneProgram;
 
 /// Frames a time step of the planes: half of the frames where the original reads half of its time axis.
 const FRAMES_PER_STEP: usize = 4;

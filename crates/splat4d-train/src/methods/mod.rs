@@ -2,28 +2,28 @@
 //!
 //! `splat4d::motion::x` holds a model's mathematics, `methods::x` its stages, rates, losses and what it needs of a capture.
 
-pub mod auto;
-pub mod control;
-pub mod deform;
-pub mod filtered;
-pub mod hexplane;
-pub mod native4d;
-pub mod spacetime;
-pub mod ssm;
+pub(crate) mod auto;
+pub(crate) mod control;
+pub(crate) mod deform;
+pub(crate) mod filtered;
+pub(crate) mod hexplane;
+pub(crate) mod native4d;
+pub(crate) mod spacetime;
+pub(crate) mod ssm;
 pub mod still;
 #[cfg(test)]
 mod tests;
-pub mod tracked;
+pub(crate) mod tracked;
 
-pub use control::ControlSettings;
-pub use deform::DeformSettings;
-pub use filtered::FilterSettings;
-pub use hexplane::HexplaneSettings;
-pub use native4d::Native4dSettings;
-pub use spacetime::{Features, SpacetimeSettings};
-pub use ssm::SsmSettings;
-pub use still::{AppearanceSettings, LifeSettings, RateSettings};
-pub use tracked::TrackedSettings;
+pub(crate) use control::ControlSettings;
+pub(crate) use deform::DeformSettings;
+pub(crate) use filtered::FilterSettings;
+pub(crate) use hexplane::HexplaneSettings;
+pub(crate) use native4d::Native4dSettings;
+pub(crate) use spacetime::SpacetimeSettings;
+pub(crate) use ssm::SsmSettings;
+pub(crate) use still::{AppearanceSettings, LifeSettings, RateSettings};
+pub(crate) use tracked::TrackedSettings;
 
 use crate::event::Progress;
 use crate::loss::image::ImageTerm;
@@ -40,7 +40,7 @@ use splat4d::motion::{BUILT_IN, Capabilities, MODELS, Motion, Phase, Spec, build
 use splat4d::scene::{LifeKind, Params};
 use std::sync::Arc;
 
-/// What a program may know of the capture and of the user's wishes.
+/// The capture and the wishes of the user, as far as a program may know them.
 #[derive(Clone, Debug, Default)]
 pub struct Plan {
     /// All knobs, resolved.
@@ -53,7 +53,7 @@ pub struct Plan {
     pub fps: f64,
     /// Distinct times in the capture.
     pub times: usize,
-    /// Cameras that do not move.
+    /// Cameras with training pictures that do not move.
     pub fixed_cameras: usize,
     /// Distinct times, seconds, ascending, and how many fixed cameras have a training picture at each.
     pub moments: Vec<(f64, usize)>,
@@ -63,7 +63,7 @@ pub struct Plan {
 
 impl Plan {
     /// Seconds of the clip, its last frame's duration included: the unit in which recipes state time.
-    pub fn seconds(&self) -> f64 {
+    pub(crate) fn seconds(&self) -> f64 {
         self.clip[1] - self.clip[0] + 1.0 / self.fps
     }
 }
@@ -84,7 +84,7 @@ impl Rate {
     }
 
     /// The rate after the share `progress` of the stage.
-    pub fn at(&self, progress: f64) -> f64 {
+    pub(crate) fn at(&self, progress: f64) -> f64 {
         if self.start <= 0.0 || self.end <= 0.0 {
             return self.start.max(0.0) * (1.0 - progress) + self.end.max(0.0) * progress;
         }
@@ -94,18 +94,18 @@ impl Rate {
 
 impl Recipe {
     /// A rate that falls to `lr_decay` of itself over the stage.
-    pub fn falling(&self, rate: f64) -> Rate {
+    pub(crate) fn falling(&self, rate: f64) -> Rate {
         Rate { start: rate, end: rate * self.rates.decay }
     }
 }
 
 /// A group of this layer is one of every layer that has its columns.
-pub const EVERY: usize = usize::MAX;
+pub(crate) const EVERY: usize = usize::MAX;
 
 /// A learnable group: one column group of one table. What no group names is frozen.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Group {
-    /// The layer, or [`EVERY`].
+    /// The layer, or `EVERY`.
     pub layer: usize,
     /// The column group's name; it is unique in a layer.
     pub column: String,
@@ -115,16 +115,25 @@ pub struct Group {
     pub rate: Rate,
     /// Frozen for so many steps of the stage (networks and fine grids that come in later).
     pub from: usize,
+    /// The rate rises linearly over so many of its first steps; 0: all at once.
+    pub warm_up: usize,
 }
 
 impl Group {
     /// All columns of a group of layer 0.
     pub fn new(column: &str, rate: Rate) -> Self {
-        Self { layer: 0, column: column.to_owned(), part: None, rate, from: 0 }
+        Self { layer: 0, column: column.to_owned(), part: None, rate, from: 0, warm_up: 0 }
+    }
+
+    /// The rate of a step of the stage, at the share `progress` of it.
+    pub(crate) fn rate_at(&self, stage_step: usize, progress: f64) -> f64 {
+        let taken = (stage_step + 1).saturating_sub(self.from);
+        let share = if taken < self.warm_up { taken as f64 / self.warm_up as f64 } else { 1.0 };
+        self.rate.at(progress) * share
     }
 
     /// Whether it is a group of the layer with this number.
-    pub fn is_of(&self, layer: usize) -> bool {
+    pub(crate) fn is_of(&self, layer: usize) -> bool {
         self.layer == EVERY || self.layer == layer
     }
 }
@@ -141,18 +150,18 @@ pub struct TimeNoise {
 
 impl TimeNoise {
     /// β after so many steps of the stage.
-    pub fn width(&self, step: usize) -> f64 {
+    pub(crate) fn width(&self, step: usize) -> f64 {
         if step >= self.steps { 0.0 } else { self.start * (1.0 - step as f64 / self.steps as f64) }
     }
 }
 
-/// What a stage does to the scene at its start or end: add pages, replace the cloud, build a graph. A layer that it
+/// A change of the scene at a stage's start or end: add pages, replace the cloud, build a graph. A layer that it
 /// replaces needs another name: rows of a layer that keeps its name and its shape keep their moments.
-pub type Hook = Box<dyn Fn(&mut Scene<f32>, &mut Progress<'_>) -> Result<()> + Send + Sync>;
+pub(crate) type Hook = Box<dyn Fn(&mut Scene<f32>, &mut Progress<'_>) -> Result<()> + Send + Sync>;
 
 /// One stage of training.
 pub struct Stage {
-    /// What progress and metrics call it.
+    /// Name in progress and metrics.
     pub name: String,
     /// Steps.
     pub iterations: usize,
@@ -160,13 +169,13 @@ pub struct Stage {
     pub sampler: Sampler,
     /// Views a step.
     pub batch: usize,
-    /// What learns, and how fast.
+    /// Learnable groups and their rates.
     pub groups: Vec<Group>,
     /// Losses over several times.
     pub probes: Vec<Box<dyn ProbeLoss<f32>>>,
     /// Losses on raw parameters.
     pub params: Vec<Box<dyn ParamLoss<f32>>>,
-    /// What is done between steps, in any order: it runs in that of [`Order`](crate::upkeep::Order).
+    /// Upkeep between steps, in any order: it runs in that of [`Order`](crate::upkeep::Order).
     pub upkeep: Vec<Box<dyn Upkeep>>,
     /// Noise on positions after every step; none: positions only learn.
     pub noise: Option<Noise>,
@@ -184,7 +193,7 @@ pub struct Stage {
     pub pictures: Vec<Box<dyn ImageTerm>>,
     /// Whether the cameras' exposures stay as they are.
     pub freeze_exposure: bool,
-    /// What stands between the parameters and the pictures; none: nothing.
+    /// The codec between the parameters and the pictures; none: nothing.
     pub codec: Option<Arc<dyn Codec<f32>>>,
     /// The phase in which it puts the models of all layers; none: as they are.
     pub phase: Option<Phase>,
@@ -229,7 +238,7 @@ impl Stage {
     /// The steps `from..to` as a stage of its own: rates, densification, degrees of SH and pictures at half size are as they
     /// would have been then.
     #[must_use]
-    pub fn part(mut self, from: usize, to: usize) -> Self {
+    pub(crate) fn part(mut self, from: usize, to: usize) -> Self {
         let share = |step: usize| step as f64 / self.iterations.max(1) as f64;
         let [start, end] = [from, to].map(share);
         for group in &mut self.groups {
@@ -246,12 +255,12 @@ impl Stage {
     }
 
     /// The highest SH degree that is drawn after so many steps, of `most`.
-    pub fn sh_degree(&self, step: usize, most: usize) -> usize {
+    pub(crate) fn sh_degree(&self, step: usize, most: usize) -> usize {
         (self.sh_from + step).checked_div(self.sh_interval).map_or(most, |unlocked| unlocked.min(most))
     }
 
     /// Tells every loss that rows were edited.
-    pub fn on_edit(&self) {
+    pub(crate) fn on_edit(&self) {
         self.params.iter().for_each(|l| l.on_edit());
         self.probes.iter().for_each(|l| l.on_edit());
     }
@@ -269,7 +278,7 @@ pub trait Program: Send + Sync {
     fn life(&self, plan: &Plan) -> LifeKind {
         plan.recipe.life.kind.unwrap_or(LifeKind::Infinite)
     }
-    /// What initial points are of: the whole clip, or what of it is learnt first.
+    /// The plan of the initial points: the whole clip, or what of it is learnt first.
     fn first(&self, plan: &Plan) -> Plan {
         plan.clone()
     }
@@ -307,7 +316,7 @@ pub trait Program: Send + Sync {
     }
     /// The stages.
     fn stages(&self, plan: &Plan) -> Vec<Stage>;
-    /// What learns when a trained scene is tuned further on all frames alike.
+    /// The stage that tunes a trained scene further on all frames alike.
     fn tuning(&self, plan: &Plan) -> Stage {
         self.stages(plan).pop().expect("a program has a stage")
     }
@@ -318,7 +327,7 @@ type Make = fn() -> Box<dyn Program>;
 
 /// The programs by the names of their models: how a model is learnt is its file and an entry here. `auto` asks them in
 /// this order.
-pub const PROGRAMS: [(&str, Make); 8] = [
+pub(crate) const PROGRAMS: [(&str, Make); 8] = [
     ("still", || Box::new(still::StillProgram)),
     ("spacetime", || Box::new(spacetime::SpacetimeProgram)),
     ("control", || Box::new(control::ControlProgram)),
@@ -343,7 +352,7 @@ pub fn program(motion: &str) -> Result<Box<dyn Program>> {
 }
 
 /// The program of a recipe: that of its motion, with the losses over time and the filter that the recipe asks for.
-pub fn program_of(recipe: &Recipe) -> Result<Box<dyn Program>> {
+pub(crate) fn program_of(recipe: &Recipe) -> Result<Box<dyn Program>> {
     let program = program(recipe.run.motion.as_str())?;
     if recipe.spacetime.has_features() && !program.has_features() {
         return Err(Error::input(format!("motion `{}` has no features", recipe.run.motion))
@@ -354,7 +363,7 @@ pub fn program_of(recipe: &Recipe) -> Result<Box<dyn Program>> {
 
 /// The stages of a program as the recipe has them: with `static_split`, still Gaussians move into a layer of their own
 /// after that share of the last stage.
-pub fn stages(program: &dyn Program, plan: &Plan) -> Vec<Stage> {
+pub(crate) fn stages(program: &dyn Program, plan: &Plan) -> Vec<Stage> {
     let mut stages = program.stages(plan);
     if let Some(last) = stages.last_mut()
         && program.capabilities(plan).moves
@@ -374,7 +383,7 @@ fn share_groups(stage: &mut Stage) {
 
 /// A stage that tunes a trained scene on all frames alike: the recipe's losses and rates, and nothing that adds, moves or
 /// replaces Gaussians.
-pub fn tuning(plan: &Plan) -> Result<Stage> {
+pub(crate) fn tuning(plan: &Plan) -> Result<Stage> {
     let mut stage = program_of(&plan.recipe)?.tuning(plan);
     share_groups(&mut stage);
     stage.upkeep.retain(|u| u.in_tuning());
@@ -383,6 +392,6 @@ pub fn tuning(plan: &Plan) -> Result<Stage> {
     (stage.start, stage.end) = (None, None);
     stage.time_noise = TimeNoise::default();
     // What came in late in training is there by now.
-    stage.groups.iter_mut().for_each(|g| g.from = 0);
+    stage.groups.iter_mut().for_each(|g| (g.from, g.warm_up) = (0, 0));
     Ok(stage)
 }

@@ -34,7 +34,7 @@ settings! {
 
 /// Gaussians of space and time, sliced at t (Yang et al. 2024, "Real-time 4DGS").
 #[derive(Clone, Copy, Debug)]
-pub struct Native4dProgram;
+pub(crate) struct Native4dProgram;
 
 impl Program for Native4dProgram {
     fn spec(&self, plan: &Plan) -> Spec {

@@ -56,14 +56,14 @@ settings! {
 
 impl SpacetimeSettings {
     /// Whether a network makes colour of features, in place of spherical harmonics.
-    pub fn has_features(&self) -> bool {
+    pub(crate) fn has_features(&self) -> bool {
         self.features == Features::Full
     }
 }
 
 /// Explicit kinematics (STG, FreeTimeGS).
 #[derive(Clone, Copy, Debug)]
-pub struct SpacetimeProgram;
+pub(crate) struct SpacetimeProgram;
 
 impl Program for SpacetimeProgram {
     fn spec(&self, plan: &Plan) -> Spec {

@@ -58,7 +58,7 @@ impl Choice for Equivariance {
 
 /// Control nodes driven by a diagonal state-space model.
 #[derive(Clone, Copy, Debug)]
-pub struct SsmProgram;
+pub(crate) struct SsmProgram;
 
 /// Distinct times a tick, where the recipe leaves the choice: on mutant (150 times) 16 ticks gained 1.5 dB over 75.
 const TIMES_PER_TICK: usize = 10;

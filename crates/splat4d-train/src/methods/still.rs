@@ -5,7 +5,7 @@ use super::{Group, Plan, Program, Rate, Stage};
 use crate::loss::neighbourhood::{MotionWeights, Neighbourhood};
 use crate::loss::scene::{MeanOpacity, MeanScale, OpacityEntropy};
 use crate::loss::terms::{ParamLoss, ProbeLoss};
-use crate::optim::Noise;
+use crate::optim::{MCMC_EXTENT, Noise};
 use crate::recipe::Recipe;
 use crate::settings::{Choice, settings};
 use crate::upkeep;
@@ -26,8 +26,8 @@ settings! {
         sh_degree: usize = 1 => within(0, 3);
         /// Iterations before each further SH degree is unlocked; 0: iterations/10.
         sh_degree_interval: usize = 0 => any().unit("iterations").when(On("appearance.sh_degree"));
-        /// Learn a gain and an offset a camera and channel, where there is more than one camera; their mean stays the
-        /// identity.
+        /// Learn a gain and an offset a camera and channel, where more than one camera has several pictures; their mean
+        /// stays the identity.
         exposure: bool = true;
         /// Rate of the exposure (Luiten et al., 10,000 steps: 1e-4).
         exposure_lr: f64 = 1e-3 => any().when(On("appearance.exposure"));
@@ -85,7 +85,7 @@ impl Choice for Option<LifeKind> {
 
 /// Static 3D Gaussian Splatting.
 #[derive(Clone, Copy, Debug)]
-pub struct StillProgram;
+pub(crate) struct StillProgram;
 
 impl Program for StillProgram {
     fn spec(&self, _plan: &Plan) -> Spec {
@@ -110,7 +110,7 @@ impl Program for StillProgram {
 }
 
 /// The groups of geometry and colour.
-pub fn groups(r: &Recipe, extent: f64) -> Vec<Group> {
+pub(crate) fn groups(r: &Recipe, extent: f64) -> Vec<Group> {
     let positions = Rate { start: r.rates.position_init * extent, end: r.rates.position_final * extent };
     let mut groups = vec![
         Group::new("means", positions),
@@ -128,7 +128,7 @@ pub fn groups(r: &Recipe, extent: f64) -> Vec<Group> {
 }
 
 /// Lets a stage learn its Gaussians' lives: birth and death, for any model.
-pub fn learn_life(stage: &mut Stage, plan: &Plan, life: LifeKind) {
+pub(crate) fn learn_life(stage: &mut Stage, plan: &Plan, life: LifeKind) {
     let r = &plan.recipe;
     if life != LifeKind::Infinite {
         stage.groups.push(Group::new("life_centers", r.falling(r.life.center_lr * plan.seconds())));
@@ -140,8 +140,8 @@ pub fn learn_life(stage: &mut Stage, plan: &Plan, life: LifeKind) {
     }
 }
 
-/// What the recipe asks of how Gaussians move.
-pub fn motion_weights(r: &Recipe) -> MotionWeights {
+/// The recipe's weights of the losses on motion.
+pub(crate) fn motion_weights(r: &Recipe) -> MotionWeights {
     MotionWeights {
         rigid: r.loss.rigid,
         rot: r.loss.rot,
@@ -163,7 +163,8 @@ pub fn stage(name: &str, plan: &Plan) -> Stage {
             params.push(Box::new(MeanOpacity { weight: r.mcmc.opacity_reg }));
         }
         if r.mcmc.scale_reg > 0.0 {
-            params.push(Box::new(MeanScale { weight: r.mcmc.scale_reg }));
+            // Sizes are in scene units: their weight is against the extent.
+            params.push(Box::new(MeanScale { weight: r.mcmc.scale_reg * MCMC_EXTENT / plan.extent }));
         }
     }
     if r.loss.opacity_entropy > 0.0 {
@@ -180,7 +181,7 @@ pub fn stage(name: &str, plan: &Plan) -> Stage {
         probes,
         params,
         upkeep: upkeep::of(r),
-        noise: Noise::of(r),
+        noise: Noise::of(r, plan.extent),
         sh_interval: r.appearance.sh_degree_interval,
         half_size_steps: (r.run.half_size_until * r.run.iterations as f64) as usize,
         ..Stage::new(name, r.run.iterations)

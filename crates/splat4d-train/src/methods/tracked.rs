@@ -70,7 +70,7 @@ settings! {
 
 /// Positions and rotations of the same Gaussians at every frame (Luiten et al. 2024, "Dynamic 3D Gaussians").
 #[derive(Clone, Copy, Debug)]
-pub struct TrackedProgram;
+pub(crate) struct TrackedProgram;
 
 impl Program for TrackedProgram {
     fn spec(&self, plan: &Plan) -> Spec {

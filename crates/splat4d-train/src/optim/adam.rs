@@ -32,7 +32,7 @@ pub(super) fn corrections<F: Real>() -> Vec<[F; 2]> {
     }
 }
 
-/// What one table's step goes by.
+/// Rates and rules of one table's step.
 pub(super) struct Rule<'a, F> {
     /// A rate a column; 0: frozen.
     pub rates: &'a [f64],

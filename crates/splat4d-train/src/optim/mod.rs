@@ -6,7 +6,7 @@
 mod adam;
 mod noise;
 
-pub use noise::Noise;
+pub(crate) use noise::{MCMC_EXTENT, Noise};
 
 use splat4d::math::Real;
 use splat4d::scene::table::{Column, par_split};
@@ -26,7 +26,7 @@ pub struct Moments<F = f32> {
 }
 
 impl<F: PartialEq> PartialEq for Moments<F> {
-    /// What is looked up is no state.
+    /// Equality of the tables: caches are no state.
     fn eq(&self, other: &Self) -> bool {
         self.tables == other.tables
     }
@@ -56,12 +56,12 @@ impl<F: Real> Moments<F> {
     }
 
     /// The moments of one table, [rows, 2W + 1]; no rows for a page that has not learnt.
-    pub fn table(&self, key: Key) -> &Table<F> {
+    pub(crate) fn table(&self, key: Key) -> &Table<F> {
         &self.tables[key.0 as usize]
     }
 
     /// The same with all its rows, to load a checkpoint or to reset.
-    pub fn table_mut(&mut self, key: Key) -> &mut Table<F> {
+    pub(crate) fn table_mut(&mut self, key: Key) -> &mut Table<F> {
         let (table, rows) = (&mut self.tables[key.0 as usize], self.rows[key.0 as usize]);
         if table.rows() < rows {
             table.resize(rows);
@@ -71,7 +71,7 @@ impl<F: Real> Moments<F> {
 
     /// Forgets the moments of pages for which `learns` (of one of their column groups) does not hold: a frame that was
     /// tracked does not learn again.
-    pub fn forget_pages(&mut self, p: &Params<F>, learns: impl Fn(&str) -> bool) {
+    pub(crate) fn forget_pages(&mut self, p: &Params<F>, learns: impl Fn(&str) -> bool) {
         for key in p.keys().filter(|&k| p.info(k).page.is_some()) {
             let table = &mut self.tables[key.0 as usize];
             if table.rows() > 0 && !p[key].columns().iter().any(|c| learns(&c.name)) {
@@ -81,12 +81,13 @@ impl<F: Real> Moments<F> {
     }
 
     /// Bytes of all tables.
-    pub fn bytes(&self) -> usize {
+    #[cfg(test)]
+    pub(crate) fn bytes(&self) -> usize {
         self.tables.iter().map(|t| size_of_val(t.data())).sum()
     }
 
     /// Takes over the tables of `old` that have the same shape and stand at the same key; the rest stays new.
-    pub fn adopt(&mut self, old: Self) {
+    pub(crate) fn adopt(&mut self, old: Self) {
         for ((table, &rows), old) in self.tables.iter_mut().zip(&self.rows).zip(old.tables) {
             // A page without history has nothing to give, whatever its rows.
             if (old.rows(), old.width()) == (rows, table.width()) {
@@ -96,7 +97,7 @@ impl<F: Real> Moments<F> {
     }
 
     /// Follows a row edit of `p` (which may stand before or after its own gather): rows that are not `Kept` start anew.
-    pub fn edit(&mut self, p: &Params<F>, edit: &RowEdit) {
+    pub(crate) fn edit(&mut self, p: &Params<F>, edit: &RowEdit) {
         for key in p.keys().filter(|&k| p.info(k).space == edit.space) {
             let table = &mut self.tables[key.0 as usize];
             self.rows[key.0 as usize] = edit.len();

@@ -10,6 +10,8 @@ use splat4d::scene::{GEOMETRY, Grads, Rows, Space};
 
 /// Opaque Gaussians get less than a ten-thousandth of the noise: not worth three normal numbers.
 const LEAST_GATE: f64 = 1e-4;
+/// Extent at which the published weights of 3DGS as MCMC hold as they are, scene units: that of NeRF's synthetic captures.
+pub(crate) const MCMC_EXTENT: f64 = 4.4;
 /// Slope of the sigmoid that ends the noise above the dead opacity (Kheradmand et al. 2024).
 const NOISE_SLOPE: f64 = 100.0;
 
@@ -23,20 +25,22 @@ pub struct Noise {
 }
 
 impl Noise {
-    /// As a recipe has it; `None`: its strategy takes none.
-    pub fn of(r: &Recipe) -> Option<Self> {
-        (r.densify.is_mcmc()).then_some(Self { strength: r.mcmc.noise_lr, until: r.densify.until })
+    /// As a recipe has it, for cameras of this extent; `None`: its strategy takes none.
+    pub(crate) fn of(r: &Recipe, extent: f64) -> Option<Self> {
+        // A shift is covariance times rate, scene units³: only against the extent does it not depend on the unit.
+        let strength = r.mcmc.noise_lr * (MCMC_EXTENT / extent).powi(2);
+        (r.densify.is_mcmc()).then_some(Self { strength, until: r.densify.until })
     }
 
     /// The same as the steps `from..to` of a stage see it.
     #[must_use]
-    pub fn part(self, from: usize, to: usize) -> Option<Self> {
+    pub(crate) fn part(self, from: usize, to: usize) -> Option<Self> {
         let until = self.until.min(to).saturating_sub(from);
         (self.until > from).then_some(Self { until, ..self })
     }
 
     /// Shakes the rows that are active in `d`; `rate`: that of a layer's positions, where they learn. `rng` is the step's.
-    pub fn add(
+    pub(crate) fn add(
         &self,
         scene: &mut Scene<f32>,
         d: &[Grads<f32>],

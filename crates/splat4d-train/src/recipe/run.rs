@@ -1,5 +1,6 @@
 //! The settings of a run as a whole.
 
+use super::Replans;
 use crate::settings::{Value, among, settings};
 use splat4d::motion::MODELS;
 
@@ -13,6 +14,9 @@ settings! {
         seed: u64 = 0;
         /// Training steps in all.
         iterations: usize = 7000 => at_least(1);
+        /// Changes of the run's length while it went, [step, steps in all]: from that step on, what is left of the
+        /// schedule of `iterations` steps is spread over the steps that are left. `--minutes` writes them.
+        replans: Replans = Replans::default();
         /// Views a step.
         batch_size: usize = 1 => at_least(1);
         /// Share of the iterations, from the first, that see pictures at half size.
@@ -34,13 +38,16 @@ pub struct MotionName(&'static str);
 const AUTO: &str = "auto";
 
 impl MotionName {
+    /// The choice that is left to the capture.
+    pub const AUTO: Self = Self(AUTO);
+
     /// The model with this name. Panics: there is none.
     pub fn of(name: &str) -> Self {
         Self::find(name).unwrap_or_else(|| panic!("there is no motion model `{name}`"))
     }
 
     /// Whether the capture has yet to choose.
-    pub fn is_auto(self) -> bool {
+    pub(crate) fn is_auto(self) -> bool {
         self.0 == AUTO
     }
 

@@ -1,7 +1,7 @@
 use super::flat::FLAT;
 use super::*;
 
-/// What recipes looked like before they had tables: all defaults, in order.
+/// A recipe from before there were tables: all defaults, in order.
 const FLAT_DEFAULTS: &str = include_str!("tests/flat-defaults.toml");
 /// A resolved one with many knobs changed.
 const FLAT_CHANGED: &str = include_str!("tests/flat-changed.toml");
@@ -97,7 +97,7 @@ fn words_come_back_and_wrong_ones_get_a_suggestion() {
             assert!(error.contains(&format!("did you mean `{first}`")), "{error}");
         }
     }
-    assert_eq!(Recipe::knobs().iter().filter(|k| !k.choices.is_empty()).count(), 14);
+    assert_eq!(Recipe::knobs().iter().filter(|k| !k.choices.is_empty()).count(), 15);
     for (set, back) in [("init=my/points.ply", "my/points.ply"), ("init=hull", "hull")] {
         assert_eq!(Recipe::of(&[set]).unwrap().get("init.source").unwrap().as_str(), Some(back));
     }
@@ -150,4 +150,32 @@ fn knobs_without_effect_are_found_with_what_they_need() {
     assert_eq!(idle(&["motion=hexplane", "life_width_lr=0.1"]).len(), 1, "nothing has a life");
     assert_eq!(idle(&["motion=hexplane", "life_width_lr=0.1", "life=interval"]), []);
     assert_eq!(idle(&["motion=tracked", "floor=3", "floor_height=0"]), []);
+}
+
+#[test]
+fn what_followed_from_the_length_follows_from_another_one_and_what_was_chosen_stays() {
+    let saved = Recipe::of(&["densify_until_iter=777", "run.replans=[[5,90],[40,60]]"]).unwrap().resolve();
+    let read = Recipe::from_toml(&saved.to_toml()).unwrap();
+    assert_eq!(read, saved);
+    assert_eq!(read.run.replans.rows(), [Replan { at: 5, total: 90 }, Replan { at: 40, total: 60 }]);
+    let again = read.unresolved().with(|r| r.run.iterations = 3000).resolve();
+    assert_eq!(again, Recipe::of(&["densify_until_iter=777", "iterations=3000"]).unwrap().resolve());
+    for wrong in ["3", "[3]", "[[3]]", "[[3, 3]]", "[[3, 9], [3, 8]]", "[[3, 9], [2, 8]]", "[[-1, 9]]"] {
+        let error = Recipe::of(&[&format!("run.replans={wrong}")]).unwrap_err().to_string();
+        assert!(error.contains("[[700, 4200]]"), "{wrong}: {error}");
+    }
+}
+
+#[test]
+fn qualities_take_more_from_one_to_the_next() {
+    let [draft, standard, best] = Quality::ALL.map(|q| Recipe::default().of_quality(q));
+    assert_eq!(standard, Recipe::default());
+    let takes = |r: &Recipe| (r.run.iterations, r.densify.max_cap);
+    assert!(takes(&draft) < takes(&standard) && takes(&standard) < takes(&best));
+    assert_eq!([&draft, &best].map(|r| r.capture.downscale), [2, 1]);
+    // Of a recipe that a run saved, schedules are the quality's.
+    let saved = Recipe::of(&["downscale=3"]).unwrap().resolve().of_quality(Quality::Draft);
+    assert_eq!((saved.capture.downscale, saved.resolve().densify.until), (6, draft.run.iterations * 3 / 4));
+    assert_eq!("best".parse::<Quality>().unwrap(), Quality::Best);
+    assert!("bets".parse::<Quality>().unwrap_err().to_string().contains("draft, standard, best"));
 }

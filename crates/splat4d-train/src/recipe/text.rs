@@ -27,7 +27,7 @@ impl Recipe {
     }
 
     /// As TOML; reading it back gives the same recipe.
-    pub fn to_toml(&self) -> String {
+    pub(crate) fn to_toml(&self) -> String {
         let mut text = String::new();
         for (name, table) in self.tables() {
             if !text.is_empty() {
@@ -42,7 +42,8 @@ impl Recipe {
     }
 
     /// The default recipe, changed by these `key=value`s.
-    pub fn of(assignments: &[&str]) -> Result<Self> {
+    #[cfg(test)]
+    pub(crate) fn of(assignments: &[&str]) -> Result<Self> {
         let mut recipe = Self::default();
         assignments.iter().try_for_each(|a| recipe.set(a))?;
         Ok(recipe)
@@ -67,12 +68,12 @@ impl Recipe {
         Self::default().tables().into_iter().flat_map(|(name, table)| table.knobs(name)).collect()
     }
 
-    /// What a table is about.
+    /// The subject of a table.
     pub fn about(table: &str) -> &'static str {
         Self::default().tables().into_iter().find(|(name, _)| *name == table).map_or("", |(_, t)| t.about())
     }
 
-    /// What a table's knobs need to have an effect; `None`: nothing.
+    /// The condition under which a table's knobs have an effect; `None`: always.
     pub fn needs(table: &str) -> Option<String> {
         let when = Self::default().tables().into_iter().find(|(name, _)| *name == table)?.1.when();
         (when != When::Always).then(|| when.to_string())
@@ -183,7 +184,7 @@ pub struct Idle {
     pub key: String,
     /// Whether it says that something is not to be, which it is not anyhow.
     pub off: bool,
-    /// What it would need.
+    /// The condition that is not met.
     pub needs: String,
 }
 

@@ -2,8 +2,8 @@
 
 use super::nearest;
 
-/// What a knob may hold.
-pub trait Value: Sized {
+/// A type of value that a knob may hold.
+pub(crate) trait Value: Sized {
     /// As TOML.
     fn to_toml(&self) -> toml::Value;
     /// Errors: what it must be, to stand behind "It must be".
@@ -92,8 +92,8 @@ impl Value for Vec<usize> {
     }
 }
 
-/// What is named by one of a few words.
-pub trait Choice: Copy + PartialEq + 'static {
+/// A value named by one of a few words.
+pub(crate) trait Choice: Copy + PartialEq + 'static {
     /// Every value with its word, in the order of help.
     const NAMES: &'static [(&'static str, Self)];
 
@@ -118,8 +118,8 @@ impl<T: Choice> Value for T {
     }
 }
 
-/// What a word must be, to stand behind "It must be": one of these, and the nearest.
-pub fn among(value: &toml::Value, known: &[&str]) -> String {
+/// The permitted words, to stand behind "It must be": one of these, and the nearest.
+pub(crate) fn among(value: &toml::Value, known: &[&str]) -> String {
     let near = value.as_str().and_then(|word| nearest(word, known));
     format!("one of {}{}", known.join(", "), near.map(|n| format!("; did you mean `{n}`?")).unwrap_or_default())
 }

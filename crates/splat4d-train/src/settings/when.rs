@@ -19,7 +19,7 @@ pub enum When {
 
 impl When {
     /// Whether it is so; `get` looks a knob up.
-    pub fn holds(self, get: &dyn Fn(&str) -> toml::Value) -> bool {
+    pub(crate) fn holds(self, get: &dyn Fn(&str) -> toml::Value) -> bool {
         match self {
             Self::Always => true,
             Self::Is(key, words) => get(key).as_str().is_some_and(|word| words.contains(&word) || is_open(key, word)),
@@ -31,7 +31,8 @@ impl When {
     }
 
     /// Every knob that it looks at.
-    pub fn keys(self) -> Vec<&'static str> {
+    #[cfg(test)]
+    pub(crate) fn keys(self) -> Vec<&'static str> {
         match self {
             Self::Always => Vec::new(),
             Self::Is(key, _) | Self::IsNot(key, _) | Self::On(key) => vec![key],

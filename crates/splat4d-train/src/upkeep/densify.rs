@@ -44,19 +44,19 @@ const ADC_DEAD_OPACITY: f64 = 0.02;
 
 impl DensifySettings {
     /// Fills what follows from the strategy.
-    pub fn resolve(&mut self) {
+    pub(crate) fn resolve(&mut self) {
         if self.min_opacity == 0.0 {
             self.min_opacity = if self.strategy == Strategy::Mcmc { MCMC_DEAD_OPACITY } else { ADC_DEAD_OPACITY };
         }
     }
 
     /// Whether Gaussians are added by Markov chain Monte Carlo.
-    pub fn is_mcmc(&self) -> bool {
+    pub(crate) fn is_mcmc(&self) -> bool {
         self.strategy == Strategy::Mcmc
     }
 
     /// The steps at which Gaussians are added and removed.
-    pub fn steps(&self) -> Every {
+    pub(crate) fn steps(&self) -> Every {
         Every { first: self.from, last: self.until, interval: self.interval }
     }
 }

@@ -74,14 +74,14 @@ struct Look {
 
 /// See the module's documentation.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Guided {
+pub(crate) struct Guided {
     /// How, and when.
     pub settings: GuidedSettings,
 }
 
 impl Guided {
     /// As a recipe has it; `None`: never.
-    pub fn of(r: &Recipe) -> Option<Self> {
+    pub(crate) fn of(r: &Recipe) -> Option<Self> {
         (r.guided.from > 0.0 && r.guided.times > 0).then_some(Self { settings: r.guided })
     }
 }
@@ -236,7 +236,7 @@ mod tests {
     use super::super::Limits;
     use super::super::tests::{context, due_steps, scene};
     use super::*;
-    use crate::train::tests::Made;
+    use crate::step::tests::Made;
 
     #[test]
     fn gaussians_appear_along_the_rays_of_what_is_wrong_under_the_cap() {

@@ -23,11 +23,11 @@ settings! {
     when (Is("densify.strategy", &["mcmc"])) {
         /// Growth a densification, up to the cap.
         growth: f64 = 1.05 => positive();
-        /// Strength of the position noise.
+        /// Strength of the position noise, for an extent of 4.4 scene units; it falls with its square.
         noise_lr: f64 = 5e5;
         /// Weight of the mean opacity.
         opacity_reg: f64 = 0.01;
-        /// Weight of the mean scale.
+        /// Weight of the mean scale, for an extent of 4.4 scene units; it falls with it.
         scale_reg: f64 = 0.01;
     }
 }
@@ -35,7 +35,7 @@ settings! {
 /// Markov chain Monte Carlo (Kheradmand et al. 2024), relocation in space-time. Its noise on positions is part of the
 /// step: [`Noise`](crate::optim::Noise).
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Mcmc {
+pub(crate) struct Mcmc {
     /// How.
     pub settings: McmcSettings,
     /// Share of the 2D gradient, against opacity, in where Gaussians go.
@@ -46,7 +46,7 @@ pub struct Mcmc {
 
 impl Mcmc {
     /// As a recipe has it; `None`: another strategy.
-    pub fn of(r: &Recipe) -> Option<Self> {
+    pub(crate) fn of(r: &Recipe) -> Option<Self> {
         let some = || Self { settings: r.mcmc, gradient_share: r.relocate.gradient_share, steps: r.densify.steps() };
         (r.densify.strategy == Strategy::Mcmc).then(some)
     }
@@ -83,7 +83,7 @@ impl Upkeep for Mcmc {
 ///
 /// o' = 1 − (1−o)^{1/N}; s'/s = o / Σ_{i=1..N} Σ_{k=0..i−1} C(i−1,k) (−1)^k o'^{k+1} / √(k+1): along every line through
 /// the centre the integrated alpha is the same.
-pub fn relocated(o: f64, copies: usize) -> (f64, f64) {
+pub(crate) fn relocated(o: f64, copies: usize) -> (f64, f64) {
     let n = copies.clamp(1, MAX_COPIES);
     let each = 1.0 - (1.0 - o).powf(1.0 / n as f64);
     // Σ_i C(i−1,k) over i = k+1..N is C(N,k+1): one sum instead of two.

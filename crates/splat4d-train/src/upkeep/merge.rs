@@ -12,7 +12,7 @@ use splat4d::math::sym3;
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{Born, GEOMETRY, RowEdit, SH, Space};
 
-/// What becomes of a pair in one place.
+/// The fate of a pair in one place.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Pair {
     /// Both stay.
@@ -53,7 +53,7 @@ const THINNEST: f64 = 1e-4;
 
 /// See the module's documentation.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Merge {
+pub(crate) struct Merge {
     /// How, and when.
     pub settings: MergeSettings,
 }
@@ -84,7 +84,7 @@ impl Upkeep for Merge {
 
 impl Merge {
     /// As a recipe has it; `None`: never.
-    pub fn of(r: &Recipe) -> Option<Self> {
+    pub(crate) fn of(r: &Recipe) -> Option<Self> {
         let settings = r.merge;
         (settings.pair != Pair::None && settings.interval > 0).then_some(Self { settings })
     }

@@ -5,34 +5,34 @@
 //! operation changes rows through [`Learner::apply`] alone, so that it works for every motion model and every loss hears
 //! of it. A new one is a file here, and a line where a program adds it to a stage.
 
-pub mod adc;
-pub mod densify;
-pub mod guided;
-pub mod mcmc;
-pub mod merge;
-pub mod morton;
-pub mod nodes;
-pub mod once;
-pub mod opacity_reset;
-pub mod prune;
-pub mod relocate;
-pub mod split;
+pub(crate) mod adc;
+pub(crate) mod densify;
+pub(crate) mod guided;
+pub(crate) mod mcmc;
+pub(crate) mod merge;
+pub(crate) mod morton;
+pub(crate) mod nodes;
+pub(crate) mod once;
+pub(crate) mod opacity_reset;
+pub(crate) mod prune;
+pub(crate) mod relocate;
+pub(crate) mod split;
 #[cfg(test)]
 pub(crate) mod tests;
 pub mod worth;
 
-pub use adc::{Adc, AdcSettings};
+pub(crate) use adc::{Adc, AdcSettings};
 pub use densify::{DensifySettings, Strategy};
-pub use guided::{Guided, GuidedSettings};
-pub use mcmc::{Mcmc, McmcSettings};
-pub use merge::{Merge, MergeSettings, Pair};
-pub use morton::MortonOrder;
-pub use nodes::{AdaptNodes, NodeSettings};
-pub use once::Once;
-pub use opacity_reset::{OpacityReset, OpacityResetSettings};
-pub use prune::{Prune, PruneSettings};
-pub use relocate::{Relocate, RelocateSettings};
-pub use split::{Split, SplitSettings};
+pub(crate) use guided::{Guided, GuidedSettings};
+pub(crate) use mcmc::{Mcmc, McmcSettings};
+pub(crate) use merge::{Merge, MergeSettings};
+pub(crate) use morton::MortonOrder;
+pub(crate) use nodes::{AdaptNodes, NodeSettings};
+pub(crate) use once::Once;
+pub(crate) use opacity_reset::{OpacityReset, OpacityResetSettings};
+pub(crate) use prune::{Prune, PruneSettings};
+pub(crate) use relocate::{Relocate, RelocateSettings};
+pub(crate) use split::{Split, SplitSettings};
 
 use crate::Result;
 use crate::capture::frames::Frames;
@@ -78,21 +78,21 @@ pub struct Every {
 
 impl Every {
     /// At no step.
-    pub const NEVER: Self = Self { first: 0, last: 0, interval: 0 };
+    pub(crate) const NEVER: Self = Self { first: 0, last: 0, interval: 0 };
 
     /// Whether it is time after so many steps.
-    pub fn is_due(&self, step: usize) -> bool {
+    pub(crate) fn is_due(&self, step: usize) -> bool {
         self.interval > 0 && step >= self.first && step <= self.last && step.is_multiple_of(self.interval)
     }
 
     /// Whether it is time, and for the last time.
-    pub fn is_last(&self, step: usize) -> bool {
+    pub(crate) fn is_last(&self, step: usize) -> bool {
         self.is_due(step) && step + self.interval > self.last
     }
 
     /// The same as the steps `from..to` of the stage see it, counted from `from`.
     #[must_use]
-    pub fn part(self, from: usize, to: usize) -> Self {
+    pub(crate) fn part(self, from: usize, to: usize) -> Self {
         Self { first: self.first.saturating_sub(from).max(1), last: self.last.min(to).saturating_sub(from), ..self }
     }
 }
@@ -127,7 +127,7 @@ pub struct Context<'a> {
     pub seed: u64,
     /// Cap, extent and dead opacity.
     pub limits: Limits,
-    /// What the scene is compared with.
+    /// The frames that the scene is compared with.
     pub frames: &'a dyn Frames,
     /// As the scene is drawn.
     pub antialias: Antialias,
@@ -154,9 +154,9 @@ pub enum Order {
     Grow,
     /// Rows are put in order.
     Sort,
-    /// What is worth little goes.
+    /// Removal of what is worth little.
     Remove,
-    /// What stands in one place becomes one.
+    /// Merging of what stands in one place.
     Merge,
     /// Numbers are set back.
     Reset,
@@ -206,7 +206,7 @@ pub trait Upkeep: Send + Sync {
         false
     }
 
-    /// What a checkpoint must hold of it, if it remembers anything from time to time.
+    /// The state for a checkpoint, if it remembers anything from time to time.
     fn state(&self) -> Vec<u32> {
         Vec::new()
     }
@@ -216,7 +216,7 @@ pub trait Upkeep: Send + Sync {
 }
 
 /// The operations that a recipe asks of every motion model.
-pub fn of(r: &Recipe) -> Vec<Box<dyn Upkeep>> {
+pub(crate) fn of(r: &Recipe) -> Vec<Box<dyn Upkeep>> {
     let all = [
         boxed(Adc::of(r)),
         boxed(Mcmc::of(r)),

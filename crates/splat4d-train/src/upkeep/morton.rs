@@ -11,14 +11,14 @@ use splat4d::scene::{Born, GEOMETRY, RowEdit, Space};
 
 /// See the module's documentation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct MortonOrder {
+pub(crate) struct MortonOrder {
     /// When the cloud is densified.
     pub densification: Every,
 }
 
 impl MortonOrder {
     /// As a recipe has it; `None`: nothing is densified.
-    pub fn of(r: &Recipe) -> Option<Self> {
+    pub(crate) fn of(r: &Recipe) -> Option<Self> {
         (r.densify.strategy != Strategy::None).then(|| Self { densification: r.densify.steps() })
     }
 }

@@ -34,7 +34,7 @@ settings! {
 
 /// See the module's documentation.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct AdaptNodes {
+pub(crate) struct AdaptNodes {
     /// How, and how often.
     pub settings: NodeSettings,
     /// First and last step that adds or removes nodes.
@@ -43,7 +43,7 @@ pub struct AdaptNodes {
 
 impl AdaptNodes {
     /// As a recipe has it.
-    pub fn of(r: &Recipe) -> Self {
+    pub(crate) fn of(r: &Recipe) -> Self {
         Self { settings: r.nodes, span: (r.densify.from, r.densify.until) }
     }
 
@@ -84,7 +84,7 @@ impl Upkeep for AdaptNodes {
     }
 }
 
-/// What the Gaussians that follow a node say of it.
+/// The pull on a node of the Gaussians that follow it.
 #[derive(Clone, Copy, Default)]
 struct Pull {
     /// Σ a and Σ a g.

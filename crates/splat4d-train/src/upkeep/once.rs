@@ -8,10 +8,10 @@ use splat4d::layers::Scene;
 
 /// A change of the scene before one step of a stage. Done twice it must be as if it had been done once: it is repeated
 /// where a run is resumed at that very step.
-pub struct Once<C> {
+pub(crate) struct Once<C> {
     /// The number of the step, from 0.
     pub at: usize,
-    /// What is done.
+    /// The change.
     pub change: C,
 }
 

@@ -24,7 +24,7 @@ settings! {
 
 /// Lowers opacities while the cloud is densified by gradients.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct OpacityReset {
+pub(crate) struct OpacityReset {
     /// How often.
     pub settings: OpacityResetSettings,
     /// When the cloud is densified: nothing is reset at the last time or after it.
@@ -33,7 +33,7 @@ pub struct OpacityReset {
 
 impl OpacityReset {
     /// As a recipe has it; `None`: never.
-    pub fn of(r: &Recipe) -> Option<Self> {
+    pub(crate) fn of(r: &Recipe) -> Option<Self> {
         let some = || Self { settings: r.opacity_reset, densification: r.densify.steps() };
         (r.densify.strategy == Strategy::Adc && r.opacity_reset.interval > 0).then(some)
     }

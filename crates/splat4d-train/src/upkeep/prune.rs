@@ -38,14 +38,14 @@ settings! {
 
 /// See the module's documentation.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Prune {
+pub(crate) struct Prune {
     /// How, and when.
     pub settings: PruneSettings,
 }
 
 impl Prune {
     /// As a recipe has it; `None`: never.
-    pub fn of(r: &Recipe) -> Option<Self> {
+    pub(crate) fn of(r: &Recipe) -> Option<Self> {
         (r.prune.interval > 0).then_some(Self { settings: r.prune })
     }
 
@@ -89,7 +89,7 @@ mod tests {
     use super::super::Limits;
     use super::super::tests::{context, due_steps, scene};
     use super::*;
-    use crate::train::tests::Made;
+    use crate::step::tests::Made;
 
     fn pruning() -> Prune {
         Prune { settings: PruneSettings { interval: 20, ratio: 0.25, views: 4, spatial: Spatial::Opacity } }

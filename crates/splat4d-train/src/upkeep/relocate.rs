@@ -33,7 +33,7 @@ settings! {
 
 /// See the module's documentation.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Relocate {
+pub(crate) struct Relocate {
     /// How, and when.
     pub settings: RelocateSettings,
     /// When statistics begin anew with densification; from its last time on they do so here.
@@ -42,7 +42,7 @@ pub struct Relocate {
 
 impl Relocate {
     /// As a recipe has it; `None`: never.
-    pub fn of(r: &Recipe) -> Option<Self> {
+    pub(crate) fn of(r: &Recipe) -> Option<Self> {
         let some = || Self { settings: r.relocate, densification: r.densify.steps() };
         (r.relocate.interval > 0).then(some)
     }

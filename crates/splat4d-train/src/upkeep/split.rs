@@ -21,9 +21,9 @@ const LASTING: f64 = 0.9;
 /// Change of the covariance, of its trace, from which on a shape counts as changed.
 const SAME_SHAPE: f64 = 0.05;
 /// Column groups that a still layer has.
-pub const STILL_COLUMNS: [&str; 5] = ["means", "quats", "log_scales", "opacity_logits", "sh"];
-/// What the layer is called.
-pub const STILL_LAYER: &str = "still";
+pub(crate) const STILL_COLUMNS: [&str; 5] = ["means", "quats", "log_scales", "opacity_logits", "sh"];
+/// Name of the layer.
+pub(crate) const STILL_LAYER: &str = "still";
 
 settings! {
     /// The split of what stands still into a layer of its own.
@@ -39,7 +39,7 @@ settings! {
 
 /// See the module's documentation.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Split {
+pub(crate) struct Split {
     /// The number of the step before which it is done.
     pub at: usize,
     /// Rows that stay within this of their middle are still, scene units.
@@ -48,7 +48,7 @@ pub struct Split {
 
 impl Split {
     /// As a recipe has it for a last stage of `steps`, in which Gaussians move; `None`: never.
-    pub fn of(r: &Recipe, extent: f64, steps: usize) -> Option<Self> {
+    pub(crate) fn of(r: &Recipe, extent: f64, steps: usize) -> Option<Self> {
         let s = r.split;
         let some = || Self { at: (steps as f64 * s.from) as usize, reach: s.reach * extent };
         (s.reach > 0.0).then(some)
@@ -76,7 +76,7 @@ impl Upkeep for Split {
 
 /// Moves rows whose mean stays within `reach` (scene units) of its middle, whose shape stays and whose life lasts, into a
 /// still layer behind the others; returns how many. A scene whose rows all move is left as it is.
-pub fn split(scene: &mut Scene<f32>, reach: f64) -> Result<usize> {
+pub(crate) fn split(scene: &mut Scene<f32>, reach: f64) -> Result<usize> {
     let mut moved = 0;
     for index in 0..scene.layers.len() {
         if !scene.layers[index].motion.capabilities().moves {

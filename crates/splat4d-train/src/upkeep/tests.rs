@@ -1,4 +1,4 @@
-//! What tests of operations share; schedules.
+//! Helpers of the tests of operations; schedules.
 
 use super::*;
 use crate::capture::frames::Picture;

@@ -43,7 +43,7 @@ impl Default for Moment {
 
 impl Moment {
     /// Takes what the nodes show at `time`, in their order. `time` is clamped to `clip`.
-    pub fn fill<'a>(&mut self, nodes: impl IntoIterator<Item = &'a Node>, clip: [f64; 2], time: f64) {
+    pub(crate) fn fill<'a>(&mut self, nodes: impl IntoIterator<Item = &'a Node>, clip: [f64; 2], time: f64) {
         let t = time.max(clip[0]).min(clip[1]);
         let shown: Vec<(&Primitive, f64)> = nodes
             .into_iter()
@@ -69,8 +69,8 @@ impl Moment {
         }
     }
 
-    /// What [`fill`](Self::fill) took.
-    pub fn splats(&self) -> Splats<'_> {
+    /// The splats taken by [`fill`](Self::fill).
+    pub(crate) fn splats(&self) -> Splats<'_> {
         let color = Color::Sh { table: &self.sh, rows: Rows::All, weights: None, base: false };
         Splats { parts: vec![Part::new(&self.out, color)], head: None }
     }
@@ -85,7 +85,7 @@ fn strength(p: &Primitive, t: f64) -> f64 {
     f64::from(p.opacity) * (-0.5 * over * over).exp()
 }
 
-/// What is compared with its model.
+/// The baked scene that is compared with its model.
 #[derive(Clone, Copy, Debug)]
 pub enum Shown<'a> {
     /// Primitives before they are rounded into a file.

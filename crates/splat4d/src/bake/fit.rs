@@ -10,7 +10,7 @@ use crate::layers::ALPHA_MIN;
 use crate::math::se3::{norm, sub};
 use crate::math::sh::{MAX_COEFFS, dc_to_rgb};
 
-/// What a full step of opacity (or of colour, 0 to 1) counts as, pixels. A Gaussian one pixel wide that is d pixels off
+/// Error of a full step of opacity (or of colour, 0 to 1), pixels. A Gaussian one pixel wide that is d pixels off
 /// changes its neighbourhood by up to 0.6·d, but with both signs, so that most of it cancels; a wrong opacity does
 /// not, and is held five times as strictly.
 pub(super) const LEVEL_PIXELS: f64 = 8.0;
@@ -29,13 +29,13 @@ pub(super) const COLORS: usize = 3 * MAX_COEFFS;
 pub(super) struct Piece {
     /// The node.
     pub span: Span,
-    /// What is drawn there.
+    /// The primitive drawn there.
     pub primitive: Primitive,
     /// Largest error over its frames, pixels.
     pub error: f64,
 }
 
-/// What all fits share.
+/// Inputs common to all fits.
 #[derive(Clone, Copy)]
 pub(super) struct Fitter<'a> {
     pub tree: &'a Tree,

@@ -3,7 +3,7 @@
 //! Every Gaussian goes to the deepest node that holds all the time in which it can be seen. There a straight line, a
 //! steady turn, one shape, one colour and its own life are fitted to what the model shows frame by frame; where that
 //! misses by more than the tolerance, both halves of the node are tried in its stead, down to single frames, which are
-//! what the model is then (key states). Motion that is straight already is copied and not fitted.
+//! what the model is then (key states). A take of few frames a second is looked at between them too. Motion that is straight already is copied and not fitted.
 //!
 //! Errors are pixels as the cameras see them, weighted by how visible the Gaussian is: distance and outline on the
 //! screen, and opacity and colour converted to pixels. The model is looked at in runs of rows, each at all its frames,
@@ -41,6 +41,8 @@ use tree::{Span, Tree};
 pub const TOLERANCE: f64 = 0.25;
 /// Default of [`Options::segment`], seconds: what a player fetches for a seek; shorter ones repeat too much.
 pub const SEGMENT: f64 = 1.0;
+/// Default of [`Options::looks`]: what players show. A network between the frames of a slow take is no line.
+pub const LOOKS: f64 = 30.0;
 /// Most rounds of [`Options::repeat`].
 pub const MAX_REPEAT: usize = 10_000;
 /// Most primitives of a scene: about 3 GB of memory while baking, 300 MB of file.
@@ -48,13 +50,15 @@ const MAX_PRIMITIVES: usize = 10_000_000;
 /// Rows of a straight layer between two calls of the progress listener.
 const STRAIGHT_RUN: usize = 1 << 16;
 
-/// What may be told.
+/// Options of baking.
 #[derive(Clone, Debug)]
 pub struct Options {
     /// Largest error that is not split further, pixels.
     pub tolerance: f64,
     /// About how long a segment lasts, seconds.
     pub segment: f64,
+    /// Looks at the model a second, at least; each of the take's frames is one in any case.
+    pub looks: f64,
     /// The take is played so many times over.
     pub repeat: usize,
     /// The cameras whose pixels count. None: a 1080p picture that the scene fills.
@@ -63,7 +67,7 @@ pub struct Options {
 
 impl Default for Options {
     fn default() -> Self {
-        Self { tolerance: TOLERANCE, segment: SEGMENT, repeat: 1, cameras: Vec::new() }
+        Self { tolerance: TOLERANCE, segment: SEGMENT, looks: LOOKS, repeat: 1, cameras: Vec::new() }
     }
 }
 
@@ -76,11 +80,11 @@ pub struct Baked {
     pub clip: [f64; 2],
     /// Highest degree of spherical harmonics that is not zero.
     pub sh_degree: usize,
-    /// What was done.
+    /// Statistics of the baking.
     pub report: Report,
 }
 
-/// What baking did.
+/// Statistics of a baking.
 #[derive(Clone, Debug, Default, PartialEq, serde::Serialize)]
 pub struct Report {
     /// Gaussians of the model.
@@ -131,7 +135,7 @@ pub fn bake(scene: &Scene<f32>, options: &Options, progress: &mut dyn FnMut(usiz
     if !(1..=MAX_REPEAT).contains(&options.repeat) {
         return Err(Error::input(format!("{} rounds", options.repeat)).remedy(format!("Give 1 to {MAX_REPEAT}.")));
     }
-    let tree = Tree::new(scene.clip, scene.fps, options.segment)?;
+    let tree = Tree::new(scene.clip, scene.fps, options.looks, options.segment)?;
     let lookout = Lookout::new(&options.cameras, &means(scene));
     let fitter = Fitter { tree: &tree, lookout: &lookout, tolerance: options.tolerance };
     let total = scene.len();
@@ -176,7 +180,7 @@ pub fn bake(scene: &Scene<f32>, options: &Options, progress: &mut dyn FnMut(usiz
     Ok(Baked { sh_degree: sh_degree(&nodes), nodes, clip, report })
 }
 
-/// What the layers have become so far.
+/// Primitives and statistics of the layers so far.
 #[derive(Default)]
 struct Tally {
     spans: BTreeMap<Span, Vec<Primitive>>,

@@ -29,7 +29,7 @@ pub(super) struct Row {
     offset: usize,
 }
 
-/// What a layer's frame makes of learnt shapes and colours.
+/// A layer's frame, applied to learnt shapes and colours.
 pub(super) struct Framed {
     frame: Sim3,
     colors: Option<[[f64; MAX_COEFFS]; MAX_COEFFS]>,
@@ -74,7 +74,7 @@ pub(super) struct Samples {
 }
 
 impl Samples {
-    /// What row `row` was at frame k.
+    /// The sample of row `row` at frame k.
     pub(super) fn at(&self, row: &Row, k: usize) -> &[f32] {
         let start = row.offset + (k - row.frames[0]) * self.width;
         &self.data[start..start + self.width]

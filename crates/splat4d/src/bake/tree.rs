@@ -8,24 +8,33 @@ pub(super) type Span = [usize; 2];
 
 /// Most frames of a clip: nine hours at 30 frames a second; more is a damaged clock.
 const MAX_FRAMES: f64 = 1_000_000.0;
+/// Most parts of a frame: enough for a take of one frame a second, and a bound on the work for a slower one.
+const MAX_PARTS: f64 = 32.0;
 
-/// Borders of spans lie on frames, so that a frame is shown by one node a level and by no two.
+/// Borders of spans lie on frames, so that a frame is shown by one node a level and by no two. Where the take has few
+/// frames a second, what is called a frame here is a part of one: a player shows the moments between them too, and a
+/// model need not be straight there.
 ///
 /// The tree halves the clip at the borders of segments, and a segment, where motion demands it, frame by frame. Its
-/// last border lies one frame behind the clip's last second, so that this second is inside.
+/// last border lies one frame of the take behind the clip's last second, so that this second is inside.
 #[derive(Clone, Debug)]
 pub(super) struct Tree {
     clip: [f64; 2],
     step: f64,
+    /// Seconds from the clip's last to the end.
+    after: f64,
     frames: usize,
     /// Frames at which segments begin, and the end.
     grid: Vec<usize>,
 }
 
 impl Tree {
-    /// Errors: the clip or the segment's length is no sensible number.
-    pub(super) fn new(clip: [f64; 2], fps: f64, segment: f64) -> Result<Self> {
+    /// At least `looks` frames a second. Errors: the clip or the segment's length is no sensible number.
+    pub(super) fn new(clip: [f64; 2], fps: f64, looks: f64, segment: f64) -> Result<Self> {
         let fps = if fps > 0.0 && fps.is_finite() { fps } else { DEFAULT_FPS };
+        let after = 1.0 / fps;
+        // 30 frames a second are enough where 29.97 are.
+        let fps = fps * (looks / fps - 0.1).ceil().clamp(1.0, MAX_PARTS);
         let frames = ((clip[1] - clip[0]) * fps).round() + 1.0;
         if !(1.0..=MAX_FRAMES).contains(&frames) || clip.iter().any(|t| !t.is_finite()) {
             return Err(Error::input(format!("the clip from {} to {} s at {fps} frames/s", clip[0], clip[1]))
@@ -37,7 +46,7 @@ impl Tree {
         let (frames, step) = (frames as usize, 1.0 / fps);
         let segments = ((frames as f64 * step / segment).round() as usize).clamp(1, frames);
         let grid = (0..=segments).map(|i| (i * frames + segments / 2) / segments).collect();
-        Ok(Self { clip, step, frames, grid })
+        Ok(Self { clip, step, after, frames, grid })
     }
 
     /// Frames of the clip.
@@ -62,7 +71,7 @@ impl Tree {
 
     /// The second at which a span that ends (or begins) at frame k ends (or begins).
     pub(super) fn border(&self, k: usize) -> f64 {
-        if k >= self.frames { self.clip[1] + self.step } else { self.time(k) }
+        if k >= self.frames { self.clip[1] + self.after } else { self.time(k) }
     }
 
     /// The frames that surround the seconds [from, to] within the clip.
@@ -109,7 +118,7 @@ mod tests {
     #[test]
     fn halves_tile_their_parent_down_to_single_frames() {
         for (frames, segment) in [(1usize, 1.0), (2, 1.0), (30, 1.0), (47, 0.3), (301, 1.0), (20, 0.01)] {
-            let tree = Tree::new([2.0, 2.0 + (frames - 1) as f64 / 30.0], 30.0, segment).unwrap();
+            let tree = Tree::new([2.0, 2.0 + (frames - 1) as f64 / 30.0], 30.0, 30.0, segment).unwrap();
             assert_eq!(tree.frames(), frames);
             let mut spans = Vec::new();
             all(&tree, tree.root(), &mut spans);
@@ -127,17 +136,36 @@ mod tests {
 
     #[test]
     fn segments_last_about_as_long_as_asked() {
-        let tree = Tree::new([0.0, 10.0 - 1.0 / 30.0], 30.0, 1.0).unwrap();
+        let tree = Tree::new([0.0, 10.0 - 1.0 / 30.0], 30.0, 30.0, 1.0).unwrap();
         assert_eq!(tree.grid, (0..=10).map(|i| 30 * i).collect::<Vec<_>>());
         assert!((tree.border(300) - 10.0).abs() < 1e-12);
     }
 
     #[test]
+    fn few_frames_a_second_are_looked_at_in_parts() {
+        for (fps, looks, parts) in
+            [(10.0, 30.0, 3), (29.97, 30.0, 1), (24.0, 30.0, 2), (60.0, 30.0, 1), (10.0, 0.0, 1), (1e-6, 30.0, 32)]
+        {
+            let last = 11.0 / fps;
+            let tree = Tree::new([0.0, last], fps, looks, 1e9).unwrap();
+            assert_eq!(tree.frames(), 11 * parts + 1, "{fps} frames/s");
+            assert!(
+                (0..=11).all(|k| (tree.time(k * parts) - k as f64 / fps).abs() <= 1e-12 * last),
+                "every frame is looked at"
+            );
+            assert!(
+                (tree.border(tree.frames()) - 12.0 / fps).abs() <= 1e-12 * last,
+                "the last frame lasts as long as any"
+            );
+        }
+    }
+
+    #[test]
     fn a_clock_that_is_no_clock_is_refused() {
         for clip in [[0.0, f64::NAN], [1.0, 0.0], [0.0, 1e9], [f64::NEG_INFINITY, 0.0]] {
-            assert!(Tree::new(clip, 30.0, 1.0).is_err(), "{clip:?}");
+            assert!(Tree::new(clip, 30.0, 30.0, 1.0).is_err(), "{clip:?}");
         }
-        assert!(Tree::new([0.0, 1.0], 30.0, 0.0).is_err());
-        assert_eq!(Tree::new([0.0, 1.0], 0.0, 1.0).unwrap().frames(), 31, "no rate: the default one");
+        assert!(Tree::new([0.0, 1.0], 30.0, 30.0, 0.0).is_err());
+        assert_eq!(Tree::new([0.0, 1.0], 0.0, 30.0, 1.0).unwrap().frames(), 31, "no rate: the default one");
     }
 }

@@ -22,7 +22,7 @@ pub fn lift_in_plane(camera: &Camera, pixel: [f64; 2], flow: [f64; 2], depth: f6
     lift(camera, camera, pixel, flow, depth, depth)
 }
 
-/// What one camera saw of a point's motion.
+/// One camera's observation of a point's motion.
 #[derive(Clone, Copy, Debug)]
 pub struct Sight<'a> {
     /// From where (pinhole, standing still).

@@ -3,7 +3,7 @@
 use super::*;
 use crate::layers::Layer;
 use crate::math::Se3;
-use crate::motion::{SpacetimeSpec, Spec, build};
+use crate::motion::{SpacetimeSpec, Spec, build_as};
 use crate::render::RenderConfig;
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::{GEOMETRY, LIFE, LifeKind, Params};
@@ -36,7 +36,7 @@ fn wall(velocity: [f64; 3], life: LifeKind) -> Scene<f64> {
         }
     }
     let spec = Spec::Spacetime(SpacetimeSpec { order: 1, origin: 0.5, ..SpacetimeSpec::default() });
-    let motion = build(&spec, &mut p).unwrap();
+    let motion = build_as(&spec, &mut p).unwrap();
     let key = p.find("velocities").unwrap();
     (0..rows).for_each(|r| p[key].write(r, 0, velocity));
     let layer = Layer::new("wall", p, motion, life);

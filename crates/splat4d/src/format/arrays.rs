@@ -20,14 +20,14 @@ pub struct Array {
 
 impl Array {
     /// The same array, borrowed, as the safetensors writer takes it.
-    pub fn tensor(&self) -> Tensor<'_> {
+    pub(crate) fn tensor(&self) -> Tensor<'_> {
         Tensor::f32(self.name.clone(), &self.shape, &self.data)
     }
 }
 
 /// All column groups of all tables, in table order, named `prefix` + group (give `layers.0.`). Groups without columns
 /// are left out, and so are arrays that no table has claimed.
-pub fn params_to_arrays(prefix: &str, params: &Params) -> Vec<Array> {
+pub(crate) fn params_to_arrays(prefix: &str, params: &Params) -> Vec<Array> {
     let mut out = Vec::new();
     for key in params.keys() {
         let table = &params[key];
@@ -56,7 +56,7 @@ pub(super) const MASKS: &str = "masks";
 /// them: the first axis is the rows, the others are one row. A layer's masks (u32) are left out.
 ///
 /// Errors: an array is not of f32, or is a single number without rows.
-pub fn tensors_to_loaded(prefix: &str, file: &SafeTensors<'_>) -> Result<Vec<LoadedArray>> {
+pub(crate) fn tensors_to_loaded(prefix: &str, file: &SafeTensors<'_>) -> Result<Vec<LoadedArray>> {
     let mut out = Vec::new();
     for tensor in file.tensors() {
         let Some(name) = tensor.name().strip_prefix(prefix) else { continue };

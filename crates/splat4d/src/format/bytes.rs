@@ -1,4 +1,4 @@
-//! What the dialects share: a careful cursor over bytes, opacities and colours in bytes, and rows that can be written.
+//! Helpers of the dialects: a careful cursor over bytes, opacities and colours in bytes, and rows that can be written.
 
 use super::warnings::Warnings;
 use crate::scene::{GEOMETRY, LIFE, Params, SH};

@@ -1,76 +1,67 @@
-//! The dialects by name: what a file is, told by its bytes, and how it is opened.
+//! A dialect: its name, its customs, how a file of it is told, read and written. Each declares itself in its own
+//! file, and [`DIALECTS`] lists them.
 
+use super::DIALECTS;
+use super::ply::PlyInfo;
+use super::spz;
 use super::warnings::Warnings;
-use super::{ply, sog, splat, splatv, spz};
-use crate::Result;
-use crate::layers::{Layer, Scene};
+use crate::layers::{Layer, Scene, moment};
 use crate::motion::Still;
-use crate::scene::{LifeKind, Params, time::DEFAULT_FPS};
+use crate::scene::time::DEFAULT_FPS;
+use crate::scene::{Camera, LifeKind, Params, Time};
+use crate::{Error, ErrorKind, Result};
+use std::fmt;
+use std::io::Write;
 use std::sync::Arc;
 
+/// Up in worlds whose y points down, as those of .ply.
+pub const Y_DOWN: [f64; 3] = [0.0, -1.0, 0.0];
+/// Up in worlds whose y points up.
+pub(crate) const Y_UP: [f64; 3] = [0.0, 1.0, 0.0];
+
 /// Files of Gaussians that other programs share. docs/formats.md tells what each holds and assumes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy)]
 #[non_exhaustive]
-pub enum Dialect {
-    /// Plain 3DGS .ply.
-    Ply,
-    /// PlayCanvas' compressed .ply.
-    CompressedPly,
-    /// Moving .ply of Spacetime Gaussians.
-    StgPly,
-    /// .spz, versions 2 to 4.
-    Spz,
-    /// antimatter's .splat.
-    Splat,
-    /// splaTV's moving .splatv.
-    Splatv,
-    /// SOG version 2, zipped.
-    Sog,
+pub struct Dialect {
+    /// Its common name.
+    pub name: &'static str,
+    /// How names of its files end, in lower case, dot included. It may end with another one's: the longer one counts.
+    pub ending: &'static str,
+    /// The direction that its world calls up, by custom: no file says it.
+    pub up: [f64; 3],
+    /// Whether it holds a moving scene.
+    pub moves: bool,
+    /// Whether bytes are such a file; `None`: they have no mark, and only the ending tells.
+    pub mark: Option<fn(&[u8]) -> bool>,
+    /// Reads a file; [`Dialect::open`] says which way is up.
+    pub read: fn(&[u8]) -> Result<Opened>,
+    /// How it is written.
+    pub writer: Writer,
 }
 
-impl Dialect {
-    /// What a file is by its content. `None`: none of these, or a .splat, which has no mark.
-    pub fn of(bytes: &[u8]) -> Option<Self> {
-        if bytes.starts_with(b"ply") {
-            return Some(match () {
-                () if ply::is_stg(bytes) => Self::StgPly,
-                () if ply::is_compressed(bytes) => Self::CompressedPly,
-                () => Self::Ply,
-            });
-        }
-        if bytes.starts_with(&spz::GZIP_MAGIC) || bytes.starts_with(&spz::MAGIC) {
-            return Some(Self::Spz);
-        }
-        if bytes.starts_with(&splatv::MAGIC) {
-            return Some(Self::Splatv);
-        }
-        bytes.starts_with(&sog::ZIP_MAGIC).then_some(Self::Sog)
-    }
+/// How a dialect is written. Writers say what was left out.
+#[derive(Clone, Copy)]
+pub enum Writer {
+    /// One moment.
+    Moment(fn(&Params, &WriteOptions, &mut dyn Write) -> Result<Warnings>),
+    /// A moving scene.
+    Moving(fn(&Scene<f32>, &WriteOptions, &mut dyn Write) -> Result<Warnings>),
+    /// Not at all: what to do in its place.
+    None(&'static str),
+}
 
-    /// What people call it.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Ply => "3DGS .ply",
-            Self::CompressedPly => "3DGS .ply, compressed (PlayCanvas)",
-            Self::StgPly => "Spacetime Gaussians .ply",
-            Self::Spz => ".spz",
-            Self::Splat => ".splat",
-            Self::Splatv => ".splatv",
-            Self::Sog => "SOG",
-        }
-    }
+/// Options of some of the writers; the others pass over them.
+#[derive(Clone, Debug)]
+pub struct WriteOptions {
+    /// Version of .spz, one of 2, 3 or 4.
+    pub spz_version: u32,
+    /// Views that a player may offer, in the axes of the scene.
+    pub cameras: Vec<Camera>,
+}
 
-    /// The direction that its world calls up, by custom: no file says it.
-    pub fn up(self) -> [f64; 3] {
-        match self {
-            Self::Spz => [0.0, 1.0, 0.0],
-            _ => [0.0, -1.0, 0.0],
-        }
-    }
-
-    /// Whether it holds a moving scene.
-    pub fn moves(self) -> bool {
-        matches!(self, Self::StgPly | Self::Splatv)
+impl Default for WriteOptions {
+    fn default() -> Self {
+        Self { spz_version: spz::DEFAULT_VERSION, cameras: Vec::new() }
     }
 }
 
@@ -79,38 +70,106 @@ impl Dialect {
 pub struct Opened {
     /// The scene, in the file's own axes; `up` says which way they lie.
     pub scene: Scene<f32>,
-    /// What a .ply said.
-    pub ply: Option<ply::PlyInfo>,
-    /// What could not be read or had to be assumed.
+    /// Metadata of a .ply.
+    pub ply: Option<PlyInfo>,
+    /// Warnings: values that could not be read or had to be assumed.
     pub warnings: Warnings,
 }
 
-/// Opens a file of the given kind. Errors: its reader's.
-pub fn open(dialect: Dialect, bytes: &[u8]) -> Result<Opened> {
-    let mut ply = None;
-    let (params, warnings) = match dialect {
-        Dialect::StgPly => return ply::read_stg(bytes).map(moving),
-        Dialect::Splatv => return splatv::read(bytes).map(moving),
-        Dialect::Ply | Dialect::CompressedPly => {
-            let (params, info) = ply::read(bytes)?;
-            ply = Some(info);
-            (params, Warnings::default())
-        }
-        Dialect::Spz => spz::read(bytes).map(|(params, _, warnings)| (params, warnings))?,
-        Dialect::Splat => splat::read(bytes)?,
-        Dialect::Sog => sog::read(&sog::unzip(bytes)?)?,
-    };
-    Ok(Opened { scene: still(params, dialect), ply, warnings })
+impl From<(Scene<f32>, Warnings)> for Opened {
+    fn from((scene, warnings): (Scene<f32>, Warnings)) -> Self {
+        Self { scene, ply: None, warnings }
+    }
 }
 
-fn moving((scene, warnings): (Scene<f32>, Warnings)) -> Opened {
-    Opened { scene, ply: None, warnings }
+impl From<(Params, Warnings)> for Opened {
+    fn from((params, warnings): (Params, Warnings)) -> Self {
+        Self { scene: still(params), ply: None, warnings }
+    }
 }
 
-/// A scene of one layer that stands still, in the axes of a dialect.
-pub fn still(params: Params, dialect: Dialect) -> Scene<f32> {
+/// A scene of one layer that stands still; its `up` is not said.
+pub fn still(params: Params) -> Scene<f32> {
     let layer = Layer::new("gaussians", params, Arc::new(Still), LifeKind::Infinite);
-    Scene { layers: vec![layer], up: dialect.up(), fps: DEFAULT_FPS, ..Scene::default() }
+    Scene { layers: vec![layer], fps: DEFAULT_FPS, ..Scene::default() }
+}
+
+impl Dialect {
+    /// What a file is by its content. `None`: none of these, or of one without a mark.
+    pub(crate) fn of(bytes: &[u8]) -> Option<Self> {
+        DIALECTS.iter().rev().find(|d| d.mark.is_some_and(|mark| mark(bytes))).copied()
+    }
+
+    /// What a file is by its content; by the ending of its name where nothing in the content could tell it.
+    pub fn of_file(name: &str, bytes: &[u8]) -> Option<Self> {
+        Self::of(bytes).or_else(|| Self::by_ending(name).filter(|d| d.mark.is_none()))
+    }
+
+    /// What a file with this name should be.
+    pub fn by_ending(name: &str) -> Option<Self> {
+        let name = name.to_ascii_lowercase();
+        DIALECTS.iter().filter(|d| name.ends_with(d.ending)).max_by_key(|d| d.ending.len()).copied()
+    }
+
+    /// The last part of its ending: `.ply` of `.compressed.ply`.
+    pub fn extension(&self) -> &'static str {
+        &self.ending[self.ending.rfind('.').unwrap_or(0)..]
+    }
+
+    /// Opens a file. Errors: its reader's.
+    pub fn open(&self, bytes: &[u8]) -> Result<Opened> {
+        let mut opened = (self.read)(bytes)?;
+        opened.scene.up = self.up;
+        Ok(opened)
+    }
+
+    /// Whether it can be written.
+    pub fn is_written(&self) -> bool {
+        !matches!(self.writer, Writer::None(_))
+    }
+
+    /// Errors where it cannot be written.
+    pub fn check_written(&self) -> Result<()> {
+        let Writer::None(remedy) = self.writer else { return Ok(()) };
+        Err(Error::new(ErrorKind::Unsupported, format!("{} is read, but not written", self.name)).remedy(remedy))
+    }
+
+    /// Writes a scene, whose axes are taken as they are; of a scene that moves, a dialect that does not gets the clip's
+    /// first moment. Says what was left out.
+    ///
+    /// Errors: it is only read; it cannot hold the scene; the sink's.
+    pub fn write(&self, scene: &Scene<f32>, options: &WriteOptions, out: &mut dyn Write) -> Result<Warnings> {
+        match self.writer {
+            Writer::Moment(write) => write(&moment(scene, Time(scene.clip[0]))?, options, out),
+            Writer::Moving(write) => write(scene, options, out),
+            Writer::None(_) => self.check_written().map(|()| Warnings::default()),
+        }
+    }
+}
+
+impl PartialEq for Dialect {
+    fn eq(&self, other: &Self) -> bool {
+        self.name == other.name
+    }
+}
+
+impl Eq for Dialect {}
+
+impl fmt::Debug for Dialect {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("Dialect").field(&self.name).finish()
+    }
+}
+
+/// The last parts of endings, each once, of the dialects for which `which` holds: for messages that list them.
+pub fn extensions(which: impl Fn(&Dialect) -> bool) -> Vec<&'static str> {
+    let mut out = Vec::new();
+    for extension in DIALECTS.iter().filter(|d| which(d)).map(Dialect::extension) {
+        if !out.contains(&extension) {
+            out.push(extension);
+        }
+    }
+    out
 }
 
 #[cfg(test)]
@@ -118,30 +177,66 @@ mod tests {
     use super::*;
     use crate::format::kinematic::tests::moving as moving_scene;
     use crate::format::samples::gaussians;
+    use crate::format::{ply, sog, splat, splatv};
+
+    /// A scene that every dialect can hold.
+    fn sample(moves: bool) -> Scene<f32> {
+        if moves { moving_scene(20, LifeKind::GaussOne, 3, true) } else { still(gaussians(20, 4)) }
+    }
 
     #[test]
-    fn every_dialect_is_known_by_its_bytes() {
-        let (p, scene) = (gaussians(20, 4), moving_scene(20, LifeKind::GaussOne, 3, true));
-        let mut files: Vec<(Option<Dialect>, Vec<u8>)> = Vec::new();
-        let mut add = |dialect, write: &dyn Fn(&mut Vec<u8>)| {
-            let mut bytes = Vec::new();
-            write(&mut bytes);
-            files.push((dialect, bytes));
-        };
-        add(Some(Dialect::Ply), &|b| ply::write(&p, b).unwrap());
-        add(Some(Dialect::CompressedPly), &|b| drop(ply::write_compressed(&p, b).unwrap()));
-        add(Some(Dialect::StgPly), &|b| drop(ply::write_stg(&scene, b).unwrap()));
-        add(Some(Dialect::Splatv), &|b| drop(splatv::write(&scene, &[], b).unwrap()));
-        for version in spz::VERSIONS {
-            add(Some(Dialect::Spz), &|b| drop(spz::write(&p, version, b).unwrap()));
-        }
-        add(None, &|b| drop(splat::write(&p, b).unwrap()));
-        for (dialect, bytes) in files {
-            assert_eq!(Dialect::of(&bytes), dialect);
-            let opened = open(dialect.unwrap_or(Dialect::Splat), &bytes).unwrap();
-            assert_eq!(opened.scene.len(), 20);
-            assert_eq!(opened.scene.up, dialect.unwrap_or(Dialect::Splat).up());
+    fn every_dialect_is_written_told_and_opened() {
+        // What is not written needs a file made by hand.
+        let by_hand = [(sog::DIALECT, sog::tests::sample(), 2)];
+        for dialect in DIALECTS {
+            let (scene, mut bytes, mut count) = (sample(dialect.moves), Vec::new(), 20);
+            let written = dialect.write(&scene, &WriteOptions::default(), &mut bytes);
+            assert_eq!(written.is_ok(), dialect.is_written(), "{dialect:?}: {written:?}");
+            if let Some((_, file, rows)) = by_hand.iter().find(|(d, ..)| d == dialect) {
+                (bytes, count) = (file.clone(), *rows);
+            }
+            let name = format!("SOME{}", dialect.ending.to_ascii_uppercase());
+            assert_eq!(Dialect::of(&bytes), dialect.mark.map(|_| *dialect));
+            assert_eq!(Dialect::of_file(&name, &bytes), Some(*dialect));
+            let opened = dialect.open(&bytes).unwrap();
+            assert_eq!((opened.scene.len(), opened.scene.up), (count, dialect.up), "{dialect:?}");
+            assert_eq!(opened.scene.is_moving(), dialect.moves, "{dialect:?}");
+            assert_eq!(matches!(dialect.writer, Writer::Moving(_)), dialect.moves && dialect.is_written());
+            assert!(opened.ply.is_some() || ![ply::DIALECT, ply::COMPRESSED].contains(dialect), "{dialect:?}");
+            for cut in (0..bytes.len()).step_by(1 + bytes.len() / 50) {
+                let _ = dialect.open(&bytes[..cut]);
+            }
         }
         assert_eq!(Dialect::of(b""), None);
+    }
+
+    #[test]
+    fn names_and_endings_are_told_apart() {
+        for (i, a) in DIALECTS.iter().enumerate() {
+            assert!(a.ending.starts_with('.') && a.ending == a.ending.to_ascii_lowercase(), "{a:?}");
+            assert_eq!(Dialect::by_ending(&format!("x{}", a.ending)), Some(*a));
+            for b in &DIALECTS[..i] {
+                assert!(a.name != b.name && a.ending != b.ending, "{a:?} and {b:?}");
+            }
+        }
+        assert_eq!(Dialect::by_ending("a.COMPRESSED.ply"), Some(ply::COMPRESSED));
+        assert_eq!(Dialect::by_ending("a.b.ply"), Some(ply::DIALECT));
+        assert_eq!(Dialect::by_ending("ply"), None);
+        // An ending counts only where nothing else can tell.
+        assert_eq!(Dialect::of_file("a.splat", b"GIF89a"), Some(splat::DIALECT));
+        assert_eq!(Dialect::of_file("a.splat", &splatv::MAGIC), Some(splatv::DIALECT));
+        assert_eq!(Dialect::of_file("a.ply", b"GIF89a"), None);
+        assert_eq!((ply::COMPRESSED.extension(), extensions(|d| d.extension() == ".ply")), (".ply", vec![".ply"]));
+    }
+
+    #[test]
+    fn every_version_of_spz_is_told_by_its_bytes() {
+        for spz_version in spz::VERSIONS {
+            let mut bytes = Vec::new();
+            let options = WriteOptions { spz_version, ..WriteOptions::default() };
+            spz::DIALECT.write(&sample(false), &options, &mut bytes).unwrap();
+            assert_eq!(Dialect::of(&bytes), Some(spz::DIALECT));
+            assert_eq!(spz::read(&bytes).unwrap().1.version, spz_version);
+        }
     }
 }

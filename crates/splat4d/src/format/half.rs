@@ -30,11 +30,6 @@ pub(super) fn f32_to_f16(x: f32) -> u16 {
     sign | bits.min(0x7BFF)
 }
 
-/// Widens a bfloat16 number, given by its bits: it is the upper half of an f32.
-pub(super) fn bf16_to_f32(bits: u16) -> f32 {
-    f32::from_bits(u32::from(bits) << 16)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -50,7 +45,6 @@ mod tests {
         assert_eq!(f16_to_f32(0x7C00), f32::INFINITY);
         assert!(f16_to_f32(0x7C01).is_nan());
         assert!(f16_to_f32(0x8000).is_sign_negative() && f16_to_f32(0x8000) == 0.0);
-        assert_eq!(bf16_to_f32(0xBF80), -1.0);
     }
 
     #[test]

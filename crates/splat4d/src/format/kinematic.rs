@@ -1,7 +1,8 @@
-//! What the two moving dialects, .splatv and STG's .ply, can say of a Gaussian: a cubic path, a quaternion with a rate, and
+//! The Gaussians of the two moving dialects, .splatv and STG's .ply: a cubic path, a quaternion with a rate, and
 //! a fade exp(−u²) **without the ½**, all on a clock of their own that runs from 0 to 1.
 
 use super::bytes::sound_rows;
+use super::dialect::Y_DOWN;
 use super::warnings::Warnings;
 use crate::layers::{ALWAYS, Layer, Scene, with_polynomial};
 use crate::math::quat;
@@ -15,9 +16,7 @@ use std::sync::Arc;
 pub(super) const FOREVER: f64 = 1e4;
 /// Narrowest fade that is believed, in clips: below it lies no number, and nothing to see.
 const NARROWEST: f64 = 1e-7;
-/// Up in the worlds of these formats: y down, as in plain .ply files.
-const UP: [f64; 3] = [0.0, -1.0, 0.0];
-/// What a file without a clock of its own is taken for: one second.
+/// Assumed length of a file without a clock of its own: one second.
 const UNKNOWN_CLIP: f64 = 1.0;
 
 /// Where the file's 0 and 1 lie on the scene clock.
@@ -38,7 +37,7 @@ impl Clock {
         (sound && fps.is_finite() && fps > 0.0).then_some(Self { clip, fps, duration })
     }
 
-    /// What is assumed where a file says nothing.
+    /// The clock assumed for a file that gives none.
     pub(super) fn assumed(warnings: &mut Warnings) -> Self {
         warnings.say("the file does not say how long it lasts: one second is assumed");
         Self { clip: [0.0, UNKNOWN_CLIP], fps: crate::scene::time::DEFAULT_FPS, duration: UNKNOWN_CLIP }
@@ -180,7 +179,7 @@ pub(super) fn scene(rows: &[Moving], clock: Clock) -> Result<Scene<f32>> {
         rates.write(row, 0, m.turn.map(|w| (w / clock.duration) as f32));
     }
     let layer = Layer::new("moving", params, Arc::new(motion), kind);
-    Ok(Scene { layers: vec![layer], clip: clock.clip, fps: clock.fps, up: UP, ..Scene::default() })
+    Ok(Scene { layers: vec![layer], clip: clock.clip, fps: clock.fps, up: Y_DOWN, ..Scene::default() })
 }
 
 #[cfg(test)]
@@ -216,7 +215,7 @@ pub(super) mod tests {
             }
         }
         let layer = Layer::new("flying", params, motion, life);
-        Scene { layers: vec![layer], clip: [2.0, 5.0], fps: 25.0, up: UP, ..Scene::default() }
+        Scene { layers: vec![layer], clip: [2.0, 5.0], fps: 25.0, up: Y_DOWN, ..Scene::default() }
     }
 
     /// Largest difference of means, covariances and opacities of two scenes over the clip; all rows.

@@ -4,7 +4,7 @@
 //! **Readers never panic, hang or allocate more than a small multiple of the bytes they were given**, whatever the
 //! bytes say: counts and lengths are compared with what is really there before anything is allocated.
 
-pub mod arrays;
+pub(crate) mod arrays;
 mod bytes;
 pub mod dialect;
 mod half;
@@ -24,31 +24,38 @@ pub mod sog;
 pub mod splat;
 pub mod splatv;
 pub mod spz;
-pub mod warnings;
+pub(crate) mod warnings;
 mod zip;
 
-pub use arrays::{params_to_arrays, tensors_to_loaded};
+pub(crate) use arrays::{params_to_arrays, tensors_to_loaded};
 pub use dialect::Dialect;
 pub use warnings::Warnings;
 
 use crate::layers::Scene;
 use crate::{Error, Result};
 
+/// The files of Gaussians that other programs share. What is known of a dialect stands in its own file; nothing else lists
+/// them. Where two know a file by its bytes, the later one is right: a layout inside another one stands behind it.
+pub const DIALECTS: &[Dialect] =
+    &[ply::DIALECT, ply::COMPRESSED, ply::STG, spz::DIALECT, splat::DIALECT, splatv::DIALECT, sog::DIALECT];
+
 /// The scene in a file of any kind that says by its first bytes what it is: `.splat4d`, .ply (3DGS, compressed, Spacetime
-/// Gaussians), .spz, .splatv, zipped SOG, `scene.safetensors` and checkpoints. A .splat has no mark: [`dialect::open`] it.
+/// Gaussians), .spz, .splatv, zipped SOG, `scene.safetensors` and checkpoints. A .splat has no mark: [`splat::read`] it.
 ///
-/// What had to be assumed is not told; [`dialect::open`] tells. Errors: no such kind; the reader's.
+/// What had to be assumed is not told; [`Dialect::open`] tells. Errors: no such kind; the reader's.
 pub fn open(bytes: &[u8]) -> Result<Scene<f32>> {
     if bytes.starts_with(&playback::MAGIC) {
         return playback::read(bytes);
     }
     if let Some(kind) = Dialect::of(bytes) {
-        return dialect::open(kind, bytes).map(|opened| opened.scene);
+        return kind.open(bytes).map(|opened| opened.scene);
     }
     // A safetensors file begins with the length of its JSON header.
     if bytes.get(8) != Some(&b'{') {
-        return Err(Error::input("its first bytes are of no format that splat4d reads")
-            .remedy("Give a .splat4d, .ply, .spz, .splatv, SOG or scene.safetensors"));
+        return Err(Error::input("its first bytes are of no format that splat4d reads").remedy(format!(
+            "Give a .splat4d, {} or scene.safetensors",
+            dialect::extensions(|d| d.mark.is_some()).join(", ")
+        )));
     }
     scene::read(bytes)
 }

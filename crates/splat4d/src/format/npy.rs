@@ -96,18 +96,14 @@ impl Npy {
     }
 
     /// How many numbers the array holds.
-    pub fn len(&self) -> usize {
+    #[cfg(test)]
+    pub(crate) fn len(&self) -> usize {
         match &self.values {
             Values::U8(v) => v.len(),
             Values::I64(v) => v.len(),
             Values::F32(v) => v.len(),
             Values::F64(v) => v.len(),
         }
-    }
-
-    /// Whether the array holds no numbers.
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
     }
 
     /// All numbers as f64 (exact but for integers above 2^53).

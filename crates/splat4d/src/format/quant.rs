@@ -9,7 +9,8 @@ use std::f64::consts::FRAC_1_SQRT_2;
 /// Code 0..=`levels` of a number in [min, max].
 ///
 /// Error of the round trip: at most (max − min)/(2·levels). A range that is empty, or a NaN, gives code 0.
-pub fn linear_code(value: f64, min: f64, max: f64, levels: u32) -> u32 {
+#[cfg(test)]
+pub(crate) fn linear_code(value: f64, min: f64, max: f64, levels: u32) -> u32 {
     coarse_code(value, min, max, levels, 1)
 }
 
@@ -17,7 +18,7 @@ pub fn linear_code(value: f64, min: f64, max: f64, levels: u32) -> u32 {
 ///
 /// Error of the round trip: at most `step` times as large, and as much again above the largest multiple.
 #[inline(always)]
-pub fn coarse_code(value: f64, min: f64, max: f64, levels: u32, step: u32) -> u32 {
+pub(crate) fn coarse_code(value: f64, min: f64, max: f64, levels: u32, step: u32) -> u32 {
     // A division by a power of two is exact: a step of 1 changes no bit.
     let (range, each, last) = (max - min, 1.0 / f64::from(step), f64::from(levels / step));
     // By way of i32, since vectors of f64 become nothing else in one instruction.
@@ -27,32 +28,34 @@ pub fn coarse_code(value: f64, min: f64, max: f64, levels: u32, step: u32) -> u3
 
 /// The number behind a [`linear_code`]: min + (max − min)·code/levels. Codes are below 2³¹.
 #[inline(always)]
-pub fn linear(code: u32, min: f64, max: f64, levels: u32) -> f64 {
+pub(crate) fn linear(code: u32, min: f64, max: f64, levels: u32) -> f64 {
     min + (max - min) * (f64::from(code as i32) / f64::from(levels))
 }
 
 /// Code 0..=`levels` of a positive number whose logarithm lies in [min, max].
 ///
 /// Relative error of the round trip: at most exp((max − min)/(2·levels)) − 1. Zero and less give code 0.
-pub fn log_code(value: f64, min: f64, max: f64, levels: u32) -> u32 {
+#[cfg(test)]
+pub(crate) fn log_code(value: f64, min: f64, max: f64, levels: u32) -> u32 {
     linear_code(value.ln(), min, max, levels)
 }
 
 /// The number behind a [`log_code`].
-pub fn log(code: u32, min: f64, max: f64, levels: u32) -> f64 {
+pub(crate) fn log(code: u32, min: f64, max: f64, levels: u32) -> f64 {
     linear(code, min, max, levels).exp()
 }
 
 /// Code 0..=2·`half` of a number within ± `most`; zero is `half` exactly.
 ///
 /// Error of the round trip: at most most/(2·half).
-pub fn signed_code(value: f64, most: f64, half: u32) -> u32 {
+#[cfg(test)]
+pub(crate) fn signed_code(value: f64, most: f64, half: u32) -> u32 {
     coarse_signed_code(value, most, half, 1)
 }
 
 /// As [`signed_code`], but only `half` and what lies multiples of `step`, a power of two, beside it.
 #[inline(always)]
-pub fn coarse_signed_code(value: f64, most: f64, half: u32, step: u32) -> u32 {
+pub(crate) fn coarse_signed_code(value: f64, most: f64, half: u32, step: u32) -> u32 {
     let share = if most > 0.0 { value / most } else { 0.0 };
     let (each, last) = (1.0 / f64::from(step), f64::from(half / step));
     // A NaN is zero here as well, which 0 as its code would not be.
@@ -62,7 +65,7 @@ pub fn coarse_signed_code(value: f64, most: f64, half: u32, step: u32) -> u32 {
 
 /// The number behind a [`signed_code`]: most·(code − half)/half.
 #[inline(always)]
-pub fn signed(code: u32, most: f64, half: u32) -> f64 {
+pub(crate) fn signed(code: u32, most: f64, half: u32) -> f64 {
     most * ((f64::from(code as i32) - f64::from(half)) / f64::from(half))
 }
 
@@ -70,13 +73,14 @@ pub fn signed(code: u32, most: f64, half: u32) -> f64 {
 /// The sign is chosen so that the largest is positive; q need not be normalised.
 ///
 /// Error of the round trip: at most 1/(2√2·half) in each of the three, and so at most 2.5/half radians of rotation.
-pub fn quat_codes(q: [f64; 4], half: u32) -> (usize, [u32; 3]) {
+#[cfg(test)]
+pub(crate) fn quat_codes(q: [f64; 4], half: u32) -> (usize, [u32; 3]) {
     coarse_quat_codes(q, half, 1)
 }
 
 /// As [`quat_codes`] with codes as those of [`coarse_signed_code`].
 #[inline(always)]
-pub fn coarse_quat_codes(q: [f64; 4], half: u32, step: u32) -> (usize, [u32; 3]) {
+pub(crate) fn coarse_quat_codes(q: [f64; 4], half: u32, step: u32) -> (usize, [u32; 3]) {
     let (q, _) = quat::normalize(q);
     let mut largest = 0;
     for i in 1..4 {
@@ -91,7 +95,7 @@ pub fn coarse_quat_codes(q: [f64; 4], half: u32, step: u32) -> (usize, [u32; 3])
 /// The unit quaternion wxyz behind [`quat_codes`]. Three codes that together exceed 1 give the largest component 0, and
 /// are normalised. Panics: largest > 3.
 #[inline(always)]
-pub fn quat(largest: usize, codes: [u32; 3], half: u32) -> [f64; 4] {
+pub(crate) fn quat(largest: usize, codes: [u32; 3], half: u32) -> [f64; 4] {
     assert!(largest < 4, "a quaternion has four components");
     let [a, b, c] = [
         signed(codes[0], FRAC_1_SQRT_2, half),

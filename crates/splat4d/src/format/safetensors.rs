@@ -8,7 +8,6 @@
 //! runs must repeat byte for byte; it takes a name that stands twice without a word; and its errors do not name the
 //! array.
 
-use super::half::{bf16_to_f32, f16_to_f32};
 use crate::{Error, ErrorKind, Result};
 use serde::de::{Deserialize, Deserializer, MapAccess, Visitor};
 use std::borrow::Cow;
@@ -25,7 +24,7 @@ const ALIGN: usize = 8;
 
 macro_rules! dtypes {
     ($($(#[$doc:meta])* $name:ident $text:literal $size:literal;)*) => {
-        /// What an array's numbers are; names and sizes as in the format.
+        /// Element type of an array; names and sizes as in the format.
         #[derive(Clone, Copy, Debug, PartialEq, Eq)]
         #[non_exhaustive]
         pub enum Dtype { $($(#[$doc])* $name,)* }
@@ -108,7 +107,7 @@ macro_rules! typed {
 
 impl<'a> Tensor<'a> {
     /// An array from little-endian bytes, row-major. Panics: the shape holds another count of bytes.
-    pub fn new(name: impl Into<String>, dtype: Dtype, shape: &[usize], bytes: Cow<'a, [u8]>) -> Self {
+    pub(crate) fn new(name: impl Into<String>, dtype: Dtype, shape: &[usize], bytes: Cow<'a, [u8]>) -> Self {
         let name = name.into();
         let size = shape.iter().product::<usize>() * dtype.size();
         assert_eq!(size, bytes.len(), "array {name} of shape {shape:?} needs another number of bytes");
@@ -121,36 +120,13 @@ impl<'a> Tensor<'a> {
     typed!(u64, as_u64, u64, U64);
     typed!(i64, as_i64, i64, I64);
 
-    /// An array of u8, row-major. Panics: the shape holds another count.
-    pub fn u8(name: impl Into<String>, shape: &[usize], data: &'a [u8]) -> Self {
-        Self::new(name, Dtype::U8, shape, Cow::Borrowed(data))
-    }
-
-    /// The bytes. Errors: the array is not of u8.
-    pub fn as_u8(&self) -> Result<&[u8]> {
-        self.must_be(Dtype::U8)?;
-        Ok(&self.bytes)
-    }
-
-    /// The numbers as f32, from any floating-point type (f64 is rounded). Errors: integers.
-    pub fn to_f32(&self) -> Result<Vec<f32>> {
-        let half = |of: fn(u16) -> f32| self.bytes.as_chunks().0.iter().map(|&b| of(u16::from_le_bytes(b))).collect();
-        match self.dtype {
-            Dtype::F32 => self.as_f32(),
-            Dtype::F64 => Ok(self.as_f64()?.into_iter().map(|x| x as f32).collect()),
-            Dtype::F16 => Ok(half(f16_to_f32)),
-            Dtype::BF16 => Ok(half(bf16_to_f32)),
-            other => Err(self.wrong(format!("holds {}, but floating-point numbers are needed", other.name()))),
-        }
-    }
-
     /// The name.
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// What the numbers are.
-    pub fn dtype(&self) -> Dtype {
+    /// The element type.
+    pub(crate) fn dtype(&self) -> Dtype {
         self.dtype
     }
 

@@ -19,7 +19,7 @@ use std::io::Write;
 use std::sync::Arc;
 
 /// The newest version of the metadata that this library reads and writes.
-pub const VERSION: u64 = 2;
+pub(crate) const VERSION: u64 = 2;
 /// The version of scenes whose layers have no frame: programs that know no frames may read them.
 const UNFRAMED: u64 = 1;
 /// The metadata's key.
@@ -190,7 +190,7 @@ fn read_layer(file: &SafeTensors<'_>, meta: &Value, index: usize) -> Result<Laye
     Ok(Layer { span, masks, frame, ..Layer::new(name, params, motion, life) })
 }
 
-/// Who is worth drawing when; none where nothing is said.
+/// Reads the visibility masks of a layer; none where the file has none.
 fn read_masks(file: &SafeTensors<'_>, meta: &Value, prefix: &str, rows: usize) -> Result<Option<Arc<KeyMasks>>> {
     let array = file.get(&format!("{prefix}{MASKS}"));
     if meta["mask_times"].is_null() && array.is_none() {

@@ -4,6 +4,7 @@
 //! 4×u8 with (b − 128)/128. World axes as in .ply: y down. Source: antimatter15/splat (MIT).
 
 use super::bytes::{byte_of_dc, byte_of_logit, dc_of_byte, f32_at, logit_of_byte, sound_rows};
+use super::dialect::{Dialect, Opened, Writer, Y_DOWN};
 use super::warnings::Warnings;
 use crate::math::quat;
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
@@ -11,8 +12,19 @@ use crate::scene::{GEOMETRY, Params, SH};
 use crate::{Error, Result};
 use std::io::Write;
 
+/// antimatter's .splat.
+pub const DIALECT: Dialect = Dialect {
+    name: ".splat",
+    ending: ".splat",
+    up: Y_DOWN,
+    moves: false,
+    mark: None,
+    read: |bytes| read(bytes).map(Opened::from),
+    writer: Writer::Moment(|params, _, mut out| write(params, &mut out)),
+};
+
 /// Bytes a Gaussian.
-pub const ROW: usize = 32;
+pub(crate) const ROW: usize = 32;
 /// A linear scale of zero or below is read as this: no logarithm, and nothing to see either.
 const SMALLEST_SCALE: f32 = 1e-30;
 

@@ -8,6 +8,7 @@
 //! Source: antimatter15/splaTV and gsplat.js (MIT), their shaders.
 
 use super::bytes::{Cursor, byte_of_dc, byte_of_logit, dc_of_byte, f32_at, logit_of_byte};
+use super::dialect::{Dialect, Opened, Writer, Y_DOWN};
 use super::half::{f16_to_f32, f32_to_f16};
 use super::kinematic::{Clock, Moving, rows, scene};
 use super::warnings::Warnings;
@@ -16,6 +17,17 @@ use crate::scene::Camera;
 use crate::{Error, Result};
 use serde_json::{Value, json};
 use std::io::Write;
+
+/// splaTV's moving .splatv.
+pub const DIALECT: Dialect = Dialect {
+    name: ".splatv",
+    ending: ".splatv",
+    up: Y_DOWN,
+    moves: true,
+    mark: Some(|bytes| bytes.starts_with(&MAGIC)),
+    read: |bytes| read(bytes).map(Opened::from),
+    writer: Writer::Moving(|scene, options, mut out| write(scene, &options.cameras, &mut out)),
+};
 
 /// First four bytes.
 pub const MAGIC: [u8; 4] = 0x674Bu32.to_le_bytes();

@@ -1,4 +1,5 @@
-//! What a file could not hold, or what had to be assumed: collected while a dialect is read or written, said by the shell.
+//! Warnings about what a file could not hold or what had to be assumed: collected while a dialect is read or written,
+//! printed by the shell.
 
 /// Sentences without a final full stop, in the order in which things came up.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -8,7 +9,7 @@ pub struct Warnings {
 
 impl Warnings {
     /// Adds a sentence.
-    pub fn say(&mut self, text: impl Into<String>) {
+    pub(crate) fn say(&mut self, text: impl Into<String>) {
         self.lines.push(text.into());
     }
 

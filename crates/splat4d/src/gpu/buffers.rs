@@ -20,19 +20,19 @@ pub(super) struct Grown {
 
 impl Grown {
     /// Nothing yet. `what` names the content in errors.
-    pub fn new(what: &'static str, usage: Usage) -> Self {
+    pub(super) fn new(what: &'static str, usage: Usage) -> Self {
         Self { what, usage, buffer: None }
     }
 
     /// Storage that copies may read and write.
-    pub fn storage(what: &'static str) -> Self {
+    pub(super) fn storage(what: &'static str) -> Self {
         Self::new(what, Usage::STORAGE | Usage::COPY_SRC | Usage::COPY_DST)
     }
 
     /// Sees to it that there are `bytes`. Whether the buffer is a new one: what it held is lost then.
     ///
     /// Errors: more than one binding may hold (128 MiB), or no memory.
-    pub fn ensure(&mut self, gpu: &Gpu, bytes: u64) -> Result<bool> {
+    pub(super) fn ensure(&mut self, gpu: &Gpu, bytes: u64) -> Result<bool> {
         let most = largest_binding(gpu);
         if bytes > most {
             let mib = |b: u64| b.div_ceil(1 << 20);
@@ -57,17 +57,17 @@ impl Grown {
     }
 
     /// The buffer. Panics before the first [`Grown::ensure`].
-    pub fn get(&self) -> &wgpu::Buffer {
+    pub(crate) fn get(&self) -> &wgpu::Buffer {
         self.buffer.as_ref().expect("a buffer is made before it is used")
     }
 
     /// All of it.
-    pub fn all(&self) -> wgpu::BindingResource<'_> {
+    pub(crate) fn all(&self) -> wgpu::BindingResource<'_> {
         self.get().as_entire_binding()
     }
 
     /// Bytes held.
-    pub fn bytes(&self) -> u64 {
+    pub(crate) fn bytes(&self) -> u64 {
         self.buffer.as_ref().map_or(0, wgpu::Buffer::size)
     }
 }
@@ -127,7 +127,7 @@ pub(super) struct Buffers {
 
 impl Buffers {
     /// Without memory yet.
-    pub fn new() -> Self {
+    pub(crate) fn new() -> Self {
         let storage = Grown::storage;
         let sizes = || Grown::new("sizes", Usage::STORAGE | Usage::INDIRECT | Usage::COPY_SRC | Usage::COPY_DST);
         Self {
@@ -154,7 +154,7 @@ impl Buffers {
     }
 
     /// Bytes held.
-    pub fn bytes(&self) -> u64 {
+    pub(crate) fn bytes(&self) -> u64 {
         let one = [
             &self.uniforms,
             &self.counts,

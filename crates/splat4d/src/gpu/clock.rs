@@ -23,7 +23,7 @@ pub(super) const STAGES: usize = 6;
 pub enum StageClock {
     /// Nothing: only whole frames are timed.
     Off,
-    /// The GPU's timestamps: costs nothing. Without them ([`Gpu::has_timestamps`]) nothing is timed.
+    /// The GPU's timestamps: costs nothing. Without them (`Gpu::has_timestamps`) nothing is timed.
     Gpu,
     /// The wall: every stage is submitted and waited for alone, which slows a frame down.
     Wall,
@@ -83,7 +83,7 @@ pub(super) struct Queries(Option<wgpu::QuerySet>);
 
 impl Queries {
     /// Made once.
-    pub fn new(gpu: &Gpu) -> Self {
+    pub(super) fn new(gpu: &Gpu) -> Self {
         let make = || {
             gpu.device.create_query_set(&wgpu::QuerySetDescriptor {
                 label: Some("stages"),
@@ -109,7 +109,7 @@ pub(super) struct Recorder<'a> {
 
 impl<'a> Recorder<'a> {
     /// Begins.
-    pub fn new(gpu: &'a Gpu, queries: &'a Queries, clock: StageClock) -> Self {
+    pub(super) fn new(gpu: &'a Gpu, queries: &'a Queries, clock: StageClock) -> Self {
         Self {
             gpu,
             encoder: encoder(gpu),
@@ -121,7 +121,7 @@ impl<'a> Recorder<'a> {
     }
 
     /// Records a stage, which must not be one that was recorded before.
-    pub fn stage(&mut self, stage: Stage, f: impl FnOnce(&mut wgpu::ComputePass<'_>)) -> Result<()> {
+    pub(super) fn stage(&mut self, stage: Stage, f: impl FnOnce(&mut wgpu::ComputePass<'_>)) -> Result<()> {
         let i = stage as usize;
         if self.wall {
             self.flush()?;
@@ -146,17 +146,17 @@ impl<'a> Recorder<'a> {
     }
 
     /// Fills the first `bytes` of a buffer with 0.
-    pub fn clear(&mut self, buffer: &wgpu::Buffer, bytes: u64) {
+    pub(crate) fn clear(&mut self, buffer: &wgpu::Buffer, bytes: u64) {
         self.encoder.clear_buffer(buffer, 0, Some(bytes));
     }
 
     /// Copies `bytes` from the start of one buffer to a place in another.
-    pub fn copy(&mut self, from: &wgpu::Buffer, to: &wgpu::Buffer, at: u64, bytes: u64) {
+    pub(crate) fn copy(&mut self, from: &wgpu::Buffer, to: &wgpu::Buffer, at: u64, bytes: u64) {
         self.encoder.copy_buffer_to_buffer(from, 0, to, at, bytes);
     }
 
     /// Writes the stages' timestamps into `times`: whether there are any.
-    pub fn resolve(&mut self, times: &wgpu::Buffer) -> bool {
+    pub(crate) fn resolve(&mut self, times: &wgpu::Buffer) -> bool {
         let [first, end] = self.recorded;
         let Some(queries) = self.queries.filter(|_| first < end) else { return false };
         // A place that was never written may not be read.
@@ -165,7 +165,7 @@ impl<'a> Recorder<'a> {
     }
 
     /// Milliseconds of the stages from the timestamps of [`Recorder::resolve`].
-    pub fn stages(&self, stamps: &[u64]) -> [f64; STAGES] {
+    pub(crate) fn stages(&self, stamps: &[u64]) -> [f64; STAGES] {
         let period = f64::from(self.gpu.queue.get_timestamp_period()) * 1e-6;
         let mut out = [0.0; STAGES];
         for (i, pair) in (self.recorded[0]..self.recorded[1]).zip(stamps.chunks_exact(2)) {
@@ -175,7 +175,7 @@ impl<'a> Recorder<'a> {
     }
 
     /// Submits what was recorded so far.
-    pub fn submit(&mut self) {
+    pub(crate) fn submit(&mut self) {
         let done = std::mem::replace(&mut self.encoder, encoder(self.gpu));
         self.gpu.queue.submit([done.finish()]);
     }

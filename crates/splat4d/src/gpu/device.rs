@@ -83,7 +83,7 @@ impl Gpu {
     }
 
     /// Whether the GPU's own clock can be read.
-    pub fn has_timestamps(&self) -> bool {
+    pub(crate) fn has_timestamps(&self) -> bool {
         self.device.features().contains(wgpu::Features::TIMESTAMP_QUERY)
     }
 

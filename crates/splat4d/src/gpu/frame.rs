@@ -22,32 +22,32 @@ const TILE_PASSES: usize = 3;
 
 /// Places of the structures in the buffer of uniforms.
 pub(super) mod slot {
-    pub const VIEW: usize = 0;
-    pub const SCAN_VISIBLE: usize = 1;
-    pub const SCAN_PAIRS: usize = 2;
-    pub const SORT_DEPTH: usize = 3;
-    pub const SORT_TILE: usize = 7;
-    pub const BAND: usize = 10;
-    pub const BLEND: usize = 11;
-    pub const PIECES: usize = 12;
+    pub(crate) const VIEW: usize = 0;
+    pub(crate) const SCAN_VISIBLE: usize = 1;
+    pub(crate) const SCAN_PAIRS: usize = 2;
+    pub(crate) const SORT_DEPTH: usize = 3;
+    pub(crate) const SORT_TILE: usize = 7;
+    pub(crate) const BAND: usize = 10;
+    pub(crate) const BLEND: usize = 11;
+    pub(crate) const PIECES: usize = 12;
 }
 
 /// Places in the buffer of counts.
 pub(super) mod count {
-    pub const SPLATS: usize = 0;
-    pub const VISIBLE: usize = 1;
-    pub const PAIRS: usize = 2;
-    pub const ALL: usize = 3;
+    pub(crate) const SPLATS: usize = 0;
+    pub(crate) const VISIBLE: usize = 1;
+    pub(crate) const PAIRS: usize = 2;
+    pub(crate) const ALL: usize = 3;
 }
 
 /// The two buffers of arguments, and what is in each: triples of u32, first for a thread a thing, then for a workgroup a
 /// block of things.
 pub(super) mod arguments {
-    pub const VISIBLE: usize = 0;
-    pub const PAIRS: usize = 1;
-    pub const THREADS: u64 = 0;
-    pub const BLOCKS: u64 = 12;
-    pub const BYTES: u64 = 24;
+    pub(crate) const VISIBLE: usize = 0;
+    pub(crate) const PAIRS: usize = 1;
+    pub(crate) const THREADS: u64 = 0;
+    pub(crate) const BLOCKS: u64 = 12;
+    pub(crate) const BYTES: u64 = 24;
 }
 
 /// Rows of tiles that are drawn at once.
@@ -92,7 +92,7 @@ pub(super) struct Groups {
 
 impl Groups {
     /// Binds all buffers.
-    pub fn new(gpu: &Gpu, k: &Kernels, b: &Buffers) -> Self {
+    pub(super) fn new(gpu: &Gpu, k: &Kernels, b: &Buffers) -> Self {
         let scan = |slot, input: &Grown, output: &Grown, sizes: usize| {
             let group = [
                 uniform(b, slot, SCAN_BYTES),
@@ -216,7 +216,7 @@ impl Frame<'_> {
     }
 
     /// Projects and colours all splats and puts the visible ones in order, nearest first.
-    pub fn splats(&self, recorder: &mut Recorder<'_>, upload: &Upload, splats: usize) -> crate::Result<()> {
+    pub(super) fn splats(&self, recorder: &mut Recorder<'_>, upload: &Upload, splats: usize) -> crate::Result<()> {
         let (k, b) = (self.kernels, self.buffers);
         let bind = |(i, draw): (usize, &Draw)| {
             let part = &upload.parts[draw.part];
@@ -251,7 +251,7 @@ impl Frame<'_> {
     }
 
     /// Lists and blends one band; returns in which of the two buffers the sorted pairs lie.
-    pub fn band(&self, recorder: &mut Recorder<'_>, band: Band, across: usize) -> crate::Result<usize> {
+    pub(super) fn band(&self, recorder: &mut Recorder<'_>, band: Band, across: usize) -> crate::Result<usize> {
         let (k, b) = (self.kernels, self.buffers);
         let tiles = band.rows * across;
         recorder.stage(Stage::Tiles, |pass| {

@@ -71,7 +71,7 @@ impl Kernel {
     }
 
     /// Binds `resources` in the order of the bindings.
-    pub fn bind(&self, gpu: &Gpu, resources: &[wgpu::BindingResource<'_>]) -> wgpu::BindGroup {
+    pub(super) fn bind(&self, gpu: &Gpu, resources: &[wgpu::BindingResource<'_>]) -> wgpu::BindGroup {
         let entries: Vec<_> = resources
             .iter()
             .enumerate()
@@ -106,7 +106,7 @@ pub(super) struct Kernels {
 
 impl Kernels {
     /// Compiles everything.
-    pub fn new(gpu: &Gpu) -> Self {
+    pub(super) fn new(gpu: &Gpu) -> Self {
         Self {
             splats: Kernel::new(
                 gpu,

@@ -96,7 +96,7 @@ fn send<T: bytemuck::NoUninit>(gpu: &Gpu, buffer: &mut Grown, data: &[T]) -> Res
 
 impl Upload {
     /// Sends what changed, and lists the dispatches.
-    pub fn send(&mut self, gpu: &Gpu, splats: &Splats<'_, f32>, tables: Tables) -> Result<()> {
+    pub(super) fn send(&mut self, gpu: &Gpu, splats: &Splats<'_, f32>, tables: Tables) -> Result<()> {
         self.draws.clear();
         if u32::try_from(splats.len()).is_err() {
             return Err(Error::new(ErrorKind::Unsupported, "the GPU counts Gaussians in 32 bits"));
@@ -199,7 +199,7 @@ impl Upload {
     }
 
     /// Bytes held.
-    pub fn bytes(&self) -> u64 {
+    pub(crate) fn bytes(&self) -> u64 {
         let part = |p: &PartBuffers| {
             p.geometry.bytes() + p.ids.bytes() + p.weights.bytes() + p.tables.iter().map(Grown::bytes).sum::<u64>()
         };

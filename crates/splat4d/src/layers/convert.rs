@@ -24,7 +24,7 @@ fn cannot(what: &str, remedy: &str) -> Error {
 /// The layer as a polynomial of time where its model is one in other numbers (`native4d`); else the layer as it is.
 ///
 /// Errors: those of [`to_spacetime`].
-pub fn with_polynomial<F: Real>(layer: &Layer<F>) -> Result<Cow<'_, Layer<F>>> {
+pub(crate) fn with_polynomial<F: Real>(layer: &Layer<F>) -> Result<Cow<'_, Layer<F>>> {
     match layer.motion.spec() {
         Spec::Native4d(_) => to_spacetime(layer).map(Cow::Owned),
         _ => Ok(Cow::Borrowed(layer)),

@@ -105,7 +105,7 @@ fn congruence<F: Real>(a: &[[F; 3]; 3], m: [[F; 3]; 3]) -> [[F; 3]; 3] {
 
 impl Layer<f32> {
     /// The layer with its frame in its tables, as far as [`absorb_frame`](Self::absorb_frame) goes; itself where it has none.
-    pub fn with_frame_absorbed(&self) -> Cow<'_, Self> {
+    pub(crate) fn with_frame_absorbed(&self) -> Cow<'_, Self> {
         if self.frame.is_identity() {
             return Cow::Borrowed(self);
         }

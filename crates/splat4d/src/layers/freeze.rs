@@ -36,6 +36,15 @@ pub fn freeze(scene: &Scene<f32>, time: Time) -> Result<Params<f32>> {
     Ok(params)
 }
 
+/// The same, but what stands still anyway keeps its very bits.
+pub fn moment(scene: &Scene<f32>, time: Time) -> Result<Params<f32>> {
+    scene.without_head("plain Gaussians")?;
+    match &scene.layers[..] {
+        [only] if !scene.is_moving() && only.frame.is_identity() => Ok(only.params.clone()),
+        _ => freeze(scene, time),
+    }
+}
+
 /// These rows of a layer (strictly increasing) as they are at `time`, life and frame included, as a still layer's
 /// parameters; of Gaussians with features only the base colour is left.
 pub fn freeze_rows(layer: &Layer<f32>, rows: &[u32], time: Time) -> Params<f32> {

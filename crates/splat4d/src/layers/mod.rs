@@ -9,9 +9,10 @@ mod rotate;
 #[cfg(test)]
 mod tests;
 
-pub use convert::{to_native4d, to_spacetime, with_polynomial};
+pub(crate) use convert::with_polynomial;
+pub use convert::{to_native4d, to_spacetime};
 pub use evaluation::{Evaluation, sweep};
-pub use freeze::{freeze, freeze_rows};
+pub use freeze::{freeze, freeze_rows, moment};
 pub use rotate::rotation_between;
 
 use crate::math::{Real, Rng, Sim3};
@@ -33,7 +34,7 @@ pub const ALWAYS: [f64; 2] = [f64::NEG_INFINITY, f64::INFINITY];
 
 /// Gaussians with one motion model and one kind of life.
 pub struct Layer<F: Real = f32> {
-    /// What the user calls it.
+    /// The user's name for it.
     pub name: String,
     /// All learnable state.
     pub params: Params<F>,
@@ -43,7 +44,7 @@ pub struct Layer<F: Real = f32> {
     pub life: LifeKind,
     /// The layer is seen for from ≤ t < to, seconds; [`ALWAYS`] but for pages of a playback file.
     pub span: [f64; 2],
-    /// Who is worth drawing when; none: everybody alive.
+    /// Visibility masks of the rows over time; none: all rows alive are drawn.
     pub masks: Option<Arc<KeyMasks>>,
     /// Where the layer stands: `world_from_layer`, applied to Gaussians after motion and life. Tables, the motion model and
     /// nodes keep the layer's own axes and unit of length.
@@ -185,7 +186,7 @@ impl<F: Real> Layer<F> {
         false
     }
 
-    /// What the life of every row is: centre, log width, log softness (seconds; columns that the kind lacks are zero).
+    /// Life of every row: centre, log width, log softness (seconds; columns that the kind lacks are zero).
     /// The model's own where it has one, otherwise the layer's.
     pub fn lives(&self) -> (LifeKind, Vec<[f64; 3]>) {
         let mut own = Table::new(&[("life", 2)], 0);
@@ -339,7 +340,7 @@ pub enum Head {
 }
 
 impl Head {
-    /// What files call it.
+    /// Its name in files.
     pub fn name(self) -> &'static str {
         match self {
             Head::Identity => "identity",
@@ -381,6 +382,11 @@ impl<F: Real> Scene<F> {
         self.len() == 0
     }
 
+    /// Whether anything depends on time: motion, life, or a layer's span.
+    pub fn is_moving(&self) -> bool {
+        self.layers.iter().any(|l| l.motion.capabilities().moves || l.life != LifeKind::Infinite || l.span != ALWAYS)
+    }
+
     /// The scene at time t, for playback: only Gaussians alive then. Question i of `evaluation` becomes layer i.
     pub fn at(&self, t: Time, evaluation: &mut Evaluation<F>) {
         evaluation.begin();
@@ -404,7 +410,7 @@ impl<F: Real> Scene<F> {
     }
 
     /// The head's weights; `None`: there is no head.
-    pub fn head_weights(&self) -> Option<HeadWeights<'_, F>> {
+    pub(crate) fn head_weights(&self) -> Option<HeadWeights<'_, F>> {
         self.head_keys().map(|(layer, keys)| keys.weights(&self.layers[layer].params))
     }
 

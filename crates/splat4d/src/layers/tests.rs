@@ -1,12 +1,12 @@
 //! Every built-in motion model and life, through the layer, against f64 finite differences.
 
 use super::*;
-use crate::motion::{SpacetimeSpec, Spec, build};
+use crate::motion::{SpacetimeSpec, Spec, build_as};
 
 fn layer(spec: &Spec, life: LifeKind, rows: usize, seed: u64) -> Layer<f64> {
     let rng = Rng::new(seed, "layer", 0);
     let mut params = Params::new(rows, 1, life.columns());
-    let motion = build(spec, &mut params).unwrap();
+    let motion = build_as(spec, &mut params).unwrap();
     for key in params.keys().collect::<Vec<_>>() {
         let table = &mut params[key];
         for r in 0..rows {

@@ -4,7 +4,7 @@
 ///
 /// It ends after a sweep that turned nothing, and at the latest after `sweeps`: convergence is quadratic, four or five
 /// are usual. An entry off the diagonal is left where `negligible` holds of it and its two entries on the diagonal.
-pub(super) fn jacobi<const N: usize>(
+pub fn jacobi<const N: usize>(
     mut a: [[f64; N]; N],
     sweeps: usize,
     negligible: impl Fn(f64, [f64; 2]) -> bool,

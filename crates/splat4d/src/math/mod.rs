@@ -1,22 +1,21 @@
 //! Small mathematics: quaternions, symmetric 3x3 matrices, rigid motions, similarities, spherical harmonics, counter-based random
 //! numbers, and the [`Real`] trait that lets every kernel run in f32 and be checked in f64.
 
-mod jacobi;
+pub mod jacobi;
 pub mod knn;
 pub mod mat3;
 pub mod quat;
-pub mod real;
-pub mod rng;
+pub(crate) mod real;
+pub(crate) mod rng;
 pub mod se3;
 pub mod sh;
-pub mod sh_rotation;
-pub mod sim3;
+pub(crate) mod sh_rotation;
+pub(crate) mod sim3;
 pub mod spd;
 pub mod sym3;
-pub mod twist;
+pub(crate) mod twist;
 
 pub use real::Real;
 pub use rng::Rng;
 pub use se3::Se3;
-pub use sh_rotation::sh_rotation;
 pub use sim3::Sim3;

@@ -31,7 +31,7 @@ impl Rng {
     }
 
     /// 64 random bits for draw `i`.
-    pub fn bits(self, i: u64) -> u64 {
+    pub(crate) fn bits(self, i: u64) -> u64 {
         mix(self.key.wrapping_add(i.wrapping_mul(0x9E37_79B9_7F4A_7C15)))
     }
 

@@ -34,7 +34,8 @@ impl Se3 {
     }
 
     /// `self` after `first`: x ↦ self(first(x)).
-    pub fn after(&self, first: &Self) -> Self {
+    #[cfg(test)]
+    pub(crate) fn after(&self, first: &Self) -> Self {
         Self { rotation: mat_mul(&self.rotation, &first.rotation), translation: self.apply(first.translation) }
     }
 

@@ -10,7 +10,7 @@ pub const MAX_DEGREE: usize = 3;
 /// Coefficients a channel at [`MAX_DEGREE`].
 pub const MAX_COEFFS: usize = 16;
 /// Added to the sum, so that all-zero coefficients are mid-grey.
-pub const COLOR_OFFSET: f64 = 0.5;
+pub(crate) const COLOR_OFFSET: f64 = 0.5;
 
 /// The basis function of degree 0: ½√(1/π).
 pub const C0: f64 = 0.282_094_791_773_878_14;
@@ -57,7 +57,7 @@ pub fn rgb_to_dc<F: Real>(rgb: F) -> F {
     (rgb - F::of(COLOR_OFFSET)) / F::of(C0)
 }
 
-/// What a degree-0 coefficient shows as (one channel, not clamped).
+/// Colour of a degree-0 coefficient (one channel, not clamped).
 #[inline(always)]
 pub fn dc_to_rgb<F: Real>(dc: F) -> F {
     dc * F::of(C0) + F::of(COLOR_OFFSET)
@@ -65,7 +65,7 @@ pub fn dc_to_rgb<F: Real>(dc: F) -> F {
 
 /// All 16 basis functions at unit direction `d`.
 #[inline(always)]
-pub fn basis<F: Real>(d: [F; 3]) -> [F; MAX_COEFFS] {
+pub(crate) fn basis<F: Real>(d: [F; 3]) -> [F; MAX_COEFFS] {
     let [x, y, z] = d;
     let (xx, yy, zz) = (x * x, y * y, z * z);
     let (c, two, three, four) = (F::of, F::TWO, F::of(3.0), F::of(4.0));
@@ -91,7 +91,7 @@ pub fn basis<F: Real>(d: [F; 3]) -> [F; MAX_COEFFS] {
 
 /// Derivatives (16 rows of 3) of [`basis`] by x, y and z, taken as polynomials of three free variables.
 #[inline(always)]
-pub fn basis_gradient<F: Real>(d: [F; 3]) -> [[F; 3]; MAX_COEFFS] {
+pub(crate) fn basis_gradient<F: Real>(d: [F; 3]) -> [[F; 3]; MAX_COEFFS] {
     let [x, y, z] = d;
     let (xx, yy, zz) = (x * x, y * y, z * z);
     let (c, o, two, three, four) = (F::of, F::ZERO, F::TWO, F::of(3.0), F::of(4.0));
@@ -117,7 +117,7 @@ pub fn basis_gradient<F: Real>(d: [F; 3]) -> [[F; 3]; MAX_COEFFS] {
 }
 
 /// Which numbers of [`basis_gradient`] are not 0 everywhere.
-pub const GRADIENT_TERMS: [[bool; 3]; MAX_COEFFS] = {
+pub(crate) const GRADIENT_TERMS: [[bool; 3]; MAX_COEFFS] = {
     const XYZ: [bool; 3] = [true; 3];
     const XY: [bool; 3] = [true, true, false];
     const YZ: [bool; 3] = [false, true, true];
@@ -129,7 +129,7 @@ pub const GRADIENT_TERMS: [[bool; 3]; MAX_COEFFS] = {
 /// Colour max(0, Σ_k Y_k(d) f_k + ½) of a Gaussian seen along unit direction `d`.
 ///
 /// Shapes: coefficients [K, 3] with K one of 1, 4, 9, 16 → rgb.
-pub fn evaluate<F: Real>(coeffs: &[[F; 3]], d: [F; 3]) -> [F; 3] {
+pub(crate) fn evaluate<F: Real>(coeffs: &[[F; 3]], d: [F; 3]) -> [F; 3] {
     let y = basis(d);
     let mut rgb = [F::of(COLOR_OFFSET); 3];
     for (f, y) in coeffs.iter().zip(y) {
@@ -142,7 +142,13 @@ pub fn evaluate<F: Real>(coeffs: &[[F; 3]], d: [F; 3]) -> [F; 3] {
 
 /// VJP of [`evaluate`]: writes d_coeffs [K, 3] and returns the gradient to the direction (not yet made tangential: see
 /// [`direction_backward`]). A channel that was clamped at 0 passes nothing.
-pub fn evaluate_backward<F: Real>(coeffs: &[[F; 3]], d: [F; 3], d_rgb: [F; 3], d_coeffs: &mut [[F; 3]]) -> [F; 3] {
+#[cfg(test)]
+pub(crate) fn evaluate_backward<F: Real>(
+    coeffs: &[[F; 3]],
+    d: [F; 3],
+    d_rgb: [F; 3],
+    d_coeffs: &mut [[F; 3]],
+) -> [F; 3] {
     let (y, dy, rgb) = (basis(d), basis_gradient(d), evaluate(coeffs, d));
     let v: [F; 3] = std::array::from_fn(|c| if rgb[c] > F::ZERO { d_rgb[c] } else { F::ZERO });
     let mut d_dir = [F::ZERO; 3];
@@ -158,7 +164,7 @@ pub fn evaluate_backward<F: Real>(coeffs: &[[F; 3]], d: [F; 3], d_rgb: [F; 3], d
 
 /// Gradient through d = v/‖v‖: (I − d dᵀ) d_dir / ‖v‖.
 #[inline(always)]
-pub fn direction_backward<F: Real>(d: [F; 3], inverse_length: F, d_dir: [F; 3]) -> [F; 3] {
+pub(crate) fn direction_backward<F: Real>(d: [F; 3], inverse_length: F, d_dir: [F; 3]) -> [F; 3] {
     let along = d[0] * d_dir[0] + d[1] * d_dir[1] + d[2] * d_dir[2];
     std::array::from_fn(|k| (d_dir[k] - d[k] * along) * inverse_length)
 }

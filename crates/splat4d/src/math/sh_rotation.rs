@@ -16,7 +16,7 @@ const AZIMUTHS: usize = 8;
 
 /// M with c' = M c: the coefficients (one channel, in the order of [`basis`]) after a turn by the rotation `r` (rows).
 /// Orthogonal, and a block a degree: lower degrees turn by its upper left part.
-pub fn sh_rotation(r: &[[f64; 3]; 3]) -> [[f64; MAX_COEFFS]; MAX_COEFFS] {
+pub(crate) fn sh_rotation(r: &[[f64; 3]; 3]) -> [[f64; MAX_COEFFS]; MAX_COEFFS] {
     let mut m = [[0.0; MAX_COEFFS]; MAX_COEFFS];
     for (z, weight) in NODES.into_iter().zip(WEIGHTS) {
         let across = (1.0 - z * z).sqrt();
@@ -38,7 +38,7 @@ pub fn sh_rotation(r: &[[f64; 3]; 3]) -> [[f64; MAX_COEFFS]; MAX_COEFFS] {
 
 /// Rotates the coefficients of one Gaussian by the matrix of [`sh_rotation`]: `block` holds coefficient k of channel c at
 /// 3k + c. Degree 0 is the same from everywhere; its bits stay.
-pub fn rotate_coefficients(m: &[[f64; MAX_COEFFS]; MAX_COEFFS], block: &mut [f32]) {
+pub(crate) fn rotate_coefficients(m: &[[f64; MAX_COEFFS]; MAX_COEFFS], block: &mut [f32]) {
     let count = (block.len() / 3).min(MAX_COEFFS);
     for c in 0..3 {
         let old: [f64; MAX_COEFFS] = std::array::from_fn(|k| if k < count { f64::from(block[3 * k + c]) } else { 0.0 });

@@ -25,7 +25,7 @@ impl Default for Sim3 {
 
 impl Sim3 {
     /// The similarity that moves nothing.
-    pub const IDENTITY: Self =
+    pub(crate) const IDENTITY: Self =
         Self { scale: 1.0, rotation: Se3::IDENTITY.rotation, translation: Se3::IDENTITY.translation };
 
     /// A rotation (rows) alone.
@@ -39,7 +39,7 @@ impl Sim3 {
     }
 
     /// Whether its numbers are finite, the scale positive and the matrix a rotation.
-    pub fn is_sound(&self) -> bool {
+    pub(crate) fn is_sound(&self) -> bool {
         let pose = Se3 { rotation: self.rotation, translation: self.translation };
         self.scale.is_finite()
             && self.scale > 0.0
@@ -55,12 +55,12 @@ impl Sim3 {
     }
 
     /// s R v: what becomes of a difference of points, or of a velocity.
-    pub fn vector(&self, v: [f64; 3]) -> [f64; 3] {
+    pub(crate) fn vector(&self, v: [f64; 3]) -> [f64; 3] {
         mat_vec(&self.rotation, v).map(|x| self.scale * x)
     }
 
     /// `self` after `first`: x ↦ self(first(x)).
-    pub fn after(&self, first: &Self) -> Self {
+    pub(crate) fn after(&self, first: &Self) -> Self {
         Self {
             scale: self.scale * first.scale,
             rotation: mat_mul(&self.rotation, &first.rotation),
@@ -69,12 +69,12 @@ impl Sim3 {
     }
 
     /// The matrix s R.
-    pub fn linear<F: Real>(&self) -> [[F; 3]; 3] {
+    pub(crate) fn linear<F: Real>(&self) -> [[F; 3]; 3] {
         self.rotation.map(|row| row.map(|x| F::of(self.scale * x)))
     }
 
     /// Rᵀ, which takes directions of the target back to the source; none where R is the identity.
-    pub fn directions<F: Real>(&self) -> Option<[[F; 3]; 3]> {
+    pub(crate) fn directions<F: Real>(&self) -> Option<[[F; 3]; 3]> {
         let r = &self.rotation;
         (*r != Self::IDENTITY.rotation).then(|| std::array::from_fn(|i| std::array::from_fn(|j| F::of(r[j][i]))))
     }

@@ -28,14 +28,14 @@ pub const IDENTITY: Mat3 = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
 
 /// Eigenvalues of a covariance count as at least this share of its trace: axes 10⁴ times thinner than the longest
 /// (methods' relative floor of 1e-4 on lengths). 32-bit covariances are not known better.
-pub const RELATIVE_FLOOR: f64 = 1e-8;
+pub(crate) const RELATIVE_FLOOR: f64 = 1e-8;
 /// And at least this, scene units²: a point has an inverse that 32 bits can still hold.
 const ABSOLUTE_FLOOR: f64 = 1e-20;
 /// Eigenvalues of a product of two covariances have twice the exponents.
 const PRODUCT_FLOOR: f64 = RELATIVE_FLOOR * RELATIVE_FLOOR;
 /// I + Γ is clamped to this from below when it leads out of the space of Gaussians (our choice): a step never shrinks an
 /// axis to less than a tenth.
-pub const STRETCH_MIN: f64 = 0.1;
+pub(crate) const STRETCH_MIN: f64 = 0.1;
 /// Sweeps of Jacobi rotations: convergence is quadratic, six suffice for f64.
 const SWEEPS: usize = 8;
 /// Off-diagonals this small against the diagonal (squared) are rounding.
@@ -50,74 +50,75 @@ pub fn unpack<F: Real>(c: [F; 6]) -> Mat3 {
 
 /// The six numbers of a symmetric matrix.
 #[inline]
-pub fn pack<F: Real>(m: &Mat3) -> [F; 6] {
+pub(crate) fn pack<F: Real>(m: &Mat3) -> [F; 6] {
     [m[0][0], m[0][1], m[0][2], m[1][1], m[1][2], m[2][2]].map(F::of)
 }
 
 /// A gradient to six packed numbers, as that to a symmetric matrix.
 #[inline]
-pub fn unpack_gradient<F: Real>(g: [F; 6]) -> Mat3 {
+pub(crate) fn unpack_gradient<F: Real>(g: [F; 6]) -> Mat3 {
     let h = F::HALF;
     unpack([g[0], g[1] * h, g[2] * h, g[3], g[4] * h, g[5]])
 }
 
 /// A gradient to a symmetric matrix, as that to its six numbers: each off-diagonal stands in two places.
 #[inline]
-pub fn pack_gradient<F: Real>(g: &Mat3) -> [F; 6] {
+pub(crate) fn pack_gradient<F: Real>(g: &Mat3) -> [F; 6] {
     [g[0][0], g[0][1] + g[1][0], g[0][2] + g[2][0], g[1][1], g[1][2] + g[2][1], g[2][2]].map(F::of)
 }
 
 /// A·B
 #[inline]
-pub fn mul(a: &Mat3, b: &Mat3) -> Mat3 {
+pub(crate) fn mul(a: &Mat3, b: &Mat3) -> Mat3 {
     std::array::from_fn(|i| std::array::from_fn(|j| a[i][0] * b[0][j] + a[i][1] * b[1][j] + a[i][2] * b[2][j]))
 }
 
 /// A·x
 #[inline]
-pub fn apply(a: &Mat3, x: [f64; 3]) -> [f64; 3] {
+pub(crate) fn apply(a: &Mat3, x: [f64; 3]) -> [f64; 3] {
     std::array::from_fn(|i| a[i][0] * x[0] + a[i][1] * x[1] + a[i][2] * x[2])
 }
 
 /// a·A + b·B
 #[inline]
-pub fn mix(a: f64, x: &Mat3, b: f64, y: &Mat3) -> Mat3 {
+pub(crate) fn mix(a: f64, x: &Mat3, b: f64, y: &Mat3) -> Mat3 {
     std::array::from_fn(|i| std::array::from_fn(|j| a * x[i][j] + b * y[i][j]))
 }
 
 /// Σ A∘B
 #[inline]
-pub fn inner(a: &Mat3, b: &Mat3) -> f64 {
+pub(crate) fn inner(a: &Mat3, b: &Mat3) -> f64 {
     (0..3).map(|i| a[i][0] * b[i][0] + a[i][1] * b[i][1] + a[i][2] * b[i][2]).sum()
 }
 
 /// (A + Aᵀ)/2
 #[inline]
-pub fn symmetric(a: &Mat3) -> Mat3 {
+pub(crate) fn symmetric(a: &Mat3) -> Mat3 {
     std::array::from_fn(|i| std::array::from_fn(|j| 0.5 * (a[i][j] + a[j][i])))
 }
 
 /// (x yᵀ + y xᵀ)/2
 #[inline]
-pub fn outer(x: [f64; 3], y: [f64; 3]) -> Mat3 {
+pub(crate) fn outer(x: [f64; 3], y: [f64; 3]) -> Mat3 {
     std::array::from_fn(|i| std::array::from_fn(|j| 0.5 * (x[i] * y[j] + y[i] * x[j])))
 }
 
 /// P A P for symmetric P and A, symmetric to the last bit.
 #[inline]
-pub fn sandwich(p: &Mat3, a: &Mat3) -> Mat3 {
+pub(crate) fn sandwich(p: &Mat3, a: &Mat3) -> Mat3 {
     symmetric(&mul(&mul(p, a), p))
 }
 
 /// tr A
 #[inline]
-pub fn trace(a: &Mat3) -> f64 {
+#[cfg(test)]
+pub(crate) fn trace(a: &Mat3) -> f64 {
     a[0][0] + a[1][1] + a[2][2]
 }
 
 /// The inverse of a symmetric positive definite matrix, by cofactors.
 #[inline]
-pub fn inverse(a: &Mat3) -> Mat3 {
+pub(crate) fn inverse(a: &Mat3) -> Mat3 {
     let [[xx, xy, xz], [_, yy, yz], [_, _, zz]] = *a;
     let (c0, c1, c2) = (yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy);
     let det = xx * c0 + xy * c1 + xz * c2;
@@ -127,7 +128,7 @@ pub fn inverse(a: &Mat3) -> Mat3 {
 
 /// A symmetric matrix as V diag(λ) Vᵀ; eigenvectors are columns of V, in no particular order.
 #[derive(Clone, Copy, Debug)]
-pub struct Eigen {
+pub(crate) struct Eigen {
     /// λ
     pub values: [f64; 3],
     /// V
@@ -136,7 +137,7 @@ pub struct Eigen {
 
 impl Eigen {
     /// By cyclic Jacobi rotations (Golub & Van Loan §8.5): backward stable, and equal eigenvalues are no special case.
-    pub fn of(m: &Mat3) -> Self {
+    pub(crate) fn of(m: &Mat3) -> Self {
         let (mut a, mut v) = (*m, IDENTITY);
         for _ in 0..SWEEPS {
             let off = a[0][1] * a[0][1] + a[0][2] * a[0][2] + a[1][2] * a[1][2];
@@ -152,7 +153,7 @@ impl Eigen {
     }
 
     /// That of a covariance: eigenvalues are lifted to the floors.
-    pub fn of_covariance(m: &Mat3) -> Self {
+    pub(crate) fn of_covariance(m: &Mat3) -> Self {
         let mut e = Self::of(m);
         e.lift(RELATIVE_FLOOR, ABSOLUTE_FLOOR);
         e
@@ -165,7 +166,7 @@ impl Eigen {
     }
 
     /// V diag(f(λ)) Vᵀ
-    pub fn map(&self, f: impl Fn(f64) -> f64) -> Mat3 {
+    pub(crate) fn map(&self, f: impl Fn(f64) -> f64) -> Mat3 {
         let w = self.values.map(f);
         let v = &self.vectors;
         std::array::from_fn(|i| {
@@ -174,7 +175,7 @@ impl Eigen {
     }
 
     /// V (f(i, j) ∘ (Vᵀ X V)) Vᵀ for symmetric X: a linear map that is diagonal in the eigenbasis, and its own adjoint.
-    pub fn weigh(&self, x: &Mat3, f: impl Fn(f64, f64) -> f64) -> Mat3 {
+    pub(crate) fn weigh(&self, x: &Mat3, f: impl Fn(f64, f64) -> f64) -> Mat3 {
         let v = &self.vectors;
         let turned: Mat3 = std::array::from_fn(|i| std::array::from_fn(|j| v[j][i]));
         let inside = mul(&mul(&turned, x), v);
@@ -209,13 +210,13 @@ fn rotate(a: &mut Mat3, v: &mut Mat3, p: usize, q: usize) {
 }
 
 /// The Γ with ΓΣ + ΣΓ = V (Lyapunov's equation).
-pub fn lyapunov(sigma: &Eigen, v: &Mat3) -> Mat3 {
+pub(crate) fn lyapunov(sigma: &Eigen, v: &Mat3) -> Mat3 {
     sigma.weigh(v, |x, y| 1.0 / (x + y))
 }
 
 /// The optimal map between two covariances, and what its gradient needs.
 #[derive(Clone, Copy, Debug)]
-pub struct Transport {
+pub(crate) struct Transport {
     /// T, symmetric positive definite.
     pub map: Mat3,
     /// Σ₁^½ and Σ₁^-½.
@@ -226,7 +227,7 @@ pub struct Transport {
 
 impl Transport {
     /// From Σ₁ to Σ₂.
-    pub fn new(from: &Mat3, to: &Mat3) -> Self {
+    pub(crate) fn new(from: &Mat3, to: &Mat3) -> Self {
         let e = Eigen::of_covariance(from);
         let half = [e.map(f64::sqrt), e.map(|x| 1.0 / x.sqrt())];
         let mut product = Eigen::of(&sandwich(&half[0], to));
@@ -235,14 +236,14 @@ impl Transport {
     }
 
     /// T⁻¹: the map from Σ₂ to Σ₁.
-    pub fn back(&self) -> Mat3 {
+    pub(crate) fn back(&self) -> Mat3 {
         sandwich(&self.half[0], &self.product.map(|x| 1.0 / x.sqrt()))
     }
 
     /// VJP of T: gradients to Σ₁ and Σ₂.
     ///
     /// From TΣ₁T = Σ₂: dTΣ₁T + TΣ₁dT = dΣ₂ − TdΣ₁T; with X = Σ₁^½ dT Σ₁^½ it is XC^½ + C^½X = Σ₁^½(…)Σ₁^½.
-    pub fn backward(&self, d_map: &Mat3) -> (Mat3, Mat3) {
+    pub(crate) fn backward(&self, d_map: &Mat3) -> (Mat3, Mat3) {
         let d_x = sandwich(&self.half[1], d_map);
         let solved = self.product.weigh(&d_x, |x, y| 1.0 / (x.sqrt() + y.sqrt()));
         let z = sandwich(&self.half[0], &solved);
@@ -262,12 +263,13 @@ pub fn bures(a: &Mat3, b: &Mat3) -> (f64, Mat3, Mat3) {
 }
 
 /// The covariances' part of the logarithm at Σ₁ of Σ₂: V = TΣ₁ + Σ₁T − 2Σ₁. The means' part is μ₂ − μ₁.
-pub fn log(from: &Mat3, to: &Mat3) -> Mat3 {
+#[cfg(test)]
+pub(crate) fn log(from: &Mat3, to: &Mat3) -> Mat3 {
     let t = Transport::new(from, to);
     mix(2.0, &symmetric(&mul(&t.map, from)), -2.0, from)
 }
 
-/// The covariances' part of the exponential at Σ of V: (I+Γ)Σ(I+Γ) with ΓΣ + ΣΓ = V, I+Γ kept above [`STRETCH_MIN`].
+/// The covariances' part of the exponential at Σ of V: (I+Γ)Σ(I+Γ) with ΓΣ + ΣΓ = V, I+Γ kept above `STRETCH_MIN`.
 pub fn exp(sigma: &Mat3, v: &Mat3) -> Mat3 {
     let gamma = lyapunov(&Eigen::of_covariance(sigma), v);
     let stretch = Eigen::of(&mix(1.0, &IDENTITY, 1.0, &gamma)).map(|x| x.max(STRETCH_MIN));
@@ -277,7 +279,7 @@ pub fn exp(sigma: &Mat3, v: &Mat3) -> Mat3 {
 /// A point of the geodesic from Σ₁ (s = 0) through Σ₂ (s = 1). With s < 0 or s > 1 it is Exp(s·Log), the constant
 /// velocity of Gaussians, and the stretch is kept above [`STRETCH_MIN`].
 #[derive(Clone, Copy, Debug)]
-pub struct Geodesic {
+pub(crate) struct Geodesic {
     /// MΣ₁M
     pub point: Mat3,
     s: f64,
@@ -296,7 +298,7 @@ struct Path {
 
 impl Geodesic {
     /// The point at s.
-    pub fn new(from: &Mat3, to: &Mat3, s: f64) -> Self {
+    pub(crate) fn new(from: &Mat3, to: &Mat3, s: f64) -> Self {
         if from == to {
             return Self { point: *from, s, from: *from, path: None };
         }
@@ -315,7 +317,7 @@ impl Geodesic {
     }
 
     /// VJP: gradients to Σ₁, Σ₂ and s.
-    pub fn backward(&self, d_point: &Mat3) -> (Mat3, Mat3, f64) {
+    pub(crate) fn backward(&self, d_point: &Mat3) -> (Mat3, Mat3, f64) {
         let s = self.s;
         let Some(Path { transport, stretch, clamped }) = &self.path else {
             // T is I: d(MΣ₁M) = (1−s)dΣ₁ + s dΣ₂ exactly, and no step along a path without length changes anything.
@@ -352,7 +354,7 @@ fn divided(s: f64, x: f64, y: f64) -> f64 {
 
 /// A matrix with its eigenvalues lifted to `floor`, and the VJP of that for a constant floor.
 #[derive(Clone, Copy, Debug)]
-pub struct Lifted {
+pub(crate) struct Lifted {
     /// The result.
     pub matrix: Mat3,
     /// `None`: nothing had to be lifted.
@@ -362,7 +364,7 @@ pub struct Lifted {
 
 impl Lifted {
     /// Lifts.
-    pub fn new(a: &Mat3, floor: f64) -> Self {
+    pub(crate) fn new(a: &Mat3, floor: f64) -> Self {
         let e = Eigen::of(a);
         if e.values.iter().all(|&x| x >= floor) {
             return Self { matrix: *a, eigen: None, floor };
@@ -371,7 +373,7 @@ impl Lifted {
     }
 
     /// The gradient to the matrix.
-    pub fn backward(&self, d: &Mat3) -> Mat3 {
+    pub(crate) fn backward(&self, d: &Mat3) -> Mat3 {
         let floor = self.floor;
         let Some(e) = &self.eigen else { return *d };
         e.weigh(d, |x, y| {

@@ -21,7 +21,7 @@ pub fn from_quat_log_scales<F: Real>(q: [F; 4], log_scales: [F; 3]) -> [F; 6] {
 ///
 /// `d_cov` is the gradient to the six packed numbers, so that an off-diagonal holds the sum over both of its places.
 #[inline(always)]
-pub fn from_quat_log_scales_backward<F: Real>(q: [F; 4], log_scales: [F; 3], d_cov: [F; 6]) -> ([F; 4], [F; 3]) {
+pub(crate) fn from_quat_log_scales_backward<F: Real>(q: [F; 4], log_scales: [F; 3], d_cov: [F; 6]) -> ([F; 4], [F; 3]) {
     let (unit, norm) = quat::normalize(q);
     let r = quat::to_rotation(unit);
     let s: [F; 3] = std::array::from_fn(|k| log_scales[k].exp());

@@ -12,7 +12,7 @@ const TERMS: usize = 8;
 
 /// exp([w; v]) p. `w`: axis times angle, radians; `v`: velocity along the screw.
 #[inline(always)]
-pub fn move_point<F: Real>(w: [F; 3], v: [F; 3], p: [F; 3]) -> [F; 3] {
+pub(crate) fn move_point<F: Real>(w: [F; 3], v: [F; 3], p: [F; 3]) -> [F; 3] {
     let ([a, b, c], _) = coefficients(dot(w, w));
     let (u1, y1) = (cross(w, p), cross(w, v));
     let (u2, y2) = (cross(w, u1), cross(w, y1));
@@ -21,7 +21,7 @@ pub fn move_point<F: Real>(w: [F; 3], v: [F; 3], p: [F; 3]) -> [F; 3] {
 
 /// VJP of [`move_point`]: (dL/dw, dL/dv, dL/dp).
 #[inline(always)]
-pub fn move_point_backward<F: Real>(w: [F; 3], v: [F; 3], p: [F; 3], d: [F; 3]) -> ([F; 3], [F; 3], [F; 3]) {
+pub(crate) fn move_point_backward<F: Real>(w: [F; 3], v: [F; 3], p: [F; 3], d: [F; 3]) -> ([F; 3], [F; 3], [F; 3]) {
     let ([a, b, c], slopes) = coefficients(dot(w, w));
     let (u1, y1) = (cross(w, p), cross(w, v));
     let (u2, y2) = (cross(w, u1), cross(w, y1));

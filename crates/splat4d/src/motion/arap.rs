@@ -17,7 +17,7 @@ use crate::{Error, Result};
 use rayon::prelude::*;
 
 /// Neighbours of a node (SC-GS).
-pub const NEIGHBOURS: usize = 10;
+pub(crate) const NEIGHBOURS: usize = 10;
 /// Of them the nearest so many always count, the others only within [`REACH`] (SC-GS).
 const SURE_NEIGHBOURS: usize = 3;
 /// Length of an edge beyond the third, of the median distance to the third neighbour: farther nodes are those of another
@@ -69,7 +69,7 @@ impl Dragged {
     }
 }
 
-/// Drags `handles` of nodes at `rest`, with `iterations` rounds (SC-GS: 3). See [`Elastic`] to drag the same nodes again.
+/// Drags `handles` of nodes at `rest`, with `iterations` rounds (SC-GS: 3). See `Elastic` to drag the same nodes again.
 ///
 /// Errors: a handle that is no node or stands twice, a target that is not finite.
 pub fn drag(rest: &[[f64; 3]], handles: &[Handle], iterations: usize) -> Result<Dragged> {
@@ -78,7 +78,7 @@ pub fn drag(rest: &[[f64; 3]], handles: &[Handle], iterations: usize) -> Result<
 
 /// Nodes tied to their neighbours.
 #[derive(Clone, Debug)]
-pub struct Elastic {
+pub(crate) struct Elastic {
     rest: Vec<[f64; 3]>,
     /// Neighbours of node k are `edges[first[k]..first[k + 1]]`, ascending; w_kj = w_jk.
     first: Vec<usize>,
@@ -90,7 +90,7 @@ pub struct Elastic {
 
 impl Elastic {
     /// Ties nodes at `rest`: [`NEIGHBOURS`] nearest, w = exp(−d²/mean d²).
-    pub fn new(rest: &[[f64; 3]]) -> Self {
+    pub(crate) fn new(rest: &[[f64; 3]]) -> Self {
         let n = rest.len();
         let points: Vec<[f32; 3]> = rest.iter().map(|p| p.map(|x| x as f32)).collect();
         let near = knn(&points, NEIGHBOURS);
@@ -125,13 +125,8 @@ impl Elastic {
     }
 
     /// Nodes.
-    pub fn len(&self) -> usize {
+    pub(crate) fn len(&self) -> usize {
         self.rest.len()
-    }
-
-    /// Whether there is none.
-    pub fn is_empty(&self) -> bool {
-        self.rest.is_empty()
     }
 
     fn ties(&self, k: usize) -> &[(usize, f64)] {
@@ -141,7 +136,7 @@ impl Elastic {
     /// Puts handles where they belong and lets all others follow. Parts without a handle stay.
     ///
     /// Errors: a handle that is no node or stands twice, a target that is not finite.
-    pub fn drag(&self, handles: &[Handle], iterations: usize) -> Result<Dragged> {
+    pub(crate) fn drag(&self, handles: &[Handle], iterations: usize) -> Result<Dragged> {
         let n = self.len();
         let mut held: Vec<Option<Handle>> = vec![None; n];
         for h in handles {
@@ -262,7 +257,7 @@ impl Elastic {
     }
 
     /// E of positions and rotations, (scene units)².
-    pub fn energy(&self, positions: &[[f64; 3]], rotations: &[[[f64; 3]; 3]]) -> f64 {
+    pub(crate) fn energy(&self, positions: &[[f64; 3]], rotations: &[[[f64; 3]; 3]]) -> f64 {
         let of_edge = |k: usize, j: usize| {
             let turned = mat_vec(&rotations[k], sub(self.rest[k], self.rest[j]));
             sub(sub(positions[k], positions[j]), turned).map(|x| x * x).iter().sum::<f64>()

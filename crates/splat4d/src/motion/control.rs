@@ -8,9 +8,9 @@ mod keys;
 mod low_rank;
 mod network;
 
-pub use keys::{Keys, Timeline};
-pub use low_rank::LowRank;
-pub use network::{Network, NetworkShape};
+pub(crate) use keys::{Keys, Timeline};
+pub(crate) use low_rank::LowRank;
+pub(crate) use network::{Network, NetworkShape};
 
 use super::skin::{Skin, SkinSpec, Skinned, Trajectory};
 use super::{Capabilities, Model, Motion, Spec};
@@ -39,7 +39,7 @@ pub enum Curve {
     Slerp,
 }
 
-/// What drives the nodes.
+/// The trajectory of the nodes.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
 #[non_exhaustive]
@@ -81,7 +81,7 @@ pub struct ControlSpec {
     pub clip: [f64; 2],
     /// Nodes and how Gaussians follow them.
     pub skin: SkinSpec,
-    /// What drives the nodes.
+    /// The trajectory of the nodes.
     pub trajectory: TrajectorySpec,
 }
 

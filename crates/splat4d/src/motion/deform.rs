@@ -37,7 +37,7 @@ pub struct DeformSpec {
     pub seed: u64,
     /// First and last second of the clip: where t̂ is 0 and 1.
     pub clip: [f64; 2],
-    /// What the trunk sees of x̂ and t̂.
+    /// Encoding of x̂ and t̂ for the trunk.
     pub input: Input,
     /// Numbers in a hidden layer of the trunk.
     pub width: usize,
@@ -49,7 +49,7 @@ pub struct DeformSpec {
     pub rigid: bool,
 }
 
-/// What a trunk sees.
+/// Input encoding of a trunk.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case", deny_unknown_fields)]
 pub enum Input {
@@ -59,7 +59,7 @@ pub enum Input {
         x_levels: usize,
         /// Levels of t̂.
         t_levels: usize,
-        /// Whether γ(t̂) goes through a small network first ([`TIME_WIDTH`] → [`TIME_OUTPUTS`]).
+        /// Whether γ(t̂) goes through a small network first (`TIME_WIDTH` → `TIME_OUTPUTS`).
         time_net: bool,
     },
     /// Hash grids.
@@ -72,9 +72,9 @@ pub enum Input {
 }
 
 /// Hidden numbers of the network that only sees time (Yang et al. 2024, synthetic scenes).
-pub const TIME_WIDTH: usize = 256;
-/// What it hands to the trunk.
-pub const TIME_OUTPUTS: usize = 30;
+pub(crate) const TIME_WIDTH: usize = 256;
+/// Number of its outputs, which the trunk gets.
+pub(crate) const TIME_OUTPUTS: usize = 30;
 /// Axes of the grids that see time, among (x, y, z, t).
 const TIME_AXES: [[usize; 3]; 3] = [[0, 1, 3], [1, 2, 3], [0, 2, 3]];
 /// Numbers of a point that grids see.
@@ -128,7 +128,7 @@ pub struct Deform {
     trunk: Mlp,
 }
 
-/// What one answer remembers for its backward.
+/// State that one answer keeps for its backward.
 #[derive(Debug)]
 struct Own<F> {
     /// Whether the network was asked.
@@ -390,7 +390,7 @@ impl<F: Real> Motion<F> for Deform {
         Spec::DeformMlp(self.spec.clone())
     }
 
-    /// What the trunk sees and what comes out, each with its gradient; of the hidden layers what [`Kept`] keeps.
+    /// Bytes of the trunk's inputs and outputs, each with its gradient; of the hidden layers what [`Kept`] keeps.
     fn scratch_bytes(&self, _p: &Params<F>, rows: usize) -> u64 {
         let shape = self.trunk.shape();
         let number = size_of::<F>();

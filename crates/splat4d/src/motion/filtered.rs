@@ -1,6 +1,6 @@
 //! `filtered`: a Kalman-like filter in Wasserstein geometry around any model.
 //!
-//! What the model inside answers at t is an observation Nₒ. From its answers one frame (and one baseline more) earlier
+//! The answer of the model inside at t is an observation Nₒ. From its answers one frame (and one baseline more) earlier
 //! follows a prediction Nₚ at constant velocity, Exp(−Log) (see [`Predictor`]). The state that is drawn lies between:
 //!
 //! | fusion | state |
@@ -37,7 +37,7 @@ use std::any::Any;
 use std::sync::Arc;
 
 /// χ² with three degrees of freedom is larger once in a hundred times.
-pub const GATE: f64 = 11.3;
+pub(crate) const GATE: f64 = 11.3;
 /// Most frames between the two states that a velocity is taken from: half a second at 30 frames a second.
 pub const MAX_BASELINE: usize = 16;
 /// Most frames of history: two seconds at 30 frames a second; every one is an answer of the model inside.
@@ -124,7 +124,7 @@ impl Model for FilteredSpec {
     /// Makes the model inside, then the filter's own table.
     fn build<F: Real>(&self, p: &mut Params<F>) -> Result<Arc<dyn Motion<F>>> {
         self.check()?;
-        let inner = super::build(&self.inner, p)?;
+        let inner = super::build_as(&self.inner, p)?;
         Ok(Arc::new(Filtered::around(inner, self.clone(), p)?))
     }
 
@@ -192,7 +192,7 @@ impl<F: Real> Filtered<F> {
         (1..=history + 1 + baseline).filter(move |&k| k <= history + 1 || k > baseline)
     }
 
-    /// What the model inside is asked in a step; one question a time, for all rows where questions differ in theirs.
+    /// Questions to the model inside in a step; one question a time, for all rows where questions differ in theirs.
     fn questions<'a>(&self, q: &[At<'a, F>]) -> Vec<At<'a, F>> {
         let mut all: Vec<At<'a, F>> = Vec::with_capacity(3 * q.len());
         let mut add = |new: At<'a, F>| match all.iter_mut().find(|old| old.of == new.of && old.t == new.t) {
@@ -251,17 +251,17 @@ impl<F: Real> Filtered<F> {
     }
 }
 
-/// What the model inside computes for a step.
+/// Values that the model inside computes for a step.
 #[derive(Default)]
 struct Shared {
     inner: Cache,
 }
 
-/// What a fused answer remembers.
+/// State that a fused answer keeps for its backward.
 struct Own<F> {
     /// The observation.
     seen: Tape<F>,
-    /// What the model inside answered earlier, by frames; unused places are empty.
+    /// Earlier answers of the model inside, by frames; unused places are empty.
     earlier: Vec<Tape<F>>,
     /// States at t and earlier, where the filter runs through its history; place 0 is unused.
     states: Vec<Table<F>>,

@@ -32,7 +32,7 @@ const TASK_ROWS: usize = 1024;
 /// Numbers of a task that adds or masks: 128 kB in f32.
 const TASK_NUMBERS: usize = 1 << 15;
 
-/// What the planes may change.
+/// Attributes that the planes may change.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Heads {
@@ -73,7 +73,7 @@ pub struct HexplaneSpec {
     pub net_width: usize,
     /// Linear maps of the trunk; 0 is 1.
     pub defor_depth: usize,
-    /// What the planes may change.
+    /// Attributes that the planes may change.
     pub heads: Heads,
     /// [`Phase::levels`] of a scene whose training is not over; the features of the other levels are zero.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -137,7 +137,7 @@ impl HexplaneSpec {
         self.unlocked.unwrap_or(self.planes.multires.len())
     }
 
-    /// What a head's output 1 moves a position by, scene units: half the longest side of the box.
+    /// Displacement of a position for a head's output 1, scene units: half the longest side of the box.
     fn reach(&self) -> f64 {
         (0..3).map(|k| 0.5 * (self.high[k] - self.low[k])).fold(0.0, f64::max)
     }
@@ -239,7 +239,7 @@ impl Hexplane {
     }
 }
 
-/// What a chunk of rows is turned into on its way to the heads.
+/// Activations of a chunk of rows up to the heads.
 #[derive(Default)]
 struct Activations<F> {
     /// [n, C·levels]
@@ -259,7 +259,7 @@ struct Back<F> {
     waiting: Vec<[F; LANES]>,
 }
 
-/// What a tape remembers.
+/// The model's own part of a tape.
 #[derive(Default)]
 struct Own<F> {
     /// Positions in the box's [0, 1]³.

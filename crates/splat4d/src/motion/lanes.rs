@@ -10,7 +10,7 @@ use crate::scene::{BLOCK, Rows, Table};
 use crate::simd::{Kernel, Simd, dispatch, each, total};
 
 /// One number of sixteen rows.
-pub type Lane<F> = [F; BLOCK];
+pub(crate) type Lane<F> = [F; BLOCK];
 
 /// How the rows of a batch lie in a table.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -25,7 +25,7 @@ enum Lie {
 
 /// Sixteen rows of a table, in increasing order; the last ones may be one row several times.
 #[derive(Clone, Copy, Debug)]
-pub struct Span {
+pub(crate) struct Span {
     rows: [u32; BLOCK],
     lie: Lie,
 }
@@ -49,13 +49,13 @@ impl Span {
 
     /// The row of a lane.
     #[inline(always)]
-    pub fn row(&self, lane: usize) -> usize {
+    pub(crate) fn row(&self, lane: usize) -> usize {
         self.rows[lane] as usize
     }
 
     /// `W` neighbouring columns of the rows.
     #[inline(always)]
-    pub fn read<F: Real, const W: usize>(&self, table: &Table<F>, col: usize) -> [Lane<F>; W] {
+    pub(crate) fn read<F: Real, const W: usize>(&self, table: &Table<F>, col: usize) -> [Lane<F>; W] {
         let mut out = [[F::ZERO; BLOCK]; W];
         let (data, width) = (table.data(), table.width());
         match self.lie {
@@ -95,7 +95,7 @@ impl Span {
 
 /// Sixteen rows that are worked on together.
 #[derive(Clone, Copy, Debug)]
-pub struct Batch {
+pub(crate) struct Batch {
     /// Rows of the layer's tables.
     pub ids: Span,
     /// Rows of the compact answer.
@@ -113,20 +113,20 @@ impl Batch {
 
     /// The sum of the live lanes, as a tree.
     #[inline(always)]
-    pub fn sum<F: Real>(&self, lane: Lane<F>) -> f64 {
+    pub(crate) fn sum<F: Real>(&self, lane: Lane<F>) -> f64 {
         total(each(|l| if self.live[l] { lane[l].f64() } else { 0.0 }))
     }
 
     /// Writes neighbouring columns of one block of an answer; only [`fill`] has whole blocks.
     #[inline(always)]
-    pub fn write<F: Real, const W: usize>(&self, view: &mut TableMut<'_, F>, col: usize, values: &[Lane<F>; W]) {
+    pub(crate) fn write<F: Real, const W: usize>(&self, view: &mut TableMut<'_, F>, col: usize, values: &[Lane<F>; W]) {
         let from = self.place(view, self.at, col);
         view.data[from..from + W * BLOCK].copy_from_slice(values.as_flattened());
     }
 
     /// Neighbouring columns of one block of an answer, as they are now.
     #[inline(always)]
-    pub fn lanes<F: Real, const W: usize>(&self, view: &TableMut<'_, F>, col: usize) -> [Lane<F>; W] {
+    pub(crate) fn lanes<F: Real, const W: usize>(&self, view: &TableMut<'_, F>, col: usize) -> [Lane<F>; W] {
         let from = self.place(view, self.at, col);
         let lanes = view.data[from..from + W * BLOCK].as_chunks().0;
         {
@@ -138,7 +138,7 @@ impl Batch {
 
     /// Adds to neighbouring columns of the live rows of one of the layer's tables.
     #[inline(always)]
-    pub fn add<F: Real, const W: usize>(&self, view: &mut TableMut<'_, F>, col: usize, values: &[Lane<F>; W]) {
+    pub(crate) fn add<F: Real, const W: usize>(&self, view: &mut TableMut<'_, F>, col: usize, values: &[Lane<F>; W]) {
         if self.ids.lie != Lie::Block {
             for l in (0..BLOCK).filter(|&l| self.live[l]) {
                 view.add::<W>(self.ids.row(l), col, each(|c| values[c][l]));
@@ -162,21 +162,25 @@ impl Batch {
     }
 }
 
-/// What is done to a batch. `run` must be `#[inline(always)]`, or it would be compiled for one SIMD level only.
-pub trait Work<F: Real, const N: usize>: Sync {
+/// Work on a batch of rows. `run` must be `#[inline(always)]`, or it would be compiled for one SIMD level only.
+pub(crate) trait Work<F: Real, const N: usize>: Sync {
     /// Reads rows, and writes or adds to the tables' views; returns whatever is to be summed.
     fn run(&self, batch: &Batch, tables: &mut [TableMut<'_, F>; N]) -> f64;
 }
 
 /// Does `work` for every row of an answer, whose tables these are; all 16 rows of a block are written, also those past the
 /// last row, which mean nothing.
-pub fn fill<F: Real, const N: usize>(work: &impl Work<F, N>, tables: [&mut Table<F>; N], rows: Rows<'_>) {
+pub(crate) fn fill<F: Real, const N: usize>(work: &impl Work<F, N>, tables: [&mut Table<F>; N], rows: Rows<'_>) {
     let simd = Simd::detect();
     par_split(tables.map(Table::view_mut), &|views| dispatch(simd, Fill { work, views, rows }));
 }
 
 /// Does `work` for the asked rows of a layer's tables; returns the sum of what it returns, in a fixed order.
-pub fn scatter<F: Real, const N: usize>(work: &impl Work<F, N>, tables: [&mut Table<F>; N], rows: Rows<'_>) -> f64 {
+pub(crate) fn scatter<F: Real, const N: usize>(
+    work: &impl Work<F, N>,
+    tables: [&mut Table<F>; N],
+    rows: Rows<'_>,
+) -> f64 {
     let simd = Simd::detect();
     par_split(tables.map(Table::view_mut), &|views| dispatch(simd, Scatter { work, views, rows }))
 }
@@ -231,7 +235,7 @@ impl<F: Real, W: Work<F, N>, const N: usize> Kernel for Scatter<'_, F, W, N> {
 
 /// All batches of the asked rows among `first..end`, where `first` is that of a block. An iterator, since a closure would be
 /// compiled by itself and for the baseline alone.
-pub struct Batches<'a> {
+pub(crate) struct Batches<'a> {
     rows: Rows<'a>,
     /// The next block, or place in the list of rows; and the end of these.
     next: usize,
@@ -243,7 +247,7 @@ pub struct Batches<'a> {
 impl<'a> Batches<'a> {
     /// Panics: a row that is asked for does not exist, when its batch is read.
     #[inline(always)]
-    pub fn new(rows: Rows<'a>, first: usize, end: usize) -> Self {
+    pub(crate) fn new(rows: Rows<'a>, first: usize, end: usize) -> Self {
         let (next, to) = match rows {
             Rows::All => (first / BLOCK, end.div_ceil(BLOCK)),
             Rows::Some(ids) => {

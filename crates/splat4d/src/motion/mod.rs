@@ -8,9 +8,9 @@ pub mod control;
 pub mod deform;
 pub mod filtered;
 pub mod hexplane;
-pub mod lanes;
+pub(crate) mod lanes;
 pub mod native4d;
-pub mod registry;
+pub(crate) mod registry;
 pub mod skin;
 pub mod spacetime;
 pub mod ssm;
@@ -52,7 +52,7 @@ impl<F: Real> At<'_, F> {
         self.rows.len(self.p.rows_of(self.of))
     }
 
-    /// Whether none is.
+    /// Whether no splat is asked for.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
@@ -83,7 +83,7 @@ impl std::fmt::Debug for Slot {
     }
 }
 
-/// What a model computes once a step for all questions together; its gradient is another one.
+/// Values that a model computes once a step for all questions together; the gradient is another one.
 pub type Cache = Slot;
 
 /// One answer, and what the model needs to remember of it for its backward.
@@ -132,15 +132,7 @@ registry! {
     }
 }
 
-impl Spec {
-    /// The model itself, without a filter around it.
-    pub fn core(&self) -> &Spec {
-        match self {
-            Spec::Filtered(f) => &f.inner,
-            other => other,
-        }
-    }
-}
+impl Spec {}
 
 /// A motion model. Immutable: a spec and keys.
 pub trait Motion<F: Real = f32>: Any + Send + Sync {
@@ -214,13 +206,13 @@ pub trait Motion<F: Real = f32>: Any + Send + Sync {
         None
     }
 
-    /// dμ/dt in scene units a second, [rows, 3]: central differences over ± [`VELOCITY_STEP`] unless a model knows better.
+    /// dμ/dt in scene units a second, [rows, 3]: central differences over ± `VELOCITY_STEP` unless a model knows better.
     fn velocity(&self, q: &At<'_, F>, out: &mut Table<F>) {
         central_velocity(self, q, out);
     }
 }
 
-/// dμ/dt by central differences over ± [`VELOCITY_STEP`].
+/// dμ/dt by central differences over ± `VELOCITY_STEP`.
 pub fn central_velocity<F: Real, M: Motion<F> + ?Sized>(model: &M, q: &At<'_, F>, out: &mut Table<F>) {
     let sides = [-VELOCITY_STEP, VELOCITY_STEP].map(|h| {
         let side = At { t: Time(q.t.0 + h), ..*q };
@@ -237,10 +229,10 @@ pub fn central_velocity<F: Real, M: Motion<F> + ?Sized>(model: &M, q: &At<'_, F>
 }
 
 /// Half the step of the default velocity: half a frame at 60 frames a second, seconds.
-pub const VELOCITY_STEP: f64 = 1.0 / 120.0;
+pub(crate) const VELOCITY_STEP: f64 = 1.0 / 120.0;
 
 /// Calls `f(j, id, tables)` for every asked row, in parallel over runs of table rows, and returns the sum of the results
-/// in a fixed order. `tables` are views that hold row `id`; j is the compact row. Models that can, use [`lanes`].
+/// in a fixed order. `tables` are views that hold row `id`; j is the compact row. Models that can, use `lanes`.
 pub fn for_rows<F: Real, const N: usize>(
     tables: [&mut Table<F>; N],
     rows: Rows<'_>,

@@ -53,7 +53,7 @@ pub struct Phase {
 }
 
 /// Motion as a polynomial in time around the centre of each Gaussian's life: what files of kinematic Gaussians hold, and
-/// what bakes without a fit where it is [straight](Self::is_straight).
+/// what bakes without a fit where it is straight.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Polynomial {
     /// Order in Δ, seconds from the centre; 0: positions stay.
@@ -68,7 +68,7 @@ pub struct Polynomial {
 
 impl Polynomial {
     /// Whether everything goes along straight lines and nothing turns.
-    pub fn is_straight(&self) -> bool {
+    pub(crate) fn is_straight(&self) -> bool {
         self.order <= 1 && self.rotation_rates.is_none()
     }
 }
@@ -131,7 +131,13 @@ macro_rules! registry {
         /// Makes the model, and in `p` the tables it needs (or claims the loaded ones).
         ///
         /// Errors: `Spec::Custom`; numbers out of their ranges; loaded arrays of the wrong shape.
-        pub fn build<F: Real>(spec: &Spec, p: &mut Params<F>) -> Result<Arc<dyn Motion<F>>> {
+        pub fn build(spec: &Spec, p: &mut Params) -> Result<Arc<dyn Motion>> {
+            build_as(spec, p)
+        }
+
+        /// As [`build`], over any kind of numbers: gradients are checked in f64. It is apart so that the models over f32
+        /// are compiled once, here, and not again in every crate that makes one.
+        pub fn build_as<F: Real>(spec: &Spec, p: &mut Params<F>) -> Result<Arc<dyn Motion<F>>> {
             match spec {
                 $(Spec::$variant $(($bound))? => Model::build($model, p),)*
                 $(Spec::$w_variant($w_bound) => Model::build($wrapper, p),)*

@@ -39,7 +39,7 @@ pub const MAX_NODES: usize = 1 << 16;
 /// Most nodes that pull one Gaussian.
 pub const MAX_NEIGHBOURS: usize = 8;
 /// Most hyper coordinates.
-pub const MAX_HYPER: usize = 32;
+pub(crate) const MAX_HYPER: usize = 32;
 /// Nodes on a Gaussian's list beyond those that pull it: room for weights to shift between two refreshes.
 const SPARE_CANDIDATES: usize = 5;
 /// Spread of the nodes' hyper coordinates at the start, in node spacings: enough to break the tie (SC-GS: 1e-2).
@@ -54,15 +54,15 @@ const LONE_RADIUS: f64 = 1.0;
 /// Column of the log radius in the table of nodes.
 pub const NODE_LOG_RADIUS: usize = 3;
 /// Column of the weight logit in the table of nodes.
-pub const NODE_LOGIT: usize = 4;
+pub(crate) const NODE_LOGIT: usize = 4;
 /// First column of the hyper coordinates in the table of nodes.
 pub const NODE_HYPER: usize = 5;
 /// Numbers of a node's pose: shift 3, quaternion residual about the identity 4.
-pub const POSE: usize = 7;
+pub(crate) const POSE: usize = 7;
 /// Columns of a table of poses.
 pub const POSE_COLUMNS: [(&str, usize); 2] = [("shift", 3), ("turn", 4)];
 
-/// What drives control nodes.
+/// The trajectories of control nodes.
 pub trait Trajectory<F: Real>: Send + Sync {
     /// Once a step with all its times: scans, networks.
     fn prepare(&self, _p: &Params<F>, _times: &[Time], _cache: &mut Slot) {}
@@ -100,7 +100,7 @@ pub struct SkinSpec {
     pub nodes: usize,
     /// Nodes that pull each Gaussian, 1 to [`MAX_NEIGHBOURS`].
     pub neighbours: usize,
-    /// Hyper coordinates of Gaussians and nodes, 0 to [`MAX_HYPER`].
+    /// Hyper coordinates of Gaussians and nodes, 0 to `MAX_HYPER`.
     pub hyper: usize,
     /// Whether Gaussians have a motion mask.
     pub mask: bool,
@@ -136,7 +136,7 @@ impl SkinSpec {
 /// The tables of a skin.
 #[derive(Clone, Copy, Debug)]
 pub struct Skin {
-    /// What it was made with.
+    /// The settings it was made with.
     pub spec: SkinSpec,
     /// Nodes: `node_means` 3, `node_log_radii` 1, `node_logits` 1, `node_hyper` h.
     pub nodes: Key,
@@ -243,7 +243,7 @@ pub struct Skinned<F: Real> {
     spec: Spec,
 }
 
-/// What a step computes once: weights, and the nodes' frames at all its times.
+/// Values that a step computes once: weights, and the nodes' frames at all its times.
 struct Prepared<F> {
     weights: Weights<F>,
     times: Vec<Time>,
@@ -274,7 +274,7 @@ struct Pending<F> {
 
 impl<F: Real> Skinned<F> {
     /// `spec`: what files store of it. The trajectory must give as many poses as the skin has nodes.
-    pub fn new(skin: Skin, trajectory: Box<dyn Trajectory<F>>, spec: Spec) -> Self {
+    pub(crate) fn new(skin: Skin, trajectory: Box<dyn Trajectory<F>>, spec: Spec) -> Self {
         Self { skin, trajectory: trajectory.into(), spec }
     }
 

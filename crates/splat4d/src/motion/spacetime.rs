@@ -21,13 +21,13 @@ use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
 /// Highest order of the polynomial.
-pub const MAX_ORDER: usize = 3;
+pub(crate) const MAX_ORDER: usize = 3;
 
 /// The model as plain data.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SpacetimeSpec {
-    /// Order of the polynomial in Δ, 0 to [`MAX_ORDER`].
+    /// Order of the polynomial in Δ, 0 to `MAX_ORDER`.
     pub order: usize,
     /// Whether quaternions have a rate.
     pub rotation: bool,
@@ -342,7 +342,7 @@ impl<F: Real> Work<F, 4> for Backward<'_, F> {
     }
 }
 
-/// What a Gaussian shows of itself, [splats, 9]: base colour, view features, time features times Δ.
+/// Colour channels of Gaussians, [splats, 9]: base colour, view features, time features times Δ.
 #[derive(Debug)]
 struct Channels<F>(Table<F>);
 

@@ -11,7 +11,7 @@
 //! - `equivariance`: none; `frames`: all that the network sees and says is in local frames of the nodes (`nn::frames`),
 //!   so that a turned scene is a turned scene; `vector`: vector neurons (`nn::vector`), which mirror exactly, too.
 //!
-//! What a node knows of its surroundings (positions, frames, neighbours) is taken when nodes are placed or edited and held
+//! A node's context (positions, frames, neighbours) is taken when nodes are placed or edited and held
 //! fixed: no gradient goes through it to the nodes' positions.
 
 mod context;
@@ -44,7 +44,7 @@ pub enum Mode {
     Causal,
 }
 
-/// What the network says of a tick.
+/// Meaning of the network's output at a tick.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Output {
@@ -92,7 +92,7 @@ pub struct SsmSpec {
     pub extent: f64,
     /// Which ticks a pose may depend on.
     pub mode: Mode,
-    /// What the network says of a tick.
+    /// Meaning of the network's output at a tick.
     pub output: Output,
     /// Which motions of the whole scene are followed exactly.
     pub equivariance: Equivariance,
@@ -152,9 +152,9 @@ impl SsmSpec {
     }
 }
 
-/// What drives the nodes.
+/// The trajectory of the nodes.
 #[derive(Clone, Debug)]
-pub struct Field {
+pub(crate) struct Field {
     spec: SsmSpec,
     net: Net,
     /// Nodes: `node_embeddings` D.
@@ -193,7 +193,7 @@ pub fn columns(spec: &SsmSpec) -> Result<(Vec<String>, Vec<String>)> {
 
 impl Field {
     /// Makes or claims the tables in `p`; `nodes` is the table of the skin. Errors: as [`build`](super::build).
-    pub fn new<F: Real>(spec: &SsmSpec, nodes: Key, p: &mut Params<F>) -> Result<Self> {
+    pub(crate) fn new<F: Real>(spec: &SsmSpec, nodes: Key, p: &mut Params<F>) -> Result<Self> {
         spec.check()?;
         let count = p[nodes].rows();
         if count.saturating_mul(2 * spec.ticks) > MAX_SCANNED {
@@ -289,7 +289,7 @@ fn embedding_lanes<F: Real>(table: &Table<F>, block: usize) -> Vec<Lane<F>> {
     table.block(block).as_chunks::<BLOCK>().0.to_vec()
 }
 
-/// What a step computes once.
+/// Values that a step computes once.
 #[derive(Default)]
 struct Scan<F> {
     prepared: Option<Prepared<F>>,

@@ -87,7 +87,7 @@ impl<F: Real> Work<F, 1> for Backward<'_, F> {
 
 /// [`activate`] of sixteen rows.
 #[inline(always)]
-pub fn activate_lanes<F: Real>(g: &[Lane<F>; 11]) -> [Lane<F>; 10] {
+pub(crate) fn activate_lanes<F: Real>(g: &[Lane<F>; 11]) -> [Lane<F>; 10] {
     let mut out = [[F::ZERO; BLOCK]; 10];
     for l in 0..BLOCK {
         let row = activate(each(|c| g[c][l]));
@@ -100,7 +100,7 @@ pub fn activate_lanes<F: Real>(g: &[Lane<F>; 11]) -> [Lane<F>; 10] {
 
 /// [`activate_backward`] of sixteen rows.
 #[inline(always)]
-pub fn activate_backward_lanes<F: Real>(g: &[Lane<F>; 11], d: &[Lane<F>; 10]) -> [Lane<F>; 11] {
+pub(crate) fn activate_backward_lanes<F: Real>(g: &[Lane<F>; 11], d: &[Lane<F>; 10]) -> [Lane<F>; 11] {
     let mut out = [[F::ZERO; BLOCK]; 11];
     for l in 0..BLOCK {
         let row = activate_backward(each(|c| g[c][l]), each(|c| d[c][l]));

@@ -104,7 +104,8 @@ impl Tracked {
     }
 
     /// Seconds of every frame.
-    pub fn times(&self) -> &[f64] {
+    #[cfg(test)]
+    pub(crate) fn times(&self) -> &[f64] {
         &self.spec.times
     }
 

@@ -7,10 +7,10 @@
 use crate::math::Real;
 
 /// More levels than any precision could tell apart; files with more are refused.
-pub const MAX_LEVELS: usize = 24;
+pub(crate) const MAX_LEVELS: usize = 24;
 
 /// Numbers that [`encode`] makes of `inputs` numbers: inputs·(2·levels + 1).
-pub fn encoded(inputs: usize, levels: usize) -> usize {
+pub(crate) fn encoded(inputs: usize, levels: usize) -> usize {
     inputs * (2 * levels + 1)
 }
 
@@ -18,7 +18,7 @@ pub fn encoded(inputs: usize, levels: usize) -> usize {
 ///
 /// Panics: `out` has another length.
 #[inline]
-pub fn encode<F: Real>(x: &[F], levels: usize, out: &mut [F]) {
+pub(crate) fn encode<F: Real>(x: &[F], levels: usize, out: &mut [F]) {
     let d = x.len();
     assert_eq!(out.len(), encoded(d, levels), "an encoding of {d} numbers to {levels} levels needs its own length");
     out[..d].copy_from_slice(x);
@@ -35,7 +35,7 @@ pub fn encode<F: Real>(x: &[F], levels: usize, out: &mut [F]) {
 ///
 /// d sin(2^k x) = 2^k cos(2^k x) dx, d cos(2^k x) = −2^k sin(2^k x) dx. Panics: lengths differ.
 #[inline]
-pub fn encode_backward<F: Real>(x: &[F], levels: usize, d_out: &[F], d_x: &mut [F]) {
+pub(crate) fn encode_backward<F: Real>(x: &[F], levels: usize, d_out: &[F], d_x: &mut [F]) {
     let d = x.len();
     assert_eq!((d_x.len(), d_out.len()), (d, encoded(d, levels)), "a gradient has the shape of what it is of");
     d_x.copy_from_slice(&d_out[..d]);

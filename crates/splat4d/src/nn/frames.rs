@@ -13,24 +13,24 @@ use std::cmp::Ordering;
 use std::collections::BinaryHeap;
 
 /// Neighbours whose offsets make a frame.
-pub const NEIGHBOURS: usize = 12;
+pub(crate) const NEIGHBOURS: usize = 12;
 /// Relative gap of moments (of the largest) below which an axis is ill-defined; the same for third moments.
 const LEAST_GAP: f64 = 0.05;
 
 /// A frame: row i of the matrix holds the world component i of the three axes (world = frame · local).
-pub type Frame = [[f64; 3]; 3];
+pub(crate) type Frame = [[f64; 3]; 3];
 
 /// The world's own axes.
-pub const WORLD: Frame = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
+pub(crate) const WORLD: Frame = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
 
 /// The `count` nearest other points' offsets, nearest first, row after row; zero where there are too few points.
-pub fn offsets(points: &[[f64; 3]], count: usize) -> Vec<[f64; 3]> {
+pub(crate) fn offsets(points: &[[f64; 3]], count: usize) -> Vec<[f64; 3]> {
     let near = knn(&single(points), count);
     near.iter().enumerate().map(|(i, &j)| minus(points[j as usize], points[i / count])).collect()
 }
 
 /// A frame a point.
-pub fn local_frames(points: &[[f64; 3]]) -> Vec<Frame> {
+pub(crate) fn local_frames(points: &[[f64; 3]]) -> Vec<Frame> {
     let near = knn(&single(points), NEIGHBOURS);
     let own: Vec<Axes> = near.chunks_exact(NEIGHBOURS).enumerate().map(|(i, n)| Axes::of(points, i, n)).collect();
     let center = mean(points);
@@ -60,7 +60,7 @@ pub fn local_frames(points: &[[f64; 3]]) -> Vec<Frame> {
 }
 
 /// The mean of the points.
-pub fn mean(points: &[[f64; 3]]) -> [f64; 3] {
+pub(crate) fn mean(points: &[[f64; 3]]) -> [f64; 3] {
     [0, 1, 2].map(|k| points.iter().map(|p| p[k]).sum::<f64>() / points.len().max(1) as f64)
 }
 

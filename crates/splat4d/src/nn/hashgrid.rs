@@ -19,7 +19,7 @@ const PRIMES: [u32; MAX_DIMS] = [1, 2_654_435_761, 805_459_861, 3_674_653_429];
 /// Entries start uniform in ± this (Müller et al. 2022 §4).
 const INITIAL: f64 = 1e-4;
 /// Most axes of a grid.
-pub const MAX_DIMS: usize = 4;
+pub(crate) const MAX_DIMS: usize = 4;
 /// Most features of an entry.
 const MAX_FEATURES: usize = 8;
 /// Most levels, features an entry, cells a side and, as a power of two, entries a level.
@@ -127,7 +127,7 @@ impl HashGrid {
     }
 
     /// Names of the column groups that learn, level by level: coarse ones first.
-    pub fn columns(&self) -> &[String] {
+    pub(crate) fn columns(&self) -> &[String] {
         &self.columns
     }
 

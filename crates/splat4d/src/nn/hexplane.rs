@@ -22,8 +22,8 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 /// The two axes of every plane, first axis contiguous; axis 3 is time.
-pub const AXES: [[usize; 2]; 6] = [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]];
-/// Names of the planes, in the order of [`AXES`].
+pub(crate) const AXES: [[usize; 2]; 6] = [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]];
+/// Names of the planes, in the order of `AXES`.
 pub const NAMES: [&str; 6] = ["xy", "xz", "xt", "yz", "yt", "zt"];
 /// The planes without time.
 pub const SPATIAL: [usize; 3] = [0, 1, 3];
@@ -31,7 +31,7 @@ pub const SPATIAL: [usize; 3] = [0, 1, 3];
 pub const TEMPORAL: [usize; 3] = [2, 4, 5];
 
 /// Channels are worked on so many at a time.
-pub const LANES: usize = 16;
+pub(crate) const LANES: usize = 16;
 /// Most channels: four times what anyone uses.
 const MAX_CHANNELS: usize = 128;
 /// Most levels.
@@ -55,7 +55,7 @@ type Lane<F> = [F; LANES];
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PlaneShape {
-    /// Features a level, C; a multiple of [`LANES`].
+    /// Features a level, C; a multiple of `LANES`.
     pub channels: usize,
     /// Grid points along a spatial axis at multiple 1.
     pub resolution: usize,
@@ -91,7 +91,7 @@ impl PlaneShape {
     }
 
     /// Features of a point: C a level.
-    pub fn features(&self) -> usize {
+    pub(crate) fn features(&self) -> usize {
         self.channels * self.multires.len()
     }
 
@@ -101,7 +101,7 @@ impl PlaneShape {
     }
 
     /// Numbers in all planes: Σ over levels of 3·C·R²m² + 3·C·R·m·T.
-    pub fn numbers(&self) -> usize {
+    pub(crate) fn numbers(&self) -> usize {
         (0..self.multires.len())
             .flat_map(|l| (0..6).map(move |p| (l, p)))
             .map(|(l, p)| self.size(l, p).iter().product::<usize>() * self.channels)
@@ -154,11 +154,12 @@ impl Planes {
     }
 
     /// Sizes.
-    pub fn shape(&self) -> &PlaneShape {
+    #[cfg(test)]
+    pub(crate) fn shape(&self) -> &PlaneShape {
         &self.shape
     }
 
-    /// Keys by level, in the order of [`AXES`].
+    /// Keys by level, in the order of `AXES`.
     pub fn keys(&self) -> &[[Key; 6]] {
         &self.keys
     }

@@ -16,11 +16,11 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 /// Most numbers that a layer takes or gives.
-pub const MAX_WIDTH: usize = 4096;
+pub(crate) const MAX_WIDTH: usize = 4096;
 /// Most hidden layers.
-pub const MAX_LAYERS: usize = 64;
+pub(crate) const MAX_LAYERS: usize = 64;
 /// Most weights in all, 64 MB in f32: eight layers of 1400.
-pub const MAX_WEIGHTS: usize = 1 << 24;
+pub(crate) const MAX_WEIGHTS: usize = 1 << 24;
 
 /// Shape of a perceptron: `layers` hidden layers of `width` with ReLU, and a linear one; `layers` 0 is one linear map.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -88,7 +88,7 @@ pub struct Mlp {
     columns: Vec<String>,
 }
 
-/// Record of a forward pass for its backward: the hidden activations of as many rows as [`Kept::BYTES`] hold. The
+/// Record of a forward pass for its backward: the hidden activations of as many rows as `Kept::BYTES` hold. The
 /// others are computed again, to the same bits.
 #[derive(Clone, Debug, Default)]
 pub struct Kept<F> {
@@ -98,7 +98,7 @@ pub struct Kept<F> {
 
 impl<F> Kept<F> {
     /// Memory for activations: 65,000 rows of 8x256. Writing and reading them costs a fifth of computing them again.
-    pub const BYTES: usize = 512 << 20;
+    pub(crate) const BYTES: usize = 512 << 20;
 }
 
 /// A forward pass, for its backward.
@@ -106,7 +106,7 @@ impl<F> Kept<F> {
 pub struct Passed<'a, F> {
     /// Its input, [n, inputs].
     pub x: &'a [F],
-    /// Its shifts; see [`Mlp::forward_shifted`].
+    /// Its shifts; see `Mlp::forward_shifted`.
     pub shifts: &'a [Vec<F>],
     /// The activations that it kept, of the same input, shifts and weights; without them they are computed again.
     pub kept: Option<&'a Kept<F>>,
@@ -176,12 +176,12 @@ impl Mlp {
     }
 
     /// Names of the column groups that learn.
-    pub fn columns(&self) -> &[String] {
+    pub(crate) fn columns(&self) -> &[String] {
         &self.columns
     }
 
     /// Weights and biases in all.
-    pub fn weights(&self) -> usize {
+    pub(crate) fn weights(&self) -> usize {
         self.maps.iter().map(|m| (m.inputs + 1) * m.outputs).sum()
     }
 
@@ -197,7 +197,7 @@ impl Mlp {
 
     /// As [`forward_keeping`](Self::forward_keeping), where `shifts[i]`, unless absent or empty, is added to the bias of
     /// map i: what all rows share (a time's features) need not stand in every row.
-    pub fn forward_shifted<F: Real>(
+    pub(crate) fn forward_shifted<F: Real>(
         &self,
         p: &Params<F>,
         x: &[F],

@@ -3,17 +3,17 @@
 //! Weights are `Space::Fixed` tables of one column, so that matrix products read them as they lie. Results are the same
 //! bits for any number of threads: work is cut by sizes alone, and partial gradients are added in a fixed order.
 
-pub mod encoding;
-pub mod frames;
-pub mod hashgrid;
+pub(crate) mod encoding;
+pub(crate) mod frames;
+pub(crate) mod hashgrid;
 pub mod hexplane;
 pub mod matmul;
 pub mod mlp;
-pub mod sequence;
-pub mod ssm;
+pub(crate) mod sequence;
+pub(crate) mod ssm;
 #[cfg(test)]
 mod tests;
-pub mod vector;
+pub(crate) mod vector;
 
 pub use hashgrid::{HashGrid, HashShape};
 pub use mlp::{InputGrad, Kept, Mlp, MlpShape, Passed};

@@ -18,14 +18,14 @@ const GELU_SLOPE: f64 = 1.702;
 
 /// Named parts of one long slice of weights.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Layout {
+pub(crate) struct Layout {
     parts: Vec<(String, Range<usize>)>,
     len: usize,
 }
 
 impl Layout {
     /// Appends a part of `numbers`; says where it lies.
-    pub fn push(&mut self, name: String, numbers: usize) -> Range<usize> {
+    pub(crate) fn push(&mut self, name: String, numbers: usize) -> Range<usize> {
         let at = self.len..self.len + numbers;
         self.len = at.end;
         self.parts.push((name, at.clone()));
@@ -33,24 +33,19 @@ impl Layout {
     }
 
     /// Names and places, in order.
-    pub fn parts(&self) -> &[(String, Range<usize>)] {
+    pub(crate) fn parts(&self) -> &[(String, Range<usize>)] {
         &self.parts
     }
 
     /// Numbers in all.
-    pub fn len(&self) -> usize {
+    pub(crate) fn len(&self) -> usize {
         self.len
-    }
-
-    /// Whether there are no parts.
-    pub fn is_empty(&self) -> bool {
-        self.len == 0
     }
 }
 
 /// Runs a loop over lanes compiled for the best SIMD level.
 #[inline(always)]
-pub fn fast(work: impl FnOnce()) {
+pub(crate) fn fast(work: impl FnOnce()) {
     struct Do<W>(W);
     impl<W: FnOnce()> Kernel for Do<W> {
         type Out = ();
@@ -63,7 +58,7 @@ pub fn fast(work: impl FnOnce()) {
 }
 
 /// out = W·x + b: W \[outputs, inputs\], b \[outputs\] or nothing, x \[inputs, ticks\], out \[outputs, ticks\].
-pub fn linear<F: Real>(w: &[F], bias: &[F], inputs: usize, x: &[Lane<F>], out: &mut [Lane<F>]) {
+pub(crate) fn linear<F: Real>(w: &[F], bias: &[F], inputs: usize, x: &[Lane<F>], out: &mut [Lane<F>]) {
     let (outputs, columns) = (w.len() / inputs, x.len() / inputs * LANES);
     product(
         Matrix::new(w, outputs, inputs, inputs),
@@ -78,7 +73,7 @@ pub fn linear<F: Real>(w: &[F], bias: &[F], inputs: usize, x: &[Lane<F>], out: &
 }
 
 /// VJP of [`linear`]: adds to d_w, d_bias (may be empty) and d_x.
-pub fn linear_backward<F: Real>(
+pub(crate) fn linear_backward<F: Real>(
     w: &[F],
     inputs: usize,
     x: &[Lane<F>],
@@ -97,7 +92,7 @@ pub fn linear_backward<F: Real>(
 }
 
 /// The sum over ticks and lanes.
-pub fn sum<F: Real>(row: &[Lane<F>]) -> F {
+pub(crate) fn sum<F: Real>(row: &[Lane<F>]) -> F {
     let mut sums = [F::ZERO; LANES];
     for lane in row {
         for l in 0..LANES {
@@ -108,7 +103,7 @@ pub fn sum<F: Real>(row: &[Lane<F>]) -> F {
 }
 
 /// x·σ(1.702x)
-pub fn gelu<F: Real>(x: &[Lane<F>], out: &mut [Lane<F>]) {
+pub(crate) fn gelu<F: Real>(x: &[Lane<F>], out: &mut [Lane<F>]) {
     fast(|| {
         for (x, out) in x.iter().zip(out) {
             for l in 0..LANES {
@@ -119,7 +114,7 @@ pub fn gelu<F: Real>(x: &[Lane<F>], out: &mut [Lane<F>]) {
 }
 
 /// VJP of [`gelu`], in place: the gradient to the output becomes that to x.
-pub fn gelu_backward<F: Real>(x: &[Lane<F>], d: &mut [Lane<F>]) {
+pub(crate) fn gelu_backward<F: Real>(x: &[Lane<F>], d: &mut [Lane<F>]) {
     fast(|| {
         for (x, d) in x.iter().zip(d) {
             for l in 0..LANES {
@@ -131,7 +126,7 @@ pub fn gelu_backward<F: Real>(x: &[Lane<F>], d: &mut [Lane<F>]) {
 }
 
 /// Normalises over rows: `unit` \[rows, ticks\] gets (x − mean)/deviation, `inverse` \[ticks\] 1/deviation.
-pub fn norm<F: Real>(x: &[Lane<F>], rows: usize, unit: &mut [Lane<F>], inverse: &mut [Lane<F>]) {
+pub(crate) fn norm<F: Real>(x: &[Lane<F>], rows: usize, unit: &mut [Lane<F>], inverse: &mut [Lane<F>]) {
     let ticks = x.len() / rows;
     let share = F::of(1.0 / rows as f64);
     let mut mean = vec![[F::ZERO; LANES]; ticks];
@@ -168,7 +163,7 @@ pub fn norm<F: Real>(x: &[Lane<F>], rows: usize, unit: &mut [Lane<F>], inverse: 
 }
 
 /// VJP of [`norm`]: adds (d_unit − mean(d_unit) − unit·mean(d_unit·unit))/deviation to d_x.
-pub fn norm_backward<F: Real>(unit: &[Lane<F>], inverse: &[Lane<F>], d_unit: &[Lane<F>], d_x: &mut [Lane<F>]) {
+pub(crate) fn norm_backward<F: Real>(unit: &[Lane<F>], inverse: &[Lane<F>], d_unit: &[Lane<F>], d_x: &mut [Lane<F>]) {
     let ticks = inverse.len();
     let share = F::of(ticks as f64 / unit.len() as f64);
     let mut means = vec![[[F::ZERO; LANES]; 2]; ticks];
@@ -195,7 +190,7 @@ pub fn norm_backward<F: Real>(unit: &[Lane<F>], inverse: &[Lane<F>], d_unit: &[L
 
 /// One residual block: where its weights lie.
 #[derive(Clone, Debug)]
-pub struct Block {
+pub(crate) struct Block {
     /// Rows of numbers.
     width: usize,
     norm: [Range<usize>; 2],
@@ -205,7 +200,7 @@ pub struct Block {
 
 /// The state-space layers of a block, one a direction.
 #[derive(Clone, Debug)]
-pub struct Scans {
+pub(crate) struct Scans {
     shape: ssm::Shape,
     /// One of the past, or one of the past and one of the future.
     ways: Vec<(Direction, Range<usize>)>,
@@ -215,7 +210,7 @@ pub struct Scans {
 
 impl Scans {
     /// Appends the layers' weights. `both`: also from the last tick to the first.
-    pub fn new(name: &str, shape: ssm::Shape, ways: &[Direction], first: usize, layout: &mut Layout) -> Self {
+    pub(crate) fn new(name: &str, shape: ssm::Shape, ways: &[Direction], first: usize, layout: &mut Layout) -> Self {
         let mut place = |way: Direction| {
             let side = if way == Direction::Forward { "past" } else { "future" };
             let at = ssm::arrays(shape).map(|(array, n)| layout.push(format!("{name}.{side}.{array}"), n));
@@ -225,31 +220,31 @@ impl Scans {
     }
 
     /// Number of scans.
-    pub fn count(&self) -> usize {
+    pub(crate) fn count(&self) -> usize {
         self.ways.len()
     }
 
     /// First weights.
-    pub fn init<F: Real>(&self, ticks: usize, rng: Rng, w: &mut [F]) {
+    pub(crate) fn init<F: Real>(&self, ticks: usize, rng: Rng, w: &mut [F]) {
         for (i, (_, at)) in self.ways.iter().enumerate() {
             ssm::init(self.shape, ticks, rng.fork(i as u64), &mut w[at.clone()]);
         }
     }
 
     /// The layers as the scan needs them.
-    pub fn discrete<F: Real>(&self, w: &[F], gaps: &[f64]) -> Vec<Discrete<F>> {
+    pub(crate) fn discrete<F: Real>(&self, w: &[F], gaps: &[f64]) -> Vec<Discrete<F>> {
         self.ways.iter().map(|(_, at)| Discrete::new(self.shape, &w[at.clone()], gaps)).collect()
     }
 
     /// VJP of [`discrete`](Self::discrete): `d` are those of the whole net.
-    pub fn discrete_backward<F: Real>(&self, w: &[F], gaps: &[f64], d: &[Discrete<F>], d_w: &mut [F]) {
+    pub(crate) fn discrete_backward<F: Real>(&self, w: &[F], gaps: &[f64], d: &[Discrete<F>], d_w: &mut [F]) {
         for ((_, at), d) in self.ways.iter().zip(&d[self.first..]) {
             Discrete::backward(&w[at.clone()], gaps, d, &mut d_w[at.clone()]);
         }
     }
 
     /// The scans of u \[rows, ticks\], one below the other in y \[ways·rows, ticks\].
-    pub fn forward<F: Real>(
+    pub(crate) fn forward<F: Real>(
         &self,
         layers: &[Discrete<F>],
         u: &[Lane<F>],
@@ -264,7 +259,7 @@ impl Scans {
     }
 
     /// VJP of [`forward`](Self::forward): adds to d_u and to the gradients of the net's layers.
-    pub fn backward<F: Real>(
+    pub(crate) fn backward<F: Real>(
         &self,
         layers: &[Discrete<F>],
         (u, marks): (&[Lane<F>], &[Vec<Pair<F>>]),
@@ -282,7 +277,7 @@ impl Scans {
 
 /// Record of a block's forward for its backward.
 #[derive(Clone, Debug, Default)]
-pub struct BlockTape<F> {
+pub(crate) struct BlockTape<F> {
     unit: Vec<Lane<F>>,
     inverse: Vec<Lane<F>>,
     normed: Vec<Lane<F>>,
@@ -291,14 +286,21 @@ pub struct BlockTape<F> {
 }
 
 /// Makes a buffer `len` long, all zero.
-pub fn clear<F: Real>(buffer: &mut Vec<Lane<F>>, len: usize) {
+pub(crate) fn clear<F: Real>(buffer: &mut Vec<Lane<F>>, len: usize) {
     buffer.clear();
     buffer.resize(len, [F::ZERO; LANES]);
 }
 
 impl Block {
     /// Appends a block's weights to the layout; its layers are the net's from number `first` on.
-    pub fn new(name: &str, width: usize, states: usize, ways: &[Direction], first: usize, layout: &mut Layout) -> Self {
+    pub(crate) fn new(
+        name: &str,
+        width: usize,
+        states: usize,
+        ways: &[Direction],
+        first: usize,
+        layout: &mut Layout,
+    ) -> Self {
         let norm = ["norm.scale", "norm.shift"].map(|part| layout.push(format!("{name}.{part}"), width));
         let shape = ssm::Shape { channels: width, states, copies: 1 };
         let scans = Scans::new(name, shape, ways, first, layout);
@@ -309,19 +311,19 @@ impl Block {
     }
 
     /// The state-space layers.
-    pub fn scans(&self) -> &Scans {
+    pub(crate) fn scans(&self) -> &Scans {
         &self.scans
     }
 
     /// First weights: norms as they are, S4D-Lin, uniform linear maps.
-    pub fn init<F: Real>(&self, ticks: usize, rng: Rng, w: &mut [F]) {
+    pub(crate) fn init<F: Real>(&self, ticks: usize, rng: Rng, w: &mut [F]) {
         w[self.norm[0].clone()].fill(F::ONE);
         self.scans.init(ticks, rng.fork(1), w);
         uniform(&mut w[self.mix[0].clone()], self.scans.count() * self.width, rng.fork(2));
     }
 
     /// x \[width, ticks\] ← x + W·gelu(scans(norm(x))) + b
-    pub fn forward<F: Real>(&self, w: &[F], layers: &[Discrete<F>], x: &mut [Lane<F>], tape: &mut BlockTape<F>) {
+    pub(crate) fn forward<F: Real>(&self, w: &[F], layers: &[Discrete<F>], x: &mut [Lane<F>], tape: &mut BlockTape<F>) {
         let (ticks, inputs) = (x.len() / self.width, self.scans.count() * self.width);
         clear(&mut tape.unit, x.len());
         clear(&mut tape.inverse, ticks);
@@ -342,7 +344,7 @@ impl Block {
     }
 
     /// VJP of [`forward`](Self::forward): d_x, the gradient to what came out, becomes that to what went in.
-    pub fn backward<F: Real>(
+    pub(crate) fn backward<F: Real>(
         &self,
         w: &[F],
         layers: &[Discrete<F>],
@@ -371,13 +373,13 @@ impl Block {
 }
 
 /// First weights of a linear map from `inputs` rows: uniform in ±1/√inputs.
-pub fn uniform<F: Real>(w: &mut [F], inputs: usize, rng: Rng) {
+pub(crate) fn uniform<F: Real>(w: &mut [F], inputs: usize, rng: Rng) {
     let bound = 1.0 / (inputs.max(1) as f64).sqrt();
     w.iter_mut().enumerate().for_each(|(i, w)| *w = F::of(bound * (2.0 * rng.uniform(i as u64) - 1.0)));
 }
 
 /// a += b
-pub fn add<F: Real>(a: &mut [Lane<F>], b: &[Lane<F>]) {
+pub(crate) fn add<F: Real>(a: &mut [Lane<F>], b: &[Lane<F>]) {
     a.as_flattened_mut().iter_mut().zip(b.as_flattened()).for_each(|(a, b)| *a += *b);
 }
 

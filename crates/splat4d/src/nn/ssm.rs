@@ -12,9 +12,9 @@ use crate::scene::BLOCK;
 use crate::simd::{Kernel, Simd, dispatch, total};
 
 /// Sequences that are scanned together.
-pub const LANES: usize = BLOCK;
+pub(crate) const LANES: usize = BLOCK;
 /// Ticks between two marks, from which the backward makes states again.
-pub const CHUNK: usize = 16;
+pub(crate) const CHUNK: usize = 16;
 /// Below this |z| the quotients φ and φ' are taken from their series (the terms left out are below 1e-15).
 const SERIES: f64 = 1e-2;
 /// Ā falls to e^-40 at most in a tick: what decays faster is gone anyway, and 0/0 is not met.
@@ -25,15 +25,15 @@ const LONGEST_LOG_STEP: f64 = 3.0;
 const FIRST_DECAY: f64 = 0.5;
 
 /// One number of sixteen sequences.
-pub type Lane<F> = [F; LANES];
+pub(crate) type Lane<F> = [F; LANES];
 /// A complex number.
-pub type Complex<F> = [F; 2];
+pub(crate) type Complex<F> = [F; 2];
 /// A complex number of sixteen sequences.
-pub type Pair<F> = [Lane<F>; 2];
+pub(crate) type Pair<F> = [Lane<F>; 2];
 
 /// Sizes of a layer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Shape {
+pub(crate) struct Shape {
     /// Channels H, each with its own Λ, Δ, B, C, D.
     pub channels: usize,
     /// Complex states N of a channel.
@@ -44,19 +44,19 @@ pub struct Shape {
 
 /// Names of a layer's learnable arrays, in the order in which they lie in its slice of weights, and numbers of each: a
 /// \[H,N\], ω \[H,N\], B and C \[H,N\] (re, im), D \[H\], log Δ \[H\] (ticks of the grid over the clip: see [`init`]).
-pub fn arrays(shape: Shape) -> [(&'static str, usize); 6] {
+pub(crate) fn arrays(shape: Shape) -> [(&'static str, usize); 6] {
     let (h, n) = (shape.channels, shape.channels * shape.states);
     [("log_decay", n), ("frequency", n), ("input", 2 * n), ("output", 2 * n), ("skip", h), ("log_step", h)]
 }
 
 /// Numbers of a layer's weights.
-pub fn weights(shape: Shape) -> usize {
+pub(crate) fn weights(shape: Shape) -> usize {
     arrays(shape).iter().map(|a| a.1).sum()
 }
 
 /// S4D-Lin: a = log ½, ω = πn, B = 1, C normal with variance 1/N, D = 1, log Δ uniform in [log 1/`ticks`, log 1/N]: the
 /// slowest channel remembers the whole grid, the fastest has ωΔ < π.
-pub fn init<F: Real>(shape: Shape, ticks: usize, rng: Rng, w: &mut [F]) {
+pub(crate) fn init<F: Real>(shape: Shape, ticks: usize, rng: Rng, w: &mut [F]) {
     let (h, n) = (shape.channels, shape.states);
     let s = Slices::of(shape, w);
     for i in 0..h * n {
@@ -101,7 +101,7 @@ impl<'a, F> Slices<'a, F> {
 
 /// Direction of a scan.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Direction {
+pub(crate) enum Direction {
     /// From the first tick to the last: sees the past.
     Forward,
     /// From the last tick to the first: sees the future.
@@ -110,7 +110,7 @@ pub enum Direction {
 
 /// Discretised parameters of a layer, for all ticks: Ā and B̄ \[gaps,H,N\], C \[H,N\], D \[H\]; also the gradient to it.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Discrete<F> {
+pub(crate) struct Discrete<F> {
     shape: Shape,
     /// 1 where ticks are evenly spaced, else one a tick.
     gaps: usize,
@@ -183,7 +183,7 @@ fn against(a: Complex<f64>, b: Complex<f64>) -> Complex<f64> {
 impl<F: Real> Discrete<F> {
     /// Of a layer's weights. `gaps`: time since the tick before, in ticks: one number for evenly spaced ones, else one a
     /// tick (the first as the others; a scan backwards takes the gap to the tick after).
-    pub fn new(shape: Shape, w: &[F], gaps: &[f64]) -> Self {
+    pub(crate) fn new(shape: Shape, w: &[F], gaps: &[f64]) -> Self {
         let mut out = Self::zeros(shape, gaps.len());
         let mut w = w.to_vec();
         let s = Slices::of(shape, &mut w);
@@ -206,7 +206,7 @@ impl<F: Real> Discrete<F> {
     }
 
     /// A gradient that nothing was added to.
-    pub fn zeros(shape: Shape, gaps: usize) -> Self {
+    pub(crate) fn zeros(shape: Shape, gaps: usize) -> Self {
         let n = shape.channels * shape.states;
         let complex = |n| vec![[F::ZERO; 2]; n];
         Self {
@@ -220,12 +220,12 @@ impl<F: Real> Discrete<F> {
     }
 
     /// A gradient to this layer that nothing was added to.
-    pub fn none(&self) -> Self {
+    pub(crate) fn none(&self) -> Self {
         Self::zeros(self.shape, self.gaps)
     }
 
     /// Adds another gradient.
-    pub fn add(&mut self, other: &Self) {
+    pub(crate) fn add(&mut self, other: &Self) {
         let pairs =
             [(&mut self.decay, &other.decay), (&mut self.drive, &other.drive), (&mut self.output, &other.output)];
         for (to, from) in pairs {
@@ -235,7 +235,7 @@ impl<F: Real> Discrete<F> {
     }
 
     /// The VJP of [`new`](Self::new): adds to the gradient of the weights. `d` is the gradient to what `new` gave.
-    pub fn backward(w: &[F], gaps: &[f64], d: &Self, d_w: &mut [F]) {
+    pub(crate) fn backward(w: &[F], gaps: &[f64], d: &Self, d_w: &mut [F]) {
         let (shape, n) = (d.shape, d.shape.states);
         let mut w = w.to_vec();
         let s = Slices::of(shape, &mut w);
@@ -267,17 +267,18 @@ impl<F: Real> Discrete<F> {
     }
 
     /// Rows of numbers: channels times copies.
-    pub fn rows(&self) -> usize {
+    pub(crate) fn rows(&self) -> usize {
         self.shape.channels * self.shape.copies
     }
 
     /// States of all rows before the first tick, all zero: \[rows,N\].
-    pub fn rest(&self) -> Vec<Pair<F>> {
+    pub(crate) fn rest(&self) -> Vec<Pair<F>> {
         vec![[[F::ZERO; LANES]; 2]; self.rows() * self.shape.states]
     }
 
     /// The impulse response K_m = Re(C Ā^m B̄) (+ D at m = 0) of a channel, m < `ticks`; for evenly spaced ticks.
-    pub fn response(&self, channel: usize, ticks: usize) -> Vec<f64> {
+    #[cfg(test)]
+    pub(crate) fn response(&self, channel: usize, ticks: usize) -> Vec<f64> {
         let own = channel * self.shape.states..(channel + 1) * self.shape.states;
         let mut out = vec![0.0; ticks];
         for i in own {
@@ -295,7 +296,7 @@ impl<F: Real> Discrete<F> {
 
     /// The scan. Shapes: u, y \[rows, ticks\]; `state` \[rows,N\] is what stood before the first tick and becomes what stands
     /// after the last; `marks` gets the states at the start of every chunk, \[rows, chunks, N\].
-    pub fn scan(
+    pub(crate) fn scan(
         &self,
         way: Direction,
         u: &[Lane<F>],
@@ -321,7 +322,7 @@ impl<F: Real> Discrete<F> {
         clippy::too_many_arguments,
         reason = "a scan's backward has all that its forward has, and their gradients"
     )]
-    pub fn scan_backward(
+    pub(crate) fn scan_backward(
         &self,
         way: Direction,
         u: &[Lane<F>],

@@ -40,7 +40,7 @@ fn dot<F: Real>(a: &Vector<F>, b: &Vector<F>) -> Lane<F> {
 }
 
 /// VN-ReLU of q with directions k, all \[channels, 3, ticks\]: where ⟨q,k⟩ < 0, q loses what points along k.
-pub fn relu<F: Real>(ticks: usize, q: &[Lane<F>], k: &[Lane<F>], out: &mut [Lane<F>]) {
+pub(crate) fn relu<F: Real>(ticks: usize, q: &[Lane<F>], k: &[Lane<F>], out: &mut [Lane<F>]) {
     fast(|| {
         for c in 0..q.len() / (3 * ticks) {
             for t in 0..ticks {
@@ -60,7 +60,7 @@ pub fn relu<F: Real>(ticks: usize, q: &[Lane<F>], k: &[Lane<F>], out: &mut [Lane
 }
 
 /// VJP of [`relu`]: writes d_q and d_k.
-pub fn relu_backward<F: Real>(
+pub(crate) fn relu_backward<F: Real>(
     ticks: usize,
     (q, k): (&[Lane<F>], &[Lane<F>]),
     d_out: &[Lane<F>],
@@ -90,7 +90,7 @@ pub fn relu_backward<F: Real>(
 }
 
 /// Gates by norms: v_c ← v_c·σ(α_c‖v_c‖ + β_c); v \[channels, 3, ticks\], α and β \[channels\].
-pub fn gate<F: Real>(ticks: usize, alpha: &[F], beta: &[F], v: &mut [Lane<F>]) {
+pub(crate) fn gate<F: Real>(ticks: usize, alpha: &[F], beta: &[F], v: &mut [Lane<F>]) {
     for (c, (&alpha, &beta)) in alpha.iter().zip(beta).enumerate() {
         fast(|| {
             for t in 0..ticks {
@@ -107,7 +107,7 @@ pub fn gate<F: Real>(ticks: usize, alpha: &[F], beta: &[F], v: &mut [Lane<F>]) {
 }
 
 /// VJP of [`gate`], v being what went in: d becomes the gradient to it; adds to those of α and β.
-pub fn gate_backward<F: Real>(
+pub(crate) fn gate_backward<F: Real>(
     ticks: usize,
     (alpha, beta): (&[F], &[F]),
     v: &[Lane<F>],
@@ -135,7 +135,7 @@ pub fn gate_backward<F: Real>(
 }
 
 /// Divides all vectors of a tick by the root of their mean square: `unit` \[channels, 3, ticks\], `inverse` \[ticks\].
-pub fn norm<F: Real>(x: &[Lane<F>], unit: &mut [Lane<F>], inverse: &mut [Lane<F>]) {
+pub(crate) fn norm<F: Real>(x: &[Lane<F>], unit: &mut [Lane<F>], inverse: &mut [Lane<F>]) {
     let ticks = inverse.len();
     let share = F::of(3.0 * ticks as f64 / x.len() as f64);
     fast(|| {
@@ -157,7 +157,7 @@ pub fn norm<F: Real>(x: &[Lane<F>], unit: &mut [Lane<F>], inverse: &mut [Lane<F>
 }
 
 /// VJP of [`norm`]: adds to d_x.
-pub fn norm_backward<F: Real>(unit: &[Lane<F>], inverse: &[Lane<F>], d_unit: &[Lane<F>], d_x: &mut [Lane<F>]) {
+pub(crate) fn norm_backward<F: Real>(unit: &[Lane<F>], inverse: &[Lane<F>], d_unit: &[Lane<F>], d_x: &mut [Lane<F>]) {
     let ticks = inverse.len();
     let share = F::of(3.0 * ticks as f64 / unit.len() as f64);
     let mut means = vec![[F::ZERO; LANES]; ticks];
@@ -176,7 +176,7 @@ pub fn norm_backward<F: Real>(unit: &[Lane<F>], inverse: &[Lane<F>], d_unit: &[L
 
 /// A residual block of vectors: norm → state space → VN-ReLU with its two linear maps → gate → residual.
 #[derive(Clone, Debug)]
-pub struct VectorBlock {
+pub(crate) struct VectorBlock {
     channels: usize,
     scans: Scans,
     maps: [Range<usize>; 2],
@@ -185,7 +185,7 @@ pub struct VectorBlock {
 
 /// Record of a block's forward for its backward.
 #[derive(Clone, Debug, Default)]
-pub struct VectorTape<F> {
+pub(crate) struct VectorTape<F> {
     unit: Vec<Lane<F>>,
     inverse: Vec<Lane<F>>,
     seen: Vec<Lane<F>>,
@@ -197,7 +197,7 @@ pub struct VectorTape<F> {
 
 impl VectorBlock {
     /// Appends a block's weights to the layout; its layers are the net's from number `first` on.
-    pub fn new(
+    pub(crate) fn new(
         name: &str,
         channels: usize,
         states: usize,
@@ -213,12 +213,12 @@ impl VectorBlock {
     }
 
     /// The state-space layers.
-    pub fn scans(&self) -> &Scans {
+    pub(crate) fn scans(&self) -> &Scans {
         &self.scans
     }
 
     /// First weights: S4D-Lin, uniform linear maps, gates half open.
-    pub fn init<F: Real>(&self, ticks: usize, rng: Rng, w: &mut [F]) {
+    pub(crate) fn init<F: Real>(&self, ticks: usize, rng: Rng, w: &mut [F]) {
         self.scans.init(ticks, rng.fork(1), w);
         for (i, map) in self.maps.iter().enumerate() {
             uniform(&mut w[map.clone()], self.scans.count() * self.channels, rng.fork(2 + i as u64));
@@ -227,7 +227,13 @@ impl VectorBlock {
     }
 
     /// x \[channels, 3, ticks\] ← x + gate(relu(W·y, U·y)), y = scans(norm(x))
-    pub fn forward<F: Real>(&self, w: &[F], layers: &[Discrete<F>], x: &mut [Lane<F>], tape: &mut VectorTape<F>) {
+    pub(crate) fn forward<F: Real>(
+        &self,
+        w: &[F],
+        layers: &[Discrete<F>],
+        x: &mut [Lane<F>],
+        tape: &mut VectorTape<F>,
+    ) {
         let ticks = x.len() / (3 * self.channels);
         clear(&mut tape.unit, x.len());
         clear(&mut tape.inverse, ticks);
@@ -247,7 +253,7 @@ impl VectorBlock {
     }
 
     /// VJP of [`forward`](Self::forward): d_x, the gradient to what came out, becomes that to what went in.
-    pub fn backward<F: Real>(
+    pub(crate) fn backward<F: Real>(
         &self,
         w: &[F],
         layers: &[Discrete<F>],

@@ -12,7 +12,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 mod tests;
 
 /// Pixels across and down a bin.
-pub const BIN: usize = 32;
+pub(crate) const BIN: usize = 32;
 /// Splats in a counting task; fixed, so that the result cannot depend on the number of threads.
 const CHUNK: usize = 8192;
 /// Bins across and down that a coverage mask holds.
@@ -23,7 +23,7 @@ const LARGE: u16 = 1 << 15;
 /// Pairs of bin and splat that are held at once. A picture with more is drawn in runs of bins, each of at most this
 /// many pairs (or a single bin, whose pairs are at most the splats). A pair holds about 130 bytes in f32 with
 /// gradients, so this is about 2 GiB; ordinary scenes of a million splats have a fifth of it.
-pub const PAIR_BUDGET: usize = 1 << 24;
+pub(crate) const PAIR_BUDGET: usize = 1 << 24;
 
 /// One splat's entry for the lists: the bins that it can touch, and its depth. Plain old data, 16 bytes.
 #[repr(C)]
@@ -62,13 +62,13 @@ impl Footprint {
 
     /// Whether no bin is touched.
     #[inline(always)]
-    pub fn is_empty(&self) -> bool {
+    pub(crate) fn is_empty(&self) -> bool {
         self.cover == 0
     }
 
     /// Number of bins touched; 0 for a culled splat.
     #[inline(always)]
-    pub fn count(&self) -> usize {
+    pub(crate) fn count(&self) -> usize {
         match self.large() {
             None => self.cover.count_ones() as usize,
             Some([x0, x1, y0, y1]) => (x1 - x0) * (y1 - y0),
@@ -77,7 +77,7 @@ impl Footprint {
 
     /// Number of touched bins that come before bin (x, y), which is one of them.
     #[inline(always)]
-    pub fn rank(&self, x: usize, y: usize) -> usize {
+    pub(crate) fn rank(&self, x: usize, y: usize) -> usize {
         match self.large() {
             None => {
                 let bit = (y - usize::from(self.y0)) * MASK_SIDE + x - usize::from(self.x0);
@@ -177,7 +177,7 @@ pub struct Bins {
 
 /// The splat a key names.
 #[inline(always)]
-pub fn id(key: u64) -> usize {
+pub(crate) fn id(key: u64) -> usize {
     (key & u64::from(u32::MAX)) as usize
 }
 
@@ -260,7 +260,7 @@ fn by_digits<const BITS: u32, const SIZE: usize>(staged: &[AtomicU64], scratch: 
 impl Bins {
     /// Divides a picture of `width` x `height` into runs of bins of at most `budget` pairs each, and makes the lists
     /// of the first.
-    pub fn prepare(&mut self, footprints: &[Footprint], width: usize, height: usize, budget: usize) {
+    pub(crate) fn prepare(&mut self, footprints: &[Footprint], width: usize, height: usize, budget: usize) {
         assert!(u32::try_from(footprints.len()).is_ok(), "a key holds the number of a splat in 32 bits");
         (self.across, self.down) = (width.div_ceil(BIN), height.div_ceil(BIN));
         assert!(self.across.max(self.down) < LARGE.into(), "a footprint holds the number of a bin in 15 bits");
@@ -286,7 +286,7 @@ impl Bins {
     }
 
     /// Makes the lists of run `run`.
-    pub fn fill(&mut self, footprints: &[Footprint], run: usize) {
+    pub(crate) fn fill(&mut self, footprints: &[Footprint], run: usize) {
         self.count(footprints, self.runs[run].clone());
         self.place(footprints, run);
     }
@@ -310,7 +310,7 @@ impl Bins {
     }
 
     /// Number of bins.
-    pub fn bins(&self) -> usize {
+    pub(crate) fn bins(&self) -> usize {
         self.across * self.down
     }
 
@@ -372,7 +372,7 @@ impl Bins {
 
     /// Gradient slots of a splat in the current run.
     #[inline(always)]
-    pub fn slots(&self, splat: usize, foot: &Footprint) -> Range<usize> {
+    pub(crate) fn slots(&self, splat: usize, foot: &Footprint) -> Range<usize> {
         let run = &self.runs[self.current];
         let (before, end) = (foot.below(run.start, self.across), foot.below(run.end, self.across));
         let first = self.first[splat].wrapping_add(before as u32) as usize;
@@ -380,7 +380,7 @@ impl Bins {
     }
 
     /// Bytes held.
-    pub fn memory_bytes(&self) -> usize {
+    pub(crate) fn memory_bytes(&self) -> usize {
         let words = [&self.starts, &self.first, &self.cursors, &self.chunk_starts, &self.next];
         4 * words.iter().map(|w| w.capacity()).sum::<usize>() + 8 * (self.keys.capacity() + self.staged.capacity())
     }

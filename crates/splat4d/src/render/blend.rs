@@ -75,7 +75,7 @@ pub(super) struct Limits<F> {
 }
 
 impl<F: Real> Limits<F> {
-    pub fn new(config: &RenderConfig) -> Self {
+    pub(super) fn new(config: &RenderConfig) -> Self {
         let [least, most] = config.alpha_limits();
         Self {
             log_min: F::of(least.log2()),
@@ -86,7 +86,7 @@ impl<F: Real> Limits<F> {
 
     /// α's ceiling as the blend computes it.
     #[inline(always)]
-    pub fn ceiling<const FMA: bool>(&self) -> F {
+    pub(crate) fn ceiling<const FMA: bool>(&self) -> F {
         self.log_max.blend_exp2::<FMA>()
     }
 }
@@ -171,7 +171,7 @@ pub(super) struct Exponent<F, const N: usize> {
     q: [F; N],
     /// dy of the strip in hand, once a lane: adding is cheaper than broadcasting.
     pub dy: [F; N],
-    /// What q and dy fall by from strip to strip.
+    /// Decrements of q and dy from strip to strip.
     pub steps: [F; 2],
     /// The exponent's ceiling: log₂ of min(o, α_max). Rounding may take a needle's above its top.
     pub top: F,
@@ -186,7 +186,7 @@ pub(super) fn offsets<F: Real, const N: usize>(r: &Record<F>, tx: usize) -> [F; 
 impl<F: Real, const N: usize> Exponent<F, N> {
     /// At strip `strip` of the tile.
     #[inline(always)]
-    pub fn new<const FMA: bool>(r: &Record<F>, tx: usize, ty: usize, strip: usize, limits: &Limits<F>) -> Self {
+    pub(crate) fn new<const FMA: bool>(r: &Record<F>, tx: usize, ty: usize, strip: usize, limits: &Limits<F>) -> Self {
         let log_opacity = limits.log_min + r.log_ratio;
         let rows = N / TILE;
         let first = r.y - (F::of((ty * TILE + strip * rows) as f64) + F::HALF);
@@ -203,13 +203,13 @@ impl<F: Real, const N: usize> Exponent<F, N> {
 
     /// The exponent at lane `l`, not yet under its ceiling.
     #[inline(always)]
-    pub fn raw<const FMA: bool>(&self, l: usize) -> F {
+    pub(crate) fn raw<const FMA: bool>(&self, l: usize) -> F {
         self.q[l].fma::<FMA>(self.dy[l], self.ax[l])
     }
 
     /// On to the next strip.
     #[inline(always)]
-    pub fn step(&mut self, l: usize) {
+    pub(crate) fn step(&mut self, l: usize) {
         self.q[l] -= self.steps[0];
         self.dy[l] -= self.steps[1];
     }
@@ -374,7 +374,7 @@ impl<F: Real> Default for Pair<F> {
 impl<F: Real> Pair<F> {
     /// Adds another bin's.
     #[inline(always)]
-    pub fn add(&mut self, other: &Self) {
+    pub(crate) fn add(&mut self, other: &Self) {
         for k in 0..NUMBERS {
             self.0[k] += other.0[k];
         }
@@ -382,33 +382,33 @@ impl<F: Real> Pair<F> {
 
     /// Σ of dL/d ln α.
     #[inline(always)]
-    pub fn log_alpha(&self) -> F {
+    pub(crate) fn log_alpha(&self) -> F {
         self.0[V]
     }
 
     /// To the centre, for a conic xx, xy, yy.
     #[inline(always)]
-    pub fn center(&self, [a, b, c]: [F; 3]) -> [F; 2] {
+    pub(crate) fn center(&self, [a, b, c]: [F; 3]) -> [F; 2] {
         let (vx, vy) = (self.0[VX], self.0[VY]);
         [-(a * vx + b * vy), -(b * vx + c * vy)]
     }
 
     /// Σ of |gradient to the centre|, 0 where it was not asked for.
     #[inline(always)]
-    pub fn center_abs(&self) -> [F; 2] {
+    pub(crate) fn center_abs(&self) -> [F; 2] {
         // The records' conic is in powers of 2.
         [F::of(LN_2) * self.0[ABS], F::of(LN_2) * self.0[ABS + 1]]
     }
 
     /// To the conic xx, xy, yy.
     #[inline(always)]
-    pub fn conic(&self) -> [F; 3] {
+    pub(crate) fn conic(&self) -> [F; 3] {
         [-F::HALF * self.0[VXX], -self.0[VXY], -F::HALF * self.0[VYY]]
     }
 
     /// To the channels.
     #[inline(always)]
-    pub fn channels(&self) -> [F; CHANNELS] {
+    pub(super) fn channels(&self) -> [F; CHANNELS] {
         std::array::from_fn(|c| self.0[LIGHT + c])
     }
 }

@@ -44,7 +44,7 @@ pub(super) struct Record<F> {
 impl<F> Record<F> {
     /// The rows of tile (tx, ty) that it can touch; of use where the tile's bit of the mask is set.
     #[inline(always)]
-    pub fn tile_rows(&self, tx: usize, ty: usize) -> Range<usize> {
+    pub(crate) fn tile_rows(&self, tx: usize, ty: usize) -> Range<usize> {
         let (top, [first, end]) = (ty * TILE, self.rows[tx % SIDE]);
         usize::from(first).saturating_sub(top)..usize::from(end).saturating_sub(top).min(TILE)
     }

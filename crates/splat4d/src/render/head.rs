@@ -47,7 +47,7 @@ pub(super) struct Headed<F> {
 
 impl<F: Real> Headed<F> {
     /// Fills [`Self::table`].
-    pub fn gather(&mut self, splats: &Splats<'_, F>, extra: Option<&Table<F>>) {
+    pub(crate) fn gather(&mut self, splats: &Splats<'_, F>, extra: Option<&Table<F>>) {
         let width = FURTHER + extra.map_or(0, Table::width);
         if self.table.width() != width {
             self.table = Table::new(&[("further", FURTHER), ("extra", width - FURTHER)], 0);
@@ -68,7 +68,7 @@ impl<F: Real> Headed<F> {
     }
 
     /// Turns blended channels into colour: `image.extra` gives up the head's further channels.
-    pub fn forward(&mut self, head: HeadWeights<'_, F>, camera: &Camera, simd: Simd, image: &mut Image<F>) {
+    pub(super) fn forward(&mut self, head: HeadWeights<'_, F>, camera: &Camera, simd: Simd, image: &mut Image<F>) {
         let (h, w) = (image.color.height, image.color.width);
         self.base.clone_from(&image.color);
         let further = &mut self.further;
@@ -87,7 +87,7 @@ impl<F: Real> Headed<F> {
 
     /// The VJP of [`forward`](Self::forward): fills the gradients to base colours and further channels (`d_extra` is the
     /// caller's part of them) and returns those of the weights and, to a left perturbation, of the pose.
-    pub fn backward(
+    pub(crate) fn backward(
         &mut self,
         head: HeadWeights<'_, F>,
         camera: &Camera,

@@ -65,7 +65,7 @@ impl Importance {
         self.renderer.contributions(splats, camera, out);
     }
 
-    /// See [`Renderer::last_contributions`].
+    /// See `Renderer::last_contributions`.
     pub fn last_contributions(&mut self, out: &mut Vec<f32>) {
         self.renderer.last_contributions(out);
     }
@@ -98,7 +98,7 @@ impl<F: Real> Renderer<F> {
     }
 
     /// [`Renderer::contributions`] of what was drawn last. A backward may still follow.
-    pub fn last_contributions(&mut self, out: &mut Vec<F>) {
+    pub(crate) fn last_contributions(&mut self, out: &mut Vec<F>) {
         self.score_all::<Contribution>(None, out);
     }
 

@@ -31,7 +31,7 @@ mod tests;
 
 pub use crate::simd::Simd;
 pub use backend::{Backend, Oracle, Shot, Tables, Wanted};
-pub use count::PairCounts;
+pub(crate) use count::PairCounts;
 pub use importance::{Importance, Sensitivity};
 pub use project::{Projected, ProjectedGrads, View};
 
@@ -485,7 +485,7 @@ impl<F: Real> Renderer<F> {
     }
 
     /// Radius of every splat of the last render: 3σ of the larger axis, pixels; 0: not drawn.
-    pub fn radii(&self) -> &[F] {
+    pub(crate) fn radii(&self) -> &[F] {
         &self.radii
     }
 

@@ -253,7 +253,7 @@ fn screen<F: Real>(view: &View<F>, mean: [F; 3], cov: [F; 6], opacity: F) -> (Pr
 
 /// Gradients of one Gaussian's inputs.
 #[derive(Clone, Copy, Debug)]
-pub struct GaussianGrads<F> {
+pub(crate) struct GaussianGrads<F> {
     /// To the world mean.
     pub mean: [F; 3],
     /// To the six packed numbers of the world covariance.
@@ -268,7 +268,7 @@ pub struct GaussianGrads<F> {
 ///
 /// Source: gsplat and Kerbl et al. 2023, appendix; d_conic → d_Σ' = −Σ'⁻¹ G Σ'⁻¹.
 #[inline(always)]
-pub fn project_backward<F: Real>(
+pub(crate) fn project_backward<F: Real>(
     view: &View<F>,
     mean: [F; 3],
     cov: [F; 6],
@@ -463,7 +463,7 @@ pub struct Projection<'a, F = f32> {
 /// VJP of [`forward`]: overwrites `parts[..].out` (culled rows get 0) and adds to the pose gradient.
 ///
 /// `partial` is scratch. Sums run in a fixed order: rows in a chunk, then chunks.
-pub fn backward<F: Real>(
+pub(crate) fn backward<F: Real>(
     projection: &Projection<'_, F>,
     d: &[ProjectedGrads<F>],
     parts: &mut [PartGrads<F>],

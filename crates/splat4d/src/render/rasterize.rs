@@ -162,7 +162,7 @@ impl<F: Real> Raster<F> {
     }
 
     /// Channel `c`, Σ c α T, [height, width].
-    pub fn channel(&self, c: usize, plane: &mut [F]) {
+    pub(crate) fn channel(&self, c: usize, plane: &mut [F]) {
         plane.par_chunks_mut(BIN * self.width.max(1)).enumerate().for_each(|(band, plane)| {
             self.each_row(band, plane.len(), |tile, row, pixels| {
                 plane[pixels.clone()].copy_from_slice(&tile.color[c][row][..pixels.len()]);
@@ -284,12 +284,12 @@ impl<F: Real> Raster<F> {
     }
 
     /// Pairs of bin and splat.
-    pub fn pairs(&self) -> usize {
+    pub(crate) fn pairs(&self) -> usize {
         self.bins.total as usize
     }
 
     /// Bytes held.
-    pub fn memory_bytes(&self) -> usize {
+    pub(crate) fn memory_bytes(&self) -> usize {
         self.bins.memory_bytes()
             + self.records.capacity() * size_of::<Record<F>>()
             + 4 * self.place.capacity()

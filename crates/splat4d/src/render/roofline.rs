@@ -82,7 +82,7 @@ fn speed<const LANES: usize, const ROWS: usize>(simd: Simd) -> f64 {
 struct Splat<const LANES: usize> {
     /// Exponent at a pixel: ax + q·dy.
     ax: [f32; LANES],
-    /// What q and dy change by from row to row.
+    /// Changes of q and dy from row to row.
     step: [[f32; LANES]; 2],
     /// log₂ of α's ceiling, which the opacity gives.
     top: [f32; LANES],

@@ -445,7 +445,7 @@ impl<F: Real> Kernel for DirectionGrads<'_, F> {
 
 /// Targets of the gradients of colours.
 #[derive(Debug)]
-pub struct ShadeGrads<'a, 't, F = f32> {
+pub(crate) struct ShadeGrads<'a, 't, F = f32> {
     /// Base SH by part, added to in rows `rows.id(j)`; `None` skips it.
     pub sh: &'a mut [Option<&'t mut Table<F>>],
     /// `out` is added to (means, through the direction), `color` and `weights` are overwritten.
@@ -457,7 +457,7 @@ pub struct ShadeGrads<'a, 't, F = f32> {
 }
 
 /// VJP of [`forward`], which made `channels`; `d` is the gradient to them.
-pub fn backward<F: Real>(
+pub(crate) fn backward<F: Real>(
     projection: &Projection<'_, F>,
     degree: usize,
     channels: &[[F; CHANNELS]],

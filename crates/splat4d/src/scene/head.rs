@@ -8,18 +8,18 @@ use crate::Result;
 use crate::math::{Real, Rng};
 
 /// Channels that a splat with features has: base colour 3, view features 3, time features 3.
-pub const FEATURES: usize = BASE + FURTHER;
+pub(crate) const FEATURES: usize = BASE + FURTHER;
 /// Those of them that are the base colour.
-pub const BASE: usize = 3;
+pub(crate) const BASE: usize = 3;
 /// Those of them that are blended beside the base colour.
 pub const FURTHER: usize = 6;
 /// Numbers that the network sees of a pixel: its further channels, its ray's origin and direction.
 pub const INPUTS: usize = FURTHER + 6;
 /// Width of the network's hidden layer.
-pub const HIDDEN: usize = 6;
-/// Name of the table of W₁, [`HIDDEN`] x [`INPUTS`], row-major, one column.
+pub(crate) const HIDDEN: usize = 6;
+/// Name of the table of W₁, `HIDDEN` x [`INPUTS`], row-major, one column.
 pub const HEAD_IN: &str = "head.in";
-/// Name of the table of W₂, 3 x [`HIDDEN`], row-major, one column.
+/// Name of the table of W₂, 3 x `HIDDEN`, row-major, one column.
 pub const HEAD_OUT: &str = "head.out";
 
 /// Where the weights of a head are: two `Fixed` tables in the parameters of a layer.
@@ -60,15 +60,15 @@ impl HeadKeys {
 pub struct HeadWeights<'a, F = f32> {
     /// W₁: entry [h, i] is number h·[`INPUTS`] + i. Longer where a table rounds its rows up; the rest means nothing.
     pub first: &'a [F],
-    /// W₂: entry [c, h] is number c·[`HIDDEN`] + h. Longer likewise.
+    /// W₂: entry [c, h] is number c·`HIDDEN` + h. Longer likewise.
     pub second: &'a [F],
 }
 
 /// Gradients to the weights of a head, in the same order.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct HeadGrads<F = f32> {
-    /// To W₁, [`HIDDEN`]·[`INPUTS`] numbers.
+    /// To W₁, `HIDDEN`·[`INPUTS`] numbers.
     pub first: Vec<F>,
-    /// To W₂, 3·[`HIDDEN`] numbers.
+    /// To W₂, 3·`HIDDEN` numbers.
     pub second: Vec<F>,
 }

@@ -22,7 +22,7 @@ pub const CENTER: usize = 0;
 /// Column of the logarithm of the width in the life table.
 pub const LOG_WIDTH: usize = 1;
 /// Column of the logarithm of the softness in the life table (interval only).
-pub const LOG_SOFTNESS: usize = 2;
+pub(crate) const LOG_SOFTNESS: usize = 2;
 
 /// σ and its derivatives to (t, centre, log width, log softness).
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -143,7 +143,7 @@ pub struct LifeBuckets {
 impl LifeBuckets {
     /// Sorts rows with the given spans [from, to] (seconds; from > to: never alive) into `count` buckets over the clip.
     /// Times outside the clip look into the first or last bucket, which also hold everything beyond.
-    pub fn new(spans: Vec<[f64; 2]>, clip: [f64; 2], count: usize) -> Self {
+    pub(crate) fn new(spans: Vec<[f64; 2]>, clip: [f64; 2], count: usize) -> Self {
         let count = count.max(1);
         let width = ((clip[1] - clip[0]) / count as f64).max(f64::MIN_POSITIVE);
         let mut buckets = vec![Vec::new(); count];

@@ -3,7 +3,7 @@
 use super::{RowEdit, Space};
 
 /// Rows of a word.
-pub const WORD: usize = u32::BITS as usize;
+pub(crate) const WORD: usize = u32::BITS as usize;
 
 /// A bit a Gaussian and key time. Between two key times a Gaussian is drawn only if its bit is set at one of them; before
 /// the first and after the last, if it is set there.
@@ -28,7 +28,7 @@ impl KeyMasks {
 
     /// From words as [`words`](Self::words) gives them; `None` if their number is wrong or a bit beyond the last row is set.
     /// Panics as [`new`](Self::new).
-    pub fn from_words(times: Vec<f64>, rows: usize, words: Vec<u32>) -> Option<Self> {
+    pub(crate) fn from_words(times: Vec<f64>, rows: usize, words: Vec<u32>) -> Option<Self> {
         let wanted = Self::new(times, rows);
         let stride = wanted.stride();
         let spare = if rows.is_multiple_of(WORD) { 0 } else { !0 << (rows % WORD) };
@@ -48,7 +48,7 @@ impl KeyMasks {
     }
 
     /// [keys, ⌈rows/32⌉]: row i is bit i % 32 of word i / 32.
-    pub fn words(&self) -> &[u32] {
+    pub(crate) fn words(&self) -> &[u32] {
         &self.words
     }
 
@@ -86,12 +86,12 @@ impl KeyMasks {
     }
 
     /// The words of the two keys around t: a row may be drawn where either has its bit.
-    pub fn words_at(&self, t: f64) -> [&[u32]; 2] {
+    pub(crate) fn words_at(&self, t: f64) -> [&[u32]; 2] {
         self.keys_at(t).map(|k| &self.words[k * self.stride()..][..self.stride()])
     }
 
     /// Keeps those of `ids` (rows, in any order) that may be drawn at time t.
-    pub fn retain(&self, t: f64, ids: &mut Vec<u32>) {
+    pub(crate) fn retain(&self, t: f64, ids: &mut Vec<u32>) {
         let [l, r] = self.words_at(t);
         ids.retain(|&i| (l[i as usize / WORD] | r[i as usize / WORD]) >> (i as usize % WORD) & 1 == 1);
     }

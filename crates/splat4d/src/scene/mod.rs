@@ -1,11 +1,11 @@
-//! What a scene is made of: tables of Gaussians, the instant they are looked at, and the cameras that look.
+//! Parts of a scene: tables of Gaussians, the instant they are looked at, and the cameras that look.
 
 pub mod camera;
 pub mod head;
 pub mod life;
-pub mod masks;
+pub(crate) mod masks;
 pub mod params;
-pub mod planes;
+pub(crate) mod planes;
 pub mod splats;
 pub mod table;
 pub mod time;

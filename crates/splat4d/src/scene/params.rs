@@ -4,7 +4,7 @@ use super::table::{Column, Table};
 use crate::math::Real;
 use crate::{Error, Result};
 
-/// What a row of a table stands for; row edits of a space reach every table of that space.
+/// Meaning of a table's rows; row edits of a space reach every table of that space.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Space {
     /// Not edited by row: network weights, grids, global state.
@@ -63,7 +63,7 @@ impl RowEdit {
         self.parent.len()
     }
 
-    /// Whether nothing is left.
+    /// Whether no row is left.
     pub fn is_empty(&self) -> bool {
         self.parent.is_empty()
     }
@@ -89,12 +89,12 @@ pub const LOG_SCALE: usize = 7;
 /// Column of the opacity logit in [`GEOMETRY`].
 pub const OPACITY: usize = 10;
 
-/// What a table is.
+/// Description of a table.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ParamInfo {
     /// Unique in its layer; the columns' names are what files show.
     pub name: String,
-    /// What its rows stand for.
+    /// Meaning of its rows.
     pub space: Space,
     /// A frame number where the table belongs to one frame; a page follows row edits too.
     pub page: Option<u32>,
@@ -115,7 +115,7 @@ pub struct LoadedArray {
     pub data: Vec<f32>,
 }
 
-/// What the page of frame `frame` of a table or column group called `name` is called.
+/// Name of the page of frame `frame` of a table or column group called `name`.
 pub fn page_name(name: &str, frame: u32) -> String {
     format!("{name}@{frame}")
 }
@@ -231,7 +231,7 @@ impl<F: Real> Params<F> {
     }
 
     /// Arrays that came from a file and that no table has claimed.
-    pub fn unclaimed(&self) -> &[LoadedArray] {
+    pub(crate) fn unclaimed(&self) -> &[LoadedArray] {
         &self.loaded
     }
 
@@ -245,12 +245,12 @@ impl<F: Real> Params<F> {
         (0..self.tables.len() as u32).map(Key)
     }
 
-    /// What the table is.
+    /// Description of the table.
     pub fn info(&self, key: Key) -> &ParamInfo {
         &self.infos[key.0 as usize]
     }
 
-    /// What the table is, to change.
+    /// Description of the table, mutable.
     pub fn info_mut(&mut self, key: Key) -> &mut ParamInfo {
         &mut self.infos[key.0 as usize]
     }

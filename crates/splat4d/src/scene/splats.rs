@@ -15,7 +15,7 @@ pub enum Rows<'a> {
 
 impl Rows<'_> {
     /// How many rows, of a table that has `total`.
-    pub fn len(&self, total: usize) -> usize {
+    pub(crate) fn len(&self, total: usize) -> usize {
         match self {
             Rows::All => total,
             Rows::Some(ids) => ids.len(),
@@ -55,7 +55,7 @@ pub enum Color<'a, F = f32> {
     },
     /// One colour a splat.
     Direct {
-        /// [splats, C]: red, green, blue, and where C is [`FEATURES`](super::head::FEATURES) the further channels that a head
+        /// [splats, C]: red, green, blue, and where C is `FEATURES` the further channels that a head
         /// sees.
         table: &'a Table<F>,
     },
@@ -84,7 +84,7 @@ impl<'a, F: Real> Part<'a, F> {
 pub struct Splats<'a, F = f32> {
     /// One a layer.
     pub parts: Vec<Part<'a, F>>,
-    /// What turns blended channels into colour; none: they are the colour. To it, parts without features have zeros.
+    /// Network from blended channels to colour; none: they are the colour. To it, parts without features have zeros.
     pub head: Option<HeadWeights<'a, F>>,
 }
 
@@ -94,7 +94,7 @@ impl<F: Real> Splats<'_, F> {
         self.parts.iter().map(|p| p.out.rows()).sum()
     }
 
-    /// Whether there is nothing to draw.
+    /// Whether there is no splat.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }

@@ -137,7 +137,7 @@ impl<F: Real> Table<F> {
     }
 
     /// The block that holds rows `16·b ..`: `[width][16]`.
-    pub fn block(&self, b: usize) -> &[F] {
+    pub(crate) fn block(&self, b: usize) -> &[F] {
         &self.data[b * self.width * BLOCK..(b + 1) * self.width * BLOCK]
     }
 
@@ -206,7 +206,7 @@ impl<F: Real> Table<F> {
     }
 
     /// The same numbers in another precision.
-    pub fn cast<G: Real>(&self) -> Table<G> {
+    pub(crate) fn cast<G: Real>(&self) -> Table<G> {
         Table {
             rows: self.rows,
             width: self.width,
@@ -258,12 +258,12 @@ pub struct TableMut<'a, F = f32> {
 
 impl<F> TableMut<'_, F> {
     /// Blocks in the view, the last one perhaps not full.
-    pub fn blocks(&self) -> usize {
+    pub(crate) fn blocks(&self) -> usize {
         self.rows.div_ceil(BLOCK)
     }
 
     /// The first `blocks` blocks, and the rest. Panics: there are not so many.
-    pub fn split_at(self, blocks: usize) -> (Self, Self) {
+    pub(crate) fn split_at(self, blocks: usize) -> (Self, Self) {
         let rows = (blocks * BLOCK).min(self.rows);
         let (head, tail) = self.data.split_at_mut(blocks * BLOCK * self.width);
         let a = Self { first: self.first, rows, width: self.width, data: head };
@@ -309,7 +309,7 @@ impl<F: Real> TableMut<'_, F> {
 }
 
 /// Work on runs of the blocks of `N` tables, for [`par_split`].
-pub type SplitFn<'f, F, const N: usize> = dyn Fn([TableMut<'_, F>; N]) -> f64 + Sync + 'f;
+pub(crate) type SplitFn<'f, F, const N: usize> = dyn Fn([TableMut<'_, F>; N]) -> f64 + Sync + 'f;
 
 /// Blocks of rows a task takes: 1024 rows are some hundreds of kilobytes of parameters, enough to hide task costs.
 const TASK_BLOCKS: usize = 64;

@@ -5,7 +5,7 @@ use splat4d::format::scene::{read, spec_from_json, spec_to_json, write};
 use splat4d::layers::{Head, Layer, Scene};
 use splat4d::math::Rng;
 use splat4d::motion::filtered::{Filtered, FilteredSpec, Fusion};
-use splat4d::motion::{At, BUILT_IN, Cache, Motion, Spec, Still, Tape, build};
+use splat4d::motion::{At, BUILT_IN, Cache, Motion, Spec, Still, Tape, build_as};
 use splat4d::scene::{
     Born, Color, GEOMETRY, Grads, HeadKeys, Key, LIFE, LifeKind, Params, RowEdit, Rows, SH, Space, SplatGrads, Table,
     Time,
@@ -22,7 +22,7 @@ const PROBED: usize = 40;
 const TIMES: [f64; 5] = [0.31, 0.7333, 0.0, 1.0, 1.2];
 
 /// A model in f64 with its parameters.
-pub struct Subject {
+pub(crate) struct Subject {
     /// All tables, filled at random.
     pub p: Params<f64>,
     /// The model.
@@ -31,7 +31,7 @@ pub struct Subject {
 
 /// Makes `rows` random Gaussians of the model. `spread`: how far every number of the model's own tables is moved from
 /// what [`build`] made of it (trainable tables only).
-pub fn subject(spec: &Spec, rows: usize, life: LifeKind, spread: f64, seed: u64) -> Subject {
+pub(crate) fn subject(spec: &Spec, rows: usize, life: LifeKind, spread: f64, seed: u64) -> Subject {
     let mut p = Params::<f64>::new(rows, 4, life.columns());
     let rng = Rng::new(seed, "check", 0);
     for row in 0..rows {
@@ -43,7 +43,7 @@ pub fn subject(spec: &Spec, rows: usize, life: LifeKind, spread: f64, seed: u64)
             p[LIFE].write(row, 0, [0.5 + 0.2 * draw(40), 0.3 * draw(41)]);
         }
     }
-    let motion = build(spec, &mut p).expect("the specification is sound");
+    let motion = build_as(spec, &mut p).expect("the specification is sound");
     let keys: Vec<Key> = p.keys().skip(3).filter(|&k| p.info(k).trainable).collect();
     for key in keys {
         for row in 0..p[key].rows() {
@@ -85,7 +85,7 @@ impl Subject {
     }
 
     /// The splats of a question.
-    pub fn splats(&self, of: Space, rows: Rows<'_>, t: f64) -> Table<f64> {
+    pub(crate) fn splats(&self, of: Space, rows: Rows<'_>, t: f64) -> Table<f64> {
         self.ask(of, rows, t).1.out
     }
 
@@ -148,7 +148,7 @@ impl Subject {
 
     /// Central differences of every trainable table (at most [`PROBED`] numbers each) and of t.
     /// `frozen`: column groups whose gradient is stopped on purpose (the model's documentation says so).
-    pub fn gradients(&mut self, spaces: &[Space], frozen: &[&str]) {
+    pub(crate) fn gradients(&mut self, spaces: &[Space], frozen: &[&str]) {
         let rows: Vec<u32> = (0..self.p.len() as u32).filter(|r| r % 3 != 1).collect();
         let w = Weights(Rng::new(77, "weights", 0));
         let (d, d_times) = self.gradient(spaces, &rows, &TIMES, &w);
@@ -196,7 +196,7 @@ impl Subject {
     }
 
     /// A question about some rows answers as the question about all.
-    pub fn compact(&self) {
+    pub(crate) fn compact(&self) {
         let rows: Vec<u32> = (0..self.p.len() as u32).filter(|r| r % 4 == 1 || r % 7 == 0).collect();
         for t in TIMES {
             let all = self.splats(Space::Gaussians, Rows::All, t);
@@ -213,7 +213,7 @@ impl Subject {
     }
 
     /// Any time has an answer, alone as together with others.
-    pub fn random_access(&self) {
+    pub(crate) fn random_access(&self) {
         for t in [-1e4, -0.3, 0.0, 0.5, 1.0, 1.7, 1e4] {
             let out = self.splats(Space::Gaussians, Rows::All, t);
             assert!(out.first_non_finite().is_none(), "at {t} something is not finite");
@@ -232,7 +232,7 @@ impl Subject {
     }
 
     /// Copies, removals and their order reach every table.
-    pub fn row_edits(&mut self) {
+    pub(crate) fn row_edits(&mut self) {
         let before = self.splats(Space::Gaussians, Rows::All, 0.4);
         let n = self.p.len();
         let mut edit = RowEdit::prune(Space::Gaussians, (0..n).map(|r| r % 3 != 0));
@@ -258,13 +258,13 @@ impl Subject {
 }
 
 /// The model is as it says: what moves and lives by itself, the SH table, scratch, and the polynomial of its path.
-pub fn capabilities(spec: &Spec, rows: usize, life: LifeKind) {
+pub(crate) fn capabilities(spec: &Spec, rows: usize, life: LifeKind) {
     let s = subject(spec, rows, life, 0.1, 4);
     let told = s.motion.capabilities();
     assert_eq!(spec.capabilities(), Some(told), "the spec and the model say the same");
     assert_eq!(told.own_life, s.motion.life(&s.p, &mut Table::new(&[("center", 1), ("log_width", 1)], rows)));
     let mut plain = Params::<f64>::new(rows, 4, &[]);
-    build(spec, &mut plain).expect("the specification is sound");
+    build_as(spec, &mut plain).expect("the specification is sound");
     assert_eq!(plain[SH].width(), 12 * told.color_blocks);
     let [few, many] = [rows, 10 * rows].map(|n| s.motion.scratch_bytes(&s.p, n));
     assert!(few <= many, "more rows take more: {few}, {many}");
@@ -289,11 +289,11 @@ pub fn capabilities(spec: &Spec, rows: usize, life: LifeKind) {
 }
 
 /// The scene file gives back the same model and the same numbers; files with a wrong specification are refused.
-pub fn files(spec: &Spec, rows: usize, life: LifeKind) {
+pub(crate) fn files(spec: &Spec, rows: usize, life: LifeKind) {
     let s = subject(spec, rows, life, 0.1, 3);
     let params = s.p.cast::<f32>();
     let mut fresh = Params::<f32>::new(rows, 4, life.columns());
-    let motion = build::<f32>(spec, &mut fresh).expect("the specification is sound");
+    let motion = build_as::<f32>(spec, &mut fresh).expect("the specification is sound");
     assert!(fresh.keys().eq(params.keys()), "a model makes the same tables in any precision");
     let layer = Layer::new("a", params.clone(), motion, life);
     let head = if HeadKeys::of(&params).is_some() { Head::Features } else { Head::Identity };
@@ -315,7 +315,7 @@ pub fn files(spec: &Spec, rows: usize, life: LifeKind) {
 }
 
 /// An answer at the start is the canonical cloud: what `build` makes does not move anything.
-pub fn starts_still(spec: &Spec, rows: usize) {
+pub(crate) fn starts_still(spec: &Spec, rows: usize) {
     let s = subject(spec, rows, LifeKind::Infinite, 0.0, 9);
     let mut still = Params::<f64>::new(rows, 4, &[]);
     still[GEOMETRY] = s.p[GEOMETRY].clone();
@@ -331,13 +331,13 @@ pub fn starts_still(spec: &Spec, rows: usize) {
 }
 
 /// One thread and four give the same bits, forward and backward, in f32.
-pub fn any_threads(spec: &Spec, rows: usize) {
+pub(crate) fn any_threads(spec: &Spec, rows: usize) {
     let run = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads can be made");
         pool.install(|| {
             let p = subject(spec, rows, LifeKind::Infinite, 0.1, 4).p.cast::<f32>();
             let mut fresh = Params::<f32>::new(rows, 4, &[]);
-            let motion = build::<f32>(spec, &mut fresh).expect("the specification is sound");
+            let motion = build_as::<f32>(spec, &mut fresh).expect("the specification is sound");
             let q = [0.25, 0.8].map(|t| At { p: &p, of: Space::Gaussians, rows: Rows::All, t: Time(t) });
             let (mut cache, mut d_cache, mut d) = (Cache::default(), Cache::default(), Grads::new(&p));
             motion.prepare(&p, &q, &mut cache);
@@ -363,7 +363,7 @@ pub fn any_threads(spec: &Spec, rows: usize) {
 
 /// A filter around the model: switched off it changes nothing; switched on, a step along a random direction of all
 /// learnable numbers changes the answers as the gradient says.
-pub fn filtered(spec: &Spec, rows: usize, life: LifeKind, spaces: &[Space], frozen: &[&str]) {
+pub(crate) fn filtered(spec: &Spec, rows: usize, life: LifeKind, spaces: &[Space], frozen: &[&str]) {
     let plain = subject(spec, rows, life, 0.1, 1);
     let around = |fusion: Fusion| {
         let mut p = plain.p.clone();
@@ -410,7 +410,7 @@ pub fn filtered(spec: &Spec, rows: usize, life: LifeKind, spaces: &[Space], froz
 }
 
 /// All of the above for one model.
-pub fn model(spec: &Spec, rows: usize, life: LifeKind, spaces: &[Space], frozen: &[&str]) {
+pub(crate) fn model(spec: &Spec, rows: usize, life: LifeKind, spaces: &[Space], frozen: &[&str]) {
     subject(spec, rows, life, 0.1, 1).gradients(spaces, frozen);
     subject(spec, rows, life, 0.1, 2).compact();
     subject(spec, rows, life, 0.1, 2).random_access();

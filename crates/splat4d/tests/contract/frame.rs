@@ -6,7 +6,7 @@ use splat4d::bake::{Options, Shown, bake, compare};
 use splat4d::format::scene::{METADATA, metadata, read, write};
 use splat4d::layers::{Evaluation, Layer, LayerTape, Scene, freeze};
 use splat4d::math::{Real, Rng, Se3, Sim3, quat, se3};
-use splat4d::motion::{Cache, Spec, build};
+use splat4d::motion::{Cache, Spec, build_as};
 use splat4d::render::{Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::splats::COV;
 use splat4d::scene::{Camera, Grads, LifeKind, Rows, SH, Space, SplatGrads, Table, Time};
@@ -65,7 +65,7 @@ fn ask<F: Real>(layer: &Layer<F>, t: f64) -> (Cache, LayerTape<F>) {
 }
 
 /// All that a frame promises, for one model.
-pub fn framed(spec: &Spec, rows: usize, life: LifeKind, frozen: &[&str]) {
+pub(crate) fn framed(spec: &Spec, rows: usize, life: LifeKind, frozen: &[&str]) {
     let s = subject(spec, rows, life, 0.1, 6);
     let own = Layer::new("own", s.p, s.motion, life);
     let placed = Layer { frame: frame(), ..own.clone() };
@@ -74,7 +74,7 @@ pub fn framed(spec: &Spec, rows: usize, life: LifeKind, frozen: &[&str]) {
     gradient(placed, frozen);
     let s = subject(spec, rows, life, 0.1, 6);
     let mut params = splat4d::scene::Params::<f32>::new(rows, 4, life.columns());
-    let motion = build::<f32>(spec, &mut params).expect("the specification is sound");
+    let motion = build_as::<f32>(spec, &mut params).expect("the specification is sound");
     let own = Layer::new("own", s.p.cast::<f32>(), motion, life);
     let placed = Layer { frame: frame(), ..own.clone() };
     files(&own, &placed);
@@ -191,7 +191,7 @@ fn frozen_moments(placed: &Layer<f32>) {
     let scene = scene(placed.clone());
     for t in [0.31, 0.8] {
         let mut params = freeze(&scene, Time(t)).expect("there is no head");
-        let motion = build(&Spec::Still, &mut params).expect("still layers need nothing");
+        let motion = build_as(&Spec::Still, &mut params).expect("still layers need nothing");
         let still = Layer::new("still", params, motion, LifeKind::Infinite);
         let (a, b) = (draw(&scene, pose, 1.0, t), draw(&self::scene(still), pose, 1.0, 0.0));
         assert!(worst(&a, &b) < f64::from(FROZEN), "frozen at {t}: {}", worst(&a, &b));

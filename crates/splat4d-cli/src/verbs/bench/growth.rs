@@ -21,10 +21,10 @@ use splat4d::scene::life::{CENTER, LOG_WIDTH};
 use splat4d::scene::params::{LOG_SCALE, QUAT};
 use splat4d::scene::{Camera, GEOMETRY, LIFE, LifeKind, Params, Planes, SH, Table, Time};
 use splat4d::{Error, Result};
-use splat4d_train::capture::{Capture, CaptureKind, Frame, ImageStore, Rig};
+use splat4d_train::capture::{Capture, CaptureKind, Frame, ImageStore, Rig, Timing};
 use splat4d_train::recipe::Recipe;
-use splat4d_train::train::dataset::Dataset;
-use splat4d_train::train::run::peak_memory;
+use splat4d_train::run::dataset::Dataset;
+use splat4d_train::run::peak_memory;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -181,12 +181,14 @@ fn capture(pinned: &Pinned, root: &Path, pictures: &[PathBuf], count: usize) -> 
         held: Vec::new(),
         train: (0..count).collect(),
         validation: Vec::new(),
+        timing: Timing::Told,
         fps: pinned.scene.fps,
         points: None,
         background: None,
         up: pinned.scene.up,
         downscale: 1,
         warnings: Vec::new(),
+        notes: Vec::new(),
     }
 }
 

@@ -3,6 +3,7 @@
 use super::super::*;
 use super::samples::{self, HEIGHT, Sample, WIDTH};
 use serde_json::json;
+use splat4d::ErrorKind;
 use std::sync::Arc;
 
 /// The message of opening the sample and, if that works, of loading its first picture.

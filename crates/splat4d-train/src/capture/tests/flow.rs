@@ -2,7 +2,8 @@
 
 use super::bad_input::assert_says;
 use super::samples::{self, FOCAL, HEIGHT, Sample, WIDTH};
-use crate::capture::{Capture, CaptureOptions, Distortion, ImageStore};
+use crate::capture::lens::Distortion;
+use crate::capture::{Capture, CaptureOptions, ImageStore};
 use image::{ImageBuffer, Rgb};
 use serde_json::json;
 use splat4d::scene::{Lens, Planes};

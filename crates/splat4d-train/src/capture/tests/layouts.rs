@@ -59,6 +59,29 @@ fn own_format() {
 }
 
 #[test]
+fn own_format_with_a_table_of_times() {
+    let sample = samples::own();
+    sample.edit("capture.json", |v| v["cameras"][1]["times"] = json!([0.25, 0.375]));
+    let capture = open(&sample);
+    let times: Vec<f64> = capture.frames[..4].iter().map(|f| f.time.0).collect();
+    assert_eq!(times, [0.0, 0.1, 0.26, 0.385], "a camera's own times, and its offset");
+    for (times, word) in [(json!([0.25]), "1 times"), (json!([0.25, 0.25]), "not later")] {
+        sample.edit("capture.json", |v| v["cameras"][1]["times"] = times);
+        let error = Capture::open(sample.root(), &CaptureOptions::default()).unwrap_err().to_string();
+        assert!(error.contains(word) && error.contains("cam01"), "{error}");
+    }
+}
+
+#[test]
+fn eight_bits_of_any_picture() {
+    let sample = samples::own();
+    let read = Rgb8::read(&sample.path("images/cam01/0006.png")).unwrap();
+    assert_eq!((read.width, read.height, read.data.len()), (WIDTH, HEIGHT, WIDTH * HEIGHT * 3));
+    assert_eq!(read.data[2], 47, "the blue of camera 1, frame 1");
+    assert!(Rgb8::decode(b"no picture", &sample.path("x.png")).unwrap_err().to_string().contains("x.png"));
+}
+
+#[test]
 fn own_format_moving_inverted_opengl_listed() {
     let sample = samples::own();
     sample.edit("capture.json", |v| {
@@ -215,10 +238,10 @@ fn colmap_of_one_moving_camera() {
     for c in 0..3 {
         std::fs::copy(
             sample.path(&format!("images/cam{c}/0000.png")),
-            sample.path(&format!("images/IMG_{}.png", c + 7)),
+            sample.path(&format!("images/frame_{}.png", c + 7)),
         )
         .unwrap();
-        text = text.replace(&format!("cam{c}/0000.png"), &format!("IMG_{}.png", c + 7));
+        text = text.replace(&format!("cam{c}/0000.png"), &format!("frame_{}.png", c + 7));
     }
     sample.write("sparse/0/images.txt", text.as_bytes());
     let capture = open(&sample);

@@ -2,6 +2,7 @@
 
 use super::super::*;
 use super::samples::{self, HEIGHT, WIDTH};
+use crate::capture::lens::Distortion;
 use image::{ImageBuffer, Luma};
 use serde_json::json;
 use std::sync::Arc;

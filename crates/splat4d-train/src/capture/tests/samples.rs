@@ -6,12 +6,12 @@ use splat4d::math::{Se3, quat};
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 
-pub const WIDTH: usize = 24;
-pub const HEIGHT: usize = 16;
-pub const FOCAL: f64 = 20.0;
+pub(super) const WIDTH: usize = 24;
+pub(super) const HEIGHT: usize = 16;
+pub(super) const FOCAL: f64 = 20.0;
 
 /// A folder and the metadata files in it.
-pub struct Sample {
+pub(super) struct Sample {
     pub dir: TempDir,
     pub files: Vec<&'static str>,
 }
@@ -21,42 +21,42 @@ impl Sample {
         Self { dir: tempfile::tempdir().unwrap(), files: files.to_vec() }
     }
 
-    pub fn root(&self) -> &Path {
+    pub(super) fn root(&self) -> &Path {
         self.dir.path()
     }
 
-    pub fn path(&self, name: &str) -> PathBuf {
+    pub(super) fn path(&self, name: &str) -> PathBuf {
         self.root().join(name)
     }
 
     /// Changes a JSON file.
-    pub fn edit(&self, name: &str, change: impl FnOnce(&mut Value)) {
+    pub(super) fn edit(&self, name: &str, change: impl FnOnce(&mut Value)) {
         let mut value = serde_json::from_slice(&std::fs::read(self.path(name)).unwrap()).unwrap();
         change(&mut value);
         self.write(name, value.to_string().as_bytes());
     }
 
-    pub fn write(&self, name: &str, bytes: &[u8]) {
+    pub(super) fn write(&self, name: &str, bytes: &[u8]) {
         let path = self.path(name);
         std::fs::create_dir_all(path.parent().unwrap()).unwrap();
         std::fs::write(path, bytes).unwrap();
     }
 
     /// An opaque picture that tells cameras and frames apart.
-    pub fn rgb(&self, name: &str, camera: usize, frame: usize) {
+    pub(super) fn rgb(&self, name: &str, camera: usize, frame: usize) {
         let pixel = |x: u32, y: u32| Rgb([(x * 10) as u8, (y * 15) as u8, (camera * 40 + frame * 7) as u8]);
         self.save(name, ImageBuffer::from_fn(WIDTH as u32, HEIGHT as u32, pixel));
     }
 
-    pub fn rgba(&self, name: &str, pixel: impl Fn(u32, u32) -> [u8; 4]) {
+    pub(super) fn rgba(&self, name: &str, pixel: impl Fn(u32, u32) -> [u8; 4]) {
         self.save(name, ImageBuffer::from_fn(WIDTH as u32, HEIGHT as u32, |x, y| Rgba(pixel(x, y))));
     }
 
-    pub fn mask(&self, name: &str, pixel: impl Fn(u32, u32) -> u8) {
+    pub(super) fn mask(&self, name: &str, pixel: impl Fn(u32, u32) -> u8) {
         self.save(name, ImageBuffer::from_fn(WIDTH as u32, HEIGHT as u32, |x, y| Luma([pixel(x, y)])));
     }
 
-    pub fn save<P: image::PixelWithColorType>(&self, name: &str, picture: ImageBuffer<P, Vec<P::Subpixel>>)
+    pub(super) fn save<P: image::PixelWithColorType>(&self, name: &str, picture: ImageBuffer<P, Vec<P::Subpixel>>)
     where
         [P::Subpixel]: image::EncodableLayout,
     {
@@ -67,18 +67,18 @@ impl Sample {
 }
 
 /// The pose of camera i.
-pub fn pose(i: usize) -> Se3 {
+pub(super) fn pose(i: usize) -> Se3 {
     let angle = i as f64 * 0.9;
     Se3::look_at([4.0 * angle.cos(), 4.0 * angle.sin(), 1.0 + 0.2 * i as f64], [0.0, 0.0, 0.3], [0.0, 0.0, 1.0])
 }
 
-pub fn rows(p: &Se3) -> Value {
+pub(super) fn rows(p: &Se3) -> Value {
     let row = |i: usize| json!([p.rotation[i][0], p.rotation[i][1], p.rotation[i][2], p.translation[i]]);
     json!([row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]])
 }
 
 /// Camera to world in OpenGL axes.
-pub fn opengl(i: usize) -> Value {
+pub(super) fn opengl(i: usize) -> Value {
     let mut p = pose(i).inverse();
     for row in &mut p.rotation {
         row[1] = -row[1];
@@ -88,12 +88,12 @@ pub fn opengl(i: usize) -> Value {
 }
 
 /// Two coloured points.
-pub const PLY: &str = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n\
+pub(super) const PLY: &str = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n\
                    property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n\
                    0 0 0.3 255 0 0\n0.5 0 0 0 0 255\n";
 
 /// Three cameras, two frames, masks, points.
-pub fn own() -> Sample {
+pub(super) fn own() -> Sample {
     let sample = Sample::new(&["capture.json", "points.ply"]);
     let cameras: Vec<Value> = (0..3)
         .map(|c| {
@@ -116,7 +116,7 @@ pub fn own() -> Sample {
 }
 
 /// Three training pictures, one validation, one test.
-pub fn dnerf() -> Sample {
+pub(super) fn dnerf() -> Sample {
     let sample = Sample::new(&["transforms_train.json", "transforms_val.json", "transforms_test.json"]);
     for (split, times, first) in [("train", &[0.0, 0.5, 1.0][..], 0), ("val", &[0.25], 3), ("test", &[0.75], 4)] {
         let frames: Vec<Value> = times
@@ -137,7 +137,7 @@ pub fn dnerf() -> Sample {
 }
 
 /// Cameras 1, 3 train, 2 is measured; two frames.
-pub fn panoptic() -> Sample {
+pub(super) fn panoptic() -> Sample {
     let sample = Sample::new(&["train_meta.json", "test_meta.json", "cloud.ply"]);
     for (name, ids) in [("train_meta.json", &[1usize, 3][..]), ("test_meta.json", &[2])] {
         let per = |value: &dyn Fn(usize, usize) -> Value| -> Value {
@@ -163,7 +163,7 @@ pub fn panoptic() -> Sample {
 }
 
 /// Two cameras by folder, two frames with time, one distorted.
-pub fn nerfstudio() -> Sample {
+pub(super) fn nerfstudio() -> Sample {
     let sample = Sample::new(&["transforms.json", "sparse_pc.ply"]);
     let mut frames = Vec::new();
     for (c, t) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
@@ -199,7 +199,7 @@ fn colmap_pictures(sample: &Sample) -> Vec<String> {
 }
 
 /// Binary model of one instant.
-pub fn colmap_bin() -> Sample {
+pub(super) fn colmap_bin() -> Sample {
     let sample = Sample::new(&["sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin"]);
     let names = colmap_pictures(&sample);
     let mut cameras = 2u64.to_le_bytes().to_vec();
@@ -236,7 +236,7 @@ pub fn colmap_bin() -> Sample {
 }
 
 /// The same as text.
-pub fn colmap_txt() -> Sample {
+pub(super) fn colmap_txt() -> Sample {
     let sample = Sample::new(&["sparse/0/cameras.txt", "sparse/0/images.txt", "sparse/0/points3D.txt"]);
     let names = colmap_pictures(&sample);
     let cameras = format!(
@@ -257,8 +257,37 @@ pub fn colmap_txt() -> Sample {
     sample
 }
 
+/// Pictures of one place each, by the names that `name` gives them in `images/`, in a `transforms.json` and, where
+/// `model` brings that world into another, a COLMAP model of the same. No times.
+pub(super) fn photos(count: usize, name: impl Fn(usize) -> String, model: Option<&splat4d::math::Sim3>) -> Sample {
+    let sample = Sample::new(&["transforms.json"]);
+    let (mut frames, mut images) = (Vec::new(), String::new());
+    for c in 0..count {
+        let name = name(c);
+        sample.rgb(&format!("images/{name}"), c, 0);
+        frames.push(json!({"file_path": format!("./images/{name}"), "transform_matrix": opengl(c)}));
+        let Some(s) = model else { continue };
+        let world_from_cam = pose(c).inverse();
+        let turned = splat4d::math::se3::mat_mul(&s.rotation, &world_from_cam.rotation);
+        let p = Se3 { rotation: turned, translation: s.apply(world_from_cam.translation) }.inverse();
+        let q = quat::from_rotation(&p.rotation);
+        let numbers: Vec<String> = q.iter().chain(&p.translation).map(|v| format!("{v:.17}")).collect();
+        images += &format!("{} {} 1 {name}\n\n", c + 1, numbers.join(" "));
+    }
+    let value = json!({"w": WIDTH, "h": HEIGHT, "fl_x": FOCAL, "fl_y": FOCAL, "cx": 12, "cy": 8, "frames": frames});
+    sample.write("transforms.json", value.to_string().as_bytes());
+    if let Some(s) = model {
+        let x = s.apply([0.1, 0.2, 0.3]);
+        sample.write("sparse/0/cameras.txt", format!("1 PINHOLE {WIDTH} {HEIGHT} {FOCAL} {FOCAL} 12 8\n").as_bytes());
+        sample.write("sparse/0/images.txt", images.as_bytes());
+        let point = format!("7 {:.17} {:.17} {:.17} 255 0 51 0.5 1 0\n", x[0], x[1], x[2]);
+        sample.write("sparse/0/points3D.txt", point.as_bytes());
+    }
+    sample
+}
+
 /// Two cameras calibrated at twice the size of the frames.
-pub fn n3dv() -> Sample {
+pub(super) fn n3dv() -> Sample {
     let sample = Sample::new(&["poses_bounds.npy"]);
     let header = "{'descr': '<f8', 'fortran_order': False, 'shape': (2, 17), }\n";
     let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
@@ -281,7 +310,7 @@ pub fn n3dv() -> Sample {
 }
 
 /// One sample of every layout.
-pub fn all() -> Vec<(&'static str, Sample)> {
+pub(super) fn all() -> Vec<(&'static str, Sample)> {
     vec![
         ("own", own()),
         ("dnerf", dnerf()),

@@ -31,13 +31,13 @@ const SH_SLOWDOWN: f64 = 20.0;
 /// A codec that is the playback file. Before its stage begins it holds nothing; [`begin`](Self::begin) belongs into the
 /// stage's start.
 #[derive(Debug)]
-pub struct Quantised {
+pub(crate) struct Quantised {
     coder: Coder,
     rate: Rate,
     memory: Mutex<Option<Memory>>,
 }
 
-/// What is remembered from step to step.
+/// State kept from step to step.
 #[derive(Debug)]
 struct Memory {
     /// One a layer: its rows' entries of the palette.
@@ -52,13 +52,13 @@ struct Memory {
 
 impl Quantised {
     /// A codec of codes of so many bits; `rate`: how fast the palette learns. Errors: depths out of range.
-    pub fn new(depths: Depths, rate: Rate) -> Result<Arc<Self>> {
+    pub(crate) fn new(depths: Depths, rate: Rate) -> Result<Arc<Self>> {
         depths.check()?;
         Ok(Arc::new(Self { coder: Coder { depths }, rate, memory: Mutex::new(None) }))
     }
 
     /// Makes the scene the pages of a file.
-    pub fn begin(&self, pages: Pages, scene: &mut Scene<f32>) {
+    pub(crate) fn begin(&self, pages: Pages, scene: &mut Scene<f32>) {
         *scene = Scene { head: scene.head, ..pages.scene() };
         let Pages { layers, labels, palette, tiers, .. } = pages;
         let dirty = layers.iter().map(fresh).collect();
@@ -68,7 +68,7 @@ impl Quantised {
 
     /// The pages to write: what a reader decodes of them is [`whole`](Codec::whole) of the scene, bit for bit. `scene`
     /// is the one that learns. Errors: the codec's stage has not begun.
-    pub fn pages(&self, scene: &Scene<f32>, meta: Meta) -> Result<Pages> {
+    pub(crate) fn pages(&self, scene: &Scene<f32>, meta: Meta) -> Result<Pages> {
         let mut memory = self.memory();
         let Some(m) = memory.as_mut() else {
             return Err(Error::input("this scene has not been quantised yet").remedy("Run it through all stages"));
@@ -172,20 +172,20 @@ fn paint(table: &mut Table<f32>, labels: &[u16], palette: &Palette, wanted: &[bo
 }
 
 /// Rates with which a trained scene is tuned: those with which its training ended, times `share`, falling on.
-pub fn tuned(groups: Vec<Group>, share: f64) -> Vec<Group> {
+pub(crate) fn tuned(groups: Vec<Group>, share: f64) -> Vec<Group> {
     let fall = |rate: Rate| Rate { start: share * rate.end, end: FALL * share * rate.end };
     groups.into_iter().map(|g| Group { rate: fall(g.rate), ..g }).collect()
 }
 
 /// The rate of a palette that goes with [`tuned`].
-pub fn palette_rate(recipe: &Recipe, share: f64) -> Rate {
+pub(crate) fn palette_rate(recipe: &Recipe, share: f64) -> Rate {
     let rate = share * recipe.rates.feature * recipe.rates.decay / SH_SLOWDOWN;
     Rate { start: rate, end: FALL * rate }
 }
 
 /// A stage on the pages of a file, whatever model they were baked from: all groups of kinematic primitives with a life,
 /// in every layer. Its `start` is still to be told: it ends with [`Quantised::begin`].
-pub fn stage(plan: &Plan, iterations: usize, share: f64, codec: Arc<Quantised>) -> Stage {
+pub(crate) fn stage(plan: &Plan, iterations: usize, share: f64, codec: Arc<Quantised>) -> Stage {
     let rotates = program_of(&plan.recipe).is_ok_and(|p| p.capabilities(plan).rotates);
     let recipe = plan.recipe.clone().with(|r| {
         r.spacetime.order = 1;

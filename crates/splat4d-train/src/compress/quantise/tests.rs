@@ -1,13 +1,13 @@
-//! What learns behind a codec: the same picture as the file's, gradients past the rounding, a palette that is a sum, a
+//! Learning behind a codec: the same picture as the file's, gradients past the rounding, a palette that is a sum, a
 //! memory that comes back.
 
 use super::*;
+use crate::capture::frames::{Frames, Picture};
 use crate::loss::terms::StepInfo;
-use crate::train::chain::{Chain, Losses, Step, View};
-use crate::train::frames::{Frames, Picture};
-use crate::train::loss::TrainLoss;
-use crate::train::tests::Made;
-use crate::train::trainer::{Settings, Trainer};
+use crate::step::chain::{Chain, Losses, Step, View};
+use crate::step::loss::TrainLoss;
+use crate::step::tests::Made;
+use crate::step::trainer::{Settings, Trainer};
 use crate::upkeep::Limits;
 use splat4d::format::playback::{Draft, Node, Primitive, WriteConfig, read, read_pages, write, write_pages};
 use splat4d::math::Rng;

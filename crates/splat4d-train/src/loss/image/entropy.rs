@@ -7,7 +7,7 @@ use splat4d::scene::Planes;
 
 /// [`mask_entropy`] of alpha, times a weight.
 #[derive(Clone, Copy, Debug)]
-pub struct MaskEntropy(pub f64);
+pub(crate) struct MaskEntropy(pub f64);
 
 impl<F: Real> ImageTerm<F> for MaskEntropy {
     fn eval(&mut self, _: &StepInfo, _: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64 {
@@ -19,7 +19,7 @@ impl<F: Real> ImageTerm<F> for MaskEntropy {
 const MARGIN: f64 = 1e-4;
 
 /// −p ln p − (1−p) ln(1−p), nats, and its slope ln((1−p)/p); beyond the margin the slope is 0.
-pub fn binary_entropy<F: Real>(p: F) -> (F, F) {
+pub(crate) fn binary_entropy<F: Real>(p: F) -> (F, F) {
     let held = p.max(F::of(MARGIN)).min(F::of(1.0 - MARGIN));
     let (q, slope) = (F::ONE - held, if held == p { ((F::ONE - p) / p).ln() } else { F::ZERO });
     (-(held * held.ln()) - q * q.ln(), slope)
@@ -28,7 +28,7 @@ pub fn binary_entropy<F: Real>(p: F) -> (F, F) {
 /// Mean over pixels of the binary entropy of alpha, nats: foreground and background, and no haze between them.
 ///
 /// Source: the opacity entropy of SuGaR (Guédon and Lepetit 2024) on what a pixel shows.
-pub fn mask_entropy<F: Real>(alpha: &Planes<F>, weight: f64, d_alpha: &mut Planes<F>) -> f64 {
+pub(crate) fn mask_entropy<F: Real>(alpha: &Planes<F>, weight: f64, d_alpha: &mut Planes<F>) -> f64 {
     assert_eq!(alpha.data.len(), d_alpha.data.len(), "a gradient has its picture's shape");
     let scale = weight / alpha.data.len().max(1) as f64;
     scale

@@ -7,7 +7,7 @@ use splat4d::scene::Planes;
 
 /// [`flow()`] of views that know theirs, times a weight.
 #[derive(Clone, Copy, Debug)]
-pub struct Flow(pub f64);
+pub(crate) struct Flow(pub f64);
 
 impl<F: Real> ImageTerm<F> for Flow {
     fn needs(&self, view: &View<'_, F>) -> Needs {
@@ -30,7 +30,7 @@ const KNOWN: f64 = 0.999;
 ///
 /// Shapes: `drawn` [3, h, w] holds Σ α T f (2) and Σ α T of the splats that have an f; `d` adds up its gradient.
 /// Source: SC-GS (Huang et al. 2024) and GaussianFlow (Gao et al. 2024).
-pub fn flow<F: Real>(drawn: &Planes<F>, truth: &Planes<F>, weight: f64, d: &mut Planes<F>) -> f64 {
+pub(crate) fn flow<F: Real>(drawn: &Planes<F>, truth: &Planes<F>, weight: f64, d: &mut Planes<F>) -> f64 {
     let n = drawn.pixels();
     assert!([drawn.data.len(), truth.data.len(), d.data.len()] == [3 * n; 3], "flow has three channels of {n} pixels");
     let shows = |p: usize| drawn.plane(2)[p] >= F::of(SEEN) && truth.plane(2)[p] >= F::of(KNOWN);

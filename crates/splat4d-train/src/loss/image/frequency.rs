@@ -9,14 +9,14 @@ use splat4d::scene::Planes;
 
 /// [`Frequency`] of the colours, times a weight.
 #[derive(Clone, Debug)]
-pub struct FrequencyTerm<F = f32> {
+pub(crate) struct FrequencyTerm<F = f32> {
     weight: f64,
     frequency: Frequency<F>,
 }
 
 impl<F: Real> FrequencyTerm<F> {
     /// With this weight.
-    pub fn new(weight: f64) -> Self {
+    pub(crate) fn new(weight: f64) -> Self {
         Self { weight, frequency: Frequency::default() }
     }
 }
@@ -43,14 +43,14 @@ const SILENT: f64 = 1e-8;
 /// Source: Zhang et al. 2024, "FreGS", equations 5 to 9 (there phases count unweighted, and the band grows linearly too).
 /// Pictures are padded with zeros to the next power of two.
 #[derive(Clone, Debug, Default)]
-pub struct Frequency<F> {
+pub(crate) struct Frequency<F> {
     spectrum: Spectrum<F>,
     grads: Spectrum<F>,
 }
 
 impl<F: Real> Frequency<F> {
     /// The loss after the share `progress` of the stage; adds `weight` times the gradient to `d`.
-    pub fn loss_and_grad(
+    pub(crate) fn loss_and_grad(
         &mut self,
         image: &Planes<F>,
         truth: &Planes<F>,

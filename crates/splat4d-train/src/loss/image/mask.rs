@@ -6,7 +6,7 @@ use splat4d::math::Real;
 
 /// Mean |alpha − mask| over the pixels of views that have a mask, times a weight.
 #[derive(Clone, Copy, Debug)]
-pub struct Mask(pub f64);
+pub(crate) struct Mask(pub f64);
 
 impl<F: Real> ImageTerm<F> for Mask {
     fn eval(&mut self, _: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64 {

@@ -2,19 +2,19 @@
 //! agreement of depth and normals, flow.
 //!
 //! Each *adds* `weight` times its gradient and returns `weight` times its value, and gives the same bits with any number
-//! of threads. [`terms`] is the list of those that a recipe asks for.
+//! of threads. `terms` is the list of those that a recipe asks for.
 
-pub mod entropy;
+pub(crate) mod entropy;
 mod fft;
-pub mod flow;
-pub mod frequency;
-pub mod mask;
-pub mod normal;
-pub mod segmentation;
+pub(crate) mod flow;
+pub(crate) mod frequency;
+pub(crate) mod mask;
+pub(crate) mod normal;
+pub(crate) mod segmentation;
 mod term;
 #[cfg(test)]
 mod tests;
-pub mod tv;
+pub(crate) mod tv;
 
 pub use term::{Channel, Gradient, ImageTerm, Needs, PictureGrads, Shown, View};
 
@@ -24,11 +24,11 @@ use rayon::prelude::*;
 use splat4d::math::Real;
 
 /// Alpha from which on a pixel shows something: below it depth, normal and flow are those of haze.
-pub const SEEN: f64 = 0.5;
+pub(crate) const SEEN: f64 = 0.5;
 
 /// The terms of a recipe, in the order in which values and gradients are summed: colours as 3DGS compares them, then what
 /// has a weight.
-pub fn terms(r: &Recipe) -> Vec<Box<dyn ImageTerm>> {
+pub(crate) fn terms(r: &Recipe) -> Vec<Box<dyn ImageTerm>> {
     type Make = fn(f64) -> Box<dyn ImageTerm>;
     let weighted: [(f64, Make); 7] = [
         (r.loss.tv, |w| Box::new(tv::TotalVariation(w))),
@@ -79,7 +79,7 @@ pub(crate) mod check {
     use splat4d::scene::Planes;
 
     /// Uniform numbers in [low, high).
-    pub fn planes(purpose: &str, shape: [usize; 3], low: f64, high: f64) -> Planes<f64> {
+    pub(crate) fn planes(purpose: &str, shape: [usize; 3], low: f64, high: f64) -> Planes<f64> {
         let rng = Rng::new(13, purpose, 0);
         let mut out = Planes::new(shape[0], shape[1], shape[2]);
         out.data.iter_mut().enumerate().for_each(|(i, x)| *x = low + (high - low) * rng.uniform(i as u64));
@@ -87,7 +87,7 @@ pub(crate) mod check {
     }
 
     /// Every seventh number of every plane; returns the value.
-    pub fn gradients(
+    pub(crate) fn gradients(
         inputs: &[Planes<f64>],
         loss: impl Fn(&[Planes<f64>], &mut [Planes<f64>]) -> f64,
         value: impl Fn(&[Planes<f64>]) -> f64,

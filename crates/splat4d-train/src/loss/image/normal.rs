@@ -7,7 +7,7 @@ use splat4d::scene::{Camera, Planes};
 
 /// [`depth_normal`], times a weight.
 #[derive(Clone, Copy, Debug)]
-pub struct DepthNormal(pub f64);
+pub(crate) struct DepthNormal(pub f64);
 
 impl<F: Real> ImageTerm<F> for DepthNormal {
     fn needs(&self, _: &View<'_, F>) -> Needs {
@@ -41,7 +41,7 @@ fn dot<F: Real>(a: [F; 3], b: [F; 3]) -> F {
 ///
 /// Shapes: `depth` (Σ z α T) and `alpha` [1, h, w], `normals` [3, h, w]. Adds to all three gradients.
 /// Source: Huang et al. 2024, "2D Gaussian Splatting", equation 14, with the shortest axis as a Gaussian's normal.
-pub fn depth_normal<F: Real>(
+pub(crate) fn depth_normal<F: Real>(
     camera: &Camera,
     [depth, alpha, normals]: [&Planes<F>; 3],
     weight: f64,

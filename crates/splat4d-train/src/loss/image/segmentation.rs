@@ -9,7 +9,7 @@ use splat4d::scene::Planes;
 ///
 /// Source: Luiten et al. 2024, "seg".
 #[derive(Debug)]
-pub struct Segmentation {
+pub(crate) struct Segmentation {
     channel: Channel,
     weight: f64,
     photometric: Photometric,
@@ -18,7 +18,7 @@ pub struct Segmentation {
 
 impl Segmentation {
     /// Of a column group of one logit, with a weight beside the colours' and their share of D-SSIM.
-    pub fn new(column: &str, weight: f64, dssim: f64) -> Self {
+    pub(crate) fn new(column: &str, weight: f64, dssim: f64) -> Self {
         let photometric = Photometric::new(dssim as f32);
         Self { channel: Channel::Sigmoid(column.to_owned()), weight, photometric, d_shown: Planes::default() }
     }

@@ -47,7 +47,7 @@ pub enum Channel {
 
 impl Channel {
     /// Its planes.
-    pub fn width(&self) -> usize {
+    pub(crate) fn width(&self) -> usize {
         match self {
             Channel::Normals | Channel::Flow => 3,
             Channel::Sigmoid(_) => 1,
@@ -63,7 +63,7 @@ impl Channel {
     }
 }
 
-/// What is to be drawn of a view beside colour and alpha.
+/// The planes to draw of a view beside colour and alpha.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Needs {
     /// Σ z α T.
@@ -93,12 +93,12 @@ pub struct Shown<'a, F = f32> {
     pub depth: &'a Planes<F>,
     /// Further channels, [C, h, w].
     pub extra: &'a Planes<F>,
-    /// What these are, each with its first plane.
+    /// The kinds of these, each with its first plane.
     pub channels: &'a [(Channel, usize)],
 }
 
 impl<'a, F: Real> Shown<'a, F> {
-    /// What was drawn, with these further channels.
+    /// A drawn image with these further channels.
     pub fn new(image: &'a Image<F>, channels: &'a [(Channel, usize)]) -> Self {
         Self { color: &image.color, alpha: &image.alpha, depth: &image.depth, extra: &image.extra, channels }
     }
@@ -126,7 +126,7 @@ impl<F: Real> Gradient<F> {
     }
 
     /// The planes, to be added to.
-    pub fn add(&mut self) -> &mut Planes<F> {
+    pub(crate) fn add(&mut self) -> &mut Planes<F> {
         if !std::mem::replace(&mut self.touched, true) {
             let [channels, height, width] = self.shape;
             self.planes.reset(channels, height, width);
@@ -135,12 +135,12 @@ impl<F: Real> Gradient<F> {
     }
 
     /// The planes, of any shape and content, to be overwritten as a whole; `None`: a term has added to them already.
-    pub fn overwrite(&mut self) -> Option<&mut Planes<F>> {
+    pub(crate) fn overwrite(&mut self) -> Option<&mut Planes<F>> {
         (!std::mem::replace(&mut self.touched, true)).then_some(&mut self.planes)
     }
 
     /// The planes, if a term has touched them.
-    pub fn get(&self) -> Option<&Planes<F>> {
+    pub(crate) fn get(&self) -> Option<&Planes<F>> {
         self.touched.then_some(&self.planes)
     }
 }
@@ -160,7 +160,7 @@ pub struct PictureGrads<F = f32> {
 
 impl<F: Real> PictureGrads<F> {
     /// Zeros in the shape of `image`.
-    pub fn begin(&mut self, image: &Image<F>) {
+    pub(crate) fn begin(&mut self, image: &Image<F>) {
         self.color.begin(&image.color);
         self.alpha.begin(&image.alpha);
         self.depth.begin(&image.depth);
@@ -175,7 +175,7 @@ impl<F: Real> PictureGrads<F> {
     }
 
     /// As the renderer takes it.
-    pub fn grads(&mut self) -> ImageGrads<'_, F> {
+    pub(crate) fn grads(&mut self) -> ImageGrads<'_, F> {
         self.color.add();
         ImageGrads {
             color: &self.color.planes,
@@ -188,7 +188,7 @@ impl<F: Real> PictureGrads<F> {
 
 /// A loss on rendered pictures.
 pub trait ImageTerm<F: Real = f32>: Send {
-    /// What it needs of this view beside colour and alpha.
+    /// The planes that it needs of this view beside colour and alpha.
     fn needs(&self, _view: &View<'_, F>) -> Needs {
         Needs::default()
     }
@@ -196,7 +196,7 @@ pub trait ImageTerm<F: Real = f32>: Send {
     /// Its value for one view; adds its gradient to `d`.
     fn eval(&mut self, info: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64;
 
-    /// What it measured of the last view, for progress and metrics.
+    /// Its measurement of the last view, for progress and metrics.
     fn measured(&self) -> Option<LossValue> {
         None
     }

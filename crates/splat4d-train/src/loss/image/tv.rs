@@ -7,7 +7,7 @@ use splat4d::scene::Planes;
 
 /// [`total_variation`] of the colours, times a weight.
 #[derive(Clone, Copy, Debug)]
-pub struct TotalVariation(pub f64);
+pub(crate) struct TotalVariation(pub f64);
 
 impl<F: Real> ImageTerm<F> for TotalVariation {
     fn eval(&mut self, _: &StepInfo, _: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64 {
@@ -17,7 +17,7 @@ impl<F: Real> ImageTerm<F> for TotalVariation {
 
 /// [`depth_smoothness`] beside the view's truth, times a weight.
 #[derive(Clone, Copy, Debug)]
-pub struct DepthSmoothness(pub f64);
+pub(crate) struct DepthSmoothness(pub f64);
 
 impl<F: Real> ImageTerm<F> for DepthSmoothness {
     fn needs(&self, _: &View<'_, F>) -> Needs {
@@ -32,7 +32,7 @@ impl<F: Real> ImageTerm<F> for DepthSmoothness {
 /// How fast an edge of the picture frees the depth beside it: a difference of a tenth of the colour range counts e⁻¹.
 const EDGE: f64 = 10.0;
 
-/// What a pair of neighbouring pixels, by their numbers, weighs; 0: they are not compared.
+/// The weight of a pair of neighbouring pixels, by their numbers; 0: they are not compared.
 type Pair<'a, F> = dyn Fn(usize, usize) -> F + Sync + 'a;
 
 fn sign<F: Real>(x: F) -> F {
@@ -80,7 +80,7 @@ fn variation<F: Real>(plane: &[F], [width, height]: [usize; 2], pair: &Pair<'_, 
 /// Mean over pixels and channels of |difference to the right| + |difference below|, in the picture's unit.
 ///
 /// Source: Rudin, Osher, Fatemi 1992, anisotropic.
-pub fn total_variation<F: Real>(image: &Planes<F>, weight: f64, d: &mut Planes<F>) -> f64 {
+pub(crate) fn total_variation<F: Real>(image: &Planes<F>, weight: f64, d: &mut Planes<F>) -> f64 {
     assert_eq!(image.data.len(), d.data.len(), "a gradient has its picture's shape");
     let scale = weight / image.data.len().max(1) as f64;
     let size = [image.width, image.height];
@@ -92,7 +92,7 @@ pub fn total_variation<F: Real>(image: &Planes<F>, weight: f64, d: &mut Planes<F
 /// depth|, over the mean expected depth (held constant): no unit. Depth may break where the truth has an edge.
 ///
 /// `depth` is Σ z α T. Source: Godard et al. 2017, "edge-aware" disparity smoothness, with depth over its mean.
-pub fn depth_smoothness<F: Real>(
+pub(crate) fn depth_smoothness<F: Real>(
     depth: &Planes<F>,
     alpha: &Planes<F>,
     truth: &Planes<F>,

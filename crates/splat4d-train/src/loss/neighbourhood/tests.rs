@@ -1,6 +1,6 @@
 use super::*;
 use splat4d::layers::Layer;
-use splat4d::motion::{SpacetimeSpec, Spec, build};
+use splat4d::motion::{SpacetimeSpec, Spec, build_as};
 use splat4d::scene::splats::SPLAT_COLUMNS;
 use splat4d::scene::{LifeKind, Params};
 
@@ -14,7 +14,7 @@ fn made(weights: MotionWeights, clip: [f64; 2]) -> Neighbourhood<f64> {
 
 fn scene(life: LifeKind) -> Scene<f64> {
     let mut params = Params::new(N, 1, life.columns());
-    let motion = build(&Spec::Spacetime(SpacetimeSpec::default()), &mut params).unwrap();
+    let motion = build_as(&Spec::Spacetime(SpacetimeSpec::default()), &mut params).unwrap();
     let rng = Rng::new(4, "neighbourhood", 0);
     for key in params.keys().collect::<Vec<_>>() {
         for r in 0..N {
@@ -151,7 +151,7 @@ fn still_layers_short_clips_and_lonely_gaussians_are_left_alone() {
     assert!(ProbeLoss::probes(&loss, &scene(LifeKind::Infinite), &info(0)).is_empty());
     let loss = made(all(), CLIP);
     let mut still = scene(LifeKind::Infinite);
-    still.layers[0].motion = build(&Spec::Still, &mut still.layers[0].params).unwrap();
+    still.layers[0].motion = build_as(&Spec::Still, &mut still.layers[0].params).unwrap();
     assert!(ProbeLoss::probes(&loss, &still, &info(0)).is_empty());
     let mut few = scene(LifeKind::Infinite);
     few.layers[0].params.apply(&splat4d::scene::RowEdit::prune(Space::Gaussians, (0..N).map(|r| r < 5)));

@@ -43,7 +43,7 @@ fn draw(info: &StepInfo, purpose: &str) -> Rng {
 
 /// Nodes move as rigidly as possible from the time of the view to one near it.
 #[derive(Clone, Copy, Debug)]
-pub struct NodeArap {
+pub(crate) struct NodeArap {
     /// Weight of the mean squared misfit in units of the extent.
     pub weight: f64,
     /// The scene's extent.
@@ -79,7 +79,7 @@ impl<F: Real> ProbeLoss<F> for NodeArap {
 
 /// Distances between neighbouring nodes stay as they are through a small window of time.
 #[derive(Clone, Copy, Debug)]
-pub struct NodeElastic {
+pub(crate) struct NodeElastic {
     /// Weight; the loss has no unit.
     pub weight: f64,
     /// First and last second.
@@ -113,7 +113,7 @@ impl<F: Real> ProbeLoss<F> for NodeElastic {
 
 /// Nodes change their velocity as little as possible.
 #[derive(Clone, Copy, Debug)]
-pub struct NodeAcceleration {
+pub(crate) struct NodeAcceleration {
     /// Weight; the loss has no unit.
     pub weight: f64,
     /// First and last second.
@@ -147,7 +147,7 @@ impl<F: Real> ProbeLoss<F> for NodeAcceleration {
 
 /// Mean of the motion mask: what need not move rests.
 #[derive(Clone, Copy, Debug)]
-pub struct MaskSize {
+pub(crate) struct MaskSize {
     /// Weight.
     pub weight: f64,
 }
@@ -177,7 +177,7 @@ impl<F: Real> ParamLoss<F> for MaskSize {
 
 /// Mean |x| of a table of the nodes: few shared motions a node (DynMF).
 #[derive(Clone, Copy, Debug)]
-pub struct Sparse {
+pub(crate) struct Sparse {
     /// Weight.
     pub weight: f64,
     /// The table.

@@ -30,6 +30,19 @@ fn two_stages_make_one_schedule() {
 }
 
 #[test]
+fn networks_come_in_slowly_and_the_cloud_learns_on() {
+    let moving = DeformProgram.stages(&plan(&["deform_trunk=hash"])).remove(1);
+    let group = |column: &str| moving.groups.iter().find(|g| g.column == column).unwrap();
+    let (network, late) = (group("deform_trunk.0.weight"), group("deform_xyz.7"));
+    let share = |g: &Group, step: usize| (1e6 * g.rate_at(step, 0.0) / g.rate.start).round() / 1e6;
+    assert_eq!([0, 24, 49, 50].map(|s| share(network, s)), [0.02, 0.5, 1.0, 1.0]);
+    assert!(late.from > 0 && share(late, late.from) == 0.02, "each group from its own first step");
+    assert_eq!(share(group("means"), 0), 1.0);
+    let tuning = super::super::tuning(&plan(&["deform_trunk=hash"])).unwrap();
+    assert!(tuning.groups.iter().all(|g| share(g, 0) == 1.0), "what is there already needs no warm-up");
+}
+
+#[test]
 fn smoothing_noise_starts_at_its_share_of_a_frame_and_ends() {
     let plan = plan(&["deform_time_noise=0.1", "deform_warmup=0"]);
     let noise = DeformProgram.stages(&plan)[0].time_noise;
@@ -55,9 +68,11 @@ fn fine_levels_of_hash_grids_wait() {
 #[test]
 fn the_network_suits_the_cameras() {
     let mut plan = plan(&[]);
-    assert!(matches!(spec(&plan).input, Input::Encoded { .. }));
-    plan.fixed_cameras = 4;
-    assert!(matches!(spec(&plan).input, Input::Hashed { .. }));
+    let mut hashed = |fixed_cameras: usize, masks: bool| {
+        (plan.fixed_cameras, plan.masks) = (fixed_cameras, masks);
+        matches!(spec(&plan).input, Input::Hashed { .. })
+    };
+    assert!(!hashed(0, true) && hashed(0, false) && hashed(4, true) && hashed(4, false));
     plan.recipe.set("deform_trunk=small").unwrap();
     assert!(matches!(spec(&plan).input, Input::Encoded { .. }));
 }

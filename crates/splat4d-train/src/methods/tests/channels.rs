@@ -1,8 +1,8 @@
 //! Gradients through the whole chain of what is drawn beside colours: depth, normals, flow and a column's sigmoid.
 
 use super::*;
+use crate::capture::frames::FlowTruth;
 use crate::loss::image::{Channel, Needs};
-use crate::train::chain::FlowTruth;
 
 /// Random weights on every number of every picture but the colours.
 struct Weighted(Needs);
@@ -32,7 +32,7 @@ impl ImageTerm<f64> for Weighted {
 
 fn moving(life: LifeKind) -> Scene<f64> {
     let mut params = cloud(24, life, 9);
-    let motion = build(&Spec::Spacetime(SpacetimeSpec::default()), &mut params).unwrap();
+    let motion = build_as(&Spec::Spacetime(SpacetimeSpec::default()), &mut params).unwrap();
     let velocities = params.find("velocities").unwrap();
     shake(&mut params, velocities, 0.5, 3);
     one_layer(params, motion, life)

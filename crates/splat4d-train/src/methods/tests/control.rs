@@ -15,7 +15,7 @@ fn skinned<F: Real>(rows: usize, nodes: usize, trajectory: TrajectorySpec) -> Sc
     let mut p = cloud::<F>(rows, LifeKind::Infinite, 3);
     let skin = SkinSpec { nodes, neighbours: 3, hyper: 2, mask: true };
     let spec = Spec::Control(ControlSpec { seed: 1, clip: [0.0, 0.2], skin, trajectory });
-    let motion = build(&spec, &mut p).unwrap();
+    let motion = build_as(&spec, &mut p).unwrap();
     one_layer(p, motion, LifeKind::Infinite)
 }
 

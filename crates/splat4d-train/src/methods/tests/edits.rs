@@ -21,7 +21,7 @@ fn fill(table: &mut Table<f32>) {
 fn tagged(rows: usize) -> (Scene<f32>, Vec<Moments<f32>>, Stats) {
     let mut p = cloud::<f32>(rows, LifeKind::GaussHalf, 1);
     let spec = Spec::Spacetime(SpacetimeSpec { order: 2, rotation: true, ..SpacetimeSpec::default() });
-    let motion = build(&spec, &mut p).unwrap();
+    let motion = build_as(&spec, &mut p).unwrap();
     p.entry("weights", Space::Fixed, &[("weights", 1)], 21, |_| {}).unwrap();
     p.entry("nodes", Space::Nodes, &[("node_centers", 3)], 19, |_| {}).unwrap();
     for frame in 0..3 {

@@ -12,14 +12,14 @@ fn featured<F: Real>(life: LifeKind, detach: bool, beside: bool) -> Scene<F> {
     let mut p = cloud::<F>(12, life, 31);
     let features = Some(FeatureSpec { seed: 4 });
     let spec = Spec::Spacetime(SpacetimeSpec { order: 2, rotation: true, detach, origin: 0.1, features });
-    let motion = build(&spec, &mut p).unwrap();
+    let motion = build_as(&spec, &mut p).unwrap();
     for key in p.keys().skip(3).collect::<Vec<_>>() {
         let weights = p.info(key).space == Space::Fixed;
         shake(&mut p, key, if weights { 0.6 } else { 0.2 }, 1);
     }
     let mut scene = Scene { head: Head::Features, ..one_layer(p, motion, life) };
     if beside {
-        let still = build(&Spec::Still, &mut Params::new(0, 1, &[])).unwrap();
+        let still = build_as(&Spec::Still, &mut Params::new(0, 1, &[])).unwrap();
         let plain = one_layer(cloud::<F>(5, LifeKind::Infinite, 22), still, LifeKind::Infinite);
         scene.layers.splice(0..0, plain.layers);
     }
@@ -118,7 +118,7 @@ fn colours_that_change_with_time_and_view_are_learnt_better_with_a_head() {
         // Everything stays for the whole clip: nobody can show a new colour by being born.
         let mut p = cloud::<f32>(160, LifeKind::Infinite, 4);
         let spec = SpacetimeSpec { order: 1, origin: 0.1, features, ..SpacetimeSpec::default() };
-        let motion = build(&Spec::Spacetime(spec), &mut p).unwrap();
+        let motion = build_as(&Spec::Spacetime(spec), &mut p).unwrap();
         let mut scene = one_layer(p, motion, LifeKind::Infinite);
         if features.is_some() {
             scene.head = Head::Features;

@@ -16,7 +16,7 @@ fn filtered_scene<F: Real>(change: impl Fn(&mut FilteredSpec)) -> Scene<F> {
     let mut spec = FilteredSpec { fusion: Fusion::Geodesic, ..FilteredSpec::around(inner(), 0.05, -0.3) };
     change(&mut spec);
     let mut p = cloud::<F>(8, LifeKind::GaussHalf, 9);
-    let motion = build(&Spec::Filtered(spec), &mut p).unwrap();
+    let motion = build_as(&Spec::Filtered(spec), &mut p).unwrap();
     for key in p.keys().skip(3).collect::<Vec<_>>() {
         shake(&mut p, key, 0.2, 1);
     }
@@ -48,7 +48,7 @@ fn the_whole_chain_has_the_gradient_of_differences() {
     let probes: Probes = vec![Box::new(Transport::new(transport(), 0))];
     let plain = {
         let mut p = cloud::<f64>(8, LifeKind::Infinite, 9);
-        let motion = build(&inner(), &mut p).unwrap();
+        let motion = build_as(&inner(), &mut p).unwrap();
         let key = p.find("velocities").unwrap();
         shake(&mut p, key, 0.3, 2);
         one_layer(p, motion, LifeKind::Infinite)
@@ -117,7 +117,7 @@ fn a_recipe_wraps_any_program_and_leaves_no_trace() {
         let due = |step: &usize| stages[0].upkeep.iter().any(|u| u.due(&At { step: *step, steps: 40 }));
         assert_eq!((0..40).filter(due).collect::<Vec<_>>(), [20]);
         let mut p = cloud::<f32>(40, LifeKind::GaussHalf, 4);
-        let motion = build(&Spec::Filtered(spec), &mut p).unwrap();
+        let motion = build_as(&Spec::Filtered(spec), &mut p).unwrap();
         let mut t = trainer(one_layer(p, motion, LifeKind::GaussHalf), stages, 200);
         for step in 0..40 {
             t.step().unwrap().expect("no fault");
@@ -173,7 +173,7 @@ fn hooks_of_the_program_inside_see_its_own_model() {
     let plan = made_plan(r.resolve());
     let program = super::super::filtered::wrap(Box::new(Hooked), &plan.recipe);
     let mut p = cloud::<f32>(20, LifeKind::Infinite, 4);
-    let motion = build(&program.spec(&plan), &mut p).unwrap();
+    let motion = build_as(&program.spec(&plan), &mut p).unwrap();
     let mut t = trainer(one_layer(p, motion, LifeKind::Infinite), program.stages(&plan), 200);
     let mut on = Vec::new();
     while !t.is_done() {

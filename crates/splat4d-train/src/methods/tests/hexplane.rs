@@ -29,7 +29,7 @@ fn plan() -> Plan {
 
 fn start(plan: &Plan) -> Trainer<'static> {
     let mut p = cloud::<f32>(60, LifeKind::Infinite, 3);
-    let motion = build(&HexplaneProgram.spec(plan), &mut p).unwrap();
+    let motion = build_as(&HexplaneProgram.spec(plan), &mut p).unwrap();
     trainer(one_layer(p, motion, LifeKind::Infinite), HexplaneProgram.stages(plan), 60)
 }
 

@@ -4,7 +4,7 @@ use super::*;
 use crate::optim::Noise;
 use crate::upkeep::{Adc, AdcSettings, Every, Mcmc, McmcSettings, MortonOrder};
 
-/// What a strategy adds to a stage.
+/// A function that adds a strategy to a stage.
 pub(super) type Strategy = fn(&mut Stage, Every);
 
 /// Both strategies, eager enough for thirty steps.
@@ -23,7 +23,7 @@ fn mcmc(stage: &mut Stage, steps: Every) {
 }
 
 fn two_layers<F: Real>(rows: usize) -> Scene<F> {
-    let still = build(&Spec::Still, &mut Params::<F>::new(0, 1, &[])).unwrap();
+    let still = build_as(&Spec::Still, &mut Params::<F>::new(0, 1, &[])).unwrap();
     let mut scene = one_layer(cloud(rows, LifeKind::Infinite, 31), still, LifeKind::Infinite);
     scene.layers.extend(scan::scan_scene::<F>(rows).layers);
     let (lobes, _) = lobes::lobes_scene(rows);

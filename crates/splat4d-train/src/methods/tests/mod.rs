@@ -4,7 +4,6 @@
 mod channels;
 mod control;
 mod edits;
-mod engine;
 mod features;
 mod filtered;
 mod guests;
@@ -20,17 +19,17 @@ mod upkeep;
 mod wrapper;
 
 use super::*;
+use crate::capture::frames::{Frames, Picture};
 use crate::loss::image::{ImageTerm, PictureGrads, Shown};
-use crate::train::chain::{Chain, Losses, Step, StepInfo, StepReport, View};
-use crate::train::frames::{Frames, Picture};
-use crate::train::loss::TrainLoss;
-use crate::train::tests::Made;
-use crate::train::trainer::{Settings, Trainer};
+use crate::step::chain::{Chain, Losses, Step, StepInfo, StepReport, View};
+use crate::step::loss::TrainLoss;
+use crate::step::tests::Made;
+use crate::step::trainer::{Settings, Trainer};
 use crate::upkeep::Limits;
 use splat4d::layers::Layer;
 use splat4d::math::sh::MAX_DEGREE;
 use splat4d::math::{Real, Rng};
-use splat4d::motion::{Motion, SpacetimeSpec, build};
+use splat4d::motion::{Motion, SpacetimeSpec, build_as};
 use splat4d::render::{
     self, Backend, Image, ImageGrads, PartGrads, RenderConfig, RenderGrads, Renderer, Wanted, oracle,
 };

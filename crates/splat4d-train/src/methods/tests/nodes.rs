@@ -280,15 +280,15 @@ impl<F: Real> ProbeLoss<F> for Anchors {
         "anchors"
     }
 
-    fn probes(&self, _: &Scene<F>, _: &StepInfo) -> Vec<crate::train::chain::Probe> {
+    fn probes(&self, _: &Scene<F>, _: &StepInfo) -> Vec<crate::step::chain::Probe> {
         let times = self.at.iter().map(|a| a.1).collect();
-        vec![crate::train::chain::Probe { layer: 0, of: Space::Nodes, rows: None, times }]
+        vec![crate::step::chain::Probe { layer: 0, of: Space::Nodes, rows: None, times }]
     }
 
     fn eval(
         &self,
         _: &Scene<F>,
-        _: &[crate::train::chain::Probe],
+        _: &[crate::step::chain::Probe],
         seen: &[Vec<Table<F>>],
         d: &mut [Vec<Table<F>>],
     ) -> f64 {
@@ -342,7 +342,7 @@ fn an_edit_of_nodes_keeps_every_gaussian_on_its_nodes() {
 
 #[test]
 fn warm_up_then_nodes_then_frame_by_frame_tracking() {
-    let motion = build(&Spec::Still, &mut Params::<f32>::new(0, 1, &[])).unwrap();
+    let motion = build_as(&Spec::Still, &mut Params::<f32>::new(0, 1, &[])).unwrap();
     let scene = one_layer(cloud::<f32>(90, LifeKind::Infinite, 1), motion, LifeKind::Infinite);
     let warm_up =
         Stage { sampler: Sampler::Frame(0), batch: 4, groups: groups(&ORDINARY), ..Stage::new("warm-up", 20) };

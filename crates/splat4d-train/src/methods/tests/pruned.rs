@@ -3,7 +3,7 @@
 use super::nodes::Skinned;
 use super::*;
 use crate::learner::Learner;
-use crate::upkeep::worth::{Keys, MaskConfig, ScoreConfig, Spatial, key_masks, prune, score};
+use crate::upkeep::worth::{MaskConfig, ScoreConfig, Spatial, key_masks, prune, score};
 use crate::upkeep::{Prune, PruneSettings};
 
 /// A deformation model whose nodes move between its two pages, and whose first ten Gaussians live for a moment.
@@ -45,7 +45,7 @@ fn a_deformation_model_is_scored_pruned_masked_and_trained_on() {
     let nodes = scene.layers[0].params.find("nodes").unwrap();
     assert_eq!(scene.layers[0].params[nodes].rows(), 3, "nodes stay");
 
-    let config = MaskConfig { keys: Keys::Interval(2), ..MaskConfig::default() };
+    let config = MaskConfig { interval: 2, ..MaskConfig::default() };
     key_masks(&mut scene, &made, &config, &mut |_, _| {}).unwrap();
     let mut active = Vec::new();
     scene.layers[0].active(Time(0.05), &mut active);

@@ -1,7 +1,7 @@
 //! A loss over triples of times, merged with the step's views: one question a distinct (layer, time).
 
 use super::*;
-use crate::train::chain::Probe;
+use crate::step::chain::Probe;
 use splat4d::layers::LayerTape;
 use splat4d::motion::Cache;
 use splat4d::scene::Rows;
@@ -49,14 +49,14 @@ fn two_layers() -> Scene<f64> {
     p[LIFE].write(2, 0, [5.0, -2.0]);
     p[LIFE].write(6, 0, [5.0, -2.0]);
     let spec = Spec::Spacetime(SpacetimeSpec { order: 3, rotation: true, ..SpacetimeSpec::default() });
-    let motion = build(&spec, &mut p).unwrap();
+    let motion = build_as(&spec, &mut p).unwrap();
     for key in p.keys().skip(3).collect::<Vec<_>>() {
         shake(&mut p, key, 0.2, 1);
     }
     let mut scene = one_layer(p, motion, LifeKind::GaussHalf);
     let still = one_layer(
         cloud::<f64>(5, LifeKind::Infinite, 22),
-        build(&Spec::Still, &mut Params::new(0, 1, &[])).unwrap(),
+        build_as(&Spec::Still, &mut Params::new(0, 1, &[])).unwrap(),
         LifeKind::Infinite,
     );
     scene.layers.extend(still.layers);
@@ -102,7 +102,7 @@ fn direct(scene: &Scene<f64>, rows: Option<&[u32]>) -> f64 {
 fn a_triple_trains_with_pictures() {
     let mut p = cloud::<f32>(70, LifeKind::GaussHalf, 4);
     let spec = Spec::Spacetime(SpacetimeSpec { order: 2, ..SpacetimeSpec::default() });
-    let motion = build(&spec, &mut p).unwrap();
+    let motion = build_as(&spec, &mut p).unwrap();
     let key = p.find("velocities").unwrap();
     shake(&mut p, key, 0.3, 2);
     let stage = Stage {

@@ -1,14 +1,12 @@
-//! What adds, moves and removes rows in the middle of a stage: every loss hears of it, and guided sampling finds what no
-//! Gaussian stands for.
+//! Edits of rows in the middle of a stage: every loss hears of them, and guided sampling finds what no Gaussian stands
+//! for.
 
 use super::*;
-use crate::learner::Learner;
-use crate::train::checkpoint;
-use crate::upkeep::Change as Rows;
+use crate::upkeep::merge::Pair;
 use crate::upkeep::worth::Spatial;
 use crate::upkeep::{
-    AdaptNodes, Context, Every, Guided, GuidedSettings, Merge, MergeSettings, NodeSettings, Once, Pair, Prune,
-    PruneSettings, Relocate, RelocateSettings, Upkeep,
+    AdaptNodes, Every, Guided, GuidedSettings, Merge, MergeSettings, NodeSettings, Once, Prune, PruneSettings,
+    Relocate, RelocateSettings,
 };
 use splat4d::motion::control::{ControlSpec, Curve, TrajectorySpec};
 use splat4d::motion::skin::SkinSpec;
@@ -24,13 +22,13 @@ impl ProbeLoss<f32> for Ear {
     fn name(&self) -> &str {
         "ear"
     }
-    fn probes(&self, _: &Scene<f32>, _: &StepInfo) -> Vec<crate::train::chain::Probe> {
+    fn probes(&self, _: &Scene<f32>, _: &StepInfo) -> Vec<crate::step::chain::Probe> {
         Vec::new()
     }
     fn eval(
         &self,
         _: &Scene<f32>,
-        _: &[crate::train::chain::Probe],
+        _: &[crate::step::chain::Probe],
         _: &[Vec<Table<f32>>],
         _: &mut [Vec<Table<f32>>],
     ) -> f64 {
@@ -58,7 +56,7 @@ fn on_nodes() -> Scene<f32> {
     let skin = SkinSpec { nodes: 12, neighbours: 3, hyper: 2, mask: false };
     let trajectory = TrajectorySpec::Keys { curve: Curve::Cubic, keys: 5 };
     let spec = Spec::Control(ControlSpec { seed: 1, clip: [0.0, 0.2], skin, trajectory });
-    let motion = build(&spec, &mut p).unwrap();
+    let motion = build_as(&spec, &mut p).unwrap();
     one_layer(p, motion, LifeKind::Infinite)
 }
 
@@ -131,7 +129,7 @@ fn guided_sampling_finds_a_sky_that_no_gaussian_stands_for() {
     let run = |guided: Option<GuidedSettings>| {
         // All at the ball: the sky of the capture is not the background.
         let mut p = cloud::<f32>(60, LifeKind::GaussHalf, 3);
-        let motion = build(&Spec::Spacetime(SpacetimeSpec::default()), &mut p).unwrap();
+        let motion = build_as(&Spec::Spacetime(SpacetimeSpec::default()), &mut p).unwrap();
         for r in 0..60 {
             p[LIFE].write(r, 0, [0.1, 2.0]);
             let mean = p[GEOMETRY].read::<3>(r, 0);
@@ -157,61 +155,4 @@ fn guided_sampling_finds_a_sky_that_no_gaussian_stands_for() {
     let [(none, left), (added, mended)] = [None, Some(GuidedSettings { from: 0.1, times: 3, share: 0.5 })].map(run);
     assert!(none == 0 && added > 20, "{added} were added");
     assert!(mended < 0.99 * left, "{mended} of the error is left, {left} without");
-}
-
-/// An operation of a caller's own: every seven steps the next Gaussian turns white. It remembers which one is next.
-struct Whiten {
-    next: u32,
-}
-
-impl Upkeep for Whiten {
-    fn name(&self) -> &str {
-        "whiten"
-    }
-    fn due(&self, at: &crate::upkeep::At) -> bool {
-        at.step.is_multiple_of(7)
-    }
-    fn run(&mut self, learner: &mut Learner, _: &Context<'_>) -> Result<Rows> {
-        learner.scene_mut().layers[0].params[SH].write(self.next as usize, 0, [1.5f32; 3]);
-        self.next += 1;
-        Ok(Default::default())
-    }
-    fn state(&self) -> Vec<u32> {
-        vec![self.next]
-    }
-    fn restore(&mut self, state: &[u32]) {
-        self.next = state.first().copied().unwrap_or(0);
-    }
-}
-
-/// One file and one line add an operation: it runs, is in checkpoints, and goes on where it was.
-#[test]
-fn an_operation_of_ones_own_runs_and_resumes_to_the_bit() {
-    let start = || {
-        let still = build(&Spec::Still, &mut Params::<f32>::new(0, 1, &[])).unwrap();
-        let scene = one_layer(cloud(30, LifeKind::Infinite, 3), still, LifeKind::Infinite);
-        let mut stage = Stage { groups: groups(&ORDINARY), ..Stage::new("whiten", 30) };
-        stage.keep(Whiten { next: 0 });
-        trainer(scene, vec![stage], 30)
-    };
-    let identity = checkpoint::Identity::default();
-    let saved = |t: &Trainer<'_>| checkpoint::write(t, &identity, &Default::default()).unwrap();
-    let mut whole = start();
-    let mut kept = Vec::new();
-    while !whole.is_done() {
-        whole.step().unwrap().expect("no fault");
-        if whole.progress.iteration == 16 {
-            kept = saved(&whole);
-        }
-        if whole.progress.iteration == 14 {
-            assert_eq!(whole.scene().layers[0].params[SH].read::<3>(1, 0), [1.5; 3], "the second one's turn");
-        }
-    }
-    let mut again = start();
-    checkpoint::read(&kept, &mut again, &identity).unwrap();
-    while !again.is_done() {
-        again.step().unwrap().expect("no fault");
-    }
-    assert!(saved(&again) == saved(&whole), "resumed, it ends elsewhere");
-    assert_eq!(again.stages[0].upkeep[0].state(), [4]);
 }

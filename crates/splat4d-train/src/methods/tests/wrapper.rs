@@ -158,7 +158,7 @@ fn glow_scene<F: Real>() -> Scene<F> {
 
 fn built(spec: &Spec, life: LifeKind) -> Scene<f64> {
     let mut p = cloud::<f64>(8, life, 9);
-    let motion = build(spec, &mut p).unwrap();
+    let motion = build_as(spec, &mut p).unwrap();
     for key in p.keys().skip(3).collect::<Vec<_>>() {
         shake(&mut p, key, 0.2, 1);
     }

@@ -11,20 +11,11 @@ use splat4d::render::Antialias;
 use splat4d::scene::{KeyMasks, Time};
 use std::sync::Arc;
 
-/// Where key times lie. They are always times of training frames, the first and the last among them.
-#[derive(Clone, Debug, PartialEq)]
-pub enum Keys {
-    /// So many frames of the clip apart (0 counts as 1); the last gap may be shorter.
-    Interval(usize),
-    /// At the training times nearest to these, seconds.
-    Times(Vec<f64>),
-}
-
 /// How masks are made.
 #[derive(Clone, Debug, PartialEq)]
-pub struct MaskConfig {
-    /// Where key times lie.
-    pub keys: Keys,
+pub(crate) struct MaskConfig {
+    /// Frames of the clip between key times (0 counts as 1); the last gap may be shorter.
+    pub interval: usize,
     /// As the scene was trained.
     pub antialias: Antialias,
 }
@@ -32,39 +23,27 @@ pub struct MaskConfig {
 impl Default for MaskConfig {
     /// A key every fifth frame.
     fn default() -> Self {
-        Self { keys: Keys::Interval(5), antialias: Antialias::Off }
+        Self { interval: 5, antialias: Antialias::Off }
     }
 }
 
-impl Keys {
-    /// The key times for training frames at `times` (rising) of a clip of `fps` frames a second.
-    pub fn among(&self, times: &[f64], fps: f64) -> Vec<f64> {
-        let [Some(&first), Some(&last)] = [times.first(), times.last()] else { return Vec::new() };
-        let nearest = |t: f64| {
-            let after = times.partition_point(|x| *x < t).min(times.len() - 1);
-            let before = after.saturating_sub(1);
-            if t - times[before] < times[after] - t { times[before] } else { times[after] }
-        };
-        let mut keys = match self {
-            Keys::Times(wanted) => wanted.iter().filter(|t| t.is_finite()).map(|&t| nearest(t)).collect(),
-            Keys::Interval(frames) => {
-                let frames = (*frames).max(1) as f64;
-                let (gap, mut keys, mut next) = (frames / fps, Vec::new(), first);
-                // Every key is the time of a frame, so that there are never more keys than times.
-                for &t in times {
-                    if t >= next - 0.5 / fps {
-                        keys.push(t);
-                        next = first + (((t - first) / gap + 0.5 / frames).floor() + 1.0) * gap;
-                    }
-                }
-                keys
-            }
-        };
-        keys.extend([first, last]);
-        keys.sort_by(f64::total_cmp);
-        keys.dedup();
-        keys
+/// Key times so many frames apart, for training frames at `times` (rising) of a clip of `fps` frames a second: always
+/// times of training frames, the first and the last among them.
+pub(super) fn keys(interval: usize, times: &[f64], fps: f64) -> Vec<f64> {
+    let [Some(&first), Some(&last)] = [times.first(), times.last()] else { return Vec::new() };
+    let frames = interval.max(1) as f64;
+    let (gap, mut keys, mut next) = (frames / fps, Vec::new(), first);
+    // Every key is the time of a frame, so that there are never more keys than times.
+    for &t in times {
+        if t >= next - 0.5 / fps {
+            keys.push(t);
+            next = first + (((t - first) / gap + 0.5 / frames).floor() + 1.0) * gap;
+        }
     }
+    keys.extend([first, last]);
+    keys.sort_by(f64::total_cmp);
+    keys.dedup();
+    keys
 }
 
 /// Gives every layer of `scene` masks: at a key time, the Gaussians that any training view of that time shows (weight
@@ -73,7 +52,7 @@ impl Keys {
 /// `progress` hears of views done and in all.
 ///
 /// Errors: there is no frame.
-pub fn key_masks(
+pub(crate) fn key_masks(
     scene: &mut Scene<f32>,
     frames: &dyn Frames,
     config: &MaskConfig,
@@ -86,7 +65,7 @@ pub fn key_masks(
     let timeline = Timeline::new(frames);
     let times: Vec<f64> = (0..timeline.times()).map(|k| frames.time(timeline.at(k)[0] as usize).0).collect();
     let fps = if scene.fps > 0.0 { scene.fps } else { splat4d::scene::time::DEFAULT_FPS };
-    let keys = config.keys.among(&times, fps);
+    let keys = keys(config.interval, &times, fps);
     scene.layers.iter_mut().for_each(|l| l.masks = None);
     let mut masks: Vec<KeyMasks> = scene.layers.iter().map(|l| KeyMasks::new(keys.clone(), l.params.len())).collect();
 

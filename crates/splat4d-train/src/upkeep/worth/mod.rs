@@ -1,4 +1,4 @@
-//! Worth: which Gaussians are worth keeping ([`score()`], [`prune`]) and which are worth drawing when ([`key_masks`]).
+//! Worth: which Gaussians are worth keeping ([`score()`], [`prune`]) and which are worth drawing when (`key_masks`).
 //!
 //! After 4DGS-1K (Yuan et al. 2025), for every layer whatever its motion model: a Gaussian's worth is what it adds to
 //! the training pictures, and what is known of its life. Nothing is learnt here; a scene recovers by further training.
@@ -10,7 +10,7 @@ mod temporal;
 mod tests;
 mod weighing;
 
-pub use masks::{Keys, MaskConfig, key_masks};
+pub(crate) use masks::{MaskConfig, key_masks};
 pub use score::{ScoreConfig, Scores, UNIT_FRAMES, score};
 pub use temporal::{Combine, Spatial, Temporal};
 

@@ -1,4 +1,4 @@
-//! What every Gaussian is worth: how much of the training pictures it is, at instants that its life serves well.
+//! Importance scores of Gaussians: how much of the training pictures each is, at instants that its life serves well.
 //!
 //! Source: 4DGS-1K (Yuan et al. 2025, §4.1); the volume as LightGaussian (Fan et al. 2024).
 
@@ -27,9 +27,9 @@ pub const UNIT_FRAMES: f64 = 30.0;
 /// How Gaussians are scored.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ScoreConfig {
-    /// What of a view counts.
+    /// The quantity of a view that counts.
     pub spatial: Spatial,
-    /// What becomes of the life.
+    /// The temporal score of the life.
     pub temporal: Temporal,
     /// How it meets the spatial score.
     pub combine: Combine,
@@ -62,7 +62,7 @@ impl Default for ScoreConfig {
     }
 }
 
-/// What every Gaussian is worth; larger is better, 0 is never seen.
+/// Importance score of every Gaussian; larger is better, 0 is never seen.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Scores {
     /// A score a row, by layer.

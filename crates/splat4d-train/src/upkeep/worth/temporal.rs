@@ -36,7 +36,7 @@ pub enum Temporal {
     None,
 }
 
-/// What of a view becomes a spatial score.
+/// The quantity of a view that becomes a spatial score.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum Spatial {
@@ -79,7 +79,7 @@ macro_rules! names {
             /// Every one, the default first.
             pub const ALL: &'static [Self] = &[$(Self::$variant),*];
 
-            /// What recipes and the command line call it.
+            /// The name in recipes and on the command line.
             pub fn name(self) -> &'static str {
                 match self { $(Self::$variant => $name),* }
             }

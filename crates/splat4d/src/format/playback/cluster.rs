@@ -19,7 +19,7 @@ const NEAREST: usize = 3;
 /// Points a task assigns.
 const TASK: usize = 1024;
 
-/// What becomes of the points.
+/// Result of the clustering.
 pub(super) struct Clusters {
     /// [k, width]
     pub centroids: Vec<f32>,

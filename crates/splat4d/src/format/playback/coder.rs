@@ -1,4 +1,4 @@
-//! What a reader would see of layers that are pages, without the way through a file: for training against the numbers
+//! Layers of pages as a reader would see them, without the way through a file: for training against the numbers
 //! that will be drawn (straight-through quantisation).
 
 use super::block::Words;

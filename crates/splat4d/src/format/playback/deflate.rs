@@ -12,7 +12,7 @@ use rayon::prelude::*;
 
 /// Without zlib's head and checksum: miniz takes it from the window's sign.
 const RAW: i32 = -15;
-/// What is tried on each run.
+/// Strategies that are tried on each run.
 const STRATEGIES: [CompressionStrategy; 4] = [
     CompressionStrategy::Default,
     CompressionStrategy::Filtered,

@@ -20,7 +20,7 @@ pub(super) const MAX_KEYS: usize = 65_535;
 /// Flag of an entry: who does not know the kind refuses the file.
 const REQUIRED: u32 = 1;
 
-/// What a section holds.
+/// The kind of a section.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Kind {
     /// Gaussians of one span of time.
@@ -81,7 +81,7 @@ impl Codec {
 /// One section, as the table has it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Entry {
-    /// What it holds.
+    /// Kind of its contents.
     pub kind: Kind,
     /// Whether who does not know the kind must refuse the file.
     pub required: bool,
@@ -186,7 +186,7 @@ impl Index {
     }
 
     /// All pages with their places in the table.
-    pub fn pages(&self) -> impl Iterator<Item = (usize, &Entry)> {
+    pub(crate) fn pages(&self) -> impl Iterator<Item = (usize, &Entry)> {
         self.sections.iter().enumerate().filter(|(_, e)| e.kind == Kind::Page)
     }
 
@@ -198,7 +198,7 @@ impl Index {
         all
     }
 
-    /// What ties sections to each other and to the file.
+    /// Checks that sections fit each other and the file.
     fn check(&self, first_byte: u64) -> Result<()> {
         let mut order: Vec<usize> = (0..self.sections.len()).collect();
         order.sort_by_key(|&i| (self.sections[i].offset, self.sections[i].stored));
@@ -349,7 +349,7 @@ impl Entry {
         Ok(entry)
     }
 
-    /// What an entry of a known kind says about itself must fit together.
+    /// Checks that the fields of an entry of a known kind fit together.
     fn check(&self, words: usize) -> Result<()> {
         let most = match self.codec {
             Codec::Raw => u64::from(self.stored),

@@ -4,7 +4,7 @@ use super::block::{Columns, NO_WIDTH, SHARPEST, Words};
 use super::index::broken;
 use super::page::{self, Header, at, half_width, lives_through, reach};
 use super::page::{FOR_EVER as FULL_LIFE, FULL8, FULL10, HALF10, LEVELS8, LEVELS16, MAX_LOG, THINNEST, WIDTH_LEVELS};
-use super::{BLOCK_GAUSSIANS, PAGE_WORDS, Page, Palette, Primitive};
+use super::{BLOCK_GAUSSIANS, PAGE_WORDS, Page, Palette};
 use crate::Result;
 use crate::format::quant;
 use crate::layers::Layer;
@@ -30,7 +30,7 @@ const OPACITY_MARGIN: f64 = 1e-4;
 /// Largest velocity and rate that a layer holds: far beyond any scene, and finite in f32 when times are multiplied.
 const FASTEST: f64 = 1e15;
 
-/// What every Gaussian of a page's layer shares.
+/// Constants common to all Gaussians of a page's layer.
 struct Constants {
     /// By code of the opacity: its logit.
     logits: [f32; 1 << FULL8],
@@ -83,7 +83,7 @@ impl Page {
     /// The page as a layer that is seen during its span; coefficients come from its palette, where it has one.
     ///
     /// Errors: a Gaussian's label is not in the palette. Panics: the page has a palette and none is given.
-    pub fn layer(&self, palette: Option<&Palette>) -> Result<Layer<f32>> {
+    pub(crate) fn layer(&self, palette: Option<&Palette>) -> Result<Layer<f32>> {
         let palette = palette.filter(|_| self.palette.is_some());
         assert!(palette.is_some() || self.palette.is_none(), "a page with a palette needs it");
         let labels = self.labels();
@@ -342,7 +342,8 @@ fn angular([w, x, y, z]: [f64; 4], [a, b, c, d]: [f64; 4]) -> [f64; 3] {
 /// The Gaussians of a page's layer as primitives: the inverse of [`Page::layer`], in the layer's order. Importance is 1.
 ///
 /// Panics: the layer moves or lives otherwise than those of a page.
-pub fn primitives(layer: &Layer<f32>) -> Vec<Primitive> {
+#[cfg(test)]
+pub(crate) fn primitives(layer: &Layer<f32>) -> Vec<super::Primitive> {
     let [.., velocities, rates] = keys(layer);
     let p = &layer.params;
     let coefficients = p[SH].width();
@@ -357,7 +358,7 @@ pub fn primitives(layer: &Layer<f32>) -> Vec<Primitive> {
         let turn = angular(q, p[rates].read::<4>(row, 0).map(f64::from));
         let mut sh_rest = [0.0; 45];
         (3..coefficients).for_each(|k| sh_rest[k - 3] = p[SH].get(row, k));
-        Primitive {
+        super::Primitive {
             mean: p[GEOMETRY].read::<3>(row, 0).map(f64::from),
             center,
             half_width,

@@ -11,7 +11,7 @@ use crate::{Error, Result};
 const WORD_BYTES: usize = WORD / 8;
 
 /// Decodes masks from their stored bytes. Errors: they are not the entry's, or do not hold together.
-pub fn decode_masks(entry: &Entry, stored: &[u8]) -> Result<KeyMasks> {
+pub(crate) fn decode_masks(entry: &Entry, stored: &[u8]) -> Result<KeyMasks> {
     assert!(entry.kind == Kind::Masks, "only masks are decoded as such");
     parse(&unpack(entry, stored)?, entry)
 }

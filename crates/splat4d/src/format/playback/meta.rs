@@ -23,7 +23,7 @@ pub struct Meta {
     /// Metres a scene unit, where known.
     #[serde(default)]
     pub unit: Option<f64>,
-    /// What people call it.
+    /// The scene's title.
     #[serde(default)]
     pub title: String,
     /// Least and greatest corner of the means.
@@ -45,7 +45,7 @@ pub struct Meta {
 pub struct Viewpoint {
     /// The eye.
     pub position: [f64; 3],
-    /// What is in the middle of the picture.
+    /// The point in the middle of the picture.
     pub target: [f64; 3],
     /// Upwards in the picture.
     pub up: [f64; 3],
@@ -97,7 +97,7 @@ pub struct PathKey {
     pub at: f64,
     /// The eye.
     pub position: [f64; 3],
-    /// What is in the middle of the picture.
+    /// The point in the middle of the picture.
     pub target: [f64; 3],
     /// Upwards in the picture.
     pub up: [f64; 3],

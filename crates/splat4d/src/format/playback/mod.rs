@@ -1,7 +1,7 @@
 //! The playback file `.splat4d`: a moving scene, small, readable in parts, checked. docs/format.md is its specification.
 //!
 //! [`write()`] takes a [`Draft`] (floats, sorted into time spans by whoever bakes it), orders, quantises and packs it.
-//! [`Index::parse`] understands the start of a file, [`decode_page`] and [`decode_palette`] any section of it by itself,
+//! [`Index::parse`] understands the start of a file, `decode_page` and [`decode_palette`] any section of it by itself,
 //! and [`read()`] a whole file as a scene of one layer a page.
 
 mod block;
@@ -25,10 +25,11 @@ mod write;
 pub use coder::Coder;
 pub use depths::{Depths, LEAST_DEPTH};
 pub use index::{Codec, Entry, Index, Kind};
-pub use layer::primitives;
-pub use mask::decode_masks;
+#[cfg(test)]
+pub(crate) use layer::primitives;
+pub(crate) use mask::decode_masks;
 pub use meta::{Meta, NamedCamera, PathKey, Viewpoint};
-pub use page::{Page, Record, decode_page};
+pub(crate) use page::{Page, decode_page};
 pub use pages::{Pages, PagesDraft, read_pages, write_pages};
 pub use palette::{Palette, decode_palette};
 pub use read::read;
@@ -37,7 +38,7 @@ pub use write::{ErrorStat, Errors, Summary, WriteConfig, write};
 /// First bytes of a playback file.
 pub const MAGIC: [u8; 8] = *b"\x89S4D\r\n\x1a\n";
 /// The version that this library knows: major, minor. A file states the least that has all it holds.
-pub const VERSION: [u16; 2] = [1, 1];
+pub(crate) const VERSION: [u16; 2] = [1, 1];
 /// The version of a file without masks.
 const FIRST_VERSION: [u16; 2] = [1, 0];
 /// Bytes of the header.
@@ -45,11 +46,11 @@ pub const HEADER_BYTES: usize = 64;
 /// Gaussians in a block, which share ranges.
 pub const BLOCK_GAUSSIANS: usize = 256;
 /// Most Gaussians of a page: 2 MiB of words, and a row number has 16 bits.
-pub const MAX_PAGE_GAUSSIANS: usize = 65_536;
+pub(crate) const MAX_PAGE_GAUSSIANS: usize = 65_536;
 /// Words of a Gaussian.
-pub const PAGE_WORDS: usize = 8;
+pub(crate) const PAGE_WORDS: usize = 8;
 /// Numbers in a block's header.
-pub const BLOCK_HEADER: usize = 24;
+pub(crate) const BLOCK_HEADER: usize = 24;
 /// Most entries of a palette: labels have 16 bits.
 pub const MAX_PALETTE: usize = 65_536;
 /// The least importance a `σ` has before it counts as dead, as everywhere: 1/255.

@@ -28,15 +28,15 @@ pub(super) const MAX_LOG: f64 = 40.0;
 pub(super) const THINNEST: f64 = 1e-3;
 /// Places of a block header (docs/format.md, "Page").
 pub(super) mod at {
-    pub const BOX: usize = 0;
-    pub const CENTER: usize = 6;
-    pub const ALIVE: usize = 8;
-    pub const SCALE: usize = 10;
-    pub const SHIFT: usize = 12;
-    pub const TURN: usize = 13;
-    pub const WIDTH: usize = 14;
-    pub const SOFTNESS: usize = 16;
-    pub const COLOR: usize = 18;
+    pub(crate) const BOX: usize = 0;
+    pub(crate) const CENTER: usize = 6;
+    pub(crate) const ALIVE: usize = 8;
+    pub(crate) const SCALE: usize = 10;
+    pub(crate) const SHIFT: usize = 12;
+    pub(crate) const TURN: usize = 13;
+    pub(crate) const WIDTH: usize = 14;
+    pub(crate) const SOFTNESS: usize = 16;
+    pub(crate) const COLOR: usize = 18;
 }
 
 /// Header of a block.
@@ -44,7 +44,7 @@ pub(super) type Header = [f32; BLOCK_HEADER];
 
 /// A decoded page: headers and words as the file's bits have them.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Page {
+pub(crate) struct Page {
     /// It is drawn for from ≤ t < to, seconds.
     pub span: [f64; 2],
     /// One a block of 256 Gaussians.
@@ -57,7 +57,7 @@ pub struct Page {
 
 /// One Gaussian of a page in numbers.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Record {
+pub(crate) struct Record {
     /// Mean at `center`, scene units.
     pub mean: [f64; 3],
     /// Middle of its life, seconds.
@@ -83,7 +83,7 @@ pub struct Record {
 }
 
 /// Decodes a page from its stored bytes. Errors: they are not the entry's, or do not hold together.
-pub fn decode_page(entry: &Entry, stored: &[u8]) -> Result<Page> {
+pub(crate) fn decode_page(entry: &Entry, stored: &[u8]) -> Result<Page> {
     assert!(entry.kind == Kind::Page, "only a page is decoded as one");
     parse_page(&unpack(entry, stored)?, entry)
 }
@@ -202,17 +202,12 @@ pub(super) fn half_width(code: u32, low: f64, high: f64) -> f64 {
 
 impl Page {
     /// Gaussians.
-    pub fn len(&self) -> usize {
+    pub(crate) fn len(&self) -> usize {
         self.words.len()
     }
 
-    /// Whether it has none; no page of a file has.
-    pub fn is_empty(&self) -> bool {
-        self.words.is_empty()
-    }
-
     /// Gaussian i in numbers. Panics: there are fewer.
-    pub fn record(&self, i: usize) -> Record {
+    pub(crate) fn record(&self, i: usize) -> Record {
         let (h, w) = (&self.headers[i / BLOCK_GAUSSIANS], &self.words[i]);
         let bits = |word: usize, first: u32, count: u32| w[word] >> first & ((1 << count) - 1);
         let line = |at: usize, step: usize, code: u32, levels: u32| {

@@ -15,7 +15,7 @@ use crate::{Error, ErrorKind, Result};
 use rayon::prelude::*;
 use std::io::Write;
 
-/// What a playback file holds, apart from its poster.
+/// Contents of a playback file, apart from its poster.
 #[derive(Clone, Debug)]
 pub struct Pages {
     /// About the scene.
@@ -44,7 +44,7 @@ impl Pages {
     }
 }
 
-/// What [`write_pages`] writes.
+/// The input of [`write_pages`].
 #[derive(Clone, Copy, Debug)]
 pub struct PagesDraft<'a> {
     /// About the scene; `gaussians` is counted by the writer.
@@ -54,7 +54,7 @@ pub struct PagesDraft<'a> {
     pub layers: &'a [Layer<f32>],
     /// Of every layer its rows' entries of the palette.
     pub labels: &'a [Vec<u16>],
-    /// What the labels mean; none: base colours only, and labels are not looked at.
+    /// The entries that the labels number; none: base colours only, and labels are not looked at.
     pub palette: Option<&'a Palette>,
     /// Of every layer.
     pub tiers: &'a [u16],

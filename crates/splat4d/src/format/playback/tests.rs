@@ -6,7 +6,7 @@ mod masks;
 
 use super::block::encode_page;
 use super::index::crc;
-use super::page::parse_page;
+use super::page::{Record, parse_page};
 use super::*;
 use crate::layers::{Evaluation, Scene};
 use crate::math::{Rng, Se3, quat};

@@ -75,7 +75,7 @@ impl ErrorStat {
     }
 }
 
-/// What quantisation changed.
+/// Errors of quantisation.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Errors {
     /// Means in the middle of lives, per axis, scene units.
@@ -98,7 +98,7 @@ pub struct Errors {
     pub sh: ErrorStat,
 }
 
-/// What was written.
+/// Sizes and counts of a written file.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Summary {
     /// Bytes of the file.
@@ -117,7 +117,7 @@ pub struct Summary {
     pub palette_bytes: u64,
     /// Stored bytes of the poster.
     pub poster_bytes: u64,
-    /// What quantisation changed.
+    /// Errors of quantisation.
     pub errors: Errors,
 }
 
@@ -201,7 +201,7 @@ impl Sections {
     }
 }
 
-/// What the table says of a page.
+/// A page's fields in the table of sections.
 pub(super) struct PageEntry {
     pub tier: u16,
     pub count: usize,

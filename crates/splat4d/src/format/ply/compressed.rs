@@ -6,11 +6,23 @@
 //! holds f_rest in bytes over [-4, 4]. Source: layout of PlayCanvas' splat-transform (MIT).
 
 use super::header::{Element, Header, broken};
-use super::{PlyInfo, degree, f_rest_columns, non_finite, rows};
+use super::{PlyInfo, degree, f_rest_columns, is_compressed, non_finite, open, rows, write_compressed};
 use crate::format::bytes::{SH_C0, logit_of_byte};
+use crate::format::dialect::{Dialect, Writer, Y_DOWN};
 use crate::scene::params::{GEOMETRY, LOG_SCALE, OPACITY, Params, QUAT, SH};
 use crate::scene::table::Table;
 use crate::{Error, ErrorKind, Result};
+
+/// PlayCanvas' compressed .ply.
+pub const COMPRESSED: Dialect = Dialect {
+    name: "3DGS .ply, compressed (PlayCanvas)",
+    ending: ".compressed.ply",
+    up: Y_DOWN,
+    moves: false,
+    mark: Some(is_compressed),
+    read: open,
+    writer: Writer::Moment(|params, _, mut out| write_compressed(params, &mut out)),
+};
 
 /// Gaussians that share their bounds.
 pub(super) const CHUNK: usize = 256;

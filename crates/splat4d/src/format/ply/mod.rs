@@ -12,6 +12,8 @@ mod pack;
 mod rows;
 mod stg;
 
+use crate::format::dialect::{Dialect, Opened, Writer, Y_DOWN};
+use crate::format::warnings::Warnings;
 use crate::scene::params::{GEOMETRY, GEOMETRY_COLUMNS, Params, SH};
 use crate::scene::table::{BLOCK, Table};
 use crate::{Error, ErrorKind, Result};
@@ -20,8 +22,20 @@ use rayon::prelude::*;
 use rows::Rows;
 use std::io::Write;
 
-pub use pack::write_compressed;
-pub use stg::{is_stg, read_stg, write_stg};
+pub use compressed::COMPRESSED;
+pub(crate) use pack::write_compressed;
+pub use stg::{STG, is_stg, read_stg, write_stg};
+
+/// Plain 3DGS .ply, and any .ply that nobody else knows.
+pub const DIALECT: Dialect = Dialect {
+    name: "3DGS .ply",
+    ending: ".ply",
+    up: Y_DOWN,
+    moves: false,
+    mark: Some(|bytes| bytes.starts_with(b"ply")),
+    read: open,
+    writer: Writer::Moment(|params, _, mut out| write(params, &mut out).map(|()| Warnings::default())),
+};
 
 /// f_rest properties of SH degree 0, 1, 2 and 3: three channels of the coefficients above the first.
 const F_REST_COUNTS: [usize; 4] = [0, 9, 24, 45];
@@ -42,7 +56,7 @@ const BLOCKS_PER_TASK: usize = 64;
 const ROWS_PER_WRITE: usize = 4096;
 const _: () = assert!(GEOMETRY_COLUMNS.len() == 4, "GEOMETRY_NAMES names these columns");
 
-/// What a file contains besides its numbers.
+/// Metadata of a file, besides its numbers.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct PlyInfo {
     /// Rows.
@@ -103,8 +117,14 @@ pub fn read(bytes: &[u8]) -> Result<(Params, PlyInfo)> {
     Ok((params, info))
 }
 
+/// Opens a plain or compressed file.
+fn open(bytes: &[u8]) -> Result<Opened> {
+    let (params, info) = read(bytes)?;
+    Ok(Opened { ply: Some(info), ..Opened::from((params, Warnings::default())) })
+}
+
 /// Whether a .ply file has PlayCanvas' compressed layout. False for anything unreadable.
-pub fn is_compressed(bytes: &[u8]) -> bool {
+pub(crate) fn is_compressed(bytes: &[u8]) -> bool {
     let packed = |e: &Element| e.name == "vertex" && compressed::is_packed(e);
     Header::read(bytes).is_ok_and(|h| h.elements.iter().any(packed))
 }

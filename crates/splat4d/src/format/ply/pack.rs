@@ -18,7 +18,7 @@ const MORTON_BITS: u32 = 10;
 /// are sorted along a Morton curve.
 ///
 /// Errors: the sink's.
-pub fn write_compressed(params: &Params, out: &mut impl Write) -> Result<Warnings> {
+pub(crate) fn write_compressed(params: &Params, out: &mut impl Write) -> Result<Warnings> {
     let mut warnings = Warnings::default();
     let mut rows = sound_rows(params, &mut warnings);
     sort_by_place(params, &mut rows);

@@ -11,10 +11,22 @@ use super::{NORMAL_NAMES, rows};
 use crate::Error;
 use crate::Result;
 use crate::format::bytes::SH_C0;
+use crate::format::dialect::{Dialect, Opened, Writer, Y_DOWN};
 use crate::format::kinematic::{Clock, Moving, rows as moving_rows, scene};
 use crate::format::warnings::Warnings;
 use crate::layers::Scene;
 use std::io::Write;
+
+/// Moving .ply of Spacetime Gaussians.
+pub const STG: Dialect = Dialect {
+    name: "Spacetime Gaussians .ply",
+    ending: ".stg.ply",
+    up: Y_DOWN,
+    moves: true,
+    mark: Some(is_stg),
+    read: |bytes| read_stg(bytes).map(Opened::from),
+    writer: Writer::Moving(|scene, _, mut out| write_stg(scene, &mut out)),
+};
 
 /// Numbers of a row as [`names`] lists them.
 const WIDTH: usize = 32;
@@ -26,7 +38,7 @@ const OPACITY: usize = 20;
 const SCALE: usize = 21;
 const ROTATION: usize = 24;
 const OMEGA: usize = 28;
-/// What our files say of their clock: `comment splat4d clip FIRST LAST fps N`.
+/// Comment in our files that gives their clock: `comment splat4d clip FIRST LAST fps N`.
 const CLOCK: &str = "splat4d clip";
 
 /// The properties of a row, in the order of the file.

@@ -9,9 +9,10 @@
 
 mod pictures;
 #[cfg(test)]
-mod tests;
+pub(super) mod tests;
 
 use super::bytes::logit_of_byte;
+use super::dialect::{Dialect, Opened, Writer, Y_DOWN};
 use super::warnings::Warnings;
 use super::zip;
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
@@ -22,8 +23,19 @@ use serde_json::Value;
 
 pub use super::zip::{Files, MAGIC as ZIP_MAGIC};
 
+/// SOG version 2, zipped.
+pub const DIALECT: Dialect = Dialect {
+    name: "SOG",
+    ending: ".sog",
+    up: Y_DOWN,
+    moves: false,
+    mark: Some(|bytes| bytes.starts_with(&ZIP_MAGIC)),
+    read: |bytes| read(&unzip(bytes)?).map(Opened::from),
+    writer: Writer::None("Write .compressed.ply or .spz; splat-transform makes SOG of either."),
+};
+
 /// The version this library reads.
-pub const VERSION: u64 = 2;
+pub(crate) const VERSION: u64 = 2;
 /// The file that says what the others are.
 pub const META: &str = "meta.json";
 /// Most Gaussians that are believed, a byte of the files: real ones take eight bytes and more each.

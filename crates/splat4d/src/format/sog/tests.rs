@@ -108,6 +108,11 @@ fn zipped(files: &Files<'_>, folder: &str) -> Vec<u8> {
     out
 }
 
+/// A zipped scene of two Gaussians.
+pub(in crate::format) fn sample() -> Vec<u8> {
+    zipped(&files(), "")
+}
+
 #[test]
 fn a_zip_is_the_same_as_a_folder() {
     let expected = read(&files()).unwrap();

@@ -14,26 +14,38 @@ mod streams;
 mod tests;
 
 use super::bytes::sound_rows;
+use super::dialect::{Dialect, Opened, Writer, Y_UP};
 use super::warnings::Warnings;
 use crate::math::sh::degree_of;
 use crate::scene::{Params, SH};
 use crate::{Error, ErrorKind, Result};
 use std::io::Write;
 
+/// .spz, versions 2 to 4.
+pub(crate) const DIALECT: Dialect = Dialect {
+    name: ".spz",
+    ending: ".spz",
+    up: Y_UP,
+    moves: false,
+    mark: Some(|bytes| bytes.starts_with(&GZIP_MAGIC) || bytes.starts_with(&MAGIC)),
+    read: |bytes| read(bytes).map(|(params, _, warnings)| Opened::from((params, warnings))),
+    writer: Writer::Moment(|params, options, mut out| write(params, options.spz_version, &mut out)),
+};
+
 /// The versions this library reads and writes.
-pub const VERSIONS: std::ops::RangeInclusive<u32> = 2..=4;
-/// What is written unless asked otherwise: the version that most programs open.
+pub(crate) const VERSIONS: std::ops::RangeInclusive<u32> = 2..=4;
+/// Version written by default: the one that most programs open.
 pub const DEFAULT_VERSION: u32 = 3;
 /// First bytes of a version 4 file, and of the header inside older ones.
 pub const MAGIC: [u8; 4] = *b"NGSP";
 /// First bytes of a gzip stream (RFC 1952).
-pub const GZIP_MAGIC: [u8; 2] = [0x1F, 0x8B];
+pub(crate) const GZIP_MAGIC: [u8; 2] = [0x1F, 0x8B];
 /// Flag: trained with the anti-aliasing filter of Mip-Splatting.
 const ANTIALIASED: u8 = 1;
 /// Flag: vendors' extensions are present.
 const EXTENDED: u8 = 2;
 
-/// What a file says besides its Gaussians.
+/// Metadata of a file, besides its Gaussians.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SpzInfo {
     /// 2, 3 or 4.
@@ -100,7 +112,7 @@ pub fn read(bytes: &[u8]) -> Result<(Params, SpzInfo, Warnings)> {
 
 /// Writes a file of the given version. Says what was clipped or left out.
 ///
-/// Errors: the sink's; no Gaussians (readers refuse such files). Panics: the version is not one of [`VERSIONS`].
+/// Errors: the sink's; no Gaussians (readers refuse such files). Panics: the version is not one of 2 to 4.
 pub fn write(params: &Params, version: u32, out: &mut impl Write) -> Result<Warnings> {
     assert!(VERSIONS.contains(&version), "versions 2 to 4 of .spz can be written, not {version}");
     let mut warnings = Warnings::default();

@@ -4,7 +4,7 @@ use super::*;
 use crate::math::Rng;
 use crate::motion::control::{ControlSpec, Curve, TrajectorySpec};
 use crate::motion::skin::SkinSpec;
-use crate::motion::{SpacetimeSpec, Spec, build};
+use crate::motion::{SpacetimeSpec, Spec, build_as};
 use crate::scene::params::{OPACITY, QUAT};
 use crate::scene::splats::SPLAT_COLUMNS;
 use crate::scene::{GEOMETRY, Key, LIFE, LifeKind, Params};
@@ -25,7 +25,7 @@ fn layer(spec: &Spec, life: LifeKind, seed: u64) -> Layer<f64> {
         // Some are born late, some die early.
         (0..params[LIFE].width()).for_each(|c| params[LIFE].set(r, c, if c == 0 { 1.5 * n(12) } else { -1.0 }));
     }
-    let motion = build(spec, &mut params).unwrap();
+    let motion = build_as(spec, &mut params).unwrap();
     for key in params.keys().filter(|k| *k > LIFE).collect::<Vec<_>>() {
         let table = &mut params[key];
         let lane = rng.fork(u64::from(key.0));

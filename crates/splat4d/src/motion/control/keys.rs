@@ -18,7 +18,7 @@ const SMALL_TURN: f64 = 1e-6;
 
 /// Where keys stand in time.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Timeline {
+pub(crate) struct Timeline {
     curve: Curve,
     keys: usize,
     clip: [f64; 2],
@@ -35,7 +35,7 @@ struct Place {
 
 impl Timeline {
     /// `keys` keys over `clip` (seconds). Errors: too few or too many keys, a clip that is none.
-    pub fn new(curve: Curve, keys: usize, clip: [f64; 2]) -> Result<Self> {
+    pub(crate) fn new(curve: Curve, keys: usize, clip: [f64; 2]) -> Result<Self> {
         let least = if curve == Curve::Cubic { REACH } else { 2 };
         if !(least..=MAX_KEYS).contains(&keys) {
             return Err(refuse(format!("a curve of {keys} keys cannot be: {least} to {MAX_KEYS} are possible")));
@@ -47,7 +47,7 @@ impl Timeline {
     }
 
     /// Keys in all.
-    pub fn keys(&self) -> usize {
+    pub(crate) fn keys(&self) -> usize {
         self.keys
     }
 
@@ -95,14 +95,14 @@ fn cubic_slope(u: f64) -> [f64; REACH] {
 /// A trajectory of keys: table `node_keys` with `node_shifts` [nodes, 3·keys] and `node_turns` [nodes, 4·keys], key after
 /// key.
 #[derive(Clone, Copy, Debug)]
-pub struct Keys {
+pub(crate) struct Keys {
     line: Timeline,
     keys: Key,
 }
 
 impl Keys {
     /// Makes (all at rest) or claims the table. Errors: it would be too large, a loaded array of the wrong shape.
-    pub fn new<F: Real>(line: Timeline, skin: &Skin, p: &mut Params<F>) -> Result<Self> {
+    pub(crate) fn new<F: Real>(line: Timeline, skin: &Skin, p: &mut Params<F>) -> Result<Self> {
         let (rows, width) = (skin.count(p), POSE * line.keys);
         check_size("node_keys", rows, width)?;
         let columns = [("node_shifts", 3 * line.keys), ("node_turns", 4 * line.keys)];
@@ -127,7 +127,8 @@ impl Keys {
     }
 
     /// Key of the table.
-    pub fn table(&self) -> Key {
+    #[cfg(test)]
+    pub(crate) fn table(&self) -> Key {
         self.keys
     }
 }

@@ -14,7 +14,7 @@ use std::f64::consts::PI;
 /// A trajectory of shared motions: `bases` [bases·keys, 1] (global); a table with `shift_coefficients` [nodes, 3·bases] and
 /// `turn_coefficients` [nodes, 4·bases].
 #[derive(Clone, Copy, Debug)]
-pub struct LowRank {
+pub(crate) struct LowRank {
     line: Timeline,
     count: usize,
     bases: Key,
@@ -25,7 +25,7 @@ impl LowRank {
     /// Makes or claims the tables: the motions start as cosines of rising frequency, all coefficients as zero.
     ///
     /// Errors: too many bases, tables that would be too large, loaded arrays of the wrong shape.
-    pub fn new<F: Real>(line: Timeline, count: usize, skin: &Skin, p: &mut Params<F>) -> Result<Self> {
+    pub(crate) fn new<F: Real>(line: Timeline, count: usize, skin: &Skin, p: &mut Params<F>) -> Result<Self> {
         if !(1..=MAX_BASES).contains(&count) {
             return Err(refuse(format!("{count} shared motions cannot be: 1 to {MAX_BASES} are possible")));
         }

@@ -19,7 +19,7 @@ const DEEP: usize = 6;
 
 /// Shape of the network.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct NetworkShape {
+pub(crate) struct NetworkShape {
     /// Numbers in a hidden layer.
     pub width: usize,
     /// Hidden layers.
@@ -31,7 +31,7 @@ pub struct NetworkShape {
 /// A trajectory that a perceptron gives: tables `trajectory.*`, and `node_units` [4, 1] (centre and 1/extent of the nodes at
 /// the start), which is not learnt.
 #[derive(Clone, Debug)]
-pub struct Network {
+pub(crate) struct Network {
     mlp: Mlp,
     levels: [usize; 2],
     clip: [f64; 2],
@@ -58,7 +58,7 @@ impl<F> Default for Passes<F> {
 
 impl Network {
     /// Makes or claims the tables. Errors: a shape out of range, loaded arrays of the wrong shape.
-    pub fn new<F: Real>(
+    pub(crate) fn new<F: Real>(
         shape: NetworkShape,
         clip: [f64; 2],
         seed: u64,

@@ -10,22 +10,22 @@ use crate::scene::{BLOCK, Table};
 use rayon::prelude::*;
 
 /// Numbers of a Gaussian's geometry.
-pub const GEOMETRY_WIDTH: usize = 11;
-/// What a network without screws says of a Gaussian: δx 3, δq 4, δs 3.
-pub const HEADS: usize = 10;
+pub(crate) const GEOMETRY_WIDTH: usize = 11;
+/// Outputs a Gaussian of a network without screws: δx 3, δq 4, δs 3.
+pub(crate) const HEADS: usize = 10;
 /// Numbers a row of the gradient: to the geometry, then to the heads (with a screw: 13).
 const D_ROW: usize = GEOMETRY_WIDTH + HEADS + 3;
 /// Scales never fall below this, scene units: what is added after the activation may be negative.
 const MIN_SCALE: f64 = 1e-6;
-/// What one unit of δx (or v), w, δq and δs is: of the half box, radians, of a unit quaternion, of the half box. All
+/// Units of δx (or v), w, δq and δs: of the half box, radians, of a unit quaternion, of the half box. All
 /// weights learn at one rate, and a Gaussian is some hundred times smaller than the box it moves in.
-pub const GAINS: [f64; 4] = [0.25, 1.0, 0.25, 0.01];
+pub(crate) const GAINS: [f64; 4] = [0.25, 1.0, 0.25, 0.01];
 /// Rows of a task.
 const ROWS: usize = 1024;
 
 /// The box that makes coordinates unit ones, and how positions move in it.
 #[derive(Clone, Copy, Debug)]
-pub struct Bounds<F> {
+pub(crate) struct Bounds<F> {
     /// Centre, scene units.
     pub center: [F; 3],
     /// Half the largest side, scene units.
@@ -36,7 +36,7 @@ pub struct Bounds<F> {
 
 impl Bounds<f64> {
     /// Centre and half side of a cube around (almost) all means; the unit cube for no points.
-    pub fn around<F: Real>(geometry: &Table<F>, outside: f64, margin: f64) -> [f64; 4] {
+    pub(crate) fn around<F: Real>(geometry: &Table<F>, outside: f64, margin: f64) -> [f64; 4] {
         let n = geometry.rows();
         let mut out = [0.0, 0.0, 0.0, 1.0];
         if n == 0 {
@@ -61,7 +61,7 @@ impl Bounds<f64> {
 impl<F: Real> Bounds<F> {
     /// x̂
     #[inline(always)]
-    pub fn unit(&self, x: [F; 3]) -> [F; 3] {
+    pub(crate) fn unit(&self, x: [F; 3]) -> [F; 3] {
         std::array::from_fn(|k| (x[k] - self.center[k]) / self.radius)
     }
 
@@ -158,7 +158,7 @@ impl<F: Real> Bounds<F> {
 }
 
 /// Splats of an answer.
-pub struct Written<'a, F> {
+pub(crate) struct Written<'a, F> {
     /// The layer's.
     pub geometry: &'a Table<F>,
     /// [rows, width] of the network.
@@ -186,7 +186,7 @@ impl<F: Real> Work<F, 1> for Written<'_, F> {
 }
 
 /// Gradients of an answer's rows, [rows, [`D_ROW`]].
-pub struct Gradient<'a, F> {
+pub(crate) struct Gradient<'a, F> {
     /// The layer's.
     pub geometry: &'a Table<F>,
     /// [rows, width] of the network; none: all zero.
@@ -228,7 +228,7 @@ fn column<F: Real, const W: usize>(lanes: &[Lane<F>; W], l: usize) -> [F; W] {
 }
 
 /// Adds compact rows to the layer's geometry.
-pub struct Spread<'a, F>(pub &'a Table<F>);
+pub(crate) struct Spread<'a, F>(pub &'a Table<F>);
 
 impl<F: Real> Work<F, 1> for Spread<'_, F> {
     #[inline(always)]
@@ -239,7 +239,7 @@ impl<F: Real> Work<F, 1> for Spread<'_, F> {
 }
 
 /// Makes rows of the heads' gradients.
-pub struct Gather<'a, F> {
+pub(crate) struct Gather<'a, F> {
     /// [rows, [`D_ROW`]]
     pub d_rows: &'a Table<F>,
     /// Heads a row.
@@ -248,7 +248,7 @@ pub struct Gather<'a, F> {
 
 impl<F: Real> Gather<'_, F> {
     /// d_heads [rows, width], overwritten.
-    pub fn run(&self, d_heads: &mut [F]) {
+    pub(crate) fn run(&self, d_heads: &mut [F]) {
         d_heads.par_chunks_mut(ROWS * self.width).enumerate().for_each(|(c, rows)| {
             for (j, row) in rows.chunks_exact_mut(self.width).enumerate() {
                 for (k, x) in row.iter_mut().enumerate() {

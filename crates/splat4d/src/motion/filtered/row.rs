@@ -28,7 +28,7 @@ impl Normal {
     }
 
     /// A gradient to the first nine numbers of a splat.
-    pub fn of_gradient<F: Real>(row: [F; 9]) -> Self {
+    pub(crate) fn of_gradient<F: Real>(row: [F; 9]) -> Self {
         let [x, y, z, c @ ..] = row;
         Self { mean: [x, y, z].map(F::f64), cov: unpack_gradient(c) }
     }
@@ -80,7 +80,7 @@ impl Predictor {
 /// A prediction one frame ahead, and what its gradient needs.
 #[derive(Clone, Copy, Debug)]
 pub struct Prediction {
-    /// What is predicted.
+    /// The predicted Gaussian.
     pub point: Normal,
     share: f64,
     shape: Shape,

@@ -24,7 +24,6 @@ use slice::{Frame, OWN, RIGHT};
 use std::f64::consts::TAU;
 use std::sync::Arc;
 
-pub use slice::rotation4;
 pub(crate) use sliced::Sliced;
 
 /// Most blocks of spherical harmonics beyond the first (Yang et al. 2024 use n = 0, 1, 2).
@@ -90,7 +89,7 @@ impl Native4dSpec {
 
 /// See the module's documentation.
 #[derive(Clone, Copy, Debug)]
-pub struct Native4d {
+pub(crate) struct Native4d {
     spec: Native4dSpec,
     own: Key,
 }
@@ -111,7 +110,7 @@ impl Native4d {
     /// blocks, which start at zero.
     ///
     /// Errors: numbers of the spec out of their ranges; loaded arrays of the wrong shape.
-    pub fn new<F: Real>(spec: Native4dSpec, p: &mut Params<F>) -> Result<Self> {
+    pub(crate) fn new<F: Real>(spec: Native4dSpec, p: &mut Params<F>) -> Result<Self> {
         spec.check()?;
         let rows = p.len();
         let quats: Vec<[F; 4]> = (0..rows).map(|row| p[GEOMETRY].read(row, crate::scene::params::QUAT)).collect();
@@ -123,7 +122,7 @@ impl Native4d {
     }
 
     /// Key of the table of [`COLUMNS`].
-    pub fn own(&self) -> Key {
+    pub(crate) fn own(&self) -> Key {
         self.own
     }
 }

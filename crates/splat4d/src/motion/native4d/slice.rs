@@ -21,7 +21,7 @@ pub(super) const RIGHT: usize = 2;
 /// The life's exponent stops at −30: e⁻³⁰ is seen by nobody, and in f32 products with it do not become subnormal.
 const FAINTEST: f64 = 60.0;
 
-/// What a slice needs besides a row: see [`super::Native4dSpec`].
+/// Parameters of a slice besides the row: see [`super::Native4dSpec`].
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Frame<F> {
     /// κ, scene units a second.
@@ -103,7 +103,7 @@ pub(super) fn to_products<F: Real>(d: [[F; 4]; 4]) -> [[F; 4]; 4] {
 /// The rotation X ↦ l X r̄ of two unit quaternions (wxyz), rows and columns x, y, z, t. l = r is the rotation of space by
 /// that quaternion.
 #[inline(always)]
-pub fn rotation4<F: Real>(l: [F; 4], r: [F; 4]) -> [[F; 4]; 4] {
+pub(crate) fn rotation4<F: Real>(l: [F; 4], r: [F; 4]) -> [[F; 4]; 4] {
     from_products(products(l, r))
 }
 
@@ -126,7 +126,7 @@ pub(super) fn quaternions(r: [[f64; 4]; 4]) -> [[f64; 4]; 2] {
     [quat::normalize(left).0, right]
 }
 
-/// What forward and backward share.
+/// Intermediate values common to forward and backward.
 struct Parts<F> {
     /// Unit quaternions with their norms.
     left: ([F; 4], F),

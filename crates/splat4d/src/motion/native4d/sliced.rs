@@ -30,7 +30,7 @@ pub(crate) struct Sliced {
 
 impl Sliced {
     /// A row as it is drawn: floors and ceilings applied.
-    pub fn of<F: Real>(spec: &Native4dSpec, p: &Params<F>, own: Key, row: usize) -> Self {
+    pub(crate) fn of<F: Real>(spec: &Native4dSpec, p: &Params<F>, own: Key, row: usize) -> Self {
         let g = p[GEOMETRY].read::<11>(row, 0).map(Real::f64);
         let o = p[own].read::<OWN>(row, 0).map(Real::f64);
         let frame = spec.frame();
@@ -46,7 +46,7 @@ impl Sliced {
 
     /// Writes the row: the scales and quaternions of Σ₄ = BBᵀ with B = [[√Σ, u c₀], [0, c₀]], u the velocity over κ and
     /// c₀ = κ·width.
-    pub fn write<F: Real>(&self, spec: &Native4dSpec, p: &mut Params<F>, own: Key, row: usize) {
+    pub(crate) fn write<F: Real>(&self, spec: &Native4dSpec, p: &mut Params<F>, own: Key, row: usize) {
         let (values, axes) = sym3::eigen(self.cov);
         let c0 = spec.speed * self.width;
         let b: [[f64; 4]; 4] = std::array::from_fn(|i| {

@@ -124,7 +124,7 @@ struct Moved<F> {
     mask: Lane<F>,
 }
 
-/// What a node's numbers count in a blend: a, and s·a for the quaternion.
+/// Weights of a node's numbers in a blend: a, and s·a for the quaternion.
 #[inline(always)]
 fn counts<F: Real>(a: F, sign: F) -> Frame<F> {
     each(|i| if i < TURN { a } else { sign * a })

@@ -120,7 +120,7 @@ type Best<F> = ([F; MAX_LIST], [u32; MAX_LIST]);
 
 impl<F: Real> Weights<F> {
     /// Nodes that count a Gaussian: K, or all where there are fewer.
-    pub fn neighbours(&self) -> usize {
+    pub(crate) fn neighbours(&self) -> usize {
         self.neighbours
     }
 

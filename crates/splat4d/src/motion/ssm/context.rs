@@ -1,4 +1,4 @@
-//! What nodes know of their surroundings, and how what the network says becomes a motion of the world.
+//! The context of nodes, and how the network's output becomes a motion of the world.
 
 use super::{CONTEXT, Equivariance};
 use crate::math::Real;
@@ -9,12 +9,12 @@ use crate::scene::{BLOCK, Params, Table};
 /// Neighbours whose offsets a node knows.
 const SEEN: usize = 4;
 /// Vectors that vector neurons get: from the centroid and to the neighbours.
-pub const VECTORS: usize = SEEN + 1;
+pub(crate) const VECTORS: usize = SEEN + 1;
 /// Numbers of a frame.
 const FRAME: usize = 9;
 
 /// Columns of the table of contexts: a position; a frame and offsets in it; vectors.
-pub fn width(e: Equivariance) -> usize {
+pub(crate) fn width(e: Equivariance) -> usize {
     match e {
         Equivariance::None => 3,
         Equivariance::Frames => FRAME + 3 * SEEN,
@@ -69,7 +69,7 @@ fn length(v: &[[f64; 3]]) -> f64 {
 
 /// The context of sixteen nodes.
 #[derive(Clone, Debug)]
-pub struct Around<F> {
+pub(crate) struct Around<F> {
     /// Scalars that the network sees beside the embedding: a position, or offsets in the frame.
     pub scalars: Vec<Lane<F>>,
     /// Vectors [`VECTORS`], 3 that vector neurons see.
@@ -78,7 +78,7 @@ pub struct Around<F> {
 }
 
 /// Of the nodes 16·`block` on.
-pub fn of_block<F: Real>(e: Equivariance, table: &Table<F>, block: usize) -> Around<F> {
+pub(crate) fn of_block<F: Real>(e: Equivariance, table: &Table<F>, block: usize) -> Around<F> {
     let all = table.block(block).as_chunks::<BLOCK>().0;
     let part = |from: usize, to: usize| all[from..to].to_vec();
     match e {
@@ -89,7 +89,7 @@ pub fn of_block<F: Real>(e: Equivariance, table: &Table<F>, block: usize) -> Aro
 }
 
 /// Shift and rotation vector \[6, ticks\] from the network's to the world's axes and units, in place.
-pub fn to_world<F: Real>(e: Equivariance, around: &Around<F>, extent: f64, x: &mut [Lane<F>]) {
+pub(crate) fn to_world<F: Real>(e: Equivariance, around: &Around<F>, extent: f64, x: &mut [Lane<F>]) {
     if e == Equivariance::Frames {
         turn(x, |i, a| &around.frame[3 * i + a]);
     }
@@ -97,7 +97,7 @@ pub fn to_world<F: Real>(e: Equivariance, around: &Around<F>, extent: f64, x: &m
 }
 
 /// VJP of [`to_world`], in place.
-pub fn to_world_backward<F: Real>(e: Equivariance, around: &Around<F>, extent: f64, d: &mut [Lane<F>]) {
+pub(crate) fn to_world_backward<F: Real>(e: Equivariance, around: &Around<F>, extent: f64, d: &mut [Lane<F>]) {
     scale(extent, d);
     if e == Equivariance::Frames {
         turn(d, |i, a| &around.frame[3 * a + i]);

@@ -13,12 +13,12 @@ use std::ops::Range;
 
 /// Octaves in which a node sees its own position (without equivariance): down to 0.4 radii of the cloud.
 const PLACE_OCTAVES: usize = 5;
-/// What a tick of the clock is made of beside γ: the impulses at the first and the last tick.
+/// Numbers of a tick of the clock beside γ: the impulses at the first and the last tick.
 const IMPULSES: usize = 2;
 
 /// Where the weights lie, and in which tables.
 #[derive(Clone, Debug)]
-pub struct Net {
+pub(crate) struct Net {
     keys: Vec<Key>,
     layout: Layout,
     width: usize,
@@ -39,9 +39,9 @@ enum Body {
     Vector { channels: usize, coefficients: [Range<usize>; 2], blocks: Vec<VectorBlock>, head: [Range<usize>; 3] },
 }
 
-/// What all nodes share in a step.
+/// Values common to all nodes in a step.
 #[derive(Clone, Debug)]
-pub struct Prepared<F> {
+pub(crate) struct Prepared<F> {
     w: Vec<F>,
     layers: Vec<Discrete<F>>,
     /// \[ticks, clock\]
@@ -53,7 +53,7 @@ pub struct Prepared<F> {
 
 /// Working memory of sixteen nodes; the backward reads what the forward left.
 #[derive(Clone, Debug, Default)]
-pub struct NetTape<F> {
+pub(crate) struct NetTape<F> {
     own: Vec<Lane<F>>,
     first: Vec<Lane<F>>,
     bent: Vec<Lane<F>>,
@@ -67,7 +67,7 @@ pub struct NetTape<F> {
 
 /// dL/d weights of some nodes.
 #[derive(Clone, Debug)]
-pub struct NetGrads<F> {
+pub(crate) struct NetGrads<F> {
     w: Vec<F>,
     layers: Vec<Discrete<F>>,
     beat: Vec<F>,
@@ -75,7 +75,7 @@ pub struct NetGrads<F> {
 
 impl<F: Real> NetGrads<F> {
     /// Adds another gradient.
-    pub fn add(&mut self, other: &Self) {
+    pub(crate) fn add(&mut self, other: &Self) {
         self.w.iter_mut().zip(&other.w).for_each(|(a, b)| *a += *b);
         self.beat.iter_mut().zip(&other.beat).for_each(|(a, b)| *a += *b);
         self.layers.iter_mut().zip(&other.layers).for_each(|(a, b)| a.add(b));
@@ -84,7 +84,7 @@ impl<F: Real> NetGrads<F> {
 
 impl Net {
     /// Makes or claims the weights' tables in `p`. Errors: loaded arrays of the wrong shape.
-    pub fn new<F: Real>(spec: &SsmSpec, p: &mut Params<F>) -> Result<Self> {
+    pub(super) fn new<F: Real>(spec: &SsmSpec, p: &mut Params<F>) -> Result<Self> {
         let mut layout = Layout::default();
         let width = spec.width;
         let own = spec.embedding
@@ -150,7 +150,7 @@ impl Net {
     }
 
     /// Names of the columns of Λ and Δ, and of all others.
-    pub fn columns(&self) -> (Vec<String>, Vec<String>) {
+    pub(crate) fn columns(&self) -> (Vec<String>, Vec<String>) {
         let names = self.layout.parts().iter().map(|(name, _)| name.clone());
         names.partition(|n| ["log_decay", "frequency", "log_step"].iter().any(|end| n.ends_with(end)))
     }
@@ -162,8 +162,8 @@ impl Net {
         }
     }
 
-    /// What all nodes share, for the first `ticks` ticks.
-    pub fn prepare<F: Real>(&self, p: &Params<F>, spec: &SsmSpec, ticks: usize) -> Prepared<F> {
+    /// Values common to all nodes, for the first `ticks` ticks.
+    pub(super) fn prepare<F: Real>(&self, p: &Params<F>, spec: &SsmSpec, ticks: usize) -> Prepared<F> {
         let mut w = Vec::with_capacity(self.layout.len());
         for (key, (_, at)) in self.keys.iter().zip(self.layout.parts()) {
             w.extend_from_slice(&p[*key].data()[..at.len()]);
@@ -191,7 +191,7 @@ impl Net {
     }
 
     /// Shift and rotation vector \[6, ticks\] of sixteen nodes, in the network's own axes.
-    pub fn forward<F: Real>(
+    pub(crate) fn forward<F: Real>(
         &self,
         net: &Prepared<F>,
         embedding: &[Lane<F>],
@@ -264,13 +264,13 @@ impl Net {
     }
 
     /// No gradient yet.
-    pub fn no_gradient<F: Real>(&self, net: &Prepared<F>) -> NetGrads<F> {
+    pub(crate) fn no_gradient<F: Real>(&self, net: &Prepared<F>) -> NetGrads<F> {
         let layers = net.layers.iter().map(Discrete::none).collect();
         NetGrads { w: vec![F::ZERO; net.w.len()], layers, beat: vec![F::ZERO; net.beat.len()] }
     }
 
     /// VJP of [`forward`](Self::forward): the gradients to the weights and to the embedding.
-    pub fn backward<F: Real>(
+    pub(crate) fn backward<F: Real>(
         &self,
         net: &Prepared<F>,
         tape: &NetTape<F>,
@@ -335,7 +335,7 @@ impl Net {
     }
 
     /// Brings the gradient of all nodes to the tables.
-    pub fn finish<F: Real>(&self, net: &Prepared<F>, mut sum: NetGrads<F>, d: &mut Grads<F>) {
+    pub(super) fn finish<F: Real>(&self, net: &Prepared<F>, mut sum: NetGrads<F>, d: &mut Grads<F>) {
         let [by_clock, ..] = &self.entry;
         for (row, d_w) in sum.w[by_clock.clone()].chunks_exact_mut(self.clock).enumerate() {
             for (t, clock) in net.clock.chunks_exact(self.clock).enumerate() {

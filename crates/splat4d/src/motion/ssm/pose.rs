@@ -9,7 +9,7 @@ const SMALL_ANGLE: f64 = 1e-4;
 
 /// The ticks around a time, with Catmull-Rom weights and their slopes.
 #[derive(Clone, Copy, Debug)]
-pub struct Knots<F> {
+pub(crate) struct Knots<F> {
     ticks: [usize; 4],
     weights: [F; 4],
     /// Of the weights, 1/s.
@@ -18,7 +18,7 @@ pub struct Knots<F> {
 
 impl<F: Real> Knots<F> {
     /// Around `u`, in ticks; `per_second` ticks a second. Before the first and after the last tick the nearest one counts.
-    pub fn new(u: f64, per_second: f64, last: usize) -> Self {
+    pub(crate) fn new(u: f64, per_second: f64, last: usize) -> Self {
         let inside = u > 0.0 && u < last as f64;
         let u = if u.is_nan() { 0.0 } else { u.clamp(0.0, last as f64) };
         let low = (u.floor() as usize).min(last - 1);
@@ -44,14 +44,14 @@ impl<F: Real> Knots<F> {
     }
 
     /// The last tick that is looked at.
-    pub fn last(&self) -> usize {
+    pub(crate) fn last(&self) -> usize {
         self.ticks[3]
     }
 }
 
 /// The pose at the knots of one node's ticks \[ticks, 6 or 7\]: shift 3, quaternion residual 4; and the numbers that were
 /// interpolated.
-pub fn at<F: Real>(own: &[F], width: usize, knots: &Knots<F>) -> ([F; 7], [F; 7]) {
+pub(crate) fn at<F: Real>(own: &[F], width: usize, knots: &Knots<F>) -> ([F; 7], [F; 7]) {
     let mut x = [F::ZERO; 7];
     for (&tick, &w) in knots.ticks.iter().zip(&knots.weights) {
         (0..width).for_each(|k| x[k] += w * own[tick * width + k]);
@@ -61,7 +61,7 @@ pub fn at<F: Real>(own: &[F], width: usize, knots: &Knots<F>) -> ([F; 7], [F; 7]
 }
 
 /// VJP of [`at`]: adds to `d_own`, returns dL/dt.
-pub fn at_backward<F: Real>(own: &[F], width: usize, knots: &Knots<F>, d: [F; 7], d_own: &mut [F]) -> f64 {
+pub(crate) fn at_backward<F: Real>(own: &[F], width: usize, knots: &Knots<F>, d: [F; 7], d_own: &mut [F]) -> f64 {
     let (_, x) = at(own, width, knots);
     let mut d_x = d;
     if width == 6 {
@@ -92,13 +92,13 @@ fn half_angle<F: Real>(square: F) -> [F; 3] {
 }
 
 /// The unit quaternion of a rotation vector, radians.
-pub fn exp<F: Real>(theta: [F; 3]) -> [F; 4] {
+pub(super) fn exp<F: Real>(theta: [F; 3]) -> [F; 4] {
     let [c, s, _] = half_angle(theta[0] * theta[0] + theta[1] * theta[1] + theta[2] * theta[2]);
     [c, s * theta[0], s * theta[1], s * theta[2]]
 }
 
 /// VJP of [`exp`].
-pub fn exp_backward<F: Real>(theta: [F; 3], d: [F; 4]) -> [F; 3] {
+pub(crate) fn exp_backward<F: Real>(theta: [F; 3], d: [F; 4]) -> [F; 3] {
     let [_, s, slope] = half_angle(theta[0] * theta[0] + theta[1] * theta[1] + theta[2] * theta[2]);
     let along = d[1] * theta[0] + d[2] * theta[1] + d[3] * theta[2];
     // d cos/d|θ|² = −s/4
@@ -108,7 +108,7 @@ pub fn exp_backward<F: Real>(theta: [F; 3], d: [F; 4]) -> [F; 3] {
 
 /// Poses \[7, ticks\] of rates \[6, ticks\]: the first tick's is the first pose, the others last `share` of a clip each:
 /// ρₙ = ρₙ₋₁ + share·ξₙ, qₙ = qₙ₋₁ ⊗ exp(share·ωₙ).
-pub fn compose<F: Real>(rates: &[Lane<F>], share: f64) -> Vec<Lane<F>> {
+pub(crate) fn compose<F: Real>(rates: &[Lane<F>], share: f64) -> Vec<Lane<F>> {
     let ticks = rates.len() / 6;
     let mut out = vec![[F::ZERO; LANES]; 7 * ticks];
     for l in 0..LANES {
@@ -127,7 +127,7 @@ pub fn compose<F: Real>(rates: &[Lane<F>], share: f64) -> Vec<Lane<F>> {
 }
 
 /// VJP of [`compose`].
-pub fn compose_backward<F: Real>(rates: &[Lane<F>], share: f64, d_out: &[Lane<F>]) -> Vec<Lane<F>> {
+pub(crate) fn compose_backward<F: Real>(rates: &[Lane<F>], share: f64, d_out: &[Lane<F>]) -> Vec<Lane<F>> {
     let ticks = rates.len() / 6;
     let out = compose(rates, share);
     let mut d = vec![[F::ZERO; LANES]; 6 * ticks];

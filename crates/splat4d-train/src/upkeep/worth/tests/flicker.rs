@@ -4,8 +4,8 @@ use super::*;
 use crate::eval::metrics::psnr;
 use crate::learner::Learner;
 use crate::methods::{Group, Rate, Stage};
-use crate::train::loss::TrainLoss;
-use crate::train::trainer::{Settings, Trainer};
+use crate::step::loss::TrainLoss;
+use crate::step::trainer::{Settings, Trainer};
 use crate::upkeep::{Limits, Prune, PruneSettings};
 use std::sync::Arc;
 
@@ -14,10 +14,10 @@ const TRUTH: usize = 60;
 const REPEATS: usize = 4;
 /// Steps of training before and after pruning.
 const STEPS: usize = 120;
-/// What may be lost, dB.
+/// The permitted loss, dB.
 const BOUND: f64 = 0.1;
 
-/// What the truth looks like in every frame of the made-up capture.
+/// The truth's pictures in every frame of the made-up capture.
 struct Drawn {
     frames: Made,
     pictures: Vec<Picture>,

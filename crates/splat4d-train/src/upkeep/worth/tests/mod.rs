@@ -7,7 +7,7 @@ mod transient;
 use super::*;
 use crate::Result;
 use crate::capture::frames::{Frames, Picture};
-use crate::train::tests::Made;
+use crate::step::tests::Made;
 use splat4d::layers::{Evaluation, Layer, LayerTape};
 use splat4d::math::Rng;
 use splat4d::motion::{SpacetimeSpec, Spec, build};
@@ -226,17 +226,16 @@ fn interval_buckets_lose_nothing() {
 #[test]
 fn keys_are_times_of_frames_with_both_ends() {
     let times: Vec<f64> = (0..12).map(|k| 3.0 + 0.1 * k as f64).collect();
-    let at = |keys: Keys, times: &[f64]| {
-        keys.among(times, 10.0).iter().map(|k| ((k - 3.0) * 10.0).round() as i32).collect::<Vec<_>>()
+    let at = |interval: usize, times: &[f64]| {
+        masks::keys(interval, times, 10.0).iter().map(|k| ((k - 3.0) * 10.0).round() as i32).collect::<Vec<_>>()
     };
-    assert_eq!(at(Keys::Interval(5), &times), [0, 5, 10, 11]);
-    assert_eq!(at(Keys::Interval(0), &times), (0..12).collect::<Vec<_>>());
-    assert_eq!(at(Keys::Interval(100), &times), [0, 11]);
-    assert_eq!(at(Keys::Times(vec![3.52, f64::NAN, 3.31, 99.0, 3.3]), &times), [0, 3, 5, 11]);
+    assert_eq!(at(5, &times), [0, 5, 10, 11]);
+    assert_eq!(at(0, &times), (0..12).collect::<Vec<_>>());
+    assert_eq!(at(100, &times), [0, 11]);
     let holes = [3.0, 3.1, 3.7, 3.8, 4.1];
-    assert_eq!(at(Keys::Interval(4), &holes), [0, 7, 8, 11]);
-    assert!(Keys::Interval(5).among(&[], 10.0).is_empty());
-    assert_eq!(Keys::Interval(5).among(&[2.0], 10.0), [2.0]);
+    assert_eq!(at(4, &holes), [0, 7, 8, 11]);
+    assert!(masks::keys(5, &[], 10.0).is_empty());
+    assert_eq!(masks::keys(5, &[2.0], 10.0), [2.0]);
 }
 
 #[test]
@@ -255,7 +254,7 @@ fn masks_hold_what_key_views_show_and_lives_between_keys() {
         s.layers[0].params[GEOMETRY].set(row, OPACITY, 2.0);
     }
     let whole = s.clone();
-    let config = MaskConfig { keys: Keys::Interval(4), ..MaskConfig::default() };
+    let config = MaskConfig { interval: 4, ..MaskConfig::default() };
     let mut heard = (0, 0);
     key_masks(&mut s, &made, &config, &mut |d, n| heard = (d, n)).unwrap();
     assert_eq!(heard, (3 * CAPTURE.0, 3 * CAPTURE.0));

@@ -1,10 +1,10 @@
-//! What is there for a part of the clip only survives: the orb of the bundled capture, which appears at frame 9, and
-//! its painted crate, which is gone from frame 18 on (docs/bundled-capture.md). Without fine-tuning.
+//! Survival of transient objects: the orb of the bundled capture, which appears at frame 9, and its painted crate,
+//! which is gone from frame 18 on (docs/bundled-capture.md). Without fine-tuning.
 
 use super::*;
 use crate::capture::{Capture, CaptureOptions, ImageStore};
 use crate::eval::metrics::psnr_region;
-use crate::train::dataset::Dataset;
+use crate::run::dataset::Dataset;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -19,7 +19,7 @@ const EVERY: usize = 3;
 
 /// Of the views at a time one in so many is scored by: one at every time.
 const VIEWS: usize = 16;
-/// What half of the Gaussians may lose in either, without fine-tuning, dB.
+/// The permitted loss of half of the Gaussians in either, without fine-tuning, dB.
 const LOST_AT_HALF: f64 = 1.5;
 /// The orb's pixels where only the hall behind it is drawn are below this, dB.
 const GONE: f64 = 12.0;
@@ -73,7 +73,7 @@ fn quality(scene: &Scene<f32>, held: &Dataset) -> [f64; 2] {
     [0, 1].map(|k| sums[k] / counts[k])
 }
 
-/// What is left of the orb and the crate of a scene of which a share is pruned.
+/// The remains of the orb and the crate of a scene of which a share is pruned.
 fn left(scene: &Scene<f32>, train: &Dataset, held: &Dataset, config: &ScoreConfig, ratio: f64) -> [f64; 2] {
     let mut scene = scene.clone();
     let edits = prune(&scene, &scored(&scene, train, config), ratio);

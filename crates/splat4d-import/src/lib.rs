@@ -1,0 +1,10 @@
+//! Makes captures of videos: frames with their times, a clock that all cameras share, poses from pictures alone, and a folder that
+//! training takes.
+
+pub mod corrections;
+pub mod sfm;
+pub mod sync;
+pub mod video;
+pub mod write;
+
+pub use splat4d::{Error, ErrorKind, Result};

@@ -1,0 +1,192 @@
+//! Structure from motion: poses, lenses, clocks and points of pictures that bring none.
+//!
+//! Fixed cameras are one picture each: the features of their median background, and the features of what moves at some moments
+//! that all share. People and balls are evidence where walls are alike, and each of their features carries its velocity, so that
+//! clocks are found together with poses ([`adjust`]). Frames of moving cameras are a picture each.
+
+pub mod adjust;
+mod algebra;
+pub mod align;
+mod flow;
+pub mod lens;
+pub mod mapper;
+pub mod pictures;
+pub mod resection;
+mod sample;
+pub mod tracks;
+pub mod two_view;
+
+use crate::{Error, Result};
+use lens::Lens;
+use mapper::Mapping;
+use pictures::{Look, Pictures, Sight};
+use splat4d::math::Se3;
+use splat4d::math::se3::{norm, sub};
+use splat4d_train::event::Progress;
+use tracks::Pairing;
+
+/// A camera, and the frame of a moving one.
+type Who = (usize, Option<usize>);
+
+/// How poses are found.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Options {
+    /// What features are taken from.
+    pub look: Look,
+    /// How cameras are placed.
+    pub mapping: Mapping,
+    /// Whether cameras move: then every frame is placed on its own, at most so many of them.
+    pub walking: Option<usize>,
+}
+
+/// Where a picture was taken from: a fixed camera's, or one frame's of a moving one.
+#[derive(Clone, Debug)]
+pub struct Taken {
+    /// The camera.
+    pub camera: usize,
+    /// The frame of a moving camera.
+    pub frame: Option<usize>,
+    /// Its name in messages.
+    pub name: String,
+    /// Where it is; why not, where it could not be found.
+    pub placed: Result<Placed, String>,
+}
+
+/// Where a camera stands.
+#[derive(Clone, Copy, Debug)]
+pub struct Placed {
+    /// Takes world points into the camera's axes.
+    pub pose: Se3,
+    /// In pixels of the files' pictures.
+    pub lens: Lens,
+    /// Pixels across and down of the files' pictures (of those that were halved: a little less).
+    pub size: [usize; 2],
+    /// What must be added to its times, seconds; only differences between cameras mean anything.
+    pub tau: f64,
+    /// Points that it sees where they are.
+    pub sightings: usize,
+    /// Their median distance from where they are seen, pixels of the files' pictures.
+    pub error: f64,
+}
+
+/// A point that cameras agreed on.
+#[derive(Clone, Debug)]
+pub struct Point {
+    /// In the world.
+    pub place: [f64; 3],
+    /// sRGB.
+    pub color: [u8; 3],
+    /// 0: it stands still; otherwise the moment it was seen at.
+    pub moment: usize,
+    /// Pictures that see it, by their place in [`Solution::taken`].
+    pub seen: Vec<usize>,
+    /// Mean distance from where it is seen, pixels of the pictures that were worked with.
+    pub error: f64,
+}
+
+/// Poses, lenses, clocks and points.
+#[derive(Clone, Debug)]
+pub struct Solution {
+    /// One for each camera, or for each frame that was chosen of moving ones.
+    pub taken: Vec<Taken>,
+    /// What they see.
+    pub points: Vec<Point>,
+    /// Upwards in the world, guessed: what most cameras hold upwards (unit).
+    pub up: [f64; 3],
+    /// Pairs of pictures that were found to show one scene.
+    pub pairs: usize,
+}
+
+/// Finds where pictures were taken from.
+///
+/// The world's unit is the median distance of the cameras from what they see; its axes are those of the camera that was placed
+/// first. Lengths and the vertical must come from elsewhere.
+///
+/// Errors: pictures that cannot be read; no two that show one scene.
+pub fn solve(pictures: &dyn Pictures, options: &Options, progress: &mut Progress<'_>) -> Result<Solution> {
+    let (who, sights, pairing): (Vec<Who>, Vec<Sight>, Pairing) = match options.walking {
+        None => {
+            let sights = pictures::fixed(pictures, &options.look, progress)?;
+            ((0..sights.len()).map(|c| (c, None)).collect(), sights, Pairing::All)
+        }
+        Some(most) => {
+            let all = pictures::walking(pictures, &options.look, most, progress)?;
+            let pairing = if all.len() <= ALL_UP_TO { Pairing::All } else { WALK };
+            let who = all.iter().map(|(c, k, _)| (*c, Some(*k))).collect();
+            (who, all.into_iter().map(|(_, _, s)| s).collect(), pairing)
+        }
+    };
+    solve_sights(&who, &sights, pairing, options, progress)
+}
+
+/// So many frames are all compared with each other.
+const ALL_UP_TO: usize = 50;
+/// Of more, neighbours and loops.
+const WALK: Pairing = Pairing::Sequence { near: 10, every: 6 };
+
+fn solve_sights(
+    who: &[Who],
+    sights: &[Sight],
+    pairing: Pairing,
+    options: &Options,
+    progress: &mut Progress<'_>,
+) -> Result<Solution> {
+    let links = tracks::links(sights, pairing, options.mapping.seed, progress);
+    let alone = || {
+        Error::input("no two of these pictures show the same things")
+            .remedy("Film one scene from neighbouring places (at most 30 degrees apart), in focus and in light.")
+    };
+    if links.is_empty() {
+        return Err(alone());
+    }
+    let joined = tracks::join(sights, &links);
+    let focals = tracks::focal_votes(sights, &links, &mapper::FOCALS);
+    let mapped = mapper::map(sights, &joined, &links, &focals, &options.mapping, progress).ok_or_else(alone)?;
+    Ok(in_units(who, sights, mapped, links.len()))
+}
+
+/// The solution whose unit is the median distance of cameras from what they see.
+fn in_units(who: &[Who], sights: &[Sight], mapped: mapper::Mapped, pairs: usize) -> Solution {
+    let mut distances = vec![Vec::new(); sights.len()];
+    for p in &mapped.points {
+        for &(s, _) in &p.seen {
+            if let Ok(camera) = &mapped.cameras[s] {
+                distances[s].push(norm(sub(p.place, camera.pose.inverse().translation)));
+            }
+        }
+    }
+    let scale = 1.0 / align::median_distance(&mut distances).unwrap_or(1.0);
+    let placed = |(camera, sight): (&Result<mapper::Stand, String>, &Sight)| {
+        camera.as_ref().map_err(Clone::clone).map(|c| Placed {
+            pose: Se3 { rotation: c.pose.rotation, translation: c.pose.translation.map(|t| t * scale) },
+            lens: c.lens.scaled(sight.factor),
+            size: sight.size.map(|v| (v as f64 * sight.factor) as usize),
+            tau: c.tau,
+            sightings: c.sightings,
+            error: c.error * sight.factor,
+        })
+    };
+    let taken: Vec<Taken> = mapped
+        .cameras
+        .iter()
+        .zip(sights)
+        .zip(who)
+        .map(|(c, &(camera, frame))| Taken { camera, frame, name: c.1.name.clone(), placed: placed(c) })
+        .collect();
+    let point = |p: mapper::Found| {
+        let (s, f) = p.seen[0];
+        let first = &sights[s].features[f];
+        Point {
+            place: p.place.map(|v| v * scale),
+            color: first.color,
+            moment: first.moment,
+            seen: p.seen.iter().map(|(s, _)| *s).collect(),
+            error: p.error,
+        }
+    };
+    let poses: Vec<Se3> = taken.iter().filter_map(|t| t.placed.as_ref().ok().map(|p| p.pose)).collect();
+    Solution { up: align::up_of(&poses), points: mapped.points.into_iter().map(point).collect(), taken, pairs }
+}
+
+#[cfg(test)]
+mod tests;

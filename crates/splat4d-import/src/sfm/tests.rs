@@ -1,0 +1,202 @@
+//! From made-up features and pictures to cameras.
+
+use super::align::apart;
+use super::lens::Lens;
+use super::mapper::{FOCALS, Mapping, map};
+use super::pictures::{Feature, Look, Pictures, Sight, fixed};
+use super::tracks::{Pairing, focal_votes, join, links};
+use super::{Options, solve, solve_sights};
+use crate::Result;
+use splat4d::math::{Rng, Se3};
+use splat4d::scene::Planes;
+use splat4d_train::event::Progress;
+use splat4d_train::vision::raster::blurred;
+
+/// What a rig of cameras about a scene truly is.
+struct Rig {
+    poses: Vec<Se3>,
+    lenses: Vec<Lens>,
+    taus: Vec<f64>,
+    sights: Vec<Sight>,
+}
+
+/// Cameras on an arc around points, seven tenths of which move; every feature off by `noise` pixels, and `wrong` of them look like
+/// another one.
+fn rig(cameras: usize, points: usize, noise: f64, wrong: f64) -> Rig {
+    let rng = Rng::new(21, "rig", 0);
+    let look = |p: usize, c: usize| {
+        // As others see it, but for a little.
+        let (kind, here) = (rng.fork(1000 + p as u64), rng.fork((5000 + 100 * p + c) as u64));
+        std::array::from_fn(|k| (70.0 * kind.uniform(k as u64) + 10.0 * here.uniform(k as u64)) as u8)
+    };
+    let mut out = Rig { poses: Vec::new(), lenses: Vec::new(), taus: Vec::new(), sights: Vec::new() };
+    for c in 0..cameras {
+        let angle = 0.3 * c as f64;
+        let eye = [5.0 * angle.sin(), -1.0 + 0.7 * rng.normal(c as u64), -5.0 * angle.cos()];
+        let pose = Se3::look_at(eye, [0.0; 3], [0.0, -1.0, 0.0]);
+        let lens = Lens { focal: 480.0 * (0.08 * rng.normal(50 + c as u64)).exp(), k1: -0.02, center: [322.0, 179.0] };
+        let tau = 0.01 * rng.normal(80 + c as u64);
+        let draw = rng.fork(100 + c as u64);
+        let mut features = Vec::new();
+        for p in 0..points {
+            let x: [f64; 3] = std::array::from_fn(|k| 1.1 * rng.normal((1000 + 3 * p + k) as u64));
+            let moment = if p < 3 * points / 10 { 0 } else { 1 + p % 4 };
+            let moves = f64::from(u8::from(moment > 0));
+            let speed: [f64; 3] = std::array::from_fn(|k| moves * rng.normal((9000 + 3 * p + k) as u64));
+            let at = |t: f64| lens.project(pose.apply(std::array::from_fn(|k| x[k] + t * speed[k])));
+            let (Some(here), Some(ago), Some(after)) = (at(0.0), at(-1e-4), at(1e-4)) else { continue };
+            let velocity: [f64; 2] = std::array::from_fn(|k| (after[k] - ago[k]) / 2e-4);
+            let pixel = std::array::from_fn(|k| here[k] - tau * velocity[k] + noise * draw.normal((2 * p + k) as u64));
+            let inside = (0.0..640.0).contains(&pixel[0]) && (0.0..360.0).contains(&pixel[1]);
+            let other = draw.fork(1).uniform(p as u64) < wrong;
+            let kind = if other { draw.fork(2).below(p as u64, points) } else { p };
+            if inside {
+                features.push(Feature { pixel, velocity, moment, descriptor: look(kind, c), color: [p as u8; 3] });
+            }
+        }
+        features.sort_by_key(|f| f.moment);
+        out.sights.push(Sight {
+            name: format!("camera {c}"),
+            size: [640, 360],
+            factor: 1.0,
+            focal: None,
+            lens: c,
+            frame: 1.0 / 30.0,
+            features,
+        });
+        out.poses.push(pose);
+        out.lenses.push(lens);
+        out.taus.push(tau);
+    }
+    out
+}
+
+#[test]
+fn a_rig_is_found_among_noise_and_outliers_with_focal_lengths_and_clocks() {
+    let rig = rig(7, 900, 0.5, 0.3);
+    let mut silent = |_: &_| {};
+    let who: Vec<_> = (0..7).map(|c| (c, None)).collect();
+    let options = Options::default();
+    let found = solve_sights(&who, &rig.sights, Pairing::All, &options, &mut Progress(&mut silent)).unwrap();
+    let placed: Vec<_> = found.taken.iter().map(|t| t.placed.clone().unwrap()).collect();
+    let poses: Vec<Se3> = placed.iter().map(|p| p.pose).collect();
+    let off = apart(&poses, &rig.poses).unwrap();
+    assert!(off.iter().all(|a| a.degrees < 0.5 && a.center < 0.01), "{off:?}");
+    let clocks: Vec<f64> = placed.iter().zip(&rig.taus).map(|(p, t)| p.tau - t).collect();
+    for (k, p) in placed.iter().enumerate() {
+        let zoom = p.lens.focal / rig.lenses[k].focal - 1.0;
+        assert!(zoom.abs() < 0.02, "{zoom} {k}");
+        // A tenth of a frame.
+        assert!((clocks[k] - clocks[0]).abs() < 0.0033, "{clocks:?}");
+        assert!(p.error < 1.0 && p.sightings > 100);
+    }
+    assert!(found.points.len() > 400 && found.pairs > 10);
+    assert!(found.points.iter().all(|p| p.moment <= 4 && p.seen.len() >= 2));
+    let up = [0.0, -1.0, 0.0];
+    let turned = super::align::similarity(
+        &poses.iter().map(|p| p.inverse().translation).collect::<Vec<_>>(),
+        &rig.poses.iter().map(|p| p.inverse().translation).collect::<Vec<_>>(),
+    );
+    let there = splat4d::math::se3::mat_vec(&turned.unwrap().rotation, found.up);
+    assert!(splat4d::math::se3::dot(there, up) > 0.9, "{there:?}");
+}
+
+#[test]
+fn a_camera_of_another_scene_is_left_out_and_says_why() {
+    let mut rig = rig(4, 260, 0.3, 0.1);
+    let rng = Rng::new(5, "elsewhere", 0);
+    for (k, f) in rig.sights[2].features.iter_mut().enumerate() {
+        f.descriptor = std::array::from_fn(|i| (80.0 * rng.fork(k as u64).uniform(i as u64)) as u8);
+    }
+    let mut silent = |_: &_| {};
+    let progress = &mut Progress(&mut silent);
+    let links = links(&rig.sights, Pairing::All, 0, progress);
+    let tracks = join(&rig.sights, &links);
+    let focals = focal_votes(&rig.sights, &links, &FOCALS);
+    let how = Mapping { starts: 1, ..Mapping::default() };
+    let mapped = map(&rig.sights, &tracks, &links, &focals, &how, progress).unwrap();
+    let placed: Vec<bool> = mapped.cameras.iter().map(Result::is_ok).collect();
+    assert_eq!(placed, [true, true, false, true]);
+    let again = map(&rig.sights, &tracks, &links, &focals, &how, progress).unwrap();
+    let poses = |m: &super::mapper::Mapped| m.cameras.iter().flatten().map(|c| c.pose).collect::<Vec<_>>();
+    assert_eq!(poses(&mapped), poses(&again), "the same bits");
+}
+
+/// A patch that moves over a wall, eight pixels a frame.
+struct Walk {
+    wall: Planes<f32>,
+    patch: Planes<f32>,
+    cameras: usize,
+}
+
+const FRAMES: usize = 12;
+
+impl Pictures for Walk {
+    fn cameras(&self) -> usize {
+        self.cameras
+    }
+
+    fn name(&self, camera: usize) -> String {
+        format!("camera {camera}")
+    }
+
+    fn frames(&self, _: usize) -> usize {
+        FRAMES
+    }
+
+    fn time(&self, _: usize, frame: usize) -> f64 {
+        frame as f64 / 30.0
+    }
+
+    fn load(&self, _: usize, frame: usize) -> Result<Planes<f32>> {
+        let mut out = self.wall.clone();
+        for c in 0..3 {
+            for y in 0..self.patch.height {
+                for x in 0..self.patch.width {
+                    let at = (c * out.height + y + 30) * out.width + x + 20 + 8 * frame;
+                    out.data[at] = self.patch.get(0, y, x);
+                }
+            }
+        }
+        Ok(out)
+    }
+}
+
+fn noise(seed: u64, height: usize, width: usize) -> Planes<f32> {
+    let rng = Rng::new(seed, "noise", 0);
+    let mut out = Planes::<f32>::new(1, height, width);
+    out.data.iter_mut().enumerate().for_each(|(k, v)| *v = rng.uniform(k as u64) as f32);
+    let mut out = blurred(&out, 2.0);
+    out.data.iter_mut().for_each(|v| *v = (0.5 + 4.0 * (*v - 0.5)).clamp(0.0, 1.0));
+    out
+}
+
+fn walk(cameras: usize) -> Walk {
+    let wall = noise(1, 120, 240);
+    let mut colored = Planes::new(3, 120, 240);
+    (0..3).for_each(|c| colored.plane_mut(c).copy_from_slice(&wall.data));
+    Walk { wall: colored, patch: noise(2, 60, 60), cameras }
+}
+
+#[test]
+fn what_moves_is_seen_at_moments_with_its_velocity() {
+    let mut silent = |_: &_| {};
+    let look = Look { moments: 3, ..Look::default() };
+    let sights = fixed(&walk(1), &look, &mut Progress(&mut silent)).unwrap();
+    let features = &sights[0].features;
+    assert!(features.is_sorted_by_key(|f| f.moment));
+    let still = features.iter().filter(|f| f.moment == 0).count();
+    let moving: Vec<&Feature> = features.iter().filter(|f| f.moment > 0).collect();
+    assert!(still > 40 && moving.len() > 20, "{still} {}", moving.len());
+    let near = |f: &Feature, speed: f64| (f.velocity[0] - speed).hypot(f.velocity[1]) < 8.0;
+    let share = |speed: f64| moving.iter().filter(|f| near(f, speed)).count() as f64 / moving.len() as f64;
+    // The rest lies on the patch's border, where windows hold some of the wall.
+    assert!(share(240.0) > 0.65, "{}", share(240.0));
+}
+
+#[test]
+fn cameras_that_share_nothing_are_refused() {
+    let mut silent = |_: &_| {};
+    let error = solve(&walk(1), &Options::default(), &mut Progress(&mut silent)).unwrap_err();
+    assert!(error.to_string().contains("show the same"), "{error}");
+}

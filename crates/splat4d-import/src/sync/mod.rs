@@ -1,0 +1,81 @@
+//! A clock that all cameras share, found by sound, by motion and by geometry.
+//!
+//! Every camera's frames have times on its own clock. What is looked for is, per camera, the [`graph::Offset`] that is
+//! added to them. Evidence is about pairs: a *lag* of cameras a and b is how much later, on its own clock, b notes what a
+//! notes: `t_b − t_a` of one event, so that `lag = offset_a − offset_b`. [`sound`] and [`epipolar`] measure lags, [`motion`]
+//! guesses them, and [`graph`] makes offsets of lags and leaves out the ones that contradict the rest. What cannot be told is
+//! refused with a [`Refusal`] and never averaged in.
+
+pub mod epipolar;
+mod fft;
+pub mod graph;
+pub mod grey;
+pub mod motion;
+pub mod sound;
+pub mod tracks;
+
+use std::fmt;
+
+/// Why there is no lag.
+#[derive(Clone, Debug, PartialEq)]
+#[non_exhaustive]
+pub enum Refusal {
+    /// Too little in common to compare, seconds or samples of it as a word.
+    Short(&'static str),
+    /// Nothing is heard.
+    Silent,
+    /// Nothing moves.
+    Still,
+    /// Nothing agrees better at one lag than at others: other takes, or nothing in common.
+    Unrelated,
+    /// Several lags agree alike: what moves or sounds repeats itself. The two best, seconds.
+    Repeating([f64; 2]),
+    /// What agrees leaves the lag open by so many seconds: motion along the epipolar lines.
+    Vague(f64),
+    /// The evidence grows or shrinks in time, by so many seconds a second: a wrong frame rate in a file.
+    Drifting(f64),
+}
+
+impl fmt::Display for Refusal {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Short(what) => write!(f, "there is too little of {what}"),
+            Self::Silent => write!(f, "nothing is heard"),
+            Self::Still => write!(f, "nothing moves"),
+            Self::Unrelated => write!(f, "nothing agrees: these may be different takes"),
+            Self::Repeating([a, b]) => write!(f, "it repeats itself: {a:.3} s and {b:.3} s fit alike"),
+            Self::Vague(s) => write!(f, "what moves leaves it open by {s:.3} s"),
+            Self::Drifting(r) => {
+                write!(f, "it changes by {:.1} ms a second: a frame rate may be wrong in a file", r * 1e3)
+            }
+        }
+    }
+}
+
+/// The middle value; half of the values may be anything. NaN of none.
+fn median(values: &mut [f64]) -> f64 {
+    if values.is_empty() {
+        return f64::NAN;
+    }
+    let middle = values.len() / 2;
+    *values.select_nth_unstable_by(middle, f64::total_cmp).1
+}
+
+/// Ratio of the standard deviation to the median absolute deviation of a normal distribution.
+const NORMAL_MAD: f64 = 1.4826;
+
+/// Where a parabola through three values, one step apart, has its extremum: −½ to ½ steps from the middle one, and the
+/// value there.
+fn parabola([left, middle, right]: [f64; 3]) -> (f64, f64) {
+    let bend = left - 2.0 * middle + right;
+    if bend.abs() < f64::MIN_POSITIVE {
+        return (0.0, middle);
+    }
+    let at = (0.5 * (left - right) / bend).clamp(-0.5, 0.5);
+    (at, middle - 0.25 * (left - right) * at)
+}
+
+#[cfg(test)]
+mod drawn;
+#[cfg(test)]
+mod tests;

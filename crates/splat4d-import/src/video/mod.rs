@@ -1,0 +1,194 @@
+//! Pictures with their times: videos through the ffmpeg program, folders of pictures, motion JPEG without any program.
+//!
+//! A [`Source`] tells what it holds ([`Info`]) and gives its frames one by one, each with the time stamp that it has in the
+//! file: frame rates vary and frames get lost, so that a frame's number is no clock. What comes is upright, in square pixels
+//! and in sRGB; one frame is in memory at a time.
+
+mod avi;
+mod clock;
+mod ffmpeg;
+mod filters;
+mod folder;
+mod probe;
+mod program;
+
+pub use clock::{Clock, Gap, mean_difference};
+pub use folder::Folder;
+pub use probe::{Color, Info, Range, Transfer};
+pub use program::Tools;
+pub use splat4d_train::capture::Rgb8;
+
+use splat4d::{Error, ErrorKind, Result};
+use std::path::Path;
+
+/// Samples per second of what [`Source::sound`] gives: 62 µs a sample, an 18th of what a metre of way makes, and above twice
+/// the highest frequency that sound is compared at.
+pub const SOUND_RATE: f64 = 16_000.0;
+
+/// Which frames of a source, and how large.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Selection {
+    /// Every so many frames, from the first one on; at least 1.
+    pub every: usize,
+    /// No frame before this second of the source's clock.
+    pub from: Option<f64>,
+    /// No frame at or after this second.
+    pub to: Option<f64>,
+    /// Pixels of the shorter side; smaller pictures stay as they are.
+    pub size: Option<usize>,
+    /// Whether interlaced videos are taken, and their lines filled in.
+    pub deinterlace: bool,
+}
+
+impl Default for Selection {
+    fn default() -> Self {
+        Self { every: 1, from: None, to: None, size: None, deinterlace: false }
+    }
+}
+
+impl Selection {
+    /// An error unless the numbers make sense.
+    pub fn check(&self) -> Result<()> {
+        let bad = |what: String, remedy: &str| Err(Error::input(what).remedy(remedy));
+        if self.every == 0 {
+            return bad("every 0th frame is asked for".into(), "Take every frame (1), every second (2) and so on.");
+        }
+        if self.size.is_some_and(|s| s < MIN_SIDE) {
+            return bad(format!("pictures of less than {MIN_SIDE} pixels are asked for"), "Take 1080, for example.");
+        }
+        for second in [self.from, self.to].into_iter().flatten() {
+            if !second.is_finite() || second < 0.0 {
+                return bad(format!("{second} is no second of a video"), "Give seconds from its beginning, 3.2 or so.");
+            }
+        }
+        if let (Some(from), Some(to)) = (self.from, self.to)
+            && from >= to
+        {
+            return bad(format!("the part from {from} s to {to} s is empty"), "Let the end come after the beginning.");
+        }
+        Ok(())
+    }
+
+    /// The size that pictures of `size` get: of the same shape, their shorter side as asked for.
+    pub(crate) fn scaled(&self, [width, height]: [usize; 2]) -> [usize; 2] {
+        match self.size {
+            Some(side) if side < width.min(height) => {
+                let scale = side as f64 / width.min(height) as f64;
+                [width, height].map(|s| (s as f64 * scale).round() as usize)
+            }
+            _ => [width, height],
+        }
+    }
+
+    /// Whether a time is in the chosen part.
+    fn holds(&self, time: f64) -> bool {
+        self.from.is_none_or(|from| time >= from) && self.to.is_none_or(|to| time < to)
+    }
+}
+
+/// Shorter side of the smallest pictures that anything can be made of.
+const MIN_SIDE: usize = 16;
+
+/// A picture and when it was taken.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Frame {
+    /// Its number among the frames that were passed, chosen or not; an index into [`Reader::times`].
+    pub number: usize,
+    /// Seconds on the source's clock.
+    pub time: f64,
+    /// Its pixels.
+    pub picture: Rgb8,
+}
+
+/// Frames in the order of time, one in memory at a time.
+pub trait Reader {
+    /// The next chosen frame, in the place of the last one; false at the end.
+    ///
+    /// Errors: nothing can be decoded at all, a picture is damaged or of another size. What can be decoded in part ends
+    /// early, and a warning says so.
+    fn next(&mut self, frame: &mut Frame) -> Result<bool>;
+
+    /// Times of all frames passed so far, chosen or not, seconds, ascending.
+    fn times(&self) -> &[f64];
+
+    /// What was odd so far, a sentence or two each.
+    fn warnings(&self) -> &[String];
+}
+
+/// What pictures come from.
+pub trait Source: Send + Sync {
+    /// What it is.
+    fn info(&self) -> &Info;
+
+    /// Its frames. Errors: nonsense in the selection, interlaced, a program that cannot be started.
+    fn frames(&self, selection: &Selection) -> Result<Box<dyn Reader + '_>>;
+
+    /// Its sound as one channel at [`SOUND_RATE`]; the first sample at second 0 of the clock that frames have. None where
+    /// there is none.
+    fn sound(&self) -> Result<Option<Vec<f32>>>;
+
+    /// What changes when the contents do: 16 hexadecimal digits.
+    fn fingerprint(&self) -> Result<String>;
+}
+
+/// Opens a video file or a folder of pictures. Pictures of folders are `1/fps` seconds apart.
+///
+/// Errors: no such file; no ffmpeg, and no format that is read without it; no picture stream; damage.
+pub fn open(path: &Path, fps: f64) -> Result<Box<dyn Source>> {
+    open_with(path, fps, Tools::find())
+}
+
+/// [`open`] with certain programs, or with the error of not having them.
+pub fn open_with(path: &Path, fps: f64, tools: Result<Tools>) -> Result<Box<dyn Source>> {
+    let kind = std::fs::metadata(path).map_err(|e| {
+        Error::io("cannot be read", e).at(path.display()).remedy("Check that the file exists and may be read by you.")
+    })?;
+    if kind.is_dir() {
+        return Ok(Box::new(Folder::open(path, fps)?));
+    }
+    if kind.len() == 0 {
+        return Err(Error::input("the file is empty").at(path.display()).remedy("Copy it again from the camera."));
+    }
+    match tools {
+        Ok(tools) => Ok(Box::new(ffmpeg::Video::open(path, tools)?)),
+        // Without the program, what is simple enough; its absence is told where the file is not.
+        Err(missing) => match avi::Avi::open(path) {
+            Ok(avi) => Ok(Box::new(avi)),
+            Err(e) if e.kind() == ErrorKind::Unsupported => Err(missing.at(path.display())),
+            Err(e) => Err(e),
+        },
+    }
+}
+
+/// A name for a camera that films this: the file's or folder's, without its ending.
+fn stem(path: &Path) -> String {
+    let whole = path.canonicalize().unwrap_or_else(|_| path.to_owned());
+    let name = if whole.is_dir() { whole.file_name() } else { whole.file_stem() };
+    name.map_or_else(|| "camera".into(), |n| n.to_string_lossy().into_owned())
+}
+
+/// Tells two files apart: FNV-1a of length, beginning, middle and end, against mistakes and not against malice.
+fn fingerprint_of_file(path: &Path) -> Result<u64> {
+    use std::io::{Read, Seek, SeekFrom};
+    /// Bytes of each of the three places: a video's tables and some of its pictures.
+    const PIECE: u64 = 64 << 10;
+    let fail = |e| Error::io("cannot be read", e).at(path.display());
+    let mut file = std::fs::File::open(path).map_err(fail)?;
+    let length = file.metadata().map_err(fail)?.len();
+    let mut bytes = length.to_le_bytes().to_vec();
+    for at in [0, (length / 2).saturating_sub(PIECE / 2), length.saturating_sub(PIECE)] {
+        file.seek(SeekFrom::Start(at)).map_err(fail)?;
+        file.by_ref().take(PIECE).read_to_end(&mut bytes).map_err(fail)?;
+    }
+    Ok(fnv1a(&bytes))
+}
+
+/// FNV-1a with 64 bits (Fowler, Noll, Vo).
+pub(crate) fn fnv1a(bytes: &[u8]) -> u64 {
+    const OFFSET: u64 = 0xcbf2_9ce4_8422_2325;
+    const PRIME: u64 = 0x0000_0100_0000_01b3;
+    bytes.iter().fold(OFFSET, |h, b| (h ^ u64::from(*b)).wrapping_mul(PRIME))
+}
+
+#[cfg(test)]
+mod tests;

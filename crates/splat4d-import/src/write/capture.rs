@@ -1,0 +1,134 @@
+//! `capture.json`: what the pictures are, where they were taken from and when.
+
+use super::Pictures;
+use crate::sync::graph::Offset;
+use serde_json::{Map, Value, json};
+use splat4d::math::Se3;
+use splat4d::scene::{Intrinsics, Lens};
+use splat4d::{Error, Result};
+use splat4d_train::run::checkpoint::write_atomically;
+use std::path::{Path, PathBuf};
+
+/// Times are written to so many parts of a second: cameras' clocks tell no more, and people can read them.
+const TICKS: f64 = 1e6;
+
+/// Where a camera was.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Poses {
+    /// In one place: `cam_from_world`.
+    Fixed(Se3),
+    /// In another for every shot.
+    Moving(Vec<Se3>),
+}
+
+/// A camera whose clock, lens and place are known.
+#[derive(Clone, Debug)]
+pub struct Placed {
+    /// Its pictures.
+    pub pictures: Pictures,
+    /// Its clock.
+    pub offset: Offset,
+    /// Pixels of the stored pictures.
+    pub intrinsics: Intrinsics,
+    /// Of the stored pictures, which are not undistorted.
+    pub lens: Lens,
+    /// Where it was.
+    pub poses: Poses,
+}
+
+/// What is known of the whole take.
+#[derive(Clone, Debug, Default)]
+pub struct Take {
+    /// A short name; the folder's if there is none.
+    pub name: Option<String>,
+    /// Upwards in the world.
+    pub up: Option<[f64; 3]>,
+    /// The initial cloud, from the folder on.
+    pub points: Option<PathBuf>,
+    /// Cameras that are kept from training.
+    pub hold_out: Vec<String>,
+    /// Anything else for those who read the file; training does not.
+    pub extra: Map<String, Value>,
+}
+
+/// Writes `capture.json` into the folder that holds the pictures; the file.
+///
+/// Errors: no cameras, no pictures of one, poses that are not as many as shots, no space.
+pub fn capture(folder: &Path, take: &Take, cameras: &[Placed]) -> Result<PathBuf> {
+    if cameras.is_empty() {
+        return Err(Error::input("there is no camera whose place is known").remedy("See the report for why."));
+    }
+    // The median rate of all; each camera's own times say more.
+    let mut intervals: Vec<f64> = cameras.iter().map(|c| c.pictures.clock.interval).filter(|i| *i > 0.0).collect();
+    intervals.sort_by(f64::total_cmp);
+    let interval = intervals.get(intervals.len() / 2).copied();
+    let list = cameras.iter().map(camera).collect::<Result<Vec<Value>>>()?;
+    let mut top = json!({"version": 1, "cameras": list});
+    let mut set = |key: &str, value: Value| drop(top.as_object_mut().expect("it is one").insert(key.into(), value));
+    if let Some(interval) = interval {
+        set("fps", json!((1e3 / interval).round() / 1e3));
+    }
+    if let Some(name) = &take.name {
+        set("name", json!(name));
+    }
+    if let Some(up) = take.up {
+        set("up", json!(up));
+    }
+    if let Some(points) = &take.points {
+        set("points", json!(points.to_string_lossy().replace('\\', "/")));
+    }
+    if !take.hold_out.is_empty() {
+        set("hold_out", json!({"cameras": take.hold_out}));
+    }
+    if !take.extra.is_empty() {
+        set("extra", Value::Object(take.extra.clone()));
+    }
+    let path = folder.join("capture.json");
+    write_atomically(&path, format!("{top:#}\n").as_bytes())?;
+    Ok(path)
+}
+
+fn camera(camera: &Placed) -> Result<Value> {
+    let Placed { pictures, offset, intrinsics, lens, poses } = camera;
+    let place = |e: Error| e.at(format!("camera {}", pictures.name));
+    if pictures.shots.is_empty() {
+        return Err(place(Error::input("there are no pictures of it").remedy("Leave the camera out.")));
+    }
+    let matrix = |p: &Se3| {
+        let row = |i: usize| {
+            let r = p.rotation[i];
+            [r[0], r[1], r[2], p.translation[i]]
+        };
+        [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]]
+    };
+    let world_to_camera = match poses {
+        Poses::Fixed(pose) => json!(matrix(pose)),
+        Poses::Moving(all) if all.len() == pictures.shots.len() => json!(all.iter().map(matrix).collect::<Vec<_>>()),
+        Poses::Moving(all) => {
+            let what = format!("there are {} poses for {} pictures", all.len(), pictures.shots.len());
+            return Err(place(Error::input(what).remedy("Import it again.")));
+        }
+    };
+    let distortion = match lens {
+        Lens::Brown { k, p, s } => json!({"model": "opencv", "k": k, "p": p, "s": s}),
+        Lens::Fisheye { k } => json!({"model": "fisheye", "k": k}),
+        _ => json!({"model": "pinhole"}),
+    };
+    let tick = |t: f64| (t * TICKS).round() / TICKS;
+    let times: Vec<f64> = pictures.shots.iter().map(|s| tick(s.time * (1.0 + offset.rate))).collect();
+    Ok(json!({
+        "name": pictures.name,
+        "width": pictures.size[0],
+        "height": pictures.size[1],
+        "fx": intrinsics.fx,
+        "fy": intrinsics.fy,
+        "cx": intrinsics.cx,
+        "cy": intrinsics.cy,
+        "distortion": distortion,
+        "world_to_camera": world_to_camera,
+        "time_offset": tick(offset.seconds),
+        "times": times,
+        "images": pictures.pattern,
+        "frames": pictures.shots.len(),
+    }))
+}

@@ -1,0 +1,290 @@
+//! Frames of videos as picture files, and a table of their times.
+
+use crate::video::{Clock, Frame, Gap, Rgb8, Selection, Source, fnv1a, mean_difference};
+use image::codecs::jpeg::JpegEncoder;
+use image::codecs::png::{CompressionType, FilterType, PngEncoder};
+use image::{ExtendedColorType, ImageEncoder};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+use splat4d::{Error, ErrorKind, Result};
+use splat4d_train::event::Progress;
+use splat4d_train::run::checkpoint::write_atomically;
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+/// Version of the notes; others are made anew.
+const VERSION: u32 = 1;
+/// Folder of the notes, beside that of the pictures.
+const NOTES: &str = "import";
+/// Pictures that are compressed at a time: eight of 4K are 200 MB.
+const BATCH: usize = 8;
+/// Least quality of JPEG files: below, blocks are seen that training would learn.
+const MIN_QUALITY: u8 = 95;
+/// Longest name of a camera, characters.
+const MAX_NAME: usize = 60;
+
+/// How pictures are stored.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Format {
+    /// JPEG of this quality, 95 to 100, colours in full resolution.
+    Jpeg(u8),
+    /// PNG: every bit, four times as large.
+    Png,
+}
+
+impl Default for Format {
+    fn default() -> Self {
+        Self::Jpeg(MIN_QUALITY)
+    }
+}
+
+impl Format {
+    fn ending(self) -> &'static str {
+        match self {
+            Self::Jpeg(_) => "jpg",
+            Self::Png => "png",
+        }
+    }
+
+    fn encode(self, picture: &Rgb8) -> Result<Vec<u8>> {
+        let mut bytes = Vec::new();
+        let (width, height) = (picture.width as u32, picture.height as u32);
+        let done = match self {
+            Self::Jpeg(quality) => JpegEncoder::new_with_quality(&mut bytes, quality).write_image(
+                &picture.data,
+                width,
+                height,
+                ExtendedColorType::Rgb8,
+            ),
+            Self::Png => PngEncoder::new_with_quality(&mut bytes, CompressionType::Fast, FilterType::Adaptive)
+                .write_image(&picture.data, width, height, ExtendedColorType::Rgb8),
+        };
+        done.map_err(|e| Error::input(format!("a picture of {width}x{height} cannot be stored ({e})")))?;
+        Ok(bytes)
+    }
+}
+
+/// What of a source is stored, and under which name.
+pub struct Clip<'a> {
+    /// The camera's name; see [`camera_names`].
+    pub name: String,
+    /// Where frames come from.
+    pub source: &'a dyn Source,
+    /// Which of them, on the source's own clock.
+    pub selection: Selection,
+}
+
+/// A stored frame.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Shot {
+    /// Its number among the frames that were read.
+    pub number: usize,
+    /// Seconds on the camera's clock.
+    pub time: f64,
+}
+
+/// The stored pictures of a camera.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Pictures {
+    /// The camera's name.
+    pub name: String,
+    /// Pixels across and down.
+    pub size: [usize; 2],
+    /// The pattern of the files, from the capture's folder on; the number is the place in `shots`.
+    pub pattern: String,
+    /// The frames, in the order of time.
+    pub shots: Vec<Shot>,
+    /// The camera's clock.
+    pub clock: Clock,
+    /// What was odd, a sentence or two each.
+    pub warnings: Vec<String>,
+}
+
+impl Pictures {
+    /// The file of a shot, from the capture's folder on.
+    pub fn file(&self, shot: usize) -> PathBuf {
+        let (before, after) = self.pattern.split_once("%06d").expect("we wrote the pattern");
+        PathBuf::from(format!("{before}{shot:06}{after}"))
+    }
+}
+
+/// The notes beside a camera's pictures.
+#[derive(Default, Serialize, Deserialize)]
+struct Note {
+    version: u32,
+    /// Of everything that the pictures depend on.
+    fingerprint: String,
+    /// Whether all are there.
+    complete: bool,
+    size: [usize; 2],
+    shots: Vec<Shot>,
+    interval: f64,
+    variable: bool,
+    still: bool,
+    /// After which frame, how many.
+    dropped: Vec<[usize; 2]>,
+    doubled: Vec<usize>,
+    warnings: Vec<String>,
+}
+
+/// Names for cameras that are folders, too: of their sources' names what all systems allow, each once.
+pub fn camera_names(wanted: &[&str]) -> Vec<String> {
+    let mut taken = BTreeSet::new();
+    let one = |name: &&str| {
+        let allowed = |c: char| if c.is_alphanumeric() || "-_".contains(c) { c } else { '_' };
+        let plain: String = name.chars().take(MAX_NAME).map(allowed).collect();
+        // A dash at the beginning is an option to other programs.
+        let plain = plain.trim_start_matches('-');
+        let plain = if plain.is_empty() { "camera" } else { plain };
+        // Some systems do not tell large letters from small ones.
+        let numbered = (2..).map(|k| format!("{plain}_{k}"));
+        std::iter::once(plain.to_owned()).chain(numbered).find(|n| taken.insert(n.to_lowercase())).expect("one is free")
+    };
+    wanted.iter().map(one).collect()
+}
+
+/// Stores the frames of all cameras below `folder`, as `images/NAME/000000.jpg` and so on. What is there already, made of the
+/// same and in the same way, is left; `stop` is asked after every few frames.
+///
+/// Errors: a source that cannot be read, no space; of kind `Interrupted` where `stop` said so.
+pub fn pictures(
+    folder: &Path,
+    clips: &[Clip<'_>],
+    format: Format,
+    progress: &mut Progress<'_>,
+    stop: &dyn Fn() -> bool,
+) -> Result<Vec<Pictures>> {
+    if let Format::Jpeg(quality) = format
+        && !(MIN_QUALITY..=100).contains(&quality)
+    {
+        return Err(Error::input(format!("pictures of quality {quality} are asked for"))
+            .remedy(format!("Take {MIN_QUALITY} to 100: training learns the blocks of lower ones.")));
+    }
+    let mut out = Vec::new();
+    for (k, clip) in clips.iter().enumerate() {
+        progress.phase("frames", k, clips.len());
+        out.push(camera(folder, clip, format, stop).map_err(|e| e.at(format!("camera {}", clip.name)))?);
+    }
+    progress.phase("frames", clips.len(), clips.len());
+    Ok(out)
+}
+
+fn camera(folder: &Path, clip: &Clip<'_>, format: Format, stop: &dyn Fn() -> bool) -> Result<Pictures> {
+    let place = folder.join("images").join(&clip.name);
+    let notes = folder.join(NOTES).join(format!("{}.json", clip.name));
+    let made_of = format!("{} {:?} {format:?} {VERSION}", clip.source.fingerprint()?, clip.selection);
+    let fingerprint = format!("{:016x}", fnv1a(made_of.as_bytes()));
+    let pattern = format!("images/{}/%06d.{}", clip.name, format.ending());
+    let known = read(&notes).filter(|n| n.version == VERSION && n.fingerprint == fingerprint);
+    let file = |number: usize| place.join(format!("{number:06}.{}", format.ending()));
+    if let Some(note) = &known
+        && note.complete
+        && (0..note.shots.len()).all(|i| file(i).is_file())
+    {
+        return Ok(note.pictures(clip, pattern));
+    }
+    if known.is_none() {
+        // What was made of something else must not be taken for this.
+        clear(&place)?;
+        let begun = Note { version: VERSION, fingerprint: fingerprint.clone(), ..Note::default() };
+        begun.write(&notes)?;
+    }
+    let mut reader = clip.source.frames(&clip.selection)?;
+    let mut note = Note { version: VERSION, fingerprint, complete: true, ..Note::default() };
+    let mut differences = Vec::new();
+    let mut batch: Vec<Frame> = Vec::new();
+    let mut last: Option<Frame> = None;
+    loop {
+        let mut frame = Frame::default();
+        let more = reader.next(&mut frame)?;
+        if more {
+            if let Some(last) = &last
+                && frame.number == last.number + 1
+            {
+                differences.push((frame.number, mean_difference(&frame.picture, &last.picture)));
+            }
+            note.size = [frame.picture.width, frame.picture.height];
+            last = Some(frame.clone());
+            batch.push(frame);
+        }
+        if batch.len() == BATCH || !more {
+            let first = note.shots.len();
+            note.shots.extend(batch.iter().map(|f| Shot { number: f.number, time: f.time }));
+            batch.par_iter().enumerate().try_for_each(|(i, frame)| {
+                let path = file(first + i);
+                // A file under this name is a whole one of the same making.
+                if path.is_file() { Ok(()) } else { write_atomically(&path, &format.encode(&frame.picture)?) }
+            })?;
+            batch.clear();
+        }
+        if !more {
+            break;
+        }
+        if stop() {
+            return Err(Error::new(ErrorKind::Interrupted, "stopped while frames were stored")
+                .remedy("The same command goes on from there."));
+        }
+    }
+    let clock = Clock::of(reader.times(), &differences);
+    (note.interval, note.variable, note.still) = (clock.interval, clock.variable, clock.still);
+    note.dropped = clock.dropped.iter().map(|g| [g.after, g.missing]).collect();
+    note.doubled = clock.doubled;
+    note.warnings = reader.warnings().to_vec();
+    // Left from a time when more of the same could be read.
+    let mut number = note.shots.len();
+    while file(number).is_file() {
+        remove(&file(number))?;
+        number += 1;
+    }
+    note.write(&notes)?;
+    Ok(note.pictures(clip, pattern))
+}
+
+impl Note {
+    fn write(&self, path: &Path) -> Result<()> {
+        let text = serde_json::to_string(self).expect("notes are plain data");
+        write_atomically(path, text.as_bytes())
+    }
+
+    fn pictures(&self, clip: &Clip<'_>, pattern: String) -> Pictures {
+        let clock = Clock {
+            interval: self.interval,
+            variable: self.variable,
+            dropped: self.dropped.iter().map(|&[after, missing]| Gap { after, missing }).collect(),
+            doubled: self.doubled.clone(),
+            still: self.still,
+        };
+        Pictures {
+            name: clip.name.clone(),
+            size: self.size,
+            pattern,
+            shots: self.shots.clone(),
+            clock,
+            warnings: self.warnings.clone(),
+        }
+    }
+}
+
+/// Notes that can be read; others are as good as none.
+fn read(path: &Path) -> Option<Note> {
+    serde_json::from_slice(&std::fs::read(path).ok()?).ok()
+}
+
+/// Removes the pictures that were written into a folder before, and nothing else.
+fn clear(folder: &Path) -> Result<()> {
+    let Ok(entries) = std::fs::read_dir(folder) else { return Ok(()) };
+    for path in entries.filter_map(|e| e.ok().map(|e| e.path())) {
+        let name = path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+        let ours = name.split_once('.').is_some_and(|(stem, ending)| {
+            stem.len() == 6 && stem.bytes().all(|b| b.is_ascii_digit()) && ["jpg", "png"].contains(&ending)
+        });
+        if ours {
+            remove(&path)?;
+        }
+    }
+    Ok(())
+}
+
+fn remove(path: &Path) -> Result<()> {
+    std::fs::remove_file(path).map_err(|e| Error::io("an old picture cannot be removed", e).at(path.display()))
+}

@@ -1,0 +1,217 @@
+//! Cameras and frame numbers of pictures that say nothing of time: one moment, or the frames of films, by their names.
+
+use super::{Sequence, rig};
+use splat4d::math::Se3;
+use std::collections::{BTreeMap, BTreeSet};
+
+/// Where a capture's times are from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Timing {
+    /// The capture states them.
+    Told,
+    /// It states none; the numbers in picture names count frames.
+    Numbers,
+    /// It states none; all pictures show one moment.
+    Moment,
+}
+
+/// Who took every picture, and when.
+pub(super) struct Order {
+    /// Camera names.
+    pub cameras: Vec<String>,
+    /// For each picture its camera, its frame number and its time in seconds.
+    pub frames: Vec<(usize, usize, f64)>,
+    /// Whether the data set tells cameras apart; else one entry may stand for many.
+    pub named: bool,
+    /// Where the times are from.
+    pub timing: Timing,
+}
+
+/// Words before the number in the names of a film's frames: what guides to ffmpeg, COLMAP and renderers write. Photos
+/// are named by the camera that took them (`IMG_1234`, `DSC01234`, `cam07`) or by the date.
+const FILM_WORDS: [&str; 12] =
+    ["", "frame", "frames", "image", "img", "out", "output", "video", "thumb", "rgb", "color", "f"];
+/// The one that telephones and cameras write for photos.
+const PHOTO_WORD: &str = "IMG";
+/// Part of the steps from number to number that are alike where a film was cut into frames; some pictures may not have
+/// been registered.
+const EVEN: f64 = 0.5;
+
+/// Finds cameras and frame numbers of pictures without times. What was assumed and how to say otherwise is told.
+pub(super) fn order(
+    names: &[&str],
+    poses: &[Se3],
+    sequence: Sequence,
+    fps: f64,
+    warnings: &mut Vec<String>,
+    notes: &mut Vec<String>,
+) -> Order {
+    let naming = rig::naming(names);
+    let rig = naming.told && naming.cameras.len() > 1;
+    let mut groups = vec![Vec::new(); naming.cameras.len()];
+    naming.frames.iter().enumerate().for_each(|(i, f)| groups[f.0].push(i));
+    let one_each = rig && naming.cameras.len() == names.len();
+    let film = !one_each && groups.iter().all(|group| is_film(group, names, poses));
+    let moment = match sequence {
+        Sequence::Auto => !film,
+        Sequence::Photos => true,
+        Sequence::Video => false,
+    };
+    let count = names.len();
+    if sequence == Sequence::Auto && moment && !one_each && count > 1 {
+        notes.push(format!(
+            "The capture states no times, and its names do not number the frames of a film: its {count} pictures are \
+             one moment. If they are frames of a film, say --set capture.sequence=video."
+        ));
+    }
+    if sequence == Sequence::Auto && !moment && !rig && count > 1 && !still(&groups[0], poses) {
+        warnings.push(format!(
+            "The capture states no times: its {count} pictures are numbered like frames ({}) and taken for a film of \
+             one moving camera at {fps} frames per second. If they are photos of one moment, say --set \
+             capture.sequence=photos.",
+            names[0]
+        ));
+    }
+    if moment && !one_each {
+        return self::moment(names);
+    }
+    let place = |&(camera, number): &(usize, usize)| {
+        let number = if moment { 0 } else { number };
+        (camera, number, number as f64 / fps)
+    };
+    Order {
+        frames: naming.frames.iter().map(place).collect(),
+        cameras: naming.cameras,
+        named: rig,
+        timing: if moment { Timing::Moment } else { Timing::Numbers },
+    }
+}
+
+/// One moment: every picture has a place of its own, and is its own camera.
+pub(super) fn moment(names: &[&str]) -> Order {
+    let stem = |name: &str| name.rsplit_once('.').map_or(name, |(stem, _)| stem).to_owned();
+    let short = |name: &str| stem(name.rsplit_once('/').map_or(name, |(_, file)| file));
+    let distinct = names.iter().map(|n| short(n)).collect::<BTreeSet<_>>().len() == names.len();
+    let full: Vec<String> = names.iter().map(|n| if distinct { short(n) } else { stem(n) }).collect();
+    let sorted: BTreeMap<(&str, usize), usize> = full.iter().enumerate().map(|(i, n)| ((n.as_str(), i), i)).collect();
+    let mut frames = vec![(0, 0, 0.0); names.len()];
+    sorted.values().enumerate().for_each(|(camera, &i)| frames[i].0 = camera);
+    let cameras = sorted.keys().map(|(name, _)| (*name).to_owned()).collect();
+    Order { cameras, frames, named: false, timing: Timing::Moment }
+}
+
+/// Whether the pictures are frames of one camera's film: it never moves, or they are numbered evenly as films are.
+fn is_film(group: &[usize], names: &[&str], poses: &[Se3]) -> bool {
+    let words: BTreeSet<Option<&str>> = group.iter().map(|&i| film_word(names[i])).collect();
+    let numbers: BTreeSet<usize> = group.iter().filter_map(|&i| rig::trailing_number(names[i])).collect();
+    let mut steps: BTreeMap<usize, usize> = BTreeMap::new();
+    numbers.iter().zip(numbers.iter().skip(1)).for_each(|(a, b)| *steps.entry(b - a).or_default() += 1);
+    let most = steps.values().max().copied().unwrap_or(0) as f64;
+    let numbered = words.len() == 1 && !words.contains(&None) && numbers.len() == group.len();
+    still(group, poses) || numbered && most >= EVEN * (group.len() - 1) as f64
+}
+
+fn still(group: &[usize], poses: &[Se3]) -> bool {
+    group.len() > 1 && group.iter().all(|&i| poses[i] == poses[group[0]])
+}
+
+/// The word before the number of a picture's name, if it is one that frames have.
+fn film_word(name: &str) -> Option<&str> {
+    let file = name.rsplit_once('/').map_or(name, |(_, file)| file);
+    let stem = file.rsplit_once('.').map_or(file, |(stem, _)| stem);
+    let before = stem.trim_end_matches(|c: char| c.is_ascii_digit());
+    let apart = |c: char| matches!(c, '_' | '-' | ' ' | '.');
+    let word = before.trim_end_matches(apart).rsplit(apart).next().unwrap_or_default();
+    let known = FILM_WORDS.contains(&word.to_ascii_lowercase().as_str());
+    (before.len() < stem.len() && known && word != PHOTO_WORD).then_some(word)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn poses(count: usize) -> Vec<Se3> {
+        let at =
+            |i: usize| Se3 { translation: [i as f64, 0.0, 1.0], ..Se3::look_at([0.0; 3], [1.0; 3], [0.0, 0.0, 1.0]) };
+        (0..count).map(at).collect()
+    }
+
+    fn timing(names: &[String]) -> (Timing, usize, usize, usize) {
+        let names: Vec<&str> = names.iter().map(String::as_str).collect();
+        let (mut warnings, mut notes) = (Vec::new(), Vec::new());
+        let order = order(&names, &poses(names.len()), Sequence::Auto, 30.0, &mut warnings, &mut notes);
+        assert!(warnings.len() + notes.len() <= 1);
+        (order.timing, order.cameras.len(), warnings.len(), notes.len())
+    }
+
+    fn numbered(count: usize, name: impl Fn(usize) -> String) -> Vec<String> {
+        (0..count).map(name).collect()
+    }
+
+    #[test]
+    fn names_tell_photos_from_films() {
+        let films: [&dyn Fn(usize) -> String; 7] = [
+            &|i| format!("frame_{:04}.png", i + 1),
+            &|i| format!("{i:06}.jpg"),
+            &|i| format!("images/image{:06}.png", i + 1),
+            &|i| format!("img{:03}.png", 5 * i),
+            &|i| format!("take/walk-frame-{i}.jpg"),
+            // A few were not registered.
+            &|i| format!("frame_{}.png", i + i / 4),
+            &|i| format!("Frame{i}.png"),
+        ];
+        for name in films {
+            assert_eq!(timing(&numbered(12, name)), (Timing::Numbers, 1, 1, 0), "{}", name(0));
+        }
+        let photos: [&dyn Fn(usize) -> String; 8] = [
+            &|i| format!("cam{i:02}.png"),
+            &|i| format!("IMG_{}.JPG", i + 1234),
+            &|i| format!("DSC{:05}.jpg", i + 7),
+            &|i| format!("20240212_{:06}.jpg", 3919 + i),
+            &|i| format!("r_{i}.png"),
+            &|i| format!("{}.png", i * i),
+            &|i| format!("view-{}.png", char::from(b'a' + i as u8)),
+            &|i| format!("photos/P10{i:02}.jpg"),
+        ];
+        for name in photos {
+            assert_eq!(timing(&numbered(12, name)), (Timing::Moment, 12, 0, 1), "{}", name(0));
+        }
+    }
+
+    #[test]
+    fn rigs_number_their_frames_or_show_one_moment() {
+        let rig = |name: &dyn Fn(usize, usize) -> String| numbered(12, |i| name(i / 4, i % 4));
+        assert_eq!(timing(&rig(&|c, t| format!("cam{c}/{t:04}.png"))), (Timing::Numbers, 3, 0, 0));
+        assert_eq!(timing(&rig(&|c, t| format!("side{c}/DSC{t}.png"))), (Timing::Moment, 12, 0, 1));
+        let one_each = numbered(5, |c| format!("cam{c}/IMG_{}.png", c + 20));
+        assert_eq!(timing(&one_each), (Timing::Moment, 5, 0, 0));
+        assert_eq!(timing(&["a/1.png".to_owned()]).0, Timing::Numbers, "one picture is one moment either way");
+    }
+
+    #[test]
+    fn cameras_of_a_moment_are_named_by_their_pictures() {
+        let order = moment(&["images/b.png", "images/a.jpg"]);
+        assert_eq!((order.cameras, order.frames), (vec!["a".into(), "b".into()], vec![(1, 0, 0.0), (0, 0, 0.0)]));
+        assert_eq!(moment(&["x/a.png", "y/a.png"]).cameras, ["x/a", "y/a"]);
+    }
+
+    #[test]
+    fn a_camera_that_never_moves_makes_a_film_whatever_the_names() {
+        let (mut warnings, mut notes) = (Vec::new(), Vec::new());
+        let still =
+            order(&["IMG_7.png", "IMG_9.png"], &[poses(1)[0]; 2], Sequence::Auto, 10.0, &mut warnings, &mut notes);
+        assert_eq!((still.timing, still.frames), (Timing::Numbers, vec![(0, 0, 0.0), (0, 2, 0.2)]));
+        assert!(warnings.is_empty() && notes.is_empty());
+    }
+
+    #[test]
+    fn what_is_said_goes_before_what_names_tell() {
+        let (names, poses) = (["frame_1.png", "frame_2.png", "frame_3.png"], poses(3));
+        let mut said = (Vec::new(), Vec::new());
+        let mut of = |names, sequence| order(names, &poses, sequence, 30.0, &mut said.0, &mut said.1);
+        assert_eq!(of(&names, Sequence::Photos).timing, Timing::Moment);
+        assert_eq!(of(&["IMG_1.png", "IMG_5.png", "IMG_7.png"], Sequence::Video).frames[2], (0, 6, 0.2));
+        assert_eq!(said, (Vec::new(), Vec::new()), "what the user said needs no comment");
+    }
+}

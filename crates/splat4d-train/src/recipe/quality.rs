@@ -1,0 +1,72 @@
+//! `--quality`: how much a run is to take, in three words.
+
+use super::Recipe;
+use crate::{Error, Result};
+
+/// A quality: steps, Gaussians and size of pictures at once.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Quality {
+    /// A look at whether a capture works: pictures of half the size, few steps, half as many Gaussians.
+    Draft,
+    /// The default recipe.
+    Standard,
+    /// What a long run is worth: many steps and Gaussians.
+    Best,
+}
+
+/// Steps of a draft: at half the size of its pictures a kitchen has 31.2 dB after 2,500 steps where 7,000 have 31.0
+/// (docs/suite.md).
+const DRAFT_STEPS: usize = 2500;
+/// Most Gaussians of a draft: half the default's, for a quarter of the pixels.
+const DRAFT_CAP: usize = 15_000;
+/// Times that a draft's pictures are reduced, besides what the recipe does.
+const DRAFT_DOWNSCALE: usize = 2;
+/// Steps and most Gaussians of the best: basketball gains 1.5 dB by them over 8,000 and 30,000 (docs/benchmarks.md).
+const BEST_STEPS: usize = 20_000;
+/// See [`BEST_STEPS`].
+const BEST_CAP: usize = 60_000;
+
+impl Quality {
+    /// All, from the fastest on.
+    pub const ALL: [Self; 3] = [Self::Draft, Self::Standard, Self::Best];
+
+    /// The word for it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Draft => "draft",
+            Self::Standard => "standard",
+            Self::Best => "best",
+        }
+    }
+}
+
+impl std::str::FromStr for Quality {
+    type Err = Error;
+
+    fn from_str(text: &str) -> Result<Self> {
+        let found = Self::ALL.into_iter().find(|q| q.name() == text);
+        found.ok_or_else(|| {
+            let names: Vec<&str> = Self::ALL.iter().map(|q| q.name()).collect();
+            Error::input(format!("`{text}` is not a quality")).remedy(format!("Use one of: {}", names.join(", ")))
+        })
+    }
+}
+
+impl Recipe {
+    /// This recipe with a quality's steps, Gaussians and size of pictures. `Standard` sets the default's steps and
+    /// Gaussians. Schedules that followed from the length follow from the new one.
+    #[must_use]
+    pub fn of_quality(&self, quality: Quality) -> Self {
+        let standard = Self::default();
+        self.unresolved().with(|r| {
+            (r.run.iterations, r.densify.max_cap) = match quality {
+                Quality::Draft => (DRAFT_STEPS, DRAFT_CAP),
+                Quality::Standard => (standard.run.iterations, standard.densify.max_cap),
+                Quality::Best => (BEST_STEPS, BEST_CAP),
+            };
+            if quality == Quality::Draft {
+                r.capture.downscale *= DRAFT_DOWNSCALE;
+            }
+        })
+    }
+}

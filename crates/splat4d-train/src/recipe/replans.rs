@@ -1,0 +1,57 @@
+//! `run.replans`: changes of a run's length while it goes, as they were made.
+
+use crate::settings::Value;
+
+/// A change of a run's length while it goes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Replan {
+    /// Steps that had been taken.
+    pub at: usize,
+    /// Steps of the run in all, from then on.
+    pub total: usize,
+}
+
+/// Changes of a run's length, in the order in which they were made.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Replans(Vec<Replan>);
+
+/// The form of the knob, to stand behind "It must be".
+const FORM: &str = "a list of [step, steps in all], steps ascending and below the steps in all, such as [[700, 4200]]";
+
+impl Replans {
+    /// The changes.
+    pub fn rows(&self) -> &[Replan] {
+        &self.0
+    }
+
+    /// Adds one. Panics: it is not behind the last, or leaves no step to take.
+    pub(crate) fn push(&mut self, row: Replan) {
+        assert!(self.may_follow(row), "a run is planned anew at ascending steps, and has a step left then");
+        self.0.push(row);
+    }
+
+    fn may_follow(&self, row: Replan) -> bool {
+        row.at < row.total && self.0.last().is_none_or(|last| last.at < row.at)
+    }
+}
+
+impl Value for Replans {
+    fn to_toml(&self) -> toml::Value {
+        toml::Value::Array(self.0.iter().map(|r| vec![r.at, r.total].to_toml()).collect())
+    }
+
+    fn from_toml(value: &toml::Value) -> Result<Self, String> {
+        let mut out = Self::default();
+        for row in value.as_array().ok_or(FORM)? {
+            let &[at, total] = Vec::<usize>::from_toml(row).map_err(|_| FORM)?.as_slice() else {
+                return Err(FORM.into());
+            };
+            let row = Replan { at, total };
+            if !out.may_follow(row) {
+                return Err(FORM.into());
+            }
+            out.push(row);
+        }
+        Ok(out)
+    }
+}

@@ -1,0 +1,80 @@
+//! A capture on disk as the trainer sees it: one of its splits, through the image store.
+
+use crate::Result;
+use crate::capture::frames::{Flow, Frames, Picture};
+use crate::capture::{Capture, ImageStore};
+use splat4d::scene::{Camera, Planes, Time};
+use std::sync::Arc;
+
+/// Some of a capture's frames.
+pub struct Dataset {
+    capture: Arc<Capture>,
+    store: Arc<ImageStore>,
+    frames: Vec<usize>,
+}
+
+impl Dataset {
+    /// The frames with these numbers.
+    pub fn new(store: Arc<ImageStore>, frames: Vec<usize>) -> Self {
+        Self { capture: store.capture().clone(), store, frames }
+    }
+
+    /// The capture whose frames they are.
+    pub fn capture(&self) -> &Arc<Capture> {
+        &self.capture
+    }
+}
+
+impl Frames for Dataset {
+    fn len(&self) -> usize {
+        self.frames.len()
+    }
+
+    fn camera(&self, i: usize) -> &Camera {
+        &self.capture.frames[self.frames[i]].view
+    }
+
+    fn time(&self, i: usize) -> Time {
+        self.capture.frames[self.frames[i]].time
+    }
+
+    fn rig(&self, i: usize) -> usize {
+        self.capture.frames[self.frames[i]].camera
+    }
+
+    fn name(&self, i: usize) -> String {
+        let frame = &self.capture.frames[self.frames[i]];
+        format!("camera {}, frame {}", self.capture.cameras[frame.camera].name, frame.index)
+    }
+
+    fn has_masks(&self) -> bool {
+        self.capture.background.is_some() || self.frames.iter().any(|&i| self.capture.frames[i].mask.is_some())
+    }
+
+    fn load(&self, i: usize, out: &mut Picture) -> Result<()> {
+        let frame = self.frames[i];
+        let stored = self.store.load(frame)?;
+        stored.color_into(&mut out.color);
+        fill(&mut out.mask, |plane| stored.mask_into(plane));
+        fill(&mut out.weight, |plane| stored.valid_into(plane));
+        let mut vectors = out.flow.take().map(|f| f.vectors).unwrap_or_default();
+        if let (Some(file), true) = (&self.capture.frames[frame].flow, stored.flow_into(&mut vectors)) {
+            let to = &self.capture.frames[file.to];
+            out.flow = Some(Flow { to: to.time, camera: to.view.clone(), vectors });
+        }
+        Ok(())
+    }
+
+    fn prefetch(&self, frames: &[usize]) {
+        let ids: Vec<usize> = frames.iter().map(|&i| self.frames[i]).collect();
+        self.store.prefetch(&ids);
+    }
+}
+
+/// Keeps the plane's allocation when there is something to fill it with.
+fn fill(slot: &mut Option<Planes<f32>>, read: impl FnOnce(&mut Planes<f32>) -> bool) {
+    let mut plane = slot.take().unwrap_or_default();
+    if read(&mut plane) {
+        *slot = Some(plane);
+    }
+}

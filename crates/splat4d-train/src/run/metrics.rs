@@ -1,0 +1,91 @@
+//! metrics.csv and the times of a step's parts.
+
+use super::checkpoint::{RunState, write_atomically};
+use crate::Result;
+use crate::step::trainer::{Stepped, Trainer};
+use std::path::Path;
+
+/// Rows of metrics.csv in a whole run, about.
+const METRIC_ROWS: usize = 600;
+
+/// Seconds by stage of the chain, over the whole session.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Totals {
+    pub(super) seconds: [f64; 8],
+    pub(super) steps: usize,
+}
+
+/// Names of the columns that [`Totals`] holds.
+pub(super) const STAGE_NAMES: [&str; 8] =
+    ["motion", "render", "loss", "render_backward", "motion_backward", "adam", "load", "other"];
+
+impl Totals {
+    fn of(s: &Stepped) -> [f64; 8] {
+        let t = &s.report.timings;
+        [t.motion, t.render, t.loss, t.render_backward, t.motion_backward, s.adam, s.load, s.other]
+            .map(|d| d.as_secs_f64())
+    }
+
+    pub(super) fn add(&mut self, s: &Stepped) {
+        self.steps += 1;
+        for (sum, x) in self.seconds.iter_mut().zip(Self::of(s)) {
+            *sum += x;
+        }
+    }
+}
+
+/// metrics.csv: kept in memory, written whole at every checkpoint, so that it never runs ahead of one.
+pub(super) struct Metrics {
+    rows: Vec<(usize, String)>,
+    every: usize,
+}
+
+impl Metrics {
+    const HEADER: &'static str = "iteration,stage,loss,l1,ssim,psnr,gaussians,seconds,motion_ms,render_ms,loss_ms,\
+        render_backward_ms,motion_backward_ms,adam_ms,load_ms,other_ms";
+
+    pub(super) fn open(run: &Path, iteration: usize, iterations: usize) -> Self {
+        let text = std::fs::read_to_string(run.join("metrics.csv")).unwrap_or_default();
+        let row = |line: &str| Some((line.split(',').next()?.parse::<usize>().ok()?, line.to_owned()));
+        let rows = text.lines().skip(1).filter_map(row).filter(|(i, _)| *i <= iteration).collect();
+        Self { rows, every: (iterations / METRIC_ROWS).max(1) }
+    }
+
+    pub(super) fn push(&mut self, trainer: &Trainer<'_>, s: &Stepped, state: &RunState) {
+        let i = trainer.progress.iteration;
+        if !i.is_multiple_of(self.every) && !trainer.is_done() {
+            return;
+        }
+        let ms: Vec<String> = Totals::of(s).iter().map(|t| format!("{:.3}", t * 1e3)).collect();
+        let row = format!(
+            "{i},{},{:.6},{:.6},{:.6},{:.4},{},{:.2},{}",
+            trainer.stage_name(),
+            s.report.loss,
+            s.l1,
+            s.ssim,
+            psnr(s.mse),
+            trainer.scene().len(),
+            state.seconds,
+            ms.join(",")
+        );
+        self.rows.push((i, row));
+    }
+
+    /// Forgets the rows after an iteration.
+    pub(super) fn rewind(&mut self, iteration: usize) {
+        self.rows.retain(|(i, _)| *i <= iteration);
+    }
+
+    pub(super) fn write(&self, run: &Path) -> Result<()> {
+        let mut text = Self::HEADER.to_owned() + "\n";
+        for (_, row) in &self.rows {
+            text += row;
+            text.push('\n');
+        }
+        write_atomically(&run.join("metrics.csv"), text.as_bytes())
+    }
+}
+
+pub(super) fn psnr(mse: f64) -> f64 {
+    -10.0 * mse.max(1e-10).log10()
+}

@@ -1,0 +1,258 @@
+//! The time that steps take, found out before a run: a few steps are timed at the initial and at the capped number of
+//! Gaussians, and the schedule's own densification says how many there are when. `--minutes M` begins with as many
+//! iterations as fit by that; [`budget`](super::budget) plans anew when the machine turns out to be slower or faster.
+
+use super::clock::Stopwatch;
+use super::open::OpenCapture;
+use crate::event::{Event, Progress};
+use crate::methods::{Stage, program_of, stages};
+use crate::recipe::Recipe;
+use crate::step::trainer::Trainer;
+use crate::upkeep::{At, Every};
+use crate::{Error, ErrorKind, Result};
+use serde::{Deserialize, Serialize};
+
+/// Steps that are timed; the first third of them warm caches up and do not count.
+const TIMED: usize = 37;
+/// See [`TIMED`].
+const WARM_UP: f64 = 1.0 / 3.0;
+/// Steps that are timed however long they take.
+const LEAST: usize = 6;
+/// Steps between two densifications of the probe, and at most so many steps until it stands at the cap.
+const HURRIED: usize = 20;
+/// See [`HURRIED`].
+const GROWTH_STEPS: usize = 400;
+/// Steps of a stage that is not to end while it is timed.
+const ENDLESS: usize = 1 << 40;
+/// Of the time that probes may take, what is over when the few Gaussians have been timed, and when the cloud has grown.
+const PARTS: [f64; 2] = [0.25, 0.65];
+/// Bounds of what is sensible.
+const ITERATIONS: std::ops::RangeInclusive<usize> = 50..=1_000_000;
+
+/// The duration of a run's steps by what they do.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub(super) struct Timing {
+    /// In the first stage, and in those after it.
+    stages: [Steps; 2],
+    /// Seconds until the first scene is made.
+    pub(super) scene: f64,
+}
+
+/// The duration of a stage's steps: linear in the number of Gaussians.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+struct Steps {
+    /// The two numbers of Gaussians at which it was measured.
+    gaussians: [usize; 2],
+    /// Seconds a step [half size, full size] at either.
+    seconds: [[f64; 2]; 2],
+}
+
+impl Steps {
+    /// Seconds a step of `stage` takes, `place` steps into its schedule, with so many Gaussians.
+    fn at(&self, stage: &Stage, place: usize, count: f64) -> f64 {
+        let ([start, end], [few, many]) = (self.gaussians.map(|n| n as f64), self.seconds);
+        let size = usize::from(place >= stage.half_size_steps);
+        let slope = if end > start { (many[size] - few[size]) / (end - start) } else { 0.0 };
+        // A slope that noise turned over must not make steps free.
+        (few[size] + slope * (count - start)).max(0.5 * few[size].min(many[size]))
+    }
+}
+
+impl Timing {
+    /// Times steps of a recipe on a capture, for about `seconds` in all.
+    pub(super) fn measure(
+        opened: &OpenCapture,
+        recipe: &Recipe,
+        clock: &Stopwatch,
+        seconds: f64,
+        listen: &mut dyn FnMut(&Event),
+    ) -> Result<Self> {
+        let tell = |listen: &mut dyn FnMut(&Event), done| {
+            listen(&Event::Phase { name: "timing steps".into(), done, total: 2 });
+        };
+        tell(listen, 0);
+        // A filter would be switched on later than the probes look.
+        let plan = opened.plan(&recipe.unresolved().with(|r| r.filter.start = 0.0));
+        let began = clock.seconds();
+        let scene = opened.initial_scene(&plan)?;
+        let first = clock.seconds() - began;
+        // The scene is not made faster because steps are to be timed.
+        let began = clock.seconds();
+        let until = |part: f64| began + part * seconds;
+        let start = scene.len();
+        // Copies of initial Gaussians would cost far more than trained ones, which are small: the probe grows by the
+        // recipe's own strategy, in a hurry. A probe's rates do not matter, its number of Gaussians does: nothing of it is
+        // kept.
+        let mut probe = Probe { trainer: opened.trainer(&plan, scene.clone())?, clock };
+        probe.trainer.check_not_empty()?;
+        let few = probe.rates(until(PARTS[0]))?;
+        tell(listen, 1);
+        let mut probe = Probe { trainer: opened.trainer(&plan, scene)?, clock };
+        probe.densify(Every { first: HURRIED, last: usize::MAX, interval: HURRIED });
+        probe.trainer.stages.iter_mut().for_each(|s| s.half_size_steps = usize::MAX);
+        probe.trainer.stages[0].iterations = ENDLESS;
+        for _ in 0..GROWTH_STEPS {
+            if probe.trainer.scene().len() >= recipe.densify.max_cap || clock.seconds() > until(PARTS[1]) {
+                break;
+            }
+            probe.step()?;
+        }
+        probe.densify(Every::NEVER);
+        let gaussians = [start, probe.trainer.scene().len()];
+        let many = probe.rates(until(1.0))?;
+        tell(listen, 2);
+        let stages = [0, 1].map(|later| Steps { gaussians, seconds: [few[later], many[later]] });
+        Ok(Self { stages, scene: first })
+    }
+
+    /// Seconds of one step in a place of the schedule, with so many Gaussians.
+    pub(super) fn step(&self, stages: &[Stage], stage: usize, place: usize, count: usize) -> f64 {
+        stages.get(stage).map_or(0.0, |s| self.stages[stage.min(1)].at(s, place, count as f64))
+    }
+
+    /// Seconds of the schedule from a place on, `count` Gaussians at which grow by the schedule.
+    pub(super) fn rest(&self, stages: &[Stage], from: [usize; 2], count: usize, cap: usize) -> f64 {
+        let (mut count, mut total) = (count as f64, 0.0);
+        for (number, stage) in stages.iter().enumerate().skip(from[0]) {
+            let steps = &self.stages[number.min(1)];
+            for i in if number == from[0] { from[1] } else { 0 }..stage.iterations {
+                total += steps.at(stage, i, count);
+                let at = At { step: i + 1, steps: stage.iterations };
+                for growth in stage.upkeep.iter().map(|u| u.growth(&at)).filter(|g| *g != 1.0) {
+                    count = (count * growth).min(cap as f64);
+                }
+            }
+        }
+        total
+    }
+
+    /// Seconds of a whole recipe's steps, and of a step at its end.
+    pub(super) fn of(&self, opened: &OpenCapture, recipe: &Recipe) -> Result<[f64; 2]> {
+        let r = recipe.resolve();
+        let stages = stages(program_of(&r)?.as_ref(), &opened.plan(&r));
+        let (start, cap) = (self.stages[0].gaussians[0], r.densify.max_cap);
+        Ok([self.rest(&stages, [0, 0], start, cap), self.last(&stages, cap)])
+    }
+
+    /// Seconds of a step at the end of the schedule.
+    pub(super) fn last(&self, stages: &[Stage], cap: usize) -> f64 {
+        self.step(stages, stages.len() - 1, usize::MAX, cap.max(self.stages[0].gaussians[0]))
+    }
+
+    /// The recipe with as many iterations as take `seconds`, where what follows takes as long as so many steps at the end.
+    pub(super) fn fit(&self, opened: &OpenCapture, recipe: &Recipe, seconds: f64, finish: f64) -> Result<Recipe> {
+        let recipe = recipe.unresolved();
+        let cost = |iterations: usize| -> Result<f64> {
+            let [steps, last] = self.of(opened, &recipe.clone().with(|r| r.run.iterations = iterations))?;
+            Ok(steps + finish * last)
+        };
+        let (mut low, mut high) = (*ITERATIONS.start(), *ITERATIONS.end());
+        while low + 1 < high {
+            let middle = low.midpoint(high);
+            if cost(middle)? <= seconds { low = middle } else { high = middle }
+        }
+        Ok(recipe.with(|r| r.run.iterations = low))
+    }
+}
+
+/// A trainer whose steps are timed.
+struct Probe<'a> {
+    trainer: Trainer<'a>,
+    clock: &'a Stopwatch,
+}
+
+impl Probe<'_> {
+    /// Lets all stages densify at other steps.
+    fn densify(&mut self, steps: Every) {
+        for stage in &mut self.trainer.stages {
+            stage.upkeep.iter_mut().filter_map(|u| u.densification()).for_each(|s| *s = steps);
+        }
+    }
+
+    /// Seconds a step [half size, full size] in the first stage and, skipping what is left of it, in the second; a run of
+    /// one stage has the first twice. It is over by `until`, if only a few steps are.
+    fn rates(&mut self, until: f64) -> Result<[[f64; 2]; 2]> {
+        let sizes = [usize::MAX, 0];
+        let all = sizes.len() * self.trainer.stages.len().min(2);
+        let now = self.clock.seconds();
+        let share = |k: usize| now + (until - now).max(0.0) * (k + 1) as f64 / all as f64;
+        let first = [self.time(sizes[0], share(0))?, self.time(sizes[1], share(1))?];
+        if self.trainer.stages.len() == 1 {
+            return Ok([first; 2]);
+        }
+        self.trainer.stages[0].iterations = self.trainer.progress.stage_step + 1;
+        self.step()?;
+        // Stages without a step are passed by.
+        self.trainer.enter(&mut Progress(&mut |_| {}))?;
+        if self.trainer.is_done() {
+            return Ok([first; 2]);
+        }
+        Ok([first, [self.time(sizes[0], share(2))?, self.time(sizes[1], share(3))?]])
+    }
+
+    /// Seconds a step of the current stage, the first `half_size_steps` of it at half size.
+    fn time(&mut self, half_size_steps: usize, until: f64) -> Result<f64> {
+        let stage = &mut self.trainer.stages[self.trainer.progress.stage];
+        (stage.half_size_steps, stage.iterations) = (half_size_steps, ENDLESS);
+        let mut times = vec![self.clock.seconds()];
+        while times.len() <= TIMED {
+            self.step()?;
+            let now = self.clock.seconds();
+            times.push(now);
+            if times.len() > LEAST && now > until {
+                break;
+            }
+        }
+        let (warm, last) = ((times.len() as f64 * WARM_UP) as usize, times.len() - 1);
+        Ok((times[last] - times[warm]) / (last - warm) as f64)
+    }
+
+    fn step(&mut self) -> Result<()> {
+        match self.trainer.step()? {
+            Ok(_) => Ok(()),
+            Err(fault) => Err(Error::new(ErrorKind::Diverged, format!("the timing probe failed: {}", fault.0))
+                .remedy("Look for wrong poses with `splat4d info CAPTURE`")),
+        }
+    }
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+    use crate::upkeep;
+
+    /// Of steps that take so long [half size, full size] with either number of Gaussians, in every stage.
+    pub(crate) fn timing(gaussians: [usize; 2], few: [f64; 2], many: [f64; 2]) -> Timing {
+        Timing { stages: [Steps { gaussians, seconds: [few, many] }; 2], scene: 0.0 }
+    }
+
+    #[test]
+    fn the_cost_follows_the_growth_and_the_size() {
+        let r = Recipe::default()
+            .with(|r| {
+                r.run.iterations = 1000;
+                r.run.half_size_until = 0.0;
+                r.densify.max_cap = 2000;
+            })
+            .resolve();
+        let mut stage = Stage { upkeep: upkeep::of(&r), ..Stage::new("all", 1000) };
+        let cost = |stages: &[Stage], t: Timing| t.rest(stages, [0, 0], 1000, r.densify.max_cap);
+        let flat = cost(std::slice::from_ref(&stage), timing([1000, 1000], [0.01; 2], [0.01; 2]));
+        assert!((flat - 10.0).abs() < 1e-9);
+        let grown = timing([1000, 2000], [0.01; 2], [0.02; 2]);
+        let all = cost(std::slice::from_ref(&stage), grown);
+        assert!(all > 12.0 && all < 20.0, "{all}");
+        // The rest of it, with as many Gaussians as are there.
+        let rest = |place, count| grown.rest(std::slice::from_ref(&stage), [0, place], count, 2000);
+        assert!((rest(900, 2000) - 2.0).abs() < 1e-9 && (rest(900, 1000) - 1.0).abs() < 1e-9 && rest(1000, 1) == 0.0);
+        stage.half_size_steps = 500;
+        let halves = [0.0, 0.01];
+        let half = cost(std::slice::from_ref(&stage), timing([1000, 1000], halves, halves));
+        assert!((half - 5.0).abs() < 1e-9);
+        // A still warm-up of 100 free steps; then 900 of a network, a third of them at half size.
+        let stages = [Stage::new("still", 100), Stage { half_size_steps: 300, ..Stage::new("network", 900) }];
+        let mut t = timing([1000, 1000], [0.0; 2], [0.0; 2]);
+        t.stages[1].seconds = [[0.01, 0.02]; 2];
+        assert!((cost(&stages, t) - 15.0).abs() < 1e-9);
+    }
+}

@@ -1,0 +1,29 @@
+//! The run on disk: a folder with its recipe, checkpoints, metrics and scene; resume, rollback, `--minutes`.
+
+mod budget;
+pub mod checkpoint;
+mod clock;
+pub mod dataset;
+mod identity;
+mod memory;
+mod metrics;
+mod minutes;
+mod open;
+mod points;
+mod refine;
+mod session;
+mod snapshot;
+mod start;
+
+#[cfg(test)]
+pub(crate) mod tests;
+
+pub use clock::Stopwatch;
+pub use memory::{memory_estimate, peak_memory};
+#[cfg(test)]
+pub(crate) use open::OpenCapture;
+pub use open::{capture_options, open_capture, plan, training_frames};
+pub(crate) use points::with_found;
+pub(crate) use refine::{Refine, refine};
+pub use session::{Outcome, TrainOptions};
+pub use start::{open_run, resume, resume_with, train};

@@ -1,0 +1,202 @@
+//! [`OpenCapture`]: a capture as a recipe wants it, opened for training, and what is made of it: a plan, a first scene, a
+//! trainer.
+
+use super::dataset::Dataset;
+use crate::capture::{Capture, CaptureOptions, ImageStore};
+use crate::event::Event;
+use crate::init::{self, Seeds, Source};
+use crate::learner::Exposure;
+use crate::loss::image::terms;
+use crate::methods::{Plan, Stage, auto, program_of, stages};
+use crate::recipe::{MotionName, Recipe};
+use crate::step::loss::TrainLoss;
+use crate::step::trainer::{Settings, Trainer};
+use crate::upkeep::Limits;
+use crate::{Error, Result};
+use splat4d::device;
+use splat4d::layers::Scene;
+use splat4d::render::{Antialias, RenderConfig, Simd};
+use std::path::Path;
+use std::sync::Arc;
+
+/// Extent of cameras in a single place, scene units.
+const SINGLE_PLACE: f64 = 1e-6;
+
+/// The options with which a recipe opens its capture.
+pub fn capture_options(recipe: &Recipe) -> Result<CaptureOptions> {
+    Ok(CaptureOptions {
+        downscale: recipe.capture.downscale,
+        hold_out: recipe.capture.hold_out.clone(),
+        fps: (recipe.capture.fps > 0.0).then_some(recipe.capture.fps),
+        sequence: recipe.capture.sequence,
+        background: (!recipe.capture.white_background).then_some([0.0; 3]),
+        near: recipe.capture.near,
+        ..CaptureOptions::default()
+    })
+}
+
+/// Opens a capture as a recipe wants it: scale, split, and the part of the take that is used.
+pub fn open_capture(path: &Path, recipe: &Recipe) -> Result<Capture> {
+    let mut capture = Capture::open(path, &capture_options(recipe)?)?;
+    if recipe.loss.flow == 0.0 {
+        // Nobody looks at it: it need not be decoded.
+        capture.frames.iter_mut().for_each(|f| f.flow = None);
+    }
+    if recipe.capture.first_frame > 0 || recipe.capture.max_frames > 0 {
+        let last = if recipe.capture.max_frames == 0 {
+            usize::MAX
+        } else {
+            recipe.capture.first_frame.saturating_add(recipe.capture.max_frames)
+        };
+        let keep = |i: &usize| (recipe.capture.first_frame..last).contains(&capture.frames[*i].index);
+        let (train, held) =
+            (capture.train.iter().copied().filter(keep).collect(), capture.held.iter().copied().filter(keep).collect());
+        let validation = capture.validation.iter().copied().filter(keep).collect();
+        (capture.train, capture.held, capture.validation) = (train, held, validation);
+        if capture.train.is_empty() {
+            return Err(Error::input(format!(
+                "no training frame is left of frames {}..{last}",
+                recipe.capture.first_frame
+            ))
+            .remedy("Change first_frame or max_frames"));
+        }
+    }
+    Ok(capture)
+}
+
+/// Errors: a loss on flow, and not one training picture has any.
+pub(super) fn check_flow(capture: &Capture, recipe: &Recipe) -> Result<()> {
+    if recipe.loss.flow == 0.0 || capture.train.iter().any(|&i| capture.frames[i].flow.is_some()) {
+        return Ok(());
+    }
+    Err(Error::input("lambda_flow compares flow, and the capture's training pictures have none")
+        .remedy("Give cameras a `flow` in capture.json (docs/capture-format.md), or leave lambda_flow at 0"))
+}
+
+/// A capture opened for training: what fresh runs, resumes and probes share.
+pub(crate) struct OpenCapture {
+    pub(crate) capture: Arc<Capture>,
+    pub(crate) frames: Arc<Dataset>,
+    pub(crate) simd: Simd,
+}
+
+/// The training frames of a capture, with as much memory for pictures as the recipe grants. Errors: there are none.
+pub fn training_frames(capture: Arc<Capture>, recipe: &Recipe) -> Result<Arc<Dataset>> {
+    if capture.train.is_empty() {
+        return Err(Error::input("the capture has no training frames").remedy("Hold out fewer views with --hold-out"));
+    }
+    let store = Arc::new(ImageStore::new(capture.clone(), recipe.run.image_memory as usize));
+    Ok(Arc::new(Dataset::new(store, capture.train.clone())))
+}
+
+/// The programs' plan for a capture and a recipe. Panics: the capture has no training frames.
+pub fn plan(capture: &Capture, recipe: &Recipe) -> Plan {
+    let mut times: Vec<f64> = capture.train.iter().map(|&i| capture.frames[i].time.0).collect();
+    times.sort_by(f64::total_cmp);
+    times.dedup();
+    let clip = [times[0], times[times.len() - 1]];
+    let fixed = |i: &&usize| capture.cameras[capture.frames[**i].camera].fixed;
+    let mut seen: Vec<f64> = capture.train.iter().filter(fixed).map(|&i| capture.frames[i].time.0).collect();
+    seen.sort_by(f64::total_cmp);
+    // A fixed camera that is held out tells training nothing.
+    let mut rigs: Vec<usize> = capture.train.iter().filter(fixed).map(|&i| capture.frames[i].camera).collect();
+    rigs.sort_unstable();
+    rigs.dedup();
+    let views = |t: f64| seen.partition_point(|s| *s <= t) - seen.partition_point(|s| *s < t);
+    let moments = times.iter().map(|&t| (t, views(t))).collect();
+    // Cameras that all stand in one place say nothing of the scene's size.
+    let radius = capture.center_and_radius().1;
+    Plan {
+        recipe: recipe.resolve(),
+        extent: if radius > SINGLE_PLACE { radius } else { 1.0 },
+        clip,
+        fps: capture.fps,
+        times: times.len(),
+        fixed_cameras: rigs.len(),
+        moments,
+        masks: capture.background.is_some() || capture.train.iter().any(|&i| capture.frames[i].mask.is_some()),
+    }
+}
+
+impl OpenCapture {
+    pub(crate) fn new(capture: Arc<Capture>, recipe: &Recipe) -> Result<Self> {
+        Ok(Self::with(training_frames(capture, recipe)?))
+    }
+
+    /// With frames that somebody else looks at too.
+    pub(crate) fn with(frames: Arc<Dataset>) -> Self {
+        Self { capture: frames.capture().clone(), frames, simd: Simd::detect() }
+    }
+
+    pub(crate) fn plan(&self, recipe: &Recipe) -> Plan {
+        plan(&self.capture, recipe)
+    }
+
+    /// The recipe with a motion model that suits the capture.
+    pub(super) fn choose(&self, recipe: Recipe, listen: &mut dyn FnMut(&Event)) -> Result<Recipe> {
+        listen(&Event::Phase { name: "looking at the capture".into(), done: 0, total: 0 });
+        let choice = auto::choose(&self.plan(&recipe), self.frames.as_ref())?;
+        listen(&Event::Chosen { motion: choice.motion.into(), why: choice.why });
+        Ok(recipe.with(|r| r.run.motion = MotionName::of(choice.motion)))
+    }
+
+    pub(super) fn background(&self) -> [f32; 3] {
+        self.capture.background.unwrap_or([0.0; 3])
+    }
+
+    pub(crate) fn initial_scene(&self, plan: &Plan) -> Result<Scene<f32>> {
+        let program = program_of(&plan.recipe)?;
+        let moving = program.capabilities(plan).moves && plan.times > 1;
+        let points = if let Source::File(path) = &plan.recipe.init.source {
+            let cloud = crate::capture::read_points(path)?;
+            Some(Seeds { points: cloud.points, colors: cloud.colors, times: cloud.times })
+        } else {
+            self.capture.points.as_ref().map(|c| Seeds {
+                points: c.points.clone(),
+                colors: c.colors.clone(),
+                times: c.times.clone(),
+            })
+        };
+        let (first, frames) = (program.first(plan), self.frames.as_ref());
+        let seeds = match moving && program.one_moment(plan) {
+            true => init::one_moment(&first, frames, points)?,
+            false => init::seeds(&first, frames, points, moving)?,
+        };
+        init::scene(plan, program.as_ref(), &seeds, self.background(), self.capture.up)
+    }
+
+    pub(crate) fn trainer(&self, plan: &Plan, scene: Scene<f32>) -> Result<Trainer<'static>> {
+        let mut trainer = self.trainer_of(plan, scene, stages(program_of(&plan.recipe)?.as_ref(), plan));
+        trainer.replan(plan.recipe.run.replans.rows());
+        Ok(trainer)
+    }
+
+    /// A trainer with stages that no program made.
+    pub(crate) fn trainer_of(&self, plan: &Plan, scene: Scene<f32>, stages: Vec<Stage>) -> Trainer<'static> {
+        let r = &plan.recipe;
+        let config = RenderConfig {
+            antialias: if r.appearance.antialias { Antialias::On } else { Antialias::Off },
+            simd: self.simd,
+            ..RenderConfig::default()
+        };
+        let mut trained: Vec<usize> = self.capture.train.iter().map(|&i| self.capture.frames[i].camera).collect();
+        trained.sort_unstable();
+        // The only picture of a camera does not tell its gain from what it sees: of photos learnt with a gain each, those
+        // that were held out lose half a decibel (a kitchen of 21 photos, a doll of 97).
+        let trained: Vec<usize> = trained.chunk_by(|a, b| a == b).filter(|c| c.len() > 1).map(|c| c[0]).collect();
+        // A single camera's gain is its own mean, which stays the identity.
+        let exposure =
+            (r.appearance.exposure && trained.len() > 1).then(|| Exposure::new(self.capture.cameras.len(), trained));
+        let settings = Settings {
+            seed: r.run.seed,
+            limits: Limits { cap: r.densify.max_cap, extent: plan.extent, min_opacity: r.densify.min_opacity },
+            background: self.background(),
+            sh_degree: r.appearance.sh_degree,
+            exposure_lr: r.appearance.exposure_lr,
+        };
+        let loss = TrainLoss::new(terms(r));
+        let mut trainer = Trainer::new(scene, stages, self.frames.clone(), device::cpu(config), loss, settings);
+        trainer.learner.exposure = exposure;
+        trainer
+    }
+}

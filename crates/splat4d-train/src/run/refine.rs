@@ -1,0 +1,97 @@
+//! Runs that do not begin with points: a scene and a list of stages, driven as safely as training is.
+
+#[cfg(test)]
+mod tests;
+
+use super::checkpoint;
+use super::dataset::Dataset;
+use super::identity::identity;
+use super::memory::memory_estimate;
+use super::open::OpenCapture;
+use super::session::{Outcome, Session, TrainOptions};
+use crate::event::Event;
+use crate::methods::Stage;
+use crate::recipe::{Recipe, Replans};
+use crate::{Error, Result};
+use splat4d::layers::Scene;
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+/// A refinement of a scene.
+pub(crate) struct Refine {
+    /// The verb that asks for it: run.json names it, and errors tell the user to continue with it.
+    pub made_by: String,
+    /// The scene before the first stage.
+    pub scene: Scene<f32>,
+    /// The stages, in order. Their hooks may replace the scene.
+    pub stages: Vec<Stage>,
+    /// The frames that the scene is compared with ([`training_frames`](super::training_frames)).
+    pub frames: Arc<Dataset>,
+    /// Losses, background, SH degree, seed, thresholds, steps between checkpoints. Its motion model and its iterations do
+    /// not count: the scene and the stages have theirs.
+    pub recipe: Recipe,
+    /// All else that the result depends on, as text: settings and a fingerprint of the scene. A run is only continued
+    /// with the same.
+    pub identity: String,
+}
+
+/// The result of a refinement.
+#[derive(Debug)]
+pub(crate) struct Refined {
+    /// How the run ended.
+    pub outcome: Outcome,
+    /// The scene that learns. Where the last stage has a codec, what is seen of it is another: that one is in the run's
+    /// `scene.safetensors`.
+    pub scene: Scene<f32>,
+}
+
+/// Begins the run in the folder `run`, or continues it, exactly, where that holds one.
+///
+/// A stage's start is not run again once a checkpoint holds a step of the stage: what codecs, losses and layers remember
+/// comes from the checkpoint. Errors: the folder holds another run; what stages and files may say.
+pub(crate) fn refine(
+    job: Refine,
+    run: &Path,
+    options: &TrainOptions,
+    stop: &AtomicBool,
+    listen: &mut dyn FnMut(&Event),
+) -> Result<Refined> {
+    job.recipe.check()?;
+    if job.stages.is_empty() {
+        return Err(Error::input("there is not one stage to run").remedy("Ask for at least one step"));
+    }
+    let total: usize = job.stages.iter().map(|s| s.iterations).sum();
+    let recipe = job
+        .recipe
+        .with(|r| {
+            r.run.iterations = total.max(1);
+            // Those of the run that the scene comes from.
+            r.run.replans = Replans::default();
+        })
+        .resolve();
+    let opened = OpenCapture::with(job.frames);
+    let plan = opened.plan(&recipe);
+    let held = recipe.clone().with(|r| r.densify.max_cap = job.scene.len().max(1));
+    let session = Session {
+        run,
+        opened: &opened,
+        recipe: &recipe,
+        identity: identity(&opened.capture, &recipe, &format!("\n{}\n{}", job.made_by, job.identity)),
+        made_by: &job.made_by,
+        estimate: memory_estimate(&opened.capture, &held),
+        snapshots: options.snapshots,
+        clock: options.clock.clone(),
+        budget: None,
+        stop,
+    };
+    let mut trainer = opened.trainer_of(&plan, job.scene, job.stages);
+    let state = if checkpoint::list(run).is_empty() {
+        trainer.check_not_empty()?;
+        session.begin(&trainer, listen)?
+    } else {
+        session.restore(&mut trainer, listen)?
+    };
+    let outcome = session.drive(&mut trainer, state, listen)?;
+    Ok(Refined { outcome, scene: trainer.learner.into_scene() })
+}

@@ -1,0 +1,358 @@
+//! [`Session`]: a run while it is driven, from checkpoint to checkpoint. It emits events and never prints.
+
+use super::budget::{Budget, Place, Planner};
+use super::checkpoint::{self, Identity, RunState, write_atomically};
+use super::clock::Stopwatch;
+use super::identity::fingerprint;
+use super::memory::peak_memory;
+use super::metrics::{Metrics, STAGE_NAMES, Totals, psnr};
+use super::open::OpenCapture;
+use super::snapshot::Snapshots;
+use crate::event::{Event, Progress};
+use crate::recipe::Recipe;
+use crate::step::trainer::Trainer;
+use crate::{Error, ErrorKind, Result};
+use serde_json::json;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant as Clock};
+
+/// Options of a run besides its recipe.
+#[derive(Clone, Debug, Default)]
+pub struct TrainOptions {
+    /// Keep all from the clock's zero to the end of what follows training to so long: iterations are fitted to it, and
+    /// fitted anew while the run goes.
+    pub minutes: Option<f64>,
+    /// What the caller does after training (measuring, filming, baking) takes as long as about so many steps at the end
+    /// of training; `minutes` leaves room for it.
+    pub finish: f64,
+    /// Time steps before the run and say by [`Event::Predicted`] how long it will take. With `minutes` it is said anyhow.
+    pub predict: bool,
+    /// The clock of `minutes`; its zero is when the command began, or these options were made.
+    pub clock: Stopwatch,
+    /// Emit [`Event::Snapshot`] about so often, and at the end. They never take more than a fortieth of the time, and
+    /// do not change the result.
+    pub snapshots: Option<Duration>,
+}
+
+/// How a run ended.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Outcome {
+    /// Its folder.
+    pub run: PathBuf,
+    /// Steps taken.
+    pub iteration: usize,
+    /// Gaussians at the end.
+    pub gaussians: usize,
+    /// Seconds of training, resumed ones included.
+    pub seconds: f64,
+    /// Whether it was stopped before its last step; `resume` continues it.
+    pub interrupted: bool,
+}
+
+/// Faults at which a run is given up.
+pub(super) const MAX_STRIKES: usize = 3;
+/// After a rollback rates are multiplied by this.
+pub(super) const ROLLBACK_RATE: f64 = 0.5;
+/// Weight of the newest step in smoothed numbers.
+const SMOOTHING: f64 = 0.05;
+/// Seconds between two progress events.
+const PROGRESS_SECONDS: f64 = 0.25;
+/// Puts the newest sound checkpoint into the trainer. A damaged newest one is skipped, and said so.
+pub(super) fn restore_newest(
+    run: &Path,
+    trainer: &mut Trainer<'_>,
+    identity: &Identity,
+) -> Result<(RunState, Option<String>)> {
+    let mut first_error = None;
+    for path in checkpoint::list(run).iter().rev() {
+        let read = std::fs::read(path)
+            .map_err(|e| Error::io("the checkpoint cannot be read", e))
+            .and_then(|bytes| checkpoint::read(&bytes, trainer, identity))
+            .map_err(|e| e.at(path.display()));
+        match read {
+            Ok(state) => return Ok((state, first_error.map(|e: Error| e.to_string()))),
+            // Another version or capture is not damage: older ones would say the same.
+            Err(e) if e.kind() == ErrorKind::Unsupported => return Err(e),
+            Err(e) => first_error = first_error.or(Some(e)),
+        }
+    }
+    Err(first_error.unwrap_or_else(|| {
+        Error::input("there is no checkpoint to continue from").at(run.display()).remedy("Train from the start")
+    }))
+}
+
+fn save_checkpoint(
+    run: &Path,
+    trainer: &Trainer<'_>,
+    identity: &Identity,
+    state: &RunState,
+    listen: &mut dyn FnMut(&Event),
+) -> Result<()> {
+    let path = checkpoint::path(run, trainer.progress.iteration);
+    write_atomically(&path, &checkpoint::write(trainer, identity, state)?)?;
+    // The one before stays, in case this one is damaged on disk.
+    let all = checkpoint::list(run);
+    for old in all.iter().rev().skip(2) {
+        let _ = std::fs::remove_file(old);
+    }
+    listen(&Event::Checkpoint { iteration: trainer.progress.iteration, path });
+    Ok(())
+}
+
+/// Seconds since the last lap, which begins anew.
+fn lap(clock: &Stopwatch, last: &mut f64) -> f64 {
+    let now = clock.seconds();
+    now - std::mem::replace(last, now)
+}
+
+/// The duration of this session's steps, without what stages do at their start.
+#[derive(Clone, Copy, Debug, Default)]
+struct Steps {
+    seconds: f64,
+    count: usize,
+}
+
+impl Steps {
+    fn add(&mut self, seconds: f64) {
+        self.seconds += seconds;
+        self.count += 1;
+    }
+
+    /// Seconds a step.
+    fn mean(&self) -> f64 {
+        self.seconds / self.count.max(1) as f64
+    }
+}
+
+/// A run while it is driven.
+pub(super) struct Session<'a> {
+    pub(super) run: &'a Path,
+    pub(super) opened: &'a OpenCapture,
+    pub(super) recipe: &'a Recipe,
+    pub(super) identity: Identity,
+    /// The verb that made it, and that continues it.
+    pub(super) made_by: &'a str,
+    /// Bytes of memory, estimated.
+    pub(super) estimate: u64,
+    pub(super) snapshots: Option<Duration>,
+    pub(super) clock: Stopwatch,
+    /// The time that it is to keep to.
+    pub(super) budget: Option<Budget>,
+    pub(super) stop: &'a AtomicBool,
+}
+
+impl Session<'_> {
+    /// Makes the folder of a run that has not taken a step.
+    pub(super) fn begin(&self, trainer: &Trainer<'_>, listen: &mut dyn FnMut(&Event)) -> Result<RunState> {
+        self.write_recipe(self.recipe)?;
+        let state = RunState::default();
+        save_checkpoint(self.run, trainer, &self.identity, &state, listen)?;
+        self.write_info(&Totals::default(), trainer, &state, false)?;
+        Ok(state)
+    }
+
+    fn write_recipe(&self, recipe: &Recipe) -> Result<()> {
+        write_atomically(&self.run.join("recipe.toml"), recipe.to_toml().as_bytes())
+    }
+
+    /// Goes to the newest sound checkpoint, and warns of what was skipped.
+    pub(super) fn restore(&self, trainer: &mut Trainer<'_>, listen: &mut dyn FnMut(&Event)) -> Result<RunState> {
+        let (state, warning) = restore_newest(self.run, trainer, &self.identity)?;
+        if let Some(message) = warning {
+            listen(&Event::Warning { message });
+        }
+        Ok(state)
+    }
+
+    /// Steps until all stages are done or somebody says stop.
+    pub(super) fn drive(
+        &self,
+        trainer: &mut Trainer<'_>,
+        mut state: RunState,
+        listen: &mut dyn FnMut(&Event),
+    ) -> Result<Outcome> {
+        let iterations = trainer.iterations();
+        let first = trainer.progress.iteration;
+        listen(&Event::Started {
+            run: self.run.to_owned(),
+            iteration: first,
+            iterations,
+            gaussians: trainer.scene().len(),
+            memory_estimate: self.estimate,
+        });
+        let mut metrics = Metrics::open(self.run, first, iterations);
+        let mut totals = Totals::default();
+        let shown = trainer.scene().without_head("the player");
+        if let (Some(_), Err(e)) = (self.snapshots, &shown) {
+            listen(&Event::Warning { message: format!("training cannot be watched: {e}") });
+        }
+        let interval = self.snapshots.filter(|_| shown.is_ok());
+        let mut snapshots = interval.map(|interval| Snapshots::new(interval, &self.opened.capture));
+        let (mut clock, mut told) = (self.clock.seconds(), Clock::now());
+        // A run that was continued has a clock that began later than its first command.
+        let lead = self.budget.filter(|_| first > 0).map_or(0.0, |b| b.before + state.seconds - clock);
+        let mut recipe = self.recipe.clone();
+        let mut planner = self.budget.map(|b| Planner::new(b, clock + lead, recipe.run.replans.rows()));
+        let (mut steps, mut warned) = (Steps::default(), false);
+        while !trainer.is_done() && !self.stop.load(Ordering::Relaxed) {
+            let from = (trainer.progress.stage, trainer.progress.iteration);
+            let between = self.clock.seconds() - clock;
+            trainer.enter(&mut Progress(listen))?;
+            state.seconds += lap(&self.clock, &mut clock);
+            if trainer.is_done() {
+                break;
+            }
+            let entered = from == (0, 0) || from.0 != trainer.progress.stage || trainer.progress.taken == 0;
+            let expected = self.budget.map_or(0.0, |b| Place::of(trainer).step_seconds(&b.timing));
+            let step = match trainer.step()? {
+                Ok(step) => step,
+                Err(fault) => {
+                    state = self.roll_back(trainer, &fault.0, listen)?;
+                    metrics.rewind(trainer.progress.iteration);
+                    continue;
+                }
+            };
+            let seconds = lap(&self.clock, &mut clock);
+            steps.add(seconds);
+            state.seconds += seconds;
+            if let Some(planner) = &mut planner {
+                planner.add(between + seconds, expected);
+                if let Some(new) = planner.look(clock + lead, &Place::of(trainer)) {
+                    recipe.run.replans.push(new.row);
+                    // What is on disk is what is followed, and the other way round.
+                    self.write_recipe(&recipe)?;
+                    trainer.replan(recipe.run.replans.rows());
+                    if let Some(late) = new.late.filter(|_| !warned) {
+                        warned = true;
+                        let message = format!(
+                            "this machine is too slow now for {} minutes: about {:.1} are needed. Give more --minutes, or \
+                             use --downscale 2",
+                            planner.minutes(),
+                            late / 60.0
+                        );
+                        listen(&Event::Warning { message });
+                    }
+                    listen(&Event::Replanned {
+                        iteration: new.row.at,
+                        iterations: trainer.iterations(),
+                        seconds: new.end,
+                        minutes: planner.minutes(),
+                    });
+                }
+            }
+            let fresh = if trainer.progress.iteration <= 1 { 1.0 } else { SMOOTHING };
+            for (old, new) in state.smooth.iter_mut().zip([step.report.loss, step.mse]) {
+                *old += fresh * (new - *old);
+            }
+            totals.add(&step);
+            metrics.push(trainer, &step, &state);
+            if told.elapsed().as_secs_f64() > PROGRESS_SECONDS || trainer.is_done() {
+                told = Clock::now();
+                listen(&self.progress(trainer, &state, &steps));
+            }
+            let i = trainer.progress.iteration;
+            if let Some(event) = snapshots.as_mut().and_then(|s| s.take(trainer)) {
+                listen(&event);
+            }
+            // What the start of a later stage did may have taken long: it is not to be done twice.
+            let due = i.is_multiple_of(self.recipe.run.checkpoint_interval) || entered && i > 1;
+            if due && !trainer.is_done() {
+                self.save(trainer, &state, &metrics, &totals, false, listen)?;
+            }
+        }
+        let done = trainer.is_done();
+        self.save(trainer, &state, &metrics, &totals, done, listen)?;
+        let gaussians = trainer.scene().len();
+        let iteration = trainer.progress.iteration;
+        if let Some(snapshots) = &mut snapshots {
+            listen(&snapshots.now(trainer));
+        }
+        if done {
+            let mut bytes = Vec::new();
+            splat4d::format::scene::write(&trainer.shown(), &mut bytes)?;
+            write_atomically(&self.run.join("scene.safetensors"), &bytes)?;
+            listen(&Event::Finished { iteration, seconds: state.seconds, gaussians, peak_memory: peak_memory() });
+        }
+        Ok(Outcome { run: self.run.to_owned(), iteration, gaussians, seconds: state.seconds, interrupted: !done })
+    }
+
+    fn progress(&self, trainer: &Trainer<'_>, state: &RunState, steps: &Steps) -> Event {
+        let (iteration, iterations) = (trainer.progress.iteration, trainer.iterations());
+        Event::Progress {
+            iteration,
+            iterations,
+            stage: trainer.stage_name().to_owned(),
+            loss: state.smooth[0],
+            psnr: psnr(state.smooth[1]),
+            gaussians: trainer.scene().len(),
+            seconds: state.seconds,
+            seconds_left: steps.mean() * iterations.saturating_sub(iteration) as f64,
+        }
+    }
+
+    fn save(
+        &self,
+        trainer: &Trainer<'_>,
+        state: &RunState,
+        metrics: &Metrics,
+        totals: &Totals,
+        finished: bool,
+        listen: &mut dyn FnMut(&Event),
+    ) -> Result<()> {
+        metrics.write(self.run)?;
+        save_checkpoint(self.run, trainer, &self.identity, state, listen)?;
+        self.write_info(totals, trainer, state, finished)
+    }
+
+    /// run.json: what the run is and how it went.
+    fn write_info(&self, totals: &Totals, trainer: &Trainer<'_>, state: &RunState, finished: bool) -> Result<()> {
+        let (capture, recipe) = (&self.opened.capture, self.recipe);
+        let steps = totals.steps.max(1) as f64;
+        let ms: serde_json::Map<String, serde_json::Value> =
+            STAGE_NAMES.iter().zip(totals.seconds).map(|(n, s)| ((*n).to_owned(), json!(s * 1e3 / steps))).collect();
+        let root = std::fs::canonicalize(&capture.root).unwrap_or_else(|_| capture.root.clone());
+        let info = json!({
+            "version": env!("CARGO_PKG_VERSION"),
+            "made_by": self.made_by,
+            "capture": root,
+            "capture_name": capture.name,
+            "capture_fingerprint": fingerprint(capture),
+            "motion": recipe.run.motion.as_str(),
+            "seed": recipe.run.seed,
+            "simd": self.opened.simd.name(),
+            "threads": rayon::current_num_threads(),
+            "iteration": trainer.progress.iteration,
+            "iterations": trainer.iterations(),
+            "gaussians": trainer.scene().len(),
+            "seconds": state.seconds,
+            "finished": finished,
+            "rollbacks": trainer.progress.strikes,
+            "peak_memory": peak_memory(),
+            "memory_estimate": self.estimate,
+            "ms_per_step": ms,
+            "warnings": capture.warnings,
+            "budget": self.budget,
+        });
+        let text = serde_json::to_string_pretty(&info).expect("plain data is JSON");
+        write_atomically(&self.run.join("run.json"), text.as_bytes())
+    }
+
+    /// Back to the last checkpoint with half the rates; the third time the run is given up.
+    fn roll_back(&self, trainer: &mut Trainer<'_>, what: &str, listen: &mut dyn FnMut(&Event)) -> Result<RunState> {
+        let (failed, strikes, rate) =
+            (trainer.progress.iteration + 1, trainer.progress.strikes + 1, trainer.progress.rate_scale);
+        if strikes >= MAX_STRIKES {
+            return Err(Error::new(
+                ErrorKind::Diverged,
+                format!("training diverged {strikes} times, last at iteration {failed}: {what}"),
+            )
+            .remedy("Look for wrong poses with `splat4d info CAPTURE`, or lower position_lr_init and scaling_lr"));
+        }
+        let (state, _) = restore_newest(self.run, trainer, &self.identity)?;
+        trainer.progress.strikes = strikes;
+        trainer.progress.rate_scale = rate * ROLLBACK_RATE;
+        listen(&Event::RolledBack { iteration: failed, to: trainer.progress.iteration, what: what.to_owned() });
+        Ok(state)
+    }
+}

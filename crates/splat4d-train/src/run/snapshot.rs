@@ -1,0 +1,109 @@
+//! The scene while it learns, as a playback file: for whoever watches. It only reads, so that the result stays the same
+//! to the bit.
+
+use crate::Result;
+use crate::capture::Capture;
+use crate::event::Event;
+use crate::step::trainer::Trainer;
+use splat4d::bake::{Options, bake};
+use splat4d::format::playback::{Draft, Meta, NamedCamera, Viewpoint, WriteConfig, write};
+use splat4d::layers::Scene;
+use splat4d::math::se3::{dot, sub};
+use splat4d::scene::{Camera, time::DEFAULT_FPS};
+use std::time::{Duration, Instant};
+
+/// Training goes on for so many times as long as the last snapshot took: at most 2.5 % of the time.
+const REST: u32 = 40;
+/// Entries of the palette, rounds that fit it, effort of deflate: a snapshot is looked at for seconds.
+const PALETTE: usize = 256;
+const ROUNDS: usize = 1;
+const EFFORT: u32 = 1;
+/// Most cameras that a snapshot names and is measured by.
+const CAMERAS: usize = 64;
+/// Rows whose means tell where the middle of the scene is.
+const ROWS: usize = 1000;
+
+/// When the next snapshot is due, and what stays the same from one to the next.
+pub(super) struct Snapshots {
+    interval: Duration,
+    due: Instant,
+    title: String,
+    cameras: Vec<NamedCamera>,
+    poses: Vec<Camera>,
+}
+
+impl Snapshots {
+    /// The first one is due at once.
+    pub(super) fn new(interval: Duration, capture: &Capture) -> Self {
+        let mut poses: Vec<(usize, Camera)> = Vec::new();
+        for frame in capture.train.iter().map(|&i| &capture.frames[i]) {
+            if poses.len() < CAMERAS && poses.iter().all(|(c, _)| *c != frame.camera) {
+                poses.push((frame.camera, frame.view.clone()));
+            }
+        }
+        let named = |(camera, view): &(usize, Camera)| NamedCamera::new(&capture.cameras[*camera].name, view);
+        Self {
+            interval,
+            due: Instant::now(),
+            title: capture.name.clone(),
+            cameras: poses.iter().map(named).collect(),
+            poses: poses.into_iter().map(|p| p.1).collect(),
+        }
+    }
+
+    /// The snapshot, where one is due. One that fails is a warning.
+    pub(super) fn take(&mut self, trainer: &Trainer<'_>) -> Option<Event> {
+        (Instant::now() >= self.due).then(|| self.now(trainer))
+    }
+
+    /// The snapshot, due or not.
+    pub(super) fn now(&mut self, trainer: &Trainer<'_>) -> Event {
+        let (started, iteration) = (Instant::now(), trainer.progress.iteration);
+        let event = match self.bytes(&trainer.shown()) {
+            Ok(bytes) => Event::Snapshot { iteration, bytes: bytes.into() },
+            Err(e) => Event::Warning { message: format!("step {iteration} cannot be shown: {e}") },
+        };
+        self.due = Instant::now() + self.interval.max(started.elapsed() * REST);
+        event
+    }
+
+    fn bytes(&self, scene: &Scene<f32>) -> Result<Vec<u8>> {
+        // Without a tolerance nothing is split: one look at every frame, one piece a Gaussian.
+        let options =
+            Options { tolerance: f64::INFINITY, looks: 0.0, cameras: self.poses.clone(), ..Options::default() };
+        let baked = bake(scene, &options, &mut |_, _| {})?;
+        let meta = Meta {
+            clip: baked.clip,
+            fps: if scene.fps > 0.0 && scene.fps.is_finite() { scene.fps } else { DEFAULT_FPS },
+            up: scene.up,
+            background: scene.background,
+            sh_degree: baked.sh_degree,
+            title: self.title.clone(),
+            view: self.poses.first().map(|camera| view(camera, scene)),
+            cameras: self.cameras.clone(),
+            ..Meta::default()
+        };
+        let config =
+            WriteConfig { palette: PALETTE, kmeans_rounds: ROUNDS, deflate_level: EFFORT, ..WriteConfig::default() };
+        let mut bytes = Vec::new();
+        write(&Draft { meta, nodes: baked.nodes, poster: None }, &config, &mut bytes)?;
+        Ok(bytes)
+    }
+}
+
+/// The camera's viewpoint, with the depth of the scene's middle as the distance of its target.
+fn view(camera: &Camera, scene: &Scene<f32>) -> Viewpoint {
+    let (eye, forward) = (camera.center(), camera.forward());
+    let stride = scene.len().div_ceil(ROWS).max(1);
+    let mut depths: Vec<f64> = scene
+        .layers
+        .iter()
+        .flat_map(|layer| layer.means().step_by(stride))
+        .map(|mean| dot(sub(mean, eye), forward))
+        .filter(|z| *z > 0.0)
+        .collect();
+    depths.sort_by(f64::total_cmp);
+    let depth = depths.get(depths.len() / 2).copied().unwrap_or(1.0);
+    let fov_y = 2.0 * (0.5 * camera.height as f64 / camera.intrinsics.fy).atan().to_degrees();
+    Viewpoint { position: eye, target: std::array::from_fn(|k| eye[k] + depth * forward[k]), up: scene.up, fov_y }
+}

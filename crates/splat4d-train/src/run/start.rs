@@ -1,0 +1,196 @@
+//! How a run begins, and how it goes on from its folder.
+
+use super::budget::{Budget, PROBES};
+use super::checkpoint;
+use super::identity::identity;
+use super::memory::memory_estimate;
+use super::minutes::Timing;
+use super::open::{OpenCapture, check_flow, open_capture};
+use super::points;
+use super::session::{Outcome, Session, TrainOptions};
+use crate::capture::Capture;
+use crate::event::Event;
+use crate::init::{self, Seeds};
+use crate::methods::program_of;
+use crate::recipe::Recipe;
+use crate::{Error, ErrorKind, Result};
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+/// Seconds that steps are timed for, where a run is not kept to its minutes and is only to be foretold.
+const PREDICTION: f64 = 4.0;
+/// The verb that makes runs from points.
+pub(super) const TRAIN: &str = "train";
+
+/// Trains a scene of `capture` into the folder `run`.
+pub fn train(
+    capture: Arc<Capture>,
+    recipe: Recipe,
+    run: &Path,
+    options: &TrainOptions,
+    stop: &AtomicBool,
+    listen: &mut dyn FnMut(&Event),
+) -> Result<Outcome> {
+    recipe.check()?;
+    if !checkpoint::list(run).is_empty() {
+        return Err(Error::input("this folder already holds a run")
+            .at(run.display())
+            .remedy("Continue it with `train --resume`, or give another folder with -o"));
+    }
+    let opened = OpenCapture::new(capture, &recipe)?;
+    check_flow(&opened.capture, &recipe)?;
+    let mut listen = listen;
+    let recipe = if recipe.run.motion.is_auto() { opened.choose(recipe, &mut listen)? } else { recipe };
+    program_of(&recipe)?.check(&opened.plan(&recipe))?;
+    recipe.without_effect().iter().for_each(|idle| listen(&Event::Warning { message: idle.to_string() }));
+    let opened = points::complete(opened, &recipe, run, &mut listen)?;
+    let timed = timed(&opened, recipe, options, &mut listen)?;
+    let recipe = timed.recipe.resolve();
+    let plan = opened.plan(&recipe);
+    let estimate = memory_estimate(&opened.capture, &recipe);
+    if let Some(seconds) = timed.seconds {
+        let view = &opened.capture.frames[opened.capture.train[0]].view;
+        listen(&Event::Predicted {
+            iterations: recipe.run.iterations,
+            gaussians: recipe.densify.max_cap,
+            size: [view.width, view.height],
+            seconds,
+            memory_estimate: estimate,
+        });
+    }
+    if recipe.run.memory_limit > 0 && estimate > recipe.run.memory_limit {
+        return Err(Error::new(
+            ErrorKind::Memory,
+            format!(
+                "training would take about {} MiB, and memory_limit is {} MiB",
+                estimate >> 20,
+                recipe.run.memory_limit >> 20
+            ),
+        )
+        .remedy("Lower max_cap or image_memory, or use --downscale 2"));
+    }
+    listen(&Event::Phase { name: "initial points".into(), done: 0, total: 0 });
+    let scene = opened.initial_scene(&plan)?;
+    let mut trainer = opened.trainer(&plan, scene)?;
+    trainer.check_not_empty()?;
+    let session = Session {
+        run,
+        opened: &opened,
+        recipe: &recipe,
+        identity: identity(&opened.capture, &recipe, ""),
+        made_by: TRAIN,
+        estimate,
+        snapshots: options.snapshots,
+        clock: options.clock.clone(),
+        budget: timed.budget.map(|b| Budget { before: options.clock.seconds(), ..b }),
+        stop,
+    };
+    let state = session.begin(&trainer, &mut listen)?;
+    session.drive(&mut trainer, state, &mut listen)
+}
+
+/// A recipe, and what is known of the time that it takes.
+struct Timed {
+    recipe: Recipe,
+    /// From the command's start to its end.
+    seconds: Option<f64>,
+    budget: Option<Budget>,
+}
+
+/// Times steps where the options ask for it, and fits the recipe to its minutes.
+fn timed(
+    opened: &OpenCapture,
+    recipe: Recipe,
+    options: &TrainOptions,
+    listen: &mut dyn FnMut(&Event),
+) -> Result<Timed> {
+    let TrainOptions { minutes, finish, predict, ref clock, .. } = *options;
+    if minutes.is_none() && !predict {
+        return Ok(Timed { recipe, seconds: None, budget: None });
+    }
+    if let Some(m) = minutes.filter(|m| !(*m > 0.0 && m.is_finite())) {
+        return Err(Error::input(format!("--minutes cannot be {m}")).remedy("Give a positive number, for instance 3"));
+    }
+    let timing = Timing::measure(opened, &recipe, clock, minutes.map_or(PREDICTION, |m| 60.0 * PROBES * m), listen)?;
+    let before = clock.seconds() + timing.scene;
+    let recipe = match minutes {
+        Some(m) => timing.fit(opened, &recipe, 60.0 * m - before, finish)?,
+        None => recipe,
+    };
+    let [steps, last] = timing.of(opened, &recipe)?;
+    let budget = minutes.map(|minutes| Budget { minutes, before, finish, timing });
+    Ok(Timed { recipe, seconds: Some(before + steps + finish * last), budget })
+}
+
+/// Continues the run in the folder `run`, exactly.
+pub fn resume(run: &Path, stop: &AtomicBool, listen: &mut dyn FnMut(&Event)) -> Result<Outcome> {
+    resume_with(run, &TrainOptions::default(), stop, listen)
+}
+
+/// As [`resume`]; of the options only `snapshots` and `clock` count, the rest was settled at the start. A run with
+/// `minutes` keeps to what is left of them: time between the commands does not count.
+pub fn resume_with(
+    run: &Path,
+    options: &TrainOptions,
+    stop: &AtomicBool,
+    listen: &mut dyn FnMut(&Event),
+) -> Result<Outcome> {
+    let (recipe, capture) = open_run(run)?;
+    if let Some(other) = made_by(run)?.filter(|m| m != TRAIN) {
+        return Err(Error::input(format!("this run was made by `{other}`"))
+            .at(run.display())
+            .remedy(format!("Continue it with `splat4d {other}` and the options it began with")));
+    }
+    let opened = OpenCapture::new(Arc::new(capture), &recipe)?;
+    let plan = opened.plan(&recipe);
+    let empty =
+        init::scene(&plan, program_of(&recipe)?.as_ref(), &Seeds::default(), opened.background(), opened.capture.up)?;
+    let mut trainer = opened.trainer(&plan, empty)?;
+    let session = Session {
+        run,
+        opened: &opened,
+        recipe: &recipe,
+        identity: identity(&opened.capture, &recipe, ""),
+        made_by: TRAIN,
+        estimate: memory_estimate(&opened.capture, &recipe),
+        snapshots: options.snapshots,
+        clock: options.clock.clone(),
+        // A run of before there were budgets has none.
+        budget: serde_json::from_value(read_info(run)?["budget"].clone()).ok(),
+        stop,
+    };
+    let mut listen = listen;
+    let state = session.restore(&mut trainer, &mut listen)?;
+    session.drive(&mut trainer, state, &mut listen)
+}
+
+/// A run's recipe and its capture. Errors: not a run; the capture has gone.
+pub fn open_run(run: &Path) -> Result<(Recipe, Capture)> {
+    let text = read_text(&run.join("recipe.toml"))?;
+    let recipe = Recipe::from_toml(&text).map_err(|e| e.at(run.join("recipe.toml").display()))?;
+    let info = read_info(run)?;
+    let path = info["capture"].as_str().ok_or_else(|| {
+        Error::input("it does not name its capture").at(run.join("run.json").display()).remedy("Train again")
+    })?;
+    let capture = open_capture(Path::new(path), &recipe)
+        .map_err(|e| e.remedy("The run needs its capture where it was when it was trained"))?;
+    let capture = points::with_found(capture, &recipe, run)?;
+    Ok((recipe, capture))
+}
+
+fn read_info(run: &Path) -> Result<serde_json::Value> {
+    let path = run.join("run.json");
+    serde_json::from_str(&read_text(&path)?)
+        .map_err(|e| Error::input(format!("it is not JSON: {e}")).at(path.display()))
+}
+
+/// The verb that made a run. Errors: not a run.
+fn made_by(run: &Path) -> Result<Option<String>> {
+    Ok(read_info(run)?["made_by"].as_str().map(str::to_owned))
+}
+
+pub(super) fn read_text(path: &Path) -> Result<String> {
+    std::fs::read_to_string(path)
+        .map_err(|e| Error::io("the run cannot be read", e).at(path.display()).remedy("Give the folder of a run"))
+}

@@ -1,0 +1,294 @@
+//! The fixed chain of one step: `motion.at → render → loss → render.backward → motion.backward`.
+//!
+//! Views and the questions of losses that look at several times are merged: one `prepare`, one `at` and one `backward`
+//! for every distinct (layer, space, time), one `finish`.
+
+use super::channels::{Channels, Source};
+use crate::Result;
+pub(crate) use crate::learner::Observation;
+use crate::loss::image::{Channel, PictureGrads, Shown};
+pub(crate) use crate::loss::image::{ImageTerm, View};
+pub(crate) use crate::loss::terms::{ParamLoss, Probe, ProbeLoss, StepInfo};
+use splat4d::layers::{Evaluation, Scene};
+use splat4d::math::Real;
+use splat4d::render::{Backend, Image, RenderGrads, Shot};
+use splat4d::scene::{Color, Grads, Part, Rows, SH, Space, Splats, Table, Time};
+use std::time::{Duration, Instant as Clock};
+
+/// Where a step's time went.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Timings {
+    /// `prepare` and `at`.
+    pub motion: Duration,
+    /// Drawing.
+    pub render: Duration,
+    /// Image, probe and parameter losses with their gradients.
+    pub loss: Duration,
+    /// The renderer's VJP.
+    pub render_backward: Duration,
+    /// The motion's VJP and `finish`.
+    pub motion_backward: Duration,
+}
+
+/// The result of a step.
+#[derive(Clone, Debug, Default)]
+pub struct StepReport {
+    /// All losses together.
+    pub loss: f64,
+    /// The image loss of every view.
+    pub view_losses: Vec<f64>,
+    /// dL/dt of every view's time: the same number for views at one time, which share it.
+    pub d_times: Vec<f64>,
+    /// dL/d pose of every view, left perturbation (ρ, θ).
+    pub d_cameras: Vec<[f64; 6]>,
+    /// Where the time went.
+    pub timings: Timings,
+}
+
+/// The input of one step.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Step<'a, F: Real> {
+    /// The scene to draw.
+    pub scene: &'a Scene<F>,
+    /// The views to compare it with.
+    pub views: &'a [View<'a, F>],
+    /// Where in training.
+    pub info: &'a StepInfo,
+    /// Highest degree of spherical harmonics drawn.
+    pub sh_degree: usize,
+}
+
+/// The losses of a step.
+pub(crate) struct Losses<'a, F: Real> {
+    /// Compares pictures.
+    pub image: &'a mut dyn ImageTerm<F>,
+    /// Look at several times.
+    pub probes: &'a [Box<dyn ProbeLoss<F>>],
+    /// Look at raw parameters.
+    pub params: &'a [Box<dyn ParamLoss<F>>],
+}
+
+/// The chain's arena: reused from step to step.
+#[derive(Default)]
+pub(crate) struct Chain<F: Real = f32> {
+    evaluation: Evaluation<F>,
+    picture: Compared<F>,
+    /// Number of `Motion::at` calls of the last step, for tests and reports.
+    pub at_calls: usize,
+}
+
+/// The working state of a step, view after view.
+struct Work<'a, F: Real> {
+    backend: &'a mut dyn Backend<F>,
+    image: &'a mut dyn ImageTerm<F>,
+    /// Gradients of the layers.
+    d: &'a mut [Grads<F>],
+    observe: &'a mut dyn FnMut(Observation<'_, F>),
+    report: StepReport,
+}
+
+impl<F: Real> Chain<F> {
+    /// One step: adds all gradients to `d` (one a layer, cleared by the caller). `observe` is told of every view.
+    ///
+    /// Errors: those of the backend.
+    pub(crate) fn step(
+        &mut self,
+        step: &Step<'_, F>,
+        backend: &mut dyn Backend<F>,
+        losses: &mut Losses<'_, F>,
+        d: &mut [Grads<F>],
+        observe: &mut dyn FnMut(Observation<'_, F>),
+    ) -> Result<StepReport> {
+        let Step { scene, views, info, .. } = *step;
+        let mut work = Work { backend, image: &mut *losses.image, d, observe, report: StepReport::default() };
+        let mut clock = Clock::now();
+        let probes: Vec<Vec<Probe>> = losses.probes.iter().map(|l| l.probes(scene, info)).collect();
+        self.ask(step, work.image, &probes);
+        self.evaluation.answer(&scene.layers);
+        self.evaluation.activate(work.d);
+        work.report.timings.motion = lap(&mut clock);
+        for view in views {
+            self.view(step, view, &mut work)?;
+        }
+        let Work { d, mut report, .. } = work;
+        clock = Clock::now();
+        for (loss, probes) in losses.probes.iter().zip(&probes).filter(|(_, probes)| !probes.is_empty()) {
+            report.loss += self.probe(scene, loss.as_ref(), probes);
+        }
+        for loss in losses.params {
+            report.loss += loss.eval(scene, info, d);
+        }
+        report.timings.loss += lap(&mut clock);
+        self.evaluation.backward(&scene.layers, d);
+        report.timings.motion_backward = lap(&mut clock);
+        report.d_times.extend(views.iter().map(|view| self.evaluation.d_time(view.t)));
+        self.at_calls = self.evaluation.len();
+        Ok(report)
+    }
+
+    /// Collects the questions: what views see is what is alive, probes add their rows, channels other times.
+    fn ask(&mut self, step: &Step<'_, F>, image: &dyn ImageTerm<F>, probes: &[Vec<Probe>]) {
+        self.evaluation.begin();
+        for view in step.views {
+            for (index, layer) in step.scene.layers.iter().enumerate() {
+                self.evaluation.ask_active(index, layer, view.t);
+            }
+        }
+        for probe in probes.iter().flatten() {
+            for &t in &probe.times {
+                let rows = probe.rows.as_deref().map_or(Rows::All, Rows::Some);
+                self.evaluation.ask(probe.layer, probe.of, rows, t);
+            }
+        }
+        for view in step.views {
+            for t in image.needs(view).extra.iter().filter_map(|channel| channel.other_time(view)) {
+                for i in self.asked(step.scene, view.t) {
+                    self.evaluation.ask_again(i, t);
+                }
+            }
+        }
+    }
+
+    /// By layer the question for its Gaussians at a time of this step.
+    fn asked(&self, scene: &Scene<F>, t: Time) -> Vec<usize> {
+        let question =
+            |layer| self.evaluation.find(layer, Space::Gaussians, t).expect("every time of a step was asked");
+        (0..scene.layers.len()).map(question).collect()
+    }
+
+    /// Draws one view, compares it, and takes the gradient back to its splats.
+    fn view(&mut self, step: &Step<'_, F>, view: &View<'_, F>, work: &mut Work<'_, F>) -> Result<()> {
+        let mut clock = Clock::now();
+        let scene = step.scene;
+        let asked = self.asked(scene, view.t);
+        let source = Source { scene, view, asked: &asked };
+        let needs = work.image.needs(view);
+        let channels = Channels::new(&needs.extra, source, &self.evaluation);
+        let splats = self.evaluation.splats(scene, view.t);
+        let shot = Shot {
+            extra: channels.as_ref().map(|c| &c.table),
+            sh_degree: step.sh_degree,
+            depth: needs.depth,
+            ..Shot::new(&splats, view.camera, view.background)
+        };
+        work.backend.render(&shot, &mut self.picture.image)?;
+        work.report.timings.render += lap(&mut clock);
+        self.picture.compare(step.info, view, channels.as_ref().map_or(&[], |c| &c.places), work);
+        work.report.timings.loss += lap(&mut clock);
+        self.picture.backward(scene, &shot, work)?;
+        self.picture.tell(&self.evaluation, &asked, work);
+        drop(splats);
+        for (&i, part) in asked.iter().zip(&mut self.picture.d_splats.parts) {
+            self.evaluation.add_gradient(i, &mut part.out, &mut part.color, &mut part.weights);
+        }
+        if let (Some(channels), Some(d_table)) = (&channels, self.picture.d_channels()) {
+            channels.backward(d_table, source, &mut self.evaluation, work.d);
+        }
+        work.report.timings.render_backward += lap(&mut clock);
+        Ok(())
+    }
+
+    /// Shows a loss the rows it asked for and scatters its gradient back.
+    fn probe(&mut self, scene: &Scene<F>, loss: &dyn ProbeLoss<F>, probes: &[Probe]) -> f64 {
+        let mut places = Vec::new();
+        let mut seen = Vec::new();
+        for probe in probes {
+            let mut tables = Vec::new();
+            let mut place = Vec::new();
+            for &t in &probe.times {
+                let i = self.evaluation.find(probe.layer, probe.of, t).expect("every probe's time was asked");
+                let tape = self.evaluation.tape(i);
+                let index: Vec<u32> = match (tape.rows(), &probe.rows) {
+                    (_, None) => (0..tape.out().rows() as u32).collect(),
+                    (Rows::All, Some(rows)) => rows.clone(),
+                    (Rows::Some(ids), Some(rows)) => rows
+                        .iter()
+                        .map(|r| ids.binary_search(r).expect("the asked rows hold the probe's rows") as u32)
+                        .collect(),
+                };
+                tables.push(tape.out().gather(&index));
+                place.push((i, index));
+            }
+            seen.push(tables);
+            places.push(place);
+        }
+        let mut d: Vec<Vec<Table<F>>> = seen.iter().map(|t| t.iter().map(Table::zeros_like).collect()).collect();
+        let value = loss.eval(scene, probes, &seen, &mut d);
+        for (place, tables) in places.iter().zip(&d) {
+            for ((i, index), table) in place.iter().zip(tables) {
+                let d_out = self.evaluation.d_out(*i);
+                for (j, &row) in index.iter().enumerate() {
+                    d_out.add(row as usize, 0, table.read::<10>(j, 0));
+                }
+            }
+        }
+        value
+    }
+}
+
+/// A picture, and the gradients to it and to its splats.
+#[derive(Default)]
+struct Compared<F> {
+    image: Image<F>,
+    d_image: PictureGrads<F>,
+    d_splats: RenderGrads<F>,
+}
+
+impl<F: Real> Compared<F> {
+    /// The picture loss and its gradient.
+    fn compare(&mut self, info: &StepInfo, view: &View<'_, F>, drawn: &[(Channel, usize)], work: &mut Work<'_, F>) {
+        self.d_image.begin(&self.image);
+        let value = work.image.eval(info, view, &Shown::new(&self.image, drawn), &mut self.d_image);
+        work.report.loss += value;
+        work.report.view_losses.push(value);
+    }
+
+    /// The backend's VJP; what belongs to no question goes to the layers: their own SH and the head's weights.
+    fn backward(&mut self, scene: &Scene<F>, shot: &Shot<'_, F>, work: &mut Work<'_, F>) -> Result<()> {
+        let mut d_sh = own_sh(shot.splats, work.d);
+        work.backend.vjp(shot, &self.d_image.grads(), &mut d_sh, &mut self.d_splats)?;
+        work.report.d_cameras.push(self.d_splats.camera);
+        if let (Some((layer, keys)), Some(head)) = (scene.head_keys(), &self.d_splats.head) {
+            let [first, second] = work.d[layer].of([keys.first, keys.second]);
+            first.data_mut().iter_mut().zip(&head.first).for_each(|(d, x)| *d += *x);
+            second.data_mut().iter_mut().zip(&head.second).for_each(|(d, x)| *d += *x);
+        }
+        Ok(())
+    }
+
+    /// Tells the observer what the view saw of every layer.
+    fn tell(&self, evaluation: &Evaluation<F>, asked: &[usize], work: &mut Work<'_, F>) {
+        let mut first = 0;
+        for (layer, &i) in asked.iter().enumerate() {
+            let tape = evaluation.tape(i);
+            let splats = first..first + tape.out().rows();
+            first = splats.end;
+            let mean2d = &self.d_splats.mean2d[splats.clone()];
+            let radii = &work.backend.radii()[splats];
+            (work.observe)(Observation { layer, rows: tape.rows(), mean2d, radii });
+        }
+    }
+
+    /// The gradient to the further channels, if a term has looked at them.
+    fn d_channels(&self) -> Option<&Table<F>> {
+        self.d_splats.extra.as_ref().filter(|_| self.d_image.extra.get().is_some())
+    }
+}
+
+/// The time since the last lap.
+fn lap(clock: &mut Clock) -> Duration {
+    let now = Clock::now();
+    now - std::mem::replace(clock, now)
+}
+
+/// The gradients of the layers' own SH, where that is the colour.
+fn own_sh<'a, F: Real>(splats: &Splats<'_, F>, d: &'a mut [Grads<F>]) -> Vec<Option<&'a mut Table<F>>> {
+    let own = |(d, part): (&'a mut Grads<F>, &Part<'_, F>)| match part.color {
+        Color::Sh { base: true, .. } => {
+            let [table] = d.of([SH]);
+            Some(table)
+        }
+        _ => None,
+    };
+    d.iter_mut().zip(&splats.parts).map(own).collect()
+}

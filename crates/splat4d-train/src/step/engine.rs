@@ -1,0 +1,222 @@
+//! [`Engine`]: takes steps on a learner. The processor's is [`CpuEngine`]; one whose tables stay on a device can stand in its
+//! place, since a plan says all that a step is of, and a learner says what happened to it between steps.
+
+use super::chain::{Chain, Losses, Step, StepInfo, StepReport, View};
+use super::loss::TrainLoss;
+use crate::Result;
+use crate::learner::{Learner, Parts};
+use crate::methods::Stage;
+use crate::optim::Floor;
+use crate::upkeep::Change;
+use splat4d::layers::Scene;
+use splat4d::math::Rng;
+use splat4d::render::{Antialias, Backend};
+use splat4d::scene::life::LOG_WIDTH;
+use splat4d::scene::{Grads, Key, LIFE, SH};
+use std::time::{Duration, Instant as Clock};
+
+/// All that one step is of.
+pub struct StepPlan<'a> {
+    /// The stage: learnable groups, their rates and losses.
+    pub stage: &'a mut Stage,
+    /// Compares pictures.
+    pub loss: &'a mut TrainLoss,
+    /// Pictures and their truth.
+    pub views: &'a [View<'a, f32>],
+    /// Where in training.
+    pub info: &'a StepInfo,
+    /// Steps of the stage that were taken before.
+    pub stage_step: usize,
+    /// Highest SH degree drawn.
+    pub sh_degree: usize,
+    /// Every rate is multiplied by this.
+    pub rate_scale: f64,
+    /// Rate of the exposure.
+    pub exposure_lr: f64,
+    /// Opacity below which a Gaussian is dead.
+    pub min_opacity: f64,
+}
+
+/// The result of a step.
+#[derive(Clone, Debug, Default)]
+pub struct Stepped {
+    /// Losses, timings and gradients to times and cameras.
+    pub report: StepReport,
+    /// L1 of the last view.
+    pub l1: f64,
+    /// SSIM of the last view.
+    pub ssim: f64,
+    /// Mean squared error over the step's views.
+    pub mse: f64,
+    /// Loading pictures.
+    pub load: Duration,
+    /// Adam.
+    pub adam: Duration,
+    /// Upkeep, noise and the rest.
+    pub other: Duration,
+    /// Gaussians born, moved, removed.
+    pub change: Change,
+}
+
+/// A number that was not finite: what and where.
+#[derive(Clone, Debug)]
+pub struct Fault(pub String);
+
+/// Takes steps on a learner.
+pub trait Engine: Send {
+    /// One step: evaluate, draw, compare, back, Adam, noise. Inner error: a number was not finite, and nothing of the learner
+    /// is to be trusted any more. Errors: those of what draws.
+    fn step(&mut self, learner: &mut Learner, plan: &mut StepPlan<'_>) -> Result<Result<Stepped, Fault>>;
+
+    /// The learner was changed in other ways than by a step, or another stage begins: what is remembered of it is stale.
+    fn changed(&mut self, learner: &Learner);
+
+    /// As it draws.
+    fn antialias(&self) -> Antialias;
+}
+
+/// Steps on the processor, with whatever draws.
+pub struct CpuEngine<'a> {
+    backend: Box<dyn Backend<f32> + 'a>,
+    chain: Chain<f32>,
+    grads: Vec<Grads<f32>>,
+    /// Scratch: a rate a column, by layer and table.
+    rates: Vec<Vec<Option<Vec<f64>>>>,
+    /// The scene as the stage's codec shows it.
+    shown: Scene<f32>,
+    /// Whether `shown` is to be copied from the scene anew.
+    stale: bool,
+}
+
+impl<'a> CpuEngine<'a> {
+    /// An engine that draws with `backend`.
+    pub fn new(backend: Box<dyn Backend<f32> + 'a>) -> Self {
+        Self {
+            backend,
+            chain: Chain::default(),
+            grads: Vec::new(),
+            rates: Vec::new(),
+            shown: Scene::default(),
+            stale: true,
+        }
+    }
+
+    /// Brings what the stage's codec shows up to date.
+    fn show(&mut self, scene: &Scene<f32>, plan: &StepPlan<'_>) {
+        let Some(codec) = &plan.stage.codec else { return };
+        if std::mem::take(&mut self.stale) {
+            self.shown = scene.clone();
+            codec.reset();
+        }
+        codec.show(scene, &plan.info.times, &mut self.shown);
+    }
+
+    /// Evaluate, draw, compare, and all the way back: fills the gradients.
+    fn evaluate(&mut self, learner: &mut Learner, plan: &mut StepPlan<'_>, out: &mut Stepped) -> Result<()> {
+        let Parts { scene, stats, exposure, .. } = learner.parts_mut();
+        let scene = if plan.stage.codec.is_some() { &self.shown } else { &*scene };
+        let Stage { pictures, probes, params, .. } = &mut *plan.stage;
+        let mut image = plan.loss.of_step(pictures, exposure);
+        let mut losses = Losses { image: &mut image, probes, params };
+        let step = Step { scene, views: plan.views, info: plan.info, sh_degree: plan.sh_degree };
+        let (backend, grads) = (self.backend.as_mut(), &mut self.grads);
+        out.report = self.chain.step(&step, backend, &mut losses, grads, &mut |o| stats.observe(o))?;
+        (out.l1, out.ssim, out.mse) = (plan.loss.l1, plan.loss.ssim, plan.loss.mse());
+        Ok(())
+    }
+
+    /// Adam on every group of the stage. Returns what was not finite.
+    fn adam(&mut self, learner: &mut Learner, plan: &StepPlan<'_>) -> Vec<(usize, Key)> {
+        let (stage, scale, progress) = (&*plan.stage, plan.rate_scale, plan.info.progress);
+        let mut bad = Vec::new();
+        if let Some(codec) = &stage.codec
+            && !codec.learn(&mut self.grads, progress, scale)
+        {
+            bad.push((0, SH));
+        }
+        let Parts { scene, moments, exposure, .. } = learner.parts_mut();
+        self.rates.resize_with(scene.layers.len(), Vec::new);
+        for (index, layer) in scene.layers.iter_mut().enumerate() {
+            let rates = &mut self.rates[index];
+            rates.resize(layer.params.keys().count(), None);
+            rates.iter_mut().flatten().for_each(|table| table.fill(0.0));
+            for group in stage.groups.iter().filter(|g| g.is_of(index) && g.from <= plan.stage_step) {
+                let found = layer.params.keys().find_map(|k| layer.params[k].column(&group.column).map(|c| (k, c)));
+                let Some((key, (first, width))) = found else { continue };
+                let (from, count) = group.part.unwrap_or((0, width));
+                let table = rates[key.0 as usize].get_or_insert_default();
+                table.resize(layer.params[key].width(), 0.0);
+                let end = (first + from + count).min(first + width);
+                table[first + from..end].fill(group.rate_at(plan.stage_step, progress) * scale);
+            }
+            let floor = stage.min_log_life.filter(|_| layer.params[LIFE].width() > LOG_WIDTH);
+            let floor = floor.map(|least| Floor { key: LIFE, column: LOG_WIDTH, least });
+            let keys = moments[index].step(&mut layer.params, &mut self.grads[index], rates, floor.as_slice());
+            bad.extend(keys.into_iter().map(|k| (index, k)));
+        }
+        if let Some(exposure) = exposure {
+            match stage.freeze_exposure {
+                true => exposure.rest(),
+                false => {
+                    let _ = exposure.step(plan.exposure_lr * scale);
+                }
+            }
+        }
+        bad
+    }
+
+    /// Names the first number that is not finite, if the step was not sound.
+    fn sound(&self, scene: &Scene<f32>, report: &StepReport, bad: &[(usize, Key)]) -> Result<(), Fault> {
+        let Some(&(layer, key)) = bad.first() else {
+            return if report.loss.is_finite() { Ok(()) } else { Err(Fault(format!("the loss is {}", report.loss))) };
+        };
+        let params = &scene.layers[layer].params;
+        let place = self.grads[layer].table(key).first_non_finite().or_else(|| params[key].first_non_finite());
+        let (row, col) = place.unwrap_or((0, 0));
+        let column = params.column_name(key, col);
+        Err(Fault(format!("`{column}` of Gaussian {row} of layer {layer} is not finite")))
+    }
+
+    /// Noise on positions, where the stage has it.
+    fn shake(&self, learner: &mut Learner, plan: &StepPlan<'_>) {
+        let Some(noise) = plan.stage.noise else { return };
+        let rate = |layer: usize| {
+            let group = plan.stage.groups.iter().find(|g| g.is_of(layer) && g.column == "means")?;
+            Some(group.rate.at(plan.info.progress))
+        };
+        let rng = Rng::new(plan.info.seed, "noise", plan.info.iteration as u64);
+        noise.add(learner.parts_mut().scene, &self.grads, rate, plan.min_opacity, rng);
+    }
+}
+
+impl Engine for CpuEngine<'_> {
+    fn step(&mut self, learner: &mut Learner, plan: &mut StepPlan<'_>) -> Result<Result<Stepped, Fault>> {
+        let mut out = Stepped::default();
+        let clock = Clock::now();
+        self.show(learner.scene(), plan);
+        out.other = clock.elapsed();
+        self.evaluate(learner, plan, &mut out)?;
+        let clock = Clock::now();
+        let bad = self.adam(learner, plan);
+        out.adam = clock.elapsed();
+        if let Err(fault) = self.sound(learner.scene(), &out.report, &bad) {
+            return Ok(Err(fault));
+        }
+        let clock = Clock::now();
+        self.shake(learner, plan);
+        for (d, layer) in self.grads.iter_mut().zip(&learner.scene().layers) {
+            d.clear(&layer.params);
+        }
+        out.other += clock.elapsed();
+        Ok(Ok(out))
+    }
+
+    fn changed(&mut self, learner: &Learner) {
+        self.stale = true;
+        self.grads = learner.scene().layers.iter().map(|l| Grads::new(&l.params)).collect();
+    }
+
+    fn antialias(&self) -> Antialias {
+        self.backend.config().antialias
+    }
+}

@@ -1,0 +1,12 @@
+//! A training step: the fixed chain, the engine that takes it, and the trainer that repeats it.
+
+mod batch;
+pub(crate) mod chain;
+mod channels;
+pub mod engine;
+pub mod loss;
+pub(crate) mod pace;
+pub mod trainer;
+
+#[cfg(test)]
+pub(crate) mod tests;

@@ -1,0 +1,89 @@
+//! Known flow of a capture on disk reaches the motion.
+
+use crate::capture::frames::{Frames, Picture};
+use crate::run::tests::{Place, recipe};
+use crate::run::training_frames;
+use crate::step::tests::Made;
+use image::{ImageBuffer, Rgb};
+use serde_json::{Value, json};
+use splat4d::flow::{Shot, render_flow};
+use splat4d::math::se3::{dot, normalize, sub};
+use splat4d::render::{RenderConfig, Renderer};
+use splat4d::scene::Camera;
+
+/// Where the pixel of the ball goes in a frame; `None`: it shows the sky.
+fn way(made: &Made, camera: &Camera, p: [f64; 2], from: f64, to: f64) -> Option<[f64; 2]> {
+    let (eye, center) = (camera.center(), made.object_at(from));
+    let ray = normalize(sub(camera.unproject(p, 1.0), eye));
+    let along = dot(sub(center, eye), ray);
+    let miss = dot(sub(center, eye), sub(center, eye)) - along * along;
+    let depth = along - (Made::RADIUS * Made::RADIUS - miss).max(0.0).sqrt();
+    let then = made.object_at(to);
+    let hit: [f64; 3] = std::array::from_fn(|k| eye[k] + depth * ray[k] + then[k] - center[k]);
+    let q = camera.project(hit)?.0;
+    (miss < Made::RADIUS * Made::RADIUS).then_some([q[0] - p[0], q[1] - p[1]])
+}
+
+/// Adds the flow of all cameras to the capture on disk.
+fn write(place: &Place, made: &Made) {
+    let capture = place.open(&recipe(&[]));
+    let marker = capture.root.join("capture.json");
+    let mut json: Value = serde_json::from_slice(&std::fs::read(&marker).unwrap()).unwrap();
+    for (k, camera) in json["cameras"].as_array_mut().unwrap().iter_mut().enumerate() {
+        camera["flow"] = json!(format!("flow/{k}/%04d.png"));
+        std::fs::create_dir_all(capture.root.join(format!("flow/{k}"))).unwrap();
+        for frame in 0..2 {
+            let view = made.camera(k);
+            let code = |v: f64| (v * 64.0 + 32768.0).round() as u16;
+            let pixel = |x: u32, y: u32| {
+                let p = [f64::from(x) + 0.5, f64::from(y) + 0.5];
+                let [from, to] = [frame, frame + 1].map(|f| made.time_of(f));
+                way(made, view, p, from, to).map_or(Rgb([0u16; 3]), |[u, v]| Rgb([code(u), code(v), 1]))
+            };
+            let picture = ImageBuffer::from_fn(view.width as u32, view.height as u32, pixel);
+            picture.save(capture.root.join(format!("flow/{k}/{frame:04}.png"))).unwrap();
+        }
+    }
+    std::fs::write(&marker, json.to_string()).unwrap();
+}
+
+#[test]
+fn known_flow_teaches_motion() {
+    let (place, made) = (Place::new(), Made::new(4, 3, 24));
+    let refused = place.train("none", &recipe(&["lambda_flow=1"])).unwrap_err().to_string();
+    assert!(refused.contains("lambda_flow") && refused.contains("capture.json"), "{refused}");
+    write(&place, &made);
+    let error = |lambda: f64| {
+        let r = recipe(&["strategy=none", "num_pts=200", "half_size_until=0.3", "velocity_lr_init=0.03"])
+            .with(|r| r.loss.flow = lambda);
+        let name = format!("{lambda}");
+        place.train(&name, &r).unwrap();
+        let scene = splat4d::format::scene::read(&place.scene(&name)).unwrap();
+        let frames = training_frames(place.open(&r), &r).unwrap();
+        let mut renderer = Renderer::new(RenderConfig::default());
+        let (mut picture, mut sum, mut count) = (Picture::default(), 0.0, 0.0);
+        for i in 0..frames.len() {
+            frames.load(i, &mut picture).unwrap();
+            let from = Shot { camera: frames.camera(i), t: frames.time(i) };
+            let Some(flow) = &picture.flow else {
+                assert!(frames.time(i).0 > 0.15, "only the last frame leads nowhere");
+                continue;
+            };
+            assert!((flow.to.0 - frames.time(i).0 - 0.1).abs() < 1e-9);
+            let to = Shot { camera: &flow.camera, t: flow.to };
+            let drawn = render_flow(&scene, from, to, &mut renderer).vectors;
+            for p in (0..flow.vectors.pixels()).filter(|&p| flow.vectors.plane(2)[p] == 1.0) {
+                sum += (0..2).map(|c| f64::from((drawn.plane(c)[p] - flow.vectors.plane(c)[p]).abs())).sum::<f64>();
+                count += 1.0;
+            }
+        }
+        sum / f64::max(count, 1.0)
+    };
+    // With so little weight the loss is read and does nothing.
+    let [little, much] = [1e-6, 3.0].map(error);
+    assert!(much < 0.8 * little, "{much} px with the loss, {little} px without");
+    let unread = training_frames(place.open(&recipe(&[])), &recipe(&[])).unwrap();
+    let mut picture = Picture::default();
+    unread.load(0, &mut picture).unwrap();
+    assert!(picture.flow.is_none(), "without the loss nobody decodes it");
+}

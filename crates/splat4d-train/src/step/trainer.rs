@@ -1,0 +1,380 @@
+//! [`Trainer`]: the state of a run and one step of it. Files, progress and clocks are the business of `run`.
+
+use super::batch::Batch;
+use super::chain::StepInfo;
+use super::engine::{CpuEngine, Engine, StepPlan};
+pub use super::engine::{Fault, Stepped};
+use super::loss::TrainLoss;
+use super::pace::Pace;
+use crate::capture::frames::Frames;
+use crate::event::Progress;
+use crate::learner::{Learner, Touched};
+use crate::loss::terms::Codec;
+use crate::methods::{Group, Hook, Stage};
+use crate::recipe::Replan;
+use crate::sampler::{Draw, Timeline};
+use crate::upkeep::{At, Change, Context, Limits, Upkeep};
+use crate::{Error, ErrorKind, Result};
+use splat4d::layers::Scene;
+use splat4d::math::Rng;
+use splat4d::render::Backend;
+use splat4d::scene::GEOMETRY;
+use std::borrow::Cow;
+use std::ops::RangeInclusive;
+use std::sync::Arc;
+use std::time::Instant as Clock;
+
+/// Settings that hold for all stages.
+#[derive(Clone, Debug)]
+pub struct Settings {
+    /// Seed of every random choice.
+    pub seed: u64,
+    /// Cap, extent and dead opacity.
+    pub limits: Limits,
+    /// Colour behind the scene.
+    pub background: [f32; 3],
+    /// Highest SH degree.
+    pub sh_degree: usize,
+    /// Rate of the exposure.
+    pub exposure_lr: f64,
+}
+
+/// How far a run is. All of it is in every checkpoint.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Position {
+    /// Steps taken.
+    pub iteration: usize,
+    /// Current stage.
+    pub stage: usize,
+    /// Steps of its schedule that are behind it: those taken, unless the run was planned anew.
+    pub stage_step: usize,
+    /// Steps taken in it.
+    pub taken: usize,
+    /// Whether the last step left the place in the schedule as it was: what is due there was done.
+    pub rests: bool,
+    /// Every rate is multiplied by this; halved after a rollback.
+    pub rate_scale: f64,
+    /// Rollbacks so far.
+    pub strikes: usize,
+}
+
+/// The state of a run.
+pub struct Trainer<'a> {
+    /// The scene that learns, with its optimiser.
+    pub learner: Learner,
+    /// The stages, in order.
+    pub stages: Vec<Stage>,
+    /// How far.
+    pub progress: Position,
+    /// Compares pictures.
+    pub loss: TrainLoss,
+    /// Settings that hold for all stages.
+    pub settings: Settings,
+    /// The pace through the schedule; none: a step is one of the schedule.
+    pace: Option<Pace>,
+    /// Whether what comes before the step is done already.
+    entered: bool,
+    frames: Arc<dyn Frames>,
+    timeline: Timeline,
+    engine: Box<dyn Engine + 'a>,
+    batch: Batch,
+}
+
+impl<'a> Trainer<'a> {
+    /// A run that has not begun, on the processor. Panics: no frames, no stages.
+    pub fn new(
+        scene: Scene<f32>,
+        mut stages: Vec<Stage>,
+        frames: Arc<dyn Frames>,
+        backend: Box<dyn Backend<f32> + 'a>,
+        loss: TrainLoss,
+        settings: Settings,
+    ) -> Self {
+        assert!(!stages.is_empty(), "a program has at least one stage");
+        let unframed = scene.layers.iter().all(|l| l.frame.is_identity());
+        assert!(unframed, "training moves rows in the layers' own axes, which must be the world's");
+        stages.iter_mut().for_each(|s| s.upkeep.sort_by_key(|u| u.order()));
+        let timeline = Timeline::new(frames.as_ref());
+        let mut trainer = Self {
+            learner: Learner::new(scene),
+            stages,
+            progress: Position { rate_scale: 1.0, ..Position::default() },
+            loss,
+            settings,
+            pace: None,
+            entered: false,
+            frames,
+            timeline,
+            engine: Box::new(CpuEngine::new(backend)),
+            batch: Batch::default(),
+        };
+        trainer.spread();
+        trainer
+    }
+
+    /// Takes steps with another engine from now on.
+    pub fn set_engine(&mut self, engine: impl Engine + 'a) {
+        self.engine = Box::new(engine);
+        self.engine.changed(&self.learner);
+    }
+
+    /// Looks at other frames, of the same times, from now on.
+    #[cfg(test)]
+    pub(crate) fn set_frames(&mut self, frames: Arc<dyn Frames>) {
+        self.frames = frames;
+    }
+
+    /// Steps of the run in all.
+    pub(crate) fn iterations(&self) -> usize {
+        self.pace.as_ref().map_or_else(|| self.schedule(), Pace::total)
+    }
+
+    /// Steps of the schedule: of all stages.
+    fn schedule(&self) -> usize {
+        self.stages.iter().map(|s| s.iterations).sum()
+    }
+
+    /// Goes through the schedule at the pace of these changes of plan: all that were ever made.
+    pub(crate) fn replan(&mut self, replans: &[Replan]) {
+        self.pace = (!replans.is_empty()).then(|| Pace::new(self.schedule(), replans));
+    }
+
+    /// Changes of plan that were followed in the first `taken` steps: the step at which each came, and the steps in all.
+    pub(crate) fn replans_before(&self, taken: usize) -> Vec<[usize; 2]> {
+        self.pace.as_ref().map_or_else(Vec::new, |p| p.replans_before(taken))
+    }
+
+    /// Steps of the current stage's schedule that will be behind the run after this step: at most to the stage's end, so
+    /// that no stage is passed over.
+    fn next_place(&self) -> usize {
+        let Position { iteration, stage, stage_step, .. } = self.progress;
+        match &self.pace {
+            None => stage_step + 1,
+            Some(pace) => {
+                let before: usize = self.stages[..stage].iter().map(|s| s.iterations).sum();
+                let end = self.stages[stage].iterations;
+                pace.done_after(iteration + 1).saturating_sub(before).clamp(stage_step, end)
+            }
+        }
+    }
+
+    /// Whether every stage is done.
+    pub fn is_done(&self) -> bool {
+        self.progress.stage >= self.stages.len()
+    }
+
+    /// The stage's name.
+    pub(crate) fn stage_name(&self) -> &str {
+        self.stages.get(self.progress.stage).map_or("done", |s| &s.name)
+    }
+
+    /// The scene that learns.
+    pub fn scene(&self) -> &Scene<f32> {
+        self.learner.scene()
+    }
+
+    /// Takes over a checkpoint's state. The scene and all tables must belong together.
+    pub(crate) fn restore(&mut self, learner: Learner, progress: Position) {
+        (self.learner, self.progress, self.entered) = (learner, progress, progress.rests);
+        self.spread();
+    }
+
+    /// Tells those that remember something of the learner what was done to it, steps apart: the one place where that is
+    /// known.
+    fn spread(&mut self) {
+        let touched = self.learner.take_touched();
+        if let (Touched::Rows, Some(stage)) = (touched, self.stages.get(self.progress.stage)) {
+            stage.on_edit();
+        }
+        if touched != Touched::Nothing {
+            self.engine.changed(&self.learner);
+        }
+    }
+
+    /// Runs a hook of the current stage.
+    fn run_hook(&mut self, hook: impl Fn(&Stage) -> Option<&Hook>, progress: &mut Progress<'_>) -> Result<()> {
+        let stage = &self.stages[self.progress.stage];
+        if let Some(hook) = hook(stage) {
+            self.learner
+                .rebuild(&|layer, column| learns(&stage.groups, layer, column), |scene| hook(scene, progress))?;
+            self.spread();
+        }
+        Ok(())
+    }
+
+    /// Does what is due before the next step, through stages without steps. [`step`](Self::step) does so by itself, but
+    /// tells nobody.
+    pub(crate) fn enter(&mut self, progress: &mut Progress<'_>) -> Result<()> {
+        while !self.entered && !self.is_done() {
+            if self.progress.stage_step == 0 {
+                self.run_hook(|s| s.start.as_ref(), progress)?;
+                self.set_phase();
+                // Of another stage's codec nothing is kept.
+                self.engine.changed(&self.learner);
+            }
+            if self.stages[self.progress.stage].iterations == 0 {
+                self.leave_stage(progress)?;
+                continue;
+            }
+            let at = self.progress.stage_step;
+            self.keep_up(at..=at, |u| u.once())?;
+            self.entered = true;
+        }
+        Ok(())
+    }
+
+    /// Puts the models of all layers into the stage's phase.
+    fn set_phase(&mut self) {
+        let Some(phase) = self.stages[self.progress.stage].phase else { return };
+        for layer in &mut self.learner.scene_mut().layers {
+            if let Some(motion) = layer.motion.with_phase(&phase) {
+                layer.motion = motion;
+            }
+        }
+    }
+
+    fn leave_stage(&mut self, progress: &mut Progress<'_>) -> Result<()> {
+        self.run_hook(|s| s.end.as_ref(), progress)?;
+        self.progress.stage += 1;
+        (self.progress.stage_step, self.progress.taken, self.progress.rests) = (0, 0, false);
+        self.entered = false;
+        Ok(())
+    }
+
+    /// The codec of the stage that runs, or of the last one when all is done.
+    fn codec(&self) -> Option<&Arc<dyn Codec<f32>>> {
+        let begun = self.progress.stage_step > 0 || self.entered || self.is_done();
+        let stage = self.progress.stage.min(self.stages.len() - 1);
+        self.stages[stage].codec.as_ref().filter(|_| begun)
+    }
+
+    /// The scene as pictures show it: as it will be read from its file, where the stage has a codec.
+    pub(crate) fn shown(&self) -> Cow<'_, Scene<f32>> {
+        self.codec().map_or(Cow::Borrowed(self.scene()), |c| Cow::Owned(c.whole(self.scene())))
+    }
+
+    /// The frames of the current stage's step after `taken`, `place` steps into its schedule.
+    fn draw_frames(&self, taken: usize, place: usize) -> Vec<usize> {
+        let s = &self.stages[self.progress.stage];
+        let (seed, stage, steps) = (self.settings.seed, self.progress.stage, s.iterations);
+        self.timeline.draw(&s.sampler, s.batch, Draw { seed, stage, taken, place, steps })
+    }
+
+    /// One step. Inner error: a number was not finite, nothing is to be trusted until a rollback.
+    pub fn step(&mut self) -> Result<std::result::Result<Stepped, Fault>> {
+        // On a thread of the pool a task costs next to nothing; from outside, each of a step's dozens of parallel loops
+        // would put this thread to sleep and wake another one.
+        rayon::scope(|_| self.step_in_pool())
+    }
+
+    fn step_in_pool(&mut self) -> Result<std::result::Result<Stepped, Fault>> {
+        self.enter(&mut Progress(&mut |_| {}))?;
+        if self.is_done() {
+            return Ok(Ok(Stepped::default()));
+        }
+        let clock = Clock::now();
+        self.load()?;
+        let load = clock.elapsed();
+        let mut out = match self.learn()? {
+            Ok(stepped) => Stepped { load, ..stepped },
+            Err(fault) => {
+                let views = self.batch.names(self.frames.as_ref());
+                return Ok(Err(Fault(format!("{} ({views})", fault.0))));
+            }
+        };
+        let clock = Clock::now();
+        let (place, next) = (self.progress.stage_step, self.next_place());
+        out.change = self.keep_up(place + 1..=next, |_| true)?;
+        if self.scene().is_empty() {
+            return Ok(Err(Fault("not one Gaussian is left: all of them became transparent or huge".into())));
+        }
+        self.progress.iteration += 1;
+        self.progress.taken += 1;
+        (self.progress.stage_step, self.progress.rests) = (next, next == place);
+        if self.progress.stage_step == self.stages[self.progress.stage].iterations {
+            self.leave_stage(&mut Progress(&mut |_| {}))?;
+        }
+        out.other += clock.elapsed();
+        Ok(Ok(out))
+    }
+
+    /// Loads the pictures of this step; the next one's are read meanwhile.
+    fn load(&mut self) -> Result<()> {
+        let (Position { taken, stage_step: place, .. }, next) = (self.progress, self.next_place());
+        let stage = &self.stages[self.progress.stage];
+        self.batch.load(self.frames.as_ref(), self.draw_frames(taken, place), place < stage.half_size_steps)?;
+        if next < stage.iterations {
+            self.frames.prefetch(&self.draw_frames(taken + 1, next));
+        }
+        Ok(())
+    }
+
+    /// The engine's step on the pictures that were loaded.
+    fn learn(&mut self) -> Result<std::result::Result<Stepped, Fault>> {
+        let (Settings { seed, limits, background, sh_degree, exposure_lr }, at) =
+            (self.settings.clone(), self.progress);
+        let stage = &mut self.stages[at.stage];
+        let width = stage.time_noise.width(at.stage_step);
+        let shift = match width > 0.0 {
+            true => width * Rng::new(seed, "time noise", at.iteration as u64).normal(0),
+            false => 0.0,
+        };
+        let views = self.batch.views(self.frames.as_ref(), shift, background);
+        let info = StepInfo {
+            iteration: at.iteration,
+            times: views.iter().map(|v| v.t).collect(),
+            seed,
+            progress: at.stage_step as f64 / stage.iterations as f64,
+        };
+        let mut plan = StepPlan {
+            sh_degree: stage.sh_degree(at.stage_step, sh_degree),
+            stage,
+            loss: &mut self.loss,
+            views: &views,
+            info: &info,
+            stage_step: at.stage_step,
+            rate_scale: at.rate_scale,
+            exposure_lr,
+            min_opacity: limits.min_opacity,
+        };
+        self.engine.step(&mut self.learner, &mut plan)
+    }
+
+    /// Runs the operations of `which` that are due after any of these steps of the stage's schedule, once each and where
+    /// they are due last, and tells losses what they did.
+    fn keep_up(&mut self, passed: RangeInclusive<usize>, which: impl Fn(&dyn Upkeep) -> bool) -> Result<Change> {
+        let Stage { upkeep, groups, iterations, .. } = &mut self.stages[self.progress.stage];
+        let at = |step| At { step, steps: *iterations };
+        let context = Context {
+            at: at(*passed.end()),
+            iteration: self.progress.iteration,
+            seed: self.settings.seed,
+            limits: self.settings.limits,
+            frames: self.frames.as_ref(),
+            antialias: self.engine.antialias(),
+            learns: &|layer, column| learns(groups, layer, column),
+        };
+        let mut change = Change::default();
+        for operation in upkeep.iter_mut().filter(|u| which(u.as_ref())) {
+            if let Some(at) = passed.clone().rev().map(at).find(|at| operation.due(at)) {
+                change += operation.run(&mut self.learner, &Context { at, ..context })?;
+            }
+        }
+        self.spread();
+        Ok(change)
+    }
+
+    /// Errors if the scene is empty: nothing could be learnt.
+    pub(crate) fn check_not_empty(&self) -> Result<()> {
+        if self.scene().layers.iter().all(|l| l.params[GEOMETRY].rows() == 0) {
+            return Err(Error::new(ErrorKind::BadInput, "there is not one Gaussian to start from")
+                .remedy("Give points, masks or --set init=random --set num_pts=10000"));
+        }
+        Ok(())
+    }
+}
+
+/// Whether a column group of a layer is in one of the groups.
+fn learns(groups: &[Group], layer: usize, column: &str) -> bool {
+    groups.iter().any(|g| g.is_of(layer) && g.column == column)
+}

@@ -1,0 +1,177 @@
+//! The pictures that points are looked for in: what stands still as fixed cameras see it, single moments, or the frames
+//! of moving cameras.
+
+use super::raster::{blurred, grey};
+use crate::Result;
+use crate::capture::frames::{Frames, Picture};
+use rayon::prelude::*;
+use splat4d::scene::{Camera, Planes};
+use std::collections::BTreeMap;
+
+/// Pictures that are looked at together, at most, evenly chosen.
+const VIEWS: usize = 64;
+/// Pictures are halved until they have no more pixels than this: finer detail places points no better than Gaussians
+/// need.
+const PIXELS: usize = 300_000;
+/// Moments of a fixed camera whose median is what stands still.
+const MEDIAN_OF: usize = 9;
+/// From so many moments on a median knows what stands still.
+const MEDIAN_FROM: usize = 3;
+/// A pixel that differs by more than this from what stands still (mean of the channels, in [0, 1]) belongs to something
+/// that moves: above the noise of ordinary cameras.
+const MOVED: f32 = 0.06;
+/// Differences are blurred by so many pixels: single ones are noise.
+const MOVED_BLUR: f64 = 1.0;
+
+/// A picture to look for points in.
+pub(crate) struct View {
+    /// Where it was taken from; its size is the picture's.
+    pub camera: Camera,
+    /// Colours as bytes, pixel by pixel.
+    pub colors: Vec<[u8; 3]>,
+    /// The mean of the channels.
+    pub grey: Planes<f32>,
+    /// Pixels in which points are looked for.
+    pub wanted: Vec<bool>,
+}
+
+impl View {
+    fn new(camera: Camera, color: &Planes<f32>, wanted: Vec<bool>) -> Self {
+        let byte = |v: f32| (v * 255.0).round().clamp(0.0, 255.0) as u8;
+        let colors = (0..color.pixels()).map(|p| [0, 1, 2].map(|c| byte(color.plane(c)[p]))).collect();
+        Self { camera, colors, grey: grey(color), wanted }
+    }
+
+    /// Whether points are looked for in a pixel.
+    pub(crate) fn wants(&self, x: usize, y: usize) -> bool {
+        self.wanted[y * self.camera.width + x]
+    }
+
+    /// Its colour in [0, 1] at a pixel position inside the picture.
+    pub(crate) fn color(&self, [u, v]: [f64; 2]) -> [f32; 3] {
+        let x = (u.max(0.0) as usize).min(self.camera.width - 1);
+        let y = (v.max(0.0) as usize).min(self.camera.height - 1);
+        self.colors[y * self.camera.width + x].map(|c| f32::from(c) / 255.0)
+    }
+
+    /// Whether a pixel position lies inside the picture.
+    pub(crate) fn holds(&self, [u, v]: [f64; 2]) -> bool {
+        (0.0..self.camera.width as f64).contains(&u) && (0.0..self.camera.height as f64).contains(&v)
+    }
+}
+
+/// A capture's pictures, sorted by what can be compared.
+pub(crate) enum Rigs {
+    /// Cameras that do not move, each with its frames in the order of time.
+    Fixed(Vec<Vec<usize>>),
+    /// Frames of cameras that move: what they agree on stands still.
+    Moving(Vec<usize>),
+}
+
+impl Rigs {
+    /// Fixed cameras, where there are at least two of them; else some of all frames.
+    pub(crate) fn of(frames: &dyn Frames) -> Self {
+        let mut rigs: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
+        (0..frames.len()).for_each(|i| rigs.entry(frames.rig(i)).or_default().push(i));
+        let still = |rig: &[usize]| {
+            rig.iter().all(|&i| frames.camera(i).cam_from_world == frames.camera(rig[0]).cam_from_world)
+        };
+        let mut fixed: Vec<Vec<usize>> = rigs.into_values().filter(|rig| still(rig)).collect();
+        if fixed.len() < 2 {
+            return Self::Moving(spread(frames.len(), VIEWS).collect());
+        }
+        fixed = spread(fixed.len(), VIEWS).map(|k| std::mem::take(&mut fixed[k])).collect();
+        fixed.iter_mut().for_each(|rig| rig.sort_by(|&a, &b| frames.time(a).0.total_cmp(&frames.time(b).0)));
+        Self::Fixed(fixed)
+    }
+
+    /// What stands still, as every camera sees it.
+    pub(crate) fn still(&self, frames: &dyn Frames) -> Result<Vec<View>> {
+        match self {
+            Self::Moving(all) => all.par_iter().map(|&i| single(frames, i)).collect(),
+            Self::Fixed(rigs) => rigs.par_iter().map(|rig| median(frames, rig)).collect(),
+        }
+    }
+
+    /// What differs from `still` in the frames nearest to time t, and their time; nothing where cameras move or moments are
+    /// few.
+    pub(crate) fn moving(&self, frames: &dyn Frames, still: &[View], t: f64) -> Result<Option<(Vec<View>, f64)>> {
+        let Self::Fixed(rigs) = self else { return Ok(None) };
+        if rigs.iter().all(|rig| rig.len() < MEDIAN_FROM) {
+            return Ok(None);
+        }
+        let nearest = |rig: &[usize]| {
+            let off = |i: usize| (frames.time(i).0 - t).abs();
+            rig.iter().copied().min_by(|&a, &b| off(a).total_cmp(&off(b))).expect("a camera has frames")
+        };
+        let differing = |(rig, still): (&Vec<usize>, &View)| -> Result<View> {
+            let mut view = single(frames, nearest(rig))?;
+            let mut off = view.grey.clone();
+            for (p, v) in off.data.iter_mut().enumerate() {
+                let channel = |c: usize| view.colors[p][c].abs_diff(still.colors[p][c]);
+                *v = (0..3).map(|c| f32::from(channel(c))).sum::<f32>() / (3.0 * 255.0);
+            }
+            let off = blurred(&off, MOVED_BLUR);
+            let few = rig.len() < MEDIAN_FROM;
+            view.wanted.iter_mut().zip(&off.data).for_each(|(w, v)| *w = *w && *v > MOVED && !few);
+            Ok(view)
+        };
+        let views = rigs.par_iter().zip(still).map(differing).collect::<Result<Vec<View>>>()?;
+        Ok(Some((views, frames.time(nearest(&rigs[0])).0)))
+    }
+}
+
+/// At most `most` of `count` numbers, evenly chosen.
+pub(crate) fn spread(count: usize, most: usize) -> impl Iterator<Item = usize> {
+    let kept = count.min(most);
+    (0..kept).map(move |k| k * count / kept)
+}
+
+/// A frame's picture at the size that is worked with, and its camera.
+fn load(frames: &dyn Frames, i: usize) -> Result<(Camera, Picture)> {
+    let mut picture = Picture::default();
+    frames.load(i, &mut picture)?;
+    picture.flow = None;
+    let mut camera = frames.camera(i).clone();
+    while picture.color.pixels() > PIXELS {
+        picture.halve();
+        camera = camera.downscaled(2);
+    }
+    Ok((camera, picture))
+}
+
+/// The pixels that the lens filled.
+fn filled(picture: &Picture) -> Vec<bool> {
+    match &picture.weight {
+        Some(weight) => weight.data.iter().map(|w| *w == 1.0).collect(),
+        None => vec![true; picture.color.pixels()],
+    }
+}
+
+fn single(frames: &dyn Frames, i: usize) -> Result<View> {
+    let (camera, picture) = load(frames, i)?;
+    let wanted = filled(&picture);
+    Ok(View::new(camera, &picture.color, wanted))
+}
+
+/// The median over some of a fixed camera's frames, channel by channel.
+fn median(frames: &dyn Frames, rig: &[usize]) -> Result<View> {
+    let most = if rig.len() < MEDIAN_FROM { 1 } else { MEDIAN_OF };
+    let (camera, mut first) = load(frames, rig[0])?;
+    let mut wanted = filled(&first);
+    let mut values: Vec<Vec<f32>> = Vec::new();
+    for k in spread(rig.len(), most).skip(1) {
+        let (_, picture) = load(frames, rig[k])?;
+        wanted.iter_mut().zip(filled(&picture)).for_each(|(w, also)| *w &= also);
+        values.push(picture.color.data);
+    }
+    let mut sorted = Vec::with_capacity(values.len() + 1);
+    for (p, value) in first.color.data.iter_mut().enumerate() {
+        sorted.clear();
+        sorted.push(*value);
+        sorted.extend(values.iter().map(|v| v[p]));
+        let middle = sorted.len() / 2;
+        *value = *sorted.select_nth_unstable_by(middle, f32::total_cmp).1;
+    }
+    Ok(View::new(camera, &first.color, wanted))
+}

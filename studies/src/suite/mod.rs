@@ -1,0 +1,387 @@
+//! `studies suite`: the recipe on captures of every kind, before and after a change of it.
+
+mod list;
+mod page;
+mod rule;
+
+use anyhow::Context;
+use list::{Entry, List, Tier};
+use rule::{Fall, MORE, Probe, broken, largest_fall};
+use serde::{Deserialize, Serialize};
+use serde_json::json;
+use splat4d::{Error, ErrorKind, Result};
+use splat4d_cli::console::Console;
+use splat4d_cli::files::{self, human_seconds};
+use splat4d_cli::run_folder::{self, Run};
+use splat4d_cli::source::read_scene;
+use splat4d_cli::{finish, interrupt};
+use splat4d_train::capture::{Capture, ImageStore};
+use splat4d_train::eval::run::{EvalOptions, Scores, assess};
+use splat4d_train::event::Event;
+use splat4d_train::recipe::Recipe;
+use splat4d_train::run::{self, TrainOptions, checkpoint, open_capture};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use std::time::Instant;
+
+/// The form of the file; another is refused.
+const VERSION: u32 = 1;
+/// Training views are looked at so often in a run.
+const PROBES: usize = 20;
+/// Training views that are looked at, the same every time.
+const PROBE_VIEWS: usize = 6;
+
+const EXAMPLES: &str = "\
+Examples:
+  studies suite --data sets                      every capture of the list that is there
+  studies suite --data sets --only mutant,knight
+  studies suite --data sets -o runs/after --baseline runs/suite/results.json
+  studies suite --data sets --rule               do four times the steps cost anything?
+  studies suite --data sets -o runs/mcmc --set strategy=mcmc
+
+Steps are fixed (studies/suite.toml), so that results of machines with more or less to do compare. What was found is in
+DIR/results.json (after every capture: the same command goes on where it was stopped) and DIR/suite.md, runs are in
+DIR/runs. A cell is measured anew when the program, its recipe or its capture's place has changed.";
+
+/// Train the recipe on a list of captures, each in so many steps, and compare
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub(crate) struct Args {
+    /// Folder with data sets in folders; may be repeated
+    #[arg(long, value_name = "FOLDER")]
+    data: Vec<PathBuf>,
+    /// Folder for what is found
+    #[arg(short, long, value_name = "DIR", default_value = "runs/suite")]
+    output: PathBuf,
+    /// Size of pictures and number of steps
+    #[arg(long, value_enum, default_value = "quick")]
+    tier: Tier,
+    /// Only these captures [default: all of the list]
+    #[arg(long, value_name = "NAME,...", value_delimiter = ',')]
+    only: Vec<String>,
+    /// A list of captures [default: studies/suite.toml as it was when the program was built]
+    #[arg(long, value_name = "FILE")]
+    list: Option<PathBuf>,
+    /// Set a knob of every recipe; may be repeated
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// Train each for four times the steps too, and say where that costs quality
+    #[arg(long)]
+    rule: bool,
+    /// Bake playback files and compare them with their models, as the full tier does
+    #[arg(long)]
+    playback: bool,
+    /// Results of an earlier suite to compare with
+    #[arg(long, value_name = "FILE")]
+    baseline: Option<PathBuf>,
+}
+
+/// What one capture came to in so many steps. Values are dB unless named otherwise.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+struct Found {
+    capture: String,
+    steps: usize,
+    /// Of the program, the recipe and the capture's place.
+    print: String,
+    /// Why there are no numbers.
+    refused: Option<String>,
+    motion: String,
+    /// Held-out views: whole pictures, where things move, and (from these two and the share that moves) elsewhere.
+    psnr: Option<f64>,
+    /// Whole pictures after each camera's colour matrix.
+    psnr_cc: Option<f64>,
+    psnr_dynamic: Option<f64>,
+    psnr_still: Option<f64>,
+    ssim: Option<f64>,
+    flicker: Option<f64>,
+    psnr_train: Option<f64>,
+    /// Training views on the way.
+    probes: Vec<Probe>,
+    fall: Option<Fall>,
+    gaussians: usize,
+    /// Of training, without the looks on the way.
+    seconds: f64,
+    /// The playback file against its model.
+    playback_psnr: Option<f64>,
+}
+
+/// All cells.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct Results {
+    version: u32,
+    cells: Vec<Found>,
+}
+
+impl Results {
+    /// Errors: a file that is none of ours, or of another version.
+    fn read(path: &Path) -> Result<Self> {
+        let refuse = |what: String| Error::input(what).at(path.display()).remedy("Move it away, or name another file.");
+        let results: Self = serde_json::from_str(&files::read_text(path)?)
+            .map_err(|e| refuse(format!("it holds no results of a suite: {e}")))?;
+        if results.version != VERSION {
+            return Err(refuse(format!("its version is {}, not {VERSION}", results.version)));
+        }
+        Ok(results)
+    }
+
+    fn save(&self, path: &Path) -> Result<()> {
+        files::write(path, serde_json::to_string_pretty(self).expect("results are plain data").as_bytes())
+    }
+}
+
+/// A cell that is to be measured.
+struct Order<'a> {
+    entry: &'a Entry,
+    folder: PathBuf,
+    recipe: Recipe,
+    print: String,
+}
+
+pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
+    // What cannot work is said before anything takes time.
+    let list = List::open(args.list.as_deref())?;
+    let entries = list.only(&args.only)?;
+    let baseline = args.baseline.as_deref().map(Results::read).transpose()?;
+    let file = args.output.join("results.json");
+    let mut results =
+        if file.is_file() { Results::read(&file)? } else { Results { version: VERSION, cells: Vec::new() } };
+    files::make_folder(&args.output)?;
+    let orders = orders(args, &list, &entries, console)?;
+    let stop = interrupt::flag("stopping: finished cells are kept");
+    let started = Instant::now();
+    let mut cells = Vec::new();
+    for (i, order) in orders.iter().enumerate() {
+        let (name, steps) = (order.entry.name.as_str(), order.recipe.run.iterations);
+        let known = results.cells.iter().find(|f| f.print == order.print && f.capture == name && f.steps == steps);
+        let found = match known {
+            Some(found) => found.clone(),
+            None => {
+                console.note(&format!("{name}, {steps} steps, {}/{}", i + 1, orders.len()));
+                let found = measure(order, args, &stop, console)?;
+                console.clear();
+                results.cells.retain(|f| f.capture != name || f.steps != steps);
+                results.cells.push(found.clone());
+                results.save(&file)?;
+                found
+            }
+        };
+        console.emit(&json!({"type": "cell", "cell": found}));
+        cells.push(found);
+    }
+    console.note(&format!("measured in {}", human_seconds(started.elapsed().as_secs_f64())));
+    let mut text = page::table(&cells);
+    if args.rule {
+        text += &judged(&cells);
+    }
+    if let Some(baseline) = baseline {
+        text += &format!("\n{}", page::differences(&cells, &baseline.cells));
+    }
+    let page = args.output.join("suite.md");
+    files::write(&page, text.as_bytes())?;
+    console.say(text.trim_end());
+    console.written(&page);
+    console.emit(&json!({"type": "done", "study": file}));
+    Ok(())
+}
+
+/// Where the rule is broken.
+fn judged(cells: &[Found]) -> String {
+    let longer = |s: &Found| cells.iter().find(|l| l.capture == s.capture && l.steps == s.steps * MORE);
+    let broken: Vec<String> = cells.iter().filter_map(|s| longer(s).map(|l| broken(s, l))).flatten().collect();
+    match broken[..] {
+        [] => "\nThe rule holds everywhere.\n".into(),
+        _ => format!("\nThe rule is broken:\n\n- {}\n", broken.join("\n- ")),
+    }
+}
+
+/// Every cell of the captures that are there; of others it is said that they are not.
+fn orders<'a>(args: &Args, list: &List, entries: &[&'a Entry], console: &Console) -> anyhow::Result<Vec<Order<'a>>> {
+    let own = std::env::current_exe().context("this program does not know where it lies")?;
+    let program = files::fingerprint(std::fs::read(&own).map_err(|e| files::cannot_read(&own, e))?);
+    let work = args.output.join("captures");
+    let mut orders = Vec::new();
+    for &entry in entries {
+        let recipe = recipe(entry, list.steps(args.tier), args)?;
+        let Some(folder) = entry.folder(&args.data, &work)? else {
+            console.note(&format!("{}: not there, skipped", entry.name));
+            continue;
+        };
+        for more in if args.rule { vec![1, MORE] } else { vec![1] } {
+            let mut recipe = recipe.clone();
+            recipe.run.iterations *= more;
+            if recipe.run.checkpoint_interval == 0 {
+                // A checkpoint is a look at the training views.
+                recipe.run.checkpoint_interval = (recipe.run.iterations / PROBES).max(1);
+            }
+            let told = [program.as_str(), &folder.display().to_string(), &recipe.flat_toml()].join("\n");
+            orders.push(Order { entry, folder: folder.clone(), recipe, print: files::fingerprint(told) });
+        }
+    }
+    Ok(orders)
+}
+
+/// The recipe of a capture: the default one, with what the list and the user say.
+fn recipe(entry: &Entry, steps: usize, args: &Args) -> Result<Recipe> {
+    let mut recipe = Recipe::default();
+    recipe.set("run.motion=auto")?;
+    recipe.run.iterations = steps;
+    recipe.capture.downscale = entry.downscale.at(args.tier);
+    recipe.capture.hold_out = entry.hold_out.as_deref().map(str::parse).transpose()?;
+    for assignment in &entry.set {
+        recipe.set(assignment).map_err(|e| e.at(format!("capture {}", entry.name)))?;
+    }
+    for assignment in &args.set {
+        recipe.set(assignment).map_err(|e| e.at("--set"))?;
+    }
+    recipe.check()?;
+    Ok(recipe)
+}
+
+/// Trains and measures; a capture that refuses is a finding too. Errors: stopped; files that cannot be written.
+fn measure(order: &Order<'_>, args: &Args, stop: &AtomicBool, console: &Console) -> anyhow::Result<Found> {
+    let steps = order.recipe.run.iterations;
+    let blank = Found { capture: order.entry.name.clone(), steps, print: order.print.clone(), ..Found::default() };
+    let run = args.output.join("runs").join(format!("{}-{steps}", order.entry.name));
+    files::make_folder(&run)?;
+    run_folder::clear(&run)?;
+    let found = trained(order, &run, blank.clone(), stop, console);
+    let interrupted = |e: &Error| e.kind() == ErrorKind::Interrupted;
+    let mut found = match found {
+        Err(error) if !interrupted(&error) => return Ok(Found { refused: Some(error.to_string()), ..blank }),
+        found => found.map_err(|e| e.at(args.output.display()).remedy("The same command goes on with it."))?,
+    };
+    if args.playback || args.tier == Tier::Full {
+        finish::playback(&run, console)?;
+        found.playback_psnr = Run::open(&run)?.number("playback_psnr");
+    }
+    // The scene stays, to look at; checkpoints are three times its size.
+    checkpoint::list(&run).iter().try_for_each(std::fs::remove_file).map_err(|e| files::cannot_write(&run, e))?;
+    Ok(found)
+}
+
+fn trained(order: &Order<'_>, run: &Path, blank: Found, stop: &AtomicBool, console: &Console) -> Result<Found> {
+    let capture = Arc::new(open_capture(&order.folder, &order.recipe)?);
+    if capture.held.is_empty() {
+        return Err(Error::input("it holds out no view, so that nothing can be measured")
+            .remedy("Give it a hold_out in the list."));
+    }
+    let judge = Judge::new(&capture, &order.recipe);
+    // While pictures of half the size are trained on, they are what training views are: at full size a scene that has
+    // never seen one gets worse and better at random.
+    let halved = order.recipe.clone().with(|r| r.capture.downscale *= 2);
+    let coarse = Judge::new(&Arc::new(open_capture(&order.folder, &halved)?), &halved);
+    let change = (order.recipe.run.half_size_until * order.recipe.run.iterations as f64) as usize;
+    let (mut probes, mut looking, mut trouble) = (Vec::new(), 0.0, None);
+    let mut listen = |event: &Event| match event {
+        Event::Checkpoint { iteration, path } if trouble.is_none() => {
+            let clock = Instant::now();
+            let judge = if *iteration <= change { &coarse } else { &judge };
+            match judge.training(path, *iteration) {
+                Ok(psnr) => probes.extend(psnr.map(|psnr| Probe { step: *iteration, psnr })),
+                Err(error) => trouble = Some(error),
+            }
+            looking += clock.elapsed().as_secs_f64();
+        }
+        Event::Phase { .. } | Event::Progress { .. } => console.event(event),
+        _ => {}
+    };
+    let options = TrainOptions::default();
+    let outcome = run::train(capture.clone(), order.recipe.clone(), run, &options, stop, &mut listen)?;
+    if let Some(error) = trouble {
+        return Err(error);
+    }
+    if outcome.interrupted {
+        return Err(Error::new(ErrorKind::Interrupted, "the suite is unfinished; finished cells are kept"));
+    }
+    let effective = Run::open(run)?.recipe()?;
+    let scores = judge.scores(&run.join("scene.safetensors"), outcome.iteration, console)?;
+    let [psnr, psnr_cc, psnr_dynamic, ssim, flicker] =
+        ["PSNR", "PSNR-cc", "PSNR-dynamic", "SSIM", "flicker"].map(|name| scores.held(name));
+    Ok(Found {
+        motion: effective.run.motion.as_str().into(),
+        psnr,
+        psnr_cc,
+        psnr_dynamic,
+        psnr_still: elsewhere(psnr, psnr_dynamic, scores.dynamic_share),
+        ssim,
+        flicker,
+        psnr_train: scores.train("PSNR"),
+        fall: largest_fall(&probes, change),
+        probes,
+        gaussians: outcome.gaussians,
+        seconds: outcome.seconds - looking,
+        ..blank
+    })
+}
+
+/// PSNR where nothing moves, by the means of whole pictures and of what moves.
+fn elsewhere(whole: Option<f64>, moving: Option<f64>, share: Option<f64>) -> Option<f64> {
+    let error = |psnr: f64| 10f64.powf(-0.1 * psnr);
+    let (whole, moving, share) = (error(whole?), error(moving?), share?);
+    let rest = (whole - share * moving) / (1.0 - share);
+    (rest > 0.0 && rest.is_finite()).then(|| -10.0 * rest.log10())
+}
+
+/// A capture that scenes are measured on.
+struct Judge {
+    capture: Arc<Capture>,
+    /// The same without held-out views.
+    training: Capture,
+    store: ImageStore,
+    antialias: bool,
+}
+
+impl Judge {
+    fn new(capture: &Arc<Capture>, recipe: &Recipe) -> Self {
+        let training = Capture { held: Vec::new(), ..(**capture).clone() };
+        let memory = usize::try_from(recipe.run.image_memory).unwrap_or(usize::MAX);
+        let store = ImageStore::new(capture.clone(), memory);
+        Self { capture: capture.clone(), training, store, antialias: recipe.appearance.antialias }
+    }
+
+    fn options(&self) -> EvalOptions {
+        EvalOptions { antialias: self.antialias, pictures: false, ..EvalOptions::default() }
+    }
+
+    /// PSNR of the same few training views every time.
+    fn training(&self, scene: &Path, step: usize) -> Result<Option<f64>> {
+        let options = EvalOptions { train_views: PROBE_VIEWS, ..self.options() };
+        let scores = assess(&read_scene(scene)?, &self.training, &self.store, step, &options, &mut |_| {})?;
+        Ok(scores.train("PSNR"))
+    }
+
+    fn scores(&self, scene: &Path, step: usize, console: &Console) -> Result<Scores> {
+        let mut listen = |event: &Event| console.event(event);
+        assess(&read_scene(scene)?, &self.capture, &self.store, step, &self.options(), &mut listen)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_stands_still_is_what_the_rest_leaves() {
+        // Half the pixels are wrong by 0.1, the others by 0.01.
+        let psnr = |mse: f64| -10.0 * mse.log10();
+        let still = elsewhere(Some(psnr(0.5 * (0.01 + 0.0001))), Some(psnr(0.01)), Some(0.5)).unwrap();
+        assert!((still - 40.0).abs() < 1e-9);
+        assert_eq!(elsewhere(Some(30.0), None, Some(0.5)), None);
+        assert_eq!(elsewhere(Some(30.0), Some(10.0), Some(0.5)), None, "means of dB need not add up");
+    }
+
+    #[test]
+    fn results_are_read_back_and_foreign_files_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("results.json");
+        let cell = Found { capture: "a".into(), probes: vec![Probe { step: 5, psnr: 20.0 }], ..Found::default() };
+        Results { version: VERSION, cells: vec![cell.clone()] }.save(&file).unwrap();
+        assert_eq!(Results::read(&file).unwrap().cells, [cell]);
+        for text in ["", "{}", "{\"version\": 9, \"cells\": []}"] {
+            std::fs::write(&file, text).unwrap();
+            assert!(Results::read(&file).unwrap_err().to_string().contains("results.json"));
+        }
+    }
+}
