@@ -37,6 +37,7 @@ const BAD_INPUT: u8 = 2;
 
 const EXAMPLES: &str = "\
 Examples:
+  splat4d import videos/ -o my-take        videos of one scene become a capture: clocks, poses, points
   splat4d train examples/knight            train, measure, report and film the bundled capture
   splat4d train my-take --minutes 10       fit the steps of training into ten minutes
   splat4d train --resume runs/my-take      continue exactly where a run stopped
@@ -82,6 +83,7 @@ pub struct Globals {
 
 #[derive(Debug, Subcommand)]
 enum Verb {
+    Import(verbs::import::Args),
     Train(Box<verbs::train::Args>),
     Eval(verbs::eval::Args),
     Render(verbs::render::Args),
@@ -100,6 +102,7 @@ pub fn main() -> ExitCode {
     parsed(|cli: Cli| {
         let threads = cli.globals.threads;
         (cli.globals, move |console: &Console| match cli.verb {
+            Verb::Import(args) => verbs::import::run(&args, console),
             Verb::Train(args) => verbs::train::run(&args, console),
             Verb::Eval(args) => verbs::eval::run(&args, console),
             Verb::Render(args) => verbs::render::run(&args, console),

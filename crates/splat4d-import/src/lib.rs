@@ -4,6 +4,7 @@
 pub mod corrections;
 pub mod sfm;
 pub mod sync;
+pub mod take;
 pub mod video;
 pub mod write;
 

@@ -7,6 +7,7 @@ pub(crate) mod compress;
 pub(crate) mod convert;
 pub(crate) mod eval;
 pub(crate) mod export;
+pub(crate) mod import;
 pub(crate) mod info;
 pub(crate) mod render;
 pub mod train;

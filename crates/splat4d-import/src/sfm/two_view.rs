@@ -240,7 +240,7 @@ pub fn five(sample: &[Pair; 5]) -> Vec<Mat3> {
     out
 }
 
-/// [t]× R of the motion from the first camera's axes to the second's.
+/// The product `[t]× R` of the motion from the first camera's axes to the second's.
 pub fn essential_of(motion: &Se3) -> Mat3 {
     mat_mul(&skew(motion.translation), &motion.rotation)
 }

@@ -17,8 +17,8 @@ const TICKS: f64 = 1e6;
 pub enum Poses {
     /// In one place: `cam_from_world`.
     Fixed(Se3),
-    /// In another for every shot.
-    Moving(Vec<Se3>),
+    /// In another for every shot; shots whose place is not known are left out.
+    Moving(Vec<Option<Se3>>),
 }
 
 /// A camera whose clock, lens and place are known.
@@ -103,7 +103,9 @@ fn camera(camera: &Placed) -> Result<Value> {
     };
     let world_to_camera = match poses {
         Poses::Fixed(pose) => json!(matrix(pose)),
-        Poses::Moving(all) if all.len() == pictures.shots.len() => json!(all.iter().map(matrix).collect::<Vec<_>>()),
+        Poses::Moving(all) if all.len() == pictures.shots.len() => {
+            json!(all.iter().flatten().map(matrix).collect::<Vec<_>>())
+        }
         Poses::Moving(all) => {
             let what = format!("there are {} poses for {} pictures", all.len(), pictures.shots.len());
             return Err(place(Error::input(what).remedy("Import it again.")));
@@ -115,7 +117,19 @@ fn camera(camera: &Placed) -> Result<Value> {
         _ => json!({"model": "pinhole"}),
     };
     let tick = |t: f64| (t * TICKS).round() / TICKS;
-    let times: Vec<f64> = pictures.shots.iter().map(|s| tick(s.time * (1.0 + offset.rate))).collect();
+    let known: Vec<usize> = match poses {
+        Poses::Fixed(_) => (0..pictures.shots.len()).collect(),
+        Poses::Moving(all) => (0..all.len()).filter(|&k| all[k].is_some()).collect(),
+    };
+    if known.is_empty() {
+        return Err(place(Error::input("no place of it is known").remedy("Leave the camera out.")));
+    }
+    let times: Vec<f64> = known.iter().map(|&k| tick(pictures.shots[k].time * (1.0 + offset.rate))).collect();
+    let images = if known.len() == pictures.shots.len() {
+        json!(pictures.pattern)
+    } else {
+        json!(known.iter().map(|&k| pictures.file(k).to_string_lossy().replace('\\', "/")).collect::<Vec<_>>())
+    };
     Ok(json!({
         "name": pictures.name,
         "width": pictures.size[0],
@@ -128,7 +142,7 @@ fn camera(camera: &Placed) -> Result<Value> {
         "world_to_camera": world_to_camera,
         "time_offset": tick(offset.seconds),
         "times": times,
-        "images": pictures.pattern,
-        "frames": pictures.shots.len(),
+        "images": images,
+        "frames": known.len(),
     }))
 }

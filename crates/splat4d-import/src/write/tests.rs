@@ -119,7 +119,7 @@ fn the_capture_is_read_as_it_was_meant() {
     let lens = Lens::Brown { k: [-0.05, 0.01, 0.0, 0.0, 0.0, 0.0], p: [1e-3, 0.0], s: [0.0; 4] };
     let pose = |x: f64| Se3::look_at([x, -0.2, -4.0], [0.0; 3], [0.0, -1.0, 0.0]);
     let offset = |seconds: f64, rate: f64| Offset { seconds, sigma: 0.0, rate, kinds: Vec::new(), checked: true };
-    let moving = Poses::Moving((0..11).map(|k| pose(1.0 + 0.1 * f64::from(k))).collect());
+    let moving = Poses::Moving((0..11).map(|k| Some(pose(1.0 + 0.1 * f64::from(k)))).collect());
     let mut cameras = vec![
         Placed {
             pictures: stored[0].clone(),

@@ -31,7 +31,7 @@ mod transforms;
 
 pub(crate) use flow::FlowFile;
 pub use options::{CaptureOptions, CaptureSettings, HoldOut, MAX_POINTS, Sequence};
-pub(crate) use points::PointCloud;
+pub use points::PointCloud;
 pub use preflight::{Finding, Severity};
 pub use rgb8::Rgb8;
 pub use sequence::Timing;

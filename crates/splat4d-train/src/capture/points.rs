@@ -52,7 +52,7 @@ const STEPS: usize = 16;
 
 impl PointCloud {
     /// All of it as a binary .ply file, from which it comes back bit by bit; `comment`: lines for its header.
-    pub(crate) fn to_ply(&self, comment: &str) -> Vec<u8> {
+    pub fn to_ply(&self, comment: &str) -> Vec<u8> {
         let mut out = format!(
             "ply\nformat binary_little_endian 1.0\n{comment}\nelement vertex {}\nproperty double x\nproperty double y\n\
              property double z\nproperty float r\nproperty float g\nproperty float b\nproperty double time\nend_header\n",

@@ -1,0 +1,177 @@
+//! `import`: videos become a capture: frames, a common clock, poses and points.
+
+use crate::console::Console;
+use crate::interrupt;
+use serde_json::json;
+use splat4d::{Error, ErrorKind};
+use splat4d_import::corrections;
+use splat4d_import::take::{self, CameraReport, Report, Request, Rig};
+use splat4d_import::video::Selection;
+use splat4d_import::write::Format;
+use splat4d_train::event::Progress;
+use std::fmt::Write;
+use std::path::PathBuf;
+use std::sync::atomic::Ordering;
+
+const EXAMPLES: &str = "\
+Examples:
+  splat4d import videos/ -o my-take                  all videos of a folder: fixed cameras round a scene
+  splat4d import a.mp4 b.mp4 c.mp4 -o my-take --from 3.2 --to 9.8 --size 720
+  splat4d import walk.mp4 -o walk --every 5          one camera, carried round the scene
+  splat4d import videos/ -o my-take --apart left,right=2.4    in metres
+
+What was found of every camera is written to my-take/import.toml: correct an offset, a lens, or leave a camera out there,
+and run the same command again. Then: splat4d train my-take. How to film a take that works: docs/filming.md.";
+
+/// Pixels of the shorter side that pictures get: training on a CPU sees no more.
+const SIZE: usize = 1080;
+/// Frames per second of folders of pictures.
+const FPS: f64 = 30.0;
+
+/// Make a capture of videos: frames, a common clock, poses and points, from the videos alone
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub(crate) struct Args {
+    /// Videos, folders of videos, or folders of pictures (one for each camera)
+    #[arg(value_name = "VIDEOS", required = true)]
+    videos: Vec<PathBuf>,
+    /// The capture's folder; work that was interrupted there goes on
+    #[arg(short, long, value_name = "TAKE")]
+    output: PathBuf,
+    /// Whether cameras stand still; auto: one video is of a moving camera, several are of fixed ones
+    #[arg(long, value_name = "auto|fixed|moving", default_value = "auto", value_parser = ["auto", "fixed", "moving"])]
+    rig: String,
+    /// Do not listen to the videos' sound
+    #[arg(long)]
+    no_audio: bool,
+    /// Keep every Nth frame
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    every: usize,
+    /// Begin at this second of the first camera's video
+    #[arg(long, value_name = "SECONDS")]
+    from: Option<f64>,
+    /// End before this second
+    #[arg(long, value_name = "SECONDS")]
+    to: Option<f64>,
+    /// Pixels of the pictures' shorter side, at most
+    #[arg(long, value_name = "PIXELS", default_value_t = SIZE)]
+    size: usize,
+    /// Frames per second of folders of pictures
+    #[arg(long, value_name = "N", default_value_t = FPS)]
+    fps: f64,
+    /// Two cameras and the metres between them
+    #[arg(long, value_name = "A,B=METRES", value_parser = apart)]
+    apart: Option<([String; 2], f64)>,
+    /// Take interlaced videos, and fill their lines in
+    #[arg(long)]
+    deinterlace: bool,
+    /// Store pictures as PNG: every bit, four times as large
+    #[arg(long)]
+    png: bool,
+}
+
+fn apart(text: &str) -> Result<([String; 2], f64), String> {
+    let wrong = || format!("\"{text}\" is no distance of two cameras: write left,right=2.4");
+    let (pair, metres) = text.rsplit_once('=').ok_or_else(wrong)?;
+    let (a, b) = pair.split_once(',').ok_or_else(wrong)?;
+    let metres: f64 = metres.trim().parse().map_err(|_| wrong())?;
+    if !metres.is_finite() || metres <= 0.0 {
+        return Err(format!("{metres} m is no distance"));
+    }
+    Ok(([a, b].map(|n| n.trim().to_owned()), metres))
+}
+
+pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
+    let folder = &args.output;
+    let foreign = folder.join("capture.json").is_file() && !folder.join(corrections::FILE).is_file();
+    if foreign {
+        return Err(Error::input("there is a capture already, and it is not from here")
+            .at(folder.display())
+            .remedy("Give another folder with -o.")
+            .into());
+    }
+    let request = Request {
+        inputs: args.videos.clone(),
+        folder: folder.clone(),
+        selection: Selection {
+            every: args.every,
+            from: args.from,
+            to: args.to,
+            size: Some(args.size),
+            deinterlace: args.deinterlace,
+        },
+        fps: args.fps,
+        rig: match args.rig.as_str() {
+            "fixed" => Rig::Fixed,
+            "moving" => Rig::Moving,
+            _ => Rig::Auto,
+        },
+        sound: !args.no_audio,
+        format: if args.png { Format::Png } else { Format::default() },
+        apart: args.apart.clone(),
+    };
+    let stop = interrupt::flag("stopping: what is stored is kept");
+    let mut tell = |event: &splat4d_train::event::Event| console.event(event);
+    let made = take::import(&request, &mut Progress(&mut tell), &|| stop.load(Ordering::SeqCst));
+    console.clear();
+    let report = made.map_err(|e| match e.kind() {
+        ErrorKind::Interrupted => e,
+        _ => e.at("import"),
+    })?;
+    told(&report, console);
+    Ok(())
+}
+
+fn told(report: &Report, console: &Console) {
+    for camera in &report.cameras {
+        for warning in &camera.warnings {
+            console.warn(&format!("camera {}: {warning}", camera.name));
+        }
+        if let Some(trouble) = &camera.trouble {
+            console.warn(&format!("camera {} is left out: {trouble}", camera.name));
+        }
+    }
+    for line in &report.refused {
+        console.warn(line);
+    }
+    let silent: Vec<&str> = report.cameras.iter().filter(|c| c.offset.is_none()).map(|c| c.name.as_str()).collect();
+    if report.cameras.len() > 1 && !silent.is_empty() {
+        console.warn(&format!(
+            "nothing tells how the clocks of these cameras differ, their files' are taken: {} (tell it in {})",
+            silent.join(", "),
+            corrections::FILE
+        ));
+    }
+    if console.json() {
+        console.emit(&json!({"type": "imported", "report": report}));
+        return;
+    }
+    let mut text = String::from(
+        "camera              frames  offset ms     ±  by                     points   error px  focal px\n",
+    );
+    for camera in &report.cameras {
+        let _ = writeln!(text, "{}", row(camera));
+    }
+    for guess in &report.guesses {
+        let _ = writeln!(text, "{guess}");
+    }
+    let _ = write!(text, "{} points; wrote {}", report.points, report.capture.display());
+    console.result(&text);
+}
+
+fn row(camera: &CameraReport) -> String {
+    let number = |v: Option<f64>, scale: f64, digits: usize| {
+        v.map_or_else(|| "-".to_owned(), |v| format!("{:.digits$}", v * scale))
+    };
+    format!(
+        "{:<20}{:>6}{:>11}{:>6}  {:<22}{:>7}{:>11}{:>10}",
+        camera.name,
+        camera.frames,
+        number(camera.offset, 1e3, 1),
+        number(camera.sigma, 1e3, 1),
+        if camera.by.is_empty() { "its file".to_owned() } else { camera.by.join(", ") },
+        camera.sightings,
+        number(camera.error, 1.0, 2),
+        number(camera.focal, 1.0, 0),
+    )
+}

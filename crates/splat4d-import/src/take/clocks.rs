@@ -1,0 +1,153 @@
+//! The clock of all cameras before poses are known: by sound, then by motion, then as their files have it.
+
+use super::stored::Stored;
+use super::{Camera, Report};
+use crate::sync::graph::{self, Evidence, Kind, Solution};
+use crate::sync::motion::{self, Motion};
+use crate::sync::sound::{self, SoundTrack};
+use crate::video::Selection;
+use crate::{Error, ErrorKind, Result};
+use rayon::prelude::*;
+use splat4d_train::event::Progress;
+
+/// Metres between cameras as sound goes, where nothing is known of them: a room's; 15 ms.
+const WAY: f64 = 5.0;
+/// Least seconds that all cameras must film at once.
+const LEAST_SHARED: f64 = 0.1;
+/// Frames a second of cameras that do not tell.
+const USUAL_RATE: f64 = 30.0;
+
+/// Lags of all pairs of cameras with sound.
+pub(super) fn by_sound(
+    cameras: &[Camera],
+    progress: &mut Progress<'_>,
+    stop: &dyn Fn() -> bool,
+) -> Result<Vec<Evidence>> {
+    let mut tracks = Vec::new();
+    for (k, camera) in cameras.iter().enumerate() {
+        progress.phase("sound", k, cameras.len());
+        if stop() {
+            return Err(Error::new(ErrorKind::Interrupted, "stopped while sound was read"));
+        }
+        match camera.source.sound() {
+            Ok(track) => tracks.push(track.map(SoundTrack::new)),
+            Err(e) => {
+                progress.warn(format!("camera {}: {e}", camera.name));
+                tracks.push(None);
+            }
+        }
+    }
+    let n = cameras.len();
+    let pairs: Vec<[usize; 2]> = (0..n).flat_map(|a| (a + 1..n).map(move |b| [a, b])).collect();
+    let of = |&[a, b]: &[usize; 2]| {
+        let (x, y) = (tracks[a].as_ref()?, tracks[b].as_ref()?);
+        let lag = sound::lag(x, y, None).ok()?;
+        // Sound needs time for its way, and nobody knows yet from where: part of what is uncertain.
+        let sigma = lag.sigma.hypot(0.5 * sound::way(WAY));
+        Some(Evidence { cameras: [a, b], lag: lag.at_zero(), sigma, drift: lag.drift, kind: Kind::Sound })
+    };
+    Ok(pairs.par_iter().filter_map(of).collect())
+}
+
+/// Lags by how much moves, of cameras that sound leaves open with all others.
+pub(super) fn by_motion(
+    stored: &Stored<'_>,
+    clock: &Solution,
+    progress: &mut Progress<'_>,
+    report: &mut Report,
+) -> Result<Vec<Evidence>> {
+    let n = stored.pictures.len();
+    let mut moved = Vec::with_capacity(n);
+    for (k, pictures) in stored.pictures.iter().enumerate() {
+        progress.phase("motion", k, n);
+        let mut motion = Motion::default();
+        for (i, shot) in pictures.shots.iter().enumerate() {
+            motion.push(shot.time, &stored.rgb(k, i)?);
+        }
+        moved.push(motion);
+    }
+    let open = |k: usize| clock.offsets[k].is_none();
+    let mut out = Vec::new();
+    for a in 0..n {
+        for b in a + 1..n {
+            if !open(a) && !open(b) {
+                continue;
+            }
+            match motion::lag(&moved[a], &moved[b], None) {
+                Ok(found) => out.push(Evidence {
+                    cameras: [a, b],
+                    lag: found.seconds,
+                    sigma: found.sigma,
+                    drift: None,
+                    kind: Kind::Motion,
+                }),
+                Err(why) => {
+                    report.motion.push(graph::describe([&stored.pictures[a].name, &stored.pictures[b].name], &why));
+                }
+            }
+        }
+    }
+    Ok(out)
+}
+
+/// Offsets of all cameras from what is known of pairs.
+pub(super) fn solve(cameras: &[Camera], evidence: &[Evidence], told: &[Option<f64>]) -> Solution {
+    let rate = |c: &Camera| c.source.info().average_rate.or(c.source.info().nominal_rate).unwrap_or(USUAL_RATE);
+    let slowest = cameras.iter().map(rate).fold(f64::INFINITY, f64::min);
+    graph::solve(cameras.len(), evidence, told, 0.5 / slowest)
+}
+
+/// What of each camera is stored: of the chosen part, on the first camera's clock, what all cameras film.
+pub(super) fn shared(
+    cameras: &[Camera],
+    clock: &Solution,
+    selection: &Selection,
+    report: &mut Report,
+) -> Result<Vec<Selection>> {
+    let known: Option<Vec<(f64, f64)>> = cameras
+        .iter()
+        .zip(&clock.offsets)
+        .map(|(c, o)| Some((o.as_ref()?.seconds, c.source.info().duration?)))
+        .collect();
+    let Some(known) = known.filter(|_| cameras.len() > 1) else {
+        if cameras.len() > 1 && (selection.from.is_some() || selection.to.is_some()) {
+            report
+                .guesses
+                .push("The chosen part is cut by each file's own clock, for no sound tells how they differ.".into());
+        }
+        return Ok(vec![selection.clone(); cameras.len()]);
+    };
+    let begin = known.iter().map(|(o, _)| *o).fold(f64::NEG_INFINITY, f64::max);
+    let end = known.iter().map(|(o, d)| o + d).fold(f64::INFINITY, f64::min);
+    let from = selection.from.map_or(begin, |f| f.max(begin));
+    let to = selection.to.map_or(end, |t| t.min(end));
+    if to - from < LEAST_SHARED {
+        let spans: Vec<String> =
+            cameras.iter().zip(&known).map(|(c, (o, d))| format!("{} {:.1} to {:.1} s", c.name, o, o + d)).collect();
+        return Err(Error::input(format!("the cameras film nothing at the same time: {}", spans.join(", ")))
+            .remedy("Leave out the camera that is apart (use = false in import.toml), or choose another part."));
+    }
+    let cut = |(offset, duration): &(f64, f64)| Selection {
+        from: (from - offset > 0.0).then_some(from - offset),
+        to: (to - offset < *duration).then_some(to - offset),
+        ..selection.clone()
+    };
+    Ok(known.iter().map(cut).collect())
+}
+
+/// What was measured and not believed, a line each.
+pub(super) fn refusals(names: &[&str], evidence: &[Evidence], clock: &Solution) -> Vec<String> {
+    let word = |kind: Kind| match kind {
+        Kind::Given => "what was told",
+        Kind::Geometry => "geometry",
+        Kind::Sound => "sound",
+        Kind::Motion => "motion",
+    };
+    let line = |r: &graph::Refused| {
+        let e = &evidence[r.evidence];
+        let off = r.off?;
+        let [a, b] = e.cameras.map(|c| names[c]);
+        Some(format!("{a} and {b}: {} contradicts the rest by {:.0} ms", word(e.kind), 1e3 * off.abs()))
+    };
+    clock.refused.iter().filter_map(line).collect()
+}

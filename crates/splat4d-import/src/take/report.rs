@@ -1,0 +1,94 @@
+//! What was found, and how sure it is.
+
+use super::poses::Stand;
+use crate::Result;
+use crate::sync::graph::{Kind, Offset};
+use crate::write::Pictures;
+use serde::Serialize;
+use splat4d_train::run::checkpoint::write_atomically;
+use std::path::{Path, PathBuf};
+
+/// The file in the capture's folder.
+const FILE: &str = "import/report.json";
+
+/// What an import found.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct Report {
+    /// The capture's file.
+    pub capture: PathBuf,
+    /// A row for each camera.
+    pub cameras: Vec<CameraReport>,
+    /// Points that cameras agree on.
+    pub points: usize,
+    /// What had to be assumed, a sentence each.
+    pub guesses: Vec<String>,
+    /// Pairs of cameras whose lag was measured and contradicts the rest.
+    pub refused: Vec<String>,
+    /// Pairs of cameras that motion tells no lag of, and why.
+    pub motion: Vec<String>,
+}
+
+/// What an import found of a camera.
+#[derive(Clone, Debug, Serialize)]
+pub struct CameraReport {
+    /// Its name.
+    pub name: String,
+    /// Stored frames.
+    pub frames: usize,
+    /// Pixels across and down.
+    pub size: [usize; 2],
+    /// Frames per second.
+    pub rate: f64,
+    /// Missing and doubled frames.
+    pub lost: [usize; 2],
+    /// Seconds that are added to its clock; none: its file's clock was taken.
+    pub offset: Option<f64>,
+    /// Their standard deviation.
+    pub sigma: Option<f64>,
+    /// What the offset is from.
+    pub by: Vec<&'static str>,
+    /// Why it could not be placed.
+    pub trouble: Option<String>,
+    /// Points that it sees where they are.
+    pub sightings: usize,
+    /// Median distance of points from where they are seen, pixels.
+    pub error: Option<f64>,
+    /// Focal length, pixels.
+    pub focal: Option<f64>,
+    /// What was odd about its file.
+    pub warnings: Vec<String>,
+}
+
+impl CameraReport {
+    pub(super) fn of(pictures: &Pictures, placed: &Result<Stand, String>, offset: Option<&Offset>) -> Self {
+        let stand = placed.as_ref().ok();
+        let word = |kind: &Kind| match kind {
+            Kind::Given => "told",
+            Kind::Geometry => "geometry",
+            Kind::Sound => "sound",
+            Kind::Motion => "motion",
+        };
+        Self {
+            name: pictures.name.clone(),
+            frames: pictures.shots.len(),
+            size: pictures.size,
+            rate: pictures.clock.rate(),
+            lost: [pictures.clock.missing(), pictures.clock.doubled.len()],
+            offset: offset.map(|o| o.seconds),
+            sigma: offset.map(|o| o.sigma),
+            by: offset.map_or_else(Vec::new, |o| o.kinds.iter().map(word).collect()),
+            trouble: placed.as_ref().err().cloned(),
+            sightings: stand.map_or(0, |s| s.sightings),
+            error: stand.map(|s| s.error),
+            focal: stand.map(|s| s.lens.focal),
+            warnings: pictures.warnings.clone(),
+        }
+    }
+}
+
+impl Report {
+    pub(super) fn write(&self, folder: &Path) -> Result<()> {
+        let text = serde_json::to_string_pretty(self).expect("a report is plain data");
+        write_atomically(&folder.join(FILE), format!("{text}\n").as_bytes())
+    }
+}

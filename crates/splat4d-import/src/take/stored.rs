@@ -1,0 +1,67 @@
+//! The stored pictures as structure from motion asks for them.
+
+use crate::sfm;
+use crate::sync::graph::Offset;
+use crate::write::Pictures;
+use crate::{Error, Result};
+use splat4d::scene::Planes;
+use splat4d_train::capture::Rgb8;
+use std::path::Path;
+
+/// All cameras' stored pictures, and the clock of all as far as it is known.
+pub(super) struct Stored<'a> {
+    pub folder: &'a Path,
+    pub pictures: &'a [Pictures],
+    pub offsets: Vec<Option<Offset>>,
+}
+
+impl<'a> Stored<'a> {
+    pub(super) fn new(folder: &'a Path, pictures: &'a [Pictures]) -> Self {
+        Self { folder, pictures, offsets: vec![None; pictures.len()] }
+    }
+
+    /// The same pictures on another clock.
+    pub(super) fn on(&self, offsets: &[Option<Offset>]) -> Self {
+        Self { offsets: offsets.to_vec(), ..*self }
+    }
+
+    pub(super) fn rgb(&self, camera: usize, frame: usize) -> Result<Rgb8> {
+        Rgb8::read(&self.folder.join(self.pictures[camera].file(frame)))
+    }
+}
+
+impl sfm::pictures::Pictures for Stored<'_> {
+    fn cameras(&self) -> usize {
+        self.pictures.len()
+    }
+
+    fn name(&self, camera: usize) -> String {
+        self.pictures[camera].name.clone()
+    }
+
+    fn frames(&self, camera: usize) -> usize {
+        self.pictures[camera].shots.len()
+    }
+
+    fn time(&self, camera: usize, frame: usize) -> f64 {
+        let time = self.pictures[camera].shots[frame].time;
+        self.offsets[camera].as_ref().map_or(time, |o| o.global(time))
+    }
+
+    fn load(&self, camera: usize, frame: usize) -> Result<Planes<f32>> {
+        let picture = self.rgb(camera, frame)?;
+        if [picture.width, picture.height] != self.pictures[camera].size {
+            return Err(Error::input("a stored picture is of another size than the rest")
+                .at(self.folder.join(self.pictures[camera].file(frame)).display())
+                .remedy("Remove the folder \"images\" and import again."));
+        }
+        let mut out = Planes::new(3, picture.height, picture.width);
+        let count = picture.width * picture.height;
+        for (i, pixel) in picture.data.chunks_exact(3).enumerate() {
+            for c in 0..3 {
+                out.data[c * count + i] = f32::from(pixel[c]) / 255.0;
+            }
+        }
+        Ok(out)
+    }
+}
