@@ -6,6 +6,8 @@ mod bench;
 mod compress;
 #[path = "cli/convert.rs"]
 mod convert;
+#[path = "cli/import.rs"]
+mod import;
 #[path = "cli/sample.rs"]
 mod sample;
 
@@ -42,7 +44,9 @@ fn json_of(path: &Path) -> Value {
 #[test]
 fn help_teaches_and_completions_complete() {
     let help = splat4d(&["--help"]).run().ok();
-    for verb in ["train", "eval", "render", "bake", "view", "export", "convert", "info", "bench", "completions"] {
+    for verb in
+        ["import", "train", "eval", "render", "bake", "view", "export", "convert", "info", "bench", "completions"]
+    {
         assert!(help.contains(verb), "{verb} is missing");
         let own = splat4d(&[verb, "--help"]).run().ok();
         assert!(own.contains("Examples:") && own.contains(&format!("splat4d {verb}")), "{verb} --help teaches nothing");

@@ -21,7 +21,7 @@ pub struct View {
     pub pose: Se3,
     /// Which of [`Bundle::lenses`]; several views may share one.
     pub lens: usize,
-    /// What must be added to its times, seconds.
+    /// How far its clock is ahead, seconds: to be taken from its times.
     pub tau: f64,
 }
 

@@ -69,6 +69,8 @@ const PLACED_WITHIN: f64 = 2.0;
 /// Views from which on focal lengths are adjusted, and from which on all else is: few views do not tell them from poses.
 const FOCAL_FROM: usize = 3;
 const ALL_FROM: usize = 7;
+/// Small rigs have no more: then from all of them, and at least so many.
+const FEWEST: usize = 4;
 /// Everything is adjusted again once there are so many times as many views.
 const GROWTH: f64 = 1.08;
 /// Standard deviations: of log f where it is guessed and where it is known; of k1; of the principal point, of the larger side; of
@@ -335,9 +337,9 @@ impl Map<'_> {
         self.spots = (0..self.tracks.len()).into_par_iter().map(next).collect();
     }
 
-    fn free(&self, all: bool) -> Free {
+    fn free(&self) -> Free {
         let n = self.order.len();
-        let rest = all || n >= ALL_FROM;
+        let rest = n >= ALL_FROM.min(self.sights.len()).max(FEWEST);
         let moves = self.how.clocks && self.sights.iter().all(|s| s.frame > 0.0);
         Free { focal: n >= FOCAL_FROM, k1: rest, center: rest, tau: rest && moves }
     }
@@ -384,7 +386,7 @@ impl Map<'_> {
         let family = !told && self.family(&lens_back);
         let settings = Settings {
             scale: self.how.scale * unit(size),
-            free: self.free(false),
+            free: self.free(),
             priors: Priors {
                 lenses: lens_back.iter().map(|&l| self.guesses[l]).collect(),
                 focal: if told { TOLD } else { GUESSED },
@@ -614,7 +616,7 @@ pub struct Stand {
     pub pose: Se3,
     /// Of pictures of the sight's size.
     pub lens: Lens,
-    /// What must be added to its times, seconds.
+    /// How far its clock is ahead, seconds.
     pub tau: f64,
     /// Points that it sees where they are.
     pub sightings: usize,

@@ -61,7 +61,7 @@ pub struct Placed {
     pub lens: Lens,
     /// Pixels across and down of the files' pictures (of those that were halved: a little less).
     pub size: [usize; 2],
-    /// What must be added to its times, seconds; only differences between cameras mean anything.
+    /// How far its clock is ahead, seconds: to be taken from its times. Only differences between cameras mean anything.
     pub tau: f64,
     /// Points that it sees where they are.
     pub sightings: usize,

@@ -56,6 +56,13 @@ pub struct Request {
 /// Frames of a moving camera that are placed at most: every one is a camera of its own to the solver.
 const MOST_WALKING: usize = 150;
 
+/// Share of the cameras that must be placed, and below which that is told: what people who reconstruct by
+/// structure from motion go by.
+const PLACED_LEAST: f64 = 0.7;
+const PLACED_WARN: f64 = 0.9;
+/// Points below which a reconstruction hangs on too little: a chessboard's.
+const FEW_POINTS: usize = 50;
+
 /// A camera on its way.
 struct Camera {
     name: String,
@@ -142,6 +149,43 @@ fn names_of(pictures: &[Pictures]) -> Vec<&str> {
     pictures.iter().map(|p| p.name.as_str()).collect()
 }
 
+/// Refuses what would only waste the time of training: most cameras, or frames of a moving one, must have been placed.
+fn check(solved: &poses::Solved, pictures: &[Pictures], report: &mut Report) -> Result<()> {
+    let (placed, asked) = if solved.moving {
+        let known = |s: &poses::Stand| s.poses.iter().flatten().count();
+        let asked: usize = pictures.iter().map(|p| p.shots.len()).sum();
+        (solved.cameras.iter().flatten().map(known).sum(), asked.min(MOST_WALKING))
+    } else {
+        (solved.cameras.iter().flatten().count(), solved.cameras.len())
+    };
+    let what = if solved.moving { "frames" } else { "cameras" };
+    let share = placed as f64 / asked as f64;
+    if placed < 2 || share < PLACED_LEAST {
+        let reasons: Vec<String> = solved
+            .cameras
+            .iter()
+            .zip(pictures)
+            .filter_map(|(c, p)| c.as_ref().err().map(|why| format!("{}: {why}", p.name)))
+            .collect();
+        let reasons = if reasons.is_empty() { String::new() } else { format!(" ({})", reasons.join("; ")) };
+        return Err(Error::input(format!("only {placed} of {asked} {what} could be placed{reasons}")).remedy(format!(
+            "Film one scene from neighbouring places (at most 30 degrees apart), in focus and in light; or leave those out \
+             (use = false in {}) and run the same command again.",
+            corrections::FILE
+        )));
+    }
+    if share < PLACED_WARN {
+        report.guesses.push(format!("Only {placed} of {asked} {what} could be placed; the rest is left out."));
+    }
+    if solved.points.len() < FEW_POINTS {
+        report.guesses.push(format!(
+            "Only {} points hold the cameras together: look at the result before you trust it.",
+            solved.points.len()
+        ));
+    }
+    Ok(())
+}
+
 /// Opens all inputs; no file twice.
 fn open(request: &Request) -> Result<Vec<Camera>> {
     let paths = find(&request.inputs)?;
@@ -197,18 +241,8 @@ fn finish(
         }
     }
     corrections.write(folder)?;
-    let least = if solved.moving { 1 } else { 2 };
     report.write(folder)?;
-    if placed.len() < least {
-        let reasons: Vec<String> = solved
-            .cameras
-            .iter()
-            .zip(pictures)
-            .filter_map(|(c, p)| c.as_ref().err().map(|why| format!("{}: {why}", p.name)))
-            .collect();
-        return Err(Error::input(format!("too few cameras could be placed ({})", reasons.join("; ")))
-            .remedy("Film one scene from neighbouring places (at most 30 degrees apart), in focus and in light."));
-    }
+    check(&solved, pictures, &mut report)?;
     let points = PathBuf::from("points.ply");
     splat4d_train::run::checkpoint::write_atomically(
         &folder.join(&points),

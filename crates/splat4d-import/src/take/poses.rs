@@ -120,6 +120,10 @@ fn refined(
         let taken = solution.taken.iter().find(|t| t.camera == c)?;
         taken.placed.as_ref().ok().filter(|_| seen[c] >= MOVING_POINTS).map(|p| p.tau)
     };
+    // Of three cameras clocks are not adjusted.
+    if (0..n).filter_map(tau).all(|tau| tau == 0.0) {
+        return 0.0;
+    }
     // The clock of those that are told, else the first camera's that geometry knows.
     let mut fixed: Vec<f64> = (0..n).filter(|&c| told[c].is_some()).filter_map(tau).collect();
     fixed.sort_by(f64::total_cmp);
@@ -127,7 +131,8 @@ fn refined(
     let mut most: f64 = 0.0;
     for c in 0..n {
         let Some(tau) = tau(c).filter(|_| told[c].is_none()) else { continue };
-        let change = tau - zero;
+        // A clock that is ahead is put back.
+        let change = zero - tau;
         most = most.max(change.abs());
         let own = &mut current[c];
         own.seconds += change;

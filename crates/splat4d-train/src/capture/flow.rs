@@ -7,7 +7,6 @@
 use super::lens::Distortion;
 use super::picture::{self, Samples};
 use super::{Capture, Frame};
-use rayon::prelude::*;
 use splat4d::scene::{Camera, Planes};
 use splat4d::{Error, Result};
 use std::path::{Path, PathBuf};
@@ -94,5 +93,5 @@ fn straighten(codes: Vec<Code>, from: &Camera, to: &Camera) -> Vec<Code> {
         let fits = way.iter().all(|w| (0.0..=f64::from(u16::MAX)).contains(w));
         (code[2] != 0 && fits).then_some([way[0] as u16, way[1] as u16, 1])
     };
-    (0..codes.len()).into_par_iter().map(|p| pixel(p).unwrap_or_default()).collect()
+    (0..codes.len()).map(|p| pixel(p).unwrap_or_default()).collect()
 }

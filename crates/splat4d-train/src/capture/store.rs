@@ -284,6 +284,7 @@ impl Shared {
         }
         drop(state);
         let _loading = Loading(self, frame);
+        // On this thread alone: one that shared the work with others could be given a job that waits for this very picture.
         let picture = Arc::new(prepare(&self.capture.frames[frame], &self.capture)?);
         self.keep(frame, &picture);
         Ok(picture)
@@ -449,7 +450,7 @@ impl UndistortMap {
             let inside = (0.0..=width).contains(&u) && (0.0..=height).contains(&v);
             if inside { [(u - 0.5) as f32, (v - 0.5) as f32] } else { outside }
         };
-        Self { positions: (0..camera.width * camera.height).into_par_iter().map(at).collect() }
+        Self { positions: (0..camera.width * camera.height).map(at).collect() }
     }
 
     /// 1 where the original picture reaches, else 0; `None` if it reaches everywhere.
@@ -471,6 +472,6 @@ impl UndistortMap {
             let row = |y: usize| plane[y * width + x0] * (1.0 - fx) + plane[y * width + x1] * fx;
             row(y0) * (1.0 - fy) + row(y1) * fy
         };
-        self.positions.par_iter().map(sample).collect()
+        self.positions.iter().map(sample).collect()
     }
 }

@@ -5,7 +5,8 @@ use super::samples::{self, HEIGHT, WIDTH};
 use crate::capture::lens::Distortion;
 use image::{ImageBuffer, Luma};
 use serde_json::json;
-use std::sync::Arc;
+use std::sync::{Arc, Condvar, Mutex};
+use std::time::Duration;
 
 const JPEG: &[u8] = include_bytes!("tiny.jpg");
 
@@ -155,4 +156,34 @@ fn cache_keeps_its_budget_and_never_changes_pixels() {
     }
     (0..3).for_each(|i| drop(roomy.load(i).unwrap()));
     assert_eq!(roomy.decoded(), 3, "prefetched pictures must not be decoded again");
+}
+
+#[test]
+fn a_picture_is_undistorted_while_all_workers_are_busy() {
+    // A worker that waits for a picture cannot help to make it: whoever makes one must not need the workers.
+    let sample = samples::own();
+    sample.edit("capture.json", |v| {
+        v["cameras"][1]["distortion"] = json!({"model": "opencv", "k": [-0.2, 0.03], "p": [0.002, -0.001]});
+    });
+    let store = ImageStore::new(open(sample.root(), 1), 1 << 30);
+    let busy = Arc::new((Mutex::new((0, false)), Condvar::new()));
+    let workers = rayon::current_num_threads();
+    for _ in 0..workers {
+        let busy = Arc::clone(&busy);
+        rayon::spawn(move || {
+            let mut state = busy.0.lock().unwrap();
+            state.0 += 1;
+            busy.1.notify_all();
+            drop(busy.1.wait_while(state, |s| !s.1).unwrap());
+        });
+    }
+    // Where other tests keep a worker for longer, it is busy too.
+    let all = busy.1.wait_timeout_while(busy.0.lock().unwrap(), Duration::from_secs(2), |s| s.0 < workers).unwrap();
+    drop(all);
+    let (done, ended) = std::sync::mpsc::channel();
+    std::thread::spawn(move || done.send(store.load(2).is_ok()));
+    let answer = ended.recv_timeout(Duration::from_secs(20));
+    busy.0.lock().unwrap().1 = true;
+    busy.1.notify_all();
+    assert_eq!(answer, Ok(true));
 }
