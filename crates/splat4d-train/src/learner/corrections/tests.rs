@@ -73,7 +73,7 @@ fn only_what_was_seen_moves_within_its_time_and_its_limits() {
     c.step(&[1], &d, &[1.0], 0.9, 1.0);
     c.step(&[1], &[[f64::NAN; 6]], &[f64::NAN], 0.5, 1.0);
     assert!(c.tables().zip(&before).all(|((_, t), old)| t == old), "too early, too late, not finite");
-    c.step(&[1, 0], &[d[0], d[0]], &[1.0, 1.0], 0.5, 1.0);
+    c.step(&[1, 0], &[d[0], d[0]], &[1.0, 1.0], 0.34, 1.0);
     let times: Vec<f64> = (0..3).map(|i| c.time(i, Time(0.0)).0).collect();
     assert!(times[0] == 0.0 && (times[1] + 0.15).abs() < 1e-6 && times[2].abs() < 1e-6, "{times:?}");
     let moved = |i: usize| c.camera(i, &cameras[i]) != cameras[i];
