@@ -5,7 +5,7 @@ use crate::console::Console;
 use crate::draw::{Channel, Painter};
 use crate::files;
 use crate::paths::{Clock, Route, Stage, orbit_seconds, shots};
-use crate::report;
+use crate::report::{self, refined_in_words};
 use crate::run_folder::{ORDER, Run};
 use crate::source::{Source, not_empty, read_scene};
 use crate::video::{Film, have_ffmpeg};
@@ -13,9 +13,11 @@ use serde_json::{Value, json};
 use splat4d::layers::Scene;
 use splat4d::{Error, Result};
 use splat4d_train::capture::{Capture, ImageStore};
+use splat4d_train::eval::Align;
 use splat4d_train::eval::run::{EvalOptions, Measured, Scores, evaluate};
 use splat4d_train::eval::tracks::track_error;
 use splat4d_train::recipe::Recipe;
+use splat4d_train::run::corrected;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
@@ -116,7 +118,8 @@ pub fn playback(run: &Path, console: &Console) -> Result<()> {
 /// Renders and scores the held-out views.
 pub(crate) fn scores(run: &Path, scene: &Scene<f32>, measure: &Measure, console: &Console) -> anyhow::Result<Scores> {
     let opened = Run::open(run)?;
-    let (capture, recipe) = opened.open_capture()?;
+    let (mut capture, recipe) = opened.open_capture()?;
+    corrected::apply(&mut capture, run)?;
     let capture = Arc::new(capture);
     let measuring = Measuring { opened: &opened, recipe: &recipe, measure };
     let evaluation = measuring.evaluate(scene, &capture, Measured::Test, None, console)?;
@@ -143,7 +146,8 @@ pub(crate) fn scores_on(
 ) -> anyhow::Result<()> {
     let opened = Run::open(run)?;
     let mut scene = read_scene(&opened.scene_file()?)?;
-    let (capture, recipe) = opened.open_capture()?;
+    let (mut capture, recipe) = opened.open_capture()?;
+    corrected::apply(&mut capture, run)?;
     let split = measured.name();
     if measured.frames(&capture).is_empty() {
         return Err(Error::input(format!("the run's capture has no views of the split `{split}`"))
@@ -213,6 +217,7 @@ impl Measuring<'_> {
             lpips_weights: self.measure.lpips_weights.clone(),
             measured,
             place,
+            align: Align::of(capture, self.recipe),
             ..EvalOptions::default()
         };
         let iteration = self.opened.iteration().unwrap_or(0);
@@ -260,6 +265,7 @@ fn in_words(score: impl Fn(&str) -> Option<f64>) -> String {
     let mut words = Vec::new();
     for (key, name, digits, unit) in [
         ("PSNR", "PSNR", 2, " dB"),
+        ("PSNR-aligned", "aligned", 2, " dB"),
         ("PSNR-cc", "colour-corrected", 2, " dB"),
         ("PSNR-dynamic", "where things move", 2, " dB"),
         ("PSNR-foreground", "foreground", 2, " dB"),
@@ -274,6 +280,14 @@ fn in_words(score: impl Fn(&str) -> Option<f64>) -> String {
         }
     }
     words.join(", ")
+}
+
+/// Says how far training moved the cameras, the one that went furthest by name.
+pub(crate) fn say_refined(run: &Path, console: &Console) -> Result<()> {
+    if let Some(words) = corrected::read(run)?.and_then(|refined| refined_in_words(&refined)) {
+        console.say(&words);
+    }
+    Ok(())
 }
 
 /// The scores in one line.

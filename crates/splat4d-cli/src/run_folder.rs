@@ -18,7 +18,7 @@ pub(crate) const COMPRESS: &str = "compress.json";
 /// File that holds the settings `compress` was asked for.
 pub(crate) const ORDER: &str = "compress.toml";
 /// Files and folders that splat4d writes into a run; `--force` replaces these and nothing else.
-const OURS: [&str; 26] = [
+const OURS: [&str; 27] = [
     "recipe.toml",
     "run.json",
     "scene.safetensors",
@@ -26,6 +26,7 @@ const OURS: [&str; 26] = [
     "checkpoints",
     "metrics.csv",
     "results.json",
+    "refined.json",
     "per_view.json",
     COMPRESS,
     "cameras.json",

@@ -4,8 +4,11 @@
 //! scene, opacities are lowered) goes through the methods here, so that scene, moments and statistics cannot come apart,
 //! and whoever remembers something of rows hears of it: the learner notes how far it was `Touched`.
 
+mod corrections;
 mod exposure;
 
+pub use corrections::{Corrections, RefineSettings, Scale};
+pub(crate) use corrections::{Origin, moved};
 pub(crate) use exposure::Exposure;
 
 use crate::Result;
@@ -95,6 +98,8 @@ pub struct Learner {
     touched: Touched,
     /// Learnable exposures of the cameras; none: they show what is drawn.
     pub exposure: Option<Exposure>,
+    /// Learnable corrections of poses and clocks; none: they are what the capture states.
+    pub corrections: Option<Corrections>,
 }
 
 /// All parts of a learner, for a step.
@@ -109,14 +114,14 @@ impl Learner {
     /// A scene that has learnt nothing yet.
     pub(crate) fn new(scene: Scene<f32>) -> Self {
         let moments = scene.layers.iter().map(|l| Moments::new(&l.params)).collect();
-        Self { stats: Stats::new(&scene), moments, scene, touched: Touched::Values, exposure: None }
+        Self { stats: Stats::new(&scene), moments, scene, touched: Touched::Values, exposure: None, corrections: None }
     }
 
     /// A learner as a checkpoint has it. Panics: moments and statistics of another scene.
     pub(crate) fn resumed(scene: Scene<f32>, moments: Vec<Moments<f32>>, stats: Stats) -> Self {
         let layers = scene.layers.len();
         assert_eq!([moments.len(), stats.tables.len()], [layers; 2], "moments and statistics by layer");
-        Self { scene, moments, stats, touched: Touched::Values, exposure: None }
+        Self { scene, moments, stats, touched: Touched::Values, exposure: None, corrections: None }
     }
 
     /// The scene that learns.

@@ -16,6 +16,7 @@ mod text;
 
 use crate::capture::CaptureSettings;
 use crate::init::InitSettings;
+use crate::learner::RefineSettings;
 use crate::loss::{LossSettings, TransportSettings};
 use crate::methods::{
     AppearanceSettings, ControlSettings, DeformSettings, FilterSettings, HexplaneSettings, LifeSettings,
@@ -60,6 +61,7 @@ recipe! {
     init: InitSettings,
     appearance: AppearanceSettings,
     rates: RateSettings,
+    refine: RefineSettings,
     life: LifeSettings,
     spacetime: SpacetimeSettings,
     deform: DeformSettings,

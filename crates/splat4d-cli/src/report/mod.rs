@@ -5,10 +5,12 @@
 pub mod chart;
 pub(crate) mod compress;
 mod pictures;
+mod refined;
 
 use crate::files::{self, grouped, human_bytes, human_seconds};
 use crate::run_folder::{Beside, Metrics, Run, ViewScore, beside};
 use chart::{Series, bars, escape, lines, short};
+pub(crate) use refined::refined_in_words;
 use serde_json::Value;
 use splat4d::Result;
 use std::fmt::Write;
@@ -34,6 +36,7 @@ fn page(run: &Run) -> String {
     header(&mut body, run);
     cards(&mut body, run);
     findings(&mut body, run);
+    refined::section(&mut body, run);
     compress::section(&mut body, run);
     film(&mut body, run);
     views(&mut body, run);
@@ -77,6 +80,7 @@ fn cards(out: &mut String, run: &Run) {
     };
     for (class, key, digits, unit, name) in [
         ("main", "PSNR", 2, "dB", "PSNR, held-out views"),
+        ("", "PSNR-aligned", 2, "dB", "PSNR, held-out cameras aligned"),
         ("", "PSNR-cc", 2, "dB", "PSNR, each camera's colours corrected"),
         ("main", "PSNR-dynamic", 2, "dB", "PSNR where things move"),
         ("", "PSNR-foreground", 2, "dB", "PSNR of the foreground"),

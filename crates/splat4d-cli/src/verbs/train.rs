@@ -194,6 +194,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         .into());
     }
     console.say(&format!("wrote {}", run.join("scene.safetensors").display()));
+    finish::say_refined(&run, console)?;
     if args.no_eval {
         finish::playback(&run, console)?;
     } else {

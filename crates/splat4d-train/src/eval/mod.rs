@@ -3,6 +3,7 @@
 //! [`score_view`] measures one image, a [`Split`] holds the images of the held-out or the training cameras, and
 //! [`run::evaluate`] writes `results.json` (means) and `per_view.json` in the layout of the 3DGS scripts.
 
+mod align;
 mod colour;
 mod conv;
 pub(crate) mod lpips;
@@ -11,6 +12,7 @@ mod report;
 pub mod run;
 pub mod tracks;
 
+pub use align::Align;
 pub use colour::ColourMatrix;
 pub use lpips::{InputScaling, Lpips, Net};
 pub use report::{CameraScores, Conditions, Report, Score, Split, View};

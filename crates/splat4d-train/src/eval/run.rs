@@ -16,6 +16,7 @@
 //! camera's temporal mean) and flicker are defined for fixed cameras only. Where a picture was undistorted, pixels
 //! without an original take the truth's colour, so that they count as right in every metric.
 
+use super::align::Align;
 use super::colour::{ColourSums, IDENTITY};
 use super::metrics::{self, Flicker, TemporalMean};
 use super::report::METHOD;
@@ -94,6 +95,8 @@ pub struct EvalOptions {
     /// Where results and pictures go in their files: `None` for the held-out views on the run's own background, which are
     /// what a run is judged by; otherwise the name of an entry, such as `val` or `test-black`.
     pub place: Option<String>,
+    /// How held-out views are aligned, to be measured a second time (`PSNR-aligned`); `None`: not.
+    pub align: Option<Align>,
 }
 
 impl Default for EvalOptions {
@@ -106,6 +109,7 @@ impl Default for EvalOptions {
             train_views: TRAIN_VIEWS,
             measured: Measured::Test,
             place: None,
+            align: None,
         }
     }
 }
@@ -122,6 +126,8 @@ pub struct Scores {
     pub report: Report,
     /// Share of the held-out pixels that are dynamic; `None` without fixed held-out cameras.
     pub dynamic_share: Option<f64>,
+    /// How far held-out cameras were moved for `PSNR-aligned`; `None`: they were not aligned.
+    pub aligned: Option<Value>,
 }
 
 impl Scores {
@@ -164,10 +170,13 @@ pub fn evaluate(
     listen: &mut dyn FnMut(&Event),
 ) -> Result<Scores> {
     let evaluation = assess(scene, capture, store, iteration, options, listen)?;
-    let Scores { report, dynamic_share } = &evaluation;
+    let Scores { report, dynamic_share, aligned } = &evaluation;
     let (mut results, mut views) = (report.results(), report.per_view());
     let (ours, frames) = (report.method(), options.measured.frames(capture));
     results[&ours]["dynamic-share"] = json!(dynamic_share);
+    if let Some(aligned) = aligned {
+        results[&ours]["aligned"] = aligned.clone();
+    }
     results[&ours]["conditions"] = json!(report.conditions);
     results[&ours]["conditions"]["step"] = json!(report.iteration);
     views[&ours]["camera"] = by_file(frames, |f| json!(capture.cameras[capture.frames[f].camera].name));
@@ -201,8 +210,12 @@ pub fn assess(
         Measured::Validation => "evaluating validation views",
         Measured::Train => "evaluating all training views",
     };
-    let test = judge.split(options.measured.frames(capture), whole, name, listen)?;
+    let mut test = judge.split(options.measured.frames(capture), whole, name, listen)?;
     let dynamic_share = judge.dynamic_share();
+    let frames = options.measured.frames(capture);
+    // What was trained on stands where training put it.
+    let align = options.align.as_ref().filter(|_| options.measured != Measured::Train && !frames.is_empty());
+    let aligned = align.map(|align| judge.align(align, frames, &mut test, listen)).transpose()?;
     let some =
         if options.measured == Measured::Test { spread(&capture.train, options.train_views) } else { Vec::new() };
     let train = judge.split(&some, Views::Train, "evaluating training views", listen)?;
@@ -214,7 +227,7 @@ pub fn assess(
     };
     let train = (!some.is_empty()).then_some(train);
     let report = Report { iteration: iteration as u64, conditions, test, train };
-    Ok(Scores { report, dynamic_share })
+    Ok(Scores { report, dynamic_share, aligned })
 }
 
 struct Judge<'a> {
@@ -300,6 +313,24 @@ impl<'a> Judge<'a> {
         Ok(split)
     }
 
+    /// Measures `PSNR-aligned` of frames that `split` holds. Returns how far they were moved.
+    fn align(
+        &mut self,
+        align: &Align,
+        frames: &[usize],
+        split: &mut Split,
+        listen: &mut dyn FnMut(&Event),
+    ) -> Result<Value> {
+        let mut told = |done, total| listen(&Event::Phase { name: "aligning held-out cameras".into(), done, total });
+        let (scene, store, backend) = (self.scene, self.store, self.backend.as_mut());
+        let (capture, report) = align.fit(scene, self.capture, store, frames, backend, &mut told)?;
+        for (view, &frame) in split.views.iter_mut().zip(frames) {
+            let (image, truth, _) = self.draw(&capture, frame)?;
+            view.set("PSNR-aligned", Score::or(metrics::psnr(&image, &truth), "the image has no pixels"));
+        }
+        Ok(report)
+    }
+
     fn temporal_mean(&self, frames: &[usize], places: &[usize]) -> Result<Planes<f32>> {
         let (mut mean, mut truth) = (TemporalMean::default(), Planes::default());
         for &place in places {
@@ -309,10 +340,10 @@ impl<'a> Judge<'a> {
         Ok(mean.mean().expect("a camera has at least one frame"))
     }
 
-    /// Draws one frame and measures it.
-    fn view(&mut self, name: &str, frame: usize, mean: Option<&Planes<f32>>) -> Result<Drawn> {
+    /// Draws a frame from where `capture` has it: the render, clean of pixels without truth, the truth, and the sums of both.
+    fn draw(&mut self, capture: &Capture, frame: usize) -> Result<(Planes<f32>, Planes<f32>, ColourSums)> {
         let stored = self.store.load(frame)?;
-        let (info, mut truth) = (&self.capture.frames[frame], Planes::default());
+        let (info, mut truth) = (&capture.frames[frame], Planes::default());
         stored.color_into(&mut truth);
         self.scene.at(info.time, &mut self.instant);
         let splats = self.scene.splats(&self.instant);
@@ -324,6 +355,13 @@ impl<'a> Judge<'a> {
         if let Some(known) = known {
             hide_unknown(&mut image, &truth, known);
         }
+        Ok((image, truth, sums))
+    }
+
+    /// Draws one frame and measures it.
+    fn view(&mut self, name: &str, frame: usize, mean: Option<&Planes<f32>>) -> Result<Drawn> {
+        let (image, truth, sums) = self.draw(self.capture, frame)?;
+        let stored = self.store.load(frame)?;
         let foreground = foreground(&stored);
         let dynamic = mean.map(|m| metrics::dynamic_region(&truth, m));
         if let Some(region) = &dynamic {

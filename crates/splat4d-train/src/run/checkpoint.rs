@@ -1,4 +1,4 @@
-//! Checkpoints hold everything: scene, moments, statistics, exposure, the memory of
+//! Checkpoints hold everything: scene, moments, statistics, exposure, corrections of cameras, the memory of
 //! losses, codecs and upkeep, how far the run is. Random
 //! numbers and samplers are functions of the step and need no saving. A resumed run is bit for bit the unbroken one.
 //!
@@ -61,6 +61,9 @@ pub fn write(trainer: &Trainer<'_>, identity: &Identity, state: &RunState) -> Re
     if let Some(e) = &trainer.learner.exposure {
         push("exposure".into(), &e.params[e.key()]);
         push("exposure.moments".into(), e.moments.table(e.key()));
+    }
+    for (name, table) in trainer.learner.corrections.iter().flat_map(|c| c.tables()) {
+        push(name.into(), table);
     }
     let mut memories: Vec<(String, Vec<u32>)> = trainer
         .stages
@@ -146,6 +149,9 @@ pub fn read(bytes: &[u8], trainer: &mut Trainer<'_>, identity: &Identity) -> Res
         load(&file, "exposure", &mut e.params[key])?;
         load(&file, "exposure.moments", e.moments.table_mut(key))?;
     }
+    for (name, table) in trainer.learner.corrections.iter_mut().flat_map(|c| c.tables_mut()) {
+        load(&file, name, table)?;
+    }
     for (s, stage) in trainer.stages.iter_mut().enumerate() {
         for (k, loss) in stage.params.iter().enumerate() {
             match file.get(&format!("memory.{s}.{k}")) {
@@ -195,6 +201,7 @@ pub fn read(bytes: &[u8], trainer: &mut Trainer<'_>, identity: &Identity) -> Res
     }
     let mut learner = Learner::resumed(scene, moments, stats);
     learner.exposure = trainer.learner.exposure.take();
+    learner.corrections = trainer.learner.corrections.take();
     trainer.restore(learner, progress);
     Ok(RunState {
         seconds: number(&meta["seconds"], "seconds")?,

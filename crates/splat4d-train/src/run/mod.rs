@@ -3,6 +3,7 @@
 mod budget;
 pub mod checkpoint;
 mod clock;
+pub mod corrected;
 pub mod dataset;
 mod identity;
 mod memory;
@@ -23,6 +24,7 @@ pub use memory::{memory_estimate, peak_memory};
 #[cfg(test)]
 pub(crate) use open::OpenCapture;
 pub use open::{capture_options, open_capture, plan, training_frames};
+pub(crate) use open::{learnable, scale};
 pub(crate) use points::with_found;
 pub(crate) use refine::{Refine, refine};
 pub use session::{Outcome, TrainOptions};

@@ -5,7 +5,7 @@ use super::dataset::Dataset;
 use crate::capture::{Capture, CaptureOptions, ImageStore};
 use crate::event::Event;
 use crate::init::{self, Seeds, Source};
-use crate::learner::Exposure;
+use crate::learner::{Corrections, Exposure, Origin, RefineSettings, Scale};
 use crate::loss::image::terms;
 use crate::methods::{Plan, Stage, auto, program_of, stages};
 use crate::recipe::{MotionName, Recipe};
@@ -118,6 +118,18 @@ pub fn plan(capture: &Capture, recipe: &Recipe) -> Plan {
     }
 }
 
+/// What of cameras a recipe lets learn. Clocks say nothing where nothing moves, and nothing can be asked between the frames
+/// of a model that is learnt frame by frame.
+pub(crate) fn learnable(recipe: &Recipe) -> RefineSettings {
+    let timed = !["still", "tracked"].contains(&recipe.run.motion.as_str());
+    RefineSettings { times: recipe.refine.times && timed, ..recipe.refine.clone() }
+}
+
+/// The scale of a plan's capture.
+pub(crate) fn scale(plan: &Plan) -> Scale {
+    Scale { extent: plan.extent, frame: if plan.fps > 0.0 { 1.0 / plan.fps } else { 1.0 } }
+}
+
 impl OpenCapture {
     pub(crate) fn new(capture: Arc<Capture>, recipe: &Recipe) -> Result<Self> {
         Ok(Self::with(training_frames(capture, recipe)?))
@@ -165,6 +177,20 @@ impl OpenCapture {
         init::scene(plan, program.as_ref(), &seeds, self.background(), self.capture.up)
     }
 
+    /// What is to be learnt of cameras, where the recipe wants it.
+    fn corrections(&self, plan: &Plan) -> Option<Corrections> {
+        let settings = learnable(&plan.recipe);
+        if !settings.poses && !settings.times {
+            return None;
+        }
+        let origin = |&i: &usize| {
+            let frame = &self.capture.frames[i];
+            Origin { rig: frame.camera, fixed: self.capture.cameras[frame.camera].fixed, camera: &frame.view }
+        };
+        let frames: Vec<Origin<'_>> = self.capture.train.iter().map(origin).collect();
+        Some(Corrections::new(&settings, scale(plan), &frames, self.capture.cameras.len(), true))
+    }
+
     pub(crate) fn trainer(&self, plan: &Plan, scene: Scene<f32>) -> Result<Trainer<'static>> {
         let mut trainer = self.trainer_of(plan, scene, stages(program_of(&plan.recipe)?.as_ref(), plan));
         trainer.replan(plan.recipe.run.replans.rows());
@@ -197,6 +223,7 @@ impl OpenCapture {
         let loss = TrainLoss::new(terms(r));
         let mut trainer = Trainer::new(scene, stages, self.frames.clone(), device::cpu(config), loss, settings);
         trainer.learner.exposure = exposure;
+        trainer.learner.corrections = self.corrections(plan);
         trainer
     }
 }

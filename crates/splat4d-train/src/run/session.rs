@@ -3,6 +3,7 @@
 use super::budget::{Budget, Place, Planner};
 use super::checkpoint::{self, Identity, RunState, write_atomically};
 use super::clock::Stopwatch;
+use super::corrected;
 use super::identity::fingerprint;
 use super::memory::peak_memory;
 use super::metrics::{Metrics, STAGE_NAMES, Totals, psnr};
@@ -302,6 +303,7 @@ impl Session<'_> {
     ) -> Result<()> {
         metrics.write(self.run)?;
         save_checkpoint(self.run, trainer, &self.identity, state, listen)?;
+        corrected::write(self.run, trainer, &self.opened.capture)?;
         self.write_info(totals, trainer, state, finished)
     }
 

@@ -282,6 +282,7 @@ impl<'a> Trainer<'a> {
                 return Ok(Err(Fault(format!("{} ({views})", fault.0))));
             }
         };
+        self.correct(&out);
         let clock = Clock::now();
         let (place, next) = (self.progress.stage_step, self.next_place());
         out.change = self.keep_up(place + 1..=next, |_| true)?;
@@ -302,7 +303,13 @@ impl<'a> Trainer<'a> {
     fn load(&mut self) -> Result<()> {
         let (Position { taken, stage_step: place, .. }, next) = (self.progress, self.next_place());
         let stage = &self.stages[self.progress.stage];
-        self.batch.load(self.frames.as_ref(), self.draw_frames(taken, place), place < stage.half_size_steps)?;
+        let corrections = self.learner.corrections.as_ref();
+        self.batch.load(
+            self.frames.as_ref(),
+            self.draw_frames(taken, place),
+            place < stage.half_size_steps,
+            corrections,
+        )?;
         if next < stage.iterations {
             self.frames.prefetch(&self.draw_frames(taken + 1, next));
         }
@@ -338,6 +345,17 @@ impl<'a> Trainer<'a> {
             min_opacity: limits.min_opacity,
         };
         self.engine.step(&mut self.learner, &mut plan)
+    }
+
+    /// Corrects cameras by what the step's views say.
+    fn correct(&mut self, stepped: &Stepped) {
+        let Position { stage, stage_step, rate_scale, .. } = self.progress;
+        let before: usize = self.stages[..stage].iter().map(|s| s.iterations).sum();
+        let progress = (before + stage_step) as f64 / self.schedule().max(1) as f64;
+        if let Some(corrections) = &mut self.learner.corrections {
+            let report = &stepped.report;
+            corrections.step(self.batch.seen(), &report.d_cameras, &report.d_times, progress, rate_scale);
+        }
     }
 
     /// Runs the operations of `which` that are due after any of these steps of the stage's schedule, once each and where

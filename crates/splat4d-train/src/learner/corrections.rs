@@ -1,0 +1,339 @@
+//! [`Corrections`]: what training learns of where cameras stand and when they looked.
+//!
+//! A correction of a pose is a twist ξ = (ρ, θ) in the camera's axes, `exp(ξ)·cam_from_world`; all frames of a fixed camera
+//! share one. A correction of a clock is a shift of all times of a camera. Pictures say nothing of where the scene as a whole
+//! stands, how large it is and when it begins: the cameras' mean motion, their mean growth and the first camera's clock stay.
+
+use crate::settings::settings;
+use serde_json::{Value, json};
+use splat4d::math::Se3;
+use splat4d::math::se3::{cross, dot, mat_mul, mat_vec, norm, sub, transpose};
+use splat4d::scene::{Camera, Table, Time};
+
+settings! {
+    /// Refinement of what the capture says of its cameras: poses and clocks that are corrected while the scene is learnt.
+    pub struct RefineSettings {
+        /// Learn a correction of every training camera's pose; one for all frames of a fixed camera. The cameras' mean
+        /// motion and growth stay nothing. Held-out views are measured aligned as well.
+        poses: bool = false;
+        /// Learn a shift of every training camera's clock; the first camera's stays.
+        times: bool = false => any().when(IsNot("run.motion", &["still", "tracked"]));
+        /// Rate of rotations at first (gsplat: 1e-5 over 30,000 steps; ours reaches half a degree in 50 views of a camera).
+        rotation_init: f64 = 1e-3 => positive().unit("radians").when(On("refine.poses"));
+        /// Rate of rotations at the end.
+        rotation_final: f64 = 1e-5 => positive().unit("radians").when(On("refine.poses"));
+        /// Rate of positions at first.
+        position_init: f64 = 1e-3 => positive().unit("extents").when(On("refine.poses"));
+        /// Rate of positions at the end.
+        position_final: f64 = 1e-5 => positive().unit("extents").when(On("refine.poses"));
+        /// Rate of clocks at first.
+        time_init: f64 = 0.05 => positive().unit("frames").when(On("refine.times"));
+        /// Rate of clocks at the end.
+        time_final: f64 = 1e-3 => positive().unit("frames").when(On("refine.times"));
+        /// A clock is shifted by at most so much.
+        time_limit: f64 = 1.5 => positive().unit("frames").when(On("refine.times"));
+        /// Share of the run after which poses are learnt: the scene has formed by then.
+        poses_from: f64 = 0.1 => share().when(On("refine.poses"));
+        /// Share of the run after which clocks are learnt.
+        times_from: f64 = 0.33 => share().when(On("refine.times"));
+        /// Share of the run after which nothing of a camera is learnt any more, so that the scene settles on it.
+        until: f64 = 0.8 => share().when(Any(&[On("refine.poses"), On("refine.times")]));
+        /// Steps by which every held-out camera is aligned before it is measured a second time.
+        align_steps: usize = 100 => any().unit("iterations").when(Any(&[On("refine.poses"), On("refine.times")]));
+    }
+}
+
+/// Adam's constants (Kingma and Ba 2015); the last is the trainer's.
+const BETA: [f64; 2] = [0.9, 0.999];
+const EPSILON: f64 = 1e-15;
+/// Terms of the exponential's series: twists are small, and below one radian the next term is lost in rounding.
+const TERMS: usize = 16;
+/// Share of a frame by which cameras' times differ at least. Views at one time share one gradient to it; at times that are
+/// hardly different each has its own.
+const APART: f64 = 1e-6;
+
+/// Columns of a table of numbers with their moments.
+const POSE: usize = 6;
+
+/// What is known of a frame that is corrected.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Origin<'a> {
+    /// The number of its camera.
+    pub rig: usize,
+    /// Whether that camera has one pose.
+    pub fixed: bool,
+    /// As the capture has it.
+    pub camera: &'a Camera,
+}
+
+/// The scale of a capture, in which rates are stated.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Scale {
+    /// The rig's radius, scene units.
+    pub extent: f64,
+    /// Seconds between two frames.
+    pub frame: f64,
+}
+
+/// See the module's documentation.
+#[derive(Clone, Debug)]
+pub struct Corrections {
+    settings: RefineSettings,
+    scale: Scale,
+    /// By frame: the row of its pose.
+    rows: Vec<usize>,
+    /// By frame: its camera.
+    rigs: Vec<usize>,
+    /// By row: the pose that the capture states, and a frame that has it.
+    origins: Vec<(Se3, usize)>,
+    /// Values 6, moments 12, steps 1; by row.
+    poses: Option<Table<f32>>,
+    /// Values 1, moments 2, steps 1; by camera.
+    times: Option<Table<f32>>,
+    /// Whether the mean of all stays nothing: not where the scene is frozen.
+    gauge: bool,
+}
+
+impl Corrections {
+    /// None for every frame, of `cameras` cameras. `gauge`: the scene learns too.
+    pub(crate) fn new(
+        settings: &RefineSettings,
+        scale: Scale,
+        frames: &[Origin<'_>],
+        cameras: usize,
+        gauge: bool,
+    ) -> Self {
+        let (mut of_rig, mut origins, mut rows) = (vec![None; cameras], Vec::new(), Vec::new());
+        for (i, frame) in frames.iter().enumerate() {
+            let known = of_rig[frame.rig].filter(|_| frame.fixed);
+            rows.push(known.unwrap_or_else(|| {
+                origins.push((frame.camera.cam_from_world, i));
+                origins.len() - 1
+            }));
+            of_rig[frame.rig] = Some(rows[i]);
+        }
+        let table = |width, rows| Table::new(&[("values", width), ("moments", 2 * width), ("steps", 1)], rows);
+        let first = frames.first().map(|f| f.rig);
+        // A single camera is its own mean.
+        let poses = settings.poses && !(gauge && origins.len() < 2);
+        let times = settings.times && !(gauge && frames.iter().all(|f| Some(f.rig) == first));
+        Self {
+            settings: settings.clone(),
+            scale,
+            poses: poses.then(|| table(POSE, origins.len())),
+            times: times.then(|| table(1, cameras)),
+            rigs: frames.iter().map(|f| f.rig).collect(),
+            rows,
+            origins,
+            gauge,
+        }
+    }
+
+    /// All that a checkpoint holds of it.
+    pub(crate) fn tables(&self) -> impl Iterator<Item = (&'static str, &Table<f32>)> {
+        [("refine.poses", &self.poses), ("refine.times", &self.times)]
+            .into_iter()
+            .filter_map(|(name, table)| Some((name, table.as_ref()?)))
+    }
+
+    /// The same, to read it.
+    pub(crate) fn tables_mut(&mut self) -> impl Iterator<Item = (&'static str, &mut Table<f32>)> {
+        [("refine.poses", &mut self.poses), ("refine.times", &mut self.times)]
+            .into_iter()
+            .filter_map(|(name, table)| Some((name, table.as_mut()?)))
+    }
+
+    /// The camera of frame `i`, corrected.
+    pub(crate) fn camera(&self, i: usize, stated: &Camera) -> Camera {
+        let moved = self.twist(self.rows[i]).map(|twist| after(&exp(twist), &stated.cam_from_world));
+        Camera { cam_from_world: moved.unwrap_or(stated.cam_from_world), ..stated.clone() }
+    }
+
+    /// The time of frame `i`, corrected.
+    pub(crate) fn time(&self, i: usize, stated: Time) -> Time {
+        let Some(times) = &self.times else { return stated };
+        let rig = self.rigs[i];
+        Time(stated.0 + f64::from(times.get(rig, 0)) + APART * self.scale.frame * rig as f64)
+    }
+
+    fn twist(&self, row: usize) -> Option<[f64; POSE]> {
+        self.poses.as_ref().map(|p| p.read::<POSE>(row, 0).map(f64::from))
+    }
+
+    /// One step of Adam with the gradients of some frames; `progress`: of the run. Frames whose gradient is not finite
+    /// rest.
+    pub(crate) fn step(
+        &mut self,
+        frames: &[usize],
+        d_cameras: &[[f64; 6]],
+        d_times: &[f64],
+        progress: f64,
+        scale: f64,
+    ) {
+        let s = self.settings.clone();
+        let share = |from: f64| {
+            let done = (progress - from) / (s.until - from).max(f64::EPSILON);
+            (0.0..1.0).contains(&done).then_some(done)
+        };
+        let rate = |ends: [f64; 2], done: f64, unit: f64| scale * unit * ends[0] * (ends[1] / ends[0]).powf(done);
+        if let (Some(done), Some(poses)) = (share(s.poses_from), &mut self.poses) {
+            let place = rate([s.position_init, s.position_final], done, self.scale.extent);
+            let turn = rate([s.rotation_init, s.rotation_final], done, 1.0);
+            let mut sums: Vec<(usize, [f64; POSE])> = Vec::new();
+            for (&i, d) in frames.iter().zip(d_cameras) {
+                let row = self.rows[i];
+                let twist = poses.read::<POSE>(row, 0).map(f64::from);
+                add(&mut sums, row, to_twist(twist, *d));
+            }
+            for (row, d) in sums {
+                adam(poses, row, d, [place, place, place, turn, turn, turn]);
+            }
+            if self.gauge {
+                self.fix_poses();
+            }
+        }
+        if let (Some(done), Some(times)) = (share(s.times_from), &mut self.times) {
+            let step = rate([s.time_init, s.time_final], done, self.scale.frame);
+            let limit = (s.time_limit * self.scale.frame) as f32;
+            let mut sums: Vec<(usize, [f64; 1])> = Vec::new();
+            for (&i, &d) in frames.iter().zip(d_times) {
+                add(&mut sums, self.rigs[i], [d]);
+            }
+            for (rig, d) in sums.into_iter().filter(|(rig, _)| !(self.gauge && *rig == self.rigs[0])) {
+                adam(times, rig, d, [step]);
+                times.set(rig, 0, times.get(rig, 0).clamp(-limit, limit));
+            }
+        }
+    }
+
+    /// Takes the motion and growth that all cameras have in common out of the twists.
+    fn fix_poses(&mut self) {
+        let Some(poses) = &mut self.poses else { return };
+        let n = self.origins.len() as f64;
+        let centers: Vec<[f64; 3]> = self.origins.iter().map(|(pose, _)| pose.inverse().translation).collect();
+        let mean: [f64; 3] = std::array::from_fn(|k| centers.iter().map(|c| c[k]).sum::<f64>() / n);
+        // To first order a camera turns by −Rᵀθ and its centre moves by −Rᵀρ.
+        let moved: Vec<[[f64; 3]; 2]> = (self.origins.iter().enumerate())
+            .map(|(row, (pose, _))| {
+                let x = poses.read::<POSE>(row, 0).map(|x| -f64::from(x));
+                let world = transpose(&pose.rotation);
+                [mat_vec(&world, [x[0], x[1], x[2]]), mat_vec(&world, [x[3], x[4], x[5]])]
+            })
+            .collect();
+        let of_all =
+            |part: usize| -> [f64; 3] { std::array::from_fn(|k| moved.iter().map(|m| m[part][k]).sum::<f64>() / n) };
+        let (shift, turn) = (of_all(0), of_all(1));
+        let arms: Vec<[f64; 3]> = centers.iter().map(|&c| sub(c, mean)).collect();
+        let (along, squares) =
+            arms.iter().zip(&moved).fold((0.0, 0.0), |(a, s), (r, m)| (a + dot(*r, m[0]), s + dot(*r, *r)));
+        let growth = if squares > 0.0 { along / squares } else { 0.0 };
+        for (row, ((pose, _), (arm, own))) in self.origins.iter().zip(arms.iter().zip(&moved)).enumerate() {
+            let swing = cross(turn, *arm);
+            let center = std::array::from_fn(|k| own[0][k] - shift[k] - swing[k] - growth * arm[k]);
+            let (p, r) = (mat_vec(&pose.rotation, center), mat_vec(&pose.rotation, sub(own[1], turn)));
+            poses.write(row, 0, [p[0], p[1], p[2], r[0], r[1], r[2]].map(|x| -x as f32));
+        }
+    }
+
+    /// What was learnt, a row for every camera (or picture of a moving one), as plain data. `name` tells of a frame: its
+    /// camera's name, and its number where that camera moves.
+    pub(crate) fn report(&self, name: &dyn Fn(usize) -> (String, Option<usize>)) -> Value {
+        let row = |(row, (_, frame)): (usize, &(Se3, usize))| {
+            let (camera, index) = name(*frame);
+            let twist = self.twist(row).unwrap_or_default();
+            let offset = self.times.as_ref().map_or(0.0, |t| f64::from(t.get(self.rigs[*frame], 0)));
+            let [p, r] = [0, 3].map(|k| norm([twist[k], twist[k + 1], twist[k + 2]]));
+            json!({
+                "camera": camera, "frame": index, "twist": twist, "offset": offset, "degrees": r.to_degrees(),
+                "share": p / self.scale.extent, "frames": offset / self.scale.frame,
+            })
+        };
+        json!({
+            "poses": self.poses.is_some(), "times": self.times.is_some(),
+            "cameras": self.origins.iter().enumerate().map(row).collect::<Vec<_>>(),
+        })
+    }
+
+    /// Sets values, to make some up.
+    #[cfg(test)]
+    pub(crate) fn set(&mut self, row: usize, twist: [f32; 6], offset: f32) {
+        if let Some(poses) = &mut self.poses {
+            poses.write(row, 0, twist);
+        }
+        if let Some(times) = &mut self.times {
+            times.set(row, 0, offset);
+        }
+    }
+}
+
+/// A pose moved by a twist (ρ, θ) from the left.
+pub(crate) fn moved(pose: &Se3, twist: [f64; 6]) -> Se3 {
+    after(&exp(twist), pose)
+}
+
+/// x ↦ last(first(x)).
+fn after(last: &Se3, first: &Se3) -> Se3 {
+    Se3 { rotation: mat_mul(&last.rotation, &first.rotation), translation: last.apply(first.translation) }
+}
+
+/// The rigid motion of a twist, by the series of the exponential: it rounds alike on every machine, as sines do not.
+fn exp(twist: [f64; 6]) -> Se3 {
+    let (rho, w) = ([twist[0], twist[1], twist[2]], [twist[3], twist[4], twist[5]]);
+    let mut out = Se3 { rotation: Se3::IDENTITY.rotation, translation: rho };
+    // Columns of [w]ⁿ/n! and [w]ⁿρ/(n + 1)!.
+    let (mut columns, mut shift) = (Se3::IDENTITY.rotation, rho);
+    for n in 1..TERMS {
+        columns = columns.map(|c| cross(w, c).map(|x| x / n as f64));
+        shift = cross(w, shift).map(|x| x / (n + 1) as f64);
+        for k in 0..3 {
+            (0..3).for_each(|j| out.rotation[k][j] += columns[j][k]);
+            out.translation[k] += shift[k];
+        }
+    }
+    out
+}
+
+/// The gradient to a twist ξ of that to a perturbation from the left of exp(ξ): Jᵀd with the left Jacobian
+/// J = Σ adⁿ/(n + 1)!. Source: Barfoot 2017, §7.1.5.
+fn to_twist(twist: [f64; 6], d: [f64; 6]) -> [f64; 6] {
+    let (rho, w) = ([twist[0], twist[1], twist[2]], [twist[3], twist[4], twist[5]]);
+    let (mut sum, mut term) = (d, d);
+    for n in 1..TERMS {
+        // ad = [[w, ρ], [0, w]] of cross products: its transpose turns their order.
+        let (a, b) = ([term[0], term[1], term[2]], [term[3], term[4], term[5]]);
+        let (top, low, more) = (cross(a, w), cross(a, rho), cross(b, w));
+        term = std::array::from_fn(|k| if k < 3 { top[k] } else { low[k - 3] + more[k - 3] } / (n + 1) as f64);
+        (0..6).for_each(|k| sum[k] += term[k]);
+    }
+    sum
+}
+
+/// Adds to the sum of a row.
+fn add<const N: usize>(sums: &mut Vec<(usize, [f64; N])>, row: usize, d: [f64; N]) {
+    match sums.iter_mut().find(|(known, _)| *known == row) {
+        Some((_, sum)) => (0..N).for_each(|k| sum[k] += d[k]),
+        None => sums.push((row, d)),
+    }
+}
+
+/// Adam on one row of values, moments and steps; a gradient that is not finite leaves it as it was.
+fn adam<const N: usize>(table: &mut Table<f32>, row: usize, d: [f64; N], rates: [f64; N]) {
+    if d.iter().any(|x| !x.is_finite()) {
+        return;
+    }
+    let steps = table.get(row, 3 * N) + 1.0;
+    table.set(row, 3 * N, steps);
+    let unbias = BETA.map(|beta| 1.0 / (1.0 - beta.powi(steps as i32)));
+    for k in 0..N {
+        let old = |col| f64::from(table.get(row, col));
+        let first = BETA[0] * old(N + k) + (1.0 - BETA[0]) * d[k];
+        let second = BETA[1] * old(2 * N + k) + (1.0 - BETA[1]) * d[k] * d[k];
+        let value = old(k) - rates[k] * first * unbias[0] / ((second * unbias[1]).sqrt() + EPSILON);
+        table.set(row, k, value as f32);
+        table.set(row, N + k, first as f32);
+        table.set(row, 2 * N + k, second as f32);
+    }
+}
+
+#[cfg(test)]
+mod tests;

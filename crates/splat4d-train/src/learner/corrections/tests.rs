@@ -1,0 +1,93 @@
+use super::*;
+
+fn camera(k: usize) -> Camera {
+    let a = k as f64;
+    Camera::with_fov_y(Se3::look_at([4.0 * a.cos(), 0.3 * a, 4.0 * a.sin()], [0.0; 3], [0.0, 1.0, 0.0]), 0.7, 16, 16)
+}
+
+fn corrections(settings: &RefineSettings, cameras: &[Camera], gauge: bool) -> Corrections {
+    let frames: Vec<Origin<'_>> =
+        cameras.iter().enumerate().map(|(rig, camera)| Origin { rig, fixed: true, camera }).collect();
+    Corrections::new(settings, Scale { extent: 4.0, frame: 0.1 }, &frames, cameras.len(), gauge)
+}
+
+fn on() -> RefineSettings {
+    RefineSettings { poses: true, times: true, ..RefineSettings::default() }
+}
+
+const TWIST: [f64; 6] = [0.3, -0.2, 0.5, 0.4, -0.6, 0.2];
+
+#[test]
+fn twists_move_rigidly_and_have_the_gradient_of_perturbations() {
+    let motion = exp(TWIST);
+    assert!(motion.orthogonality_error() < 1e-14 && (motion.det() - 1.0).abs() < 1e-14);
+    let back = after(&exp(TWIST.map(|x| -x)), &motion);
+    assert!(norm(back.translation) < 1e-14);
+    // A made-up loss of a pose: d is its gradient to a perturbation from the left, by differences.
+    let (x, g) = ([0.3, 1.2, -0.7], [0.5, -1.0, 0.8]);
+    let loss = |pose: &Se3| dot(pose.apply(x), g);
+    const H: f64 = 1e-6;
+    let slope = |f: &dyn Fn([f64; 6]) -> f64| -> [f64; 6] {
+        std::array::from_fn(|k| {
+            let at = |h: f64| f(std::array::from_fn(|j| if j == k { h } else { 0.0 }));
+            (at(H) - at(-H)) / (2.0 * H)
+        })
+    };
+    let d = slope(&|xi| loss(&after(&exp(xi), &motion)));
+    let expected = slope(&|xi| loss(&exp(std::array::from_fn(|k| TWIST[k] + xi[k]))));
+    let found = to_twist(TWIST, d);
+    assert!((0..6).all(|k| (found[k] - expected[k]).abs() < 1e-8), "{found:?} {expected:?}");
+}
+
+#[test]
+fn what_all_cameras_do_alike_is_no_correction() {
+    let cameras: Vec<Camera> = (0..6).map(camera).collect();
+    let mut c = corrections(&on(), &cameras, true);
+    // The world turns, shifts and grows by a little about a point of its own.
+    let (turn, shift, growth) = ([2e-4, -1e-4, 3e-4], [1e-4, 2e-4, -1e-4], 3e-4);
+    for (row, camera) in cameras.iter().enumerate() {
+        let (rotation, center) = (camera.cam_from_world.rotation, camera.center());
+        let swing = cross(turn, center);
+        let moved: [f64; 3] = std::array::from_fn(|k| swing[k] + shift[k] + growth * center[k]);
+        let (p, r) = (mat_vec(&rotation, moved), mat_vec(&rotation, turn));
+        c.set(row, [p[0], p[1], p[2], r[0], r[1], r[2]].map(|x| -x as f32), 0.0);
+    }
+    c.fix_poses();
+    for row in 0..cameras.len() {
+        assert!(c.twist(row).unwrap().iter().all(|x| x.abs() < 1e-6), "{:?}", c.twist(row));
+    }
+    c.set(2, [0.0, 0.0, 0.0, 0.01, 0.0, 0.0], 0.0);
+    c.fix_poses();
+    let once = c.twist(2).unwrap();
+    c.fix_poses();
+    assert!(once[3] > 0.005 && (0..6).all(|k| (once[k] - c.twist(2).unwrap()[k]).abs() < 1e-6), "done is done");
+}
+
+#[test]
+fn only_what_was_seen_moves_within_its_time_and_its_limits() {
+    let cameras: Vec<Camera> = (0..3).map(camera).collect();
+    let mut c = corrections(&RefineSettings { time_init: 10.0, ..on() }, &cameras, true);
+    let d = [[1.0, 0.0, 0.0, 0.0, 0.5, 0.0]];
+    let before: Vec<_> = c.tables().map(|(_, t)| t.clone()).collect();
+    c.step(&[1], &d, &[1.0], 0.05, 1.0);
+    c.step(&[1], &d, &[1.0], 0.9, 1.0);
+    c.step(&[1], &[[f64::NAN; 6]], &[f64::NAN], 0.5, 1.0);
+    assert!(c.tables().zip(&before).all(|((_, t), old)| t == old), "too early, too late, not finite");
+    c.step(&[1, 0], &[d[0], d[0]], &[1.0, 1.0], 0.34, 1.0);
+    let times: Vec<f64> = (0..3).map(|i| c.time(i, Time(0.0)).0).collect();
+    assert!(times[0] == 0.0 && (times[1] + 0.15).abs() < 1e-6 && times[2].abs() < 1e-6, "{times:?}");
+    let moved = |i: usize| c.camera(i, &cameras[i]) != cameras[i];
+    assert!([0, 1, 2].into_iter().all(moved), "the mean stays, so the others give way");
+}
+
+#[test]
+fn frames_of_a_fixed_camera_share_a_pose_and_those_of_a_moving_one_do_not() {
+    let all: Vec<Camera> = (0..4).map(camera).collect();
+    let frame = |rig, fixed, k: usize| Origin { rig, fixed, camera: &all[k] };
+    let frames = [frame(0, true, 0), frame(1, false, 1), frame(0, true, 0), frame(1, false, 2)];
+    let c = Corrections::new(&on(), Scale { extent: 4.0, frame: 0.1 }, &frames, 2, true);
+    assert_eq!((c.rows.clone(), c.origins.len()), (vec![0, 1, 0, 2], 3));
+    let alone = corrections(&on(), &all[..1], true);
+    assert_eq!(alone.tables().count(), 0, "a single camera is its own mean");
+    assert_eq!(corrections(&on(), &all[..1], false).tables().count(), 2, "but not where the scene stays");
+}

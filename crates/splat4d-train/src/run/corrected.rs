@@ -1,0 +1,68 @@
+//! `refined.json`: what a run has learnt of its capture's cameras, so that whoever measures the scene looks at it from there.
+
+use super::checkpoint::write_atomically;
+use crate::capture::Capture;
+use crate::learner::moved;
+use crate::step::trainer::Trainer;
+use crate::{Error, Result};
+use serde_json::Value;
+use splat4d::scene::Time;
+use std::path::Path;
+
+/// The file's name in a run.
+pub const FILE: &str = "refined.json";
+
+/// Writes what the trainer has learnt of cameras, if that is anything.
+pub(super) fn write(run: &Path, trainer: &Trainer<'_>, capture: &Capture) -> Result<()> {
+    let Some(corrections) = &trainer.learner.corrections else { return Ok(()) };
+    let name = |i: usize| {
+        let frame = &capture.frames[capture.train[i]];
+        let camera = &capture.cameras[frame.camera];
+        (camera.name.clone(), (!camera.fixed).then_some(frame.index))
+    };
+    let text = format!("{:#}\n", corrections.report(&name));
+    write_atomically(&run.join(FILE), text.as_bytes())
+}
+
+/// What a run has learnt of its cameras; `None`: it was not asked to. Errors: damage.
+pub fn read(run: &Path) -> Result<Option<Value>> {
+    let path = run.join(FILE);
+    if !path.is_file() {
+        return Ok(None);
+    }
+    let text = std::fs::read_to_string(&path).map_err(|e| Error::io("it cannot be read", e).at(path.display()))?;
+    let damage = |what: String| {
+        Error::input(what)
+            .at(path.display())
+            .remedy("Continue the run with `train --resume`, which writes it again, or delete it to measure without it")
+    };
+    let value: Value = serde_json::from_str(&text).map_err(|e| damage(format!("it is not JSON: {e}")))?;
+    let sound = value["cameras"].as_array().is_some_and(|rows| rows.iter().all(|row| correction(row).is_some()));
+    if sound { Ok(Some(value)) } else { Err(damage("it is no list of corrections of cameras".into())) }
+}
+
+/// A row: camera, number of its picture if it moves, twist, seconds.
+fn correction(row: &Value) -> Option<(&str, Option<u64>, [f64; 6], f64)> {
+    let twist: Vec<f64> = row["twist"].as_array()?.iter().filter_map(Value::as_f64).collect();
+    Some((row["camera"].as_str()?, row["frame"].as_u64(), twist.try_into().ok()?, row["offset"].as_f64()?))
+}
+
+/// Moves the capture's cameras and clocks to where the run has learnt that they are: those of training, and held-out pictures
+/// of the same cameras as far as they share them.
+///
+/// Errors: those of [`read`].
+pub fn apply(capture: &mut Capture, run: &Path) -> Result<()> {
+    let Some(value) = read(run)? else { return Ok(()) };
+    let rows: Vec<_> = value["cameras"].as_array().into_iter().flatten().filter_map(correction).collect();
+    for frame in &mut capture.frames {
+        let camera = &capture.cameras[frame.camera].name;
+        let mut of_camera = rows.iter().filter(|row| row.0 == camera);
+        if let Some(row) = of_camera.clone().find(|row| row.1.is_none_or(|index| index == frame.index as u64)) {
+            frame.view.cam_from_world = moved(&frame.view.cam_from_world, row.2);
+        }
+        if let Some(row) = of_camera.next() {
+            frame.time = Time(frame.time.0 + row.3);
+        }
+    }
+    Ok(())
+}
