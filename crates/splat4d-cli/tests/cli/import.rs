@@ -54,7 +54,7 @@ fn pictures_alone_become_a_capture_with_clocks_and_poses() {
         CAMERAS.iter().map(of).collect::<Vec<_>>()
     };
     for (off, (name, _)) in apart(&poses(&found), &poses(&truth)).unwrap().iter().zip(&CAMERAS) {
-        assert!(off.degrees < 1.5 && off.center < 0.05, "{name}: {off:?}");
+        assert!(off.degrees < 3.0 && off.center < 0.05, "{name}: {off:?}");
     }
 }
 

@@ -127,6 +127,8 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
     if stop() {
         return Err(stopped());
     }
+    // From here on it can be corrected, even if no pose is found.
+    corrections.write(folder)?;
     let stored = stored::Stored::new(folder, &pictures);
     let mut evidence = heard;
     if pictures.len() > 1 && !moving && clock.offsets.iter().any(Option::is_none) {
