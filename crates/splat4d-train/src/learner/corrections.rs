@@ -18,7 +18,7 @@ settings! {
         poses: bool = false;
         /// Learn a shift of every training camera's clock; the first camera's stays.
         times: bool = false => any().when(IsNot("run.motion", &["still", "tracked"]));
-        /// Rate of rotations at first (gsplat: 1e-5 over 30,000 steps; ours reaches half a degree in 50 views of a camera).
+        /// Rate of rotations at first (chosen so that half a degree is within reach of the 50 views that a camera gets in a short run; not swept).
         rotation_init: f64 = 1e-3 => positive().unit("radians").when(On("refine.poses"));
         /// Rate of rotations at the end.
         rotation_final: f64 = 1e-5 => positive().unit("radians").when(On("refine.poses"));
