@@ -4,6 +4,7 @@
 
 pub mod chart;
 pub(crate) mod compress;
+pub(crate) mod doctor;
 mod pictures;
 
 use crate::files::{self, grouped, human_bytes, human_seconds};

@@ -1,0 +1,1 @@
+//! Each fault drawn once, and a clean take.
