@@ -45,6 +45,8 @@ pub struct Finding {
     pub looks: &'static str,
     /// The remedy, a sentence.
     pub remedy: String,
+    /// The same of other cameras, where it is a fault of most.
+    pub alike: Vec<Finding>,
 }
 
 /// What was measured of a camera, and a picture of it.
@@ -125,6 +127,7 @@ pub fn examine(capture: &Capture, options: &Options, progress: &mut Progress<'_>
             what: finding.what,
             looks: "",
             remedy: finding.remedy,
+            alike: Vec::new(),
         });
     }
     let mut seen = Vec::new();
