@@ -2,6 +2,7 @@
 //! training takes.
 
 pub mod corrections;
+pub mod doctor;
 pub mod sfm;
 pub mod sync;
 pub mod take;

@@ -4,6 +4,7 @@
 
 pub mod chart;
 pub(crate) mod compress;
+pub(crate) mod doctor;
 mod pictures;
 mod refined;
 

@@ -43,7 +43,8 @@ pub(super) fn difference(a: &Path, b: &Path) -> Option<String> {
     reduced(RgbImage::from_raw(width as u32, height as u32, data)?)
 }
 
-fn reduced(picture: RgbImage) -> Option<String> {
+/// A JPEG data URI of a picture, reduced.
+pub(super) fn reduced(picture: RgbImage) -> Option<String> {
     let (w, h) = picture.dimensions();
     let picture: RgbImage = if w > WIDTH {
         let height = ((u64::from(h) * u64::from(WIDTH)) / u64::from(w)).max(1) as u32;

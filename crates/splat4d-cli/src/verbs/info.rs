@@ -1,5 +1,6 @@
 //! `info`: what a capture, a run or a file contains, and whether it looks healthy.
 
+mod doctor;
 mod playback;
 
 use crate::console::Console;
@@ -39,6 +40,7 @@ const BAR: usize = 32;
 const EXAMPLES: &str = "\
 Examples:
   splat4d info my-take            cameras, frames, split, findings, memory estimate
+  splat4d info my-take --doctor   what is wrong with which camera, and what to do (writes ./doctor/doctor.html)
   splat4d info runs/knight        recipe, progress, scores
   splat4d info scene.ply --json   Gaussians, SH degree, bounds, opacity and scales, damage";
 
@@ -58,6 +60,12 @@ pub(crate) struct Args {
     /// Read a capture with a knob of the recipe set, such as capture.sequence=photos; may be repeated
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
+    /// Look at a capture's pictures for everything that spoils results, and write doctor.html and doctor.json
+    #[arg(long)]
+    doctor: bool,
+    /// Where --doctor writes; a folder
+    #[arg(short, long, value_name = "FOLDER", default_value = "doctor", requires = "doctor")]
+    output: PathBuf,
 }
 
 /// Output of the verb: a JSON object, and the same for people.
@@ -78,10 +86,17 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     }
     let marker = path.extension().is_some_and(|e| e == "json" || e == "npy");
     let sog = path.join(sog::META).is_file() || path.file_name().is_some_and(|name| name == sog::META);
+    let is_capture = !Run::is(path) && !sog && (path.is_dir() || marker);
+    if args.doctor && !is_capture {
+        return Err(Error::input("the doctor looks at captures, and this is none")
+            .at(path.display())
+            .remedy("Give a capture's folder, or leave --doctor out.")
+            .into());
+    }
     let mut told = if Run::is(path) {
         of_run(path)?
-    } else if !sog && (path.is_dir() || marker) {
-        of_capture(path, args)?
+    } else if is_capture {
+        of_capture(path, args, console)?
     } else {
         of_file(path)?
     };
@@ -103,7 +118,7 @@ fn line(out: &mut String, name: &str, value: &str) {
     let _ = writeln!(out, "{name:<16} {value}");
 }
 
-fn of_capture(path: &Path, args: &Args) -> anyhow::Result<Told> {
+fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Told> {
     let mut recipe = Recipe::default();
     if let Some(k) = args.downscale {
         recipe.set(&format!("downscale={k}"))?;
@@ -115,6 +130,9 @@ fn of_capture(path: &Path, args: &Args) -> anyhow::Result<Told> {
         recipe.set(assignment).map_err(|e| e.at("--set"))?;
     }
     let capture = open_capture(path, &recipe)?;
+    if args.doctor {
+        return doctor::of(&capture, &args.output, console);
+    }
     let (first, last) = capture.time_range();
     let (times, sizes) = (capture.times(), sizes(&capture));
     let memory = memory_estimate(&capture, &recipe);

@@ -53,7 +53,7 @@ impl fmt::Display for Refusal {
 }
 
 /// The middle value; half of the values may be anything. NaN of none.
-fn median(values: &mut [f64]) -> f64 {
+pub(crate) fn median(values: &mut [f64]) -> f64 {
     if values.is_empty() {
         return f64::NAN;
     }

@@ -1,0 +1,188 @@
+//! What is looked at of a camera: a few pictures over the take, and some in a row.
+
+use super::Options;
+use crate::Result;
+use crate::sync::grey::{Grey, Pyramid};
+use crate::sync::tracks::{Track, Tracker, corners, follow, moving};
+use crate::video::{Clock, mean_difference};
+use splat4d::scene::{Camera, Planes};
+use splat4d_train::capture::{Capture, ImageStore, Rgb8};
+
+/// Pictures over the take whose median is what stands still.
+const SPREAD: usize = 15;
+/// From so many on a median knows what stands still.
+const MEDIAN_FROM: usize = 3;
+/// Pictures of a moving camera that are compared with others.
+const STANDS: usize = 16;
+/// A value at or above (at or below one minus) this is clipped, of 255.
+const CLIPPED: [u8; 2] = [2, 253];
+/// Pixels between corners that are followed.
+const APART: f64 = 8.0;
+/// Levels of pictures that corners are followed through between the first and the last pictures of a take.
+const LEVELS: usize = 4;
+/// Corners that must be found again before a camera is said to have moved.
+const CORNERS: usize = 12;
+
+/// A picture from a place: of what stands still, or one of a moving camera.
+pub(super) struct Stand {
+    pub(super) view: Camera,
+    pub(super) picture: Rgb8,
+}
+
+/// What was seen of a camera.
+#[derive(Default)]
+pub(super) struct Seen {
+    pub(super) stands: Vec<Stand>,
+    /// Corners that move, by the camera's clock.
+    pub(super) tracks: Vec<Track>,
+    pub(super) clock: Clock,
+    /// Pictures that were looked at in a row.
+    pub(super) row: usize,
+    /// Mean of 255 and detail of pictures in a row.
+    pub(super) means: Vec<f64>,
+    pub(super) detail: Vec<f64>,
+    /// Part of the pixels that is black, and white.
+    pub(super) clipped: [f64; 2],
+    /// Step across the borders of blocks of 8 pixels over that elsewhere.
+    pub(super) blocks: f64,
+    /// Pixels that what stands still went.
+    pub(super) moved: Option<f64>,
+    pub(super) sizes: Vec<[usize; 2]>,
+}
+
+fn bytes(color: &Planes<f32>) -> Rgb8 {
+    let data = color.interleaved().iter().map(|v| (v * 255.0).round().clamp(0.0, 255.0) as u8).collect();
+    Rgb8 { width: color.width, height: color.height, data }
+}
+
+/// Numbers evenly among so many, the first and last with them.
+fn spread(of: usize, count: usize) -> Vec<usize> {
+    match of.min(count) {
+        0 => Vec::new(),
+        1 => vec![0],
+        kept => (0..kept).map(|k| k * (of - 1) / (kept - 1)).collect(),
+    }
+}
+
+fn median_of(all: &[Rgb8]) -> Rgb8 {
+    let mut out = all[all.len() / 2].clone();
+    if all.len() >= MEDIAN_FROM {
+        let mut values = vec![0; all.len()];
+        for (p, v) in out.data.iter_mut().enumerate() {
+            values.iter_mut().zip(all).for_each(|(v, a)| *v = a.data[p]);
+            let middle = values.len() / 2;
+            *v = *values.select_nth_unstable(middle).1;
+        }
+    }
+    out
+}
+
+/// Mean absolute second difference: what blur takes away first.
+pub(super) fn detail(g: &Grey) -> f64 {
+    let (w, h) = (g.width, g.height);
+    if w < 3 || h < 3 {
+        return 0.0;
+    }
+    let mut sum = 0.0;
+    for y in 1..h - 1 {
+        for x in 1..w - 1 {
+            let p = y * w + x;
+            let d = 4.0 * g.data[p] - g.data[p - 1] - g.data[p + 1] - g.data[p - w] - g.data[p + w];
+            sum += f64::from(d.abs());
+        }
+    }
+    sum / ((w - 2) * (h - 2)) as f64
+}
+
+/// How much larger steps are across borders of blocks of 8 pixels than elsewhere.
+fn blocks(g: &Grey) -> f64 {
+    /// Pixels of a block of JPEG and of most videos.
+    const BLOCK: usize = 8;
+    let mut sums = [[0.0f64; 2]; 2];
+    for row in g.data.chunks_exact(g.width) {
+        for x in 2..g.width.saturating_sub(1) {
+            // The bend of a step, so that slopes of the picture itself count little.
+            let step =
+                (row[x] - row[x - 1]).abs() - 0.5 * ((row[x - 1] - row[x - 2]).abs() + (row[x + 1] - row[x]).abs());
+            let side = usize::from(x % BLOCK == 0);
+            sums[side][0] += f64::from(step);
+            sums[side][1] += 1.0;
+        }
+    }
+    let mean = |k: usize| sums[k][0] / f64::max(sums[k][1], 1.0);
+    255.0 * (mean(1) - mean(0))
+}
+
+fn moved(first: &Grey, last: &Grey) -> Option<f64> {
+    let found = corners(first, None, 120, APART, &[]);
+    let [a, b] = [first, last].map(|g| Pyramid::new(g.clone(), LEVELS));
+    let ends = follow(&a, &b, &found);
+    let way = |(p, q): (&[f64; 2], &Option<[f64; 2]>)| q.map(|q| (p[0] - q[0]).hypot(p[1] - q[1]));
+    let mut ways: Vec<f64> = found.iter().zip(&ends).filter_map(way).collect();
+    if ways.len() < CORNERS {
+        return None;
+    }
+    ways.sort_by(f64::total_cmp);
+    Some(ways[ways.len() / 2])
+}
+
+pub(super) fn camera(capture: &Capture, store: &ImageStore, camera: usize, options: &Options) -> Result<Seen> {
+    let mut frames: Vec<usize> = (0..capture.frames.len()).filter(|&i| capture.frames[i].camera == camera).collect();
+    frames.sort_by(|&i, &j| capture.frames[i].time.0.total_cmp(&capture.frames[j].time.0));
+    let fixed = capture.cameras[camera].fixed;
+    let load = |i: usize| Ok::<Rgb8, crate::Error>(bytes(&store.load(i)?.to_picture().color));
+    let mut seen = Seen::default();
+    let size = |i: usize| [capture.frames[i].source.width, capture.frames[i].source.height];
+    seen.sizes = frames.iter().map(|&i| size(i)).collect();
+    seen.sizes.sort_unstable();
+    seen.sizes.dedup();
+    let chosen: Vec<usize> =
+        spread(frames.len(), if fixed { SPREAD } else { STANDS }).iter().map(|&k| frames[k]).collect();
+    let pictures: Vec<Rgb8> = chosen.iter().map(|&i| load(i)).collect::<Result<_>>()?;
+    let Some(one) = pictures.first() else { return Ok(seen) };
+    let same = pictures.iter().all(|p| (p.width, p.height) == (one.width, one.height));
+    let all: Vec<u8> = pictures.iter().flat_map(|p| p.data.iter().copied()).collect();
+    let part = |f: &dyn Fn(u8) -> bool| all.iter().filter(|v| f(**v)).count() as f64 / all.len().max(1) as f64;
+    seen.clipped = [part(&|v| v <= CLIPPED[0]), part(&|v| v >= CLIPPED[1])];
+    if pictures.iter().any(|p| p.width.min(p.height) < 32) {
+        return Ok(seen);
+    }
+    seen.blocks = blocks(&Grey::of(&pictures[pictures.len() / 2]));
+    if fixed && same {
+        let third = (pictures.len() / 3).min(3);
+        if third > 0 {
+            let ends = [&pictures[..third], &pictures[pictures.len() - third..]].map(|p| Grey::of(&median_of(p)));
+            seen.moved = moved(&ends[0], &ends[1]);
+        }
+        seen.stands.push(Stand { view: capture.frames[chosen[0]].view.clone(), picture: median_of(&pictures) });
+    } else {
+        for (&i, picture) in chosen.iter().zip(pictures) {
+            seen.stands.push(Stand { view: capture.frames[i].view.clone(), picture });
+        }
+    }
+    let first = (frames.len() - frames.len().min(options.window)) / 2;
+    let row = &frames[first..first + frames.len().min(options.window)];
+    let still = (fixed && same && frames.len() >= MEDIAN_FROM).then(|| Grey::of(&seen.stands[0].picture));
+    let mut tracker = Tracker::new(options.tracks, APART);
+    let mut differences = Vec::new();
+    let mut last: Option<Rgb8> = None;
+    for (k, &i) in row.iter().enumerate() {
+        let picture = load(i)?;
+        if let Some(last) = &last {
+            differences.push((first + k, mean_difference(last, &picture)));
+        }
+        let grey = Grey::of(&picture);
+        seen.means.push(255.0 * grey.data.iter().map(|v| f64::from(*v)).sum::<f64>() / grey.data.len() as f64);
+        seen.detail.push(detail(&grey));
+        if let Some(still) = &still {
+            let mask = moving(&grey, still);
+            tracker.push(capture.frames[i].time.0, grey, Some(&mask));
+        }
+        last = Some(picture);
+    }
+    let times: Vec<f64> = frames.iter().map(|&i| capture.frames[i].time.0).collect();
+    seen.clock = Clock::of(&times, &differences);
+    seen.row = row.len();
+    seen.tracks = tracker.finish();
+    Ok(seen)
+}

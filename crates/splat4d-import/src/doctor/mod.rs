@@ -1,0 +1,141 @@
+//! A look at a capture before it is trained on: what is wrong, with which camera, by how much, what it will look like and what
+//! to do. Reads pictures and poses of any layout and writes nothing.
+//!
+//! Matches between cameras are found without the capture's poses, so that wrong poses do not hide themselves.
+
+mod check;
+mod look;
+#[cfg(test)]
+mod tests;
+
+use crate::{Error, Result};
+use serde::Serialize;
+use splat4d_train::capture::{Capture, ImageStore, Rgb8, Severity};
+use splat4d_train::event::Progress;
+use std::sync::Arc;
+
+/// How bad a [`Finding`] is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Grade {
+    /// Worth knowing.
+    Note,
+    /// It will probably be seen.
+    Warning,
+    /// It will spoil the result.
+    Bad,
+}
+
+/// Something that will show in the result.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Finding {
+    /// How bad it is.
+    pub grade: Grade,
+    /// Which check found it: a word that stays the same.
+    pub check: &'static str,
+    /// The camera; none: the whole take.
+    pub camera: Option<String>,
+    /// How much, in `unit`.
+    pub amount: Option<f64>,
+    /// The unit of `amount`.
+    pub unit: &'static str,
+    /// The finding, a sentence.
+    pub what: String,
+    /// What it will look like, a sentence; empty where that is said.
+    pub looks: &'static str,
+    /// The remedy, a sentence.
+    pub remedy: String,
+    /// The same of other cameras, where it is a fault of most.
+    pub alike: Vec<Finding>,
+}
+
+/// What was measured of a camera, and a picture of it.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct CameraReport {
+    /// Its name.
+    pub name: String,
+    /// Whether it stands still.
+    pub fixed: bool,
+    /// Distance of matches from their epipolar lines, pixels of a picture 1920 wide.
+    pub epipolar: Option<f64>,
+    /// Seconds that its clock is off, and their standard deviation.
+    pub offset: Option<[f64; 2]>,
+    /// Brightness relative to other cameras, stops: red, green, blue.
+    pub exposure: Option<[f64; 3]>,
+    /// Sharpness relative to other cameras, at places that both see.
+    pub sharpness: Option<f64>,
+    /// Pixels (of 1920) that what stands still went between the first and the last pictures.
+    pub moved: Option<f64>,
+    /// Its picture.
+    #[serde(skip)]
+    pub picture: Rgb8,
+}
+
+/// The result of [`examine`].
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct Report {
+    /// The capture's name.
+    pub capture: String,
+    /// Findings, worst first.
+    pub findings: Vec<Finding>,
+    /// All cameras.
+    pub cameras: Vec<CameraReport>,
+    /// Cameras that should be left out.
+    pub leave_out: Vec<String>,
+    /// Checks that could not be made, and why.
+    pub left: Vec<String>,
+}
+
+/// How closely to look.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Options {
+    /// Consecutive pictures of a camera that are followed.
+    pub window: usize,
+    /// Features of a picture.
+    pub features: usize,
+    /// Corners of a camera that are followed.
+    pub tracks: usize,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        // 31 cameras of 30 pictures at 640x360 are to take about a minute.
+        Self { window: 30, features: 900, tracks: 50 }
+    }
+}
+
+/// Bytes of decoded pictures that are kept at once: each is looked at once or twice, so that more gains nothing.
+const STORE: usize = 64 << 20;
+
+/// Looks for everything that commonly spoils results.
+///
+/// Errors: a capture without pictures, pictures that cannot be read.
+pub fn examine(capture: &Capture, options: &Options, progress: &mut Progress<'_>) -> Result<Report> {
+    if capture.frames.is_empty() {
+        return Err(Error::input("the capture has no pictures").at(capture.root.display()).remedy("Add some."));
+    }
+    let store = ImageStore::new(Arc::new(capture.clone()), STORE);
+    let mut report = Report { capture: capture.name.clone(), ..Report::default() };
+    for finding in capture.preflight() {
+        let grade = if finding.severity == Severity::Warning { Grade::Warning } else { Grade::Note };
+        report.findings.push(Finding {
+            grade,
+            check: "capture",
+            camera: None,
+            amount: None,
+            unit: "",
+            what: finding.what,
+            looks: "",
+            remedy: finding.remedy,
+            alike: Vec::new(),
+        });
+    }
+    let mut seen = Vec::new();
+    for camera in 0..capture.cameras.len() {
+        progress.phase("looking at cameras", camera, capture.cameras.len());
+        seen.push(look::camera(capture, &store, camera, options)?);
+    }
+    check::all(capture, &seen, options, &mut report, progress);
+    report.findings.sort_by_key(|f| std::cmp::Reverse(f.grade));
+    Ok(report)
+}

@@ -1,0 +1,231 @@
+//! Each fault drawn once, and a clean take: a room of random spots that six cameras see, and balls that move in it.
+
+use super::{Grade, Options, Report, examine};
+use serde_json::json;
+use splat4d::math::{Rng, Se3};
+use splat4d::scene::Camera;
+use splat4d_train::capture::{Capture, CaptureOptions, Rgb8};
+use splat4d_train::event::Progress;
+use std::sync::OnceLock;
+
+const SIZE: [usize; 2] = [256, 192];
+const CAMERAS: usize = 6;
+const FRAMES: usize = 12;
+const FPS: f64 = 30.0;
+/// The camera with the fault.
+const ILL: usize = 3;
+type Clip = Vec<Vec<Rgb8>>;
+
+fn camera(c: usize) -> Camera {
+    let angle = 0.19 * (c as f64 - 2.5);
+    let eye = [4.0 * angle.sin(), -0.6 + 0.5 * (c % 2) as f64, -4.0 * angle.cos()];
+    Camera::with_fov_y(Se3::look_at(eye, [0.0, 0.0, 0.5], [0.0, -1.0, 0.0]), 0.7, SIZE[0], SIZE[1])
+}
+
+/// Spots on a wall that bends, and balls: centre, radius, colour.
+fn things(t: f64) -> Vec<([f64; 3], f64, [f64; 3])> {
+    let mut out = Vec::new();
+    for k in 0..700 {
+        let rng = Rng::new(3, "spots of a drawn room", k);
+        let (x, y) = (6.0 * (rng.uniform(0) - 0.5), 4.0 * (rng.uniform(1) - 0.5));
+        let color = [5, 6, 7].map(|i| 0.8 * (rng.uniform(i) - 0.5));
+        out.push(([x, y, 0.6 + 0.5 * (1.3 * x).sin() + 0.3 * (1.7 * y).cos()], 0.03 + 0.07 * rng.uniform(3), color));
+    }
+    for k in 0..14 {
+        let rng = Rng::new(4, "balls of a drawn room", k);
+        let place = |i: u64| {
+            2.0 * (rng.uniform(i) - 0.5)
+                + 0.35 * (9.0 * t * (0.6 + rng.uniform(i + 3)) + 6.0 * rng.uniform(i + 6)).sin()
+        };
+        out.push(([place(0), 0.7 * place(1), 0.3 * place(2) - 0.6], 0.05, [0.45; 3]));
+    }
+    out
+}
+
+fn draw(view: &Camera, t: f64) -> Rgb8 {
+    let mut data = vec![0.45f64; SIZE[0] * SIZE[1] * 3];
+    for (place, radius, color) in things(t) {
+        let Some(([u, v], z)) = view.project(place) else { continue };
+        let size = radius * view.intrinsics.fx / z;
+        let range = |c: f64, most: usize| {
+            (c - 3.0 * size).max(0.0) as usize..((c + 3.0 * size).max(0.0) as usize + 1).min(most)
+        };
+        for y in range(v, SIZE[1]) {
+            for x in range(u, SIZE[0]) {
+                let square = (x as f64 + 0.5 - u).powi(2) + (y as f64 + 0.5 - v).powi(2);
+                let weight = (-0.5 * square / (size * size)).exp();
+                (0..3).for_each(|c| data[(y * SIZE[0] + x) * 3 + c] += weight * color[c]);
+            }
+        }
+    }
+    let data = data.iter().map(|v| (255.0 * v).round().clamp(4.0, 250.0) as u8).collect();
+    Rgb8 { width: SIZE[0], height: SIZE[1], data }
+}
+
+fn clean() -> &'static Clip {
+    static CLIP: OnceLock<Clip> = OnceLock::new();
+    CLIP.get_or_init(|| (0..CAMERAS).map(|c| (0..FRAMES).map(|n| draw(&camera(c), n as f64 / FPS)).collect()).collect())
+}
+
+/// What the doctor says of these pictures, where the ill camera's pose is turned by so many radians about its own x axis.
+fn says(clip: &Clip, turned: f64, cameras: usize) -> Report {
+    let folder = tempfile::tempdir().unwrap();
+    let mut list = Vec::new();
+    for (c, frames) in clip.iter().enumerate().take(cameras) {
+        let own = folder.path().join(format!("c{c}"));
+        std::fs::create_dir(&own).unwrap();
+        for (n, p) in frames.iter().enumerate() {
+            let path = own.join(format!("{n:04}.png"));
+            image::save_buffer(path, &p.data, p.width as u32, p.height as u32, image::ColorType::Rgb8).unwrap();
+        }
+        let view = camera(c);
+        let (k, mut m) = (view.intrinsics, view.cam_from_world);
+        if c == ILL {
+            let (sin, cos) = turned.sin_cos();
+            let turn = |v: [f64; 3]| [v[0], cos * v[1] - sin * v[2], sin * v[1] + cos * v[2]];
+            let columns = [0, 1, 2].map(|j| turn([0, 1, 2].map(|i| m.rotation[i][j])));
+            m.rotation = [0, 1, 2].map(|i| [0, 1, 2].map(|j| columns[j][i]));
+            m.translation = turn(m.translation);
+        }
+        let row = |i: usize| [m.rotation[i][0], m.rotation[i][1], m.rotation[i][2], m.translation[i]];
+        list.push(json!({"name": format!("c{c}"), "width": view.width, "height": view.height, "fx": k.fx, "fy": k.fy,
+            "cx": k.cx, "cy": k.cy, "world_to_camera": [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]],
+            "images": format!("c{c}/%04d.png")}));
+    }
+    let all = json!({"version": 1, "fps": FPS, "cameras": list, "hold_out": "none"});
+    std::fs::write(folder.path().join("capture.json"), all.to_string()).unwrap();
+    let capture = Capture::open(folder.path(), &CaptureOptions::default()).unwrap();
+    examine(&capture, &Options::default(), &mut Progress(&mut |_| {})).unwrap()
+}
+
+fn found(report: &Report, check: &str) -> Vec<String> {
+    let own = report.findings.iter().filter(|f| f.check == check && f.grade > Grade::Note);
+    own.map(|f| f.camera.clone().unwrap_or_default()).collect()
+}
+
+fn is_found(clip: &Clip, check: &str) {
+    let report = says(clip, 0.0, CAMERAS);
+    assert_eq!(found(&report, check), [format!("c{ILL}")], "{check}: {:#?}", report.findings);
+}
+
+/// The clean take, with the ill camera's frames changed by their numbers.
+fn with(change: impl Fn(usize, &mut Rgb8)) -> Clip {
+    let mut clip = clean().clone();
+    clip[ILL].iter_mut().enumerate().for_each(|(n, p)| change(n, p));
+    clip
+}
+
+fn times(p: &mut Rgb8, factors: [f64; 3]) {
+    p.data.iter_mut().enumerate().for_each(|(i, v)| *v = (f64::from(*v) * factors[i % 3]).min(255.0) as u8);
+}
+
+fn blur(p: &mut Rgb8, reach: isize) {
+    let from = p.clone();
+    for y in 0..p.height as isize {
+        for x in 0..p.width as isize {
+            for c in 0..3 {
+                let mut sum = 0.0;
+                for dy in -reach..=reach {
+                    for dx in -reach..=reach {
+                        let (u, v) =
+                            ((x + dx).clamp(0, p.width as isize - 1), (y + dy).clamp(0, p.height as isize - 1));
+                        sum += f64::from(from.data[(v as usize * p.width + u as usize) * 3 + c]);
+                    }
+                }
+                p.data[(y as usize * p.width + x as usize) * 3 + c] = (sum / ((2 * reach + 1).pow(2)) as f64) as u8;
+            }
+        }
+    }
+}
+
+#[test]
+fn a_clean_take_raises_nothing() {
+    let report = says(clean(), 0.0, CAMERAS);
+    let bad: Vec<_> = report.findings.iter().filter(|f| f.grade > Grade::Note).collect();
+    assert!(bad.is_empty() && report.leave_out.is_empty(), "{bad:#?}");
+    assert!(report.cameras.iter().all(|c| c.epipolar.is_some()), "all were compared: {:?}", report.left);
+}
+
+#[test]
+fn a_wrong_pose_is_found_and_left_out() {
+    let report = says(clean(), 0.02, CAMERAS);
+    assert_eq!(found(&report, "epipolar"), ["c3"], "{:#?}", report.findings);
+    assert_eq!(report.leave_out, ["c3"]);
+}
+
+#[test]
+fn exposure_and_colour_are_found() {
+    is_found(&with(|_, p| times(p, [0.8; 3])), "exposure");
+    is_found(&with(|_, p| times(p, [1.0, 1.0, 0.8])), "white-balance");
+}
+
+#[test]
+fn flicker_is_found() {
+    is_found(&with(|n, p| times(p, [if n % 2 == 0 { 1.0 } else { 0.9 }; 3])), "flicker");
+}
+
+#[test]
+fn a_camera_out_of_focus_is_found() {
+    is_found(&with(|_, p| blur(p, 2)), "sharpness");
+}
+
+#[test]
+fn single_blurred_pictures_are_found() {
+    is_found(
+        &with(|n, p| {
+            if n == 5 {
+                blur(p, 2)
+            }
+        }),
+        "blurred",
+    );
+}
+
+#[test]
+fn a_camera_that_was_pushed_is_found() {
+    let mut clip = clean().clone();
+    let mut view = camera(ILL);
+    view.intrinsics.cx += 4.0;
+    (FRAMES / 2..FRAMES).for_each(|n| clip[ILL][n] = draw(&view, n as f64 / FPS));
+    is_found(&clip, "moved");
+}
+
+#[test]
+fn pictures_that_come_twice_are_found() {
+    let mut clip = clean().clone();
+    clip[ILL][6] = clip[ILL][5].clone();
+    is_found(&clip, "doubled");
+}
+
+#[test]
+fn dark_and_clipped_pictures_are_found() {
+    is_found(&with(|_, p| times(p, [0.1; 3])), "dark");
+    is_found(&with(|_, p| times(p, [3.0; 3])), "clipped");
+}
+
+#[test]
+fn hard_compression_is_found() {
+    is_found(
+        &with(|_, p| {
+            let (from, w) = (p.clone(), p.width);
+            let block = |i: usize| ((i / 3 / w) / 8 * 8 * w + (i / 3 % w) / 8 * 8) * 3 + i % 3;
+            (0..p.data.len()).for_each(|i| p.data[i] = from.data[block(i)]);
+        }),
+        "compression",
+    );
+}
+
+#[test]
+fn a_late_clock_is_found() {
+    let mut clip = clean().clone();
+    (0..FRAMES).for_each(|n| clip[ILL][n] = draw(&camera(ILL), (n as f64 - 1.0) / FPS));
+    is_found(&clip, "offset");
+}
+
+#[test]
+fn few_cameras_one_camera_and_one_moment_are_told() {
+    assert_eq!(found(&says(clean(), 0.0, 3), "cameras").len(), 1);
+    assert_eq!(found(&says(clean(), 0.0, 1), "cameras").len(), 1);
+    let moment: Clip = clean().iter().map(|c| c[..1].to_vec()).collect();
+    assert!(says(&moment, 0.0, CAMERAS).left.iter().any(|l| l.starts_with("Clocks")));
+}
