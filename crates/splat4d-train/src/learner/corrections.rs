@@ -16,9 +16,11 @@ settings! {
         /// Learn a correction of every training camera's pose; one for all frames of a fixed camera. The cameras' mean
         /// motion and growth stay nothing. Held-out views are measured aligned as well.
         poses: bool = false;
-        /// Learn a shift of every training camera's clock; the first camera's stays.
+        /// Learn a shift of every training camera's clock; the first camera's stays. Shifts of whole frames are hardly found
+        /// (docs/benchmarks.md); `splat4d import` finds those.
         times: bool = false => any().when(IsNot("run.motion", &["still", "tracked"]));
-        /// Rate of rotations at first (chosen so that half a degree is within reach of the 50 views that a camera gets in a short run; not swept).
+        /// Rate of rotations at first: half a degree is within reach of the 50 views that a camera gets in a short run. Not
+        /// swept.
         rotation_init: f64 = 1e-3 => positive().unit("radians").when(On("refine.poses"));
         /// Rate of rotations at the end.
         rotation_final: f64 = 1e-5 => positive().unit("radians").when(On("refine.poses"));

@@ -152,7 +152,7 @@ fn cache_keeps_its_budget_and_never_changes_pixels() {
     roomy.prefetch(&[0, 1, 2]);
     let start = std::time::Instant::now();
     while roomy.decoded() < 3 && start.elapsed().as_secs() < 10 {
-        std::thread::sleep(std::time::Duration::from_millis(1));
+        std::thread::sleep(Duration::from_millis(1));
     }
     (0..3).for_each(|i| drop(roomy.load(i).unwrap()));
     assert_eq!(roomy.decoded(), 3, "prefetched pictures must not be decoded again");
