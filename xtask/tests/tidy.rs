@@ -102,7 +102,7 @@ const SHELLS: [&str; 3] = ["crates/splat4d-cli/", "studies/", "xtask/"];
 const PATH_WORDS: [&str; 3] = ["std::fs", "std::path", "File::open"];
 
 /// Documents whose paths and flags are checked.
-const DOCS: [&str; 11] = [
+const DOCS: [&str; 12] = [
     "README.md",
     "ARCHITECTURE.md",
     "CONVENTIONS.md",
@@ -110,6 +110,7 @@ const DOCS: [&str; 11] = [
     "docs/benchmarks.md",
     "docs/bundled-capture.md",
     "docs/capture-format.md",
+    "docs/doctor.md",
     "docs/formats.md",
     "docs/models.md",
     "docs/recipe.md",

@@ -14,6 +14,8 @@ const SPREAD: usize = 15;
 const MEDIAN_FROM: usize = 3;
 /// Pictures of a moving camera that are compared with others.
 const STANDS: usize = 16;
+/// Pictures are halved until they have no more pixels: 640x360 is looked at as it is, and a film's pictures at half size.
+const PIXELS: usize = 700_000;
 /// A value at or above (at or below one minus) this is clipped, of 255.
 const CLIPPED: [u8; 2] = [2, 253];
 /// Pixels between corners that are followed.
@@ -50,7 +52,31 @@ pub(super) struct Seen {
     pub(super) sizes: Vec<[usize; 2]>,
 }
 
-fn bytes(color: &Planes<f32>) -> Rgb8 {
+/// How often a picture of this size is halved.
+fn halvings(view: &Camera) -> u32 {
+    (0..).find(|k| (view.width >> k) * (view.height >> k) <= PIXELS).unwrap_or(0)
+}
+
+/// The view of a picture as it is looked at.
+fn looked(view: &Camera) -> Camera {
+    view.downscaled(1 << halvings(view))
+}
+
+fn bytes(color: &Planes<f32>, halvings: u32) -> Rgb8 {
+    let k = 1 << halvings;
+    if k > 1 {
+        let (width, height) = (color.width / k, color.height / k);
+        let mut data = Vec::with_capacity(3 * width * height);
+        for p in 0..width * height {
+            for c in 0..3 {
+                let (x, y) = (p % width * k, p / width * k);
+                let row = |y: usize| color.plane(c)[y * color.width + x..][..k].iter().sum::<f32>();
+                let mean = (y..y + k).map(row).sum::<f32>() / (k * k) as f32;
+                data.push((mean * 255.0).round().clamp(0.0, 255.0) as u8);
+            }
+        }
+        return Rgb8 { width, height, data };
+    }
     let data = color.interleaved().iter().map(|v| (v * 255.0).round().clamp(0.0, 255.0) as u8).collect();
     Rgb8 { width: color.width, height: color.height, data }
 }
@@ -130,7 +156,9 @@ pub(super) fn camera(capture: &Capture, store: &ImageStore, camera: usize, optio
     let mut frames: Vec<usize> = (0..capture.frames.len()).filter(|&i| capture.frames[i].camera == camera).collect();
     frames.sort_by(|&i, &j| capture.frames[i].time.0.total_cmp(&capture.frames[j].time.0));
     let fixed = capture.cameras[camera].fixed;
-    let load = |i: usize| Ok::<Rgb8, crate::Error>(bytes(&store.load(i)?.to_picture().color));
+    let load = |i: usize| {
+        Ok::<Rgb8, crate::Error>(bytes(&store.load(i)?.to_picture().color, halvings(&capture.frames[i].view)))
+    };
     let mut seen = Seen::default();
     let size = |i: usize| [capture.frames[i].source.width, capture.frames[i].source.height];
     seen.sizes = frames.iter().map(|&i| size(i)).collect();
@@ -147,27 +175,31 @@ pub(super) fn camera(capture: &Capture, store: &ImageStore, camera: usize, optio
     if pictures.iter().any(|p| p.width.min(p.height) < 32) {
         return Ok(seen);
     }
-    seen.blocks = blocks(&Grey::of(&pictures[pictures.len() / 2]));
+    // Blocks of pictures that were made smaller are no longer of 8 pixels.
+    if halvings(&capture.frames[chosen[0]].view) == 0 {
+        seen.blocks = blocks(&Grey::of(&pictures[pictures.len() / 2]));
+    }
     if fixed && same {
         let third = (pictures.len() / 3).min(3);
         if third > 0 {
             let ends = [&pictures[..third], &pictures[pictures.len() - third..]].map(|p| Grey::of(&median_of(p)));
             seen.moved = moved(&ends[0], &ends[1]);
         }
-        seen.stands.push(Stand { view: capture.frames[chosen[0]].view.clone(), picture: median_of(&pictures) });
+        seen.stands.push(Stand { view: looked(&capture.frames[chosen[0]].view), picture: median_of(&pictures) });
     } else {
         for (&i, picture) in chosen.iter().zip(pictures) {
-            seen.stands.push(Stand { view: capture.frames[i].view.clone(), picture });
+            seen.stands.push(Stand { view: looked(&capture.frames[i].view), picture });
         }
     }
     let first = (frames.len() - frames.len().min(options.window)) / 2;
-    let row = &frames[first..first + frames.len().min(options.window)];
+    // Of a moving camera only its darkness is asked, which a few pictures tell.
+    let row = if fixed { &frames[first..first + frames.len().min(options.window)] } else { &chosen[..] };
     let still = (fixed && same && frames.len() >= MEDIAN_FROM).then(|| Grey::of(&seen.stands[0].picture));
     let mut tracker = Tracker::new(options.tracks, APART);
     let mut differences = Vec::new();
     let mut last: Option<Rgb8> = None;
     for (k, &i) in row.iter().enumerate() {
-        let picture = load(i)?;
+        let picture = if fixed { load(i)? } else { seen.stands[k].picture.clone() };
         if let Some(last) = &last {
             differences.push((first + k, mean_difference(last, &picture)));
         }

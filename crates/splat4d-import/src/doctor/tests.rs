@@ -1,11 +1,16 @@
 //! Each fault drawn once, and a clean take: a room of random spots that six cameras see, and balls that move in it.
 
-use super::{Grade, Options, Report, examine};
+use super::check::clocks;
+use super::look::{Seen, Stand};
+use super::{CameraReport, Grade, Options, Report, examine};
+use crate::sync::tracks::Track;
+use crate::video::Clock;
 use serde_json::json;
 use splat4d::math::{Rng, Se3};
 use splat4d::scene::Camera;
 use splat4d_train::capture::{Capture, CaptureOptions, Rgb8};
 use splat4d_train::event::Progress;
+use std::path::Path;
 use std::sync::OnceLock;
 
 const SIZE: [usize; 2] = [256, 192];
@@ -25,11 +30,11 @@ fn camera(c: usize) -> Camera {
 /// Spots on a wall that bends, and balls: centre, radius, colour.
 fn things(t: f64) -> Vec<([f64; 3], f64, [f64; 3])> {
     let mut out = Vec::new();
-    for k in 0..700 {
+    for k in 0..1600 {
         let rng = Rng::new(3, "spots of a drawn room", k);
         let (x, y) = (6.0 * (rng.uniform(0) - 0.5), 4.0 * (rng.uniform(1) - 0.5));
         let color = [5, 6, 7].map(|i| 0.8 * (rng.uniform(i) - 0.5));
-        out.push(([x, y, 0.6 + 0.5 * (1.3 * x).sin() + 0.3 * (1.7 * y).cos()], 0.03 + 0.07 * rng.uniform(3), color));
+        out.push(([x, y, 0.6 + 0.5 * (1.3 * x).sin() + 0.3 * (1.7 * y).cos()], 0.015 + 0.04 * rng.uniform(3), color));
     }
     for k in 0..14 {
         let rng = Rng::new(4, "balls of a drawn room", k);
@@ -70,9 +75,15 @@ fn clean() -> &'static Clip {
 /// What the doctor says of these pictures, where the ill camera's pose is turned by so many radians about its own x axis.
 fn says(clip: &Clip, turned: f64, cameras: usize) -> Report {
     let folder = tempfile::tempdir().unwrap();
+    let capture = write(folder.path(), clip, turned, cameras);
+    let options = Options { features: 500, ..Options::default() };
+    examine(&capture, &options, &mut Progress(&mut |_| {})).unwrap()
+}
+
+fn write(folder: &Path, clip: &Clip, turned: f64, cameras: usize) -> Capture {
     let mut list = Vec::new();
     for (c, frames) in clip.iter().enumerate().take(cameras) {
-        let own = folder.path().join(format!("c{c}"));
+        let own = folder.join(format!("c{c}"));
         std::fs::create_dir(&own).unwrap();
         for (n, p) in frames.iter().enumerate() {
             let path = own.join(format!("{n:04}.png"));
@@ -93,9 +104,8 @@ fn says(clip: &Clip, turned: f64, cameras: usize) -> Report {
             "images": format!("c{c}/%04d.png")}));
     }
     let all = json!({"version": 1, "fps": FPS, "cameras": list, "hold_out": "none"});
-    std::fs::write(folder.path().join("capture.json"), all.to_string()).unwrap();
-    let capture = Capture::open(folder.path(), &CaptureOptions::default()).unwrap();
-    examine(&capture, &Options::default(), &mut Progress(&mut |_| {})).unwrap()
+    std::fs::write(folder.join("capture.json"), all.to_string()).unwrap();
+    Capture::open(folder, &CaptureOptions::default()).unwrap()
 }
 
 fn found(report: &Report, check: &str) -> Vec<String> {
@@ -215,11 +225,48 @@ fn hard_compression_is_found() {
     );
 }
 
+/// Perfect tracks of things that move by one music, on a clock that is late by so many seconds.
+fn tracks(c: usize, late: f64) -> Vec<Track> {
+    let place = |k: usize, t: f64| {
+        let rng = Rng::new(8, "dancers", k as u64);
+        let time = t + 0.28 * (1.9 * t).sin() + 0.13 * (4.3 * t + 1.0).sin() + 0.05 * (9.7 * t + 2.0).sin();
+        let wave = |i: u64| {
+            let one = |s: f64, j: u64| (s * time + 6.283 * rng.uniform(i + j)).sin();
+            1.6 * (rng.uniform(i) - 0.5)
+                + 0.35 * one(1.3 + rng.uniform(i + 1), 2)
+                + 0.2 * one(2.9 + 2.0 * rng.uniform(i + 3), 4)
+        };
+        [wave(0), 0.7 * wave(10), wave(20)]
+    };
+    let sample = |k: usize, n: usize| {
+        let t = n as f64 / FPS;
+        (t, camera(c).project(place(k, t - late)).unwrap().0)
+    };
+    (0..30).map(|k| Track { samples: (0..60).map(|n| sample(k, n)).collect() }).collect()
+}
+
 #[test]
 fn a_late_clock_is_found() {
-    let mut clip = clean().clone();
-    (0..FRAMES).for_each(|n| clip[ILL][n] = draw(&camera(ILL), (n as f64 - 1.0) / FPS));
-    is_found(&clip, "offset");
+    let folder = tempfile::tempdir().unwrap();
+    let moment: Clip = clean().iter().map(|c| c[..2].to_vec()).collect();
+    let capture = write(folder.path(), &moment, 0.0, CAMERAS);
+    for (late, expected) in [(0.0, vec![]), (0.9 / FPS, vec!["c3"])] {
+        let seen = |c: usize| Seen {
+            stands: vec![Stand { view: camera(c), picture: Rgb8::default() }],
+            tracks: tracks(c, if c == ILL { late } else { 0.0 }),
+            clock: Clock { interval: 1.0 / FPS, ..Clock::default() },
+            row: 60,
+            ..Seen::default()
+        };
+        let seen: Vec<Seen> = (0..CAMERAS).map(seen).collect();
+        let cameras = (0..CAMERAS).map(|_| CameraReport::default()).collect();
+        let mut report = Report { cameras, ..Report::default() };
+        clocks(&capture, &seen, &mut report, &mut Progress(&mut |_| {}));
+        assert_eq!(found(&report, "offset"), expected, "{:?} {:?}", report.findings, report.left);
+        if let Some(f) = report.findings.first() {
+            assert!((f.amount.unwrap() + 1e3 * late).abs() < 2.0, "late by {late}: {f:?}");
+        }
+    }
 }
 
 #[test]
