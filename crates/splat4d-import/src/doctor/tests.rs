@@ -231,7 +231,7 @@ fn tracks(c: usize, late: f64) -> Vec<Track> {
         let rng = Rng::new(8, "dancers", k as u64);
         let time = t + 0.28 * (1.9 * t).sin() + 0.13 * (4.3 * t + 1.0).sin() + 0.05 * (9.7 * t + 2.0).sin();
         let wave = |i: u64| {
-            let one = |s: f64, j: u64| (s * time + 6.283 * rng.uniform(i + j)).sin();
+            let one = |s: f64, j: u64| (s * time + std::f64::consts::TAU * rng.uniform(i + j)).sin();
             1.6 * (rng.uniform(i) - 0.5)
                 + 0.35 * one(1.3 + rng.uniform(i + 1), 2)
                 + 0.2 * one(2.9 + 2.0 * rng.uniform(i + 3), 4)
