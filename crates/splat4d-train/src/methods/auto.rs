@@ -31,9 +31,10 @@ impl Seen {
     /// Looks at the training frames of a capture.
     pub(crate) fn of(plan: &Plan, frames: &dyn Frames) -> Result<Self> {
         let looks = plan.times > 1 && plan.fixed_cameras > 0;
+        let times = if plan.fixed_cameras > 1 { moments(frames).min(plan.times) } else { plan.times };
         Ok(Self {
-            times: plan.times,
-            cameras: frames.len() as f64 / plan.times.max(1) as f64,
+            times,
+            cameras: frames.len() as f64 / times.max(1) as f64,
             changing: if looks { motion_energy(frames)? } else { None },
             masks: frames.has_masks(),
         })
@@ -64,6 +65,24 @@ pub(crate) fn choose(plan: &Plan, frames: &dyn Frames) -> Result<Choice> {
     let seen = Seen::of(plan, frames)?;
     let choice = PROGRAMS.into_iter().find_map(|(motion, make)| Some(Choice { motion, why: make().suits(&seen)? }));
     Ok(choice.expect("one program suits whatever no other does"))
+}
+
+/// Moments of a rig whose shutters do not open at once: times less than half a frame apart are one.
+fn moments(frames: &dyn Frames) -> usize {
+    let mut all: Vec<(usize, f64)> = (0..frames.len()).map(|i| (frames.rig(i), frames.time(i).0)).collect();
+    all.sort_by(|a, b| a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)));
+    let mut frame: Vec<f64> = all.windows(2).filter(|w| w[0].0 == w[1].0).map(|w| w[1].1 - w[0].1).collect();
+    frame.sort_by(f64::total_cmp);
+    let half = 0.5 * frame.get(frame.len() / 2).copied().unwrap_or(0.0);
+    let mut times: Vec<f64> = all.into_iter().map(|(_, t)| t).collect();
+    times.sort_by(f64::total_cmp);
+    let (mut count, mut first) = (0, f64::NEG_INFINITY);
+    for t in times {
+        if t - first > half {
+            (count, first) = (count + 1, t);
+        }
+    }
+    count
 }
 
 /// Share of the pixels of fixed cameras that change from one of their frames to the next; `None`: no camera has two.
@@ -113,12 +132,14 @@ mod tests {
         speed: usize,
         masks: bool,
         camera: Camera,
+        /// Seconds by which each camera is later than the one before.
+        late: f64,
     }
 
     impl Made {
         fn new(cameras: usize, times: usize, speed: usize, masks: bool) -> Self {
             let pose = Se3::look_at([0.0, 0.0, -4.0], [0.0; 3], [0.0, -1.0, 0.0]);
-            Self { cameras, times, speed, masks, camera: Camera::with_fov_y(pose, 0.9, 64, 48) }
+            Self { cameras, times, speed, masks, camera: Camera::with_fov_y(pose, 0.9, 64, 48), late: 0.0 }
         }
 
         fn choose(&self, fixed: bool) -> Choice {
@@ -127,7 +148,7 @@ mod tests {
                 extent: 1.0,
                 clip: [0.0, 1.0],
                 fps: 30.0,
-                times: self.times,
+                times: if self.late == 0.0 { self.times } else { self.times * self.cameras },
                 fixed_cameras: if fixed { self.cameras } else { 0 },
                 moments: Vec::new(),
                 masks: self.masks,
@@ -144,7 +165,7 @@ mod tests {
             &self.camera
         }
         fn time(&self, i: usize) -> Time {
-            Time((i / self.cameras) as f64 / 30.0)
+            Time((i / self.cameras) as f64 / 30.0 + self.late * (i % self.cameras) as f64)
         }
         fn rig(&self, i: usize) -> usize {
             i % self.cameras
@@ -177,6 +198,9 @@ mod tests {
         is(Made::new(6, 1, 4, true), true, "still", "one moment");
         is(Made::new(6, 10, 0, true), true, "still", "0.000 %");
         is(Made::new(6, 10, 4, true), true, "spacetime", "6 cameras");
+        // Shutters that do not open at once: by little, and by up to a frame.
+        is(Made { late: 0.002, ..Made::new(6, 10, 4, true) }, true, "spacetime", "6 cameras");
+        is(Made { late: 0.005, ..Made::new(6, 10, 4, true) }, true, "spacetime", "3");
         is(Made::new(1, 50, 4, true), false, "control", "one camera");
         is(Made::new(1, 50, 4, false), false, "deform-mlp", "one camera");
         is(Made::new(2, 700, 4, true), true, "deform-mlp", "of 700");
