@@ -200,7 +200,7 @@ mod tests {
         is(Made::new(6, 10, 4, true), true, "spacetime", "6 cameras");
         // Shutters that do not open at once: by little, and by up to a frame.
         is(Made { late: 0.002, ..Made::new(6, 10, 4, true) }, true, "spacetime", "6 cameras");
-        is(Made { late: 0.005, ..Made::new(6, 10, 4, true) }, true, "spacetime", "3");
+        is(Made { late: 0.005, ..Made::new(6, 10, 4, true) }, true, "spacetime", "4 cameras");
         is(Made::new(1, 50, 4, true), false, "control", "one camera");
         is(Made::new(1, 50, 4, false), false, "deform-mlp", "one camera");
         is(Made::new(2, 700, 4, true), true, "deform-mlp", "of 700");
