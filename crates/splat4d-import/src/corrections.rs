@@ -1,6 +1,6 @@
 //! `import.toml`: what was found of every camera, to be corrected by hand and run again.
 
-use crate::sync::graph::{Kind, Offset};
+use crate::sync::graph::Offset;
 use serde::{Deserialize, Serialize};
 use splat4d::scene::{Intrinsics, Lens};
 use splat4d::{Error, ErrorKind, Result};
@@ -121,15 +121,9 @@ impl Camera {
         if self.keep_offset {
             return;
         }
-        let word = |kind: &Kind| match kind {
-            Kind::Given => "told",
-            Kind::Geometry => "geometry",
-            Kind::Sound => "sound",
-            Kind::Motion => "motion",
-        };
         (self.offset, self.rate) = (Some(offset.seconds), offset.rate);
         (self.sigma, self.checked) = (Some(offset.sigma), Some(offset.checked));
-        self.by = offset.kinds.iter().map(|k| word(k).to_owned()).collect();
+        self.by = offset.kinds.iter().map(|k| k.name().to_owned()).collect();
     }
 
     /// Notes a lens that was found; the user's stays.
@@ -268,6 +262,7 @@ impl Corrections {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::sync::graph::Kind;
 
     fn names() -> Vec<String> {
         ["left", "right"].map(String::from).to_vec()

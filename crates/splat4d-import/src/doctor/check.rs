@@ -1,5 +1,5 @@
 //! The checks. Thresholds are of the project's own study of captures ("Doctor": what is seen in results) where no other source
-//! is named: the first of two is a warning, the second is bad.
+//! is named: the first of two is a warning, the second is bad. Those of flicker, dark and clipped pictures are chosen by eye.
 
 use super::look::{Seen, Stand, detail};
 use super::{CameraReport, Finding, Grade, Options, Report};

@@ -27,6 +27,18 @@ pub enum Kind {
     Motion,
 }
 
+impl Kind {
+    /// Its name in reports and in the file of corrections.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Given => "told",
+            Self::Geometry => "geometry",
+            Self::Sound => "sound",
+            Self::Motion => "motion",
+        }
+    }
+}
+
 /// A lag of two cameras.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Evidence {
@@ -43,7 +55,7 @@ pub struct Evidence {
 }
 
 /// What is added to a camera's times: an event at t is at `t·(1 + rate) + seconds` on the clock of all.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Offset {
     /// Seconds.
     pub seconds: f64,

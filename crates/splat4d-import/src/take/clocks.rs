@@ -137,17 +137,11 @@ pub(super) fn shared(
 
 /// What was measured and not believed, a line each.
 pub(super) fn refusals(names: &[&str], evidence: &[Evidence], clock: &Solution) -> Vec<String> {
-    let word = |kind: Kind| match kind {
-        Kind::Given => "what was told",
-        Kind::Geometry => "geometry",
-        Kind::Sound => "sound",
-        Kind::Motion => "motion",
-    };
     let line = |r: &graph::Refused| {
         let e = &evidence[r.evidence];
         let off = r.off?;
         let [a, b] = e.cameras.map(|c| names[c]);
-        Some(format!("{a} and {b}: {} contradicts the rest by {:.0} ms", word(e.kind), 1e3 * off.abs()))
+        Some(format!("{a} and {b}: {} contradicts the rest by {:.0} ms", e.kind.name(), 1e3 * off.abs()))
     };
     clock.refused.iter().filter_map(line).collect()
 }

@@ -1,13 +1,12 @@
 //! Which files and folders are cameras.
 
+use crate::video::PICTURE_ENDINGS;
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 
 /// Endings of videos.
 const VIDEOS: [&str; 14] =
     ["mp4", "mov", "m4v", "mkv", "avi", "webm", "mts", "m2ts", "ts", "mpg", "mpeg", "mxf", "3gp", "wmv"];
-/// Endings of pictures.
-const PICTURES: [&str; 4] = ["jpg", "jpeg", "png", "webp"];
 
 /// The cameras that paths stand for: a video is one, a folder of pictures is one, and a folder of those is all of them, by
 /// name.
@@ -24,12 +23,12 @@ pub fn find(paths: &[PathBuf]) -> Result<Vec<PathBuf>> {
         let videos: Vec<PathBuf> = inside.iter().filter(|p| p.is_file() && ends(p, &VIDEOS)).cloned().collect();
         if !videos.is_empty() {
             out.extend(videos);
-        } else if inside.iter().any(|p| p.is_file() && ends(p, &PICTURES)) {
+        } else if inside.iter().any(|p| p.is_file() && ends(p, &PICTURE_ENDINGS)) {
             out.push(path.clone());
         } else {
             let mut folders = Vec::new();
             for folder in inside.iter().filter(|p| p.is_dir()) {
-                if entries(folder)?.iter().any(|p| p.is_file() && ends(p, &PICTURES)) {
+                if entries(folder)?.iter().any(|p| p.is_file() && ends(p, &PICTURE_ENDINGS)) {
                     folders.push(folder.clone());
                 }
             }

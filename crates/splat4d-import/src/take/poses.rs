@@ -59,8 +59,8 @@ pub(super) fn standing(
     let n = stored.pictures.len();
     let mut offsets = clock.offsets;
     // What nothing tells stays as the files have it.
-    let silent = Offset { seconds: 0.0, sigma: 0.0, rate: 0.0, kinds: Vec::new(), checked: false };
-    let mut current: Vec<Offset> = offsets.iter().map(|o| o.clone().unwrap_or_else(|| silent.clone())).collect();
+    let mut current: Vec<Offset> = offsets.iter().map(|o| o.clone().unwrap_or_default()).collect();
+    let before: Vec<f64> = current.iter().map(|o| o.seconds).collect();
     let frame = stored.pictures.iter().map(|p| p.clock.interval).filter(|i| *i > 0.0).fold(f64::INFINITY, f64::min);
     let all_told = told.iter().all(Option::is_some);
     let mut options = Options::default();
@@ -82,9 +82,7 @@ pub(super) fn standing(
     for c in 0..n {
         // Sound that geometry contradicts was sound of something else.
         if let Some(o) = &mut offsets[c]
-            && let Some(first) = current.get(c)
-            && o.kinds.contains(&Kind::Sound)
-            && (o.seconds - first.seconds).abs() > CONTRADICTS * frame
+            && (o.seconds - before[c]).abs() > CONTRADICTS * frame
         {
             o.kinds.retain(|k| *k != Kind::Sound);
         }
@@ -193,8 +191,7 @@ fn points_of(solution: &Solution) -> Vec<([f64; 3], [u8; 3])> {
 impl Solved {
     /// The clock of a camera; its file's where nothing is known.
     pub(super) fn offset(&self, camera: usize) -> Offset {
-        let silent = Offset { seconds: 0.0, sigma: 0.0, rate: 0.0, kinds: Vec::new(), checked: false };
-        self.offsets[camera].clone().unwrap_or(silent)
+        self.offsets[camera].clone().unwrap_or_default()
     }
 
     /// Makes the unit of length the metre.

@@ -2,7 +2,7 @@
 
 use super::poses::Stand;
 use crate::Result;
-use crate::sync::graph::{Kind, Offset};
+use crate::sync::graph::Offset;
 use crate::write::Pictures;
 use serde::Serialize;
 use splat4d_train::run::checkpoint::write_atomically;
@@ -62,12 +62,6 @@ pub struct CameraReport {
 impl CameraReport {
     pub(super) fn of(pictures: &Pictures, placed: &Result<Stand, String>, offset: Option<&Offset>) -> Self {
         let stand = placed.as_ref().ok();
-        let word = |kind: &Kind| match kind {
-            Kind::Given => "told",
-            Kind::Geometry => "geometry",
-            Kind::Sound => "sound",
-            Kind::Motion => "motion",
-        };
         Self {
             name: pictures.name.clone(),
             frames: pictures.shots.len(),
@@ -76,7 +70,7 @@ impl CameraReport {
             lost: [pictures.clock.missing(), pictures.clock.doubled.len()],
             offset: offset.map(|o| o.seconds),
             sigma: offset.map(|o| o.sigma),
-            by: offset.map_or_else(Vec::new, |o| o.kinds.iter().map(word).collect()),
+            by: offset.map_or_else(Vec::new, |o| o.kinds.iter().map(|k| k.name()).collect()),
             trouble: placed.as_ref().err().cloned(),
             sightings: stand.map_or(0, |s| s.sightings),
             error: stand.map(|s| s.error),

@@ -7,7 +7,7 @@ use std::cmp::Ordering;
 use std::path::{Path, PathBuf};
 
 /// Endings of pictures.
-const ENDINGS: [&str; 4] = ["jpg", "jpeg", "png", "webp"];
+pub(crate) const ENDINGS: [&str; 4] = ["jpg", "jpeg", "png", "webp"];
 /// Frames per second that anything was ever filmed at, and slower time lapses.
 const RATES: std::ops::RangeInclusive<f64> = 1e-6..=1e5;
 

@@ -13,6 +13,7 @@ mod probe;
 mod program;
 
 pub use clock::{Clock, Gap, mean_difference};
+pub(crate) use folder::ENDINGS as PICTURE_ENDINGS;
 pub use folder::Folder;
 pub use probe::{Color, Info, Range, Transfer};
 pub use program::Tools;
