@@ -34,7 +34,7 @@ const JPEG_QUALITY: u8 = 60;
 const TRUTH_CAMERAS: [usize; 4] = [2, 8, 11, 17];
 const TRUTH_FRAMES: [usize; 4] = [3, 10, 17, 24];
 
-/// `capture [FOLDER]`, `capture --check [N]` and `capture --still CHARACTER.glb FOLDER ...`.
+/// `capture [FOLDER]`, `capture --check [N]`, `capture --still CHARACTER.glb FOLDER ...` and `capture --videos FOLDER`.
 pub(crate) fn command(arguments: &[String]) -> Result<()> {
     let home = bundled_folder();
     match arguments {
@@ -49,14 +49,17 @@ pub(crate) fn command(arguments: &[String]) -> Result<()> {
             check(&home, &picks.map(|p| (p % CAMERAS, p / CAMERAS)).collect::<Vec<_>>())
         }
         [flag, rest @ ..] if flag == "--still" => crate::still::command(rest),
+        [flag, folder] if flag == "--videos" => crate::videos::command(Path::new(folder)),
         [] => write(&home, &home),
         [folder] if !folder.starts_with('-') => write(&home, Path::new(folder)),
-        _ => bail!("capture takes a folder, --check with a number, or --still with a character and a folder"),
+        _ => bail!(
+            "capture takes a folder, --check with a number, --still with a character and a folder, or --videos with a folder"
+        ),
     }
 }
 
 /// examples/knight of this checkout.
-fn bundled_folder() -> PathBuf {
+pub(crate) fn bundled_folder() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/knight")
 }
 

@@ -18,6 +18,7 @@ mod strip;
 mod texture;
 mod truth;
 mod vector;
+mod videos;
 
 use anyhow::{Context, Result, bail, ensure};
 use std::path::Path;
@@ -32,6 +33,8 @@ chores:
   capture --still CHARACTER.glb FOLDER [--views N] [--size PIXELS] [--pose CLIP SECONDS] [--drop NODE...]
                              draws a character frozen in one pose, cut out, from N (default 100) cameras on a
                              hemisphere, PIXELS (default 400) wide and high; every 8th is held out
+  capture --videos FOLDER    draws the scene as eight unsynchronised, uncalibrated, differently exposed videos with sound,
+                             for `splat4d import`, and truth.json beside them
   strip-character IN.glb OUT.glb CLIP... [--drop NODE...]
                              keeps the named animation clips of a character, drops the named nodes' meshes
   count [FOLDER]             counts lines of code, without tests, comments and blank lines, of the repository FOLDER";

@@ -83,20 +83,25 @@ impl Stage {
 
     /// The scene at frame `t`.
     pub(crate) fn frame(&self, t: usize) -> Result<Frame> {
-        let seconds = t as f64 / FPS;
+        self.frame_at(t as f64)
+    }
+
+    /// The scene at a time in frames, between two of them where it is not whole.
+    pub(crate) fn frame_at(&self, t: f64) -> Result<Frame> {
+        let seconds = t / FPS;
         let mut moving = Mesh::default();
         let fixed = self.fixed.positions.len();
         let mut first_vertex = [None; OBJECTS];
         first_vertex[0] = Some(0);
         let mut mark = |object: usize, mesh: &Mesh| first_vertex[object] = Some((fixed + mesh.positions.len()) as u32);
 
-        let (knight_at, knight_angle) = knight_path(t as f64);
+        let (knight_at, knight_angle) = knight_path(t);
         mark(1, &moving);
-        let pose = self.knight_pose(t as f64)?;
+        let pose = self.knight_pose(t)?;
         let knight = self.knight.draw(&pose, &Affine::standing(knight_at, knight_angle), KNIGHT, 1, &mut moving);
         let mage_start = moving.positions.len();
         mark(2, &moving);
-        let mage_at = v3(1.15, 0.0, -0.35).lerp(v3(1.65, 0.0, -1.15), t as f64 / FRAMES as f64);
+        let mage_at = v3(1.15, 0.0, -0.35).lerp(v3(1.65, 0.0, -1.15), t / FRAMES as f64);
         let mage_angle = heading(-1.0, 0.45);
         let legs = self.mage.sample("Walking_Backwards", 0.9 * seconds)?;
         let arms = self.mage.sample("Spellcast_Long", 0.55 + 1.25 * seconds)?;
@@ -106,13 +111,13 @@ impl Stage {
         let (ball, roll) = ball_path(seconds);
         moving.ball(&Affine { origin: ball, ..Affine::standing(ball, roll) }, BALL_RADIUS, 24, BALL, 3);
         let mut feet = vec![knight_at, mage_at, v3(ball.x, 0.0, ball.z)];
-        if t < CRATE_LEAVES {
+        if t < CRATE_LEAVES as f64 {
             mark(4, &moving);
             let place = Affine::standing(v3(-0.55, 0.0, 1.75), 0.5);
             moving.crate_box(&place, v3(0.8, 0.8, 0.8), PAINTED_CRATE, 4);
             feet.push(place.origin);
         }
-        let orb = (t >= ORB_APPEARS).then(|| orb_path(t as f64));
+        let orb = (t >= ORB_APPEARS as f64).then(|| orb_path(t));
         let light_casters = {
             let mut casters = self.props.clone();
             casters.append(&moving);

@@ -2,14 +2,39 @@
 
 use super::chart::escape;
 use super::{STYLE, pictures};
+use crate::console::Console;
+use crate::files;
 use image::RgbImage;
-use splat4d_import::doctor::{Grade, Report};
+use splat4d_import::doctor::{Finding, Grade, Options, Report, examine};
+use splat4d_train::capture::Capture;
+use splat4d_train::event::{Event, Progress};
 use std::fmt::Write;
+use std::path::{Path, PathBuf};
+
+/// Looks at a capture and writes `doctor.html`, whose path is given back, and `doctor.json` into `folder`.
+pub(crate) fn made(capture: &Capture, folder: &Path, console: &Console) -> anyhow::Result<(Report, PathBuf)> {
+    let mut listen = |event: &Event| console.event(event);
+    let report = examine(capture, &Options::default(), &mut Progress(&mut listen))?;
+    console.clear();
+    files::make_folder(folder)?;
+    let html = folder.join("doctor.html");
+    files::write(&html, page(&report).as_bytes())?;
+    files::write(&folder.join("doctor.json"), &serde_json::to_vec_pretty(&report)?)?;
+    Ok((report, html))
+}
+
+/// A finding in sentences.
+pub(crate) fn sentence(f: &Finding) -> String {
+    format!("{}: {} {} {}", word(f.grade), f.what, f.looks, f.remedy)
+}
 
 /// The page.
-pub(crate) fn page(report: &Report) -> String {
+fn page(report: &Report) -> String {
     let mut body = String::new();
     let _ = writeln!(body, "<header><h1>{}</h1><p>{}</p></header>", escape(&report.capture), escape(&summary(report)));
+    for line in about(report) {
+        let _ = writeln!(body, "<p>{}</p>", escape(&line));
+    }
     body.push_str("<h2>Findings, worst first</h2>\n");
     for f in &report.findings {
         let text = format!("{} {} {}", f.what, f.looks, f.remedy);
@@ -47,15 +72,45 @@ pub(crate) fn page(report: &Report) -> String {
         row("exposure", camera.exposure.map(|e| e.map(|v| format!("{v:+.2}")).join(" ") + " stops"));
         row("sharpness", camera.sharpness.map(|v| format!("{v:.2} times the others'")));
         row("moved", camera.moved.map(|v| format!("{v:.2} px of 1920")));
+        row("focus, last to first", camera.focus.map(|v| format!("{v:.2}")));
+        row("first to last row", camera.shutter.map(|[v, s]| format!("{:+.1} ± {:.1} ms", 1e3 * v, 1e3 * s)));
         body.push_str("</table></div>\n");
     }
     body.push_str("</div>\n");
+    body.push_str(&pairs(report));
     let title = escape(&report.capture);
     format!(
         "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><meta name=\"viewport\" \
          content=\"width=device-width, initial-scale=1\"><title>{title} · splat4d doctor</title>\n<style>\n{STYLE}</style>\
          </head>\n<body><main>\n{body}</main></body></html>\n"
     )
+}
+
+/// What pairs of cameras say, folded.
+fn pairs(report: &Report) -> String {
+    if report.pairs.is_empty() {
+        return String::new();
+    }
+    let number = |v: f64, digits: usize| if v.is_finite() { format!("{v:+.digits$}") } else { "–".to_owned() };
+    let mut out = format!(
+        "<details><summary>{} pairs of pictures that show the same, the worst poses first</summary>\n<table>\
+         <tr><th>cameras</th><th>features</th><th>poses, px of 1920</th><th>second is brighter, stops (red green blue)</th>\
+         <th>as sharp</th></tr>\n",
+        report.pairs.len()
+    );
+    for p in &report.pairs {
+        let _ = writeln!(
+            out,
+            "<tr><td>{} – {}</td><td>{}</td><td>{:.2}</td><td>{}</td><td>{:.2}</td></tr>",
+            escape(&p.cameras[0]),
+            escape(&p.cameras[1]),
+            p.matches,
+            p.epipolar,
+            p.gain.map(|g| number(g, 2)).join(" "),
+            p.sharper
+        );
+    }
+    out + "</table></details>\n"
 }
 
 /// How bad it is, in a word.
@@ -65,6 +120,22 @@ pub(crate) fn word(grade: Grade) -> &'static str {
         Grade::Warning => "warning",
         Grade::Note => "note",
     }
+}
+
+/// What else is worth knowing of the take, in sentences.
+pub(crate) fn about(report: &Report) -> Vec<String> {
+    let mut out = Vec::new();
+    if let Some(share) = report.seen_by_three {
+        out.push(format!("Of the space in which something moves three cameras see {:.0} %.", 100.0 * share));
+    }
+    if let Some(training) = &report.training {
+        out.push(format!(
+            "Training learns `{}` and takes about {} MB of memory.",
+            training.motion,
+            training.memory.div_ceil(1 << 20)
+        ));
+    }
+    out
 }
 
 /// All of it in a sentence.

@@ -2,13 +2,17 @@
 
 use crate::console::Console;
 use crate::interrupt;
+use crate::report::doctor;
 use serde_json::json;
 use splat4d::{Error, ErrorKind};
 use splat4d_import::corrections;
+use splat4d_import::doctor::{Grade, Report as Looked};
 use splat4d_import::take::{self, CameraReport, Report, Request, Rig};
 use splat4d_import::video::Selection;
 use splat4d_import::write::Format;
 use splat4d_train::event::Progress;
+use splat4d_train::recipe::Recipe;
+use splat4d_train::run::open_capture;
 use std::fmt::Write;
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
@@ -25,6 +29,8 @@ and run the same command again. Then: splat4d train my-take. How to film a take 
 
 /// Pixels of the shorter side that pictures get: training on a CPU sees no more.
 const SIZE: usize = 1080;
+/// Findings of the doctor that are printed; its page has all.
+const MOST: usize = 6;
 /// Frames per second of folders of pictures.
 const FPS: f64 = 30.0;
 
@@ -68,6 +74,9 @@ pub(crate) struct Args {
     /// Store pictures as PNG: every bit, four times as large
     #[arg(long)]
     png: bool,
+    /// Do not look for what is wrong with the finished capture
+    #[arg(long)]
+    no_doctor: bool,
 }
 
 fn apart(text: &str) -> Result<([String; 2], f64), String> {
@@ -118,11 +127,17 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         ErrorKind::Interrupted => e,
         _ => e.at("import"),
     })?;
-    told(&report, console);
+    let looked = if args.no_doctor {
+        None
+    } else {
+        let capture = open_capture(folder, &Recipe::default())?;
+        Some(doctor::made(&capture, &folder.join("import"), console)?)
+    };
+    told(&report, looked.as_ref(), console);
     Ok(())
 }
 
-fn told(report: &Report, console: &Console) {
+fn told(report: &Report, looked: Option<&(Looked, PathBuf)>, console: &Console) {
     for camera in &report.cameras {
         for warning in &camera.warnings {
             console.warn(&format!("camera {}: {warning}", camera.name));
@@ -143,7 +158,7 @@ fn told(report: &Report, console: &Console) {
         ));
     }
     if console.json() {
-        console.emit(&json!({"type": "imported", "report": report}));
+        console.emit(&json!({"type": "imported", "report": report, "doctor": looked.map(|l| &l.0)}));
         return;
     }
     let mut text = String::from(
@@ -156,6 +171,15 @@ fn told(report: &Report, console: &Console) {
         let _ = writeln!(text, "{guess}");
     }
     let _ = write!(text, "{} points; wrote {}", report.points, report.capture.display());
+    if let Some((findings, page)) = looked {
+        let _ = write!(text, "\ndoctor: {}; wrote {}", doctor::summary(findings), page.display());
+        for f in findings.findings.iter().filter(|f| f.grade > Grade::Note).take(MOST) {
+            let _ = write!(text, "\n! {}", doctor::sentence(f));
+        }
+        if !findings.leave_out.is_empty() {
+            let _ = write!(text, "\nleave out: {}", findings.leave_out.join(", "));
+        }
+    }
     console.result(&text);
 }
 

@@ -3,6 +3,7 @@
 use super::Options;
 use crate::Result;
 use crate::sync::grey::{Grey, Pyramid};
+use crate::sync::median;
 use crate::sync::tracks::{Track, Tracker, corners, follow, moving};
 use crate::video::{Clock, mean_difference};
 use splat4d::scene::{Camera, Planes};
@@ -24,6 +25,10 @@ const APART: f64 = 8.0;
 const LEVELS: usize = 4;
 /// Corners that must be found again before a camera is said to have moved.
 const CORNERS: usize = 12;
+/// Pixels along a side of the cells that motion is noted in.
+pub(super) const CELL: usize = 8;
+/// A cell moves from this part of its pixels on.
+const MOVING: f64 = 0.25;
 
 /// A picture from a place: of what stands still, or one of a moving camera.
 pub(super) struct Stand {
@@ -49,6 +54,10 @@ pub(super) struct Seen {
     pub(super) blocks: f64,
     /// Pixels that what stands still went.
     pub(super) moved: Option<f64>,
+    /// Detail of the take's last third relative to its first.
+    pub(super) focus: Option<f64>,
+    /// The cells, row by row, in which something moves, of pictures evenly over the take.
+    pub(super) motion: Vec<Vec<bool>>,
     pub(super) sizes: Vec<[usize; 2]>,
 }
 
@@ -139,6 +148,36 @@ fn blocks(g: &Grey) -> f64 {
     255.0 * (mean(1) - mean(0))
 }
 
+/// The cells of a picture that differ from what stands still.
+fn cells(picture: &Grey, still: &Grey) -> Vec<bool> {
+    let (across, down) = (picture.width.div_ceil(CELL), picture.height.div_ceil(CELL));
+    let mut counts = vec![[0usize; 2]; across * down];
+    for (p, m) in moving(picture, still).into_iter().enumerate() {
+        let count = &mut counts[p / picture.width / CELL * across + p % picture.width / CELL];
+        count[0] += usize::from(m);
+        count[1] += 1;
+    }
+    counts.into_iter().map(|[m, all]| m as f64 >= MOVING * all.max(1) as f64).collect()
+}
+
+/// How much more detail the last third of pictures has than the first, relative to their brightness.
+fn focus(pictures: &[Rgb8]) -> Option<f64> {
+    /// Pictures of a third.
+    const LEAST: usize = 2;
+    let third = pictures.len() / 3;
+    if third < LEAST {
+        return None;
+    }
+    let fine = |p: &Rgb8| {
+        let g = Grey::of(p);
+        let mean = g.data.iter().map(|v| f64::from(*v)).sum::<f64>() / g.data.len().max(1) as f64;
+        detail(&g) / mean.max(f64::MIN_POSITIVE)
+    };
+    let of = |part: &[Rgb8]| median(&mut part.iter().map(fine).collect::<Vec<_>>());
+    let (first, last) = (of(&pictures[..third]), of(&pictures[pictures.len() - third..]));
+    (first > 0.0).then(|| last / first)
+}
+
 fn moved(first: &Grey, last: &Grey) -> Option<f64> {
     let found = corners(first, None, 120, APART, &[]);
     let [a, b] = [first, last].map(|g| Pyramid::new(g.clone(), LEVELS));
@@ -185,7 +224,13 @@ pub(super) fn camera(capture: &Capture, store: &ImageStore, camera: usize, optio
             let ends = [&pictures[..third], &pictures[pictures.len() - third..]].map(|p| Grey::of(&median_of(p)));
             seen.moved = moved(&ends[0], &ends[1]);
         }
-        seen.stands.push(Stand { view: looked(&capture.frames[chosen[0]].view), picture: median_of(&pictures) });
+        seen.focus = focus(&pictures);
+        let picture = median_of(&pictures);
+        if pictures.len() >= MEDIAN_FROM {
+            let still = Grey::of(&picture);
+            seen.motion = pictures.iter().map(|p| cells(&Grey::of(p), &still)).collect();
+        }
+        seen.stands.push(Stand { view: looked(&capture.frames[chosen[0]].view), picture });
     } else {
         for (&i, picture) in chosen.iter().zip(pictures) {
             seen.stands.push(Stand { view: looked(&capture.frames[i].view), picture });

@@ -3,15 +3,21 @@
 //!
 //! Matches between cameras are found without the capture's poses, so that wrong poses do not hide themselves.
 
+mod alone;
+mod between;
 mod check;
+mod clocks;
 mod look;
+mod shutter;
 #[cfg(test)]
 mod tests;
+mod volume;
 
 use crate::{Error, Result};
 use serde::Serialize;
 use splat4d_train::capture::{Capture, ImageStore, Rgb8, Severity};
 use splat4d_train::event::Progress;
+use splat4d_train::run::forecast;
 use std::sync::Arc;
 
 /// How bad a [`Finding`] is.
@@ -66,9 +72,37 @@ pub struct CameraReport {
     pub sharpness: Option<f64>,
     /// Pixels (of 1920) that what stands still went between the first and the last pictures.
     pub moved: Option<f64>,
+    /// Detail of the take's last third relative to its first.
+    pub focus: Option<f64>,
+    /// Seconds from the first to the last row of a picture, and their standard deviation.
+    pub shutter: Option<[f64; 2]>,
     /// Its picture.
     #[serde(skip)]
     pub picture: Rgb8,
+}
+
+/// What two cameras say of each other.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct PairReport {
+    /// Their names.
+    pub cameras: [String; 2],
+    /// Features that both see.
+    pub matches: usize,
+    /// How far those lie from their epipolar lines, pixels of a picture 1920 wide.
+    pub epipolar: f64,
+    /// Stops by which the second is brighter: red, green, blue.
+    pub gain: [f64; 3],
+    /// How many times as sharp the second is.
+    pub sharper: f64,
+}
+
+/// What training with all defaults takes.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Training {
+    /// The motion model that suits.
+    pub motion: &'static str,
+    /// Bytes of memory at most, estimated.
+    pub memory: u64,
 }
 
 /// The result of [`examine`].
@@ -80,6 +114,12 @@ pub struct Report {
     pub findings: Vec<Finding>,
     /// All cameras.
     pub cameras: Vec<CameraReport>,
+    /// Pairs of cameras that see the same, the worst poses first.
+    pub pairs: Vec<PairReport>,
+    /// Part of the space in which something moves that three cameras see.
+    pub seen_by_three: Option<f64>,
+    /// What training takes with all defaults.
+    pub training: Option<Training>,
     /// Cameras that should be left out.
     pub leave_out: Vec<String>,
     /// Checks that could not be made, and why.
@@ -136,6 +176,10 @@ pub fn examine(capture: &Capture, options: &Options, progress: &mut Progress<'_>
         seen.push(look::camera(capture, &store, camera, options)?);
     }
     check::all(capture, &seen, options, &mut report, progress);
+    match forecast(Arc::new(capture.clone()), progress.0) {
+        Ok(forecast) => report.training = Some(Training { motion: forecast.motion, memory: forecast.memory }),
+        Err(e) => report.left.push(format!("What training takes cannot be told: {e}")),
+    }
     report.findings.sort_by_key(|f| std::cmp::Reverse(f.grade));
     Ok(report)
 }

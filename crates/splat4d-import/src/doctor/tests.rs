@@ -1,8 +1,8 @@
 //! Each fault drawn once, and a clean take: a room of random spots that six cameras see, and balls that move in it.
 
-use super::check::clocks;
+use super::clocks::clocks;
 use super::look::{Seen, Stand};
-use super::{CameraReport, Grade, Options, Report, examine};
+use super::{CameraReport, Grade, Options, Report, examine, volume};
 use crate::sync::tracks::Track;
 use crate::video::Clock;
 use serde_json::json;
@@ -225,8 +225,108 @@ fn hard_compression_is_found() {
     );
 }
 
-/// Perfect tracks of things that move by one music, on a clock that is late by so many seconds.
-fn tracks(c: usize, late: f64) -> Vec<Track> {
+#[test]
+fn a_focus_that_changes_is_found() {
+    is_found(
+        &with(|n, p| {
+            if n >= FRAMES / 2 {
+                blur(p, 2);
+            }
+        }),
+        "focus",
+    );
+}
+
+#[test]
+fn a_wrong_focal_length_and_swapped_cameras_are_found() {
+    let folder = tempfile::tempdir().unwrap();
+    write(folder.path(), clean(), 0.0, CAMERAS);
+    let path = folder.path().join("capture.json");
+    let sound: serde_json::Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
+    let says = |json: &serde_json::Value| {
+        std::fs::write(&path, json.to_string()).unwrap();
+        let capture = Capture::open(folder.path(), &CaptureOptions::default()).unwrap();
+        let options = Options { features: 500, ..Options::default() };
+        examine(&capture, &options, &mut Progress(&mut |_| {})).unwrap()
+    };
+    let mut longer = sound.clone();
+    for f in ["fx", "fy"] {
+        longer["cameras"][ILL][f] = json!(1.06 * sound["cameras"][ILL][f].as_f64().unwrap());
+    }
+    assert_eq!(found(&says(&longer), "epipolar"), ["c3"]);
+    let mut swapped = sound.clone();
+    swapped["cameras"][0]["images"] = sound["cameras"][4]["images"].clone();
+    swapped["cameras"][4]["images"] = sound["cameras"][0]["images"].clone();
+    let report = says(&swapped);
+    let ill = found(&report, "epipolar");
+    assert!(["c0", "c4"].iter().all(|c| ill.iter().any(|i| i == c)), "{:#?}", report.findings);
+}
+
+#[test]
+fn frames_that_were_dropped_are_found() {
+    let folder = tempfile::tempdir().unwrap();
+    write(folder.path(), clean(), 0.0, CAMERAS);
+    let path = folder.path().join("capture.json");
+    let mut all: serde_json::Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
+    let times: Vec<f64> = (0..FRAMES).map(|n| (n + 2 * usize::from(n > 5)) as f64 / FPS).collect();
+    all["cameras"][ILL]["times"] = json!(times);
+    std::fs::write(&path, all.to_string()).unwrap();
+    let capture = Capture::open(folder.path(), &CaptureOptions::default()).unwrap();
+    let report = examine(&capture, &Options::default(), &mut Progress(&mut |_| {})).unwrap();
+    assert_eq!(found(&report, "dropped"), ["c3"], "{:#?}", report.findings);
+}
+
+#[test]
+fn a_camera_apart_from_the_others_is_found() {
+    let folder = tempfile::tempdir().unwrap();
+    write(folder.path(), clean(), 0.0, CAMERAS);
+    let path = folder.path().join("capture.json");
+    let mut all: serde_json::Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
+    let far = Se3::look_at([-4.0, -0.6, 0.5], [0.0, 0.0, 0.5], [0.0, -1.0, 0.0]);
+    let row = |i: usize| [far.rotation[i][0], far.rotation[i][1], far.rotation[i][2], far.translation[i]];
+    all["cameras"][0]["world_to_camera"] = json!([row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]]);
+    std::fs::write(&path, all.to_string()).unwrap();
+    let capture = Capture::open(folder.path(), &CaptureOptions::default()).unwrap();
+    let report = examine(&capture, &Options::default(), &mut Progress(&mut |_| {})).unwrap();
+    assert_eq!(found(&report, "angle"), ["c0"], "{:#?}", report.findings);
+}
+
+/// What cameras see of a ball: the cells in which it is.
+fn seen_ball(view: Camera, place: [f64; 3]) -> Seen {
+    let (across, down) = (view.width.div_ceil(super::look::CELL), view.height.div_ceil(super::look::CELL));
+    let mut cells = vec![false; across * down];
+    for y in 0..down {
+        for x in 0..across {
+            let middle = [x, y].map(|v| (v as f64 + 0.5) * super::look::CELL as f64);
+            let Some((pixel, z)) = view.project(place) else { continue };
+            let radius = 0.4 * view.intrinsics.fx / z;
+            cells[y * across + x] = (pixel[0] - middle[0]).hypot(pixel[1] - middle[1]) < radius;
+        }
+    }
+    Seen { stands: vec![Stand { view, picture: Rgb8::default() }], motion: vec![cells; 2], ..Seen::default() }
+}
+
+#[test]
+fn the_share_of_what_moves_that_three_cameras_see_is_measured() {
+    let place = [0.0, 0.0, 0.5];
+    let away = |c: usize| {
+        let mut view = camera(c);
+        // Four of six look to one side of it.
+        view.intrinsics.cx += if c < 4 { 1e4 } else { 0.0 };
+        view
+    };
+    let rig = |view: &dyn Fn(usize) -> Camera| (0..CAMERAS).map(|c| seen_ball(view(c), place)).collect::<Vec<_>>();
+    let share = |rig: &[Seen]| volume::seen_by_three(&rig.iter().collect::<Vec<_>>(), place);
+    assert_eq!(share(&rig(&camera)), Some(1.0));
+    assert_eq!(share(&rig(&away)), Some(0.0));
+    let mut still = rig(&camera);
+    still.iter_mut().for_each(|s| s.motion.iter_mut().for_each(|m| m.fill(false)));
+    assert_eq!(share(&still), None, "nothing moves");
+}
+
+/// Perfect tracks of things that move by one music, on a clock that is late by so many seconds, by a shutter that takes so
+/// long from the first to the last row.
+fn tracks(c: usize, late: f64, shutter: f64) -> Vec<Track> {
     let place = |k: usize, t: f64| {
         let rng = Rng::new(8, "dancers", k as u64);
         let time = t + 0.28 * (1.9 * t).sin() + 0.13 * (4.3 * t + 1.0).sin() + 0.05 * (9.7 * t + 2.0).sin();
@@ -240,7 +340,12 @@ fn tracks(c: usize, late: f64) -> Vec<Track> {
     };
     let sample = |k: usize, n: usize| {
         let t = n as f64 / FPS;
-        (t, camera(c).project(place(k, t - late)).unwrap().0)
+        let mut pixel = [0.0, 0.5 * SIZE[1] as f64];
+        for _ in 0..8 {
+            let row = pixel[1] / SIZE[1] as f64 - 0.5;
+            pixel = camera(c).project(place(k, t - late + shutter * row)).unwrap().0;
+        }
+        (t, pixel)
     };
     (0..30).map(|k| Track { samples: (0..60).map(|n| sample(k, n)).collect() }).collect()
 }
@@ -253,7 +358,7 @@ fn a_late_clock_is_found() {
     for (late, expected) in [(0.0, vec![]), (0.9 / FPS, vec!["c3"])] {
         let seen = |c: usize| Seen {
             stands: vec![Stand { view: camera(c), picture: Rgb8::default() }],
-            tracks: tracks(c, if c == ILL { late } else { 0.0 }),
+            tracks: tracks(c, if c == ILL { late } else { 0.0 }, 0.0),
             clock: Clock { interval: 1.0 / FPS, ..Clock::default() },
             row: 60,
             ..Seen::default()
@@ -265,6 +370,32 @@ fn a_late_clock_is_found() {
         assert_eq!(found(&report, "offset"), expected, "{:?} {:?}", report.findings, report.left);
         if let Some(f) = report.findings.first() {
             assert!((f.amount.unwrap() + 1e3 * late).abs() < 2.0, "late by {late}: {f:?}");
+        }
+    }
+}
+
+#[test]
+fn a_rolling_shutter_is_found() {
+    let folder = tempfile::tempdir().unwrap();
+    let moment: Clip = clean().iter().map(|c| c[..2].to_vec()).collect();
+    let capture = write(folder.path(), &moment, 0.0, CAMERAS);
+    for (shutter, expected) in [(0.0, vec![]), (0.02, vec!["c3"])] {
+        let seen = |c: usize| Seen {
+            stands: vec![Stand { view: camera(c), picture: Rgb8::default() }],
+            tracks: tracks(c, 0.0, if c == ILL { shutter } else { 0.0 }),
+            clock: Clock { interval: 1.0 / FPS, ..Clock::default() },
+            row: 60,
+            ..Seen::default()
+        };
+        let seen: Vec<Seen> = (0..CAMERAS).map(seen).collect();
+        let cameras = (0..CAMERAS).map(|_| CameraReport::default()).collect();
+        let mut report = Report { cameras, ..Report::default() };
+        clocks(&capture, &seen, &mut report, &mut Progress(&mut |_| {}));
+        assert_eq!(found(&report, "rolling-shutter"), expected, "{:?} {:?}", report.findings, report.left);
+        let told: Vec<f64> = report.cameras.iter().map(|c| c.shutter.unwrap()[0]).collect();
+        for (c, seconds) in told.iter().enumerate() {
+            let truth = if c == ILL { shutter } else { 0.0 };
+            assert!((seconds - truth).abs() < 0.003, "{told:?}");
         }
     }
 }

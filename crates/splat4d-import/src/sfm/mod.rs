@@ -5,7 +5,7 @@
 //! clocks are found together with poses ([`adjust`]). Frames of moving cameras are a picture each.
 
 pub mod adjust;
-mod algebra;
+pub(crate) mod algebra;
 pub mod align;
 mod flow;
 pub mod lens;

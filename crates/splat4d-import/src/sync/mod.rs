@@ -62,7 +62,7 @@ pub(crate) fn median(values: &mut [f64]) -> f64 {
 }
 
 /// Ratio of the standard deviation to the median absolute deviation of a normal distribution.
-const NORMAL_MAD: f64 = 1.4826;
+pub(crate) const NORMAL_MAD: f64 = 1.4826;
 
 /// Where a parabola through three values, one step apart, has its extremum: −½ to ½ steps from the middle one, and the
 /// value there.

@@ -28,4 +28,4 @@ pub(crate) use open::{learnable, scale};
 pub(crate) use points::with_found;
 pub(crate) use refine::{Refine, refine};
 pub use session::{Outcome, TrainOptions};
-pub use start::{open_run, resume, resume_with, train};
+pub use start::{Forecast, forecast, open_run, resume, resume_with, train};

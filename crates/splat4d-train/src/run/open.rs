@@ -146,10 +146,16 @@ impl OpenCapture {
 
     /// The recipe with a motion model that suits the capture.
     pub(super) fn choose(&self, recipe: Recipe, listen: &mut dyn FnMut(&Event)) -> Result<Recipe> {
+        let (recipe, choice) = self.chosen(recipe, listen)?;
+        listen(&Event::Chosen { motion: choice.motion.into(), why: choice.why });
+        Ok(recipe)
+    }
+
+    /// The recipe with a motion model that suits the capture, and why it is that one.
+    pub(super) fn chosen(&self, recipe: Recipe, listen: &mut dyn FnMut(&Event)) -> Result<(Recipe, auto::Choice)> {
         listen(&Event::Phase { name: "looking at the capture".into(), done: 0, total: 0 });
         let choice = auto::choose(&self.plan(&recipe), self.frames.as_ref())?;
-        listen(&Event::Chosen { motion: choice.motion.into(), why: choice.why });
-        Ok(recipe.with(|r| r.run.motion = MotionName::of(choice.motion)))
+        Ok((recipe.with(|r| r.run.motion = MotionName::of(choice.motion)), choice))
     }
 
     pub(super) fn background(&self) -> [f32; 3] {

@@ -128,6 +128,31 @@ pub fn resume(run: &Path, stop: &AtomicBool, listen: &mut dyn FnMut(&Event)) -> 
     resume_with(run, &TrainOptions::default(), stop, listen)
 }
 
+/// What training with all defaults would take.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Forecast {
+    /// The motion model that would be learnt.
+    pub motion: &'static str,
+    /// Why it is that one, a sentence.
+    pub why: String,
+    /// Steps.
+    pub iterations: usize,
+    /// Bytes of memory at most, estimated.
+    pub memory: u64,
+}
+
+/// Looks at a capture as `train` would before its first step.
+///
+/// Errors: what `train` would refuse the capture for, pictures that cannot be read.
+pub fn forecast(capture: Arc<Capture>, listen: &mut dyn FnMut(&Event)) -> Result<Forecast> {
+    let recipe = Recipe::default();
+    let opened = OpenCapture::new(capture, &recipe)?;
+    let (recipe, choice) = opened.chosen(recipe, listen)?;
+    let recipe = recipe.resolve();
+    let memory = memory_estimate(&opened.capture, &recipe);
+    Ok(Forecast { motion: choice.motion, why: choice.why, iterations: recipe.run.iterations, memory })
+}
+
 /// As [`resume`]; of the options only `snapshots` and `clock` count, the rest was settled at the start. A run with
 /// `minutes` keeps to what is left of them: time between the commands does not count.
 pub fn resume_with(

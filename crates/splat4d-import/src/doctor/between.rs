@@ -1,0 +1,260 @@
+//! What cameras say of each other: poses, exposure, white balance and sharpness, by features that two of them see.
+
+use super::check::{GAMMA, MATCHES, SHARPNESS, Told, fundamental, grade, unit};
+use super::look::{Seen, Stand, detail};
+use super::{Options, PairReport, Report};
+use crate::sfm::pictures::{Feature, Sight};
+use crate::sfm::tracks::{Pairing, links};
+use crate::sync::epipolar::sampson;
+use crate::sync::grey::Grey;
+use crate::sync::median;
+use rayon::prelude::*;
+use splat4d::math::se3::dot;
+use splat4d::scene::Planes;
+use splat4d_train::capture::Capture;
+use splat4d_train::event::Progress;
+use splat4d_train::vision::features::{Limits, find};
+use splat4d_train::vision::raster::grey;
+
+/// Distance of matches from their epipolar lines, pixels of a picture 1920 wide.
+const EPIPOLAR: [f64; 2] = [1.0, 2.0];
+/// And at least so many of the picture's own: of the bundled capture, whose poses are exact, up to 0.8 were measured.
+const OWN_PIXELS: [f64; 2] = [1.0, 2.0];
+/// Exposure, and one channel against green, stops.
+const EXPOSURE: [f64; 2] = [0.15, 0.5];
+/// And of poses: of pairs with fewer many are chance (measured on a hall and on the bundled capture), of cameras whose axes
+/// are farther apart most, degrees.
+const SURE: usize = 20;
+const APART: f64 = 60.0;
+/// So many of a camera's pairs must agree on its error at least, of so many that tell it; chance only makes errors larger.
+pub(super) const AGREE: usize = 2;
+const TELL: usize = 3;
+/// Median over lower quartile of the size of a normal error: 0.6745 / 0.3186.
+const QUARTILE_TO_MEDIAN: f64 = 2.117;
+/// Half the side of what is compared for sharpness, pixels.
+const PATCH: usize = 8;
+
+fn planes(stand: &Stand) -> Planes<f32> {
+    let values: Vec<f32> = stand.picture.data.iter().map(|v| f32::from(*v) / 255.0).collect();
+    Planes::from_interleaved(3, stand.picture.height, stand.picture.width, &values)
+}
+
+fn sight(name: &str, number: usize, stand: &Stand, most: usize) -> Sight {
+    /// Least contrast of a feature, as structure from motion takes it.
+    const CONTRAST: f64 = 0.004;
+    let found = find(&grey(&planes(stand)), Limits { contrast: CONTRAST, most }, &|_, _| true);
+    let feature = |f: &splat4d_train::vision::features::Feature| Feature {
+        pixel: f.pixel,
+        velocity: [0.0; 2],
+        moment: 0,
+        descriptor: f.descriptor,
+        color: [0; 3],
+    };
+    Sight {
+        name: name.to_owned(),
+        size: [stand.picture.width, stand.picture.height],
+        factor: 1.0,
+        focal: None,
+        lens: number,
+        frame: 0.0,
+        features: found.iter().map(feature).collect(),
+    }
+}
+
+/// The mean of a channel around a place, and the patch's detail relative to its brightness.
+fn around(stand: &Stand, [u, v]: [f64; 2]) -> Option<([f64; 3], f64)> {
+    let p = &stand.picture;
+    let (x, y) = (u as usize, v as usize);
+    if x < PATCH || y < PATCH || x + PATCH >= p.width || y + PATCH >= p.height {
+        return None;
+    }
+    let side = 2 * PATCH + 1;
+    let mut sums = [0.0; 3];
+    let mut data = Vec::with_capacity(side * side);
+    for row in y - PATCH..=y + PATCH {
+        for pixel in p.data[3 * (row * p.width + x - PATCH)..][..3 * side].chunks_exact(3) {
+            (0..3).for_each(|c| sums[c] += f64::from(pixel[c]));
+            data.push(pixel.iter().map(|v| f32::from(*v)).sum::<f32>() / (3.0 * 255.0));
+        }
+    }
+    let mean = f64::from(data.iter().sum::<f32>()) / data.len() as f64;
+    let fine = detail(&Grey { width: side, height: side, data });
+    (mean > 0.0).then(|| (sums.map(|s| s / (side * side) as f64), fine / mean))
+}
+
+/// What two stands say of each other.
+struct Pair {
+    stands: [usize; 2],
+    matches: usize,
+    /// Pixels of 1920, and own ones.
+    off: [f64; 2],
+    /// Stops by which the second is brighter.
+    gain: [f64; 3],
+    /// Logarithm of how much sharper it is.
+    sharper: f64,
+}
+
+fn pair(
+    stands: &[(usize, &Stand)],
+    sights: &[Sight],
+    [a, b]: [usize; 2],
+    matches: &[([usize; 2], f32)],
+) -> Option<Pair> {
+    /// Values between which ratios of brightness mean something, of 255.
+    const EXPOSED: [f64; 2] = [12.0, 240.0];
+    let (p, q) = (stands[a].1, stands[b].1);
+    let f = fundamental(&p.view, &q.view);
+    let (mut off, mut gains, mut sharper) = (Vec::new(), [Vec::new(), Vec::new(), Vec::new()], Vec::new());
+    for ([i, j], _) in matches {
+        let (x, y) = (sights[a].features[*i].pixel, sights[b].features[*j].pixel);
+        off.push(sampson(&f, x, y).abs());
+        let (Some(one), Some(two)) = (around(p, x), around(q, y)) else { continue };
+        let exposed = |v: f64| (EXPOSED[0]..EXPOSED[1]).contains(&v);
+        for c in (0..3).filter(|&c| exposed(one.0[c]) && exposed(two.0[c])) {
+            gains[c].push(GAMMA * (two.0[c] / one.0[c]).log2());
+        }
+        sharper.push((two.1.max(1e-9) / one.1.max(1e-9)).ln());
+    }
+    let near = dot(p.view.forward(), q.view.forward()) > APART.to_radians().cos();
+    if off.len() < SURE || !near {
+        return None;
+    }
+    // Chance matches only add large distances: the lower quartile, as the median that it implies of normal errors.
+    off.sort_by(f64::total_cmp);
+    let own = QUARTILE_TO_MEDIAN * off[off.len() / 4];
+    Some(Pair {
+        stands: [a, b],
+        matches: off.len(),
+        off: [own * 0.5 * (unit(&p.view) + unit(&q.view)), own],
+        gain: gains.map(|mut g| if g.len() < MATCHES { f64::NAN } else { median(&mut g) }),
+        sharper: median(&mut sharper),
+    })
+}
+
+/// The median over the pairs of a camera of what they say, with its sign as seen from the others.
+fn of_camera(
+    pairs: &[Pair],
+    stands: &[(usize, &Stand)],
+    camera: usize,
+    f: &dyn Fn(&Pair) -> (f64, bool),
+) -> Option<f64> {
+    let own = |k: usize| stands[k].0 == camera;
+    let mut values: Vec<f64> = pairs
+        .iter()
+        .filter(|p| own(p.stands[0]) || own(p.stands[1]))
+        .map(|p| {
+            let (value, signed) = f(p);
+            if signed && own(p.stands[0]) { -value } else { value }
+        })
+        .filter(|v| v.is_finite())
+        .collect();
+    (!values.is_empty()).then(|| median(&mut values))
+}
+
+/// How far what a camera shows lies off, as those of its pairs say that are surest: pixels of 1920, and own ones.
+fn poses(pairs: &[Pair], stands: &[(usize, &Stand)], camera: usize) -> Option<(f64, f64)> {
+    let mut own: Vec<&Pair> = pairs.iter().filter(|p| p.stands.iter().any(|&k| stands[k].0 == camera)).collect();
+    own.sort_by(|p, q| p.off[0].total_cmp(&q.off[0]));
+    (own.len() >= TELL).then(|| (own[AGREE - 1].off[0], own[AGREE - 1].off[1]))
+}
+
+pub(super) fn between(
+    capture: &Capture,
+    seen: &[Seen],
+    options: &Options,
+    report: &mut Report,
+    progress: &mut Progress<'_>,
+) {
+    let stands: Vec<(usize, &Stand)> =
+        seen.iter().enumerate().flat_map(|(c, s)| s.stands.iter().map(move |stand| (c, stand))).collect();
+    progress.phase("features", 0, stands.len());
+    let name = |c: usize| capture.cameras[c].name.as_str();
+    let sights: Vec<Sight> =
+        stands.par_iter().enumerate().map(|(k, (c, s))| sight(name(*c), k, s, options.features)).collect();
+    let found = links(&sights, Pairing::All, 0, progress);
+    let pairs: Vec<Pair> = found.iter().filter_map(|l| pair(&stands, &sights, l.sights, &l.matches)).collect();
+    if pairs.is_empty() {
+        report
+            .left
+            .push("No two pictures have enough in common: poses, exposure and sharpness were not compared.".into());
+        return;
+    }
+    let told = |p: &Pair| PairReport {
+        cameras: p.stands.map(|k| name(stands[k].0).to_owned()),
+        matches: p.matches,
+        epipolar: p.off[0],
+        gain: p.gain,
+        sharper: p.sharper.exp(),
+    };
+    report.pairs = pairs.iter().map(told).collect();
+    report.pairs.sort_by(|a, b| b.epipolar.total_cmp(&a.epipolar));
+    let rig = seen.iter().filter(|s| !s.stands.is_empty()).count();
+    for camera in 0..seen.len() {
+        let (off, own) = poses(&pairs, &stands, camera).unzip();
+        let gain = [0, 1, 2].map(|c| of_camera(&pairs, &stands, camera, &move |p| (p.gain[c], true)));
+        let sharp = of_camera(&pairs, &stands, camera, &|p| (p.sharper, true)).map(f64::exp);
+        let row = &mut report.cameras[camera];
+        row.epipolar = off;
+        if rig > 1 {
+            if let [Some(r), Some(g), Some(b)] = gain {
+                row.exposure = Some([r, g, b]);
+            }
+            row.sharpness = sharp;
+        }
+        let (exposure, sharpness) = (row.exposure, row.sharpness);
+        let mut told = Told { report };
+        if let (Some(off), Some(own)) = (off, own)
+            && let Some(g) = grade(off, EPIPOLAR).min(grade(own, OWN_PIXELS))
+        {
+            let what = format!(
+                "Camera {}: what it shows lies {off:.1} px (of 1920) beside where its pose and lens say.",
+                name(camera)
+            );
+            let words = (
+                "Doubled edges and blur in all views that show the same.",
+                "Calibrate again, or refine its pose; else leave it out.",
+            );
+            told.add((g, "epipolar"), Some(name(camera)), (off, "px"), what, words);
+        }
+        if let Some([r, green, b]) = exposure {
+            if let Some(g) = grade(green.abs(), EXPOSURE) {
+                let way = if green > 0.0 { "brighter" } else { "darker" };
+                let what = format!("Camera {} is {:.2} stops {way} than the others.", name(camera), green.abs());
+                let words = (
+                    "Brightness that changes with the view, and fog that explains it.",
+                    "Lock exposure, correct its pictures, or keep exposure learnt.",
+                );
+                told.add((g, "exposure"), Some(name(camera)), (green, "stops"), what, words);
+            }
+            let tint = if (r - green).abs() > (b - green).abs() { r - green } else { b - green };
+            if let Some(g) = grade(tint.abs(), EXPOSURE) {
+                let what = format!(
+                    "Camera {}: white balance differs by {:.2} stops (red {:+.2}, blue {:+.2} against green).",
+                    name(camera),
+                    tint.abs(),
+                    r - green,
+                    b - green
+                );
+                let words = (
+                    "Colours that change with the view.",
+                    "Lock white balance, correct its pictures, or keep exposure learnt.",
+                );
+                told.add((g, "white-balance"), Some(name(camera)), (tint, "stops"), what, words);
+            }
+        }
+        if let Some(sharp) = sharpness
+            && let Some(g) = grade(1.0 / sharp, SHARPNESS.map(|s| 1.0 / s))
+        {
+            let what =
+                format!("Camera {} is {sharp:.2} times as sharp as the others at the same places.", name(camera));
+            let words = ("Soft texture in the views around it.", "Focus it again; where it is bad, leave it out.");
+            told.add((g, "sharpness"), Some(name(camera)), (sharp, "times"), what, words);
+        }
+    }
+    let alone: Vec<usize> = (0..seen.len())
+        .filter(|&c| rig > 1 && report.cameras[c].epipolar.is_none() && !seen[c].stands.is_empty())
+        .collect();
+    for camera in alone {
+        report.left.push(format!("Camera {} shares too few features with others to be compared.", name(camera)));
+    }
+}
