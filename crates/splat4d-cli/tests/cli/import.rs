@@ -34,7 +34,8 @@ fn pictures_alone_become_a_capture_with_clocks_and_poses() {
     let (films, take) = (dir.path().join("films"), dir.path().join("take"));
     filmed(&films);
     let told = splat4d(&["import", str(&films), "-o", str(&take)]).run().ok();
-    assert!(told.contains("cam09") && told.contains("geometry"), "{told}");
+    assert!(told.contains("cam09") && told.contains("geometry") && told.contains("doctor: 6 cameras"), "{told}");
+    assert!(take.join("import/doctor.html").is_file() && take.join("import/doctor.json").is_file());
 
     let report = json_of(&take.join("import/report.json"));
     let offset = |k: usize| report["cameras"][k]["offset"].as_f64().unwrap();
@@ -55,6 +56,81 @@ fn pictures_alone_become_a_capture_with_clocks_and_poses() {
     };
     for (off, (name, _)) in apart(&poses(&found), &poses(&truth)).unwrap().iter().zip(&CAMERAS) {
         assert!(off.degrees < 3.0 && off.center < 0.05, "{name}: {off:?}");
+    }
+}
+
+/// Samples of sound a second, and the films' frames a second: slow, so that a second of pictures is long enough to listen.
+const SOUND_RATE: u32 = 16_000;
+const SLOW: usize = 10;
+
+/// A WAV file of what a camera hears that begins after so many seconds: bursts of noise, the same for all.
+fn heard(begin: f64, seconds: f64, camera: u64) -> Vec<u8> {
+    let noise = |stream: u64, k: u64| {
+        let mut z = (stream << 32 | k).wrapping_mul(0x9E37_79B9_7F4A_7C15);
+        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        ((z ^ (z >> 27)) >> 11) as f64 / (1u64 << 52) as f64 - 1.0
+    };
+    let rate = f64::from(SOUND_RATE);
+    let first = (begin * rate).round() as u64;
+    let sample = |k: u64| {
+        let own = 0.01 * noise(100 + camera, k);
+        let t = (first + k) as f64 / rate;
+        // A burst each quarter of a second, at places that do not repeat.
+        let burst = (0..16u64).map(|b| {
+            let since = t - 0.23 * b as f64 - 0.07 * noise(7, b).abs();
+            if (0.0..0.06).contains(&since) { (1.0 - since / 0.06) * noise(8, first + k) } else { 0.0 }
+        });
+        ((own + burst.sum::<f64>()).clamp(-1.0, 1.0) * 20_000.0) as i16
+    };
+    let data: Vec<u8> = (0..(seconds * rate) as u64).flat_map(|k| sample(k).to_le_bytes()).collect();
+    let mut out = b"RIFF".to_vec();
+    out.extend((36 + data.len() as u32).to_le_bytes());
+    out.extend(b"WAVEfmt ");
+    out.extend([16, 0, 0, 0, 1, 0, 1, 0]);
+    out.extend(SOUND_RATE.to_le_bytes());
+    out.extend((2 * SOUND_RATE).to_le_bytes());
+    out.extend([2, 0, 16, 0]);
+    out.extend(b"data");
+    out.extend((data.len() as u32).to_le_bytes());
+    out.extend(data);
+    out
+}
+
+#[test]
+fn videos_with_sound_become_a_capture_whose_clocks_were_heard() {
+    if std::process::Command::new("ffmpeg").arg("-version").output().is_err() {
+        assert!(std::env::var_os("REQUIRE_FFMPEG").is_none(), "ffmpeg is missing");
+        eprintln!("skipped: no ffmpeg");
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let (films, take) = (dir.path().join("films"), dir.path().join("take"));
+    std::fs::create_dir_all(&films).unwrap();
+    let taken = 20;
+    for (k, (name, begin)) in CAMERAS.iter().enumerate() {
+        let wave = dir.path().join(format!("{name}.wav"));
+        let seconds = taken as f64 / SLOW as f64;
+        std::fs::write(&wave, heard(*begin as f64 / SLOW as f64, seconds, k as u64)).unwrap();
+        let pictures = bundled().join(format!("images/{name}/%04d.jpg"));
+        let done = std::process::Command::new("ffmpeg")
+            .args(["-v", "error", "-framerate", &SLOW.to_string(), "-start_number", &begin.to_string(), "-i"])
+            .arg(&pictures)
+            .arg("-i")
+            .arg(&wave)
+            .args(["-frames:v", &taken.to_string(), "-c:v", "mjpeg", "-q:v", "2", "-c:a", "copy"])
+            .arg(films.join(format!("{name}.mov")))
+            .output()
+            .unwrap();
+        assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+    }
+    splat4d(&["import", str(&films), "-o", str(&take), "--no-doctor"]).run().ok();
+    let report = json_of(&take.join("import/report.json"));
+    for (k, (name, begin)) in CAMERAS.iter().enumerate() {
+        let camera = &report["cameras"][k];
+        let by: Vec<&str> = camera["by"].as_array().unwrap().iter().map(|v| v.as_str().unwrap()).collect();
+        assert!(by.contains(&"sound"), "{name}: {by:?}");
+        let off = (camera["offset"].as_f64().unwrap() - report["cameras"][0]["offset"].as_f64().unwrap()) * SLOW as f64;
+        assert!((off - *begin as f64).abs() < 0.2, "{name}: {off} frames, begun after {begin}");
     }
 }
 

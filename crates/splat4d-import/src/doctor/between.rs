@@ -3,6 +3,7 @@
 use super::check::{GAMMA, MATCHES, SHARPNESS, Told, fundamental, grade, unit};
 use super::look::{Seen, Stand, detail};
 use super::{Options, PairReport, Report};
+use crate::sfm::algebra::Cholesky;
 use crate::sfm::pictures::{Feature, Sight};
 use crate::sfm::tracks::{Pairing, links};
 use crate::sync::epipolar::sampson;
@@ -31,6 +32,9 @@ pub(super) const AGREE: usize = 2;
 const TELL: usize = 3;
 /// Median over lower quartile of the size of a normal error: 0.6745 / 0.3186.
 const QUARTILE_TO_MEDIAN: f64 = 2.117;
+/// Differences of pairs, in stops and as a logarithm of sharpness, that are off by more contradict the others.
+const STOPS: f64 = 0.1;
+const TIMES: f64 = 0.15;
 /// Half the side of what is compared for sharpness, pixels.
 const PATCH: usize = 8;
 
@@ -131,24 +135,38 @@ fn pair(
     })
 }
 
-/// The median over the pairs of a camera of what they say, with its sign as seen from the others.
-fn of_camera(
-    pairs: &[Pair],
-    stands: &[(usize, &Stand)],
-    camera: usize,
-    f: &dyn Fn(&Pair) -> (f64, bool),
-) -> Option<f64> {
-    let own = |k: usize| stands[k].0 == camera;
-    let mut values: Vec<f64> = pairs
-        .iter()
-        .filter(|p| own(p.stands[0]) || own(p.stands[1]))
-        .map(|p| {
-            let (value, signed) = f(p);
-            if signed && own(p.stands[0]) { -value } else { value }
-        })
-        .filter(|v| v.is_finite())
-        .collect();
-    (!values.is_empty()).then(|| median(&mut values))
+/// A number for each camera of which pairs tell the differences, about the median of the cameras that are connected; None for
+/// those without a pair. Least squares, in which pairs of many features count more and those that contradict little (Cauchy's
+/// weights at `scale`).
+fn relative(cameras: usize, told: &[([usize; 2], f64, f64)], scale: f64) -> Vec<Option<f64>> {
+    /// Of the weight of one feature: it only makes the equations of what nothing connects solvable.
+    const RIDGE: f64 = 1e-9;
+    const ROUNDS: usize = 10;
+    let told: Vec<_> = told.iter().filter(|(c, difference, _)| c[0] != c[1] && difference.is_finite()).collect();
+    let mut values = vec![0.0; cameras];
+    for _ in 0..ROUNDS {
+        let (mut matrix, mut right) = (vec![0.0; cameras * cameras], vec![0.0; cameras]);
+        (0..cameras).for_each(|c| matrix[c * cameras + c] = RIDGE);
+        for ([a, b], difference, features) in told.iter().copied() {
+            let rest = values[*b] - values[*a] - difference;
+            let weight = features / (1.0 + (rest / scale).powi(2));
+            for (i, j, sign) in [(*a, *a, 1.0), (*b, *b, 1.0), (*a, *b, -1.0), (*b, *a, -1.0)] {
+                matrix[i * cameras + j] += sign * weight;
+            }
+            right[*b] += weight * difference;
+            right[*a] -= weight * difference;
+        }
+        let Some(factor) = Cholesky::new(cameras, matrix) else { return vec![None; cameras] };
+        values = factor.solve(right);
+    }
+    let mut part: Vec<usize> = (0..cameras).collect();
+    for ([a, b], ..) in told.iter().copied() {
+        let (from, to) = (part[*a].max(part[*b]), part[*a].min(part[*b]));
+        part.iter_mut().filter(|p| **p == from).for_each(|p| *p = to);
+    }
+    let middle =
+        |c: usize| median(&mut (0..cameras).filter(|&o| part[o] == part[c]).map(|o| values[o]).collect::<Vec<_>>());
+    (0..cameras).map(|c| told.iter().any(|(pair, ..)| pair.contains(&c)).then(|| values[c] - middle(c))).collect()
 }
 
 /// How far what a camera shows lies off, as those of its pairs say that are surest: pixels of 1920, and own ones.
@@ -189,10 +207,16 @@ pub(super) fn between(
     report.pairs = pairs.iter().map(told).collect();
     report.pairs.sort_by(|a, b| b.epipolar.total_cmp(&a.epipolar));
     let rig = seen.iter().filter(|s| !s.stands.is_empty()).count();
+    let by_camera = |value: &dyn Fn(&Pair) -> f64, scale: f64| {
+        let of = |p: &Pair| (p.stands.map(|k| stands[k].0), value(p), p.matches as f64);
+        relative(seen.len(), &pairs.iter().map(of).collect::<Vec<_>>(), scale)
+    };
+    let gains = [0, 1, 2].map(|c| by_camera(&move |p| p.gain[c], STOPS));
+    let sharper = by_camera(&|p| p.sharper, TIMES);
     for camera in 0..seen.len() {
         let (off, own) = poses(&pairs, &stands, camera).unzip();
-        let gain = [0, 1, 2].map(|c| of_camera(&pairs, &stands, camera, &move |p| (p.gain[c], true)));
-        let sharp = of_camera(&pairs, &stands, camera, &|p| (p.sharper, true)).map(f64::exp);
+        let gain = [0, 1, 2].map(|c| gains[c][camera]);
+        let sharp = sharper[camera].map(f64::exp);
         let row = &mut report.cameras[camera];
         row.epipolar = off;
         if rig > 1 {
@@ -256,5 +280,27 @@ pub(super) fn between(
         .collect();
     for camera in alone {
         report.left.push(format!("Camera {} shares too few features with others to be compared.", name(camera)));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn differences_of_pairs_become_numbers_of_cameras() {
+        let truth = [0.0, 0.2, -0.3, 0.1, 0.0];
+        let pair = |a: usize, b: usize, off: f64| ([a, b], truth[b] - truth[a] + off, 20.0);
+        // One pair is wrong by a stop, and camera 5 has none.
+        let told =
+            [pair(0, 1, 0.0), pair(1, 2, 0.0), pair(2, 3, 0.0), pair(3, 4, 0.0), pair(4, 0, 0.0), pair(0, 2, 1.0)];
+        let found = relative(6, &told, 0.1);
+        for (c, v) in truth.iter().enumerate() {
+            assert!((found[c].unwrap() - v).abs() < 0.02, "camera {c}: {found:?}");
+        }
+        assert_eq!(found[5], None);
+        // Two groups that nothing connects each have a middle of their own.
+        let apart = relative(4, &[([0, 1], 0.4, 20.0), ([2, 3], -0.2, 20.0)], 0.1);
+        assert!((apart[1].unwrap() - apart[0].unwrap() - 0.4).abs() < 1e-6, "{apart:?}");
     }
 }

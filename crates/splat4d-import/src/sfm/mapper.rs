@@ -85,6 +85,11 @@ const GUIDED_WITHIN: f64 = 0.5;
 const ALIKE: f64 = 0.06;
 const FAMILY_FROM: usize = 4;
 const FAMILY: f64 = 0.003;
+/// Where pictures contradict that, lenses differ by this share: of phones of several models, some per cent.
+const STRANGERS: f64 = 0.05;
+/// Twice the loss that it costs to take lenses for equal, of the variance of a sighting and for each lens: more contradicts it.
+/// Were sightings' errors independent, 1 would be usual (Wilks 1938).
+const CONTRADICTS: f64 = 8.0;
 /// Rounds of adjusting, leaving out and finding again at the end.
 const ROUNDS: usize = 4;
 
@@ -116,6 +121,8 @@ pub(crate) struct Map<'a> {
     spots: Vec<Option<Spot>>,
     /// Why sights could not be placed.
     reasons: Vec<String>,
+    /// Lenses that look alike were found not to be of one model.
+    strangers: bool,
 }
 
 /// What all starts share.
@@ -200,6 +207,7 @@ impl<'a> Ground<'a> {
             lens_of: &self.lens_of,
             spots: vec![None; self.tracks.len()],
             reasons: vec![String::new(); n],
+            strangers: false,
         }
     }
 
@@ -225,6 +233,7 @@ impl<'a> Ground<'a> {
         map.lenses.clone_from(&from.lenses);
         map.guesses.clone_from(&from.guesses);
         map.reasons.clone_from(&from.reasons);
+        map.strangers = from.strangers;
         map.renew();
         map
     }
@@ -344,8 +353,8 @@ impl Map<'_> {
         Free { focal: n >= FOCAL_FROM, k1: rest, center: rest, tau: rest && moves }
     }
 
-    /// Adjusts everything with so many evaluations.
-    fn adjust(&mut self, steps: usize) {
+    /// Adjusts everything with so many evaluations; the loss and how many sightings it is of.
+    fn adjust(&mut self, steps: usize) -> Option<(f64, usize)> {
         let mut bundle = Bundle::default();
         let mut number = vec![usize::MAX; self.sights.len()];
         let mut lens_number = vec![usize::MAX; self.lenses.len()];
@@ -378,7 +387,7 @@ impl Map<'_> {
             back.push(t);
         }
         if bundle.sightings.len() < SEES {
-            return;
+            return None;
         }
         let size = self.order.iter().map(|&s| self.size(s)).fold(0.0, f64::max);
         let frame = self.order.iter().map(|&s| self.sights[s].frame).fold(0.0, f64::max);
@@ -390,7 +399,11 @@ impl Map<'_> {
             priors: Priors {
                 lenses: lens_back.iter().map(|&l| self.guesses[l]).collect(),
                 focal: if told { TOLD } else { GUESSED },
-                family: if family { FAMILY } else { f64::INFINITY },
+                family: match family {
+                    true if self.strangers => STRANGERS,
+                    true => FAMILY,
+                    false => f64::INFINITY,
+                },
                 k1: self.how.k1,
                 center: self.how.center * size,
                 tau: (CLOCK * frame).max(f64::MIN_POSITIVE),
@@ -398,7 +411,7 @@ impl Map<'_> {
             steps,
             gain: 1e-8,
         };
-        adjust(&mut bundle, &settings);
+        let report = adjust(&mut bundle, &settings);
         for (&s, view) in self.order.iter().zip(&bundle.views) {
             self.poses[s] = Some(view.pose);
             self.taus[s] = view.tau;
@@ -407,6 +420,28 @@ impl Map<'_> {
         for (&t, place) in back.iter().zip(&bundle.points) {
             self.spots[t].as_mut().expect("it has a place").place = *place;
         }
+        Some((report.after, bundle.sightings.len()))
+    }
+
+    /// Whether the pictures contradict that all lenses are of one model, where that was assumed: the likelihood ratio of both.
+    fn are_strangers(&self) -> bool {
+        const STEPS: usize = 30;
+        let lenses: std::collections::BTreeSet<usize> = self.order.iter().map(|&s| self.lens_of[s]).collect();
+        let lenses: Vec<usize> = lenses.into_iter().collect();
+        if self.strangers || !self.family(&lenses) || lenses.iter().all(|&l| self.told[l]) {
+            return false;
+        }
+        let loss = |strangers: bool| {
+            let mut map = Self { strangers, ..self.clone() };
+            map.adjust(STEPS)
+        };
+        let (Some((alike, _)), Some((strangers, sightings))) = (loss(false), loss(true)) else { return false };
+        let variance = strangers / sightings as f64;
+        eprintln!(
+            "RATIO {} {alike} {strangers} {sightings}",
+            2.0 * (alike - strangers) / variance / lenses.len() as f64
+        );
+        2.0 * (alike - strangers) > CONTRADICTS * variance * lenses.len() as f64
     }
 
     /// Whether all lenses seem to be of one model: rigs are often made of equal cameras, and what differs between them is then the
@@ -517,6 +552,7 @@ impl Map<'_> {
         const STEPS: usize = 50;
         for _ in 0..ROUNDS {
             self.adjust(STEPS);
+            self.strangers |= self.are_strangers();
             self.renew();
             let weak: Vec<usize> = self.order.iter().copied().filter(|&s| self.fits(s) < FITS).collect();
             if !weak.is_empty() && self.order.len() - weak.len() >= 2 {

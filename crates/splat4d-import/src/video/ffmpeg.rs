@@ -62,10 +62,13 @@ impl Source for Video {
         let mut input = Vec::new();
         let seek = selection.from.map_or(0.0, |from| (from - SEEK_MARGIN).max(0.0));
         if seek > 0.0 {
-            input.extend(["-ss".into(), format!("{seek:.6}")]);
+            // Its own clock is kept: shifted to the place that was sought, time stamps are rounded to ticks of the file, and those of
+            // AVI are whole frames.
+            input.extend(["-copyts".into(), "-start_at_zero".into(), "-ss".into(), format!("{seek:.6}")]);
         }
         if let Some(to) = selection.to {
-            input.extend(["-t".into(), format!("{:.6}", to - seek)]);
+            // The program rounds this end to ticks of the file too; what it gives too much is left out below.
+            input.extend(["-t".into(), format!("{:.6}", to - seek + END_FRAMES * self.interval())]);
         }
         let mut output = vec!["-map".into(), format!("0:{}", self.probe.picture), "-vf".into(), text];
         output.extend(self.tools.passthrough().map(String::from));
@@ -127,7 +130,7 @@ struct Pictures<'a> {
     running: Running,
     selection: Selection,
     size: [usize; 2],
-    /// The second that ffmpeg calls 0.
+    /// The second where reading began.
     seek: f64,
     times: Vec<f64>,
     /// How many frames ffmpeg kept, of which it told the time.
@@ -147,7 +150,7 @@ impl Pictures<'_> {
             let (which, time) = self.running.stamps.recv().ok()?;
             match which {
                 Stamp::All => {
-                    let time = time.map(|t| t + self.seek).unwrap_or_else(|| {
+                    let time = time.unwrap_or_else(|| {
                         self.guessed = true;
                         self.times.last().map_or(self.seek, |t| t + self.video.interval())
                     });
@@ -156,7 +159,7 @@ impl Pictures<'_> {
                 Stamp::Kept => {
                     self.told += 1;
                     // A frame is kept right after its time was noted.
-                    return time.map(|t| t + self.seek).or(self.times.last().copied());
+                    return time.or(self.times.last().copied());
                 }
             }
         }

@@ -162,6 +162,30 @@ fn a_high_dynamic_range_is_mapped_with_a_warning() {
 }
 
 #[test]
+fn a_part_has_the_times_of_the_whole() {
+    let Some(made) = Made::new() else { return };
+    for (name, codec) in [
+        ("a.avi", "-c:v mjpeg -q:v 3"),
+        ("b.mkv", EXACT),
+        ("c.mp4", "-c:v mpeg4 -g 4"),
+        ("d.mov", "-c:v mjpeg -q:v 3 -video_track_timescale 30"),
+    ] {
+        let path = made.make(name, &format!("{MOVING} {codec}"));
+        let whole = made.read(&path, &Selection::default());
+        for from in [0.05, 0.1176, 0.2] {
+            let part = made.read(&path, &Selection { from: Some(from), to: Some(0.45), ..Selection::default() });
+            let wanted: Vec<_> =
+                whole.frames.iter().filter(|f| f.time >= from - 1e-3 && f.time < 0.45 - 1e-3).collect();
+            assert_eq!(part.frames.len(), wanted.len(), "{name} from {from}");
+            for (a, b) in part.frames.iter().zip(wanted) {
+                assert!((a.time - b.time).abs() < 1e-3, "{name} from {from}: {} for {}", a.time, b.time);
+                assert_eq!(a.picture, b.picture, "{name} from {from}, at {}", a.time);
+            }
+        }
+    }
+}
+
+#[test]
 fn rates_that_vary_and_lost_frames_are_seen() {
     let Some(made) = Made::new() else { return };
     // Frames 5 and 6 are left out; those left keep their times.
