@@ -21,8 +21,8 @@ struct Rig {
 }
 
 /// Cameras on an arc around points, seven tenths of which move; every feature off by `noise` pixels, and `wrong` of them look like
-/// another one.
-fn rig(cameras: usize, points: usize, noise: f64, wrong: f64) -> Rig {
+/// another one. Focal lengths differ by `spread`.
+fn rig(cameras: usize, points: usize, noise: f64, wrong: f64, spread: f64) -> Rig {
     let rng = Rng::new(21, "rig", 0);
     let look = |p: usize, c: usize| {
         // As others see it, but for a little.
@@ -34,7 +34,8 @@ fn rig(cameras: usize, points: usize, noise: f64, wrong: f64) -> Rig {
         let angle = 0.3 * c as f64;
         let eye = [5.0 * angle.sin(), -1.0 + 0.7 * rng.normal(c as u64), -5.0 * angle.cos()];
         let pose = Se3::look_at(eye, [0.0; 3], [0.0, -1.0, 0.0]);
-        let lens = Lens { focal: 480.0 * (0.08 * rng.normal(50 + c as u64)).exp(), k1: -0.02, center: [322.0, 179.0] };
+        let lens =
+            Lens { focal: 480.0 * (spread * rng.normal(50 + c as u64)).exp(), k1: -0.02, center: [322.0, 179.0] };
         let tau = 0.01 * rng.normal(80 + c as u64);
         let draw = rng.fork(100 + c as u64);
         let mut features = Vec::new();
@@ -73,7 +74,7 @@ fn rig(cameras: usize, points: usize, noise: f64, wrong: f64) -> Rig {
 
 #[test]
 fn a_rig_is_found_among_noise_and_outliers_with_focal_lengths_and_clocks() {
-    let rig = rig(7, 900, 0.5, 0.3);
+    let rig = rig(7, 900, 0.5, 0.3, 0.08);
     let mut silent = |_: &_| {};
     let who: Vec<_> = (0..7).map(|c| (c, None)).collect();
     let options = Options::default();
@@ -102,8 +103,25 @@ fn a_rig_is_found_among_noise_and_outliers_with_focal_lengths_and_clocks() {
 }
 
 #[test]
+fn equal_lenses_are_taken_for_equal_and_others_are_not() {
+    for (spread, within) in [(0.0, 0.003), (0.02, 0.01)] {
+        let rig = rig(7, 600, 0.3, 0.2, spread);
+        let mut silent = |_: &_| {};
+        let who: Vec<_> = (0..7).map(|c| (c, None)).collect();
+        let found =
+            solve_sights(&who, &rig.sights, Pairing::All, &Options::default(), &mut Progress(&mut silent)).unwrap();
+        let zooms: Vec<f64> = (found.taken.iter().zip(&rig.lenses))
+            .map(|(t, lens)| (t.placed.as_ref().unwrap().lens.focal / lens.focal).ln())
+            .collect();
+        // What all have in common is told by the scene's depth alone.
+        let mean = zooms.iter().sum::<f64>() / zooms.len() as f64;
+        assert!(zooms.iter().all(|z| (z - mean).abs() < within), "differing by {spread}: {zooms:?}");
+    }
+}
+
+#[test]
 fn a_camera_of_another_scene_is_left_out_and_says_why() {
-    let mut rig = rig(4, 260, 0.3, 0.1);
+    let mut rig = rig(4, 260, 0.3, 0.1, 0.08);
     let rng = Rng::new(5, "elsewhere", 0);
     for (k, f) in rig.sights[2].features.iter_mut().enumerate() {
         f.descriptor = std::array::from_fn(|i| (80.0 * rng.fork(k as u64).uniform(i as u64)) as u8);
