@@ -130,7 +130,7 @@ pub(crate) fn about(report: &Report) -> Vec<String> {
     }
     if let Some(training) = &report.training {
         out.push(format!(
-            "Training learns `{}` and takes about {} MB of memory.",
+            "Training learns the motion model {} and takes about {} MB of memory.",
             training.motion,
             training.memory.div_ceil(1 << 20)
         ));

@@ -275,11 +275,15 @@ pub(super) fn between(
             told.add((g, "sharpness"), Some(name(camera)), (sharp, "times"), what, words);
         }
     }
-    let alone: Vec<usize> = (0..seen.len())
+    let alone: Vec<&str> = (0..seen.len())
         .filter(|&c| rig > 1 && report.cameras[c].epipolar.is_none() && !seen[c].stands.is_empty())
+        .map(name)
         .collect();
-    for camera in alone {
-        report.left.push(format!("Camera {} shares too few features with others to be compared.", name(camera)));
+    if !alone.is_empty() {
+        report.left.push(format!(
+            "Poses of these cameras were not checked, for fewer than {TELL} others show enough of the same: {}.",
+            alone.join(", ")
+        ));
     }
 }
 
