@@ -3,15 +3,22 @@
 #[cfg(test)]
 mod tests;
 
-use crate::render::{Backend, Image, RenderConfig, Renderer, Shot, Tables, Wanted};
-use crate::{Error, Result};
+use crate::math::{Rng, Se3, sym3};
+use crate::render::{Backend, Image, ImageGrads, RenderConfig, RenderGrads, Renderer, Shot, Tables, Wanted};
+use crate::scene::splats::{COV, SPLAT_COLUMNS, SPLAT_OPACITY};
+use crate::scene::{Camera, Color, Part, Planes, Splats, Table};
+use crate::{Error, ErrorKind, Result};
+
+/// The name of the CPU as a device.
+const CPU: &str = "the CPU";
 
 /// The choice of a device.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Device {
     /// The GPU if there is one, else the CPU; never a driver that computes on the CPU.
     Auto,
     /// The CPU.
+    #[default]
     Cpu,
     /// Any Vulkan, Metal or Direct3D 12 driver, even one that computes on the CPU.
     Gpu,
@@ -21,6 +28,8 @@ pub enum Device {
 pub struct Opened {
     /// It.
     pub backend: Box<dyn Backend>,
+    /// It in words: of a GPU its driver too.
+    pub name: String,
     /// The device in words; where it is not the one that was asked for, the reason too.
     pub why: String,
     /// Whether there is no GPU to draw on although one was asked for.
@@ -36,17 +45,29 @@ pub fn cpu(config: RenderConfig) -> Box<dyn Backend> {
 /// The device that was asked for, if it has the abilities in `wanted`, or else the CPU.
 pub fn open(device: Device, config: RenderConfig, wanted: &Wanted, tables: Tables) -> Opened {
     if device == Device::Cpu {
-        return Opened { backend: cpu(config), why: "drawing on the CPU".into(), fell_back: false };
+        let why = format!("drawing on {CPU}");
+        return Opened { backend: cpu(config), name: CPU.into(), why, fell_back: false };
     }
     match gpu(device, config, wanted, tables) {
-        Ok((backend, name)) => Opened { backend, why: format!("drawing on {name}"), fell_back: false },
+        Ok((backend, name)) => Opened { backend, why: format!("drawing on {name}"), name, fell_back: false },
         Err(reason) => on_cpu(config, &reason),
+    }
+}
+
+/// The device that was asked for, with the CPU beside it: what the GPU cannot draw is drawn by the CPU, picture by picture,
+/// and a GPU that fails is left for good. Each is told once ([`Backend::notice`]), and neither is an error.
+pub fn open_to_train(device: Device, config: RenderConfig) -> Opened {
+    let opened = open(device, config, &Wanted { backward: true, ..Wanted::default() }, Tables::Changing);
+    let why = opened.why.replacen("drawing", "training", 1);
+    match device == Device::Cpu || opened.fell_back {
+        true => Opened { why, ..opened },
+        false => Opened { backend: Box::new(WithCpu::new(opened.backend)), why, name: opened.name, fell_back: false },
     }
 }
 
 /// The CPU instead of the GPU that was asked for.
 pub fn on_cpu(config: RenderConfig, reason: &dyn std::fmt::Display) -> Opened {
-    Opened { backend: cpu(config), why: format!("drawing on the CPU: {reason}"), fell_back: true }
+    Opened { backend: cpu(config), name: CPU.into(), why: format!("drawing on {CPU}: {reason}"), fell_back: true }
 }
 
 /// Draws. A backend that fails on the way is left for the CPU, which draws instead; its error is returned.
@@ -57,9 +78,173 @@ pub fn draw(backend: &mut Box<dyn Backend>, shot: &Shot<'_>, out: &mut Image) ->
     Some(error)
 }
 
+/// A device, and the CPU for what it cannot do.
+struct WithCpu {
+    /// Until it fails.
+    other: Option<Box<dyn Backend>>,
+    cpu: Box<dyn Backend>,
+    /// Whether the last picture is the other's.
+    drawn_by_other: bool,
+    /// What it was refused for.
+    refused: Vec<String>,
+    notices: Vec<String>,
+    /// Where a picture that is drawn again goes.
+    again: Image,
+    name: String,
+}
+
+impl WithCpu {
+    fn new(other: Box<dyn Backend>) -> Self {
+        let (config, name) = (*other.config(), other.name().to_owned());
+        Self {
+            other: Some(other),
+            cpu: cpu(config),
+            drawn_by_other: false,
+            refused: Vec::new(),
+            notices: Vec::new(),
+            again: Image::default(),
+            name,
+        }
+    }
+
+    /// The other device, if it is there and can draw a shot and take it back.
+    fn able(&mut self, shot: &Shot<'_>) -> Option<&mut Box<dyn Backend>> {
+        let other = self.other.as_mut()?;
+        match other.can(&Wanted { backward: true, ..shot.wanted() }) {
+            Ok(()) => Some(other),
+            Err(refusal) => {
+                let why = refusal.to_string();
+                if !self.refused.contains(&why) {
+                    self.notices.push(format!("the CPU draws what the GPU does not: {why}"));
+                    self.refused.push(why);
+                }
+                None
+            }
+        }
+    }
+
+    fn leave(&mut self, error: &Error) {
+        self.other = None;
+        self.name = CPU.into();
+        self.notices.push(format!("training goes on on the CPU: {error}"));
+    }
+}
+
+impl Backend for WithCpu {
+    fn can(&self, _: &Wanted) -> Result<()> {
+        Ok(())
+    }
+
+    fn render(&mut self, shot: &Shot<'_>, out: &mut Image) -> Result<()> {
+        self.drawn_by_other = false;
+        match self.able(shot).map(|other| other.render(shot, out)) {
+            Some(Ok(())) => {
+                self.drawn_by_other = true;
+                return Ok(());
+            }
+            Some(Err(error)) => self.leave(&error),
+            None => {}
+        }
+        self.cpu.render(shot, out)
+    }
+
+    fn vjp(
+        &mut self,
+        shot: &Shot<'_>,
+        grads: &ImageGrads<'_>,
+        d_sh: &mut [Option<&mut Table>],
+        d: &mut RenderGrads,
+    ) -> Result<()> {
+        if let Some(other) = self.other.as_mut().filter(|_| self.drawn_by_other) {
+            match other.vjp(shot, grads, d_sh, d) {
+                Ok(()) => return Ok(()),
+                Err(error) => self.leave(&error),
+            }
+            self.drawn_by_other = false;
+            self.cpu.render(shot, &mut self.again)?;
+        }
+        self.cpu.vjp(shot, grads, d_sh, d)
+    }
+
+    fn radii(&self) -> &[f32] {
+        match &self.other {
+            Some(other) if self.drawn_by_other => other.radii(),
+            _ => self.cpu.radii(),
+        }
+    }
+
+    fn config(&self) -> &RenderConfig {
+        self.cpu.config()
+    }
+
+    fn name(&self) -> &str {
+        &self.name
+    }
+
+    fn notice(&mut self) -> Option<String> {
+        if self.notices.is_empty() { None } else { Some(self.notices.remove(0)) }
+    }
+}
+
+/// Splats of the self-test.
+const TEST_SPLATS: usize = 200;
+/// Width and height of its picture: no whole tiles.
+const TEST_SIZE: [usize; 2] = [75, 45];
+/// Largest difference of a channel, and of a gradient as a share of its length, at which a device is trusted: far above
+/// roundings and a splat at the α cut-off, far below any mistake.
+const TRUSTED: [f64; 2] = [0.02, 0.05];
+
+/// Draws a little scene and takes it back, as the CPU does. Errors: something else comes out.
+#[cfg_attr(not(feature = "gpu"), allow(dead_code))]
+fn trusted(backend: &mut dyn Backend) -> Result<()> {
+    let rng = Rng::new(1, "self-test", 0);
+    let (mut out, mut colors) = (Table::new(&SPLAT_COLUMNS, TEST_SPLATS), Table::new(&[("rgb", 3)], TEST_SPLATS));
+    for j in 0..TEST_SPLATS {
+        let r = rng.fork(j as u64);
+        out.write::<3>(j, 0, std::array::from_fn(|k| 2.0 * r.uniform(k as u64) as f32 - 1.0));
+        let turn: [f32; 4] = std::array::from_fn(|k| r.normal(10 + k as u64) as f32);
+        out.write(
+            j,
+            COV,
+            sym3::from_quat_log_scales(turn, std::array::from_fn(|k| r.normal(20 + k as u64) as f32 - 2.5)),
+        );
+        out.set(j, SPLAT_OPACITY, r.uniform(4) as f32);
+        colors.write::<3>(j, 0, std::array::from_fn(|k| r.uniform(30 + k as u64) as f32));
+    }
+    let splats = Splats { parts: vec![Part::new(&out, Color::Direct { table: &colors })], head: None };
+    let pose = Se3::look_at([0.0, 0.5, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
+    let camera = Camera::with_fov_y(pose, 0.6, TEST_SIZE[0], TEST_SIZE[1]);
+    let shot = Shot::new(&splats, &camera, [0.2, 0.5, 0.8]);
+    let mut pull = Planes::new(3, TEST_SIZE[1], TEST_SIZE[0]);
+    pull.data.iter_mut().enumerate().for_each(|(i, v)| *v = rng.normal(i as u64) as f32);
+    let grads = ImageGrads { color: &pull, alpha: None, depth: None, extra: None };
+    let through = |backend: &mut dyn Backend| -> Result<(Image, Table)> {
+        let (mut image, mut d) = (Image::default(), RenderGrads::default());
+        backend.render(&shot, &mut image)?;
+        backend.vjp(&shot, &grads, &mut [None], &mut d)?;
+        Ok((image, d.parts.swap_remove(0).out))
+    };
+    let (config, (image, d)) = (*backend.config(), through(backend)?);
+    let (expected, d_expected) = through(cpu(config).as_mut())?;
+    let off = |(a, b): (&f32, &f32)| f64::from(a - b);
+    // NaN is no less than anything.
+    let same = image.color.data.iter().zip(&expected.color.data).map(off).all(|v| v.abs() < TRUSTED[0]);
+    let square = |v: f64| v * v;
+    let apart: f64 = d.data().iter().zip(d_expected.data()).map(off).map(square).sum();
+    let length: f64 = d_expected.data().iter().map(|v| square(f64::from(*v))).sum();
+    if same && (apart / length).sqrt() < TRUSTED[1] {
+        return Ok(());
+    }
+    Err(Error::new(
+        ErrorKind::Unsupported,
+        "the GPU's driver fails a self-test: its picture or its gradients are not the CPU's",
+    )
+    .remedy("Update the driver, or use --device cpu."))
+}
+
 #[cfg(not(feature = "gpu"))]
 fn gpu(_: Device, _: RenderConfig, _: &Wanted, _: Tables) -> Result<(Box<dyn Backend>, String)> {
-    Err(Error::new(crate::ErrorKind::Unsupported, "this splat4d was built without the feature `gpu`"))
+    Err(Error::new(ErrorKind::Unsupported, "this splat4d was built without the feature `gpu`"))
 }
 
 #[cfg(feature = "gpu")]
@@ -71,5 +256,9 @@ fn gpu(device: Device, config: RenderConfig, wanted: &Wanted, tables: Tables) ->
     let name = gpu.describe();
     let mut renderer = GpuRenderer::new(gpu, config)?;
     renderer.tables = tables;
+    if wanted.backward {
+        renderer.for_training()?;
+        trusted(&mut renderer).map_err(|e| e.at(&name))?;
+    }
     Ok((Box::new(renderer), name))
 }

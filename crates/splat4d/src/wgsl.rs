@@ -17,12 +17,25 @@ pub const SPLATS: &str = include_str!("gpu/splats.wgsl");
 pub const SCAN: &str = include_str!("gpu/scan.wgsl");
 /// Visible splats as (depth, number) pairs.
 pub const COMPACT: &str = include_str!("gpu/compact.wgsl");
+/// `project_back`: twin of `render::project`'s VJP. After [`PROJECT`]. No bindings.
+pub const PROJECT_BACK: &str = include_str!("render/project_back.wgsl");
 /// (tile, splat) pairs: `count`, `emit`. After [`PROJECT`].
 pub const TILES: &str = include_str!("gpu/tiles.wgsl");
 /// Start and end of each tile's list.
 pub const RANGES: &str = include_str!("gpu/ranges.wgsl");
 /// Blends to colour, alpha and depth. After [`PROJECT`].
 pub const RASTERIZE: &str = include_str!("gpu/rasterize.wgsl");
+/// Planes → 8 bits a channel. After [`PROJECT`].
+pub const BYTES: &str = include_str!("gpu/bytes.wgsl");
+/// The blend's way back: a record a (tile, splat) pair. After [`PROJECT`].
+pub const RASTERIZE_BACK: &str = include_str!("gpu/rasterize_back.wgsl");
+/// A splat's records added up.
+pub const GATHER: &str = include_str!("gpu/gather.wgsl");
+/// Those sums → gradients of Gaussians and pose. After [`PROJECT`] and [`PROJECT_BACK`].
+pub const SPLATS_BACK: &str = include_str!("gpu/splats_back.wgsl");
+
+/// The blend's arithmetic alone, to measure.
+pub const ROOFLINE: &str = include_str!("gpu/roofline.wgsl");
 
 #[cfg(test)]
 mod tests {
@@ -36,7 +49,7 @@ mod tests {
 
     #[test]
     fn every_shader_is_valid_within_webgpus_default_limits() {
-        let shaders: [(&str, &[&str]); 8] = [
+        let shaders: [(&str, &[&str]); 13] = [
             ("project and shade", &[PROJECT, SHADE]),
             ("sort", &[SORT]),
             ("splats", &[PROJECT, SHADE, SPLATS]),
@@ -45,6 +58,11 @@ mod tests {
             ("tiles", &[PROJECT, TILES]),
             ("ranges", &[RANGES]),
             ("rasterize", &[PROJECT, RASTERIZE]),
+            ("rasterize, backward", &[PROJECT, RASTERIZE_BACK]),
+            ("bytes", &[PROJECT, BYTES]),
+            ("gather", &[GATHER]),
+            ("roofline", &[ROOFLINE]),
+            ("splats, backward", &[PROJECT, PROJECT_BACK, SPLATS_BACK]),
         ];
         for (name, files) in shaders {
             let text = files.join("\n");

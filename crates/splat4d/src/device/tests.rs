@@ -1,12 +1,11 @@
 //! Every backend against the oracle through the trait, refusals, and the way from a device that fails to the CPU.
 
 use super::*;
-use crate::math::{Real, Rng, Se3, sym3};
+use crate::math::Real;
+use crate::render::backend::refusal;
 use crate::render::{ImageGrads, Oracle, RenderGrads};
 use crate::scene::head::{HIDDEN, INPUTS};
-use crate::scene::splats::SPLAT_COLUMNS;
-use crate::scene::{Camera, Color, HeadWeights, Part, Planes, Rows, Splats, Table};
-use crate::{ErrorKind, Result};
+use crate::scene::{HeadWeights, Rows};
 
 fn view() -> Camera {
     Camera::with_fov_y(Se3::look_at([0.0, 0.0, -1.0], [0.0; 3], [0.0, -1.0, 0.0]), 1.0, 3, 2)
@@ -28,44 +27,44 @@ fn the_cpu_is_always_there() {
 
 #[test]
 fn what_only_the_cpu_can_is_done_by_the_cpu() {
-    for wanted in [
-        Wanted { head: true, ..Wanted::default() },
-        Wanted { extra: true, ..Wanted::default() },
-        Wanted { backward: true, ..Wanted::default() },
-    ] {
+    for wanted in [Wanted { head: true, ..Wanted::default() }, Wanted { extra: true, ..Wanted::default() }] {
         let opened = open(Device::Gpu, RenderConfig::default(), &wanted, Tables::Changing);
         assert!(opened.fell_back && opened.backend.can(&wanted).is_ok(), "{}", opened.why);
     }
 }
 
-/// A device whose driver fails at its second picture.
+/// A device whose driver fails at its second picture, or at the way back from it.
 struct Failing {
     renderer: Renderer<f32>,
     drawn: usize,
+    going_back: bool,
 }
 
 impl Backend for Failing {
-    fn can(&self, _: &Wanted) -> Result<()> {
-        Ok(())
+    fn can(&self, wanted: &Wanted) -> Result<()> {
+        if wanted.extra { Err(refusal("it", "blend further channels")) } else { Ok(()) }
     }
     fn render(&mut self, shot: &Shot<'_>, out: &mut Image) -> Result<()> {
         self.drawn += 1;
-        if self.drawn > 1 {
+        if self.drawn > 1 && !self.going_back {
             return Err(Error::new(ErrorKind::Unsupported, "the driver is gone"));
         }
         Backend::render(&mut self.renderer, shot, out)
     }
     fn vjp(
         &mut self,
-        _: &Shot<'_>,
-        _: &ImageGrads<'_>,
-        _: &mut [Option<&mut Table>],
-        _: &mut RenderGrads,
+        shot: &Shot<'_>,
+        grads: &ImageGrads<'_>,
+        d_sh: &mut [Option<&mut Table>],
+        d: &mut RenderGrads,
     ) -> Result<()> {
-        Ok(())
+        if self.drawn > 1 {
+            return Err(Error::new(ErrorKind::Unsupported, "the driver is gone"));
+        }
+        Backend::vjp(&mut self.renderer, shot, grads, d_sh, d)
     }
     fn radii(&self) -> &[f32] {
-        &[]
+        Backend::radii(&self.renderer)
     }
     fn config(&self) -> &RenderConfig {
         &self.renderer.config
@@ -78,7 +77,8 @@ impl Backend for Failing {
 #[test]
 fn a_device_that_fails_on_the_way_is_left_for_the_cpu() {
     let config = RenderConfig { low_pass: 0.5, ..RenderConfig::default() };
-    let mut backend: Box<dyn Backend> = Box::new(Failing { renderer: Renderer::new(config), drawn: 0 });
+    let mut backend: Box<dyn Backend> =
+        Box::new(Failing { renderer: Renderer::new(config), drawn: 0, going_back: false });
     let (splats, camera, mut image) = (Splats::default(), view(), Image::default());
     let shot = Shot::new(&splats, &camera, BACKGROUND);
     assert!(draw(&mut backend, &shot, &mut image).is_none() && backend.name() == "failing");
@@ -88,6 +88,93 @@ fn a_device_that_fails_on_the_way_is_left_for_the_cpu() {
     assert!(image.color.plane(0).iter().all(|v| *v == BACKGROUND[0]), "the CPU has drawn instead");
     assert_eq!(backend.config().low_pass, 0.5, "with the same limits");
     assert!(draw(&mut backend, &shot, &mut image).is_none(), "and goes on");
+}
+
+#[test]
+fn training_goes_on_on_the_cpu_with_the_very_gradients() {
+    let made = scene(3, 2).cast::<f32>();
+    let camera = Camera::with_fov_y(Se3::look_at([0.0, 0.5, -4.0], [0.0; 3], [0.0, -1.0, 0.0]), 0.8, 40, 30);
+    let direct = |out| Part::new(out, Color::Direct { table: &made.direct });
+    let splats = Splats { parts: made.outs.iter().map(direct).collect(), head: None };
+    let mut color = Planes::new(3, 30, 40);
+    color.data.iter_mut().enumerate().for_each(|(i, v)| *v = ((i * 31) % 17) as f32 - 8.0);
+    let (plain, extra) = (
+        Shot::new(&splats, &camera, BACKGROUND),
+        Shot { extra: made.extra.as_ref(), ..Shot::new(&splats, &camera, BACKGROUND) },
+    );
+    let returned = |backend: &mut dyn Backend, shot: &Shot<'_>| {
+        let (mut image, mut d) = (Image::default(), RenderGrads::default());
+        backend.render(shot, &mut image).expect("somebody draws it");
+        let grads = ImageGrads { color: &color, alpha: None, depth: None, extra: None };
+        backend.vjp(shot, &grads, &mut [None, None], &mut d).expect("and takes it back");
+        (image, d.parts, backend.radii().to_vec())
+    };
+    let config = RenderConfig::default();
+    let (with_extra, without) = (returned(cpu(config).as_mut(), &extra), returned(cpu(config).as_mut(), &plain));
+    for going_back in [false, true] {
+        let mut backend = WithCpu::new(Box::new(Failing { renderer: Renderer::new(config), drawn: 0, going_back }));
+        // What it refuses is told once, and does not end it.
+        for _ in 0..2 {
+            assert!(returned(&mut backend, &extra) == with_extra);
+        }
+        assert!(backend.notice().is_some_and(|n| n.contains("blend further channels")) && backend.notice().is_none());
+        assert!(returned(&mut backend, &plain) == without && backend.name() == "failing" && backend.notice().is_none());
+        // Its failure is told too, and nothing of the step is lost.
+        assert!(returned(&mut backend, &plain) == without && backend.name() == CPU);
+        let notice = backend.notice().expect("it is told");
+        assert!(notice.contains("goes on on the CPU") && notice.contains("the driver is gone"), "{notice}");
+        assert!(returned(&mut backend, &plain) == without && backend.notice().is_none());
+    }
+}
+
+/// The renderer of the CPU with a fault in the picture or in the way back.
+struct Crooked(Renderer<f32>, [f32; 2]);
+
+impl Backend for Crooked {
+    fn can(&self, _: &Wanted) -> Result<()> {
+        Ok(())
+    }
+    fn render(&mut self, shot: &Shot<'_>, out: &mut Image) -> Result<()> {
+        Backend::render(&mut self.0, shot, out)?;
+        out.color.data[70] += self.1[0];
+        Ok(())
+    }
+    fn vjp(
+        &mut self,
+        shot: &Shot<'_>,
+        grads: &ImageGrads<'_>,
+        d_sh: &mut [Option<&mut Table>],
+        d: &mut RenderGrads,
+    ) -> Result<()> {
+        Backend::vjp(&mut self.0, shot, grads, d_sh, d)?;
+        d.parts.iter_mut().for_each(|p| p.out.data_mut().iter_mut().for_each(|v| *v *= 1.0 + self.1[1]));
+        Ok(())
+    }
+    fn radii(&self) -> &[f32] {
+        Backend::radii(&self.0)
+    }
+    fn config(&self) -> &RenderConfig {
+        &self.0.config
+    }
+    fn name(&self) -> &str {
+        "crooked"
+    }
+}
+
+#[test]
+fn a_device_that_computes_something_else_is_not_trusted() {
+    for (faults, good) in [
+        ([0.0, 0.0], true),
+        ([0.005, 0.01], true),
+        ([0.1, 0.0], false),
+        ([0.0, 0.1], false),
+        ([f32::NAN, 0.0], false),
+        ([0.0, f32::NAN], false),
+    ] {
+        let said = trusted(&mut Crooked(Renderer::new(RenderConfig::default()), faults));
+        assert_eq!(said.is_ok(), good, "{faults:?}: {said:?}");
+        assert!(said.is_ok() || said.is_err_and(|e| e.to_string().contains("self-test")));
+    }
 }
 
 /// Largest difference of a value from the oracle's, of the largest depth for depth: a splat at the α cut-off may be drawn by

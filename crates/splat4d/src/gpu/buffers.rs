@@ -8,7 +8,7 @@ use wgpu::BufferUsages as Usage;
 const LEAST: u64 = 256;
 /// A buffer that grows gets this share more than it needs, so that a scene that grows slowly does not make it anew
 /// every frame.
-const SPARE: u64 = 4;
+pub(super) const SPARE: u64 = 4;
 
 /// One buffer, made anew when it must hold more.
 #[derive(Debug)]
@@ -31,7 +31,7 @@ impl Grown {
 
     /// Sees to it that there are `bytes`. Whether the buffer is a new one: what it held is lost then.
     ///
-    /// Errors: more than one binding may hold (128 MiB), or no memory.
+    /// Errors: more than one binding may hold, or no memory.
     pub(super) fn ensure(&mut self, gpu: &Gpu, bytes: u64) -> Result<bool> {
         let most = largest_binding(gpu);
         if bytes > most {
@@ -113,16 +113,32 @@ pub(super) struct Buffers {
     pub first_pairs: Grown,
     /// Tiles of pairs, to and fro.
     pub pair_keys: [Grown; 2],
-    /// Their splats.
+    /// Their numbers.
     pub pair_values: [Grown; 2],
-    /// Two numbers a tile.
+    /// Splat and quadrants of a pair, by its number.
+    pub owners: Grown,
+    /// Three numbers a tile.
     pub ranges: Grown,
     /// Five planes.
     pub planes: Grown,
+    /// A pixel in 8 bits a channel.
+    pub bytes: Grown,
+    /// Gradient to the planes.
+    pub d_planes: Grown,
+    /// Twelve sums a pair, then three a tile.
+    pub records: Grown,
+    /// Twelve a splat.
+    pub sums: Grown,
+    /// Twenty numbers a splat for the CPU.
+    pub back: Grown,
+    /// Six a workgroup.
+    pub poses: Grown,
     /// Timestamps.
     pub times: Grown,
     /// Memory that the CPU reads.
     pub staging: Grown,
+    /// The same, of the way back.
+    pub back_staging: Grown,
 }
 
 impl Buffers {
@@ -146,10 +162,18 @@ impl Buffers {
             first_pairs: storage("numbers of pairs"),
             pair_keys: [storage("pairs of tile and splat"), storage("pairs of tile and splat")],
             pair_values: [storage("pairs of tile and splat"), storage("pairs of tile and splat")],
+            owners: storage("pairs of tile and splat"),
             ranges: storage("the tiles' lists"),
             planes: storage("the picture's planes"),
+            bytes: storage("the picture's bytes"),
+            d_planes: storage("the gradient to the picture"),
+            records: storage("gradients of pairs of tile and splat"),
+            sums: storage("gradients of the splats"),
+            back: storage("gradients of the Gaussians"),
+            poses: storage("gradients of the pose"),
             times: Grown::new("timestamps", Usage::QUERY_RESOLVE | Usage::COPY_SRC),
             staging: Grown::new("the picture", Usage::MAP_READ | Usage::COPY_DST),
+            back_staging: Grown::new("the gradients", Usage::MAP_READ | Usage::COPY_DST),
         }
     }
 
@@ -166,10 +190,18 @@ impl Buffers {
             &self.scan_sums,
             &self.tile_counts,
             &self.first_pairs,
+            &self.owners,
             &self.ranges,
             &self.planes,
+            &self.bytes,
+            &self.d_planes,
+            &self.records,
+            &self.sums,
+            &self.back,
+            &self.poses,
             &self.times,
             &self.staging,
+            &self.back_staging,
         ];
         let two = [&self.arguments, &self.depth_keys, &self.depth_values, &self.pair_keys, &self.pair_values];
         one.iter().map(|b| b.bytes()).sum::<u64>() + two.iter().flat_map(|b| b.iter()).map(Grown::bytes).sum::<u64>()

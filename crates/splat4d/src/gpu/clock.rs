@@ -13,10 +13,13 @@ pub(super) enum Stage {
     Tiles,
     SortPairs,
     Rasterize,
+    RasterizeBack,
+    Gather,
+    SplatsBack,
 }
 
 /// Number of stages.
-pub(super) const STAGES: usize = 6;
+pub(super) const STAGES: usize = 9;
 
 /// Source of the stages' times.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -46,16 +49,27 @@ pub struct GpuTimings {
     pub sort_pairs: f64,
     /// Blending.
     pub rasterize: f64,
+    /// Blending, backward.
+    pub rasterize_back: f64,
+    /// Sums of the records of each splat.
+    pub gather: f64,
+    /// Projection, backward.
+    pub splats_back: f64,
     /// From the last submission to the picture in the CPU's memory, the GPU's work included.
     pub wait: f64,
     /// The whole call.
     pub total: f64,
+    /// The same of the way back, which adds to the stages above; 0 where there was none.
+    pub back_wait: f64,
+    /// The whole call of the way back.
+    pub back_total: f64,
 }
 
 impl GpuTimings {
     /// The GPU's stages together; 0 where they were not timed.
     pub fn gpu(&self) -> f64 {
-        self.project + self.compact + self.sort_splats + self.tiles + self.sort_pairs + self.rasterize
+        let forward = self.project + self.compact + self.sort_splats + self.tiles + self.sort_pairs + self.rasterize;
+        forward + self.rasterize_back + self.gather + self.splats_back
     }
 
     /// Adds the stages' milliseconds.
@@ -67,6 +81,9 @@ impl GpuTimings {
             &mut self.tiles,
             &mut self.sort_pairs,
             &mut self.rasterize,
+            &mut self.rasterize_back,
+            &mut self.gather,
+            &mut self.splats_back,
         ];
         for (sum, ms) in own.into_iter().zip(stages) {
             *sum += ms;
@@ -152,7 +169,12 @@ impl<'a> Recorder<'a> {
 
     /// Copies `bytes` from the start of one buffer to a place in another.
     pub(crate) fn copy(&mut self, from: &wgpu::Buffer, to: &wgpu::Buffer, at: u64, bytes: u64) {
-        self.encoder.copy_buffer_to_buffer(from, 0, to, at, bytes);
+        self.copy_from(from, 0, to, at, bytes);
+    }
+
+    /// Copies `bytes` from a place in one buffer to a place in another.
+    pub(crate) fn copy_from(&mut self, from: &wgpu::Buffer, first: u64, to: &wgpu::Buffer, at: u64, bytes: u64) {
+        self.encoder.copy_buffer_to_buffer(from, first, to, at, bytes);
     }
 
     /// Writes the stages' timestamps into `times`: whether there are any.

@@ -1,5 +1,5 @@
 //! Choice and opening of the GPU: nothing beyond WebGPU's default limits is asked for, so that what runs here runs in
-//! a browser too.
+//! a browser too; but for the size of buffers, which natively may be as large as the driver has them.
 
 use crate::{Error, ErrorKind, Result};
 use std::future::Future;
@@ -51,10 +51,18 @@ impl Gpu {
                 .at(&info.name)
                 .remedy("Update its driver, or render on the CPU.")
         };
+        let (own, least) = (adapter.limits(), wgpu::Limits::default());
+        let limits = wgpu::Limits {
+            max_buffer_size: own.max_buffer_size.max(least.max_buffer_size),
+            max_storage_buffer_binding_size: own
+                .max_storage_buffer_binding_size
+                .max(least.max_storage_buffer_binding_size),
+            ..least
+        };
         let descriptor = wgpu::DeviceDescriptor {
             label: Some("splat4d"),
             required_features: adapter.features() & wgpu::Features::TIMESTAMP_QUERY,
-            required_limits: wgpu::Limits::default(),
+            required_limits: limits,
             ..Default::default()
         };
         let (device, queue) = block_on(adapter.request_device(&descriptor)).map_err(refused)?;

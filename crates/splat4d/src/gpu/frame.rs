@@ -1,16 +1,17 @@
 //! One frame as dispatches: which kernel runs over which buffers, in which order.
 
+use super::MOST_GROUPS;
 use super::buffers::{Buffers, Grown, UNIFORM_STRIDE};
 use super::clock::{Recorder, Stage};
 use super::device::Gpu;
-use super::kernels::{Kernel, Kernels};
+use super::kernels::{BackKernels, Kernel, Kernels};
 use super::upload::{Draw, Upload};
 use wgpu::{BindGroup, BindingResource, ComputePass};
 
 /// Pixels across and down a tile (tiles.wgsl, rasterize.wgsl).
 pub(super) const TILE: usize = 16;
 /// Threads of every workgroup.
-const THREADS: usize = 256;
+pub(super) const THREADS: usize = 256;
 /// Things in a block of a scan or a sort (scan.wgsl, sort.wgsl).
 pub(super) const BLOCK: usize = 2048;
 /// Digits of a sort's pass; each has a workgroup in its scan.
@@ -19,6 +20,10 @@ pub(super) const DIGITS: usize = 256;
 const DEPTH_PASSES: usize = 4;
 /// Passes that sort a tile's number: there are fewer than 2^24 tiles in a band.
 const TILE_PASSES: usize = 3;
+/// Bytes of a tile's list (ranges.wgsl).
+pub(super) const RANGE_BYTES: u64 = 12;
+/// Bytes of a pair's record (rasterize_back.wgsl).
+pub(super) const RECORD_BYTES: u64 = 48;
 
 /// Places of the structures in the buffer of uniforms.
 pub(super) mod slot {
@@ -60,7 +65,7 @@ pub(super) struct Band {
 }
 
 /// `size` bytes of the uniform in a slot.
-fn uniform(buffers: &Buffers, slot: usize, size: u64) -> BindingResource<'_> {
+pub(super) fn uniform(buffers: &Buffers, slot: usize, size: u64) -> BindingResource<'_> {
     BindingResource::Buffer(wgpu::BufferBinding {
         buffer: buffers.uniforms.get(),
         offset: slot as u64 * UNIFORM_STRIDE,
@@ -74,7 +79,7 @@ const PIECE_BYTES: u64 = 80;
 const SCAN_BYTES: u64 = 16;
 const SORT_BYTES: u64 = 8;
 const BAND_BYTES: u64 = 16;
-const BLEND_BYTES: u64 = 32;
+const BLEND_BYTES: u64 = 48;
 
 /// Everything that is bound, made anew when a buffer is.
 #[derive(Debug)]
@@ -128,6 +133,7 @@ impl Groups {
             b.first_pairs.all(),
             b.pair_keys[0].all(),
             b.pair_values[0].all(),
+            b.owners.all(),
         ];
         let rasterize = |at: usize| {
             let group = [
@@ -135,6 +141,7 @@ impl Groups {
                 uniform(b, slot::BLEND, BLEND_BYTES),
                 b.ranges.all(),
                 b.pair_values[at].all(),
+                b.owners.all(),
                 b.shapes.all(),
                 b.colors.all(),
                 b.planes.all(),
@@ -231,7 +238,7 @@ impl Frame<'_> {
                 b.colors.all(),
                 b.marks.all(),
             ];
-            (k.splats.bind(self.gpu, &group), (draw.piece.rows as usize).div_ceil(THREADS))
+            (k.splats.bind(self.gpu, &group), draw.groups())
         };
         let draws: Vec<_> = upload.draws.iter().enumerate().map(bind).collect();
         recorder.stage(Stage::Project, |pass| {
@@ -250,8 +257,15 @@ impl Frame<'_> {
         })
     }
 
-    /// Lists and blends one band; returns in which of the two buffers the sorted pairs lie.
-    pub(super) fn band(&self, recorder: &mut Recorder<'_>, band: Band, across: usize) -> crate::Result<usize> {
+    /// Lists and blends one band; `bytes`: so many pixels of it in 8 bits too. Returns in which of the two buffers the sorted
+    /// pairs lie.
+    pub(super) fn band(
+        &self,
+        recorder: &mut Recorder<'_>,
+        band: Band,
+        across: usize,
+        bytes: Option<usize>,
+    ) -> crate::Result<usize> {
         let (k, b) = (self.kernels, self.buffers);
         let tiles = band.rows * across;
         recorder.stage(Stage::Tiles, |pass| {
@@ -262,23 +276,114 @@ impl Frame<'_> {
             dispatch(pass, &k.tiles, 1, b, Size::Written(arguments::VISIBLE, arguments::THREADS));
         })?;
         let passes = tile_passes(tiles);
-        recorder.clear(b.ranges.get(), 8 * tiles as u64);
+        recorder.clear(b.ranges.get(), RANGE_BYTES * tiles as u64);
         recorder.stage(Stage::SortPairs, |pass| {
             self.sort(pass, &self.groups.sort_tile[..passes], arguments::PAIRS);
             pass.set_bind_group(0, &self.groups.ranges[passes % 2], &[]);
             dispatch(pass, &k.ranges, 0, b, Size::Written(arguments::PAIRS, arguments::BLOCKS));
         })?;
+        let packed = bytes.map(|pixels| {
+            let view = uniform(b, slot::VIEW, VIEW_BYTES);
+            let group = [view, uniform(b, slot::BLEND, BLEND_BYTES), b.planes.all(), b.bytes.all()];
+            (k.bytes.bind(self.gpu, &group), pixels.div_ceil(THREADS).min(MOST_GROUPS))
+        });
         recorder.stage(Stage::Rasterize, |pass| {
             pass.set_bind_group(0, &self.groups.rasterize[passes % 2], &[]);
             pass.set_pipeline(&k.rasterize.pipelines[0]);
             pass.dispatch_workgroups(across as u32, band.rows as u32, 1);
+            if let Some((group, groups)) = &packed {
+                pass.set_bind_group(0, group, &[]);
+                dispatch(pass, &k.bytes, 0, b, Size::Known(*groups));
+            }
         })?;
         Ok(passes % 2)
     }
 }
 
-/// Passes of eight bits that tell `tiles` tiles apart.
+/// What the way back of a frame runs over.
+#[derive(Clone, Copy)]
+pub(super) struct Back<'a> {
+    /// The frame before.
+    pub frame: Frame<'a>,
+    /// Pipelines.
+    pub kernels: &'a BackKernels,
+    /// Pairs of the band.
+    pub pairs: usize,
+}
+
+impl Back<'_> {
+    /// Of one band, whose lists and planes are those of the last [`Frame::band`]: records, and their sums a splat.
+    pub(super) fn band(&self, recorder: &mut Recorder<'_>, band: Band, across: usize) -> crate::Result<()> {
+        let (k, b, gpu) = (self.kernels, self.frame.buffers, self.frame.gpu);
+        let tiles = band.rows * across;
+        let at = tile_passes(tiles) % 2;
+        let rasterize = [
+            uniform(b, slot::VIEW, VIEW_BYTES),
+            uniform(b, slot::BLEND, BLEND_BYTES),
+            b.ranges.all(),
+            b.pair_values[at].all(),
+            b.owners.all(),
+            b.shapes.all(),
+            b.colors.all(),
+            b.planes.all(),
+            b.d_planes.all(),
+            b.records.all(),
+        ];
+        let gather = [
+            uniform(b, slot::BAND, BAND_BYTES),
+            b.counts.all(),
+            b.depth_values[0].all(),
+            b.tile_counts.all(),
+            b.first_pairs.all(),
+            b.records.all(),
+            b.sums.all(),
+            b.marks.all(),
+        ];
+        let (rasterize, gather) = (k.rasterize.bind(gpu, &rasterize), k.gather.bind(gpu, &gather));
+        // Pairs that no pixel used are not written.
+        if self.pairs > 0 {
+            recorder.clear(b.records.get(), RECORD_BYTES * self.pairs as u64);
+        }
+        recorder.stage(Stage::RasterizeBack, |pass| {
+            pass.set_bind_group(0, &rasterize, &[]);
+            pass.set_pipeline(&k.rasterize.pipelines[0]);
+            pass.dispatch_workgroups(across as u32, band.rows as u32, 1);
+        })?;
+        recorder.stage(Stage::Gather, |pass| {
+            pass.set_bind_group(0, &gather, &[]);
+            dispatch(pass, &k.gather, 0, b, Size::Written(arguments::VISIBLE, arguments::THREADS));
+        })
+    }
+
+    /// From the sums of all bands to the gradients of all splats, and of the pose.
+    pub(super) fn splats(&self, recorder: &mut Recorder<'_>, upload: &Upload) -> crate::Result<()> {
+        let (k, b) = (self.kernels, self.frame.buffers);
+        let bind = |(i, draw): (usize, &Draw)| {
+            let group = [
+                uniform(b, slot::VIEW, VIEW_BYTES),
+                uniform(b, slot::PIECES + i, PIECE_BYTES),
+                upload.parts[draw.part].geometry.all(),
+                b.shapes.all(),
+                b.colors.all(),
+                b.marks.all(),
+                b.sums.all(),
+                b.back.all(),
+                b.poses.all(),
+            ];
+            (k.splats.bind(self.frame.gpu, &group), draw.groups())
+        };
+        let draws: Vec<_> = upload.draws.iter().enumerate().map(bind).collect();
+        recorder.stage(Stage::SplatsBack, |pass| {
+            for (group, groups) in &draws {
+                pass.set_bind_group(0, group, &[]);
+                dispatch(pass, &k.splats, 0, b, Size::Known(*groups));
+            }
+        })
+    }
+}
+
+/// Passes of eight bits that tell `tiles` tiles apart, and what belongs to none from them.
 pub(super) fn tile_passes(tiles: usize) -> usize {
-    let bits = usize::BITS - tiles.saturating_sub(1).leading_zeros();
+    let bits = usize::BITS - tiles.leading_zeros();
     (bits as usize).div_ceil(8).clamp(1, TILE_PASSES)
 }

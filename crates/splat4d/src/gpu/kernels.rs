@@ -5,7 +5,7 @@ use crate::wgsl;
 
 /// Kind of a binding.
 #[derive(Clone, Copy, Debug)]
-enum Kind {
+pub(super) enum Kind {
     Uniform,
     Read,
     Write,
@@ -21,7 +21,7 @@ pub(super) struct Kernel {
 }
 
 impl Kernel {
-    fn new(gpu: &Gpu, label: &str, sources: &[&str], bindings: &[Kind], entries: &[&str]) -> Self {
+    pub(super) fn new(gpu: &Gpu, label: &str, sources: &[&str], bindings: &[Kind], entries: &[&str]) -> Self {
         let device = &gpu.device;
         let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
             label: Some(label),
@@ -102,6 +102,8 @@ pub(super) struct Kernels {
     pub ranges: Kernel,
     /// rasterize
     pub rasterize: Kernel,
+    /// bytes_of
+    pub bytes: Kernel,
 }
 
 impl Kernels {
@@ -140,7 +142,7 @@ impl Kernels {
                 gpu,
                 "tiles",
                 &[wgsl::PROJECT, wgsl::TILES],
-                &[Uniform, Uniform, Read, Read, Read, Write, Read, Write, Write],
+                &[Uniform, Uniform, Read, Read, Read, Write, Read, Write, Write, Write],
                 &["count", "emit"],
             ),
             ranges: Kernel::new(gpu, "ranges", &[wgsl::RANGES], &[Read, Read, Write], &["ranges_of"]),
@@ -148,8 +150,55 @@ impl Kernels {
                 gpu,
                 "rasterize",
                 &[wgsl::PROJECT, wgsl::RASTERIZE],
-                &[Uniform, Uniform, Read, Read, Read, Read, Write],
+                &[Uniform, Uniform, Write, Read, Read, Read, Read, Write],
                 &["rasterize"],
+            ),
+            bytes: Kernel::new(
+                gpu,
+                "bytes",
+                &[wgsl::PROJECT, wgsl::BYTES],
+                &[Uniform, Uniform, Read, Write],
+                &["bytes_of"],
+            ),
+        }
+    }
+}
+
+/// The kernels of the way back.
+#[derive(Debug)]
+pub(super) struct BackKernels {
+    /// rasterize_back
+    pub rasterize: Kernel,
+    /// gather
+    pub gather: Kernel,
+    /// splats_back
+    pub splats: Kernel,
+}
+
+impl BackKernels {
+    /// Compiles everything.
+    pub(super) fn new(gpu: &Gpu) -> Self {
+        Self {
+            rasterize: Kernel::new(
+                gpu,
+                "rasterize, backward",
+                &[wgsl::PROJECT, wgsl::RASTERIZE_BACK],
+                &[Uniform, Uniform, Read, Read, Read, Read, Read, Read, Read, Write],
+                &["rasterize_back"],
+            ),
+            gather: Kernel::new(
+                gpu,
+                "gather",
+                &[wgsl::GATHER],
+                &[Uniform, Read, Read, Read, Read, Read, Write, Write],
+                &["gather"],
+            ),
+            splats: Kernel::new(
+                gpu,
+                "splats, backward",
+                &[wgsl::PROJECT, wgsl::PROJECT_BACK, wgsl::SPLATS_BACK],
+                &[Uniform, Uniform, Read, Read, Read, Read, Read, Write, Write],
+                &["splats_back"],
             ),
         }
     }

@@ -2,39 +2,47 @@
 //!
 //! Stages: project and colour every splat; gather the visible ones; sort them by depth (ties by number, the order that
 //! `render::bin` defines); count, sum and write pairs of tile and splat in that order; sort the pairs stably by tile;
-//! blend 16² tiles. Every stage is checked against its CPU twin. The shaders stay inside WebGPU's default limits and
-//! are the ones the browser's player uses.
+//! blend 16² tiles. The way back (`back.rs`): a record of sums a pair, the records of each splat added in a fixed order,
+//! the projection's VJP; colours go back on the CPU. Every stage is checked against its CPU twin. The shaders stay inside
+//! WebGPU's default limits. Nothing is ever added atomically but integers, so that the same bits come out every time.
 //!
 //! Memory is one arena that only grows: a steady scene allocates nothing. How many pairs there are is known only when
-//! they have been counted, so a frame runs with the room of the last one; were they more, the arena grows and the
-//! lists are made again. A picture whose pairs or pixels would not fit into a binding is drawn in bands of tile rows.
+//! they have been counted, so a frame runs with the room of the last one and nobody waits in it; were they more, the
+//! rest of the frame is empty dispatches, and its lists are made again with more room. A picture whose pairs or pixels
+//! would not fit into a binding is drawn in bands of tile rows, which change no bit.
 
+mod back;
 mod buffers;
 mod clock;
 mod device;
 mod frame;
 mod kernels;
+mod roofline;
 #[cfg(test)]
 mod tests;
 mod upload;
 
 pub use clock::{GpuTimings, StageClock};
 pub use device::{Adapters, Gpu};
+pub use roofline::GpuRoofline;
 
 use crate::render::backend::refusal;
 use crate::render::{Antialias, Backend, Image, ImageGrads, RenderConfig, RenderGrads, Shot, Tables, Wanted};
 use crate::scene::{Planes, Table};
 use crate::{Error, ErrorKind, Result};
+use back::Returned;
 use buffers::{Buffers, UNIFORM_STRIDE, largest_binding};
 use clock::{Queries, Recorder, TIMES_BYTES};
-use frame::{BLOCK, Band, DIGITS, Frame, Groups, TILE, arguments, count, slot};
-use kernels::Kernels;
+use frame::{BLOCK, Band, DIGITS, Frame, Groups, RANGE_BYTES, THREADS, TILE, arguments, count, slot};
+use kernels::{BackKernels, Kernels};
 use rayon::prelude::*;
 use std::time::Instant;
 use upload::Upload;
 
 /// Planes of a picture: red, green, blue, alpha, depth.
 const PLANES: usize = 5;
+/// An owner's bits from here on are its quadrants (tiles.wgsl).
+const OWNER_SHIFT: u32 = 28;
 /// Bit of the view's flags in project.wgsl.
 const FLAG_ANTIALIAS: u32 = 1;
 /// Pairs of tile and splat that are held at once (a quarter GiB); bands are made so that no more are needed.
@@ -77,6 +85,11 @@ pub struct GpuRenderer {
     most_pairs: usize,
     timings: GpuTimings,
     stats: GpuStats,
+    /// Compiled when they are first needed.
+    back_kernels: Option<BackKernels>,
+    /// Bands of the last render with their pairs; empty where there is nothing to take back.
+    drawn: Vec<(Band, usize)>,
+    returned: Returned,
 }
 
 impl GpuRenderer {
@@ -100,6 +113,9 @@ impl GpuRenderer {
             most_pairs: MOST_PAIRS,
             timings: GpuTimings::default(),
             stats: GpuStats::default(),
+            back_kernels: None,
+            drawn: Vec::new(),
+            returned: Returned::default(),
         })
     }
 
@@ -125,16 +141,12 @@ impl GpuRenderer {
 
     /// Refuses what the shaders cannot do, without opening a GPU.
     pub(crate) fn refuses(wanted: &Wanted) -> Result<()> {
-        let lacks = [
-            (wanted.head, "draw scenes with a pixel head"),
-            (wanted.extra, "blend further channels"),
-            (wanted.backward, "take gradients back"),
-        ];
+        let lacks = [(wanted.head, "draw scenes with a pixel head"), (wanted.extra, "blend further channels")];
         lacks.iter().find(|(wanted, _)| *wanted).map_or(Ok(()), |(_, what)| Err(refusal("the GPU", what)))
     }
 
     /// Draws all bands of a picture that has pixels.
-    fn draw_bands(&mut self, shot: &Shot<'_, f32>, out: &mut Image<f32>) -> Result<()> {
+    fn draw_bands(&mut self, shot: &Shot<'_, f32>, out: &mut Out<'_>) -> Result<()> {
         let start = Instant::now();
         let (n, w, h) = (self.stats.splats, shot.camera.width, shot.camera.height);
         let (across, down) = (w.div_ceil(TILE), h.div_ceil(TILE));
@@ -145,6 +157,13 @@ impl GpuRenderer {
             return Err(Error::new(
                 ErrorKind::Unsupported,
                 format!("a picture {w} pixels wide is too large for the GPU"),
+            )
+            .remedy("Render on the CPU."));
+        }
+        if n > MOST_GROUPS * THREADS {
+            return Err(Error::new(
+                ErrorKind::Unsupported,
+                format!("{n} Gaussians at one moment are too many for the GPU"),
             )
             .remedy("Render on the CPU."));
         }
@@ -161,12 +180,13 @@ impl GpuRenderer {
                 self.groups = Some(Groups::new(&self.gpu, &self.kernels, &self.buffers));
                 fresh = false;
             }
-            self.write_uniforms(shot, band, across)?;
-            let pairs = self.draw(band, across, !projected, out)?;
+            self.write_uniforms(shot, band, across, [0; 3])?;
+            let pairs = self.draw(band, [w, h], !projected, out)?;
             projected = true;
             if pairs <= self.pair_capacity() {
                 self.stats.pairs += pairs;
                 self.stats.bands += 1;
+                self.drawn.push((band, pairs));
                 continue;
             }
             // Too many pairs for the room there is: more room, or two halves.
@@ -223,7 +243,7 @@ impl GpuRenderer {
     fn make_room_for_pairs(&mut self, pairs: usize) -> Result<bool> {
         let (gpu, b) = (&self.gpu, &mut self.buffers);
         let mut fresh = false;
-        for buffer in b.pair_keys.iter_mut().chain(&mut b.pair_values) {
+        for buffer in b.pair_keys.iter_mut().chain(&mut b.pair_values).chain([&mut b.owners]) {
             fresh |= buffer.ensure(gpu, 4 * pairs as u64)?;
         }
         fresh |= b.sort_counts.ensure(gpu, sort_bytes(b.pair_keys[0].bytes() / 4))?;
@@ -233,7 +253,8 @@ impl GpuRenderer {
     fn make_room_for_band(&mut self, band: Band, across: usize, width: usize) -> Result<bool> {
         let (gpu, b) = (&self.gpu, &mut self.buffers);
         let planes = plane_bytes(band, width);
-        let mut fresh = b.ranges.ensure(gpu, (8 * band.rows * across) as u64)?;
+        b.bytes.ensure(gpu, planes / PLANES as u64)?;
+        let mut fresh = b.ranges.ensure(gpu, RANGE_BYTES * (band.rows * across) as u64)?;
         fresh |= b.planes.ensure(gpu, planes)?;
         fresh |= b.staging.ensure(gpu, counts_at(planes) + UNIFORM_STRIDE + TIMES_BYTES)?;
         Ok(fresh)
@@ -244,8 +265,9 @@ impl GpuRenderer {
         (self.buffers.pair_keys[0].bytes() / 4) as usize
     }
 
-    /// Writes every uniform of a submission.
-    fn write_uniforms(&mut self, shot: &Shot<'_, f32>, band: Band, across: usize) -> Result<()> {
+    /// Writes every uniform of a submission. `back`: of the way back, flags and place of the sums in `Blend`, and whether
+    /// records are added to those of earlier bands.
+    fn write_uniforms(&mut self, shot: &Shot<'_, f32>, band: Band, across: usize, back: [u32; 3]) -> Result<()> {
         let draws = &self.upload.draws;
         self.uniforms.clear();
         self.uniforms.resize((slot::PIECES + draws.len()) * UNIFORM_STRIDE as usize, 0);
@@ -261,12 +283,12 @@ impl GpuRenderer {
             put(out, slot, &[8 * pass as u32, count::PAIRS as u32]);
         }
         let [first, rows, across] = [band.first, band.rows, across].map(|v| v as u32);
-        put(out, slot::BAND, &[first, rows, across, 0]);
+        put(out, slot::BAND, &[first, rows, across, back[2]]);
         let c = &self.config;
         let pixel_rows = pixel_rows(band, shot.camera.height) as u32;
         let limits = [c.alpha_limits()[1] as f32, c.transmittance_min.max(0.0) as f32].map(f32::to_bits);
         let [r, g, b] = shot.background.map(f32::to_bits);
-        put(out, slot::BLEND, &[r, g, b, limits[0], limits[1], first, pixel_rows, 0]);
+        put(out, slot::BLEND, &[r, g, b, limits[0], limits[1], first, pixel_rows, back[0], back[1], 0, 0, 0]);
         for (i, draw) in draws.iter().enumerate() {
             put(out, slot::PIECES + i, std::slice::from_ref(&draw.piece));
         }
@@ -275,7 +297,7 @@ impl GpuRenderer {
     }
 
     /// Runs a submission and reads its picture, unless there were too many pairs. Returns how many there were.
-    fn draw(&mut self, band: Band, across: usize, project: bool, out: &mut Image<f32>) -> Result<usize> {
+    fn draw(&mut self, band: Band, [width, height]: [usize; 2], project: bool, out: &mut Out<'_>) -> Result<usize> {
         let (gpu, b) = (&self.gpu, &self.buffers);
         let groups = self.groups.as_ref().expect("groups are made before a frame");
         let frame = Frame { gpu, kernels: &self.kernels, buffers: b, groups };
@@ -283,13 +305,16 @@ impl GpuRenderer {
         if project {
             frame.splats(&mut recorder, &self.upload, self.stats.splats)?;
         }
-        frame.band(&mut recorder, band, across)?;
-        let (width, height) = (out.alpha.width, out.alpha.height);
         let rows = pixel_rows(band, height);
-        let planes = (4 * PLANES * width * rows) as u64;
+        let (source, each, bytes) = match out {
+            Out::Planes(_) => (&b.planes, 4 * PLANES, None),
+            Out::Bytes(_) => (&b.bytes, 4, Some(width * rows)),
+        };
+        frame.band(&mut recorder, band, width.div_ceil(TILE), bytes)?;
+        let planes = (each * width * rows) as u64;
         let counts_at = counts_at(planes);
         let times_at = counts_at + UNIFORM_STRIDE;
-        recorder.copy(b.planes.get(), b.staging.get(), 0, planes);
+        recorder.copy(source.get(), b.staging.get(), 0, planes);
         recorder.copy(b.counts.get(), b.staging.get(), counts_at, 4 * count::ALL as u64);
         let timed = recorder.resolve(b.times.get());
         if timed {
@@ -312,7 +337,14 @@ impl GpuRenderer {
         self.stats.visible = counts[count::VISIBLE] as usize;
         let stamps: Vec<u64> = bytemuck::pod_collect_to_vec(&view[times_at as usize..][..TIMES_BYTES as usize]);
         if pairs <= (b.pair_keys[0].bytes() / 4) as usize {
-            read_planes(&view[..planes as usize], band.first * TILE, rows, out);
+            let (view, first) = (&view[..planes as usize], band.first * TILE);
+            match out {
+                Out::Planes(image) => read_planes(view, first, rows, image),
+                Out::Bytes(pixels) => {
+                    let target = &mut pixels[first * width..(first + rows) * width];
+                    target.as_flattened_mut().copy_from_slice(view);
+                }
+            }
         }
         drop(view);
         staging.unmap();
@@ -333,25 +365,41 @@ impl Backend<f32> for GpuRenderer {
         let (n, w, h) = (shot.splats.len(), shot.camera.width, shot.camera.height);
         self.timings = GpuTimings::default();
         self.stats = GpuStats { splats: n, ..GpuStats::default() };
+        self.drawn.clear();
         reshape(&mut out.color, 3, h, w);
         reshape(&mut out.alpha, 1, h, w);
         reshape(&mut out.depth, usize::from(shot.depth), h, w);
         reshape(&mut out.extra, 0, h, w);
-        if w == 0 || h == 0 { Ok(()) } else { self.draw_bands(shot, out) }
+        if w == 0 || h == 0 { Ok(()) } else { self.draw_bands(shot, &mut Out::Planes(out)) }
     }
 
+    fn render_bytes(&mut self, shot: &Shot<'_, f32>, out: &mut Vec<[u8; 4]>) -> Result<bool> {
+        self.can(&shot.wanted())?;
+        let (n, w, h) = (shot.splats.len(), shot.camera.width, shot.camera.height);
+        self.timings = GpuTimings::default();
+        self.stats = GpuStats { splats: n, ..GpuStats::default() };
+        self.drawn.clear();
+        out.resize(w * h, [0; 4]);
+        if w > 0 && h > 0 {
+            self.draw_bands(shot, &mut Out::Bytes(out))?;
+        }
+        Ok(true)
+    }
+
+    /// Errors besides: a gradient that is not finite.
     fn vjp(
         &mut self,
-        _: &Shot<'_, f32>,
-        _: &ImageGrads<'_, f32>,
-        _: &mut [Option<&mut Table<f32>>],
-        _: &mut RenderGrads<f32>,
+        shot: &Shot<'_, f32>,
+        grads: &ImageGrads<'_, f32>,
+        d_sh: &mut [Option<&mut Table<f32>>],
+        d: &mut RenderGrads<f32>,
     ) -> Result<()> {
-        self.can(&Wanted { backward: true, ..Wanted::default() })
+        self.can(&Wanted { backward: true, ..shot.wanted() })?;
+        self.take_back(shot, grads, d_sh, d)
     }
 
     fn radii(&self) -> &[f32] {
-        &[]
+        &self.returned.radii
     }
 
     fn config(&self) -> &RenderConfig {
@@ -361,6 +409,13 @@ impl Backend<f32> for GpuRenderer {
     fn name(&self) -> &str {
         self.gpu.name()
     }
+}
+
+/// Where a picture goes.
+enum Out<'a> {
+    Planes(&'a mut Image<f32>),
+    /// Red, green, blue, alpha of every pixel.
+    Bytes(&'a mut [[u8; 4]]),
 }
 
 /// Copies the planes of a band into the picture, from pixel row `first` on; the depth only where it is drawn.

@@ -1,13 +1,19 @@
 // Blends each tile's splats front to back to colour, alpha and depth. Twin of render/rasterize.rs (forward), where the
 // equations and their sources stand. render/project.wgsl is put in front of this file.
 //
-// Bindings, group 0: 0 view; 1 blend; 2 ranges (two u32 a tile), 3 values (splats, sorted by tile, then nearest first);
-// 4 shapes, 5 colors; out: 6 planes: red, green, blue over the background, alpha, depth (sum of z alpha T), each
-// [rows of the band][width]. Five storage buffers, 11 KiB of workgroup memory.
-// A workgroup owns a tile of 16 x 16 pixels, a thread a pixel; 256 splats at a time are read by all threads together.
+// Bindings, group 0: 0 view; 1 blend; 2 ranges (three u32 a tile; the third is written: one past the last pair that some
+// pixel used), 3 values (pairs, sorted by tile, then nearest first), 4 owners (of a pair: splat and quadrants);
+// 5 shapes, 6 colors; out: 7 planes: red, green, blue over the background, alpha, depth (sum of z alpha T), each
+// [rows of the band][width]. Six storage buffers, 12 KiB of workgroup memory.
+// A workgroup owns a tile of 16 x 16 pixels, 64 neighbouring threads a quadrant of it, a thread a pixel; 256 splats at a
+// time are read by all threads together.
 
 const TILE: u32 = 16u;
 const BATCH: u32 = 256u;
+// Pixels across and down a quadrant, and the split of an owner (tiles.wgsl).
+const QUADRANT: u32 = 8u;
+const OWNER_SHIFT: u32 = 28u;
+const OWNER_SPLAT: u32 = 0x0fffffffu;
 const LOG2_E: f32 = 1.4426950408889634;
 
 struct Blend {
@@ -16,23 +22,28 @@ struct Blend {
     transmittance_min: f32,
     first_row: u32, // first row of tiles of the band
     pixel_rows: u32, // rows of pixels of the band
-    spare: u32,
+    flags: u32,      // of rasterize_back.wgsl, as what follows
+    sums_at: u32,
 }
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> blend: Blend;
-@group(0) @binding(2) var<storage, read> ranges: array<u32>;
+@group(0) @binding(2) var<storage, read_write> ranges: array<u32>;
 @group(0) @binding(3) var<storage, read> values: array<u32>;
-@group(0) @binding(4) var<storage, read> shapes: array<vec4<f32>>;
-@group(0) @binding(5) var<storage, read> colors: array<vec4<f32>>;
-@group(0) @binding(6) var<storage, read_write> planes: array<f32>;
+@group(0) @binding(4) var<storage, read> owners: array<u32>;
+@group(0) @binding(5) var<storage, read> shapes: array<vec4<f32>>;
+@group(0) @binding(6) var<storage, read> colors: array<vec4<f32>>;
+@group(0) @binding(7) var<storage, read_write> planes: array<f32>;
 
 var<workgroup> batch_center: array<vec2<f32>, 256>;
 // The exponent's factors in powers of 2, and log2 of the opacity.
 var<workgroup> batch_power: array<vec4<f32>, 256>;
 var<workgroup> batch_color: array<vec4<f32>, 256>;
+var<workgroup> batch_quadrants: array<u32, 256>;
 var<workgroup> stopped: atomic<u32>;
 var<workgroup> all_stopped: u32;
+var<workgroup> last_used: atomic<u32>;
+var<workgroup> list: vec2<u32>;
 
 @compute @workgroup_size(256)
 fn rasterize(
@@ -40,14 +51,13 @@ fn rasterize(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) thread: u32,
 ) {
-    let x = group.x * TILE + thread % TILE;
-    let y = group.y * TILE + thread / TILE;
+    let quadrant = thread / (QUADRANT * QUADRANT);
+    let x = group.x * TILE + (quadrant % 2u) * QUADRANT + thread % QUADRANT;
+    let y = group.y * TILE + (quadrant / 2u) * QUADRANT + thread / QUADRANT % QUADRANT;
     let width = u32(view.size.x);
     let pixel = vec2<f32>(f32(x), f32(blend.first_row * TILE + y)) + 0.5;
     let inside = x < width && y < blend.pixel_rows;
     let tile = group.y * groups.x + group.x;
-    let first = ranges[2u * tile];
-    let end = ranges[2u * tile + 1u];
     let log_min = log2(view.alpha_min);
     var sum = vec4<f32>(0.0); // red, green, blue, depth
     var t = 1.0;
@@ -55,8 +65,13 @@ fn rasterize(
     // Set here, because natively nobody clears a workgroup's memory.
     if (thread == 0u) {
         atomicStore(&stopped, 0u);
+        atomicStore(&last_used, 0u);
+        list = vec2<u32>(ranges[3u * tile], ranges[3u * tile + 1u]);
     }
-    workgroupBarrier();
+    let both = workgroupUniformLoad(&list);
+    let first = both.x;
+    let end = both.y;
+    var used = first;
     if (!inside) {
         atomicAdd(&stopped, 1u);
     }
@@ -71,7 +86,9 @@ fn rasterize(
         }
         let own = start + thread;
         if (own < end) {
-            let splat = values[own];
+            let owner = owners[values[own]];
+            let splat = owner & OWNER_SPLAT;
+            batch_quadrants[thread] = owner >> OWNER_SHIFT;
             let conic = shapes[2u * splat + 1u];
             batch_center[thread] = shapes[2u * splat].xy;
             batch_power[thread] = vec4<f32>(-LOG2_E * vec3<f32>(0.5, 1.0, 0.5) * conic.xyz, log2(conic.w));
@@ -80,6 +97,9 @@ fn rasterize(
         workgroupBarrier();
         let count = min(end - start, BATCH);
         for (var i = 0u; open && i < count; i++) {
+            if (((batch_quadrants[i] >> quadrant) & 1u) == 0u) {
+                continue;
+            }
             let d = batch_center[i] - pixel;
             let p = batch_power[i];
             // Rounding may take a needle's exponent above its top.
@@ -96,7 +116,13 @@ fn rasterize(
             }
             sum += (alpha * t) * batch_color[i];
             t = next;
+            used = start + i + 1u;
         }
+    }
+    atomicMax(&last_used, used);
+    workgroupBarrier();
+    if (thread == 0u) {
+        ranges[3u * tile + 2u] = atomicLoad(&last_used);
     }
     if (inside) {
         let plane = width * blend.pixel_rows;

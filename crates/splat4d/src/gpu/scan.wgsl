@@ -16,7 +16,7 @@ struct ScanPass {
     count_index: u32,
     total_index: u32,
     arguments_at: u32,
-    capacity: u32, // things beyond this are not dispatched
+    capacity: u32, // more things than this are not dispatched at all: the total says that they were too many
 }
 
 @group(0) @binding(0) var<uniform> scan_pass: ScanPass;
@@ -90,7 +90,7 @@ fn total(@builtin(local_invocation_index) thread: u32) {
     }
     if (thread == SCAN_THREADS - 1u) {
         counts[scan_pass.total_index] = before;
-        let things = min(before, scan_pass.capacity);
+        let things = select(before, 0u, before > scan_pass.capacity);
         let at = scan_pass.arguments_at;
         arguments[at] = (things + SCAN_THREADS - 1u) / SCAN_THREADS;
         arguments[at + 1u] = 1u;

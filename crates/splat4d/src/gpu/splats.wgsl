@@ -23,7 +23,7 @@ struct Piece {
     blocks: u32,      // blocks of SH coefficients
     flags: u32,
     first_id: u32,    // row of the colour table with which the buffer begins
-    spare: u32,
+    first_group: u32, // of splats_back.wgsl
     layer_from_world: mat3x3<f32>, // of directions, to the axes of the SH; the identity where they are the world's
 }
 

@@ -1,6 +1,7 @@
 //! Every stage against its twin on the CPU, then whole pictures. Without an adapter each test prints "skipped"; with
 //! REQUIRE_GPU=1 that is a failure.
 
+mod back;
 mod pictures;
 mod stages;
 
@@ -55,6 +56,7 @@ fn renderer() -> Option<impl DerefMut<Target = GpuRenderer>> {
     let mut held = Held(shared);
     held.config = RenderConfig::default();
     held.tables = Tables::Changing;
+    held.most_pairs = MOST_PAIRS;
     held.clock = if held.gpu.has_timestamps() { StageClock::Gpu } else { StageClock::Off };
     Some(held)
 }

@@ -3,9 +3,10 @@
 //! Tables of colours may be larger than a binding: they are cut by rows, and each cut is projected and coloured by a
 //! dispatch of its own.
 
-use super::Tables;
 use super::buffers::{Grown, largest_binding};
 use super::device::Gpu;
+use super::frame::THREADS;
+use super::{MOST_GROUPS, Tables};
 use crate::scene::splats::{Part, Rows, SPLAT_OPACITY};
 use crate::scene::{BLOCK, Color, Splats, Table};
 use crate::{Error, ErrorKind, Result};
@@ -27,7 +28,8 @@ pub(super) struct Piece {
     blocks: u32,
     flags: u32,
     first_id: u32,
-    spare: u32,
+    /// Number of its first workgroup's sums in splats_back.wgsl.
+    first_group: u32,
     /// Columns of the rotation of directions to the axes of the SH, each padded to a vec4.
     layer_from_world: [[f32; 4]; 3],
 }
@@ -47,6 +49,13 @@ pub(super) struct Draw {
     pub part: usize,
     /// Number of the cut of its table of colours.
     pub cut: usize,
+}
+
+impl Draw {
+    /// Workgroups of its dispatch.
+    pub(super) fn groups(&self) -> usize {
+        (self.piece.rows as usize).div_ceil(THREADS)
+    }
 }
 
 /// The buffers of one part.
@@ -157,7 +166,7 @@ impl Upload {
             )
             .remedy("Render on the CPU."));
         }
-        let cut_rows = blocks_a_cut * BLOCK;
+        let cut_rows = (blocks_a_cut * BLOCK).min(MOST_GROUPS * THREADS);
         let cuts = table.rows().div_ceil(cut_rows).max(1);
         let name = (table.data().as_ptr() as usize, table.data().len());
         let known = base && tables == Tables::Constant && own.sent == Some(name);
@@ -186,7 +195,7 @@ impl Upload {
                     blocks: blocks as u32,
                     flags,
                     first_id: first_id as u32,
-                    spare: 0,
+                    first_group: self.draws.iter().map(|d| d.groups() as u32).sum(),
                     layer_from_world: columns(part.layer_from_world),
                 };
                 self.draws.push(Draw { piece, part: i, cut });

@@ -69,6 +69,15 @@ pub trait Backend<F: Real = f32>: Send {
     /// nothing then. Panics: `extra` has not one row a splat.
     fn render(&mut self, shot: &Shot<'_, F>, out: &mut Image<F>) -> Result<()>;
 
+    /// Draws as [`render`](Self::render) does, but in 8 bits: red, green, blue and alpha of every pixel, clamped and rounded,
+    /// which is less to bring back from a device. `false`: it has no such way, and nothing was done.
+    ///
+    /// Errors: as of `render`.
+    fn render_bytes(&mut self, shot: &Shot<'_, F>, out: &mut Vec<[u8; 4]>) -> Result<bool> {
+        let _ = (shot, out);
+        Ok(false)
+    }
+
     /// VJP of the last [`render`](Self::render), whose shot must be given again.
     ///
     /// `d_sh` has one entry a part: for a part whose colour is the layer's own SH, the gradient is *added* to rows
@@ -82,8 +91,8 @@ pub trait Backend<F: Real = f32>: Send {
         d: &mut RenderGrads<F>,
     ) -> Result<()>;
 
-    /// Radius of every splat of the last render: 3σ of the larger axis, pixels; 0: not drawn. Empty where the backend has
-    /// no way back.
+    /// Radius of every splat of the last render that was taken back: 3σ of the larger axis, pixels; 0: not drawn. Empty
+    /// where the backend has no way back.
     fn radii(&self) -> &[F];
 
     /// The limits that it draws with.
@@ -91,6 +100,11 @@ pub trait Backend<F: Real = f32>: Send {
 
     /// The device, in a word or two.
     fn name(&self) -> &str;
+
+    /// What happened since the last call that whoever runs it should know, in one line: what is drawn elsewhere, and why.
+    fn notice(&mut self) -> Option<String> {
+        None
+    }
 }
 
 /// The refusal of an ability.

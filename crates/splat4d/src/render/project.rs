@@ -566,7 +566,7 @@ impl<F: Real> Kernel for Backward<'_, F> {
 }
 
 /// A table [rows, 10] for the gradient of a part's `out`, reusing `table` where its shape allows.
-pub(super) fn reshape<F: Real>(table: &mut Table<F>, like: &Table<F>) {
+pub(crate) fn reshape<F: Real>(table: &mut Table<F>, like: &Table<F>) {
     if table.width() == like.width() {
         table.resize(like.rows());
     } else {

@@ -201,3 +201,28 @@ fn a_second_frame_is_the_same_and_allocates_nothing() {
     let splats = Splats { parts: vec![Part::new(&scene.out, color)], head: None };
     compare(&mut r, &shot(&splats, &camera), "other colours");
 }
+
+#[test]
+fn bytes_are_the_picture_clamped_and_rounded() {
+    let Some(mut r) = own_renderer() else { return };
+    let (scene, camera) = (Scenery::new(23, 3000, 1.2, 0.1), camera([0.0, 0.5, -4.0], 131, 77));
+    let splats = scene.splats();
+    let shot = Shot::new(&splats, &camera, BACKGROUND);
+    let (mut image, mut whole, mut bands) = (Image::default(), Vec::new(), vec![[7; 4]; 3]);
+    r.render(&shot, &mut image).expect("it is drawn");
+    assert!(r.render_bytes(&shot, &mut whole).expect("it is drawn"), "the GPU has such a way");
+    assert_eq!(whole.len(), 131 * 77);
+    for (i, pixel) in whole.iter().enumerate() {
+        for (c, byte) in pixel.iter().enumerate() {
+            let v = if c < 3 { image.color.plane(c)[i] } else { image.alpha.data[i] };
+            assert_eq!(*byte, (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8, "pixel {i}, channel {c}: {v}");
+        }
+    }
+    r.most_pairs = r.stats().pairs / 4;
+    (r.buffers, r.groups) = (Buffers::new(), None);
+    assert!(r.render_bytes(&shot, &mut bands).expect("it is drawn") && r.stats().bands > 1);
+    assert!(bands == whole, "in bands too");
+    let mut none = vec![[1; 4]];
+    assert!(!crate::device::cpu(RenderConfig::default()).render_bytes(&shot, &mut none).expect("nothing fails"));
+    assert_eq!(none, [[1; 4]], "the CPU has no such way, and does nothing");
+}

@@ -1,0 +1,293 @@
+//! The way back of a picture: records, sums and the projection's VJP on the GPU, colours on the CPU.
+
+use super::buffers::{SPARE, UNIFORM_STRIDE};
+use super::clock::{Recorder, TIMES_BYTES};
+use super::frame::{Back, Band, Frame, RECORD_BYTES, TILE};
+use super::kernels::BackKernels;
+use super::{GpuRenderer, pixel_rows};
+use crate::render::project::Projection;
+use crate::render::rasterize::CHANNELS;
+use crate::render::shade::{self, ShadeGrads};
+use crate::render::{ImageGrads, PartGrads, Projected, RenderGrads, Shot, View, project};
+use crate::scene::splats::{COV, SPLAT_OPACITY};
+use crate::scene::{BLOCK, Planes, Table};
+use crate::{Error, ErrorKind, Result};
+use rayon::prelude::*;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
+
+/// Numbers that come back of a splat: five vec4 (splats_back.wgsl).
+const NUMBERS: usize = 20;
+/// Numbers of a pose's gradient.
+const POSE: usize = 6;
+/// Bits of `Blend::flags` in rasterize_back.wgsl.
+const FLAG_ALPHA: u32 = 1;
+const FLAG_DEPTH: u32 = 2;
+const FLAG_ABS: u32 = 4;
+/// Splats in a task: whole blocks of a table.
+const CHUNK: usize = 1024;
+
+/// What came back, splat by splat; memory is reused from call to call.
+#[derive(Debug, Default)]
+pub(super) struct Returned {
+    /// 0: not drawn.
+    pub radii: Vec<f32>,
+    /// Of which the CPU's half of the way back looks at the radius alone.
+    projected: Vec<Projected<f32>>,
+    channels: Vec<[f32; CHANNELS]>,
+    d_channels: Vec<[f32; CHANNELS]>,
+    partial: Vec<[f64; 3]>,
+}
+
+/// Where things lie in the memory that the CPU reads.
+struct Layout {
+    poses: u64,
+    sums: u64,
+    times: u64,
+    all: u64,
+}
+
+impl GpuRenderer {
+    /// Compiles the kernels of the way back, and draws so that its records have room. Errors: the driver refuses one.
+    pub fn for_training(&mut self) -> Result<()> {
+        // Lists may grow by a share more than they need; behind the records are a few sums.
+        let room = super::largest_binding(&self.gpu) / (RECORD_BYTES + 1) * SPARE / (SPARE + 1);
+        self.most_pairs = self.most_pairs.min(usize::try_from(room).unwrap_or(usize::MAX));
+        self.compile_back()
+    }
+
+    fn compile_back(&mut self) -> Result<()> {
+        if self.back_kernels.is_none() {
+            self.back_kernels = Some(BackKernels::new(&self.gpu));
+        }
+        self.gpu.check()
+    }
+
+    /// [`Backend::vjp`](crate::render::Backend::vjp).
+    pub(super) fn take_back(
+        &mut self,
+        shot: &Shot<'_, f32>,
+        grads: &ImageGrads<'_, f32>,
+        d_sh: &mut [Option<&mut Table<f32>>],
+        d: &mut RenderGrads<f32>,
+    ) -> Result<()> {
+        let start = Instant::now();
+        let (n, size) = (shot.splats.len(), [shot.camera.width, shot.camera.height]);
+        assert_eq!(self.stats.splats, n, "backward must follow the render of the same splats");
+        let shaped = |planes: Option<&Planes<f32>>, channels: usize| {
+            if let Some(p) = planes {
+                let shape = [p.channels, p.height, p.width];
+                assert_eq!(shape, [channels, size[1], size[0]], "a picture's gradient has the picture's shape");
+            }
+        };
+        shaped(Some(grads.color), 3);
+        shaped(grads.alpha, 1);
+        shaped(grads.depth, usize::from(shot.depth));
+        d.background = [0.0; 3];
+        d.camera = [0.0; 6];
+        (d.extra, d.head) = (None, None);
+        if n == 0 || self.drawn.is_empty() {
+            let rows = vec![0.0; n * NUMBERS];
+            d.background = d_background_of_nothing(grads.color, self.drawn.is_empty());
+            self.spread(shot, &rows, d_sh, d)?;
+            return Ok(());
+        }
+        self.compile_back()?;
+        let across = size[0].div_ceil(TILE);
+        let layout = self.make_room_to_return(n, across, size)?;
+        let bands = self.drawn.clone();
+        let (mut rows, mut d_background) = (Vec::new(), [0.0; 3]);
+        for (i, &(band, pairs)) in bands.iter().enumerate() {
+            let last = i + 1 == bands.len();
+            let sums_at = (RECORD_BYTES / 4) as u32 * pairs as u32;
+            let flag = |on: bool, flag: u32| if on { flag } else { 0 };
+            let flags = flag(grads.alpha.is_some(), FLAG_ALPHA)
+                | flag(shot.depth && grads.depth.is_some(), FLAG_DEPTH)
+                | flag(self.config.abs_grads, FLAG_ABS);
+            self.write_uniforms(shot, band, across, [flags, sums_at, u32::from(i > 0)])?;
+            self.send_gradient(shot, grads, band);
+            let end = if last { Some((&mut rows, &mut d.camera)) } else { None };
+            let sums = self.return_band((band, pairs), across, bands.len() > 1, end, &layout)?;
+            for tile in sums.chunks_exact(3) {
+                for c in 0..3 {
+                    d_background[c] += f64::from(tile[c]);
+                }
+            }
+        }
+        d.background = d_background.map(|v| v as f32);
+        self.spread(shot, &rows, d_sh, d)?;
+        self.timings.back_total = start.elapsed().as_secs_f64() * 1e3;
+        Ok(())
+    }
+
+    fn make_room_to_return(&mut self, n: usize, across: usize, size: [usize; 2]) -> Result<Layout> {
+        let (gpu, b) = (&self.gpu, &mut self.buffers);
+        let most = |f: &dyn Fn(&(Band, usize)) -> u64| self.drawn.iter().map(f).max().unwrap_or(0);
+        let pixels = most(&|(band, _)| (size[0] * pixel_rows(*band, size[1])) as u64);
+        let tiles = most(&|(band, _)| (across * band.rows) as u64);
+        let records = most(&|(band, pairs)| RECORD_BYTES * *pairs as u64 + 12 * (across * band.rows) as u64);
+        let groups: usize = self.upload.draws.iter().map(|draw| draw.groups()).sum();
+        b.d_planes.ensure(gpu, 20 * pixels)?;
+        b.records.ensure(gpu, records)?;
+        b.sums.ensure(gpu, 48 * n as u64)?;
+        b.back.ensure(gpu, (4 * NUMBERS * n) as u64)?;
+        b.poses.ensure(gpu, (4 * POSE * groups) as u64)?;
+        let poses = ((4 * NUMBERS * n) as u64).next_multiple_of(UNIFORM_STRIDE);
+        let sums = (poses + (4 * POSE * groups) as u64).next_multiple_of(UNIFORM_STRIDE);
+        let times = (sums + 12 * tiles).next_multiple_of(UNIFORM_STRIDE);
+        let layout = Layout { poses, sums, times, all: times + TIMES_BYTES };
+        b.back_staging.ensure(gpu, layout.all)?;
+        Ok(layout)
+    }
+
+    /// Sends the gradient to a band's planes.
+    fn send_gradient(&self, shot: &Shot<'_, f32>, grads: &ImageGrads<'_, f32>, band: Band) {
+        let width = shot.camera.width;
+        let rows = pixel_rows(band, shot.camera.height);
+        let (first, count) = (band.first * TILE * width, rows * width);
+        let colors = (0..3).map(|c| (c, Some(grads.color.plane(c))));
+        let others =
+            [(3, grads.alpha.map(|p| p.plane(0))), (4, grads.depth.filter(|_| shot.depth).map(|p| p.plane(0)))];
+        for (at, plane) in colors.chain(others) {
+            if let Some(plane) = plane {
+                let bytes = bytemuck::cast_slice(&plane[first..first + count]);
+                self.gpu.queue.write_buffer(self.buffers.d_planes.get(), (4 * at * count) as u64, bytes);
+            }
+        }
+    }
+
+    /// Takes one band back. Returns the background's gradient by tile; of the last band also what came of the splats, and the
+    /// pose's, which is added to.
+    fn return_band(
+        &mut self,
+        (band, pairs): (Band, usize),
+        across: usize,
+        again: bool,
+        end: Option<(&mut Vec<f32>, &mut [f64; POSE])>,
+        layout: &Layout,
+    ) -> Result<Vec<f32>> {
+        let (gpu, b) = (&self.gpu, &self.buffers);
+        let groups = self.groups.as_ref().expect("a frame was drawn");
+        let frame = Frame { gpu, kernels: &self.kernels, buffers: b, groups };
+        let kernels = self.back_kernels.as_ref().expect("they were compiled");
+        let back = Back { frame, kernels, pairs };
+        let mut recorder = Recorder::new(gpu, &self.queries, self.clock);
+        if again {
+            // The lists and planes of another band lie there.
+            frame.band(&mut recorder, band, across, None)?;
+        }
+        back.band(&mut recorder, band, across)?;
+        let tiles = across * band.rows;
+        let staging = b.back_staging.get();
+        if end.is_some() {
+            back.splats(&mut recorder, &self.upload)?;
+            recorder.copy(b.back.get(), staging, 0, (4 * NUMBERS * self.stats.splats) as u64);
+            let groups: usize = self.upload.draws.iter().map(|draw| draw.groups()).sum();
+            recorder.copy(b.poses.get(), staging, layout.poses, (4 * POSE * groups) as u64);
+        }
+        recorder.copy_from(b.records.get(), RECORD_BYTES * pairs as u64, staging, layout.sums, 12 * tiles as u64);
+        let timed = recorder.resolve(b.times.get());
+        if timed {
+            recorder.copy(b.times.get(), staging, layout.times, TIMES_BYTES);
+        }
+        let start = Instant::now();
+        recorder.submit();
+        staging.map_async(wgpu::MapMode::Read, ..layout.all, |_| ());
+        gpu.wait()?;
+        let lost = |e: wgpu::MapRangeError| {
+            Error::new(ErrorKind::Unsupported, format!("the gradients cannot be read from the GPU ({e})"))
+                .at(gpu.name())
+                .remedy("Train on the CPU.")
+        };
+        let view = staging.get_mapped_range(..layout.all).map_err(lost)?;
+        let at = |first: u64, bytes: usize| &view[first as usize..][..bytes];
+        let sums = bytemuck::pod_collect_to_vec(at(layout.sums, 12 * tiles));
+        let stamps: Vec<u64> = bytemuck::pod_collect_to_vec(at(layout.times, TIMES_BYTES as usize));
+        if let Some((rows, camera)) = end {
+            *rows = bytemuck::pod_collect_to_vec(at(0, 4 * NUMBERS * self.stats.splats));
+            let groups: usize = self.upload.draws.iter().map(|draw| draw.groups()).sum();
+            let poses: Vec<f32> = bytemuck::pod_collect_to_vec(at(layout.poses, 4 * POSE * groups));
+            for pose in poses.chunks_exact(POSE) {
+                for k in 0..POSE {
+                    camera[k] += f64::from(pose[k]);
+                }
+            }
+        }
+        drop(view);
+        staging.unmap();
+        self.timings.back_wait += start.elapsed().as_secs_f64() * 1e3;
+        self.timings.add(if timed { recorder.stages(&stamps) } else { recorder.by_wall });
+        Ok(sums)
+    }
+
+    /// Writes the gradients of all splats where they belong, and takes colours back.
+    fn spread(
+        &mut self,
+        shot: &Shot<'_, f32>,
+        rows: &[f32],
+        d_sh: &mut [Option<&mut Table<f32>>],
+        d: &mut RenderGrads<f32>,
+    ) -> Result<()> {
+        let (splats, n) = (shot.splats, shot.splats.len());
+        let Returned { radii, projected, channels, d_channels, partial } = &mut self.returned;
+        radii.resize(n, 0.0);
+        projected.resize(n, Projected::default());
+        channels.resize(n, [0.0; CHANNELS]);
+        d_channels.resize(n, [0.0; CHANNELS]);
+        d.mean2d.resize(n, 0.0);
+        d.mean2d_abs.resize(n, 0.0);
+        d.parts.resize_with(splats.parts.len(), PartGrads::default);
+        let finite = AtomicBool::new(true);
+        let (rows, _) = rows.as_chunks::<NUMBERS>();
+        let mut first = 0;
+        for (part, out) in splats.parts.iter().zip(&mut d.parts) {
+            project::reshape(&mut out.out, part.out);
+            let all = first..first + part.out.rows();
+            first = all.end;
+            let tables = out.out.data_mut().par_chunks_mut(CHUNK * (SPLAT_OPACITY + 1));
+            let sources = rows[all.clone()].par_chunks(CHUNK);
+            let drawn = radii[all.clone()].par_chunks_mut(CHUNK).zip(projected[all.clone()].par_chunks_mut(CHUNK));
+            let colors = channels[all.clone()].par_chunks_mut(CHUNK).zip(d_channels[all.clone()].par_chunks_mut(CHUNK));
+            let norms = d.mean2d[all.clone()].par_chunks_mut(CHUNK).zip(d.mean2d_abs[all].par_chunks_mut(CHUNK));
+            tables.zip(sources).zip(drawn).zip(colors).zip(norms).for_each(
+                |((((table, rows), (radii, projected)), (channels, d_channels)), (mean2d, mean2d_abs))| {
+                    let mut sum = 0.0;
+                    for (i, row) in rows.iter().enumerate() {
+                        let mut put = |column: usize, v: f32| {
+                            table[(i / BLOCK * (SPLAT_OPACITY + 1) + column) * BLOCK + i % BLOCK] = v;
+                        };
+                        (0..3).for_each(|k| put(k, row[k]));
+                        put(SPLAT_OPACITY, row[3]);
+                        (0..6).for_each(|k| put(COV + k, row[4 + k]));
+                        radii[i] = row[10];
+                        projected[i] = Projected { radius: row[10], ..Projected::default() };
+                        d_channels[i] = [row[12], row[13], row[14]];
+                        mean2d[i] = row[15];
+                        channels[i] = [row[16], row[17], row[18]];
+                        mean2d_abs[i] = row[19];
+                        // 0 times a number is 0, of others NaN.
+                        sum += row.iter().map(|v| 0.0 * v).sum::<f32>();
+                    }
+                    if sum != 0.0 {
+                        finite.store(false, Ordering::Relaxed);
+                    }
+                },
+            );
+        }
+        if !finite.into_inner() {
+            return Err(Error::new(ErrorKind::Unsupported, "a gradient from the GPU is not a finite number")
+                .at(self.gpu.name())
+                .remedy("Train on the CPU."));
+        }
+        let view = View::new(shot.camera, &self.config);
+        let projection = Projection { splats, view: &view, simd: self.config.simd, projected };
+        let mut targets = ShadeGrads { sh: d_sh, parts: &mut d.parts, pose: &mut d.camera, partial };
+        shade::backward(&projection, shot.sh_degree, channels, d_channels, &mut targets);
+        Ok(())
+    }
+}
+
+/// The background's gradient of a picture without splats, or without pixels.
+fn d_background_of_nothing(color: &Planes<f32>, no_pixels: bool) -> [f32; 3] {
+    if no_pixels { [0.0; 3] } else { std::array::from_fn(|c| color.plane(c).iter().sum()) }
+}
