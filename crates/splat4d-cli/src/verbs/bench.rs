@@ -1,5 +1,7 @@
 //! `bench`: how long every stage takes on pinned scenes, and how far that is from what this machine could do.
 
+#[cfg(feature = "gpu")]
+mod gpu;
 mod growth;
 mod playback;
 mod roofline;
@@ -39,6 +41,7 @@ Examples:
   splat4d bench --save today.json
   splat4d bench --against today.json              ratios to an earlier result
   splat4d bench --growth all --plots docs/images  steps with more Gaussians, pixels and frames; memory
+  splat4d bench --device gpu --save gpu.json      every stage of a GPU, scenes A, B and C
   splat4d bench --playback runs/a runs/a-small    frames a second of runs and files, in turns
 
 Times are means over eight views of the best of several rounds. `of ceiling` is the least time in which the stage's
@@ -52,9 +55,13 @@ docs/benchmarks.md.";
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
-    /// Which scene; may be given more than once [default: all]
+    /// Which scene; may be given more than once [default: T, U and S; of a GPU A, B and C]
     #[arg(long = "scene", value_name = "NAME", value_enum, ignore_case = true)]
     scenes: Vec<Name>,
+    /// What is measured: the CPU, or a GPU of any kind by its own clock, with the least that each stage could take by its
+    /// copies and its arithmetic
+    #[arg(long, value_enum, default_value = "cpu", conflicts_with_all = ["growth", "playback", "simd"])]
+    device: Measured,
     /// Folder with the SOG files of scene S
     #[arg(long, value_name = "FOLDER")]
     playbot: Option<PathBuf>,
@@ -89,6 +96,15 @@ pub(crate) struct Args {
     /// Tell the ratio to an earlier result
     #[arg(long, value_name = "FILE")]
     against: Option<PathBuf>,
+}
+
+/// The device that is measured.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum Measured {
+    /// The CPU
+    Cpu,
+    /// A GPU, even one whose driver computes on the CPU
+    Gpu,
 }
 
 fn rounds(text: &str) -> std::result::Result<usize, String> {
@@ -141,6 +157,8 @@ pub(crate) fn run(args: &Args, threads: Option<u16>, console: &Console) -> anyho
     let places = Places { playbot: args.playbot.clone(), file: args.file.clone() };
     let names = match &args.scenes[..] {
         _ if !args.growth.is_empty() => vec![Name::T],
+        #[cfg(feature = "gpu")]
+        [] if args.device == Measured::Gpu => Name::OF_GPU.to_vec(),
         [] => Name::ALL.to_vec(),
         names => names.to_vec(),
     };
@@ -151,7 +169,9 @@ pub(crate) fn run(args: &Args, threads: Option<u16>, console: &Console) -> anyho
             Err(skipped) => console.aside(&skipped.0),
         }
     }
-    let mut rows = if args.growth.is_empty() {
+    let mut rows = if args.device == Measured::Gpu {
+        on_gpu(&scenes, Way { threads: threads[threads.len() - 1], simd: levels[0], rounds: args.rounds }, console)?
+    } else if args.growth.is_empty() {
         measure(&scenes, &levels, &threads, args.rounds, console)?
     } else {
         grow(&scenes, args, &levels, &threads, console)?
@@ -174,6 +194,18 @@ pub(crate) fn run(args: &Args, threads: Option<u16>, console: &Console) -> anyho
         _ => console.result(rows::table(&rows).trim_end()),
     }
     Ok(())
+}
+
+/// Measures a GPU, with the most threads beside it.
+#[cfg(feature = "gpu")]
+fn on_gpu(scenes: &[Pinned], way: Way, console: &Console) -> anyhow::Result<Vec<Row>> {
+    Ok(gpu::measure(scenes, way, &pool(way.threads)?, &|text| console.note(text))?)
+}
+
+#[cfg(not(feature = "gpu"))]
+fn on_gpu(_: &[Pinned], _: Way, _: &Console) -> anyhow::Result<Vec<Row>> {
+    let error = Error::new(ErrorKind::Unsupported, "this splat4d was built without the feature `gpu`");
+    Err(error.remedy("Build it with its default features.").into())
 }
 
 /// Measures how files play.

@@ -97,7 +97,9 @@ fn what_cannot_be_measured_is_refused_at_once() {
     std::fs::create_dir(&folder).unwrap();
     let text = |path: &Path| path.to_str().unwrap().to_owned();
     for (args, word) in [
-        (vec!["--scene", "X"], "[possible values: S, T, U]"),
+        (vec!["--scene", "X"], "[possible values: S, T, U, A, B, C]"),
+        (vec!["--device", "tpu"], "[possible values: cpu, gpu]"),
+        (vec!["--device", "gpu", "--growth", "pixels"], "cannot be used with"),
         (vec!["--simd", "mmx"], "[possible values: scalar, avx2, avx512]"),
         (vec!["--rounds", "0"], "1 to 1000"),
         (vec!["--growth", "time"], "possible values"),

@@ -9,11 +9,11 @@ use std::path::Path;
 /// One measurement. Its JSON is the verb's interface; further fields appear where they mean something.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct Row {
-    /// S, T, U, or what grew.
+    /// A letter, or what grew.
     pub scene: String,
     pub stage: String,
     pub threads: usize,
-    /// scalar, avx2 or avx512.
+    /// scalar, avx2 or avx512; gpu.
     pub simd: String,
     /// Mean over the scene's views of the best of several rounds.
     pub ms: f64,
@@ -40,6 +40,9 @@ pub(super) struct Row {
     /// Bytes, for rows that tell where memory is.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub bytes: Option<u64>,
+    /// The GPU and its driver, where one was measured.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub device: Option<String>,
     /// This time over that of the earlier result; above 1 is slower.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub against: Option<f64>,
@@ -186,6 +189,9 @@ fn remarks(row: &Row) -> String {
             tested as f64 * 1e-6,
             seen as f64 * 1e-6
         ));
+    }
+    if let (Some(tested), None) = (row.tested_pairs, row.contributing_pairs) {
+        said.push(format!("{:.2} M pairs of pixel and Gaussian at most", tested as f64 * 1e-6));
     }
     if let Some(rate) = row.gb_per_s {
         said.push(format!("{rate:.1} GB/s"));

@@ -2,11 +2,14 @@
 
 use crate::source::Source;
 use splat4d::layers::{Layer, Scene};
-use splat4d::math::Se3;
-use splat4d::scene::{Born, Camera, RowEdit, Space, Time};
+use splat4d::math::{Rng, Se3, sh};
+use splat4d::motion::{Spacetime, SpacetimeSpec};
+use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
+use splat4d::scene::{Born, Camera, GEOMETRY, LifeKind, Params, RowEdit, SH, Space, Time};
 use splat4d::{Error, Result};
 use std::f64::consts::TAU;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// Views of a scene; figures are means over them.
 pub(super) const VIEWS: usize = 8;
@@ -29,17 +32,42 @@ pub(super) enum Name {
     /// The same, 800x800
     #[value(name = "U")]
     U,
+    /// 100,000 random Gaussians with spherical harmonics of degree 3, 800x800
+    #[value(name = "A")]
+    A,
+    /// 500,000 of them, 1920x1080
+    #[value(name = "B")]
+    B,
+    /// 1,000,000 of them, 1920x1080
+    #[value(name = "C")]
+    C,
 }
 
 impl Name {
-    /// All of them, the large one last: peaks of memory are those of a process that has held nothing larger.
+    /// Those of the CPU, the large one last: peaks of memory are those of a process that has held nothing larger.
     pub(super) const ALL: [Self; 3] = [Self::T, Self::U, Self::S];
+    /// Those of a GPU.
+    #[cfg(feature = "gpu")]
+    pub(super) const OF_GPU: [Self; 3] = [Self::A, Self::B, Self::C];
+
+    /// Gaussians and picture of a scene that is made up.
+    fn made(self) -> Option<(usize, [usize; 2])> {
+        match self {
+            Self::A => Some((100_000, [800, 800])),
+            Self::B => Some((500_000, [1920, 1080])),
+            Self::C => Some((1_000_000, [1920, 1080])),
+            Self::S | Self::T | Self::U => None,
+        }
+    }
 
     pub(super) fn letter(self) -> &'static str {
         match self {
             Self::S => "S",
             Self::T => "T",
             Self::U => "U",
+            Self::A => "A",
+            Self::B => "B",
+            Self::C => "C",
         }
     }
 }
@@ -55,7 +83,7 @@ impl Places {
     fn of(&self, name: Name) -> (&Path, &'static str) {
         match name {
             Name::S => (self.playbot.as_deref().unwrap_or(Path::new(PLAYBOT)), "--playbot FOLDER"),
-            Name::T | Name::U => (self.file.as_deref().unwrap_or(Path::new(KNIGHT)), "--file FILE"),
+            _ => (self.file.as_deref().unwrap_or(Path::new(KNIGHT)), "--file FILE"),
         }
     }
 }
@@ -81,6 +109,9 @@ pub(super) struct Skipped(pub String);
 impl Pinned {
     /// Reads a scene. The inner error says that its file is not there, which is no fault.
     pub(super) fn open(name: Name, places: &Places) -> Result<std::result::Result<Self, Skipped>> {
+        if let Some((count, size)) = name.made() {
+            return Ok(Ok(made_up(name.letter(), count, size)));
+        }
         let (path, option) = places.of(name);
         if !path.exists() {
             let (letter, path) = (name.letter(), path.display());
@@ -91,7 +122,7 @@ impl Pinned {
         let views = match name {
             Name::S => around(),
             Name::T => of_the_capture(&source, path, 400)?,
-            Name::U => of_the_capture(&source, path, 800)?,
+            _ => of_the_capture(&source, path, 800)?,
         };
         Ok(Ok(Self { name: name.letter().into(), scene: in_one_layer(source.scene), views }))
     }
@@ -109,6 +140,38 @@ fn around() -> Vec<View> {
         View { camera: Camera::with_fov_y(pose, FOV_Y.to_radians(), 1280, 720), time: Time(0.0) }
     };
     (0..VIEWS).map(view).collect()
+}
+
+/// Random Gaussians in a box, from eight places around it. The box is covered as often whatever their number.
+pub(super) fn made_up(name: &str, count: usize, [width, height]: [usize; 2]) -> Pinned {
+    const BOX: [f64; 3] = [4.0, 2.2, 4.0];
+    const DISTANCE: f64 = 5.0;
+    const FOV_Y: f64 = 0.55;
+    /// Typical scale at half a million: about two pixels of standard deviation.
+    const SCALE: f64 = 0.004;
+    const AT: f64 = 500_000.0;
+    let (mut params, rng) = (Params::new(count, sh::MAX_COEFFS, LifeKind::Infinite.columns()), Rng::new(1, "made", 0));
+    let motion = Spacetime::new(SpacetimeSpec::default(), &mut params).expect("a built-in model fits");
+    let scale = (SCALE * (AT / count as f64).sqrt()).ln();
+    let [geometry, colors] = params.get_mut([GEOMETRY, SH]);
+    for j in 0..count {
+        let r = rng.fork(j as u64);
+        let mean: [f32; 3] = std::array::from_fn(|k| (BOX[k] * (r.uniform(k as u64) - 0.5)) as f32);
+        geometry.write(j, 0, mean);
+        geometry.write::<4>(j, QUAT, std::array::from_fn(|k| r.normal(10 + k as u64) as f32));
+        geometry.write::<3>(j, LOG_SCALE, std::array::from_fn(|k| (scale + 0.5 * r.normal(20 + k as u64)) as f32));
+        geometry.set(j, OPACITY, r.normal(4) as f32);
+        (0..colors.width()).for_each(|c| colors.set(j, c, (0.4 * (r.uniform(30 + c as u64) - 0.5)) as f32));
+    }
+    let layer = Layer::new("made", params, Arc::new(motion), LifeKind::Infinite);
+    let scene = Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 30.0, up: [0.0, -1.0, 0.0], ..Scene::default() };
+    let view = |k: usize| {
+        let a = TAU * k as f64 / VIEWS as f64;
+        let pose = Se3::look_at([DISTANCE * a.sin(), 0.0, -DISTANCE * a.cos()], [0.0; 3], [0.0, -1.0, 0.0]);
+        let time = Time((k as f64 + 0.5) / VIEWS as f64);
+        View { camera: Camera::with_fov_y(pose, FOV_Y, width, height), time }
+    };
+    Pinned { name: name.into(), scene, views: (0..VIEWS).map(view).collect() }
 }
 
 /// Eight of the capture's cameras over its clip; square pictures with the same horizontal field of view.

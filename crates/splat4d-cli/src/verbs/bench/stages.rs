@@ -53,7 +53,7 @@ pub(super) fn simd_name(simd: Simd) -> &'static str {
 }
 
 /// A gradient to a picture: always the same numbers, small and of both signs.
-fn gradient(view: &View) -> Planes<f32> {
+pub(super) fn gradient(view: &View) -> Planes<f32> {
     let mut grad = Planes::new(3, view.camera.height, view.camera.width);
     for (i, g) in grad.data.iter_mut().enumerate() {
         *g = ((i * 7919 % 1000) as f32 - 500.0) * 1e-6;
@@ -62,7 +62,7 @@ fn gradient(view: &View) -> Planes<f32> {
 }
 
 /// One table a part, where its colours are the layer's own.
-fn zeros(splats: &Splats<'_, f32>) -> Vec<Option<Table<f32>>> {
+pub(super) fn zeros(splats: &Splats<'_, f32>) -> Vec<Option<Table<f32>>> {
     let table = |color: Color<'_, f32>| match color {
         Color::Sh { table, base: true, .. } => Some(table.zeros_like()),
         _ => None,

@@ -8,7 +8,7 @@ use super::stages::{Way, simd_name};
 use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::Rng;
 use splat4d::math::sh::degree_of;
-use splat4d::render::{Image, RenderConfig, Renderer, Shot};
+use splat4d::render::{Backend, Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::{Camera, Planes, SH, Time};
 use splat4d::{Error, ErrorKind, Result};
 use splat4d_train::capture::frames::{Frames, Picture};
@@ -141,6 +141,16 @@ fn stage(scene: &Scene<f32>, extent: f64) -> Result<Stage> {
 
 /// A trainer that goes on for ever and changes next to nothing.
 pub(super) fn trainer(scene: Scene<f32>, frames: Arc<dyn Frames>, way: Way) -> Result<Trainer<'static>> {
+    let renderer = Renderer::new(RenderConfig { simd: way.simd, ..RenderConfig::default() });
+    trainer_on(scene, frames, Box::new(renderer))
+}
+
+/// The same, drawn by `backend`.
+pub(super) fn trainer_on(
+    scene: Scene<f32>,
+    frames: Arc<dyn Frames>,
+    backend: Box<dyn Backend>,
+) -> Result<Trainer<'static>> {
     // Rates of positions are in units of it; any number would do.
     let extent = 1.0;
     let stage = stage(&scene, extent)?;
@@ -151,9 +161,8 @@ pub(super) fn trainer(scene: Scene<f32>, frames: Arc<dyn Frames>, way: Way) -> R
         sh_degree: splat4d::math::sh::MAX_DEGREE,
         exposure_lr: 0.0,
     };
-    let renderer = Renderer::new(RenderConfig { simd: way.simd, ..RenderConfig::default() });
     let loss = TrainLoss::photometric(LAMBDA_DSSIM);
-    let mut trainer = Trainer::new(scene, vec![stage], frames, Box::new(renderer), loss, settings);
+    let mut trainer = Trainer::new(scene, vec![stage], frames, backend, loss, settings);
     trainer.progress.rate_scale = STANDSTILL;
     Ok(trainer)
 }
@@ -209,7 +218,11 @@ impl Times {
 
 /// The mean over views of each view's best step. Call it inside a pool of `way.threads` threads.
 pub(super) fn times(scene: Scene<f32>, held: &Arc<Held>, way: Way) -> Result<Times> {
-    let mut trainer = trainer(scene, held.clone(), way)?;
+    times_of(trainer(scene, held.clone(), way)?, held, way)
+}
+
+/// The same of a trainer that was made.
+pub(super) fn times_of(mut trainer: Trainer<'_>, held: &Held, way: Way) -> Result<Times> {
     let mut best = vec![[f64::MAX; 6]; held.len()];
     for round in 0..=way.rounds {
         for _ in 0..held.len() {
