@@ -183,6 +183,10 @@ impl Console {
                     )
                 });
             }
+            Event::Device { why, .. } => {
+                self.clear();
+                self.say(why);
+            }
             Event::Chosen { motion, why } => {
                 self.clear();
                 self.say(&format!("motion model: {motion}, because {why}"));

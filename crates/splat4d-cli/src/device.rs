@@ -17,16 +17,33 @@ pub(crate) enum Device {
 
 /// Files of which one is there where Linux has a driver for a GPU: asking Vulkan itself costs time, and its loader
 /// complains on stderr on machines without a screen.
-#[cfg(all(feature = "gpu", target_os = "linux"))]
 const LINUX_GPUS: [&str; 5] = ["/dev/dri", "/dev/nvidiactl", "/dev/kfd", "/dev/dxg", "/dev/mali0"];
+
+/// What is said where `auto` finds none.
+const NO_GPU: &str = "this machine has no GPU";
+
+/// Whether there is none for certain.
+fn no_gpu() -> bool {
+    cfg!(all(feature = "gpu", target_os = "linux")) && !LINUX_GPUS.iter().any(|p| std::path::Path::new(p).exists())
+}
+
+/// The device to train on; where there is certainly no GPU for `auto`, that is said here.
+pub(crate) fn to_train(device: Device, console: &Console) -> device::Device {
+    match device {
+        Device::Auto if no_gpu() => {
+            console.say(&format!("training on the CPU: {NO_GPU}"));
+            device::Device::Cpu
+        }
+        Device::Auto => device::Device::Auto,
+        Device::Cpu => device::Device::Cpu,
+        Device::Gpu => device::Device::Gpu,
+    }
+}
 
 /// Opens the device for a scene that does not change; only a GPU that was demanded is missed aloud.
 pub(crate) fn open(device: Device, config: RenderConfig, wanted: &Wanted, console: &Console) -> Opened {
     let opened = match device {
-        #[cfg(all(feature = "gpu", target_os = "linux"))]
-        Device::Auto if !LINUX_GPUS.iter().any(|p| std::path::Path::new(p).exists()) => {
-            device::on_cpu(config, &"this machine has no GPU")
-        }
+        Device::Auto if no_gpu() => device::on_cpu(config, &NO_GPU),
         Device::Auto => device::open(device::Device::Auto, config, wanted, Tables::Constant),
         Device::Cpu => device::open(device::Device::Cpu, config, wanted, Tables::Constant),
         Device::Gpu => device::open(device::Device::Gpu, config, wanted, Tables::Constant),

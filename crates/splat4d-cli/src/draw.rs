@@ -47,6 +47,7 @@ pub(crate) struct Painter<'a> {
     console: Option<&'a Console>,
     /// The last picture.
     pub image: Image<f32>,
+    bytes: Vec<[u8; 4]>,
 }
 
 impl<'a> Painter<'a> {
@@ -55,7 +56,7 @@ impl<'a> Painter<'a> {
         let config = RenderConfig { antialias: self::antialias(antialias), ..RenderConfig::default() };
         let (player, backend, image) = (Player::of_scene(scene), device::cpu(config), Image::default());
         let wanted = Wanted { head: scene.head != Head::Identity, ..Wanted::default() };
-        Self { player, background, depth, backend, wanted, console: None, image }
+        Self { player, background, depth, backend, wanted, console: None, image, bytes: Vec::new() }
     }
 
     /// The same on another device, where that can draw the scene.
@@ -79,6 +80,22 @@ impl<'a> Painter<'a> {
         {
             console.warn(&format!("drawing on the CPU: {error}"));
         }
+    }
+
+    /// Draws and takes over the picture in 8 bits, without more of it where the device has a way to that; `range` as in
+    /// [`rgb`](Self::rgb).
+    pub(crate) fn picture(&mut self, camera: &Camera, time: f64, channel: Channel, range: [f32; 2]) -> Rgb {
+        if channel == Channel::Color {
+            let splats = self.player.at(Time(time)).expect("nothing is read for a scene that is in memory");
+            let shot = Shot::new(&splats, camera, self.background);
+            // A device that fails is left by what follows.
+            if let Ok(true) = self.backend.render_bytes(&shot, &mut self.bytes) {
+                let data = self.bytes.iter().flat_map(|[r, g, b, _]| [*r, *g, *b]).collect();
+                return Rgb { width: camera.width, height: camera.height, data };
+            }
+        }
+        self.draw(camera, time);
+        self.rgb(channel, range)
     }
 
     /// The last picture in 8 bits. `range`: nearest and farthest depth of the depth colours.

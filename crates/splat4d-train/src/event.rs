@@ -88,6 +88,13 @@ pub enum Event {
         /// Seconds that are left, estimated.
         seconds_left: f64,
     },
+    /// On what a run trains, where that was asked for or changed.
+    Device {
+        /// It in words, its driver too.
+        name: String,
+        /// One line: what was taken, and why.
+        why: String,
+    },
     /// The model that `motion = "auto"` has become.
     Chosen {
         /// Its name.

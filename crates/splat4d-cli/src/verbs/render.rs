@@ -207,9 +207,9 @@ fn film(args: &Args, path: &Path, console: &Console) -> anyhow::Result<()> {
     let mut drawing = Duration::ZERO;
     for (i, shot) in shots.iter().enumerate() {
         let start = Instant::now();
-        painter.draw(&shot.camera, shot.time);
+        let picture = painter.picture(&shot.camera, shot.time, args.channel, range);
         drawing += start.elapsed();
-        film.frame(&painter.rgb(args.channel, range))?;
+        film.frame(&picture)?;
         console.phase("rendering", i + 1, shots.len());
     }
     film.finish()?;

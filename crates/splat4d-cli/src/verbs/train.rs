@@ -1,6 +1,7 @@
 //! `train`: a capture becomes a run: trained, measured, filmed and reported.
 
 use crate::console::Console;
+use crate::device::{self, Device};
 use crate::files::{self, human_bytes, parse_bytes};
 use crate::run_folder::{self, Run, cameras_json};
 use crate::serving::{self, Place, Watch};
@@ -29,6 +30,7 @@ Examples:
   splat4d train my-take --motion still              one scene for all times: a calibration check
   splat4d train my-take --downscale 4 --set iterations=1000 --set sh_degree=0
   splat4d train my-take --hold-out camera=0,10      measure on these cameras
+  splat4d train my-take --device auto               a GPU draws, if there is one
   splat4d train --resume runs/first                 continue exactly where it stopped
 
 A capture is a folder with one of these: capture.json (write it by hand for your own rig), transforms_train.json
@@ -101,6 +103,9 @@ pub struct Args {
     /// Memory for decoded pictures [default: 1GiB]
     #[arg(long, value_name = "SIZE", value_parser = parse_bytes, help_heading = "What is read")]
     image_memory: Option<u64>,
+    /// What draws while it trains; the rest is done by the CPU. Not part of the recipe: a run may go on on another device
+    #[arg(long, value_enum, default_value = "cpu", help_heading = "What computes")]
+    device: Device,
     #[command(flatten)]
     measure: finish::Measure,
     /// Show the scene in the browser while it learns, and on a terminal afterwards too, until Ctrl-C
@@ -153,7 +158,8 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     };
     let (run, watch, trained) = if let Some(run) = &args.resume {
         let watch = watch(&Run::open(run)?.name());
-        let options = TrainOptions { snapshots: snapshots(&watch), clock, ..TrainOptions::default() };
+        let device = device::to_train(args.device, console);
+        let options = TrainOptions { device, snapshots: snapshots(&watch), clock, ..TrainOptions::default() };
         let trained = run::resume_with(run, &options, &stop, &mut |event| listen(event, &watch));
         (run.clone(), watch, trained)
     } else {
@@ -169,6 +175,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         files::write(&run.join("cameras.json"), &cameras)?;
         let watch = watch(&capture.name);
         let options = TrainOptions {
+            device: device::to_train(args.device, console),
             minutes: args.minutes,
             finish: finish::steps(&capture, args.no_eval),
             predict: args.quality.is_some(),

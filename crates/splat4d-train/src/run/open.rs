@@ -10,10 +10,10 @@ use crate::loss::image::terms;
 use crate::methods::{Plan, Stage, auto, program_of, stages};
 use crate::recipe::{MotionName, Recipe};
 use crate::step::loss::TrainLoss;
-use crate::step::trainer::{Settings, Trainer};
+use crate::step::trainer::{Settings, TrainedOn, Trainer};
 use crate::upkeep::Limits;
 use crate::{Error, Result};
-use splat4d::device;
+use splat4d::device::{self, Device};
 use splat4d::layers::Scene;
 use splat4d::render::{Antialias, RenderConfig, Simd};
 use std::path::Path;
@@ -78,6 +78,8 @@ pub(crate) struct OpenCapture {
     pub(crate) capture: Arc<Capture>,
     pub(crate) frames: Arc<Dataset>,
     pub(crate) simd: Simd,
+    /// What its trainers draw with.
+    pub(crate) device: Device,
 }
 
 /// The training frames of a capture, with as much memory for pictures as the recipe grants. Errors: there are none.
@@ -137,7 +139,12 @@ impl OpenCapture {
 
     /// With frames that somebody else looks at too.
     pub(crate) fn with(frames: Arc<Dataset>) -> Self {
-        Self { capture: frames.capture().clone(), frames, simd: Simd::detect() }
+        Self { capture: frames.capture().clone(), frames, simd: Simd::detect(), device: Device::Cpu }
+    }
+
+    /// The same, drawn by another device.
+    pub(crate) fn on(self, device: Device) -> Self {
+        Self { device, ..self }
     }
 
     pub(crate) fn plan(&self, recipe: &Recipe) -> Plan {
@@ -227,7 +234,9 @@ impl OpenCapture {
             exposure_lr: r.appearance.exposure_lr,
         };
         let loss = TrainLoss::new(terms(r));
-        let mut trainer = Trainer::new(scene, stages, self.frames.clone(), device::cpu(config), loss, settings);
+        let drawing = device::open_to_train(self.device, config);
+        let mut trainer = Trainer::new(scene, stages, self.frames.clone(), drawing.backend, loss, settings);
+        trainer.device = TrainedOn { name: drawing.name, why: drawing.why, missed: drawing.fell_back };
         trainer.learner.exposure = exposure;
         trainer.learner.corrections = self.corrections(plan);
         trainer

@@ -46,7 +46,7 @@ pub(super) fn complete(
         write_atomically(&run.join(FILE), &cloud.to_ply(&mark))?;
     }
     let completed = with_found(Capture::clone(capture), recipe, run)?;
-    Ok(OpenCapture::with(training_frames(Arc::new(completed), recipe)?))
+    Ok(OpenCapture::with(training_frames(Arc::new(completed), recipe)?).on(opened.device))
 }
 
 /// The capture with the points that were found for a run, if any were.

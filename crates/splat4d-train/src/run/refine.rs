@@ -70,7 +70,7 @@ pub(crate) fn refine(
             r.run.replans = Replans::default();
         })
         .resolve();
-    let opened = OpenCapture::with(job.frames);
+    let opened = OpenCapture::with(job.frames).on(options.device);
     let plan = opened.plan(&recipe);
     let held = recipe.clone().with(|r| r.densify.max_cap = job.scene.len().max(1));
     let session = Session {

@@ -9,11 +9,13 @@ use super::memory::peak_memory;
 use super::metrics::{Metrics, STAGE_NAMES, Totals, psnr};
 use super::open::OpenCapture;
 use super::snapshot::Snapshots;
+use super::start::read_info;
 use crate::event::{Event, Progress};
 use crate::recipe::Recipe;
 use crate::step::trainer::Trainer;
 use crate::{Error, ErrorKind, Result};
 use serde_json::json;
+use splat4d::device::Device;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant as Clock};
@@ -21,6 +23,8 @@ use std::time::{Duration, Instant as Clock};
 /// Options of a run besides its recipe.
 #[derive(Clone, Debug, Default)]
 pub struct TrainOptions {
+    /// What draws. It is no part of the recipe: a run may be resumed on another device, whose last bits are others.
+    pub device: Device,
     /// Keep all from the clock's zero to the end of what follows training to so long: iterations are fitted to it, and
     /// fitted anew while the run goes.
     pub minutes: Option<f64>,
@@ -182,6 +186,7 @@ impl Session<'_> {
             gaussians: trainer.scene().len(),
             memory_estimate: self.estimate,
         });
+        self.tell_device(trainer, listen);
         let mut metrics = Metrics::open(self.run, first, iterations);
         let mut totals = Totals::default();
         let shown = trainer.scene().without_head("the player");
@@ -246,6 +251,9 @@ impl Session<'_> {
             for (old, new) in state.smooth.iter_mut().zip([step.report.loss, step.mse]) {
                 *old += fresh * (new - *old);
             }
+            for message in &step.notices {
+                listen(&Event::Warning { message: message.clone() });
+            }
             totals.add(&step);
             metrics.push(trainer, &step, &state);
             if told.elapsed().as_secs_f64() > PROGRESS_SECONDS || trainer.is_done() {
@@ -276,6 +284,24 @@ impl Session<'_> {
             listen(&Event::Finished { iteration, seconds: state.seconds, gaussians, peak_memory: peak_memory() });
         }
         Ok(Outcome { run: self.run.to_owned(), iteration, gaussians, seconds: state.seconds, interrupted: !done })
+    }
+
+    /// Says on what it trains, where that was asked for or is not what it was before.
+    fn tell_device(&self, trainer: &Trainer<'_>, listen: &mut dyn FnMut(&Event)) {
+        let device = &trainer.device;
+        // Runs of before there were other devices name none.
+        let info = read_info(self.run).unwrap_or_default();
+        let before = info["device"].as_str().unwrap_or(&trainer.device.name);
+        let mut why = device.why.clone();
+        if before != device.name {
+            why = format!("{why}; before it was {before}, and from here on last bits may be others");
+        } else if self.opened.device == Device::Cpu {
+            return;
+        }
+        listen(&match device.missed && self.opened.device == Device::Gpu {
+            true => Event::Warning { message: why },
+            false => Event::Device { name: device.name.clone(), why },
+        });
     }
 
     fn progress(&self, trainer: &Trainer<'_>, state: &RunState, steps: &Steps) -> Event {
@@ -323,6 +349,7 @@ impl Session<'_> {
             "motion": recipe.run.motion.as_str(),
             "seed": recipe.run.seed,
             "simd": self.opened.simd.name(),
+            "device": trainer.device.name,
             "threads": rayon::current_num_threads(),
             "iteration": trainer.progress.iteration,
             "iterations": trainer.iterations(),

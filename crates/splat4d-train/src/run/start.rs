@@ -38,7 +38,7 @@ pub fn train(
             .at(run.display())
             .remedy("Continue it with `train --resume`, or give another folder with -o"));
     }
-    let opened = OpenCapture::new(capture, &recipe)?;
+    let opened = OpenCapture::new(capture, &recipe)?.on(options.device);
     check_flow(&opened.capture, &recipe)?;
     let mut listen = listen;
     let recipe = if recipe.run.motion.is_auto() { opened.choose(recipe, &mut listen)? } else { recipe };
@@ -153,7 +153,7 @@ pub fn forecast(capture: Arc<Capture>, listen: &mut dyn FnMut(&Event)) -> Result
     Ok(Forecast { motion: choice.motion, why: choice.why, iterations: recipe.run.iterations, memory })
 }
 
-/// As [`resume`]; of the options only `snapshots` and `clock` count, the rest was settled at the start. A run with
+/// As [`resume`]; of the options only `device`, `snapshots` and `clock` count, the rest was settled at the start. A run with
 /// `minutes` keeps to what is left of them: time between the commands does not count.
 pub fn resume_with(
     run: &Path,
@@ -167,7 +167,7 @@ pub fn resume_with(
             .at(run.display())
             .remedy(format!("Continue it with `splat4d {other}` and the options it began with")));
     }
-    let opened = OpenCapture::new(Arc::new(capture), &recipe)?;
+    let opened = OpenCapture::new(Arc::new(capture), &recipe)?.on(options.device);
     let plan = opened.plan(&recipe);
     let empty =
         init::scene(&plan, program_of(&recipe)?.as_ref(), &Seeds::default(), opened.background(), opened.capture.up)?;
@@ -204,7 +204,7 @@ pub fn open_run(run: &Path) -> Result<(Recipe, Capture)> {
     Ok((recipe, capture))
 }
 
-fn read_info(run: &Path) -> Result<serde_json::Value> {
+pub(super) fn read_info(run: &Path) -> Result<serde_json::Value> {
     let path = run.join("run.json");
     serde_json::from_str(&read_text(&path)?)
         .map_err(|e| Error::input(format!("it is not JSON: {e}")).at(path.display()))

@@ -1,6 +1,7 @@
 //! Whole runs on a tiny capture on disk: the same bits for any number of threads, after any stop and after a crash; faults
 //! that roll back; outputs, memory and checkpoints that are refused.
 
+mod device;
 mod on_time;
 
 use super::budget::Budget;

@@ -56,6 +56,8 @@ pub struct Stepped {
     pub other: Duration,
     /// Gaussians born, moved, removed.
     pub change: Change,
+    /// What the user should know of the device that draws.
+    pub notices: Vec<String>,
 }
 
 /// A number that was not finite: what and where.
@@ -121,6 +123,7 @@ impl<'a> CpuEngine<'a> {
         let step = Step { scene, views: plan.views, info: plan.info, sh_degree: plan.sh_degree };
         let (backend, grads) = (self.backend.as_mut(), &mut self.grads);
         out.report = self.chain.step(&step, backend, &mut losses, grads, &mut |o| stats.observe(o))?;
+        out.notices.extend(std::iter::from_fn(|| self.backend.notice()));
         (out.l1, out.ssim, out.mse) = (plan.loss.l1, plan.loss.ssim, plan.loss.mse());
         Ok(())
     }

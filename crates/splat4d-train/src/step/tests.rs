@@ -2,6 +2,8 @@
 
 mod bed;
 mod flow;
+#[cfg(feature = "gpu")]
+mod gpu;
 mod limits;
 mod resume;
 mod switches;

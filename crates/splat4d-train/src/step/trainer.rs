@@ -58,6 +58,17 @@ pub struct Position {
     pub strikes: usize,
 }
 
+/// The device that draws.
+#[derive(Clone, Debug)]
+pub(crate) struct TrainedOn {
+    /// It in words, its driver too.
+    pub(crate) name: String,
+    /// What was taken and why, in a line.
+    pub(crate) why: String,
+    /// Whether it is not the one that was asked for.
+    pub(crate) missed: bool,
+}
+
 /// The state of a run.
 pub struct Trainer<'a> {
     /// The scene that learns, with its optimiser.
@@ -70,6 +81,8 @@ pub struct Trainer<'a> {
     pub loss: TrainLoss,
     /// Settings that hold for all stages.
     pub settings: Settings,
+    /// What draws.
+    pub(crate) device: TrainedOn,
     /// The pace through the schedule; none: a step is one of the schedule.
     pace: Option<Pace>,
     /// Whether what comes before the step is done already.
@@ -95,12 +108,15 @@ impl<'a> Trainer<'a> {
         assert!(unframed, "training moves rows in the layers' own axes, which must be the world's");
         stages.iter_mut().for_each(|s| s.upkeep.sort_by_key(|u| u.order()));
         let timeline = Timeline::new(frames.as_ref());
+        let name = backend.name().to_owned();
+        let device = TrainedOn { why: format!("training on {name}"), name, missed: false };
         let mut trainer = Self {
             learner: Learner::new(scene),
             stages,
             progress: Position { rate_scale: 1.0, ..Position::default() },
             loss,
             settings,
+            device,
             pace: None,
             entered: false,
             frames,

@@ -9,6 +9,7 @@ use crate::run::tests::{Place, recipe};
 use crate::run::{OpenCapture, training_frames};
 use crate::step::trainer::Trainer;
 use crate::upkeep::Change;
+use splat4d::device::Device;
 use splat4d::format::scene;
 use splat4d::layers::{Evaluation, Scene};
 use splat4d::scene::{Rows, Space, Time};
@@ -80,7 +81,12 @@ impl Bed {
 
     /// A run that has not begun.
     pub(super) fn start(&self, recipe: &Recipe) -> Trainer<'static> {
-        let opened = OpenCapture::with(self.frames.clone());
+        self.start_on(Device::Cpu, recipe)
+    }
+
+    /// The same, drawn by another device.
+    pub(super) fn start_on(&self, device: Device, recipe: &Recipe) -> Trainer<'static> {
+        let opened = OpenCapture::with(self.frames.clone()).on(device);
         let plan = opened.plan(recipe);
         program_of(recipe).unwrap().check(&plan).unwrap();
         opened.trainer(&plan, opened.initial_scene(&plan).unwrap()).unwrap()
@@ -88,7 +94,12 @@ impl Bed {
 
     /// As a resume does: an empty scene, and everything from the checkpoint.
     pub(super) fn resumed(&self, recipe: &Recipe, checkpoint: &[u8]) -> Trainer<'static> {
-        let opened = OpenCapture::with(self.frames.clone());
+        self.resumed_on(Device::Cpu, recipe, checkpoint)
+    }
+
+    /// The same, drawn by another device.
+    pub(super) fn resumed_on(&self, device: Device, recipe: &Recipe, checkpoint: &[u8]) -> Trainer<'static> {
+        let opened = OpenCapture::with(self.frames.clone()).on(device);
         let plan = opened.plan(recipe);
         let program = program_of(recipe).unwrap();
         let empty = init::scene(&plan, program.as_ref(), &Seeds::default(), [0.0; 3], [0.0, 1.0, 0.0]).unwrap();

@@ -1,0 +1,110 @@
+//! Training with a GPU that draws, against the CPU alone; on any driver, that of a CPU too. Without one each test prints
+//! "skipped"; with REQUIRE_GPU=1 that is a failure.
+
+use super::bed::{Bed, bytes, knobs, saved};
+use crate::recipe::Recipe;
+use crate::step::trainer::Trainer;
+use splat4d::device::Device;
+
+/// A short recipe of every motion model, and how far its last steps may be off: roundings grow, and where Gaussians are born
+/// and die they decide who.
+const MODELS: [(&str, f64); 10] = [
+    ("motion=still strategy=none sh_degree=2 sh_degree_interval=7", 0.02),
+    ("motion=spacetime strategy=none motion_order=2 rotation_rate=true life=interval lambda_velocity=0.1", 0.02),
+    ("motion=spacetime strategy=adc exposure=true antialias=true", 0.15),
+    ("motion=native4d sh_harmonics=1 strategy=mcmc", 0.15),
+    ("motion=tracked rigid_neighbours=5", 0.02),
+    ("motion=control strategy=none control_nodes=10", 0.02),
+    ("motion=ssm strategy=none control_nodes=10 ssm_width=8 ssm_states=4 ssm_warm_up=0.1", 0.02),
+    ("motion=hexplane strategy=none coarse_iterations=10 plane_channels=16 plane_resolution=6 net_width=16", 0.02),
+    ("motion=deform-mlp strategy=none deform_width=16", 0.02),
+    ("motion=spacetime strategy=none filter=geodesic", 0.02),
+];
+/// Steps in which curves are the same but for roundings, and their largest relative difference: Adam's first steps are whole
+/// ones even where a gradient is nothing but roundings.
+const FIRST: (usize, f64) = (5, 2e-3);
+/// Steps at the end whose mean is compared.
+const LAST: usize = 8;
+
+fn on_gpu(bed: &Bed, recipe: &Recipe) -> Option<Trainer<'static>> {
+    let trainer = bed.start_on(Device::Gpu, recipe);
+    if trainer.device.missed {
+        assert!(std::env::var_os("REQUIRE_GPU").is_none(), "REQUIRE_GPU is set: {}", trainer.device.why);
+        println!("skipped: {}", trainer.device.why);
+        return None;
+    }
+    assert!(trainer.device.why.starts_with("training on ") && trainer.device.name != "the CPU");
+    Some(trainer)
+}
+
+/// Mean squared errors of all steps that are left, and what was said.
+fn finish(trainer: &mut Trainer<'_>, what: &str) -> (Vec<f64>, Vec<String>) {
+    let (mut mse, mut notices) = (Vec::new(), Vec::new());
+    while !trainer.is_done() {
+        let step = trainer.step().unwrap().unwrap_or_else(|fault| panic!("{what}: {}", fault.0));
+        mse.push(step.mse);
+        notices.extend(step.notices);
+    }
+    (mse, notices)
+}
+
+#[test]
+fn every_model_learns_as_on_the_cpu() {
+    let bed = Bed::new();
+    let mut troubles = Vec::new();
+    for (line, most) in MODELS {
+        let recipe = knobs(line);
+        let Some(mut trainer) = on_gpu(&bed, &recipe) else { return };
+        let mut cpu = bed.start(&recipe);
+        let ((mse, notices), (expected, _)) = (finish(&mut trainer, line), finish(&mut cpu, line));
+        assert!(notices.is_empty(), "{line}: {notices:?}");
+        let off = |a: f64, b: f64| (a / b - 1.0).abs();
+        let first = mse.iter().zip(&expected).take(FIRST.0).map(|(a, b)| off(*a, *b)).fold(0.0, f64::max);
+        let mean = |v: &[f64]| v[v.len() - LAST..].iter().sum::<f64>();
+        let last = off(mean(&mse), mean(&expected));
+        let (rows, others) = (trainer.scene().len(), cpu.scene().len());
+        let said =
+            format!("{line}: {first:.1e} in the first steps, {last:.1e} in the last, {rows} and {others} Gaussians");
+        println!("{said}");
+        if first > FIRST.1 || last > most || off(rows as f64, others as f64) > most {
+            troubles.push(said);
+        }
+    }
+    assert!(troubles.is_empty(), "these are not as on the CPU:\n{}", troubles.join("\n"));
+}
+
+#[test]
+fn a_run_on_a_gpu_repeats_and_resumes_bit_for_bit() {
+    let bed = Bed::new();
+    let recipe = knobs("motion=spacetime strategy=mcmc refine.poses=true batch_size=2");
+    let Some(mut trainer) = on_gpu(&bed, &recipe) else { return };
+    let mut checkpoints = Vec::new();
+    while !trainer.is_done() {
+        trainer.step().unwrap().unwrap();
+        if [7, 18].contains(&trainer.progress.iteration) {
+            checkpoints.push(saved(&trainer));
+        }
+    }
+    assert_eq!(checkpoints.len(), 2);
+    let whole = bytes(trainer.scene());
+    for checkpoint in &checkpoints {
+        let mut resumed = bed.resumed_on(Device::Gpu, &recipe, checkpoint);
+        finish(&mut resumed, "resumed");
+        assert!(bytes(resumed.scene()) == whole, "a resumed run has the bytes of one that was not stopped");
+    }
+    // The CPU goes on too, with other last bits.
+    let mut elsewhere = bed.resumed(&recipe, &checkpoints[0]);
+    finish(&mut elsewhere, "elsewhere");
+    assert!(elsewhere.scene().len().abs_diff(trainer.scene().len()) < 10);
+}
+
+#[test]
+fn what_a_gpu_does_not_draw_is_said_once_and_drawn_by_the_cpu() {
+    let bed = Bed::new();
+    let recipe = knobs("motion=spacetime features=full iterations=6");
+    let Some(mut trainer) = on_gpu(&bed, &recipe) else { return };
+    let mut cpu = bed.start(&recipe);
+    let (mse, notices) = finish(&mut trainer, "a pixel head");
+    assert!(notices.len() == 1 && notices[0].contains("pixel head"), "{notices:?}");
+    assert!(mse == finish(&mut cpu, "a pixel head").0 && bytes(trainer.scene()) == bytes(cpu.scene()));
+}
