@@ -2,6 +2,7 @@
 
 use crate::sample::splat4d;
 use crate::{json_of, str};
+use serde_json::Value;
 use splat4d_import::sfm::align::apart;
 use splat4d_train::capture::{Capture, CaptureOptions};
 use std::path::{Path, PathBuf};
@@ -132,6 +133,101 @@ fn videos_with_sound_become_a_capture_whose_clocks_were_heard() {
         let off = (camera["offset"].as_f64().unwrap() - report["cameras"][0]["offset"].as_f64().unwrap()) * SLOW as f64;
         assert!((off - *begin as f64).abs() < 0.2, "{name}: {off} frames, begun after {begin}");
     }
+}
+
+/// The bundled cameras' numbers, as they are.
+fn told() -> Vec<Value> {
+    let capture = json_of(&bundled().join("capture.json"));
+    let cameras = capture["cameras"].as_array().unwrap();
+    CAMERAS.iter().map(|(name, _)| cameras.iter().find(|c| c["name"] == **name).unwrap().clone()).collect()
+}
+
+/// A calibration as anipose writes them, of cameras that are called so.
+fn toml(cameras: &[Value], names: &[&str]) -> String {
+    let one = |(camera, name): (&Value, &&str)| {
+        let number = |key: &str| camera[key].as_f64().unwrap();
+        let row = |i: usize| camera["world_to_camera"][i].as_array().unwrap().clone();
+        let rows: Vec<Value> = (0..3).map(|i| row(i)[..3].into()).collect();
+        let (cx, cy) = (number("cx") - 0.5, number("cy") - 0.5);
+        format!(
+            "[{name}]\nname = \"{name}\"\nsize = [{}, {}]\nmatrix = [[{:?}, 0, {cx:?}], [0, {:?}, {cy:?}], [0, 0, 1]]\n\
+             distortions = [0.0, 0.0, 0.0, 0.0]\nrotation = {}\ntranslation = {}\n",
+            camera["width"],
+            camera["height"],
+            number("fx"),
+            number("fy"),
+            Value::from(rows),
+            Value::from((0..3).map(|i| row(i)[3].clone()).collect::<Vec<_>>())
+        )
+    };
+    cameras.iter().zip(names).map(one).collect()
+}
+
+#[test]
+fn a_calibration_places_cameras_and_clocks_are_found() {
+    /// How exactly numbers must come through.
+    const EXACT: f64 = 1e-5;
+    let dir = tempfile::tempdir().unwrap();
+    let at = |name: &str| dir.path().join(name);
+    let films = at("films");
+    filmed(&films);
+    let names: Vec<&str> = CAMERAS.iter().map(|c| c.0).collect();
+    let told = told();
+    std::fs::write(at("calibration.toml"), toml(&told, &names)).unwrap();
+    // A mask for each camera: its upper quarter does not count.
+    std::fs::create_dir(at("masks")).unwrap();
+    for name in &names {
+        let mask = image::GrayImage::from_fn(200, 150, |_, y| image::Luma([if y < 37 { 0 } else { 255 }]));
+        mask.save(at("masks").join(format!("{name}.png"))).unwrap();
+    }
+    for (calibration, masks) in [(at("calibration.toml"), true), (bundled().join("capture.json"), false)] {
+        let take = at(if masks { "take" } else { "again" });
+        let masks_at = at("masks");
+        let mut args = vec!["import", str(&films), "-o", str(&take), "--calibration", str(&calibration)];
+        if masks {
+            args.extend(["--masks", str(&masks_at)]);
+        }
+        let said = splat4d(&args).run().ok();
+        assert!(said.contains("calibration px") && said.contains("geometry"), "{said}");
+        let made = json_of(&take.join("capture.json"));
+        for (k, camera) in told.iter().enumerate() {
+            let found = &made["cameras"][k];
+            for key in ["fx", "fy", "cx", "cy"] {
+                assert!((found[key].as_f64().unwrap() - camera[key].as_f64().unwrap()).abs() < EXACT, "{key} {found}");
+            }
+            for (i, j) in (0..3).flat_map(|i| (0..4).map(move |j| (i, j))) {
+                let number = |v: &Value| v["world_to_camera"][i][j].as_f64().unwrap();
+                assert!((number(found) - number(camera)).abs() < EXACT, "{found}");
+            }
+        }
+        let report = json_of(&take.join("import/report.json"));
+        for (k, (name, begin)) in CAMERAS.iter().enumerate() {
+            let row = &report["cameras"][k];
+            let offset = |k: usize| report["cameras"][k]["offset"].as_f64().unwrap();
+            let off = (offset(k) - offset(0)) * 30.0 - *begin as f64;
+            assert!(off.abs() < 0.1, "{name}: {off} frames off");
+            assert!(row["calibration"].as_f64().unwrap() < 1.0, "{row}");
+        }
+        let capture = Capture::open(&take, &CaptureOptions::default()).unwrap();
+        assert_eq!(capture.frames.iter().all(|f| f.mask.is_some()), masks);
+        assert!(capture.points.is_some_and(|p| p.points.len() > 50));
+    }
+    // Every camera is another one's.
+    let mut turned = names.clone();
+    turned.rotate_left(1);
+    std::fs::write(at("wrong.toml"), toml(&told, &turned)).unwrap();
+    let refused = |file: &Path| {
+        let take = at("refused");
+        splat4d(&["import", str(&films), "-o", str(&take), "--calibration", str(file)]).run().refused()
+    };
+    let why = refused(&at("wrong.toml"));
+    assert!(why.contains("contradicts the pictures"), "{why}");
+    let strange: Vec<String> = (0..names.len()).map(|k| format!("strange{}", 3 * k)).collect();
+    let strange: Vec<&str> = strange.iter().map(String::as_str).collect();
+    std::fs::write(at("strange.toml"), toml(&told, &strange)).unwrap();
+    let why = refused(&at("strange.toml"));
+    assert!(why.contains("strange3") && why.contains("cam07"), "{why}");
+    assert!(refused(&at("missing.toml")).contains("missing.toml"));
 }
 
 #[test]

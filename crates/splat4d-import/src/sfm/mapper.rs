@@ -117,6 +117,8 @@ pub(crate) struct Map<'a> {
     lenses: Vec<Lens>,
     guesses: Vec<Lens>,
     told: Vec<bool>,
+    /// Lenses that are known exactly.
+    exact: Vec<bool>,
     lens_of: &'a [usize],
     spots: Vec<Option<Spot>>,
     /// Why sights could not be placed.
@@ -186,10 +188,12 @@ impl<'a> Ground<'a> {
     fn empty(&self, focal: f64) -> Map<'_> {
         let mut lenses: Vec<Option<Lens>> = vec![None; self.lens_count];
         let mut told = vec![false; self.lens_count];
+        let mut exact = vec![false; self.lens_count];
         for (k, s) in self.sights.iter().enumerate() {
             let guess = s.focal.unwrap_or(focal * self.size(k));
             lenses[self.lens_of[k]].get_or_insert(Lens::plain(guess, s.size[0], s.size[1]));
             told[self.lens_of[k]] |= s.focal.is_some();
+            exact[self.lens_of[k]] |= s.exact;
         }
         let lenses: Vec<Lens> = lenses.into_iter().map(|l| l.expect("every lens has a sight")).collect();
         let n = self.sights.len();
@@ -204,6 +208,7 @@ impl<'a> Ground<'a> {
             guesses: lenses.clone(),
             lenses,
             told,
+            exact,
             lens_of: &self.lens_of,
             spots: vec![None; self.tracks.len()],
             reasons: vec![String::new(); n],
@@ -221,6 +226,17 @@ impl<'a> Ground<'a> {
         map.renew();
         map.adjust(8);
         map.renew();
+        map
+    }
+
+    /// The map of cameras that stand where they are said to, with the clocks that were found before.
+    fn given(&self, before: Option<&Mapped>) -> Map<'_> {
+        let mut map = self.empty(1.0);
+        map.order = (0..self.sights.len()).collect();
+        map.poses = self.sights.iter().map(|s| s.pose).collect();
+        if let Some(before) = before {
+            map.taus = before.cameras.iter().map(|c| c.as_ref().map_or(0.0, |c| c.tau)).collect();
+        }
         map
     }
 
@@ -348,9 +364,19 @@ impl Map<'_> {
 
     fn free(&self) -> Free {
         let n = self.order.len();
+        if self.placed_before() {
+            // Poses that are given tell clocks from places, of two cameras on.
+            let moves = self.how.clocks && self.sights.iter().all(|s| s.frame > 0.0);
+            return Free { pose: false, focal: false, k1: false, center: false, tau: moves };
+        }
         let rest = n >= ALL_FROM.min(self.sights.len()).max(FEWEST);
         let moves = self.how.clocks && self.sights.iter().all(|s| s.frame > 0.0);
-        Free { focal: n >= FOCAL_FROM, k1: rest, center: rest, tau: rest && moves }
+        Free { pose: true, focal: n >= FOCAL_FROM, k1: rest, center: rest, tau: rest && moves }
+    }
+
+    /// Whether poses were given, and are not to be found.
+    fn placed_before(&self) -> bool {
+        self.sights.iter().all(|s| s.pose.is_some())
     }
 
     /// Adjusts everything with so many evaluations; the loss and how many sightings it is of.
@@ -396,6 +422,7 @@ impl Map<'_> {
         let settings = Settings {
             scale: self.how.scale * unit(size),
             free: self.free(),
+            exact: lens_back.iter().map(|&l| self.exact[l]).collect(),
             priors: Priors {
                 lenses: lens_back.iter().map(|&l| self.guesses[l]).collect(),
                 focal: if told { TOLD } else { GUESSED },
@@ -478,7 +505,7 @@ impl Map<'_> {
             return false;
         }
         let lens = self.lens_of[sight];
-        let used = self.order.iter().any(|&s| self.lens_of[s] == lens);
+        let used = self.exact[lens] || self.order.iter().any(|&s| self.lens_of[s] == lens);
         let guess = self.guesses[lens];
         let lenses: Vec<Lens> = if used {
             vec![self.lenses[lens]]
@@ -544,6 +571,15 @@ impl Map<'_> {
                 self.renew();
                 adjusted = self.order.len() as f64;
             }
+        }
+    }
+
+    /// Adjusts, leaves out and finds again; all sights stay.
+    fn settle(&mut self) {
+        const STEPS: usize = 50;
+        for _ in 0..ROUNDS {
+            self.adjust(STEPS);
+            self.renew();
         }
     }
 
@@ -641,6 +677,7 @@ impl Map<'_> {
         Mapped {
             cameras: (0..self.sights.len()).map(of).collect(),
             points: self.spots.iter().enumerate().filter_map(point).collect(),
+            contradiction: vec![None; self.sights.len()],
         }
     }
 }
@@ -678,6 +715,29 @@ pub struct Mapped {
     pub cameras: Vec<Result<Stand, String>>,
     /// In the order of tracks.
     pub points: Vec<Found>,
+    /// Of cameras whose poses were given; see [`super::Solution::contradiction`].
+    pub contradiction: Vec<Option<f64>>,
+}
+
+/// Points and clocks of cameras whose poses and lenses are given. `links` were found without them, and tell how right they are;
+/// points come from matches along epipolar lines.
+pub(crate) fn about(sights: &[Sight], links: &[Link], how: &Mapping, progress: &mut Progress<'_>) -> Mapped {
+    /// Rounds of matching with clocks that get better.
+    const TWICE: usize = 2;
+    let mut placed: Option<Mapped> = None;
+    for _ in 0..TWICE {
+        let ground = Ground::new(sights, &[], links, how);
+        let mut map = ground.given(placed.as_ref());
+        let joined = tracks::join(sights, &map.guided(links, progress));
+        let ground = Ground::new(sights, &joined, links, how);
+        map = ground.given(placed.as_ref());
+        map.renew();
+        map.settle();
+        placed = Some(map.result());
+    }
+    let mut out = placed.expect("there was a round");
+    out.contradiction = super::known::errors(sights, links);
+    out
 }
 
 /// Places cameras: from several starts, the best of which is kept. `None`: no two pictures fit together.

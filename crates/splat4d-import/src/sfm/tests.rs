@@ -61,6 +61,8 @@ fn rig(cameras: usize, points: usize, noise: f64, wrong: f64, spread: f64) -> Ri
             size: [640, 360],
             factor: 1.0,
             focal: None,
+            exact: false,
+            pose: None,
             lens: c,
             frame: 1.0 / 30.0,
             features,

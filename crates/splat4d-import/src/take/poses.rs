@@ -4,10 +4,11 @@ use super::stored::Stored;
 use crate::sfm::pictures::Pictures as _;
 use crate::sfm::{self, Options, Solution};
 use crate::sync::graph::{self, Kind, Offset};
-use crate::write::{Pictures, Placed, Poses};
+use crate::write::{Masks, Pictures, Placed, Poses};
 use crate::{Error, Result};
 use splat4d::math::Se3;
 use splat4d::math::se3::{norm, sub};
+use splat4d::scene::{Intrinsics, Lens};
 use splat4d_train::capture::PointCloud;
 use splat4d_train::event::Progress;
 
@@ -32,7 +33,9 @@ pub(super) struct Stand {
     pub poses: Vec<Option<Se3>>,
     /// One pose for all frames.
     pub fixed: bool,
-    pub lens: sfm::lens::Lens,
+    /// Pixels of the stored pictures.
+    pub intrinsics: Intrinsics,
+    pub lens: Lens,
     pub sightings: usize,
     /// Pixels of the stored pictures.
     pub error: f64,
@@ -46,6 +49,8 @@ pub(super) struct Solved {
     pub points: Vec<([f64; 3], [u8; 3])>,
     pub up: [f64; 3],
     pub moving: bool,
+    /// See [`sfm::Solution::contradiction`].
+    pub contradiction: Vec<Option<f64>>,
 }
 
 /// Places cameras that stand still, and refines their clocks.
@@ -89,16 +94,15 @@ pub(super) fn standing(
     }
     let placed = |c: usize| {
         let taken = solution.taken.iter().find(|t| t.camera == c).expect("every camera is a sight");
-        taken.placed.clone().map(|p| Stand {
-            poses: vec![Some(p.pose)],
-            fixed: true,
-            lens: p.lens,
-            sightings: p.sightings,
-            error: p.error,
+        taken.placed.clone().map(|p| {
+            let (intrinsics, lens) = optics(stored, c, &p.lens);
+            let poses = vec![Some(p.pose)];
+            Stand { poses, fixed: true, intrinsics, lens, sightings: p.sightings, error: p.error }
         })
     };
     let cameras = (0..n).map(placed).collect();
-    Ok(Solved { cameras, offsets, points: points_of(&solution), up: solution.up, moving: false })
+    let (points, contradiction) = (points_of(&solution), solution.contradiction);
+    Ok(Solved { cameras, offsets, points, up: solution.up, moving: false, contradiction })
 }
 
 /// Adds what geometry found to the clocks; by how many seconds the one moved that moved most.
@@ -167,8 +171,10 @@ pub(super) fn walking(stored: &Stored<'_>, most: usize, progress: &mut Progress<
     for taken in &solution.taken {
         let Ok(placed) = &taken.placed else { continue };
         let shots = stored.pictures[taken.camera].shots.len();
-        let fresh =
-            || Stand { poses: vec![None; shots], fixed: false, lens: placed.lens, sightings: 0, error: placed.error };
+        let fresh = || {
+            let (intrinsics, lens) = optics(stored, taken.camera, &placed.lens);
+            Stand { poses: vec![None; shots], fixed: false, intrinsics, lens, sightings: 0, error: placed.error }
+        };
         if cameras[taken.camera].is_err() {
             cameras[taken.camera] = Ok(fresh());
         }
@@ -179,7 +185,14 @@ pub(super) fn walking(stored: &Stored<'_>, most: usize, progress: &mut Progress<
         }
     }
     let offsets = vec![None; stored.cameras()];
-    Ok(Solved { cameras, offsets, points: points_of(&solution), up: solution.up, moving: true })
+    Ok(Solved { cameras, offsets, points: points_of(&solution), up: solution.up, moving: true, contradiction: Vec::new() })
+}
+
+/// The lens that was given, else the one that was found.
+fn optics(stored: &Stored<'_>, camera: usize, found: &sfm::lens::Lens) -> (Intrinsics, Lens) {
+    let [width, height] = stored.pictures[camera].size;
+    let found = found.camera(Se3::IDENTITY, width, height);
+    stored.known(camera).map_or((found.intrinsics, found.lens), |k| (k.intrinsics, k.lens))
 }
 
 fn points_of(solution: &Solution) -> Vec<([f64; 3], [u8; 3])> {
@@ -218,6 +231,12 @@ impl Solved {
         Ok(())
     }
 
+    /// Takes points from elsewhere, of the same world.
+    pub(super) fn take_points(&mut self, cloud: &PointCloud) {
+        let color = |c: &[f32; 3]| c.map(|v| (v * 255.0).round().clamp(0.0, 255.0) as u8);
+        self.points = cloud.points.iter().zip(&cloud.colors).map(|(p, c)| (*p, color(c))).collect();
+    }
+
     pub(super) fn cloud(&self) -> PointCloud {
         PointCloud {
             points: self.points.iter().map(|p| p.0).collect(),
@@ -229,13 +248,11 @@ impl Solved {
 
 impl Stand {
     /// As it is written.
-    pub(super) fn written(&self, pictures: &Pictures, offset: Offset) -> Placed {
-        let [width, height] = pictures.size;
-        let camera = self.lens.camera(Se3::IDENTITY, width, height);
+    pub(super) fn written(&self, pictures: &Pictures, offset: Offset, masks: Option<Masks>) -> Placed {
         let poses = match &self.poses[..] {
             [Some(pose)] if self.fixed => Poses::Fixed(*pose),
             all => Poses::Moving(all.to_vec()),
         };
-        Placed { pictures: pictures.clone(), offset, intrinsics: camera.intrinsics, lens: camera.lens, poses }
+        Placed { pictures: pictures.clone(), offset, intrinsics: self.intrinsics, lens: self.lens, poses, masks }
     }
 }

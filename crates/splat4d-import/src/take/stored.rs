@@ -1,8 +1,9 @@
 //! The stored pictures as structure from motion asks for them.
 
 use crate::sfm;
+use crate::sfm::known::Known;
 use crate::sync::graph::Offset;
-use crate::write::Pictures;
+use crate::write::{Masks, Pictures};
 use crate::{Error, Result};
 use splat4d::scene::Planes;
 use splat4d_train::capture::Rgb8;
@@ -13,16 +14,35 @@ pub(super) struct Stored<'a> {
     pub folder: &'a Path,
     pub pictures: &'a [Pictures],
     pub offsets: Vec<Option<Offset>>,
+    /// Lenses, and places, that were given.
+    pub known: &'a [Option<Known>],
+    /// What of pictures counts; empty: all of it.
+    pub masks: &'a [Masks],
 }
 
 impl<'a> Stored<'a> {
-    pub(super) fn new(folder: &'a Path, pictures: &'a [Pictures]) -> Self {
-        Self { folder, pictures, offsets: vec![None; pictures.len()] }
+    pub(super) fn new(
+        folder: &'a Path,
+        pictures: &'a [Pictures],
+        known: &'a [Option<Known>],
+        masks: &'a [Masks],
+    ) -> Self {
+        Self { folder, pictures, offsets: vec![None; pictures.len()], known, masks }
     }
 
     /// The same pictures on another clock.
     pub(super) fn on(&self, offsets: &[Option<Offset>]) -> Self {
         Self { offsets: offsets.to_vec(), ..*self }
+    }
+
+    /// What was given of a camera.
+    pub(super) fn known(&self, camera: usize) -> Option<Known> {
+        self.known.get(camera).copied().flatten()
+    }
+
+    /// Whether all places were given.
+    pub(super) fn posed(&self) -> bool {
+        self.known.iter().all(|k| k.is_some_and(|k| k.pose.is_some()))
     }
 
     pub(super) fn rgb(&self, camera: usize, frame: usize) -> Result<Rgb8> {
@@ -46,6 +66,18 @@ impl sfm::pictures::Pictures for Stored<'_> {
     fn time(&self, camera: usize, frame: usize) -> f64 {
         let time = self.pictures[camera].shots[frame].time;
         self.offsets[camera].as_ref().map_or(time, |o| o.global(time))
+    }
+
+    fn known(&self, camera: usize) -> Option<Known> {
+        Stored::known(self, camera)
+    }
+
+    fn mask(&self, camera: usize, frame: usize) -> Result<Option<Planes<f32>>> {
+        let Some(masks) = self.masks.get(camera) else { return Ok(None) };
+        let mask = Rgb8::read(&self.folder.join(&masks.files[frame]))?;
+        let mut out = Planes::new(1, mask.height, mask.width);
+        out.data.iter_mut().zip(mask.data.chunks_exact(3)).for_each(|(v, p)| *v = f32::from(p[0]) / 255.0);
+        Ok(Some(out))
     }
 
     fn load(&self, camera: usize, frame: usize) -> Result<Planes<f32>> {
