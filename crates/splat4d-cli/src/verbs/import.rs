@@ -170,9 +170,8 @@ fn told(report: &Report, looked: Option<&(Looked, PathBuf)>, console: &Console) 
         console.emit(&json!({"type": "imported", "report": report, "doctor": looked.map(|l| &l.0)}));
         return;
     }
-    let mut text = String::from(
-        "camera              frames  offset ms     ±  by                     points   error px  focal px",
-    );
+    let mut text =
+        String::from("camera              frames  offset ms     ±  by                     points   error px  focal px");
     let given = report.cameras.iter().any(|c| c.calibration.is_some());
     text += if given { "  calibration px\n" } else { "\n" };
     for camera in &report.cameras {

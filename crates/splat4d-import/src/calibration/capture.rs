@@ -50,8 +50,12 @@ fn terms<const N: usize>(tree: Option<&Tree>, key: &str) -> Result<[f64; N]> {
 }
 
 fn camera(tree: &Tree, opengl: bool) -> Result<Part> {
-    let intrinsics =
-        Intrinsics { fx: number(tree, "fx")?, fy: number(tree, "fy")?, cx: number(tree, "cx")?, cy: number(tree, "cy")? };
+    let intrinsics = Intrinsics {
+        fx: number(tree, "fx")?,
+        fy: number(tree, "fy")?,
+        cx: number(tree, "cx")?,
+        cy: number(tree, "cy")?,
+    };
     let distortion = tree.get("distortion");
     let model = distortion.and_then(|d| d.get("model")).and_then(Tree::text);
     let lens = match model.as_deref() {

@@ -35,12 +35,16 @@ pub fn assign(calibration: &Calibration, videos: &[Video<'_>]) -> Result<(Vec<us
             .collect();
         if let Some(found) = sure(&words) {
             let mut notes = unused(cameras, videos, &words);
-            notes.push(format!("Cameras of the calibration were found in the videos' names: {}.", pairs(cameras, videos, &found)));
+            notes.push(format!(
+                "Cameras of the calibration were found in the videos' names: {}.",
+                pairs(cameras, videos, &found)
+            ));
             return Ok((found, notes));
         }
         if let Some(found) = by_number(cameras, videos) {
             let pairs = pairs(cameras, videos, &found);
-            let note = format!("The calibration has numbers and no names; they are taken for the videos' numbers: {pairs}.");
+            let note =
+                format!("The calibration has numbers and no names; they are taken for the videos' numbers: {pairs}.");
             return Ok((found, vec![note]));
         }
     }
@@ -61,7 +65,8 @@ fn named(cameras: &[Calibrated], fits: &dyn Fn(&str) -> bool) -> Vec<usize> {
 
 /// One camera for every video, none twice.
 fn sure(found: &[Vec<usize>]) -> Option<Vec<usize>> {
-    let all: Vec<usize> = found.iter().map(|f| <[usize; 1]>::try_from(f.as_slice()).ok().map(|f| f[0])).collect::<Option<_>>()?;
+    let all: Vec<usize> =
+        found.iter().map(|f| <[usize; 1]>::try_from(f.as_slice()).ok().map(|f| f[0])).collect::<Option<_>>()?;
     let mut once = all.clone();
     once.sort_unstable();
     once.dedup();

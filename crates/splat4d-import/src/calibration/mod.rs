@@ -158,7 +158,8 @@ pub fn read(path: &Path) -> Result<Calibration> {
                 DIALECTS.map(|d| d.name).join(", ")
             )));
     }
-    out.cameras = parts.into_iter().map(|(part, file)| whole(part).map_err(|e| e.at(file.display()))).collect::<Result<_>>()?;
+    out.cameras =
+        parts.into_iter().map(|(part, file)| whole(part).map_err(|e| e.at(file.display()))).collect::<Result<_>>()?;
     alike(&out.cameras).map_err(|e| e.at(path.display()))?;
     Ok(out)
 }
@@ -261,8 +262,9 @@ fn whole(part: Part) -> Result<Calibrated> {
     let place = |e: Error| e.at(format!("camera {:.80}", part.names[0]));
     let Some((intrinsics, lens)) = part.optics else {
         return Err(place(
-            Error::input("its camera matrix is missing")
-                .remedy("Give the file with the lenses too: both files in one folder, and the folder to --calibration."),
+            Error::input("its camera matrix is missing").remedy(
+                "Give the file with the lenses too: both files in one folder, and the folder to --calibration.",
+            ),
         ));
     };
     let [width, height] = part.size.unwrap_or([ANY_SIDE; 2]);
@@ -302,7 +304,9 @@ impl Calibration {
         apart.sort_by(f64::total_cmp);
         let Some(middle) = apart.get(apart.len() / 2) else { return String::new() };
         match self.unit {
-            Unit::Metre => format!("Lengths are metres, as the calibration says: neighbouring cameras are {middle:.2} m apart."),
+            Unit::Metre => {
+                format!("Lengths are metres, as the calibration says: neighbouring cameras are {middle:.2} m apart.")
+            }
             Unit::Unstated if *middle > MILLIMETRES => format!(
                 "Lengths are the calibration's, whose unit it does not tell: neighbouring cameras are {middle:.0} apart, which \
                  looks like millimetres (--apart A,B=METRES makes metres of them)."

@@ -84,7 +84,8 @@ fn reads(text: &Text) -> bool {
 fn read(text: &Text) -> Result<Said> {
     let mut said = Said::default();
     for (key, tree) in cameras(&text.tree) {
-        let own = ["name", "camera_name"].iter().find_map(|k| tree.get(k)).and_then(Tree::text).filter(|n| !n.is_empty());
+        let own =
+            ["name", "camera_name"].iter().find_map(|k| tree.get(k)).and_then(Tree::text).filter(|n| !n.is_empty());
         let mut names: Vec<String> = own.into_iter().collect();
         // A file's own name tells its camera as well as the name in it.
         names.push(key.unwrap_or_else(|| text.stem()));
@@ -123,12 +124,11 @@ fn camera(tree: &Tree) -> Result<Part> {
         .map(|(key, v)| numbers(key, v))
         .transpose()?;
     let apart = match (find(tree, &ROTATION), find(tree, &TRANSLATION)) {
-        (Some((r, rotation)), Some((t, translation))) => {
-            Some(pose(&numbers(r, rotation)?, &numbers(t, translation)?)?)
-        }
+        (Some((r, rotation)), Some((t, translation))) => Some(pose(&numbers(r, rotation)?, &numbers(t, translation)?)?),
         (Some((key, _)), None) | (None, Some((key, _))) => {
-            return Err(Error::input(format!("there is {key}, but not both rotation and translation"))
-                .remedy("Add the other."));
+            return Err(
+                Error::input(format!("there is {key}, but not both rotation and translation")).remedy("Add the other.")
+            );
         }
         (None, None) => None,
     };
@@ -142,7 +142,8 @@ fn camera(tree: &Tree) -> Result<Part> {
 /// Finite numbers of a matrix.
 pub(super) fn numbers(key: &str, tree: &Tree) -> Result<Matrix> {
     let matrix = tree.matrix().ok_or_else(|| {
-        Error::input(format!("{key} is no matrix of numbers, or has not as many as it says")).remedy("Write it row by row.")
+        Error::input(format!("{key} is no matrix of numbers, or has not as many as it says"))
+            .remedy("Write it row by row.")
     })?;
     if let Some(bad) = matrix.data.iter().find(|v| !v.is_finite()) {
         return Err(Error::input(format!("{key} holds {bad}")).remedy("Calibrate that camera again."));
@@ -177,7 +178,9 @@ fn fisheye(tree: &Tree) -> Result<bool> {
     }
     let Some(model) = find(tree, &MODEL).and_then(|(_, v)| v.text()) else { return Ok(false) };
     match plain(&model).as_str() {
-        "plumbbob" | "rationalpolynomial" | "opencv" | "pinhole" | "perspective" | "brown" | "radtan" | "standard" => Ok(false),
+        "plumbbob" | "rationalpolynomial" | "opencv" | "pinhole" | "perspective" | "brown" | "radtan" | "standard" => {
+            Ok(false)
+        }
         "equidistant" | "fisheye" | "kannalabrandt" | "opencvfisheye" => Ok(true),
         _ => Err(Error::new(ErrorKind::Unsupported, format!("the distortion model {model:.60} is not known"))
             .remedy("OpenCV's (plumb_bob, rational_polynomial) and its fisheye (equidistant) are.")),
@@ -233,7 +236,9 @@ pub(super) fn pose(rotation: &Matrix, translation: &Matrix) -> Result<Se3> {
 /// World to camera of [R | t].
 fn rows34(m: &Matrix) -> Result<Se3> {
     if m.data.len() < 12 || m.columns != 4 {
-        return Err(Error::input(format!("the extrinsics are {}x{}", m.rows, m.columns)).remedy("They must be 3x4: [R | t]."));
+        return Err(
+            Error::input(format!("the extrinsics are {}x{}", m.rows, m.columns)).remedy("They must be 3x4: [R | t].")
+        );
     }
     let row = |i: usize| &m.data[4 * i..4 * i + 4];
     Ok(Se3 {

@@ -61,7 +61,9 @@ fn read(text: &Text) -> Result<Said> {
         }
         let own = |tag: &str| {
             let found = inside(children, tag).next().map(|c| c.0);
-            found.ok_or_else(|| place(Error::input(format!("<{tag}> is missing")).remedy("Export the calibration again.")))
+            found.ok_or_else(|| {
+                place(Error::input(format!("<{tag}> is missing")).remedy("Export the calibration again."))
+            })
         };
         let part = camera(own("transform")?, own("intrinsic")?, inside(children, "fov_video").next().map(|c| c.0));
         said.parts.push(Part { names: vec![name.clone()], ..part.map_err(place)? });
@@ -92,7 +94,11 @@ fn camera(transform: &Attributes, intrinsic: &Attributes, view: Option<&Attribut
         Some(v) => [number(v, "right")? - number(v, "left")? + 1.0, number(v, "bottom")? - number(v, "top")? + 1.0],
         None => {
             // The last 64th.
-            let side = |axis: &str| Ok::<f64, Error>(((sub(&format!("sensorMax{axis}"))? - sub(&format!("sensorMin{axis}"))?) + 1.0 / SUBPIXELS).round());
+            let side = |axis: &str| {
+                Ok::<f64, Error>(
+                    ((sub(&format!("sensorMax{axis}"))? - sub(&format!("sensorMin{axis}"))?) + 1.0 / SUBPIXELS).round(),
+                )
+            };
             [side("U")?, side("V")?]
         }
     };

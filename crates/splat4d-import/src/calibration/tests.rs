@@ -131,7 +131,8 @@ fn tables(cameras: &[Calibrated], more: &str) -> String {
 
 fn easymocap(cameras: &[Calibrated]) -> [String; 2] {
     let names: String = cameras.iter().map(|c| format!("  - \"{}\"\n", c.names[0])).collect();
-    let (mut intri, mut extri) = (format!("%YAML:1.0\n---\nnames:\n{names}"), format!("%YAML:1.0\n---\nnames:\n{names}"));
+    let (mut intri, mut extri) =
+        (format!("%YAML:1.0\n---\nnames:\n{names}"), format!("%YAML:1.0\n---\nnames:\n{names}"));
     for c in cameras {
         let (name, p) = (&c.names[0], pose_of(c));
         intri += &yaml_matrix(&format!("K_{name}"), [3, 3], &k(c));
@@ -213,7 +214,12 @@ fn colmap_text(cameras: &[Calibrated]) -> [String; 2] {
         let v = rvec(&p.rotation);
         let half = 0.5 * norm(v);
         let q = [half.cos(), v[0], v[1], v[2]];
-        let q = [q[0], q[1] * half.sin() / (2.0 * half), q[2] * half.sin() / (2.0 * half), q[3] * half.sin() / (2.0 * half)];
+        let q = [
+            q[0],
+            q[1] * half.sin() / (2.0 * half),
+            q[2] * half.sin() / (2.0 * half),
+            q[3] * half.sin() / (2.0 * half),
+        ];
         let numbers = |v: &[f64]| v.iter().map(|v| format!("{v:.12}")).collect::<Vec<_>>().join(" ");
         let _ = writeln!(
             first,
@@ -222,7 +228,8 @@ fn colmap_text(cameras: &[Calibrated]) -> [String; 2] {
             numbers(&[i.fx, i.fy, i.cx, i.cy, t[0], t[1], t[2], t[3]]),
             numbers(&[t[4]])
         );
-        let _ = writeln!(second, "{} {} {} {} {}.png\n", n + 1, numbers(&q), numbers(&p.translation), n + 1, c.names[0]);
+        let _ =
+            writeln!(second, "{} {} {} {} {}.png\n", n + 1, numbers(&q), numbers(&p.translation), n + 1, c.names[0]);
     }
     [first, second]
 }
@@ -256,7 +263,8 @@ fn colmap_binary(cameras: &[Calibrated]) -> [Vec<u8>; 2] {
 #[test]
 fn opencv_and_openpose_files_of_each_camera_are_read() {
     let truth = truth();
-    let yaml: Vec<(&str, String)> = truth.iter().zip(["left.yml", "right_calib.yaml"]).map(|(c, f)| (f, opencv_yaml(c))).collect();
+    let yaml: Vec<(&str, String)> =
+        truth.iter().zip(["left.yml", "right_calib.yaml"]).map(|(c, f)| (f, opencv_yaml(c))).collect();
     let found = folder(&yaml).unwrap();
     same(&found, &truth);
     assert_eq!((found.cameras[0].size, found.unit, found.posed()), (Some([1280, 720]), Unit::Unstated, true));
@@ -270,7 +278,10 @@ fn opencv_and_openpose_files_of_each_camera_are_read() {
             xml_matrix("tvec", [3, 1], &p.translation)
         ))
     };
-    same(&folder(&[("left.xml", xml(&truth[0])), ("right.xml", xml(&truth[1])), ("notes.md", "hello".into())]).unwrap(), &truth);
+    same(
+        &folder(&[("left.xml", xml(&truth[0])), ("right.xml", xml(&truth[1])), ("notes.md", "hello".into())]).unwrap(),
+        &truth,
+    );
     // OpenPose: [R | t] under the camera matrix' name, eight terms.
     let openpose = |c: &Calibrated| {
         let (p, t) = (pose_of(c), terms(c));
@@ -293,7 +304,8 @@ fn opencv_and_openpose_files_of_each_camera_are_read() {
     let both = serde_json::json!({"left": json(&truth[0]), "right": json(&truth[1])}).to_string();
     same(&folder(&[("calibration.json", both)]).unwrap(), &truth);
     // A lens and no place.
-    let alone: Vec<(&str, String)> = yaml.iter().map(|(f, t)| (*f, t.split("rotation:").next().unwrap().to_owned())).collect();
+    let alone: Vec<(&str, String)> =
+        yaml.iter().map(|(f, t)| (*f, t.split("rotation:").next().unwrap().to_owned())).collect();
     let bare: Vec<Calibrated> = truth.iter().map(|c| Calibrated { pose: None, ..c.clone() }).collect();
     same(&folder(&alone).unwrap(), &bare);
     refused(&[yaml[0].clone(), alone[1].clone()], "place is not told");
@@ -337,7 +349,8 @@ fn tables_of_pose2sim_and_anipose_are_read() {
     assert_eq!(found.cameras[1].names, ["right", "cam_1"]);
     // A fisheye has four terms.
     let good = tables(&truth, "fisheye = true");
-    let four = good.replace(&format!("distortions = [ {}]", list(&terms(&truth[0]))), "distortions = [ 0.1, 0.2, 0.3, 0.4]");
+    let four =
+        good.replace(&format!("distortions = [ {}]", list(&terms(&truth[0]))), "distortions = [ 0.1, 0.2, 0.3, 0.4]");
     let found = folder(&[("a.toml", four)]).unwrap();
     assert_eq!(found.cameras[0].lens, Lens::Fisheye { k: [0.1, 0.2, 0.3, 0.4] });
     refused(&[("a.toml", good)], "a fisheye with 5");
@@ -365,7 +378,10 @@ fn easymocap_files_are_joined() {
     refused(&[("intri.yml", intri.replace("K_right", "K_write"))], "K_right is missing");
     refused(&[("intri.yml", intri.replacen("901.250000000000", ".Nan", 1))], "NaN");
     refused(&[("intri.yml", intri.replacen("  - \"right\"", "  - \"left\"", 1))], "twice");
-    refused(&[("intri.yml", intri), ("extri.yml", extri.replacen("rows: 3\n   cols: 1", "rows: 2\n   cols: 1", 1))], "R_left");
+    refused(
+        &[("intri.yml", intri), ("extri.yml", extri.replacen("rows: 3\n   cols: 1", "rows: 2\n   cols: 1", 1))],
+        "R_left",
+    );
 }
 
 #[test]
@@ -389,7 +405,10 @@ fn transforms_captures_and_colmap_are_read_without_pictures() {
     let truth = truth();
     let good = transforms(&truth);
     same(&folder(&[("transforms.json", good.clone())]).unwrap(), &truth);
-    refused(&[("t.json", good.replace("\"k1\":-0.12", "\"k1\":-0.12,\"camera_model\":\"EQUIRECTANGULAR\""))], "EQUIRECTANGULAR");
+    refused(
+        &[("t.json", good.replace("\"k1\":-0.12", "\"k1\":-0.12,\"camera_model\":\"EQUIRECTANGULAR\""))],
+        "EQUIRECTANGULAR",
+    );
     refused(&[("t.json", good.replace("\"fl_x\":901.25,", ""))], "fl_x");
     refused(&[("t.json", good.replace("1280", "NaN"))], "JSON");
     let good = own(&truth);
@@ -455,7 +474,10 @@ fn videos_are_matched_by_name_and_never_by_order() {
         let videos: Vec<Video<'_>> = videos.iter().map(|name| Video { name, size }).collect();
         assign(&called(cameras), &videos)
     };
-    assert_eq!(assign(&["a", "b", "c"], &["B", "a"]).unwrap(), (vec![1, 0], vec!["Cameras of the calibration without a video: c.".into()]));
+    assert_eq!(
+        assign(&["a", "b", "c"], &["B", "a"]).unwrap(),
+        (vec![1, 0], vec!["Cameras of the calibration without a video: c.".into()])
+    );
     let (found, notes) = assign(&["26580", "26581"], &["take_Miqus_2_26581", "take_Miqus_1_26580"]).unwrap();
     assert_eq!(found, [1, 0]);
     assert!(notes[0].contains("take_Miqus_2_26581 is 26581"), "{notes:?}");

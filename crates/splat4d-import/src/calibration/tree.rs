@@ -80,7 +80,8 @@ impl Tree {
             (_, Ok(tree @ Self::Map(_))) => Ok(tree),
             // A mistake in TOML makes one long word to YAML.
             (Some(Err(why)), _) if text.lines().any(|l| l.trim_start().starts_with('[')) => {
-                Err(Error::input(format!("it is not valid TOML: {}", why.to_string().trim())).remedy("Correct it there."))
+                Err(Error::input(format!("it is not valid TOML: {}", why.to_string().trim()))
+                    .remedy("Correct it there."))
             }
             (_, other) => other,
         }
@@ -169,9 +170,7 @@ fn scalar(word: &str) -> Tree {
         _ => None,
     };
     let digits = word.starts_with(|c: char| c.is_ascii_digit() || "+-.".contains(c));
-    special
-        .or_else(|| word.parse().ok().filter(|_| digits))
-        .map_or_else(|| Tree::Word(word.to_owned()), Tree::Number)
+    special.or_else(|| word.parse().ok().filter(|_| digits)).map_or_else(|| Tree::Word(word.to_owned()), Tree::Number)
 }
 
 fn json(value: &serde_json::Value) -> Tree {
@@ -247,7 +246,8 @@ fn yaml_tree(value: &yaml_rust2::Yaml, depth: usize) -> Result<Tree> {
 const STORAGE: &str = "opencv_storage";
 
 fn xml(text: &str) -> Result<Tree> {
-    let wrong = |why: String| Error::input(format!("it is not valid XML: {why}")).remedy("Export the calibration again.");
+    let wrong =
+        |why: String| Error::input(format!("it is not valid XML: {why}")).remedy("Export the calibration again.");
     let document = roxmltree::Document::parse(text).map_err(|e| wrong(e.to_string()))?;
     let root = document.root_element();
     if root.descendants().any(|n| n.ancestors().nth(MAX_DEPTH).is_some()) {

@@ -158,7 +158,8 @@ mod tests {
         let pixel = |t: f64| seen(&k, at(t)).map(|v| v / 2.0);
         let h = 1e-4;
         let slope = |f: &dyn Fn(f64) -> [f64; 2]| [0, 1].map(|a| (f(h)[a] - f(-h)[a]) / (2.0 * h));
-        let mut f = Feature { pixel: pixel(0.0), velocity: slope(&pixel), moment: 1, descriptor: [0; 128], color: [0; 3] };
+        let mut f =
+            Feature { pixel: pixel(0.0), velocity: slope(&pixel), moment: 1, descriptor: [0; 128], color: [0; 3] };
         assert!(straight.feature(&mut f));
         let (place, speed) = (pinhole(at(0.0)), slope(&|t| pinhole(at(t))));
         assert!((0..2).all(|a| (f.pixel[a] - place[a]).abs() < 1e-6), "{f:?} {place:?}");

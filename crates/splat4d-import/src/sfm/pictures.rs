@@ -288,7 +288,8 @@ fn sight(pictures: &dyn Pictures, camera: usize, look: &Look, moments: &[f64]) -
         }
     }
     let size = [background.width, background.height];
-    Ok(Sight { name: pictures.name(camera), features, frame, ..empty(pictures, camera, size, factor) }.straightened(pictures, camera))
+    Ok(Sight { name: pictures.name(camera), features, frame, ..empty(pictures, camera, size, factor) }
+        .straightened(pictures, camera))
 }
 
 /// A camera of which nothing was seen yet.
@@ -370,8 +371,7 @@ fn moving(
     }
     let off = blurred(&off, MOVED_BLUR);
     let counts = mask(pictures, camera, frame, &picture)?;
-    let wanted =
-        |x: usize, y: usize| off.get(0, y, x) > MOVED && counts.as_ref().is_none_or(|m| m.counts(x, y));
+    let wanted = |x: usize, y: usize| off.get(0, y, x) > MOVED && counts.as_ref().is_none_or(|m| m.counts(x, y));
     let Some(window) = Window::around(picture.width, picture.height, &wanted) else { return Ok(Vec::new()) };
     let limits = Limits { contrast: look.contrast, most: look.moving };
     let inner = window.cut(&picture);

@@ -1,5 +1,6 @@
 //! Lags by what moves, of cameras whose places are known: no feature needs to look alike from two sides.
 
+use super::cache::Cache;
 use super::stored::Stored;
 use crate::Result;
 use crate::sync::epipolar::{Range, fundamental, lag};
@@ -38,8 +39,15 @@ struct Seen {
 pub(super) fn by_geometry(
     stored: &Stored<'_>,
     clock: &Solution,
+    cache: &Cache,
     progress: &mut Progress<'_>,
 ) -> Result<Vec<Evidence>> {
+    let offsets: Vec<Option<f64>> = clock.offsets.iter().map(|o| o.as_ref().map(|o| o.seconds)).collect();
+    let made_of = format!("{} {offsets:?}", stored.fingerprint());
+    cache.or("geometry", &made_of, || measured(stored, clock, progress))
+}
+
+fn measured(stored: &Stored<'_>, clock: &Solution, progress: &mut Progress<'_>) -> Result<Vec<Evidence>> {
     let n = stored.pictures.len();
     let offset = |c: usize| clock.offsets[c].as_ref().map_or(0.0, |o| o.seconds);
     let ends = |c: usize| {
@@ -71,13 +79,7 @@ pub(super) fn by_geometry(
         let within = WITHIN * p.frames.min(q.frames) as f64 * interval;
         let range = Range { around: offset(a) - offset(b), within };
         let found = lag(&fundamental(&p.camera, &q.camera), [&p.tracks, &q.tracks], None, range).ok()?;
-        Some(Evidence {
-            cameras: [a, b],
-            lag: found.seconds,
-            sigma: found.sigma,
-            drift: None,
-            kind: Kind::Geometry,
-        })
+        Some(Evidence { cameras: [a, b], lag: found.seconds, sigma: found.sigma, drift: None, kind: Kind::Geometry })
     };
     Ok(pairs.par_iter().filter_map(of).collect())
 }
@@ -91,7 +93,8 @@ fn small(picture: Rgb8) -> (Rgb8, f64) {
         for y in 0..height {
             for x in 0..width {
                 for c in 0..3 {
-                    let at = |dx: usize, dy: usize| u16::from(out.data[3 * ((2 * y + dy) * out.width + 2 * x + dx) + c]);
+                    let at =
+                        |dx: usize, dy: usize| u16::from(out.data[3 * ((2 * y + dy) * out.width + 2 * x + dx) + c]);
                     data.push(((at(0, 0) + at(1, 0) + at(0, 1) + at(1, 1) + 2) / 4) as u8);
                 }
             }
@@ -111,8 +114,7 @@ fn camera(stored: &Stored<'_>, c: usize, middle: f64) -> Result<Option<Seen>> {
     }
     let kept = count.min(SPREAD);
     let chosen: Vec<usize> = (0..kept).map(|k| (2 * k + 1) * count / (2 * kept)).collect();
-    let all: Vec<Rgb8> =
-        chosen.par_iter().map(|&k| Ok(small(stored.rgb(c, k)?).0)).collect::<Result<_>>()?;
+    let all: Vec<Rgb8> = chosen.par_iter().map(|&k| Ok(small(stored.rgb(c, k)?).0)).collect::<Result<_>>()?;
     let mut still = all[0].clone();
     let mut values = vec![0u8; all.len()];
     for (p, v) in still.data.iter_mut().enumerate() {

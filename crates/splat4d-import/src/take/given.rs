@@ -61,7 +61,11 @@ impl Given {
 }
 
 /// What is known of every camera's stored pictures: by calibration, and by the user's own lens, which goes first.
-pub(super) fn known(given: Option<&Given>, corrections: &Corrections, pictures: &[Pictures]) -> Result<Vec<Option<Known>>> {
+pub(super) fn known(
+    given: Option<&Given>,
+    corrections: &Corrections,
+    pictures: &[Pictures],
+) -> Result<Vec<Option<Known>>> {
     let of = |(k, p): (usize, &Pictures)| {
         let calibrated = given.map(|g| calibration::fitted(&g.cameras[k], g.sizes[k], p.size)).transpose()?;
         let own = corrections.cameras.iter().find(|c| c.name == p.name).and_then(|c| c.given_lens());

@@ -4,6 +4,7 @@
 //! clocks that sound leaves open; clocks and poses are solved in turn until both rest. What was found stands in
 //! [`corrections::FILE`], where it can be corrected and the same work run again.
 
+mod cache;
 mod clocks;
 mod geometry;
 mod given;
@@ -125,8 +126,12 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
     let given = given::Given::read(request, &cameras, moving)?;
     let mut report = Report::default();
     report.guesses.extend(given.iter().flat_map(|g| g.notes.iter().cloned()));
-    let heard =
-        if request.sound && cameras.len() > 1 { clocks::by_sound(&cameras, progress, stop)? } else { Vec::new() };
+    let cache = cache::Cache::of(folder);
+    let heard = if request.sound && cameras.len() > 1 {
+        clocks::by_sound(&cameras, &cache, progress, stop)?
+    } else {
+        Vec::new()
+    };
     let clock = clocks::solve(&cameras, &heard, &told);
     let selections = clocks::shared(&cameras, &clock, &request.selection, &mut report)?;
     let clips: Vec<Clip<'_>> = cameras
@@ -155,19 +160,22 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
     let stored = stored::Stored::new(folder, &pictures, &known, &masks);
     let mut evidence = heard;
     if pictures.len() > 1 && !moving && clock.offsets.iter().any(Option::is_none) {
-        evidence.extend(clocks::by_motion(&stored, &clock, progress, &mut report)?);
+        evidence.extend(clocks::by_motion(&stored, &clock, &cache, progress, &mut report)?);
     }
     if stored.posed() && pictures.len() > 1 && told.iter().any(Option::is_none) {
         let rough = clocks::solve(&cameras, &evidence, &told);
-        evidence.extend(geometry::by_geometry(&stored, &rough, progress)?);
+        evidence.extend(geometry::by_geometry(&stored, &rough, &cache, progress)?);
     }
     let clock = clocks::solve(&cameras, &evidence, &told);
     report.refused = clocks::refusals(&names_of(&pictures), &evidence, &clock);
-    let solved = if moving {
-        poses::walking(&stored, MOST_WALKING, progress)?
-    } else {
-        poses::standing(&stored, clock, &told, progress, stop)?
-    };
+    let about = format!("{moving} {told:?} {:?}", clock.offsets);
+    let solved = poses::once(&cache, &stored, &about, || {
+        if moving {
+            poses::walking(&stored, MOST_WALKING, progress)
+        } else {
+            poses::standing(&stored, clock, &told, progress, stop)
+        }
+    })?;
     if stop() {
         return Err(stopped());
     }
@@ -243,7 +251,8 @@ fn agrees(solved: &poses::Solved, pictures: &[Pictures], report: &mut Report) ->
         }
     }
     if told.len() < pictures.len() {
-        let silent = pictures.iter().zip(&solved.contradiction).filter(|(_, c)| c.is_none()).map(|(p, _)| p.name.as_str());
+        let silent =
+            pictures.iter().zip(&solved.contradiction).filter(|(_, c)| c.is_none()).map(|(p, _)| p.name.as_str());
         report.guesses.push(format!(
             "Whether the calibration fits was not checked, for too few features are seen by two cameras: {}.",
             silent.collect::<Vec<_>>().join(", ")
@@ -296,12 +305,7 @@ fn open(request: &Request) -> Result<Vec<Camera>> {
 }
 
 /// Writes points, capture, corrections and report.
-fn finish(
-    request: &Request,
-    found: Found<'_>,
-    corrections: &mut Corrections,
-    mut report: Report,
-) -> Result<Report> {
+fn finish(request: &Request, found: Found<'_>, corrections: &mut Corrections, mut report: Report) -> Result<Report> {
     let folder = &request.folder;
     let Found { pictures, masks, given, mut solved } = found;
     let posed = given.as_ref().is_some_and(|g| g.posed);

@@ -1,11 +1,13 @@
 //! Where the cameras are and when: clocks and poses need each other, and are solved in turn until both rest.
 
+use super::cache::Cache;
 use super::stored::Stored;
 use crate::sfm::pictures::Pictures as _;
 use crate::sfm::{self, Options, Solution};
 use crate::sync::graph::{self, Kind, Offset};
 use crate::write::{Masks, Pictures, Placed, Poses};
-use crate::{Error, Result};
+use crate::{Error, ErrorKind, Result};
+use serde::{Deserialize, Serialize};
 use splat4d::math::Se3;
 use splat4d::math::se3::{norm, sub};
 use splat4d::scene::{Intrinsics, Lens};
@@ -53,6 +55,107 @@ pub(super) struct Solved {
     pub contradiction: Vec<Option<f64>>,
 }
 
+/// A solution as it is stored; of lenses that were given nothing.
+#[derive(Serialize, Deserialize)]
+struct Note {
+    cameras: Vec<Result<Row, String>>,
+    offsets: Vec<Option<Offset>>,
+    points: Vec<([f64; 3], [u8; 3])>,
+    up: [f64; 3],
+    moving: bool,
+    contradiction: Vec<Option<f64>>,
+}
+
+#[derive(Serialize, Deserialize)]
+struct Row {
+    /// Rotation row by row, then translation.
+    poses: Vec<Option<[f64; 12]>>,
+    fixed: bool,
+    /// fx fy cx cy.
+    intrinsics: [f64; 4],
+    /// k1 to k6, p1, p2; what is found has no other terms.
+    brown: Option<[f64; 8]>,
+    sightings: usize,
+    error: f64,
+}
+
+impl Note {
+    fn of(solved: &Solved) -> Self {
+        let numbers = |p: &Se3| -> [f64; 12] {
+            let r = p.rotation.as_flattened();
+            std::array::from_fn(|k| if k < 9 { r[k] } else { p.translation[k - 9] })
+        };
+        let row = |s: &Stand| {
+            let Intrinsics { fx, fy, cx, cy } = s.intrinsics;
+            let brown = match &s.lens {
+                Lens::Brown { k, p, .. } => Some([k[0], k[1], k[2], k[3], k[4], k[5], p[0], p[1]]),
+                _ => None,
+            };
+            Row {
+                poses: s.poses.iter().map(|p| p.as_ref().map(numbers)).collect(),
+                fixed: s.fixed,
+                intrinsics: [fx, fy, cx, cy],
+                brown,
+                sightings: s.sightings,
+                error: s.error,
+            }
+        };
+        Self {
+            cameras: solved.cameras.iter().map(|c| c.as_ref().map(row).map_err(Clone::clone)).collect(),
+            offsets: solved.offsets.clone(),
+            points: solved.points.clone(),
+            up: solved.up,
+            moving: solved.moving,
+            contradiction: solved.contradiction.clone(),
+        }
+    }
+
+    fn solved(self, stored: &Stored<'_>) -> Solved {
+        let pose = |n: [f64; 12]| Se3 {
+            rotation: std::array::from_fn(|i| std::array::from_fn(|k| n[3 * i + k])),
+            translation: [n[9], n[10], n[11]],
+        };
+        let stand = |(c, row): (usize, Result<Row, String>)| {
+            row.map(|r| {
+                let [fx, fy, cx, cy] = r.intrinsics;
+                let lens = r.brown.map_or(Lens::Pinhole, |b| Lens::Brown {
+                    k: std::array::from_fn(|i| b[i]),
+                    p: [b[6], b[7]],
+                    s: [0.0; 4],
+                });
+                let given = stored.known(c);
+                Stand {
+                    poses: r.poses.into_iter().map(|p| p.map(pose)).collect(),
+                    fixed: r.fixed,
+                    intrinsics: given.map_or(Intrinsics { fx, fy, cx, cy }, |g| g.intrinsics),
+                    lens: given.map_or(lens, |g| g.lens),
+                    sightings: r.sightings,
+                    error: r.error,
+                }
+            })
+        };
+        Solved {
+            cameras: self.cameras.into_iter().enumerate().map(stand).collect(),
+            offsets: self.offsets,
+            points: self.points,
+            up: self.up,
+            moving: self.moving,
+            contradiction: self.contradiction,
+        }
+    }
+}
+
+/// What was solved before of the same pictures, clocks and lenses, else what `solve` finds now.
+pub(super) fn once(
+    cache: &Cache,
+    stored: &Stored<'_>,
+    clock: &str,
+    solve: impl FnOnce() -> Result<Solved>,
+) -> Result<Solved> {
+    let made_of = format!("{} {clock}", stored.fingerprint());
+    Ok(cache.or("solved", &made_of, || Ok(Note::of(&solve()?)))?.solved(stored))
+}
+
 /// Places cameras that stand still, and refines their clocks.
 pub(super) fn standing(
     stored: &Stored<'_>,
@@ -80,7 +183,10 @@ pub(super) fn standing(
             break;
         }
         let moved = refined(&solution, &mut current, &mut offsets, told, frame);
-        if moved < RESTED * frame || round == ROUNDS || stop() {
+        if stop() {
+            return Err(Error::new(ErrorKind::Interrupted, "stopped").remedy("The same command goes on from there."));
+        }
+        if moved < RESTED * frame || round == ROUNDS {
             break;
         }
     }
@@ -185,7 +291,14 @@ pub(super) fn walking(stored: &Stored<'_>, most: usize, progress: &mut Progress<
         }
     }
     let offsets = vec![None; stored.cameras()];
-    Ok(Solved { cameras, offsets, points: points_of(&solution), up: solution.up, moving: true, contradiction: Vec::new() })
+    Ok(Solved {
+        cameras,
+        offsets,
+        points: points_of(&solution),
+        up: solution.up,
+        moving: true,
+        contradiction: Vec::new(),
+    })
 }
 
 /// The lens that was given, else the one that was found.

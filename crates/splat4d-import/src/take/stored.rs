@@ -45,6 +45,13 @@ impl<'a> Stored<'a> {
         self.known.iter().all(|k| k.is_some_and(|k| k.pose.is_some()))
     }
 
+    /// Changes with pictures, masks, and what was given of cameras.
+    pub(super) fn fingerprint(&self) -> String {
+        let prints: Vec<&str> = self.pictures.iter().map(|p| p.fingerprint.as_str()).collect();
+        let masks: Vec<u64> = self.masks.iter().map(|m| m.fingerprint).collect();
+        format!("{prints:?} {masks:?} {:?}", self.known)
+    }
+
     pub(super) fn rgb(&self, camera: usize, frame: usize) -> Result<Rgb8> {
         Rgb8::read(&self.folder.join(self.pictures[camera].file(frame)))
     }

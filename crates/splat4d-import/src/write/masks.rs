@@ -1,6 +1,7 @@
 //! Masks beside pictures: white where the picture counts, stored in the size of the pictures.
 
 use super::Pictures;
+use crate::video::fnv1a;
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
 use rayon::prelude::*;
@@ -18,6 +19,8 @@ const ENDINGS: [&str; 4] = ["png", "jpg", "jpeg", "webp"];
 pub struct Masks {
     /// One file for each picture, from the capture's folder on; all may be the same.
     pub files: Vec<PathBuf>,
+    /// Changes when the masks do.
+    pub fingerprint: u64,
 }
 
 /// Where the pictures of a camera begin in its video.
@@ -57,8 +60,8 @@ fn camera(folder: &Path, from: &Path, pictures: &Pictures, begin: Begin) -> Resu
     let single = ENDINGS.iter().map(|e| from.join(format!("{}.{e}", pictures.name))).find(|p| p.is_file());
     if let Some(mask) = single {
         let file = to.join("000000.png");
-        store(&mask, &folder.join(&file), pictures.size)?;
-        return Ok(Masks { files: vec![file; pictures.shots.len()] });
+        let fingerprint = store(&mask, &folder.join(&file), pictures.size)?;
+        return Ok(Masks { files: vec![file; pictures.shots.len()], fingerprint });
     }
     let own = from.join(&pictures.name);
     if !own.is_dir() {
@@ -80,10 +83,12 @@ fn camera(folder: &Path, from: &Path, pictures: &Pictures, begin: Begin) -> Resu
             .at(own.display())
             .remedy("Give one for each frame of the video, those that are left out too."));
     }
-    numbers.par_iter().enumerate().try_for_each(|(k, &number)| {
+    let one = |(k, &number): (usize, &usize)| {
         store(&masks[number], &folder.join(&to).join(format!("{k:06}.png")), pictures.size)
-    })?;
-    Ok(Masks { files: (0..numbers.len()).map(|k| to.join(format!("{k:06}.png"))).collect() })
+    };
+    let prints = numbers.par_iter().enumerate().map(one).collect::<Result<Vec<u64>>>()?;
+    let fingerprint = fnv1a(&prints.iter().flat_map(|p| p.to_le_bytes()).collect::<Vec<u8>>());
+    Ok(Masks { files: (0..numbers.len()).map(|k| to.join(format!("{k:06}.png"))).collect(), fingerprint })
 }
 
 /// The numbers of stored pictures among all frames of the video.
@@ -93,30 +98,37 @@ fn numbers(pictures: &Pictures, begin: Begin) -> Result<Vec<usize>> {
     };
     // Frames before the part that was read were not counted.
     if pictures.clock.variable || pictures.clock.interval <= 0.0 {
-        return Err(Error::input(format!("its frame rate varies, and it is read from {from:.2} s on: which mask is which frame's is not known"))
-            .remedy("Give one mask for the whole take, or cut the video and its masks beforehand."));
+        return Err(Error::input(format!(
+            "its frame rate varies, and it is read from {from:.2} s on: which mask is which frame's is not known"
+        ))
+        .remedy("Give one mask for the whole take, or cut the video and its masks beforehand."));
     }
     Ok(pictures.shots.iter().map(|s| (s.time / pictures.clock.interval).round() as usize).collect())
 }
 
-/// Stores a mask in a size, black and white as it is; a file that is there is of another run and is written anew.
-fn store(from: &Path, to: &Path, [width, height]: [usize; 2]) -> Result<()> {
+/// Stores a mask in a size, black and white as it is, and tells what changes with it; a file that is there is of another run and is written anew.
+fn store(from: &Path, to: &Path, [width, height]: [usize; 2]) -> Result<u64> {
     let mask = Rgb8::read(from)?;
     let off = (mask.width * height).abs_diff(mask.height * width);
     // Sides are whole pixels.
     if off > mask.width.max(mask.height).max(width).max(height) {
-        return Err(Error::input(format!("the mask has {}x{} pixels, its picture {width}x{height}", mask.width, mask.height))
-            .at(from.display())
-            .remedy("Masks must show the same part as pictures, in any size."));
+        return Err(Error::input(format!(
+            "the mask has {}x{} pixels, its picture {width}x{height}",
+            mask.width, mask.height
+        ))
+        .at(from.display())
+        .remedy("Masks must show the same part as pictures, in any size."));
     }
     // Masks of zeros and ones are meant to be black and white.
     let most = mask.data.iter().copied().max().unwrap_or(0);
     let gain = if most == 1 { 255 } else { 1 };
-    let value = |x: usize, y: usize| mask.data[3 * (y * mask.height / height * mask.width + x * mask.width / width)] * gain;
+    let value =
+        |x: usize, y: usize| mask.data[3 * (y * mask.height / height * mask.width + x * mask.width / width)] * gain;
     let data: Vec<u8> = (0..width * height).map(|p| value(p % width, p / width)).collect();
     let mut bytes = Vec::new();
     PngEncoder::new_with_quality(&mut bytes, CompressionType::Fast, FilterType::Adaptive)
         .write_image(&data, width as u32, height as u32, ExtendedColorType::L8)
         .map_err(|e| Error::input(format!("the mask cannot be stored ({e})")).at(from.display()))?;
-    write_atomically(to, &bytes)
+    write_atomically(to, &bytes)?;
+    Ok(fnv1a(&bytes))
 }

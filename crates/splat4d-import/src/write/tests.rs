@@ -129,7 +129,14 @@ fn the_capture_is_read_as_it_was_meant() {
             poses: Poses::Fixed(pose(0.0)),
             masks: None,
         },
-        Placed { pictures: stored[1].clone(), offset: offset(-0.0125, 1e-4), intrinsics, lens, poses: moving, masks: None },
+        Placed {
+            pictures: stored[1].clone(),
+            offset: offset(-0.0125, 1e-4),
+            intrinsics,
+            lens,
+            poses: moving,
+            masks: None,
+        },
     ];
     let take = Take { up: Some([0.0, -1.0, 0.0]), hold_out: vec!["cam_1".into()], ..Take::default() };
     capture(out.path(), &take, &cameras).unwrap();

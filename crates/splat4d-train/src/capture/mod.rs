@@ -31,8 +31,8 @@ mod store;
 mod transforms;
 
 pub(crate) use flow::FlowFile;
-pub use options::{CaptureOptions, CaptureSettings, HoldOut, MAX_POINTS, Sequence};
 pub use lens::Distortion;
+pub use options::{CaptureOptions, CaptureSettings, HoldOut, MAX_POINTS, Sequence};
 pub use points::PointCloud;
 pub use posed::{PosedCamera, check_intrinsics, colmap_cameras, is_colmap, rigid, transforms_cameras};
 pub use preflight::{Finding, Severity};
