@@ -72,6 +72,9 @@ pub(crate) struct Args {
     /// Lenses and places of the cameras, from a file or a folder that another program wrote
     #[arg(long, value_name = "FILE|FOLDER")]
     calibration: Option<PathBuf>,
+    /// Let the COLMAP program find lenses and places, if it is installed
+    #[arg(long, conflicts_with = "calibration")]
+    colmap: bool,
     /// Masks, white where pictures count: NAME.png for a camera, or a folder NAME with one for each frame
     #[arg(long, value_name = "FOLDER")]
     masks: Option<PathBuf>,
@@ -126,6 +129,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         format: if args.png { Format::Png } else { Format::default() },
         apart: args.apart.clone(),
         calibration: args.calibration.clone(),
+        colmap: args.colmap,
         masks: args.masks.clone(),
     };
     let stop = interrupt::flag("stopping: what is stored is kept");

@@ -230,6 +230,83 @@ fn a_calibration_places_cameras_and_clocks_are_found() {
     assert!(refused(&at("missing.toml")).contains("missing.toml"));
 }
 
+/// A program that notes how it is called and, as the mapper, copies a model to where it is asked for.
+#[cfg(unix)]
+fn stand_in(folder: &Path, ends: &str) {
+    use std::os::unix::fs::PermissionsExt;
+    let script = format!(
+        "#!/bin/sh\nif [ \"$2\" = --help ]; then echo '  --FeatureExtraction.use_gpu arg (=1)'; exit 0; fi\n\
+         echo \"$@\" >> '{0}/calls'\nif [ \"$1\" = mapper ]; then\n\
+         while [ \"$1\" != --output_path ]; do shift; done\n\
+         /bin/mkdir -p \"$2/0\" && /bin/cp '{0}/model/cameras.txt' '{0}/model/images.txt' \"$2/0\"\nfi\n{ends}\n",
+        folder.display()
+    );
+    let path = folder.join("colmap");
+    std::fs::write(&path, script).unwrap();
+    std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o755)).unwrap();
+}
+
+#[cfg(unix)]
+#[test]
+fn colmap_is_called_where_it_is_asked_for_and_its_model_is_taken() {
+    use splat4d::math::quat;
+    /// Decimals of the model's text, and the unit that it is in.
+    const EXACT: f64 = 1e-5;
+    const HALF: f64 = 0.5;
+    let dir = tempfile::tempdir().unwrap();
+    let at = |name: &str| dir.path().join(name);
+    let (films, take, program) = (at("films"), at("take"), at("program"));
+    filmed(&films);
+    std::fs::create_dir_all(program.join("model")).unwrap();
+    let (mut cameras, mut images) = (String::new(), String::new());
+    for (k, (camera, (name, _))) in told().iter().zip(&CAMERAS).enumerate() {
+        let number = |i: usize, j: usize| camera["world_to_camera"][i][j].as_f64().unwrap();
+        let q = quat::from_rotation(&std::array::from_fn(|i| std::array::from_fn(|j| number(i, j))));
+        let t = [0, 1, 2].map(|i| HALF * number(i, 3));
+        let text = |v: &[f64]| v.iter().map(|v| format!("{v:.12}")).collect::<Vec<_>>().join(" ");
+        cameras +=
+            &format!("{k} PINHOLE 400 300 {} {} {} {}\n", camera["fx"], camera["fy"], camera["cx"], camera["cy"]);
+        images += &format!("{k} {} {} {k} {name}.png\n\n", text(&q), text(&t));
+    }
+    std::fs::write(program.join("model/cameras.txt"), cameras).unwrap();
+    std::fs::write(program.join("model/images.txt"), images).unwrap();
+    let folder = str(&program).to_owned();
+    let import = |path: &str| splat4d(&["import", str(&films), "-o", str(&take), "--colmap"]).path(path).run();
+    let missing = import("/nonexistent").refused();
+    assert!(missing.contains("colmap cannot be started") && missing.contains("leave --colmap out"), "{missing}");
+    stand_in(&program, "if [ -z \"$1\" ]; then :; fi; echo 'out of features' >&2; exit 3");
+    let failed = import(&folder).refused();
+    assert!(failed.contains("feature_extractor") && failed.contains("out of features"), "{failed}");
+    std::fs::remove_file(program.join("calls")).unwrap();
+    stand_in(&program, "exit 0");
+    import(&folder).ok();
+    let calls = std::fs::read_to_string(program.join("calls")).unwrap();
+    let lines: Vec<&str> = calls.lines().collect();
+    assert_eq!(lines.len(), 3, "{calls}");
+    for (line, words) in lines.iter().zip([
+        ["feature_extractor", "--ImageReader.single_camera_per_image 1", "--FeatureExtraction.use_gpu 0"],
+        ["exhaustive_matcher", "--SiftMatching.guided_matching 1", "database.db"],
+        ["mapper", "--Mapper.ba_refine_principal_point 0", "--output_path"],
+    ]) {
+        assert!(words.iter().all(|w| line.contains(w)), "{line}");
+    }
+    let made = json_of(&take.join("capture.json"));
+    for (k, camera) in told().iter().enumerate() {
+        for (i, j) in (0..3).flat_map(|i| (0..4).map(move |j| (i, j))) {
+            let number = |v: &Value| v["world_to_camera"][i][j].as_f64().unwrap();
+            let wanted = number(camera) * if j == 3 { HALF } else { 1.0 };
+            assert!((number(&made["cameras"][k]) - wanted).abs() < EXACT, "{made}");
+        }
+    }
+    // Nothing changed: neither the program nor the solver is at work again.
+    let before = std::fs::read(take.join("capture.json")).unwrap();
+    let saved = |folder: &Path| std::fs::read_dir(folder.join("import/cache")).unwrap().count();
+    let count = saved(&take);
+    import(&folder).ok();
+    assert_eq!(std::fs::read_to_string(program.join("calls")).unwrap(), calls);
+    assert_eq!((std::fs::read(take.join("capture.json")).unwrap(), saved(&take)), (before, count));
+}
+
 #[test]
 fn what_cannot_be_imported_is_explained() {
     let dir = tempfile::tempdir().unwrap();

@@ -719,25 +719,28 @@ pub struct Mapped {
     pub contradiction: Vec<Option<f64>>,
 }
 
-/// Points and clocks of cameras whose poses and lenses are given. `links` were found without them, and tell how right they are;
-/// points come from matches along epipolar lines.
+/// Points and clocks of cameras whose poses and lenses are given. `links` were found without them, and tell how right they are.
+///
+/// What moves lies beside its epipolar lines as long as clocks are off: first clocks are found of what looks alike, within wide
+/// bounds; then points of what lies on the lines.
 pub(crate) fn about(sights: &[Sight], links: &[Link], how: &Mapping, progress: &mut Progress<'_>) -> Mapped {
-    /// Rounds of matching with clocks that get better.
-    const TWICE: usize = 2;
-    let mut placed: Option<Mapped> = None;
-    for _ in 0..TWICE {
-        let ground = Ground::new(sights, &[], links, how);
-        let mut map = ground.given(placed.as_ref());
-        let joined = tracks::join(sights, &map.guided(links, progress));
-        let ground = Ground::new(sights, &joined, links, how);
-        map = ground.given(placed.as_ref());
-        map.renew();
-        map.settle();
-        placed = Some(map.result());
-    }
-    let mut out = placed.expect("there was a round");
-    out.contradiction = super::known::errors(sights, links);
-    out
+    /// Of the tolerance: two frames of what is followed at all, in pictures 1920 across.
+    const WIDE: f64 = 8.0;
+    let wide = Mapping { tolerance: WIDE * how.tolerance, ..how.clone() };
+    let first = tracks::join(sights, links);
+    let ground = Ground::new(sights, &first, links, &wide);
+    let mut map = ground.given(None);
+    map.renew();
+    map.settle();
+    let clocks = map.result();
+    let ground = Ground::new(sights, &[], links, how);
+    let along = ground.given(Some(&clocks)).guided(links, progress);
+    let joined = tracks::join(sights, &along);
+    let ground = Ground::new(sights, &joined, links, how);
+    let mut map = ground.given(Some(&clocks));
+    map.renew();
+    map.settle();
+    Mapped { contradiction: super::known::errors(sights, links), ..map.result() }
 }
 
 /// Places cameras: from several starts, the best of which is kept. `None`: no two pictures fit together.

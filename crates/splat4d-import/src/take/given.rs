@@ -1,7 +1,7 @@
 //! A calibration that was given: whose camera is whose, and what it says of stored pictures.
 
 use super::{Camera, Request};
-use crate::calibration::{self, Calibrated, Video};
+use crate::calibration::{self, Calibrated, Calibration, Video};
 use crate::corrections::Corrections;
 use crate::sfm::known::Known;
 use crate::write::Pictures;
@@ -27,36 +27,42 @@ impl Given {
     /// Errors: it cannot be read, names do not match, videos are of another shape, places of cameras that move.
     pub(super) fn read(request: &Request, cameras: &[Camera], moving: bool) -> Result<Option<Self>> {
         let Some(path) = &request.calibration else { return Ok(None) };
-        let found = calibration::read(path)?;
         let place = |e: Error| e.at(path.display());
+        let found = calibration::read(path)?;
         if moving && found.posed() {
             return Err(place(
                 Error::input("it says where cameras stand, but these move")
                     .remedy("Leave --calibration out, give one of lenses alone, or --rig fixed if they stand still."),
             ));
         }
+        let from = path.display().to_string();
         let videos: Vec<Video<'_>> =
             cameras.iter().map(|c| Video { name: &c.name, size: c.source.info().size }).collect();
-        let (which, mut notes) = calibration::assign(&found, &videos).map_err(place)?;
+        let mut given = Self::of(&found, &videos, &from).map_err(place)?;
+        if found.posed() && request.apart.is_none() {
+            given.notes.push(found.about_lengths());
+        }
+        Ok(Some(given))
+    }
+
+    /// A calibration for these videos, whose source is called so.
+    pub(super) fn of(found: &Calibration, videos: &[Video<'_>], from: &str) -> Result<Self> {
+        let (which, mut notes) = calibration::assign(found, videos)?;
         let own: Vec<Calibrated> = which.iter().map(|&k| found.cameras[k].clone()).collect();
-        for (camera, video) in own.iter().zip(&videos) {
-            calibration::fitted(camera, video.size, video.size)
-                .map_err(|e| place(e.at(format!("camera {}", video.name))))?;
+        for (camera, video) in own.iter().zip(videos) {
+            calibration::fitted(camera, video.size, video.size).map_err(|e| e.at(format!("camera {}", video.name)))?;
         }
         let what = if found.posed() { "Lenses and places of cameras are" } else { "Lenses of cameras are" };
-        let mut all = vec![format!("{what} from {} ({}).", path.display(), found.dialects.join(", "))];
+        let mut all = vec![format!("{what} from {from} ({}).", found.dialects.join(", "))];
         all.extend(found.notes.iter().cloned());
         all.append(&mut notes);
-        if found.posed() && request.apart.is_none() {
-            all.push(found.about_lengths());
-        }
-        Ok(Some(Self {
+        Ok(Self {
             cameras: own,
             sizes: videos.iter().map(|v| v.size).collect(),
             notes: all,
             posed: found.posed(),
-            points: found.points,
-        }))
+            points: found.points.clone(),
+        })
     }
 }
 

@@ -6,6 +6,7 @@
 
 mod cache;
 mod clocks;
+mod colmap;
 mod geometry;
 mod given;
 mod inputs;
@@ -16,6 +17,7 @@ mod stored;
 pub use inputs::find;
 pub use report::{CameraReport, Report};
 
+use crate::calibration::Video;
 use crate::corrections::{self, Corrections};
 use crate::sfm::known::pixel_unit;
 use crate::video::{self, Selection, Source};
@@ -57,6 +59,8 @@ pub struct Request {
     pub apart: Option<([String; 2], f64)>,
     /// A calibration of the cameras, in any of [`crate::calibration`]'s dialects.
     pub calibration: Option<PathBuf>,
+    /// Whether the COLMAP program finds lenses and places.
+    pub colmap: bool,
     /// A folder of masks; see [`write::masks`].
     pub masks: Option<PathBuf>,
 }
@@ -123,7 +127,13 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
     }
     // It can be corrected even if the calibration does not fit.
     corrections.write(folder)?;
-    let given = given::Given::read(request, &cameras, moving)?;
+    if request.colmap && (moving || request.calibration.is_some()) {
+        let why = if moving { "cameras move" } else { "a calibration is given" };
+        return Err(Error::input(format!("COLMAP is asked for poses, but {why}")).remedy(
+            "Leave --colmap out. A COLMAP reconstruction of a moving camera's frames is a capture as it is: splat4d train FOLDER.",
+        ));
+    }
+    let mut given = given::Given::read(request, &cameras, moving)?;
     let mut report = Report::default();
     report.guesses.extend(given.iter().flat_map(|g| g.notes.iter().cloned()));
     let cache = cache::Cache::of(folder);
@@ -151,12 +161,21 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
     if stop() {
         return Err(stopped());
     }
-    let known = given::known(given.as_ref(), &corrections, &pictures)?;
     let begins: Vec<write::Begin> = clips.iter().map(|c| write::Begin { from: c.selection.from }).collect();
     let masks = match &request.masks {
         Some(from) => write::masks(folder, from, &pictures, &begins, progress, stop)?,
         None => Vec::new(),
     };
+    if request.colmap {
+        let bare = stored::Stored::new(folder, &pictures, &[], &masks);
+        let found = colmap::calibrate(&bare, progress, stop)?;
+        // It saw the stored pictures.
+        let seen: Vec<Video<'_>> = pictures.iter().map(|p| Video { name: &p.name, size: p.size }).collect();
+        let found = given::Given::of(&found, &seen, "the COLMAP program")?;
+        report.guesses.extend(found.notes.iter().cloned());
+        given = Some(found);
+    }
+    let known = given::known(given.as_ref(), &corrections, &pictures)?;
     let stored = stored::Stored::new(folder, &pictures, &known, &masks);
     let mut evidence = heard;
     if pictures.len() > 1 && !moving && clock.offsets.iter().any(Option::is_none) {
@@ -315,14 +334,14 @@ fn finish(request: &Request, found: Found<'_>, corrections: &mut Corrections, mu
     }
     match &request.apart {
         Some((pair, metres)) => solved.scale_to(pictures, pair, *metres)?,
-        None if posed => {}
-        None => report.guesses.push(
-            "The unit of length is the median distance of the cameras from what they see: tell two cameras' distance \
-             (--apart A,B=METRES) for metres."
-                .into(),
-        ),
+        None if posed && !request.colmap => {}
+        None => report.guesses.push(format!(
+            "The unit of length is {}: tell two cameras' distance (--apart A,B=METRES) for metres.",
+            if request.colmap { "COLMAP's" } else { "the median distance of the cameras from what they see" }
+        )),
     }
-    let axis = along_axis(solved.up).filter(|_| posed);
+    // COLMAP's own axes are those of some camera.
+    let axis = along_axis(solved.up).filter(|_| posed && !request.colmap);
     match axis {
         Some((axis, name)) => {
             solved.up = axis;

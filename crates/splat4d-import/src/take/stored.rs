@@ -5,6 +5,7 @@ use crate::sfm::known::Known;
 use crate::sync::graph::Offset;
 use crate::write::{Masks, Pictures};
 use crate::{Error, Result};
+use rayon::prelude::*;
 use splat4d::scene::Planes;
 use splat4d_train::capture::Rgb8;
 use std::path::Path;
@@ -42,7 +43,7 @@ impl<'a> Stored<'a> {
 
     /// Whether all places were given.
     pub(super) fn posed(&self) -> bool {
-        self.known.iter().all(|k| k.is_some_and(|k| k.pose.is_some()))
+        !self.known.is_empty() && self.known.iter().all(|k| k.is_some_and(|k| k.pose.is_some()))
     }
 
     /// Changes with pictures, masks, and what was given of cameras.
@@ -50,6 +51,24 @@ impl<'a> Stored<'a> {
         let prints: Vec<&str> = self.pictures.iter().map(|p| p.fingerprint.as_str()).collect();
         let masks: Vec<u64> = self.masks.iter().map(|m| m.fingerprint).collect();
         format!("{prints:?} {masks:?} {:?}", self.known)
+    }
+
+    /// What stands still: the median of some frames, each made into what is worked with.
+    pub(super) fn median(&self, camera: usize, made: impl Fn(Rgb8) -> Rgb8 + Sync) -> Result<Rgb8> {
+        /// Frames over the take.
+        const SPREAD: usize = 15;
+        let count = self.pictures[camera].shots.len();
+        let kept = count.min(SPREAD);
+        let chosen: Vec<usize> = (0..kept).map(|k| (2 * k + 1) * count / (2 * kept)).collect();
+        let all: Vec<Rgb8> = chosen.par_iter().map(|&k| Ok(made(self.rgb(camera, k)?))).collect::<Result<_>>()?;
+        let mut still = all[0].clone();
+        let mut values = vec![0u8; all.len()];
+        for (p, v) in still.data.iter_mut().enumerate() {
+            values.iter_mut().zip(&all).for_each(|(v, a)| *v = a.data[p]);
+            let half = values.len() / 2;
+            *v = *values.select_nth_unstable(half).1;
+        }
+        Ok(still)
     }
 
     pub(super) fn rgb(&self, camera: usize, frame: usize) -> Result<Rgb8> {
