@@ -86,7 +86,7 @@ const QUARTILE_TO_MEDIAN: f64 = 2.117;
 const AGREE: usize = 2;
 const TELL: usize = 3;
 
-/// How far what each camera shows lies from where the given poses say, and the pixels that a tolerance of one is worth.
+/// How far what each camera shows lies from where the given poses say, pixels of the files' pictures.
 ///
 /// Links must have been found without these poses. Distances are epipolar, as the doctor takes them: the lower quartile of a
 /// pair, as the median that it implies, for chance matches only add large ones; of a camera the second least of its pairs.

@@ -637,6 +637,16 @@ impl Map<'_> {
         self.shows[sight].iter().filter(of).count()
     }
 
+    /// Of these, what moves.
+    fn moving(&self, sight: usize) -> usize {
+        let of = |&&(t, k): &&(usize, usize)| {
+            let feature = self.tracks[t].seen[k].1;
+            let moves = self.sights[sight].features[feature].moment > 0;
+            moves && self.spots[t].as_ref().is_some_and(|s| s.seen.contains(&k))
+        };
+        self.shows[sight].iter().filter(of).count()
+    }
+
     /// Whether this map is better: more cameras, then more sightings.
     pub(crate) fn score(&self) -> (usize, usize) {
         (self.order.len(), self.spots.iter().flatten().map(|s| s.seen.len()).sum())
@@ -678,6 +688,7 @@ impl Map<'_> {
             cameras: (0..self.sights.len()).map(of).collect(),
             points: self.spots.iter().enumerate().filter_map(point).collect(),
             contradiction: vec![None; self.sights.len()],
+            moving: (0..self.sights.len()).map(|s| self.moving(s)).collect(),
         }
     }
 }
@@ -717,6 +728,8 @@ pub struct Mapped {
     pub points: Vec<Found>,
     /// Of cameras whose poses were given; see [`super::Solution::contradiction`].
     pub contradiction: Vec<Option<f64>>,
+    /// Of each camera, the points that move by which its clock was found.
+    pub moving: Vec<usize>,
 }
 
 /// Points and clocks of cameras whose poses and lenses are given. `links` were found without them, and tell how right they are.
@@ -733,14 +746,17 @@ pub(crate) fn about(sights: &[Sight], links: &[Link], how: &Mapping, progress: &
     map.renew();
     map.settle();
     let clocks = map.result();
-    let ground = Ground::new(sights, &[], links, how);
+    // What is looked for along the lines lies on them at any clock: it tells none.
+    let fixed = Mapping { clocks: false, ..how.clone() };
+    let ground = Ground::new(sights, &[], links, &fixed);
     let along = ground.given(Some(&clocks)).guided(links, progress);
     let joined = tracks::join(sights, &along);
-    let ground = Ground::new(sights, &joined, links, how);
+    let ground = Ground::new(sights, &joined, links, &fixed);
     let mut map = ground.given(Some(&clocks));
     map.renew();
     map.settle();
-    Mapped { contradiction: super::known::errors(sights, links), ..map.result() }
+    let contradiction = super::known::errors(sights, links);
+    Mapped { contradiction, moving: clocks.moving, ..map.result() }
 }
 
 /// Places cameras: from several starts, the best of which is kept. `None`: no two pictures fit together.

@@ -99,6 +99,8 @@ pub struct Solution {
     /// For each camera whose place was known, how far what it shows lies from where that says: epipolar distance of matches that
     /// were found without it, at the median, pixels of the files' pictures. None: too few matches.
     pub contradiction: Vec<Option<f64>>,
+    /// Of each of [`Solution::taken`], the points that move by which its clock was found.
+    pub moving: Vec<usize>,
 }
 
 /// Finds where pictures were taken from.
@@ -205,6 +207,7 @@ fn solution(who: &[Who], sights: &[Sight], mapped: mapper::Mapped, pairs: usize,
         taken,
         pairs,
         contradiction: mapped.contradiction,
+        moving: mapped.moving,
     }
 }
 

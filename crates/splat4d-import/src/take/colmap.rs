@@ -8,7 +8,7 @@ use image::{ExtendedColorType, ImageEncoder};
 use splat4d_train::event::Progress;
 use splat4d_train::run::checkpoint::write_atomically;
 use std::fs::File;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
@@ -169,7 +169,7 @@ fn run(step: &Step, help: &str, work: &Path, masks: bool, stop: &dyn Fn() -> boo
     if status.success() { Ok(()) } else { Err(failed(step, &log, status)) }
 }
 
-fn failed(step: &Step, log: &PathBuf, status: std::process::ExitStatus) -> Error {
+fn failed(step: &Step, log: &Path, status: std::process::ExitStatus) -> Error {
     let words = std::fs::read(log).map(|b| String::from_utf8_lossy(&b).into_owned()).unwrap_or_default();
     let words = words.trim();
     let from = words.char_indices().rev().nth(LAST_WORDS).map_or(0, |(k, _)| k);

@@ -221,9 +221,7 @@ fn refined(
 ) -> f64 {
     let n = current.len();
     let mut seen = vec![0; n];
-    for point in solution.points.iter().filter(|p| p.moment != 0) {
-        point.seen.iter().for_each(|&t| seen[solution.taken[t].camera] += 1);
-    }
+    solution.taken.iter().zip(&solution.moving).for_each(|(t, moving)| seen[t.camera] += moving);
     let tau = |c: usize| {
         let taken = solution.taken.iter().find(|t| t.camera == c)?;
         taken.placed.as_ref().ok().filter(|_| seen[c] >= MOVING_POINTS).map(|p| p.tau)
