@@ -180,13 +180,11 @@ fn a_calibration_places_cameras_and_clocks_are_found() {
         let mask = image::GrayImage::from_fn(200, 150, |_, y| image::Luma([if y < 37 { 0 } else { 255 }]));
         mask.save(at("masks").join(format!("{name}.png"))).unwrap();
     }
-    for (calibration, masks) in [(at("calibration.toml"), true), (bundled().join("capture.json"), false)] {
-        let take = at(if masks { "take" } else { "again" });
-        let masks_at = at("masks");
-        let mut args = vec!["import", str(&films), "-o", str(&take), "--calibration", str(&calibration)];
-        if masks {
-            args.extend(["--masks", str(&masks_at)]);
-        }
+    // The second dialect says the same to the last bit, so that nothing is solved again.
+    let (take, masks) = (at("take"), at("masks"));
+    for calibration in [at("calibration.toml"), bundled().join("capture.json")] {
+        let args = ["import", str(&films), "-o", str(&take), "--calibration", str(&calibration)];
+        let args = [&args[..], &["--masks", str(&masks), "--no-doctor"]].concat();
         let said = splat4d(&args).run().ok();
         assert!(said.contains("calibration px") && said.contains("geometry"), "{said}");
         let made = json_of(&take.join("capture.json"));
@@ -209,16 +207,18 @@ fn a_calibration_places_cameras_and_clocks_are_found() {
             assert!(row["calibration"].as_f64().unwrap() < 1.0, "{row}");
         }
         let capture = Capture::open(&take, &CaptureOptions::default()).unwrap();
-        assert_eq!(capture.frames.iter().all(|f| f.mask.is_some()), masks);
+        assert!(capture.frames.iter().all(|f| f.mask.is_some()));
         assert!(capture.points.is_some_and(|p| p.points.len() > 50));
     }
     // Every camera is another one's.
     let mut turned = names.clone();
     turned.rotate_left(1);
     std::fs::write(at("wrong.toml"), toml(&told, &turned)).unwrap();
+    let some: Vec<PathBuf> = names[..3].iter().map(|n| films.join(n)).collect();
     let refused = |file: &Path| {
         let take = at("refused");
-        splat4d(&["import", str(&films), "-o", str(&take), "--calibration", str(file)]).run().refused()
+        let args: Vec<&str> = some.iter().map(|p| str(p)).collect();
+        splat4d(&["import", "-o", str(&take), "--calibration", str(file)]).args(&args).run().refused()
     };
     let why = refused(&at("wrong.toml"));
     assert!(why.contains("contradicts the pictures"), "{why}");
@@ -271,7 +271,8 @@ fn colmap_is_called_where_it_is_asked_for_and_its_model_is_taken() {
     std::fs::write(program.join("model/cameras.txt"), cameras).unwrap();
     std::fs::write(program.join("model/images.txt"), images).unwrap();
     let folder = str(&program).to_owned();
-    let import = |path: &str| splat4d(&["import", str(&films), "-o", str(&take), "--colmap"]).path(path).run();
+    let import =
+        |path: &str| splat4d(&["import", str(&films), "-o", str(&take), "--colmap", "--no-doctor"]).path(path).run();
     let missing = import("/nonexistent").refused();
     assert!(missing.contains("colmap cannot be started") && missing.contains("leave --colmap out"), "{missing}");
     stand_in(&program, "if [ -z \"$1\" ]; then :; fi; echo 'out of features' >&2; exit 3");
