@@ -333,6 +333,10 @@ fn bad_opencv_files_are_explained() {
     refused(&[("a.txt", "nothing here".into())], "no calibration");
     refused(&[("left.xml", "<opencv_storage><a>".into())], "XML");
     refused(&[], "no calibration");
+    refused(
+        &[("left.yml", good.replacen("image_width: 1280", "a: &a [1, 2]\nb: [*a, *a]\nimage_width: 1280", 1))],
+        "anchors",
+    );
     let mirrored = pose_of(c).rotation.map(|row| [-row[0], row[1], row[2]]);
     let text = good.replace(
         &yaml_matrix("rotation", [3, 3], pose_of(c).rotation.as_flattened()),

@@ -208,6 +208,10 @@ fn yaml(text: &str) -> Result<Tree> {
     let wrong = |why: String| {
         Error::input(format!("it is neither YAML, TOML, JSON nor XML: {why}")).remedy("Export the calibration again.")
     };
+    // Few anchors of anchors make gigabytes, and no calibration has any.
+    if [" &", "\t&", "[&", ",&"].iter().any(|anchor| body.contains(anchor)) {
+        return Err(wrong("it has anchors (&), which calibrations have not".into()));
+    }
     let documents = yaml_rust2::YamlLoader::load_from_str(&body).map_err(|e| wrong(e.to_string()))?;
     let first = documents.first().ok_or_else(|| wrong("there is nothing in it".into()))?;
     yaml_tree(first, 0)
