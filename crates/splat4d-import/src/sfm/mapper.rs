@@ -464,10 +464,6 @@ impl Map<'_> {
         };
         let (Some((alike, _)), Some((strangers, sightings))) = (loss(false), loss(true)) else { return false };
         let variance = strangers / sightings as f64;
-        eprintln!(
-            "RATIO {} {alike} {strangers} {sightings}",
-            2.0 * (alike - strangers) / variance / lenses.len() as f64
-        );
         2.0 * (alike - strangers) > CONTRADICTS * variance * lenses.len() as f64
     }
 
