@@ -73,8 +73,11 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
     })
 }
 
+/// A picture's name and its camera.
+pub(super) type Shot = (String, Camera);
+
 /// Name and camera of every registered picture.
-fn sources(folder: &Path, registered: &[Registered]) -> Result<Vec<(String, Camera)>> {
+fn sources(folder: &Path, registered: &[Registered]) -> Result<Vec<Shot>> {
     let optics = colmap_files::cameras(folder)?;
     let mut shots = Vec::with_capacity(registered.len());
     for picture in registered {
@@ -98,7 +101,7 @@ fn sources(folder: &Path, registered: &[Registered]) -> Result<Vec<(String, Came
 }
 
 /// The registered pictures of the largest model in a folder, and its points; no picture is looked at.
-pub(super) fn shots(folder: &Path) -> Result<(Vec<(String, Camera)>, Option<PointCloud>)> {
+pub(super) fn shots(folder: &Path) -> Result<(Vec<Shot>, Option<PointCloud>)> {
     let (folder, registered) = best_model(folder, &mut Vec::new())?;
     Ok((sources(&folder, &registered)?, cloud(&colmap_files::points(&folder)?)))
 }
