@@ -1,6 +1,6 @@
 //! Calibrations that other programs wrote: lenses, and where cameras stand.
 //!
-//! A dialect is a file here and a line in [`DIALECTS`]; which one a file is in, its content tells. What a camera is called is
+//! A dialect is a file here and a line in its list; which one a file is in, its content tells. What a camera is called is
 //! matched with what its video is called ([`assign`]). Everything comes out as the rest of the program has it: `cam_from_world` in
 //! OpenCV axes, pixels whose first centre is at 0.5.
 

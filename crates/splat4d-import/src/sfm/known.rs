@@ -1,14 +1,15 @@
 //! Cameras of which the lens is known, or the lens and the place: features are straightened once, and the rest is found about them.
 
 use super::lens::Lens as Plain;
-use super::mapper::unit;
+use super::mapper::{Ground, Mapped, Mapping, unit};
 use super::pictures::{Feature, Sight};
-use super::tracks::Link;
+use super::tracks::{self, Link};
 use crate::sync::epipolar::{fundamental, sampson};
 use splat4d::math::Se3;
 use splat4d::math::se3::dot;
 use splat4d::scene::{Camera, Intrinsics, Lens};
 use splat4d_train::capture::Distortion;
+use splat4d_train::event::Progress;
 
 /// What is known of a camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -76,6 +77,45 @@ impl Straight {
     }
 }
 
+/// Points and clocks of cameras whose poses and lenses are given. `links` were found without them, and tell how right they are.
+///
+/// What moves lies beside its epipolar lines as long as clocks are off: first clocks are found of what looks alike, within wide
+/// bounds; then points of what lies on the lines, which it does at any clock, so that they tell none.
+pub(crate) fn about(sights: &[Sight], links: &[Link], how: &Mapping, progress: &mut Progress<'_>) -> Mapped {
+    /// Of the tolerance: two frames of what is followed at all, in pictures 1920 across.
+    const WIDE: f64 = 8.0;
+    /// Of what moves and was matched, the least share that must fit a clock: of matches by chance few do.
+    const CLOCK_SHARE: f64 = 0.5;
+    let wide = Mapping { tolerance: WIDE * how.tolerance, ..how.clone() };
+    let first = tracks::join(sights, links);
+    let ground = Ground::new(sights, &first, links, &wide);
+    let mut map = ground.given(None);
+    map.renew();
+    map.settle();
+    let mut clocks = map.result();
+    let ground = Ground::new(sights, &first, links, how);
+    let mut map = ground.given(Some(&clocks));
+    map.renew();
+    for (s, (camera, moving)) in clocks.cameras.iter_mut().zip(&mut clocks.moving).enumerate() {
+        let moves = |&&(t, k): &&(usize, usize)| sights[s].features[first[t].seen[k].1].moment > 0;
+        let matched = ground.shows[s].iter().filter(moves).count();
+        *moving = map.moving(s);
+        if (*moving as f64) < CLOCK_SHARE * matched as f64 {
+            *moving = 0;
+            camera.iter_mut().for_each(|c| c.tau = 0.0);
+        }
+    }
+    let fixed = Mapping { clocks: false, ..how.clone() };
+    let ground = Ground::new(sights, &[], links, &fixed);
+    let along = ground.given(Some(&clocks)).guided(links, progress);
+    let joined = tracks::join(sights, &along);
+    let ground = Ground::new(sights, &joined, links, &fixed);
+    let mut map = ground.given(Some(&clocks));
+    map.renew();
+    map.settle();
+    Mapped { contradiction: errors(sights, links), moving: clocks.moving, ..map.result() }
+}
+
 /// Matches of what stands still that a pair of cameras must have before it tells whether poses are right.
 const SURE: usize = 12;
 /// Cameras whose axes are farther apart see other sides of things: what seems alike there is chance, degrees.
@@ -90,7 +130,7 @@ const TELL: usize = 3;
 ///
 /// Links must have been found without these poses. Distances are epipolar, as the doctor takes them: the lower quartile of a
 /// pair, as the median that it implies, for chance matches only add large ones; of a camera the second least of its pairs.
-pub(crate) fn errors(sights: &[Sight], links: &[Link]) -> Vec<Option<f64>> {
+fn errors(sights: &[Sight], links: &[Link]) -> Vec<Option<f64>> {
     let camera = |s: &Sight| {
         let lens = Plain::plain(s.focal?, s.size[0], s.size[1]);
         Some(lens.pinhole(s.pose?, s.size[0], s.size[1]))

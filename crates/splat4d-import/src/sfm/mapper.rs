@@ -133,7 +133,7 @@ pub(crate) struct Ground<'a> {
     pub tracks: &'a [Track],
     pub links: &'a [Link],
     pub how: &'a Mapping,
-    shows: Vec<Vec<(usize, usize)>>,
+    pub(super) shows: Vec<Vec<(usize, usize)>>,
     lens_of: Vec<usize>,
     lens_count: usize,
 }
@@ -230,7 +230,7 @@ impl<'a> Ground<'a> {
     }
 
     /// The map of cameras that stand where they are said to, with the clocks that were found before.
-    fn given(&self, before: Option<&Mapped>) -> Map<'_> {
+    pub(super) fn given(&self, before: Option<&Mapped>) -> Map<'_> {
         let mut map = self.empty(1.0);
         map.order = (0..self.sights.len()).collect();
         map.poses = self.sights.iter().map(|s| s.pose).collect();
@@ -344,7 +344,7 @@ impl Map<'_> {
     }
 
     /// Leaves out what does not fit, takes in what fits, and finds places for tracks that have none.
-    fn renew(&mut self) {
+    pub(super) fn renew(&mut self) {
         let cameras = self.cameras();
         let next = |t: usize| -> Option<Spot> {
             if let Some(spot) = &self.spots[t] {
@@ -571,7 +571,7 @@ impl Map<'_> {
     }
 
     /// Adjusts, leaves out and finds again; all sights stay.
-    fn settle(&mut self) {
+    pub(super) fn settle(&mut self) {
         const STEPS: usize = 50;
         for _ in 0..ROUNDS {
             self.adjust(STEPS);
@@ -601,7 +601,7 @@ impl Map<'_> {
     }
 
     /// Matches of placed cameras along epipolar lines, and those of `links` that lie on them.
-    fn guided(&self, links: &[Link], progress: &mut Progress<'_>) -> Vec<Link> {
+    pub(super) fn guided(&self, links: &[Link], progress: &mut Progress<'_>) -> Vec<Link> {
         let known = |s: usize| {
             let [w, h] = self.sights[s].size;
             let camera = self.lens(s).pinhole(self.poses[s]?, w, h);
@@ -634,7 +634,7 @@ impl Map<'_> {
     }
 
     /// Of these, what moves.
-    fn moving(&self, sight: usize) -> usize {
+    pub(super) fn moving(&self, sight: usize) -> usize {
         let of = |&&(t, k): &&(usize, usize)| {
             let feature = self.tracks[t].seen[k].1;
             let moves = self.sights[sight].features[feature].moment > 0;
@@ -726,33 +726,6 @@ pub struct Mapped {
     pub contradiction: Vec<Option<f64>>,
     /// Of each camera, the points that move by which its clock was found.
     pub moving: Vec<usize>,
-}
-
-/// Points and clocks of cameras whose poses and lenses are given. `links` were found without them, and tell how right they are.
-///
-/// What moves lies beside its epipolar lines as long as clocks are off: first clocks are found of what looks alike, within wide
-/// bounds; then points of what lies on the lines.
-pub(crate) fn about(sights: &[Sight], links: &[Link], how: &Mapping, progress: &mut Progress<'_>) -> Mapped {
-    /// Of the tolerance: two frames of what is followed at all, in pictures 1920 across.
-    const WIDE: f64 = 8.0;
-    let wide = Mapping { tolerance: WIDE * how.tolerance, ..how.clone() };
-    let first = tracks::join(sights, links);
-    let ground = Ground::new(sights, &first, links, &wide);
-    let mut map = ground.given(None);
-    map.renew();
-    map.settle();
-    let clocks = map.result();
-    // What is looked for along the lines lies on them at any clock: it tells none.
-    let fixed = Mapping { clocks: false, ..how.clone() };
-    let ground = Ground::new(sights, &[], links, &fixed);
-    let along = ground.given(Some(&clocks)).guided(links, progress);
-    let joined = tracks::join(sights, &along);
-    let ground = Ground::new(sights, &joined, links, &fixed);
-    let mut map = ground.given(Some(&clocks));
-    map.renew();
-    map.settle();
-    let contradiction = super::known::errors(sights, links);
-    Mapped { contradiction, moving: clocks.moving, ..map.result() }
 }
 
 /// Places cameras: from several starts, the best of which is kept. `None`: no two pictures fit together.

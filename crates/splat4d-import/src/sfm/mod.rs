@@ -140,7 +140,7 @@ fn solve_sights(
 ) -> Result<Solution> {
     let links = tracks::links(sights, pairing, options.mapping.seed, progress);
     if sights.iter().all(|s| s.pose.is_some()) {
-        let mapped = mapper::about(sights, &links, &options.mapping, progress);
+        let mapped = known::about(sights, &links, &options.mapping, progress);
         return Ok(solution(who, sights, mapped, links.len(), 1.0));
     }
     let alone = || {
