@@ -23,7 +23,7 @@ const ORDER: [(&str, &[&str]); 6] = [
             "methods", "step", "init", "run", "eval", "training", "compress", "dynamics", "dist",
         ],
     ),
-    ("crates/splat4d-import", &["video", "sync", "sfm", "corrections", "write", "take", "doctor"]),
+    ("crates/splat4d-import", &["calibration", "video", "sync", "sfm", "corrections", "write", "take", "doctor"]),
     (
         "crates/splat4d-serve",
         &["write_timeout", "body", "range", "guard", "scene", "assets", "page", "events", "answer", "server"],

@@ -23,6 +23,7 @@ Examples:
   splat4d import a.mp4 b.mp4 c.mp4 -o my-take --from 3.2 --to 9.8 --size 720
   splat4d import walk.mp4 -o walk --every 5          one camera, carried round the scene
   splat4d import videos/ -o my-take --apart left,right=2.4    in metres
+  splat4d import videos/ -o my-take --calibration Calib.toml    poses are known: clocks and points are found
 
 What was found of every camera is written to my-take/import.toml: correct an offset, a lens, or leave a camera out there,
 and run the same command again. Then: splat4d train my-take. How to film a take that works: docs/filming.md.";
@@ -68,6 +69,15 @@ pub(crate) struct Args {
     /// Two cameras and the metres between them
     #[arg(long, value_name = "A,B=METRES", value_parser = apart)]
     apart: Option<([String; 2], f64)>,
+    /// Lenses and places of the cameras, from a file or a folder that another program wrote
+    #[arg(long, value_name = "FILE|FOLDER")]
+    calibration: Option<PathBuf>,
+    /// Let the COLMAP program find lenses and places, if it is installed
+    #[arg(long, conflicts_with = "calibration")]
+    colmap: bool,
+    /// Masks, white where pictures count: NAME.png for a camera, or a folder NAME with one for each frame
+    #[arg(long, value_name = "FOLDER")]
+    masks: Option<PathBuf>,
     /// Take interlaced videos, and fill their lines in
     #[arg(long)]
     deinterlace: bool,
@@ -118,6 +128,9 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         sound: !args.no_audio,
         format: if args.png { Format::Png } else { Format::default() },
         apart: args.apart.clone(),
+        calibration: args.calibration.clone(),
+        colmap: args.colmap,
+        masks: args.masks.clone(),
     };
     let stop = interrupt::flag("stopping: what is stored is kept");
     let mut tell = |event: &splat4d_train::event::Event| console.event(event);
@@ -161,11 +174,13 @@ fn told(report: &Report, looked: Option<&(Looked, PathBuf)>, console: &Console) 
         console.emit(&json!({"type": "imported", "report": report, "doctor": looked.map(|l| &l.0)}));
         return;
     }
-    let mut text = String::from(
-        "camera              frames  offset ms     ±  by                     points   error px  focal px\n",
-    );
+    let mut text =
+        String::from("camera              frames  offset ms     ±  by                     points   error px  focal px");
+    let given = report.cameras.iter().any(|c| c.calibration.is_some());
+    text += if given { "  calibration px\n" } else { "\n" };
     for camera in &report.cameras {
-        let _ = writeln!(text, "{}", row(camera));
+        let off = camera.calibration.map_or_else(|| "-".to_owned(), |v| format!("{v:.2}"));
+        let _ = writeln!(text, "{}{}", row(camera), if given { format!("{off:>16}") } else { String::new() });
     }
     for guess in &report.guesses {
         let _ = writeln!(text, "{guess}");

@@ -2,6 +2,7 @@
 
 use crate::sample::splat4d;
 use crate::{json_of, str};
+use serde_json::Value;
 use splat4d_import::sfm::align::apart;
 use splat4d_train::capture::{Capture, CaptureOptions};
 use std::path::{Path, PathBuf};
@@ -132,6 +133,179 @@ fn videos_with_sound_become_a_capture_whose_clocks_were_heard() {
         let off = (camera["offset"].as_f64().unwrap() - report["cameras"][0]["offset"].as_f64().unwrap()) * SLOW as f64;
         assert!((off - *begin as f64).abs() < 0.2, "{name}: {off} frames, begun after {begin}");
     }
+}
+
+/// The bundled cameras' numbers, as they are.
+fn told() -> Vec<Value> {
+    let capture = json_of(&bundled().join("capture.json"));
+    let cameras = capture["cameras"].as_array().unwrap();
+    CAMERAS.iter().map(|(name, _)| cameras.iter().find(|c| c["name"] == **name).unwrap().clone()).collect()
+}
+
+/// A calibration as anipose writes them, of cameras that are called so.
+fn toml(cameras: &[Value], names: &[&str]) -> String {
+    let one = |(camera, name): (&Value, &&str)| {
+        let number = |key: &str| camera[key].as_f64().unwrap();
+        let row = |i: usize| camera["world_to_camera"][i].as_array().unwrap().clone();
+        let rows: Vec<Value> = (0..3).map(|i| row(i)[..3].into()).collect();
+        let (cx, cy) = (number("cx") - 0.5, number("cy") - 0.5);
+        format!(
+            "[{name}]\nname = \"{name}\"\nsize = [{}, {}]\nmatrix = [[{:?}, 0, {cx:?}], [0, {:?}, {cy:?}], [0, 0, 1]]\n\
+             distortions = [0.0, 0.0, 0.0, 0.0]\nrotation = {}\ntranslation = {}\n",
+            camera["width"],
+            camera["height"],
+            number("fx"),
+            number("fy"),
+            Value::from(rows),
+            Value::from((0..3).map(|i| row(i)[3].clone()).collect::<Vec<_>>())
+        )
+    };
+    cameras.iter().zip(names).map(one).collect()
+}
+
+#[test]
+fn a_calibration_places_cameras_and_clocks_are_found() {
+    /// How exactly numbers must come through.
+    const EXACT: f64 = 1e-5;
+    let dir = tempfile::tempdir().unwrap();
+    let at = |name: &str| dir.path().join(name);
+    let films = at("films");
+    filmed(&films);
+    let names: Vec<&str> = CAMERAS.iter().map(|c| c.0).collect();
+    let told = told();
+    std::fs::write(at("calibration.toml"), toml(&told, &names)).unwrap();
+    // A mask for each camera: its upper quarter does not count.
+    std::fs::create_dir(at("masks")).unwrap();
+    for name in &names {
+        let mask = image::GrayImage::from_fn(200, 150, |_, y| image::Luma([if y < 37 { 0 } else { 255 }]));
+        mask.save(at("masks").join(format!("{name}.png"))).unwrap();
+    }
+    // The second dialect says the same to the last bit, so that nothing is solved again.
+    let (take, masks) = (at("take"), at("masks"));
+    for calibration in [at("calibration.toml"), bundled().join("capture.json")] {
+        let args = ["import", str(&films), "-o", str(&take), "--calibration", str(&calibration)];
+        let args = [&args[..], &["--masks", str(&masks), "--no-doctor"]].concat();
+        let said = splat4d(&args).run().ok();
+        assert!(said.contains("calibration px") && said.contains("geometry"), "{said}");
+        let made = json_of(&take.join("capture.json"));
+        for (k, camera) in told.iter().enumerate() {
+            let found = &made["cameras"][k];
+            for key in ["fx", "fy", "cx", "cy"] {
+                assert!((found[key].as_f64().unwrap() - camera[key].as_f64().unwrap()).abs() < EXACT, "{key} {found}");
+            }
+            for (i, j) in (0..3).flat_map(|i| (0..4).map(move |j| (i, j))) {
+                let number = |v: &Value| v["world_to_camera"][i][j].as_f64().unwrap();
+                assert!((number(found) - number(camera)).abs() < EXACT, "{found}");
+            }
+        }
+        let report = json_of(&take.join("import/report.json"));
+        for (k, (name, begin)) in CAMERAS.iter().enumerate() {
+            let row = &report["cameras"][k];
+            let offset = |k: usize| report["cameras"][k]["offset"].as_f64().unwrap();
+            let off = (offset(k) - offset(0)) * 30.0 - *begin as f64;
+            assert!(off.abs() < 0.1, "{name}: {off} frames off");
+            assert!(row["calibration"].as_f64().unwrap() < 1.0, "{row}");
+        }
+        let capture = Capture::open(&take, &CaptureOptions::default()).unwrap();
+        assert!(capture.frames.iter().all(|f| f.mask.is_some()));
+        assert!(capture.points.is_some_and(|p| p.points.len() > 50));
+    }
+    // Every camera is another one's.
+    let mut turned = names.clone();
+    turned.rotate_left(1);
+    std::fs::write(at("wrong.toml"), toml(&told, &turned)).unwrap();
+    let some: Vec<PathBuf> = names[..3].iter().map(|n| films.join(n)).collect();
+    let refused = |file: &Path| {
+        let take = at("refused");
+        let args: Vec<&str> = some.iter().map(|p| str(p)).collect();
+        splat4d(&["import", "-o", str(&take), "--calibration", str(file)]).args(&args).run().refused()
+    };
+    let why = refused(&at("wrong.toml"));
+    assert!(why.contains("contradicts the pictures"), "{why}");
+    let strange: Vec<String> = (0..names.len()).map(|k| format!("strange{}", 3 * k)).collect();
+    let strange: Vec<&str> = strange.iter().map(String::as_str).collect();
+    std::fs::write(at("strange.toml"), toml(&told, &strange)).unwrap();
+    let why = refused(&at("strange.toml"));
+    assert!(why.contains("strange3") && why.contains("cam07"), "{why}");
+    assert!(refused(&at("missing.toml")).contains("missing.toml"));
+}
+
+/// A program that notes how it is called and, as the mapper, copies a model to where it is asked for.
+#[cfg(unix)]
+fn stand_in(folder: &Path, ends: &str) {
+    use std::os::unix::fs::PermissionsExt;
+    let script = format!(
+        "#!/bin/sh\nif [ \"$2\" = --help ]; then echo '  --FeatureExtraction.use_gpu arg (=1)'; exit 0; fi\n\
+         echo \"$@\" >> '{0}/calls'\nif [ \"$1\" = mapper ]; then\n\
+         while [ \"$1\" != --output_path ]; do shift; done\n\
+         /bin/mkdir -p \"$2/0\" && /bin/cp '{0}/model/cameras.txt' '{0}/model/images.txt' \"$2/0\"\nfi\n{ends}\n",
+        folder.display()
+    );
+    let path = folder.join("colmap");
+    std::fs::write(&path, script).unwrap();
+    std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o755)).unwrap();
+}
+
+#[cfg(unix)]
+#[test]
+fn colmap_is_called_where_it_is_asked_for_and_its_model_is_taken() {
+    use splat4d::math::quat;
+    /// Decimals of the model's text, and the unit that it is in.
+    const EXACT: f64 = 1e-5;
+    const HALF: f64 = 0.5;
+    let dir = tempfile::tempdir().unwrap();
+    let at = |name: &str| dir.path().join(name);
+    let (films, take, program) = (at("films"), at("take"), at("program"));
+    filmed(&films);
+    std::fs::create_dir_all(program.join("model")).unwrap();
+    let (mut cameras, mut images) = (String::new(), String::new());
+    for (k, (camera, (name, _))) in told().iter().zip(&CAMERAS).enumerate() {
+        let number = |i: usize, j: usize| camera["world_to_camera"][i][j].as_f64().unwrap();
+        let q = quat::from_rotation(&std::array::from_fn(|i| std::array::from_fn(|j| number(i, j))));
+        let t = [0, 1, 2].map(|i| HALF * number(i, 3));
+        let text = |v: &[f64]| v.iter().map(|v| format!("{v:.12}")).collect::<Vec<_>>().join(" ");
+        cameras +=
+            &format!("{k} PINHOLE 400 300 {} {} {} {}\n", camera["fx"], camera["fy"], camera["cx"], camera["cy"]);
+        images += &format!("{k} {} {} {k} {name}.png\n\n", text(&q), text(&t));
+    }
+    std::fs::write(program.join("model/cameras.txt"), cameras).unwrap();
+    std::fs::write(program.join("model/images.txt"), images).unwrap();
+    let folder = str(&program).to_owned();
+    let import =
+        |path: &str| splat4d(&["import", str(&films), "-o", str(&take), "--colmap", "--no-doctor"]).path(path).run();
+    let missing = import("/nonexistent").refused();
+    assert!(missing.contains("colmap cannot be started") && missing.contains("leave --colmap out"), "{missing}");
+    stand_in(&program, "if [ -z \"$1\" ]; then :; fi; echo 'out of features' >&2; exit 3");
+    let failed = import(&folder).refused();
+    assert!(failed.contains("feature_extractor") && failed.contains("out of features"), "{failed}");
+    std::fs::remove_file(program.join("calls")).unwrap();
+    stand_in(&program, "exit 0");
+    import(&folder).ok();
+    let calls = std::fs::read_to_string(program.join("calls")).unwrap();
+    let lines: Vec<&str> = calls.lines().collect();
+    assert_eq!(lines.len(), 3, "{calls}");
+    for (line, words) in lines.iter().zip([
+        ["feature_extractor", "--ImageReader.single_camera_per_image 1", "--FeatureExtraction.use_gpu 0"],
+        ["exhaustive_matcher", "--SiftMatching.guided_matching 1", "database.db"],
+        ["mapper", "--Mapper.ba_refine_principal_point 0", "--output_path"],
+    ]) {
+        assert!(words.iter().all(|w| line.contains(w)), "{line}");
+    }
+    let made = json_of(&take.join("capture.json"));
+    for (k, camera) in told().iter().enumerate() {
+        for (i, j) in (0..3).flat_map(|i| (0..4).map(move |j| (i, j))) {
+            let number = |v: &Value| v["world_to_camera"][i][j].as_f64().unwrap();
+            let wanted = number(camera) * if j == 3 { HALF } else { 1.0 };
+            assert!((number(&made["cameras"][k]) - wanted).abs() < EXACT, "{made}");
+        }
+    }
+    // Nothing changed: neither the program nor the solver is at work again.
+    let before = std::fs::read(take.join("capture.json")).unwrap();
+    let saved = |folder: &Path| std::fs::read_dir(folder.join("import/cache")).unwrap().count();
+    let count = saved(&take);
+    import(&folder).ok();
+    assert_eq!(std::fs::read_to_string(program.join("calls")).unwrap(), calls);
+    assert_eq!((std::fs::read(take.join("capture.json")).unwrap(), saved(&take)), (before, count));
 }
 
 #[test]

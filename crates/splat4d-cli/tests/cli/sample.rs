@@ -135,6 +135,7 @@ impl Capture {
 /// A call of the binary.
 pub(crate) struct Call {
     args: Vec<OsString>,
+    path: Option<OsString>,
 }
 
 /// How it went.
@@ -147,7 +148,7 @@ pub(crate) struct Answer {
 
 /// The program with these arguments.
 pub(crate) fn splat4d(args: &[&str]) -> Call {
-    Call { args: args.iter().map(OsString::from).collect() }
+    Call { args: args.iter().map(OsString::from).collect(), path: None }
 }
 
 impl Call {
@@ -157,6 +158,12 @@ impl Call {
         self
     }
 
+    /// Programs are looked for in these folders alone.
+    #[cfg(unix)]
+    pub(crate) fn path(self, folders: &str) -> Self {
+        Self { path: Some(folders.into()), ..self }
+    }
+
     /// Runs in the current folder.
     pub(crate) fn run(self) -> Answer {
         self.run_in(Path::new("."))
@@ -164,11 +171,11 @@ impl Call {
 
     /// Runs in a folder.
     pub(crate) fn run_in(self, folder: &Path) -> Answer {
-        let output = Command::new(PROGRAM.expect("cargo builds the program"))
-            .args(&self.args)
-            .current_dir(folder)
-            .output()
-            .unwrap();
+        let mut command = Command::new(PROGRAM.expect("cargo builds the program"));
+        if let Some(path) = &self.path {
+            command.env("PATH", path);
+        }
+        let output = command.args(&self.args).current_dir(folder).output().unwrap();
         Answer {
             call: format!("{:?}", self.args),
             code: output.status.code(),

@@ -1,12 +1,12 @@
 //! What cameras say of each other: poses, exposure, white balance and sharpness, by features that two of them see.
 
-use super::check::{GAMMA, MATCHES, SHARPNESS, Told, fundamental, grade, unit};
+use super::check::{GAMMA, MATCHES, SHARPNESS, Told, grade, unit};
 use super::look::{Seen, Stand, detail};
 use super::{Options, PairReport, Report};
 use crate::sfm::algebra::Cholesky;
 use crate::sfm::pictures::{Feature, Sight};
 use crate::sfm::tracks::{Pairing, links};
-use crate::sync::epipolar::sampson;
+use crate::sync::epipolar::{fundamental, sampson};
 use crate::sync::grey::Grey;
 use crate::sync::median;
 use rayon::prelude::*;
@@ -59,6 +59,8 @@ fn sight(name: &str, number: usize, stand: &Stand, most: usize) -> Sight {
         size: [stand.picture.width, stand.picture.height],
         factor: 1.0,
         focal: None,
+        exact: false,
+        pose: None,
         lens: number,
         frame: 0.0,
         features: found.iter().map(feature).collect(),

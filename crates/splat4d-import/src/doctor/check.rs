@@ -3,7 +3,6 @@
 
 use super::look::Seen;
 use super::{CameraReport, Finding, Grade, Options, Report, alone, between, clocks, volume};
-use splat4d::math::se3::{mat_mul, mat_vec, sub, transpose};
 use splat4d::scene::Camera;
 use splat4d_train::capture::Capture;
 use splat4d_train::event::Progress;
@@ -41,18 +40,6 @@ pub(super) fn unit(view: &Camera) -> f64 {
     /// The longer side of what thresholds are about.
     const WIDE: f64 = 1920.0;
     WIDE / view.width.max(view.height) as f64
-}
-
-/// F with `x_bᵀ F x_a = 0`.
-pub(super) fn fundamental(a: &Camera, b: &Camera) -> [[f64; 3]; 3] {
-    let rotation = mat_mul(&b.cam_from_world.rotation, &transpose(&a.cam_from_world.rotation));
-    let t = sub(b.cam_from_world.translation, mat_vec(&rotation, a.cam_from_world.translation));
-    let cross = [[0.0, -t[2], t[1]], [t[2], 0.0, -t[0]], [-t[1], t[0], 0.0]];
-    let inverse = |c: &Camera| {
-        let k = &c.intrinsics;
-        [[1.0 / k.fx, 0.0, -k.cx / k.fx], [0.0, 1.0 / k.fy, -k.cy / k.fy], [0.0, 0.0, 1.0]]
-    };
-    mat_mul(&transpose(&inverse(b)), &mat_mul(&mat_mul(&cross, &rotation), &inverse(a)))
 }
 
 /// Where findings go.

@@ -2,10 +2,10 @@
 
 use super::Report;
 use super::between::AGREE;
-use super::check::{MATCHES, Told, fundamental, grade, unit};
+use super::check::{MATCHES, Told, grade, unit};
 use super::look::Seen;
 use super::shutter::{self, Pair};
-use crate::sync::epipolar::{Range, lag};
+use crate::sync::epipolar::{Range, fundamental, lag};
 use crate::sync::graph::{Evidence, Kind, solve};
 use crate::sync::median;
 use rayon::prelude::*;

@@ -51,9 +51,11 @@ pub struct Bundle {
     pub sightings: Vec<Sighting>,
 }
 
-/// What is adjusted besides poses and points.
+/// What is adjusted besides points.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Free {
+    /// Poses.
+    pub pose: bool,
     /// Focal lengths.
     pub focal: bool,
     /// Radial distortion.
@@ -96,6 +98,8 @@ pub struct Settings {
     pub scale: f64,
     /// What is adjusted.
     pub free: Free,
+    /// Lenses that are known exactly and stay, whatever is free; none where it is empty.
+    pub exact: Vec<bool>,
     /// What is known beforehand.
     pub priors: Priors,
     /// Evaluations, at most.
@@ -416,7 +420,7 @@ struct Gauge {
 
 impl Gauge {
     /// The first view stays, and of the view that is farthest from it the translation along the line between them.
-    fn new(bundle: &Bundle, free: Free) -> Self {
+    fn new(bundle: &Bundle, free: Free, exact: &[bool]) -> Self {
         let views = bundle.views.len();
         let mut held = vec![false; POSE * views + LENS * bundle.lenses.len()];
         if views > 0 {
@@ -431,14 +435,18 @@ impl Gauge {
             held[POSE * far + 3 + axis] = true;
         }
         for v in 0..views {
+            if !free.pose {
+                held[POSE * v..POSE * (v + 1) - 1].fill(true);
+            }
             held[POSE * v + POSE - 1] |= !free.tau;
         }
         for l in 0..bundle.lenses.len() {
             let row = POSE * views + LENS * l;
-            held[row] = !free.focal;
-            held[row + 1] = !free.k1;
-            held[row + 2] = !free.center;
-            held[row + 3] = !free.center;
+            let stays = exact.get(l) == Some(&true);
+            held[row] = stays || !free.focal;
+            held[row + 1] = stays || !free.k1;
+            held[row + 2] = stays || !free.center;
+            held[row + 3] = stays || !free.center;
         }
         Self { held }
     }
@@ -478,7 +486,7 @@ pub fn adjust(bundle: &mut Bundle, settings: &Settings) -> Report {
     const SHRINK: f64 = 0.2;
     const LEAST: f64 = 1e-14;
     const LARGEST: f64 = 1e8;
-    let gauge = Gauge::new(bundle, settings.free);
+    let gauge = Gauge::new(bundle, settings.free, &settings.exact);
     let before = bundle.cost(settings);
     let mut cost = before;
     let mut damping = START;
@@ -516,7 +524,7 @@ mod tests {
     use splat4d::math::Rng;
     use splat4d::math::se3::{norm, sub};
 
-    const ALL: Free = Free { focal: true, k1: true, center: true, tau: true };
+    const ALL: Free = Free { pose: true, focal: true, k1: true, center: true, tau: true };
 
     /// Cameras around points, some of which move; everything seen exactly.
     fn ring(views: usize, shared: bool) -> Bundle {
@@ -576,7 +584,7 @@ mod tests {
     }
 
     fn settings(lenses: &[Lens], free: Free) -> Settings {
-        Settings { scale: f64::INFINITY, free, priors: Priors::none(lenses), steps: 100, gain: 0.0 }
+        Settings { scale: f64::INFINITY, free, exact: Vec::new(), priors: Priors::none(lenses), steps: 100, gain: 0.0 }
     }
 
     /// Largest differences of rotations (radians) and of centres after the best similarity, of focal lengths (relative) and

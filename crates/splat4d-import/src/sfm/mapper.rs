@@ -117,6 +117,8 @@ pub(crate) struct Map<'a> {
     lenses: Vec<Lens>,
     guesses: Vec<Lens>,
     told: Vec<bool>,
+    /// Lenses that are known exactly.
+    exact: Vec<bool>,
     lens_of: &'a [usize],
     spots: Vec<Option<Spot>>,
     /// Why sights could not be placed.
@@ -131,7 +133,7 @@ pub(crate) struct Ground<'a> {
     pub tracks: &'a [Track],
     pub links: &'a [Link],
     pub how: &'a Mapping,
-    shows: Vec<Vec<(usize, usize)>>,
+    pub(super) shows: Vec<Vec<(usize, usize)>>,
     lens_of: Vec<usize>,
     lens_count: usize,
 }
@@ -186,10 +188,12 @@ impl<'a> Ground<'a> {
     fn empty(&self, focal: f64) -> Map<'_> {
         let mut lenses: Vec<Option<Lens>> = vec![None; self.lens_count];
         let mut told = vec![false; self.lens_count];
+        let mut exact = vec![false; self.lens_count];
         for (k, s) in self.sights.iter().enumerate() {
             let guess = s.focal.unwrap_or(focal * self.size(k));
             lenses[self.lens_of[k]].get_or_insert(Lens::plain(guess, s.size[0], s.size[1]));
             told[self.lens_of[k]] |= s.focal.is_some();
+            exact[self.lens_of[k]] |= s.exact;
         }
         let lenses: Vec<Lens> = lenses.into_iter().map(|l| l.expect("every lens has a sight")).collect();
         let n = self.sights.len();
@@ -204,6 +208,7 @@ impl<'a> Ground<'a> {
             guesses: lenses.clone(),
             lenses,
             told,
+            exact,
             lens_of: &self.lens_of,
             spots: vec![None; self.tracks.len()],
             reasons: vec![String::new(); n],
@@ -221,6 +226,17 @@ impl<'a> Ground<'a> {
         map.renew();
         map.adjust(8);
         map.renew();
+        map
+    }
+
+    /// The map of cameras that stand where they are said to, with the clocks that were found before.
+    pub(super) fn given(&self, before: Option<&Mapped>) -> Map<'_> {
+        let mut map = self.empty(1.0);
+        map.order = (0..self.sights.len()).collect();
+        map.poses = self.sights.iter().map(|s| s.pose).collect();
+        if let Some(before) = before {
+            map.taus = before.cameras.iter().map(|c| c.as_ref().map_or(0.0, |c| c.tau)).collect();
+        }
         map
     }
 
@@ -328,7 +344,7 @@ impl Map<'_> {
     }
 
     /// Leaves out what does not fit, takes in what fits, and finds places for tracks that have none.
-    fn renew(&mut self) {
+    pub(super) fn renew(&mut self) {
         let cameras = self.cameras();
         let next = |t: usize| -> Option<Spot> {
             if let Some(spot) = &self.spots[t] {
@@ -348,9 +364,19 @@ impl Map<'_> {
 
     fn free(&self) -> Free {
         let n = self.order.len();
+        if self.placed_before() {
+            // Poses that are given tell clocks from places, of two cameras on.
+            let moves = self.how.clocks && self.sights.iter().all(|s| s.frame > 0.0);
+            return Free { pose: false, focal: false, k1: false, center: false, tau: moves };
+        }
         let rest = n >= ALL_FROM.min(self.sights.len()).max(FEWEST);
         let moves = self.how.clocks && self.sights.iter().all(|s| s.frame > 0.0);
-        Free { focal: n >= FOCAL_FROM, k1: rest, center: rest, tau: rest && moves }
+        Free { pose: true, focal: n >= FOCAL_FROM, k1: rest, center: rest, tau: rest && moves }
+    }
+
+    /// Whether poses were given, and are not to be found.
+    fn placed_before(&self) -> bool {
+        self.sights.iter().all(|s| s.pose.is_some())
     }
 
     /// Adjusts everything with so many evaluations; the loss and how many sightings it is of.
@@ -396,6 +422,7 @@ impl Map<'_> {
         let settings = Settings {
             scale: self.how.scale * unit(size),
             free: self.free(),
+            exact: lens_back.iter().map(|&l| self.exact[l]).collect(),
             priors: Priors {
                 lenses: lens_back.iter().map(|&l| self.guesses[l]).collect(),
                 focal: if told { TOLD } else { GUESSED },
@@ -437,10 +464,6 @@ impl Map<'_> {
         };
         let (Some((alike, _)), Some((strangers, sightings))) = (loss(false), loss(true)) else { return false };
         let variance = strangers / sightings as f64;
-        eprintln!(
-            "RATIO {} {alike} {strangers} {sightings}",
-            2.0 * (alike - strangers) / variance / lenses.len() as f64
-        );
         2.0 * (alike - strangers) > CONTRADICTS * variance * lenses.len() as f64
     }
 
@@ -478,7 +501,7 @@ impl Map<'_> {
             return false;
         }
         let lens = self.lens_of[sight];
-        let used = self.order.iter().any(|&s| self.lens_of[s] == lens);
+        let used = self.exact[lens] || self.order.iter().any(|&s| self.lens_of[s] == lens);
         let guess = self.guesses[lens];
         let lenses: Vec<Lens> = if used {
             vec![self.lenses[lens]]
@@ -547,6 +570,15 @@ impl Map<'_> {
         }
     }
 
+    /// Adjusts, leaves out and finds again; all sights stay.
+    pub(super) fn settle(&mut self) {
+        const STEPS: usize = 50;
+        for _ in 0..ROUNDS {
+            self.adjust(STEPS);
+            self.renew();
+        }
+    }
+
     /// Adjusts, leaves out, finds again until it rests; sights that are left with too little are taken out.
     pub(crate) fn finish(&mut self) {
         const STEPS: usize = 50;
@@ -569,7 +601,7 @@ impl Map<'_> {
     }
 
     /// Matches of placed cameras along epipolar lines, and those of `links` that lie on them.
-    fn guided(&self, links: &[Link], progress: &mut Progress<'_>) -> Vec<Link> {
+    pub(super) fn guided(&self, links: &[Link], progress: &mut Progress<'_>) -> Vec<Link> {
         let known = |s: usize| {
             let [w, h] = self.sights[s].size;
             let camera = self.lens(s).pinhole(self.poses[s]?, w, h);
@@ -598,6 +630,16 @@ impl Map<'_> {
     /// Points that a sight sees where they are.
     fn fits(&self, sight: usize) -> usize {
         let of = |&&(t, k): &&(usize, usize)| self.spots[t].as_ref().is_some_and(|s| s.seen.contains(&k));
+        self.shows[sight].iter().filter(of).count()
+    }
+
+    /// Of these, what moves.
+    pub(super) fn moving(&self, sight: usize) -> usize {
+        let of = |&&(t, k): &&(usize, usize)| {
+            let feature = self.tracks[t].seen[k].1;
+            let moves = self.sights[sight].features[feature].moment > 0;
+            moves && self.spots[t].as_ref().is_some_and(|s| s.seen.contains(&k))
+        };
         self.shows[sight].iter().filter(of).count()
     }
 
@@ -641,6 +683,8 @@ impl Map<'_> {
         Mapped {
             cameras: (0..self.sights.len()).map(of).collect(),
             points: self.spots.iter().enumerate().filter_map(point).collect(),
+            contradiction: vec![None; self.sights.len()],
+            moving: (0..self.sights.len()).map(|s| self.moving(s)).collect(),
         }
     }
 }
@@ -678,6 +722,10 @@ pub struct Mapped {
     pub cameras: Vec<Result<Stand, String>>,
     /// In the order of tracks.
     pub points: Vec<Found>,
+    /// Of cameras whose poses were given; see [`super::Solution::contradiction`].
+    pub contradiction: Vec<Option<f64>>,
+    /// Of each camera, the points that move by which its clock was found.
+    pub moving: Vec<usize>,
 }
 
 /// Places cameras: from several starts, the best of which is kept. `None`: no two pictures fit together.

@@ -8,6 +8,7 @@ pub mod adjust;
 pub(crate) mod algebra;
 pub mod align;
 mod flow;
+pub mod known;
 pub mod lens;
 pub mod mapper;
 pub mod pictures;
@@ -57,7 +58,7 @@ pub struct Taken {
 pub struct Placed {
     /// Takes world points into the camera's axes.
     pub pose: Se3,
-    /// In pixels of the files' pictures.
+    /// In pixels of the files' pictures; of cameras whose lens was known without distortion, which took it away.
     pub lens: Lens,
     /// Pixels across and down of the files' pictures (of those that were halved: a little less).
     pub size: [usize; 2],
@@ -95,12 +96,18 @@ pub struct Solution {
     pub up: [f64; 3],
     /// Pairs of pictures that were found to show one scene.
     pub pairs: usize,
+    /// For each camera whose place was known, how far what it shows lies from where that says: epipolar distance of matches that
+    /// were found without it, at the median, pixels of the files' pictures. None: too few matches.
+    pub contradiction: Vec<Option<f64>>,
+    /// Of each of [`Solution::taken`], the points that move by which its clock was found.
+    pub moving: Vec<usize>,
 }
 
 /// Finds where pictures were taken from.
 ///
 /// The world's unit is the median distance of the cameras from what they see; its axes are those of the camera that was placed
-/// first. Lengths and the vertical must come from elsewhere.
+/// first. Lengths and the vertical must come from elsewhere. Where all places are known, so are unit and axes: then only points
+/// and clocks are found.
 ///
 /// Errors: pictures that cannot be read; no two that show one scene.
 pub fn solve(pictures: &dyn Pictures, options: &Options, progress: &mut Progress<'_>) -> Result<Solution> {
@@ -132,6 +139,10 @@ fn solve_sights(
     progress: &mut Progress<'_>,
 ) -> Result<Solution> {
     let links = tracks::links(sights, pairing, options.mapping.seed, progress);
+    if sights.iter().all(|s| s.pose.is_some()) {
+        let mapped = known::about(sights, &links, &options.mapping, progress);
+        return Ok(solution(who, sights, mapped, links.len(), 1.0));
+    }
     let alone = || {
         Error::input("no two of these pictures show the same things")
             .remedy("Film one scene from neighbouring places (at most 30 degrees apart), in focus and in light.")
@@ -156,6 +167,11 @@ fn in_units(who: &[Who], sights: &[Sight], mapped: mapper::Mapped, pairs: usize)
         }
     }
     let scale = 1.0 / align::median_distance(&mut distances).unwrap_or(1.0);
+    solution(who, sights, mapped, pairs, scale)
+}
+
+/// The solution in a unit of so many of the map's.
+fn solution(who: &[Who], sights: &[Sight], mapped: mapper::Mapped, pairs: usize, scale: f64) -> Solution {
     let placed = |(camera, sight): (&Result<mapper::Stand, String>, &Sight)| {
         camera.as_ref().map_err(Clone::clone).map(|c| Placed {
             pose: Se3 { rotation: c.pose.rotation, translation: c.pose.translation.map(|t| t * scale) },
@@ -185,7 +201,14 @@ fn in_units(who: &[Who], sights: &[Sight], mapped: mapper::Mapped, pairs: usize)
         }
     };
     let poses: Vec<Se3> = taken.iter().filter_map(|t| t.placed.as_ref().ok().map(|p| p.pose)).collect();
-    Solution { up: align::up_of(&poses), points: mapped.points.into_iter().map(point).collect(), taken, pairs }
+    Solution {
+        up: align::up_of(&poses),
+        points: mapped.points.into_iter().map(point).collect(),
+        taken,
+        pairs,
+        contradiction: mapped.contradiction,
+        moving: mapped.moving,
+    }
 }
 
 #[cfg(test)]

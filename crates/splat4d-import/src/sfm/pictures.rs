@@ -1,8 +1,10 @@
 //! What cameras see, as features: of what stands still on the median picture, of what moves at moments that all share.
 
 use super::flow::{Pyramid, surely};
+use super::known::Known;
 use crate::{Error, Result};
 use rayon::prelude::*;
+use splat4d::math::Se3;
 use splat4d::scene::Planes;
 use splat4d_train::event::Progress;
 use splat4d_train::vision::features::{self, Limits, NUMBERS};
@@ -27,6 +29,14 @@ pub trait Pictures: Sync {
     /// Cameras of one number share a lens (the same model at the same zoom).
     fn lens(&self, camera: usize) -> usize {
         camera
+    }
+    /// Its lens, or lens and place, where they are known exactly.
+    fn known(&self, _camera: usize) -> Option<Known> {
+        None
+    }
+    /// What of a camera's frame counts: one channel, above one half; all of it where there is none.
+    fn mask(&self, _camera: usize, _frame: usize) -> Result<Option<Planes<f32>>> {
+        Ok(None)
     }
 }
 
@@ -57,6 +67,11 @@ pub struct Sight {
     pub factor: f64,
     /// The focal length in pixels, where it is known roughly.
     pub focal: Option<f64>,
+    /// Whether the lens is known exactly: then features are where a pinhole camera of this focal length, its principal point in
+    /// the middle, sees them.
+    pub exact: bool,
+    /// Takes world points into the camera's axes, where that is known.
+    pub pose: Option<Se3>,
     /// Sights of one number share a lens.
     pub lens: usize,
     /// How long a frame lasts, seconds.
@@ -140,6 +155,25 @@ fn spread(of: usize, count: usize) -> Vec<usize> {
 
 fn bytes(picture: &Planes<f32>) -> Vec<u8> {
     picture.data.iter().map(|v| (v * 255.0).round().clamp(0.0, 255.0) as u8).collect()
+}
+
+/// What of a picture counts.
+struct Mask {
+    mask: Planes<f32>,
+    size: [usize; 2],
+}
+
+impl Mask {
+    fn counts(&self, x: usize, y: usize) -> bool {
+        let [w, h] = self.size;
+        self.mask.get(0, y * self.mask.height / h, x * self.mask.width / w) > 0.5
+    }
+}
+
+/// The mask for a picture at the size that is worked with.
+fn mask(pictures: &dyn Pictures, camera: usize, frame: usize, picture: &Planes<f32>) -> Result<Option<Mask>> {
+    let size = [picture.width, picture.height];
+    Ok(pictures.mask(camera, frame)?.map(|mask| Mask { mask, size }))
 }
 
 /// What stands still: the median over some frames, channel by channel.
@@ -238,7 +272,10 @@ pub fn fixed(pictures: &dyn Pictures, look: &Look, progress: &mut Progress<'_>) 
 fn sight(pictures: &dyn Pictures, camera: usize, look: &Look, moments: &[f64]) -> Result<Sight> {
     let (background, factor) = median(pictures, camera, look.pixels)?;
     let limits = |most: usize| Limits { contrast: look.contrast, most };
-    let mut features = found(&background, limits(look.still), &|_, _| true, 0);
+    // What stands still counts where the middle frame does.
+    let counts = mask(pictures, camera, pictures.frames(camera) / 2, &background)?;
+    let mut features =
+        found(&background, limits(look.still), &|x, y| counts.as_ref().is_none_or(|m| m.counts(x, y)), 0);
     let frame = frame_length(pictures, camera);
     if pictures.frames(camera) >= MEDIAN_FROM {
         for (m, &t) in moments.iter().enumerate() {
@@ -250,15 +287,34 @@ fn sight(pictures: &dyn Pictures, camera: usize, look: &Look, moments: &[f64]) -
             }
         }
     }
-    Ok(Sight {
-        name: pictures.name(camera),
-        size: [background.width, background.height],
+    let size = [background.width, background.height];
+    Ok(Sight { name: pictures.name(camera), features, frame, ..empty(pictures, camera, size, factor) }
+        .straightened(pictures, camera))
+}
+
+/// A camera of which nothing was seen yet.
+fn empty(pictures: &dyn Pictures, camera: usize, size: [usize; 2], factor: f64) -> Sight {
+    Sight {
+        name: String::new(),
+        size,
         factor,
         focal: pictures.focal(camera).map(|f| f / factor),
+        exact: false,
+        pose: None,
         lens: pictures.lens(camera),
-        frame,
-        features,
-    })
+        frame: 0.0,
+        features: Vec::new(),
+    }
+}
+
+impl Sight {
+    /// Takes away the distortion of a lens that is known.
+    fn straightened(mut self, pictures: &dyn Pictures, camera: usize) -> Self {
+        let Some(known) = pictures.known(camera) else { return self };
+        let straight = known.straight(self.size, self.factor);
+        self.features.retain_mut(|f| straight.feature(f));
+        Self { focal: Some(straight.focal()), exact: true, pose: known.pose, ..self }
+    }
 }
 
 /// Part of a picture.
@@ -314,7 +370,8 @@ fn moving(
         *v = (0..3).map(|c| (picture.plane(c)[p] - background.plane(c)[p]).abs()).sum::<f32>() / 3.0;
     }
     let off = blurred(&off, MOVED_BLUR);
-    let wanted = |x: usize, y: usize| off.get(0, y, x) > MOVED;
+    let counts = mask(pictures, camera, frame, &picture)?;
+    let wanted = |x: usize, y: usize| off.get(0, y, x) > MOVED && counts.as_ref().is_none_or(|m| m.counts(x, y));
     let Some(window) = Window::around(picture.width, picture.height, &wanted) else { return Ok(Vec::new()) };
     let limits = Limits { contrast: look.contrast, most: look.moving };
     let inner = window.cut(&picture);
@@ -377,15 +434,16 @@ pub fn walking(
             .map(|&(camera, frame)| {
                 let (picture, factor) = load(pictures, camera, frame, look.pixels)?;
                 let limits = Limits { contrast: look.contrast, most: look.still };
-                Ok(Sight {
+                let counts = mask(pictures, camera, frame, &picture)?;
+                let sight = Sight {
                     name: format!("{}, frame {frame}", pictures.name(camera)),
-                    size: [picture.width, picture.height],
-                    factor,
-                    focal: pictures.focal(camera).map(|f| f / factor),
-                    lens: pictures.lens(camera),
                     frame: frame_length(pictures, camera),
-                    features: found(&picture, limits, &|_, _| true, 0),
-                })
+                    features: found(&picture, limits, &|x, y| counts.as_ref().is_none_or(|m| m.counts(x, y)), 0),
+                    ..empty(pictures, camera, [picture.width, picture.height], factor)
+                };
+                let sight = sight.straightened(pictures, camera);
+                // One frame's place is not the camera's.
+                Ok(Sight { pose: None, ..sight })
             })
             .collect();
         out.extend(part.iter().zip(sights?).map(|(&(camera, frame), s)| (camera, frame, s)));

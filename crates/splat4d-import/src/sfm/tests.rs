@@ -1,6 +1,7 @@
 //! From made-up features and pictures to cameras.
 
 use super::align::apart;
+use super::known::Known;
 use super::lens::Lens;
 use super::mapper::{FOCALS, Mapping, map};
 use super::pictures::{Feature, Look, Pictures, Sight, fixed};
@@ -61,6 +62,8 @@ fn rig(cameras: usize, points: usize, noise: f64, wrong: f64, spread: f64) -> Ri
             size: [640, 360],
             factor: 1.0,
             focal: None,
+            exact: false,
+            pose: None,
             lens: c,
             frame: 1.0 / 30.0,
             features,
@@ -100,6 +103,69 @@ fn a_rig_is_found_among_noise_and_outliers_with_focal_lengths_and_clocks() {
     );
     let there = splat4d::math::se3::mat_vec(&turned.unwrap().rotation, found.up);
     assert!(splat4d::math::se3::dot(there, up) > 0.9, "{there:?}");
+}
+
+/// Tells the lenses of a rig, and its poses if they are `placed`; those of `wrong` cameras are turned by 1.5 degrees.
+fn tell(rig: &mut Rig, placed: bool, wrong: &[usize]) -> Vec<f64> {
+    let turn = super::algebra::rotation([0.0, 1.5f64.to_radians(), 0.0]);
+    let mut focals = Vec::new();
+    for (k, sight) in rig.sights.iter_mut().enumerate() {
+        let camera = rig.lenses[k].camera(rig.poses[k], 640, 360);
+        let known = Known { intrinsics: camera.intrinsics, lens: camera.lens, pose: None };
+        let straight = known.straight(sight.size, sight.factor);
+        sight.features.retain_mut(|f| straight.feature(f));
+        let mut pose = rig.poses[k];
+        if wrong.contains(&k) {
+            pose.rotation = splat4d::math::se3::mat_mul(&turn, &pose.rotation);
+            pose.translation = splat4d::math::se3::mat_vec(&turn, pose.translation);
+        }
+        (sight.focal, sight.exact, sight.pose) = (Some(straight.focal()), true, placed.then_some(pose));
+        focals.push(straight.focal());
+    }
+    focals
+}
+
+#[test]
+fn cameras_that_are_given_stay_and_clocks_and_points_are_found() {
+    let mut silent = |_: &_| {};
+    let who: Vec<_> = (0..4).map(|c| (c, None)).collect();
+    let mut solved = |wrong: &[usize]| {
+        let mut rig = rig(4, 600, 0.3, 0.2);
+        tell(&mut rig, true, wrong);
+        let found =
+            solve_sights(&who, &rig.sights, Pairing::All, &Options::default(), &mut Progress(&mut silent)).unwrap();
+        (rig, found)
+    };
+    let (rig, found) = solved(&[]);
+    let placed: Vec<_> = found.taken.iter().map(|t| t.placed.clone().unwrap()).collect();
+    let clocks: Vec<f64> = placed.iter().zip(&rig.taus).map(|(p, t)| p.tau - t).collect();
+    for (k, p) in placed.iter().enumerate() {
+        assert_eq!(p.pose, rig.poses[k], "poses stay, and so does the unit");
+        assert!((clocks[k] - clocks[0]).abs() < 0.0033, "{clocks:?}");
+        assert!(p.error < 1.0 && p.sightings > 80, "{p:?}");
+        assert!(found.contradiction[k].is_some_and(|off| off < 1.0), "{:?}", found.contradiction);
+    }
+    assert!(found.points.len() > 250, "{}", found.points.len());
+    // One that is turned contradicts, and not its neighbours.
+    let (_, found) = solved(&[2]);
+    let off: Vec<f64> = found.contradiction.iter().map(|c| c.unwrap()).collect();
+    assert!((0..4).all(|k| if k == 2 { off[k] > 4.0 } else { off[k] < 1.0 }), "{off:?}");
+}
+
+#[test]
+fn lenses_that_are_given_stay_while_poses_are_found() {
+    let mut silent = |_: &_| {};
+    let mut rig = rig(5, 500, 0.3, 0.1);
+    let focals = tell(&mut rig, false, &[]);
+    let who: Vec<_> = (0..5).map(|c| (c, None)).collect();
+    let found = solve_sights(&who, &rig.sights, Pairing::All, &Options::default(), &mut Progress(&mut silent)).unwrap();
+    let placed: Vec<_> = found.taken.iter().map(|t| t.placed.clone().unwrap()).collect();
+    for (p, focal) in placed.iter().zip(&focals) {
+        assert_eq!((p.lens.focal, p.lens.k1, p.lens.center), (*focal, 0.0, [320.0, 180.0]));
+    }
+    let poses: Vec<Se3> = placed.iter().map(|p| p.pose).collect();
+    let off = apart(&poses, &rig.poses).unwrap();
+    assert!(off.iter().all(|a| a.degrees < 0.3 && a.center < 0.01), "{off:?}");
 }
 
 #[test]

@@ -369,7 +369,17 @@ mod tests {
     use super::*;
 
     fn sight(features: Vec<Feature>) -> Sight {
-        Sight { name: String::new(), size: [640, 360], factor: 1.0, focal: None, lens: 0, frame: 0.03, features }
+        Sight {
+            name: String::new(),
+            size: [640, 360],
+            factor: 1.0,
+            focal: None,
+            exact: false,
+            pose: None,
+            lens: 0,
+            frame: 0.03,
+            features,
+        }
     }
 
     fn feature(kind: u64, place: f64, moment: usize) -> Feature {

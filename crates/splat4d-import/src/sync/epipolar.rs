@@ -4,6 +4,8 @@
 use super::tracks::Track;
 use super::{NORMAL_MAD, Refusal, median};
 use rayon::prelude::*;
+use splat4d::math::se3::{mat_mul, mat_vec, sub, transpose};
+use splat4d::scene::Camera;
 
 /// Pixels off the epipolar line from which on a match at some lag is none: a few times what corners and poses are exact to.
 const TOLERANCE: f64 = 3.0;
@@ -115,6 +117,18 @@ pub fn lag(
     }
     let error = scale / NORMAL_MAD;
     Ok(EpipolarLag { seconds: lag, sigma, matches: matched.iter().map(|m| m.pair).collect(), error })
+}
+
+/// The fundamental matrix of two cameras (pinhole): `x_bᵀ F x_a = 0`.
+pub fn fundamental(a: &Camera, b: &Camera) -> [[f64; 3]; 3] {
+    let rotation = mat_mul(&b.cam_from_world.rotation, &transpose(&a.cam_from_world.rotation));
+    let t = sub(b.cam_from_world.translation, mat_vec(&rotation, a.cam_from_world.translation));
+    let cross = [[0.0, -t[2], t[1]], [t[2], 0.0, -t[0]], [-t[1], t[0], 0.0]];
+    let inverse = |c: &Camera| {
+        let k = &c.intrinsics;
+        [[1.0 / k.fx, 0.0, -k.cx / k.fx], [0.0, 1.0 / k.fy, -k.cy / k.fy], [0.0, 0.0, 1.0]]
+    };
+    mat_mul(&transpose(&inverse(b)), &mat_mul(&mat_mul(&cross, &rotation), &inverse(a)))
 }
 
 /// The median interval between samples, seconds.

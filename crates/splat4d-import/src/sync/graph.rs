@@ -1,7 +1,7 @@
 //! Offsets of all cameras from lags of pairs: robust least squares on the graph. What contradicts the rest is left out and
 //! named.
 
-use super::Refusal;
+use serde::{Deserialize, Serialize};
 
 /// Standard deviations that a lag may be off before it contradicts.
 const SIGMAS: f64 = 4.0;
@@ -15,7 +15,7 @@ const STEPS: usize = 100;
 const RIDGE: f64 = 1e-9;
 
 /// What a lag is from, the most trusted first.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub enum Kind {
     /// Told by the user.
     Given,
@@ -40,7 +40,7 @@ impl Kind {
 }
 
 /// A lag of two cameras.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Evidence {
     /// The cameras a and b.
     pub cameras: [usize; 2],
@@ -55,7 +55,7 @@ pub struct Evidence {
 }
 
 /// What is added to a camera's times: an event at t is at `t·(1 + rate) + seconds` on the clock of all.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Offset {
     /// Seconds.
     pub seconds: f64,
@@ -161,11 +161,6 @@ pub fn solve(cameras: usize, evidence: &[Evidence], given: &[Option<f64>], toler
         })
         .collect();
     Solution { offsets, refused }
-}
-
-/// What is wrong with a refusal to measure, for a report of pairs.
-pub fn describe(names: [&str; 2], refusal: &Refusal) -> String {
-    format!("{} and {}: {refusal}", names[0], names[1])
 }
 
 struct Graph<'a> {

@@ -1,5 +1,6 @@
 //! The clock of all cameras before poses are known: by sound, then by motion, then as their files have it.
 
+use super::cache::Cache;
 use super::stored::Stored;
 use super::{Camera, Report};
 use crate::sync::graph::{self, Evidence, Kind, Solution};
@@ -17,17 +18,41 @@ const LEAST_SHARED: f64 = 0.1;
 /// Frames a second of cameras that do not tell.
 const USUAL_RATE: f64 = 30.0;
 
+/// All pairs of so many.
+fn pairs(n: usize) -> Vec<[usize; 2]> {
+    (0..n).flat_map(|a| (a + 1..n).map(move |b| [a, b])).collect()
+}
+
 /// Lags of all pairs of cameras with sound.
 pub(super) fn by_sound(
     cameras: &[Camera],
+    cache: &Cache,
     progress: &mut Progress<'_>,
     stop: &dyn Fn() -> bool,
 ) -> Result<Vec<Evidence>> {
+    let prints = cameras.iter().map(|c| c.source.fingerprint()).collect::<Result<Vec<_>>>()?;
+    let pairs = pairs(cameras.len());
+    let found = cache.pairs("sound", &pairs, &prints, |missing| heard(cameras, missing, progress, stop))?;
+    let of = |(cameras, e): (&[usize; 2], Option<Evidence>)| e.map(|e| Evidence { cameras: *cameras, ..e });
+    Ok(pairs.iter().zip(found).filter_map(of).collect())
+}
+
+/// Lags of some pairs of cameras.
+fn heard(
+    cameras: &[Camera],
+    pairs: &[[usize; 2]],
+    progress: &mut Progress<'_>,
+    stop: &dyn Fn() -> bool,
+) -> Result<Vec<Option<Evidence>>> {
     let mut tracks = Vec::new();
     for (k, camera) in cameras.iter().enumerate() {
         progress.phase("sound", k, cameras.len());
         if stop() {
             return Err(Error::new(ErrorKind::Interrupted, "stopped while sound was read"));
+        }
+        if !pairs.iter().flatten().any(|c| *c == k) {
+            tracks.push(None);
+            continue;
         }
         match camera.source.sound() {
             Ok(track) => tracks.push(track.map(SoundTrack::new)),
@@ -37,8 +62,6 @@ pub(super) fn by_sound(
             }
         }
     }
-    let n = cameras.len();
-    let pairs: Vec<[usize; 2]> = (0..n).flat_map(|a| (a + 1..n).map(move |b| [a, b])).collect();
     let of = |&[a, b]: &[usize; 2]| {
         let (x, y) = (tracks[a].as_ref()?, tracks[b].as_ref()?);
         let lag = sound::lag(x, y, None).ok()?;
@@ -46,48 +69,59 @@ pub(super) fn by_sound(
         let sigma = lag.sigma.hypot(0.5 * sound::way(WAY));
         Some(Evidence { cameras: [a, b], lag: lag.at_zero(), sigma, drift: lag.drift, kind: Kind::Sound })
     };
-    Ok(pairs.par_iter().filter_map(of).collect())
+    Ok(pairs.par_iter().map(of).collect())
 }
 
 /// Lags by how much moves, of cameras that sound leaves open with all others.
 pub(super) fn by_motion(
     stored: &Stored<'_>,
     clock: &Solution,
+    cache: &Cache,
     progress: &mut Progress<'_>,
     report: &mut Report,
 ) -> Result<Vec<Evidence>> {
+    let open = |k: usize| clock.offsets[k].is_none();
+    let pairs: Vec<[usize; 2]> =
+        pairs(stored.pictures.len()).into_iter().filter(|&[a, b]| open(a) || open(b)).collect();
+    let prints: Vec<String> = stored.pictures.iter().map(|p| p.fingerprint.clone()).collect();
+    let found = cache.pairs("motion", &pairs, &prints, |missing| seen(stored, missing, progress))?;
+    let mut out = Vec::new();
+    for ([a, b], found) in pairs.into_iter().zip(found) {
+        match found {
+            Ok([lag, sigma]) => out.push(Evidence { cameras: [a, b], lag, sigma, drift: None, kind: Kind::Motion }),
+            Err(why) => {
+                let [a, b] = [a, b].map(|c| stored.pictures[c].name.as_str());
+                report.motion.push(format!("{a} and {b}: {why}"));
+            }
+        }
+    }
+    Ok(out)
+}
+
+/// Lag and standard deviation of some pairs, or why there is none.
+fn seen(
+    stored: &Stored<'_>,
+    pairs: &[[usize; 2]],
+    progress: &mut Progress<'_>,
+) -> Result<Vec<Result<[f64; 2], String>>> {
     let n = stored.pictures.len();
     let mut moved = Vec::with_capacity(n);
     for (k, pictures) in stored.pictures.iter().enumerate() {
         progress.phase("motion", k, n);
+        if !pairs.iter().flatten().any(|c| *c == k) {
+            moved.push(Motion::default());
+            continue;
+        }
         let mut motion = Motion::default();
         for (i, shot) in pictures.shots.iter().enumerate() {
             motion.push(shot.time, &stored.rgb(k, i)?);
         }
         moved.push(motion);
     }
-    let open = |k: usize| clock.offsets[k].is_none();
-    let mut out = Vec::new();
-    for a in 0..n {
-        for b in a + 1..n {
-            if !open(a) && !open(b) {
-                continue;
-            }
-            match motion::lag(&moved[a], &moved[b], None) {
-                Ok(found) => out.push(Evidence {
-                    cameras: [a, b],
-                    lag: found.seconds,
-                    sigma: found.sigma,
-                    drift: None,
-                    kind: Kind::Motion,
-                }),
-                Err(why) => {
-                    report.motion.push(graph::describe([&stored.pictures[a].name, &stored.pictures[b].name], &why));
-                }
-            }
-        }
-    }
-    Ok(out)
+    let of = |&[a, b]: &[usize; 2]| {
+        motion::lag(&moved[a], &moved[b], None).map(|f| [f.seconds, f.sigma]).map_err(|why| why.to_string())
+    };
+    Ok(pairs.iter().map(of).collect())
 }
 
 /// Offsets of all cameras from what is known of pairs.

@@ -4,7 +4,11 @@
 //! clocks that sound leaves open; clocks and poses are solved in turn until both rest. What was found stands in
 //! [`corrections::FILE`], where it can be corrected and the same work run again.
 
+mod cache;
 mod clocks;
+mod colmap;
+mod geometry;
+mod given;
 mod inputs;
 mod poses;
 mod report;
@@ -13,9 +17,11 @@ mod stored;
 pub use inputs::find;
 pub use report::{CameraReport, Report};
 
+use crate::calibration::Video;
 use crate::corrections::{self, Corrections};
+use crate::sfm::known::pixel_unit;
 use crate::video::{self, Selection, Source};
-use crate::write::{self, Clip, Format, Pictures, Take};
+use crate::write::{self, Clip, Format, Masks, Pictures, Take};
 use crate::{Error, ErrorKind, Result};
 use splat4d_train::event::Progress;
 use std::path::{Path, PathBuf};
@@ -51,6 +57,12 @@ pub struct Request {
     pub format: Format,
     /// Two cameras and the metres between them.
     pub apart: Option<([String; 2], f64)>,
+    /// A calibration of the cameras, in any of [`crate::calibration`]'s dialects.
+    pub calibration: Option<PathBuf>,
+    /// Whether the COLMAP program finds lenses and places.
+    pub colmap: bool,
+    /// A folder of masks; see [`write::masks`].
+    pub masks: Option<PathBuf>,
 }
 
 /// Frames of a moving camera that are placed at most: every one is a camera of its own to the solver.
@@ -62,6 +74,14 @@ const PLACED_LEAST: f64 = 0.7;
 const PLACED_WARN: f64 = 0.9;
 /// Points below which a reconstruction hangs on too little: a chessboard's.
 const FEW_POINTS: usize = 50;
+
+/// Pixels of 1920 that what a camera shows may lie from where the calibration says: a rig that was pushed or focussed anew is off
+/// by more, and rigs that people work with by 1 or 2.
+const CONTRADICTS: f64 = 5.0;
+/// A calibration that is contradicted by more than this part of the cameras that tell is not of this take.
+const CONTRADICTED: f64 = 0.67;
+/// Upwards is an axis of a calibrated world where that is so near (cosine of 15 degrees): people calibrate on floors.
+const ALONG_AXIS: f64 = 0.966;
 
 /// A camera on its way.
 struct Camera {
@@ -105,9 +125,23 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
         return Err(Error::input("one camera that stands still shows nothing from two sides")
             .remedy("Give the videos of all cameras, or --rig moving if this one was carried about."));
     }
+    // It can be corrected even if the calibration does not fit.
+    corrections.write(folder)?;
+    if request.colmap && (moving || request.calibration.is_some()) {
+        let why = if moving { "cameras move" } else { "a calibration is given" };
+        return Err(Error::input(format!("COLMAP is asked for poses, but {why}")).remedy(
+            "Leave --colmap out. A COLMAP reconstruction of a moving camera's frames is a capture as it is: splat4d train FOLDER.",
+        ));
+    }
+    let mut given = given::Given::read(request, &cameras, moving)?;
     let mut report = Report::default();
-    let heard =
-        if request.sound && cameras.len() > 1 { clocks::by_sound(&cameras, progress, stop)? } else { Vec::new() };
+    report.guesses.extend(given.iter().flat_map(|g| g.notes.iter().cloned()));
+    let cache = cache::Cache::of(folder);
+    let heard = if request.sound && cameras.len() > 1 {
+        clocks::by_sound(&cameras, &cache, progress, stop)?
+    } else {
+        Vec::new()
+    };
     let clock = clocks::solve(&cameras, &heard, &told);
     let selections = clocks::shared(&cameras, &clock, &request.selection, &mut report)?;
     let clips: Vec<Clip<'_>> = cameras
@@ -127,24 +161,53 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
     if stop() {
         return Err(stopped());
     }
-    // From here on it can be corrected, even if no pose is found.
-    corrections.write(folder)?;
-    let stored = stored::Stored::new(folder, &pictures);
+    let begins: Vec<write::Begin> = clips.iter().map(|c| write::Begin { from: c.selection.from }).collect();
+    let masks = match &request.masks {
+        Some(from) => write::masks(folder, from, &pictures, &begins, progress, stop)?,
+        None => Vec::new(),
+    };
+    if request.colmap {
+        let bare = stored::Stored::new(folder, &pictures, &[], &masks);
+        let found = colmap::calibrate(&bare, progress, stop)?;
+        // It saw the stored pictures.
+        let seen: Vec<Video<'_>> = pictures.iter().map(|p| Video { name: &p.name, size: p.size }).collect();
+        let found = given::Given::of(&found, &seen, "the COLMAP program")?;
+        report.guesses.extend(found.notes.iter().cloned());
+        given = Some(found);
+    }
+    let known = given::known(given.as_ref(), &corrections, &pictures)?;
+    let stored = stored::Stored::new(folder, &pictures, &known, &masks);
     let mut evidence = heard;
     if pictures.len() > 1 && !moving && clock.offsets.iter().any(Option::is_none) {
-        evidence.extend(clocks::by_motion(&stored, &clock, progress, &mut report)?);
+        evidence.extend(clocks::by_motion(&stored, &clock, &cache, progress, &mut report)?);
+    }
+    if stored.posed() && pictures.len() > 1 && told.iter().any(Option::is_none) {
+        let rough = clocks::solve(&cameras, &evidence, &told);
+        evidence.extend(geometry::by_geometry(&stored, &rough, &cache, progress)?);
     }
     let clock = clocks::solve(&cameras, &evidence, &told);
     report.refused = clocks::refusals(&names_of(&pictures), &evidence, &clock);
-    let solved = if moving {
-        poses::walking(&stored, MOST_WALKING, progress)?
-    } else {
-        poses::standing(&stored, clock, &told, progress, stop)?
-    };
+    let about = format!("{moving} {told:?} {:?}", clock.offsets);
+    let solved = poses::once(&cache, &stored, &about, || {
+        if moving {
+            poses::walking(&stored, MOST_WALKING, progress)
+        } else {
+            poses::standing(&stored, clock, &told, progress, stop)
+        }
+    })?;
     if stop() {
         return Err(stopped());
     }
-    finish(request, &pictures, solved, &mut corrections, report)
+    let found = Found { pictures: &pictures, masks: &masks, given, solved };
+    finish(request, found, &mut corrections, report)
+}
+
+/// All that was found.
+struct Found<'a> {
+    pictures: &'a [Pictures],
+    masks: &'a [Masks],
+    given: Option<given::Given>,
+    solved: poses::Solved,
 }
 
 fn names_of(pictures: &[Pictures]) -> Vec<&str> {
@@ -180,12 +243,63 @@ fn check(solved: &poses::Solved, pictures: &[Pictures], report: &mut Report) -> 
         report.guesses.push(format!("Only {placed} of {asked} {what} could be placed; the rest is left out."));
     }
     if solved.points.len() < FEW_POINTS {
+        let given = !solved.contradiction.is_empty();
+        let what = if given {
+            "were found on the given poses: cameras see little in common, and training looks for more."
+        } else {
+            "hold the cameras together: look at the result before you trust it."
+        };
+        report.guesses.push(format!("Only {} points {what}", solved.points.len()));
+    }
+    Ok(())
+}
+
+/// Compares what was given with what pictures show, and refuses what they contradict.
+fn agrees(solved: &poses::Solved, pictures: &[Pictures], report: &mut Report) -> Result<()> {
+    let (mut told, mut wrong) = (Vec::new(), 0);
+    for (k, p) in pictures.iter().enumerate() {
+        let Some(off) = solved.contradiction.get(k).copied().flatten() else { continue };
+        told.push(off);
+        report.cameras[k].calibration = Some(off);
+        if off > CONTRADICTS * pixel_unit(p.size) {
+            wrong += 1;
+            report.cameras[k].warnings.push(format!(
+                "what it shows lies {off:.1} px beside where the calibration says: it was moved or focussed anew, or the \
+                 calibration is another camera's"
+            ));
+        }
+    }
+    if told.len() < pictures.len() {
+        let silent =
+            pictures.iter().zip(&solved.contradiction).filter(|(_, c)| c.is_none()).map(|(p, _)| p.name.as_str());
         report.guesses.push(format!(
-            "Only {} points hold the cameras together: look at the result before you trust it.",
-            solved.points.len()
+            "Whether the calibration fits was not checked, for too few features are seen by two cameras: {}.",
+            silent.collect::<Vec<_>>().join(", ")
+        ));
+    }
+    if told.len() >= 2 && wrong as f64 > CONTRADICTED * told.len() as f64 {
+        told.sort_by(f64::total_cmp);
+        return Err(Error::input(format!(
+            "the calibration contradicts the pictures: what {wrong} of {} cameras show lies {:.0} px at the median beside where \
+             it says",
+            told.len(),
+            told[told.len() / 2]
+        ))
+        .remedy(
+            "Is it of this take, are videos named as their cameras, and were they neither cut nor turned? Without \
+             --calibration, poses are found in the pictures.",
         ));
     }
     Ok(())
+}
+
+/// The axis that a direction is near to, and its name.
+fn along_axis(up: [f64; 3]) -> Option<([f64; 3], String)> {
+    let k = (0..3).max_by(|&a, &b| up[a].abs().total_cmp(&up[b].abs()))?;
+    let mut axis = [0.0; 3];
+    axis[k] = up[k].signum();
+    let sign = if up[k] > 0.0 { "+" } else { "-" };
+    (up[k].abs() > ALONG_AXIS).then(|| (axis, format!("{sign}{}", ["x", "y", "z"][k])))
 }
 
 /// Opens all inputs; no file twice.
@@ -210,29 +324,37 @@ fn open(request: &Request) -> Result<Vec<Camera>> {
 }
 
 /// Writes points, capture, corrections and report.
-fn finish(
-    request: &Request,
-    pictures: &[Pictures],
-    mut solved: poses::Solved,
-    corrections: &mut Corrections,
-    mut report: Report,
-) -> Result<Report> {
+fn finish(request: &Request, found: Found<'_>, corrections: &mut Corrections, mut report: Report) -> Result<Report> {
     let folder = &request.folder;
+    let Found { pictures, masks, given, mut solved } = found;
+    let posed = given.as_ref().is_some_and(|g| g.posed);
+    if let Some(points) = given.and_then(|g| g.points).filter(|_| solved.points.len() < FEW_POINTS) {
+        solved.take_points(&points);
+        report.guesses.push("Points are the calibration's: too few were found in these pictures.".into());
+    }
     match &request.apart {
         Some((pair, metres)) => solved.scale_to(pictures, pair, *metres)?,
-        None => report.guesses.push(
-            "The unit of length is the median distance of the cameras from what they see: tell two cameras' distance \
-             (--apart A,B=METRES) for metres."
-                .into(),
-        ),
+        None if posed && !request.colmap => {}
+        None => report.guesses.push(format!(
+            "The unit of length is {}: tell two cameras' distance (--apart A,B=METRES) for metres.",
+            if request.colmap { "COLMAP's" } else { "the median distance of the cameras from what they see" }
+        )),
     }
-    report.guesses.push("Upwards is what most cameras hold upwards.".into());
+    // COLMAP's own axes are those of some camera.
+    let axis = along_axis(solved.up).filter(|_| posed && !request.colmap);
+    match axis {
+        Some((axis, name)) => {
+            solved.up = axis;
+            report.guesses.push(format!("Upwards is {name} of the calibration, which most cameras hold upwards."));
+        }
+        None => report.guesses.push("Upwards is what most cameras hold upwards.".into()),
+    }
     let mut placed = Vec::new();
     for (k, (camera, p)) in solved.cameras.iter().zip(pictures).enumerate() {
         let row = CameraReport::of(p, camera, solved.offsets.get(k).and_then(Option::as_ref));
         report.cameras.push(row);
         if let Ok(stand) = camera {
-            placed.push(stand.written(p, solved.offset(k)));
+            placed.push(stand.written(p, solved.offset(k), masks.get(k).cloned()));
             if let Some(own) = corrections.cameras.iter_mut().find(|c| c.name == p.name) {
                 if let Some(offset) = solved.offsets.get(k).and_then(Option::as_ref) {
                     own.found_offset(offset);
@@ -243,14 +365,18 @@ fn finish(
         }
     }
     corrections.write(folder)?;
+    let contradicted = posed.then(|| agrees(&solved, pictures, &mut report)).transpose();
     report.write(folder)?;
+    contradicted?;
     check(&solved, pictures, &mut report)?;
-    let points = PathBuf::from("points.ply");
-    splat4d_train::run::checkpoint::write_atomically(
-        &folder.join(&points),
-        &solved.cloud().to_ply("comment points of import"),
-    )?;
-    let take = Take { name: None, up: Some(solved.up), points: Some(points), ..Take::default() };
+    let mut points = None;
+    if !solved.points.is_empty() {
+        let file = PathBuf::from("points.ply");
+        let bytes = solved.cloud().to_ply("comment points of import");
+        splat4d_train::run::checkpoint::write_atomically(&folder.join(&file), &bytes)?;
+        points = Some(file);
+    }
+    let take = Take { name: None, up: Some(solved.up), points, ..Take::default() };
     report.capture = write::capture(folder, &take, &placed)?;
     report.points = solved.points.len();
     report.write(folder)?;

@@ -1,13 +1,16 @@
 //! Where the cameras are and when: clocks and poses need each other, and are solved in turn until both rest.
 
+use super::cache::Cache;
 use super::stored::Stored;
 use crate::sfm::pictures::Pictures as _;
 use crate::sfm::{self, Options, Solution};
 use crate::sync::graph::{self, Kind, Offset};
-use crate::write::{Pictures, Placed, Poses};
-use crate::{Error, Result};
+use crate::write::{Masks, Pictures, Placed, Poses};
+use crate::{Error, ErrorKind, Result};
+use serde::{Deserialize, Serialize};
 use splat4d::math::Se3;
 use splat4d::math::se3::{norm, sub};
+use splat4d::scene::{Intrinsics, Lens};
 use splat4d_train::capture::PointCloud;
 use splat4d_train::event::Progress;
 
@@ -32,7 +35,9 @@ pub(super) struct Stand {
     pub poses: Vec<Option<Se3>>,
     /// One pose for all frames.
     pub fixed: bool,
-    pub lens: sfm::lens::Lens,
+    /// Pixels of the stored pictures.
+    pub intrinsics: Intrinsics,
+    pub lens: Lens,
     pub sightings: usize,
     /// Pixels of the stored pictures.
     pub error: f64,
@@ -46,6 +51,109 @@ pub(super) struct Solved {
     pub points: Vec<([f64; 3], [u8; 3])>,
     pub up: [f64; 3],
     pub moving: bool,
+    /// See [`sfm::Solution::contradiction`].
+    pub contradiction: Vec<Option<f64>>,
+}
+
+/// A solution as it is stored; of lenses that were given nothing.
+#[derive(Serialize, Deserialize)]
+struct Note {
+    cameras: Vec<Result<Row, String>>,
+    offsets: Vec<Option<Offset>>,
+    points: Vec<([f64; 3], [u8; 3])>,
+    up: [f64; 3],
+    moving: bool,
+    contradiction: Vec<Option<f64>>,
+}
+
+#[derive(Serialize, Deserialize)]
+struct Row {
+    /// Rotation row by row, then translation.
+    poses: Vec<Option<[f64; 12]>>,
+    fixed: bool,
+    /// fx fy cx cy.
+    intrinsics: [f64; 4],
+    /// k1 to k6, p1, p2; what is found has no other terms.
+    brown: Option<[f64; 8]>,
+    sightings: usize,
+    error: f64,
+}
+
+impl Note {
+    fn of(solved: &Solved) -> Self {
+        let numbers = |p: &Se3| -> [f64; 12] {
+            let r = p.rotation.as_flattened();
+            std::array::from_fn(|k| if k < 9 { r[k] } else { p.translation[k - 9] })
+        };
+        let row = |s: &Stand| {
+            let Intrinsics { fx, fy, cx, cy } = s.intrinsics;
+            let brown = match &s.lens {
+                Lens::Brown { k, p, .. } => Some([k[0], k[1], k[2], k[3], k[4], k[5], p[0], p[1]]),
+                _ => None,
+            };
+            Row {
+                poses: s.poses.iter().map(|p| p.as_ref().map(numbers)).collect(),
+                fixed: s.fixed,
+                intrinsics: [fx, fy, cx, cy],
+                brown,
+                sightings: s.sightings,
+                error: s.error,
+            }
+        };
+        Self {
+            cameras: solved.cameras.iter().map(|c| c.as_ref().map(row).map_err(Clone::clone)).collect(),
+            offsets: solved.offsets.clone(),
+            points: solved.points.clone(),
+            up: solved.up,
+            moving: solved.moving,
+            contradiction: solved.contradiction.clone(),
+        }
+    }
+
+    fn solved(self, stored: &Stored<'_>) -> Solved {
+        let pose = |n: [f64; 12]| Se3 {
+            rotation: std::array::from_fn(|i| std::array::from_fn(|k| n[3 * i + k])),
+            translation: [n[9], n[10], n[11]],
+        };
+        let stand = |(c, row): (usize, Result<Row, String>)| {
+            row.map(|r| {
+                let [fx, fy, cx, cy] = r.intrinsics;
+                let lens = r.brown.map_or(Lens::Pinhole, |b| Lens::Brown {
+                    k: std::array::from_fn(|i| b[i]),
+                    p: [b[6], b[7]],
+                    s: [0.0; 4],
+                });
+                let given = stored.known(c);
+                Stand {
+                    poses: r.poses.into_iter().map(|p| p.map(pose)).collect(),
+                    fixed: r.fixed,
+                    intrinsics: given.map_or(Intrinsics { fx, fy, cx, cy }, |g| g.intrinsics),
+                    lens: given.map_or(lens, |g| g.lens),
+                    sightings: r.sightings,
+                    error: r.error,
+                }
+            })
+        };
+        Solved {
+            cameras: self.cameras.into_iter().enumerate().map(stand).collect(),
+            offsets: self.offsets,
+            points: self.points,
+            up: self.up,
+            moving: self.moving,
+            contradiction: self.contradiction,
+        }
+    }
+}
+
+/// What was solved before of the same pictures, clocks and lenses, else what `solve` finds now.
+pub(super) fn once(
+    cache: &Cache,
+    stored: &Stored<'_>,
+    clock: &str,
+    solve: impl FnOnce() -> Result<Solved>,
+) -> Result<Solved> {
+    let made_of = format!("{} {clock}", stored.fingerprint());
+    Ok(cache.or("solved", &made_of, || Ok(Note::of(&solve()?)))?.solved(stored))
 }
 
 /// Places cameras that stand still, and refines their clocks.
@@ -75,7 +183,10 @@ pub(super) fn standing(
             break;
         }
         let moved = refined(&solution, &mut current, &mut offsets, told, frame);
-        if moved < RESTED * frame || round == ROUNDS || stop() {
+        if stop() {
+            return Err(Error::new(ErrorKind::Interrupted, "stopped").remedy("The same command goes on from there."));
+        }
+        if moved < RESTED * frame || round == ROUNDS {
             break;
         }
     }
@@ -89,16 +200,15 @@ pub(super) fn standing(
     }
     let placed = |c: usize| {
         let taken = solution.taken.iter().find(|t| t.camera == c).expect("every camera is a sight");
-        taken.placed.clone().map(|p| Stand {
-            poses: vec![Some(p.pose)],
-            fixed: true,
-            lens: p.lens,
-            sightings: p.sightings,
-            error: p.error,
+        taken.placed.clone().map(|p| {
+            let (intrinsics, lens) = optics(stored, c, &p.lens);
+            let poses = vec![Some(p.pose)];
+            Stand { poses, fixed: true, intrinsics, lens, sightings: p.sightings, error: p.error }
         })
     };
     let cameras = (0..n).map(placed).collect();
-    Ok(Solved { cameras, offsets, points: points_of(&solution), up: solution.up, moving: false })
+    let (points, contradiction) = (points_of(&solution), solution.contradiction);
+    Ok(Solved { cameras, offsets, points, up: solution.up, moving: false, contradiction })
 }
 
 /// Adds what geometry found to the clocks; by how many seconds the one moved that moved most.
@@ -111,9 +221,7 @@ fn refined(
 ) -> f64 {
     let n = current.len();
     let mut seen = vec![0; n];
-    for point in solution.points.iter().filter(|p| p.moment != 0) {
-        point.seen.iter().for_each(|&t| seen[solution.taken[t].camera] += 1);
-    }
+    solution.taken.iter().zip(&solution.moving).for_each(|(t, moving)| seen[t.camera] += moving);
     let tau = |c: usize| {
         let taken = solution.taken.iter().find(|t| t.camera == c)?;
         taken.placed.as_ref().ok().filter(|_| seen[c] >= MOVING_POINTS).map(|p| p.tau)
@@ -167,8 +275,10 @@ pub(super) fn walking(stored: &Stored<'_>, most: usize, progress: &mut Progress<
     for taken in &solution.taken {
         let Ok(placed) = &taken.placed else { continue };
         let shots = stored.pictures[taken.camera].shots.len();
-        let fresh =
-            || Stand { poses: vec![None; shots], fixed: false, lens: placed.lens, sightings: 0, error: placed.error };
+        let fresh = || {
+            let (intrinsics, lens) = optics(stored, taken.camera, &placed.lens);
+            Stand { poses: vec![None; shots], fixed: false, intrinsics, lens, sightings: 0, error: placed.error }
+        };
         if cameras[taken.camera].is_err() {
             cameras[taken.camera] = Ok(fresh());
         }
@@ -179,7 +289,21 @@ pub(super) fn walking(stored: &Stored<'_>, most: usize, progress: &mut Progress<
         }
     }
     let offsets = vec![None; stored.cameras()];
-    Ok(Solved { cameras, offsets, points: points_of(&solution), up: solution.up, moving: true })
+    Ok(Solved {
+        cameras,
+        offsets,
+        points: points_of(&solution),
+        up: solution.up,
+        moving: true,
+        contradiction: Vec::new(),
+    })
+}
+
+/// The lens that was given, else the one that was found.
+fn optics(stored: &Stored<'_>, camera: usize, found: &sfm::lens::Lens) -> (Intrinsics, Lens) {
+    let [width, height] = stored.pictures[camera].size;
+    let found = found.camera(Se3::IDENTITY, width, height);
+    stored.known(camera).map_or((found.intrinsics, found.lens), |k| (k.intrinsics, k.lens))
 }
 
 fn points_of(solution: &Solution) -> Vec<([f64; 3], [u8; 3])> {
@@ -218,6 +342,12 @@ impl Solved {
         Ok(())
     }
 
+    /// Takes points from elsewhere, of the same world.
+    pub(super) fn take_points(&mut self, cloud: &PointCloud) {
+        let color = |c: &[f32; 3]| c.map(|v| (v * 255.0).round().clamp(0.0, 255.0) as u8);
+        self.points = cloud.points.iter().zip(&cloud.colors).map(|(p, c)| (*p, color(c))).collect();
+    }
+
     pub(super) fn cloud(&self) -> PointCloud {
         PointCloud {
             points: self.points.iter().map(|p| p.0).collect(),
@@ -229,13 +359,11 @@ impl Solved {
 
 impl Stand {
     /// As it is written.
-    pub(super) fn written(&self, pictures: &Pictures, offset: Offset) -> Placed {
-        let [width, height] = pictures.size;
-        let camera = self.lens.camera(Se3::IDENTITY, width, height);
+    pub(super) fn written(&self, pictures: &Pictures, offset: Offset, masks: Option<Masks>) -> Placed {
         let poses = match &self.poses[..] {
             [Some(pose)] if self.fixed => Poses::Fixed(*pose),
             all => Poses::Moving(all.to_vec()),
         };
-        Placed { pictures: pictures.clone(), offset, intrinsics: camera.intrinsics, lens: camera.lens, poses }
+        Placed { pictures: pictures.clone(), offset, intrinsics: self.intrinsics, lens: self.lens, poses, masks }
     }
 }

@@ -55,6 +55,8 @@ pub struct CameraReport {
     pub error: Option<f64>,
     /// Focal length, pixels.
     pub focal: Option<f64>,
+    /// How far what it shows lies from where the calibration says, pixels; none: there is none, or too few matches tell.
+    pub calibration: Option<f64>,
     /// What was odd about its file.
     pub warnings: Vec<String>,
 }
@@ -73,8 +75,9 @@ impl CameraReport {
             by: offset.map_or_else(Vec::new, |o| o.kinds.iter().map(|k| k.name()).collect()),
             trouble: placed.as_ref().err().cloned(),
             sightings: stand.map_or(0, |s| s.sightings),
-            error: stand.map(|s| s.error),
-            focal: stand.map(|s| s.lens.focal),
+            error: stand.filter(|s| s.sightings > 0).map(|s| s.error),
+            focal: stand.map(|s| s.intrinsics.fx),
+            calibration: None,
             warnings: pictures.warnings.clone(),
         }
     }

@@ -1,9 +1,11 @@
 //! The stored pictures as structure from motion asks for them.
 
 use crate::sfm;
+use crate::sfm::known::Known;
 use crate::sync::graph::Offset;
-use crate::write::Pictures;
+use crate::write::{Masks, Pictures};
 use crate::{Error, Result};
+use rayon::prelude::*;
 use splat4d::scene::Planes;
 use splat4d_train::capture::Rgb8;
 use std::path::Path;
@@ -13,16 +15,60 @@ pub(super) struct Stored<'a> {
     pub folder: &'a Path,
     pub pictures: &'a [Pictures],
     pub offsets: Vec<Option<Offset>>,
+    /// Lenses, and places, that were given.
+    pub known: &'a [Option<Known>],
+    /// What of pictures counts; empty: all of it.
+    pub masks: &'a [Masks],
 }
 
 impl<'a> Stored<'a> {
-    pub(super) fn new(folder: &'a Path, pictures: &'a [Pictures]) -> Self {
-        Self { folder, pictures, offsets: vec![None; pictures.len()] }
+    pub(super) fn new(
+        folder: &'a Path,
+        pictures: &'a [Pictures],
+        known: &'a [Option<Known>],
+        masks: &'a [Masks],
+    ) -> Self {
+        Self { folder, pictures, offsets: vec![None; pictures.len()], known, masks }
     }
 
     /// The same pictures on another clock.
     pub(super) fn on(&self, offsets: &[Option<Offset>]) -> Self {
         Self { offsets: offsets.to_vec(), ..*self }
+    }
+
+    /// What was given of a camera.
+    pub(super) fn known(&self, camera: usize) -> Option<Known> {
+        self.known.get(camera).copied().flatten()
+    }
+
+    /// Whether all places were given.
+    pub(super) fn posed(&self) -> bool {
+        !self.known.is_empty() && self.known.iter().all(|k| k.is_some_and(|k| k.pose.is_some()))
+    }
+
+    /// Changes with pictures, masks, and what was given of cameras.
+    pub(super) fn fingerprint(&self) -> String {
+        let prints: Vec<&str> = self.pictures.iter().map(|p| p.fingerprint.as_str()).collect();
+        let masks: Vec<u64> = self.masks.iter().map(|m| m.fingerprint).collect();
+        format!("{prints:?} {masks:?} {:?}", self.known)
+    }
+
+    /// What stands still: the median of some frames, each made into what is worked with.
+    pub(super) fn median(&self, camera: usize, made: impl Fn(Rgb8) -> Rgb8 + Sync) -> Result<Rgb8> {
+        /// Frames over the take.
+        const SPREAD: usize = 15;
+        let count = self.pictures[camera].shots.len();
+        let kept = count.min(SPREAD);
+        let chosen: Vec<usize> = (0..kept).map(|k| (2 * k + 1) * count / (2 * kept)).collect();
+        let all: Vec<Rgb8> = chosen.par_iter().map(|&k| Ok(made(self.rgb(camera, k)?))).collect::<Result<_>>()?;
+        let mut still = all[0].clone();
+        let mut values = vec![0u8; all.len()];
+        for (p, v) in still.data.iter_mut().enumerate() {
+            values.iter_mut().zip(&all).for_each(|(v, a)| *v = a.data[p]);
+            let half = values.len() / 2;
+            *v = *values.select_nth_unstable(half).1;
+        }
+        Ok(still)
     }
 
     pub(super) fn rgb(&self, camera: usize, frame: usize) -> Result<Rgb8> {
@@ -46,6 +92,18 @@ impl sfm::pictures::Pictures for Stored<'_> {
     fn time(&self, camera: usize, frame: usize) -> f64 {
         let time = self.pictures[camera].shots[frame].time;
         self.offsets[camera].as_ref().map_or(time, |o| o.global(time))
+    }
+
+    fn known(&self, camera: usize) -> Option<Known> {
+        Stored::known(self, camera)
+    }
+
+    fn mask(&self, camera: usize, frame: usize) -> Result<Option<Planes<f32>>> {
+        let Some(masks) = self.masks.get(camera) else { return Ok(None) };
+        let mask = Rgb8::read(&self.folder.join(&masks.files[frame]))?;
+        let mut out = Planes::new(1, mask.height, mask.width);
+        out.data.iter_mut().zip(mask.data.chunks_exact(3)).for_each(|(v, p)| *v = f32::from(p[0]) / 255.0);
+        Ok(Some(out))
     }
 
     fn load(&self, camera: usize, frame: usize) -> Result<Planes<f32>> {

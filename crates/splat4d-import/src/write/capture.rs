@@ -1,6 +1,6 @@
 //! `capture.json`: what the pictures are, where they were taken from and when.
 
-use super::Pictures;
+use super::{Masks, Pictures};
 use crate::sync::graph::Offset;
 use serde_json::{Map, Value, json};
 use splat4d::math::Se3;
@@ -34,6 +34,8 @@ pub struct Placed {
     pub lens: Lens,
     /// Where it was.
     pub poses: Poses,
+    /// What of its pictures counts.
+    pub masks: Option<Masks>,
 }
 
 /// What is known of the whole take.
@@ -89,7 +91,7 @@ pub fn capture(folder: &Path, take: &Take, cameras: &[Placed]) -> Result<PathBuf
 }
 
 fn camera(camera: &Placed) -> Result<Value> {
-    let Placed { pictures, offset, intrinsics, lens, poses } = camera;
+    let Placed { pictures, offset, intrinsics, lens, poses, masks } = camera;
     let place = |e: Error| e.at(format!("camera {}", pictures.name));
     if pictures.shots.is_empty() {
         return Err(place(Error::input("there are no pictures of it").remedy("Leave the camera out.")));
@@ -130,7 +132,7 @@ fn camera(camera: &Placed) -> Result<Value> {
     } else {
         json!(known.iter().map(|&k| pictures.file(k).to_string_lossy().replace('\\', "/")).collect::<Vec<_>>())
     };
-    Ok(json!({
+    let mut out = json!({
         "name": pictures.name,
         "width": pictures.size[0],
         "height": pictures.size[1],
@@ -144,5 +146,10 @@ fn camera(camera: &Placed) -> Result<Value> {
         "times": times,
         "images": images,
         "frames": known.len(),
-    }))
+    });
+    if let Some(masks) = masks {
+        let path = |&k: &usize| masks.files[k].to_string_lossy().replace('\\', "/");
+        out["masks"] = json!(known.iter().map(path).collect::<Vec<_>>());
+    }
+    Ok(out)
 }

@@ -4,9 +4,11 @@
 //! written under another name and renamed, and [`pictures`] notes beside them what they were made of.
 
 mod capture;
+mod masks;
 mod pictures;
 
 pub use capture::{Placed, Poses, Take, capture};
+pub use masks::{Begin, Masks, masks};
 pub use pictures::{Clip, Format, Pictures, Shot, camera_names, pictures};
 
 #[cfg(test)]

@@ -98,6 +98,8 @@ pub struct Pictures {
     pub clock: Clock,
     /// What was odd, a sentence or two each.
     pub warnings: Vec<String>,
+    /// Changes with everything that the pictures were made of.
+    pub fingerprint: String,
 }
 
 impl Pictures {
@@ -261,6 +263,7 @@ impl Note {
             shots: self.shots.clone(),
             clock,
             warnings: self.warnings.clone(),
+            fingerprint: self.fingerprint.clone(),
         }
     }
 }

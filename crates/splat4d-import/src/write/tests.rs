@@ -111,6 +111,55 @@ fn names_of_cameras_are_names_of_folders() {
 }
 
 #[test]
+fn masks_are_stored_beside_their_pictures() {
+    let (_folder, sources) = rig();
+    let out = tempfile::tempdir().unwrap();
+    let half = Selection { every: 2, ..Selection::default() };
+    let stored = store(out.path(), &clips(&sources, &half), usize::MAX).unwrap();
+    let from = tempfile::tempdir().unwrap();
+    let gray = |value: u8, width: u32, height: u32, name: &str| {
+        let path = from.path().join(name);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        image::GrayImage::from_pixel(width, height, image::Luma([value])).save(path).unwrap();
+    };
+    let begins = [Begin { from: None }; 2];
+    let make =
+        |begins: &[Begin]| masks(out.path(), from.path(), &stored, begins, &mut Progress(&mut |_| ()), &|| false);
+    // One for the whole take; one for each frame of the video, of another size.
+    gray(1, 32, 24, "cam_0.png");
+    (0..10).for_each(|n| gray(20 * n, 64, 48, &format!("cam_1/m{n:02}.png")));
+    let why = make(&begins).unwrap_err().to_string();
+    assert!(why.contains("camera cam_1") && why.contains("10 masks") && why.contains("frame 10"), "{why}");
+    gray(200, 64, 48, "cam_1/m10.png");
+    let found = make(&begins).unwrap();
+    assert_eq!((found[0].files.len(), found[1].files.len()), (stored[0].shots.len(), stored[1].shots.len()));
+    let value = |file: &Path| {
+        let mask = image::open(out.path().join(file)).unwrap().to_luma8();
+        assert_eq!((mask.width(), mask.height()), (32, 24));
+        mask.get_pixel(5, 5).0[0]
+    };
+    assert_eq!(value(&found[0].files[7]), 255, "ones are white");
+    let values: Vec<u8> = found[1].files.iter().map(|f| value(f)).collect();
+    assert_eq!(values, [0, 40, 80, 120, 160, 200]);
+    // From some second on, frames were not counted: times tell them.
+    let late: Vec<Pictures> = stored
+        .iter()
+        .cloned()
+        .map(|mut p| {
+            p.shots.iter_mut().for_each(|s| s.number = 0);
+            p
+        })
+        .collect();
+    let begins = [Begin { from: Some(0.1) }; 2];
+    let again = masks(out.path(), from.path(), &late, &begins, &mut Progress(&mut |_| ()), &|| false).unwrap();
+    assert_eq!(again, found);
+    gray(9, 50, 24, "cam_0.png");
+    assert!(make(&begins).unwrap_err().to_string().contains("50x24"));
+    std::fs::remove_file(from.path().join("cam_0.png")).unwrap();
+    assert!(make(&begins).unwrap_err().to_string().contains("has no masks"));
+}
+
+#[test]
 fn the_capture_is_read_as_it_was_meant() {
     let (_folder, sources) = rig();
     let out = tempfile::tempdir().unwrap();
@@ -127,8 +176,16 @@ fn the_capture_is_read_as_it_was_meant() {
             intrinsics,
             lens,
             poses: Poses::Fixed(pose(0.0)),
+            masks: None,
         },
-        Placed { pictures: stored[1].clone(), offset: offset(-0.0125, 1e-4), intrinsics, lens, poses: moving },
+        Placed {
+            pictures: stored[1].clone(),
+            offset: offset(-0.0125, 1e-4),
+            intrinsics,
+            lens,
+            poses: moving,
+            masks: None,
+        },
     ];
     let take = Take { up: Some([0.0, -1.0, 0.0]), hold_out: vec!["cam_1".into()], ..Take::default() };
     capture(out.path(), &take, &cameras).unwrap();

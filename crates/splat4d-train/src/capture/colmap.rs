@@ -27,27 +27,9 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
     let fps = options.fps.unwrap_or(DEFAULT_FPS);
     let mut warnings = Vec::new();
     let (folder, registered) = best_model(marker, &mut warnings)?;
-    let optics = colmap_files::cameras(&folder)?;
     let points = colmap_files::points(&folder)?;
     let base = image_folder(root, &registered);
-    let mut shots = Vec::new();
-    for picture in &registered {
-        let place = |e: Error| e.at(format!("{}: picture {:.200}", folder.display(), picture.name));
-        let camera = optics.get(&picture.camera).ok_or_else(|| {
-            place(Error::input(format!("its camera {} is not in the cameras file", picture.camera)))
-                .remedy("Export the reconstruction again.")
-        })?;
-        let cam_from_world = pose_of(picture).map_err(place)?;
-        let source = Camera {
-            cam_from_world,
-            intrinsics: camera.intrinsics,
-            lens: camera.lens,
-            width: camera.width,
-            height: camera.height,
-            near: Camera::NEAR,
-        };
-        shots.push((picture.name.clone(), source));
-    }
+    let mut shots = sources(&folder, &registered)?;
     let listed = shots.len();
     add_siblings(&base, &mut shots);
     if shots.len() == listed {
@@ -89,6 +71,39 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         warnings,
         notes,
     })
+}
+
+/// A picture's name and its camera.
+pub(super) type Shot = (String, Camera);
+
+/// Name and camera of every registered picture.
+fn sources(folder: &Path, registered: &[Registered]) -> Result<Vec<Shot>> {
+    let optics = colmap_files::cameras(folder)?;
+    let mut shots = Vec::with_capacity(registered.len());
+    for picture in registered {
+        let place = |e: Error| e.at(format!("{}: picture {:.200}", folder.display(), picture.name));
+        let camera = optics.get(&picture.camera).ok_or_else(|| {
+            place(Error::input(format!("its camera {} is not in the cameras file", picture.camera)))
+                .remedy("Export the reconstruction again.")
+        })?;
+        let cam_from_world = pose_of(picture).map_err(place)?;
+        let source = Camera {
+            cam_from_world,
+            intrinsics: camera.intrinsics,
+            lens: camera.lens,
+            width: camera.width,
+            height: camera.height,
+            near: Camera::NEAR,
+        };
+        shots.push((picture.name.clone(), source));
+    }
+    Ok(shots)
+}
+
+/// The registered pictures of the largest model in a folder, and its points; no picture is looked at.
+pub(super) fn shots(folder: &Path) -> Result<(Vec<Shot>, Option<PointCloud>)> {
+    let (folder, registered) = best_model(folder, &mut Vec::new())?;
+    Ok((sources(&folder, &registered)?, cloud(&colmap_files::points(&folder)?)))
 }
 
 /// Whether a folder is a model, or holds some.

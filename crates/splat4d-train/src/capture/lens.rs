@@ -20,7 +20,7 @@ const TOLERANCE: f64 = 1e-10;
 ///
 /// Sources: OpenCV's camera model (Brown 1966; rational and thin-prism terms); Kannala and Brandt 2006.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Distortion {
+pub struct Distortion {
     lens: Lens,
     /// Largest x/z-radius (Brown) or angle in radians (fisheye) that is still imaged.
     limit: f64,
@@ -28,7 +28,7 @@ pub(crate) struct Distortion {
 
 impl Distortion {
     /// Prepares a lens: finds where it folds.
-    pub(crate) fn new(lens: Lens) -> Self {
+    pub fn new(lens: Lens) -> Self {
         let limit = match lens {
             Lens::Brown { k, .. } => first_fold(MAX_RADIUS, |r| brown_slope(&k, r)),
             Lens::Fisheye { k } => first_fold(MAX_ANGLE, |theta| fisheye_slope(&k, theta)),
@@ -43,7 +43,7 @@ impl Distortion {
     }
 
     /// Where the ray (x, y, 1) lands on the normalised sensor; `None` beyond the fold.
-    pub(crate) fn distort(&self, [x, y]: [f64; 2]) -> Option<[f64; 2]> {
+    pub fn distort(&self, [x, y]: [f64; 2]) -> Option<[f64; 2]> {
         let r = x.hypot(y);
         match self.lens {
             Lens::Brown { k, p, s } => {
@@ -64,7 +64,7 @@ impl Distortion {
 
     /// The ray (x, y, 1) that lands on a point of the normalised sensor; `None` where no ray before the fold does (for
     /// fisheyes also where the ray is 90° or more off the axis).
-    pub(crate) fn undistort(&self, target: [f64; 2]) -> Option<[f64; 2]> {
+    pub fn undistort(&self, target: [f64; 2]) -> Option<[f64; 2]> {
         match self.lens {
             Lens::Brown { k, p, s } => self.undistort_brown(&k, &p, &s, target),
             Lens::Fisheye { k } => {

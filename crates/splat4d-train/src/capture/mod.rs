@@ -22,6 +22,7 @@ mod panoptic;
 mod picture;
 mod points;
 mod pose;
+mod posed;
 mod preflight;
 mod rgb8;
 mod rig;
@@ -30,8 +31,10 @@ mod store;
 mod transforms;
 
 pub(crate) use flow::FlowFile;
+pub use lens::Distortion;
 pub use options::{CaptureOptions, CaptureSettings, HoldOut, MAX_POINTS, Sequence};
 pub use points::PointCloud;
+pub use posed::{PosedCamera, check_intrinsics, colmap_cameras, is_colmap, rigid, transforms_cameras};
 pub use preflight::{Finding, Severity};
 pub use rgb8::Rgb8;
 pub use sequence::Timing;

@@ -13,6 +13,7 @@ use super::sequence::{self, Order};
 use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Sequence, Split, Take, colmap};
 use frame::Entry;
 use splat4d::Result;
+use splat4d::scene::Camera;
 use splat4d::scene::time::DEFAULT_FPS;
 use std::path::Path;
 
@@ -84,6 +85,11 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         warnings,
         notes,
     })
+}
+
+/// Names and cameras of all frames of a file; no picture is looked at that states its size.
+pub(super) fn posed_frames(root: &Path, top: &Node<'_>) -> Result<Vec<(String, Camera)>> {
+    top.get("frames")?.list()?.iter().map(|node| frame::posed(root, top, node)).collect()
 }
 
 /// Adds the frames of a file beside. One file with all frames may list them too, for the same purpose or none.

@@ -30,9 +30,23 @@ pub(super) struct Entry {
 pub(super) fn read(root: &Path, top: &Node<'_>, node: &Node<'_>) -> Result<Entry> {
     let name = node.get("file_path")?.text()?;
     let image = image_path(root, name)?;
+    let (source, by_angle) = camera(top, node, &|| Ok(image.clone()))?;
+    let time = node.opt("time")?.map(|n| n.number()).transpose()?;
+    let mask = node.opt("mask_path")?.map(|n| Ok(root.join(n.text()?))).transpose()?;
+    Ok(Entry { name: name.into(), image, source, by_angle, time, mask, split: Split::Train })
+}
+
+/// The name and camera of a frame whose picture need not be there where the size is stated.
+pub(super) fn posed(root: &Path, top: &Node<'_>, node: &Node<'_>) -> Result<(String, Camera)> {
+    let name = node.get("file_path")?.text()?;
+    Ok((name.to_owned(), camera(top, node, &|| image_path(root, name))?.0))
+}
+
+/// Pose, intrinsics and lens, and whether the focal length is an angle of view. `image` is asked where no size is stated.
+fn camera(top: &Node<'_>, node: &Node<'_>, image: &dyn Fn() -> Result<PathBuf>) -> Result<(Camera, bool)> {
     let matrix = node.get("transform_matrix")?;
     let cam_from_world = pose::from_opengl(&matrix.matrix4()?).map_err(|e| matrix.at(e))?;
-    let (width, height) = size(top, node, &image)?;
+    let (width, height) = size(top, node, image)?;
     let fx = focal(top, node, ["fl_x", "camera_angle_x", "x_fov"], width)?;
     let (fx, by_angle) = fx.ok_or_else(|| {
         node.error("neither fl_x nor camera_angle_x is given")
@@ -44,10 +58,7 @@ pub(super) fn read(root: &Path, top: &Node<'_>, node: &Node<'_>) -> Result<Entry
     let intrinsics = Intrinsics { fx, fy, cx, cy };
     pose::check_intrinsics(&intrinsics, width, height).map_err(|e| node.at(e))?;
     let lens = lens(top, node)?;
-    let source = Camera { cam_from_world, intrinsics, lens, width, height, near: Camera::NEAR };
-    let time = node.opt("time")?.map(|n| n.number()).transpose()?;
-    let mask = node.opt("mask_path")?.map(|n| Ok(root.join(n.text()?))).transpose()?;
-    Ok(Entry { name: name.into(), image, source, by_angle, time, mask, split: Split::Train })
+    Ok((Camera { cam_from_world, intrinsics, lens, width, height, near: Camera::NEAR }, by_angle))
 }
 
 /// The frame's own value, else that of the file.
@@ -60,12 +71,12 @@ fn number(top: &Node<'_>, node: &Node<'_>, key: &str) -> Result<Option<f64>> {
 }
 
 /// The size that the intrinsics are for: as it is stated, else the picture's.
-fn size(top: &Node<'_>, node: &Node<'_>, image: &Path) -> Result<(usize, usize)> {
+fn size(top: &Node<'_>, node: &Node<'_>, image: &dyn Fn() -> Result<PathBuf>) -> Result<(usize, usize)> {
     let side = |key: &str| value(top, node, key)?.map(|n| n.count()).transpose();
     if let (Some(width), Some(height)) = (side("w")?, side("h")?) {
         return Ok((width, height));
     }
-    let header = picture::header(image)?;
+    let header = picture::header(&image()?)?;
     Ok((header.width, header.height))
 }
 

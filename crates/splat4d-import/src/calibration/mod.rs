@@ -1,0 +1,319 @@
+//! Calibrations that other programs wrote: lenses, and where cameras stand.
+//!
+//! A dialect is a file here and a line in its list; which one a file is in, its content tells. What a camera is called is
+//! matched with what its video is called ([`assign`]). Everything comes out as the rest of the program has it: `cam_from_world` in
+//! OpenCV axes, pixels whose first centre is at 0.5.
+
+mod capture;
+mod easymocap;
+mod matching;
+mod opencv;
+mod qualisys;
+#[cfg(test)]
+mod tests;
+mod transforms;
+mod tree;
+
+pub use matching::{Video, assign, fitted};
+
+use splat4d::math::Se3;
+use splat4d::math::se3::{norm, sub};
+use splat4d::scene::{Intrinsics, Lens};
+use splat4d::{Error, ErrorKind, Result};
+use splat4d_train::capture::{PointCloud, check_intrinsics, colmap_cameras, is_colmap, rigid};
+use std::path::{Path, PathBuf};
+use tree::Tree;
+
+/// A camera of a calibration.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Calibrated {
+    /// What it is called; the first is its name, others are what its video may be called too.
+    pub names: Vec<String>,
+    /// Pixels across and down of the pictures that it was calibrated with, where that is told.
+    pub size: Option<[usize; 2]>,
+    /// Pixels; the first pixel's centre is at 0.5.
+    pub intrinsics: Intrinsics,
+    /// Distortion.
+    pub lens: Lens,
+    /// Takes world points into the camera's axes; none: only the lens is calibrated.
+    pub pose: Option<Se3>,
+}
+
+/// The unit of a calibration's lengths.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Unit {
+    /// Metres, for the format says so.
+    Metre,
+    /// Whatever it was made with.
+    #[default]
+    Unstated,
+}
+
+/// All cameras of a calibration.
+#[derive(Clone, Debug, Default)]
+pub struct Calibration {
+    /// The dialects it is in.
+    pub dialects: Vec<&'static str>,
+    /// The cameras, in the order of the files.
+    pub cameras: Vec<Calibrated>,
+    /// The unit of lengths.
+    pub unit: Unit,
+    /// Points that come with it.
+    pub points: Option<PointCloud>,
+    /// What was left out or is odd, a sentence each.
+    pub notes: Vec<String>,
+}
+
+/// A text file of a calibration.
+struct Text {
+    path: PathBuf,
+    tree: Tree,
+}
+
+/// What a file says of a camera; two files may share what there is to say.
+#[derive(Clone, Debug, Default)]
+struct Part {
+    names: Vec<String>,
+    size: Option<[usize; 2]>,
+    optics: Option<(Intrinsics, Lens)>,
+    pose: Option<Se3>,
+}
+
+/// What a file says.
+#[derive(Default)]
+struct Said {
+    parts: Vec<Part>,
+    unit: Unit,
+    notes: Vec<String>,
+}
+
+/// A way in which programs write calibrations.
+struct Dialect {
+    /// Its name in messages.
+    name: &'static str,
+    /// Whether a file is in it.
+    reads: fn(&Text) -> bool,
+    read: fn(&Text) -> Result<Said>,
+}
+
+/// The dialects of text files, the most particular first.
+const DIALECTS: [Dialect; 5] =
+    [qualisys::DIALECT, capture::DIALECT, transforms::DIALECT, easymocap::DIALECT, opencv::DIALECT];
+
+/// Longest file that is looked at, bytes: those of a hundred cameras have some hundred thousand.
+const MAX_BYTES: u64 = 64 << 20;
+/// Files of a folder that are looked at, at most.
+const MAX_FILES: usize = 1000;
+
+/// Reads a calibration: a file, or a folder with one, with a file for each camera, or with a COLMAP reconstruction.
+///
+/// Errors: nothing that is known; damage; matrices that are missing or none; a camera twice; lenses that captures cannot have.
+pub fn read(path: &Path) -> Result<Calibration> {
+    let there = std::fs::metadata(path).map_err(|e| {
+        Error::io("the calibration cannot be read", e).at(path.display()).remedy("Check the path behind --calibration.")
+    })?;
+    if there.is_dir() {
+        for folder in [path.to_path_buf(), path.join("sparse")] {
+            if is_colmap(&folder) {
+                return colmap(&folder);
+            }
+        }
+    }
+    let files = if there.is_dir() { files_of(path)? } else { vec![path.to_path_buf()] };
+    let mut out = Calibration { unit: Unit::Metre, ..Calibration::default() };
+    let mut parts: Vec<(Part, PathBuf)> = Vec::new();
+    let mut refused = Vec::new();
+    for file in files {
+        let text = match Text::read(&file) {
+            Ok(text) => text,
+            // Other files may lie in the folder; a file that was named is meant.
+            Err(e) if there.is_dir() => {
+                refused.push(e.to_string());
+                continue;
+            }
+            Err(e) => return Err(e),
+        };
+        let Some(dialect) = DIALECTS.iter().find(|d| (d.reads)(&text)) else {
+            refused.push(format!("{}: it names no cameras", file.display()));
+            continue;
+        };
+        let said = (dialect.read)(&text).map_err(|e| e.at(file.display()))?;
+        if !out.dialects.contains(&dialect.name) {
+            out.dialects.push(dialect.name);
+        }
+        if said.unit == Unit::Unstated {
+            out.unit = Unit::Unstated;
+        }
+        out.notes.extend(said.notes);
+        for part in said.parts {
+            add(&mut parts, part, &file)?;
+        }
+    }
+    if parts.is_empty() {
+        let why = if refused.is_empty() { "the folder is empty".into() } else { refused.join("; ") };
+        return Err(Error::new(ErrorKind::Unsupported, format!("no calibration of cameras is found ({why:.600})"))
+            .at(path.display())
+            .remedy(format!(
+                "Known are: a COLMAP reconstruction, {}; see docs/filming.md.",
+                DIALECTS.map(|d| d.name).join(", ")
+            )));
+    }
+    out.cameras =
+        parts.into_iter().map(|(part, file)| whole(part).map_err(|e| e.at(file.display()))).collect::<Result<_>>()?;
+    alike(&out.cameras).map_err(|e| e.at(path.display()))?;
+    Ok(out)
+}
+
+fn colmap(folder: &Path) -> Result<Calibration> {
+    let (cameras, points) = colmap_cameras(folder)?;
+    let of = |c: splat4d_train::capture::PosedCamera| {
+        let pose = rigid(c.camera.cam_from_world).map_err(|e| e.at(folder.display()))?;
+        Ok(Calibrated {
+            names: vec![c.name],
+            size: Some([c.camera.width, c.camera.height]),
+            intrinsics: c.camera.intrinsics,
+            lens: c.camera.lens,
+            pose: Some(pose),
+        })
+    };
+    let cameras = cameras.into_iter().map(of).collect::<Result<Vec<_>>>()?;
+    Ok(Calibration { dialects: vec!["COLMAP"], cameras, points, ..Calibration::default() })
+}
+
+/// Plain files of a folder that are not hidden, by name.
+fn files_of(folder: &Path) -> Result<Vec<PathBuf>> {
+    let all = std::fs::read_dir(folder).map_err(|e| Error::io("the folder cannot be read", e).at(folder.display()))?;
+    let hidden = |p: &PathBuf| p.file_name().is_some_and(|n| n.to_string_lossy().starts_with('.'));
+    let small = |p: &PathBuf| p.metadata().is_ok_and(|m| m.is_file() && m.len() <= MAX_BYTES);
+    let mut files: Vec<PathBuf> = all.filter_map(|e| e.ok().map(|e| e.path())).collect();
+    files.retain(|p| !hidden(p) && small(p));
+    files.sort();
+    if files.len() > MAX_FILES {
+        return Err(Error::input(format!("there are {} files in it", files.len()))
+            .at(folder.display())
+            .remedy("Give the calibration's file, or a folder with nothing else."));
+    }
+    Ok(files)
+}
+
+impl Text {
+    fn read(path: &Path) -> Result<Self> {
+        let fail = |e| Error::io("cannot be read", e).at(path.display());
+        let length = std::fs::metadata(path).map_err(fail)?.len();
+        if length > MAX_BYTES {
+            return Err(Error::input(format!("it is {length} bytes long: no calibration")).at(path.display()));
+        }
+        let bytes = std::fs::read(path).map_err(fail)?;
+        let tree = String::from_utf8(bytes)
+            .map_err(|_| Error::input("it is no text").remedy("Give the calibration's own file."))
+            .and_then(|body| Tree::parse(&body));
+        Ok(Self { path: path.to_path_buf(), tree: tree.map_err(|e| e.at(path.display()))? })
+    }
+
+    /// The file's name without what many files of one camera are called.
+    fn stem(&self) -> String {
+        let whole = self.path.file_stem().map_or_else(String::new, |n| n.to_string_lossy().into_owned());
+        const WORDS: [&str; 8] =
+            ["intrinsics", "intrinsic", "intri", "extrinsics", "extrinsic", "extri", "calibration", "calib"];
+        let lower = whole.to_lowercase();
+        for word in WORDS {
+            for between in ["_", "-", "."] {
+                if let Some(rest) = lower.strip_suffix(&format!("{between}{word}"))
+                    && !rest.is_empty()
+                    && let Some(name) = whole.get(..rest.len())
+                {
+                    return name.to_owned();
+                }
+            }
+        }
+        whole
+    }
+}
+
+/// Whether two names are one to people.
+fn same_name(a: &str, b: &str) -> bool {
+    a.to_lowercase() == b.to_lowercase()
+}
+
+/// Joins what several files say of a camera.
+fn add(parts: &mut Vec<(Part, PathBuf)>, part: Part, file: &Path) -> Result<()> {
+    let name = part.names.first().cloned().unwrap_or_default();
+    let Some((known, first)) = parts.iter_mut().find(|(p, _)| same_name(&p.names[0], &name)) else {
+        parts.push((part, file.to_path_buf()));
+        return Ok(());
+    };
+    let twice = known.optics.is_some() && part.optics.is_some() || known.pose.is_some() && part.pose.is_some();
+    if twice {
+        let what = if first == file { String::new() } else { format!(" (also in {})", first.display()) };
+        return Err(Error::input(format!("camera {name:.80} is there twice{what}"))
+            .at(file.display())
+            .remedy("Take one out: names tell which video is which camera's."));
+    }
+    known.size = known.size.or(part.size);
+    known.optics = known.optics.or(part.optics);
+    known.pose = known.pose.or(part.pose);
+    Ok(())
+}
+
+/// Sides that are taken where the size is not told, to check focal lengths by.
+const ANY_SIDE: usize = 1;
+
+fn whole(part: Part) -> Result<Calibrated> {
+    let place = |e: Error| e.at(format!("camera {:.80}", part.names[0]));
+    let Some((intrinsics, lens)) = part.optics else {
+        return Err(place(
+            Error::input("its camera matrix is missing").remedy(
+                "Give the file with the lenses too: both files in one folder, and the folder to --calibration.",
+            ),
+        ));
+    };
+    let [width, height] = part.size.unwrap_or([ANY_SIDE; 2]);
+    check_intrinsics(&intrinsics, width, height).map_err(place)?;
+    let pose = part.pose.map(rigid).transpose().map_err(place)?;
+    Ok(Calibrated { names: part.names, size: part.size, intrinsics, lens, pose })
+}
+
+/// Either all cameras are placed or none.
+fn alike(cameras: &[Calibrated]) -> Result<()> {
+    let without: Vec<&str> = cameras.iter().filter(|c| c.pose.is_none()).map(|c| c.names[0].as_str()).collect();
+    if without.is_empty() || without.len() == cameras.len() {
+        return Ok(());
+    }
+    Err(Error::input(format!("of these cameras the place is not told, of others it is: {}", without.join(", ")))
+        .remedy("Give rotation and translation of all cameras, or of none."))
+}
+
+impl Calibration {
+    /// Whether it says where the cameras stand.
+    pub fn posed(&self) -> bool {
+        self.cameras.iter().all(|c| c.pose.is_some())
+    }
+
+    /// What its unit of length is, a sentence.
+    pub fn about_lengths(&self) -> String {
+        /// Cameras farther apart than this are measured in millimetres: rigs of more metres are rare, of fewer millimetres too.
+        const MILLIMETRES: f64 = 200.0;
+        let centers: Vec<[f64; 3]> =
+            self.cameras.iter().filter_map(|c| c.pose.map(|p| p.inverse().translation)).collect();
+        let mut apart: Vec<f64> = Vec::new();
+        for (i, a) in centers.iter().enumerate() {
+            let others = centers.iter().enumerate().filter(|(j, _)| *j != i).map(|(_, b)| norm(sub(*a, *b)));
+            apart.push(others.fold(f64::INFINITY, f64::min));
+        }
+        apart.retain(|d| d.is_finite());
+        apart.sort_by(f64::total_cmp);
+        let Some(middle) = apart.get(apart.len() / 2) else { return String::new() };
+        match self.unit {
+            Unit::Metre => {
+                format!("Lengths are metres, as the calibration says: neighbouring cameras are {middle:.2} m apart.")
+            }
+            Unit::Unstated if *middle > MILLIMETRES => format!(
+                "Lengths are the calibration's, whose unit it does not tell: neighbouring cameras are {middle:.0} apart, which \
+                 looks like millimetres (--apart A,B=METRES makes metres of them)."
+            ),
+            Unit::Unstated => format!(
+                "Lengths are the calibration's, whose unit it does not tell: neighbouring cameras are {middle:.3} apart."
+            ),
+        }
+    }
+}

@@ -1,0 +1,135 @@
+//! Lags by what moves, of cameras whose places are known: no feature needs to look alike from two sides.
+
+use super::cache::Cache;
+use super::stored::Stored;
+use crate::Result;
+use crate::sync::epipolar::{Range, fundamental, lag};
+use crate::sync::graph::{Evidence, Kind, Solution};
+use crate::sync::grey::Grey;
+use crate::sync::tracks::{Track, Tracker, moving};
+use rayon::prelude::*;
+use splat4d::math::se3::{norm, sub};
+use splat4d::scene::Camera;
+use splat4d_train::capture::Rgb8;
+use splat4d_train::event::Progress;
+
+/// Frames in a row in which corners are followed.
+const WINDOW: usize = 90;
+/// Part of them that a clock is looked for within: right lags are told by standing out of many.
+const WITHIN: f64 = 1.0 / 3.0;
+/// Corners of a camera that are followed, and pixels between them, as the doctor has them.
+const TRACKS: usize = 60;
+const APART: f64 = 8.0;
+/// Frames that it takes: among fewer lags, a wrong one stands out as well (of 14 frames of the bundled capture, one was a frame off).
+const SHORTEST: usize = 30;
+/// Pictures are halved until they have no more pixels.
+const PIXELS: usize = 700_000;
+/// Neighbours that each camera is compared with.
+const NEIGHBOURS: usize = 3;
+
+/// A camera that stands still, as a pinhole camera, and corners that move in it, by its own clock.
+struct Seen {
+    camera: Camera,
+    tracks: Vec<Track>,
+    frames: usize,
+}
+
+/// Lags of neighbouring cameras. `clock` says about where to look.
+pub(super) fn by_geometry(
+    stored: &Stored<'_>,
+    clock: &Solution,
+    cache: &Cache,
+    progress: &mut Progress<'_>,
+) -> Result<Vec<Evidence>> {
+    let offsets: Vec<Option<f64>> = clock.offsets.iter().map(|o| o.as_ref().map(|o| o.seconds)).collect();
+    let made_of = format!("{} {offsets:?}", stored.fingerprint());
+    cache.or("geometry", &made_of, || measured(stored, clock, progress))
+}
+
+fn measured(stored: &Stored<'_>, clock: &Solution, progress: &mut Progress<'_>) -> Result<Vec<Evidence>> {
+    let n = stored.pictures.len();
+    let offset = |c: usize| clock.offsets[c].as_ref().map_or(0.0, |o| o.seconds);
+    let ends = |c: usize| {
+        let shots = &stored.pictures[c].shots;
+        (shots[0].time + offset(c), shots[shots.len() - 1].time + offset(c))
+    };
+    let first = (0..n).map(|c| ends(c).0).fold(f64::NEG_INFINITY, f64::max);
+    let last = (0..n).map(|c| ends(c).1).fold(f64::INFINITY, f64::min);
+    let middle = 0.5 * (first + last);
+    let mut seen = Vec::with_capacity(n);
+    for c in 0..n {
+        progress.phase("following what moves", c, n);
+        seen.push(camera(stored, c, middle - offset(c))?);
+    }
+    let mut pairs: Vec<[usize; 2]> = Vec::new();
+    let center = |c: usize| seen[c].as_ref().map(|s| s.camera.center());
+    for a in 0..n {
+        let Some(own) = center(a) else { continue };
+        let mut others: Vec<(f64, usize)> =
+            (0..n).filter(|&b| b != a).filter_map(|b| Some((norm(sub(own, center(b)?)), b))).collect();
+        others.sort_by(|x, y| x.0.total_cmp(&y.0).then(x.1.cmp(&y.1)));
+        pairs.extend(others.iter().take(NEIGHBOURS).map(|&(_, b)| [a.min(b), a.max(b)]));
+    }
+    pairs.sort_unstable();
+    pairs.dedup();
+    let of = |&[a, b]: &[usize; 2]| {
+        let (p, q) = (seen[a].as_ref()?, seen[b].as_ref()?);
+        let interval = stored.pictures[a].clock.interval.max(stored.pictures[b].clock.interval);
+        let within = WITHIN * p.frames.min(q.frames) as f64 * interval;
+        let range = Range { around: offset(a) - offset(b), within };
+        let found = lag(&fundamental(&p.camera, &q.camera), [&p.tracks, &q.tracks], None, range).ok()?;
+        Some(Evidence { cameras: [a, b], lag: found.seconds, sigma: found.sigma, drift: None, kind: Kind::Geometry })
+    };
+    Ok(pairs.par_iter().filter_map(of).collect())
+}
+
+/// The picture at the size that is worked with, and how many of the file's pixels are one of its.
+fn small(picture: Rgb8) -> (Rgb8, f64) {
+    let (mut out, mut factor) = (picture, 1.0);
+    while out.width * out.height > PIXELS {
+        let (width, height) = (out.width / 2, out.height / 2);
+        let mut data = Vec::with_capacity(3 * width * height);
+        for y in 0..height {
+            for x in 0..width {
+                for c in 0..3 {
+                    let at =
+                        |dx: usize, dy: usize| u16::from(out.data[3 * ((2 * y + dy) * out.width + 2 * x + dx) + c]);
+                    data.push(((at(0, 0) + at(1, 0) + at(0, 1) + at(1, 1) + 2) / 4) as u8);
+                }
+            }
+        }
+        out = Rgb8 { width, height, data };
+        factor *= 2.0;
+    }
+    (out, factor)
+}
+
+fn camera(stored: &Stored<'_>, c: usize, middle: f64) -> Result<Option<Seen>> {
+    let Some((known, pose)) = stored.known(c).and_then(|k| Some((k, k.pose?))) else { return Ok(None) };
+    let shots = &stored.pictures[c].shots;
+    let count = shots.len();
+    if count < SHORTEST {
+        return Ok(None);
+    }
+    let still = stored.median(c, |picture| small(picture).0)?;
+    let still = Grey::of(&still);
+    let nearest = shots.partition_point(|s| s.time < middle).min(count - 1);
+    let row = count.min(WINDOW);
+    let first = nearest.saturating_sub(row / 2).min(count - row);
+    let mut tracker = Tracker::new(TRACKS, APART);
+    let (mut size, mut factor) = ([0, 0], 1.0);
+    for (k, shot) in shots.iter().enumerate().skip(first).take(row) {
+        let (picture, by) = small(stored.rgb(c, k)?);
+        (size, factor) = ([picture.width, picture.height], by);
+        let grey = Grey::of(&picture);
+        let mask = moving(&grey, &still);
+        tracker.push(shot.time, grey, Some(&mask));
+    }
+    let straight = known.straight(size, factor);
+    let mut tracks = tracker.finish();
+    for track in &mut tracks {
+        track.samples = track.samples.iter().map_while(|(t, p)| Some((*t, straight.pixel(*p)?))).collect();
+    }
+    tracks.retain(|t| !t.samples.is_empty());
+    Ok(Some(Seen { camera: straight.camera(pose, size), tracks, frames: row }))
+}
