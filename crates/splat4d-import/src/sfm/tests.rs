@@ -130,7 +130,7 @@ fn cameras_that_are_given_stay_and_clocks_and_points_are_found() {
     let mut silent = |_: &_| {};
     let who: Vec<_> = (0..4).map(|c| (c, None)).collect();
     let mut solved = |wrong: &[usize]| {
-        let mut rig = rig(4, 600, 0.3, 0.2);
+        let mut rig = rig(4, 600, 0.3, 0.2, 0.08);
         tell(&mut rig, true, wrong);
         let found =
             solve_sights(&who, &rig.sights, Pairing::All, &Options::default(), &mut Progress(&mut silent)).unwrap();
@@ -155,7 +155,7 @@ fn cameras_that_are_given_stay_and_clocks_and_points_are_found() {
 #[test]
 fn lenses_that_are_given_stay_while_poses_are_found() {
     let mut silent = |_: &_| {};
-    let mut rig = rig(5, 500, 0.3, 0.1);
+    let mut rig = rig(5, 500, 0.3, 0.1, 0.08);
     let focals = tell(&mut rig, false, &[]);
     let who: Vec<_> = (0..5).map(|c| (c, None)).collect();
     let found = solve_sights(&who, &rig.sights, Pairing::All, &Options::default(), &mut Progress(&mut silent)).unwrap();
