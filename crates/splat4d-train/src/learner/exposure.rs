@@ -1,14 +1,23 @@
 //! [`Exposure`]: what learns of the cameras.
 
 use crate::optim::Moments;
+use rayon::prelude::*;
+use splat4d::math::Real;
 use splat4d::scene::{Grads, Key, Params, Planes, Space};
 
-/// A gain exp(m) and an offset c a camera and channel: columns m 3, c 3. The cameras' mean is held at the identity, so that
-/// the scene keeps the rig's mean exposure and held-out cameras are drawn with it.
-/// Source: Luiten et al. 2024 (gain and offset a camera); the fixed mean is ours.
+/// Columns of a camera: its matrix without the identity, row by row, then an offset a channel.
+const COLUMNS: usize = 12;
+/// The first offset.
+const OFFSET: usize = 9;
+/// Pixels of a piece of parallel work: sums are by piece and in order, so that they do not depend on the threads.
+const PIECE: usize = 8192;
+
+/// A colour matrix I + M and an offset c a camera: the colour x that is drawn is shown as (I + M)x + c. The mean over the
+/// cameras is held at the identity, so that the scene keeps the rig's mean colours and held-out cameras are drawn with them.
+/// Source: FreeTimeGS++ 2026 (an affine colour correction a camera); the fixed mean is ours.
 #[derive(Debug)]
 pub struct Exposure {
-    /// One table [cameras, 6].
+    /// One table [cameras, 12].
     pub params: Params<f32>,
     /// Its moments.
     pub moments: Moments<f32>,
@@ -17,12 +26,34 @@ pub struct Exposure {
     trained: Vec<usize>,
 }
 
+/// (I + M)x + c.
+fn shown<F: Real>(row: &[F; COLUMNS], x: [F; 3]) -> [F; 3] {
+    std::array::from_fn(|c| x[c] + row[3 * c] * x[0] + row[3 * c + 1] * x[1] + row[3 * c + 2] * x[2] + row[OFFSET + c])
+}
+
+/// The VJP of [`shown`]: the gradients to x and to the row, of that to what is shown.
+fn shown_backward<F: Real>(row: &[F; COLUMNS], x: [F; 3], d: [F; 3]) -> ([F; 3], [F; COLUMNS]) {
+    let d_x = std::array::from_fn(|k| d[k] + row[k] * d[0] + row[3 + k] * d[1] + row[6 + k] * d[2]);
+    let d_row = std::array::from_fn(|i| if i < OFFSET { d[i / 3] * x[i % 3] } else { d[i - OFFSET] });
+    (d_x, d_row)
+}
+
+/// The three channels of a picture, by pieces of their pixels.
+fn pieces(picture: &mut Planes<f32>) -> impl IndexedParallelIterator<Item = [&mut [f32]; 3]> {
+    assert_eq!(picture.channels, 3, "cameras show three colours");
+    let pixels = picture.pixels();
+    let (red, rest) = picture.data.split_at_mut(pixels);
+    let (green, blue) = rest.split_at_mut(pixels);
+    let cut = |plane| <[f32]>::par_chunks_mut(plane, PIECE);
+    cut(red).zip(cut(green)).zip(cut(blue)).map(|((r, g), b)| [r, g, b])
+}
+
 impl Exposure {
     /// The identity for every camera; only the `trained` ones ever change.
     pub(crate) fn new(cameras: usize, trained: Vec<usize>) -> Self {
         let mut params = Params::new(0, 0, &[]);
         let key = params
-            .entry("exposure", Space::Fixed, &[("exposure", 6)], cameras, |_| {})
+            .entry("exposure", Space::Fixed, &[("exposure", COLUMNS)], cameras, |_| {})
             .expect("a new table fits itself");
         Self { moments: Moments::new(&params), grads: Grads::new(&params), params, key, trained }
     }
@@ -37,45 +68,123 @@ impl Exposure {
         self.grads.clear(&self.params);
     }
 
-    /// Applies the gain and offset of camera `rig` to `color`.
+    /// Turns the colours `color` into those that camera `rig` shows.
     pub(crate) fn respond(&self, rig: usize, color: &mut Planes<f32>) {
-        let row = self.params[self.key].read::<6>(rig, 0);
-        for c in 0..3 {
-            let gain = row[c].exp();
-            color.plane_mut(c).iter_mut().for_each(|x| *x = *x * gain + row[3 + c]);
-        }
+        let row = self.params[self.key].read::<COLUMNS>(rig, 0);
+        pieces(color).for_each(|[r, g, b]| {
+            for ((r, g), b) in r.iter_mut().zip(g).zip(b) {
+                [*r, *g, *b] = shown(&row, [*r, *g, *b]);
+            }
+        });
     }
 
-    /// The VJP of [`respond`](Self::respond) at what was drawn: turns the gradient to the exposed colours into that to the
+    /// The VJP of [`respond`](Self::respond) at what was drawn: turns the gradient to the shown colours into that to the
     /// drawn ones, and adds to the camera's.
     pub(crate) fn respond_backward(&mut self, rig: usize, drawn: &Planes<f32>, d_color: &mut Planes<f32>) {
-        let row = self.params[self.key].read::<6>(rig, 0);
-        let mut d_row = [0.0f32; 6];
-        for c in 0..3 {
-            let gain = row[c].exp();
-            let (mut d_gain, mut d_offset) = (0.0f64, 0.0f64);
-            for (g, x) in d_color.plane_mut(c).iter_mut().zip(drawn.plane(c)) {
-                d_offset += f64::from(*g);
-                d_gain += f64::from(*g * x * gain);
-                *g *= gain;
-            }
-            (d_row[c], d_row[3 + c]) = (d_gain as f32, d_offset as f32);
-        }
-        self.grads.of([self.key])[0].add(rig, 0, d_row);
+        let row = self.params[self.key].read::<COLUMNS>(rig, 0);
+        let sums: Vec<[f64; COLUMNS]> = pieces(d_color)
+            .enumerate()
+            .map(|(piece, [r, g, b])| {
+                let (mut sums, first) = ([0.0; COLUMNS], piece * PIECE);
+                for (i, ((r, g), b)) in r.iter_mut().zip(g).zip(b).enumerate() {
+                    let x = [0, 1, 2].map(|c| drawn.plane(c)[first + i]);
+                    let (d_x, d_row) = shown_backward(&row, x, [*r, *g, *b]);
+                    [*r, *g, *b] = d_x;
+                    (0..COLUMNS).for_each(|k| sums[k] += f64::from(d_row[k]));
+                }
+                sums
+            })
+            .collect();
+        let sum = |k: usize| sums.iter().map(|s| s[k]).sum::<f64>() as f32;
+        self.grads.of([self.key])[0].add(rig, 0, std::array::from_fn::<f32, COLUMNS, _>(sum));
     }
 
     /// One Adam step with what the last views gave. Returns whether all was finite.
     pub(crate) fn step(&mut self, rate: f64) -> bool {
         let mut rates = vec![None; self.key.0 as usize];
-        rates.push(Some(vec![rate; 6]));
+        rates.push(Some(vec![rate; COLUMNS]));
         let finite = self.moments.step(&mut self.params, &mut self.grads, &rates, &[]).is_empty();
         self.grads.clear(&self.params);
         let table = &mut self.params[self.key];
-        for col in 0..6 {
+        for col in 0..COLUMNS {
             let sum: f64 = self.trained.iter().map(|&c| f64::from(table.get(c, col))).sum();
             let mean = (sum / self.trained.len().max(1) as f64) as f32;
             self.trained.iter().for_each(|&c| *table.get_mut(c, col) -= mean);
         }
         finite
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use splat4d::math::Rng;
+
+    fn random<const N: usize>(purpose: &str) -> [f64; N] {
+        let rng = Rng::new(4, purpose, 0);
+        std::array::from_fn(|i| rng.uniform(i as u64) - 0.4)
+    }
+
+    #[test]
+    fn colours_have_the_gradient_of_what_is_shown() {
+        let (row, x, d) = (random::<COLUMNS>("row"), random::<3>("x"), random::<3>("d"));
+        let value = |row: &[f64; COLUMNS], x: [f64; 3]| -> f64 {
+            shown(row, x).iter().zip(d).map(|(shown, d)| shown * d).sum()
+        };
+        let (d_x, d_row) = shown_backward(&row, x, d);
+        let h = 1e-5;
+        let check = |name: &str, got: f64, at: &dyn Fn(f64) -> f64| {
+            let fd = (at(h) - at(-h)) / (2.0 * h);
+            assert!((fd - got).abs() < 1e-9, "{name}: {fd} {got}");
+        };
+        for k in 0..3 {
+            check("colour", d_x[k], &|by| value(&row, std::array::from_fn(|i| x[i] + if i == k { by } else { 0.0 })));
+        }
+        for k in 0..COLUMNS {
+            let moved = |by: f64| std::array::from_fn(|i| row[i] + if i == k { by } else { 0.0 });
+            check("camera", d_row[k], &|by| value(&moved(by), x));
+        }
+        assert_eq!(shown(&[0.0; COLUMNS], x), x, "no row is the identity");
+    }
+
+    /// Every pixel of every piece, with the same bits whatever the threads, and nothing learnt of the cameras' mean.
+    #[test]
+    fn cameras_differ_from_their_mean_alone() {
+        let (width, height) = (101, 2 * PIECE / 101 + 3);
+        let picture = |purpose: &str| {
+            let rng = Rng::new(5, purpose, 0);
+            let mut out = Planes::<f32>::new(3, height, width);
+            out.data.iter_mut().enumerate().for_each(|(i, x)| *x = rng.uniform(i as u64) as f32);
+            out
+        };
+        let run = |threads: usize| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| {
+                let mut exposure = Exposure::new(4, vec![0, 2, 3]);
+                for step in 0..6 {
+                    let rig = [0, 2, 3][step % 3];
+                    let mut d = picture(&format!("gradient {step}"));
+                    d.data.iter_mut().for_each(|x| *x -= 0.45);
+                    exposure.respond_backward(rig, &picture("drawn"), &mut d);
+                    assert!(exposure.step(0.01));
+                }
+                let mut shown = picture("drawn");
+                exposure.respond(2, &mut shown);
+                let table = &exposure.params[exposure.key()];
+                let rows: Vec<[f32; COLUMNS]> = (0..4).map(|rig| table.read(rig, 0)).collect();
+                (rows, shown)
+            })
+        };
+        let (rows, color) = run(1);
+        assert_eq!((rows.clone(), color.clone()), run(3));
+        assert!(rows[1] == [0.0; COLUMNS], "a camera that is not trained");
+        for k in 0..COLUMNS {
+            assert!(rows[0][k] != 0.0 && rows.iter().map(|r| r[k]).sum::<f32>().abs() < 1e-6, "column {k}");
+        }
+        let drawn = picture("drawn");
+        for p in [0, PIECE - 1, PIECE, drawn.pixels() - 1] {
+            let at = |picture: &Planes<f32>| [0, 1, 2].map(|c| picture.plane(c)[p]);
+            assert_eq!(at(&color), shown(&rows[2], at(&drawn)), "pixel {p}");
+        }
     }
 }

@@ -26,9 +26,12 @@ settings! {
         sh_degree: usize = 1 => within(0, 3);
         /// Iterations before each further SH degree is unlocked; 0: iterations/10.
         sh_degree_interval: usize = 0 => any().unit("iterations").when(On("appearance.sh_degree"));
-        /// Learn a gain and an offset a camera and channel, where more than one camera has several pictures; their mean
-        /// stays the identity.
+        /// Learn a colour matrix and an offset a camera, where more than one camera has several pictures; their mean stays
+        /// the identity.
         exposure: bool = true;
+        /// The same where every camera has a single picture: a rig's one moment, or photos. Colours between cameras get
+        /// truer, but for the held-out ones' own (docs/suite.md).
+        exposure_single: bool = false => any().when(On("appearance.exposure"));
         /// Rate of the exposure (Luiten et al., 10,000 steps: 1e-4).
         exposure_lr: f64 = 1e-3 => any().when(On("appearance.exposure"));
         /// Antialiased mode (opacity compensation).

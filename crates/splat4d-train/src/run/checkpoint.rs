@@ -18,7 +18,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Version of the checkpoint's own metadata.
-const VERSION: u64 = 2;
+const VERSION: u64 = 3;
 /// The metadata's key.
 const CHECKPOINT: &str = "splat4d-checkpoint";
 

@@ -220,10 +220,12 @@ impl OpenCapture {
         };
         let mut trained: Vec<usize> = self.capture.train.iter().map(|&i| self.capture.frames[i].camera).collect();
         trained.sort_unstable();
-        // The only picture of a camera does not tell its gain from what it sees: of photos learnt with a gain each, those
-        // that were held out lose half a decibel (a kitchen of 21 photos, a doll of 97).
-        let trained: Vec<usize> = trained.chunk_by(|a, b| a == b).filter(|c| c.len() > 1).map(|c| c[0]).collect();
-        // A single camera's gain is its own mean, which stays the identity.
+        // What the only picture of a camera tells of its colours the scene would tell a held-out neighbour: with plain
+        // PSNR such captures may lose as much as they gain (docs/suite.md), so that it is left to the recipe.
+        let pictures = if r.appearance.exposure_single { 1 } else { 2 };
+        let trained: Vec<usize> =
+            trained.chunk_by(|a, b| a == b).filter(|c| c.len() >= pictures).map(|c| c[0]).collect();
+        // A single camera's matrix is its own mean, which stays the identity.
         let exposure =
             (r.appearance.exposure && trained.len() > 1).then(|| Exposure::new(self.capture.cameras.len(), trained));
         let settings = Settings {

@@ -421,16 +421,23 @@ fn foreign_checkpoints_are_refused_with_a_reason() {
         place.run(name)
     };
     let newest = |run: &Path| checkpoint::list(run).pop().unwrap();
-    // Another version: the last number called `version` in the header is the checkpoint's own.
-    let run = copy("version");
-    let mut bytes = std::fs::read(newest(&run)).unwrap();
-    let needle = br#"\"version\":2"#;
-    let at = bytes.windows(needle.len()).rposition(|w| w == needle).unwrap();
-    bytes[at + needle.len() - 1] = b'9';
-    std::fs::write(newest(&run), &bytes).unwrap();
-    let error = resume_quietly(&run).unwrap_err();
-    assert_eq!(error.kind(), ErrorKind::Unsupported, "{error}");
-    assert!(error.to_string().contains("version 9"), "{error}");
+    // Another version, the one before or a later one: the last number called `version` in the header is the checkpoint's own.
+    for version in [b'2', b'9'] {
+        let run = copy(&format!("version-{version}"));
+        let mut bytes = std::fs::read(newest(&run)).unwrap();
+        let needle = br#"\"version\":3"#;
+        let at = bytes.windows(needle.len()).rposition(|w| w == needle).unwrap();
+        bytes[at + needle.len() - 1] = version;
+        std::fs::write(newest(&run), &bytes).unwrap();
+        let error = resume_quietly(&run).unwrap_err();
+        assert_eq!(error.kind(), ErrorKind::Unsupported, "{error}");
+        let says = format!("version {}, this splat4d continues version 3", char::from(version));
+        assert!(error.to_string().contains(&says), "{error}");
+        assert!(
+            splat4d::format::scene::read(&bytes).is_ok(),
+            "its scene can still be rendered and exported, as the error says"
+        );
+    }
     // Another recipe.
     let run = copy("recipe");
     let other = base.resolve().with(|r| r.rates.feature = 0.004);
@@ -519,7 +526,7 @@ fn minutes_fix_a_recipe_that_repeats() {
 }
 
 #[test]
-fn a_camera_with_one_picture_learns_no_exposure() {
+fn a_camera_with_one_picture_learns_no_exposure_unless_told() {
     let place = Place::new();
     let exposed = |changes: &[&str]| {
         let recipe = recipe(changes);
@@ -529,6 +536,7 @@ fn a_camera_with_one_picture_learns_no_exposure() {
         opened.trainer(&plan, scene).unwrap().learner.exposure.is_some()
     };
     assert!(exposed(&["exposure=true"]) && !exposed(&["exposure=true", "max_frames=1"]));
+    assert!(exposed(&["exposure=true", "max_frames=1", "appearance.exposure_single=true"]));
 }
 
 #[test]

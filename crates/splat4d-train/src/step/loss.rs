@@ -100,6 +100,8 @@ mod tests {
 
     const SIZE: usize = 12;
     const RIG: usize = 1;
+    /// Its matrix without the identity, and its offsets.
+    const ROW: [f32; 12] = [0.2, 0.03, -0.02, 0.01, -0.1, 0.04, -0.03, 0.02, 0.05, 0.02, 0.0, -0.03];
 
     /// A caller's own term: Σ w·picture with random weights, and what it saw.
     struct Own {
@@ -132,7 +134,7 @@ mod tests {
     fn exposure() -> Exposure {
         let mut exposure = Exposure::new(2, vec![0, 1]);
         let key = exposure.key();
-        exposure.params[key].write(RIG, 0, [0.2, -0.1, 0.05, 0.02, 0.0, -0.03]);
+        exposure.params[key].write(RIG, 0, ROW);
         exposure
     }
 
@@ -182,12 +184,13 @@ mod tests {
             }
             let (total, d_both) = eval(&mut loss, &mut stage, &color, &mut exposure());
             let seen = seen.lock().unwrap();
-            let row = exposure().params[exposure().key()].read::<6>(RIG, 0);
             let (mut own_value, pixels) = (0.0, SIZE * SIZE);
-            for (i, (&x, &drawn)) in seen.iter().zip(&color.data).enumerate() {
-                let gain = row[i / pixels].exp();
-                assert!((x - (drawn * gain + row[3 + i / pixels])).abs() < 1e-6, "the camera's gain and offset");
-                assert!((d_both[i] - (d[i] + weight(i) * gain)).abs() < 1e-5 * (1.0 + weight(i).abs()), "{i}");
+            for (i, &x) in seen.iter().enumerate() {
+                let (c, p) = (i / pixels, i % pixels);
+                let mixed: f32 = (0..3).map(|k| ROW[3 * c + k] * color.plane(k)[p]).sum();
+                assert!((x - (color.data[i] + mixed + ROW[9 + c])).abs() < 1e-6, "the camera's matrix and offset");
+                let own: f32 = (0..3).map(|k| ROW[3 * k + c] * weight(k * pixels + p)).sum::<f32>() + weight(i);
+                assert!((d_both[i] - (d[i] + own)).abs() < 1e-5 * (1.0 + own.abs()), "{i}");
                 own_value += f64::from(x * weight(i));
             }
             assert!((total - value - own_value).abs() < 1e-4 * own_value.abs().max(1.0));
@@ -204,7 +207,7 @@ mod tests {
         eval(&mut loss, &mut [], &color, &mut e);
         // Small: every pixel whose difference changes its sign within a step is a kink of L1.
         let (key, h) = (e.key(), 1e-4f32);
-        let got = e.grads.table(key).read::<6>(RIG, 0);
+        let got = e.grads.table(key).read::<12>(RIG, 0);
         for (col, got) in got.into_iter().enumerate() {
             let mut at = |by: f32| {
                 let mut moved = exposure();
