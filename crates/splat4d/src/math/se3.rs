@@ -34,7 +34,6 @@ impl Se3 {
     }
 
     /// `self` after `first`: x ↦ self(first(x)).
-    #[cfg(test)]
     pub fn after(&self, first: &Self) -> Self {
         Self { rotation: mat_mul(&self.rotation, &first.rotation), translation: self.apply(first.translation) }
     }
