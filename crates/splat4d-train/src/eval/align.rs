@@ -2,6 +2,7 @@
 //! scene whose cameras were refined is not judged by where the others were said to stand.
 
 use crate::Result;
+use crate::capture::frames::{Frames, Picture};
 use crate::capture::{Capture, ImageStore};
 use crate::learner::{Corrections, Origin, RefineSettings, Scale};
 use crate::loss::image::View;
@@ -9,14 +10,18 @@ use crate::loss::terms::StepInfo;
 use crate::recipe::Recipe;
 use crate::run::{learnable, plan, scale};
 use crate::step::chain::{Chain, Losses, Step};
+use crate::step::clocks::Look;
 use crate::step::loss::TrainLoss;
 use serde_json::Value;
 use splat4d::layers::Scene;
 use splat4d::render::Backend;
-use splat4d::scene::{Grads, Planes};
+use splat4d::scene::{Camera, Grads, Planes, Time};
 
 /// Share of D-SSIM in what is made small: none, since plain differences have the wider basin and cost less.
 const DSSIM: f64 = 0.0;
+
+/// Searches of a clock before its gradients are followed: far, then near ([`Corrections::search`]).
+const SEARCHES: [usize; 2] = [0, usize::MAX];
 
 /// How held-out views are aligned.
 #[derive(Clone, Debug)]
@@ -29,7 +34,8 @@ impl Align {
     /// As a run with this recipe wants it; `None` where it refined nothing.
     pub fn of(capture: &Capture, recipe: &Recipe) -> Option<Self> {
         let learnt = learnable(recipe);
-        let wanted = (learnt.poses || learnt.times) && learnt.align_steps > 0 && !capture.train.is_empty();
+        let wanted =
+            (learnt.poses || learnt.focal || learnt.times) && learnt.align_steps > 0 && !capture.train.is_empty();
         // The whole run is of use here: the scene has formed, and does not settle.
         let settings = RefineSettings { poses_from: 0.0, times_from: 0.0, until: 1.0, ..learnt };
         wanted.then(|| Self { settings, scale: scale(&plan(capture, recipe)) })
@@ -51,6 +57,15 @@ impl Align {
         let origins: Vec<Origin<'_>> =
             frames.iter().map(|&f| Origin { rig: info(f).camera, fixed: fixed(f), camera: &info(f).view }).collect();
         let mut found = Corrections::new(&self.settings, self.scale, &origins, capture.cameras.len(), false);
+        if self.settings.times {
+            for round in SEARCHES {
+                let look = Held { capture, store, frames };
+                let antialias = backend.config().antialias;
+                let look = Look { frames: &look, corrections: &found, exposure: None, antialias };
+                let shifts = look.shifts(scene, found.search(round))?;
+                found.shift(&shifts);
+            }
+        }
         // Frames that share a pose take turns.
         let mut groups: Vec<(usize, Vec<usize>)> = Vec::new();
         for (place, &f) in frames.iter().enumerate() {
@@ -60,8 +75,7 @@ impl Align {
                 None => groups.push((info(f).camera, vec![place])),
             }
         }
-        let (mut chain, mut loss) = (Chain::default(), TrainLoss::photometric(DSSIM));
-        let mut grads: Vec<Grads<f32>> = scene.layers.iter().map(|l| Grads::new(&l.params)).collect();
+        let mut follower = Follower::new(scene);
         let (mut truth, mut valid) = (Planes::default(), Planes::default());
         let steps = self.settings.align_steps;
         for (done, (_, places)) in groups.iter().enumerate() {
@@ -72,26 +86,9 @@ impl Align {
                 let stored = store.load(frames[place])?;
                 stored.color_into(&mut truth);
                 let weight = stored.valid_into(&mut valid).then_some(&valid);
-                let (camera, t) = (found.camera(place, &frame.view), found.time(place, frame.time));
-                let view = View {
-                    camera: &camera,
-                    t,
-                    background: scene.background,
-                    truth: &truth,
-                    mask: None,
-                    weight,
-                    flow: None,
-                    frame: place,
-                    rig: frame.camera,
-                };
-                let progress = step as f64 / steps as f64;
-                let now = StepInfo { iteration: step, times: vec![t], seed: 0, progress };
-                let mut image = loss.of_step(&mut [], None);
-                let mut losses = Losses { image: &mut image, probes: &[], params: &[] };
-                let one = Step { scene, views: &[view], info: &now, sh_degree: usize::MAX };
-                let report = chain.step(&one, backend, &mut losses, &mut grads, &mut |_| {})?;
-                found.step(&[place], &report.d_cameras, &report.d_times, progress, 1.0);
-                grads.iter_mut().zip(&scene.layers).for_each(|(d, layer)| d.clear(&layer.params));
+                let seen =
+                    Seen { place, rig: frame.camera, camera: &frame.view, time: frame.time, truth: &truth, weight };
+                follower.step(scene, &seen, backend, &mut found, [step, steps])?;
             }
             told(done + 1, groups.len());
         }
@@ -107,5 +104,101 @@ impl Align {
         };
         let report = found.report(&name);
         Ok((aligned, report))
+    }
+}
+
+/// A picture, and what is stated of its camera.
+pub(super) struct Seen<'a> {
+    /// Its number among the corrections' frames.
+    pub place: usize,
+    pub rig: usize,
+    pub camera: &'a Camera,
+    pub time: Time,
+    pub truth: &'a Planes<f32>,
+    pub weight: Option<&'a Planes<f32>>,
+}
+
+/// Follows the gradients of pictures to where and when they were taken; the scene stays.
+pub(super) struct Follower {
+    chain: Chain,
+    loss: TrainLoss,
+    grads: Vec<Grads<f32>>,
+}
+
+impl Follower {
+    pub(super) fn new(scene: &Scene<f32>) -> Self {
+        let grads = scene.layers.iter().map(|l| Grads::new(&l.params)).collect();
+        Self { chain: Chain::default(), loss: TrainLoss::photometric(DSSIM), grads }
+    }
+
+    /// One step of so many, by one picture.
+    pub(super) fn step(
+        &mut self,
+        scene: &Scene<f32>,
+        seen: &Seen<'_>,
+        backend: &mut dyn Backend,
+        found: &mut Corrections,
+        [step, steps]: [usize; 2],
+    ) -> Result<()> {
+        let (camera, t) = (found.camera(seen.place, seen.camera), found.time(seen.place, seen.time));
+        let view = View {
+            camera: &camera,
+            t,
+            background: scene.background,
+            truth: seen.truth,
+            mask: None,
+            weight: seen.weight,
+            flow: None,
+            frame: seen.place,
+            rig: seen.rig,
+        };
+        let progress = step as f64 / steps as f64;
+        let now = StepInfo { iteration: step, times: vec![t], seed: 0, progress };
+        let mut image = self.loss.of_step(&mut [], None);
+        let mut losses = Losses { image: &mut image, probes: &[], params: &[] };
+        let one = Step { scene, views: &[view], info: &now, sh_degree: usize::MAX };
+        let report = self.chain.step(&one, backend, &mut losses, &mut self.grads, &mut |_| {})?;
+        found.step(&[seen.place], &report.grads(), progress, 1.0);
+        self.grads.iter_mut().zip(&scene.layers).for_each(|(d, layer)| d.clear(&layer.params));
+        Ok(())
+    }
+}
+
+/// Some of a capture's frames, held out or not.
+struct Held<'a> {
+    capture: &'a Capture,
+    store: &'a ImageStore,
+    frames: &'a [usize],
+}
+
+impl Frames for Held<'_> {
+    fn len(&self) -> usize {
+        self.frames.len()
+    }
+
+    fn camera(&self, i: usize) -> &Camera {
+        &self.capture.frames[self.frames[i]].view
+    }
+
+    fn time(&self, i: usize) -> Time {
+        self.capture.frames[self.frames[i]].time
+    }
+
+    fn rig(&self, i: usize) -> usize {
+        self.capture.frames[self.frames[i]].camera
+    }
+
+    fn name(&self, i: usize) -> String {
+        self.capture.cameras[self.rig(i)].name.clone()
+    }
+
+    fn load(&self, i: usize, out: &mut Picture) -> Result<()> {
+        let stored = self.store.load(self.frames[i])?;
+        stored.color_into(&mut out.color);
+        let weight = out.weight.get_or_insert_default();
+        if !stored.valid_into(weight) {
+            out.weight = None;
+        }
+        Ok(())
     }
 }

@@ -6,11 +6,13 @@
 mod align;
 mod colour;
 mod conv;
+pub mod localise;
 pub(crate) mod lpips;
 pub mod metrics;
 mod report;
 pub mod run;
 pub mod tracks;
+pub mod trajectory;
 
 pub use align::Align;
 pub use colour::ColourMatrix;
