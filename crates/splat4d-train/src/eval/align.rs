@@ -34,8 +34,7 @@ impl Align {
     /// As a run with this recipe wants it; `None` where it refined nothing.
     pub fn of(capture: &Capture, recipe: &Recipe) -> Option<Self> {
         let learnt = learnable(recipe);
-        let wanted =
-            (learnt.poses || learnt.focal || learnt.times) && learnt.align_steps > 0 && !capture.train.is_empty();
+        let wanted = (learnt.poses || learnt.times) && learnt.align_steps > 0 && !capture.train.is_empty();
         // The whole run is of use here: the scene has formed, and does not settle.
         let settings = RefineSettings { poses_from: 0.0, times_from: 0.0, until: 1.0, ..learnt };
         wanted.then(|| Self { settings, scale: scale(&plan(capture, recipe)) })
@@ -75,7 +74,8 @@ impl Align {
                 None => groups.push((info(f).camera, vec![place])),
             }
         }
-        let mut follower = Follower::new(scene);
+        let (mut chain, mut loss) = (Chain::default(), TrainLoss::photometric(DSSIM));
+        let mut grads: Vec<Grads<f32>> = scene.layers.iter().map(|l| Grads::new(&l.params)).collect();
         let (mut truth, mut valid) = (Planes::default(), Planes::default());
         let steps = self.settings.align_steps;
         for (done, (_, places)) in groups.iter().enumerate() {
@@ -86,9 +86,26 @@ impl Align {
                 let stored = store.load(frames[place])?;
                 stored.color_into(&mut truth);
                 let weight = stored.valid_into(&mut valid).then_some(&valid);
-                let seen =
-                    Seen { place, rig: frame.camera, camera: &frame.view, time: frame.time, truth: &truth, weight };
-                follower.step(scene, &seen, backend, &mut found, [step, steps])?;
+                let (camera, t) = (found.camera(place, &frame.view), found.time(place, frame.time));
+                let view = View {
+                    camera: &camera,
+                    t,
+                    background: scene.background,
+                    truth: &truth,
+                    mask: None,
+                    weight,
+                    flow: None,
+                    frame: place,
+                    rig: frame.camera,
+                };
+                let progress = step as f64 / steps as f64;
+                let now = StepInfo { iteration: step, times: vec![t], seed: 0, progress };
+                let mut image = loss.of_step(&mut [], None);
+                let mut losses = Losses { image: &mut image, probes: &[], params: &[] };
+                let one = Step { scene, views: &[view], info: &now, sh_degree: usize::MAX };
+                let report = chain.step(&one, backend, &mut losses, &mut grads, &mut |_| {})?;
+                found.step(&[place], &report.d_cameras, &report.d_times, progress, 1.0);
+                grads.iter_mut().zip(&scene.layers).for_each(|(d, layer)| d.clear(&layer.params));
             }
             told(done + 1, groups.len());
         }
@@ -104,63 +121,6 @@ impl Align {
         };
         let report = found.report(&name);
         Ok((aligned, report))
-    }
-}
-
-/// A picture, and what is stated of its camera.
-pub(super) struct Seen<'a> {
-    /// Its number among the corrections' frames.
-    pub place: usize,
-    pub rig: usize,
-    pub camera: &'a Camera,
-    pub time: Time,
-    pub truth: &'a Planes<f32>,
-    pub weight: Option<&'a Planes<f32>>,
-}
-
-/// Follows the gradients of pictures to where and when they were taken; the scene stays.
-pub(super) struct Follower {
-    chain: Chain,
-    loss: TrainLoss,
-    grads: Vec<Grads<f32>>,
-}
-
-impl Follower {
-    pub(super) fn new(scene: &Scene<f32>) -> Self {
-        let grads = scene.layers.iter().map(|l| Grads::new(&l.params)).collect();
-        Self { chain: Chain::default(), loss: TrainLoss::photometric(DSSIM), grads }
-    }
-
-    /// One step of so many, by one picture.
-    pub(super) fn step(
-        &mut self,
-        scene: &Scene<f32>,
-        seen: &Seen<'_>,
-        backend: &mut dyn Backend,
-        found: &mut Corrections,
-        [step, steps]: [usize; 2],
-    ) -> Result<()> {
-        let (camera, t) = (found.camera(seen.place, seen.camera), found.time(seen.place, seen.time));
-        let view = View {
-            camera: &camera,
-            t,
-            background: scene.background,
-            truth: seen.truth,
-            mask: None,
-            weight: seen.weight,
-            flow: None,
-            frame: seen.place,
-            rig: seen.rig,
-        };
-        let progress = step as f64 / steps as f64;
-        let now = StepInfo { iteration: step, times: vec![t], seed: 0, progress };
-        let mut image = self.loss.of_step(&mut [], None);
-        let mut losses = Losses { image: &mut image, probes: &[], params: &[] };
-        let one = Step { scene, views: &[view], info: &now, sh_degree: usize::MAX };
-        let report = self.chain.step(&one, backend, &mut losses, &mut self.grads, &mut |_| {})?;
-        found.step(&[seen.place], &report.grads(), progress, 1.0);
-        self.grads.iter_mut().zip(&scene.layers).for_each(|(d, layer)| d.clear(&layer.params));
-        Ok(())
     }
 }
 

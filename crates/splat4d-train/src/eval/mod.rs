@@ -6,7 +6,6 @@
 mod align;
 mod colour;
 mod conv;
-pub mod localise;
 pub(crate) mod lpips;
 pub mod metrics;
 mod report;

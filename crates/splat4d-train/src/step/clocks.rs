@@ -76,7 +76,7 @@ impl Look<'_> {
                 if let Some(exposure) = self.exposure {
                     exposure.respond(self.frames.rig(i), &mut image.color);
                 }
-                *cost += difference(&image.color, &picture.color, picture.weight.as_ref());
+                *cost += difference(&image.color, &picture);
             }
         }
         Ok(costs)
@@ -84,11 +84,11 @@ impl Look<'_> {
 }
 
 /// Mean absolute difference of colours over the pixels that count. What does not move costs the same at every shift.
-pub(crate) fn difference(drawn: &Planes<f32>, truth: &Planes<f32>, weight: Option<&Planes<f32>>) -> f64 {
+fn difference(drawn: &Planes<f32>, picture: &Picture) -> f64 {
     let (mut sum, mut weights) = (0.0, 0.0);
     for p in 0..drawn.pixels() {
-        let weight = weight.map_or(1.0, |w| f64::from(w.data[p]));
-        let apart = |c: usize| f64::from((drawn.plane(c)[p] - truth.plane(c)[p]).abs());
+        let weight = picture.weight.as_ref().map_or(1.0, |w| f64::from(w.data[p]));
+        let apart = |c: usize| f64::from((drawn.plane(c)[p] - picture.color.plane(c)[p]).abs());
         sum += weight * (apart(0) + apart(1) + apart(2)) / 3.0;
         weights += weight;
     }
@@ -97,7 +97,7 @@ pub(crate) fn difference(drawn: &Planes<f32>, truth: &Planes<f32>, weight: Optio
 
 /// The shift of evenly spaced ones that costs least: the vertex of the parabola through it and its neighbours. None where
 /// all cost the same.
-pub(crate) fn least(shifts: &[f64], costs: &[f64]) -> f64 {
+fn least(shifts: &[f64], costs: &[f64]) -> f64 {
     let order =
         |&a: &usize, &b: &usize| costs[a].total_cmp(&costs[b]).then(shifts[a].abs().total_cmp(&shifts[b].abs()));
     let best = (0..shifts.len()).min_by(order).expect("no shift is one of them");

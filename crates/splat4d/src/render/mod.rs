@@ -163,8 +163,6 @@ pub struct RenderGrads<F = f32> {
     pub background: [F; 3],
     /// To a left perturbation exp(ρ, θ)·cam_from_world: ρ 3, θ 3.
     pub camera: [f64; 6],
-    /// To the logarithm of the focal lengths, both at once.
-    pub focal: f64,
     /// |dL/d mean2d| of every splat, x times width/2 and y times height/2, as densification thresholds assume.
     pub mean2d: Vec<F>,
     /// The same norm of Σ over pixels of |gradient| (AbsGS), if [`RenderConfig::abs_grads`] is on; passes over the
@@ -422,7 +420,6 @@ impl<F: Real> Renderer<F> {
             project::reshape(&mut out.out, part.out);
         }
         d.camera = [0.0; 6];
-        d.focal = project::focal_backward(&view, &self.projected, &self.d_projected);
         let projection = Projection { splats, view: &view, simd, projected: &self.projected };
         project::backward(&projection, &self.d_projected, &mut d.parts, &mut d.camera, &mut self.pose_partial);
         let (parts, pose, partial) = (&mut d.parts[..], &mut d.camera, &mut self.center_partial);

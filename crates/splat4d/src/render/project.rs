@@ -343,24 +343,6 @@ pub(crate) fn project_backward<F: Real>(
     GaussianGrads { mean: d_mean, cov: d_cov, opacity: d.opacity * rho, pose }
 }
 
-/// The gradient to the logarithm of the focal lengths, both at once, from those of the projected rows. A common factor of
-/// the focal lengths moves centres away from the principal point and scales the covariance before the low-pass λ:
-/// dΣ1 = 2(Σ1 − λ), dρ = ρ λ tr Σ1⁻¹. As of poses, nothing goes through the clamp inside J, nor to a pixel head.
-pub(super) fn focal_backward<F: Real>(view: &View<F>, rows: &[Projected<F>], d: &[ProjectedGrads<F>]) -> f64 {
-    let low_pass = view.low_pass.f64();
-    let one = |(row, d): (&Projected<F>, &ProjectedGrads<F>)| {
-        let k = row.conic.map(Real::f64);
-        let g = d.conic.map(Real::f64);
-        let square = [k[0] * k[0] + k[1] * k[1], k[1] * (k[0] + k[2]), k[1] * k[1] + k[2] * k[2]];
-        let along = |k: [f64; 3]| k[0] * g[0] + k[1] * g[1] + k[2] * g[2];
-        let away = |k: usize| d.mean2d[k].f64() * (row.mean2d[k] - view.principal[k]).f64();
-        let compensated = view.antialias == Antialias::On && row.rho.f64() > RHO_MIN;
-        let faded = if compensated { (d.opacity * row.opacity).f64() * low_pass * (k[0] + k[2]) } else { 0.0 };
-        away(0) + away(1) - 2.0 * (along(k) - low_pass * along(square)) + faded
-    };
-    rows.iter().zip(d).filter(|(row, _)| row.radius > F::ZERO).map(one).sum()
-}
-
 /// Projects all splats and finds the bins that each can touch. A splat that touches no pixel is culled.
 ///
 /// Shapes: `projected`, `footprints`, `radii` [all splats], overwritten; `radii` are those of the rows.

@@ -147,24 +147,22 @@ fn run(frames: Disturbed, line: &str) -> Left {
 
 #[test]
 fn clocks_that_are_frames_apart_are_found() {
-    let late = [0.0, 2.0, 0.0, -1.4, 0.0, 0.6, 0.0];
-    let left = run(Disturbed::new(0.0, late), "iterations=160 refine.times=true");
-    println!("late {:?} gauge {:?}", left.late, left.gauge);
-    assert!(left.late[0] == 2.0 && left.late[1] < 0.35, "{:?}", left.late);
+    // The ball moves evenly, so that the model can be as sharp as 24 pixels allow.
+    let line = "iterations=600 motion_order=1 densify.max_cap=200 refine.times=true";
+    let left = run(Disturbed::new(0.0, [0.0, 2.0, 0.0, -1.4, 0.0, 0.6, 0.0]), line);
+    assert!(left.late[0] == 2.0 && left.late[1] < 0.5, "{:?}", left.late);
     assert!(left.gauge[1] < 1e-4, "the median of all clocks stays: {:?}", left.gauge);
-    let left = run(Disturbed::new(0.0, [0.0; CAMERAS]), "iterations=160 refine.times=true");
-    println!("late {:?}", left.late);
-    assert!(left.late[1] < 0.25, "clocks that are right stay: {:?}", left.late);
+    let left = run(Disturbed::new(0.0, [0.0; CAMERAS]), line);
+    assert!(left.late[1] < 0.2, "clocks that are right stay: {:?}", left.late);
 }
 
 #[test]
 fn poses_that_are_off_come_nearer_and_right_ones_stay() {
-    let poses = "iterations=240 refine.poses=true";
-    let left = run(Disturbed::new(0.015, [0.0; CAMERAS]), poses);
-    println!("degrees {:?} gauge {:?}", left.degrees, left.gauge);
-    assert!(left.degrees[1] < 0.7 * left.degrees[0], "{:?}", left.degrees);
+    // A pixel is 1.7 degrees wide: all of this is less than one.
+    let line = "iterations=1000 motion_order=1 densify.max_cap=200 refine.poses=true";
+    let left = run(Disturbed::new(0.015, [0.0; CAMERAS]), line);
+    assert!(left.degrees[0] > 1.4 && left.degrees[1] < 0.8 * left.degrees[0], "{:?}", left.degrees);
     assert!(left.gauge[0] < 1e-3, "the cameras' mean stays: {:?}", left.gauge);
-    let left = run(Disturbed::new(0.0, [0.0; CAMERAS]), poses);
-    println!("degrees {:?}", left.degrees);
+    let left = run(Disturbed::new(0.0, [0.0; CAMERAS]), line);
     assert!(left.degrees[1] < 0.5, "{:?}", left.degrees);
 }
