@@ -12,12 +12,14 @@ use crate::video::{Film, have_ffmpeg};
 use serde_json::{Value, json};
 use splat4d::layers::Scene;
 use splat4d::{Error, Result};
-use splat4d_train::capture::{Capture, ImageStore};
+use splat4d_train::capture::{Capture, CaptureOptions, ImageStore};
 use splat4d_train::eval::Align;
 use splat4d_train::eval::run::{EvalOptions, Measured, Scores, evaluate};
 use splat4d_train::eval::tracks::track_error;
+use splat4d_train::eval::trajectory::trajectory_error;
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::corrected;
+use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
@@ -191,6 +193,36 @@ pub(crate) fn scores_on(
     Ok(())
 }
 
+/// Says and writes how far the cameras of a run are from those of a capture that knows.
+///
+/// Errors: captures that cannot be read, or have no cameras in common.
+pub(crate) fn trajectory(run: &Path, truth: &Path, console: &Console) -> anyhow::Result<()> {
+    let (mut capture, recipe) = Run::open(run)?.open_capture()?;
+    corrected::apply(&mut capture, run)?;
+    let fps = (recipe.capture.fps > 0.0).then_some(recipe.capture.fps);
+    let truth = Capture::open(truth, &CaptureOptions { fps, ..CaptureOptions::default() })?;
+    let found = trajectory_error(&capture, &truth)?;
+    found.write(run)?;
+    let t = &found.poses;
+    let worst = (0..t.apart.len()).max_by(|&a, &b| t.apart[a].center.total_cmp(&t.apart[b].center));
+    let worst = worst.map_or("", |k| found.names[k].0.as_str());
+    let mut words = format!(
+        "{} cameras: ATE {:.5} units, {:.3} % of the rig's radius (worst: {worst})",
+        t.apart.len(),
+        t.ate,
+        100.0 * t.ate / t.radius
+    );
+    if let Some([turn, shift]) = t.rpe {
+        let _ = write!(words, "; RPE {turn:.3}°, {shift:.5} units");
+    }
+    if let Some([middle, most]) = found.clock_errors() {
+        let _ = write!(words, "; clocks off by {:.2} ms at the median, {:.2} ms at most", 1e3 * middle, 1e3 * most);
+    }
+    console.say(&words);
+    console.emit(&json!({"type": "trajectory", "results": found.report()}));
+    Ok(())
+}
+
 /// A run that is measured, and how.
 struct Measuring<'a> {
     opened: &'a Run,
@@ -268,6 +300,7 @@ fn in_words(score: impl Fn(&str) -> Option<f64>) -> String {
         ("PSNR-aligned", "aligned", 2, " dB"),
         ("PSNR-cc", "colour-corrected", 2, " dB"),
         ("PSNR-dynamic", "where things move", 2, " dB"),
+        ("PSNR-dynamic-aligned", "there aligned", 2, " dB"),
         ("PSNR-foreground", "foreground", 2, " dB"),
         ("SSIM", "SSIM", 4, ""),
         ("MS-SSIM", "MS-SSIM", 4, ""),

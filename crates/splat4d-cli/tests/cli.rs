@@ -64,6 +64,18 @@ fn help_teaches_and_completions_complete() {
 }
 
 #[test]
+fn cameras_are_compared_with_their_truth() {
+    let work = tempfile::tempdir().unwrap();
+    let capture = Capture::new(work.path()).write();
+    let run = work.path().join("run");
+    train(&capture, &run).ok();
+    let said = splat4d(&["eval", str(&run), "--truth", str(&capture)]).run().ok();
+    assert!(said.contains("ATE 0.00000 units") && said.contains("0.00 ms at most"), "{said}");
+    let error = &json_of(&run.join("results.json"))["trajectory"];
+    assert!(error["ate"].as_f64().unwrap() < 1e-6 && !error["cameras"].as_array().unwrap().is_empty(), "{error}");
+}
+
+#[test]
 fn a_capture_becomes_a_run_and_everything_follows() {
     let work = tempfile::tempdir().unwrap();
     let capture = Capture::new(work.path()).write();

@@ -4,8 +4,8 @@
 //! cargo run --release -p splat4d-import --example poses -- examples/knight [--downscale 2] [--walking 100] [--no-clocks] [--shared] [--moments 10]
 //! ```
 
+use splat4d::math::align::apart;
 use splat4d::scene::Planes;
-use splat4d_import::sfm::align::apart;
 use splat4d_import::sfm::pictures::Pictures;
 use splat4d_import::sfm::{Options, solve};
 use splat4d_train::Result;

@@ -19,6 +19,7 @@ Examples:
   splat4d eval runs/knight --lpips-weights vgg.safetensors --json
   splat4d eval runs/mutant --background both   on white and on black
   splat4d eval runs/mutant --split val         on views to choose by; the test views are for the end
+  splat4d eval runs/take --truth calibrated    how far are its cameras from where they truly stood?
 
 Results are in RUN/results.json and RUN/per_view.json (keys as 3DGS writes them), pictures in RUN/test/ours_N. With --split
 or --background only scores are made; what is not the test split on the run's own background stands under an entry and in a
@@ -86,6 +87,11 @@ pub(crate) struct Args {
     /// Composite transparent pixels of pictures and renders on this, and make nothing but scores [default: as the run]
     #[arg(long, value_enum, conflicts_with = "baseline", help_heading = "What is measured")]
     background: Option<Background>,
+    /// Compare the training cameras, as the run has them, with this capture's, which are right, and make nothing but that:
+    /// absolute and relative trajectory error after a similarity, and clocks
+    #[arg(long, value_name = "CAPTURE", conflicts_with_all = ["baseline", "split", "background"],
+          help_heading = "What is measured")]
+    truth: Option<PathBuf>,
     #[command(flatten)]
     measure: finish::Measure,
 
@@ -98,6 +104,9 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let path = args.run.as_ref().or(args.model.as_ref()).expect("clap asks for a run");
     let run = Run::open(path)?;
     run.scene_file()?;
+    if let Some(truth) = &args.truth {
+        return finish::trajectory(path, truth, console);
+    }
     if args.split.is_some() || args.background.is_some() {
         let split = args.split.unwrap_or(Split::Test).measured();
         let backgrounds = args.background.map_or(&[][..], Background::colors);

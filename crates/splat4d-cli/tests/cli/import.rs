@@ -3,7 +3,7 @@
 use crate::sample::splat4d;
 use crate::{json_of, str};
 use serde_json::Value;
-use splat4d_import::sfm::align::apart;
+use splat4d::math::align::apart;
 use splat4d_train::capture::{Capture, CaptureOptions};
 use std::path::{Path, PathBuf};
 

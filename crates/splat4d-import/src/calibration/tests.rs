@@ -115,12 +115,11 @@ fn tables(cameras: &[Calibrated], more: &str) -> String {
         let (k, p) = (k(c), pose_of(c));
         let _ = write!(
             out,
-            "[cam_{n}]\nname = \"{}\"\nsize = [ 1280.0, 720 ]\nmatrix = [ [ {}], [ {}], [ {}]]\ndistortions = [ {}]\n\
+            "[cam_{n}]\nname = \"{}\"\nsize = [ 1280.0, 720 ]\nmatrix = [ [ {}], [ {}], [ 0.0, 0.0, 1.0]]\ndistortions = [ {}]\n\
              rotation = [ {}]\ntranslation = [ {}]\n{more}\n",
             c.names[0],
             list(&k[..3]),
             list(&k[3..6]),
-            "0.0, 0.0, 1.0",
             list(&terms(c)),
             list(&rvec(&p.rotation)),
             list(&p.translation)

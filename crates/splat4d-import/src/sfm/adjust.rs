@@ -519,10 +519,9 @@ pub fn adjust(bundle: &mut Bundle, settings: &Settings) -> Report {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::sfm::align::{Similarity, similarity};
-    use crate::sfm::two_view::turn_between;
-    use splat4d::math::Rng;
+    use splat4d::math::align::{similarity, turn_between};
     use splat4d::math::se3::{norm, sub};
+    use splat4d::math::{Rng, Sim3};
 
     const ALL: Free = Free { pose: true, focal: true, k1: true, center: true, tau: true };
 
@@ -593,7 +592,7 @@ mod tests {
         let poses = |b: &Bundle| b.views.iter().map(|v| v.pose).collect::<Vec<_>>();
         let (from, to) = (poses(a), poses(b));
         let centers = |p: &[Se3]| p.iter().map(|q| q.inverse().translation).collect::<Vec<_>>();
-        let s: Similarity = similarity(&centers(&from), &centers(&to)).unwrap();
+        let s: Sim3 = similarity(&centers(&from), &centers(&to)).unwrap();
         let largest = |it: &mut dyn Iterator<Item = f64>| it.fold(0.0, f64::max);
         let turned = |p: &Se3| mat_mul(&p.rotation, &splat4d::math::se3::transpose(&s.rotation));
         let clock = |b: &Bundle, v: usize| b.views[v].tau - b.views[0].tau;

@@ -212,7 +212,7 @@ pub(crate) fn place(known: &[Known], lenses: &[Lens], free: bool, tolerance: f64
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::sfm::two_view::turn_between;
+    use splat4d::math::align::turn_between;
 
     fn room(step: u64, n: usize, lens: &Lens) -> (Se3, Vec<Known>) {
         let rng = Rng::new(2, "resection", step);

@@ -1,6 +1,5 @@
 //! From made-up features and pictures to cameras.
 
-use super::align::apart;
 use super::known::Known;
 use super::lens::Lens;
 use super::mapper::{FOCALS, Mapping, map};
@@ -8,6 +7,7 @@ use super::pictures::{Feature, Look, Pictures, Sight, fixed};
 use super::tracks::{Pairing, focal_votes, join, links};
 use super::{Options, solve, solve_sights};
 use crate::Result;
+use splat4d::math::align::apart;
 use splat4d::math::{Rng, Se3};
 use splat4d::scene::Planes;
 use splat4d_train::event::Progress;
@@ -97,7 +97,7 @@ fn a_rig_is_found_among_noise_and_outliers_with_focal_lengths_and_clocks() {
     assert!(found.points.len() > 400 && found.pairs > 10);
     assert!(found.points.iter().all(|p| p.moment <= 4 && p.seen.len() >= 2));
     let up = [0.0, -1.0, 0.0];
-    let turned = super::align::similarity(
+    let turned = splat4d::math::align::similarity(
         &poses.iter().map(|p| p.inverse().translation).collect::<Vec<_>>(),
         &rig.poses.iter().map(|p| p.inverse().translation).collect::<Vec<_>>(),
     );

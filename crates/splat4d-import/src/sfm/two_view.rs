@@ -376,16 +376,10 @@ pub(crate) fn relative(rays: &[Pair], focal: f64, tolerance: f64, rng: Rng) -> O
     Some(Relative { motion, inliers, angle })
 }
 
-/// The angle of the rotation between two rotations, radians.
-pub fn turn_between(a: &Mat3, b: &Mat3) -> f64 {
-    let r = mat_mul(a, &transpose(b));
-    let axis = [r[2][1] - r[1][2], r[0][2] - r[2][0], r[1][0] - r[0][1]];
-    norm(axis).atan2(r[0][0] + r[1][1] + r[2][2] - 1.0)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use splat4d::math::align::turn_between;
     use splat4d::math::se3::sub;
 
     fn scene(step: u64, n: usize) -> (Se3, Vec<Pair>) {

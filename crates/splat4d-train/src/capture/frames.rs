@@ -108,9 +108,40 @@ pub trait Frames: Send + Sync {
     fn prefetch(&self, _frames: &[usize]) {}
 }
 
+/// Half the time between two pictures of a camera, seconds: the median over the frames (camera, time); 0 where no camera
+/// has two.
+pub(crate) fn half_frame(frames: impl Iterator<Item = (usize, f64)>) -> f64 {
+    let mut all: Vec<(usize, f64)> = frames.collect();
+    all.sort_by(|a, b| a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)));
+    let mut gaps: Vec<f64> = all.windows(2).filter(|w| w[0].0 == w[1].0).map(|w| w[1].1 - w[0].1).collect();
+    gaps.sort_by(f64::total_cmp);
+    0.5 * gaps.get(gaps.len() / 2).copied().unwrap_or(0.0)
+}
+
+/// Moments of a rig whose shutters do not open at once: times less than half a frame apart are one.
+pub(crate) fn moments(frames: impl Iterator<Item = (usize, f64)> + Clone) -> usize {
+    let half = half_frame(frames.clone());
+    let mut times: Vec<f64> = frames.map(|(_, t)| t).collect();
+    times.sort_by(f64::total_cmp);
+    let (mut count, mut first) = (0, f64::NEG_INFINITY);
+    for t in times {
+        if t - first > half {
+            (count, first) = (count + 1, t);
+        }
+    }
+    count
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn shutters_that_do_not_open_at_once_share_their_moments() {
+        let rig = |late: f64| (0..12).map(move |i| (i % 3, (i / 3) as f64 + late * (i % 3) as f64));
+        assert_eq!([moments(rig(0.0)), moments(rig(0.2)), moments(rig(1.0))], [4, 4, 6]);
+        assert_eq!((half_frame(rig(0.2)), half_frame([(0, 1.0), (1, 3.0)].into_iter())), (0.5, 0.0));
+    }
 
     #[test]
     fn half_a_picture_is_the_mean_of_its_boxes() {

@@ -2,6 +2,7 @@
 //! scene whose cameras were refined is not judged by where the others were said to stand.
 
 use crate::Result;
+use crate::capture::frames::{Frames, Picture};
 use crate::capture::{Capture, ImageStore};
 use crate::learner::{Corrections, Origin, RefineSettings, Scale};
 use crate::loss::image::View;
@@ -9,14 +10,18 @@ use crate::loss::terms::StepInfo;
 use crate::recipe::Recipe;
 use crate::run::{learnable, plan, scale};
 use crate::step::chain::{Chain, Losses, Step};
+use crate::step::clocks::Look;
 use crate::step::loss::TrainLoss;
 use serde_json::Value;
 use splat4d::layers::Scene;
 use splat4d::render::Backend;
-use splat4d::scene::{Grads, Planes};
+use splat4d::scene::{Camera, Grads, Planes, Time};
 
 /// Share of D-SSIM in what is made small: none, since plain differences have the wider basin and cost less.
 const DSSIM: f64 = 0.0;
+
+/// Searches of a clock before its gradients are followed: far, then near ([`Corrections::search`]).
+const SEARCHES: [usize; 2] = [0, usize::MAX];
 
 /// How held-out views are aligned.
 #[derive(Clone, Debug)]
@@ -51,6 +56,15 @@ impl Align {
         let origins: Vec<Origin<'_>> =
             frames.iter().map(|&f| Origin { rig: info(f).camera, fixed: fixed(f), camera: &info(f).view }).collect();
         let mut found = Corrections::new(&self.settings, self.scale, &origins, capture.cameras.len(), false);
+        if self.settings.times {
+            for round in SEARCHES {
+                let look = Held { capture, store, frames };
+                let antialias = backend.config().antialias;
+                let look = Look { frames: &look, corrections: &found, exposure: None, antialias };
+                let shifts = look.shifts(scene, found.search(round))?;
+                found.shift(&shifts);
+            }
+        }
         // Frames that share a pose take turns.
         let mut groups: Vec<(usize, Vec<usize>)> = Vec::new();
         for (place, &f) in frames.iter().enumerate() {
@@ -107,5 +121,44 @@ impl Align {
         };
         let report = found.report(&name);
         Ok((aligned, report))
+    }
+}
+
+/// Some of a capture's frames, held out or not.
+struct Held<'a> {
+    capture: &'a Capture,
+    store: &'a ImageStore,
+    frames: &'a [usize],
+}
+
+impl Frames for Held<'_> {
+    fn len(&self) -> usize {
+        self.frames.len()
+    }
+
+    fn camera(&self, i: usize) -> &Camera {
+        &self.capture.frames[self.frames[i]].view
+    }
+
+    fn time(&self, i: usize) -> Time {
+        self.capture.frames[self.frames[i]].time
+    }
+
+    fn rig(&self, i: usize) -> usize {
+        self.capture.frames[self.frames[i]].camera
+    }
+
+    fn name(&self, i: usize) -> String {
+        self.capture.cameras[self.rig(i)].name.clone()
+    }
+
+    fn load(&self, i: usize, out: &mut Picture) -> Result<()> {
+        let stored = self.store.load(self.frames[i])?;
+        stored.color_into(&mut out.color);
+        let weight = out.weight.get_or_insert_default();
+        if !stored.valid_into(weight) {
+            out.weight = None;
+        }
+        Ok(())
     }
 }

@@ -11,6 +11,7 @@ pub mod metrics;
 mod report;
 pub mod run;
 pub mod tracks;
+pub mod trajectory;
 
 pub use align::Align;
 pub use colour::ColourMatrix;

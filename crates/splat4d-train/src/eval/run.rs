@@ -313,7 +313,7 @@ impl<'a> Judge<'a> {
         Ok(split)
     }
 
-    /// Measures `PSNR-aligned` of frames that `split` holds. Returns how far they were moved.
+    /// Measures `PSNR-aligned` and `PSNR-dynamic-aligned` of frames that `split` holds. Returns how far they were moved.
     fn align(
         &mut self,
         align: &Align,
@@ -324,9 +324,18 @@ impl<'a> Judge<'a> {
         let mut told = |done, total| listen(&Event::Phase { name: "aligning held-out cameras".into(), done, total });
         let (scene, store, backend) = (self.scene, self.store, self.backend.as_mut());
         let (capture, report) = align.fit(scene, self.capture, store, frames, backend, &mut told)?;
-        for (view, &frame) in split.views.iter_mut().zip(frames) {
-            let (image, truth, _) = self.draw(&capture, frame)?;
-            view.set("PSNR-aligned", Score::or(metrics::psnr(&image, &truth), "the image has no pixels"));
+        for camera in cameras(&capture, frames) {
+            let fixed = capture.cameras[camera.id].fixed && camera.places.len() > 1;
+            let mean = if fixed { Some(self.temporal_mean(frames, &camera.places)?) } else { None };
+            for place in camera.places {
+                let (image, truth, _) = self.draw(&capture, frames[place])?;
+                let view = &mut split.views[place];
+                view.set("PSNR-aligned", Score::or(metrics::psnr(&image, &truth), "the image has no pixels"));
+                if let Some(region) = mean.as_ref().map(|mean| metrics::dynamic_region(&truth, mean)) {
+                    let moving = metrics::psnr_region(&image, &truth, &region);
+                    view.set("PSNR-dynamic-aligned", Score::or(moving, "not defined: no pixel moves"));
+                }
+            }
         }
         Ok(report)
     }
@@ -473,7 +482,7 @@ fn by_file(frames: &[usize], value: impl Fn(usize) -> Value) -> Value {
 }
 
 /// Puts entries into a JSON file that may hold others.
-fn merge(path: &Path, entries: Value) -> Result<()> {
+pub(super) fn merge(path: &Path, entries: Value) -> Result<()> {
     // A damaged file is replaced: everything in it can be measured again.
     let old = std::fs::read_to_string(path).ok().and_then(|text| serde_json::from_str::<Value>(&text).ok());
     let mut all = old.filter(Value::is_object).unwrap_or_else(|| json!({}));

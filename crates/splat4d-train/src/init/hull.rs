@@ -3,9 +3,10 @@
 use super::Seeds;
 use super::volume::Volume;
 use crate::Result;
-use crate::capture::frames::{Frames, Picture};
+use crate::capture::frames::{Frames, Picture, half_frame};
 use rayon::prelude::*;
 use splat4d::math::Rng;
+use std::collections::BTreeMap;
 
 /// Candidates a wanted point: the hull is a small part of the box.
 const CANDIDATES: usize = 40;
@@ -32,10 +33,13 @@ pub(crate) fn carve(
     let each = count.div_ceil(times.len().max(1));
     let mut out = Seeds::default();
     // A single camera sees one side at a time: all moments together carve one hull, good for every moment.
-    let monocular = pictures_near(frames, times[0]).len() < MIN_VIEWS;
+    let monocular = pictures_near(frames, times[0]).1.len() < MIN_VIEWS;
     for (k, &t) in times.iter().enumerate() {
-        let pictures = if monocular { spread(frames) } else { pictures_near(frames, t) };
-        let stamp = (moving && !monocular).then(|| frames.time(pictures[0]).0);
+        let (near, mut pictures) = pictures_near(frames, t);
+        let stamp = (moving && !monocular).then_some(near);
+        if monocular {
+            pictures = spread(frames);
+        }
         let wanted = if monocular { count } else { each };
         let mut kept = carve_moment(frames, &pictures, volume, wanted, rng.fork(k as u64))?;
         kept.times.fill(stamp);
@@ -47,13 +51,28 @@ pub(crate) fn carve(
     Ok(out)
 }
 
-/// The frames at the distinct time nearest to t.
-fn pictures_near(frames: &dyn Frames, t: f64) -> Vec<usize> {
-    let Some(best) = (0..frames.len()).map(|i| frames.time(i).0).min_by(|a, b| (a - t).abs().total_cmp(&(b - t).abs()))
-    else {
-        return Vec::new();
+/// The distinct time nearest to t and its frames; of cameras whose shutters do not open at once the frame that is nearest
+/// to it, if that is less than half a frame.
+fn pictures_near(frames: &dyn Frames, t: f64) -> (f64, Vec<usize>) {
+    let all = || (0..frames.len()).map(|i| (frames.rig(i), frames.time(i).0));
+    let Some(best) = all().map(|(_, time)| time).min_by(|a, b| (a - t).abs().total_cmp(&(b - t).abs())) else {
+        return (t, Vec::new());
     };
-    (0..frames.len()).filter(|&i| frames.time(i).0 == best).collect()
+    let half = half_frame(all());
+    let mut near: BTreeMap<usize, (f64, Vec<usize>)> = BTreeMap::new();
+    for (i, (rig, time)) in all().enumerate() {
+        let apart = (time - best).abs();
+        let entry = near.entry(rig).or_insert((f64::INFINITY, Vec::new()));
+        if apart < entry.0 {
+            *entry = (apart, Vec::new());
+        }
+        if apart == entry.0 && (apart == 0.0 || apart < half) {
+            entry.1.push(i);
+        }
+    }
+    let mut chosen: Vec<usize> = near.into_values().flat_map(|(_, frames)| frames).collect();
+    chosen.sort_unstable();
+    (best, chosen)
 }
 
 fn spread(frames: &dyn Frames) -> Vec<usize> {

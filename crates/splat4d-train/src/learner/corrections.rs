@@ -2,12 +2,13 @@
 //!
 //! A correction of a pose is a twist ξ = (ρ, θ) in the camera's axes, `exp(ξ)·cam_from_world`; all frames of a fixed camera
 //! share one. A correction of a clock is a shift of all times of a camera. Pictures say nothing of where the scene as a whole
-//! stands, how large it is and when it begins: the cameras' mean motion, their mean growth and the first camera's clock stay.
+//! stands, how large it is and when it begins: the cameras' mean motion, their mean growth and the median of their clocks
+//! stay. The median, since of a rig with one clock that is wrong the others are right.
 
 use crate::settings::settings;
 use serde_json::{Value, json};
 use splat4d::math::Se3;
-use splat4d::math::se3::{cross, dot, mat_mul, mat_vec, norm, sub, transpose};
+use splat4d::math::se3::{cross, dot, mat_vec, norm, sub, transpose};
 use splat4d::scene::{Camera, Table, Time};
 
 settings! {
@@ -16,8 +17,8 @@ settings! {
         /// Learn a correction of every training camera's pose; one for all frames of a fixed camera. The cameras' mean
         /// motion and growth stay nothing. Held-out views are measured aligned as well.
         poses: bool = false;
-        /// Learn a shift of every training camera's clock; the first camera's stays. Shifts of whole frames are hardly found
-        /// (docs/benchmarks.md); `splat4d import` finds those.
+        /// Find by how much every training camera's clock is early or late: searched first, then learnt; the median of all
+        /// clocks stays. Held-out views are measured aligned as well.
         times: bool = false => any().when(IsNot("run.motion", &["still", "tracked"]));
         /// Rate of rotations at first: half a degree is within reach of the 50 views that a camera gets in a short run. Not
         /// swept.
@@ -28,16 +29,19 @@ settings! {
         position_init: f64 = 1e-3 => positive().unit("extents").when(On("refine.poses"));
         /// Rate of positions at the end.
         position_final: f64 = 1e-5 => positive().unit("extents").when(On("refine.poses"));
-        /// Rate of clocks at first.
+        /// Searches of clocks: each compares every camera's pictures with the scene at shifted times. 4 to 20 found clocks
+        /// alike (docs/refine.md).
+        searches: usize = 8 => any().when(On("refine.times"));
+        /// Rate of clocks at first, after the last search.
         time_init: f64 = 0.05 => positive().unit("frames").when(On("refine.times"));
         /// Rate of clocks at the end.
         time_final: f64 = 1e-3 => positive().unit("frames").when(On("refine.times"));
-        /// A clock is shifted by at most so much.
-        time_limit: f64 = 1.5 => positive().unit("frames").when(On("refine.times"));
+        /// A clock is shifted by at most so much; the first searches look so far.
+        time_limit: f64 = 4.0 => positive().unit("frames").when(On("refine.times"));
         /// Share of the run after which poses are learnt: the scene has formed by then.
         poses_from: f64 = 0.1 => share().when(On("refine.poses"));
-        /// Share of the run after which clocks are learnt.
-        times_from: f64 = 0.33 => share().when(On("refine.times"));
+        /// Share of the run after which clocks are searched; the searches are spread over what is left up to half of it.
+        times_from: f64 = 0.1 => share().when(On("refine.times"));
         /// Share of the run after which nothing of a camera is learnt any more, so that the scene settles on it.
         until: f64 = 0.8 => share().when(Any(&[On("refine.poses"), On("refine.times")]));
         /// Steps by which every held-out camera is aligned before it is measured a second time.
@@ -53,6 +57,13 @@ const TERMS: usize = 16;
 /// Share of a frame by which cameras' times differ at least. Views at one time share one gradient to it; at times that are
 /// hardly different each has its own.
 const APART: f64 = 1e-6;
+
+/// Share of the run by which clocks were searched: then the scene is sharp enough for gradients to go on. Not swept.
+const SEARCHED: f64 = 0.5;
+/// Searches that look as far as clocks may be wrong, in whole frames; later ones look about in halves.
+const WIDE_SEARCHES: usize = 3;
+/// Reach and distance of shifts of the later searches, frames.
+const NARROW: [f64; 2] = [1.5, 0.5];
 
 /// Columns of a table of numbers with their moments.
 const POSE: usize = 6;
@@ -75,6 +86,16 @@ pub struct Scale {
     pub extent: f64,
     /// Seconds between two frames.
     pub frame: f64,
+}
+
+/// A search of clocks that is due.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct SearchDue {
+    /// Which of them.
+    pub round: usize,
+    /// Largest shift and distance of shifts, seconds.
+    pub reach: f64,
+    pub step: f64,
 }
 
 /// See the module's documentation.
@@ -147,7 +168,7 @@ impl Corrections {
 
     /// The camera of frame `i`, corrected.
     pub(crate) fn camera(&self, i: usize, stated: &Camera) -> Camera {
-        let moved = self.twist(self.rows[i]).map(|twist| after(&exp(twist), &stated.cam_from_world));
+        let moved = self.twist(self.rows[i]).map(|twist| exp(twist).after(&stated.cam_from_world));
         Camera { cam_from_world: moved.unwrap_or(stated.cam_from_world), ..stated.clone() }
     }
 
@@ -194,18 +215,68 @@ impl Corrections {
                 self.fix_poses();
             }
         }
-        if let (Some(done), Some(times)) = (share(s.times_from), &mut self.times) {
+        if let (Some(done), Some(times)) = (share(self.searched()), &mut self.times) {
             let step = rate([s.time_init, s.time_final], done, self.scale.frame);
             let limit = (s.time_limit * self.scale.frame) as f32;
             let mut sums: Vec<(usize, [f64; 1])> = Vec::new();
             for (&i, &d) in frames.iter().zip(d_times) {
                 add(&mut sums, self.rigs[i], [d]);
             }
-            for (rig, d) in sums.into_iter().filter(|(rig, _)| !(self.gauge && *rig == self.rigs[0])) {
+            for (rig, d) in sums {
                 adam(times, rig, d, [step]);
                 times.set(rig, 0, times.get(rig, 0).clamp(-limit, limit));
             }
+            self.fix_times();
         }
+    }
+
+    /// The share of the run after which no clock is searched any more.
+    fn searched(&self) -> f64 {
+        let s = &self.settings;
+        if s.searches > 0 && self.gauge {
+            SEARCHED.clamp(s.times_from, s.until.max(s.times_from))
+        } else {
+            s.times_from
+        }
+    }
+
+    /// The search of clocks that is due where the run comes from one share of itself to another.
+    pub(crate) fn search_due(&self, before: f64, after: f64) -> Option<SearchDue> {
+        self.times.as_ref()?;
+        let (from, rounds) = (self.settings.times_from, self.settings.searches);
+        let at = |round: usize| from + (self.searched() - from) * round as f64 / rounds as f64;
+        let round = (0..rounds).rev().find(|&k| (before..after).contains(&at(k)))?;
+        Some(self.search(round))
+    }
+
+    /// The search of this number.
+    pub(crate) fn search(&self, round: usize) -> SearchDue {
+        let [reach, step] = if round < WIDE_SEARCHES { [self.settings.time_limit, 1.0] } else { NARROW };
+        SearchDue { round, reach: reach * self.scale.frame, step: step * self.scale.frame }
+    }
+
+    /// Shifts the clocks of cameras by so many seconds. What gradients said of them before holds no longer.
+    pub(crate) fn shift(&mut self, shifts: &[(usize, f64)]) {
+        let limit = (self.settings.time_limit * self.scale.frame) as f32;
+        let Some(times) = &mut self.times else { return };
+        for &(rig, shift) in shifts {
+            let value = times.get(rig, 0) + shift as f32;
+            times.clear_row(rig);
+            times.set(rig, 0, value.clamp(-limit, limit));
+        }
+        self.fix_times();
+    }
+
+    /// Takes the median of all cameras' shifts out of them.
+    fn fix_times(&mut self) {
+        let (Some(times), true) = (&mut self.times, self.gauge) else { return };
+        let mut rigs = self.rigs.clone();
+        rigs.sort_unstable();
+        rigs.dedup();
+        let mut all: Vec<f32> = rigs.iter().map(|&rig| times.get(rig, 0)).collect();
+        all.sort_by(f32::total_cmp);
+        let median = 0.5 * (all[(all.len() - 1) / 2] + all[all.len() / 2]);
+        rigs.iter().for_each(|&rig| times.set(rig, 0, times.get(rig, 0) - median));
     }
 
     /// Takes the motion and growth that all cameras have in common out of the twists.
@@ -270,12 +341,7 @@ impl Corrections {
 
 /// A pose moved by a twist (ρ, θ) from the left.
 pub(crate) fn moved(pose: &Se3, twist: [f64; 6]) -> Se3 {
-    after(&exp(twist), pose)
-}
-
-/// x ↦ last(first(x)).
-fn after(last: &Se3, first: &Se3) -> Se3 {
-    Se3 { rotation: mat_mul(&last.rotation, &first.rotation), translation: last.apply(first.translation) }
+    exp(twist).after(pose)
 }
 
 /// The rigid motion of a twist, by the series of the exponential: it rounds alike on every machine, as sines do not.

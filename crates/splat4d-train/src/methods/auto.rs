@@ -31,10 +31,9 @@ impl Seen {
     /// Looks at the training frames of a capture.
     pub(crate) fn of(plan: &Plan, frames: &dyn Frames) -> Result<Self> {
         let looks = plan.times > 1 && plan.fixed_cameras > 0;
-        let times = if plan.fixed_cameras > 1 { moments(frames).min(plan.times) } else { plan.times };
         Ok(Self {
-            times,
-            cameras: frames.len() as f64 / times.max(1) as f64,
+            times: plan.times,
+            cameras: frames.len() as f64 / plan.times.max(1) as f64,
             changing: if looks { motion_energy(frames)? } else { None },
             masks: frames.has_masks(),
         })
@@ -65,24 +64,6 @@ pub(crate) fn choose(plan: &Plan, frames: &dyn Frames) -> Result<Choice> {
     let seen = Seen::of(plan, frames)?;
     let choice = PROGRAMS.into_iter().find_map(|(motion, make)| Some(Choice { motion, why: make().suits(&seen)? }));
     Ok(choice.expect("one program suits whatever no other does"))
-}
-
-/// Moments of a rig whose shutters do not open at once: times less than half a frame apart are one.
-fn moments(frames: &dyn Frames) -> usize {
-    let mut all: Vec<(usize, f64)> = (0..frames.len()).map(|i| (frames.rig(i), frames.time(i).0)).collect();
-    all.sort_by(|a, b| a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)));
-    let mut frame: Vec<f64> = all.windows(2).filter(|w| w[0].0 == w[1].0).map(|w| w[1].1 - w[0].1).collect();
-    frame.sort_by(f64::total_cmp);
-    let half = 0.5 * frame.get(frame.len() / 2).copied().unwrap_or(0.0);
-    let mut times: Vec<f64> = all.into_iter().map(|(_, t)| t).collect();
-    times.sort_by(f64::total_cmp);
-    let (mut count, mut first) = (0, f64::NEG_INFINITY);
-    for t in times {
-        if t - first > half {
-            (count, first) = (count + 1, t);
-        }
-    }
-    count
 }
 
 /// Share of the pixels of fixed cameras that change from one of their frames to the next; `None`: no camera has two.
@@ -121,6 +102,7 @@ fn changes(a: &Planes<f32>, b: &Planes<f32>) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::capture::frames::moments;
     use crate::recipe::Recipe;
     use splat4d::math::Se3;
     use splat4d::scene::{Camera, Time};
@@ -148,7 +130,7 @@ mod tests {
                 extent: 1.0,
                 clip: [0.0, 1.0],
                 fps: 30.0,
-                times: if self.late == 0.0 { self.times } else { self.times * self.cameras },
+                times: moments((0..self.len()).map(|i| (self.rig(i), self.time(i).0))),
                 fixed_cameras: if fixed { self.cameras } else { 0 },
                 moments: Vec::new(),
                 masks: self.masks,

@@ -51,7 +51,7 @@ pub struct Plan {
     pub clip: [f64; 2],
     /// Frames a second.
     pub fps: f64,
-    /// Distinct times in the capture.
+    /// Distinct times in the capture; of a rig of fixed cameras whose shutters do not open at once, its moments.
     pub times: usize,
     /// Cameras with training pictures that do not move.
     pub fixed_cameras: usize,

@@ -2,7 +2,7 @@
 //! trainer.
 
 use super::dataset::Dataset;
-use crate::capture::{Capture, CaptureOptions, ImageStore};
+use crate::capture::{Capture, CaptureOptions, ImageStore, frames};
 use crate::event::Event;
 use crate::init::{self, Seeds, Source};
 use crate::learner::{Corrections, Exposure, Origin, RefineSettings, Scale};
@@ -104,6 +104,7 @@ pub fn plan(capture: &Capture, recipe: &Recipe) -> Plan {
     let mut rigs: Vec<usize> = capture.train.iter().filter(fixed).map(|&i| capture.frames[i].camera).collect();
     rigs.sort_unstable();
     rigs.dedup();
+    let of_rigs = capture.train.iter().map(|&i| (capture.frames[i].camera, capture.frames[i].time.0));
     let views = |t: f64| seen.partition_point(|s| *s <= t) - seen.partition_point(|s| *s < t);
     let moments = times.iter().map(|&t| (t, views(t))).collect();
     // Cameras that all stand in one place say nothing of the scene's size.
@@ -113,7 +114,7 @@ pub fn plan(capture: &Capture, recipe: &Recipe) -> Plan {
         extent: if radius > SINGLE_PLACE { radius } else { 1.0 },
         clip,
         fps: capture.fps,
-        times: times.len(),
+        times: if rigs.len() > 1 { frames::moments(of_rigs) } else { times.len() },
         fixed_cameras: rigs.len(),
         moments,
         masks: capture.background.is_some() || capture.train.iter().any(|&i| capture.frames[i].mask.is_some()),

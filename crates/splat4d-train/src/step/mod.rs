@@ -3,6 +3,7 @@
 mod batch;
 pub(crate) mod chain;
 mod channels;
+pub(crate) mod clocks;
 pub mod engine;
 pub mod loss;
 pub(crate) mod pace;

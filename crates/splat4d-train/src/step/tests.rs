@@ -5,6 +5,7 @@ mod flow;
 #[cfg(feature = "gpu")]
 mod gpu;
 mod limits;
+mod refine;
 mod resume;
 mod switches;
 

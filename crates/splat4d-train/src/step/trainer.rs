@@ -2,6 +2,7 @@
 
 use super::batch::Batch;
 use super::chain::StepInfo;
+use super::clocks::Look;
 use super::engine::{CpuEngine, Engine, StepPlan};
 pub use super::engine::{Fault, Stepped};
 use super::loss::TrainLoss;
@@ -298,7 +299,7 @@ impl<'a> Trainer<'a> {
                 return Ok(Err(Fault(format!("{} ({views})", fault.0))));
             }
         };
-        self.correct(&out);
+        self.correct(&out)?;
         let clock = Clock::now();
         let (place, next) = (self.progress.stage_step, self.next_place());
         out.change = self.keep_up(place + 1..=next, |_| true)?;
@@ -363,8 +364,8 @@ impl<'a> Trainer<'a> {
         self.engine.step(&mut self.learner, &mut plan)
     }
 
-    /// Corrects cameras by what the step's views say.
-    fn correct(&mut self, stepped: &Stepped) {
+    /// Corrects cameras by what the step's views say, and searches their clocks where that is due.
+    fn correct(&mut self, stepped: &Stepped) -> Result<()> {
         let Position { stage, stage_step, rate_scale, .. } = self.progress;
         let before: usize = self.stages[..stage].iter().map(|s| s.iterations).sum();
         let progress = (before + stage_step) as f64 / self.schedule().max(1) as f64;
@@ -372,6 +373,15 @@ impl<'a> Trainer<'a> {
             let report = &stepped.report;
             corrections.step(self.batch.seen(), &report.d_cameras, &report.d_times, progress, rate_scale);
         }
+        let after = (before + self.next_place()) as f64 / self.schedule().max(1) as f64;
+        let Some(corrections) = &self.learner.corrections else { return Ok(()) };
+        if let Some(due) = corrections.search_due(progress, after) {
+            let (frames, antialias) = (self.frames.as_ref(), self.engine.antialias());
+            let look = Look { frames, corrections, exposure: self.learner.exposure.as_ref(), antialias };
+            let shifts = look.shifts(self.learner.scene(), due)?;
+            self.learner.corrections.iter_mut().for_each(|c| c.shift(&shifts));
+        }
+        Ok(())
     }
 
     /// Runs the operations of `which` that are due after any of these steps of the stage's schedule, once each and where

@@ -1,6 +1,7 @@
 //! Small mathematics: quaternions, symmetric 3x3 matrices, rigid motions, similarities, spherical harmonics, counter-based random
 //! numbers, and the [`Real`] trait that lets every kernel run in f32 and be checked in f64.
 
+pub mod align;
 pub mod jacobi;
 pub mod knn;
 pub mod mat3;

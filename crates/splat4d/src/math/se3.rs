@@ -34,8 +34,7 @@ impl Se3 {
     }
 
     /// `self` after `first`: x ↦ self(first(x)).
-    #[cfg(test)]
-    pub(crate) fn after(&self, first: &Self) -> Self {
+    pub fn after(&self, first: &Self) -> Self {
         Self { rotation: mat_mul(&self.rotation, &first.rotation), translation: self.apply(first.translation) }
     }
 

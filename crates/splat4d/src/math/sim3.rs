@@ -1,6 +1,6 @@
 //! Similarities of space in f64: rotation, translation and scale.
 
-use super::se3::{mat_mul, mat_vec};
+use super::se3::{mat_mul, mat_vec, transpose};
 use super::{Real, Se3};
 
 /// A rotation, a scale and a translation, named by direction at the use (`world_from_layer`): y = s R x + t.
@@ -66,6 +66,14 @@ impl Sim3 {
             rotation: mat_mul(&self.rotation, &first.rotation),
             translation: self.apply(first.translation),
         }
+    }
+
+    /// The pose `cam_from_world` of a camera in the world that this leads to.
+    pub fn pose(&self, pose: &Se3) -> Se3 {
+        let center = self.apply(pose.inverse().translation);
+        let rotation = mat_mul(&pose.rotation, &transpose(&self.rotation));
+        let translation = mat_vec(&rotation, center).map(|v| -v);
+        Se3 { rotation, translation }
     }
 
     /// The matrix s R.

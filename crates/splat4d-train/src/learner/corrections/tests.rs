@@ -11,6 +11,10 @@ fn corrections(settings: &RefineSettings, cameras: &[Camera], gauge: bool) -> Co
     Corrections::new(settings, Scale { extent: 4.0, frame: 0.1 }, &frames, cameras.len(), gauge)
 }
 
+fn step(c: &mut Corrections, frames: &[usize], d_cameras: &[[f64; 6]], d: &[f64], progress: f64) {
+    c.step(frames, d_cameras, d, progress, 1.0);
+}
+
 fn on() -> RefineSettings {
     RefineSettings { poses: true, times: true, ..RefineSettings::default() }
 }
@@ -21,7 +25,7 @@ const TWIST: [f64; 6] = [0.3, -0.2, 0.5, 0.4, -0.6, 0.2];
 fn twists_move_rigidly_and_have_the_gradient_of_perturbations() {
     let motion = exp(TWIST);
     assert!(motion.orthogonality_error() < 1e-14 && (motion.det() - 1.0).abs() < 1e-14);
-    let back = after(&exp(TWIST.map(|x| -x)), &motion);
+    let back = exp(TWIST.map(|x| -x)).after(&motion);
     assert!(norm(back.translation) < 1e-14);
     // A made-up loss of a pose: d is its gradient to a perturbation from the left, by differences.
     let (x, g) = ([0.3, 1.2, -0.7], [0.5, -1.0, 0.8]);
@@ -33,7 +37,7 @@ fn twists_move_rigidly_and_have_the_gradient_of_perturbations() {
             (at(H) - at(-H)) / (2.0 * H)
         })
     };
-    let d = slope(&|xi| loss(&after(&exp(xi), &motion)));
+    let d = slope(&|xi| loss(&exp(xi).after(&motion)));
     let expected = slope(&|xi| loss(&exp(std::array::from_fn(|k| TWIST[k] + xi[k]))));
     let found = to_twist(TWIST, d);
     assert!((0..6).all(|k| (found[k] - expected[k]).abs() < 1e-8), "{found:?} {expected:?}");
@@ -69,15 +73,39 @@ fn only_what_was_seen_moves_within_its_time_and_its_limits() {
     let mut c = corrections(&RefineSettings { time_init: 10.0, ..on() }, &cameras, true);
     let d = [[1.0, 0.0, 0.0, 0.0, 0.5, 0.0]];
     let before: Vec<_> = c.tables().map(|(_, t)| t.clone()).collect();
-    c.step(&[1], &d, &[1.0], 0.05, 1.0);
-    c.step(&[1], &d, &[1.0], 0.9, 1.0);
-    c.step(&[1], &[[f64::NAN; 6]], &[f64::NAN], 0.5, 1.0);
+    step(&mut c, &[1], &d, &[1.0], 0.05);
+    step(&mut c, &[1], &d, &[1.0], 0.9);
+    step(&mut c, &[1], &[[f64::NAN; 6]], &[f64::NAN], 0.7);
     assert!(c.tables().zip(&before).all(|((_, t), old)| t == old), "too early, too late, not finite");
-    c.step(&[1, 0], &[d[0], d[0]], &[1.0, 1.0], 0.34, 1.0);
+    // Rates are largest when they begin, of clocks after the last search: there a step goes beyond the limit.
+    step(&mut c, &[1, 0], &[d[0], d[0]], &[1.0, -1.0], SEARCHED);
     let times: Vec<f64> = (0..3).map(|i| c.time(i, Time(0.0)).0).collect();
-    assert!(times[0] == 0.0 && (times[1] + 0.15).abs() < 1e-6 && times[2].abs() < 1e-6, "{times:?}");
-    let moved = |i: usize| c.camera(i, &cameras[i]) != cameras[i];
+    let limit = 0.1 * c.settings.time_limit;
+    assert!((times[0] - limit).abs() < 1e-6 && (times[1] + limit).abs() < 1e-6 && times[2].abs() < 1e-6, "{times:?}");
+    let moved = |i: usize| c.camera(i, &cameras[i]).cam_from_world != cameras[i].cam_from_world;
     assert!([0, 1, 2].into_iter().all(moved), "the mean stays, so the others give way");
+}
+
+#[test]
+fn searches_are_spread_over_the_run_and_keep_the_median_of_all_clocks() {
+    let cameras: Vec<Camera> = (0..5).map(camera).collect();
+    let mut c = corrections(&on(), &cameras, true);
+    const STEPS: usize = 1000;
+    let due = |k: usize| c.search_due(k as f64 / STEPS as f64, (k + 1) as f64 / STEPS as f64);
+    let found: Vec<(usize, SearchDue)> = (0..STEPS).filter_map(|k| Some((k, due(k)?))).collect();
+    assert_eq!(found.iter().map(|(_, d)| d.round).collect::<Vec<_>>(), (0..c.settings.searches).collect::<Vec<_>>());
+    assert!(found[0].0 == 100 && found.iter().all(|(k, _)| *k < 500), "{found:?}");
+    assert!((found[0].1.reach - 0.4).abs() < 1e-12 && found.last().unwrap().1.reach < 0.2, "far first: {found:?}");
+    // Places are passed over where the run was planned anew: one search is made, and none twice.
+    assert_eq!(c.search_due(0.05, 0.44).map(|d| d.round), Some(6));
+    assert_eq!(c.search_due(0.25, 0.25), None);
+    // Four clocks that are right by themselves and one that is not.
+    c.shift(&[(0, 0.1), (1, 0.1), (2, 0.35), (3, 0.1), (4, 0.12)]);
+    let times: Vec<f64> = (0..5).map(|i| c.time(i, Time(0.0)).0).collect();
+    let close = |i: usize, t: f64| (times[i] - t).abs() < 1e-5;
+    assert!(close(0, 0.0) && close(1, 0.0) && close(2, 0.25) && close(4, 0.02), "{times:?}");
+    let still = corrections(&RefineSettings { times: false, ..on() }, &cameras, true);
+    assert_eq!(still.search_due(0.0, 1.0), None, "nobody asked for it");
 }
 
 #[test]

@@ -187,7 +187,7 @@ fn assert_close(got: f64, fd: f64, what: &str) {
     assert!((got - fd).abs() <= floor + relative * fd.abs(), "{what}: chain {got:e}, differences {fd:e}");
 }
 
-/// Every column of a few rows of every trainable table, and dL/dt of every view, against central differences. Returns
+/// Every column of a few rows of every trainable table, and dL/dt and dL/d pose of every view, against central differences. Returns
 /// the largest gradient of every table of every layer, so that a test can say which parameters must be reached.
 fn check_gradients(scene: &Scene<f64>, shots: &[Shot], probes: &Probes) -> Vec<Vec<(String, f64)>> {
     let (report, d, _) = step(scene, shots, probes, &mut Renderer::new(smooth()));
@@ -232,6 +232,16 @@ fn check_gradients(scene: &Scene<f64>, shots: &[Shot], probes: &Probes) -> Vec<V
                 value(scene, &s, probes)
             };
             assert_close(report.d_times[i], (moved(H) - moved(-H)) / (2.0 * H), "dL/dt");
+            for k in 0..6 {
+                let turned = |by: f64| {
+                    let mut s = shots.to_vec();
+                    let twist = std::array::from_fn(|j| if j == k { by } else { 0.0 });
+                    s[i].camera.cam_from_world = crate::learner::moved(&shot.camera.cam_from_world, twist);
+                    value(scene, &s, probes)
+                };
+                let fd = (turned(H) - turned(-H)) / (2.0 * H);
+                assert_close(report.d_cameras[i][k], fd, &format!("view {i}: dL/d pose {k}"));
+            }
         }
     }
     reached
