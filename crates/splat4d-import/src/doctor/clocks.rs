@@ -5,11 +5,10 @@ use super::between::AGREE;
 use super::check::{MATCHES, Told, grade, unit};
 use super::look::Seen;
 use super::shutter::{self, Pair};
-use crate::sync::epipolar::{Range, fundamental, lag};
+use crate::sync::epipolar::{Range, fundamental, lag, neighbours};
 use crate::sync::graph::{Evidence, Kind, solve};
 use crate::sync::median;
 use rayon::prelude::*;
-use splat4d::math::se3::{norm, sub};
 use splat4d_train::capture::Capture;
 use splat4d_train::event::Progress;
 
@@ -39,15 +38,8 @@ pub(super) fn clocks(capture: &Capture, seen: &[Seen], report: &mut Report, prog
         return;
     }
     let view = |c: usize| &seen[c].stands[0].view;
-    let mut chosen: Vec<[usize; 2]> = Vec::new();
-    for &a in &ready {
-        let far = |b: usize| norm(sub(view(a).center(), view(b).center()));
-        let mut others: Vec<usize> = ready.iter().copied().filter(|&b| b != a).collect();
-        others.sort_by(|&i, &j| far(i).total_cmp(&far(j)));
-        chosen.extend(others.iter().take(NEIGHBOURS).map(|&b| [a.min(b), a.max(b)]));
-    }
-    chosen.sort_unstable();
-    chosen.dedup();
+    let centers: Vec<_> = (0..seen.len()).map(|c| ready.contains(&c).then(|| view(c).center())).collect();
+    let chosen = neighbours(&centers, NEIGHBOURS);
     progress.phase("comparing clocks", 0, chosen.len());
     let interval = ready.iter().map(|&c| seen[c].clock.interval).fold(0.0, f64::max);
     let pairs: Vec<Pair> = chosen

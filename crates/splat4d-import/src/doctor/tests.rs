@@ -350,23 +350,32 @@ fn tracks(c: usize, late: f64, shutter: f64) -> Vec<Track> {
     (0..30).map(|k| Track { samples: (0..60).map(|n| sample(k, n)).collect() }).collect()
 }
 
-#[test]
-fn a_late_clock_is_found() {
+/// What is told of the clocks where the ill camera is late by so many seconds, and reads its rows over so many.
+fn timed(late: f64, shutter: f64) -> Report {
     let folder = tempfile::tempdir().unwrap();
     let moment: Clip = clean().iter().map(|c| c[..2].to_vec()).collect();
     let capture = write(folder.path(), &moment, 0.0, CAMERAS);
-    for (late, expected) in [(0.0, vec![]), (0.9 / FPS, vec!["c3"])] {
-        let seen = |c: usize| Seen {
+    let seen = |c: usize| {
+        let own = |value: f64| if c == ILL { value } else { 0.0 };
+        Seen {
             stands: vec![Stand { view: camera(c), picture: Rgb8::default() }],
-            tracks: tracks(c, if c == ILL { late } else { 0.0 }, 0.0),
+            tracks: tracks(c, own(late), own(shutter)),
             clock: Clock { interval: 1.0 / FPS, ..Clock::default() },
             row: 60,
             ..Seen::default()
-        };
-        let seen: Vec<Seen> = (0..CAMERAS).map(seen).collect();
-        let cameras = (0..CAMERAS).map(|_| CameraReport::default()).collect();
-        let mut report = Report { cameras, ..Report::default() };
-        clocks(&capture, &seen, &mut report, &mut Progress(&mut |_| {}));
+        }
+    };
+    let seen: Vec<Seen> = (0..CAMERAS).map(seen).collect();
+    let cameras = (0..CAMERAS).map(|_| CameraReport::default()).collect();
+    let mut report = Report { cameras, ..Report::default() };
+    clocks(&capture, &seen, &mut report, &mut Progress(&mut |_| {}));
+    report
+}
+
+#[test]
+fn a_late_clock_is_found() {
+    for (late, expected) in [(0.0, vec![]), (0.9 / FPS, vec!["c3"])] {
+        let report = timed(late, 0.0);
         assert_eq!(found(&report, "offset"), expected, "{:?} {:?}", report.findings, report.left);
         if let Some(f) = report.findings.first() {
             assert!((f.amount.unwrap() + 1e3 * late).abs() < 2.0, "late by {late}: {f:?}");
@@ -376,21 +385,8 @@ fn a_late_clock_is_found() {
 
 #[test]
 fn a_rolling_shutter_is_found() {
-    let folder = tempfile::tempdir().unwrap();
-    let moment: Clip = clean().iter().map(|c| c[..2].to_vec()).collect();
-    let capture = write(folder.path(), &moment, 0.0, CAMERAS);
     for (shutter, expected) in [(0.0, vec![]), (0.02, vec!["c3"])] {
-        let seen = |c: usize| Seen {
-            stands: vec![Stand { view: camera(c), picture: Rgb8::default() }],
-            tracks: tracks(c, 0.0, if c == ILL { shutter } else { 0.0 }),
-            clock: Clock { interval: 1.0 / FPS, ..Clock::default() },
-            row: 60,
-            ..Seen::default()
-        };
-        let seen: Vec<Seen> = (0..CAMERAS).map(seen).collect();
-        let cameras = (0..CAMERAS).map(|_| CameraReport::default()).collect();
-        let mut report = Report { cameras, ..Report::default() };
-        clocks(&capture, &seen, &mut report, &mut Progress(&mut |_| {}));
+        let report = timed(0.0, shutter);
         assert_eq!(found(&report, "rolling-shutter"), expected, "{:?} {:?}", report.findings, report.left);
         let told: Vec<f64> = report.cameras.iter().map(|c| c.shutter.unwrap()[0]).collect();
         for (c, seconds) in told.iter().enumerate() {

@@ -4,7 +4,7 @@
 use super::tracks::Track;
 use super::{NORMAL_MAD, Refusal, median};
 use rayon::prelude::*;
-use splat4d::math::se3::{mat_mul, mat_vec, sub, transpose};
+use splat4d::math::se3::{mat_mul, mat_vec, norm, sub, transpose};
 use splat4d::scene::Camera;
 
 /// Pixels off the epipolar line from which on a match at some lag is none: a few times what corners and poses are exact to.
@@ -129,6 +129,21 @@ pub fn fundamental(a: &Camera, b: &Camera) -> [[f64; 3]; 3] {
         [[1.0 / k.fx, 0.0, -k.cx / k.fx], [0.0, 1.0 / k.fy, -k.cy / k.fy], [0.0, 0.0, 1.0]]
     };
     mat_mul(&transpose(&inverse(b)), &mat_mul(&mat_mul(&cross, &rotation), &inverse(a)))
+}
+
+/// Pairs of cameras, each with so many that stand nearest to it, in order; None: a camera that takes no part.
+pub fn neighbours(centers: &[Option<[f64; 3]>], count: usize) -> Vec<[usize; 2]> {
+    let mut pairs = Vec::new();
+    for (a, own) in centers.iter().enumerate() {
+        let Some(own) = own else { continue };
+        let far = |(b, c): (usize, &Option<[f64; 3]>)| c.filter(|_| b != a).map(|c| (norm(sub(*own, c)), b));
+        let mut others: Vec<(f64, usize)> = centers.iter().enumerate().filter_map(far).collect();
+        others.sort_by(|x, y| x.0.total_cmp(&y.0).then(x.1.cmp(&y.1)));
+        pairs.extend(others.iter().take(count).map(|&(_, b)| [a.min(b), a.max(b)]));
+    }
+    pairs.sort_unstable();
+    pairs.dedup();
+    pairs
 }
 
 /// The median interval between samples, seconds.

@@ -3,12 +3,11 @@
 use super::cache::Cache;
 use super::stored::Stored;
 use crate::Result;
-use crate::sync::epipolar::{Range, fundamental, lag};
+use crate::sync::epipolar::{Range, fundamental, lag, neighbours};
 use crate::sync::graph::{Evidence, Kind, Solution};
 use crate::sync::grey::Grey;
 use crate::sync::tracks::{Track, Tracker, moving};
 use rayon::prelude::*;
-use splat4d::math::se3::{norm, sub};
 use splat4d::scene::Camera;
 use splat4d_train::capture::Rgb8;
 use splat4d_train::event::Progress;
@@ -61,17 +60,8 @@ fn measured(stored: &Stored<'_>, clock: &Solution, progress: &mut Progress<'_>) 
         progress.phase("following what moves", c, n);
         seen.push(camera(stored, c, middle - offset(c))?);
     }
-    let mut pairs: Vec<[usize; 2]> = Vec::new();
-    let center = |c: usize| seen[c].as_ref().map(|s| s.camera.center());
-    for a in 0..n {
-        let Some(own) = center(a) else { continue };
-        let mut others: Vec<(f64, usize)> =
-            (0..n).filter(|&b| b != a).filter_map(|b| Some((norm(sub(own, center(b)?)), b))).collect();
-        others.sort_by(|x, y| x.0.total_cmp(&y.0).then(x.1.cmp(&y.1)));
-        pairs.extend(others.iter().take(NEIGHBOURS).map(|&(_, b)| [a.min(b), a.max(b)]));
-    }
-    pairs.sort_unstable();
-    pairs.dedup();
+    let centers: Vec<_> = seen.iter().map(|s| s.as_ref().map(|s| s.camera.center())).collect();
+    let pairs = neighbours(&centers, NEIGHBOURS);
     let of = |&[a, b]: &[usize; 2]| {
         let (p, q) = (seen[a].as_ref()?, seen[b].as_ref()?);
         let interval = stored.pictures[a].clock.interval.max(stored.pictures[b].clock.interval);
