@@ -236,7 +236,8 @@ fn judge(
     }
     let scene = read_scene(&Run::open(folder)?.scene_file()?)?;
     let recipe = &order.recipe;
-    let store = ImageStore::new(capture.clone(), usize::try_from(recipe.run.image_memory).unwrap_or(usize::MAX));
+    let store =
+        Arc::new(ImageStore::new(capture.clone(), usize::try_from(recipe.run.image_memory).unwrap_or(usize::MAX)));
     let options = EvalOptions {
         antialias: recipe.appearance.antialias,
         pictures: false,

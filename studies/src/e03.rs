@@ -132,7 +132,7 @@ struct Trial {
     scene: Scene<f32>,
     capture: Arc<Capture>,
     recipe: Recipe,
-    store: ImageStore,
+    store: Arc<ImageStore>,
     looks: Vec<Look>,
     grid: Grid,
 }
@@ -154,7 +154,8 @@ impl Trial {
                 .into());
         }
         let capture = Arc::new(capture);
-        let store = ImageStore::new(capture.clone(), usize::try_from(recipe.run.image_memory).unwrap_or(usize::MAX));
+        let store =
+            Arc::new(ImageStore::new(capture.clone(), usize::try_from(recipe.run.image_memory).unwrap_or(usize::MAX)));
         let share = if args.quick { QUICK_SHARE } else { STEPS_SHARE };
         let own = run.iteration().unwrap_or(recipe.resolve().run.iterations);
         let steps = args.fine_tune.unwrap_or(((own as f64 * share) as usize).max(1));

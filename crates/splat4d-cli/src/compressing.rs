@@ -339,7 +339,7 @@ impl Original<'_> {
 
     /// The scores of a scene of this capture, without a trace in any folder.
     fn scores(&self, scene: &Scene<f32>, console: &Console) -> anyhow::Result<Scores> {
-        let store = ImageStore::new(self.capture.clone(), self.recipe.run.image_memory as usize);
+        let store = Arc::new(ImageStore::new(self.capture.clone(), self.recipe.run.image_memory as usize));
         let options =
             EvalOptions { antialias: self.recipe.appearance.antialias, pictures: false, ..EvalOptions::default() };
         let scores = assess(scene, &self.capture, &store, 0, &options, &mut |event| console.event(event))?;

@@ -242,7 +242,7 @@ impl Measuring<'_> {
     ) -> anyhow::Result<Scores> {
         not_empty(scene, &self.opened.path)?;
         let memory = usize::try_from(self.recipe.run.image_memory).unwrap_or(usize::MAX);
-        let store = ImageStore::new(capture.clone(), memory);
+        let store = Arc::new(ImageStore::new(capture.clone(), memory));
         let options = EvalOptions {
             folder: self.opened.path.clone(),
             antialias: self.recipe.appearance.antialias,

@@ -174,17 +174,16 @@ return max(ceil(center - extent - 0.5), 0.0) <= min(floor(center + extent - 0.5)
 fn cutoff(view: View, opacity: f32) -> f32 {
 return 2.0 * log(opacity / view.alpha_min) + PROJECT_TAU_MARGIN;
 }
-fn project(view: View, mean: vec3<f32>, cov: Cov, opacity: f32) -> Ellipse {
-var out: Ellipse;
-out.visible = 0u;
-out.rho = 1.0;
-let p = (view.camera_from_world * vec4<f32>(mean, 1.0)).xyz;
-if (!(finite(p.x) && finite(p.y) && finite(p.z) && finite(opacity))) {
-return out;
+struct Linear {
+uv: vec2<f32>,
+held: vec2<f32>,
+r0: vec3<f32>,
+r1: vec3<f32>,
+r2: vec3<f32>,
+m0: vec3<f32>,
+m1: vec3<f32>,
 }
-if (!(p.z > view.near && opacity >= view.alpha_min)) {
-return out;
-}
+fn linear(view: View, p: vec3<f32>) -> Linear {
 let inv_z = 1.0 / p.z;
 let uv = p.xy * inv_z;
 let margin = PROJECT_J_MARGIN * 0.5 * view.size / view.focal;
@@ -196,6 +195,22 @@ let r1 = vec3<f32>(view.camera_from_world[0].y, view.camera_from_world[1].y, vie
 let r2 = vec3<f32>(view.camera_from_world[0].z, view.camera_from_world[1].z, view.camera_from_world[2].z);
 let m0 = view.focal.x * inv_z * (r0 - held.x * r2);
 let m1 = view.focal.y * inv_z * (r1 - held.y * r2);
+return Linear(uv, held, r0, r1, r2, m0, m1);
+}
+fn project(view: View, mean: vec3<f32>, cov: Cov, opacity: f32) -> Ellipse {
+var out: Ellipse;
+out.visible = 0u;
+out.rho = 1.0;
+let p = (view.camera_from_world * vec4<f32>(mean, 1.0)).xyz;
+if (!(finite(p.x) && finite(p.y) && finite(p.z) && finite(opacity))) {
+return out;
+}
+if (!(p.z > view.near && opacity >= view.alpha_min)) {
+return out;
+}
+let local = linear(view, p);
+let m0 = local.m0;
+let m1 = local.m1;
 let s0 = cov_times(cov, m0);
 let s1 = cov_times(cov, m1);
 let xx = dot(s0, m0);
@@ -218,7 +233,7 @@ if (!(dimmed >= view.alpha_min)) {
 return out;
 }
 let inv = 1.0 / det1;
-out.center = view.focal * uv + view.center;
+out.center = view.focal * local.uv + view.center;
 out.extent = sqrt(cutoff(view, dimmed) * wide.xz);
 out.conic = vec3<f32>(wide.z * inv, -wide.y * inv, wide.x * inv);
 out.depth = p.z;

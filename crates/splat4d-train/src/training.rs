@@ -90,7 +90,7 @@ impl Trained {
     ///
     /// Errors: those of [`scene`](Self::scene); a picture that cannot be read.
     pub fn evaluate(&self) -> Result<Scores> {
-        let store = ImageStore::new(self.capture.clone(), STORE_BYTES);
+        let store = Arc::new(ImageStore::new(self.capture.clone(), STORE_BYTES));
         let options = EvalOptions {
             folder: self.outcome.run.clone(),
             antialias: self.antialias,

@@ -329,7 +329,7 @@ struct Judge {
     capture: Arc<Capture>,
     /// The same without held-out views.
     training: Capture,
-    store: ImageStore,
+    store: Arc<ImageStore>,
     antialias: bool,
 }
 
@@ -337,7 +337,7 @@ impl Judge {
     fn new(capture: &Arc<Capture>, recipe: &Recipe) -> Self {
         let training = Capture { held: Vec::new(), ..(**capture).clone() };
         let memory = usize::try_from(recipe.run.image_memory).unwrap_or(usize::MAX);
-        let store = ImageStore::new(capture.clone(), memory);
+        let store = Arc::new(ImageStore::new(capture.clone(), memory));
         Self { capture: capture.clone(), training, store, antialias: recipe.appearance.antialias }
     }
 

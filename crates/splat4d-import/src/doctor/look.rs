@@ -4,7 +4,7 @@ use super::Options;
 use crate::Result;
 use crate::sync::grey::{Grey, Pyramid};
 use crate::sync::median;
-use crate::sync::tracks::{Track, Tracker, corners, follow, moving};
+use crate::sync::tracks::{APART, PIXELS, Track, Tracker, corners, follow, moving, small};
 use crate::video::{Clock, mean_difference};
 use splat4d::scene::{Camera, Planes};
 use splat4d_train::capture::{Capture, ImageStore, Rgb8};
@@ -15,12 +15,8 @@ const SPREAD: usize = 15;
 const MEDIAN_FROM: usize = 3;
 /// Pictures of a moving camera that are compared with others.
 const STANDS: usize = 16;
-/// Pictures are halved until they have no more pixels: 640x360 is looked at as it is, and a film's pictures at half size.
-const PIXELS: usize = 700_000;
 /// A value at or above (at or below one minus) this is clipped, of 255.
 const CLIPPED: [u8; 2] = [2, 253];
-/// Pixels between corners that are followed.
-const APART: f64 = 8.0;
 /// Levels of pictures that corners are followed through between the first and the last pictures of a take.
 const LEVELS: usize = 4;
 /// Corners that must be found again before a camera is said to have moved.
@@ -71,23 +67,9 @@ fn looked(view: &Camera) -> Camera {
     view.downscaled(1 << halvings(view))
 }
 
-fn bytes(color: &Planes<f32>, halvings: u32) -> Rgb8 {
-    let k = 1 << halvings;
-    if k > 1 {
-        let (width, height) = (color.width / k, color.height / k);
-        let mut data = Vec::with_capacity(3 * width * height);
-        for p in 0..width * height {
-            for c in 0..3 {
-                let (x, y) = (p % width * k, p / width * k);
-                let row = |y: usize| color.plane(c)[y * color.width + x..][..k].iter().sum::<f32>();
-                let mean = (y..y + k).map(row).sum::<f32>() / (k * k) as f32;
-                data.push((mean * 255.0).round().clamp(0.0, 255.0) as u8);
-            }
-        }
-        return Rgb8 { width, height, data };
-    }
+fn bytes(color: &Planes<f32>) -> Rgb8 {
     let data = color.interleaved().iter().map(|v| (v * 255.0).round().clamp(0.0, 255.0) as u8).collect();
-    Rgb8 { width: color.width, height: color.height, data }
+    small(Rgb8 { width: color.width, height: color.height, data }).0
 }
 
 /// Numbers evenly among so many, the first and last with them.
@@ -195,9 +177,7 @@ pub(super) fn camera(capture: &Capture, store: &ImageStore, camera: usize, optio
     let mut frames: Vec<usize> = (0..capture.frames.len()).filter(|&i| capture.frames[i].camera == camera).collect();
     frames.sort_by(|&i, &j| capture.frames[i].time.0.total_cmp(&capture.frames[j].time.0));
     let fixed = capture.cameras[camera].fixed;
-    let load = |i: usize| {
-        Ok::<Rgb8, crate::Error>(bytes(&store.load(i)?.to_picture().color, halvings(&capture.frames[i].view)))
-    };
+    let load = |i: usize| Ok::<Rgb8, crate::Error>(bytes(&store.load(i)?.to_picture().color));
     let mut seen = Seen::default();
     let size = |i: usize| [capture.frames[i].source.width, capture.frames[i].source.height];
     seen.sizes = frames.iter().map(|&i| size(i)).collect();

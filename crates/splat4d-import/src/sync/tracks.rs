@@ -2,7 +2,12 @@
 
 use super::grey::{Grey, Pyramid};
 use rayon::prelude::*;
+use splat4d_train::capture::Rgb8;
 
+/// Pixels between corners that are followed.
+pub const APART: f64 = 8.0;
+/// Pictures are halved until they have no more pixels: 640x360 is looked at as it is, and a film's pictures at half size.
+pub const PIXELS: usize = 700_000;
 /// Sizes of a picture: motion of up to `RADIUS · 2^(LEVELS − 1)` pixels is followed.
 const LEVELS: usize = 4;
 /// Half the side of the window that is followed, pixels.
@@ -19,6 +24,27 @@ const LEAST_EIGENVALUE: f64 = 2e-5;
 const QUALITY: f64 = 0.01;
 /// The largest mean absolute difference between a window and where it went, of 1: more, and something else is there.
 const LARGEST_CHANGE: f64 = 0.08;
+
+/// The picture at the size at which corners are followed, and how many of its own pixels are one of that across.
+pub fn small(picture: Rgb8) -> (Rgb8, f64) {
+    let (mut out, mut factor) = (picture, 1.0);
+    while out.width * out.height > PIXELS {
+        let (width, height) = (out.width / 2, out.height / 2);
+        let mut data = Vec::with_capacity(3 * width * height);
+        for y in 0..height {
+            for x in 0..width {
+                for c in 0..3 {
+                    let at =
+                        |dx: usize, dy: usize| u16::from(out.data[3 * ((2 * y + dy) * out.width + 2 * x + dx) + c]);
+                    data.push(((at(0, 0) + at(1, 0) + at(0, 1) + at(1, 1) + 2) / 4) as u8);
+                }
+            }
+        }
+        out = Rgb8 { width, height, data };
+        factor *= 2.0;
+    }
+    (out, factor)
+}
 
 /// A point that was followed: seconds and pixel positions (the first pixel's centre is at (0.5, 0.5)), in the order of time.
 #[derive(Clone, Debug, Default, PartialEq)]

@@ -6,23 +6,19 @@ use crate::Result;
 use crate::sync::epipolar::{Range, fundamental, lag, neighbours};
 use crate::sync::graph::{Evidence, Kind, Solution};
 use crate::sync::grey::Grey;
-use crate::sync::tracks::{Track, Tracker, moving};
+use crate::sync::tracks::{APART, Track, Tracker, moving, small};
 use rayon::prelude::*;
 use splat4d::scene::Camera;
-use splat4d_train::capture::Rgb8;
 use splat4d_train::event::Progress;
 
 /// Frames in a row in which corners are followed.
 const WINDOW: usize = 90;
 /// Part of them that a clock is looked for within: right lags are told by standing out of many.
 const WITHIN: f64 = 1.0 / 3.0;
-/// Corners of a camera that are followed, and pixels between them, as the doctor has them.
+/// Corners of a camera that are followed, as the doctor has them.
 const TRACKS: usize = 60;
-const APART: f64 = 8.0;
 /// Frames that it takes: among fewer lags, a wrong one stands out as well (of 14 frames of the bundled capture, one was a frame off).
 const SHORTEST: usize = 30;
-/// Pictures are halved until they have no more pixels.
-const PIXELS: usize = 700_000;
 /// Neighbours that each camera is compared with.
 const NEIGHBOURS: usize = 3;
 
@@ -71,27 +67,6 @@ fn measured(stored: &Stored<'_>, clock: &Solution, progress: &mut Progress<'_>) 
         Some(Evidence { cameras: [a, b], lag: found.seconds, sigma: found.sigma, drift: None, kind: Kind::Geometry })
     };
     Ok(pairs.par_iter().filter_map(of).collect())
-}
-
-/// The picture at the size that is worked with, and how many of the file's pixels are one of its.
-fn small(picture: Rgb8) -> (Rgb8, f64) {
-    let (mut out, mut factor) = (picture, 1.0);
-    while out.width * out.height > PIXELS {
-        let (width, height) = (out.width / 2, out.height / 2);
-        let mut data = Vec::with_capacity(3 * width * height);
-        for y in 0..height {
-            for x in 0..width {
-                for c in 0..3 {
-                    let at =
-                        |dx: usize, dy: usize| u16::from(out.data[3 * ((2 * y + dy) * out.width + 2 * x + dx) + c]);
-                    data.push(((at(0, 0) + at(1, 0) + at(0, 1) + at(1, 1) + 2) / 4) as u8);
-                }
-            }
-        }
-        out = Rgb8 { width, height, data };
-        factor *= 2.0;
-    }
-    (out, factor)
 }
 
 fn camera(stored: &Stored<'_>, c: usize, middle: f64) -> Result<Option<Seen>> {

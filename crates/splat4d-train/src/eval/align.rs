@@ -2,12 +2,12 @@
 //! scene whose cameras were refined is not judged by where the others were said to stand.
 
 use crate::Result;
-use crate::capture::frames::{Frames, Picture};
 use crate::capture::{Capture, ImageStore};
 use crate::learner::{Corrections, Origin, RefineSettings, Scale};
 use crate::loss::image::View;
 use crate::loss::terms::StepInfo;
 use crate::recipe::Recipe;
+use crate::run::dataset::Dataset;
 use crate::run::{learnable, plan, scale};
 use crate::step::chain::{Chain, Losses, Step};
 use crate::step::clocks::Look;
@@ -15,7 +15,8 @@ use crate::step::loss::TrainLoss;
 use serde_json::Value;
 use splat4d::layers::Scene;
 use splat4d::render::Backend;
-use splat4d::scene::{Camera, Grads, Planes, Time};
+use splat4d::scene::{Grads, Planes};
+use std::sync::Arc;
 
 /// Share of D-SSIM in what is made small: none, since plain differences have the wider basin and cost less.
 const DSSIM: f64 = 0.0;
@@ -46,7 +47,7 @@ impl Align {
         &self,
         scene: &Scene<f32>,
         capture: &Capture,
-        store: &ImageStore,
+        store: &Arc<ImageStore>,
         frames: &[usize],
         backend: &mut dyn Backend,
         told: &mut dyn FnMut(usize, usize),
@@ -57,8 +58,8 @@ impl Align {
             frames.iter().map(|&f| Origin { rig: info(f).camera, fixed: fixed(f), camera: &info(f).view }).collect();
         let mut found = Corrections::new(&self.settings, self.scale, &origins, capture.cameras.len(), false);
         if self.settings.times {
+            let look = Dataset::new(store.clone(), frames.to_vec());
             for round in SEARCHES {
-                let look = Held { capture, store, frames };
                 let antialias = backend.config().antialias;
                 let look = Look { frames: &look, corrections: &found, exposure: None, antialias };
                 let shifts = look.shifts(scene, found.search(round))?;
@@ -121,44 +122,5 @@ impl Align {
         };
         let report = found.report(&name);
         Ok((aligned, report))
-    }
-}
-
-/// Some of a capture's frames, held out or not.
-struct Held<'a> {
-    capture: &'a Capture,
-    store: &'a ImageStore,
-    frames: &'a [usize],
-}
-
-impl Frames for Held<'_> {
-    fn len(&self) -> usize {
-        self.frames.len()
-    }
-
-    fn camera(&self, i: usize) -> &Camera {
-        &self.capture.frames[self.frames[i]].view
-    }
-
-    fn time(&self, i: usize) -> Time {
-        self.capture.frames[self.frames[i]].time
-    }
-
-    fn rig(&self, i: usize) -> usize {
-        self.capture.frames[self.frames[i]].camera
-    }
-
-    fn name(&self, i: usize) -> String {
-        self.capture.cameras[self.rig(i)].name.clone()
-    }
-
-    fn load(&self, i: usize, out: &mut Picture) -> Result<()> {
-        let stored = self.store.load(self.frames[i])?;
-        stored.color_into(&mut out.color);
-        let weight = out.weight.get_or_insert_default();
-        if !stored.valid_into(weight) {
-            out.weight = None;
-        }
-        Ok(())
     }
 }

@@ -35,6 +35,7 @@ use splat4d::layers::{Evaluation, Scene};
 use splat4d::render::{Antialias, Backend, Image, RenderConfig, Shot, Simd};
 use splat4d::scene::Planes;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// Training views that are measured: their mean moves by less than 0.1 dB beyond that.
 const TRAIN_VIEWS: usize = 24;
@@ -164,7 +165,7 @@ enum Views<'a> {
 pub fn evaluate(
     scene: &Scene<f32>,
     capture: &Capture,
-    store: &ImageStore,
+    store: &Arc<ImageStore>,
     iteration: usize,
     options: &EvalOptions,
     listen: &mut dyn FnMut(&Event),
@@ -195,7 +196,7 @@ pub fn evaluate(
 pub fn assess(
     scene: &Scene<f32>,
     capture: &Capture,
-    store: &ImageStore,
+    store: &Arc<ImageStore>,
     iteration: usize,
     options: &EvalOptions,
     listen: &mut dyn FnMut(&Event),
@@ -233,7 +234,7 @@ pub fn assess(
 struct Judge<'a> {
     scene: &'a Scene<f32>,
     capture: &'a Capture,
-    store: &'a ImageStore,
+    store: &'a Arc<ImageStore>,
     lpips: Option<Lpips>,
     backend: Box<dyn Backend>,
     instant: Evaluation<f32>,
@@ -246,7 +247,7 @@ impl<'a> Judge<'a> {
     fn new(
         scene: &'a Scene<f32>,
         capture: &'a Capture,
-        store: &'a ImageStore,
+        store: &'a Arc<ImageStore>,
         lpips: Option<Lpips>,
         antialias: bool,
     ) -> Self {

@@ -593,7 +593,7 @@ fn scenes_with_a_head_are_judged_with_it_and_refuse_what_cannot_hold_it() {
     // Hidden units that the held-out camera wakes, which looks along -x; by chance it may wake none.
     let first = &mut loud.layers[layer].params[keys.first];
     (0..first.rows()).for_each(|i| first.set(i, 0, if i % INPUTS == FURTHER { 1.0 } else { 0.0 }));
-    let store = ImageStore::new(capture.clone(), 1 << 20);
+    let store = Arc::new(ImageStore::new(capture.clone(), 1 << 20));
     let psnr = |scene: &Scene<f32>, name: &str| {
         let options = EvalOptions { folder: place.run(name), ..EvalOptions::default() };
         let found = evaluate(scene, &capture, &store, 1, &options, &mut |_| {}).unwrap();
@@ -626,7 +626,7 @@ fn figures_say_what_they_hold_for_and_what_is_colour_in_them() {
     let mut measure = |capture: &Arc<Capture>, measured, entry: Option<&str>| {
         let options =
             EvalOptions { folder: place.run("a"), measured, place: entry.map(str::to_owned), ..EvalOptions::default() };
-        let store = ImageStore::new(capture.clone(), 1 << 20);
+        let store = Arc::new(ImageStore::new(capture.clone(), 1 << 20));
         scene.background = capture.background.unwrap();
         evaluate(&scene, capture, &store, 7, &options, &mut |_| {}).unwrap()
     };

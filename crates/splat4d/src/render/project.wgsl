@@ -105,6 +105,34 @@ fn cutoff(view: View, opacity: f32) -> f32 {
     return 2.0 * log(opacity / view.alpha_min) + PROJECT_TAU_MARGIN;
 }
 
+// The projection around one point in camera axes: J W, its rows m0 and m1, and what they are made of.
+struct Linear {
+    uv: vec2<f32>,   // direction, x/z and y/z
+    held: vec2<f32>, // the direction inside J
+    r0: vec3<f32>,   // rows of W
+    r1: vec3<f32>,
+    r2: vec3<f32>,
+    m0: vec3<f32>,
+    m1: vec3<f32>,
+}
+
+fn linear(view: View, p: vec3<f32>) -> Linear {
+    let inv_z = 1.0 / p.z;
+    let uv = p.xy * inv_z;
+    // J clamps the direction, so that a Gaussian far outside the picture does not become a huge streak.
+    let margin = PROJECT_J_MARGIN * 0.5 * view.size / view.focal;
+    let low = -(view.center / view.focal + margin);
+    let high = (view.size - view.center) / view.focal + margin;
+    let held = min(max(uv, low), high);
+    let r0 = vec3<f32>(view.camera_from_world[0].x, view.camera_from_world[1].x, view.camera_from_world[2].x);
+    let r1 = vec3<f32>(view.camera_from_world[0].y, view.camera_from_world[1].y, view.camera_from_world[2].y);
+    let r2 = vec3<f32>(view.camera_from_world[0].z, view.camera_from_world[1].z, view.camera_from_world[2].z);
+    // Row k of J W is (f_k / z)(W_k - held_k W_2).
+    let m0 = view.focal.x * inv_z * (r0 - held.x * r2);
+    let m1 = view.focal.y * inv_z * (r1 - held.y * r2);
+    return Linear(uv, held, r0, r1, r2, m0, m1);
+}
+
 // Projects one Gaussian. Culled: z <= near, opacity below alpha_min, a degenerate or non-finite ellipse, off screen.
 fn project(view: View, mean: vec3<f32>, cov: Cov, opacity: f32) -> Ellipse {
     var out: Ellipse;
@@ -117,19 +145,9 @@ fn project(view: View, mean: vec3<f32>, cov: Cov, opacity: f32) -> Ellipse {
     if (!(p.z > view.near && opacity >= view.alpha_min)) {
         return out;
     }
-    let inv_z = 1.0 / p.z;
-    let uv = p.xy * inv_z;
-    // J clamps the direction, so that a Gaussian far outside the picture does not become a huge streak.
-    let margin = PROJECT_J_MARGIN * 0.5 * view.size / view.focal;
-    let low = -(view.center / view.focal + margin);
-    let high = (view.size - view.center) / view.focal + margin;
-    let held = min(max(uv, low), high);
-    // Row k of J W is (f_k / z)(W_k - held_k W_2).
-    let r0 = vec3<f32>(view.camera_from_world[0].x, view.camera_from_world[1].x, view.camera_from_world[2].x);
-    let r1 = vec3<f32>(view.camera_from_world[0].y, view.camera_from_world[1].y, view.camera_from_world[2].y);
-    let r2 = vec3<f32>(view.camera_from_world[0].z, view.camera_from_world[1].z, view.camera_from_world[2].z);
-    let m0 = view.focal.x * inv_z * (r0 - held.x * r2);
-    let m1 = view.focal.y * inv_z * (r1 - held.y * r2);
+    let local = linear(view, p);
+    let m0 = local.m0;
+    let m1 = local.m1;
     let s0 = cov_times(cov, m0);
     let s1 = cov_times(cov, m1);
     let xx = dot(s0, m0);
@@ -153,7 +171,7 @@ fn project(view: View, mean: vec3<f32>, cov: Cov, opacity: f32) -> Ellipse {
         return out;
     }
     let inv = 1.0 / det1;
-    out.center = view.focal * uv + view.center;
+    out.center = view.focal * local.uv + view.center;
     out.extent = sqrt(cutoff(view, dimmed) * wide.xz);
     out.conic = vec3<f32>(wide.z * inv, -wide.y * inv, wide.x * inv);
     out.depth = p.z;

@@ -28,17 +28,15 @@ struct GaussianGrads {
 fn project_back(view: View, mean: vec3<f32>, cov: Cov, opacity: f32, conic: vec3<f32>, d: ScreenGrads) -> GaussianGrads {
     let p = (view.camera_from_world * vec4<f32>(mean, 1.0)).xyz;
     let inv_z = 1.0 / p.z;
-    let uv = p.xy * inv_z;
-    let margin = PROJECT_J_MARGIN * 0.5 * view.size / view.focal;
-    let low = -(view.center / view.focal + margin);
-    let high = (view.size - view.center) / view.focal + margin;
-    let held = min(max(uv, low), high);
-    let r0 = vec3<f32>(view.camera_from_world[0].x, view.camera_from_world[1].x, view.camera_from_world[2].x);
-    let r1 = vec3<f32>(view.camera_from_world[0].y, view.camera_from_world[1].y, view.camera_from_world[2].y);
-    let r2 = vec3<f32>(view.camera_from_world[0].z, view.camera_from_world[1].z, view.camera_from_world[2].z);
     let f = view.focal * inv_z;
-    let m0 = f.x * (r0 - held.x * r2);
-    let m1 = f.y * (r1 - held.y * r2);
+    let local = linear(view, p);
+    let uv = local.uv;
+    let held = local.held;
+    let r0 = local.r0;
+    let r1 = local.r1;
+    let r2 = local.r2;
+    let m0 = local.m0;
+    let m1 = local.m1;
     let c0 = cov_times(cov, m0);
     let c1 = cov_times(cov, m1);
     let xx = dot(c0, m0);
