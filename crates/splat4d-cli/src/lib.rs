@@ -43,6 +43,7 @@ Examples:
   splat4d train --resume runs/my-take      continue exactly where a run stopped
   splat4d eval runs/knight --baseline      measure again, next to a scene that stands still
   splat4d render runs/knight -o turn.mp4   film an orbit through space and time
+  splat4d localise runs/knight photo.jpg   from where and when was it taken?
   splat4d bake runs/knight -o knight.splat4d       one small, seekable file for players
   splat4d compress runs/knight             the same many times smaller and faster, and measured
   splat4d view runs/knight                 play it in the browser
@@ -87,6 +88,7 @@ enum Verb {
     Train(Box<verbs::train::Args>),
     Eval(verbs::eval::Args),
     Render(verbs::render::Args),
+    Localise(verbs::localise::Args),
     Bake(verbs::bake::Args),
     Compress(verbs::compress::Args),
     Export(verbs::export::Args),
@@ -106,6 +108,7 @@ pub fn main() -> ExitCode {
             Verb::Train(args) => verbs::train::run(&args, console),
             Verb::Eval(args) => verbs::eval::run(&args, console),
             Verb::Render(args) => verbs::render::run(&args, console),
+            Verb::Localise(args) => verbs::localise::run(&args, console),
             Verb::Bake(args) => verbs::bake::run(&args, console),
             Verb::Compress(args) => verbs::compress::run(&args, console),
             Verb::Export(args) => verbs::export::run(&args, console),

@@ -267,10 +267,7 @@ impl Run {
     pub fn views(&self) -> Result<Vec<View>> {
         let file = self.path.join("cameras.json");
         if file.is_file() {
-            let value = crate::camera_file::json(&read_text(&file)?).map_err(|e| e.at(file.display()))?;
-            let list = value.as_array().map(Vec::as_slice).unwrap_or_default();
-            let views: Option<Vec<View>> = list.iter().map(read_view).collect();
-            return views.filter(|v| !v.is_empty()).ok_or_else(|| {
+            return views_in(&file)?.ok_or_else(|| {
                 Error::input("is no list of cameras as splat4d writes it")
                     .at(file.display())
                     .remedy("Delete it: the cameras are then read from the capture.")
@@ -278,6 +275,14 @@ impl Run {
         }
         Ok(views_of(&self.open_capture()?.0))
     }
+}
+
+/// The cameras in a file such as `cameras.json`; `None`: it is JSON of another kind.
+pub(crate) fn views_in(file: &Path) -> Result<Option<Vec<View>>> {
+    let value = crate::camera_file::json(&read_text(file)?).map_err(|e| e.at(file.display()))?;
+    let list = value.as_array().map(Vec::as_slice).unwrap_or_default();
+    let views: Option<Vec<View>> = list.iter().map(read_view).collect();
+    Ok(views.filter(|v| !v.is_empty()))
 }
 
 /// The pictures that a run uses as views, held-out ones marked.
@@ -299,17 +304,19 @@ pub(crate) fn views_of(capture: &Capture) -> Vec<View> {
 
 /// `cameras.json` as 3DGS viewers read it (camera-to-world position and rotation), with a few keys more.
 pub(crate) fn cameras_json(capture: &Capture) -> Value {
-    let one = |(id, view): (usize, View)| {
-        let world = view.camera.cam_from_world.inverse();
-        let k = &view.camera.intrinsics;
-        json!({
-            "id": id, "img_name": view.name, "width": view.camera.width, "height": view.camera.height,
-            "position": world.translation, "rotation": world.rotation, "fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy,
-            "near": view.camera.near,
-            "time": view.time, "split": if view.held { "test" } else { "train" },
-        })
-    };
-    views_of(capture).into_iter().enumerate().map(one).collect()
+    views_of(capture).iter().enumerate().map(|(id, view)| view_json(id, view)).collect()
+}
+
+/// One of them.
+pub(crate) fn view_json(id: usize, view: &View) -> Value {
+    let world = view.camera.cam_from_world.inverse();
+    let k = &view.camera.intrinsics;
+    json!({
+        "id": id, "img_name": view.name, "width": view.camera.width, "height": view.camera.height,
+        "position": world.translation, "rotation": world.rotation, "fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy,
+        "near": view.camera.near,
+        "time": view.time, "split": if view.held { "test" } else { "train" },
+    })
 }
 
 fn read_view(value: &Value) -> Option<View> {

@@ -44,9 +44,20 @@ fn json_of(path: &Path) -> Value {
 #[test]
 fn help_teaches_and_completions_complete() {
     let help = splat4d(&["--help"]).run().ok();
-    for verb in
-        ["import", "train", "eval", "render", "bake", "view", "export", "convert", "info", "bench", "completions"]
-    {
+    for verb in [
+        "import",
+        "train",
+        "eval",
+        "render",
+        "localise",
+        "bake",
+        "view",
+        "export",
+        "convert",
+        "info",
+        "bench",
+        "completions",
+    ] {
         assert!(help.contains(verb), "{verb} is missing");
         let own = splat4d(&[verb, "--help"]).run().ok();
         assert!(own.contains("Examples:") && own.contains(&format!("splat4d {verb}")), "{verb} --help teaches nothing");
@@ -64,7 +75,7 @@ fn help_teaches_and_completions_complete() {
 }
 
 #[test]
-fn cameras_are_compared_with_their_truth() {
+fn pictures_are_found_in_a_scene_and_cameras_compared_with_their_truth() {
     let work = tempfile::tempdir().unwrap();
     let capture = Capture::new(work.path()).write();
     let run = work.path().join("run");
@@ -73,6 +84,33 @@ fn cameras_are_compared_with_their_truth() {
     assert!(said.contains("ATE 0.00000 units") && said.contains("0.00 ms at most"), "{said}");
     let error = &json_of(&run.join("results.json"))["trajectory"];
     assert!(error["ate"].as_f64().unwrap() < 1e-6 && !error["cameras"].as_array().unwrap().is_empty(), "{error}");
+    // A picture of the scene itself, from one of its cameras: nothing need move.
+    let (picture, camera, found) =
+        (work.path().join("a.png"), work.path().join("cam.json"), work.path().join("b.json"));
+    let text = std::fs::read_to_string(capture.join("capture.json")).unwrap();
+    let stated = serde_json::from_str::<Value>(&text).unwrap()["cameras"][1].clone();
+    let one = json!({"fx": stated["fx"], "fy": stated["fy"], "cx": stated["cx"], "cy": stated["cy"], "w": stated["width"],
+        "h": stated["height"], "world_to_camera": stated["world_to_camera"]});
+    std::fs::write(&camera, one.to_string()).unwrap();
+    let background = "--background=0,0,0";
+    splat4d(&["render", str(&run), "--camera", str(&camera), "-o", str(&picture), background]).run().ok();
+    let said = splat4d(&["localise", str(&run), str(&picture), "-o", str(&found)]).run().ok();
+    assert!(said.contains("a.png: at (") && said.contains("of what one plain colour leaves"), "{said}");
+    let row = &json_of(&found)[0];
+    let number = |v: &Value| v.as_f64().unwrap();
+    let pose = &stated["world_to_camera"];
+    let center = [0, 1, 2].map(|k| -(0..3).map(|i| number(&pose[i][k]) * number(&pose[i][3])).sum::<f64>());
+    let off = (0..3).map(|k| (number(&row["position"][k]) - center[k]).powi(2)).sum::<f64>().sqrt();
+    assert!(off < 0.02 && number(&row["share"]) < 0.05, "{off} {row}");
+    // Noise is nowhere in it.
+    let noise = image::RgbImage::from_fn(32, 24, |x, y| {
+        image::Rgb([0, 1, 2].map(|c| ((x * 7919 + y * 104_729 + c * 31) % 251) as u8))
+    });
+    noise.save(&picture).unwrap();
+    let refused = splat4d(&["localise", str(&run), str(&picture)]).run().refused();
+    assert!(refused.contains("not found: a.png") && refused.contains("--start"), "{refused}");
+    image::RgbImage::new(30, 30).save(&picture).unwrap();
+    assert!(splat4d(&["localise", str(&run), str(&picture)]).run().refused().contains("30x30"));
 }
 
 #[test]

@@ -8,7 +8,7 @@ mod corrections;
 mod exposure;
 
 pub use corrections::{Corrections, RefineSettings, Scale};
-pub(crate) use corrections::{Origin, SearchDue, moved};
+pub(crate) use corrections::{Origin, SearchDue, StepGrads, moved, zoomed};
 pub(crate) use exposure::Exposure;
 
 use crate::Result;

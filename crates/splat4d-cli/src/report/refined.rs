@@ -30,6 +30,16 @@ pub(crate) fn refined_in_words(refined: &Value) -> Option<String> {
             far["camera"].as_str()?,
         ));
     }
+    if refined["focal"] == true {
+        let by_focal = sorted("focal");
+        let worst = by_focal.first()?;
+        words.push(format!(
+            "focal lengths changed by {:.2} % at the median, most by {:.2} % ({})",
+            100.0 * number(by_focal[by_focal.len() / 2], "focal"),
+            100.0 * number(worst, "focal"),
+            worst["camera"].as_str()?,
+        ));
+    }
     if refined["times"] == true {
         let by_time = sorted("offset");
         let worst = by_time.first()?;
@@ -55,7 +65,7 @@ pub(super) fn section(out: &mut String, run: &Run) {
     let _ = writeln!(
         out,
         "<h2>Where cameras were found</h2>\n<p class=\"note\">{}</p>\n<table><tr><th>camera</th><th>turned, °</th><th>moved, % \
-         of the radius</th><th>clock, ms</th></tr>",
+         of the radius</th><th>focal length, %</th><th>clock, ms</th></tr>",
         escape(&words)
     );
     for row in rows.into_iter().take(super::CAMERA_BARS) {
@@ -63,10 +73,11 @@ pub(super) fn section(out: &mut String, run: &Run) {
         let name = row["frame"].as_u64().map_or_else(|| name.to_owned(), |frame| format!("{name}, picture {frame}"));
         let _ = writeln!(
             out,
-            "<tr><td>{}</td><td>{:.3}</td><td>{:.3}</td><td>{:.2}</td></tr>",
+            "<tr><td>{}</td><td>{:.3}</td><td>{:.3}</td><td>{:.3}</td><td>{:.2}</td></tr>",
             escape(&name),
             number(row, "degrees"),
             100.0 * number(row, "share"),
+            100.0 * number(row, "focal"),
             1e3 * number(row, "offset")
         );
     }

@@ -3,13 +3,13 @@
 use super::check::{GAMMA, MATCHES, SHARPNESS, Told, grade, unit};
 use super::look::{Seen, Stand, detail};
 use super::{Options, PairReport, Report};
-use crate::sfm::algebra::Cholesky;
 use crate::sfm::pictures::{Feature, Sight};
 use crate::sfm::tracks::{Pairing, links};
 use crate::sync::epipolar::{fundamental, sampson};
 use crate::sync::grey::Grey;
 use crate::sync::median;
 use rayon::prelude::*;
+use splat4d::math::cholesky::Cholesky;
 use splat4d::math::se3::dot;
 use splat4d::scene::Planes;
 use splat4d_train::capture::Capture;

@@ -2,9 +2,9 @@
 //! moves leaves its epipolar line by as much.
 
 use super::look::Seen;
-use crate::sfm::algebra::Cholesky;
 use crate::sync::epipolar::{EpipolarLag, sampson};
 use crate::sync::{NORMAL_MAD, median};
+use splat4d::math::cholesky::Cholesky;
 
 /// Seconds from the first to the last row that cameras usually have: telephones 10 to 30 ms, film cameras less.
 const USUAL: f64 = 0.02;

@@ -7,12 +7,13 @@
 //! therefore belongs at x + v·τ, and the residual of point X is e = π(X) − (x + v·τ): clocks are found by the same least
 //! squares as poses, and what moves helps poses.
 
-use super::algebra::{Cholesky, orthonormal, rotation};
+use super::algebra::{orthonormal, rotation};
 use super::lens::Lens;
 use rayon::prelude::*;
 use splat4d::math::Se3;
+use splat4d::math::cholesky::Cholesky;
+use splat4d::math::mat3;
 use splat4d::math::se3::{cross, mat_mul, mat_vec};
-use splat4d_train::vision::triangulate::solve as solve3;
 
 /// A camera among others.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -409,7 +410,7 @@ impl Normal {
 
 /// The inverse of a symmetric matrix; nothing where it is singular.
 fn invert(m: &[[f64; 3]; 3]) -> Option<[[f64; 3]; 3]> {
-    let column = |k: usize| solve3(*m, std::array::from_fn(|i| f64::from(u8::from(i == k))));
+    let column = |k: usize| mat3::solve(*m, std::array::from_fn(|i| f64::from(u8::from(i == k))));
     Some([column(0)?, column(1)?, column(2)?])
 }
 

@@ -192,49 +192,6 @@ pub(crate) fn svd(m: &Mat3) -> (Mat3, [f64; 3], Mat3) {
     (transpose(&[u0, u1, u2]), [dot(u0, a), dot(u1, b), dot(u2, c)], transpose(&[v0, v1, v2]))
 }
 
-/// A symmetric positive definite matrix, of which the lower triangle is read; row-major.
-pub(crate) struct Cholesky {
-    n: usize,
-    /// L, row-major; A = L Lᵀ.
-    lower: Vec<f64>,
-}
-
-impl Cholesky {
-    /// `None`: it is not positive definite.
-    pub(crate) fn new(n: usize, mut a: Vec<f64>) -> Option<Self> {
-        for i in 0..n {
-            let (above, row) = a.split_at_mut(i * n);
-            for j in 0..i {
-                let other = &above[j * n..j * n + j + 1];
-                let sum: f64 = row[..j].iter().zip(other).map(|(x, y)| x * y).sum();
-                row[j] = (row[j] - sum) / other[j];
-            }
-            let left = row[i] - row[..i].iter().map(|x| x * x).sum::<f64>();
-            if left <= 0.0 || !left.is_finite() {
-                return None;
-            }
-            row[i] = left.sqrt();
-        }
-        Some(Self { n, lower: a })
-    }
-
-    /// A⁻¹ b
-    pub(crate) fn solve(&self, mut b: Vec<f64>) -> Vec<f64> {
-        let n = self.n;
-        for i in 0..n {
-            let row = &self.lower[i * n..];
-            let sum: f64 = row[..i].iter().zip(&b).map(|(x, y)| x * y).sum();
-            b[i] = (b[i] - sum) / row[i];
-        }
-        for i in (0..n).rev() {
-            b[i] /= self.lower[i * n + i];
-            let x = b[i];
-            (0..i).for_each(|j| b[j] -= self.lower[i * n + j] * x);
-        }
-        b
-    }
-}
-
 /// [v]×, with [v]× w = v × w.
 pub(crate) fn skew(v: [f64; 3]) -> Mat3 {
     [[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]]
@@ -278,7 +235,7 @@ mod tests {
     }
 
     #[test]
-    fn null_space_singular_values_and_factors_do_what_they_say() {
+    fn null_space_and_singular_values_do_what_they_say() {
         let rng = Rng::new(1, "algebra", 0);
         let rows: Vec<[f64; 9]> = (0..5).map(|i| std::array::from_fn(|k| rng.normal((9 * i + k) as u64))).collect();
         let null = null_space(&rows);
@@ -294,14 +251,5 @@ mod tests {
         let back = mat_mul(&us, &transpose(&v));
         assert!((0..9).all(|k| (back[k / 3][k % 3] - m[k / 3][k % 3]).abs() < 1e-12), "{back:?} {m:?}");
         assert!(s[0] >= s[1] && s[1] >= s[2].abs());
-        let n = 6;
-        let b: Vec<f64> = (0..n * n).map(|k| rng.normal(200 + k as u64)).collect();
-        let at = |i: usize, j: usize| (0..n).map(|k| b[i * n + k] * b[j * n + k]).sum::<f64>();
-        let a: Vec<f64> = (0..n * n).map(|k| at(k / n, k % n)).collect();
-        let x: Vec<f64> = (0..n).map(|k| rng.normal(300 + k as u64)).collect();
-        let right = (0..n).map(|i| (0..n).map(|k| a[i * n + k] * x[k]).sum()).collect();
-        let got = Cholesky::new(n, a).unwrap().solve(right);
-        assert!(got.iter().zip(&x).all(|(g, t)| (g - t).abs() < 1e-9));
-        assert!(Cholesky::new(1, vec![-1.0]).is_none());
     }
 }

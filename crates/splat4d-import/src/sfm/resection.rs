@@ -1,10 +1,11 @@
 //! Where a camera stands that sees known points, and with which focal length.
 
-use super::algebra::{Cholesky, orthonormal, roots, rotation};
+use super::algebra::{orthonormal, roots, rotation};
 use super::lens::{Lens, off};
 use super::sample::{Data, Found, Search, consensus};
+use splat4d::math::cholesky::Cholesky;
 use splat4d::math::se3::{cross, dot, mat_mul, mat_vec, norm, normalize, sub, transpose};
-use splat4d::math::{Rng, Se3};
+use splat4d::math::{Rng, Se3, mat3};
 
 /// The poses (at most four) from which three points are seen along three rays: Grunert's solution (1841) as in Haralick et al.
 /// 1994, "Review and analysis of solutions of the three point perspective pose estimation problem".
@@ -49,7 +50,7 @@ pub fn three(points: &[[f64; 3]; 3], rays: &[[f64; 3]; 3]) -> Vec<Se3> {
                 [2.0 * (s[0] - s[2] * cos_b), 0.0, 2.0 * (s[2] - s[0] * cos_b)],
                 [2.0 * (s[0] - s[1] * cos_c), 2.0 * (s[1] - s[0] * cos_c), 0.0],
             ];
-            let Some(step) = splat4d_train::vision::triangulate::solve(slopes, f) else { break };
+            let Some(step) = mat3::solve(slopes, f) else { break };
             (0..3).for_each(|k| s[k] -= step[k]);
         }
         let seen: [[f64; 3]; 3] = std::array::from_fn(|k| j[k].map(|x| s[k] * x));

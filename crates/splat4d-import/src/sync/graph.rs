@@ -2,6 +2,7 @@
 //! named.
 
 use serde::{Deserialize, Serialize};
+use splat4d::math::cholesky::Cholesky;
 
 /// Standard deviations that a lag may be off before it contradicts.
 const SIGMAS: f64 = 4.0;
@@ -320,39 +321,15 @@ fn weighted(cameras: usize, terms: &[Term], known: &[Option<f64>]) -> (Vec<f64>,
             }
         }
     }
-    cholesky(&mut matrix, n);
-    let solved = substitute(&matrix, n, right);
+    let factor = Cholesky::new(n, matrix).expect("weights are positive, and a ridge is below them");
+    let solved = factor.solve(right);
     let mut values: Vec<f64> = known.iter().map(|k| k.unwrap_or(0.0)).collect();
     let mut variances = vec![0.0; cameras];
     for (i, &c) in unknown.iter().enumerate() {
         values[c] = solved[i];
         let mut unit = vec![0.0; n];
         unit[i] = 1.0;
-        variances[c] = substitute(&matrix, n, unit)[i];
+        variances[c] = factor.solve(unit)[i];
     }
     (values, variances)
-}
-
-/// L of a positive definite matrix L Lᵀ, in place of its lower half.
-fn cholesky(m: &mut [f64], n: usize) {
-    for i in 0..n {
-        for j in 0..=i {
-            let dot: f64 = (0..j).map(|k| m[i * n + k] * m[j * n + k]).sum();
-            let rest = m[i * n + j] - dot;
-            m[i * n + j] = if i == j { rest.max(f64::MIN_POSITIVE).sqrt() } else { rest / m[j * n + j] };
-        }
-    }
-}
-
-/// x of L Lᵀ x = b.
-fn substitute(l: &[f64], n: usize, mut b: Vec<f64>) -> Vec<f64> {
-    for i in 0..n {
-        let dot: f64 = (0..i).map(|k| l[i * n + k] * b[k]).sum();
-        b[i] = (b[i] - dot) / l[i * n + i];
-    }
-    for i in (0..n).rev() {
-        let dot: f64 = (i + 1..n).map(|k| l[k * n + i] * b[k]).sum();
-        b[i] = (b[i] - dot) / l[i * n + i];
-    }
-    b
 }

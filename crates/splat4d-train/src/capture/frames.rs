@@ -65,7 +65,7 @@ impl Picture {
 }
 
 /// In place: a pixel of the half picture is written before the places that later ones read.
-fn halve(planes: &mut Planes<f32>) {
+pub(crate) fn halve(planes: &mut Planes<f32>) {
     let (height, width) = (planes.height / 2, planes.width / 2);
     for c in 0..planes.channels {
         for y in 0..height {

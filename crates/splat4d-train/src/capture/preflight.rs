@@ -1,6 +1,7 @@
 //! Checks of a capture before hours of training: few cameras, narrow coverage, uneven clocks.
 
 use super::{Capture, Frame};
+use splat4d::math::mat3::solve;
 use splat4d::math::se3::{dot, norm, normalize, sub};
 
 /// How bad a [`Finding`] is.
@@ -170,19 +171,4 @@ fn look_at(views: &[&Frame]) -> [f64; 3] {
         let reach = views.iter().map(|f| norm(sub(f.view.center(), center))).fold(1.0, f64::max);
         std::array::from_fn(|k| center[k] + 3.0 * reach * ahead[k])
     })
-}
-
-/// Cramer's rule; `None` for a matrix that is nearly singular.
-fn solve(m: [[f64; 3]; 3], b: [f64; 3]) -> Option<[f64; 3]> {
-    let det = |a: &[[f64; 3]; 3]| dot(a[0], splat4d::math::se3::cross(a[1], a[2]));
-    let d = det(&m);
-    let scale = m.iter().flatten().fold(0.0f64, |s, v| s.max(v.abs()));
-    if d.is_nan() || d.abs() <= 1e-9 * scale.powi(3) {
-        return None;
-    }
-    Some(std::array::from_fn(|k| {
-        let mut replaced = m;
-        (0..3).for_each(|i| replaced[i][k] = b[i]);
-        det(&replaced) / d
-    }))
 }

@@ -105,7 +105,7 @@ impl Align {
                 let mut losses = Losses { image: &mut image, probes: &[], params: &[] };
                 let one = Step { scene, views: &[view], info: &now, sh_degree: usize::MAX };
                 let report = chain.step(&one, backend, &mut losses, &mut grads, &mut |_| {})?;
-                found.step(&[place], &report.d_cameras, &report.d_times, progress, 1.0);
+                found.step(&[place], &report.grads(), progress, 1.0);
                 grads.iter_mut().zip(&scene.layers).for_each(|(d, layer)| d.clear(&layer.params));
             }
             told(done + 1, groups.len());

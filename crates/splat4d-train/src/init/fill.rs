@@ -9,6 +9,7 @@ use super::Seeds;
 use crate::Result;
 use crate::capture::frames::{Frames, Picture};
 use rayon::prelude::*;
+use splat4d::math::mat3;
 use splat4d::scene::Camera;
 use std::collections::HashSet;
 
@@ -128,7 +129,7 @@ fn depth(marks: &[Mark], [u, v]: [f64; 2]) -> f64 {
                 b[r] += weight * trust * row[r] * inverse;
             }
         }
-        plane = super::volume::solve(a, b).unwrap_or([rows[0].1, 0.0, 0.0]);
+        plane = mat3::solve(a, b).unwrap_or([rows[0].1, 0.0, 0.0]);
         for ((row, inverse, _), trust) in rows.iter().zip(&mut trust) {
             let off = inverse - (0..3).map(|k| row[k] * plane[k]).sum::<f64>();
             *trust = 1.0 / (1.0 + (off / (OUTLIER * plane[0].abs())).powi(2));

@@ -3,7 +3,8 @@
 use super::{Seeds, UNKNOWN_COLOR};
 use crate::capture::frames::Frames;
 use splat4d::math::Rng;
-use splat4d::math::se3::{dot, norm, sub};
+use splat4d::math::mat3::solve;
+use splat4d::math::se3::{norm, sub};
 use splat4d::scene::Camera;
 
 /// Where the cameras look.
@@ -47,21 +48,6 @@ pub(crate) fn common(frames: &dyn Frames) -> Volume {
     let nearest = centers.iter().map(|&c| norm(sub(c, center))).fold(f64::INFINITY, f64::min);
     let radius = if nearest.is_finite() { (REACH * nearest).max(1e-3 * spread) } else { 1.0 };
     Volume { center, radius }
-}
-
-/// Cramer's rule; `None` when singular.
-pub(super) fn solve(a: [[f64; 3]; 3], b: [f64; 3]) -> Option<[f64; 3]> {
-    use splat4d::math::se3::cross;
-    let columns: [[f64; 3]; 3] = std::array::from_fn(|c| std::array::from_fn(|r| a[r][c]));
-    let det = dot(columns[0], cross(columns[1], columns[2]));
-    if det.abs() < 1e-12 {
-        return None;
-    }
-    Some([
-        dot(b, cross(columns[1], columns[2])) / det,
-        dot(columns[0], cross(b, columns[2])) / det,
-        dot(columns[0], cross(columns[1], b)) / det,
-    ])
 }
 
 /// Cameras that are asked whether they see a candidate.

@@ -1,7 +1,7 @@
 //! [`Corrections`]: what training learns of where cameras stand and when they looked.
 //!
 //! A correction of a pose is a twist ξ = (ρ, θ) in the camera's axes, `exp(ξ)·cam_from_world`; all frames of a fixed camera
-//! share one. A correction of a clock is a shift of all times of a camera. Pictures say nothing of where the scene as a whole
+//! share one. A correction of a focal length is a share of it, of a camera. A correction of a clock is a shift of all times of a camera. Pictures say nothing of where the scene as a whole
 //! stands, how large it is and when it begins: the cameras' mean motion, their mean growth and the median of their clocks
 //! stay. The median, since of a rig with one clock that is wrong the others are right.
 
@@ -9,7 +9,7 @@ use crate::settings::settings;
 use serde_json::{Value, json};
 use splat4d::math::Se3;
 use splat4d::math::se3::{cross, dot, mat_vec, norm, sub, transpose};
-use splat4d::scene::{Camera, Table, Time};
+use splat4d::scene::{Camera, Intrinsics, Table, Time};
 
 settings! {
     /// Refinement of what the capture says of its cameras: poses and clocks that are corrected while the scene is learnt.
@@ -20,6 +20,8 @@ settings! {
         /// Find by how much every training camera's clock is early or late: searched first, then learnt; the median of all
         /// clocks stays. Held-out views are measured aligned as well.
         times: bool = false => any().when(IsNot("run.motion", &["still", "tracked"]));
+        /// Learn a correction of every training camera's focal length, as small as pictures allow.
+        focal: bool = false;
         /// Rate of rotations at first: half a degree is within reach of the 50 views that a camera gets in a short run. Not
         /// swept.
         rotation_init: f64 = 1e-3 => positive().unit("radians").when(On("refine.poses"));
@@ -32,20 +34,24 @@ settings! {
         /// Searches of clocks: each compares every camera's pictures with the scene at shifted times. 4 to 20 found clocks
         /// alike (docs/refine.md).
         searches: usize = 8 => any().when(On("refine.times"));
+        /// Rate of focal lengths at first, a share of them.
+        focal_init: f64 = 1e-3 => positive().when(On("refine.focal"));
+        /// Rate of focal lengths at the end.
+        focal_final: f64 = 1e-5 => positive().when(On("refine.focal"));
         /// Rate of clocks at first, after the last search.
         time_init: f64 = 0.05 => positive().unit("frames").when(On("refine.times"));
         /// Rate of clocks at the end.
         time_final: f64 = 1e-3 => positive().unit("frames").when(On("refine.times"));
         /// A clock is shifted by at most so much; the first searches look so far.
         time_limit: f64 = 4.0 => positive().unit("frames").when(On("refine.times"));
-        /// Share of the run after which poses are learnt: the scene has formed by then.
-        poses_from: f64 = 0.1 => share().when(On("refine.poses"));
+        /// Share of the run after which poses and focal lengths are learnt: the scene has formed by then.
+        poses_from: f64 = 0.1 => share().when(Any(&[On("refine.poses"), On("refine.focal")]));
         /// Share of the run after which clocks are searched; the searches are spread over what is left up to half of it.
         times_from: f64 = 0.1 => share().when(On("refine.times"));
         /// Share of the run after which nothing of a camera is learnt any more, so that the scene settles on it.
-        until: f64 = 0.8 => share().when(Any(&[On("refine.poses"), On("refine.times")]));
+        until: f64 = 0.8 => share().when(Any(&[On("refine.poses"), On("refine.focal"), On("refine.times")]));
         /// Steps by which every held-out camera is aligned before it is measured a second time.
-        align_steps: usize = 100 => any().unit("iterations").when(Any(&[On("refine.poses"), On("refine.times")]));
+        align_steps: usize = 100 => any().unit("iterations").when(Any(&[On("refine.poses"), On("refine.focal"), On("refine.times")]));
     }
 }
 
@@ -58,6 +64,11 @@ const TERMS: usize = 16;
 /// hardly different each has its own.
 const APART: f64 = 1e-6;
 
+/// Share by which a correction of a focal length falls back in every step: what pictures do not ask for goes away. Our
+/// choice, not swept.
+const PULL: f64 = 1e-4;
+/// Largest correction of a focal length, a share of it.
+const FOCAL_LIMIT: f64 = 0.2;
 /// Share of the run by which clocks were searched: then the scene is sharp enough for gradients to go on. Not swept.
 const SEARCHED: f64 = 0.5;
 /// Searches that look as far as clocks may be wrong, in whole frames; later ones look about in halves.
@@ -88,6 +99,17 @@ pub struct Scale {
     pub frame: f64,
 }
 
+/// The gradients of some frames to what is corrected.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct StepGrads<'a> {
+    /// To left perturbations of poses.
+    pub d_cameras: &'a [[f64; 6]],
+    /// To logarithms of focal lengths.
+    pub d_focals: &'a [f64],
+    /// To times.
+    pub d_times: &'a [f64],
+}
+
 /// A search of clocks that is due.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct SearchDue {
@@ -112,6 +134,8 @@ pub struct Corrections {
     /// Values 6, moments 12, steps 1; by row.
     poses: Option<Table<f32>>,
     /// Values 1, moments 2, steps 1; by camera.
+    focal: Option<Table<f32>>,
+    /// The same.
     times: Option<Table<f32>>,
     /// Whether the mean of all stays nothing: not where the scene is frozen.
     gauge: bool,
@@ -144,6 +168,7 @@ impl Corrections {
             settings: settings.clone(),
             scale,
             poses: poses.then(|| table(POSE, origins.len())),
+            focal: settings.focal.then(|| table(1, cameras)),
             times: times.then(|| table(1, cameras)),
             rigs: frames.iter().map(|f| f.rig).collect(),
             rows,
@@ -154,14 +179,14 @@ impl Corrections {
 
     /// All that a checkpoint holds of it.
     pub(crate) fn tables(&self) -> impl Iterator<Item = (&'static str, &Table<f32>)> {
-        [("refine.poses", &self.poses), ("refine.times", &self.times)]
+        [("refine.poses", &self.poses), ("refine.focal", &self.focal), ("refine.times", &self.times)]
             .into_iter()
             .filter_map(|(name, table)| Some((name, table.as_ref()?)))
     }
 
     /// The same, to read it.
     pub(crate) fn tables_mut(&mut self) -> impl Iterator<Item = (&'static str, &mut Table<f32>)> {
-        [("refine.poses", &mut self.poses), ("refine.times", &mut self.times)]
+        [("refine.poses", &mut self.poses), ("refine.focal", &mut self.focal), ("refine.times", &mut self.times)]
             .into_iter()
             .filter_map(|(name, table)| Some((name, table.as_mut()?)))
     }
@@ -169,7 +194,13 @@ impl Corrections {
     /// The camera of frame `i`, corrected.
     pub(crate) fn camera(&self, i: usize, stated: &Camera) -> Camera {
         let moved = self.twist(self.rows[i]).map(|twist| exp(twist).after(&stated.cam_from_world));
-        Camera { cam_from_world: moved.unwrap_or(stated.cam_from_world), ..stated.clone() }
+        let zoomed = zoomed(&stated.intrinsics, self.zoom(self.rigs[i]));
+        Camera { cam_from_world: moved.unwrap_or(stated.cam_from_world), intrinsics: zoomed, ..stated.clone() }
+    }
+
+    /// The share by which the focal lengths of a camera are longer than stated.
+    fn zoom(&self, rig: usize) -> f64 {
+        self.focal.as_ref().map_or(0.0, |t| f64::from(t.get(rig, 0)))
     }
 
     /// The time of frame `i`, corrected.
@@ -185,14 +216,8 @@ impl Corrections {
 
     /// One step of Adam with the gradients of some frames; `progress`: of the run. Frames whose gradient is not finite
     /// rest.
-    pub(crate) fn step(
-        &mut self,
-        frames: &[usize],
-        d_cameras: &[[f64; 6]],
-        d_times: &[f64],
-        progress: f64,
-        scale: f64,
-    ) {
+    pub(crate) fn step(&mut self, frames: &[usize], report: &StepGrads<'_>, progress: f64, scale: f64) {
+        let StepGrads { d_cameras, d_focals, d_times } = *report;
         let s = self.settings.clone();
         let share = |from: f64| {
             let done = (progress - from) / (s.until - from).max(f64::EPSILON);
@@ -213,6 +238,19 @@ impl Corrections {
             }
             if self.gauge {
                 self.fix_poses();
+            }
+        }
+        if let (Some(done), Some(focal)) = (share(s.poses_from), &mut self.focal) {
+            let step = rate([s.focal_init, s.focal_final], done, 1.0);
+            let mut sums: Vec<(usize, [f64; 1])> = Vec::new();
+            for (&i, &d) in frames.iter().zip(d_focals) {
+                // To the share, of that to the logarithm.
+                add(&mut sums, self.rigs[i], [d / (1.0 + f64::from(focal.get(self.rigs[i], 0)))]);
+            }
+            for (rig, d) in sums {
+                adam(focal, rig, d, [step]);
+                let kept = f64::from(focal.get(rig, 0)) * (1.0 - PULL);
+                focal.set(rig, 0, kept.clamp(-FOCAL_LIMIT, FOCAL_LIMIT) as f32);
             }
         }
         if let (Some(done), Some(times)) = (share(self.searched()), &mut self.times) {
@@ -319,10 +357,11 @@ impl Corrections {
             json!({
                 "camera": camera, "frame": index, "twist": twist, "offset": offset, "degrees": r.to_degrees(),
                 "share": p / self.scale.extent, "frames": offset / self.scale.frame,
+                "focal": self.zoom(self.rigs[*frame]),
             })
         };
         json!({
-            "poses": self.poses.is_some(), "times": self.times.is_some(),
+            "poses": self.poses.is_some(), "focal": self.focal.is_some(), "times": self.times.is_some(),
             "cameras": self.origins.iter().enumerate().map(row).collect::<Vec<_>>(),
         })
     }
@@ -337,6 +376,11 @@ impl Corrections {
             times.set(row, 0, offset);
         }
     }
+}
+
+/// Intrinsics of which both focal lengths are longer by a share of them.
+pub(crate) fn zoomed(stated: &Intrinsics, share: f64) -> Intrinsics {
+    Intrinsics { fx: stated.fx * (1.0 + share), fy: stated.fy * (1.0 + share), ..*stated }
 }
 
 /// A pose moved by a twist (ρ, θ) from the left.

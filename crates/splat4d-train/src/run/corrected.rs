@@ -2,7 +2,7 @@
 
 use super::checkpoint::write_atomically;
 use crate::capture::Capture;
-use crate::learner::moved;
+use crate::learner::{moved, zoomed};
 use crate::step::trainer::Trainer;
 use crate::{Error, Result};
 use serde_json::Value;
@@ -41,10 +41,12 @@ pub fn read(run: &Path) -> Result<Option<Value>> {
     if sound { Ok(Some(value)) } else { Err(damage("it is no list of corrections of cameras".into())) }
 }
 
-/// A row: camera, number of its picture if it moves, twist, seconds.
-fn correction(row: &Value) -> Option<(&str, Option<u64>, [f64; 6], f64)> {
+/// A row: camera, number of its picture if it moves, twist, seconds, share of the focal length.
+fn correction(row: &Value) -> Option<(&str, Option<u64>, [f64; 6], f64, f64)> {
+    // Runs of older versions have none.
+    let zoom = row.get("focal").map_or(Some(0.0), Value::as_f64)?;
     let twist: Vec<f64> = row["twist"].as_array()?.iter().filter_map(Value::as_f64).collect();
-    Some((row["camera"].as_str()?, row["frame"].as_u64(), twist.try_into().ok()?, row["offset"].as_f64()?))
+    Some((row["camera"].as_str()?, row["frame"].as_u64(), twist.try_into().ok()?, row["offset"].as_f64()?, zoom))
 }
 
 /// Moves the capture's cameras and clocks to where the run has learnt that they are: those of training, and held-out pictures
@@ -62,6 +64,7 @@ pub fn apply(capture: &mut Capture, run: &Path) -> Result<()> {
         }
         if let Some(row) = of_camera.next() {
             frame.time = Time(frame.time.0 + row.3);
+            frame.view.intrinsics = zoomed(&frame.view.intrinsics, row.4);
         }
     }
     Ok(())

@@ -194,7 +194,7 @@ impl OpenCapture {
     /// What is to be learnt of cameras, where the recipe wants it.
     fn corrections(&self, plan: &Plan) -> Option<Corrections> {
         let settings = learnable(&plan.recipe);
-        if !settings.poses && !settings.times {
+        if !settings.poses && !settings.focal && !settings.times {
             return None;
         }
         let origin = |&i: &usize| {

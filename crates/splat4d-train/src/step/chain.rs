@@ -6,6 +6,7 @@
 use super::channels::{Channels, Source};
 use crate::Result;
 pub(crate) use crate::learner::Observation;
+use crate::learner::StepGrads;
 use crate::loss::image::{Channel, PictureGrads, Shown};
 pub(crate) use crate::loss::image::{ImageTerm, View};
 pub(crate) use crate::loss::terms::{ParamLoss, Probe, ProbeLoss, StepInfo};
@@ -41,8 +42,17 @@ pub struct StepReport {
     pub d_times: Vec<f64>,
     /// dL/d pose of every view, left perturbation (ρ, θ).
     pub d_cameras: Vec<[f64; 6]>,
+    /// dL/d logarithm of every view's focal lengths.
+    pub d_focals: Vec<f64>,
     /// Where the time went.
     pub timings: Timings,
+}
+
+impl StepReport {
+    /// The gradients to what cameras learn.
+    pub(crate) fn grads(&self) -> StepGrads<'_> {
+        StepGrads { d_cameras: &self.d_cameras, d_focals: &self.d_focals, d_times: &self.d_times }
+    }
 }
 
 /// The input of one step.
@@ -248,6 +258,7 @@ impl<F: Real> Compared<F> {
         let mut d_sh = own_sh(shot.splats, work.d);
         work.backend.vjp(shot, &self.d_image.grads(), &mut d_sh, &mut self.d_splats)?;
         work.report.d_cameras.push(self.d_splats.camera);
+        work.report.d_focals.push(self.d_splats.focal);
         if let (Some((layer, keys)), Some(head)) = (scene.head_keys(), &self.d_splats.head) {
             let [first, second] = work.d[layer].of([keys.first, keys.second]);
             first.data_mut().iter_mut().zip(&head.first).for_each(|(d, x)| *d += *x);

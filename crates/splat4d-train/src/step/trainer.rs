@@ -371,7 +371,7 @@ impl<'a> Trainer<'a> {
         let progress = (before + stage_step) as f64 / self.schedule().max(1) as f64;
         if let Some(corrections) = &mut self.learner.corrections {
             let report = &stepped.report;
-            corrections.step(self.batch.seen(), &report.d_cameras, &report.d_times, progress, rate_scale);
+            corrections.step(self.batch.seen(), &report.grads(), progress, rate_scale);
         }
         let after = (before + self.next_place()) as f64 / self.schedule().max(1) as f64;
         let Some(corrections) = &self.learner.corrections else { return Ok(()) };

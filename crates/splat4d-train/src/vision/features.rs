@@ -5,7 +5,7 @@
 //! bytes, so that distances are whole numbers.
 
 use super::raster::{blurred, doubled, every_second};
-use super::triangulate::solve;
+use splat4d::math::mat3::solve;
 use splat4d::scene::Planes;
 use std::f64::consts::TAU;
 

@@ -1,24 +1,8 @@
 //! From pixels of several cameras to points of the world.
 
-use splat4d::math::se3::{cross, dot, mat_mul, mat_vec, norm, normalize, sub, transpose};
+use splat4d::math::mat3::solve;
+use splat4d::math::se3::{cross, dot, mat_mul, mat_vec, normalize, sub, transpose};
 use splat4d::scene::Camera;
-
-/// Solves a x = b by Cramer's rule; `None` where a is nearly singular, whatever its unit.
-pub fn solve(a: [[f64; 3]; 3], b: [f64; 3]) -> Option<[f64; 3]> {
-    /// Of the product of the rows' lengths, which the determinant reaches where rows stand at right angles.
-    const SINGULAR: f64 = 1e-12;
-    let columns = transpose(&a);
-    let det = dot(columns[0], cross(columns[1], columns[2]));
-    let largest = a.iter().map(|&row| norm(row)).product::<f64>();
-    if det.abs() <= SINGULAR * largest || det.is_nan() {
-        return None;
-    }
-    Some([
-        dot(b, cross(columns[1], columns[2])) / det,
-        dot(columns[0], cross(b, columns[2])) / det,
-        dot(columns[0], cross(columns[1], b)) / det,
-    ])
-}
 
 /// The rows of K: pixel = K·x / z.
 fn calibration(camera: &Camera) -> [[f64; 3]; 3] {
@@ -143,6 +127,7 @@ pub fn triangulate(sights: &[Sight<'_>]) -> Option<[f64; 3]> {
 mod tests {
     use super::*;
     use splat4d::math::Se3;
+    use splat4d::math::se3::norm;
 
     fn camera(x: f64, unit: f64) -> Camera {
         let pose = Se3::look_at([x * unit, 0.1 * unit, -4.0 * unit], [0.0; 3], [0.0, -1.0, 0.0]);

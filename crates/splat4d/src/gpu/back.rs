@@ -5,7 +5,7 @@ use super::clock::{Recorder, TIMES_BYTES};
 use super::frame::{Back, Band, Frame, RECORD_BYTES, TILE};
 use super::kernels::BackKernels;
 use super::{GpuRenderer, pixel_rows};
-use crate::render::project::Projection;
+use crate::render::project::{CAMERA, Projection};
 use crate::render::rasterize::CHANNELS;
 use crate::render::shade::{self, ShadeGrads};
 use crate::render::{ImageGrads, PartGrads, Projected, RenderGrads, Shot, View, project};
@@ -18,8 +18,6 @@ use std::time::Instant;
 
 /// Numbers that come back of a splat: five vec4 (splats_back.wgsl).
 const NUMBERS: usize = 20;
-/// Numbers of a pose's gradient.
-const POSE: usize = 6;
 /// Bits of `Blend::flags` in rasterize_back.wgsl.
 const FLAG_ALPHA: u32 = 1;
 const FLAG_DEPTH: u32 = 2;
@@ -41,7 +39,7 @@ pub(super) struct Returned {
 
 /// Where things lie in the memory that the CPU reads.
 struct Layout {
-    poses: u64,
+    cameras: u64,
     sums: u64,
     times: u64,
     all: u64,
@@ -84,7 +82,7 @@ impl GpuRenderer {
         shaped(grads.alpha, 1);
         shaped(grads.depth, usize::from(shot.depth));
         d.background = [0.0; 3];
-        d.camera = [0.0; 6];
+        (d.camera, d.focal) = ([0.0; 6], 0.0);
         (d.extra, d.head) = (None, None);
         if n == 0 || self.drawn.is_empty() {
             let rows = vec![0.0; n * NUMBERS];
@@ -96,7 +94,7 @@ impl GpuRenderer {
         let across = size[0].div_ceil(TILE);
         let layout = self.make_room_to_return(n, across, size)?;
         let bands = self.drawn.clone();
-        let (mut rows, mut d_background) = (Vec::new(), [0.0; 3]);
+        let (mut rows, mut d_camera, mut d_background) = (Vec::new(), [0.0; CAMERA], [0.0; 3]);
         for (i, &(band, pairs)) in bands.iter().enumerate() {
             let last = i + 1 == bands.len();
             let sums_at = (RECORD_BYTES / 4) as u32 * pairs as u32;
@@ -106,7 +104,7 @@ impl GpuRenderer {
                 | flag(self.config.abs_grads, FLAG_ABS);
             self.write_uniforms(shot, band, across, [flags, sums_at, u32::from(i > 0)])?;
             self.send_gradient(shot, grads, band);
-            let end = if last { Some((&mut rows, &mut d.camera)) } else { None };
+            let end = if last { Some((&mut rows, &mut d_camera)) } else { None };
             let sums = self.return_band((band, pairs), across, bands.len() > 1, end, &layout)?;
             for tile in sums.chunks_exact(3) {
                 for c in 0..3 {
@@ -115,6 +113,8 @@ impl GpuRenderer {
             }
         }
         d.background = d_background.map(|v| v as f32);
+        d.camera.copy_from_slice(&d_camera[..6]);
+        d.focal = d_camera[6];
         self.spread(shot, &rows, d_sh, d)?;
         self.timings.back_total = start.elapsed().as_secs_f64() * 1e3;
         Ok(())
@@ -131,11 +131,11 @@ impl GpuRenderer {
         b.records.ensure(gpu, records)?;
         b.sums.ensure(gpu, 48 * n as u64)?;
         b.back.ensure(gpu, (4 * NUMBERS * n) as u64)?;
-        b.poses.ensure(gpu, (4 * POSE * groups) as u64)?;
-        let poses = ((4 * NUMBERS * n) as u64).next_multiple_of(UNIFORM_STRIDE);
-        let sums = (poses + (4 * POSE * groups) as u64).next_multiple_of(UNIFORM_STRIDE);
+        b.cameras.ensure(gpu, (4 * CAMERA * groups) as u64)?;
+        let cameras = ((4 * NUMBERS * n) as u64).next_multiple_of(UNIFORM_STRIDE);
+        let sums = (cameras + (4 * CAMERA * groups) as u64).next_multiple_of(UNIFORM_STRIDE);
         let times = (sums + 12 * tiles).next_multiple_of(UNIFORM_STRIDE);
-        let layout = Layout { poses, sums, times, all: times + TIMES_BYTES };
+        let layout = Layout { cameras, sums, times, all: times + TIMES_BYTES };
         b.back_staging.ensure(gpu, layout.all)?;
         Ok(layout)
     }
@@ -157,13 +157,13 @@ impl GpuRenderer {
     }
 
     /// Takes one band back. Returns the background's gradient by tile; of the last band also what came of the splats, and the
-    /// pose's, which is added to.
+    /// camera's, which is added to.
     fn return_band(
         &mut self,
         (band, pairs): (Band, usize),
         across: usize,
         again: bool,
-        end: Option<(&mut Vec<f32>, &mut [f64; POSE])>,
+        end: Option<(&mut Vec<f32>, &mut [f64; CAMERA])>,
         layout: &Layout,
     ) -> Result<Vec<f32>> {
         let (gpu, b) = (&self.gpu, &self.buffers);
@@ -183,7 +183,7 @@ impl GpuRenderer {
             back.splats(&mut recorder, &self.upload)?;
             recorder.copy(b.back.get(), staging, 0, (4 * NUMBERS * self.stats.splats) as u64);
             let groups: usize = self.upload.draws.iter().map(|draw| draw.groups()).sum();
-            recorder.copy(b.poses.get(), staging, layout.poses, (4 * POSE * groups) as u64);
+            recorder.copy(b.cameras.get(), staging, layout.cameras, (4 * CAMERA * groups) as u64);
         }
         recorder.copy_from(b.records.get(), RECORD_BYTES * pairs as u64, staging, layout.sums, 12 * tiles as u64);
         let timed = recorder.resolve(b.times.get());
@@ -206,10 +206,10 @@ impl GpuRenderer {
         if let Some((rows, camera)) = end {
             *rows = bytemuck::pod_collect_to_vec(at(0, 4 * NUMBERS * self.stats.splats));
             let groups: usize = self.upload.draws.iter().map(|draw| draw.groups()).sum();
-            let poses: Vec<f32> = bytemuck::pod_collect_to_vec(at(layout.poses, 4 * POSE * groups));
-            for pose in poses.chunks_exact(POSE) {
-                for k in 0..POSE {
-                    camera[k] += f64::from(pose[k]);
+            let cameras: Vec<f32> = bytemuck::pod_collect_to_vec(at(layout.cameras, 4 * CAMERA * groups));
+            for one in cameras.chunks_exact(CAMERA) {
+                for k in 0..CAMERA {
+                    camera[k] += f64::from(one[k]);
                 }
             }
         }

@@ -132,7 +132,7 @@ pub(super) struct Buffers {
     /// Twenty numbers a splat for the CPU.
     pub back: Grown,
     /// Six a workgroup.
-    pub poses: Grown,
+    pub cameras: Grown,
     /// Timestamps.
     pub times: Grown,
     /// Memory that the CPU reads.
@@ -170,7 +170,7 @@ impl Buffers {
             records: storage("gradients of pairs of tile and splat"),
             sums: storage("gradients of the splats"),
             back: storage("gradients of the Gaussians"),
-            poses: storage("gradients of the pose"),
+            cameras: storage("gradients of the camera"),
             times: Grown::new("timestamps", Usage::QUERY_RESOLVE | Usage::COPY_SRC),
             staging: Grown::new("the picture", Usage::MAP_READ | Usage::COPY_DST),
             back_staging: Grown::new("the gradients", Usage::MAP_READ | Usage::COPY_DST),
@@ -198,7 +198,7 @@ impl Buffers {
             &self.records,
             &self.sums,
             &self.back,
-            &self.poses,
+            &self.cameras,
             &self.times,
             &self.staging,
             &self.back_staging,

@@ -368,7 +368,7 @@ impl Back<'_> {
                 b.marks.all(),
                 b.sums.all(),
                 b.back.all(),
-                b.poses.all(),
+                b.cameras.all(),
             ];
             (k.splats.bind(self.frame.gpu, &group), draw.groups())
         };

@@ -3,8 +3,8 @@
 //
 // Bindings, group 0: 0 view; 1 piece; 2 geometry as in splats.wgsl; 3 shapes, 4 colors, 5 marks as that wrote them; 6 sums of
 // gather.wgsl; out: 7 back, five vec4 a splat (mean, opacity; covariance xx xy xz yy; yz zz, radius, 0; colour, norm of the
-// centre's gradient; the colour that was drawn, norm of the absolute gradients), all 0 where it was not visible; 8 poses,
-// six sums a workgroup. Seven storage buffers, 6 KiB of workgroup memory.
+// centre's gradient; the colour that was drawn, norm of the absolute gradients), all 0 where it was not visible; 8 cameras,
+// seven sums a workgroup (the pose's six, the focal lengths'). Seven storage buffers, 7 KiB of workgroup memory.
 // A thread owns one row.
 
 const TABLE_BLOCK: u32 = 16u;
@@ -31,9 +31,9 @@ struct Piece {
 @group(0) @binding(5) var<storage, read> marks: array<u32>;
 @group(0) @binding(6) var<storage, read> sums: array<vec4<f32>>;
 @group(0) @binding(7) var<storage, read_write> back: array<vec4<f32>>;
-@group(0) @binding(8) var<storage, read_write> poses: array<f32>;
+@group(0) @binding(8) var<storage, read_write> cameras: array<f32>;
 
-var<workgroup> pose_sums: array<array<f32, 6>, 256>;
+var<workgroup> camera_sums: array<array<f32, 7>, 256>;
 
 @compute @workgroup_size(256)
 fn splats_back(
@@ -42,7 +42,7 @@ fn splats_back(
     @builtin(local_invocation_index) thread: u32,
 ) {
     let splat = piece.first_splat + at.x;
-    var pose = array<f32, 6>(0.0, 0.0, 0.0, 0.0, 0.0, 0.0);
+    var camera = array<f32, 7>(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0);
     if (at.x < piece.rows) {
         var rows = array<vec4<f32>, 5>();
         if (marks[splat] == 2u) {
@@ -68,24 +68,26 @@ fn splats_back(
             rows[2] = vec4<f32>(out.cov.yz, out.cov.zz, out.radius, 0.0);
             rows[3] = vec4<f32>(s1.z, s1.w, s2.x, length(d.center * scale));
             rows[4] = vec4<f32>(colors[splat].xyz, length(s2.zw * scale));
-            pose = array<f32, 6>(out.moved.x, out.moved.y, out.moved.z, out.turned.x, out.turned.y, out.turned.z);
+            let moved = out.moved;
+            let turned = out.turned;
+            camera = array<f32, 7>(moved.x, moved.y, moved.z, turned.x, turned.y, turned.z, out.focal);
         }
         for (var i = 0u; i < 5u; i++) {
             back[5u * splat + i] = rows[i];
         }
     }
-    pose_sums[thread] = pose;
+    camera_sums[thread] = camera;
     for (var step = BACK_THREADS / 2u; step > 0u; step /= 2u) {
         workgroupBarrier();
         if (thread < step) {
-            for (var i = 0u; i < 6u; i++) {
-                pose_sums[thread][i] += pose_sums[thread + step][i];
+            for (var i = 0u; i < 7u; i++) {
+                camera_sums[thread][i] += camera_sums[thread + step][i];
             }
         }
     }
     if (thread == 0u) {
-        for (var i = 0u; i < 6u; i++) {
-            poses[6u * (piece.first_group + group.x) + i] = pose_sums[0][i];
+        for (var i = 0u; i < 7u; i++) {
+            cameras[7u * (piece.first_group + group.x) + i] = camera_sums[0][i];
         }
     }
 }

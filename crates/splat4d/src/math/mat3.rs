@@ -1,6 +1,7 @@
-//! General 3x3 matrices: the rotation nearest to one.
+//! General 3x3 matrices: equations, the rotation nearest to one.
 
 use super::jacobi::jacobi;
+use super::se3::{cross, dot, norm, transpose};
 use super::{Real, quat};
 
 /// Share of the matrix's size that is added along the identity, so that of several equally near rotations (points on a
@@ -9,6 +10,23 @@ use super::{Real, quat};
 const LEAST_TURN: f64 = 1e-12;
 /// Sweeps of the Jacobi iteration, at most; it converges quadratically, four or five are usual for 4x4.
 const SWEEPS: usize = 12;
+
+/// Solves a x = b by Cramer's rule; `None` where a is nearly singular, whatever its unit.
+pub fn solve(a: [[f64; 3]; 3], b: [f64; 3]) -> Option<[f64; 3]> {
+    /// Of the product of the rows' lengths, which the determinant reaches where rows stand at right angles.
+    const SINGULAR: f64 = 1e-12;
+    let columns = transpose(&a);
+    let det = dot(columns[0], cross(columns[1], columns[2]));
+    let largest = a.iter().map(|&row| norm(row)).product::<f64>();
+    if det.abs() <= SINGULAR * largest || det.is_nan() {
+        return None;
+    }
+    Some([
+        dot(b, cross(columns[1], columns[2])) / det,
+        dot(columns[0], cross(b, columns[2])) / det,
+        dot(columns[0], cross(columns[1], b)) / det,
+    ])
+}
 
 /// The rotation R (det +1, never a reflection) that maximises Σ_ij R_ij cov_ij, so that for cov = Σ w a bᵀ it minimises
 /// Σ w ‖a − R b‖² (the orthogonal Procrustes or Wahba problem).

@@ -2,6 +2,7 @@
 //! numbers, and the [`Real`] trait that lets every kernel run in f32 and be checked in f64.
 
 pub mod align;
+pub mod cholesky;
 pub mod jacobi;
 pub mod knn;
 pub mod mat3;

@@ -163,6 +163,8 @@ pub struct RenderGrads<F = f32> {
     pub background: [F; 3],
     /// To a left perturbation exp(ρ, θ)·cam_from_world: ρ 3, θ 3.
     pub camera: [f64; 6],
+    /// To the logarithm of the focal lengths, both at once.
+    pub focal: f64,
     /// |dL/d mean2d| of every splat, x times width/2 and y times height/2, as densification thresholds assume.
     pub mean2d: Vec<F>,
     /// The same norm of Σ over pixels of |gradient| (AbsGS), if [`RenderConfig::abs_grads`] is on; passes over the
@@ -216,7 +218,7 @@ pub struct Renderer<F = f32> {
     d_extra: Vec<[F; CHANNELS]>,
     radii: Vec<F>,
     headed: Headed<F>,
-    pose_partial: Vec<[f64; 6]>,
+    camera_partial: Vec<[f64; project::CAMERA]>,
     center_partial: Vec<[f64; 3]>,
     seconds: StageSeconds,
 }
@@ -237,7 +239,7 @@ impl<F: Real> Renderer<F> {
             d_extra: Vec::new(),
             radii: Vec::new(),
             headed: Headed::default(),
-            pose_partial: Vec::new(),
+            camera_partial: Vec::new(),
             center_partial: Vec::new(),
             seconds: StageSeconds::default(),
         }
@@ -419,9 +421,11 @@ impl<F: Real> Renderer<F> {
         for (part, out) in splats.parts.iter().zip(&mut d.parts) {
             project::reshape(&mut out.out, part.out);
         }
-        d.camera = [0.0; 6];
+        let mut d_camera = [0.0; project::CAMERA];
         let projection = Projection { splats, view: &view, simd, projected: &self.projected };
-        project::backward(&projection, &self.d_projected, &mut d.parts, &mut d.camera, &mut self.pose_partial);
+        project::backward(&projection, &self.d_projected, &mut d.parts, &mut d_camera, &mut self.camera_partial);
+        d.camera.copy_from_slice(&d_camera[..6]);
+        d.focal = d_camera[6];
         let (parts, pose, partial) = (&mut d.parts[..], &mut d.camera, &mut self.center_partial);
         let mut d_colors = ShadeGrads { sh: d_sh, parts, pose, partial };
         shade::backward(&projection, shot.sh_degree, &self.channels, &self.d_channels, &mut d_colors);

@@ -251,6 +251,9 @@ fn screen<F: Real>(view: &View<F>, mean: [F; 3], cov: [F; 6], opacity: F) -> (Pr
     (out, drawn)
 }
 
+/// Numbers of a camera's gradient: six of its pose, one of its focal lengths.
+pub(crate) const CAMERA: usize = 7;
+
 /// Gradients of one Gaussian's inputs.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct GaussianGrads<F> {
@@ -260,8 +263,8 @@ pub(crate) struct GaussianGrads<F> {
     pub cov: [F; 6],
     /// To the opacity before compensation.
     pub opacity: F,
-    /// To a left perturbation of cam_from_world: translation, rotation.
-    pub pose: [F; 6],
+    /// To a left perturbation of cam_from_world: translation, rotation; then to the logarithm of the focal lengths, both at once.
+    pub camera: [F; CAMERA],
 }
 
 /// VJP of [`project`] for a row that was not culled; without a branch.
@@ -317,8 +320,13 @@ pub(crate) fn project_backward<F: Real>(
     // J = f/z (1, −clamped) in its two rows; the mean's path comes on top.
     let iz = e.inv_z;
     let mut d_p = [F::ZERO, F::ZERO, d.depth];
+    // Longer focal lengths move the centre away from the principal point and stretch M; where J is clamped, its bound is so
+    // many pixels, and its column of z stays.
+    let mut d_focal = F::ZERO;
     for a in 0..2 {
         let f = view.focal[a];
+        let stays = select(e.uv[a] == e.clamped[a], F::ZERO, d_j[a][2] * f * iz * e.clamped[a]);
+        d_focal += d.mean2d[a] * f * e.uv[a] + dot(d_m[a], m[a]) + stays;
         let inside = select(e.uv[a] == e.clamped[a], d_j[a][2] * f * iz, F::ZERO);
         let d_uv = d.mean2d[a] * f - inside;
         d_p[a] += d_uv * iz;
@@ -332,15 +340,16 @@ pub(crate) fn project_backward<F: Real>(
     ];
     let q = |a: usize, b: usize| j[0][a] * d_j[0][b] + j[1][a] * d_j[1][b];
     let p = e.p;
-    let pose = [
+    let camera = [
         d_p[0],
         d_p[1],
         d_p[2],
         p[1] * d_p[2] - p[2] * d_p[1] + q(2, 1) - q(1, 2),
         p[2] * d_p[0] - p[0] * d_p[2] + q(0, 2) - q(2, 0),
         p[0] * d_p[1] - p[1] * d_p[0] + q(1, 0) - q(0, 1),
+        d_focal,
     ];
-    GaussianGrads { mean: d_mean, cov: d_cov, opacity: d.opacity * rho, pose }
+    GaussianGrads { mean: d_mean, cov: d_cov, opacity: d.opacity * rho, camera }
 }
 
 /// Projects all splats and finds the bins that each can touch. A splat that touches no pixel is culled.
@@ -460,15 +469,15 @@ pub struct Projection<'a, F = f32> {
     pub projected: &'a [Projected<F>],
 }
 
-/// VJP of [`forward`]: overwrites `parts[..].out` (culled rows get 0) and adds to the pose gradient.
+/// VJP of [`forward`]: overwrites `parts[..].out` (culled rows get 0) and adds to the camera's gradient.
 ///
 /// `partial` is scratch. Sums run in a fixed order: rows in a chunk, then chunks.
 pub(crate) fn backward<F: Real>(
     projection: &Projection<'_, F>,
     d: &[ProjectedGrads<F>],
     parts: &mut [PartGrads<F>],
-    pose: &mut [f64; 6],
-    partial: &mut Vec<[f64; 6]>,
+    camera: &mut [f64; CAMERA],
+    partial: &mut Vec<[f64; CAMERA]>,
 ) {
     let Projection { splats, view, simd, projected } = *projection;
     assert_eq!(parts.len(), splats.parts.len(), "one gradient a part");
@@ -488,14 +497,14 @@ pub(crate) fn backward<F: Real>(
             })
             .collect_into_vec(partial);
         for sum in partial.iter() {
-            for k in 0..6 {
-                pose[k] += sum[k];
+            for k in 0..CAMERA {
+                camera[k] += sum[k];
             }
         }
     }
 }
 
-/// One task's share of [`backward`]; returns its sum of the pose's gradient.
+/// One task's share of [`backward`]; returns its sum of the camera's gradient.
 struct Backward<'a, F> {
     out: &'a Table<F>,
     view: &'a View<F>,
@@ -507,11 +516,11 @@ struct Backward<'a, F> {
 }
 
 impl<F: Real> Kernel for Backward<'_, F> {
-    type Out = [f64; 6];
+    type Out = [f64; CAMERA];
     #[inline(always)]
-    fn run<const FMA: bool>(self) -> [f64; 6] {
+    fn run<const FMA: bool>(self) -> [f64; CAMERA] {
         let view = *self.view;
-        let mut sums = [[0.0; BLOCK]; 6];
+        let mut sums = [[0.0; BLOCK]; CAMERA];
         let (outs, _) = self.data.as_chunks_mut::<BLOCK>();
         let (outs, _) = outs.as_chunks_mut::<{ SPLAT_OPACITY + 1 }>();
         for (g, (out, (rows, d_rows))) in
@@ -532,7 +541,7 @@ impl<F: Real> Kernel for Backward<'_, F> {
                 (d.opacity[l], d.depth[l]) = (from.opacity, from.depth);
             }
             let block = columns(self.out, self.first / BLOCK + g);
-            let mut pose = [[F::ZERO; BLOCK]; 6];
+            let mut camera = [[F::ZERO; BLOCK]; CAMERA];
             for l in 0..BLOCK {
                 let (mean, cov, opacity) = gaussian(block, l);
                 let row = Projected { conic: std::array::from_fn(|k| conic[k][l]), ..Projected::default() };
@@ -551,13 +560,15 @@ impl<F: Real> Kernel for Backward<'_, F> {
                 }
                 for k in 0..6 {
                     out[COV + k][l] = select(drawn, g.cov[k], F::ZERO);
-                    pose[k][l] = select(drawn, g.pose[k], F::ZERO);
+                }
+                for k in 0..CAMERA {
+                    camera[k][l] = select(drawn, g.camera[k], F::ZERO);
                 }
                 out[SPLAT_OPACITY][l] = select(drawn, g.opacity, F::ZERO);
             }
-            for k in 0..6 {
+            for k in 0..CAMERA {
                 for l in 0..BLOCK {
-                    sums[k][l] += pose[k][l].f64();
+                    sums[k][l] += camera[k][l].f64();
                 }
             }
         }

@@ -21,6 +21,7 @@ struct GaussianGrads {
     opacity: f32, // before the compensation
     moved: vec3<f32>,
     turned: vec3<f32>,
+    focal: f32,   // to the logarithm of the focal lengths, both at once
     radius: f32,  // no gradient: 3 sigma of the larger axis, px
 }
 
@@ -80,6 +81,8 @@ fn project_back(view: View, mean: vec3<f32>, cov: Cov, opacity: f32, conic: vec3
     let j1 = vec3<f32>(dot(d_m1, r0), dot(d_m1, r1), dot(d_m1, r2));
     // J = f/z (1, -held) in its two rows; the mean's path comes on top.
     let inside = select(vec2<f32>(0.0), vec2<f32>(j0.z, j1.z) * f, uv == held);
+    let stays = select(vec2<f32>(j0.z, j1.z) * f * held, vec2<f32>(0.0), uv == held);
+    out.focal = dot(d.center * view.focal, uv) + dot(d_m0, m0) + dot(d_m1, m1) + stays.x + stays.y;
     let d_uv = d.center * view.focal - inside;
     var d_p = vec3<f32>(d_uv * inv_z, d.depth);
     d_p.z += -d_uv.x * uv.x * inv_z - f.x * inv_z * (j0.x - j0.z * held.x);

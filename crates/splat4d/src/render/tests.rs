@@ -308,6 +308,12 @@ fn every_gradient_equals_finite_differences() {
             };
             close((at(1e-6) - at(-1e-6)) / 2e-6, d.camera[k], &format!("{antialias:?} pose {k}"));
         }
+        let zoomed = |h: f64| {
+            let mut camera = view.clone();
+            (camera.intrinsics.fx, camera.intrinsics.fy) = (h.exp() * view.intrinsics.fx, h.exp() * view.intrinsics.fy);
+            loss.of(&draw(&s, &camera, config))
+        };
+        close((zoomed(1e-6) - zoomed(-1e-6)) / 2e-6, d.focal, &format!("{antialias:?} focal length"));
     }
 }
 

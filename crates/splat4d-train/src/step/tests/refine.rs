@@ -5,7 +5,7 @@ use super::bed::knobs;
 use crate::Result;
 use crate::capture::frames::{Frames, Picture};
 use crate::init;
-use crate::learner::{Corrections, Origin, Scale, moved};
+use crate::learner::{Corrections, Origin, Scale, moved, zoomed};
 use crate::methods::{Plan, program_of, stages};
 use crate::step::loss::TrainLoss;
 use crate::step::trainer::{Settings, Trainer};
@@ -19,7 +19,9 @@ use std::sync::Arc;
 
 const CAMERAS: usize = 7;
 const MOMENTS: usize = 9;
+/// Sides of the pictures: for clocks, and for what is a matter of pixels.
 const SIZE: usize = 24;
+const FINE: usize = 48;
 /// Seconds of a frame.
 const FRAME: f64 = 0.1;
 /// Radius of the ring of cameras.
@@ -34,13 +36,29 @@ struct Disturbed {
 }
 
 impl Disturbed {
-    fn new(turn: f64, late: [f64; CAMERAS]) -> Self {
-        let made = Made::new(CAMERAS, MOMENTS, SIZE);
+    /// Clocks that are late by so many frames.
+    fn clocks(late: [f64; CAMERAS]) -> Self {
+        Self::new(SIZE, 0.0, late, [0.0; CAMERAS])
+    }
+
+    /// Poses that are off by about so many radians and radii.
+    fn poses(turn: f64) -> Self {
+        Self::new(FINE, turn, [0.0; CAMERAS], [0.0; CAMERAS])
+    }
+
+    /// Focal lengths that are stated by such shares too long.
+    fn lenses(longer: [f64; CAMERAS]) -> Self {
+        Self::new(FINE, 0.0, [0.0; CAMERAS], longer)
+    }
+
+    fn new(size: usize, turn: f64, late: [f64; CAMERAS], longer: [f64; CAMERAS]) -> Self {
+        let made = Made::new(CAMERAS, MOMENTS, size);
         let camera = |i: usize| {
             let rng = Rng::new(3, "disturbed", i as u64);
             let twist = std::array::from_fn(|k| turn * rng.normal(k as u64) * if k < 3 { EXTENT } else { 1.0 });
             let stated = made.camera(i).clone();
-            Camera { cam_from_world: moved(&stated.cam_from_world, twist), ..stated }
+            let intrinsics = zoomed(&stated.intrinsics, longer[i]);
+            Camera { cam_from_world: moved(&stated.cam_from_world, twist), intrinsics, ..stated }
         };
         Self { cameras: (0..CAMERAS).map(camera).collect(), made, late }
     }
@@ -72,6 +90,8 @@ impl Frames for Disturbed {
 
 /// What is left of the disturbance after a run.
 struct Left {
+    /// Of focal lengths, shares of them: root mean square over cameras, before and after.
+    zoom: [f64; 2],
     /// Of the rotations, degrees: root mean square over cameras, before and after.
     degrees: [f64; 2],
     /// Of clocks, frames from their median: the largest, before and after.
@@ -82,7 +102,7 @@ struct Left {
 
 fn run(frames: Disturbed, line: &str) -> Left {
     let recipe = knobs(&format!("motion=spacetime batch_size=2 init=hull {line}"));
-    let (truth, stated) = (Made::new(CAMERAS, MOMENTS, SIZE), frames.cameras.clone());
+    let (truth, stated) = (Made::new(CAMERAS, MOMENTS, frames.cameras[0].width), frames.cameras.clone());
     let late = frames.late;
     let frames: Arc<dyn Frames> = Arc::new(frames);
     let times: Vec<f64> = (0..frames.len()).map(|i| frames.time(i).0).collect();
@@ -138,7 +158,11 @@ fn run(frames: Disturbed, line: &str) -> Left {
     let centers = |poses: &[Se3]| poses.iter().map(|p| p.inverse().translation).collect::<Vec<_>>();
     let (a, b) = (centers(&stated_poses), centers(&found_poses));
     let drift = (0..3).map(|k| a.iter().zip(&b).map(|(a, b)| b[k] - a[k]).sum::<f64>().abs() / CAMERAS as f64);
+    let fx = |of: &dyn Fn(usize) -> Camera, i: usize| of(i).intrinsics.fx / truth.camera(i).intrinsics.fx - 1.0;
+    let zoom =
+        |of: &dyn Fn(usize) -> Camera| ((0..CAMERAS).map(|i| fx(of, i).powi(2)).sum::<f64>() / CAMERAS as f64).sqrt();
     Left {
+        zoom: [zoom(&|i| stated[i].clone()), zoom(&|i| found.camera(i, &stated[i]))],
         degrees: [off(&stated_poses), off(&found_poses)],
         late: [spread(&late), spread(&after)],
         gauge: [drift.fold(0.0, f64::max) / EXTENT, median(&shifts).abs()],
@@ -149,20 +173,30 @@ fn run(frames: Disturbed, line: &str) -> Left {
 fn clocks_that_are_frames_apart_are_found() {
     // The ball moves evenly, so that the model can be as sharp as 24 pixels allow.
     let line = "iterations=600 motion_order=1 densify.max_cap=200 refine.times=true";
-    let left = run(Disturbed::new(0.0, [0.0, 2.0, 0.0, -1.4, 0.0, 0.6, 0.0]), line);
+    let left = run(Disturbed::clocks([0.0, 2.0, 0.0, -1.4, 0.0, 0.6, 0.0]), line);
     assert!(left.late[0] == 2.0 && left.late[1] < 0.5, "{:?}", left.late);
     assert!(left.gauge[1] < 1e-4, "the median of all clocks stays: {:?}", left.gauge);
-    let left = run(Disturbed::new(0.0, [0.0; CAMERAS]), line);
+    let left = run(Disturbed::clocks([0.0; CAMERAS]), line);
     assert!(left.late[1] < 0.2, "clocks that are right stay: {:?}", left.late);
 }
 
 #[test]
 fn poses_that_are_off_come_nearer_and_right_ones_stay() {
-    // A pixel is 1.7 degrees wide: all of this is less than one.
+    // A pixel is 0.8 degrees wide: this is less than two.
     let line = "iterations=1000 motion_order=1 densify.max_cap=200 refine.poses=true";
-    let left = run(Disturbed::new(0.015, [0.0; CAMERAS]), line);
+    let left = run(Disturbed::poses(0.015), line);
     assert!(left.degrees[0] > 1.4 && left.degrees[1] < 0.8 * left.degrees[0], "{:?}", left.degrees);
     assert!(left.gauge[0] < 1e-3, "the cameras' mean stays: {:?}", left.gauge);
-    let left = run(Disturbed::new(0.0, [0.0; CAMERAS]), line);
+    let left = run(Disturbed::poses(0.0), line);
     assert!(left.degrees[1] < 0.5, "{:?}", left.degrees);
+}
+
+#[test]
+fn focal_lengths_that_are_off_come_nearer_and_right_ones_stay() {
+    let longer = [0.0, 0.04, -0.05, 0.03, 0.0, -0.04, 0.05];
+    let line = "iterations=1000 motion_order=1 densify.max_cap=200 refine.focal=true";
+    let left = run(Disturbed::lenses(longer), line);
+    assert!(left.zoom[0] > 0.03 && left.zoom[1] < 0.6 * left.zoom[0], "{:?}", left.zoom);
+    let left = run(Disturbed::poses(0.0), line);
+    assert!(left.zoom[1] < 0.015, "{:?}", left.zoom);
 }

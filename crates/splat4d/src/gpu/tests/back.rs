@@ -89,6 +89,7 @@ fn named(d: &RenderGrads<f32>, d_sh: &[Option<Table<f32>>]) -> Vec<(String, Vec<
         }
     }
     put("pose".into(), d.camera.to_vec());
+    put("focal".into(), vec![d.focal]);
     put("background".into(), d.background.iter().map(|v| f64::from(*v)).collect());
     put("screen".into(), d.mean2d.iter().map(|v| f64::from(*v)).collect());
     put("absolute".into(), d.mean2d_abs.iter().map(|v| f64::from(*v)).collect());
