@@ -1,11 +1,14 @@
-//! Visual hull: a random point is kept where (almost) every camera that sees it at that moment has it in its mask.
+//! Visual hull: a random point is kept where (almost) every camera that sees it at that moment has it in its silhouette: the
+//! mask, or where fixed cameras have none, what differs from what stands still.
 
 use super::Seeds;
 use super::volume::Volume;
 use crate::Result;
 use crate::capture::frames::{Frames, Picture, half_frame};
+use crate::vision::view::{Rigs, View};
 use rayon::prelude::*;
 use splat4d::math::Rng;
+use splat4d::scene::Camera;
 use std::collections::BTreeMap;
 
 /// Candidates a wanted point: the hull is a small part of the box.
@@ -14,8 +17,16 @@ const CANDIDATES: usize = 40;
 const ROUNDS: u64 = 4;
 /// The next round's box is this much larger on every side than what was kept.
 const MARGIN: f64 = 0.05;
-/// A point may be outside this share of the masks that see it (masks have ragged edges).
+/// A point may be outside this share of the silhouettes that see it: masks have ragged edges, and what moves has holes where
+/// it looks like what is behind it.
 const MISSES: f64 = 0.05;
+const MOVING_MISSES: f64 = 0.25;
+/// What moves is grown by so many pixels, since it hides the edges of what is behind it.
+const GROWN: usize = 1;
+/// Cameras that must see something move for its hull to be more than a cone.
+const MOVING_CAMERAS: usize = 4;
+/// A camera in which more of the picture differs (an exposure that was changed, a camera that was pushed) shows no silhouette.
+const MOVING_PICTURE: f64 = 0.5;
 /// A point must be seen by at least so many pictures.
 const MIN_VIEWS: usize = 2;
 /// One moving camera: pictures of so many moments around stand in for other cameras.
@@ -41,7 +52,18 @@ pub(crate) fn carve(
             pictures = spread(frames);
         }
         let wanted = if monocular { count } else { each };
-        let mut kept = carve_moment(frames, &pictures, volume, wanted, rng.fork(k as u64))?;
+        let shown = |vote: &mut dyn FnMut(Silhouette<'_>)| {
+            let mut picture = Picture::default();
+            for &i in &pictures {
+                frames.load(i, &mut picture)?;
+                let (Some(mask), color) = (&picture.mask, &picture.color) else { continue };
+                let color = |p: usize| std::array::from_fn(|c| color.plane(c)[p]);
+                vote(Silhouette { camera: frames.camera(i), inside: &|p| mask.data[p] > 0.5, color: &color });
+            }
+            Ok(())
+        };
+        let silhouettes = Silhouettes { count: pictures.len(), misses: MISSES, shown: &shown };
+        let mut kept = carve_moment(&silhouettes, volume, wanted, rng.fork(k as u64))?;
         kept.times.fill(stamp);
         out.append(kept);
         if monocular {
@@ -80,9 +102,69 @@ fn spread(frames: &dyn Frames) -> Vec<usize> {
     (0..frames.len()).step_by(step).collect()
 }
 
+/// About `count` points on what moves, over all `times`, of fixed cameras without masks; none where cameras move or are few.
+pub(crate) fn carve_moving(
+    frames: &dyn Frames,
+    volume: &Volume,
+    times: &[f64],
+    count: usize,
+    rng: Rng,
+) -> Result<Seeds> {
+    let rigs = Rigs::of(frames);
+    let still = match &rigs {
+        Rigs::Fixed(cameras) if cameras.len() >= MOVING_CAMERAS => rigs.still(frames)?,
+        _ => return Ok(Seeds::default()),
+    };
+    let mut out = Seeds::default();
+    for (k, &t) in times.iter().enumerate() {
+        let Some((mut views, t)) = rigs.moving(frames, &still, t)? else { break };
+        let share = |v: &View| v.wanted.iter().filter(|w| **w).count() as f64 / v.wanted.len() as f64;
+        views.retain(|v| share(v) <= MOVING_PICTURE);
+        if views.iter().filter(|v| v.wanted.contains(&true)).count() < MOVING_CAMERAS {
+            continue;
+        }
+        views.par_iter_mut().for_each(|v| v.wanted = grown(&v.wanted, v.camera.width));
+        let shown = |vote: &mut dyn FnMut(Silhouette<'_>)| {
+            for view in &views {
+                let color = |p: usize| view.colors[p].map(|b| f32::from(b) / 255.0);
+                vote(Silhouette { camera: &view.camera, inside: &|p| view.wanted[p], color: &color });
+            }
+            Ok(())
+        };
+        let silhouettes = Silhouettes { count: views.len(), misses: MOVING_MISSES, shown: &shown };
+        let mut kept = carve_moment(&silhouettes, volume, count.div_ceil(times.len()), rng.fork(k as u64))?;
+        kept.times.fill(Some(t));
+        out.append(kept);
+    }
+    Ok(out)
+}
+
+/// A mask that is larger by [`GROWN`] pixels to every side.
+fn grown(mask: &[bool], width: usize) -> Vec<bool> {
+    let height = mask.len() / width;
+    let near = |p: usize, of: usize| p.saturating_sub(GROWN)..(p + GROWN + 1).min(of);
+    let any = |p: usize| near(p / width, height).any(|y| near(p % width, width).any(|x| mask[y * width + x]));
+    (0..mask.len()).map(any).collect()
+}
+
+/// What one camera shows at a moment, by pixels.
+struct Silhouette<'a> {
+    camera: &'a Camera,
+    inside: &'a (dyn Fn(usize) -> bool + Sync),
+    color: &'a (dyn Fn(usize) -> [f32; 3] + Sync),
+}
+
+/// Those of all cameras, one after the other.
+struct Silhouettes<'a> {
+    count: usize,
+    /// Share of them that a point may be outside of.
+    misses: f64,
+    shown: &'a dyn Fn(&mut dyn FnMut(Silhouette<'_>)) -> Result<()>,
+}
+
 /// Carves one moment in rounds: each looks only in the box of what the last one kept, so that a small object in a large
 /// volume still gets its points.
-fn carve_moment(frames: &dyn Frames, pictures: &[usize], volume: &Volume, wanted: usize, rng: Rng) -> Result<Seeds> {
+fn carve_moment(silhouettes: &Silhouettes<'_>, volume: &Volume, wanted: usize, rng: Rng) -> Result<Seeds> {
     let mut low = volume.center.map(|c| c - volume.radius);
     let mut high = volume.center.map(|c| c + volume.radius);
     let mut out = Seeds::default();
@@ -91,7 +173,7 @@ fn carve_moment(frames: &dyn Frames, pictures: &[usize], volume: &Volume, wanted
         let points: Vec<[f64; 3]> = (0..(wanted * CANDIDATES) as u64)
             .map(|i| std::array::from_fn(|k| low[k] + (high[k] - low[k]) * round_rng.uniform(3 * i + k as u64)))
             .collect();
-        let kept = vote(frames, pictures, &points)?;
+        let kept = vote(silhouettes, &points)?;
         if kept.is_empty() {
             break;
         }
@@ -121,38 +203,35 @@ struct Votes {
     colors: Vec<[f32; 3]>,
 }
 
-/// The points that lie in (almost) all masks that see them, with their median colour. One picture at a time is held.
-fn vote(frames: &dyn Frames, pictures: &[usize], points: &[[f64; 3]]) -> Result<Seeds> {
-    let allowed = MISSES * pictures.len() as f64;
+/// The points that lie in (almost) all silhouettes that see them, with their median colour. One picture at a time is held.
+fn vote(silhouettes: &Silhouettes<'_>, points: &[[f64; 3]]) -> Result<Seeds> {
+    let allowed = silhouettes.misses * silhouettes.count as f64;
     let mut votes = vec![Votes::default(); points.len()];
-    let mut picture = Picture::default();
-    for &i in pictures {
-        frames.load(i, &mut picture)?;
-        let Some(mask) = &picture.mask else { continue };
-        let camera = frames.camera(i);
+    (silhouettes.shown)(&mut |shown| {
+        let Silhouette { camera, inside, color } = shown;
         points.par_iter().zip(&mut votes).for_each(|(x, v)| {
             if (v.views - v.inside) as f64 > allowed {
                 return;
             }
             let Some(([px, py], _)) = camera.project(*x) else { return };
-            if !(px >= 0.0 && py >= 0.0 && px < mask.width as f64 && py < mask.height as f64) {
+            if !(px >= 0.0 && py >= 0.0 && px < camera.width as f64 && py < camera.height as f64) {
                 return;
             }
             v.views += 1;
-            let (px, py) = (px as usize, py as usize);
-            if mask.get(0, py, px) > 0.5 {
+            let pixel = py as usize * camera.width + px as usize;
+            if inside(pixel) {
                 v.inside += 1;
-                v.colors.push(std::array::from_fn(|c| picture.color.get(c, py, px)));
+                v.colors.push(color(pixel));
             } else if (v.views - v.inside) as f64 > allowed {
                 v.colors = Vec::new();
             }
         });
-    }
+    })?;
     let mut out = Seeds::default();
     for (x, v) in points.iter().zip(&mut votes) {
         let misses = (v.views - v.inside) as f64;
-        let enough = v.views >= MIN_VIEWS.max(pictures.len().div_ceil(2));
-        if enough && misses <= allowed && misses <= MISSES * v.views as f64 {
+        let enough = v.views >= MIN_VIEWS.max(silhouettes.count.div_ceil(2));
+        if enough && misses <= allowed && misses <= silhouettes.misses * v.views as f64 {
             out.push(*x, median(&mut v.colors), None);
         }
     }
@@ -183,5 +262,30 @@ mod tests {
             let far = splat4d::math::se3::norm(splat4d::math::se3::sub(*x, c));
             assert!(far < 1.6 * Made::RADIUS, "{x:?} is {far} from the object at {t:?}");
         }
+    }
+
+    #[test]
+    fn what_moves_is_carved_without_masks_where_enough_cameras_stand_still() {
+        let frames = Made::new(6, 9, 48);
+        let times: Vec<f64> = [1, 4, 7].map(|k| frames.time_of(k)).to_vec();
+        let rng = Rng::new(1, "hull", 0);
+        let seeds = carve_moving(&frames, &common(&frames), &times, 300, rng).unwrap();
+        assert!(seeds.len() >= 150, "{}", seeds.len());
+        let mut near = 0;
+        for (x, t) in seeds.points.iter().zip(&seeds.times) {
+            let t = t.expect("what moves is somewhere at a time");
+            assert!(times.contains(&t), "{t}");
+            let far = splat4d::math::se3::norm(splat4d::math::se3::sub(*x, frames.object_at(t)));
+            near += usize::from(far < 1.6 * Made::RADIUS);
+        }
+        // One camera of six may miss a point: a few stand where five of them see the ball in front of something else.
+        assert!(near * 10 >= 8 * seeds.len(), "{near} of {}", seeds.len());
+        let few = Made::new(MOVING_CAMERAS - 1, 9, 48);
+        assert!(carve_moving(&few, &common(&few), &times, 300, rng).unwrap().is_empty(), "a cone");
+        let short = Made::new(6, 2, 48);
+        assert!(
+            carve_moving(&short, &common(&short), &times[..1], 300, rng).unwrap().is_empty(),
+            "nobody knows what stands"
+        );
     }
 }

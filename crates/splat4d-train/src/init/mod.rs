@@ -1,5 +1,5 @@
-//! Where Gaussians start: the capture's points, the visual hull of the masks at several moments, or random points in the
-//! volume that the cameras share.
+//! Where Gaussians start: the capture's points, the visual hull of the masks, or of what moves, at several moments, or random
+//! points in the volume that the cameras share.
 
 pub(crate) mod fill;
 pub(crate) mod hull;
@@ -74,8 +74,8 @@ settings! {
     pub struct InitSettings {
         /// Where Gaussians start: "auto", "points", "pictures", "hull", "random", or a .ply file.
         source: Source = Source::Auto;
-        /// Initial Gaussians. Points that a capture lacks to so many are laid between its own, along surfaces; the hull
-        /// of masks and random points bring as many of their own.
+        /// Initial Gaussians. Points that a capture lacks to so many are laid between its own, along surfaces; the hulls
+        /// of masks and of what moves, and random points, bring as many of their own.
         count: usize = 10_000 => any().when(IsNot("init.source", &["points"]));
         /// Initial opacity.
         opacity: f64 = 0.1 => inside_share();
@@ -90,8 +90,8 @@ settings! {
 /// Where the first Gaussians are.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Source {
-    /// The capture's points or, where they are few, those that its pictures show, and more between them; the hull of masks; else
-    /// at random.
+    /// The capture's points or, where they are few, those that its pictures show, and more between them; the hull of masks, or
+    /// of what moves before fixed cameras; else at random.
     Auto,
     /// The capture's points.
     Points,
@@ -199,6 +199,8 @@ pub fn seeds(plan: &Plan, frames: &dyn Frames, points: Option<Seeds>, moving: bo
     }
     if use_hull {
         out.append(hull::carve(frames, &volume, &times, r.init.count, moving, rng.fork(1))?);
+    } else if r.init.source == Source::Auto && have_points && moving {
+        out.append(hull::carve_moving(frames, &volume, &times, r.init.count, rng.fork(1))?);
     } else if r.init.source == Source::Random || !have_points {
         out.append(volume::random(frames, &volume, r.init.count, moving.then_some(plan.clip), rng.fork(2)));
     }

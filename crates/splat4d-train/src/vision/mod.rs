@@ -9,7 +9,7 @@ pub mod raster;
 pub(crate) mod scale;
 mod sweep;
 pub mod triangulate;
-mod view;
+pub(crate) mod view;
 
 use crate::Result;
 use crate::capture::frames::Frames;
