@@ -18,13 +18,16 @@ const ROUNDS: u64 = 4;
 /// The next round's box is this much larger on every side than what was kept.
 const MARGIN: f64 = 0.05;
 /// A point may be outside this share of the silhouettes that see it: masks have ragged edges, and what moves has holes where
-/// it looks like what is behind it.
+/// it looks like what is behind it (0.25 gave more ghosts: 0.3 dB less where nothing moves).
 const MISSES: f64 = 0.05;
-const MOVING_MISSES: f64 = 0.25;
+const MOVING_MISSES: f64 = 0.15;
+/// Points of what moves, of those that are asked for: all of them took Gaussians away from what stands still (0.4 dB less there,
+/// as good where things move).
+const MOVING_SHARE: f64 = 0.3;
 /// What moves is grown by so many pixels, since it hides the edges of what is behind it.
 const GROWN: usize = 1;
-/// Cameras that must see something move for its hull to be more than a cone.
-const MOVING_CAMERAS: usize = 4;
+/// Cameras that must see something move for its hull to be more than a cone: of four the hull was worse than nothing.
+const MOVING_CAMERAS: usize = 5;
 /// A camera in which more of the picture differs (an exposure that was changed, a camera that was pushed) shows no silhouette.
 const MOVING_PICTURE: f64 = 0.5;
 /// A point must be seen by at least so many pictures.
@@ -102,7 +105,7 @@ fn spread(frames: &dyn Frames) -> Vec<usize> {
     (0..frames.len()).step_by(step).collect()
 }
 
-/// About `count` points on what moves, over all `times`, of fixed cameras without masks; none where cameras move or are few.
+/// Points on what moves over all `times`, [`MOVING_SHARE`] of `count`, of fixed cameras without masks; none where cameras move or are few.
 pub(crate) fn carve_moving(
     frames: &dyn Frames,
     volume: &Volume,
@@ -115,6 +118,7 @@ pub(crate) fn carve_moving(
         Rigs::Fixed(cameras) if cameras.len() >= MOVING_CAMERAS => rigs.still(frames)?,
         _ => return Ok(Seeds::default()),
     };
+    let each = (MOVING_SHARE * count as f64 / times.len().max(1) as f64).ceil() as usize;
     let mut out = Seeds::default();
     for (k, &t) in times.iter().enumerate() {
         let Some((mut views, t)) = rigs.moving(frames, &still, t)? else { break };
@@ -132,7 +136,7 @@ pub(crate) fn carve_moving(
             Ok(())
         };
         let silhouettes = Silhouettes { count: views.len(), misses: MOVING_MISSES, shown: &shown };
-        let mut kept = carve_moment(&silhouettes, volume, count.div_ceil(times.len()), rng.fork(k as u64))?;
+        let mut kept = carve_moment(&silhouettes, volume, each, rng.fork(k as u64))?;
         kept.times.fill(Some(t));
         out.append(kept);
     }
@@ -270,7 +274,7 @@ mod tests {
         let times: Vec<f64> = [1, 4, 7].map(|k| frames.time_of(k)).to_vec();
         let rng = Rng::new(1, "hull", 0);
         let seeds = carve_moving(&frames, &common(&frames), &times, 300, rng).unwrap();
-        assert!(seeds.len() >= 150, "{}", seeds.len());
+        assert!(seeds.len() >= 50, "{}", seeds.len());
         let mut near = 0;
         for (x, t) in seeds.points.iter().zip(&seeds.times) {
             let t = t.expect("what moves is somewhere at a time");
