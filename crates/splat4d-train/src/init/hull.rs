@@ -158,12 +158,15 @@ struct Silhouette<'a> {
     color: &'a (dyn Fn(usize) -> [f32; 3] + Sync),
 }
 
-/// Those of all cameras, one after the other.
+/// Tells every camera's silhouette, one after the other.
+type Shown<'a> = dyn Fn(&mut dyn FnMut(Silhouette<'_>)) -> Result<()> + 'a;
+
+/// Those of all cameras.
 struct Silhouettes<'a> {
     count: usize,
     /// Share of them that a point may be outside of.
     misses: f64,
-    shown: &'a dyn Fn(&mut dyn FnMut(Silhouette<'_>)) -> Result<()>,
+    shown: &'a Shown<'a>,
 }
 
 /// Carves one moment in rounds: each looks only in the box of what the last one kept, so that a small object in a large

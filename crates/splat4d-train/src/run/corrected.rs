@@ -41,12 +41,27 @@ pub fn read(run: &Path) -> Result<Option<Value>> {
     if sound { Ok(Some(value)) } else { Err(damage("it is no list of corrections of cameras".into())) }
 }
 
-/// A row: camera, number of its picture if it moves, twist, seconds, share of the focal length.
-fn correction(row: &Value) -> Option<(&str, Option<u64>, [f64; 6], f64, f64)> {
-    // Runs of older versions have none.
-    let zoom = row.get("focal").map_or(Some(0.0), Value::as_f64)?;
+/// A row of the list.
+struct Correction<'a> {
+    camera: &'a str,
+    /// Number of its picture, of a camera that moves.
+    picture: Option<u64>,
+    twist: [f64; 6],
+    seconds: f64,
+    /// Share by which the focal length is longer.
+    zoom: f64,
+}
+
+fn correction(row: &Value) -> Option<Correction<'_>> {
     let twist: Vec<f64> = row["twist"].as_array()?.iter().filter_map(Value::as_f64).collect();
-    Some((row["camera"].as_str()?, row["frame"].as_u64(), twist.try_into().ok()?, row["offset"].as_f64()?, zoom))
+    Some(Correction {
+        camera: row["camera"].as_str()?,
+        picture: row["frame"].as_u64(),
+        twist: twist.try_into().ok()?,
+        seconds: row["offset"].as_f64()?,
+        // Runs of older versions have none.
+        zoom: row.get("focal").map_or(Some(0.0), Value::as_f64)?,
+    })
 }
 
 /// Moves the capture's cameras and clocks to where the run has learnt that they are: those of training, and held-out pictures
@@ -58,13 +73,13 @@ pub fn apply(capture: &mut Capture, run: &Path) -> Result<()> {
     let rows: Vec<_> = value["cameras"].as_array().into_iter().flatten().filter_map(correction).collect();
     for frame in &mut capture.frames {
         let camera = &capture.cameras[frame.camera].name;
-        let mut of_camera = rows.iter().filter(|row| row.0 == camera);
-        if let Some(row) = of_camera.clone().find(|row| row.1.is_none_or(|index| index == frame.index as u64)) {
-            frame.view.cam_from_world = moved(&frame.view.cam_from_world, row.2);
+        let mut of_camera = rows.iter().filter(|row| row.camera == camera);
+        if let Some(row) = of_camera.clone().find(|row| row.picture.is_none_or(|index| index == frame.index as u64)) {
+            frame.view.cam_from_world = moved(&frame.view.cam_from_world, row.twist);
         }
         if let Some(row) = of_camera.next() {
-            frame.time = Time(frame.time.0 + row.3);
-            frame.view.intrinsics = zoomed(&frame.view.intrinsics, row.4);
+            frame.time = Time(frame.time.0 + row.seconds);
+            frame.view.intrinsics = zoomed(&frame.view.intrinsics, row.zoom);
         }
     }
     Ok(())
