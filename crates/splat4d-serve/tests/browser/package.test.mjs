@@ -85,8 +85,6 @@ const OBJECT = `<canvas width="400" height="300"></canvas><script type="module">
     renderer.render(scene, camera);
     await take.settled();
     renderer.render(scene, camera);
-    await take.settled();
-    renderer.render(scene, camera);
     const copy = new OffscreenCanvas(400, 300), draw = copy.getContext('2d');
     draw.drawImage(renderer.domElement, 0, 0);
     return [...draw.getImageData(0, 0, 400, 300).data];
