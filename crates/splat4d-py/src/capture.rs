@@ -25,23 +25,25 @@ pub(crate) struct Capture {
     pub(crate) path: PathBuf,
     capture: Arc<capture::Capture>,
     store: ImageStore,
-    /// A temporary folder, which goes with the capture.
-    kept: Option<Py<PyAny>>,
+    _temporary: Option<Temporary>,
 }
 
-impl Drop for Capture {
+/// A temporary folder (Python's), removed with what is in it when this goes.
+struct Temporary(Py<PyAny>);
+
+impl Drop for Temporary {
     fn drop(&mut self) {
         // What cannot be removed the system clears away some day.
-        let _ = self.kept.take().map(|kept| Python::attach(|py| kept.call_method0(py, "cleanup").map(drop)));
+        let _ = Python::attach(|py| self.0.call_method0(py, "cleanup"));
     }
 }
 
 impl Capture {
-    fn open(py: Python<'_>, path: PathBuf, recipe: &Recipe, kept: Option<Py<PyAny>>) -> PyResult<Self> {
+    fn open(py: Python<'_>, path: PathBuf, recipe: &Recipe, temporary: Option<Temporary>) -> PyResult<Self> {
         let capture = Arc::new(py.detach(|| open_capture(&path, recipe)).or_raise()?);
         warn(py, &capture.warnings)?;
         let store = ImageStore::new(capture.clone(), STORE_BYTES);
-        Ok(Self { path, capture, store, kept })
+        Ok(Self { path, capture, store, _temporary: temporary })
     }
 
     fn load(&self, py: Python<'_>, i: isize) -> PyResult<capture::Picture> {
@@ -98,18 +100,16 @@ impl Capture {
         hold_out: Option<Vec<String>>,
         folder: Option<PathBuf>,
     ) -> PyResult<Self> {
-        let kept = match &folder {
-            Some(_) => None,
-            None => Some(py.import("tempfile")?.call_method0("TemporaryDirectory")?),
-        };
-        let folder = match (folder, &kept) {
-            (Some(folder), _) => folder,
-            (None, Some(kept)) => kept.getattr("name")?.extract()?,
-            (None, None) => unreachable!("there is a folder or a temporary one"),
+        let (folder, temporary) = match folder {
+            Some(folder) => (folder, None),
+            None => {
+                let made = py.import("tempfile")?.call_method0("TemporaryDirectory")?;
+                (made.getattr("name")?.extract()?, Some(Temporary(made.unbind())))
+            }
         };
         let arrays = Arrays { images, cameras, times, points, colors, names, fps, up, hold_out };
         write(py, &arrays, &folder)?;
-        Self::open(py, folder, &Recipe::default(), kept.map(Bound::unbind))
+        Self::open(py, folder, &Recipe::default(), temporary)
     }
 
     #[getter]

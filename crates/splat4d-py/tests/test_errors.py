@@ -33,7 +33,7 @@ class Errors(InFolder):
         with self.assertRaisesRegex(splat4d.Error, "ending") as caught:
             splat4d.open(PLAYABLE).export(self.folder / "out.nothing")
         self.assertEqual(caught.exception.kind, "unsupported")
-        self.refuses("no run", splat4d.Run, self.folder)
+        self.refuses("not a run", splat4d.Run, self.folder)
         self.assertEqual(list(self.folder.iterdir()), [broken])
 
     def test_numbers(self):
