@@ -16,8 +16,8 @@ for name, camera in scene.cameras:
     rr.log(f"cameras/{name}", lens, static=True)
 for t in np.arange(*scene.clip, 1 / scene.fps):
     now = scene.at(t)
-    colors = np.clip(0.5 + 0.28209479 * now.sh[:, 0], 0, 1)  # spherical harmonics of degree 0
     rr.set_time("time", duration=t)
+    colors = np.clip(0.5 + 0.28209479 * now.sh[:, 0], 0, 1)  # spherical harmonics of degree 0
+    rgba = np.column_stack([colors, now.opacities])
     turns = now.quats[:, [1, 2, 3, 0]]  # Rerun has xyzw
-    shapes = rr.Ellipsoids3D(centers=now.means, half_sizes=now.scales, quaternions=turns, colors=colors, fill_mode=3)
-    rr.log("gaussians", shapes)
+    rr.log("gaussians", rr.GaussianSplats3D(now.means, scales=now.scales, quaternions=turns, colors=rgba))
