@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::motion::{SpacetimeSpec, Spec, build_as};
+use crate::scene::SH;
 
 fn layer(spec: &Spec, life: LifeKind, rows: usize, seed: u64) -> Layer<f64> {
     let rng = Rng::new(seed, "layer", 0);
