@@ -1,6 +1,6 @@
 from collections.abc import Callable, Sequence
 from os import PathLike
-from typing import Any, Literal
+from typing import Any, Literal, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,9 +17,10 @@ __version__: str
 class Error(Exception):
     kind: Literal["bad_input", "io", "unsupported", "memory", "diverged", "interrupted", "failed"]
 
+@final
 class Camera:
-    def __init__(
-        self,
+    def __new__(
+        cls,
         width: int,
         height: int,
         fx: float,
@@ -27,8 +28,8 @@ class Camera:
         cx: float | None = None,
         cy: float | None = None,
         world_to_camera: ArrayLike | None = None,
-        near: float = 0.01,
-    ) -> None: ...
+        near: float = ...,
+    ) -> Camera: ...
     @staticmethod
     def look_at(
         position: ArrayLike,
@@ -38,7 +39,7 @@ class Camera:
         width: int = 800,
         height: int = 600,
         fov_y: float = 45.0,
-        near: float = 0.01,
+        near: float = ...,
     ) -> Camera: ...
     @property
     def width(self) -> int: ...
@@ -62,6 +63,7 @@ class Camera:
     def position(self) -> list[float]: ...
     def downscaled(self, k: int) -> Camera: ...
 
+@final
 class Gaussians:
     @property
     def time(self) -> float: ...
@@ -77,6 +79,7 @@ class Gaussians:
     def sh(self) -> _F32: ...
     def __len__(self) -> int: ...
 
+@final
 class Tracks:
     @property
     def times(self) -> _F64: ...
@@ -87,6 +90,7 @@ class Tracks:
     @property
     def rows(self) -> NDArray[np.uint32]: ...
 
+@final
 class Scene:
     @property
     def clip(self) -> tuple[float, float]: ...
@@ -113,6 +117,7 @@ class Scene:
     def export(self, path: _Path, t: float | None = None) -> None: ...
     def __len__(self) -> int: ...
 
+@final
 class Frame:
     number: int
     name: str
@@ -122,8 +127,9 @@ class Frame:
     split: Literal["train", "test", "val"]
     file: Any
 
+@final
 class Capture:
-    def __init__(self, path: _Path, **settings: Any) -> None: ...
+    def __new__(cls, path: _Path, **settings: Any) -> Capture: ...
     @classmethod
     def from_arrays(
         cls,
@@ -158,16 +164,18 @@ class Capture:
     def image(self, i: int) -> _F32: ...
     def mask(self, i: int) -> _F32 | None: ...
     def __len__(self) -> int: ...
-    def __getitem__(self, i: int) -> Frame: ...
+    def __getitem__(self, i: int, /) -> Frame: ...
 
+@final
 class View:
     time: float
     frame: int
     camera: int
     iteration: int
 
+@final
 class Run:
-    def __init__(self, path: _Path) -> None: ...
+    def __new__(cls, path: _Path) -> Run: ...
     @property
     def path(self) -> Any: ...
     @property
@@ -202,3 +210,4 @@ def resume(
     device: _Device = "cpu",
 ) -> Run: ...
 def command(*words: _Path) -> None: ...
+def main(words: Sequence[str]) -> int: ...
