@@ -225,6 +225,8 @@ export const SHOW_FRAGMENT = `#version 300 es
 precision highp float;
 uniform highp sampler2D sums;
 uniform vec3 background;
+// 1, or 0 where what lies behind is not ours to draw.
+uniform float opaque;
 uniform ivec2 origin;
 // Height of the picture where rows must be turned round, else 0.
 uniform int turned;
@@ -238,5 +240,5 @@ void main() {
   if (channel == ${CHANNELS.alpha}) rgb = vec3(sum.a);
   // Near is white, far black; black as well where little is drawn.
   if (channel == ${CHANNELS.depth}) rgb = sum.a < 0.5 ? vec3(0) : vec3(1.0 - sum.r / sum.a);
-  color = vec4(clamp(rgb, 0.0, 1.0), 1);
+  color = vec4(clamp(rgb, 0.0, 1.0), max(sum.a, opaque));
 }`;

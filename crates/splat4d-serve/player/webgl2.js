@@ -226,7 +226,7 @@ export class WebGL2Backend {
   }
 
   /// Draws with the newest order there is, and asks for a better one where time or camera moved. `target` {framebuffer,
-  /// x, y}: where the picture goes instead of the canvas (a headset's).
+  /// x, y}: where the picture goes instead of the canvas (a headset's). `background` null: nothing, premultiplied.
   draw({ time, view, channel = 'color', background = [0, 0, 0], depthRange = [0, 1], flowScale = 100, target = null }) {
     this.#last = {
       time: Math.min(Math.max(time, this.#clip[0]), this.#clip[1]),
@@ -491,7 +491,8 @@ export class WebGL2Backend {
     gl.bindVertexArray(this.#empty);
     gl.bindTexture(gl.TEXTURE_2D, this.#sums.texture);
     gl.uniform1i(at.sums, 0);
-    gl.uniform3f(at.background, background[0], background[1], background[2]);
+    gl.uniform3fv(at.background, background ?? [0, 0, 0]);
+    gl.uniform1f(at.opaque, background ? 1 : 0);
     gl.uniform2i(at.origin, x, y);
     gl.uniform1i(at.turned, turned);
     gl.uniform1i(at.channel, CHANNELS[channel]);
