@@ -128,6 +128,8 @@ export class Interface {
     on('waiting', () => this.#progress());
     on('statechange', () => this.#stateChanged());
     on('error', e => this.#error(e.detail.error));
+    on('leftout', e => this.quiet || this.toast(
+      `Too large for this device: the ${e.detail.gaussians.toLocaleString('en-GB')} least important Gaussians are left out`, 3 * TOAST));
     on('trouble', e => this.quiet || this.toast(e.detail.error.what ?? e.detail.error.message, 3 * TOAST));
     on('poster', e => this.setPoster(e.detail.blob));
     on('viewed', e => { this.toast(`Camera ${e.detail.number + 1} · ${e.detail.name ?? ''}`); this.refresh(); });
