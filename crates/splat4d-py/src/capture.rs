@@ -8,7 +8,7 @@ use crate::settings::set;
 use pyo3::exceptions::PyIndexError;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyType};
-use splat4d_train::capture::{self, ImageStore, Split};
+use splat4d_train::capture::{self, CaptureSettings, ImageStore, Split};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::open_capture;
 use std::path::PathBuf;
@@ -23,6 +23,8 @@ pub(crate) struct Capture {
     /// Its folder or marker file.
     #[pyo3(get)]
     pub(crate) path: PathBuf,
+    /// How it was opened; training on it begins with the same.
+    pub(crate) settings: CaptureSettings,
     capture: Arc<capture::Capture>,
     store: ImageStore,
     _temporary: Option<Temporary>,
@@ -43,7 +45,7 @@ impl Capture {
         let capture = Arc::new(py.detach(|| open_capture(&path, recipe)).or_raise()?);
         warn(py, &capture.warnings)?;
         let store = ImageStore::new(capture.clone(), STORE_BYTES);
-        Ok(Self { path, capture, store, _temporary: temporary })
+        Ok(Self { path, settings: recipe.capture.clone(), capture, store, _temporary: temporary })
     }
 
     fn load(&self, py: Python<'_>, i: isize) -> PyResult<capture::Picture> {

@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 use splat4d::{Error, Result, scene};
 use splat4d_train::capture::PointCloud;
 use splat4d_train::run::checkpoint::write_atomically;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Steps of a float picture in its file: 16 bits a sample, whose rounding is far below what cameras tell apart.
 const LEVELS: f32 = 65535.0;
@@ -35,8 +35,22 @@ struct Samples {
     kind: ExtendedColorType,
 }
 
-/// Writes the capture. Errors: shapes that do not fit each other, numbers that are none, a folder that holds one already.
+/// Writes the capture. Errors, which leave nothing behind: shapes that do not fit each other, numbers that are none, a folder
+/// that holds a capture already.
 pub(crate) fn write(py: Python<'_>, arrays: &Arrays<'_, '_>, folder: &Path) -> PyResult<()> {
+    let mut written = Vec::new();
+    let done = write_all(py, arrays, folder, &mut written);
+    if done.is_err() {
+        for path in &written {
+            let _ = std::fs::remove_file(path);
+            // Folders go when they are empty; those of the user are not.
+            path.ancestors().skip(1).take_while(|f| *f != folder).for_each(|f| drop(std::fs::remove_dir(f)));
+        }
+    }
+    done
+}
+
+fn write_all(py: Python<'_>, arrays: &Arrays<'_, '_>, folder: &Path, written: &mut Vec<PathBuf>) -> PyResult<()> {
     if folder.join("capture.json").exists() {
         let what = format!("{} holds a capture already", folder.display());
         return Err(bad_input(what, "Open it with Capture(path), or give another folder"));
@@ -64,7 +78,8 @@ pub(crate) fn write(py: Python<'_>, arrays: &Arrays<'_, '_>, folder: &Path) -> P
     }
     let mut entries = Vec::new();
     for (c, name) in names.iter().enumerate() {
-        entries.push(camera(py, arrays, folder, c, name, &of_cameras[c], &of_images[c])?);
+        let camera = Filmed { folder, number: c, name, cameras: &of_cameras[c], images: &of_images[c] };
+        entries.push(camera.write(py, arrays, written)?);
     }
     let mut top = json!({"version": 1, "cameras": entries});
     if let Some(fps) = arrays.fps {
@@ -78,76 +93,79 @@ pub(crate) fn write(py: Python<'_>, arrays: &Arrays<'_, '_>, folder: &Path) -> P
     }
     if let Some(points) = arrays.points {
         let cloud = cloud(points, arrays.colors)?;
-        write_atomically(&folder.join("points.ply"), &cloud.to_ply("comment from arrays")).or_raise()?;
+        let path = folder.join("points.ply");
+        write_atomically(&path, &cloud.to_ply("comment from arrays")).or_raise()?;
+        written.push(path);
         top["points"] = json!("points.ply");
     }
     write_atomically(&folder.join("capture.json"), format!("{top:#}\n").as_bytes()).or_raise()
 }
 
-/// Writes one camera's pictures; its entry.
-fn camera(
-    py: Python<'_>,
-    arrays: &Arrays<'_, '_>,
-    folder: &Path,
+/// One camera as the caller gave it.
+struct Filmed<'a, 'py> {
+    folder: &'a Path,
     number: usize,
-    name: &str,
-    cameras: &Bound<'_, PyAny>,
-    images: &Bound<'_, PyAny>,
-) -> PyResult<Value> {
-    let images = items(images, &format!("images[{number}]"))?;
-    let moving = !cameras.is_instance_of::<Camera>();
-    let views: Vec<Camera> = match moving {
-        false => vec![cameras.extract::<Camera>()?],
-        true => items(cameras, &format!("cameras[{number}]"))?
-            .iter()
-            .map(|c| {
-                c.extract::<Camera>().map_err(|_| {
-                    bad_input(
-                        format!("cameras[{number}] holds something that is no Camera"),
-                        "Give splat4d.Camera objects",
-                    )
-                })
-            })
-            .collect::<PyResult<_>>()?,
-    };
-    let Some(first) = views.first().filter(|_| !images.is_empty()) else {
-        return Err(bad_input(format!("camera {name} has no images"), "Leave it out"));
-    };
-    if moving && views.len() != images.len() {
-        let what = format!("camera {name} has {} poses for {} images", views.len(), images.len());
-        return Err(bad_input(what, "Give one Camera a frame, or one for all"));
+    name: &'a str,
+    cameras: &'a Bound<'py, PyAny>,
+    images: &'a Bound<'py, PyAny>,
+}
+
+impl Filmed<'_, '_> {
+    /// Its places: one, or one a frame.
+    fn views(&self) -> PyResult<Vec<Camera>> {
+        if let Ok(fixed) = self.cameras.extract::<Camera>() {
+            return Ok(vec![fixed]);
+        }
+        let what = format!("cameras[{}]", self.number);
+        let one = |camera: &Bound<'_, PyAny>| {
+            let wrong =
+                || bad_input(format!("{what} holds something that is no Camera"), "Give splat4d.Camera objects");
+            camera.extract::<Camera>().map_err(|_| wrong())
+        };
+        items(self.cameras, &what)?.iter().map(one).collect()
     }
-    let first = &first.0;
-    if views
-        .iter()
-        .any(|v| v.0.intrinsics != first.intrinsics || (v.0.width, v.0.height) != (first.width, first.height))
-    {
-        return Err(bad_input(format!("the lens or size of camera {name} changes"), "Make two cameras of it"));
+
+    /// Writes its pictures; its entry.
+    fn write(&self, py: Python<'_>, arrays: &Arrays<'_, '_>, written: &mut Vec<PathBuf>) -> PyResult<Value> {
+        let Self { folder, number, name, .. } = *self;
+        let (images, views) = (items(self.images, &format!("images[{number}]"))?, self.views()?);
+        let moving = !self.cameras.is_instance_of::<Camera>();
+        let Some(Camera(first)) = views.first().filter(|_| !images.is_empty()) else {
+            return Err(bad_input(format!("camera {name} has no images"), "Leave it out"));
+        };
+        if moving && views.len() != images.len() {
+            let what = format!("camera {name} has {} poses for {} images", views.len(), images.len());
+            return Err(bad_input(what, "Give one Camera a frame, or one for all"));
+        }
+        let lens = |c: &scene::Camera| (c.intrinsics, c.width, c.height);
+        if views.iter().any(|v| lens(&v.0) != lens(first)) {
+            return Err(bad_input(format!("the lens or size of camera {name} changes"), "Make two cameras of it"));
+        }
+        let times = times(arrays.times, number, images.len(), arrays.fps)?;
+        let files: Vec<String> = (0..images.len()).map(|k| format!("images/{name}/{k:06}.png")).collect();
+        for (k, image) in images.iter().enumerate() {
+            let samples = samples(image, &format!("images[{number}][{k}]"), first)?;
+            let path = folder.join(&files[k]);
+            py.detach(|| store(&samples, first, &path)).or_raise()?;
+            written.push(path);
+        }
+        let pose = |c: &scene::Camera| {
+            let (r, t) = (c.cam_from_world.rotation, c.cam_from_world.translation);
+            let row = |i: usize| if i < 3 { [r[i][0], r[i][1], r[i][2], t[i]] } else { [0.0, 0.0, 0.0, 1.0] };
+            [0, 1, 2, 3].map(row)
+        };
+        let poses: Vec<_> = views.iter().map(|v| pose(&v.0)).collect();
+        let k = &first.intrinsics;
+        let mut entry = json!({
+            "name": name, "width": first.width, "height": first.height,
+            "fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy, "images": files,
+            "world_to_camera": if moving { json!(poses) } else { json!(poses[0]) },
+        });
+        if let Some(times) = times {
+            entry["times"] = json!(times);
+        }
+        Ok(entry)
     }
-    let times = times(arrays.times, number, images.len(), arrays.fps)?;
-    let files: Vec<String> = (0..images.len()).map(|k| format!("images/{name}/{k:06}.png")).collect();
-    for (k, image) in images.iter().enumerate() {
-        let what = format!("images[{number}][{k}]");
-        let samples = samples(image, &what, first)?;
-        let path = folder.join(&files[k]);
-        py.detach(|| store(&samples, first, &path)).or_raise()?;
-    }
-    let pose = |c: &scene::Camera| {
-        let (r, t) = (c.cam_from_world.rotation, c.cam_from_world.translation);
-        let mut rows: Vec<[f64; 4]> = (0..3).map(|i| [r[i][0], r[i][1], r[i][2], t[i]]).collect();
-        rows.push([0.0, 0.0, 0.0, 1.0]);
-        rows
-    };
-    let poses = if moving { json!(views.iter().map(|v| pose(&v.0)).collect::<Vec<_>>()) } else { json!(pose(first)) };
-    let k = &first.intrinsics;
-    let mut entry = json!({
-        "name": name, "width": first.width, "height": first.height,
-        "fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy, "world_to_camera": poses, "images": files,
-    });
-    if let Some(times) = times {
-        entry["times"] = json!(times);
-    }
-    Ok(entry)
 }
 
 /// The elements of a list, a tuple or an array's first axis.

@@ -38,11 +38,14 @@ pub(crate) fn train(
     device: &str,
     settings: Option<&Bound<'_, PyDict>>,
 ) -> PyResult<Run> {
+    let mut recipe = Recipe::default().with(|r| r.run.motion = MotionName::AUTO);
     let path = match capture.cast::<Capture>() {
-        Ok(capture) => capture.get().path.clone(),
+        Ok(capture) => {
+            recipe.capture = capture.get().settings.clone();
+            capture.get().path.clone()
+        }
         Err(_) => capture.extract::<PathBuf>()?,
     };
-    let mut recipe = Recipe::default().with(|r| r.run.motion = MotionName::AUTO);
     if let Some(quality) = quality {
         recipe = recipe.of_quality(quality.parse::<Quality>().or_raise()?);
     }

@@ -36,6 +36,15 @@ class Training(InFolder):
         self.assertEqual(scores["PSNR"], run.results["PSNR"])
         self.assertGreater(scores["PSNR"], 10)
 
+    def test_a_capture_is_trained_as_it_was_opened_unless_told(self):
+        capture = splat4d.Capture(KNIGHT, downscale=8, hold_out="camera=0")
+        few = dict(iterations=50, max_frames=2, motion="still")
+        recipe = lambda run: (run.path / "recipe.toml").read_text()
+        same = splat4d.train(capture, self.folder / "same", **few)
+        self.assertRegex(recipe(same), r"downscale = 8\n(.*\n)*hold_out = \"camera=0\"|hold_out = .*\n(.*\n)*downscale = 8")
+        other = splat4d.train(capture, self.folder / "other", downscale=16, **few)
+        self.assertIn("downscale = 16", recipe(other))
+
     def test_an_interruption_saves_and_the_rest_is_the_same(self):
         whole = self.train("whole")
         steps = []
