@@ -66,7 +66,7 @@ pub struct Gaussians {
     pub quats: Vec<[f32; 4]>,
     /// [N, 3] standard deviations along the axes, scene units.
     pub scales: Vec<[f32; 3]>,
-    /// [N] in (0, 1), life applied.
+    /// `[N]` in (0, 1), life applied.
     pub opacities: Vec<f32>,
 }
 
