@@ -12,6 +12,7 @@ mod metrics;
 mod picture;
 mod raster;
 mod scene;
+mod site;
 mod skin;
 mod still;
 mod strip;
@@ -37,6 +38,7 @@ chores:
                              for `splat4d import`, and truth.json beside them
   strip-character IN.glb OUT.glb CLIP... [--drop NODE...]
                              keeps the named animation clips of a character, drops the named nodes' meshes
+  site OUT [--no-api]        makes the static site in OUT: documents, API, a gallery that plays the example scenes
   count [FOLDER]             counts lines of code, without tests, comments and blank lines, of the repository FOLDER";
 
 fn main() -> ExitCode {
@@ -55,6 +57,7 @@ fn run(arguments: &[String]) -> Result<()> {
     match chore.as_str() {
         "capture" => capture::command(rest),
         "count" => count::command(rest),
+        "site" => site::command(rest),
         "strip-character" => strip_character(rest),
         _ => bail!("unknown chore {chore}\n{USAGE}"),
     }

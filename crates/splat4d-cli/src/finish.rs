@@ -52,7 +52,7 @@ pub(crate) fn steps(capture: &Capture, only_playback: bool) -> f64 {
 
 /// Options of measuring.
 #[derive(Debug, Default, clap::Args)]
-pub(crate) struct Measure {
+pub struct Measure {
     /// Weights (safetensors) for LPIPS; without them it is not computed
     #[arg(long, value_name = "FILE", help_heading = "What is measured")]
     pub lpips_weights: Option<PathBuf>,
@@ -118,7 +118,7 @@ pub fn playback(run: &Path, console: &Console) -> Result<()> {
 }
 
 /// Renders and scores the held-out views.
-pub(crate) fn scores(run: &Path, scene: &Scene<f32>, measure: &Measure, console: &Console) -> anyhow::Result<Scores> {
+pub fn scores(run: &Path, scene: &Scene<f32>, measure: &Measure, console: &Console) -> anyhow::Result<Scores> {
     let opened = Run::open(run)?;
     let (mut capture, recipe) = opened.open_capture()?;
     corrected::apply(&mut capture, run)?;

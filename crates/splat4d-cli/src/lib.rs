@@ -1,7 +1,8 @@
 //! The `splat4d` command: posed, moving captures become trained, measured and rendered 4D scenes on a plain CPU.
 //!
 //! Each verb is a file in `verbs`. Only the shells print, parse arguments or exit: 0 done, 1 failed, 2 bad input. A library
-//! for the sake of the workspace's studies, which share the console, run folders and measurements: no published interface.
+//! for the sake of the workspace's studies and of the Python package, which share the console, run folders and measurements:
+//! no published interface.
 
 #![allow(missing_docs)] // nobody outside the workspace reads it
 
@@ -19,7 +20,7 @@ pub mod paths;
 mod playable;
 pub mod report;
 pub mod run_folder;
-mod sequence;
+pub mod sequence;
 mod serving;
 pub mod source;
 pub mod verbs;
@@ -28,8 +29,11 @@ mod video;
 use clap::{Parser, Subcommand};
 use console::{Console, Loudness};
 use splat4d::{Error, ErrorKind};
+use std::ffi::OsString;
 use std::process::ExitCode;
 
+/// Exit code of work that was done.
+const DONE: u8 = 0;
 /// Exit code of work that failed.
 const FAILED: u8 = 1;
 /// Exit code of bad input: the user's files or options.
@@ -99,26 +103,47 @@ enum Verb {
     Completions(verbs::completions::Args),
 }
 
-/// The command: parses the arguments, runs the verb and says how it went.
+impl Verb {
+    fn run(&self, threads: Option<u16>, console: &Console) -> anyhow::Result<()> {
+        match self {
+            Verb::Import(args) => verbs::import::run(args, console),
+            Verb::Train(args) => verbs::train::run(args, console),
+            Verb::Eval(args) => verbs::eval::run(args, console),
+            Verb::Render(args) => verbs::render::run(args, console),
+            Verb::Localise(args) => verbs::localise::run(args, console),
+            Verb::Bake(args) => verbs::bake::run(args, console),
+            Verb::Compress(args) => verbs::compress::run(args, console),
+            Verb::Export(args) => verbs::export::run(args, console),
+            Verb::View(args) => verbs::view::run(args, console),
+            Verb::Convert(args) => verbs::convert::run(args, console),
+            Verb::Info(args) => verbs::info::run(args, console),
+            Verb::Bench(args) => verbs::bench::run(args, threads, console),
+            Verb::Completions(args) => verbs::completions::run(args, console),
+        }
+    }
+}
+
+/// The command: parses the program's arguments, runs the verb and says how it went.
 pub fn main() -> ExitCode {
-    parsed(|cli: Cli| {
+    main_from(std::env::args_os()).into()
+}
+
+/// The command with these words, of which the first is its name; the exit code.
+pub fn main_from(words: impl IntoIterator<Item = OsString>) -> u8 {
+    parsed_from(words, |cli: Cli| {
         let threads = cli.globals.threads;
-        (cli.globals, move |console: &Console| match cli.verb {
-            Verb::Import(args) => verbs::import::run(&args, console),
-            Verb::Train(args) => verbs::train::run(&args, console),
-            Verb::Eval(args) => verbs::eval::run(&args, console),
-            Verb::Render(args) => verbs::render::run(&args, console),
-            Verb::Localise(args) => verbs::localise::run(&args, console),
-            Verb::Bake(args) => verbs::bake::run(&args, console),
-            Verb::Compress(args) => verbs::compress::run(&args, console),
-            Verb::Export(args) => verbs::export::run(&args, console),
-            Verb::View(args) => verbs::view::run(&args, console),
-            Verb::Convert(args) => verbs::convert::run(&args, console),
-            Verb::Info(args) => verbs::info::run(&args, console),
-            Verb::Bench(args) => verbs::bench::run(&args, threads, console),
-            Verb::Completions(args) => verbs::completions::run(&args, console),
-        })
+        (cli.globals, move |console: &Console| cli.verb.run(threads, console))
     })
+}
+
+/// One verb with its options, for another program: says nothing but warnings, and returns errors.
+pub fn call(words: &[OsString]) -> anyhow::Result<()> {
+    let name = OsString::from("splat4d");
+    let cli = Cli::try_parse_from(std::iter::once(&name).chain(words)).map_err(|e| {
+        let text = e.to_string();
+        Error::input(text.trim_start_matches("error: ").trim_end().to_owned())
+    })?;
+    cli.verb.run(None, &Console::new(Loudness::Quiet, false))
 }
 
 /// Parses the arguments of a program with the command's manners, does what `work` makes of them, and tells errors.
@@ -127,11 +152,19 @@ where
     C: Parser,
     W: FnOnce(&Console) -> anyhow::Result<()>,
 {
-    let (globals, work) = match C::try_parse() {
+    parsed_from(std::env::args_os(), work).into()
+}
+
+fn parsed_from<C, W>(words: impl IntoIterator<Item = OsString>, work: impl FnOnce(C) -> (Globals, W)) -> u8
+where
+    C: Parser,
+    W: FnOnce(&Console) -> anyhow::Result<()>,
+{
+    let (globals, work) = match C::try_parse_from(words) {
         Ok(cli) => work(cli),
         Err(error) => {
             let _ = error.print();
-            return if error.use_stderr() { BAD_INPUT.into() } else { ExitCode::SUCCESS };
+            return if error.use_stderr() { BAD_INPUT } else { DONE };
         }
     };
     let loudness = match (globals.quiet, globals.verbose) {
@@ -141,11 +174,11 @@ where
     };
     let console = Console::new(loudness, globals.json);
     match threads(globals.threads).and_then(|()| work(&console)) {
-        Ok(()) => ExitCode::SUCCESS,
+        Ok(()) => DONE,
         Err(error) => {
             let code = exit_code(&error);
             console.error(&told(&error), code);
-            code.into()
+            code
         }
     }
 }
@@ -161,7 +194,7 @@ fn threads(count: Option<u16>) -> anyhow::Result<()> {
 }
 
 /// The error and its causes, but no cause whose words were said already.
-fn told(error: &anyhow::Error) -> String {
+pub fn told(error: &anyhow::Error) -> String {
     error.chain().map(ToString::to_string).fold(String::new(), |mut said, cause| {
         if said.is_empty() {
             said = cause;

@@ -9,6 +9,7 @@ use splat4d::scene::{Camera, Intrinsics, Lens};
 use splat4d::{Error, Result};
 use splat4d_train::capture::{Capture, Split};
 use splat4d_train::recipe::Recipe;
+use splat4d_train::run::checkpoint;
 use std::path::{Path, PathBuf};
 
 /// Files that mark a folder as a run.
@@ -99,7 +100,7 @@ pub struct Run {
 
 impl Run {
     /// Whether this folder is a run.
-    pub(crate) fn is(path: &Path) -> bool {
+    pub fn is(path: &Path) -> bool {
         path.is_dir() && MARKERS.iter().any(|m| path.join(m).exists())
     }
 
@@ -250,7 +251,7 @@ impl Run {
         if scene.is_file() {
             return Ok(scene);
         }
-        splat4d_train::run::checkpoint::list(&self.path).pop().ok_or_else(|| {
+        checkpoint::list(&self.path).pop().ok_or_else(|| {
             Error::input("the run holds no scene and no checkpoint yet")
                 .at(self.path.display())
                 .remedy("Let it train, or continue it with `splat4d train --resume`.")
@@ -303,7 +304,7 @@ pub(crate) fn views_of(capture: &Capture) -> Vec<View> {
 }
 
 /// `cameras.json` as 3DGS viewers read it (camera-to-world position and rotation), with a few keys more.
-pub(crate) fn cameras_json(capture: &Capture) -> Value {
+pub fn cameras_json(capture: &Capture) -> Value {
     views_of(capture).iter().enumerate().map(|(id, view)| view_json(id, view)).collect()
 }
 
@@ -347,8 +348,44 @@ fn read_view(value: &Value) -> Option<View> {
     })
 }
 
+/// Where a run of the capture with this name goes unless told.
+pub fn usual_folder(capture: &str) -> PathBuf {
+    let name: String =
+        capture.chars().map(|c| if c.is_alphanumeric() || "-_.".contains(c) { c } else { '-' }).collect();
+    let name = name.trim_matches(['.', '-']);
+    Path::new("runs").join(if name.is_empty() { "run" } else { name })
+}
+
+/// Refuses a folder that holds anything, because a run would mix with it.
+pub fn check_unused(run: &Path) -> Result<()> {
+    if !std::fs::read_dir(run).is_ok_and(|mut d| d.next().is_some()) {
+        return Ok(());
+    }
+    let error = if Run::is(run) {
+        let what = if Run::is_finished(run) { "a finished run" } else { "an unfinished run" };
+        Error::input(format!("holds {what} already")).remedy(format!(
+            "Continue it with --resume {}, replace it with --force, or choose another folder with -o.",
+            run.display()
+        ))
+    } else {
+        Error::input("is not empty and is no run").remedy("Choose another folder with -o.")
+    };
+    Err(error.at(run.display()))
+}
+
+/// Removes a run that failed before its first checkpoint after the start: there is nothing in it to continue.
+pub fn clear_unbegun(run: &Path) -> Result<()> {
+    let begun = checkpoint::list(run).iter().any(|path| *path != checkpoint::path(run, 0));
+    if !begun {
+        clear(run)?;
+        // Fails where the user keeps files of their own there, as it should.
+        let _ = std::fs::remove_dir(run);
+    }
+    Ok(())
+}
+
 /// Where a new run goes: the wanted folder, or with a number behind it if that is taken.
-pub(crate) fn free_folder(wanted: &Path) -> PathBuf {
+pub fn free_folder(wanted: &Path) -> PathBuf {
     let taken = |p: &Path| p.is_file() || std::fs::read_dir(p).is_ok_and(|mut d| d.next().is_some());
     if !taken(wanted) {
         return wanted.to_owned();

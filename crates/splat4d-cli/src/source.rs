@@ -34,7 +34,7 @@ const SOG_LEVELS: &str = "lod-meta.json";
 const UNREAD: [&str; 5] = ["ksplat", "glb", "gltf", "4dgs", "usdz"];
 
 /// A scene and where it came from.
-pub(crate) struct Source {
+pub struct Source {
     pub scene: Scene<f32>,
     /// The run, where it is one.
     pub run: Option<Run>,
@@ -50,12 +50,12 @@ pub(crate) struct Source {
 
 impl Source {
     /// Opens a run, a file or a sequence.
-    pub(crate) fn open(path: &Path) -> Result<Self> {
+    pub fn open(path: &Path) -> Result<Self> {
         Self::open_at(path, DEFAULT_FPS)
     }
 
     /// The same; a sequence of files has `fps` a second.
-    pub(crate) fn open_at(path: &Path, fps: f64) -> Result<Self> {
+    pub fn open_at(path: &Path, fps: f64) -> Result<Self> {
         if !path.exists() && sequence::Pattern::of(path).is_some() {
             return open_sequence(path, fps);
         }
@@ -100,7 +100,7 @@ impl Source {
     }
 
     /// The data set's cameras; those that a playback file brings along; empty for other bare files.
-    pub(crate) fn views(&self) -> Result<Vec<View>> {
+    pub fn views(&self) -> Result<Vec<View>> {
         if let Some(index) = &self.playback {
             let time = index.meta.clip[0];
             let fits = |c: &Camera| c.width.max(c.height) <= crate::camera_file::MAX_SIDE;

@@ -57,8 +57,10 @@ export class Splat4D extends HTMLElement {
     });
     for (const name of OBSERVED) if (name !== 'src') this.#apply(name, this.getAttribute(name));
     // What few pages need is fetched when it is needed.
-    ui.xr = () => import('./xr.js').then(m => m.enter(player)).catch(error => ui.toast(error.message));
-    navigator.xr?.isSessionSupported('immersive-vr').then(yes => { ui.xrTool.hidden = !yes; }, () => {});
+    ui.xr = mode => import('./xr.js').then(m => m.enter(player, mode)).catch(error => ui.toast(error.message));
+    for (const [mode, tool] of [['immersive-vr', ui.xrTool], ['immersive-ar', ui.arTool]]) {
+      navigator.xr?.isSessionSupported(mode).then(yes => { tool.hidden = !yes; }, () => {});
+    }
     if (this.hasAttribute('page')) {
       addEventListener('hashchange', this.#hash);
       // While the page still asks what to show. A failure is told when there is a scene to be drawn.

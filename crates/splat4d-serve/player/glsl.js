@@ -13,7 +13,7 @@ export const ORDER_WIDTH = 1024;
 ///
 /// Culls: outside its span, z ≤ near, opacity·σ < 1/255, determinant ≤ 0, nothing in the picture.
 /// Constants: low-pass 0.3 px² and α ≥ 1/255 of Kerbl et al. 2023, τ margin of project.rs.
-const SPLAT = `#version 300 es
+export const SPLAT = `#version 300 es
 precision highp float; precision highp int;
 precision highp sampler2D; precision highp usampler2D;
 uniform usampler2D words, palette, order;
@@ -25,8 +25,8 @@ uniform float time, near, flow_scale;
 uniform int channel, count;
 
 // conic xx xy yy and opacity; centre and half of the long axis of the ellipse α = 1/255, px; colour, and the short axis
-// as a share of the long one.
-struct Splat { vec4 shape, place, tint; };
+// as a share of the long one; z in camera axes.
+struct Splat { vec4 shape, place, tint; float depth; };
 
 const float LOW_PASS = 0.3, ALPHA_MIN = 1.0 / 255.0, TAU_MARGIN = 1e-3;
 // Only an order that is older than this picture can hold pages outside their span: s.
@@ -72,7 +72,7 @@ vec3 flow_color(vec2 velocity) {
 
 // The splat at a place of the order; a long axis of 0: nothing to draw.
 Splat splat(ivec2 texel) {
-  Splat none = Splat(vec4(0), vec4(0), vec4(0));
+  Splat none = Splat(vec4(0), vec4(0), vec4(0), 0.0);
   if (texel.y * ${ORDER_WIDTH} + texel.x >= count) return none;
   uint id = texelFetch(order, texel, 0).r;
   int row = int(id >> 10), column = int(id & 1023u), b = (column >> 8) * BLOCK_TEXELS;
@@ -147,7 +147,7 @@ Splat splat(ivec2 texel) {
   vec2 along = xx > yy ? vec2(most_px - yy, sxy) : vec2(sxy, most_px - xx);
   float norm = length(along);
   vec2 axis = (norm > 0.0 ? along / norm : vec2(1, 0)) * sqrt(tau * most_px);
-  return Splat(vec4(yy / det, -sxy / det, xx / det, opacity), vec4(middle, axis), vec4(tint, share_px));
+  return Splat(vec4(yy / det, -sxy / det, xx / det, opacity), vec4(middle, axis), vec4(tint, share_px), c.z);
 }
 `;
 
@@ -225,6 +225,8 @@ export const SHOW_FRAGMENT = `#version 300 es
 precision highp float;
 uniform highp sampler2D sums;
 uniform vec3 background;
+// 1, or 0 where what lies behind is not ours to draw.
+uniform float opaque;
 uniform ivec2 origin;
 // Height of the picture where rows must be turned round, else 0.
 uniform int turned;
@@ -238,5 +240,5 @@ void main() {
   if (channel == ${CHANNELS.alpha}) rgb = vec3(sum.a);
   // Near is white, far black; black as well where little is drawn.
   if (channel == ${CHANNELS.depth}) rgb = sum.a < 0.5 ? vec3(0) : vec3(1.0 - sum.r / sum.a);
-  color = vec4(clamp(rgb, 0.0, 1.0), 1);
+  color = vec4(clamp(rgb, 0.0, 1.0), max(sum.a, opaque));
 }`;

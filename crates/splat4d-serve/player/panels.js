@@ -149,7 +149,7 @@ export function figuresCard(player) {
       ['Sorting', s.sortMs ? `${s.sortMs.toFixed(1)} ms` : '–'],
       ['Picture', `${s.width} × ${s.height}`], ['Scale', `${Math.round(100 * s.scale)} %`],
       ['Drawn', count(s.drawn)], ['Active', count(s.active)], ['Resident', count(s.resident)],
-      ['Gaussians', count(s.gaussians)], ['Read', `${bytes(s.bytesRead)} of ${bytes(s.bytesTotal)}`],
+      ...(s.leftOut ? [['Left out', count(s.leftOut)]] : []), ['Gaussians', count(s.gaussians)], ['Read', `${bytes(s.bytesRead)} of ${bytes(s.bytesTotal)}`],
       ['First picture', s.firstFrame ? `${s.firstFrame.toFixed(0)} ms` : '–'],
       ['Drawn with', s.backend === 'webgpu' ? 'WebGPU' : s.backend === 'webgl2' ? 'WebGL2' : s.backend ?? '–'],
     ];

@@ -201,6 +201,7 @@ export class Player extends EventTarget {
       ...budget,
       onchange: () => { this.redraw(); this.#bufferAt = 0; },
       onerror: error => this.#pageFailed(error),
+      onleft: gaussians => this.emit('leftout', { gaussians }),
     });
   }
 
@@ -638,7 +639,7 @@ export class Player extends EventTarget {
       ...this.figures, fps, frameMs, atRest: performance.now() - this.#dirtyAt > 1000, ...this.backend?.stats,
       backend: this.backend?.name ?? null, width, height, scale: this.scale,
       gaussians: this.meta?.gaussians ?? 0, ready: this.ready(this.time),
-      bytesRead: this.file?.bytesRead ?? 0, bytesTotal: this.file?.bytesTotal ?? 0,
+      leftOut: this.#stream?.left ?? 0, bytesRead: this.file?.bytesRead ?? 0, bytesTotal: this.file?.bytesTotal ?? 0,
     };
   }
 

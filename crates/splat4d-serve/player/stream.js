@@ -34,6 +34,7 @@ export class Stream {
   #budget;
   #onchange;
   #onerror;
+  #onleft;
   #resident = new Set();
   /// Those of them whose key masks are in the backend.
   #masked = new Set();
@@ -59,13 +60,15 @@ export class Stream {
   #ends;
 
   /// `file`: SceneFile. `backend`: of PLAYER's interface; it owns the arrays it is given. `budget`: bytes of words.
-  /// `onchange()` after each page that came or went, `onerror(SceneError)` for a page that is given up for now.
-  constructor(file, backend, { budget = defaultBudget(), onchange, onerror } = {}) {
+  /// `onchange()` after each page that came or went, `onerror(SceneError)` for a page that is given up for now,
+  /// `onleft(Gaussians)` when a moment first does not fit into the budget.
+  constructor(file, backend, { budget = defaultBudget(), onchange, onerror, onleft } = {}) {
     this.#file = file;
     this.#backend = backend;
     this.#budget = Math.min(budget, backend.capacity ?? Infinity);
     this.#onchange = onchange ?? (() => {});
     this.#onerror = onerror ?? (() => {});
+    this.#onleft = onleft ?? (() => {});
     this.#starts = Float64Array.from(file.pages, (p) => p.from).sort();
     this.#ends = Float64Array.from(file.pages, (p) => p.to).sort();
   }
@@ -74,6 +77,9 @@ export class Stream {
   get bytes() {
     return this.#bytes;
   }
+
+  /// Gaussians of this moment that the budget has no room for: those of the last tiers.
+  left = 0;
 
   /// Pages on their way.
   get loading() {
@@ -159,6 +165,10 @@ export class Stream {
     let room = this.#budget;
     const fits = (page) => (cost(page) <= room ? ((room -= cost(page)), true) : false);
     this.#now = now.filter(fits);
+    const sum = (pages) => pages.reduce((n, page) => n + page.count, 0),
+      left = sum(now) - sum(this.#now);
+    if (left && !this.left) this.#onleft(left);
+    this.left = left;
     // What is later may not push out more of itself than the budget has left.
     this.#later = later.filter(fits);
     const wanted = new Set([...this.#now, ...this.#later].map((p) => p.id));

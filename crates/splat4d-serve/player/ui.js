@@ -56,14 +56,15 @@ export class Interface {
       view: opener('view', 'View and settings', 'view'),
     };
     this.full = tool('full', 'Full screen', () => this.fullscreen());
-    this.xrTool = tool('headset', 'Look through the headset', () => this.enterXr(), { hidden: true });
+    this.xrTool = tool('headset', 'Look through the headset', () => this.xr?.('immersive-vr'), { hidden: true });
+    this.arTool = tool('room', 'Stand it in your room; tap the floor to move it', () => this.xr?.('immersive-ar'), { hidden: true });
     this.helpTool = tool('help', 'Keys and gestures', () => this.toggleHelp(), { class: 'tool wide' });
     this.#scrub();
     const spare = this.embed ? [] : [this.channel, this.openers.cameras, this.openers.view, this.helpTool];
     const steps = this.embed ? [] : [this.back, this.next];
     this.bar = h('div', { class: 'card bar', role: 'toolbar', 'aria-label': 'Playback' }, this.scrub,
       h('div', { class: 'row' }, this.play, ...steps, this.timeLabel, h('div', { class: 'space' }),
-        this.embed ? null : this.loopTool, this.embed ? null : this.speed, ...spare, this.xrTool, this.full));
+        this.embed ? null : this.loopTool, this.embed ? null : this.speed, ...spare, this.xrTool, this.arTool, this.full));
     this.panels = { cameras: cameraPanel(this), view: viewPanel(this) };
     this.dock = h('div', { class: 'dock' }, this.panels.cameras, this.panels.view, this.bar);
     this.title = h('div', { class: 'card title', hidden: true });
@@ -127,6 +128,8 @@ export class Interface {
     on('waiting', () => this.#progress());
     on('statechange', () => this.#stateChanged());
     on('error', e => this.#error(e.detail.error));
+    on('leftout', e => this.quiet || this.toast(
+      `Too large for this device: the ${e.detail.gaussians.toLocaleString('en-GB')} least important Gaussians are left out`, 3 * TOAST));
     on('trouble', e => this.quiet || this.toast(e.detail.error.what ?? e.detail.error.message, 3 * TOAST));
     on('poster', e => this.setPoster(e.detail.blob));
     on('viewed', e => { this.toast(`Camera ${e.detail.number + 1} · ${e.detail.name ?? ''}`); this.refresh(); });
@@ -419,8 +422,6 @@ export class Interface {
     } catch (error) { this.toast(`${file.name}: ${error.message}`, 4 * TOAST); }
     this.refresh();
   }
-
-  enterXr() { this.xr?.(); }
 
   // Files dropped on the page.
 

@@ -5,7 +5,6 @@ import { SceneError } from './errors.js';
 import { Rows, Timer, check, program, texture } from './gl.js';
 import {
   BATCH,
-  BLOCK_TEXELS,
   CHANNELS,
   DIRECT_VERTEX,
   DRAW_FRAGMENT,
@@ -17,21 +16,12 @@ import {
 } from './glsl.js';
 import { Order } from './order.js';
 import './sort.worker.js';
+import { BLOCKS_WIDTH, J_MARGIN, WIDTH, blockTexels, corners, paletteTexels } from './texels.js';
 
 const { ROW } = globalThis.splat4dSort;
 
-/// Texels across the words' and the palettes' textures: every WebGL2 device has them (its minimum for a texture).
-const WIDTH = 2048;
-/// Gaussians a block, blocks a row, f32 numbers of a header (docs/format.md).
-const BLOCK = 256,
-  BLOCKS = ROW / BLOCK,
-  HEADER = 24;
-/// Header numbers that are times on the scene clock: life centre min and max, alive from and to.
-const TIMES = [6, 7, 8, 9];
 /// Rows of the words' texture to begin with: 2 MiB each 64.
 const FIRST_ROWS = 256;
-/// x/z and y/z inside J may leave the picture by this share of its half-width's tangent (CONVENTIONS.md).
-const J_MARGIN = 0.3;
 
 export class WebGL2Backend {
   /// Throws SceneError where WebGL2 is not to be had. `onlost(SceneError)` is called when the browser takes it away.
@@ -122,7 +112,7 @@ export class WebGL2Backend {
     }
     this.#draw = full ? program(gl, DRAW_VERTEX, DRAW_FRAGMENT) : program(gl, DIRECT_VERTEX, DRAW_FRAGMENT);
     this.#show = program(gl, SHOW_VERTEX, SHOW_FRAGMENT);
-    this.#blocks = texture(gl, gl.RGBA32F, BLOCKS * BLOCK_TEXELS, this.#maxRows);
+    this.#blocks = texture(gl, gl.RGBA32F, BLOCKS_WIDTH, this.#maxRows);
     this.#grow(FIRST_ROWS);
     this.#palette = texture(gl, gl.RGBA8UI, 1, 1);
     this.#empty = gl.createVertexArray();
@@ -130,8 +120,7 @@ export class WebGL2Backend {
     gl.bindVertexArray(this.#quads);
     this.#corners = gl.createBuffer();
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.#corners);
-    const corners = Uint16Array.from({ length: 6 * BATCH }, (_, i) => 4 * Math.floor(i / 6) + CORNERS[i % 6]);
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners(), gl.STATIC_DRAW);
     gl.bindVertexArray(null);
     this.#timer = new Timer(gl);
     this.#order = new Order(NEAR, (answer) => this.#ordered(answer));
@@ -166,14 +155,7 @@ export class WebGL2Backend {
       this.#palette = this.#enlarged(this.#palette, gl.RGBA8UI, row, height);
       this.#paletteHeight = height;
     }
-    // From planes (coefficient, channel) to texels: one coefficient of an entry each, entry by entry.
-    const texels = new Uint8Array(rows * WIDTH * 4);
-    for (let k = 0; k < per; k++) {
-      for (let c = 0; c < 3; c++) {
-        const plane = (3 * k + c) * count;
-        for (let i = 0; i < count; i++) texels[(i * per + k) * 4 + c] = bytes[plane + i];
-      }
-    }
+    const texels = paletteTexels(per, count, bytes, rows);
     gl.bindTexture(gl.TEXTURE_2D, this.#palette);
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, row, WIDTH, rows, gl.RGBA_INTEGER, gl.UNSIGNED_BYTE, texels);
     check(gl, 'The graphics memory is full');
@@ -205,11 +187,11 @@ export class WebGL2Backend {
       0,
       0,
       row,
-      BLOCKS * BLOCK_TEXELS,
+      BLOCKS_WIDTH,
       rows,
       gl.RGBA,
       gl.FLOAT,
-      this.#blockTexels(headers, rows, entry),
+      blockTexels(headers, rows, entry, this.#palettes.get(entry.palette), this.#clip[0]),
     );
     this.#pages.set(id, { row, rows, count });
     this.stats.resident += count;
@@ -244,7 +226,7 @@ export class WebGL2Backend {
   }
 
   /// Draws with the newest order there is, and asks for a better one where time or camera moved. `target` {framebuffer,
-  /// x, y}: where the picture goes instead of the canvas (a headset's).
+  /// x, y}: where the picture goes instead of the canvas (a headset's). `background` null: nothing, premultiplied.
   draw({ time, view, channel = 'color', background = [0, 0, 0], depthRange = [0, 1], flowScale = 100, target = null }) {
     this.#last = {
       time: Math.min(Math.max(time, this.#clip[0]), this.#clip[1]),
@@ -302,20 +284,6 @@ export class WebGL2Backend {
   }
 
   // Textures
-
-  #blockTexels(headers, rows, { from, to, palette }) {
-    const texels = new Float32Array(rows * BLOCKS * BLOCK_TEXELS * 4);
-    const { row, degree, ranges } = this.#palettes.get(palette) ?? { row: -1, degree: 0, ranges: [0, 0, 0] };
-    for (let b = 0; b * HEADER < headers.length; b++) {
-      const o = b * BLOCK_TEXELS * 4,
-        h = headers.subarray(b * HEADER, (b + 1) * HEADER);
-      texels.set(h, o);
-      // Relative to the clip's start, so that 32 bits keep their precision on a clock that started long ago.
-      for (const k of TIMES) texels[o + k] = h[k] - this.#clip[0];
-      texels.set([from - this.#clip[0], to - this.#clip[0], row, degree, ...ranges, to - from], o + HEADER);
-    }
-    return texels;
-  }
 
   #grow(rows) {
     this.#words = this.#enlarged(this.#words, this.#gl.RGBA32UI, this.#rows.rows, rows);
@@ -523,7 +491,8 @@ export class WebGL2Backend {
     gl.bindVertexArray(this.#empty);
     gl.bindTexture(gl.TEXTURE_2D, this.#sums.texture);
     gl.uniform1i(at.sums, 0);
-    gl.uniform3f(at.background, background[0], background[1], background[2]);
+    gl.uniform3fv(at.background, background ?? [0, 0, 0]);
+    gl.uniform1f(at.opaque, background ? 1 : 0);
     gl.uniform2i(at.origin, x, y);
     gl.uniform1i(at.turned, turned);
     gl.uniform1i(at.channel, CHANNELS[channel]);
@@ -532,5 +501,3 @@ export class WebGL2Backend {
 }
 
 const SCRATCH = new Float32Array(9);
-/// Two triangles of a quad's four corners.
-const CORNERS = [0, 1, 2, 2, 1, 3];

@@ -1,7 +1,7 @@
 // Immersive viewing, with the WebGL2 backend, which draws each eye straight into the headset's picture. Tested: that no
-// button shows where no headset is offered, and the mathematics of an eye's view. Never tested for want of a device: a
-// session in a real headset, its frame rate, and how the order by depth, which arrives a frame late in WebGL2, looks
-// while the head turns.
+// button shows where no headset is offered, the mathematics of an eye's view, and a session of a simulated headset. Never
+// tested for want of a device: a real headset, its frame rate, and how the order by depth, which arrives a frame late in
+// WebGL2, looks while the head turns.
 
 import { add, bounds, quatMul, quatNormal, quatRows, quatTurn } from './camera.js';
 
@@ -28,29 +28,84 @@ export function eyeView(eye, start, unit, width, height) {
     cx: (1 - P[8]) * width / 2, cy: (1 + P[9]) * height / 2 };
 }
 
-/** Runs a session on the player; resolves when it has ended. */
-export async function enter(player) {
-  const session = await navigator.xr.requestSession('immersive-vr');
+/** Where a device does not know its floor, this far below it, metres: it is held before a standing person. */
+const FLOOR = -1.4;
+/** A scene in the room stands so far ahead at first, metres. */
+const AHEAD = 1.2;
+
+/** A scene on the floor of the room: `start`, for which the headset's origin stands, is moved so that it is. */
+class Standing {
+  #start;
+  #unit;
+  #foot;
+  #floor;
+  placed = false;
+
+  constructor(start, unit, meta, floor) {
+    const { center } = bounds(meta), [low, high] = meta.box ?? [center, center];
+    // Half of the box along what is up.
+    const half = start.up.reduce((sum, u, k) => sum + Math.abs(u) * (high[k] - low[k]) / 2, 0);
+    this.#foot = add(center, start.up, -half);
+    [this.#start, this.#unit, this.#floor] = [start, unit, floor];
+  }
+
+  /** Puts the middle of its foot on the floor, at x and z of the headset's space, metres. */
+  put(x, z) {
+    const turn = quatMul(this.#start.quat, FLIP);
+    this.#start.position = add(this.#foot, quatTurn(turn, [x, this.#floor, z].map(v => v / this.#unit)), -1);
+    this.placed = true;
+  }
+
+  /** Ahead of a viewer. */
+  ahead({ position: p, orientation: o }) {
+    const [x, , z] = quatTurn([o.w, o.x, o.y, o.z], [0, 0, -1]), far = Math.hypot(x, z) || 1;
+    this.put(p.x + AHEAD * x / far, p.z + AHEAD * z / far);
+  }
+
+  /** Where a ray meets the floor; nowhere: it stays. */
+  tap({ position: p, orientation: o }) {
+    const [x, y, z] = quatTurn([o.w, o.x, o.y, o.z], [0, 0, -1]), way = (this.#floor - p.y) / y;
+    if (way > 0 && isFinite(way)) this.put(p.x + way * x, p.z + way * z);
+  }
+}
+
+/**
+ * Runs a session on the player; resolves when it has ended. `mode`: 'immersive-vr', where the viewer stands in the scene, or
+ * 'immersive-ar', where the scene stands in the room and a tap on the floor puts it there.
+ */
+export async function enter(player, mode = 'immersive-vr') {
+  const ar = mode === 'immersive-ar';
+  const session = await navigator.xr.requestSession(mode, ar ? { optionalFeatures: ['local-floor'] } : {});
   if (player.backend?.name !== 'webgl2') await player.useBackend('webgl2');
   const { gl } = player.backend;
   await gl.makeXRCompatible();
-  const layer = new XRWebGLLayer(session, gl, { antialias: false, alpha: false });
+  const layer = new XRWebGLLayer(session, gl, { antialias: false, alpha: ar });
   await session.updateRenderState({ baseLayer: layer });
-  const space = await session.requestReferenceSpace('local');
+  const floor = ar && await session.requestReferenceSpace('local-floor').catch(() => null);
+  const space = floor || await session.requestReferenceSpace('local');
   const start = player.camera.clone(), { radius } = bounds(player.meta);
   // The headset's horizon is level: only the heading of the page's camera is kept.
   const ahead = add(start.forward, start.up, -start.forward.reduce((s, x, i) => s + x * start.up[i], 0));
   start.look(start.position, add(start.position, ahead));
   const unit = player.meta.unit ?? TABLE_RADIUS / radius;
+  const standing = ar ? new Standing(start, unit, player.meta, floor ? 0 : FLOOR) : null;
+  session.addEventListener('select', ({ frame, inputSource }) => {
+    const ray = frame.getPose(inputSource.targetRaySpace, space);
+    if (ray) standing?.tap(ray.transform);
+  });
   player.immersed = true;
   let last = 0;
   const tick = (now, frame) => {
     session.requestAnimationFrame(tick);
     player.advance(Math.min((now - last) / 1000, 0.1));
     last = now;
-    for (const eye of frame.getViewerPose(space)?.views ?? []) {
+    const viewer = frame.getViewerPose(space);
+    if (viewer && standing && !standing.placed) standing.ahead(viewer.transform);
+    for (const eye of viewer?.views ?? []) {
       const { x, y, width, height } = layer.getViewport(eye);
-      player.backend.draw({ ...player.drawing(width, height), view: eyeView(eye, start, unit, width, height),
+      const drawing = player.drawing(width, height);
+      if (ar) drawing.background = null;
+      player.backend.draw({ ...drawing, view: eyeView(eye, start, unit, width, height),
         target: { framebuffer: layer.framebuffer, x, y } });
     }
   };

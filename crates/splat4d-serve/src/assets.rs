@@ -40,6 +40,7 @@ const FILES: &[(&str, &str)] = player![
     "sort.worker.js",
     "stream.js",
     "style.js",
+    "texels.js",
     "track.js",
     "ui.js",
     "webgl2.js",

@@ -11,10 +11,10 @@ use splat4d::{Error, ErrorKind};
 use splat4d_train::capture::{Capture, Severity, Timing};
 use splat4d_train::event::Event;
 use splat4d_train::recipe::{MotionName, Quality, Recipe};
-use splat4d_train::run::{self, Outcome, Stopwatch, TrainOptions, checkpoint};
+use splat4d_train::run::{self, Outcome, Stopwatch, TrainOptions};
 use splat4d_train::run::{memory_estimate, open_capture};
 use splat4d_train::settings::{Knob, nearest};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -164,7 +164,8 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         (run.clone(), watch, trained)
     } else {
         let recipe = recipe(args)?;
-        refuse_idle(args, &recipe)?;
+        let typed = args.set.iter().filter_map(|a| Some(a.split_once('=')?.0));
+        recipe.refuse_idle(typed).map_err(|e| e.at("--set"))?;
         let source = args.capture.as_ref().or(args.source.as_ref()).expect("clap asks for a capture");
         console.phase("reading the capture", 0, 0);
         let capture = open_capture(source, &recipe)?;
@@ -180,12 +181,13 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             finish: finish::steps(&capture, args.no_eval),
             predict: args.quality.is_some(),
             clock,
+            own_loss: None,
             snapshots: snapshots(&watch),
         };
         let capture = Arc::new(capture);
         let trained = run::train(capture, recipe, &run, &options, &stop, &mut |event| listen(event, &watch));
         if trained.is_err() {
-            leave_nothing(&run)?;
+            run_folder::clear_unbegun(&run)?;
         }
         (run, watch, trained)
     };
@@ -252,30 +254,14 @@ fn recipe(args: &Args) -> anyhow::Result<Recipe> {
 /// Where the run goes. A folder that the user named is never silently taken over.
 fn place(args: &Args, capture: &Capture, console: &Console) -> anyhow::Result<PathBuf> {
     if let Some(run) = &args.output {
-        let used = std::fs::read_dir(run).is_ok_and(|mut d| d.next().is_some());
-        if used && args.force {
+        if args.force {
             run_folder::clear(run)?;
-        } else if used && Run::is(run) {
-            let what = if Run::is_finished(run) { "a finished run" } else { "an unfinished run" };
-            return Err(Error::input(format!("holds {what} already"))
-                .at(run.display())
-                .remedy(format!(
-                    "Continue it with --resume {}, replace it with --force, or choose another folder with -o.",
-                    run.display()
-                ))
-                .into());
-        } else if used {
-            return Err(Error::input("is not empty and is no run")
-                .at(run.display())
-                .remedy("Choose another folder with -o.")
-                .into());
+        } else {
+            run_folder::check_unused(run)?;
         }
         return Ok(run.clone());
     }
-    let name: String =
-        capture.name.chars().map(|c| if c.is_alphanumeric() || "-_.".contains(c) { c } else { '-' }).collect();
-    let name = name.trim_matches(['.', '-']);
-    let wanted = Path::new("runs").join(if name.is_empty() { "run" } else { name });
+    let wanted = run_folder::usual_folder(&capture.name);
     let run = run_folder::free_folder(&wanted);
     if run != wanted {
         let hint = if Run::is(&wanted) && !Run::is_finished(&wanted) {
@@ -286,17 +272,6 @@ fn place(args: &Args, capture: &Capture, console: &Console) -> anyhow::Result<Pa
         console.say(&format!("{} is taken{hint}: this run goes to {}", wanted.display(), run.display()));
     }
     Ok(run)
-}
-
-/// Removes a run that failed before its first checkpoint after the start: there is nothing in it to continue.
-fn leave_nothing(run: &Path) -> anyhow::Result<()> {
-    let begun = checkpoint::list(run).iter().any(|path| *path != checkpoint::path(run, 0));
-    if !begun {
-        run_folder::clear(run)?;
-        // Fails where the user keeps files of their own there, as it should.
-        let _ = std::fs::remove_dir(run);
-    }
-    Ok(())
 }
 
 fn describe(capture: &Capture, recipe: &Recipe, console: &Console) {
@@ -332,18 +307,6 @@ fn minutes(text: &str) -> Result<f64, String> {
     const MOST: f64 = 7.0 * 24.0 * 60.0;
     let value: f64 = text.parse().map_err(|_| "give minutes, for instance 10 or 2.5".to_owned())?;
     if value > 0.0 && value <= MOST { Ok(value) } else { Err(format!("give minutes above 0, at most {MOST}")) }
-}
-
-/// Errors: a knob of `--set` that does nothing in the recipe. Where it says that something is not to be, training warns.
-fn refuse_idle(args: &Args, recipe: &Recipe) -> Result<(), Error> {
-    let set: Vec<&str> =
-        args.set.iter().filter_map(|a| a.split_once('=')).map(|(name, _)| Recipe::key_of(name.trim())).collect();
-    match recipe.without_effect().into_iter().find(|idle| !idle.off && set.contains(&idle.key.as_str())) {
-        Some(idle) => {
-            Err(Error::input(idle.to_string()).at("--set").remedy("Set what it needs as well, or leave it out"))
-        }
-        None => Ok(()),
-    }
 }
 
 /// The examples, and the knobs that most runs are told by.

@@ -110,8 +110,10 @@ test('above the budget the farthest goes, never this moment; too small a budget 
     assert.equal(stream.ready(t), 1, `${t}`);
     assert.ok(r.there.size <= 8 && stream.bytes <= 8 * 32_000);
   }
+  assert.equal(stream.left, 0);
   const small = recorded(),
-    tight = new Stream(small.file, small.backend, { budget: 2 * 32_000 });
+    told = [],
+    tight = new Stream(small.file, small.backend, { budget: 2 * 32_000, onleft: (n) => told.push(n) });
   for (let t = 0.5; t < 20; t++) {
     tight.update(t, { playing: true });
     await small.all();
@@ -120,7 +122,9 @@ test('above the budget the farthest goes, never this moment; too small a budget 
       [0, 2 + Math.floor(t)],
     );
     await tight.settled(t);
+    assert.equal(tight.left, small.file.activePages(t).reduce((n, p) => n + p.count, 0) - 2000);
   }
+  assert.deepEqual(told, [tight.left], 'said once');
   const none = recorded(),
     nothing = new Stream(none.file, none.backend, { budget: 10 });
   await nothing.settled(3);

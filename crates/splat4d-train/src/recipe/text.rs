@@ -124,6 +124,16 @@ impl Recipe {
         out
     }
 
+    /// Errors: one of these knobs, by either of its names, does nothing in this recipe. Where it says that something is not
+    /// to be, training warns.
+    pub fn refuse_idle<'a>(&self, set: impl Iterator<Item = &'a str>) -> Result<()> {
+        let set: Vec<&str> = set.map(|name| Self::key_of(name.trim())).collect();
+        match self.without_effect().into_iter().find(|idle| !idle.off && set.contains(&idle.key.as_str())) {
+            Some(idle) => Err(Error::input(idle.to_string()).remedy("Set what it needs as well, or leave it out")),
+            None => Ok(()),
+        }
+    }
+
     /// The key of a knob by either of its names, `table.field` or without a table.
     pub fn key_of(name: &str) -> &str {
         FLAT.iter().find(|(flat, _)| *flat == name).map_or(name, |(_, key)| key)

@@ -27,5 +27,5 @@ pub use open::{capture_options, open_capture, plan, training_frames};
 pub(crate) use open::{learnable, scale};
 pub(crate) use points::with_found;
 pub(crate) use refine::{Refine, refine};
-pub use session::{Outcome, TrainOptions};
+pub use session::{Outcome, OwnLoss, TrainOptions};
 pub use start::{Forecast, forecast, open_run, resume, resume_with, train};

@@ -83,6 +83,7 @@ pub(crate) fn refine(
         snapshots: options.snapshots,
         clock: options.clock.clone(),
         budget: None,
+        own_loss: false,
         stop,
     };
     let mut trainer = opened.trainer_of(&plan, job.scene, job.stages);

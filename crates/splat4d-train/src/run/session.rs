@@ -11,12 +11,14 @@ use super::open::OpenCapture;
 use super::snapshot::Snapshots;
 use super::start::read_info;
 use crate::event::{Event, Progress};
+use crate::loss::image::ImageTerm;
 use crate::recipe::Recipe;
 use crate::step::trainer::Trainer;
 use crate::{Error, ErrorKind, Result};
 use serde_json::json;
 use splat4d::device::Device;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant as Clock};
 
@@ -35,9 +37,31 @@ pub struct TrainOptions {
     pub predict: bool,
     /// The clock of `minutes`; its zero is when the command began, or these options were made.
     pub clock: Stopwatch,
+    /// A loss of the caller's own beside the recipe's. It is no part of the recipe either, but a run that began with one is
+    /// only resumed with one.
+    pub own_loss: Option<OwnLoss>,
     /// Emit [`Event::Snapshot`] about so often, and at the end. They never take more than a fortieth of the time, and
     /// do not change the result.
     pub snapshots: Option<Duration>,
+}
+
+/// A loss on pictures that a caller brings along: makes its term, once for every run.
+#[derive(Clone)]
+pub struct OwnLoss(pub Arc<dyn Fn() -> Box<dyn ImageTerm> + Send + Sync>);
+
+impl std::fmt::Debug for OwnLoss {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("OwnLoss")
+    }
+}
+
+impl TrainOptions {
+    /// Gives the trainer the caller's own loss.
+    pub(super) fn add_loss(&self, trainer: &mut Trainer<'_>) {
+        if let Some(OwnLoss(make)) = &self.own_loss {
+            trainer.loss.push_boxed(make());
+        }
+    }
 }
 
 /// How a run ended.
@@ -144,6 +168,8 @@ pub(super) struct Session<'a> {
     pub(super) clock: Stopwatch,
     /// The time that it is to keep to.
     pub(super) budget: Option<Budget>,
+    /// Whether its caller brought a loss along.
+    pub(super) own_loss: bool,
     pub(super) stop: &'a AtomicBool,
 }
 
@@ -213,6 +239,12 @@ impl Session<'_> {
             let expected = self.budget.map_or(0.0, |b| Place::of(trainer).step_seconds(&b.timing));
             let step = match trainer.step()? {
                 Ok(step) => step,
+                // Whoever says stop within a step, such as a loss that failed, has spoilt it: it counts for nothing.
+                Err(_) if self.stop.load(Ordering::Relaxed) => {
+                    state = self.restore(trainer, listen)?;
+                    metrics.rewind(trainer.progress.iteration);
+                    break;
+                }
                 Err(fault) => {
                     state = self.roll_back(trainer, &fault.0, listen)?;
                     metrics.rewind(trainer.progress.iteration);
@@ -343,6 +375,7 @@ impl Session<'_> {
         let info = json!({
             "version": env!("CARGO_PKG_VERSION"),
             "made_by": self.made_by,
+            "own_loss": self.own_loss,
             "capture": root,
             "capture_name": capture.name,
             "capture_fingerprint": fingerprint(capture),

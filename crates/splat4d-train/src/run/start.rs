@@ -74,6 +74,7 @@ pub fn train(
     let scene = opened.initial_scene(&plan)?;
     let mut trainer = opened.trainer(&plan, scene)?;
     trainer.check_not_empty()?;
+    options.add_loss(&mut trainer);
     let session = Session {
         run,
         opened: &opened,
@@ -84,6 +85,7 @@ pub fn train(
         snapshots: options.snapshots,
         clock: options.clock.clone(),
         budget: timed.budget.map(|b| Budget { before: options.clock.seconds(), ..b }),
+        own_loss: options.own_loss.is_some(),
         stop,
     };
     let state = session.begin(&trainer, &mut listen)?;
@@ -153,7 +155,7 @@ pub fn forecast(capture: Arc<Capture>, listen: &mut dyn FnMut(&Event)) -> Result
     Ok(Forecast { motion: choice.motion, why: choice.why, iterations: recipe.run.iterations, memory })
 }
 
-/// As [`resume`]; of the options only `device`, `snapshots` and `clock` count, the rest was settled at the start. A run with
+/// As [`resume`]; of the options only `device`, `own_loss`, `snapshots` and `clock` count, the rest was settled at the start. A run with
 /// `minutes` keeps to what is left of them: time between the commands does not count.
 pub fn resume_with(
     run: &Path,
@@ -162,7 +164,16 @@ pub fn resume_with(
     listen: &mut dyn FnMut(&Event),
 ) -> Result<Outcome> {
     let (recipe, capture) = open_run(run)?;
-    if let Some(other) = made_by(run)?.filter(|m| m != TRAIN) {
+    let info = read_info(run)?;
+    let own_loss = info["own_loss"].as_bool().unwrap_or(false);
+    if own_loss != options.own_loss.is_some() {
+        let what =
+            if own_loss { "was trained with a loss of its own program" } else { "was trained without a loss of yours" };
+        return Err(Error::input(format!("this run {what}"))
+            .at(run.display())
+            .remedy("Continue it with the losses it began with, or begin a new run"));
+    }
+    if let Some(other) = info["made_by"].as_str().filter(|m| *m != TRAIN) {
         return Err(Error::input(format!("this run was made by `{other}`"))
             .at(run.display())
             .remedy(format!("Continue it with `splat4d {other}` and the options it began with")));
@@ -172,6 +183,7 @@ pub fn resume_with(
     let empty =
         init::scene(&plan, program_of(&recipe)?.as_ref(), &Seeds::default(), opened.background(), opened.capture.up)?;
     let mut trainer = opened.trainer(&plan, empty)?;
+    options.add_loss(&mut trainer);
     let session = Session {
         run,
         opened: &opened,
@@ -182,7 +194,8 @@ pub fn resume_with(
         snapshots: options.snapshots,
         clock: options.clock.clone(),
         // A run of before there were budgets has none.
-        budget: serde_json::from_value(read_info(run)?["budget"].clone()).ok(),
+        budget: serde_json::from_value(info["budget"].clone()).ok(),
+        own_loss,
         stop,
     };
     let mut listen = listen;
@@ -208,11 +221,6 @@ pub(super) fn read_info(run: &Path) -> Result<serde_json::Value> {
     let path = run.join("run.json");
     serde_json::from_str(&read_text(&path)?)
         .map_err(|e| Error::input(format!("it is not JSON: {e}")).at(path.display()))
-}
-
-/// The verb that made a run. Errors: not a run.
-fn made_by(run: &Path) -> Result<Option<String>> {
-    Ok(read_info(run)?["made_by"].as_str().map(str::to_owned))
 }
 
 pub(super) fn read_text(path: &Path) -> Result<String> {

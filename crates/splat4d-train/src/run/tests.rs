@@ -3,6 +3,7 @@
 
 mod device;
 mod on_time;
+mod own_loss;
 
 use super::budget::Budget;
 use super::checkpoint::write_atomically;
@@ -134,8 +135,19 @@ impl Place {
         trainer.set_engine(crate::step::engine::CpuEngine::new(draw));
         let identity = identity(&opened.capture, &recipe, "");
         let (opened, recipe, run, made_by) = (&opened, &recipe, run.as_path(), TRAIN);
-        let session =
-            Session { run, opened, recipe, identity, made_by, estimate: 0, snapshots: None, clock, budget, stop };
+        let session = Session {
+            run,
+            opened,
+            recipe,
+            identity,
+            made_by,
+            estimate: 0,
+            snapshots: None,
+            clock,
+            budget,
+            own_loss: false,
+            stop,
+        };
         let state = session.begin(&trainer, listen)?;
         session.drive(&mut trainer, state, listen)
     }

@@ -33,7 +33,12 @@ impl TrainLoss {
 
     /// Adds a term, of this library or of a caller's own.
     pub fn push(&mut self, term: impl ImageTerm + 'static) {
-        self.terms.push(Box::new(term));
+        self.push_boxed(Box::new(term));
+    }
+
+    /// The same.
+    pub(crate) fn push_boxed(&mut self, term: Box<dyn ImageTerm>) {
+        self.terms.push(term);
     }
 
     /// The loss of one step: these terms, then those of the stage, on pictures as their cameras expose them.

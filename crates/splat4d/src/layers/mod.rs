@@ -12,7 +12,7 @@ mod tests;
 pub(crate) use convert::with_polynomial;
 pub use convert::{to_native4d, to_spacetime};
 pub use evaluation::{Evaluation, sweep};
-pub use freeze::{freeze, freeze_rows, moment};
+pub use freeze::{Gaussians, freeze, freeze_rows, moment};
 pub use rotate::rotation_between;
 
 use crate::math::{Real, Rng, Sim3};

@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::motion::{SpacetimeSpec, Spec, build_as};
+use crate::scene::SH;
 
 fn layer(spec: &Spec, life: LifeKind, rows: usize, seed: u64) -> Layer<f64> {
     let rng = Rng::new(seed, "layer", 0);
@@ -226,4 +227,54 @@ fn a_layer_is_seen_in_its_span_only() {
     assert_eq!(scene.splats(&instant).len(), 3);
     scene.at(Time(0.3), &mut instant);
     assert_eq!(scene.splats(&instant).len(), 8);
+}
+
+/// A layer whose Gaussians move, turn and have their own lives, in a frame of its own.
+fn turning() -> Scene<f32> {
+    let mut params = Params::<f32>::new(40, 4, LifeKind::GaussHalf.columns());
+    let spec = SpacetimeSpec { order: 1, rotation: true, detach: false, origin: 0.5, features: None };
+    let motion = crate::motion::build(&Spec::Spacetime(spec), &mut params).unwrap();
+    let keys: Vec<_> = params.keys().collect();
+    for key in keys {
+        let (rows, width) = (params[key].rows(), params[key].width());
+        for i in 0..rows * width {
+            params[key].set(
+                i / width,
+                i % width,
+                0.4 * Rng::new(5, "turning", u64::from(key.0)).normal(i as u64) as f32,
+            );
+        }
+    }
+    for row in 0..40 {
+        params[GEOMETRY].set(row, OPACITY, 2.0);
+        params[LIFE].write(row, 0, [0.5, 0.5]);
+    }
+    let mut layer = Layer::new("turning", params, motion, LifeKind::GaussHalf);
+    layer.frame = Sim3 { scale: 1.5, rotation: crate::math::quat::to_rotation([0.8, 0.6, 0.0, 0.0]), ..Sim3::IDENTITY };
+    Scene { layers: vec![layer], ..Scene::default() }
+}
+
+#[test]
+fn plain_gaussians_are_what_is_drawn_and_what_turned_keeps_its_scales() {
+    use crate::math::sym3::from_quat_log_scales;
+    let (scene, t) = (turning(), Time(0.9));
+    let mut seen = Evaluation::default();
+    scene.at(t, &mut seen);
+    let all = Gaussians::of(&scene, &seen);
+    let (frozen, (sh, k)) = (freeze(&scene, t).unwrap(), Gaussians::sh(&scene, &seen));
+    assert_eq!((all.means.len(), k, sh.len()), (40, 4, 40 * 12));
+    for (j, ((mean, q), scales)) in all.means.iter().zip(&all.quats).zip(&all.scales).enumerate() {
+        let out = seen.tape(0).out();
+        assert_eq!(*mean, out.read::<3>(j, 0));
+        let cov = from_quat_log_scales(q.map(f64::from), scales.map(|s| f64::from(s).ln()));
+        let trace = cov[0] + cov[3] + cov[5];
+        let drawn = out.read::<6>(j, crate::scene::splats::COV);
+        assert!(cov.iter().zip(drawn).all(|(a, b)| (a - f64::from(b)).abs() < 1e-4 * trace), "{j}: {cov:?} {drawn:?}");
+        // In the order of the learnt ones: they were turned, not taken apart.
+        let learnt = scene.layers[0].params[GEOMETRY].read::<3>(j, crate::scene::params::LOG_SCALE);
+        assert!(learnt.iter().zip(scales).all(|(l, s)| (l.exp() * 1.5 - s).abs() < 1e-5 * s), "{j}");
+        let logit = frozen[GEOMETRY].get(j, OPACITY);
+        assert!((all.opacities[j] - 1.0 / (1.0 + (-logit).exp())).abs() < 1e-5);
+        assert_eq!(frozen[SH].read::<12>(j, 0), sh[12 * j..12 * j + 12]);
+    }
 }

@@ -126,7 +126,7 @@ impl<F: Real> Gradient<F> {
     }
 
     /// The planes, to be added to.
-    pub(crate) fn add(&mut self) -> &mut Planes<F> {
+    pub fn add(&mut self) -> &mut Planes<F> {
         if !std::mem::replace(&mut self.touched, true) {
             let [channels, height, width] = self.shape;
             self.planes.reset(channels, height, width);

@@ -1,0 +1,98 @@
+//! NumPy in and out: rows are moved, not copied; pictures are the renderer's planes seen as [h, w, channels].
+
+use crate::errors::bad_input;
+use numpy::{IntoPyArray, PyArray1, PyArray3, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods};
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use splat4d::scene::Planes;
+
+/// Rows of N numbers as an array [rows, N], without a copy.
+pub(crate) fn rows<const N: usize>(py: Python<'_>, rows: Vec<[f32; N]>) -> PyResult<Py<PyAny>> {
+    let count = rows.len();
+    shaped(py, rows.into_flattened(), &[count, N])
+}
+
+/// Numbers as an array of a shape that has as many, without a copy.
+pub(crate) fn shaped<T: numpy::Element>(py: Python<'_>, numbers: Vec<T>, shape: &[usize]) -> PyResult<Py<PyAny>> {
+    let flat: Bound<'_, PyArray1<T>> = numbers.into_pyarray(py);
+    Ok(flat.reshape(shape.to_vec())?.into_any().unbind())
+}
+
+/// Planes [c, h, w] as a picture [h, w, c] that looks at the same memory.
+pub(crate) fn picture(py: Python<'_>, planes: Planes<f32>) -> PyResult<Bound<'_, PyAny>> {
+    let shape = [planes.channels, planes.height, planes.width];
+    let array: Bound<'_, PyArray3<f32>> = planes.data.into_pyarray(py).reshape(shape)?;
+    array.call_method1("transpose", (1, 2, 0))
+}
+
+/// One plane as [h, w].
+pub(crate) fn plane(py: Python<'_>, planes: Planes<f32>) -> PyResult<Py<PyAny>> {
+    shaped(py, planes.data, &[planes.height, planes.width])
+}
+
+/// Anything that NumPy makes an array of, as numbers of type T; a copy only where it must be. `what` names it in errors.
+pub(crate) fn numbers<'py, T: numpy::Element>(
+    value: &Bound<'py, PyAny>,
+    what: &str,
+) -> PyResult<PyReadonlyArrayDyn<'py, T>> {
+    let py = value.py();
+    let wanted = numpy::dtype::<T>(py);
+    let options = PyDict::new(py);
+    options.set_item("dtype", &wanted)?;
+    let array = py.import("numpy")?.call_method("asarray", (value,), Some(&options)).map_err(|e| {
+        let remedy = format!("Give an array or a list of numbers ({wanted})");
+        bad_input(format!("{what} is no array of numbers ({})", e.value(py)), &remedy)
+    })?;
+    let array = array.cast_into::<PyArrayDyn<T>>().map_err(PyErr::from)?;
+    Ok(array.readonly())
+}
+
+/// Finite numbers [rows, N].
+pub(crate) fn finite_rows<const N: usize>(value: &Bound<'_, PyAny>, what: &str) -> PyResult<Vec<[f64; N]>> {
+    let array = numbers::<f64>(value, what)?;
+    if array.ndim() != 2 || array.shape()[1] != N {
+        return Err(bad_input(format!("{what} has the shape {:?}", array.shape()), &format!("Give an array [N, {N}]")));
+    }
+    let flat: Vec<f64> = array.as_array().iter().copied().collect();
+    if let Some(bad) = flat.iter().position(|x| !x.is_finite()) {
+        return Err(bad_input(format!("row {} of {what} holds NaN or infinity", bad / N), "Leave such rows out"));
+    }
+    Ok(flat.chunks_exact(N).map(|row| std::array::from_fn(|k| row[k])).collect())
+}
+
+/// N finite numbers.
+pub(crate) fn finite<const N: usize>(value: &Bound<'_, PyAny>, what: &str) -> PyResult<[f64; N]> {
+    let array = numbers::<f64>(value, what)?;
+    let flat: Vec<f64> = array.as_array().iter().copied().collect();
+    match <[f64; N]>::try_from(flat) {
+        Ok(all) if array.ndim() == 1 && all.iter().all(|x| x.is_finite()) => Ok(all),
+        _ => Err(bad_input(format!("{what} are not {N} finite numbers"), &format!("Give {N} numbers"))),
+    }
+}
+
+/// A picture [h, w, 3], as floats from 0 to 1 or 8-bit numbers, as planes.
+pub(crate) fn planes(value: &Bound<'_, PyAny>, what: &str) -> PyResult<Planes<f32>> {
+    let bytes = value.getattr("dtype").is_ok_and(|d| d.is(numpy::dtype::<u8>(value.py())));
+    let array = numbers::<f32>(value, what)?;
+    let &[height, width, 3] = array.shape() else {
+        return Err(bad_input(
+            format!("{what} has the shape {:?}", array.shape()),
+            "Give a picture [height, width, 3]",
+        ));
+    };
+    let scale = if bytes { 1.0 / 255.0 } else { 1.0 };
+    let mut out = Planes::new(3, height, width);
+    let view = array.as_array();
+    for (c, plane) in out.data.chunks_exact_mut((height * width).max(1)).enumerate() {
+        let channel = view.index_axis(numpy::ndarray::Axis(2), c);
+        plane.iter_mut().zip(channel.iter()).for_each(|(o, x)| *o = scale * x);
+    }
+    match out.data.iter().position(|x| !x.is_finite()) {
+        Some(at) => {
+            let pixel = at % (height * width);
+            let place = format!("row {}, column {}", pixel / width, pixel % width);
+            Err(bad_input(format!("{what} holds NaN or infinity at {place}"), "Give numbers from 0 to 1"))
+        }
+        None => Ok(out),
+    }
+}

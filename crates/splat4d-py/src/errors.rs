@@ -1,0 +1,66 @@
+//! Errors as exceptions: one class, the same text, and the class of trouble as `kind`.
+
+use pyo3::create_exception;
+use pyo3::exceptions::PyException;
+use pyo3::prelude::*;
+use splat4d::ErrorKind;
+
+create_exception!(
+    splat4d,
+    Error,
+    PyException,
+    "What went wrong, where, and what to do. `kind`: bad_input, io, unsupported, memory, diverged, interrupted or failed."
+);
+
+/// Results of the libraries as Python has them.
+pub(crate) trait OrRaise<T> {
+    fn or_raise(self) -> PyResult<T>;
+}
+
+impl<T> OrRaise<T> for splat4d::Result<T> {
+    fn or_raise(self) -> PyResult<T> {
+        self.map_err(|e| exception(&e.to_string(), Some(e.kind())))
+    }
+}
+
+impl<T> OrRaise<T> for anyhow::Result<T> {
+    fn or_raise(self) -> PyResult<T> {
+        self.map_err(|e| {
+            let kind = e.downcast_ref::<splat4d::Error>().map(splat4d::Error::kind);
+            exception(&splat4d_cli::told(&e), kind)
+        })
+    }
+}
+
+/// An exception for what the caller handed over: what of it is wrong, and what to do.
+pub(crate) fn bad_input(what: impl Into<String>, remedy: &str) -> PyErr {
+    let error = splat4d::Error::input(what).remedy(remedy);
+    exception(&error.to_string(), Some(error.kind()))
+}
+
+fn exception(text: &str, kind: Option<ErrorKind>) -> PyErr {
+    let kind = match kind {
+        Some(ErrorKind::BadInput) => "bad_input",
+        Some(ErrorKind::Io) => "io",
+        Some(ErrorKind::Unsupported) => "unsupported",
+        Some(ErrorKind::Memory) => "memory",
+        Some(ErrorKind::Diverged) => "diverged",
+        Some(ErrorKind::Interrupted) => "interrupted",
+        _ => "failed",
+    };
+    Python::attach(|py| {
+        let error = Error::new_err(text.to_owned());
+        // An exception of our own class takes attributes.
+        let _ = error.value(py).setattr("kind", kind);
+        error
+    })
+}
+
+/// Says these as Python warnings.
+pub(crate) fn warn(py: Python<'_>, messages: &[String]) -> PyResult<()> {
+    let category = py.get_type::<pyo3::exceptions::PyUserWarning>();
+    messages.iter().try_for_each(|message| {
+        let text = std::ffi::CString::new(message.replace('\0', " ")).expect("no zero is left");
+        PyErr::warn(py, &category, &text, 1)
+    })
+}

@@ -1,0 +1,65 @@
+//! The extension module of the Python package `splat4d` (docs/python.md): scenes as NumPy arrays, captures, training, and the
+//! command itself. Python's lock is given up while anything long works; errors become `splat4d.Error` with their own text.
+
+mod arrays;
+mod camera;
+mod capture;
+mod errors;
+mod from_arrays;
+mod gaussians;
+mod loss;
+mod metrics;
+mod plain;
+mod run;
+mod scene;
+mod settings;
+mod train;
+
+use pyo3::prelude::*;
+
+/// Native part of splat4d; `import splat4d` instead.
+#[pymodule]
+mod _native {
+    #[pymodule_export]
+    use crate::camera::Camera;
+    #[pymodule_export]
+    use crate::capture::{Capture, Frame};
+    #[pymodule_export]
+    use crate::errors::Error;
+    #[pymodule_export]
+    use crate::gaussians::Gaussians;
+    #[pymodule_export]
+    use crate::loss::View;
+    #[pymodule_export]
+    use crate::metrics::metrics;
+    #[pymodule_export]
+    use crate::run::Run;
+    #[pymodule_export]
+    use crate::scene::{Scene, Tracks, open};
+    #[pymodule_export]
+    use crate::train::{resume, train};
+
+    use super::*;
+    use crate::errors::OrRaise;
+    use std::ffi::OsString;
+    use std::path::PathBuf;
+
+    #[pymodule_init]
+    fn init(m: &Bound<'_, PyModule>) -> PyResult<()> {
+        m.add("__version__", env!("CARGO_PKG_VERSION"))
+    }
+
+    /// The command with these words, the first its name; its exit code.
+    #[pyfunction]
+    fn main(py: Python<'_>, words: Vec<OsString>) -> u8 {
+        py.detach(|| splat4d_cli::main_from(words))
+    }
+
+    /// One verb of the command with its options, quietly: `command("bake", "runs/knight", "-o", "knight.splat4d")`.
+    #[pyfunction]
+    #[pyo3(signature = (*words))]
+    fn command(py: Python<'_>, words: Vec<PathBuf>) -> PyResult<()> {
+        let words: Vec<OsString> = words.into_iter().map(PathBuf::into_os_string).collect();
+        py.detach(|| splat4d_cli::call(&words)).or_raise()
+    }
+}

@@ -1,0 +1,107 @@
+//! A loss written in Python beside the recipe's: it gets the picture and the truth, and returns a value and a gradient.
+
+use crate::arrays::{numbers, picture};
+use crate::errors::bad_input;
+use numpy::PyUntypedArrayMethods;
+use pyo3::prelude::*;
+use splat4d::scene::Planes;
+use splat4d_train::loss::image::{self, ImageTerm, Needs, PictureGrads, Shown};
+use splat4d_train::loss::terms::StepInfo;
+use splat4d_train::run::OwnLoss;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+
+/// Where a run's Python functions leave what they raised, and say stop. The first exception counts.
+#[derive(Default)]
+pub(crate) struct Raised {
+    pub(crate) stop: AtomicBool,
+    error: Mutex<Option<PyErr>>,
+}
+
+impl Raised {
+    pub(crate) fn raise(&self, error: PyErr) {
+        self.error.lock().unwrap_or_else(|e| e.into_inner()).get_or_insert(error);
+        self.stop.store(true, Ordering::Relaxed);
+    }
+
+    pub(crate) fn take(&self) -> Option<PyErr> {
+        self.error.lock().unwrap_or_else(|e| e.into_inner()).take()
+    }
+}
+
+/// The view that a loss looks at.
+#[pyclass(frozen, get_all, module = "splat4d")]
+pub(crate) struct View {
+    /// Second of the scene.
+    time: f64,
+    /// Place of the picture among those trained on.
+    frame: usize,
+    /// Place of its camera in the capture.
+    camera: usize,
+    /// Steps taken before this one.
+    iteration: usize,
+}
+
+/// The term that asks the function.
+struct Asked {
+    function: Py<PyAny>,
+    raised: Arc<Raised>,
+}
+
+/// The function as a loss of a run.
+pub(crate) fn own_loss(function: Py<PyAny>, raised: &Arc<Raised>) -> OwnLoss {
+    let raised = raised.clone();
+    OwnLoss(Arc::new(move || {
+        let function = Python::attach(|py| function.clone_ref(py));
+        Box::new(Asked { function, raised: raised.clone() })
+    }))
+}
+
+impl ImageTerm for Asked {
+    fn needs(&self, _: &image::View<'_>) -> Needs {
+        Needs::default()
+    }
+
+    fn eval(&mut self, info: &StepInfo, view: &image::View<'_>, shown: &Shown<'_>, d: &mut PictureGrads) -> f64 {
+        let seen = View { time: view.t.0, frame: view.frame, camera: view.rig, iteration: info.iteration };
+        let answer = Python::attach(|py| self.ask(py, seen, shown.color, view.truth, d.color.add()));
+        answer.unwrap_or_else(|error| {
+            self.raised.raise(error);
+            // Not a finite number: the step counts for nothing.
+            f64::NAN
+        })
+    }
+}
+
+impl Asked {
+    /// The value; the gradient is added to `d`.
+    fn ask(
+        &self,
+        py: Python<'_>,
+        view: View,
+        shown: &Planes<f32>,
+        truth: &Planes<f32>,
+        d: &mut Planes<f32>,
+    ) -> PyResult<f64> {
+        // Copies: Python may keep what it is given.
+        let answer = self.function.call1(py, (picture(py, shown.clone())?, picture(py, truth.clone())?, view))?;
+        let wrong = "the loss did not return a value and a gradient";
+        let remedy = "Return (float, array [h, w, 3])";
+        let (value, gradient): (f64, Bound<'_, PyAny>) = answer.extract(py).map_err(|_| bad_input(wrong, remedy))?;
+        let gradient = numbers::<f32>(&gradient, "the loss's gradient")?;
+        if gradient.shape() != [shown.height, shown.width, shown.channels] {
+            let what = format!("the loss's gradient has the shape {:?}", gradient.shape());
+            let wanted = format!("Return that of the picture, [{}, {}, {}]", shown.height, shown.width, shown.channels);
+            return Err(bad_input(what, &wanted));
+        }
+        let all = gradient.as_array();
+        if !value.is_finite() || all.iter().any(|x| !x.is_finite()) {
+            return Err(bad_input("the loss's value or gradient is NaN or infinity", "Return finite numbers"));
+        }
+        for (c, plane) in d.data.chunks_exact_mut(shown.pixels().max(1)).enumerate() {
+            let channel = all.index_axis(numpy::ndarray::Axis(2), c);
+            plane.iter_mut().zip(channel.iter()).for_each(|(d, x)| *d += x);
+        }
+        Ok(value)
+    }
+}

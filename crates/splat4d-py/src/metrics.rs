@@ -1,0 +1,30 @@
+//! Metrics of two pictures.
+
+use crate::arrays::planes;
+use crate::errors::bad_input;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use splat4d_train::eval::{Score, ViewContext, score_view};
+
+/// PSNR (dB), SSIM, MS-SSIM and D-SSIM of two pictures [h, w, 3] as `splat4d eval` computes them; what is not defined for
+/// pictures of this size is left out.
+#[pyfunction]
+pub(crate) fn metrics<'py>(
+    py: Python<'py>,
+    render: &Bound<'py, PyAny>,
+    truth: &Bound<'py, PyAny>,
+) -> PyResult<Bound<'py, PyDict>> {
+    let (a, b) = (planes(render, "render")?, planes(truth, "truth")?);
+    if (a.height, a.width) != (b.height, b.width) {
+        let what = format!("render has {}x{} pixels, truth {}x{}", a.width, a.height, b.width, b.height);
+        return Err(bad_input(what, "Give pictures of one size"));
+    }
+    let view = py.detach(|| score_view("", &a, &b, &ViewContext::default()));
+    let out = PyDict::new(py);
+    for (key, score) in view.scores {
+        if let Score::Value(value) = score {
+            out.set_item(key, value)?;
+        }
+    }
+    Ok(out)
+}

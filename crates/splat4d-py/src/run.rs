@@ -1,0 +1,76 @@
+//! Runs: folders that training writes.
+
+use crate::errors::OrRaise;
+use crate::plain::plain;
+use crate::scene::Scene;
+use pyo3::prelude::*;
+use serde_json::Value;
+use splat4d_cli::console::{Console, Loudness};
+use splat4d_cli::finish::{self, Measure};
+use splat4d_cli::run_folder;
+use splat4d_cli::source::read_scene;
+use std::path::PathBuf;
+
+/// A run: a folder with its recipe, checkpoints, scene and scores.
+#[pyclass(frozen, module = "splat4d")]
+pub(crate) struct Run {
+    /// Its folder.
+    #[pyo3(get)]
+    pub(crate) path: PathBuf,
+}
+
+#[pymethods]
+impl Run {
+    #[new]
+    pub(crate) fn new(path: PathBuf) -> PyResult<Self> {
+        run_folder::Run::open(&path).or_raise()?;
+        Ok(Self { path })
+    }
+
+    /// Whether it has taken its last step.
+    #[getter]
+    fn finished(&self) -> bool {
+        run_folder::Run::is_finished(&self.path)
+    }
+
+    /// Steps taken.
+    #[getter]
+    fn iteration(&self) -> PyResult<Option<usize>> {
+        Ok(run_folder::Run::open(&self.path).or_raise()?.iteration())
+    }
+
+    /// The scene: the learnt one, or that of the newest checkpoint.
+    fn scene(&self, py: Python<'_>) -> PyResult<Scene> {
+        Scene::open(py, self.path.clone())
+    }
+
+    /// `run.json`: device, timings, memory.
+    #[getter]
+    fn info(&self, py: Python<'_>) -> PyResult<Py<PyAny>> {
+        plain(py, &run_folder::Run::open(&self.path).or_raise()?.info)
+    }
+
+    /// Means over the held-out views, as `results.json` has them; None: it was not measured.
+    #[getter]
+    fn results(&self, py: Python<'_>) -> PyResult<Py<PyAny>> {
+        let results = run_folder::Run::open(&self.path).or_raise()?.results;
+        plain(py, &results.unwrap_or(Value::Null))
+    }
+
+    /// Draws the held-out views, compares them with their pictures, writes `results.json`, `per_view.json` and the
+    /// pictures, and returns the means.
+    fn evaluate(&self, py: Python<'_>) -> PyResult<Py<PyAny>> {
+        let measured = py.detach(|| {
+            let run = run_folder::Run::open(&self.path)?;
+            let scene = read_scene(&run.scene_file()?)?;
+            let console = Console::new(Loudness::Quiet, false);
+            finish::scores(&self.path, &scene, &Measure::default(), &console)
+        });
+        measured.or_raise()?;
+        self.results(py)
+    }
+
+    fn __repr__(&self) -> String {
+        format!("Run({:?})", self.path)
+    }
+}

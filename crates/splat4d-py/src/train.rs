@@ -1,0 +1,154 @@
+//! Training from Python: the command's `train` without its console. The same recipe gives the same bits.
+
+use crate::capture::Capture;
+use crate::errors::{OrRaise, warn};
+use crate::loss::{Raised, own_loss};
+use crate::plain::plain;
+use crate::run::Run;
+use crate::scene::named;
+use crate::settings::set;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use splat4d::{Error, Result};
+use splat4d_cli::run_folder;
+use splat4d_train::event::Event;
+use splat4d_train::recipe::{MotionName, Quality, Recipe};
+use splat4d_train::run::{self, Outcome, Stopwatch, TrainOptions, open_capture};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// Learns a scene of a capture (a Capture, or its path) into the folder `out` [runs/NAME] and returns the run.
+///
+/// `settings` are the recipe's knobs (docs/recipe.md): `iterations=300`, `downscale=2`, `motion="spacetime"`; a table's knob
+/// is written with two underscores, `densify__max_cap=20000`. Without `motion` one is chosen that suits the capture.
+/// `progress` is called with every event, a dict as `splat4d --json` prints them. `loss(picture, truth, view)` gets arrays
+/// [h, w, 3] and returns (value, gradient), which are added to the recipe's losses. Ctrl-C, or an exception in either
+/// function, stops with a checkpoint; `resume` goes on from there.
+#[pyfunction]
+#[pyo3(signature = (capture, out=None, *, progress=None, loss=None, minutes=None, quality=None, device="cpu", **settings))]
+#[allow(clippy::too_many_arguments)]
+pub(crate) fn train(
+    py: Python<'_>,
+    capture: &Bound<'_, PyAny>,
+    out: Option<PathBuf>,
+    progress: Option<Py<PyAny>>,
+    loss: Option<Py<PyAny>>,
+    minutes: Option<f64>,
+    quality: Option<&str>,
+    device: &str,
+    settings: Option<&Bound<'_, PyDict>>,
+) -> PyResult<Run> {
+    let mut recipe = Recipe::default().with(|r| r.run.motion = MotionName::AUTO);
+    let path = match capture.cast::<Capture>() {
+        Ok(capture) => {
+            recipe.capture = capture.get().settings.clone();
+            capture.get().path.clone()
+        }
+        Err(_) => capture.extract::<PathBuf>()?,
+    };
+    if let Some(quality) = quality {
+        recipe = recipe.of_quality(quality.parse::<Quality>().or_raise()?);
+    }
+    let names = set(&mut recipe, settings)?;
+    recipe.refuse_idle(names.iter().map(String::as_str)).or_raise()?;
+    let options =
+        TrainOptions { device: named(device)?, minutes, clock: Stopwatch::start(), ..TrainOptions::default() };
+    let listener = Listener::new(progress, loss);
+    listener.drive(py, options, |options, listen| {
+        let capture = open_capture(&path, &recipe)?;
+        let run = match out {
+            Some(out) => {
+                run_folder::check_unused(&out)?;
+                out
+            }
+            None => run_folder::free_folder(&run_folder::usual_folder(&capture.name)),
+        };
+        std::fs::create_dir_all(&run).map_err(|e| Error::io("the folder cannot be made", e).at(run.display()))?;
+        let cameras = run_folder::cameras_json(&capture).to_string();
+        run::checkpoint::write_atomically(&run.join("cameras.json"), cameras.as_bytes())?;
+        let stop = &listener.raised.stop;
+        let trained = run::train(Arc::new(capture), recipe, &run, options, stop, listen);
+        if trained.is_err() {
+            run_folder::clear_unbegun(&run)?;
+        }
+        trained
+    })
+}
+
+/// Goes on with the run in a folder, exactly where its newest checkpoint is. A run that began with a `loss` needs it again.
+#[pyfunction]
+#[pyo3(signature = (run, *, progress=None, loss=None, device="cpu"))]
+pub(crate) fn resume(
+    py: Python<'_>,
+    run: &Bound<'_, PyAny>,
+    progress: Option<Py<PyAny>>,
+    loss: Option<Py<PyAny>>,
+    device: &str,
+) -> PyResult<Run> {
+    let path = match run.cast::<Run>() {
+        Ok(run) => run.get().path.clone(),
+        Err(_) => run.extract::<PathBuf>()?,
+    };
+    let options = TrainOptions { device: named(device)?, clock: Stopwatch::start(), ..TrainOptions::default() };
+    let listener = Listener::new(progress, loss);
+    listener.drive(py, options, |options, listen| run::resume_with(&path, options, &listener.raised.stop, listen))
+}
+
+/// Who hears of a run, and may end it.
+struct Listener {
+    progress: Option<Py<PyAny>>,
+    loss: Option<Py<PyAny>>,
+    raised: Arc<Raised>,
+}
+
+impl Listener {
+    fn new(progress: Option<Py<PyAny>>, loss: Option<Py<PyAny>>) -> Self {
+        Self { progress, loss, raised: Arc::default() }
+    }
+
+    /// Does the work without Python's lock, hears its events with it, and raises what was raised meanwhile.
+    fn drive(
+        &self,
+        py: Python<'_>,
+        options: TrainOptions,
+        work: impl FnOnce(&TrainOptions, &mut dyn FnMut(&Event)) -> Result<Outcome> + Send,
+    ) -> PyResult<Run> {
+        let own_loss = self.loss.as_ref().map(|f| own_loss(f.clone_ref(py), &self.raised));
+        let options = TrainOptions { own_loss, ..options };
+        let done = py.detach(|| {
+            work(&options, &mut |event| {
+                if let Err(error) = Python::attach(|py| self.hear(py, event)) {
+                    self.raised.raise(error);
+                }
+            })
+        });
+        match (done, self.raised.take()) {
+            (Ok(outcome), None) => Ok(Run { path: outcome.run }),
+            (Ok(outcome), Some(error)) => {
+                note(py, &error, &outcome.run);
+                Err(error)
+            }
+            (Err(_), Some(error)) => Err(error),
+            (Err(error), None) => Err(error).or_raise(),
+        }
+    }
+
+    fn hear(&self, py: Python<'_>, event: &Event) -> PyResult<()> {
+        // Ctrl-C, and whatever other signals have Python functions.
+        py.check_signals()?;
+        match (&self.progress, event) {
+            (Some(progress), _) => {
+                let value = serde_json::to_value(event).expect("events are plain data");
+                progress.call1(py, (plain(py, &value)?,)).map(drop)
+            }
+            (None, Event::Warning { message }) => warn(py, std::slice::from_ref(message)),
+            _ => Ok(()),
+        }
+    }
+}
+
+/// Adds to an exception where the run is saved, where Python has room for that (3.11).
+fn note(py: Python<'_>, error: &PyErr, run: &Path) {
+    let text = format!("The run is saved in {0}; go on with splat4d.resume({0:?})", run.display());
+    let _ = error.value(py).call_method1("add_note", (text,));
+}

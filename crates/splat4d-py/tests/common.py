@@ -1,0 +1,23 @@
+"""What the tests share: where the repository is, and short settings of training."""
+
+import pathlib
+import shutil
+import tempfile
+import unittest
+
+ROOT = pathlib.Path(__file__).resolve().parents[3]
+KNIGHT = ROOT / "examples/knight"
+PLAYABLE = ROOT / "examples/knight.splat4d"
+# A few seconds of training: the pictures are small and few.
+SHORT = dict(iterations=60, downscale=8, max_frames=3, checkpoint_interval=20, motion="spacetime")
+
+
+class InFolder(unittest.TestCase):
+    """A test with a folder of its own."""
+
+    def setUp(self):
+        self.folder = pathlib.Path(tempfile.mkdtemp())
+        self.addCleanup(shutil.rmtree, self.folder)
+
+    def scene_bytes(self, run):
+        return (pathlib.Path(run.path) / "scene.safetensors").read_bytes()

@@ -1,0 +1,53 @@
+// <splat-4d>: attributes and events are in docs/player.md of the repository.
+
+export interface CameraState {
+  position: [number, number, number];
+  /** wxyz: takes the camera's axes (x right, y down, z forward) to the world's. */
+  quat: [number, number, number, number];
+  target: [number, number, number];
+  /** Degrees over the shorter side. */
+  fov: number;
+}
+
+export type Channel = 'color' | 'depth' | 'alpha' | 'flow';
+
+export interface Splat4DEventMap extends HTMLElementEventMap {
+  load: CustomEvent<{ meta: Record<string, unknown>; milliseconds: number }>;
+  timeupdate: CustomEvent<{ time: number }>;
+  channelchange: CustomEvent<{ channel: Channel }>;
+  camerachange: CustomEvent<{ camera: CameraState }>;
+  error: CustomEvent<{ what: string; where: string; remedy: string }> & ErrorEvent;
+}
+
+export class Splat4D extends HTMLElement {
+  play(): void;
+  pause(): void;
+  seek(seconds: number): void;
+  step(frames: number): void;
+  currentTime: number;
+  readonly duration: number;
+  readonly paused: boolean;
+  get camera(): CameraState;
+  set camera(camera: Partial<CameraState>);
+  set scene(source: File | Blob | ArrayBuffer);
+  screenshot(): Promise<Blob>;
+  settled(): Promise<void>;
+  readonly link: string;
+  readonly statistics: Record<string, unknown>;
+  addEventListener<K extends keyof Splat4DEventMap>(
+    type: K,
+    listener: (this: Splat4D, event: Splat4DEventMap[K]) => unknown,
+    options?: boolean | AddEventListenerOptions,
+  ): void;
+  addEventListener(
+    type: string,
+    listener: EventListenerOrEventListenerObject,
+    options?: boolean | AddEventListenerOptions,
+  ): void;
+}
+
+declare global {
+  interface HTMLElementTagNameMap {
+    'splat-4d': Splat4D;
+  }
+}
