@@ -40,6 +40,9 @@ pub struct Body {
     pub points: Vec<[f64; 3]>,
 }
 
+/// A centre and a rotation (rows).
+pub type Pose = ([f64; 3], [[f64; 3]; 3]);
+
 /// A world over all its frames.
 #[derive(Clone, Debug)]
 pub struct World {
@@ -47,8 +50,8 @@ pub struct World {
     pub name: String,
     /// What moves.
     pub bodies: Vec<Body>,
-    /// \[frames]\[bodies]: centre and rotation (rows).
-    pub poses: Vec<Vec<([f64; 3], [[f64; 3]; 3])>>,
+    /// \[frames]\[bodies].
+    pub poses: Vec<Vec<Pose>>,
     /// \[frames]: nodes of the cloth, row by row; empty without one.
     pub cloth: Vec<Vec<[f64; 3]>>,
     /// What is done to it.
@@ -83,16 +86,15 @@ impl World {
 
     /// True places of all nodes at a frame.
     pub fn nodes(&self, frame: usize) -> Vec<[f64; 3]> {
-        let of = |(body, (x, r)): (&Body, &([f64; 3], [[f64; 3]; 3]))| {
-            body.points.iter().map(|p| add(*x, mat_vec(r, *p))).collect::<Vec<_>>()
-        };
+        let of =
+            |(body, (x, r)): (&Body, &Pose)| body.points.iter().map(|p| add(*x, mat_vec(r, *p))).collect::<Vec<_>>();
         let mut out: Vec<[f64; 3]> = self.bodies.iter().zip(&self.poses[frame]).flat_map(of).collect();
         out.extend(self.cloth.get(frame).into_iter().flatten());
         out
     }
 }
 
-type Poses = Vec<Vec<([f64; 3], [[f64; 3]; 3])>>;
+type Poses = Vec<Vec<Pose>>;
 
 const IDENTITY: [[f64; 3]; 3] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
 
@@ -191,7 +193,7 @@ fn bounce() -> (Vec<Body>, Poses) {
             v[1] -= dt * GRAVITY;
             x = add(x, scale(v, dt));
             if x[1] < RADIUS && v[1] < 0.0 {
-                v[1] = -KEPT * v[1];
+                v[1] *= -KEPT;
             }
         }
     }

@@ -17,7 +17,7 @@ impl Capture {
         let place = |e: Error| e.at(format!("{} (capture.observe = {share})", self.root.display()));
         let times = || self.train.iter().chain(&self.held).map(|&i| self.frames[i].time.0);
         let (first, last) = times().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), t| (a.min(t), b.max(t)));
-        if !(last > first) {
+        if last <= first {
             return Err(place(Error::input("the capture has one moment, and so no future"))
                 .remedy("Leave --observe away, or give a moving take"));
         }
