@@ -30,6 +30,7 @@ Examples:
   splat4d train my-take --motion still              one scene for all times: a calibration check
   splat4d train my-take --downscale 4 --set iterations=1000 --set sh_degree=0
   splat4d train my-take --hold-out camera=0,10      measure on these cameras
+  splat4d train my-take --observe 0.8               keep the last fifth of the take for `predict`
   splat4d train my-take --device auto               a GPU draws, if there is one
   splat4d train --resume runs/first                 continue exactly where it stopped
 
@@ -65,7 +66,7 @@ pub struct Args {
     output: Option<PathBuf>,
     /// Continue this run exactly where its newest checkpoint is
     #[arg(long, value_name = "RUN", conflicts_with_all = ["capture", "output", "motion", "minutes", "quality", "recipe", "set",
-        "downscale", "hold_out", "image_memory", "seed", "source", "iterations", "force"])]
+        "downscale", "hold_out", "observe", "image_memory", "seed", "source", "iterations", "force"])]
     resume: Option<PathBuf>,
     /// Replace the run in the -o folder
     #[arg(long)]
@@ -100,6 +101,9 @@ pub struct Args {
     /// Views kept from training: camera=0,10 or every=8 or none [default: the data set's convention]
     #[arg(long, value_name = "RULE", help_heading = "What is read")]
     hold_out: Option<String>,
+    /// Train on the first SHARE of the clip only; what comes later scores `predict` and is not looked at [default: 1]
+    #[arg(long, value_name = "SHARE", help_heading = "What is read")]
+    observe: Option<f64>,
     /// Memory for decoded pictures [default: 1GiB]
     #[arg(long, value_name = "SIZE", value_parser = parse_bytes, help_heading = "What is read")]
     image_memory: Option<u64>,
@@ -241,6 +245,7 @@ fn recipe(args: &Args) -> anyhow::Result<Recipe> {
     set("seed", args.seed.map(|v| v.to_string()))?;
     set("downscale", args.downscale.map(|v| v.to_string()))?;
     set("hold_out", args.hold_out.as_ref().map(quoted))?;
+    set("capture.observe", args.observe.map(|v| v.to_string()))?;
     set("image_memory", args.image_memory.map(|v| v.to_string()))?;
     set("iterations", args.iterations.map(|v| v.to_string()))?;
     set("max_cap", args.max_cap.map(|v| v.to_string()))?;

@@ -54,6 +54,7 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
         held,
         train,
         validation,
+        future: Vec::new(),
         timing: take.timing,
         fps: take.fps,
         points,

@@ -16,6 +16,7 @@ mod json;
 mod layout;
 mod lens;
 mod n3dv;
+mod observe;
 mod options;
 mod own;
 mod panoptic;
@@ -103,6 +104,8 @@ pub enum Split {
     Held,
     /// Kept from training: the data set's own validation set (D-NeRF).
     Validation,
+    /// Later than what is observed ([`Capture::observe`]): only scores predictions.
+    Future,
 }
 
 /// A posed, timed set of pictures on disk.
@@ -124,6 +127,8 @@ pub struct Capture {
     pub train: Vec<usize>,
     /// Indices of the data set's own validation frames.
     pub validation: Vec<usize>,
+    /// Indices of the frames after the observed part, of every camera; see [`observe`](Self::observe).
+    pub future: Vec<usize>,
     /// Where the times are from.
     pub timing: Timing,
     /// Frames per second.
@@ -222,6 +227,8 @@ impl Capture {
             Split::Held
         } else if self.validation.binary_search(&frame).is_ok() {
             Split::Validation
+        } else if self.future.binary_search(&frame).is_ok() {
+            Split::Future
         } else {
             Split::Train
         }

@@ -98,6 +98,8 @@ settings! {
         /// How near to a camera Gaussians are drawn, of the extent; less where the capture's points come nearer, a
         /// quarter of it where there are none.
         near: f64 = NEAR => below_one().unit("extents");
+        /// Share of the used part of the clip that training may see; what comes later only scores predictions. 1: all.
+        observe: f64 = 1.0 => share();
         /// First frame of the take that is used.
         first_frame: usize = 0 => any().unit("frames");
         /// RGBA captures composite on white; false: on black.

@@ -32,14 +32,14 @@ fn assert_same(render: &Planes<f32>, truth: &Planes<f32>) {
 /// −10 log₁₀ of the mean squared error in dB; infinite for equal images, `None` for one without pixels.
 ///
 /// Shapes: `[C,H,W]` both. Panics: shapes differ.
-pub(crate) fn psnr(render: &Planes<f32>, truth: &Planes<f32>) -> Option<f64> {
+pub fn psnr(render: &Planes<f32>, truth: &Planes<f32>) -> Option<f64> {
     psnr_where(render, truth, |_| true)
 }
 
 /// [`psnr`] over the pixels p (row-major) with `region[p]`; `None` where there are none.
 ///
 /// Panics: shapes differ, or the region is not `[H·W]`.
-pub(crate) fn psnr_region(render: &Planes<f32>, truth: &Planes<f32>, region: &[bool]) -> Option<f64> {
+pub fn psnr_region(render: &Planes<f32>, truth: &Planes<f32>, region: &[bool]) -> Option<f64> {
     assert_eq!(region.len(), render.pixels(), "a region holds one value a pixel");
     psnr_where(render, truth, |p| region[p])
 }

@@ -15,7 +15,7 @@ use splat4d::math::se3::{norm, sub};
 use splat4d::scene::Time;
 
 /// Where a capture keeps the truth.
-pub(crate) const FILE: &str = "truth/tracks.npy";
+pub const FILE: &str = "truth/tracks.npy";
 /// Gaussians that carry a point: one alone may be a floater.
 const CARRIERS: usize = 4;
 /// Fainter Gaussians are not taken for a surface.

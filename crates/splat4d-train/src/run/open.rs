@@ -61,6 +61,9 @@ pub fn open_capture(path: &Path, recipe: &Recipe) -> Result<Capture> {
             .remedy("Change first_frame or max_frames"));
         }
     }
+    if recipe.capture.observe < 1.0 {
+        capture.observe(recipe.capture.observe, recipe.capture.near)?;
+    }
     Ok(capture)
 }
 

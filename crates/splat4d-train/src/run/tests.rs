@@ -2,6 +2,7 @@
 //! that roll back; outputs, memory and checkpoints that are refused.
 
 mod device;
+mod observe;
 mod on_time;
 mod own_loss;
 

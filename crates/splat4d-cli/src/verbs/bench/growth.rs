@@ -181,6 +181,7 @@ fn capture(pinned: &Pinned, root: &Path, pictures: &[PathBuf], count: usize) -> 
         held: Vec::new(),
         train: (0..count).collect(),
         validation: Vec::new(),
+        future: Vec::new(),
         timing: Timing::Told,
         fps: pinned.scene.fps,
         points: None,
