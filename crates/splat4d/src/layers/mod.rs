@@ -32,6 +32,9 @@ pub const ALPHA_MIN: f64 = 1.0 / 255.0;
 /// The span of a layer that may be seen at any time.
 pub const ALWAYS: [f64; 2] = [f64::NEG_INFINITY, f64::INFINITY];
 
+/// Beginning of the names of layers that show what was predicted, not what was seen.
+pub const PREDICTED: &str = "predicted";
+
 /// Gaussians with one motion model and one kind of life.
 pub struct Layer<F: Real = f32> {
     /// The user's name for it.
@@ -385,6 +388,12 @@ impl<F: Real> Scene<F> {
     /// Whether anything depends on time: motion, life, or a layer's span.
     pub fn is_moving(&self) -> bool {
         self.layers.iter().any(|l| l.motion.capabilities().moves || l.life != LifeKind::Infinite || l.span != ALWAYS)
+    }
+
+    /// From when on the scene shows what was predicted, seconds; `None`: it was seen as it is.
+    pub fn predicted_from(&self) -> Option<f64> {
+        let predicted = self.layers.iter().filter(|l| l.name.starts_with(PREDICTED));
+        predicted.map(|l| l.span[0]).filter(|t| t.is_finite()).min_by(f64::total_cmp)
     }
 
     /// The scene at time t, for playback: only Gaussians alive then. Question i of `evaluation` becomes layer i.

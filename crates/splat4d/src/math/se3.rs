@@ -103,6 +103,16 @@ pub fn sub(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
     [a[0] - b[0], a[1] - b[1], a[2] - b[2]]
 }
 
+/// a + b
+pub fn add(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+    [a[0] + b[0], a[1] + b[1], a[2] + b[2]]
+}
+
+/// s a
+pub fn scale(a: [f64; 3], s: f64) -> [f64; 3] {
+    a.map(|x| s * x)
+}
+
 /// Length.
 pub fn norm(a: [f64; 3]) -> f64 {
     dot(a, a).sqrt()

@@ -23,6 +23,9 @@ pub struct Meta {
     /// Metres a scene unit, where known.
     #[serde(default)]
     pub unit: Option<f64>,
+    /// From when on the scene shows what was predicted, seconds.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub predicted: Option<f64>,
     /// The scene's title.
     #[serde(default)]
     pub title: String,
