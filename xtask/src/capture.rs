@@ -34,7 +34,8 @@ const JPEG_QUALITY: u8 = 60;
 const TRUTH_CAMERAS: [usize; 4] = [2, 8, 11, 17];
 const TRUTH_FRAMES: [usize; 4] = [3, 10, 17, 24];
 
-/// `capture [FOLDER]`, `capture --check [N]`, `capture --still CHARACTER.glb FOLDER ...` and `capture --videos FOLDER`.
+/// `capture [FOLDER]`, `capture --check [N]`, `capture --still CHARACTER.glb FOLDER ...`, `capture --videos FOLDER` and
+/// `capture --world NAME FOLDER`.
 pub(crate) fn command(arguments: &[String]) -> Result<()> {
     let home = bundled_folder();
     match arguments {
@@ -49,11 +50,12 @@ pub(crate) fn command(arguments: &[String]) -> Result<()> {
             check(&home, &picks.map(|p| (p % CAMERAS, p / CAMERAS)).collect::<Vec<_>>())
         }
         [flag, rest @ ..] if flag == "--still" => crate::still::command(rest),
+        [flag, name, folder] if flag == "--world" => crate::world::command(name, Path::new(folder)),
         [flag, folder] if flag == "--videos" => crate::videos::command(Path::new(folder)),
         [] => write(&home, &home),
         [folder] if !folder.starts_with('-') => write(&home, Path::new(folder)),
         _ => bail!(
-            "capture takes a folder, --check with a number, --still with a character and a folder, or --videos with a folder"
+            "capture takes a folder, --check with a number, --still with a character and a folder, --videos with a folder, or --world with a name and a folder"
         ),
     }
 }

@@ -20,6 +20,7 @@ mod texture;
 mod truth;
 mod vector;
 mod videos;
+mod world;
 
 use anyhow::{Context, Result, bail, ensure};
 use std::path::Path;
@@ -36,6 +37,9 @@ chores:
                              hemisphere, PIXELS (default 400) wide and high; every 8th is held out
   capture --videos FOLDER    draws the scene as eight unsynchronised, uncalibrated, differently exposed videos with sound,
                              for `splat4d import`, and truth.json beside them
+  capture --world NAME FOLDER
+                             draws a world of known physics for `splat4d predict`: pendulum, circle, pushed-block, bounce,
+                             rolling, collision or cloth; true paths of its nodes and actions beside it
   strip-character IN.glb OUT.glb CLIP... [--drop NODE...]
                              keeps the named animation clips of a character, drops the named nodes' meshes
   site OUT [--no-api]        makes the static site in OUT: documents, API, a gallery that plays the example scenes

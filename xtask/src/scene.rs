@@ -81,6 +81,15 @@ impl Stage {
         [&self.knight.texture, &self.mage.texture]
     }
 
+    /// The hall with something else that moves; `feet`: where it stands on the floor.
+    pub(crate) fn with(&self, moving: &Mesh, feet: Vec<V3>) -> Frame {
+        let mut casters = self.props.clone();
+        casters.append(moving);
+        let mut mesh = self.fixed.clone();
+        mesh.append(moving);
+        Frame { mesh, first_vertex: [None; OBJECTS], skinned: [0..0, 0..0], light: Light::new(&casters, None), feet }
+    }
+
     /// The scene at frame `t`.
     pub(crate) fn frame(&self, t: usize) -> Result<Frame> {
         self.frame_at(t as f64)
