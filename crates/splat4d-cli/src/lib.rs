@@ -18,6 +18,7 @@ pub mod interrupt;
 pub mod measure;
 pub mod paths;
 mod playable;
+mod predicting;
 pub mod report;
 pub mod run_folder;
 pub mod sequence;
@@ -91,6 +92,7 @@ enum Verb {
     Import(verbs::import::Args),
     Train(Box<verbs::train::Args>),
     Eval(verbs::eval::Args),
+    Predict(verbs::predict::Args),
     Render(verbs::render::Args),
     Localise(verbs::localise::Args),
     Bake(verbs::bake::Args),
@@ -109,6 +111,7 @@ impl Verb {
             Verb::Import(args) => verbs::import::run(args, console),
             Verb::Train(args) => verbs::train::run(args, console),
             Verb::Eval(args) => verbs::eval::run(args, console),
+            Verb::Predict(args) => verbs::predict::run(args, console),
             Verb::Render(args) => verbs::render::run(args, console),
             Verb::Localise(args) => verbs::localise::run(args, console),
             Verb::Bake(args) => verbs::bake::run(args, console),

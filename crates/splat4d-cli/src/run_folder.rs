@@ -19,7 +19,7 @@ pub(crate) const COMPRESS: &str = "compress.json";
 /// File that holds the settings `compress` was asked for.
 pub(crate) const ORDER: &str = "compress.toml";
 /// Files and folders that splat4d writes into a run; `--force` replaces these and nothing else.
-const OURS: [&str; 27] = [
+const OURS: [&str; 28] = [
     "recipe.toml",
     "run.json",
     "scene.safetensors",
@@ -29,6 +29,7 @@ const OURS: [&str; 27] = [
     "results.json",
     "refined.json",
     "per_view.json",
+    "predict",
     COMPRESS,
     "cameras.json",
     "test",

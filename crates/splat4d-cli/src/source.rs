@@ -95,7 +95,8 @@ impl Source {
         opened.map_err(|e| e.at(path.display()))
     }
 
-    fn own(scene: Scene<f32>) -> Self {
+    /// A scene of our own, without a run.
+    pub(crate) fn own(scene: Scene<f32>) -> Self {
         Self { scene, run: None, ply: None, playback: None, dialect: None, warnings: Warnings::default() }
     }
 

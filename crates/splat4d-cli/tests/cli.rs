@@ -8,6 +8,8 @@ mod compress;
 mod convert;
 #[path = "cli/import.rs"]
 mod import;
+#[path = "cli/predict.rs"]
+mod predict;
 #[path = "cli/sample.rs"]
 mod sample;
 

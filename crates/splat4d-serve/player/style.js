@@ -63,6 +63,8 @@ button[disabled]{opacity:.4;pointer-events:none}
 .rail{left:0;right:0;background:var(--press)}
 .rail>.there{background:var(--muted);opacity:.45}
 .rail>.done{left:0;background:var(--accent)}
+.rail>.future{right:0;border-radius:0;background:repeating-linear-gradient(90deg,var(--text) 0 .16em,transparent .16em .4em)}
+.rail>.future[hidden]{display:none}
 .knob{position:absolute;top:50%;width:.95em;height:.95em;margin:-.475em;border-radius:50%;background:var(--accent);
  box-shadow:0 0 0 .2em var(--surface);transition:transform .12s}
 .scrub:hover .knob,.scrub:focus-visible .knob{transform:scale(1.2)}

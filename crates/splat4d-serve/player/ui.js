@@ -84,7 +84,8 @@ export class Interface {
   #scrub() {
     this.there = [];
     this.done = h('i', { class: 'done' });
-    this.rail = h('div', { class: 'rail' }, this.done);
+    this.future = h('i', { class: 'future', title: 'Predicted' });
+    this.rail = h('div', { class: 'rail' }, this.done, this.future);
     this.knob = h('div', { class: 'knob' });
     this.tip = h('div', { class: 'tip', 'aria-hidden': 'true' });
     const at = e => {
@@ -199,10 +200,13 @@ export class Interface {
     this.now.textContent = clock(at, p.duration);
     this.end.textContent = ` / ${clock(p.duration)}`;
     this.done.style.width = this.knob.style.left = `${100 * u}%`;
+    const from = p.meta?.predicted, predicted = Number.isFinite(from) && p.duration > 0;
+    this.future.hidden = !predicted;
+    if (predicted) this.future.style.left = `${100 * clamp((from - p.first) / p.duration, 0, 1)}%`;
     const s = this.scrub;
     s.setAttribute('aria-valuemax', p.duration.toFixed(2));
     s.setAttribute('aria-valuenow', at.toFixed(2));
-    s.setAttribute('aria-valuetext', `${at.toFixed(2)} of ${p.duration.toFixed(2)} seconds`);
+    s.setAttribute('aria-valuetext', `${at.toFixed(2)} of ${p.duration.toFixed(2)} seconds${predicted && p.shown >= from ? ', predicted' : ''}`);
   }
 
   #progress() {

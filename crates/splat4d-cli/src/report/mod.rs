@@ -6,6 +6,7 @@ pub mod chart;
 pub(crate) mod compress;
 pub(crate) mod doctor;
 mod pictures;
+pub(crate) mod predict;
 mod refined;
 
 use crate::files::{self, grouped, human_bytes, human_seconds};

@@ -59,27 +59,29 @@ pub(super) fn reduced(picture: RgbImage) -> Option<String> {
 
 /// The orbit film: inside the page if small, else linked beside it.
 pub(super) fn film(run: &Path) -> Option<String> {
-    let (path, video) = orbit(run)?;
+    film_file(&orbit(run)?, "The scene, seen from a camera that moves around it")
+}
+
+/// A film's file: inside the page if small, else linked beside it.
+pub(super) fn film_file(path: &Path, alt: &str) -> Option<String> {
+    let video = path.extension().is_some_and(|e| e == "mp4");
     let small = path.metadata().ok()?.len() <= FILM_BYTES;
     let name = path.file_name()?.to_string_lossy().into_owned();
     let source = if small {
         let kind = if video { "video/mp4" } else { "image/png" };
-        format!("data:{kind};base64,{}", base64(&std::fs::read(&path).ok()?))
+        format!("data:{kind};base64,{}", base64(&std::fs::read(path).ok()?))
     } else {
         name
     };
     Some(if video {
         format!(r#"<video controls loop muted autoplay playsinline src="{source}"></video>"#)
     } else {
-        format!(r#"<img class="film" alt="The scene, seen from a camera that moves around it" src="{source}">"#)
+        format!(r#"<img class="film" alt="{alt}" src="{source}">"#)
     })
 }
 
-fn orbit(run: &Path) -> Option<(PathBuf, bool)> {
-    [("orbit.mp4", true), ("orbit.png", false)]
-        .into_iter()
-        .map(|(name, video)| (run.join(name), video))
-        .find(|(path, _)| path.is_file())
+fn orbit(run: &Path) -> Option<PathBuf> {
+    ["orbit.mp4", "orbit.png"].map(|name| run.join(name)).into_iter().find(|path| path.is_file())
 }
 
 /// `count` indices spread evenly over 0..n, the first and last among them.

@@ -10,6 +10,7 @@ pub(crate) mod export;
 pub(crate) mod import;
 pub(crate) mod info;
 pub(crate) mod localise;
+pub(crate) mod predict;
 pub(crate) mod render;
 pub mod train;
 pub(crate) mod view;

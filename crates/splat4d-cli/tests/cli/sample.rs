@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 const CAMERAS: usize = 4;
+/// Frames unless told.
 const FRAMES: usize = 4;
 const SIZE: [u32; 2] = [32, 24];
 
@@ -21,6 +22,7 @@ const PROGRAM: Option<&str> = match option_env!("CARGO_BIN_EXE_splat4d") {
 /// Sample capture that is written, and how it is spoilt.
 pub(crate) struct Capture {
     folder: PathBuf,
+    pub frames: usize,
     pub distance: f64,
     pub focal: f64,
     /// Size of the picture files.
@@ -40,6 +42,7 @@ impl Capture {
     pub(crate) fn new(work: &Path) -> Self {
         Self {
             folder: work.join("capture"),
+            frames: FRAMES,
             distance: 3.0,
             focal: 30.0,
             pictures: SIZE,
@@ -75,7 +78,7 @@ impl Capture {
         let masks = self.folder.join(format!("masks/cam{camera}"));
         std::fs::create_dir_all(&images).unwrap();
         std::fs::create_dir_all(&masks).unwrap();
-        for frame in 0..FRAMES {
+        for frame in 0..self.frames {
             let path = images.join(format!("{frame:04}.png"));
             if self.missing == Some((camera, frame)) {
                 let _ = std::fs::remove_file(&path);
@@ -100,7 +103,7 @@ impl Capture {
         let mut value = json!({
             "name": format!("cam{camera}"), "width": SIZE[0], "height": SIZE[1], "fx": self.focal, "fy": self.focal,
             "cx": 16, "cy": 12, "world_to_camera": rows, "images": format!("images/cam{camera}/%04d.png"),
-            "frames": FRAMES,
+            "frames": self.frames,
         });
         if self.black_masks {
             value["masks"] = json!(format!("masks/cam{camera}/%04d.png"));
@@ -110,7 +113,7 @@ impl Capture {
 
     /// A square of half-width 0.3 at x = −0.6 … 0.6 before a wall with a slow pattern.
     fn picture(&self, pose: &Se3, frame: usize) -> RgbImage {
-        let center = -0.6 + 0.4 * frame as f64;
+        let center = -0.6 + 1.2 * frame as f64 / (self.frames - 1) as f64;
         let world = pose.inverse();
         let eye = world.translation;
         RgbImage::from_fn(self.pictures[0], self.pictures[1], |x, y| {

@@ -1,0 +1,95 @@
+//! `predict`: how a run that saw a part of its take goes on, compared with the part that it did not see.
+
+use crate::console::Console;
+use crate::files;
+use crate::predicting::{Order, Work};
+use splat4d::{Error, Result};
+use splat4d_dynamics::actions::Actions;
+use splat4d_dynamics::learnt::Training;
+use splat4d_dynamics::models::Model;
+use splat4d_dynamics::nodes::MAX_NODES;
+use std::path::PathBuf;
+
+const EXAMPLES: &str = "\
+Examples:
+  splat4d train my-take --observe 0.8 -o runs/seen      the last fifth is not looked at
+  splat4d predict runs/seen                             all models, as far as there are pictures to compare with
+  splat4d predict runs/seen --model koopman --horizon 90   three seconds, of which some cannot be compared
+  splat4d predict runs/seen --model graph --seeds 3     an ensemble tells how sure it is
+  splat4d predict runs/block --actions actions.csv      what is done to the scene, a row a frame from its first
+  splat4d predict runs/seen --oracle runs/all           beside a run of the same take that saw all of it
+  splat4d predict runs/seen --assimilate                corrected by each new frame, beside the open loop
+
+Models, each a baseline for the next: freeze, velocity, acceleration, extrapolate (what the motion model itself says of later
+times), koopman (linear with delays), causal (state space), graph (messages along edges). RUN/predict holds report.html,
+predict.json, dynamics.safetensors and the predicted scene as scene.splat4d and scene.safetensors, which view, render, bake and
+export take. With several models the scene is that of the one that forecasts the last fifth of the observed part best.";
+
+/// Default of `--nodes`.
+const NODES: usize = 48;
+/// Largest horizon, frames: a minute at 60 frames a second.
+const MAX_HORIZON: usize = 3600;
+/// Most members of an ensemble.
+const MAX_SEEDS: u64 = 16;
+
+/// Predict how a scene goes on, and compare with the part of the take that was kept from training
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub(crate) struct Args {
+    /// The run, trained with --observe; its capture must still be where it was
+    #[arg(value_name = "RUN")]
+    run: PathBuf,
+    /// Frames to predict [default: as many as there are pictures of]
+    #[arg(long, value_name = "FRAMES", value_parser = clap::value_parser!(u32).range(1..=MAX_HORIZON as i64))]
+    horizon: Option<u32>,
+    /// freeze, velocity, acceleration, extrapolate, koopman, causal, graph or all
+    #[arg(long, value_name = "NAME", default_value = "all")]
+    model: String,
+    /// What is done to the scene: a header of up to 8 names, then a row a frame from the first of the clip on. Columns NAME.x,
+    /// NAME.y, NAME.z are a vector
+    #[arg(long, value_name = "CSV")]
+    actions: Option<PathBuf>,
+    /// Members of the ensembles of the trained models
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=MAX_SEEDS))]
+    seeds: u64,
+    /// Most nodes that carry what moves
+    #[arg(long, value_name = "N", default_value_t = NODES as u32, value_parser = clap::value_parser!(u32).range(1..=MAX_NODES as i64))]
+    nodes: u32,
+    /// Steps that train causal and graph
+    #[arg(long, value_name = "STEPS", default_value_t = 1500, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    steps: u32,
+    /// Tell causal and graph which way is down
+    #[arg(long)]
+    gravity: bool,
+    /// Correct the prediction by each new frame: predict, draw, compare, update
+    #[arg(long)]
+    assimilate: bool,
+    /// A run of the same capture that saw all of it: the best that can be reached
+    #[arg(long, value_name = "RUN")]
+    oracle: Option<PathBuf>,
+    /// No films of truth and prediction
+    #[arg(long)]
+    no_film: bool,
+}
+
+pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
+    let models = match args.model.as_str() {
+        "all" => Model::ALL.to_vec(),
+        name => name.split(',').map(|n| Model::from_name(n.trim())).collect::<Result<_>>()?,
+    };
+    let read = |path: &PathBuf| Actions::parse(&files::read_text(path)?).map_err(|e: Error| e.at(path.display()));
+    let order = Order {
+        run: args.run.clone(),
+        horizon: args.horizon.map(|h| h as usize),
+        models,
+        actions: args.actions.as_ref().map(read).transpose()?,
+        seeds: args.seeds,
+        nodes: args.nodes as usize,
+        training: Training { steps: args.steps as usize, seed: 0 },
+        gravity: args.gravity,
+        assimilate: args.assimilate,
+        oracle: args.oracle.clone(),
+        film: !args.no_film,
+    };
+    Work::open(order, console)?.run(console)
+}
