@@ -168,6 +168,7 @@ impl Capture {
             Split::Train => "train",
             Split::Held => "test",
             Split::Validation => "val",
+            Split::Future => "future",
         };
         Ok(Frame {
             number: at,
@@ -209,7 +210,7 @@ pub(crate) struct Frame {
     time: f64,
     /// Frame number in the take.
     index: usize,
-    /// `train`, `test` or `val`.
+    /// `train`, `test`, `val` or `future`.
     split: &'static str,
     /// The picture file.
     file: PathBuf,

@@ -124,7 +124,7 @@ class Frame:
     camera: Camera
     time: float
     index: int
-    split: Literal["train", "test", "val"]
+    split: Literal["train", "test", "val", "future"]
     file: Any
 
 @final
