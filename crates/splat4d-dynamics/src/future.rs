@@ -9,7 +9,7 @@ use splat4d::math::knn::mean_square_distance;
 use splat4d::math::se3::sub;
 use splat4d::motion::control::{ControlSpec, Curve, TrajectorySpec, skinned};
 use splat4d::motion::skin::SkinSpec;
-use splat4d::motion::{Spec, build};
+use splat4d::motion::{Motion, Still};
 use splat4d::scene::params::LoadedArray;
 use splat4d::scene::{GEOMETRY, LifeKind, Params, SH, Time};
 use std::sync::Arc;
@@ -58,14 +58,13 @@ pub fn predicted(scene: &Scene<f32>, observed: &Observed, moments: &[Moment], cl
             alive = (0..layer.params.len() as u32).collect();
         }
         let (moves, stands): (Vec<u32>, Vec<u32>) = alive.iter().partition(|i| moving[**i as usize]);
-        let add = |kind: &str, (params, motion)| {
+        let add = |kind: &str, (params, motion): (_, Arc<dyn Motion<f32>>)| {
             let name = format!("{PREDICTED}, {kind}: {}", layer.name);
             Layer { span: [clock.cut(), f64::INFINITY], ..Layer::new(name, params, motion, LifeKind::Infinite) }
         };
         if !stands.is_empty() {
-            let mut params = freeze_rows(layer, &stands, Time(clock.until));
-            let motion = build(&Spec::Still, &mut params)?;
-            out.layers.push(add("standing", (params, motion)));
+            let params = freeze_rows(layer, &stands, Time(clock.until));
+            out.layers.push(add("standing", (params, Arc::new(Still))));
         }
         if !moves.is_empty() {
             let params = freeze_rows(layer, &moves, Time(clock.until));
@@ -81,7 +80,7 @@ fn carried(
     paths: &Paths,
     moments: &[Moment],
     clock: Clock,
-) -> Result<(Params<f32>, Arc<dyn splat4d::motion::Motion<f32>>)> {
+) -> Result<(Params<f32>, Arc<dyn Motion<f32>>)> {
     let (rest, keys) = (paths.last(), moments.len() + 1);
     let array = |name: &str, width: usize, number: &dyn Fn(usize, usize) -> f64| LoadedArray {
         name: name.into(),
