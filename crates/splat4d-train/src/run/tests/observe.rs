@@ -11,10 +11,10 @@ const SHARE: f64 = 0.6;
 fn other_pictures_of_the_future_make_the_same_tensors() {
     // Masks of motion, exposures, clocks, growth and pruning: whatever looks at pictures is switched on.
     let settings = [
-        "motion=spacetime init=pictures densify_interval=5",
+        "motion=spacetime init=auto densify.interval=5",
         "motion=control control_nodes=12 exposure=true refine.times=true",
         "motion=tracked",
-        "motion=auto init=hull",
+        "motion=auto init=auto",
     ];
     for changes in settings {
         let mut sets: Vec<&str> = changes.split(' ').collect();
