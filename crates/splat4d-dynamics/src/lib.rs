@@ -1,7 +1,7 @@
 //! Predicts how a reconstructed scene goes on: observe, reconstruct, predict, render, compare, correct.
 //!
 //! [`nodes::observe`] finds some hundred nodes with identity on whatever moves in a trained scene; a [`models::Model`] of the
-//! ladder learns from their observed paths, and [`Forecaster::rollout`](models::Forecaster::rollout) goes on from the last
+//! ladder learns from their observed paths, and [`Fitted::rollout`](models::Fitted::rollout) goes on from the last
 //! observed moment, with actions where there are any; [`future::predicted`] makes a scene of it, which bakes, plays and
 //! exports like any other. Every rung is a baseline for the next, from a scene that freezes to a network that was trained
 //! over whole rollouts; `score` tells how much each is worth.

@@ -28,7 +28,7 @@ impl Cholesky {
         Some(Self { n, lower: a })
     }
 
-    /// A⁻¹ b; b: [n].
+    /// A⁻¹ b; `b`: `[n]`.
     pub fn solve(&self, mut b: Vec<f64>) -> Vec<f64> {
         let n = self.n;
         for i in 0..n {
