@@ -24,8 +24,8 @@ use crate::methods::{
 };
 use crate::settings::Table;
 use crate::upkeep::{
-    AdcSettings, DensifySettings, GuidedSettings, McmcSettings, MergeSettings, NodeSettings, OpacityResetSettings,
-    PruneSettings, RelocateSettings, SplitSettings,
+    AdcSettings, DensifySettings, FloaterSettings, GuidedSettings, McmcSettings, MergeSettings, NodeSettings,
+    OpacityResetSettings, PruneSettings, RelocateSettings, SplitSettings,
 };
 pub use quality::Quality;
 pub use replans::{Replan, Replans};
@@ -80,6 +80,7 @@ recipe! {
     mcmc: McmcSettings,
     relocate: RelocateSettings,
     guided: GuidedSettings,
+    floaters: FloaterSettings,
     prune: PruneSettings,
     merge: MergeSettings,
     split: SplitSettings,

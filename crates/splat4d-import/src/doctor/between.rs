@@ -64,6 +64,7 @@ fn sight(name: &str, number: usize, stand: &Stand, most: usize) -> Sight {
         lens: number,
         frame: 0.0,
         features: found.iter().map(feature).collect(),
+        shown: Vec::new(),
     }
 }
 

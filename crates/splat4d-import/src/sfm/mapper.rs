@@ -1,5 +1,7 @@
 //! Cameras one after another: a pair to start with, then always the one that sees most of what is known.
 
+mod overlaid;
+
 use super::adjust::{Bundle, Free, Priors, Settings, Sighting, View, adjust};
 use super::lens::{Lens, off};
 use super::pictures::{Feature, Sight};
@@ -678,7 +680,9 @@ impl Map<'_> {
             let seen: Vec<(usize, usize)> = spot.seen.iter().map(|&k| self.tracks[t].seen[k]).collect();
             let off = spot.seen.iter().map(|&k| self.off(t, k, spot.place) * self.tolerance(self.tracks[t].seen[k].0));
             let error = off.sum::<f64>() / spot.seen.len() as f64;
-            Some(Found { place: spot.place, seen, error })
+            let first = &self.sights[seen[0].0].features[seen[0].1];
+            let (color, moment) = (first.color, first.moment);
+            Some(Found { place: spot.place, color, moment, seen: seen.into_iter().map(|(s, _)| s).collect(), error })
         };
         Mapped {
             cameras: (0..self.sights.len()).map(of).collect(),
@@ -709,8 +713,12 @@ pub struct Stand {
 pub struct Found {
     /// In the world.
     pub place: [f64; 3],
-    /// Sights that see it, and which of their features it is.
-    pub seen: Vec<(usize, usize)>,
+    /// sRGB.
+    pub color: [u8; 3],
+    /// As of its features.
+    pub moment: usize,
+    /// Sights that see it.
+    pub seen: Vec<usize>,
     /// Mean distance from where it is seen, pixels.
     pub error: f64,
 }
@@ -770,5 +778,12 @@ pub fn map(
     map.finish();
     map.grow(&mut |n| progress.phase("placing cameras", n, sights.len()));
     map.finish();
-    Some(if map.order.len() >= best.order.len() { map.result() } else { best.result() })
+    if map.order.len() < best.order.len() {
+        return Some(best.result());
+    }
+    let (exact, longer) = map.overlaid();
+    let ground = Ground::new(&exact, &longer, links, how);
+    let mut map = ground.again(&map);
+    map.finish();
+    Some(map.result())
 }

@@ -11,6 +11,7 @@ mod flow;
 pub mod known;
 pub mod lens;
 pub mod mapper;
+mod overlay;
 pub mod pictures;
 pub mod resection;
 mod sample;
@@ -160,7 +161,7 @@ fn solve_sights(
 fn in_units(who: &[Who], sights: &[Sight], mapped: mapper::Mapped, pairs: usize) -> Solution {
     let mut distances = vec![Vec::new(); sights.len()];
     for p in &mapped.points {
-        for &(s, _) in &p.seen {
+        for &s in &p.seen {
             if let Ok(camera) = &mapped.cameras[s] {
                 distances[s].push(norm(sub(p.place, camera.pose.inverse().translation)));
             }
@@ -189,16 +190,12 @@ fn solution(who: &[Who], sights: &[Sight], mapped: mapper::Mapped, pairs: usize,
         .zip(who)
         .map(|(c, &(camera, frame))| Taken { camera, frame, name: c.1.name.clone(), placed: placed(c) })
         .collect();
-    let point = |p: mapper::Found| {
-        let (s, f) = p.seen[0];
-        let first = &sights[s].features[f];
-        Point {
-            place: p.place.map(|v| v * scale),
-            color: first.color,
-            moment: first.moment,
-            seen: p.seen.iter().map(|(s, _)| *s).collect(),
-            error: p.error,
-        }
+    let point = |p: mapper::Found| Point {
+        place: p.place.map(|v| v * scale),
+        color: p.color,
+        moment: p.moment,
+        seen: p.seen,
+        error: p.error,
     };
     let poses: Vec<Se3> = taken.iter().filter_map(|t| t.placed.as_ref().ok().map(|p| p.pose)).collect();
     Solution {

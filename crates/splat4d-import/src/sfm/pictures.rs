@@ -2,6 +2,7 @@
 
 use super::flow::{Pyramid, surely};
 use super::known::Known;
+use super::overlay::Shown;
 use crate::{Error, Result};
 use rayon::prelude::*;
 use splat4d::math::Se3;
@@ -78,6 +79,8 @@ pub struct Sight {
     pub frame: f64,
     /// In the order of moments.
     pub features: Vec<Feature>,
+    /// What each moment's features are from, by the moment's number.
+    pub shown: Vec<Option<Shown>>,
 }
 
 /// What features are taken from.
@@ -277,18 +280,23 @@ fn sight(pictures: &dyn Pictures, camera: usize, look: &Look, moments: &[f64]) -
     let mut features =
         found(&background, limits(look.still), &|x, y| counts.as_ref().is_none_or(|m| m.counts(x, y)), 0);
     let frame = frame_length(pictures, camera);
+    let mut shown = vec![Some(Shown::new(&grey(&background), [0, 0], 0.0))];
     if pictures.frames(camera) >= MEDIAN_FROM {
         for (m, &t) in moments.iter().enumerate() {
             let off = |k: usize| (pictures.time(camera, k) - t).abs();
             let nearest =
                 (0..pictures.frames(camera)).min_by(|&a, &b| off(a).total_cmp(&off(b))).expect("there are some");
+            let mut window = None;
             if off(nearest) <= TOO_FAR * frame {
-                features.extend(moving(pictures, camera, nearest, &background, look, m + 1, t)?);
+                let (found, from) = moving(pictures, camera, nearest, &background, look, m + 1, t)?;
+                features.extend(found);
+                window = from;
             }
+            shown.push(window);
         }
     }
     let size = [background.width, background.height];
-    Ok(Sight { name: pictures.name(camera), features, frame, ..empty(pictures, camera, size, factor) }
+    Ok(Sight { name: pictures.name(camera), features, shown, frame, ..empty(pictures, camera, size, factor) }
         .straightened(pictures, camera))
 }
 
@@ -304,6 +312,7 @@ fn empty(pictures: &dyn Pictures, camera: usize, size: [usize; 2], factor: f64) 
         lens: pictures.lens(camera),
         frame: 0.0,
         features: Vec::new(),
+        shown: Vec::new(),
     }
 }
 
@@ -354,7 +363,7 @@ impl Window {
 }
 
 /// Features of what moves in a frame, each with its velocity; brought to the time of the moment, which may lie beside the
-/// frame's.
+/// frame's. And what they are from.
 fn moving(
     pictures: &dyn Pictures,
     camera: usize,
@@ -363,7 +372,7 @@ fn moving(
     look: &Look,
     moment: usize,
     t: f64,
-) -> Result<Vec<Feature>> {
+) -> Result<(Vec<Feature>, Option<Shown>)> {
     let (picture, _) = load(pictures, camera, frame, look.pixels)?;
     let mut off = Planes::new(1, picture.height, picture.width);
     for (p, v) in off.data.iter_mut().enumerate() {
@@ -372,7 +381,7 @@ fn moving(
     let off = blurred(&off, MOVED_BLUR);
     let counts = mask(pictures, camera, frame, &picture)?;
     let wanted = |x: usize, y: usize| off.get(0, y, x) > MOVED && counts.as_ref().is_none_or(|m| m.counts(x, y));
-    let Some(window) = Window::around(picture.width, picture.height, &wanted) else { return Ok(Vec::new()) };
+    let Some(window) = Window::around(picture.width, picture.height, &wanted) else { return Ok((Vec::new(), None)) };
     let limits = Limits { contrast: look.contrast, most: look.moving };
     let inner = window.cut(&picture);
     let mut features = found(&inner, limits, &|x, y| wanted(x + window.x, y + window.y), moment);
@@ -381,6 +390,7 @@ fn moving(
         Ok((Pyramid::new(grey(&window.cut(&picture))), pictures.time(camera, k)))
     };
     let now = (Pyramid::new(grey(&inner)), pictures.time(camera, frame));
+    let shown = Shown::new(&grey(&inner), [window.x, window.y], t - now.1);
     let ago = if frame > 0 { Some(beside(frame - 1)?) } else { None };
     let after = if frame + 1 < pictures.frames(camera) { Some(beside(frame + 1)?) } else { None };
     let length = frame_length(pictures, camera);
@@ -405,7 +415,7 @@ fn moving(
         f.pixel = std::array::from_fn(|k| corner[k] + f.pixel[k] + f.velocity[k] * (t - now.1));
         f.velocity[0].hypot(f.velocity[1]) * length < FASTEST
     });
-    Ok(features)
+    Ok((features, Some(shown)))
 }
 
 /// Frames of moving cameras, one sight each: at most `most`, evenly chosen. What moves in them contradicts what stands still and
@@ -439,6 +449,7 @@ pub fn walking(
                     name: format!("{}, frame {frame}", pictures.name(camera)),
                     frame: frame_length(pictures, camera),
                     features: found(&picture, limits, &|x, y| counts.as_ref().is_none_or(|m| m.counts(x, y)), 0),
+                    shown: vec![Some(Shown::new(&grey(&picture), [0, 0], 0.0))],
                     ..empty(pictures, camera, [picture.width, picture.height], factor)
                 };
                 let sight = sight.straightened(pictures, camera);

@@ -67,6 +67,7 @@ fn rig(cameras: usize, points: usize, noise: f64, wrong: f64, spread: f64) -> Ri
             lens: c,
             frame: 1.0 / 30.0,
             features,
+            shown: Vec::new(),
         });
         out.poses.push(pose);
         out.lenses.push(lens);

@@ -379,6 +379,7 @@ mod tests {
             lens: 0,
             frame: 0.03,
             features,
+            shown: Vec::new(),
         }
     }
 

@@ -7,6 +7,7 @@
 
 pub(crate) mod adc;
 pub(crate) mod densify;
+pub(crate) mod floaters;
 pub(crate) mod guided;
 pub(crate) mod mcmc;
 pub(crate) mod merge;
@@ -23,6 +24,7 @@ pub mod worth;
 
 pub(crate) use adc::{Adc, AdcSettings};
 pub use densify::{DensifySettings, Strategy};
+pub(crate) use floaters::{FloaterSettings, Floaters};
 pub(crate) use guided::{Guided, GuidedSettings};
 pub(crate) use mcmc::{Mcmc, McmcSettings};
 pub(crate) use merge::{Merge, MergeSettings};
@@ -222,6 +224,7 @@ pub(crate) fn of(r: &Recipe) -> Vec<Box<dyn Upkeep>> {
         boxed(Mcmc::of(r)),
         boxed(MortonOrder::of(r)),
         boxed(Relocate::of(r)),
+        boxed(Floaters::of(r)),
         boxed(Prune::of(r)),
         boxed(Merge::of(r)),
         boxed(OpacityReset::of(r)),
