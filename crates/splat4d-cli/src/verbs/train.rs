@@ -192,7 +192,10 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         let source = args.capture.as_ref().or(args.source.as_ref()).expect("clap asks for a capture");
         console.phase("reading the capture", 0, 0);
         let capture = open_capture(source, &recipe)?;
-        if let Some(plan) = ChunkPlan::even(&capture, &recipe)? {
+        // A take that is not told to be cut keeps to its minutes at once.
+        let at_once = args.minutes.is_some() && recipe.chunks.frames == 0;
+        let plan = if at_once { None } else { ChunkPlan::even(&capture, &recipe)? };
+        if let Some(plan) = plan {
             chunked::check(args.minutes)?;
             let begun = args.output.as_ref().filter(|run| Chunked::is(run) && !args.force);
             let run = begun.map_or_else(|| place(args, &capture, console), |run| Ok(run.clone()))?;

@@ -134,7 +134,7 @@ impl Chunked {
     pub fn seams(&self, scene: &Scene<f32>, listen: &mut dyn FnMut(&Event)) -> Result<Option<Seams>> {
         let capture = Arc::new(self.capture()?);
         let fixed = |i: &usize| capture.cameras[capture.frames[*i].camera].fixed;
-        let held_out = capture.held.iter().any(|i| fixed(i));
+        let held_out = capture.held.iter().any(fixed);
         let all = if held_out { &capture.held } else { &capture.train };
         let mut cameras: Vec<usize> = all.iter().copied().filter(fixed).map(|i| capture.frames[i].camera).collect();
         cameras.sort_unstable();

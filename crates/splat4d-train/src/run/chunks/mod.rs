@@ -20,12 +20,11 @@ pub use plan::ChunkPlan;
 
 use super::checkpoint::write_atomically;
 use super::identity;
-use super::open::{OpenCapture, capture_options, learnable, open_capture};
+use super::open::{OpenCapture, learnable, open_capture};
 use super::session::{Outcome, TrainOptions};
 use super::start::{read_info, read_text};
 use crate::capture::Capture;
 use crate::event::Event;
-use crate::methods::program_of;
 use crate::recipe::Recipe;
 use crate::settings::settings;
 use crate::{Error, ErrorKind, Result};
@@ -55,8 +54,8 @@ settings! {
     /// Long takes in chunks.
     #[derive(Copy)]
     pub struct ChunkSettings {
-        /// Frames of a chunk: a longer take is learnt chunk by chunk. 0: 60 where fixed cameras film more than 300 frames, else
-        /// the take is learnt at once. Iterations are those of a chunk.
+        /// Frames of a chunk: a longer take is learnt chunk by chunk. 0: 60 where fixed cameras film more than 300 frames and
+        /// nothing is asked for that chunks cannot have, else the take is learnt at once. Iterations are those of a chunk.
         frames: usize = 0 => any().unit("frames");
         /// Frames that neighbouring chunks share, in which they fade into each other; an even number.
         overlap: usize = 8 => any().unit("frames");
@@ -323,21 +322,16 @@ impl Chunked {
 
 /// Errors: what a recipe asks for that chunks cannot have together.
 fn check(recipe: &Recipe) -> Result<()> {
-    let program = program_of(recipe)?;
     let learnt = learnable(recipe);
-    let refused = if recipe.spacetime.has_features() && program.has_features() {
-        Some(("a network that makes colours (features = full)", "Use --set features=none"))
+    let (what, remedy) = if recipe.spacetime.has_features() {
+        ("a network that makes colours (features = full)", "Use --set features=none")
     } else if learnt.poses || learnt.focal || learnt.times {
-        Some(("cameras that are refined", "Refine them on a part of the take first (--set max_frames=60)"))
+        ("cameras that are refined", "Refine them on a part of the take first (--set max_frames=60)")
     } else if recipe.capture.observe < 1.0 {
-        Some(("a future that is not looked at (--observe)", "Leave --observe away"))
+        ("a future that is not looked at (--observe)", "Leave --observe away")
     } else {
-        None
+        return Ok(());
     };
-    capture_options(recipe)?;
-    match refused {
-        None => Ok(()),
-        Some((what, remedy)) => Err(Error::new(ErrorKind::Unsupported, format!("chunks cannot share {what}"))
-            .remedy(format!("{remedy}, or train at once with --chunk-frames above the take's length"))),
-    }
+    Err(Error::new(ErrorKind::Unsupported, format!("chunks cannot share {what}"))
+        .remedy(format!("{remedy}, or train at once with --chunk-frames above the take's length")))
 }

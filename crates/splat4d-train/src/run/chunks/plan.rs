@@ -3,8 +3,9 @@
 use super::{FRAMES, WHOLE};
 use crate::capture::{Capture, ImageStore};
 use crate::event::Event;
+use crate::methods::program_of;
 use crate::recipe::Recipe;
-use crate::run::open::OpenCapture;
+use crate::run::open::{OpenCapture, plan};
 use crate::{Error, Result};
 use splat4d::scene::Planes;
 use std::collections::BTreeMap;
@@ -41,8 +42,10 @@ impl ChunkPlan {
         let (Some(&first), Some(&last)) = (frames.iter().min(), frames.iter().max()) else { return Ok(None) };
         let (take, count) = ([first, last + 1], last + 1 - first);
         let fixed = capture.cameras.iter().filter(|c| c.fixed).count() > 1;
+        // `auto` has yet to say.
+        let moves = || program_of(recipe).map_or(true, |p| p.capabilities(&plan(capture, recipe)).moves);
         let length = match settings.frames {
-            0 if count > WHOLE && fixed && recipe.run.motion != "still" => FRAMES,
+            0 if count > WHOLE && fixed && moves() && super::check(recipe).is_ok() => FRAMES,
             0 => return Ok(None),
             n => n,
         };

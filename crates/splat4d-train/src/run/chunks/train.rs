@@ -68,7 +68,7 @@ pub(super) fn train(
     for stage in &mut stages {
         stage.freeze_exposure = exposure.is_some();
         if !tied.is_empty() && recipe.chunks.consistency > 0.0 {
-            let tie = Tie::new(recipe.chunks.consistency, tied.clone(), exposure.clone(), config.clone());
+            let tie = Tie::new(recipe.chunks.consistency, tied.clone(), exposure.clone(), config);
             stage.pictures.push(Box::new(tie));
         }
     }
