@@ -19,14 +19,14 @@ const WIDTH: usize = 400;
 const HEIGHT: usize = 300;
 /// Pixels; gives 67° across.
 const FOCAL: f64 = 300.0;
-const CAMERAS: usize = 20;
+pub(crate) const CAMERAS: usize = 20;
 /// The cameras stand on an arc of this many degrees about the scene, alternately at two heights.
 const ARC_DEGREES: f64 = 170.0;
 const ARC_RADIUS: f64 = 5.8;
 const ARC_HEIGHTS: [f64; 2] = [1.7, 3.3];
 const ARC_TARGET: V3 = v3(0.0, 0.95, 0.1);
 /// Cameras kept out of training: two of each height, each between training cameras.
-const HELD_OUT: [usize; 4] = [3, 8, 11, 16];
+pub(crate) const HELD_OUT: [usize; 4] = [3, 8, 11, 16];
 /// Quantisation step 13 at all frequencies: about 20 KB and 40 dB per picture, so that 600 of them stay below 13 MB.
 /// (Lossless PNG takes 68 KB each.)
 const JPEG_QUALITY: u8 = 60;
@@ -34,8 +34,8 @@ const JPEG_QUALITY: u8 = 60;
 const TRUTH_CAMERAS: [usize; 4] = [2, 8, 11, 17];
 const TRUTH_FRAMES: [usize; 4] = [3, 10, 17, 24];
 
-/// `capture [FOLDER]`, `capture --check [N]`, `capture --still CHARACTER.glb FOLDER ...`, `capture --videos FOLDER` and
-/// `capture --world NAME FOLDER`.
+/// `capture [FOLDER]`, `capture --check [N]`, `capture --still CHARACTER.glb FOLDER ...`, `capture --videos FOLDER`,
+/// `capture --world NAME FOLDER` and `capture --long SECONDS FOLDER`.
 pub(crate) fn command(arguments: &[String]) -> Result<()> {
     let home = bundled_folder();
     match arguments {
@@ -51,11 +51,12 @@ pub(crate) fn command(arguments: &[String]) -> Result<()> {
         }
         [flag, rest @ ..] if flag == "--still" => crate::still::command(rest),
         [flag, name, folder] if flag == "--world" => crate::world::command(name, Path::new(folder)),
+        [flag, seconds, folder] if flag == "--long" => crate::long::command(seconds, Path::new(folder)),
         [flag, folder] if flag == "--videos" => crate::videos::command(Path::new(folder)),
         [] => write(&home, &home),
         [folder] if !folder.starts_with('-') => write(&home, Path::new(folder)),
         _ => bail!(
-            "capture takes a folder, --check with a number, --still with a character and a folder, --videos with a folder, or --world with a name and a folder"
+            "capture takes a folder, --check with a number, --still with a character and a folder, --videos with a folder, --world with a name and a folder, or --long with seconds and a folder"
         ),
     }
 }
@@ -66,11 +67,16 @@ pub(crate) fn bundled_folder() -> PathBuf {
 }
 
 fn rig() -> Vec<Camera> {
+    rig_of(WIDTH, HEIGHT, FOCAL)
+}
+
+/// The twenty cameras with pictures of this size; `focal` in pixels.
+pub(crate) fn rig_of(width: usize, height: usize, focal: f64) -> Vec<Camera> {
     let camera = |i: usize| {
         let degrees = ARC_DEGREES * (i as f64 / (CAMERAS - 1) as f64 - 0.5);
         let (sin, cos) = sin_cos(degrees * std::f64::consts::PI / 180.0);
         let position = v3(ARC_RADIUS * sin, ARC_HEIGHTS[i % 2], ARC_RADIUS * cos);
-        Camera::look_at(format!("cam{i:02}"), position, ARC_TARGET, FOCAL, WIDTH, HEIGHT)
+        Camera::look_at(format!("cam{i:02}"), position, ARC_TARGET, focal, width, height)
     };
     (0..CAMERAS).map(camera).collect()
 }
@@ -150,8 +156,13 @@ fn mask_path(camera: &Camera, t: usize) -> PathBuf {
     Path::new("masks").join(&camera.name).join(format!("{t:04}.png"))
 }
 
-/// The picture as JPEG without chroma subsampling, the mask as PNG.
+/// The picture as JPEG, the mask as PNG.
 fn encode(rgb: &[u8], mask: &[u8]) -> Result<(Vec<u8>, Vec<u8>)> {
+    Ok((jpeg(rgb, WIDTH, HEIGHT)?, png(mask, WIDTH, HEIGHT, ExtendedColorType::L8)?))
+}
+
+/// A JPEG without chroma subsampling.
+pub(crate) fn jpeg(rgb: &[u8], width: usize, height: usize) -> Result<Vec<u8>> {
     let mut out = Vec::new();
     let mut encoder = jpeg_encoder::Encoder::new(&mut out, JPEG_QUALITY);
     encoder.set_sampling_factor(jpeg_encoder::SamplingFactor::F_1_1);
@@ -159,8 +170,8 @@ fn encode(rgb: &[u8], mask: &[u8]) -> Result<(Vec<u8>, Vec<u8>)> {
     encoder.set_optimized_huffman_tables(true);
     // Equal steps at all frequencies give the smallest squared error per byte, which is what training measures.
     encoder.set_quantization_tables(QuantizationTableType::Flat, QuantizationTableType::Flat);
-    encoder.encode(rgb, WIDTH as u16, HEIGHT as u16, jpeg_encoder::ColorType::Rgb)?;
-    Ok((out, png(mask, WIDTH, HEIGHT, ExtendedColorType::L8)?))
+    encoder.encode(rgb, width as u16, height as u16, jpeg_encoder::ColorType::Rgb)?;
+    Ok(out)
 }
 
 fn write_truth(folder: &Path, camera: &Camera, seen: &Visibility, t: usize, frame: &Frame, next: &Frame) -> Result<()> {

@@ -6,6 +6,7 @@ mod count;
 mod files;
 mod glb;
 mod light;
+mod long;
 mod material;
 mod mesh;
 mod metrics;
@@ -40,6 +41,8 @@ chores:
   capture --world NAME FOLDER
                              draws a world of known physics for `splat4d predict`: pendulum, circle, pushed-block, bounce,
                              rolling, collision or cloth; true paths of its nodes and actions beside it
+  capture --long SECONDS FOLDER
+                             draws a take of any length: twenty cameras, 30 frames a second, 200x150, a frame in memory at a time
   strip-character IN.glb OUT.glb CLIP... [--drop NODE...]
                              keeps the named animation clips of a character, drops the named nodes' meshes
   site OUT [--no-api]        makes the static site in OUT: documents, API, a gallery that plays the example scenes

@@ -42,8 +42,8 @@ const GRAVITY: f64 = 14.0;
 
 /// Everything that does not depend on time.
 pub(crate) struct Stage {
-    knight: Character,
-    mage: Character,
+    pub(crate) knight: Character,
+    pub(crate) mage: Character,
     fixed: Mesh,
     props: Mesh,
 }

@@ -8,6 +8,7 @@
 
 mod baking;
 mod camera_file;
+mod chunked;
 mod compressing;
 pub mod console;
 mod device;
@@ -91,6 +92,7 @@ pub struct Globals {
 enum Verb {
     Import(verbs::import::Args),
     Train(Box<verbs::train::Args>),
+    Join(verbs::join::Args),
     Eval(verbs::eval::Args),
     Predict(verbs::predict::Args),
     Render(verbs::render::Args),
@@ -110,6 +112,7 @@ impl Verb {
         match self {
             Verb::Import(args) => verbs::import::run(args, console),
             Verb::Train(args) => verbs::train::run(args, console),
+            Verb::Join(args) => verbs::join::run(args, console),
             Verb::Eval(args) => verbs::eval::run(args, console),
             Verb::Predict(args) => verbs::predict::run(args, console),
             Verb::Render(args) => verbs::render::run(args, console),

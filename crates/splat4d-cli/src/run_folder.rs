@@ -19,12 +19,13 @@ pub(crate) const COMPRESS: &str = "compress.json";
 /// File that holds the settings `compress` was asked for.
 pub(crate) const ORDER: &str = "compress.toml";
 /// Files and folders that splat4d writes into a run; `--force` replaces these and nothing else.
-const OURS: [&str; 28] = [
+const OURS: [&str; 29] = [
     "recipe.toml",
     "run.json",
     "scene.safetensors",
     "scene.splat4d",
     "checkpoints",
+    "chunks",
     "metrics.csv",
     "results.json",
     "refined.json",

@@ -2,6 +2,8 @@
 
 #[path = "cli/bench.rs"]
 mod bench;
+#[path = "cli/chunked.rs"]
+mod chunked;
 #[path = "cli/compress.rs"]
 mod compress;
 #[path = "cli/convert.rs"]
@@ -49,6 +51,7 @@ fn help_teaches_and_completions_complete() {
     for verb in [
         "import",
         "train",
+        "join",
         "eval",
         "render",
         "localise",

@@ -141,6 +141,12 @@ impl Learner {
         self.scene
     }
 
+    /// The layers that anything of may learn; rows of the others, which only stand there, are left alone.
+    pub(crate) fn learning(&self) -> Vec<usize> {
+        let learns = |p: &splat4d::scene::Params<f32>| p.keys().any(|key| p.info(key).trainable);
+        (0..self.scene.layers.len()).filter(|&l| learns(&self.scene.layers[l].params)).collect()
+    }
+
     /// Adam's moments, by layer.
     pub(crate) fn moments(&self) -> &[Moments<f32>] {
         &self.moments

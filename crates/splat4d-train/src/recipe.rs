@@ -22,6 +22,7 @@ use crate::methods::{
     AppearanceSettings, ControlSettings, DeformSettings, FilterSettings, HexplaneSettings, LifeSettings,
     Native4dSettings, RateSettings, SpacetimeSettings, SsmSettings, TrackedSettings,
 };
+use crate::run::chunks::ChunkSettings;
 use crate::settings::Table;
 use crate::upkeep::{
     AdcSettings, DensifySettings, FloaterSettings, GuidedSettings, McmcSettings, MergeSettings, NodeSettings,
@@ -84,6 +85,7 @@ recipe! {
     prune: PruneSettings,
     merge: MergeSettings,
     split: SplitSettings,
+    chunks: ChunkSettings,
 }
 
 impl Recipe {

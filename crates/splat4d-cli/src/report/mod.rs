@@ -317,6 +317,11 @@ fn costs(out: &mut String, run: &Run) {
             row(name, human_bytes(bytes as u64));
         }
     }
+    if let Some(seams) = run.info.get("seams").filter(|s| s.is_object()) {
+        let flicker = |key: &str| seams.get(key).and_then(Value::as_f64).unwrap_or(f64::NAN);
+        let words = format!("{}/255, in their midst {}/255", short(flicker("across")), short(flicker("inside")));
+        row("Flicker where chunks meet", words);
+    }
     let table = (!table.is_empty()).then(|| format!("<table>{table}</table>"));
     panels(
         out,

@@ -3,6 +3,7 @@
 mod doctor;
 mod playback;
 
+use crate::chunked;
 use crate::console::Console;
 use crate::files::{grouped, human_bytes, human_seconds};
 use crate::run_folder::Run;
@@ -16,6 +17,7 @@ use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{GEOMETRY, SH};
 use splat4d_train::capture::{Capture, Severity, Timing};
 use splat4d_train::recipe::Recipe;
+use splat4d_train::run::chunks::ChunkPlan;
 use splat4d_train::run::{memory_estimate, open_capture};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
@@ -135,7 +137,10 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
     }
     let (first, last) = capture.time_range();
     let (times, sizes) = (capture.times(), sizes(&capture));
-    let memory = memory_estimate(&capture, &recipe);
+    let plan = ChunkPlan::even(&capture, &recipe)?;
+    let memory = plan
+        .as_ref()
+        .map_or_else(|| memory_estimate(&capture, &recipe), |plan| chunked::memory_estimate(&capture, plan, &recipe));
     let findings = capture.preflight();
     let fixed = capture.cameras.iter().filter(|c| c.fixed).count();
     let moving = capture.cameras.len() - fixed;
@@ -172,6 +177,9 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
     let points = capture.points.as_ref().map_or("none".into(), |p| grouped(p.points.len()));
     line(&mut text, "initial points", &points);
     line(&mut text, "memory", &format!("about {} with the default recipe", human_bytes(memory)));
+    if let Some(plan) = &plan {
+        line(&mut text, "training", &chunked::in_words(plan, &recipe));
+    }
     let mut troubles = Vec::new();
     for finding in &findings {
         match finding.severity {
@@ -186,7 +194,7 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
         "timing": format!("{:?}", capture.timing).to_lowercase(),
         "train": capture.train.len(), "held_out": capture.held.len(), "validation": capture.validation.len(),
         "held_out_cameras": held, "masks": masks, "points": capture.points.as_ref().map(|p| p.points.len()),
-        "memory_estimate": memory,
+        "memory_estimate": memory, "chunks": plan.as_ref().map(ChunkPlan::len),
         "findings": findings.iter().map(|f| json!({"severity": format!("{:?}", f.severity).to_lowercase(),
             "what": f.what, "remedy": f.remedy})).collect::<Vec<_>>(),
     });

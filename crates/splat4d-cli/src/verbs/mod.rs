@@ -9,6 +9,7 @@ pub(crate) mod eval;
 pub(crate) mod export;
 pub(crate) mod import;
 pub(crate) mod info;
+pub(crate) mod join;
 pub(crate) mod localise;
 pub(crate) mod predict;
 pub(crate) mod render;

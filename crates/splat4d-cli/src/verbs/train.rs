@@ -1,5 +1,6 @@
 //! `train`: a capture becomes a run: trained, measured, filmed and reported.
 
+use crate::chunked::{self, Wanted};
 use crate::console::Console;
 use crate::device::{self, Device};
 use crate::files::{self, human_bytes, parse_bytes};
@@ -11,11 +12,13 @@ use splat4d::{Error, ErrorKind};
 use splat4d_train::capture::{Capture, Severity, Timing};
 use splat4d_train::event::Event;
 use splat4d_train::recipe::{MotionName, Quality, Recipe};
+use splat4d_train::run::chunks::{ChunkPlan, Chunked};
 use splat4d_train::run::{self, Outcome, Stopwatch, TrainOptions};
 use splat4d_train::run::{memory_estimate, open_capture};
 use splat4d_train::settings::{Knob, nearest};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 /// A new picture of the learning scene about so often: sooner than anybody would reload, later than they could follow.
@@ -31,6 +34,7 @@ Examples:
   splat4d train my-take --downscale 4 --set iterations=1000 --set sh_degree=0
   splat4d train my-take --hold-out camera=0,10      measure on these cameras
   splat4d train my-take --observe 0.8               keep the last fifth of the take for `predict`
+  splat4d train concert -o runs/concert --chunk-frames 60        a long take, chunk by chunk
   splat4d train my-take --device auto               a GPU draws, if there is one
   splat4d train --resume runs/first                 continue exactly where it stopped
 
@@ -66,7 +70,7 @@ pub struct Args {
     output: Option<PathBuf>,
     /// Continue this run exactly where its newest checkpoint is
     #[arg(long, value_name = "RUN", conflicts_with_all = ["capture", "output", "motion", "minutes", "quality", "recipe", "set",
-        "downscale", "hold_out", "observe", "image_memory", "seed", "source", "iterations", "force"])]
+        "downscale", "hold_out", "observe", "chunk_frames", "overlap", "chunk", "image_memory", "seed", "source", "iterations", "force"])]
     resume: Option<PathBuf>,
     /// Replace the run in the -o folder
     #[arg(long)]
@@ -104,6 +108,16 @@ pub struct Args {
     /// Train on the first SHARE of the clip only; what comes later scores `predict` and is not looked at [default: 1]
     #[arg(long, value_name = "SHARE", help_heading = "What is read")]
     observe: Option<f64>,
+    /// Learn a longer take in chunks of N frames [default: 60 where fixed cameras film more than 300 frames]
+    #[arg(long, value_name = "N", help_heading = "Long takes")]
+    chunk_frames: Option<usize>,
+    /// Frames that neighbouring chunks share, an even number [default: 8]
+    #[arg(long, value_name = "N", help_heading = "Long takes")]
+    overlap: Option<usize>,
+    /// Do one part and end: shared, then even chunks by their number, then odd ones; or all, beside other workers on the same
+    /// RUN. What is done already is not done again; `splat4d join RUN` ends the run
+    #[arg(long, value_name = "PART", help_heading = "Long takes", requires = "output", conflicts_with = "force")]
+    chunk: Option<Wanted>,
     /// Memory for decoded pictures [default: 1GiB]
     #[arg(long, value_name = "SIZE", value_parser = parse_bytes, help_heading = "What is read")]
     image_memory: Option<u64>,
@@ -160,6 +174,11 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         watch.hear(event);
         console.event(event);
     };
+    if let Some(run) = args.resume.as_ref().filter(|run| Chunked::is(run)) {
+        let watch = watch(&Run::open(run)?.name());
+        let chunked = Chunked::open(run)?;
+        return in_chunks(args, run, &chunked, clock, &stop, &watch, console);
+    }
     let (run, watch, trained) = if let Some(run) = &args.resume {
         let watch = watch(&Run::open(run)?.name());
         let device = device::to_train(args.device, console);
@@ -173,6 +192,27 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         let source = args.capture.as_ref().or(args.source.as_ref()).expect("clap asks for a capture");
         console.phase("reading the capture", 0, 0);
         let capture = open_capture(source, &recipe)?;
+        // A take that is not told to be cut keeps to its minutes at once.
+        let at_once = args.minutes.is_some() && recipe.chunks.frames == 0;
+        let plan = if at_once { None } else { ChunkPlan::even(&capture, &recipe)? };
+        if let Some(plan) = plan {
+            chunked::check(args.minutes)?;
+            let begun = args.output.as_ref().filter(|run| Chunked::is(run) && !args.force);
+            let run = begun.map_or_else(|| place(args, &capture, console), |run| Ok(run.clone()))?;
+            describe(&capture, &recipe, console);
+            console.say(&chunked::in_words(&plan, &recipe));
+            files::make_folder(&run)?;
+            let watch = watch(&capture.name);
+            let begun = Chunked::begin(&Arc::new(capture), &recipe, &run, &mut |event| listen(event, &watch))?;
+            let chunked = begun.expect("a take that has a plan is learnt by it");
+            return in_chunks(args, &run, &chunked, clock, &stop, &watch, console);
+        }
+        if args.chunk.is_some() {
+            return Err(Error::input("the take fits one chunk, and has no parts")
+                .at("--chunk")
+                .remedy("Train it without --chunk, or ask for shorter chunks with --chunk-frames")
+                .into());
+        }
         let run = place(args, &capture, console)?;
         describe(&capture, &recipe, console);
         files::make_folder(&run)?;
@@ -222,6 +262,42 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// Does what is wanted of a long take, and joins it where that is all.
+fn in_chunks(
+    args: &Args,
+    run: &Path,
+    chunked: &Chunked,
+    clock: Stopwatch,
+    stop: &AtomicBool,
+    watch: &Watch,
+    console: &Console,
+) -> anyhow::Result<()> {
+    let options = TrainOptions {
+        device: device::to_train(args.device, console),
+        clock,
+        snapshots: watch.is_on().then_some(SNAPSHOT_INTERVAL),
+        ..TrainOptions::default()
+    };
+    let outcome = chunked::work(chunked, args.chunk.unwrap_or(Wanted::All), &options, stop, &mut |event| {
+        watch.hear(event);
+        console.event(event);
+    });
+    console.clear();
+    if outcome?.is_some_and(|o| o.interrupted) {
+        return Err(Error::new(ErrorKind::Interrupted, "training was stopped and saved")
+            .remedy(format!("Continue with: splat4d train --resume {}", run.display()))
+            .into());
+    }
+    match args.chunk {
+        Some(_) => console.emit(&json!({"type": "done", "run": run})),
+        None => {
+            chunked::join(run, chunked, args.no_eval, &args.measure, console)?;
+            console.emit(&json!({"type": "done", "run": run}));
+        }
+    }
+    Ok(())
+}
+
 /// The recipe file, then the quality, then the options, then every --set.
 fn recipe(args: &Args) -> anyhow::Result<Recipe> {
     let mut recipe = match &args.recipe {
@@ -246,6 +322,8 @@ fn recipe(args: &Args) -> anyhow::Result<Recipe> {
     set("downscale", args.downscale.map(|v| v.to_string()))?;
     set("hold_out", args.hold_out.as_ref().map(quoted))?;
     set("capture.observe", args.observe.map(|v| v.to_string()))?;
+    set("chunks.frames", args.chunk_frames.map(|v| v.to_string()))?;
+    set("chunks.overlap", args.overlap.map(|v| v.to_string()))?;
     set("image_memory", args.image_memory.map(|v| v.to_string()))?;
     set("iterations", args.iterations.map(|v| v.to_string()))?;
     set("max_cap", args.max_cap.map(|v| v.to_string()))?;
@@ -297,7 +375,11 @@ fn describe(capture: &Capture, recipe: &Recipe, console: &Console) {
         capture.train.len(),
         capture.held.len()
     ));
-    console.detail(&format!("memory estimate: {}", human_bytes(memory_estimate(capture, recipe))));
+    let memory = match ChunkPlan::even(capture, recipe) {
+        Ok(Some(plan)) => chunked::memory_estimate(capture, &plan, recipe),
+        _ => memory_estimate(capture, recipe),
+    };
+    console.detail(&format!("memory estimate: {}", human_bytes(memory)));
     for finding in capture.preflight() {
         let text = format!("{} {}", finding.what, finding.remedy).trim_end().to_owned();
         match finding.severity {

@@ -90,6 +90,7 @@ pub fn compress(
             stages,
             frames: training_frames(job.capture.clone(), job.recipe)?,
             recipe: job.recipe.clone().with(|r| r.densify.strategy = Strategy::None),
+            exposure: None,
             identity: job.settings.to_toml(),
         },
         dir,

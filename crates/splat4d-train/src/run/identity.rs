@@ -33,8 +33,17 @@ pub(super) fn fingerprint(capture: &Capture) -> String {
     hash(&text)
 }
 
+/// The content of a file that a run depends on in 16 hexadecimal digits.
+pub(super) fn file_print(bytes: &[u8]) -> String {
+    fnv(bytes)
+}
+
 /// FNV-1a, 64 bits: it guards against mistakes, not against malice.
 fn hash(text: &str) -> String {
-    let h = text.bytes().fold(0xcbf2_9ce4_8422_2325u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3));
+    fnv(text.as_bytes())
+}
+
+fn fnv(bytes: &[u8]) -> String {
+    let h = bytes.iter().fold(0xcbf2_9ce4_8422_2325u64, |h, b| (h ^ u64::from(*b)).wrapping_mul(0x0100_0000_01b3));
     format!("{h:016x}")
 }

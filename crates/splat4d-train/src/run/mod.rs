@@ -2,6 +2,7 @@
 
 mod budget;
 pub mod checkpoint;
+pub mod chunks;
 mod clock;
 pub mod corrected;
 pub mod dataset;

@@ -174,6 +174,12 @@ impl OpenCapture {
     }
 
     pub(crate) fn initial_scene(&self, plan: &Plan) -> Result<Scene<f32>> {
+        let seeds = self.seeds(plan)?;
+        init::scene(plan, program_of(&plan.recipe)?.as_ref(), &seeds, self.background(), self.capture.up)
+    }
+
+    /// Where the first Gaussians of a plan are.
+    pub(super) fn seeds(&self, plan: &Plan) -> Result<Seeds> {
         let program = program_of(&plan.recipe)?;
         let moving = program.capabilities(plan).moves && plan.times > 1;
         let points = if let Source::File(path) = &plan.recipe.init.source {
@@ -187,11 +193,10 @@ impl OpenCapture {
             })
         };
         let (first, frames) = (program.first(plan), self.frames.as_ref());
-        let seeds = match moving && program.one_moment(plan) {
-            true => init::one_moment(&first, frames, points)?,
-            false => init::seeds(&first, frames, points, moving)?,
-        };
-        init::scene(plan, program.as_ref(), &seeds, self.background(), self.capture.up)
+        match moving && program.one_moment(plan) {
+            true => init::one_moment(&first, frames, points),
+            false => init::seeds(&first, frames, points, moving),
+        }
     }
 
     /// What is to be learnt of cameras, where the recipe wants it.

@@ -10,6 +10,7 @@ use super::memory::memory_estimate;
 use super::open::OpenCapture;
 use super::session::{Outcome, Session, TrainOptions};
 use crate::event::Event;
+use crate::learner::Exposure;
 use crate::methods::Stage;
 use crate::recipe::{Recipe, Replans};
 use crate::{Error, Result};
@@ -31,6 +32,8 @@ pub(crate) struct Refine {
     /// Losses, background, SH degree, seed, thresholds, steps between checkpoints. Its motion model and its iterations do
     /// not count: the scene and the stages have theirs.
     pub recipe: Recipe,
+    /// Exposures of the cameras; none: they show what is drawn, unless the recipe lets them learn.
+    pub exposure: Option<Exposure>,
     /// All else that the result depends on, as text: settings and a fingerprint of the scene. A run is only continued
     /// with the same.
     pub identity: String,
@@ -87,6 +90,9 @@ pub(crate) fn refine(
         stop,
     };
     let mut trainer = opened.trainer_of(&plan, job.scene, job.stages);
+    if job.exposure.is_some() {
+        trainer.learner.exposure = job.exposure;
+    }
     let state = if checkpoint::list(run).is_empty() {
         trainer.check_not_empty()?;
         session.begin(&trainer, listen)?

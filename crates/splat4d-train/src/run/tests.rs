@@ -36,14 +36,16 @@ const CAMERAS: usize = 4;
 const MOMENTS: usize = 3;
 const STEPS: usize = 40;
 
-/// Four cameras, three frames, on disk.
-fn capture_on_disk() -> TempDir {
+/// Four cameras, so many frames, on disk.
+fn capture_on_disk(moments: usize) -> TempDir {
     let folder = tempfile::tempdir().unwrap();
     let made = Made::new(CAMERAS, MOMENTS, SIZE);
     let mut picture = Picture::default();
-    for i in 0..made.len() {
-        made.load(i, &mut picture).unwrap();
-        let path = folder.path().join(format!("images/{}/{:04}.png", made.rig(i), i / CAMERAS));
+    for i in 0..CAMERAS * moments {
+        // To and fro, so that it stays in sight.
+        let moment = [0, 1, 2, 1][i / CAMERAS % 4];
+        made.load(CAMERAS * moment + i % CAMERAS, &mut picture).unwrap();
+        let path = folder.path().join(format!("images/{}/{:04}.png", i % CAMERAS, i / CAMERAS));
         std::fs::create_dir_all(path.parent().unwrap()).unwrap();
         let color = |x: u32, y: u32, c: usize| (picture.color.get(c, y as usize, x as usize) * 255.0).round() as u8;
         let pixel = |x: u32, y: u32| image::Rgb([0, 1, 2].map(|c| color(x, y, c)));
@@ -91,7 +93,12 @@ pub(crate) struct Place {
 
 impl Place {
     pub(crate) fn new() -> Self {
-        Self { capture: capture_on_disk(), runs: tempfile::tempdir().unwrap() }
+        Self::of(MOMENTS)
+    }
+
+    /// Of a longer take.
+    pub(crate) fn of(moments: usize) -> Self {
+        Self { capture: capture_on_disk(moments), runs: tempfile::tempdir().unwrap() }
     }
 
     pub(crate) fn run(&self, name: &str) -> PathBuf {

@@ -73,7 +73,7 @@ impl Upkeep for Merge {
 
     fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
         let before = learner.scene().len();
-        for layer in 0..learner.scene().layers.len() {
+        for layer in learner.learning() {
             if let Some(edit) = self.settings.edit(learner, layer) {
                 learner.apply(layer, &edit, &c.rng("crowding"));
             }

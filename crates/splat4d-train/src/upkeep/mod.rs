@@ -245,8 +245,9 @@ fn grow(
 ) -> Change {
     let mut change = Change::default();
     let mut spare = c.limits.cap.saturating_sub(learner.scene().len());
-    let mut rest = learner.scene().len();
-    for index in 0..learner.scene().layers.len() {
+    let learning = learner.learning();
+    let mut rest: usize = learning.iter().map(|&l| learner.scene().layers[l].params.len()).sum();
+    for index in learning {
         // What is left of the cap is shared by size, so that the first layer does not starve the others; what a
         // layer does not use goes to the next.
         let rows = learner.scene().layers[index].params.len();

@@ -37,7 +37,7 @@ impl Upkeep for MortonOrder {
     }
 
     fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
-        for layer in 0..learner.scene().layers.len() {
+        for layer in learner.learning() {
             let edit = sorted(learner.scene(), layer);
             learner.apply(layer, &edit, &c.rng("order"));
         }

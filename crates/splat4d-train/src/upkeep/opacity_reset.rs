@@ -54,8 +54,10 @@ impl Upkeep for OpacityReset {
 
     fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
         let ceiling = logit(ABOVE_DEAD * c.limits.min_opacity);
+        let learning = learner.learning();
         let (scene, moments) = learner.tables_mut();
-        for (layer, moments) in scene.layers.iter_mut().zip(moments) {
+        for index in learning {
+            let (layer, moments) = (&mut scene.layers[index], &mut moments[index]);
             let geometry = &mut layer.params[GEOMETRY];
             let width = geometry.width();
             for row in 0..geometry.rows() {

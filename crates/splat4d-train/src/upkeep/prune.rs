@@ -77,8 +77,9 @@ impl Upkeep for Prune {
     fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
         let before = learner.scene().len();
         let scores = self.scores(learner, c)?;
-        for (layer, edit) in prune(learner.scene(), &scores, self.settings.ratio).iter().enumerate() {
-            learner.apply(layer, edit, &c.rng("prune"));
+        let edits = prune(learner.scene(), &scores, self.settings.ratio);
+        for layer in learner.learning() {
+            learner.apply(layer, &edits[layer], &c.rng("prune"));
         }
         Ok(Change { removed: before - learner.scene().len(), ..Change::default() })
     }

@@ -67,7 +67,7 @@ impl Upkeep for Relocate {
     fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
         let settings = &self.settings;
         let mut moved = 0;
-        for layer in 0..learner.scene().layers.len() {
+        for layer in learner.learning() {
             let scene = learner.scene();
             let rows = scene.layers[layer].params.len();
             let spans = scene.layers[layer].spans();

@@ -51,6 +51,8 @@ pub(super) struct Subject<'a> {
     /// The seconds in which its layer is seen.
     pub window: [f64; 2],
     pub life: Envelope,
+    /// Whether its layer comes or goes by a cross-fade.
+    pub cross_fades: bool,
     /// Learnt rotation and scales: exact where motion leaves shapes alone.
     pub own: Shape,
     /// Colour, where it is the same at all times.
@@ -168,7 +170,7 @@ impl Fitter<'_> {
         let constant = (0.5 * (range[0] + range[1])).clamp(0.0, 1.0);
         let own = subject.life;
         if own.is_forever() {
-            return (still, constant);
+            return self.or_tail(subject, looks, (still, constant), 0.5 * (range[1] - range[0]));
         }
         let (mut above, mut below) = (0.0, 0.0);
         for look in looks {
@@ -183,8 +185,46 @@ impl Fitter<'_> {
         let far = ends.iter().map(|t| (t - own.center).abs()).fold(0.0, f64::max) > FAR * reach;
         let flat = 0.5 * (range[1] - range[0]);
         let enough = LEVEL_PIXELS * flat <= self.tolerance;
-        if (far && enough) || flat < miss { (still, constant) } else { (own, opacity) }
+        let (life, opacity, miss) =
+            if (far && enough) || flat < miss { (still, constant, flat) } else { (own, opacity, miss) };
+        self.or_tail(subject, looks, (life, opacity), miss)
     }
+
+    /// What was found, or one side of an envelope where a cross-fade makes that a better fit.
+    fn or_tail(&self, subject: &Subject<'_>, looks: &[Look], found: (Envelope, f64), miss: f64) -> (Envelope, f64) {
+        if !subject.cross_fades || LEVEL_PIXELS * miss <= self.tolerance {
+            return found;
+        }
+        let of = |&(life, opacity): &(Envelope, f64)| {
+            looks.iter().map(|l| (opacity * life.sigma(l.time) - l.alpha).abs()).fold(0.0, f64::max)
+        };
+        tail(looks).filter(|tail| of(tail) < miss).unwrap_or(found)
+    }
+}
+
+/// An envelope about the strongest look that falls as the looks do: σ = exp(−½y²), y = (x − h)/s beyond h, is a line through
+/// √(−2 ln(α/α_max)).
+fn tail(looks: &[Look]) -> Option<(Envelope, f64)> {
+    /// Looks at which next to nothing has fallen yet, or next to nothing is left, say little of the slope.
+    const TELLING: std::ops::Range<f64> = 0.02..0.98;
+    let peak = looks.iter().max_by(|a, b| a.alpha.total_cmp(&b.alpha))?;
+    let share = |l: &Look| l.alpha / peak.alpha;
+    let told: Vec<[f64; 3]> = looks
+        .iter()
+        .filter(|l| TELLING.contains(&share(l)))
+        .map(|l| [(l.time - peak.time).abs(), (-2.0 * share(l).ln()).sqrt(), share(l)])
+        .collect();
+    let total: f64 = told.iter().map(|t| t[2]).sum();
+    let mean = |k: usize| told.iter().map(|t| t[2] * t[k]).sum::<f64>() / total;
+    let (x, y) = (mean(0), mean(1));
+    let spread: f64 = told.iter().map(|t| t[2] * (t[0] - x).powi(2)).sum();
+    // Through the strongest look, where there is but one other.
+    let slope =
+        if spread > 0.0 { told.iter().map(|t| t[2] * (t[0] - x) * (t[1] - y)).sum::<f64>() / spread } else { y / x };
+    let half = (x - y / slope).max(0.0);
+    let softness = if half > 0.0 { 1.0 / slope } else { x / y };
+    let sound = softness.is_finite() && softness > 0.0 && half.is_finite();
+    sound.then_some((Envelope { center: peak.time, half, softness }, peak.alpha))
 }
 
 /// The shape: as it was learnt where that is what is seen, else turning at a steady rate.

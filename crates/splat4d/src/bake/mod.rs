@@ -269,6 +269,7 @@ fn follow(layer: &Layer<f32>, fitter: &Fitter<'_>, tally: &mut Tally, progress: 
                 row,
                 window: layer.span,
                 life: lives.envelope(row.id),
+                cross_fades: layer.cross_fades(),
                 own: frame.shape(&learnt(&layer.params[GEOMETRY].read::<11>(row.id, 0))),
                 colors: (colors == 0).then(|| frame.colors(sample::own_colors(layer, row.id))),
             };

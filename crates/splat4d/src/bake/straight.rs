@@ -8,7 +8,6 @@ use super::shape::Shape;
 use super::tree::{Span, Tree};
 use crate::layers::Layer;
 use crate::math::quat;
-use crate::motion::Polynomial;
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::{GEOMETRY, Key};
 
@@ -21,9 +20,9 @@ pub(super) struct Line {
 }
 
 impl Line {
-    /// The layer's motion, where it is straight.
+    /// The layer's motion, where it is straight and its opacities are those of its lives.
     pub(super) fn of(layer: &Layer<f32>) -> Option<Self> {
-        let motion = layer.motion.polynomial().filter(Polynomial::is_straight)?;
+        let motion = layer.motion.polynomial().filter(|p| p.is_straight() && !layer.cross_fades())?;
         Some(Self { velocities: motion.velocities, origin: motion.origin })
     }
 

@@ -94,6 +94,24 @@ fn visible(splats: &crate::scene::Splats<'_>) -> Vec<[f32; 10]> {
 }
 
 #[test]
+fn a_cross_fade_is_baked_into_opacities() {
+    let life = LifeKind::GaussHalf;
+    let going = Layer {
+        span: [f64::NEG_INFINITY, 1.2],
+        cross_fade: [0.0, 0.4],
+        ..layer(&spacetime(1, false), life, 60, 0.2, 2.0)
+    };
+    let coming = Layer { span: [0.8, f64::INFINITY], cross_fade: [0.4, 0.0], ..going.clone() };
+    let mut scene = scene(vec![going, coming], 2.0);
+    let faded = baked(&scene, &options(0.25));
+    let like = likeness(&scene, &faded);
+    assert!(like.worst_psnr > 40.0, "{like:?}");
+    // Looked at in the midst of it: without the fade it is another picture.
+    scene.layers.iter_mut().for_each(|l| l.cross_fade = [0.0; 2]);
+    assert!(likeness(&scene, &faded).worst_psnr < 35.0);
+}
+
+#[test]
 fn straight_motion_of_every_life_is_exact() {
     for (spec, life) in [
         (Spec::Still, LifeKind::Infinite),

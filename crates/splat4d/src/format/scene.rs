@@ -1,7 +1,8 @@
 //! `scene.safetensors`: the lossless learnable state of a scene.
 //!
 //! Metadata `splat4d` holds JSON: version, clip, fps, up, background, head, and a list of layers with name, rows, SH
-//! coefficients, life and motion, and `frame` where the layer's axes are not the world's. Every column group of every table is one row-major array: `layers.0.means` `[N,3]`,
+//! coefficients, life and motion, `frame` where the layer's axes are not the world's, and
+//! `cross_fade` (seconds at the span's beginning and end) where it fades. Every column group of every table is one row-major array: `layers.0.means` `[N,3]`,
 //! `layers.0.quats` `[N,4]` wxyz, `layers.0.sh` `[N,K,3]`, `layers.0.velocities` `[N,3·order]` … Seconds and scene units.
 
 use super::arrays::MASKS;
@@ -18,8 +19,10 @@ use std::collections::BTreeMap;
 use std::io::Write;
 use std::sync::Arc;
 
-/// The newest version of the metadata that this library reads and writes.
-pub(crate) const VERSION: u64 = 2;
+/// The newest version of the metadata that this library reads and writes: of scenes whose layers cross-fade.
+pub(crate) const VERSION: u64 = 3;
+/// The version of scenes whose layers have frames, and do not cross-fade.
+const FRAMED: u64 = 2;
 /// The version of scenes whose layers have no frame: programs that know no frames may read them.
 const UNFRAMED: u64 = 1;
 /// The metadata's key.
@@ -42,6 +45,9 @@ pub fn metadata(scene: &Scene<f32>) -> Value {
             if l.span != ALWAYS {
                 layer["span"] = json!(l.span.map(|t| t.is_finite().then_some(t)));
             }
+            if l.cross_fades() {
+                layer["cross_fade"] = json!(l.cross_fade);
+            }
             if let Some(masks) = &l.masks {
                 layer["mask_times"] = json!(masks.times());
             }
@@ -52,8 +58,9 @@ pub fn metadata(scene: &Scene<f32>) -> Value {
             layer
         })
         .collect();
+    let framed = if scene.layers.iter().all(|l| l.frame.is_identity()) { UNFRAMED } else { FRAMED };
     json!({
-        "version": if scene.layers.iter().all(|l| l.frame.is_identity()) { UNFRAMED } else { VERSION },
+        "version": if scene.layers.iter().any(Layer::cross_fades) { VERSION } else { framed },
         "units": "scene units, seconds, colours in [0, 1]",
         "axes": "OpenCV: x right, y down, z forward in the camera",
         "clip": scene.clip,
@@ -187,7 +194,11 @@ fn read_layer(file: &SafeTensors<'_>, meta: &Value, index: usize) -> Result<Laye
     }
     let masks = read_masks(file, meta, &prefix, rows)?;
     let (name, span, frame) = (text(meta, "name")?, span(meta)?, frame(meta)?);
-    Ok(Layer { span, masks, frame, ..Layer::new(name, params, motion, life) })
+    let cross_fade = if meta["cross_fade"].is_null() { [0.0; 2] } else { numbers::<2>(meta, "cross_fade")? };
+    if cross_fade.iter().any(|s| !(*s >= 0.0 && s.is_finite())) {
+        return Err(broken(format!("`cross_fade` is {cross_fade:?}, not two lengths in seconds")));
+    }
+    Ok(Layer { span, cross_fade, masks, frame, ..Layer::new(name, params, motion, life) })
 }
 
 /// Reads the visibility masks of a layer; none where the file has none.
@@ -310,6 +321,24 @@ mod tests {
             up: [0.0, -1.0, 0.0],
             head: Head::Identity,
         }
+    }
+
+    #[test]
+    fn cross_fades_come_back_and_older_readers_refuse_them() {
+        let mut s = scene();
+        s.layers[1].cross_fade = [0.1 + 0.2, 0.0];
+        let mut bytes = Vec::new();
+        write(&s, &mut bytes).unwrap();
+        assert_eq!(
+            read(&bytes).unwrap().layers.iter().map(|l| l.cross_fade).collect::<Vec<_>>(),
+            [[0.0; 2], [0.1 + 0.2, 0.0], [0.0; 2]]
+        );
+        assert_eq!(metadata(&s)["version"], json!(VERSION));
+        assert_eq!(metadata(&scene())["version"], json!(UNFRAMED), "other scenes stay readable");
+        let at = bytes.windows(10).position(|w| w == b"cross_fade").unwrap();
+        let minus = bytes[at..].iter().position(|b| *b == b'[').unwrap() + at + 1;
+        bytes[minus] = b'-';
+        assert!(read(&bytes).is_err());
     }
 
     #[test]

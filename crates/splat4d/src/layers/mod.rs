@@ -1,6 +1,7 @@
 //! A scene is a sum of layers: each a set of Gaussians with one motion model and one kind of life, all splatted together.
 
 mod convert;
+mod cross_fade;
 mod envelope;
 mod evaluation;
 mod frame;
@@ -47,6 +48,11 @@ pub struct Layer<F: Real = f32> {
     pub life: LifeKind,
     /// The layer is seen for from ≤ t < to, seconds; [`ALWAYS`] but for pages of a playback file.
     pub span: [f64; 2],
+    /// Seconds at the beginning and at the end of the span in which the layer cross-fades with another that shows the same
+    /// there: opacity o becomes 1 − (1 − o)^s, s rising from 0 to 1 and falling back to 0. The one of two whose spans
+    /// overlap by so much rises as the other falls, and where one Gaussian of each coincides they let through what one
+    /// would. Zeros: it begins and ends at once.
+    pub cross_fade: [f64; 2],
     /// Visibility masks of the rows over time; none: all rows alive are drawn.
     pub masks: Option<Arc<KeyMasks>>,
     /// Where the layer stands: `world_from_layer`, applied to Gaussians after motion and life. Tables, the motion model and
@@ -62,6 +68,7 @@ impl<F: Real> Clone for Layer<F> {
             motion: self.motion.clone(),
             life: self.life,
             span: self.span,
+            cross_fade: self.cross_fade,
             masks: self.masks.clone(),
             frame: self.frame,
         }
@@ -84,6 +91,8 @@ pub struct LayerTape<F = f32> {
     tape: Tape<F>,
     /// [splats, 5]: σ, ∂σ/∂t, ∂σ/∂log width, ∂σ/∂log softness, the model's opacity; empty where σ is 1.
     life: Table<F>,
+    /// [splats, 2]: ∂o'/∂o and ∂o'/∂s of the cross-fade; empty where there is none now.
+    faded: Table<F>,
     d_out: Table<F>,
     /// [splats, 10]: `tape.out` in the world; empty where the frame is the identity, and for nodes.
     world: Table<F>,
@@ -100,6 +109,7 @@ impl<F: Real> Default for LayerTape<F> {
             ids: Vec::new(),
             tape: Tape::default(),
             life: Table::default(),
+            faded: Table::default(),
             d_out: Table::default(),
             world: Table::default(),
             d_layer: Table::default(),
@@ -156,7 +166,16 @@ impl<F: Real> LayerTape<F> {
 impl<F: Real> Layer<F> {
     /// A layer that may be seen at any time, without masks, whose axes are the world's.
     pub fn new(name: impl Into<String>, params: Params<F>, motion: Arc<dyn Motion<F>>, life: LifeKind) -> Self {
-        Self { name: name.into(), params, motion, life, span: ALWAYS, masks: None, frame: Sim3::IDENTITY }
+        Self {
+            name: name.into(),
+            params,
+            motion,
+            life,
+            span: ALWAYS,
+            cross_fade: [0.0; 2],
+            masks: None,
+            frame: Sim3::IDENTITY,
+        }
     }
 
     /// Whether t lies in the layer's span. A NaN does, so that the trainer's guard finds it.
@@ -221,12 +240,13 @@ impl<F: Real> Layer<F> {
         LifeBuckets::new(self.spans(), clip, count)
     }
 
-    /// Answers the question in `tape`: the motion model, then the life, then the frame. Nodes have neither life nor frame.
+    /// Answers the question in `tape`: the motion model, then the life, the cross-fade and the frame. Nodes have none of these.
     pub fn at(&self, cache: &Cache, tape: &mut LayerTape<F>) {
         let mut own = std::mem::take(&mut tape.tape);
         self.motion.at(&tape.question(&self.params), cache, &mut own);
         tape.tape = own;
         self.fade(tape);
+        self.cross_fade(tape);
         if self.frame.is_identity() || tape.of != Space::Gaussians {
             tape.world = Table::default();
         } else {
@@ -247,6 +267,16 @@ impl<F: Real> Layer<F> {
         tape.life.resize(tape.tape.out.rows());
         let rows = if tape.all { Rows::All } else { Rows::Some(&tape.ids) };
         envelope::forward(table, self.life, tape.t, rows, &mut tape.tape.out, &mut tape.life);
+    }
+
+    /// Cross-fades the opacities of the answer in `tape`.
+    fn cross_fade(&self, tape: &mut LayerTape<F>) {
+        let (share, _) = self.fade_share(tape.t);
+        if share == 1.0 || tape.of != Space::Gaussians {
+            tape.faded = Table::default();
+            return;
+        }
+        cross_fade::forward(F::of(share), &mut tape.tape.out, &mut tape.faded);
     }
 
     /// The splats that the last [`at`](Self::at) left in `tape`.
@@ -286,6 +316,16 @@ impl<F: Real> Layer<F> {
             frame::backward(&self.frame, d_out.out, &mut d_layer);
             unframed = SplatGrads { out: &d_layer, ..*d_out };
             &unframed
+        };
+        let mut d_fade = Table::default();
+        let unfaded;
+        let d_out = if tape.faded.width() == 0 {
+            d_out
+        } else {
+            let d_share = cross_fade::backward(d_out.out, &tape.faded, &mut d_fade);
+            d_time += d_share * self.fade_share(tape.t).1;
+            unfaded = SplatGrads { out: &d_fade, ..*d_out };
+            &unfaded
         };
         let question = tape.question(&self.params);
         if tape.life.width() == 0 {

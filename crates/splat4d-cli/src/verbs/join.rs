@@ -1,0 +1,31 @@
+//! `join`: the finished chunks of a long take become one scene and one file.
+
+use crate::chunked;
+use crate::console::Console;
+use crate::finish;
+use splat4d_train::run::chunks::Chunked;
+use std::path::PathBuf;
+
+const EXAMPLES: &str = "\
+Examples:
+  splat4d join runs/concert             after `splat4d train concert -o runs/concert --chunk I` for every I
+  splat4d join runs/concert --no-eval   only the scene and the file";
+
+/// Join the chunks of a long take, whoever trained them: one scene, one file, measured and reported
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub(crate) struct Args {
+    /// The run
+    #[arg(value_name = "RUN")]
+    run: PathBuf,
+    /// Only the scene and its file: no evaluation, film or report
+    #[arg(long)]
+    no_eval: bool,
+    #[command(flatten)]
+    measure: finish::Measure,
+}
+
+pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
+    args.measure.check()?;
+    chunked::join(&args.run, &Chunked::open(&args.run)?, args.no_eval, &args.measure, console)
+}

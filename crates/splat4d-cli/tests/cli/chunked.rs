@@ -1,0 +1,59 @@
+//! A take in chunks, from the command line: part by part and joined, and what is refused.
+
+use crate::sample::{Answer, Capture, splat4d};
+use crate::{TINY, json_of, str};
+use std::path::{Path, PathBuf};
+
+const CHUNKS: [&str; 4] = ["--chunk-frames=6", "--overlap=2", "--motion=spacetime", "--set=init=random"];
+
+fn take(work: &Path) -> PathBuf {
+    let mut sample = Capture::new(work);
+    sample.frames = 12;
+    sample.write()
+}
+
+fn train(capture: &Path, run: &Path, more: &[&str]) -> Answer {
+    splat4d(&["train", str(capture), "-o", str(run)]).args(&TINY).args(&CHUNKS).args(more).run()
+}
+
+#[test]
+fn parts_by_number_and_one_command_make_the_same_scene_and_file() {
+    let work = tempfile::tempdir().unwrap();
+    let (capture, one, parts) = (take(work.path()), work.path().join("one"), work.path().join("parts"));
+    let said = splat4d(&["info", str(&capture), "--set=chunks.frames=6", "--set=chunks.overlap=2"]).run().ok();
+    assert!(said.contains("2 chunks of at most 7 frames"), "{said}");
+    let said = train(&capture, &one, &[]).ok();
+    assert!(said.contains("flicker where chunks meet"), "{said}");
+    assert!(train(&capture, &parts, &["--chunk=0"]).refused().contains("--chunk shared"));
+    for part in ["shared", "0", "1", "1"] {
+        train(&capture, &parts, &[&format!("--chunk={part}")]).ok();
+    }
+    splat4d(&["join", str(&parts), "--no-eval"]).run().ok();
+    for file in ["scene.safetensors", "scene.splat4d", "chunks/01/scene.safetensors"] {
+        assert_eq!(std::fs::read(one.join(file)).unwrap(), std::fs::read(parts.join(file)).unwrap(), "{file}");
+    }
+    assert!(json_of(&one.join("run.json"))["seams"]["inside"].is_f64());
+    assert!(std::fs::read_to_string(one.join("report.html")).unwrap().contains("Flicker where chunks meet"));
+    // A run like any other: all of it is done, and it is measured and drawn.
+    splat4d(&["train", "--resume", str(&one), "--no-eval"]).run().ok();
+    splat4d(&["eval", str(&parts)]).run().ok();
+    splat4d(&["export", str(&parts.join("chunks/00")), "-o", str(&work.path().join("now.ply")), "--time=0"]).run().ok();
+}
+
+#[test]
+fn what_cannot_be_done_in_chunks_says_so() {
+    let work = tempfile::tempdir().unwrap();
+    let (capture, run) = (take(work.path()), work.path().join("run"));
+    for (more, says) in [
+        (&["--chunk=0", "--set=chunks.frames=12"][..], "fits one chunk"),
+        (&["--chunk=7"], "no chunk 7"),
+        (&["--chunk=x"], "shared, a number or all"),
+        (&["--minutes=1"], "--minutes"),
+        (&["--set=chunks.overlap=5"], "even --overlap"),
+    ] {
+        let said = train(&capture, &run, more).refused();
+        assert!(said.contains(says), "{more:?}: {said}");
+    }
+    assert!(splat4d(&["join", str(&run)]).run().refused().contains("--chunk shared"));
+    assert!(splat4d(&["join", str(&capture)]).run().refused().contains("plan.json"));
+}

@@ -1,0 +1,220 @@
+//! Finished chunks as one scene, and how well they meet.
+
+use super::shared::{LAYER, read_scene};
+use super::train::{of_frames, seconds};
+use super::{Chunked, Part, SCENE, shared};
+use crate::Result;
+use crate::capture::{Capture, ImageStore};
+use crate::event::Event;
+use crate::recipe::Recipe;
+use crate::run::checkpoint::write_atomically;
+use crate::run::identity::recipe_print;
+use crate::run::start::{read_info, read_text};
+use crate::vision::view::spread;
+use splat4d::device;
+use splat4d::layers::{Evaluation, Layer, Scene};
+use splat4d::render::{Antialias, Image, RenderConfig, Shot};
+use splat4d::scene::{Planes, Time};
+use splat4d::{Error, ErrorKind};
+use std::ops::Range;
+use std::sync::Arc;
+
+/// Cuts at which it is measured how well chunks meet, at most.
+const MEASURED: usize = 16;
+/// Cameras that look at each.
+const CAMERAS: usize = 2;
+/// 8-bit steps in [0, 1]: flicker is told in these.
+const LEVELS: f64 = 255.0;
+
+/// A take that was put together.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Joined {
+    /// Its chunks.
+    pub chunks: usize,
+    /// Steps of all of them.
+    pub iterations: usize,
+    /// Gaussians in all layers.
+    pub gaussians: usize,
+    /// Seconds of training, all workers together.
+    pub seconds: f64,
+    /// Largest memory that one of its parts took, bytes.
+    pub peak_memory: u64,
+}
+
+/// Flicker (mean over neighbouring frames of |(R' − R) − (G' − G)|·255) where chunks meet, and for as many frames in their
+/// midst.
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
+pub struct Seams {
+    /// Where they overlap.
+    pub across: f64,
+    /// In the middle of chunks.
+    pub inside: f64,
+    /// Cuts that were looked at.
+    pub cuts: usize,
+    /// Whether cameras looked that training never saw.
+    pub held_out: bool,
+}
+
+impl Chunked {
+    /// Puts finished chunks together: writes `scene.safetensors` and `run.json` of the whole.
+    ///
+    /// Errors: parts that are missing, or were made by another version or recipe; files that cannot be read or written.
+    pub fn join(&self) -> Result<Joined> {
+        let missing: Vec<String> =
+            self.parts().into_iter().filter(|p| !self.is_done(*p)).map(|p| format!("--chunk {p}")).collect();
+        if !missing.is_empty() {
+            return Err(Error::input("parts of the take are not finished")
+                .at(self.run.display())
+                .remedy(format!("Train these first: {}", missing.join(", "))));
+        }
+        let capture = self.capture()?;
+        let mut joined = Joined { chunks: self.plan.len(), iterations: 0, gaussians: 0, seconds: 0.0, peak_memory: 0 };
+        let mut whole = Scene::default();
+        for chunk in 0..self.plan.len() {
+            self.check_made(chunk)?;
+            let folder = self.folder(Part::Chunk(chunk));
+            let info = read_info(&folder)?;
+            joined.iterations += info["iteration"].as_u64().unwrap_or(0) as usize;
+            joined.seconds += info["seconds"].as_f64().unwrap_or(0.0);
+            joined.peak_memory = joined.peak_memory.max(info["peak_memory"].as_u64().unwrap_or(0));
+            let scene = read_scene(&folder.join(SCENE))?;
+            let window = |cut: usize| {
+                let [from, to] = seconds(&capture, &self.plan.shared(cut));
+                [from - 0.5 / scene.fps, to + 0.5 / scene.fps]
+            };
+            let before = (chunk > 0).then(|| window(chunk - 1));
+            let after = (chunk + 1 < self.plan.len()).then(|| window(chunk));
+            let clip = [if chunk == 0 { scene.clip[0] } else { whole.clip[0] }, scene.clip[1]];
+            let earlier = std::mem::take(&mut whole.layers);
+            whole = Scene { clip, layers: earlier, ..Scene { layers: Vec::new(), ..scene.clone() } };
+            for layer in scene.layers.into_iter().filter(|l| l.name != LAYER) {
+                whole.layers.push(Layer {
+                    name: format!("chunk {chunk:02}"),
+                    span: [before.map_or(f64::NEG_INFINITY, |w| w[0]), after.map_or(f64::INFINITY, |w| w[1])],
+                    cross_fade: [before, after].map(|w| w.map_or(0.0, |w| w[1] - w[0])),
+                    ..layer
+                });
+            }
+        }
+        whole.layers.extend(shared::read(&self.folder(Part::Shared))?.still);
+        joined.gaussians = whole.len();
+        let mut bytes = Vec::new();
+        splat4d::format::scene::write(&whole, &mut bytes)?;
+        write_atomically(&self.run.join(SCENE), &bytes)?;
+        let done = [joined.iterations as f64, joined.gaussians as f64, joined.seconds];
+        self.write_info(&capture.name, Some(done))?;
+        Ok(joined)
+    }
+
+    /// Errors: a chunk that another version or another recipe made.
+    fn check_made(&self, chunk: usize) -> Result<()> {
+        let folder = self.folder(Part::Chunk(chunk));
+        let other = |what: String| {
+            Error::new(ErrorKind::Unsupported, format!("chunk {chunk} was made by another {what} than the take's"))
+                .at(folder.display())
+                .remedy("Delete its folder and train it again")
+        };
+        let version = read_info(&folder)?["version"].as_str().unwrap_or("unknown").to_owned();
+        if version != self.plan.version {
+            return Err(other(format!("version ({version})")));
+        }
+        let wanted = of_frames(&self.recipe, self.plan.frames(chunk));
+        let file = folder.join("recipe.toml");
+        let made = Recipe::from_toml(&read_text(&file)?).map_err(|e| e.at(file.display()))?;
+        // Stages count the steps of a chunk anew.
+        let made = made.with(|r| r.run.iterations = wanted.run.iterations);
+        if recipe_print(&made, "") != recipe_print(&wanted, "") {
+            return Err(other("recipe".into()));
+        }
+        Ok(())
+    }
+
+    /// How well the chunks of a scene meet, by cameras that stand still: those that training never saw, where there are any.
+    /// `None`: there is no such camera. Errors: pictures that cannot be read.
+    pub fn seams(&self, scene: &Scene<f32>, listen: &mut dyn FnMut(&Event)) -> Result<Option<Seams>> {
+        let capture = Arc::new(self.capture()?);
+        let fixed = |i: &usize| capture.cameras[capture.frames[*i].camera].fixed;
+        let held_out = capture.held.iter().any(fixed);
+        let all = if held_out { &capture.held } else { &capture.train };
+        let mut cameras: Vec<usize> = all.iter().copied().filter(fixed).map(|i| capture.frames[i].camera).collect();
+        cameras.sort_unstable();
+        cameras.dedup();
+        let antialias = if self.recipe.appearance.antialias { Antialias::On } else { Antialias::Off };
+        let config = RenderConfig { antialias, ..RenderConfig::default() };
+        let mut look = Look {
+            store: ImageStore::new(capture.clone(), 0),
+            backend: device::cpu(config),
+            capture: &capture,
+            frames: all,
+            scene,
+        };
+        let chosen: Vec<usize> = spread(cameras.len(), CAMERAS).map(|k| cameras[k]).collect();
+        let cuts: Vec<usize> = spread(self.plan.cuts.len(), MEASURED).collect();
+        let mut sums = [[0.0; 2]; 2];
+        for (done, &cut) in cuts.iter().enumerate() {
+            listen(&Event::Phase { name: "how chunks meet".into(), done, total: cuts.len() });
+            let seam = self.plan.shared(cut);
+            // The step into the overlap and the one out of it are part of it.
+            let seam = seam.start - 1..seam.end + 1;
+            let chunk = self.plan.frames(cut);
+            let middle = (chunk.start + chunk.end - seam.len()) / 2;
+            for (sum, window) in sums.iter_mut().zip([seam.clone(), middle..middle + seam.len()]) {
+                for &camera in &chosen {
+                    let [total, pairs] = look.flicker(camera, window.clone())?;
+                    *sum = [sum[0] + total, sum[1] + pairs];
+                }
+            }
+        }
+        if sums.iter().any(|[_, pairs]| *pairs == 0.0) {
+            return Ok(None);
+        }
+        let [across, inside] = sums.map(|[total, pairs]| total / pairs);
+        Ok(Some(Seams { across, inside, cuts: cuts.len(), held_out }))
+    }
+}
+
+/// Draws what cameras saw.
+struct Look<'a> {
+    store: ImageStore,
+    backend: Box<dyn splat4d::render::Backend<f32>>,
+    capture: &'a Capture,
+    frames: &'a [usize],
+    scene: &'a Scene<f32>,
+}
+
+impl Look<'_> {
+    /// The sum over neighbouring frames of a window of the mean |(R' − R) − (G' − G)|·255, and their number.
+    fn flicker(&mut self, camera: usize, window: Range<usize>) -> Result<[f64; 2]> {
+        let (mut sum, mut pairs) = (0.0, 0.0);
+        let mut before: Option<Vec<f32>> = None;
+        for index in window {
+            let frame = self.frames.iter().find(|&&i| {
+                let f = &self.capture.frames[i];
+                f.camera == camera && f.index == index
+            });
+            let Some(&frame) = frame else {
+                before = None;
+                continue;
+            };
+            let off = self.error(frame)?;
+            if let Some(before) = before.filter(|b| b.len() == off.len()) {
+                let total: f64 = before.iter().zip(&off).map(|(a, b)| f64::from((b - a).abs())).sum();
+                sum += LEVELS * total / off.len().max(1) as f64;
+                pairs += 1.0;
+            }
+            before = Some(off);
+        }
+        Ok([sum, pairs])
+    }
+
+    /// Render less truth of one frame, clamped as metrics are.
+    fn error(&mut self, frame: usize) -> Result<Vec<f32>> {
+        let f = &self.capture.frames[frame];
+        let (mut seen, mut image, mut truth) = (Evaluation::default(), Image::default(), Planes::default());
+        self.scene.at(Time(f.time.0), &mut seen);
+        let splats = self.scene.splats(&seen);
+        self.backend.render(&Shot::new(&splats, &f.view, self.scene.background), &mut image)?;
+        self.store.load(frame)?.color_into(&mut truth);
+        Ok(image.color.data.iter().zip(&truth.data).map(|(r, g)| r.clamp(0.0, 1.0) - g).collect())
+    }
+}

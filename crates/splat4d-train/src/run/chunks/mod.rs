@@ -1,0 +1,337 @@
+//! Long takes in chunks: what stands still is learnt once, what moves chunk by chunk, each a run folder of its own, so that
+//! memory does not grow with the take, and any number of workers on one folder may share the work.
+//!
+//! Order: the shared layer; then even chunks, which know nothing of each other; then odd ones, which start from both neighbours
+//! and are tied to them where they overlap. A chunk is a function of the capture, the recipe and the files before it, so that
+//! who does which and when changes nothing. Source: methods of overlapping chunks in 4DGaussians' and STG's practice (50 to 60
+//! frames); the cross-fade and the order are ours.
+
+mod claim;
+mod join;
+mod plan;
+mod shared;
+#[cfg(test)]
+mod tests;
+mod tie;
+mod train;
+
+pub use join::{Joined, Seams};
+pub use plan::ChunkPlan;
+
+use super::checkpoint::write_atomically;
+use super::identity;
+use super::open::{OpenCapture, learnable, open_capture};
+use super::session::{Outcome, TrainOptions};
+use super::start::{read_info, read_text};
+use crate::capture::Capture;
+use crate::event::Event;
+use crate::recipe::Recipe;
+use crate::settings::settings;
+use crate::{Error, ErrorKind, Result};
+use claim::Claim;
+use serde_json::json;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+/// Frames of a chunk where the recipe leaves it open (STG: 50).
+const FRAMES: usize = 60;
+/// A take of so many frames is learnt at once where the recipe leaves it open: the cap's Gaussians are enough for it.
+const WHOLE: usize = 300;
+/// Seconds between two looks whether other workers are done.
+const POLL: Duration = Duration::from_secs(1);
+/// Folder of the chunks in a run.
+const FOLDER: &str = "chunks";
+/// File of the plan in it.
+const PLAN: &str = "plan.json";
+/// File of a finished run.
+const SCENE: &str = "scene.safetensors";
+/// What made runs of chunks.
+pub(super) const MADE_BY: &str = "train --chunk";
+
+settings! {
+    /// Long takes in chunks.
+    #[derive(Copy)]
+    pub struct ChunkSettings {
+        /// Frames of a chunk: a longer take is learnt chunk by chunk. 0: 60 where fixed cameras film more than 300 frames and
+        /// nothing is asked for that chunks cannot have, else the take is learnt at once. Iterations are those of a chunk.
+        frames: usize = 0 => any().unit("frames");
+        /// Frames that neighbouring chunks share, in which they fade into each other; an even number.
+        overlap: usize = 8 => any().unit("frames");
+        /// Weight of the difference (L1) between an odd chunk's pictures and its neighbours' where they overlap.
+        consistency: f64 = 0.1;
+    }
+}
+
+/// A part of the work on a take.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Part {
+    /// What stands still, and the cameras' exposures.
+    Shared,
+    /// A chunk.
+    Chunk(usize),
+}
+
+impl std::fmt::Display for Part {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Part::Shared => f.write_str("shared"),
+            Part::Chunk(c) => write!(f, "{c}"),
+        }
+    }
+}
+
+/// A run of a long take.
+pub struct Chunked {
+    run: PathBuf,
+    source: PathBuf,
+    recipe: Recipe,
+    plan: ChunkPlan,
+}
+
+impl Chunked {
+    /// Begins the run of a take in the folder `run`, or finds it begun, by whichever worker. `None`: the take is learnt at once.
+    ///
+    /// Errors: what the recipe asks for cannot be had in chunks; the folder holds the run of another recipe, capture or version.
+    pub fn begin(
+        capture: &Arc<Capture>,
+        recipe: &Recipe,
+        run: &Path,
+        listen: &mut dyn FnMut(&Event),
+    ) -> Result<Option<Self>> {
+        let Some(even) = ChunkPlan::even(capture, recipe)? else { return Ok(None) };
+        let mut listen = listen;
+        let opened = OpenCapture::new(capture.clone(), recipe)?;
+        let recipe =
+            if recipe.run.motion.is_auto() { opened.choose(recipe.clone(), &mut listen)? } else { recipe.clone() };
+        recipe.check()?;
+        check(&recipe)?;
+        let recipe = recipe.resolve();
+        let stated = ChunkPlan {
+            version: env!("CARGO_PKG_VERSION").into(),
+            recipe: identity::recipe_print(&recipe, ""),
+            capture: identity::fingerprint(capture),
+            ..even
+        };
+        if Self::is(run) {
+            let begun = Self::open(run)?;
+            begun.plan.check_same(&stated).map_err(|e| e.at(run.display()))?;
+            return Ok(Some(begun));
+        }
+        let plan = stated.at_rest(&opened, listen)?;
+        let source = std::fs::canonicalize(&capture.root).unwrap_or_else(|_| capture.root.clone());
+        write_atomically(&run.join("recipe.toml"), recipe.to_toml().as_bytes())?;
+        let begun = Self { run: run.to_owned(), source, recipe, plan };
+        begun.write_info(&capture.name, None)?;
+        // Last: whoever finds it finds the others.
+        let text = serde_json::to_string_pretty(&begun.plan).expect("a plan is plain data");
+        write_atomically(&run.join(FOLDER).join(PLAN), text.as_bytes())?;
+        Ok(Some(begun))
+    }
+
+    /// Whether a folder is the run of a long take.
+    pub fn is(run: &Path) -> bool {
+        run.join(FOLDER).join(PLAN).is_file()
+    }
+
+    /// A run that was begun. Errors: it is none, or damaged.
+    pub fn open(run: &Path) -> Result<Self> {
+        let path = run.join(FOLDER).join(PLAN);
+        let plan: ChunkPlan = serde_json::from_str(&read_text(&path)?)
+            .map_err(|e| Error::input(format!("it is no plan of chunks: {e}")).at(path.display()))?;
+        plan.check().map_err(|e| e.at(path.display()))?;
+        let file = run.join("recipe.toml");
+        let recipe = Recipe::from_toml(&read_text(&file)?).map_err(|e| e.at(file.display()))?;
+        let print = identity::recipe_print(&recipe, "");
+        if print != plan.recipe {
+            return Err(Error::input("the recipe is another than the one that its chunks were planned for")
+                .at(file.display())
+                .remedy("Put it back as the run wrote it, or train into another folder"));
+        }
+        let info = read_info(run)?;
+        let source = info["capture"].as_str().map(PathBuf::from).ok_or_else(|| {
+            Error::input("it does not name its capture").at(run.join("run.json").display()).remedy("Train again")
+        })?;
+        Ok(Self { run: run.to_owned(), source, recipe, plan })
+    }
+
+    /// How it is cut.
+    pub fn plan(&self) -> &ChunkPlan {
+        &self.plan
+    }
+
+    /// All parts, in an order in which one worker can do them.
+    pub fn parts(&self) -> Vec<Part> {
+        let chunks = |odd: usize| (odd..self.plan.len()).step_by(2).map(Part::Chunk);
+        std::iter::once(Part::Shared).chain(chunks(0)).chain(chunks(1)).collect()
+    }
+
+    /// The folder of a part.
+    pub fn folder(&self, part: Part) -> PathBuf {
+        let name = match part {
+            Part::Shared => "shared".to_owned(),
+            Part::Chunk(c) => format!("{c:02}"),
+        };
+        self.run.join(FOLDER).join(name)
+    }
+
+    /// Whether a part is finished.
+    pub fn is_done(&self, part: Part) -> bool {
+        let file = if part == Part::Shared { shared::FILE } else { SCENE };
+        self.folder(part).join(file).is_file()
+    }
+
+    /// The parts that must be there before this one begins, of those that are not.
+    fn waits_for(&self, part: Part) -> Vec<Part> {
+        let needs = match part {
+            Part::Shared => Vec::new(),
+            Part::Chunk(c) => std::iter::once(Part::Shared).chain(self.neighbours(c).map(Part::Chunk)).collect(),
+        };
+        needs.into_iter().filter(|p| !self.is_done(*p)).collect()
+    }
+
+    /// The chunks that chunk c starts from.
+    fn neighbours(&self, c: usize) -> impl Iterator<Item = usize> {
+        let odd = c % 2 == 1;
+        [c.wrapping_sub(1), c + 1].into_iter().filter(move |n| odd && *n < usize::MAX).filter({
+            let count = self.plan.len();
+            move |n| *n < count
+        })
+    }
+
+    /// Does one part; nothing where it is done. Errors: parts before it are missing, another worker has it, and those of
+    /// training.
+    pub fn work(
+        &self,
+        part: Part,
+        options: &TrainOptions,
+        stop: &AtomicBool,
+        listen: &mut dyn FnMut(&Event),
+    ) -> Result<Option<Outcome>> {
+        if let Part::Chunk(c) = part
+            && c >= self.plan.len()
+        {
+            return Err(Error::input(format!("there is no chunk {c}: the take has {}", self.plan.len()))
+                .at(self.run.display())
+                .remedy("Chunks are counted from 0"));
+        }
+        if self.is_done(part) {
+            return Ok(None);
+        }
+        let missing = self.waits_for(part);
+        if !missing.is_empty() {
+            let names: Vec<String> = missing.iter().map(|p| format!("--chunk {p}")).collect();
+            return Err(Error::input(format!("chunk {part} begins where others end that are not finished"))
+                .at(self.run.display())
+                .remedy(format!("Do these first: {}", names.join(", "))));
+        }
+        match Claim::new(&self.folder(part))? {
+            Ok(_claim) => self.claimed(part, options, stop, listen),
+            Err(owner) => Err(Error::new(ErrorKind::Io, format!("another worker has it: {owner}"))
+                .at(self.folder(part).display())
+                .remedy("Wait for it, or give this worker another chunk")),
+        }
+    }
+
+    /// Does whatever there is to do until all is done, beside any number of other workers.
+    pub fn work_all(
+        &self,
+        options: &TrainOptions,
+        stop: &AtomicBool,
+        listen: &mut dyn FnMut(&Event),
+    ) -> Result<Option<Outcome>> {
+        let mut listen = listen;
+        loop {
+            let open: Vec<Part> = self.parts().into_iter().filter(|p| !self.is_done(*p)).collect();
+            if open.is_empty() {
+                return Ok(None);
+            }
+            let mut busy = false;
+            for part in open.into_iter().filter(|p| self.waits_for(*p).is_empty()) {
+                let Ok(_claim) = Claim::new(&self.folder(part))? else { continue };
+                busy = true;
+                let outcome = self.claimed(part, options, stop, &mut listen)?;
+                if outcome.as_ref().is_some_and(|o| o.interrupted) {
+                    return Ok(outcome);
+                }
+                // What was waited for may be there now.
+                break;
+            }
+            if stop.load(Ordering::Relaxed) {
+                return Err(Error::new(ErrorKind::Interrupted, "stopped while other workers train")
+                    .remedy("The same command goes on"));
+            }
+            if !busy {
+                listen(&Event::Phase { name: "waiting for other workers".into(), done: 0, total: 0 });
+                std::thread::sleep(POLL);
+            }
+        }
+    }
+
+    /// Does a part that this worker has claimed.
+    fn claimed(
+        &self,
+        part: Part,
+        options: &TrainOptions,
+        stop: &AtomicBool,
+        listen: &mut dyn FnMut(&Event),
+    ) -> Result<Option<Outcome>> {
+        // The one who had it may just have finished it.
+        if self.is_done(part) {
+            return Ok(None);
+        }
+        let mut listen = listen;
+        let (done, total) = (self.parts().iter().filter(|p| self.is_done(**p)).count(), self.plan.len() + 1);
+        listen(&Event::Phase { name: format!("chunk {part}"), done, total });
+        let outcome = match part {
+            Part::Shared => shared::train(self, options, stop, &mut listen)?,
+            Part::Chunk(c) => Some(train::train(self, c, options, stop, &mut listen)?),
+        };
+        Ok(outcome)
+    }
+
+    /// The whole take as the recipe opens it.
+    fn capture(&self) -> Result<Capture> {
+        open_capture(&self.source, &self.recipe)
+            .map_err(|e| e.remedy("The run needs its capture where it was when it was begun"))
+    }
+
+    /// run.json of the whole; `done`: steps, Gaussians and seconds of all chunks.
+    fn write_info(&self, name: &str, done: Option<[f64; 3]>) -> Result<()> {
+        let mut info = json!({
+            "version": env!("CARGO_PKG_VERSION"),
+            "made_by": MADE_BY,
+            "capture": self.source,
+            "capture_name": name,
+            "motion": self.recipe.run.motion.as_str(),
+            "seed": self.recipe.run.seed,
+            "chunks": self.plan.len(),
+            "finished": done.is_some(),
+            "peak_memory": super::peak_memory(),
+        });
+        if let Some([iterations, gaussians, seconds]) = done {
+            info["iteration"] = json!(iterations as usize);
+            info["gaussians"] = json!(gaussians as usize);
+            info["seconds"] = json!(seconds);
+        }
+        let text = serde_json::to_string_pretty(&info).expect("plain data is JSON");
+        write_atomically(&self.run.join("run.json"), text.as_bytes())
+    }
+}
+
+/// Errors: what a recipe asks for that chunks cannot have together.
+fn check(recipe: &Recipe) -> Result<()> {
+    let learnt = learnable(recipe);
+    let (what, remedy) = if recipe.spacetime.has_features() {
+        ("a network that makes colours (features = full)", "Use --set features=none")
+    } else if learnt.poses || learnt.focal || learnt.times {
+        ("cameras that are refined", "Refine them on a part of the take first (--set max_frames=60)")
+    } else if recipe.capture.observe < 1.0 {
+        ("a future that is not looked at (--observe)", "Leave --observe away")
+    } else {
+        return Ok(());
+    };
+    Err(Error::new(ErrorKind::Unsupported, format!("chunks cannot share {what}"))
+        .remedy(format!("{remedy}, or train at once with --chunk-frames above the take's length")))
+}
