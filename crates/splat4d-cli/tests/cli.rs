@@ -6,6 +6,8 @@ mod bench;
 mod compress;
 #[path = "cli/convert.rs"]
 mod convert;
+#[path = "cli/edit.rs"]
+mod edit;
 #[path = "cli/import.rs"]
 mod import;
 #[path = "cli/predict.rs"]
