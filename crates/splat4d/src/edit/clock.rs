@@ -3,7 +3,8 @@
 use crate::layers::{ALWAYS, Layer};
 use crate::math::Rng;
 use crate::motion::edited::{Change, Edited, FadeKey, PathKey};
-use crate::motion::{Motion, Spacetime, Spec};
+use crate::motion::filtered::Filtered;
+use crate::motion::{Motion, Spacetime, Still};
 use crate::scene::life::{CENTER, LOG_SOFTNESS, LOG_WIDTH};
 use crate::scene::{KeyMasks, LIFE, RowEdit, Space};
 use crate::{Error, ErrorKind, Result};
@@ -97,29 +98,26 @@ fn retimed(motion: &Arc<dyn Motion>, rate: f64, offset: f64, layer: &mut Layer<f
         return Ok(Arc::new(edited.with(inner, change)));
     }
     let any: &dyn Any = motion.as_ref();
-    match (any.downcast_ref::<Spacetime>(), motion.spec()) {
-        (Some(model), _) => Ok(Arc::new(model.retimed(rate, offset, &mut layer.params))),
-        (_, Spec::Still) => Ok(motion.clone()),
-        _ => clocked(motion, rate, offset, layer),
+    if let Some(model) = any.downcast_ref::<Spacetime>() {
+        return Ok(Arc::new(model.retimed(rate, offset, &mut layer.params)));
     }
+    if any.is::<Still>() { Ok(motion.clone()) } else { clocked(motion, rate, offset, layer) }
 }
 
 /// A clock around the model, which must not read the lives that are about to change.
 fn clocked(motion: &Arc<dyn Motion>, rate: f64, offset: f64, layer: &mut Layer<f32>) -> Result<Arc<dyn Motion>> {
-    if reads_lives(&motion.spec()) && layer.params[LIFE].width() > 0 {
+    if reads_lives(motion.as_ref()) && layer.params[LIFE].width() > 0 {
         return Err(Error::new(ErrorKind::Unsupported, format!("layer `{}` cannot run on another clock", layer.name))
             .remedy("Bake the scene first; baked scenes can"));
     }
     Ok(Arc::new(Edited::around(motion.clone(), Change::Clock { rate, offset }, &mut layer.params)?))
 }
 
-fn reads_lives(spec: &Spec) -> bool {
-    match spec {
-        Spec::Spacetime(_) => true,
-        Spec::Filtered(s) => reads_lives(&s.inner),
-        Spec::Edited(s) => reads_lives(&s.inner),
-        _ => false,
-    }
+fn reads_lives(motion: &dyn Motion) -> bool {
+    let any: &dyn Any = motion;
+    any.is::<Spacetime>()
+        || Filtered::of(motion).is_some_and(|f| reads_lives(f.inner().as_ref()))
+        || Edited::of(motion).is_some_and(|e| reads_lives(e.inner().as_ref()))
 }
 
 fn rising<K>(mut keys: Vec<K>, rate: f64) -> Vec<K> {
