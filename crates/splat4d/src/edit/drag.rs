@@ -6,7 +6,7 @@ use crate::layers::{Evaluation, Layer, Scene, sweep};
 use crate::math::quat;
 use crate::math::se3::{add, norm, sub};
 use crate::motion::arap::{Elastic, Handle};
-use crate::motion::edited::{Change, DragSpec, Edited, NodeOffsets};
+use crate::motion::edited::{Change, DragSpec, Edited, NodeOffset, NodeOffsets};
 use crate::motion::skin::farthest_points;
 use crate::scene::splats::SPLAT_OPACITY;
 use crate::scene::{Rows, Table, Time};
@@ -139,7 +139,7 @@ pub(super) fn run(scene: &mut Scene<f32>, selected: &Selected, asked: &Asked<'_>
     if pulled.iter().all(Vec::is_empty) {
         return Err(Error::input("every node of every handle is pinned").remedy("Move the pins away from the handles"));
     }
-    let offsets = |(t, rest): (&f64, &Vec<[f64; 3]>)| -> Result<Vec<([f64; 3], [f64; 3], [f64; 4])>> {
+    let offsets = |(t, rest): (&f64, &Vec<[f64; 3]>)| -> Result<Vec<NodeOffset>> {
         let mut handles: Vec<Handle> = Vec::new();
         let mut hold = |node: usize, by: [f64; 3]| {
             // A node of two handles follows the first.
@@ -194,7 +194,7 @@ struct Bend<'a> {
     paths: &'a [Vec<[f64; 3]>],
     times: &'a [f64],
     at: f64,
-    nodes: Vec<([f64; 3], [f64; 3], [f64; 4])>,
+    nodes: Vec<NodeOffset>,
 }
 
 fn bend(scene: &mut Scene<f32>, selected: &Selected, bend: &Bend<'_>) -> Result<()> {

@@ -45,6 +45,9 @@ struct LayerLooks {
 
 struct Looks(Vec<LayerLooks>);
 
+/// A time, the rows that are looked at then, and which of its looks it is for each.
+type Question<'a> = (Time, &'a (Vec<u32>, Vec<u8>));
+
 /// By layer and row: bit i stands for moment i of the row.
 type Bits = Vec<Vec<u8>>;
 
@@ -76,7 +79,7 @@ impl Looks {
                 }
             }
             let asked: Vec<_> = asked.into_iter().enumerate().filter(|(_, a)| !a.0.is_empty()).collect();
-            let questions: Vec<(Time, &(Vec<u32>, Vec<u8>))> = asked.iter().map(|(k, a)| (Time(time(*k)), a)).collect();
+            let questions: Vec<Question<'_>> = asked.iter().map(|(k, a)| (Time(time(*k)), a)).collect();
             LayerLooks::of(layer, expr, seen, count, &questions)
         };
         Self(scene.layers.iter().map(of).collect())
@@ -99,13 +102,7 @@ impl Looks {
 }
 
 impl LayerLooks {
-    fn of(
-        layer: &Layer<f32>,
-        expr: &Expr,
-        seen: Vec<[f64; 2]>,
-        count: Vec<u8>,
-        questions: &[(Time, &(Vec<u32>, Vec<u8>))],
-    ) -> Self {
+    fn of(layer: &Layer<f32>, expr: &Expr, seen: Vec<[f64; 2]>, count: Vec<u8>, questions: &[Question<'_>]) -> Self {
         let wanted = |which: &dyn Fn(&Expr) -> bool| if expr.any(which) { LOOKS * count.len() } else { 0 };
         let none = f32::NAN;
         let mut out = Self {
@@ -319,7 +316,7 @@ fn grown(scene: &Scene<f32>, mut selected: Selected, distance: f64) -> Selected 
         let cell = |x: [f64; 3]| x.map(|x| (x / distance).floor() as i64);
         let mut grid: Vec<([i64; 3], [f64; 3])> =
             points.iter().filter(|(l, row, _)| seeds[*l][*row]).map(|(_, _, x)| (cell(*x), *x)).collect();
-        grid.sort_by(|a, b| a.0.cmp(&b.0));
+        grid.sort_by_key(|g| g.0);
         for (layer, row, x) in points.iter().filter(|(l, row, _)| !seeds[*l][*row]) {
             let home = cell(*x);
             let near = (0..27).any(|n| {

@@ -19,7 +19,7 @@ mod path;
 mod tests;
 
 pub use color::ColorMap;
-pub use drag::{DragSpec, NodeOffsets};
+pub use drag::{DragSpec, NodeOffset, NodeOffsets};
 pub use path::{FadeKey, PathKey};
 
 use super::{At, Cache, Capabilities, Model, Motion, Phase, Spec, Tape, central_velocity};

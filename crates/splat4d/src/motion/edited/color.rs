@@ -40,7 +40,7 @@ impl ColorMap {
             return (x, 1.0);
         }
         let i = self.curve.iter().position(|k| k[0] > x).unwrap_or(n).clamp(1, n - 1);
-        let ([x0, y0], [x1, y1]) = (self.curve[i - 1].into(), self.curve[i].into());
+        let ([x0, y0], [x1, y1]) = (self.curve[i - 1], self.curve[i]);
         let slope = (y1 - y0) / (x1 - x0);
         (y0 + slope * (x - x0), slope)
     }

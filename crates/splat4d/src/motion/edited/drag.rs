@@ -41,11 +41,14 @@ impl DragSpec {
     }
 }
 
+/// Place, shift, and the turn as a unit quaternion.
+pub type NodeOffset = ([f64; 3], [f64; 3], [f64; 4]);
+
 /// Numbers of a drag, to be written into its tables.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct NodeOffsets {
     /// [times, nodes]: place, shift, and the turn as a unit quaternion.
-    pub nodes: Vec<([f64; 3], [f64; 3], [f64; 4])>,
+    pub nodes: Vec<NodeOffset>,
     /// [Gaussians, K]: node and weight.
     pub pulls: Vec<(u32, f32)>,
 }
@@ -100,10 +103,12 @@ impl Keys {
     }
 }
 
+/// R (rows), p + T − R p, unit quaternion.
+type Rigid<F> = ([[F; 3]; 3], [F; 3], [F; 4]);
+
 /// The nodes' rigid motions at one time, and who follows them.
 pub(super) struct Pulls<'a, F> {
-    /// R (rows), p + T − R p, unit quaternion.
-    nodes: Vec<([[F; 3]; 3], [F; 3], [F; 4])>,
+    nodes: Vec<Rigid<F>>,
     /// By Gaussian.
     table: &'a Table<F>,
 }
