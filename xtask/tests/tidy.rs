@@ -71,6 +71,7 @@ const ORDER: [(&str, &[&str]); 8] = [
             "chunked",
             "compressing",
             "predicting",
+            "editing",
             "verbs",
             "main",
         ],
@@ -142,7 +143,7 @@ const SHELLS: [&str; 3] = ["crates/splat4d-cli/", "studies/", "xtask/"];
 const PATH_WORDS: [&str; 3] = ["std::fs", "std::path", "File::open"];
 
 /// Documents whose paths and flags are checked.
-const DOCS: [&str; 14] = [
+const DOCS: [&str; 15] = [
     "README.md",
     "ARCHITECTURE.md",
     "CONVENTIONS.md",
@@ -152,6 +153,7 @@ const DOCS: [&str; 14] = [
     "docs/bundled-capture.md",
     "docs/capture-format.md",
     "docs/doctor.md",
+    "docs/edit.md",
     "docs/formats.md",
     "docs/models.md",
     "docs/python.md",

@@ -129,7 +129,10 @@ pub(crate) fn bake_into(
         tried.push((packed, likeness));
     }
     let best = tried.pop().expect("one file was packed");
-    let (Packed { bytes, baked, summary, antialias }, likeness) = best;
+    let (Packed { mut bytes, baked, summary, antialias }, likeness) = best;
+    if source.provenance.is_some() {
+        bytes = playback::with_provenance(&bytes, source.provenance.as_ref())?;
+    }
     files::write(out, &bytes)?;
     let seconds = started.elapsed().as_secs_f64();
     console.clear();
@@ -141,7 +144,7 @@ pub(crate) fn bake_into(
         .map(|(name, e)| ((*name).to_owned(), json!({"rms": e.rms, "max": e.max})))
         .collect();
     let value = json!({
-        "type": "baked", "file": out, "bytes": summary.bytes, "seconds": seconds, "clip": baked.clip,
+        "type": "baked", "file": out, "bytes": bytes.len(), "seconds": seconds, "clip": baked.clip,
         "bytes_per_primitive": summary.bytes as f64 / report.primitives.max(1) as f64,
         "pages": summary.pages, "page_bytes": summary.page_bytes, "palette_entries": summary.palette_entries,
         "palette_bytes": summary.palette_bytes, "poster_bytes": summary.poster_bytes, "baking": report,

@@ -13,6 +13,7 @@ mod compressing;
 pub mod console;
 mod device;
 pub mod draw;
+mod editing;
 pub mod files;
 pub mod finish;
 pub mod interrupt;
@@ -56,6 +57,7 @@ Examples:
   splat4d export runs/knight -o now.ply --time 0.5
   splat4d export runs/knight --html -o knight.html
   splat4d convert scene.sog scene.spz      between the formats of other programs
+  splat4d edit runs/knight edits.toml -o clean.safetensors   select, clean, recolour, move, merge, drag
   splat4d info my-take                     what is in a capture, run or file; is it healthy?
   splat4d bench                            how fast this machine draws and trains
 
@@ -102,6 +104,7 @@ enum Verb {
     Export(verbs::export::Args),
     View(verbs::view::Args),
     Convert(verbs::convert::Args),
+    Edit(verbs::edit::Args),
     Info(verbs::info::Args),
     Bench(verbs::bench::Args),
     Completions(verbs::completions::Args),
@@ -122,6 +125,7 @@ impl Verb {
             Verb::Export(args) => verbs::export::run(args, console),
             Verb::View(args) => verbs::view::run(args, console),
             Verb::Convert(args) => verbs::convert::run(args, console),
+            Verb::Edit(args) => verbs::edit::run(args, console),
             Verb::Info(args) => verbs::info::run(args, console),
             Verb::Bench(args) => verbs::bench::run(args, threads, console),
             Verb::Completions(args) => verbs::completions::run(args, console),

@@ -5,7 +5,7 @@ use crate::files::{cannot_read, either};
 use crate::paths::{Stage, View};
 use crate::run_folder::Run;
 use crate::sequence;
-use splat4d::format::playback::{self, Index};
+use splat4d::format::playback::{self, Index, Provenance};
 use splat4d::format::ply::PlyInfo;
 use splat4d::format::{Dialect, Warnings, dialect, sog};
 use splat4d::layers::{Layer, Scene};
@@ -42,6 +42,8 @@ pub struct Source {
     pub ply: Option<PlyInfo>,
     /// The start of the playback file, where it is one.
     pub playback: Option<Index>,
+    /// Where the playback file comes from, where it says so; written along into playback files that are made of it.
+    pub provenance: Option<Provenance>,
     /// Whose format it is, where it is not our own.
     pub dialect: Option<Dialect>,
     /// Warnings about parts that could not be read, or had to be assumed.
@@ -74,7 +76,8 @@ impl Source {
         if bytes.starts_with(&playback::MAGIC) {
             let index = Index::parse(&bytes, Some(bytes.len() as u64)).map_err(|e| e.at(path.display()))?;
             let scene = playback::read(&bytes).map_err(|e| e.at(path.display()))?;
-            return Ok(Self { playback: Some(index), ..Self::own(scene) });
+            let provenance = playback::provenance(&bytes).map_err(|e| e.at(path.display()))?;
+            return Ok(Self { playback: Some(index), provenance, ..Self::own(scene) });
         }
         let opened = match dialect_of(path, &bytes) {
             Some(kind) => kind.open(&bytes).map(|o| Self {
@@ -97,7 +100,8 @@ impl Source {
 
     /// A scene of our own, without a run.
     pub(crate) fn own(scene: Scene<f32>) -> Self {
-        Self { scene, run: None, ply: None, playback: None, dialect: None, warnings: Warnings::default() }
+        let warnings = Warnings::default();
+        Self { scene, run: None, ply: None, playback: None, provenance: None, dialect: None, warnings }
     }
 
     /// The data set's cameras; those that a playback file brings along; empty for other bare files.

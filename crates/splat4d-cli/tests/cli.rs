@@ -8,6 +8,8 @@ mod chunked;
 mod compress;
 #[path = "cli/convert.rs"]
 mod convert;
+#[path = "cli/edit.rs"]
+mod edit;
 #[path = "cli/import.rs"]
 mod import;
 #[path = "cli/predict.rs"]

@@ -124,8 +124,8 @@ pub fn follow(scene: &Scene<f32>, start: &Moment, ticks: &[f64]) -> Vec<Moment> 
     follow_among(scene, start, ticks, &fast)
 }
 
-/// As [`follow`], of Gaussians for which `among` holds.
-fn follow_among(scene: &Scene<f32>, start: &Moment, ticks: &[f64], among: &[bool]) -> Vec<Moment> {
+/// As [`follow`], carried by Gaussians for which `among` holds (all layers after each other), whether they move or not.
+pub fn follow_among(scene: &Scene<f32>, start: &Moment, ticks: &[f64], among: &[bool]) -> Vec<Moment> {
     let mut out = vec![start.clone()];
     let mut ties: Vec<Option<Tie>> = vec![None; start.len()];
     let mut before = look(scene, ticks[0]);

@@ -26,6 +26,7 @@
 
 pub mod bake;
 pub mod device;
+pub mod edit;
 pub mod error;
 pub mod flow;
 pub mod format;

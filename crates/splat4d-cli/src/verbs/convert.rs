@@ -79,6 +79,9 @@ pub(crate) struct Args {
     /// Highest degree of spherical harmonics to keep
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(0..=3))]
     sh: Option<u8>,
+    /// Leave out what a playback file says of where it comes from
+    #[arg(long)]
+    no_provenance: bool,
     /// Version of .spz to write
     #[arg(long, value_name = "V", default_value_t = spz::DEFAULT_VERSION,
           value_parser = clap::value_parser!(u32).range(2..=4))]
@@ -160,21 +163,50 @@ impl Target {
     }
 }
 
+impl Args {
+    /// A whole scene as one file, nothing else asked for.
+    pub(crate) fn plain(input: PathBuf, output: PathBuf) -> Self {
+        let spz_version = spz::DEFAULT_VERSION;
+        let (time, fps, from, to) = (None, None, None, None);
+        let (frames, up, sh, no_provenance) = (false, None, None, false);
+        Self { input, output, time, frames, fps, from, to, up, sh, no_provenance, spz_version }
+    }
+}
+
+/// Refuses a file whose ending names no format that is written.
+pub(crate) fn check_output(output: &Path) -> Result<()> {
+    Target::of(output).map(|_| ())
+}
+
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
+    asked(args)?;
+    let source = Source::open_at(&args.input, args.fps.unwrap_or(DEFAULT_FPS))?;
+    not_empty(&source.scene, &args.input)?;
+    source.warnings.lines().iter().for_each(|w| console.warn(&format!("{w}.")));
+    write(args, source, console)
+}
+
+/// With --frames the pattern; and the format. Errors: options that do not fit together.
+fn asked(args: &Args) -> Result<(Option<(Pattern, PathBuf)>, Target)> {
     let pattern = frames_pattern(args)?;
     let target = Target::of(pattern.as_ref().map_or(&args.output, |p| p.1.as_path()))?;
     if args.time.is_some_and(|t| !t.is_finite()) || args.fps.is_some_and(|f| !(0.01..=1000.0).contains(&f)) {
-        return Err(Error::input("--time or --fps is out of range").remedy("Give a plain, sensible number.").into());
+        return Err(Error::input("--time or --fps is out of range").remedy("Give a plain, sensible number."));
     }
     if target == Target::Playback && (args.time.is_some() || args.frames) {
         return Err(Error::input("a playback file holds the whole take")
             .at(args.output.display())
-            .remedy("Leave --time or --frames out.")
-            .into());
+            .remedy("Leave --time or --frames out."));
     }
-    let mut source = Source::open_at(&args.input, args.fps.unwrap_or(DEFAULT_FPS))?;
-    not_empty(&source.scene, &args.input)?;
-    source.warnings.lines().iter().for_each(|w| console.warn(&format!("{w}.")));
+    Ok((pattern, target))
+}
+
+/// Writes a scene that was opened, as the options say.
+pub(crate) fn write(args: &Args, mut source: Source, console: &Console) -> anyhow::Result<()> {
+    let (pattern, target) = asked(args)?;
+    if args.no_provenance {
+        source.provenance = None;
+    }
     if let Some(degree) = args.sh {
         let had = source.scene.limit_sh(degree.into());
         if had > usize::from(degree) {

@@ -289,6 +289,12 @@ fn of_file(path: &Path) -> anyhow::Result<Told> {
     if let Some(told) = &told {
         text.push_str(&told.text);
     }
+    if let Some(from) = &source.provenance {
+        let edits = (!from.edits.is_empty()).then(|| format!("{}: {}", from.edits.len(), done(&from.edits)));
+        let told = [("made with", Some(&from.made_with)), ("when", from.when.as_ref()), ("edits", edits.as_ref())];
+        let rest = [("capture", from.capture.as_ref()), ("in words", from.words.as_ref())];
+        told.into_iter().chain(rest).filter_map(|(k, v)| Some((k, v?))).for_each(|(k, v)| line(&mut text, k, v));
+    }
     if let Some(info) = &source.ply {
         if !info.extra_properties.is_empty() {
             line(&mut text, "not read", &info.extra_properties.join(", "));
@@ -301,6 +307,7 @@ fn of_file(path: &Path) -> anyhow::Result<Told> {
     let inner = of_scene(&source.scene);
     text.push_str(&inner.text);
     let mut json = inner.json;
+    json["provenance"] = json!(source.provenance);
     json["dialect"] = json!(source.dialect.map(|d| d.name));
     json["type"] = json!(if source.ply.is_some() { "ply" } else { "scene" });
     json["bytes"] = json!(bytes);
@@ -309,6 +316,11 @@ fn of_file(path: &Path) -> anyhow::Result<Told> {
         json["playback"] = told.json;
     }
     Ok(Told { json, text, troubles: inner.troubles })
+}
+
+/// Names of edits, one after the other.
+fn done(edits: &[Value]) -> String {
+    edits.iter().map(|e| e["do"].as_str().unwrap_or("?")).collect::<Vec<_>>().join(", ")
 }
 
 /// Gaussians, degree, bounds, histograms and damage.

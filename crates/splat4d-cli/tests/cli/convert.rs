@@ -19,7 +19,7 @@ use splat4d::scene::{GEOMETRY, LIFE, LifeKind, Params, SH};
 use std::path::Path;
 
 /// Gaussians that fly for a second, z up.
-fn moving() -> Scene<f32> {
+pub(crate) fn moving() -> Scene<f32> {
     birds(None)
 }
 

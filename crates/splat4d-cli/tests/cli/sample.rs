@@ -195,6 +195,12 @@ impl Answer {
         self.stdout
     }
 
+    /// All that a call that worked said.
+    pub(crate) fn all(self) -> String {
+        assert_eq!(self.code, Some(0), "{}: {}", self.call, self.stderr);
+        self.stdout + &self.stderr
+    }
+
     /// Standard error of a call that worked.
     pub(crate) fn told(self) -> String {
         assert_eq!(self.code, Some(0), "{}: {}", self.call, self.stderr);

@@ -6,6 +6,7 @@
 mod align;
 mod colour;
 mod conv;
+pub mod floaters;
 pub mod localise;
 pub(crate) mod lpips;
 pub mod metrics;

@@ -26,6 +26,7 @@ fn look(bytes: &[u8]) {
                 Kind::Page => drop(decode_page(e, stored)),
                 Kind::Palette => drop(decode_palette(e, stored)),
                 Kind::Masks => drop(decode_masks(e, stored)),
+                Kind::Provenance => drop(splat4d::format::playback::provenance(bytes)),
                 Kind::Poster | Kind::Other(_) => {}
             }
         }

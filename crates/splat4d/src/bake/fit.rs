@@ -48,8 +48,6 @@ pub(super) struct Fitter<'a> {
 pub(super) struct Subject<'a> {
     pub samples: &'a Samples,
     pub row: &'a Row,
-    /// The seconds in which its layer is seen.
-    pub window: [f64; 2],
     pub life: Envelope,
     /// Whether its layer comes or goes by a cross-fade.
     pub cross_fades: bool,
@@ -78,15 +76,12 @@ impl Fitter<'_> {
 
     /// Goes down while one half holds all that is to be seen, then fits; a miss goes on in both halves.
     fn place(&self, subject: &Subject<'_>, span: Span, out: &mut Vec<Piece>) {
-        let inside = match narrow(self.tree, subject.row.seen, subject.window, span) {
+        match narrow(self.tree, subject.row.seen, span) {
             Place::Nowhere => return,
             Place::In(half) => return self.place(subject, half, out),
-            Place::Across => false,
-            Place::Here => true,
-        };
-        let halves = self.tree.split(span);
-        let fitted = if inside || halves.is_none() { self.fit(subject, span) } else { None };
-        match (fitted, halves) {
+            Place::Here => {}
+        }
+        match (self.fit(subject, span), self.tree.split(span)) {
             (Some((primitive, error)), _) if error <= self.tolerance => out.push(Piece { span, primitive, error }),
             // Where nothing could be fitted a half may still hold a frame that is sound.
             (_, Some(halves)) => halves.into_iter().for_each(|half| self.place(subject, half, out)),
@@ -306,13 +301,11 @@ enum Place {
     Nowhere,
     /// All of it lies in this half, and the node is longer than a segment.
     In(Span),
-    /// The node reaches beyond the time in which the layer is seen.
-    Across,
     /// The node may hold it.
     Here,
 }
 
-fn narrow(tree: &Tree, seen: [f64; 2], window: [f64; 2], span: Span) -> Place {
+fn narrow(tree: &Tree, seen: [f64; 2], span: Span) -> Place {
     let [from, to] = [tree.border(span[0]), tree.border(span[1])];
     if !(seen[1] >= from && seen[0] < to) {
         return Place::Nowhere;
@@ -326,24 +319,19 @@ fn narrow(tree: &Tree, seen: [f64; 2], window: [f64; 2], span: Span) -> Place {
             return Place::In(right);
         }
     }
-    let within = (window[0] <= from || span[0] == 0 && window[0] <= tree.clip()[0])
-        && (window[1] >= to || span[1] == tree.frames() && window[1] > tree.clip()[1]);
-    if within { Place::Here } else { Place::Across }
+    Place::Here
 }
 
-/// The spans in which a Gaussian whose motion is a straight line lies: the deepest that holds all that is to be seen; where
-/// that reaches beyond the time in which the layer is seen, spans that do not.
-pub(super) fn homes(tree: &Tree, seen: [f64; 2], window: [f64; 2]) -> Vec<Span> {
-    let (mut open, mut out) = (vec![tree.root()], Vec::new());
-    while let Some(span) = open.pop() {
-        match (narrow(tree, seen, window, span), tree.split(span)) {
-            (Place::Nowhere, _) => {}
-            (Place::In(half), _) => open.push(half),
-            (Place::Across, Some([left, right])) => open.extend([right, left]),
-            (Place::Across, None) | (Place::Here, _) => out.push(span),
+/// The span in which a Gaussian whose motion is a straight line lies: the deepest that holds all that is to be seen.
+pub(super) fn home(tree: &Tree, seen: [f64; 2]) -> Option<Span> {
+    let mut span = tree.root();
+    loop {
+        match narrow(tree, seen, span) {
+            Place::Nowhere => return None,
+            Place::In(half) => span = half,
+            Place::Here => return Some(span),
         }
     }
-    out
 }
 
 /// The seconds of the clip in which something of this envelope and opacity can be seen.

@@ -21,7 +21,7 @@ mod straight;
 mod tests;
 mod tree;
 
-use crate::format::playback::{Node, Primitive};
+use crate::format::playback::{Node, Primitive, is_page, primitives};
 pub use compare::{Likeness, Moment, Shown, compare};
 
 use crate::layers::{Layer, Scene};
@@ -141,23 +141,26 @@ pub fn bake(scene: &Scene<f32>, options: &Options, progress: &mut dyn FnMut(usiz
     let total = scene.len();
     let mut tally = Tally::default();
     progress(0, total);
+    let mut pages = Vec::new();
     for layer in scene.layers.iter().map(Layer::with_frame_absorbed) {
+        if options.repeat == 1 && is_page(&layer) {
+            pages.extend(page(&layer, &lookout, &mut tally)?);
+            progress(tally.done, total);
+            continue;
+        }
         match Line::of(&layer) {
             Some(line) => copy(&layer, &line, &fitter, &mut tally, &mut |n| progress(n, total))?,
             None => follow(&layer, &fitter, &mut tally, &mut |n| progress(n, total))?,
         }
     }
-    let key_states = tally.spans.iter().filter(|(s, _)| s[1] - s[0] == 1 && tree.frames() > 1).map(|s| s.1.len()).sum();
+    let key_states =
+        tally.spans.iter().filter(|((s, _), _)| s[1] - s[0] == 1 && tree.frames() > 1).map(|s| s.1.len()).sum();
     let errors = quantiles(std::mem::take(&mut tally.errors), options.tolerance);
-    // Spans sort by their beginning; of those that begin together the longest, which holds the others, comes first.
-    let mut spans: Vec<(Span, Vec<Primitive>)> = tally.spans.into_iter().collect();
-    spans.sort_by_key(|(s, _)| (s[0], std::cmp::Reverse(s[1])));
-    let node = |(span, primitives): (Span, Vec<Primitive>)| Node {
-        from: tree.border(span[0]),
-        to: tree.border(span[1]),
-        primitives,
+    let spans = std::mem::take(&mut tally.spans);
+    let cut = |((span, window), primitives): ((Span, usize), Vec<Primitive>)| {
+        cut(Node { from: tree.border(span[0]), to: tree.border(span[1]), primitives }, tally.windows[window])
     };
-    let mut nodes: Vec<Node> = spans.into_iter().map(node).collect();
+    let mut nodes = in_order(spans.into_iter().filter_map(cut).chain(pages).collect());
     let mut clip = scene.clip;
     if options.repeat > 1 {
         let one: usize = nodes.iter().map(|n| n.primitives.len()).sum();
@@ -183,7 +186,9 @@ pub fn bake(scene: &Scene<f32>, options: &Options, progress: &mut dyn FnMut(usiz
 /// Primitives and statistics of the layers so far.
 #[derive(Default)]
 struct Tally {
-    spans: BTreeMap<Span, Vec<Primitive>>,
+    /// By span of the tree, and which of the windows cuts it.
+    spans: BTreeMap<(Span, usize), Vec<Primitive>>,
+    windows: Vec<[f64; 2]>,
     errors: Vec<f64>,
     primitives: usize,
     unseen: usize,
@@ -192,12 +197,19 @@ struct Tally {
 }
 
 impl Tally {
-    /// Adds all pieces of one Gaussian.
-    fn add(&mut self, pieces: impl IntoIterator<Item = Piece>) -> Result<()> {
+    /// Adds all pieces of one Gaussian of a layer that is seen during `window`.
+    fn add(&mut self, window: [f64; 2], pieces: impl IntoIterator<Item = Piece>) -> Result<()> {
+        let place = match self.windows.iter().position(|w| *w == window) {
+            Some(place) => place,
+            None => {
+                self.windows.push(window);
+                self.windows.len() - 1
+            }
+        };
         let (mut count, mut error) = (0, 0.0f64);
         for piece in pieces.into_iter().filter(|p| is_sound(&p.primitive)) {
             (count, error) = (count + 1, error.max(piece.error));
-            self.spans.entry(piece.span).or_default().push(piece.primitive);
+            self.spans.entry((piece.span, place)).or_default().push(piece.primitive);
         }
         self.done += 1;
         match count {
@@ -225,6 +237,56 @@ fn bounded(primitives: usize) -> Result<()> {
         .remedy("Raise --tolerance, or bake a shorter clip or fewer Gaussians."))
 }
 
+/// A layer of a playback file: pieces already, which stay as they are in their span. Their importance is not in the file.
+fn page(layer: &Layer<f32>, lookout: &Lookout, tally: &mut Tally) -> Result<Option<Node>> {
+    let mut all = primitives(layer);
+    let before = all.len();
+    all.retain(|p| is_sound(p) && p.opacity >= crate::layers::ALPHA_MIN as f32);
+    for p in &mut all {
+        let mut sizes = p.scales;
+        sizes.sort_by(f32::total_cmp);
+        let pixels = lookout.pixels(p.mean) as f32;
+        let importance = p.opacity * sizes[2] * sizes[1] * pixels * pixels;
+        p.importance = if importance.is_finite() { importance } else { 0.0 };
+    }
+    tally.done += before;
+    tally.unseen += before - all.len();
+    tally.primitives += all.len();
+    tally.errors.resize(tally.errors.len() + all.len(), 0.0);
+    bounded(tally.primitives)?;
+    let [from, to] = layer.span;
+    Ok((!all.is_empty()).then_some(Node { from, to, primitives: all }))
+}
+
+/// What is left of a node of a layer that is seen during `window` only.
+fn cut(mut node: Node, [first, last]: [f64; 2]) -> Option<Node> {
+    let (from, to) = (node.from.max(first), node.to.min(last));
+    if [from, to] != [node.from, node.to] {
+        // What lives for ever counts from the middle, so that nothing is far from where it was rounded.
+        let middle = 0.5 * (from + to);
+        for p in node.primitives.iter_mut().filter(|p| p.half_width == f64::INFINITY && p.turn == [0.0; 3]) {
+            (0..3).for_each(|k| p.mean[k] += f64::from(p.velocity[k]) * (middle - p.center));
+            p.center = middle;
+        }
+        (node.from, node.to) = (from, to);
+    }
+    (from < to).then_some(node)
+}
+
+/// Nodes by their beginning; of those that begin together the longest, which holds the others, comes first. Those of one
+/// span are one.
+fn in_order(mut nodes: Vec<Node>) -> Vec<Node> {
+    nodes.sort_by(|a, b| a.from.total_cmp(&b.from).then(b.to.total_cmp(&a.to)));
+    let mut out: Vec<Node> = Vec::with_capacity(nodes.len());
+    for node in nodes {
+        match out.last_mut() {
+            Some(last) if last.from == node.from && last.to == node.to => last.primitives.extend(node.primitives),
+            _ => out.push(node),
+        }
+    }
+    out
+}
+
 /// A straight layer.
 fn copy(
     layer: &Layer<f32>,
@@ -236,10 +298,10 @@ fn copy(
     let (lives, spans) = (Lives::new(layer), layer.spans());
     for first in (0..spans.len()).step_by(STRAIGHT_RUN) {
         let ids = first..spans.len().min(first + STRAIGHT_RUN);
-        let pieces = |id: usize| line.pieces(layer, &lives, id, spans[id], fitter.tree, fitter.lookout);
-        let all: Vec<Vec<Piece>> = ids.into_par_iter().map(pieces).collect();
-        for pieces in all {
-            tally.add(pieces)?;
+        let piece = |id: usize| line.piece(layer, &lives, id, spans[id], fitter.tree, fitter.lookout);
+        let all: Vec<Option<Piece>> = ids.into_par_iter().map(piece).collect();
+        for piece in all {
+            tally.add(layer.span, piece)?;
         }
         progress(tally.done);
     }
@@ -267,7 +329,6 @@ fn follow(layer: &Layer<f32>, fitter: &Fitter<'_>, tally: &mut Tally, progress: 
             let subject = Subject {
                 samples: &samples,
                 row,
-                window: layer.span,
                 life: lives.envelope(row.id),
                 cross_fades: layer.cross_fades(),
                 own: frame.shape(&learnt(&layer.params[GEOMETRY].read::<11>(row.id, 0))),
@@ -279,7 +340,7 @@ fn follow(layer: &Layer<f32>, fitter: &Fitter<'_>, tally: &mut Tally, progress: 
         };
         let all: Vec<Vec<Piece>> = samples.rows.par_iter().map(pieces).collect();
         for pieces in all {
-            tally.add(pieces)?;
+            tally.add(layer.span, pieces)?;
         }
         progress(tally.done);
     }

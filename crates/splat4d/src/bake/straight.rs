@@ -1,11 +1,11 @@
 //! Motion that is a straight line already: its primitives are read off the parameters, exactly and at once.
 
-use super::fit::{COLORS, Piece, homes, is_visible, primitive, seen};
+use super::fit::{COLORS, Piece, home, is_visible, primitive, seen};
 use super::life::{Envelope, Lives};
 use super::lookout::Lookout;
 use super::sample::own_colors;
 use super::shape::Shape;
-use super::tree::{Span, Tree};
+use super::tree::Tree;
 use crate::layers::Layer;
 use crate::math::quat;
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
@@ -26,9 +26,8 @@ impl Line {
         Some(Self { velocities: motion.velocities, origin: motion.origin })
     }
 
-    /// The primitive of row `id`, one for every span in `window` (the layer's span); none where it is never seen in the
-    /// clip or is not finite.
-    pub(super) fn pieces(
+    /// The primitive of row `id`; none where it is never seen in the clip or is not finite.
+    pub(super) fn piece(
         &self,
         layer: &Layer<f32>,
         lives: &Lives<'_>,
@@ -36,8 +35,9 @@ impl Line {
         span: [f64; 2],
         tree: &Tree,
         lookout: &Lookout,
-    ) -> Vec<Piece> {
-        let Some(seen) = seen(tree, span) else { return Vec::new() };
+    ) -> Option<Piece> {
+        let seen = seen(tree, span)?;
+        let node = home(tree, seen)?;
         let row = layer.params[GEOMETRY].read::<11>(id, 0);
         let opacity = f64::from(1.0 / (1.0 + (-row[OPACITY]).exp()));
         let shape = learnt(&row);
@@ -47,21 +47,18 @@ impl Line {
         let own = lives.envelope(id);
         let finite = row.iter().chain(&colors).all(|x| x.is_finite()) && velocity.iter().all(|x| x.is_finite());
         if !finite || !is_visible(opacity) || !(own.center + own.softness).is_finite() {
-            return Vec::new();
+            return None;
         }
         let origin = if lives.has_centers() { own.center } else { self.origin };
-        let piece = |node: Span| {
-            let [from, to] = [tree.border(node[0]), tree.border(node[1])];
-            // For ever counts from the middle of the node: nothing is ever further from it than half the node.
-            let life = if own.is_forever() { Envelope::forever(0.5 * (from + to)) } else { own };
-            let at = |t: f64| std::array::from_fn(|k| mean[k] + velocity[k] * (t - origin));
-            let shown = [seen[0].max(from), seen[1].min(to)];
-            let pixels = lookout.pixels(at(0.5 * (shown[0] + shown[1])));
-            let area = pixels * pixels * ((shown[1] - shown[0]) / (to - from)).clamp(0.0, 1.0);
-            let primitive = primitive(at(life.center), &life, &shape, opacity, velocity, &colors, area);
-            Piece { span: node, primitive, error: 0.0 }
-        };
-        homes(tree, seen, layer.span).into_iter().map(piece).collect()
+        let [from, to] = [tree.border(node[0]), tree.border(node[1])];
+        // For ever counts from the middle of the node: nothing is ever further from it than half the node.
+        let life = if own.is_forever() { Envelope::forever(0.5 * (from + to)) } else { own };
+        let at = |t: f64| std::array::from_fn(|k| mean[k] + velocity[k] * (t - origin));
+        let shown = [seen[0].max(from), seen[1].min(to)];
+        let pixels = lookout.pixels(at(0.5 * (shown[0] + shown[1])));
+        let area = pixels * pixels * ((shown[1] - shown[0]) / (to - from)).clamp(0.0, 1.0);
+        let primitive = primitive(at(life.center), &life, &shape, opacity, velocity, &colors, area);
+        Some(Piece { span: node, primitive, error: 0.0 })
     }
 }
 

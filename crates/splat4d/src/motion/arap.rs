@@ -124,6 +124,12 @@ impl Elastic {
         Self { rest: rest.to_vec(), first, edges, part, parts }
     }
 
+    /// The same ties between nodes that rest elsewhere.
+    pub(crate) fn at_rest(&self, rest: &[[f64; 3]]) -> Self {
+        assert_eq!(rest.len(), self.len(), "the same nodes");
+        Self { rest: rest.to_vec(), ..self.clone() }
+    }
+
     /// Nodes.
     pub(crate) fn len(&self) -> usize {
         self.rest.len()

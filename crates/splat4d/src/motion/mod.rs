@@ -6,6 +6,7 @@
 pub mod arap;
 pub mod control;
 pub mod deform;
+pub mod edited;
 pub mod filtered;
 pub mod hexplane;
 pub(crate) mod lanes;
@@ -129,6 +130,8 @@ registry! {
     wrappers {
         /// A temporal filter around any of them.
         Filtered(s: filtered::FilteredSpec) = "filtered" => s;
+        /// A change on top of any of them.
+        Edited(s: edited::EditedSpec) = "edited" => s;
     }
 }
 

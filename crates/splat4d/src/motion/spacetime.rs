@@ -127,6 +127,29 @@ impl Spacetime {
         self.rates
     }
 
+    /// The same motion on a clock that runs `rate` times as fast: inside it is rate·t + offset. Changes the model's own
+    /// tables; lives are the layer's.
+    pub(crate) fn retimed<F: Real>(&self, rate: f64, offset: f64, p: &mut Params<F>) -> Self {
+        let (velocities, rates) = (&mut p[self.velocities], F::of(rate));
+        for row in 0..velocities.rows() {
+            let mut power = F::ONE;
+            for k in 0..self.spec.order {
+                power *= rates;
+                let v = velocities.read::<3>(row, 3 * k);
+                velocities.write(row, 3 * k, v.map(|x| x * power));
+            }
+        }
+        p[self.rates].data_mut().iter_mut().for_each(|x| *x *= rates);
+        if let Some(key) = self.features {
+            let table = &mut p[key];
+            for row in 0..table.rows() {
+                let slopes = table.read::<3>(row, 3);
+                table.write(row, 3, slopes.map(|x| x * rates));
+            }
+        }
+        Self { spec: SpacetimeSpec { origin: (self.spec.origin - offset) / rate, ..self.spec }, ..*self }
+    }
+
     #[inline(always)]
     fn delta<F: Real>(&self, life: &Table<F>, id: usize, t: f64) -> F {
         if life.width() == 0 { F::of(t - self.spec.origin) } else { F::of(t) - life.get(id, 0) }

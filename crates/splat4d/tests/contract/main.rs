@@ -6,6 +6,7 @@ mod frame;
 use check::{model, starts_still};
 use splat4d::motion::control::{ControlSpec, Curve, TrajectorySpec};
 use splat4d::motion::deform::{DeformSpec, Input};
+use splat4d::motion::edited::{Change, ColorMap, DragSpec, EditedSpec, FadeKey, PathKey};
 use splat4d::motion::filtered::{FilteredSpec, Fusion, Predictor};
 use splat4d::motion::hexplane::{Heads, HexplaneSpec};
 use splat4d::motion::native4d::Native4dSpec;
@@ -172,6 +173,47 @@ fn filtered() {
         model(&spec, ROWS, LifeKind::GaussHalf, &[Space::Gaussians], &[]);
         if fusion != Fusion::Literal {
             starts_still(&spec, ROWS);
+        }
+    }
+}
+
+// edited.
+
+#[test]
+fn edited() {
+    let key = |t, scale, turn, shift| PathKey { t, scale, turn, shift };
+    let keys = vec![
+        key(-0.37, 1.0, [1.0, 0.2, 0.0, 0.1], [0.0, 0.1, 0.0]),
+        key(0.513, 1.3, [0.7, -0.4, 0.3, 0.2], [0.3, 0.1, -0.2]),
+        key(1.71, 0.8, [-0.6, 0.4, 0.1, -0.2], [-0.1, 0.2, 0.4]),
+    ];
+    let matrix = [[0.8, 0.1, 0.05], [0.02, 1.1, -0.1], [0.1, 0.0, 0.9]];
+    let curve = vec![[0.0, 0.05], [0.513, 0.6], [1.0, 0.9]];
+    let fades = [(-0.2, 0.9), (0.63, 0.4), (1.4, 1.0)].map(|(t, factor)| FadeKey { t, factor });
+    let changes = [
+        Change::Clock { rate: -0.7, offset: 0.9 },
+        Change::Path { about: [0.1, -0.2, 0.3], keys },
+        Change::Color { map: ColorMap { matrix, offset: [0.1, 0.0, -0.1], curve } },
+        Change::Fade { keys: fades.to_vec() },
+        Change::Drag(DragSpec { index: 0, nodes: 3, neighbours: 2, times: vec![0.0, 0.4] }),
+    ];
+    let harmonics = Native4dSpec { speed: 1.4, harmonics: 2, period: 0.9, ..Native4dSpec::default() };
+    let skin = SkinSpec { nodes: 7, neighbours: 3, hyper: 2, mask: false };
+    let control = ControlSpec { seed: 3, clip: [0.0, 1.0], skin, ..ControlSpec::default() };
+    for change in changes {
+        let around = |inner| Spec::Edited(EditedSpec { inner: Box::new(inner), change: change.clone() });
+        model(&around(Spec::Hexplane(hexplane_spec())), ROWS, LifeKind::Infinite, &[Space::Gaussians], &[]);
+        model(&around(Spec::Native4d(harmonics)), ROWS, LifeKind::Infinite, &[Space::Gaussians], &[]);
+        model(
+            &around(Spec::Control(control.clone())),
+            ROWS,
+            LifeKind::GaussHalf,
+            &[Space::Gaussians, Space::Nodes],
+            &[],
+        );
+        if !matches!(change, Change::Clock { .. }) {
+            let spec = SpacetimeSpec { order: 2, rotation: true, detach: false, origin: 0.5, features: None };
+            model(&around(Spec::Spacetime(spec)), ROWS, LifeKind::GaussHalf, &[Space::Gaussians], &[]);
         }
     }
 }

@@ -31,6 +31,8 @@ pub enum Kind {
     Masks,
     /// A picture.
     Poster,
+    /// Where the file comes from.
+    Provenance,
     /// Something newer, which is skipped.
     Other([u8; 4]),
 }
@@ -42,12 +44,13 @@ impl Kind {
             Kind::Palette => *b"PALT",
             Kind::Masks => *b"MASK",
             Kind::Poster => *b"POST",
+            Kind::Provenance => *b"PROV",
             Kind::Other(tag) => tag,
         }
     }
 
     fn of(tag: [u8; 4]) -> Self {
-        let known = [Kind::Page, Kind::Palette, Kind::Masks, Kind::Poster];
+        let known = [Kind::Page, Kind::Palette, Kind::Masks, Kind::Poster, Kind::Provenance];
         known.into_iter().find(|k| k.tag() == tag).unwrap_or(Kind::Other(tag))
     }
 
@@ -312,6 +315,26 @@ impl Header {
 }
 
 impl Entry {
+    /// An optional section of these bytes as they are, wherever it will lie.
+    pub(super) fn plain(kind: Kind, bytes: &[u8]) -> Self {
+        let length = u32::try_from(bytes.len()).expect("a section has less than 4 GiB");
+        Self {
+            kind,
+            required: false,
+            offset: 0,
+            stored: length,
+            bytes: length,
+            crc: crc(bytes),
+            codec: Codec::Raw,
+            tier: 0,
+            degree: 0,
+            count: 0,
+            span: [0.0; 2],
+            palette: None,
+            page: None,
+        }
+    }
+
     /// Panics: fewer than 64 bytes.
     fn parse(b: &[u8]) -> Result<Self> {
         let u32_at = |at| read_u32(b, at).expect("64 bytes");
@@ -394,7 +417,7 @@ impl Entry {
                     return Err(broken(format!("key times cannot go from {from} to {to} s")));
                 }
             }
-            Kind::Poster | Kind::Other(_) => {}
+            Kind::Poster | Kind::Provenance | Kind::Other(_) => {}
         }
         Ok(())
     }

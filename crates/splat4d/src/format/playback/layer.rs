@@ -69,13 +69,23 @@ pub(super) const TABLES: usize = 5;
 
 /// Geometry, colours, lives, velocities, rotation rates. Panics: the layer is none that a page gives.
 pub(super) fn keys(layer: &Layer<f32>) -> [Key; TABLES] {
+    let found = page_keys(layer);
+    found.unwrap_or_else(|| panic!("only a layer that moves and lives as those of a page can be one: {layer:?}"))
+}
+
+/// Whether a page could hold the layer as it is: its Gaussians are primitives already.
+pub(crate) fn is_page(layer: &Layer<f32>) -> bool {
+    page_keys(layer).is_some() && layer.span.iter().all(|t| t.is_finite())
+}
+
+fn page_keys(layer: &Layer<f32>) -> Option<[Key; TABLES]> {
     match layer.motion.polynomial() {
         Some(Polynomial { order: 1, velocities: Some(v), rotation_rates: Some(w), .. })
             if layer.life == LifeKind::Interval && layer.frame.is_identity() =>
         {
-            [GEOMETRY, SH, LIFE, v, w]
+            Some([GEOMETRY, SH, LIFE, v, w])
         }
-        _ => panic!("only a layer that moves and lives as those of a page can be one: {layer:?}"),
+        _ => None,
     }
 }
 
@@ -342,7 +352,6 @@ fn angular([w, x, y, z]: [f64; 4], [a, b, c, d]: [f64; 4]) -> [f64; 3] {
 /// The Gaussians of a page's layer as primitives: the inverse of [`Page::layer`], in the layer's order. Importance is 1.
 ///
 /// Panics: the layer moves or lives otherwise than those of a page.
-#[cfg(test)]
 pub(crate) fn primitives(layer: &Layer<f32>) -> Vec<super::Primitive> {
     let [.., velocities, rates] = keys(layer);
     let p = &layer.params;

@@ -17,6 +17,7 @@ mod order;
 mod page;
 mod pages;
 mod palette;
+mod provenance;
 mod read;
 #[cfg(test)]
 mod tests;
@@ -25,13 +26,13 @@ mod write;
 pub use coder::Coder;
 pub use depths::{Depths, LEAST_DEPTH};
 pub use index::{Codec, Entry, Index, Kind};
-#[cfg(test)]
-pub(crate) use layer::primitives;
+pub(crate) use layer::{is_page, primitives};
 pub(crate) use mask::decode_masks;
 pub use meta::{Meta, NamedCamera, PathKey, Viewpoint};
 pub(crate) use page::{Page, decode_page};
 pub use pages::{Pages, PagesDraft, read_pages, write_pages};
 pub use palette::{Palette, decode_palette};
+pub use provenance::{Provenance, provenance, with_provenance};
 pub use read::read;
 pub use write::{ErrorStat, Errors, Summary, WriteConfig, write};
 

@@ -21,6 +21,8 @@ const SMALL_PALETTE: usize = 256;
 /// Share of a node's Gaussians in its first tier, and the least worth a page of its own.
 const FIRST_TIER: f64 = 0.25;
 const SMALLEST_TIER: usize = 4096;
+/// The program that writes, as files name it.
+pub(super) const GENERATOR: &str = concat!("splat4d ", env!("CARGO_PKG_VERSION"));
 /// Bytes of a palette's ranges, before its planes.
 const RANGE_BYTES: usize = 12;
 /// A poster up to this size comes before everything else; a larger one would only delay the first picture.
@@ -191,7 +193,7 @@ impl Sections {
         if let Some(p) = self.late.take() {
             self.summary.poster_bytes = self.add(entry(Kind::Poster), p);
         }
-        let head = self.file.bytes(concat!("splat4d ", env!("CARGO_PKG_VERSION")));
+        let head = self.file.bytes(GENERATOR);
         self.summary.bytes = self.file.file_len;
         self.summary.errors.finish();
         let mut write = |bytes: &[u8]| out.write_all(bytes).map_err(|e| Error::io("the scene could not be written", e));
@@ -269,21 +271,7 @@ pub fn write(draft: &Draft, config: &WriteConfig, out: &mut dyn Write) -> Result
 
 /// An entry of a kind, all else empty.
 fn entry(kind: Kind) -> Entry {
-    Entry {
-        kind,
-        required: false,
-        offset: 0,
-        stored: 0,
-        bytes: 0,
-        crc: 0,
-        codec: Codec::Raw,
-        tier: 0,
-        degree: 0,
-        count: 0,
-        span: [0.0; 2],
-        palette: None,
-        page: None,
-    }
+    Entry::plain(kind, &[])
 }
 
 /// How many bytes come before a section's byte planes, and how many a plane has.

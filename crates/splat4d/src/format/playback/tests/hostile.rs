@@ -46,6 +46,7 @@ pub(super) fn survive(bytes: &[u8]) -> bool {
             Kind::Page => drop(decode_page(e, body)),
             Kind::Palette => drop(decode_palette(e, body)),
             Kind::Masks => drop(decode_masks(e, body)),
+            Kind::Provenance => drop(provenance(bytes)),
             Kind::Poster | Kind::Other(_) => {}
         }
     }

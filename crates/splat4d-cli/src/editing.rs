@@ -1,0 +1,279 @@
+//! The work behind `edit`: what edits name beside the scene (cameras, masks, other scenes, the capture's pictures), found.
+
+use crate::console::Console;
+use crate::files;
+use crate::paths::View;
+use crate::run_folder::Run;
+use crate::source::Source;
+use splat4d::edit::{Context, Edits, Mask, Selected, Step};
+use splat4d::format::playback::Provenance;
+use splat4d::layers::Scene;
+use splat4d::scene::{Camera, Planes, Time};
+use splat4d::{Error, Result};
+use splat4d_dynamics::nodes::follow_among;
+use splat4d_dynamics::paths::Pose;
+use splat4d_train::capture::frames::{Frames, Picture};
+use splat4d_train::capture::{Capture, ImageStore};
+use splat4d_train::eval::floaters::{floaters, support};
+use splat4d_train::eval::metrics::psnr;
+use splat4d_train::run::dataset::Dataset;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::SystemTime;
+
+/// Masks of pictures that are looked at for the subject, at most: each costs a look at the whole scene.
+const MOST_MASKS: usize = 120;
+/// Held-out pictures that are compared before and after floaters are removed.
+const COMPARED: usize = 40;
+/// Above this a mask's pixel is white, of 1.
+const WHITE: f32 = 0.5;
+
+/// Where edits find what they name.
+pub(crate) struct Bring<'a> {
+    source: &'a Source,
+    /// Names of files are relative to this folder, that of the edits.
+    folder: PathBuf,
+    views: Vec<View>,
+    console: &'a Console,
+}
+
+impl<'a> Bring<'a> {
+    pub(crate) fn new(source: &'a Source, edits: Option<&Path>, console: &'a Console) -> Result<Self> {
+        let folder = edits.and_then(Path::parent).map(Path::to_owned).unwrap_or_default();
+        Ok(Self { source, folder, views: source.views()?, console })
+    }
+
+    fn capture(&self) -> Result<(Arc<Capture>, Dataset, bool)> {
+        let Some(run) = &self.source.run else {
+            return Err(Error::input("a scene file does not bring the pictures that it was learnt from")
+                .remedy("Give the run folder."));
+        };
+        let (capture, recipe) = run.open_capture()?;
+        let capture = Arc::new(capture);
+        let memory = usize::try_from(recipe.run.image_memory).unwrap_or(usize::MAX);
+        // All frames, so that their numbers are the capture's.
+        let store = Arc::new(ImageStore::new(capture.clone(), memory));
+        let data = Dataset::new(store, (0..capture.frames.len()).collect());
+        Ok((capture, data, recipe.appearance.antialias))
+    }
+}
+
+impl Context for Bring<'_> {
+    fn camera(&self, name: &str) -> Result<Camera> {
+        let found = self.views.iter().find(|v| v.name == name);
+        found.map(|v| v.camera.clone()).ok_or_else(|| {
+            let mut names: Vec<&str> = self.views.iter().map(|v| v.name.as_str()).collect();
+            names.dedup();
+            names.truncate(12);
+            let remedy = if names.is_empty() {
+                "Give a run folder, or a .splat4d that brings its cameras along.".to_owned()
+            } else {
+                format!("It has: {}.", names.join(", "))
+            };
+            Error::input(format!("the scene has no camera `{name}`")).remedy(remedy)
+        })
+    }
+
+    fn mask(&self, name: &str) -> Result<Mask> {
+        let path = self.folder.join(name);
+        let bytes = std::fs::read(&path).map_err(|e| files::cannot_read(&path, e))?;
+        let picture = image::load_from_memory(&bytes).map_err(|e| {
+            Error::input(format!("is no picture that can be read ({e})")).at(path.display()).remedy("Give a PNG.")
+        })?;
+        let grey = picture.to_luma8();
+        let (width, height) = (grey.width() as usize, grey.height() as usize);
+        Ok(Mask { width, height, white: grey.into_raw().into_iter().map(|v| v >= 128).collect() })
+    }
+
+    fn subject(&self) -> Result<Vec<(Camera, Time, Mask)>> {
+        let (capture, data, _) = self.capture()?;
+        if !data.has_masks() {
+            return Err(Error::input("the capture has no masks: nobody can say what its subject is")
+                .at(capture.root.display())
+                .remedy("Give masks in the capture, or select by places: box, sphere."));
+        }
+        let step = capture.train.len().div_ceil(MOST_MASKS).max(1);
+        let chosen: Vec<usize> = capture.train.iter().copied().step_by(step).collect();
+        let (mut out, mut picture) = (Vec::new(), Picture::default());
+        for (i, &frame) in chosen.iter().enumerate() {
+            data.load(frame, &mut picture)?;
+            if let Some(Planes { width, height, data, .. }) = &picture.mask {
+                let mask = Mask { width: *width, height: *height, white: data.iter().map(|v| *v > WHITE).collect() };
+                let view = &capture.frames[frame];
+                out.push((view.view.clone(), view.time, mask));
+            }
+            self.console.phase("reading masks", i + 1, chosen.len());
+        }
+        Ok(out)
+    }
+
+    fn scene(&self, name: &str) -> Result<Scene<f32>> {
+        Ok(Source::open(&self.folder.join(name))?.scene)
+    }
+
+    fn floaters(&self, scene: &Scene<f32>, strength: f64) -> Result<Selected> {
+        let (capture, data, antialias) = self.capture()?;
+        let told = support(scene, &data, &capture.train, &capture.held, antialias, &mut |done, total| {
+            self.console.phase("looking for floaters", done, total);
+        })?;
+        let found = floaters(&told, strength);
+        let mut without = scene.clone();
+        for (layer, found) in without.layers.iter_mut().zip(&found) {
+            let keep = found.iter().map(|f| !f);
+            let edit = splat4d::scene::RowEdit::prune(splat4d::scene::Space::Gaussians, keep);
+            layer.edit(&edit, &splat4d::math::Rng::new(0, "floaters", 0));
+        }
+        let step = capture.held.len().div_ceil(COMPARED).max(1);
+        let held: Vec<usize> = capture.held.iter().copied().step_by(step).collect();
+        let [before, after] = [mean_psnr(scene, &data, &held)?, mean_psnr(&without, &data, &held)?];
+        self.console.clear();
+        let count = found.iter().flatten().filter(|f| **f).count();
+        self.console.say(&format!(
+            "floaters: {} of {} Gaussians; {} held-out pictures: {before:.2} dB with them, {after:.2} dB without",
+            files::grouped(count),
+            files::grouped(scene.len()),
+            held.len()
+        ));
+        self.console.emit(&serde_json::json!({"type": "floaters", "found": count, "strength": strength,
+            "pictures": held.len(), "psnr_before": before, "psnr_after": after}));
+        Ok(found)
+    }
+
+    fn follow(
+        &self,
+        scene: &Scene<f32>,
+        among: &Selected,
+        start: &[[f64; 3]],
+        times: &[f64],
+        first: usize,
+    ) -> Result<Vec<Vec<[f64; 3]>>> {
+        self.console.phase("following nodes", 0, 0);
+        let start = start.iter().map(|x| Pose::at(*x)).collect();
+        let among: Vec<bool> = among.iter().flatten().copied().collect();
+        let back: Vec<f64> = times[..=first].iter().rev().copied().collect();
+        let mut moments = follow_among(scene, &start, &back, &among);
+        moments.reverse();
+        moments.extend(follow_among(scene, &start, &times[first..], &among).into_iter().skip(1));
+        self.console.clear();
+        Ok(moments.into_iter().map(|moment| moment.into_iter().map(|pose| pose.x).collect()).collect())
+    }
+}
+
+/// The mean PSNR of some pictures, dB.
+fn mean_psnr(scene: &Scene<f32>, data: &Dataset, frames: &[usize]) -> Result<f64> {
+    let (mut picture, mut sum) = (Picture::default(), 0.0);
+    for &frame in frames {
+        data.load(frame, &mut picture)?;
+        let seen = splat4d::draw(scene, data.camera(frame), data.time(frame))?.color;
+        sum += psnr(&seen, &picture.color).unwrap_or(0.0);
+    }
+    Ok(sum / frames.len().max(1) as f64)
+}
+
+/// Reads a list of edits.
+pub(crate) fn read(path: &Path) -> Result<Edits> {
+    toml::from_str(&files::read_text(path)?).map_err(|e| {
+        let line = e.span().map_or(String::new(), |s| format!(" (byte {})", s.start));
+        Error::input(format!("are no edits{line}: {}", e.message()))
+            .at(path.display())
+            .remedy("docs/edit.md tells all steps.")
+    })
+}
+
+/// Writes a list of edits.
+pub(crate) fn write(path: &Path, edits: &Edits) -> Result<()> {
+    let text = toml::to_string_pretty(edits).map_err(|e| Error::input(format!("cannot be written as TOML: {e}")))?;
+    files::write(path, text.as_bytes())
+}
+
+/// The steps of options, behind those of a file.
+pub(crate) fn with_steps(mut edits: Edits, steps: impl IntoIterator<Item = Step>) -> Edits {
+    edits.steps.extend(steps);
+    edits
+}
+
+/// Where an edited scene comes from: what its file said before, with these edits behind those and other words if there are
+/// some.
+pub(crate) fn provenance(
+    source: &Source,
+    earlier: Option<Provenance>,
+    edits: &Edits,
+    words: Option<String>,
+) -> Provenance {
+    let earlier = earlier.unwrap_or_default();
+    let print = |run: &Run| run.info.get("capture_fingerprint")?.as_str().map(str::to_owned);
+    let capture = source.run.as_ref().and_then(print);
+    let steps = edits.steps.iter().map(|s| serde_json::to_value(s).expect("steps are plain data"));
+    Provenance {
+        made_with: concat!("splat4d ", env!("CARGO_PKG_VERSION")).into(),
+        when: Some(rfc3339(SystemTime::now())),
+        capture: capture.or(earlier.capture),
+        edits: earlier.edits.into_iter().chain(steps).collect(),
+        words: words.or(earlier.words),
+    }
+}
+
+/// A moment in UTC, to the second. Days to a date as Hinnant's `civil_from_days` has it (eras of 400 years from 1 March).
+fn rfc3339(at: SystemTime) -> String {
+    let seconds = at.duration_since(SystemTime::UNIX_EPOCH).map_or(0, |d| d.as_secs());
+    let (days, clock) = (seconds / 86_400 + 719_468, seconds % 86_400);
+    let (era, day) = (days / 146_097, days % 146_097);
+    let year = (day - day / 1460 + day / 36_524 - day / 146_096) / 365;
+    let of_year = day - (365 * year + year / 4 - year / 100);
+    let month = (5 * of_year + 2) / 153;
+    let (date, month) = (of_year - (153 * month + 2) / 5 + 1, if month < 10 { month + 3 } else { month - 9 });
+    let year = era * 400 + year + u64::from(month <= 2);
+    format!("{year:04}-{month:02}-{date:02}T{:02}:{:02}:{:02}Z", clock / 3600, clock / 60 % 60, clock % 60)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::time::Duration;
+
+    #[test]
+    fn moments_are_written_as_dates() {
+        for (seconds, text) in [
+            (0, "1970-01-01T00:00:00Z"),
+            (951_782_399, "2000-02-28T23:59:59Z"),
+            (951_782_400, "2000-02-29T00:00:00Z"),
+            (1_795_478_400, "2026-11-24T00:00:00Z"),
+        ] {
+            assert_eq!(rfc3339(SystemTime::UNIX_EPOCH + Duration::from_secs(seconds)), text);
+        }
+    }
+
+    #[test]
+    fn edits_are_toml_and_come_back() {
+        let text = r#"
+            version = 1
+            scene = "knight"
+
+            [[edit]]
+            do = "delete"
+            select = "box(-1,-1,0, 1,1,2) and not layer('hair')"
+
+            [[edit]]
+            do = "move"
+            select = "all"
+            keys = [{ t = 0.0, shift = [0, 0, 0] }, { t = 1.0, shift = [0, 0, 1.5], turn = [0, 0, 1, 90] }]
+
+            [[edit]]
+            do = "drag"
+            select = "layer(dancer)"
+            at = 0.5
+            pins = [[0, 0, 0, 0.3]]
+            handles = [{ place = [0, 0, 1], keys = [{ t = 0.5, by = [0, 0, 0] }, { t = 1.0, by = [0, 0.2, 0] }] }]
+        "#;
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("edits.toml");
+        std::fs::write(&path, text).unwrap();
+        let edits = read(&path).unwrap();
+        assert_eq!(edits.steps.len(), 3);
+        write(&path, &edits).unwrap();
+        assert_eq!(read(&path).unwrap(), edits);
+        std::fs::write(&path, "version = 1\n[[edit]]\ndo = \"explode\"\n").unwrap();
+        let error = read(&path).unwrap_err().to_string();
+        assert!(error.contains("edits.toml") && error.contains("explode"), "{error}");
+    }
+}

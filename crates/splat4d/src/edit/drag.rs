@@ -1,0 +1,275 @@
+//! Dragging: handles pull control nodes over time, the others follow as rigidly as possible, and Gaussians follow them.
+
+use super::act::{parts, wrap};
+use super::{Context, Selected};
+use crate::layers::{Evaluation, Layer, Scene, sweep};
+use crate::math::quat;
+use crate::math::se3::{add, norm, sub};
+use crate::motion::arap::{Elastic, Handle};
+use crate::motion::edited::{Change, DragSpec, Edited, NodeOffset, NodeOffsets};
+use crate::motion::skin::farthest_points;
+use crate::scene::splats::SPLAT_OPACITY;
+use crate::scene::{Rows, Table, Time};
+use crate::{Error, Result};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+/// Nodes unless told (SC-GS).
+const NODES: usize = 512;
+/// Rounds of turning and moving: after these no eye sees a difference.
+const ROUNDS: usize = 8;
+/// Most times at which nodes are followed.
+const MOST_TIMES: usize = 256;
+/// Nodes that pull a Gaussian, and the next one, whose kernel is taken off theirs so that nothing jumps where neighbours
+/// change.
+const PULLING: usize = 4;
+/// Fainter Gaussians carry no node.
+const OPAQUE: f32 = 0.1;
+/// Kernels are at least this, so that something far from all nodes follows the nearest.
+const FLOOR: f64 = 1e-9;
+
+pub(super) fn usual_nodes() -> usize {
+    NODES
+}
+
+/// What is pulled.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DragHandle {
+    /// Centre of the sphere whose nodes are held, scene units.
+    pub place: [f64; 3],
+    /// Its radius; the nearest node is always held.
+    #[serde(default)]
+    pub radius: f64,
+    /// Where it goes, along broken lines; before the first key and after the last it stays there.
+    pub keys: Vec<DragKey>,
+}
+
+/// Where a handle is, from where it would be.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DragKey {
+    /// Seconds.
+    pub t: f64,
+    /// Scene units.
+    pub by: [f64; 3],
+}
+
+/// A drag as it was asked for.
+pub(super) struct Asked<'a> {
+    pub at: f64,
+    pub nodes: usize,
+    pub handles: &'a [DragHandle],
+    pub pins: &'a [[f64; 4]],
+}
+
+impl Asked<'_> {
+    fn check(&self, scene: &Scene<f32>) -> Result<()> {
+        let bad = |what: String, remedy: &str| Err(Error::input(what).remedy(remedy.to_owned()));
+        if !(scene.clip[0]..=scene.clip[1]).contains(&self.at) {
+            return bad(format!("{} s is not in the clip", self.at), "Give a second of the clip as `at`");
+        }
+        if !(2..=MOST_TIMES * PULLING).contains(&self.nodes) {
+            return bad(format!("{} nodes", self.nodes), "Give 2 to 1024");
+        }
+        let sound = |h: &DragHandle| {
+            let numbers = h.keys.iter().flat_map(|k| k.by.into_iter().chain([k.t]));
+            !h.keys.is_empty()
+                && h.keys.windows(2).all(|k| k[0].t < k[1].t)
+                && numbers.chain(h.place).chain([h.radius]).all(f64::is_finite)
+        };
+        if self.handles.is_empty() || !self.handles.iter().all(sound) {
+            return bad(
+                "a drag needs handles, each with keys whose times rise".into(),
+                "Write handles = [{ place = [0, 0, 1], keys = [{ t = 0.0, by = [0, 0, 0] }, { t = 1.0, by = [0, 0, 1] }] }]",
+            );
+        }
+        Ok(())
+    }
+
+    /// Frames of the clip, thinned out, with all key times and `at`; and the place of `at` among them.
+    fn times(&self, scene: &Scene<f32>) -> (Vec<f64>, usize) {
+        let [start, end] = scene.clip;
+        let frames = ((end - start) * scene.fps.max(1.0)).round().max(0.0) as usize;
+        let steps = frames.clamp(1, MOST_TIMES / 2);
+        let mut times: Vec<f64> = (0..=steps).map(|i| start + (end - start) * i as f64 / steps as f64).collect();
+        let keys = self.handles.iter().flat_map(|h| h.keys.iter().map(|k| k.t));
+        times.extend(keys.filter(|t| (start..=end).contains(t)).take(MOST_TIMES));
+        times.push(self.at);
+        times.sort_by(f64::total_cmp);
+        times.dedup();
+        let first = times.iter().position(|t| *t == self.at).expect("it was just added");
+        (times, first)
+    }
+}
+
+/// The displacement of a handle at t.
+fn displaced(keys: &[DragKey], t: f64) -> [f64; 3] {
+    let after = keys.partition_point(|k| k.t <= t);
+    if after == 0 || after == keys.len() {
+        return keys[after.min(keys.len() - 1)].by;
+    }
+    let (a, b) = (&keys[after - 1], &keys[after]);
+    let u = (t - a.t) / (b.t - a.t);
+    std::array::from_fn(|k| a.by[k] * (1.0 - u) + b.by[k] * u)
+}
+
+/// Numbers of nodes within a sphere; the nearest in any case.
+fn within(nodes: &[[f64; 3]], place: [f64; 3], radius: f64) -> Vec<usize> {
+    let far: Vec<f64> = nodes.iter().map(|x| norm(sub(*x, place))).collect();
+    let nearest = (0..nodes.len()).min_by(|a, b| far[*a].total_cmp(&far[*b]));
+    (0..nodes.len()).filter(|k| far[*k] <= radius || Some(*k) == nearest).collect()
+}
+
+/// Bends the selected Gaussians, which get layers of their own.
+pub(super) fn run(scene: &mut Scene<f32>, selected: &Selected, asked: &Asked<'_>, context: &dyn Context) -> Result<()> {
+    asked.check(scene)?;
+    let start = nodes(scene, selected, asked)?;
+    let (times, first) = asked.times(scene);
+    let paths = context.follow(scene, selected, &start, &times, first)?;
+    let elastic = Elastic::new(&start);
+    let held = |at: [f64; 4]| within(&start, [at[0], at[1], at[2]], at[3]);
+    let pinned: Vec<usize> = asked.pins.iter().flat_map(|p| held(*p)).collect();
+    let pulled: Vec<Vec<usize>> = asked
+        .handles
+        .iter()
+        .map(|h| held([h.place[0], h.place[1], h.place[2], h.radius]))
+        .map(|nodes| nodes.into_iter().filter(|n| !pinned.contains(n)).collect())
+        .collect();
+    if pulled.iter().all(Vec::is_empty) {
+        return Err(Error::input("every node of every handle is pinned").remedy("Move the pins away from the handles"));
+    }
+    let offsets = |(t, rest): (&f64, &Vec<[f64; 3]>)| -> Result<Vec<NodeOffset>> {
+        let mut handles: Vec<Handle> = Vec::new();
+        let mut hold = |node: usize, by: [f64; 3]| {
+            // A node of two handles follows the first.
+            if !handles.iter().any(|h| h.node == node) {
+                handles.push(Handle { node, target: add(rest[node], by), rotation: None });
+            }
+        };
+        pinned.iter().for_each(|&n| hold(n, [0.0; 3]));
+        for (handle, nodes) in asked.handles.iter().zip(&pulled) {
+            let by = displaced(&handle.keys, *t);
+            nodes.iter().for_each(|&n| hold(n, by));
+        }
+        if handles.iter().all(|h| h.target == rest[h.node]) {
+            return Ok(rest.iter().map(|x| (*x, [0.0; 3], [1.0, 0.0, 0.0, 0.0])).collect());
+        }
+        let dragged = elastic.at_rest(rest).drag(&handles, ROUNDS)?;
+        let turns = dragged.rotations.iter().map(quat::from_rotation);
+        let moved = rest.iter().zip(&dragged.positions).zip(turns);
+        Ok(moved.map(|((from, to), turn)| (*from, sub(*to, *from), turn)).collect())
+    };
+    let moments: Vec<_> = times.par_iter().zip(&paths).map(offsets).collect::<Result<_>>()?;
+    let all: Vec<_> = moments.into_iter().flatten().collect();
+    bend(scene, selected, &Bend { start: &start, paths: &paths, times: &times, at: asked.at, nodes: all })
+}
+
+/// Nodes at farthest points of the selected Gaussians that can be seen at `at`.
+fn nodes(scene: &Scene<f32>, selected: &Selected, asked: &Asked<'_>) -> Result<Vec<[f64; 3]>> {
+    let mut seen = Evaluation::default();
+    scene.at(Time(asked.at), &mut seen);
+    let mut carriers = Vec::new();
+    for (selected, tape) in selected.iter().zip(seen.tapes()) {
+        for j in 0..tape.out().rows() {
+            if selected[tape.rows().id(j)] && tape.out().get(j, SPLAT_OPACITY) >= OPAQUE {
+                carriers.push(tape.out().read::<3>(j, 0));
+            }
+        }
+    }
+    let mut table = Table::new(&[("mean", 3)], carriers.len());
+    carriers.iter().enumerate().for_each(|(row, x)| table.write(row, 0, *x));
+    let found: Vec<[f64; 3]> =
+        farthest_points(&table, asked.nodes).into_iter().map(|x: [f32; 3]| x.map(f64::from)).collect();
+    if found.len() < 2 {
+        return Err(Error::input(format!("nothing of the selection can be seen at {} s", asked.at))
+            .remedy("Give another `at`, or another selection"));
+    }
+    Ok(found)
+}
+
+/// Nodes over time, and what they do.
+struct Bend<'a> {
+    start: &'a [[f64; 3]],
+    paths: &'a [Vec<[f64; 3]>],
+    times: &'a [f64],
+    at: f64,
+    nodes: Vec<NodeOffset>,
+}
+
+fn bend(scene: &mut Scene<f32>, selected: &Selected, bend: &Bend<'_>) -> Result<()> {
+    let count = bend.start.len();
+    let neighbours = PULLING.min(count - 1).max(1);
+    let index = |layer: &Layer<f32>| (0..).find(|i| layer.params.find(&format!("drag_nodes.{i}")).is_none());
+    let indices: Vec<u32> = scene.layers.iter().map(|l| index(l).expect("there are many numbers")).collect();
+    let change = |from: usize| {
+        let spec = DragSpec { index: indices[from], nodes: count, neighbours, times: bend.times.to_vec() };
+        Change::Drag(spec)
+    };
+    wrap(scene, selected, &change)?;
+    for (_, place) in parts(selected) {
+        let layer = &mut scene.layers[place];
+        let pulls = pulls(layer, bend, neighbours);
+        let offsets = NodeOffsets { nodes: bend.nodes.clone(), pulls };
+        let motion = layer.motion.clone();
+        let edited = Edited::of(motion.as_ref()).expect("the drag was just put around it");
+        edited.fill_drag(&offsets, &mut layer.params);
+    }
+    Ok(())
+}
+
+/// Of every Gaussian the nodes that pull it, by where they are while it is there: kernels of its distances, that of the next
+/// node taken off.
+fn pulls(layer: &Layer<f32>, bend: &Bend<'_>, neighbours: usize) -> Vec<(u32, f32)> {
+    // The time of `bend.times` nearest to `at` at which a row is there.
+    let spans = layer.spans();
+    let nearest = |t: f64| {
+        let after = bend.times.partition_point(|x| *x < t).min(bend.times.len() - 1);
+        let before = after.saturating_sub(1);
+        if (bend.times[after] - t).abs() < (t - bend.times[before]).abs() { after } else { before }
+    };
+    let mut asked: Vec<Vec<u32>> = vec![Vec::new(); bend.times.len()];
+    for (row, [from, to]) in spans.iter().enumerate() {
+        let t = if from <= to { bend.at.max(*from).min(*to) } else { bend.at };
+        asked[nearest(t)].push(row as u32);
+    }
+    let radius = spacing(bend.start);
+    let mut out = vec![(0, 0.0); spans.len() * neighbours];
+    let questions: Vec<(Rows<'_>, Time)> =
+        asked.iter().zip(bend.times).map(|(ids, t)| (Rows::Some(ids), Time(*t))).collect();
+    // Tables that pull nobody yet: the answer is that of the model inside.
+    sweep(layer, &questions, |k, tape| {
+        let nodes = &bend.paths[k];
+        let one = |j: usize| {
+            let x = tape.out().read::<3>(j, 0).map(f64::from);
+            let mut near: Vec<(f64, u32)> =
+                nodes.iter().enumerate().map(|(n, y)| (norm(sub(x, *y)), n as u32)).collect();
+            let kept = neighbours.min(near.len() - 1);
+            near.select_nth_unstable_by(kept, |a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+            // Relative to the nearest, so that far away nothing vanishes.
+            let least = near[..=kept].iter().map(|n| n.0).fold(f64::INFINITY, f64::min);
+            let kernel = |d: f64| (-(d * d - least * least) / (2.0 * radius * radius)).exp();
+            let off = kernel(near[kept].0);
+            near.truncate(kept);
+            near.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+            let weights: Vec<f64> = near.iter().map(|n| (kernel(n.0) - off).max(0.0) + FLOOR).collect();
+            let sum: f64 = weights.iter().sum();
+            near.iter().zip(weights).map(|(n, w)| (n.1, (w / sum) as f32)).collect::<Vec<_>>()
+        };
+        let found: Vec<Vec<(u32, f32)>> = (0..tape.out().rows()).into_par_iter().map(one).collect();
+        for (j, found) in found.into_iter().enumerate() {
+            let row = tape.rows().id(j);
+            out[row * neighbours..row * neighbours + found.len()].copy_from_slice(&found);
+        }
+    });
+    out
+}
+
+/// The median distance of a node to its nearest.
+fn spacing(nodes: &[[f64; 3]]) -> f64 {
+    let points: Vec<[f32; 3]> = nodes.iter().map(|x| x.map(|x| x as f32)).collect();
+    let near = crate::math::knn::knn(&points, 1);
+    let mut far: Vec<f64> = near.iter().enumerate().map(|(i, j)| norm(sub(nodes[i], nodes[*j as usize]))).collect();
+    far.sort_by(f64::total_cmp);
+    far[far.len() / 2].max(f64::MIN_POSITIVE.sqrt())
+}

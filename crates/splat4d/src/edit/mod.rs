@@ -1,0 +1,369 @@
+//! Edits in time: a list of steps that is replayed on a scene, whichever model moves it.
+//!
+//! A [`Step`] is plain data: what is done, and a selection in words ([`Expr`]). [`replay`] runs the steps in order on the scene
+//! as it was trained, so that undoing one is leaving it out, and the same list works on the scene when it was trained anew.
+//! Nothing here reads a path: whoever calls brings cameras, masks and other scenes ([`Context`]).
+
+mod act;
+mod clock;
+mod drag;
+mod look;
+mod select;
+#[cfg(test)]
+mod tests;
+
+pub use drag::{DragHandle, DragKey};
+pub use look::{Selected, select};
+pub use select::Expr;
+
+use crate::layers::Scene;
+use crate::motion::edited::FadeKey;
+use crate::scene::{Camera, Time};
+use crate::{Error, ErrorKind, Result};
+use serde::{Deserialize, Serialize};
+
+/// The version of the list of steps that this library reads and writes.
+pub const VERSION: u32 = 1;
+/// Most steps: a bound for files.
+const MOST_STEPS: usize = 10_000;
+
+/// A list of steps, as `edits.toml` has it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Edits {
+    /// [`VERSION`].
+    pub version: u32,
+    /// Title of the scene that they were made for; none: any.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub scene: Option<String>,
+    /// The steps, the first first.
+    #[serde(default, rename = "edit")]
+    pub steps: Vec<Step>,
+}
+
+impl Default for Edits {
+    fn default() -> Self {
+        Self { version: VERSION, scene: None, steps: Vec::new() }
+    }
+}
+
+impl Edits {
+    /// Refuses lists that this version does not know, and those for another scene.
+    pub fn check(&self, title: &str) -> Result<()> {
+        if self.version != VERSION {
+            let what = format!("the edits have version {}, this splat4d knows {VERSION}", self.version);
+            return Err(Error::new(ErrorKind::Unsupported, what).remedy("Install a newer splat4d"));
+        }
+        if let Some(scene) = self.scene.as_ref().filter(|s| *s != title) {
+            return Err(Error::input(format!("the edits were made for `{scene}`, this scene is `{title}`"))
+                .remedy("Give the scene that they belong to, or remove `scene` from the edits"));
+        }
+        if self.steps.len() > MOST_STEPS {
+            return Err(
+                Error::input(format!("{} steps", self.steps.len())).remedy(format!("{MOST_STEPS} are possible"))
+            );
+        }
+        Ok(())
+    }
+}
+
+/// A similarity as people write it: turned and scaled about a point, then shifted.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Place {
+    /// Scene units.
+    pub shift: [f64; 3],
+    /// Axis and degrees, right-handed.
+    pub turn: Option<[f64; 4]>,
+    /// How many times as large.
+    pub scale: Option<f64>,
+    /// The fixed point of turning and scaling, scene units; the origin unless said.
+    pub about: Option<[f64; 3]>,
+}
+
+/// A place at a time.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct PlaceKey {
+    /// Seconds of the scene.
+    pub t: f64,
+    /// Scene units.
+    pub shift: [f64; 3],
+    /// Axis and degrees, right-handed.
+    pub turn: Option<[f64; 4]>,
+    /// How many times as large.
+    pub scale: Option<f64>,
+}
+
+/// One step. `select` is a selection in words, see [`Expr`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "do", rename_all = "kebab-case", deny_unknown_fields)]
+#[non_exhaustive]
+pub enum Step {
+    /// They are gone.
+    Delete {
+        /// What.
+        select: String,
+    },
+    /// All others are gone.
+    Crop {
+        /// What stays.
+        select: String,
+    },
+    /// They are not seen for from ≤ t < to.
+    Hide {
+        /// What.
+        select: String,
+        /// Seconds.
+        from: f64,
+        /// Seconds.
+        to: f64,
+    },
+    /// Other colours: saturation, then tint and exposure, then the curve.
+    Recolor {
+        /// What.
+        select: String,
+        /// Stops: 1 is twice as bright.
+        #[serde(default)]
+        exposure: f64,
+        /// Factors of red, green and blue.
+        #[serde(default)]
+        tint: Option<[f64; 3]>,
+        /// 0 is grey, 1 as it is.
+        #[serde(default)]
+        saturation: Option<f64>,
+        /// Corners [in, out] of a broken line, 0 to 1; none: no curve.
+        #[serde(default)]
+        curve: Vec<[f64; 2]>,
+    },
+    /// Opacity times a factor.
+    Opacity {
+        /// What.
+        select: String,
+        /// 0 to 1, at all times.
+        #[serde(default)]
+        factor: Option<f64>,
+        /// Or at key times, along broken lines.
+        #[serde(default)]
+        keys: Vec<FadeKey>,
+    },
+    /// Elsewhere, turned, larger: for good, or by keys over time.
+    Move {
+        /// What.
+        select: String,
+        /// Where to, at all times.
+        #[serde(default)]
+        to: Option<Place>,
+        /// Or at key times.
+        #[serde(default)]
+        keys: Vec<PlaceKey>,
+        /// The fixed point of the keys' turning and scaling, scene units.
+        #[serde(default)]
+        about: Option<[f64; 3]>,
+    },
+    /// The same once more, as layers of another name.
+    Duplicate {
+        /// What.
+        select: String,
+        /// Name of the copy.
+        name: String,
+    },
+    /// A layer of their own.
+    Split {
+        /// What.
+        select: String,
+        /// Its name.
+        name: String,
+    },
+    /// The clip is from to to; what is seen outside of it alone is gone.
+    Cut {
+        /// Seconds.
+        from: f64,
+        /// Seconds.
+        to: f64,
+    },
+    /// A part of the clip runs `rate` times as fast, backwards below zero; what follows comes earlier or later.
+    Retime {
+        /// Factor of speed, not zero.
+        rate: f64,
+        /// Seconds; the clip's start unless said.
+        #[serde(default)]
+        from: Option<f64>,
+        /// Seconds; the clip's end unless said.
+        #[serde(default)]
+        to: Option<f64>,
+    },
+    /// Another scene beside this one.
+    Merge {
+        /// File, as whoever reads the edits finds it.
+        scene: String,
+        /// Its layers' names begin with this and a slash.
+        name: String,
+        /// The second at which its clip starts here; that of its own clock unless said.
+        #[serde(default)]
+        at: Option<f64>,
+        /// Where it stands.
+        #[serde(default)]
+        to: Place,
+    },
+    /// Control nodes are pulled by handles over time; everything between follows as rigidly as possible.
+    Drag {
+        /// What is bent.
+        select: String,
+        /// Second at which the places below are meant.
+        at: f64,
+        /// Nodes.
+        #[serde(default = "drag::usual_nodes")]
+        nodes: usize,
+        /// What is pulled, and where to.
+        handles: Vec<DragHandle>,
+        /// Spheres [x, y, z, radius] whose nodes stay.
+        #[serde(default)]
+        pins: Vec<[f64; 4]>,
+    },
+    /// Gaussians that few training views support, and without which held-out views are no worse.
+    Floaters {
+        /// 0 finds none, 1 the most.
+        strength: f64,
+    },
+}
+
+impl Step {
+    /// Its name in files.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Step::Delete { .. } => "delete",
+            Step::Crop { .. } => "crop",
+            Step::Hide { .. } => "hide",
+            Step::Recolor { .. } => "recolor",
+            Step::Opacity { .. } => "opacity",
+            Step::Move { .. } => "move",
+            Step::Duplicate { .. } => "duplicate",
+            Step::Split { .. } => "split",
+            Step::Cut { .. } => "cut",
+            Step::Retime { .. } => "retime",
+            Step::Merge { .. } => "merge",
+            Step::Drag { .. } => "drag",
+            Step::Floaters { .. } => "floaters",
+        }
+    }
+
+    /// Its selection, where it has one.
+    pub fn selection(&self) -> Option<&str> {
+        match self {
+            Step::Delete { select }
+            | Step::Crop { select }
+            | Step::Hide { select, .. }
+            | Step::Recolor { select, .. }
+            | Step::Opacity { select, .. }
+            | Step::Move { select, .. }
+            | Step::Duplicate { select, .. }
+            | Step::Split { select, .. }
+            | Step::Drag { select, .. } => Some(select),
+            Step::Cut { .. } | Step::Retime { .. } | Step::Merge { .. } | Step::Floaters { .. } => None,
+        }
+    }
+}
+
+/// A mask picture.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Mask {
+    /// Pixels across.
+    pub width: usize,
+    /// Pixels down.
+    pub height: usize,
+    /// Row by row.
+    pub white: Vec<bool>,
+}
+
+/// What edits name and a scene does not hold. The methods of the trait itself have nothing: they are errors that say so.
+pub trait Context {
+    /// The camera of that name.
+    fn camera(&self, name: &str) -> Result<Camera> {
+        Err(missing(&format!("camera `{name}`"), "Give a run folder, or a file that brings its cameras along"))
+    }
+
+    /// The mask picture of that name.
+    fn mask(&self, name: &str) -> Result<Mask> {
+        Err(missing(&format!("mask `{name}`"), "Give a file that can be read"))
+    }
+
+    /// The subject as masks of a capture have it: by camera and time.
+    fn subject(&self) -> Result<Vec<(Camera, Time, Mask)>> {
+        Err(missing("subject", "Give the run of a capture with masks"))
+    }
+
+    /// The scene of that name.
+    fn scene(&self, name: &str) -> Result<Scene<f32>> {
+        Err(missing(&format!("scene `{name}`"), "Give a file that can be read"))
+    }
+
+    /// Gaussians of `scene` that float before cameras.
+    fn floaters(&self, _scene: &Scene<f32>, _strength: f64) -> Result<Selected> {
+        Err(missing("training view", "Give the run folder of a capture that is still there"))
+    }
+
+    /// Where nodes that are at `start` at `times[first]` are at all `times`, [times][nodes]: carried by the Gaussians `among`.
+    fn follow(
+        &self,
+        scene: &Scene<f32>,
+        among: &Selected,
+        start: &[[f64; 3]],
+        times: &[f64],
+        first: usize,
+    ) -> Result<Vec<Vec<[f64; 3]>>>;
+}
+
+fn missing(what: &str, remedy: &str) -> Error {
+    Error::input(format!("there is no {what}")).remedy(remedy.to_owned())
+}
+
+/// What a step did.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Done {
+    /// The step's name.
+    pub step: &'static str,
+    /// Gaussians that it was about.
+    pub selected: usize,
+    /// Gaussians of the scene after it.
+    pub gaussians: usize,
+}
+
+/// Runs the steps on a scene, in order. The scene is what is left of it; on an error it is lost, so that callers keep theirs.
+///
+/// Errors: a step's, with its number and name: selections that cannot be read or select nothing, names that there are not,
+/// numbers out of range, what a pixel head cannot show.
+pub fn replay(
+    steps: &[Step],
+    mut scene: Scene<f32>,
+    context: &dyn Context,
+    progress: &mut dyn FnMut(usize, usize),
+) -> Result<(Scene<f32>, Vec<Done>)> {
+    let mut done = Vec::new();
+    for (i, step) in steps.iter().enumerate() {
+        progress(i, steps.len());
+        let at = |e: Error| e.at(format!("edit {} ({})", i + 1, step.name()));
+        let selected = act::run(step, &mut scene, context).map_err(at)?;
+        done.push(Done { step: step.name(), selected, gaussians: scene.len() });
+    }
+    if scene.is_empty() {
+        return Err(Error::input("the edits leave nothing of the scene").remedy("Take one of them back"));
+    }
+    Ok((scene, done))
+}
+
+/// How many Gaussians a selection holds, and of them how many can be seen at each of `times`.
+pub fn count(expr: &Expr, scene: &Scene<f32>, times: &[f64], context: &dyn Context) -> Result<(usize, Vec<usize>)> {
+    let selected = select(expr, scene, context)?;
+    let mut ids = Vec::new();
+    let mut alive = |t: f64| {
+        let of = |(layer, selected): (&crate::layers::Layer, &Vec<bool>)| {
+            let all = layer.active(Time(t), &mut ids);
+            let chosen = |i: &&u32| selected[**i as usize];
+            if all { selected.iter().filter(|s| **s).count() } else { ids.iter().filter(chosen).count() }
+        };
+        scene.layers.iter().zip(&selected).map(of).sum()
+    };
+    let over_time = times.iter().map(|&t| alive(t)).collect();
+    Ok((selected.iter().flatten().filter(|s| **s).count(), over_time))
+}

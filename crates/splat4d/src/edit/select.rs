@@ -1,0 +1,354 @@
+//! Selections: what an edit is about, in words that hold for any scene.
+//!
+//! `box(-1,-1,0, 1,1,2) and not color(0,0.6,0, 0.2)`: predicates of places, looks and lives, never row numbers, so that a
+//! selection finds the same thing again after the scene was trained anew. See docs/edit.md for the list.
+
+use crate::{Error, Result};
+use std::fmt;
+
+/// Deepest nesting of a selection: a bound for files.
+const DEEPEST: usize = 64;
+
+/// A selection.
+#[derive(Clone, Debug, PartialEq)]
+#[non_exhaustive]
+pub enum Expr {
+    /// Every Gaussian.
+    All,
+    /// Between two corners, scene units.
+    Box([f64; 3], [f64; 3]),
+    /// Centre and radius, scene units.
+    Sphere([f64; 3], f64),
+    /// In the picture of a camera, and farther than and nearer than so many scene units.
+    Frustum(String, [f64; 2]),
+    /// Base colour within a distance of one, 0 to 1.
+    Color([f64; 3], f64),
+    /// Peak opacity, least and most.
+    Opacity(f64, f64),
+    /// Largest standard deviation, scene units.
+    Size(f64, f64),
+    /// Seconds of the clip in which it can be seen.
+    Life(f64, f64),
+    /// Scene units a second.
+    Speed(f64, f64),
+    /// Name of a layer.
+    Layer(String),
+    /// On the white of a mask picture, seen by a camera.
+    Mask(String, String),
+    /// On the subject, as the capture's masks have it.
+    Subject,
+    /// What holds at that second.
+    At(f64, Box<Expr>),
+    /// What holds at any moment of a Gaussian's life.
+    Ever(Box<Expr>),
+    /// What holds at all of them.
+    Always(Box<Expr>),
+    /// These and all within a distance of one of them, scene units.
+    Grow(Box<Expr>, f64),
+    /// Both.
+    And(Box<Expr>, Box<Expr>),
+    /// Either.
+    Or(Box<Expr>, Box<Expr>),
+    /// The others.
+    Not(Box<Expr>),
+}
+
+impl Expr {
+    /// Reads a selection. Errors: the first place that cannot be read, and what may stand there.
+    pub fn parse(text: &str) -> Result<Self> {
+        let mut parser = Parser { text, tokens: tokens(text)?, at: 0, depth: 0 };
+        let expr = parser.either()?;
+        match parser.peek() {
+            None => Ok(expr),
+            Some(t) => Err(parser.wrong(&format!("`{t}` is too much"))),
+        }
+    }
+
+    /// Whether any part of it is of this kind.
+    pub(super) fn any(&self, which: &dyn Fn(&Expr) -> bool) -> bool {
+        which(self)
+            || match self {
+                Expr::At(_, e) | Expr::Ever(e) | Expr::Always(e) | Expr::Grow(e, _) | Expr::Not(e) => e.any(which),
+                Expr::And(a, b) | Expr::Or(a, b) => a.any(which) || b.any(which),
+                _ => false,
+            }
+    }
+}
+
+#[derive(Clone, Debug, PartialEq)]
+enum Token {
+    Word(String),
+    Text(String),
+    /// Its value, and as it is written: a camera may be called 00.
+    Number(f64, String),
+    Open,
+    Close,
+    Comma,
+}
+
+impl fmt::Display for Token {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Token::Word(w) | Token::Text(w) | Token::Number(_, w) => f.write_str(w),
+            Token::Open => f.write_str("("),
+            Token::Close => f.write_str(")"),
+            Token::Comma => f.write_str(","),
+        }
+    }
+}
+
+fn unreadable(text: &str, what: &str) -> Error {
+    Error::input(format!("the selection `{text}` cannot be read: {what}")).remedy(
+        "It is made of box(x0,y0,z0, x1,y1,z1), sphere(x,y,z, r), frustum(camera), color(r,g,b, near), opacity(from,to), \
+         size(from,to), life(from,to), speed(from,to), layer(name), mask(file, camera), subject, all, at(t, ...), \
+         ever(...), always(...), grow(..., distance), and, or, not and parentheses",
+    )
+}
+
+fn tokens(text: &str) -> Result<Vec<Token>> {
+    let (mut out, chars): (Vec<Token>, Vec<char>) = (Vec::new(), text.chars().collect());
+    let mut i = 0;
+    let run = |from: usize, of: &dyn Fn(char) -> bool| from + chars[from..].iter().take_while(|c| of(**c)).count();
+    while i < chars.len() {
+        let c = chars[i];
+        let one = match c {
+            '(' => Some(Token::Open),
+            ')' => Some(Token::Close),
+            ',' => Some(Token::Comma),
+            _ => None,
+        };
+        if let Some(token) = one {
+            out.push(token);
+            i += 1;
+        } else if c.is_whitespace() {
+            i += 1;
+        } else if c == '"' || c == '\'' {
+            let end = run(i + 1, &|x| x != c);
+            if end == chars.len() {
+                return Err(unreadable(text, "a quotation mark is missing"));
+            }
+            out.push(Token::Text(chars[i + 1..end].iter().collect()));
+            i = end + 1;
+        } else if c.is_ascii_digit() || "+-.".contains(c) {
+            let end = run(i, &|x| x.is_ascii_alphanumeric() || "+-.".contains(x));
+            let word: String = chars[i..end].iter().collect();
+            let number = word.parse::<f64>().ok().filter(|x| x.is_finite());
+            // Names may begin with a digit: 00.png.
+            out.push(number.map_or(Token::Word(word.clone()), |x| Token::Number(x, word)));
+            i = end;
+        } else {
+            let end = run(i, &|x| !x.is_whitespace() && !"(),\"'".contains(x));
+            out.push(Token::Word(chars[i..end].iter().collect()));
+            i = end;
+        }
+    }
+    Ok(out)
+}
+
+struct Parser<'a> {
+    text: &'a str,
+    tokens: Vec<Token>,
+    at: usize,
+    depth: usize,
+}
+
+impl Parser<'_> {
+    fn peek(&self) -> Option<&Token> {
+        self.tokens.get(self.at)
+    }
+
+    fn wrong(&self, what: &str) -> Error {
+        unreadable(self.text, what)
+    }
+
+    fn takes(&mut self, word: &str) -> bool {
+        let found = matches!(self.peek(), Some(Token::Word(w)) if w == word);
+        self.at += usize::from(found);
+        found
+    }
+
+    fn either(&mut self) -> Result<Expr> {
+        let mut left = self.both()?;
+        while self.takes("or") {
+            left = Expr::Or(Box::new(left), Box::new(self.both()?));
+        }
+        Ok(left)
+    }
+
+    fn both(&mut self) -> Result<Expr> {
+        let mut left = self.one()?;
+        while self.takes("and") {
+            left = Expr::And(Box::new(left), Box::new(self.one()?));
+        }
+        Ok(left)
+    }
+
+    fn one(&mut self) -> Result<Expr> {
+        self.depth += 1;
+        if self.depth > DEEPEST {
+            return Err(self.wrong("it is nested too deeply"));
+        }
+        let expr = self.factor();
+        self.depth -= 1;
+        expr
+    }
+
+    fn factor(&mut self) -> Result<Expr> {
+        if self.takes("not") {
+            return Ok(Expr::Not(Box::new(self.one()?)));
+        }
+        match self.peek().cloned() {
+            Some(Token::Open) => {
+                self.at += 1;
+                let inner = self.either()?;
+                self.expect(Token::Close)?;
+                Ok(inner)
+            }
+            Some(Token::Word(word)) => {
+                self.at += 1;
+                self.named(&word)
+            }
+            Some(other) => Err(self.wrong(&format!("`{other}` stands where a predicate should"))),
+            None => Err(self.wrong("it ends where a predicate should stand")),
+        }
+    }
+
+    fn named(&mut self, word: &str) -> Result<Expr> {
+        match word {
+            "all" => return Ok(Expr::All),
+            "subject" => return Ok(Expr::Subject),
+            _ => self.expect(Token::Open)?,
+        }
+        let expr = match word {
+            "box" => {
+                let [a, b, c, d, e, f] = self.numbers()?;
+                let (low, high) = ([a.min(d), b.min(e), c.min(f)], [a.max(d), b.max(e), c.max(f)]);
+                Expr::Box(low, high)
+            }
+            "sphere" => {
+                let [x, y, z, r] = self.numbers()?;
+                Expr::Sphere([x, y, z], r)
+            }
+            "color" => {
+                let [r, g, b, near] = self.numbers()?;
+                Expr::Color([r, g, b], near)
+            }
+            "opacity" | "size" | "life" | "speed" => {
+                let [from, to] = self.numbers()?;
+                match word {
+                    "opacity" => Expr::Opacity(from, to),
+                    "size" => Expr::Size(from, to),
+                    "life" => Expr::Life(from, to),
+                    _ => Expr::Speed(from, to),
+                }
+            }
+            "layer" => Expr::Layer(self.name()?),
+            "frustum" => {
+                let name = self.name()?;
+                let mut range = [0.0, f64::INFINITY];
+                if self.peek() == Some(&Token::Comma) {
+                    self.at += 1;
+                    range = self.numbers()?;
+                }
+                Expr::Frustum(name, range)
+            }
+            "mask" => {
+                let file = self.name()?;
+                self.expect(Token::Comma)?;
+                Expr::Mask(file, self.name()?)
+            }
+            "at" => {
+                let [t] = self.numbers()?;
+                self.expect(Token::Comma)?;
+                Expr::At(t, Box::new(self.either()?))
+            }
+            "ever" => Expr::Ever(Box::new(self.either()?)),
+            "always" => Expr::Always(Box::new(self.either()?)),
+            "grow" => {
+                let inner = self.either()?;
+                self.expect(Token::Comma)?;
+                let [distance] = self.numbers()?;
+                if distance <= 0.0 {
+                    return Err(self.wrong("grow needs a distance above 0"));
+                }
+                Expr::Grow(Box::new(inner), distance)
+            }
+            _ => return Err(self.wrong(&format!("there is no predicate `{word}`"))),
+        };
+        self.expect(Token::Close)?;
+        Ok(expr)
+    }
+
+    fn expect(&mut self, token: Token) -> Result<()> {
+        if self.peek() == Some(&token) {
+            self.at += 1;
+            return Ok(());
+        }
+        let found = self.peek().map_or("the end".to_owned(), |t| format!("`{t}`"));
+        Err(self.wrong(&format!("`{token}` is missing before {found}")))
+    }
+
+    /// N numbers with commas between them.
+    fn numbers<const N: usize>(&mut self) -> Result<[f64; N]> {
+        let mut out = [0.0; N];
+        for (i, out) in out.iter_mut().enumerate() {
+            let few = format!("{N} numbers are needed, {i} are there");
+            if i > 0 {
+                self.expect(Token::Comma).map_err(|_| self.wrong(&few))?;
+            }
+            let Some(Token::Number(x, _)) = self.peek() else {
+                return Err(self.wrong(&few));
+            };
+            *out = *x;
+            self.at += 1;
+        }
+        Ok(out)
+    }
+
+    /// A name, with or without quotation marks.
+    fn name(&mut self) -> Result<String> {
+        match self.peek().cloned() {
+            Some(t @ (Token::Word(_) | Token::Text(_) | Token::Number(..))) => {
+                self.at += 1;
+                Ok(t.to_string())
+            }
+            _ => Err(self.wrong("a name is missing")),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn selections_are_read_with_the_usual_precedence() {
+        let parsed = Expr::parse("box(1,0,0, 0,1,2) or not layer('my hair') and at(-0.5, speed(0.1, 9))").unwrap();
+        let hair = Expr::Not(Box::new(Expr::Layer("my hair".into())));
+        let fast = Expr::At(-0.5, Box::new(Expr::Speed(0.1, 9.0)));
+        let right = Expr::And(Box::new(hair), Box::new(fast));
+        assert_eq!(parsed, Expr::Or(Box::new(Expr::Box([0.0; 3], [1.0, 1.0, 2.0])), Box::new(right)));
+        assert_eq!(Expr::parse("frustum(00, 1e-1, 2)").unwrap(), Expr::Frustum("00".into(), [0.1, 2.0]));
+        assert_eq!(Expr::parse("mask(m/a.png, \"cam 1\")").unwrap(), Expr::Mask("m/a.png".into(), "cam 1".into()));
+        assert!(Expr::parse("grow(all, 0.1)").unwrap().any(&|e| *e == Expr::All));
+    }
+
+    #[test]
+    fn what_cannot_be_read_says_where() {
+        for (text, word) in [
+            ("", "ends"),
+            ("bux(1)", "bux"),
+            ("box(1,2,3)", "6 numbers"),
+            ("box(1,2,3,4,5,6", "missing"),
+            ("all all", "too much"),
+            ("sphere(0,0,0,nan)", "4 numbers"),
+            ("layer('x", "quotation"),
+            ("grow(all, 0)", "above 0"),
+            ("and", "and"),
+        ] {
+            let error = Expr::parse(text).unwrap_err().to_string();
+            assert!(error.contains(word), "{text}: {error}");
+        }
+        assert!(Expr::parse(&"(".repeat(100_000)).unwrap_err().to_string().contains("deeply"));
+    }
+}
