@@ -29,6 +29,8 @@ settings! {
     }
 }
 
+/// Of fewer places most of a scene is seen from one alone: nothing is removed (of four real cameras it cost 0.4 to 1.5 dB).
+const FEWEST: usize = 8;
 /// Moments, evenly over the clip, at which Gaussians are looked at; each counts where it is most visible.
 const MOMENTS: usize = 5;
 
@@ -68,6 +70,9 @@ impl Upkeep for Floaters {
 
     fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
         let places = Places::of(c.frames);
+        if places.cameras.len() < FEWEST {
+            return Ok(Change::default());
+        }
         let before = learner.scene().len();
         for layer in 0..learner.scene().layers.len() {
             let keep = places.supported(learner.scene(), layer, self.settings.distance);
@@ -164,9 +169,9 @@ mod tests {
 
     #[test]
     fn what_hangs_before_a_camera_and_one_other_alone_sees_goes() {
-        let frames = Made::new(4, 1, 16);
+        let frames = Made::new(8, 1, 16);
         let places = Places::of(&frames);
-        assert_eq!(places.cameras.len(), 4);
+        assert_eq!(places.cameras.len(), 8);
         // Where one camera alone looks, as near to another one as can be found; right before a camera that sees it; all else.
         let near = |x: [f64; 3]| {
             let unseen = |(camera, _): &&(&Camera, [f64; 3])| seen(camera, x).is_none();
