@@ -254,7 +254,8 @@ impl Template {
             }
             gain += step[6];
             lift += step[7];
-            if !(shift[0].hypot(shift[1]) <= FARTHEST) {
+            let far = shift[0].hypot(shift[1]);
+            if far > FARTHEST || far.is_nan() {
                 return None;
             }
             if step[0].hypot(step[1]) < STILL {

@@ -137,7 +137,7 @@ impl<'a> Judge<'a> {
         let config = RenderConfig { antialias, ..RenderConfig::default() };
         Self {
             scene,
-            renderer: Renderer::new(config.clone()),
+            renderer: Renderer::new(config),
             importance: Importance::new(config),
             instant: Evaluation::default(),
             image: Image::default(),

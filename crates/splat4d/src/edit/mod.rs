@@ -303,7 +303,7 @@ pub trait Context {
         Err(missing("training view", "Give the run folder of a capture that is still there"))
     }
 
-    /// Where nodes that are at `start` at `times[first]` are at all `times`, [times][nodes]: carried by the Gaussians `among`.
+    /// Where nodes that are at `start` at `times[first]` are at all `times`, `[times][nodes]`: carried by the Gaussians `among`.
     fn follow(
         &self,
         scene: &Scene<f32>,
