@@ -162,9 +162,10 @@ const SLANT: f64 = 1.0;
 pub(super) fn aligned(x: [f64; 3], seen: &[Seen<'_>], more: &[Seen<'_>]) -> Vec<Option<[f64; 2]>> {
     let toward: Vec<[f64; 3]> = seen.iter().map(|s| normalize(sub(s.eye.center(), x))).collect();
     let central = |k: usize| toward.iter().map(|t| dot(*t, toward[k])).sum::<f64>();
-    let main = (0..seen.len()).max_by(|&a, &b| central(a).total_cmp(&central(b)).then(b.cmp(&a))).expect("a sighting");
     let normal = normalize(std::array::from_fn(|k| toward.iter().map(|t| t[k]).sum()));
     let mut out = vec![None; seen.len() + more.len()];
+    let pictured = (0..seen.len()).filter(|&k| seen[k].shown.is_some());
+    let Some(main) = pictured.max_by(|&a, &b| central(a).total_cmp(&central(b)).then(b.cmp(&a))) else { return out };
     let Some(template) = Template::new(&seen[main]) else { return out };
     out[main] = Some([0.0; 2]);
     for (k, other) in seen.iter().chain(more).enumerate().filter(|(k, _)| *k != main) {

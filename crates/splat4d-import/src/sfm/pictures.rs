@@ -79,7 +79,7 @@ pub struct Sight {
     pub frame: f64,
     /// In the order of moments.
     pub features: Vec<Feature>,
-    /// What each moment's features are from, by the moment's number.
+    /// What each moment's features are from, by the moment's number; none of a lens that is known, whose features were straightened.
     pub shown: Vec<Option<Shown>>,
 }
 
@@ -322,7 +322,8 @@ impl Sight {
         let Some(known) = pictures.known(camera) else { return self };
         let straight = known.straight(self.size, self.factor);
         self.features.retain_mut(|f| straight.feature(f));
-        Self { focal: Some(straight.focal()), exact: true, pose: known.pose, ..self }
+        // Pictures are as the lens bent them: places of straightened features are not theirs.
+        Self { focal: Some(straight.focal()), exact: true, pose: known.pose, shown: Vec::new(), ..self }
     }
 }
 

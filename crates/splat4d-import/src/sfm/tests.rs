@@ -212,6 +212,7 @@ struct Walk {
     wall: Planes<f32>,
     patch: Planes<f32>,
     cameras: usize,
+    known: Option<Known>,
 }
 
 const FRAMES: usize = 12;
@@ -231,6 +232,10 @@ impl Pictures for Walk {
 
     fn time(&self, _: usize, frame: usize) -> f64 {
         frame as f64 / 30.0
+    }
+
+    fn known(&self, _: usize) -> Option<Known> {
+        self.known
     }
 
     fn load(&self, _: usize, frame: usize) -> Result<Planes<f32>> {
@@ -260,7 +265,7 @@ fn walk(cameras: usize) -> Walk {
     let wall = noise(1, 120, 240);
     let mut colored = Planes::new(3, 120, 240);
     (0..3).for_each(|c| colored.plane_mut(c).copy_from_slice(&wall.data));
-    Walk { wall: colored, patch: noise(2, 60, 60), cameras }
+    Walk { wall: colored, patch: noise(2, 60, 60), cameras, known: None }
 }
 
 #[test]
@@ -277,6 +282,17 @@ fn what_moves_is_seen_at_moments_with_its_velocity() {
     let share = |speed: f64| moving.iter().filter(|f| near(f, speed)).count() as f64 / moving.len() as f64;
     // The rest lies on the patch's border, where windows hold some of the wall.
     assert!(share(240.0) > 0.65, "{}", share(240.0));
+    assert_eq!(sights[0].shown.iter().filter(|w| w.is_some()).count(), 4);
+}
+
+#[test]
+fn pictures_of_straightened_features_are_not_laid_over_each_other() {
+    let mut silent = |_: &_| {};
+    let camera = Lens { k1: -0.2, ..Lens::plain(200.0, 240, 120) }.camera(Se3::IDENTITY, 240, 120);
+    let known = Known { intrinsics: camera.intrinsics, lens: camera.lens, pose: None };
+    let bent = Walk { known: Some(known), ..walk(1) };
+    let sights = fixed(&bent, &Look { moments: 3, ..Look::default() }, &mut Progress(&mut silent)).unwrap();
+    assert!(sights[0].exact && sights[0].shown.is_empty() && !sights[0].features.is_empty());
 }
 
 #[test]

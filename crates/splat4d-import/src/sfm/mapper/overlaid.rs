@@ -9,6 +9,9 @@ use rayon::prelude::*;
 /// Of a camera with fewer sightings whose windows agree, the others stay too.
 const LEFT: usize = 100;
 
+/// Pictures in which a point is looked for beside those that show it, at most: a walk has hundreds.
+const LOOKED_IN: usize = 32;
+
 /// What windows about a track's point say.
 struct Laid {
     /// How far each of its sightings is off, by its place in the track; none where windows do not agree.
@@ -79,6 +82,8 @@ impl Map<'_> {
         };
         let others = (0..self.sights.len()).filter(|s| track.seen.iter().all(|(other, _)| other != s));
         let guesses: Vec<(usize, Feature)> = others.filter(|&s| shown(s).is_some()).filter_map(guess).collect();
+        let step = guesses.len().div_ceil(LOOKED_IN).max(1);
+        let guesses: Vec<(usize, Feature)> = guesses.into_iter().step_by(step).collect();
         let more: Vec<Seen<'_>> = guesses.iter().filter_map(|(s, f)| at(*s, f)).collect();
         let mut offs = overlay::aligned(spot.place, &seen, &more);
         let found = offs.split_off(seen.len());
