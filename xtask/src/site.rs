@@ -1,4 +1,4 @@
-//! The static site: documents as pages, the API's pages by rustdoc, and a gallery that plays the example scenes. Any host of
+//! The static site: documents as pages, the Python API's page, the Rust API's by rustdoc, and a gallery that plays the example scenes. Any host of
 //! files serves the folder.
 
 use crate::files::write_file;
@@ -11,7 +11,7 @@ use std::process::Command;
 const ROOT: [&str; 6] =
     ["README.md", "ARCHITECTURE.md", "CONVENTIONS.md", "CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md"];
 /// The menu: page and name.
-const MENU: [(&str, &str); 8] = [
+const MENU: [(&str, &str); 9] = [
     ("index.html", "splat4d"),
     ("gallery/index.html", "Play"),
     ("docs/verbs.html", "Verbs"),
@@ -19,7 +19,8 @@ const MENU: [(&str, &str); 8] = [
     ("docs/player.html", "Player"),
     ("docs/models.html", "Models"),
     ("docs/capture-format.html", "Captures"),
-    ("api/splat4d/index.html", "API"),
+    ("api/python.html", "Python API"),
+    ("api/splat4d/index.html", "Rust API"),
 ];
 const REPOSITORY: &str = "https://github.com/splat4d/splat4d/blob/main/";
 
@@ -64,14 +65,17 @@ pub(crate) fn command(arguments: &[String]) -> Result<()> {
     }
     gallery(&root, &out.join("gallery"))?;
     if api {
-        let crates = ["splat4d", "splat4d-train", "splat4d-import", "splat4d-serve"];
+        let crates = ["splat4d", "splat4d-train", "splat4d-dynamics", "splat4d-import", "splat4d-serve"];
         let packages = crates.iter().flat_map(|name| ["-p", name]);
         let made = Command::new(env!("CARGO")).args(["doc", "--no-deps"]).args(packages).current_dir(&root).status()?;
         ensure!(made.success(), "cargo doc failed");
         let target = std::env::var_os("CARGO_TARGET_DIR").map_or_else(|| root.join("target"), PathBuf::from);
         copy(&target.join("doc"), &out.join("api"))?;
     }
-    println!("{}: {} pages; look at it with `python3 -m http.server -d {0}`", out.display(), documents.len() + 1);
+    let reference = Path::new("api/python.md");
+    let text = crate::python_api::document(&root)?;
+    write_file(&out.join(page_of(reference)), page(&text, reference, &documents).as_bytes())?;
+    println!("{}: {} pages; look at it with `python3 -m http.server -d {0}`", out.display(), documents.len() + 2);
     Ok(())
 }
 
@@ -193,7 +197,7 @@ fn gallery(root: &Path, out: &Path) -> Result<()> {
 }
 
 /// Names of the files in a folder with this ending, in order.
-fn list(folder: &Path, ending: &str) -> Result<Vec<String>> {
+pub(crate) fn list(folder: &Path, ending: &str) -> Result<Vec<String>> {
     let mut names = Vec::new();
     for entry in std::fs::read_dir(folder).with_context(|| folder.display().to_string())? {
         let path = entry?.path();
