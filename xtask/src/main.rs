@@ -11,6 +11,7 @@ mod material;
 mod mesh;
 mod metrics;
 mod picture;
+mod python_api;
 mod raster;
 mod scene;
 mod site;

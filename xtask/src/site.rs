@@ -1,4 +1,4 @@
-//! The static site: documents as pages, the API's pages by rustdoc, and a gallery that plays the example scenes. Any host of
+//! The static site: documents as pages, the Python API's page, the Rust API's by rustdoc, and a gallery that plays the example scenes. Any host of
 //! files serves the folder.
 
 use crate::files::write_file;
@@ -19,7 +19,15 @@ const MENU: [(&str, &str); 8] = [
     ("docs/player.html", "Player"),
     ("docs/models.html", "Models"),
     ("docs/capture-format.html", "Captures"),
-    ("api/splat4d/index.html", "API"),
+    ("api/index.html", "API"),
+];
+/// Crates with pages of their own, and what each is for.
+const CRATES: [(&str, &str); 5] = [
+    ("splat4d", "scenes, motion models, the renderer, formats"),
+    ("splat4d-train", "captures, training, evaluation"),
+    ("splat4d-dynamics", "forecasts"),
+    ("splat4d-import", "captures of videos"),
+    ("splat4d-serve", "the player and its server"),
 ];
 const REPOSITORY: &str = "https://github.com/splat4d/splat4d/blob/main/";
 
@@ -63,13 +71,23 @@ pub(crate) fn command(arguments: &[String]) -> Result<()> {
         copy(&root.join(name), &out.join(name))?;
     }
     gallery(&root, &out.join("gallery"))?;
+    let mut apis = String::from("# The API\n\n- [Python](python.md): the package `splat4d`\n");
     if api {
-        let crates = ["splat4d", "splat4d-train", "splat4d-import", "splat4d-serve"];
-        let packages = crates.iter().flat_map(|name| ["-p", name]);
+        let packages = CRATES.iter().flat_map(|(name, _)| ["-p", name]);
         let made = Command::new(env!("CARGO")).args(["doc", "--no-deps"]).args(packages).current_dir(&root).status()?;
         ensure!(made.success(), "cargo doc failed");
         let target = std::env::var_os("CARGO_TARGET_DIR").map_or_else(|| root.join("target"), PathBuf::from);
         copy(&target.join("doc"), &out.join("api"))?;
+        fill(&out.join("api"))?;
+        for (name, what) in CRATES {
+            apis += &format!("- Rust, [{name}](./{}/index.html): {what}\n", name.replace('-', "_"));
+        }
+    }
+    apis += "- JavaScript: [the element and the object of three.js](../docs/player.md)\n";
+    documents.extend(["api/index.md", "api/python.md"].map(PathBuf::from));
+    let texts = [apis, crate::python_api::document(&root)?];
+    for (document, text) in documents[documents.len() - 2..].iter().zip(texts) {
+        write_file(&out.join(page_of(document)), page(&text, document, &documents).as_bytes())?;
     }
     println!("{}: {} pages; look at it with `python3 -m http.server -d {0}`", out.display(), documents.len() + 1);
     Ok(())
@@ -111,7 +129,9 @@ fn page(text: &str, document: &Path, documents: &[PathBuf]) -> String {
         if documents.contains(&full) {
             return format!("{up}{}{place}", page_of(&full).display());
         }
-        match full.starts_with("docs/images") || full.components().count() == 1 {
+        // Pages that rustdoc makes lie beside ours.
+        let here = full.starts_with("docs/images") || full.starts_with("api") || full.components().count() == 1;
+        match here {
             true => target.to_owned(),
             false => format!("{REPOSITORY}{}{place}", full.display()),
         }
@@ -192,8 +212,28 @@ fn gallery(root: &Path, out: &Path) -> Result<()> {
     write_file(&out.join("index.html"), frame("splat4d: play", &body, 1, "wide").as_bytes())
 }
 
+/// Writes the scripts that rustdoc's pages of traits ask for and rustdoc leaves out where nobody implements the trait: an empty
+/// one instead of a 404.
+fn fill(folder: &Path) -> Result<()> {
+    for entry in std::fs::read_dir(folder).with_context(|| folder.display().to_string())? {
+        let path = entry?.path();
+        if path.is_dir() {
+            fill(&path)?;
+        } else if path.file_name().is_some_and(|n| n.to_string_lossy().starts_with("trait.")) {
+            let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
+            for script in text.split("src=\"").skip(1).filter_map(|rest| rest.split('"').next()) {
+                let file = clean(&folder.join(script));
+                if script.contains("trait.impl/") && !file.exists() {
+                    write_file(&file, b"")?;
+                }
+            }
+        }
+    }
+    Ok(())
+}
+
 /// Names of the files in a folder with this ending, in order.
-fn list(folder: &Path, ending: &str) -> Result<Vec<String>> {
+pub(crate) fn list(folder: &Path, ending: &str) -> Result<Vec<String>> {
     let mut names = Vec::new();
     for entry in std::fs::read_dir(folder).with_context(|| folder.display().to_string())? {
         let path = entry?.path();

@@ -70,22 +70,51 @@ pub(crate) fn finite<const N: usize>(value: &Bound<'_, PyAny>, what: &str) -> Py
     }
 }
 
-/// A picture [h, w, 3], as floats from 0 to 1 or 8-bit numbers, as planes.
+/// What the numbers of a picture are.
+pub(crate) enum Kind {
+    /// From 0 to 255.
+    Bytes,
+    /// Nominally from 0 to 1.
+    Floats,
+}
+
+/// Anything that NumPy makes an array of, in its own type of numbers, if pictures may have that one.
+pub(crate) fn pixels<'py>(value: &Bound<'py, PyAny>, what: &str) -> PyResult<(Bound<'py, PyAny>, Kind)> {
+    let array = value.py().import("numpy")?.call_method1("asarray", (value,)).map_err(|e| {
+        bad_input(format!("{what} is no array ({})", e.value(value.py())), "Give a picture [height, width, 3]")
+    })?;
+    let dtype = array.getattr("dtype")?;
+    let kind: (String, usize) = (dtype.getattr("kind")?.extract()?, dtype.getattr("itemsize")?.extract()?);
+    match (kind.0.as_str(), kind.1) {
+        ("u", 1) => Ok((array, Kind::Bytes)),
+        ("f", _) => Ok((array, Kind::Floats)),
+        _ => Err(bad_input(format!("{what} has the dtype {dtype}"), "Give float32 from 0 to 1, or uint8")),
+    }
+}
+
+/// A picture [h, w, 3], as floats nominally from 0 to 1 or 8-bit numbers, as planes.
 pub(crate) fn planes(value: &Bound<'_, PyAny>, what: &str) -> PyResult<Planes<f32>> {
-    let bytes = value.getattr("dtype").is_ok_and(|d| d.is(numpy::dtype::<u8>(value.py())));
-    let array = numbers::<f32>(value, what)?;
+    let (value, kind) = pixels(value, what)?;
+    let array = numbers::<f32>(&value, what)?;
     let &[height, width, 3] = array.shape() else {
         return Err(bad_input(
             format!("{what} has the shape {:?}", array.shape()),
             "Give a picture [height, width, 3]",
         ));
     };
-    let scale = if bytes { 1.0 / 255.0 } else { 1.0 };
+    if height * width == 0 {
+        return Err(bad_input(format!("{what} has {width}x{height} pixels"), "Give a picture with pixels"));
+    }
     let mut out = Planes::new(3, height, width);
     let view = array.as_array();
-    for (c, plane) in out.data.chunks_exact_mut((height * width).max(1)).enumerate() {
+    for (c, plane) in out.data.chunks_exact_mut(height * width).enumerate() {
         let channel = view.index_axis(numpy::ndarray::Axis(2), c);
-        plane.iter_mut().zip(channel.iter()).for_each(|(o, x)| *o = scale * x);
+        let numbers = plane.iter_mut().zip(channel.iter());
+        // Divided as pictures in files are, so that the same bytes are the same numbers.
+        match kind {
+            Kind::Bytes => numbers.for_each(|(o, x)| *o = x / 255.0),
+            Kind::Floats => numbers.for_each(|(o, x)| *o = *x),
+        }
     }
     match out.data.iter().position(|x| !x.is_finite()) {
         Some(at) => {
@@ -95,4 +124,14 @@ pub(crate) fn planes(value: &Bound<'_, PyAny>, what: &str) -> PyResult<Planes<f3
         }
         None => Ok(out),
     }
+}
+
+/// A render and its truth, of one size.
+pub(crate) fn pair(render: &Bound<'_, PyAny>, truth: &Bound<'_, PyAny>) -> PyResult<(Planes<f32>, Planes<f32>)> {
+    let (a, b) = (planes(render, "render")?, planes(truth, "truth")?);
+    if (a.height, a.width) != (b.height, b.width) {
+        let what = format!("render has {}x{} pixels, truth {}x{}", a.width, a.height, b.width, b.height);
+        return Err(bad_input(what, "Give pictures of one size"));
+    }
+    Ok((a, b))
 }

@@ -1,6 +1,6 @@
 //! Pictures in memory become a capture on disk: lossless files and a `capture.json`.
 
-use crate::arrays::{finite, finite_rows, numbers};
+use crate::arrays::{Kind, finite, finite_rows, numbers, pixels};
 use crate::camera::Camera;
 use crate::errors::{OrRaise, bad_input};
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
@@ -236,16 +236,18 @@ fn samples(image: &Bound<'_, PyAny>, what: &str, camera: &scene::Camera) -> PyRe
             Err(bad_input(format!("{what} has the shape {shape:?}"), &wanted))
         }
     };
-    let dtype = image.getattr("dtype").map_err(|_| bad_input(format!("{what} is no array"), "Give NumPy arrays"))?;
-    let kind: (String, usize) = (dtype.getattr("kind")?.extract()?, dtype.getattr("itemsize")?.extract()?);
-    match (kind.0.as_str(), kind.1) {
-        ("u", 1) => {
-            let array = numbers::<u8>(image, what)?;
+    if !image.hasattr("__array__")? {
+        return Err(bad_input(format!("{what} is no array"), "Give NumPy arrays"));
+    }
+    let (image, kind) = pixels(image, what)?;
+    match kind {
+        Kind::Bytes => {
+            let array = numbers::<u8>(&image, what)?;
             fits(array.shape())?;
             Ok(Samples { data: array.as_array().iter().copied().collect(), kind: ExtendedColorType::Rgb8 })
         }
-        ("f", 4 | 8) => {
-            let array = numbers::<f32>(image, what)?;
+        Kind::Floats => {
+            let array = numbers::<f32>(&image, what)?;
             fits(array.shape())?;
             let mut out = Vec::with_capacity(2 * array.len());
             for (i, x) in array.as_array().iter().enumerate() {
@@ -258,7 +260,6 @@ fn samples(image: &Bound<'_, PyAny>, what: &str, camera: &scene::Camera) -> PyRe
             }
             Ok(Samples { data: out, kind: ExtendedColorType::Rgb16 })
         }
-        _ => Err(bad_input(format!("{what} has the dtype {dtype}"), "Give float32 from 0 to 1, or uint8")),
     }
 }
 

@@ -29,7 +29,7 @@ mod _native {
     #[pymodule_export]
     use crate::gaussians::Gaussians;
     #[pymodule_export]
-    use crate::loss::View;
+    use crate::loss::{View, photometric};
     #[pymodule_export]
     use crate::metrics::metrics;
     #[pymodule_export]

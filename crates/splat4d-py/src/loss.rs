@@ -1,10 +1,11 @@
 //! A loss written in Python beside the recipe's: it gets the picture and the truth, and returns a value and a gradient.
 
-use crate::arrays::{numbers, picture};
+use crate::arrays::{numbers, pair, picture};
 use crate::errors::bad_input;
 use numpy::PyUntypedArrayMethods;
 use pyo3::prelude::*;
 use splat4d::scene::Planes;
+use splat4d_train::loss::Photometric;
 use splat4d_train::loss::image::{self, ImageTerm, Needs, PictureGrads, Shown};
 use splat4d_train::loss::terms::StepInfo;
 use splat4d_train::run::OwnLoss;
@@ -104,4 +105,26 @@ impl Asked {
         }
         Ok(value)
     }
+}
+
+/// The recipe's picture loss, (1 − λ)·L1 + λ·(1 − SSIM) with λ = `lambda_dssim`, of two pictures [h, w, 3]: its value, and its
+/// gradient to `render` [h, w, 3].
+#[pyfunction]
+#[pyo3(signature = (render, truth, lambda_dssim=0.2))]
+pub(crate) fn photometric<'py>(
+    py: Python<'py>,
+    render: &Bound<'py, PyAny>,
+    truth: &Bound<'py, PyAny>,
+    lambda_dssim: f32,
+) -> PyResult<(f64, Bound<'py, PyAny>)> {
+    if !(0.0..=1.0).contains(&lambda_dssim) {
+        return Err(bad_input(format!("lambda_dssim is {lambda_dssim}"), "Give 0 (L1 alone) to 1 (SSIM alone)"));
+    }
+    let (a, b) = pair(render, truth)?;
+    let (value, gradient) = py.detach(|| {
+        let mut gradient = Planes::default();
+        let value = Photometric::<f32>::new(lambda_dssim).loss_and_grad(&a, &b, None, &mut gradient);
+        (value.total, gradient)
+    });
+    Ok((value, picture(py, gradient)?))
 }

@@ -1,7 +1,6 @@
 //! Metrics of two pictures.
 
-use crate::arrays::planes;
-use crate::errors::bad_input;
+use crate::arrays::pair;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use splat4d_train::eval::{Score, ViewContext, score_view};
@@ -14,11 +13,7 @@ pub(crate) fn metrics<'py>(
     render: &Bound<'py, PyAny>,
     truth: &Bound<'py, PyAny>,
 ) -> PyResult<Bound<'py, PyDict>> {
-    let (a, b) = (planes(render, "render")?, planes(truth, "truth")?);
-    if (a.height, a.width) != (b.height, b.width) {
-        let what = format!("render has {}x{} pixels, truth {}x{}", a.width, a.height, b.width, b.height);
-        return Err(bad_input(what, "Give pictures of one size"));
-    }
+    let (a, b) = pair(render, truth)?;
     let view = py.detach(|| score_view("", &a, &b, &ViewContext::default()));
     let out = PyDict::new(py);
     for (key, score) in view.scores {

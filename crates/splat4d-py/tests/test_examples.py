@@ -47,6 +47,10 @@ class Examples(InFolder):
     def test_from_arrays(self):
         self.run_example("from_arrays.py", PLAYABLE, "again/results.json")
 
+    @unittest.skipUnless(importlib.util.find_spec("torch"), "PyTorch is not installed")
+    def test_torch_loss(self):
+        self.assertIn("50 steps", self.run_example("torch_loss.py", KNIGHT))
+
     @unittest.skipUnless(importlib.util.find_spec("rerun"), "Rerun is not installed")
     def test_to_rerun(self):
         self.run_example("to_rerun.py", PLAYABLE, "scene.rrd")

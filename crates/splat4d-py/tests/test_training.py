@@ -100,20 +100,6 @@ class Training(InFolder):
                 self.train(name, loss=lambda p, t, v, answer=answer: answer(p))
             self.assertFalse(splat4d.Run(self.folder / name).finished)
 
-    def test_a_loss_of_pytorch(self):
-        try:
-            import torch
-        except ImportError:
-            raise unittest.SkipTest("PyTorch is not installed")
-
-        def loss(picture, truth, view):
-            picture = torch.from_numpy(picture.copy()).requires_grad_()
-            value = 0.1 * torch.nn.functional.huber_loss(picture, torch.from_numpy(truth.copy()))
-            value.backward()
-            return value.item(), picture.grad.numpy()
-
-        self.assertTrue(self.train("torch", loss=loss).finished)
-
     def test_pictures_in_memory_become_a_capture_and_a_run_that_resumes(self):
         scene = splat4d.open(KNIGHT.parent / "knight.splat4d")
         cameras = [camera.downscaled(8) for _, camera in scene.cameras[:4]]

@@ -14,6 +14,7 @@ from ._native import (
     command,
     metrics,
     open,
+    photometric,
     resume,
     train,
 )
@@ -32,6 +33,7 @@ __all__ = [
     "command",
     "metrics",
     "open",
+    "photometric",
     "resume",
     "train",
 ]

@@ -15,6 +15,8 @@ _Loss = Callable[[_F32, _F32, "View"], tuple[float, ArrayLike]]
 __version__: str
 
 class Error(Exception):
+    """What went wrong, where, and what to do."""
+
     kind: Literal["bad_input", "io", "unsupported", "memory", "diverged", "interrupted", "failed"]
 
 @final
@@ -191,6 +193,7 @@ class Run:
 
 def open(path: _Path) -> Scene: ...
 def metrics(render: ArrayLike, truth: ArrayLike) -> dict[str, float]: ...
+def photometric(render: ArrayLike, truth: ArrayLike, lambda_dssim: float = 0.2) -> tuple[float, _F32]: ...
 def train(
     capture: Capture | _Path,
     out: _Path | None = None,

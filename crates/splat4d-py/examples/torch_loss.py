@@ -1,0 +1,18 @@
+"""A loss of PyTorch beside the recipe's (pip install torch)."""
+import sys
+
+import torch
+
+import splat4d
+
+
+def huber(picture, truth, view):
+    """A tenth of Huber's loss: quadratic up to a tenth of full scale, linear beyond."""
+    picture = torch.from_numpy(picture).requires_grad_()
+    value = 0.1 * torch.nn.functional.huber_loss(picture, torch.from_numpy(truth), delta=0.1)
+    value.backward()
+    return value.item(), picture.grad.numpy()
+
+
+run = splat4d.train(sys.argv[1], "huber", loss=huber, iterations=50, downscale=4)
+print(run, run.iteration, "steps")
