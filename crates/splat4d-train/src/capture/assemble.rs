@@ -1,6 +1,6 @@
 //! From what the files say to a checked capture: poses, sizes, files, duplicates, split, clock.
 
-use super::{Capture, CaptureOptions, FlowFile, Frame, HoldOut, RawFrame, Rig, Split, Take, Timing};
+use super::{Capture, CaptureOptions, Extent, FlowFile, Frame, HoldOut, RawFrame, Rig, Split, Take, Timing};
 use super::{options, picture, pose};
 use splat4d::math::se3::{norm, normalize, sub};
 use splat4d::scene::{Camera, Lens, Time};
@@ -28,14 +28,26 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
     for frame in &mut take.frames {
         check_frame(frame, &take.cameras[frame.camera], options)?;
     }
-    drop_unused_cameras(&mut take);
+    let in_part = take.take != Extent::default();
+    if !in_part {
+        drop_unused_cameras(&mut take);
+        let mut all = Extent::default();
+        take.frames.iter().for_each(|f| all.add(f.index..f.index + 1));
+        take.take = all;
+    }
     let cameras = rigs(&take);
     check_poses(&mut take, &cameras)?;
     check_duplicates(&mut take, &cameras).map_err(located)?;
     let has_alpha = fit_pictures(&mut take)?;
     check_masks(&take, has_alpha)?;
     let background = options.background.or(take.background).or(has_alpha.then_some(WHITE)).filter(|_| has_alpha);
-    let (train, held, validation) = split(&mut take, &cameras, options).map_err(located)?;
+    let (mut train, mut held, mut validation) = split(&mut take, &cameras, options).map_err(located)?;
+    if !in_part {
+        let frames = &take.frames;
+        for all in [&mut train, &mut held, &mut validation] {
+            all.retain(|&i| options.lists(frames[i].index));
+        }
+    }
     let up = take.up.map(normalize).filter(|u| norm(*u) > 0.0).unwrap_or_else(|| estimate_up(&take.frames));
     let flows = flows(&mut take.frames);
     let frames = take.frames.into_iter().zip(flows);
@@ -51,6 +63,7 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
         kind: take.kind,
         cameras,
         frames,
+        take: take.take,
         held,
         train,
         validation,
