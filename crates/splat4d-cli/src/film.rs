@@ -28,7 +28,7 @@ pub(crate) fn append(run: &Path, chunked: &Chunked, stop: &AtomicBool, console: 
     if path.is_file() && !grows(&path)? {
         return Ok(());
     }
-    append_to(&path, run, chunked, console).map(|_| ())
+    append_to(&path, run, chunked, false, console).map(|_| ())
 }
 
 /// Appends what is missing and finishes the file. Returns its length, bytes.
@@ -46,7 +46,7 @@ pub(crate) fn complete(run: &Path, chunked: &Chunked, stop: &AtomicBool, console
 }
 
 fn complete_from(growing: &Path, path: &Path, run: &Path, chunked: &Chunked, console: &Console) -> anyhow::Result<u64> {
-    let meta = append_to(growing, run, chunked, console)?;
+    let meta = append_to(growing, run, chunked, true, console)?;
     let first = opened(run, chunked.some(0..1)?)?;
     let poster = poster(&first.scene, &first.stage(&first.views()?), antialias(&first));
     let mut source = File::open(growing).map_err(|e| cannot_read(growing, e))?;
@@ -67,18 +67,27 @@ fn grows(path: &Path) -> Result<bool> {
     Ok(Index::place(&header).is_err() || Index::grows(&header))
 }
 
-fn append_to(path: &Path, run: &Path, chunked: &Chunked, console: &Console) -> anyhow::Result<Meta> {
+/// Appends what is missing; `thorough`: and looks whether what is there is of the chunks that are there.
+fn append_to(path: &Path, run: &Path, chunked: &Chunked, thorough: bool, console: &Console) -> anyhow::Result<Meta> {
     let done: Vec<Part> = chunked.parts().into_iter().filter(|p| chunked.is_done(*p)).collect();
-    let prints = done.iter().map(|p| chunked.print(*p)).collect::<Result<Vec<String>>>()?;
     let place = |e: std::io::Error| Error::io("the playback file cannot be opened", e).at(path.display());
     let known = File::options().read(true).write(true).open(path).ok().and_then(|file| Growing::open(file).ok());
+    let in_it = |meta: &Meta, part: &Part| meta.parts.iter().find(|p| p.starts_with(&format!("{part} "))).cloned();
     // Parts that were trained again since, or a file that does not hold together: all of it is made again.
-    let mut growing = known.filter(|g| g.index().meta.parts.iter().all(|p| prints.contains(p)));
+    let mut growing = None;
+    if let Some(file) = known {
+        let mut same = true;
+        for (part, print) in done.iter().filter_map(|p| Some((p, in_it(&file.index().meta, p)?))) {
+            same &= !thorough || chunked.print(*part)? == print;
+        }
+        growing = Some(file).filter(|_| same);
+    }
     let mut meta = growing.as_ref().map(|g| g.index().meta.clone());
-    for (part, print) in done.iter().zip(prints) {
-        if meta.as_ref().is_some_and(|m| m.parts.contains(&print)) {
+    for part in &done {
+        if meta.as_ref().is_some_and(|m| in_it(m, part).is_some()) {
             continue;
         }
+        let print = chunked.print(*part)?;
         console.phase(&format!("the playback file, chunk {part}"), 0, 0);
         let shell = chunked.shell()?;
         let whole = shell.clip;
@@ -108,7 +117,7 @@ fn append_to(path: &Path, run: &Path, chunked: &Chunked, console: &Console) -> a
         next.sh_degree = next.sh_degree.max(theirs.sh_degree);
         next.bounds = union(next.bounds, theirs.bounds);
         next.parts.push(print);
-        next.missing = missing(chunked.plan(), &next, &done);
+        next.missing = missing(chunked.plan(), &next);
         let file = match growing.as_mut() {
             Some(file) => file,
             None => {
@@ -147,10 +156,8 @@ fn union(a: Option<[[f64; 3]; 2]>, b: Option<[[f64; 3]; 2]>) -> Option<[[f64; 3]
 }
 
 /// Seconds before the clip's end whose chunks are not there, from cut to cut.
-fn missing(plan: &ChunkPlan, meta: &Meta, done: &[Part]) -> Vec<[f64; 2]> {
-    let there = |c: usize| {
-        done.contains(&Part::Chunk(c)) && meta.parts.iter().any(|p| p.starts_with(&format!("{} ", Part::Chunk(c))))
-    };
+fn missing(plan: &ChunkPlan, meta: &Meta) -> Vec<[f64; 2]> {
+    let there = |c: usize| meta.parts.iter().any(|p| p.starts_with(&format!("{c} ")));
     let second = |frame: usize| meta.clip[0] + (frame - plan.take[0]) as f64 / meta.fps;
     let border = |k: usize| match k {
         0 => plan.take[0],

@@ -111,7 +111,7 @@ pub struct Args {
     /// Learn a longer take in chunks of N frames [default: 60 where fixed cameras film more than 300 frames]
     #[arg(long, value_name = "N", help_heading = "Long takes")]
     chunk_frames: Option<usize>,
-    /// Frames that neighbouring chunks share, an even number [default: 8]
+    /// Frames that neighbouring chunks share, an even number [default: 16]
     #[arg(long, value_name = "N", help_heading = "Long takes")]
     overlap: Option<usize>,
     /// Do one part and end: shared, then even chunks by their number, then odd ones; or all, beside other workers on the same

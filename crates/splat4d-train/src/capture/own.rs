@@ -126,7 +126,7 @@ fn in_part(top: &Node<'_>, nodes: &[Node<'_>], told: Option<&HoldOut>, options: 
         let one_by_one =
             ["world_to_camera", "camera_to_world"].iter().any(|k| node.value[*k].pointer("/0/0/0").is_some());
         let none = node.value["images"].as_array().is_some_and(Vec::is_empty)
-            || node.opt("frames")?.or(top.opt("frames")?).is_some_and(|n| n.value == &0);
+            || node.opt("frames")?.or(top.opt("frames")?).is_some_and(|n| *n.value == 0);
         if one_by_one || none {
             return Ok(false);
         }

@@ -23,7 +23,7 @@ const LESS: f64 = 0.8;
 /// Least memory for decoded pictures, bytes; less makes runs slower, and no picture worse.
 const PICTURES: u64 = 64 << 20;
 /// Shortest chunk, in overlaps: in a shorter one there is hardly a frame that is not shared.
-const SHORTEST: usize = 4;
+const SHORTEST: usize = 3;
 /// Share of the time that is kept for putting the take together, and for what training takes beside its steps.
 const JOIN: f64 = 0.1;
 

@@ -65,9 +65,9 @@ settings! {
         /// nothing is asked for that chunks cannot have, else the take is learnt at once. Iterations are those of a chunk.
         frames: usize = 0 => any().unit("frames");
         /// Frames that neighbouring chunks share, in which they fade into each other; an even number.
-        overlap: usize = 8 => any().unit("frames");
+        overlap: usize = 16 => any().unit("frames");
         /// Weight of the difference (L1) between an odd chunk's pictures and its neighbours' where they overlap.
-        consistency: f64 = 0.1;
+        consistency: f64 = 2.0;
     }
 }
 
@@ -388,7 +388,8 @@ fn beginning(capture: &Capture, plan: &ChunkPlan) -> Capture {
 /// The frames of a capture to look at first: with them it can be told whether it is a long take.
 pub fn look_ahead(recipe: &Recipe) -> Vec<Range<usize>> {
     let first = recipe.capture.first_frame;
-    vec![first..first.saturating_add(recipe.chunks.frames.max(WHOLE)).saturating_add(1)]
+    let look = first..first.saturating_add(recipe.chunks.frames.max(WHOLE)).saturating_add(1);
+    vec![look]
 }
 
 /// Errors: what a recipe asks for that chunks cannot have together.

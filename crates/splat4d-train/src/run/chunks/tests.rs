@@ -190,11 +190,33 @@ fn a_plan_keeps_to_its_memory_and_its_minutes() {
     let set = format!("memory_limit={limit}");
     let tight = outlook(&["max_cap=20000", &set], None).unwrap().unwrap();
     assert!(tight.memory <= limit && tight.recipe.densify.max_cap < free.recipe.densify.max_cap);
-    assert!(tight.plan.len() >= free.plan.len() && tight.recipe.chunks.frames >= 4 * 2);
+    assert!(tight.plan.len() >= free.plan.len() && tight.recipe.chunks.frames >= 3 * 2);
     assert!(outlook(&["memory_limit=1000000"], None).unwrap_err().to_string().contains("more memory"));
     // Of two times, the longer one is worth more steps, and all parts together take no more than it.
     let steps = [0.02, 0.2].map(|m| outlook(&[], Some(m)).unwrap().unwrap());
     assert!(steps[0].recipe.run.iterations < steps[1].recipe.run.iterations);
     assert!(steps[1].seconds.unwrap() <= 60.0 * 0.2);
     assert!(outlook(&["chunks.frames=20"], None).unwrap().is_none(), "it is learnt at once");
+}
+
+#[test]
+fn every_motion_model_goes_through_two_chunks() {
+    let place = Place::of(12);
+    for motion in ["spacetime", "deform-mlp", "hexplane", "tracked", "native4d", "control", "ssm"] {
+        let recipe = recipe(&["chunks.frames=6", "chunks.overlap=2", "iterations=8", &format!("motion={motion}")]);
+        let run = begin(&place, motion, &recipe).unwrap().unwrap();
+        let never = AtomicBool::new(false);
+        run.work_all(&TrainOptions::default(), &never, &mut || Ok(()), &mut |_| {}).unwrap();
+        run.join().unwrap();
+        let whole = read(&run.run.join(SCENE));
+        assert_eq!(run.plan.len(), 2, "{motion}");
+        let own = whole.layers.iter().filter(|l| l.name != shared::LAYER);
+        assert!(own.clone().count() == 2 && own.clone().all(|l| l.motion.spec().name() == motion), "{motion}");
+        // Every moment is seen, those that both show too.
+        for t in [0.0, 0.55, 1.1] {
+            let mut seen = splat4d::layers::Evaluation::default();
+            whole.at(Time(t), &mut seen);
+            assert!(!whole.splats(&seen).is_empty(), "{motion} at {t}");
+        }
+    }
 }

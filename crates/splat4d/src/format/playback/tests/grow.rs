@@ -57,7 +57,9 @@ fn the_finished_file_does_not_tell_who_came_first_and_is_like_any_other() {
     let parts = [part(1, 0.0), part(2, 0.5), part(3, 0.0)];
     let file = |order: [usize; 3]| {
         let mut growing = Growing::begin(Cursor::new(Vec::new()), meta(1.0, &[])).unwrap();
-        order.map(|i| added(&mut growing, &parts[i], meta(1.0, &["x"])).unwrap());
+        for i in order {
+            added(&mut growing, &parts[i], meta(1.0, &["x"])).unwrap();
+        }
         let mut out = Vec::new();
         let length = finish(growing.file(), meta(1.0, &["x"]), Some(b"poster"), &mut out).unwrap();
         assert_eq!(length, out.len() as u64);
