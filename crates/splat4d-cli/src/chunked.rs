@@ -64,9 +64,10 @@ pub(crate) fn work(
     listen: &mut dyn FnMut(&Event),
 ) -> Result<Option<Outcome>> {
     // What goes wrong with it never costs a chunk, and is made good at the join.
-    let append = || match film::append(run, chunked, stop, console) {
-        Err(e) => console.warn(&format!("the playback file does not grow: {e:#}")),
-        Ok(()) => {}
+    let append = || {
+        if let Err(e) = film::append(run, chunked, stop, console) {
+            console.warn(&format!("the playback file does not grow: {e:#}"));
+        }
     };
     let outcome = match wanted {
         Wanted::One(part) => chunked.work(part, options, stop, listen),

@@ -230,7 +230,7 @@ mod tests {
         std::fs::write(&path, [1, 2, 3]).unwrap();
         let scene = Scene::new(Content::File(path.clone())).unwrap();
         let before = scene.version(None).unwrap();
-        std::io::Write::write_all(&mut File::options().append(true).open(&path).unwrap(), &[4, 5]).unwrap();
+        io::Write::write_all(&mut File::options().append(true).open(&path).unwrap(), &[4, 5]).unwrap();
         let after = scene.version(None).unwrap();
         assert_eq!((before.length, after.length, after.number), (3, 5, before.number));
         assert_ne!(before.etag, after.etag);

@@ -41,13 +41,7 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
     let has_alpha = fit_pictures(&mut take)?;
     check_masks(&take, has_alpha)?;
     let background = options.background.or(take.background).or(has_alpha.then_some(WHITE)).filter(|_| has_alpha);
-    let (mut train, mut held, mut validation) = split(&mut take, &cameras, options).map_err(located)?;
-    if !in_part {
-        let frames = &take.frames;
-        for all in [&mut train, &mut held, &mut validation] {
-            all.retain(|&i| options.lists(frames[i].index));
-        }
-    }
+    let (train, held, validation) = split(&mut take, &cameras, options).map_err(located)?;
     let up = take.up.map(normalize).filter(|u| norm(*u) > 0.0).unwrap_or_else(|| estimate_up(&take.frames));
     let flows = flows(&mut take.frames);
     let frames = take.frames.into_iter().zip(flows);
@@ -79,6 +73,11 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
     };
     let near = near(&capture, options.near);
     capture.frames.iter_mut().for_each(|f| f.view.near = near);
+    // Last: all else is told by the whole take.
+    let frames = &capture.frames;
+    for all in [&mut capture.train, &mut capture.held, &mut capture.validation] {
+        all.retain(|&i| options.lists(frames[i].index));
+    }
     Ok(capture)
 }
 
