@@ -67,7 +67,7 @@ impl Default for Baking {
 /// A baked scene as a file's bytes, and what became of it.
 pub(crate) struct Packed {
     pub bytes: Vec<u8>,
-    baked: bake::Baked,
+    pub baked: bake::Baked,
     summary: playback::Summary,
     antialias: bool,
 }
@@ -103,33 +103,8 @@ pub(crate) fn bake_into(
     console: &Console,
 ) -> anyhow::Result<Value> {
     let started = Instant::now();
-    let scene = &source.scene;
-    let views = source.views()?;
-    let (stage, cameras) = (source.stage(&views), distinct(&views));
-    let packed = pack(source, title, baking, console)?;
-    let likeness = compare(scene, &packed.bytes, &stage, &cameras, packed.antialias, console)?;
-    let mut tried = vec![(packed, likeness)];
-    while tried.len() < TRIES {
-        let known: Vec<(f64, f64)> =
-            tried.iter().filter_map(|(p, like)| Some((p.baked.report.tolerance, like.as_ref()?.psnr))).collect();
-        // What is straight already has no pieces to add.
-        let splits = tried[0].0.baked.report.errors.worst > 0.0;
-        let Some(tolerance) = closer(baking.like.filter(|_| splits), &known) else { break };
-        let mut strict = baking.clone();
-        strict.options.tolerance = tolerance;
-        let packed = pack(source, title, &strict, console)?;
-        let likeness = compare(scene, &packed.bytes, &stage, &cameras, packed.antialias, console)?;
-        let gained = likeness.zip(tried[tried.len() - 1].1).is_some_and(|(new, old)| new.psnr >= old.psnr + WORTH);
-        if !gained {
-            break;
-        }
-        // One file at a time: those before are not needed again.
-        let last = tried.len() - 1;
-        tried[last].0.bytes = Vec::new();
-        tried.push((packed, likeness));
-    }
-    let best = tried.pop().expect("one file was packed");
-    let (Packed { mut bytes, baked, summary, antialias }, likeness) = best;
+    let (packed, likeness) = bake_like(source, title, baking, console)?;
+    let Packed { mut bytes, baked, summary, antialias } = packed;
     if source.provenance.is_some() {
         bytes = playback::with_provenance(&bytes, source.provenance.as_ref())?;
     }
@@ -160,6 +135,41 @@ pub(crate) fn bake_into(
     console.emit(&value);
     console.written(out);
     Ok(value)
+}
+
+/// Bakes and packs a scene, again with a smaller tolerance where the file is less like its model than is wanted.
+pub(crate) fn bake_like(
+    source: &Source,
+    title: &str,
+    baking: &Baking,
+    console: &Console,
+) -> anyhow::Result<(Packed, Option<bake::Likeness>)> {
+    let scene = &source.scene;
+    let views = source.views()?;
+    let (stage, cameras) = (source.stage(&views), distinct(&views));
+    let packed = pack(source, title, baking, console)?;
+    let likeness = compare(scene, &packed.bytes, &stage, &cameras, packed.antialias, console)?;
+    let mut tried = vec![(packed, likeness)];
+    while tried.len() < TRIES {
+        let known: Vec<(f64, f64)> =
+            tried.iter().filter_map(|(p, like)| Some((p.baked.report.tolerance, like.as_ref()?.psnr))).collect();
+        // What is straight already has no pieces to add.
+        let splits = tried[0].0.baked.report.errors.worst > 0.0;
+        let Some(tolerance) = closer(baking.like.filter(|_| splits), &known) else { break };
+        let mut strict = baking.clone();
+        strict.options.tolerance = tolerance;
+        let packed = pack(source, title, &strict, console)?;
+        let likeness = compare(scene, &packed.bytes, &stage, &cameras, packed.antialias, console)?;
+        let gained = likeness.zip(tried[tried.len() - 1].1).is_some_and(|(new, old)| new.psnr >= old.psnr + WORTH);
+        if !gained {
+            break;
+        }
+        // One file at a time: those before are not needed again.
+        let last = tried.len() - 1;
+        tried[last].0.bytes = Vec::new();
+        tried.push((packed, likeness));
+    }
+    Ok(tried.pop().expect("one file was packed"))
 }
 
 /// The tolerance with which a file that is less like its model than wanted is baked again, by what tolerances (pixels) came

@@ -1,19 +1,17 @@
 //! Long takes in chunks: the work behind `train --chunk` and `join`.
 
 use crate::console::Console;
-use crate::files::human_bytes;
-use crate::finish;
-use crate::source::read_scene;
+use crate::files::{grouped, human_bytes, human_seconds};
+use crate::{film, finish};
 use serde_json::json;
-use splat4d::{Error, Result};
-use splat4d_train::capture::Capture;
+use splat4d::Result;
 use splat4d_train::event::Event;
-use splat4d_train::recipe::Recipe;
-use splat4d_train::run::chunks::{ChunkPlan, Chunked, Joined, Part};
+use splat4d_train::run::chunks::{Chunked, Joined, Outlook, Part};
 use splat4d_train::run::{self, Outcome, TrainOptions};
 use std::path::Path;
 use std::str::FromStr;
 use std::sync::atomic::AtomicBool;
+use std::time::Instant;
 
 /// The value of `--chunk`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -37,36 +35,54 @@ impl FromStr for Wanted {
 }
 
 /// The plan in a line.
-pub(crate) fn in_words(plan: &ChunkPlan, recipe: &Recipe) -> String {
+pub(crate) fn in_words(outlook: &Outlook) -> String {
+    let Outlook { recipe, plan, seconds, memory } = outlook;
     let longest = (0..plan.len()).map(|c| plan.frames(c).len()).max().unwrap_or(0);
-    format!(
-        "{} chunks of at most {longest} frames, {} of them shared by neighbours, {} steps each, and a shared layer before them",
+    let mut words = format!(
+        "{} chunks of at most {longest} frames and {} Gaussians, {} frames shared by neighbours, {} steps each, and a shared \
+         layer before them; about {} at a time",
         plan.len(),
+        grouped(recipe.densify.max_cap),
         plan.overlap,
-        recipe.run.iterations
-    )
+        recipe.run.iterations,
+        human_bytes(*memory)
+    );
+    if let Some(seconds) = seconds {
+        words += &format!(", {} on this machine", human_seconds(*seconds));
+    }
+    words
 }
 
-/// Estimated peak memory of a take that is learnt in chunks, bytes: that of its longest chunk.
-pub(crate) fn memory_estimate(capture: &Capture, plan: &ChunkPlan, recipe: &Recipe) -> u64 {
-    let longest = (0..plan.len()).map(|c| plan.frames(c)).max_by_key(ExactSizeIterator::len);
-    let frames = longest.expect("a plan has a chunk");
-    let train = capture.train.iter().copied().filter(|&i| frames.contains(&capture.frames[i].index)).collect();
-    run::memory_estimate(&Capture { train, ..capture.clone() }, recipe)
-}
-
-/// Does what is wanted of a take. `None`: nothing was to do.
+/// Does what is wanted of a take, and appends what is finished to its playback file. `None`: nothing was to do.
 pub(crate) fn work(
+    run: &Path,
     chunked: &Chunked,
     wanted: Wanted,
     options: &TrainOptions,
     stop: &AtomicBool,
+    console: &Console,
     listen: &mut dyn FnMut(&Event),
 ) -> Result<Option<Outcome>> {
-    match wanted {
+    // What goes wrong with it never costs a chunk, and is made good at the join.
+    let append = || {
+        if let Err(e) = film::append(run, chunked, stop, console) {
+            console.warn(&format!("the playback file does not grow: {e:#}"));
+        }
+    };
+    let outcome = match wanted {
         Wanted::One(part) => chunked.work(part, options, stop, listen),
-        Wanted::All => chunked.work_all(options, stop, listen),
+        Wanted::All => {
+            let mut finished = || {
+                append();
+                Ok(())
+            };
+            chunked.work_all(options, stop, &mut finished, listen)
+        }
+    }?;
+    if !outcome.as_ref().is_some_and(|o| o.interrupted) && chunked.is_done(Part::Shared) {
+        append();
     }
+    Ok(outcome)
 }
 
 /// Puts the chunks of a run together, measures how they meet, and does what follows training.
@@ -75,6 +91,7 @@ pub(crate) fn join(
     chunked: &Chunked,
     no_eval: bool,
     measure: &finish::Measure,
+    stop: &AtomicBool,
     console: &Console,
 ) -> anyhow::Result<()> {
     let joined = chunked.join()?;
@@ -85,7 +102,7 @@ pub(crate) fn join(
         human_bytes(peak_memory)
     ));
     let path = run.join("scene.safetensors");
-    let seams = chunked.seams(&read_scene(&path)?, &mut |event| console.event(event))?;
+    let seams = chunked.seams(&mut |event| console.event(event))?;
     console.clear();
     if let Some(seams) = &seams {
         let whose = if seams.held_out { "held-out" } else { "training" };
@@ -96,14 +113,16 @@ pub(crate) fn join(
     }
     finish::amend(run, [("seams".into(), json!(seams)), ("chunk_peak_memory".into(), json!(peak_memory))])?;
     console.say(&format!("wrote {}", path.display()));
-    if no_eval { Ok(finish::playback(run, console)?) } else { finish::all(run, measure, console) }
-}
-
-/// Errors: options that chunks do not know.
-pub(crate) fn check(minutes: Option<f64>) -> Result<()> {
-    match minutes {
-        None => Ok(()),
-        Some(_) => Err(Error::input("--minutes is not kept in chunks: steps are those of a chunk")
-            .remedy("Use --set iterations=N, or --chunk-frames above the take's length")),
-    }
+    let started = Instant::now();
+    let bytes = film::complete(run, chunked, stop, console)?;
+    console.say(&format!("the playback file has {}", human_bytes(bytes)));
+    finish::amend(
+        run,
+        [
+            ("playback_bytes".into(), json!(bytes)),
+            ("playback_seconds".into(), json!(started.elapsed().as_secs_f64())),
+            ("join_peak_memory".into(), json!(run::peak_memory())),
+        ],
+    )?;
+    if no_eval { Ok(()) } else { finish::all(run, measure, console) }
 }

@@ -18,6 +18,7 @@ use splat4d_train::eval::run::{EvalOptions, Measured, Scores, evaluate};
 use splat4d_train::eval::tracks::track_error;
 use splat4d_train::eval::trajectory::trajectory_error;
 use splat4d_train::recipe::Recipe;
+use splat4d_train::run::chunks::Chunked;
 use splat4d_train::run::corrected;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -92,7 +93,8 @@ pub(crate) fn all(run: &Path, measure: &Measure, console: &Console) -> anyhow::R
 /// Bakes the run into `scene.splat4d`. What goes wrong is said and never costs the run.
 pub fn playback(run: &Path, console: &Console) -> Result<()> {
     // The file of a compression is what was learnt: baking anew would lose its codes, palette and masks.
-    if run.join(ORDER).is_file() {
+    // That of a long take was made chunk by chunk.
+    if run.join(ORDER).is_file() || Chunked::is(run) {
         return Ok(());
     }
     let baked = Source::open(run).map_err(anyhow::Error::from).and_then(|source| {

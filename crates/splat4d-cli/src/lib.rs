@@ -15,6 +15,7 @@ mod device;
 pub mod draw;
 mod editing;
 pub mod files;
+mod film;
 pub mod finish;
 pub mod interrupt;
 pub mod measure;

@@ -10,7 +10,7 @@ use splat4d::Result;
 use splat4d::format::playback::{HEADER_BYTES, Index, MAGIC};
 use splat4d_serve::Content;
 use std::fs::File;
-use std::io::Read;
+use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 /// A playback file and what people call it.
@@ -70,10 +70,12 @@ fn ready(path: &Path) -> Result<Option<PathBuf>> {
 fn index(path: &Path) -> Result<Index> {
     let fail = |e| cannot_read(path, e);
     let file = File::open(path).map_err(fail)?;
-    let length = file.metadata().map_err(fail)?.len();
-    let mut start = Vec::new();
-    (&file).take(HEADER_BYTES as u64).read_to_end(&mut start).map_err(fail)?;
-    let needed = Index::needed(&start).map_err(|e| e.at(path.display()))?;
-    (&file).take((needed - HEADER_BYTES) as u64).read_to_end(&mut start).map_err(fail)?;
-    Index::parse(&start, Some(length)).map_err(|e| e.at(path.display()))
+    let mut header = Vec::new();
+    (&file).take(HEADER_BYTES as u64).read_to_end(&mut header).map_err(fail)?;
+    // Behind everything else in a file that grows.
+    let place = Index::place(&header).map_err(|e| e.at(path.display()))?;
+    (&file).seek(SeekFrom::Start(place.start)).map_err(fail)?;
+    let mut index = Vec::new();
+    (&file).take(place.end - place.start).read_to_end(&mut index).map_err(fail)?;
+    Index::of(&header, &index).map_err(|e| e.at(path.display()))
 }

@@ -17,7 +17,9 @@ const HEAD = 64,
   BLOCK_BYTES = 96,
   WORDS = 8;
 const MAGIC = [0x89, 0x53, 0x34, 0x44, 0x0d, 0x0a, 0x1a, 0x0a];
-const MAJOR = 1;
+/// A finished file, and one that grows: its index lies behind what it lists.
+const MAJOR = 1,
+  GROWING = 2;
 const MAX_INDEX = 64 << 20,
   MAX_SECTIONS = 1e6,
   MAX_COUNT = 65536,
@@ -138,6 +140,8 @@ export class SceneFile {
   pages = [];
   /// Whether the file was cut short.
   truncated = false;
+  /// Whether it is of a take that is not finished: there may be more of it later.
+  growing = false;
   #source;
   #where;
   #head;
@@ -233,23 +237,25 @@ export class SceneFile {
     if (view.getUint32(60, true) !== crc32(head.subarray(0, 60)))
       this.#refuse('The header is damaged: its checksum differs');
     const major = view.getUint16(8, true);
-    if (major !== MAJOR) {
+    if (major !== MAJOR && major !== GROWING) {
       this.#refuse(`This file has version ${major}, this player reads ${MAJOR}`, 'Use a newer player.');
     }
     const indexBytes = view.getUint32(12, true);
     const length = long(view, 16);
+    this.growing = major === GROWING;
+    const at = this.growing ? long(view, 28) : HEAD;
     this.bytesTotal = Math.min(length, this.#source.size);
     this.truncated = this.#source.size < length;
-    if (indexBytes > MAX_INDEX || HEAD + indexBytes > length) this.#refuse('The index is longer than may be');
+    if (indexBytes > MAX_INDEX || !(at >= HEAD && at + indexBytes <= length)) this.#refuse('The index is longer than may be');
     this.#head = head;
-    const whole = HEAD + indexBytes <= this.bytesTotal;
-    const index = whole ? await this.#bytes(HEAD, indexBytes, signal) : [];
+    const whole = at + indexBytes <= this.bytesTotal;
+    const index = whole ? await this.#bytes(at, indexBytes, signal) : [];
     if (index.length !== indexBytes) this.#refuse('The file is cut short inside its index');
     if (crc32(index) !== view.getUint32(24, true)) this.#refuse('The index is damaged: its checksum differs');
-    this.#index(index, HEAD + indexBytes, length);
+    this.#index(index, at, length);
   }
 
-  #index(index, begin, length) {
+  #index(index, at, length) {
     const view = new DataView(index.buffer, index.byteOffset, index.byteLength);
     const jsonBytes = index.length >= 8 ? view.getUint32(0, true) : NO_PALETTE;
     if (jsonBytes % 4 || jsonBytes > index.length - 8) this.#refuse('The index does not hold its own description');
@@ -265,8 +271,9 @@ export class SceneFile {
       this.#refuse(`The index is no table of ${count} sections`);
     }
     this.meta = this.#checkedMeta(json);
-    for (let id = 0; id < count; id++) this.sections.push(this.#entry(view, table + id * ENTRY, id, begin, length));
-    const order = this.sections.map((s) => s).sort((a, b) => a.offset - b.offset);
+    for (let id = 0; id < count; id++) this.sections.push(this.#entry(view, table + id * ENTRY, id, length));
+    const order = [...this.sections, { id: 'index', offset: at, stored: index.length }];
+    order.sort((a, b) => a.offset - b.offset);
     for (let i = 1; i < order.length; i++) {
       if (order[i].offset < order[i - 1].offset + order[i - 1].stored) {
         this.#refuse(`Sections ${order[i - 1].id} and ${order[i].id} overlap`);
@@ -297,7 +304,7 @@ export class SceneFile {
     this.meta.gaussians = this.pages.reduce((n, p) => n + p.count, 0);
   }
 
-  #entry(view, at, id, begin, length) {
+  #entry(view, at, id, length) {
     const u32 = (o) => view.getUint32(at + o, true);
     const kind = String.fromCharCode(...[0, 1, 2, 3].map((i) => view.getUint8(at + i)));
     const [offset, stored, bytes] = [long(view, at + 8), u32(16), u32(20)];
@@ -307,7 +314,7 @@ export class SceneFile {
     Object.assign(section, { to: view.getFloat64(at + 48, true), palette: u32(56) === NO_PALETTE ? -1 : u32(56) });
     section.missing = offset + stored > this.bytesTotal;
     const refuse = (what, remedy) => this.#refuse(`Section ${id} (${kind.replace(/[^ -~]/g, '?')}) ${what}`, remedy);
-    if (!(offset >= begin && offset + stored <= length)) refuse('lies outside the file');
+    if (!(offset >= HEAD && offset + stored <= length)) refuse('lies outside the file');
     if (!['PAGE', 'PALT', 'POST', 'MASK'].includes(kind)) {
       if (section.flags & 1) refuse('is of a kind that this player does not know', 'Use a newer player.');
       return section;
@@ -380,6 +387,7 @@ export class SceneFile {
       box,
       view: look(j.view) ? j.view : null,
       cameras,
+      missing: list(j.missing).filter((span) => numbers(span, 2) && span[0] < span[1]),
       near: nears.length ? Math.min(...nears) : NEAR,
       path: list(j.path)
         .filter((k) => look(k) && number(k.at))

@@ -3,7 +3,7 @@
 use crate::body::Body;
 use hyper::body::Bytes;
 use splat4d::{Error, Result};
-use std::fs::File;
+use std::fs::{File, Metadata};
 use std::io;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -81,8 +81,7 @@ impl Scene {
                 if !meta.is_file() {
                     return Err(Error::input("is not a file").at(path.display()).remedy("Name a .splat4d file."));
                 }
-                let changed = meta.modified().ok().and_then(|t| t.duration_since(UNIX_EPOCH).ok()).unwrap_or_default();
-                let etag = format!("\"f{:x}-{:x}\"", changed.as_nanos(), meta.len());
+                let etag = file_etag(&meta);
                 scene.push(Source::File(Arc::new(file)), meta.len(), etag);
             }
         }
@@ -114,7 +113,7 @@ impl Scene {
         let guard = self.versions.lock().unwrap_or_else(PoisonError::into_inner);
         let (count, versions) = &*guard;
         match number {
-            None => versions.last().cloned().ok_or(Missing::Never),
+            None => versions.last().map(Version::grown).ok_or(Missing::Never),
             Some(n) => versions.iter().find(|v| v.number == n).cloned().ok_or(if n < *count {
                 Missing::Gone
             } else {
@@ -124,7 +123,23 @@ impl Scene {
     }
 }
 
+/// A file's tag: another one after every write.
+fn file_etag(meta: &Metadata) -> String {
+    let changed = meta.modified().ok().and_then(|t| t.duration_since(UNIX_EPOCH).ok()).unwrap_or_default();
+    format!("\"f{:x}-{:x}\"", changed.as_nanos(), meta.len())
+}
+
 impl Version {
+    /// The same, as long as its file has become: one of an unfinished take is appended to while somebody plays it, and what
+    /// was there stays as it was.
+    fn grown(&self) -> Self {
+        let Source::File(file) = &self.source else { return self.clone() };
+        match file.metadata() {
+            Ok(meta) if meta.len() > self.length => Self { length: meta.len(), etag: file_etag(&meta), ..self.clone() },
+            _ => self.clone(),
+        }
+    }
+
     /// Bytes `start..end`. Must be called on the server's runtime.
     pub(crate) fn body(&self, start: u64, end: u64) -> Body {
         match &self.source {
@@ -206,6 +221,19 @@ mod tests {
             let error = Scene::new(Content::File(path.clone())).unwrap_err().to_string();
             assert!(error.contains(&path.display().to_string()), "{error}");
         }
+    }
+
+    #[test]
+    fn a_file_that_grows_is_as_long_as_it_has_become() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("growing");
+        std::fs::write(&path, [1, 2, 3]).unwrap();
+        let scene = Scene::new(Content::File(path.clone())).unwrap();
+        let before = scene.version(None).unwrap();
+        io::Write::write_all(&mut File::options().append(true).open(&path).unwrap(), &[4, 5]).unwrap();
+        let after = scene.version(None).unwrap();
+        assert_eq!((before.length, after.length, after.number), (3, 5, before.number));
+        assert_ne!(before.etag, after.etag);
     }
 
     #[test]

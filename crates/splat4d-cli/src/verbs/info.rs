@@ -16,11 +16,13 @@ use splat4d::math::sh::degree_of;
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{GEOMETRY, SH};
 use splat4d_train::capture::{Capture, Severity, Timing};
+use splat4d_train::event::Event;
 use splat4d_train::recipe::Recipe;
-use splat4d_train::run::chunks::ChunkPlan;
-use splat4d_train::run::{memory_estimate, open_capture};
+use splat4d_train::run::chunks::Outlook;
+use splat4d_train::run::{Stopwatch, memory_estimate, open_capture};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// Edges of the opacity histogram.
 const OPACITY_EDGES: [f64; 6] = [0.0, 0.005, 0.1, 0.5, 0.9, 1.0];
@@ -137,10 +139,11 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
     }
     let (first, last) = capture.time_range();
     let (times, sizes) = (capture.times(), sizes(&capture));
-    let plan = ChunkPlan::even(&capture, &recipe)?;
-    let memory = plan
-        .as_ref()
-        .map_or_else(|| memory_estimate(&capture, &recipe), |plan| chunked::memory_estimate(&capture, plan, &recipe));
+    let capture = Arc::new(capture);
+    let mut listen = |event: &Event| console.event(event);
+    let outlook = Outlook::new(&capture, &recipe, None, true, &Stopwatch::start(), &mut listen)?;
+    console.clear();
+    let memory = outlook.as_ref().map_or_else(|| memory_estimate(&capture, &recipe), |o| o.memory);
     let findings = capture.preflight();
     let fixed = capture.cameras.iter().filter(|c| c.fixed).count();
     let moving = capture.cameras.len() - fixed;
@@ -177,8 +180,8 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
     let points = capture.points.as_ref().map_or("none".into(), |p| grouped(p.points.len()));
     line(&mut text, "initial points", &points);
     line(&mut text, "memory", &format!("about {} with the default recipe", human_bytes(memory)));
-    if let Some(plan) = &plan {
-        line(&mut text, "training", &chunked::in_words(plan, &recipe));
+    if let Some(outlook) = &outlook {
+        line(&mut text, "training", &chunked::in_words(outlook));
     }
     let mut troubles = Vec::new();
     for finding in &findings {
@@ -194,7 +197,8 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
         "timing": format!("{:?}", capture.timing).to_lowercase(),
         "train": capture.train.len(), "held_out": capture.held.len(), "validation": capture.validation.len(),
         "held_out_cameras": held, "masks": masks, "points": capture.points.as_ref().map(|p| p.points.len()),
-        "memory_estimate": memory, "chunks": plan.as_ref().map(ChunkPlan::len),
+        "memory_estimate": memory, "chunks": outlook.as_ref().map(|o| o.plan.len()),
+        "training_seconds": outlook.as_ref().and_then(|o| o.seconds),
         "findings": findings.iter().map(|f| json!({"severity": format!("{:?}", f.severity).to_lowercase(),
             "what": f.what, "remedy": f.remedy})).collect::<Vec<_>>(),
     });

@@ -2,7 +2,7 @@
 
 use crate::chunked;
 use crate::console::Console;
-use crate::finish;
+use crate::{finish, interrupt};
 use splat4d_train::run::chunks::Chunked;
 use std::path::PathBuf;
 
@@ -27,5 +27,6 @@ pub(crate) struct Args {
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     args.measure.check()?;
-    chunked::join(&args.run, &Chunked::open(&args.run)?, args.no_eval, &args.measure, console)
+    let stop = interrupt::flag("stopping");
+    chunked::join(&args.run, &Chunked::open(&args.run)?, args.no_eval, &args.measure, &stop, console)
 }

@@ -12,9 +12,9 @@ use splat4d::{Error, ErrorKind};
 use splat4d_train::capture::{Capture, Severity, Timing};
 use splat4d_train::event::Event;
 use splat4d_train::recipe::{MotionName, Quality, Recipe};
-use splat4d_train::run::chunks::{ChunkPlan, Chunked};
+use splat4d_train::run::chunks::{Chunked, Outlook, look_ahead};
 use splat4d_train::run::{self, Outcome, Stopwatch, TrainOptions};
-use splat4d_train::run::{memory_estimate, open_capture};
+use splat4d_train::run::{memory_estimate, open_capture, open_frames};
 use splat4d_train::settings::{Knob, nearest};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -70,7 +70,7 @@ pub struct Args {
     output: Option<PathBuf>,
     /// Continue this run exactly where its newest checkpoint is
     #[arg(long, value_name = "RUN", conflicts_with_all = ["capture", "output", "motion", "minutes", "quality", "recipe", "set",
-        "downscale", "hold_out", "observe", "chunk_frames", "overlap", "chunk", "image_memory", "seed", "source", "iterations", "force"])]
+        "downscale", "hold_out", "observe", "chunk_frames", "overlap", "chunk", "image_memory", "memory_limit", "seed", "source", "iterations", "force"])]
     resume: Option<PathBuf>,
     /// Replace the run in the -o folder
     #[arg(long)]
@@ -111,7 +111,7 @@ pub struct Args {
     /// Learn a longer take in chunks of N frames [default: 60 where fixed cameras film more than 300 frames]
     #[arg(long, value_name = "N", help_heading = "Long takes")]
     chunk_frames: Option<usize>,
-    /// Frames that neighbouring chunks share, an even number [default: 8]
+    /// Frames that neighbouring chunks share, an even number [default: 16]
     #[arg(long, value_name = "N", help_heading = "Long takes")]
     overlap: Option<usize>,
     /// Do one part and end: shared, then even chunks by their number, then odd ones; or all, beside other workers on the same
@@ -121,6 +121,9 @@ pub struct Args {
     /// Memory for decoded pictures [default: 1GiB]
     #[arg(long, value_name = "SIZE", value_parser = parse_bytes, help_heading = "What is read")]
     image_memory: Option<u64>,
+    /// Most memory that training may take: a long take is cut into as short chunks of as few Gaussians as that asks for
+    #[arg(long, value_name = "SIZE", value_parser = parse_bytes, help_heading = "What is read")]
+    memory_limit: Option<u64>,
     /// What draws while it trains; the rest is done by the CPU. Not part of the recipe: a run may go on on another device
     #[arg(long, value_enum, default_value = "cpu", help_heading = "What computes")]
     device: Device,
@@ -191,21 +194,40 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         recipe.refuse_idle(typed).map_err(|e| e.at("--set"))?;
         let source = args.capture.as_ref().or(args.source.as_ref()).expect("clap asks for a capture");
         console.phase("reading the capture", 0, 0);
-        let capture = open_capture(source, &recipe)?;
+        // Of a long take no more is listed than tells that it is one.
+        let capture = open_frames(source, &recipe, look_ahead(&recipe))?;
         // A take that is not told to be cut keeps to its minutes at once.
         let at_once = args.minutes.is_some() && recipe.chunks.frames == 0;
-        let plan = if at_once { None } else { ChunkPlan::even(&capture, &recipe)? };
-        if let Some(plan) = plan {
-            chunked::check(args.minutes)?;
-            let begun = args.output.as_ref().filter(|run| Chunked::is(run) && !args.force);
+        let begun = args.output.as_ref().filter(|run| Chunked::is(run) && !args.force);
+        // Steps that were fitted to minutes are those of the worker that began.
+        let (recipe, minutes) = match begun.filter(|_| args.minutes.is_some() && !at_once) {
+            None => (recipe, args.minutes),
+            Some(run) => {
+                let steps = Chunked::open(run)?.recipe().run.iterations;
+                (recipe.unresolved().with(|r| r.run.iterations = steps), None)
+            }
+        };
+        let mut capture = Arc::new(capture);
+        let outlook = match at_once {
+            true => None,
+            false => Outlook::new(&capture, &recipe, minutes, false, &clock, &mut |event| console.event(event))?,
+        };
+        console.clear();
+        if let Some(outlook) = outlook {
             let run = begun.map_or_else(|| place(args, &capture, console), |run| Ok(run.clone()))?;
-            describe(&capture, &recipe, console);
-            console.say(&chunked::in_words(&plan, &recipe));
+            describe(&capture, outlook.memory, console);
+            console.say(&chunked::in_words(&outlook));
             files::make_folder(&run)?;
+            if begun.is_none() {
+                files::write(&run.join("cameras.json"), &serde_json::to_vec(&cameras_json(&once(&capture)))?)?;
+            }
             let watch = watch(&capture.name);
-            let begun = Chunked::begin(&Arc::new(capture), &recipe, &run, &mut |event| listen(event, &watch))?;
+            let begun = Chunked::begin(&capture, &outlook.recipe, &run, &mut |event| listen(event, &watch))?;
             let chunked = begun.expect("a take that has a plan is learnt by it");
             return in_chunks(args, &run, &chunked, clock, &stop, &watch, console);
+        }
+        if capture.frames.len() < capture.take.pictures {
+            capture = Arc::new(open_capture(source, &recipe)?);
         }
         if args.chunk.is_some() {
             return Err(Error::input("the take fits one chunk, and has no parts")
@@ -214,7 +236,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
                 .into());
         }
         let run = place(args, &capture, console)?;
-        describe(&capture, &recipe, console);
+        describe(&capture, memory_estimate(&capture, &recipe), console);
         files::make_folder(&run)?;
         let cameras = serde_json::to_vec(&cameras_json(&capture))?;
         files::write(&run.join("cameras.json"), &cameras)?;
@@ -228,7 +250,6 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             own_loss: None,
             snapshots: snapshots(&watch),
         };
-        let capture = Arc::new(capture);
         let trained = run::train(capture, recipe, &run, &options, &stop, &mut |event| listen(event, &watch));
         if trained.is_err() {
             run_folder::clear_unbegun(&run)?;
@@ -278,7 +299,8 @@ fn in_chunks(
         snapshots: watch.is_on().then_some(SNAPSHOT_INTERVAL),
         ..TrainOptions::default()
     };
-    let outcome = chunked::work(chunked, args.chunk.unwrap_or(Wanted::All), &options, stop, &mut |event| {
+    let wanted = args.chunk.unwrap_or(Wanted::All);
+    let outcome = chunked::work(run, chunked, wanted, &options, stop, console, &mut |event| {
         watch.hear(event);
         console.event(event);
     });
@@ -291,7 +313,7 @@ fn in_chunks(
     match args.chunk {
         Some(_) => console.emit(&json!({"type": "done", "run": run})),
         None => {
-            chunked::join(run, chunked, args.no_eval, &args.measure, console)?;
+            chunked::join(run, chunked, args.no_eval, &args.measure, stop, console)?;
             console.emit(&json!({"type": "done", "run": run}));
         }
     }
@@ -325,6 +347,7 @@ fn recipe(args: &Args) -> anyhow::Result<Recipe> {
     set("chunks.frames", args.chunk_frames.map(|v| v.to_string()))?;
     set("chunks.overlap", args.overlap.map(|v| v.to_string()))?;
     set("image_memory", args.image_memory.map(|v| v.to_string()))?;
+    set("memory_limit", args.memory_limit.map(|v| v.to_string()))?;
     set("iterations", args.iterations.map(|v| v.to_string()))?;
     set("max_cap", args.max_cap.map(|v| v.to_string()))?;
     set("sh_degree", args.sh_degree.map(|v| v.to_string()))?;
@@ -357,28 +380,42 @@ fn place(args: &Args, capture: &Capture, console: &Console) -> anyhow::Result<Pa
     Ok(run)
 }
 
-fn describe(capture: &Capture, recipe: &Recipe, console: &Console) {
-    let (first, last) = capture.time_range();
+/// Every fixed camera once: a long take has too many pictures to name them all.
+fn once(capture: &Capture) -> Capture {
+    let mut seen = vec![false; capture.cameras.len()];
+    let mut new = |i: &usize| {
+        let camera = capture.frames[*i].camera;
+        !(capture.cameras[camera].fixed && std::mem::replace(&mut seen[camera], true))
+    };
+    let train = capture.train.iter().copied().filter(&mut new).collect();
+    let held = capture.held.iter().copied().filter(&mut new).collect();
+    Capture { train, held, ..capture.clone() }
+}
+
+fn describe(capture: &Capture, memory: u64, console: &Console) {
+    let in_part = capture.frames.len() < capture.take.pictures;
+    let (first, last) = match capture.time_range() {
+        (first, _) if in_part => (first, first + (capture.take.frames.len() as f64 - 1.0) / capture.fps),
+        whole => whole,
+    };
     let size = capture.frames.first().map_or([0, 0], |f| [f.view.width, f.view.height]);
     let span = match capture.timing {
         Timing::Moment => "at one moment".to_owned(),
         _ => format!("over {:.2} s", last - first),
     };
     console.say(&format!(
-        "{}: {} camera{}, {} pictures of {}x{} {span}; {} train, {} held out",
+        "{}: {} camera{}, {} pictures of {}x{} {span}{}",
         capture.name,
         capture.cameras.len(),
         if capture.cameras.len() == 1 { "" } else { "s" },
-        capture.frames.len(),
+        capture.take.pictures,
         size[0],
         size[1],
-        capture.train.len(),
-        capture.held.len()
+        match in_part {
+            true => String::new(),
+            false => format!("; {} train, {} held out", capture.train.len(), capture.held.len()),
+        }
     ));
-    let memory = match ChunkPlan::even(capture, recipe) {
-        Ok(Some(plan)) => chunked::memory_estimate(capture, &plan, recipe),
-        _ => memory_estimate(capture, recipe),
-    };
     console.detail(&format!("memory estimate: {}", human_bytes(memory)));
     for finding in capture.preflight() {
         let text = format!("{} {}", finding.what, finding.remedy).trim_end().to_owned();

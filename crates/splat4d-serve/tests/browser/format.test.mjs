@@ -7,7 +7,7 @@ import { at, gaussian } from '../../player/motion.js';
 import { SceneError } from '../../player/errors.js';
 import { SceneFile } from '../../player/scene-file.js';
 import { moved } from './reference.mjs';
-import { keyMasks, layout, random, sample } from './sample.mjs';
+import { grown, keyMasks, layout, random, sample } from './sample.mjs';
 import { serve } from './server.mjs';
 
 // Loaded by motion.js; a worker is a classic script and exports nothing.
@@ -191,6 +191,21 @@ test('a file that was cut short is complete up to there', async () => {
   await assert.rejects(file.page(whole.pages[3].id), /cut short/);
 });
 
+test('a file that grows has its index behind its sections, and reads like a finished one', async () => {
+  const { bytes } = sample({ masks: 0.5 }),
+    growing = grown(bytes);
+  const [a, b] = [await SceneFile.open(bytes), await SceneFile.open(growing)];
+  assert.deepEqual([a.growing, b.growing, b.truncated], [false, true, false]);
+  assert.deepEqual(a.meta, b.meta);
+  for (const { id } of a.pages) assert.deepEqual(await a.page(id), await b.page(id));
+  // What was added since the header was written is not looked at, and what is not there yet is told.
+  const more = await SceneFile.open(Buffer.concat([growing, Buffer.alloc(99, 7)]));
+  assert.equal(more.pages.length, a.pages.length);
+  const gaps = await SceneFile.open(grown(sample({ json: { missing: [[2, 3], [5, 4]] } }).bytes));
+  assert.deepEqual(gaps.meta.missing, [[2, 3]]);
+  await assert.rejects(SceneFile.open(growing.subarray(0, growing.length - 1)), /inside its index/);
+});
+
 test('hostile and foreign files are refused in words', async () => {
   const base = sample().json,
     PAGE = (more) => ({
@@ -215,7 +230,7 @@ test('hostile and foreign files are refused in words', async () => {
     (e) =>
       size === 8 ? e.writeBigUInt64LE(value, at) : size === 2 ? e.writeUInt16LE(value, at) : e.writeUInt32LE(value, at);
   const cases = [
-    ['version', layout(base, [PAGE()], { major: 2 })],
+    ['version', layout(base, [PAGE()], { major: 3 })],
     ['no valid "clip"', layout({ ...base, clip: [3, 2] }, [])],
     ['no valid "clip"', layout(null, [])],
     ['no valid "fps"', layout({ ...base, fps: 0 }, [])],
@@ -223,7 +238,10 @@ test('hostile and foreign files are refused in words', async () => {
     ['no valid "background"', layout({ ...base, background: 'red' }, [])],
     ['not know', layout(base, [{ kind: 'NEWS', data: Buffer.alloc(4), flags: 1 }])],
     ['outside', layout(base, [PAGE({ patch: patch(8, 1n << 62n, 8) })])],
-    ['outside', layout(base, [PAGE({ patch: patch(8, 64n, 8) })])],
+    ['outside', layout(base, [PAGE({ patch: patch(8, 63n, 8) })])],
+    ['overlap', layout(base, [PAGE({ patch: patch(8, 64n, 8) })])],
+    ['index is longer', grown(layout(base, [PAGE()]), { at: 1n << 60n })],
+    ['index is longer', grown(layout(base, [PAGE()]), { at: 12n })],
     ['overlap', layout(base, [PAGE(), PAGE({ patch: (e) => e.writeBigUInt64LE(e.readBigUInt64LE(8) - 64n, 8) })])],
     ['cannot hold', layout(base, [PAGE({ codec: 1, patch: patch(20, 4e9) })])],
     ['cannot hold', layout(base, [PAGE({ patch: patch(20, 64) })])],

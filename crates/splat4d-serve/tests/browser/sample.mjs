@@ -188,6 +188,18 @@ export function layout(json, sections, { major = 1, minor = 0 } = {}) {
   return Buffer.concat([head, index, ...bodies]);
 }
 
+/// A finished file as one that grows: its index behind its sections, or where `at` says.
+export function grown(bytes, { at } = {}) {
+  const size = bytes.readUInt32LE(12),
+    out = Buffer.concat([bytes, bytes.subarray(64, 64 + size)]);
+  out.writeUInt16LE(2, 8);
+  out.writeUInt16LE(0, 10);
+  out.writeBigUInt64LE(BigInt(out.length), 16);
+  out.writeBigUInt64LE(at ?? BigInt(bytes.length), 28);
+  out.writeUInt32LE(crc(out.subarray(0, 60)), 60);
+  return out;
+}
+
 /// A 1x1 PNG.
 const POSTER = Buffer.from(
   'iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJggg==',

@@ -1,6 +1,6 @@
 //! From what the files say to a checked capture: poses, sizes, files, duplicates, split, clock.
 
-use super::{Capture, CaptureOptions, FlowFile, Frame, HoldOut, RawFrame, Rig, Split, Take, Timing};
+use super::{Capture, CaptureOptions, Extent, FlowFile, Frame, HoldOut, RawFrame, Rig, Split, Take, Timing};
 use super::{options, picture, pose};
 use splat4d::math::se3::{norm, normalize, sub};
 use splat4d::scene::{Camera, Lens, Time};
@@ -28,7 +28,13 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
     for frame in &mut take.frames {
         check_frame(frame, &take.cameras[frame.camera], options)?;
     }
-    drop_unused_cameras(&mut take);
+    let in_part = take.take != Extent::default();
+    if !in_part {
+        drop_unused_cameras(&mut take);
+        let mut all = Extent::default();
+        take.frames.iter().for_each(|f| all.add(f.index..f.index + 1));
+        take.take = all;
+    }
     let cameras = rigs(&take);
     check_poses(&mut take, &cameras)?;
     check_duplicates(&mut take, &cameras).map_err(located)?;
@@ -51,6 +57,7 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
         kind: take.kind,
         cameras,
         frames,
+        take: take.take,
         held,
         train,
         validation,
@@ -66,6 +73,11 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
     };
     let near = near(&capture, options.near);
     capture.frames.iter_mut().for_each(|f| f.view.near = near);
+    // Last: all else is told by the whole take.
+    let frames = &capture.frames;
+    for all in [&mut capture.train, &mut capture.held, &mut capture.validation] {
+        all.retain(|&i| options.lists(frames[i].index));
+    }
     Ok(capture)
 }
 

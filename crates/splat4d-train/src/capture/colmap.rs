@@ -5,7 +5,7 @@
 //! fixed rig is to reconstruct one instant.
 
 use super::colmap_files::{self, Point, Registered};
-use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Split, Take, beside, rig, sequence};
+use super::{CaptureKind, CaptureOptions, Extent, PointCloud, RawFrame, Split, Take, beside, rig, sequence};
 use splat4d::math::{Se3, quat};
 use splat4d::scene::Camera;
 use splat4d::scene::time::DEFAULT_FPS;
@@ -61,6 +61,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         kind: CaptureKind::Colmap,
         cameras: order.cameras,
         frames,
+        take: Extent::default(),
         named: order.named,
         timing: order.timing,
         hold_out: None,

@@ -44,6 +44,7 @@ pub use store::{ImageStore, Picture, StoredPicture};
 use splat4d::Result;
 use splat4d::math::se3::{norm, sub};
 use splat4d::scene::{Camera, Time};
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 /// Which layout a capture was read from.
@@ -108,6 +109,24 @@ pub enum Split {
     Future,
 }
 
+/// How much there is of a take.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Extent {
+    /// The first frame number, and the one after the last.
+    pub frames: Range<usize>,
+    /// Pictures of all cameras.
+    pub pictures: usize,
+}
+
+impl Extent {
+    /// With one picture more for each of these frame numbers.
+    fn add(&mut self, frames: Range<usize>) {
+        let both = self.frames.start.min(frames.start)..self.frames.end.max(frames.end);
+        self.pictures += frames.len();
+        self.frames = if self.frames.is_empty() { frames } else { both };
+    }
+}
+
 /// A posed, timed set of pictures on disk.
 #[derive(Clone, Debug)]
 pub struct Capture {
@@ -119,8 +138,10 @@ pub struct Capture {
     pub kind: CaptureKind,
     /// The cameras; a moving camera is one entry that is not `fixed`.
     pub cameras: Vec<Rig>,
-    /// All pictures.
+    /// All pictures, or those that were asked for ([`CaptureOptions::frames`]).
     pub frames: Vec<Frame>,
+    /// The whole take, whatever of it is listed.
+    pub take: Extent,
     /// Indices of the frames held out to measure.
     pub held: Vec<usize>,
     /// Indices of the frames to train on.
@@ -157,6 +178,8 @@ struct Take {
     named: bool,
     timing: Timing,
     frames: Vec<RawFrame>,
+    /// The whole take, where the reader listed a part of it; empty: all is listed.
+    take: Extent,
     /// The data set's convention, where it is not told by the frames' splits.
     hold_out: Option<HoldOut>,
     fps: f64,

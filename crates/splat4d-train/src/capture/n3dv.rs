@@ -2,7 +2,7 @@
 
 use super::layout::{ffmpeg_command, videos};
 use super::points::read_ply;
-use super::{CaptureKind, CaptureOptions, RawFrame, Split, Take, Timing};
+use super::{CaptureKind, CaptureOptions, Extent, RawFrame, Split, Take, Timing};
 use super::{json, picture, pose, rig};
 use splat4d::format::npy::Npy;
 use splat4d::math::Se3;
@@ -71,6 +71,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         kind: CaptureKind::N3dv,
         cameras: folders.into_iter().map(|f| f.name).collect(),
         frames,
+        take: Extent::default(),
         named: true,
         timing: Timing::Told,
         hold_out: None,

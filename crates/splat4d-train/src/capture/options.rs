@@ -2,6 +2,7 @@
 
 use crate::settings::{Value, choices, settings};
 use splat4d::{Error, Result};
+use std::ops::Range;
 use std::str::FromStr;
 
 /// Which frames are kept from training and used to measure.
@@ -128,6 +129,9 @@ pub struct CaptureOptions {
     /// How near to a camera splats are drawn, as a share of the cameras' extent; less where the capture's points come
     /// nearer, and a quarter of it where it has none.
     pub near: f64,
+    /// Only pictures with these frame numbers are listed, so that memory does not grow with the take; empty: all. What they
+    /// are for (training, held out) is what it is in the whole take.
+    pub frames: Vec<Range<usize>>,
 }
 
 /// Most points an initial cloud keeps by default.
@@ -144,11 +148,17 @@ impl Default for CaptureOptions {
             unit_time_seconds: None,
             max_points: MAX_POINTS,
             near: NEAR,
+            frames: Vec::new(),
         }
     }
 }
 
 impl CaptureOptions {
+    /// Whether a picture with this frame number is to be listed.
+    pub(super) fn lists(&self, index: usize) -> bool {
+        self.frames.is_empty() || self.frames.iter().any(|f| f.contains(&index))
+    }
+
     /// An error for values that mean nothing: downscale 0, fps ≤ 0, a background outside 0 to 1.
     pub(super) fn check(&self) -> Result<()> {
         if self.downscale == 0 {

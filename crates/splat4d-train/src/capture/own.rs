@@ -2,7 +2,7 @@
 
 use super::json::{self, Node};
 use super::points::read_ply;
-use super::{CaptureKind, CaptureOptions, HoldOut, RawFrame, Split, Take, Timing, pose};
+use super::{CaptureKind, CaptureOptions, Extent, HoldOut, RawFrame, Split, Take, Timing, pose};
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::scene::{Camera, Intrinsics, Lens};
@@ -78,14 +78,19 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<T
     };
     super::options::check_rate("frame rate", fps)?;
     let mut cameras: Vec<String> = Vec::new();
-    let mut frames = Vec::new();
-    for node in top.get("cameras")?.list()? {
+    let (mut frames, mut take) = (Vec::new(), Extent::default());
+    let hold_out = top.opt("hold_out")?.map(|n| read_hold_out(&n)).transpose()?;
+    let nodes = top.get("cameras")?.list()?;
+    let in_part = in_part(top, &nodes, options.hold_out.as_ref().or(hold_out.as_ref()), options)?;
+    for node in nodes {
         let name = node.get("name")?.text()?.to_string();
         if cameras.contains(&name) {
             return Err(node.error(format!("the camera name \"{name:.80}\" is given twice")).remedy("Rename one."));
         }
-        let context = Context { root, top, opengl, fps, camera: cameras.len() };
-        read_camera(&context, &node, &mut frames).map_err(|e| e.at(format!("camera {name:.80}")))?;
+        let listed = in_part.then_some(options);
+        let context = Context { root, top, opengl, fps, camera: cameras.len(), listed };
+        let count = read_camera(&context, &node, &mut frames).map_err(|e| e.at(format!("camera {name:.80}")))?;
+        take.add(0..count);
         cameras.push(name);
     }
     Ok(Take {
@@ -94,9 +99,10 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<T
         kind: CaptureKind::Own,
         cameras,
         frames,
+        take: if in_part { take } else { Extent::default() },
         named: true,
         timing: Timing::Told,
-        hold_out: top.opt("hold_out")?.map(|n| read_hold_out(&n)).transpose()?,
+        hold_out,
         fps,
         points: top.opt("points")?.map(|n| read_ply(&root.join(n.text()?))).transpose()?,
         background: read_background(top)?,
@@ -104,6 +110,28 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<T
         warnings: Vec::new(),
         notes: Vec::new(),
     })
+}
+
+/// Whether the part that is wanted can be read by itself: of fixed cameras, which are held out as a whole or not at all.
+/// What else there is can only be told from the whole.
+fn in_part(top: &Node<'_>, nodes: &[Node<'_>], told: Option<&HoldOut>, options: &CaptureOptions) -> Result<bool> {
+    let by_camera = match told {
+        None => nodes.len() > 1,
+        Some(rule) => !matches!(rule, HoldOut::Every(_)),
+    };
+    if options.frames.is_empty() || !by_camera {
+        return Ok(false);
+    }
+    for node in nodes {
+        let one_by_one =
+            ["world_to_camera", "camera_to_world"].iter().any(|k| node.value[*k].pointer("/0/0/0").is_some());
+        let none = node.value["images"].as_array().is_some_and(Vec::is_empty)
+            || node.opt("frames")?.or(top.opt("frames")?).is_some_and(|n| *n.value == 0);
+        if one_by_one || none {
+            return Ok(false);
+        }
+    }
+    Ok(true)
 }
 
 fn read_background(top: &Node<'_>) -> Result<Option<[f32; 3]>> {
@@ -138,6 +166,8 @@ struct Context<'a> {
     opengl: bool,
     fps: f64,
     camera: usize,
+    /// What of the take is listed; none: all.
+    listed: Option<&'a CaptureOptions>,
 }
 
 impl Context<'_> {
@@ -164,7 +194,8 @@ impl Context<'_> {
     }
 }
 
-fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame>) -> Result<()> {
+/// Adds the frames of a camera that are listed; returns how many it has.
+fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame>) -> Result<usize> {
     node.only(CAMERA_KEYS)?;
     let number = |key: &str| node.get(key)?.number();
     let (width, height) = (node.get("width")?.count()?, node.get("height")?.count()?);
@@ -208,16 +239,27 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
             return Err(node.error(what).remedy("List one file per frame, or correct \"frames\"."));
         }
     }
-    let first = frames.len();
-    for index in 0..count.unwrap_or(usize::MAX) {
+    let (first, mut there) = (frames.len(), 0);
+    let most = if let Files::List(names) = &images { names.len() } else { usize::MAX };
+    for index in 0..count.unwrap_or(most) {
+        let listed = context.listed.is_none_or(|o| o.lists(index));
+        let ends = count.is_none() && matches!(images, Files::Pattern { .. }) && index > 0;
+        if !listed && !ends {
+            there = index + 1;
+            continue;
+        }
         let Some(image) = images.name(context.root, start, index) else { break };
         if !image.is_file() {
-            if count.is_none() && matches!(images, Files::Pattern { .. }) && index > 0 {
+            if ends {
                 break;
             }
             return Err(Error::input(format!("the picture of frame {index} is missing"))
                 .at(image.display())
                 .remedy("Restore the file, or correct \"images\", \"start\" and \"count\"."));
+        }
+        there = index + 1;
+        if !listed {
+            continue;
         }
         let pose = if moving { poses.get(index) } else { poses.first() };
         let Some(&cam_from_world) = pose else {
@@ -248,7 +290,7 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
     if let Some(last) = frames[first..].last_mut() {
         last.flow = None;
     }
-    Ok(())
+    Ok(there)
 }
 
 /// When a camera took its frames: seconds on its own clock, each later than the one before.

@@ -3,7 +3,7 @@
 
 use super::json::{self, Node};
 use super::points::read_ply;
-use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Split, Take, Timing, rig};
+use super::{CaptureKind, CaptureOptions, Extent, PointCloud, RawFrame, Split, Take, Timing, rig};
 use splat4d::format::npy::Npy;
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
@@ -40,6 +40,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         kind: CaptureKind::Panoptic,
         cameras: ids.iter().map(ToString::to_string).collect(),
         frames: found.into_iter().map(|(_, f)| f).collect(),
+        take: Extent::default(),
         named: true,
         timing: Timing::Told,
         hold_out: None,

@@ -10,7 +10,7 @@ mod frame;
 use super::json::{self, Node};
 use super::points::read_ply;
 use super::sequence::{self, Order};
-use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Sequence, Split, Take, colmap};
+use super::{CaptureKind, CaptureOptions, Extent, PointCloud, RawFrame, Sequence, Split, Take, colmap};
 use frame::Entry;
 use splat4d::Result;
 use splat4d::scene::Camera;
@@ -75,6 +75,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         kind: if several { CaptureKind::DNerf } else { CaptureKind::Nerfstudio },
         cameras,
         frames,
+        take: Extent::default(),
         named,
         timing,
         hold_out: None,

@@ -24,7 +24,7 @@ pub use clock::Stopwatch;
 pub use memory::{memory_estimate, peak_memory};
 #[cfg(test)]
 pub(crate) use open::OpenCapture;
-pub use open::{capture_options, open_capture, plan, training_frames};
+pub use open::{capture_options, open_capture, open_frames, plan, training_frames};
 pub(crate) use open::{learnable, scale};
 pub(crate) use points::with_found;
 pub(crate) use refine::{Refine, refine};

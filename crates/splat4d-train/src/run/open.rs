@@ -16,6 +16,7 @@ use crate::{Error, Result};
 use splat4d::device::{self, Device};
 use splat4d::layers::Scene;
 use splat4d::render::{Antialias, RenderConfig, Simd};
+use std::ops::Range;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -37,7 +38,12 @@ pub fn capture_options(recipe: &Recipe) -> Result<CaptureOptions> {
 
 /// Opens a capture as a recipe wants it: scale, split, and the part of the take that is used.
 pub fn open_capture(path: &Path, recipe: &Recipe) -> Result<Capture> {
-    let mut capture = Capture::open(path, &capture_options(recipe)?)?;
+    open_frames(path, recipe, Vec::new())
+}
+
+/// The same for a part of a long take: only pictures with these frame numbers are listed ([`CaptureOptions::frames`]).
+pub fn open_frames(path: &Path, recipe: &Recipe, frames: Vec<Range<usize>>) -> Result<Capture> {
+    let mut capture = Capture::open(path, &CaptureOptions { frames, ..capture_options(recipe)? })?;
     if recipe.loss.flow == 0.0 {
         // Nobody looks at it: it need not be decoded.
         capture.frames.iter_mut().for_each(|f| f.flow = None);

@@ -226,6 +226,19 @@ impl<'a> SafeTensors<'a> {
 pub fn write(tensors: &[Tensor<'_>], metadata: &BTreeMap<String, String>, out: &mut impl Write) -> Result<()> {
     let mut order: Vec<&Tensor<'_>> = tensors.iter().collect();
     order.sort_by(|a, b| b.dtype.size().cmp(&a.dtype.size()).then_with(|| a.name.cmp(&b.name)));
+    let head = header(order.iter().map(|t| (t.name.as_str(), t.dtype, t.shape.as_slice())), metadata);
+    let mut write = |bytes: &[u8]| out.write_all(bytes).map_err(|e| Error::io("the arrays could not be written", e));
+    write(&head)?;
+    order.iter().try_for_each(|t| write(&t.bytes))
+}
+
+/// Length and header of a file of these arrays (name, type, shape) in this order.
+///
+/// Panics: two arrays of one name, or one called `__metadata__`.
+pub(crate) fn header<'a>(
+    order: impl Iterator<Item = (&'a str, Dtype, &'a [usize])>,
+    metadata: &BTreeMap<String, String>,
+) -> Vec<u8> {
     let mut names = BTreeSet::from([METADATA]);
     let mut header = String::from("{");
     if !metadata.is_empty() {
@@ -233,13 +246,13 @@ pub fn write(tensors: &[Tensor<'_>], metadata: &BTreeMap<String, String>, out: &
         write!(header, "\"{METADATA}\":{text}").expect("a string grows");
     }
     let mut begin = 0;
-    for t in &order {
-        assert!(names.insert(&t.name), "two arrays of one file are called {}", t.name);
-        let end = begin + t.bytes.len();
+    for (name, dtype, shape) in order {
+        assert!(names.insert(name), "two arrays of one file are called {name}");
+        let end = begin + shape.iter().product::<usize>() * dtype.size();
         let comma = if header.len() > 1 { "," } else { "" };
-        let name = serde_json::to_string(&t.name).expect("a string is JSON");
-        let shape = serde_json::to_string(&t.shape).expect("a list of integers is JSON");
-        let dtype = t.dtype.name();
+        let name = serde_json::to_string(name).expect("a string is JSON");
+        let shape = serde_json::to_string(shape).expect("a list of integers is JSON");
+        let dtype = dtype.name();
         write!(header, "{comma}{name}:{{\"dtype\":\"{dtype}\",\"shape\":{shape},\"data_offsets\":[{begin},{end}]}}")
             .expect("a string grows");
         begin = end;
@@ -247,10 +260,7 @@ pub fn write(tensors: &[Tensor<'_>], metadata: &BTreeMap<String, String>, out: &
     header.push('}');
     let padding = header.len().next_multiple_of(ALIGN) - header.len();
     header.extend(std::iter::repeat_n(' ', padding));
-    let mut write = |bytes: &[u8]| out.write_all(bytes).map_err(|e| Error::io("the arrays could not be written", e));
-    write(&(header.len() as u64).to_le_bytes())?;
-    write(header.as_bytes())?;
-    order.iter().try_for_each(|t| write(&t.bytes))
+    [&(header.len() as u64).to_le_bytes(), header.as_bytes()].concat()
 }
 
 /// The header as it stands in the file; a list, so that a name that stands twice is seen.

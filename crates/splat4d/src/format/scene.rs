@@ -6,7 +6,7 @@
 //! `layers.0.quats` `[N,4]` wxyz, `layers.0.sh` `[N,K,3]`, `layers.0.velocities` `[N,3·order]` … Seconds and scene units.
 
 use super::arrays::MASKS;
-use super::safetensors::{SafeTensors, Tensor};
+use super::safetensors::{Dtype, SafeTensors, Tensor, header};
 use super::{params_to_arrays, tensors_to_loaded};
 use crate::layers::{ALWAYS, Head, Layer, Scene};
 use crate::math::Sim3;
@@ -30,37 +30,48 @@ pub const METADATA: &str = "splat4d";
 
 /// A scene's metadata as JSON.
 pub fn metadata(scene: &Scene<f32>) -> Value {
-    let layers: Vec<Value> = scene
-        .layers
-        .iter()
-        .map(|l| {
-            let mut layer = json!({
-                "name": l.name,
-                "rows": l.params.len(),
-                "sh_coefficients": l.params[SH].width() / 3,
-                "life": l.life.name(),
-                "motion": spec_to_json(&l.motion.spec()),
-            });
-            // JSON knows no infinity: a side that is open is null, and a layer that is always seen says nothing.
-            if l.span != ALWAYS {
-                layer["span"] = json!(l.span.map(|t| t.is_finite().then_some(t)));
-            }
-            if l.cross_fades() {
-                layer["cross_fade"] = json!(l.cross_fade);
-            }
-            if let Some(masks) = &l.masks {
-                layer["mask_times"] = json!(masks.times());
-            }
-            if !l.frame.is_identity() {
-                let Sim3 { scale, rotation, translation } = l.frame;
-                layer["frame"] = json!({ "scale": scale, "rotation": rotation, "translation": translation });
-            }
-            layer
-        })
-        .collect();
-    let framed = if scene.layers.iter().all(|l| l.frame.is_identity()) { UNFRAMED } else { FRAMED };
+    about(scene, scene.layers.iter().map(Stated::of).collect())
+}
+
+/// What a file's metadata states of a layer.
+struct Stated {
+    json: Value,
+    framed: bool,
+    fades: bool,
+}
+
+impl Stated {
+    fn of(l: &Layer<f32>) -> Self {
+        let mut layer = json!({
+            "name": l.name,
+            "rows": l.params.len(),
+            "sh_coefficients": l.params[SH].width() / 3,
+            "life": l.life.name(),
+            "motion": spec_to_json(&l.motion.spec()),
+        });
+        // JSON knows no infinity: a side that is open is null, and a layer that is always seen says nothing.
+        if l.span != ALWAYS {
+            layer["span"] = json!(l.span.map(|t| t.is_finite().then_some(t)));
+        }
+        if l.cross_fades() {
+            layer["cross_fade"] = json!(l.cross_fade);
+        }
+        if let Some(masks) = &l.masks {
+            layer["mask_times"] = json!(masks.times());
+        }
+        if !l.frame.is_identity() {
+            let Sim3 { scale, rotation, translation } = l.frame;
+            layer["frame"] = json!({ "scale": scale, "rotation": rotation, "translation": translation });
+        }
+        Self { json: layer, framed: !l.frame.is_identity(), fades: l.cross_fades() }
+    }
+}
+
+/// The metadata of a scene with these layers in place of its own.
+fn about(scene: &Scene<f32>, layers: Vec<Stated>) -> Value {
+    let framed = if layers.iter().any(|l| l.framed) { FRAMED } else { UNFRAMED };
     json!({
-        "version": if scene.layers.iter().any(Layer::cross_fades) { VERSION } else { framed },
+        "version": if layers.iter().any(|l| l.fades) { VERSION } else { framed },
         "units": "scene units, seconds, colours in [0, 1]",
         "axes": "OpenCV: x right, y down, z forward in the camera",
         "clip": scene.clip,
@@ -68,7 +79,7 @@ pub fn metadata(scene: &Scene<f32>) -> Value {
         "up": scene.up,
         "background": scene.background,
         "head": scene.head.name(),
-        "layers": layers,
+        "layers": layers.into_iter().map(|l| l.json).collect::<Vec<_>>(),
     })
 }
 
@@ -115,6 +126,44 @@ pub fn write(scene: &Scene<f32>, out: &mut impl Write) -> Result<()> {
     tensors.extend(masks(scene));
     let metadata = BTreeMap::from([(METADATA.to_owned(), metadata(scene).to_string())]);
     super::safetensors::write(&tensors, &metadata, out)
+}
+
+/// Writes a scene whose layers do not fit into memory together: the bytes of [`write()`]. `scene` has no layers; `layer` is
+/// asked for each of the `count` twice.
+///
+/// Errors: those of `layer`, the sink's. Panics: `scene` has layers; `layer` answers twice differently, or with masks.
+pub fn write_by_layer(
+    scene: &Scene<f32>,
+    count: usize,
+    layer: &mut dyn FnMut(usize) -> Result<Layer<f32>>,
+    out: &mut dyn Write,
+) -> Result<()> {
+    assert!(scene.layers.is_empty(), "the layers come one by one");
+    let arrays_of = |i: usize, l: &Layer<f32>| {
+        assert!(l.masks.is_none(), "layers with masks are written as a whole");
+        let mut all = params_to_arrays(&format!("layers.{i}."), &l.params);
+        all.sort_by(|a, b| a.name.cmp(&b.name));
+        all
+    };
+    let (mut stated, mut order) = (Vec::new(), Vec::new());
+    for i in 0..count {
+        let l = layer(i)?;
+        stated.push(Stated::of(&l));
+        order.push((format!("layers.{i}."), i, Vec::new()));
+        order[i].2.extend(arrays_of(i, &l).into_iter().map(|a| (a.name, a.shape)));
+    }
+    order.sort();
+    let metadata = BTreeMap::from([(METADATA.to_owned(), about(scene, stated).to_string())]);
+    let named = order.iter().flat_map(|(.., arrays)| arrays);
+    let head = header(named.map(|(name, shape)| (name.as_str(), Dtype::F32, shape.as_slice())), &metadata);
+    let mut put = |bytes: &[u8]| out.write_all(bytes).map_err(|e| Error::io("the arrays could not be written", e));
+    put(&head)?;
+    for (_, i, arrays) in &order {
+        let found = arrays_of(*i, &layer(*i)?);
+        assert!(found.iter().map(|a| &a.shape).eq(arrays.iter().map(|(_, shape)| shape)), "layer {i} became another");
+        found.iter().try_for_each(|a| put(a.tensor().bytes()))?;
+    }
+    Ok(())
 }
 
 /// Reads a scene. Errors: not a scene, a newer version, an unknown motion model, arrays that do not fit.
@@ -321,6 +370,21 @@ mod tests {
             up: [0.0, -1.0, 0.0],
             head: Head::Identity,
         }
+    }
+
+    #[test]
+    fn layer_by_layer_the_same_bytes_are_written() {
+        // More than ten, so that names do not sort like numbers.
+        let mut scene = scene();
+        scene.layers.iter_mut().for_each(|l| l.masks = None);
+        let some = scene.layers.clone();
+        scene.layers = some.iter().cycle().take(23).cloned().collect();
+        scene.layers[4].cross_fade = [0.1, 0.0];
+        let (mut whole, mut parts) = (Vec::new(), Vec::new());
+        write(&scene, &mut whole).unwrap();
+        let shell = Scene { layers: Vec::new(), ..scene.clone() };
+        write_by_layer(&shell, 23, &mut |i| Ok(scene.layers[i].clone()), &mut parts).unwrap();
+        assert!(whole == parts);
     }
 
     #[test]

@@ -21,7 +21,7 @@ use splat4d::scene::life::{CENTER, LOG_WIDTH};
 use splat4d::scene::params::{LOG_SCALE, QUAT};
 use splat4d::scene::{Camera, GEOMETRY, LIFE, LifeKind, Params, Planes, SH, Table, Time};
 use splat4d::{Error, Result};
-use splat4d_train::capture::{Capture, CaptureKind, Frame, ImageStore, Rig, Timing};
+use splat4d_train::capture::{Capture, CaptureKind, Extent, Frame, ImageStore, Rig, Timing};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::dataset::Dataset;
 use splat4d_train::run::peak_memory;
@@ -178,6 +178,7 @@ fn capture(pinned: &Pinned, root: &Path, pictures: &[PathBuf], count: usize) -> 
         kind: CaptureKind::Own,
         cameras: (0..pinned.views.len()).map(|i| Rig { name: format!("camera {i}"), fixed: true }).collect(),
         frames: (0..count).map(frame).collect(),
+        take: Extent { frames: 0..count, pictures: count },
         held: Vec::new(),
         train: (0..count).collect(),
         validation: Vec::new(),

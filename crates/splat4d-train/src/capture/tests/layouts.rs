@@ -288,6 +288,34 @@ fn camera_extent() {
     assert!(norm(sub(center, mean)) < 1e-9 && (radius - 1.1 * far).abs() < 1e-9);
 }
 
+#[test]
+fn a_part_of_a_take_is_what_the_whole_says_of_it() {
+    let part = 1..2;
+    for (sample, hold_out) in [
+        (samples::own(), None),
+        (samples::own(), Some("camera=cam02")),
+        (samples::own(), Some("every=3")),
+        (samples::dnerf(), None),
+    ] {
+        let options = || CaptureOptions { hold_out: hold_out.map(|t| t.parse().unwrap()), ..CaptureOptions::default() };
+        let whole = open_with(&sample, options());
+        let some = open_with(&sample, CaptureOptions { frames: vec![part.clone()], ..options() });
+        assert_eq!(whole.take, some.take);
+        assert_eq!((whole.take.pictures, whole.cameras.clone()), (whole.frames.len(), some.cameras.clone()));
+        let named = |c: &Capture, of: &[usize]| {
+            let frames = of.iter().map(|&i| &c.frames[i]).filter(|f| part.contains(&f.index));
+            frames.map(|f| format!("{f:?}")).collect::<Vec<_>>()
+        };
+        for split in [|c: &Capture| c.train.clone(), |c: &Capture| c.held.clone()] {
+            assert_eq!(named(&whole, &split(&whole)), named(&some, &split(&some)), "{hold_out:?}");
+            assert!(split(&some).iter().all(|&i| part.contains(&some.frames[i].index)));
+        }
+    }
+    // Of fixed cameras that are held out as a whole no more is listed than is asked for.
+    let own = open_with(&samples::own(), CaptureOptions { frames: vec![part], ..CaptureOptions::default() });
+    assert_eq!((own.frames.len(), own.take.pictures, own.take.frames), (3, 6, 0..2));
+}
+
 trait Center {
     fn center_of(&self) -> [f64; 3];
 }

@@ -7,7 +7,7 @@ use crate::Result;
 use crate::capture::{Capture, ImageStore};
 use crate::event::Event;
 use crate::recipe::Recipe;
-use crate::run::checkpoint::write_atomically;
+use crate::run::checkpoint::write_atomically_with;
 use crate::run::identity::recipe_print;
 use crate::run::start::{read_info, read_text};
 use crate::vision::view::spread;
@@ -16,6 +16,7 @@ use splat4d::layers::{Evaluation, Layer, Scene};
 use splat4d::render::{Antialias, Image, RenderConfig, Shot};
 use splat4d::scene::{Planes, Time};
 use splat4d::{Error, ErrorKind};
+use std::collections::BTreeMap;
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -67,43 +68,95 @@ impl Chunked {
                 .at(self.run.display())
                 .remedy(format!("Train these first: {}", missing.join(", "))));
         }
-        let capture = self.capture()?;
         let mut joined = Joined { chunks: self.plan.len(), iterations: 0, gaussians: 0, seconds: 0.0, peak_memory: 0 };
-        let mut whole = Scene::default();
         for chunk in 0..self.plan.len() {
             self.check_made(chunk)?;
-            let folder = self.folder(Part::Chunk(chunk));
-            let info = read_info(&folder)?;
+            let info = read_info(&self.folder(Part::Chunk(chunk)))?;
             joined.iterations += info["iteration"].as_u64().unwrap_or(0) as usize;
             joined.seconds += info["seconds"].as_f64().unwrap_or(0.0);
             joined.peak_memory = joined.peak_memory.max(info["peak_memory"].as_u64().unwrap_or(0));
-            let scene = read_scene(&folder.join(SCENE))?;
-            let window = |cut: usize| {
-                let [from, to] = seconds(&capture, &self.plan.shared(cut));
-                [from - 0.5 / scene.fps, to + 0.5 / scene.fps]
-            };
-            let before = (chunk > 0).then(|| window(chunk - 1));
-            let after = (chunk + 1 < self.plan.len()).then(|| window(chunk));
-            let clip = [if chunk == 0 { scene.clip[0] } else { whole.clip[0] }, scene.clip[1]];
-            let earlier = std::mem::take(&mut whole.layers);
-            whole = Scene { clip, layers: earlier, ..Scene { layers: Vec::new(), ..scene.clone() } };
-            for layer in scene.layers.into_iter().filter(|l| l.name != LAYER) {
-                whole.layers.push(Layer {
-                    name: format!("chunk {chunk:02}"),
-                    span: [before.map_or(f64::NEG_INFINITY, |w| w[0]), after.map_or(f64::INFINITY, |w| w[1])],
-                    cross_fade: [before, after].map(|w| w.map_or(0.0, |w| w[1] - w[0])),
-                    ..layer
-                });
-            }
         }
-        whole.layers.extend(shared::read(&self.folder(Part::Shared))?.still);
-        joined.gaussians = whole.len();
-        let mut bytes = Vec::new();
-        splat4d::format::scene::write(&whole, &mut bytes)?;
-        write_atomically(&self.run.join(SCENE), &bytes)?;
+        // A chunk at a time is in memory. Of each there is one layer that learnt.
+        let last = self.plan.len() - 1;
+        let still = shared::read(&self.folder(Part::Shared))?.still;
+        let whole = Scene { clip: self.shell()?.clip, layers: Vec::new(), ..self.alone(last)? };
+        let count = self.plan.len() + usize::from(still.is_some());
+        let mut gaussians = BTreeMap::new();
+        let mut layer = |i: usize| {
+            let layer = match (i <= last, &still) {
+                (false, Some(still)) => still.clone(),
+                _ => self.alone(i)?.layers.remove(0),
+            };
+            gaussians.insert(i, layer.params.len());
+            Ok(layer)
+        };
+        write_atomically_with(&self.run.join(SCENE), &mut |file| {
+            splat4d::format::scene::write_by_layer(&whole, count, &mut layer, file)
+        })?;
+        joined.gaussians = gaussians.values().sum();
         let done = [joined.iterations as f64, joined.gaussians as f64, joined.seconds];
-        self.write_info(&capture.name, Some(done))?;
+        let name = read_info(&self.run)?["capture_name"].as_str().unwrap_or_default().to_owned();
+        self.write_info(&name, Some(done))?;
         Ok(joined)
+    }
+
+    /// The whole take without what was learnt. Errors: the capture cannot be read.
+    pub fn shell(&self) -> Result<Scene<f32>> {
+        let [first, end] = self.plan.take;
+        let ends = self.capture(vec![first..first + 1, end - 1..end])?;
+        let background = ends.background.unwrap_or([0.0; 3]);
+        Ok(Scene { clip: seconds(&ends, &(first..end)), fps: ends.fps, up: ends.up, background, ..Scene::default() })
+    }
+
+    /// The seconds in which a cut's neighbours fade into each other.
+    fn fade(&self, cut: usize) -> Result<[f64; 2]> {
+        let shared = self.plan.shared(cut);
+        let capture = self.capture(vec![shared.clone()])?;
+        let [from, to] = seconds(&capture, &shared);
+        Ok([from - 0.5 / capture.fps, to + 0.5 / capture.fps])
+    }
+
+    /// A finished chunk as a scene of one layer, which is seen as it will be in the whole take; what all share is left out.
+    ///
+    /// Errors: files that cannot be read.
+    pub fn alone(&self, chunk: usize) -> Result<Scene<f32>> {
+        let path = self.folder(Part::Chunk(chunk)).join(SCENE);
+        let scene = read_scene(&path)?;
+        let before = (chunk > 0).then(|| self.fade(chunk - 1)).transpose()?;
+        let after = (chunk + 1 < self.plan.len()).then(|| self.fade(chunk)).transpose()?;
+        let layer = scene.layers.into_iter().find(|l| l.name != LAYER).ok_or_else(|| {
+            Error::input("the chunk has no layer of its own")
+                .at(path.display())
+                .remedy("Delete its folder, train it again")
+        })?;
+        let layer = Layer {
+            name: format!("chunk {chunk:02}"),
+            span: [before.map_or(f64::NEG_INFINITY, |w| w[0]), after.map_or(f64::INFINITY, |w| w[1])],
+            cross_fade: [before, after].map(|w| w.map_or(0.0, |w| w[1] - w[0])),
+            ..layer
+        };
+        Ok(Scene { layers: vec![layer], ..scene })
+    }
+
+    /// Some neighbouring chunks and what all share, as the whole take shows them. Errors: files that cannot be read.
+    pub fn some(&self, chunks: Range<usize>) -> Result<Scene<f32>> {
+        let mut whole = Scene::default();
+        for chunk in chunks {
+            let mut one = self.alone(chunk)?;
+            if !whole.layers.is_empty() {
+                one.clip[0] = whole.clip[0];
+            }
+            whole.layers.append(&mut one.layers);
+            one.layers = whole.layers;
+            whole = one;
+        }
+        whole.layers.extend(self.still()?);
+        Ok(whole)
+    }
+
+    /// What all chunks share; none: nothing stands still. Errors: the file cannot be read.
+    pub fn still(&self) -> Result<Option<Layer<f32>>> {
+        Ok(shared::read(&self.folder(Part::Shared))?.still)
     }
 
     /// Errors: a chunk that another version or another recipe made.
@@ -129,28 +182,13 @@ impl Chunked {
         Ok(())
     }
 
-    /// How well the chunks of a scene meet, by cameras that stand still: those that training never saw, where there are any.
-    /// `None`: there is no such camera. Errors: pictures that cannot be read.
-    pub fn seams(&self, scene: &Scene<f32>, listen: &mut dyn FnMut(&Event)) -> Result<Option<Seams>> {
-        let capture = Arc::new(self.capture()?);
-        let fixed = |i: &usize| capture.cameras[capture.frames[*i].camera].fixed;
-        let held_out = capture.held.iter().any(fixed);
-        let all = if held_out { &capture.held } else { &capture.train };
-        let mut cameras: Vec<usize> = all.iter().copied().filter(fixed).map(|i| capture.frames[i].camera).collect();
-        cameras.sort_unstable();
-        cameras.dedup();
+    /// How well chunks meet, by cameras that stand still: those that training never saw, where there are any. `None`: there
+    /// is no such camera. Errors: chunks or pictures that cannot be read.
+    pub fn seams(&self, listen: &mut dyn FnMut(&Event)) -> Result<Option<Seams>> {
         let antialias = if self.recipe.appearance.antialias { Antialias::On } else { Antialias::Off };
         let config = RenderConfig { antialias, ..RenderConfig::default() };
-        let mut look = Look {
-            store: ImageStore::new(capture.clone(), 0),
-            backend: device::cpu(config),
-            capture: &capture,
-            frames: all,
-            scene,
-        };
-        let chosen: Vec<usize> = spread(cameras.len(), CAMERAS).map(|k| cameras[k]).collect();
         let cuts: Vec<usize> = spread(self.plan.cuts.len(), MEASURED).collect();
-        let mut sums = [[0.0; 2]; 2];
+        let (mut sums, mut held_out) = ([[0.0; 2]; 2], false);
         for (done, &cut) in cuts.iter().enumerate() {
             listen(&Event::Phase { name: "how chunks meet".into(), done, total: cuts.len() });
             let seam = self.plan.shared(cut);
@@ -158,9 +196,25 @@ impl Chunked {
             let seam = seam.start - 1..seam.end + 1;
             let chunk = self.plan.frames(cut);
             let middle = (chunk.start + chunk.end - seam.len()) / 2;
-            for (sum, window) in sums.iter_mut().zip([seam.clone(), middle..middle + seam.len()]) {
-                for &camera in &chosen {
-                    let [total, pairs] = look.flicker(camera, window.clone())?;
+            let windows = [seam.clone(), middle..middle + seam.len()];
+            let capture = Arc::new(self.capture(windows.to_vec())?);
+            let fixed = |i: &usize| capture.cameras[capture.frames[*i].camera].fixed;
+            held_out = capture.held.iter().any(fixed);
+            let all = if held_out { &capture.held } else { &capture.train };
+            let mut cameras: Vec<usize> = all.iter().copied().filter(fixed).map(|i| capture.frames[i].camera).collect();
+            cameras.sort_unstable();
+            cameras.dedup();
+            let scene = self.some(cut..cut + 2)?;
+            let mut look = Look {
+                store: ImageStore::new(capture.clone(), 0),
+                backend: device::cpu(config),
+                capture: &capture,
+                frames: all,
+                scene: &scene,
+            };
+            for (sum, window) in sums.iter_mut().zip(windows) {
+                for k in spread(cameras.len(), CAMERAS) {
+                    let [total, pairs] = look.flicker(cameras[k], window.clone())?;
                     *sum = [sum[0] + total, sum[1] + pairs];
                 }
             }

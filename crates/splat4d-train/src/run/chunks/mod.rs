@@ -6,6 +6,7 @@
 //! who does which and when changes nothing. Source: methods of overlapping chunks in 4DGaussians' and STG's practice (50 to 60
 //! frames); the cross-fade and the order are ours.
 
+mod budget;
 mod claim;
 mod join;
 mod plan;
@@ -15,12 +16,13 @@ mod tests;
 mod tie;
 mod train;
 
+pub use budget::Outlook;
 pub use join::{Joined, Seams};
 pub use plan::ChunkPlan;
 
 use super::checkpoint::write_atomically;
 use super::identity;
-use super::open::{OpenCapture, learnable, open_capture};
+use super::open::{OpenCapture, learnable, open_frames};
 use super::session::{Outcome, TrainOptions};
 use super::start::{read_info, read_text};
 use crate::capture::Capture;
@@ -30,6 +32,7 @@ use crate::settings::settings;
 use crate::{Error, ErrorKind, Result};
 use claim::Claim;
 use serde_json::json;
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -43,6 +46,10 @@ const WHOLE: usize = 300;
 const POLL: Duration = Duration::from_secs(1);
 /// Folder of the chunks in a run.
 const FOLDER: &str = "chunks";
+/// Folder in it whose lock says who writes the playback file.
+const FILM: &str = "film";
+/// Time between two looks whether it may be written.
+const TURNS: Duration = Duration::from_millis(200);
 /// File of the plan in it.
 const PLAN: &str = "plan.json";
 /// File of a finished run.
@@ -58,9 +65,9 @@ settings! {
         /// nothing is asked for that chunks cannot have, else the take is learnt at once. Iterations are those of a chunk.
         frames: usize = 0 => any().unit("frames");
         /// Frames that neighbouring chunks share, in which they fade into each other; an even number.
-        overlap: usize = 8 => any().unit("frames");
+        overlap: usize = 16 => any().unit("frames");
         /// Weight of the difference (L1) between an odd chunk's pictures and its neighbours' where they overlap.
-        consistency: f64 = 0.1;
+        consistency: f64 = 2.0;
     }
 }
 
@@ -82,6 +89,9 @@ impl std::fmt::Display for Part {
     }
 }
 
+/// The right to write what workers share; given back when it is dropped.
+pub struct Turn(#[expect(dead_code, reason = "it is held, not looked at")] Claim);
+
 /// A run of a long take.
 pub struct Chunked {
     run: PathBuf,
@@ -102,16 +112,19 @@ impl Chunked {
     ) -> Result<Option<Self>> {
         let Some(even) = ChunkPlan::even(capture, recipe)? else { return Ok(None) };
         let mut listen = listen;
-        let opened = OpenCapture::new(capture.clone(), recipe)?;
-        let recipe =
-            if recipe.run.motion.is_auto() { opened.choose(recipe.clone(), &mut listen)? } else { recipe.clone() };
+        // What is looked at before the first step is the take's beginning, however much of it the caller has listed.
+        let first = Arc::new(beginning(capture, &even));
+        let recipe = match recipe.run.motion.is_auto() {
+            true => OpenCapture::new(first.clone(), recipe)?.choose(recipe.clone(), &mut listen)?,
+            false => recipe.clone(),
+        };
         recipe.check()?;
         check(&recipe)?;
         let recipe = recipe.resolve();
         let stated = ChunkPlan {
             version: env!("CARGO_PKG_VERSION").into(),
             recipe: identity::recipe_print(&recipe, ""),
-            capture: identity::fingerprint(capture),
+            capture: format!("{}-{}-{}", identity::fingerprint(&first), even.take[0], even.take[1]),
             ..even
         };
         if Self::is(run) {
@@ -119,8 +132,8 @@ impl Chunked {
             begun.plan.check_same(&stated).map_err(|e| e.at(run.display()))?;
             return Ok(Some(begun));
         }
-        let plan = stated.at_rest(&opened, listen)?;
         let source = std::fs::canonicalize(&capture.root).unwrap_or_else(|_| capture.root.clone());
+        let plan = stated.at_rest(&|frames| open_frames(&source, &recipe, vec![frames]), listen)?;
         write_atomically(&run.join("recipe.toml"), recipe.to_toml().as_bytes())?;
         let begun = Self { run: run.to_owned(), source, recipe, plan };
         begun.write_info(&capture.name, None)?;
@@ -156,15 +169,28 @@ impl Chunked {
         Ok(Self { run: run.to_owned(), source, recipe, plan })
     }
 
+    /// The recipe that its chunks were planned for.
+    pub fn recipe(&self) -> &Recipe {
+        &self.recipe
+    }
+
     /// How it is cut.
     pub fn plan(&self) -> &ChunkPlan {
         &self.plan
     }
 
-    /// All parts, in an order in which one worker can do them.
+    /// All parts, in an order in which one worker can do them: an odd chunk as soon as both its neighbours are there, so that
+    /// what is finished has few gaps.
     pub fn parts(&self) -> Vec<Part> {
-        let chunks = |odd: usize| (odd..self.plan.len()).step_by(2).map(Part::Chunk);
-        std::iter::once(Part::Shared).chain(chunks(0)).chain(chunks(1)).collect()
+        let count = self.plan.len();
+        let chunks = (0..count).map(|k| match k {
+            0 => 0,
+            // 2, 1, 4, 3 ...; of an even number the last one has no neighbour behind it.
+            k if k % 2 == 1 && k + 1 < count => k + 1,
+            k if k % 2 == 1 => k,
+            k => k - 1,
+        });
+        std::iter::once(Part::Shared).chain(chunks.map(Part::Chunk)).collect()
     }
 
     /// The folder of a part.
@@ -234,11 +260,41 @@ impl Chunked {
         }
     }
 
-    /// Does whatever there is to do until all is done, beside any number of other workers.
+    /// Waits for the right to write the playback file, which workers append to one at a time.
+    ///
+    /// Errors: the folder cannot be written; `stop` is set.
+    pub fn turn(&self, stop: &AtomicBool) -> Result<Turn> {
+        loop {
+            if let Ok(claim) = Claim::new(&self.run.join(FOLDER).join(FILM))? {
+                return Ok(Turn(claim));
+            }
+            if stop.load(Ordering::Relaxed) {
+                return Err(Error::new(
+                    ErrorKind::Interrupted,
+                    "stopped while another worker writes the playback file",
+                )
+                .remedy("The same command goes on"));
+            }
+            std::thread::sleep(TURNS);
+        }
+    }
+
+    /// What a finished part is known by: its name and a fingerprint of its file. Errors: the file cannot be read.
+    pub fn print(&self, part: Part) -> Result<String> {
+        let file = if part == Part::Shared { shared::FILE } else { SCENE };
+        let bytes = shared::read_file(&self.folder(part).join(file))?;
+        Ok(format!("{part} {}", identity::file_print(&bytes)))
+    }
+
+    /// Does whatever there is to do until all is done, beside any number of other workers. `finished` hears of every part
+    /// that this worker has finished.
+    ///
+    /// Errors: those of training, and of `finished`.
     pub fn work_all(
         &self,
         options: &TrainOptions,
         stop: &AtomicBool,
+        finished: &mut dyn FnMut() -> Result<()>,
         listen: &mut dyn FnMut(&Event),
     ) -> Result<Option<Outcome>> {
         let mut listen = listen;
@@ -249,12 +305,14 @@ impl Chunked {
             }
             let mut busy = false;
             for part in open.into_iter().filter(|p| self.waits_for(*p).is_empty()) {
-                let Ok(_claim) = Claim::new(&self.folder(part))? else { continue };
+                let Ok(claim) = Claim::new(&self.folder(part))? else { continue };
                 busy = true;
                 let outcome = self.claimed(part, options, stop, &mut listen)?;
                 if outcome.as_ref().is_some_and(|o| o.interrupted) {
                     return Ok(outcome);
                 }
+                drop(claim);
+                finished()?;
                 // What was waited for may be there now.
                 break;
             }
@@ -291,9 +349,9 @@ impl Chunked {
         Ok(outcome)
     }
 
-    /// The whole take as the recipe opens it.
-    fn capture(&self) -> Result<Capture> {
-        open_capture(&self.source, &self.recipe)
+    /// The pictures of some frames of the take, as the recipe opens them.
+    fn capture(&self, frames: Vec<Range<usize>>) -> Result<Capture> {
+        open_frames(&self.source, &self.recipe, frames)
             .map_err(|e| e.remedy("The run needs its capture where it was when it was begun"))
     }
 
@@ -318,6 +376,20 @@ impl Chunked {
         let text = serde_json::to_string_pretty(&info).expect("plain data is JSON");
         write_atomically(&self.run.join("run.json"), text.as_bytes())
     }
+}
+
+/// The first part of a take, which is as long for whoever has listed how much of it.
+fn beginning(capture: &Capture, plan: &ChunkPlan) -> Capture {
+    let end = plan.take[0] + WHOLE;
+    let train = capture.train.iter().copied().filter(|&i| capture.frames[i].index < end).collect();
+    Capture { train, ..capture.clone() }
+}
+
+/// The frames of a capture to look at first: with them it can be told whether it is a long take.
+pub fn look_ahead(recipe: &Recipe) -> Vec<Range<usize>> {
+    let first = recipe.capture.first_frame;
+    let look = first..first.saturating_add(recipe.chunks.frames.max(WHOLE)).saturating_add(1);
+    vec![look]
 }
 
 /// Errors: what a recipe asks for that chunks cannot have together.

@@ -5,7 +5,7 @@ use crate::capture::{Capture, ImageStore};
 use crate::event::Event;
 use crate::methods::program_of;
 use crate::recipe::Recipe;
-use crate::run::open::{OpenCapture, plan};
+use crate::run::open::plan;
 use crate::{Error, Result};
 use splat4d::scene::Planes;
 use std::collections::BTreeMap;
@@ -38,9 +38,13 @@ impl ChunkPlan {
     /// The plan with even cuts; `None`: the take is learnt at once. Errors: an overlap that does not fit.
     pub fn even(capture: &Capture, recipe: &Recipe) -> Result<Option<Self>> {
         let settings = recipe.chunks;
-        let frames: Vec<usize> = capture.train.iter().map(|&i| capture.frames[i].index).collect();
-        let (Some(&first), Some(&last)) = (frames.iter().min(), frames.iter().max()) else { return Ok(None) };
-        let (take, count) = ([first, last + 1], last + 1 - first);
+        if capture.train.is_empty() {
+            return Ok(None);
+        }
+        let first = recipe.capture.first_frame.max(capture.take.frames.start);
+        let most = if recipe.capture.max_frames == 0 { usize::MAX } else { recipe.capture.max_frames };
+        let end = recipe.capture.first_frame.saturating_add(most).min(capture.take.frames.end);
+        let (take, count) = ([first, end], end.saturating_sub(first));
         let fixed = capture.cameras.iter().filter(|c| c.fixed).count() > 1;
         // `auto` has yet to say.
         let moves = || program_of(recipe).map_or(true, |p| p.capabilities(&plan(capture, recipe)).moves);
@@ -67,15 +71,12 @@ impl ChunkPlan {
     }
 
     /// The plan with its cuts where least moves, as a few of the fixed cameras see it.
-    pub(super) fn at_rest(mut self, opened: &OpenCapture, listen: &mut dyn FnMut(&Event)) -> Result<Self> {
-        let capture = &opened.capture;
-        let mut seen: BTreeMap<usize, BTreeMap<usize, usize>> = BTreeMap::new();
-        for &i in capture.train.iter().filter(|&&i| capture.cameras[capture.frames[i].camera].fixed) {
-            seen.entry(capture.frames[i].camera).or_default().insert(capture.frames[i].index, i);
-        }
-        let cameras: Vec<BTreeMap<usize, usize>> = seen.into_values().collect();
-        let step = cameras.len().div_ceil(LOOKED_AT).max(1);
-        let store = Arc::new(ImageStore::new(capture.clone(), 0));
+    /// `open` lists some frames of the take.
+    pub(super) fn at_rest(
+        mut self,
+        open: &dyn Fn(Range<usize>) -> Result<Capture>,
+        listen: &mut dyn FnMut(&Event),
+    ) -> Result<Self> {
         let (half, chunks) = (self.overlap / 2, self.cuts.len() + 1);
         let reach = (MOVED * ((self.take[1] - self.take[0]) / chunks) as f64) as usize;
         for k in 0..self.cuts.len() {
@@ -83,6 +84,14 @@ impl ChunkPlan {
             let cut = self.cuts[k];
             let first = cut - reach - half;
             let mut change = vec![0.0; 2 * (reach + half)];
+            let capture = Arc::new(open(first..first + change.len())?);
+            let mut seen: BTreeMap<usize, BTreeMap<usize, usize>> = BTreeMap::new();
+            for &i in capture.train.iter().filter(|&&i| capture.cameras[capture.frames[i].camera].fixed) {
+                seen.entry(capture.frames[i].camera).or_default().insert(capture.frames[i].index, i);
+            }
+            let cameras: Vec<BTreeMap<usize, usize>> = seen.into_values().collect();
+            let step = cameras.len().div_ceil(LOOKED_AT).max(1);
+            let store = Arc::new(ImageStore::new(capture.clone(), 0));
             for camera in cameras.iter().step_by(step) {
                 let mut before: Option<Planes<f32>> = None;
                 for (j, change) in change.iter_mut().enumerate() {

@@ -68,14 +68,16 @@ pub(super) fn train(
     let folder = chunked.folder(super::Part::Shared);
     let source = folder.join(CAPTURE);
     if !source.join("capture.json").is_file() {
-        let capture = Arc::new(chunked.capture()?);
+        let looked_at = looked_at(chunked.plan.take);
+        let frames = looked_at.iter().flatten().map(|&n| n..n + 1).collect();
+        let capture = Arc::new(chunked.capture(frames)?);
         let opened = OpenCapture::new(capture, &chunked.recipe)?;
         if let Some(why) = nothing_still(&opened.capture) {
             listen(&Event::Warning { message: format!("chunks share no still layer: {why}") });
             write_still(&folder, Scene::default())?;
             return Ok(None);
         }
-        medians(&opened, &source, &mut listen)?;
+        medians(&opened, &looked_at, &source, &mut listen)?;
     }
     let recipe = of_medians(&chunked.recipe);
     let own = TrainOptions { device: options.device, clock: options.clock.clone(), ..TrainOptions::default() };
@@ -163,30 +165,39 @@ fn of_medians(recipe: &Recipe) -> Recipe {
     })
 }
 
+/// The frames of each part of a take whose median is taken.
+fn looked_at([first, end]: [usize; 2]) -> [Vec<usize>; PARTS] {
+    let border = |part: usize| first + part * (end - first) / PARTS;
+    std::array::from_fn(|part| {
+        let of = border(part)..border(part + 1).max(border(part) + 1).min(end);
+        spread(of.len(), MEDIAN_OF).map(|k| of.start + k).collect()
+    })
+}
+
 /// Writes the medians of all training cameras as a capture, and where next to nothing changes.
-fn medians(opened: &OpenCapture, folder: &Path, listen: &mut dyn FnMut(&Event)) -> Result<()> {
+fn medians(
+    opened: &OpenCapture,
+    looked_at: &[Vec<usize>; PARTS],
+    folder: &Path,
+    listen: &mut dyn FnMut(&Event),
+) -> Result<()> {
     let capture = &opened.capture;
     let (mut cameras, mut names) = (Vec::new(), Vec::new());
     for rig in 0..capture.cameras.len() {
         listen(&Event::Phase { name: "what stands still".into(), done: rig, total: capture.cameras.len() });
         // Frames of the data set stand in the order of `train`.
-        let mut frames: Vec<usize> =
+        let frames: Vec<usize> =
             (0..capture.train.len()).filter(|&i| capture.frames[capture.train[i]].camera == rig).collect();
         if frames.is_empty() {
             continue;
         }
-        frames.sort_by(|&a, &b| {
-            let time = |i: usize| capture.frames[capture.train[i]].time.0;
-            time(a).total_cmp(&time(b))
-        });
         let view = &capture.frames[capture.train[frames[0]]].view;
         let name = format!("{rig:03}");
         let mut changed = vec![0u16; view.width * view.height];
-        let mut looked = 0;
-        for part in 0..PARTS {
-            let of = &frames[part * frames.len() / PARTS..((part + 1) * frames.len() / PARTS).max(1)];
-            let pictures =
-                spread(of.len(), MEDIAN_OF).map(|k| bytes(opened, of[k])).collect::<Result<Vec<Vec<u8>>>>()?;
+        let (mut looked, mut written) = (0, 0);
+        for part in looked_at {
+            let within = |i: &&usize| part.contains(&capture.frames[capture.train[**i]].index);
+            let pictures = frames.iter().filter(within).map(|&i| bytes(opened, i)).collect::<Result<Vec<Vec<u8>>>>()?;
             let Some(first) = pictures.first() else { continue };
             let middle: Vec<u8> = (0..first.len()).into_par_iter().map(|i| median(&pictures, i)).collect();
             for picture in &pictures {
@@ -196,7 +207,8 @@ fn medians(opened: &OpenCapture, folder: &Path, listen: &mut dyn FnMut(&Event)) 
                     *count += u16::from(off as f32 > 3.0 * 255.0 * CHANGED);
                 });
             }
-            write_png(&folder.join(format!("images/{name}/{part}.png")), &middle, view, ExtendedColorType::Rgb8)?;
+            write_png(&folder.join(format!("images/{name}/{written}.png")), &middle, view, ExtendedColorType::Rgb8)?;
+            written += 1;
         }
         let calm: Vec<u8> =
             changed.iter().map(|c| if f64::from(*c) <= CALM * f64::from(looked) { 255 } else { 0 }).collect();
@@ -206,7 +218,7 @@ fn medians(opened: &OpenCapture, folder: &Path, listen: &mut dyn FnMut(&Event)) 
         cameras.push(json!({
             "name": name, "width": view.width, "height": view.height, "fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy,
             "world_to_camera": [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]],
-            "images": format!("images/{name}/%d.png"), "start": 0, "frames": PARTS.min(frames.len()),
+            "images": format!("images/{name}/%d.png"), "start": 0, "frames": written,
         }));
         names.push(capture.cameras[rig].name.clone());
     }

@@ -4,6 +4,7 @@ use super::tie::{Neighbour, Tie};
 use super::*;
 use crate::loss::image::{ImageTerm, PictureGrads, Shown, View};
 use crate::loss::terms::StepInfo;
+use crate::run::Stopwatch;
 use crate::run::tests::{Place, recipe};
 use splat4d::format::scene;
 use splat4d::layers::Scene;
@@ -38,8 +39,8 @@ fn the_scene_does_not_depend_on_who_does_which_chunk_when_and_how_often_they_are
     let (place, recipe) = (Place::of(MOMENTS), of_chunks(&[]));
     let (options, never) = (TrainOptions::default(), AtomicBool::new(false));
     let one = begin(&place, "one", &recipe).unwrap().unwrap();
-    assert_eq!((one.plan.len(), one.parts()[1..3].to_vec()), (3, vec![Part::Chunk(0), Part::Chunk(2)]));
-    assert!(one.work_all(&options, &never, &mut |_| {}).unwrap().is_none());
+    assert_eq!((one.plan.len(), one.parts()[1..].to_vec()), (3, [0, 2, 1].map(Part::Chunk).to_vec()));
+    assert!(one.work_all(&options, &never, &mut || Ok(()), &mut |_| {}).unwrap().is_none());
     let other = begin(&place, "other", &recipe).unwrap().unwrap();
     for part in [Part::Shared, Part::Chunk(2), Part::Chunk(0), Part::Chunk(1)] {
         // Stopped in the midst of it, and gone on with by somebody who knows the folder alone.
@@ -74,7 +75,7 @@ fn the_scene_does_not_depend_on_who_does_which_chunk_when_and_how_often_they_are
         assert_eq!((&own.params[GEOMETRY], &own.params[SH]), (&still.params[GEOMETRY], &still.params[SH]), "chunk {c}");
         assert!(chunk.len() <= recipe.densify.max_cap && !chunk.layers[0].params.is_empty());
     }
-    let seams = one.seams(&whole, &mut |_| {}).unwrap().unwrap();
+    let seams = one.seams(&mut |_| {}).unwrap().unwrap();
     assert!(seams.cuts == 2 && seams.held_out && seams.across.is_finite() && seams.inside > 0.0, "{seams:?}");
 }
 
@@ -92,7 +93,7 @@ fn what_is_missing_or_of_another_take_is_named() {
     let claim = Claim::new(&run.folder(Part::Chunk(0))).unwrap().ok();
     assert!(work(Part::Chunk(0)).contains("another worker"));
     drop(claim);
-    run.work_all(&options, &never, &mut |_| {}).unwrap();
+    run.work_all(&options, &never, &mut || Ok(()), &mut |_| {}).unwrap();
     run.join().unwrap();
     // Another recipe in the same folder; a chunk of another recipe; one of another version.
     let again = |changes: &[&str]| begin(&place, "run", &of_chunks(changes)).map(|_| ()).unwrap_err().to_string();
@@ -138,8 +139,8 @@ fn a_take_that_fits_is_not_cut_and_others_are_cut_where_they_rest() {
         let picture = |k: usize| capture.root.join(format!("images/{camera}/{k:04}.png"));
         std::fs::copy(picture(10), picture(11)).unwrap();
     }
-    let opened = OpenCapture::new(capture, &recipe).unwrap();
-    assert_eq!(even.at_rest(&opened, &mut |_| {}).unwrap().cuts, [11]);
+    let open = |frames| open_frames(&capture.root, &recipe, vec![frames]);
+    assert_eq!(even.at_rest(&open, &mut |_| {}).unwrap().cuts, [11]);
 }
 
 #[test]
@@ -175,4 +176,47 @@ fn the_tie_is_the_mean_difference_to_the_neighbour_where_both_are() {
     let mean = (0..108).map(|i| off(i).abs()).sum::<f64>() / 108.0;
     assert!((value - 0.5 * mean).abs() < 1e-7, "{value} {mean}");
     assert!((0..108).all(|i| (f64::from(d[i]) - 0.5 / 108.0 * off(i).signum()).abs() < 1e-9));
+}
+
+#[test]
+fn a_plan_keeps_to_its_memory_and_its_minutes() {
+    let place = Place::of(MOMENTS);
+    let outlook = |changes: &[&str], minutes: Option<f64>| {
+        let recipe = of_chunks(changes);
+        Outlook::new(&place.open(&recipe), &recipe, minutes, false, &Stopwatch::start(), &mut |_| {})
+    };
+    let free = outlook(&["max_cap=20000"], None).unwrap().unwrap();
+    let limit = free.memory - (4 << 20);
+    let set = format!("memory_limit={limit}");
+    let tight = outlook(&["max_cap=20000", &set], None).unwrap().unwrap();
+    assert!(tight.memory <= limit && tight.recipe.densify.max_cap < free.recipe.densify.max_cap);
+    assert!(tight.plan.len() >= free.plan.len() && tight.recipe.chunks.frames >= 3 * 2);
+    assert!(outlook(&["memory_limit=1000000"], None).unwrap_err().to_string().contains("more memory"));
+    // Of two times, the longer one is worth more steps, and all parts together take no more than it.
+    let steps = [0.02, 0.2].map(|m| outlook(&[], Some(m)).unwrap().unwrap());
+    assert!(steps[0].recipe.run.iterations < steps[1].recipe.run.iterations);
+    assert!(steps[1].seconds.unwrap() <= 60.0 * 0.2);
+    assert!(outlook(&["chunks.frames=20"], None).unwrap().is_none(), "it is learnt at once");
+}
+
+#[test]
+fn every_motion_model_goes_through_two_chunks() {
+    let place = Place::of(12);
+    for motion in ["spacetime", "deform-mlp", "hexplane", "tracked", "native4d", "control", "ssm"] {
+        let recipe = recipe(&["chunks.frames=6", "chunks.overlap=2", "iterations=8", &format!("motion={motion}")]);
+        let run = begin(&place, motion, &recipe).unwrap().unwrap();
+        let never = AtomicBool::new(false);
+        run.work_all(&TrainOptions::default(), &never, &mut || Ok(()), &mut |_| {}).unwrap();
+        run.join().unwrap();
+        let whole = read(&run.run.join(SCENE));
+        assert_eq!(run.plan.len(), 2, "{motion}");
+        let own = whole.layers.iter().filter(|l| l.name != shared::LAYER);
+        assert!(own.clone().count() == 2 && own.clone().all(|l| l.motion.spec().name() == motion), "{motion}");
+        // Every moment is seen, those that both show too.
+        for t in [0.0, 0.55, 1.1] {
+            let mut seen = splat4d::layers::Evaluation::default();
+            whole.at(Time(t), &mut seen);
+            assert!(!whole.splats(&seen).is_empty(), "{motion} at {t}");
+        }
+    }
 }

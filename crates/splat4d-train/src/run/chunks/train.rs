@@ -10,7 +10,7 @@ use crate::init::{self, Seeds};
 use crate::methods::{Plan, program_of, stages};
 use crate::recipe::Recipe;
 use crate::run::checkpoint;
-use crate::run::open::{OpenCapture, check_flow, open_capture};
+use crate::run::open::{OpenCapture, check_flow, open_frames};
 use crate::run::points;
 use crate::run::refine::{Refine, refine};
 use crate::run::session::{Outcome, TrainOptions};
@@ -41,7 +41,7 @@ pub(super) fn train(
     let mut listen = listen;
     let folder = chunked.folder(Part::Chunk(chunk));
     let recipe = of_frames(&chunked.recipe, chunked.plan.frames(chunk));
-    let capture = Arc::new(open_capture(&chunked.source, &recipe)?);
+    let capture = Arc::new(open_frames(&chunked.source, &recipe, vec![chunked.plan.frames(chunk)])?);
     let opened = OpenCapture::new(capture, &recipe)?.on(options.device);
     check_flow(&opened.capture, &recipe)?;
     let program = program_of(&recipe)?;

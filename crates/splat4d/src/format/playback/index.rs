@@ -1,8 +1,12 @@
 //! The start of a playback file: header, JSON, and the table of sections.
 
-use super::{BLOCK_GAUSSIANS, BLOCK_HEADER, HEADER_BYTES, MAGIC, MAX_PAGE_GAUSSIANS, MAX_PALETTE, Meta, PAGE_WORDS};
+use super::{
+    BLOCK_GAUSSIANS, BLOCK_HEADER, GROWING, HEADER_BYTES, MAGIC, MAX_PAGE_GAUSSIANS, MAX_PALETTE, Meta, PAGE_WORDS,
+    VERSION,
+};
 use crate::math::sh;
 use crate::{Error, ErrorKind, Result};
+use std::ops::Range;
 
 /// Bytes of an entry of the table.
 pub(super) const ENTRY_BYTES: usize = 64;
@@ -128,13 +132,16 @@ pub struct Index {
 /// The fixed header.
 struct Header {
     version: [u16; 2],
+    /// Where the index lies: behind the header, but in files that grow.
+    index_at: u64,
     index_bytes: usize,
     file_len: u64,
     index_crc: u32,
 }
 
 impl Index {
-    /// Bytes from the start that [`parse`](Self::parse) wants: 64 as long as `prefix` is shorter, then the exact number.
+    /// Bytes from the start that [`parse`](Self::parse) wants: 64 as long as `prefix` is shorter, then the exact number. Of a
+    /// file that grows that is nearly all of it: whoever can read elsewhere asks for its [`place`](Self::place).
     ///
     /// Errors: not a playback file, a newer major version, a damaged header.
     pub fn needed(prefix: &[u8]) -> Result<usize> {
@@ -142,7 +149,23 @@ impl Index {
             let known = prefix.len().min(MAGIC.len());
             return if prefix[..known] == MAGIC[..known] { Ok(HEADER_BYTES) } else { Err(foreign()) };
         }
-        Ok(HEADER_BYTES + Header::parse(prefix)?.index_bytes)
+        Ok(Self::place(prefix)?.end as usize)
+    }
+
+    /// Whether a file's first bytes say that it is of a take that is not finished.
+    pub fn grows(header: &[u8]) -> bool {
+        header.get(..10).is_some_and(|h| h[..8] == MAGIC && h[8..] == GROWING[0].to_le_bytes())
+    }
+
+    /// The bytes of the file in which its index lies, by its first [`HEADER_BYTES`].
+    ///
+    /// Errors: not a playback file, a newer major version, a damaged header.
+    pub fn place(header: &[u8]) -> Result<Range<u64>> {
+        if header.len() < HEADER_BYTES {
+            return Err(broken(format!("it has {} bytes, its header alone {HEADER_BYTES}", header.len())));
+        }
+        let header = Header::parse(header)?;
+        Ok(header.index_at..header.index_at + header.index_bytes as u64)
     }
 
     /// Understands the start of a file, of which `prefix` holds at least [`needed`](Self::needed) bytes. `file_len`, where
@@ -155,9 +178,16 @@ impl Index {
             let have = file_len.unwrap_or(prefix.len() as u64);
             return Err(broken(format!("its index ends at byte {end}, but there are only {have}")));
         }
-        let header = Header::parse(prefix)?;
-        let index = &prefix[HEADER_BYTES..end];
-        if crc(index) != header.index_crc {
+        let place = Self::place(prefix)?;
+        Self::of(prefix, &prefix[place.start as usize..end])
+    }
+
+    /// The same of a file's first [`HEADER_BYTES`] and the bytes of its [`place`](Self::place). Errors: as
+    /// [`parse`](Self::parse).
+    pub fn of(header: &[u8], index: &[u8]) -> Result<Self> {
+        let place = Self::place(header)?;
+        let header = Header::parse(header)?;
+        if index.len() as u64 != place.end - place.start || crc(index) != header.index_crc {
             return Err(broken("the checksum of its index is wrong".into()));
         }
         let json_len = read_u32(index, 0).ok_or_else(short)? as usize;
@@ -175,7 +205,7 @@ impl Index {
             .map(|(i, bytes)| Entry::parse(bytes).map_err(|e| e.at(format!("section {i}"))))
             .collect::<Result<_>>()?;
         let index = Self { version: header.version, file_len: header.file_len, meta, sections };
-        index.check(end as u64)?;
+        index.check(place)?;
         Ok(index)
     }
 
@@ -201,13 +231,17 @@ impl Index {
         all
     }
 
-    /// Checks that sections fit each other and the file.
-    fn check(&self, first_byte: u64) -> Result<()> {
+    /// Checks that sections fit each other, the file and its index.
+    fn check(&self, place: Range<u64>) -> Result<()> {
         let mut order: Vec<usize> = (0..self.sections.len()).collect();
         order.sort_by_key(|&i| (self.sections[i].offset, self.sections[i].stored));
-        let mut free = first_byte;
+        // Behind the header, and on either side of the index.
+        let mut free = if place.start == HEADER_BYTES as u64 { place.end } else { HEADER_BYTES as u64 };
         for i in order {
             let e = &self.sections[i];
+            if e.offset < place.end && place.start < e.offset.saturating_add(u64::from(e.stored)) {
+                return Err(broken("it overlaps the index".into()).at(format!("section {i}")));
+            }
             let end = e.offset.checked_add(u64::from(e.stored)).filter(|&end| end <= self.file_len);
             let end = end.ok_or_else(|| broken("it ends beyond the file".into()).at(format!("section {i}")))?;
             if e.offset < free {
@@ -247,34 +281,67 @@ impl Index {
     /// Panics: more sections, or a larger index, than the format allows.
     pub(super) fn bytes(&mut self, generator: &str) -> Vec<u8> {
         assert!(self.sections.len() <= MAX_SECTIONS, "a file has at most {MAX_SECTIONS} sections");
-        let mut json = serde_json::to_value(&self.meta).expect("plain numbers and texts are JSON");
-        json["generator"] = generator.into();
-        let mut json = json.to_string().into_bytes();
-        json.resize(json.len().next_multiple_of(4), b' ');
+        let json = self.json(generator);
         let index_bytes = 8 + json.len() + ENTRY_BYTES * self.sections.len();
-        assert!(index_bytes <= MAX_INDEX, "an index has at most {MAX_INDEX} bytes");
         let mut offset = (HEADER_BYTES + index_bytes) as u64;
         for e in &mut self.sections {
             e.offset = offset;
             offset += u64::from(e.stored);
         }
         self.file_len = offset;
-        let mut out = Vec::with_capacity(HEADER_BYTES + index_bytes);
-        out.extend_from_slice(&MAGIC);
-        self.version.iter().for_each(|v| out.extend_from_slice(&v.to_le_bytes()));
-        out.extend_from_slice(&(index_bytes as u32).to_le_bytes());
-        out.extend_from_slice(&self.file_len.to_le_bytes());
-        out.resize(HEADER_BYTES, 0);
+        let index = self.table(&json);
+        [&self.header(HEADER_BYTES as u64, &index)[..], &index].concat()
+    }
+
+    /// The start of a file that grows, and its index, which is to lie behind everything else, `at`; sections stay where they
+    /// are. Panics: as [`bytes`](Self::bytes).
+    pub(super) fn growing(&mut self, at: u64, generator: &str) -> ([u8; HEADER_BYTES], Vec<u8>) {
+        let index = self.table(&self.json(generator));
+        (self.version, self.file_len) = (GROWING, at + index.len() as u64);
+        (self.header(at, &index), index)
+    }
+
+    fn json(&self, generator: &str) -> Vec<u8> {
+        let mut json = serde_json::to_value(&self.meta).expect("plain numbers and texts are JSON");
+        json["generator"] = generator.into();
+        let mut json = json.to_string().into_bytes();
+        json.resize(json.len().next_multiple_of(4), b' ');
+        json
+    }
+
+    /// The bytes of an index.
+    fn table(&self, json: &[u8]) -> Vec<u8> {
+        assert!(self.sections.len() <= MAX_SECTIONS, "a file has at most {MAX_SECTIONS} sections");
+        let index_bytes = 8 + json.len() + ENTRY_BYTES * self.sections.len();
+        assert!(index_bytes <= MAX_INDEX, "an index has at most {MAX_INDEX} bytes");
+        let mut out = Vec::with_capacity(index_bytes);
         out.extend_from_slice(&(json.len() as u32).to_le_bytes());
-        out.extend_from_slice(&json);
+        out.extend_from_slice(json);
         out.extend_from_slice(&(self.sections.len() as u32).to_le_bytes());
         self.sections.iter().for_each(|e| e.append(&mut out));
-        seal(&mut out);
+        out
+    }
+
+    /// The header of a file whose index lies `at`.
+    fn header(&self, at: u64, index: &[u8]) -> [u8; HEADER_BYTES] {
+        let mut out = [0; HEADER_BYTES];
+        out[..8].copy_from_slice(&MAGIC);
+        out[8..10].copy_from_slice(&self.version[0].to_le_bytes());
+        out[10..12].copy_from_slice(&self.version[1].to_le_bytes());
+        out[12..16].copy_from_slice(&(index.len() as u32).to_le_bytes());
+        out[16..24].copy_from_slice(&self.file_len.to_le_bytes());
+        out[24..28].copy_from_slice(&crc(index).to_le_bytes());
+        if self.version == GROWING {
+            out[28..36].copy_from_slice(&at.to_le_bytes());
+        }
+        let header_crc = crc(&out[..60]);
+        out[60..64].copy_from_slice(&header_crc.to_le_bytes());
         out
     }
 }
 
-/// Writes both checksums of a file's start. Panics: fewer bytes than header and index have.
+/// Writes both checksums of a file's start, whose index lies behind its header. Panics: fewer bytes than header and index have.
+#[cfg(test)]
 pub(super) fn seal(file: &mut [u8]) {
     let index_bytes = read_u32(file, 12).expect("a header") as usize;
     let index_crc = crc(&file[HEADER_BYTES..HEADER_BYTES + index_bytes]);
@@ -291,13 +358,10 @@ impl Header {
         }
         let [major, minor] = [8, 10].map(|at| u16::from_le_bytes([bytes[at], bytes[at + 1]]));
         // Asked first: a newer format may have another header behind these bytes.
-        if major != super::VERSION[0] {
+        if major != VERSION[0] && major != GROWING[0] {
             return Err(Error::new(
                 ErrorKind::Unsupported,
-                format!(
-                    "this playback file has version {major}.{minor}, this splat4d reads version {}",
-                    super::VERSION[0]
-                ),
+                format!("this playback file has version {major}.{minor}, this splat4d reads version {}", VERSION[0]),
             )
             .remedy("Install a newer splat4d, or bake the scene again with this one"));
         }
@@ -307,10 +371,15 @@ impl Header {
         }
         let index_bytes = u32_at(12) as usize;
         let file_len = u64::from(u32_at(16)) | u64::from(u32_at(20)) << 32;
-        if index_bytes > MAX_INDEX || (HEADER_BYTES + index_bytes) as u64 > file_len {
+        let index_at = match major == GROWING[0] {
+            true => u64::from(u32_at(28)) | u64::from(u32_at(32)) << 32,
+            false => HEADER_BYTES as u64,
+        };
+        let end = index_at.checked_add(index_bytes as u64).filter(|_| index_at >= HEADER_BYTES as u64);
+        if index_bytes > MAX_INDEX || end.is_none_or(|end| end > file_len) {
             return Err(broken(format!("its header claims an index of {index_bytes} bytes in a file of {file_len}")));
         }
-        Ok(Self { version: [major, minor], index_bytes, file_len, index_crc: u32_at(24) })
+        Ok(Self { version: [major, minor], index_at, index_bytes, file_len, index_crc: u32_at(24) })
     }
 }
 

@@ -41,6 +41,12 @@ pub struct Meta {
     /// The default camera path.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub path: Vec<PathKey>,
+    /// Of a file that grows: the parts that are in it, as their maker names them.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub parts: Vec<String>,
+    /// Of a file that grows: spans of the clip, seconds, of which only what all parts share is there so far.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub missing: Vec<[f64; 2]>,
 }
 
 /// A place to look from.

@@ -9,6 +9,7 @@ mod cluster;
 mod coder;
 mod deflate;
 mod depths;
+mod grow;
 mod index;
 mod layer;
 mod mask;
@@ -25,6 +26,7 @@ mod write;
 
 pub use coder::Coder;
 pub use depths::{Depths, LEAST_DEPTH};
+pub use grow::{Growing, finish};
 pub use index::{Codec, Entry, Index, Kind};
 pub(crate) use layer::{is_page, primitives};
 pub(crate) use mask::decode_masks;
@@ -42,6 +44,8 @@ pub const MAGIC: [u8; 8] = *b"\x89S4D\r\n\x1a\n";
 pub(crate) const VERSION: [u16; 2] = [1, 1];
 /// The version of a file without masks.
 const FIRST_VERSION: [u16; 2] = [1, 0];
+/// The version of a file that grows, which readers of version 1 refuse: its index is not where they look for it.
+const GROWING: [u16; 2] = [2, 0];
 /// Bytes of the header.
 pub const HEADER_BYTES: usize = 64;
 /// Gaussians in a block, which share ranges.

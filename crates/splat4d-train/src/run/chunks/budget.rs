@@ -1,0 +1,126 @@
+//! What a take in chunks costs before it is begun, and the plan that stays within a memory limit and a time: shorter chunks of
+//! fewer Gaussians, and the steps of a chunk.
+
+use super::{ChunkPlan, beginning, check};
+use crate::capture::Capture;
+use crate::event::Event;
+use crate::recipe::Recipe;
+use crate::run::clock::Stopwatch;
+use crate::run::memory::memory_estimate;
+use crate::run::minutes::Timing;
+use crate::run::open::OpenCapture;
+use crate::{Error, ErrorKind, Result};
+use std::sync::Arc;
+
+/// Share of the time that timing steps may take (as for takes that are learnt at once).
+const PROBES: f64 = 0.06;
+/// Seconds that timing steps takes where only the length is asked for.
+const PREDICTION: f64 = 6.0;
+/// Fewest Gaussians of a chunk that a memory limit may leave: with fewer nothing can be told in the pictures.
+const FEWEST: usize = 1000;
+/// By how much the number of Gaussians falls from try to try.
+const LESS: f64 = 0.8;
+/// Least memory for decoded pictures, bytes; less makes runs slower, and no picture worse.
+const PICTURES: u64 = 64 << 20;
+/// Shortest chunk, in overlaps: in a shorter one there is hardly a frame that is not shared.
+const SHORTEST: usize = 3;
+/// Share of the time that is kept for putting the take together, and for what training takes beside its steps.
+const JOIN: f64 = 0.1;
+
+/// A take in chunks before it is begun.
+#[derive(Clone, Debug)]
+pub struct Outlook {
+    /// The recipe, with the motion model and the steps that are chosen.
+    pub recipe: Recipe,
+    /// Even cuts.
+    pub plan: ChunkPlan,
+    /// Estimated seconds of all parts, one after the other, where steps were timed.
+    pub seconds: Option<f64>,
+    /// Estimated memory of a part at most, bytes.
+    pub memory: u64,
+}
+
+impl Outlook {
+    /// Looks at a take as `train` would before its first step, of which at least [`look_ahead`](super::look_ahead) is listed.
+    /// Within `minutes`, if there are any, from the start of `clock` on, and within the recipe's memory limit. `timed`: steps
+    /// are timed even without `minutes`. `None`: the take is learnt at once.
+    ///
+    /// Errors: what the recipe asks for cannot be had in chunks, or not within these limits; pictures that cannot be read.
+    pub fn new(
+        capture: &Arc<Capture>,
+        recipe: &Recipe,
+        minutes: Option<f64>,
+        timed: bool,
+        clock: &Stopwatch,
+        listen: &mut dyn FnMut(&Event),
+    ) -> Result<Option<Self>> {
+        let Some(plan) = ChunkPlan::even(capture, recipe)? else { return Ok(None) };
+        let mut listen = listen;
+        let mut recipe = recipe.clone();
+        if recipe.run.motion.is_auto() {
+            let first = Arc::new(beginning(capture, &plan));
+            recipe = OpenCapture::new(first, &recipe)?.choose(recipe, &mut listen)?;
+        }
+        recipe.check()?;
+        check(&recipe)?;
+        let (mut recipe, plan, memory) = within_memory(capture, recipe, plan)?;
+        let mut seconds = None;
+        if minutes.is_some() || timed {
+            let parts = (plan.len() + 1) as f64;
+            let one = Arc::new(longest(capture, &plan));
+            let opened = OpenCapture::new(one, &recipe)?;
+            let probes = minutes.map_or(PREDICTION, |m| 60.0 * PROBES * m);
+            let timing = Timing::measure(&opened, &recipe, clock, probes, &mut listen)?;
+            if let Some(minutes) = minutes {
+                let left = (1.0 - JOIN) * (60.0 * minutes - clock.seconds());
+                recipe = timing.fit(&opened, &recipe, left / parts - timing.scene, 0.0)?;
+            }
+            let [steps, _] = timing.of(&opened, &recipe)?;
+            seconds = Some(parts * (steps + timing.scene));
+        }
+        Ok(Some(Self { recipe, plan, seconds, memory }))
+    }
+}
+
+/// A capture with as many pictures to train on as the longest chunk has; those of the beginning, which are listed in any case.
+fn longest(capture: &Capture, plan: &ChunkPlan) -> Capture {
+    let longest = (0..plan.len()).map(|c| plan.frames(c).len()).max().unwrap_or(0);
+    let frames = plan.take[0]..plan.take[0] + longest;
+    let train = capture.train.iter().copied().filter(|&i| frames.contains(&capture.frames[i].index)).collect();
+    Capture { train, ..capture.clone() }
+}
+
+/// The recipe and plan within the recipe's memory limit: less memory for pictures first, then fewer Gaussians in chunks that are
+/// shorter by as much, so that a frame keeps as many.
+fn within_memory(capture: &Capture, mut recipe: Recipe, mut plan: ChunkPlan) -> Result<(Recipe, ChunkPlan, u64)> {
+    let estimate = |recipe: &Recipe, plan: &ChunkPlan| memory_estimate(&longest(capture, plan), recipe);
+    let (limit, cap) = (recipe.run.memory_limit, recipe.densify.max_cap as f64);
+    let length = (plan.take[1] - plan.take[0]) as f64 / plan.len() as f64;
+    let mut share = 1.0;
+    loop {
+        let memory = estimate(&recipe, &plan);
+        if limit == 0 || memory <= limit {
+            return Ok((recipe, plan, memory));
+        }
+        if recipe.run.image_memory > PICTURES {
+            recipe.run.image_memory = (recipe.run.image_memory / 2).max(PICTURES);
+            continue;
+        }
+        share *= LESS;
+        if share * cap < FEWEST as f64 {
+            return Err(Error::new(
+                ErrorKind::Memory,
+                format!(
+                    "a chunk of {FEWEST} Gaussians would take about {} MiB, and memory_limit is {} MiB",
+                    memory >> 20,
+                    limit >> 20
+                ),
+            )
+            .remedy("Allow more memory, or use --downscale 2"));
+        }
+        recipe.densify.max_cap = (share * cap) as usize;
+        let shortest = (SHORTEST * recipe.chunks.overlap).min(length as usize);
+        recipe.chunks.frames = ((share * length) as usize).max(shortest);
+        plan = ChunkPlan::even(capture, &recipe)?.expect("shorter chunks are chunks");
+    }
+}
