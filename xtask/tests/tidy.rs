@@ -68,6 +68,7 @@ const ORDER: [(&str, &[&str]); 8] = [
             "serving",
             "report",
             "finish",
+            "film",
             "chunked",
             "compressing",
             "predicting",
