@@ -14,7 +14,7 @@ use splat4d_dynamics::nodes::follow_among;
 use splat4d_dynamics::paths::Pose;
 use splat4d_train::capture::frames::{Frames, Picture};
 use splat4d_train::capture::{Capture, ImageStore};
-use splat4d_train::eval::floaters::{floaters, support};
+use splat4d_train::eval::floaters::support;
 use splat4d_train::eval::metrics::psnr;
 use splat4d_train::run::dataset::Dataset;
 use std::path::{Path, PathBuf};
@@ -167,7 +167,7 @@ impl Bring<'_> {
         let told = support(scene, &data, &capture.train, &capture.held, antialias, &mut |done, total| {
             self.console.phase("looking for floaters", done, total);
         })?;
-        let found = floaters(&told, strength);
+        let found = told.floaters(strength);
         let mut without = scene.clone();
         for (layer, found) in without.layers.iter_mut().zip(&found) {
             let keep = found.iter().map(|f| !f);

@@ -60,7 +60,7 @@ const number = (label, value, onchange, props = {}) => {
   return node;
 };
 const slider = (label, low, high, value, onchange, oninput) => {
-  const node = h('input', { type: 'range', min: low, max: high, step: (high - low) / 200, 'aria-label': label, value,
+  const node = h('input', { type: 'range', min: low, max: high, step: high > 2 ? 0.05 : 0.01, 'aria-label': label, value,
     onchange: () => onchange(+node.value), oninput: () => oninput?.(+node.value) });
   return node;
 };
@@ -112,6 +112,8 @@ export class Editing {
     }
   }
 
+  /** Whether nothing is asked for, and the scene is that of the list. */
+  get idle() { return !this.#busy && !this.#standing && !this.overlay.shows; }
   get time() { return this.player.shown; }
   get steps() { return this.history.steps; }
   get step() { return this.steps[this.active]; }
