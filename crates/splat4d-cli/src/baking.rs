@@ -74,7 +74,17 @@ pub(crate) struct Packed {
 
 /// Bakes a scene and packs it, without a look at how well. The options' cameras are the source's.
 pub(crate) fn pack(source: &Source, title: &str, baking: &Baking, console: &Console) -> anyhow::Result<Packed> {
-    let scene = &source.scene;
+    pack_scene(&source.scene, source, title, baking, console)
+}
+
+/// The same of another scene in the source's place.
+pub(crate) fn pack_scene(
+    scene: &Scene<f32>,
+    source: &Source,
+    title: &str,
+    baking: &Baking,
+    console: &Console,
+) -> anyhow::Result<Packed> {
     let views = source.views()?;
     let stage = source.stage(&views);
     let cameras = distinct(&views);

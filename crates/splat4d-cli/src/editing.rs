@@ -14,7 +14,7 @@ use splat4d_dynamics::nodes::follow_among;
 use splat4d_dynamics::paths::Pose;
 use splat4d_train::capture::frames::{Frames, Picture};
 use splat4d_train::capture::{Capture, ImageStore};
-use splat4d_train::eval::floaters::{floaters, support};
+use splat4d_train::eval::floaters::support;
 use splat4d_train::eval::metrics::psnr;
 use splat4d_train::run::dataset::Dataset;
 use std::path::{Path, PathBuf};
@@ -112,31 +112,18 @@ impl Context for Bring<'_> {
     }
 
     fn floaters(&self, scene: &Scene<f32>, strength: f64) -> Result<Selected> {
-        let (capture, data, antialias) = self.capture()?;
-        let told = support(scene, &data, &capture.train, &capture.held, antialias, &mut |done, total| {
-            self.console.phase("looking for floaters", done, total);
-        })?;
-        let found = floaters(&told, strength);
-        let mut without = scene.clone();
-        for (layer, found) in without.layers.iter_mut().zip(&found) {
-            let keep = found.iter().map(|f| !f);
-            let edit = splat4d::scene::RowEdit::prune(splat4d::scene::Space::Gaussians, keep);
-            layer.edit(&edit, &splat4d::math::Rng::new(0, "floaters", 0));
-        }
-        let step = capture.held.len().div_ceil(COMPARED).max(1);
-        let held: Vec<usize> = capture.held.iter().copied().step_by(step).collect();
-        let [before, after] = [mean_psnr(scene, &data, &held)?, mean_psnr(&without, &data, &held)?];
+        let found = self.propose(scene, strength)?;
+        let Proposal { selected, pictures, before, after } = found;
         self.console.clear();
-        let count = found.iter().flatten().filter(|f| **f).count();
+        let count = selected.iter().flatten().filter(|f| **f).count();
         self.console.say(&format!(
-            "floaters: {} of {} Gaussians; {} held-out pictures: {before:.2} dB with them, {after:.2} dB without",
+            "floaters: {} of {} Gaussians; {pictures} held-out pictures: {before:.2} dB with them, {after:.2} dB without",
             files::grouped(count),
-            files::grouped(scene.len()),
-            held.len()
+            files::grouped(scene.len())
         ));
         self.console.emit(&serde_json::json!({"type": "floaters", "found": count, "strength": strength,
-            "pictures": held.len(), "psnr_before": before, "psnr_after": after}));
-        Ok(found)
+            "pictures": pictures, "psnr_before": before, "psnr_after": after}));
+        Ok(selected)
     }
 
     fn follow(
@@ -156,6 +143,41 @@ impl Context for Bring<'_> {
         moments.extend(follow_among(scene, &start, &times[first..], &among).into_iter().skip(1));
         self.console.clear();
         Ok(moments.into_iter().map(|moment| moment.into_iter().map(|pose| pose.x).collect()).collect())
+    }
+}
+
+/// Gaussians that float, and what held-out pictures say of it.
+pub(crate) struct Proposal {
+    pub selected: Selected,
+    /// Pictures that were compared, and their mean PSNR with and without the floaters, dB.
+    pub pictures: usize,
+    pub before: f64,
+    pub after: f64,
+}
+
+impl Bring<'_> {
+    /// Looks for floaters.
+    ///
+    /// Errors: no run with its capture, no held-out views, a strength that is not from 0 to 1.
+    pub(crate) fn propose(&self, scene: &Scene<f32>, strength: f64) -> Result<Proposal> {
+        if !(0.0..=1.0).contains(&strength) {
+            return Err(Error::input(format!("a strength of {strength}")).remedy("Give 0 to 1"));
+        }
+        let (capture, data, antialias) = self.capture()?;
+        let told = support(scene, &data, &capture.train, &capture.held, antialias, &mut |done, total| {
+            self.console.phase("looking for floaters", done, total);
+        })?;
+        let found = told.floaters(strength);
+        let mut without = scene.clone();
+        for (layer, found) in without.layers.iter_mut().zip(&found) {
+            let keep = found.iter().map(|f| !f);
+            let edit = splat4d::scene::RowEdit::prune(splat4d::scene::Space::Gaussians, keep);
+            layer.edit(&edit, &splat4d::math::Rng::new(0, "floaters", 0));
+        }
+        let step = capture.held.len().div_ceil(COMPARED).max(1);
+        let held: Vec<usize> = capture.held.iter().copied().step_by(step).collect();
+        let [before, after] = [mean_psnr(scene, &data, &held)?, mean_psnr(&without, &data, &held)?];
+        Ok(Proposal { selected: found, pictures: held.len(), before, after })
     }
 }
 

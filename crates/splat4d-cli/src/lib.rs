@@ -14,6 +14,7 @@ pub mod console;
 mod device;
 pub mod draw;
 mod editing;
+mod editor;
 pub mod files;
 mod film;
 pub mod finish;

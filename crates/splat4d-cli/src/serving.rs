@@ -38,20 +38,33 @@ impl Place {
 
 /// Starts a server, says where, and opens the browser.
 pub(crate) fn start(config: Config, place: &Place, console: &Console) -> splat4d::Result<Running> {
+    start_for(config, place, None, console)
+}
+
+/// The same; the page that is opened here may edit by this token.
+pub(crate) fn start_for(
+    config: Config,
+    place: &Place,
+    token: Option<&str>,
+    console: &Console,
+) -> splat4d::Result<Running> {
     let host = place.host.clone().unwrap_or(config.host);
     let running =
         Server::start(Config { host, port: place.port, player_folder: place.player_folder.clone(), ..config })?;
-    console.say(&format!("the player is at {}", running.url()));
-    console.emit(&json!({"type": "serving", "url": running.url()}));
+    // Behind `#` a browser sends nothing to anybody, and pages that are linked to do not see it.
+    let url = token.map_or(running.url().to_owned(), |token| format!("{}#edit={token}", running.url()));
+    console.say(&format!("the player is at {url}"));
+    console.emit(&json!({"type": "serving", "url": url}));
     if !running.address().ip().is_loopback() {
         console.warn("everybody who reaches this machine over the network can look at the scene.");
     }
-    if !place.no_open && !open_browser(running.url()) {
+    if !place.no_open && !open_browser(&url) {
         let port = running.address().port();
         console.say(&format!(
             "there is no screen here. On a computer that has one: ssh -L {port}:localhost:{port} {}, then open \
-             http://localhost:{port}/ there",
-            machine()
+             http://localhost:{port}/{} there",
+            machine(),
+            token.map_or(String::new(), |token| format!("#edit={token}"))
         ));
     }
     Ok(running)

@@ -44,6 +44,9 @@ export class Controls {
     on('contextmenu', e => e.preventDefault());
   }
 
+  /** A finger that something else held until now. */
+  take(e) { this.#down(e); }
+
   get busy() { return this.#pointers.size > 0 || this.#held.size > 0; }
 
   #down(e) {

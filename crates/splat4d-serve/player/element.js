@@ -151,6 +151,7 @@ export class Splat4D extends HTMLElement {
   get scene() { return this.#scene; }
   set scene(value) { this.#scene = value; this.#load(); }
   get player() { return this.#player; }
+  get face() { return this.#ui; }
   get paused() { return !this.#player?.playing; }
   get currentTime() { return this.#player?.shown ?? 0; }
   set currentTime(t) { this.seek(t); }

@@ -14,11 +14,25 @@ async function config() {
   } catch { return {}; }
 }
 
+/** The leave to edit that the program's address brings. It goes from the address bar, and stays for this tab. */
+function leave() {
+  const kept = f => { try { return f(sessionStorage); } catch { return null; /* Storage may be shut; the address then serves once. */ } };
+  const given = new URLSearchParams(location.hash.slice(1)), found = given.get('edit');
+  if (!found) return kept(s => s.getItem('splat4d-edit'));
+  given.delete('edit');
+  kept(s => s.setItem('splat4d-edit', found));
+  const rest = decodeURIComponent(given.toString());
+  history.replaceState(null, '', location.pathname + location.search + (rest ? `#${rest}` : ''));
+  return found;
+}
+
+const about = await config();
+const token = about.edit ? leave() : null;
 const element = document.createElement('splat-4d');
 element.setAttribute('page', '');
 document.body.append(element);
-const { scene, src = scene, title, live, metrics, version, autoplay = true } = await config();
-if (autoplay && !matchMedia('(prefers-reduced-motion: reduce)').matches) element.setAttribute('autoplay', '');
+const { scene, src = scene, title, live, metrics, version, autoplay = true } = about;
+if (autoplay && !token && !matchMedia('(prefers-reduced-motion: reduce)').matches) element.setAttribute('autoplay', '');
 if (title) {
   element.setAttribute('heading', title);
   document.title = `${title} · splat4d`;
@@ -29,3 +43,7 @@ if (live) {
 } else if (src instanceof Blob) element.scene = src;
 else if (src) element.setAttribute('src', src);
 else element.invite();
+if (token) {
+  element.addEventListener('load', () => import('./edit.js').then(m => m.Editing.start(element.face, token))
+    .catch(error => element.face.toast(error.message, 8000)), { once: true });
+}

@@ -293,6 +293,7 @@ export class Interface {
   /** Opens a panel by name, or closes what is open. */
   open(name, refocus = true) {
     const before = this.#panel;
+    if (name && this.editing?.open) this.editing.toggle(false);
     this.#panel = name;
     for (const key of Object.keys(this.panels)) {
       this.panels[key].hidden = key !== name;
@@ -323,7 +324,7 @@ export class Interface {
 
   sleep() {
     const p = this.player;
-    const used = this.#panel || !this.help.hidden || p.state !== 'ready' || this.bar.matches(':hover')
+    const used = this.#panel || this.editing?.open || !this.help.hidden || p.state !== 'ready' || this.bar.matches(':hover')
       || this.bar.querySelector(':focus-visible');
     if (used) return this.wake();
     this.root.classList.add('idle');
@@ -476,6 +477,7 @@ export class Interface {
     const at = e.composedPath()[0];
     if (e.key === 'Escape') {
       if (!this.help.hidden) return this.toggleHelp(false);
+      if (!this.#panel && this.editing?.escape()) return;
       if (this.#panel) return this.open(null);
       return this.player.film && this.player.stopFilm();
     }
@@ -523,6 +525,7 @@ export class Interface {
       },
       k: () => this.addKey(), p: () => this.playPath(), b: () => this.bullet(),
       f: () => this.fullscreen(), i: () => this.setFigures(!this.figuresOn), g: () => this.screenshot(),
+      x: () => this.editing?.toggle(),
       t: () => this.setTheme(this.dark ? 'light' : 'dark'), h: () => this.toggleHelp(), '?': () => this.toggleHelp(),
     };
   }

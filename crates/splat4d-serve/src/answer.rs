@@ -2,11 +2,12 @@
 
 use crate::assets::{self, Asset, INDEX};
 use crate::body::Body;
+use crate::edit::{self, Editing};
 use crate::events::Hub;
 use crate::guard::Guard;
 use crate::range::{self, Wanted};
 use crate::scene::{Missing, Scene};
-use hyper::body::Bytes;
+use hyper::body::{Bytes, Incoming};
 use hyper::header::{self, HeaderMap, HeaderName, HeaderValue};
 use hyper::http::request::Parts;
 use hyper::{Method, Response, StatusCode};
@@ -40,6 +41,10 @@ pub(crate) struct Shared {
     /// A scene elsewhere, and its origin.
     pub foreign: Option<(String, String)>,
     pub player_folder: Option<PathBuf>,
+    /// Leave to edit.
+    pub editing: Option<Editing>,
+    /// Questions of editing pages that are worked on.
+    pub editors: Arc<Semaphore>,
     listeners: Arc<Semaphore>,
     policy: HeaderValue,
 }
@@ -55,6 +60,8 @@ impl Shared {
             live,
             foreign,
             player_folder: None,
+            editing: None,
+            editors: Arc::new(Semaphore::new(edit::AT_ONCE)),
             listeners: Arc::new(Semaphore::new(MAX_LISTENERS)),
             policy: policy.parse().expect("an origin was checked"),
         }
@@ -73,10 +80,13 @@ fn policy(origin: &str) -> String {
 }
 
 /// Answers one request.
-pub(crate) async fn answer(shared: &Arc<Shared>, request: &Parts) -> Response<Body> {
-    let mut response = match shared.guard.check(request) {
-        Err(refusal) => text(refusal.status, refusal.why),
-        Ok(()) => route(shared, request).await,
+pub(crate) async fn answer(shared: &Arc<Shared>, request: &Parts, body: Incoming) -> Response<Body> {
+    let editing = shared.editing.as_ref().filter(|_| request.uri.path() == edit::ROUTE);
+    let mut response = match (shared.guard.check(request, editing.is_some()), editing) {
+        (Err(refusal), _) => text(refusal.status, refusal.why),
+        (Ok(()), Some(editing)) if request.method == Method::POST => edit::answer(shared, editing, request, body).await,
+        // A body that a client sends is never read.
+        (Ok(()), _) => route(shared, request).await,
     };
     let headers = response.headers_mut();
     for (name, value) in HEADERS {
@@ -114,6 +124,7 @@ fn config(shared: &Shared) -> Value {
     let mut config = if shared.about.is_object() { shared.about.clone() } else { json!({}) };
     let version = shared.scene.version(None).map(|v| v.number).ok();
     config["live"] = json!(shared.live);
+    config["edit"] = json!(shared.editing.is_some());
     config["version"] = json!(version);
     config["scene"] = match &shared.foreign {
         Some((url, _)) => json!(url),
@@ -230,14 +241,14 @@ fn missing() -> Response<Body> {
     text(StatusCode::NOT_FOUND, "there is nothing here")
 }
 
-fn text(status: StatusCode, what: &'static str) -> Response<Body> {
+pub(crate) fn text(status: StatusCode, what: &'static str) -> Response<Body> {
     let mut response = whole(Bytes::from_static(what.as_bytes()), "text/plain; charset=utf-8");
     *response.status_mut() = status;
     response
 }
 
 /// Bytes that are not to be kept.
-fn whole(bytes: Bytes, mime: &str) -> Response<Body> {
+pub(crate) fn whole(bytes: Bytes, mime: &str) -> Response<Body> {
     let headers = [(header::CONTENT_TYPE, mime), (header::CACHE_CONTROL, "no-store")];
     with(bytes.into(), StatusCode::OK, &headers)
 }

@@ -32,9 +32,11 @@ impl Guard {
         Self { told: told.trim_matches(['[', ']']).to_ascii_lowercase(), open }
     }
 
-    /// Whether a request may be answered.
-    pub(crate) fn check(&self, request: &Parts) -> Result<(), Refusal> {
-        if request.method != Method::GET && request.method != Method::HEAD {
+    /// Whether a request may be answered. `posts`: whether one of this path may be sent something, which has rules of its own
+    /// besides.
+    pub(crate) fn check(&self, request: &Parts, posts: bool) -> Result<(), Refusal> {
+        let known = request.method == Method::GET || request.method == Method::HEAD;
+        if !known && !(posts && request.method == Method::POST) {
             return Err(refusal(StatusCode::METHOD_NOT_ALLOWED, "only GET and HEAD are answered"));
         }
         if request.version < Version::HTTP_11 {
@@ -92,7 +94,7 @@ mod tests {
         if let Some(origin) = origin {
             request = request.header("origin", origin);
         }
-        guard.check(&request.body(()).unwrap().into_parts().0).map_err(|r| r.status.as_u16())
+        guard.check(&request.body(()).unwrap().into_parts().0, false).map_err(|r| r.status.as_u16())
     }
 
     #[test]
@@ -136,7 +138,7 @@ mod tests {
         let ask = |mode: &str| {
             let request = Request::get("/").header("host", "localhost");
             let request = request.header("sec-fetch-site", "cross-site").header("sec-fetch-mode", mode);
-            local.check(&request.body(()).unwrap().into_parts().0).is_ok()
+            local.check(&request.body(()).unwrap().into_parts().0, false).is_ok()
         };
         assert!(!ask("no-cors") && !ask("cors") && ask("navigate"));
     }

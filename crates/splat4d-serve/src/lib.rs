@@ -13,6 +13,7 @@
 //! | `/config.json` | what the page shows: `{title, scene, live, …}` of [`Config::about`] |
 //! | `/events` | news of a live run as server-sent events; see [`News`] |
 //! | `/metrics.json` | the same news so far, in one piece |
+//! | `POST /edit` | only with [`Config::editing`]: what a page with the token wants of a list of edits |
 //!
 //! ```no_run
 //! # fn main() -> splat4d::Result<()> {
@@ -28,6 +29,7 @@
 mod answer;
 mod assets;
 mod body;
+mod edit;
 mod events;
 mod guard;
 mod page;
@@ -37,6 +39,7 @@ mod server;
 mod write_timeout;
 
 pub use assets::{Asset, asset, assets};
+pub use edit::{EditAnswer, Editing};
 pub use events::News;
 pub use page::{Page, SceneIn};
 pub use scene::Content;

@@ -1,6 +1,7 @@
 //! Starting, running and stopping: one thread with a runtime of its own, and bounds on what strangers can make it hold.
 
 use crate::answer::{Shared, answer};
+use crate::edit::Editing;
 use crate::events::News;
 use crate::guard::Guard;
 use crate::scene::{Content, Scene};
@@ -64,6 +65,8 @@ pub struct Config {
     pub about: Value,
     /// Whether news will be published: the page then listens.
     pub live: bool,
+    /// Leave for pages to edit; none: nothing can be sent.
+    pub editing: Option<Editing>,
     /// Whether to step back for other work of this machine (Linux only).
     pub background: bool,
     /// Reads the player from this folder, at every request, instead of the embedded one. For whoever writes the player.
@@ -79,6 +82,7 @@ impl Default for Config {
             foreign: None,
             about: Value::Null,
             live: false,
+            editing: None,
             background: false,
             player_folder: None,
         }
@@ -116,6 +120,7 @@ impl Server {
         let guard = Guard::new(&config.host, !address.ip().is_loopback());
         let mut shared = Shared::new(scene, guard, config.about, config.live, foreign);
         shared.player_folder = config.player_folder;
+        shared.editing = config.editing;
         let shared = Arc::new(shared);
         let (stop, stopped) = watch::channel(false);
         let at_work = shared.clone();
@@ -292,9 +297,8 @@ async fn serve(stream: TcpStream, shared: Arc<Shared>, slot: OwnedSemaphorePermi
     let _ = stream.set_nodelay(true);
     let service = service_fn(move |request: hyper::Request<_>| {
         let shared = shared.clone();
-        // A body that a client sends is never read.
-        let (request, _): (_, hyper::body::Incoming) = request.into_parts();
-        async move { Ok::<_, Infallible>(answer(&shared, &request).await) }
+        let (request, body): (_, hyper::body::Incoming) = request.into_parts();
+        async move { Ok::<_, Infallible>(answer(&shared, &request, body).await) }
     });
     let mut connection = pin!(
         http1::Builder::new()

@@ -1,6 +1,6 @@
 //! The whole server on loopback: what clients ask, well and badly, and what they get.
 
-use crate::{Config, Content, News, Running, Server};
+use crate::{Config, Content, EditAnswer, Editing, News, Running, Server};
 use serde_json::{Value, json};
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{Shutdown, TcpStream};
@@ -475,4 +475,119 @@ fn a_taken_port_is_an_error_or_the_next_one() {
     assert!(Server::start(Config { host: "no such host".into(), ..Config::default() }).is_err());
     first.stop();
     Server::start(Config { port: Some(port), ..Config::default() }).expect("a port is free again at once").stop();
+}
+
+/// What a page with leave to edit sends; it may be changed by more headers, of which the last of a name counts.
+fn post(server: &Running, target: &str, headers: &[(&str, &str)], body: &[u8]) -> Reply {
+    let length = body.len().to_string();
+    let usual = [
+        ("host", "localhost"),
+        ("origin", "http://localhost"),
+        ("x-splat4d-token", TOKEN),
+        ("content-type", "application/json"),
+        ("content-length", length.as_str()),
+    ];
+    let given = |name: &str| headers.iter().any(|(n, _)| *n == name);
+    let mut request = format!("POST {target} HTTP/1.1\r\nconnection: close\r\n");
+    for (name, value) in usual.iter().filter(|(n, _)| !given(n)).chain(headers).filter(|(_, v)| !v.is_empty()) {
+        request += &format!("{name}: {value}\r\n");
+    }
+    let reply = raw(server, &[(request + "\r\n").as_bytes(), body].concat(), true);
+    let end = reply.windows(4).position(|w| w == b"\r\n\r\n").expect("an answer has a head");
+    let head = String::from_utf8(reply[..end].to_vec()).unwrap();
+    let status = head.split(' ').nth(1).unwrap().parse().unwrap();
+    Reply { status, head, body: reply[end + 4..].to_vec() }
+}
+
+const TOKEN: &str = "0123456789abcdef0123456789abcdef";
+
+fn editor(asked: &Arc<std::sync::Mutex<Vec<Value>>>) -> Running {
+    let asked = asked.clone();
+    let editing = Editing::new(TOKEN.into(), move |value| {
+        asked.lock().unwrap().push(value.clone());
+        assert!(value["do"] != "panic", "as it was asked to");
+        if value["do"] == "fail" {
+            return Err(splat4d::Error::input("there is nothing to do").remedy("Give a step"));
+        }
+        let scene = (value["do"] == "bake").then(|| vec![7; 10].into());
+        Ok(EditAnswer { told: json!({"heard": value}), scene })
+    });
+    start(Config { content: Content::Bytes(bytes(1000).into()), editing: Some(editing), ..Config::default() })
+}
+
+#[test]
+fn a_page_with_the_token_edits() {
+    let asked = Arc::default();
+    let server = editor(&asked);
+    let told = |body: &str| {
+        let reply = post(&server, "/edit", &[("sec-fetch-site", "same-origin")], body.as_bytes());
+        (reply.status, serde_json::from_slice::<Value>(&reply.body).unwrap_or_default())
+    };
+    assert_eq!(told(r#"{"do": "x"}"#), (200, json!({"heard": {"do": "x"}})));
+    assert_eq!(told(r#"{"do": "bake"}"#).1["version"], 2, "the scene that pages see is the new one");
+    assert_eq!(get(&server, "/scene.splat4d?v=2").body, [7; 10]);
+    let (status, error) = told(r#"{"do": "fail"}"#);
+    assert_eq!((status, error["error"].as_str()), (422, Some("there is nothing to do. Give a step")));
+    assert_eq!(told(r#"{"do": "panic"}"#).0, 500);
+    assert_eq!(told(r#"{"do": "x"}"#).0, 200, "it goes on");
+    let config: Value = serde_json::from_slice(&get(&server, "/config.json").body).unwrap();
+    assert_eq!(config["edit"], true);
+    assert!(!config.to_string().contains(TOKEN), "whoever may look may not edit");
+}
+
+#[test]
+fn nobody_else_edits() {
+    let asked = Arc::default();
+    let server = editor(&asked);
+    let good = br#"{"do": "x"}"#;
+    let mut tried = 0;
+    let mut refused = |status: u16, target: &str, headers: &[(&str, &str)], body: &[u8]| {
+        let reply = post(&server, target, headers, body);
+        assert_eq!(reply.status, status, "{target} {headers:?}: {}", String::from_utf8_lossy(&reply.body));
+        assert!(!String::from_utf8_lossy(&reply.body).contains(TOKEN));
+        assert!(reply.header("access-control-allow-origin").is_none());
+        tried += 1;
+    };
+    let wrong = "0123456789abcdef0123456789abcdeF";
+    for token in ["", wrong, "x", &TOKEN[1..], &format!("{TOKEN}0")] {
+        refused(403, "/edit", &[("x-splat4d-token", token)], good);
+    }
+    refused(403, "/edit", &[("x-splat4d-token", TOKEN), ("X-Splat4d-Token", wrong)], good);
+    refused(403, &format!("/edit?token={TOKEN}"), &[("x-splat4d-token", "")], good);
+    for origin in ["", "null", "http://evil.example", "http://localhost:81", "https://localhost.evil.example"] {
+        refused(403, "/edit", &[("origin", origin)], good);
+    }
+    refused(403, "/edit", &[("host", "evil.example"), ("origin", "http://evil.example")], good);
+    for site in ["cross-site", "same-site", "none"] {
+        refused(403, "/edit", &[("sec-fetch-site", site)], good);
+    }
+    for kind in ["", "text/plain", "application/x-www-form-urlencoded", "multipart/form-data; boundary=x"] {
+        refused(415, "/edit", &[("content-type", kind)], good);
+    }
+    refused(413, "/edit", &[("content-length", "1048577")], good);
+    refused(413, "/edit", &[("content-length", "99999999999999")], good);
+    let chunk = [format!("{:x}\r\n", (1 << 20) + 1).into_bytes(), vec![b' '; (1 << 20) + 1], b"\r\n0\r\n\r\n".to_vec()].concat();
+    refused(413, "/edit", &[("transfer-encoding", "chunked"), ("content-length", "")], &chunk);
+    for body in [&b"not JSON"[..], b"", b"{\"do\": \"x\"", b"\xff\xfe{}", b"[edit]\ndo = 1"] {
+        refused(400, "/edit", &[], body);
+    }
+    refused(400, "/edit", &[("content-length", "400")], good);
+    for target in ["/edit/", "//edit", "/Edit", "/%65dit", "/./edit", "/edit/../edit", "/player/edit", "/scene.splat4d", "/"] {
+        refused(405, target, &[], good);
+    }
+    assert!(tried > 30 && asked.lock().unwrap().is_empty(), "none of it reached the program");
+    for method in ["PUT", "DELETE", "PATCH", "OPTIONS"] {
+        let headers = [("origin", "http://localhost"), ("x-splat4d-token", TOKEN), ("content-type", "application/json")];
+        assert_eq!(ask(&server, method, "/edit", &headers).status, 405, "{method}");
+    }
+    assert_eq!(get(&server, "/edit").status, 404);
+    assert_eq!(get(&server, "/scene.splat4d").body, bytes(1000), "the scene is what it was");
+}
+
+#[test]
+fn without_leave_nothing_can_be_sent() {
+    let server = of_bytes(&bytes(10));
+    assert_eq!(post(&server, "/edit", &[], br#"{"do": "x"}"#).status, 405);
+    let config: Value = serde_json::from_slice(&get(&server, "/config.json").body).unwrap();
+    assert_eq!(config["edit"], false);
 }

@@ -4,15 +4,20 @@ use crate::console::Console;
 use crate::interrupt;
 use crate::playable::Playable;
 use crate::serving::{self, Place};
+use crate::editor::{self, Editor};
+use crate::source::{Source, not_empty};
+use crate::baking::title;
 use serde_json::json;
-use splat4d_serve::Config;
-use std::path::Path;
+use splat4d::Error;
+use splat4d_serve::{Config, Content, Editing};
+use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "\
 Examples:
   splat4d view runs/knight              play a run; works while it trains, too (its newest checkpoint)
   splat4d view scene.splat4d            or a playback file, a scene.safetensors, a 3DGS .ply
   splat4d view https://example.org/a.splat4d
+  splat4d view runs/knight --edit edits.toml    select, clean, recolour, move, bend; saved as a list (docs/edit.md)
   splat4d view runs/knight --no-open --port 8080
 
 On a machine without a screen it says how to look from another one through ssh. A scene on another web server is read
@@ -25,12 +30,26 @@ pub(crate) struct Args {
     /// The run, scene file, .ply, playback file, or the address of a playback file
     #[arg(value_name = "RUN|FILE|URL")]
     source: String,
+    /// Let the page edit, and save its list of edits in this file; it is made where it is not there
+    #[arg(long, value_name = "FILE")]
+    edit: Option<PathBuf>,
     #[command(flatten)]
     place: Place,
 }
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
-    let config = if ["http://", "https://"].iter().any(|scheme| args.source.starts_with(scheme)) {
+    let foreign = ["http://", "https://"].iter().any(|scheme| args.source.starts_with(scheme));
+    let mut token = None;
+    let config = if let Some(file) = &args.edit {
+        if foreign {
+            return Err(Error::input("a scene on another server cannot be edited")
+                .at(&args.source)
+                .remedy("Download it first.")
+                .into());
+        }
+        token = Some(editor::token()?);
+        editing(Path::new(&args.source), file, token.clone().expect("it was just made"), console)?
+    } else if foreign {
         let name = args.source.split(['?', '#']).next().and_then(|path| path.rsplit('/').next()).unwrap_or_default();
         Config { foreign: Some(args.source.clone()), about: json!({ "title": name }), ..Config::default() }
     } else {
@@ -38,9 +57,24 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         Config { content, about: json!({ "title": title }), ..Config::default() }
     };
     let stop = interrupt::flag("stopping");
-    let running = serving::start(config, &args.place, console)?;
+    let running = serving::start_for(config, &args.place, token.as_deref(), console)?;
     console.say("Ctrl-C stops it");
     serving::wait(&stop);
     running.stop();
     Ok(())
+}
+
+/// A server whose pages may edit the scene by a list.
+fn editing(path: &Path, file: &Path, token: String, console: &Console) -> anyhow::Result<Config> {
+    let source = Source::open(path)?;
+    not_empty(&source.scene, path)?;
+    source.warnings.lines().iter().for_each(|w| console.warn(&format!("{w}.")));
+    let title = title(&source, path);
+    let editor = Editor::new(source, title.clone(), file)?;
+    let content = match editor.start(console)? {
+        Some(bytes) => Content::Bytes(bytes.into()),
+        None => Playable::open(path, console)?.content,
+    };
+    let editing = Some(Editing::new(token, move |asked| editor.answer(asked)));
+    Ok(Config { content, editing, about: json!({ "title": title }), ..Config::default() })
 }

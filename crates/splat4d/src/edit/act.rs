@@ -279,7 +279,7 @@ fn fade(scene: &mut Scene<f32>, selected: &Selected, factor: f64) -> Result<()> 
         }
         selected.fill(false);
     }
-    wrap(scene, &others, &|_| Change::Fade { keys: vec![FadeKey { t: 0.0, factor }] })
+    wrap(scene, &others, &|_| Change::Fade { keys: vec![FadeKey { t: 0.0, factor, ease: false }] })
 }
 
 /// Moves the selected Gaussians by a similarity of the world.
@@ -316,7 +316,8 @@ fn similarity(place: &Place) -> Result<Sim3> {
 }
 
 fn path_key(key: &PlaceKey) -> Result<PathKey> {
-    Ok(PathKey { t: key.t, scale: key.scale.unwrap_or(1.0), turn: rotation(key.turn)?, shift: key.shift })
+    let (scale, turn) = (key.scale.unwrap_or(1.0), rotation(key.turn)?);
+    Ok(PathKey { t: key.t, scale, turn, shift: key.shift, ease: key.ease })
 }
 
 fn color_map(exposure: f64, tint: Option<[f64; 3]>, saturation: Option<f64>, curve: &[[f64; 2]]) -> Result<ColorMap> {

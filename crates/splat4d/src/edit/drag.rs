@@ -2,17 +2,19 @@
 
 use super::act::{parts, wrap};
 use super::{Context, Selected};
-use crate::layers::{Evaluation, Layer, Scene, sweep};
+use crate::layers::{Evaluation, Layer, Scene, freeze_rows, sweep};
 use crate::math::quat;
 use crate::math::se3::{add, norm, sub};
+use crate::motion::Still;
 use crate::motion::arap::{Elastic, Handle};
-use crate::motion::edited::{Change, DragSpec, Edited, NodeOffset, NodeOffsets};
+use crate::motion::edited::{Change, DragSpec, Edited, NodeOffset, NodeOffsets, eased};
 use crate::motion::skin::farthest_points;
 use crate::scene::splats::SPLAT_OPACITY;
-use crate::scene::{Rows, Table, Time};
+use crate::scene::{LifeKind, Rows, Space, Table, Time};
 use crate::{Error, Result};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+use std::sync::Arc;
 
 /// Nodes unless told (SC-GS).
 const NODES: usize = 512;
@@ -53,6 +55,9 @@ pub struct DragKey {
     pub t: f64,
     /// Scene units.
     pub by: [f64; 3],
+    /// Whether it is come to and left slowly.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub ease: bool,
 }
 
 /// A drag as it was asked for.
@@ -64,14 +69,20 @@ pub(super) struct Asked<'a> {
 }
 
 impl Asked<'_> {
-    fn check(&self, scene: &Scene<f32>) -> Result<()> {
+    fn check_moment(&self, scene: &Scene<f32>) -> Result<()> {
         let bad = |what: String, remedy: &str| Err(Error::input(what).remedy(remedy.to_owned()));
         if !(scene.clip[0]..=scene.clip[1]).contains(&self.at) {
             return bad(format!("{} s is not in the clip", self.at), "Give a second of the clip as `at`");
         }
-        if !(2..=MOST_TIMES * PULLING).contains(&self.nodes) {
-            return bad(format!("{} nodes", self.nodes), "Give 2 to 1024");
+        if self.nodes != 0 && !(2..=MOST_TIMES * PULLING).contains(&self.nodes) {
+            return bad(format!("{} nodes", self.nodes), "Give 2 to 1024, or 0 for those that the model has");
         }
+        Ok(())
+    }
+
+    fn check(&self, scene: &Scene<f32>) -> Result<()> {
+        let bad = |what: String, remedy: &str| Err(Error::input(what).remedy(remedy.to_owned()));
+        self.check_moment(scene)?;
         let sound = |h: &DragHandle| {
             let numbers = h.keys.iter().flat_map(|k| k.by.into_iter().chain([k.t]));
             !h.keys.is_empty()
@@ -110,7 +121,7 @@ fn displaced(keys: &[DragKey], t: f64) -> [f64; 3] {
         return keys[after.min(keys.len() - 1)].by;
     }
     let (a, b) = (&keys[after - 1], &keys[after]);
-    let u = (t - a.t) / (b.t - a.t);
+    let u = eased((t - a.t) / (b.t - a.t), [a.ease, b.ease]);
     std::array::from_fn(|k| a.by[k] * (1.0 - u) + b.by[k] * u)
 }
 
@@ -124,22 +135,52 @@ fn within(nodes: &[[f64; 3]], place: [f64; 3], radius: f64) -> Vec<usize> {
 /// Bends the selected Gaussians, which get layers of their own.
 pub(super) fn run(scene: &mut Scene<f32>, selected: &Selected, asked: &Asked<'_>, context: &dyn Context) -> Result<()> {
     asked.check(scene)?;
-    let start = nodes(scene, selected, asked)?;
     let (times, first) = asked.times(scene);
-    let paths = context.follow(scene, selected, &start, &times, first)?;
+    let (start, paths) = carried(scene, selected, asked, (&times, first), context)?;
     let elastic = Elastic::new(&start);
-    let held = |at: [f64; 4]| within(&start, [at[0], at[1], at[2]], at[3]);
-    let pinned: Vec<usize> = asked.pins.iter().flat_map(|p| held(*p)).collect();
-    let pulled: Vec<Vec<usize>> = asked
-        .handles
-        .iter()
-        .map(|h| held([h.place[0], h.place[1], h.place[2], h.radius]))
-        .map(|nodes| nodes.into_iter().filter(|n| !pinned.contains(n)).collect())
-        .collect();
-    if pulled.iter().all(Vec::is_empty) {
-        return Err(Error::input("every node of every handle is pinned").remedy("Move the pins away from the handles"));
+    let held = Held::of(&start, asked.handles.iter(), asked.pins)?;
+    let offsets = |(t, rest): (&f64, &Vec<[f64; 3]>)| {
+        let by: Vec<[f64; 3]> = asked.handles.iter().map(|h| displaced(&h.keys, *t)).collect();
+        held.offsets(&elastic.at_rest(rest), rest, &by)
+    };
+    let moments: Vec<_> = times.par_iter().zip(&paths).map(offsets).collect::<Result<_>>()?;
+    let all: Vec<_> = moments.into_iter().flatten().collect();
+    let bend = Bend { start: &start, paths: &paths, times: &times, at: asked.at };
+    for (place, pulls) in bend.around(scene, selected)? {
+        fill(&mut scene.layers[place], &NodeOffsets { nodes: all.clone(), pulls });
     }
-    let offsets = |(t, rest): (&f64, &Vec<[f64; 3]>)| -> Result<Vec<NodeOffset>> {
+    Ok(())
+}
+
+/// The nodes that are held: those that stay, and those of every handle.
+struct Held {
+    pinned: Vec<usize>,
+    pulled: Vec<Vec<usize>>,
+}
+
+impl Held {
+    /// Errors: all nodes of all handles are pinned.
+    fn of<'a>(
+        nodes: &[[f64; 3]],
+        handles: impl Iterator<Item = &'a DragHandle>,
+        pins: &[[f64; 4]],
+    ) -> Result<Self> {
+        let held = |at: [f64; 4]| within(nodes, [at[0], at[1], at[2]], at[3]);
+        let pinned: Vec<usize> = pins.iter().flat_map(|p| held(*p)).collect();
+        let pulled: Vec<Vec<usize>> = handles
+            .map(|h| held([h.place[0], h.place[1], h.place[2], h.radius]))
+            .map(|nodes| nodes.into_iter().filter(|n| !pinned.contains(n)).collect())
+            .collect();
+        if pulled.iter().all(Vec::is_empty) {
+            return Err(
+                Error::input("every node of every handle is pinned").remedy("Move the pins away from the handles")
+            );
+        }
+        Ok(Self { pinned, pulled })
+    }
+
+    /// What becomes of nodes at `rest` whose handles are displaced.
+    fn offsets(&self, elastic: &Elastic, rest: &[[f64; 3]], by: &[[f64; 3]]) -> Result<Vec<NodeOffset>> {
         let mut handles: Vec<Handle> = Vec::new();
         let mut hold = |node: usize, by: [f64; 3]| {
             // A node of two handles follows the first.
@@ -147,22 +188,161 @@ pub(super) fn run(scene: &mut Scene<f32>, selected: &Selected, asked: &Asked<'_>
                 handles.push(Handle { node, target: add(rest[node], by), rotation: None });
             }
         };
-        pinned.iter().for_each(|&n| hold(n, [0.0; 3]));
-        for (handle, nodes) in asked.handles.iter().zip(&pulled) {
-            let by = displaced(&handle.keys, *t);
-            nodes.iter().for_each(|&n| hold(n, by));
+        self.pinned.iter().for_each(|&n| hold(n, [0.0; 3]));
+        for (nodes, by) in self.pulled.iter().zip(by) {
+            nodes.iter().for_each(|&n| hold(n, *by));
         }
         if handles.iter().all(|h| h.target == rest[h.node]) {
-            return Ok(rest.iter().map(|x| (*x, [0.0; 3], [1.0, 0.0, 0.0, 0.0])).collect());
+            return Ok(unmoved(rest));
         }
-        let dragged = elastic.at_rest(rest).drag(&handles, ROUNDS)?;
+        let dragged = elastic.drag(&handles, ROUNDS)?;
         let turns = dragged.rotations.iter().map(quat::from_rotation);
         let moved = rest.iter().zip(&dragged.positions).zip(turns);
         Ok(moved.map(|((from, to), turn)| (*from, sub(*to, *from), turn)).collect())
+    }
+}
+
+fn unmoved(rest: &[[f64; 3]]) -> Vec<NodeOffset> {
+    rest.iter().map(|x| (*x, [0.0; 3], [1.0, 0.0, 0.0, 0.0])).collect()
+}
+
+/// A drag under the hand: one moment of a scene, of which nodes are pulled again and again. What is shown is what a step with
+/// the same nodes, handles and pins makes of that moment.
+#[derive(Clone, Debug)]
+pub struct Dragging {
+    scene: Scene<f32>,
+    elastic: Elastic,
+    /// Where the nodes are meant, and where they are at the moment that is shown.
+    places: Vec<[f64; 3]>,
+    nodes: Vec<[f64; 3]>,
+    /// Of the layers that bend: their place, and which nodes pull their rows.
+    bent: Vec<(usize, Vec<(u32, f32)>)>,
+}
+
+impl Dragging {
+    /// Takes hold of what is selected, as it is at second `now`, by nodes whose places are meant at second `at`.
+    ///
+    /// Errors: as of the step; a scene with a pixel head.
+    pub fn new(
+        scene: &Scene<f32>,
+        selected: &Selected,
+        [at, now]: [f64; 2],
+        nodes: usize,
+        context: &dyn Context,
+    ) -> Result<Self> {
+        scene.without_head("a drag under the hand")?;
+        let asked = Asked { at, nodes, handles: &[], pins: &[] };
+        asked.check_moment(scene)?;
+        Asked { at: now, ..asked }.check_moment(scene)?;
+        // Frame by frame, as a step follows them.
+        let between = |t: &f64| (at.min(now)..=at.max(now)).contains(t);
+        let mut times: Vec<f64> = asked.times(scene).0.into_iter().filter(between).chain([now]).collect();
+        times.sort_by(f64::total_cmp);
+        times.dedup();
+        let place = |t: f64| times.iter().position(|x| *x == t).expect("both ends are among them");
+        let (places, mut paths) = carried(scene, selected, &asked, (&times, place(at)), context)?;
+        let start = paths.swap_remove(place(now));
+        let at = now;
+        let (mut still, mut chosen) = (Scene { layers: Vec::new(), ..scene.clone() }, Vec::new());
+        let mut ids = Vec::new();
+        for (layer, selected) in scene.layers.iter().zip(selected) {
+            if layer.active(Time(at), &mut ids) {
+                ids = (0..layer.params.len() as u32).collect();
+            }
+            for wanted in [false, true] {
+                let rows: Vec<u32> = ids.iter().copied().filter(|id| selected[*id as usize] == wanted).collect();
+                if !rows.is_empty() {
+                    chosen.push(vec![wanted; rows.len()]);
+                    let params = freeze_rows(layer, &rows, Time(at));
+                    still.layers.push(Layer::new(&layer.name, params, Arc::new(Still), LifeKind::Infinite));
+                }
+            }
+        }
+        let (paths, times) = ([start.clone()], [at]);
+        let bent = Bend { start: &start, paths: &paths, times: &times, at }.around(&mut still, &chosen)?;
+        // The ties are those of the places, as a step has them.
+        let elastic = Elastic::new(&places).at_rest(&start);
+        let mut out = Self { scene: still, elastic, places, nodes: start, bent };
+        out.fill(&unmoved(&out.nodes));
+        Ok(out)
+    }
+
+    /// Where the nodes are meant: what handles and pins take is told by these.
+    pub fn places(&self) -> &[[f64; 3]] {
+        &self.places
+    }
+
+    /// Where the nodes are before anything is pulled.
+    pub fn nodes(&self) -> &[[f64; 3]] {
+        &self.nodes
+    }
+
+    /// The moment as it is bent now: the same at any time.
+    pub fn scene(&self) -> &Scene<f32> {
+        &self.scene
+    }
+
+    /// Displaces handles, whose keys do not count; without any, all is as it was. Returns where the nodes are.
+    ///
+    /// Errors: all nodes of all handles are pinned; numbers that are not finite.
+    pub fn pull(&mut self, handles: &[(DragHandle, [f64; 3])], pins: &[[f64; 4]]) -> Result<Vec<[f64; 3]>> {
+        let offsets = if handles.is_empty() {
+            unmoved(&self.nodes)
+        } else {
+            let by: Vec<[f64; 3]> = handles.iter().map(|h| h.1).collect();
+            Held::of(&self.places, handles.iter().map(|h| &h.0), pins)?.offsets(&self.elastic, &self.nodes, &by)?
+        };
+        self.fill(&offsets);
+        Ok(offsets.iter().map(|(place, shift, _)| add(*place, *shift)).collect())
+    }
+
+    fn fill(&mut self, offsets: &[NodeOffset]) {
+        for (place, pulls) in &self.bent {
+            fill(&mut self.scene.layers[*place], &NodeOffsets { nodes: offsets.to_vec(), pulls: pulls.clone() });
+        }
+    }
+}
+
+/// Writes a drag into the layer that [`Bend::around`] put it around.
+fn fill(layer: &mut Layer<f32>, offsets: &NodeOffsets) {
+    let motion = layer.motion.clone();
+    let edited = Edited::of(motion.as_ref()).expect("the drag was put around it");
+    edited.fill_drag(offsets, &mut layer.params);
+}
+
+/// Nodes at the moment `first` of `times`, and at all of them: the model's own, or new ones that are followed.
+fn carried(
+    scene: &Scene<f32>,
+    selected: &Selected,
+    asked: &Asked<'_>,
+    (times, first): (&[f64], usize),
+    context: &dyn Context,
+) -> Result<(Vec<[f64; 3]>, Vec<Vec<[f64; 3]>>)> {
+    if asked.nodes > 0 {
+        let start = nodes(scene, selected, asked)?;
+        let paths = context.follow(scene, selected, &start, times, first)?;
+        return Ok((start, paths));
+    }
+    let Some(layer) = own_nodes(scene, selected) else {
+        return Err(Error::input("what is selected has no control nodes of its own, or is of several layers that have")
+            .remedy("Give nodes = 512, or select one layer that a model on control nodes moves"));
     };
-    let moments: Vec<_> = times.par_iter().zip(&paths).map(offsets).collect::<Result<_>>()?;
-    let all: Vec<_> = moments.into_iter().flatten().collect();
-    bend(scene, selected, &Bend { start: &start, paths: &paths, times: &times, at: asked.at, nodes: all })
+    let at = |t: &f64| {
+        let seen = Evaluation::of_layer(layer, Space::Nodes, Rows::All, Time(*t));
+        let out = seen.tape(0).out();
+        (0..out.rows()).map(|j| layer.frame.apply(out.read::<3>(j, 0).map(f64::from))).collect()
+    };
+    let paths: Vec<Vec<[f64; 3]>> = times.iter().map(at).collect();
+    Ok((paths[first].clone(), paths))
+}
+
+/// The only layer with selected rows whose model has nodes; none of an edited model, whose nodes are those inside.
+pub(super) fn own_nodes<'a>(scene: &'a Scene<f32>, selected: &Selected) -> Option<&'a Layer<f32>> {
+    let has = |(l, s): &(&Layer<f32>, &Vec<bool>)| {
+        s.contains(&true) && l.params.rows_of(Space::Nodes) > 1 && Edited::of(l.motion.as_ref()).is_none()
+    };
+    let mut all = scene.layers.iter().zip(selected).filter(has).map(|(l, _)| l);
+    all.next().filter(|_| all.next().is_none())
 }
 
 /// Nodes at farthest points of the selected Gaussians that can be seen at `at`.
@@ -188,34 +368,29 @@ fn nodes(scene: &Scene<f32>, selected: &Selected, asked: &Asked<'_>) -> Result<V
     Ok(found)
 }
 
-/// Nodes over time, and what they do.
+/// Nodes over time.
 struct Bend<'a> {
     start: &'a [[f64; 3]],
     paths: &'a [Vec<[f64; 3]>],
     times: &'a [f64],
     at: f64,
-    nodes: Vec<NodeOffset>,
 }
 
-fn bend(scene: &mut Scene<f32>, selected: &Selected, bend: &Bend<'_>) -> Result<()> {
-    let count = bend.start.len();
-    let neighbours = PULLING.min(count - 1).max(1);
-    let index = |layer: &Layer<f32>| (0..).find(|i| layer.params.find(&format!("drag_nodes.{i}")).is_none());
-    let indices: Vec<u32> = scene.layers.iter().map(|l| index(l).expect("there are many numbers")).collect();
-    let change = |from: usize| {
-        let spec = DragSpec { index: indices[from], nodes: count, neighbours, times: bend.times.to_vec() };
-        Change::Drag(spec)
-    };
-    wrap(scene, selected, &change)?;
-    for (_, place) in parts(selected) {
-        let layer = &mut scene.layers[place];
-        let pulls = pulls(layer, bend, neighbours);
-        let offsets = NodeOffsets { nodes: bend.nodes.clone(), pulls };
-        let motion = layer.motion.clone();
-        let edited = Edited::of(motion.as_ref()).expect("the drag was just put around it");
-        edited.fill_drag(&offsets, &mut layer.params);
+impl Bend<'_> {
+    /// Puts a drag around the selected Gaussians, which get layers of their own; returns the places of those, and which nodes
+    /// pull their rows. It is to be filled.
+    fn around(&self, scene: &mut Scene<f32>, selected: &Selected) -> Result<Vec<(usize, Vec<(u32, f32)>)>> {
+        let count = self.start.len();
+        let neighbours = PULLING.min(count - 1).max(1);
+        let index = |layer: &Layer<f32>| (0..).find(|i| layer.params.find(&format!("drag_nodes.{i}")).is_none());
+        let indices: Vec<u32> = scene.layers.iter().map(|l| index(l).expect("there are many numbers")).collect();
+        let change = |from: usize| {
+            let spec = DragSpec { index: indices[from], nodes: count, neighbours, times: self.times.to_vec() };
+            Change::Drag(spec)
+        };
+        wrap(scene, selected, &change)?;
+        Ok(parts(selected).into_iter().map(|(_, at)| (at, pulls(&scene.layers[at], self, neighbours))).collect())
     }
-    Ok(())
 }
 
 /// Of every Gaussian the nodes that pull it, by where they are while it is there: kernels of its distances, that of the next

@@ -193,6 +193,10 @@ fn evaluate(expr: &Expr, scene: &Scene<f32>, looks: &Looks, context: &dyn Contex
         Expr::All => rows(&|_, _| true),
         Expr::Box(low, high) => places(&|x| (0..3).all(|k| (low[k]..=high[k]).contains(&x[k]))),
         Expr::Sphere(center, radius) => places(&|x| norm(sub(x, *center)) <= *radius),
+        Expr::Lasso(lasso) => {
+            let turn = lasso.cam_from_world();
+            places(&|x| lasso.holds(&turn, x))
+        }
         Expr::Frustum(name, [near, far]) => {
             let camera = context.camera(name)?;
             places(&|x| pixel(&camera, x).is_some_and(|(_, z)| z >= near.max(camera.near) && z <= *far))

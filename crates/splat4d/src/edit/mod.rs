@@ -12,9 +12,9 @@ mod select;
 #[cfg(test)]
 mod tests;
 
-pub use drag::{DragHandle, DragKey};
+pub use drag::{DragHandle, DragKey, Dragging};
 pub use look::{Selected, select};
-pub use select::Expr;
+pub use select::{Expr, Lasso, within};
 
 use crate::layers::Scene;
 use crate::motion::edited::FadeKey;
@@ -93,6 +93,9 @@ pub struct PlaceKey {
     pub turn: Option<[f64; 4]>,
     /// How many times as large.
     pub scale: Option<f64>,
+    /// Whether it is come to and left slowly.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub ease: bool,
 }
 
 /// One step. `select` is a selection in words, see [`Expr`].
@@ -212,7 +215,7 @@ pub enum Step {
         select: String,
         /// Second at which the places below are meant.
         at: f64,
-        /// Nodes.
+        /// Nodes; 0: those that the model has.
         #[serde(default = "drag::usual_nodes")]
         nodes: usize,
         /// What is pulled, and where to.
@@ -335,14 +338,26 @@ pub struct Done {
 /// numbers out of range, what a pixel head cannot show.
 pub fn replay(
     steps: &[Step],
+    scene: Scene<f32>,
+    context: &dyn Context,
+    progress: &mut dyn FnMut(usize, usize),
+) -> Result<(Scene<f32>, Vec<Done>)> {
+    replay_after(Vec::new(), steps, scene, context, progress)
+}
+
+/// The same, on a scene on which others were run before; what those did comes back in front.
+///
+/// Errors: as [`replay`].
+pub fn replay_after(
+    mut done: Vec<Done>,
+    steps: &[Step],
     mut scene: Scene<f32>,
     context: &dyn Context,
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<(Scene<f32>, Vec<Done>)> {
-    let mut done = Vec::new();
     for (i, step) in steps.iter().enumerate() {
         progress(i, steps.len());
-        let at = |e: Error| e.at(format!("edit {} ({})", i + 1, step.name()));
+        let at = |e: Error| e.at(format!("edit {} ({})", done.len() + 1, step.name()));
         let selected = act::run(step, &mut scene, context).map_err(at)?;
         done.push(Done { step: step.name(), selected, gaussians: scene.len() });
     }
@@ -355,6 +370,17 @@ pub fn replay(
 /// How many Gaussians a selection holds, and of them how many can be seen at each of `times`.
 pub fn count(expr: &Expr, scene: &Scene<f32>, times: &[f64], context: &dyn Context) -> Result<(usize, Vec<usize>)> {
     let selected = select(expr, scene, context)?;
+    let over_time = seen(&selected, scene, times);
+    Ok((selected.iter().flatten().filter(|s| **s).count(), over_time))
+}
+
+/// Whether a drag of the selected can take the nodes that their model has (`nodes = 0`).
+pub fn has_nodes(scene: &Scene<f32>, selected: &Selected) -> bool {
+    drag::own_nodes(scene, selected).is_some()
+}
+
+/// How many of the selected can be seen at each of `times`.
+pub fn seen(selected: &Selected, scene: &Scene<f32>, times: &[f64]) -> Vec<usize> {
     let mut ids = Vec::new();
     let mut alive = |t: f64| {
         let of = |(layer, selected): (&crate::layers::Layer, &Vec<bool>)| {
@@ -362,8 +388,7 @@ pub fn count(expr: &Expr, scene: &Scene<f32>, times: &[f64], context: &dyn Conte
             let chosen = |i: &&u32| selected[**i as usize];
             if all { selected.iter().filter(|s| **s).count() } else { ids.iter().filter(chosen).count() }
         };
-        scene.layers.iter().zip(&selected).map(of).sum()
+        scene.layers.iter().zip(selected).map(of).sum()
     };
-    let over_time = times.iter().map(|&t| alive(t)).collect();
-    Ok((selected.iter().flatten().filter(|s| **s).count(), over_time))
+    times.iter().map(|&t| alive(t)).collect()
 }

@@ -3,11 +3,15 @@
 //! `box(-1,-1,0, 1,1,2) and not color(0,0.6,0, 0.2)`: predicates of places, looks and lives, never row numbers, so that a
 //! selection finds the same thing again after the scene was trained anew. See docs/edit.md for the list.
 
+use crate::math::quat;
+use crate::math::se3::{mat_vec, sub, transpose};
 use crate::{Error, Result};
 use std::fmt;
 
 /// Deepest nesting of a selection: a bound for files.
 const DEEPEST: usize = 64;
+/// Most corners of a lasso: a bound for files.
+const MOST_CORNERS: usize = 1024;
 
 /// A selection.
 #[derive(Clone, Debug, PartialEq)]
@@ -33,6 +37,8 @@ pub enum Expr {
     Speed(f64, f64),
     /// Name of a layer.
     Layer(String),
+    /// Within what was drawn on a picture.
+    Lasso(Box<Lasso>),
     /// On the white of a mask picture, seen by a camera.
     Mask(String, String),
     /// On the subject, as the capture's masks have it.
@@ -53,7 +59,56 @@ pub enum Expr {
     Not(Box<Expr>),
 }
 
+/// A polygon on a picture, and how far behind it is looked.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Lasso {
+    /// Where the picture was seen from, scene units.
+    pub eye: [f64; 3],
+    /// World from camera, wxyz of any length but zero; camera axes are OpenCV's.
+    pub turn: [f64; 4],
+    /// Depths z, nearest and farthest, scene units.
+    pub range: [f64; 2],
+    /// Corners as x/z and y/z in the camera's axes, three or more.
+    pub corners: Vec<[f64; 2]>,
+}
+
+impl Lasso {
+    /// Whether a point lies behind the polygon, within the depths.
+    pub(super) fn holds(&self, cam_from_world: &[[f64; 3]; 3], x: [f64; 3]) -> bool {
+        let p = mat_vec(cam_from_world, sub(x, self.eye));
+        let deep = p[2] > 0.0 && (self.range[0]..=self.range[1]).contains(&p[2]);
+        deep && within(&self.corners, [p[0] / p[2], p[1] / p[2]])
+    }
+
+    /// Rows of the rotation from the world to the camera.
+    pub(super) fn cam_from_world(&self) -> [[f64; 3]; 3] {
+        transpose(&quat::to_rotation(quat::normalize(self.turn).0))
+    }
+}
+
+/// Whether a point lies within a polygon, by the even-odd rule.
+pub fn within(polygon: &[[f64; 2]], [x, y]: [f64; 2]) -> bool {
+    let mut inside = false;
+    for (i, a) in polygon.iter().enumerate() {
+        let b = polygon[(i + 1) % polygon.len()];
+        if (a[1] > y) != (b[1] > y) && x < (b[0] - a[0]) * (y - a[1]) / (b[1] - a[1]) + a[0] {
+            inside = !inside;
+        }
+    }
+    inside
+}
+
 impl Expr {
+    /// Names of the files that it reads.
+    pub fn files(&self) -> Vec<String> {
+        match self {
+            Expr::Mask(file, _) => vec![file.clone()],
+            Expr::At(_, e) | Expr::Ever(e) | Expr::Always(e) | Expr::Grow(e, _) | Expr::Not(e) => e.files(),
+            Expr::And(a, b) | Expr::Or(a, b) => a.files().into_iter().chain(b.files()).collect(),
+            _ => Vec::new(),
+        }
+    }
+
     /// Reads a selection. Errors: the first place that cannot be read, and what may stand there.
     pub fn parse(text: &str) -> Result<Self> {
         let mut parser = Parser { text, tokens: tokens(text)?, at: 0, depth: 0 };
@@ -100,7 +155,8 @@ impl fmt::Display for Token {
 fn unreadable(text: &str, what: &str) -> Error {
     Error::input(format!("the selection `{text}` cannot be read: {what}")).remedy(
         "It is made of box(x0,y0,z0, x1,y1,z1), sphere(x,y,z, r), frustum(camera), color(r,g,b, near), opacity(from,to), \
-         size(from,to), life(from,to), speed(from,to), layer(name), mask(file, camera), subject, all, at(t, ...), \
+         size(from,to), life(from,to), speed(from,to), layer(name), mask(file, camera), subject, lasso(...), all, \
+         at(t, ...), \
          ever(...), always(...), grow(..., distance), and, or, not and parentheses",
     )
 }
@@ -257,6 +313,7 @@ impl Parser<'_> {
                 self.expect(Token::Comma)?;
                 Expr::Mask(file, self.name()?)
             }
+            "lasso" => Expr::Lasso(Box::new(self.lasso()?)),
             "at" => {
                 let [t] = self.numbers()?;
                 self.expect(Token::Comma)?;
@@ -305,6 +362,21 @@ impl Parser<'_> {
         Ok(out)
     }
 
+    /// Eye, turn, depths and corners.
+    fn lasso(&mut self) -> Result<Lasso> {
+        let head: [f64; 9] = self.numbers()?;
+        let mut corners = Vec::new();
+        while self.peek() == Some(&Token::Comma) && corners.len() < MOST_CORNERS {
+            self.at += 1;
+            corners.push(self.numbers()?);
+        }
+        let [ex, ey, ez, w, x, y, z, near, far] = head;
+        if corners.len() < 3 || [w, x, y, z].iter().map(|q| q * q).sum::<f64>() == 0.0 {
+            return Err(self.wrong("a lasso has an eye, a turn, two depths, and three corners or more"));
+        }
+        Ok(Lasso { eye: [ex, ey, ez], turn: [w, x, y, z], range: [near, far], corners })
+    }
+
     /// A name, with or without quotation marks.
     fn name(&mut self) -> Result<String> {
         match self.peek().cloned() {
@@ -331,6 +403,18 @@ mod tests {
         assert_eq!(Expr::parse("frustum(00, 1e-1, 2)").unwrap(), Expr::Frustum("00".into(), [0.1, 2.0]));
         assert_eq!(Expr::parse("mask(m/a.png, \"cam 1\")").unwrap(), Expr::Mask("m/a.png".into(), "cam 1".into()));
         assert!(Expr::parse("grow(all, 0.1)").unwrap().any(&|e| *e == Expr::All));
+        let Expr::Not(lasso) = Expr::parse("not lasso(1,2,3, 1,0,0,0, 0.5,9, 0,0, 1,0, 0.5,1)").unwrap() else { panic!() };
+        let Expr::Lasso(lasso) = *lasso else { panic!() };
+        assert_eq!((lasso.eye, lasso.range, lasso.corners.len()), ([1.0, 2.0, 3.0], [0.5, 9.0], 3));
+        assert_eq!(Expr::parse("not (mask(a, b) and all)").unwrap().files(), ["a"]);
+    }
+
+    #[test]
+    fn a_point_is_within_a_polygon_by_the_even_odd_rule() {
+        let horseshoe = [[0.0, 0.0], [3.0, 0.0], [3.0, 3.0], [2.0, 3.0], [2.0, 1.0], [1.0, 1.0], [1.0, 3.0], [0.0, 3.0]];
+        for (point, inside) in [([0.5, 2.0], true), ([1.5, 2.0], false), ([2.5, 2.0], true), ([1.5, 0.5], true), ([4.0, 0.5], false)] {
+            assert_eq!(within(&horseshoe, point), inside, "{point:?}");
+        }
     }
 
     #[test]
@@ -344,6 +428,9 @@ mod tests {
             ("sphere(0,0,0,nan)", "4 numbers"),
             ("layer('x", "quotation"),
             ("grow(all, 0)", "above 0"),
+            ("lasso(0,0,0, 1,0,0,0, 1,9, 0,0, 1,0)", "three corners"),
+            ("lasso(0,0,0, 0,0,0,0, 1,9, 0,0, 1,0, 0,1)", "a turn"),
+            ("lasso(0,0,0, 1,0,0,0, 1,9, 0,0, 1,0, 0)", "2 numbers"),
             ("and", "and"),
         ] {
             let error = Expr::parse(text).unwrap_err().to_string();

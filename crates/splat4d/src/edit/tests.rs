@@ -10,7 +10,7 @@ use crate::motion::{SpacetimeSpec, Spec, build};
 use crate::nn::hexplane::PlaneShape;
 use crate::render::RenderConfig;
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
-use crate::scene::{GEOMETRY, LIFE, LifeKind, Params, SH};
+use crate::scene::{GEOMETRY, LIFE, LifeKind, Params, Rows, SH, Space};
 
 /// A context that has one camera, one mask and one scene; nodes stand still.
 struct Bench {
@@ -526,5 +526,82 @@ fn a_subject_alone_has_no_halo() {
         // Where the subject is not, nothing is left.
         let outside = b.alpha.data.iter().zip(&a.alpha.data).filter(|(truth, _)| **truth < 0.01);
         assert!(outside.clone().count() > 3000 && outside.clone().all(|(_, alone)| *alone < 0.02), "a halo");
+    }
+}
+
+#[test]
+fn a_lasso_holds_what_lies_behind_what_was_drawn() {
+    let scene = &scenes()[3];
+    let camera = front();
+    let world = camera.cam_from_world.inverse();
+    let turn = quat::from_rotation(&world.rotation).map(|x| x.to_string()).join(",");
+    let eye = world.translation.map(|x| x.to_string()).join(",");
+    let half = |range: &str| format!("lasso({eye}, {turn}, {range}, 0,-1, 1,-1, 1,1, 0,1)");
+    let found = |text: &str| select(&Expr::parse(text).unwrap(), scene, &Bench::empty()).unwrap().remove(0);
+    let (all, near) = (found(&half("0,100")), found(&half("0,5")));
+    for (row, x) in scene.layers[0].means().enumerate() {
+        let p = camera.cam_from_world.apply(x);
+        assert_eq!(all[row], p[0] > 0.0, "row {row}");
+        assert_eq!(near[row], p[0] > 0.0 && p[2] <= 5.0, "row {row}");
+    }
+    assert!(near.contains(&true) && near != all);
+}
+
+#[test]
+fn eased_keys_are_left_and_come_to_slowly_and_meet_where_even_ones_do() {
+    let scene = &scenes()[3];
+    let path = |ease: bool, t: f64| {
+        let keys = format!(
+            r#"[{{"do":"move","select":"all","keys":[{{"t":0,"ease":{ease}}},{{"t":1,"shift":[0,0,1],"ease":{ease}}}]}}]"#
+        );
+        let moved = run(&keys, scene).unwrap();
+        let mut seen = Evaluation::default();
+        moved.at(Time(t), &mut seen);
+        f64::from(seen.tape(0).out().get(0, 2)) - scene.layers[0].means().next().unwrap()[2]
+    };
+    for (t, way) in [(0.0, 0.0), (0.5, 0.5), (1.0, 1.0)] {
+        assert!((path(true, t) - way).abs() < 1e-6 && (path(false, t) - way).abs() < 1e-6, "{t}");
+    }
+    assert!((path(true, 0.1) - 0.028).abs() < 1e-6 && (path(false, 0.1) - 0.1).abs() < 1e-6);
+}
+
+#[test]
+fn the_nodes_of_a_model_bend_what_is_on_them() {
+    let scene = &scenes()[2];
+    let all: Selected = vec![vec![true; 150]];
+    let own = Evaluation::of_layer(&scene.layers[0], Space::Nodes, Rows::All, Time(0.5));
+    let mut dragging = Dragging::new(scene, &all, [0.5, 0.5], 0, &Bench::empty()).unwrap();
+    assert_eq!(dragging.nodes().len(), scene.layers[0].params.rows_of(Space::Nodes));
+    assert_eq!(dragging.nodes()[1], own.tape(0).out().read::<3>(1, 0).map(f64::from));
+    let handle = DragHandle { place: dragging.nodes()[0], radius: 0.0, keys: vec![DragKey { t: 0.5, by: [0.5; 3], ease: false }] };
+    dragging.pull(&[(handle.clone(), [0.5; 3])], &[]).unwrap();
+    let step = |nodes| Step::Drag { select: "all".into(), at: 0.5, nodes, handles: vec![handle.clone()], pins: Vec::new() };
+    let (bent, _) = replay(&[step(0)], scene.clone(), &Bench::empty(), &mut |_, _| {}).unwrap();
+    let same = psnr(&draw(&bent, 0.5), &draw(dragging.scene(), 0.0));
+    assert!(same > 50.0, "{same} dB");
+    let error = replay(&[step(0)], scenes()[0].clone(), &Bench::empty(), &mut |_, _| {}).unwrap_err().to_string();
+    assert!(error.contains("no control nodes") && error.contains("512"), "{error}");
+}
+
+#[test]
+fn what_is_bent_under_the_hand_is_what_the_step_makes_of_it() {
+    for scene in scenes() {
+        let bench = Bench::empty();
+        let all: Selected = scene.layers.iter().map(|l| vec![true; l.params.len()]).collect();
+        for now in [0.5, 0.75] {
+            let mut dragging = Dragging::new(&scene, &all, [0.5, now], 24, &bench).unwrap();
+            let place = dragging.places()[3];
+            let handle = DragHandle { place, radius: 0.1, keys: vec![DragKey { t: 0.5, by: [0.4, 0.1, 0.0], ease: false }] };
+            let pins = [[0.0, 0.0, 0.0, 0.2]];
+            let nodes = dragging.pull(&[(handle.clone(), [0.4, 0.1, 0.0])], &pins).unwrap();
+            assert!((nodes[3][0] - dragging.nodes()[3][0] - 0.4).abs() < 1e-9);
+            let step = Step::Drag { select: "all".into(), at: 0.5, nodes: 24, handles: vec![handle], pins: pins.to_vec() };
+            let (bent, _) = replay(&[step], scene.clone(), &bench, &mut |_, _| {}).unwrap();
+            let same = psnr(&draw(&bent, now), &draw(dragging.scene(), 0.0));
+            assert!(same > 50.0, "{same} dB at {now}");
+            assert!(psnr(&draw(&scene, now), &draw(dragging.scene(), 0.0)) < 35.0, "something was bent");
+            dragging.pull(&[], &[]).unwrap();
+            assert!(psnr(&draw(&scene, now), &draw(dragging.scene(), 0.0)) > 50.0, "let go, it is as it was");
+        }
     }
 }

@@ -20,6 +20,7 @@ mod tests;
 
 pub use color::ColorMap;
 pub use drag::{DragSpec, NodeOffset, NodeOffsets};
+pub(crate) use path::eased;
 pub use path::{FadeKey, PathKey};
 
 use super::{At, Cache, Capabilities, Model, Motion, Phase, Spec, Tape, central_velocity};

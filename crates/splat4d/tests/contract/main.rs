@@ -181,7 +181,7 @@ fn filtered() {
 
 #[test]
 fn edited() {
-    let key = |t, scale, turn, shift| PathKey { t, scale, turn, shift };
+    let key = |t, scale, turn, shift| PathKey { t, scale, turn, shift, ease: t > 0.0 };
     let keys = vec![
         key(-0.37, 1.0, [1.0, 0.2, 0.0, 0.1], [0.0, 0.1, 0.0]),
         key(0.513, 1.3, [0.7, -0.4, 0.3, 0.2], [0.3, 0.1, -0.2]),
@@ -189,7 +189,7 @@ fn edited() {
     ];
     let matrix = [[0.8, 0.1, 0.05], [0.02, 1.1, -0.1], [0.1, 0.0, 0.9]];
     let curve = vec![[0.0, 0.05], [0.513, 0.6], [1.0, 0.9]];
-    let fades = [(-0.2, 0.9), (0.63, 0.4), (1.4, 1.0)].map(|(t, factor)| FadeKey { t, factor });
+    let fades = [(-0.2, 0.9), (0.63, 0.4), (1.4, 1.0)].map(|(t, factor)| FadeKey { t, factor, ease: t > 1.0 });
     let changes = [
         Change::Clock { rate: -0.7, offset: 0.9 },
         Change::Path { about: [0.1, -0.2, 0.3], keys },

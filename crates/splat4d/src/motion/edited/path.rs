@@ -19,18 +19,22 @@ pub struct PathKey {
     pub turn: [f64; 4],
     /// Scene units.
     pub shift: [f64; 3],
+    /// Whether it is come to and left slowly.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub ease: bool,
 }
 
 impl Default for PathKey {
     fn default() -> Self {
-        Self { t: 0.0, scale: 1.0, turn: [1.0, 0.0, 0.0, 0.0], shift: [0.0; 3] }
+        Self { t: 0.0, scale: 1.0, turn: [1.0, 0.0, 0.0, 0.0], shift: [0.0; 3], ease: false }
     }
 }
 
 impl PathKey {
     /// A similarity at a time.
     pub fn new(t: f64, at: &Sim3) -> Self {
-        Self { t, scale: at.scale, turn: quat::from_rotation(&at.rotation), shift: at.translation }
+        let turn = quat::from_rotation(&at.rotation);
+        Self { t, scale: at.scale, turn, shift: at.translation, ease: false }
     }
 
     /// The similarity about a point.
@@ -55,6 +59,19 @@ pub struct FadeKey {
     pub t: f64,
     /// 0 to 1.
     pub factor: f64,
+    /// Whether it is come to and left slowly.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub ease: bool,
+}
+
+/// How far something is on its way at the share u of its time: evenly, or slowly at the ends that ease (Hermite's cubic with
+/// slope 0 there and 1 elsewhere).
+pub(crate) fn eased(u: f64, ease: [bool; 2]) -> f64 {
+    if ease == [false; 2] {
+        return u;
+    }
+    let [from, to] = ease.map(|e| if e { 0.0 } else { 1.0 });
+    u * (from + u * (3.0 - 2.0 * from - to + u * (from + to - 2.0)))
 }
 
 pub(super) fn sound(about: &[f64; 3], keys: &[PathKey]) -> bool {
@@ -86,8 +103,10 @@ pub(super) fn at(about: [f64; 3], keys: &[PathKey], t: f64) -> Sim3 {
         return keys[a].similarity(about);
     }
     let (a, b) = (&keys[a], &keys[b]);
+    let u = eased(u, [a.ease, b.ease]);
     PathKey {
         t,
+        ease: false,
         scale: (a.scale.ln() * (1.0 - u) + b.scale.ln() * u).exp(),
         turn: slerp(quat::normalize(a.turn).0, quat::normalize(b.turn).0, u),
         shift: std::array::from_fn(|k| scale(a.shift, 1.0 - u)[k] + scale(b.shift, u)[k]),
@@ -97,6 +116,7 @@ pub(super) fn at(about: [f64; 3], keys: &[PathKey], t: f64) -> Sim3 {
 
 pub(super) fn factor(keys: &[FadeKey], t: f64) -> f64 {
     let (a, b, u) = around(keys.len(), |k| keys[k].t, t);
+    let u = eased(u, [keys[a].ease, keys[b].ease]);
     keys[a].factor * (1.0 - u) + keys[b].factor * u
 }
 

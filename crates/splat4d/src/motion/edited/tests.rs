@@ -74,7 +74,7 @@ fn what_cannot_be_is_refused() {
         (Change::Path { about: [0.0; 3], keys: vec![] }, "keys"),
         (Change::Path { about: [0.0; 3], keys: vec![key(1.0), key(1.0)] }, "keys"),
         (Change::Path { about: [0.0; 3], keys: vec![PathKey { scale: 0.0, ..key(0.0) }] }, "similarities"),
-        (Change::Fade { keys: vec![FadeKey { t: 0.0, factor: 1.5 }] }, "factors"),
+        (Change::Fade { keys: vec![FadeKey { t: 0.0, factor: 1.5, ease: false }] }, "factors"),
         (Change::Drag(DragSpec { index: 0, nodes: 0, neighbours: 2, times: vec![0.0] }), "nodes"),
     ] {
         let error = Edited::around(Arc::new(Still), change, &mut p).err().expect("it cannot be").to_string();

@@ -1,0 +1,156 @@
+//! The one thing that a page may send: what it wants of a list of edits, where the program was started to edit.
+//!
+//! A page of any origin in the user's browser can send a form to loopback. This asks for more than a form can bring: a
+//! token that only the address which the program printed holds, JSON (for which a browser asks leave first, and gets none),
+//! and our own origin. What is done with it is the program's business; it may answer with another scene.
+
+use crate::answer::{Shared, text, whole};
+use crate::body::Body;
+use crate::write_timeout::{Either, either};
+use hyper::body::{Bytes, Incoming};
+use hyper::header;
+use hyper::http::request::Parts;
+use hyper::{Response, StatusCode};
+use serde_json::{Value, json};
+use splat4d::{Error, Result};
+use std::fmt;
+use std::future::poll_fn;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::sync::oneshot;
+
+/// Name of the route.
+pub(crate) const ROUTE: &str = "/edit";
+/// The header that holds the token.
+const TOKEN: &str = "x-splat4d-token";
+/// Most bytes that a page may send: ten thousand steps of a hundred bytes.
+const MAX_BODY: usize = 1 << 20;
+/// A body must be complete in this time.
+const BODY_TIME: Duration = Duration::from_secs(10);
+/// Questions that are worked on at a time: one that takes long, and one that looks meanwhile.
+pub(crate) const AT_ONCE: usize = 2;
+/// Least length of a token: shorter ones could be guessed.
+const LEAST_TOKEN: usize = 16;
+
+/// What a program answers to a page that edits.
+#[derive(Clone, Debug, Default)]
+pub struct EditAnswer {
+    /// Told to the page.
+    pub told: Value,
+    /// The scene from now on, a `.splat4d`; `told` gets its number as `version`.
+    pub scene: Option<Arc<[u8]>>,
+}
+
+/// Does what a page asks for.
+type Answer = dyn Fn(Value) -> Result<EditAnswer> + Send + Sync;
+
+/// Leave for pages that bring a token to ask a program for edits.
+#[derive(Clone)]
+pub struct Editing {
+    token: String,
+    answer: Arc<Answer>,
+}
+
+impl fmt::Debug for Editing {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Editing")
+    }
+}
+
+impl Editing {
+    /// `answer` is called on a thread of its own, on two at a time. Panics: a token that could be guessed.
+    pub fn new(token: String, answer: impl Fn(Value) -> Result<EditAnswer> + Send + Sync + 'static) -> Self {
+        assert!(token.len() >= LEAST_TOKEN && token.bytes().all(|b| b.is_ascii_alphanumeric()), "a token is random");
+        Self { token, answer: Arc::new(answer) }
+    }
+
+    /// Why a request may not edit. Host and origins that were sent are checked already.
+    fn refuses(&self, request: &Parts) -> Option<(StatusCode, &'static str)> {
+        let mut tokens = request.headers.get_all(TOKEN).iter();
+        let token = tokens.next().filter(|_| tokens.next().is_none());
+        if !token.is_some_and(|t| same(t.as_bytes(), self.token.as_bytes())) {
+            return Some((StatusCode::FORBIDDEN, "the token is missing or wrong: open the address that splat4d printed"));
+        }
+        let one = |name: &str| request.headers.get(name).and_then(|v| v.to_str().ok());
+        if request.headers.get_all(header::ORIGIN).iter().count() != 1 {
+            return Some((StatusCode::FORBIDDEN, "a page says its origin once"));
+        }
+        if one("sec-fetch-site").is_some_and(|site| site != "same-origin") {
+            return Some((StatusCode::FORBIDDEN, "only the player's own page may edit"));
+        }
+        let json = one("content-type").is_some_and(|t| t.split(';').next().is_some_and(|t| t.trim() == "application/json"));
+        if !json {
+            return Some((StatusCode::UNSUPPORTED_MEDIA_TYPE, "edits are application/json"));
+        }
+        let length = one("content-length").and_then(|l| l.parse::<usize>().ok());
+        if length.is_some_and(|l| l > MAX_BODY) {
+            return Some(TOO_LARGE);
+        }
+        None
+    }
+}
+
+const TOO_LARGE: (StatusCode, &str) = (StatusCode::PAYLOAD_TOO_LARGE, "a list of edits has at most a megabyte");
+
+/// Compares in a time that does not tell where two texts differ.
+fn same(a: &[u8], b: &[u8]) -> bool {
+    a.len() == b.len() && a.iter().zip(b).fold(0, |sum, (a, b)| sum | (a ^ b)) == 0
+}
+
+/// Answers what a page sent. Must be called on the server's runtime.
+pub(crate) async fn answer(shared: &Arc<Shared>, editing: &Editing, request: &Parts, body: Incoming) -> Response<Body> {
+    if let Some((status, why)) = editing.refuses(request) {
+        return text(status, why);
+    }
+    let asked = match either(tokio::time::sleep(BODY_TIME), read(body)).await {
+        Either::First(()) => return text(StatusCode::REQUEST_TIMEOUT, "the edits did not arrive"),
+        Either::Second(Err((status, why))) => return text(status, why),
+        Either::Second(Ok(bytes)) => bytes,
+    };
+    let Ok(asked) = serde_json::from_slice::<Value>(&asked) else {
+        return text(StatusCode::BAD_REQUEST, "this is no JSON");
+    };
+    let place = shared.editors.clone().acquire_owned().await.expect("it is never closed");
+    let (sender, told) = oneshot::channel();
+    let work = editing.answer.clone();
+    let spawned = std::thread::Builder::new().name("splat4d-edit".into()).spawn(move || {
+        let _place = place;
+        // A page that has gone hears nothing.
+        let _ = sender.send(work(asked));
+    });
+    // A panic of the work ends its thread, and with it the channel.
+    let done = if spawned.is_ok() { told.await.ok() } else { None };
+    match done {
+        None => text(StatusCode::INTERNAL_SERVER_ERROR, "the edit failed; the program's terminal says more"),
+        Some(Err(error)) => refused(&error),
+        Some(Ok(EditAnswer { mut told, scene })) => {
+            if let Some(bytes) = scene {
+                told["version"] = json!(shared.scene.set(bytes));
+            }
+            whole(told.to_string().into(), "application/json")
+        }
+    }
+}
+
+/// What cannot be done is told as JSON.
+fn refused(error: &Error) -> Response<Body> {
+    let mut response = whole(json!({ "error": error.to_string() }).to_string().into(), "application/json");
+    *response.status_mut() = StatusCode::UNPROCESSABLE_ENTITY;
+    response
+}
+
+/// The whole body, within its bound.
+async fn read(mut body: Incoming) -> Result<Bytes, (StatusCode, &'static str)> {
+    let mut all = Vec::new();
+    while let Some(frame) = poll_fn(|cx| http_body::Body::poll_frame(Pin::new(&mut body), cx)).await {
+        let frame = frame.map_err(|_| (StatusCode::BAD_REQUEST, "the edits were cut short"))?;
+        if let Ok(data) = frame.into_data() {
+            if all.len() + data.len() > MAX_BODY {
+                return Err(TOO_LARGE);
+            }
+            all.extend_from_slice(&data);
+        }
+    }
+    Ok(all.into())
+}
