@@ -43,7 +43,10 @@ const ORDER: [(&str, &[&str]); 8] = [
             "assimilate",
         ],
     ),
-    ("crates/splat4d-import", &["calibration", "video", "sync", "sfm", "corrections", "write", "take", "doctor"]),
+    (
+        "crates/splat4d-import",
+        &["board", "calibration", "video", "sync", "sfm", "corrections", "write", "take", "doctor"],
+    ),
     (
         "crates/splat4d-serve",
         &["write_timeout", "body", "range", "guard", "scene", "assets", "page", "events", "answer", "server"],

@@ -1,6 +1,7 @@
 //! Makes captures of videos: frames with their times, a clock that all cameras share, poses from pictures alone, and a folder that
 //! training takes.
 
+pub mod board;
 pub mod calibration;
 pub mod corrections;
 pub mod doctor;

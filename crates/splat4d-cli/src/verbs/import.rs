@@ -5,6 +5,7 @@ use crate::interrupt;
 use crate::report::doctor;
 use serde_json::json;
 use splat4d::{Error, ErrorKind};
+use splat4d_import::board::Board;
 use splat4d_import::corrections;
 use splat4d_import::doctor::{Grade, Report as Looked};
 use splat4d_import::take::{self, CameraReport, Report, Request, Rig};
@@ -23,6 +24,7 @@ Examples:
   splat4d import a.mp4 b.mp4 c.mp4 -o my-take --from 3.2 --to 9.8 --size 720
   splat4d import walk.mp4 -o walk --every 5          one camera, carried round the scene
   splat4d import videos/ -o my-take --apart left,right=2.4    in metres
+  splat4d import videos/ -o my-take --board 36h11:0.16:floor    an AprilTag of 16 cm lies on the floor
   splat4d import videos/ -o my-take --calibration Calib.toml    poses are known: clocks and points are found
 
 What was found of every camera is written to my-take/import.toml: correct an offset, a lens, or leave a camera out there,
@@ -69,6 +71,13 @@ pub(crate) struct Args {
     /// Two cameras and the metres between them
     #[arg(long, value_name = "A,B=METRES", value_parser = apart)]
     apart: Option<([String; 2], f64)>,
+    /// Tags that are seen: their family (36h11; 4x4, 5x5, 6x6 of ArUco and ChArUco), the metres along one's dark square, and
+    /// floor or wall where the board tells upwards
+    #[arg(long, value_name = "FAMILY:METRES[:floor|:wall]", conflicts_with_all = ["apart", "camera_height"])]
+    board: Option<Board>,
+    /// A camera and the metres that it stands above the floor
+    #[arg(long, value_name = "NAME=METRES", value_parser = height, conflicts_with = "apart")]
+    camera_height: Option<(String, f64)>,
     /// Lenses and places of the cameras, from a file or a folder that another program wrote
     #[arg(long, value_name = "FILE|FOLDER")]
     calibration: Option<PathBuf>,
@@ -100,6 +109,16 @@ fn apart(text: &str) -> Result<([String; 2], f64), String> {
     Ok(([a, b].map(|n| n.trim().to_owned()), metres))
 }
 
+fn height(text: &str) -> Result<(String, f64), String> {
+    let wrong = || format!("\"{text}\" is no height of a camera: write left=1.6");
+    let (name, metres) = text.rsplit_once('=').ok_or_else(wrong)?;
+    let metres: f64 = metres.trim().parse().map_err(|_| wrong())?;
+    if !metres.is_finite() || metres <= 0.0 {
+        return Err(format!("{metres} m is no height"));
+    }
+    Ok((name.trim().to_owned(), metres))
+}
+
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let folder = &args.output;
     let foreign = folder.join("capture.json").is_file() && !folder.join(corrections::FILE).is_file();
@@ -128,6 +147,8 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         sound: !args.no_audio,
         format: if args.png { Format::Png } else { Format::default() },
         apart: args.apart.clone(),
+        board: args.board,
+        camera_height: args.camera_height.clone(),
         calibration: args.calibration.clone(),
         colmap: args.colmap,
         masks: args.masks.clone(),

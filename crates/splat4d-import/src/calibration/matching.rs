@@ -1,7 +1,6 @@
-//! Which video is which camera's, and a calibration for pictures of another size.
+//! Which video is which camera's.
 
 use super::{Calibrated, Calibration, same_name};
-use splat4d::scene::Intrinsics;
 use splat4d::{Error, Result};
 
 /// A video that a camera is looked for.
@@ -124,43 +123,4 @@ fn unused(cameras: &[Calibrated], videos: &[Video<'_>], found: &[Vec<usize>]) ->
         return Vec::new();
     }
     vec![format!("Cameras of the calibration without a video: {}.", left.join(", "))]
-}
-
-/// Pixels that a side may differ from the calibrated shape: sides are whole.
-const ROUNDING: f64 = 1.0;
-
-/// The camera for pictures of a video's size that are stored in another one.
-///
-/// Errors: the video is of another shape than the pictures it was calibrated with; the principal point lies outside.
-pub fn fitted(camera: &Calibrated, video: [usize; 2], stored: [usize; 2]) -> Result<Calibrated> {
-    let size = camera.size.unwrap_or(video);
-    let [w, h] = size.map(|v| v as f64);
-    let [vw, vh] = video.map(|v| v as f64);
-    // Either side, had the other decided about the scale.
-    let off = (vw - w * vh / h).abs().min((vh - h * vw / w).abs());
-    if off > ROUNDING {
-        let turned = (vh - w * vw / h).abs() <= ROUNDING;
-        let advice = if turned {
-            "The video is turned against the calibration: turn it as it was when the camera was calibrated."
-        } else {
-            "Pictures of another shape were cut or padded, which changes the principal point: give the video as it was when \
-             the camera was calibrated, or correct size and principal point in the calibration."
-        };
-        return Err(Error::input(format!(
-            "the video has {}x{} pixels, the calibration is for {}x{}",
-            video[0], video[1], size[0], size[1]
-        ))
-        .remedy(advice));
-    }
-    let k = &camera.intrinsics;
-    if !(0.0..=w).contains(&k.cx) || !(0.0..=h).contains(&k.cy) {
-        return Err(Error::input(format!(
-            "its principal point ({:.0}, {:.0}) lies outside of pictures of {}x{}",
-            k.cx, k.cy, size[0], size[1]
-        ))
-        .remedy("It was calibrated with larger pictures: write their size into the calibration (size, image_width)."));
-    }
-    let [sx, sy] = [stored[0] as f64 / w, stored[1] as f64 / h];
-    let intrinsics = Intrinsics { fx: k.fx * sx, fy: k.fy * sy, cx: k.cx * sx, cy: k.cy * sy };
-    Ok(Calibrated { intrinsics, size: Some(stored), ..camera.clone() })
 }

@@ -9,12 +9,14 @@ mod easymocap;
 mod matching;
 mod opencv;
 mod qualisys;
+mod shape;
 #[cfg(test)]
 mod tests;
 mod transforms;
 mod tree;
 
-pub use matching::{Video, assign, fitted};
+pub use matching::{Video, assign};
+pub use shape::{Shape, bars, fitted, shape};
 
 use splat4d::math::Se3;
 use splat4d::math::se3::{norm, sub};

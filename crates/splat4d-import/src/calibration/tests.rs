@@ -1,5 +1,6 @@
 use super::*;
 use splat4d::math::se3::mat_vec;
+use splat4d::scene::Planes;
 use std::fmt::Write;
 
 /// What a calibration is written from and must be read as, to the sixth decimal.
@@ -503,18 +504,55 @@ fn videos_are_matched_by_name_and_never_by_order() {
 #[test]
 fn intrinsics_follow_the_size_and_other_shapes_are_refused() {
     let camera = &truth()[0];
-    let half = fitted(camera, [2560, 1440], [640, 360]).unwrap();
+    let whole = |camera: &Calibrated, video, stored| fitted(camera, video, stored, [0.0; 4]).map(|f| f.0);
+    let half = whole(camera, [2560, 1440], [640, 360]).unwrap();
     assert_eq!((half.intrinsics.fx, half.intrinsics.cy, half.size), (901.25 / 2.0, 183.0, Some([640, 360])));
-    assert!(fitted(camera, [854, 480], [854, 480]).is_ok(), "sides are rounded");
-    let wide = fitted(camera, [1920, 1200], [1920, 1200]).unwrap_err().to_string();
-    assert!(wide.contains("1920x1200") && wide.contains("1280x720"), "{wide}");
-    assert!(fitted(camera, [720, 1280], [720, 1280]).unwrap_err().to_string().contains("turned"));
+    assert!(whole(camera, [854, 480], [854, 480]).is_ok(), "sides are rounded");
+    let wide = whole(camera, [1920, 1200], [1920, 1200]).unwrap_err().to_string();
+    assert!(wide.contains("1920x1200") && wide.contains("1280x720") && wide.contains("no black bars"), "{wide}");
+    assert!(shape(camera, [720, 1280]).unwrap_err().to_string().contains("turned"));
+    assert!(shape(camera, [1280, 200]).is_err(), "nobody's bars are so wide");
     let bare = Calibrated { size: None, ..camera.clone() };
-    assert_eq!(fitted(&bare, [1280, 720], [1280, 720]).unwrap().intrinsics, camera.intrinsics);
-    assert!(fitted(&bare, [640, 360], [640, 360]).unwrap_err().to_string().contains("principal point"));
+    assert_eq!(whole(&bare, [1280, 720], [1280, 720]).unwrap().intrinsics, camera.intrinsics);
+    assert!(whole(&bare, [640, 360], [640, 360]).unwrap_err().to_string().contains("principal point"));
     // A point is seen at the same place of the picture.
     let x = mat_vec(&pose_of(camera).rotation, [0.3, 0.2, 0.1]);
     let z = x[2] + pose_of(camera).translation[2];
     let at = |c: &Calibrated| c.intrinsics.fx * x[0] / z + c.intrinsics.cx;
     assert!((at(&half) * 2.0 - at(camera)).abs() < 1e-9);
+}
+
+#[test]
+fn bars_and_padding_are_seen_through() {
+    let camera = &truth()[0];
+    let k = camera.intrinsics;
+    // 1280x720 made to fit 1080 wide (607.5 high), in the middle of 640 pixels; stored at half the size.
+    assert_eq!(shape(camera, [1080, 640]).unwrap(), Shape::Boxed([0.0, 640.0 - 607.5]));
+    let (boxed, note) = fitted(camera, [1080, 640], [540, 320], [0.0, 8.0, 0.0, 8.0]).unwrap();
+    let scale = 540.0 / 1280.0;
+    assert!((boxed.intrinsics.fx - k.fx * scale).abs() < 1e-9 && (boxed.intrinsics.fy - k.fy * scale).abs() < 1e-9);
+    assert!((boxed.intrinsics.cy - (k.cy * scale + 8.125)).abs() < 1e-9, "{:?}", boxed.intrinsics);
+    assert!(note.expect("it is not plain").contains("black bars"));
+    assert!(fitted(camera, [1080, 640], [540, 320], [0.0, 20.0, 0.0, 20.0]).is_err(), "of other bars");
+    // A codec's padding, which some programs leave in.
+    let (padded, note) = fitted(camera, [1280, 712], [1280, 712], [0.0; 4]).unwrap();
+    assert_eq!(padded.intrinsics, k);
+    assert!(note.expect("it is not plain").contains("multiples of 16"));
+    // Pictures with bars, one of which is dark where the other is not.
+    let picture = |dark: usize| {
+        let mut p = Planes::new(1, 40, 60);
+        for (i, v) in p.data.iter_mut().enumerate() {
+            let (x, y) = (i % 60, i / 60);
+            *v = if !(5..36).contains(&y) {
+                0.03
+            } else if x < dark {
+                0.05
+            } else {
+                0.5
+            };
+        }
+        p
+    };
+    assert_eq!(bars(&[picture(12), picture(0)]), [0.0, 5.0, 0.0, 4.0]);
+    assert_eq!(bars(&[]), [0.0; 4]);
 }

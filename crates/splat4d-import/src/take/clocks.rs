@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use splat4d_train::event::Progress;
 
 /// Metres between cameras as sound goes, where nothing is known of them: a room's; 15 ms.
-const WAY: f64 = 5.0;
+pub(super) const WAY: f64 = 5.0;
 /// Least seconds that all cameras must film at once.
 const LEAST_SHARED: f64 = 0.1;
 /// Frames a second of cameras that do not tell.

@@ -1,12 +1,14 @@
 //! A calibration that was given: whose camera is whose, and what it says of stored pictures.
 
 use super::{Camera, Request};
-use crate::calibration::{self, Calibrated, Calibration, Video};
+use crate::calibration::{self, Calibrated, Calibration, Shape, Unit, Video};
 use crate::corrections::Corrections;
 use crate::sfm::known::Known;
 use crate::write::Pictures;
 use crate::{Error, Result};
-use splat4d_train::capture::PointCloud;
+use splat4d::scene::Planes;
+use splat4d_train::capture::{PointCloud, Rgb8};
+use std::path::Path;
 
 /// What was given of all cameras, in their order.
 pub(super) struct Given {
@@ -17,6 +19,8 @@ pub(super) struct Given {
     pub notes: Vec<String>,
     /// Whether places are given and not only lenses.
     pub posed: bool,
+    /// Whether its lengths are metres.
+    pub metres: bool,
     /// Points that came with it.
     pub points: Option<PointCloud>,
 }
@@ -39,7 +43,8 @@ impl Given {
         let videos: Vec<Video<'_>> =
             cameras.iter().map(|c| Video { name: &c.name, size: c.source.info().size }).collect();
         let mut given = Self::of(&found, &videos, &from).map_err(place)?;
-        if found.posed() && request.apart.is_none() {
+        let told = request.apart.is_some() || request.board.is_some() || request.camera_height.is_some();
+        if found.posed() && !told {
             given.notes.push(found.about_lengths());
         }
         Ok(Some(given))
@@ -50,7 +55,7 @@ impl Given {
         let (which, mut notes) = calibration::assign(found, videos)?;
         let own: Vec<Calibrated> = which.iter().map(|&k| found.cameras[k].clone()).collect();
         for (camera, video) in own.iter().zip(videos) {
-            calibration::fitted(camera, video.size, video.size).map_err(|e| e.at(format!("camera {}", video.name)))?;
+            calibration::shape(camera, video.size).map_err(|e| e.at(format!("camera {}", video.name)))?;
         }
         let what = if found.posed() { "Lenses and places of cameras are" } else { "Lenses of cameras are" };
         let mut all = vec![format!("{what} from {from} ({}).", found.dialects.join(", "))];
@@ -61,23 +66,56 @@ impl Given {
             sizes: videos.iter().map(|v| v.size).collect(),
             notes: all,
             posed: found.posed(),
+            metres: found.unit == Unit::Metre,
             points: found.points.clone(),
         })
     }
 }
 
-/// What is known of every camera's stored pictures: by calibration, and by the user's own lens, which goes first.
+/// Pictures of a camera in which bars are looked for.
+const LOOKS: usize = 3;
+
+/// What is known of every camera's stored pictures: by calibration, and by the user's own lens, which goes first. Sentences about
+/// calibrations that had to be corrected for them join the pictures' warnings.
 pub(super) fn known(
     given: Option<&Given>,
     corrections: &Corrections,
-    pictures: &[Pictures],
+    folder: &Path,
+    pictures: &mut [Pictures],
 ) -> Result<Vec<Option<Known>>> {
-    let of = |(k, p): (usize, &Pictures)| {
-        let calibrated = given.map(|g| calibration::fitted(&g.cameras[k], g.sizes[k], p.size)).transpose()?;
+    let mut out = Vec::with_capacity(pictures.len());
+    for (k, p) in pictures.iter_mut().enumerate() {
+        let calibrated = match given {
+            None => None,
+            Some(g) => {
+                let camera = &g.cameras[k];
+                let bars = match calibration::shape(camera, g.sizes[k])? {
+                    Shape::Boxed(_) => calibration::bars(&some(folder, p)?),
+                    _ => [0.0; 4],
+                };
+                let (camera, note) = calibration::fitted(camera, g.sizes[k], p.size, bars)
+                    .map_err(|e| e.at(format!("camera {}", p.name)))?;
+                p.warnings.extend(note);
+                Some(camera)
+            }
+        };
         let own = corrections.cameras.iter().find(|c| c.name == p.name).and_then(|c| c.given_lens());
         let pose = calibrated.as_ref().and_then(|c| c.pose);
         let optics = own.or(calibrated.map(|c| (c.intrinsics, c.lens)));
-        Ok(optics.map(|(intrinsics, lens)| Known { intrinsics, lens, pose }))
+        out.push(optics.map(|(intrinsics, lens)| Known { intrinsics, lens, pose }));
+    }
+    Ok(out)
+}
+
+/// Some grey pictures of a camera, spread over the take.
+fn some(folder: &Path, pictures: &Pictures) -> Result<Vec<Planes<f32>>> {
+    let count = pictures.shots.len();
+    let look = |k: usize| {
+        let rgb = Rgb8::read(&folder.join(pictures.file((2 * k + 1) * count / (2 * LOOKS))))?;
+        let mut grey = Planes::new(1, rgb.height, rgb.width);
+        let mean = |p: &[u8]| p.iter().map(|v| f32::from(*v)).sum::<f32>() / (3.0 * 255.0);
+        grey.data.iter_mut().zip(rgb.data.chunks_exact(3)).for_each(|(v, p)| *v = mean(p));
+        Ok(grey)
     };
-    pictures.iter().enumerate().map(of).collect()
+    (0..LOOKS).map(look).collect()
 }

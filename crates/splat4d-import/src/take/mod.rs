@@ -13,15 +13,20 @@ mod inputs;
 mod poses;
 mod report;
 mod stored;
+mod tags;
+mod way;
+mod world;
 
 pub use inputs::find;
 pub use report::{CameraReport, Report};
 
+use crate::board::Board;
 use crate::calibration::Video;
 use crate::corrections::{self, Corrections};
 use crate::sfm::known::pixel_unit;
+use crate::sync::graph::Evidence;
 use crate::video::{self, Selection, Source};
-use crate::write::{self, Clip, Format, Masks, Pictures, Take};
+use crate::write::{self, Clip, Format, Pictures, Take};
 use crate::{Error, ErrorKind, Result};
 use splat4d_train::event::Progress;
 use std::path::{Path, PathBuf};
@@ -57,6 +62,10 @@ pub struct Request {
     pub format: Format,
     /// Two cameras and the metres between them.
     pub apart: Option<([String; 2], f64)>,
+    /// Tags that are in the pictures, for lengths and upwards.
+    pub board: Option<Board>,
+    /// A camera and the metres that it stands above the floor.
+    pub camera_height: Option<(String, f64)>,
     /// A calibration of the cameras, in any of [`crate::calibration`]'s dialects.
     pub calibration: Option<PathBuf>,
     /// Whether the COLMAP program finds lenses and places.
@@ -80,9 +89,6 @@ const FEW_POINTS: usize = 50;
 const CONTRADICTS: f64 = 5.0;
 /// A calibration that is contradicted by more than this part of the cameras that tell is not of this take.
 const CONTRADICTED: f64 = 0.67;
-/// Upwards is an axis of a calibrated world where that is so near (cosine of 15 degrees): people calibrate on floors.
-const ALONG_AXIS: f64 = 0.966;
-
 /// A camera on its way.
 struct Camera {
     name: String,
@@ -108,13 +114,22 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
     if cameras.is_empty() {
         return Err(Error::input("all cameras are left out").at(folder.join(corrections::FILE).display()));
     }
-    if let Some((pair, _)) = &request.apart {
-        let unknown = pair.iter().find(|n| !cameras.iter().any(|c| c.name == **n));
-        if let Some(name) = unknown {
+    let measured =
+        request.apart.iter().flat_map(|(pair, _)| pair).chain(request.camera_height.iter().map(|(name, _)| name));
+    for name in measured {
+        if !cameras.iter().any(|c| c.name == *name) {
             let known: Vec<&str> = cameras.iter().map(|c| c.name.as_str()).collect();
-            return Err(Error::input(format!("there is no camera \"{name}\" whose distance is told"))
+            return Err(Error::input(format!("there is no camera \"{name}\", of which a length is told"))
                 .remedy(format!("Cameras are {}.", known.join(", "))));
         }
+    }
+    if usize::from(request.apart.is_some())
+        + usize::from(request.board.is_some())
+        + usize::from(request.camera_height.is_some())
+        > 1
+    {
+        return Err(Error::input("lengths are told in two ways")
+            .remedy("Tell the distance of two cameras, tags, or a height: one."));
     }
     let moving = match request.rig {
         Rig::Auto => cameras.len() == 1,
@@ -149,7 +164,7 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
         .zip(selections)
         .map(|(c, selection)| Clip { name: c.name.clone(), source: &*c.source, selection })
         .collect();
-    let pictures = write::pictures(folder, &clips, request.format, progress, stop)?;
+    let mut pictures = write::pictures(folder, &clips, request.format, progress, stop)?;
     for p in &pictures {
         if p.shots.is_empty() {
             return Err(Error::input("no frame lies in the part that was chosen")
@@ -175,7 +190,7 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
         report.guesses.extend(found.notes.iter().cloned());
         given = Some(found);
     }
-    let known = given::known(given.as_ref(), &corrections, &pictures)?;
+    let known = given::known(given.as_ref(), &corrections, folder, &mut pictures)?;
     let stored = stored::Stored::new(folder, &pictures, &known, &masks);
     let mut evidence = heard;
     if pictures.len() > 1 && !moving && clock.offsets.iter().any(Option::is_none) {
@@ -198,16 +213,18 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
     if stop() {
         return Err(stopped());
     }
-    let found = Found { pictures: &pictures, masks: &masks, given, solved };
-    finish(request, found, &mut corrections, report)
+    let found = Found { stored: &stored, given, solved, evidence: &evidence, told: &told };
+    finish(request, found, &mut corrections, report, progress)
 }
 
 /// All that was found.
 struct Found<'a> {
-    pictures: &'a [Pictures],
-    masks: &'a [Masks],
+    stored: &'a stored::Stored<'a>,
     given: Option<given::Given>,
     solved: poses::Solved,
+    /// Lags of pairs, and offsets that were told.
+    evidence: &'a [Evidence],
+    told: &'a [Option<f64>],
 }
 
 fn names_of(pictures: &[Pictures]) -> Vec<&str> {
@@ -293,13 +310,32 @@ fn agrees(solved: &poses::Solved, pictures: &[Pictures], report: &mut Report) ->
     Ok(())
 }
 
-/// The axis that a direction is near to, and its name.
-fn along_axis(up: [f64; 3]) -> Option<([f64; 3], String)> {
-    let k = (0..3).max_by(|&a, &b| up[a].abs().total_cmp(&up[b].abs()))?;
-    let mut axis = [0.0; 3];
-    axis[k] = up[k].signum();
-    let sign = if up[k] > 0.0 { "+" } else { "-" };
-    (up[k].abs() > ALONG_AXIS).then(|| (axis, format!("{sign}{}", ["x", "y", "z"][k])))
+/// Takes the way of sound out of clocks that sound alone tells, or says why not.
+fn sound_goes(
+    solved: &mut poses::Solved,
+    evidence: &[Evidence],
+    told: &[Option<f64>],
+    metres: bool,
+    pictures: &[Pictures],
+    report: &mut Report,
+) {
+    if solved.moving {
+        return;
+    }
+    if metres {
+        let frame = pictures.iter().map(|p| p.clock.interval).fold(0.0, f64::max);
+        if let Some(done) = way::corrected(solved, evidence, told, 0.5 * frame) {
+            report.guesses.push(format!(
+                "The way of sound is taken out of {} clocks that nothing else tells, up to {:.1} ms.",
+                done.clocks,
+                1e3 * done.most
+            ));
+        }
+    } else if way::hangs_on_sound(solved, told) {
+        report.guesses.push(
+            "Clocks by sound alone are late by 2.9 ms a metre of its way, which is not taken out, for the unit is no metre.".into(),
+        );
+    }
 }
 
 /// Opens all inputs; no file twice.
@@ -324,37 +360,41 @@ fn open(request: &Request) -> Result<Vec<Camera>> {
 }
 
 /// Writes points, capture, corrections and report.
-fn finish(request: &Request, found: Found<'_>, corrections: &mut Corrections, mut report: Report) -> Result<Report> {
+fn finish(
+    request: &Request,
+    found: Found<'_>,
+    corrections: &mut Corrections,
+    mut report: Report,
+    progress: &mut Progress<'_>,
+) -> Result<Report> {
     let folder = &request.folder;
-    let Found { pictures, masks, given, mut solved } = found;
+    let Found { stored, given, mut solved, evidence, told } = found;
+    let pictures = stored.pictures;
     let posed = given.as_ref().is_some_and(|g| g.posed);
+    // COLMAP's own axes and unit are those of some camera.
+    let origin = match &given {
+        Some(g) if g.posed && !request.colmap => world::Origin::Calibrated { metres: g.metres },
+        _ => world::Origin::Free,
+    };
     if let Some(points) = given.and_then(|g| g.points).filter(|_| solved.points.len() < FEW_POINTS) {
         solved.take_points(&points);
         report.guesses.push("Points are the calibration's: too few were found in these pictures.".into());
     }
-    match &request.apart {
-        Some((pair, metres)) => solved.scale_to(pictures, pair, *metres)?,
-        None if posed && !request.colmap => {}
-        None => report.guesses.push(format!(
-            "The unit of length is {}: tell two cameras' distance (--apart A,B=METRES) for metres.",
-            if request.colmap { "COLMAP's" } else { "the median distance of the cameras from what they see" }
-        )),
-    }
-    // COLMAP's own axes are those of some camera.
-    let axis = along_axis(solved.up).filter(|_| posed && !request.colmap);
-    match axis {
-        Some((axis, name)) => {
-            solved.up = axis;
-            report.guesses.push(format!("Upwards is {name} of the calibration, which most cameras hold upwards."));
+    // What could not be placed is told before what could not be measured.
+    let metres = match world::settle(request, stored, origin, &mut solved, &mut report, progress) {
+        Ok(metres) => metres,
+        Err(e) => {
+            check(&solved, pictures, &mut report)?;
+            return Err(e);
         }
-        None => report.guesses.push("Upwards is what most cameras hold upwards.".into()),
-    }
+    };
+    sound_goes(&mut solved, evidence, told, metres, pictures, &mut report);
     let mut placed = Vec::new();
     for (k, (camera, p)) in solved.cameras.iter().zip(pictures).enumerate() {
         let row = CameraReport::of(p, camera, solved.offsets.get(k).and_then(Option::as_ref));
         report.cameras.push(row);
         if let Ok(stand) = camera {
-            placed.push(stand.written(p, solved.offset(k), masks.get(k).cloned()));
+            placed.push(stand.written(p, solved.offset(k), stored.masks.get(k).cloned()));
             if let Some(own) = corrections.cameras.iter_mut().find(|c| c.name == p.name) {
                 if let Some(offset) = solved.offsets.get(k).and_then(Option::as_ref) {
                     own.found_offset(offset);

@@ -9,7 +9,6 @@ use crate::write::{Masks, Pictures, Placed, Poses};
 use crate::{Error, ErrorKind, Result};
 use serde::{Deserialize, Serialize};
 use splat4d::math::Se3;
-use splat4d::math::se3::{norm, sub};
 use splat4d::scene::{Intrinsics, Lens};
 use splat4d_train::capture::PointCloud;
 use splat4d_train::event::Progress;
@@ -316,30 +315,6 @@ impl Solved {
     /// The clock of a camera; its file's where nothing is known.
     pub(super) fn offset(&self, camera: usize) -> Offset {
         self.offsets[camera].clone().unwrap_or_default()
-    }
-
-    /// Makes the unit of length the metre.
-    pub(super) fn scale_to(&mut self, pictures: &[Pictures], pair: &[String; 2], metres: f64) -> Result<()> {
-        let place = |name: &String| {
-            let k = pictures.iter().position(|p| p.name == *name)?;
-            let stand = self.cameras[k].as_ref().ok()?;
-            stand.poses.iter().flatten().next().map(|p| p.inverse().translation)
-        };
-        let (Some(a), Some(b)) = (place(&pair[0]), place(&pair[1])) else {
-            return Err(Error::input(format!("{} or {} could not be placed", pair[0], pair[1]))
-                .remedy("Tell the distance of two other cameras."));
-        };
-        let now = norm(sub(a, b));
-        if now <= 0.0 {
-            return Err(Error::input(format!("{} and {} stand in one place", pair[0], pair[1]))
-                .remedy("Tell the distance of two other cameras."));
-        }
-        let scale = metres / now;
-        for pose in self.cameras.iter_mut().flatten().flat_map(|s| s.poses.iter_mut().flatten()) {
-            pose.translation = pose.translation.map(|v| v * scale);
-        }
-        self.points.iter_mut().for_each(|(p, _)| *p = p.map(|v| v * scale));
-        Ok(())
     }
 
     /// Takes points from elsewhere, of the same world.

@@ -1,0 +1,170 @@
+//! The world of a capture: its unit of length, what is up in it, and its axes.
+
+use super::poses::Solved;
+use super::stored::Stored;
+use super::{Report, Request, tags};
+use crate::board::Lies;
+use crate::sfm::align::{Axes, axes, floor};
+use crate::{Error, Result};
+use splat4d::math::se3::{add, dot, mat_mul, mat_vec, norm, sub};
+use splat4d::math::{Se3, Sim3};
+use splat4d_train::event::Progress;
+
+/// Upwards is an axis of a calibrated world where that is so near (cosine of 15 degrees): people calibrate on floors.
+const ALONG_AXIS: f64 = 0.966;
+/// Degrees between what floor and walls say and what cameras hold upwards that are told.
+const TOLD: f64 = 1.0;
+
+/// Where the world is from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Origin {
+    /// A calibration, whose axes and lengths stay; whether these are metres.
+    Calibrated { metres: bool },
+    /// Nobody's: axes and unit are as it happened.
+    Free,
+}
+
+/// Gives a solution its unit and its axes, and says so in the report; whether the unit is the metre.
+///
+/// Errors: what should tell lengths is not seen, or contradicts itself.
+pub(super) fn settle(
+    request: &Request,
+    stored: &Stored<'_>,
+    origin: Origin,
+    solved: &mut Solved,
+    report: &mut Report,
+    progress: &mut Progress<'_>,
+) -> Result<bool> {
+    let found = request.board.as_ref().map(|b| tags::measured(b, stored, solved, progress)).transpose()?;
+    if let Some(found) = &found {
+        solved.place(&Sim3 { scale: found.scale, ..Sim3::default() });
+        report.guesses.push(found.about());
+    }
+    if let Some((pair, metres)) = &request.apart {
+        let by = apart(solved, stored, pair, *metres)?;
+        solved.place(&Sim3 { scale: by, ..Sim3::default() });
+    }
+    let laid = found.as_ref().and_then(|f| f.frame);
+    if let Some((up, origin)) = laid {
+        let turned = turn(solved, up, true);
+        let at = mat_vec(&turned.rotation, origin);
+        solved.place(&Sim3 { translation: at.map(|v| -v), ..Sim3::default() });
+        let stands = if request.board.is_some_and(|b| b.lies == Some(Lies::Floor)) { "lies" } else { "hangs" };
+        report.guesses.push(format!("Upwards (+z) and the origin are the board's, as it {stands}."));
+    } else if let Origin::Calibrated { .. } = origin {
+        match along_axis(solved.up) {
+            Some((axis, name)) => {
+                solved.up = axis;
+                report.guesses.push(format!("Upwards is {name} of the calibration, which most cameras hold upwards."));
+            }
+            None => report.guesses.push("Upwards is what most cameras hold upwards.".into()),
+        }
+    } else {
+        let held = solved.up;
+        let turned = turn(solved, held, false);
+        let off = dot(turned.rotation[2], held).clamp(-1.0, 1.0).acos().to_degrees();
+        report.guesses.push(match (turned.upright, turned.along) {
+            (true, _) if off > TOLD => format!(
+                "Upwards (+z) and the other axes are those of floor and walls; cameras were held {off:.0} degrees off."
+            ),
+            (true, _) => "Upwards (+z) and the other axes are those of floor and walls.".into(),
+            (false, true) => "Upwards (+z) is what most cameras hold upwards; x and y lie along walls.".into(),
+            (false, false) => "Upwards (+z) is what most cameras hold upwards.".into(),
+        });
+    }
+    if let Some((name, metres)) = &request.camera_height {
+        let by = metres / height(solved, stored, name)?;
+        solved.place(&Sim3 { scale: by, ..Sim3::default() });
+        report.guesses.push(format!(
+            "The unit of length is the metre: {name} stands {metres} m above the floor that points show. Tags or the distance of two \
+             cameras tell it more exactly."
+        ));
+    }
+    let told = found.is_some() || request.apart.is_some() || request.camera_height.is_some();
+    if !told && (origin == Origin::Free || request.colmap) {
+        report.guesses.push(format!(
+            "The unit of length is {}: tell two cameras' distance (--apart A,B=METRES), or film tags (--board), for metres.",
+            if request.colmap { "COLMAP's" } else { "the median distance of the cameras from what they see" }
+        ));
+    }
+    Ok(told || origin == Origin::Calibrated { metres: true })
+}
+
+/// Turns the world so that z is upwards and x and y lie along walls, if there are any, with cameras looking along y.
+fn turn(solved: &mut Solved, up: [f64; 3], fixed: bool) -> Axes {
+    let points: Vec<[f64; 3]> = solved.points.iter().map(|p| p.0).collect();
+    let found = axes(&points, up, fixed);
+    let mut ahead = [0.0; 3];
+    for pose in solved.cameras.iter().flatten().flat_map(|s| s.poses.iter().flatten()) {
+        ahead = add(ahead, pose.rotation[2]);
+    }
+    let ahead = mat_vec(&found.rotation, ahead);
+    // Four frames have the same axes; one of them looks ahead.
+    let quarter = |k: usize| [[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]][k];
+    let along = |k: usize| quarter(k)[1] * ahead[0] + quarter(k)[0] * ahead[1];
+    let best = (0..4).max_by(|&a, &b| along(a).total_cmp(&along(b))).expect("there are four");
+    let [c, s] = quarter(best);
+    let rotation = mat_mul(&[[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], &found.rotation);
+    solved.place(&Sim3::from_rotation(rotation));
+    solved.up = [0.0, 0.0, 1.0];
+    Axes { rotation, ..found }
+}
+
+/// A camera's only, or first known, place.
+fn place(solved: &Solved, stored: &Stored<'_>, name: &str) -> Option<[f64; 3]> {
+    let k = stored.pictures.iter().position(|p| p.name == name)?;
+    let stand = solved.cameras[k].as_ref().ok()?;
+    stand.poses.iter().flatten().next().map(|p: &Se3| p.inverse().translation)
+}
+
+/// What makes the distance of two cameras so many metres.
+fn apart(solved: &Solved, stored: &Stored<'_>, pair: &[String; 2], metres: f64) -> Result<f64> {
+    let other = |what: String| Error::input(what).remedy("Tell the distance of two other cameras.");
+    let (Some(a), Some(b)) = (place(solved, stored, &pair[0]), place(solved, stored, &pair[1])) else {
+        return Err(other(format!("{} or {} could not be placed", pair[0], pair[1])));
+    };
+    let now = norm(sub(a, b));
+    if now <= 0.0 {
+        return Err(other(format!("{} and {} stand in one place", pair[0], pair[1])));
+    }
+    Ok(metres / now)
+}
+
+/// How high a camera stands above the floor, in the unit that is.
+fn height(solved: &Solved, stored: &Stored<'_>, name: &str) -> Result<f64> {
+    let other = |what: String| {
+        Error::input(what).remedy("Tell two cameras' distance instead (--apart A,B=METRES), or film tags (--board).")
+    };
+    let Some(camera) = place(solved, stored, name) else {
+        return Err(other(format!("{name}, whose height is told, could not be placed")));
+    };
+    let points: Vec<[f64; 3]> = solved.points.iter().map(|p| p.0).collect();
+    let Some(floor) = floor(&points, solved.up) else {
+        return Err(other("no floor is seen: no height at the bottom of the scene has many points".into()));
+    };
+    let high = dot(camera, solved.up) - floor;
+    if high <= 0.0 {
+        return Err(other(format!("{name} seems to stand below the floor")));
+    }
+    Ok(high)
+}
+
+/// The axis that a direction is near to, and its name.
+fn along_axis(up: [f64; 3]) -> Option<([f64; 3], String)> {
+    let k = (0..3).max_by(|&a, &b| up[a].abs().total_cmp(&up[b].abs()))?;
+    let mut axis = [0.0; 3];
+    axis[k] = up[k].signum();
+    let sign = if up[k] > 0.0 { "+" } else { "-" };
+    (up[k].abs() > ALONG_AXIS).then(|| (axis, format!("{sign}{}", ["x", "y", "z"][k])))
+}
+
+impl Solved {
+    /// Moves the whole world.
+    pub(super) fn place(&mut self, by: &Sim3) {
+        for pose in self.cameras.iter_mut().flatten().flat_map(|s| s.poses.iter_mut().flatten()) {
+            *pose = by.pose(pose);
+        }
+        self.points.iter_mut().for_each(|(p, _)| *p = by.apply(*p));
+        self.up = mat_vec(&by.rotation, self.up);
+    }
+}
