@@ -67,6 +67,7 @@ const ORDER: [(&str, &[&str]); 8] = [
             "measure",
             "baking",
             "playable",
+            "film",
             "serving",
             "report",
             "finish",

@@ -19,6 +19,7 @@ use splat4d_train::eval::points::point_errors;
 use splat4d_train::eval::run::{EvalOptions, Measured, Scores, evaluate};
 use splat4d_train::eval::tracks::track_error;
 use splat4d_train::eval::trajectory::trajectory_error;
+use splat4d_train::labels::{MOST_PICTURES, ROUNDS};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::chunks::Chunked;
 use splat4d_train::run::{capture_options, corrected};
@@ -43,14 +44,19 @@ const FILM_STEPS: f64 = 0.5;
 /// See [`HELD_STEPS`].
 const BAKE_STEPS: f64 = 60.0;
 
+/// See [`HELD_STEPS`]: a picture with a mask of labels, drawn and taken back once.
+const LABEL_STEPS: f64 = 1.0;
+
 /// The time of what follows training, in training steps at full size: `--minutes` leaves room for it.
 pub(crate) fn steps(capture: &Capture, only_playback: bool) -> f64 {
+    let masks = capture.train.iter().filter(|&&i| capture.frames[i].labels.is_some()).count().min(MOST_PICTURES);
+    let labels = (ROUNDS * masks) as f64 * LABEL_STEPS;
     if only_playback {
-        return BAKE_STEPS;
+        return BAKE_STEPS + labels;
     }
     let (first, last) = capture.time_range();
     let fps = if have_ffmpeg() { ORBIT_FPS } else { ORBIT_FPS_PNG };
-    capture.held.len() as f64 * HELD_STEPS + orbit_seconds(last - first) * fps * FILM_STEPS + BAKE_STEPS
+    labels + capture.held.len() as f64 * HELD_STEPS + orbit_seconds(last - first) * fps * FILM_STEPS + BAKE_STEPS
 }
 
 /// Options of measuring.
