@@ -151,5 +151,28 @@ fn plots(s: &Settings, first: &Findings, sweep: &[(f64, Vec<Findings>)]) -> Vec<
         ("time", chart::file(&by_time, "time", "mean distance")),
         ("penalty", chart::file(&tradeoff, "log10 λ (left: 0)", "length")),
     ];
-    all.into_iter().filter_map(|(name, svg)| Some((name, svg?))).collect()
+    let mut out: Vec<_> = all.into_iter().filter_map(|(name, svg)| Some((name, svg?))).collect();
+    out.push(("clouds", clouds(&first.paths)));
+    out
+}
+
+/// Both clouds in one picture: true paths as lines that end in circles, the network's as dots at every time.
+fn clouds([truth, found]: &[Vec<Vec<[f64; 2]>>; 2]) -> String {
+    const SIDE: f64 = 640.0;
+    let far = truth.iter().chain(found).flatten().flatten().fold(0.0f64, |far, x| far.max(x.abs()));
+    let place = |x: [f64; 2]| [0.5 * SIDE * (1.0 + 0.96 * x[0] / far), 0.5 * SIDE * (1.0 - 0.96 * x[1] / far)];
+    let mut svg = format!(
+        r#"<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {SIDE} {SIDE}" width="{SIDE}" height="{SIDE}"><rect width="{SIDE}" height="{SIDE}" fill="white"/>"#
+    );
+    for path in truth {
+        let points: Vec<String> = path.iter().map(|x| place(*x)).map(|[x, y]| format!("{x:.1},{y:.1}")).collect();
+        let _ = write!(svg, r##"<polyline points="{}" fill="none" stroke="#8a8a8a"/>"##, points.join(" "));
+        if let Some([x, y]) = path.last().map(|x| place(*x)) {
+            let _ = write!(svg, r##"<circle cx="{x:.1}" cy="{y:.1}" r="4" fill="none" stroke="#333333"/>"##);
+        }
+    }
+    for [x, y] in found.iter().flatten().map(|x| place(*x)) {
+        let _ = write!(svg, r##"<circle cx="{x:.1}" cy="{y:.1}" r="1.6" fill="#c0392b"/>"##);
+    }
+    svg + "<title>grey: true paths, circles at their ends; red: the network at every time</title></svg>\n"
 }

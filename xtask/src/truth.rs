@@ -47,6 +47,12 @@ pub(crate) fn flow(camera: &Camera, seen: &Visibility, frame: &Frame, next: &Fra
     out
 }
 
+/// The object that each pixel's centre shows, 0 the static set; 255 where there is none.
+pub(crate) fn labels(camera: &Camera, seen: &Visibility, frame: &Frame) -> Vec<u8> {
+    let object = |(index, ..): (u32, _, _)| frame.mesh.triangles[index as usize].object;
+    pixels(camera).map(|(x, y)| surface(frame, camera, seen, x, y).map_or(u8::MAX, object)).collect()
+}
+
 fn pixels(camera: &Camera) -> impl Iterator<Item = (usize, usize)> + '_ {
     (0..camera.height).flat_map(|y| (0..camera.width).map(move |x| (x, y)))
 }

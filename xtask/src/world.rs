@@ -1,5 +1,5 @@
 //! `capture --world NAME FOLDER`: a world whose physics is known, filmed by eight cameras, with the true paths of its nodes
-//! and what was done to it.
+//! what was done to it, and masks that say which body a pixel shows.
 
 use crate::camera::Camera;
 use crate::files::{png, write_file};
@@ -14,7 +14,7 @@ use anyhow::{Result, anyhow};
 use image::ExtendedColorType;
 use rayon::prelude::*;
 use serde_json::json;
-use splat4d_dynamics::worlds::{CLOTH, FPS, FRAMES, Shape, World};
+use splat4d_dynamics::worlds::{Body, CLOTH, FPS, FRAMES, Shape, World};
 use std::path::Path;
 
 const WIDTH: usize = 200;
@@ -46,6 +46,11 @@ pub(crate) fn command(name: &str, folder: &Path) -> Result<()> {
             let file = png(rgb, WIDTH, HEIGHT, ExtendedColorType::Rgb8)?;
             write_file(&folder.join(format!("images/{}/{t:04}.png", camera.name)), &file)?;
         }
+        for (camera, seen) in cameras.iter().zip(&seen) {
+            let labels = truth::labels(camera, seen, &frame);
+            let file = png(&labels, WIDTH, HEIGHT, ExtendedColorType::L8)?;
+            write_file(&folder.join(format!("labels/{}/{t:04}.png", camera.name)), &file)?;
+        }
         if t == 0 {
             let training = (0..CAMERAS).filter(|c| *c != HELD_OUT);
             let training: Vec<_> = training.map(|c| (&cameras[c], &seen[c], pictures[c].as_slice())).collect();
@@ -58,10 +63,22 @@ pub(crate) fn command(name: &str, folder: &Path) -> Result<()> {
             "name": camera.name, "width": WIDTH, "height": HEIGHT,
             "fx": camera.focal, "fy": camera.focal, "cx": 0.5 * WIDTH as f64, "cy": 0.5 * HEIGHT as f64,
             "world_to_camera": camera.matrix(), "images": format!("images/{}/%04d.png", camera.name),
+            "labels": format!("labels/{}/%04d.png", camera.name),
             "start": 0, "frames": FRAMES,
         })
     };
+    let body = |(i, body): (usize, &Body)| {
+        let shape = match body.shape {
+            Shape::Ball(_) => "ball",
+            Shape::Box(_) => "box",
+            Shape::Cloth => "cloth",
+        };
+        format!("{shape} {}", i + 1)
+    };
+    let labels: Vec<String> =
+        std::iter::once("hall".to_owned()).chain(world.bodies.iter().enumerate().map(body)).collect();
     let capture = json!({
+        "labels": labels,
         "version": 1, "name": name, "fps": FPS, "up": [0, 1, 0], "points": "points.ply",
         "hold_out": {"cameras": [cameras[HELD_OUT].name]}, "cameras": cameras.iter().map(entry).collect::<Vec<_>>(),
     });

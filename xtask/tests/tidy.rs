@@ -11,7 +11,7 @@ const ORDER: [(&str, &[&str]); 8] = [
         "crates/splat4d",
         &[
             "error", "wgsl", "simd", "math", "scene", "nn", "motion", "layers", "render", "gpu", "device", "flow",
-            "format", "bake", "play", "edit",
+            "channels", "format", "bake", "play", "edit",
         ],
     ),
     (
@@ -20,7 +20,7 @@ const ORDER: [(&str, &[&str]); 8] = [
         // `methods`, which choose among them; `init` needs a model's plan; `eval` writes as safely as `run` does.
         &[
             "settings", "recipe", "event", "capture", "vision", "sampler", "optim", "loss", "learner", "upkeep",
-            "methods", "step", "init", "run", "eval", "training", "compress", "dist",
+            "methods", "step", "init", "run", "labels", "eval", "training", "compress", "dist",
         ],
     ),
     (
@@ -60,18 +60,22 @@ const ORDER: [(&str, &[&str]); 8] = [
             "console",
             "video",
             "device",
-            "draw",
             "paths",
             "run_folder",
             "sequence",
             "source",
+            "draw",
+            "raw",
+            "asked",
             "measure",
             "baking",
             "playable",
+            "film",
             "serving",
             "report",
             "finish",
             "film",
+            "labelling",
             "chunked",
             "compressing",
             "predicting",

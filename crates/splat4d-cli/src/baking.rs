@@ -312,6 +312,7 @@ pub(crate) fn meta(scene: &Scene<f32>, outline: &Outline, stage: &Stage, views: 
         sh_degree: outline.sh_degree,
         bounds: outline.bounds,
         predicted: scene.predicted_from(),
+        labels: scene.labels.clone(),
         view: Some(look(0.0)),
         cameras: views.iter().map(|v| NamedCamera::new(&v.name, &v.camera)).collect(),
         // The last key is the first again, so that the orbit closes.

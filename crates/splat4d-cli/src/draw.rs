@@ -2,29 +2,88 @@
 
 use crate::console::Console;
 use crate::device::Device;
+use crate::paths::View;
+use crate::source::cloud;
 use crate::video::Rgb;
 use rayon::prelude::*;
+use splat4d::channels::{self, Witness};
 use splat4d::device;
-use splat4d::layers::{Head, Scene};
+use splat4d::flow;
+use splat4d::layers::{ALWAYS, Evaluation, Head, Scene};
 use splat4d::play::Player;
 use splat4d::render::{Antialias, Backend, Image, RenderConfig, Shot, Wanted};
 use splat4d::scene::{Camera, Planes, Time};
+use splat4d::{Error, Result};
+use splat4d_train::labels::best;
 
 /// Channel of the rendering that is shown.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-pub(crate) enum Channel {
+pub enum Channel {
     /// Colour over the background
     Color,
     /// How opaque: white where something is
     Alpha,
     /// Expected depth: near is bright
     Depth,
+    /// Where pixels go by the next frame of the scene, for this camera: the direction as hue, the length as strength
+    Flow,
+    /// Velocity in the world: x, y, z as red, green, blue about grey
+    Velocity,
+    /// Normals in the camera's axes: right, up, towards the camera as red, green, blue
+    Normal,
+    /// The likeliest label, a colour each
+    Label,
+    /// Seconds of the clip in which what is seen is there: long is bright
+    Life,
+    /// Standard deviation of the place of what is seen that the training pictures leave open: unsure is bright
+    Uncertainty,
 }
 
-/// Alpha below which a pixel has no depth worth showing.
+impl Channel {
+    /// Its name.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Color => "color",
+            Self::Alpha => "alpha",
+            Self::Depth => "depth",
+            Self::Flow => "flow",
+            Self::Velocity => "velocity",
+            Self::Normal => "normal",
+            Self::Label => "label",
+            Self::Life => "life",
+            Self::Uncertainty => "uncertainty",
+        }
+    }
+
+    /// The channel with this name.
+    pub fn named(name: &str) -> Option<Self> {
+        <Self as clap::ValueEnum>::value_variants().iter().copied().find(|c| c.name() == name)
+    }
+
+    /// Whether it is the mean of a number of what a pixel shows.
+    pub fn is_field(self) -> bool {
+        !matches!(self, Self::Color | Self::Alpha | Self::Depth)
+    }
+
+    /// Names of the planes of [`Painter::raw`], for files that name them.
+    pub(crate) fn planes(self) -> &'static [&'static str] {
+        match self {
+            Self::Color => &["R", "G", "B"],
+            Self::Alpha => &["A"],
+            Self::Depth => &["Z"],
+            Self::Flow => &["U", "V"],
+            Self::Velocity | Self::Normal => &["X", "Y", "Z"],
+            Self::Label => &["label"],
+            Self::Life => &["life"],
+            Self::Uncertainty => &["uncertainty"],
+        }
+    }
+}
+
+/// Alpha below which a pixel has no depth, and no other number, worth showing.
 const DEPTH_ALPHA: f32 = 0.1;
-/// Colours of depth from far to near, sRGB: dark blue to pale yellow, brightness rising throughout.
-const DEPTH_COLORS: [[f32; 3]; 6] = [
+/// Colours from little to much, sRGB: dark blue to pale yellow, brightness rising throughout.
+const RAMP: [[f32; 3]; 6] = [
     [13.0, 10.0, 36.0],
     [74.0, 25.0, 101.0],
     [148.0, 44.0, 98.0],
@@ -32,13 +91,19 @@ const DEPTH_COLORS: [[f32; 3]; 6] = [
     [250.0, 158.0, 74.0],
     [252.0, 245.0, 186.0],
 ];
+/// Turn of the hue from one label to the next, of a whole one: the golden section, so that few labels are far apart and
+/// many never meet.
+const GOLDEN: f32 = 0.618_034;
+/// Most training pictures that are asked for the uncertainty of a scene, evenly chosen.
+const WITNESSES: usize = 48;
 
 /// Pixels that a thread turns into bytes at once: enough to be worth its while.
 const CHUNK: usize = 1 << 14;
 
 /// Draws, on the CPU unless told; memory is reused from picture to picture.
-pub(crate) struct Painter<'a> {
+pub struct Painter<'a> {
     player: Player<'a>,
+    scene: &'a Scene<f32>,
     background: [f32; 3],
     depth: bool,
     backend: Box<dyn Backend>,
@@ -48,15 +113,71 @@ pub(crate) struct Painter<'a> {
     /// The last picture.
     pub image: Image<f32>,
     bytes: Vec<[u8; 4]>,
+    channel: Channel,
+    /// A number a Gaussian, by layer and row, of channels that show one.
+    numbers: Vec<Vec<f32>>,
+    instant: Evaluation<f32>,
+    /// Of the last picture: the channel's values and the weight of what has one.
+    field: (Planes<f32>, Planes<f32>),
 }
 
 impl<'a> Painter<'a> {
     /// `depth`: whether pictures of depth will be asked for.
-    pub(crate) fn new(scene: &'a Scene<f32>, background: [f32; 3], antialias: bool, depth: bool) -> Self {
+    pub fn new(scene: &'a Scene<f32>, background: [f32; 3], antialias: bool, depth: bool) -> Self {
         let config = RenderConfig { antialias: self::antialias(antialias), ..RenderConfig::default() };
         let (player, backend, image) = (Player::of_scene(scene), device::cpu(config), Image::default());
         let wanted = Wanted { head: scene.head != Head::Identity, ..Wanted::default() };
-        Self { player, background, depth, backend, wanted, console: None, image, bytes: Vec::new() }
+        Self {
+            player,
+            scene,
+            background,
+            depth,
+            backend,
+            wanted,
+            console: None,
+            image,
+            bytes: Vec::new(),
+            channel: Channel::Color,
+            numbers: Vec::new(),
+            instant: Evaluation::default(),
+            field: Default::default(),
+        }
+    }
+
+    /// The same for pictures of this channel. `views`: the training pictures' cameras, which alone can tell of uncertainty.
+    ///
+    /// Errors: a scene without labels, or without training pictures to be certain by.
+    pub fn of_channel(
+        mut self,
+        channel: Channel,
+        views: &[View],
+        progress: &mut dyn FnMut(usize, usize),
+    ) -> Result<Self> {
+        self.channel = channel;
+        self.depth |= channel == Channel::Depth;
+        self.wanted.extra = channel.is_field();
+        match channel {
+            Channel::Label if self.scene.labels.is_empty() => {
+                return Err(Error::input("the scene has no labels")
+                    .remedy("Give the capture's cameras masks of labels, then: splat4d label RUN (docs/labels.md)."));
+            }
+            Channel::Life => self.numbers = channels::lifetimes(self.scene),
+            Channel::Uncertainty => {
+                let seen: Vec<&View> = views.iter().filter(|v| !v.held).collect();
+                if seen.is_empty() {
+                    return Err(Error::input("nobody knows from where the scene was seen")
+                        .remedy("Render uncertainty of a run: a bare scene file brings no training cameras."));
+                }
+                let chosen: Vec<&View> = seen.iter().copied().step_by(seen.len().div_ceil(WITNESSES)).collect();
+                let witnesses: Vec<Witness<'_>> =
+                    chosen.iter().map(|v| Witness { camera: &v.camera, t: Time(v.time) }).collect();
+                let share = seen.len() as f64 / chosen.len() as f64;
+                let reach = cloud(self.scene).1;
+                self.numbers = channels::uncertainties(self.scene, &witnesses, share, reach, progress);
+            }
+            _ => {}
+        }
+        Ok(self)
     }
 
     /// The same on another device, where that can draw the scene.
@@ -72,13 +193,80 @@ impl<'a> Painter<'a> {
     }
 
     /// Draws into [`image`](Self::image). A GPU that fails on the way is said, and left for the CPU.
-    pub(crate) fn draw(&mut self, camera: &Camera, time: f64) {
+    pub fn draw(&mut self, camera: &Camera, time: f64) {
+        if self.channel.is_field() {
+            return self.draw_field(camera, time);
+        }
         let splats = self.player.at(Time(time)).expect("nothing is read for a scene that is in memory");
         let shot = Shot { depth: self.depth, ..Shot::new(&splats, camera, self.background) };
         if let Some(error) = device::draw(&mut self.backend, &shot, &mut self.image)
             && let Some(console) = self.console
         {
             console.warn(&format!("drawing on the CPU: {error}"));
+        }
+    }
+
+    /// Draws the means of the channel's numbers into `field`.
+    fn draw_field(&mut self, camera: &Camera, time: f64) {
+        let scene = self.scene;
+        // As players do: what lies beyond the clip of spans is its end.
+        let spans = scene.layers.iter().any(|l| l.span != ALWAYS);
+        let t = Time(if spans { time.max(scene.clip[0]).min(scene.clip[1]) } else { time });
+        scene.at(t, &mut self.instant);
+        let columns = match self.channel {
+            Channel::Flow => {
+                let next = flow::Shot { t: Time(t.0 + 1.0 / scene.fps), camera };
+                flow::flow_columns(scene, &self.instant, camera, next)
+            }
+            Channel::Velocity => flow::velocity_columns(scene, &self.instant),
+            Channel::Normal => channels::normal_columns(&self.instant, camera),
+            Channel::Label => channels::label_columns(scene, &self.instant).expect("a scene with labels was asked for"),
+            _ => channels::number_columns(&self.instant, &self.numbers),
+        };
+        let splats = scene.splats(&self.instant);
+        let shot = Shot { extra: Some(&columns), ..Shot::new(&splats, camera, self.background) };
+        if let Some(error) = device::draw(&mut self.backend, &shot, &mut self.image)
+            && let Some(console) = self.console
+        {
+            console.warn(&format!("drawing on the CPU: {error}"));
+        }
+        self.field = flow::divided(&self.image.extra);
+    }
+
+    /// The numbers of the last picture, plane by plane ([`Channel::planes`]), NaN where nothing has any: colours over the
+    /// background; alpha; expected depth, scene units; flow, pixels; velocity, scene units a second; unit normals in camera
+    /// axes (x right, y down, z forward); the number of the likeliest label, −1 for none; seconds; scene units.
+    pub fn raw(&self) -> Planes<f32> {
+        let (values, weight) = &self.field;
+        let known = |p: usize| weight.data[p] >= DEPTH_ALPHA;
+        match self.channel {
+            Channel::Color => self.image.color.clone(),
+            Channel::Alpha => self.image.alpha.clone(),
+            Channel::Depth => {
+                let mut out = self.image.depth.clone();
+                let pairs = out.data.iter_mut().zip(&self.image.alpha.data);
+                pairs.for_each(|(d, a)| *d = if *a < DEPTH_ALPHA { f32::NAN } else { *d / a });
+                out
+            }
+            Channel::Label => {
+                let mut out = Planes::new(1, values.height, values.width);
+                for (p, label) in out.data.iter_mut().enumerate() {
+                    *label = best(&self.image.extra, p).map_or(-1.0, |l| l as f32);
+                }
+                out
+            }
+            channel => {
+                let mut out = values.clone();
+                for p in 0..out.pixels() {
+                    let length = (0..out.channels).map(|c| out.plane(c)[p].powi(2)).sum::<f32>().sqrt();
+                    // A mean of normals is no unit vector.
+                    let unit = if channel == Channel::Normal { 1.0 / length } else { 1.0 };
+                    for c in 0..out.channels {
+                        out.plane_mut(c)[p] = if known(p) { unit * values.plane(c)[p] } else { f32::NAN };
+                    }
+                }
+                out
+            }
         }
     }
 
@@ -100,8 +288,10 @@ impl<'a> Painter<'a> {
 
     /// The last picture in 8 bits. `range`: nearest and farthest depth of the depth colours.
     pub(crate) fn rgb(&self, channel: Channel, range: [f32; 2]) -> Rgb {
+        if channel.is_field() {
+            return field_rgb(&self.raw(), channel, range);
+        }
         match channel {
-            Channel::Color => color_rgb(&self.image.color),
             Channel::Alpha => {
                 let plane = &self.image.alpha;
                 let data = plane.data.iter().flat_map(|a| [byte(*a); 3]).collect();
@@ -115,19 +305,37 @@ impl<'a> Painter<'a> {
                 let data = depth.data.iter().zip(&alpha.data).flat_map(pixel).collect();
                 Rgb { width: depth.width, height: depth.height, data }
             }
+            _ => color_rgb(&self.image.color),
         }
     }
 
-    /// Nearest and farthest of the last picture's expected depths, without the outermost hundredths.
-    pub(crate) fn depth_range(&self) -> Option<[f32; 2]> {
-        let pairs = self.image.depth.data.iter().zip(&self.image.alpha.data);
-        let mut depths: Vec<f32> = pairs.filter(|(_, a)| **a >= 0.5).map(|(d, a)| d / a).collect();
-        if depths.is_empty() {
+    /// The range of the last picture's numbers that its colours spread over, without the outermost hundredths: of depth and
+    /// uncertainty from the least on, of flow and velocity the largest length behind 0, of life the whole clip. `None`:
+    /// nothing is seen, or the channel needs no range.
+    pub(crate) fn range(&self) -> Option<[f32; 2]> {
+        if self.channel == Channel::Life {
+            return Some([0.0, (self.scene.clip[1] - self.scene.clip[0]) as f32]);
+        }
+        let mut numbers: Vec<f32> = match self.channel {
+            Channel::Depth => {
+                let pairs = self.image.depth.data.iter().zip(&self.image.alpha.data);
+                pairs.filter(|(_, a)| **a >= 0.5).map(|(d, a)| d / a).collect()
+            }
+            Channel::Flow | Channel::Velocity | Channel::Uncertainty => {
+                let raw = self.raw();
+                let length = |p: usize| (0..raw.channels).map(|c| raw.plane(c)[p].powi(2)).sum::<f32>().sqrt();
+                (0..raw.pixels()).map(length).filter(|l| l.is_finite()).collect()
+            }
+            _ => return None,
+        };
+        if numbers.is_empty() {
             return None;
         }
-        depths.sort_by(f32::total_cmp);
-        let n = depths.len();
-        Some([depths[n / 100], depths[n - 1 - n / 100]])
+        numbers.sort_by(f32::total_cmp);
+        let n = numbers.len();
+        let [low, high] = [numbers[n / 100], numbers[n - 1 - n / 100]];
+        let signed = matches!(self.channel, Channel::Flow | Channel::Velocity);
+        Some([if signed { 0.0 } else { low }, high])
     }
 }
 
@@ -139,11 +347,58 @@ pub fn antialias(on: bool) -> Antialias {
 /// Near is bright; even steps of disparity look even.
 fn depth_color(depth: f32, [near, far]: [f32; 2]) -> [u8; 3] {
     let (n, f) = (1.0 / near.max(1e-6), 1.0 / far.max(near * 1.0001).max(1e-6));
-    let share = ((1.0 / depth.max(1e-6) - f) / (n - f)).clamp(0.0, 1.0);
-    let place = share * (DEPTH_COLORS.len() - 1) as f32;
-    let i = (place as usize).min(DEPTH_COLORS.len() - 2);
+    ramp((1.0 / depth.max(1e-6) - f) / (n - f))
+}
+
+/// The colour of a share from 0 to 1.
+fn ramp(share: f32) -> [u8; 3] {
+    let place = share.clamp(0.0, 1.0) * (RAMP.len() - 1) as f32;
+    let i = (place as usize).min(RAMP.len() - 2);
     let u = place - i as f32;
-    std::array::from_fn(|k| (DEPTH_COLORS[i][k] * (1.0 - u) + DEPTH_COLORS[i + 1][k] * u).round() as u8)
+    std::array::from_fn(|k| (RAMP[i][k] * (1.0 - u) + RAMP[i + 1][k] * u).round() as u8)
+}
+
+/// Numbers as colours; what has none is black.
+fn field_rgb(raw: &Planes<f32>, channel: Channel, [low, high]: [f32; 2]) -> Rgb {
+    let span = (high - low).max(f32::MIN_POSITIVE);
+    let color = |p: usize| -> [u8; 3] {
+        let at = |c: usize| raw.plane(c)[p];
+        if (0..raw.channels).any(|c| !at(c).is_finite()) {
+            return [0; 3];
+        }
+        match channel {
+            Channel::Flow => {
+                // Right is red, down yellow-green, left cyan, up violet; what stands still is white.
+                let turn = at(1).atan2(at(0)) / std::f32::consts::TAU;
+                hue(turn.rem_euclid(1.0), (at(0).hypot(at(1)) / span).min(1.0), 1.0)
+            }
+            Channel::Velocity => std::array::from_fn(|c| byte(0.5 + 0.5 * at(c) / span)),
+            Channel::Normal => [byte(0.5 + 0.5 * at(0)), byte(0.5 - 0.5 * at(1)), byte(0.5 - 0.5 * at(2))],
+            Channel::Label if at(0) < 0.0 => [0; 3],
+            Channel::Label => label_color(at(0) as usize),
+            Channel::Uncertainty => {
+                let log = |x: f32| x.max(f32::MIN_POSITIVE).ln();
+                ramp((log(at(0)) - log(low)) / (log(high) - log(low)).max(f32::MIN_POSITIVE))
+            }
+            _ => ramp((at(0) - low) / span),
+        }
+    };
+    let data = (0..raw.pixels()).flat_map(color).collect();
+    Rgb { width: raw.width, height: raw.height, data }
+}
+
+/// The colour of a label: hues a golden section apart, every other one paler.
+pub fn label_color(label: usize) -> [u8; 3] {
+    hue((label as f32 * GOLDEN).fract(), if label % 2 == 0 { 0.75 } else { 0.45 }, 0.95)
+}
+
+/// Hue from 0 to 1 (red, yellow, green, cyan, blue, violet), saturation and value as 8 bits.
+fn hue(turn: f32, saturation: f32, value: f32) -> [u8; 3] {
+    let channel = |n: f32| {
+        let k = (n + 6.0 * turn) % 6.0;
+        byte(value - value * saturation * k.min(4.0 - k).clamp(0.0, 1.0))
+    };
+    [channel(5.0), channel(3.0), channel(1.0)]
 }
 
 /// Clamped and rounded; NaN is black. Half is added and cut off, which is rounding here and vectorises.

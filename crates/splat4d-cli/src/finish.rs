@@ -12,14 +12,17 @@ use crate::video::{Film, have_ffmpeg};
 use serde_json::{Value, json};
 use splat4d::layers::Scene;
 use splat4d::{Error, Result};
-use splat4d_train::capture::{Capture, CaptureOptions, ImageStore};
+use splat4d_train::capture::{Capture, CaptureKind, CaptureOptions, ImageStore};
 use splat4d_train::eval::Align;
+use splat4d_train::eval::flow::flow_error;
+use splat4d_train::eval::points::point_errors;
 use splat4d_train::eval::run::{EvalOptions, Measured, Scores, evaluate};
 use splat4d_train::eval::tracks::track_error;
 use splat4d_train::eval::trajectory::trajectory_error;
+use splat4d_train::labels::{MOST_PICTURES, ROUNDS};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::chunks::Chunked;
-use splat4d_train::run::corrected;
+use splat4d_train::run::{capture_options, corrected};
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -41,14 +44,19 @@ const FILM_STEPS: f64 = 0.5;
 /// See [`HELD_STEPS`].
 const BAKE_STEPS: f64 = 60.0;
 
+/// See [`HELD_STEPS`]: a picture with a mask of labels, drawn and taken back once.
+const LABEL_STEPS: f64 = 1.0;
+
 /// The time of what follows training, in training steps at full size: `--minutes` leaves room for it.
 pub(crate) fn steps(capture: &Capture, only_playback: bool) -> f64 {
+    let masks = capture.train.iter().filter(|&&i| capture.frames[i].labels.is_some()).count().min(MOST_PICTURES);
+    let labels = (ROUNDS * masks) as f64 * LABEL_STEPS;
     if only_playback {
-        return BAKE_STEPS;
+        return BAKE_STEPS + labels;
     }
     let (first, last) = capture.time_range();
     let fps = if have_ffmpeg() { ORBIT_FPS } else { ORBIT_FPS_PNG };
-    capture.held.len() as f64 * HELD_STEPS + orbit_seconds(last - first) * fps * FILM_STEPS + BAKE_STEPS
+    labels + capture.held.len() as f64 * HELD_STEPS + orbit_seconds(last - first) * fps * FILM_STEPS + BAKE_STEPS
 }
 
 /// Options of measuring.
@@ -127,7 +135,9 @@ pub fn scores(run: &Path, scene: &Scene<f32>, measure: &Measure, console: &Conso
     let capture = Arc::new(capture);
     let measuring = Measuring { opened: &opened, recipe: &recipe, measure };
     let evaluation = measuring.evaluate(scene, &capture, Measured::Test, None, console)?;
+    amend(run, [("lives".into(), json!(lives(scene)))])?;
     tracks(run, scene, &capture, console)?;
+    flow(run, scene, &capture, &recipe, console)?;
     if capture.held.is_empty() {
         console.warn(
             "no view was held out, so that quality on new views cannot be measured. Hold out a camera (--hold-out \
@@ -261,6 +271,20 @@ impl Measuring<'_> {
     }
 }
 
+/// Bins of the histogram of lives.
+const LIFE_BINS: usize = 10;
+
+/// How many Gaussians can be seen for how much of the clip: in tenths, those that are never seen left out.
+fn lives(scene: &Scene<f32>) -> [usize; LIFE_BINS] {
+    let length = (scene.clip[1] - scene.clip[0]).max(f64::MIN_POSITIVE);
+    let mut counts = [0; LIFE_BINS];
+    for seconds in splat4d::channels::lifetimes(scene).into_iter().flatten().filter(|s| *s > 0.0) {
+        let share = f64::from(seconds) / length;
+        counts[((share * LIFE_BINS as f64) as usize).min(LIFE_BINS - 1)] += 1;
+    }
+    counts
+}
+
 /// Measures tracks in space where the capture comes with true ones.
 fn tracks(run: &Path, scene: &Scene<f32>, capture: &Capture, console: &Console) -> Result<()> {
     let Some(e) = track_error(scene, capture)? else { return Ok(()) };
@@ -279,7 +303,76 @@ fn tracks(run: &Path, scene: &Scene<f32>, capture: &Capture, console: &Console) 
         "height": e.height,
         "percent": e.percent(), "followed": e.followed,
     });
-    amend(run, [("tracks".into(), entry)])
+    amend(run, [("tracks".into(), entry)])?;
+    let Some(e) = point_errors(scene, capture)? else { return Ok(()) };
+    let percent = |shares: &[f64]| shares.iter().map(|s| format!("{:.1}", 100.0 * s)).collect::<Vec<_>>().join(", ");
+    let mut words = format!(
+        "points followed in space: median error {:.4} units, {} % within 1, 2, 4, 8, 16 % of their height, {:.1} % lost",
+        e.median,
+        percent(&e.within),
+        100.0 * e.lost
+    );
+    if let Some(slope) = e.slope {
+        let _ = write!(words, ", drift slope {slope:.2}");
+    }
+    console.say(&words);
+    if let Some(p) = &e.pictures {
+        let mut words = format!(
+            "in {} views: median error {:.2} px, {} % within 1, 2, 4, 8, 16 px (mean {:.1} %)",
+            p.cameras,
+            p.median,
+            percent(&p.within),
+            100.0 * p.average()
+        );
+        if let Some(slope) = p.slope {
+            let _ = write!(words, ", drift slope {slope:.2}");
+        }
+        if let Some(right) = p.visibility {
+            let _ = write!(words, ", visibility right for {:.1} %", 100.0 * right);
+        }
+        console.say(&words);
+    }
+    let pictures = e.pictures.as_ref().map(|p| {
+        json!({
+            "cameras": p.cameras, "median_px": p.median, "within_px": p.within, "delta_avg": p.average(),
+            "slope": p.slope, "visibility": p.visibility,
+        })
+    });
+    let entry = json!({
+        "points": e.points, "median": e.median, "within_height": e.within, "lost": e.lost, "slope": e.slope,
+        "pictures": pictures,
+    });
+    amend(run, [("point_tracks".into(), entry)])
+}
+
+/// Measures drawn flow where the capture brings some along.
+fn flow(run: &Path, scene: &Scene<f32>, capture: &Capture, recipe: &Recipe, console: &Console) -> Result<()> {
+    if capture.kind != CaptureKind::Own {
+        return Ok(());
+    }
+    // A run that does not train on flow has left the files out.
+    let mut whole = Capture::open(&capture.root, &capture_options(recipe)?)?;
+    corrected::apply(&mut whole, run)?;
+    whole.held.retain(|i| capture.held.contains(i));
+    whole.train.retain(|i| capture.train.contains(i));
+    let Some(e) = flow_error(scene, &whole)? else { return Ok(()) };
+    let mut words = format!(
+        "flow of {} {} views: end-point error {:.3} px in the mean, {:.3} at the median, {:.1} % within 1 px",
+        e.pictures,
+        if e.held { "held-out" } else { "training" },
+        e.mean,
+        e.median,
+        100.0 * e.within[0]
+    );
+    if let (Some(moving), Some(length)) = (e.moving, e.length) {
+        let _ = write!(words, "; where things move {moving:.3} px of {length:.2}");
+    }
+    console.say(&words);
+    let entry = json!({
+        "pictures": e.pictures, "held": e.held, "mean": e.mean, "median": e.median, "moving": e.moving,
+        "length": e.length, "within_px": e.within, "drawn": e.drawn,
+    });
+    amend(run, [("flow".into(), entry)])
 }
 
 /// The report, and the scores on the console.

@@ -6,6 +6,7 @@
 
 #![allow(missing_docs)] // nobody outside the workspace reads it
 
+mod asked;
 mod baking;
 mod camera_file;
 mod chunked;
@@ -19,10 +20,12 @@ pub mod files;
 mod film;
 pub mod finish;
 pub mod interrupt;
+mod labelling;
 pub mod measure;
 pub mod paths;
 mod playable;
 mod predicting;
+mod raw;
 pub mod report;
 pub mod run_folder;
 pub mod sequence;
@@ -60,6 +63,7 @@ Examples:
   splat4d export runs/knight --html -o knight.html
   splat4d convert scene.sog scene.spz      between the formats of other programs
   splat4d edit runs/knight edits.toml -o clean.safetensors   select, clean, recolour, move, merge, drag
+  splat4d label runs/take                  what each Gaussian is part of, from masks
   splat4d info my-take                     what is in a capture, run or file; is it healthy?
   splat4d bench                            how fast this machine draws and trains
 
@@ -107,6 +111,7 @@ enum Verb {
     View(verbs::view::Args),
     Convert(verbs::convert::Args),
     Edit(verbs::edit::Args),
+    Label(verbs::label::Args),
     Info(verbs::info::Args),
     Bench(verbs::bench::Args),
     Completions(verbs::completions::Args),
@@ -128,6 +133,7 @@ impl Verb {
             Verb::View(args) => verbs::view::run(args, console),
             Verb::Convert(args) => verbs::convert::run(args, console),
             Verb::Edit(args) => verbs::edit::run(args, console),
+            Verb::Label(args) => verbs::label::run(args, console),
             Verb::Info(args) => verbs::info::run(args, console),
             Verb::Bench(args) => verbs::bench::run(args, threads, console),
             Verb::Completions(args) => verbs::completions::run(args, console),

@@ -2,6 +2,8 @@
 
 #[path = "cli/bench.rs"]
 mod bench;
+#[path = "cli/channels.rs"]
+mod channels;
 #[path = "cli/chunked.rs"]
 mod chunked;
 #[path = "cli/compress.rs"]
@@ -61,6 +63,7 @@ fn help_teaches_and_completions_complete() {
         "view",
         "export",
         "convert",
+        "label",
         "info",
         "bench",
         "completions",

@@ -10,7 +10,7 @@ use splat4d::flow::tracks;
 use splat4d::layers::{Evaluation, Head};
 use splat4d::render::{Image, RenderConfig, Shot, Tables, Wanted};
 use splat4d::scene::{Planes, Time};
-use splat4d_cli::draw::antialias;
+use splat4d_cli::draw::{Channel, Painter, antialias};
 use splat4d_cli::paths::View;
 use splat4d_cli::sequence::moments;
 use splat4d_cli::source::Source;
@@ -75,6 +75,12 @@ impl Scene {
         self.source.scene.background
     }
 
+    /// Names of the labels that its Gaussians have, in the order of their numbers; empty: none.
+    #[getter]
+    fn labels(&self) -> Vec<String> {
+        self.source.scene.labels.clone()
+    }
+
     /// The capture's cameras, (name, camera); empty where the file brings none.
     #[getter]
     fn cameras(&self) -> Vec<(String, Camera)> {
@@ -91,7 +97,10 @@ impl Scene {
     }
 
     /// A picture at second t: `color` [h, w, 3] over the background, `alpha` [h, w], or expected `depth` [h, w] along the
-    /// camera's z in scene units, NaN where nothing is. float32. `device`: `cpu`, `gpu` or `auto`.
+    /// camera's z in scene units, NaN where nothing is; or one of what `splat4d render --channel` shows as raw numbers, NaN
+    /// where nothing has any: `flow` [h, w, 2] in pixels to the scene's next frame, `velocity` [h, w, 3] in scene units a
+    /// second, unit `normal` [h, w, 3] in camera axes, number of the `label` [h, w] (-1: none), `life` [h, w] in seconds,
+    /// `uncertainty` [h, w] in scene units (of a run; drawn on the CPU as all of these). float32. `device`: `cpu`, `gpu` or `auto`.
     #[pyo3(signature = (camera, t, *, channel="color", background=None, device="cpu"))]
     fn render<'py>(
         &self,
@@ -103,15 +112,28 @@ impl Scene {
         device: &str,
     ) -> PyResult<Bound<'py, PyAny>> {
         let t = time(t)?;
-        if !["color", "alpha", "depth"].contains(&channel) {
-            return Err(bad_input(format!("there is no channel `{channel}`"), "Give color, alpha or depth"));
-        }
+        let Some(kind) = Channel::named(channel) else {
+            return Err(bad_input(
+                format!("there is no channel `{channel}`"),
+                "Give color, alpha, depth, flow, velocity, normal, label, life or uncertainty",
+            ));
+        };
         let device = named(device)?;
         let background = background.map(|b| finite::<3>(b, "background")).transpose()?;
         let scene = &self.source.scene;
         let background = background.map_or(scene.background, |b| b.map(|x| x as f32));
         let depth = channel == "depth";
         let smooth = self.source.run.as_ref().and_then(|r| r.recipe().ok()).is_some_and(|r| r.appearance.antialias);
+        if kind.is_field() {
+            let drawn = py.detach(|| {
+                let painter = Painter::new(scene, background, smooth, false);
+                let mut painter = painter.of_channel(kind, &self.views, &mut |_, _| {})?;
+                painter.draw(&camera.0, t.0);
+                Ok(painter.raw())
+            });
+            let drawn: Planes<f32> = drawn.or_raise()?;
+            return if drawn.channels > 1 { picture(py, drawn) } else { Ok(plane(py, drawn)?.into_bound(py)) };
+        }
         let (image, trouble) = py.detach(|| {
             let config = RenderConfig { antialias: antialias(smooth), ..RenderConfig::default() };
             let wanted = Wanted { head: scene.head != Head::Identity, ..Wanted::default() };

@@ -30,6 +30,8 @@ export class Splat4D extends HTMLElement {
   get camera(): CameraState;
   set camera(camera: Partial<CameraState>);
   set scene(source: File | Blob | ArrayBuffer);
+  /** Labels as colours, or the label with this name alone. */
+  setLabels(show: { colors?: boolean; only?: string | null }): void;
   screenshot(): Promise<Blob>;
   settled(): Promise<void>;
   readonly link: string;

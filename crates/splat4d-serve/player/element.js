@@ -9,7 +9,8 @@ import { readLink, vector } from './camera.js';
 const OBSERVED = ['src', 'controls', 'time', 'speed', 'loop', 'backend', 'channel', 'background', 'camera', 'poster',
   'theme', 'resolution', 'heading'];
 /** Events of the player that the element shows to its page. */
-const EVENTS = ['load', 'timeupdate', 'play', 'pause', 'ended', 'error', 'camerachange', 'channelchange', 'ratechange'];
+const EVENTS = ['load', 'timeupdate', 'play', 'pause', 'ended', 'error', 'camerachange', 'channelchange', 'labelschange',
+  'ratechange'];
 
 let sheet;
 
@@ -125,6 +126,9 @@ export class Splat4D extends HTMLElement {
     if (poster) ui.setPoster(new URL(poster, document.baseURI).href);
     await p.load(source, { start: this.#start() });
   }
+
+  /** Labels as colours, or one label alone: docs/player.md. */
+  setLabels(show) { this.#player?.setLabels(show); }
 
   /** How a scene begins: the attributes say, and a page's address says more. */
   #start() {

@@ -40,6 +40,12 @@ export function viewPanel(ui) {
     player.background = BACKGROUNDS[b];
     player.redraw();
   });
+  const OFF = '-';
+  let named = null;
+  const labels = choice('Labels', [], v => player.setLabels({
+    colors: v === OFF + OFF, only: v.startsWith(OFF) ? null : player.meta.labels[+v],
+  }));
+  const labelsField = field('Labels', labels);
   const theme = segments('Theme', [['auto', 'Auto'], ['light', 'Light'], ['dark', 'Dark']], t => ui.setTheme(t));
   const figures = h('input', { type: 'checkbox', 'aria-label': 'Figures',
     onchange: () => ui.setFigures(figures.checked) });
@@ -51,7 +57,7 @@ export function viewPanel(ui) {
     h('div', { class: 'field cramped' }, channel),
     path,
     field('Speed', speed, 'narrow'), field('Loop', loop, 'narrow'), field('Resolution', scale),
-    field('Background', ground), field('Theme', theme), field('Drawn with', backend), field('Figures', figures),
+    labelsField, field('Background', ground), field('Theme', theme), field('Drawn with', backend), field('Figures', figures),
     h('div', { class: 'wrap' },
       button('Save picture', () => ui.screenshot(), {}, 'photo'),
       ui.page ? button('Copy link', () => ui.copyLink(), {}, 'link') : null,
@@ -64,6 +70,14 @@ export function viewPanel(ui) {
     backend.set(player.backendName);
     const now = JSON.stringify(player.background);
     ground.set(Object.keys(BACKGROUNDS).find(k => JSON.stringify(BACKGROUNDS[k]) === now));
+    const names = player.meta?.labels ?? [];
+    if (named !== names) {
+      named = names;
+      labels.replaceChildren(h('option', { value: OFF }, 'Not shown'), h('option', { value: OFF + OFF }, 'As colours'),
+        ...names.map((name, i) => h('option', { value: i }, `Only ${name}`)));
+    }
+    labelsField.hidden = !names.length;
+    labels.value = player.labels.only !== null ? String(player.labels.only) : player.labels.colors ? OFF + OFF : OFF;
     theme.set(ui.theme);
     figures.checked = ui.figuresOn;
     for (const item of [path.children[0], path.children[1], speed, loop]) item.disabled = player.still;

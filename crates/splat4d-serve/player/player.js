@@ -40,6 +40,8 @@ const BUFFER_EVERY = 250;
 export class Player extends EventTarget {
   camera = new Camera();
   channel = 'color';
+  /** {colors: labels as colours, only: number of the label that alone is seen, or null}. */
+  labels = { colors: false, only: null };
   background = null;
   state = 'empty';
   time = 0;
@@ -162,6 +164,7 @@ export class Player extends EventTarget {
     this.file?.close();
     this.file = file;
     this.meta = file.meta;
+    if (!keep) this.labels = { colors: false, only: null };
     this.#attach();
     this.#held = keep ? performance.now() + HOLD : 0;
     if (keep) this.time = clamp(this.time, this.first, this.last);
@@ -202,6 +205,7 @@ export class Player extends EventTarget {
       onchange: () => { this.redraw(); this.#bufferAt = 0; },
       onerror: error => this.#pageFailed(error),
       onleft: gaussians => this.emit('leftout', { gaussians }),
+      show: this.labels.colors || this.labels.only !== null ? this.labels : null,
     });
   }
 
@@ -371,6 +375,18 @@ export class Player extends EventTarget {
     this.channel = channel;
     this.redraw();
     this.emit('channelchange', { channel });
+  }
+
+  /** Shows labels as colours, or one label (its name) alone; both may be. Names that there are not are none. */
+  setLabels({ colors = false, only = null } = {}) {
+    const at = this.meta?.labels.indexOf(only) ?? -1;
+    this.labels = { colors: !!colors, only: at < 0 ? null : at };
+    if (this.file && this.backend) {
+      this.#stream?.destroy();
+      this.#attach();
+    }
+    this.redraw();
+    this.emit('labelschange', { colors: this.labels.colors, only: at < 0 ? null : only });
   }
 
   // The camera.

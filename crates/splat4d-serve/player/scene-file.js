@@ -173,6 +173,11 @@ export class SceneFile {
     return { id, ...(await this.#decoded(this.sections[id], signal, 0)) };
   }
 
+  /// The labels of a page, `id` its `labels`: a byte a Gaussian, 255: it has none.
+  async labels(id, { signal } = {}) {
+    return (await this.#decoded(this.sections[id], signal, 0)).bytes;
+  }
+
   /// The poster as a Blob, or null.
   async poster({ signal } = {}) {
     const entry = this.sections.find((s) => s.kind === 'POST' && !s.missing);
@@ -300,6 +305,15 @@ export class SceneFile {
       page.mask = mask.id;
       page.maskBytes = mask.keys * 4 * Math.ceil(mask.count / 32);
     }
+    for (const labels of this.sections) {
+      if (labels.kind !== 'LABL') continue;
+      const page = this.sections[labels.page];
+      if (page?.kind !== 'PAGE' || page.count !== labels.count) {
+        this.#refuse(`Labels ${labels.id} are of no page of ${labels.count} Gaussians`);
+      }
+      if (page.labels !== -1) this.#refuse(`Page ${page.id} has labels twice`);
+      if (!labels.missing) page.labels = labels.id;
+    }
     // What the pages state is what will be drawn, whatever the description says.
     this.meta.gaussians = this.pages.reduce((n, p) => n + p.count, 0);
   }
@@ -315,7 +329,7 @@ export class SceneFile {
     section.missing = offset + stored > this.bytesTotal;
     const refuse = (what, remedy) => this.#refuse(`Section ${id} (${kind.replace(/[^ -~]/g, '?')}) ${what}`, remedy);
     if (!(offset >= HEAD && offset + stored <= length)) refuse('lies outside the file');
-    if (!['PAGE', 'PALT', 'POST', 'MASK'].includes(kind)) {
+    if (!['PAGE', 'PALT', 'POST', 'MASK', 'LABL'].includes(kind)) {
       if (section.flags & 1) refuse('is of a kind that this player does not know', 'Use a newer player.');
       return section;
     }
@@ -327,7 +341,12 @@ export class SceneFile {
       this.#checkMask(section, u32(56), refuse);
       return section;
     }
-    if (kind === 'PAGE') Object.assign(section, { mask: -1, maskBytes: 0 });
+    if (kind === 'LABL') {
+      Object.assign(section, { page: u32(56), palette: -1 });
+      if (bytes !== count) refuse(`decodes to ${bytes} bytes, not one for each of ${count} Gaussians`);
+      return section;
+    }
+    if (kind === 'PAGE') Object.assign(section, { mask: -1, maskBytes: 0, labels: -1 });
     if (kind === 'PAGE' && section.words !== WORDS) {
       refuse(`has ${section.words} words a Gaussian, not ${WORDS}`, 'Use a newer player.');
     }
@@ -387,6 +406,7 @@ export class SceneFile {
       box,
       view: look(j.view) ? j.view : null,
       cameras,
+      labels: list(j.labels).filter((name) => typeof name === 'string').slice(0, 255),
       missing: list(j.missing).filter((span) => numbers(span, 2) && span[0] < span[1]),
       near: nears.length ? Math.min(...nears) : NEAR,
       path: list(j.path)

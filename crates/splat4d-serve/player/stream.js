@@ -2,6 +2,7 @@
 // above its budget it lets go of what is farthest in time, never of what this moment needs.
 
 import { isAbort } from './errors.js';
+import { painted } from './labels.js';
 
 /// Bytes of 32-bit words that stay resident, by default, and on small machines (navigator.deviceMemory, GiB).
 const BUDGET = 512 << 20,
@@ -35,6 +36,7 @@ export class Stream {
   #onchange;
   #onerror;
   #onleft;
+  #show;
   #resident = new Set();
   /// Those of them whose key masks are in the backend.
   #masked = new Set();
@@ -61,8 +63,10 @@ export class Stream {
 
   /// `file`: SceneFile. `backend`: of PLAYER's interface; it owns the arrays it is given. `budget`: bytes of words.
   /// `onchange()` after each page that came or went, `onerror(SceneError)` for a page that is given up for now,
-  /// `onleft(Gaussians)` when a moment first does not fit into the budget.
-  constructor(file, backend, { budget = defaultBudget(), onchange, onerror, onleft } = {}) {
+  /// `onleft(Gaussians)` when a moment first does not fit into the budget. `show`: labels as `painted` wants it, null: pages
+  /// are shown as they are.
+  constructor(file, backend, { budget = defaultBudget(), onchange, onerror, onleft, show = null } = {}) {
+    this.#show = show;
     this.#file = file;
     this.#backend = backend;
     this.#budget = Math.min(budget, backend.capacity ?? Infinity);
@@ -238,14 +242,15 @@ export class Stream {
         : [
             this.#file.page(entry.id, { signal }),
             entry.palette < 0 ? null : this.#palette(entry.palette),
+            this.#show && entry.labels >= 0 ? this.#file.labels(entry.labels, { signal }) : null,
           ];
       const coming = entry.mask >= 0 ? this.#file.mask(entry.mask, { signal }) : null;
       // Waited for below; a page that fails first must not leave it unheard.
       coming?.catch(() => {});
       if (parts) {
-        const [page] = await Promise.all(parts);
+        const [page, , labels] = await Promise.all(parts);
         if (signal.aborted) return;
-        this.#backend.addPage(page, entry);
+        this.#backend.addPage(...(this.#show ? painted(page, entry, labels, this.#show) : [page, entry]));
         this.#resident.add(entry.id);
         this.#bytes += cost(entry);
         if (coming) this.#onchange();

@@ -121,7 +121,7 @@ export class Interface {
     const p = this.player;
     const on = (name, f) => p.addEventListener(name, f);
     on('timeupdate', () => this.#showTime());
-    for (const name of ['play', 'pause', 'ratechange', 'channelchange', 'film', 'mode', 'backend']) {
+    for (const name of ['play', 'pause', 'ratechange', 'channelchange', 'labelschange', 'film', 'mode', 'backend']) {
       on(name, () => this.refresh());
     }
     on('scene', () => { this.notice.replaceChildren(); this.refresh(); this.#showTime(); });

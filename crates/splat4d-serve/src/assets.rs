@@ -30,6 +30,7 @@ const FILES: &[(&str, &str)] = player![
     "glsl.js",
     "icons.js",
     "index.html",
+    "labels.js",
     "live.js",
     "motion.js",
     "order.js",

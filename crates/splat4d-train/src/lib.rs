@@ -26,6 +26,7 @@ pub mod compress;
 pub mod eval;
 pub mod event;
 pub mod init;
+pub mod labels;
 pub mod learner;
 pub mod loss;
 pub mod methods;

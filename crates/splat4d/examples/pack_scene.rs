@@ -223,6 +223,7 @@ fn primitive(layer: &Layer<f32>, row: usize) -> Result<Primitive, String> {
         base_color: colors.read::<3>(row, 0).map(sh::dc_to_rgb),
         sh_rest,
         importance: opacity * area * seconds.max(0.01) as f32,
+        label: None,
     })
 }
 

@@ -7,6 +7,7 @@
 //! [`Motion::at`]: crate::motion::Motion::at
 
 pub mod lift;
+pub mod query;
 #[cfg(test)]
 mod tests;
 pub mod tracks;
@@ -62,13 +63,21 @@ pub fn velocities<F: Real>(scene: &Scene<F>, instant: &Evaluation<F>) -> Table<F
 pub fn render_velocity<F: Real>(scene: &Scene<F>, shot: Shot<'_>, renderer: &mut Renderer<F>) -> Flow<F> {
     let mut instant = Evaluation::default();
     scene.at(shot.t, &mut instant);
-    let moving = velocities(scene, &instant);
+    let extra = velocity_columns(scene, &instant);
+    draw(&scene.splats(&instant), shot.camera, scene.background, &extra, renderer)
+}
+
+/// [`velocities`] as further channels of a picture: [splats, 4], x, y, z and 1 ([`divided`]).
+///
+/// Panics: `instant` is not this scene's.
+pub fn velocity_columns<F: Real>(scene: &Scene<F>, instant: &Evaluation<F>) -> Table<F> {
+    let moving = velocities(scene, instant);
     let mut extra = Table::new(&[("velocity", 3), ("valid", 1)], moving.rows());
     for j in 0..moving.rows() {
         let [x, y, z] = moving.read::<3>(j, 0);
         extra.write(j, 0, [x, y, z, F::ONE]);
     }
-    draw(&scene.splats(&instant), shot.camera, scene.background, &extra, renderer)
+    extra
 }
 
 /// 2D flow in pixels, [2, h, w] (x right, y down): F(p) = Σ w_i [π_to(μ_i(t_to)) − π_from(μ_i(t_from))] / Σ w_i.
@@ -78,22 +87,31 @@ pub fn render_velocity<F: Real>(scene: &Scene<F>, shot: Shot<'_>, renderer: &mut
 /// Source: "F_simple" of rendered optical flow, Σ w Δμ_2D, as in Gao et al. 2024 (GaussianFlow) §3.2 without its
 /// covariance term.
 pub fn render_flow<F: Real>(scene: &Scene<F>, from: Shot<'_>, to: Shot<'_>, renderer: &mut Renderer<F>) -> Flow<F> {
-    let (mut start, mut end) = (Evaluation::default(), Evaluation::default());
+    let mut start = Evaluation::default();
     scene.at(from.t, &mut start);
-    follow(scene, &start, to.t, &mut end);
-    let splats = scene.splats(&start);
-    let mut extra = Table::new(&[("flow", 2), ("valid", 1)], splats.len());
+    let extra = flow_columns(scene, &start, from.camera, to);
+    draw(&scene.splats(&start), from.camera, scene.background, &extra, renderer)
+}
+
+/// The way of every splat on the screen as further channels of a picture: [splats, 3], u, v in pixels and 1, or zeros for a
+/// splat that is behind a camera ([`divided`]).
+///
+/// Panics: `start` is not this scene's.
+pub fn flow_columns<F: Real>(scene: &Scene<F>, start: &Evaluation<F>, from: &Camera, to: Shot<'_>) -> Table<F> {
+    let mut end = Evaluation::default();
+    follow(scene, start, to.t, &mut end);
+    let mut extra = Table::new(&[("flow", 2), ("valid", 1)], scene.splats(start).len());
     let mut j = 0;
     for (a, b) in start.tapes().zip(end.tapes()) {
         for r in 0..a.out().rows() {
             let [at, then] = [a, b].map(|t| t.out().read::<3>(r, 0).map(F::f64));
-            if let (Some((p, _)), Some((q, _))) = (from.camera.project(at), to.camera.project(then)) {
+            if let (Some((p, _)), Some((q, _))) = (from.project(at), to.camera.project(then)) {
                 extra.write(j, 0, [F::of(q[0] - p[0]), F::of(q[1] - p[1]), F::ONE]);
             }
             j += 1;
         }
     }
-    draw(&splats, from.camera, scene.background, &extra, renderer)
+    extra
 }
 
 /// The same rows as in `of`, at time t.
@@ -117,15 +135,22 @@ fn draw<F: Real>(
     let background = background.map(|b| F::of(f64::from(b)));
     let shot = render::Shot { extra: Some(extra), depth: true, ..render::Shot::new(splats, camera, background) };
     renderer.render(&shot, &mut image);
-    let count = extra.width() - 1;
-    let mut vectors = Planes::new(count, camera.height, camera.width);
-    let mut weight = Planes::new(1, camera.height, camera.width);
-    weight.data.copy_from_slice(image.extra.plane(count));
+    let (vectors, weight) = divided(&image.extra);
+    Flow { vectors, weight, image }
+}
+
+/// Blended channels, of which the last is Σ w_i of the splats that have a value: the others over that, [C − 1, h, w], and
+/// it, [1, h, w]. Where it is small the values mean nothing.
+pub fn divided<F: Real>(extra: &Planes<F>) -> (Planes<F>, Planes<F>) {
+    let count = extra.channels - 1;
+    let mut values = Planes::new(count, extra.height, extra.width);
+    let mut weight = Planes::new(1, extra.height, extra.width);
+    weight.data.copy_from_slice(extra.plane(count));
     for c in 0..count {
-        let sums = image.extra.plane(c).iter().zip(&weight.data);
-        for (out, (&sum, &w)) in vectors.plane_mut(c).iter_mut().zip(sums) {
+        let sums = extra.plane(c).iter().zip(&weight.data);
+        for (out, (&sum, &w)) in values.plane_mut(c).iter_mut().zip(sums) {
             *out = sum / w.max(F::of(FLOW_ALPHA_MIN));
         }
     }
-    Flow { vectors, weight, image }
+    (values, weight)
 }

@@ -25,6 +25,7 @@
 //! This crate reads bytes, not paths; it knows no loss, no optimiser and no data set (those are in `splat4d-train`).
 
 pub mod bake;
+pub mod channels;
 pub mod device;
 pub mod edit;
 pub mod error;

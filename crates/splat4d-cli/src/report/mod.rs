@@ -44,6 +44,7 @@ fn page(run: &Run) -> String {
     views(&mut body, run);
     curves(&mut body, run);
     scores(&mut body, run);
+    lives(&mut body, run);
     conditions(&mut body, run);
     costs(&mut body, run);
     again(&mut body, run);
@@ -245,6 +246,30 @@ fn scores(out: &mut String, run: &Run) {
         out.push_str(
             "<p class=\"note\">In brackets: after the one affine colour matrix that suits all held-out views of the \
              camera best. The rest of the error is no matter of white balance.</p>\n",
+        );
+    }
+}
+
+/// How long Gaussians can be seen.
+fn lives(out: &mut String, run: &Run) {
+    let counts = run.info.get("lives").and_then(crate::camera_file::numbers).unwrap_or_default();
+    let all: f64 = counts.iter().sum();
+    let share = |bin: usize| {
+        format!(
+            "{:.0} to {:.0} %",
+            100.0 * bin as f64 / counts.len() as f64,
+            100.0 * (bin + 1) as f64 / counts.len() as f64
+        )
+    };
+    let row = |(bin, n): (usize, &f64)| (share(bin), 100.0 * n / all, format!("{:.1} %", 100.0 * n / all));
+    let rows: Vec<(String, f64, String)> = counts.iter().enumerate().map(row).collect();
+    // A scene in which all live for ever has nothing to tell.
+    if counts.iter().filter(|n| **n > 0.0).count() > 1 {
+        let chart = bars(&rows, 0.0, "Gaussians by the share of the clip in which they can be seen");
+        panels(
+            out,
+            "How long Gaussians live",
+            [("Share of all, by the part of the clip in which one can be seen", chart)],
         );
     }
 }

@@ -380,7 +380,14 @@ impl Writer {
     fn bytes(&self, scene: &Scene<f32>) -> Result<(Vec<u8>, Warnings)> {
         let mut out = Vec::new();
         let warnings = match self.target {
-            Target::Dialect(dialect) => dialect.write(scene, &self.options, &mut out)?,
+            Target::Dialect(dialect) => {
+                let mut warnings = dialect.write(scene, &self.options, &mut out)?;
+                if !scene.labels.is_empty() {
+                    warnings
+                        .say(format!("{} labels are left out: the format has no place for them", scene.labels.len()));
+                }
+                warnings
+            }
             Target::Scene | Target::Playback => format::scene::write(scene, &mut out).map(|()| Warnings::default())?,
         };
         Ok((out, warnings))

@@ -1,6 +1,7 @@
 //! `export`: moments of a scene as plain 3DGS .ply files, the whole of it as one page with its player, or where its
-//! Gaussians go as JSON or CSV.
+//! Gaussians, or points that are asked for, go as JSON or CSV.
 
+use crate::asked::{self, Answer};
 use crate::console::Console;
 use crate::files;
 use crate::playable::Playable;
@@ -10,7 +11,8 @@ use serde_json::json;
 use splat4d::flow::tracks::{Tracks, every, nearest};
 use splat4d::layers::Scene;
 use splat4d::layers::freeze;
-use splat4d::scene::Time;
+use splat4d::math::Rng;
+use splat4d::scene::{RowEdit, Space, Time, labels};
 use splat4d::{Error, format};
 use splat4d_serve::{Page, SceneIn};
 use std::path::{Path, PathBuf};
@@ -24,7 +26,15 @@ Examples:
   splat4d export runs/knight --html -o index.html --link knight.splat4d     for a web server: seeks, starts at once
   splat4d export runs/knight --tracks tracks.csv           where every Gaussian is at every frame; .json too
   splat4d export runs/knight --tracks tracks.json --every 50
-  splat4d export runs/knight --tracks hand.csv --near 0.3,1.2,-0.5 --count 20";
+  splat4d export runs/knight --tracks hand.csv --near 0.3,1.2,-0.5 --count 20
+  splat4d export runs/knight --tracks paths.csv --points asked.csv    points that are asked for, and who sees them
+  splat4d export runs/knight -o knight.ply --time 0.5 --label knight  what has this label
+
+A file of points has a header and a line a point, either of what a camera's pixel shows at a time or of a place at a time:
+  camera,x,y,time          time,x,y,z           time,x,y,z,camera
+  cam03,151.5,88,0.2       0,0.31,1.2,-0.5      0,0.31,1.2,-0.5,cam03
+Pixels are those of the camera's picture, the first one's centre at 0.5; times are seconds. Each point is followed through
+all moments; `visible` is 1 where its camera sees it, and empty where it has none.";
 
 /// Write moments of a scene as 3DGS .ply files, all of it as a page, or tracks of its Gaussians
 #[derive(Debug, clap::Args)]
@@ -55,6 +65,12 @@ pub(crate) struct Args {
     /// Write positions of Gaussians over time (seconds, scene units) to this .csv or .json file
     #[arg(long, value_name = "FILE", conflicts_with_all = ["output", "sequence", "time", "html"])]
     tracks: Option<PathBuf>,
+    /// Follow these points through all moments, and say where their camera sees them, in place of Gaussians
+    #[arg(long, value_name = "FILE", requires = "tracks", conflicts_with_all = ["near", "every", "label"])]
+    points: Option<PathBuf>,
+    /// Only Gaussians with this label
+    #[arg(long, value_name = "NAME")]
+    label: Option<String>,
     /// Only every N-th Gaussian's track
     #[arg(long, value_name = "N", requires = "tracks", conflicts_with = "near",
           value_parser = clap::value_parser!(u32).range(1..))]
@@ -102,9 +118,23 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         }
     }
     if args.html {
+        if args.label.is_some() {
+            return Err(Error::input("a page shows the whole file")
+                .remedy(
+                    "Make a file of what has the label first: splat4d edit RUN --crop 'label(NAME)' -o part.splat4d.",
+                )
+                .into());
+        }
         return page(path, args, console);
     }
-    let source = Source::open(path)?;
+    let mut source = Source::open(path)?;
+    if let Some(name) = args.label.as_ref().filter(|_| args.tracks.is_none()) {
+        let wanted = Some(labels::named(&source.scene.labels, name).map_err(|e| e.at(path.display()))?);
+        for layer in &mut source.scene.layers {
+            let of = labels::of(&layer.params);
+            layer.edit(&RowEdit::prune(Space::Gaussians, of.iter().map(|l| *l == wanted)), &Rng::new(0, "export", 0));
+        }
+    }
     let scene = &source.scene;
     not_empty(scene, path)?;
     let write = |time: f64, out: &Path| -> anyhow::Result<usize> {
@@ -115,7 +145,10 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         Ok(params.len())
     };
     if let Some(out) = &args.tracks {
-        return tracks(scene, args, out, console);
+        return match &args.points {
+            Some(points) => followed(&source, args, [points, out], console),
+            None => tracks(scene, args, out, console),
+        };
     }
     if let Some(folder) = &args.sequence {
         let (fps, times) = sequence::moments(scene, args.fps, [args.from, args.to])?;
@@ -154,20 +187,51 @@ const MOST_NUMBERS: usize = 300_000_000;
 /// Fainter Gaussians than this are not near anything.
 const LEAST_OPACITY: f64 = 0.1;
 
+/// Whether tracks are written as JSON. Errors: neither that nor CSV.
+fn is_json(out: &Path) -> splat4d::Result<bool> {
+    match out.extension().map(|e| e.to_ascii_lowercase()) {
+        Some(e) if e == "json" => Ok(true),
+        Some(e) if e == "csv" => Ok(false),
+        _ => Err(Error::input("tracks are written as .csv or .json")
+            .at(out.display())
+            .remedy("Use --tracks NAME.csv or --tracks NAME.json.")),
+    }
+}
+
+/// Writes where points of a file go, and who sees them.
+fn followed(source: &Source, args: &Args, [points, out]: [&PathBuf; 2], console: &Console) -> anyhow::Result<()> {
+    let (scene, json) = (&source.scene, is_json(out)?);
+    let (_, times) = sequence::moments(scene, args.fps, [args.from, args.to])?;
+    let views = source.views()?;
+    let asked = asked::read(&files::read_text(points)?, &views, scene.clip).map_err(|e| e.at(points.display()))?;
+    if asked.len().saturating_mul(times.len()).saturating_mul(3) > MOST_NUMBERS {
+        return Err(Error::input(format!("{} points at {} moments are too many", asked.len(), times.len()))
+            .remedy("Ask for fewer points, or take fewer moments with --fps, --from or --to.")
+            .into());
+    }
+    let answer = Answer::of(scene, asked, &views, &times, &mut |done, of| console.phase("following", done, of));
+    console.clear();
+    if answer.missing() > 0 {
+        console.warn(&format!(
+            "at {} of {} points nothing is there to follow: they are left out",
+            answer.missing(),
+            answer.len()
+        ));
+    }
+    files::write(out, if json { answer.to_json() } else { answer.to_csv() }.as_bytes())?;
+    console.say(&format!("{} points at {} moments", files::grouped(answer.len()), times.len()));
+    console.emit(&json!({
+        "type": "exported", "points": answer.len(), "moments": times.len(), "missing": answer.missing(),
+    }));
+    console.written(out);
+    Ok(())
+}
+
 /// Writes where Gaussians are over time.
 fn tracks(scene: &Scene<f32>, args: &Args, out: &Path, console: &Console) -> anyhow::Result<()> {
-    let json = match out.extension().map(|e| e.to_ascii_lowercase()) {
-        Some(e) if e == "json" => true,
-        Some(e) if e == "csv" => false,
-        _ => {
-            return Err(Error::input("tracks are written as .csv or .json")
-                .at(out.display())
-                .remedy("Use --tracks NAME.csv or --tracks NAME.json.")
-                .into());
-        }
-    };
+    let json = is_json(out)?;
     let (_, times) = sequence::moments(scene, args.fps, [args.from, args.to])?;
-    let members = match args.near[..] {
+    let mut members = match args.near[..] {
         [] => every(scene, args.every.unwrap_or(1) as usize),
         [x, y, z] if [x, y, z].iter().all(|v| v.is_finite()) => {
             let count = args.count.unwrap_or(1) as usize;
@@ -179,6 +243,11 @@ fn tracks(scene: &Scene<f32>, args: &Args, out: &Path, console: &Console) -> any
                 .into());
         }
     };
+    if let Some(name) = &args.label {
+        let wanted = Some(labels::named(&scene.labels, name)?);
+        let of: Vec<Vec<Option<usize>>> = scene.layers.iter().map(|l| labels::of(&l.params)).collect();
+        members.retain(|m| of[m.layer][m.row as usize] == wanted);
+    }
     if members.len().saturating_mul(times.len()).saturating_mul(3) > MOST_NUMBERS {
         return Err(Error::input(format!("{} tracks of {} moments are too many", members.len(), times.len()))
             .remedy("Take fewer with --every N, --near X,Y,Z, --fps, --from or --to.")

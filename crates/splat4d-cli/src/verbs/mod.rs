@@ -11,6 +11,7 @@ pub(crate) mod export;
 pub(crate) mod import;
 pub(crate) mod info;
 pub(crate) mod join;
+pub(crate) mod label;
 pub(crate) mod localise;
 pub(crate) mod predict;
 pub(crate) mod render;

@@ -4,9 +4,11 @@ use crate::console::Console;
 use crate::device::Device;
 use crate::draw::{Channel, Painter};
 use crate::paths::{self, Clock, Route, parse_size, shots};
+use crate::raw::RawFormat;
 use crate::source::{Source, not_empty};
 use crate::video::{self, Film};
 use crate::{camera_file, files};
+use clap::ValueEnum;
 use splat4d::scene::Planes;
 use splat4d::{Error, format};
 use std::ffi::OsString;
@@ -15,10 +17,10 @@ use std::time::{Duration, Instant};
 
 /// Frames a second of films unless told.
 const FPS: f64 = 30.0;
-/// Shots that are looked at to find the range of depths.
-const DEPTH_PROBES: usize = 8;
-/// Depth range of a film in which nothing is to be seen.
-const NO_DEPTH: [f32; 2] = [1.0, 2.0];
+/// Shots that are looked at to find the range of a channel.
+const PROBES: usize = 8;
+/// Range of a film in which nothing is to be seen, or of a channel that needs none.
+const NO_RANGE: [f32; 2] = [1.0, 2.0];
 
 const EXAMPLES: &str = "\
 Examples:
@@ -28,6 +30,8 @@ Examples:
   splat4d render runs/knight --path keys.json --size 1280x720 -o flight.mp4
   splat4d render runs/knight --path test -o views/         held-out views as numbered PNGs
   splat4d render runs/knight --channel depth --from 0.2 --to 0.8 -o depth.mp4
+  splat4d render runs/knight --channel flow --path camera=cam03 -o flow/ --raw flow/ --raw-format flo
+  splat4d render runs/knight --channel uncertainty -o unsure.mp4
   splat4d render scene.ply --camera cam.json -o view.png --raw view
   splat4d render runs/knight --device gpu -v               on the GPU, or say why not; prints frames/s
 
@@ -82,9 +86,13 @@ pub(crate) struct Args {
     /// Colour behind the scene, 0 to 1 [default: the scene's, or the camera file's]
     #[arg(long, value_name = "R,G,B", value_parser = color, help_heading = "Picture")]
     background: Option<Color>,
-    /// With --camera: also write P.npy [h,w,3], P.alpha.npy [h,w] and P.depth.npy [h,w] (Σ zαT), unclamped
-    #[arg(long, value_name = "P", requires = "camera", help_heading = "Picture")]
+    /// Also write the numbers behind the pictures. With --camera P.npy [h,w,3], P.alpha.npy [h,w] and P.depth.npy [h,w]
+    /// (Σ zαT), unclamped, and those of another --channel as P.CHANNEL.npy; of a film the channel's as numbered files in P
+    #[arg(long, value_name = "P", help_heading = "Picture")]
     raw: Option<PathBuf>,
+    /// How the channel's numbers are written
+    #[arg(long, value_enum, default_value = "npy", requires = "raw", help_heading = "Picture")]
+    raw_format: RawFormat,
 
     /// What draws
     #[arg(long, value_enum, default_value = "auto")]
@@ -116,17 +124,25 @@ fn one(args: &Args, path: &Path, camera: &Path, console: &Console) -> anyhow::Re
             .remedy("Use -o NAME.png.")
             .into());
     }
+    args.raw_format.suits(args.channel)?;
     let source = Source::open(path)?;
     let depth = args.channel == Channel::Depth || args.raw.is_some();
     let background = args.background.unwrap_or(background);
-    let mut painter = Painter::new(&source.scene, background, antialias(&source), depth).on(args.device, console);
+    let painter = Painter::new(&source.scene, background, antialias(&source), depth);
+    let mut painter = channel(painter, args, &source, console)?;
     painter.draw(&camera, args.freeze.unwrap_or(source.scene.clip[0]));
     if let Some(out) = &args.output {
-        let range = painter.depth_range().unwrap_or(NO_DEPTH);
+        let range = painter.range().unwrap_or(NO_RANGE);
         files::write(out, &painter.rgb(args.channel, range).png())?;
         console.written(out);
     }
-    if let Some(raw) = &args.raw {
+    if let Some(raw) = args.raw.as_ref().filter(|_| args.channel.is_field() || args.raw_format != RawFormat::Npy) {
+        let mut name = stem(raw);
+        name.push(format!(".{}.{}", args.channel.name(), args.raw_format.ending()));
+        let path = PathBuf::from(name);
+        files::write(&path, &args.raw_format.bytes(args.channel, &painter.raw())?)?;
+        console.written(&path);
+    } else if let Some(raw) = &args.raw {
         let image = &painter.image;
         raw_array(raw, ".npy", &[camera.height, camera.width, 3], &image.color.interleaved(), console)?;
         raw_array(raw, ".alpha.npy", &[camera.height, camera.width], plane(&image.alpha), console)?;
@@ -140,11 +156,7 @@ fn plane(planes: &Planes<f32>) -> &[f32] {
 }
 
 fn raw_array(prefix: &Path, ending: &str, shape: &[usize], data: &[f32], console: &Console) -> anyhow::Result<()> {
-    // `--raw view` and `--raw view.npy` mean the same.
-    let mut name: OsString = prefix.as_os_str().to_owned();
-    if prefix.extension().is_some_and(|e| e == "npy") {
-        name = prefix.with_extension("").into_os_string();
-    }
+    let mut name = stem(prefix);
     name.push(ending);
     let path = PathBuf::from(name);
     let mut bytes = Vec::new();
@@ -154,11 +166,32 @@ fn raw_array(prefix: &Path, ending: &str, shape: &[usize], data: &[f32], console
     Ok(())
 }
 
+/// `--raw view` and `--raw view.npy` mean the same.
+fn stem(prefix: &Path) -> OsString {
+    let ending = RawFormat::value_variants().iter().any(|f| prefix.extension().is_some_and(|e| e == f.ending()));
+    if ending { prefix.with_extension("").into_os_string() } else { prefix.as_os_str().to_owned() }
+}
+
+/// A painter of the channel that is asked for, on the device that is.
+fn channel<'a>(
+    painter: Painter<'a>,
+    args: &Args,
+    source: &Source,
+    console: &'a Console,
+) -> anyhow::Result<Painter<'a>> {
+    let views = if args.channel == Channel::Uncertainty { source.views()? } else { Vec::new() };
+    let mut phase = |done, of| console.phase("asking the training pictures", done, of);
+    let painter = painter.of_channel(args.channel, &views, &mut phase)?.on(args.device, console);
+    console.clear();
+    Ok(painter)
+}
+
 /// Many pictures along a path.
 fn film(args: &Args, path: &Path, console: &Console) -> anyhow::Result<()> {
     if let Some(out) = &args.output {
         video::check(out)?;
     }
+    args.raw_format.suits(args.channel)?;
     let source = Source::open(path)?;
     let scene = &source.scene;
     not_empty(scene, path)?;
@@ -196,12 +229,16 @@ fn film(args: &Args, path: &Path, console: &Console) -> anyhow::Result<()> {
     }
     let background = args.background.unwrap_or(scene.background);
     let depth = args.channel == Channel::Depth;
-    let mut painter = Painter::new(scene, background, antialias(&source), depth).on(args.device, console);
-    let range = if args.channel == Channel::Depth { depth_range(&mut painter, &shots) } else { NO_DEPTH };
+    let mut painter = channel(Painter::new(scene, background, antialias(&source), depth), args, &source, console)?;
+    let plain = matches!(args.channel, Channel::Color | Channel::Alpha | Channel::Normal | Channel::Label);
+    let range = if plain { NO_RANGE } else { range(&mut painter, &shots) };
     if args.output.is_none()
         && let Some(folder) = output.parent().filter(|p| !p.as_os_str().is_empty())
     {
         files::make_folder(folder)?;
+    }
+    if let Some(raw) = &args.raw {
+        files::make_folder(raw)?;
     }
     let mut film = Film::create(&output, size, clock.fps, shots.len())?;
     let mut drawing = Duration::ZERO;
@@ -210,10 +247,24 @@ fn film(args: &Args, path: &Path, console: &Console) -> anyhow::Result<()> {
         let picture = painter.picture(&shot.camera, shot.time, args.channel, range);
         drawing += start.elapsed();
         film.frame(&picture)?;
+        if let Some(raw) = &args.raw {
+            if args.channel == Channel::Color {
+                // What takes over 8 bits alone leaves no numbers behind.
+                painter.draw(&shot.camera, shot.time);
+            }
+            let bytes = args.raw_format.bytes(args.channel, &painter.raw())?;
+            files::write(&raw.join(format!("{i:05}.{}", args.raw_format.ending())), &bytes)?;
+        }
         console.phase("rendering", i + 1, shots.len());
     }
     film.finish()?;
     console.clear();
+    if let Some([low, high]) = (!plain && range != NO_RANGE).then_some(range) {
+        console.detail(&format!("colours of {} from {low:.4} to {high:.4}", args.channel.name()));
+    }
+    if let Some(raw) = &args.raw {
+        console.written(raw);
+    }
     console.detail(&format!(
         "{} frames of {}x{}, drawn on {} at {:.1} frames/s, coding apart",
         shots.len(),
@@ -226,17 +277,17 @@ fn film(args: &Args, path: &Path, console: &Console) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// One range for the whole film, so that depth does not flicker.
-fn depth_range(painter: &mut Painter<'_>, shots: &[paths::Shot]) -> [f32; 2] {
-    let step = shots.len().div_ceil(DEPTH_PROBES).max(1);
+/// One range for the whole film, so that its colours do not flicker.
+fn range(painter: &mut Painter<'_>, shots: &[paths::Shot]) -> [f32; 2] {
+    let step = shots.len().div_ceil(PROBES).max(1);
     let mut range: Option<[f32; 2]> = None;
     for shot in shots.iter().step_by(step) {
         painter.draw(&shot.camera, shot.time);
-        if let Some([near, far]) = painter.depth_range() {
+        if let Some([near, far]) = painter.range() {
             range = Some(range.map_or([near, far], |[n, f]| [n.min(near), f.max(far)]));
         }
     }
-    range.unwrap_or(NO_DEPTH)
+    range.unwrap_or(NO_RANGE)
 }
 
 fn antialias(source: &Source) -> bool {

@@ -6,7 +6,7 @@ use crate::device::{self, Device};
 use crate::files::{self, human_bytes, parse_bytes};
 use crate::run_folder::{self, Run, cameras_json};
 use crate::serving::{self, Place, Watch};
-use crate::{finish, interrupt};
+use crate::{finish, interrupt, labelling};
 use serde_json::json;
 use splat4d::{Error, ErrorKind};
 use splat4d_train::capture::{Capture, Severity, Timing};
@@ -269,6 +269,9 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     }
     console.say(&format!("wrote {}", run.join("scene.safetensors").display()));
     finish::say_refined(&run, console)?;
+    if labelling::has_labels(&Run::open(&run)?.open_capture()?.0) {
+        labelling::label(&run, None, None, console)?;
+    }
     if args.no_eval {
         finish::playback(&run, console)?;
     } else {

@@ -110,7 +110,9 @@ class Scene:
         camera: Camera,
         t: float,
         *,
-        channel: Literal["color", "alpha", "depth"] = "color",
+        channel: Literal[
+            "color", "alpha", "depth", "flow", "velocity", "normal", "label", "life", "uncertainty"
+        ] = "color",
         background: ArrayLike | None = None,
         device: _Device = "cpu",
     ) -> _F32: ...

@@ -67,6 +67,7 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
         points,
         background,
         up,
+        labels: take.labels,
         downscale: options.downscale,
         warnings: take.warnings,
         notes: take.notes,
@@ -123,6 +124,7 @@ fn finish(raw: RawFrame, downscale: usize) -> Frame {
         image: raw.image,
         mask: raw.mask,
         flow: None,
+        labels: raw.labels,
     }
 }
 
@@ -147,7 +149,12 @@ fn check_frame(frame: &mut RawFrame, camera: &str, options: &CaptureOptions) -> 
             format!("nothing of a {}x{} image is left at downscale {}", source.width, source.height, options.downscale);
         return Err(place(Error::input(what).remedy("Choose a smaller downscale.")));
     }
-    let files = [("picture", Some(&frame.image)), ("mask", frame.mask.as_ref()), ("flow", frame.flow.as_ref())];
+    let files = [
+        ("picture", Some(&frame.image)),
+        ("mask", frame.mask.as_ref()),
+        ("flow", frame.flow.as_ref()),
+        ("mask of labels", frame.labels.as_ref()),
+    ];
     for (what, file) in files.into_iter().filter_map(|(what, file)| Some((what, file?))) {
         if !file.is_file() {
             return Err(Error::input(format!("the {what} of camera {camera}, frame {} is missing", frame.index))

@@ -51,6 +51,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
             image: base.join(name),
             mask: mask_of(root, name),
             flow: None,
+            labels: None,
             split: Split::Train,
         })
         .collect();
@@ -69,6 +70,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         points: cloud(&points),
         background: None,
         up: None,
+        labels: Vec::new(),
         warnings,
         notes,
     })

@@ -47,6 +47,18 @@ pub(super) fn read(file: &FlowFile, frame: &Frame, capture: &Capture) -> Result<
     Ok(out)
 }
 
+/// The flow of a frame alone, [3, height, width] of its view: u, v and 1 where they are known; `None`: it has none.
+///
+/// Errors: the file is none, or of another size than the picture.
+pub(crate) fn vectors(frame: &Frame, capture: &Capture) -> Result<Option<Planes<f32>>> {
+    let Some(file) = &frame.flow else { return Ok(None) };
+    let camera = &capture.cameras[frame.camera].name;
+    let codes = read(file, frame, capture).map_err(|e| e.at(format!("camera {camera}, frame {}", frame.index)))?;
+    let mut out = Planes::default();
+    decode_into(&codes, frame.view.width, frame.view.height, &mut out);
+    Ok(Some(out))
+}
+
 /// Pixels from code: [3, height, width] of u, v and 1 where they are known.
 pub(super) fn decode_into(codes: &[u16], width: usize, height: usize, out: &mut Planes<f32>) {
     (out.channels, out.height, out.width) = (3, height, width);

@@ -1,7 +1,7 @@
 //! Which layout a folder has: markers in a stated order, what lies beside the one that is taken, and what to do where there
 //! is none.
 
-use super::{CaptureOptions, Take, colmap, n3dv, own, panoptic, rig, transforms};
+use super::{CaptureOptions, Take, colmap, n3dv, nerfies, own, panoptic, rig, transforms};
 use splat4d::{Error, ErrorKind, Result};
 use std::path::Path;
 
@@ -14,6 +14,7 @@ const READERS: &[(&str, Reader)] = &[
     (transforms::TRAIN, transforms::read),
     ("train_meta.json", panoptic::read),
     (transforms::ALL, transforms::read),
+    (nerfies::MARKER, nerfies::read),
     (BOUNDS, n3dv::read),
     (colmap::SPARSE, colmap::read),
 ];
@@ -22,11 +23,8 @@ const READERS: &[(&str, Reader)] = &[
 const BOUNDS: &str = "poses_bounds.npy";
 
 /// Markers of layouts that this version does not read, and what to do.
-const FOREIGN: &[(&str, &str)] = &[
-    ("dataset.json", "HyperNeRF and Nerfies captures"),
-    ("reconstruction.json", "OpenSfM reconstructions"),
-    ("sfm_data.json", "OpenMVG reconstructions"),
-];
+const FOREIGN: &[(&str, &str)] =
+    &[("reconstruction.json", "OpenSfM reconstructions"), ("sfm_data.json", "OpenMVG reconstructions")];
 
 /// Where the videos of a rig often lie.
 const VIDEO_FOLDER: &str = "videos";
@@ -60,7 +58,9 @@ pub(super) fn read(path: &Path, options: &CaptureOptions) -> Result<Take> {
 fn is_there(path: &Path, marker: &str) -> bool {
     // A single camera's LLFF folder is read from its COLMAP model.
     let llff = || path.join(colmap::SPARSE).is_dir() && !n3dv::applies(path);
-    path.join(marker).exists() && !(marker == BOUNDS && llff())
+    // Others call their files so too.
+    let foreign = marker == nerfies::MARKER && !nerfies::applies(path);
+    path.join(marker).exists() && !(marker == BOUNDS && llff()) && !foreign
 }
 
 /// Says which of several layouts was read, why, and how to choose another.
@@ -102,9 +102,9 @@ fn unknown_layout(root: &Path, named: &Path) -> Error {
     let below = videos(&root.join(VIDEO_FOLDER)).into_iter().map(|name| format!("{VIDEO_FOLDER}/{name}"));
     if let Some(video) = videos(root).into_iter().chain(below).next() {
         error = error.remedy(format!(
-            "It holds videos, but no camera poses that are known here. Extract frames with `{}`, then calibrate the \
-             cameras (COLMAP on the first frames will do), or turn the calibration that you have into a capture.json \
-             (examples/rig_from_calibration.py, docs/capture-format.md).",
+            "It holds videos, but no camera poses that are known here. Make a capture of them with `splat4d import`, which \
+             finds clocks and poses, or reads a calibration that you have (docs/filming.md); or extract frames with `{}` and \
+             write a capture.json (examples/rig_from_calibration.py, docs/capture-format.md).",
             ffmpeg_command(&video)
         ));
     }

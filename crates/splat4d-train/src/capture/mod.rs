@@ -10,12 +10,14 @@ mod assemble;
 mod beside;
 mod colmap;
 mod colmap_files;
-mod flow;
+pub(crate) mod flow;
 pub mod frames;
 mod json;
+pub(crate) mod labels;
 mod layout;
 mod lens;
 mod n3dv;
+mod nerfies;
 mod observe;
 mod options;
 mod own;
@@ -63,6 +65,8 @@ pub enum CaptureKind {
     Colmap,
     /// N3DV: `poses_bounds.npy` and a folder of frames per camera.
     N3dv,
+    /// Nerfies and HyperNeRF: `dataset.json`, `metadata.json` and a camera file a picture.
+    Nerfies,
 }
 
 /// One picture of the take.
@@ -85,6 +89,8 @@ pub struct Frame {
     pub mask: Option<PathBuf>,
     /// Where its pixels go.
     pub flow: Option<FlowFile>,
+    /// The mask of labels: its values number [`Capture::labels`].
+    pub labels: Option<PathBuf>,
 }
 
 /// One camera of the rig, or one moving camera.
@@ -160,6 +166,8 @@ pub struct Capture {
     pub background: Option<[f32; 3]>,
     /// Upwards in the world (unit); estimated from the cameras where the data set states none.
     pub up: [f64; 3],
+    /// Names of what masks of labels number; empty: there are none.
+    pub labels: Vec<String>,
     /// The k of [`CaptureOptions::downscale`].
     pub downscale: usize,
     /// The reader's warnings, a sentence or two each.
@@ -186,6 +194,7 @@ struct Take {
     points: Option<PointCloud>,
     background: Option<[f32; 3]>,
     up: Option<[f64; 3]>,
+    labels: Vec<String>,
     warnings: Vec<String>,
     notes: Vec<String>,
 }
@@ -199,6 +208,7 @@ struct RawFrame {
     image: PathBuf,
     mask: Option<PathBuf>,
     flow: Option<PathBuf>,
+    labels: Option<PathBuf>,
     split: Split,
 }
 

@@ -60,6 +60,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
                 image: image.clone(),
                 mask: None,
                 flow: None,
+                labels: None,
                 split: if camera == 0 && rows > 1 { Split::Held } else { Split::Train },
             });
         }
@@ -79,6 +80,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         points: points.map(|p| read_ply(&p)).transpose()?,
         background: None,
         up: None,
+        labels: Vec::new(),
         warnings: Vec::new(),
         notes: Vec::new(),
     })

@@ -23,6 +23,7 @@ const TOP_KEYS: &[&str] = &[
     "points",
     "background",
     "up",
+    "labels",
     "comment",
     "extra",
 ];
@@ -42,6 +43,7 @@ const CAMERA_KEYS: &[&str] = &[
     "images",
     "masks",
     "flow",
+    "labels",
     "start",
     "frames",
     "comment",
@@ -80,6 +82,7 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<T
     let mut cameras: Vec<String> = Vec::new();
     let (mut frames, mut take) = (Vec::new(), Extent::default());
     let hold_out = top.opt("hold_out")?.map(|n| read_hold_out(&n)).transpose()?;
+    let labels = top.opt("labels")?.map(|n| read_labels(&n)).transpose()?.unwrap_or_default();
     let nodes = top.get("cameras")?.list()?;
     let in_part = in_part(top, &nodes, options.hold_out.as_ref().or(hold_out.as_ref()), options)?;
     for node in nodes {
@@ -107,6 +110,7 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<T
         points: top.opt("points")?.map(|n| read_ply(&root.join(n.text()?))).transpose()?,
         background: read_background(top)?,
         up: top.opt("up")?.map(|n| n.numbers::<3>()).transpose()?,
+        labels,
         warnings: Vec::new(),
         notes: Vec::new(),
     })
@@ -132,6 +136,13 @@ fn in_part(top: &Node<'_>, nodes: &[Node<'_>], told: Option<&HoldOut>, options: 
         }
     }
     Ok(true)
+}
+
+/// Names of labels, that of mask value 0 first.
+fn read_labels(node: &Node<'_>) -> Result<Vec<String>> {
+    let names = node.list()?.iter().map(|n| n.text().map(str::to_owned)).collect::<Result<Vec<_>>>()?;
+    splat4d::scene::labels::check(&names).map_err(|e| node.at(e))?;
+    Ok(names)
 }
 
 fn read_background(top: &Node<'_>) -> Result<Option<[f32; 3]>> {
@@ -223,9 +234,17 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
     let start = context.shared(node, "start")?.unwrap_or(0);
     let count = context.shared(node, "frames")?;
     let images = Files::read(&node.get("images")?)?;
-    let [masks, flow] = ["masks", "flow"].map(|key| node.opt(key)?.map(|n| Files::read(&n)).transpose());
-    let (masks, flow) = (masks?, flow?);
-    for (key, files) in [("images", Some(&images)), ("masks", masks.as_ref()), ("flow", flow.as_ref())] {
+    let [masks, flow, labels] =
+        ["masks", "flow", "labels"].map(|key| node.opt(key)?.map(|n| Files::read(&n)).transpose());
+    let (masks, flow, labels) = (masks?, flow?, labels?);
+    if labels.is_some() && context.top.opt("labels")?.is_none() {
+        return Err(node
+            .error("its masks of labels have no names")
+            .remedy("Add \"labels\" at the top of capture.json: a list of names, that of mask value 0 first."));
+    }
+    for (key, files) in
+        [("images", Some(&images)), ("masks", masks.as_ref()), ("flow", flow.as_ref()), ("labels", labels.as_ref())]
+    {
         let Some(Files::List(names)) = files else { continue };
         let expected = match (&images, count) {
             (_, Some(count)) => count,
@@ -283,6 +302,7 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
             image,
             mask: masks.as_ref().and_then(|m| m.name(context.root, start, index)),
             flow: flow.as_ref().and_then(|f| f.name(context.root, start, index)),
+            labels: labels.as_ref().and_then(|l| l.name(context.root, start, index)),
             split: Split::Train,
         });
     }

@@ -3,6 +3,7 @@
 mod bad_input;
 mod flow;
 mod forgiving;
+mod labels;
 mod layouts;
 mod mutants;
 mod pictures;

@@ -61,6 +61,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         image: entry.image,
         mask: entry.mask,
         flow: None,
+        labels: None,
         split: entry.split,
     };
     let frames: Vec<RawFrame> = entries.into_iter().zip(places).map(frame).collect();
@@ -83,6 +84,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         points,
         background: None,
         up: blender.then_some(BLENDER_UP),
+        labels: Vec::new(),
         warnings,
         notes,
     })

@@ -143,5 +143,6 @@ fn draft(
 /// The scene's own metadata.
 fn meta(scene: &Scene<f32>) -> Meta {
     let Scene { clip, fps, up, background, .. } = *scene;
-    Meta { clip, fps, up, background, ..Meta::default() }
+    let labels = scene.labels.clone();
+    Meta { clip, fps, up, background, labels, ..Meta::default() }
 }

@@ -54,24 +54,29 @@ impl TrackError {
 ///
 /// Errors: a file of tracks that is damaged.
 pub fn track_error(scene: &Scene<f32>, capture: &Capture) -> Result<Option<TrackError>> {
-    let path = capture.root.join(FILE);
-    if !path.is_file() {
-        return Ok(None);
-    }
-    let bytes = std::fs::read(&path).map_err(|e| Error::io("the true tracks cannot be read", e).at(path.display()))?;
-    let truth = Truth::read(&bytes).map_err(|e| e.at(path.display()))?;
-    Ok(truth.compare(scene, capture.fps))
+    Ok(Truth::of(capture)?.and_then(|truth| truth.compare(scene, capture.fps)))
 }
 
 /// True paths of points.
-struct Truth {
-    frames: usize,
-    points: usize,
+pub(super) struct Truth {
+    pub(super) frames: usize,
+    pub(super) points: usize,
     /// [frames, points, 3]
     data: Vec<f32>,
 }
 
 impl Truth {
+    /// What a capture brings along; `None`: nothing.
+    pub(super) fn of(capture: &Capture) -> Result<Option<Self>> {
+        let path = capture.root.join(FILE);
+        if !path.is_file() {
+            return Ok(None);
+        }
+        let bytes =
+            std::fs::read(&path).map_err(|e| Error::io("the true tracks cannot be read", e).at(path.display()))?;
+        Self::read(&bytes).map(Some).map_err(|e| e.at(path.display()))
+    }
+
     fn read(bytes: &[u8]) -> Result<Self> {
         let array = Npy::read(bytes)?;
         match array.shape[..] {
@@ -81,15 +86,27 @@ impl Truth {
         }
     }
 
-    fn at(&self, frame: usize, point: usize) -> [f64; 3] {
+    /// The frames in a scene's clip: a part of the take has a part of them.
+    pub(super) fn frames_of(&self, scene: &Scene<f32>, fps: f64) -> Vec<usize> {
+        let [from, to] = [scene.clip[0] - CLOCK_ERROR, scene.clip[1] + CLOCK_ERROR];
+        (0..self.frames).filter(|&k| (from..=to).contains(&(k as f64 / fps))).collect()
+    }
+
+    /// Height of all points together along a direction at a frame.
+    pub(super) fn height(&self, frame: usize, up: [f64; 3]) -> f64 {
+        let along = |p: usize| (0..3).map(|k| self.at(frame, p)[k] * up[k]).sum::<f64>();
+        let ends =
+            (0..self.points).map(along).fold([f64::INFINITY, f64::NEG_INFINITY], |[l, h], x| [l.min(x), h.max(x)]);
+        ends[1] - ends[0]
+    }
+
+    pub(super) fn at(&self, frame: usize, point: usize) -> [f64; 3] {
         let i = 3 * (frame * self.points + point);
         [0, 1, 2].map(|k| f64::from(self.data[i + k]))
     }
 
     fn compare(&self, scene: &Scene<f32>, fps: f64) -> Option<TrackError> {
-        // A part of the take has a part of the frames.
-        let [from, to] = [scene.clip[0] - CLOCK_ERROR, scene.clip[1] + CLOCK_ERROR];
-        let frames: Vec<usize> = (0..self.frames).filter(|&k| (from..=to).contains(&(k as f64 / fps))).collect();
+        let frames = self.frames_of(scene, fps);
         let times: Vec<f64> = frames.iter().map(|&k| k as f64 / fps).collect();
         if frames.len() < 2 {
             return None;
@@ -117,9 +134,6 @@ impl Truth {
                 }
             }
         }
-        let up = |x: &[f64; 3]| (0..3).map(|k| x[k] * scene.up[k]).sum::<f64>();
-        let (low, high) =
-            start.iter().map(up).fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), x| (l.min(x), h.max(x)));
         let asked = self.points * (frames.len() - 1);
         Some(TrackError {
             points: self.points,
@@ -128,12 +142,12 @@ impl Truth {
             median: median(&mut carried)?,
             nearest: median(&mut nearest)?,
             first: median(&mut firsts)?,
-            height: high - low,
+            height: self.height(frames[0], scene.up),
         })
     }
 }
 
-fn median(values: &mut [f64]) -> Option<f64> {
+pub(super) fn median(values: &mut [f64]) -> Option<f64> {
     let middle = values.len() / 2;
     (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
 }

@@ -257,7 +257,7 @@ pub fn scene(
     program.init(&lives, &mut params);
     let head = if HeadKeys::of(&params).is_some() { Head::Features } else { Head::Identity };
     let layer = Layer::new("scene", params, motion, life);
-    Ok(Scene { layers: vec![layer], background, clip: plan.clip, fps: plan.fps, up, head })
+    Ok(Scene { layers: vec![layer], background, clip: plan.clip, fps: plan.fps, up, head, labels: Vec::new() })
 }
 
 /// Centre and width (seconds) of the life that a Gaussian at a point of this time starts with.

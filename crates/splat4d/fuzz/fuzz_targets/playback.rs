@@ -27,7 +27,7 @@ fn look(bytes: &[u8]) {
                 Kind::Palette => drop(decode_palette(e, stored)),
                 Kind::Masks => drop(decode_masks(e, stored)),
                 Kind::Provenance => drop(splat4d::format::playback::provenance(bytes)),
-                Kind::Poster | Kind::Other(_) => {}
+                Kind::Labels | Kind::Poster | Kind::Other(_) => {} // labels are decoded with the whole, below
             }
         }
     }

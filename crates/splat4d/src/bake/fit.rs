@@ -292,6 +292,7 @@ pub(super) fn primitive(
         base_color: std::array::from_fn(|k| dc_to_rgb(colors[k])),
         sh_rest: std::array::from_fn(|k| colors[k + 3]),
         importance: if importance.is_finite() { importance } else { 0.0 },
+        label: None,
     }
 }
 

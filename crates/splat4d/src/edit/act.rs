@@ -7,7 +7,7 @@ use crate::math::se3::{add, norm, sub};
 use crate::math::{Rng, Sim3, quat};
 use crate::motion::edited::{Change, ColorMap, Edited, FadeKey, PathKey};
 use crate::scene::params::OPACITY;
-use crate::scene::{GEOMETRY, HeadKeys, RowEdit, SH, Space};
+use crate::scene::{GEOMETRY, HeadKeys, RowEdit, SH, Space, labels};
 use crate::{Error, Result};
 use std::sync::Arc;
 
@@ -405,6 +405,16 @@ fn merge(scene: &mut Scene<f32>, mut other: Scene<f32>, name: &str, at: Option<f
             own.layers = own.layers.iter().filter_map(|l| window(l, [from, to])).collect();
         }
     }
+    let mut names = scene.labels.clone();
+    names.extend(other.labels.iter().filter(|n| !scene.labels.contains(n)).cloned());
+    if !names.is_empty() {
+        labels::check(&names)?;
+    }
+    for own in [&mut *scene, &mut other] {
+        let from: Vec<Option<usize>> = names.iter().map(|n| own.labels.iter().position(|o| o == n)).collect();
+        own.layers.iter_mut().for_each(|l| labels::renumber(&mut l.params, &from));
+    }
+    scene.labels = names;
     scene.layers.append(&mut other.layers);
     scene.clip = clip;
     Ok(())

@@ -8,7 +8,7 @@ use crate::math::sh::dc_to_rgb;
 use crate::math::{Real, sym3};
 use crate::scene::params::OPACITY;
 use crate::scene::splats::{COV, SPLAT_OPACITY};
-use crate::scene::{Camera, Color, GEOMETRY, Rows, Space, Table, Time};
+use crate::scene::{Camera, Color, GEOMETRY, Rows, Space, Table, Time, labels};
 use crate::{Error, Result};
 
 /// Moments at which a Gaussian is looked at, at most, evenly over its life: a bit each.
@@ -225,6 +225,11 @@ fn evaluate(expr: &Expr, scene: &Scene<f32>, looks: &Looks, context: &dyn Contex
                     .remedy(format!("It has: {}", names.join(", "))));
             }
             rows(&|layer, _| scene.layers[layer].name == *name)
+        }
+        Expr::Label(name) => {
+            let wanted = Some(labels::named(&scene.labels, name)?);
+            let of: Vec<Vec<Option<usize>>> = scene.layers.iter().map(|l| labels::of(&l.params)).collect();
+            rows(&|layer, row| of[layer][row] == wanted)
         }
         Expr::At(t, inner) => {
             if !(scene.clip[0]..=scene.clip[1]).contains(t) {

@@ -39,6 +39,8 @@ pub enum Expr {
     Layer(String),
     /// Within what was drawn on a picture.
     Lasso(Box<Lasso>),
+    /// Name of a label.
+    Label(String),
     /// On the white of a mask picture, seen by a camera.
     Mask(String, String),
     /// On the subject, as the capture's masks have it.
@@ -155,8 +157,8 @@ impl fmt::Display for Token {
 fn unreadable(text: &str, what: &str) -> Error {
     Error::input(format!("the selection `{text}` cannot be read: {what}")).remedy(
         "It is made of box(x0,y0,z0, x1,y1,z1), sphere(x,y,z, r), frustum(camera), color(r,g,b, near), opacity(from,to), \
-         size(from,to), life(from,to), speed(from,to), layer(name), mask(file, camera), subject, lasso(...), all, \
-         at(t, ...), \
+         size(from,to), life(from,to), speed(from,to), layer(name), label(name), mask(file, camera), subject, lasso(...), \
+         all, at(t, ...), \
          ever(...), always(...), grow(..., distance), and, or, not and parentheses",
     )
 }
@@ -299,6 +301,7 @@ impl Parser<'_> {
                 }
             }
             "layer" => Expr::Layer(self.name()?),
+            "label" => Expr::Label(self.name()?),
             "frustum" => {
                 let name = self.name()?;
                 let mut range = [0.0, f64::INFINITY];
@@ -402,6 +405,8 @@ mod tests {
         assert_eq!(parsed, Expr::Or(Box::new(Expr::Box([0.0; 3], [1.0, 1.0, 2.0])), Box::new(right)));
         assert_eq!(Expr::parse("frustum(00, 1e-1, 2)").unwrap(), Expr::Frustum("00".into(), [0.1, 2.0]));
         assert_eq!(Expr::parse("mask(m/a.png, \"cam 1\")").unwrap(), Expr::Mask("m/a.png".into(), "cam 1".into()));
+        assert_eq!(Expr::parse("label(left hand)").ok(), None, "names with spaces stand in quotation marks");
+        assert_eq!(Expr::parse("label('left hand')").unwrap(), Expr::Label("left hand".into()));
         assert!(Expr::parse("grow(all, 0.1)").unwrap().any(&|e| *e == Expr::All));
         let Expr::Not(lasso) = Expr::parse("not lasso(1,2,3, 1,0,0,0, 0.5,9, 0,0, 1,0, 0.5,1)").unwrap() else { panic!() };
         let Expr::Lasso(lasso) = *lasso else { panic!() };

@@ -187,6 +187,31 @@ fn selections_hold_over_time() {
 }
 
 #[test]
+fn labels_are_selected_kept_and_merged() {
+    use crate::scene::labels;
+    let labelled = |names: [&str; 2], of: [Option<usize>; 2]| {
+        let mut s = walker();
+        labels::state(&mut s.layers[0].params, 2, &of);
+        s.labels = names.map(str::to_owned).to_vec();
+        s
+    };
+    let s = labelled(["floor", "left hand"], [Some(1), None]);
+    for (text, wanted) in [("label('left hand')", 1), ("not label(floor)", 2), ("label(floor)", 0)] {
+        assert_eq!(counted(text, &s), wanted, "{text}");
+    }
+    let error = count(&Expr::parse("label(foot)").unwrap(), &s, &[], &Bench::empty()).unwrap_err().to_string();
+    assert!(error.contains("`foot`") && error.contains("floor, left hand"), "{error}");
+    // Numbers are a scene's own: the same name is one label.
+    let other = labelled(["left hand", "ball"], [Some(0), Some(1)]);
+    let bench = Bench { other, ..Bench::empty() };
+    let both = replay(&steps(r#"[{"do": "merge", "scene": "b", "name": "b"}]"#), s, &bench, &mut |_, _| {}).unwrap().0;
+    assert_eq!(both.labels, ["floor", "left hand", "ball"]);
+    let of = |layer: usize| labels::of(&both.layers[layer].params);
+    assert_eq!((of(0), of(1)), (vec![Some(1), None], vec![Some(1), Some(2)]));
+    assert_eq!(counted("label('left hand')", &both), 2);
+}
+
+#[test]
 fn masks_are_seen_from_their_camera() {
     let s = walker();
     // The left half of the picture is white: x < 0 of the camera, which sees the world mirrored in no axis.

@@ -1,6 +1,7 @@
 //! `scene.safetensors`: the lossless learnable state of a scene.
 //!
-//! Metadata `splat4d` holds JSON: version, clip, fps, up, background, head, and a list of layers with name, rows, SH
+//! Metadata `splat4d` holds JSON: version, clip, fps, up, background, head, `labels` (names) where Gaussians have some, and
+//! a list of layers with name, rows, SH
 //! coefficients, life and motion, `frame` where the layer's axes are not the world's, and
 //! `cross_fade` (seconds at the span's beginning and end) where it fades. Every column group of every table is one row-major array: `layers.0.means` `[N,3]`,
 //! `layers.0.quats` `[N,4]` wxyz, `layers.0.sh` `[N,K,3]`, `layers.0.velocities` `[N,3·order]` … Seconds and scene units.
@@ -11,16 +12,19 @@ use super::{params_to_arrays, tensors_to_loaded};
 use crate::layers::{ALWAYS, Head, Layer, Scene};
 use crate::math::Sim3;
 use crate::motion::{BUILT_IN, Spec, build};
+use crate::scene::labels::LABEL_LOGITS;
 use crate::scene::masks::WORD;
-use crate::scene::{HeadKeys, KeyMasks, LifeKind, Params, SH};
+use crate::scene::{HeadKeys, KeyMasks, LifeKind, Params, SH, labels as scene_labels};
 use crate::{Error, ErrorKind, Result};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::io::Write;
 use std::sync::Arc;
 
-/// The newest version of the metadata that this library reads and writes: of scenes whose layers cross-fade.
-pub(crate) const VERSION: u64 = 3;
+/// The newest version of the metadata that this library reads and writes: of scenes with labels.
+pub(crate) const VERSION: u64 = 4;
+/// The version of scenes whose layers cross-fade, without labels.
+const FADING: u64 = 3;
 /// The version of scenes whose layers have frames, and do not cross-fade.
 const FRAMED: u64 = 2;
 /// The version of scenes whose layers have no frame: programs that know no frames may read them.
@@ -70,8 +74,9 @@ impl Stated {
 /// The metadata of a scene with these layers in place of its own.
 fn about(scene: &Scene<f32>, layers: Vec<Stated>) -> Value {
     let framed = if layers.iter().any(|l| l.framed) { FRAMED } else { UNFRAMED };
-    json!({
-        "version": if layers.iter().any(|l| l.fades) { VERSION } else { framed },
+    let plain = if layers.iter().any(|l| l.fades) { FADING } else { framed };
+    let mut out = json!({
+        "version": if scene.labels.is_empty() { plain } else { VERSION },
         "units": "scene units, seconds, colours in [0, 1]",
         "axes": "OpenCV: x right, y down, z forward in the camera",
         "clip": scene.clip,
@@ -80,7 +85,11 @@ fn about(scene: &Scene<f32>, layers: Vec<Stated>) -> Value {
         "background": scene.background,
         "head": scene.head.name(),
         "layers": layers.into_iter().map(|l| l.json).collect::<Vec<_>>(),
-    })
+    });
+    if !scene.labels.is_empty() {
+        out["labels"] = json!(scene.labels);
+    }
+    out
 }
 
 /// A motion model's spec as JSON.
@@ -193,10 +202,12 @@ pub fn from_tensors(file: &SafeTensors<'_>) -> Result<Scene<f32>> {
         background: numbers::<3>(&meta, "background")?.map(|x| x as f32),
         head: head(&meta)?,
         layers: Vec::new(),
+        labels: label_names(&meta)?,
     };
     let layers = meta["layers"].as_array().ok_or_else(|| broken("its metadata lists no layers".into()))?;
     for (i, layer) in layers.iter().enumerate() {
-        scene.layers.push(read_layer(file, layer, i).map_err(|e| e.at(format!("layer {i}")))?);
+        let layer = read_layer(file, layer, i, scene.labels.len());
+        scene.layers.push(layer.map_err(|e| e.at(format!("layer {i}")))?);
     }
     if scene.layers.iter().any(|l| HeadKeys::of(&l.params).is_some()) != (scene.head == Head::Features) {
         return Err(broken(format!("its head is `{}`, which does not fit its layers", scene.head.name())));
@@ -219,7 +230,19 @@ fn head(meta: &Value) -> Result<Head> {
     })
 }
 
-fn read_layer(file: &SafeTensors<'_>, meta: &Value, index: usize) -> Result<Layer<f32>> {
+/// The scene's labels; none where nothing is said.
+fn label_names(meta: &Value) -> Result<Vec<String>> {
+    if meta["labels"].is_null() {
+        return Ok(Vec::new());
+    }
+    let names: Option<Vec<String>> =
+        meta["labels"].as_array().and_then(|l| l.iter().map(|n| n.as_str().map(str::to_owned)).collect());
+    let names = names.ok_or_else(|| broken("`labels` is no list of names".into()))?;
+    scene_labels::check(&names)?;
+    Ok(names)
+}
+
+fn read_layer(file: &SafeTensors<'_>, meta: &Value, index: usize, labels: usize) -> Result<Layer<f32>> {
     let prefix = format!("layers.{index}.");
     let rows = count(meta, "rows")?;
     let coefficients = count(meta, "sh_coefficients")?;
@@ -238,6 +261,9 @@ fn read_layer(file: &SafeTensors<'_>, meta: &Value, index: usize) -> Result<Laye
     let loaded = tensors_to_loaded(&prefix, file)?;
     let mut params = Params::build(loaded, rows, coefficients, life.columns())?;
     let motion = build(&motion, &mut params)?;
+    if labels > 0 && params.unclaimed().iter().any(|a| a.name == LABEL_LOGITS) {
+        scene_labels::claim(&mut params, labels)?;
+    }
     if let Some(array) = params.unclaimed().first() {
         return Err(broken(format!("array `{}` belongs to no table of this layer", array.name)));
     }
@@ -369,6 +395,7 @@ mod tests {
             fps: 30.0,
             up: [0.0, -1.0, 0.0],
             head: Head::Identity,
+            labels: Vec::new(),
         }
     }
 
@@ -397,12 +424,34 @@ mod tests {
             read(&bytes).unwrap().layers.iter().map(|l| l.cross_fade).collect::<Vec<_>>(),
             [[0.0; 2], [0.1 + 0.2, 0.0], [0.0; 2]]
         );
-        assert_eq!(metadata(&s)["version"], json!(VERSION));
+        assert_eq!(metadata(&s)["version"], json!(FADING));
         assert_eq!(metadata(&scene())["version"], json!(UNFRAMED), "other scenes stay readable");
         let at = bytes.windows(10).position(|w| w == b"cross_fade").unwrap();
         let minus = bytes[at..].iter().position(|b| *b == b'[').unwrap() + at + 1;
         bytes[minus] = b'-';
         assert!(read(&bytes).is_err());
+    }
+
+    #[test]
+    fn labels_come_back_and_older_readers_refuse_them() {
+        let mut s = scene();
+        s.labels = vec!["floor".into(), "hand".into()];
+        scene_labels::state(&mut s.layers[1].params, 2, &[Some(1); 37]);
+        assert_eq!(metadata(&s)["version"], json!(VERSION));
+        let mut bytes = Vec::new();
+        write(&s, &mut bytes).unwrap();
+        let back = read(&bytes).unwrap();
+        assert_eq!((&back.labels, &back.layers[1].params), (&s.labels, &s.layers[1].params));
+        assert!(scene_labels::key(&back.layers[0].params).is_none(), "the others have none");
+        // One name more than logits.
+        s.labels.push("ball".into());
+        bytes.clear();
+        write(&s, &mut bytes).unwrap();
+        assert!(read(&bytes).unwrap_err().to_string().contains("label_logits"));
+        s.labels.clear();
+        bytes.clear();
+        write(&s, &mut bytes).unwrap();
+        assert!(read(&bytes).unwrap_err().to_string().contains("label_logits"), "logits of nothing");
     }
 
     #[test]

@@ -9,7 +9,7 @@ pub struct Warnings {
 
 impl Warnings {
     /// Adds a sentence.
-    pub(crate) fn say(&mut self, text: impl Into<String>) {
+    pub fn say(&mut self, text: impl Into<String>) {
         self.lines.push(text.into());
     }
 

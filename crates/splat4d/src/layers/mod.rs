@@ -412,6 +412,8 @@ pub struct Scene<F: Real = f32> {
     pub up: [f64; 3],
     /// How blended channels become colour.
     pub head: Head,
+    /// Names of the labels that its Gaussians have logits for ([`scene::labels`](crate::scene::labels)); empty: none.
+    pub labels: Vec<String>,
 }
 
 impl<F: Real> Scene<F> {

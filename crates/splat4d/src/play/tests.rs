@@ -23,6 +23,7 @@ fn primitive(rng: &Rng, center: f64, half_width: f64) -> Primitive {
         base_color: [f(12), f(13), f(14)],
         sh_rest: std::array::from_fn(|k| 0.1 * (f(20 + k as u64) - 0.5)),
         importance: f(15),
+        label: None,
     }
 }
 

@@ -80,6 +80,12 @@ impl Importance {
         self.renderer.sensitivities(shot, out);
     }
 
+    /// Splats as a camera sees them, before any is blended, one a splat.
+    pub fn project(&mut self, splats: &Splats<'_>, camera: &Camera) -> &[Projected] {
+        self.renderer.list(splats, camera);
+        self.renderer.projected()
+    }
+
     /// See [`Renderer::projected`].
     pub fn projected(&self) -> &[Projected] {
         self.renderer.projected()

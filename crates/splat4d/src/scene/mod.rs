@@ -2,6 +2,7 @@
 
 pub mod camera;
 pub mod head;
+pub mod labels;
 pub mod life;
 pub(crate) mod masks;
 pub mod params;

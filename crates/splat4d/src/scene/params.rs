@@ -278,6 +278,13 @@ impl<F: Real> Params<F> {
         }
     }
 
+    /// Puts another table of as many rows in one's place. Panics: it has another number of rows.
+    pub(crate) fn replace(&mut self, key: Key, table: Table<F>) {
+        let own = &mut self.tables[key.0 as usize];
+        assert_eq!(own.rows(), table.rows(), "a table of a layer has a row for each of its space");
+        *own = table;
+    }
+
     /// Gathers every table of the edit's space. Models mend what copying alone cannot in `Motion::on_edit`.
     pub fn apply(&mut self, edit: &RowEdit) {
         for (info, table) in self.infos.iter().zip(&mut self.tables) {

@@ -169,6 +169,7 @@ fn capture(pinned: &Pinned, root: &Path, pictures: &[PathBuf], count: usize) -> 
             index: i,
             image,
             flow: None,
+            labels: None,
             mask: None,
         }
     };
@@ -188,6 +189,7 @@ fn capture(pinned: &Pinned, root: &Path, pictures: &[PathBuf], count: usize) -> 
         points: None,
         background: None,
         up: pinned.scene.up,
+        labels: Vec::new(),
         downscale: 1,
         warnings: Vec::new(),
         notes: Vec::new(),

@@ -28,6 +28,9 @@ pub(super) fn of_index(index: &Index) -> ToldIndex {
     if !meta.title.is_empty() {
         line(&mut text, "title", &meta.title);
     }
+    if !meta.labels.is_empty() {
+        line(&mut text, "labels", &meta.labels.join(", "));
+    }
     line(&mut text, "degree", &format!("{} of the spherical harmonics", meta.sh_degree));
     let extras = [("cameras", meta.cameras.len()), ("keys of a camera path", meta.path.len())];
     for (name, count) in extras.into_iter().filter(|(_, count)| *count > 0) {
@@ -50,9 +53,10 @@ pub(super) fn of_index(index: &Index) -> ToldIndex {
     if sections.len() > LISTED {
         line(&mut text, "", &format!("and {} more", grouped(sections.len() - LISTED)));
     }
-    let sizes = [Kind::Page, Kind::Palette, Kind::Poster, Kind::Masks].map(|kind| (kind, stored(kind)));
+    let sizes = [Kind::Page, Kind::Palette, Kind::Poster, Kind::Masks, Kind::Labels].map(|kind| (kind, stored(kind)));
     let head = index.file_len.saturating_sub(known);
-    let parts = ["pages", "palettes", "poster", "masks"].iter().zip(&sizes).map(|(name, (_, bytes))| (*name, *bytes));
+    let parts =
+        ["pages", "palettes", "poster", "masks", "labels"].iter().zip(&sizes).map(|(name, (_, bytes))| (*name, *bytes));
     let parts: Vec<String> = parts
         .chain([("index", head)])
         .filter(|(_, bytes)| *bytes > 0)
@@ -91,6 +95,10 @@ fn section(e: &Entry) -> Value {
     if e.kind == Kind::Masks {
         v["gaussians"] = json!(e.count);
         v["span"] = json!(e.span);
+        v["page"] = json!(e.page);
+    }
+    if e.kind == Kind::Labels {
+        v["gaussians"] = json!(e.count);
         v["page"] = json!(e.page);
     }
     if e.kind == Kind::Palette {

@@ -36,8 +36,8 @@ fn no_capture_and_no_frames() {
     assert_says(&say(empty.path()), &["not a capture", "capture.json", "docs/capture-format.md"]);
     std::fs::write(empty.path().join("cam00.mp4"), b"").unwrap();
     assert_says(&say(empty.path()), &["videos", "ffmpeg -i cam00.mp4"]);
-    std::fs::write(empty.path().join("dataset.json"), b"{}").unwrap();
-    assert_says(&say(empty.path()), &["HyperNeRF", "COLMAP"]);
+    std::fs::write(empty.path().join("sfm_data.json"), b"{}").unwrap();
+    assert_says(&say(empty.path()), &["OpenMVG", "COLMAP"]);
     let sample = samples::own();
     sample.edit("capture.json", |v| v["cameras"] = json!([]));
     assert_says(&message(&sample), &["no frames"]);

@@ -38,6 +38,31 @@ fn blue(capture: &Arc<Capture>, frame: usize) -> usize {
 }
 
 #[test]
+fn nerfies_and_hypernerf() {
+    let sample = samples::nerfies();
+    let capture = Arc::new(open_with(&sample, CaptureOptions { fps: Some(10.0), ..CaptureOptions::default() }));
+    assert_eq!((capture.kind, capture.fps, names(&capture)), (CaptureKind::Nerfies, 10.0, vec!["camera0"]));
+    assert_eq!((capture.frames.len(), &capture.held, &capture.train), (4, &vec![2], &vec![0, 1, 3]));
+    for (i, frame) in capture.frames.iter().enumerate() {
+        assert_pose(frame, i);
+        assert!((frame.time.0 - 0.1 * i as f64).abs() < 1e-12 && blue(&capture, i) == i * 7);
+    }
+    assert!(matches!(capture.frames[3].source.lens, Lens::Brown { k, .. } if k[0] == 0.1));
+    let points = capture.points.as_ref().unwrap();
+    assert_eq!(points.points, [[0.0; 3]], "a point that is no number is left out");
+    let say = |sample: &Sample| Capture::open(sample.root(), &CaptureOptions::default()).unwrap_err().to_string();
+    sample.edit("dataset.json", |v| v["val_ids"] = json!(["000009"]));
+    assert!(say(&sample).contains("000009") && say(&sample).contains("dataset.json"));
+    sample.edit("dataset.json", |v| v["val_ids"] = json!([]));
+    sample.edit("camera/000001.json", |v| v["skew"] = json!(3.0));
+    assert!(say(&sample).contains("000001.json") && say(&sample).contains("skew"), "{}", say(&sample));
+    std::fs::remove_file(sample.path("camera/000001.json")).unwrap();
+    assert!(say(&sample).contains("000001.json"));
+    std::fs::remove_file(sample.path("metadata.json")).unwrap();
+    assert!(say(&sample).contains("not a capture"));
+}
+
+#[test]
 fn own_format() {
     let sample = samples::own();
     let capture = Arc::new(open(&sample));

@@ -162,6 +162,35 @@ pub(super) fn panoptic() -> Sample {
     sample
 }
 
+/// A camera that moves, in HyperNeRF's layout: three moments to train on, one held out; the world is twice as large and
+/// elsewhere.
+pub(super) fn nerfies() -> Sample {
+    let sample = Sample::new(&["dataset.json", "metadata.json", "scene.json", "camera/000001.json"]);
+    let mut metadata = serde_json::Map::new();
+    for i in 0..4 {
+        let (id, pose) = (format!("{i:06}"), pose(i));
+        sample.rgb(&format!("rgb/2x/{id}.png"), 0, i);
+        metadata.insert(id.clone(), json!({"warp_id": i, "appearance_id": 9, "camera_id": 0}));
+        let center = pose.inverse().translation.map(|x| 2.0 * x + 1.0);
+        let camera = json!({
+            "orientation": pose.rotation, "position": center, "focal_length": 2.0 * FOCAL, "skew": 0.0,
+            "pixel_aspect_ratio": 1.0, "principal_point": [24.0, 16.0], "image_size": [2 * WIDTH, 2 * HEIGHT],
+            "radial_distortion": [if i == 3 { 0.1 } else { 0.0 }, 0.0, 0.0], "tangential_distortion": [0.0, 0.0],
+        });
+        sample.write(&format!("camera/{id}.json"), camera.to_string().as_bytes());
+    }
+    let ids: Vec<String> = metadata.keys().cloned().collect();
+    let dataset = json!({"count": 4, "ids": ids, "train_ids": [ids[0], ids[1], ids[3]], "val_ids": [ids[2]]});
+    sample.write("dataset.json", dataset.to_string().as_bytes());
+    sample.write("metadata.json", Value::Object(metadata).to_string().as_bytes());
+    sample
+        .write("scene.json", json!({"scale": 0.5, "center": [1, 1, 1], "near": 0.1, "far": 9}).to_string().as_bytes());
+    let mut points = Vec::new();
+    splat4d::format::npy::write_f32(&[2, 3], &[1.0, 1.0, 1.0, 3.0, 1.0, f32::NAN], &mut points).unwrap();
+    sample.write("points.npy", &points);
+    sample
+}
+
 /// Two cameras by folder, two frames with time, one distorted.
 pub(super) fn nerfstudio() -> Sample {
     let sample = Sample::new(&["transforms.json", "sparse_pc.ply"]);
@@ -319,5 +348,6 @@ pub(super) fn all() -> Vec<(&'static str, Sample)> {
         ("colmap binary", colmap_bin()),
         ("colmap text", colmap_txt()),
         ("n3dv", n3dv()),
+        ("nerfies", nerfies()),
     ]
 }

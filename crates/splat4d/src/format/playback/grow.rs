@@ -4,7 +4,7 @@
 
 use super::index::broken;
 use super::write::GENERATOR;
-use super::{Entry, FIRST_VERSION, GROWING, HEADER_BYTES, Index, Kind, Meta, VERSION};
+use super::{Entry, GROWING, HEADER_BYTES, Index, Kind, Meta};
 use crate::{Error, Result};
 use std::io::{Read, Seek, SeekFrom, Write};
 
@@ -46,7 +46,7 @@ impl<F: Read + Write + Seek> Growing<F> {
         &mut self.file
     }
 
-    /// Adds the pages of a whole playback file, their palettes and masks, and states `meta`, of which `gaussians` is counted.
+    /// Adds the pages of a whole playback file, their palettes, masks and labels, and states `meta`, of which `gaussians` is counted.
     /// `sync` is called before the header names what was added: until then the file is what it was.
     ///
     /// Errors: `part` is no whole file; metadata out of range; the file's. After an error the file is what it was.
@@ -67,7 +67,7 @@ impl<F: Read + Write + Seek> Growing<F> {
 
     fn add(&mut self, part: &[u8], meta: Meta, sync: &mut dyn FnMut(&mut F) -> std::io::Result<()>) -> Result<()> {
         let theirs = Index::parse(part, Some(part.len() as u64))?;
-        let wanted = |e: &&Entry| matches!(e.kind, Kind::Page | Kind::Palette | Kind::Masks);
+        let wanted = |e: &&Entry| matches!(e.kind, Kind::Page | Kind::Palette | Kind::Masks | Kind::Labels);
         // Sections are named by their places, which change.
         let mut places = vec![0u32; theirs.sections.len()];
         let mut next = self.index.sections.len() as u32;
@@ -125,9 +125,9 @@ pub fn finish(source: &mut (impl Read + Seek), meta: Meta, poster: Option<&[u8]>
         let [palette, page] = [e.palette, e.page].map(|p| p.map(|p| places[p as usize]));
         sections.push(Entry { palette, page, ..e.clone() });
     }
-    let masked = sections.iter().any(|e| e.kind == Kind::Masks);
     let meta = Meta { gaussians: grown.meta.gaussians, parts: Vec::new(), missing: Vec::new(), ..meta };
-    let mut index = Index { version: if masked { VERSION } else { FIRST_VERSION }, file_len: 0, meta, sections };
+    let mut index = Index { version: [0; 2], file_len: 0, meta, sections };
+    index.version = index.least_version();
     let head = index.bytes(GENERATOR);
     out.write_all(&head).map_err(unwritten)?;
     poster.map_or(Ok(()), |p| out.write_all(p)).map_err(unwritten)?;
@@ -147,7 +147,7 @@ pub fn finish(source: &mut (impl Read + Seek), meta: Meta, poster: Option<&[u8]>
 }
 
 /// What the first picture needs: the first tier of its pages, what colours them, the rest of them; then time goes on. Palettes
-/// come before the first page that names them, masks behind their page. Equal ones stand by their bytes, so that who added
+/// come before the first page that names them, masks behind their page, labels behind everything. Equal ones stand by their bytes, so that who added
 /// what when does not show.
 fn order(index: &Index) -> Vec<usize> {
     let start = index.meta.clip[0];
@@ -177,6 +177,12 @@ fn order(index: &Index) -> Vec<usize> {
         }
         if place + 1 == before {
             pages[..before].iter().for_each(|(_, page)| color(&mut order, page));
+        }
+    }
+    let labels = index.of_pages(Kind::Labels);
+    for (page, _) in &pages {
+        if let Ok(at) = labels.binary_search_by_key(&(*page as u32), |(page, _)| *page) {
+            order.push(labels[at].1);
         }
     }
     order

@@ -1,8 +1,8 @@
 //! The start of a playback file: header, JSON, and the table of sections.
 
 use super::{
-    BLOCK_GAUSSIANS, BLOCK_HEADER, GROWING, HEADER_BYTES, MAGIC, MAX_PAGE_GAUSSIANS, MAX_PALETTE, Meta, PAGE_WORDS,
-    VERSION,
+    BLOCK_GAUSSIANS, BLOCK_HEADER, FIRST_VERSION, GROWING, HEADER_BYTES, MAGIC, MASKED, MAX_PAGE_GAUSSIANS,
+    MAX_PALETTE, Meta, PAGE_WORDS, VERSION,
 };
 use crate::math::sh;
 use crate::{Error, ErrorKind, Result};
@@ -33,6 +33,8 @@ pub enum Kind {
     Palette,
     /// Which Gaussians of a page are worth drawing when.
     Masks,
+    /// What the Gaussians of a page are part of.
+    Labels,
     /// A picture.
     Poster,
     /// Where the file comes from.
@@ -47,6 +49,7 @@ impl Kind {
             Kind::Page => *b"PAGE",
             Kind::Palette => *b"PALT",
             Kind::Masks => *b"MASK",
+            Kind::Labels => *b"LABL",
             Kind::Poster => *b"POST",
             Kind::Provenance => *b"PROV",
             Kind::Other(tag) => tag,
@@ -54,7 +57,7 @@ impl Kind {
     }
 
     fn of(tag: [u8; 4]) -> Self {
-        let known = [Kind::Page, Kind::Palette, Kind::Masks, Kind::Poster, Kind::Provenance];
+        let known = [Kind::Page, Kind::Palette, Kind::Masks, Kind::Labels, Kind::Poster, Kind::Provenance];
         known.into_iter().find(|k| k.tag() == tag).unwrap_or(Kind::Other(tag))
     }
 
@@ -106,13 +109,13 @@ pub struct Entry {
     pub tier: u16,
     /// Palette: the degree of its spherical harmonics, 1 to 3.
     pub degree: u16,
-    /// Page: Gaussians. Palette: entries. Masks: Gaussians of their page.
+    /// Page: Gaussians. Palette: entries. Masks, labels: Gaussians of their page.
     pub count: u32,
     /// Page: it is drawn for from ≤ t < to, seconds. Masks: first and last key time.
     pub span: [f64; 2],
     /// Page: place of its palette in the table of sections; none: base colour only.
     pub palette: Option<u32>,
-    /// Masks: place of their page in the table of sections.
+    /// Masks, labels: place of their page in the table of sections.
     pub page: Option<u32>,
 }
 
@@ -225,7 +228,12 @@ impl Index {
 
     /// Pages that have masks, and the sections of these, by page.
     pub(crate) fn masks(&self) -> Vec<(u32, usize)> {
-        let sections = self.sections.iter().enumerate().filter(|(_, e)| e.kind == Kind::Masks);
+        self.of_pages(Kind::Masks)
+    }
+
+    /// Pages that have a section of this kind beside them, and these sections, by page.
+    pub(crate) fn of_pages(&self, kind: Kind) -> Vec<(u32, usize)> {
+        let sections = self.sections.iter().enumerate().filter(|(_, e)| e.kind == kind);
         let mut all: Vec<(u32, usize)> = sections.filter_map(|(i, e)| Some((e.page?, i))).collect();
         all.sort_unstable();
         all
@@ -249,15 +257,18 @@ impl Index {
             }
             free = end;
         }
-        if let Some(pair) = self.masks().windows(2).find(|pair| pair[0].0 == pair[1].0) {
-            let what = format!("section {} has masks already", pair[0].0);
-            return Err(broken(what).at(format!("section {}", pair[1].1)));
-        }
-        for (page, i) in self.masks() {
-            let count = self.sections[i].count;
-            if self.sections.get(page as usize).is_none_or(|e| e.kind != Kind::Page || e.count != count) {
-                let what = format!("its page, section {page}, is none of {count} Gaussians");
-                return Err(broken(what).at(format!("section {i}")));
+        for (kind, name) in [(Kind::Masks, "masks"), (Kind::Labels, "labels")] {
+            let beside = self.of_pages(kind);
+            if let Some(pair) = beside.windows(2).find(|pair| pair[0].0 == pair[1].0) {
+                let what = format!("section {} has {name} already", pair[0].0);
+                return Err(broken(what).at(format!("section {}", pair[1].1)));
+            }
+            for (page, i) in beside {
+                let count = self.sections[i].count;
+                if self.sections.get(page as usize).is_none_or(|e| e.kind != Kind::Page || e.count != count) {
+                    let what = format!("its page, section {page}, is none of {count} Gaussians");
+                    return Err(broken(what).at(format!("section {i}")));
+                }
             }
         }
         let mut gaussians = 0u64;
@@ -273,6 +284,16 @@ impl Index {
             return Err(broken(format!("its pages hold {gaussians} Gaussians, its JSON says {claimed}")));
         }
         Ok(())
+    }
+
+    /// The least version that has all these sections.
+    pub(super) fn least_version(&self) -> [u16; 2] {
+        let has = |kind: Kind| self.sections.iter().any(|e| e.kind == kind);
+        match (has(Kind::Labels), has(Kind::Masks)) {
+            (true, _) => VERSION,
+            (false, true) => MASKED,
+            (false, false) => FIRST_VERSION,
+        }
     }
 
     /// Header and index of a file with these sections; `offset`s are moved behind the index, and the file's length is
@@ -428,7 +449,7 @@ impl Entry {
             count: u32_at(32),
             span: [f64::from_bits(u64_at(40)), f64::from_bits(u64_at(48))],
             palette: Some(u32_at(56)).filter(|&p| kind == Kind::Page && p != NO_PALETTE),
-            page: Some(u32_at(56)).filter(|_| kind == Kind::Masks),
+            page: Some(u32_at(56)).filter(|_| matches!(kind, Kind::Masks | Kind::Labels)),
         };
         if let Kind::Other(_) = kind {
             if required {
@@ -486,6 +507,11 @@ impl Entry {
                     return Err(broken(format!("key times cannot go from {from} to {to} s")));
                 }
             }
+            Kind::Labels => {
+                if !(1..=MAX_PAGE_GAUSSIANS).contains(&count) || self.bytes as usize != count {
+                    return Err(broken(format!("labels of {count} Gaussians do not have {} bytes", self.bytes)));
+                }
+            }
             Kind::Poster | Kind::Provenance | Kind::Other(_) => {}
         }
         Ok(())
@@ -507,7 +533,7 @@ impl Entry {
         self.span.iter().for_each(|t| out.extend_from_slice(&t.to_le_bytes()));
         let other = match self.kind {
             Kind::Page => self.palette.unwrap_or(NO_PALETTE),
-            Kind::Masks => self.page.expect("masks are those of a page"),
+            Kind::Masks | Kind::Labels => self.page.expect("masks and labels are those of a page"),
             _ => 0,
         };
         out.extend_from_slice(&other.to_le_bytes());

@@ -356,6 +356,7 @@ pub(crate) fn primitives(layer: &Layer<f32>) -> Vec<super::Primitive> {
     let [.., velocities, rates] = keys(layer);
     let p = &layer.params;
     let coefficients = p[SH].width();
+    let labels = super::labels_of(p);
     let one = |row: usize| {
         let [center, width, softness] = p[LIFE].read::<3>(row, 0).map(f64::from);
         let half_width = match width.exp() {
@@ -380,6 +381,7 @@ pub(crate) fn primitives(layer: &Layer<f32>) -> Vec<super::Primitive> {
             base_color: p[SH].read::<3>(row, 0).map(sh::dc_to_rgb),
             sh_rest,
             importance: 1.0,
+            label: labels[row],
         }
     };
     (0..p.len()).map(one).collect()

@@ -1,7 +1,8 @@
 //! The JSON of a playback file.
 
+use crate::layers::{Head, Layer, Scene};
 use crate::math::Se3;
-use crate::scene::{Camera, Intrinsics, Lens};
+use crate::scene::{Camera, Intrinsics, Lens, labels};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 
@@ -41,6 +42,9 @@ pub struct Meta {
     /// The default camera path.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub path: Vec<PathKey>,
+    /// Names of the labels that pages number.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub labels: Vec<String>,
     /// Of a file that grows: the parts that are in it, as their maker names them.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub parts: Vec<String>,
@@ -178,7 +182,13 @@ impl Meta {
         if self.bounds.is_some_and(|b| !finite(b.as_flattened())) {
             return wrong("`box` is not finite");
         }
-        Ok(())
+        if self.labels.is_empty() { Ok(()) } else { labels::check(&self.labels) }
+    }
+
+    /// Layers as the scene that this is about.
+    pub(super) fn scene(&self, layers: Vec<Layer<f32>>) -> Scene<f32> {
+        let Self { background, clip, fps, up, .. } = *self;
+        Scene { layers, background, clip, fps, up, head: Head::Identity, labels: self.labels.clone() }
     }
 }
 

@@ -11,6 +11,7 @@ mod deflate;
 mod depths;
 mod grow;
 mod index;
+mod labels;
 mod layer;
 mod mask;
 mod meta;
@@ -28,6 +29,7 @@ pub use coder::Coder;
 pub use depths::{Depths, LEAST_DEPTH};
 pub use grow::{Growing, finish};
 pub use index::{Codec, Entry, Index, Kind};
+pub(crate) use labels::of_layer as labels_of;
 pub(crate) use layer::{is_page, primitives};
 pub(crate) use mask::decode_masks;
 pub use meta::{Meta, NamedCamera, PathKey, Viewpoint};
@@ -41,8 +43,10 @@ pub use write::{ErrorStat, Errors, Summary, WriteConfig, write};
 /// First bytes of a playback file.
 pub const MAGIC: [u8; 8] = *b"\x89S4D\r\n\x1a\n";
 /// The version that this library knows: major, minor. A file states the least that has all it holds.
-pub(crate) const VERSION: [u16; 2] = [1, 1];
-/// The version of a file without masks.
+pub(crate) const VERSION: [u16; 2] = [1, 2];
+/// The version of a file with masks and without labels.
+const MASKED: [u16; 2] = [1, 1];
+/// The version of a file without either.
 const FIRST_VERSION: [u16; 2] = [1, 0];
 /// The version of a file that grows, which readers of version 1 refuse: its index is not where they look for it.
 const GROWING: [u16; 2] = [2, 0];
@@ -89,6 +93,8 @@ pub struct Primitive {
     pub sh_rest: [f32; 45],
     /// How much it adds to pictures; any unit. Decides tiers and how much the palette cares.
     pub importance: f32,
+    /// Number of its label in [`Meta::labels`]; none: it has none.
+    pub label: Option<u8>,
 }
 
 /// Gaussians that are drawn for from ≤ t < to.

@@ -7,8 +7,8 @@ use super::layer::keys;
 use super::page::page_of;
 use super::read::Parts;
 use super::write::{PageEntry, Sections};
-use super::{BLOCK_GAUSSIANS, MAX_PAGE_GAUSSIANS, Meta, PAGE_WORDS, Palette, Summary, WriteConfig};
-use crate::layers::{Head, Layer, Scene};
+use super::{BLOCK_GAUSSIANS, MAX_PAGE_GAUSSIANS, Meta, PAGE_WORDS, Palette, Summary, WriteConfig, labels_of};
+use crate::layers::{Layer, Scene};
 use crate::scene::SH;
 use crate::simd::{Simd, dispatch};
 use crate::{Error, ErrorKind, Result};
@@ -33,8 +33,7 @@ pub struct Pages {
 impl Pages {
     /// The pages as a scene.
     pub fn scene(&self) -> Scene<f32> {
-        let Meta { background, clip, fps, up, .. } = self.meta;
-        Scene { layers: self.layers.clone(), background, clip, fps, up, head: Head::Identity }
+        self.meta.scene(self.layers.clone())
     }
 
     /// The same, to be written.
@@ -123,6 +122,9 @@ pub fn write_pages(draft: &PagesDraft<'_>, config: &WriteConfig, out: &mut dyn W
         file.page(body, &entry);
         if let Some(masks) = &layer.masks {
             file.masks(masks).map_err(|e| e.at(format!("layer {i}")))?;
+        }
+        if !draft.meta.labels.is_empty() {
+            file.labels(labels_of(&layer.params).into_iter());
         }
     }
     file.finish(out)

@@ -1,8 +1,8 @@
 //! A whole playback file as a scene.
 
 use super::index::broken;
-use super::{Index, Kind, Meta, Palette, decode_masks, decode_page, decode_palette};
-use crate::layers::{Head, Layer, Scene};
+use super::{Index, Kind, Meta, Palette, decode_masks, decode_page, decode_palette, labels};
+use crate::layers::{Layer, Scene};
 use crate::{Error, ErrorKind, Result};
 use std::sync::Arc;
 
@@ -18,7 +18,7 @@ const SMALL: u64 = 64 << 20;
 pub fn read(bytes: &[u8]) -> Result<Scene<f32>> {
     let Parts { meta, pages, .. } = Parts::read(bytes)?;
     let layers = pages.into_iter().map(|p| p.layer).collect();
-    Ok(Scene { layers, background: meta.background, clip: meta.clip, fps: meta.fps, up: meta.up, head: Head::Identity })
+    Ok(meta.scene(layers))
 }
 
 /// All that a file holds.
@@ -56,7 +56,8 @@ impl Parts {
             let palette = decode_palette(entry, stored(bytes, entry)).map_err(|e| e.at(format!("section {i}")))?;
             palettes.push((i as u32, palette));
         }
-        let masks = index.masks();
+        let (masks, labelled) = (index.masks(), index.of_pages(Kind::Labels));
+        let names = index.meta.labels.len();
         let mut pages = Vec::new();
         for (i, entry) in index.pages() {
             let palette = entry.palette.and_then(|p| palettes.iter().find(|(at, _)| *at == p)).map(|(_, p)| p);
@@ -67,6 +68,11 @@ impl Parts {
                 let (i, entry) = (masks[at].1, &index.sections[masks[at].1]);
                 let masks = decode_masks(entry, stored(bytes, entry)).map_err(|e| e.at(format!("section {i}")))?;
                 layer.masks = Some(Arc::new(masks));
+            }
+            if let Ok(at) = labelled.binary_search_by_key(&(i as u32), |(page, _)| *page) {
+                let (i, entry) = (labelled[at].1, &index.sections[labelled[at].1]);
+                labels::decode(entry, stored(bytes, entry), names, &mut layer.params)
+                    .map_err(|e| e.at(format!("section {i}")))?;
             }
             pages.push(PagePart { layer, labels: page.labels(), palette: entry.palette, tier: entry.tier });
         }

@@ -3,6 +3,7 @@
 mod coder;
 mod grow;
 mod hostile;
+mod labels;
 mod masks;
 
 use super::block::encode_page;
@@ -35,6 +36,7 @@ fn primitive(r: Rng) -> Primitive {
         base_color: std::array::from_fn(|k| (0.5 + 0.3 * r.normal(60 + k as u64)) as f32),
         sh_rest: std::array::from_fn(|k| (0.05 * r.normal(100 + k as u64)) as f32),
         importance: r.uniform(6) as f32,
+        label: None,
     }
 }
 
@@ -77,6 +79,7 @@ fn tiny() -> Draft {
         base_color: [0.25, 0.5, 0.75],
         sh_rest: std::array::from_fn(|k| if k < 9 { 0.01 * k as f32 } else { 0.0 }),
         importance: 1.0,
+        label: None,
     };
     let moving = Primitive {
         mean: [1.0, -0.5, 3.0],

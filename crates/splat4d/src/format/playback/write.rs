@@ -7,7 +7,7 @@ use super::index::{MASK_HEAD, crc, mask_keys};
 use super::page::parse_page;
 use super::{
     BLOCK_GAUSSIANS, BLOCK_HEADER, Codec, Depths, Draft, Entry, FIRST_VERSION, Index, Kind, MAX_PAGE_GAUSSIANS,
-    MAX_PALETTE, Meta, Node, Page, Palette, VERSION, mask, order,
+    MAX_PALETTE, Meta, Node, Page, Palette, labels, mask, order,
 };
 use crate::math::{Rng, quat, sh};
 use crate::scene::KeyMasks;
@@ -135,6 +135,8 @@ pub(super) struct Sections {
     pub file: Index,
     bodies: Vec<Vec<u8>>,
     level: u32,
+    /// Labels by the section of their page: written behind everything that is drawn.
+    labels: Vec<(u32, Vec<u8>)>,
     /// A poster that is written last.
     late: Option<Vec<u8>>,
     pub summary: Summary,
@@ -146,7 +148,7 @@ impl Sections {
         meta.check()?;
         let summary = Summary { gaussians: meta.gaussians, ..Summary::default() };
         let file = Index { version: FIRST_VERSION, file_len: 0, meta, sections: Vec::new() };
-        let mut out = Self { file, bodies: Vec::new(), level, late: None, summary };
+        let mut out = Self { file, bodies: Vec::new(), level, labels: Vec::new(), late: None, summary };
         match poster.filter(|p| !p.is_empty()) {
             Some(p) if p.len() <= SMALL_POSTER => out.summary.poster_bytes = out.add(entry(Kind::Poster), p.to_vec()),
             p => out.late = p.map(<[u8]>::to_vec),
@@ -180,7 +182,6 @@ impl Sections {
     pub(super) fn masks(&mut self, masks: &KeyMasks) -> Result<()> {
         let body = mask::bytes(masks)?;
         let times = masks.times();
-        self.file.version = VERSION;
         let page = Some(self.file.sections.len() as u32 - 1);
         let span = [times[0], times[times.len() - 1]];
         let e = Entry { count: masks.rows() as u32, span, page, ..entry(Kind::Masks) };
@@ -188,8 +189,18 @@ impl Sections {
         Ok(())
     }
 
+    /// Labels of the page that was added last, one a Gaussian.
+    pub(super) fn labels(&mut self, of: impl Iterator<Item = Option<u8>>) {
+        let page = self.file.sections.iter().rposition(|e| e.kind == Kind::Page).expect("a page was added");
+        self.labels.extend(labels::bytes(of).map(|bytes| (page as u32, bytes)));
+    }
+
     /// Writes the file. Errors: the sink's.
     pub(super) fn finish(mut self, out: &mut dyn Write) -> Result<Summary> {
+        for (page, body) in std::mem::take(&mut self.labels) {
+            self.add(Entry { count: body.len() as u32, page: Some(page), ..entry(Kind::Labels) }, body);
+        }
+        self.file.version = self.file.least_version();
         if let Some(p) = self.late.take() {
             self.summary.poster_bytes = self.add(entry(Kind::Poster), p);
         }
@@ -227,8 +238,12 @@ pub fn write(draft: &Draft, config: &WriteConfig, out: &mut dyn Write) -> Result
     meta.gaussians = draft.nodes.iter().map(|n| n.primitives.len()).sum();
     config.depths.check()?;
     let mut file = Sections::new(meta, draft.poster.as_deref(), config.deflate_level)?;
-    draft.nodes.iter().enumerate().try_for_each(|(i, n)| check(n).map_err(|e| e.at(format!("node {i}"))))?;
-    let (palette, labels) = palette(draft, config);
+    draft
+        .nodes
+        .iter()
+        .enumerate()
+        .try_for_each(|(i, n)| check(n, draft.meta.labels.len()).map_err(|e| e.at(format!("node {i}"))))?;
+    let (palette, entries) = palette(draft, config);
     // First what the first picture needs: the important Gaussians of the clip's start in their base colours, what
     // colours them, the rest of them; then time goes on.
     let start = draft.meta.clip[0];
@@ -257,7 +272,7 @@ pub fn write(draft: &Draft, config: &WriteConfig, out: &mut dyn Write) -> Result
         let rows: Vec<_> = piece
             .rows
             .iter()
-            .map(|&i| (&node.primitives[i as usize], labels.get(piece.node).map_or(0, |l| l[i as usize])))
+            .map(|&i| (&node.primitives[i as usize], entries.get(piece.node).map_or(0, |l| l[i as usize])))
             .collect();
         let body = encode_page(&rows, span, &config.depths);
         let palette_at = palette.is_some().then_some(palette_at);
@@ -265,6 +280,9 @@ pub fn write(draft: &Draft, config: &WriteConfig, out: &mut dyn Write) -> Result
         let page = parse_page(&body, &entry.entry()).expect("a page that was just written");
         compare(&mut file.summary.errors, &page, &rows, palette.as_ref());
         file.page(body, &entry);
+        if !draft.meta.labels.is_empty() {
+            file.labels(rows.iter().map(|(p, _)| p.label));
+        }
     }
     file.finish(out)
 }
@@ -304,12 +322,15 @@ fn pack(mut entry: Entry, body: Vec<u8>, level: u32) -> (Entry, Vec<u8>) {
 }
 
 /// Refuses what cannot be written.
-fn check(node: &Node) -> Result<()> {
+fn check(node: &Node, labels: usize) -> Result<()> {
     if !(node.from.is_finite() && node.to.is_finite() && node.from < node.to) {
         return Err(Error::input(format!("a part of a scene cannot last from {} to {} s", node.from, node.to)));
     }
     assert!(u32::try_from(node.primitives.len()).is_ok(), "a node has at most 4 billion Gaussians");
     for (i, p) in node.primitives.iter().enumerate() {
+        if let Some(label) = p.label.filter(|&l| labels > 0 && usize::from(l) >= labels) {
+            return Err(Error::input(format!("Gaussian {i} has label {label} of {labels}")));
+        }
         let numbers = p.mean.iter().chain([&p.center, &p.softness]).all(|x| (*x as f32).is_finite());
         let shape = p.quat.iter().chain(&p.scales).chain(&p.velocity).chain(&p.turn);
         let color = p.base_color.iter().chain(&p.sh_rest).chain([&p.opacity, &p.importance]);

@@ -46,6 +46,9 @@ pub(super) fn survive(bytes: &[u8]) -> bool {
             Kind::Page => drop(decode_page(e, body)),
             Kind::Palette => drop(decode_palette(e, body)),
             Kind::Masks => drop(decode_masks(e, body)),
+            Kind::Labels => {
+                drop(super::super::labels::decode(e, body, 3, &mut crate::scene::Params::new(e.count as usize, 1, &[])))
+            }
             Kind::Provenance => drop(provenance(bytes)),
             Kind::Poster | Kind::Other(_) => {}
         }
@@ -200,6 +203,7 @@ fn a_bomb_of_zeros_is_not_unpacked() {
         base_color: [0.0; 3],
         sh_rest: [0.0; 45],
         importance: 0.0,
+        label: None,
     };
     let mut draft = tiny();
     draft.meta.sh_degree = 0;

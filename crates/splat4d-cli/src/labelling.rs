@@ -1,0 +1,82 @@
+//! The work behind `label`, which `train` does too where a capture has labels: labels learnt into a run's scene, and measured.
+
+use crate::console::Console;
+use crate::files;
+use crate::finish::amend;
+use crate::run_folder::Run;
+use crate::source::{not_empty, read_scene};
+use serde_json::json;
+use splat4d::format;
+use splat4d_train::capture::{Capture, CaptureOptions};
+use splat4d_train::labels::{self, LabelScores, ROUNDS, learn, measure};
+use splat4d_train::run::{capture_options, corrected};
+use std::path::Path;
+
+/// Whether any picture of a run's capture has a mask of labels.
+pub(crate) fn has_labels(capture: &Capture) -> bool {
+    capture.frames.iter().any(|f| f.labels.is_some())
+}
+
+/// Learns the labels of a run's capture, or of another with the same cameras, into its `scene.safetensors`.
+///
+/// Errors: no training picture has labels; masks that cannot be read.
+pub(crate) fn label(run: &Path, from: Option<&Path>, rounds: Option<usize>, console: &Console) -> anyhow::Result<()> {
+    let opened = Run::open(run)?;
+    let file = opened.scene_file()?;
+    let mut scene = read_scene(&file)?;
+    not_empty(&scene, run)?;
+    let (mut capture, recipe) = opened.open_capture()?;
+    if let Some(from) = from {
+        capture = Capture::open(from, &CaptureOptions { frames: Vec::new(), ..capture_options(&recipe)? })?;
+    }
+    corrected::apply(&mut capture, run)?;
+    let mut phase = |done, of| console.phase("learning labels", done, of);
+    let losses = learn(&mut scene, &capture, rounds.unwrap_or(ROUNDS), &mut phase)?;
+    console.clear();
+    let mut bytes = Vec::new();
+    format::scene::write(&scene, &mut bytes)?;
+    files::write(&file, &bytes)?;
+    let list: Vec<String> = losses.iter().map(|l| format!("{l:.4}")).collect();
+    console.detail(&format!("cross-entropy of a labelled pixel before each round: {} nats", list.join(", ")));
+    let held = measure(&scene, &capture, &capture.held)?;
+    let (scores, views) = match held {
+        Some(scores) => (Some(scores), "held-out"),
+        None => (measure(&scene, &capture, &capture.train)?, "training"),
+    };
+    if let Some(scores) = &scores {
+        console.say(&in_words(scores, views));
+        amend(
+            run,
+            [(
+                "labels".into(),
+                json!({
+                    "names": scores.names, "views": views, "pictures": scores.pictures, "accuracy": scores.accuracy,
+                    "mean_iou": scores.mean_iou(), "iou": scores.iou, "cross_entropy": losses,
+                }),
+            )],
+        )?;
+    }
+    let mut counts = vec![0usize; scene.labels.len()];
+    let all = scene.layers.iter().flat_map(|l| splat4d::scene::labels::of(&l.params));
+    all.flatten().for_each(|k| counts[k] += 1);
+    let gaussians: Vec<String> =
+        scene.labels.iter().zip(&counts).map(|(name, n)| format!("{name} {}", files::grouped(*n))).collect();
+    console.say(&format!("Gaussians: {}", gaussians.join(", ")));
+    console.emit(&json!({
+        "type": "labelled", "labels": scene.labels, "gaussians": counts, "most_pictures": labels::MOST_PICTURES,
+    }));
+    console.written(&file);
+    Ok(())
+}
+
+fn in_words(scores: &LabelScores, views: &str) -> String {
+    let each = scores.names.iter().zip(&scores.iou);
+    let each: Vec<String> = each.filter_map(|(name, iou)| Some(format!("{name} {:.3}", (*iou)?))).collect();
+    format!(
+        "labels of {} {views} views: {:.1} % of the pixels are right, mean IoU {:.3} ({})",
+        scores.pictures,
+        100.0 * scores.accuracy,
+        scores.mean_iou(),
+        each.join(", ")
+    )
+}

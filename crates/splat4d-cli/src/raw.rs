@@ -1,0 +1,154 @@
+//! The numbers behind pictures as files: NumPy arrays, Middlebury flow, OpenEXR.
+
+use crate::draw::Channel;
+use splat4d::scene::Planes;
+use splat4d::{Error, Result, format};
+
+/// A format of arrays of numbers.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub(crate) enum RawFormat {
+    /// NumPy float32, [h,w,C], or [h,w] of one number
+    Npy,
+    /// Middlebury .flo: of flow alone; unknown pixels are 1e10
+    Flo,
+    /// OpenEXR, 32-bit floats, a channel a number: R G B, A, Z, U V, X Y Z, or the channel's name
+    Exr,
+}
+
+/// First number of a .flo file, as text "PIEH" (Baker et al. 2011).
+const FLO_MAGIC: f32 = 202_021.25;
+/// What stands for a flow that is not known there: readers take anything above 1e9 for it.
+const FLO_UNKNOWN: f32 = 1e10;
+
+impl RawFormat {
+    /// The files' ending.
+    pub(crate) fn ending(self) -> &'static str {
+        match self {
+            Self::Npy => "npy",
+            Self::Flo => "flo",
+            Self::Exr => "exr",
+        }
+    }
+
+    /// Errors: .flo of anything but flow.
+    pub(crate) fn suits(self, channel: Channel) -> Result<()> {
+        if self == Self::Flo && channel != Channel::Flow {
+            return Err(Error::input(format!(".flo holds flow, not {}", channel.name()))
+                .remedy("Add --channel flow, or take --raw-format npy or exr."));
+        }
+        Ok(())
+    }
+
+    /// The bytes of a file. Errors: as [`suits`](Self::suits).
+    pub(crate) fn bytes(self, channel: Channel, raw: &Planes<f32>) -> Result<Vec<u8>> {
+        self.suits(channel)?;
+        let mut out = Vec::new();
+        match self {
+            Self::Npy => {
+                let shape = [raw.height, raw.width, raw.channels];
+                let shape = if raw.channels == 1 { &shape[..2] } else { &shape[..] };
+                format::npy::write_f32(shape, &raw.interleaved(), &mut out)?;
+            }
+            Self::Flo => {
+                out.extend_from_slice(&FLO_MAGIC.to_le_bytes());
+                for side in [raw.width, raw.height] {
+                    out.extend_from_slice(&(side as u32).to_le_bytes());
+                }
+                let known = |x: f32| if x.is_finite() { x } else { FLO_UNKNOWN };
+                raw.interleaved().iter().for_each(|x| out.extend_from_slice(&known(*x).to_le_bytes()));
+            }
+            Self::Exr => exr(channel, raw, &mut out),
+        }
+        Ok(out)
+    }
+}
+
+/// A single-part OpenEXR file of uncompressed scan lines in 32-bit floats (openexr.com, "OpenEXR File Layout"). Our own, because
+/// that is a page: the crates that also read what others compress bring several more along, for nothing that is needed here.
+fn exr(channel: Channel, raw: &Planes<f32>, out: &mut Vec<u8>) {
+    /// 32-bit float, of the pixel types.
+    const FLOAT: u32 = 2;
+    // Channels lie in the order of their names.
+    let mut order: Vec<usize> = (0..raw.channels).collect();
+    order.sort_by_key(|&c| channel.planes()[c]);
+    out.extend_from_slice(&[0x76, 0x2f, 0x31, 0x01, 2, 0, 0, 0]);
+    let mut attribute = |name: &str, kind: &str, value: &[u8]| {
+        for text in [name, kind] {
+            out.extend_from_slice(text.as_bytes());
+            out.push(0);
+        }
+        out.extend_from_slice(&(value.len() as u32).to_le_bytes());
+        out.extend_from_slice(value);
+    };
+    let mut list = Vec::new();
+    for &c in &order {
+        list.extend_from_slice(channel.planes()[c].as_bytes());
+        list.push(0);
+        // Type, perceptually linear or not with its padding, sampling of x and y.
+        for number in [FLOAT, 0, 1, 1] {
+            list.extend_from_slice(&number.to_le_bytes());
+        }
+    }
+    list.push(0);
+    let words = |numbers: [u32; 4]| numbers.map(u32::to_le_bytes).concat();
+    let window = words([0, 0, raw.width as u32 - 1, raw.height as u32 - 1]);
+    let one = 1.0f32.to_le_bytes();
+    attribute("channels", "chlist", &list);
+    attribute("compression", "compression", &[0]);
+    attribute("dataWindow", "box2i", &window);
+    attribute("displayWindow", "box2i", &window);
+    attribute("lineOrder", "lineOrder", &[0]);
+    attribute("pixelAspectRatio", "float", &one);
+    attribute("screenWindowCenter", "v2f", &[0; 8]);
+    attribute("screenWindowWidth", "float", &one);
+    out.push(0);
+    let line = 4 * raw.channels * raw.width;
+    let first = out.len() + 8 * raw.height;
+    for y in 0..raw.height {
+        out.extend_from_slice(&((first + y * (8 + line)) as u64).to_le_bytes());
+    }
+    for y in 0..raw.height {
+        out.extend_from_slice(&(y as u32).to_le_bytes());
+        out.extend_from_slice(&(line as u32).to_le_bytes());
+        for &c in &order {
+            let row = &raw.plane(c)[y * raw.width..(y + 1) * raw.width];
+            row.iter().for_each(|x| out.extend_from_slice(&x.to_le_bytes()));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use splat4d::format::npy::Npy;
+
+    fn flow() -> Planes<f32> {
+        Planes {
+            channels: 2,
+            height: 2,
+            width: 3,
+            data: vec![1.0, 2.0, 3.0, 4.0, 5.0, f32::NAN, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6],
+        }
+    }
+
+    #[test]
+    fn numbers_come_back() {
+        let npy = Npy::read(&RawFormat::Npy.bytes(Channel::Flow, &flow()).unwrap()).unwrap();
+        assert_eq!((npy.shape.as_slice(), &npy.to_f32()[..4]), (&[2, 3, 2][..], &[1.0, 0.1, 2.0, 0.2][..]));
+        let flo = RawFormat::Flo.bytes(Channel::Flow, &flow()).unwrap();
+        assert_eq!((&flo[..4], flo.len()), (&b"PIEH"[..], 12 + 8 * 6));
+        assert_eq!(u32::from_le_bytes([flo[4], flo[5], flo[6], flo[7]]), 3);
+        let last = f32::from_le_bytes(std::array::from_fn(|i| flo[12 + 40 + i]));
+        assert!(last > 1e9, "what is not known is said so: {last}");
+        assert!(RawFormat::Flo.bytes(Channel::Depth, &flow()).unwrap_err().to_string().contains("depth"));
+        // The last line of the file, behind the place that the table states: all of U, then all of V.
+        let exr = RawFormat::Exr.bytes(Channel::Flow, &flow()).unwrap();
+        let number = |at: usize| f32::from_le_bytes(std::array::from_fn(|i| exr[at + i]));
+        let line = exr.len() - 24;
+        assert_eq!([number(line), number(line + 4), number(line + 12), number(line + 20)], [4.0, 5.0, 0.4, 0.6]);
+        let table = exr.len() - 2 * (8 + 24) - 2 * 8;
+        let place = u64::from_le_bytes(std::array::from_fn(|i| exr[table + 8 + i]));
+        assert_eq!(place as usize, line - 8);
+        assert_eq!((&exr[..5], exr[line - 8]), (&[0x76, 0x2f, 0x31, 0x01, 2][..], 1));
+    }
+}

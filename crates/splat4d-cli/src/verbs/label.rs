@@ -1,0 +1,35 @@
+//! `label`: labels learnt into a trained run from masks.
+
+use crate::console::Console;
+use crate::{finish, labelling};
+use std::path::PathBuf;
+
+const EXAMPLES: &str = "\
+Examples:
+  splat4d label runs/take                      from the masks that its capture.json names (docs/labels.md)
+  splat4d label runs/take --from segmented/    from another capture's masks, of the same cameras
+  splat4d render runs/take --channel label -o labels.mp4
+  splat4d edit runs/take --delete 'not label(hand)' -o hand.splat4d
+
+`train` does it at its end where the capture has labels. Shapes, places and colours stay as they are.";
+
+/// Learn what each Gaussian is part of from masks of labels
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub(crate) struct Args {
+    /// The run
+    #[arg(value_name = "RUN")]
+    run: PathBuf,
+    /// The capture whose masks are meant [default: the run's]
+    #[arg(long, value_name = "CAPTURE")]
+    from: Option<PathBuf>,
+    /// Passes over the masks
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=100))]
+    rounds: Option<u16>,
+}
+
+pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
+    labelling::label(&args.run, args.from.as_deref(), args.rounds.map(usize::from), console)?;
+    finish::playback(&args.run, console)?;
+    finish::write_page(&args.run, console)
+}

@@ -1,0 +1,212 @@
+//! Nerfies and HyperNeRF captures (Park et al. 2021): `dataset.json`, `metadata.json`, a camera a picture in `camera/`,
+//! `scene.json`, `points.npy`, and pictures in `rgb/1x` or smaller.
+//!
+//! A camera file holds `orientation` (world to camera, OpenCV axes), `position` (its centre), `focal_length`,
+//! `pixel_aspect_ratio`, `principal_point`, `radial_distortion`, `tangential_distortion` and `image_size` [width, height] of
+//! the pictures at 1x. `scene.json` brings the world to about a unit: x becomes (x − center)·scale, cameras and points alike.
+
+use super::json::{self, Node};
+use super::{CaptureKind, CaptureOptions, Extent, PointCloud, RawFrame, Split, Take, Timing, pose};
+use splat4d::format::npy::Npy;
+use splat4d::math::Se3;
+use splat4d::scene::time::DEFAULT_FPS;
+use splat4d::scene::{Camera, Intrinsics, Lens};
+use splat4d::{Error, Result};
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+/// Marker of the layout, and the file without which it is another's.
+pub(super) const MARKER: &str = "dataset.json";
+const METADATA: &str = "metadata.json";
+/// Folders of pictures, finest first.
+const SCALES: [&str; 5] = ["1x", "2x", "4x", "8x", "16x"];
+/// Endings that pictures have.
+const ENDINGS: [&str; 3] = ["png", "jpg", "jpeg"];
+/// Skew above this bends pictures visibly, and is not modelled, pixels.
+const MOST_SKEW: f64 = 0.5;
+/// Colour of points, which the layout gives none.
+const GREY: f32 = 0.5;
+
+/// Whether a folder with the marker is of this layout.
+pub(super) fn applies(root: &Path) -> bool {
+    root.join(METADATA).is_file() && root.join("camera").is_dir()
+}
+
+/// Similarity from the files' world to the scene's.
+struct Framing {
+    center: [f64; 3],
+    scale: f64,
+}
+
+impl Framing {
+    fn read(root: &Path) -> Result<Self> {
+        let path = root.join("scene.json");
+        if !path.is_file() {
+            return Ok(Self { center: [0.0; 3], scale: 1.0 });
+        }
+        let value = json::read(&path)?;
+        let node = Node::root(&value);
+        let read = || -> Result<Self> {
+            let out = Self { center: node.get("center")?.numbers::<3>()?, scale: node.get("scale")?.number()? };
+            if out.scale > 0.0 { Ok(out) } else { Err(node.get("scale")?.error("the scale is not above 0")) }
+        };
+        read().map_err(|e| e.at(path.display()))
+    }
+
+    fn apply(&self, x: [f64; 3]) -> [f64; 3] {
+        std::array::from_fn(|k| (x[k] - self.center[k]) * self.scale)
+    }
+}
+
+/// Reads a capture.
+pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
+    let fps = options.fps.unwrap_or(DEFAULT_FPS);
+    let value = json::read(marker)?;
+    let top = Node::root(&value);
+    let list = |key: &str| -> Result<Vec<String>> {
+        let names = |n: Node<'_>| n.list()?.iter().map(|n| n.text().map(str::to_owned)).collect();
+        top.opt(key)?.map_or(Ok(Vec::new()), names).map_err(|e: Error| e.at(marker.display()))
+    };
+    let (ids, train, held) = (list("ids")?, list("train_ids")?, list("val_ids")?);
+    let known: BTreeSet<&String> = ids.iter().collect();
+    if let Some(other) = train.iter().chain(&held).find(|id| !known.contains(id)) {
+        return Err(Error::input(format!("\"{other:.80}\" is to be trained or held out, and not among \"ids\""))
+            .at(marker.display())
+            .remedy("List every picture in \"ids\"."));
+    }
+    let framing = Framing::read(root)?;
+    let path = root.join(METADATA);
+    let metadata = json::read(&path)?;
+    let about = Node::root(&metadata);
+    let [for_train, for_held]: [BTreeSet<&String>; 2] = [&train, &held].map(|l| l.iter().collect());
+    let folder = pictures(root)?;
+    let (mut frames, mut cameras) = (Vec::new(), Vec::<u64>::new());
+    let mut left_out = 0;
+    for id in &ids {
+        let split = match (for_train.contains(id), for_held.contains(id)) {
+            (_, true) => Split::Held,
+            (true, false) => Split::Train,
+            (false, false) if train.is_empty() => Split::Train,
+            (false, false) => {
+                left_out += 1;
+                continue;
+            }
+        };
+        let of = |key: &str| -> Result<Option<usize>> {
+            let own = about.get(id).and_then(|n| n.opt(key)?.map(|n| n.count()).transpose());
+            own.map_err(|e| e.at(path.display()))
+        };
+        // Warp codes count moments; later takes say it in so many words.
+        let index = match (of("time_id")?, of("warp_id")?, of("appearance_id")?) {
+            (Some(n), ..) | (_, Some(n), _) | (.., Some(n)) => n,
+            _ => {
+                return Err(Error::input(format!("picture \"{id:.80}\" has no time_id, warp_id or appearance_id"))
+                    .at(path.display())
+                    .remedy("Give each picture the number of its moment."));
+            }
+        };
+        let number = of("camera_id")?.unwrap_or(0) as u64;
+        let camera = cameras.iter().position(|c| *c == number).unwrap_or_else(|| {
+            cameras.push(number);
+            cameras.len() - 1
+        });
+        let file = root.join("camera").join(format!("{id}.json"));
+        let value = json::read(&file)?;
+        let source = camera_of(&Node::root(&value), &framing).map_err(|e| e.at(file.display()))?;
+        let image = ENDINGS.iter().map(|e| folder.join(format!("{id}.{e}"))).find(|p| p.is_file());
+        let image = image.unwrap_or_else(|| folder.join(format!("{id}.png")));
+        let time = index as f64 / fps;
+        frames.push(RawFrame { camera, source, time, index, image, mask: None, flow: None, labels: None, split });
+    }
+    let mut notes =
+        vec![format!("The layout states no frame rate: {fps} pictures a second of each camera are taken for it.")];
+    if left_out > 0 {
+        notes.push(format!("{left_out} pictures are neither trained on nor held out by dataset.json, and left out."));
+    }
+    let named = cameras.len() > 1;
+    Ok(Take {
+        name: None,
+        root: root.to_path_buf(),
+        kind: CaptureKind::Nerfies,
+        cameras: cameras.iter().map(|c| format!("camera{c}")).collect(),
+        frames,
+        take: Extent::default(),
+        named,
+        timing: Timing::Told,
+        hold_out: None,
+        fps,
+        points: points(root, &framing)?,
+        background: None,
+        up: None,
+        labels: Vec::new(),
+        warnings: Vec::new(),
+        notes,
+    })
+}
+
+/// The finest folder of pictures. Errors: there is none.
+fn pictures(root: &Path) -> Result<PathBuf> {
+    let all = SCALES.map(|s| root.join("rgb").join(s));
+    all.into_iter().find(|p| p.is_dir()).ok_or_else(|| {
+        Error::input("there are no pictures: none of 1x, 2x, 4x, 8x and 16x is there")
+            .at(root.join("rgb").display())
+            .remedy("Copy the data set's rgb folder here.")
+    })
+}
+
+fn camera_of(node: &Node<'_>, framing: &Framing) -> Result<Camera> {
+    let rotation = node.get("orientation")?.matrix3()?;
+    let center = framing.apply(node.get("position")?.numbers::<3>()?);
+    let translation = std::array::from_fn(|r| -(0..3).map(|c| rotation[r][c] * center[c]).sum::<f64>());
+    let cam_from_world = pose::checked(Se3 { rotation, translation }).map_err(|e| node.at(e))?;
+    let [width, height] = node.get("image_size")?.numbers::<2>()?;
+    let [cx, cy] = node.get("principal_point")?.numbers::<2>()?;
+    let focal = node.get("focal_length")?.number()?;
+    let aspect = node.opt("pixel_aspect_ratio")?.map_or(Ok(1.0), |n| n.number())?;
+    let skew = node.opt("skew")?.map_or(Ok(0.0), |n| n.number())?;
+    if skew.abs() > MOST_SKEW {
+        return Err(node
+            .error(format!("the pixels are skewed by {skew} px, which is not modelled"))
+            .remedy("Calibrate without skew."));
+    }
+    let numbers = |key: &str| -> Result<Vec<f64>> {
+        node.opt(key)?.map_or(Ok(Vec::new()), |n| n.list()?.iter().map(|n| n.number()).collect())
+    };
+    let (radial, tangential) = (numbers("radial_distortion")?, numbers("tangential_distortion")?);
+    if radial.len() > 3 || tangential.len() > 2 {
+        return Err(node
+            .error("more than three radial or two tangential coefficients")
+            .remedy("Give k1 k2 k3 and p1 p2."));
+    }
+    let at = |list: &[f64], i: usize| list.get(i).copied().unwrap_or(0.0);
+    let k = [at(&radial, 0), at(&radial, 1), at(&radial, 2), 0.0, 0.0, 0.0];
+    let p = [at(&tangential, 0), at(&tangential, 1)];
+    let straight = k.iter().chain(&p).all(|x| *x == 0.0);
+    let lens = if straight { Lens::Pinhole } else { Lens::Brown { k, p, s: [0.0; 4] } };
+    let side = |x: f64| if x >= 1.0 && x.fract() == 0.0 && x < f64::from(u32::MAX) { x as usize } else { 0 };
+    let intrinsics = Intrinsics { fx: focal, fy: focal * aspect, cx, cy };
+    let (width, height) = (side(width), side(height));
+    pose::check_intrinsics(&intrinsics, width, height).map_err(|e| node.at(e))?;
+    Ok(Camera { cam_from_world, intrinsics, lens, width, height, near: Camera::NEAR })
+}
+
+/// `points.npy`, [N, 3] in the files' world.
+fn points(root: &Path, framing: &Framing) -> Result<Option<PointCloud>> {
+    let path = root.join("points.npy");
+    if !path.is_file() {
+        return Ok(None);
+    }
+    let array = Npy::read(&json::read_bytes(&path)?).map_err(|e| e.at(path.display()))?;
+    if array.shape.len() != 2 || array.shape[1] != 3 {
+        return Err(Error::input(format!("the points have shape {:?}, not [N, 3]", array.shape))
+            .at(path.display())
+            .remedy("Delete the file: points are then found in the pictures."));
+    }
+    let mut cloud = PointCloud::default();
+    for x in array.to_f64().chunks_exact(3).filter(|x| x.iter().all(|v| v.is_finite())) {
+        cloud.points.push(framing.apply([x[0], x[1], x[2]]));
+        cloud.colors.push([GREY; 3]);
+        cloud.times.push(None);
+    }
+    Ok((!cloud.points.is_empty()).then_some(cloud))
+}
