@@ -1,4 +1,4 @@
-//! `capture --world NAME FOLDER`: a world whose physics is known, filmed by eight cameras, with the true paths of its nodes
+//! `capture --world NAME [--truth] FOLDER`: a world whose physics is known, filmed by eight cameras, with the true paths of its nodes
 //! and what was done to it.
 
 use crate::camera::Camera;
@@ -31,8 +31,8 @@ const ARC_TARGET: V3 = v3(0.0, 1.0, 0.3);
 /// Sides of a ball's mesh.
 const SIDES: u32 = 32;
 
-/// `--world NAME FOLDER`.
-pub(crate) fn command(name: &str, folder: &Path) -> Result<()> {
+/// `--world NAME FOLDER`; `maps`: with depth, flow and labels of every picture.
+pub(crate) fn command(name: &str, folder: &Path, maps: bool) -> Result<()> {
     let world = World::new(name).map_err(|e| anyhow!("{e}"))?;
     let stage = Stage::load(&crate::capture::bundled_folder().join("characters"))?;
     let cameras = rig();
@@ -42,6 +42,11 @@ pub(crate) fn command(name: &str, folder: &Path) -> Result<()> {
         let pictures: Vec<Vec<u8>> = (cameras.par_iter().zip(&seen))
             .map(|(camera, seen)| shade(stage.textures(), &frame, camera, seen).rgb)
             .collect();
+        if maps {
+            let next = (t + 1 < FRAMES).then(|| scene(&stage, &world, t + 1));
+            (cameras.par_iter().zip(&seen))
+                .try_for_each(|(c, seen)| truth::write_maps(folder, c, seen, t, &frame, next.as_ref()))?;
+        }
         for (camera, rgb) in cameras.iter().zip(&pictures) {
             let file = png(rgb, WIDTH, HEIGHT, ExtendedColorType::Rgb8)?;
             write_file(&folder.join(format!("images/{}/{t:04}.png", camera.name)), &file)?;
@@ -54,12 +59,16 @@ pub(crate) fn command(name: &str, folder: &Path) -> Result<()> {
     }
     write_truth(folder, &world)?;
     let entry = |camera: &Camera| {
-        json!({
+        let mut entry = json!({
             "name": camera.name, "width": WIDTH, "height": HEIGHT,
             "fx": camera.focal, "fy": camera.focal, "cx": 0.5 * WIDTH as f64, "cy": 0.5 * HEIGHT as f64,
             "world_to_camera": camera.matrix(), "images": format!("images/{}/%04d.png", camera.name),
             "start": 0, "frames": FRAMES,
-        })
+        });
+        if maps {
+            truth::list_maps(&mut entry, camera);
+        }
+        entry
     };
     let capture = json!({
         "version": 1, "name": name, "fps": FPS, "up": [0, 1, 0], "points": "points.ply",

@@ -122,7 +122,9 @@ fn finish(raw: RawFrame, downscale: usize) -> Frame {
         index: raw.index,
         image: raw.image,
         mask: raw.mask,
+        depth: raw.depth,
         flow: None,
+        tracks: raw.tracks,
     }
 }
 
@@ -131,7 +133,7 @@ fn flows(frames: &mut [RawFrame]) -> Vec<Option<FlowFile>> {
     let numbers: BTreeMap<(usize, usize), usize> =
         frames.iter().enumerate().map(|(i, f)| ((f.camera, f.index), i)).collect();
     let next = |f: &RawFrame| numbers.get(&(f.camera, f.index + 1)).copied();
-    frames.iter_mut().map(|f| Some(FlowFile { to: next(f)?, path: f.flow.take()? })).collect()
+    frames.iter_mut().map(|f| Some(FlowFile { to: next(f)?, path: f.flow.take()?, of_view: false })).collect()
 }
 
 fn check_frame(frame: &mut RawFrame, camera: &str, options: &CaptureOptions) -> Result<()> {
@@ -147,7 +149,12 @@ fn check_frame(frame: &mut RawFrame, camera: &str, options: &CaptureOptions) -> 
             format!("nothing of a {}x{} image is left at downscale {}", source.width, source.height, options.downscale);
         return Err(place(Error::input(what).remedy("Choose a smaller downscale.")));
     }
-    let files = [("picture", Some(&frame.image)), ("mask", frame.mask.as_ref()), ("flow", frame.flow.as_ref())];
+    let files = [
+        ("picture", Some(&frame.image)),
+        ("mask", frame.mask.as_ref()),
+        ("depth", frame.depth.as_ref().map(|d| &d.path)),
+        ("flow", frame.flow.as_ref()),
+    ];
     for (what, file) in files.into_iter().filter_map(|(what, file)| Some((what, file?))) {
         if !file.is_file() {
             return Err(Error::input(format!("the {what} of camera {camera}, frame {} is missing", frame.index))

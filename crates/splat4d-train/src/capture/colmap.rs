@@ -50,7 +50,9 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
             index,
             image: base.join(name),
             mask: mask_of(root, name),
+            depth: None,
             flow: None,
+            tracks: None,
             split: Split::Train,
         })
         .collect();

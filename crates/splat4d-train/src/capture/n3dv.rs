@@ -59,7 +59,9 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
                 index,
                 image: image.clone(),
                 mask: None,
+                depth: None,
                 flow: None,
+                tracks: None,
                 split: if camera == 0 && rows > 1 { Split::Held } else { Split::Train },
             });
         }

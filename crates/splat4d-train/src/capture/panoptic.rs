@@ -81,7 +81,18 @@ fn read_meta(root: &Path, top: &Node<'_>, split: Split, fps: f64, out: &mut Vec<
             };
             let mask = Some(root.join(mask)).filter(|m| m.is_file());
             let image = root.join("ims").join(name);
-            let raw = RawFrame { camera: 0, source, time: t as f64 / fps, index: t, image, mask, flow: None, split };
+            let raw = RawFrame {
+                camera: 0,
+                source,
+                time: t as f64 / fps,
+                index: t,
+                image,
+                mask,
+                depth: None,
+                flow: None,
+                tracks: None,
+                split,
+            };
             out.push((ids[c].count()?, raw));
         }
     }

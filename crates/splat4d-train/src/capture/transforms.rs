@@ -60,7 +60,9 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         index,
         image: entry.image,
         mask: entry.mask,
+        depth: entry.depth,
         flow: None,
+        tracks: None,
         split: entry.split,
     };
     let frames: Vec<RawFrame> = entries.into_iter().zip(places).map(frame).collect();

@@ -168,7 +168,9 @@ fn capture(pinned: &Pinned, root: &Path, pictures: &[PathBuf], count: usize) -> 
             time,
             index: i,
             image,
+            depth: None,
             flow: None,
+            tracks: None,
             mask: None,
         }
     };
