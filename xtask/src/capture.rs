@@ -34,7 +34,7 @@ const JPEG_QUALITY: u8 = 60;
 const TRUTH_CAMERAS: [usize; 4] = [2, 8, 11, 17];
 const TRUTH_FRAMES: [usize; 4] = [3, 10, 17, 24];
 
-/// `capture [FOLDER]`, `capture --check [N]`, `capture --still CHARACTER.glb FOLDER ...`, `capture --videos FOLDER`,
+/// `capture [FOLDER]`, `capture --truth FOLDER`, `capture --check [N]`, `capture --still CHARACTER.glb FOLDER ...`, `capture --videos FOLDER`,
 /// `capture --world NAME FOLDER` and `capture --long SECONDS FOLDER`.
 pub(crate) fn command(arguments: &[String]) -> Result<()> {
     let home = bundled_folder();
@@ -50,13 +50,17 @@ pub(crate) fn command(arguments: &[String]) -> Result<()> {
             check(&home, &picks.map(|p| (p % CAMERAS, p / CAMERAS)).collect::<Vec<_>>())
         }
         [flag, rest @ ..] if flag == "--still" => crate::still::command(rest),
-        [flag, name, folder] if flag == "--world" => crate::world::command(name, Path::new(folder)),
+        [flag, name, folder] if flag == "--world" => crate::world::command(name, Path::new(folder), false),
+        [flag, name, truth, folder] if flag == "--world" && truth == "--truth" => {
+            crate::world::command(name, Path::new(folder), true)
+        }
+        [flag, folder] if flag == "--truth" && !folder.starts_with('-') => write(&home, Path::new(folder), true),
         [flag, seconds, folder] if flag == "--long" => crate::long::command(seconds, Path::new(folder)),
         [flag, folder] if flag == "--videos" => crate::videos::command(Path::new(folder)),
-        [] => write(&home, &home),
-        [folder] if !folder.starts_with('-') => write(&home, Path::new(folder)),
+        [] => write(&home, &home, false),
+        [folder] if !folder.starts_with('-') => write(&home, Path::new(folder), false),
         _ => bail!(
-            "capture takes a folder, --check with a number, --still with a character and a folder, --videos with a folder, --world with a name and a folder, or --long with seconds and a folder"
+            "capture takes a folder, --truth with a folder, --check with a number, --still with a character and a folder, --videos with a folder, --world with a name, --truth if it is wanted, and a folder, or --long with seconds and a folder"
         ),
     }
 }
@@ -88,7 +92,8 @@ struct View {
     tracks_seen: Vec<u8>,
 }
 
-fn write(home: &Path, folder: &Path) -> Result<()> {
+/// Draws the capture; `maps`: with depth, flow and labels of every picture.
+fn write(home: &Path, folder: &Path, maps: bool) -> Result<()> {
     let start = std::time::Instant::now();
     let stage = Stage::load(&home.join("characters"))?;
     let cameras = rig();
@@ -98,7 +103,7 @@ fn write(home: &Path, folder: &Path) -> Result<()> {
     drop((first, seen));
     let per_frame = |t: usize| -> Result<(Vec<View>, Vec<V3>)> {
         let frame = stage.frame(t)?;
-        let next = TRUTH_FRAMES.contains(&t).then(|| stage.frame(t + 1)).transpose()?;
+        let next = (TRUTH_FRAMES.contains(&t) || maps && t + 1 < FRAMES).then(|| stage.frame(t + 1)).transpose()?;
         let points = truth::track_points(&frame.mesh, &tracked);
         let seen: Vec<Visibility> = cameras.par_iter().map(|camera| rasterize(&frame.mesh, camera)).collect();
         let views = (cameras.par_iter().enumerate()).map(|(c, camera)| -> Result<View> {
@@ -106,7 +111,10 @@ fn write(home: &Path, folder: &Path) -> Result<()> {
             let (jpeg, mask) = encode(&picture.rgb, &picture.mask)?;
             write_file(&folder.join(picture_path(camera, t)), &jpeg)?;
             write_file(&folder.join(mask_path(camera, t)), &mask)?;
-            if let (Some(next), true) = (&next, TRUTH_CAMERAS.contains(&c)) {
+            if maps {
+                truth::write_maps(folder, camera, &seen[c], t, &frame, next.as_ref())?;
+            }
+            if let (Some(next), true) = (&next, TRUTH_CAMERAS.contains(&c) && TRUTH_FRAMES.contains(&t)) {
                 write_truth(folder, camera, &seen[c], t, &frame, next)?;
             }
             let tracks_seen = truth::seen_points(camera, &seen[c], &points);
@@ -123,7 +131,7 @@ fn write(home: &Path, folder: &Path) -> Result<()> {
     // One frame after the other bounds the memory; the cameras of a frame keep all threads busy.
     let frames = (0..FRAMES).map(per_frame).collect::<Result<Vec<_>>>()?;
     write_tracks(folder, &frames)?;
-    write_file(&folder.join("capture.json"), &description(&cameras)?)?;
+    write_file(&folder.join("capture.json"), &description(&cameras, maps)?)?;
     report(&frames);
     println!("drawn in {:.0} s", start.elapsed().as_secs_f64());
     Ok(())
@@ -195,16 +203,20 @@ fn write_tracks(folder: &Path, frames: &[(Vec<View>, Vec<V3>)]) -> Result<()> {
     write_file(&folder.join("truth/tracks_visible.npy"), &seen)
 }
 
-fn description(cameras: &[Camera]) -> Result<Vec<u8>> {
+fn description(cameras: &[Camera], maps: bool) -> Result<Vec<u8>> {
     let entry = |camera: &Camera| {
-        json!({
+        let mut entry = json!({
             "name": camera.name, "width": WIDTH, "height": HEIGHT,
             "fx": camera.focal, "fy": camera.focal, "cx": 0.5 * WIDTH as f64, "cy": 0.5 * HEIGHT as f64,
             "world_to_camera": camera.matrix(), "time_offset": 0,
             "images": format!("images/{}/%04d.jpg", camera.name),
             "masks": format!("masks/{}/%04d.png", camera.name),
             "start": 0, "frames": FRAMES,
-        })
+        });
+        if maps {
+            truth::list_maps(&mut entry, camera);
+        }
+        entry
     };
     let capture = json!({
         "version": 1, "name": "knight", "fps": FPS, "up": [0, 1, 0],

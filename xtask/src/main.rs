@@ -33,15 +33,16 @@ usage: cargo run --release -p xtask -- CHORE
 
 chores:
   capture [FOLDER]           draws the bundled capture into FOLDER (default: examples/knight)
+  capture --truth FOLDER     the same with depth, flow and labels (integer PNG) of every picture: some 80 MB
   capture --check [N]        draws N random pictures (default 3) and compares them with examples/knight byte for byte
   capture --still CHARACTER.glb FOLDER [--views N] [--size PIXELS] [--pose CLIP SECONDS] [--drop NODE...]
                              draws a character frozen in one pose, cut out, from N (default 100) cameras on a
                              hemisphere, PIXELS (default 400) wide and high; every 8th is held out
   capture --videos FOLDER    draws the scene as eight unsynchronised, uncalibrated, differently exposed videos with sound,
                              for `splat4d import`, and truth.json beside them
-  capture --world NAME FOLDER
+  capture --world NAME [--truth] FOLDER
                              draws a world of known physics for `splat4d predict`: pendulum, circle, pushed-block, bounce,
-                             rolling, collision or cloth; true paths of its nodes and actions beside it
+                             rolling, collision or cloth; true paths of its nodes and actions beside it, with --truth also depth, flow and labels
   capture --long SECONDS FOLDER
                              draws a take of any length: twenty cameras, 30 frames a second, 200x150, a frame in memory at a time
   strip-character IN.glb OUT.glb CLIP... [--drop NODE...]

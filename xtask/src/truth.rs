@@ -1,11 +1,16 @@
 //! Ground truth: depth and optical flow of a few views, vertex tracks with visibility, and a sparse cloud.
 
 use crate::camera::Camera;
+use crate::files::{png, write_file};
 use crate::mesh::Mesh;
 use crate::picture::{EdgeCache, point_at, surface};
 use crate::raster::{NOTHING, SUPERSAMPLING, Visibility, sample_ray};
 use crate::scene::Frame;
 use crate::vector::{V3, hash01};
+use anyhow::Result;
+use image::ExtendedColorType;
+use serde_json::json;
+use std::path::Path;
 
 /// Depth codes per scene unit in the 16-bit pictures; code 0 means "nothing".
 pub(crate) const DEPTH_SCALE: f64 = 2048.0;
@@ -21,6 +26,35 @@ const CLOUD_POINTS: usize = 3000;
 const CLOUD_NOISE: f64 = 0.005;
 /// Cameras that must see a point of the cloud or of a track in the first frame.
 const CLOUD_VIEWS: usize = 3;
+
+/// Writes `depth/CAM/FRAME.png`, `labels/CAM/FRAME.png` and, where there is a next frame, `flow/CAM/FRAME.png`.
+pub(crate) fn write_maps(
+    folder: &Path,
+    camera: &Camera,
+    seen: &Visibility,
+    t: usize,
+    frame: &Frame,
+    next: Option<&Frame>,
+) -> Result<()> {
+    let bytes = |codes: Vec<u16>| -> Vec<u8> { codes.iter().flat_map(|c| c.to_ne_bytes()).collect() };
+    let save = |kind: &str, data: &[u8], color: ExtendedColorType| {
+        let file = png(data, camera.width, camera.height, color)?;
+        write_file(&folder.join(format!("{kind}/{}/{t:04}.png", camera.name)), &file)
+    };
+    save("depth", &bytes(depth(camera, seen, frame)), ExtendedColorType::L16)?;
+    save("labels", &labels(camera, seen, frame), ExtendedColorType::L8)?;
+    match next {
+        Some(next) => save("flow", &bytes(flow(camera, seen, frame, next)), ExtendedColorType::Rgb16),
+        None => Ok(()),
+    }
+}
+
+/// Adds what [`write_maps`] wrote to a camera's entry of `capture.json`. Labels are not listed.
+pub(crate) fn list_maps(entry: &mut serde_json::Value, camera: &Camera) {
+    entry["depth"] = json!(format!("depth/{}/%04d.png", camera.name));
+    entry["depth_scale"] = json!(1.0 / DEPTH_SCALE);
+    entry["flow"] = json!(format!("flow/{}/%04d.png", camera.name));
+}
 
 /// Depth (z in camera axes) at pixel centres, one code per pixel.
 pub(crate) fn depth(camera: &Camera, seen: &Visibility, frame: &Frame) -> Vec<u16> {
@@ -170,7 +204,6 @@ mod tests {
     use crate::raster::rasterize;
     use crate::scene::Stage;
     use crate::vector::v3;
-    use std::path::Path;
 
     #[test]
     fn flow_and_depth_agree_with_the_tracks() {

@@ -1,5 +1,5 @@
-//! `capture --world NAME FOLDER`: a world whose physics is known, filmed by eight cameras, with the true paths of its nodes
-//! what was done to it, and masks that say which body a pixel shows.
+//! `capture --world NAME [--truth] FOLDER`: a world whose physics is known, filmed by eight cameras, with the true paths of its
+//! nodes, what was done to it, and masks that say which body a pixel shows.
 
 use crate::camera::Camera;
 use crate::files::{png, write_file};
@@ -31,8 +31,8 @@ const ARC_TARGET: V3 = v3(0.0, 1.0, 0.3);
 /// Sides of a ball's mesh.
 const SIDES: u32 = 32;
 
-/// `--world NAME FOLDER`.
-pub(crate) fn command(name: &str, folder: &Path) -> Result<()> {
+/// `--world NAME FOLDER`; `maps`: with depth, flow and labels of every picture.
+pub(crate) fn command(name: &str, folder: &Path, maps: bool) -> Result<()> {
     let world = World::new(name).map_err(|e| anyhow!("{e}"))?;
     let stage = Stage::load(&crate::capture::bundled_folder().join("characters"))?;
     let cameras = rig();
@@ -42,11 +42,16 @@ pub(crate) fn command(name: &str, folder: &Path) -> Result<()> {
         let pictures: Vec<Vec<u8>> = (cameras.par_iter().zip(&seen))
             .map(|(camera, seen)| shade(stage.textures(), &frame, camera, seen).rgb)
             .collect();
+        if maps {
+            let next = (t + 1 < FRAMES).then(|| scene(&stage, &world, t + 1));
+            (cameras.par_iter().zip(&seen))
+                .try_for_each(|(c, seen)| truth::write_maps(folder, c, seen, t, &frame, next.as_ref()))?;
+        }
         for (camera, rgb) in cameras.iter().zip(&pictures) {
             let file = png(rgb, WIDTH, HEIGHT, ExtendedColorType::Rgb8)?;
             write_file(&folder.join(format!("images/{}/{t:04}.png", camera.name)), &file)?;
         }
-        for (camera, seen) in cameras.iter().zip(&seen) {
+        for (camera, seen) in cameras.iter().zip(&seen).filter(|_| !maps) {
             let labels = truth::labels(camera, seen, &frame);
             let file = png(&labels, WIDTH, HEIGHT, ExtendedColorType::L8)?;
             write_file(&folder.join(format!("labels/{}/{t:04}.png", camera.name)), &file)?;
@@ -59,13 +64,17 @@ pub(crate) fn command(name: &str, folder: &Path) -> Result<()> {
     }
     write_truth(folder, &world)?;
     let entry = |camera: &Camera| {
-        json!({
+        let mut entry = json!({
             "name": camera.name, "width": WIDTH, "height": HEIGHT,
             "fx": camera.focal, "fy": camera.focal, "cx": 0.5 * WIDTH as f64, "cy": 0.5 * HEIGHT as f64,
             "world_to_camera": camera.matrix(), "images": format!("images/{}/%04d.png", camera.name),
             "labels": format!("labels/{}/%04d.png", camera.name),
             "start": 0, "frames": FRAMES,
-        })
+        });
+        if maps {
+            truth::list_maps(&mut entry, camera);
+        }
+        entry
     };
     let body = |(i, body): (usize, &Body)| {
         let shape = match body.shape {

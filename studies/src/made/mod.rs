@@ -19,7 +19,12 @@ use std::path::Path;
 use world::{Pinhole, V3};
 
 /// The generator's version: drawings of another are drawn anew.
-pub(crate) const VERSION: usize = 1;
+pub(crate) const VERSION: usize = 2;
+/// Codes of depth a world unit, in pictures of 16 bits: depths to 16 units.
+const DEPTH_CODES: f64 = 4096.0;
+/// Codes of flow a pixel, and the code of none (KITTI 2012).
+const FLOW_CODES: f64 = 64.0;
+const FLOW_ZERO: f64 = 32768.0;
 /// Seed of the points.
 const SEED: u64 = 18;
 /// Points of a cloud.
@@ -49,9 +54,42 @@ pub(crate) fn write(name: &str, folder: &Path) -> anyhow::Result<()> {
         PngEncoder::new(&mut png).write_image(&pixels, width, height, ExtendedColorType::Rgb8)?;
         Ok(files::write(&folder.join(images(c)).join(format!("{m:04}.png")), &png)?)
     })?;
+    if scene.truth {
+        write_truth(&scene, folder)?;
+    }
     files::write(&folder.join("points.ply"), &ply(&cloud(&scene), scene.units))?;
     let text = serde_json::to_string_pretty(&description(name, &scene)).context("plain data is JSON")?;
     Ok(files::write(&folder.join("capture.json"), (text + "\n").as_bytes())?)
+}
+
+/// Depth and flow of the pictures to train on. Flow lies in `truth/`: it is measured with, not listed.
+fn write_truth(scene: &Scene, folder: &Path) -> anyhow::Result<()> {
+    let training = scene.viewers.iter().enumerate().filter(|(_, v)| !v.held);
+    for (c, viewer) in training {
+        let [depths, flows] = [depth_maps(c), format!("truth/flow/cam{c:02}")].map(|name| folder.join(name));
+        files::make_folder(&depths)?;
+        files::make_folder(&flows)?;
+        (0..scene.moments).into_par_iter().try_for_each(|m| -> anyhow::Result<()> {
+            let (camera, at) = (viewer.at(m), share(m, scene.moments));
+            let save = |path: std::path::PathBuf, codes: Vec<u16>, color: ExtendedColorType| -> anyhow::Result<()> {
+                let bytes: Vec<u8> = codes.iter().flat_map(|c| c.to_ne_bytes()).collect();
+                let [width, height] = camera.size.map(|s| s as u32);
+                let mut png = Vec::new();
+                PngEncoder::new(&mut png).write_image(&bytes, width, height, color)?;
+                Ok(files::write(&path, &png)?)
+            };
+            let codes = camera.depth(&scene.world, at).iter().map(|z| (z * DEPTH_CODES).round() as u16).collect();
+            save(depths.join(format!("{m:04}.png")), codes, ExtendedColorType::L16)?;
+            if m + 1 == scene.moments {
+                return Ok(());
+            }
+            let ways = camera.flow(&scene.world, [at, share(m + 1, scene.moments)], viewer.at(m + 1));
+            let code = |v: f64| (v * FLOW_CODES + FLOW_ZERO).round() as u16;
+            let codes = ways.iter().flat_map(|w| w.map_or([0; 3], |[u, v]| [code(u), code(v), 1])).collect();
+            save(flows.join(format!("{m:04}.png")), codes, ExtendedColorType::Rgb16)
+        })?;
+    }
+    Ok(())
 }
 
 /// The error of a name that nothing has.
@@ -62,6 +100,10 @@ pub(crate) fn unknown(name: &str) -> Error {
 
 fn images(camera: usize) -> String {
     format!("images/cam{camera:02}")
+}
+
+fn depth_maps(camera: usize) -> String {
+    format!("depth/cam{camera:02}")
 }
 
 /// The share of the take at a moment.
@@ -81,13 +123,18 @@ fn description(name: &str, scene: &Scene) -> Value {
     let camera = |(c, viewer): (usize, &Viewer)| {
         let first = viewer.at(0);
         let poses: Vec<_> = viewer.poses.iter().map(|p| matrix(p, viewer.wrong)).collect();
-        json!({
+        let mut entry = json!({
             "name": format!("cam{c:02}"), "width": first.size[0], "height": first.size[1],
             "fx": first.focal, "fy": first.focal,
             "cx": 0.5 * first.size[0] as f64, "cy": 0.5 * first.size[1] as f64,
             "world_to_camera": if poses.len() == 1 { json!(poses[0]) } else { json!(poses) },
             "images": format!("{}/%04d.png", images(c)), "frames": scene.moments,
-        })
+        });
+        if scene.truth && !viewer.held {
+            entry["depth"] = json!(format!("{}/%04d.png", depth_maps(c)));
+            entry["depth_scale"] = json!(scene.units / DEPTH_CODES);
+        }
+        entry
     };
     let held: Vec<String> =
         scene.viewers.iter().enumerate().filter(|(_, v)| v.held).map(|(c, _)| format!("cam{c:02}")).collect();

@@ -64,6 +64,8 @@ pub(crate) struct Scene {
     pub units: f64,
     /// Whether points of moving things belong to the cloud.
     pub moving_points: bool,
+    /// Whether depth and flow of the pictures to train on are written beside them.
+    pub truth: bool,
 }
 
 /// Names of the made-up captures, each with what is hard about it.
@@ -90,6 +92,7 @@ pub(crate) fn scene(name: &str) -> Option<Scene> {
         fps: 10.0,
         units: 1.0,
         moving_points: true,
+        truth: false,
     };
     let scene = match name {
         "far-background" => Scene { world: outdoors(), ..room() },
@@ -239,5 +242,5 @@ fn hand_held(moments: usize) -> Scene {
     let world = World { things: vec![floor(20.0), back_wall(), ball()] };
     // Both takes last the same time.
     let fps = (moments - 1) as f64 / 1.1;
-    Scene { world, viewers: vec![path, fixed], moments, fps, units: 1.0, moving_points: false }
+    Scene { world, viewers: vec![path, fixed], moments, fps, units: 1.0, moving_points: false, truth: true }
 }

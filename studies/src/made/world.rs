@@ -7,6 +7,8 @@ use splat4d::math::{Rng, Se3};
 
 /// A place, a direction or a colour.
 pub(crate) type V3 = [f64; 3];
+/// A place in a picture, pixels.
+pub(crate) type V2 = [f64; 2];
 
 /// Rays a pixel in each direction: their mean is the pixel.
 const SAMPLES: usize = 2;
@@ -166,6 +168,14 @@ pub(crate) struct Seen {
     pub thing: usize,
 }
 
+impl World {
+    /// Where the point of a thing that was seen at a share of the take is at another one.
+    pub(crate) fn later(&self, seen: &Seen, at: f64, then: f64) -> V3 {
+        let place = self.things[seen.thing].place;
+        add(sub(seen.point, place(at)), place(then))
+    }
+}
+
 /// Everything that is there.
 #[derive(Clone, Debug)]
 pub(crate) struct World {
@@ -240,6 +250,31 @@ impl Pinhole {
             }
         }
         out
+    }
+
+    /// Depth along the camera's axis at the pixels' centres, world units; 0 where nothing is.
+    pub(crate) fn depth(&self, world: &World, at: f64) -> Vec<f64> {
+        let eye = self.center();
+        let seen = |ray: V3| world.look(eye, ray, at).map_or(0.0, |s| self.cam_from_world.apply(s.point)[2]);
+        self.pixels().map(|place| seen(self.ray(place))).collect()
+    }
+
+    /// Where what the pixels' centres show goes by another time as another camera sees it, pixels; `None`: behind that.
+    pub(crate) fn flow(&self, world: &World, [at, then]: [f64; 2], to: &Self) -> Vec<Option<[f64; 2]>> {
+        let eye = self.center();
+        let way = |place: V2| {
+            let seen = world.look(eye, self.ray(place), at)?;
+            let p = to.cam_from_world.apply(world.later(&seen, at, then));
+            let arrives = |k: usize| to.focal * p[k] / p[2] + 0.5 * to.size[k] as f64;
+            (p[2] > 0.0).then(|| [arrives(0) - place[0], arrives(1) - place[1]])
+        };
+        self.pixels().map(way).collect()
+    }
+
+    /// Centres of the pixels, row by row.
+    fn pixels(&self) -> impl Iterator<Item = V2> + '_ {
+        let [width, height] = self.size;
+        (0..width * height).map(move |p| [(p % width) as f64 + 0.5, (p / width) as f64 + 0.5])
     }
 
     /// This camera, turned about its own vertical by an angle: what a wrong calibration writes.

@@ -15,7 +15,7 @@ use splat4d::layers::{Head, Scene};
 use splat4d::math::sh::degree_of;
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{GEOMETRY, SH};
-use splat4d_train::capture::{Capture, Severity, Timing};
+use splat4d_train::capture::{Capture, Frame, Reach, Severity, Timing};
 use splat4d_train::event::Event;
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::chunks::Outlook;
@@ -133,7 +133,15 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
     for assignment in &args.set {
         recipe.set(assignment).map_err(|e| e.at("--set"))?;
     }
-    let capture = open_capture(path, &recipe)?;
+    // What lies beside pictures is told also where this recipe would not look at it.
+    let all = recipe.clone().with(|r| (r.loss.depth, r.loss.flow, r.loss.tracks) = (1.0, 1.0, 1.0));
+    let mut capture = open_capture(path, &all)?;
+    let priors = priors(&capture);
+    for frame in &mut capture.frames {
+        frame.depth = frame.depth.take().filter(|_| recipe.loss.depth > 0.0);
+        frame.flow = frame.flow.take().filter(|_| recipe.loss.flow > 0.0);
+        frame.tracks = frame.tracks.take().filter(|_| recipe.loss.tracks > 0.0);
+    }
     if args.doctor {
         return doctor::of(&capture, &args.output, console);
     }
@@ -179,6 +187,13 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
     line(&mut text, "masks", &format!("{masks} of {}", capture.frames.len()));
     let points = capture.points.as_ref().map_or("none".into(), |p| grouped(p.points.len()));
     line(&mut text, "initial points", &points);
+    if !priors.is_empty() {
+        line(&mut text, "beside pictures", &priors.join(", "));
+    }
+    let reach = capture.reach();
+    if let Some(reach) = &reach {
+        line(&mut text, "views hold", &in_words(reach));
+    }
     line(&mut text, "memory", &format!("about {} with the default recipe", human_bytes(memory)));
     if let Some(outlook) = &outlook {
         line(&mut text, "training", &chunked::in_words(outlook));
@@ -197,12 +212,35 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
         "timing": format!("{:?}", capture.timing).to_lowercase(),
         "train": capture.train.len(), "held_out": capture.held.len(), "validation": capture.validation.len(),
         "held_out_cameras": held, "masks": masks, "points": capture.points.as_ref().map(|p| p.points.len()),
+        "priors": priors, "views_hold": reach.map(|r| json!({"center": r.center, "degrees": r.degrees,
+            "distances": r.distances, "held_out_cameras": r.held[0], "held_out_cameras_beyond": r.held[1]})),
         "memory_estimate": memory, "chunks": outlook.as_ref().map(|o| o.plan.len()),
         "training_seconds": outlook.as_ref().and_then(|o| o.seconds),
         "findings": findings.iter().map(|f| json!({"severity": format!("{:?}", f.severity).to_lowercase(),
             "what": f.what, "remedy": f.remedy})).collect::<Vec<_>>(),
     });
     Ok(Told { json, text, troubles })
+}
+
+/// What lies beside the pictures, in words.
+fn priors(capture: &Capture) -> Vec<String> {
+    let count = |has: fn(&Frame) -> bool| capture.frames.iter().filter(|f| has(f)).count();
+    let kinds: [(&str, fn(&Frame) -> bool); 3] =
+        [("depth", |f| f.depth.is_some()), ("flow", Frame::has_flow), ("tracks", |f| f.tracks.is_some())];
+    let told = kinds.map(|(name, has)| (name, count(has)));
+    told.iter().filter(|(_, n)| *n > 0).map(|(name, n)| format!("{name} of {}", grouped(*n))).collect()
+}
+
+fn in_words(reach: &Reach) -> String {
+    let [x, y, z] = reach.center;
+    let mut out = format!(
+        "to about {:.0}° from a training camera, seen from ({x:.2}, {y:.2}, {z:.2}), {:.2} to {:.2} units from there",
+        reach.degrees, reach.distances[0], reach.distances[1]
+    );
+    if reach.held[1] > 0 {
+        let _ = write!(out, "; of {} held-out cameras {} stand farther away", reach.held[0], reach.held[1]);
+    }
+    out
 }
 
 fn sizes(capture: &Capture) -> Vec<[usize; 2]> {

@@ -7,7 +7,6 @@
 pub mod adjust;
 pub(crate) mod algebra;
 pub mod align;
-mod flow;
 pub mod known;
 pub mod lens;
 pub mod mapper;

@@ -1,6 +1,5 @@
 //! What cameras see, as features: of what stands still on the median picture, of what moves at moments that all share.
 
-use super::flow::{Pyramid, surely};
 use super::known::Known;
 use super::overlay::Shown;
 use crate::{Error, Result};
@@ -9,6 +8,7 @@ use splat4d::math::Se3;
 use splat4d::scene::Planes;
 use splat4d_train::event::Progress;
 use splat4d_train::vision::features::{self, Limits, NUMBERS};
+use splat4d_train::vision::flow::{Pyramid, surely};
 use splat4d_train::vision::raster::{blurred, grey};
 
 /// Pictures of cameras, by number.

@@ -123,8 +123,10 @@ fn finish(raw: RawFrame, downscale: usize) -> Frame {
         index: raw.index,
         image: raw.image,
         mask: raw.mask,
+        depth: raw.depth,
         flow: None,
         labels: raw.labels,
+        tracks: raw.tracks,
     }
 }
 
@@ -133,7 +135,7 @@ fn flows(frames: &mut [RawFrame]) -> Vec<Option<FlowFile>> {
     let numbers: BTreeMap<(usize, usize), usize> =
         frames.iter().enumerate().map(|(i, f)| ((f.camera, f.index), i)).collect();
     let next = |f: &RawFrame| numbers.get(&(f.camera, f.index + 1)).copied();
-    frames.iter_mut().map(|f| Some(FlowFile { to: next(f)?, path: f.flow.take()? })).collect()
+    frames.iter_mut().map(|f| Some(FlowFile { to: next(f)?, path: f.flow.take()?, of_view: false })).collect()
 }
 
 fn check_frame(frame: &mut RawFrame, camera: &str, options: &CaptureOptions) -> Result<()> {
@@ -152,6 +154,7 @@ fn check_frame(frame: &mut RawFrame, camera: &str, options: &CaptureOptions) -> 
     let files = [
         ("picture", Some(&frame.image)),
         ("mask", frame.mask.as_ref()),
+        ("depth", frame.depth.as_ref().map(|d| &d.path)),
         ("flow", frame.flow.as_ref()),
         ("mask of labels", frame.labels.as_ref()),
     ];

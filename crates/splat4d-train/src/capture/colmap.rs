@@ -50,8 +50,10 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
             index,
             image: base.join(name),
             mask: mask_of(root, name),
+            depth: None,
             flow: None,
             labels: None,
+            tracks: None,
             split: Split::Train,
         })
         .collect();

@@ -1,6 +1,8 @@
 //! Posed pictures by number, the input of initialisation and training. Captures on disk and made-up ones in tests both
 //! serve.
 
+use super::depth::{self, DepthKind};
+use super::tracks::Tracks;
 use crate::Result;
 use splat4d::scene::{Camera, Planes, Time};
 
@@ -13,8 +15,42 @@ pub struct Picture {
     pub mask: Option<Planes<f32>>,
     /// 1 channel, 0 = a pixel that the lens never filled and that must not count.
     pub weight: Option<Planes<f32>>,
+    /// How far away what it shows is, as far as that is known.
+    pub depth: Option<Depth>,
     /// Where its pixels go, as far as that is known.
     pub flow: Option<Flow>,
+}
+
+/// Known depth of a picture, as a loss sees it.
+#[derive(Clone, Copy, Debug)]
+pub struct DepthTruth<'a, F = f32> {
+    /// [1, h, w]; 0: not known.
+    pub values: &'a Planes<F>,
+    /// What they are.
+    pub kind: DepthKind,
+}
+
+/// Known depth of a picture.
+#[derive(Clone, Debug)]
+pub struct Depth {
+    /// [1, h, w]; 0: not known.
+    pub values: Planes<f32>,
+    /// What they are.
+    pub kind: DepthKind,
+}
+
+impl Depth {
+    /// As losses take it.
+    pub(crate) fn truth(&self) -> DepthTruth<'_> {
+        DepthTruth { values: &self.values, kind: self.kind }
+    }
+
+    /// Where four pixels show one surface.
+    fn halve(&mut self) {
+        let map = &mut self.values;
+        map.data = depth::reduce(&map.data, map.width, map.height, 2);
+        (map.width, map.height) = (map.width / 2, map.height / 2);
+    }
 }
 
 /// Known optical flow of a picture, as a loss sees it.
@@ -26,6 +62,17 @@ pub struct FlowTruth<'a, F = f32> {
     pub camera: &'a Camera,
     /// [3, h, w]: u right, v down in pixels, and 1 where they are known.
     pub vectors: &'a Planes<F>,
+}
+
+/// The tracks of a frame's camera.
+#[derive(Clone, Copy, Debug)]
+pub struct Tracked<'a> {
+    /// All of them.
+    pub tracks: &'a Tracks,
+    /// The frame's number in the take.
+    pub frame: usize,
+    /// The camera of the picture file, in whose pixels they are.
+    pub source: &'a Camera,
 }
 
 /// Known optical flow of a picture.
@@ -60,6 +107,7 @@ impl Picture {
         halve(&mut self.color);
         self.mask.as_mut().map(halve);
         self.weight.as_mut().map(halve);
+        self.depth.as_mut().map(Depth::halve);
         self.flow.as_mut().map(Flow::halve);
     }
 }
@@ -101,6 +149,14 @@ pub trait Frames: Send + Sync {
     /// Whether frames have foreground masks.
     fn has_masks(&self) -> bool {
         false
+    }
+    /// Whether frames have metric depth maps.
+    fn has_depth(&self) -> bool {
+        false
+    }
+    /// The tracks of the camera of frame i.
+    fn tracked(&self, _i: usize) -> Option<Tracked<'_>> {
+        None
     }
     /// Reads frame i.
     fn load(&self, i: usize, out: &mut Picture) -> Result<()>;

@@ -10,6 +10,8 @@ mod assemble;
 mod beside;
 mod colmap;
 mod colmap_files;
+mod depth;
+mod exr;
 pub(crate) mod flow;
 pub mod frames;
 mod json;
@@ -31,23 +33,27 @@ mod rgb8;
 mod rig;
 mod sequence;
 mod store;
+mod tracks;
 mod transforms;
 
-pub(crate) use flow::FlowFile;
+pub use depth::{DepthFile, DepthKind};
+pub(crate) use flow::{FlowFile, to_picture as flow_picture};
 pub use lens::Distortion;
-pub use options::{CaptureOptions, CaptureSettings, HoldOut, MAX_POINTS, Sequence};
+pub use options::{CaptureOptions, CaptureSettings, FlowSource, HoldOut, MAX_POINTS, Sequence};
 pub use points::PointCloud;
 pub use posed::{PosedCamera, check_intrinsics, colmap_cameras, is_colmap, rigid, transforms_cameras};
-pub use preflight::{Finding, Severity};
+pub use preflight::{Finding, Reach, Severity};
 pub use rgb8::Rgb8;
 pub use sequence::Timing;
 pub use store::{ImageStore, Picture, StoredPicture};
+pub use tracks::Tracks;
 
 use splat4d::Result;
 use splat4d::math::se3::{norm, sub};
 use splat4d::scene::{Camera, Time};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// Which layout a capture was read from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -87,10 +93,21 @@ pub struct Frame {
     pub image: PathBuf,
     /// The foreground mask file (white = foreground).
     pub mask: Option<PathBuf>,
+    /// How far away what its pixels show is.
+    pub depth: Option<DepthFile>,
     /// Where its pixels go.
     pub flow: Option<FlowFile>,
     /// The mask of labels: its values number [`Capture::labels`].
     pub labels: Option<PathBuf>,
+    /// The tracks of its camera.
+    pub tracks: Option<Arc<Tracks>>,
+}
+
+impl Frame {
+    /// Whether it is known where its pixels go.
+    pub fn has_flow(&self) -> bool {
+        self.flow.is_some()
+    }
 }
 
 /// One camera of the rig, or one moving camera.
@@ -207,8 +224,10 @@ struct RawFrame {
     index: usize,
     image: PathBuf,
     mask: Option<PathBuf>,
+    depth: Option<DepthFile>,
     flow: Option<PathBuf>,
     labels: Option<PathBuf>,
+    tracks: Option<Arc<Tracks>>,
     split: Split,
 }
 

@@ -59,8 +59,10 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
                 index,
                 image: image.clone(),
                 mask: None,
+                depth: None,
                 flow: None,
                 labels: None,
+                tracks: None,
                 split: if camera == 0 && rows > 1 { Split::Held } else { Split::Train },
             });
         }

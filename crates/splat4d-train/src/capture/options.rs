@@ -83,6 +83,16 @@ choices! {
     }
 }
 
+choices! {
+    /// Where the optical flow of pictures is from.
+    pub enum FlowSource {
+        /// The capture's files; where it brings none there is none.
+        Files = "files",
+        /// The capture's files, and where it brings none, followed from picture to picture by this program.
+        Own = "own",
+    }
+}
+
 settings! {
     /// The capture: what of it is read, and how.
     pub struct CaptureSettings {
@@ -94,6 +104,9 @@ settings! {
         fps: f64 = 0.0 => any().unit("frames/s");
         /// Pictures that state no times: photos of one moment, frames of a video, or auto: as their names tell.
         sequence: Sequence = Sequence::Auto;
+        /// Where optical flow is from: files (the capture's own) or own (followed from picture to picture where it brings
+        /// none, and kept beside the run).
+        flow: FlowSource = FlowSource::Files => any().when(On("loss.flow"));
         /// Only this many frames of the take; 0: all.
         max_frames: usize = 0 => any().unit("frames");
         /// How near to a camera Gaussians are drawn, of the extent; less where the capture's points come nearer, a

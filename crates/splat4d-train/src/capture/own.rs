@@ -2,12 +2,15 @@
 
 use super::json::{self, Node};
 use super::points::read_ply;
-use super::{CaptureKind, CaptureOptions, Extent, HoldOut, RawFrame, Split, Take, Timing, pose};
+use super::{
+    CaptureKind, CaptureOptions, DepthFile, DepthKind, Extent, HoldOut, RawFrame, Split, Take, Timing, Tracks, pose,
+};
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::scene::{Camera, Intrinsics, Lens};
 use splat4d::{Error, ErrorKind, Result};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// The version of the format that this reader knows.
 const VERSION: usize = 1;
@@ -24,6 +27,8 @@ const TOP_KEYS: &[&str] = &[
     "background",
     "up",
     "labels",
+    "depth_kind",
+    "depth_scale",
     "comment",
     "extra",
 ];
@@ -42,8 +47,12 @@ const CAMERA_KEYS: &[&str] = &[
     "times",
     "images",
     "masks",
+    "depth",
+    "depth_kind",
+    "depth_scale",
     "flow",
     "labels",
+    "tracks",
     "start",
     "frames",
     "comment",
@@ -234,17 +243,23 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
     let start = context.shared(node, "start")?.unwrap_or(0);
     let count = context.shared(node, "frames")?;
     let images = Files::read(&node.get("images")?)?;
-    let [masks, flow, labels] =
-        ["masks", "flow", "labels"].map(|key| node.opt(key)?.map(|n| Files::read(&n)).transpose());
-    let (masks, flow, labels) = (masks?, flow?, labels?);
+    let [masks, depth, flow, labels] =
+        ["masks", "depth", "flow", "labels"].map(|key| node.opt(key)?.map(|n| Files::read(&n)).transpose());
+    let (masks, depth, flow, labels) = (masks?, depth?, flow?, labels?);
+    let depth = depth.map(|files| Depth::read(context, node, files)).transpose()?;
     if labels.is_some() && context.top.opt("labels")?.is_none() {
         return Err(node
             .error("its masks of labels have no names")
             .remedy("Add \"labels\" at the top of capture.json: a list of names, that of mask value 0 first."));
     }
-    for (key, files) in
-        [("images", Some(&images)), ("masks", masks.as_ref()), ("flow", flow.as_ref()), ("labels", labels.as_ref())]
-    {
+    let lists = [
+        ("images", Some(&images)),
+        ("masks", masks.as_ref()),
+        ("depth", depth.as_ref().map(|d| &d.files)),
+        ("flow", flow.as_ref()),
+        ("labels", labels.as_ref()),
+    ];
+    for (key, files) in lists {
         let Some(Files::List(names)) = files else { continue };
         let expected = match (&images, count) {
             (_, Some(count)) => count,
@@ -301,8 +316,10 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
             index,
             image,
             mask: masks.as_ref().and_then(|m| m.name(context.root, start, index)),
+            depth: depth.as_ref().and_then(|d| d.file(context.root, start, index)),
             flow: flow.as_ref().and_then(|f| f.name(context.root, start, index)),
             labels: labels.as_ref().and_then(|l| l.name(context.root, start, index)),
+            tracks: None,
             split: Split::Train,
         });
     }
@@ -310,7 +327,55 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
     if let Some(last) = frames[first..].last_mut() {
         last.flow = None;
     }
+    if let Some(file) = node.opt("tracks")? {
+        let tracks = Arc::new(Tracks::read(&context.root.join(file.text()?), [width, height], there)?);
+        frames[first..].iter_mut().for_each(|f| f.tracks = Some(tracks.clone()));
+    }
     Ok(there)
+}
+
+/// The depth maps of a camera.
+struct Depth {
+    files: Files,
+    kind: DepthKind,
+    scale: f64,
+}
+
+impl Depth {
+    fn read(context: &Context<'_>, camera: &Node<'_>, files: Files) -> Result<Self> {
+        let of = |key: &str| Ok::<_, Error>(camera.opt(key)?.or(context.top.opt(key)?));
+        let kind = match of("depth_kind")? {
+            None => DepthKind::Metric,
+            Some(node) => {
+                let (word, names) = (node.text()?, DepthKind::NAMES);
+                let known = names.iter().find(|(name, _)| *name == word).map(|(_, kind)| *kind);
+                known.ok_or_else(|| {
+                    node.error(format!("the kind of depth \"{word:.30}\" is not known")).remedy(
+                        "Write \"metric\" (z in scene units), \"relative\" (z up to scale and shift) or \"inverse\" (1/z up to \
+                         scale and shift).",
+                    )
+                })?
+            }
+        };
+        let scale = of("depth_scale")?.map(|n| n.number()).transpose()?;
+        if let Some(scale) = scale.filter(|s| *s <= 0.0) {
+            return Err(camera.error(format!("depth_scale is {scale}")).remedy("Give a positive number."));
+        }
+        let whole = match &files {
+            Files::Pattern { after, .. } => after.to_ascii_lowercase().ends_with(".png"),
+            Files::List(names) => names.iter().any(|n| n.to_ascii_lowercase().ends_with(".png")),
+        };
+        if scale.is_none() && whole && kind == DepthKind::Metric {
+            return Err(camera
+                .error("\"depth\" are pictures of whole numbers, and nothing says what one of them is")
+                .remedy("Give \"depth_scale\": scene units a number, for instance 0.001 for millimetres in metres."));
+        }
+        Ok(Self { files, kind, scale: scale.unwrap_or(1.0) })
+    }
+
+    fn file(&self, root: &Path, start: usize, index: usize) -> Option<DepthFile> {
+        Some(DepthFile { path: self.files.name(root, start, index)?, scale: self.scale, kind: self.kind })
+    }
 }
 
 /// When a camera took its frames: seconds on its own clock, each later than the one before.

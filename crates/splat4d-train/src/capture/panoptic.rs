@@ -89,8 +89,10 @@ fn read_meta(root: &Path, top: &Node<'_>, split: Split, fps: f64, out: &mut Vec<
                 index: t,
                 image,
                 mask,
+                depth: None,
                 flow: None,
                 labels: None,
+                tracks: None,
                 split,
             };
             out.push((ids[c].count()?, raw));

@@ -33,7 +33,60 @@ const UNEVEN: f64 = 1.5;
 /// Angle and relative distance below which two cameras add little to each other.
 const CLOSE_DEGREES: f64 = 0.5;
 
+/// Between these angles to the nearest training camera new views end to hold, degrees: half the gap between neighbouring
+/// cameras, whose middle is seen from both sides, but nowhere less than what any two pictures share, and nowhere more than
+/// what was seen to hold (docs/priors.md).
+const REACH_DEGREES: [f64; 2] = [5.0, 15.0];
+/// Of the nearest and of the farthest training camera's distance: nearer than half of it a pixel shows what no picture did.
+const REACH_DISTANCE: [f64; 2] = [0.5, 2.0];
+/// Training views that the reach is told by, at most, evenly chosen.
+const REACH_VIEWS: usize = 200;
+
+/// How far from the training cameras new views will hold: a rule, not a measurement.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Reach {
+    /// The place that the cameras look at.
+    pub center: [f64; 3],
+    /// The angle there to the nearest training camera, degrees.
+    pub degrees: f64,
+    /// Distances from there, scene units.
+    pub distances: [f64; 2],
+    /// Cameras with held-out frames, and those of them that have one beyond the reach.
+    pub held: [usize; 2],
+}
+
 impl Capture {
+    /// How far from the training cameras new views will hold; `None`: there is one camera alone.
+    pub fn reach(&self) -> Option<Reach> {
+        let all = self.training_views();
+        let views: Vec<&Frame> = all.iter().step_by(all.len().div_ceil(REACH_VIEWS).max(1)).copied().collect();
+        if views.len() < 2 {
+            return None;
+        }
+        let center = look_at(&views);
+        let ray = |f: &Frame| normalize(sub(f.view.center(), center));
+        let rays: Vec<[f64; 3]> = views.iter().map(|f| ray(f)).collect();
+        let angle = |a: [f64; 3], b: [f64; 3]| dot(a, b).clamp(-1.0, 1.0).acos().to_degrees();
+        let nearest = |from: [f64; 3], but: Option<usize>| {
+            let others = rays.iter().enumerate().filter(|(j, _)| Some(*j) != but);
+            others.map(|(_, r)| angle(from, *r)).fold(f64::INFINITY, f64::min)
+        };
+        let mut gaps: Vec<f64> = rays.iter().enumerate().map(|(i, r)| nearest(*r, Some(i))).collect();
+        let middle = gaps.len() / 2;
+        let gap = *gaps.select_nth_unstable_by(middle, f64::total_cmp).1;
+        let degrees = (0.5 * gap).clamp(REACH_DEGREES[0], REACH_DEGREES[1]);
+        let far = |f: &Frame| norm(sub(f.view.center(), center));
+        let range = views.iter().map(|f| far(f)).fold([f64::INFINITY, 0.0], |[l, h], d| [d.min(l), d.max(h)]);
+        let distances = [REACH_DISTANCE[0] * range[0], REACH_DISTANCE[1] * range[1]];
+        let mut held = vec![[false; 2]; self.cameras.len()];
+        for frame in self.held.iter().map(|&i| &self.frames[i]) {
+            let beyond = nearest(ray(frame), None) > degrees || !(distances[0]..=distances[1]).contains(&far(frame));
+            held[frame.camera] = [true, held[frame.camera][1] || beyond];
+        }
+        let held = [0, 1].map(|k| held.iter().filter(|h| h[k]).count());
+        Some(Reach { center, degrees, distances, held })
+    }
+
     /// Looks for what commonly spoils results. Cheap: opens no picture.
     pub fn preflight(&self) -> Vec<Finding> {
         let mut findings = Vec::new();

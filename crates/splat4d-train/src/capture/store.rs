@@ -7,7 +7,7 @@
 
 use super::lens::Distortion;
 use super::picture::{self, Raster, Samples};
-use super::{Capture, Frame, flow};
+use super::{Capture, DepthKind, Frame, depth, flow};
 use rayon::prelude::*;
 use splat4d::Result;
 use splat4d::scene::{Camera, Planes};
@@ -27,6 +27,8 @@ pub struct Picture {
     /// [1, height, width] part of the pixel that the original picture covers, where undistortion left borders. Colour
     /// there is meaningless; losses and measurements must leave those pixels out.
     pub valid: Option<Planes<f32>>,
+    /// [1, height, width] the depth of what pixels show, 0 where it is not known, and what kind of depth it is.
+    pub depth: Option<(Planes<f32>, DepthKind)>,
     /// [3, height, width] where its pixels go by the next frame of its camera: u right, v down in pixels, and 1 where
     /// they are known.
     pub flow: Option<Planes<f32>>,
@@ -40,6 +42,8 @@ pub struct StoredPicture {
     color: Samples,
     mask: Option<Vec<u8>>,
     valid: Option<Vec<u8>>,
+    /// As [`depth::read`] gives it.
+    depth: Option<(Vec<f32>, DepthKind)>,
     /// As [`flow::read`] gives it.
     flow: Option<Vec<u16>>,
 }
@@ -52,7 +56,8 @@ impl StoredPicture {
             Samples::Sixteen(s) => 2 * s.len(),
         };
         let weights = [&self.mask, &self.valid].into_iter().flatten().map(Vec::len).sum::<usize>();
-        color + weights + self.flow.as_ref().map_or(0, |f| 2 * f.len())
+        let depth = self.depth.as_ref().map_or(0, |(d, _)| 4 * d.len());
+        color + weights + depth + self.flow.as_ref().map_or(0, |f| 2 * f.len())
     }
 
     /// Writes the colour as [3, height, width] sRGB values from 0 to 1, reusing `out`'s memory.
@@ -71,6 +76,14 @@ impl StoredPicture {
     /// Writes the validity as [1, height, width] from 0 to 1; false (and `out` untouched) if all pixels are valid.
     pub(crate) fn valid_into(&self, out: &mut Planes<f32>) -> bool {
         self.weights_into(self.valid.as_deref(), out)
+    }
+
+    /// Writes the depth as [1, height, width] and says what kind it is; `None` (and `out` untouched) if there is none.
+    pub(crate) fn depth_into(&self, out: &mut Planes<f32>) -> Option<DepthKind> {
+        let (values, kind) = self.depth.as_ref()?;
+        (out.channels, out.height, out.width) = (1, self.height, self.width);
+        out.data.clone_from(values);
+        Some(*kind)
     }
 
     /// Writes the flow as [3, height, width]; false (and `out` untouched) if there is none.
@@ -103,9 +116,11 @@ impl StoredPicture {
             let mut out = Planes::default();
             self.weights_into(weights.as_deref(), &mut out).then_some(out)
         };
+        let mut distances = Planes::default();
+        let depth = self.depth_into(&mut distances).map(|kind| (distances, kind));
         let mut vectors = Planes::default();
         let flow = self.flow_into(&mut vectors).then_some(vectors);
-        Picture { color, mask: plane(&self.mask), valid: plane(&self.valid), flow }
+        Picture { color, mask: plane(&self.mask), valid: plane(&self.valid), depth, flow }
     }
 }
 
@@ -131,10 +146,11 @@ impl<S: Copy + Into<f32>> Pass for Convert<'_, S> {
 impl std::fmt::Debug for StoredPicture {
     /// Size and kind; millions of samples help nobody.
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let (mask, valid, flow) = (self.mask.is_some(), self.valid.is_some(), self.flow.is_some());
+        let (mask, valid) = (self.mask.is_some(), self.valid.is_some());
+        let (depth, flow) = (self.depth.is_some(), self.flow.is_some());
         write!(
             f,
-            "StoredPicture {{ {}x{}, {} bytes, mask: {mask}, valid: {valid}, flow: {flow} }}",
+            "StoredPicture {{ {}x{}, {} bytes, mask: {mask}, valid: {valid}, depth: {depth}, flow: {flow} }}",
             self.width,
             self.height,
             self.bytes()
@@ -341,7 +357,7 @@ impl Shared {
 /// White: stands in where a picture has alpha although the capture's first pictures had none.
 const WHITE: [f32; 3] = [1.0; 3];
 
-/// Decodes a frame's picture, mask and flow and brings them to the frame's view.
+/// Decodes a frame's picture, mask, depth and flow and brings them to the frame's view.
 fn prepare(frame: &Frame, capture: &Capture) -> Result<StoredPicture> {
     let place = |e: splat4d::Error| {
         let camera = &capture.cameras[frame.camera].name;
@@ -351,13 +367,15 @@ fn prepare(frame: &Frame, capture: &Capture) -> Result<StoredPicture> {
     let background = capture.background.unwrap_or(WHITE);
     let mask = frame.mask.as_deref().map(|m| read_mask(m, &frame.source)).transpose().map_err(place)?;
     let mask = mask.or_else(|| raster.alpha().map(|_| picture::mask_values(&raster, true)));
+    let depth = frame.depth.as_ref();
+    let depth = depth.map(|d| Ok((depth::read(d, frame, capture.downscale)?, d.kind))).transpose().map_err(place)?;
     let flow = frame.flow.as_ref().map(|f| flow::read(f, frame, capture)).transpose().map_err(place)?;
     let lens = Distortion::new(frame.source.lens);
     let opaque = raster.alpha().is_none_or(|a| (0..raster.width * raster.height).all(|p| raster.get(p, a) >= 1.0));
     if let (true, true, 1, Samples::Eight(samples)) = (opaque, lens.is_pinhole(), capture.downscale, &raster.samples) {
         let mask = mask.map(|m| m.iter().map(|&v| to_byte(v)).collect());
         let color = Samples::Eight(planar(samples, raster.channels));
-        return Ok(StoredPicture { width: raster.width, height: raster.height, color, mask, valid: None, flow });
+        return Ok(StoredPicture { width: raster.width, height: raster.height, color, mask, valid: None, depth, flow });
     }
     let (width, height) = (raster.width, raster.height);
     let mut planes = composite(&raster, background);
@@ -376,7 +394,7 @@ fn prepare(frame: &Frame, capture: &Capture) -> Result<StoredPicture> {
     // Any doubt about a pixel must not round to certainty.
     let valid = valid.map(|plane| plane.iter().map(|&v| (v.clamp(0.0, 1.0) * 255.0) as u8).collect());
     let color = planes.iter().flatten().map(|&v| (v.clamp(0.0, 1.0) * 65535.0).round() as u16).collect();
-    Ok(StoredPicture { width: width / k, height: height / k, color: Samples::Sixteen(color), mask, valid, flow })
+    Ok(StoredPicture { width: width / k, height: height / k, color: Samples::Sixteen(color), mask, valid, depth, flow })
 }
 
 fn to_byte(v: f32) -> u8 {

@@ -60,8 +60,10 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         index,
         image: entry.image,
         mask: entry.mask,
+        depth: entry.depth,
         flow: None,
         labels: None,
+        tracks: None,
         split: entry.split,
     };
     let frames: Vec<RawFrame> = entries.into_iter().zip(places).map(frame).collect();

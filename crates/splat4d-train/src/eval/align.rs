@@ -95,7 +95,9 @@ impl Align {
                     truth: &truth,
                     mask: None,
                     weight,
+                    depth: None,
                     flow: None,
+                    tracks: None,
                     frame: place,
                     rig: frame.camera,
                 };

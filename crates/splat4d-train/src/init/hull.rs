@@ -78,7 +78,7 @@ pub(crate) fn carve(
 
 /// The distinct time nearest to t and its frames; of cameras whose shutters do not open at once the frame that is nearest
 /// to it, if that is less than half a frame.
-fn pictures_near(frames: &dyn Frames, t: f64) -> (f64, Vec<usize>) {
+pub(super) fn pictures_near(frames: &dyn Frames, t: f64) -> (f64, Vec<usize>) {
     let all = || (0..frames.len()).map(|i| (frames.rig(i), frames.time(i).0));
     let Some(best) = all().map(|(_, time)| time).min_by(|a, b| (a - t).abs().total_cmp(&(b - t).abs())) else {
         return (t, Vec::new());

@@ -1,6 +1,7 @@
-//! Where Gaussians start: the capture's points, the visual hull of the masks, or of what moves, at several moments, or random
+//! Where Gaussians start: the capture's points, those of its depth maps, the visual hull of the masks, or of what moves, at several moments, or random
 //! points in the volume that the cameras share.
 
+mod depth;
 pub(crate) mod fill;
 pub(crate) mod hull;
 pub(crate) mod volume;
@@ -90,8 +91,8 @@ settings! {
 /// Where the first Gaussians are.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Source {
-    /// The capture's points or, where they are few, those that its pictures show, and more between them; the hull of masks, or
-    /// of what moves before fixed cameras; else at random.
+    /// The capture's points and those of its depth maps; without maps, or where points are few, those that its pictures show,
+    /// and more between them; the hull of masks, or of what moves before fixed cameras; else at random.
     Auto,
     /// The capture's points.
     Points,
@@ -187,17 +188,25 @@ pub fn seeds(plan: &Plan, frames: &dyn Frames, points: Option<Seeds>, moving: bo
     }
     let use_hull =
         frames.has_masks() && matches!(r.init.source, Source::Auto | Source::Hull) && (moving || !have_points);
+    let seen = match r.init.source {
+        Source::Auto if frames.has_depth() => depth::points(frames, &times, r.init.count, moving, rng.fork(4))?,
+        _ => Seeds::default(),
+    };
+    let have_depth = !seen.is_empty();
+    out.append(seen);
     if have_points && !matches!(r.init.source, Source::Random | Source::Hull) {
         out.append(points.expect("just seen"));
         let filled = matches!(r.init.source, Source::Auto | Source::Pictures);
-        if filled && out.len() < r.init.count {
+        if filled && !have_depth && out.len() < r.init.count {
             // Surfaces that move are elsewhere at other times.
             let still = (0..out.len()).filter(|&i| out.times[i].is_none());
             let known: Vec<[f64; 3]> = still.map(|i| out.points[i]).collect();
             out.append(fill::between(frames, &known, r.init.count - out.len())?);
         }
     }
-    if use_hull {
+    if have_depth {
+        // What a map shows no hull knows better.
+    } else if use_hull {
         out.append(hull::carve(frames, &volume, &times, r.init.count, moving, rng.fork(1))?);
     } else if r.init.source == Source::Auto && have_points && moving {
         out.append(hull::carve_moving(frames, &volume, &times, r.init.count, rng.fork(1))?);

@@ -47,6 +47,10 @@ settings! {
         elastic: f64 = 0.0 => any().when(IsNot("run.motion", &["still"]));
         /// Weight of the third difference of positions over four frames, extents: against jitter.
         jerk: f64 = 0.0 => any().when(IsNot("run.motion", &["still"]));
+        /// Weight of the square of the acceleration over three frames, extents² (NSFF; 0.1 there).
+        acceleration: f64 = 0.0 => any().when(IsNot("run.motion", &["still"]));
+        /// Weight of the way over a frame, extents: what need not move stays (NSFF's minimal flow; 0.1 there).
+        least_motion: f64 = 0.0 => any().when(IsNot("run.motion", &["still"]));
         /// Weight of the total variation of the picture's colours.
         tv: f64 = 0.0;
         /// Weight of the edge-aware total variation of depth, over its mean.
@@ -59,7 +63,12 @@ settings! {
         mask_entropy: f64 = 0.0;
         /// Weight of the entropy of opacities, nats: Gaussians are there or not (SuGaR; 0.1 there).
         opacity_entropy: f64 = 0.0;
+        /// Weight of the drawn depth against the capture's depth maps (capture.json: `depth`); falls to a tenth by the end.
+        depth: f64 = 0.1;
         /// Weight of the drawn flow against a known one, shares of the picture's longer side (capture.json: `flow`).
         flow: f64 = 0.0;
+        /// Weight of the drawn way of tracked points against their tracks, shares of the picture's longer side (capture.json:
+        /// `tracks`).
+        tracks: f64 = 0.0;
     }
 }

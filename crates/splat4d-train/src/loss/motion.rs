@@ -198,6 +198,53 @@ pub(crate) fn jerk<F: Real>(at: [&[[F; 3]]; 4], weight: f64, d: [&mut [[F; 3]]; 
     scale * sum
 }
 
+/// Acceleration: mean over points of ½‖s⁺ + s⁻‖², s⁺ = x₂ − x₁ the flow to the next instant and s⁻ = x₀ − x₁ to the last
+/// one, scene units²: steady motion is free.
+///
+/// Source: Li et al. 2021 (NSFF), temporal scene flow smoothness.
+pub(crate) fn acceleration<F: Real>(at: [&[[F; 3]]; 3], weight: f64, d: [&mut [[F; 3]]; 3]) -> f64 {
+    let n = at[0].len();
+    assert!(at.iter().all(|x| x.len() == n) && d.iter().all(|x| x.len() == n), "{n} points");
+    let second = |i: usize| -> [F; 3] { std::array::from_fn(|k| at[2][i][k] - F::TWO * at[1][i][k] + at[0][i][k]) };
+    let scale = weight / n.max(1) as f64;
+    let mut unused = vec![(); n];
+    let sum = over_points(&mut unused, |i, ()| 0.5 * square(second(i)).f64());
+    for (d, share) in d.into_iter().zip([1.0, -2.0, 1.0]) {
+        over_points(d, |i, d| {
+            add_to(d, second(i), F::of(scale * share));
+            0.0
+        });
+    }
+    scale * sum
+}
+
+/// Least motion: mean over points of ‖x₁ − x₀‖₁, scene units: what need not move stays.
+///
+/// Source: Li et al. 2021 (NSFF), minimal scene flow.
+pub(crate) fn least<F: Real>([now, before]: [&[[F; 3]]; 2], weight: f64, [d_now, d_before]: [&mut [[F; 3]]; 2]) -> f64 {
+    let n = now.len();
+    assert!([before.len(), d_now.len(), d_before.len()] == [n; 3], "{n} points");
+    let scale = weight / n.max(1) as f64;
+    let mut d: Vec<(&mut [F; 3], &mut [F; 3])> = d_now.iter_mut().zip(d_before).collect();
+    scale
+        * over_points(&mut d, |i, (d_now, d_before)| {
+            let way = sub(now[i], before[i]);
+            let sign = |x: F| {
+                if x > F::ZERO {
+                    F::ONE
+                } else if x < F::ZERO {
+                    -F::ONE
+                } else {
+                    F::ZERO
+                }
+            };
+            let signs = way.map(sign);
+            add_to(d_now, signs, F::of(scale));
+            add_to(d_before, signs, F::of(-scale));
+            way.iter().map(|x| x.abs().f64()).sum()
+        })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -264,6 +311,15 @@ mod tests {
             let [a, b, c, e] = d else { panic!("four instants") };
             jerk([&at[0], &at[1], &at[2], &at[3]], 0.7, [a, b, c, e])
         });
+        check(&at[..3], |at, d| {
+            let [a, b, c] = d else { panic!("three instants") };
+            acceleration([&at[0], &at[1], &at[2]], 0.7, [a, b, c])
+        });
+        check(&at[..2], |at, d| least([&at[0], &at[1]], 0.7, two(d)));
+        let steady: [Points; 3] = [0.0, 1.0, 2.0].map(|t| rest.iter().map(|p| p.map(|x| x + 0.3 * t)).collect());
+        let mut d = vec![vec![[0.0; 3]; N]; 3];
+        let [a, b, c] = &mut d[..] else { panic!("three instants") };
+        assert!(acceleration([&steady[0], &steady[1], &steady[2]], 1.0, [a, b, c]) < 1e-12, "steady motion is free");
         let cov = |p: &str| -> Vec<[f64; 6]> {
             normals::<7>(p, 0.5)
                 .iter()

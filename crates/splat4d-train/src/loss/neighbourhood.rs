@@ -33,16 +33,25 @@ pub(crate) struct MotionWeights {
     pub velocity: f64,
     /// [`motion::jerk`] of four frames, extents.
     pub jerk: f64,
+    /// [`motion::acceleration`] of three frames, extents².
+    pub acceleration: f64,
+    /// [`motion::least`] over a frame, extents.
+    pub least: f64,
 }
 
 impl MotionWeights {
+    /// Whether four frames are looked at.
+    fn wide(&self) -> bool {
+        self.elastic > 0.0 || self.jerk > 0.0 || self.acceleration > 0.0
+    }
+
     /// Whether nothing is to be done.
     pub(crate) fn is_off(&self) -> bool {
         *self == Self::default()
     }
 }
 
-/// Rigidity, rotation, isometry, ARAP, elasticity, velocity and jerk of the Gaussians of every layer that moves, over
+/// Rigidity, rotation, isometry, ARAP, elasticity, velocity, jerk, acceleration and least motion of the Gaussians of every layer that moves, over
 /// random neighbourhoods of those alive at the view's time.
 ///
 /// Neighbours are those of the raw means, searched anew every 200 steps and after every edit of rows; an edge counts
@@ -71,7 +80,7 @@ impl<F: Real> Neighbourhood<F> {
         let seconds = self.clip[1] - self.clip[0];
         let t = info.times.first()?.0;
         let w = &self.weights;
-        let wide = w.elastic > 0.0 || w.jerk > 0.0;
+        let wide = w.wide();
         let (before, after) = if wide { (self.frame, 2.0 * self.frame) } else { (0.0, self.frame) };
         if seconds < before + after {
             return None;
@@ -128,7 +137,11 @@ impl<F: Real> ProbeLoss<F> for Neighbourhood<F> {
             let x: Vec<Vec<[F; 3]>> = seen.iter().map(|t| (0..t.rows()).map(|r| t.read(r, 0)).collect()).collect();
             let mut g: Vec<Vec<[F; 3]>> = x.iter().map(|x| vec![[F::ZERO; 3]; x.len()]).collect();
             let (w, unit) = (&self.weights, self.unit);
-            let wide = w.elastic > 0.0 || w.jerk > 0.0;
+            let wide = w.wide();
+            if w.least > 0.0 {
+                let [before, now, ..] = &mut g[..] else { unreachable!("two instants are always asked for") };
+                loss += motion::least([&x[1], &x[0]], w.least * unit, [now, before]);
+            }
             if w.rigid > 0.0 || w.rot > 0.0 || w.velocity > 0.0 {
                 let rotations = arap::rotations(graph, &x[1], &x[0]);
                 let [before, now, ..] = &mut g[..] else { unreachable!("two instants are always asked for") };
@@ -158,6 +171,9 @@ impl<F: Real> ProbeLoss<F> for Neighbourhood<F> {
                 let x = [&x[2][..], &x[0][..], &x[1][..], &x[3][..]];
                 if w.jerk > 0.0 {
                     loss += motion::jerk(x, w.jerk * unit, [before, at, after, last]);
+                }
+                if w.acceleration > 0.0 {
+                    loss += motion::acceleration([x[0], x[1], x[2]], w.acceleration * unit * unit, [before, at, after]);
                 }
                 if w.elastic > 0.0 {
                     let mut d: [&mut [[F; 3]]; 4] = [before, at, after, last];

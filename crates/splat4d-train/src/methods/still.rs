@@ -153,6 +153,8 @@ pub(crate) fn motion_weights(r: &Recipe) -> MotionWeights {
         elastic: r.loss.elastic,
         velocity: r.loss.velocity,
         jerk: r.loss.jerk,
+        acceleration: r.loss.acceleration,
+        least: r.loss.least_motion,
     }
 }
 

@@ -1,8 +1,8 @@
 //! A capture on disk as the trainer sees it: one of its splits, through the image store.
 
 use crate::Result;
-use crate::capture::frames::{Flow, Frames, Picture};
-use crate::capture::{Capture, ImageStore};
+use crate::capture::frames::{Depth, Flow, Frames, Picture, Tracked};
+use crate::capture::{Capture, DepthKind, ImageStore};
 use splat4d::scene::{Camera, Planes, Time};
 use std::sync::Arc;
 
@@ -51,12 +51,24 @@ impl Frames for Dataset {
         self.capture.background.is_some() || self.frames.iter().any(|&i| self.capture.frames[i].mask.is_some())
     }
 
+    fn has_depth(&self) -> bool {
+        let metric = |&i: &usize| self.capture.frames[i].depth.as_ref().is_some_and(|d| d.kind == DepthKind::Metric);
+        self.frames.iter().any(metric)
+    }
+
+    fn tracked(&self, i: usize) -> Option<Tracked<'_>> {
+        let frame = &self.capture.frames[self.frames[i]];
+        Some(Tracked { tracks: frame.tracks.as_deref()?, frame: frame.index, source: &frame.source })
+    }
+
     fn load(&self, i: usize, out: &mut Picture) -> Result<()> {
         let frame = self.frames[i];
         let stored = self.store.load(frame)?;
         stored.color_into(&mut out.color);
         fill(&mut out.mask, |plane| stored.mask_into(plane));
         fill(&mut out.weight, |plane| stored.valid_into(plane));
+        let mut values = out.depth.take().map(|d| d.values).unwrap_or_default();
+        out.depth = stored.depth_into(&mut values).map(|kind| Depth { values, kind });
         let mut vectors = out.flow.take().map(|f| f.vectors).unwrap_or_default();
         if let (Some(file), true) = (&self.capture.frames[frame].flow, stored.flow_into(&mut vectors)) {
             let to = &self.capture.frames[file.to];

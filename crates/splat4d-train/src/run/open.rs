@@ -2,7 +2,7 @@
 //! trainer.
 
 use super::dataset::Dataset;
-use crate::capture::{Capture, CaptureOptions, ImageStore, frames};
+use crate::capture::{Capture, CaptureOptions, FlowSource, ImageStore, frames};
 use crate::event::Event;
 use crate::init::{self, Seeds, Source};
 use crate::learner::{Corrections, Exposure, Origin, RefineSettings, Scale};
@@ -48,6 +48,12 @@ pub fn open_frames(path: &Path, recipe: &Recipe, frames: Vec<Range<usize>>) -> R
         // Nobody looks at it: it need not be decoded.
         capture.frames.iter_mut().for_each(|f| f.flow = None);
     }
+    if recipe.loss.tracks == 0.0 {
+        capture.frames.iter_mut().for_each(|f| f.tracks = None);
+    }
+    if recipe.loss.depth == 0.0 {
+        capture.frames.iter_mut().for_each(|f| f.depth = None);
+    }
     if recipe.capture.first_frame > 0 || recipe.capture.max_frames > 0 {
         let last = if recipe.capture.max_frames == 0 {
             usize::MAX
@@ -73,13 +79,20 @@ pub fn open_frames(path: &Path, recipe: &Recipe, frames: Vec<Range<usize>>) -> R
     Ok(capture)
 }
 
-/// Errors: a loss on flow, and not one training picture has any.
+/// Errors: a loss on flow or tracks, and not one training picture has any.
 pub(super) fn check_flow(capture: &Capture, recipe: &Recipe) -> Result<()> {
-    if recipe.loss.flow == 0.0 || capture.train.iter().any(|&i| capture.frames[i].flow.is_some()) {
+    if recipe.loss.tracks > 0.0 && capture.train.iter().all(|&i| capture.frames[i].tracks.is_none()) {
+        return Err(Error::input("loss.tracks compares point tracks, and the capture's training cameras have none")
+            .remedy("Give cameras `tracks` in capture.json (docs/priors.md), or leave loss.tracks at 0"));
+    }
+    let own = recipe.capture.flow == FlowSource::Own;
+    if recipe.loss.flow == 0.0 || own || capture.train.iter().any(|&i| capture.frames[i].flow.is_some()) {
         return Ok(());
     }
-    Err(Error::input("lambda_flow compares flow, and the capture's training pictures have none")
-        .remedy("Give cameras a `flow` in capture.json (docs/capture-format.md), or leave lambda_flow at 0"))
+    Err(Error::input("lambda_flow compares flow, and the capture's training pictures have none").remedy(
+        "Give cameras a `flow` in capture.json (docs/capture-format.md), follow the pictures with --set \
+             capture.flow=own, or leave lambda_flow at 0",
+    ))
 }
 
 /// A capture opened for training: what fresh runs, resumes and probes share.

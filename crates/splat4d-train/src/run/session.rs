@@ -8,6 +8,7 @@ use super::identity::fingerprint;
 use super::memory::peak_memory;
 use super::metrics::{Metrics, STAGE_NAMES, Totals, psnr};
 use super::open::OpenCapture;
+use super::priors;
 use super::snapshot::Snapshots;
 use super::start::read_info;
 use crate::event::{Event, Progress};
@@ -313,6 +314,9 @@ impl Session<'_> {
             let mut bytes = Vec::new();
             splat4d::format::scene::write(&trainer.shown(), &mut bytes)?;
             write_atomically(&self.run.join("scene.safetensors"), &bytes)?;
+            for message in priors::after(self.opened, &trainer.shown(), self.recipe)? {
+                listen(&Event::Warning { message });
+            }
             listen(&Event::Finished { iteration, seconds: state.seconds, gaussians, peak_memory: peak_memory() });
         }
         Ok(Outcome { run: self.run.to_owned(), iteration, gaussians, seconds: state.seconds, interrupted: !done })

@@ -2,11 +2,13 @@
 
 use super::budget::{Budget, PROBES};
 use super::checkpoint;
+use super::flows;
 use super::identity::identity;
 use super::memory::memory_estimate;
 use super::minutes::Timing;
 use super::open::{OpenCapture, check_flow, open_capture};
 use super::points;
+use super::priors;
 use super::session::{Outcome, Session, TrainOptions};
 use crate::capture::Capture;
 use crate::event::Event;
@@ -45,6 +47,10 @@ pub fn train(
     program_of(&recipe)?.check(&opened.plan(&recipe))?;
     recipe.without_effect().iter().for_each(|idle| listen(&Event::Warning { message: idle.to_string() }));
     let opened = points::complete(opened, &recipe, run, &mut listen)?;
+    let opened = flows::complete(opened, &recipe, run, &mut listen)?;
+    for message in priors::before(&opened, &recipe)? {
+        listen(&Event::Warning { message });
+    }
     let timed = timed(&opened, recipe, options, &mut listen)?;
     let recipe = timed.recipe.resolve();
     let plan = opened.plan(&recipe);
@@ -213,7 +219,7 @@ pub fn open_run(run: &Path) -> Result<(Recipe, Capture)> {
     })?;
     let capture = open_capture(Path::new(path), &recipe)
         .map_err(|e| e.remedy("The run needs its capture where it was when it was trained"))?;
-    let capture = points::with_found(capture, &recipe, run)?;
+    let capture = flows::with_found(points::with_found(capture, &recipe, run)?, &recipe, run);
     Ok((recipe, capture))
 }
 

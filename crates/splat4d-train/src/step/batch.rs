@@ -2,38 +2,45 @@
 
 use super::chain::View;
 use crate::Result;
-use crate::capture::frames::{FlowTruth, Frames, Picture};
+use crate::capture::frames::{Depth, Flow, FlowTruth, Frames, Picture};
 use crate::learner::Corrections;
-use splat4d::scene::{Camera, Time};
+use splat4d::math::Rng;
+use splat4d::scene::{Camera, Planes, Time};
 
 /// Frames of one step, loaded; memory is reused from step to step.
 #[derive(Default)]
 pub(super) struct Batch {
     seen: Vec<usize>,
     pictures: Vec<Picture>,
+    tracks: Vec<Option<Flow>>,
     cameras: Vec<Camera>,
     times: Vec<Time>,
 }
 
 impl Batch {
-    /// Loads the frames `seen`, at half their size where `half` says so, from where and when `corrections` say.
+    /// Loads the frames `seen`, at half their size where `half` says so, from where and when `corrections` say. `rng` draws the
+    /// frames to which points are followed.
     pub(super) fn load(
         &mut self,
         frames: &dyn Frames,
         seen: Vec<usize>,
         half: bool,
         corrections: Option<&Corrections>,
+        rng: Rng,
     ) -> Result<()> {
         self.pictures.resize_with(seen.len(), Picture::default);
         self.cameras.clear();
         self.times.clear();
+        self.tracks.clear();
         for (&i, picture) in seen.iter().zip(&mut self.pictures) {
             frames.load(i, picture)?;
             let stated = frames.camera(i);
             let camera = corrections.map_or_else(|| stated.clone(), |c| c.camera(i, stated));
             let time = frames.time(i);
             self.times.push(corrections.map_or(time, |c| c.time(i, time)));
-            self.cameras.push(match half && camera.width > 1 && camera.height > 1 {
+            let half = half && camera.width > 1 && camera.height > 1;
+            self.tracks.push(tracks(frames, i, half, rng.fork(i as u64)));
+            self.cameras.push(match half {
                 true => {
                     picture.halve();
                     camera.downscaled(2)
@@ -47,16 +54,20 @@ impl Batch {
 
     /// The views that the scene is compared with, at times that are `shift` seconds later than they were.
     pub(super) fn views(&self, frames: &dyn Frames, shift: f64, background: [f32; 3]) -> Vec<View<'_, f32>> {
+        let later = |f: &Flow| -> Time { Time(f.to.0 + shift) };
         let views = self.seen.iter().zip(&self.pictures).zip(self.cameras.iter().zip(&self.times));
+        let views = views.zip(&self.tracks);
         views
-            .map(|((&i, picture), (camera, time))| View {
+            .map(|(((&i, picture), (camera, time)), tracks)| View {
                 camera,
                 t: Time(time.0 + shift),
                 background,
                 truth: &picture.color,
                 mask: picture.mask.as_ref(),
                 weight: picture.weight.as_ref(),
-                flow: picture.flow.as_ref().map(|f| FlowTruth { to: Time(f.to.0 + shift), ..f.truth() }),
+                depth: picture.depth.as_ref().map(Depth::truth),
+                flow: picture.flow.as_ref().map(|f| FlowTruth { to: later(f), ..f.truth() }),
+                tracks: tracks.as_ref().map(|f| FlowTruth { to: later(f), ..f.truth() }),
                 frame: i,
                 rig: frames.rig(i),
             })
@@ -72,4 +83,33 @@ impl Batch {
     pub(super) fn names(&self, frames: &dyn Frames) -> String {
         self.seen.iter().map(|&i| frames.name(i)).collect::<Vec<_>>().join(", ")
     }
+}
+
+/// The ways of the points that are seen in frame i, to another training frame of its camera that sees some of them: flow
+/// that is known in their pixels alone. `None`: no such points.
+fn tracks(frames: &dyn Frames, i: usize, half: bool, rng: Rng) -> Option<Flow> {
+    let own = frames.tracked(i)?;
+    let others = (0..frames.len()).filter(|&j| {
+        let other = || frames.tracked(j).is_some_and(|o| own.tracks.shares(own.frame, o.frame));
+        frames.rig(j) == frames.rig(i) && other()
+    });
+    let others: Vec<usize> = others.collect();
+    let to = *others.get(rng.below(0, others.len().max(1)))?;
+    let [here, there] = [i, to].map(|k| match half {
+        true => frames.camera(k).downscaled(2),
+        false => frames.camera(k).clone(),
+    });
+    let then = frames.tracked(to)?;
+    let mut vectors = Planes::new(3, here.height, here.width);
+    for [from, arrives] in own.tracks.pairs(own.frame, then.frame) {
+        let start = own.tracks.in_view(from, own.source, &here);
+        let (Some(p), Some(q)) = (start, own.tracks.in_view(arrives, then.source, &there)) else { continue };
+        if !(0.0..here.width as f64).contains(&p[0]) || !(0.0..here.height as f64).contains(&p[1]) {
+            continue;
+        }
+        let way = [q[0] - p[0], q[1] - p[1], 1.0];
+        let pixel = p[1] as usize * here.width + p[0] as usize;
+        way.iter().enumerate().for_each(|(c, w)| vectors.plane_mut(c)[pixel] = *w as f32);
+    }
+    Some(Flow { to: frames.time(to), camera: there, vectors })
 }

@@ -35,8 +35,8 @@ pub(super) struct Channels<F> {
     pub(super) table: Table<F>,
     /// The drawn channels, each with its first column.
     pub(super) places: Vec<(Channel, usize)>,
-    /// By layer, where the view's flow goes; empty: it is not drawn.
-    later: Vec<Later>,
+    /// By channel that draws a way, by layer, where it goes.
+    later: Vec<(Channel, Vec<Later>)>,
 }
 
 impl<F: Real> Channels<F> {
@@ -44,7 +44,7 @@ impl<F: Real> Channels<F> {
     pub(super) fn new(wanted: &[Channel], source: Source<'_, F>, evaluation: &Evaluation<F>) -> Option<Self> {
         let drawn = wanted.iter().filter(|c| match c {
             Channel::Sigmoid(column) => source.scene.layers.iter().any(|l| logit_of(&l.params, column).is_some()),
-            Channel::Normals | Channel::Flow => true,
+            Channel::Normals | Channel::Flow | Channel::Tracks => true,
         });
         let mut width = 0;
         let place = |channel: &Channel| {
@@ -60,7 +60,7 @@ impl<F: Real> Channels<F> {
         for (channel, column) in out.places.clone() {
             match &channel {
                 Channel::Normals => out.normals(column, source, evaluation),
-                Channel::Flow => out.flow(column, source, evaluation),
+                Channel::Flow | Channel::Tracks => out.flow(column, &channel, source, evaluation),
                 Channel::Sigmoid(name) => out.sigmoid(column, name, source, evaluation),
             }
         }
@@ -78,7 +78,7 @@ impl<F: Real> Channels<F> {
         for (channel, column) in &self.places {
             match channel {
                 Channel::Normals => normals_backward((d_table, *column), source, evaluation),
-                Channel::Flow => self.flow_backward((d_table, *column), source, evaluation),
+                Channel::Flow | Channel::Tracks => self.flow_backward((d_table, *column), channel, source, evaluation),
                 Channel::Sigmoid(name) => self.sigmoid_backward((d_table, *column), name, source, evaluation, d),
             }
         }
@@ -94,9 +94,9 @@ impl<F: Real> Channels<F> {
         }
     }
 
-    fn flow(&mut self, column: usize, source: Source<'_, F>, evaluation: &Evaluation<F>) {
-        let truth = source.view.flow.as_ref().expect("only views that know their flow ask for it");
-        let mut first = 0;
+    fn flow(&mut self, column: usize, channel: &Channel, source: Source<'_, F>, evaluation: &Evaluation<F>) {
+        let truth = channel.way(source.view).expect("only views that know their flow ask for it");
+        let (mut first, mut all) = (0, Vec::new());
         for (layer, &i) in source.asked.iter().enumerate() {
             let now = evaluation.tape(i);
             let question = evaluation.find(layer, Space::Gaussians, truth.to).expect("a flow's time was asked");
@@ -116,19 +116,22 @@ impl<F: Real> Channels<F> {
             let values = ways.iter().map(|w| w.unwrap_or([F::ZERO; 3]));
             values.enumerate().for_each(|(r, w)| self.table.write(first + r, column, w));
             first += rows.len();
-            self.later.push(Later { question, rows });
+            all.push(Later { question, rows });
         }
+        self.later.push((channel.clone(), all));
     }
 
     fn flow_backward(
         &self,
         (d_table, column): (&Table<F>, usize),
+        channel: &Channel,
         source: Source<'_, F>,
         evaluation: &mut Evaluation<F>,
     ) {
-        let truth = source.view.flow.as_ref().expect("only views that know their flow ask for it");
+        let truth = channel.way(source.view).expect("only views that know their flow ask for it");
+        let (_, all) = self.later.iter().find(|(c, _)| c == channel).expect("what goes back was drawn");
         let mut first = 0;
-        for (&i, later) in source.asked.iter().zip(&self.later) {
+        for (&i, later) in source.asked.iter().zip(all) {
             // Where the flow goes nowhere in time, it tells the splats nothing.
             if later.question != i {
                 let (now, then) = (evaluation.tape(i).out(), evaluation.tape(later.question).out());

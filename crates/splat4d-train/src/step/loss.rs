@@ -158,7 +158,9 @@ mod tests {
             truth: &truth,
             mask: None,
             weight: None,
+            depth: None,
             flow: None,
+            tracks: None,
             frame: 0,
             rig: RIG,
         };

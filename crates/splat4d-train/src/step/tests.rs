@@ -1,6 +1,7 @@
 //! A made-up capture: a ring of cameras around a shaded ball that moves in front of a striped sky.
 
 mod bed;
+mod depth;
 mod flow;
 #[cfg(feature = "gpu")]
 mod gpu;

@@ -326,6 +326,7 @@ impl<'a> Trainer<'a> {
             self.draw_frames(taken, place),
             place < stage.half_size_steps,
             corrections,
+            Rng::new(self.settings.seed, "tracks", self.progress.iteration as u64),
         )?;
         if next < stage.iterations {
             self.frames.prefetch(&self.draw_frames(taken + 1, next));

@@ -3,6 +3,7 @@
 //! Everything is measured in pixels, angles and ratios: scenes may be in millimetres or kilometres.
 
 pub mod features;
+pub mod flow;
 mod matching;
 pub mod raster;
 #[cfg_attr(not(test), expect(dead_code, reason = "sizes to prune and near distances are to be measured by it"))]

@@ -131,7 +131,7 @@ pub(crate) fn spread(count: usize, most: usize) -> impl Iterator<Item = usize> {
 fn load(frames: &dyn Frames, i: usize) -> Result<(Camera, Picture)> {
     let mut picture = Picture::default();
     frames.load(i, &mut picture)?;
-    picture.flow = None;
+    (picture.depth, picture.flow) = (None, None);
     let mut camera = frames.camera(i).clone();
     while picture.color.pixels() > PIXELS {
         picture.halve();

@@ -168,8 +168,10 @@ fn capture(pinned: &Pinned, root: &Path, pictures: &[PathBuf], count: usize) -> 
             time,
             index: i,
             image,
+            depth: None,
             flow: None,
             labels: None,
+            tracks: None,
             mask: None,
         }
     };

@@ -117,3 +117,53 @@ fn what_is_no_flow_is_refused() {
     sample.edit("capture.json", |v| v["cameras"][1]["flow"] = json!("flow.png"));
     assert_says(&message(&sample), &["flow.png", "%04d"]);
 }
+
+/// The flow file of frame 0 of camera 1, with this ending, listed.
+fn write_other(sample: &Sample, ending: &str, bytes: &[u8]) {
+    let name = format!("flow/cam01/0005.{ending}");
+    sample.write(&name, bytes);
+    sample.edit("capture.json", |v| v["cameras"][1]["flow"] = json!([name]));
+}
+
+fn flo(mark: f32, vectors: &[[f32; 2]]) -> Vec<u8> {
+    let size = [WIDTH, HEIGHT].map(|s| (s as i32).to_le_bytes()).concat();
+    let numbers: Vec<u8> = vectors.iter().flatten().flat_map(|v| v.to_le_bytes()).collect();
+    [mark.to_le_bytes().to_vec(), size, numbers].concat()
+}
+
+#[test]
+fn flo_and_npy_are_read_as_pictures_are() {
+    let sample = sample(|_, _| Some([0.0; 2]));
+    let mut vectors = vec![[1.5f32, -2.25]; WIDTH * HEIGHT];
+    vectors[3] = [1e10, 1e10];
+    vectors[4] = [4000.0, 0.0];
+    write_other(&sample, "flo", &flo(202_021.25, &vectors));
+    let flow = load(&open(&sample, 1).unwrap(), 2).unwrap();
+    assert_eq!([0, 3, 4].map(|p| flow.plane(2)[p]), [1.0, 0.0, 0.0], "not known, and too far for the code");
+    assert_eq!([flow.plane(0)[9], flow.plane(1)[9]], [1.5, -2.25]);
+    let npy = |shape: &[usize], values: &[f32]| {
+        let mut bytes = Vec::new();
+        splat4d::format::npy::write_f32(shape, values, &mut bytes).unwrap();
+        bytes
+    };
+    let together: Vec<f32> = vectors.iter().flat_map(|[u, v]| [*u, *v, 1.0]).collect();
+    let apart: Vec<f32> = [0, 1].iter().flat_map(|&c| vectors.iter().map(move |v| v[c])).collect();
+    for bytes in [npy(&[HEIGHT, WIDTH, 3], &together), npy(&[2, HEIGHT, WIDTH], &apart)] {
+        write_other(&sample, "npy", &bytes);
+        assert_eq!(load(&open(&sample, 1).unwrap(), 2).unwrap(), flow);
+    }
+    let message = |sample: &Sample| ImageStore::new(open(sample, 1).unwrap(), 1 << 20).load(2).unwrap_err().to_string();
+    write_other(&sample, "npy", &npy(&[HEIGHT * WIDTH, 2, 1], &[0.0; 2 * WIDTH * HEIGHT]));
+    assert_says(&message(&sample), &["cam01", "frame 0", "0005.npy", "[height, width, 2]"]);
+    write_other(&sample, "npy", &npy(&[WIDTH, HEIGHT, 2], &[0.0; 2 * WIDTH * HEIGHT]));
+    assert_says(&message(&sample), &["0005.npy", "16x24", "24x16"]);
+    vectors[WIDTH + 2] = [f32::NAN, 0.0];
+    write_other(&sample, "flo", &flo(202_021.25, &vectors));
+    assert_says(&message(&sample), &["cam01", "frame 0", "0005.flo", "(2, 1) is not a number"]);
+    write_other(&sample, "flo", &flo(1.0, &vectors));
+    assert_says(&message(&sample), &["0005.flo", "202021.25"]);
+    write_other(&sample, "flo", &flo(202_021.25, &vectors)[..200]);
+    assert_says(&message(&sample), &["0005.flo", "cut short"]);
+    write_other(&sample, "flo", b"PIEH");
+    assert_says(&message(&sample), &["0005.flo", "cut short"]);
+}

@@ -2,7 +2,7 @@
 //! file says for all.
 
 use super::super::json::Node;
-use super::super::{Split, picture, pose, rig};
+use super::super::{DepthFile, DepthKind, Split, picture, pose, rig};
 use splat4d::scene::{Camera, Intrinsics, Lens};
 use splat4d::{Error, ErrorKind, Result};
 use std::f64::consts::PI;
@@ -22,6 +22,8 @@ pub(super) struct Entry {
     pub time: Option<f64>,
     /// The mask.
     pub mask: Option<PathBuf>,
+    /// The depth map.
+    pub depth: Option<DepthFile>,
     /// What it is for.
     pub split: Split,
 }
@@ -33,7 +35,22 @@ pub(super) fn read(root: &Path, top: &Node<'_>, node: &Node<'_>) -> Result<Entry
     let (source, by_angle) = camera(top, node, &|| Ok(image.clone()))?;
     let time = node.opt("time")?.map(|n| n.number()).transpose()?;
     let mask = node.opt("mask_path")?.map(|n| Ok(root.join(n.text()?))).transpose()?;
-    Ok(Entry { name: name.into(), image, source, by_angle, time, mask, split: Split::Train })
+    let depth = node.opt("depth_file_path")?.map(|n| depth(root, top, node, n.text()?)).transpose()?;
+    Ok(Entry { name: name.into(), image, source, by_angle, time, mask, depth, split: Split::Train })
+}
+
+/// Units of the scene a stored number of a depth map where a file does not say: thousandths, as Nerfstudio has it.
+const DEPTH_UNIT: f64 = 1e-3;
+
+/// A depth map in units of `depth_unit_scale_factor`, whatever its kind of file (Nerfstudio).
+fn depth(root: &Path, top: &Node<'_>, node: &Node<'_>, name: &str) -> Result<DepthFile> {
+    let key = "depth_unit_scale_factor";
+    let scale = number(top, node, key)?.unwrap_or(DEPTH_UNIT);
+    if scale <= 0.0 {
+        let what = format!("{key} is {scale}");
+        return Err(node.error(what).remedy("Give the scene units of a stored number, for instance 0.001"));
+    }
+    Ok(DepthFile { path: root.join(name), scale, kind: DepthKind::Metric })
 }
 
 /// The name and camera of a frame whose picture need not be there where the size is stated.

@@ -221,7 +221,9 @@ fn the_gradient_of_what_is_shown_moves_what_learns() {
             truth: &picture.color,
             mask: None,
             weight: None,
+            depth: None,
             flow: None,
+            tracks: None,
             frame: i,
             rig: 0,
         };

@@ -1,4 +1,4 @@
-//! Flow: what a pixel shows goes where the truth says.
+//! Flow and tracks: what a pixel shows goes where the truth says, by the next frame or by any other.
 
 use super::{Channel, ImageTerm, Needs, PictureGrads, SEEN, Shown, View, over_rows};
 use crate::loss::terms::StepInfo;
@@ -23,6 +23,24 @@ impl<F: Real> ImageTerm<F> for Flow {
     }
 }
 
+/// [`tracks()`] of views that know some, times a weight.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Tracks(pub f64);
+
+impl<F: Real> ImageTerm<F> for Tracks {
+    fn needs(&self, view: &View<'_, F>) -> Needs {
+        Needs { depth: false, extra: view.tracks.map(|_| Channel::Tracks).into_iter().collect() }
+    }
+
+    fn eval(&mut self, _: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64 {
+        let (Some(truth), Some((first, drawn))) = (&view.tracks, shown.channel(&Channel::Tracks)) else { return 0.0 };
+        let mut d_drawn = Planes::new(3, drawn.height, drawn.width);
+        let value = tracks(&drawn, truth.vectors, self.0, &mut d_drawn);
+        d.add_extra(first, &d_drawn);
+        value
+    }
+}
+
 /// Known flow is that of a whole pixel: of a mean of pixels all must be known.
 const KNOWN: f64 = 0.999;
 
@@ -31,6 +49,34 @@ const KNOWN: f64 = 0.999;
 /// Shapes: `drawn` [3, h, w] holds Σ α T f (2) and Σ α T of the splats that have an f; `d` adds up its gradient.
 /// Source: SC-GS (Huang et al. 2024) and GaussianFlow (Gao et al. 2024).
 pub(crate) fn flow<F: Real>(drawn: &Planes<F>, truth: &Planes<F>, weight: f64, d: &mut Planes<F>) -> f64 {
+    let sign = |e: F| if e > F::ZERO { F::ONE } else { -F::ONE };
+    compare(drawn, truth, weight, d, |e| (e[0].abs() + e[1].abs(), e.map(sign)))
+}
+
+/// Errors of tracks up to here cost their square, pixels.
+const HUBER: f64 = 3.0;
+
+/// Mean over pixels of tracked points that show something of h(‖F − F*‖₂) over the picture's longer side, F as in [`flow`] but
+/// to the time of the track's other end: r²/(2δ) to δ = 3 pixels, and r − δ/2 beyond (Huber). What the pixel shows is followed by
+/// the weights with which it is blended: the point is where these Gaussians are, and goes where they go.
+///
+/// Shapes: as [`flow`]. Source: Wang et al. 2024 (Shape of Motion), track reprojection, with Huber's penalty.
+pub(crate) fn tracks<F: Real>(drawn: &Planes<F>, truth: &Planes<F>, weight: f64, d: &mut Planes<F>) -> f64 {
+    let (delta, half) = (F::of(HUBER), F::of(0.5));
+    compare(drawn, truth, weight, d, |e| {
+        let r = (e[0] * e[0] + e[1] * e[1]).sqrt();
+        if r <= delta { (half * r * r / delta, e.map(|e| e / delta)) } else { (r - half * delta, e.map(|e| e / r)) }
+    })
+}
+
+/// Mean over pixels that are known and show something of a penalty of F − F*, which gives its value and slopes.
+fn compare<F: Real>(
+    drawn: &Planes<F>,
+    truth: &Planes<F>,
+    weight: f64,
+    d: &mut Planes<F>,
+    penalty: impl Fn([F; 2]) -> (F, [F; 2]) + Sync,
+) -> f64 {
     let n = drawn.pixels();
     assert!([drawn.data.len(), truth.data.len(), d.data.len()] == [3 * n; 3], "flow has three channels of {n} pixels");
     let shows = |p: usize| drawn.plane(2)[p] >= F::of(SEEN) && truth.plane(2)[p] >= F::of(KNOWN);
@@ -49,13 +95,12 @@ pub(crate) fn flow<F: Real>(drawn: &Planes<F>, truth: &Planes<F>, weight: f64, d
                 continue;
             }
             let w = drawn.plane(2)[p];
+            let f = [0, 1].map(|k| drawn.plane(k)[p] / w);
+            let (value, slopes) = penalty([f[0] - truth.plane(0)[p], f[1] - truth.plane(1)[p]]);
+            sum += value.f64();
             for k in 0..2 {
-                let f = drawn.plane(k)[p] / w;
-                let e = f - truth.plane(k)[p];
-                sum += e.abs().f64();
-                let sign = if e > F::ZERO { F::ONE } else { -F::ONE };
-                g[k] = factor * sign / w;
-                g[2] -= factor * sign * f / w;
+                g[k] = factor * slopes[k] / w;
+                g[2] -= factor * slopes[k] * f[k] / w;
             }
         }
         sum
@@ -78,6 +123,13 @@ mod tests {
         drawn.plane_mut(2)[7] = 0.3;
         let mut truth = check::planes("truth", [3, 5, 8], -2.0, 2.0);
         truth.plane_mut(2).iter_mut().enumerate().for_each(|(i, v)| *v = f64::from(u8::from(i % 3 > 0)));
+        let far = Planes { data: truth.data.iter().map(|x| 5.0 * x).collect(), ..truth.clone() };
+        let far = Planes { data: [&far.data[..80], &truth.data[80..]].concat(), ..far };
+        for truth in [&truth, &far] {
+            let run = |p: &[Planes<f64>], d: &mut [Planes<f64>]| tracks(&p[0], truth, 0.7, &mut d[0]);
+            let value = check::gradients(&[drawn.clone()], run, |p| run(p, &mut [Planes::new(3, 5, 8)]));
+            assert!(value > 0.005, "near and far errors have slopes of their own");
+        }
         let run = |p: &[Planes<f64>], d: &mut [Planes<f64>]| flow(&p[0], &truth, 0.7, &mut d[0]);
         let value = check::gradients(&[drawn.clone()], run, |p| run(p, &mut [Planes::new(3, 5, 8)]));
         assert!(value > 0.01);

@@ -1,9 +1,10 @@
 //! Losses on a rendered picture, each an [`ImageTerm`]: photometric, total variation, frequencies, masks, entropy of alpha,
-//! agreement of depth and normals, flow.
+//! agreement of depth and normals, known depth, flow.
 //!
 //! Each *adds* `weight` times its gradient and returns `weight` times its value, and gives the same bits with any number
 //! of threads. `terms` is the list of those that a recipe asks for.
 
+pub(crate) mod depth;
 pub(crate) mod entropy;
 mod fft;
 pub(crate) mod flow;
@@ -30,14 +31,16 @@ pub(crate) const SEEN: f64 = 0.5;
 /// has a weight.
 pub(crate) fn terms(r: &Recipe) -> Vec<Box<dyn ImageTerm>> {
     type Make = fn(f64) -> Box<dyn ImageTerm>;
-    let weighted: [(f64, Make); 7] = [
+    let weighted: [(f64, Make); 9] = [
         (r.loss.tv, |w| Box::new(tv::TotalVariation(w))),
         (r.loss.frequency, |w| Box::new(frequency::FrequencyTerm::new(w))),
         (r.loss.mask, |w| Box::new(mask::Mask(w))),
         (r.loss.mask_entropy, |w| Box::new(entropy::MaskEntropy(w))),
         (r.loss.depth_tv, |w| Box::new(tv::DepthSmoothness(w))),
         (r.loss.depth_normal, |w| Box::new(normal::DepthNormal(w))),
+        (r.loss.depth, |w| Box::new(depth::Depth(w))),
         (r.loss.flow, |w| Box::new(flow::Flow(w))),
+        (r.loss.tracks, |w| Box::new(flow::Tracks(w))),
     ];
     let photometric: Box<dyn ImageTerm> = Box::new(Photometric::new(r.loss.dssim as f32));
     let weighted = weighted.into_iter().filter(|(weight, _)| *weight > 0.0).map(|(weight, make)| make(weight));

@@ -1,7 +1,7 @@
 //! The contract of losses on rendered pictures, [`ImageTerm`]: it says which channels it needs, looks at a picture and its
 //! truth, and adds its gradient.
 
-use crate::capture::frames::FlowTruth;
+use crate::capture::frames::{DepthTruth, FlowTruth};
 use crate::loss::LossValue;
 use crate::loss::terms::StepInfo;
 use splat4d::math::Real;
@@ -23,8 +23,12 @@ pub struct View<'a, F = f32> {
     pub mask: Option<&'a Planes<F>>,
     /// Pixels that count, 1 channel.
     pub weight: Option<&'a Planes<F>>,
+    /// How far away what it shows is, as far as that is known.
+    pub depth: Option<DepthTruth<'a, F>>,
     /// Where its pixels go, as far as that is known.
     pub flow: Option<FlowTruth<'a, F>>,
+    /// Where tracked points are at another time: flow that is known in their pixels alone.
+    pub tracks: Option<FlowTruth<'a, F>>,
     /// The frame's number in the capture, for messages.
     pub frame: usize,
     /// The camera's number in the capture, for the exposure.
@@ -40,6 +44,8 @@ pub enum Channel {
     /// Σ α T f, f the way of a splat's centre on the screen to where the view's flow goes, pixels, 2 planes, and Σ α T of
     /// the splats that have an f. Only views that know their flow may ask for it.
     Flow,
+    /// The same for where the view's tracks go.
+    Tracks,
     /// Σ α T s, s the sigmoid of this column of the Gaussians, 1 plane; 0 in layers without that column, and not drawn where
     /// no layer has it.
     Sigmoid(String),
@@ -49,15 +55,24 @@ impl Channel {
     /// Its planes.
     pub(crate) fn width(&self) -> usize {
         match self {
-            Channel::Normals | Channel::Flow => 3,
+            Channel::Normals | Channel::Flow | Channel::Tracks => 3,
             Channel::Sigmoid(_) => 1,
         }
     }
 
     /// The other time at which it looks at the view's splats.
-    pub fn other_time<F>(&self, view: &View<'_, F>) -> Option<Time> {
+    pub fn other_time<F: Copy>(&self, view: &View<'_, F>) -> Option<Time> {
         match self {
-            Channel::Flow => Some(view.flow.as_ref()?.to),
+            Channel::Flow | Channel::Tracks => Some(self.way(view)?.to),
+            Channel::Normals | Channel::Sigmoid(_) => None,
+        }
+    }
+
+    /// What is known of the way that it draws.
+    pub(crate) fn way<'a, F: Copy>(&self, view: &View<'a, F>) -> Option<FlowTruth<'a, F>> {
+        match self {
+            Channel::Flow => view.flow,
+            Channel::Tracks => view.tracks,
             Channel::Normals | Channel::Sigmoid(_) => None,
         }
     }

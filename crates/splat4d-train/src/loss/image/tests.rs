@@ -23,7 +23,19 @@ fn view<'a, F>(camera: &'a Camera, truth: &'a Planes<F>, mask: Option<&'a Planes
 where
     F: Real,
 {
-    View { camera, t: Time(0.0), background: [F::ZERO; 3], truth, mask, weight: None, flow: None, frame: 0, rig: 0 }
+    View {
+        camera,
+        t: Time(0.0),
+        background: [F::ZERO; 3],
+        truth,
+        mask,
+        weight: None,
+        depth: None,
+        flow: None,
+        tracks: None,
+        frame: 0,
+        rig: 0,
+    }
 }
 
 fn info() -> StepInfo {
@@ -104,12 +116,13 @@ fn what_terms_need_is_drawn_once_and_in_one_order() {
 
 #[test]
 fn a_recipe_lists_the_terms_that_have_a_weight() {
-    let mut recipe = Recipe::default();
+    // Known depth costs nothing where there is none, and counts where there is.
+    let mut recipe = Recipe::default().with(|r| r.loss.depth = 0.0);
     let count = |r: &Recipe| terms(r).len();
     assert_eq!(count(&recipe), 1, "colours alone");
-    for knob in ["tv", "frequency", "mask", "mask_entropy", "depth_tv", "depth_normal", "flow"] {
+    for knob in ["tv", "frequency", "mask", "mask_entropy", "depth_tv", "depth_normal", "depth", "flow", "tracks"] {
         let before = count(&recipe);
-        recipe.set(&format!("lambda_{knob}=0.1")).unwrap();
+        recipe.set(&format!("loss.{knob}=0.1")).unwrap();
         assert_eq!(count(&recipe), before + 1, "{knob}");
     }
 }

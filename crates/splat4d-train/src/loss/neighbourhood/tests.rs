@@ -32,7 +32,17 @@ fn info(iteration: usize) -> StepInfo {
 }
 
 fn all() -> MotionWeights {
-    MotionWeights { rigid: 0.3, rot: 0.2, iso: 0.5, arap: 0.7, elastic: 0.1, velocity: 0.01, jerk: 0.4 }
+    MotionWeights {
+        rigid: 0.3,
+        rot: 0.2,
+        iso: 0.5,
+        arap: 0.7,
+        elastic: 0.1,
+        velocity: 0.01,
+        jerk: 0.4,
+        acceleration: 0.2,
+        least: 0.3,
+    }
 }
 
 /// Answers of no model in particular.

@@ -49,11 +49,13 @@ fn run(scene: &Scene<f64>, needs: &Needs, backend: &mut dyn Backend<f64>) -> (f6
             truth: &shots[i].truth,
             mask: None,
             weight: None,
+            depth: None,
             flow: Some(FlowTruth {
                 to: Time(if i == 0 { 0.1 } else { 0.15 }),
                 camera: &shots[1 - i].camera,
                 vectors: &shots[i].truth,
             }),
+            tracks: Some(FlowTruth { to: Time(0.12), camera: &shots[i].camera, vectors: &shots[i].truth }),
             frame: 0,
             rig: 0,
         })
@@ -75,7 +77,7 @@ fn depth_normals_and_flow_have_the_gradient_of_their_values() {
         // Opacity logits stand for a learnt column: it is the sigmoid of any.
         let sigmoid = Channel::Sigmoid("opacity_logits".to_owned());
         for needs in [
-            Needs { depth: true, extra: vec![Channel::Normals, Channel::Flow, sigmoid] },
+            Needs { depth: true, extra: vec![Channel::Normals, Channel::Flow, Channel::Tracks, sigmoid] },
             Needs { depth: false, extra: vec![Channel::Flow] },
             Needs { depth: true, extra: vec![] },
         ] {

@@ -164,7 +164,9 @@ fn step(
             truth: &s.truth,
             mask: None,
             weight: None,
+            depth: None,
             flow: None,
+            tracks: None,
             frame: 0,
             rig: 0,
         })

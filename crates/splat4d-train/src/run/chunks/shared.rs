@@ -157,7 +157,7 @@ fn of_medians(recipe: &Recipe) -> Recipe {
         r.capture.downscale = 1;
         r.capture.hold_out = Some(HoldOut::None);
         (r.capture.first_frame, r.capture.max_frames, r.capture.fps) = (0, 0, 0.0);
-        r.loss.flow = 0.0;
+        (r.loss.depth, r.loss.flow, r.loss.tracks) = (0.0, 0.0, 0.0);
         r.life.kind = None;
         if r.init.source == Source::Hull {
             r.init.source = Source::Auto;

@@ -160,7 +160,9 @@ fn the_tie_is_the_mean_difference_to_the_neighbour_where_both_are() {
             truth: &truth,
             mask: None,
             weight: None,
+            depth: None,
             flow: None,
+            tracks: None,
             frame: 0,
             rig: 0,
         };

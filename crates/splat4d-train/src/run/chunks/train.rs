@@ -10,6 +10,7 @@ use crate::init::{self, Seeds};
 use crate::methods::{Plan, program_of, stages};
 use crate::recipe::Recipe;
 use crate::run::checkpoint;
+use crate::run::flows;
 use crate::run::open::{OpenCapture, check_flow, open_frames};
 use crate::run::points;
 use crate::run::refine::{Refine, refine};
@@ -47,6 +48,7 @@ pub(super) fn train(
     let program = program_of(&recipe)?;
     program.check(&opened.plan(&recipe))?;
     let opened = points::complete(opened, &recipe, &folder, &mut listen)?;
+    let opened = flows::complete(opened, &recipe, &folder, &mut listen)?;
     let plan = opened.plan(&recipe);
     let shared = shared::read(&chunked.folder(Part::Shared))?;
     let neighbours = neighbours(chunked, chunk, &opened.capture)?;

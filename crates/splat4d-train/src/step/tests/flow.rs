@@ -87,3 +87,71 @@ fn known_flow_teaches_motion() {
     unread.load(0, &mut picture).unwrap();
     assert!(picture.flow.is_none(), "without the loss nobody decodes it");
 }
+
+#[test]
+fn flow_of_our_own_is_followed_once_and_kept_beside_the_run() {
+    let place = Place::new();
+    let own = recipe(&["lambda_flow=1", "capture.flow=own"]);
+    place.train("own", &own).unwrap();
+    let folder = place.run("own").join("flow");
+    let mark = std::fs::read(folder.join("of.txt")).unwrap();
+    let opened = place.open(&own);
+    let camera = opened.frames[opened.train[0]].camera;
+    let picture = folder.join(format!("{camera:03}/000000.png"));
+    let first = std::fs::read(&picture).unwrap();
+    assert!(!folder.join(format!("{camera:03}/000002.png")).exists(), "the last frame leads nowhere");
+    // As long as the mark is of the same capture the files are taken at their word.
+    let frames = training_frames(place.open(&own), &own).unwrap();
+    let camera = frames.camera(0);
+    ImageBuffer::from_fn(camera.width as u32, camera.height as u32, |_, _| Rgb([32768u16 + 64, 32768, 1]))
+        .save(&picture)
+        .unwrap();
+    let (_, capture) = crate::run::open_run(&place.run("own")).unwrap();
+    let capture = std::sync::Arc::new(capture);
+    let store = crate::capture::ImageStore::new(capture.clone(), 0);
+    let flow = store.load(capture.train[0]).unwrap().to_picture().flow.unwrap();
+    assert!(flow.plane(0).iter().all(|u| *u == 1.0) && flow.plane(2).iter().all(|k| *k == 1.0));
+    std::fs::remove_dir_all(place.run("own").join("checkpoints")).unwrap();
+    place.train("own", &own).unwrap();
+    assert_ne!(std::fs::read(&picture).unwrap(), first, "it was kept");
+    std::fs::write(folder.join("of.txt"), b"another capture").unwrap();
+    std::fs::remove_dir_all(place.run("own").join("checkpoints")).unwrap();
+    place.train("own", &own).unwrap();
+    assert_eq!(std::fs::read(&picture).unwrap(), first, "it is followed anew");
+    assert_eq!(std::fs::read(folder.join("of.txt")).unwrap(), mark);
+}
+
+#[test]
+fn flow_that_runs_backwards_is_refused_by_file_and_frame() {
+    let place = Place::new();
+    let all = recipe(&["lambda_flow=1"]);
+    // Pictures of noise, each the one before moved by three pixels to the right.
+    let capture = place.open(&recipe(&[]));
+    let marker = capture.root.join("capture.json");
+    let mut json: Value = serde_json::from_slice(&std::fs::read(&marker).unwrap()).unwrap();
+    for (k, camera) in json["cameras"].as_array_mut().unwrap().iter_mut().enumerate() {
+        camera["flow"] = json!(format!("flow/{k}/%04d.png"));
+        std::fs::create_dir_all(capture.root.join(format!("flow/{k}"))).unwrap();
+    }
+    std::fs::write(&marker, json.to_string()).unwrap();
+    let write = |[u, v]: [f64; 2]| {
+        for frame in &capture.frames {
+            let noise = splat4d::math::Rng::new(frame.camera as u64, "noise", 0);
+            let pixel = |x: u32, y: u32| {
+                let at = u64::from(y) * 1000 + (u64::from(x) + 500 - 3 * frame.index as u64);
+                Rgb([0, 1, 2].map(|c| (255.0 * noise.uniform(3 * at + c)) as u8))
+            };
+            let size = [frame.view.width as u32, frame.view.height as u32];
+            ImageBuffer::from_fn(size[0], size[1], pixel).save(&frame.image).unwrap();
+            let code = |v: f64| (v * 64.0 + 32768.0).round() as u16;
+            let path = capture.root.join(format!("flow/{}/{:04}.png", frame.camera, frame.index));
+            ImageBuffer::from_fn(size[0], size[1], |_, _| Rgb([code(u), code(v), 1])).save(path).unwrap();
+        }
+    };
+    write([-3.0, 0.0]);
+    let text = place.train("back", &all).unwrap_err().to_string();
+    assert!(["backwards", "0000.png", "frame 0", "camera"].iter().all(|word| text.contains(word)), "{text}");
+    write([0.0, 3.0]);
+    let text = place.train("turned", &all).unwrap_err().to_string();
+    assert!(["u and v", "0000.png", "frame 0"].iter().all(|word| text.contains(word)), "{text}");
+}

@@ -86,7 +86,13 @@ fn a_flickering_copy_of_the_backdrop_goes_and_the_picture_stays() {
         truth.layers[0].params[LIFE].write(r, 0, [0.4, 3f32.ln()]);
     }
     let frames = made();
-    let picture = |i: usize| Picture { color: drawn(&truth, &frames, i).color, mask: None, weight: None, flow: None };
+    let picture = |i: usize| Picture {
+        color: drawn(&truth, &frames, i).color,
+        mask: None,
+        weight: None,
+        depth: None,
+        flow: None,
+    };
     let pictures = (0..frames.len()).map(picture).collect();
     let frames = Arc::new(Drawn { frames, pictures });
 

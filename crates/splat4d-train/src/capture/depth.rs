@@ -1,0 +1,183 @@
+//! Depth maps on disk: 16-bit grey PNG, `.npy` or OpenEXR; z along the camera's axis in scene units, or known up to a scale
+//! and a shift only, as networks that look at a single picture tell it.
+//!
+//! In memory a map is that of the pinhole view, [height, width], and 0 where nothing is known.
+
+use super::Frame;
+use super::exr;
+use super::json;
+use super::lens::Distortion;
+use super::picture::{self, Samples};
+use splat4d::format::npy::Npy;
+use splat4d::scene::Camera;
+use splat4d::{Error, Result};
+use std::path::{Path, PathBuf};
+
+/// Lengths from here on are no depth: renderers write 10¹⁰ or infinity where nothing is hit.
+const NOWHERE: f32 = 1e9;
+/// Pixels of a box of which one is made belong to one surface if their values are within this share of the largest: the
+/// mean over an edge is nobody's depth (docs of scene flow: bilinear samples within 5 %).
+const ONE_SURFACE: f32 = 0.05;
+
+/// What the numbers of a depth map are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum DepthKind {
+    /// z along the camera's axis, scene units.
+    Metric,
+    /// a z + b with a and b of each picture's own, a > 0.
+    Relative,
+    /// a / z + b with a and b of each picture's own, a > 0: disparity.
+    Inverse,
+}
+
+impl DepthKind {
+    /// Its names in `capture.json`.
+    pub(super) const NAMES: [(&'static str, Self); 3] =
+        [("metric", Self::Metric), ("relative", Self::Relative), ("inverse", Self::Inverse)];
+}
+
+/// The depth map of a frame: its file, and how it is read.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DepthFile {
+    /// The map.
+    pub path: PathBuf,
+    /// Scene units a stored number; no matter but for metric ones.
+    pub scale: f64,
+    /// What it tells.
+    pub kind: DepthKind,
+}
+
+/// A frame's depth, [height, width] of its view, 0: not known. Errors: no depth map, of another shape than the picture,
+/// numbers that are none.
+pub(super) fn read(file: &DepthFile, frame: &Frame, downscale: usize) -> Result<Vec<f32>> {
+    let map = Map::read(file)?;
+    check(&map, file)?;
+    let source = &frame.source;
+    if (map.width, map.height) != (source.width, source.height) && !picture::is_resized((map.width, map.height), source)
+    {
+        let what =
+            format!("the depth map is {}x{}, its picture {}x{}", map.width, map.height, source.width, source.height);
+        return Err(Error::input(what)
+            .at(file.path.display())
+            .remedy("Write it in the picture's shape (it may be smaller or larger as a whole)"));
+    }
+    let full = straighten(&map, source);
+    Ok(reduce(&full, source.width, source.height, downscale))
+}
+
+/// The mean of k×k boxes that lie on one surface; 0 where a box lies on several or any of its pixels is not known.
+pub(super) fn reduce(map: &[f32], width: usize, height: usize, k: usize) -> Vec<f32> {
+    if k == 1 {
+        return map.to_vec();
+    }
+    let mut out = Vec::with_capacity((width / k) * (height / k));
+    for y in 0..height / k {
+        for x in 0..width / k {
+            let pixels = || (0..k * k).map(|i| map[(y * k + i / k) * width + x * k + i % k]);
+            let (mut low, mut high, mut sum) = (f32::INFINITY, f32::NEG_INFINITY, 0.0);
+            for v in pixels() {
+                (low, high, sum) = (low.min(v), high.max(v), sum + v);
+            }
+            let known = pixels().all(|v| v != 0.0);
+            let one = high - low <= ONE_SURFACE * high.abs().max(low.abs());
+            out.push(if known && one { sum / (k * k) as f32 } else { 0.0 });
+        }
+    }
+    out
+}
+
+/// A map as its file has it, in scene units where it is metric.
+struct Map {
+    width: usize,
+    height: usize,
+    values: Vec<f32>,
+}
+
+impl Map {
+    fn read(file: &DepthFile) -> Result<Self> {
+        let path = &file.path;
+        let mut map = match path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase).as_deref() {
+            Some("npy") => Self::npy(path)?,
+            Some("exr") => {
+                let (width, height, values) = exr::read(&json::read_bytes(path)?).map_err(|e| e.at(path.display()))?;
+                Self { width, height, values }
+            }
+            _ => Self::picture(file)?,
+        };
+        let known = |v: f32| if v >= NOWHERE { 0.0 } else { (f64::from(v) * file.scale) as f32 };
+        map.values.iter_mut().for_each(|v| *v = known(*v));
+        Ok(map)
+    }
+
+    fn npy(path: &Path) -> Result<Self> {
+        let array = Npy::read(&json::read_bytes(path)?).map_err(|e| e.at(path.display()))?;
+        let (height, width) = match array.shape[..] {
+            [h, w] | [h, w, 1] | [1, h, w] => (h, w),
+            _ => {
+                return Err(Error::input(format!("a depth map is [height, width], this array is {:?}", array.shape))
+                    .at(path.display())
+                    .remedy("Save one map a file: numpy.save(path, depth.astype('f4'))"));
+            }
+        };
+        Ok(Self { width, height, values: array.to_f32() })
+    }
+
+    fn picture(file: &DepthFile) -> Result<Self> {
+        let raster = picture::decode(&file.path, None)?;
+        let bad = |what: String| {
+            Err(Error::input(what)
+                .at(file.path.display())
+                .remedy("Write one channel of 16 bits (or .npy or .exr), 0 where nothing is known"))
+        };
+        if raster.channels != 1 {
+            return bad(format!("the depth map has {} channels, not 1", raster.channels));
+        }
+        let values = match raster.samples {
+            Samples::Sixteen(v) => v.into_iter().map(f32::from).collect(),
+            // What networks tell is often kept so; lengths are not to be told in 255 steps.
+            Samples::Eight(v) if file.kind != DepthKind::Metric => v.into_iter().map(f32::from).collect(),
+            Samples::Eight(_) => return bad("the depth map has 8 bits, not 16".into()),
+        };
+        Ok(Self { width: raster.width, height: raster.height, values })
+    }
+}
+
+/// Errors: numbers that are none; lengths below zero; nothing known at all.
+fn check(map: &Map, file: &DepthFile) -> Result<()> {
+    let wrong = |v: &f32| !v.is_finite() || file.kind == DepthKind::Metric && *v < 0.0;
+    let count = map.values.iter().filter(|v| wrong(v)).count();
+    if let Some(p) = map.values.iter().position(|v| wrong(v)) {
+        let what = format!(
+            "the depth at pixel ({}, {}) is {} ({count} pixels of {} are like it)",
+            p % map.width.max(1),
+            p / map.width.max(1),
+            map.values[p],
+            map.values.len()
+        );
+        return Err(Error::input(what).at(file.path.display()).remedy("Write 0 where depth is not known"));
+    }
+    if map.values.iter().all(|v| *v == 0.0) {
+        return Err(Error::input("the depth map knows no pixel: all of it is 0")
+            .at(file.path.display())
+            .remedy("Leave the map out of the capture, or write it again"));
+    }
+    Ok(())
+}
+
+/// At the size of the picture's pinhole view, each pixel as the nearest one of the map: means across an edge are nobody's.
+/// Undistortion keeps rays, and so z.
+fn straighten(map: &Map, camera: &Camera) -> Vec<f32> {
+    let (lens, k) = (Distortion::new(camera.lens), &camera.intrinsics);
+    if lens.is_pinhole() && (map.width, map.height) == (camera.width, camera.height) {
+        return map.values.clone();
+    }
+    let scale = [map.width as f64 / camera.width as f64, map.height as f64 / camera.height as f64];
+    let pixel = |p: usize| {
+        let (x, y) = ((p % camera.width) as f64 + 0.5, (p / camera.width) as f64 + 0.5);
+        let [u, v] = lens.distort([(x - k.cx) / k.fx, (y - k.cy) / k.fy])?;
+        let seen = [(k.fx * u + k.cx) * scale[0], (k.fy * v + k.cy) * scale[1]];
+        let inside = (0.0..map.width as f64).contains(&seen[0]) && (0.0..map.height as f64).contains(&seen[1]);
+        inside.then(|| map.values[seen[1] as usize * map.width + seen[0] as usize])
+    };
+    (0..camera.width * camera.height).map(|p| pixel(p).unwrap_or(0.0)).collect()
+}

@@ -1,0 +1,94 @@
+//! Optical flow of our own, where a capture brings none and the recipe asks for it: followed once from every training
+//! picture to the next one of its camera, kept beside the run in `flow/`, and from then on the capture's own.
+
+use super::checkpoint::write_atomically;
+use super::identity::fingerprint;
+use super::open::{OpenCapture, training_frames};
+use crate::capture::frames::{Frames, Picture};
+use crate::capture::{Capture, FlowFile, FlowSource, flow_picture};
+use crate::event::{Event, Progress};
+use crate::recipe::Recipe;
+use crate::vision::flow::{Pyramid, dense};
+use crate::vision::raster::grey;
+use crate::{Error, Result};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// The folder beside the run, and the file that says what its flow is of.
+const FOLDER: &str = "flow";
+const MARK: &str = "of.txt";
+/// The next training picture may be so many frames later: one between them may be held out.
+const MOST_FRAMES: usize = 2;
+
+/// The capture with flow between its training pictures, where it brings none and the recipe wants our own.
+pub(super) fn complete(
+    opened: OpenCapture,
+    recipe: &Recipe,
+    run: &Path,
+    listen: &mut dyn FnMut(&Event),
+) -> Result<OpenCapture> {
+    let capture = &opened.capture;
+    let wanted = wanted(capture, recipe, run);
+    if wanted.is_empty() {
+        return Ok(opened);
+    }
+    let mark = format!("{} {}", fingerprint(capture), env!("CARGO_PKG_VERSION"));
+    let kept = std::fs::read(run.join(FOLDER).join(MARK)).is_ok_and(|text| text == mark.as_bytes());
+    if !kept {
+        let mut progress = Progress(listen);
+        // Of most pictures the pyramid is needed twice: as where flow comes from and where it goes.
+        let mut last: Option<(usize, Pyramid)> = None;
+        for (done, (frame, file)) in wanted.iter().enumerate() {
+            progress.phase("flow from pictures", done, wanted.len());
+            let from = match last.take().filter(|(i, _)| i == frame) {
+                Some((_, pyramid)) => pyramid,
+                None => pyramid(&opened, *frame)?,
+            };
+            let to = pyramid(&opened, file.to)?;
+            let mut bytes = std::io::Cursor::new(Vec::new());
+            let picture = flow_picture(&dense(&from, &to));
+            picture
+                .write_to(&mut bytes, image::ImageFormat::Png)
+                .map_err(|e| Error::input(format!("the flow picture cannot be made: {e}")).at(file.path.display()))?;
+            write_atomically(&file.path, &bytes.into_inner())?;
+            last = Some((file.to, to));
+        }
+        write_atomically(&run.join(FOLDER).join(MARK), mark.as_bytes())?;
+    }
+    let completed = with_found(Capture::clone(capture), recipe, run);
+    Ok(OpenCapture::with(training_frames(Arc::new(completed), recipe)?).on(opened.device))
+}
+
+/// The capture with the flow that was followed for a run, if any was.
+pub(crate) fn with_found(mut capture: Capture, recipe: &Recipe, run: &Path) -> Capture {
+    for (frame, file) in wanted(&capture, recipe, run) {
+        if file.path.is_file() {
+            capture.frames[frame].flow = Some(file);
+        }
+    }
+    capture
+}
+
+/// Training frames without flow, each with where its own is kept; none where nobody asks for it.
+fn wanted(capture: &Capture, recipe: &Recipe, run: &Path) -> Vec<(usize, FlowFile)> {
+    if recipe.loss.flow == 0.0 || recipe.capture.flow != FlowSource::Own {
+        return Vec::new();
+    }
+    let mut order = capture.train.clone();
+    order.sort_by_key(|&i| (capture.frames[i].camera, capture.frames[i].index));
+    let pair = |w: &[usize]| {
+        let [from, to] = [w[0], w[1]].map(|i| &capture.frames[i]);
+        let follows = from.camera == to.camera && (1..=MOST_FRAMES).contains(&(to.index - from.index));
+        let same = (from.view.width, from.view.height) == (to.view.width, to.view.height);
+        let path: PathBuf = run.join(FOLDER).join(format!("{:03}", from.camera)).join(format!("{:06}.png", from.index));
+        (follows && same && from.flow.is_none()).then(|| (w[0], FlowFile { path, to: w[1], of_view: true }))
+    };
+    order.windows(2).filter_map(pair).collect()
+}
+
+fn pyramid(opened: &OpenCapture, frame: usize) -> Result<Pyramid> {
+    let place = opened.capture.train.binary_search(&frame).expect("flow is between training pictures");
+    let mut picture = Picture::default();
+    opened.frames.load(place, &mut picture)?;
+    Ok(Pyramid::new(grey(&picture.color)))
+}
