@@ -29,6 +29,8 @@ pub const RASTERIZE: &str = include_str!("gpu/rasterize.wgsl");
 pub const BYTES: &str = include_str!("gpu/bytes.wgsl");
 /// The blend's way back: a record a (tile, splat) pair. After [`PROJECT`].
 pub const RASTERIZE_BACK: &str = include_str!("gpu/rasterize_back.wgsl");
+/// A picture compared with its truth: L1, D-SSIM and their gradient: `moments`, `gradient`.
+pub const LOSS: &str = include_str!("gpu/loss.wgsl");
 /// A splat's records added up.
 pub const GATHER: &str = include_str!("gpu/gather.wgsl");
 /// Those sums → gradients of Gaussians and pose. After [`PROJECT`] and [`PROJECT_BACK`].
@@ -49,7 +51,7 @@ mod tests {
 
     #[test]
     fn every_shader_is_valid_within_webgpus_default_limits() {
-        let shaders: [(&str, &[&str]); 13] = [
+        let shaders: [(&str, &[&str]); 14] = [
             ("project and shade", &[PROJECT, SHADE]),
             ("sort", &[SORT]),
             ("splats", &[PROJECT, SHADE, SPLATS]),
@@ -60,6 +62,7 @@ mod tests {
             ("rasterize", &[PROJECT, RASTERIZE]),
             ("rasterize, backward", &[PROJECT, RASTERIZE_BACK]),
             ("bytes", &[PROJECT, BYTES]),
+            ("loss", &[LOSS]),
             ("gather", &[GATHER]),
             ("roofline", &[ROOFLINE]),
             ("splats, backward", &[PROJECT, PROJECT_BACK, SPLATS_BACK]),

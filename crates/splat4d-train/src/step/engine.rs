@@ -1,7 +1,7 @@
 //! [`Engine`]: takes steps on a learner. The processor's is [`CpuEngine`]; one whose tables stay on a device can stand in its
 //! place, since a plan says all that a step is of, and a learner says what happened to it between steps.
 
-use super::chain::{Chain, Losses, Step, StepInfo, StepReport, View};
+use super::chain::{Chain, ImageTerm, Losses, Step, StepInfo, StepReport, View};
 use super::loss::TrainLoss;
 use crate::Result;
 use crate::learner::{Learner, Parts};
@@ -10,7 +10,7 @@ use crate::optim::Floor;
 use crate::upkeep::Change;
 use splat4d::layers::Scene;
 use splat4d::math::Rng;
-use splat4d::render::{Antialias, Backend};
+use splat4d::render::{Antialias, Backend, Wanted};
 use splat4d::scene::life::LOG_WIDTH;
 use splat4d::scene::{Grads, Key, LIFE, SH};
 use std::time::{Duration, Instant as Clock};
@@ -88,6 +88,8 @@ pub struct CpuEngine<'a> {
     shown: Scene<f32>,
     /// Whether `shown` is to be copied from the scene anew.
     stale: bool,
+    /// Whether it was said that pictures are compared on the CPU.
+    told: bool,
 }
 
 impl<'a> CpuEngine<'a> {
@@ -100,8 +102,10 @@ impl<'a> CpuEngine<'a> {
             rates: Vec::new(),
             shown: Scene::default(),
             stale: true,
+            told: false,
         }
     }
+
 
     /// Brings what the stage's codec shows up to date.
     fn show(&mut self, scene: &Scene<f32>, plan: &StepPlan<'_>) {
@@ -119,6 +123,10 @@ impl<'a> CpuEngine<'a> {
         let scene = if plan.stage.codec.is_some() { &self.shown } else { &*scene };
         let Stage { pictures, probes, params, .. } = &mut *plan.stage;
         let mut image = plan.loss.of_step(pictures, exposure);
+        if !self.told && compares(self.backend.as_ref()) && plan.views.iter().any(|v| image.target(v).is_none()) {
+            out.notices.push("the CPU compares pictures: the recipe's loss on them is more than L1 and D-SSIM".into());
+            self.told = true;
+        }
         let mut losses = Losses { image: &mut image, probes, params };
         let step = Step { scene, views: plan.views, info: plan.info, sh_degree: plan.sh_degree };
         let (backend, grads) = (self.backend.as_mut(), &mut self.grads);
@@ -190,6 +198,11 @@ impl<'a> CpuEngine<'a> {
         let rng = Rng::new(plan.info.seed, "noise", plan.info.iteration as u64);
         noise.add(learner.parts_mut().scene, &self.grads, rate, plan.min_opacity, rng);
     }
+}
+
+/// Whether a backend compares pictures, where the loss lets it.
+fn compares(backend: &dyn Backend) -> bool {
+    backend.can(&Wanted { compare: true, ..Wanted::default() }).is_ok()
 }
 
 impl Engine for CpuEngine<'_> {

@@ -16,10 +16,12 @@ pub(super) enum Stage {
     RasterizeBack,
     Gather,
     SplatsBack,
+    // Last, because the stages of one submission follow each other in this list, and a way back need not compare.
+    Loss,
 }
 
 /// Number of stages.
-pub(super) const STAGES: usize = 9;
+pub(super) const STAGES: usize = 10;
 
 /// Source of the stages' times.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -55,6 +57,8 @@ pub struct GpuTimings {
     pub gather: f64,
     /// Projection, backward.
     pub splats_back: f64,
+    /// Comparing the picture with its truth, and the gradient to it.
+    pub loss: f64,
     /// From the last submission to the picture in the CPU's memory, the GPU's work included.
     pub wait: f64,
     /// The whole call.
@@ -69,7 +73,7 @@ impl GpuTimings {
     /// The GPU's stages together; 0 where they were not timed.
     pub fn gpu(&self) -> f64 {
         let forward = self.project + self.compact + self.sort_splats + self.tiles + self.sort_pairs + self.rasterize;
-        forward + self.rasterize_back + self.gather + self.splats_back
+        forward + self.loss + self.rasterize_back + self.gather + self.splats_back
     }
 
     /// Adds the stages' milliseconds.
@@ -84,6 +88,7 @@ impl GpuTimings {
             &mut self.rasterize_back,
             &mut self.gather,
             &mut self.splats_back,
+            &mut self.loss,
         ];
         for (sum, ms) in own.into_iter().zip(stages) {
             *sum += ms;

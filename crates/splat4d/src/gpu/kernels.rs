@@ -164,9 +164,11 @@ impl Kernels {
     }
 }
 
-/// The kernels of the way back.
+/// The kernels of the loss and of the way back.
 #[derive(Debug)]
 pub(super) struct BackKernels {
+    /// moments, gradient
+    pub loss: Kernel,
     /// rasterize_back
     pub rasterize: Kernel,
     /// gather
@@ -179,6 +181,13 @@ impl BackKernels {
     /// Compiles everything.
     pub(super) fn new(gpu: &Gpu) -> Self {
         Self {
+            loss: Kernel::new(
+                gpu,
+                "loss",
+                &[wgsl::LOSS],
+                &[Uniform, Read, Read, Write, Write, Write],
+                &["moments", "gradient"],
+            ),
             rasterize: Kernel::new(
                 gpu,
                 "rasterize, backward",

@@ -30,7 +30,7 @@ pub mod shade;
 mod tests;
 
 pub use crate::simd::Simd;
-pub use backend::{Backend, Oracle, Shot, Tables, Wanted};
+pub use backend::{Backend, Comparison, Oracle, Shot, Tables, Target, Wanted};
 pub(crate) use count::PairCounts;
 pub use importance::{Importance, Sensitivity};
 pub use project::{Projected, ProjectedGrads, View};
