@@ -5,7 +5,7 @@ mod tests;
 
 use crate::math::{Rng, Se3, sym3};
 use crate::render::{
-    Backend, Comparison, Image, ImageGrads, RenderConfig, RenderGrads, Renderer, Shot, Tables, Target, Wanted,
+    Backend, Comparison, Image, ImageGrads, RenderConfig, RenderGrads, Renderer, Resident, Shot, Tables, Target, Wanted,
 };
 use crate::scene::splats::{COV, SPLAT_COLUMNS, SPLAT_OPACITY};
 use crate::scene::{Camera, Color, Part, Planes, Splats, Table};
@@ -188,6 +188,10 @@ impl Backend for WithCpu {
             None => {}
         }
         Ok(None)
+    }
+
+    fn resident(&mut self) -> Option<&mut dyn Resident> {
+        self.other.as_mut()?.resident()
     }
 
     fn radii(&self) -> &[f32] {

@@ -4,6 +4,7 @@ use super::buffers::{SPARE, UNIFORM_STRIDE};
 use super::clock::{Recorder, STAGES, TIMES_BYTES};
 use super::frame::{Back, Band, Frame, RECORD_BYTES, TILE, count};
 use super::kernels::BackKernels;
+use super::resident::KeptPass;
 use super::{GpuRenderer, pixel_rows};
 use crate::render::project::{CAMERA, Projection};
 use crate::render::rasterize::CHANNELS;
@@ -60,9 +61,22 @@ pub(super) struct Came {
     pub counts: Vec<u32>,
     /// What the tiles add to the loss.
     pub partials: Vec<f32>,
+    /// What Adam found of tables that stay.
+    pub words: Vec<u32>,
     /// Milliseconds of the wait, and of the stages.
     pub wait: f64,
     pub stages: [f64; STAGES],
+}
+
+/// Where a way back ends.
+#[derive(Clone, Copy)]
+pub(super) enum End<'a> {
+    /// At sums of records, to which another band adds.
+    Band,
+    /// At the splats, whose gradients the CPU reads.
+    Splats,
+    /// At tables that stay; the first byte of the words of Adam.
+    Kept(&'a KeptPass<'a>, u64),
 }
 
 impl GpuRenderer {
@@ -218,7 +232,8 @@ impl GpuRenderer {
             // The lists and planes of another band lie there.
             frame.band(&mut recorder, band, across, None)?;
         }
-        self.come_back(recorder, (band, pairs), across, last, layout)
+        let end = if last { End::Splats } else { End::Band };
+        self.come_back(recorder, (band, pairs), across, end, layout)
     }
 
     /// The way back of a band whose lists, planes and gradient are at hand after what `recorder` holds, and the reading of
@@ -228,9 +243,10 @@ impl GpuRenderer {
         mut recorder: Recorder<'_>,
         (band, pairs): (Band, usize),
         across: usize,
-        last: bool,
+        end: End<'_>,
         layout: &Layout,
     ) -> Result<Came> {
+        let last = matches!(end, End::Splats);
         let (gpu, b) = (&self.gpu, &self.buffers);
         let groups = self.groups.as_ref().expect("a frame was drawn");
         let frame = Frame { gpu, kernels: &self.kernels, buffers: b, groups };
@@ -243,6 +259,10 @@ impl GpuRenderer {
             back.splats(&mut recorder, &self.upload)?;
             recorder.copy(b.back.get(), staging, 0, (4 * NUMBERS * n) as u64);
             recorder.copy(b.cameras.get(), staging, layout.cameras, (4 * CAMERA * groups) as u64);
+        }
+        if let End::Kept(kept, words_at) = end {
+            back.splats(&mut recorder, &self.upload)?;
+            kept.learn(gpu, b, &self.upload, words_at, &mut recorder)?;
         }
         recorder.copy_from(b.records.get(), RECORD_BYTES * pairs as u64, staging, layout.sums, 12 * tiles as u64);
         recorder.copy(b.counts.get(), staging, layout.counts, 4 * count::ALL as u64);
@@ -276,6 +296,7 @@ impl GpuRenderer {
             camera,
             counts: bytemuck::pod_collect_to_vec(at(layout.counts, 4 * count::ALL)),
             partials: bytemuck::pod_collect_to_vec(&view[layout.partials as usize..]),
+            words: Vec::new(),
             wait: 0.0,
             stages: if timed { recorder.stages(&stamps) } else { recorder.by_wall },
         };

@@ -46,8 +46,7 @@ impl Grown {
         let most = largest_binding(gpu);
         if size > most.next_multiple_of(LEAST) {
             let mib = |b: u64| b.div_ceil(1 << 20);
-            let text =
-                format!("{} need {} MiB in one GPU buffer, {} MiB are allowed", self.what, mib(size), mib(most));
+            let text = format!("{} need {} MiB in one GPU buffer, {} MiB are allowed", self.what, mib(size), mib(most));
             return Err(Error::new(ErrorKind::Unsupported, text).remedy("Render on the CPU."));
         }
         // The old one goes first: both together may be more than there is.

@@ -1,10 +1,11 @@
 //! A picture that never leaves the GPU: drawn, compared with its truth and taken back in one submission.
 
-use super::back::Came;
+use super::back::{Came, End};
 use super::buffers::UNIFORM_STRIDE;
 use super::clock::Recorder;
 use super::frame::{Back, Band, Frame, Groups, RECORD_BYTES, THREADS, TILE, count, slot};
 use super::pictures::Held;
+use super::resident::{KeptPass, words_of};
 use super::{GpuRenderer, GpuStats, GpuTimings, MOST_GROUPS, PLANES, largest_binding, plane_bytes};
 use crate::Result;
 use crate::render::{Comparison, RenderGrads, Shot, Target};
@@ -82,7 +83,29 @@ impl GpuRenderer {
         d: &mut RenderGrads<f32>,
     ) -> Result<Option<Comparison>> {
         let start = Instant::now();
-        let (n, size) = (shot.splats.len(), [shot.camera.width, shot.camera.height]);
+        if self.can_compare(shot.splats.len(), [shot.camera.width, shot.camera.height]) {
+            self.upload.send(&self.gpu, shot.splats, self.tables)?;
+        }
+        let upload = start.elapsed();
+        let Some((came, comparison)) = self.compare_with(shot, target, shot.splats.len(), None)? else {
+            return Ok(None);
+        };
+        self.deliver(shot, &came, d_sh, d)?;
+        self.timings.upload += upload.as_secs_f64() * 1e3;
+        self.timings.total = start.elapsed().as_secs_f64() * 1e3;
+        Ok(Some(comparison))
+    }
+
+    /// Draws the `n` splats whose tables are on the GPU, compares and goes back; with `kept` they are made of tables that stay,
+    /// which learn of it. `None` if that cannot be: no number that stays was changed but statistics.
+    pub(super) fn compare_with(
+        &mut self,
+        shot: &Shot<'_, f32>,
+        target: &Target<'_, f32>,
+        n: usize,
+        kept: Option<&KeptPass<'_>>,
+    ) -> Result<Option<(Came, Comparison)>> {
+        let size = [shot.camera.width, shot.camera.height];
         let shape = [target.truth.channels, target.truth.width, target.truth.height];
         assert_eq!(shape, [CHANNELS, size[0], size[1]], "a picture and its truth have one shape");
         if !self.can_compare(n, size) {
@@ -99,11 +122,13 @@ impl GpuRenderer {
         let (loss, total) = (Loss::new(target, held), held.weight * CHANNELS as f64);
         let band = Band { first: 0, rows: size[1].div_ceil(TILE) };
         let across = size[0].div_ceil(TILE);
-        self.upload.send(&self.gpu, shot.splats, self.tables)?;
+        // The words of Adam lie behind what the tiles give.
+        let partials = PARTIALS * across * band.rows;
+        let words = kept.map_or(0, |k| k.words());
+        let words_at = partials.next_multiple_of(UNIFORM_STRIDE as usize / 4);
         let mut fresh = self.make_room_for_splats(n)?;
-        self.timings.upload = start.elapsed().as_secs_f64() * 1e3;
         fresh |= self.make_room_for_band(band, across, size[0])?;
-        fresh |= self.make_room_for_loss(size, across * band.rows)?;
+        fresh |= self.make_room_for_loss(size, words_at + words)?;
         let came = loop {
             let room = self.pair_capacity();
             if fresh || self.groups.is_none() {
@@ -115,7 +140,12 @@ impl GpuRenderer {
             self.write_uniforms(shot, band, across, [flags, sums_at, 0])?;
             let at = slot::LOSS as u64 * UNIFORM_STRIDE;
             self.gpu.queue.write_buffer(self.buffers.uniforms.get(), at, bytemuck::bytes_of(&loss));
-            let came = self.there_and_back(target, (band, room), across, size)?;
+            if let Some(kept) = kept {
+                kept.write_uniforms(&self.gpu, room);
+                let zeros = vec![0u8; 4 * words];
+                self.gpu.queue.write_buffer(self.buffers.partials.get(), 4 * words_at as u64, &zeros);
+            }
+            let came = self.there_and_back(target, (band, room), across, size, (words_at, words), kept)?;
             let pairs = came.counts[count::PAIRS] as usize;
             (self.stats.visible, self.stats.pairs) = (came.counts[count::VISIBLE] as usize, pairs);
             if pairs <= room {
@@ -128,20 +158,18 @@ impl GpuRenderer {
             fresh = self.make_room_for_pairs(pairs)?;
         };
         let mut sums = [0.0; PARTIALS];
-        for tile in came.partials.chunks_exact(PARTIALS) {
+        for tile in came.partials[..partials].chunks_exact(PARTIALS) {
             sums.iter_mut().zip(tile).for_each(|(sum, x)| *sum += f64::from(*x));
         }
-        self.deliver(shot, &came, d_sh, d)?;
-        self.timings.total = start.elapsed().as_secs_f64() * 1e3;
         let [l1, ssim, mse] = [0, 1, 2].map(|k| sums[k] / total);
         let d_response = target.response.map(|_| std::array::from_fn(|k| sums[RESPONSE + k]));
-        Ok(Some(Comparison { l1, ssim, mse, d_response }))
+        Ok(Some((came, Comparison { l1, ssim, mse, d_response })))
     }
 
-    fn make_room_for_loss(&mut self, [w, h]: [usize; 2], tiles: usize) -> Result<bool> {
+    fn make_room_for_loss(&mut self, [w, h]: [usize; 2], partials: usize) -> Result<bool> {
         let (gpu, b) = (&self.gpu, &mut self.buffers);
         b.maps.ensure(gpu, (4 * CHANNELS * MAPS * w * h) as u64)?;
-        b.partials.ensure(gpu, (4 * PARTIALS * tiles) as u64)?;
+        b.partials.ensure(gpu, 4 * partials as u64)?;
         b.d_planes.ensure(gpu, (4 * PLANES * w * h) as u64)
     }
 
@@ -152,18 +180,25 @@ impl GpuRenderer {
         (band, room): (Band, usize),
         across: usize,
         size: [usize; 2],
+        (words_at, words): (usize, usize),
+        kept: Option<&KeptPass<'_>>,
     ) -> Result<Came> {
-        let layout = self.make_room_to_return(self.stats.splats, across, size, PARTIALS * across * band.rows)?;
+        let layout = self.make_room_to_return(self.stats.splats, across, size, words_at + words)?;
         let held = self.pictures.get(target.picture);
         let groups = self.groups.as_ref().expect("groups are made before a frame");
         let frame = Frame { gpu: &self.gpu, kernels: &self.kernels, buffers: &self.buffers, groups };
         let kernels = self.back_kernels.as_ref().expect("they were compiled");
         let back = Back { frame, kernels, pairs: room };
         let mut recorder = Recorder::new(&self.gpu, &self.queries, self.clock);
+        if let Some(kept) = kept {
+            kept.answer(&self.gpu, &self.upload, &mut recorder)?;
+        }
         frame.splats(&mut recorder, &self.upload, self.stats.splats)?;
         frame.band(&mut recorder, band, across, None)?;
         back.loss(&mut recorder, &held.buffer, [across, band.rows])?;
-        let came = self.come_back(recorder, (band, room), across, true, &layout)?;
+        let end = kept.map_or(End::Splats, |kept| End::Kept(kept, 4 * words_at as u64));
+        let mut came = self.come_back(recorder, (band, room), across, end, &layout)?;
+        came.words = words_of(&came.partials[words_at..]);
         self.timings.wait = came.wait;
         self.timings.add(came.stages);
         Ok(came)

@@ -75,7 +75,7 @@ pub(super) fn uniform(buffers: &Buffers, slot: usize, size: u64) -> BindingResou
 }
 
 /// Bytes of the structures in WGSL.
-const VIEW_BYTES: u64 = 128;
+pub(super) const VIEW_BYTES: u64 = 128;
 const PIECE_BYTES: u64 = 80;
 const SCAN_BYTES: u64 = 16;
 const SORT_BYTES: u64 = 8;
@@ -315,7 +315,12 @@ pub(super) struct Back<'a> {
 
 impl Back<'_> {
     /// Compares the planes of the last [`Frame::band`], a whole picture, with a truth, and writes the gradient to them.
-    pub(super) fn loss(&self, recorder: &mut Recorder<'_>, truth: &Grown, [across, down]: [usize; 2]) -> crate::Result<()> {
+    pub(super) fn loss(
+        &self,
+        recorder: &mut Recorder<'_>,
+        truth: &Grown,
+        [across, down]: [usize; 2],
+    ) -> crate::Result<()> {
         let (k, b) = (&self.kernels.loss, self.frame.buffers);
         let group = [
             uniform(b, slot::LOSS, LOSS_BYTES),

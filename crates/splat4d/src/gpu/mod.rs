@@ -20,6 +20,7 @@ mod device;
 mod frame;
 mod kernels;
 mod pictures;
+mod resident;
 mod roofline;
 #[cfg(test)]
 mod tests;
@@ -31,7 +32,8 @@ pub use roofline::GpuRoofline;
 
 use crate::render::backend::refusal;
 use crate::render::{
-    Antialias, Backend, Comparison, Image, ImageGrads, RenderConfig, RenderGrads, Shot, Tables, Target, Wanted,
+    Antialias, Backend, Comparison, Image, ImageGrads, RenderConfig, RenderGrads, Resident, Shot, Tables, Target,
+    Wanted,
 };
 use crate::scene::{Planes, Table};
 use crate::{Error, ErrorKind, Result};
@@ -42,6 +44,7 @@ use frame::{BLOCK, Band, DIGITS, Frame, Groups, RANGE_BYTES, THREADS, TILE, argu
 use kernels::{BackKernels, Kernels};
 use pictures::Pictures;
 use rayon::prelude::*;
+use resident::Tables as KeptTables;
 use std::time::Instant;
 use upload::Upload;
 
@@ -97,6 +100,7 @@ pub struct GpuRenderer {
     drawn: Vec<(Band, usize)>,
     returned: Returned,
     pictures: Pictures,
+    resident: Option<Box<KeptTables>>,
 }
 
 impl GpuRenderer {
@@ -124,6 +128,7 @@ impl GpuRenderer {
             drawn: Vec::new(),
             returned: Returned::default(),
             pictures: Pictures::new(),
+            resident: None,
         })
     }
 
@@ -144,7 +149,8 @@ impl GpuRenderer {
 
     /// Bytes of GPU memory held, tables included.
     pub fn memory_bytes(&self) -> u64 {
-        self.buffers.bytes() + self.upload.bytes() + self.pictures.bytes()
+        let tables = self.resident.as_ref().map_or(0, |t| t.bytes());
+        self.buffers.bytes() + self.upload.bytes() + self.pictures.bytes() + tables
     }
 
     /// Refuses what the shaders cannot do, without opening a GPU.
@@ -417,6 +423,10 @@ impl Backend<f32> for GpuRenderer {
     ) -> Result<Option<Comparison>> {
         self.can(&Wanted { backward: true, ..shot.wanted() })?;
         if shot.depth { Ok(None) } else { self.compare_here(shot, target, d_sh, d) }
+    }
+
+    fn resident(&mut self) -> Option<&mut dyn Resident> {
+        Some(self)
     }
 
     fn radii(&self) -> &[f32] {

@@ -1,7 +1,7 @@
 //! The seam between a scene and whatever draws it: [`Backend`], implemented by the renderer of the CPU, by the oracle and
 //! (feature `gpu`) by the renderer of the GPU, so that training, evaluation and the command know none of them by name.
 
-use super::{Image, ImageGrads, RenderConfig, RenderGrads, Renderer, oracle};
+use super::{Image, ImageGrads, RenderConfig, RenderGrads, Renderer, Resident, oracle};
 use crate::math::{Real, sh};
 use crate::scene::{Camera, Planes, Splats, Table};
 use crate::{Error, ErrorKind, Result};
@@ -134,6 +134,11 @@ pub trait Backend<F: Real = f32>: Send {
     ) -> Result<Option<Comparison>> {
         let _ = (shot, target, d_sh, d);
         Ok(None)
+    }
+
+    /// Where whole steps are taken on the device, on tables that stay there; none: it has no such way.
+    fn resident(&mut self) -> Option<&mut dyn Resident> {
+        None
     }
 
     /// Radius of every splat of the last render that was taken back: 3σ of the larger axis, pixels; 0: not drawn. Empty

@@ -12,6 +12,8 @@ const VECTOR: f64 = 1e-4;
 /// A camera's matrix without the identity, row by row, and its offsets.
 const RESPONSE: [f32; 12] = [0.2, 0.03, -0.02, 0.01, -0.1, 0.04, -0.03, 0.02, 0.05, 0.02, 0.0, -0.03];
 const DSSIM: f64 = 0.2;
+/// The background: nothing of 8 bits, of which a picture may be made, because where both are equal L1 has no gradient.
+const BEHIND: [f32; 3] = [0.21, 0.507, 0.903];
 
 /// The truth, and the weights of its pixels: numbers of 8 bits, or any.
 fn truth(seed: u64, camera: &Camera, eight: bool) -> (Planes<f32>, Planes<f32>) {
@@ -108,11 +110,7 @@ fn wide(v: &[f32]) -> Vec<f64> {
 }
 
 /// Compares; gradients to Gaussians and their colours.
-fn compared(
-    r: &mut GpuRenderer,
-    shot: &Shot<'_>,
-    target: &Target<'_>,
-) -> (Comparison, RenderGrads<f32>, Table<f32>) {
+fn compared(r: &mut GpuRenderer, shot: &Shot<'_>, target: &Target<'_>) -> (Comparison, RenderGrads<f32>, Table<f32>) {
     let (mut d, mut d_sh) = (RenderGrads::default(), Table::new(&[("sh", 48)], shot.splats.len()));
     let comparison = r.compare(shot, target, &mut [Some(&mut d_sh)], &mut d).expect("it compares");
     (comparison.expect("it is drawn in one piece"), d, d_sh)
@@ -128,7 +126,7 @@ fn value_and_gradient_equal_the_definition_and_the_way_through_the_cpu() {
             [(false, None, true), (true, None, true), (false, Some(RESPONSE), false), (true, Some(RESPONSE), false)]
         {
             let (splats, (truth, weight)) = (scene.splats(), truth(81 + i as u64, camera, eight));
-            let shot = Shot::new(&splats, camera, BACKGROUND);
+            let shot = Shot::new(&splats, camera, BEHIND);
             let weight = weighted.then_some(&weight);
             let picture = 10 * i + 4 * usize::from(weighted) + usize::from(eight);
             let target = Target { truth: &truth, weight, picture, dssim: DSSIM, response };
@@ -170,7 +168,7 @@ fn comparing_repeats_bit_for_bit_whatever_room_there_is_and_pictures_are_sent_on
     let Some(mut r) = own_renderer() else { return };
     let (scene, camera) = (Scenery::new(82, 3000, 1.2, 0.08), camera([0.0, 0.5, -4.0], 100, 70));
     let (splats, (color, weight)) = (scene.splats(), truth(83, &camera, true));
-    let shot = Shot::new(&splats, &camera, BACKGROUND);
+    let shot = Shot::new(&splats, &camera, BEHIND);
     let target =
         |picture| Target { truth: &color, weight: Some(&weight), picture, dssim: DSSIM, response: Some(RESPONSE) };
     let bits = |(c, d, sh): (Comparison, RenderGrads<f32>, Table<f32>)| {
@@ -194,7 +192,7 @@ fn comparing_repeats_bit_for_bit_whatever_room_there_is_and_pictures_are_sent_on
     let small = super::camera([0.0, 0.5, -4.0], 50, 35);
     let (other, _) = truth(84, &small, false);
     let half = Target { truth: &other, weight: None, picture: 1, dssim: DSSIM, response: None };
-    compared(&mut r, &Shot::new(&splats, &small, BACKGROUND), &half);
+    compared(&mut r, &Shot::new(&splats, &small, BEHIND), &half);
     assert!(r.pictures.bytes() < 3 * one);
     // More pairs than may be at once: bands, which are not compared here.
     r.most_pairs = r.stats().pairs / 3;
@@ -214,7 +212,7 @@ fn a_lost_device_does_not_compare() {
     let Some(mut r) = own_renderer() else { return };
     let (scene, camera) = (Scenery::new(85, 50, 1.0, 0.1), camera([0.0, 0.5, -4.0], 20, 20));
     let (splats, (truth, _)) = (scene.splats(), truth(86, &camera, true));
-    let shot = Shot::new(&splats, &camera, BACKGROUND);
+    let shot = Shot::new(&splats, &camera, BEHIND);
     let target = Target { truth: &truth, weight: None, picture: 0, dssim: DSSIM, response: None };
     compared(&mut r, &shot, &target);
     r.gpu.device.destroy();
