@@ -116,7 +116,19 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         let image = ENDINGS.iter().map(|e| folder.join(format!("{id}.{e}"))).find(|p| p.is_file());
         let image = image.unwrap_or_else(|| folder.join(format!("{id}.png")));
         let time = index as f64 / fps;
-        frames.push(RawFrame { camera, source, time, index, image, mask: None, flow: None, labels: None, split });
+        frames.push(RawFrame {
+            camera,
+            source,
+            time,
+            index,
+            image,
+            mask: None,
+            depth: None,
+            flow: None,
+            labels: None,
+            tracks: None,
+            split,
+        });
     }
     let mut notes =
         vec![format!("The layout states no frame rate: {fps} pictures a second of each camera are taken for it.")];

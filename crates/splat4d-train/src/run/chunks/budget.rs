@@ -1,6 +1,7 @@
 //! What a take in chunks costs before it is begun, and the plan that stays within a memory limit and a time: shorter chunks of
 //! fewer Gaussians, and the steps of a chunk.
 
+use super::shared::STEPS;
 use super::{ChunkPlan, beginning, check};
 use crate::capture::Capture;
 use crate::event::Event;
@@ -66,7 +67,7 @@ impl Outlook {
         let (mut recipe, plan, memory) = within_memory(capture, recipe, plan)?;
         let mut seconds = None;
         if minutes.is_some() || timed {
-            let parts = (plan.len() + 1) as f64;
+            let parts = (plan.len() + STEPS) as f64;
             let one = Arc::new(longest(capture, &plan));
             let opened = OpenCapture::new(one, &recipe)?;
             let probes = minutes.map_or(PREDICTION, |m| 60.0 * PROBES * m);

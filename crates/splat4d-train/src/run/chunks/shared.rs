@@ -45,6 +45,8 @@ const MEDIAN_OF: usize = 9;
 const CHANGED: f32 = 0.06;
 /// A pixel is calm where at most this share of the frames that are looked at has changed.
 const CALM: f64 = 0.1;
+/// Steps of the layer, in those of a chunk: every chunk shows it and none can mend it (docs/scale.md has what that is worth).
+pub(super) const STEPS: usize = 4;
 /// A Gaussian stays where at least this share of the cameras that look at it finds it calm.
 const AGREED: f64 = 0.5;
 
@@ -151,7 +153,8 @@ fn nothing_still(capture: &Capture) -> Option<&'static str> {
 
 /// The recipe of the still scene.
 fn of_medians(recipe: &Recipe) -> Recipe {
-    recipe.clone().with(|r| {
+    let longer = recipe.unresolved().with(|r| r.run.iterations *= STEPS);
+    longer.resolve().with(|r| {
         r.run.motion = MotionName::of("still");
         r.run.half_size_until = r.run.half_size_until.min(0.5);
         r.capture.downscale = 1;
