@@ -70,7 +70,10 @@ impl Editing {
         let mut tokens = request.headers.get_all(TOKEN).iter();
         let token = tokens.next().filter(|_| tokens.next().is_none());
         if !token.is_some_and(|t| same(t.as_bytes(), self.token.as_bytes())) {
-            return Some((StatusCode::FORBIDDEN, "the token is missing or wrong: open the address that splat4d printed"));
+            return Some((
+                StatusCode::FORBIDDEN,
+                "the token is missing or wrong: open the address that splat4d printed",
+            ));
         }
         let one = |name: &str| request.headers.get(name).and_then(|v| v.to_str().ok());
         if request.headers.get_all(header::ORIGIN).iter().count() != 1 {
@@ -79,7 +82,8 @@ impl Editing {
         if one("sec-fetch-site").is_some_and(|site| site != "same-origin") {
             return Some((StatusCode::FORBIDDEN, "only the player's own page may edit"));
         }
-        let json = one("content-type").is_some_and(|t| t.split(';').next().is_some_and(|t| t.trim() == "application/json"));
+        let json =
+            one("content-type").is_some_and(|t| t.split(';').next().is_some_and(|t| t.trim() == "application/json"));
         if !json {
             return Some((StatusCode::UNSUPPORTED_MEDIA_TYPE, "edits are application/json"));
         }
