@@ -46,7 +46,7 @@ const ORDER: [(&str, &[&str]); 8] = [
     ("crates/splat4d-import", &["calibration", "video", "sync", "sfm", "corrections", "write", "take", "doctor"]),
     (
         "crates/splat4d-serve",
-        &["write_timeout", "body", "range", "guard", "scene", "assets", "page", "events", "answer", "server"],
+        &["write_timeout", "body", "range", "reply", "guard", "scene", "edit", "assets", "page", "events", "answer", "server"],
     ),
     (
         "crates/splat4d-cli",
@@ -64,6 +64,7 @@ const ORDER: [(&str, &[&str]); 8] = [
             "source",
             "measure",
             "baking",
+            "film",
             "playable",
             "serving",
             "report",
@@ -72,6 +73,7 @@ const ORDER: [(&str, &[&str]); 8] = [
             "compressing",
             "predicting",
             "editing",
+            "editor",
             "verbs",
             "main",
         ],
