@@ -49,7 +49,7 @@ const ORDER: [(&str, &[&str]); 8] = [
     ),
     (
         "crates/splat4d-serve",
-        &["write_timeout", "body", "range", "guard", "scene", "assets", "page", "events", "answer", "server"],
+        &["write_timeout", "body", "range", "reply", "guard", "scene", "edit", "assets", "page", "events", "answer", "server"],
     ),
     (
         "crates/splat4d-cli",
@@ -69,6 +69,7 @@ const ORDER: [(&str, &[&str]); 8] = [
             "asked",
             "measure",
             "baking",
+            "film",
             "playable",
             "film",
             "serving",
@@ -80,6 +81,7 @@ const ORDER: [(&str, &[&str]); 8] = [
             "compressing",
             "predicting",
             "editing",
+            "editor",
             "verbs",
             "main",
         ],

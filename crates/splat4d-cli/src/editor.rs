@@ -67,7 +67,8 @@ struct Eye {
 
 impl Eye {
     fn camera(&self) -> Result<Camera> {
-        let numbers = self.position.iter().chain(&self.quat).chain([&self.fx, &self.fy, &self.cx, &self.cy, &self.near]);
+        let numbers =
+            self.position.iter().chain(&self.quat).chain([&self.fx, &self.fy, &self.cx, &self.cy, &self.near]);
         let sized = (1..=MOST_SIDE).contains(&self.width) && (1..=MOST_SIDE).contains(&self.height);
         let length: f64 = self.quat.iter().map(|x| x * x).sum();
         if !(numbers.copied().all(f64::is_finite) && sized && length > 0.0 && self.fx > 0.0 && self.fy > 0.0) {
@@ -177,7 +178,9 @@ impl Editor {
     pub(crate) fn new(source: Source, title: String, file: &Path) -> Result<Self> {
         let folder = file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
         if !folder.is_dir() {
-            return Err(Error::input("lies in a folder that is not there").at(file.display()).remedy("Make the folder"));
+            return Err(Error::input("lies in a folder that is not there")
+                .at(file.display())
+                .remedy("Make the folder"));
         }
         let text = file.exists().then(|| files::read_text(file)).transpose()?;
         let listed = if text.is_some() { editing::read(file)? } else { Edits::default() };
@@ -202,8 +205,9 @@ impl Editor {
     ///
     /// Errors: what is no question, and those of its work; nothing is changed then.
     pub(crate) fn answer(&self, asked: Value) -> Result<EditAnswer> {
-        let ask: Ask = serde_json::from_value(asked)
-            .map_err(|e| Error::input(format!("the page asks for what is not known: {e}")).remedy("Load the page again"))?;
+        let ask: Ask = serde_json::from_value(asked).map_err(|e| {
+            Error::input(format!("the page asks for what is not known: {e}")).remedy("Load the page again")
+        })?;
         let told = |told: Value| Ok(EditAnswer { told, scene: None });
         match ask {
             Ask::Open => told(self.open()),
@@ -343,7 +347,9 @@ impl Editor {
 
     fn bend(&self, steps: &[Step], select: &str, times: [f64; 2], nodes: usize) -> Result<Value> {
         if self.source.playback.is_some() {
-            return Err(Error::input("a playback file cannot be bent").remedy("Give the run folder or scene.safetensors"));
+            return Err(
+                Error::input("a playback file cannot be bent").remedy("Give the run folder or scene.safetensors")
+            );
         }
         let (scene, _) = self.replayed(steps)?;
         let selected = self.select(select, &scene)?;
@@ -528,8 +534,11 @@ impl Drawn<'_> {
                 };
                 // What is seen is the front of something about as deep as it is wide.
                 let wide = near * side(0).min(side(1));
-                let range =
-                    if self.through { [0.0, ENDLESS] } else { [near - MARGIN * wide - MARGIN * near, far + wide.min(far - near + wide)] };
+                let range = if self.through {
+                    [0.0, ENDLESS]
+                } else {
+                    [near - MARGIN * wide - MARGIN * near, far + wide.min(far - near + wide)]
+                };
                 let range = [range[0].max(0.0), range[1]];
                 if self.shape == Shape::Lasso {
                     let eye = world.translation;
@@ -596,7 +605,13 @@ mod tests {
             p[SH].write(row, 0, if side < 0.0 { [1.5f32, -1.5, -1.5] } else { [-1.5, 1.5, -1.5] });
         }
         let layer = Layer::new("balls", p, Arc::new(Still), LifeKind::Infinite);
-        Source::own(Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 10.0, up: [0.0, -1.0, 0.0], ..Scene::default() })
+        Source::own(Scene {
+            layers: vec![layer],
+            clip: [0.0, 1.0],
+            fps: 10.0,
+            up: [0.0, -1.0, 0.0],
+            ..Scene::default()
+        })
     }
 
     fn view() -> Value {
@@ -656,7 +671,8 @@ mod tests {
             let x = told["center"][0].as_f64().unwrap();
             assert!((x + 1.0).abs() < 0.1, "{word} {x}");
         }
-        let nothing = bench.refused(json!({"do": "pick", "steps": [], "shape": "box", "corners": [[0.4, 0.3], [0.45, 0.35]],
+        let nothing = bench
+            .refused(json!({"do": "pick", "steps": [], "shape": "box", "corners": [[0.4, 0.3], [0.45, 0.35]],
             "view": view(), "t": 0.0, "through": false, "now": false}));
         assert!(nothing.contains("nothing is seen there"), "{nothing}");
     }
@@ -726,7 +742,9 @@ mod tests {
     #[test]
     fn nodes_are_pulled_and_the_picture_follows() {
         let bench = Bench::new();
-        let bent = bench.ask(json!({"do": "bend", "steps": [], "select": "box(-9,-9,-9, 0,9,9)", "at": 0.5, "t": 0.5, "nodes": 16}));
+        let bent = bench.ask(
+            json!({"do": "bend", "steps": [], "select": "box(-9,-9,-9, 0,9,9)", "at": 0.5, "t": 0.5, "nodes": 16}),
+        );
         assert_eq!((bent["nodes"].as_array().unwrap().len(), &bent["own"]), (16, &json!(false)));
         let pull = |by: [f64; 3]| {
             let handle = json!({"place": bent["places"][0], "radius": 0.1, "by": by});

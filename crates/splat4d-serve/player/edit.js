@@ -8,7 +8,7 @@ import { button, choice, clock, field, h, segments, tool } from './dom.js';
 import { clamp } from './camera.js';
 
 /** Longer side of pictures that the program draws, pixels: at rest, and while something is pulled. */
-const SIDE = 960, SIDE_PULLING = 512;
+const SIDE = 960, SIDE_PULLING = 384;
 /** Rest after which the selection is looked up at another moment, ms. */
 const REST = 180;
 /** Nodes of a bend. */

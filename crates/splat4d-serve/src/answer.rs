@@ -6,6 +6,7 @@ use crate::edit::{self, Editing};
 use crate::events::Hub;
 use crate::guard::Guard;
 use crate::range::{self, Wanted};
+use crate::reply::{text, value, whole, with};
 use crate::scene::{Missing, Scene};
 use hyper::body::{Bytes, Incoming};
 use hyper::header::{self, HeaderMap, HeaderName, HeaderValue};
@@ -43,8 +44,6 @@ pub(crate) struct Shared {
     pub player_folder: Option<PathBuf>,
     /// Leave to edit.
     pub editing: Option<Editing>,
-    /// Questions of editing pages that are worked on.
-    pub editors: Arc<Semaphore>,
     listeners: Arc<Semaphore>,
     policy: HeaderValue,
 }
@@ -61,7 +60,6 @@ impl Shared {
             foreign,
             player_folder: None,
             editing: None,
-            editors: Arc::new(Semaphore::new(edit::AT_ONCE)),
             listeners: Arc::new(Semaphore::new(MAX_LISTENERS)),
             policy: policy.parse().expect("an origin was checked"),
         }
@@ -84,7 +82,9 @@ pub(crate) async fn answer(shared: &Arc<Shared>, request: &Parts, body: Incoming
     let editing = shared.editing.as_ref().filter(|_| request.uri.path() == edit::ROUTE);
     let mut response = match (shared.guard.check(request, editing.is_some()), editing) {
         (Err(refusal), _) => text(refusal.status, refusal.why),
-        (Ok(()), Some(editing)) if request.method == Method::POST => edit::answer(shared, editing, request, body).await,
+        (Ok(()), Some(editing)) if request.method == Method::POST => {
+            edit::answer(&shared.scene, editing, request, body).await
+        }
         // A body that a client sends is never read.
         (Ok(()), _) => route(shared, request).await,
     };
@@ -239,31 +239,6 @@ fn matches(list: &HeaderValue, etag: &str) -> bool {
 
 fn missing() -> Response<Body> {
     text(StatusCode::NOT_FOUND, "there is nothing here")
-}
-
-pub(crate) fn text(status: StatusCode, what: &'static str) -> Response<Body> {
-    let mut response = whole(Bytes::from_static(what.as_bytes()), "text/plain; charset=utf-8");
-    *response.status_mut() = status;
-    response
-}
-
-/// Bytes that are not to be kept.
-pub(crate) fn whole(bytes: Bytes, mime: &str) -> Response<Body> {
-    let headers = [(header::CONTENT_TYPE, mime), (header::CACHE_CONTROL, "no-store")];
-    with(bytes.into(), StatusCode::OK, &headers)
-}
-
-fn with(body: Body, status: StatusCode, headers: &[(HeaderName, &str)]) -> Response<Body> {
-    let mut response = Response::new(body);
-    *response.status_mut() = status;
-    for (name, text) in headers {
-        response.headers_mut().insert(name, value(text));
-    }
-    response
-}
-
-fn value(text: &str) -> HeaderValue {
-    HeaderValue::from_str(text).expect("headers are written here, in ASCII")
 }
 
 #[cfg(test)]

@@ -4,8 +4,9 @@
 //! token that only the address which the program printed holds, JSON (for which a browser asks leave first, and gets none),
 //! and our own origin. What is done with it is the program's business; it may answer with another scene.
 
-use crate::answer::{Shared, text, whole};
 use crate::body::Body;
+use crate::reply::{text, whole};
+use crate::scene::Scene;
 use crate::write_timeout::{Either, either};
 use hyper::body::{Bytes, Incoming};
 use hyper::header;
@@ -18,7 +19,7 @@ use std::future::poll_fn;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
-use tokio::sync::oneshot;
+use tokio::sync::{Semaphore, oneshot};
 
 /// Name of the route.
 pub(crate) const ROUTE: &str = "/edit";
@@ -29,7 +30,7 @@ const MAX_BODY: usize = 1 << 20;
 /// A body must be complete in this time.
 const BODY_TIME: Duration = Duration::from_secs(10);
 /// Questions that are worked on at a time: one that takes long, and one that looks meanwhile.
-pub(crate) const AT_ONCE: usize = 2;
+const AT_ONCE: usize = 2;
 /// Least length of a token: shorter ones could be guessed.
 const LEAST_TOKEN: usize = 16;
 
@@ -50,6 +51,7 @@ type Answer = dyn Fn(Value) -> Result<EditAnswer> + Send + Sync;
 pub struct Editing {
     token: String,
     answer: Arc<Answer>,
+    places: Arc<Semaphore>,
 }
 
 impl fmt::Debug for Editing {
@@ -62,7 +64,7 @@ impl Editing {
     /// `answer` is called on a thread of its own, on two at a time. Panics: a token that could be guessed.
     pub fn new(token: String, answer: impl Fn(Value) -> Result<EditAnswer> + Send + Sync + 'static) -> Self {
         assert!(token.len() >= LEAST_TOKEN && token.bytes().all(|b| b.is_ascii_alphanumeric()), "a token is random");
-        Self { token, answer: Arc::new(answer) }
+        Self { token, answer: Arc::new(answer), places: Arc::new(Semaphore::new(AT_ONCE)) }
     }
 
     /// Why a request may not edit. Host and origins that were sent are checked already.
@@ -70,7 +72,10 @@ impl Editing {
         let mut tokens = request.headers.get_all(TOKEN).iter();
         let token = tokens.next().filter(|_| tokens.next().is_none());
         if !token.is_some_and(|t| same(t.as_bytes(), self.token.as_bytes())) {
-            return Some((StatusCode::FORBIDDEN, "the token is missing or wrong: open the address that splat4d printed"));
+            return Some((
+                StatusCode::FORBIDDEN,
+                "the token is missing or wrong: open the address that splat4d printed",
+            ));
         }
         let one = |name: &str| request.headers.get(name).and_then(|v| v.to_str().ok());
         if request.headers.get_all(header::ORIGIN).iter().count() != 1 {
@@ -79,7 +84,8 @@ impl Editing {
         if one("sec-fetch-site").is_some_and(|site| site != "same-origin") {
             return Some((StatusCode::FORBIDDEN, "only the player's own page may edit"));
         }
-        let json = one("content-type").is_some_and(|t| t.split(';').next().is_some_and(|t| t.trim() == "application/json"));
+        let json =
+            one("content-type").is_some_and(|t| t.split(';').next().is_some_and(|t| t.trim() == "application/json"));
         if !json {
             return Some((StatusCode::UNSUPPORTED_MEDIA_TYPE, "edits are application/json"));
         }
@@ -99,7 +105,7 @@ fn same(a: &[u8], b: &[u8]) -> bool {
 }
 
 /// Answers what a page sent. Must be called on the server's runtime.
-pub(crate) async fn answer(shared: &Arc<Shared>, editing: &Editing, request: &Parts, body: Incoming) -> Response<Body> {
+pub(crate) async fn answer(scene: &Scene, editing: &Editing, request: &Parts, body: Incoming) -> Response<Body> {
     if let Some((status, why)) = editing.refuses(request) {
         return text(status, why);
     }
@@ -111,7 +117,7 @@ pub(crate) async fn answer(shared: &Arc<Shared>, editing: &Editing, request: &Pa
     let Ok(asked) = serde_json::from_slice::<Value>(&asked) else {
         return text(StatusCode::BAD_REQUEST, "this is no JSON");
     };
-    let place = shared.editors.clone().acquire_owned().await.expect("it is never closed");
+    let place = editing.places.clone().acquire_owned().await.expect("it is never closed");
     let (sender, told) = oneshot::channel();
     let work = editing.answer.clone();
     let spawned = std::thread::Builder::new().name("splat4d-edit".into()).spawn(move || {
@@ -124,9 +130,9 @@ pub(crate) async fn answer(shared: &Arc<Shared>, editing: &Editing, request: &Pa
     match done {
         None => text(StatusCode::INTERNAL_SERVER_ERROR, "the edit failed; the program's terminal says more"),
         Some(Err(error)) => refused(&error),
-        Some(Ok(EditAnswer { mut told, scene })) => {
-            if let Some(bytes) = scene {
-                told["version"] = json!(shared.scene.set(bytes));
+        Some(Ok(EditAnswer { mut told, scene: fresh })) => {
+            if let Some(bytes) = fresh {
+                told["version"] = json!(scene.set(bytes));
             }
             whole(told.to_string().into(), "application/json")
         }

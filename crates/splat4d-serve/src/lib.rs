@@ -34,6 +34,7 @@ mod events;
 mod guard;
 mod page;
 mod range;
+mod reply;
 mod scene;
 mod server;
 mod write_timeout;

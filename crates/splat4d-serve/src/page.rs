@@ -38,8 +38,11 @@ pub enum SceneIn<'a> {
 impl Page<'_> {
     /// The page, UTF-8. It loads nothing but a linked scene. Errors: the scene is too large to lie in a page.
     pub fn html(&self) -> Result<String> {
-        let modules: BTreeMap<&str, &str> =
-            assets().iter().filter(|a| a.name.ends_with(".js") && !a.name.starts_with(EDITING)).map(|a| (&*a.name, &*a.text)).collect();
+        let modules: BTreeMap<&str, &str> = assets()
+            .iter()
+            .filter(|a| a.name.ends_with(".js") && !a.name.starts_with(EDITING))
+            .map(|a| (&*a.name, &*a.text))
+            .collect();
         let index = &crate::asset(INDEX).expect("the page is embedded").text;
         self.assemble(index, &modules)
     }

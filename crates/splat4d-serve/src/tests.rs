@@ -566,18 +566,22 @@ fn nobody_else_edits() {
     }
     refused(413, "/edit", &[("content-length", "1048577")], good);
     refused(413, "/edit", &[("content-length", "99999999999999")], good);
-    let chunk = [format!("{:x}\r\n", (1 << 20) + 1).into_bytes(), vec![b' '; (1 << 20) + 1], b"\r\n0\r\n\r\n".to_vec()].concat();
+    let chunk = [format!("{:x}\r\n", (1 << 20) + 1).into_bytes(), vec![b' '; (1 << 20) + 1], b"\r\n0\r\n\r\n".to_vec()]
+        .concat();
     refused(413, "/edit", &[("transfer-encoding", "chunked"), ("content-length", "")], &chunk);
     for body in [&b"not JSON"[..], b"", b"{\"do\": \"x\"", b"\xff\xfe{}", b"[edit]\ndo = 1"] {
         refused(400, "/edit", &[], body);
     }
     refused(400, "/edit", &[("content-length", "400")], good);
-    for target in ["/edit/", "//edit", "/Edit", "/%65dit", "/./edit", "/edit/../edit", "/player/edit", "/scene.splat4d", "/"] {
+    for target in
+        ["/edit/", "//edit", "/Edit", "/%65dit", "/./edit", "/edit/../edit", "/player/edit", "/scene.splat4d", "/"]
+    {
         refused(405, target, &[], good);
     }
     assert!(tried > 30 && asked.lock().unwrap().is_empty(), "none of it reached the program");
     for method in ["PUT", "DELETE", "PATCH", "OPTIONS"] {
-        let headers = [("origin", "http://localhost"), ("x-splat4d-token", TOKEN), ("content-type", "application/json")];
+        let headers =
+            [("origin", "http://localhost"), ("x-splat4d-token", TOKEN), ("content-type", "application/json")];
         assert_eq!(ask(&server, method, "/edit", &headers).status, 405, "{method}");
     }
     assert_eq!(get(&server, "/edit").status, 404);

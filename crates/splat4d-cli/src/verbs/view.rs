@@ -1,12 +1,12 @@
 //! `view`: a scene in the browser's player.
 
+use crate::baking::title;
 use crate::console::Console;
+use crate::editor::{self, Editor};
 use crate::interrupt;
 use crate::playable::Playable;
 use crate::serving::{self, Place};
-use crate::editor::{self, Editor};
 use crate::source::{Source, not_empty};
-use crate::baking::title;
 use serde_json::json;
 use splat4d::Error;
 use splat4d_serve::{Config, Content, Editing};

@@ -15,9 +15,9 @@ import { launch } from './browser.mjs';
 const KNIGHT = fileURLToPath(new URL('../../../../examples/knight.splat4d', import.meta.url));
 const PROGRAM = process.env.SPLAT4D;
 const browser = PROGRAM && existsSync(PROGRAM) ? await launch() : null;
-const options = { skip: browser ? false : 'needs the program (SPLAT4D) and a browser', timeout: PATIENCE0 };
 /// A wait that is longer than this, ms, has found a hang. Generous: machines that test are busy.
 const PATIENCE = 120000;
+const options = { skip: browser ? false : 'needs the program (SPLAT4D) and a browser', timeout: 3 * PATIENCE };
 const work = mkdtempSync(path.join(tmpdir(), 'splat4d-edit-'));
 const servers = [];
 test.after(async () => {

@@ -160,11 +160,7 @@ struct Held {
 
 impl Held {
     /// Errors: all nodes of all handles are pinned.
-    fn of<'a>(
-        nodes: &[[f64; 3]],
-        handles: impl Iterator<Item = &'a DragHandle>,
-        pins: &[[f64; 4]],
-    ) -> Result<Self> {
+    fn of<'a>(nodes: &[[f64; 3]], handles: impl Iterator<Item = &'a DragHandle>, pins: &[[f64; 4]]) -> Result<Self> {
         let held = |at: [f64; 4]| within(nodes, [at[0], at[1], at[2]], at[3]);
         let pinned: Vec<usize> = pins.iter().flat_map(|p| held(*p)).collect();
         let pulled: Vec<Vec<usize>> = handles
@@ -324,8 +320,10 @@ fn carried(
         return Ok((start, paths));
     }
     let Some(layer) = own_nodes(scene, selected) else {
-        return Err(Error::input("what is selected has no control nodes of its own, or is of several layers that have")
-            .remedy("Give nodes = 512, or select one layer that a model on control nodes moves"));
+        return Err(Error::input(
+            "what is selected has no control nodes of its own, or is of several layers that have",
+        )
+        .remedy("Give nodes = 512, or select one layer that a model on control nodes moves"));
     };
     let at = |t: &f64| {
         let seen = Evaluation::of_layer(layer, Space::Nodes, Rows::All, Time(*t));

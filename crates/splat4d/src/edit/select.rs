@@ -408,7 +408,9 @@ mod tests {
         assert_eq!(Expr::parse("label(left hand)").ok(), None, "names with spaces stand in quotation marks");
         assert_eq!(Expr::parse("label('left hand')").unwrap(), Expr::Label("left hand".into()));
         assert!(Expr::parse("grow(all, 0.1)").unwrap().any(&|e| *e == Expr::All));
-        let Expr::Not(lasso) = Expr::parse("not lasso(1,2,3, 1,0,0,0, 0.5,9, 0,0, 1,0, 0.5,1)").unwrap() else { panic!() };
+        let Expr::Not(lasso) = Expr::parse("not lasso(1,2,3, 1,0,0,0, 0.5,9, 0,0, 1,0, 0.5,1)").unwrap() else {
+            panic!()
+        };
         let Expr::Lasso(lasso) = *lasso else { panic!() };
         assert_eq!((lasso.eye, lasso.range, lasso.corners.len()), ([1.0, 2.0, 3.0], [0.5, 9.0], 3));
         assert_eq!(Expr::parse("not (mask(a, b) and all)").unwrap().files(), ["a"]);
@@ -416,8 +418,11 @@ mod tests {
 
     #[test]
     fn a_point_is_within_a_polygon_by_the_even_odd_rule() {
-        let horseshoe = [[0.0, 0.0], [3.0, 0.0], [3.0, 3.0], [2.0, 3.0], [2.0, 1.0], [1.0, 1.0], [1.0, 3.0], [0.0, 3.0]];
-        for (point, inside) in [([0.5, 2.0], true), ([1.5, 2.0], false), ([2.5, 2.0], true), ([1.5, 0.5], true), ([4.0, 0.5], false)] {
+        let horseshoe =
+            [[0.0, 0.0], [3.0, 0.0], [3.0, 3.0], [2.0, 3.0], [2.0, 1.0], [1.0, 1.0], [1.0, 3.0], [0.0, 3.0]];
+        for (point, inside) in
+            [([0.5, 2.0], true), ([1.5, 2.0], false), ([2.5, 2.0], true), ([1.5, 0.5], true), ([4.0, 0.5], false)]
+        {
             assert_eq!(within(&horseshoe, point), inside, "{point:?}");
         }
     }

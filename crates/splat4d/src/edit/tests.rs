@@ -521,10 +521,7 @@ fn a_subject_alone_has_no_halo() {
     let truth = Scene {
         layers: vec![{
             let mut l = s.layers[0].clone();
-            l.edit(
-                &crate::scene::RowEdit::prune(crate::scene::Space::Gaussians, (0..n).map(|i| i % 2 == 0)),
-                &Rng::new(0, "x", 0),
-            );
+            l.edit(&crate::scene::RowEdit::prune(Space::Gaussians, (0..n).map(|i| i % 2 == 0)), &Rng::new(0, "x", 0));
             l
         }],
         ..s.clone()
@@ -598,9 +595,14 @@ fn the_nodes_of_a_model_bend_what_is_on_them() {
     let mut dragging = Dragging::new(scene, &all, [0.5, 0.5], 0, &Bench::empty()).unwrap();
     assert_eq!(dragging.nodes().len(), scene.layers[0].params.rows_of(Space::Nodes));
     assert_eq!(dragging.nodes()[1], own.tape(0).out().read::<3>(1, 0).map(f64::from));
-    let handle = DragHandle { place: dragging.nodes()[0], radius: 0.0, keys: vec![DragKey { t: 0.5, by: [0.5; 3], ease: false }] };
+    let handle = DragHandle {
+        place: dragging.nodes()[0],
+        radius: 0.0,
+        keys: vec![DragKey { t: 0.5, by: [0.5; 3], ease: false }],
+    };
     dragging.pull(&[(handle.clone(), [0.5; 3])], &[]).unwrap();
-    let step = |nodes| Step::Drag { select: "all".into(), at: 0.5, nodes, handles: vec![handle.clone()], pins: Vec::new() };
+    let step =
+        |nodes| Step::Drag { select: "all".into(), at: 0.5, nodes, handles: vec![handle.clone()], pins: Vec::new() };
     let (bent, _) = replay(&[step(0)], scene.clone(), &Bench::empty(), &mut |_, _| {}).unwrap();
     let same = psnr(&draw(&bent, 0.5), &draw(dragging.scene(), 0.0));
     assert!(same > 50.0, "{same} dB");
@@ -616,11 +618,13 @@ fn what_is_bent_under_the_hand_is_what_the_step_makes_of_it() {
         for now in [0.5, 0.75] {
             let mut dragging = Dragging::new(&scene, &all, [0.5, now], 24, &bench).unwrap();
             let place = dragging.places()[3];
-            let handle = DragHandle { place, radius: 0.1, keys: vec![DragKey { t: 0.5, by: [0.4, 0.1, 0.0], ease: false }] };
+            let handle =
+                DragHandle { place, radius: 0.1, keys: vec![DragKey { t: 0.5, by: [0.4, 0.1, 0.0], ease: false }] };
             let pins = [[0.0, 0.0, 0.0, 0.2]];
             let nodes = dragging.pull(&[(handle.clone(), [0.4, 0.1, 0.0])], &pins).unwrap();
             assert!((nodes[3][0] - dragging.nodes()[3][0] - 0.4).abs() < 1e-9);
-            let step = Step::Drag { select: "all".into(), at: 0.5, nodes: 24, handles: vec![handle], pins: pins.to_vec() };
+            let step =
+                Step::Drag { select: "all".into(), at: 0.5, nodes: 24, handles: vec![handle], pins: pins.to_vec() };
             let (bent, _) = replay(&[step], scene.clone(), &bench, &mut |_, _| {}).unwrap();
             let same = psnr(&draw(&bent, now), &draw(dragging.scene(), 0.0));
             assert!(same > 50.0, "{same} dB at {now}");
