@@ -92,12 +92,12 @@ fn dark(picture: &Planes<f32>) -> Vec<bool> {
 }
 
 /// Gives limits to tiles that have none: the mean of their neighbours', ring after ring.
-fn filled(limits: &mut Vec<Option<f32>>, across: usize) {
+fn filled(limits: &mut [Option<f32>], across: usize) {
     /// Rings: tags whose bits are wider than so many tiles twice are not found.
     const RINGS: usize = 12;
     let down = limits.len() / across;
     for _ in 0..RINGS {
-        let before = limits.clone();
+        let before = limits.to_vec();
         let mut changed = false;
         for (t, limit) in limits.iter_mut().enumerate().filter(|(_, l)| l.is_none()) {
             let (x, y) = (t % across, t / across);
