@@ -67,6 +67,18 @@ class Scenes(InFolder):
         red = self.scene.render(self.camera, 0.4, background=[1, 0, 0])
         np.testing.assert_allclose(red[..., 0] - black[..., 0], 1 - alpha, atol=1e-5)
 
+    def test_other_channels_are_numbers_of_what_is_seen(self):
+        alpha = self.scene.render(self.camera, 0.4, channel="alpha")
+        for channel, shape in [("flow", (2,)), ("velocity", (3,)), ("normal", (3,)), ("life", ()), ("uncertainty", ())]:
+            numbers = self.scene.render(self.camera, 0.4, channel=channel)
+            self.assertEqual((numbers.shape, numbers.dtype), ((150, 200, *shape), np.float32), channel)
+            seen = np.isfinite(numbers).reshape(150, 200, -1).all(axis=2)
+            self.assertTrue(seen.mean() > 0.5 and not seen[alpha < 0.05].any(), channel)
+        normals = self.scene.render(self.camera, 0.4, channel="normal")
+        lengths = np.linalg.norm(normals, axis=2)
+        np.testing.assert_allclose(lengths[np.isfinite(lengths)], 1, atol=1e-4)
+        self.assertEqual(self.scene.labels, [])
+
     def test_metrics_are_those_of_eval(self):
         picture = self.scene.render(self.camera, 0.4).clip(0, 1)
         other = (0.9 * picture).astype(np.float32)

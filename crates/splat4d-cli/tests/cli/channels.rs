@@ -119,7 +119,7 @@ fn masks_teach_a_run_its_labels_and_points_are_followed() {
     let run = work.path().join("run");
     let said = train(&root, &run).ok();
     assert!(said.contains("labels of") && said.contains("mean IoU"), "{said}");
-    let scene = splat4d::format::scene::read(&std::fs::read(run.join("scene.safetensors")).unwrap()).unwrap();
+    let scene = scene::read(&std::fs::read(run.join("scene.safetensors")).unwrap()).unwrap();
     assert_eq!(scene.labels, ["left", "right"]);
     assert!(json_of(&run.join("run.json"))["labels"]["accuracy"].as_f64().unwrap() > 0.5);
     let playback = splat4d::open(&std::fs::read(run.join("scene.splat4d")).unwrap()).unwrap();

@@ -97,9 +97,8 @@ pub fn of<F: Real>(params: &Params<F>) -> Vec<Option<usize>> {
 pub fn named(names: &[String], name: &str) -> Result<usize> {
     names.iter().position(|n| n == name).ok_or_else(|| {
         let remedy = match names.len() {
-            0 => {
-                "It has none: give the capture's cameras `labels` (docs/labels.md) and train with lambda_labels.".into()
-            }
+            0 => "It has none: give the capture's cameras masks of labels, then: splat4d label RUN (docs/labels.md)."
+                .into(),
             _ => format!("It has {}.", names.join(", ")),
         };
         Error::input(format!("the scene has no label `{name:.80}`")).remedy(remedy)
