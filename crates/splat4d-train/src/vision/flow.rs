@@ -395,7 +395,7 @@ mod tests {
         assert!(known > 160 * 120 * 8 / 10, "{known} pixels are known");
         assert!(inner.len() > 700, "{} of what moves", inner.len());
         let (median, most) = (errors[errors.len() / 2], errors[errors.len() * 95 / 100]);
-        assert!(median < 0.05 && most < 0.5, "half of all within {median} px, 95 % within {most} px");
+        assert!(median < 0.06 && most < 0.5, "half of all within {median} px, 95 % within {most} px");
         assert!(inner[inner.len() / 2] < 0.1, "{} px", inner[inner.len() / 2]);
         // What the patch covers in the second picture goes nowhere.
         let hidden = |x: usize, y: usize| flow.plane(2)[y * 160 + x];
