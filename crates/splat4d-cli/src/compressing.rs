@@ -11,6 +11,7 @@ use crate::source::{Source, not_empty, read_scene};
 use crate::{files, interrupt, report};
 use serde::{Deserialize, Serialize};
 use serde_json::json;
+use splat4d::device::Device;
 use splat4d::format::playback::{Meta, PagesDraft, Summary, WriteConfig, write_pages};
 use splat4d::layers::Scene;
 use splat4d::{Error, ErrorKind, Result};
@@ -58,15 +59,22 @@ pub(crate) struct Work {
     order: Order,
     /// Whether this call began it.
     fresh: bool,
+    /// What draws while it is tuned. No part of the order: it may go on on another device.
+    device: Device,
 }
 
 impl Work {
     /// A new compression. Errors: the folder cannot be written.
     pub(crate) fn begin(dir: PathBuf, order: Order) -> Result<Self> {
         files::make_folder(&dir)?;
-        let work = Self { dir, order, fresh: true };
+        let work = Self { dir, order, fresh: true, device: Device::Cpu };
         work.save()?;
         Ok(work)
+    }
+
+    /// The same, tuned on this device.
+    pub(crate) fn on(self, device: Device) -> Self {
+        Self { device, ..self }
     }
 
     /// The compression in a folder, to continue it. Errors: there is none.
@@ -83,7 +91,7 @@ impl Work {
                 .remedy("Begin anew: splat4d compress RUN.")
         })?;
         order.settings.check().map_err(|e| e.at(path.display()))?;
-        Ok(Self { dir: dir.to_owned(), order, fresh: false })
+        Ok(Self { dir: dir.to_owned(), order, fresh: false, device: Device::Cpu })
     }
 
     fn save(&self) -> Result<()> {
@@ -207,7 +215,7 @@ impl Work {
         files::make_folder(&folder)?;
         console.say("training the unpruned scene on for as many steps, to compare");
         let job = original.job(&settings);
-        let options = TrainOptions::default();
+        let options = TrainOptions { device: self.device, ..TrainOptions::default() };
         let done = compress::compress(&job, &folder, &options, stop, &mut |event| console.event(event))?;
         console.clear();
         if done.outcome.interrupted {
@@ -260,7 +268,7 @@ impl Work {
     ) -> anyhow::Result<compress::Compressed> {
         files::write(&self.dir.join("cameras.json"), &serde_json::to_vec(&cameras_json(&original.capture))?)?;
         let job = original.job(&self.order.settings);
-        let options = TrainOptions::default();
+        let options = TrainOptions { device: self.device, ..TrainOptions::default() };
         let compressed = compress::compress(&job, &self.dir, &options, stop, &mut |event| console.event(event))?;
         console.clear();
         if compressed.outcome.interrupted {

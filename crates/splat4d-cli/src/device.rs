@@ -27,11 +27,16 @@ fn no_gpu() -> bool {
     cfg!(all(feature = "gpu", target_os = "linux")) && !LINUX_GPUS.iter().any(|p| std::path::Path::new(p).exists())
 }
 
-/// The device to train on; where there is certainly no GPU for `auto`, that is said here.
+/// The device to train on.
 pub(crate) fn to_train(device: Device, console: &Console) -> device::Device {
+    chosen(device, "training", console)
+}
+
+/// The device that does something; where there is certainly no GPU for `auto`, that is said here.
+pub(crate) fn chosen(device: Device, does: &str, console: &Console) -> device::Device {
     match device {
         Device::Auto if no_gpu() => {
-            console.say(&format!("training on the CPU: {NO_GPU}"));
+            console.say(&format!("{does} on the CPU: {NO_GPU}"));
             device::Device::Cpu
         }
         Device::Auto => device::Device::Auto,

@@ -10,6 +10,7 @@ use crate::run_folder::{ORDER, Run};
 use crate::source::{Source, not_empty, read_scene};
 use crate::video::{Film, have_ffmpeg};
 use serde_json::{Value, json};
+use splat4d::device::Device;
 use splat4d::layers::Scene;
 use splat4d::{Error, Result};
 use splat4d_train::capture::{Capture, CaptureOptions, ImageStore};
@@ -57,6 +58,9 @@ pub struct Measure {
     /// Weights (safetensors) for LPIPS; without them it is not computed
     #[arg(long, value_name = "FILE", help_heading = "What is measured")]
     pub lpips_weights: Option<PathBuf>,
+    /// What draws the views.
+    #[arg(skip)]
+    pub device: Device,
 }
 
 impl Measure {
@@ -252,6 +256,7 @@ impl Measuring<'_> {
             measured,
             place,
             align: Align::of(capture, self.recipe),
+            device: self.measure.device,
             ..EvalOptions::default()
         };
         let iteration = self.opened.iteration().unwrap_or(0);

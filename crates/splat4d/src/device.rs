@@ -4,7 +4,9 @@
 mod tests;
 
 use crate::math::{Rng, Se3, sym3};
-use crate::render::{Backend, Image, ImageGrads, RenderConfig, RenderGrads, Renderer, Shot, Tables, Wanted};
+use crate::render::{
+    Backend, Comparison, Image, ImageGrads, RenderConfig, RenderGrads, Renderer, Resident, Shot, Tables, Target, Wanted,
+};
 use crate::scene::splats::{COV, SPLAT_COLUMNS, SPLAT_OPACITY};
 use crate::scene::{Camera, Color, Part, Planes, Splats, Table};
 use crate::{Error, ErrorKind, Result};
@@ -131,8 +133,11 @@ impl WithCpu {
 }
 
 impl Backend for WithCpu {
-    fn can(&self, _: &Wanted) -> Result<()> {
-        Ok(())
+    fn can(&self, wanted: &Wanted) -> Result<()> {
+        match &self.other {
+            Some(other) if wanted.compare => other.can(wanted),
+            _ => self.cpu.can(wanted),
+        }
     }
 
     fn render(&mut self, shot: &Shot<'_>, out: &mut Image) -> Result<()> {
@@ -164,6 +169,29 @@ impl Backend for WithCpu {
             self.cpu.render(shot, &mut self.again)?;
         }
         self.cpu.vjp(shot, grads, d_sh, d)
+    }
+
+    fn compare(
+        &mut self,
+        shot: &Shot<'_>,
+        target: &Target<'_>,
+        d_sh: &mut [Option<&mut Table>],
+        d: &mut RenderGrads,
+    ) -> Result<Option<Comparison>> {
+        self.drawn_by_other = false;
+        match self.able(shot).map(|other| other.compare(shot, target, d_sh, d)) {
+            Some(Ok(compared)) => {
+                self.drawn_by_other = compared.is_some();
+                return Ok(compared);
+            }
+            Some(Err(error)) => self.leave(&error),
+            None => {}
+        }
+        Ok(None)
+    }
+
+    fn resident(&mut self) -> Option<&mut dyn Resident> {
+        self.other.as_mut()?.resident()
     }
 
     fn radii(&self) -> &[f32] {

@@ -29,6 +29,18 @@ pub const RASTERIZE: &str = include_str!("gpu/rasterize.wgsl");
 pub const BYTES: &str = include_str!("gpu/bytes.wgsl");
 /// The blend's way back: a record a (tile, splat) pair. After [`PROJECT`].
 pub const RASTERIZE_BACK: &str = include_str!("gpu/rasterize_back.wgsl");
+/// A picture compared with its truth: L1, D-SSIM and their gradient: `moments`, `gradient`.
+pub const LOSS: &str = include_str!("gpu/loss.wgsl");
+/// Learnable rows at time t, and their lives. Reads `params`, which whoever includes it binds.
+pub const LEARNT: &str = include_str!("gpu/learnt.wgsl");
+/// Rows that stay on the GPU → splats. After [`LEARNT`].
+pub const ANSWER: &str = include_str!("gpu/answer.wgsl");
+/// Gradients of splats → those of rows. After [`LEARNT`].
+pub const ANSWER_BACK: &str = include_str!("gpu/answer_back.wgsl");
+/// Gradients of colours → those of SH and means, and statistics. After [`PROJECT`], [`SHADE`] and [`LEARNT`].
+pub const COLORS_BACK: &str = include_str!("gpu/colors_back.wgsl");
+/// A step of Adam on one table.
+pub const ADAM: &str = include_str!("gpu/adam.wgsl");
 /// A splat's records added up.
 pub const GATHER: &str = include_str!("gpu/gather.wgsl");
 /// Those sums → gradients of Gaussians and pose. After [`PROJECT`] and [`PROJECT_BACK`].
@@ -49,7 +61,7 @@ mod tests {
 
     #[test]
     fn every_shader_is_valid_within_webgpus_default_limits() {
-        let shaders: [(&str, &[&str]); 13] = [
+        let shaders: [(&str, &[&str]); 18] = [
             ("project and shade", &[PROJECT, SHADE]),
             ("sort", &[SORT]),
             ("splats", &[PROJECT, SHADE, SPLATS]),
@@ -60,6 +72,11 @@ mod tests {
             ("rasterize", &[PROJECT, RASTERIZE]),
             ("rasterize, backward", &[PROJECT, RASTERIZE_BACK]),
             ("bytes", &[PROJECT, BYTES]),
+            ("loss", &[LOSS]),
+            ("answer", &[LEARNT, ANSWER]),
+            ("answer, backward", &[LEARNT, ANSWER_BACK]),
+            ("colours, backward", &[PROJECT, SHADE, LEARNT, COLORS_BACK]),
+            ("adam", &[ADAM]),
             ("gather", &[GATHER]),
             ("roofline", &[ROOFLINE]),
             ("splats, backward", &[PROJECT, PROJECT_BACK, SPLATS_BACK]),

@@ -2,6 +2,7 @@
 
 use crate::compressing::{Order, Work};
 use crate::console::Console;
+use crate::device::{self, Device};
 use crate::finish;
 use crate::run_folder::{self, Run};
 use splat4d::{Error, Result};
@@ -68,6 +69,9 @@ pub(crate) struct Args {
     /// Only compress: no evaluation, no guard, no comparison, no report
     #[arg(long)]
     no_eval: bool,
+    /// What draws while it is tuned; the rest is done by the CPU
+    #[arg(long, value_enum, default_value = "cpu", help_heading = "What computes")]
+    device: Device,
     #[command(flatten)]
     measure: finish::Measure,
 }
@@ -78,7 +82,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         Some(dir) => Work::reopen(dir)?,
         None => begin(args, console)?,
     };
-    work.run(!args.no_eval, &args.measure, console)
+    work.on(device::to_train(args.device, console)).run(!args.no_eval, &args.measure, console)
 }
 
 /// Settles what is to be done, and where, before anything is computed.

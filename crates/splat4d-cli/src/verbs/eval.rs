@@ -1,6 +1,7 @@
 //! `eval`: measures a run again, perhaps next to a scene that stands still.
 
 use crate::console::Console;
+use crate::device::{self, Device};
 use crate::finish;
 use crate::run_folder::{Run, cameras_json};
 use crate::source::read_scene;
@@ -92,6 +93,9 @@ pub(crate) struct Args {
     #[arg(long, value_name = "CAPTURE", conflicts_with_all = ["baseline", "split", "background"],
           help_heading = "What is measured")]
     truth: Option<PathBuf>,
+    /// What draws the views; the metrics are computed on the CPU
+    #[arg(long, value_enum, default_value = "cpu", help_heading = "What computes")]
+    device: Device,
     #[command(flatten)]
     measure: finish::Measure,
 
@@ -101,6 +105,8 @@ pub(crate) struct Args {
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     args.measure.check()?;
+    let lpips_weights = args.measure.lpips_weights.clone();
+    let measure = finish::Measure { lpips_weights, device: device::chosen(args.device, "measuring", console) };
     let path = args.run.as_ref().or(args.model.as_ref()).expect("clap asks for a run");
     let run = Run::open(path)?;
     run.scene_file()?;
@@ -110,22 +116,22 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     if args.split.is_some() || args.background.is_some() {
         let split = args.split.unwrap_or(Split::Test).measured();
         let backgrounds = args.background.map_or(&[][..], Background::colors);
-        finish::scores_on(path, split, backgrounds, &args.measure, console)?;
+        finish::scores_on(path, split, backgrounds, &measure, console)?;
         return finish::write_page(path, console);
     }
     if args.baseline {
-        baseline(path, &run, args, console)?;
+        baseline(path, &run, &measure, console)?;
     }
     if args.no_film {
         let scene = read_scene(&run.scene_file()?)?;
-        finish::scores(path, &scene, &args.measure, console)?;
+        finish::scores(path, &scene, &measure, console)?;
         return finish::write_report(path, console);
     }
-    finish::all(path, &args.measure, console)
+    finish::all(path, &measure, console)
 }
 
 /// Trains the still scene unless it is there, and measures it.
-fn baseline(path: &Path, run: &Run, args: &Args, console: &Console) -> anyhow::Result<()> {
+fn baseline(path: &Path, run: &Run, measure: &finish::Measure, console: &Console) -> anyhow::Result<()> {
     let folder = path.join("baseline");
     let recipe = run.recipe()?.with(|r| r.run.motion = MotionName::of("still"));
     let cached = Run::is_finished(&folder)
@@ -148,7 +154,7 @@ fn baseline(path: &Path, run: &Run, args: &Args, console: &Console) -> anyhow::R
         }
     }
     let scene = read_scene(&Run::open(&folder)?.scene_file()?)?;
-    let evaluation = finish::scores(&folder, &scene, &args.measure, console)?;
+    let evaluation = finish::scores(&folder, &scene, measure, console)?;
     let scores: Value = evaluation.report.results()[evaluation.report.method()].clone();
     let results = path.join("results.json");
     let mut all = if results.is_file() {

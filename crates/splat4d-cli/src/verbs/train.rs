@@ -35,7 +35,7 @@ Examples:
   splat4d train my-take --hold-out camera=0,10      measure on these cameras
   splat4d train my-take --observe 0.8               keep the last fifth of the take for `predict`
   splat4d train concert -o runs/concert --chunk-frames 60        a long take, chunk by chunk
-  splat4d train my-take --device auto               a GPU draws, if there is one
+  splat4d train my-take --device auto               on a GPU, if there is one
   splat4d train --resume runs/first                 continue exactly where it stopped
 
 A capture is a folder with one of these: capture.json (write it by hand for your own rig), transforms_train.json
@@ -124,7 +124,7 @@ pub struct Args {
     /// Most memory that training may take: a long take is cut into as short chunks of as few Gaussians as that asks for
     #[arg(long, value_name = "SIZE", value_parser = parse_bytes, help_heading = "What is read")]
     memory_limit: Option<u64>,
-    /// What draws while it trains; the rest is done by the CPU. Not part of the recipe: a run may go on on another device
+    /// What trains; what a GPU cannot of a recipe is done by the CPU. Not part of the recipe: a run may go on on another device
     #[arg(long, value_enum, default_value = "cpu", help_heading = "What computes")]
     device: Device,
     #[command(flatten)]

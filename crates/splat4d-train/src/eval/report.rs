@@ -173,7 +173,7 @@ pub struct Conditions {
     /// Instructions of the kernels: `scalar`, `avx2`, `avx512` or `neon`. Levels round differently.
     pub simd: &'static str,
     /// What drew.
-    pub device: &'static str,
+    pub device: String,
 }
 
 /// An evaluation after some steps of training.

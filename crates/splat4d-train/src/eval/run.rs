@@ -29,7 +29,7 @@ use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
 use rayon::prelude::*;
 use serde_json::{Value, json};
-use splat4d::device;
+use splat4d::device::{self, Device, Opened};
 use splat4d::format::safetensors::SafeTensors;
 use splat4d::layers::{Evaluation, Scene};
 use splat4d::render::{Antialias, Backend, Image, RenderConfig, Shot, Simd};
@@ -98,6 +98,8 @@ pub struct EvalOptions {
     pub place: Option<String>,
     /// How held-out views are aligned, to be measured a second time (`PSNR-aligned`); `None`: not.
     pub align: Option<Align>,
+    /// What draws; the metrics are the CPU's.
+    pub device: Device,
 }
 
 impl Default for EvalOptions {
@@ -111,6 +113,7 @@ impl Default for EvalOptions {
             measured: Measured::Test,
             place: None,
             align: None,
+            device: Device::Cpu,
         }
     }
 }
@@ -204,7 +207,7 @@ pub fn assess(
     let lpips = options.lpips_weights.as_deref().map(load_lpips).transpose()?;
     let place = options.place.as_deref().unwrap_or(Measured::Test.name());
     let folder = options.folder.join(place).join(format!("ours_{iteration}"));
-    let mut judge = Judge::new(scene, capture, store, lpips, options.antialias);
+    let mut judge = Judge::new(scene, capture, store, lpips, options, listen);
     let whole = Views::Whole(options.pictures.then_some(folder.as_path()));
     let name = match options.measured {
         Measured::Test => "evaluating held-out views",
@@ -224,9 +227,10 @@ pub fn assess(
         split: options.measured.name(),
         background: capture.background.map(|_| scene.background),
         simd: Simd::detect().name(),
-        device: DEVICE,
+        device: judge.device,
     };
     let train = (!some.is_empty()).then_some(train);
+    std::iter::from_fn(|| judge.backend.notice()).for_each(|message| listen(&Event::Warning { message }));
     let report = Report { iteration: iteration as u64, conditions, test, train };
     Ok(Scores { report, dynamic_share, aligned })
 }
@@ -237,6 +241,8 @@ struct Judge<'a> {
     store: &'a Arc<ImageStore>,
     lpips: Option<Lpips>,
     backend: Box<dyn Backend>,
+    /// It in words.
+    device: String,
     instant: Evaluation<f32>,
     image: Image<f32>,
     /// Pixels seen and dynamic pixels among them.
@@ -249,16 +255,26 @@ impl<'a> Judge<'a> {
         capture: &'a Capture,
         store: &'a Arc<ImageStore>,
         lpips: Option<Lpips>,
-        antialias: bool,
+        options: &EvalOptions,
+        listen: &mut dyn FnMut(&Event),
     ) -> Self {
-        let antialias = if antialias { Antialias::On } else { Antialias::Off };
+        let antialias = if options.antialias { Antialias::On } else { Antialias::Off };
         let config = RenderConfig { antialias, ..RenderConfig::default() };
+        let Opened { backend, name, why, fell_back } = device::open_to_train(options.device, config);
+        let why = why.replacen("training", "measuring", 1).replacen("drawing", "measuring", 1);
+        match options.device {
+            Device::Cpu => {}
+            Device::Gpu if fell_back => listen(&Event::Warning { message: why }),
+            _ => listen(&Event::Device { name: name.clone(), why }),
+        }
+        let on_cpu = options.device == Device::Cpu || fell_back;
         Self {
             scene,
             capture,
             store,
             lpips,
-            backend: device::cpu(config),
+            backend,
+            device: if on_cpu { DEVICE.into() } else { name },
             instant: Evaluation::default(),
             image: Image::default(),
             dynamic: [0; 2],

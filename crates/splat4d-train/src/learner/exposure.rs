@@ -68,9 +68,19 @@ impl Exposure {
         self.grads.clear(&self.params);
     }
 
+    /// The row of a camera: its matrix without the identity, row by row, then its offsets.
+    pub(crate) fn response(&self, rig: usize) -> [f32; COLUMNS] {
+        self.params[self.key].read::<COLUMNS>(rig, 0)
+    }
+
+    /// Adds to the gradient of a camera's row.
+    pub(crate) fn add_gradient(&mut self, rig: usize, d: &[f64; COLUMNS]) {
+        self.grads.of([self.key])[0].add(rig, 0, d.map(|x| x as f32));
+    }
+
     /// Turns the colours `color` into those that camera `rig` shows.
     pub(crate) fn respond(&self, rig: usize, color: &mut Planes<f32>) {
-        let row = self.params[self.key].read::<COLUMNS>(rig, 0);
+        let row = self.response(rig);
         pieces(color).for_each(|[r, g, b]| {
             for ((r, g), b) in r.iter_mut().zip(g).zip(b) {
                 [*r, *g, *b] = shown(&row, [*r, *g, *b]);
@@ -81,7 +91,7 @@ impl Exposure {
     /// The VJP of [`respond`](Self::respond) at what was drawn: turns the gradient to the shown colours into that to the
     /// drawn ones, and adds to the camera's.
     pub(crate) fn respond_backward(&mut self, rig: usize, drawn: &Planes<f32>, d_color: &mut Planes<f32>) {
-        let row = self.params[self.key].read::<COLUMNS>(rig, 0);
+        let row = self.response(rig);
         let sums: Vec<[f64; COLUMNS]> = pieces(d_color)
             .enumerate()
             .map(|(piece, [r, g, b])| {
@@ -95,8 +105,8 @@ impl Exposure {
                 sums
             })
             .collect();
-        let sum = |k: usize| sums.iter().map(|s| s[k]).sum::<f64>() as f32;
-        self.grads.of([self.key])[0].add(rig, 0, std::array::from_fn::<f32, COLUMNS, _>(sum));
+        let sum = |k: usize| sums.iter().map(|s| s[k]).sum::<f64>();
+        self.add_gradient(rig, &std::array::from_fn(sum));
     }
 
     /// One Adam step with what the last views gave. Returns whether all was finite.

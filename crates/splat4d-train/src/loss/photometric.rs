@@ -5,6 +5,7 @@ use super::kernel::{self, Scratch, Strip};
 use super::terms::StepInfo;
 use rayon::prelude::*;
 use splat4d::math::Real;
+use splat4d::render::{Comparison, Target};
 use splat4d::scene::Planes;
 use splat4d::simd::{Simd, dispatch_pass};
 use std::sync::Mutex;
@@ -148,6 +149,18 @@ impl<F: Real> ImageTerm<F> for Photometric<F> {
             }
         };
         self.measured.total
+    }
+
+    fn target<'a>(&self, view: &View<'a, F>) -> Option<Target<'a, F>> {
+        let View { truth, weight, frame, .. } = *view;
+        Some(Target { truth, weight, picture: frame, dssim: f64::from(self.lambda_dssim), response: None })
+    }
+
+    fn compared(&mut self, _: &View<'_, F>, c: &Comparison) -> f64 {
+        let lambda = f64::from(self.lambda_dssim);
+        let total = (1.0 - lambda) * c.l1 + lambda * (1.0 - c.ssim);
+        self.measured = LossValue { total, l1: c.l1, ssim: c.ssim, mse: c.mse };
+        total
     }
 
     fn measured(&self) -> Option<LossValue> {

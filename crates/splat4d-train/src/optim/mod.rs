@@ -6,6 +6,7 @@
 mod adam;
 mod noise;
 
+pub(crate) use adam::corrections;
 pub(crate) use noise::{MCMC_EXTENT, Noise};
 
 use splat4d::math::Real;
@@ -126,7 +127,7 @@ impl<F: Real> Moments<F> {
         floors: &[Floor],
     ) -> Vec<Key> {
         if self.corrections.is_empty() {
-            self.corrections = adam::corrections();
+            self.corrections = corrections();
         }
         let (mut bad, simd) = (Vec::new(), Simd::detect());
         for key in p.keys() {

@@ -13,7 +13,8 @@ use super::start::read_info;
 use crate::event::{Event, Progress};
 use crate::loss::image::ImageTerm;
 use crate::recipe::Recipe;
-use crate::step::trainer::Trainer;
+use crate::step::engine::Blame;
+use crate::step::trainer::{Fault, Trainer};
 use crate::{Error, ErrorKind, Result};
 use serde_json::json;
 use splat4d::device::Device;
@@ -246,7 +247,7 @@ impl Session<'_> {
                     break;
                 }
                 Err(fault) => {
-                    state = self.roll_back(trainer, &fault.0, listen)?;
+                    state = self.roll_back(trainer, &fault, listen)?;
                     metrics.rewind(trainer.progress.iteration);
                     continue;
                 }
@@ -293,14 +294,24 @@ impl Session<'_> {
                 listen(&self.progress(trainer, &state, &steps));
             }
             let i = trainer.progress.iteration;
+            // What the start of a later stage did may have taken long: it is not to be done twice.
+            let due = i.is_multiple_of(self.recipe.run.checkpoint_interval) || entered && i > 1;
+            let looked_at = due || snapshots.as_ref().is_some_and(Snapshots::is_due);
+            if looked_at && let Err(fault) = trainer.settle() {
+                state = self.roll_back(trainer, &fault, listen)?;
+                metrics.rewind(trainer.progress.iteration);
+                continue;
+            }
             if let Some(event) = snapshots.as_mut().and_then(|s| s.take(trainer)) {
                 listen(&event);
             }
-            // What the start of a later stage did may have taken long: it is not to be done twice.
-            let due = i.is_multiple_of(self.recipe.run.checkpoint_interval) || entered && i > 1;
             if due && !trainer.is_done() {
                 self.save(trainer, &state, &metrics, &totals, false, listen)?;
             }
+        }
+        if let Err(fault) = trainer.settle() {
+            state = self.roll_back(trainer, &fault, listen)?;
+            metrics.rewind(trainer.progress.iteration);
         }
         let done = trainer.is_done();
         self.save(trainer, &state, &metrics, &totals, done, listen)?;
@@ -401,9 +412,11 @@ impl Session<'_> {
     }
 
     /// Back to the last checkpoint with half the rates; the third time the run is given up.
-    fn roll_back(&self, trainer: &mut Trainer<'_>, what: &str, listen: &mut dyn FnMut(&Event)) -> Result<RunState> {
+    fn roll_back(&self, trainer: &mut Trainer<'_>, fault: &Fault, listen: &mut dyn FnMut(&Event)) -> Result<RunState> {
+        let Fault(what, blame) = fault;
+        let (strike, share) = if *blame == Blame::Device { (0, 1.0) } else { (1, ROLLBACK_RATE) };
         let (failed, strikes, rate) =
-            (trainer.progress.iteration + 1, trainer.progress.strikes + 1, trainer.progress.rate_scale);
+            (trainer.progress.iteration + 1, trainer.progress.strikes + strike, trainer.progress.rate_scale);
         if strikes >= MAX_STRIKES {
             return Err(Error::new(
                 ErrorKind::Diverged,
@@ -413,7 +426,7 @@ impl Session<'_> {
         }
         let (state, _) = restore_newest(self.run, trainer, &self.identity)?;
         trainer.progress.strikes = strikes;
-        trainer.progress.rate_scale = rate * ROLLBACK_RATE;
+        trainer.progress.rate_scale = rate * share;
         listen(&Event::RolledBack { iteration: failed, to: trainer.progress.iteration, what: what.to_owned() });
         Ok(state)
     }

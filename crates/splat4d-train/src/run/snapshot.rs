@@ -51,9 +51,14 @@ impl Snapshots {
         }
     }
 
+    /// Whether one is due.
+    pub(super) fn is_due(&self) -> bool {
+        Instant::now() >= self.due
+    }
+
     /// The snapshot, where one is due. One that fails is a warning.
     pub(super) fn take(&mut self, trainer: &Trainer<'_>) -> Option<Event> {
-        (Instant::now() >= self.due).then(|| self.now(trainer))
+        self.is_due().then(|| self.now(trainer))
     }
 
     /// The snapshot, due or not.

@@ -12,7 +12,7 @@ pub(crate) use crate::loss::image::{ImageTerm, View};
 pub(crate) use crate::loss::terms::{ParamLoss, Probe, ProbeLoss, StepInfo};
 use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::Real;
-use splat4d::render::{Backend, Image, RenderGrads, Shot};
+use splat4d::render::{Backend, Image, RenderGrads, Shot, Target};
 use splat4d::scene::{Color, Grads, Part, Rows, SH, Space, Splats, Table, Time};
 use std::time::{Duration, Instant as Clock};
 
@@ -21,7 +21,7 @@ use std::time::{Duration, Instant as Clock};
 pub struct Timings {
     /// `prepare` and `at`.
     pub motion: Duration,
-    /// Drawing.
+    /// Drawing; of a device that does it all at once also comparing and the renderer's VJP.
     pub render: Duration,
     /// Image, probe and parameter losses with their gradients.
     pub loss: Duration,
@@ -95,6 +95,14 @@ struct Work<'a, F: Real> {
     d: &'a mut [Grads<F>],
     observe: &'a mut dyn FnMut(Observation<'_, F>),
     report: StepReport,
+}
+
+impl<F: Real> Work<'_, F> {
+    /// Adds the picture loss of one view.
+    fn tell_loss(&mut self, value: f64) {
+        self.report.loss += value;
+        self.report.view_losses.push(value);
+    }
 }
 
 impl<F: Real> Chain<F> {
@@ -181,11 +189,20 @@ impl<F: Real> Chain<F> {
             depth: needs.depth,
             ..Shot::new(&splats, view.camera, view.background)
         };
-        work.backend.render(&shot, &mut self.picture.image)?;
-        work.report.timings.render += lap(&mut clock);
-        self.picture.compare(step.info, view, channels.as_ref().map_or(&[], |c| &c.places), work);
-        work.report.timings.loss += lap(&mut clock);
-        self.picture.backward(scene, &shot, work)?;
+        let target = if channels.is_none() && !needs.depth { work.image.target(view) } else { None };
+        let compared = match target {
+            Some(target) => self.picture.compare_there(view, &shot, &target, work)?,
+            None => false,
+        };
+        if !compared {
+            work.backend.render(&shot, &mut self.picture.image)?;
+            work.report.timings.render += lap(&mut clock);
+            self.picture.compare(step.info, view, channels.as_ref().map_or(&[], |c| &c.places), work);
+            work.report.timings.loss += lap(&mut clock);
+            self.picture.backward(&shot, work)?;
+        }
+        work.report.timings.render += if compared { lap(&mut clock) } else { Duration::ZERO };
+        self.picture.deliver(scene, work);
         self.picture.tell(&self.evaluation, &asked, work);
         drop(splats);
         for (&i, part) in asked.iter().zip(&mut self.picture.d_splats.parts) {
@@ -249,14 +266,34 @@ impl<F: Real> Compared<F> {
     fn compare(&mut self, info: &StepInfo, view: &View<'_, F>, drawn: &[(Channel, usize)], work: &mut Work<'_, F>) {
         self.d_image.begin(&self.image);
         let value = work.image.eval(info, view, &Shown::new(&self.image, drawn), &mut self.d_image);
-        work.report.loss += value;
-        work.report.view_losses.push(value);
+        work.tell_loss(value);
     }
 
-    /// The backend's VJP; what belongs to no question goes to the layers: their own SH and the head's weights.
-    fn backward(&mut self, scene: &Scene<F>, shot: &Shot<'_, F>, work: &mut Work<'_, F>) -> Result<()> {
+    /// Drawing, the picture loss and the backend's VJP, all on its device. Returns whether it could.
+    fn compare_there(
+        &mut self,
+        view: &View<'_, F>,
+        shot: &Shot<'_, F>,
+        target: &Target<'_, F>,
+        work: &mut Work<'_, F>,
+    ) -> Result<bool> {
         let mut d_sh = own_sh(shot.splats, work.d);
-        work.backend.vjp(shot, &self.d_image.grads(), &mut d_sh, &mut self.d_splats)?;
+        let Some(comparison) = work.backend.compare(shot, target, &mut d_sh, &mut self.d_splats)? else {
+            return Ok(false);
+        };
+        let value = work.image.compared(view, &comparison);
+        work.tell_loss(value);
+        Ok(true)
+    }
+
+    /// The backend's VJP.
+    fn backward(&mut self, shot: &Shot<'_, F>, work: &mut Work<'_, F>) -> Result<()> {
+        let mut d_sh = own_sh(shot.splats, work.d);
+        work.backend.vjp(shot, &self.d_image.grads(), &mut d_sh, &mut self.d_splats)
+    }
+
+    /// What came back and belongs to no question: the camera's gradients, and the weights of the head, which go to its layer.
+    fn deliver(&self, scene: &Scene<F>, work: &mut Work<'_, F>) {
         work.report.d_cameras.push(self.d_splats.camera);
         work.report.d_focals.push(self.d_splats.focal);
         if let (Some((layer, keys)), Some(head)) = (scene.head_keys(), &self.d_splats.head) {
@@ -264,7 +301,6 @@ impl<F: Real> Compared<F> {
             first.data_mut().iter_mut().zip(&head.first).for_each(|(d, x)| *d += *x);
             second.data_mut().iter_mut().zip(&head.second).for_each(|(d, x)| *d += *x);
         }
-        Ok(())
     }
 
     /// Tells the observer what the view saw of every layer.

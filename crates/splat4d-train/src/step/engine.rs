@@ -1,7 +1,7 @@
 //! [`Engine`]: takes steps on a learner. The processor's is [`CpuEngine`]; one whose tables stay on a device can stand in its
 //! place, since a plan says all that a step is of, and a learner says what happened to it between steps.
 
-use super::chain::{Chain, Losses, Step, StepInfo, StepReport, View};
+use super::chain::{Chain, ImageTerm, Losses, Step, StepInfo, StepReport, View};
 use super::loss::TrainLoss;
 use crate::Result;
 use crate::learner::{Learner, Parts};
@@ -10,7 +10,7 @@ use crate::optim::Floor;
 use crate::upkeep::Change;
 use splat4d::layers::Scene;
 use splat4d::math::Rng;
-use splat4d::render::{Antialias, Backend};
+use splat4d::render::{Antialias, Backend, Wanted};
 use splat4d::scene::life::LOG_WIDTH;
 use splat4d::scene::{Grads, Key, LIFE, SH};
 use std::time::{Duration, Instant as Clock};
@@ -60,21 +60,70 @@ pub struct Stepped {
     pub notices: Vec<String>,
 }
 
-/// A number that was not finite: what and where.
+/// What a step was spoilt by.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Blame {
+    /// A number that is not finite: smaller steps may help.
+    Numbers,
+    /// A device that failed: the same steps, taken elsewhere, are as good as ever.
+    Device,
+}
+
+/// A step that was spoilt, so that nothing of the learner is to be trusted any more: what and where, and by what.
 #[derive(Clone, Debug)]
-pub struct Fault(pub String);
+pub struct Fault(pub String, pub Blame);
 
 /// Takes steps on a learner.
 pub trait Engine: Send {
-    /// One step: evaluate, draw, compare, back, Adam, noise. Inner error: a number was not finite, and nothing of the learner
-    /// is to be trusted any more. Errors: those of what draws.
+    /// One step: evaluate, draw, compare, back, Adam, noise. Inner error: it was spoilt. Errors: those of what draws.
     fn step(&mut self, learner: &mut Learner, plan: &mut StepPlan<'_>) -> Result<Result<Stepped, Fault>>;
 
-    /// The learner was changed in other ways than by a step, or another stage begins: what is remembered of it is stale.
+    /// The learner was changed in other ways than by a step (it was settled before), or another stage begins: what is remembered
+    /// of it is stale.
     fn changed(&mut self, learner: &Learner);
+
+    /// Brings the learner up to date, where its numbers are kept elsewhere: asked before anybody looks at them. Errors: they
+    /// are lost.
+    fn settle(&mut self, _learner: &mut Learner) -> Result<(), Fault> {
+        Ok(())
+    }
 
     /// As it draws.
     fn antialias(&self) -> Antialias;
+}
+
+/// A rate a column, by layer and table; none: the table rests.
+pub(super) type Rates = Vec<Vec<Option<Vec<f64>>>>;
+
+/// The rates of a step.
+pub(super) fn rates_of(scene: &Scene<f32>, plan: &StepPlan<'_>, all: &mut Rates) {
+    let (stage, scale, progress) = (&*plan.stage, plan.rate_scale, plan.info.progress);
+    all.resize_with(scene.layers.len(), Vec::new);
+    for (index, (layer, rates)) in scene.layers.iter().zip(all).enumerate() {
+        rates.resize(layer.params.keys().count(), None);
+        rates.iter_mut().flatten().for_each(|table| table.fill(0.0));
+        for group in stage.groups.iter().filter(|g| g.is_of(index) && g.from <= plan.stage_step) {
+            let found = layer.params.keys().find_map(|k| layer.params[k].column(&group.column).map(|c| (k, c)));
+            let Some((key, (first, width))) = found else { continue };
+            let (from, count) = group.part.unwrap_or((0, width));
+            let table = rates[key.0 as usize].get_or_insert_default();
+            table.resize(layer.params[key].width(), 0.0);
+            let end = (first + from + count).min(first + width);
+            table[first + from..end].fill(group.rate_at(plan.stage_step, progress) * scale);
+        }
+    }
+}
+
+/// Adam on the cameras' exposures.
+pub(super) fn learn_exposure(learner: &mut Learner, plan: &StepPlan<'_>) {
+    if let Some(exposure) = learner.parts_mut().exposure {
+        match plan.stage.freeze_exposure {
+            true => exposure.rest(),
+            false => {
+                let _ = exposure.step(plan.exposure_lr * plan.rate_scale);
+            }
+        }
+    }
 }
 
 /// Steps on the processor, with whatever draws.
@@ -82,12 +131,14 @@ pub struct CpuEngine<'a> {
     backend: Box<dyn Backend<f32> + 'a>,
     chain: Chain<f32>,
     grads: Vec<Grads<f32>>,
-    /// Scratch: a rate a column, by layer and table.
-    rates: Vec<Vec<Option<Vec<f64>>>>,
+    /// Scratch.
+    rates: Rates,
     /// The scene as the stage's codec shows it.
     shown: Scene<f32>,
     /// Whether `shown` is to be copied from the scene anew.
     stale: bool,
+    /// Whether it was said that pictures are compared on the CPU.
+    told: bool,
 }
 
 impl<'a> CpuEngine<'a> {
@@ -100,7 +151,13 @@ impl<'a> CpuEngine<'a> {
             rates: Vec::new(),
             shown: Scene::default(),
             stale: true,
+            told: false,
         }
+    }
+
+    /// What draws.
+    pub(super) fn backend(&mut self) -> &mut (dyn Backend<f32> + 'a) {
+        self.backend.as_mut()
     }
 
     /// Brings what the stage's codec shows up to date.
@@ -119,6 +176,10 @@ impl<'a> CpuEngine<'a> {
         let scene = if plan.stage.codec.is_some() { &self.shown } else { &*scene };
         let Stage { pictures, probes, params, .. } = &mut *plan.stage;
         let mut image = plan.loss.of_step(pictures, exposure);
+        if !self.told && compares(self.backend.as_ref()) && plan.views.iter().any(|v| image.target(v).is_none()) {
+            out.notices.push("the CPU compares pictures: the recipe's loss on them is more than L1 and D-SSIM".into());
+            self.told = true;
+        }
         let mut losses = Losses { image: &mut image, probes, params };
         let step = Step { scene, views: plan.views, info: plan.info, sh_degree: plan.sh_degree };
         let (backend, grads) = (self.backend.as_mut(), &mut self.grads);
@@ -137,47 +198,30 @@ impl<'a> CpuEngine<'a> {
         {
             bad.push((0, SH));
         }
-        let Parts { scene, moments, exposure, .. } = learner.parts_mut();
-        self.rates.resize_with(scene.layers.len(), Vec::new);
+        rates_of(learner.scene(), plan, &mut self.rates);
+        let Parts { scene, moments, .. } = learner.parts_mut();
         for (index, layer) in scene.layers.iter_mut().enumerate() {
-            let rates = &mut self.rates[index];
-            rates.resize(layer.params.keys().count(), None);
-            rates.iter_mut().flatten().for_each(|table| table.fill(0.0));
-            for group in stage.groups.iter().filter(|g| g.is_of(index) && g.from <= plan.stage_step) {
-                let found = layer.params.keys().find_map(|k| layer.params[k].column(&group.column).map(|c| (k, c)));
-                let Some((key, (first, width))) = found else { continue };
-                let (from, count) = group.part.unwrap_or((0, width));
-                let table = rates[key.0 as usize].get_or_insert_default();
-                table.resize(layer.params[key].width(), 0.0);
-                let end = (first + from + count).min(first + width);
-                table[first + from..end].fill(group.rate_at(plan.stage_step, progress) * scale);
-            }
             let floor = stage.min_log_life.filter(|_| layer.params[LIFE].width() > LOG_WIDTH);
             let floor = floor.map(|least| Floor { key: LIFE, column: LOG_WIDTH, least });
-            let keys = moments[index].step(&mut layer.params, &mut self.grads[index], rates, floor.as_slice());
+            let (d, rates) = (&mut self.grads[index], &self.rates[index]);
+            let keys = moments[index].step(&mut layer.params, d, rates, floor.as_slice());
             bad.extend(keys.into_iter().map(|k| (index, k)));
         }
-        if let Some(exposure) = exposure {
-            match stage.freeze_exposure {
-                true => exposure.rest(),
-                false => {
-                    let _ = exposure.step(plan.exposure_lr * scale);
-                }
-            }
-        }
+        learn_exposure(learner, plan);
         bad
     }
 
     /// Names the first number that is not finite, if the step was not sound.
     fn sound(&self, scene: &Scene<f32>, report: &StepReport, bad: &[(usize, Key)]) -> Result<(), Fault> {
         let Some(&(layer, key)) = bad.first() else {
-            return if report.loss.is_finite() { Ok(()) } else { Err(Fault(format!("the loss is {}", report.loss))) };
+            let fault = || Fault(format!("the loss is {}", report.loss), Blame::Numbers);
+            return if report.loss.is_finite() { Ok(()) } else { Err(fault()) };
         };
         let params = &scene.layers[layer].params;
         let place = self.grads[layer].table(key).first_non_finite().or_else(|| params[key].first_non_finite());
         let (row, col) = place.unwrap_or((0, 0));
         let column = params.column_name(key, col);
-        Err(Fault(format!("`{column}` of Gaussian {row} of layer {layer} is not finite")))
+        Err(Fault(format!("`{column}` of Gaussian {row} of layer {layer} is not finite"), Blame::Numbers))
     }
 
     /// Noise on positions, where the stage has it.
@@ -190,6 +234,11 @@ impl<'a> CpuEngine<'a> {
         let rng = Rng::new(plan.info.seed, "noise", plan.info.iteration as u64);
         noise.add(learner.parts_mut().scene, &self.grads, rate, plan.min_opacity, rng);
     }
+}
+
+/// Whether a backend compares pictures, where the loss lets it.
+fn compares(backend: &dyn Backend) -> bool {
+    backend.can(&Wanted { compare: true, ..Wanted::default() }).is_ok()
 }
 
 impl Engine for CpuEngine<'_> {

@@ -4,6 +4,7 @@ use crate::learner::Exposure;
 use crate::loss::image::{ImageTerm, Needs, PictureGrads, Shown, View};
 use crate::loss::photometric::Photometric;
 use crate::loss::terms::StepInfo;
+use splat4d::render::{Comparison, Target};
 use splat4d::scene::Planes;
 
 /// The loss on pictures: terms, in the order in which their values and gradients are summed. The exposure of the
@@ -90,6 +91,30 @@ impl ImageTerm for StepLoss<'_> {
         run.views += 1;
         if let Some(exposure) = &mut self.exposure {
             exposure.respond_backward(view.rig, drawn.color, d.color.add());
+        }
+        total
+    }
+
+    fn target<'a>(&self, view: &View<'a>) -> Option<Target<'a>> {
+        let mut terms = self.run.terms.iter().chain(&*self.stage);
+        let (Some(only), None) = (terms.next(), terms.next()) else { return None };
+        let response = self.exposure.as_ref().map(|exposure| exposure.response(view.rig));
+        only.target(view).map(|target| Target { response, ..target })
+    }
+
+    fn compared(&mut self, view: &View<'_>, comparison: &Comparison) -> f64 {
+        let run = &mut *self.run;
+        let mut total = 0.0;
+        for term in run.terms.iter_mut().chain(&mut *self.stage) {
+            total += term.compared(view, comparison);
+            if let Some(measured) = term.measured() {
+                (run.l1, run.ssim) = (measured.l1, measured.ssim);
+                run.squares += measured.mse;
+            }
+        }
+        run.views += 1;
+        if let (Some(exposure), Some(d)) = (&mut self.exposure, &comparison.d_response) {
+            exposure.add_gradient(view.rig, d);
         }
         total
     }

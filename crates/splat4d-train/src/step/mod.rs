@@ -7,6 +7,7 @@ pub(crate) mod clocks;
 pub mod engine;
 pub mod loss;
 pub(crate) mod pace;
+mod resident;
 pub mod trainer;
 
 #[cfg(test)]

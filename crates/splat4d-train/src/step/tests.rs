@@ -6,6 +6,8 @@ mod flow;
 mod gpu;
 mod limits;
 mod refine;
+#[cfg(feature = "gpu")]
+mod resident;
 mod resume;
 mod switches;
 

@@ -3,10 +3,11 @@
 use super::batch::Batch;
 use super::chain::StepInfo;
 use super::clocks::Look;
-use super::engine::{CpuEngine, Engine, StepPlan};
+use super::engine::{Blame, Engine, StepPlan};
 pub use super::engine::{Fault, Stepped};
 use super::loss::TrainLoss;
 use super::pace::Pace;
+use super::resident::DeviceEngine;
 use crate::capture::frames::Frames;
 use crate::event::Progress;
 use crate::learner::{Learner, Touched};
@@ -122,7 +123,7 @@ impl<'a> Trainer<'a> {
             entered: false,
             frames,
             timeline,
-            engine: Box::new(CpuEngine::new(backend)),
+            engine: Box::new(DeviceEngine::new(backend)),
             batch: Batch::default(),
         };
         trainer.spread();
@@ -296,15 +297,21 @@ impl<'a> Trainer<'a> {
             Ok(stepped) => Stepped { load, ..stepped },
             Err(fault) => {
                 let views = self.batch.names(self.frames.as_ref());
-                return Ok(Err(Fault(format!("{} ({views})", fault.0))));
+                return Ok(Err(Fault(format!("{} ({views})", fault.0), fault.1)));
             }
         };
         self.correct(&out)?;
         let clock = Clock::now();
         let (place, next) = (self.progress.stage_step, self.next_place());
+        if self.looked_at_after(place + 1..=next)
+            && let Err(fault) = self.settle()
+        {
+            return Ok(Err(fault));
+        }
         out.change = self.keep_up(place + 1..=next, |_| true)?;
         if self.scene().is_empty() {
-            return Ok(Err(Fault("not one Gaussian is left: all of them became transparent or huge".into())));
+            let what = "not one Gaussian is left: all of them became transparent or huge";
+            return Ok(Err(Fault(what.into(), Blame::Numbers)));
         }
         self.progress.iteration += 1;
         self.progress.taken += 1;
@@ -314,6 +321,19 @@ impl<'a> Trainer<'a> {
         }
         out.other += clock.elapsed();
         Ok(Ok(out))
+    }
+
+    /// Brings the learner up to date, which a device may keep: before anybody looks at it between steps. It is so by itself at the
+    /// end of every stage. Errors: its numbers are lost, and the run must go back to a checkpoint.
+    pub fn settle(&mut self) -> std::result::Result<(), Fault> {
+        self.engine.settle(&mut self.learner)
+    }
+
+    /// Whether upkeep, a hook or another stage looks at the learner after these steps of the stage's schedule.
+    fn looked_at_after(&self, mut passed: RangeInclusive<usize>) -> bool {
+        let stage = &self.stages[self.progress.stage];
+        let last = *passed.end() == stage.iterations;
+        last || passed.any(|step| stage.upkeep.iter().any(|u| u.due(&At { step, steps: stage.iterations })))
     }
 
     /// Loads the pictures of this step; the next one's are read meanwhile.

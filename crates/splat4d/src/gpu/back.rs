@@ -1,9 +1,10 @@
 //! The way back of a picture: records, sums and the projection's VJP on the GPU, colours on the CPU.
 
 use super::buffers::{SPARE, UNIFORM_STRIDE};
-use super::clock::{Recorder, TIMES_BYTES};
-use super::frame::{Back, Band, Frame, RECORD_BYTES, TILE};
+use super::clock::{Recorder, STAGES, TIMES_BYTES};
+use super::frame::{Back, Band, Frame, RECORD_BYTES, TILE, count};
 use super::kernels::BackKernels;
+use super::resident::KeptPass;
 use super::{GpuRenderer, pixel_rows};
 use crate::render::project::{CAMERA, Projection};
 use crate::render::rasterize::CHANNELS;
@@ -21,7 +22,7 @@ const NUMBERS: usize = 20;
 /// Bits of `Blend::flags` in rasterize_back.wgsl.
 const FLAG_ALPHA: u32 = 1;
 const FLAG_DEPTH: u32 = 2;
-const FLAG_ABS: u32 = 4;
+pub(super) const FLAG_ABS: u32 = 4;
 /// Splats in a task: whole blocks of a table.
 const CHUNK: usize = 1024;
 
@@ -38,11 +39,44 @@ pub(super) struct Returned {
 }
 
 /// Where things lie in the memory that the CPU reads.
-struct Layout {
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Layout {
     cameras: u64,
     sums: u64,
     times: u64,
+    counts: u64,
+    partials: u64,
     all: u64,
+}
+
+/// What a submission of the way back leaves to the CPU.
+pub(super) struct Came {
+    /// Gradient to the background, by tile.
+    pub sums: Vec<f32>,
+    /// Of every splat [`NUMBERS`].
+    pub rows: Vec<f32>,
+    /// Gradient to pose and focal lengths.
+    pub camera: [f64; CAMERA],
+    /// Splats, visible ones, pairs.
+    pub counts: Vec<u32>,
+    /// What the tiles add to the loss.
+    pub partials: Vec<f32>,
+    /// What Adam found of tables that stay.
+    pub words: Vec<u32>,
+    /// Milliseconds of the wait, and of the stages.
+    pub wait: f64,
+    pub stages: [f64; STAGES],
+}
+
+/// Where a way back ends.
+#[derive(Clone, Copy)]
+pub(super) enum End<'a> {
+    /// At sums of records, to which another band adds.
+    Band,
+    /// At the splats, whose gradients the CPU reads.
+    Splats,
+    /// At tables that stay; the first byte of the words of Adam.
+    Kept(&'a KeptPass<'a>, u64),
 }
 
 impl GpuRenderer {
@@ -92,9 +126,9 @@ impl GpuRenderer {
         }
         self.compile_back()?;
         let across = size[0].div_ceil(TILE);
-        let layout = self.make_room_to_return(n, across, size)?;
+        let layout = self.make_room_to_return(n, across, size, 0)?;
         let bands = self.drawn.clone();
-        let (mut rows, mut d_camera, mut d_background) = (Vec::new(), [0.0; CAMERA], [0.0; 3]);
+        let mut all: Option<Came> = None;
         for (i, &(band, pairs)) in bands.iter().enumerate() {
             let last = i + 1 == bands.len();
             let sums_at = (RECORD_BYTES / 4) as u32 * pairs as u32;
@@ -104,23 +138,46 @@ impl GpuRenderer {
                 | flag(self.config.abs_grads, FLAG_ABS);
             self.write_uniforms(shot, band, across, [flags, sums_at, u32::from(i > 0)])?;
             self.send_gradient(shot, grads, band);
-            let end = if last { Some((&mut rows, &mut d_camera)) } else { None };
-            let sums = self.return_band((band, pairs), across, bands.len() > 1, end, &layout)?;
-            for tile in sums.chunks_exact(3) {
-                for c in 0..3 {
-                    d_background[c] += f64::from(tile[c]);
-                }
+            let mut came = self.return_band((band, pairs), across, bands.len() > 1, last, &layout)?;
+            self.timings.back_wait += came.wait;
+            self.timings.add(came.stages);
+            if let Some(before) = all.take() {
+                came.sums.splice(..0, before.sums);
             }
+            all = Some(came);
         }
-        d.background = d_background.map(|v| v as f32);
-        d.camera.copy_from_slice(&d_camera[..6]);
-        d.focal = d_camera[6];
-        self.spread(shot, &rows, d_sh, d)?;
+        self.deliver(shot, &all.expect("something was drawn"), d_sh, d)?;
         self.timings.back_total = start.elapsed().as_secs_f64() * 1e3;
         Ok(())
     }
 
-    fn make_room_to_return(&mut self, n: usize, across: usize, size: [usize; 2]) -> Result<Layout> {
+    /// Hands out what came back of all bands.
+    pub(super) fn deliver(
+        &mut self,
+        shot: &Shot<'_, f32>,
+        came: &Came,
+        d_sh: &mut [Option<&mut Table<f32>>],
+        d: &mut RenderGrads<f32>,
+    ) -> Result<()> {
+        let mut d_background = [0.0; 3];
+        for tile in came.sums.chunks_exact(3) {
+            (0..3).for_each(|c| d_background[c] += f64::from(tile[c]));
+        }
+        d.background = d_background.map(|v| v as f32);
+        d.camera.copy_from_slice(&came.camera[..6]);
+        d.focal = came.camera[6];
+        (d.extra, d.head) = (None, None);
+        self.spread(shot, &came.rows, d_sh, d)
+    }
+
+    /// `partials`: numbers of a loss that come back too.
+    pub(super) fn make_room_to_return(
+        &mut self,
+        n: usize,
+        across: usize,
+        size: [usize; 2],
+        partials: usize,
+    ) -> Result<Layout> {
         let (gpu, b) = (&self.gpu, &mut self.buffers);
         let most = |f: &dyn Fn(&(Band, usize)) -> u64| self.drawn.iter().map(f).max().unwrap_or(0);
         let pixels = most(&|(band, _)| (size[0] * pixel_rows(*band, size[1])) as u64);
@@ -135,7 +192,10 @@ impl GpuRenderer {
         let cameras = ((4 * NUMBERS * n) as u64).next_multiple_of(UNIFORM_STRIDE);
         let sums = (cameras + (4 * CAMERA * groups) as u64).next_multiple_of(UNIFORM_STRIDE);
         let times = (sums + 12 * tiles).next_multiple_of(UNIFORM_STRIDE);
-        let layout = Layout { cameras, sums, times, all: times + TIMES_BYTES };
+        let counts = times + TIMES_BYTES.next_multiple_of(UNIFORM_STRIDE);
+        let partials_at = counts + UNIFORM_STRIDE;
+        let all = partials_at + 4 * partials as u64;
+        let layout = Layout { cameras, sums, times, counts, partials: partials_at, all };
         b.back_staging.ensure(gpu, layout.all)?;
         Ok(layout)
     }
@@ -156,36 +216,59 @@ impl GpuRenderer {
         }
     }
 
-    /// Takes one band back. Returns the background's gradient by tile; of the last band also what came of the splats, and the
-    /// camera's, which is added to.
+    /// Takes one band back; `again`: it must be listed and drawn once more; `last`: with what came of the splats.
     fn return_band(
-        &mut self,
+        &self,
         (band, pairs): (Band, usize),
         across: usize,
         again: bool,
-        end: Option<(&mut Vec<f32>, &mut [f64; CAMERA])>,
+        last: bool,
         layout: &Layout,
-    ) -> Result<Vec<f32>> {
-        let (gpu, b) = (&self.gpu, &self.buffers);
+    ) -> Result<Came> {
         let groups = self.groups.as_ref().expect("a frame was drawn");
-        let frame = Frame { gpu, kernels: &self.kernels, buffers: b, groups };
-        let kernels = self.back_kernels.as_ref().expect("they were compiled");
-        let back = Back { frame, kernels, pairs };
-        let mut recorder = Recorder::new(gpu, &self.queries, self.clock);
+        let frame = Frame { gpu: &self.gpu, kernels: &self.kernels, buffers: &self.buffers, groups };
+        let mut recorder = Recorder::new(&self.gpu, &self.queries, self.clock);
         if again {
             // The lists and planes of another band lie there.
             frame.band(&mut recorder, band, across, None)?;
         }
+        let end = if last { End::Splats } else { End::Band };
+        self.come_back(recorder, (band, pairs), across, end, layout)
+    }
+
+    /// The way back of a band whose lists, planes and gradient are at hand after what `recorder` holds, and the reading of
+    /// what comes of it. `pairs`: so many at most.
+    pub(super) fn come_back(
+        &self,
+        mut recorder: Recorder<'_>,
+        (band, pairs): (Band, usize),
+        across: usize,
+        end: End<'_>,
+        layout: &Layout,
+    ) -> Result<Came> {
+        let last = matches!(end, End::Splats);
+        let (gpu, b) = (&self.gpu, &self.buffers);
+        let groups = self.groups.as_ref().expect("a frame was drawn");
+        let frame = Frame { gpu, kernels: &self.kernels, buffers: b, groups };
+        let back = Back { frame, kernels: self.back_kernels.as_ref().expect("they were compiled"), pairs };
         back.band(&mut recorder, band, across)?;
-        let tiles = across * band.rows;
+        let (tiles, n) = (across * band.rows, if last { self.stats.splats } else { 0 });
+        let groups: usize = if last { self.upload.draws.iter().map(|draw| draw.groups()).sum() } else { 0 };
         let staging = b.back_staging.get();
-        if end.is_some() {
+        if last {
             back.splats(&mut recorder, &self.upload)?;
-            recorder.copy(b.back.get(), staging, 0, (4 * NUMBERS * self.stats.splats) as u64);
-            let groups: usize = self.upload.draws.iter().map(|draw| draw.groups()).sum();
+            recorder.copy(b.back.get(), staging, 0, (4 * NUMBERS * n) as u64);
             recorder.copy(b.cameras.get(), staging, layout.cameras, (4 * CAMERA * groups) as u64);
         }
+        if let End::Kept(kept, words_at) = end {
+            back.splats(&mut recorder, &self.upload)?;
+            kept.learn(gpu, b, &self.upload, words_at, &mut recorder)?;
+        }
         recorder.copy_from(b.records.get(), RECORD_BYTES * pairs as u64, staging, layout.sums, 12 * tiles as u64);
+        recorder.copy(b.counts.get(), staging, layout.counts, 4 * count::ALL as u64);
+        if layout.all > layout.partials {
+            recorder.copy(b.partials.get(), staging, layout.partials, layout.all - layout.partials);
+        }
         let timed = recorder.resolve(b.times.get());
         if timed {
             recorder.copy(b.times.get(), staging, layout.times, TIMES_BYTES);
@@ -201,23 +284,26 @@ impl GpuRenderer {
         };
         let view = staging.get_mapped_range(..layout.all).map_err(lost)?;
         let at = |first: u64, bytes: usize| &view[first as usize..][..bytes];
-        let sums = bytemuck::pod_collect_to_vec(at(layout.sums, 12 * tiles));
         let stamps: Vec<u64> = bytemuck::pod_collect_to_vec(at(layout.times, TIMES_BYTES as usize));
-        if let Some((rows, camera)) = end {
-            *rows = bytemuck::pod_collect_to_vec(at(0, 4 * NUMBERS * self.stats.splats));
-            let groups: usize = self.upload.draws.iter().map(|draw| draw.groups()).sum();
-            let cameras: Vec<f32> = bytemuck::pod_collect_to_vec(at(layout.cameras, 4 * CAMERA * groups));
-            for one in cameras.chunks_exact(CAMERA) {
-                for k in 0..CAMERA {
-                    camera[k] += f64::from(one[k]);
-                }
-            }
+        let cameras: Vec<f32> = bytemuck::pod_collect_to_vec(at(layout.cameras, 4 * CAMERA * groups));
+        let mut camera = [0.0; CAMERA];
+        for one in cameras.chunks_exact(CAMERA) {
+            (0..CAMERA).for_each(|k| camera[k] += f64::from(one[k]));
         }
+        let mut came = Came {
+            sums: bytemuck::pod_collect_to_vec(at(layout.sums, 12 * tiles)),
+            rows: bytemuck::pod_collect_to_vec(at(0, 4 * NUMBERS * n)),
+            camera,
+            counts: bytemuck::pod_collect_to_vec(at(layout.counts, 4 * count::ALL)),
+            partials: bytemuck::pod_collect_to_vec(&view[layout.partials as usize..]),
+            words: Vec::new(),
+            wait: 0.0,
+            stages: if timed { recorder.stages(&stamps) } else { recorder.by_wall },
+        };
         drop(view);
         staging.unmap();
-        self.timings.back_wait += start.elapsed().as_secs_f64() * 1e3;
-        self.timings.add(if timed { recorder.stages(&stamps) } else { recorder.by_wall });
-        Ok(sums)
+        came.wait = start.elapsed().as_secs_f64() * 1e3;
+        Ok(came)
     }
 
     /// Writes the gradients of all splats where they belong, and takes colours back.

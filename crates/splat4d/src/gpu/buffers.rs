@@ -33,17 +33,22 @@ impl Grown {
     ///
     /// Errors: more than one binding may hold, or no memory.
     pub(super) fn ensure(&mut self, gpu: &Gpu, bytes: u64) -> Result<bool> {
-        let most = largest_binding(gpu);
-        if bytes > most {
-            let mib = |b: u64| b.div_ceil(1 << 20);
-            let text =
-                format!("{} need {} MiB in one GPU buffer, {} MiB are allowed", self.what, mib(bytes), mib(most));
-            return Err(Error::new(ErrorKind::Unsupported, text).remedy("Render on the CPU."));
-        }
         if self.buffer.as_ref().is_some_and(|b| b.size() >= bytes.max(LEAST)) {
             return Ok(false);
         }
-        let size = (bytes + bytes / SPARE).clamp(LEAST, most).next_multiple_of(LEAST);
+        let most = largest_binding(gpu).max(bytes);
+        self.make(gpu, (bytes + bytes / SPARE).clamp(LEAST, most).next_multiple_of(LEAST))?;
+        Ok(true)
+    }
+
+    /// Makes the buffer anew with `size` bytes.
+    fn make(&mut self, gpu: &Gpu, size: u64) -> Result<()> {
+        let most = largest_binding(gpu);
+        if size > most.next_multiple_of(LEAST) {
+            let mib = |b: u64| b.div_ceil(1 << 20);
+            let text = format!("{} need {} MiB in one GPU buffer, {} MiB are allowed", self.what, mib(size), mib(most));
+            return Err(Error::new(ErrorKind::Unsupported, text).remedy("Render on the CPU."));
+        }
         // The old one goes first: both together may be more than there is.
         self.buffer = None;
         self.buffer = Some(gpu.device.create_buffer(&wgpu::BufferDescriptor {
@@ -52,8 +57,17 @@ impl Grown {
             usage: self.usage,
             mapped_at_creation: false,
         }));
-        gpu.check()?;
-        Ok(true)
+        gpu.check()
+    }
+
+    /// Sees to it that there are `bytes`, and no more than that of a buffer that is made: for what never grows.
+    ///
+    /// Errors: as of [`ensure`](Self::ensure).
+    pub(super) fn fit(&mut self, gpu: &Gpu, bytes: u64) -> Result<()> {
+        if self.bytes() < bytes.max(LEAST) {
+            self.make(gpu, bytes.max(LEAST).next_multiple_of(LEAST))?;
+        }
+        Ok(())
     }
 
     /// The buffer. Panics before the first [`Grown::ensure`].
@@ -125,6 +139,10 @@ pub(super) struct Buffers {
     pub bytes: Grown,
     /// Gradient to the planes.
     pub d_planes: Grown,
+    /// Nine planes of the loss.
+    pub maps: Grown,
+    /// Sixteen numbers a tile of the loss.
+    pub partials: Grown,
     /// Twelve sums a pair, then three a tile.
     pub records: Grown,
     /// Twelve a splat.
@@ -167,6 +185,8 @@ impl Buffers {
             planes: storage("the picture's planes"),
             bytes: storage("the picture's bytes"),
             d_planes: storage("the gradient to the picture"),
+            maps: storage("the loss's planes"),
+            partials: storage("the loss's sums"),
             records: storage("gradients of pairs of tile and splat"),
             sums: storage("gradients of the splats"),
             back: storage("gradients of the Gaussians"),
@@ -195,6 +215,8 @@ impl Buffers {
             &self.planes,
             &self.bytes,
             &self.d_planes,
+            &self.maps,
+            &self.partials,
             &self.records,
             &self.sums,
             &self.back,

@@ -16,10 +16,16 @@ pub(super) enum Stage {
     RasterizeBack,
     Gather,
     SplatsBack,
+    // Last, because the stages of one submission follow each other in this list, and a way back need not compare.
+    Loss,
+    // Those of tables that stay on the GPU.
+    Answer,
+    AnswerBack,
+    Adam,
 }
 
 /// Number of stages.
-pub(super) const STAGES: usize = 9;
+pub(super) const STAGES: usize = 13;
 
 /// Source of the stages' times.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -55,6 +61,14 @@ pub struct GpuTimings {
     pub gather: f64,
     /// Projection, backward.
     pub splats_back: f64,
+    /// Comparing the picture with its truth, and the gradient to it.
+    pub loss: f64,
+    /// Rows to splats, of tables that stay on the GPU.
+    pub answer: f64,
+    /// The same, backward, colours included.
+    pub answer_back: f64,
+    /// Adam.
+    pub adam: f64,
     /// From the last submission to the picture in the CPU's memory, the GPU's work included.
     pub wait: f64,
     /// The whole call.
@@ -69,7 +83,14 @@ impl GpuTimings {
     /// The GPU's stages together; 0 where they were not timed.
     pub fn gpu(&self) -> f64 {
         let forward = self.project + self.compact + self.sort_splats + self.tiles + self.sort_pairs + self.rasterize;
-        forward + self.rasterize_back + self.gather + self.splats_back
+        forward
+            + self.loss
+            + self.rasterize_back
+            + self.gather
+            + self.splats_back
+            + self.answer
+            + self.answer_back
+            + self.adam
     }
 
     /// Adds the stages' milliseconds.
@@ -84,6 +105,10 @@ impl GpuTimings {
             &mut self.rasterize_back,
             &mut self.gather,
             &mut self.splats_back,
+            &mut self.loss,
+            &mut self.answer,
+            &mut self.answer_back,
+            &mut self.adam,
         ];
         for (sum, ms) in own.into_iter().zip(stages) {
             *sum += ms;

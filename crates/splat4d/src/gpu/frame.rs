@@ -34,7 +34,8 @@ pub(super) mod slot {
     pub(crate) const SORT_TILE: usize = 7;
     pub(crate) const BAND: usize = 10;
     pub(crate) const BLEND: usize = 11;
-    pub(crate) const PIECES: usize = 12;
+    pub(crate) const LOSS: usize = 12;
+    pub(crate) const PIECES: usize = 13;
 }
 
 /// Places in the buffer of counts.
@@ -74,12 +75,13 @@ pub(super) fn uniform(buffers: &Buffers, slot: usize, size: u64) -> BindingResou
 }
 
 /// Bytes of the structures in WGSL.
-const VIEW_BYTES: u64 = 128;
+pub(super) const VIEW_BYTES: u64 = 128;
 const PIECE_BYTES: u64 = 80;
 const SCAN_BYTES: u64 = 16;
 const SORT_BYTES: u64 = 8;
 const BAND_BYTES: u64 = 16;
 const BLEND_BYTES: u64 = 48;
+const LOSS_BYTES: u64 = 128;
 
 /// Everything that is bound, made anew when a buffer is.
 #[derive(Debug)]
@@ -312,6 +314,32 @@ pub(super) struct Back<'a> {
 }
 
 impl Back<'_> {
+    /// Compares the planes of the last [`Frame::band`], a whole picture, with a truth, and writes the gradient to them.
+    pub(super) fn loss(
+        &self,
+        recorder: &mut Recorder<'_>,
+        truth: &Grown,
+        [across, down]: [usize; 2],
+    ) -> crate::Result<()> {
+        let (k, b) = (&self.kernels.loss, self.frame.buffers);
+        let group = [
+            uniform(b, slot::LOSS, LOSS_BYTES),
+            b.planes.all(),
+            truth.all(),
+            b.maps.all(),
+            b.d_planes.all(),
+            b.partials.all(),
+        ];
+        let group = k.bind(self.frame.gpu, &group);
+        recorder.stage(Stage::Loss, |pass| {
+            pass.set_bind_group(0, &group, &[]);
+            for pipeline in &k.pipelines {
+                pass.set_pipeline(pipeline);
+                pass.dispatch_workgroups(across as u32, down as u32, 1);
+            }
+        })
+    }
+
     /// Of one band, whose lists and planes are those of the last [`Frame::band`]: records, and their sums a splat.
     pub(super) fn band(&self, recorder: &mut Recorder<'_>, band: Band, across: usize) -> crate::Result<()> {
         let (k, b, gpu) = (self.kernels, self.frame.buffers, self.frame.gpu);

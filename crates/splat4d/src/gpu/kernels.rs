@@ -164,9 +164,60 @@ impl Kernels {
     }
 }
 
-/// The kernels of the way back.
+/// The kernels of tables that stay.
+#[derive(Debug)]
+pub(super) struct ResidentKernels {
+    /// answer
+    pub answer: Kernel,
+    /// colors_back
+    pub colors_back: Kernel,
+    /// answer_back
+    pub answer_back: Kernel,
+    /// adam
+    pub adam: Kernel,
+}
+
+impl ResidentKernels {
+    /// Compiles everything.
+    pub(super) fn new(gpu: &Gpu) -> Self {
+        Self {
+            answer: Kernel::new(
+                gpu,
+                "answer",
+                &[wgsl::LEARNT, wgsl::ANSWER],
+                &[Uniform, Read, Write, Write],
+                &["answer"],
+            ),
+            colors_back: Kernel::new(
+                gpu,
+                "colours, backward",
+                &[wgsl::PROJECT, wgsl::SHADE, wgsl::LEARNT, wgsl::COLORS_BACK],
+                &[Uniform, Uniform, Read, Read, Read, Write, Write, Write],
+                &["colors_back"],
+            ),
+            answer_back: Kernel::new(
+                gpu,
+                "answer, backward",
+                &[wgsl::LEARNT, wgsl::ANSWER_BACK],
+                &[Uniform, Read, Read, Read, Write],
+                &["answer_back"],
+            ),
+            adam: Kernel::new(
+                gpu,
+                "adam",
+                &[wgsl::ADAM],
+                &[Uniform, Read, Write, Read, Write, Read, Read, Write],
+                &["adam"],
+            ),
+        }
+    }
+}
+
+/// The kernels of the loss and of the way back.
 #[derive(Debug)]
 pub(super) struct BackKernels {
+    /// moments, gradient
+    pub loss: Kernel,
     /// rasterize_back
     pub rasterize: Kernel,
     /// gather
@@ -179,6 +230,13 @@ impl BackKernels {
     /// Compiles everything.
     pub(super) fn new(gpu: &Gpu) -> Self {
         Self {
+            loss: Kernel::new(
+                gpu,
+                "loss",
+                &[wgsl::LOSS],
+                &[Uniform, Read, Read, Write, Write, Write],
+                &["moments", "gradient"],
+            ),
             rasterize: Kernel::new(
                 gpu,
                 "rasterize, backward",

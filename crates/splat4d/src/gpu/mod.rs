@@ -3,7 +3,8 @@
 //! Stages: project and colour every splat; gather the visible ones; sort them by depth (ties by number, the order that
 //! `render::bin` defines); count, sum and write pairs of tile and splat in that order; sort the pairs stably by tile;
 //! blend 16² tiles. The way back (`back.rs`): a record of sums a pair, the records of each splat added in a fixed order,
-//! the projection's VJP; colours go back on the CPU. Every stage is checked against its CPU twin. The shaders stay inside
+//! the projection's VJP; colours go back on the CPU. Where the loss is L1 and D-SSIM, the picture is compared with its truth
+//! in between (`compare.rs`) and stays on the GPU. Every stage is checked against its CPU twin. The shaders stay inside
 //! WebGPU's default limits. Nothing is ever added atomically but integers, so that the same bits come out every time.
 //!
 //! Memory is one arena that only grows: a steady scene allocates nothing. How many pairs there are is known only when
@@ -14,9 +15,12 @@
 mod back;
 mod buffers;
 mod clock;
+mod compare;
 mod device;
 mod frame;
 mod kernels;
+mod pictures;
+mod resident;
 mod roofline;
 #[cfg(test)]
 mod tests;
@@ -27,7 +31,10 @@ pub use device::{Adapters, Gpu};
 pub use roofline::GpuRoofline;
 
 use crate::render::backend::refusal;
-use crate::render::{Antialias, Backend, Image, ImageGrads, RenderConfig, RenderGrads, Shot, Tables, Wanted};
+use crate::render::{
+    Antialias, Backend, Comparison, Image, ImageGrads, RenderConfig, RenderGrads, Resident, Shot, Tables, Target,
+    Wanted,
+};
 use crate::scene::{Planes, Table};
 use crate::{Error, ErrorKind, Result};
 use back::Returned;
@@ -35,7 +42,9 @@ use buffers::{Buffers, UNIFORM_STRIDE, largest_binding};
 use clock::{Queries, Recorder, TIMES_BYTES};
 use frame::{BLOCK, Band, DIGITS, Frame, Groups, RANGE_BYTES, THREADS, TILE, arguments, count, slot};
 use kernels::{BackKernels, Kernels};
+use pictures::Pictures;
 use rayon::prelude::*;
+use resident::Tables as KeptTables;
 use std::time::Instant;
 use upload::Upload;
 
@@ -90,6 +99,8 @@ pub struct GpuRenderer {
     /// Bands of the last render with their pairs; empty where there is nothing to take back.
     drawn: Vec<(Band, usize)>,
     returned: Returned,
+    pictures: Pictures,
+    resident: Option<Box<KeptTables>>,
 }
 
 impl GpuRenderer {
@@ -116,6 +127,8 @@ impl GpuRenderer {
             back_kernels: None,
             drawn: Vec::new(),
             returned: Returned::default(),
+            pictures: Pictures::new(),
+            resident: None,
         })
     }
 
@@ -136,7 +149,8 @@ impl GpuRenderer {
 
     /// Bytes of GPU memory held, tables included.
     pub fn memory_bytes(&self) -> u64 {
-        self.buffers.bytes() + self.upload.bytes()
+        let tables = self.resident.as_ref().map_or(0, |t| t.bytes());
+        self.buffers.bytes() + self.upload.bytes() + self.pictures.bytes() + tables
     }
 
     /// Refuses what the shaders cannot do, without opening a GPU.
@@ -396,6 +410,23 @@ impl Backend<f32> for GpuRenderer {
     ) -> Result<()> {
         self.can(&Wanted { backward: true, ..shot.wanted() })?;
         self.take_back(shot, grads, d_sh, d)
+    }
+
+    /// Errors besides: a gradient that is not finite. `None` besides: the picture must be drawn in bands, or none of its pixels
+    /// counts.
+    fn compare(
+        &mut self,
+        shot: &Shot<'_, f32>,
+        target: &Target<'_, f32>,
+        d_sh: &mut [Option<&mut Table<f32>>],
+        d: &mut RenderGrads<f32>,
+    ) -> Result<Option<Comparison>> {
+        self.can(&Wanted { backward: true, ..shot.wanted() })?;
+        if shot.depth { Ok(None) } else { self.compare_here(shot, target, d_sh, d) }
+    }
+
+    fn resident(&mut self) -> Option<&mut dyn Resident> {
+        Some(self)
     }
 
     fn radii(&self) -> &[f32] {

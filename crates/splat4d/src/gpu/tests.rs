@@ -2,6 +2,7 @@
 //! REQUIRE_GPU=1 that is a failure.
 
 mod back;
+mod compare;
 mod pictures;
 mod stages;
 

@@ -6,6 +6,7 @@
 use super::buffers::{Grown, largest_binding};
 use super::device::Gpu;
 use super::frame::THREADS;
+use super::resident::geometry_bytes;
 use super::{MOST_GROUPS, Tables};
 use crate::scene::splats::{Part, Rows, SPLAT_OPACITY};
 use crate::scene::{BLOCK, Color, Splats, Table};
@@ -121,6 +122,40 @@ impl Upload {
                 self.send_part(gpu, i, part, first_splat, tables)?;
             }
             first_splat += n;
+        }
+        Ok(())
+    }
+
+    /// Makes room for layers of so many rows and columns of SH, which kernels fill, and lists the dispatches. What
+    /// buffers held may be lost. Errors: no memory, or a table that is larger than a binding.
+    pub(super) fn keep(&mut self, gpu: &Gpu, layers: &[(usize, usize)]) -> Result<()> {
+        self.draws.clear();
+        self.parts.resize_with(layers.len(), PartBuffers::new);
+        let mut first_splat = 0;
+        for (i, &(rows, width)) in layers.iter().enumerate() {
+            let part = &mut self.parts[i];
+            if part.tables.is_empty() {
+                part.tables.push(Grown::storage("a layer's colours"));
+            }
+            part.geometry.ensure(gpu, geometry_bytes(rows))?;
+            part.tables[0].ensure(gpu, (width * rows.next_multiple_of(BLOCK) * size_of::<f32>()) as u64)?;
+            part.ids.ensure(gpu, 0)?;
+            part.weights.ensure(gpu, 0)?;
+            let piece = Piece {
+                first_row: 0,
+                rows: rows as u32,
+                first_splat: first_splat as u32,
+                width: width as u32,
+                blocks: 1,
+                flags: 0,
+                first_id: 0,
+                first_group: self.draws.iter().map(|d| d.groups() as u32).sum(),
+                layer_from_world: columns(None),
+            };
+            if rows > 0 {
+                self.draws.push(Draw { piece, part: i, cut: 0 });
+            }
+            first_splat += rows;
         }
         Ok(())
     }

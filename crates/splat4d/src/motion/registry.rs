@@ -64,6 +64,8 @@ pub struct Polynomial {
     pub rotation_rates: Option<Key>,
     /// Centre for Gaussians that live for ever, seconds.
     pub origin: f64,
+    /// Whether Δ is a constant, so that the life's centre learns from opacity alone.
+    pub detached: bool,
 }
 
 impl Polynomial {

@@ -199,6 +199,7 @@ impl<F: Real> Motion<F> for Spacetime {
             velocities: (self.spec.order > 0).then_some(self.velocities),
             rotation_rates: self.spec.rotation.then_some(self.rates),
             origin: self.spec.origin,
+            detached: self.spec.detach,
         })
     }
 

@@ -36,7 +36,7 @@ impl<F: Real> Motion<F> for Still {
     }
 
     fn polynomial(&self) -> Option<Polynomial> {
-        Some(Polynomial { order: 0, velocities: None, rotation_rates: None, origin: 0.0 })
+        Some(Polynomial { order: 0, velocities: None, rotation_rates: None, origin: 0.0, detached: false })
     }
 
     fn scratch_bytes(&self, _p: &Params<F>, _rows: usize) -> u64 {

@@ -1,9 +1,9 @@
 //! The seam between a scene and whatever draws it: [`Backend`], implemented by the renderer of the CPU, by the oracle and
 //! (feature `gpu`) by the renderer of the GPU, so that training, evaluation and the command know none of them by name.
 
-use super::{Image, ImageGrads, RenderConfig, RenderGrads, Renderer, oracle};
+use super::{Image, ImageGrads, RenderConfig, RenderGrads, Renderer, Resident, oracle};
 use crate::math::{Real, sh};
-use crate::scene::{Camera, Splats, Table};
+use crate::scene::{Camera, Planes, Splats, Table};
 use crate::{Error, ErrorKind, Result};
 
 /// Abilities that not every backend has. Colour, alpha and depth over a background are drawn by all.
@@ -15,6 +15,8 @@ pub struct Wanted {
     pub head: bool,
     /// The way back ([`Backend::vjp`]).
     pub backward: bool,
+    /// The comparison with a truth ([`Backend::compare`]).
+    pub compare: bool,
 }
 
 /// A picture to draw.
@@ -42,8 +44,36 @@ impl<'a, F: Real> Shot<'a, F> {
 
     /// Abilities that drawing it takes.
     pub fn wanted(&self) -> Wanted {
-        Wanted { extra: self.extra.is_some(), head: self.splats.head.is_some(), backward: false }
+        Wanted { extra: self.extra.is_some(), head: self.splats.head.is_some(), ..Wanted::default() }
     }
+}
+
+/// What a picture is compared with, and how: the loss of 3DGS, (1 − λ)·L1 + λ·(1 − SSIM), as plain data.
+#[derive(Clone, Copy, Debug)]
+pub struct Target<'a, F = f32> {
+    /// The truth, [3, h, w].
+    pub truth: &'a Planes<F>,
+    /// Weights of pixels, ≥ 0, [1, h, w]; one of weight 0 is as one outside of the picture. None: 1.
+    pub weight: Option<&'a Planes<F>>,
+    /// The truth's number: under one number and size there is always the same truth, which a device may keep.
+    pub picture: usize,
+    /// λ: the share of 1 − SSIM.
+    pub dssim: f64,
+    /// How the camera shows what is drawn: a matrix without the identity, row by row, then an offset a channel.
+    pub response: Option<[F; 12]>,
+}
+
+/// The result of a comparison, its means weighted.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Comparison {
+    /// Mean |picture − truth| over pixels and channels.
+    pub l1: f64,
+    /// Mean of the SSIM map.
+    pub ssim: f64,
+    /// Mean of (picture − truth)², the picture clamped to [0, 1].
+    pub mse: f64,
+    /// Gradient to the camera's response, where there is one.
+    pub d_response: Option<[f64; 12]>,
 }
 
 /// Whether a scene's tables change between renders.
@@ -91,6 +121,26 @@ pub trait Backend<F: Real = f32>: Send {
         d: &mut RenderGrads<F>,
     ) -> Result<()>;
 
+    /// Draws, compares with the truth and takes the gradient of that loss back, without the picture ever leaving the device.
+    /// Targets, overwritten and added to, as of [`vjp`](Self::vjp). `None`: it cannot, and nothing was done.
+    ///
+    /// Errors: as of `render`. Panics: the truth has another size than the camera's picture.
+    fn compare(
+        &mut self,
+        shot: &Shot<'_, F>,
+        target: &Target<'_, F>,
+        d_sh: &mut [Option<&mut Table<F>>],
+        d: &mut RenderGrads<F>,
+    ) -> Result<Option<Comparison>> {
+        let _ = (shot, target, d_sh, d);
+        Ok(None)
+    }
+
+    /// Where whole steps are taken on the device, on tables that stay there; none: it has no such way.
+    fn resident(&mut self) -> Option<&mut dyn Resident> {
+        None
+    }
+
     /// Radius of every splat of the last render that was taken back: 3σ of the larger axis, pixels; 0: not drawn. Empty
     /// where the backend has no way back.
     fn radii(&self) -> &[F];
@@ -113,8 +163,8 @@ pub(crate) fn refusal(who: &str, what: &str) -> Error {
 }
 
 impl<F: Real> Backend<F> for Renderer<F> {
-    fn can(&self, _: &Wanted) -> Result<()> {
-        Ok(())
+    fn can(&self, wanted: &Wanted) -> Result<()> {
+        if wanted.compare { Err(refusal("the renderer of the CPU", "compare pictures")) } else { Ok(()) }
     }
 
     fn render(&mut self, shot: &Shot<'_, F>, out: &mut Image<F>) -> Result<()> {
@@ -155,7 +205,7 @@ pub struct Oracle {
 
 impl Backend<f64> for Oracle {
     fn can(&self, wanted: &Wanted) -> Result<()> {
-        if wanted.backward { Err(refusal("the oracle", "take gradients back")) } else { Ok(()) }
+        if wanted.backward || wanted.compare { Err(refusal("the oracle", "take gradients back")) } else { Ok(()) }
     }
 
     fn render(&mut self, shot: &Shot<'_, f64>, out: &mut Image<f64>) -> Result<()> {

@@ -24,16 +24,20 @@ pub mod oracle;
 mod parallel;
 pub mod project;
 pub mod rasterize;
+mod resident;
 pub mod roofline;
 pub mod shade;
 #[cfg(test)]
 mod tests;
 
 pub use crate::simd::Simd;
-pub use backend::{Backend, Oracle, Shot, Tables, Wanted};
+pub use backend::{Backend, Comparison, Oracle, Shot, Tables, Target, Wanted};
 pub(crate) use count::PairCounts;
 pub use importance::{Importance, Sensitivity};
 pub use project::{Projected, ProjectedGrads, View};
+pub use resident::{
+    KEPT, KeptLayer, KeptNumbers, KeptRule, KeptStep, KeptStepped, KeptTable, KeptView, Moves, Resident,
+};
 
 use crate::math::Real;
 use crate::scene::{HeadGrads, Planes, Table};

@@ -5,7 +5,7 @@ use crate::capture::frames::FlowTruth;
 use crate::loss::LossValue;
 use crate::loss::terms::StepInfo;
 use splat4d::math::Real;
-use splat4d::render::{Image, ImageGrads};
+use splat4d::render::{Comparison, Image, ImageGrads, Target};
 use splat4d::scene::{Camera, Planes, Time};
 
 /// One picture that the scene is compared with.
@@ -25,7 +25,7 @@ pub struct View<'a, F = f32> {
     pub weight: Option<&'a Planes<F>>,
     /// Where its pixels go, as far as that is known.
     pub flow: Option<FlowTruth<'a, F>>,
-    /// The frame's number in the capture, for messages.
+    /// The frame's number in the capture, for messages and for devices that keep its picture.
     pub frame: usize,
     /// The camera's number in the capture, for the exposure.
     pub rig: usize,
@@ -195,6 +195,17 @@ pub trait ImageTerm<F: Real = f32>: Send {
 
     /// Its value for one view; adds its gradient to `d`.
     fn eval(&mut self, info: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64;
+
+    /// The loss of a view as plain data, where it is that of 3DGS and nothing else: a device may then compute it.
+    fn target<'a>(&self, _view: &View<'a, F>) -> Option<Target<'a, F>> {
+        None
+    }
+
+    /// Takes over what a device made of [`target`](Self::target) instead of [`eval`](Self::eval), the gradient apart.
+    /// Returns the value.
+    fn compared(&mut self, _view: &View<'_, F>, _comparison: &Comparison) -> f64 {
+        unreachable!("only what has a target is compared by a device")
+    }
 
     /// Its measurement of the last view, for progress and metrics.
     fn measured(&self) -> Option<LossValue> {

@@ -1,0 +1,219 @@
+//! Tables that stay on a GPU against the CPU's engine: gradients, resumes, faults.
+
+use super::bed::{Bed, bytes, knobs, saved};
+use super::gpu::{finish, on_gpu};
+use crate::step::engine::Blame;
+use crate::step::resident::DeviceEngine;
+use splat4d::device::{self, Device};
+use splat4d::layers::ALPHA_MIN;
+use splat4d::render::{
+    Antialias, Backend, Image, ImageGrads, KeptLayer, KeptNumbers, KeptStep, KeptStepped, RenderConfig, RenderGrads,
+    Resident, Shot, Wanted,
+};
+use splat4d::scene::{GEOMETRY, Table};
+use splat4d::{Error, ErrorKind, Result};
+
+/// Recipes that stay on the device throughout: every kind of motion and of life.
+const STAYS: [&str; 6] = [
+    "motion=still strategy=adc sh_degree=3 sh_degree_interval=1",
+    "motion=spacetime strategy=adc exposure=true antialias=true",
+    "motion=spacetime strategy=none motion_order=3 rotation_rate=true life=interval sh_degree=2 batch_size=3",
+    "motion=spacetime strategy=none motion_order=2 rotation_rate=true life=gauss-one detach=true",
+    "motion=spacetime strategy=none motion_order=1 life=infinite batch_size=2",
+    "motion=spacetime strategy=none motion_order=0 sh_degree=0",
+];
+/// Largest relative difference of a table's gradient, as a vector: a splat at the α cut-off may be drawn by one side only.
+const GRADIENT: f64 = 5e-3;
+/// Steps until which a table's first moments are still its gradients' sums.
+const FEW: usize = 2;
+
+/// The first moments of all tables with columns, and how often rows stepped.
+fn moments(trainer: &crate::step::trainer::Trainer<'_>) -> Vec<(String, Vec<f64>, Vec<f32>)> {
+    let (scene, all) = (trainer.scene(), trainer.learner.moments());
+    let mut out = Vec::new();
+    for (layer, moments) in scene.layers.iter().zip(all) {
+        for key in layer.params.keys().filter(|&k| layer.params[k].width() > 0) {
+            let (table, width) = (moments.table(key), layer.params[key].width());
+            let first = table.column_to_rows(0, width).into_iter().map(f64::from).collect();
+            out.push((layer.params.column_name(key, 0).to_string(), first, table.column_to_rows(2 * width, 1)));
+        }
+    }
+    out
+}
+
+#[test]
+fn gradients_of_the_whole_chain_equal_the_cpus() {
+    let bed = Bed::new();
+    for line in STAYS {
+        let recipe = knobs(line);
+        let Some(mut trainer) = on_gpu(&bed, &recipe) else { return };
+        let mut cpu = bed.start(&recipe);
+        for step in 1..=FEW {
+            let stepped = trainer.step().unwrap().unwrap();
+            let expected = cpu.step().unwrap().unwrap();
+            assert!(stepped.notices.is_empty(), "{line}: {:?}", stepped.notices);
+            for (a, b) in [
+                (stepped.report.loss, expected.report.loss),
+                (stepped.mse, expected.mse),
+                (stepped.l1, expected.l1),
+                (stepped.ssim, expected.ssim),
+            ] {
+                assert!((a - b).abs() < 1e-4 * b.abs(), "{line}, step {step}: {a} {b}");
+            }
+            trainer.settle().unwrap();
+            let mut worst = 0.0f64;
+            for ((name, a, steps), (_, b, expected)) in moments(&trainer).into_iter().zip(moments(&cpu)) {
+                let others = steps.iter().zip(&expected).filter(|(a, b)| a != b).count();
+                assert!(
+                    others <= steps.len() / 200,
+                    "{line}: {others} rows of `{name}` stepped another number of times"
+                );
+                let off: f64 = a.iter().zip(&b).map(|(a, b)| (a - b) * (a - b)).sum();
+                let all: f64 = b.iter().map(|b| b * b).sum();
+                assert!(all > 0.0 || off == 0.0, "{line}: `{name}` has no gradient");
+                let off = if all > 0.0 { (off / all).sqrt() } else { 0.0 };
+                assert!(off < GRADIENT, "{line}, step {step}: gradients of `{name}` differ by {off:.1e}");
+                worst = worst.max(off);
+            }
+            println!("{line}, step {step}: {worst:.1e}");
+            let stats = [&trainer, &cpu].map(|t| t.learner.stats().tables[0].column_to_rows(0, 3));
+            let sums = stats.map(|s| s.chunks_exact(3).map(|r| [r[0], r[1], r[2]].map(f64::from)).collect::<Vec<_>>());
+            for c in 0..3 {
+                let [a, b] = sums.each_ref().map(|s| s.iter().map(|r| r[c]).sum::<f64>());
+                // The CPU looks whether an ellipse meets bins, the GPU whether it meets tiles.
+                assert!((a - b).abs() < 3e-2 * b, "{line}: statistics {c}: {a} {b}");
+            }
+        }
+    }
+}
+
+#[test]
+fn tables_that_stay_repeat_and_resume_bit_for_bit() {
+    let bed = Bed::new();
+    let recipe = knobs("motion=spacetime strategy=adc batch_size=2");
+    let run = || {
+        let mut trainer = on_gpu(&bed, &recipe)?;
+        let mut checkpoints = Vec::new();
+        while !trainer.is_done() {
+            assert!(trainer.step().unwrap().unwrap().notices.is_empty());
+            if [7, 18].contains(&trainer.progress.iteration) {
+                trainer.settle().unwrap();
+                checkpoints.push(saved(&trainer));
+            }
+        }
+        Some((bytes(trainer.scene()), checkpoints))
+    };
+    let Some((whole, checkpoints)) = run() else { return };
+    assert!(checkpoints.len() == 2 && run() == Some((whole.clone(), checkpoints.clone())), "the same bits again");
+    for checkpoint in &checkpoints {
+        let mut resumed = bed.resumed_on(Device::Gpu, &recipe, checkpoint);
+        finish(&mut resumed, "resumed");
+        assert!(bytes(resumed.scene()) == whole, "a resumed run has the bytes of one that was not stopped");
+    }
+}
+
+#[test]
+fn a_number_that_is_not_finite_is_found_and_named() {
+    let bed = Bed::new();
+    let recipe = knobs("motion=spacetime strategy=none");
+    let Some(mut trainer) = on_gpu(&bed, &recipe) else { return };
+    trainer.step().unwrap().unwrap();
+    trainer.settle().unwrap();
+    let before = saved(&trainer);
+    trainer.learner.scene_mut().layers[0].params[GEOMETRY].set(7, 0, f32::NAN);
+    let (learner, progress) =
+        (std::mem::replace(&mut trainer.learner, crate::learner::Learner::new(Default::default())), trainer.progress);
+    trainer.restore(learner, progress);
+    let fault = (0..3).find_map(|_| trainer.step().unwrap().err()).expect("it is found");
+    assert!(fault.1 == Blame::Numbers && fault.0.contains("not finite") && fault.0.contains('7'), "{}", fault.0);
+    // As after a rollback.
+    let mut resumed = bed.resumed_on(Device::Gpu, &recipe, &before);
+    resumed.step().unwrap().unwrap();
+}
+
+/// A device that fails after some steps, or while it is asked for its tables.
+struct Failing {
+    device: Box<dyn Backend>,
+    steps: usize,
+    fetches: usize,
+}
+
+fn failed() -> Error {
+    Error::new(ErrorKind::Unsupported, "the driver is gone")
+}
+
+impl Backend for Failing {
+    fn can(&self, wanted: &Wanted) -> Result<()> {
+        self.device.can(wanted)
+    }
+    fn render(&mut self, shot: &Shot<'_>, out: &mut Image) -> Result<()> {
+        self.device.render(shot, out)
+    }
+    fn vjp(
+        &mut self,
+        shot: &Shot<'_>,
+        grads: &ImageGrads<'_>,
+        d_sh: &mut [Option<&mut Table>],
+        d: &mut RenderGrads,
+    ) -> Result<()> {
+        self.device.vjp(shot, grads, d_sh, d)
+    }
+    fn resident(&mut self) -> Option<&mut dyn Resident> {
+        Some(self)
+    }
+    fn radii(&self) -> &[f32] {
+        self.device.radii()
+    }
+    fn config(&self) -> &RenderConfig {
+        self.device.config()
+    }
+    fn name(&self) -> &str {
+        "failing"
+    }
+}
+
+impl Resident for Failing {
+    fn keep(&mut self, layers: &[KeptLayer<'_>], corrections: &[[f32; 2]]) -> Result<()> {
+        self.device.resident().expect("a GPU").keep(layers, corrections)
+    }
+    fn step(&mut self, step: &KeptStep<'_>) -> Result<Option<KeptStepped>> {
+        assert_eq!(step.alpha_min, ALPHA_MIN);
+        self.steps = self.steps.checked_sub(1).ok_or_else(failed)?;
+        self.device.resident().expect("a GPU").step(step)
+    }
+    fn fetch(&mut self, layer: usize) -> Result<KeptNumbers> {
+        self.fetches = self.fetches.checked_sub(1).ok_or_else(failed)?;
+        self.device.resident().expect("a GPU").fetch(layer)
+    }
+}
+
+#[test]
+fn a_device_that_fails_costs_the_steps_since_it_was_settled_and_nothing_else() {
+    let bed = Bed::new();
+    let recipe = knobs("motion=spacetime strategy=none");
+    for (steps, fetches) in [(0, 9), (3, 9), (9, 0)] {
+        let Some(mut trainer) = on_gpu(&bed, &recipe) else { return };
+        let config = RenderConfig { antialias: Antialias::Off, ..RenderConfig::default() };
+        let device = device::open_to_train(Device::Gpu, config).backend;
+        trainer.set_engine(DeviceEngine::new(Box::new(Failing { device, steps, fetches })));
+        let mut notices = Vec::new();
+        for _ in 0..3 {
+            notices.extend(trainer.step().unwrap().unwrap().notices);
+        }
+        if steps == 0 {
+            // The learner had everything: the CPU has taken the same step.
+            assert!(notices.len() == 1 && notices[0].contains("the driver is gone"), "{notices:?}");
+            continue;
+        }
+        assert!(notices.is_empty());
+        let fault = match fetches {
+            0 => trainer.settle().expect_err("it is gone"),
+            _ => trainer.step().unwrap().expect_err("it is gone"),
+        };
+        assert!(fault.1 == Blame::Device && fault.0.contains("goes on on the CPU"), "{}", fault.0);
+        // What a run does then: back to a checkpoint, and on with the CPU.
+        let start = saved(&bed.start(&recipe));
+        crate::run::checkpoint::read(&start, &mut trainer, &Default::default()).unwrap();
+        finish(&mut trainer, "on the CPU");
+    }
+}

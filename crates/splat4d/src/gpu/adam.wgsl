@@ -1,0 +1,81 @@
+// A step of Adam on one table of a layer. Twin of splat4d-train's optim/adam.rs, where the equations stand.
+//
+// Bindings, group 0: 0 rule; 1 counts ([2]: pairs); 2 params, 3 gradient: buffers of `stride` columns, of which the table has
+// some; 4 moments: a buffer of `moments_stride` columns, first and second moments and the row's step count; 5 alive: the rows that
+// take part; 6 corrections by step count, made by the CPU; 7 status, a word a table: one more than the last row whose number
+// is not finite. Seven storage buffers.
+// A thread owns one row.
+
+const TABLE_BLOCK: u32 = 16u;
+const BETA1: f32 = 0.9;
+const BETA2: f32 = 0.999;
+const EPSILON: f32 = 1e-15;
+const LARGEST: f32 = 3.4028234e38;
+
+struct Rule {
+    rows: u32,
+    width: u32,           // columns of the table
+    stride: u32,          // columns of params and gradient, and the table's first
+    first: u32,
+    moments_stride: u32,
+    moments_first: u32,
+    counted: u32,         // entries of corrections
+    floor_column: u32,    // lifted to floor_least; none: width
+    floor_least: f32,
+    capacity: u32,        // pairs that there is room for
+    word: u32,            // of status
+    rates: array<vec4<f32>, 12>, // a rate a column; 0: frozen
+}
+
+@group(0) @binding(0) var<uniform> rule: Rule;
+@group(0) @binding(1) var<storage, read> counts: array<u32>;
+@group(0) @binding(2) var<storage, read_write> params: array<f32>;
+@group(0) @binding(3) var<storage, read> gradient: array<f32>;
+@group(0) @binding(4) var<storage, read_write> moments: array<f32>;
+@group(0) @binding(5) var<storage, read> alive: array<u32>;
+@group(0) @binding(6) var<storage, read> corrections: array<vec2<f32>>;
+@group(0) @binding(7) var<storage, read_write> status: array<atomic<u32>>;
+
+fn at(row: u32, column: u32, width: u32) -> u32 {
+    return (row / TABLE_BLOCK * width + column) * TABLE_BLOCK + row % TABLE_BLOCK;
+}
+
+@compute @workgroup_size(256)
+fn adam(@builtin(global_invocation_id) id: vec3<u32>) {
+    let row = id.x;
+    if (row >= rule.rows || counts[2] > rule.capacity) {
+        return;
+    }
+    if (alive[row] == 0u) {
+        return;
+    }
+    let first = at(row, rule.first, rule.stride);
+    let first_moment = at(row, rule.moments_first, rule.moments_stride);
+    let second_moment = first_moment + rule.width * TABLE_BLOCK;
+    let steps = second_moment + rule.width * TABLE_BLOCK;
+    let count = moments[steps] + 1.0;
+    moments[steps] = count;
+    let correct = corrections[min(u32(count), rule.counted - 1u)];
+    var bad = false;
+    for (var c = 0u; c < rule.width; c++) {
+        let rate = rule.rates[c / 4u][c % 4u];
+        if (rate != 0.0) {
+            let step = c * TABLE_BLOCK;
+            let d = gradient[first + step];
+            let m1 = BETA1 * moments[first_moment + step] + (1.0 - BETA1) * d;
+            let m2 = BETA2 * moments[second_moment + step] + (1.0 - BETA2) * d * d;
+            moments[first_moment + step] = m1;
+            moments[second_moment + step] = m2;
+            var x = params[first + step] - rate * (m1 * correct.x) / (sqrt(m2 * correct.y) + EPSILON);
+            // Before the floor, because a maximum would hide what is not a number.
+            bad = bad || !(abs(x) <= LARGEST);
+            if (c == rule.floor_column) {
+                x = max(x, rule.floor_least);
+            }
+            params[first + step] = x;
+        }
+    }
+    if (bad) {
+        atomicMax(&status[rule.word], row + 1u);
+    }
+}

@@ -1,0 +1,58 @@
+// The splats of a layer's rows at time t, and who is alive then. Twin of Motion::at for `still` and `spacetime` with the life
+// of layers/envelope.rs; learnt.wgsl is put in front of this file.
+//
+// Bindings, group 0: 0 ask; 1 params; out: 2 geometry as splats.wgsl reads it (mean 3, covariance 6, opacity 1; opacity 0
+// where the row is not alive), 3 alive, 1 a row that is alive at the time of any of the step's views. Three storage buffers.
+// A thread owns one row.
+
+const GEOMETRY_WIDTH: u32 = 10u;
+
+@group(0) @binding(0) var<uniform> ask: Ask;
+@group(0) @binding(1) var<storage, read> params: array<f32>;
+@group(0) @binding(2) var<storage, read_write> geometry: array<f32>;
+@group(0) @binding(3) var<storage, read_write> alive: array<u32>;
+
+// Phrased so that what is not a number is kept and found by Adam, not hidden.
+fn dead(row: u32, opacity: f32, sigma: f32) -> bool {
+    if (ask.life == LIFE_INFINITE) {
+        return false;
+    }
+    var reach = exp(params[at(row, ask.life_at + 1u, ask.width)]);
+    if (ask.life == LIFE_INTERVAL) {
+        reach += exp(params[at(row, ask.life_at + 2u, ask.width)]) * ask.widest;
+    } else {
+        reach *= ask.widest;
+    }
+    return abs(delta_of(ask, row)) > reach || opacity * sigma < ask.alpha_min;
+}
+
+@compute @workgroup_size(256)
+fn answer(@builtin(global_invocation_id) id: vec3<u32>) {
+    let row = id.x;
+    if (row >= ask.rows) {
+        return;
+    }
+    let g = moved(ask, row, delta_of(ask, row));
+    let opacity = sigmoid(g.logit);
+    let sigma = life_of(ask, row).x;
+    let lives = !dead(row, opacity, sigma);
+    let r = rotation_rows(unit_of(g.quat).quat);
+    let s = exp(g.log_scale);
+    let s2 = s * s;
+    let to = at(row, 0u, GEOMETRY_WIDTH);
+    geometry[to] = g.mean.x;
+    geometry[to + 16u] = g.mean.y;
+    geometry[to + 32u] = g.mean.z;
+    geometry[to + 48u] = dot(r[0] * r[0], s2);
+    geometry[to + 64u] = dot(r[0] * r[1], s2);
+    geometry[to + 80u] = dot(r[0] * r[2], s2);
+    geometry[to + 96u] = dot(r[1] * r[1], s2);
+    geometry[to + 112u] = dot(r[1] * r[2], s2);
+    geometry[to + 128u] = dot(r[2] * r[2], s2);
+    geometry[to + 144u] = select(0.0, opacity * sigma, lives);
+    var mark = select(0u, 1u, lives);
+    if ((ask.flags & ASK_FIRST) == 0u) {
+        mark |= alive[row];
+    }
+    alive[row] = mark;
+}

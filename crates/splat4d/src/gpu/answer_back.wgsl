@@ -1,0 +1,111 @@
+// From the gradients of a layer's splats to those of its rows. Twin of Motion::backward for `still` and `spacetime`, of the
+// life's VJP in layers/envelope.rs; learnt.wgsl is put in front of this file.
+//
+// Bindings, group 0: 0 ask; 1 counts ([2]: pairs); 2 params; 3 back as colors_back.wgsl left it (mean, opacity; covariance);
+// out: 4 d_params, laid out as params: overwritten by the step's first view, added to by the others. Four storage buffers.
+// A thread owns one row.
+
+@group(0) @binding(0) var<uniform> ask: Ask;
+@group(0) @binding(1) var<storage, read> counts: array<u32>;
+@group(0) @binding(2) var<storage, read> params: array<f32>;
+@group(0) @binding(3) var<storage, read> back: array<vec4<f32>>;
+@group(0) @binding(4) var<storage, read_write> d_params: array<f32>;
+
+fn put(row: u32, column: u32, d: f32) {
+    let i = at(row, column, ask.width);
+    if ((ask.flags & ASK_FIRST) != 0u) {
+        d_params[i] = d;
+    } else {
+        d_params[i] += d;
+    }
+}
+
+fn put_three(row: u32, column: u32, d: vec3<f32>) {
+    put(row, column, d.x);
+    put(row, column + 1u, d.y);
+    put(row, column + 2u, d.z);
+}
+
+@compute @workgroup_size(256)
+fn answer_back(@builtin(global_invocation_id) id: vec3<u32>) {
+    let row = id.x;
+    if (row >= ask.rows || counts[2] > ask.capacity) {
+        return;
+    }
+    let splat = 5u * (ask.first_splat + row);
+    let d0 = back[splat];
+    let d1 = back[splat + 1u];
+    let d2 = back[splat + 2u];
+    let delta = delta_of(ask, row);
+    let g = moved(ask, row, delta);
+    let life = life_of(ask, row);
+    let opacity = sigmoid(g.logit);
+    let d_logit = d0.w * life.x * opacity * (1.0 - opacity);
+    // With M = R S: dL/dM = 2 G M, G the full symmetric gradient to the covariance.
+    let unit = unit_of(g.quat);
+    let r = rotation_rows(unit.quat);
+    let s = exp(g.log_scale);
+    let sym = mat3x3<f32>(
+        vec3<f32>(d1.x, 0.5 * d1.y, 0.5 * d1.z),
+        vec3<f32>(0.5 * d1.y, d1.w, 0.5 * d2.x),
+        vec3<f32>(0.5 * d1.z, 0.5 * d2.x, d2.y),
+    );
+    // Columns of R and of the gradient to it.
+    var d_log = vec3<f32>(0.0);
+    var d_r: mat3x3<f32>;
+    for (var k = 0u; k < 3u; k++) {
+        let column = vec3<f32>(r[0][k], r[1][k], r[2][k]);
+        let d_m = 2.0 * (sym * (column * s[k]));
+        d_log[k] = dot(column, d_m) * s[k];
+        d_r[k] = s[k] * d_m;
+    }
+    let w = unit.quat.x;
+    let x = unit.quat.y;
+    let y = unit.quat.z;
+    let z = unit.quat.w;
+    // d_r[j][i] is the gradient to row i, column j.
+    let d_unit = 2.0 * vec4<f32>(
+        x * (d_r[1][2] - d_r[2][1]) + y * (d_r[2][0] - d_r[0][2]) + z * (d_r[0][1] - d_r[1][0]),
+        w * (d_r[1][2] - d_r[2][1]) + y * (d_r[1][0] + d_r[0][1]) + z * (d_r[2][0] + d_r[0][2])
+            - 2.0 * x * (d_r[1][1] + d_r[2][2]),
+        w * (d_r[2][0] - d_r[0][2]) + x * (d_r[1][0] + d_r[0][1]) + z * (d_r[2][1] + d_r[1][2])
+            - 2.0 * y * (d_r[0][0] + d_r[2][2]),
+        w * (d_r[0][1] - d_r[1][0]) + x * (d_r[2][0] + d_r[0][2]) + y * (d_r[2][1] + d_r[1][2])
+            - 2.0 * z * (d_r[0][0] + d_r[1][1]),
+    );
+    var d_quat = vec4<f32>(0.0);
+    if (unit.norm > 0.0) {
+        d_quat = (d_unit - unit.quat * dot(unit.quat, d_unit)) / unit.norm;
+    }
+    put_three(row, 0u, d0.xyz);
+    put(row, QUAT, d_quat.x);
+    put_three(row, QUAT + 1u, d_quat.yzw);
+    put_three(row, LOG_SCALE, d_log);
+    put(row, OPACITY, d_logit);
+    // d/d delta of v_k delta^k is k v_k delta^(k - 1).
+    var d_delta = 0.0;
+    var power = 1.0;
+    for (var k = 0u; k < ask.order; k++) {
+        let column = ask.velocities_at + 3u * k;
+        d_delta += f32(k + 1u) * power * dot(three(ask, row, column), d0.xyz);
+        power *= delta;
+        put_three(row, column, power * d0.xyz);
+    }
+    if ((ask.flags & ASK_ROTATION) != 0u) {
+        d_delta += dot(four(ask, row, ask.rates_at), d_quat);
+        put(row, ask.rates_at, delta * d_quat.x);
+        put_three(row, ask.rates_at + 1u, delta * d_quat.yzw);
+    }
+    if (ask.life != LIFE_INFINITE) {
+        let d_sigma = d0.w * opacity;
+        var d_center = -d_sigma * life.y;
+        if ((ask.flags & ASK_DETACH) == 0u) {
+            d_center -= d_delta;
+        }
+        put(row, ask.life_at, d_center);
+        put(row, ask.life_at + 1u, d_sigma * life.z);
+        if (ask.life == LIFE_INTERVAL) {
+            put(row, ask.life_at + 2u, d_sigma * life.w);
+        }
+    }
+}
