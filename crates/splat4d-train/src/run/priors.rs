@@ -21,7 +21,7 @@ const CLEARLY: f64 = 0.7;
 /// Depths and points that are apart by more than this factor are in different units.
 const OTHER_UNIT: f64 = 1.25;
 /// A metric map is believed while the scene is within this share of it (median); others while they correlate by this.
-const METRIC_OFF: f64 = 0.05;
+const METRIC_OFF: f64 = 0.1;
 const CORRELATED: f64 = 0.8;
 
 /// Checks flow and depth before training; returns warnings. Errors: flow that runs backwards, or whose axes are exchanged.
