@@ -46,7 +46,20 @@ const ORDER: [(&str, &[&str]); 8] = [
     ("crates/splat4d-import", &["calibration", "video", "sync", "sfm", "corrections", "write", "take", "doctor"]),
     (
         "crates/splat4d-serve",
-        &["write_timeout", "body", "range", "reply", "guard", "scene", "edit", "assets", "page", "events", "answer", "server"],
+        &[
+            "write_timeout",
+            "body",
+            "range",
+            "reply",
+            "guard",
+            "scene",
+            "edit",
+            "assets",
+            "page",
+            "events",
+            "answer",
+            "server",
+        ],
     ),
     (
         "crates/splat4d-cli",
