@@ -49,7 +49,20 @@ const ORDER: [(&str, &[&str]); 8] = [
     ),
     (
         "crates/splat4d-serve",
-        &["write_timeout", "body", "range", "reply", "guard", "scene", "edit", "assets", "page", "events", "answer", "server"],
+        &[
+            "write_timeout",
+            "body",
+            "range",
+            "reply",
+            "guard",
+            "scene",
+            "edit",
+            "assets",
+            "page",
+            "events",
+            "answer",
+            "server",
+        ],
     ),
     (
         "crates/splat4d-cli",

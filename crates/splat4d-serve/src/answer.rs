@@ -124,7 +124,9 @@ fn config(shared: &Shared) -> Value {
     let mut config = if shared.about.is_object() { shared.about.clone() } else { json!({}) };
     let version = shared.scene.version(None).map(|v| v.number).ok();
     config["live"] = json!(shared.live);
-    config["edit"] = json!(shared.editing.is_some());
+    if shared.editing.is_some() {
+        config["edit"] = json!(true);
+    }
     config["version"] = json!(version);
     config["scene"] = match &shared.foreign {
         Some((url, _)) => json!(url),

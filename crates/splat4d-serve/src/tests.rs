@@ -492,7 +492,8 @@ fn post(server: &Running, target: &str, headers: &[(&str, &str)], body: &[u8]) -
     for (name, value) in usual.iter().filter(|(n, _)| !given(n)).chain(headers).filter(|(_, v)| !v.is_empty()) {
         request += &format!("{name}: {value}\r\n");
     }
-    let reply = raw(server, &[(request + "\r\n").as_bytes(), body].concat(), true);
+    // A page that promised more than it sent has gone.
+    let reply = raw(server, &[(request + "\r\n").as_bytes(), body].concat(), given("content-length"));
     let end = reply.windows(4).position(|w| w == b"\r\n\r\n").expect("an answer has a head");
     let head = String::from_utf8(reply[..end].to_vec()).unwrap();
     let status = head.split(' ').nth(1).unwrap().parse().unwrap();
@@ -593,5 +594,5 @@ fn without_leave_nothing_can_be_sent() {
     let server = of_bytes(&bytes(10));
     assert_eq!(post(&server, "/edit", &[], br#"{"do": "x"}"#).status, 405);
     let config: Value = serde_json::from_slice(&get(&server, "/config.json").body).unwrap();
-    assert_eq!(config["edit"], false);
+    assert_eq!(config["edit"], Value::Null);
 }
