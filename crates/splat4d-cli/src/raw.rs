@@ -1,8 +1,10 @@
 //! The numbers behind pictures as files: NumPy arrays, Middlebury flow, OpenEXR.
 
 use crate::draw::Channel;
+use exr::prelude::{AnyChannel, AnyChannels, Encoding, FlatSamples, Image, Layer, LayerAttributes, WritableImage};
 use splat4d::scene::Planes;
 use splat4d::{Error, Result, format};
+use std::io::Cursor;
 
 /// A format of arrays of numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -57,64 +59,22 @@ impl RawFormat {
                 let known = |x: f32| if x.is_finite() { x } else { FLO_UNKNOWN };
                 raw.interleaved().iter().for_each(|x| out.extend_from_slice(&known(*x).to_le_bytes()));
             }
-            Self::Exr => exr(channel, raw, &mut out),
+            Self::Exr => out = open_exr(channel, raw)?,
         }
         Ok(out)
     }
 }
 
-/// A single-part OpenEXR file of uncompressed scan lines in 32-bit floats (openexr.com, "OpenEXR File Layout"). Our own, because
-/// that is a page: the crates that also read what others compress bring several more along, for nothing that is needed here.
-fn exr(channel: Channel, raw: &Planes<f32>, out: &mut Vec<u8>) {
-    /// 32-bit float, of the pixel types.
-    const FLOAT: u32 = 2;
-    // Channels lie in the order of their names.
-    let mut order: Vec<usize> = (0..raw.channels).collect();
-    order.sort_by_key(|&c| channel.planes()[c]);
-    out.extend_from_slice(&[0x76, 0x2f, 0x31, 0x01, 2, 0, 0, 0]);
-    let mut attribute = |name: &str, kind: &str, value: &[u8]| {
-        for text in [name, kind] {
-            out.extend_from_slice(text.as_bytes());
-            out.push(0);
-        }
-        out.extend_from_slice(&(value.len() as u32).to_le_bytes());
-        out.extend_from_slice(value);
-    };
-    let mut list = Vec::new();
-    for &c in &order {
-        list.extend_from_slice(channel.planes()[c].as_bytes());
-        list.push(0);
-        // Type, perceptually linear or not with its padding, sampling of x and y.
-        for number in [FLOAT, 0, 1, 1] {
-            list.extend_from_slice(&number.to_le_bytes());
-        }
-    }
-    list.push(0);
-    let words = |numbers: [u32; 4]| numbers.map(u32::to_le_bytes).concat();
-    let window = words([0, 0, raw.width as u32 - 1, raw.height as u32 - 1]);
-    let one = 1.0f32.to_le_bytes();
-    attribute("channels", "chlist", &list);
-    attribute("compression", "compression", &[0]);
-    attribute("dataWindow", "box2i", &window);
-    attribute("displayWindow", "box2i", &window);
-    attribute("lineOrder", "lineOrder", &[0]);
-    attribute("pixelAspectRatio", "float", &one);
-    attribute("screenWindowCenter", "v2f", &[0; 8]);
-    attribute("screenWindowWidth", "float", &one);
-    out.push(0);
-    let line = 4 * raw.channels * raw.width;
-    let first = out.len() + 8 * raw.height;
-    for y in 0..raw.height {
-        out.extend_from_slice(&((first + y * (8 + line)) as u64).to_le_bytes());
-    }
-    for y in 0..raw.height {
-        out.extend_from_slice(&(y as u32).to_le_bytes());
-        out.extend_from_slice(&(line as u32).to_le_bytes());
-        for &c in &order {
-            let row = &raw.plane(c)[y * raw.width..(y + 1) * raw.width];
-            row.iter().for_each(|x| out.extend_from_slice(&x.to_le_bytes()));
-        }
-    }
+/// A single-part OpenEXR file of uncompressed scan lines, which every reader takes.
+fn open_exr(channel: Channel, raw: &Planes<f32>) -> Result<Vec<u8>> {
+    let one = |c: usize| AnyChannel::new(channel.planes()[c], FlatSamples::F32(raw.plane(c).to_vec()));
+    let channels = AnyChannels::sort((0..raw.channels).map(one).collect());
+    let layer = Layer::new((raw.width, raw.height), LayerAttributes::default(), Encoding::UNCOMPRESSED, channels);
+    let mut out = Cursor::new(Vec::new());
+    Image::from_layer(layer).write().non_parallel().to_buffered(&mut out).map_err(|e| {
+        Error::input(format!("a picture cannot be written as OpenEXR ({e})")).remedy("Take --raw-format npy.")
+    })?;
+    Ok(out.into_inner())
 }
 
 #[cfg(test)]
