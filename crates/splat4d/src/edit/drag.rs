@@ -203,7 +203,8 @@ fn unmoved(rest: &[[f64; 3]]) -> Vec<NodeOffset> {
 }
 
 /// A drag under the hand: one moment of a scene, of which nodes are pulled again and again. What is shown is what a step with
-/// the same nodes, handles and pins makes of that moment.
+/// the same nodes, handles and pins makes of that moment; away from the second at which places are meant nearly so, because who
+/// follows which node is then told by where all are now.
 #[derive(Clone, Debug)]
 pub struct Dragging {
     scene: Scene<f32>,
