@@ -18,8 +18,8 @@ use std::path::{Path, PathBuf};
 /// Marker of the layout, and the file without which it is another's.
 pub(super) const MARKER: &str = "dataset.json";
 const METADATA: &str = "metadata.json";
-/// Folders of pictures, finest first.
-const SCALES: [&str; 5] = ["1x", "2x", "4x", "8x", "16x"];
+/// By how much the pictures of each folder are reduced, finest first.
+const SCALES: [usize; 5] = [1, 2, 4, 8, 16];
 /// Endings that pictures have.
 const ENDINGS: [&str; 3] = ["png", "jpg", "jpeg"];
 /// Skew above this bends pictures visibly, and is not modelled, pixels.
@@ -79,7 +79,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
     let metadata = json::read(&path)?;
     let about = Node::root(&metadata);
     let [for_train, for_held]: [BTreeSet<&String>; 2] = [&train, &held].map(|l| l.iter().collect());
-    let folder = pictures(root)?;
+    let (folder, smaller) = pictures(root)?;
     let (mut frames, mut cameras) = (Vec::new(), Vec::<u64>::new());
     let mut left_out = 0;
     for id in &ids {
@@ -112,7 +112,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         });
         let file = root.join("camera").join(format!("{id}.json"));
         let value = json::read(&file)?;
-        let source = camera_of(&Node::root(&value), &framing).map_err(|e| e.at(file.display()))?;
+        let source = camera_of(&Node::root(&value), &framing).map_err(|e| e.at(file.display()))?.downscaled(smaller);
         let image = ENDINGS.iter().map(|e| folder.join(format!("{id}.{e}"))).find(|p| p.is_file());
         let image = image.unwrap_or_else(|| folder.join(format!("{id}.png")));
         let time = index as f64 / fps;
@@ -156,10 +156,10 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
     })
 }
 
-/// The finest folder of pictures. Errors: there is none.
-fn pictures(root: &Path) -> Result<PathBuf> {
-    let all = SCALES.map(|s| root.join("rgb").join(s));
-    all.into_iter().find(|p| p.is_dir()).ok_or_else(|| {
+/// The finest folder of pictures, and by how much they are reduced. Errors: there is none.
+fn pictures(root: &Path) -> Result<(PathBuf, usize)> {
+    let all = SCALES.map(|k| (root.join("rgb").join(format!("{k}x")), k));
+    all.into_iter().find(|(p, _)| p.is_dir()).ok_or_else(|| {
         Error::input("there are no pictures: none of 1x, 2x, 4x, 8x and 16x is there")
             .at(root.join("rgb").display())
             .remedy("Copy the data set's rgb folder here.")

@@ -96,7 +96,7 @@ impl ImageTerm for StepLoss<'_> {
     }
 
     fn target<'a>(&self, view: &View<'a>) -> Option<Target<'a>> {
-        let mut terms = self.run.terms.iter().chain(&*self.stage);
+        let mut terms = self.run.terms.iter().chain(&*self.stage).filter(|term| term.looks_at(view));
         let (Some(only), None) = (terms.next(), terms.next()) else { return None };
         let response = self.exposure.as_ref().map(|exposure| exposure.response(view.rig));
         only.target(view).map(|target| Target { response, ..target })
@@ -105,7 +105,7 @@ impl ImageTerm for StepLoss<'_> {
     fn compared(&mut self, view: &View<'_>, comparison: &Comparison) -> f64 {
         let run = &mut *self.run;
         let mut total = 0.0;
-        for term in run.terms.iter_mut().chain(&mut *self.stage) {
+        for term in run.terms.iter_mut().chain(&mut *self.stage).filter(|term| term.looks_at(view)) {
             total += term.compared(view, comparison);
             if let Some(measured) = term.measured() {
                 (run.l1, run.ssim) = (measured.l1, measured.ssim);

@@ -20,6 +20,10 @@ impl<F: Real> ImageTerm<F> for Depth {
         Needs { depth: view.depth.is_some(), extra: Vec::new() }
     }
 
+    fn looks_at(&self, view: &View<'_, F>) -> bool {
+        view.depth.is_some()
+    }
+
     fn eval(&mut self, info: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64 {
         let Some(truth) = view.depth else { return 0.0 };
         let weight = self.0 * LAST.powf(info.progress);

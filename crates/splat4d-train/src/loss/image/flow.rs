@@ -14,6 +14,10 @@ impl<F: Real> ImageTerm<F> for Flow {
         Needs { depth: false, extra: view.flow.map(|_| Channel::Flow).into_iter().collect() }
     }
 
+    fn looks_at(&self, view: &View<'_, F>) -> bool {
+        view.flow.is_some()
+    }
+
     fn eval(&mut self, _: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64 {
         let (Some(truth), Some((first, drawn))) = (&view.flow, shown.channel(&Channel::Flow)) else { return 0.0 };
         let mut d_drawn = Planes::new(3, drawn.height, drawn.width);
@@ -30,6 +34,10 @@ pub(crate) struct Tracks(pub f64);
 impl<F: Real> ImageTerm<F> for Tracks {
     fn needs(&self, view: &View<'_, F>) -> Needs {
         Needs { depth: false, extra: view.tracks.map(|_| Channel::Tracks).into_iter().collect() }
+    }
+
+    fn looks_at(&self, view: &View<'_, F>) -> bool {
+        view.tracks.is_some()
     }
 
     fn eval(&mut self, _: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64 {

@@ -208,6 +208,11 @@ pub trait ImageTerm<F: Real = f32>: Send {
         Needs::default()
     }
 
+    /// Whether it looks at this view: where it does not, its value is 0 and it adds no gradient.
+    fn looks_at(&self, _view: &View<'_, F>) -> bool {
+        true
+    }
+
     /// Its value for one view; adds its gradient to `d`.
     fn eval(&mut self, info: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64;
 
