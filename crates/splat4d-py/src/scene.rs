@@ -129,9 +129,9 @@ impl Scene {
                 let painter = Painter::new(scene, background, smooth, false);
                 let mut painter = painter.of_channel(kind, &self.views, &mut |_, _| {})?;
                 painter.draw(&camera.0, t.0);
-                Ok(painter.raw())
+                Ok::<Planes<f32>, splat4d::Error>(painter.raw())
             });
-            let drawn: Planes<f32> = drawn.or_raise()?;
+            let drawn = drawn.or_raise()?;
             return if drawn.channels > 1 { picture(py, drawn) } else { Ok(plane(py, drawn)?.into_bound(py)) };
         }
         let (image, trouble) = py.detach(|| {
