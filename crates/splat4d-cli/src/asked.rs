@@ -104,7 +104,7 @@ pub(crate) fn read(text: &str, views: &[View], clip: [f64; 2]) -> Result<Vec<Ask
                         "Pixels are those of the pictures as the run has them (divided by its --downscale).",
                     )));
                 }
-                Place::Pixel(camera.clone(), [x, y])
+                Place::Pixel(Box::new(camera.clone()), [x, y])
             }
             None => return Err(place(Error::input("a pixel has no camera").remedy(remedy()))),
         };
@@ -236,7 +236,10 @@ mod tests {
     #[test]
     fn pixels_and_places_are_read() {
         let asked = read("camera,x,y,time\nfront, 3.5,8,0.2\n\n", &views(), [0.0, 1.0]).unwrap();
-        assert_eq!(asked[0].query, Query { time: 0.2, place: Place::Pixel(views()[0].camera.clone(), [3.5, 8.0]) });
+        assert_eq!(
+            asked[0].query,
+            Query { time: 0.2, place: Place::Pixel(Box::new(views()[0].camera.clone()), [3.5, 8.0]) }
+        );
         let asked = read("t,x,y,z,camera\n0,1,2,3,front\n0.5,1,2,3,\n", &views(), [0.0, 1.0]).unwrap();
         assert_eq!(asked[0].query, Query { time: 0.0, place: Place::World([1.0, 2.0, 3.0]) });
         assert_eq!([&asked[0].camera, &asked[1].camera], [&Some("front".to_owned()), &None]);

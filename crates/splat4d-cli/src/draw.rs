@@ -389,7 +389,7 @@ fn field_rgb(raw: &Planes<f32>, channel: Channel, [low, high]: [f32; 2]) -> Rgb 
 
 /// The colour of a label: hues a golden section apart, every other one paler.
 pub fn label_color(label: usize) -> [u8; 3] {
-    hue((label as f32 * GOLDEN).fract(), if label % 2 == 0 { 0.75 } else { 0.45 }, 0.95)
+    hue((label as f32 * GOLDEN).fract(), if label.is_multiple_of(2) { 0.75 } else { 0.45 }, 0.95)
 }
 
 /// Hue from 0 to 1 (red, yellow, green, cyan, blue, violet), saturation and value as 8 bits.

@@ -36,7 +36,8 @@ impl Guard {
     /// besides.
     pub(crate) fn check(&self, request: &Parts, posts: bool) -> Result<(), Refusal> {
         let known = request.method == Method::GET || request.method == Method::HEAD;
-        if !known && !(posts && request.method == Method::POST) {
+        let posts = posts && request.method == Method::POST;
+        if !known && !posts {
             return Err(refusal(StatusCode::METHOD_NOT_ALLOWED, "only GET and HEAD are answered"));
         }
         if request.version < Version::HTTP_11 {

@@ -225,7 +225,8 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
 /// What lies beside the pictures, in words.
 fn priors(capture: &Capture) -> Vec<String> {
     let count = |has: fn(&Frame) -> bool| capture.frames.iter().filter(|f| has(f)).count();
-    let kinds: [(&str, fn(&Frame) -> bool); 3] =
+    type Has = fn(&Frame) -> bool;
+    let kinds: [(&str, Has); 3] =
         [("depth", |f| f.depth.is_some()), ("flow", Frame::has_flow), ("tracks", |f| f.tracks.is_some())];
     let told = kinds.map(|(name, has)| (name, count(has)));
     told.iter().filter(|(_, n)| *n > 0).map(|(name, n)| format!("{name} of {}", grouped(*n))).collect()

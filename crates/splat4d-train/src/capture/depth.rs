@@ -146,7 +146,7 @@ impl Map {
 fn check(map: &Map, file: &DepthFile) -> Result<()> {
     let wrong = |v: &f32| !v.is_finite() || file.kind == DepthKind::Metric && *v < 0.0;
     let count = map.values.iter().filter(|v| wrong(v)).count();
-    if let Some(p) = map.values.iter().position(|v| wrong(v)) {
+    if let Some(p) = map.values.iter().position(wrong) {
         let what = format!(
             "the depth at pixel ({}, {}) is {} ({count} pixels of {} are like it)",
             p % map.width.max(1),

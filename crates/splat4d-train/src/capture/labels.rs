@@ -30,7 +30,8 @@ pub(crate) fn read(frame: &Frame, capture: &Capture) -> Result<Option<Vec<u8>>> 
         let first = (p / width * k) * source.width + p % width * k;
         let label = full[first];
         // A pixel that is half the one and half the other is neither.
-        (0..k * k).all(|i| full[first + i / k * source.width + i % k] == label).then_some(label).unwrap_or(UNKNOWN)
+        let whole = (0..k * k).all(|i| full[first + i / k * source.width + i % k] == label);
+        if whole { label } else { UNKNOWN }
     };
     Ok(Some((0..width * height).map(pixel).collect()))
 }

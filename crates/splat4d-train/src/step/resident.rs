@@ -219,7 +219,7 @@ impl Engine for DeviceEngine<'_> {
         out.report.timings.render = clock.elapsed();
         if let Some([layer, table, row]) = stepped.bad {
             let params = &scene.layers[layer].params;
-            let column = keys(&scene.layers[layer])[table].map_or("?".into(), |key| params.column_name(key, 0));
+            let column = keys(&scene.layers[layer])[table].map_or("?", |key| params.column_name(key, 0));
             let what = format!("the table of `{column}` is not finite at Gaussian {row} of layer {layer}");
             return Ok(Err(Fault(what, Blame::Numbers)));
         }

@@ -307,6 +307,9 @@ fn fill(layer: &mut Layer<f32>, offsets: &NodeOffsets) {
     edited.fill_drag(offsets, &mut layer.params);
 }
 
+/// Places of nodes at one moment, and [moments, nodes] at all of them.
+type Carried = (Vec<[f64; 3]>, Vec<Vec<[f64; 3]>>);
+
 /// Nodes at the moment `first` of `times`, and at all of them: the model's own, or new ones that are followed.
 fn carried(
     scene: &Scene<f32>,
@@ -314,7 +317,7 @@ fn carried(
     asked: &Asked<'_>,
     (times, first): (&[f64], usize),
     context: &dyn Context,
-) -> Result<(Vec<[f64; 3]>, Vec<Vec<[f64; 3]>>)> {
+) -> Result<Carried> {
     if asked.nodes > 0 {
         let start = nodes(scene, selected, asked)?;
         let paths = context.follow(scene, selected, &start, times, first)?;
@@ -375,10 +378,13 @@ struct Bend<'a> {
     at: f64,
 }
 
+/// A layer's place in the scene, and for each of its rows in turn the nodes that pull it, with their shares.
+type Pulled = (usize, Vec<(u32, f32)>);
+
 impl Bend<'_> {
     /// Puts a drag around the selected Gaussians, which get layers of their own; returns the places of those, and which nodes
     /// pull their rows. It is to be filled.
-    fn around(&self, scene: &mut Scene<f32>, selected: &Selected) -> Result<Vec<(usize, Vec<(u32, f32)>)>> {
+    fn around(&self, scene: &mut Scene<f32>, selected: &Selected) -> Result<Vec<Pulled>> {
         let count = self.start.len();
         let neighbours = PULLING.min(count - 1).max(1);
         let index = |layer: &Layer<f32>| (0..).find(|i| layer.params.find(&format!("drag_nodes.{i}")).is_none());

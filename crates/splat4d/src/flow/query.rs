@@ -33,7 +33,7 @@ pub enum Place {
     /// There, scene units.
     World([f64; 3]),
     /// What this pixel position shows.
-    Pixel(Camera, [f64; 2]),
+    Pixel(Box<Camera>, [f64; 2]),
 }
 
 /// A point to follow.
@@ -151,9 +151,10 @@ fn begin(scene: &Scene<f32>, now: &Seen, queries: &[Query], begins: &[usize], k:
         let point = match &query.place {
             Place::World(x) => {
                 let carriers = now.around(*x, None);
-                (!carriers.is_empty()).then(|| Point { at: *x, carriers })
+                (!carriers.is_empty()).then_some(Point { at: *x, carriers })
             }
             Place::Pixel(camera, pixel) => {
+                let camera = &**camera;
                 if of_camera.as_ref().is_none_or(|(c, _)| *c != camera) {
                     of_camera = Some((camera, projected(scene, now, camera)));
                 }
@@ -382,7 +383,7 @@ mod tests {
     fn a_pixel_is_followed_both_ways_and_goes_as_the_wall_does() {
         let v = [0.4, -0.2, 0.1];
         let s = scene(vec![wall(0.0, 3.0, v, None)]);
-        let query = Query { time: 0.5, place: Place::Pixel(camera(), [33.0, 25.5]) };
+        let query = Query { time: 0.5, place: Place::Pixel(Box::new(camera()), [33.0, 25.5]) };
         let found = follow(&s, &[query], &times());
         let start = found.starts[0].unwrap();
         assert!(norm(sub(start, camera().unproject([33.0, 25.5], 4.0))) < 1e-3, "{start:?}");
@@ -416,7 +417,7 @@ mod tests {
         assert!(sights(&s, &camera(), Time(0.0), &[None, Some([0.0, 0.0, 9.0])]).iter().all(Option::is_none));
         let lone = scene(vec![wall(0.0, 0.6, [0.0; 3], None)]);
         let queries = [
-            Query { time: 0.0, place: Place::Pixel(camera(), [2.0, 2.0]) },
+            Query { time: 0.0, place: Place::Pixel(Box::new(camera()), [2.0, 2.0]) },
             Query { time: 0.0, place: Place::World([0.0, 0.0, 2.0]) },
         ];
         let found = follow(&lone, &queries, &times());

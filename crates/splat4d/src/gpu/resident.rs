@@ -171,7 +171,7 @@ impl Tables {
 }
 
 /// Tables side by side: block by block, the columns of one after those of the other.
-fn side_by_side<'a>(tables: &[(&'a [f32], usize)]) -> Vec<f32> {
+fn side_by_side(tables: &[(&[f32], usize)]) -> Vec<f32> {
     let stride: usize = tables.iter().map(|t| t.1).sum();
     let blocks = tables.iter().find(|t| t.1 > 0).map_or(0, |(data, width)| data.len() / (width * BLOCK));
     let mut out = Vec::with_capacity(blocks * stride * BLOCK);

@@ -71,7 +71,7 @@ pub fn probabilities<F: Real>(params: &Params<F>, key: Key, row: usize, out: &mu
         *p = (logits.get(row, k) - largest).exp();
         sum += *p;
     }
-    out.iter_mut().for_each(|p| *p = *p / sum);
+    out.iter_mut().for_each(|p| *p /= sum);
 }
 
 /// VJP of [`probabilities`]: dL/dlogit_k = p_k (dL/dp_k − Σ_j p_j dL/dp_j).
