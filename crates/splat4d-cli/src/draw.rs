@@ -233,7 +233,7 @@ impl<'a> Painter<'a> {
         self.field = flow::divided(&self.image.extra);
     }
 
-    /// The numbers of the last picture, plane by plane ([`Channel::planes`]), NaN where nothing has any: colours over the
+    /// The numbers of the last picture, plane by plane (`Channel::planes`), NaN where nothing has any: colours over the
     /// background; alpha; expected depth, scene units; flow, pixels; velocity, scene units a second; unit normals in camera
     /// axes (x right, y down, z forward); the number of the likeliest label, −1 for none; seconds; scene units.
     pub fn raw(&self) -> Planes<f32> {

@@ -94,7 +94,7 @@ fn follow(from: &Pyramid, to: &Pyramid, place: [f64; 2]) -> Option<[f64; 2]> {
     inside.then_some(out)
 }
 
-/// As [`follow`], where the way back leads to the start.
+/// As `follow`, where the way back leads to the start.
 pub fn surely(from: &Pyramid, to: &Pyramid, place: [f64; 2]) -> Option<[f64; 2]> {
     let there = follow(from, to, place)?;
     let back = follow(to, from, there)?;
