@@ -27,8 +27,10 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Share of the observed ticks from which the rest is forecast, to choose a model by.
-const EARLIER: f64 = 0.8;
+/// Shares of the observed ticks from which forecasts are tried to choose a model by, and how far these go. Models are fitted to
+/// what is before the first of them: one start can fall where a wrong model is right by chance, say on a swing's turning point.
+const STARTS: [f64; 3] = [0.6, 0.7, 0.8];
+const AHEAD: f64 = 0.2;
 /// Where the work goes, in the run.
 pub(crate) const FOLDER: &str = "predict";
 
@@ -214,16 +216,24 @@ impl Work {
         let (moments, spread) = self.rollout(&fitted, paths, actions, self.horizon);
         let scene = predicted(&self.scene, &self.observed, &moments, self.clock)?;
         let rollout = started.elapsed().as_secs_f64();
-        let earlier = ((EARLIER * self.ticks as f64) as usize).max(1);
-        let backtest = if self.order.models.len() > 1 && earlier >= splat4d_dynamics::learnt::LEAST_TICKS {
-            let seen = paths.first(earlier);
-            let moments = self.rollout(&self.fit(model, &seen)?, &seen, actions, self.ticks - earlier).0;
-            let errors = node_errors(&moments, &paths.moments[earlier..]);
-            Some(errors.iter().sum::<f64>() / errors.len().max(1) as f64)
-        } else {
-            None
-        };
+        let backtest = if self.order.models.len() > 1 { self.backtest(model)? } else { None };
         Ok(Forecast { model, fitted, moments, spread, scene, seconds: [fit, rollout], backtest })
+    }
+
+    /// The mean node error of forecasts of what was observed; `None`: too little was.
+    fn backtest(&self, model: Model) -> Result<Option<f64>> {
+        let (paths, actions) = (&self.observed.paths, self.order.actions.as_ref());
+        let tick = |share: f64| ((share * self.ticks as f64).round() as usize).min(self.ticks);
+        if tick(STARTS[0]) < splat4d_dynamics::learnt::LEAST_TICKS {
+            return Ok(None);
+        }
+        let fitted = self.fit(model, &paths.first(tick(STARTS[0])))?;
+        let mut errors = Vec::new();
+        for (start, end) in STARTS.map(|s| (tick(s), tick(s + AHEAD))) {
+            let moments = self.rollout(&fitted, &paths.first(start), actions, end - start).0;
+            errors.extend(node_errors(&moments, &paths.moments[start..end]));
+        }
+        Ok(Some(errors.iter().sum::<f64>() / errors.len().max(1) as f64))
     }
 
     fn fit(&self, model: Model, paths: &Paths) -> Result<Vec<Fitted>> {

@@ -54,7 +54,7 @@ pub(crate) struct ModelScores {
     pub node_error: Option<Vec<f64>>,
     /// Mean distance of known points from where they truly were, scene units, by horizon.
     pub track_error: Option<Vec<f64>>,
-    /// Mean node error of forecasting the last fifth of the observed part, scene units.
+    /// Mean node error of forecasts of a fifth of the observed part, from three moments of it, scene units.
     pub backtest: Option<f64>,
     /// The first frame at which it left the scene.
     pub diverged: Option<usize>,
@@ -119,8 +119,8 @@ fn page(run: &str, told: &Told, films: &[(String, PathBuf)]) -> String {
     body.push_str(
         "<p class=\"note\">Where things move: pixels that differ from the last observed picture of the camera. Skill: 1 minus the \
          mean squared error there over the baseline's; 0 is no better, below 0 is worse. Wins: share of the views nearer to \
-         the truth than the baseline's. Back-test: node error when the last fifth of the observed part is forecast, by which \
-         the scene's model was chosen; nothing later had a say in it.</p>\n",
+         the truth than the baseline's. Back-test: node error of forecasts from three moments of the observed part, \
+         by which the scene's model was chosen; nothing later had a say in it.</p>\n",
     );
     format!(
         "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><meta name=\"viewport\" \

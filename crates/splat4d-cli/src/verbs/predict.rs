@@ -21,9 +21,9 @@ Examples:
   splat4d predict runs/seen --assimilate                corrected by each new frame, beside the open loop
 
 Models, each a baseline for the next: freeze, velocity, acceleration, extrapolate (what the motion model itself says of later
-times), koopman (linear with delays), causal (state space), graph (messages along edges). RUN/predict holds report.html,
+times), koopman (swings that fade), causal (state space), graph (messages along edges). RUN/predict holds report.html,
 predict.json, dynamics.safetensors and the predicted scene as scene.splat4d and scene.safetensors, which view, render, bake and
-export take. With several models the scene is that of the one that forecasts the last fifth of the observed part best.";
+export take. With several models the scene is that of the one whose forecasts from three moments of the observed part were best.";
 
 /// Default of `--nodes`.
 const NODES: usize = 48;

@@ -23,8 +23,12 @@ pub struct Seen {
     /// Share of the pixels of fixed cameras that change from one of their frames to the next; none where that cannot be
     /// told.
     pub changing: Option<f64>,
+    /// Fewest pictures of fixed cameras at a moment.
+    pub fewest: usize,
     /// Pictures have masks.
     pub masks: bool,
+    /// The end of the take is kept from training, to be predicted.
+    pub predicted: bool,
 }
 
 impl Seen {
@@ -35,7 +39,9 @@ impl Seen {
             times: plan.times,
             cameras: frames.len() as f64 / plan.times.max(1) as f64,
             changing: if looks { motion_energy(frames)? } else { None },
+            fewest: plan.moments.iter().map(|m| m.1).min().unwrap_or(0),
             masks: frames.has_masks(),
+            predicted: plan.recipe.capture.observe < 1.0,
         })
     }
 
@@ -116,23 +122,33 @@ mod tests {
         camera: Camera,
         /// Seconds by which each camera is later than the one before.
         late: f64,
+        /// Share of the take that is seen.
+        observe: f64,
     }
 
     impl Made {
         fn new(cameras: usize, times: usize, speed: usize, masks: bool) -> Self {
             let pose = Se3::look_at([0.0, 0.0, -4.0], [0.0; 3], [0.0, -1.0, 0.0]);
-            Self { cameras, times, speed, masks, camera: Camera::with_fov_y(pose, 0.9, 64, 48), late: 0.0 }
+            Self {
+                cameras,
+                times,
+                speed,
+                masks,
+                camera: Camera::with_fov_y(pose, 0.9, 64, 48),
+                late: 0.0,
+                observe: 1.0,
+            }
         }
 
         fn choose(&self, fixed: bool) -> Choice {
             let plan = Plan {
-                recipe: Recipe::default().resolve(),
+                recipe: Recipe::default().with(|r| r.capture.observe = self.observe).resolve(),
                 extent: 1.0,
                 clip: [0.0, 1.0],
                 fps: 30.0,
                 times: moments((0..self.len()).map(|i| (self.rig(i), self.time(i).0))),
                 fixed_cameras: if fixed { self.cameras } else { 0 },
-                moments: Vec::new(),
+                moments: (0..self.times).map(|t| (t as f64 / 30.0, if fixed { self.cameras } else { 0 })).collect(),
                 masks: self.masks,
             };
             choose(&plan, self).unwrap()
@@ -183,6 +199,10 @@ mod tests {
         // Shutters that do not open at once: by little, and by up to a frame.
         is(Made { late: 0.002, ..Made::new(6, 10, 4, true) }, true, "spacetime", "6 cameras");
         is(Made { late: 0.005, ..Made::new(6, 10, 4, true) }, true, "spacetime", "4 cameras");
+        // What is to go on needs Gaussians that last, where cameras can follow them.
+        is(Made { observe: 0.8, ..Made::new(6, 10, 4, true) }, true, "tracked", "to be predicted");
+        is(Made { observe: 0.8, ..Made::new(2, 10, 4, true) }, true, "deform-mlp", "2");
+        is(Made { observe: 0.8, ..Made::new(1, 50, 4, true) }, false, "control", "one camera");
         is(Made::new(1, 50, 4, true), false, "control", "one camera");
         is(Made::new(1, 50, 4, false), false, "deform-mlp", "one camera");
         is(Made::new(2, 700, 4, true), true, "deform-mlp", "of 700");

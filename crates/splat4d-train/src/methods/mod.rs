@@ -329,11 +329,11 @@ type Make = fn() -> Box<dyn Program>;
 /// this order.
 pub(crate) const PROGRAMS: [(&str, Make); 8] = [
     ("still", || Box::new(still::StillProgram)),
+    ("tracked", || Box::new(tracked::TrackedProgram)),
     ("spacetime", || Box::new(spacetime::SpacetimeProgram)),
     ("control", || Box::new(control::ControlProgram)),
     ("deform-mlp", || Box::new(deform::DeformProgram)),
     ("hexplane", || Box::new(hexplane::HexplaneProgram)),
-    ("tracked", || Box::new(tracked::TrackedProgram)),
     ("native4d", || Box::new(native4d::Native4dProgram)),
     ("ssm", || Box::new(ssm::SsmProgram)),
 ];

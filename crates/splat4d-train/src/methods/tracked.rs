@@ -4,6 +4,7 @@
 //! Source: Luiten et al. 2024 (Dynamic 3D Gaussians). Ours: who is foreground is learnt from frame 0's masks and not given;
 //! lengths are in shares of the rig, so that the weights hold in any unit; the neighbours' weights do not know the unit.
 
+use super::auto::Seen;
 use super::{Group, Hook, Plan, Program, Rate, Stage, program, still};
 use crate::loss::graph::{LEAST_MEAN_WEIGHT, Weigh};
 use crate::loss::image::ImageTerm;
@@ -15,7 +16,7 @@ use crate::settings::settings;
 use crate::{Error, Result};
 use splat4d::layers::Layer;
 use splat4d::math::quat;
-use splat4d::motion::tracked::{FOREGROUND, POSE, Tracked, TrackedSpec};
+use splat4d::motion::tracked::{FOREGROUND, LEAST_CAMERAS, POSE, Tracked, TrackedSpec};
 use splat4d::motion::{MODELS, Spec};
 use splat4d::scene::GEOMETRY;
 use splat4d::scene::params::{QUAT, page_name};
@@ -49,7 +50,8 @@ settings! {
         neighbours: usize = 20;
         /// A neighbour at distance d counts exp(−β d²), β in 1/(scene units)²; 0: 1/median(d²).
         beta: f64 = 0.0 => any().unit("1/units²");
-        /// Weight of neighbours keeping their offsets.
+        /// Weight of neighbours keeping their offsets. A quarter of this and of the next two keeps up with bodies that are fast for
+        /// the frame rate, which the paper's lose; points of slow ones are followed less closely (docs/dynamics.md).
         rigid: f64 = 4.0;
         /// Weight of neighbours turning alike.
         rot: f64 = 4.0;
@@ -102,6 +104,13 @@ impl Program for TrackedProgram {
                 .remedy("Leave prune_interval at 0, or prune afterwards with `splat4d compress`"));
         }
         Ok(())
+    }
+
+    fn suits(&self, seen: &Seen) -> Option<String> {
+        (seen.predicted && seen.fewest >= LEAST_CAMERAS && !seen.is_long()).then(|| {
+            let cameras = seen.cameras_in_words();
+            format!("{cameras} each moment, and what is to be predicted needs Gaussians that last and can be followed")
+        })
     }
 
     fn stages(&self, plan: &Plan) -> Vec<Stage> {

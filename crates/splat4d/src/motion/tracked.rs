@@ -30,7 +30,7 @@ const PAGES: &str = "poses";
 /// Name of the table, and of its only column group, that says who is foreground: a logit.
 pub const FOREGROUND: &str = "foreground_logits";
 /// Cameras that must see every moment: with two, what moves along a line between them is not seen to move.
-const LEAST_CAMERAS: usize = 3;
+pub const LEAST_CAMERAS: usize = 3;
 /// Most frames of a file that is believed: some nine hours at 30 a second.
 const MAX_FRAMES: usize = 1 << 20;
 /// Numbers of pages that are made and not loaded, at most: a gigabyte. A file whose specification asks for more has lost
