@@ -5,8 +5,8 @@ use crate::worlds::World;
 use splat4d::math::se3::{norm, sub};
 
 /// Of the 1,500 that the models have: as many as the pendulum asks of each.
-const CAUSAL_STEPS: usize = 100;
-const GRAPH_STEPS: usize = 100;
+const CAUSAL_STEPS: usize = 200;
+const GRAPH_STEPS: usize = 200;
 
 /// True node paths of a world: the first `seen` frames with rotations, and what comes after.
 fn world(name: &str, seen: usize) -> (Paths, Vec<Moment>, Option<Actions>) {
