@@ -6,7 +6,7 @@ use splat4d::math::se3::{norm, sub};
 
 /// Of the 1,500 that the models have: as many as the pendulum asks of each.
 const CAUSAL_STEPS: usize = 200;
-const GRAPH_STEPS: usize = 200;
+const GRAPH_STEPS: usize = 100;
 
 /// True node paths of a world: the first `seen` frames with rotations, and what comes after.
 fn world(name: &str, seen: usize) -> (Paths, Vec<Moment>, Option<Actions>) {
@@ -20,7 +20,8 @@ fn world(name: &str, seen: usize) -> (Paths, Vec<Moment>, Option<Actions>) {
 fn error_after(model: Model, name: &str, horizon: usize, steps: usize, with_actions: bool) -> f64 {
     let (paths, truth, actions) = world(name, 120);
     let actions = actions.filter(|_| with_actions);
-    let settings = Settings { training: Training { steps, seed: 0 }, ..Settings::default() };
+    let gravity = Some([0.0, -1.0, 0.0]);
+    let settings = Settings { training: Training { steps, seed: 0 }, gravity, ..Settings::default() };
     let fitted = Fitted::fit(model, &paths, actions.as_ref(), &settings).unwrap();
     node_errors(&fitted.rollout(&paths, actions.as_ref(), horizon), &truth)[horizon - 1]
 }
