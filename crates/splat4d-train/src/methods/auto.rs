@@ -201,7 +201,7 @@ mod tests {
         is(Made { late: 0.005, ..Made::new(6, 10, 4, true) }, true, "spacetime", "4 cameras");
         // What is to go on needs Gaussians that last, where cameras can follow them.
         is(Made { observe: 0.8, ..Made::new(6, 10, 4, true) }, true, "tracked", "to be predicted");
-        is(Made { observe: 0.8, ..Made::new(2, 10, 4, true) }, true, "deform-mlp", "2");
+        is(Made { observe: 0.8, ..Made::new(2, 10, 4, true) }, true, "control", "2.0 cameras");
         is(Made { observe: 0.8, ..Made::new(1, 50, 4, true) }, false, "control", "one camera");
         is(Made::new(1, 50, 4, true), false, "control", "one camera");
         is(Made::new(1, 50, 4, false), false, "deform-mlp", "one camera");
