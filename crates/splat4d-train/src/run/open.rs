@@ -9,6 +9,7 @@ use crate::learner::{Corrections, Exposure, Origin, RefineSettings, Scale};
 use crate::loss::image::terms;
 use crate::methods::{Plan, Stage, auto, program_of, stages};
 use crate::recipe::{MotionName, Recipe};
+use crate::step::emphasis::Emphasis;
 use crate::step::loss::TrainLoss;
 use crate::step::trainer::{Settings, TrainedOn, Trainer};
 use crate::upkeep::Limits;
@@ -235,6 +236,9 @@ impl OpenCapture {
     pub(crate) fn trainer(&self, plan: &Plan, scene: Scene<f32>) -> Result<Trainer<'static>> {
         let mut trainer = self.trainer_of(plan, scene, stages(program_of(&plan.recipe)?.as_ref(), plan));
         trainer.replan(plan.recipe.run.replans.rows());
+        let moves = plan.recipe.run.motion.as_str() != "still";
+        let strength = if moves { plan.recipe.loss.moving } else { 0.0 };
+        trainer.emphasise(Emphasis::new(self.frames.as_ref(), strength)?);
         Ok(trainer)
     }
 

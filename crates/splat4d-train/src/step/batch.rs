@@ -1,6 +1,7 @@
 //! [`Batch`]: the pictures of one step.
 
 use super::chain::View;
+use super::emphasis::Emphasis;
 use crate::Result;
 use crate::capture::frames::{Depth, Flow, FlowTruth, Frames, Picture};
 use crate::learner::Corrections;
@@ -10,6 +11,8 @@ use splat4d::scene::{Camera, Planes, Time};
 /// Frames of one step, loaded; memory is reused from step to step.
 #[derive(Default)]
 pub(super) struct Batch {
+    /// Which pixels weigh more.
+    pub(super) emphasis: Option<Emphasis>,
     seen: Vec<usize>,
     pictures: Vec<Picture>,
     tracks: Vec<Option<Flow>>,
@@ -34,6 +37,9 @@ impl Batch {
         self.tracks.clear();
         for (&i, picture) in seen.iter().zip(&mut self.pictures) {
             frames.load(i, picture)?;
+            if let Some(emphasis) = &mut self.emphasis {
+                emphasis.apply(frames.rig(i), picture);
+            }
             let stated = frames.camera(i);
             let camera = corrections.map_or_else(|| stated.clone(), |c| c.camera(i, stated));
             let time = frames.time(i);

@@ -114,13 +114,26 @@ pub(super) fn rates_of(scene: &Scene<f32>, plan: &StepPlan<'_>, all: &mut Rates)
     }
 }
 
+/// Share of a stage after which exposures come to rest: before it they learn at a constant rate, since a rate that falls from the
+/// start leaves them short in runs of a few dozen pictures a camera (docs/suite.md).
+const EXPOSURE_RESTS: f64 = 0.7;
+/// What is left of their rate at the end: Adam moves a camera's colours by up to the rate a step whatever the gradient, and at the
+/// full rate pictures end a thousandth off.
+const EXPOSURE_END: f64 = 0.01;
+
+/// What is left of the exposures' rate at a place in the stage.
+fn rests(progress: f64) -> f64 {
+    EXPOSURE_END.powf(((progress - EXPOSURE_RESTS) / (1.0 - EXPOSURE_RESTS)).max(0.0))
+}
+
 /// Adam on the cameras' exposures.
 pub(super) fn learn_exposure(learner: &mut Learner, plan: &StepPlan<'_>) {
     if let Some(exposure) = learner.parts_mut().exposure {
         match plan.stage.freeze_exposure {
             true => exposure.rest(),
             false => {
-                let _ = exposure.step(plan.exposure_lr * plan.rate_scale);
+                let rest = rests(plan.info.progress);
+                let _ = exposure.step(plan.exposure_lr * plan.rate_scale * rest);
             }
         }
     }

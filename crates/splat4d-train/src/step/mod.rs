@@ -4,6 +4,7 @@ mod batch;
 pub(crate) mod chain;
 mod channels;
 pub(crate) mod clocks;
+pub(crate) mod emphasis;
 pub mod engine;
 pub mod loss;
 pub(crate) mod pace;

@@ -2,6 +2,7 @@
 
 use super::batch::Batch;
 use super::chain::StepInfo;
+use super::emphasis::Emphasis;
 use super::clocks::Look;
 use super::engine::{Blame, Engine, StepPlan};
 pub use super::engine::{Fault, Stepped};
@@ -134,6 +135,11 @@ impl<'a> Trainer<'a> {
     pub fn set_engine(&mut self, engine: impl Engine + 'a) {
         self.engine = Box::new(engine);
         self.engine.changed(&self.learner);
+    }
+
+    /// Lets some pixels weigh more from now on.
+    pub(crate) fn emphasise(&mut self, emphasis: Option<Emphasis>) {
+        self.batch.emphasis = emphasis;
     }
 
     /// Looks at other frames, of the same times, from now on.

@@ -69,8 +69,18 @@ pub(crate) enum Rigs {
 }
 
 impl Rigs {
-    /// Fixed cameras, where there are at least two of them; else some of all frames.
+    /// Fixed cameras, where there are at least two of them; else some of all frames. Of many some, evenly chosen.
     pub(crate) fn of(frames: &dyn Frames) -> Self {
+        match Self::all(frames) {
+            Self::Fixed(mut cameras) => {
+                Self::Fixed(spread(cameras.len(), VIEWS).map(|k| std::mem::take(&mut cameras[k])).collect())
+            }
+            moving => moving,
+        }
+    }
+
+    /// The same with every fixed camera.
+    pub(crate) fn all(frames: &dyn Frames) -> Self {
         let mut rigs: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
         (0..frames.len()).for_each(|i| rigs.entry(frames.rig(i)).or_default().push(i));
         let still = |rig: &[usize]| {
@@ -80,9 +90,13 @@ impl Rigs {
         if fixed.len() < 2 {
             return Self::Moving(spread(frames.len(), VIEWS).collect());
         }
-        fixed = spread(fixed.len(), VIEWS).map(|k| std::mem::take(&mut fixed[k])).collect();
         fixed.iter_mut().for_each(|rig| rig.sort_by(|&a, &b| frames.time(a).0.total_cmp(&frames.time(b).0)));
         Self::Fixed(fixed)
+    }
+
+    /// Whether a fixed camera has so many moments that their median is what stands still.
+    pub(crate) fn have_medians(&self) -> bool {
+        matches!(self, Self::Fixed(rigs) if rigs.iter().any(|rig| rig.len() >= MEDIAN_FROM))
     }
 
     /// What stands still, as every camera sees it.
@@ -97,7 +111,7 @@ impl Rigs {
     /// few.
     pub(crate) fn moving(&self, frames: &dyn Frames, still: &[View], t: f64) -> Result<Option<(Vec<View>, f64)>> {
         let Self::Fixed(rigs) = self else { return Ok(None) };
-        if rigs.iter().all(|rig| rig.len() < MEDIAN_FROM) {
+        if !self.have_medians() {
             return Ok(None);
         }
         let nearest = |rig: &[usize]| {
@@ -127,13 +141,18 @@ pub(crate) fn spread(count: usize, most: usize) -> impl Iterator<Item = usize> {
     (0..kept).map(move |k| k * count / kept)
 }
 
+/// How often a picture is halved to the size that is worked with.
+pub(crate) fn halvings(width: usize, height: usize) -> usize {
+    (0..).find(|&k| (width >> k) * (height >> k) <= PIXELS).expect("a picture can be halved to nothing")
+}
+
 /// A frame's picture at the size that is worked with, and its camera.
 fn load(frames: &dyn Frames, i: usize) -> Result<(Camera, Picture)> {
     let mut picture = Picture::default();
     frames.load(i, &mut picture)?;
     (picture.depth, picture.flow) = (None, None);
     let mut camera = frames.camera(i).clone();
-    while picture.color.pixels() > PIXELS {
+    for _ in 0..halvings(camera.width, camera.height) {
         picture.halve();
         camera = camera.downscaled(2);
     }
@@ -154,24 +173,55 @@ fn single(frames: &dyn Frames, i: usize) -> Result<View> {
     Ok(View::new(camera, &picture.color, wanted))
 }
 
+/// Some of a fixed camera's frames, all at once.
+struct Moments {
+    camera: Camera,
+    /// Their pictures, [3, h, w].
+    colors: Vec<Planes<f32>>,
+    /// The pixels that the lens filled in all of them.
+    wanted: Vec<bool>,
+}
+
+impl Moments {
+    fn of(frames: &dyn Frames, rig: &[usize]) -> Result<Self> {
+        let most = if rig.len() < MEDIAN_FROM { 1 } else { MEDIAN_OF };
+        let (camera, first) = load(frames, rig[0])?;
+        let mut wanted = filled(&first);
+        let mut colors = vec![first.color];
+        for k in spread(rig.len(), most).skip(1) {
+            let (_, picture) = load(frames, rig[k])?;
+            wanted.iter_mut().zip(filled(&picture)).for_each(|(w, also)| *w &= also);
+            colors.push(picture.color);
+        }
+        Ok(Self { camera, colors, wanted })
+    }
+
+    /// One number a channel and pixel of those of all moments.
+    fn reduce(&self, of: impl Fn(&mut [f32]) -> f32) -> Planes<f32> {
+        let mut out = self.colors[0].clone();
+        let mut values = vec![0.0; self.colors.len()];
+        for (p, out) in out.data.iter_mut().enumerate() {
+            values.iter_mut().zip(&self.colors).for_each(|(v, color)| *v = color.data[p]);
+            *out = of(&mut values);
+        }
+        out
+    }
+
+    fn median(&self) -> Planes<f32> {
+        self.reduce(|values| *values.select_nth_unstable_by(values.len() / 2, f32::total_cmp).1)
+    }
+}
+
 /// The median over some of a fixed camera's frames, channel by channel.
 fn median(frames: &dyn Frames, rig: &[usize]) -> Result<View> {
-    let most = if rig.len() < MEDIAN_FROM { 1 } else { MEDIAN_OF };
-    let (camera, mut first) = load(frames, rig[0])?;
-    let mut wanted = filled(&first);
-    let mut values: Vec<Vec<f32>> = Vec::new();
-    for k in spread(rig.len(), most).skip(1) {
-        let (_, picture) = load(frames, rig[k])?;
-        wanted.iter_mut().zip(filled(&picture)).for_each(|(w, also)| *w &= also);
-        values.push(picture.color.data);
-    }
-    let mut sorted = Vec::with_capacity(values.len() + 1);
-    for (p, value) in first.color.data.iter_mut().enumerate() {
-        sorted.clear();
-        sorted.push(*value);
-        sorted.extend(values.iter().map(|v| v[p]));
-        let middle = sorted.len() / 2;
-        *value = *sorted.select_nth_unstable_by(middle, f32::total_cmp).1;
-    }
-    Ok(View::new(camera, &first.color, wanted))
+    let moments = Moments::of(frames, rig)?;
+    let color = moments.median();
+    Ok(View::new(moments.camera, &color, moments.wanted))
+}
+
+/// The temporal median and mean of a fixed camera over some of its frames, [3, h, w] at the size that is worked with.
+pub(crate) fn median_and_mean(frames: &dyn Frames, rig: &[usize]) -> Result<[Planes<f32>; 2]> {
+    let moments = Moments::of(frames, rig)?;
+    let mean = moments.reduce(|values| values.iter().sum::<f32>() / values.len() as f32);
+    Ok([moments.median(), mean])
 }

@@ -1,0 +1,160 @@
+//! [`Emphasis`]: pixels that show what moves weigh more. What moves is a small part of most pictures and the hardest, since
+//! a still Gaussian learns from every frame and a moving one from those of its life.
+//!
+//! Source: the importance of DyNeRF (Li et al. 2022) by the distance from the temporal median, which draws rays there and
+//! weighs pixels here. To it comes the distance from the temporal mean, which marks where anything moves at some moment: what
+//! is uncovered there is as hard as what moves. w = 1 + k·⅓ Σ_c (ψ(I_c − median_c) + ψ(I_c − mean_c)), ψ(x) = x²/(x² + γ²).
+
+use crate::Result;
+use crate::capture::frames::{Frames, Picture, halve};
+use crate::vision::view::{self, Rigs};
+use rayon::prelude::*;
+use splat4d::scene::Planes;
+use std::collections::BTreeMap;
+
+/// γ: a channel that is so far from the median counts half (K-Planes' setting of DyNeRF's for all frames).
+const GAMMA: f32 = 0.02;
+
+/// Weights of pixels by how much they differ from other moments'; none where cameras move, or have few pictures.
+pub(crate) struct Emphasis {
+    /// k: how much more than others a pixel weighs that differs from the median, or from the mean.
+    strength: f32,
+    /// By camera: its temporal median and mean, [3, h, w] at the size that pictures are looked at in, as bytes.
+    usual: BTreeMap<usize, [Vec<u8>; 2]>,
+    /// Scratch: Σ ψ/3 by pixel at that size.
+    moves: Planes<f32>,
+}
+
+impl Emphasis {
+    /// Looks at what stands still. `None`: nothing is emphasised. Errors: a picture cannot be read.
+    pub(crate) fn new(frames: &dyn Frames, strength: f64) -> Result<Option<Self>> {
+        if strength <= 0.0 {
+            return Ok(None);
+        }
+        let rigs = Rigs::all(frames);
+        if !rigs.have_medians() {
+            return Ok(None);
+        }
+        let Rigs::Fixed(cameras) = rigs else { return Ok(None) };
+        let byte = |v: &f32| (v * 255.0).round().clamp(0.0, 255.0) as u8;
+        let of_camera = |rig: &Vec<usize>| {
+            let usual = view::median_and_mean(frames, rig)?;
+            Ok((frames.rig(rig[0]), usual.map(|picture| picture.data.iter().map(byte).collect())))
+        };
+        let usual = cameras.par_iter().map(of_camera).collect::<Result<_>>()?;
+        Ok(Some(Self { strength: strength as f32, usual, moves: Planes::default() }))
+    }
+
+    /// Multiplies the weights of a whole picture of camera `rig`, which is not yet halved.
+    pub(super) fn apply(&mut self, rig: usize, picture: &mut Picture) {
+        let Some(usual) = self.usual.get(&rig) else { return };
+        let (width, height) = (picture.color.width, picture.color.height);
+        let halvings = view::halvings(width, height);
+        let mut small;
+        let color = match halvings {
+            0 => &picture.color,
+            _ => {
+                small = picture.color.clone();
+                (0..halvings).for_each(|_| halve(&mut small));
+                &small
+            }
+        };
+        self.moves.reset(1, color.height, color.width);
+        let pixels = color.pixels();
+        for usual in usual {
+            assert_eq!(usual.len(), color.data.len(), "pictures of one camera have one size");
+            for (plane, usual) in color.data.chunks_exact(pixels).zip(usual.chunks_exact(pixels)) {
+                for ((out, v), usual) in self.moves.data.iter_mut().zip(plane).zip(usual) {
+                    let x = v - f32::from(*usual) / 255.0;
+                    *out += x * x / (x * x + GAMMA * GAMMA) / 3.0;
+                }
+            }
+        }
+        let weight = picture.weight.get_or_insert_with(|| {
+            let mut all = Planes::new(1, height, width);
+            all.data.fill(1.0);
+            all
+        });
+        for (y, row) in weight.data.chunks_mut(width).enumerate() {
+            // An odd last row or column is left out where pictures are halved: it is like the one before.
+            let from = (y >> halvings).min(color.height - 1) * color.width;
+            for (x, w) in row.iter_mut().enumerate() {
+                *w *= 1.0 + self.strength * self.moves.data[from + (x >> halvings).min(color.width - 1)];
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::step::tests::Made;
+
+    #[test]
+    fn weights_follow_the_distance_from_the_median_and_what_the_lens_never_filled_has_none() {
+        let frames = Made::new(3, 5, 24);
+        let mut emphasis = Emphasis::new(&frames, 2.0).unwrap().expect("cameras stand still and have five moments");
+        let load = |i: usize| {
+            let mut picture = Picture::default();
+            frames.load(i, &mut picture).unwrap();
+            picture
+        };
+        let (rig, shown) = (1, 1 + 4 * 3);
+        let others: Vec<Picture> = (0..5).map(|k| load(rig + 3 * k)).collect();
+        let mut picture = load(shown);
+        emphasis.apply(rig, &mut picture);
+        let weight = picture.weight.take().unwrap();
+        let mut moving = 0;
+        for (p, w) in weight.data.iter().enumerate() {
+            let psi = |c: usize| {
+                let mut all: Vec<f32> = others.iter().map(|o| o.color.plane(c)[p]).collect();
+                all.sort_by(f32::total_cmp);
+                let far = |from: f32| f64::from(picture.color.plane(c)[p] - from);
+                let psi = |x: f64| x * x / (x * x + f64::from(GAMMA).powi(2));
+                psi(far(all[2])) + psi(far(all.iter().sum::<f32>() / 5.0))
+            };
+            let expected = 1.0 + 2.0 * (0..3).map(psi).sum::<f64>() / 3.0;
+            // Median and mean are kept as bytes: half a step of 1/255 moves ψ by at most 0.064.
+            assert!((f64::from(*w) - expected).abs() < 0.26, "pixel {p}: {w} {expected}");
+            moving += usize::from(*w > 4.8);
+        }
+        assert!(moving > 10, "the ball is where it was not before");
+        let mut filled = Planes::new(1, weight.height, weight.width);
+        filled.data[0] = 1.0;
+        picture.weight = Some(filled);
+        emphasis.apply(rig, &mut picture);
+        let weight = picture.weight.unwrap();
+        assert!(weight.data[0] >= 1.0 && weight.data[1..].iter().all(|w| *w == 0.0), "what the lens never filled");
+    }
+
+    #[test]
+    fn nothing_is_emphasised_without_fixed_cameras_or_moments() {
+        assert!(Emphasis::new(&Made::new(3, 5, 4), 0.0).unwrap().is_none());
+        assert!(Emphasis::new(&Made::new(3, 2, 4), 1.0).unwrap().is_none(), "two moments have no median");
+    }
+
+    /// Pictures that are larger than the size that is worked with: every pixel has a weight.
+    #[test]
+    fn weights_are_those_of_the_place_in_a_smaller_picture() {
+        let (width, height) = (801, 603);
+        let small = [width / 2, height / 2];
+        let mut emphasis = Emphasis {
+            strength: 1.0,
+            usual: [(0, [(); 2].map(|()| vec![0; 3 * small[0] * small[1]]))].into(),
+            moves: Planes::default(),
+        };
+        let mut picture = Picture { color: Planes::new(3, height, width), ..Picture::default() };
+        let bright = |x: usize, y: usize| (200..204).contains(&x) && (100..102).contains(&y);
+        for c in 0..3 {
+            for (p, v) in picture.color.plane_mut(c).iter_mut().enumerate() {
+                *v = f32::from(bright(p % width, p / width));
+            }
+        }
+        emphasis.apply(0, &mut picture);
+        let weight = picture.weight.unwrap();
+        for (p, w) in weight.data.iter().enumerate() {
+            let expected = if bright(p % width, p / width) { 3.0 } else { 1.0 };
+            assert!((w - expected).abs() < 1e-3, "pixel {p}: {w}");
+        }
+    }
+}
