@@ -267,18 +267,16 @@ fn trained(order: &Order<'_>, run: &Path, blank: Found, stop: &AtomicBool, conso
         return Err(Error::input("it holds out no view, so that nothing can be measured")
             .remedy("Give it a hold_out in the list."));
     }
-    let judge = Judge::new(&capture, &order.recipe);
-    // While pictures of half the size are trained on, they are what training views are: at full size a scene that has
-    // never seen one gets worse and better at random.
-    let halved = order.recipe.clone().with(|r| r.capture.downscale *= 2);
-    let coarse = Judge::new(&Arc::new(open_capture(&order.folder, &halved)?), &halved);
     let change = (order.recipe.run.half_size_until * order.recipe.run.iterations as f64) as usize;
-    let (mut probes, mut looking, mut trouble) = (Vec::new(), 0.0, None);
+    let (mut judges, mut probes, mut looking, mut trouble) = (None, Vec::new(), 0.0, None);
     let mut listen = |event: &Event| match event {
         Event::Checkpoint { iteration, path } if trouble.is_none() => {
             let clock = Instant::now();
-            let judge = if *iteration <= change { &coarse } else { &judge };
-            match judge.training(path, *iteration) {
+            let look = |judges: &mut Option<Judges>| {
+                let judges = Judges::of(judges, order, run)?;
+                if *iteration <= change { &judges.coarse } else { &judges.whole }.training(path, *iteration)
+            };
+            match look(&mut judges) {
                 Ok(psnr) => probes.extend(psnr.map(|psnr| Probe { step: *iteration, psnr })),
                 Err(error) => trouble = Some(error),
             }
@@ -296,6 +294,7 @@ fn trained(order: &Order<'_>, run: &Path, blank: Found, stop: &AtomicBool, conso
         return Err(Error::new(ErrorKind::Interrupted, "the suite is unfinished; finished cells are kept"));
     }
     let effective = Run::open(run)?.recipe()?;
+    let judge = &Judges::of(&mut judges, order, run)?.whole;
     let scores = judge.scores(&run.join("scene.safetensors"), outcome.iteration, console)?;
     let [psnr, psnr_cc, psnr_dynamic, ssim, flicker] =
         ["PSNR", "PSNR-cc", "PSNR-dynamic", "SSIM", "flicker"].map(|name| scores.held(name));
@@ -322,6 +321,28 @@ fn elsewhere(whole: Option<f64>, moving: Option<f64>, share: Option<f64>) -> Opt
     let (whole, moving, share) = (error(whole?), error(moving?), share?);
     let rest = (whole - share * moving) / (1.0 - share);
     (rest > 0.0 && rest.is_finite()).then(|| -10.0 * rest.log10())
+}
+
+/// What a run is measured on, opened when it has begun: points that it found in its pictures say from how near its cameras see.
+struct Judges {
+    whole: Judge,
+    /// The same at half the size. While pictures of half the size are trained on, they are what training views are: at full
+    /// size a scene that has never seen one gets worse and better at random.
+    coarse: Judge,
+}
+
+impl Judges {
+    fn of<'a>(judges: &'a mut Option<Self>, order: &Order<'_>, run: &Path) -> Result<&'a Self> {
+        if judges.is_none() {
+            let (whole, recipe) = Run::open(run)?.open_capture()?;
+            let halved = order.recipe.clone().with(|r| r.capture.downscale *= 2);
+            let mut coarse = open_capture(&order.folder, &halved)?;
+            coarse.frames.iter_mut().zip(&whole.frames).for_each(|(half, f)| half.view.near = f.view.near);
+            let [whole, coarse] = [(whole, recipe), (coarse, halved)].map(|(c, r)| Judge::new(&Arc::new(c), &r));
+            *judges = Some(Self { whole, coarse });
+        }
+        Ok(judges.as_ref().expect("they were just made"))
+    }
 }
 
 /// A capture that scenes are measured on.

@@ -56,6 +56,7 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
         root: take.root,
         kind: take.kind,
         cameras,
+        named: take.named,
         frames,
         take: take.take,
         held,

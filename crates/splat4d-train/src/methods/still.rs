@@ -26,11 +26,11 @@ settings! {
         sh_degree: usize = 1 => within(0, 3);
         /// Iterations before each further SH degree is unlocked; 0: iterations/10.
         sh_degree_interval: usize = 0 => any().unit("iterations").when(On("appearance.sh_degree"));
-        /// Learn a colour matrix and an offset a camera, where more than one camera has several pictures; their mean stays
-        /// the identity.
+        /// Learn a colour matrix and an offset a camera, where there are several cameras and each is named or has several
+        /// pictures; their mean stays the identity.
         exposure: bool = true;
-        /// The same where every camera has a single picture: a rig's one moment, or photos. Colours between cameras get
-        /// truer, but for the held-out ones' own (docs/suite.md).
+        /// The same for photos of one camera that chose their exposure: colours between them get truer, but for the held-out
+        /// ones' own (docs/suite.md).
         exposure_single: bool = false => any().when(On("appearance.exposure"));
         /// Rate of the exposure (Luiten et al., 10,000 steps: 1e-4).
         exposure_lr: f64 = 1e-3 => any().when(On("appearance.exposure"));

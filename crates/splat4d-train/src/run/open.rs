@@ -252,9 +252,9 @@ impl OpenCapture {
         };
         let mut trained: Vec<usize> = self.capture.train.iter().map(|&i| self.capture.frames[i].camera).collect();
         trained.sort_unstable();
-        // What the only picture of a camera tells of its colours the scene would tell a held-out neighbour: with plain
-        // PSNR such captures may lose as much as they gain (docs/suite.md), so that it is left to the recipe.
-        let pictures = if r.appearance.exposure_single { 1 } else { 2 };
+        // Cameras of a rig have colours of their own, and one picture of each tells them. Photos of one camera differ where it
+        // chose its exposure, which goes with the place and is then the scene's (docs/suite.md).
+        let pictures = if self.capture.named || r.appearance.exposure_single { 1 } else { 2 };
         let trained: Vec<usize> =
             trained.chunk_by(|a, b| a == b).filter(|c| c.len() >= pictures).map(|c| c[0]).collect();
         // A single camera's matrix is its own mean, which stays the identity.

@@ -546,17 +546,20 @@ fn minutes_fix_a_recipe_that_repeats() {
 }
 
 #[test]
-fn a_camera_with_one_picture_learns_no_exposure_unless_told() {
+fn photos_of_one_camera_learn_no_exposure_unless_told_and_a_rig_learns_them_from_one_picture_each() {
     let place = Place::new();
-    let exposed = |changes: &[&str]| {
+    let exposed = |named: bool, changes: &[&str]| {
         let recipe = recipe(changes);
-        let opened = OpenCapture::new(place.open(&recipe), &recipe).unwrap();
+        let capture = Capture { named, ..Capture::clone(&place.open(&recipe)) };
+        let opened = OpenCapture::new(Arc::new(capture), &recipe).unwrap();
         let plan = opened.plan(&recipe);
         let scene = opened.initial_scene(&plan).unwrap();
         opened.trainer(&plan, scene).unwrap().learner.exposure.is_some()
     };
-    assert!(exposed(&["exposure=true"]) && !exposed(&["exposure=true", "max_frames=1"]));
-    assert!(exposed(&["exposure=true", "max_frames=1", "appearance.exposure_single=true"]));
+    let moment = ["exposure=true", "max_frames=1"];
+    assert!(exposed(true, &moment) && exposed(false, &["exposure=true"]) && !exposed(false, &moment));
+    assert!(exposed(false, &[&moment[..], &["appearance.exposure_single=true"]].concat()));
+    assert!(!exposed(true, &["exposure=false"]));
 }
 
 #[test]

@@ -180,6 +180,7 @@ fn capture(pinned: &Pinned, root: &Path, pictures: &[PathBuf], count: usize) -> 
         root: root.to_owned(),
         kind: CaptureKind::Own,
         cameras: (0..pinned.views.len()).map(|i| Rig { name: format!("camera {i}"), fixed: true }).collect(),
+        named: true,
         frames: (0..count).map(frame).collect(),
         take: Extent { frames: 0..count, pictures: count },
         held: Vec::new(),
