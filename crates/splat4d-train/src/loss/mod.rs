@@ -27,9 +27,8 @@ settings! {
     pub struct LossSettings {
         /// Share of D-SSIM in the photometric loss.
         dssim: f64 = 0.2 => share();
-        /// How much more the pixels of fixed cameras weigh that differ from their temporal median, and again from their
-        /// mean (after DyNeRF).
-        moving: f64 = 0.7 => any().when(IsNot("run.motion", &["still"]));
+        /// How much more the pixels of fixed cameras weigh that differ from their temporal median (after DyNeRF).
+        moving: f64 = 1.0 => any().when(IsNot("run.motion", &["still"]));
         /// Weight of the alpha-mask loss |alpha − mask| where masks cover the whole scene (RGBA captures).
         mask: f64 = 0.0;
         /// Weight of the σ-weighted opacity regulariser (FreeTimeGS).

@@ -2,25 +2,23 @@
 //! a still Gaussian learns from every frame and a moving one from those of its life.
 //!
 //! Source: the importance of DyNeRF (Li et al. 2022) by the distance from the temporal median, which draws rays there and
-//! weighs pixels here. To it comes the distance from the temporal mean, which marks where anything moves at some moment: what
-//! is uncovered there is as hard as what moves. w = 1 + k·⅓ Σ_c (ψ(I_c − median_c) + ψ(I_c − mean_c)), ψ(x) = x²/(x² + γ²).
+//! weighs pixels here: w = 1 + k·⅓ Σ_c ψ(I_c − median_c), ψ(x) = x²/(x² + γ²).
 
 use crate::Result;
 use crate::capture::frames::{Frames, Picture, halve};
 use crate::vision::view::{self, Rigs};
-use rayon::prelude::*;
 use splat4d::scene::Planes;
 use std::collections::BTreeMap;
 
 /// γ: a channel that is so far from the median counts half (K-Planes' setting of DyNeRF's for all frames).
 const GAMMA: f32 = 0.02;
 
-/// Weights of pixels by how much they differ from other moments'; none where cameras move, or have few pictures.
+/// Weights of pixels by how much they differ from what stands still; none where cameras move, or have few pictures.
 pub(crate) struct Emphasis {
-    /// k: how much more than others a pixel weighs that differs from the median, or from the mean.
+    /// k: how much more than others a pixel weighs that shows nothing but what moves.
     strength: f32,
-    /// By camera: its temporal median and mean, [3, h, w] at the size that pictures are looked at in, as bytes.
-    usual: BTreeMap<usize, [Vec<u8>; 2]>,
+    /// By camera: its temporal median, pixel by pixel at the size that pictures are looked at in, as bytes.
+    still: BTreeMap<usize, Vec<[u8; 3]>>,
     /// Scratch: Σ ψ/3 by pixel at that size.
     moves: Planes<f32>,
 }
@@ -35,19 +33,15 @@ impl Emphasis {
         if !rigs.have_medians() {
             return Ok(None);
         }
-        let Rigs::Fixed(cameras) = rigs else { return Ok(None) };
-        let byte = |v: &f32| (v * 255.0).round().clamp(0.0, 255.0) as u8;
-        let of_camera = |rig: &Vec<usize>| {
-            let usual = view::median_and_mean(frames, rig)?;
-            Ok((frames.rig(rig[0]), usual.map(|picture| picture.data.iter().map(byte).collect())))
-        };
-        let usual = cameras.par_iter().map(of_camera).collect::<Result<_>>()?;
-        Ok(Some(Self { strength: strength as f32, usual, moves: Planes::default() }))
+        let Rigs::Fixed(cameras) = &rigs else { return Ok(None) };
+        let ids = cameras.iter().map(|frames_of| frames.rig(frames_of[0]));
+        let still = ids.zip(rigs.still(frames)?).map(|(id, view)| (id, view.colors)).collect();
+        Ok(Some(Self { strength: strength as f32, still, moves: Planes::default() }))
     }
 
     /// Multiplies the weights of a whole picture of camera `rig`, which is not yet halved.
     pub(super) fn apply(&mut self, rig: usize, picture: &mut Picture) {
-        let Some(usual) = self.usual.get(&rig) else { return };
+        let Some(still) = self.still.get(&rig) else { return };
         let (width, height) = (picture.color.width, picture.color.height);
         let halvings = view::halvings(width, height);
         let mut small;
@@ -60,14 +54,11 @@ impl Emphasis {
             }
         };
         self.moves.reset(1, color.height, color.width);
-        let pixels = color.pixels();
-        for usual in usual {
-            assert_eq!(usual.len(), color.data.len(), "pictures of one camera have one size");
-            for (plane, usual) in color.data.chunks_exact(pixels).zip(usual.chunks_exact(pixels)) {
-                for ((out, v), usual) in self.moves.data.iter_mut().zip(plane).zip(usual) {
-                    let x = v - f32::from(*usual) / 255.0;
-                    *out += x * x / (x * x + GAMMA * GAMMA) / 3.0;
-                }
+        assert_eq!(still.len(), color.pixels(), "pictures of one camera have one size");
+        for c in 0..3 {
+            for ((out, v), still) in self.moves.data.iter_mut().zip(color.plane(c)).zip(still) {
+                let x = v - f32::from(still[c]) / 255.0;
+                *out += x * x / (x * x + GAMMA * GAMMA) / 3.0;
             }
         }
         let weight = picture.weight.get_or_insert_with(|| {
@@ -111,12 +102,12 @@ mod tests {
                 all.sort_by(f32::total_cmp);
                 let far = |from: f32| f64::from(picture.color.plane(c)[p] - from);
                 let psi = |x: f64| x * x / (x * x + f64::from(GAMMA).powi(2));
-                psi(far(all[2])) + psi(far(all.iter().sum::<f32>() / 5.0))
+                psi(far(all[2]))
             };
             let expected = 1.0 + 2.0 * (0..3).map(psi).sum::<f64>() / 3.0;
-            // Median and mean are kept as bytes: half a step of 1/255 moves ψ by at most 0.064.
-            assert!((f64::from(*w) - expected).abs() < 0.26, "pixel {p}: {w} {expected}");
-            moving += usize::from(*w > 4.8);
+            // The median is kept as bytes: half a step of 1/255 moves ψ by at most 0.064.
+            assert!((f64::from(*w) - expected).abs() < 0.13, "pixel {p}: {w} {expected}");
+            moving += usize::from(*w > 2.9);
         }
         assert!(moving > 10, "the ball is where it was not before");
         let mut filled = Planes::new(1, weight.height, weight.width);
@@ -140,7 +131,7 @@ mod tests {
         let small = [width / 2, height / 2];
         let mut emphasis = Emphasis {
             strength: 1.0,
-            usual: [(0, [(); 2].map(|()| vec![0; 3 * small[0] * small[1]]))].into(),
+            still: [(0, vec![[0; 3]; small[0] * small[1]])].into(),
             moves: Planes::default(),
         };
         let mut picture = Picture { color: Planes::new(3, height, width), ..Picture::default() };
@@ -153,7 +144,7 @@ mod tests {
         emphasis.apply(0, &mut picture);
         let weight = picture.weight.unwrap();
         for (p, w) in weight.data.iter().enumerate() {
-            let expected = if bright(p % width, p / width) { 3.0 } else { 1.0 };
+            let expected = if bright(p % width, p / width) { 2.0 } else { 1.0 };
             assert!((w - expected).abs() < 1e-3, "pixel {p}: {w}");
         }
     }

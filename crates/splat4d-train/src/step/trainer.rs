@@ -2,8 +2,8 @@
 
 use super::batch::Batch;
 use super::chain::StepInfo;
-use super::emphasis::Emphasis;
 use super::clocks::Look;
+use super::emphasis::Emphasis;
 use super::engine::{Blame, Engine, StepPlan};
 pub use super::engine::{Fault, Stepped};
 use super::loss::TrainLoss;

@@ -173,55 +173,24 @@ fn single(frames: &dyn Frames, i: usize) -> Result<View> {
     Ok(View::new(camera, &picture.color, wanted))
 }
 
-/// Some of a fixed camera's frames, all at once.
-struct Moments {
-    camera: Camera,
-    /// Their pictures, [3, h, w].
-    colors: Vec<Planes<f32>>,
-    /// The pixels that the lens filled in all of them.
-    wanted: Vec<bool>,
-}
-
-impl Moments {
-    fn of(frames: &dyn Frames, rig: &[usize]) -> Result<Self> {
-        let most = if rig.len() < MEDIAN_FROM { 1 } else { MEDIAN_OF };
-        let (camera, first) = load(frames, rig[0])?;
-        let mut wanted = filled(&first);
-        let mut colors = vec![first.color];
-        for k in spread(rig.len(), most).skip(1) {
-            let (_, picture) = load(frames, rig[k])?;
-            wanted.iter_mut().zip(filled(&picture)).for_each(|(w, also)| *w &= also);
-            colors.push(picture.color);
-        }
-        Ok(Self { camera, colors, wanted })
-    }
-
-    /// One number a channel and pixel of those of all moments.
-    fn reduce(&self, of: impl Fn(&mut [f32]) -> f32) -> Planes<f32> {
-        let mut out = self.colors[0].clone();
-        let mut values = vec![0.0; self.colors.len()];
-        for (p, out) in out.data.iter_mut().enumerate() {
-            values.iter_mut().zip(&self.colors).for_each(|(v, color)| *v = color.data[p]);
-            *out = of(&mut values);
-        }
-        out
-    }
-
-    fn median(&self) -> Planes<f32> {
-        self.reduce(|values| *values.select_nth_unstable_by(values.len() / 2, f32::total_cmp).1)
-    }
-}
-
 /// The median over some of a fixed camera's frames, channel by channel.
 fn median(frames: &dyn Frames, rig: &[usize]) -> Result<View> {
-    let moments = Moments::of(frames, rig)?;
-    let color = moments.median();
-    Ok(View::new(moments.camera, &color, moments.wanted))
-}
-
-/// The temporal median and mean of a fixed camera over some of its frames, [3, h, w] at the size that is worked with.
-pub(crate) fn median_and_mean(frames: &dyn Frames, rig: &[usize]) -> Result<[Planes<f32>; 2]> {
-    let moments = Moments::of(frames, rig)?;
-    let mean = moments.reduce(|values| values.iter().sum::<f32>() / values.len() as f32);
-    Ok([moments.median(), mean])
+    let most = if rig.len() < MEDIAN_FROM { 1 } else { MEDIAN_OF };
+    let (camera, mut first) = load(frames, rig[0])?;
+    let mut wanted = filled(&first);
+    let mut values: Vec<Vec<f32>> = Vec::new();
+    for k in spread(rig.len(), most).skip(1) {
+        let (_, picture) = load(frames, rig[k])?;
+        wanted.iter_mut().zip(filled(&picture)).for_each(|(w, also)| *w &= also);
+        values.push(picture.color.data);
+    }
+    let mut sorted = Vec::with_capacity(values.len() + 1);
+    for (p, value) in first.color.data.iter_mut().enumerate() {
+        sorted.clear();
+        sorted.push(*value);
+        sorted.extend(values.iter().map(|v| v[p]));
+        let middle = sorted.len() / 2;
+        *value = *sorted.select_nth_unstable_by(middle, f32::total_cmp).1;
+    }
+    Ok(View::new(camera, &first.color, wanted))
 }
