@@ -173,8 +173,18 @@ pub(super) struct ResidentKernels {
     pub colors_back: Kernel,
     /// answer_back
     pub answer_back: Kernel,
+    /// answer of Gaussians of space and time
+    pub slice_answer: Kernel,
+    /// answer_back of the same
+    pub slice_back: Kernel,
+    /// count_rows, row_losses
+    pub row_losses: Kernel,
+    /// turns_of, hold
+    pub ties: Kernel,
     /// adam
     pub adam: Kernel,
+    /// shake
+    pub shake: Kernel,
 }
 
 impl ResidentKernels {
@@ -192,15 +202,43 @@ impl ResidentKernels {
                 gpu,
                 "colours, backward",
                 &[wgsl::PROJECT, wgsl::SHADE, wgsl::LEARNT, wgsl::COLORS_BACK],
-                &[Uniform, Uniform, Read, Read, Read, Write, Write, Write],
+                &[Uniform, Uniform, Read, Read, Read, Write, Write, Write, Write],
                 &["colors_back"],
             ),
             answer_back: Kernel::new(
                 gpu,
                 "answer, backward",
-                &[wgsl::LEARNT, wgsl::ANSWER_BACK],
+                &[wgsl::LEARNT, wgsl::PUT, wgsl::ANSWER_BACK],
                 &[Uniform, Read, Read, Read, Write],
                 &["answer_back"],
+            ),
+            slice_answer: Kernel::new(
+                gpu,
+                "slice",
+                &[wgsl::LEARNT, wgsl::NUMBERS, wgsl::SLICE, wgsl::SLICE_ANSWER],
+                &[Uniform, Read, Write, Write, Write],
+                &["answer"],
+            ),
+            slice_back: Kernel::new(
+                gpu,
+                "slice, backward",
+                &[wgsl::LEARNT, wgsl::PUT, wgsl::NUMBERS, wgsl::SLICE, wgsl::SLICE_BACK],
+                &[Uniform, Read, Read, Read, Read, Write],
+                &["answer_back"],
+            ),
+            row_losses: Kernel::new(
+                gpu,
+                "losses on rows",
+                &[wgsl::LEARNT, wgsl::NUMBERS, wgsl::ROW_LOSSES],
+                &[Uniform, Uniform, Read, Read, Write, Write],
+                &["count_rows", "row_losses"],
+            ),
+            ties: Kernel::new(
+                gpu,
+                "ties",
+                &[wgsl::LEARNT, wgsl::TIES],
+                &[Uniform, Uniform, Read, Read, Read, Read, Write, Write, Write],
+                &["turns_of", "hold"],
             ),
             adam: Kernel::new(
                 gpu,
@@ -208,6 +246,13 @@ impl ResidentKernels {
                 &[wgsl::ADAM],
                 &[Uniform, Read, Write, Read, Write, Read, Read, Write],
                 &["adam"],
+            ),
+            shake: Kernel::new(
+                gpu,
+                "shake",
+                &[wgsl::LEARNT, wgsl::NUMBERS, wgsl::SHAKE],
+                &[Uniform, Uniform, Read, Read, Write],
+                &["shake"],
             ),
         }
     }

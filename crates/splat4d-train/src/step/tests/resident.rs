@@ -14,13 +14,18 @@ use splat4d::scene::{GEOMETRY, Table};
 use splat4d::{Error, ErrorKind, Result};
 
 /// Recipes that stay on the device throughout: every kind of motion and of life.
-const STAYS: [&str; 6] = [
+const STAYS: [&str; 11] = [
     "motion=still strategy=adc sh_degree=3 sh_degree_interval=1",
     "motion=spacetime strategy=adc exposure=true antialias=true",
     "motion=spacetime strategy=none motion_order=3 rotation_rate=true life=interval sh_degree=2 batch_size=3",
     "motion=spacetime strategy=none motion_order=2 rotation_rate=true life=gauss-one detach=true",
     "motion=spacetime strategy=none motion_order=1 life=infinite batch_size=2",
     "motion=spacetime strategy=none motion_order=0 sh_degree=0",
+    "motion=spacetime strategy=mcmc loss.opacity_entropy=0.02",
+    "motion=native4d strategy=adc",
+    "motion=native4d strategy=none sh_harmonics=2 sh_degree=3 sh_degree_interval=1 batch_size=2",
+    "motion=native4d strategy=mcmc sh_harmonics=1 batch_size=2",
+    "motion=tracked strategy=adc",
 ];
 /// Largest relative difference of a table's gradient, as a vector: a splat at the α cut-off may be drawn by one side only.
 const GRADIENT: f64 = 5e-3;
