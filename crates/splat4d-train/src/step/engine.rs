@@ -56,6 +56,8 @@ pub struct Stepped {
     pub other: Duration,
     /// Gaussians born, moved, removed.
     pub change: Change,
+    /// Milliseconds of the stages of the last view, where a device that took the whole step tells them.
+    pub stages: Vec<(&'static str, f64)>,
     /// What the user should know of the device that draws.
     pub notices: Vec<String>,
 }

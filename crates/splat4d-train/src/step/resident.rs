@@ -287,7 +287,8 @@ impl Engine for DeviceEngine<'_> {
             }
         };
         self.newest = Newest::Device;
-        let mut out = Stepped { notices, ..Stepped::default() };
+        let stages = self.cpu.backend().resident().map_or_else(Vec::new, |resident| resident.stages());
+        let mut out = Stepped { notices, stages, ..Stepped::default() };
         let Parts { scene, exposure, .. } = learner.parts_mut();
         let mut image = plan.loss.of_step(&mut plan.stage.pictures, exposure);
         for (view, comparison) in plan.views.iter().zip(&stepped.comparisons) {

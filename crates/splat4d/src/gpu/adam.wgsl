@@ -7,6 +7,7 @@
 // A thread owns one row. A table with more columns than there is room for rates is taken in pieces, in order.
 
 const TABLE_BLOCK: u32 = 16u;
+const ROW_THREADS: u32 = 256u;
 const BETA1: f32 = 0.9;
 const BETA2: f32 = 0.999;
 const EPSILON: f32 = 1e-15;
@@ -45,7 +46,7 @@ fn at(row: u32, column: u32, width: u32) -> u32 {
     return (row / TABLE_BLOCK * width + column) * TABLE_BLOCK + row % TABLE_BLOCK;
 }
 
-@compute @workgroup_size(256)
+@compute @workgroup_size(ROW_THREADS)
 fn adam(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = id.x;
     if (row >= rule.rows || counts[2] > rule.capacity) {

@@ -26,7 +26,7 @@ fn dead(row: u32, opacity: f32, sigma: f32) -> bool {
     return abs(delta_of(ask, row)) > reach || opacity * sigma < ask.alpha_min;
 }
 
-@compute @workgroup_size(256)
+@compute @workgroup_size(ROW_THREADS)
 fn answer(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = id.x;
     if (row >= ask.rows) {

@@ -49,7 +49,7 @@ fn sh_basis_gradient(d: vec3<f32>) -> array<vec3<f32>, 16> {
     );
 }
 
-@compute @workgroup_size(256)
+@compute @workgroup_size(ROW_THREADS)
 fn colors_back(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = id.x;
     // With too many pairs there are no gradients: the view is drawn again.

@@ -1,6 +1,7 @@
 //! Choice and opening of the GPU: nothing beyond WebGPU's default limits is asked for, so that what runs here runs in
 //! a browser too; but for the size of buffers, which natively may be as large as the driver has them.
 
+use super::tuning::Tuning;
 use crate::{Error, ErrorKind, Result};
 use std::future::Future;
 use std::pin::pin;
@@ -24,6 +25,8 @@ type Trouble = Arc<Mutex<Option<(ErrorKind, String)>>>;
 pub struct Gpu {
     pub(super) device: wgpu::Device,
     pub(super) queue: wgpu::Queue,
+    /// Of the kernels that are compiled for it.
+    pub(super) tuning: Tuning,
     info: wgpu::AdapterInfo,
     trouble: Trouble,
 }
@@ -75,7 +78,13 @@ impl Gpu {
             };
             first.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert((kind, e.to_string()));
         }));
-        Ok(Self { device, queue, info, trouble })
+        Ok(Self { device, queue, tuning: Tuning::default(), info, trouble })
+    }
+
+    /// The same with other constants in the kernels that are compiled from now on.
+    #[must_use]
+    pub fn tuned(self, tuning: Tuning) -> Self {
+        Self { tuning, ..self }
     }
 
     /// The card's name as its driver gives it.

@@ -25,7 +25,7 @@ impl Kernel {
         let device = &gpu.device;
         let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
             label: Some(label),
-            source: wgpu::ShaderSource::Wgsl(sources.join("\n").into()),
+            source: wgpu::ShaderSource::Wgsl(gpu.tuning.text(&sources.join("\n")).into()),
         });
         let entry = |(i, kind): (usize, &Kind)| wgpu::BindGroupLayoutEntry {
             binding: i as u32,

@@ -5,6 +5,8 @@
 // after the other, [row / 16][column][16].
 
 const TABLE_BLOCK: u32 = 16u;
+// Threads of a workgroup of the kernels over rows (gpu/tuning.rs).
+const ROW_THREADS: u32 = 256u;
 // Columns of geometry: mean, raw quaternion wxyz, log scales, opacity logit (scene/params.rs).
 const QUAT: u32 = 3u;
 const LOG_SCALE: u32 = 7u;

@@ -6,7 +6,7 @@
 // rasterize.wgsl read and wrote them; 8 d_planes: gradient to the planes, laid out as they are; out: 9 records, twelve
 // numbers a pair, cleared to 0 before, and behind them (at blend.sums_at) three a tile, the gradient to the background.
 // Eight storage buffers, 16 KiB of workgroup memory.
-// A workgroup owns a tile and goes front to back in rounds of four splats: a thread owns a pixel and writes v = dL/d ln
+// A workgroup owns a tile and goes front to back in rounds of up to four splats: a thread owns a pixel and writes v = dL/d ln
 // alpha and the weight w = alpha T of each splat; then a thread owns a splat, a column of the tile and a quarter of the
 // sums; then a thread owns one sum of one splat, and adds the columns in order.
 //
@@ -19,7 +19,7 @@ const QUADRANT: u32 = 8u;
 const OWNER_SHIFT: u32 = 28u;
 const OWNER_SPLAT: u32 = 0x0fffffffu;
 const LOG2_E: f32 = 1.4426950408889634;
-// Splats in a round: more need more than 16 KiB.
+// Splats in a round, at most one for 64 threads: more need more than 16 KiB (gpu/tuning.rs).
 const ROUND: u32 = 4u;
 // Numbers between two rows of pixels in workgroup memory, and in a splat's plane of them: one more than pixels, so that
 // columns lie in different banks.
@@ -52,19 +52,17 @@ struct Blend {
 @group(0) @binding(8) var<storage, read> d_planes: array<f32>;
 @group(0) @binding(9) var<storage, read_write> records: array<f32>;
 
-// ROUND x PLANE.
-var<workgroup> round_v: array<f32, 1088>;
-var<workgroup> round_w: array<f32, 1088>;
+var<workgroup> round_v: array<f32, ROUND * PLANE>;
+var<workgroup> round_w: array<f32, ROUND * PLANE>;
 // Gradient to red, green, blue and depth, [row][column].
 var<workgroup> pixel_g: array<vec4<f32>, 256>;
-// ROUND x NUMBERS x TILE.
-var<workgroup> columns: array<f32, 768>;
-var<workgroup> round_center: array<vec2<f32>, 4>;
-var<workgroup> round_power: array<vec4<f32>, 4>;
-var<workgroup> round_color: array<vec4<f32>, 4>;
-var<workgroup> round_conic: array<vec4<f32>, 4>;
-var<workgroup> round_quadrants: array<u32, 4>;
-var<workgroup> round_pair: array<u32, 4>;
+var<workgroup> columns: array<f32, ROUND * NUMBERS * TILE>;
+var<workgroup> round_center: array<vec2<f32>, ROUND>;
+var<workgroup> round_power: array<vec4<f32>, ROUND>;
+var<workgroup> round_color: array<vec4<f32>, ROUND>;
+var<workgroup> round_conic: array<vec4<f32>, ROUND>;
+var<workgroup> round_quadrants: array<u32, ROUND>;
+var<workgroup> round_pair: array<u32, ROUND>;
 
 @compute @workgroup_size(256)
 fn rasterize_back(

@@ -1,6 +1,8 @@
 //! Tables that stay on the GPU: rows become splats, splats a picture, and its loss steps of Adam, without a number of them
 //! passing through the CPU. Densification, files and whatever else looks at a scene fetch the tables, and hand them back.
 
+#[cfg(test)]
+mod tests;
 mod ties;
 mod uniforms;
 
@@ -92,6 +94,11 @@ impl Kept {
 
     fn groups(&self) -> u32 {
         self.rows.div_ceil(THREADS) as u32
+    }
+
+    /// The same of the kernels whose workgroups may have another size.
+    fn row_groups(&self, gpu: &Gpu) -> u32 {
+        self.rows.div_ceil(gpu.tuning.row_threads) as u32
     }
 
     /// The kernels of its motion.
@@ -290,7 +297,7 @@ impl KeptPass<'_> {
                 group.push(part.weights.all());
             }
             let [kernel, _] = layer.kernels(&self.tables.kernels);
-            Run::new(gpu, kernel, 0, &group, layer.groups())
+            Run::new(gpu, kernel, 0, &group, layer.row_groups(gpu))
         };
         let runs: Vec<_> = self.tables.layers.iter().enumerate().map(bind).collect();
         recorder.stage(Stage::Answer, |pass| runs.iter().for_each(|run| run.record(pass)))
@@ -322,13 +329,13 @@ impl KeptPass<'_> {
                 layer.stats.all(),
                 part.weights.all(),
             ];
-            runs.push(Run::new(gpu, &k.colors_back, 0, &colors, layer.groups()));
+            runs.push(Run::new(gpu, &k.colors_back, 0, &colors, layer.row_groups(gpu)));
             let mut rows = vec![self.ask(i), b.counts.all(), layer.params.all(), b.back.all()];
             if matches!(layer.moves, Moves::Sliced { .. }) {
                 rows.push(part.weights.all());
             }
             rows.push(layer.d_params.all());
-            runs.push(Run::new(gpu, layer.kernels(k)[1], 0, &rows, layer.groups()));
+            runs.push(Run::new(gpu, layer.kernels(k)[1], 0, &rows, layer.row_groups(gpu)));
         }
         let words = wgpu::BindingResource::Buffer(wgpu::BufferBinding {
             buffer: b.partials.get(),
@@ -348,7 +355,7 @@ impl KeptPass<'_> {
             if self.step.noise[i].is_some() {
                 let noise = self.uniform(i * at::ALL + at::NOISE, size_of::<uniforms::Noise>());
                 let group = [self.ask(i), noise, b.counts.all(), layer.alive.all(), layer.params.all()];
-                runs.push(Run::new(gpu, &k.shake, 0, &group, layer.groups()));
+                runs.push(Run::new(gpu, &k.shake, 0, &group, layer.row_groups(gpu)));
             }
         }
         recorder.stage(Stage::Adam, |pass| runs.iter().for_each(|run| run.record(pass)))
@@ -400,7 +407,7 @@ impl KeptPass<'_> {
                     corrections.all(),
                     words.clone(),
                 ];
-                runs.push(Run::new(gpu, &k.adam, 0, &group, layer.groups()));
+                runs.push(Run::new(gpu, &k.adam, 0, &group, layer.row_groups(gpu)));
             }
         }
     }
@@ -490,7 +497,7 @@ impl Resident for GpuRenderer {
         }
         let (gpu, tables) = (&self.gpu, self.resident.as_deref_mut().expect("it was made"));
         gpu.check()?;
-        let most = layers.iter().map(|l| l.rows.div_ceil(THREADS)).max().unwrap_or(0);
+        let most = layers.iter().map(|l| l.rows.div_ceil(gpu.tuning.row_threads.min(THREADS))).max().unwrap_or(0);
         let wide = layers.iter().flat_map(|l| &l.tables).any(|t| t.width > MOST_COLUMNS * PIECES);
         if most > MOST_GROUPS || wide {
             return Err(Error::new(ErrorKind::Unsupported, "the scene's tables are too large for the GPU"));
@@ -534,6 +541,10 @@ impl Resident for GpuRenderer {
 
     fn step(&mut self, step: &KeptStep<'_>) -> Result<Option<KeptStepped>> {
         self.with_tables(|renderer, tables| renderer.step_kept(tables, step))
+    }
+
+    fn stages(&self) -> Vec<(&'static str, f64)> {
+        self.timings.stages().to_vec()
     }
 
     fn fetch(&mut self, layer: usize) -> Result<KeptNumbers> {

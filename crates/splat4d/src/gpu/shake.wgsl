@@ -18,7 +18,7 @@ struct Noise {
 @group(0) @binding(3) var<storage, read> alive: array<u32>;
 @group(0) @binding(4) var<storage, read_write> params: array<f32>;
 
-@compute @workgroup_size(256)
+@compute @workgroup_size(ROW_THREADS)
 fn shake(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = id.x;
     if (row >= ask.rows || counts[2] > ask.capacity) {

@@ -17,7 +17,7 @@ fn cov(s: Slice, blur: f32, i: u32, j: u32) -> f32 {
     return dot(s.k[i], s.k[j]) + s.v[i] * s.v[j] * blur;
 }
 
-@compute @workgroup_size(256)
+@compute @workgroup_size(ROW_THREADS)
 fn answer(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = id.x;
     if (row >= ask.rows) {

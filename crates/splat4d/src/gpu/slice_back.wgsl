@@ -14,7 +14,7 @@ const TAU: f32 = 6.283185307179586;
 @group(0) @binding(4) var<storage, read> weights: array<f32>;
 @group(0) @binding(5) var<storage, read_write> d_params: array<f32>;
 
-@compute @workgroup_size(256)
+@compute @workgroup_size(ROW_THREADS)
 fn answer_back(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = id.x;
     if (row >= ask.rows || counts[2] > ask.capacity) {

@@ -208,6 +208,11 @@ pub trait Resident {
     /// Errors: the device failed, and nothing kept is to be trusted. Panics: nothing is kept.
     fn step(&mut self, step: &KeptStep<'_>) -> Result<Option<KeptStepped>>;
 
+    /// Milliseconds of the stages of the last view by the device's own clock; 0 where it has none.
+    fn stages(&self) -> Vec<(&'static str, f64)> {
+        Vec::new()
+    }
+
     /// The numbers of a layer as they are now. Errors: the device failed. Panics: as of `step`.
     fn fetch(&mut self, layer: usize) -> Result<KeptNumbers>;
 }

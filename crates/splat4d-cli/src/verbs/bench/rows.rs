@@ -43,6 +43,9 @@ pub(super) struct Row {
     /// The GPU and its driver, where one was measured.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub device: Option<String>,
+    /// Constants of its kernels that were not at their defaults.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tuning: Option<String>,
     /// This time over that of the earlier result; above 1 is slower.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub against: Option<f64>,
@@ -51,7 +54,7 @@ pub(super) struct Row {
 impl Row {
     /// Whether two rows measure the same thing.
     fn twin(&self, other: &Self) -> bool {
-        let key = |r: &Self| (r.threads, r.x.map(f64::to_bits));
+        let key = |r: &Self| (r.threads, r.x.map(f64::to_bits), r.tuning.clone());
         self.scene == other.scene && self.stage == other.stage && self.simd == other.simd && key(self) == key(other)
     }
 }
