@@ -27,7 +27,11 @@ pub const RANGES: &str = include_str!("gpu/ranges.wgsl");
 pub const RASTERIZE: &str = include_str!("gpu/rasterize.wgsl");
 /// Planes → 8 bits a channel. After [`PROJECT`].
 pub const BYTES: &str = include_str!("gpu/bytes.wgsl");
-/// The blend's way back: a record a (tile, splat) pair. After [`PROJECT`].
+/// What both ways back of the blend share. After [`PROJECT`].
+pub const BLEND_BACK: &str = include_str!("gpu/blend_back.wgsl");
+/// The blend's way back with subgroups. After [`BLEND_BACK`].
+pub const RASTERIZE_BACK_SUBGROUP: &str = include_str!("gpu/rasterize_back_subgroup.wgsl");
+/// The blend's way back: a record a (tile, splat) pair. After [`BLEND_BACK`].
 pub const RASTERIZE_BACK: &str = include_str!("gpu/rasterize_back.wgsl");
 /// A picture compared with its truth: L1, D-SSIM and their gradient: `moments`, `gradient`.
 pub const LOSS: &str = include_str!("gpu/loss.wgsl");
@@ -74,10 +78,12 @@ mod tests {
     const STORAGE_BUFFERS: usize = 8;
     const WORKGROUP_BYTES: u32 = 16 << 10;
     const INVOCATIONS: u32 = 256;
+    /// The one that needs more than WebGPU's core, on devices that have it.
+    const SUBGROUPS: &str = "rasterize, backward, with subgroups";
 
     #[test]
     fn every_shader_is_valid_within_webgpus_default_limits() {
-        let shaders: [(&str, &[&str]); 23] = [
+        let shaders: [(&str, &[&str]); 24] = [
             ("project and shade", &[PROJECT, SHADE]),
             ("sort", &[SORT]),
             ("splats", &[PROJECT, SHADE, SPLATS]),
@@ -86,7 +92,8 @@ mod tests {
             ("tiles", &[PROJECT, TILES]),
             ("ranges", &[RANGES]),
             ("rasterize", &[PROJECT, RASTERIZE]),
-            ("rasterize, backward", &[PROJECT, RASTERIZE_BACK]),
+            ("rasterize, backward", &[PROJECT, BLEND_BACK, RASTERIZE_BACK]),
+            (SUBGROUPS, &[PROJECT, BLEND_BACK, RASTERIZE_BACK_SUBGROUP]),
             ("bytes", &[PROJECT, BYTES]),
             ("loss", &[LOSS]),
             ("answer", &[LEARNT, ANSWER]),
@@ -106,7 +113,8 @@ mod tests {
             let text = files.join("\n");
             let module =
                 naga::front::wgsl::parse_str(&text).unwrap_or_else(|e| panic!("{name}: {}", e.emit_to_string(&text)));
-            Validator::new(ValidationFlags::all(), Capabilities::empty())
+            let needs = if name == SUBGROUPS { Capabilities::SUBGROUP } else { Capabilities::empty() };
+            Validator::new(ValidationFlags::all(), needs)
                 .validate(&module)
                 .unwrap_or_else(|e| panic!("{name}: {}", e.emit_to_string(&text)));
             let mut layouter = naga::proc::Layouter::default();

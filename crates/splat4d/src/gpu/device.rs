@@ -1,5 +1,6 @@
 //! Choice and opening of the GPU: nothing beyond WebGPU's default limits is asked for, so that what runs here runs in
-//! a browser too; but for the size of buffers, which natively may be as large as the driver has them.
+//! a browser too; but for the size of buffers, which natively may be as large as the driver has them, and subgroups, where it has
+//! them.
 
 use super::tuning::Tuning;
 use crate::{Error, ErrorKind, Result};
@@ -16,6 +17,9 @@ pub enum Adapters {
     /// A GPU if there is one, else a driver that computes on the CPU (Mesa's lavapipe).
     Any,
 }
+
+/// Threads of the smallest and the largest subgroup that kernels can work with (rasterize_back_subgroup.wgsl).
+const SUBGROUPS: [u32; 2] = [8, 64];
 
 /// The first error that the driver reported since it was last asked for.
 type Trouble = Arc<Mutex<Option<(ErrorKind, String)>>>;
@@ -64,7 +68,7 @@ impl Gpu {
         };
         let descriptor = wgpu::DeviceDescriptor {
             label: Some("splat4d"),
-            required_features: adapter.features() & wgpu::Features::TIMESTAMP_QUERY,
+            required_features: adapter.features() & (wgpu::Features::TIMESTAMP_QUERY | wgpu::Features::SUBGROUP),
             required_limits: limits,
             ..Default::default()
         };
@@ -92,16 +96,23 @@ impl Gpu {
         &self.info.name
     }
 
-    /// Card, kind, interface and driver in one line.
+    /// Card, kind, interface and driver in one line, and whether kernels use its subgroups.
     pub fn describe(&self) -> String {
         let i = &self.info;
         let driver = [i.driver.as_str(), i.driver_info.as_str()].join(" ");
-        format!("{} ({:?}, {}, {})", i.name, i.device_type, i.backend, driver.trim())
+        let with = if self.has_subgroups() { ", with subgroups" } else { "" };
+        format!("{} ({:?}, {}, {}{with})", i.name, i.device_type, i.backend, driver.trim())
     }
 
     /// Whether the GPU's own clock can be read.
     pub(crate) fn has_timestamps(&self) -> bool {
         self.device.features().contains(wgpu::Features::TIMESTAMP_QUERY)
+    }
+
+    /// Whether kernels are compiled that exchange numbers within subgroups.
+    pub(crate) fn has_subgroups(&self) -> bool {
+        let fits = self.info.subgroup_min_size >= SUBGROUPS[0] && self.info.subgroup_max_size <= SUBGROUPS[1];
+        self.tuning.subgroups && fits && self.device.features().contains(wgpu::Features::SUBGROUP)
     }
 
     /// Waits until all work has been done.

@@ -274,6 +274,7 @@ pub(super) struct BackKernels {
 impl BackKernels {
     /// Compiles everything.
     pub(super) fn new(gpu: &Gpu) -> Self {
+        let rasterize_back = if gpu.has_subgroups() { wgsl::RASTERIZE_BACK_SUBGROUP } else { wgsl::RASTERIZE_BACK };
         Self {
             loss: Kernel::new(
                 gpu,
@@ -285,7 +286,7 @@ impl BackKernels {
             rasterize: Kernel::new(
                 gpu,
                 "rasterize, backward",
-                &[wgsl::PROJECT, wgsl::RASTERIZE_BACK],
+                &[wgsl::PROJECT, wgsl::BLEND_BACK, rasterize_back],
                 &[Uniform, Uniform, Read, Read, Read, Read, Read, Read, Read, Write],
                 &["rasterize_back"],
             ),

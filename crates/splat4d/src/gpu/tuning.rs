@@ -1,4 +1,5 @@
-//! Constants of the kernels that decide how fast they are and not one bit of what they compute: what a sweep on a card varies.
+//! Constants of the kernels that decide how fast they are, and of what they compute nothing but, where it says so, last bits: what
+//! a sweep on a card varies.
 
 use super::frame::THREADS;
 
@@ -11,13 +12,15 @@ pub struct Tuning {
     pub rounds: usize,
     /// Splats that a tile reads at a time, to blend them.
     pub batch: usize,
-    /// Splats of a round of the blend's way back.
+    /// Whether the blend goes back with subgroups, where the device has them: this alone changes last bits.
+    pub subgroups: bool,
+    /// Splats of a round of its way back without them.
     pub back_round: usize,
 }
 
 impl Default for Tuning {
     fn default() -> Self {
-        Self { row_threads: THREADS, rounds: 8, batch: THREADS, back_round: 4 }
+        Self { row_threads: THREADS, rounds: 8, batch: THREADS, subgroups: true, back_round: 4 }
     }
 }
 
@@ -42,14 +45,22 @@ impl Tuning {
         out.extend(with(|t, v| t.row_threads = v, &ROW_THREADS));
         out.extend(with(|t, v| t.rounds = v, &ROUNDS));
         out.extend(with(|t, v| t.batch = v, &BATCHES));
-        out.extend(with(|t, v| t.back_round = v, &BACK_ROUNDS));
+        let portable = Self { subgroups: false, ..Self::default() };
+        out.push(portable);
+        out.extend(BACK_ROUNDS.map(|back_round| Self { back_round, ..portable }));
         out
     }
 
     /// What is not as by default, `name=value`.
     pub fn changes(&self) -> Option<String> {
         let numbers = |t: &Self| {
-            [("row_threads", t.row_threads), ("rounds", t.rounds), ("batch", t.batch), ("back_round", t.back_round)]
+            [
+                ("row_threads", t.row_threads),
+                ("rounds", t.rounds),
+                ("batch", t.batch),
+                ("subgroups", usize::from(t.subgroups)),
+                ("back_round", t.back_round),
+            ]
         };
         let changed = numbers(self).into_iter().zip(numbers(&Self::default())).filter(|(a, b)| a != b);
         let words: Vec<String> = changed.map(|((name, value), _)| format!("{name}={value}")).collect();
@@ -96,7 +107,8 @@ mod tests {
             [wgsl::SORT, wgsl::SCAN, wgsl::RANGES, wgsl::RASTERIZE, wgsl::RASTERIZE_BACK, wgsl::LEARNT, wgsl::ADAM];
         for shader in shaders {
             assert_eq!(Tuning::default().text(shader), shader);
-            let changed = Tuning { row_threads: 32, rounds: 1, batch: 16, back_round: 3 }.text(shader);
+            let changed =
+                Tuning { row_threads: 32, rounds: 1, batch: 16, subgroups: false, back_round: 3 }.text(shader);
             let others = shader.lines().zip(changed.lines()).filter(|(a, b)| a != b).count();
             // A sort and a sum have both rounds and blocks.
             let expected = if shader == wgsl::SORT || shader == wgsl::SCAN { 2 } else { 1 };
