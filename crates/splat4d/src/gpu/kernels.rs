@@ -230,14 +230,14 @@ impl ResidentKernels {
                 gpu,
                 "losses on rows",
                 &[wgsl::LEARNT, wgsl::NUMBERS, wgsl::ROW_LOSSES],
-                &[Uniform, Uniform, Read, Read, Write, Write],
+                &[Uniform, Uniform, Read, Read, Read, Write, Write],
                 &["count_rows", "row_losses"],
             ),
             ties: Kernel::new(
                 gpu,
                 "ties",
                 &[wgsl::LEARNT, wgsl::TIES],
-                &[Uniform, Uniform, Read, Read, Read, Read, Write, Write, Write],
+                &[Uniform, Uniform, Read, Read, Read, Read, Write, Write, Write, Read],
                 &["turns_of", "hold"],
             ),
             adam: Kernel::new(

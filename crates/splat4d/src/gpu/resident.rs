@@ -343,7 +343,7 @@ impl KeptPass<'_> {
             size: std::num::NonZeroU64::new((4 * self.words()) as u64),
         });
         if self.is_last() {
-            layers.iter().enumerate().for_each(|(i, layer)| self.losses(gpu, (i, layer), &words, &mut runs));
+            layers.iter().enumerate().for_each(|(i, layer)| self.losses(gpu, b, (i, layer), &words, &mut runs));
         }
         recorder.stage(Stage::AnswerBack, |pass| runs.iter().for_each(|run| run.record(pass)))?;
         if !self.is_last() {
@@ -362,19 +362,26 @@ impl KeptPass<'_> {
     }
 
     /// Losses that look at rows, which add to their gradients.
-    fn losses(&self, gpu: &Gpu, (i, layer): (usize, &Kept), words: &wgpu::BindingResource<'_>, runs: &mut Vec<Run>) {
+    fn losses(
+        &self,
+        gpu: &Gpu,
+        b: &Buffers,
+        (i, layer): (usize, &Kept),
+        words: &wgpu::BindingResource<'_>,
+        runs: &mut Vec<Run>,
+    ) {
         let k = &self.tables.kernels;
         if self.has_row_losses() {
             let rule = self.uniform(i * at::ALL + at::ROWS, size_of::<uniforms::RowRule>());
             let (params, alive, d) = (layer.params.all(), layer.alive.all(), layer.d_params.all());
-            let group = [self.ask(i), rule, params, alive, d, words.clone()];
+            let group = [self.ask(i), rule, b.counts.all(), params, alive, d, words.clone()];
             runs.extend([0, 1].map(|entry| Run::new(gpu, &k.row_losses, entry, &group, layer.groups())));
         }
         if let Some(ties) = &layer.ties {
             let rule = self.uniform(i * at::ALL + at::TIES, size_of::<uniforms::TieRule>());
             let [before, edges, links, turns] = ties.buffers();
             let (params, d) = (layer.params.all(), layer.d_params.all());
-            let group = [self.ask(i), rule, params, before, edges, links, turns, d, words.clone()];
+            let group = [self.ask(i), rule, params, before, edges, links, turns, d, words.clone(), b.counts.all()];
             runs.extend([0, 1].map(|entry| Run::new(gpu, &k.ties, entry, &group, ties.groups())));
         }
     }

@@ -1,9 +1,9 @@
 // Losses on the geometry of the rows that are alive, each a mean over them: opacity, its entropy, scale. Twin of MeanOpacity,
 // OpacityEntropy and MeanScale in splat4d-train's loss/scene.rs; learnt.wgsl and numbers.wgsl are put in front of this file.
 //
-// Bindings, group 0: 0 ask; 1 rule; 2 params; 3 alive, as answer.wgsl left it; in and out: 4 d_params, which is added to; 5 status,
-// cleared to 0 before: rows alive at rule.count_at, and from rule.sums_at on the loss of each workgroup's rows, as bits. Four
-// storage buffers.
+// Bindings, group 0: 0 ask; 1 rule; 2 counts ([2]: pairs); 3 params; 4 alive, as answer.wgsl left it; in and out: 5 d_params, which
+// is added to; 6 status, cleared to 0 before: rows alive at rule.count_at, and from rule.sums_at on the loss of each workgroup's
+// rows, as bits. Five storage buffers.
 // A thread owns one row; the rows of a workgroup are added in a fixed order.
 
 // Probabilities are kept this far from 0 and 1 (loss/image/entropy.rs).
@@ -20,16 +20,18 @@ struct RowRule {
 
 @group(0) @binding(0) var<uniform> ask: Ask;
 @group(0) @binding(1) var<uniform> rule: RowRule;
-@group(0) @binding(2) var<storage, read> params: array<f32>;
-@group(0) @binding(3) var<storage, read> alive: array<u32>;
-@group(0) @binding(4) var<storage, read_write> d_params: array<f32>;
-@group(0) @binding(5) var<storage, read_write> status: array<atomic<u32>>;
+@group(0) @binding(2) var<storage, read> counts: array<u32>;
+@group(0) @binding(3) var<storage, read> params: array<f32>;
+@group(0) @binding(4) var<storage, read> alive: array<u32>;
+@group(0) @binding(5) var<storage, read_write> d_params: array<f32>;
+@group(0) @binding(6) var<storage, read_write> status: array<atomic<u32>>;
 
 var<workgroup> marks: array<u32, 256>;
 var<workgroup> sums: array<f32, 256>;
 
+// None with too many pairs: the view is drawn again, and what other views gave must stay as it is.
 fn lives(row: u32) -> bool {
-    return row < ask.rows && alive[min(row, ask.rows - 1u)] != 0u;
+    return counts[2] <= ask.capacity && row < ask.rows && alive[min(row, ask.rows - 1u)] != 0u;
 }
 
 @compute @workgroup_size(256)

@@ -99,18 +99,20 @@ pub(super) fn measure(
     let best = Roofline { pairs: r.pairs, bytes: r.bytes };
     note(&format!("{name}: at best {:.2} G pairs/s and {:.1} GB/s", best.pairs * 1e-9, best.bytes * 1e-9));
     let tunings = if sweep { Tuning::sweep() } else { vec![Tuning::default()] };
-    let mut rows = Vec::new();
+    let mut rows: Vec<Row> = Vec::new();
     for pinned in scenes {
         for tuning in &tunings {
             let changes = tuning.changes();
             let with = changes.as_ref().map_or_else(String::new, |c| format!(" with {c}"));
             note(&format!("scene {} on {name}{with} ...", pinned.name));
-            let before = rows.len();
-            rows.extend(pool.install(|| stages(pinned, way, &mut renderer(*tuning)?, &best))?);
-            rows.extend(pool.install(|| steps(pinned, way, renderer(*tuning)?, &best))?);
-            for row in &mut rows[before..] {
+            let mut here = pool.install(|| stages(pinned, way, &mut renderer(*tuning)?, &best))?;
+            here.extend(pool.install(|| steps(pinned, way, renderer(*tuning)?, &best))?);
+            for row in here.iter_mut().filter(|_| changes.is_some()) {
+                let default = rows.iter().find(|r| r.scene == row.scene && r.stage == row.stage && r.tuning.is_none());
+                row.against = default.filter(|d| d.ms > 0.0).map(|d| row.ms / d.ms);
                 row.tuning.clone_from(&changes);
             }
+            rows.append(&mut here);
         }
     }
     for row in &mut rows {
@@ -224,18 +226,20 @@ mod tests {
         let pinned = made_up("small", 400, [40, 30]);
         let way = Way { threads: 1, simd: Simd::detect(), rounds: 1 };
         let pool = super::super::pool(way.threads).unwrap();
-        let rows = match measure(&[pinned], way, false, &pool, &|_| {}) {
+        let rows = match measure(&[pinned], way, true, &pool, &|_| {}) {
             Ok(rows) => rows,
             Err(e) => {
                 assert!(std::env::var_os("REQUIRE_GPU").is_none(), "REQUIRE_GPU is set: {e}");
                 return println!("skipped: {e}");
             }
         };
+        let all = [&STAGES[..], &OF_STEPS, &["step"]].concat();
         let stages: Vec<&str> = rows.iter().map(|r| r.stage.as_str()).collect();
-        assert_eq!(stages, [&STAGES[..], &OF_STEPS, &["step"]].concat());
+        assert_eq!(stages, all.repeat(Tuning::sweep().len()));
         for row in &rows {
             assert!(row.ms > 0.0 && row.ms.is_finite() && row.device.is_some() && row.simd == "gpu", "{row:?}");
             assert!(row.ceiling_share.is_none_or(|share| share > 0.0), "{row:?}");
+            assert_eq!(row.tuning.is_some(), row.against.is_some(), "{row:?}");
         }
         let ms = |stage: &str| rows.iter().find(|r| r.stage == stage).expect("it is there").ms;
         assert!(ms("rasterize") < ms("forward, memory to memory") && ms("gather") < ms("backward, memory to memory"));

@@ -46,7 +46,7 @@ pub(super) struct Row {
     /// Constants of its kernels that were not at their defaults.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tuning: Option<String>,
-    /// This time over that of the earlier result; above 1 is slower.
+    /// This time over that of the earlier result, or of a sweep over that at the defaults; above 1 is slower.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub against: Option<f64>,
 }
@@ -155,12 +155,13 @@ fn stage_cells(rows: &[Row]) -> Vec<Vec<String>> {
     }
     head.push("remarks".into());
     let mut out = vec![head];
-    let place = |r: &Row| (r.scene.clone(), r.stage.clone(), r.simd.clone());
+    let place = |r: &Row| (r.scene.clone(), r.stage.clone(), r.simd.clone(), r.tuning.clone());
     for at in distinct(rows.iter().map(place)) {
         let of = |n: usize| rows.iter().find(|r| r.threads == n && place(r) == at);
         let all: Vec<Option<&Row>> = threads.iter().map(|n| of(*n)).collect();
         let here: Vec<&Row> = all.iter().flatten().copied().collect();
         let scene = if levels { format!("{} {}", at.0, at.2) } else { at.0.clone() };
+        let scene = at.3.as_ref().map_or(scene.clone(), |tuning| format!("{scene} {tuning}"));
         let mut line = vec![scene, at.1.clone()];
         line.extend(all.iter().map(|r| r.map_or_else(String::new, |r| milliseconds(r.ms))));
         if threads.len() > 1 {

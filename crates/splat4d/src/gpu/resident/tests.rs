@@ -6,7 +6,7 @@ use crate::math::{Real, Rng};
 use crate::motion::native4d::{Native4dSpec, TABLE};
 use crate::motion::{At, Cache, Motion, Spec, Tape, build_as};
 use crate::render::{KeptRule, KeptView, Target};
-use crate::scene::{GEOMETRY, Grads, Key, Params, Planes, Rows, Space, SplatGrads, Table, Time};
+use crate::scene::{Camera, GEOMETRY, Grads, Key, Params, Planes, Rows, Space, SplatGrads, Table, Time};
 use std::sync::Arc;
 
 const ROWS: usize = 500;
@@ -129,10 +129,8 @@ fn slices_equal_the_model_forth_and_back() {
     of(own, 0..6, 11, "time");
 }
 
-#[test]
-fn tunings_change_no_bit() {
-    let (camera, mut truth) = (camera([0.0, 0.0, -4.0], 61, 47), Planes::new(3, 47, 61));
-    truth.data.iter_mut().enumerate().for_each(|(i, x)| *x = (i % 7) as f32 / 7.0);
+/// A step that these cameras see, with losses on rows; what it was, and the numbers after it.
+fn stepped(r: &mut GpuRenderer, cameras: &[Camera]) -> (KeptStepped, KeptNumbers) {
     let spec = Native4dSpec::default();
     let (p, own, _) = params::<f32>(&spec);
     let [floor, ceiling] = spec.bounds();
@@ -141,31 +139,57 @@ fn tunings_change_no_bit() {
     let tables = [table(GEOMETRY), KeptTable::default(), table(own), KeptTable::default(), table(crate::scene::SH)];
     let stats = vec![0.0; STATS_WIDTH * ROWS.next_multiple_of(BLOCK)];
     let layer = KeptLayer { rows: ROWS, moves, life: LifeKind::Infinite, tables, stats: &stats, ties: None };
-    let target = Target { truth: &truth, weight: None, picture: 0, dssim: 0.2, response: None };
-    let view = KeptView { camera: &camera, t: Time(0.0), background: [0.5; 3], target };
+    r.keep(&[layer], &[[1.0; 2]; 3]).expect("a small scene");
+    let truth = |camera: &Camera| {
+        let mut truth = Planes::new(3, camera.height, camera.width);
+        truth.data.iter_mut().enumerate().for_each(|(i, x)| *x = (i % 7) as f32 / 7.0);
+        truth
+    };
+    let truths: Vec<Planes<f32>> = cameras.iter().map(truth).collect();
+    let view = |(i, camera)| {
+        let target = Target { truth: &truths[i], weight: None, picture: i, dssim: 0.2, response: None };
+        KeptView { camera, t: Time(0.0), background: [0.5; 3], target }
+    };
+    let views: Vec<KeptView<'_>> = cameras.iter().enumerate().map(view).collect();
     let rule = |width: usize| Some(KeptRule { rates: vec![0.01; width], floor: None });
     let step = KeptStep {
-        views: &[view],
+        views: &views,
         sh_degree: 0,
         alpha_min: 1.0 / 255.0,
         rules: &[[rule(11), None, rule(6), None, rule(3)]],
         rows: RowWeights { opacity: 0.1, ..RowWeights::default() },
         noise: &[None],
     };
+    let stepped = r.step(&step).expect("it runs").expect("small pictures");
+    assert!(stepped.bad.is_none() && stepped.loss > 0.0 && r.stats().pairs > ROWS, "{:?}", r.stats());
+    let numbers = r.fetch(0).expect("it is read");
+    assert!(numbers.params[0] != p[GEOMETRY].data(), "something was learnt");
+    (stepped, numbers)
+}
+
+#[test]
+fn tunings_change_no_bit() {
+    let camera = camera([0.0, 0.0, -4.0], 61, 47);
     // Without subgroups and with them.
     let mut first: [Option<(KeptStepped, KeptNumbers)>; 2] = [None, None];
     for tuning in crate::gpu::Tuning::sweep() {
         let Some(gpu) = crate::gpu::tests::gpu() else { return };
         let mut r = GpuRenderer::new(gpu.tuned(tuning), Default::default()).expect("the kernels compile");
-        r.keep(&[layer], &[[1.0; 2]; 3]).expect("a small scene");
-        let stepped = r.step(&step).expect("it runs").expect("a small picture");
-        assert!(stepped.bad.is_none() && r.stats().pairs > ROWS, "{:?}", r.stats());
-        let now = (stepped, r.fetch(0).expect("it is read"));
+        let now = stepped(&mut r, std::slice::from_ref(&camera));
         let first = first[usize::from(tuning.subgroups)].get_or_insert_with(|| now.clone());
         assert!(*first == now, "{:?} changes bits", tuning.changes());
     }
-    let learnt = |kept: &Option<(KeptStepped, KeptNumbers)>| {
-        kept.as_ref().is_some_and(|(_, numbers)| numbers.params[0] != p[GEOMETRY].data())
-    };
-    assert!(first.iter().all(learnt), "something was learnt");
+}
+
+#[test]
+fn room_that_runs_out_at_a_later_view_changes_no_bit() {
+    let Some(mut r) = renderer() else { return };
+    // Few pairs at first, then more than there was room for.
+    let cameras = [camera([0.0, 0.0, -80.0], 16, 16), camera([0.0, 0.0, -4.0], 150, 110)];
+    let plenty = stepped(&mut r, &cameras);
+    (r.buffers, r.groups) = (Buffers::new(), None);
+    r.make_room_for_pairs(ROWS).expect("a little room");
+    let first = r.pair_capacity();
+    assert!(stepped(&mut r, &cameras) == plenty, "room changes bits");
+    assert!(r.pair_capacity() > first, "the first room was too little");
 }
