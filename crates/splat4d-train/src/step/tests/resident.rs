@@ -32,6 +32,8 @@ const STAYS: [&str; 12] = [
 ];
 /// Largest relative difference of a table's gradient, as a vector: a splat at the α cut-off may be drawn by one side only.
 const GRADIENT: f64 = 5e-3;
+/// Largest relative difference of a statistic's sum: two of the fifty Gaussians of a tracked frame make 4 %.
+const STATISTICS: f64 = 5e-2;
 /// Steps until which a table's first moments are still its gradients' sums.
 const FEW: usize = 2;
 
@@ -89,8 +91,7 @@ fn gradients_of_the_whole_chain_equal_the_cpus() {
             for c in 0..3 {
                 let [a, b] = sums.each_ref().map(|s| s.iter().map(|r| r[c]).sum::<f64>());
                 // The CPU looks whether an ellipse meets bins, the GPU whether it meets tiles: a few are drawn by one side only.
-                let few = if c == 1 { 2.0 } else { 0.0 };
-                assert!((a - b).abs() <= 3e-2 * b + few, "{line}: statistics {c}: {a} {b}");
+                assert!((a - b).abs() <= STATISTICS * b, "{line}: statistics {c}: {a} {b}");
             }
         }
     }
