@@ -208,7 +208,8 @@ fn noise(plan: &StepPlan<'_>, layer: usize) -> Option<KeptNoise> {
 
 /// By layer and table, how it learns.
 fn rules(learner: &Learner, plan: &StepPlan<'_>, rates: &Rates, known: &[Known]) -> Vec<[Option<KeptRule>; KEPT]> {
-    let of_layer = |((layer, rates), known): ((&Layer<f32>, &Vec<Option<Vec<f64>>>), &Known)| {
+    let of_layer = |(index, known): (usize, &Known)| {
+        let (layer, rates) = (&learner.scene().layers[index], &rates[index]);
         known.keys.map(|key| {
             let key = key.filter(|&k| layer.params.info(k).trainable && layer.params[k].width() > 0)?;
             let rates = rates.get(key.0 as usize)?.clone().filter(|r| r.iter().any(|r| *r != 0.0))?;
@@ -216,7 +217,7 @@ fn rules(learner: &Learner, plan: &StepPlan<'_>, rates: &Rates, known: &[Known])
             Some(KeptRule { rates, floor })
         })
     };
-    learner.scene().layers.iter().zip(rates).zip(known).map(of_layer).collect()
+    known.iter().enumerate().map(of_layer).collect()
 }
 
 impl Engine for DeviceEngine<'_> {
