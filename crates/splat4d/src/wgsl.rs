@@ -27,15 +27,35 @@ pub const RANGES: &str = include_str!("gpu/ranges.wgsl");
 pub const RASTERIZE: &str = include_str!("gpu/rasterize.wgsl");
 /// Planes → 8 bits a channel. After [`PROJECT`].
 pub const BYTES: &str = include_str!("gpu/bytes.wgsl");
-/// The blend's way back: a record a (tile, splat) pair. After [`PROJECT`].
+/// What both ways back of the blend share. After [`PROJECT`].
+pub const BLEND_BACK: &str = include_str!("gpu/blend_back.wgsl");
+/// The blend's way back with subgroups. After [`BLEND_BACK`].
+pub const RASTERIZE_BACK_SUBGROUP: &str = include_str!("gpu/rasterize_back_subgroup.wgsl");
+/// The blend's way back: a record a (tile, splat) pair. After [`BLEND_BACK`].
 pub const RASTERIZE_BACK: &str = include_str!("gpu/rasterize_back.wgsl");
 /// A picture compared with its truth: L1, D-SSIM and their gradient: `moments`, `gradient`.
 pub const LOSS: &str = include_str!("gpu/loss.wgsl");
 /// Learnable rows at time t, and their lives. Reads `params`, which whoever includes it binds.
 pub const LEARNT: &str = include_str!("gpu/learnt.wgsl");
+/// Writes a row's gradients. After [`LEARNT`].
+pub const PUT: &str = include_str!("gpu/put.wgsl");
+/// Cosines, logarithms, random numbers. No bindings.
+pub const NUMBERS: &str = include_str!("gpu/numbers.wgsl");
+/// A Gaussian of space and time, sliced. After [`LEARNT`] and [`NUMBERS`].
+pub const SLICE: &str = include_str!("gpu/slice.wgsl");
+/// Rows of such Gaussians → splats. After [`SLICE`].
+pub const SLICE_ANSWER: &str = include_str!("gpu/slice_answer.wgsl");
+/// Gradients of splats → those of such rows. After [`SLICE`] and [`PUT`].
+pub const SLICE_BACK: &str = include_str!("gpu/slice_back.wgsl");
+/// Losses on rows: `count_rows`, `row_losses`. After [`LEARNT`] and [`NUMBERS`].
+pub const ROW_LOSSES: &str = include_str!("gpu/row_losses.wgsl");
+/// What holds the poses of a tracked frame: `turns_of`, `hold`. After [`LEARNT`].
+pub const TIES: &str = include_str!("gpu/ties.wgsl");
+/// Noise on positions. After [`LEARNT`] and [`NUMBERS`].
+pub const SHAKE: &str = include_str!("gpu/shake.wgsl");
 /// Rows that stay on the GPU → splats. After [`LEARNT`].
 pub const ANSWER: &str = include_str!("gpu/answer.wgsl");
-/// Gradients of splats → those of rows. After [`LEARNT`].
+/// Gradients of splats → those of rows. After [`LEARNT`] and [`PUT`].
 pub const ANSWER_BACK: &str = include_str!("gpu/answer_back.wgsl");
 /// Gradients of colours → those of SH and means, and statistics. After [`PROJECT`], [`SHADE`] and [`LEARNT`].
 pub const COLORS_BACK: &str = include_str!("gpu/colors_back.wgsl");
@@ -58,10 +78,12 @@ mod tests {
     const STORAGE_BUFFERS: usize = 8;
     const WORKGROUP_BYTES: u32 = 16 << 10;
     const INVOCATIONS: u32 = 256;
+    /// The one that needs more than WebGPU's core, on devices that have it.
+    const SUBGROUPS: &str = "rasterize, backward, with subgroups";
 
     #[test]
     fn every_shader_is_valid_within_webgpus_default_limits() {
-        let shaders: [(&str, &[&str]); 18] = [
+        let shaders: [(&str, &[&str]); 24] = [
             ("project and shade", &[PROJECT, SHADE]),
             ("sort", &[SORT]),
             ("splats", &[PROJECT, SHADE, SPLATS]),
@@ -70,11 +92,17 @@ mod tests {
             ("tiles", &[PROJECT, TILES]),
             ("ranges", &[RANGES]),
             ("rasterize", &[PROJECT, RASTERIZE]),
-            ("rasterize, backward", &[PROJECT, RASTERIZE_BACK]),
+            ("rasterize, backward", &[PROJECT, BLEND_BACK, RASTERIZE_BACK]),
+            (SUBGROUPS, &[PROJECT, BLEND_BACK, RASTERIZE_BACK_SUBGROUP]),
             ("bytes", &[PROJECT, BYTES]),
             ("loss", &[LOSS]),
             ("answer", &[LEARNT, ANSWER]),
-            ("answer, backward", &[LEARNT, ANSWER_BACK]),
+            ("answer, backward", &[LEARNT, PUT, ANSWER_BACK]),
+            ("slice", &[LEARNT, NUMBERS, SLICE, SLICE_ANSWER]),
+            ("slice, backward", &[LEARNT, PUT, NUMBERS, SLICE, SLICE_BACK]),
+            ("losses on rows", &[LEARNT, NUMBERS, ROW_LOSSES]),
+            ("ties", &[LEARNT, TIES]),
+            ("shake", &[LEARNT, NUMBERS, SHAKE]),
             ("colours, backward", &[PROJECT, SHADE, LEARNT, COLORS_BACK]),
             ("adam", &[ADAM]),
             ("gather", &[GATHER]),
@@ -85,7 +113,8 @@ mod tests {
             let text = files.join("\n");
             let module =
                 naga::front::wgsl::parse_str(&text).unwrap_or_else(|e| panic!("{name}: {}", e.emit_to_string(&text)));
-            Validator::new(ValidationFlags::all(), Capabilities::empty())
+            let needs = if name == SUBGROUPS { Capabilities::SUBGROUP } else { Capabilities::empty() };
+            Validator::new(ValidationFlags::all(), needs)
                 .validate(&module)
                 .unwrap_or_else(|e| panic!("{name}: {}", e.emit_to_string(&text)));
             let mut layouter = naga::proc::Layouter::default();

@@ -42,6 +42,7 @@ Examples:
   splat4d bench --against today.json              ratios to an earlier result
   splat4d bench --growth all --plots docs/images  steps with more Gaussians, pixels and frames; memory
   splat4d bench --device gpu --save gpu.json      every stage of a GPU, scenes A, B and C
+  splat4d bench --device gpu --sweep --save sweep.json  the same with every value of the kernels' constants
   splat4d bench --playback runs/a runs/a-small    frames a second of runs and files, in turns
 
 Times are means over eight views of the best of several rounds. `of ceiling` is the least time in which the stage's
@@ -62,6 +63,9 @@ pub(crate) struct Args {
     /// copies and its arithmetic
     #[arg(long, value_enum, default_value = "cpu", conflicts_with_all = ["growth", "playback", "simd"])]
     device: Measured,
+    /// Measure a GPU with each constant of its kernels at each of its values, one after the other: what to set them to on this card
+    #[arg(long)]
+    sweep: bool,
     /// Folder with the SOG files of scene S
     #[arg(long, value_name = "FOLDER")]
     playbot: Option<PathBuf>,
@@ -143,6 +147,10 @@ pub(crate) fn run(args: &Args, threads: Option<u16>, console: &Console) -> anyho
         return play(args, console);
     }
     // What cannot work is said before anything takes time.
+    if args.sweep && args.device != Measured::Gpu {
+        let error = Error::new(ErrorKind::BadInput, "only a GPU's kernels have constants to sweep");
+        return Err(error.remedy("Add --device gpu.").into());
+    }
     let earlier = args.against.as_deref().map(rows::read).transpose()?;
     let levels: Vec<Simd> = match &args.simd[..] {
         [] => vec![Simd::detect()],
@@ -170,7 +178,8 @@ pub(crate) fn run(args: &Args, threads: Option<u16>, console: &Console) -> anyho
         }
     }
     let mut rows = if args.device == Measured::Gpu {
-        on_gpu(&scenes, Way { threads: threads[threads.len() - 1], simd: levels[0], rounds: args.rounds }, console)?
+        let way = Way { threads: threads[threads.len() - 1], simd: levels[0], rounds: args.rounds };
+        on_gpu(&scenes, way, args.sweep, console)?
     } else if args.growth.is_empty() {
         measure(&scenes, &levels, &threads, args.rounds, console)?
     } else {
@@ -198,12 +207,12 @@ pub(crate) fn run(args: &Args, threads: Option<u16>, console: &Console) -> anyho
 
 /// Measures a GPU, with the most threads beside it.
 #[cfg(feature = "gpu")]
-fn on_gpu(scenes: &[Pinned], way: Way, console: &Console) -> anyhow::Result<Vec<Row>> {
-    Ok(gpu::measure(scenes, way, &pool(way.threads)?, &|text| console.note(text))?)
+fn on_gpu(scenes: &[Pinned], way: Way, sweep: bool, console: &Console) -> anyhow::Result<Vec<Row>> {
+    Ok(gpu::measure(scenes, way, sweep, &pool(way.threads)?, &|text| console.note(text))?)
 }
 
 #[cfg(not(feature = "gpu"))]
-fn on_gpu(_: &[Pinned], _: Way, _: &Console) -> anyhow::Result<Vec<Row>> {
+fn on_gpu(_: &[Pinned], _: Way, _: bool, _: &Console) -> anyhow::Result<Vec<Row>> {
     let error = Error::new(ErrorKind::Unsupported, "this splat4d was built without the feature `gpu`");
     Err(error.remedy("Build it with its default features.").into())
 }

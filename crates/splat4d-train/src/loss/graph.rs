@@ -106,6 +106,16 @@ impl<F: Real> Graph<F> {
         self.edges
     }
 
+    /// Where each edge leads, with its length at rest and its weight.
+    pub(crate) fn all(&self) -> impl Iterator<Item = (u32, F, F)> + '_ {
+        (0..self.near.len()).map(|e| (self.near[e], self.d0[e], self.weights[e]))
+    }
+
+    /// By point the first of the edges that lead to it, with one past the last; and those edges.
+    pub(crate) fn all_to(&self) -> [&[u32]; 2] {
+        [&self.first, &self.back]
+    }
+
     /// Lengths at rest, scene units, an edge.
     pub(crate) fn lengths(&self) -> &[F] {
         &self.d0

@@ -2,10 +2,11 @@
 
 use super::image::entropy::binary_entropy;
 use super::near::{NEIGHBOURS, Near};
-use super::terms::{ParamLoss, StepInfo};
+use super::terms::{KeptLoss, ParamLoss, StepInfo};
 use splat4d::layers::Scene;
 use splat4d::math::Real;
 use splat4d::motion::for_rows;
+use splat4d::render::RowWeights;
 use splat4d::scene::params::{LOG_SCALE, OPACITY};
 use splat4d::scene::{GEOMETRY, Grads, Rows, Space};
 
@@ -50,6 +51,10 @@ impl<F: Real> ParamLoss<F> for MeanOpacity {
         "opacity_reg"
     }
 
+    fn kept(&self) -> Option<KeptLoss> {
+        Some(KeptLoss::Rows(RowWeights { opacity: self.weight, ..RowWeights::default() }))
+    }
+
     fn eval(&self, scene: &Scene<F>, _info: &StepInfo, d: &mut [Grads<F>]) -> f64 {
         over_active(scene, d, self.weight, |_, g, _| {
             let o = g[OPACITY].sigmoid();
@@ -74,6 +79,10 @@ impl<F: Real> ParamLoss<F> for OpacityEntropy {
         "lambda_opacity_entropy"
     }
 
+    fn kept(&self) -> Option<KeptLoss> {
+        Some(KeptLoss::Rows(RowWeights { entropy: self.weight, ..RowWeights::default() }))
+    }
+
     fn eval(&self, scene: &Scene<F>, _info: &StepInfo, d: &mut [Grads<F>]) -> f64 {
         over_active(scene, d, self.weight, |_, g, _| {
             let (value, slope) = binary_entropy(g[OPACITY].sigmoid());
@@ -95,6 +104,10 @@ pub(crate) struct MeanScale {
 impl<F: Real> ParamLoss<F> for MeanScale {
     fn name(&self) -> &str {
         "scale_reg"
+    }
+
+    fn kept(&self) -> Option<KeptLoss> {
+        Some(KeptLoss::Rows(RowWeights { scale: self.weight, ..RowWeights::default() }))
     }
 
     fn eval(&self, scene: &Scene<F>, _info: &StepInfo, d: &mut [Grads<F>]) -> f64 {

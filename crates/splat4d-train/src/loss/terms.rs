@@ -4,6 +4,7 @@
 use crate::Result;
 use splat4d::layers::Scene;
 use splat4d::math::Real;
+use splat4d::render::{KeptTies, RowWeights};
 use splat4d::scene::{Grads, Space, Table, Time};
 
 /// Where in training a loss is asked.
@@ -50,12 +51,29 @@ pub trait ProbeLoss<F: Real>: Send + Sync {
     fn restore(&self, _state: &[u32]) {}
 }
 
+/// A loss on raw parameters that a device can take which keeps them.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum KeptLoss {
+    /// Means over the rows that are active.
+    Rows(RowWeights),
+    /// Ties of poses, which [`ParamLoss::ties`] tells.
+    Ties,
+}
+
 /// A loss on raw parameters; must add only to rows that are active in `d`.
 pub trait ParamLoss<F: Real>: Send + Sync {
     /// Its name, in recipes and metrics.
     fn name(&self) -> &str;
     /// The loss; adds to one `Grads` a layer.
     fn eval(&self, scene: &Scene<F>, info: &StepInfo, d: &mut [Grads<F>]) -> f64;
+    /// The same as a device knows it; none: the CPU must take it.
+    fn kept(&self) -> Option<KeptLoss> {
+        None
+    }
+    /// The ties of [`KeptLoss::Ties`].
+    fn ties(&self, _scene: &Scene<F>) -> Option<KeptTies> {
+        None
+    }
     /// Rows were edited: whatever was remembered of rows is stale.
     fn on_edit(&self) {}
     /// The state for a checkpoint, if it remembers anything from step to step.

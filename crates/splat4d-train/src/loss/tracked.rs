@@ -9,12 +9,13 @@
 
 use super::graph::{Graph, Weigh};
 use super::rigid::{Poses, isometry, rigidity, rotation};
-use super::terms::{ParamLoss, StepInfo};
+use super::terms::{KeptLoss, ParamLoss, StepInfo};
 use rayon::prelude::*;
 use splat4d::layers::{Layer, Scene};
 use splat4d::math::Real;
 use splat4d::math::sh::C0;
 use splat4d::motion::tracked::{FOREGROUND, POSE, page_of};
+use splat4d::render::KeptTies;
 use splat4d::scene::params::QUAT;
 use splat4d::scene::{GEOMETRY, Grads, Key, SH, Space};
 use std::sync::{Arc, Mutex, MutexGuard};
@@ -239,6 +240,38 @@ impl<F: Real> ParamLoss<F> for Tied<F> {
         self.foreground(scene, &frame0, [before, now], &mut d[0])
             + self.background(layer, &frame0.background, now, &mut d[0])
             + self.colors(layer, &mut d[0])
+    }
+
+    /// Colours that learn are the CPU's.
+    fn kept(&self) -> Option<KeptLoss> {
+        (self.of.ties.weights.soft_col == 0.0).then_some(KeptLoss::Ties)
+    }
+
+    fn ties(&self, scene: &Scene<F>) -> Option<KeptTies> {
+        let layer = &scene.layers[0];
+        let before = page_of(&layer.params, self.frame - 1)?;
+        let (frame0, Ties { weights: w, floor, unit, .. }) = (self.of.frame0(layer), &self.of.ties);
+        let Frame0 { foreground, background, graph } = frame0.as_ref();
+        let share = |weight: f64, of: usize| weight / of.max(1) as f64;
+        let single = |x: F| x.f64() as f32;
+        let [first, back] = graph.all_to();
+        let stays = share(w.bg, background.len());
+        Some(KeptTies {
+            points: foreground.clone(),
+            background: background.clone(),
+            neighbours: graph.k(),
+            edges: graph.all().map(|(to, long, weight)| (to, single(long), single(weight))).collect(),
+            first: first.to_vec(),
+            back: back.to_vec(),
+            before: foreground.iter().map(|&r| layer.params[before].read(r as usize, 0).map(single)).collect(),
+            rigid: share(w.rigid / unit, graph.edges()),
+            rot: share(w.rot, graph.edges()),
+            iso: share(w.iso / unit, graph.edges()),
+            floor: share(w.floor / unit, foreground.len()),
+            height: *floor,
+            up: scene.up,
+            stays: [stays / unit, stays],
+        })
     }
 
     fn on_edit(&self) {

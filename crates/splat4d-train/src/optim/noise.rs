@@ -5,6 +5,7 @@ use crate::recipe::Recipe;
 use splat4d::layers::{Layer, Scene};
 use splat4d::math::{Real, Rng, sym3};
 use splat4d::motion::for_rows;
+use splat4d::render::KeptNoise;
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{GEOMETRY, Grads, Rows, Space};
 
@@ -39,6 +40,12 @@ impl Noise {
         (self.until > from).then_some(Self { until, ..self })
     }
 
+    /// The same as a device knows it that keeps a layer's tables; none: there is nothing to shake. `rng` is the layer's.
+    pub(crate) fn kept(&self, rate: f64, min_opacity: f64, rng: Rng) -> Option<KeptNoise> {
+        let (strength, limit) = (rate * self.strength, limit(min_opacity));
+        (strength != 0.0).then_some(KeptNoise { strength, dead: min_opacity, slope: NOISE_SLOPE, limit, rng })
+    }
+
     /// Shakes the rows that are active in `d`; `rate`: that of a layer's positions, where they learn. `rng` is the step's.
     pub(crate) fn add(
         &self,
@@ -56,15 +63,19 @@ impl Noise {
     }
 }
 
+/// The logit of the opacity from which on the gate is below the least one: most Gaussians are told by one number.
+fn limit(min_opacity: f64) -> f32 {
+    let opaque = min_opacity + (1.0 / LEAST_GATE - 1.0).ln() / NOISE_SLOPE;
+    if opaque < 1.0 { (opaque / (1.0 - opaque)).ln() as f32 } else { f32::INFINITY }
+}
+
 /// Adds the noise to the means of the active rows: Σ·ε·σ(−100(o − o_dead))·`strength`, ε ~ N(0, I).
 fn shake(layer: &mut Layer<f32>, active: &[bool], strength: f64, min_opacity: f64, rng: Rng) {
     if strength == 0.0 {
         return;
     }
     let [geometry] = layer.params.get_mut([GEOMETRY]);
-    // The opacity, and its logit, from which the gate is below the least one: most Gaussians are told by one number.
-    let opaque = min_opacity + (1.0 / LEAST_GATE - 1.0).ln() / NOISE_SLOPE;
-    let limit = if opaque < 1.0 { (opaque / (1.0 - opaque)).ln() as f32 } else { f32::INFINITY };
+    let limit = limit(min_opacity);
     for_rows([geometry], Rows::All, |_, row, [geometry]| {
         if !active[row] || geometry.read::<1>(row, OPACITY)[0] > limit {
             return 0.0;

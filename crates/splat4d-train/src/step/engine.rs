@@ -56,6 +56,8 @@ pub struct Stepped {
     pub other: Duration,
     /// Gaussians born, moved, removed.
     pub change: Change,
+    /// Milliseconds of the stages of the last view, where a device that took the whole step tells them.
+    pub stages: Vec<(&'static str, f64)>,
     /// What the user should know of the device that draws.
     pub notices: Vec<String>,
 }
@@ -137,6 +139,17 @@ pub(super) fn learn_exposure(learner: &mut Learner, plan: &StepPlan<'_>) {
             }
         }
     }
+}
+
+/// The rate of a layer's positions, by which noise on them goes; none: they rest.
+pub(super) fn noise_rate(plan: &StepPlan<'_>, layer: usize) -> Option<f64> {
+    let group = plan.stage.groups.iter().find(|g| g.is_of(layer) && g.column == "means")?;
+    Some(group.rate.at(plan.info.progress))
+}
+
+/// The step's random numbers for that noise; a layer has a fork.
+pub(super) fn noise_stream(plan: &StepPlan<'_>) -> Rng {
+    Rng::new(plan.info.seed, "noise", plan.info.iteration as u64)
 }
 
 /// Steps on the processor, with whatever draws.
@@ -240,11 +253,7 @@ impl<'a> CpuEngine<'a> {
     /// Noise on positions, where the stage has it.
     fn shake(&self, learner: &mut Learner, plan: &StepPlan<'_>) {
         let Some(noise) = plan.stage.noise else { return };
-        let rate = |layer: usize| {
-            let group = plan.stage.groups.iter().find(|g| g.is_of(layer) && g.column == "means")?;
-            Some(group.rate.at(plan.info.progress))
-        };
-        let rng = Rng::new(plan.info.seed, "noise", plan.info.iteration as u64);
+        let (rate, rng) = (|layer: usize| noise_rate(plan, layer), noise_stream(plan));
         noise.add(learner.parts_mut().scene, &self.grads, rate, plan.min_opacity, rng);
     }
 }

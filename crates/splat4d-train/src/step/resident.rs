@@ -2,15 +2,23 @@
 //! draws.
 
 use super::chain::ImageTerm;
-use super::engine::{Blame, CpuEngine, Engine, Fault, Rates, StepPlan, Stepped, learn_exposure, rates_of};
+use super::engine::{
+    Blame, CpuEngine, Engine, Fault, Rates, StepPlan, Stepped, learn_exposure, noise_rate, noise_stream, rates_of,
+};
 use crate::Result;
 use crate::learner::{Learner, Parts};
+use crate::loss::terms::KeptLoss;
 use crate::optim::corrections;
 use splat4d::layers::{ALPHA_MIN, ALWAYS, Layer};
-use splat4d::motion::Polynomial;
-use splat4d::render::{Antialias, Backend, KEPT, KeptLayer, KeptRule, KeptStep, KeptTable, KeptView, Moves, Target};
+use splat4d::motion::tracked::{Tracked, page_of};
+use splat4d::motion::{Polynomial, Spec, native4d};
+use splat4d::render::{
+    Antialias, Backend, KEPT, KeptLayer, KeptNoise, KeptRule, KeptStep, KeptTable, KeptTies, KeptView, Moves,
+    RowWeights, Target,
+};
 use splat4d::scene::life::LOG_WIDTH;
-use splat4d::scene::{GEOMETRY, Key, LIFE, LifeKind, SH};
+use splat4d::scene::{GEOMETRY, Key, LIFE, LifeKind, SH, Time};
+use std::any::Any;
 use std::time::Instant as Clock;
 
 /// Who has the newest numbers.
@@ -34,13 +42,15 @@ pub(super) struct DeviceEngine<'a> {
     told: bool,
     /// See [`rates_of`].
     rates: Rates,
+    /// Tables that are kept, by layer.
+    known: Vec<Known>,
 }
 
 impl<'a> DeviceEngine<'a> {
     /// An engine that draws with `backend`, and takes steps with it where it keeps tables.
     pub(super) fn new(backend: Box<dyn Backend<f32> + 'a>) -> Self {
         let (cpu, rates) = (CpuEngine::new(backend), Rates::default());
-        Self { cpu, newest: Newest::Learner, given_up: false, told: false, rates }
+        Self { cpu, newest: Newest::Learner, given_up: false, told: false, rates, known: Vec::new() }
     }
 
     /// Tells once why the CPU keeps the tables of a device that could.
@@ -66,11 +76,14 @@ impl<'a> DeviceEngine<'a> {
     }
 
     /// Hands the tables over, if what is kept is stale.
-    fn keep(&mut self, learner: &Learner) -> Result<()> {
+    fn keep(&mut self, learner: &Learner, plan: &StepPlan<'_>) -> Result<()> {
         if self.newest != Newest::Learner {
             return Ok(());
         }
-        let layers: Vec<KeptLayer<'_>> = learner.scene().layers.iter().enumerate().map(|l| kept(learner, l)).collect();
+        let scene = learner.scene();
+        let ties = plan.stage.params.iter().find_map(|loss| loss.ties(scene));
+        let of_layer = |(i, known): (usize, &Known)| kept(learner, i, known, ties.as_ref().filter(|_| i == 0));
+        let layers: Vec<KeptLayer<'_>> = self.known.iter().enumerate().map(of_layer).collect();
         let resident = self.cpu.backend().resident().expect("only such a device keeps tables");
         resident.keep(&layers, &corrections::<f32>())?;
         self.newest = Newest::Both;
@@ -78,22 +91,47 @@ impl<'a> DeviceEngine<'a> {
     }
 }
 
-/// How a layer's rows move, if a device knows such motion.
-fn moves(layer: &Layer<f32>) -> Option<Moves> {
-    let Polynomial { order, rotation_rates, origin, detached, .. } = layer.motion.polynomial()?;
-    Some(Moves { order, rotation: rotation_rates.is_some(), detach: detached, origin })
+/// What a device knows of a layer: its motion, and its tables in the order of [`KEPT`].
+#[derive(Clone, Debug, PartialEq)]
+struct Known {
+    moves: Moves,
+    keys: [Option<Key>; KEPT],
 }
 
-/// A layer's tables, in the order of [`KEPT`].
-fn keys(layer: &Layer<f32>) -> [Option<Key>; KEPT] {
-    let polynomial = layer.motion.polynomial();
-    let of = |f: fn(&Polynomial) -> Option<Key>| polynomial.as_ref().and_then(f);
-    let life = (layer.life != LifeKind::Infinite).then_some(LIFE);
-    [Some(GEOMETRY), life, of(|p| p.velocities), of(|p| p.rotation_rates), Some(SH)]
+impl Known {
+    /// As all these times see it; none: no device knows such motion.
+    fn new(layer: &Layer<f32>, times: &[Time]) -> Option<Self> {
+        let life = (layer.life != LifeKind::Infinite).then_some(LIFE);
+        let known =
+            |moves, own: [Option<Key>; 2]| Self { moves, keys: [Some(GEOMETRY), life, own[0], own[1], Some(SH)] };
+        let still = Moves::Along { order: 0, rotation: false, detach: false, origin: 0.0 };
+        if let Some(polynomial) = layer.motion.polynomial() {
+            let Polynomial { order, velocities, rotation_rates, origin, detached } = polynomial;
+            let moves = Moves::Along { order, rotation: rotation_rates.is_some(), detach: detached, origin };
+            return Some(known(moves, [velocities, rotation_rates]));
+        }
+        let model: &dyn Any = layer.motion.as_ref();
+        if let Some(tracked) = model.downcast_ref::<Tracked>() {
+            // A picture between two frames, or pictures of several, are the CPU's.
+            let frame = times.first().and_then(|t| tracked.frame_at(t.0))?;
+            let one = times.iter().all(|t| tracked.frame_at(t.0) == Some(frame));
+            return one.then(|| match frame {
+                0 => known(still, [None; 2]),
+                _ => known(Moves::Posed, [page_of(&layer.params, frame), None]),
+            });
+        }
+        if let Spec::Native4d(spec) = layer.motion.spec() {
+            let ([floor, ceiling], own) = (spec.bounds(), layer.params.find(native4d::TABLE)?);
+            let (speed, harmonics, period) = (spec.speed, spec.harmonics, spec.period);
+            return Some(known(Moves::Sliced { speed, floor, ceiling, harmonics, period }, [Some(own), None]));
+        }
+        None
+    }
 }
 
 /// A layer as a device takes it over.
-fn kept<'a>(learner: &'a Learner, (index, layer): (usize, &'a Layer<f32>)) -> KeptLayer<'a> {
+fn kept<'a>(learner: &'a Learner, index: usize, known: &Known, ties: Option<&'a KeptTies>) -> KeptLayer<'a> {
+    let layer = &learner.scene().layers[index];
     let table = |key: Option<Key>| {
         key.map_or(KeptTable::default(), |key| {
             let (params, moments) = (&layer.params[key], learner.moments()[index].table(key));
@@ -102,55 +140,84 @@ fn kept<'a>(learner: &'a Learner, (index, layer): (usize, &'a Layer<f32>)) -> Ke
     };
     KeptLayer {
         rows: layer.params.len(),
-        moves: moves(layer).expect("only such layers are kept"),
+        moves: known.moves,
         life: layer.life,
-        tables: keys(layer).map(table),
+        tables: known.keys.map(table),
         stats: learner.stats().tables[index].data(),
+        ties,
     }
 }
 
-/// Why a step is the CPU's; none: a device can take it.
-fn refusal(learner: &Learner, plan: &StepPlan<'_>, rates: &Rates) -> Option<String> {
+/// What a device knows of all layers for a step, or why the step is the CPU's.
+fn known(learner: &Learner, plan: &StepPlan<'_>, rates: &Rates) -> std::result::Result<Vec<Known>, String> {
     let (stage, scene) = (&*plan.stage, learner.scene());
     let of_stage = [
         (!stage.probes.is_empty(), "losses look at several times"),
-        (!stage.params.is_empty(), "losses look at raw numbers"),
         (stage.codec.is_some(), "scenes are shown as their file will be read"),
-        (stage.noise.is_some(), "positions are shaken after every step (MCMC)"),
         (learner.corrections.is_some(), "cameras learn"),
         (scene.head_keys().is_some(), "a pixel head learns"),
     ];
     if let Some((_, why)) = of_stage.iter().find(|(is, _)| *is) {
-        return Some((*why).into());
+        return Err((*why).into());
     }
+    let mut all = Vec::new();
     for (layer, rates) in scene.layers.iter().zip(rates) {
-        if moves(layer).is_none() {
-            return Some(format!("the GPU does not know the motion of `{}`", layer.name));
-        }
+        let Some(known) = Known::new(layer, &plan.info.times) else {
+            return Err(format!("the GPU does not know the motion of `{}`", layer.name));
+        };
         let plain = layer.masks.is_none() && layer.span == ALWAYS && layer.cross_fade == [0.0; 2];
         if !plain || !layer.frame.is_identity() {
-            return Some(format!("`{}` is seen for a part of the time, or in axes of its own", layer.name));
+            return Err(format!("`{}` is seen for a part of the time, or in axes of its own", layer.name));
         }
-        let known = keys(layer);
         let learns = |key: &Key| rates.get(key.0 as usize).is_some_and(|r| r.iter().flatten().any(|r| *r != 0.0));
-        if let Some(key) = layer.params.keys().filter(learns).find(|k| !known.contains(&Some(*k))) {
-            return Some(format!("`{}` learns, which the GPU does not know", layer.params.column_name(key, 0)));
+        if let Some(key) = layer.params.keys().filter(learns).find(|k| !known.keys.contains(&Some(*k))) {
+            return Err(format!("`{}` learns, which the GPU does not know", layer.params.column_name(key, 0)));
         }
+        all.push(known);
     }
-    None
+    // Ties go by the poses of a frame, of Gaussians that are all there.
+    let posed = all.iter().zip(&scene.layers).all(|(k, l)| k.moves == Moves::Posed && l.life == LifeKind::Infinite);
+    let knows = |kept: Option<KeptLoss>| match kept {
+        Some(KeptLoss::Rows(_)) => true,
+        Some(KeptLoss::Ties) => posed && all.len() == 1,
+        None => false,
+    };
+    match stage.params.iter().find(|loss| !knows(loss.kept())) {
+        Some(loss) => Err(format!("the loss `{}` looks at raw numbers", loss.name())),
+        None => Ok(all),
+    }
+}
+
+/// The losses on rows of a stage.
+fn row_weights(plan: &StepPlan<'_>) -> RowWeights {
+    plan.stage.params.iter().fold(RowWeights::default(), |sum, loss| match loss.kept() {
+        Some(KeptLoss::Rows(w)) => RowWeights {
+            opacity: sum.opacity + w.opacity,
+            entropy: sum.entropy + w.entropy,
+            scale: sum.scale + w.scale,
+        },
+        _ => sum,
+    })
+}
+
+/// The noise on the positions of a layer after a step.
+fn noise(plan: &StepPlan<'_>, layer: usize) -> Option<KeptNoise> {
+    let rate = noise_rate(plan, layer)?;
+    plan.stage.noise?.kept(rate, plan.min_opacity, noise_stream(plan).fork(layer as u64))
 }
 
 /// By layer and table, how it learns.
-fn rules(learner: &Learner, plan: &StepPlan<'_>, rates: &Rates) -> Vec<[Option<KeptRule>; KEPT]> {
-    let of_layer = |(layer, rates): (&Layer<f32>, &Vec<Option<Vec<f64>>>)| {
-        keys(layer).map(|key| {
+fn rules(learner: &Learner, plan: &StepPlan<'_>, rates: &Rates, known: &[Known]) -> Vec<[Option<KeptRule>; KEPT]> {
+    let of_layer = |(index, known): (usize, &Known)| {
+        let (layer, rates) = (&learner.scene().layers[index], &rates[index]);
+        known.keys.map(|key| {
             let key = key.filter(|&k| layer.params.info(k).trainable && layer.params[k].width() > 0)?;
             let rates = rates.get(key.0 as usize)?.clone().filter(|r| r.iter().any(|r| *r != 0.0))?;
             let floor = plan.stage.min_log_life.filter(|_| key == LIFE).map(|least| (LOG_WIDTH, least));
             Some(KeptRule { rates, floor })
         })
     };
-    learner.scene().layers.iter().zip(rates).map(of_layer).collect()
+    known.iter().enumerate().map(of_layer).collect()
 }
 
 impl Engine for DeviceEngine<'_> {
@@ -160,24 +227,30 @@ impl Engine for DeviceEngine<'_> {
             return self.step_on_cpu(learner, plan, notices);
         }
         rates_of(learner.scene(), plan, &mut self.rates);
-        let why = refusal(learner, plan, &self.rates);
+        let known = known(learner, plan, &self.rates);
         let targets: Option<Vec<Target<'_>>> = {
             let exposure = learner.parts_mut().exposure;
             let image = plan.loss.of_step(&mut plan.stage.pictures, exposure);
             plan.views.iter().map(|view| image.target(view)).collect()
         };
-        let targets = match (why, targets) {
-            (None, Some(targets)) => targets,
-            (why, _) => {
+        let (known, targets) = match (known, targets) {
+            (Ok(known), Some(targets)) => (known, targets),
+            (known, _) => {
                 // Of losses on pictures the CPU's engine tells.
-                if let Some(why) = why {
+                if let Err(why) = known {
                     self.tell(&why, &mut notices);
                 }
                 return self.step_on_cpu(learner, plan, notices);
             }
         };
+        if known != self.known {
+            if let Err(fault) = self.settle(learner) {
+                return Ok(Err(fault));
+            }
+            (self.newest, self.known) = (Newest::Learner, known);
+        }
         let clock = Clock::now();
-        if let Err(error) = self.keep(learner) {
+        if let Err(error) = self.keep(learner, plan) {
             self.given_up = true;
             self.tell(&error.to_string(), &mut notices);
             return self.step_on_cpu(learner, plan, notices);
@@ -188,8 +261,16 @@ impl Engine for DeviceEngine<'_> {
             .zip(targets)
             .map(|(v, target)| KeptView { camera: v.camera, t: v.t, background: v.background, target })
             .collect();
-        let rules = rules(learner, plan, &self.rates);
-        let step = KeptStep { views: &views, sh_degree: plan.sh_degree, alpha_min: ALPHA_MIN, rules: &rules };
+        let rules = rules(learner, plan, &self.rates, &self.known);
+        let noise: Vec<_> = (0..rules.len()).map(|layer| noise(plan, layer)).collect();
+        let step = KeptStep {
+            views: &views,
+            sh_degree: plan.sh_degree,
+            alpha_min: ALPHA_MIN,
+            rules: &rules,
+            rows: row_weights(plan),
+            noise: &noise,
+        };
         let resident = self.cpu.backend().resident().expect("it was there before");
         let stepped = match resident.step(&step) {
             Ok(Some(stepped)) => stepped,
@@ -207,7 +288,8 @@ impl Engine for DeviceEngine<'_> {
             }
         };
         self.newest = Newest::Device;
-        let mut out = Stepped { notices, ..Stepped::default() };
+        let stages = self.cpu.backend().resident().map_or_else(Vec::new, |resident| resident.stages());
+        let mut out = Stepped { notices, stages, ..Stepped::default() };
         let Parts { scene, exposure, .. } = learner.parts_mut();
         let mut image = plan.loss.of_step(&mut plan.stage.pictures, exposure);
         for (view, comparison) in plan.views.iter().zip(&stepped.comparisons) {
@@ -215,11 +297,12 @@ impl Engine for DeviceEngine<'_> {
             out.report.loss += value;
             out.report.view_losses.push(value);
         }
+        out.report.loss += stepped.loss;
         (out.l1, out.ssim, out.mse) = (plan.loss.l1, plan.loss.ssim, plan.loss.mse());
         out.report.timings.render = clock.elapsed();
         if let Some([layer, table, row]) = stepped.bad {
             let params = &scene.layers[layer].params;
-            let column = keys(&scene.layers[layer])[table].map_or("?", |key| params.column_name(key, 0));
+            let column = self.known[layer].keys[table].map_or("?", |key| params.column_name(key, 0));
             let what = format!("the table of `{column}` is not finite at Gaussian {row} of layer {layer}");
             return Ok(Err(Fault(what, Blame::Numbers)));
         }
@@ -250,7 +333,7 @@ impl Engine for DeviceEngine<'_> {
                 }
                 None => return Err(Fault("the GPU that kept the tables is gone".into(), Blame::Device)),
             };
-            for (table, key) in keys(layer).into_iter().enumerate() {
+            for (table, key) in self.known[index].keys.into_iter().enumerate() {
                 let Some(key) = key.filter(|&k| layer.params[k].width() > 0) else { continue };
                 let [params] = layer.params.get_mut([key]);
                 params.data_mut().copy_from_slice(&numbers.params[table]);

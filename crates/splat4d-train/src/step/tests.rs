@@ -5,6 +5,8 @@ mod depth;
 mod flow;
 #[cfg(feature = "gpu")]
 mod gpu;
+#[cfg(feature = "gpu")]
+mod kept;
 mod limits;
 mod refine;
 #[cfg(feature = "gpu")]

@@ -4,9 +4,10 @@
 // some; 4 moments: a buffer of `moments_stride` columns, first and second moments and the row's step count; 5 alive: the rows that
 // take part; 6 corrections by step count, made by the CPU; 7 status, a word a table: one more than the last row whose number
 // is not finite. Seven storage buffers.
-// A thread owns one row.
+// A thread owns one row. A table with more columns than there is room for rates is taken in pieces, in order.
 
 const TABLE_BLOCK: u32 = 16u;
+const ROW_THREADS: u32 = 256u;
 const BETA1: f32 = 0.9;
 const BETA2: f32 = 0.999;
 const EPSILON: f32 = 1e-15;
@@ -24,6 +25,11 @@ struct Rule {
     floor_least: f32,
     capacity: u32,        // pairs that there is room for
     word: u32,            // of status
+    start: u32,           // first column of this piece, and how many it has
+    columns: u32,
+    unused_0: u32,
+    unused_1: u32,
+    unused_2: u32,
     rates: array<vec4<f32>, 12>, // a rate a column; 0: frozen
 }
 
@@ -40,7 +46,7 @@ fn at(row: u32, column: u32, width: u32) -> u32 {
     return (row / TABLE_BLOCK * width + column) * TABLE_BLOCK + row % TABLE_BLOCK;
 }
 
-@compute @workgroup_size(256)
+@compute @workgroup_size(ROW_THREADS)
 fn adam(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = id.x;
     if (row >= rule.rows || counts[2] > rule.capacity) {
@@ -54,12 +60,16 @@ fn adam(@builtin(global_invocation_id) id: vec3<u32>) {
     let second_moment = first_moment + rule.width * TABLE_BLOCK;
     let steps = second_moment + rule.width * TABLE_BLOCK;
     let count = moments[steps] + 1.0;
-    moments[steps] = count;
+    // The last piece counts.
+    if (rule.start + rule.columns == rule.width) {
+        moments[steps] = count;
+    }
     let correct = corrections[min(u32(count), rule.counted - 1u)];
     var bad = false;
-    for (var c = 0u; c < rule.width; c++) {
-        let rate = rule.rates[c / 4u][c % 4u];
+    for (var i = 0u; i < rule.columns; i++) {
+        let rate = rule.rates[i / 4u][i % 4u];
         if (rate != 0.0) {
+            let c = rule.start + i;
             let step = c * TABLE_BLOCK;
             let d = gradient[first + step];
             let m1 = BETA1 * moments[first_moment + step] + (1.0 - BETA1) * d;

@@ -1,5 +1,5 @@
-// The splats of a layer's rows at time t, and who is alive then. Twin of Motion::at for `still` and `spacetime` with the life
-// of layers/envelope.rs; learnt.wgsl is put in front of this file.
+// The splats of a layer's rows at time t, and who is alive then. Twin of Motion::at for `still`, `spacetime` and a
+// frame of `tracked`, with the life of layers/envelope.rs; learnt.wgsl is put in front of this file.
 //
 // Bindings, group 0: 0 ask; 1 params; out: 2 geometry as splats.wgsl reads it (mean 3, covariance 6, opacity 1; opacity 0
 // where the row is not alive), 3 alive, 1 a row that is alive at the time of any of the step's views. Three storage buffers.
@@ -26,7 +26,7 @@ fn dead(row: u32, opacity: f32, sigma: f32) -> bool {
     return abs(delta_of(ask, row)) > reach || opacity * sigma < ask.alpha_min;
 }
 
-@compute @workgroup_size(256)
+@compute @workgroup_size(ROW_THREADS)
 fn answer(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = id.x;
     if (row >= ask.rows) {

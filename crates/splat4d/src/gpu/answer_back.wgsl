@@ -1,5 +1,5 @@
-// From the gradients of a layer's splats to those of its rows. Twin of Motion::backward for `still` and `spacetime`, of the
-// life's VJP in layers/envelope.rs; learnt.wgsl is put in front of this file.
+// From the gradients of a layer's splats to those of its rows. Twin of Motion::backward for `still`, `spacetime` and a frame of
+// `tracked`, of the life's VJP in layers/envelope.rs; learnt.wgsl and put.wgsl are put in front of this file.
 //
 // Bindings, group 0: 0 ask; 1 counts ([2]: pairs); 2 params; 3 back as colors_back.wgsl left it (mean, opacity; covariance);
 // out: 4 d_params, laid out as params: overwritten by the step's first view, added to by the others. Four storage buffers.
@@ -11,22 +11,7 @@
 @group(0) @binding(3) var<storage, read> back: array<vec4<f32>>;
 @group(0) @binding(4) var<storage, read_write> d_params: array<f32>;
 
-fn put(row: u32, column: u32, d: f32) {
-    let i = at(row, column, ask.width);
-    if ((ask.flags & ASK_FIRST) != 0u) {
-        d_params[i] = d;
-    } else {
-        d_params[i] += d;
-    }
-}
-
-fn put_three(row: u32, column: u32, d: vec3<f32>) {
-    put(row, column, d.x);
-    put(row, column + 1u, d.y);
-    put(row, column + 2u, d.z);
-}
-
-@compute @workgroup_size(256)
+@compute @workgroup_size(ROW_THREADS)
 fn answer_back(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = id.x;
     if (row >= ask.rows || counts[2] > ask.capacity) {
@@ -59,27 +44,14 @@ fn answer_back(@builtin(global_invocation_id) id: vec3<u32>) {
         d_log[k] = dot(column, d_m) * s[k];
         d_r[k] = s[k] * d_m;
     }
-    let w = unit.quat.x;
-    let x = unit.quat.y;
-    let y = unit.quat.z;
-    let z = unit.quat.w;
-    // d_r[j][i] is the gradient to row i, column j.
-    let d_unit = 2.0 * vec4<f32>(
-        x * (d_r[1][2] - d_r[2][1]) + y * (d_r[2][0] - d_r[0][2]) + z * (d_r[0][1] - d_r[1][0]),
-        w * (d_r[1][2] - d_r[2][1]) + y * (d_r[1][0] + d_r[0][1]) + z * (d_r[2][0] + d_r[0][2])
-            - 2.0 * x * (d_r[1][1] + d_r[2][2]),
-        w * (d_r[2][0] - d_r[0][2]) + x * (d_r[1][0] + d_r[0][1]) + z * (d_r[2][1] + d_r[1][2])
-            - 2.0 * y * (d_r[0][0] + d_r[2][2]),
-        w * (d_r[0][1] - d_r[1][0]) + x * (d_r[2][0] + d_r[0][2]) + y * (d_r[2][1] + d_r[1][2])
-            - 2.0 * z * (d_r[0][0] + d_r[1][1]),
-    );
-    var d_quat = vec4<f32>(0.0);
-    if (unit.norm > 0.0) {
-        d_quat = (d_unit - unit.quat * dot(unit.quat, d_unit)) / unit.norm;
+    let d_quat = unit_back(unit, rotation_back(unit.quat, d_r));
+    if (ask.poses_at > 0u) {
+        // The geometry's own poses are another frame's.
+        put_three(row, 0u, vec3<f32>(0.0));
+        put_four(row, QUAT, vec4<f32>(0.0));
     }
-    put_three(row, 0u, d0.xyz);
-    put(row, QUAT, d_quat.x);
-    put_three(row, QUAT + 1u, d_quat.yzw);
+    put_three(row, ask.poses_at, d0.xyz);
+    put_four(row, ask.poses_at + QUAT, d_quat);
     put_three(row, LOG_SCALE, d_log);
     put(row, OPACITY, d_logit);
     // d/d delta of v_k delta^k is k v_k delta^(k - 1).
@@ -93,8 +65,7 @@ fn answer_back(@builtin(global_invocation_id) id: vec3<u32>) {
     }
     if ((ask.flags & ASK_ROTATION) != 0u) {
         d_delta += dot(four(ask, row, ask.rates_at), d_quat);
-        put(row, ask.rates_at, delta * d_quat.x);
-        put_three(row, ask.rates_at + 1u, delta * d_quat.yzw);
+        put_four(row, ask.rates_at, delta * d_quat);
     }
     if (ask.life != LIFE_INFINITE) {
         let d_sigma = d0.w * opacity;

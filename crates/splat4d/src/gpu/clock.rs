@@ -93,6 +93,25 @@ impl GpuTimings {
             + self.adam
     }
 
+    /// The GPU's stages by name, in the order in which they run.
+    pub fn stages(&self) -> [(&'static str, f64); STAGES] {
+        [
+            ("answer", self.answer),
+            ("project", self.project),
+            ("compact", self.compact),
+            ("sort splats", self.sort_splats),
+            ("tiles", self.tiles),
+            ("sort pairs", self.sort_pairs),
+            ("rasterize", self.rasterize),
+            ("loss", self.loss),
+            ("rasterize backward", self.rasterize_back),
+            ("gather", self.gather),
+            ("splats backward", self.splats_back),
+            ("answer backward", self.answer_back),
+            ("adam", self.adam),
+        ]
+    }
+
     /// Adds the stages' milliseconds.
     pub(super) fn add(&mut self, stages: [f64; STAGES]) {
         let own = [

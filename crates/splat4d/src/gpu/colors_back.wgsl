@@ -4,7 +4,8 @@
 //
 // Bindings, group 0: 0 view; 1 ask; 2 counts ([2]: pairs); 3 geometry as answer.wgsl wrote it, 4 params: here the SH table; in and
 // out: 5 back as splats_back.wgsl wrote it, whose means are added to; 6 d_sh, as the SH table; 7 stats, three columns a row: sum
-// of |dL/dmean2d|, number of views that drew it, largest radius. Six storage buffers.
+// of |dL/dmean2d|, number of views that drew it, largest radius; 8 weights of the blocks of SH, of which the gradients take the
+// place. Seven storage buffers.
 // A thread owns one row.
 
 const GEOMETRY_WIDTH: u32 = 10u;
@@ -18,6 +19,7 @@ const STATS_WIDTH: u32 = 3u;
 @group(0) @binding(5) var<storage, read_write> back: array<vec4<f32>>;
 @group(0) @binding(6) var<storage, read_write> d_sh: array<f32>;
 @group(0) @binding(7) var<storage, read_write> stats: array<f32>;
+@group(0) @binding(8) var<storage, read_write> weights: array<f32>;
 
 // Gradients of the basis functions of shade.wgsl. Twin of math/sh.rs (basis_gradient).
 fn sh_basis_gradient(d: vec3<f32>) -> array<vec3<f32>, 16> {
@@ -47,7 +49,7 @@ fn sh_basis_gradient(d: vec3<f32>) -> array<vec3<f32>, 16> {
     );
 }
 
-@compute @workgroup_size(256)
+@compute @workgroup_size(ROW_THREADS)
 fn colors_back(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = id.x;
     // With too many pairs there are no gradients: the view is drawn again.
@@ -57,6 +59,14 @@ fn colors_back(@builtin(global_invocation_id) id: vec3<u32>) {
     if ((ask.flags & ASK_FIRST) != 0u) {
         for (var c = 0u; c < ask.sh_width; c++) {
             d_sh[at(row, c, ask.sh_width)] = 0.0;
+        }
+    }
+    var weight = vec3<f32>(1.0);
+    if (ask.blocks > 1u) {
+        for (var b = 0u; b < ask.blocks; b++) {
+            let i = at(row, b, ask.blocks);
+            weight[b] = weights[i];
+            weights[i] = 0.0;
         }
     }
     let splat = 5u * (ask.first_splat + row);
@@ -70,7 +80,8 @@ fn colors_back(@builtin(global_invocation_id) id: vec3<u32>) {
     stats[seen + 32u] = max(stats[seen + 32u], radius);
     // A channel that was clamped at 0 passes nothing.
     let v = select(vec3<f32>(0.0), back[splat + 3u].xyz, back[splat + 4u].xyz > vec3<f32>(0.0));
-    let used = sh_used(ask.sh_width / 3u, view.sh_degree);
+    let block = ask.sh_width / ask.blocks;
+    let used = sh_used(block / 3u, view.sh_degree);
     if (all(v == vec3<f32>(0.0)) || used == 0u) {
         return;
     }
@@ -81,13 +92,21 @@ fn colors_back(@builtin(global_invocation_id) id: vec3<u32>) {
     var basis = sh_basis(unit);
     var slopes = sh_basis_gradient(unit);
     var d_unit = vec3<f32>(0.0);
-    for (var k = 0u; k < used; k++) {
-        let i = at(row, 3u * k, ask.sh_width);
-        let d = basis[k] * v;
-        d_sh[i] += d.x;
-        d_sh[i + 16u] += d.y;
-        d_sh[i + 32u] += d.z;
-        d_unit += dot(vec3<f32>(params[i], params[i + 16u], params[i + 32u]), v) * slopes[k];
+    for (var b = 0u; b < ask.blocks; b++) {
+        var d_weight = 0.0;
+        for (var k = 0u; k < used; k++) {
+            let i = at(row, b * block + 3u * k, ask.sh_width);
+            let d = weight[b] * basis[k] * v;
+            d_sh[i] += d.x;
+            d_sh[i + 16u] += d.y;
+            d_sh[i + 32u] += d.z;
+            let light = dot(vec3<f32>(params[i], params[i + 16u], params[i + 32u]), v);
+            d_weight += basis[k] * light;
+            d_unit += weight[b] * light * slopes[k];
+        }
+        if (ask.blocks > 1u) {
+            weights[at(row, b, ask.blocks)] = d_weight;
+        }
     }
     if (used > 1u) {
         let d_mean = (d_unit - unit * dot(unit, d_unit)) * inverse;

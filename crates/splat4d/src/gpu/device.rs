@@ -1,6 +1,8 @@
 //! Choice and opening of the GPU: nothing beyond WebGPU's default limits is asked for, so that what runs here runs in
-//! a browser too; but for the size of buffers, which natively may be as large as the driver has them.
+//! a browser too; but for the size of buffers, which natively may be as large as the driver has them, and subgroups, where it has
+//! them.
 
+use super::tuning::Tuning;
 use crate::{Error, ErrorKind, Result};
 use std::future::Future;
 use std::pin::pin;
@@ -16,6 +18,9 @@ pub enum Adapters {
     Any,
 }
 
+/// Threads of the smallest and the largest subgroup that kernels can work with (rasterize_back_subgroup.wgsl).
+const SUBGROUPS: [u32; 2] = [8, 64];
+
 /// The first error that the driver reported since it was last asked for.
 type Trouble = Arc<Mutex<Option<(ErrorKind, String)>>>;
 
@@ -24,6 +29,8 @@ type Trouble = Arc<Mutex<Option<(ErrorKind, String)>>>;
 pub struct Gpu {
     pub(super) device: wgpu::Device,
     pub(super) queue: wgpu::Queue,
+    /// Of the kernels that are compiled for it.
+    pub(super) tuning: Tuning,
     info: wgpu::AdapterInfo,
     trouble: Trouble,
 }
@@ -61,7 +68,7 @@ impl Gpu {
         };
         let descriptor = wgpu::DeviceDescriptor {
             label: Some("splat4d"),
-            required_features: adapter.features() & wgpu::Features::TIMESTAMP_QUERY,
+            required_features: adapter.features() & (wgpu::Features::TIMESTAMP_QUERY | wgpu::Features::SUBGROUP),
             required_limits: limits,
             ..Default::default()
         };
@@ -75,7 +82,13 @@ impl Gpu {
             };
             first.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert((kind, e.to_string()));
         }));
-        Ok(Self { device, queue, info, trouble })
+        Ok(Self { device, queue, tuning: Tuning::default(), info, trouble })
+    }
+
+    /// The same with other constants in the kernels that are compiled from now on.
+    #[must_use]
+    pub fn tuned(self, tuning: Tuning) -> Self {
+        Self { tuning, ..self }
     }
 
     /// The card's name as its driver gives it.
@@ -83,16 +96,23 @@ impl Gpu {
         &self.info.name
     }
 
-    /// Card, kind, interface and driver in one line.
+    /// Card, kind, interface and driver in one line, and whether kernels use its subgroups.
     pub fn describe(&self) -> String {
         let i = &self.info;
         let driver = [i.driver.as_str(), i.driver_info.as_str()].join(" ");
-        format!("{} ({:?}, {}, {})", i.name, i.device_type, i.backend, driver.trim())
+        let with = if self.has_subgroups() { ", with subgroups" } else { "" };
+        format!("{} ({:?}, {}, {}{with})", i.name, i.device_type, i.backend, driver.trim())
     }
 
     /// Whether the GPU's own clock can be read.
     pub(crate) fn has_timestamps(&self) -> bool {
         self.device.features().contains(wgpu::Features::TIMESTAMP_QUERY)
+    }
+
+    /// Whether kernels are compiled that exchange numbers within subgroups.
+    pub(crate) fn has_subgroups(&self) -> bool {
+        let fits = self.info.subgroup_min_size >= SUBGROUPS[0] && self.info.subgroup_max_size <= SUBGROUPS[1];
+        self.tuning.subgroups && fits && self.device.features().contains(wgpu::Features::SUBGROUP)
     }
 
     /// Waits until all work has been done.

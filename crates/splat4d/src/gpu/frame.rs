@@ -12,8 +12,6 @@ use wgpu::{BindGroup, BindingResource, ComputePass};
 pub(super) const TILE: usize = 16;
 /// Threads of every workgroup.
 pub(super) const THREADS: usize = 256;
-/// Things in a block of a scan or a sort (scan.wgsl, sort.wgsl).
-pub(super) const BLOCK: usize = 2048;
 /// Digits of a sort's pass; each has a workgroup in its scan.
 pub(super) const DIGITS: usize = 256;
 /// Passes that sort 32 bits.
@@ -250,7 +248,7 @@ impl Frame<'_> {
             }
         })?;
         recorder.stage(Stage::Compact, |pass| {
-            self.scan(pass, &self.groups.scan_visible, Size::Known(splats.div_ceil(BLOCK)));
+            self.scan(pass, &self.groups.scan_visible, Size::Known(splats.div_ceil(self.gpu.tuning.block())));
             pass.set_bind_group(0, &self.groups.compact, &[]);
             dispatch(pass, &k.compact, 0, b, Size::Known(splats.div_ceil(THREADS)));
         })?;

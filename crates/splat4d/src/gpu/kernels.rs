@@ -25,7 +25,7 @@ impl Kernel {
         let device = &gpu.device;
         let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
             label: Some(label),
-            source: wgpu::ShaderSource::Wgsl(sources.join("\n").into()),
+            source: wgpu::ShaderSource::Wgsl(gpu.tuning.text(&sources.join("\n")).into()),
         });
         let entry = |(i, kind): (usize, &Kind)| wgpu::BindGroupLayoutEntry {
             binding: i as u32,
@@ -173,8 +173,18 @@ pub(super) struct ResidentKernels {
     pub colors_back: Kernel,
     /// answer_back
     pub answer_back: Kernel,
+    /// answer of Gaussians of space and time
+    pub slice_answer: Kernel,
+    /// answer_back of the same
+    pub slice_back: Kernel,
+    /// count_rows, row_losses
+    pub row_losses: Kernel,
+    /// turns_of, hold
+    pub ties: Kernel,
     /// adam
     pub adam: Kernel,
+    /// shake
+    pub shake: Kernel,
 }
 
 impl ResidentKernels {
@@ -192,15 +202,43 @@ impl ResidentKernels {
                 gpu,
                 "colours, backward",
                 &[wgsl::PROJECT, wgsl::SHADE, wgsl::LEARNT, wgsl::COLORS_BACK],
-                &[Uniform, Uniform, Read, Read, Read, Write, Write, Write],
+                &[Uniform, Uniform, Read, Read, Read, Write, Write, Write, Write],
                 &["colors_back"],
             ),
             answer_back: Kernel::new(
                 gpu,
                 "answer, backward",
-                &[wgsl::LEARNT, wgsl::ANSWER_BACK],
+                &[wgsl::LEARNT, wgsl::PUT, wgsl::ANSWER_BACK],
                 &[Uniform, Read, Read, Read, Write],
                 &["answer_back"],
+            ),
+            slice_answer: Kernel::new(
+                gpu,
+                "slice",
+                &[wgsl::LEARNT, wgsl::NUMBERS, wgsl::SLICE, wgsl::SLICE_ANSWER],
+                &[Uniform, Read, Write, Write, Write],
+                &["answer"],
+            ),
+            slice_back: Kernel::new(
+                gpu,
+                "slice, backward",
+                &[wgsl::LEARNT, wgsl::PUT, wgsl::NUMBERS, wgsl::SLICE, wgsl::SLICE_BACK],
+                &[Uniform, Read, Read, Read, Read, Write],
+                &["answer_back"],
+            ),
+            row_losses: Kernel::new(
+                gpu,
+                "losses on rows",
+                &[wgsl::LEARNT, wgsl::NUMBERS, wgsl::ROW_LOSSES],
+                &[Uniform, Uniform, Read, Read, Read, Write, Write],
+                &["count_rows", "row_losses"],
+            ),
+            ties: Kernel::new(
+                gpu,
+                "ties",
+                &[wgsl::LEARNT, wgsl::TIES],
+                &[Uniform, Uniform, Read, Read, Read, Read, Write, Write, Write, Read],
+                &["turns_of", "hold"],
             ),
             adam: Kernel::new(
                 gpu,
@@ -208,6 +246,13 @@ impl ResidentKernels {
                 &[wgsl::ADAM],
                 &[Uniform, Read, Write, Read, Write, Read, Read, Write],
                 &["adam"],
+            ),
+            shake: Kernel::new(
+                gpu,
+                "shake",
+                &[wgsl::LEARNT, wgsl::NUMBERS, wgsl::SHAKE],
+                &[Uniform, Uniform, Read, Read, Write],
+                &["shake"],
             ),
         }
     }
@@ -229,6 +274,7 @@ pub(super) struct BackKernels {
 impl BackKernels {
     /// Compiles everything.
     pub(super) fn new(gpu: &Gpu) -> Self {
+        let rasterize_back = if gpu.has_subgroups() { wgsl::RASTERIZE_BACK_SUBGROUP } else { wgsl::RASTERIZE_BACK };
         Self {
             loss: Kernel::new(
                 gpu,
@@ -240,7 +286,7 @@ impl BackKernels {
             rasterize: Kernel::new(
                 gpu,
                 "rasterize, backward",
-                &[wgsl::PROJECT, wgsl::RASTERIZE_BACK],
+                &[wgsl::PROJECT, wgsl::BLEND_BACK, rasterize_back],
                 &[Uniform, Uniform, Read, Read, Read, Read, Read, Read, Read, Write],
                 &["rasterize_back"],
             ),

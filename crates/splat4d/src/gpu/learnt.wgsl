@@ -1,10 +1,12 @@
 // Learnable rows of a layer that stays on the GPU, and what they are at time t. Twin of motion/still.rs (activate and its VJP),
-// motion/spacetime.rs and scene/life.rs.
+// motion/spacetime.rs, scene/life.rs, and of motion/tracked.rs on a frame.
 //
 // No bindings and no entry point, but for `params`, which whoever includes this binds: all tables of a layer but the SH, one
 // after the other, [row / 16][column][16].
 
 const TABLE_BLOCK: u32 = 16u;
+// Threads of a workgroup of the kernels over rows (gpu/tuning.rs).
+const ROW_THREADS: u32 = 256u;
 // Columns of geometry: mean, raw quaternion wxyz, log scales, opacity logit (scene/params.rs).
 const QUAT: u32 = 3u;
 const LOG_SCALE: u32 = 7u;
@@ -37,6 +39,13 @@ struct Ask {
     first_splat: u32,
     capacity: u32,      // pairs that there is room for
     sh_width: u32,
+    blocks: u32,        // of spherical harmonics
+    poses_at: u32,      // mean and quaternion: 0, or where the poses of a tracked frame are
+    own_at: u32,        // what Gaussians of space and time have besides (slice.wgsl), and their numbers
+    speed: f32,
+    floor: f32,
+    ceiling: f32,
+    pace: f32,
 }
 
 struct Moved {
@@ -72,8 +81,8 @@ fn delta_of(ask: Ask, row: u32) -> f32 {
 
 fn moved(ask: Ask, row: u32, delta: f32) -> Moved {
     var out: Moved;
-    out.mean = three(ask, row, 0u);
-    out.quat = four(ask, row, QUAT);
+    out.mean = three(ask, row, ask.poses_at);
+    out.quat = four(ask, row, ask.poses_at + QUAT);
     out.log_scale = three(ask, row, LOG_SCALE);
     out.logit = params[at(row, OPACITY, ask.width)];
     var power = 1.0;
@@ -138,4 +147,29 @@ fn rotation_rows(q: vec4<f32>) -> mat3x3<f32> {
         vec3<f32>(2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
         vec3<f32>(2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
     );
+}
+
+// From the gradient of that rotation to the quaternion's: d[j][i] is the one to row i, column j. Twin of math/quat.rs.
+fn rotation_back(q: vec4<f32>, d: mat3x3<f32>) -> vec4<f32> {
+    let w = q.x;
+    let x = q.y;
+    let y = q.z;
+    let z = q.w;
+    return 2.0 * vec4<f32>(
+        x * (d[1][2] - d[2][1]) + y * (d[2][0] - d[0][2]) + z * (d[0][1] - d[1][0]),
+        w * (d[1][2] - d[2][1]) + y * (d[1][0] + d[0][1]) + z * (d[2][0] + d[0][2])
+            - 2.0 * x * (d[1][1] + d[2][2]),
+        w * (d[2][0] - d[0][2]) + x * (d[1][0] + d[0][1]) + z * (d[2][1] + d[1][2])
+            - 2.0 * y * (d[0][0] + d[2][2]),
+        w * (d[0][1] - d[1][0]) + x * (d[2][0] + d[0][2]) + y * (d[2][1] + d[1][2])
+            - 2.0 * z * (d[0][0] + d[1][1]),
+    );
+}
+
+// From the gradient of the unit quaternion to that of the one before.
+fn unit_back(unit: Unit, d: vec4<f32>) -> vec4<f32> {
+    if (unit.norm > 0.0) {
+        return (d - unit.quat * dot(unit.quat, d)) / unit.norm;
+    }
+    return vec4<f32>(0.0);
 }

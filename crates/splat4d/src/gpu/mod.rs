@@ -24,11 +24,13 @@ mod resident;
 mod roofline;
 #[cfg(test)]
 mod tests;
+mod tuning;
 mod upload;
 
 pub use clock::{GpuTimings, StageClock};
 pub use device::{Adapters, Gpu};
 pub use roofline::GpuRoofline;
+pub use tuning::Tuning;
 
 use crate::render::backend::refusal;
 use crate::render::{
@@ -40,7 +42,7 @@ use crate::{Error, ErrorKind, Result};
 use back::Returned;
 use buffers::{Buffers, UNIFORM_STRIDE, largest_binding};
 use clock::{Queries, Recorder, TIMES_BYTES};
-use frame::{BLOCK, Band, DIGITS, Frame, Groups, RANGE_BYTES, THREADS, TILE, arguments, count, slot};
+use frame::{Band, DIGITS, Frame, Groups, RANGE_BYTES, THREADS, TILE, arguments, count, slot};
 use kernels::{BackKernels, Kernels};
 use pictures::Pictures;
 use rayon::prelude::*;
@@ -235,7 +237,7 @@ impl GpuRenderer {
         }
         fresh |= b.shapes.ensure(gpu, 32 * n)?;
         fresh |= b.colors.ensure(gpu, 16 * n)?;
-        let blocks = n.div_ceil(BLOCK as u64);
+        let blocks = n.div_ceil(gpu.tuning.block() as u64);
         for buffer in [&mut b.marks, &mut b.places, &mut b.tile_counts, &mut b.first_pairs] {
             fresh |= buffer.ensure(gpu, 4 * n)?;
         }
@@ -243,7 +245,7 @@ impl GpuRenderer {
             fresh |= buffer.ensure(gpu, 4 * n)?;
         }
         fresh |= b.scan_sums.ensure(gpu, 4 * blocks)?;
-        fresh |= b.sort_counts.ensure(gpu, sort_bytes(b.depth_keys[0].bytes() / 4))?;
+        fresh |= b.sort_counts.ensure(gpu, sort_bytes(gpu, b.depth_keys[0].bytes() / 4))?;
         fresh |= b.times.ensure(gpu, TIMES_BYTES)?;
         if b.pair_keys[0].bytes() == 0 {
             let (each, least) = FIRST_PAIRS;
@@ -260,7 +262,7 @@ impl GpuRenderer {
         for buffer in b.pair_keys.iter_mut().chain(&mut b.pair_values).chain([&mut b.owners]) {
             fresh |= buffer.ensure(gpu, 4 * pairs as u64)?;
         }
-        fresh |= b.sort_counts.ensure(gpu, sort_bytes(b.pair_keys[0].bytes() / 4))?;
+        fresh |= b.sort_counts.ensure(gpu, sort_bytes(gpu, b.pair_keys[0].bytes() / 4))?;
         Ok(fresh)
     }
 
@@ -479,8 +481,8 @@ fn counts_at(planes: u64) -> u64 {
 }
 
 /// Bytes of the sort's counts for so many pairs.
-fn sort_bytes(pairs: u64) -> u64 {
-    4 * DIGITS as u64 * (pairs.div_ceil(BLOCK as u64) + 1)
+fn sort_bytes(gpu: &Gpu, pairs: u64) -> u64 {
+    4 * DIGITS as u64 * (pairs.div_ceil(gpu.tuning.block() as u64) + 1)
 }
 
 /// Writes a structure into its slot.

@@ -5,10 +5,12 @@
 // pixel used), 3 values (pairs, sorted by tile, then nearest first), 4 owners (of a pair: splat and quadrants);
 // 5 shapes, 6 colors; out: 7 planes: red, green, blue over the background, alpha, depth (sum of z alpha T), each
 // [rows of the band][width]. Six storage buffers, 12 KiB of workgroup memory.
-// A workgroup owns a tile of 16 x 16 pixels, 64 neighbouring threads a quadrant of it, a thread a pixel; 256 splats at a
-// time are read by all threads together.
+// A workgroup owns a tile of 16 x 16 pixels, 64 neighbouring threads a quadrant of it, a thread a pixel; splats are
+// read in batches by all threads together.
 
 const TILE: u32 = 16u;
+const THREADS: u32 = 256u;
+// Splats that are read at a time, at most one a thread (gpu/tuning.rs).
 const BATCH: u32 = 256u;
 // Pixels across and down a quadrant, and the split of an owner (tiles.wgsl).
 const QUADRANT: u32 = 8u;
@@ -35,11 +37,11 @@ struct Blend {
 @group(0) @binding(6) var<storage, read> colors: array<vec4<f32>>;
 @group(0) @binding(7) var<storage, read_write> planes: array<f32>;
 
-var<workgroup> batch_center: array<vec2<f32>, 256>;
+var<workgroup> batch_center: array<vec2<f32>, BATCH>;
 // The exponent's factors in powers of 2, and log2 of the opacity.
-var<workgroup> batch_power: array<vec4<f32>, 256>;
-var<workgroup> batch_color: array<vec4<f32>, 256>;
-var<workgroup> batch_quadrants: array<u32, 256>;
+var<workgroup> batch_power: array<vec4<f32>, BATCH>;
+var<workgroup> batch_color: array<vec4<f32>, BATCH>;
+var<workgroup> batch_quadrants: array<u32, BATCH>;
 var<workgroup> stopped: atomic<u32>;
 var<workgroup> all_stopped: u32;
 var<workgroup> last_used: atomic<u32>;
@@ -81,11 +83,11 @@ fn rasterize(
         if (thread == 0u) {
             all_stopped = atomicLoad(&stopped);
         }
-        if (workgroupUniformLoad(&all_stopped) == BATCH) {
+        if (workgroupUniformLoad(&all_stopped) == THREADS) {
             break;
         }
         let own = start + thread;
-        if (own < end) {
+        if (thread < BATCH && own < end) {
             let owner = owners[values[own]];
             let splat = owner & OWNER_SPLAT;
             batch_quadrants[thread] = owner >> OWNER_SHIFT;

@@ -1,70 +1,29 @@
 // The way back through a tile: of each pair of tile and splat one record of twelve sums, at a place that is known
-// beforehand, so that nothing is added atomically. Twin of Returning in render/blend.rs, where the equations stand.
-// render/project.wgsl is put in front of this file.
+// beforehand, so that nothing is added atomically. render/project.wgsl and blend_back.wgsl, where bindings and twin stand, are
+// put in front of this file. 16 KiB of workgroup memory; rasterize_back_subgroup.wgsl is for devices with subgroups.
 //
-// Bindings, group 0: 0 view; 1 blend; 2 ranges (three u32 a tile), 3 values, 4 owners, 5 shapes, 6 colors and 7 planes as
-// rasterize.wgsl read and wrote them; 8 d_planes: gradient to the planes, laid out as they are; out: 9 records, twelve
-// numbers a pair, cleared to 0 before, and behind them (at blend.sums_at) three a tile, the gradient to the background.
-// Eight storage buffers, 16 KiB of workgroup memory.
-// A workgroup owns a tile and goes front to back in rounds of four splats: a thread owns a pixel and writes v = dL/d ln
+// A workgroup owns a tile and goes front to back in rounds of up to four splats: a thread owns a pixel and writes v = dL/d ln
 // alpha and the weight w = alpha T of each splat; then a thread owns a splat, a column of the tile and a quarter of the
 // sums; then a thread owns one sum of one splat, and adds the columns in order.
-//
-// Of a record: 0 v, 1 v dx, 2 v dx^2, 3 v dy, 4 v dx dy, 5 v dy^2, 6 to 9 gradient to red, green, blue and depth, 10 and
-// 11 absolute gradients to the centre, where they are wanted.
 
-const TILE: u32 = 16u;
-// Pixels across and down a quadrant, and the split of an owner (tiles.wgsl).
-const QUADRANT: u32 = 8u;
-const OWNER_SHIFT: u32 = 28u;
-const OWNER_SPLAT: u32 = 0x0fffffffu;
-const LOG2_E: f32 = 1.4426950408889634;
-// Splats in a round: more need more than 16 KiB.
+// Splats in a round, at most one for 64 threads: more need more than 16 KiB (gpu/tuning.rs).
 const ROUND: u32 = 4u;
 // Numbers between two rows of pixels in workgroup memory, and in a splat's plane of them: one more than pixels, so that
 // columns lie in different banks.
 const ROW: u32 = 17u;
 const PLANE: u32 = 272u;
-const NUMBERS: u32 = 12u;
-// Bits of blend.flags: there is a gradient to alpha, to depth; absolute gradients are wanted.
-const BACK_ALPHA: u32 = 1u;
-const BACK_DEPTH: u32 = 2u;
-const BACK_ABS: u32 = 4u;
 
-struct Blend {
-    background: vec3<f32>,
-    alpha_max: f32,
-    transmittance_min: f32,
-    first_row: u32,
-    pixel_rows: u32,
-    flags: u32,
-    sums_at: u32, // number of the first sum behind the records
-}
-
-@group(0) @binding(0) var<uniform> view: View;
-@group(0) @binding(1) var<uniform> blend: Blend;
-@group(0) @binding(2) var<storage, read> ranges: array<u32>;
-@group(0) @binding(3) var<storage, read> values: array<u32>;
-@group(0) @binding(4) var<storage, read> owners: array<u32>;
-@group(0) @binding(5) var<storage, read> shapes: array<vec4<f32>>;
-@group(0) @binding(6) var<storage, read> colors: array<vec4<f32>>;
-@group(0) @binding(7) var<storage, read> planes: array<f32>;
-@group(0) @binding(8) var<storage, read> d_planes: array<f32>;
-@group(0) @binding(9) var<storage, read_write> records: array<f32>;
-
-// ROUND x PLANE.
-var<workgroup> round_v: array<f32, 1088>;
-var<workgroup> round_w: array<f32, 1088>;
+var<workgroup> round_v: array<f32, ROUND * PLANE>;
+var<workgroup> round_w: array<f32, ROUND * PLANE>;
 // Gradient to red, green, blue and depth, [row][column].
 var<workgroup> pixel_g: array<vec4<f32>, 256>;
-// ROUND x NUMBERS x TILE.
-var<workgroup> columns: array<f32, 768>;
-var<workgroup> round_center: array<vec2<f32>, 4>;
-var<workgroup> round_power: array<vec4<f32>, 4>;
-var<workgroup> round_color: array<vec4<f32>, 4>;
-var<workgroup> round_conic: array<vec4<f32>, 4>;
-var<workgroup> round_quadrants: array<u32, 4>;
-var<workgroup> round_pair: array<u32, 4>;
+var<workgroup> columns: array<f32, ROUND * NUMBERS * TILE>;
+var<workgroup> round_center: array<vec2<f32>, ROUND>;
+var<workgroup> round_power: array<vec4<f32>, ROUND>;
+var<workgroup> round_color: array<vec4<f32>, ROUND>;
+var<workgroup> round_conic: array<vec4<f32>, ROUND>;
+var<workgroup> round_quadrants: array<u32, ROUND>;
+var<workgroup> round_pair: array<u32, ROUND>;
 
 @compute @workgroup_size(256)
 fn rasterize_back(
@@ -83,29 +42,16 @@ fn rasterize_back(
     let tile = group.y * groups.x + group.x;
     let first = ranges[3u * tile];
     let end = ranges[3u * tile + 2u];
-    let log_min = log2(view.alpha_min);
-    let log_max = log2(blend.alpha_max);
+    let limits = log2(vec2<f32>(view.alpha_min, blend.alpha_max));
     var open = x < width && y < blend.pixel_rows;
-    var g = vec4<f32>(0.0);
-    // The gradient times the light that is still to come, background included.
-    var rest = 0.0;
-    var behind = 0.0;
+    var own: Seen;
     if (open) {
-        let plane = width * blend.pixel_rows;
-        let at = y * width + x;
-        behind = 1.0 - planes[3u * plane + at];
-        g = vec4<f32>(d_planes[at], d_planes[plane + at], d_planes[2u * plane + at], 0.0);
-        rest = g.x * planes[at] + g.y * planes[plane + at] + g.z * planes[2u * plane + at];
-        if ((blend.flags & BACK_ALPHA) != 0u) {
-            rest -= behind * d_planes[3u * plane + at];
-        }
-        if ((blend.flags & BACK_DEPTH) != 0u) {
-            g.w = d_planes[4u * plane + at];
-            rest += g.w * planes[4u * plane + at];
-        }
+        own = seen(y * width + x, width * blend.pixel_rows);
     }
+    let g = own.g;
+    var rest = own.rest;
     pixel_g[py * TILE + px] = g;
-    round_v[py * ROW + px] = behind;
+    round_v[py * ROW + px] = own.behind;
     workgroupBarrier();
     // The background's gradient, in the same two steps as the records' sums.
     if (thread < TILE) {
@@ -151,25 +97,12 @@ fn rasterize_back(
             var v = 0.0;
             var w = 0.0;
             if (open && ((round_quadrants[i] >> quadrant) & 1u) != 0u) {
-                let d = round_center[i] - pixel;
-                let p = round_power[i];
-                let power = min((p.z * d.y + p.y * d.x) * d.y + p.x * d.x * d.x + p.w, p.w);
-                if (power >= log_min) {
-                    let alpha = min(blend.alpha_max, exp2(power));
-                    let next = t * (1.0 - alpha);
-                    if (next < blend.transmittance_min) {
-                        open = false;
-                    } else {
-                        w = alpha * t;
-                        let light = dot(g, round_color[i]);
-                        rest -= w * light;
-                        // Nothing passes where alpha is at its ceiling.
-                        if (power < log_max) {
-                            v = w * light - alpha / (1.0 - alpha) * rest;
-                        }
-                        t = next;
-                    }
-                }
+                let s = passed(round_center[i] - pixel, round_power[i], round_color[i], g, rest, t, limits);
+                v = s.v;
+                w = s.w;
+                rest = s.rest;
+                t = s.t;
+                open = s.open;
             }
             round_v[i * PLANE + py * ROW + px] = v;
             round_w[i * PLANE + py * ROW + px] = w;

@@ -1,71 +1,43 @@
 //! Tables that stay on the GPU: rows become splats, splats a picture, and its loss steps of Adam, without a number of them
 //! passing through the CPU. Densification, files and whatever else looks at a scene fetch the tables, and hand them back.
 
+#[cfg(test)]
+mod tests;
+mod ties;
+mod uniforms;
+
 use super::buffers::{Buffers, Grown, UNIFORM_STRIDE};
 use super::clock::{Recorder, Stage};
 use super::device::Gpu;
 use super::frame::{THREADS, count, slot};
-use super::kernels::ResidentKernels;
+use super::kernels::{Kernel, ResidentKernels};
 use super::upload::Upload;
 use super::{GpuRenderer, MOST_GROUPS};
-use crate::render::{KEPT, KeptLayer, KeptNumbers, KeptRule, KeptStep, KeptStepped, KeptTable, Moves, Resident, Shot};
+use crate::render::{
+    KEPT, KeptLayer, KeptNumbers, KeptStep, KeptStepped, KeptTable, Moves, Resident, RowWeights, Shot,
+};
 use crate::scene::{BLOCK, LifeKind, Splats};
 use crate::{Error, ErrorKind, Result};
+use std::borrow::Cow;
 use std::ops::Range;
+use ties::Tied;
+use uniforms::{Ask, MOST_COLUMNS, Rule};
 
 /// Number of the SH table; those before it lie side by side in one buffer.
 const SH: usize = KEPT - 1;
 /// Columns of the geometry that splats are made of (mean, covariance, opacity) and of a row's statistics.
 const GEOMETRY_WIDTH: usize = 10;
 const STATS_WIDTH: usize = 3;
-/// Most columns of a table (adam.wgsl).
-const MOST_COLUMNS: usize = 48;
-/// Bits of `Ask::flags` (learnt.wgsl).
-const FLAG_ROTATION: u32 = 1;
-const FLAG_DETACH: u32 = 2;
-const FLAG_FIRST: u32 = 4;
-/// Structures a layer in the buffer of uniforms: what is asked, and a rule a table.
-const SLOTS: usize = 1 + KEPT;
-
-/// `struct Ask` of learnt.wgsl.
-#[repr(C)]
-#[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
-struct Ask {
-    rows: u32,
-    width: u32,
-    order: u32,
-    flags: u32,
-    life: u32,
-    life_at: u32,
-    velocities_at: u32,
-    rates_at: u32,
-    t: f32,
-    delta: f32,
-    alpha_min: f32,
-    widest: f32,
-    first_splat: u32,
-    capacity: u32,
-    sh_width: u32,
-    unused: u32,
-}
-
-/// `struct Rule` of adam.wgsl.
-#[repr(C)]
-#[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
-struct Rule {
-    rows: u32,
-    width: u32,
-    stride: u32,
-    first: u32,
-    moments_stride: u32,
-    moments_first: u32,
-    counted: u32,
-    floor_column: u32,
-    floor_least: f32,
-    capacity: u32,
-    word: u32,
-    unused: u32,
-    rates: [f32; MOST_COLUMNS],
+/// Pieces in which Adam takes the widest table: three blocks of SH of degree 3.
+const PIECES: usize = 3;
+/// Structures a layer in the buffer of uniforms: what is asked, a rule a piece of a table, losses on rows, noise, ties.
+mod at {
+    pub(super) const ASK: usize = 0;
+    pub(super) const RULES: usize = 1;
+    pub(super) const ROWS: usize = RULES + super::KEPT * super::PIECES;
+    pub(super) const NOISE: usize = ROWS + 1;
+    pub(super) const TIES: usize = ROWS + 2;
+    pub(super) const ALL: usize = ROWS + 3;
 }
 
 /// The tables of one layer.
@@ -83,6 +55,7 @@ struct Kept {
     sh_moments: Grown,
     stats: Grown,
     alive: Grown,
+    ties: Option<Tied>,
 }
 
 impl Kept {
@@ -99,12 +72,13 @@ impl Kept {
             sh_moments: Grown::storage("moments of a layer's colours"),
             stats: Grown::storage("a layer's statistics"),
             alive: Grown::storage("a layer's living rows"),
+            ties: None,
         }
     }
 
     fn bytes(&self) -> u64 {
         let all = [&self.params, &self.d_params, &self.moments, &self.d_sh, &self.sh_moments, &self.stats, &self.alive];
-        all.iter().map(|b| b.bytes()).sum()
+        all.iter().map(|b| b.bytes()).sum::<u64>() + self.ties.as_ref().map_or(0, Tied::bytes)
     }
 
     /// First column of a table but the SH, and of its moments.
@@ -120,6 +94,24 @@ impl Kept {
 
     fn groups(&self) -> u32 {
         self.rows.div_ceil(THREADS) as u32
+    }
+
+    /// The same of the kernels whose workgroups may have another size.
+    fn row_groups(&self, gpu: &Gpu) -> u32 {
+        self.rows.div_ceil(gpu.tuning.row_threads) as u32
+    }
+
+    /// The kernels of its motion.
+    fn kernels<'a>(&self, k: &'a ResidentKernels) -> [&'a Kernel; 2] {
+        match self.moves {
+            Moves::Sliced { .. } => [&k.slice_answer, &k.slice_back],
+            _ => [&k.answer, &k.answer_back],
+        }
+    }
+
+    /// First columns of the pieces in which Adam takes a table.
+    fn pieces(&self, table: usize) -> impl Iterator<Item = usize> {
+        (0..self.widths[table]).step_by(MOST_COLUMNS)
     }
 }
 
@@ -160,14 +152,37 @@ impl Tables {
         self.upload.bytes() + own.iter().sum::<u64>() + self.layers.iter().map(Kept::bytes).sum::<u64>()
     }
 
-    /// Words that tell of numbers that are not finite.
-    fn words(&self) -> usize {
-        self.layers.len() * KEPT
+    /// What steps leave in their status.
+    fn status(&self) -> Status {
+        let groups = |f: &dyn Fn(&Kept) -> usize| -> Vec<usize> { self.layers.iter().map(f).collect() };
+        let rows = groups(&|l| l.groups() as usize);
+        let ties = groups(&|l| l.ties.as_ref().map_or(0, |t| t.groups() as usize));
+        let mut next = self.layers.len() * (KEPT + 1);
+        let mut place = |groups: usize| {
+            let first = next;
+            next += groups;
+            first
+        };
+        let sums = rows.iter().zip(&ties).map(|(rows, ties)| [place(*rows), place(*ties)]).collect();
+        Status { bad: 0, alive: self.layers.len() * KEPT, sums, words: next }
     }
 
     fn rows(&self) -> usize {
         self.layers.iter().map(|l| l.rows).sum()
     }
+}
+
+/// The words that a step leaves behind the loss's sums, from 0 on.
+#[derive(Debug)]
+struct Status {
+    /// One a table: one more than the last row whose number is not finite.
+    bad: usize,
+    /// Rows alive, by layer.
+    alive: usize,
+    /// By layer the first sums of losses on rows and of ties, one a workgroup.
+    sums: Vec<[usize; 2]>,
+    /// All of them.
+    words: usize,
 }
 
 /// Tables side by side: block by block, the columns of one after those of the other.
@@ -183,6 +198,12 @@ fn side_by_side(tables: &[(&[f32], usize)]) -> Vec<f32> {
     out
 }
 
+/// The moments of a table of so many rows: zeros where it has not learnt.
+fn history<'a>(table: &KeptTable<'a>, rows: usize) -> Cow<'a, [f32]> {
+    let numbers = rows * moments_width(table.width);
+    if table.moments.is_empty() { Cow::Owned(vec![0.0; numbers]) } else { Cow::Borrowed(table.moments) }
+}
+
 /// The other way round: some columns of tables that lie side by side.
 fn apart(all: &[f32], stride: usize, columns: Range<usize>) -> Vec<f32> {
     all.chunks_exact(stride.max(1) * BLOCK)
@@ -191,7 +212,7 @@ fn apart(all: &[f32], stride: usize, columns: Range<usize>) -> Vec<f32> {
         .collect()
 }
 
-fn send(gpu: &Gpu, buffer: &mut Grown, data: &[f32]) -> Result<()> {
+fn send<T: bytemuck::NoUninit>(gpu: &Gpu, buffer: &mut Grown, data: &[T]) -> Result<()> {
     buffer.ensure(gpu, size_of_val(data) as u64)?;
     if !data.is_empty() {
         gpu.queue.write_buffer(buffer.get(), 0, bytemuck::cast_slice(data));
@@ -211,83 +232,47 @@ impl KeptPass<'_> {
         self.view + 1 == self.step.views.len()
     }
 
-    /// Numbers behind the loss's in its buffer: the words of Adam.
+    /// Words behind the loss's numbers in its buffer.
     pub(super) fn words(&self) -> usize {
-        self.tables.words()
+        self.tables.status().words
+    }
+
+    /// Whether losses look at rows.
+    fn has_row_losses(&self) -> bool {
+        self.step.rows != RowWeights::default()
     }
 
     /// Writes what is asked and by which rules is learnt, for so many pairs.
     pub(super) fn write_uniforms(&self, gpu: &Gpu, capacity: usize) {
-        let mut out = vec![0u8; self.tables.layers.len() * SLOTS * UNIFORM_STRIDE as usize];
+        let Self { tables, step, view } = *self;
+        let status = tables.status();
+        let mut out = vec![0u8; tables.layers.len() * at::ALL * UNIFORM_STRIDE as usize];
         let mut put =
             |at: usize, bytes: &[u8]| out[at * UNIFORM_STRIDE as usize..][..bytes.len()].copy_from_slice(bytes);
         let mut first_splat = 0;
-        for (i, layer) in self.tables.layers.iter().enumerate() {
-            let ask = self.ask(layer, first_splat, capacity);
-            put(i * SLOTS, bytemuck::bytes_of(&ask));
+        for (i, layer) in tables.layers.iter().enumerate() {
+            let slot = |at: usize| i * at::ALL + at;
+            let ask = Ask::new(layer, step, view, first_splat, capacity);
+            put(slot(at::ASK), bytemuck::bytes_of(&ask));
             first_splat += layer.rows;
-            for (table, rule) in self.step.rules[i].iter().enumerate() {
-                if let Some(rule) = rule {
-                    let rule = self.rule(layer, table, i * KEPT + table, rule, capacity);
-                    put(i * SLOTS + 1 + table, bytemuck::bytes_of(&rule));
+            for (table, rule) in step.rules[i].iter().enumerate() {
+                let Some(rule) = rule else { continue };
+                for (piece, from) in layer.pieces(table).enumerate() {
+                    let [counted, word] = [tables.counted, status.bad + i * KEPT + table];
+                    let rule = Rule::new(layer, table, from, rule, [counted, word, capacity]);
+                    put(slot(at::RULES + table * PIECES + piece), bytemuck::bytes_of(&rule));
                 }
             }
+            let [row_sums, tie_sums] = status.sums[i];
+            put(slot(at::ROWS), bytemuck::bytes_of(&uniforms::RowRule::new(&step.rows, [status.alive + i, row_sums])));
+            if let Some(noise) = &step.noise[i] {
+                put(slot(at::NOISE), bytemuck::bytes_of(&uniforms::Noise::new(noise)));
+            }
+            if let Some(ties) = &layer.ties {
+                put(slot(at::TIES), bytemuck::bytes_of(&ties.rule(tie_sums)));
+            }
         }
-        gpu.queue.write_buffer(self.tables.uniforms.get(), 0, &out);
-    }
-
-    fn ask(&self, layer: &Kept, first_splat: usize, capacity: usize) -> Ask {
-        let flag = |on: bool, flag: u32| if on { flag } else { 0 };
-        let (moves, t) = (layer.moves, self.step.views[self.view].t.0);
-        let life = match layer.life {
-            LifeKind::Infinite => 0,
-            LifeKind::GaussHalf => 1,
-            LifeKind::GaussOne => 2,
-            LifeKind::Interval => 3,
-        };
-        let [_, life_at, velocities_at, rates_at, _] = std::array::from_fn(|table| layer.first(table)[0] as u32);
-        Ask {
-            rows: layer.rows as u32,
-            width: layer.strides()[0] as u32,
-            order: moves.order as u32,
-            flags: flag(moves.rotation, FLAG_ROTATION)
-                | flag(moves.detach, FLAG_DETACH)
-                | flag(self.view == 0, FLAG_FIRST),
-            life,
-            life_at,
-            velocities_at,
-            rates_at,
-            t: t as f32,
-            delta: (t - moves.origin) as f32,
-            alpha_min: self.step.alpha_min as f32,
-            widest: (2.0 * -self.step.alpha_min.ln()).sqrt() as f32,
-            first_splat: first_splat as u32,
-            capacity: capacity as u32,
-            sh_width: layer.widths[SH] as u32,
-            unused: 0,
-        }
-    }
-
-    fn rule(&self, layer: &Kept, table: usize, word: usize, rule: &KeptRule, capacity: usize) -> Rule {
-        let width = layer.widths[table];
-        let ([first, moments_first], [stride, moments_stride]) =
-            if table == SH { ([0; 2], [width, moments_width(width)]) } else { (layer.first(table), layer.strides()) };
-        let (floor_column, floor_least) = rule.floor.unwrap_or((width, 0.0));
-        Rule {
-            rows: layer.rows as u32,
-            width: width as u32,
-            stride: stride as u32,
-            first: first as u32,
-            moments_stride: moments_stride as u32,
-            moments_first: moments_first as u32,
-            counted: self.tables.counted as u32,
-            floor_column: floor_column as u32,
-            floor_least: floor_least as f32,
-            capacity: capacity as u32,
-            word: word as u32,
-            unused: 0,
-            rates: std::array::from_fn(|c| rule.rates.get(c).map_or(0.0, |r| *r as f32)),
-        }
+        gpu.queue.write_buffer(tables.uniforms.get(), 0, &out);
     }
 
     fn uniform(&self, at: usize, size: usize) -> wgpu::BindingResource<'_> {
@@ -298,30 +283,28 @@ impl KeptPass<'_> {
         })
     }
 
-    /// Rows to splats.
-    pub(super) fn answer(&self, gpu: &Gpu, upload: &Upload, recorder: &mut Recorder<'_>) -> Result<()> {
-        let kernel = &self.tables.kernels.answer;
-        let bind = |(i, layer): (usize, &Kept)| {
-            let group = [
-                self.uniform(i * SLOTS, size_of::<Ask>()),
-                layer.params.all(),
-                upload.parts[i].geometry.all(),
-                layer.alive.all(),
-            ];
-            (kernel.bind(gpu, &group), layer.groups())
-        };
-        let groups: Vec<_> = self.tables.layers.iter().enumerate().map(bind).collect();
-        recorder.stage(Stage::Answer, |pass| {
-            pass.set_pipeline(&kernel.pipelines[0]);
-            for (group, groups) in &groups {
-                pass.set_bind_group(0, group, &[]);
-                pass.dispatch_workgroups(*groups, 1, 1);
-            }
-        })
+    /// What is asked of a layer.
+    fn ask(&self, layer: usize) -> wgpu::BindingResource<'_> {
+        self.uniform(layer * at::ALL + at::ASK, size_of::<Ask>())
     }
 
-    /// The gradients of splats to those of rows, and, after the step's last view, Adam. `status`: the loss's buffer, and where in
-    /// it the words are.
+    /// Rows to splats.
+    pub(super) fn answer(&self, gpu: &Gpu, upload: &Upload, recorder: &mut Recorder<'_>) -> Result<()> {
+        let bind = |(i, layer): (usize, &Kept)| {
+            let part = &upload.parts[i];
+            let mut group = vec![self.ask(i), layer.params.all(), part.geometry.all(), layer.alive.all()];
+            if matches!(layer.moves, Moves::Sliced { .. }) {
+                group.push(part.weights.all());
+            }
+            let [kernel, _] = layer.kernels(&self.tables.kernels);
+            Run::new(gpu, kernel, 0, &group, layer.row_groups(gpu))
+        };
+        let runs: Vec<_> = self.tables.layers.iter().enumerate().map(bind).collect();
+        recorder.stage(Stage::Answer, |pass| runs.iter().for_each(|run| run.record(pass)))
+    }
+
+    /// The gradients of splats to those of rows, and, after the step's last view, Adam. `status_at`: where in the loss's buffer the
+    /// words are.
     pub(super) fn learn(
         &self,
         gpu: &Gpu,
@@ -330,56 +313,99 @@ impl KeptPass<'_> {
         status_at: u64,
         recorder: &mut Recorder<'_>,
     ) -> Result<()> {
-        let Tables { layers, kernels: k, corrections, .. } = self.tables;
-        let ask = |i: usize| self.uniform(i * SLOTS, size_of::<Ask>());
-        let colors = |(i, layer): (usize, &Kept)| {
+        let Tables { layers, kernels: k, .. } = self.tables;
+        let mut runs = Vec::new();
+        for (i, layer) in layers.iter().enumerate() {
             let part = &upload.parts[i];
             let view = super::frame::uniform(b, slot::VIEW, super::frame::VIEW_BYTES);
-            let group = [
+            let colors = [
                 view,
-                ask(i),
+                self.ask(i),
                 b.counts.all(),
                 part.geometry.all(),
                 part.tables[0].all(),
                 b.back.all(),
                 layer.d_sh.all(),
                 layer.stats.all(),
+                part.weights.all(),
             ];
-            (k.colors_back.bind(gpu, &group), layer.groups())
-        };
-        let rows = |(i, layer): (usize, &Kept)| {
-            let group = [ask(i), b.counts.all(), layer.params.all(), b.back.all(), layer.d_params.all()];
-            (k.answer_back.bind(gpu, &group), layer.groups())
-        };
-        let colors: Vec<_> = layers.iter().enumerate().map(colors).collect();
-        let rows: Vec<_> = layers.iter().enumerate().map(rows).collect();
-        recorder.stage(Stage::AnswerBack, |pass| {
-            for (kernel, groups) in [(&k.colors_back, &colors), (&k.answer_back, &rows)] {
-                pass.set_pipeline(&kernel.pipelines[0]);
-                for (group, groups) in groups {
-                    pass.set_bind_group(0, group, &[]);
-                    pass.dispatch_workgroups(*groups, 1, 1);
-                }
+            runs.push(Run::new(gpu, &k.colors_back, 0, &colors, layer.row_groups(gpu)));
+            let mut rows = vec![self.ask(i), b.counts.all(), layer.params.all(), b.back.all()];
+            if matches!(layer.moves, Moves::Sliced { .. }) {
+                rows.push(part.weights.all());
             }
-        })?;
-        if !self.is_last() {
-            return Ok(());
+            rows.push(layer.d_params.all());
+            runs.push(Run::new(gpu, layer.kernels(k)[1], 0, &rows, layer.row_groups(gpu)));
         }
         let words = wgpu::BindingResource::Buffer(wgpu::BufferBinding {
             buffer: b.partials.get(),
             offset: status_at,
             size: std::num::NonZeroU64::new((4 * self.words()) as u64),
         });
-        let mut steps = Vec::new();
+        if self.is_last() {
+            layers.iter().enumerate().for_each(|(i, layer)| self.losses(gpu, b, (i, layer), &words, &mut runs));
+        }
+        recorder.stage(Stage::AnswerBack, |pass| runs.iter().for_each(|run| run.record(pass)))?;
+        if !self.is_last() {
+            return Ok(());
+        }
+        let mut runs = Vec::new();
         for (i, layer) in layers.iter().enumerate() {
-            for table in (0..KEPT).filter(|&t| self.step.rules[i][t].is_some()) {
-                let (params, d, moments) = if table == SH {
-                    (&upload.parts[i].tables[0], &layer.d_sh, &layer.sh_moments)
-                } else {
-                    (&layer.params, &layer.d_params, &layer.moments)
-                };
+            self.adam(gpu, b, upload, (i, layer), &words, &mut runs);
+            if self.step.noise[i].is_some() {
+                let noise = self.uniform(i * at::ALL + at::NOISE, size_of::<uniforms::Noise>());
+                let group = [self.ask(i), noise, b.counts.all(), layer.alive.all(), layer.params.all()];
+                runs.push(Run::new(gpu, &k.shake, 0, &group, layer.row_groups(gpu)));
+            }
+        }
+        recorder.stage(Stage::Adam, |pass| runs.iter().for_each(|run| run.record(pass)))
+    }
+
+    /// Losses that look at rows, which add to their gradients.
+    fn losses(
+        &self,
+        gpu: &Gpu,
+        b: &Buffers,
+        (i, layer): (usize, &Kept),
+        words: &wgpu::BindingResource<'_>,
+        runs: &mut Vec<Run>,
+    ) {
+        let k = &self.tables.kernels;
+        if self.has_row_losses() {
+            let rule = self.uniform(i * at::ALL + at::ROWS, size_of::<uniforms::RowRule>());
+            let (params, alive, d) = (layer.params.all(), layer.alive.all(), layer.d_params.all());
+            let group = [self.ask(i), rule, b.counts.all(), params, alive, d, words.clone()];
+            runs.extend([0, 1].map(|entry| Run::new(gpu, &k.row_losses, entry, &group, layer.groups())));
+        }
+        if let Some(ties) = &layer.ties {
+            let rule = self.uniform(i * at::ALL + at::TIES, size_of::<uniforms::TieRule>());
+            let [before, edges, links, turns] = ties.buffers();
+            let (params, d) = (layer.params.all(), layer.d_params.all());
+            let group = [self.ask(i), rule, params, before, edges, links, turns, d, words.clone(), b.counts.all()];
+            runs.extend([0, 1].map(|entry| Run::new(gpu, &k.ties, entry, &group, ties.groups())));
+        }
+    }
+
+    fn adam(
+        &self,
+        gpu: &Gpu,
+        b: &Buffers,
+        upload: &Upload,
+        (i, layer): (usize, &Kept),
+        words: &wgpu::BindingResource<'_>,
+        runs: &mut Vec<Run>,
+    ) {
+        let Tables { kernels: k, corrections, .. } = self.tables;
+        for table in (0..KEPT).filter(|&t| self.step.rules[i][t].is_some()) {
+            let (params, d, moments) = if table == SH {
+                (&upload.parts[i].tables[0], &layer.d_sh, &layer.sh_moments)
+            } else {
+                (&layer.params, &layer.d_params, &layer.moments)
+            };
+            for piece in 0..layer.pieces(table).count() {
+                let rule = i * at::ALL + at::RULES + table * PIECES + piece;
                 let group = [
-                    self.uniform(i * SLOTS + 1 + table, size_of::<Rule>()),
+                    self.uniform(rule, size_of::<Rule>()),
                     b.counts.all(),
                     params.all(),
                     d.all(),
@@ -388,16 +414,28 @@ impl KeptPass<'_> {
                     corrections.all(),
                     words.clone(),
                 ];
-                steps.push((k.adam.bind(gpu, &group), layer.groups()));
+                runs.push(Run::new(gpu, &k.adam, 0, &group, layer.row_groups(gpu)));
             }
         }
-        recorder.stage(Stage::Adam, |pass| {
-            pass.set_pipeline(&k.adam.pipelines[0]);
-            for (group, groups) in &steps {
-                pass.set_bind_group(0, group, &[]);
-                pass.dispatch_workgroups(*groups, 1, 1);
-            }
-        })
+    }
+}
+
+/// An entry point over a layer's rows.
+struct Run {
+    pipeline: wgpu::ComputePipeline,
+    group: wgpu::BindGroup,
+    groups: u32,
+}
+
+impl Run {
+    fn new(gpu: &Gpu, kernel: &Kernel, entry: usize, group: &[wgpu::BindingResource<'_>], groups: u32) -> Self {
+        Self { pipeline: kernel.pipelines[entry].clone(), group: kernel.bind(gpu, group), groups }
+    }
+
+    fn record(&self, pass: &mut wgpu::ComputePass<'_>) {
+        pass.set_pipeline(&self.pipeline);
+        pass.set_bind_group(0, &self.group, &[]);
+        pass.dispatch_workgroups(self.groups, 1, 1);
     }
 }
 
@@ -425,8 +463,12 @@ impl GpuRenderer {
             comparisons.push(comparison);
             words = came.words;
         }
-        let bad = words.iter().position(|w| *w != 0).map(|at| [at / KEPT, at % KEPT, words[at] as usize - 1]);
-        Ok(Some(KeptStepped { comparisons, bad }))
+        let status = tables.status();
+        let bad = words[..status.alive].iter().position(|w| *w != 0);
+        let bad = bad.map(|at| [at / KEPT, at % KEPT, words[at] as usize - 1]);
+        let first = status.sums.first().map_or(status.words, |sums| sums[0]);
+        let loss = words[first..].iter().map(|bits| f64::from(f32::from_bits(*bits))).sum();
+        Ok(Some(KeptStepped { comparisons, loss, bad }))
     }
 
     /// Copies of the numbers in a buffer.
@@ -462,15 +504,15 @@ impl Resident for GpuRenderer {
         }
         let (gpu, tables) = (&self.gpu, self.resident.as_deref_mut().expect("it was made"));
         gpu.check()?;
-        let most = layers.iter().map(|l| l.rows.div_ceil(THREADS)).max().unwrap_or(0);
-        let wide = layers.iter().flat_map(|l| &l.tables).any(|t| t.width > MOST_COLUMNS);
+        let most = layers.iter().map(|l| l.rows.div_ceil(gpu.tuning.row_threads.min(THREADS))).max().unwrap_or(0);
+        let wide = layers.iter().flat_map(|l| &l.tables).any(|t| t.width > MOST_COLUMNS * PIECES);
         if most > MOST_GROUPS || wide {
             return Err(Error::new(ErrorKind::Unsupported, "the scene's tables are too large for the GPU"));
         }
         send(gpu, &mut tables.corrections, corrections.as_flattened())?;
         tables.counted = corrections.len();
-        tables.uniforms.ensure(gpu, (layers.len() * SLOTS) as u64 * UNIFORM_STRIDE)?;
-        let sizes: Vec<_> = layers.iter().map(|l| (l.rows, l.tables[SH].width)).collect();
+        tables.uniforms.ensure(gpu, (layers.len() * at::ALL) as u64 * UNIFORM_STRIDE)?;
+        let sizes: Vec<_> = layers.iter().map(|l| (l.rows, l.tables[SH].width, l.moves.blocks())).collect();
         tables.upload.keep(gpu, &sizes)?;
         // The old ones' memory is used again where layers stayed.
         tables.layers.truncate(layers.len());
@@ -487,22 +529,29 @@ impl Resident for GpuRenderer {
             let small = &layer.tables[..SH];
             let all = |f: &dyn Fn(&KeptTable<'_>) -> usize| small.iter().map(f).collect::<Vec<_>>();
             let params: Vec<_> = small.iter().map(|t| t.params).zip(all(&|t| t.width)).collect();
-            let moments: Vec<_> = small.iter().map(|t| t.moments).zip(all(&|t| moments_width(t.width))).collect();
+            let padded = layer.rows.next_multiple_of(BLOCK);
+            let histories: Vec<_> = small.iter().map(|t| history(t, padded)).collect();
+            let moments: Vec<_> = histories.iter().map(|m| &m[..]).zip(all(&|t| moments_width(t.width))).collect();
             let params = side_by_side(&params);
             send(gpu, &mut kept.params, &params)?;
             kept.d_params.ensure(gpu, size_of_val(&params[..]) as u64)?;
             send(gpu, &mut kept.moments, &side_by_side(&moments))?;
             send(gpu, &mut tables.upload.parts[i].tables[0], layer.tables[SH].params)?;
             kept.d_sh.ensure(gpu, size_of_val(layer.tables[SH].params) as u64)?;
-            send(gpu, &mut kept.sh_moments, layer.tables[SH].moments)?;
+            send(gpu, &mut kept.sh_moments, &history(&layer.tables[SH], padded))?;
             send(gpu, &mut kept.stats, layer.stats)?;
             kept.alive.ensure(gpu, 4 * layer.rows as u64)?;
+            kept.ties = layer.ties.map(|ties| Tied::new(gpu, ties)).transpose()?;
         }
         gpu.check()
     }
 
     fn step(&mut self, step: &KeptStep<'_>) -> Result<Option<KeptStepped>> {
         self.with_tables(|renderer, tables| renderer.step_kept(tables, step))
+    }
+
+    fn stages(&self) -> Vec<(&'static str, f64)> {
+        self.timings.stages().to_vec()
     }
 
     fn fetch(&mut self, layer: usize) -> Result<KeptNumbers> {
@@ -545,7 +594,7 @@ pub(super) fn geometry_bytes(rows: usize) -> u64 {
     (4 * GEOMETRY_WIDTH * rows.next_multiple_of(BLOCK)) as u64
 }
 
-/// The words of Adam among what came back.
+/// The words of a step among what came back.
 pub(super) fn words_of(numbers: &[f32]) -> Vec<u32> {
     numbers.iter().map(|x| x.to_bits()).collect()
 }

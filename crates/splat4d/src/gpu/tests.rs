@@ -16,7 +16,7 @@ use std::ops::{Deref, DerefMut};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 /// An adapter of any kind.
-fn gpu() -> Option<Gpu> {
+pub(super) fn gpu() -> Option<Gpu> {
     match Gpu::open(Adapters::Any) {
         Ok(gpu) => Some(gpu),
         Err(e) => {
@@ -33,7 +33,7 @@ fn own_renderer() -> Option<GpuRenderer> {
 
 /// The renderer that the tests share, with its defaults: on lavapipe compiling the kernels takes longer than most of
 /// them. Memory that an earlier test left behind must not matter.
-fn renderer() -> Option<impl DerefMut<Target = GpuRenderer>> {
+pub(super) fn renderer() -> Option<impl DerefMut<Target = GpuRenderer>> {
     static SHARED: Mutex<Option<Box<GpuRenderer>>> = Mutex::new(None);
     /// A lock whose content is there.
     struct Held(MutexGuard<'static, Option<Box<GpuRenderer>>>);
@@ -63,7 +63,7 @@ fn renderer() -> Option<impl DerefMut<Target = GpuRenderer>> {
 }
 
 /// The first `n` numbers of a buffer.
-fn read<T: bytemuck::AnyBitPattern + bytemuck::NoUninit>(gpu: &Gpu, buffer: &Grown, n: usize) -> Vec<T> {
+pub(super) fn read<T: bytemuck::AnyBitPattern + bytemuck::NoUninit>(gpu: &Gpu, buffer: &Grown, n: usize) -> Vec<T> {
     let bytes = (n * size_of::<T>()) as u64;
     let mut staging = Grown::new("test", wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST);
     staging.ensure(gpu, bytes).expect("a small buffer");
@@ -117,7 +117,7 @@ impl Scenery {
 }
 
 /// Looks at the origin from `eye`.
-fn camera(eye: [f64; 3], width: usize, height: usize) -> Camera {
+pub(super) fn camera(eye: [f64; 3], width: usize, height: usize) -> Camera {
     Camera::with_fov_y(Se3::look_at(eye, [0.1, -0.1, 0.0], [0.0, 1.0, 0.0]), 0.8, width, height)
 }
 
@@ -138,6 +138,11 @@ fn on_cpu(shot: &Shot<'_>, config: &RenderConfig) -> (Renderer<f32>, Image<f32>)
     let (mut renderer, mut image) = (Renderer::new(*config), Image::default());
     renderer.render(shot, &mut image);
     (renderer, image)
+}
+
+/// Things in a block of a sum or of a sort.
+fn block() -> usize {
+    Tuning::default().block()
 }
 
 const BACKGROUND: [f32; 3] = [0.2, 0.5, 0.9];

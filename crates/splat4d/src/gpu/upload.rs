@@ -126,13 +126,13 @@ impl Upload {
         Ok(())
     }
 
-    /// Makes room for layers of so many rows and columns of SH, which kernels fill, and lists the dispatches. What
+    /// Makes room for layers of so many rows, columns and blocks of SH, which kernels fill, and lists the dispatches. What
     /// buffers held may be lost. Errors: no memory, or a table that is larger than a binding.
-    pub(super) fn keep(&mut self, gpu: &Gpu, layers: &[(usize, usize)]) -> Result<()> {
+    pub(super) fn keep(&mut self, gpu: &Gpu, layers: &[(usize, usize, usize)]) -> Result<()> {
         self.draws.clear();
         self.parts.resize_with(layers.len(), PartBuffers::new);
         let mut first_splat = 0;
-        for (i, &(rows, width)) in layers.iter().enumerate() {
+        for (i, &(rows, width, blocks)) in layers.iter().enumerate() {
             let part = &mut self.parts[i];
             if part.tables.is_empty() {
                 part.tables.push(Grown::storage("a layer's colours"));
@@ -140,14 +140,16 @@ impl Upload {
             part.geometry.ensure(gpu, geometry_bytes(rows))?;
             part.tables[0].ensure(gpu, (width * rows.next_multiple_of(BLOCK) * size_of::<f32>()) as u64)?;
             part.ids.ensure(gpu, 0)?;
-            part.weights.ensure(gpu, 0)?;
+            // Blocks of which there are several are weighed.
+            let weighed = if blocks > 1 { blocks } else { 0 };
+            part.weights.ensure(gpu, (weighed * rows.next_multiple_of(BLOCK) * size_of::<f32>()) as u64)?;
             let piece = Piece {
                 first_row: 0,
                 rows: rows as u32,
                 first_splat: first_splat as u32,
                 width: width as u32,
-                blocks: 1,
-                flags: 0,
+                blocks: blocks as u32,
+                flags: if blocks > 1 { WEIGHTS } else { 0 },
                 first_id: 0,
                 first_group: self.draws.iter().map(|d| d.groups() as u32).sum(),
                 layer_from_world: columns(None),

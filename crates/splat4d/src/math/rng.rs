@@ -30,6 +30,12 @@ impl Rng {
         Self { key: mix(self.key ^ index.wrapping_mul(0xD134_2543_DE82_EF95)) }
     }
 
+    /// What the stream is made of, for its twin on a GPU (gpu/numbers.wgsl).
+    #[cfg(feature = "gpu")]
+    pub(crate) fn key(self) -> u64 {
+        self.key
+    }
+
     /// 64 random bits for draw `i`.
     pub(crate) fn bits(self, i: u64) -> u64 {
         mix(self.key.wrapping_add(i.wrapping_mul(0x9E37_79B9_7F4A_7C15)))

@@ -114,6 +114,12 @@ impl Tracked {
         self.pages[k]
     }
 
+    /// The frame that alone counts at t; none between two.
+    pub fn frame_at(&self, t: f64) -> Option<usize> {
+        let (a, b, _) = self.around(t);
+        (a == b).then_some(a)
+    }
+
     /// Adds a frame whose poses are `pose(p, row)` unless they were loaded.
     fn push<F: Real>(
         &mut self,

@@ -36,7 +36,8 @@ pub(crate) use count::PairCounts;
 pub use importance::{Importance, Sensitivity};
 pub use project::{Projected, ProjectedGrads, View};
 pub use resident::{
-    KEPT, KeptLayer, KeptNumbers, KeptRule, KeptStep, KeptStepped, KeptTable, KeptView, Moves, Resident,
+    KEPT, KeptLayer, KeptNoise, KeptNumbers, KeptRule, KeptStep, KeptStepped, KeptTable, KeptTies, KeptView, Moves,
+    Resident, RowWeights,
 };
 
 use crate::math::Real;

@@ -2,22 +2,48 @@
 
 use super::{Comparison, Target};
 use crate::Result;
+use crate::math::Rng;
 use crate::scene::{Camera, LifeKind, Time};
 
-/// Tables of a layer that a device keeps, in this order: geometry, life, velocities, rotation rates, SH.
+/// Tables of a layer that a device keeps, in this order: geometry, life, two of the motion's own (see [`Moves`]), SH.
 pub const KEPT: usize = 5;
 
-/// How the rows of a layer move, of what [`Spacetime`](crate::motion::SpacetimeSpec) can; order 0 without rotation: not at all.
+/// How the rows of a layer move.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Moves {
-    /// Order of the polynomial.
-    pub order: usize,
-    /// Whether quaternions have a rate.
-    pub rotation: bool,
-    /// Whether the life's centre learns from opacity alone.
-    pub detach: bool,
-    /// Origin of time for Gaussians that live for ever, seconds.
-    pub origin: f64,
+pub enum Moves {
+    /// As [`Spacetime`](crate::motion::SpacetimeSpec) can, by its velocities and rotation rates; order 0 without rotation: not at all.
+    Along {
+        /// Order of the polynomial.
+        order: usize,
+        /// Whether quaternions have a rate.
+        rotation: bool,
+        /// Whether the life's centre learns from opacity alone.
+        detach: bool,
+        /// Origin of time for Gaussians that live for ever, seconds.
+        origin: f64,
+    },
+    /// Not at all: positions and quaternions are those of a tracked frame, in a table of their own.
+    Posed,
+    /// As slices of Gaussians of space and time ([`motion::native4d`](crate::motion::native4d)), whose further columns are a table.
+    Sliced {
+        /// κ, scene units a second.
+        speed: f64,
+        /// Least c, scene units².
+        floor: f64,
+        /// Largest log scale in time, log seconds.
+        ceiling: f64,
+        /// Blocks of spherical harmonics that change with time.
+        harmonics: usize,
+        /// The period of their colours, seconds.
+        period: f64,
+    },
+}
+
+impl Moves {
+    /// Blocks of spherical harmonics in the layer's SH table.
+    pub fn blocks(&self) -> usize {
+        if let Self::Sliced { harmonics, .. } = self { harmonics + 1 } else { 1 }
+    }
 }
 
 /// A table on the CPU, as [`Table::data`](crate::scene::Table::data) has it; nothing where a layer has no such table.
@@ -27,7 +53,7 @@ pub struct KeptTable<'a> {
     pub width: usize,
     /// Its numbers.
     pub params: &'a [f32],
-    /// First and second moments and step counts, 2·width + 1 columns.
+    /// First and second moments and step counts, 2·width + 1 columns; nothing where it has not learnt.
     pub moments: &'a [f32],
 }
 
@@ -44,6 +70,68 @@ pub struct KeptLayer<'a> {
     pub tables: [KeptTable<'a>; KEPT],
     /// Sum of |dL/dmean2d|, number of views that drew it, largest radius: three columns.
     pub stats: &'a [f32],
+    /// What the poses of a [`Moves::Posed`] layer are held by.
+    pub ties: Option<&'a KeptTies>,
+}
+
+/// The ties of a tracked frame's poses: rigidity, rotation and isometry along the edges of a graph, a floor below its points, and a
+/// background that stays where the geometry's own poses are. Weights are those of a point's or an edge's share in the loss.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct KeptTies {
+    /// Rows of the graph's points.
+    pub points: Vec<u32>,
+    /// Rows of the background.
+    pub background: Vec<u32>,
+    /// Edges a point; one that leads to itself is none.
+    pub neighbours: usize,
+    /// The point that each edge leads to, its length at rest and its weight.
+    pub edges: Vec<(u32, f32, f32)>,
+    /// First of `back` by point, and one past the last.
+    pub first: Vec<u32>,
+    /// Edges that lead to a point.
+    pub back: Vec<u32>,
+    /// The points' poses in the frame before.
+    pub before: Vec<[f32; 7]>,
+    /// Neighbours keep their offsets, turned with each point.
+    pub rigid: f64,
+    /// Neighbours turn alike.
+    pub rot: f64,
+    /// Neighbours keep their distances.
+    pub iso: f64,
+    /// Points stay above the floor.
+    pub floor: f64,
+    /// Height of the floor along `up`.
+    pub height: f64,
+    /// Upwards.
+    pub up: [f64; 3],
+    /// The background stays in place, and keeps its turn.
+    pub stays: [f64; 2],
+}
+
+/// Weights of losses on the geometry of the rows that are alive, each a mean over them.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct RowWeights {
+    /// Of the opacity.
+    pub opacity: f64,
+    /// Of its entropy.
+    pub entropy: f64,
+    /// Of the mean of the three scales.
+    pub scale: f64,
+}
+
+/// Noise on the positions of the rows that are alive, after Adam (3DGS as MCMC).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct KeptNoise {
+    /// Times covariance times a standard normal vector times the gate.
+    pub strength: f64,
+    /// Opacity at which the gate is half open.
+    pub dead: f64,
+    /// Slope of the gate.
+    pub slope: f64,
+    /// Logit of the opacity above which there is none.
+    pub limit: f32,
+    /// Its stream, of which row r has fork r.
+    pub rng: Rng,
 }
 
 /// What one table learns by.
@@ -79,6 +167,10 @@ pub struct KeptStep<'a> {
     pub alpha_min: f64,
     /// By layer and table; none: it rests.
     pub rules: &'a [[Option<KeptRule>; KEPT]],
+    /// Losses on rows.
+    pub rows: RowWeights,
+    /// By layer.
+    pub noise: &'a [Option<KeptNoise>],
 }
 
 /// The result of a step.
@@ -86,6 +178,8 @@ pub struct KeptStep<'a> {
 pub struct KeptStepped {
     /// By view.
     pub comparisons: Vec<Comparison>,
+    /// Losses on rows and ties of poses.
+    pub loss: f64,
     /// Layer, table and row of a number that is not finite; nothing kept is to be trusted then.
     pub bad: Option<[usize; 3]>,
 }
@@ -113,6 +207,11 @@ pub trait Resident {
     ///
     /// Errors: the device failed, and nothing kept is to be trusted. Panics: nothing is kept.
     fn step(&mut self, step: &KeptStep<'_>) -> Result<Option<KeptStepped>>;
+
+    /// Milliseconds of the stages of the last view by the device's own clock; 0 where it has none.
+    fn stages(&self) -> Vec<(&'static str, f64)> {
+        Vec::new()
+    }
 
     /// The numbers of a layer as they are now. Errors: the device failed. Panics: as of `step`.
     fn fetch(&mut self, layer: usize) -> Result<KeptNumbers>;

@@ -7,8 +7,7 @@ use super::scenes::Pinned;
 use super::stages::{Way, gradient, zeros};
 use super::training::{self, Held};
 use splat4d::Result;
-use splat4d::device::{self, Device};
-use splat4d::gpu::{Adapters, Gpu, GpuRenderer, GpuStats, GpuTimings, StageClock};
+use splat4d::gpu::{Adapters, Gpu, GpuRenderer, GpuStats, GpuTimings, StageClock, Tuning};
 use splat4d::play::Player;
 use splat4d::render::{Backend, Image, ImageGrads, RenderConfig, RenderGrads, Shot};
 use splat4d::scene::{Splats, Table};
@@ -72,23 +71,49 @@ fn floors(splats: &Splats<'_, f32>, s: GpuStats, evaluations: u64, best: &Roofli
     out
 }
 
-/// Draws every view of every scene and takes it back, and trains a few steps. Errors: there is no GPU of any kind.
-pub(super) fn measure(scenes: &[Pinned], way: Way, pool: &rayon::ThreadPool, note: &dyn Fn(&str)) -> Result<Vec<Row>> {
-    let gpu = Gpu::open(Adapters::Any)?;
-    let name = gpu.describe();
-    let mut renderer = GpuRenderer::new(gpu, RenderConfig::default())?;
+/// Stages that only whole training steps on the GPU have.
+const OF_STEPS: [&str; 4] = ["answer", "loss", "answer backward", "adam"];
+
+/// A GPU of any kind whose kernels are compiled with these constants.
+fn renderer(tuning: Tuning) -> Result<GpuRenderer> {
+    let mut renderer = GpuRenderer::new(Gpu::open(Adapters::Any)?.tuned(tuning), RenderConfig::default())?;
     renderer.for_training()?;
     if renderer.clock == StageClock::Off {
         renderer.clock = StageClock::Wall;
     }
-    let r = renderer.roofline()?;
+    Ok(renderer)
+}
+
+/// Draws every view of every scene and takes it back, and trains a few steps; with `sweep` for every value of the kernels' constants.
+/// Errors: there is no GPU of any kind.
+pub(super) fn measure(
+    scenes: &[Pinned],
+    way: Way,
+    sweep: bool,
+    pool: &rayon::ThreadPool,
+    note: &dyn Fn(&str),
+) -> Result<Vec<Row>> {
+    let first = renderer(Tuning::default())?;
+    let (name, r) = (first.gpu().describe(), first.roofline()?);
+    drop(first);
     let best = Roofline { pairs: r.pairs, bytes: r.bytes };
     note(&format!("{name}: at best {:.2} G pairs/s and {:.1} GB/s", best.pairs * 1e-9, best.bytes * 1e-9));
-    let mut rows = Vec::new();
+    let tunings = if sweep { Tuning::sweep() } else { vec![Tuning::default()] };
+    let mut rows: Vec<Row> = Vec::new();
     for pinned in scenes {
-        note(&format!("scene {} on {name} ...", pinned.name));
-        rows.extend(pool.install(|| stages(pinned, way, &mut renderer, &best))?);
-        rows.push(pool.install(|| step(pinned, way))?);
+        for tuning in &tunings {
+            let changes = tuning.changes();
+            let with = changes.as_ref().map_or_else(String::new, |c| format!(" with {c}"));
+            note(&format!("scene {} on {name}{with} ...", pinned.name));
+            let mut here = pool.install(|| stages(pinned, way, &mut renderer(*tuning)?, &best))?;
+            here.extend(pool.install(|| steps(pinned, way, renderer(*tuning)?, &best))?);
+            for row in here.iter_mut().filter(|_| changes.is_some()) {
+                let default = rows.iter().find(|r| r.scene == row.scene && r.stage == row.stage && r.tuning.is_none());
+                row.against = default.filter(|d| d.ms > 0.0).map(|d| row.ms / d.ms);
+                row.tuning.clone_from(&changes);
+            }
+            rows.append(&mut here);
+        }
     }
     for row in &mut rows {
         row.device = Some(name.clone());
@@ -141,20 +166,53 @@ fn stages(pinned: &Pinned, way: Way, renderer: &mut GpuRenderer, best: &Roofline
     Ok(STAGES.iter().enumerate().map(row).collect())
 }
 
-/// A training step in which the GPU draws, and all else is done by the CPU.
-fn step(pinned: &Pinned, way: Way) -> Result<Row> {
+/// Whole training steps on the GPU, and those of their stages that drawing alone does not have.
+fn steps(pinned: &Pinned, way: Way, renderer: GpuRenderer, best: &Roofline) -> Result<Vec<Row>> {
     let held = Arc::new(Held::of(pinned, way));
-    let config = RenderConfig { simd: way.simd, ..RenderConfig::default() };
-    let backend = device::open_to_train(Device::Gpu, config).backend;
-    let t = training::times_of(training::trainer_on(pinned.scene.clone(), held.clone(), backend)?, &held, way)?;
-    Ok(Row {
+    let mut trainer = training::trainer_on(pinned.scene.clone(), held.clone(), Box::new(renderer))?;
+    // The stages, then the whole step and the time of the calls that draw.
+    const ALL: usize = OF_STEPS.len() + 2;
+    let mut seen = vec![[f64::MAX; ALL]; pinned.views.len()];
+    for round in 0..=way.rounds {
+        for _ in 0..seen.len() {
+            let (stepped, seconds) = training::step(&mut trainer)?;
+            if round > 0 {
+                let of = |stage: &str| stepped.stages.iter().find(|s| s.0 == stage).map_or(0.0, |s| s.1);
+                let drawn = stepped.report.timings.render + stepped.report.timings.render_backward;
+                let whole = [1e3 * seconds, 1e3 * drawn.as_secs_f64()];
+                let now = OF_STEPS.into_iter().map(of).chain(whole);
+                seen[held.last()].iter_mut().zip(now).for_each(|(best, now)| *best = best.min(now));
+            }
+        }
+    }
+    let mean = |k: usize| seen.iter().map(|s| s[k]).sum::<f64>() / seen.len() as f64;
+    let mut player = Player::of_scene(&pinned.scene);
+    let mut alive = 0;
+    for view in &pinned.views {
+        alive += player.at(view.time)?.len();
+    }
+    let (alive, camera) = (alive / pinned.views.len(), &pinned.views[0].camera);
+    let moved = [
+        bytes::motion(&pinned.scene, alive),
+        bytes::loss(camera.width * camera.height),
+        bytes::motion_backward(&pinned.scene, alive),
+        bytes::adam(&pinned.scene, alive),
+    ];
+    let row = |stage: &str, ms: f64| Row {
         scene: pinned.name.clone(),
-        stage: "step".into(),
+        stage: stage.into(),
         threads: way.threads,
-        ms: t.step,
-        outside_share: Some(1.0 - t.renderer / t.step),
+        ms,
         ..Row::default()
-    })
+    };
+    let of_stage = |(k, stage): (usize, &&str)| {
+        let (ms, floor) = (mean(k), 1e3 * moved[k] as f64 / best.bytes);
+        Row { ceiling_share: (ms > 0.0).then(|| floor / ms), ..row(stage, ms) }
+    };
+    let mut rows: Vec<Row> = OF_STEPS.iter().enumerate().map(of_stage).collect();
+    let [step, drawn] = [ALL - 2, ALL - 1].map(mean);
+    rows.push(Row { outside_share: Some(1.0 - drawn / step), ..row("step", step) });
+    Ok(rows)
 }
 
 #[cfg(test)]
@@ -168,18 +226,20 @@ mod tests {
         let pinned = made_up("small", 400, [40, 30]);
         let way = Way { threads: 1, simd: Simd::detect(), rounds: 1 };
         let pool = super::super::pool(way.threads).unwrap();
-        let rows = match measure(&[pinned], way, &pool, &|_| {}) {
+        let rows = match measure(&[pinned], way, true, &pool, &|_| {}) {
             Ok(rows) => rows,
             Err(e) => {
                 assert!(std::env::var_os("REQUIRE_GPU").is_none(), "REQUIRE_GPU is set: {e}");
                 return println!("skipped: {e}");
             }
         };
+        let all = [&STAGES[..], &OF_STEPS, &["step"]].concat();
         let stages: Vec<&str> = rows.iter().map(|r| r.stage.as_str()).collect();
-        assert_eq!(stages, [&STAGES[..], &["step"]].concat());
+        assert_eq!(stages, all.repeat(Tuning::sweep().len()));
         for row in &rows {
             assert!(row.ms > 0.0 && row.ms.is_finite() && row.device.is_some() && row.simd == "gpu", "{row:?}");
             assert!(row.ceiling_share.is_none_or(|share| share > 0.0), "{row:?}");
+            assert_eq!(row.tuning.is_some(), row.against.is_some(), "{row:?}");
         }
         let ms = |stage: &str| rows.iter().find(|r| r.stage == stage).expect("it is there").ms;
         assert!(ms("rasterize") < ms("forward, memory to memory") && ms("gather") < ms("backward, memory to memory"));

@@ -43,7 +43,10 @@ pub(super) struct Row {
     /// The GPU and its driver, where one was measured.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub device: Option<String>,
-    /// This time over that of the earlier result; above 1 is slower.
+    /// Constants of its kernels that were not at their defaults.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tuning: Option<String>,
+    /// This time over that of the earlier result, or of a sweep over that at the defaults; above 1 is slower.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub against: Option<f64>,
 }
@@ -51,7 +54,7 @@ pub(super) struct Row {
 impl Row {
     /// Whether two rows measure the same thing.
     fn twin(&self, other: &Self) -> bool {
-        let key = |r: &Self| (r.threads, r.x.map(f64::to_bits));
+        let key = |r: &Self| (r.threads, r.x.map(f64::to_bits), r.tuning.clone());
         self.scene == other.scene && self.stage == other.stage && self.simd == other.simd && key(self) == key(other)
     }
 }
@@ -152,12 +155,13 @@ fn stage_cells(rows: &[Row]) -> Vec<Vec<String>> {
     }
     head.push("remarks".into());
     let mut out = vec![head];
-    let place = |r: &Row| (r.scene.clone(), r.stage.clone(), r.simd.clone());
+    let place = |r: &Row| (r.scene.clone(), r.stage.clone(), r.simd.clone(), r.tuning.clone());
     for at in distinct(rows.iter().map(place)) {
         let of = |n: usize| rows.iter().find(|r| r.threads == n && place(r) == at);
         let all: Vec<Option<&Row>> = threads.iter().map(|n| of(*n)).collect();
         let here: Vec<&Row> = all.iter().flatten().copied().collect();
         let scene = if levels { format!("{} {}", at.0, at.2) } else { at.0.clone() };
+        let scene = at.3.as_ref().map_or(scene.clone(), |tuning| format!("{scene} {tuning}"));
         let mut line = vec![scene, at.1.clone()];
         line.extend(all.iter().map(|r| r.map_or_else(String::new, |r| milliseconds(r.ms))));
         if threads.len() > 1 {

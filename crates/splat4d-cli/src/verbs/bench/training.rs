@@ -66,6 +66,11 @@ impl Held {
         }
     }
 
+    /// The picture that was loaded last.
+    pub(super) fn last(&self) -> usize {
+        self.last.load(Ordering::Relaxed)
+    }
+
     /// The pictures.
     pub(super) fn pictures(&self) -> &[Planes<f32>] {
         &self.pictures
@@ -228,7 +233,7 @@ pub(super) fn times_of(mut trainer: Trainer<'_>, held: &Held, way: Way) -> Resul
         for _ in 0..held.len() {
             let (stepped, seconds) = step(&mut trainer)?;
             if round > 0 {
-                let seen = &mut best[held.last.load(Ordering::Relaxed)];
+                let seen = &mut best[held.last()];
                 let now = Times::of(&stepped, seconds).each();
                 seen.iter_mut().zip(now).for_each(|(best, now)| *best = best.min(now));
             }

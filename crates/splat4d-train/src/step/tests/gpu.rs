@@ -62,8 +62,9 @@ fn every_model_learns_as_on_the_cpu() {
         let Some(mut trainer) = on_gpu(&bed, &recipe) else { return };
         let mut cpu = bed.start(&recipe);
         let ((mse, notices), (expected, _)) = (finish(&mut trainer, line), finish(&mut cpu, line));
-        // `still` and `spacetime` stay on the device, but for what MCMC, neighbours and the filter want of them.
-        let stays = line.starts_with("motion=still") || line.contains("strategy=adc");
+        // These stay on the device whole; of the others neighbours, networks and the filter want something else.
+        let whole = ["motion=still", "motion=native4d", "motion=tracked"];
+        let stays = whole.iter().any(|m| line.starts_with(m)) || line.contains("strategy=adc");
         assert!(notices.len() == usize::from(!stays) && notices.iter().all(|n| is_of_tables(n)), "{line}: {notices:?}");
         let off = |a: f64, b: f64| (a / b - 1.0).abs();
         let first = mse.iter().zip(&expected).take(FIRST.0).map(|(a, b)| off(*a, *b)).fold(0.0, f64::max);

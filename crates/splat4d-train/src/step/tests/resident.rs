@@ -2,6 +2,7 @@
 
 use super::bed::{Bed, bytes, knobs, saved};
 use super::gpu::{finish, on_gpu};
+use crate::recipe::Recipe;
 use crate::step::engine::Blame;
 use crate::step::resident::DeviceEngine;
 use splat4d::device::{self, Device};
@@ -14,16 +15,25 @@ use splat4d::scene::{GEOMETRY, Table};
 use splat4d::{Error, ErrorKind, Result};
 
 /// Recipes that stay on the device throughout: every kind of motion and of life.
-const STAYS: [&str; 6] = [
+const STAYS: [&str; 12] = [
     "motion=still strategy=adc sh_degree=3 sh_degree_interval=1",
     "motion=spacetime strategy=adc exposure=true antialias=true",
     "motion=spacetime strategy=none motion_order=3 rotation_rate=true life=interval sh_degree=2 batch_size=3",
     "motion=spacetime strategy=none motion_order=2 rotation_rate=true life=gauss-one detach=true",
     "motion=spacetime strategy=none motion_order=1 life=infinite batch_size=2",
     "motion=spacetime strategy=none motion_order=0 sh_degree=0",
+    "motion=spacetime strategy=mcmc loss.opacity_entropy=0.02",
+    "motion=native4d strategy=adc",
+    "motion=native4d strategy=none sh_harmonics=2 sh_degree=3 sh_degree_interval=1 batch_size=2",
+    "motion=native4d strategy=mcmc sh_harmonics=1 batch_size=2",
+    "motion=tracked strategy=adc",
+    // Frame 1 from the second step on.
+    "motion=tracked strategy=none tracked.first_share=0.001 rigid_neighbours=5",
 ];
 /// Largest relative difference of a table's gradient, as a vector: a splat at the α cut-off may be drawn by one side only.
 const GRADIENT: f64 = 5e-3;
+/// Largest relative difference of a statistic's sum: two of the fifty Gaussians of a tracked frame make 4 %.
+const STATISTICS: f64 = 5e-2;
 /// Steps until which a table's first moments are still its gradients' sums.
 const FEW: usize = 2;
 
@@ -80,8 +90,8 @@ fn gradients_of_the_whole_chain_equal_the_cpus() {
             let sums = stats.map(|s| s.chunks_exact(3).map(|r| [r[0], r[1], r[2]].map(f64::from)).collect::<Vec<_>>());
             for c in 0..3 {
                 let [a, b] = sums.each_ref().map(|s| s.iter().map(|r| r[c]).sum::<f64>());
-                // The CPU looks whether an ellipse meets bins, the GPU whether it meets tiles.
-                assert!((a - b).abs() < 3e-2 * b, "{line}: statistics {c}: {a} {b}");
+                // The CPU looks whether an ellipse meets bins, the GPU whether it meets tiles: a few are drawn by one side only.
+                assert!((a - b).abs() <= STATISTICS * b, "{line}: statistics {c}: {a} {b}");
             }
         }
     }
@@ -90,9 +100,18 @@ fn gradients_of_the_whole_chain_equal_the_cpus() {
 #[test]
 fn tables_that_stay_repeat_and_resume_bit_for_bit() {
     let bed = Bed::new();
-    let recipe = knobs("motion=spacetime strategy=adc batch_size=2");
+    for line in [
+        "motion=spacetime strategy=adc batch_size=2",
+        "motion=native4d strategy=mcmc sh_harmonics=1",
+        "motion=tracked strategy=mcmc rigid_neighbours=5",
+    ] {
+        repeats_and_resumes(&bed, &knobs(line));
+    }
+}
+
+fn repeats_and_resumes(bed: &Bed, recipe: &Recipe) {
     let run = || {
-        let mut trainer = on_gpu(&bed, &recipe)?;
+        let mut trainer = on_gpu(bed, recipe)?;
         let mut checkpoints = Vec::new();
         while !trainer.is_done() {
             assert!(trainer.step().unwrap().unwrap().notices.is_empty());
@@ -106,7 +125,7 @@ fn tables_that_stay_repeat_and_resume_bit_for_bit() {
     let Some((whole, checkpoints)) = run() else { return };
     assert!(checkpoints.len() == 2 && run() == Some((whole.clone(), checkpoints.clone())), "the same bits again");
     for checkpoint in &checkpoints {
-        let mut resumed = bed.resumed_on(Device::Gpu, &recipe, checkpoint);
+        let mut resumed = bed.resumed_on(Device::Gpu, recipe, checkpoint);
         finish(&mut resumed, "resumed");
         assert!(bytes(resumed.scene()) == whole, "a resumed run has the bytes of one that was not stopped");
     }

@@ -229,6 +229,19 @@ fn records_of(
 #[test]
 fn each_kernel_equals_its_twin() {
     let Some(mut r) = renderer() else { return };
+    println!("on {}", r.gpu.describe());
+    each_equals_its_twin(&mut r);
+}
+
+#[test]
+fn without_subgroups_each_kernel_equals_its_twin_too() {
+    let Some(gpu) = gpu() else { return };
+    let portable = gpu.tuned(Tuning { subgroups: false, ..Tuning::default() });
+    assert!(!portable.has_subgroups());
+    each_equals_its_twin(&mut GpuRenderer::new(portable, RenderConfig::default()).expect("the kernels compile"));
+}
+
+fn each_equals_its_twin(r: &mut GpuRenderer) {
     r.config.abs_grads = true;
     for (scene, camera) in [
         (Scenery::new(40, 500, 1.2, 0.06), camera([0.0, 0.5, -4.0], 131, 77)),
@@ -236,7 +249,7 @@ fn each_kernel_equals_its_twin() {
     ] {
         let (splats, n) = (scene.splats(), scene.out.rows());
         let (shot, pulled) = (shot(&splats, &camera), Pulled::new(42, &camera));
-        let (_, d, _) = back(&mut *r, &shot, &pulled.all());
+        let (_, d, _) = back(r, &shot, &pulled.all());
         let (across, down) = (camera.width.div_ceil(TILE), camera.height.div_ceil(TILE));
         let pairs = r.stats().pairs;
         let shapes: Vec<[f32; 8]> = read(&r.gpu, &r.buffers.shapes, n);

@@ -107,7 +107,7 @@ fn sorted(gpu: &Gpu, kernels: &Kernels, keys: &[u32], values: &[u32], passes: u3
     let values = [storage(gpu, values), storage(gpu, values)];
     let counts = storage(gpu, &[7, n as u32, 9]);
     // Not cleared, on purpose: the kernels must not rely on it.
-    let sums = storage(gpu, &vec![0xdead_beefu32; DIGITS * (n.div_ceil(BLOCK) + 1)]);
+    let sums = storage(gpu, &vec![0xdead_beefu32; DIGITS * (n.div_ceil(block()) + 1)]);
     for pass in 0..passes {
         let mut uniform = Grown::new("pass", wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST);
         uniform.ensure(gpu, 8).expect("a small buffer");
@@ -120,7 +120,7 @@ fn sorted(gpu: &Gpu, kernels: &Kernels, keys: &[u32], values: &[u32], passes: u3
             let mut cp = encoder.begin_compute_pass(&Default::default());
             cp.set_bind_group(0, &group, &[]);
             // More workgroups than blocks: the spare ones do nothing.
-            let blocks = n.div_ceil(BLOCK) as u32 + 1;
+            let blocks = n.div_ceil(block()) as u32 + 1;
             for (pipeline, groups) in kernels.sort.pipelines.iter().zip([blocks, DIGITS as u32, blocks]) {
                 cp.set_pipeline(pipeline);
                 cp.dispatch_workgroups(groups, 1, 1);
@@ -176,7 +176,7 @@ fn sums_are_exclusive_and_stop_at_the_top() {
         let counts = storage(&gpu, &[n as u32, 0, 0]);
         let arguments = storage(&gpu, &[0u32; 12]);
         let (scan_in, out) = (storage(&gpu, &input), storage(&gpu, &vec![0u32; n]));
-        let sums = storage(&gpu, &vec![0u32; n.div_ceil(BLOCK)]);
+        let sums = storage(&gpu, &vec![0u32; n.div_ceil(block())]);
         let mut uniform = Grown::new("pass", wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST);
         uniform.ensure(&gpu, 16).expect("a small buffer");
         gpu.queue.write_buffer(uniform.get(), 0, bytemuck::cast_slice(&[0u32, 2, 6, 1_000_000]));
@@ -186,7 +186,7 @@ fn sums_are_exclusive_and_stop_at_the_top() {
         {
             let mut cp = encoder.begin_compute_pass(&Default::default());
             cp.set_bind_group(0, &group, &[]);
-            let blocks = n.div_ceil(BLOCK) as u32;
+            let blocks = n.div_ceil(block()) as u32;
             for (pipeline, groups) in kernels.scan.pipelines.iter().zip([blocks, 1, blocks]) {
                 cp.set_pipeline(pipeline);
                 cp.dispatch_workgroups(groups, 1, 1);

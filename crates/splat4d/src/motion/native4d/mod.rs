@@ -78,12 +78,14 @@ impl Native4dSpec {
             .remedy("The file is damaged or was written by another program; export it again"))
     }
 
+    /// Least c of a slice, scene units², and largest log scale in time, log seconds.
+    pub fn bounds(&self) -> [f64; 2] {
+        [(self.speed * self.min_life.max(SHORTEST)).powi(2), self.max_life.max(SHORTEST).ln()]
+    }
+
     fn frame<F: Real>(&self) -> Frame<F> {
-        Frame {
-            speed: F::of(self.speed),
-            floor: F::of((self.speed * self.min_life.max(SHORTEST)).powi(2)),
-            ceiling: F::of(self.max_life.max(SHORTEST).ln()),
-        }
+        let [floor, ceiling] = self.bounds().map(F::of);
+        Frame { speed: F::of(self.speed), floor, ceiling }
     }
 }
 

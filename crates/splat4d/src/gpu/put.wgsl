@@ -1,0 +1,23 @@
+// Writes a row's gradients: the step's first view overwrites, the others add. After learnt.wgsl.
+//
+// No bindings and no entry point, but for `ask` and `d_params`, which whoever includes this binds.
+
+fn put(row: u32, column: u32, d: f32) {
+    let i = at(row, column, ask.width);
+    if ((ask.flags & ASK_FIRST) != 0u) {
+        d_params[i] = d;
+    } else {
+        d_params[i] += d;
+    }
+}
+
+fn put_three(row: u32, column: u32, d: vec3<f32>) {
+    put(row, column, d.x);
+    put(row, column + 1u, d.y);
+    put(row, column + 2u, d.z);
+}
+
+fn put_four(row: u32, column: u32, d: vec4<f32>) {
+    put_three(row, column, d.xyz);
+    put(row, column + 3u, d.w);
+}

@@ -1,0 +1,120 @@
+//! Constants of the kernels that decide how fast they are, and of what they compute nothing but, where it says so, last bits: what
+//! a sweep on a card varies.
+
+use super::frame::THREADS;
+
+/// See the module's documentation. The defaults are the portable ones, chosen without a card.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Tuning {
+    /// Threads of a workgroup of the kernels over rows that stay on the GPU.
+    pub row_threads: usize,
+    /// Things that a thread of a sort, of a sum or of the search for tiles' lists handles.
+    pub rounds: usize,
+    /// Splats that a tile reads at a time, to blend them.
+    pub batch: usize,
+    /// Whether the blend goes back with subgroups, where the device has them: this alone changes last bits.
+    pub subgroups: bool,
+    /// Splats of a round of its way back without them.
+    pub back_round: usize,
+}
+
+impl Default for Tuning {
+    fn default() -> Self {
+        Self { row_threads: THREADS, rounds: 8, batch: THREADS, subgroups: true, back_round: 4 }
+    }
+}
+
+/// What a sweep tries. More splats a batch or a round need more than the 16 KiB of workgroup memory that every device has.
+const ROW_THREADS: [usize; 2] = [64, 128];
+const ROUNDS: [usize; 3] = [2, 4, 16];
+const BATCHES: [usize; 3] = [32, 64, 128];
+const BACK_ROUNDS: [usize; 2] = [1, 2];
+
+impl Tuning {
+    /// The defaults, then each constant's other values.
+    pub fn sweep() -> Vec<Self> {
+        let with = |f: fn(&mut Self, usize), values: &[usize]| -> Vec<Self> {
+            let one = |value: &usize| {
+                let mut out = Self::default();
+                f(&mut out, *value);
+                out
+            };
+            values.iter().map(one).collect()
+        };
+        let mut out = vec![Self::default()];
+        out.extend(with(|t, v| t.row_threads = v, &ROW_THREADS));
+        out.extend(with(|t, v| t.rounds = v, &ROUNDS));
+        out.extend(with(|t, v| t.batch = v, &BATCHES));
+        let portable = Self { subgroups: false, ..Self::default() };
+        out.push(portable);
+        out.extend(BACK_ROUNDS.map(|back_round| Self { back_round, ..portable }));
+        out
+    }
+
+    /// What is not as by default, `name=value`.
+    pub fn changes(&self) -> Option<String> {
+        let numbers = |t: &Self| {
+            [
+                ("row_threads", t.row_threads),
+                ("rounds", t.rounds),
+                ("batch", t.batch),
+                ("subgroups", usize::from(t.subgroups)),
+                ("back_round", t.back_round),
+            ]
+        };
+        let changed = numbers(self).into_iter().zip(numbers(&Self::default())).filter(|(a, b)| a != b);
+        let words: Vec<String> = changed.map(|((name, value), _)| format!("{name}={value}")).collect();
+        (!words.is_empty()).then(|| words.join(" "))
+    }
+
+    /// Things in a block of a sum or of a sort (scan.wgsl, sort.wgsl).
+    pub(super) fn block(&self) -> usize {
+        THREADS * self.rounds
+    }
+
+    /// A shader's text with these constants in place of those that stand there.
+    pub(super) fn text(&self, shader: &str) -> String {
+        let constants = [
+            ("ROW_THREADS", self.row_threads),
+            ("SORT_ROUNDS", self.rounds),
+            ("SORT_BLOCK", self.block()),
+            ("SCAN_RUN", self.rounds),
+            ("SCAN_BLOCK", self.block()),
+            ("RANGES_ROUNDS", self.rounds),
+            ("BATCH", self.batch),
+            ("ROUND", self.back_round),
+        ];
+        let mut out = shader.to_owned();
+        for (name, value) in constants {
+            let before = format!("const {name}: u32 = ");
+            if let Some(at) = out.find(&before).map(|at| at + before.len()) {
+                let end = at + out[at..].find(';').expect("a constant ends");
+                out.replace_range(at..end, &format!("{value}u"));
+            }
+        }
+        out
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::wgsl;
+
+    #[test]
+    fn every_constant_is_found_once_and_its_default_is_what_stands_there() {
+        let shaders =
+            [wgsl::SORT, wgsl::SCAN, wgsl::RANGES, wgsl::RASTERIZE, wgsl::RASTERIZE_BACK, wgsl::LEARNT, wgsl::ADAM];
+        for shader in shaders {
+            assert_eq!(Tuning::default().text(shader), shader);
+            let changed =
+                Tuning { row_threads: 32, rounds: 1, batch: 16, subgroups: false, back_round: 3 }.text(shader);
+            let others = shader.lines().zip(changed.lines()).filter(|(a, b)| a != b).count();
+            // A sort and a sum have both rounds and blocks.
+            let expected = if shader == wgsl::SORT || shader == wgsl::SCAN { 2 } else { 1 };
+            assert_eq!(others, expected, "{}", &shader[..60]);
+        }
+        let sweep = Tuning::sweep();
+        assert!(sweep[0].changes().is_none() && sweep[1..].iter().all(|t| t.changes().is_some()));
+    }
+}
