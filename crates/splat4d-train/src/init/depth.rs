@@ -23,12 +23,9 @@ const THROUGH: f64 = 0.05;
 const CANDIDATES: usize = 4;
 /// Pixels of a picture of which is asked whether they move, at most.
 const ASKED: usize = 20_000;
-/// Of the wanted points, those that may lie on what moves, where that much of it is seen: few pixels show it, and at every
-/// moment others.
-const MOVING_SHARE: f64 = 0.5;
-/// Of the wanted points, those on what moves that are alive at a moment: lives are as wide as that takes, within bounds in
-/// times between moments. Shorter ones than half of it leave holes between moments; over longer ones velocities change.
-const ALIVE_SHARE: f64 = 0.05;
+/// As a share of the wanted points, those on what moves that are alive at a moment: lives are as wide as that takes, within
+/// bounds in times between moments. Shorter ones leave holes between moments; over longer ones velocities change.
+const ALIVE_SHARE: f64 = 0.15;
 const LIFE: [f64; 2] = [0.5, 2.0];
 
 /// A picture's map.
@@ -77,8 +74,9 @@ struct Candidate {
     still: bool,
 }
 
-/// About `count` points of metric depth maps; none where there are no such maps. With `moving`, what moves is taken from
-/// every picture that is looked at, and belongs to its moment.
+/// About `count` points of metric depth maps that stand still; none where there are no such maps. With `moving`, up to as
+/// many again on what moves: few pixels show it, and at every moment others. They are taken from every picture that is
+/// looked at.
 pub(crate) fn points(frames: &dyn Frames, count: usize, moving: bool, rng: Rng) -> Result<Seeds> {
     let step = frames.len().div_ceil(VIEWS).max(1);
     let chosen: Vec<usize> = (0..frames.len()).step_by(step).collect();
@@ -112,8 +110,8 @@ pub(crate) fn points(frames: &dyn Frames, count: usize, moving: bool, rng: Rng) 
             out.push(candidate.point, candidate.color, None);
         }
     }
-    let alive = evenly(alive, (MOVING_SHARE * count as f64) as usize, rng.fork(u64::MAX));
-    out.truncate_evenly(count.saturating_sub(alive.len()), rng.fork(u64::MAX - 1));
+    let alive = evenly(alive, count, rng.fork(u64::MAX));
+    out.truncate_evenly(count, rng.fork(u64::MAX - 1));
     let mut times: Vec<f64> = maps.iter().map(|m| m.time).collect();
     times.sort_by(f64::total_cmp);
     times.dedup();
@@ -146,6 +144,8 @@ fn evenly<T>(all: Vec<T>, count: usize, rng: Rng) -> Vec<T> {
 mod tests {
     use super::*;
     use crate::capture::frames::Depth;
+    use crate::methods::Plan;
+    use crate::recipe::Recipe;
     use crate::step::tests::Made;
     use splat4d::math::se3::{dot, norm, normalize, sub};
     use splat4d::scene::Time;
@@ -202,16 +202,31 @@ mod tests {
     #[test]
     fn what_moves_belongs_to_its_moment_and_all_else_to_all() {
         let deep = Deep(Made::new(4, 3, 24));
-        let time = deep.time(1).0;
         let seeds = points(&deep, 400, true, Rng::new(1, "test", 0)).unwrap();
         let moving: Vec<usize> = (0..seeds.len()).filter(|&i| seeds.times[i].is_some()).collect();
-        assert!(seeds.len() > 200 && moving.len() > 20, "{} of {}", moving.len(), seeds.len());
+        assert!(seeds.len() > 200 && moving.len() > 60, "{} of {}", moving.len(), seeds.len());
         for &i in &moving {
-            assert_eq!(seeds.times[i], Some(time));
-            let off = norm(sub(seeds.points[i], deep.0.object_at(time)));
+            let off = norm(sub(seeds.points[i], deep.0.object_at(seeds.times[i].unwrap())));
             assert!((off - Made::RADIUS).abs() < 1e-3, "{off}");
         }
+        for k in 0..3 {
+            let of = moving.iter().filter(|&&i| seeds.times[i] == Some(deep.0.time_of(k))).count();
+            assert!(of > 10, "{of} at moment {k}");
+        }
+        let gap = deep.0.time_of(1) - deep.0.time_of(0);
+        let life = seeds.life.expect("what moves lives about its moment");
+        assert!(life >= 0.5 * gap && life <= 2.0 * gap, "{life}");
         let none = points(&deep.0, 400, true, Rng::new(1, "test", 0)).unwrap();
         assert!(none.is_empty(), "no maps, no points");
+        // Gaussians that live through the whole clip begin with what moves at one moment of it.
+        let recipe = Recipe::default().with(|r| r.init.count = 400).resolve();
+        let plan =
+            Plan { recipe, clip: [deep.0.time_of(0), deep.0.time_of(2)], times: 3, fps: 10.0, ..Plan::default() };
+        let one = super::super::one_moment(&plan, &deep, None).unwrap();
+        let near =
+            |i: usize, k: usize| norm(sub(one.points[i], deep.0.object_at(deep.0.time_of(k)))) < 1.01 * Made::RADIUS;
+        let count = |k: usize| (0..one.len()).filter(|&i| near(i, k)).count();
+        assert!(one.times.iter().all(Option::is_none) && one.life.is_none());
+        assert!(count(1) > 10 && count(0) + count(2) < count(1) / 2, "{:?}", [count(0), count(1), count(2)]);
     }
 }

@@ -247,7 +247,8 @@ pub(crate) fn one_moment(plan: &Plan, frames: &dyn Frames, points: Option<Seeds>
     if out.life.take().is_some() {
         // Depth maps show every moment: of what moves only one is wanted.
         let middle = 0.5 * (plan.clip[0] + plan.clip[1]);
-        let nearest = out.times.iter().flatten().copied().min_by(|a, b| (a - middle).abs().total_cmp(&(b - middle).abs()));
+        let nearest =
+            out.times.iter().flatten().copied().min_by(|a, b| (a - middle).abs().total_cmp(&(b - middle).abs()));
         out.retain(|i, s| s.times[i].is_none() || s.times[i] == nearest);
     }
     out.times.fill(None);
@@ -339,4 +340,36 @@ fn scales(seeds: &Seeds, extent: f64) -> Vec<f64> {
         rest = if count < 8 { &[] } else { tail };
     }
     out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::methods::program;
+    use crate::recipe::{MotionName, Recipe};
+    use splat4d::layers::Evaluation;
+    use splat4d::math::se3::{norm, sub};
+    use splat4d::scene::{Rows, Space, Time};
+
+    #[test]
+    fn a_seed_that_moves_makes_a_gaussian_that_moves() {
+        for motion in ["spacetime", "native4d"] {
+            let recipe = Recipe::default().with(|r| r.run.motion = MotionName::of(motion)).resolve();
+            let plan = Plan { recipe, extent: 2.0, clip: [0.0, 1.0], times: 11, fps: 10.0, ..Plan::default() };
+            let mut seeds = Seeds { life: Some(0.2), ..Seeds::default() };
+            for k in 0..6 {
+                seeds.push([0.1 * k as f64, 0.0, 1.0], [0.5; 3], Some(0.5));
+                seeds.velocities[k] = [0.3 * k as f64, -0.4, 0.7];
+            }
+            let made = scene(&plan, program(motion).unwrap().as_ref(), &seeds, [0.0; 3], [0.0, 1.0, 0.0]).unwrap();
+            for t in [0.5, 0.6] {
+                let answer = Evaluation::of_layer(&made.layers[0], Space::Gaussians, Rows::All, Time(t));
+                for k in 0..6 {
+                    let there = std::array::from_fn(|i| seeds.points[k][i] + (t - 0.5) * seeds.velocities[k][i]);
+                    let off = norm(sub(answer.tape(0).out().read::<3>(k, 0).map(f64::from), there));
+                    assert!(off < 1e-5, "{motion}, {k} at {t}: {off}");
+                }
+            }
+        }
+    }
 }

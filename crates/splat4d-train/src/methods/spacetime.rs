@@ -10,8 +10,8 @@ use crate::settings::{choices, settings};
 use crate::upkeep::Guided;
 use splat4d::motion::spacetime::{FeatureSpec, TIME_FEATURES, VELOCITIES, VIEW_FEATURES};
 use splat4d::motion::{SpacetimeSpec, Spec};
-use splat4d::scene::{LifeKind, Params};
 use splat4d::scene::head::{HEAD_IN, HEAD_OUT};
+use splat4d::scene::{LifeKind, Params};
 
 /// Cameras at a moment from which on a scene is seen from all sides at once.
 const MANY_CAMERAS: f64 = 3.0;
@@ -96,7 +96,9 @@ impl Program for SpacetimeProgram {
     fn suits(&self, seen: &Seen) -> Option<String> {
         if seen.depth && !seen.masks && !seen.predicted {
             let cameras = seen.cameras_in_words();
-            return Some(format!("{cameras} a moment, and depth maps say where things are then: Gaussians begin there"));
+            return Some(format!(
+                "{cameras} a moment, and depth maps say where things are then: Gaussians begin there"
+            ));
         }
         let moving =
             seen.changing.map_or_else(String::new, |share| format!(", {:.1} % of the pixels move", 100.0 * share));
