@@ -223,8 +223,8 @@ mod tests {
         let plan =
             Plan { recipe, clip: [deep.0.time_of(0), deep.0.time_of(2)], times: 3, fps: 10.0, ..Plan::default() };
         let one = super::super::one_moment(&plan, &deep, None).unwrap();
-        let near =
-            |i: usize, k: usize| norm(sub(one.points[i], deep.0.object_at(deep.0.time_of(k)))) < 1.01 * Made::RADIUS;
+        let off = |i: usize, k: usize| norm(sub(one.points[i], deep.0.object_at(deep.0.time_of(k)))) - Made::RADIUS;
+        let near = |i: usize, k: usize| off(i, k).abs() < 1e-3;
         let count = |k: usize| (0..one.len()).filter(|&i| near(i, k)).count();
         assert!(one.times.iter().all(Option::is_none) && one.life.is_none());
         assert!(count(1) > 10 && count(0) + count(2) < count(1) / 2, "{:?}", [count(0), count(1), count(2)]);
