@@ -20,7 +20,7 @@ const fn variant(key: &'static str, name: &'static str, knobs: &'static [&'stati
 }
 
 /// The first is what all are compared with.
-const ALL: [Variant; 10] = [
+const ALL: [Variant; 16] = [
     variant("alone", "the motion alone", &[], true),
     variant(
         "filter-euclidean",
@@ -31,6 +31,34 @@ const ALL: [Variant; 10] = [
     variant("filter-hold", "filter, without log and exp", &["filter=geodesic", "filter_predictor=hold"], false),
     variant("filter", "filter, Wasserstein predictor", &["filter=geodesic"], true),
     variant("filter-literal", "filter, Kalman's formulas", &["filter=literal"], false),
+    variant("kept", "filter, drawn with", &["filter=geodesic", "filter_keep=true"], true),
+    variant("literal-kept", "filter, Kalman's formulas, drawn with", &["filter=literal", "filter_keep=true"], false),
+    variant("retuned", "filter, off for the last quarter", &["filter=geodesic", "filter.until=0.75"], true),
+    variant(
+        "history",
+        "filter through four frames, drawn with",
+        &["filter=geodesic", "filter_keep=true", "filter_history=4"],
+        false,
+    ),
+    variant(
+        "history-learnt",
+        "the same, gradients through time",
+        &["filter=geodesic", "filter_keep=true", "filter_history=4", "filter_stop_gradient=false"],
+        false,
+    ),
+    variant(
+        "published",
+        "filter, small motion and alignment, drawn with",
+        &[
+            "filter=geodesic",
+            "filter_keep=true",
+            "transport=wasserstein",
+            "transport_second=0",
+            "transport_temporal=0.1",
+            "transport_align=0.1",
+        ],
+        false,
+    ),
     variant("linear", "linear regulariser", &["transport=linear"], true),
     variant(
         "w2-hold",

@@ -1,33 +1,58 @@
 //! Points that depth maps show: pixels of training pictures, unprojected. A point through which a picture of another time
-//! sees what is farther away belongs to something that moves, and to its moment; all others stand still.
+//! sees what is farther away belongs to something that moves: it lives about its moment, and begins with the velocity that
+//! optical flow and the depth at both of its ends tell ([`super::scene_flow`]). All others stand still.
 
-use super::Seeds;
+use super::{Seeds, scene_flow};
 use crate::Result;
 use crate::capture::DepthKind;
 use crate::capture::frames::{Frames, Picture};
 use rayon::prelude::*;
 use splat4d::math::Rng;
 use splat4d::scene::{Camera, Planes};
+use std::f64::consts::TAU;
 
-/// Pictures that points are taken from and held against, at most, evenly chosen, beside those of keyframes.
+/// Pictures that points are taken from and held against, at most, evenly chosen.
 const VIEWS: usize = 100;
+/// Pictures whose longer side exceeds this many pixels are halved until it does not: they have more pixels than there are
+/// seeds, and a hundred maps of that size fit into any memory.
+const LONGEST_SIDE: usize = 640;
 /// A picture sees through a point if what it shows there is farther away by more than this share: beyond the noise of
 /// sensors and the slant of surfaces within a pixel.
 const THROUGH: f64 = 0.05;
-/// Points a wanted one: what moves is a small part of them.
+/// Points a wanted one that stand still.
 const CANDIDATES: usize = 4;
-/// Of the wanted points, those that may lie on what moves, where that much of it is seen (as of hulls).
-const MOVING_SHARE: f64 = 0.3;
+/// Pixels of a picture of which is asked whether they move, at most.
+const ASKED: usize = 20_000;
+/// As a share of the wanted points, those on what moves that are alive at a moment: lives are as wide as that takes, within
+/// bounds in times between moments. Shorter ones leave holes between moments; over longer ones velocities change.
+const ALIVE_SHARE: f64 = 0.15;
+const LIFE: [f64; 2] = [0.5, 2.0];
 
 /// A picture's map.
-struct Map {
-    frame: usize,
-    camera: Camera,
-    time: f64,
-    depth: Planes<f32>,
+pub(super) struct Map {
+    pub frame: usize,
+    pub camera: Camera,
+    pub time: f64,
+    /// [1, h, w]; 0: not known.
+    pub depth: Planes<f32>,
 }
 
 impl Map {
+    /// The frame's metric map, its picture made small in `picture`; nothing where it has none.
+    pub(super) fn load(frames: &dyn Frames, frame: usize, picture: &mut Picture) -> Result<Option<Self>> {
+        frames.load(frame, picture)?;
+        if picture.depth.as_ref().is_none_or(|d| d.kind != DepthKind::Metric) {
+            return Ok(None);
+        }
+        let mut camera = frames.camera(frame).clone();
+        while camera.width.max(camera.height) > LONGEST_SIDE {
+            picture.halve();
+            camera = camera.downscaled(2);
+        }
+        let depth = picture.depth.as_ref().expect("just seen").values.clone();
+        Ok(Some(Self { frame, camera, time: frames.time(frame).0, depth }))
+    }
+
     /// Whether it sees something farther away where the point is.
     fn sees_through(&self, point: [f64; 3]) -> bool {
         let Some(([u, v], z)) = self.camera.project(point) else { return false };
@@ -39,65 +64,88 @@ impl Map {
     }
 }
 
-/// About `count` points of metric depth maps; none where there are no such maps. Points on what moves are those of the
-/// pictures nearest to `times`, and belong to these.
-pub(crate) fn points(frames: &dyn Frames, times: &[f64], count: usize, moving: bool, rng: Rng) -> Result<Seeds> {
+/// A pixel and where it is.
+struct Candidate {
+    map: usize,
+    pixel: usize,
+    point: [f64; 3],
+    color: [f32; 3],
+    /// Whether it may stand for what is still.
+    still: bool,
+}
+
+/// About `count` points of metric depth maps that stand still; none where there are no such maps. With `moving`, up to as
+/// many again on what moves: few pixels show it, and at every moment others. They are taken from every picture that is
+/// looked at.
+pub(crate) fn points(frames: &dyn Frames, count: usize, moving: bool, rng: Rng) -> Result<Seeds> {
     let step = frames.len().div_ceil(VIEWS).max(1);
-    let mut chosen: Vec<usize> = (0..frames.len()).step_by(step).collect();
-    let near: Vec<Vec<usize>> = times.iter().map(|&t| super::hull::pictures_near(frames, t).1).collect();
-    if moving {
-        chosen.extend(near.iter().flatten());
-        chosen.sort_unstable();
-        chosen.dedup();
-    }
-    let key = |i: usize| moving && near.iter().any(|frames| frames.contains(&i));
-    let keys = chosen.iter().filter(|&&i| key(i)).count();
+    let chosen: Vec<usize> = (0..frames.len()).step_by(step).collect();
+    let still = CANDIDATES * count / chosen.len().max(1);
     let (mut maps, mut candidates) = (Vec::new(), Vec::new());
     let mut picture = Picture::default();
     for &i in &chosen {
-        frames.load(i, &mut picture)?;
-        let Some(depth) = picture.depth.as_ref().filter(|d| d.kind == DepthKind::Metric) else { continue };
-        let known: Vec<usize> = (0..depth.values.pixels()).filter(|&p| depth.values.data[p] > 0.0).collect();
-        // What moves comes from keyframes alone, so that these are looked at more closely.
-        let wanted = CANDIDATES * count / chosen.len() + if key(i) { CANDIDATES * count / keys } else { 0 };
-        let rng = rng.fork(i as u64);
-        for k in 0..wanted.min(known.len()) {
-            let p = known[rng.below(k as u64, known.len())];
-            let (x, y) = (p % depth.values.width, p / depth.values.width);
-            let at = [x as f64 + 0.5, y as f64 + 0.5];
-            let point = frames.camera(i).unproject(at, f64::from(depth.values.data[p]));
+        let Some(map) = Map::load(frames, i, &mut picture)? else { continue };
+        let known: Vec<usize> = (0..map.depth.pixels()).filter(|&p| map.depth.data[p] > 0.0).collect();
+        let asked = if moving { still.max(ASKED) } else { still };
+        let order = rng.fork(i as u64).permutation(known.len());
+        for (n, &k) in order.iter().take(asked).enumerate() {
+            let pixel = known[k as usize];
+            let (x, y) = (pixel % map.depth.width, pixel / map.depth.width);
+            let point = map.camera.unproject([x as f64 + 0.5, y as f64 + 0.5], f64::from(map.depth.data[pixel]));
             let color = std::array::from_fn(|c| picture.color.get(c, y, x));
-            candidates.push((maps.len(), point, color));
+            candidates.push(Candidate { map: maps.len(), pixel, point, color, still: n < still });
         }
-        let (camera, time) = (frames.camera(i).clone(), frames.time(i).0);
-        maps.push(Map { frame: i, camera, time, depth: depth.values.clone() });
+        maps.push(map);
     }
-    let moves: Vec<bool> = candidates
-        .par_iter()
-        .map(|&(map, point, _)| {
-            let own: &Map = &maps[map];
-            moving && maps.iter().any(|m| m.time != own.time && m.sees_through(point))
-        })
-        .collect();
-    let (mut still, mut alive) = (Seeds::default(), Seeds::default());
-    for ((map, point, color), moves) in candidates.into_iter().zip(moves) {
-        let map = &maps[map];
-        if !moves {
-            still.push(point, color, None);
-        } else if key(map.frame) {
-            alive.push(point, color, Some(map.time));
+    let moves = |c: &Candidate| {
+        let own: &Map = &maps[c.map];
+        moving && maps.iter().any(|m| m.time != own.time && m.sees_through(c.point))
+    };
+    let moves: Vec<bool> = candidates.par_iter().map(moves).collect();
+    let (mut out, mut alive) = (Seeds::default(), Vec::new());
+    for (candidate, moves) in candidates.into_iter().zip(moves) {
+        if moves {
+            alive.push(candidate);
+        } else if candidate.still {
+            out.push(candidate.point, candidate.color, None);
         }
     }
-    alive.truncate_evenly((MOVING_SHARE * count as f64) as usize, rng.fork(u64::MAX));
-    still.truncate_evenly(count - alive.len(), rng.fork(u64::MAX - 1));
-    still.append(alive);
-    Ok(still)
+    let alive = evenly(alive, count, rng.fork(u64::MAX));
+    out.truncate_evenly(count, rng.fork(u64::MAX - 1));
+    let mut times: Vec<f64> = maps.iter().map(|m| m.time).collect();
+    times.sort_by(f64::total_cmp);
+    times.dedup();
+    if let [first, .., last] = times[..] {
+        let gap = (last - first) / (times.len() - 1) as f64;
+        // The integral of a life exp(−½(t/w)²) is √(2π)w.
+        let wanted = ALIVE_SHARE * count as f64 / alive.len().max(1) as f64 * (last - first) / TAU.sqrt();
+        out.life = Some(wanted.clamp(LIFE[0] * gap, LIFE[1] * gap));
+    }
+    for of_map in alive.chunk_by(|a, b| a.map == b.map) {
+        let map = &maps[of_map[0].map];
+        let pixels: Vec<usize> = of_map.iter().map(|c| c.pixel).collect();
+        let velocities = scene_flow::velocities(frames, map, &pixels)?;
+        for (c, velocity) in of_map.iter().zip(velocities) {
+            out.push(c.point, c.color, Some(map.time));
+            *out.velocities.last_mut().expect("just pushed") = velocity;
+        }
+    }
+    Ok(out)
+}
+
+/// At most `count` of them, evenly chosen, in their order.
+fn evenly<T>(all: Vec<T>, count: usize, rng: Rng) -> Vec<T> {
+    let mut keep = vec![all.len() <= count; all.len()];
+    rng.permutation(all.len()).into_iter().take(count).for_each(|i| keep[i as usize] = true);
+    all.into_iter().zip(keep).filter_map(|(one, keep)| keep.then_some(one)).collect()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::capture::frames::Depth;
+    use crate::methods::Plan;
+    use crate::recipe::Recipe;
     use crate::step::tests::Made;
     use splat4d::math::se3::{dot, norm, normalize, sub};
     use splat4d::scene::Time;
@@ -154,16 +202,31 @@ mod tests {
     #[test]
     fn what_moves_belongs_to_its_moment_and_all_else_to_all() {
         let deep = Deep(Made::new(4, 3, 24));
-        let time = deep.time(1).0;
-        let seeds = points(&deep, &[time], 400, true, Rng::new(1, "test", 0)).unwrap();
+        let seeds = points(&deep, 400, true, Rng::new(1, "test", 0)).unwrap();
         let moving: Vec<usize> = (0..seeds.len()).filter(|&i| seeds.times[i].is_some()).collect();
-        assert!(seeds.len() > 200 && moving.len() > 20, "{} of {}", moving.len(), seeds.len());
+        assert!(seeds.len() > 200 && moving.len() > 60, "{} of {}", moving.len(), seeds.len());
         for &i in &moving {
-            assert_eq!(seeds.times[i], Some(time));
-            let off = norm(sub(seeds.points[i], deep.0.object_at(time)));
+            let off = norm(sub(seeds.points[i], deep.0.object_at(seeds.times[i].unwrap())));
             assert!((off - Made::RADIUS).abs() < 1e-3, "{off}");
         }
-        let none = points(&deep.0, &[time], 400, true, Rng::new(1, "test", 0)).unwrap();
+        for k in 0..3 {
+            let of = moving.iter().filter(|&&i| seeds.times[i] == Some(deep.0.time_of(k))).count();
+            assert!(of > 10, "{of} at moment {k}");
+        }
+        let gap = deep.0.time_of(1) - deep.0.time_of(0);
+        let life = seeds.life.expect("what moves lives about its moment");
+        assert!(life >= 0.5 * gap && life <= 2.0 * gap, "{life}");
+        let none = points(&deep.0, 400, true, Rng::new(1, "test", 0)).unwrap();
         assert!(none.is_empty(), "no maps, no points");
+        // Gaussians that live through the whole clip begin with what moves at one moment of it.
+        let recipe = Recipe::default().with(|r| r.init.count = 400).resolve();
+        let plan =
+            Plan { recipe, clip: [deep.0.time_of(0), deep.0.time_of(2)], times: 3, fps: 10.0, ..Plan::default() };
+        let one = super::super::one_moment(&plan, &deep, None).unwrap();
+        let off = |i: usize, k: usize| norm(sub(one.points[i], deep.0.object_at(deep.0.time_of(k)))) - Made::RADIUS;
+        let near = |i: usize, k: usize| off(i, k).abs() < 1e-3;
+        let count = |k: usize| (0..one.len()).filter(|&i| near(i, k)).count();
+        assert!(one.times.iter().all(Option::is_none) && one.life.is_none());
+        assert!(count(1) > 10 && count(0) + count(2) < count(1) / 2, "{:?}", [count(0), count(1), count(2)]);
     }
 }

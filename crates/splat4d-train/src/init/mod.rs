@@ -4,8 +4,10 @@
 mod depth;
 pub(crate) mod fill;
 pub(crate) mod hull;
+mod scene_flow;
 pub(crate) mod volume;
 
+use crate::capture::PointCloud;
 use crate::capture::frames::Frames;
 use crate::methods::{Plan, Program};
 use crate::settings::{Value, among, settings};
@@ -27,9 +29,20 @@ pub struct Seeds {
     pub colors: Vec<[f32; 3]>,
     /// When the point was seen, seconds; `None`: during the whole clip.
     pub times: Vec<Option<f64>>,
+    /// How fast it moves, scene units a second; zero where nobody knows.
+    pub velocities: Vec<[f64; 3]>,
+    /// Width of the lives of points with a time, seconds; `None`: the recipe's.
+    pub life: Option<f64>,
 }
 
 impl Seeds {
+    /// Points of a cloud, which says nothing of velocities.
+    pub(crate) fn of(cloud: &PointCloud) -> Self {
+        let velocities = vec![[0.0; 3]; cloud.points.len()];
+        let (points, colors, times) = (cloud.points.clone(), cloud.colors.clone(), cloud.times.clone());
+        Self { points, colors, times, velocities, life: None }
+    }
+
     /// Number of points.
     pub(crate) fn len(&self) -> usize {
         self.points.len()
@@ -45,6 +58,7 @@ impl Seeds {
         self.points.push(point);
         self.colors.push(color);
         self.times.push(time);
+        self.velocities.push([0.0; 3]);
     }
 
     /// Adds all of another set.
@@ -52,6 +66,8 @@ impl Seeds {
         self.points.append(&mut other.points);
         self.colors.append(&mut other.colors);
         self.times.append(&mut other.times);
+        self.velocities.append(&mut other.velocities);
+        self.life = self.life.or(other.life);
     }
 
     /// At most `count` of them, evenly chosen.
@@ -59,13 +75,18 @@ impl Seeds {
         if self.len() <= count {
             return;
         }
-        let mut chosen = rng.permutation(self.len());
-        chosen.truncate(count);
-        chosen.sort_unstable();
+        let mut keep = vec![false; self.len()];
+        rng.permutation(self.len()).into_iter().take(count).for_each(|i| keep[i as usize] = true);
+        self.retain(|i, _| keep[i]);
+    }
+
+    /// Keeps those of which the rule says so.
+    fn retain(&mut self, rule: impl Fn(usize, &Self) -> bool) {
         let old = std::mem::take(self);
-        for i in chosen {
-            let i = i as usize;
+        self.life = old.life;
+        for i in (0..old.len()).filter(|&i| rule(i, &old)) {
             self.push(old.points[i], old.colors[i], old.times[i]);
+            self.velocities[self.points.len() - 1] = old.velocities[i];
         }
     }
 }
@@ -82,7 +103,7 @@ settings! {
         opacity: f64 = 0.1 => inside_share();
         /// Moments at which initial points are spread over the clip; 0: about every 5 frames.
         keyframes: usize = 0;
-        /// Initial life width of moving points, clips; 0: twice the gap between keyframes.
+        /// Initial life width of moving points, clips; 0: twice the gap between keyframes; of depth maps what covers what moves.
         life: f64 = 0.0
             => any().unit("clips").when(Any(&[Is("run.motion", &["spacetime", "native4d"]), Is("life.kind", &["gauss-half", "gauss-one", "interval"])]));
     }
@@ -189,7 +210,7 @@ pub fn seeds(plan: &Plan, frames: &dyn Frames, points: Option<Seeds>, moving: bo
     let use_hull =
         frames.has_masks() && matches!(r.init.source, Source::Auto | Source::Hull) && (moving || !have_points);
     let seen = match r.init.source {
-        Source::Auto if frames.has_depth() => depth::points(frames, &times, r.init.count, moving, rng.fork(4))?,
+        Source::Auto if frames.has_depth() => depth::points(frames, r.init.count, moving, rng.fork(4))?,
         _ => Seeds::default(),
     };
     let have_depth = !seen.is_empty();
@@ -223,8 +244,24 @@ pub(crate) fn one_moment(plan: &Plan, frames: &dyn Frames, points: Option<Seeds>
     let mut single = plan.clone();
     single.recipe.init.keyframes = single.recipe.init.keyframes.max(1);
     let mut out = seeds(&single, frames, points, true)?;
+    if out.life.take().is_some() {
+        // Depth maps show every moment: of what moves only one is wanted.
+        let middle = 0.5 * (plan.clip[0] + plan.clip[1]);
+        let nearest =
+            out.times.iter().flatten().copied().min_by(|a, b| (a - middle).abs().total_cmp(&(b - middle).abs()));
+        out.retain(|i, s| s.times[i].is_none() || s.times[i] == nearest);
+    }
     out.times.fill(None);
     Ok(out)
+}
+
+/// How a Gaussian begins, as far as its seed says it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Beginning {
+    /// Centre and width of its life, seconds.
+    pub life: (f64, f64),
+    /// At the centre of its life, scene units a second.
+    pub velocity: [f64; 3],
 }
 
 /// One layer of Gaussians at the seeds: isotropic, as large as the distance to their neighbours of the same moment.
@@ -240,7 +277,8 @@ pub fn scene(
     let n = seeds.len();
     let mut params = Params::<f32>::new(n, (r.appearance.sh_degree + 1) * (r.appearance.sh_degree + 1), life.columns());
     let scales = scales(seeds, plan.extent);
-    let lives: Vec<(f64, f64)> = seeds.times.iter().map(|&t| first_life(plan, t)).collect();
+    let begin = |i: usize| Beginning { life: first_life(plan, seeds, i), velocity: seeds.velocities[i] };
+    let beginnings: Vec<Beginning> = (0..n).map(begin).collect();
     let logit = (r.init.opacity / (1.0 - r.init.opacity)).ln() as f32;
     for i in 0..n {
         let geometry = &mut params[GEOMETRY];
@@ -250,7 +288,7 @@ pub fn scene(
         geometry.set(i, OPACITY, logit);
         params[SH].write(i, 0, seeds.colors[i].map(rgb_to_dc));
         if life != LifeKind::Infinite {
-            let (center, mut width) = lives[i];
+            let (center, mut width) = beginnings[i].life;
             let mut softness = INITIAL_SOFTNESS_FRAMES / plan.fps;
             if life == LifeKind::Interval && seeds.times[i].is_none() {
                 // Flat ends outside the clip would never be felt: nobody could learn to come or go.
@@ -263,17 +301,21 @@ pub fn scene(
         }
     }
     let motion = program.build(plan, &mut params)?;
-    program.init(&lives, &mut params);
+    program.init(plan, &beginnings, &mut params);
     let head = if HeadKeys::of(&params).is_some() { Head::Features } else { Head::Identity };
     let layer = Layer::new("scene", params, motion, life);
     Ok(Scene { layers: vec![layer], background, clip: plan.clip, fps: plan.fps, up, head, labels: Vec::new() })
 }
 
-/// Centre and width (seconds) of the life that a Gaussian at a point of this time starts with.
-fn first_life(plan: &Plan, time: Option<f64>) -> (f64, f64) {
+/// Centre and width (seconds) of the life that a Gaussian at a seed starts with.
+fn first_life(plan: &Plan, seeds: &Seeds, i: usize) -> (f64, f64) {
     let gap = plan.seconds() / keyframes(plan).len() as f64;
-    let short = if plan.recipe.init.life > 0.0 { plan.recipe.init.life * plan.seconds() } else { 2.0 * gap };
-    match time {
+    let short = match seeds.life {
+        _ if plan.recipe.init.life > 0.0 => plan.recipe.init.life * plan.seconds(),
+        Some(width) => width,
+        None => 2.0 * gap,
+    };
+    match seeds.times[i] {
         Some(t) => (t, short),
         None => (0.5 * (plan.clip[0] + plan.clip[1]), LONG_LIFE_CLIPS * plan.seconds()),
     }
@@ -298,4 +340,36 @@ fn scales(seeds: &Seeds, extent: f64) -> Vec<f64> {
         rest = if count < 8 { &[] } else { tail };
     }
     out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::methods::program;
+    use crate::recipe::{MotionName, Recipe};
+    use splat4d::layers::Evaluation;
+    use splat4d::math::se3::{norm, sub};
+    use splat4d::scene::{Rows, Space, Time};
+
+    #[test]
+    fn a_seed_that_moves_makes_a_gaussian_that_moves() {
+        for motion in ["spacetime", "native4d"] {
+            let recipe = Recipe::default().with(|r| r.run.motion = MotionName::of(motion)).resolve();
+            let plan = Plan { recipe, extent: 2.0, clip: [0.0, 1.0], times: 11, fps: 10.0, ..Plan::default() };
+            let mut seeds = Seeds { life: Some(0.2), ..Seeds::default() };
+            for k in 0..6 {
+                seeds.push([0.1 * k as f64, 0.0, 1.0], [0.5; 3], Some(0.5));
+                seeds.velocities[k] = [0.3 * k as f64, -0.4, 0.7];
+            }
+            let made = scene(&plan, program(motion).unwrap().as_ref(), &seeds, [0.0; 3], [0.0, 1.0, 0.0]).unwrap();
+            for t in [0.5, 0.6] {
+                let answer = Evaluation::of_layer(&made.layers[0], Space::Gaussians, Rows::All, Time(t));
+                for k in 0..6 {
+                    let there = std::array::from_fn(|i| seeds.points[k][i] + (t - 0.5) * seeds.velocities[k][i]);
+                    let off = norm(sub(answer.tape(0).out().read::<3>(k, 0).map(f64::from), there));
+                    assert!(off < 1e-5, "{motion}, {k} at {t}: {off}");
+                }
+            }
+        }
+    }
 }

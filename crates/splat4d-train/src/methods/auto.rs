@@ -27,6 +27,8 @@ pub struct Seen {
     pub fewest: usize,
     /// Pictures have masks.
     pub masks: bool,
+    /// Pictures have metric depth maps, which are read.
+    pub depth: bool,
     /// The end of the take is kept from training, to be predicted.
     pub predicted: bool,
 }
@@ -41,6 +43,7 @@ impl Seen {
             changing: if looks { motion_energy(frames)? } else { None },
             fewest: plan.moments.iter().map(|m| m.1).min().unwrap_or(0),
             masks: frames.has_masks(),
+            depth: frames.has_depth(),
             predicted: plan.recipe.capture.observe < 1.0,
         })
     }
@@ -119,6 +122,7 @@ mod tests {
         times: usize,
         speed: usize,
         masks: bool,
+        depth: bool,
         camera: Camera,
         /// Seconds by which each camera is later than the one before.
         late: f64,
@@ -134,6 +138,7 @@ mod tests {
                 times,
                 speed,
                 masks,
+                depth: false,
                 camera: Camera::with_fov_y(pose, 0.9, 64, 48),
                 late: 0.0,
                 observe: 1.0,
@@ -174,6 +179,9 @@ mod tests {
         fn has_masks(&self) -> bool {
             self.masks
         }
+        fn has_depth(&self) -> bool {
+            self.depth
+        }
         fn load(&self, i: usize, out: &mut Picture) -> Result<()> {
             out.color = Planes::new(3, 48, 64);
             out.color.data.fill(0.4);
@@ -206,5 +214,9 @@ mod tests {
         is(Made::new(1, 50, 4, true), false, "control", "one camera");
         is(Made::new(1, 50, 4, false), false, "deform-mlp", "one camera");
         is(Made::new(2, 700, 4, true), true, "deform-mlp", "of 700");
+        // What depth maps show of every moment is where it is, whatever moves the camera.
+        is(Made { depth: true, ..Made::new(1, 50, 4, false) }, false, "spacetime", "depth");
+        is(Made { depth: true, ..Made::new(2, 700, 4, false) }, true, "spacetime", "depth");
+        is(Made { depth: true, observe: 0.8, ..Made::new(1, 50, 4, true) }, false, "control", "one camera");
     }
 }

@@ -7,6 +7,7 @@
 
 use super::{Group, Hook, Plan, Program, Stage};
 use crate::Result;
+use crate::init::Beginning;
 use crate::loss::transport::{Transport, TransportConfig};
 use crate::recipe::Recipe;
 use crate::settings::{Choice, settings};
@@ -29,6 +30,8 @@ settings! {
             => any().switch().when(Any(&[On("filter.fusion"), On("transport.metric")]));
         /// Share of the iterations after which it is switched on.
         start: f64 = 0.2 => share();
+        /// Share of the iterations after which it is taken off, and the motion learns on alone; 1: it stays to the end.
+        until: f64 = 1.0 => share();
         /// Share of the motion's answer that Gaussians start with; the rest is the prediction's.
         gain: f64 = 0.5 => inside_share();
         /// Rate of the gains' logits.
@@ -99,9 +102,10 @@ impl Program for FilteredProgram {
 
     fn check(&self, plan: &Plan) -> Result<()> {
         let r = &plan.recipe;
-        if r.filter.history > 0 && !r.filter.stop_gradient && r.filter.fusion != Fusion::Off {
-            return Err(crate::Error::input("filter_history has no gradient to earlier frames")
-                .remedy("Set filter_stop_gradient=true, or filter_history=0"));
+        let off_early = r.filter.until < 1.0;
+        if r.filter.fusion != Fusion::Off && off_early && (r.filter.until <= r.filter.start || r.filter.keep) {
+            return Err(crate::Error::input(format!("the filter is taken off at filter.until={}", r.filter.until))
+                .remedy("Let filter.start be less, and do not ask for filter.keep"));
         }
         self.inner.check(plan)
     }
@@ -126,8 +130,8 @@ impl Program for FilteredProgram {
         self.inner.growth_bytes(plan, rows)
     }
 
-    fn init(&self, lives: &[(f64, f64)], params: &mut Params) {
-        self.inner.init(lives, params);
+    fn init(&self, plan: &Plan, beginnings: &[Beginning], params: &mut Params) {
+        self.inner.init(plan, beginnings, params);
     }
 
     fn tuning(&self, plan: &Plan) -> Stage {
@@ -151,7 +155,10 @@ impl Program for FilteredProgram {
             stage.start = stage.start.take().map(around);
             stage.end = stage.end.take().map(around);
         }
-        switch_on(&mut stages, r.filter.start, fusion);
+        switch(&mut stages, r.filter.start, fusion);
+        if r.filter.until < 1.0 {
+            switch(&mut stages, r.filter.until, Fusion::Off);
+        }
         if let (Some(last), false) = (stages.last_mut(), r.filter.keep) {
             let before = last.end.take();
             last.end = Some(Box::new(move |scene, progress| {
@@ -165,8 +172,8 @@ impl Program for FilteredProgram {
     }
 }
 
-/// Switches the filter on after a share of all steps, in the stage that runs by then.
-fn switch_on(stages: &mut [Stage], share: f64, fusion: Fusion) {
+/// Switches the filter after a share of all steps, in the stage that runs by then.
+fn switch(stages: &mut [Stage], share: f64, fusion: Fusion) {
     let total: usize = stages.iter().map(|s| s.iterations).sum();
     let mut left = (share * total as f64).round() as usize;
     for stage in stages {

@@ -26,6 +26,7 @@ pub(crate) use still::{AppearanceSettings, LifeSettings, RateSettings};
 pub(crate) use tracked::TrackedSettings;
 
 use crate::event::Progress;
+use crate::init::Beginning;
 use crate::loss::image::ImageTerm;
 use crate::loss::terms::{Codec, ParamLoss, ProbeLoss};
 use crate::optim::Noise;
@@ -282,9 +283,8 @@ pub trait Program: Send + Sync {
     fn first(&self, plan: &Plan) -> Plan {
         plan.clone()
     }
-    /// Fills what the model's own tables start with, row by row; `lives`: centre and width (seconds) of the life that
-    /// suits the point at which a Gaussian starts.
-    fn init(&self, _lives: &[(f64, f64)], _params: &mut Params) {}
+    /// Fills what the model's own tables start with, row by row.
+    fn init(&self, _plan: &Plan, _beginnings: &[Beginning], _params: &mut Params) {}
     /// Says before training, and not after an hour, that the model cannot work on a capture.
     fn check(&self, _plan: &Plan) -> Result<()> {
         Ok(())

@@ -4,11 +4,12 @@
 //! the velocity by twice its size in extents a clip, which is the unit of the rotation (`Native4dSpec::speed`).
 
 use super::{Group, Plan, Program, Rate, Stage, still};
+use crate::init::Beginning;
 use crate::loss::scene::LivingOpacity;
 use crate::settings::{Choice, settings};
 use crate::{Error, Result};
 use splat4d::motion::Spec;
-use splat4d::motion::native4d::{MAX_HARMONICS, Native4dSpec, TABLE};
+use splat4d::motion::native4d::{MAX_HARMONICS, Native4dSpec, TABLE, set_velocity};
 use splat4d::scene::{LifeKind, Params};
 
 /// Scales in time count up to so many clips: a Gaussian is then as good as immortal (0.5 % fainter at the clip's ends).
@@ -54,10 +55,15 @@ impl Program for Native4dProgram {
         LifeKind::Infinite
     }
 
-    fn init(&self, lives: &[(f64, f64)], params: &mut Params) {
+    fn init(&self, plan: &Plan, beginnings: &[Beginning], params: &mut Params) {
+        let Spec::Native4d(spec) = self.spec(plan) else { unreachable!("its own spec") };
         let key = params.find(TABLE).expect("the model has made its table");
-        for (row, &(center, width)) in lives.iter().enumerate() {
+        for (row, begin) in beginnings.iter().enumerate() {
+            let (center, width) = begin.life;
             params[key].write(row, 0, [center as f32, width.ln() as f32]);
+            if begin.velocity != [0.0; 3] {
+                set_velocity(&spec, params, row, begin.velocity);
+            }
         }
     }
 

@@ -4,13 +4,14 @@
 use super::auto::Seen;
 use super::still;
 use super::{Group, Plan, Program, Rate, Stage};
+use crate::init::Beginning;
 use crate::loss::scene::{LivingOpacity, VelocitySmoothness};
 use crate::settings::{choices, settings};
 use crate::upkeep::Guided;
-use splat4d::motion::spacetime::{FeatureSpec, TIME_FEATURES, VIEW_FEATURES};
+use splat4d::motion::spacetime::{FeatureSpec, TIME_FEATURES, VELOCITIES, VIEW_FEATURES};
 use splat4d::motion::{SpacetimeSpec, Spec};
-use splat4d::scene::LifeKind;
 use splat4d::scene::head::{HEAD_IN, HEAD_OUT};
+use splat4d::scene::{LifeKind, Params};
 
 /// Cameras at a moment from which on a scene is seen from all sides at once.
 const MANY_CAMERAS: f64 = 3.0;
@@ -81,11 +82,24 @@ impl Program for SpacetimeProgram {
         plan.recipe.life.kind.unwrap_or(LifeKind::GaussHalf)
     }
 
+    fn init(&self, _plan: &Plan, beginnings: &[Beginning], params: &mut Params) {
+        let Some(key) = params.find(VELOCITIES) else { return };
+        if params[key].width() > 0 {
+            beginnings.iter().enumerate().for_each(|(row, b)| params[key].write(row, 0, b.velocity.map(|v| v as f32)));
+        }
+    }
+
     fn has_features(&self) -> bool {
         true
     }
 
     fn suits(&self, seen: &Seen) -> Option<String> {
+        if seen.depth && !seen.masks && !seen.predicted {
+            let cameras = seen.cameras_in_words();
+            return Some(format!(
+                "{cameras} a moment, and depth maps say where things are then: Gaussians begin there"
+            ));
+        }
         let moving =
             seen.changing.map_or_else(String::new, |share| format!(", {:.1} % of the pixels move", 100.0 * share));
         (seen.cameras >= MANY_CAMERAS).then(|| {

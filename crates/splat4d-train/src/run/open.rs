@@ -203,14 +203,9 @@ impl OpenCapture {
         let program = program_of(&plan.recipe)?;
         let moving = program.capabilities(plan).moves && plan.times > 1;
         let points = if let Source::File(path) = &plan.recipe.init.source {
-            let cloud = crate::capture::read_points(path)?;
-            Some(Seeds { points: cloud.points, colors: cloud.colors, times: cloud.times })
+            Some(Seeds::of(&crate::capture::read_points(path)?))
         } else {
-            self.capture.points.as_ref().map(|c| Seeds {
-                points: c.points.clone(),
-                colors: c.colors.clone(),
-                times: c.times.clone(),
-            })
+            self.capture.points.as_ref().map(Seeds::of)
         };
         let (first, frames) = (program.first(plan), self.frames.as_ref());
         match moving && program.one_moment(plan) {

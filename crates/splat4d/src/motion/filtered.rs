@@ -13,8 +13,8 @@
 //! once. All is continuous in t, between frames too. With `history` the earlier states are filtered themselves,
 //! that many frames back: sequential inference with random access. Opacity and colour are the observation's.
 //!
-//! Gradients: exact by default of the mathematics; with `stop_gradient` (the default, truncated back-propagation of
-//! length 2) earlier answers are constants, and with `history` they always are. Nodes are answered by the model inside.
+//! Gradients: exact, through all of `history`; with `stop_gradient` (the default) earlier answers are constants. Nodes are
+//! answered by the model inside.
 //!
 //! Source: Deng et al. 2024 ("Wasserstein 4DGS", arXiv 2412.00333); the scalar gain, the geodesic fusion, the gate's
 //! fading and the baseline are ours.
@@ -28,7 +28,6 @@ pub use row::{Fused, FusedGrads, Fusion, Normal, Prediction, Predictor};
 use super::{At, Cache, Capabilities, Model, Motion, Phase, Spec, Tape};
 use crate::math::{Real, Rng};
 use crate::scene::splats::SPLAT_COLUMNS;
-use crate::scene::splats::SPLAT_OPACITY;
 use crate::scene::table::par_split;
 use crate::scene::{Color, Grads, Key, Params, RowEdit, Rows, Space, SplatGrads, Table, Time};
 use crate::{Error, Result};
@@ -112,9 +111,6 @@ impl FilteredSpec {
         }
         if !(self.gate >= 0.0 && self.gate.is_finite()) {
             return bad(format!("gate is {}", self.gate));
-        }
-        if self.history > 0 && !self.stop_gradient {
-            return bad("history has no gradient: stop_gradient must be true with it".into());
         }
         Ok(())
     }
@@ -217,11 +213,6 @@ impl<F: Real> Filtered<F> {
         all
     }
 
-    /// Whether gradients go to earlier answers.
-    fn learns_from_before(&self) -> bool {
-        !self.spec.stop_gradient && self.spec.history == 0
-    }
-
     fn gain(&self, q: &At<'_, F>, j: usize) -> f64 {
         q.p[self.gains].get(q.rows.id(j), 0).sigmoid().f64()
     }
@@ -265,8 +256,8 @@ struct Own<F> {
     earlier: Vec<Tape<F>>,
     /// States at t and earlier, where the filter runs through its history; place 0 is unused.
     states: Vec<Table<F>>,
-    /// Gradients to the observation and the two earlier states.
-    d: [Table<F>; 3],
+    /// Gradients to the states, by frames earlier; unused places are empty.
+    d: Vec<Table<F>>,
     d_gains: Table<F>,
 }
 
@@ -279,7 +270,7 @@ where
             seen: Tape::default(),
             earlier: Vec::new(),
             states: Vec::new(),
-            d: Default::default(),
+            d: Vec::new(),
             d_gains: Table::new(&[(GAINS, 1)], 0),
         }
     }
@@ -383,39 +374,52 @@ impl<F: Real> Motion<F> for Filtered<F> {
         }
         let own = tape.own.get_or_default::<Own<F>>();
         let (baseline, history) = (self.spec.baseline, self.spec.history);
+        let back = !self.spec.stop_gradient;
+        // Gradients to states by frames earlier; each becomes that to the observation of its frame as the chain goes back.
         let mut d_states = std::mem::take(&mut own.d);
-        for table in &mut d_states {
+        d_states.resize_with(history + 2 + baseline, Table::default);
+        for (k, table) in d_states.iter_mut().enumerate().filter(|(k, _)| back || [0, 1, 1 + baseline].contains(k)) {
             if table.width() == 0 {
                 *table = d_out.out.zeros_like();
             }
             table.resize(q.len());
-        }
-        own.d_gains.resize(q.len());
-        let mut d_gains = std::mem::take(&mut own.d_gains);
-        let [seen, last, before] = [&own.seen.out, own.state(1, history), own.state(1 + baseline, history)];
-        let [trust, slope] = self.trust(q.t.0);
-        let back = self.learns_from_before();
-        let [d_seen, d_last, d_before] = &mut d_states;
-        let views = [d_seen, d_last, d_before, &mut d_gains].map(Table::view_mut);
-        let mut d_time = par_split(views, &|[mut d_seen, mut d_last, mut d_before, mut d_gains]| {
-            let mut d_trust = 0.0;
-            for j in d_seen.first..d_seen.first + d_seen.rows {
-                let [a, b, c] = [seen, last, before].map(|t| Normal::of_splat(t.read::<9>(j, 0)));
-                let gain = self.gain(q, j);
-                let (prediction, state) = self.row([&a, &b, &c], gain, trust);
-                let g = state.backward(&a, &Normal::of_gradient(d_out.out.read::<9>(j, 0)));
-                d_seen.write(j, 0, g.seen.gradient::<F>());
-                d_seen.write(j, SPLAT_OPACITY, [d_out.out.get(j, SPLAT_OPACITY)]);
-                d_gains.write(j, 0, [F::of(g.gain * gain * (1.0 - gain))]);
-                d_trust += g.trust;
-                if back {
-                    let (to_last, to_before) = prediction.backward(&g.predicted);
-                    d_last.write(j, 0, to_last.gradient::<F>());
-                    d_before.write(j, 0, to_before.gradient::<F>());
-                }
+            if k > 0 {
+                table.fill(F::ZERO);
             }
-            d_trust
-        }) * slope;
+        }
+        d_states[0].data_mut().copy_from_slice(d_out.out.data());
+        let mut d_gains = std::mem::take(&mut own.d_gains);
+        d_gains.resize(q.len());
+        d_gains.fill(F::ZERO);
+        let mut d_time = 0.0;
+        for k in 0..=if back { history } else { 0 } {
+            let asked = self.earlier(q, k);
+            let seen = if k == 0 { &own.seen.out } else { &own.earlier[k].out };
+            let [last, before] = [k + 1, k + 1 + baseline].map(|k| own.state(k, history));
+            let [trust, slope] = self.trust(asked.t.0);
+            let (now, earlier) = d_states[k..].split_at_mut(1);
+            let (near, far) = earlier.split_at_mut(baseline);
+            let views = [&mut now[0], &mut near[0], &mut far[0], &mut d_gains].map(Table::view_mut);
+            d_time += slope
+                * par_split(views, &|[mut d_state, mut d_last, mut d_before, mut d_gains]| {
+                    let mut d_trust = 0.0;
+                    for j in d_state.first..d_state.first + d_state.rows {
+                        let [a, b, c] = [seen, last, before].map(|t| Normal::of_splat(t.read::<9>(j, 0)));
+                        let gain = self.gain(q, j);
+                        let (prediction, state) = self.row([&a, &b, &c], gain, trust);
+                        let g = state.backward(&a, &Normal::of_gradient(d_state.read::<9>(j, 0)));
+                        d_state.write(j, 0, g.seen.gradient::<F>());
+                        d_gains.add(j, 0, [F::of(g.gain * gain * (1.0 - gain))]);
+                        d_trust += g.trust;
+                        if back {
+                            let (to_last, to_before) = prediction.backward(&g.predicted);
+                            d_last.add(j, 0, to_last.gradient::<F>());
+                            d_before.add(j, 0, to_before.gradient::<F>());
+                        }
+                    }
+                    d_trust
+                });
+        }
         let [to_gains] = d.of([self.gains]);
         for j in 0..q.len() {
             to_gains.add(q.rows.id(j), 0, [d_gains.get(j, 0)]);
@@ -423,10 +427,9 @@ impl<F: Real> Motion<F> for Filtered<F> {
         let grads = SplatGrads { out: &d_states[0], ..*d_out };
         d_time += self.inner.backward(q, cache, &mut own.seen, &grads, d_cache, d);
         if back {
-            for (k, table) in [(1, &d_states[1]), (1 + baseline, &d_states[2])] {
-                let grads = SplatGrads { out: table, color: None, weights: None };
-                let q = self.earlier(q, k);
-                d_time += self.inner.backward(&q, cache, &mut own.earlier[k], &grads, d_cache, d);
+            for k in self.frames() {
+                let grads = SplatGrads { out: &d_states[k], color: None, weights: None };
+                d_time += self.inner.backward(&self.earlier(q, k), cache, &mut own.earlier[k], &grads, d_cache, d);
             }
         }
         (own.d, own.d_gains) = (d_states, d_gains);

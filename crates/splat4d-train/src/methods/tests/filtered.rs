@@ -140,6 +140,16 @@ fn a_recipe_wraps_any_program_and_leaves_no_trace() {
         let moved = layer.params.find("velocities").unwrap();
         assert!(layer.params[moved].data().iter().any(|x| *x != 0.0), "what was learnt stays");
     }
+    let plan = plan(recipe("filter=geodesic filter_start=0.25 filter.until=0.75"));
+    let mut early = program_of(&plan.recipe).unwrap().stages(&plan);
+    early[0].upkeep.retain(|u| u.once());
+    let due = |step: &usize| early[0].upkeep.iter().any(|u| u.due(&At { step: *step, steps: 40 }));
+    assert_eq!((0..40).filter(due).collect::<Vec<_>>(), [10, 30]);
+    for bad in ["filter.until=0.1", "filter.until=0.5 filter_keep=true"] {
+        let plan = made_plan(recipe(&format!("filter=geodesic {bad}")));
+        let refused = program_of(&plan.recipe).unwrap().check(&plan).expect_err(bad).to_string();
+        assert!(refused.contains("filter.until"), "{refused}");
+    }
     let none = program("filtered").err().expect("it wraps, and moves nothing itself").to_string();
     assert!(none.contains("filter=geodesic"), "{none}");
     for bad in ["filter=kalman", "filter_gain=1", "filter_baseline=0", "filter_history=1000", "transport_every=2"] {

@@ -107,6 +107,14 @@ impl Model for Native4dSpec {
     }
 }
 
+/// Gives a Gaussian, which may move, another velocity at the middle of its life, scene units a second: its slice there and
+/// its life stay. Panics: the model has not made its table.
+pub fn set_velocity(spec: &Native4dSpec, params: &mut Params<f32>, row: usize, velocity: [f64; 3]) {
+    let own = params.find(TABLE).expect("the model has made its table");
+    let slice = Sliced::of(spec, params, own, row);
+    Sliced { velocity, ..slice }.write(spec, params, own, row);
+}
+
 impl Native4d {
     /// New Gaussians stand still and live for a second around t = 0. With harmonics, the layer's SH table grows by their
     /// blocks, which start at zero.
