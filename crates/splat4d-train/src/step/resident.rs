@@ -10,15 +10,13 @@ use crate::learner::{Learner, Parts};
 use crate::loss::terms::KeptLoss;
 use crate::optim::corrections;
 use splat4d::layers::{ALPHA_MIN, ALWAYS, Layer};
-use splat4d::motion::tracked::{Tracked, page_of};
-use splat4d::motion::{Polynomial, Spec, native4d};
+use splat4d::motion::{Polynomial, Slices};
 use splat4d::render::{
     Antialias, Backend, KEPT, KeptLayer, KeptNoise, KeptRule, KeptStep, KeptTable, KeptTies, KeptView, Moves,
     RowWeights, Target,
 };
 use splat4d::scene::life::LOG_WIDTH;
 use splat4d::scene::{GEOMETRY, Key, LIFE, LifeKind, SH, Time};
-use std::any::Any;
 use std::time::Instant as Clock;
 
 /// Who has the newest numbers.
@@ -110,22 +108,16 @@ impl Known {
             let moves = Moves::Along { order, rotation: rotation_rates.is_some(), detach: detached, origin };
             return Some(known(moves, [velocities, rotation_rates]));
         }
-        let model: &dyn Any = layer.motion.as_ref();
-        if let Some(tracked) = model.downcast_ref::<Tracked>() {
-            // A picture between two frames, or pictures of several, are the CPU's.
-            let frame = times.first().and_then(|t| tracked.frame_at(t.0))?;
-            let one = times.iter().all(|t| tracked.frame_at(t.0) == Some(frame));
-            return one.then(|| match frame {
-                0 => known(still, [None; 2]),
-                _ => known(Moves::Posed, [page_of(&layer.params, frame), None]),
-            });
-        }
-        if let Spec::Native4d(spec) = layer.motion.spec() {
-            let ([floor, ceiling], own) = (spec.bounds(), layer.params.find(native4d::TABLE)?);
-            let (speed, harmonics, period) = (spec.speed, spec.harmonics, spec.period);
+        if let Some(Slices { own, speed, floor, ceiling, harmonics, period }) = layer.motion.slices() {
             return Some(known(Moves::Sliced { speed, floor, ceiling, harmonics, period }, [Some(own), None]));
         }
-        None
+        // Pictures of several frames, or of a time between two, are the CPU's.
+        let page = layer.motion.pose_table(*times.first()?)?;
+        let one = times.iter().all(|t| layer.motion.pose_table(*t) == Some(page));
+        one.then(|| match page {
+            GEOMETRY => known(still, [None; 2]),
+            _ => known(Moves::Posed, [Some(page), None]),
+        })
     }
 }
 

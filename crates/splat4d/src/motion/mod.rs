@@ -22,7 +22,7 @@ use crate::math::{Real, Rng, Sim3};
 use crate::scene::params::LOG_SCALE;
 use crate::scene::splats::SPLAT_COLUMNS;
 use crate::scene::table::{TableMut, par_split};
-use crate::scene::{Color, GEOMETRY, Grads, Params, RowEdit, Rows, SH, Space, SplatGrads, Table, Time};
+use crate::scene::{Color, GEOMETRY, Grads, Key, Params, RowEdit, Rows, SH, Space, SplatGrads, Table, Time};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use std::any::Any;
@@ -30,7 +30,7 @@ use std::sync::Arc;
 
 use registry::registry;
 
-pub use registry::{Capabilities, Model, Phase, Polynomial};
+pub use registry::{Capabilities, Model, Phase, Polynomial, Slices};
 pub use spacetime::{Spacetime, SpacetimeSpec};
 pub use still::Still;
 
@@ -197,6 +197,16 @@ pub trait Motion<F: Real = f32>: Any + Send + Sync {
 
     /// The motion as a polynomial in time, if it is one.
     fn polynomial(&self) -> Option<Polynomial> {
+        None
+    }
+
+    /// The motion as slices of Gaussians of space and time, if it is that.
+    fn slices(&self) -> Option<Slices> {
+        None
+    }
+
+    /// The table whose first columns are positions and quaternions at t, if all else of the geometry stays as it is.
+    fn pose_table(&self, _t: Time) -> Option<Key> {
         None
     }
 

@@ -68,6 +68,23 @@ pub struct Polynomial {
     pub detached: bool,
 }
 
+/// Motion as slices of Gaussians of space and time (see [`native4d`](super::native4d)): what all of them share.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Slices {
+    /// Table of the columns beyond the geometry.
+    pub own: Key,
+    /// κ, scene units a second.
+    pub speed: f64,
+    /// Least c, scene units².
+    pub floor: f64,
+    /// Largest log scale in time, log seconds.
+    pub ceiling: f64,
+    /// Blocks of spherical harmonics that change with time.
+    pub harmonics: usize,
+    /// Their period, seconds.
+    pub period: f64,
+}
+
 impl Polynomial {
     /// Whether everything goes along straight lines and nothing turns.
     pub(crate) fn is_straight(&self) -> bool {

@@ -15,7 +15,7 @@ use super::{At, Cache, Capabilities, Model, Motion, Spec, Tape, fill_rows};
 use crate::math::{Real, quat};
 use crate::scene::params::{QUAT, page_name};
 use crate::scene::table::TableMut;
-use crate::scene::{BLOCK, GEOMETRY, Grads, Key, Params, Space, SplatGrads, Table};
+use crate::scene::{BLOCK, GEOMETRY, Grads, Key, Params, Space, SplatGrads, Table, Time};
 use crate::simd::each;
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
@@ -114,12 +114,6 @@ impl Tracked {
         self.pages[k]
     }
 
-    /// The frame that alone counts at t; none between two.
-    pub fn frame_at(&self, t: f64) -> Option<usize> {
-        let (a, b, _) = self.around(t);
-        (a == b).then_some(a)
-    }
-
     /// Adds a frame whose poses are `pose(p, row)` unless they were loaded.
     fn push<F: Real>(
         &mut self,
@@ -210,6 +204,12 @@ fn align<F: Real>(a: [F; 4], b: [F; 4]) -> F {
 impl<F: Real> Motion<F> for Tracked {
     fn spec(&self) -> Spec {
         Spec::Tracked(self.spec.clone())
+    }
+
+    /// On a frame, and outside of the clip; what lies between two frames is of both.
+    fn pose_table(&self, t: Time) -> Option<Key> {
+        let (a, b, _) = self.around(t.0);
+        (a == b).then_some(self.pages[a])
     }
 
     fn scratch_bytes(&self, _p: &Params<F>, _rows: usize) -> u64 {

@@ -4,7 +4,7 @@ use super::*;
 use crate::gpu::tests::{camera, read, renderer};
 use crate::math::{Real, Rng};
 use crate::motion::native4d::{Native4dSpec, TABLE};
-use crate::motion::{At, Cache, Motion, Spec, Tape, build_as};
+use crate::motion::{At, Cache, Motion, Slices, Spec, Tape, build_as};
 use crate::render::{KeptRule, KeptView, Target};
 use crate::scene::{Camera, GEOMETRY, Grads, Key, Params, Planes, Rows, Space, SplatGrads, Table, Time};
 use std::sync::Arc;
@@ -31,6 +31,12 @@ fn params<F: Real>(spec: &Native4dSpec) -> (Params<F>, Key, Arc<dyn Motion<F>>) 
         p[own].write(row, 2, [13, 14, 15, 16].map(|k| number(k, 1.0)));
     }
     (p, own, motion)
+}
+
+/// The motion as kernels know it.
+fn moves<F: Real>(motion: &dyn Motion<F>) -> Moves {
+    let Slices { speed, floor, ceiling, harmonics, period, .. } = motion.slices().expect("it is of slices");
+    Moves::Sliced { speed, floor, ceiling, harmonics, period }
 }
 
 /// Asserts that a column of rows is as expected.
@@ -64,8 +70,7 @@ fn slices_equal_the_model_forth_and_back() {
     let d_out = SplatGrads { out: &pulled, color: None, weights: None };
     motion.backward(&question, &Cache::default(), &mut tape, &d_out, &mut Cache::default(), &mut d);
     // The same by the kernels: the first of two views, after which nothing learns.
-    let [floor, ceiling] = spec.bounds();
-    let moves = Moves::Sliced { speed: spec.speed, floor, ceiling, harmonics: 0, period: 1.0 };
+    let moves = moves(motion.as_ref());
     let table = |key: Key| KeptTable { width: single[key].width(), params: single[key].data(), moments: &[] };
     let tables = [table(GEOMETRY), KeptTable::default(), table(own), KeptTable::default(), table(crate::scene::SH)];
     let stats = vec![0.0; STATS_WIDTH * ROWS.next_multiple_of(BLOCK)];
@@ -132,9 +137,8 @@ fn slices_equal_the_model_forth_and_back() {
 /// A step that these cameras see, with losses on rows; what it was, and the numbers after it.
 fn stepped(r: &mut GpuRenderer, cameras: &[Camera]) -> (KeptStepped, KeptNumbers) {
     let spec = Native4dSpec::default();
-    let (p, own, _) = params::<f32>(&spec);
-    let [floor, ceiling] = spec.bounds();
-    let moves = Moves::Sliced { speed: spec.speed, floor, ceiling, harmonics: 0, period: 1.0 };
+    let (p, own, motion) = params::<f32>(&spec);
+    let moves = moves(motion.as_ref());
     let table = |key: Key| KeptTable { width: p[key].width(), params: p[key].data(), moments: &[] };
     let tables = [table(GEOMETRY), KeptTable::default(), table(own), KeptTable::default(), table(crate::scene::SH)];
     let stats = vec![0.0; STATS_WIDTH * ROWS.next_multiple_of(BLOCK)];

@@ -13,7 +13,7 @@ mod sliced;
 mod tests;
 
 use super::lanes::{Batch, Lane, Work, fill, scatter};
-use super::{At, Cache, Capabilities, Model, Motion, Spec, Tape, fill_rows};
+use super::{At, Cache, Capabilities, Model, Motion, Slices, Spec, Tape, fill_rows};
 use crate::math::{Real, Rng, Sim3, quat};
 use crate::scene::table::TableMut;
 use crate::scene::{BLOCK, Born, Color, GEOMETRY, Grads, Key, Params, RowEdit, SH, Space, SplatGrads, Table};
@@ -78,14 +78,12 @@ impl Native4dSpec {
             .remedy("The file is damaged or was written by another program; export it again"))
     }
 
-    /// Least c of a slice, scene units², and largest log scale in time, log seconds.
-    pub fn bounds(&self) -> [f64; 2] {
-        [(self.speed * self.min_life.max(SHORTEST)).powi(2), self.max_life.max(SHORTEST).ln()]
-    }
-
     fn frame<F: Real>(&self) -> Frame<F> {
-        let [floor, ceiling] = self.bounds().map(F::of);
-        Frame { speed: F::of(self.speed), floor, ceiling }
+        Frame {
+            speed: F::of(self.speed),
+            floor: F::of((self.speed * self.min_life.max(SHORTEST)).powi(2)),
+            ceiling: F::of(self.max_life.max(SHORTEST).ln()),
+        }
     }
 }
 
@@ -185,6 +183,12 @@ impl<F: Real> Motion<F> for Native4d {
             table.write(row, RIGHT, quat::rotated(q, table.read(row, RIGHT)));
         }
         true
+    }
+
+    fn slices(&self) -> Option<Slices> {
+        let Frame { speed, floor, ceiling } = self.spec.frame();
+        let Native4dSpec { harmonics, period, .. } = self.spec;
+        Some(Slices { own: self.own, speed, floor, ceiling, harmonics, period })
     }
 
     fn scratch_bytes(&self, _p: &Params<F>, _rows: usize) -> u64 {
