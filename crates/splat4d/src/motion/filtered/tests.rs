@@ -6,6 +6,7 @@ use crate::format::scene::{spec_from_json, spec_to_json};
 use crate::math::spd::{Mat3, mix, unpack};
 use crate::math::sym3;
 use crate::motion::{SpacetimeSpec, build_as as build_model};
+use crate::scene::splats::SPLAT_OPACITY;
 use crate::scene::{Born, GEOMETRY, LifeKind, SH};
 
 const H: f64 = 1e-6;
