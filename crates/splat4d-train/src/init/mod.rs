@@ -9,7 +9,7 @@ pub(crate) mod volume;
 
 use crate::capture::PointCloud;
 use crate::capture::frames::Frames;
-use crate::methods::{Plan, Program};
+use crate::methods::{Beginning, Plan, Program};
 use crate::settings::{Value, among, settings};
 use crate::{Error, Result};
 use splat4d::layers::{Head, Layer, Scene};
@@ -253,15 +253,6 @@ pub(crate) fn one_moment(plan: &Plan, frames: &dyn Frames, points: Option<Seeds>
     }
     out.times.fill(None);
     Ok(out)
-}
-
-/// How a Gaussian begins, as far as its seed says it.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Beginning {
-    /// Centre and width of its life, seconds.
-    pub life: (f64, f64),
-    /// At the centre of its life, scene units a second.
-    pub velocity: [f64; 3],
 }
 
 /// One layer of Gaussians at the seeds: isotropic, as large as the distance to their neighbours of the same moment.

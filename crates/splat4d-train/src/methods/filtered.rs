@@ -5,9 +5,8 @@
 //! the filter is taken off around them. At the end the filter is disabled and the network kept, unless the recipe says
 //! otherwise: the filter has then taught the model to move steadily, and playing costs no more than without.
 
-use super::{Group, Hook, Plan, Program, Stage};
+use super::{Beginning, Group, Hook, Plan, Program, Stage};
 use crate::Result;
-use crate::init::Beginning;
 use crate::loss::transport::{Transport, TransportConfig};
 use crate::recipe::Recipe;
 use crate::settings::{Choice, settings};

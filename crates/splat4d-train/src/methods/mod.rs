@@ -26,7 +26,6 @@ pub(crate) use still::{AppearanceSettings, LifeSettings, RateSettings};
 pub(crate) use tracked::TrackedSettings;
 
 use crate::event::Progress;
-use crate::init::Beginning;
 use crate::loss::image::ImageTerm;
 use crate::loss::terms::{Codec, ParamLoss, ProbeLoss};
 use crate::optim::Noise;
@@ -265,6 +264,15 @@ impl Stage {
         self.params.iter().for_each(|l| l.on_edit());
         self.probes.iter().for_each(|l| l.on_edit());
     }
+}
+
+/// How a Gaussian begins, as far as its seed says it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Beginning {
+    /// Centre and width of its life, seconds.
+    pub life: (f64, f64),
+    /// At the centre of its life, scene units a second.
+    pub velocity: [f64; 3],
 }
 
 /// How one motion model is learnt.

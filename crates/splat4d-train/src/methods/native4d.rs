@@ -3,8 +3,7 @@
 //! Rates follow those of `spacetime`, since the two are charts of the same Gaussians: a step of both quaternions changes
 //! the velocity by twice its size in extents a clip, which is the unit of the rotation (`Native4dSpec::speed`).
 
-use super::{Group, Plan, Program, Rate, Stage, still};
-use crate::init::Beginning;
+use super::{Beginning, Group, Plan, Program, Rate, Stage, still};
 use crate::loss::scene::LivingOpacity;
 use crate::settings::{Choice, settings};
 use crate::{Error, Result};

@@ -3,8 +3,7 @@
 
 use super::auto::Seen;
 use super::still;
-use super::{Group, Plan, Program, Rate, Stage};
-use crate::init::Beginning;
+use super::{Beginning, Group, Plan, Program, Rate, Stage};
 use crate::loss::scene::{LivingOpacity, VelocitySmoothness};
 use crate::settings::{choices, settings};
 use crate::upkeep::Guided;
