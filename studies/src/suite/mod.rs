@@ -19,7 +19,7 @@ use splat4d_train::capture::{Capture, ImageStore};
 use splat4d_train::eval::run::{EvalOptions, Scores, assess};
 use splat4d_train::event::Event;
 use splat4d_train::recipe::Recipe;
-use splat4d_train::run::{self, TrainOptions, checkpoint, open_capture};
+use splat4d_train::run::{self, TrainOptions, checkpoint, open_capture, with_found};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -334,11 +334,12 @@ struct Judges {
 impl Judges {
     fn of<'a>(judges: &'a mut Option<Self>, order: &Order<'_>, run: &Path) -> Result<&'a Self> {
         if judges.is_none() {
-            let (whole, recipe) = Run::open(run)?.open_capture()?;
-            let halved = order.recipe.clone().with(|r| r.capture.downscale *= 2);
-            let mut coarse = open_capture(&order.folder, &halved)?;
-            coarse.frames.iter_mut().zip(&whole.frames).for_each(|(half, f)| half.view.near = f.view.near);
-            let [whole, coarse] = [(whole, recipe), (coarse, halved)].map(|(c, r)| Judge::new(&Arc::new(c), &r));
+            let open = |recipe: Recipe| -> Result<Judge> {
+                let capture = with_found(open_capture(&order.folder, &recipe)?, &recipe, run)?;
+                Ok(Judge::new(&Arc::new(capture), &recipe))
+            };
+            let whole = open(order.recipe.clone())?;
+            let coarse = open(order.recipe.clone().with(|r| r.capture.downscale *= 2))?;
             *judges = Some(Self { whole, coarse });
         }
         Ok(judges.as_ref().expect("they were just made"))

@@ -56,7 +56,7 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
         root: take.root,
         kind: take.kind,
         cameras,
-        named: take.named,
+        named: take.named || super::sequence::are_cameras(&take.cameras),
         frames,
         take: take.take,
         held,

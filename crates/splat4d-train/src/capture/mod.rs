@@ -161,7 +161,8 @@ pub struct Capture {
     pub kind: CaptureKind,
     /// The cameras; a moving camera is one entry that is not `fixed`.
     pub cameras: Vec<Rig>,
-    /// Whether the data set tells cameras apart; else an entry is one camera's photo of a moment, or stands for many.
+    /// Whether the data set, or the names of its pictures (`cam07`), tell cameras apart; else an entry is one camera's photo of a
+    /// moment, or stands for many.
     pub named: bool,
     /// All pictures, or those that were asked for ([`CaptureOptions::frames`]).
     pub frames: Vec<Frame>,

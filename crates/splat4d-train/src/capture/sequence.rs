@@ -34,6 +34,8 @@ const FILM_WORDS: [&str; 12] =
     ["", "frame", "frames", "image", "img", "out", "output", "video", "thumb", "rgb", "color", "f"];
 /// The one that telephones and cameras write for photos.
 const PHOTO_WORD: &str = "IMG";
+/// Words before the number in the names of a rig's cameras.
+const CAMERA_WORDS: [&str; 2] = ["cam", "camera"];
 /// Part of the steps from number to number that are alike where a film was cut into frames; some pictures may not have
 /// been registered.
 const EVEN: f64 = 0.5;
@@ -119,17 +121,35 @@ fn still(group: &[usize], poses: &[Se3]) -> bool {
 /// The word before the number of a picture's name, if it is one that frames have.
 fn film_word(name: &str) -> Option<&str> {
     let file = name.rsplit_once('/').map_or(name, |(_, file)| file);
-    let stem = file.rsplit_once('.').map_or(file, |(stem, _)| stem);
+    let word = word_before_number(file.rsplit_once('.').map_or(file, |(stem, _)| stem))?;
+    let known = FILM_WORDS.contains(&word.to_ascii_lowercase().as_str());
+    (known && word != PHOTO_WORD).then_some(word)
+}
+
+/// Whether pictures are called by the cameras of a rig (`cam07`).
+pub(super) fn are_cameras(stems: &[String]) -> bool {
+    let known = |word: &str| CAMERA_WORDS.contains(&word.to_ascii_lowercase().as_str());
+    stems.iter().all(|stem| word_before_number(stem).is_some_and(known))
+}
+
+/// The last word of a name before the number that it ends in; `None`: it ends in none.
+fn word_before_number(stem: &str) -> Option<&str> {
     let before = stem.trim_end_matches(|c: char| c.is_ascii_digit());
     let apart = |c: char| matches!(c, '_' | '-' | ' ' | '.');
     let word = before.trim_end_matches(apart).rsplit(apart).next().unwrap_or_default();
-    let known = FILM_WORDS.contains(&word.to_ascii_lowercase().as_str());
-    (before.len() < stem.len() && known && word != PHOTO_WORD).then_some(word)
+    (before.len() < stem.len()).then_some(word)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn cameras_of_a_rig_are_told_from_photos() {
+        let are = |names: &[&str]| are_cameras(&names.iter().map(|n| (*n).to_owned()).collect::<Vec<_>>());
+        assert!(are(&["cam00", "cam_01"]) && are(&["left-camera2", "Camera 10"]));
+        assert!(!are(&["cam00", "IMG_1234"]) && !are(&["webcam"]) && !are(&["20240212_003919"]) && !are(&["cam"]));
+    }
 
     fn poses(count: usize) -> Vec<Se3> {
         let at =

@@ -28,7 +28,7 @@ pub use memory::{memory_estimate, peak_memory};
 pub(crate) use open::OpenCapture;
 pub use open::{capture_options, open_capture, open_frames, plan, training_frames};
 pub(crate) use open::{learnable, scale};
-pub(crate) use points::with_found;
+pub use points::with_found;
 pub(crate) use refine::{Refine, refine};
 pub use session::{Outcome, OwnLoss, TrainOptions};
 pub use start::{Forecast, forecast, open_run, resume, resume_with, train};

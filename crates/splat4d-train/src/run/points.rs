@@ -49,8 +49,8 @@ pub(super) fn complete(
     Ok(OpenCapture::with(training_frames(Arc::new(completed), recipe)?).on(opened.device))
 }
 
-/// The capture with the points that were found for a run, if any were.
-pub(crate) fn with_found(mut capture: Capture, recipe: &Recipe, run: &Path) -> Result<Capture> {
+/// The capture with the points that were found for the run in this folder, if any were. Errors: they cannot be read.
+pub fn with_found(mut capture: Capture, recipe: &Recipe, run: &Path) -> Result<Capture> {
     let file = run.join(FILE);
     if file.is_file() && wanted(&capture, recipe) {
         let found = read_points(&file)?;
