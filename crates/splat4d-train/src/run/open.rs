@@ -229,10 +229,11 @@ impl OpenCapture {
     }
 
     pub(crate) fn trainer(&self, plan: &Plan, scene: Scene<f32>) -> Result<Trainer<'static>> {
-        let mut trainer = self.trainer_of(plan, scene, stages(program_of(&plan.recipe)?.as_ref(), plan));
+        let program = program_of(&plan.recipe)?;
+        let mut trainer = self.trainer_of(plan, scene, stages(program.as_ref(), plan));
         trainer.replan(plan.recipe.run.replans.rows());
-        let moves = plan.recipe.run.motion.as_str() != "still";
-        let strength = if moves { plan.recipe.loss.moving } else { 0.0 };
+        // What a still scene cannot show must not draw it away from what it can.
+        let strength = if program.capabilities(plan).moves { plan.recipe.loss.moving } else { 0.0 };
         trainer.emphasise(Emphasis::new(self.frames.as_ref(), strength)?);
         Ok(trainer)
     }
