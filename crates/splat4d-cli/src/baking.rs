@@ -44,6 +44,9 @@ const SLOPE: f64 = 0.55;
 const SLOPES: [f64; 2] = [0.25, 1.0];
 /// Most by which a tolerance is reduced at once.
 const REDUCED: f64 = 0.15;
+/// Where one primitive of so many lasts one look at the model only, a smaller tolerance has nothing left to split there: the
+/// model is looked at twice as often instead. Measured on a network that a hand-held camera's take taught (docs/suite.md).
+const SHORT_LIVED: usize = 10;
 /// A smaller tolerance that gains less than this, dB, costs more than it is worth: what is missing is the rounding's.
 const WORTH: f64 = 0.5;
 
@@ -160,14 +163,20 @@ pub(crate) fn bake_like(
     let packed = pack(source, title, baking, console)?;
     let likeness = compare(scene, &packed.bytes, &stage, &cameras, packed.antialias, console)?;
     let mut tried = vec![(packed, likeness)];
+    let mut looks = baking.options.looks;
     while tried.len() < TRIES {
         let known: Vec<(f64, f64)> =
             tried.iter().filter_map(|(p, like)| Some((p.baked.report.tolerance, like.as_ref()?.psnr))).collect();
         // What is straight already has no pieces to add.
         let splits = tried[0].0.baked.report.errors.worst > 0.0;
         let Some(tolerance) = closer(baking.like.filter(|_| splits), &known) else { break };
+        let last = &tried[tried.len() - 1].0.baked.report;
         let mut strict = baking.clone();
         strict.options.tolerance = tolerance;
+        if SHORT_LIVED * last.key_states >= last.primitives {
+            looks *= 2.0;
+        }
+        strict.options.looks = looks;
         let packed = pack(source, title, &strict, console)?;
         let likeness = compare(scene, &packed.bytes, &stage, &cameras, packed.antialias, console)?;
         let gained = likeness.zip(tried[tried.len() - 1].1).is_some_and(|(new, old)| new.psnr >= old.psnr + WORTH);

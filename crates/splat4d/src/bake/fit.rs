@@ -110,10 +110,10 @@ impl Fitter<'_> {
         });
 
         let (life, opacity) = self.life(subject, span, held);
-        let shape = shape(subject, held, life.center);
+        let pixels = self.lookout.pixels(mean);
+        let shape = self.shape(subject, &looks, held, life.center, pixels);
         let colors = colors(subject, held);
         let center: [f64; 3] = std::array::from_fn(|k| mean[k] + velocity[k] * (life.center - time));
-        let pixels = self.lookout.pixels(mean);
         let mut error = 0.0f64;
         for look in held {
             let delta = look.time - life.center;
@@ -134,6 +134,22 @@ impl Fitter<'_> {
         let sound = first.mean.iter().chain(&velocity).chain(&shape.scales).all(|x| x.is_finite());
         let primitive = primitive(center, &life, &shape, opacity, velocity, &colors, share * pixels * pixels);
         sound.then_some((primitive, error))
+    }
+
+    /// The shape of the looks that a piece is held to. That of a single frame turns on to the next one's, so that what is
+    /// seen between them is whole, where it then misses its own by no more than is allowed, and both by less.
+    fn shape(&self, subject: &Subject<'_>, looks: &[Look], held: &[Look], center: f64, pixels: f64) -> Shape {
+        let own = shape(subject, held, center);
+        if held.len() == looks.len() {
+            return own;
+        }
+        let turning = shape(subject, looks, center);
+        let miss = |shape: &Shape, look: &Look| {
+            look.alpha * difference(shape.covariance(look.time - center), look.cov) * pixels
+        };
+        let worst = |shape: &Shape| looks.iter().map(|l| miss(shape, l)).fold(0.0, f64::max);
+        let allowed = held.iter().all(|l| miss(&turning, l) <= self.tolerance);
+        if allowed && worst(&turning) < worst(&own) { turning } else { own }
     }
 
     /// The finite looks at a span's frames, its end included.

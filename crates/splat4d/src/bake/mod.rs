@@ -3,7 +3,8 @@
 //! Every Gaussian goes to the deepest node that holds all the time in which it can be seen. There a straight line, a
 //! steady turn, one shape, one colour and its own life are fitted to what the model shows frame by frame; where that
 //! misses by more than the tolerance, both halves of the node are tried in its stead, down to single frames, which are
-//! what the model is then (key states). A take of few frames a second is looked at between them too. Motion that is straight already is copied and not fitted.
+//! what the model is then and go straight on to the next frame (key states). A take of few frames a second is looked at
+//! between them too. Motion that is straight already is copied and not fitted.
 //!
 //! Errors are pixels as the cameras see them, weighted by how visible the Gaussian is: distance and outline on the
 //! screen, and opacity and colour converted to pixels. The model is looked at in runs of rows, each at all its frames,

@@ -79,8 +79,13 @@ fn baked(scene: &Scene<f32>, options: &Options) -> Baked {
 }
 
 fn likeness(scene: &Scene<f32>, baked: &Baked) -> Likeness {
+    likeness_after(scene, baked, 0.0)
+}
+
+/// So many frames after frames.
+fn likeness_after(scene: &Scene<f32>, baked: &Baked, part: f64) -> Likeness {
     let frames = ((scene.clip[1] - scene.clip[0]) * FPS).round() as usize + 1;
-    let times: Vec<f64> = (0..frames).step_by(frames.div_ceil(9)).map(|k| k as f64 / FPS).collect();
+    let times: Vec<f64> = (0..frames).step_by(frames.div_ceil(9)).map(|k| (k as f64 + part) / FPS).collect();
     let mut cpu = device::cpu(RenderConfig::default());
     compare(scene, Shown::Nodes(&baked.nodes), &cameras(), &times, cpu.as_mut(), &mut |_, _| {}).unwrap().unwrap()
 }
@@ -172,6 +177,16 @@ fn curves_and_turns_are_split_and_stay_within_the_tolerance() {
         assert!(coarse.report.primitives < report.primitives, "a wider tolerance needs fewer pieces");
         assert!(likeness(&scene, &coarse).psnr < like.psnr);
     }
+}
+
+/// What turns too fast for anything but key states is whole between frames as well.
+#[test]
+fn key_states_turn_on_to_the_next_frame() {
+    let scene = scene(vec![layer(&spacetime(1, true), LifeKind::Infinite, 120, 6.0, 0.9)], 0.9);
+    let baked = baked(&scene, &options(0.02));
+    assert!(baked.report.key_states > 300, "{:?}", baked.report);
+    let [on, between] = [0.0, 0.5].map(|part| likeness_after(&scene, &baked, part).psnr);
+    assert!(on > 60.0 && between > 53.0, "{on} dB on frames, {between} dB between them");
 }
 
 #[test]
