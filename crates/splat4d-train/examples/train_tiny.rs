@@ -98,6 +98,7 @@ fn main() -> Result<()> {
     let plan = Plan {
         recipe: recipe.resolve(),
         extent: 3.3,
+        center: [0.0; 3],
         clip: [0.0, (TIMES - 1) as f64 / FPS],
         fps: FPS,
         times: TIMES,

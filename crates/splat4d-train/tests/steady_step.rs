@@ -92,6 +92,7 @@ fn trainer() -> Result<Trainer<'static>> {
     let plan = Plan {
         recipe: recipe.resolve(),
         extent: 3.3,
+        center: [0.0; 3],
         clip: [0.0, 0.1],
         fps: 10.0,
         times: TIMES,

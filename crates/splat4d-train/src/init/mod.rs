@@ -15,6 +15,7 @@ use crate::{Error, Result};
 use splat4d::layers::{Head, Layer, Scene};
 use splat4d::math::Rng;
 use splat4d::math::knn::mean_square_distance;
+use splat4d::math::se3::{norm, sub};
 use splat4d::math::sh::rgb_to_dc;
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{GEOMETRY, HeadKeys, LIFE, LifeKind, Params, SH};
@@ -112,8 +113,8 @@ settings! {
 /// Where the first Gaussians are.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Source {
-    /// The capture's points and those of its depth maps; without maps, or where points are few, those that its pictures show,
-    /// and more between them; the hull of masks, or of what moves before fixed cameras; else at random.
+    /// The capture's points and those of its depth maps; without maps, where points are few or leave out a part of what cameras
+    /// see, those that its pictures show, and more between them; the hull of masks, or of what moves before fixed cameras; else at random.
     Auto,
     /// The capture's points.
     Points,
@@ -164,7 +165,8 @@ const UNKNOWN_COLOR: [f32; 3] = [0.5; 3];
 const LONG_LIFE_CLIPS: f64 = 2.0;
 /// One keyframe of initial points about every so many frames.
 const FRAMES_PER_KEYFRAME: usize = 5;
-/// Initial scales are clamped to this share of the extent: a lone point would otherwise hide the scene.
+/// Initial scales are clamped to this share of the extent, or of the distance from the cameras where that is more: a lone point
+/// would otherwise hide the scene, and a far background of points that are a pixel wide would have to grow first.
 const LARGEST_SCALE: f64 = 0.05;
 /// Smallest initial scale, of the extent.
 const SMALLEST_SCALE: f64 = 1e-5;
@@ -267,7 +269,7 @@ pub fn scene(
     let life = program.life(plan);
     let n = seeds.len();
     let mut params = Params::<f32>::new(n, (r.appearance.sh_degree + 1) * (r.appearance.sh_degree + 1), life.columns());
-    let scales = scales(seeds, plan.extent);
+    let scales = scales(seeds, plan);
     let begin = |i: usize| Beginning { life: first_life(plan, seeds, i), velocity: seeds.velocities[i] };
     let beginnings: Vec<Beginning> = (0..n).map(begin).collect();
     let logit = (r.init.opacity / (1.0 - r.init.opacity)).ln() as f32;
@@ -313,7 +315,7 @@ fn first_life(plan: &Plan, seeds: &Seeds, i: usize) -> (f64, f64) {
 }
 
 /// Root mean square distance to the three nearest seeds of the same moment (Kerbl et al. 2023), clamped.
-fn scales(seeds: &Seeds, extent: f64) -> Vec<f64> {
+fn scales(seeds: &Seeds, plan: &Plan) -> Vec<f64> {
     let mut order: Vec<usize> = (0..seeds.len()).collect();
     let key = |i: usize| seeds.times[i].unwrap_or(f64::NEG_INFINITY);
     order.sort_by(|&a, &b| key(a).total_cmp(&key(b)).then(a.cmp(&b)));
@@ -326,7 +328,8 @@ fn scales(seeds: &Seeds, extent: f64) -> Vec<f64> {
         let group = if count < 8 { rest } else { group };
         let points: Vec<[f32; 3]> = group.iter().map(|&i| seeds.points[i].map(|x| x as f32)).collect();
         for (&i, d) in group.iter().zip(mean_square_distance(&points)) {
-            out[i] = f64::from(d).sqrt().clamp(SMALLEST_SCALE * extent, LARGEST_SCALE * extent);
+            let reach = plan.extent.max(norm(sub(seeds.points[i], plan.center)));
+            out[i] = f64::from(d).sqrt().clamp(SMALLEST_SCALE * plan.extent, LARGEST_SCALE * reach);
         }
         rest = if count < 8 { &[] } else { tail };
     }
@@ -339,8 +342,21 @@ mod tests {
     use crate::methods::program;
     use crate::recipe::{MotionName, Recipe};
     use splat4d::layers::Evaluation;
-    use splat4d::math::se3::{norm, sub};
     use splat4d::scene::{Rows, Space, Time};
+
+    /// What is far is as wide as its neighbours are apart, as seen from the cameras, and not a speck.
+    #[test]
+    fn first_sizes_are_bounded_by_the_distance_from_the_cameras() {
+        let plan = Plan { extent: 2.0, center: [0.0, 0.0, -1.0], ..Plan::default() };
+        let mut seeds = Seeds::default();
+        for at in [1.0, 99.0] {
+            (0..5).for_each(|k| seeds.push([0.3 * at * f64::from(k), 0.0, at], [0.5; 3], None));
+        }
+        let sizes = scales(&seeds, &plan);
+        let bound = |i: usize| LARGEST_SCALE * norm(sub(seeds.points[i], plan.center)).max(2.0);
+        assert!((0..10).all(|i| (sizes[i] - bound(i)).abs() < 1e-9), "all lie further apart than that: {sizes:?}");
+        assert!(sizes[0] == LARGEST_SCALE * 2.0 && sizes[5] == LARGEST_SCALE * 100.0);
+    }
 
     #[test]
     fn a_seed_that_moves_makes_a_gaussian_that_moves() {

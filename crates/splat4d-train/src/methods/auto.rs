@@ -149,6 +149,7 @@ mod tests {
             let plan = Plan {
                 recipe: Recipe::default().with(|r| r.capture.observe = self.observe).resolve(),
                 extent: 1.0,
+                center: [0.0; 3],
                 clip: [0.0, 1.0],
                 fps: 30.0,
                 times: moments((0..self.len()).map(|i| (self.rig(i), self.time(i).0))),

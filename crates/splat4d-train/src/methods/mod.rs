@@ -47,6 +47,8 @@ pub struct Plan {
     pub recipe: Recipe,
     /// 1.1 times the largest distance of a camera from the cameras' centroid, scene units (Kerbl et al. 2023).
     pub extent: f64,
+    /// The cameras' centroid, scene units.
+    pub center: [f64; 3],
     /// First and last second of the clip.
     pub clip: [f64; 2],
     /// Frames a second.

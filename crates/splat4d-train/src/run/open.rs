@@ -131,10 +131,11 @@ pub fn plan(capture: &Capture, recipe: &Recipe) -> Plan {
     let views = |t: f64| seen.partition_point(|s| *s <= t) - seen.partition_point(|s| *s < t);
     let moments = times.iter().map(|&t| (t, views(t))).collect();
     // Cameras that all stand in one place say nothing of the scene's size.
-    let radius = capture.center_and_radius().1;
+    let (center, radius) = capture.center_and_radius();
     Plan {
         recipe: recipe.resolve(),
         extent: if radius > SINGLE_PLACE { radius } else { 1.0 },
+        center,
         clip,
         fps: capture.fps,
         times: if rigs.len() > 1 { frames::moments(of_rigs) } else { times.len() },

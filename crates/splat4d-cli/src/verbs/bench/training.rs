@@ -126,6 +126,7 @@ fn stage(scene: &Scene<f32>, extent: f64) -> Result<Stage> {
     let plan = Plan {
         recipe: recipe.resolve(),
         extent,
+        center: [0.0; 3],
         clip: scene.clip,
         fps: scene.fps.max(1.0),
         times: 8,

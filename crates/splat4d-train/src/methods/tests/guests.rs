@@ -115,6 +115,7 @@ fn errors(motion: &str, life: &str) -> [f64; 2] {
     let plan = Plan {
         recipe,
         extent: 4.4,
+        center: [0.0; 3],
         clip,
         fps: FPS,
         times: MOMENTS,

@@ -143,6 +143,7 @@ fn plan(frames: usize, cameras: usize, masks: bool, knobs: &[&str]) -> Plan {
     Plan {
         recipe: recipe.resolve(),
         extent: 3.0,
+        center: [0.0; 3],
         clip: [0.0, (frames - 1) as f64 / FPS],
         fps: FPS,
         times: frames,

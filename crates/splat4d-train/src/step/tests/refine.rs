@@ -110,6 +110,7 @@ fn run(frames: Disturbed, line: &str) -> Left {
     let plan = Plan {
         recipe: recipe.clone(),
         extent: EXTENT,
+        center: [0.0; 3],
         clip: [end(f64::min), end(f64::max)],
         fps: 1.0 / FRAME,
         times: MOMENTS,
