@@ -602,16 +602,43 @@ impl Map<'_> {
         self.adjust(STEPS);
     }
 
+    /// A placed camera without distortion, and where it saw its features by the clock that all share.
+    fn stands(&self, sight: usize) -> Option<tracks::Known> {
+        let [w, h] = self.sights[sight].size;
+        let camera = self.lens(sight).pinhole(self.poses[sight]?, w, h);
+        let straight = |f: &Feature| {
+            self.lens(sight).straight(std::array::from_fn(|a| f.pixel[a] + f.velocity[a] * self.taus[sight]))
+        };
+        Some(tracks::Known { camera, pixels: self.sights[sight].features.iter().map(straight).collect() })
+    }
+
+    /// Of every sight the matches that look alike, and those of them that lie on epipolar lines; of what stands still and of
+    /// what moves.
+    fn agreement(&self, links: &[Link]) -> Vec<[[usize; 2]; 2]> {
+        let known: Vec<Option<tracks::Known>> =
+            (0..self.sights.len()).into_par_iter().map(|s| self.stands(s)).collect();
+        let mut out = vec![[[0; 2]; 2]; self.sights.len()];
+        for link in links {
+            let [a, b] = link.sights;
+            let (Some(p), Some(q)) = (&known[a], &known[b]) else { continue };
+            let transfer = Transfer::new(&p.camera, &q.camera);
+            for &[i, j] in &link.alike {
+                let [u, v] = q.pixels[j];
+                let off = transfer.line(p.pixels[i]).map_or(f64::INFINITY, |l| l[0] * u + l[1] * v + l[2]);
+                let moves = usize::from(self.sights[a].features[i].moment > 0);
+                for s in [a, b] {
+                    out[s][moves][0] += 1;
+                    out[s][moves][1] += usize::from(off.abs() < self.tolerance(b));
+                }
+            }
+        }
+        out
+    }
+
     /// Matches of placed cameras along epipolar lines, and those of `links` that lie on them.
     pub(super) fn guided(&self, links: &[Link], progress: &mut Progress<'_>) -> Vec<Link> {
-        let known = |s: usize| {
-            let [w, h] = self.sights[s].size;
-            let camera = self.lens(s).pinhole(self.poses[s]?, w, h);
-            let straight =
-                |f: &Feature| self.lens(s).straight(std::array::from_fn(|a| f.pixel[a] + f.velocity[a] * self.taus[s]));
-            Some(tracks::Known { camera, pixels: self.sights[s].features.iter().map(straight).collect() })
-        };
-        let known: Vec<Option<tracks::Known>> = (0..self.sights.len()).into_par_iter().map(known).collect();
+        let known: Vec<Option<tracks::Known>> =
+            (0..self.sights.len()).into_par_iter().map(|s| self.stands(s)).collect();
         let mut out = tracks::guided(self.sights, &known, GUIDED_WITHIN * self.how.tolerance, progress);
         for link in links {
             let [a, b] = link.sights;
@@ -785,5 +812,14 @@ pub fn map(
     let ground = Ground::new(&exact, &longer, links, how);
     let mut map = ground.again(&map);
     map.finish();
+    if std::env::var_os("AGREEMENT").is_some() {
+        for (s, a) in map.agreement(links).iter().enumerate() {
+            eprintln!(
+                "AGREE {} still {}/{} {:.2} moving {}/{} {:.2} kept {} tau {:.1} ms",
+                sights[s].name, a[0][1], a[0][0], a[0][1] as f64 / a[0][0] as f64, a[1][1], a[1][0],
+                a[1][1] as f64 / a[1][0] as f64, map.moving(s), 1e3 * map.taus[s]
+            );
+        }
+    }
     Some(map.result())
 }
