@@ -211,7 +211,9 @@ pub(super) fn volume_of(seen: &[&Seen], target: [f64; 3], report: &mut Report) {
 /// Whether training with all defaults fits into the memory there is.
 pub(super) fn memory(needed: u64, there: Option<u64>, report: &mut Report) {
     let Some(there) = there else {
-        report.left.push("Whether training fits into memory was not judged: this system does not tell how much there is.".into());
+        report.left.push(
+            "Whether training fits into memory was not judged: this system does not tell how much there is.".into(),
+        );
         return;
     };
     if let Some(g) = grade(needed as f64 / there.max(1) as f64, MEMORY) {

@@ -420,7 +420,8 @@ fn training_that_does_not_fit_into_memory_is_told() {
         examine(&capture, &options, &mut Progress(&mut |_| {})).unwrap()
     };
     let needed = say(u64::MAX).training.unwrap().memory;
-    let grades = |report: &Report| report.findings.iter().filter(|f| f.check == "memory").map(|f| f.grade).collect::<Vec<_>>();
+    let grades =
+        |report: &Report| report.findings.iter().filter(|f| f.check == "memory").map(|f| f.grade).collect::<Vec<_>>();
     assert_eq!(grades(&say(needed * 2)), []);
     assert_eq!(grades(&say(needed * 10 / 9)), [Grade::Warning]);
     assert_eq!(grades(&say(needed / 2)), [Grade::Bad]);
@@ -437,7 +438,21 @@ fn faults_too_small_to_be_seen_are_not_told() {
         ("exposure by 0.1 stops", with(|_, p| times(p, [0.97; 3]))),
         ("white balance by 0.1 stops", with(|_, p| times(p, [1.0, 1.0, 0.97]))),
         ("flicker by 0.03 stops", with(|n, p| times(p, [if n % 2 == 0 { 1.0 } else { 0.99 }; 3]))),
-        ("half as bright, all cameras", clean().iter().map(|c| c.iter().cloned().map(|mut p| { times(&mut p, [0.5; 3]); p }).collect()).collect()),
+        (
+            "half as bright, all cameras",
+            clean()
+                .iter()
+                .map(|c| {
+                    c.iter()
+                        .cloned()
+                        .map(|mut p| {
+                            times(&mut p, [0.5; 3]);
+                            p
+                        })
+                        .collect()
+                })
+                .collect(),
+        ),
         ("moved by 0.25 pixels", pushed),
     ];
     for (name, clip) in cases {

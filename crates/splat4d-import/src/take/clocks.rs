@@ -1,8 +1,8 @@
 //! The clock of all cameras before poses are known: by sound, then by motion, then as their files have it.
 
 use super::cache::Cache;
-use super::stored::Stored;
 use super::poses::Solved;
+use super::stored::Stored;
 use super::{Camera, PLACED_LEAST, Report};
 use crate::sync::Refusal;
 use crate::sync::graph::{self, Evidence, Kind, Offset, Solution};
@@ -128,7 +128,12 @@ pub(super) fn check(names: &[&str], solved: &Solved, told: &[Option<f64>], motio
         Some(format!("{} {:+.0} ± {:.0} ms", names[c], 1e3 * o.seconds, 1e3 * o.sigma))
     };
     let guesses: Vec<String> = open.iter().filter_map(guess).collect();
-    let mut why = vec!["sound agrees of no two of them".to_owned(), "no two see the same thing move".to_owned()];
+    // Of three cameras that are not calibrated clocks are not adjusted: they cannot be told from places.
+    let seen = match placed.len() {
+        ..4 => "geometry tells the clocks of four cameras and more, or of calibrated ones that see the same thing move",
+        _ => "too few see the same thing move",
+    };
+    let mut why = vec!["sound agrees of no two of them".to_owned(), seen.to_owned()];
     if let Some(first) = motion.first() {
         why.push(format!("how much moves says nothing of {first}"));
     }

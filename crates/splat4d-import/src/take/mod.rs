@@ -169,7 +169,10 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
         .zip(selections)
         .map(|(c, selection)| Clip { name: c.name.clone(), source: &*c.source, selection })
         .collect();
-    let mut pictures = write::pictures(folder, &clips, request.format, progress, stop)?;
+    let stopped = || Error::new(ErrorKind::Interrupted, "stopped").remedy("The same command goes on from there.");
+    // A terminal's Ctrl-C ends ffmpeg too, whose video then seems to be damaged.
+    let mut pictures = write::pictures(folder, &clips, request.format, progress, stop)
+        .map_err(|e| if stop() && e.kind() != ErrorKind::Interrupted { stopped() } else { e })?;
     for p in &pictures {
         if p.shots.is_empty() {
             return Err(Error::input("no frame lies in the part that was chosen")
@@ -177,7 +180,6 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
                 .remedy("Choose another part, or leave the camera out."));
         }
     }
-    let stopped = || Error::new(ErrorKind::Interrupted, "stopped").remedy("The same command goes on from there.");
     if stop() {
         return Err(stopped());
     }
@@ -403,6 +405,13 @@ fn finish(
     for (k, (camera, p)) in solved.cameras.iter().zip(pictures).enumerate() {
         let row = CameraReport::of(p, camera, solved.offsets.get(k).and_then(Option::as_ref));
         report.cameras.push(row);
+        if solved.stray.get(k) == Some(&true) {
+            report.cameras[k].warnings.push(
+                "what moves in it fits the other cameras much less than theirs does: it films another time (tell its offset), \
+                 another take, or from too far aside; its clock is not believed"
+                    .into(),
+            );
+        }
         if let Ok(stand) = camera {
             placed.push(stand.written(p, solved.offset(k), stored.masks.get(k).cloned()));
             if let Some(own) = corrections.cameras.iter_mut().find(|c| c.name == p.name) {
