@@ -53,6 +53,9 @@ pub(crate) struct Args {
     /// Do not listen to the videos' sound
     #[arg(long)]
     no_audio: bool,
+    /// One clock drives all cameras: take the times of their files, and do not look how their clocks differ
+    #[arg(long)]
+    synchronous: bool,
     /// Keep every Nth frame
     #[arg(long, value_name = "N", default_value_t = 1)]
     every: usize,
@@ -152,6 +155,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         calibration: args.calibration.clone(),
         colmap: args.colmap,
         masks: args.masks.clone(),
+        synchronous: args.synchronous,
     };
     let stop = interrupt::flag("stopping: what is stored is kept");
     let mut tell = |event: &splat4d_train::event::Event| console.event(event);
@@ -183,8 +187,17 @@ fn told(report: &Report, looked: Option<&(Looked, PathBuf)>, console: &Console) 
     for line in &report.refused {
         console.warn(line);
     }
+    let guess = |c: &&CameraReport| c.by == ["motion"];
+    let guessed: Vec<&str> = report.cameras.iter().filter(guess).map(|c| c.name.as_str()).collect();
+    if !guessed.is_empty() {
+        console.warn(&format!(
+            "the clocks of these cameras are guessed from how much moves, and nothing confirms it: {} (tell them in {})",
+            guessed.join(", "),
+            corrections::FILE
+        ));
+    }
     let silent: Vec<&str> = report.cameras.iter().filter(|c| c.offset.is_none()).map(|c| c.name.as_str()).collect();
-    if report.cameras.len() > 1 && !silent.is_empty() {
+    if report.cameras.len() > 1 && !silent.is_empty() && !report.still {
         console.warn(&format!(
             "nothing tells how the clocks of these cameras differ, their files' are taken: {} (tell it in {})",
             silent.join(", "),

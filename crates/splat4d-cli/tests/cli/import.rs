@@ -316,6 +316,56 @@ fn colmap_is_called_where_it_is_asked_for_and_its_model_is_taken() {
     assert_eq!((std::fs::read(take.join("capture.json")).unwrap(), saved(&take)), (before, count));
 }
 
+/// Of three cameras geometry does not tell clocks, and these are silent: what is left is a guess.
+#[test]
+fn clocks_that_nothing_confirms_are_refused_and_can_be_told() {
+    let dir = tempfile::tempdir().unwrap();
+    let (films, take) = (dir.path().join("films"), dir.path().join("take"));
+    filmed(&films);
+    let three: Vec<PathBuf> = ["cam07", "cam08", "cam09"].iter().map(|c| films.join(c)).collect();
+    let import = |more: &[&str]| {
+        let mut all = vec!["import"];
+        all.extend(three.iter().map(|p| str(p)));
+        all.extend(["-o", str(&take), "--no-doctor"]);
+        splat4d(&all).args(more).run()
+    };
+    let refused = import(&[]).refused();
+    assert!(refused.contains("nothing tells how the clocks") && refused.contains("cam08"), "{refused}");
+    assert!(refused.contains("--synchronous") && refused.contains("keep_offset"), "{refused}");
+    assert!(!take.join("capture.json").exists());
+    assert!(take.join("import/report.json").is_file() && take.join("images/cam08").is_dir(), "what was found is kept");
+    // The times of the files, on the user's word.
+    import(&["--synchronous"]).ok();
+    let report = json_of(&take.join("import/report.json"));
+    assert!((0..3).all(|k| report["cameras"][k]["offset"].as_f64() == Some(0.0)), "{report}");
+    // Or offsets that are told.
+    let path = take.join("import.toml");
+    let mut text = std::fs::read_to_string(&path).unwrap();
+    for (name, offset) in [("cam07", 0.0), ("cam08", -1.0 / 30.0), ("cam09", 1.0 / 30.0)] {
+        let (before, own) = text.split_once(&format!("name = \"{name}\"")).unwrap();
+        let own = own.replacen("offset = 0.0", &format!("offset = {offset}"), 1);
+        let own = own.replacen("keep_offset = false", "keep_offset = true", 1);
+        text = format!("{before}name = \"{name}\"{own}");
+    }
+    std::fs::write(&path, text).unwrap();
+    import(&[]).ok();
+    let report = json_of(&take.join("import/report.json"));
+    assert!((report["cameras"][1]["offset"].as_f64().unwrap() + 1.0 / 30.0).abs() < 1e-9, "{report}");
+}
+
+#[test]
+fn a_moment_from_all_sides_needs_no_clock() {
+    let dir = tempfile::tempdir().unwrap();
+    let (films, take) = (dir.path().join("films"), dir.path().join("take"));
+    for (name, _) in CAMERAS {
+        std::fs::create_dir_all(films.join(name)).unwrap();
+        std::fs::copy(bundled().join(format!("images/{name}/0004.jpg")), films.join(name).join("0004.jpg")).unwrap();
+    }
+    let told = splat4d(&["import", str(&films), "-o", str(&take), "--no-doctor"]).run().ok();
+    assert!(told.contains("do not matter") && !told.contains("nothing tells how"), "{told}");
+    assert_eq!(Capture::open(&take, &CaptureOptions::default()).unwrap().frames.len(), CAMERAS.len());
+}
+
 #[test]
 fn what_cannot_be_imported_is_explained() {
     let dir = tempfile::tempdir().unwrap();
@@ -348,9 +398,19 @@ fn what_cannot_be_imported_is_explained() {
     }
     let alone = refused(&far, &[]);
     assert!(alone.contains("30 degrees"), "{alone}");
-    // Who is left out stays out.
+    // Clocks that are told to be so far apart that nothing is shared.
     let path = take.join("import.toml");
     let text = std::fs::read_to_string(&path).unwrap();
+    let mut offsets = ["0.0", "100.0"].iter();
+    let told = |line: &str| match line {
+        "keep_offset = false" => Some(format!("keep_offset = true\noffset = {}", offsets.next().unwrap())),
+        line if line.starts_with("offset = ") => None,
+        line => Some(line.to_owned()),
+    };
+    std::fs::write(&path, text.lines().filter_map(told).collect::<Vec<_>>().join("\n")).unwrap();
+    let apart = refused(&far, &[]);
+    assert!(apart.contains("nothing at the same time") && apart.contains("cam19 100.0"), "{apart}");
+    // Who is left out stays out.
     let (before, own) = text.split_once("name = \"cam19\"").unwrap();
     let own = own.replacen("use = true", "use = false", 1);
     std::fs::write(&path, format!("{before}name = \"cam19\"{own}")).unwrap();

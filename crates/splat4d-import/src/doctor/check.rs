@@ -16,6 +16,8 @@ const ANGLE: [f64; 2] = [25.0, 45.0];
 const CAMERAS: [usize; 2] = [6, 4];
 /// Part of the space in which something moves that three cameras see; less than the first is a warning, than the second bad.
 const VOLUME: [f64; 2] = [0.8, 0.5];
+/// Part of the memory that training takes: the system and other programs want theirs, and what does not fit is swapped.
+const MEMORY: [f64; 2] = [0.8, 1.0];
 /// sRGB values are this power of light, about.
 pub(super) const GAMMA: f64 = 2.2;
 /// Matches that tell something of a pair.
@@ -186,7 +188,12 @@ fn take(capture: &Capture, seen: &[Seen], report: &mut Report) {
         return;
     }
     let own: Vec<&Seen> = fixed.iter().map(|&c| &seen[c]).collect();
-    report.seen_by_three = volume::seen_by_three(&own, target);
+    volume_of(&own, target, report);
+}
+
+/// What three cameras see of what moves about a place.
+pub(super) fn volume_of(seen: &[&Seen], target: [f64; 3], report: &mut Report) {
+    report.seen_by_three = volume::seen_by_three(seen, target);
     let Some(share) = report.seen_by_three else {
         report
             .left
@@ -198,5 +205,29 @@ fn take(capture: &Capture, seen: &[Seen], report: &mut Report) {
         let words =
             ("Moving things that dissolve between the views.", "Turn the cameras to the action, or film with more.");
         Told { report }.add((g, "volume"), None, (100.0 * share, "%"), what, words);
+    }
+}
+
+/// Whether training with all defaults fits into the memory there is.
+pub(super) fn memory(needed: u64, there: Option<u64>, report: &mut Report) {
+    let Some(there) = there else {
+        report.left.push(
+            "Whether training fits into memory was not judged: this system does not tell how much there is.".into(),
+        );
+        return;
+    };
+    if let Some(g) = grade(needed as f64 / there.max(1) as f64, MEMORY) {
+        let mega = |bytes: u64| bytes.div_ceil(1 << 20);
+        let what = format!("Training takes about {} MB of memory, and there are {}.", mega(needed), mega(there));
+        Told { report }.add(
+            (g, "memory"),
+            None,
+            (mega(needed) as f64, "MB"),
+            what,
+            (
+                "Training that crawls, or ends without a word.",
+                "Train with --downscale 2, with fewer Gaussians (--set densify.max_cap), or a long take in chunks (--memory-limit).",
+            ),
+        );
     }
 }

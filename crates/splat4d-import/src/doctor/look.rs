@@ -4,7 +4,7 @@ use super::Options;
 use crate::Result;
 use crate::sync::grey::{Grey, Pyramid};
 use crate::sync::median;
-use crate::sync::tracks::{APART, PIXELS, Track, Tracker, corners, follow, moving, small};
+use crate::sync::tracks::{APART, LEVELS, PIXELS, Track, Tracker, corners, follow, moving, small};
 use crate::video::{Clock, mean_difference};
 use splat4d::scene::{Camera, Planes};
 use splat4d_train::capture::{Capture, ImageStore, Rgb8};
@@ -17,8 +17,6 @@ const MEDIAN_FROM: usize = 3;
 const STANDS: usize = 16;
 /// A value at or above (at or below one minus) this is clipped, of 255.
 const CLIPPED: [u8; 2] = [2, 253];
-/// Levels of pictures that corners are followed through between the first and the last pictures of a take.
-const LEVELS: usize = 4;
 /// Corners that must be found again before a camera is said to have moved.
 const CORNERS: usize = 12;
 /// Pixels along a side of the cells that motion is noted in.

@@ -135,17 +135,29 @@ pub struct Options {
     pub features: usize,
     /// Corners of a camera that are followed.
     pub tracks: usize,
+    /// Bytes of memory that training may take; none: all that the machine has, where it tells.
+    pub memory: Option<u64>,
 }
 
 impl Default for Options {
     fn default() -> Self {
         // 31 cameras of 30 pictures at 640x360 are to take about a minute.
-        Self { window: 30, features: 900, tracks: 50 }
+        Self { window: 30, features: 900, tracks: 50, memory: None }
     }
 }
 
 /// Bytes of decoded pictures that are kept at once: each is looked at once or twice, so that more gains nothing.
 const STORE: usize = 64 << 20;
+
+/// Bytes of memory that the machine has, or less where it is a container that may take less; none: it does not tell (it is no
+/// Linux).
+fn machine_memory() -> Option<u64> {
+    let text = std::fs::read_to_string("/proc/meminfo").ok()?;
+    let all = text.lines().find_map(|l| l.strip_prefix("MemTotal:"))?.trim().strip_suffix("kB")?;
+    let all = all.trim().parse::<u64>().ok()? << 10;
+    let container = std::fs::read_to_string("/sys/fs/cgroup/memory.max").ok().and_then(|t| t.trim().parse().ok());
+    Some(container.map_or(all, |c: u64| c.min(all)))
+}
 
 /// Looks for everything that commonly spoils results.
 ///
@@ -177,7 +189,10 @@ pub fn examine(capture: &Capture, options: &Options, progress: &mut Progress<'_>
     }
     check::all(capture, &seen, options, &mut report, progress);
     match forecast(Arc::new(capture.clone()), progress.0) {
-        Ok(forecast) => report.training = Some(Training { motion: forecast.motion, memory: forecast.memory }),
+        Ok(forecast) => {
+            report.training = Some(Training { motion: forecast.motion, memory: forecast.memory });
+            check::memory(forecast.memory, options.memory.or_else(machine_memory), &mut report);
+        }
         Err(e) => report.left.push(format!("What training takes cannot be told: {e}")),
     }
     report.findings.sort_by_key(|f| std::cmp::Reverse(f.grade));

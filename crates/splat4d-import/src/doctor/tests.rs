@@ -2,7 +2,7 @@
 
 use super::clocks::clocks;
 use super::look::{Seen, Stand};
-use super::{CameraReport, Grade, Options, Report, examine, volume};
+use super::{CameraReport, Grade, Options, Report, check, examine, volume};
 use crate::sync::tracks::Track;
 use crate::video::Clock;
 use serde_json::json;
@@ -319,6 +319,13 @@ fn the_share_of_what_moves_that_three_cameras_see_is_measured() {
     let share = |rig: &[Seen]| volume::seen_by_three(&rig.iter().collect::<Vec<_>>(), place);
     assert_eq!(share(&rig(&camera)), Some(1.0));
     assert_eq!(share(&rig(&away)), Some(0.0));
+    let told = |rig: &[Seen]| {
+        let mut report = Report::default();
+        check::volume_of(&rig.iter().collect::<Vec<_>>(), place, &mut report);
+        report.findings.iter().map(|f| (f.check, f.grade)).collect::<Vec<_>>()
+    };
+    assert_eq!(told(&rig(&camera)), []);
+    assert_eq!(told(&rig(&away)), [("volume", Grade::Bad)]);
     let mut still = rig(&camera);
     still.iter_mut().for_each(|s| s.motion.iter_mut().for_each(|m| m.fill(false)));
     assert_eq!(share(&still), None, "nothing moves");
@@ -402,4 +409,57 @@ fn few_cameras_one_camera_and_one_moment_are_told() {
     assert_eq!(found(&says(clean(), 0.0, 1), "cameras").len(), 1);
     let moment: Clip = clean().iter().map(|c| c[..1].to_vec()).collect();
     assert!(says(&moment, 0.0, CAMERAS).left.iter().any(|l| l.starts_with("Clocks")));
+}
+
+#[test]
+fn training_that_does_not_fit_into_memory_is_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let capture = write(folder.path(), clean(), 0.0, CAMERAS);
+    let say = |memory: u64| {
+        let options = Options { features: 500, memory: Some(memory), ..Options::default() };
+        examine(&capture, &options, &mut Progress(&mut |_| {})).unwrap()
+    };
+    let needed = say(u64::MAX).training.unwrap().memory;
+    let grades =
+        |report: &Report| report.findings.iter().filter(|f| f.check == "memory").map(|f| f.grade).collect::<Vec<_>>();
+    assert_eq!(grades(&say(needed * 2)), []);
+    assert_eq!(grades(&say(needed * 10 / 9)), [Grade::Warning]);
+    assert_eq!(grades(&say(needed / 2)), [Grade::Bad]);
+}
+
+/// The clean take with faults that are smaller than what is told, each of them as large as the names of the checks say.
+#[test]
+fn faults_too_small_to_be_seen_are_not_told() {
+    let mut pushed = clean().clone();
+    let mut view = camera(ILL);
+    view.intrinsics.cx += 0.25;
+    (FRAMES / 2..FRAMES).for_each(|n| pushed[ILL][n] = draw(&view, n as f64 / FPS));
+    let cases = [
+        ("exposure by 0.1 stops", with(|_, p| times(p, [0.97; 3]))),
+        ("white balance by 0.1 stops", with(|_, p| times(p, [1.0, 1.0, 0.97]))),
+        ("flicker by 0.03 stops", with(|n, p| times(p, [if n % 2 == 0 { 1.0 } else { 0.99 }; 3]))),
+        (
+            "half as bright, all cameras",
+            clean()
+                .iter()
+                .map(|c| {
+                    c.iter()
+                        .cloned()
+                        .map(|mut p| {
+                            times(&mut p, [0.5; 3]);
+                            p
+                        })
+                        .collect()
+                })
+                .collect(),
+        ),
+        ("moved by 0.25 pixels", pushed),
+    ];
+    for (name, clip) in cases {
+        let report = says(&clip, 0.0, CAMERAS);
+        let told: Vec<_> = report.findings.iter().filter(|f| f.grade > Grade::Note).collect();
+        assert!(told.is_empty(), "{name}: {told:#?}");
+    }
+    // A pose that is 0.05 degrees off: 0.2 of these pixels.
+    assert_eq!(found(&says(clean(), 0.0009, CAMERAS), "epipolar"), [""; 0]);
 }

@@ -1,6 +1,7 @@
 //! Cameras one after another: a pair to start with, then always the one that sees most of what is known.
 
 mod overlaid;
+mod strays;
 
 use super::adjust::{Bundle, Free, Priors, Settings, Sighting, View, adjust};
 use super::lens::{Lens, off};
@@ -602,16 +603,20 @@ impl Map<'_> {
         self.adjust(STEPS);
     }
 
+    /// A placed camera without distortion, and where it saw its features by the clock that all share.
+    fn stands(&self, sight: usize) -> Option<tracks::Known> {
+        let [w, h] = self.sights[sight].size;
+        let camera = self.lens(sight).pinhole(self.poses[sight]?, w, h);
+        let straight = |f: &Feature| {
+            self.lens(sight).straight(std::array::from_fn(|a| f.pixel[a] + f.velocity[a] * self.taus[sight]))
+        };
+        Some(tracks::Known { camera, pixels: self.sights[sight].features.iter().map(straight).collect() })
+    }
+
     /// Matches of placed cameras along epipolar lines, and those of `links` that lie on them.
     pub(super) fn guided(&self, links: &[Link], progress: &mut Progress<'_>) -> Vec<Link> {
-        let known = |s: usize| {
-            let [w, h] = self.sights[s].size;
-            let camera = self.lens(s).pinhole(self.poses[s]?, w, h);
-            let straight =
-                |f: &Feature| self.lens(s).straight(std::array::from_fn(|a| f.pixel[a] + f.velocity[a] * self.taus[s]));
-            Some(tracks::Known { camera, pixels: self.sights[s].features.iter().map(straight).collect() })
-        };
-        let known: Vec<Option<tracks::Known>> = (0..self.sights.len()).into_par_iter().map(known).collect();
+        let known: Vec<Option<tracks::Known>> =
+            (0..self.sights.len()).into_par_iter().map(|s| self.stands(s)).collect();
         let mut out = tracks::guided(self.sights, &known, GUIDED_WITHIN * self.how.tolerance, progress);
         for link in links {
             let [a, b] = link.sights;
@@ -689,6 +694,7 @@ impl Map<'_> {
             points: self.spots.iter().enumerate().filter_map(point).collect(),
             contradiction: vec![None; self.sights.len()],
             moving: (0..self.sights.len()).map(|s| self.moving(s)).collect(),
+            stray: vec![false; self.sights.len()],
         }
     }
 }
@@ -734,6 +740,8 @@ pub struct Mapped {
     pub contradiction: Vec<Option<f64>>,
     /// Of each camera, the points that move by which its clock was found.
     pub moving: Vec<usize>,
+    /// Of each camera, whether what moves in it contradicts the others: it shows another time.
+    pub stray: Vec<bool>,
 }
 
 /// Places cameras: from several starts, the best of which is kept. `None`: no two pictures fit together.
@@ -785,5 +793,5 @@ pub fn map(
     let ground = Ground::new(&exact, &longer, links, how);
     let mut map = ground.again(&map);
     map.finish();
-    Some(map.result())
+    Some(Mapped { stray: strays::of(&map.agreement(links)), ..map.result() })
 }

@@ -101,6 +101,8 @@ pub struct Solution {
     pub contradiction: Vec<Option<f64>>,
     /// Of each of [`Solution::taken`], the points that move by which its clock was found.
     pub moving: Vec<usize>,
+    /// Of each of them, whether what moves in it contradicts the others: it shows another time, or another take.
+    pub stray: Vec<bool>,
 }
 
 /// Finds where pictures were taken from.
@@ -204,6 +206,7 @@ fn solution(who: &[Who], sights: &[Sight], mapped: mapper::Mapped, pairs: usize,
         pairs,
         contradiction: mapped.contradiction,
         moving: mapped.moving,
+        stray: mapped.stray,
     }
 }
 

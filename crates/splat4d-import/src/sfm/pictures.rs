@@ -2,13 +2,14 @@
 
 use super::known::Known;
 use super::overlay::Shown;
+use crate::sync::grey::{Grey, Pyramid};
+use crate::sync::tracks::{LEVELS, follow};
 use crate::{Error, Result};
 use rayon::prelude::*;
 use splat4d::math::Se3;
 use splat4d::scene::Planes;
 use splat4d_train::event::Progress;
 use splat4d_train::vision::features::{self, Limits, NUMBERS};
-use splat4d_train::vision::flow::{Pyramid, surely};
 use splat4d_train::vision::raster::{blurred, grey};
 
 /// Pictures of cameras, by number.
@@ -248,11 +249,11 @@ pub fn fixed(pictures: &dyn Pictures, look: &Look, progress: &mut Progress<'_>) 
     // What all cameras share; where they share nothing, what most of them see.
     let first = (0..count).filter(|&c| !still(c)).map(|c| ends(c).0).fold(f64::NEG_INFINITY, f64::max);
     let last = (0..count).filter(|&c| !still(c)).map(|c| ends(c).1).fold(f64::INFINITY, f64::min);
-    let moments: Vec<f64> = if first < last {
+    let clock = (0..count).find(|&c| !still(c)).filter(|_| first < last);
+    let moments: Vec<f64> = if let Some(clock) = clock {
         let step = (last - first) / look.moments as f64;
         // Each at a frame of one camera: where clocks agree no feature is brought to another time by its own velocity, whose noise
         // it would take along.
-        let clock = (0..count).find(|&c| !still(c)).expect("some have several frames");
         let frames: Vec<f64> = (0..pictures.frames(clock)).map(|k| pictures.time(clock, k)).collect();
         let near = |t: f64| frames.iter().copied().min_by(|a, b| (a - t).abs().total_cmp(&(b - t).abs()));
         let mut all: Vec<f64> = (0..look.moments).filter_map(|k| near(first + (k as f64 + 0.5) * step)).collect();
@@ -385,38 +386,42 @@ fn moving(
     let Some(window) = Window::around(picture.width, picture.height, &wanted) else { return Ok((Vec::new(), None)) };
     let limits = Limits { contrast: look.contrast, most: look.moving };
     let inner = window.cut(&picture);
-    let mut features = found(&inner, limits, &|x, y| wanted(x + window.x, y + window.y), moment);
-    let beside = |k: usize| -> Result<(Pyramid, f64)> {
+    let features = found(&inner, limits, &|x, y| wanted(x + window.x, y + window.y), moment);
+    let sizes = |g: Planes<f32>| Pyramid::new(Grey { width: g.width, height: g.height, data: g.data }, LEVELS);
+    let (now, time_now) = (grey(&inner), pictures.time(camera, frame));
+    let shown = Shown::new(&now, [window.x, window.y], t - time_now);
+    let now = sizes(now);
+    let places: Vec<[f64; 2]> = features.iter().map(|f| f.pixel).collect();
+    // Where features are in another frame, and when that is.
+    let beside = |k: usize| -> Result<(Vec<Option<[f64; 2]>>, f64)> {
         let (picture, _) = load(pictures, camera, k, look.pixels)?;
-        Ok((Pyramid::new(grey(&window.cut(&picture))), pictures.time(camera, k)))
+        Ok((follow(&now, &sizes(grey(&window.cut(&picture))), &places), pictures.time(camera, k)))
     };
-    let now = (Pyramid::new(grey(&inner)), pictures.time(camera, frame));
-    let shown = Shown::new(&grey(&inner), [window.x, window.y], t - now.1);
     let ago = if frame > 0 { Some(beside(frame - 1)?) } else { None };
     let after = if frame + 1 < pictures.frames(camera) { Some(beside(frame + 1)?) } else { None };
     let length = frame_length(pictures, camera);
-    features.retain_mut(|f| {
-        let follow = |other: &Option<(Pyramid, f64)>| {
-            let (picture, time) = other.as_ref()?;
-            Some((surely(&now.0, picture, f.pixel)?, *time))
+    let with_velocity = |(k, mut f): (usize, Feature)| {
+        let at = |other: &Option<(Vec<Option<[f64; 2]>>, f64)>| {
+            let (places, time) = other.as_ref()?;
+            Some((places[k]?, *time))
         };
-        let here = (f.pixel, now.1);
-        let (from, to) = match (follow(&ago), follow(&after)) {
+        let here = (f.pixel, time_now);
+        let (from, to) = match (at(&ago), at(&after)) {
             (Some(a), Some(b)) => (a, b),
             (Some(a), None) => (a, here),
             (None, Some(b)) => (here, b),
-            (None, None) => return false,
+            (None, None) => return None,
         };
         let time = to.1 - from.1;
         if time <= 0.0 {
-            return false;
+            return None;
         }
         f.velocity = std::array::from_fn(|k| (to.0[k] - from.0[k]) / time);
         let corner = [window.x as f64, window.y as f64];
-        f.pixel = std::array::from_fn(|k| corner[k] + f.pixel[k] + f.velocity[k] * (t - now.1));
-        f.velocity[0].hypot(f.velocity[1]) * length < FASTEST
-    });
-    Ok((features, Some(shown)))
+        f.pixel = std::array::from_fn(|k| corner[k] + f.pixel[k] + f.velocity[k] * (t - time_now));
+        (f.velocity[0].hypot(f.velocity[1]) * length < FASTEST).then_some(f)
+    };
+    Ok((features.into_iter().enumerate().filter_map(with_velocity).collect(), Some(shown)))
 }
 
 /// Frames of moving cameras, one sight each: at most `most`, evenly chosen. What moves in them contradicts what stands still and

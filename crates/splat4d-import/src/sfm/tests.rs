@@ -207,6 +207,24 @@ fn a_camera_of_another_scene_is_left_out_and_says_why() {
     assert_eq!(poses(&mapped), poses(&again), "the same bits");
 }
 
+#[test]
+fn a_camera_that_films_another_time_is_known_by_what_moves() {
+    let mut rig = rig(5, 700, 0.3, 0.1, 0.0);
+    let who: Vec<_> = (0..5).map(|c| (c, None)).collect();
+    let strays = |rig: &Rig| {
+        let mut silent = |_: &_| {};
+        let progress = &mut Progress(&mut silent);
+        solve_sights(&who, &rig.sights, Pairing::All, &Options::default(), progress).unwrap().stray
+    };
+    assert_eq!(strays(&rig), [false; 5]);
+    // Where everybody was half a second before, each of them elsewhere; walls stay.
+    let rng = Rng::new(6, "before", 0);
+    for (k, f) in rig.sights[2].features.iter_mut().enumerate().filter(|(_, f)| f.moment > 0) {
+        f.pixel = std::array::from_fn(|a| f.pixel[a] + 40.0 * rng.normal((2 * k + a) as u64));
+    }
+    assert_eq!(strays(&rig), [false, false, true, false, false]);
+}
+
 /// A patch that moves over a wall, eight pixels a frame.
 struct Walk {
     wall: Planes<f32>,

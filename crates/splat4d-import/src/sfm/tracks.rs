@@ -31,6 +31,8 @@ pub struct Link {
     pub matches: Vec<([usize; 2], f32)>,
     /// From pixels (about the middle of the first picture) to lines of the second; zero where poses led to the matches.
     pub fundamental: [[f64; 3]; 3],
+    /// All that look alike, whether they agree with one motion or not; empty where poses led to the matches.
+    pub alike: Vec<[usize; 2]>,
 }
 
 /// A place that several sights see.
@@ -217,7 +219,12 @@ pub(crate) fn guided(
                     .collect();
                 let matches: Vec<([usize; 2], f32)> =
                     all[a].iter().zip(&all[b]).flat_map(|(r, s)| along(r, s, &lines, &q.pixels)).collect();
-                (!matches.is_empty()).then_some(Link { sights: [a, b], matches, fundamental: [[0.0; 3]; 3] })
+                (!matches.is_empty()).then_some(Link {
+                    sights: [a, b],
+                    matches,
+                    fundamental: [[0.0; 3]; 3],
+                    alike: Vec::new(),
+                })
             })
             .collect();
         out.extend(found.into_iter().flatten());
@@ -297,6 +304,7 @@ fn verified(sights: &[Sight], [a, b]: [usize; 2], matches: Vec<([usize; 2], f32)
         sights: [a, b],
         matches: found.inliers.iter().map(|&k| matches[k]).collect(),
         fundamental: found.model,
+        alike: matches.iter().map(|m| m.0).collect(),
     })
 }
 
@@ -414,6 +422,7 @@ mod tests {
             sights,
             matches: matches.to_vec(),
             fundamental: [[0.0; 3]; 3],
+            alike: Vec::new(),
         };
         let links = [
             link([0, 1], &[([0, 0], 0.1), ([1, 1], 0.2)]),

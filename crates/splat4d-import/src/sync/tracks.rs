@@ -9,7 +9,7 @@ pub const APART: f64 = 8.0;
 /// Pictures are halved until they have no more pixels: 640x360 is looked at as it is, and a film's pictures at half size.
 pub const PIXELS: usize = 700_000;
 /// Sizes of a picture: motion of up to `RADIUS · 2^(LEVELS − 1)` pixels is followed.
-const LEVELS: usize = 4;
+pub const LEVELS: usize = 4;
 /// Half the side of the window that is followed, pixels.
 const RADIUS: usize = 6;
 /// Steps of Newton's method at a level, and the one that is small enough, pixels.

@@ -1,9 +1,11 @@
 //! The clock of all cameras before poses are known: by sound, then by motion, then as their files have it.
 
 use super::cache::Cache;
+use super::poses::Solved;
 use super::stored::Stored;
-use super::{Camera, Report};
-use crate::sync::graph::{self, Evidence, Kind, Solution};
+use super::{Camera, PLACED_LEAST, Report};
+use crate::sync::Refusal;
+use crate::sync::graph::{self, Evidence, Kind, Offset, Solution};
 use crate::sync::motion::{self, Motion};
 use crate::sync::sound::{self, SoundTrack};
 use crate::video::Selection;
@@ -72,6 +74,14 @@ fn heard(
     Ok(pairs.par_iter().map(of).collect())
 }
 
+/// What motion says.
+pub(super) struct Guessed {
+    /// Lags that are guessed.
+    pub evidence: Vec<Evidence>,
+    /// Whether anything moves in two cameras, one of them open, as far as a short take tells: then clocks matter.
+    pub moves: bool,
+}
+
 /// Lags by how much moves, of cameras that sound leaves open with all others.
 pub(super) fn by_motion(
     stored: &Stored<'_>,
@@ -79,12 +89,15 @@ pub(super) fn by_motion(
     cache: &Cache,
     progress: &mut Progress<'_>,
     report: &mut Report,
-) -> Result<Vec<Evidence>> {
+) -> Result<Guessed> {
     let open = |k: usize| clock.offsets[k].is_none();
     let pairs: Vec<[usize; 2]> =
         pairs(stored.pictures.len()).into_iter().filter(|&[a, b]| open(a) || open(b)).collect();
     let prints: Vec<String> = stored.pictures.iter().map(|p| p.fingerprint.clone()).collect();
     let found = cache.pairs("motion", &pairs, &prints, |missing| seen(stored, missing, progress))?;
+    let still = Refusal::Still.to_string();
+    let several = stored.pictures.iter().filter(|p| p.shots.len() > 1).count() > 1;
+    let moves = several && found.iter().any(|f| f.as_ref().err() != Some(&still));
     let mut out = Vec::new();
     for ([a, b], found) in pairs.into_iter().zip(found) {
         match found {
@@ -95,7 +108,49 @@ pub(super) fn by_motion(
             }
         }
     }
-    Ok(out)
+    Ok(Guessed { evidence: out, moves })
+}
+
+/// Refuses a take in which something moves and too few clocks are told: it would be seen at other moments by every camera, and
+/// nothing later could tell. How much moves is a guess that other evidence has to confirm, and counts for nothing here.
+pub(super) fn check(names: &[&str], solved: &Solved, told: &[Option<f64>], motion: &[String]) -> Result<()> {
+    let known = |c: usize| {
+        let measured = |o: &Offset| o.kinds.iter().any(|k| *k != Kind::Motion);
+        told.get(c).copied().flatten().is_some() || solved.offsets[c].as_ref().is_some_and(measured)
+    };
+    let placed: Vec<usize> = (0..names.len()).filter(|&c| solved.cameras[c].is_ok()).collect();
+    let open: Vec<usize> = placed.iter().copied().filter(|&c| !known(c)).collect();
+    if placed.len() < 2 || (placed.len() - open.len()) as f64 >= PLACED_LEAST * placed.len() as f64 {
+        return Ok(());
+    }
+    let guess = |&c: &usize| {
+        let o = solved.offsets[c].as_ref().filter(|o| o.sigma > 0.0)?;
+        Some(format!("{} {:+.0} ± {:.0} ms", names[c], 1e3 * o.seconds, 1e3 * o.sigma))
+    };
+    let guesses: Vec<String> = open.iter().filter_map(guess).collect();
+    // Of three cameras that are not calibrated clocks are not adjusted: they cannot be told from places.
+    let seen = match placed.len() {
+        ..4 => "geometry tells the clocks of four cameras and more, or of calibrated ones that see the same thing move",
+        _ => "too few see the same thing move",
+    };
+    let mut why = vec!["sound agrees of no two of them".to_owned(), seen.to_owned()];
+    if let Some(first) = motion.first() {
+        why.push(format!("how much moves says nothing of {first}"));
+    }
+    if !guesses.is_empty() {
+        why.push(format!("it lets guess {}, which nothing confirms", guesses.join(", ")));
+    }
+    let open: Vec<&str> = open.iter().map(|&c| names[c]).collect();
+    Err(Error::input(format!(
+        "nothing tells how the clocks of these cameras differ, and something moves: {} ({})",
+        open.join(", "),
+        why.join("; ")
+    ))
+    .remedy(
+        "If one trigger drives all cameras, say so with --synchronous. Else tell offsets in import.toml (offset, keep_offset = \
+         true) and run the same command again: what was found is kept. Next time let sound run and clap, or film so that two \
+         cameras at most 30 degrees apart see the same thing move for a second.",
+    ))
 }
 
 /// Lag and standard deviation of some pairs, or why there is none.

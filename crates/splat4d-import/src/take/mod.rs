@@ -72,6 +72,8 @@ pub struct Request {
     pub colmap: bool,
     /// A folder of masks; see [`write::masks`].
     pub masks: Option<PathBuf>,
+    /// Whether one clock drives all cameras, so that their files' times are taken.
+    pub synchronous: bool,
 }
 
 /// Frames of a moving camera that are placed at most: every one is a camera of its own to the solver.
@@ -111,6 +113,9 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
     let mut told =
         corrections.cameras.iter().filter(|c| c.wanted).map(corrections::Camera::given_offset).collect::<Vec<_>>();
     told.resize(cameras.len(), None);
+    if request.synchronous {
+        told.iter_mut().for_each(|t| *t = t.or(Some(0.0)));
+    }
     if cameras.is_empty() {
         return Err(Error::input("all cameras are left out").at(folder.join(corrections::FILE).display()));
     }
@@ -152,7 +157,7 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
     let mut report = Report::default();
     report.guesses.extend(given.iter().flat_map(|g| g.notes.iter().cloned()));
     let cache = cache::Cache::of(folder);
-    let heard = if request.sound && cameras.len() > 1 {
+    let heard = if request.sound && cameras.len() > 1 && told.iter().any(Option::is_none) {
         clocks::by_sound(&cameras, &cache, progress, stop)?
     } else {
         Vec::new()
@@ -164,7 +169,10 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
         .zip(selections)
         .map(|(c, selection)| Clip { name: c.name.clone(), source: &*c.source, selection })
         .collect();
-    let mut pictures = write::pictures(folder, &clips, request.format, progress, stop)?;
+    let stopped = || Error::new(ErrorKind::Interrupted, "stopped").remedy("The same command goes on from there.");
+    // A terminal's Ctrl-C ends ffmpeg too, whose video then seems to be damaged.
+    let mut pictures = write::pictures(folder, &clips, request.format, progress, stop)
+        .map_err(|e| if stop() && e.kind() != ErrorKind::Interrupted { stopped() } else { e })?;
     for p in &pictures {
         if p.shots.is_empty() {
             return Err(Error::input("no frame lies in the part that was chosen")
@@ -172,7 +180,6 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
                 .remedy("Choose another part, or leave the camera out."));
         }
     }
-    let stopped = || Error::new(ErrorKind::Interrupted, "stopped").remedy("The same command goes on from there.");
     if stop() {
         return Err(stopped());
     }
@@ -193,8 +200,11 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
     let known = given::known(given.as_ref(), &corrections, folder, &mut pictures)?;
     let stored = stored::Stored::new(folder, &pictures, &known, &masks);
     let mut evidence = heard;
+    let mut moves = None;
     if pictures.len() > 1 && !moving && clock.offsets.iter().any(Option::is_none) {
-        evidence.extend(clocks::by_motion(&stored, &clock, &cache, progress, &mut report)?);
+        let found = clocks::by_motion(&stored, &clock, &cache, progress, &mut report)?;
+        moves = Some(found.moves);
+        evidence.extend(found.evidence);
     }
     if stored.posed() && pictures.len() > 1 && told.iter().any(Option::is_none) {
         let rough = clocks::solve(&cameras, &evidence, &told);
@@ -213,7 +223,7 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
     if stop() {
         return Err(stopped());
     }
-    let found = Found { stored: &stored, given, solved, evidence: &evidence, told: &told };
+    let found = Found { stored: &stored, given, solved, evidence: &evidence, told: &told, moves };
     finish(request, found, &mut corrections, report, progress)
 }
 
@@ -225,6 +235,8 @@ struct Found<'a> {
     /// Lags of pairs, and offsets that were told.
     evidence: &'a [Evidence],
     told: &'a [Option<f64>],
+    /// Whether something moves in cameras whose clocks sound leaves open; none: it leaves none open.
+    moves: Option<bool>,
 }
 
 fn names_of(pictures: &[Pictures]) -> Vec<&str> {
@@ -368,7 +380,7 @@ fn finish(
     progress: &mut Progress<'_>,
 ) -> Result<Report> {
     let folder = &request.folder;
-    let Found { stored, given, mut solved, evidence, told } = found;
+    let Found { stored, given, mut solved, evidence, told, moves } = found;
     let pictures = stored.pictures;
     let posed = given.as_ref().is_some_and(|g| g.posed);
     // COLMAP's own axes and unit are those of some camera.
@@ -393,6 +405,13 @@ fn finish(
     for (k, (camera, p)) in solved.cameras.iter().zip(pictures).enumerate() {
         let row = CameraReport::of(p, camera, solved.offsets.get(k).and_then(Option::as_ref));
         report.cameras.push(row);
+        if solved.stray.get(k) == Some(&true) {
+            report.cameras[k].warnings.push(
+                "what moves in it fits the other cameras much less than theirs does: it films another time (tell its offset), \
+                 another take, or from too far aside; its clock is not believed"
+                    .into(),
+            );
+        }
         if let Ok(stand) = camera {
             placed.push(stand.written(p, solved.offset(k), stored.masks.get(k).cloned()));
             if let Some(own) = corrections.cameras.iter_mut().find(|c| c.name == p.name) {
@@ -409,6 +428,14 @@ fn finish(
     report.write(folder)?;
     contradicted?;
     check(&solved, pictures, &mut report)?;
+    match moves {
+        Some(true) => clocks::check(&names_of(pictures), &solved, told, &report.motion)?,
+        Some(false) => {
+            report.still = true;
+            report.guesses.push("Nothing moves: clocks are those of the files, and do not matter.".into());
+        }
+        None => {}
+    }
     let mut points = None;
     if !solved.points.is_empty() {
         let file = PathBuf::from("points.ply");

@@ -52,6 +52,8 @@ pub(super) struct Solved {
     pub moving: bool,
     /// See [`sfm::Solution::contradiction`].
     pub contradiction: Vec<Option<f64>>,
+    /// Cameras whose clock adjusting did not find, for what moves in them contradicts the others.
+    pub stray: Vec<bool>,
 }
 
 /// A solution as it is stored; of lenses that were given nothing.
@@ -63,6 +65,7 @@ struct Note {
     up: [f64; 3],
     moving: bool,
     contradiction: Vec<Option<f64>>,
+    stray: Vec<bool>,
 }
 
 #[derive(Serialize, Deserialize)]
@@ -106,6 +109,7 @@ impl Note {
             up: solved.up,
             moving: solved.moving,
             contradiction: solved.contradiction.clone(),
+            stray: solved.stray.clone(),
         }
     }
 
@@ -140,6 +144,7 @@ impl Note {
             up: self.up,
             moving: self.moving,
             contradiction: self.contradiction,
+            stray: self.stray,
         }
     }
 }
@@ -168,6 +173,7 @@ pub(super) fn standing(
     // What nothing tells stays as the files have it.
     let mut current: Vec<Offset> = offsets.iter().map(|o| o.clone().unwrap_or_default()).collect();
     let before: Vec<f64> = current.iter().map(|o| o.seconds).collect();
+    let begun = offsets.clone();
     let frame = stored.pictures.iter().map(|p| p.clock.interval).filter(|i| *i > 0.0).fold(f64::INFINITY, f64::min);
     let all_told = told.iter().all(Option::is_some);
     let mut options = Options::default();
@@ -189,6 +195,15 @@ pub(super) fn standing(
             break;
         }
     }
+    let mut stray = vec![false; n];
+    for (taken, contradicts) in solution.taken.iter().zip(&solution.stray) {
+        let c = taken.camera;
+        if *contradicts && told[c].is_none() {
+            // What adjusting made of its clock is chance.
+            stray[c] = true;
+            offsets[c].clone_from(&begun[c]);
+        }
+    }
     for c in 0..n {
         // Sound that geometry contradicts was sound of something else.
         if let Some(o) = &mut offsets[c]
@@ -207,7 +222,7 @@ pub(super) fn standing(
     };
     let cameras = (0..n).map(placed).collect();
     let (points, contradiction) = (points_of(&solution), solution.contradiction);
-    Ok(Solved { cameras, offsets, points, up: solution.up, moving: false, contradiction })
+    Ok(Solved { cameras, offsets, points, up: solution.up, moving: false, contradiction, stray })
 }
 
 /// Adds what geometry found to the clocks; by how many seconds the one moved that moved most.
@@ -295,6 +310,7 @@ pub(super) fn walking(stored: &Stored<'_>, most: usize, progress: &mut Progress<
         up: solution.up,
         moving: true,
         contradiction: Vec::new(),
+        stray: Vec::new(),
     })
 }
 

@@ -26,6 +26,8 @@ pub struct Report {
     pub refused: Vec<String>,
     /// Pairs of cameras that motion tells no lag of, and why.
     pub motion: Vec<String>,
+    /// Nothing moves in cameras whose clocks nothing tells: they do not matter.
+    pub still: bool,
 }
 
 /// What an import found of a camera.

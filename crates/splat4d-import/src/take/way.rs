@@ -230,6 +230,7 @@ mod tests {
             up: [0.0, 0.0, 1.0],
             moving: false,
             contradiction: Vec::new(),
+            stray: Vec::new(),
         };
         (solved, evidence, truth)
     }

@@ -5,6 +5,7 @@
 //! bytes each. What the matrix makes of a render is not clamped again, which sums could not do: the true error is never
 //! above the one told, since the truth lies in `[0,1]`.
 
+use splat4d::math::cholesky::Cholesky;
 use splat4d::scene::Planes;
 
 /// Colours of a pixel of the render, and 1.
@@ -83,30 +84,12 @@ impl ColourSums {
     ///
     /// Source: FreeTimeGS++ 2026 measures renders with an affine colour correction a camera, to tell colour from shape.
     pub(crate) fn fit(&self) -> Option<ColourMatrix> {
-        // xx Δ = xe by Cholesky, L Lᵀ = xx; Δ is what differs from the identity.
-        let mut l = [[0.0; IN]; IN];
-        for i in 0..IN {
-            for j in 0..=i {
-                let rest = self.xx[i][j] - (0..j).map(|k| l[i][k] * l[j][k]).sum::<f64>();
-                l[i][j] = if i != j {
-                    rest / l[j][j]
-                } else if rest > SINGULAR * self.xx[i][i] {
-                    rest.sqrt()
-                } else {
-                    return None;
-                };
-            }
-        }
+        // xx Δ = xe; Δ is what differs from the identity.
+        let factor = Cholesky::with_pivots(IN, self.xx.as_flattened().to_vec(), SINGULAR)?;
         let mut matrix = IDENTITY;
         for (c, row) in matrix.iter_mut().enumerate() {
-            let mut d = [0.0; IN];
-            for i in 0..IN {
-                d[i] = (self.xe[i][c] - (0..i).map(|k| l[i][k] * d[k]).sum::<f64>()) / l[i][i];
-            }
-            for i in (0..IN).rev() {
-                d[i] = (d[i] - (i + 1..IN).map(|k| l[k][i] * d[k]).sum::<f64>()) / l[i][i];
-                row[i] += d[i];
-            }
+            let d = factor.solve(self.xe.iter().map(|e| e[c]).collect());
+            row.iter_mut().zip(d).for_each(|(m, d)| *m += d);
         }
         matrix.iter().flatten().all(|m| m.is_finite()).then_some(matrix)
     }

@@ -110,6 +110,17 @@ pub(crate) struct StepGrads<'a> {
     pub d_times: &'a [f64],
 }
 
+/// Gradients to what is learnt: the number of a row and what is told of it.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Gradients {
+    /// To twists, by row.
+    pub poses: Vec<(usize, [f64; POSE])>,
+    /// To shares of focal lengths, by camera.
+    pub focal: Vec<(usize, [f64; 1])>,
+    /// To shifts of clocks, by camera.
+    pub times: Vec<(usize, [f64; 1])>,
+}
+
 /// A search of clocks that is due.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct SearchDue {
@@ -214,26 +225,38 @@ impl Corrections {
         self.poses.as_ref().map(|p| p.read::<POSE>(row, 0).map(f64::from))
     }
 
+    /// The gradients to what is learnt, of those of some frames to their cameras, focal lengths and times: the way back of
+    /// [`camera`](Self::camera) and [`time`](Self::time).
+    pub(crate) fn gradients(&self, frames: &[usize], report: &StepGrads<'_>) -> Gradients {
+        let mut out = Gradients::default();
+        for (&i, &d) in frames.iter().zip(report.d_cameras) {
+            let Some(twist) = self.twist(self.rows[i]) else { continue };
+            add(&mut out.poses, self.rows[i], to_twist(twist, d));
+        }
+        for (&i, &d) in frames.iter().zip(report.d_focals) {
+            // To the share, of that to the logarithm.
+            add(&mut out.focal, self.rigs[i], [d / (1.0 + self.zoom(self.rigs[i]))]);
+        }
+        for (&i, &d) in frames.iter().zip(report.d_times) {
+            add(&mut out.times, self.rigs[i], [d]);
+        }
+        out
+    }
+
     /// One step of Adam with the gradients of some frames; `progress`: of the run. Frames whose gradient is not finite
     /// rest.
     pub(crate) fn step(&mut self, frames: &[usize], report: &StepGrads<'_>, progress: f64, scale: f64) {
-        let StepGrads { d_cameras, d_focals, d_times } = *report;
         let s = self.settings.clone();
         let share = |from: f64| {
             let done = (progress - from) / (s.until - from).max(f64::EPSILON);
             (0.0..1.0).contains(&done).then_some(done)
         };
         let rate = |ends: [f64; 2], done: f64, unit: f64| scale * unit * ends[0] * (ends[1] / ends[0]).powf(done);
+        let Gradients { poses: d_poses, focal: d_focal, times: d_times } = self.gradients(frames, report);
         if let (Some(done), Some(poses)) = (share(s.poses_from), &mut self.poses) {
             let place = rate([s.position_init, s.position_final], done, self.scale.extent);
             let turn = rate([s.rotation_init, s.rotation_final], done, 1.0);
-            let mut sums: Vec<(usize, [f64; POSE])> = Vec::new();
-            for (&i, d) in frames.iter().zip(d_cameras) {
-                let row = self.rows[i];
-                let twist = poses.read::<POSE>(row, 0).map(f64::from);
-                add(&mut sums, row, to_twist(twist, *d));
-            }
-            for (row, d) in sums {
+            for (row, d) in d_poses {
                 adam(poses, row, d, [place, place, place, turn, turn, turn]);
             }
             if self.gauge {
@@ -242,12 +265,7 @@ impl Corrections {
         }
         if let (Some(done), Some(focal)) = (share(s.poses_from), &mut self.focal) {
             let step = rate([s.focal_init, s.focal_final], done, 1.0);
-            let mut sums: Vec<(usize, [f64; 1])> = Vec::new();
-            for (&i, &d) in frames.iter().zip(d_focals) {
-                // To the share, of that to the logarithm.
-                add(&mut sums, self.rigs[i], [d / (1.0 + f64::from(focal.get(self.rigs[i], 0)))]);
-            }
-            for (rig, d) in sums {
+            for (rig, d) in d_focal {
                 adam(focal, rig, d, [step]);
                 let kept = f64::from(focal.get(rig, 0)) * (1.0 - PULL);
                 focal.set(rig, 0, kept.clamp(-FOCAL_LIMIT, FOCAL_LIMIT) as f32);
@@ -256,11 +274,7 @@ impl Corrections {
         if let (Some(done), Some(times)) = (share(self.searched()), &mut self.times) {
             let step = rate([s.time_init, s.time_final], done, self.scale.frame);
             let limit = (s.time_limit * self.scale.frame) as f32;
-            let mut sums: Vec<(usize, [f64; 1])> = Vec::new();
-            for (&i, &d) in frames.iter().zip(d_times) {
-                add(&mut sums, self.rigs[i], [d]);
-            }
-            for (rig, d) in sums {
+            for (rig, d) in d_times {
                 adam(times, rig, d, [step]);
                 times.set(rig, 0, times.get(rig, 0).clamp(-limit, limit));
             }
@@ -364,6 +378,12 @@ impl Corrections {
             "poses": self.poses.is_some(), "focal": self.focal.is_some(), "times": self.times.is_some(),
             "cameras": self.origins.iter().enumerate().map(row).collect::<Vec<_>>(),
         })
+    }
+
+    /// Sets the share by which a camera's focal lengths are longer, to make one up.
+    #[cfg(test)]
+    pub(crate) fn set_zoom(&mut self, rig: usize, share: f32) {
+        self.focal.as_mut().expect("focal lengths are learnt").set(rig, 0, share);
     }
 
     /// Sets values, to make some up.

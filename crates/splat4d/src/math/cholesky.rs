@@ -10,7 +10,13 @@ pub struct Cholesky {
 
 impl Cholesky {
     /// Of a matrix [n, n], row-major, of which the lower triangle is read. `None`: it is not positive definite.
-    pub fn new(n: usize, mut a: Vec<f64>) -> Option<Self> {
+    pub fn new(n: usize, a: Vec<f64>) -> Option<Self> {
+        Self::with_pivots(n, a, 0.0)
+    }
+
+    /// As [`new`](Self::new); `None` also where what is left of a number of the diagonal is at most this share of it, so that
+    /// rounding decides.
+    pub fn with_pivots(n: usize, mut a: Vec<f64>, least: f64) -> Option<Self> {
         assert_eq!(a.len(), n * n, "a square matrix");
         for i in 0..n {
             let (above, row) = a.split_at_mut(i * n);
@@ -20,7 +26,7 @@ impl Cholesky {
                 row[j] = (row[j] - sum) / other[j];
             }
             let left = row[i] - row[..i].iter().map(|x| x * x).sum::<f64>();
-            if left <= 0.0 || !left.is_finite() {
+            if left <= least * row[i] || !left.is_finite() {
                 return None;
             }
             row[i] = left.sqrt();
@@ -60,6 +66,8 @@ mod tests {
         let right = (0..n).map(|i| (0..n).map(|k| a[i * n + k] * x[k]).sum()).collect();
         let got = Cholesky::new(n, a.clone()).unwrap().solve(right);
         assert!(got.iter().zip(&x).all(|(g, t)| (g - t).abs() < 1e-9), "{got:?} {x:?}");
+        let nearly = vec![1.0, 1.0, 1.0, 1.0 + 1e-9];
+        assert!(Cholesky::new(2, nearly.clone()).is_some() && Cholesky::with_pivots(2, nearly, 1e-6).is_none());
         a[0] = -1.0;
         assert!(Cholesky::new(n, a.clone()).is_none(), "not positive");
         a[0] = f64::NAN;

@@ -12,6 +12,7 @@ mod layers;
 mod lobes;
 mod nodes;
 mod pruned;
+mod refine;
 mod scan;
 mod split;
 mod triple;
