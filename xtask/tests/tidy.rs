@@ -20,7 +20,7 @@ const ORDER: [(&str, &[&str]); 8] = [
         // `methods`, which choose among them; `init` needs a model's plan; `eval` writes as safely as `run` does.
         &[
             "settings", "recipe", "event", "capture", "vision", "sampler", "optim", "loss", "learner", "upkeep",
-            "methods", "step", "init", "run", "labels", "eval", "training", "compress", "dist",
+            "methods", "step", "init", "run", "blended", "labels", "features", "eval", "training", "compress", "dist",
         ],
     ),
     (

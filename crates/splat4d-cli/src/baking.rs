@@ -10,7 +10,9 @@ use image::codecs::jpeg::JpegEncoder;
 use serde_json::{Value, json};
 use splat4d::bake::{self, Options, Shown, bake};
 use splat4d::device;
-use splat4d::format::playback::{self, Draft, Meta, NamedCamera, Pages, PathKey, Viewpoint, WriteConfig};
+use splat4d::format::playback::{
+    self, Draft, Meta, NamedCamera, Pages, PathKey, Viewpoint, WriteConfig, feature_ranges,
+};
 use splat4d::layers::Scene;
 use splat4d::render::{Antialias, RenderConfig};
 use splat4d::scene::{Camera, GEOMETRY};
@@ -322,6 +324,7 @@ pub(crate) fn meta(scene: &Scene<f32>, outline: &Outline, stage: &Stage, views: 
         bounds: outline.bounds,
         predicted: scene.predicted_from(),
         labels: scene.labels.clone(),
+        features: feature_ranges(scene),
         view: Some(look(0.0)),
         cameras: views.iter().map(|v| NamedCamera::new(&v.name, &v.camera)).collect(),
         // The last key is the first again, so that the orbit closes.

@@ -33,6 +33,8 @@ pub enum Channel {
     Normal,
     /// The likeliest label, a colour each
     Label,
+    /// Feature channels: the first three as red, green, blue about grey
+    Feature,
     /// Seconds of the clip in which what is seen is there: long is bright
     Life,
     /// Standard deviation of the place of what is seen that the training pictures leave open: unsure is bright
@@ -50,6 +52,7 @@ impl Channel {
             Self::Velocity => "velocity",
             Self::Normal => "normal",
             Self::Label => "label",
+            Self::Feature => "feature",
             Self::Life => "life",
             Self::Uncertainty => "uncertainty",
         }
@@ -65,18 +68,20 @@ impl Channel {
         !matches!(self, Self::Color | Self::Alpha | Self::Depth)
     }
 
-    /// Names of the planes of [`Painter::raw`], for files that name them.
-    pub(crate) fn planes(self) -> &'static [&'static str] {
-        match self {
+    /// Name of a plane of [`Painter::raw`], for files that name them.
+    pub(crate) fn plane(self, c: usize) -> String {
+        let names: &[&str] = match self {
             Self::Color => &["R", "G", "B"],
             Self::Alpha => &["A"],
             Self::Depth => &["Z"],
             Self::Flow => &["U", "V"],
             Self::Velocity | Self::Normal => &["X", "Y", "Z"],
             Self::Label => &["label"],
+            Self::Feature => return format!("F{c:02}"),
             Self::Life => &["life"],
             Self::Uncertainty => &["uncertainty"],
-        }
+        };
+        names[c].into()
     }
 }
 
@@ -161,6 +166,11 @@ impl<'a> Painter<'a> {
                 return Err(Error::input("the scene has no labels")
                     .remedy("Give the capture's cameras masks of labels, then: splat4d label RUN (docs/labels.md)."));
             }
+            Channel::Feature if self.scene.feature_channels() == 0 => {
+                return Err(Error::input("the scene has no features").remedy(
+                    "Give the capture's cameras pictures of features, then: splat4d label RUN (docs/labels.md).",
+                ));
+            }
             Channel::Life => self.numbers = channels::lifetimes(self.scene),
             Channel::Uncertainty => {
                 let seen: Vec<&View> = views.iter().filter(|v| !v.held).collect();
@@ -221,6 +231,9 @@ impl<'a> Painter<'a> {
             Channel::Velocity => flow::velocity_columns(scene, &self.instant),
             Channel::Normal => channels::normal_columns(&self.instant, camera),
             Channel::Label => channels::label_columns(scene, &self.instant).expect("a scene with labels was asked for"),
+            Channel::Feature => {
+                channels::feature_columns(scene, &self.instant).expect("a scene with features was asked for")
+            }
             _ => channels::number_columns(&self.instant, &self.numbers),
         };
         let splats = scene.splats(&self.instant);
@@ -373,6 +386,9 @@ fn field_rgb(raw: &Planes<f32>, channel: Channel, [low, high]: [f32; 2]) -> Rgb 
                 hue(turn.rem_euclid(1.0), (at(0).hypot(at(1)) / span).min(1.0), 1.0)
             }
             Channel::Velocity => std::array::from_fn(|c| byte(0.5 + 0.5 * at(c) / span)),
+            Channel::Feature => {
+                std::array::from_fn(|c| if c < raw.channels { byte(0.5 + 0.5 * at(c) / span) } else { byte(0.5) })
+            }
             Channel::Normal => [byte(0.5 + 0.5 * at(0)), byte(0.5 - 0.5 * at(1)), byte(0.5 - 0.5 * at(2))],
             Channel::Label if at(0) < 0.0 => [0; 3],
             Channel::Label => label_color(at(0) as usize),

@@ -20,10 +20,10 @@ use splat4d_train::eval::points::point_errors;
 use splat4d_train::eval::run::{EvalOptions, Measured, Scores, evaluate};
 use splat4d_train::eval::tracks::track_error;
 use splat4d_train::eval::trajectory::trajectory_error;
-use splat4d_train::labels::{MOST_PICTURES, ROUNDS};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::chunks::Chunked;
 use splat4d_train::run::{capture_options, corrected};
+use splat4d_train::{features, labels};
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -45,13 +45,15 @@ const FILM_STEPS: f64 = 0.5;
 /// See [`HELD_STEPS`].
 const BAKE_STEPS: f64 = 60.0;
 
-/// See [`HELD_STEPS`]: a picture with a mask of labels, drawn and taken back once.
+/// See [`HELD_STEPS`]: a picture with a mask of labels or a picture of features, drawn and taken back once.
 const LABEL_STEPS: f64 = 1.0;
 
 /// The time of what follows training, in training steps at full size: `--minutes` leaves room for it.
 pub(crate) fn steps(capture: &Capture, only_playback: bool) -> f64 {
-    let masks = capture.train.iter().filter(|&&i| capture.frames[i].labels.is_some()).count().min(MOST_PICTURES);
-    let labels = (ROUNDS * masks) as f64 * LABEL_STEPS;
+    let frames = || capture.train.iter().map(|&i| &capture.frames[i]);
+    let masks = frames().filter(|f| f.labels.is_some()).count().min(labels::MOST_PICTURES);
+    let featured = frames().filter(|f| f.features.is_some()).count().min(features::MOST_PICTURES);
+    let labels = (labels::ROUNDS * masks + (features::ROUNDS + 1) * featured) as f64 * LABEL_STEPS;
     if only_playback {
         return BAKE_STEPS + labels;
     }

@@ -1,4 +1,5 @@
-//! The work behind `label`, which `train` does too where a capture has labels: labels learnt into a run's scene, and measured.
+//! The work behind `label`, which `train` does too where a capture has labels or features: both learnt into a run's scene, and
+//! measured.
 
 use crate::console::Console;
 use crate::files;
@@ -7,19 +8,21 @@ use crate::run_folder::Run;
 use crate::source::{not_empty, read_scene};
 use serde_json::json;
 use splat4d::format;
-use splat4d_train::capture::{Capture, CaptureOptions};
+use splat4d::layers::Scene;
+use splat4d_train::capture::{Capture, CaptureOptions, Frame};
+use splat4d_train::features;
 use splat4d_train::labels::{self, LabelScores, ROUNDS, learn, measure};
 use splat4d_train::run::{capture_options, corrected};
 use std::path::Path;
 
-/// Whether any picture of a run's capture has a mask of labels.
-pub(crate) fn has_labels(capture: &Capture) -> bool {
-    capture.frames.iter().any(|f| f.labels.is_some())
+/// Whether any picture of a run's capture has a mask of labels or a picture of features.
+pub(crate) fn has_any(capture: &Capture) -> bool {
+    capture.frames.iter().any(|f| f.labels.is_some() || f.features.is_some())
 }
 
-/// Learns the labels of a run's capture, or of another with the same cameras, into its `scene.safetensors`.
+/// Learns the labels and the features of a run's capture, or of another with the same cameras, into its `scene.safetensors`.
 ///
-/// Errors: no training picture has labels; masks that cannot be read.
+/// Errors: no training picture has either; files that cannot be read.
 pub(crate) fn label(run: &Path, from: Option<&Path>, rounds: Option<usize>, console: &Console) -> anyhow::Result<()> {
     let opened = Run::open(run)?;
     let file = opened.scene_file()?;
@@ -30,18 +33,71 @@ pub(crate) fn label(run: &Path, from: Option<&Path>, rounds: Option<usize>, cons
         capture = Capture::open(from, &CaptureOptions { frames: Vec::new(), ..capture_options(&recipe)? })?;
     }
     corrected::apply(&mut capture, run)?;
-    let mut phase = |done, of| console.phase("learning labels", done, of);
-    let losses = learn(&mut scene, &capture, rounds.unwrap_or(ROUNDS), &mut phase)?;
-    console.clear();
+    let there = |which: fn(&Frame) -> bool| capture.train.iter().any(|&i| which(&capture.frames[i]));
+    let (labelled, featured) = (there(|f| f.labels.is_some()), there(|f| f.features.is_some()));
+    if featured {
+        learn_features(run, &mut scene, &capture, rounds, console)?;
+    }
+    if labelled || !featured {
+        learn_labels(run, &mut scene, &capture, rounds, console)?;
+    }
     let mut bytes = Vec::new();
     format::scene::write(&scene, &mut bytes)?;
     files::write(&file, &bytes)?;
+    console.written(&file);
+    Ok(())
+}
+
+fn learn_features(
+    run: &Path,
+    scene: &mut Scene<f32>,
+    capture: &Capture,
+    rounds: Option<usize>,
+    console: &Console,
+) -> anyhow::Result<()> {
+    let mut phase = |done, of| console.phase("learning features", done, of);
+    let losses = features::learn(scene, capture, rounds.unwrap_or(features::ROUNDS), &mut phase)?;
+    console.clear();
+    let list: Vec<String> = losses.iter().map(|l| format!("{l:.4}")).collect();
+    console.detail(&format!("half the squared error of a pixel's features, round by round: {}", list.join(", ")));
+    let (scores, views) = match features::measure(scene, capture, &capture.held)? {
+        Some(scores) => (Some(scores), "held-out"),
+        None => (features::measure(scene, capture, &capture.train)?, "training"),
+    };
+    if let Some(scores) = scores {
+        let channels = scene.feature_channels();
+        console.say(&format!(
+            "{channels} feature channels: {:.1} % of the variance of {} {views} views is explained, mean cosine {:.3}",
+            100.0 * scores.explained,
+            scores.pictures,
+            scores.cosine
+        ));
+        let told = json!({
+            "channels": channels, "views": views, "pictures": scores.pictures, "explained": scores.explained,
+            "cosine": scores.cosine, "losses": losses,
+        });
+        amend(run, [("features".into(), told)])?;
+    }
+    console.emit(&json!({"type": "featured", "channels": scene.feature_channels()}));
+    Ok(())
+}
+
+fn learn_labels(
+    run: &Path,
+    scene: &mut Scene<f32>,
+    capture: &Capture,
+    rounds: Option<usize>,
+    console: &Console,
+) -> anyhow::Result<()> {
+    let mut phase = |done, of| console.phase("learning labels", done, of);
+    let losses = learn(scene, capture, rounds.unwrap_or(ROUNDS), &mut phase)?;
+    console.clear();
     let list: Vec<String> = losses.iter().map(|l| format!("{l:.4}")).collect();
     console.detail(&format!("cross-entropy of a labelled pixel before each round: {} nats", list.join(", ")));
-    let held = measure(&scene, &capture, &capture.held)?;
+    let held = measure(scene, capture, &capture.held)?;
     let (scores, views) = match held {
         Some(scores) => (Some(scores), "held-out"),
-        None => (measure(&scene, &capture, &capture.train)?, "training"),
+        None => (measure(scene, capture, &capture.train)?, "training"),
     };
     if let Some(scores) = &scores {
         console.say(&in_words(scores, views));
@@ -65,7 +121,6 @@ pub(crate) fn label(run: &Path, from: Option<&Path>, rounds: Option<usize>, cons
     console.emit(&json!({
         "type": "labelled", "labels": scene.labels, "gaussians": counts, "most_pictures": labels::MOST_PICTURES,
     }));
-    console.written(&file);
     Ok(())
 }
 

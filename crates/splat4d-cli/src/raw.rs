@@ -13,7 +13,7 @@ pub(crate) enum RawFormat {
     Npy,
     /// Middlebury .flo: of flow alone; unknown pixels are 1e10
     Flo,
-    /// OpenEXR, 32-bit floats, a channel a number: R G B, A, Z, U V, X Y Z, or the channel's name
+    /// OpenEXR, 32-bit floats, a channel a number: R G B, A, Z, U V, X Y Z, F00 F01 ..., or the channel's name
     Exr,
 }
 
@@ -67,7 +67,7 @@ impl RawFormat {
 
 /// A single-part OpenEXR file of uncompressed scan lines, which every reader takes.
 fn open_exr(channel: Channel, raw: &Planes<f32>) -> Result<Vec<u8>> {
-    let one = |c: usize| AnyChannel::new(channel.planes()[c], FlatSamples::F32(raw.plane(c).to_vec()));
+    let one = |c: usize| AnyChannel::new(channel.plane(c).as_str(), FlatSamples::F32(raw.plane(c).to_vec()));
     let channels = AnyChannels::sort((0..raw.channels).map(one).collect());
     let layer = Layer::new((raw.width, raw.height), LayerAttributes::default(), Encoding::UNCOMPRESSED, channels);
     let mut out = Cursor::new(Vec::new());

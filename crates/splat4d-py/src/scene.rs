@@ -99,7 +99,7 @@ impl Scene {
     /// A picture at second t: `color` [h, w, 3] over the background, `alpha` [h, w], or expected `depth` [h, w] along the
     /// camera's z in scene units, NaN where nothing is; or one of what `splat4d render --channel` shows as raw numbers, NaN
     /// where nothing has any: `flow` [h, w, 2] in pixels to the scene's next frame, `velocity` [h, w, 3] in scene units a
-    /// second, unit `normal` [h, w, 3] in camera axes, number of the `label` [h, w] (-1: none), `life` [h, w] in seconds,
+    /// second, unit `normal` [h, w, 3] in camera axes, number of the `label` [h, w] (-1: none), `feature` [h, w, C], `life` [h, w] in seconds,
     /// `uncertainty` [h, w] in scene units (of a run; drawn on the CPU as all of these). float32. `device`: `cpu`, `gpu` or `auto`.
     #[pyo3(signature = (camera, t, *, channel="color", background=None, device="cpu"))]
     fn render<'py>(
@@ -115,7 +115,7 @@ impl Scene {
         let Some(kind) = Channel::named(channel) else {
             return Err(bad_input(
                 format!("there is no channel `{channel}`"),
-                "Give color, alpha, depth, flow, velocity, normal, label, life or uncertainty",
+                "Give color, alpha, depth, flow, velocity, normal, label, feature, life or uncertainty",
             ));
         };
         let device = named(device)?;

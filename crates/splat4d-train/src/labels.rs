@@ -9,13 +9,13 @@
 //!
 //! Shapes and places learn nothing from labels: they are those that make the best pictures.
 
+use crate::blended::{Blended, SEEN};
 use crate::capture::Capture;
 use crate::capture::labels::{UNKNOWN, read};
 use crate::{Error, Result};
 use splat4d::channels::label_columns;
 use splat4d::flow::divided;
-use splat4d::layers::{Evaluation, Scene};
-use splat4d::render::{Image, ImageGrads, RenderConfig, RenderGrads, Renderer, Shot};
+use splat4d::layers::Scene;
 use splat4d::scene::labels::{self, LABEL_LOGITS};
 use splat4d::scene::{Planes, Table};
 
@@ -23,8 +23,6 @@ use splat4d::scene::{Planes, Table};
 pub const ROUNDS: usize = 4;
 /// Most pictures of a round, evenly chosen: more say the same again.
 pub const MOST_PICTURES: usize = 240;
-/// A pixel that shows less than this teaches nothing, and is not measured.
-const SEEN: f32 = 0.5;
 /// Pixels' worth of an even vote that every Gaussian has: what no picture shows keeps no label.
 const PRIOR: f64 = 1e-3;
 /// Probabilities are kept this far from 0: a wrong mask must not forbid a label for ever.
@@ -86,7 +84,7 @@ pub fn learn(
             None => drop(labels::claim(&mut layer.params, count)?),
         }
     }
-    let mut work = Work::default();
+    let mut work = Blended::default();
     let total = rounds * frames.len();
     let mut losses = Vec::with_capacity(rounds);
     for round in 0..rounds {
@@ -96,7 +94,7 @@ pub fn learn(
         for (i, &frame) in frames.iter().enumerate() {
             progress(round * frames.len() + i, total);
             let truth = read(&capture.frames[frame], capture)?.expect("only frames with labels were chosen");
-            let (sum, seen) = work.vote(scene, capture, frame, &truth, &mut votes);
+            let (sum, seen) = vote(&mut work, scene, capture, frame, &truth, &mut votes);
             (loss, pixels) = (loss + sum, pixels + seen);
         }
         losses.push(loss / pixels.max(1) as f64);
@@ -135,10 +133,10 @@ pub fn measure(scene: &Scene<f32>, capture: &Capture, frames: &[usize]) -> Resul
     let count = scene.labels.len();
     let (mut right, mut all) = (0usize, 0usize);
     let (mut both, mut drawn, mut true_) = (vec![0usize; count], vec![0usize; count], vec![0usize; count]);
-    let mut work = Work::default();
+    let mut work = Blended::default();
     for &frame in &frames {
         let truth = read(&capture.frames[frame], capture)?.expect("only frames with labels were chosen");
-        work.draw(scene, capture, frame);
+        draw(&mut work, scene, capture, frame);
         for (p, &y) in truth.iter().enumerate().filter(|(_, y)| **y != UNKNOWN) {
             let Some(best) = best(&work.image.extra, p) else { continue };
             let y = usize::from(y);
@@ -164,84 +162,41 @@ pub fn best(extra: &Planes<f32>, p: usize) -> Option<usize> {
     (extra.plane(count)[p] >= SEEN).then(|| (0..count).max_by(likelier)).flatten()
 }
 
-/// Memory of a picture after the other.
-struct Work {
-    renderer: Renderer<f32>,
-    instant: Evaluation<f32>,
-    columns: Table<f32>,
-    image: Image<f32>,
-    grads: RenderGrads<f32>,
+/// Draws the blended probabilities of a frame's view.
+fn draw(work: &mut Blended, scene: &Scene<f32>, capture: &Capture, frame: usize) {
+    work.draw(scene, capture, frame, |instant| label_columns(scene, instant).expect("the scene has labels"));
 }
 
-impl Default for Work {
-    fn default() -> Self {
-        Self {
-            renderer: Renderer::new(RenderConfig::default()),
-            instant: Evaluation::default(),
-            columns: Table::default(),
-            image: Image::default(),
-            grads: RenderGrads::default(),
+/// Adds a picture's votes; returns its cross-entropy and how many pixels that is of.
+fn vote(
+    work: &mut Blended,
+    scene: &Scene<f32>,
+    capture: &Capture,
+    frame: usize,
+    truth: &[u8],
+    votes: &mut [Table<f64>],
+) -> (f64, usize) {
+    draw(work, scene, capture, frame);
+    let count = scene.labels.len();
+    let (shares, weight) = divided(&work.image.extra);
+    let mut d_extra = Planes::new(count + 1, shares.height, shares.width);
+    let (mut loss, mut seen) = (0.0, 0);
+    for (p, &y) in truth.iter().enumerate() {
+        if y == UNKNOWN || weight.data[p] < SEEN {
+            continue;
         }
+        let share = f64::from(shares.plane(usize::from(y))[p]).max(LEAST);
+        loss -= share.ln();
+        seen += 1;
+        // Σ w p_y is the share times Σ w.
+        d_extra.plane_mut(usize::from(y))[p] = (1.0 / (share * f64::from(weight.data[p]))) as f32;
     }
-}
-
-impl Work {
-    /// Draws the blended probabilities of a frame's view.
-    fn draw(&mut self, scene: &Scene<f32>, capture: &Capture, frame: usize) {
-        let frame = &capture.frames[frame];
-        scene.at(frame.time, &mut self.instant);
-        self.columns = label_columns(scene, &self.instant).expect("the scene has labels");
-        let splats = scene.splats(&self.instant);
-        let shot = Shot { extra: Some(&self.columns), ..Shot::new(&splats, &frame.view, scene.background) };
-        self.renderer.render(&shot, &mut self.image);
-    }
-
-    /// Adds a picture's votes; returns its cross-entropy and how many pixels that is of.
-    fn vote(
-        &mut self,
-        scene: &Scene<f32>,
-        capture: &Capture,
-        frame: usize,
-        truth: &[u8],
-        votes: &mut [Table<f64>],
-    ) -> (f64, usize) {
-        self.draw(scene, capture, frame);
-        let count = scene.labels.len();
-        let (shares, weight) = divided(&self.image.extra);
-        let mut d_extra = Planes::new(count + 1, shares.height, shares.width);
-        let (mut loss, mut seen) = (0.0, 0);
-        for (p, &y) in truth.iter().enumerate() {
-            if y == UNKNOWN || weight.data[p] < SEEN {
-                continue;
-            }
-            let share = f64::from(shares.plane(usize::from(y))[p]).max(LEAST);
-            loss -= share.ln();
-            seen += 1;
-            // Σ w p_y is the share times Σ w.
-            d_extra.plane_mut(usize::from(y))[p] = (1.0 / (share * f64::from(weight.data[p]))) as f32;
+    work.back(scene, capture, frame, &d_extra, |[layer, row], j, d, columns| {
+        for k in 0..count {
+            *votes[layer].get_mut(row, k) += f64::from(d.get(j, k)) * f64::from(columns.get(j, k));
         }
-        let frame = &capture.frames[frame];
-        let splats = scene.splats(&self.instant);
-        let shot = Shot { extra: Some(&self.columns), ..Shot::new(&splats, &frame.view, scene.background) };
-        let d_color = Planes::new(3, shares.height, shares.width);
-        let grads = ImageGrads { color: &d_color, alpha: None, depth: None, extra: Some(&d_extra) };
-        let mut no_sh: Vec<Option<&mut Table<f32>>> = splats.parts.iter().map(|_| None).collect();
-        self.renderer.backward(&shot, &grads, &mut no_sh, &mut self.grads);
-        let d = self.grads.extra.as_ref().expect("the channels were drawn");
-        let mut first = 0;
-        for (votes, tape) in votes.iter_mut().zip(self.instant.tapes()) {
-            let rows = tape.out().rows();
-            for j in 0..rows {
-                let id = tape.rows().id(j);
-                for k in 0..count {
-                    let share = f64::from(d.get(first + j, k)) * f64::from(self.columns.get(first + j, k));
-                    *votes.get_mut(id, k) += share;
-                }
-            }
-            first += rows;
-        }
-        (loss, seen)
-    }
+    });
+    (loss, seen)
 }
 
 #[cfg(test)]

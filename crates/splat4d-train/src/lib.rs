@@ -21,10 +21,12 @@
 //!
 //! The trainer only emits [`event::Event`]s; progress bars, logs and viewers listen.
 
+mod blended;
 pub mod capture;
 pub mod compress;
 pub mod eval;
 pub mod event;
+pub mod features;
 pub mod init;
 pub mod labels;
 pub mod learner;

@@ -224,6 +224,7 @@ fn primitive(layer: &Layer<f32>, row: usize) -> Result<Primitive, String> {
         sh_rest,
         importance: opacity * area * seconds.max(0.01) as f32,
         label: None,
+        features: Vec::new(),
     })
 }
 

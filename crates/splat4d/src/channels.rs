@@ -1,4 +1,4 @@
-//! What pictures show beside colour, alpha and depth: normals, labels, lives and uncertainty, each as further channels of the
+//! What pictures show beside colour, alpha and depth: normals, labels, features, lives and uncertainty, each as further channels of the
 //! renderer ([`Shot::extra`](crate::render::Shot::extra)) with a last column that is 1 where a splat has a value, so that
 //! [`divided`](crate::flow::divided) gives the mean over what a pixel shows. Velocity and flow are in [`flow`](crate::flow).
 
@@ -6,7 +6,7 @@ use crate::layers::{Evaluation, Scene};
 use crate::math::{Real, sym3};
 use crate::render::{Importance, RenderConfig, Shot};
 use crate::scene::splats::COV;
-use crate::scene::{Camera, Table, Time, labels};
+use crate::scene::{Camera, Table, Time, features, labels};
 
 /// The least gap between the two smallest variances, as a share of the largest, at which the shortest axis is one.
 const LEAST_GAP: f64 = 1e-3;
@@ -55,6 +55,32 @@ pub fn label_columns<F: Real>(scene: &Scene<F>, instant: &Evaluation<F>) -> Opti
             for j in 0..own {
                 labels::probabilities(&layer.params, key, tape.rows().id(j), &mut p);
                 (0..count).for_each(|k| out.set(first + j, k, p[k]));
+                out.set(first + j, count, F::ONE);
+            }
+        }
+        first += own;
+    }
+    Some(out)
+}
+
+/// The scene's feature channels: [splats, channels + 1], the last 1, or zeros in layers without features. `None`: the scene
+/// has none.
+///
+/// Panics: `instant` is not this scene's.
+pub fn feature_columns<F: Real>(scene: &Scene<F>, instant: &Evaluation<F>) -> Option<Table<F>> {
+    let count = scene.feature_channels();
+    if count == 0 {
+        return None;
+    }
+    let rows = instant.tapes().map(|t| t.out().rows()).sum();
+    let mut out = Table::new(&[("features", count), ("valid", 1)], rows);
+    let mut first = 0;
+    for (layer, tape) in scene.layers.iter().zip(instant.tapes()) {
+        let own = tape.out().rows();
+        if let Some(key) = features::key(&layer.params) {
+            for j in 0..own {
+                let row = tape.rows().id(j);
+                (0..count).for_each(|k| out.set(first + j, k, layer.params[key].get(row, k)));
                 out.set(first + j, count, F::ONE);
             }
         }

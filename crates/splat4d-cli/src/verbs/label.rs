@@ -1,4 +1,4 @@
-//! `label`: labels learnt into a trained run from masks.
+//! `label`: labels and features learnt into a trained run from masks and pictures of features.
 
 use crate::console::Console;
 use crate::{finish, labelling};
@@ -6,24 +6,24 @@ use std::path::PathBuf;
 
 const EXAMPLES: &str = "\
 Examples:
-  splat4d label runs/take                      from the masks that its capture.json names (docs/labels.md)
+  splat4d label runs/take                      from what its capture.json names (docs/labels.md)
   splat4d label runs/take --from segmented/    from another capture's masks, of the same cameras
   splat4d render runs/take --channel label -o labels.mp4
   splat4d edit runs/take --delete 'not label(hand)' -o hand.splat4d
 
-`train` does it at its end where the capture has labels. Shapes, places and colours stay as they are.";
+`train` does it at its end where the capture has labels or features. Shapes, places and colours stay as they are.";
 
-/// Learn what each Gaussian is part of from masks of labels
+/// Learn what each Gaussian is part of from masks of labels, and its features from pictures of features
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
     /// The run
     #[arg(value_name = "RUN")]
     run: PathBuf,
-    /// The capture whose masks are meant [default: the run's]
+    /// The capture whose masks and features are meant [default: the run's]
     #[arg(long, value_name = "CAPTURE")]
     from: Option<PathBuf>,
-    /// Passes over the masks
+    /// Passes over the pictures
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=100))]
     rounds: Option<u16>,
 }

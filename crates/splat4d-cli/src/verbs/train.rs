@@ -269,7 +269,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     }
     console.say(&format!("wrote {}", run.join("scene.safetensors").display()));
     finish::say_refined(&run, console)?;
-    if labelling::has_labels(&Run::open(&run)?.open_capture()?.0) {
+    if labelling::has_any(&Run::open(&run)?.open_capture()?.0) {
         labelling::label(&run, None, None, console)?;
     }
     if args.no_eval {

@@ -113,7 +113,7 @@ class Scene:
         t: float,
         *,
         channel: Literal[
-            "color", "alpha", "depth", "flow", "velocity", "normal", "label", "life", "uncertainty"
+            "color", "alpha", "depth", "flow", "velocity", "normal", "label", "feature", "life", "uncertainty"
         ] = "color",
         background: ArrayLike | None = None,
         device: _Device = "cpu",

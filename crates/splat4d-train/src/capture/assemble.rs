@@ -127,6 +127,7 @@ fn finish(raw: RawFrame, downscale: usize) -> Frame {
         depth: raw.depth,
         flow: None,
         labels: raw.labels,
+        features: raw.features,
         tracks: raw.tracks,
     }
 }
@@ -158,6 +159,7 @@ fn check_frame(frame: &mut RawFrame, camera: &str, options: &CaptureOptions) -> 
         ("depth", frame.depth.as_ref().map(|d| &d.path)),
         ("flow", frame.flow.as_ref()),
         ("mask of labels", frame.labels.as_ref()),
+        ("picture of features", frame.features.as_ref()),
     ];
     for (what, file) in files.into_iter().filter_map(|(what, file)| Some((what, file?))) {
         if !file.is_file() {

@@ -12,6 +12,7 @@ mod colmap;
 mod colmap_files;
 mod depth;
 mod exr;
+pub(crate) mod features;
 pub(crate) mod flow;
 pub mod frames;
 mod json;
@@ -99,6 +100,8 @@ pub struct Frame {
     pub flow: Option<FlowFile>,
     /// The mask of labels: its values number [`Capture::labels`].
     pub labels: Option<PathBuf>,
+    /// The picture of features: numbers of its pixels.
+    pub features: Option<PathBuf>,
     /// The tracks of its camera.
     pub tracks: Option<Arc<Tracks>>,
 }
@@ -230,6 +233,7 @@ struct RawFrame {
     depth: Option<DepthFile>,
     flow: Option<PathBuf>,
     labels: Option<PathBuf>,
+    features: Option<PathBuf>,
     tracks: Option<Arc<Tracks>>,
     split: Split,
 }

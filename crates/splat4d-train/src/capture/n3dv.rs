@@ -62,6 +62,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
                 depth: None,
                 flow: None,
                 labels: None,
+                features: None,
                 tracks: None,
                 split: if camera == 0 && rows > 1 { Split::Held } else { Split::Train },
             });

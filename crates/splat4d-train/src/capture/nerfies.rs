@@ -126,6 +126,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
             depth: None,
             flow: None,
             labels: None,
+            features: None,
             tracks: None,
             split,
         });

@@ -52,6 +52,7 @@ const CAMERA_KEYS: &[&str] = &[
     "depth_scale",
     "flow",
     "labels",
+    "features",
     "tracks",
     "start",
     "frames",
@@ -243,9 +244,9 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
     let start = context.shared(node, "start")?.unwrap_or(0);
     let count = context.shared(node, "frames")?;
     let images = Files::read(&node.get("images")?)?;
-    let [masks, depth, flow, labels] =
-        ["masks", "depth", "flow", "labels"].map(|key| node.opt(key)?.map(|n| Files::read(&n)).transpose());
-    let (masks, depth, flow, labels) = (masks?, depth?, flow?, labels?);
+    let [masks, depth, flow, labels, features] =
+        ["masks", "depth", "flow", "labels", "features"].map(|key| node.opt(key)?.map(|n| Files::read(&n)).transpose());
+    let (masks, depth, flow, labels, features) = (masks?, depth?, flow?, labels?, features?);
     let depth = depth.map(|files| Depth::read(context, node, files)).transpose()?;
     if labels.is_some() && context.top.opt("labels")?.is_none() {
         return Err(node
@@ -258,6 +259,7 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
         ("depth", depth.as_ref().map(|d| &d.files)),
         ("flow", flow.as_ref()),
         ("labels", labels.as_ref()),
+        ("features", features.as_ref()),
     ];
     for (key, files) in lists {
         let Some(Files::List(names)) = files else { continue };
@@ -319,6 +321,7 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
             depth: depth.as_ref().and_then(|d| d.file(context.root, start, index)),
             flow: flow.as_ref().and_then(|f| f.name(context.root, start, index)),
             labels: labels.as_ref().and_then(|l| l.name(context.root, start, index)),
+            features: features.as_ref().and_then(|f| f.name(context.root, start, index)),
             tracks: None,
             split: Split::Train,
         });

@@ -92,6 +92,7 @@ fn read_meta(root: &Path, top: &Node<'_>, split: Split, fps: f64, out: &mut Vec<
                 depth: None,
                 flow: None,
                 labels: None,
+                features: None,
                 tracks: None,
                 split,
             };

@@ -130,6 +130,16 @@ pub(super) fn check_size(path: &Path, size: (usize, usize), camera: &Camera) -> 
     ))
 }
 
+/// An error unless what lies beside a picture, `what` in words, is of that picture's size.
+pub(super) fn check_beside(path: &Path, what: &str, size: (usize, usize), camera: &Camera) -> Result<()> {
+    if size == (camera.width, camera.height) {
+        return Ok(());
+    }
+    Err(Error::input(format!("the {what} is {}x{}, its picture {}x{}", size.0, size.1, camera.width, camera.height))
+        .at(path.display())
+        .remedy("Write it in the size of the stored picture"))
+}
+
 /// Decodes a picture, upright. Fails before any large allocation if its size is impossible or, where given, not
 /// `expected`.
 pub(super) fn decode(path: &Path, expected: Option<&Camera>) -> Result<Raster> {

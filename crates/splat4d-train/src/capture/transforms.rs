@@ -63,6 +63,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         depth: entry.depth,
         flow: None,
         labels: None,
+        features: None,
         tracks: None,
         split: entry.split,
     };

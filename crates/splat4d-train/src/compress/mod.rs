@@ -28,7 +28,7 @@ use crate::upkeep::Strategy;
 use crate::upkeep::worth::{Scores, score};
 use crate::{Error, Result};
 use splat4d::bake::{self, bake};
-use splat4d::format::playback::{Draft, Meta, Pages};
+use splat4d::format::playback::{Draft, Meta, Pages, feature_ranges};
 use splat4d::layers::Scene;
 use splat4d::scene::Camera;
 use stages::Prepared;
@@ -143,6 +143,6 @@ fn draft(
 /// The scene's own metadata.
 fn meta(scene: &Scene<f32>) -> Meta {
     let Scene { clip, fps, up, background, .. } = *scene;
-    let labels = scene.labels.clone();
-    Meta { clip, fps, up, background, labels, ..Meta::default() }
+    let (labels, features) = (scene.labels.clone(), feature_ranges(scene));
+    Meta { clip, fps, up, background, labels, features, ..Meta::default() }
 }

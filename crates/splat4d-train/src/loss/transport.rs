@@ -5,13 +5,17 @@
 //! |---|---|
 //! | temporal | ½ (D(a, b) + D(b, c)): small motion |
 //! | second | D(c, P(b, a)), P at constant velocity (log and exp): steady motion, fast or slow, costs nothing |
-//! | align | the same value, but a and b are constants: the observation is drawn to the state |
+//! | align | D(o, F) between the model's own answer o and the state F that the filter makes of it (`align.rs`) |
 //!
 //! D = (‖Δμ‖² + m·B²)/extent² with B² the covariances' part of W₂², or ‖Δμ‖²/extent² alone in the linear variant. The
 //! multiplier m is needed because motion is 10² to 10⁴ times what shapes change (squared). Frames are those around a
 //! view's own, so that one of three answers is there anyhow, in a share of the steps whose terms weigh that much more.
 //!
 //! Source: Deng et al. 2024 ("Wasserstein 4DGS"); second order and normalisation are ours.
+
+mod align;
+
+pub(crate) use align::Align;
 
 use super::terms::{Probe, ProbeLoss, StepInfo};
 use crate::settings::{Choice, settings};
@@ -33,8 +37,8 @@ settings! {
         temporal: f64 = 0.0 => any().unit("1/extents²");
         /// Weight of constant velocity (second order), per squared extent.
         second: f64 = 10.0 => any().unit("1/extents²");
-        /// Weight of drawing what is seen to what was predicted, per squared extent.
-        align: f64 = 0.0 => any().unit("1/extents²");
+        /// Weight of the distance between what the motion alone says and what the filter makes of it, per squared extent.
+        align: f64 = 0.0 => any().unit("1/extents²").when(All(&[On("transport.metric"), On("filter.fusion")]));
         /// What shapes count for, against positions.
         covariance: f64 = 100.0;
         /// Share of the steps that look at three frames.
@@ -71,7 +75,7 @@ pub(crate) struct TransportConfig {
     pub temporal: f64,
     /// Weight of the second-order term.
     pub second: f64,
-    /// Weight of the alignment.
+    /// Weight of the alignment of observation and state.
     pub align: f64,
     /// m: what covariances count for, against means.
     pub covariance: f64,
@@ -89,6 +93,36 @@ pub(crate) struct TransportConfig {
     pub ramp: f64,
 }
 
+impl TransportConfig {
+    /// The weight's factor after the share `progress` of the stage.
+    pub(crate) fn factor(&self, progress: f64) -> f64 {
+        let past = progress - self.start;
+        if past < 0.0 {
+            0.0
+        } else if self.ramp > 0.0 {
+            (past / self.ramp).min(1.0)
+        } else {
+            1.0
+        }
+    }
+
+    /// D and its gradients.
+    pub(crate) fn distance(&self, x: &Normal, y: &Normal) -> (f64, Normal, Normal) {
+        let unit = 1.0 / (self.extent * self.extent);
+        let delta: [f64; 3] = std::array::from_fn(|k| x.mean[k] - y.mean[k]);
+        let mut value = unit * delta.iter().map(|v| v * v).sum::<f64>();
+        let mut d_x = Normal { mean: delta.map(|v| 2.0 * unit * v), ..Normal::ZERO };
+        let mut d_y = Normal { mean: delta.map(|v| -2.0 * unit * v), ..Normal::ZERO };
+        if self.metric == Metric::Wasserstein && self.covariance > 0.0 {
+            let (b, to_x, to_y) = bures(&x.cov, &y.cov);
+            let m = self.covariance * unit;
+            value += m * b;
+            (d_x.cov, d_y.cov) = (scaled(m, &to_x), scaled(m, &to_y));
+        }
+        (value, d_x, d_y)
+    }
+}
+
 /// The loss; see the module's documentation.
 #[derive(Debug)]
 pub(crate) struct Transport {
@@ -104,24 +138,11 @@ impl Transport {
         Self { settings, layer, now: AtomicU64::new(0) }
     }
 
-    /// The weight's factor after the share `progress` of the stage.
-    pub(crate) fn factor(&self, progress: f64) -> f64 {
-        let s = &self.settings;
-        let past = progress - s.start;
-        if past < 0.0 {
-            0.0
-        } else if s.ramp > 0.0 {
-            (past / s.ramp).min(1.0)
-        } else {
-            1.0
-        }
-    }
-
     /// The three times of a step, if it has any.
     fn times(&self, info: &StepInfo) -> Option<[Time; 3]> {
         let s = &self.settings;
-        let idle = s.temporal == 0.0 && s.second == 0.0 && s.align == 0.0;
-        if idle || s.clip[1] - s.clip[0] < 2.0 * s.frame * (1.0 - 1e-9) || self.factor(info.progress) == 0.0 {
+        let idle = s.temporal == 0.0 && s.second == 0.0;
+        if idle || s.clip[1] - s.clip[0] < 2.0 * s.frame * (1.0 - 1e-9) || s.factor(info.progress) == 0.0 {
             return None;
         }
         let rng = Rng::new(info.seed, "transport", info.iteration as u64).fork(self.layer as u64);
@@ -141,41 +162,22 @@ impl Transport {
         let mut d = [Normal::ZERO; 3];
         if s.temporal > 0.0 {
             for (i, [x, y]) in [[a, b], [b, c]].into_iter().enumerate() {
-                let (v, d_x, d_y) = self.distance(x, y);
+                let (v, d_x, d_y) = s.distance(x, y);
                 value += 0.5 * s.temporal * v;
                 add(&mut d[i], 0.5 * s.temporal, &d_x);
                 add(&mut d[i + 1], 0.5 * s.temporal, &d_y);
             }
         }
-        if s.second > 0.0 || s.align > 0.0 {
+        if s.second > 0.0 {
             let predicted = Prediction::new(s.predictor, b, a, 1);
-            let (v, d_seen, d_predicted) = self.distance(c, &predicted.point);
-            value += (s.second + s.align) * v;
-            add(&mut d[2], s.second + s.align, &d_seen);
-            if s.second > 0.0 {
-                let (d_last, d_before) = predicted.backward(&d_predicted);
-                add(&mut d[1], s.second, &d_last);
-                add(&mut d[0], s.second, &d_before);
-            }
+            let (v, d_seen, d_predicted) = s.distance(c, &predicted.point);
+            value += s.second * v;
+            add(&mut d[2], s.second, &d_seen);
+            let (d_last, d_before) = predicted.backward(&d_predicted);
+            add(&mut d[1], s.second, &d_last);
+            add(&mut d[0], s.second, &d_before);
         }
         (value, d)
-    }
-
-    /// D and its gradients.
-    fn distance(&self, x: &Normal, y: &Normal) -> (f64, Normal, Normal) {
-        let s = &self.settings;
-        let unit = 1.0 / (s.extent * s.extent);
-        let delta: [f64; 3] = std::array::from_fn(|k| x.mean[k] - y.mean[k]);
-        let mut value = unit * delta.iter().map(|v| v * v).sum::<f64>();
-        let mut d_x = Normal { mean: delta.map(|v| 2.0 * unit * v), ..Normal::ZERO };
-        let mut d_y = Normal { mean: delta.map(|v| -2.0 * unit * v), ..Normal::ZERO };
-        if s.metric == Metric::Wasserstein && s.covariance > 0.0 {
-            let (b, to_x, to_y) = bures(&x.cov, &y.cov);
-            let m = s.covariance * unit;
-            value += m * b;
-            (d_x.cov, d_y.cov) = (scaled(m, &to_x), scaled(m, &to_y));
-        }
-        (value, d_x, d_y)
     }
 }
 
@@ -200,7 +202,7 @@ impl<F: Real> ProbeLoss<F> for Transport {
     fn probes(&self, scene: &Scene<F>, info: &StepInfo) -> Vec<Probe> {
         let Some(times) = self.times(info) else { return Vec::new() };
         let Some(layer) = scene.layers.get(self.layer) else { return Vec::new() };
-        self.now.store(self.factor(info.progress).to_bits(), Ordering::Relaxed);
+        self.now.store(self.settings.factor(info.progress).to_bits(), Ordering::Relaxed);
         // Whom nobody sees in the middle frame needs no steadying.
         let mut ids = Vec::new();
         let rows = if layer.active(times[1], &mut ids) { None } else { Some(ids) };

@@ -7,7 +7,7 @@
 
 use super::{Beginning, Group, Hook, Plan, Program, Stage};
 use crate::Result;
-use crate::loss::transport::{Transport, TransportConfig};
+use crate::loss::transport::{Align, Transport, TransportConfig};
 use crate::recipe::Recipe;
 use crate::settings::{Choice, settings};
 use crate::upkeep::Once;
@@ -143,6 +143,9 @@ impl Program for FilteredProgram {
         if let Some(settings) = transport(plan) {
             for stage in &mut stages {
                 stage.probes.push(Box::new(Transport::new(settings, 0)));
+                if settings.align > 0.0 {
+                    stage.params.push(Box::new(Align::new(settings, 0)));
+                }
             }
         }
         let fusion = r.filter.fusion;

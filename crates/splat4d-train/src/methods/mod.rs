@@ -285,9 +285,13 @@ pub trait Program: Send + Sync {
     fn build(&self, plan: &Plan, params: &mut Params) -> Result<Arc<dyn Motion>> {
         build(&self.spec(plan), params)
     }
-    /// The life its Gaussians have: the recipe's; for ever where it leaves the choice to the model.
+    /// The life its Gaussians have: the recipe's. Where it leaves the choice to the model, those of a cloud that lasts
+    /// ([`one_moment`](Self::one_moment)) may come and go before fixed cameras, which see that a place is empty before something
+    /// comes there (docs/models.md); a camera that moves sees every place at few moments, and lives gain nothing. Others, and
+    /// those whose future is to be predicted, are there for ever.
     fn life(&self, plan: &Plan) -> LifeKind {
-        plan.recipe.life.kind.unwrap_or(LifeKind::Infinite)
+        let lasting = self.one_moment(plan) && plan.fixed_cameras > 0 && plan.recipe.capture.observe >= 1.0;
+        plan.recipe.life.kind.unwrap_or(if lasting { LifeKind::Interval } else { LifeKind::Infinite })
     }
     /// The plan of the initial points: the whole clip, or what of it is learnt first.
     fn first(&self, plan: &Plan) -> Plan {

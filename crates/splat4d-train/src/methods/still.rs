@@ -62,9 +62,9 @@ settings! {
 settings! {
     /// The envelope of a Gaussian in time.
     pub struct LifeSettings
-    when (Any(&[Is("run.motion", &["spacetime", "native4d"]), Is("life.kind", &["gauss-half", "gauss-one", "interval"])])) {
-        /// The life of a Gaussian: auto (spacetime gauss-half, others infinite), infinite, gauss-half, gauss-one,
-        /// interval.
+    when (Any(&[IsNot("run.motion", &["still", "tracked"]), Is("life.kind", &["gauss-half", "gauss-one", "interval"])])) {
+        /// The life of a Gaussian: auto (spacetime gauss-half; control, ssm, deform-mlp and hexplane before fixed cameras
+        /// interval; else infinite), infinite, gauss-half, gauss-one, interval.
         kind: Option<LifeKind> = None => any().switch().when(IsNot("run.motion", &["still"]));
         /// Rate of life centres, clips.
         center_lr: f64 = 1e-3 => any().unit("clips");

@@ -147,8 +147,9 @@ fn knobs_without_effect_are_found_with_what_they_need() {
     assert_eq!(idle(&["motion=control", "control_bases=4"]).len(), 1);
     assert_eq!(idle(&["motion=ssm", "control_nodes=40"]), []);
     assert_eq!(idle(&["motion=auto", "control_nodes=40", "motion_order=2"]), [], "the capture may choose either");
-    assert_eq!(idle(&["motion=hexplane", "life_width_lr=0.1"]).len(), 1, "nothing has a life");
-    assert_eq!(idle(&["motion=hexplane", "life_width_lr=0.1", "life=interval"]), []);
+    assert_eq!(idle(&["motion=tracked", "life_width_lr=0.1"]).len(), 1, "nothing has a life");
+    assert_eq!(idle(&["motion=tracked", "life_width_lr=0.1", "life=interval"]), []);
+    assert_eq!(idle(&["motion=hexplane", "life_width_lr=0.1"]), [], "fixed cameras would give it one");
     assert_eq!(idle(&["motion=tracked", "floor=3", "floor_height=0"]), []);
 }
 

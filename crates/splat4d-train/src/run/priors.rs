@@ -1,7 +1,7 @@
 //! What files say of a capture beside its pictures, held against these: before training what can be told at once, after it
 //! what the scene made of them.
 
-use super::open::OpenCapture;
+use super::open::{OpenCapture, training_frames};
 use crate::capture::frames::{Depth, Frames, Picture};
 use crate::capture::{Capture, DepthKind, ImageStore};
 use crate::loss::image::depth::{Apart, apart};
@@ -9,6 +9,7 @@ use crate::recipe::Recipe;
 use crate::{Error, Result};
 use splat4d::layers::{Evaluation, Scene};
 use splat4d::render::{Antialias, Image, RenderConfig, Renderer, Shot};
+use std::sync::Arc;
 
 /// Frames that are looked at, evenly chosen.
 const LOOKED_AT: usize = 8;
@@ -18,13 +19,20 @@ const SHORT: f32 = 1.0;
 const ENOUGH: usize = 200;
 /// Another reading of flow is the right one if it leaves less than this share of the difference between pictures.
 const CLEARLY: f64 = 0.7;
-/// Depths and points that are apart by more than this factor are in different units.
-const OTHER_UNIT: f64 = 1.25;
+/// Logarithm of the factor beyond which depths and points are at different scales: more than the points' own noise leaves of
+/// the median of hundreds.
+const OTHER_SCALE: f64 = 0.02;
+/// Share of the points that what is in front of them hides from a picture at most but for this: the scale is that of the
+/// closest so many ratios.
+const VISIBLE: f64 = 0.3;
+/// Depths whose closest ratios to the points are spread by more than this either way (logarithm) are not theirs, at whatever
+/// scale: noise of a quarter of the depth does as much, and single-picture networks have less.
+const FOREIGN: f64 = 0.1;
 /// A metric map is believed while the scene is within this share of it (median); others while they correlate by this.
 const METRIC_OFF: f64 = 0.1;
 const CORRELATED: f64 = 0.8;
 
-/// Checks flow and depth before training; returns warnings. Errors: flow that runs backwards, or whose axes are exchanged.
+/// Checks flow before training; returns warnings. Errors: flow that runs backwards, or whose axes are exchanged.
 pub(super) fn before(opened: &OpenCapture, recipe: &Recipe) -> Result<Vec<String>> {
     let capture = &opened.capture;
     let mut warnings = Vec::new();
@@ -37,9 +45,6 @@ pub(super) fn before(opened: &OpenCapture, recipe: &Recipe) -> Result<Vec<String
         }
     }
     warnings.truncate(1);
-    if recipe.loss.depth > 0.0 {
-        warnings.extend(depth_unit(opened)?);
-    }
     Ok(warnings)
 }
 
@@ -110,18 +115,27 @@ fn flow_reads(capture: &Capture, store: &ImageStore, frame: usize) -> Result<Opt
     }))
 }
 
-/// Whether metric depth and the capture's points agree on the unit.
-fn depth_unit(opened: &OpenCapture) -> Result<Option<String>> {
+/// How metric depth lies to the capture's points.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Depths {
+    /// They agree, or nobody can tell.
+    Fit,
+    /// The points are so many times as far away, everywhere.
+    Scaled(f64),
+    /// Even the closest scatter about the points by this (logarithm): no unit mends that.
+    Foreign(f64),
+}
+
+/// How the metric depth maps of a capture lie to its points: by where their ratios are densest, since a point that something hides
+/// is farther away than what is seen there.
+fn depths(opened: &OpenCapture) -> Result<Depths> {
     let capture = &opened.capture;
-    let Some(cloud) = capture.points.as_ref() else { return Ok(None) };
+    let Some(cloud) = capture.points.as_ref() else { return Ok(Depths::Fit) };
     let still: Vec<[f64; 3]> =
         (0..cloud.points.len()).filter(|&i| cloud.times[i].is_none()).map(|i| cloud.points[i]).collect();
-    let places: Vec<usize> = (0..opened.frames.len()).collect();
+    let places: Vec<usize> = (0..opened.frames.len()).filter(|&i| is_metric(capture, capture.train[i])).collect();
     let (mut ratios, mut picture) = (Vec::new(), Picture::default());
     for &i in chosen(&places) {
-        if capture.frames[capture.train[i]].depth.as_ref().is_none_or(|d| d.kind != DepthKind::Metric) {
-            continue;
-        }
         opened.frames.load(i, &mut picture)?;
         let (Some(depth), camera) = (&picture.depth, opened.frames.camera(i)) else { continue };
         for &point in &still {
@@ -129,23 +143,60 @@ fn depth_unit(opened: &OpenCapture) -> Result<Option<String>> {
             let inside = (0.0..camera.width as f64).contains(&u) && (0.0..camera.height as f64).contains(&v);
             let told = if inside { depth.values.get(0, v as usize, u as usize) } else { 0.0 };
             if told > 0.0 {
-                ratios.push(z / f64::from(told));
+                ratios.push((z / f64::from(told)).ln());
             }
         }
     }
     if ratios.len() < ENOUGH {
-        return Ok(None);
+        return Ok(Depths::Fit);
     }
-    let middle = ratios.len() / 2;
-    // Points that something hides are further away than what is seen, so that half of them may be.
-    let ratio = *ratios.select_nth_unstable_by(middle, f64::total_cmp).1;
-    let apart = ratio.max(1.0 / ratio);
-    Ok((apart > OTHER_UNIT).then(|| {
-        format!(
-            "the capture's points are {ratio:.3} times as far away as its depth maps say (median): correct depth_scale, or \
-             call the maps relative (docs/priors.md)"
-        )
-    }))
+    ratios.sort_by(f64::total_cmp);
+    let few = (VISIBLE * ratios.len() as f64).ceil() as usize;
+    let closest = ratios.windows(few).min_by(|a, b| (a[few - 1] - a[0]).total_cmp(&(b[few - 1] - b[0])));
+    let closest = closest.expect("there are as many");
+    let (ratio, scatter) = (closest[few / 2], 0.5 * (closest[few - 1] - closest[0]));
+    Ok(match (scatter, ratio.abs()) {
+        (scatter, _) if scatter > FOREIGN => Depths::Foreign(scatter),
+        (_, off) if off > OTHER_SCALE => Depths::Scaled(ratio.exp()),
+        _ => Depths::Fit,
+    })
+}
+
+fn is_metric(capture: &Capture, frame: usize) -> bool {
+    capture.frames[frame].depth.as_ref().is_some_and(|d| d.kind == DepthKind::Metric)
+}
+
+/// The capture with its metric depth in the unit of its points, or without it where it contradicts them, and what is to be
+/// said of that: poses and points are of one unit, and pictures were matched to find them.
+pub(super) fn believed(opened: OpenCapture, recipe: &Recipe) -> Result<(OpenCapture, Option<String>)> {
+    if recipe.loss.depth <= 0.0 || !opened.capture.train.iter().any(|&i| is_metric(&opened.capture, i)) {
+        return Ok((opened, None));
+    }
+    let found = depths(&opened)?;
+    let message = match found {
+        Depths::Fit => return Ok((opened, None)),
+        Depths::Scaled(ratio) => format!(
+            "the capture's points are {ratio:.3} times as far away as its depth maps say: maps are taken times \
+             {ratio:.3}; correct depth_scale (docs/priors.md)"
+        ),
+        Depths::Foreign(scatter) => format!(
+            "the capture's depth maps and points contradict each other at any scale, the closest by {:.0} % either way: maps are left \
+             out; they may be mirrored, of other frames or cameras, or not metric (depth_kind, docs/priors.md)",
+            100.0 * (scatter.exp() - 1.0)
+        ),
+    };
+    let mut capture = Capture::clone(&opened.capture);
+    for frame in &mut capture.frames {
+        if frame.depth.as_ref().is_none_or(|d| d.kind != DepthKind::Metric) {
+            continue;
+        }
+        match (found, &mut frame.depth) {
+            (Depths::Scaled(ratio), Some(depth)) => depth.scale *= ratio,
+            _ => frame.depth = None,
+        }
+    }
+    let frames = training_frames(Arc::new(capture), recipe)?;
+    Ok((OpenCapture::with(frames).on(opened.device), Some(message)))
 }
 
 /// Holds the trained scene against the depth maps that it was trained on; returns warnings of those that it contradicts.
@@ -188,4 +239,81 @@ fn draw(scene: &Scene<f32>, opened: &OpenCapture, i: usize, renderer: &mut Rende
     scene.at(opened.frames.time(i), &mut instant);
     let splats = scene.splats(&instant);
     renderer.render(&Shot { depth: true, ..Shot::new(&splats, opened.frames.camera(i), scene.background) }, out);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::capture::{CaptureOptions, PointCloud};
+    use splat4d::format::npy;
+    use std::path::Path;
+
+    const SIDE: usize = 32;
+    /// Focal length, pixels.
+    const FOCAL: f64 = 40.0;
+
+    /// Depth of the slanted wall z = 4 + x at (x/z, y/z).
+    fn wall(u: f64) -> f64 {
+        4.0 / (1.0 - u)
+    }
+
+    /// Two cameras in one place look at the wall, with points on it; maps say `told` of a column's true depth and its number.
+    fn opened(folder: &Path, kind: &str, told: &dyn Fn(&dyn Fn(usize) -> f64, usize) -> f64) -> OpenCapture {
+        let true_ = |x: usize| wall((x as f64 + 0.5 - 16.0) / FOCAL);
+        let mut cameras = Vec::new();
+        for c in 0..2 {
+            let picture = image::RgbImage::from_pixel(SIDE as u32, SIDE as u32, image::Rgb([90, 90, 90]));
+            picture.save(folder.join(format!("{c}.png"))).unwrap();
+            let values: Vec<f32> = (0..SIDE * SIDE).map(|p| told(&true_, p % SIDE) as f32).collect();
+            let mut file = Vec::new();
+            npy::write_f32(&[SIDE, SIDE], &values, &mut file).unwrap();
+            std::fs::write(folder.join(format!("d{c}.npy")), file).unwrap();
+            cameras.push(format!(
+                r#"{{"name": "c{c}", "width": {SIDE}, "height": {SIDE}, "fx": {FOCAL}, "fy": {FOCAL}, "cx": 16, "cy": 16,
+                "images": ["{c}.png"], "depth": ["d{c}.npy"], "depth_kind": "{kind}",
+                "world_to_camera": [[1, 0, 0, {}], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}}"#,
+                1e-3 * f64::from(c)
+            ));
+        }
+        let text = format!(r#"{{"version": 1, "hold_out": "none", "cameras": [{}]}}"#, cameras.join(", "));
+        std::fs::write(folder.join("capture.json"), text).unwrap();
+        let mut capture = Capture::open(folder, &CaptureOptions::default()).unwrap();
+        let mut cloud = PointCloud::default();
+        for k in 0..400 {
+            let (u, v) = (0.7 * (f64::from(k % 20) / 19.0 - 0.5), 0.7 * (f64::from(k / 20) / 19.0 - 0.5));
+            let z = wall(u);
+            // The wall hides as many others behind it.
+            for z in [z, z * (1.3 + f64::from(k) / 400.0)] {
+                cloud.points.push([u * z, v * z, z]);
+                cloud.colors.push([0.5; 3]);
+                cloud.times.push(None);
+            }
+        }
+        capture.points = Some(cloud);
+        OpenCapture::new(Arc::new(capture), &Recipe::default()).unwrap()
+    }
+
+    #[test]
+    fn maps_are_taken_in_the_unit_of_the_points_and_left_out_where_they_contradict_them() {
+        let folder = tempfile::tempdir().unwrap();
+        let recipe = Recipe::default();
+        let scales = |o: &OpenCapture| -> Vec<Option<f64>> {
+            o.capture.frames.iter().map(|f| f.depth.as_ref().map(|d| d.scale)).collect()
+        };
+        let (exact, said) = believed(opened(folder.path(), "metric", &|z, x| z(x)), &recipe).unwrap();
+        assert_eq!((scales(&exact), said), (vec![Some(1.0); 2], None));
+        let (scaled, said) = believed(opened(folder.path(), "metric", &|z, x| z(x) / 1.3), &recipe).unwrap();
+        assert!(scales(&scaled).iter().all(|s| s.is_some_and(|s| (s - 1.3).abs() < 0.03)), "{:?}", scales(&scaled));
+        assert!(said.is_some_and(|s| s.contains("1.3") && s.contains("depth_scale")));
+        let (again, said) = believed(scaled, &recipe).unwrap();
+        assert!(said.is_none() && scales(&again)[0].is_some_and(|s| s > 1.2), "what was mended fits");
+        let (mirrored, said) = believed(opened(folder.path(), "metric", &|z, x| z(SIDE - 1 - x)), &recipe).unwrap();
+        assert_eq!(scales(&mirrored), [None, None]);
+        assert!(said.is_some_and(|s| s.contains("contradict") && s.contains("mirrored")));
+        // What claims no unit is held against the scene alone, and what is not read is not looked at.
+        let relative = opened(folder.path(), "relative", &|z, x| z(SIDE - 1 - x));
+        assert_eq!(believed(relative, &recipe).unwrap().1, None);
+        let off = recipe.with(|r| r.loss.depth = 0.0);
+        assert_eq!(believed(opened(folder.path(), "metric", &|z, x| z(x) / 1.3), &off).unwrap().1, None);
+    }
 }

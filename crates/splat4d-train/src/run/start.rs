@@ -43,12 +43,15 @@ pub fn train(
     let opened = OpenCapture::new(capture, &recipe)?.on(options.device);
     check_flow(&opened.capture, &recipe)?;
     let mut listen = listen;
+    // Before the model is chosen by what maps say; again where points have to be found first.
+    let (opened, early) = priors::believed(opened, &recipe)?;
     let recipe = if recipe.run.motion.is_auto() { opened.choose(recipe, &mut listen)? } else { recipe };
     program_of(&recipe)?.check(&opened.plan(&recipe))?;
     recipe.without_effect().iter().for_each(|idle| listen(&Event::Warning { message: idle.to_string() }));
     let opened = points::complete(opened, &recipe, run, &mut listen)?;
     let opened = flows::complete(opened, &recipe, run, &mut listen)?;
-    for message in priors::before(&opened, &recipe)? {
+    let (opened, warning) = priors::believed(opened, &recipe)?;
+    for message in priors::before(&opened, &recipe)?.into_iter().chain(early).chain(warning) {
         listen(&Event::Warning { message });
     }
     let timed = timed(&opened, recipe, options, &mut listen)?;
@@ -185,6 +188,8 @@ pub fn resume_with(
             .remedy(format!("Continue it with `splat4d {other}` and the options it began with")));
     }
     let opened = OpenCapture::new(Arc::new(capture), &recipe)?.on(options.device);
+    // As it was settled at the start.
+    let (opened, _) = priors::believed(opened, &recipe)?;
     let plan = opened.plan(&recipe);
     let empty =
         init::scene(&plan, program_of(&recipe)?.as_ref(), &Seeds::default(), opened.background(), opened.capture.up)?;

@@ -309,6 +309,7 @@ pub(super) fn primitive(
         sh_rest: std::array::from_fn(|k| colors[k + 3]),
         importance: if importance.is_finite() { importance } else { 0.0 },
         label: None,
+        features: Vec::new(),
     }
 }
 

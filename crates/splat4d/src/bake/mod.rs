@@ -22,7 +22,7 @@ mod straight;
 mod tests;
 mod tree;
 
-use crate::format::playback::{Node, Primitive, is_page, labels_of, primitives};
+use crate::format::playback::{Node, Primitive, features_of, is_page, labels_of, primitives};
 pub use compare::{Likeness, Moment, Shown, compare};
 
 use crate::layers::{Layer, Scene};
@@ -297,12 +297,12 @@ fn copy(
     progress: &mut dyn FnMut(usize),
 ) -> Result<()> {
     let (lives, spans) = (Lives::new(layer), layer.spans());
-    let labels = labels_of(&layer.params);
+    let (labels, features) = (labels_of(&layer.params), features_of(&layer.params));
     for first in (0..spans.len()).step_by(STRAIGHT_RUN) {
         let ids = first..spans.len().min(first + STRAIGHT_RUN);
         let piece = |id: usize| {
             let mut piece = line.piece(layer, &lives, id, spans[id], fitter.tree, fitter.lookout)?;
-            piece.primitive.label = labels[id];
+            (piece.primitive.label, piece.primitive.features) = (labels[id], features[id].clone());
             Some(piece)
         };
         let all: Vec<Option<Piece>> = ids.into_par_iter().map(piece).collect();
@@ -318,7 +318,7 @@ fn copy(
 fn follow(layer: &Layer<f32>, fitter: &Fitter<'_>, tally: &mut Tally, progress: &mut dyn FnMut(usize)) -> Result<()> {
     let lives = Lives::new(layer);
     let spans = layer.spans();
-    let labels = labels_of(&layer.params);
+    let (labels, features) = (labels_of(&layer.params), features_of(&layer.params));
     let shown = |(id, span): (usize, &[f64; 2])| seen(fitter.tree, *span).map(|s| (id, s));
     let rows: Vec<(usize, [f64; 2])> = spans.iter().enumerate().filter_map(shown).collect();
     (tally.done, tally.unseen) = (tally.done + spans.len() - rows.len(), tally.unseen + spans.len() - rows.len());
@@ -344,7 +344,9 @@ fn follow(layer: &Layer<f32>, fitter: &Fitter<'_>, tally: &mut Tally, progress: 
             // Colours that are no numbers would show as black; what cannot be drawn is left out.
             let sound = subject.colors.is_none_or(|c| c.iter().all(|x| x.is_finite()));
             let mut pieces = if sound { fitter.pieces(&subject) } else { Vec::new() };
-            pieces.iter_mut().for_each(|p| p.primitive.label = labels[row.id]);
+            for p in &mut pieces {
+                (p.primitive.label, p.primitive.features) = (labels[row.id], features[row.id].clone());
+            }
             pieces
         };
         let all: Vec<Vec<Piece>> = samples.rows.par_iter().map(pieces).collect();

@@ -8,7 +8,7 @@ use crate::math::sh::dc_to_rgb;
 use crate::math::{Real, sym3};
 use crate::scene::params::OPACITY;
 use crate::scene::splats::{COV, SPLAT_OPACITY};
-use crate::scene::{Camera, Color, GEOMETRY, Rows, Space, Table, Time, labels};
+use crate::scene::{Camera, Color, GEOMETRY, Rows, Space, Table, Time, features, labels};
 use crate::{Error, Result};
 
 /// Moments at which a Gaussian is looked at, at most, evenly over its life: a bit each.
@@ -159,6 +159,35 @@ fn all(count: u8) -> u8 {
     ((1u16 << count) - 1) as u8
 }
 
+/// The rows whose features are like those of the Gaussian that is nearest to a place at any moment that is looked at.
+///
+/// Errors: the scene has no features.
+fn alike(scene: &Scene<f32>, looks: &Looks, place: [f64; 3], least: f64) -> Result<Selected> {
+    let of = |layer: usize, row: usize| {
+        let params = &scene.layers[layer].params;
+        features::key(params).map(|key| features::row(params, key, row)).filter(|f| f.iter().any(|x| *x != 0.0))
+    };
+    let mut nearest: Option<(f64, Vec<f32>)> = None;
+    for (layer, l) in looks.0.iter().enumerate() {
+        for row in 0..l.count.len() {
+            let far = |i: u8| norm(sub(l.means[LOOKS * row + usize::from(i)].map(f64::from), place));
+            let far = (0..l.count[row]).map(far).fold(f64::INFINITY, f64::min);
+            if far < nearest.as_ref().map_or(f64::INFINITY, |n| n.0)
+                && let Some(features) = of(layer, row)
+            {
+                nearest = Some((far, features));
+            }
+        }
+    }
+    let (_, wanted) = nearest.ok_or_else(|| {
+        Error::input("the scene has no features").remedy(
+            "Give the capture's cameras pictures of features, then: splat4d label RUN (docs/labels.md, \"Features\").",
+        )
+    })?;
+    let like = |layer: usize, row: usize| of(layer, row).is_some_and(|f| features::likeness(&f, &wanted) >= least);
+    Ok((0..scene.layers.len()).map(|l| (0..scene.layers[l].params.len()).map(|r| like(l, r)).collect()).collect())
+}
+
 /// The rows for which a selection holds at most moments.
 fn most(bits: &Bits, looks: &Looks) -> Selected {
     let of = |(bits, looks): (&Vec<u8>, &LayerLooks)| {
@@ -231,6 +260,7 @@ fn evaluate(expr: &Expr, scene: &Scene<f32>, looks: &Looks, context: &dyn Contex
             let of: Vec<Vec<Option<usize>>> = scene.layers.iter().map(|l| labels::of(&l.params)).collect();
             rows(&|layer, row| of[layer][row] == wanted)
         }
+        Expr::Like(place, least) => chosen(&alike(scene, looks, *place, *least)?),
         Expr::At(t, inner) => {
             if !(scene.clip[0]..=scene.clip[1]).contains(t) {
                 return Err(Error::input(format!("{t} s is not in the scene's clip"))

@@ -41,6 +41,8 @@ pub enum Expr {
     Lasso(Box<Lasso>),
     /// Name of a label.
     Label(String),
+    /// Features like those of the Gaussian nearest to a place, scene units: the least cosine between them.
+    Like([f64; 3], f64),
     /// On the white of a mask picture, seen by a camera.
     Mask(String, String),
     /// On the subject, as the capture's masks have it.
@@ -157,8 +159,8 @@ impl fmt::Display for Token {
 fn unreadable(text: &str, what: &str) -> Error {
     Error::input(format!("the selection `{text}` cannot be read: {what}")).remedy(
         "It is made of box(x0,y0,z0, x1,y1,z1), sphere(x,y,z, r), frustum(camera), color(r,g,b, near), opacity(from,to), \
-         size(from,to), life(from,to), speed(from,to), layer(name), label(name), mask(file, camera), subject, lasso(...), \
-         all, at(t, ...), \
+         size(from,to), life(from,to), speed(from,to), layer(name), label(name), like(x,y,z, cosine), mask(file, camera), subject, \
+         lasso(...), all, at(t, ...), \
          ever(...), always(...), grow(..., distance), and, or, not and parentheses",
     )
 }
@@ -302,6 +304,10 @@ impl Parser<'_> {
             }
             "layer" => Expr::Layer(self.name()?),
             "label" => Expr::Label(self.name()?),
+            "like" => {
+                let [x, y, z, least] = self.numbers()?;
+                Expr::Like([x, y, z], least)
+            }
             "frustum" => {
                 let name = self.name()?;
                 let mut range = [0.0, f64::INFINITY];

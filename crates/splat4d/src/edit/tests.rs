@@ -187,6 +187,29 @@ fn selections_hold_over_time() {
 }
 
 #[test]
+fn features_like_those_of_a_place_are_selected() {
+    use crate::scene::features;
+    let mut s = of(vec![layer("ball", &Spec::Still, 150, 4), layer("other", &Spec::Still, 60, 5)]);
+    let nothing = Bench::empty();
+    let expr = Expr::parse("like(0,0,0, 0.9)").unwrap();
+    assert!(select(&expr, &s, &nothing).unwrap_err().to_string().contains("has no features"));
+    let rows = s.layers[0].params.len();
+    let key = features::claim(&mut s.layers[0].params, 2).unwrap();
+    // Every third has none, the others one of two kinds of any length.
+    for row in 0..rows {
+        let kind = if row % 3 == 1 { [1.0 + row as f32, 0.1] } else { [-0.1, 2.0] };
+        s.layers[0].params[key].write(row, 0, if row % 3 == 0 { [0.0; 2] } else { kind });
+    }
+    let place = s.layers[0].params[GEOMETRY].read::<3>(1, 0);
+    let [x, y, z] = place;
+    let t = s.clip[0];
+    let found = select(&Expr::parse(&format!("at({t}, like({x},{y},{z}, 0.9))")).unwrap(), &s, &nothing).unwrap();
+    let alive = found[0].iter().enumerate().filter(|(_, chosen)| **chosen).count();
+    assert!(alive > 0 && found[0].iter().enumerate().all(|(row, chosen)| !chosen || row % 3 == 1), "{found:?}");
+    assert!(found[1..].iter().flatten().all(|chosen| !chosen), "the others have no features");
+}
+
+#[test]
 fn labels_are_selected_kept_and_merged() {
     use crate::scene::labels;
     let labelled = |names: [&str; 2], of: [Option<usize>; 2]| {

@@ -12,18 +12,19 @@ use super::{params_to_arrays, tensors_to_loaded};
 use crate::layers::{ALWAYS, Head, Layer, Scene};
 use crate::math::Sim3;
 use crate::motion::{BUILT_IN, Spec, build};
+use crate::scene::features::{FEATURES, MOST_CHANNELS};
 use crate::scene::labels::LABEL_LOGITS;
 use crate::scene::masks::WORD;
-use crate::scene::{HeadKeys, KeyMasks, LifeKind, Params, SH, labels as scene_labels};
+use crate::scene::{HeadKeys, KeyMasks, LifeKind, Params, SH, features, labels as scene_labels};
 use crate::{Error, ErrorKind, Result};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::io::Write;
 use std::sync::Arc;
 
-/// The newest version of the metadata that this library reads and writes: of scenes with labels.
+/// The newest version of the metadata that this library reads and writes: of scenes with labels or features.
 pub(crate) const VERSION: u64 = 4;
-/// The version of scenes whose layers cross-fade, without labels.
+/// The version of scenes whose layers cross-fade, without labels and features.
 const FADING: u64 = 3;
 /// The version of scenes whose layers have frames, and do not cross-fade.
 const FRAMED: u64 = 2;
@@ -76,7 +77,7 @@ fn about(scene: &Scene<f32>, layers: Vec<Stated>) -> Value {
     let framed = if layers.iter().any(|l| l.framed) { FRAMED } else { UNFRAMED };
     let plain = if layers.iter().any(|l| l.fades) { FADING } else { framed };
     let mut out = json!({
-        "version": if scene.labels.is_empty() { plain } else { VERSION },
+        "version": if scene.labels.is_empty() && scene.feature_channels() == 0 { plain } else { VERSION },
         "units": "scene units, seconds, colours in [0, 1]",
         "axes": "OpenCV: x right, y down, z forward in the camera",
         "clip": scene.clip,
@@ -209,6 +210,11 @@ pub fn from_tensors(file: &SafeTensors<'_>) -> Result<Scene<f32>> {
         let layer = read_layer(file, layer, i, scene.labels.len());
         scene.layers.push(layer.map_err(|e| e.at(format!("layer {i}")))?);
     }
+    let channels = scene.feature_channels();
+    let widths = scene.layers.iter().filter_map(|l| Some(l.params[features::key(&l.params)?].width()));
+    if let Some(other) = widths.into_iter().find(|&w| w != channels) {
+        return Err(broken(format!("one layer has {channels} feature channels, another {other}")));
+    }
     if scene.layers.iter().any(|l| HeadKeys::of(&l.params).is_some()) != (scene.head == Head::Features) {
         return Err(broken(format!("its head is `{}`, which does not fit its layers", scene.head.name())));
     }
@@ -263,6 +269,14 @@ fn read_layer(file: &SafeTensors<'_>, meta: &Value, index: usize, labels: usize)
     let motion = build(&motion, &mut params)?;
     if labels > 0 && params.unclaimed().iter().any(|a| a.name == LABEL_LOGITS) {
         scene_labels::claim(&mut params, labels)?;
+    }
+    if let Some(channels) = params.unclaimed().iter().find(|a| a.name == FEATURES).map(|a| a.width) {
+        if !(1..=MOST_CHANNELS).contains(&channels) {
+            return Err(broken(format!(
+                "Gaussians have {channels} feature channels, 1 to {MOST_CHANNELS} are possible"
+            )));
+        }
+        features::claim(&mut params, channels)?;
     }
     if let Some(array) = params.unclaimed().first() {
         return Err(broken(format!("array `{}` belongs to no table of this layer", array.name)));
@@ -430,6 +444,22 @@ mod tests {
         let minus = bytes[at..].iter().position(|b| *b == b'[').unwrap() + at + 1;
         bytes[minus] = b'-';
         assert!(read(&bytes).is_err());
+    }
+
+    #[test]
+    fn features_come_back_and_have_one_width() {
+        let mut s = scene();
+        let key = features::claim(&mut s.layers[1].params, 3).unwrap();
+        s.layers[1].params[key].write(2, 0, [0.5, -1.5, 2.0]);
+        let mut bytes = Vec::new();
+        write(&s, &mut bytes).unwrap();
+        let back = read(&bytes).unwrap();
+        assert_eq!((back.feature_channels(), &back.layers[1].params), (3, &s.layers[1].params));
+        assert!(features::key(&back.layers[0].params).is_none(), "the others have none");
+        features::claim(&mut s.layers[0].params, 2).unwrap();
+        let mut bytes = Vec::new();
+        write(&s, &mut bytes).unwrap();
+        assert!(read(&bytes).unwrap_err().to_string().contains("feature channels"));
     }
 
     #[test]

@@ -432,6 +432,12 @@ impl<F: Real> Scene<F> {
         self.layers.iter().any(|l| l.motion.capabilities().moves || l.life != LifeKind::Infinite || l.span != ALWAYS)
     }
 
+    /// Feature channels of its Gaussians ([`scene::features`](crate::scene::features)); 0: none.
+    pub fn feature_channels(&self) -> usize {
+        let of = |l: &Layer<F>| crate::scene::features::key(&l.params).map_or(0, |key| l.params[key].width());
+        self.layers.iter().map(of).max().unwrap_or(0)
+    }
+
     /// From when on the scene shows what was predicted, seconds; `None`: it was seen as it is.
     pub fn predicted_from(&self) -> Option<f64> {
         let predicted = self.layers.iter().filter(|l| l.name.starts_with(PREDICTED));

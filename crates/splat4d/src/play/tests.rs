@@ -24,6 +24,7 @@ fn primitive(rng: &Rng, center: f64, half_width: f64) -> Primitive {
         sh_rest: std::array::from_fn(|k| 0.1 * (f(20 + k as u64) - 0.5)),
         importance: f(15),
         label: None,
+        features: Vec::new(),
     }
 }
 

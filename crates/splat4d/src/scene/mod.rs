@@ -1,6 +1,7 @@
 //! Parts of a scene: tables of Gaussians, the instant they are looked at, and the cameras that look.
 
 pub mod camera;
+pub mod features;
 pub mod head;
 pub mod labels;
 pub mod life;

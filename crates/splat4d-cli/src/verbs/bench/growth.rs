@@ -171,6 +171,7 @@ fn capture(pinned: &Pinned, root: &Path, pictures: &[PathBuf], count: usize) -> 
             depth: None,
             flow: None,
             labels: None,
+            features: None,
             tracks: None,
             mask: None,
         }

@@ -41,6 +41,7 @@ fn file(rows: usize) -> Vec<u8> {
             sh_rest: std::array::from_fn(|k| if k < 9 { 0.1 * f(20 + k as u64) } else { 0.0 }),
             importance: rng.uniform(70) as f32,
             label: None,
+            features: Vec::new(),
         }
     };
     let meta =

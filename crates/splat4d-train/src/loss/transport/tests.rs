@@ -86,22 +86,12 @@ fn steady_motion_costs_the_second_order_nothing_and_the_first_its_length() {
 }
 
 #[test]
-fn alignment_moves_the_observation_alone() {
-    let at = [0, 1, 2].map(|i| normal(3, i));
-    let row = |temporal, second, align| {
-        Transport::new(TransportConfig { temporal, second, align, ..settings() }, 0).row([&at[0], &at[1], &at[2]])
-    };
-    let (second, d_second) = row(0.0, 1.0, 0.0);
-    let (align, d_align) = row(0.0, 0.0, 1.0);
-    assert_eq!(second, align);
-    assert_eq!(d_align[2], d_second[2]);
-    assert!(d_align[0] == Normal::ZERO && d_align[1] == Normal::ZERO && d_second[0] != Normal::ZERO);
-}
-
-#[test]
 fn it_begins_when_it_should_and_looks_at_a_share_of_the_steps() {
     let loss = Transport::new(TransportConfig { start: 0.2, ramp: 0.1, every: 0.25, ..settings() }, 0);
-    assert_eq!([0.0, 0.19, 0.25, 0.3, 0.9].map(|p| (100.0 * loss.factor(p)).round()), [0.0, 0.0, 50.0, 100.0, 100.0]);
+    assert_eq!(
+        [0.0, 0.19, 0.25, 0.3, 0.9].map(|p| (100.0 * loss.settings.factor(p)).round()),
+        [0.0, 0.0, 50.0, 100.0, 100.0]
+    );
     let info = |iteration, progress, t| StepInfo { iteration, times: vec![Time(t)], seed: 3, progress };
     let met = (0..2000).filter(|&i| loss.times(&info(i, 0.5, 0.5)).is_some()).count();
     assert!((420..580).contains(&met), "{met} of 2000");

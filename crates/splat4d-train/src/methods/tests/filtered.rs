@@ -2,11 +2,12 @@
 //! model inside, and a scene without a trace of it at the end.
 
 use super::*;
-use crate::loss::transport::{Metric, Transport, TransportConfig};
+use crate::loss::transport::{Align, Metric, Transport, TransportConfig};
 use crate::recipe::MotionName;
 use crate::upkeep::{At, Once};
 use splat4d::format::scene;
 use splat4d::motion::filtered::{Filtered, FilteredSpec, Fusion, GAINS, Predictor};
+use splat4d::scene::Rows;
 
 fn inner() -> Spec {
     Spec::Spacetime(SpacetimeSpec { order: 2, rotation: true, ..SpacetimeSpec::default() })
@@ -55,6 +56,84 @@ fn the_whole_chain_has_the_gradient_of_differences() {
     };
     let reached = check_gradients(&plain, &shots, &probes);
     assert_reached(&reached[0], &["geometry", "velocities"]);
+}
+
+/// The alignment of a filtered scene at its second view, and the gradient.
+fn aligned(scene: &Scene<f64>, change: &dyn Fn(&mut TransportConfig)) -> (f64, Grads<f64>) {
+    let mut settings = TransportConfig { align: 1.5, ..transport() };
+    change(&mut settings);
+    let info = StepInfo { iteration: 0, times: vec![Time(0.12)], seed: 0, progress: 0.5 };
+    let mut d = vec![Grads::new(&scene.layers[0].params)];
+    let value = Align::new(settings, 0).eval(scene, &info, &mut d);
+    (value, d.remove(0))
+}
+
+#[test]
+fn alignment_has_the_gradient_of_differences() {
+    let nodes = || {
+        let skin = splat4d::motion::skin::SkinSpec { nodes: 4, ..Default::default() };
+        Spec::Control(splat4d::motion::control::ControlSpec { skin, clip: [0.0, 0.3], ..Default::default() })
+    };
+    let cases: [(&str, Spec, Fusion, usize); 4] = [
+        ("velocities", inner(), Fusion::Geodesic, 0),
+        ("velocities", inner(), Fusion::Literal, 0),
+        ("velocities", inner(), Fusion::Geodesic, 2),
+        ("node_keys", nodes(), Fusion::Geodesic, 0),
+    ];
+    for (moving, of, fusion, history) in cases {
+        let scene = filtered_scene::<f64>(|s| {
+            (s.inner, s.fusion, s.history, s.stop_gradient) = (Box::new(of.clone()), fusion, history, false);
+        });
+        let (value, d) = aligned(&scene, &|_| {});
+        assert!(value > 1e-6, "{moving}: nothing to align, {value}");
+        let p = &scene.layers[0].params;
+        let mut reached = Vec::new();
+        for key in p.keys().collect::<Vec<_>>() {
+            for row in 0..p[key].rows().min(5) {
+                for column in 0..p[key].width() {
+                    let at = |h: f64| {
+                        let mut moved = scene.clone();
+                        let x = moved.layers[0].params[key].get(row, column);
+                        moved.layers[0].params[key].set(row, column, x + h);
+                        aligned(&moved, &|_| {}).0
+                    };
+                    let fd = (at(1e-5) - at(-1e-5)) / 2e-5;
+                    let got = if d.touched(key) { d.table(key).get(row, column) } else { 0.0 };
+                    let name = &p.info(key).name;
+                    assert!((fd - got).abs() < 1e-7 * (1.0 + fd.abs()), "{name}[{row}, {column}]: {got} {fd}");
+                    if got != 0.0 {
+                        reached.push(name.to_string());
+                    }
+                }
+            }
+        }
+        for name in ["geometry", moving] {
+            assert!(reached.iter().any(|r| r == name), "{name} is not reached: {reached:?}");
+        }
+        assert_eq!(reached.iter().any(|r| r == GAINS), fusion == Fusion::Geodesic, "{reached:?}");
+    }
+}
+
+#[test]
+fn alignment_is_between_observation_and_state() {
+    let scene = filtered_scene::<f64>(|s| (s.gain, s.gate) = (0.5, 0.0));
+    let layer = &scene.layers[0];
+    let filter = Filtered::of(layer.motion.as_ref()).unwrap();
+    let means = |model: &dyn Motion<f64>| {
+        let q = splat4d::motion::At { p: &layer.params, of: Space::Gaussians, rows: Rows::All, t: Time(0.12) };
+        let (mut cache, mut tape) = (splat4d::motion::Cache::default(), splat4d::motion::Tape::default());
+        model.prepare(q.p, &[q], &mut cache);
+        model.at(&q, &cache, &mut tape);
+        (0..q.len()).map(|r| tape.out.read::<3>(r, 0)).collect::<Vec<_>>()
+    };
+    let (seen, state) = (means(filter.inner().as_ref()), means(layer.motion.as_ref()));
+    let squares = seen.iter().zip(&state).map(|(a, b)| (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f64>());
+    let expected = 1.5 * squares.sum::<f64>() / seen.len() as f64;
+    let (value, _) = aligned(&scene, &|s| s.metric = Metric::Linear);
+    assert!((value - expected).abs() < 1e-12 && value > 0.0, "{value} {expected}");
+    // Where nothing is fused there is nothing to align.
+    let off = filtered_scene::<f64>(|s| s.fusion = Fusion::Off);
+    assert_eq!(aligned(&off, &|_| {}).0, 0.0);
 }
 
 fn stage(steps: usize) -> Stage {

@@ -53,6 +53,28 @@ fn every_built_in_model_has_a_program() {
 }
 
 #[test]
+fn lasting_clouds_come_and_go_before_fixed_cameras() {
+    let life = |motion: &str, fixed_cameras: usize, change: &dyn Fn(&mut Recipe)| {
+        let recipe = Recipe::default().with(|r| {
+            r.run.motion = crate::recipe::MotionName::of(motion);
+            change(r);
+        });
+        let plan = Plan { fixed_cameras, ..filtered::made_plan(recipe.resolve()) };
+        program(motion).unwrap().life(&plan)
+    };
+    for motion in ["control", "ssm", "deform-mlp", "hexplane"] {
+        assert_eq!(life(motion, 1, &|_| ()), LifeKind::Interval, "{motion}");
+        assert_eq!(life(motion, 0, &|_| ()), LifeKind::Infinite, "{motion} of a moving camera");
+        assert_eq!(life(motion, 1, &|r| r.capture.observe = 0.8), LifeKind::Infinite, "{motion}, to be predicted");
+        let told = |r: &mut Recipe| r.life.kind = Some(LifeKind::GaussOne);
+        assert_eq!(life(motion, 0, &told), LifeKind::GaussOne, "{motion} as it is told");
+    }
+    assert_eq!(life("still", 3, &|_| ()), LifeKind::Infinite);
+    assert_eq!(life("tracked", 3, &|_| ()), LifeKind::Infinite);
+    assert_eq!(life("spacetime", 3, &|_| ()), LifeKind::GaussHalf);
+}
+
+#[test]
 fn rates_are_log_linear() {
     let r = Rate { start: 1e-2, end: 1e-4 };
     assert!((r.at(0.0) - 1e-2).abs() < 1e-12 && (r.at(0.5) - 1e-3).abs() < 1e-12 && (r.at(1.0) - 1e-4).abs() < 1e-12);

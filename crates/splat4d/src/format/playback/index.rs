@@ -5,6 +5,7 @@ use super::{
     MAX_PALETTE, Meta, PAGE_WORDS, VERSION,
 };
 use crate::math::sh;
+use crate::scene::features::MOST_CHANNELS;
 use crate::{Error, ErrorKind, Result};
 use std::ops::Range;
 
@@ -35,6 +36,8 @@ pub enum Kind {
     Masks,
     /// What the Gaussians of a page are part of.
     Labels,
+    /// Feature channels of the Gaussians of a page.
+    Features,
     /// A picture.
     Poster,
     /// Where the file comes from.
@@ -50,6 +53,7 @@ impl Kind {
             Kind::Palette => *b"PALT",
             Kind::Masks => *b"MASK",
             Kind::Labels => *b"LABL",
+            Kind::Features => *b"FEAT",
             Kind::Poster => *b"POST",
             Kind::Provenance => *b"PROV",
             Kind::Other(tag) => tag,
@@ -57,7 +61,8 @@ impl Kind {
     }
 
     fn of(tag: [u8; 4]) -> Self {
-        let known = [Kind::Page, Kind::Palette, Kind::Masks, Kind::Labels, Kind::Poster, Kind::Provenance];
+        let known =
+            [Kind::Page, Kind::Palette, Kind::Masks, Kind::Labels, Kind::Features, Kind::Poster, Kind::Provenance];
         known.into_iter().find(|k| k.tag() == tag).unwrap_or(Kind::Other(tag))
     }
 
@@ -109,13 +114,13 @@ pub struct Entry {
     pub tier: u16,
     /// Palette: the degree of its spherical harmonics, 1 to 3.
     pub degree: u16,
-    /// Page: Gaussians. Palette: entries. Masks, labels: Gaussians of their page.
+    /// Page: Gaussians. Palette: entries. Masks, labels, features: Gaussians of their page.
     pub count: u32,
     /// Page: it is drawn for from ≤ t < to, seconds. Masks: first and last key time.
     pub span: [f64; 2],
     /// Page: place of its palette in the table of sections; none: base colour only.
     pub palette: Option<u32>,
-    /// Masks, labels: place of their page in the table of sections.
+    /// Masks, labels, features: place of their page in the table of sections.
     pub page: Option<u32>,
 }
 
@@ -257,7 +262,7 @@ impl Index {
             }
             free = end;
         }
-        for (kind, name) in [(Kind::Masks, "masks"), (Kind::Labels, "labels")] {
+        for (kind, name) in [(Kind::Masks, "masks"), (Kind::Labels, "labels"), (Kind::Features, "features")] {
             let beside = self.of_pages(kind);
             if let Some(pair) = beside.windows(2).find(|pair| pair[0].0 == pair[1].0) {
                 let what = format!("section {} has {name} already", pair[0].0);
@@ -289,7 +294,7 @@ impl Index {
     /// The least version that has all these sections.
     pub(super) fn least_version(&self) -> [u16; 2] {
         let has = |kind: Kind| self.sections.iter().any(|e| e.kind == kind);
-        match (has(Kind::Labels), has(Kind::Masks)) {
+        match (has(Kind::Labels) || has(Kind::Features), has(Kind::Masks)) {
             (true, _) => VERSION,
             (false, true) => MASKED,
             (false, false) => FIRST_VERSION,
@@ -449,7 +454,7 @@ impl Entry {
             count: u32_at(32),
             span: [f64::from_bits(u64_at(40)), f64::from_bits(u64_at(48))],
             palette: Some(u32_at(56)).filter(|&p| kind == Kind::Page && p != NO_PALETTE),
-            page: Some(u32_at(56)).filter(|_| matches!(kind, Kind::Masks | Kind::Labels)),
+            page: Some(u32_at(56)).filter(|_| matches!(kind, Kind::Masks | Kind::Labels | Kind::Features)),
         };
         if let Kind::Other(_) = kind {
             if required {
@@ -512,6 +517,13 @@ impl Entry {
                     return Err(broken(format!("labels of {count} Gaussians do not have {} bytes", self.bytes)));
                 }
             }
+            Kind::Features => {
+                let bytes = self.bytes as usize;
+                let fits = bytes.is_multiple_of(count.max(1)) && (1..=MOST_CHANNELS).contains(&(bytes / count.max(1)));
+                if !(1..=MAX_PAGE_GAUSSIANS).contains(&count) || !fits {
+                    return Err(broken(format!("features of {count} Gaussians do not have {bytes} bytes")));
+                }
+            }
             Kind::Poster | Kind::Provenance | Kind::Other(_) => {}
         }
         Ok(())
@@ -533,7 +545,7 @@ impl Entry {
         self.span.iter().for_each(|t| out.extend_from_slice(&t.to_le_bytes()));
         let other = match self.kind {
             Kind::Page => self.palette.unwrap_or(NO_PALETTE),
-            Kind::Masks | Kind::Labels => self.page.expect("masks and labels are those of a page"),
+            Kind::Masks | Kind::Labels | Kind::Features => self.page.expect("they are those of a page"),
             _ => 0,
         };
         out.extend_from_slice(&other.to_le_bytes());

@@ -356,7 +356,7 @@ pub(crate) fn primitives(layer: &Layer<f32>) -> Vec<super::Primitive> {
     let [.., velocities, rates] = keys(layer);
     let p = &layer.params;
     let coefficients = p[SH].width();
-    let labels = super::labels_of(p);
+    let (labels, features) = (super::labels_of(p), super::features_of(p));
     let one = |row: usize| {
         let [center, width, softness] = p[LIFE].read::<3>(row, 0).map(f64::from);
         let half_width = match width.exp() {
@@ -382,6 +382,7 @@ pub(crate) fn primitives(layer: &Layer<f32>) -> Vec<super::Primitive> {
             sh_rest,
             importance: 1.0,
             label: labels[row],
+            features: features[row].clone(),
         }
     };
     (0..p.len()).map(one).collect()

@@ -2,6 +2,7 @@
 
 use crate::layers::{Head, Layer, Scene};
 use crate::math::Se3;
+use crate::scene::features::MOST_CHANNELS;
 use crate::scene::{Camera, Intrinsics, Lens, labels};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
@@ -45,6 +46,9 @@ pub struct Meta {
     /// Names of the labels that pages number.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub labels: Vec<String>,
+    /// Least and greatest number of each feature channel, between which pages count in steps.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub features: Vec<[f32; 2]>,
     /// Of a file that grows: the parts that are in it, as their maker names them.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub parts: Vec<String>,
@@ -181,6 +185,10 @@ impl Meta {
         }
         if self.bounds.is_some_and(|b| !finite(b.as_flattened())) {
             return wrong("`box` is not finite");
+        }
+        let sound = |[low, high]: &[f32; 2]| low.is_finite() && high.is_finite() && low <= high;
+        if self.features.len() > MOST_CHANNELS || !self.features.iter().all(sound) {
+            return wrong("`features` are not ranges of 1 to 64 channels");
         }
         if self.labels.is_empty() { Ok(()) } else { labels::check(&self.labels) }
     }

@@ -9,6 +9,7 @@ mod cluster;
 mod coder;
 mod deflate;
 mod depths;
+mod features;
 mod grow;
 mod index;
 mod labels;
@@ -27,6 +28,8 @@ mod write;
 
 pub use coder::Coder;
 pub use depths::{Depths, LEAST_DEPTH};
+pub use features::feature_ranges;
+pub(crate) use features::of_layer as features_of;
 pub use grow::{Growing, finish};
 pub use index::{Codec, Entry, Index, Kind};
 pub(crate) use labels::of_layer as labels_of;
@@ -95,6 +98,8 @@ pub struct Primitive {
     pub importance: f32,
     /// Number of its label in [`Meta::labels`]; none: it has none.
     pub label: Option<u8>,
+    /// Its feature channels, as many as [`Meta::features`] has; empty: it has none.
+    pub features: Vec<f32>,
 }
 
 /// Gaussians that are drawn for from ≤ t < to.

@@ -7,7 +7,9 @@ use super::layer::keys;
 use super::page::page_of;
 use super::read::Parts;
 use super::write::{PageEntry, Sections};
-use super::{BLOCK_GAUSSIANS, MAX_PAGE_GAUSSIANS, Meta, PAGE_WORDS, Palette, Summary, WriteConfig, labels_of};
+use super::{
+    BLOCK_GAUSSIANS, MAX_PAGE_GAUSSIANS, Meta, PAGE_WORDS, Palette, Summary, WriteConfig, features_of, labels_of,
+};
 use crate::layers::{Layer, Scene};
 use crate::scene::SH;
 use crate::simd::{Simd, dispatch};
@@ -126,6 +128,7 @@ pub fn write_pages(draft: &PagesDraft<'_>, config: &WriteConfig, out: &mut dyn W
         if !draft.meta.labels.is_empty() {
             file.labels(labels_of(&layer.params).into_iter());
         }
+        file.features(features_of(&layer.params).iter().map(Vec::as_slice));
     }
     file.finish(out)
 }

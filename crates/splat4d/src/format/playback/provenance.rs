@@ -110,6 +110,7 @@ mod tests {
             sh_rest: std::array::from_fn(|k| if k < 9 { 0.01 * (i + k) as f32 } else { 0.0 }),
             importance: 1.0,
             label: None,
+            features: Vec::new(),
         };
         let node = |from: f64| Node { from, to: from + 1.0, primitives: (0..40).map(one).collect() };
         let meta = Meta { clip: [0.0, 2.0], fps: 30.0, up: [0.0, 1.0, 0.0], sh_degree: 1, ..Meta::default() };

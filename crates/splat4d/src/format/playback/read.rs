@@ -1,7 +1,7 @@
 //! A whole playback file as a scene.
 
 use super::index::broken;
-use super::{Index, Kind, Meta, Palette, decode_masks, decode_page, decode_palette, labels};
+use super::{Index, Kind, Meta, Palette, decode_masks, decode_page, decode_palette, features, labels};
 use crate::layers::{Layer, Scene};
 use crate::{Error, ErrorKind, Result};
 use std::sync::Arc;
@@ -57,6 +57,7 @@ impl Parts {
             palettes.push((i as u32, palette));
         }
         let (masks, labelled) = (index.masks(), index.of_pages(Kind::Labels));
+        let featured = index.of_pages(Kind::Features);
         let names = index.meta.labels.len();
         let mut pages = Vec::new();
         for (i, entry) in index.pages() {
@@ -72,6 +73,11 @@ impl Parts {
             if let Ok(at) = labelled.binary_search_by_key(&(i as u32), |(page, _)| *page) {
                 let (i, entry) = (labelled[at].1, &index.sections[labelled[at].1]);
                 labels::decode(entry, stored(bytes, entry), names, &mut layer.params)
+                    .map_err(|e| e.at(format!("section {i}")))?;
+            }
+            if let Ok(at) = featured.binary_search_by_key(&(i as u32), |(page, _)| *page) {
+                let (i, entry) = (featured[at].1, &index.sections[featured[at].1]);
+                features::decode(entry, stored(bytes, entry), &index.meta.features, &mut layer.params)
                     .map_err(|e| e.at(format!("section {i}")))?;
             }
             pages.push(PagePart { layer, labels: page.labels(), palette: entry.palette, tier: entry.tier });

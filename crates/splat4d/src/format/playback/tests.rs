@@ -1,6 +1,7 @@
 //! Round trips, error bounds, partial and hostile files.
 
 mod coder;
+mod features;
 mod grow;
 mod hostile;
 mod labels;
@@ -37,6 +38,7 @@ fn primitive(r: Rng) -> Primitive {
         sh_rest: std::array::from_fn(|k| (0.05 * r.normal(100 + k as u64)) as f32),
         importance: r.uniform(6) as f32,
         label: None,
+        features: Vec::new(),
     }
 }
 
@@ -80,6 +82,7 @@ fn tiny() -> Draft {
         sh_rest: std::array::from_fn(|k| if k < 9 { 0.01 * k as f32 } else { 0.0 }),
         importance: 1.0,
         label: None,
+        features: Vec::new(),
     };
     let moving = Primitive {
         mean: [1.0, -0.5, 3.0],

@@ -7,7 +7,7 @@ use super::index::{MASK_HEAD, crc, mask_keys};
 use super::page::parse_page;
 use super::{
     BLOCK_GAUSSIANS, BLOCK_HEADER, Codec, Depths, Draft, Entry, FIRST_VERSION, Index, Kind, MAX_PAGE_GAUSSIANS,
-    MAX_PALETTE, Meta, Node, Page, Palette, labels, mask, order,
+    MAX_PALETTE, Meta, Node, Page, Palette, features, labels, mask, order,
 };
 use crate::math::{Rng, quat, sh};
 use crate::scene::KeyMasks;
@@ -135,8 +135,9 @@ pub(super) struct Sections {
     pub file: Index,
     bodies: Vec<Vec<u8>>,
     level: u32,
-    /// Labels by the section of their page: written behind everything that is drawn.
+    /// Labels and features by the section of their page: written behind everything that is drawn.
     labels: Vec<(u32, Vec<u8>)>,
+    features: Vec<(u32, Vec<u8>)>,
     /// A poster that is written last.
     late: Option<Vec<u8>>,
     pub summary: Summary,
@@ -148,7 +149,8 @@ impl Sections {
         meta.check()?;
         let summary = Summary { gaussians: meta.gaussians, ..Summary::default() };
         let file = Index { version: FIRST_VERSION, file_len: 0, meta, sections: Vec::new() };
-        let mut out = Self { file, bodies: Vec::new(), level, labels: Vec::new(), late: None, summary };
+        let mut out =
+            Self { file, bodies: Vec::new(), level, labels: Vec::new(), features: Vec::new(), late: None, summary };
         match poster.filter(|p| !p.is_empty()) {
             Some(p) if p.len() <= SMALL_POSTER => out.summary.poster_bytes = out.add(entry(Kind::Poster), p.to_vec()),
             p => out.late = p.map(<[u8]>::to_vec),
@@ -191,14 +193,29 @@ impl Sections {
 
     /// Labels of the page that was added last, one a Gaussian.
     pub(super) fn labels(&mut self, of: impl Iterator<Item = Option<u8>>) {
-        let page = self.file.sections.iter().rposition(|e| e.kind == Kind::Page).expect("a page was added");
-        self.labels.extend(labels::bytes(of).map(|bytes| (page as u32, bytes)));
+        let page = self.last_page();
+        self.labels.extend(labels::bytes(of).map(|bytes| (page, bytes)));
+    }
+
+    /// Features of the page that was added last, those of a Gaussian after the other.
+    pub(super) fn features<'a>(&mut self, of: impl Iterator<Item = &'a [f32]>) {
+        let (page, bytes) = (self.last_page(), features::bytes(&self.file.meta.features, of));
+        self.features.extend(bytes.map(|bytes| (page, bytes)));
+    }
+
+    fn last_page(&self) -> u32 {
+        self.file.sections.iter().rposition(|e| e.kind == Kind::Page).expect("a page was added") as u32
     }
 
     /// Writes the file. Errors: the sink's.
     pub(super) fn finish(mut self, out: &mut dyn Write) -> Result<Summary> {
         for (page, body) in std::mem::take(&mut self.labels) {
             self.add(Entry { count: body.len() as u32, page: Some(page), ..entry(Kind::Labels) }, body);
+        }
+        let channels = self.file.meta.features.len().max(1);
+        for (page, body) in std::mem::take(&mut self.features) {
+            let count = (body.len() / channels) as u32;
+            self.add(Entry { count, page: Some(page), ..entry(Kind::Features) }, body);
         }
         self.file.version = self.file.least_version();
         if let Some(p) = self.late.take() {
@@ -242,7 +259,7 @@ pub fn write(draft: &Draft, config: &WriteConfig, out: &mut dyn Write) -> Result
         .nodes
         .iter()
         .enumerate()
-        .try_for_each(|(i, n)| check(n, draft.meta.labels.len()).map_err(|e| e.at(format!("node {i}"))))?;
+        .try_for_each(|(i, n)| check(n, &draft.meta).map_err(|e| e.at(format!("node {i}"))))?;
     let (palette, entries) = palette(draft, config);
     // First what the first picture needs: the important Gaussians of the clip's start in their base colours, what
     // colours them, the rest of them; then time goes on.
@@ -283,6 +300,7 @@ pub fn write(draft: &Draft, config: &WriteConfig, out: &mut dyn Write) -> Result
         if !draft.meta.labels.is_empty() {
             file.labels(rows.iter().map(|(p, _)| p.label));
         }
+        file.features(rows.iter().map(|(p, _)| p.features.as_slice()));
     }
     file.finish(out)
 }
@@ -302,6 +320,7 @@ fn runs(entry: &Entry) -> (usize, usize) {
             let keys = mask_keys(count, entry.bytes as usize).expect("masks that were just written");
             (MASK_HEAD + 8 * keys, count.div_ceil(8))
         }
+        Kind::Features => (0, count),
         _ => (entry.bytes as usize, 1),
     }
 }
@@ -322,7 +341,8 @@ fn pack(mut entry: Entry, body: Vec<u8>, level: u32) -> (Entry, Vec<u8>) {
 }
 
 /// Refuses what cannot be written.
-fn check(node: &Node, labels: usize) -> Result<()> {
+fn check(node: &Node, meta: &Meta) -> Result<()> {
+    let (labels, channels) = (meta.labels.len(), meta.features.len());
     if !(node.from.is_finite() && node.to.is_finite() && node.from < node.to) {
         return Err(Error::input(format!("a part of a scene cannot last from {} to {} s", node.from, node.to)));
     }
@@ -330,6 +350,10 @@ fn check(node: &Node, labels: usize) -> Result<()> {
     for (i, p) in node.primitives.iter().enumerate() {
         if let Some(label) = p.label.filter(|&l| labels > 0 && usize::from(l) >= labels) {
             return Err(Error::input(format!("Gaussian {i} has label {label} of {labels}")));
+        }
+        let known = p.features.is_empty() || p.features.len() == channels;
+        if channels > 0 && !(known && p.features.iter().all(|x| x.is_finite())) {
+            return Err(Error::input(format!("Gaussian {i} has features that are not {channels} numbers")));
         }
         let numbers = p.mean.iter().chain([&p.center, &p.softness]).all(|x| (*x as f32).is_finite());
         let shape = p.quat.iter().chain(&p.scales).chain(&p.velocity).chain(&p.turn);

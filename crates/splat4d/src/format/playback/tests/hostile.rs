@@ -49,6 +49,10 @@ pub(super) fn survive(bytes: &[u8]) -> bool {
             Kind::Labels => {
                 drop(super::super::labels::decode(e, body, 3, &mut crate::scene::Params::new(e.count as usize, 1, &[])))
             }
+            Kind::Features => {
+                let mut params = crate::scene::Params::new(e.count as usize, 1, &[]);
+                drop(super::super::features::decode(e, body, &[[0.0, 1.0]; 3], &mut params));
+            }
             Kind::Provenance => drop(provenance(bytes)),
             Kind::Poster | Kind::Other(_) => {}
         }
@@ -204,6 +208,7 @@ fn a_bomb_of_zeros_is_not_unpacked() {
         sh_rest: [0.0; 45],
         importance: 0.0,
         label: None,
+        features: Vec::new(),
     };
     let mut draft = tiny();
     draft.meta.sh_degree = 0;

@@ -1,7 +1,9 @@
-//! Against a perceptron: node paths of several frequencies, learnt by both with the same steps, rate and about as many
-//! weights; then both are asked for the 50 ticks after the last that they saw.
+//! Against a perceptron and a spline: node paths of several frequencies, learnt by all with the same steps, rate and about as
+//! many numbers; then they are asked for the 50 ticks after the last that they saw.
 
 use super::*;
+use crate::motion::control::{Curve, Keys, Timeline};
+use crate::motion::skin::Skin;
 use crate::nn::encoding::{encode, encoded};
 use crate::nn::{InputGrad, Mlp, MlpShape, Passed};
 
@@ -17,6 +19,23 @@ fn path(node: usize, second: f64) -> [f64; 3] {
     let x = 0.6 * (1.3 * second + phase).sin() + 0.4 * (3.1 * second + 2.0 * phase).sin();
     [x, (2.0 * second + phase).cos(), (2.0 * second + phase).sin()]
 }
+
+/// Everywhere at random, with a turn about every two seconds: nothing that one node does tells of another, or of later.
+fn wander(node: usize, second: f64) -> [f64; 3] {
+    let rng = Rng::new(7, "wander", 0).fork(node as u64);
+    std::array::from_fn(|axis| {
+        let first = second.floor();
+        let u = second - first;
+        let v = 1.0 - u;
+        let basis =
+            [v * v * v, 3.0 * u * u * u - 6.0 * u * u + 4.0, -3.0 * u * u * u + 3.0 * u * u + 3.0 * u + 1.0, u * u * u];
+        let key = |k: usize| rng.fork(axis as u64).normal(first as u64 + k as u64);
+        (0..4).map(|k| basis[k] / 6.0 * key(k)).sum()
+    })
+}
+
+/// Where a node is at a second.
+type Path = fn(usize, f64) -> [f64; 3];
 
 /// Adam over every learnable table.
 struct Adam {
@@ -72,19 +91,42 @@ fn rate(step: usize, steps: usize) -> f32 {
     1e-2 * 0.03f32.powf(step as f32 / steps as f32)
 }
 
-fn fit_ssm(spec: &SsmSpec, seconds: f64, steps: usize) -> Score {
-    let mut p = Params::<f32>::new(0, 1, &[]);
+/// Nodes at rest, in a table that does not learn.
+fn at_rest_in(p: &mut Params<f32>) -> Key {
     let columns = [("node_means", 3), ("node_log_radii", 1), ("node_logits", 1)];
     let fill = |t: &mut Table<f32>| (0..SOURCES).for_each(|k| t.set(k, k % 3, k as f32));
     let nodes = p.entry("nodes", Space::Nodes, &columns, SOURCES, fill).unwrap();
     p.info_mut(nodes).trainable = false;
+    nodes
+}
+
+/// `samples` evenly spaced times of the take are learnt.
+fn fit_ssm(spec: &SsmSpec, path: Path, samples: usize, steps: usize) -> Score {
+    let mut p = Params::<f32>::new(0, 1, &[]);
+    let nodes = at_rest_in(&mut p);
     let of = Field::new(spec, nodes, &mut p).unwrap();
-    let second = |tick: usize| tick as f64 * seconds / (spec.ticks - 1) as f64;
+    fit(&of, p, path, [samples as f64, spec.clip[1]], steps)
+}
+
+/// A cubic spline a node; only its shifts learn.
+fn fit_spline(keys: usize, path: Path, samples: usize, seconds: f64, steps: usize) -> Score {
+    let mut p = Params::<f32>::new(0, 1, &[]);
+    let nodes = at_rest_in(&mut p);
+    let spec = SkinSpec { nodes: SOURCES, hyper: 0, ..SkinSpec::default() };
+    let skin = Skin { spec, nodes, hyper: nodes, mask: nodes, candidates: nodes };
+    let of = Keys::new(Timeline::new(Curve::Cubic, keys, [0.0, seconds]).unwrap(), &skin, &mut p).unwrap();
+    let score = fit(&of, p, path, [samples as f64, seconds], steps);
+    Score { numbers: 3 * SOURCES * keys, ..score }
+}
+
+fn fit(of: &dyn Trajectory<f32>, mut p: Params<f32>, path: Path, [samples, seconds]: [f64; 2], steps: usize) -> Score {
+    let last = samples as usize;
+    let second = |tick: usize| tick as f64 * seconds / (samples - 1.0);
     let ask = |ticks: std::ops::Range<usize>| ticks.map(|t| Time(second(t))).collect::<Vec<_>>();
     let mut adam = Adam::new(&p);
     let mut out = Table::new(&POSE_COLUMNS, SOURCES);
     for step in 0..steps {
-        let times = ask(0..spec.ticks);
+        let times = ask(0..last);
         let (mut cache, mut d_cache, mut d) = (Slot::default(), Slot::default(), Grads::new(&p));
         of.prepare(&p, &times, &mut cache);
         for t in &times {
@@ -114,11 +156,11 @@ fn fit_ssm(spec: &SsmSpec, seconds: f64, steps: usize) -> Score {
         }
         rms(sum, times.len() * SOURCES)
     };
-    let (within, ahead) = (error(ask(0..spec.ticks)), error(ask(spec.ticks..spec.ticks + AHEAD)));
+    let (within, ahead) = (error(ask(0..last)), error(ask(last..last + AHEAD)));
     Score { within, ahead, numbers: numbers(&p) }
 }
 
-fn fit_mlp(ticks: usize, seconds: f64, width: usize, steps: usize) -> Score {
+fn fit_mlp(path: Path, ticks: usize, seconds: f64, width: usize, steps: usize) -> Score {
     let mut p = Params::<f32>::new(0, 1, &[]);
     let inputs = encoded(1, OCTAVES) + SOURCES;
     let shape = MlpShape { inputs, width, layers: 4, skip: None, outputs: 3 };
@@ -177,24 +219,33 @@ fn causal(ticks: usize, seconds: f64) -> SsmSpec {
 #[test]
 fn node_paths_are_learnt_and_carried_on_better_than_by_a_perceptron() {
     let steps = 300;
-    let (ssm, mlp) = (fit_ssm(&causal(300, 10.0), 10.0, steps), fit_mlp(300, 10.0, 64, steps));
+    let (ssm, mlp) = (fit_ssm(&causal(300, 10.0), path, 300, steps), fit_mlp(path, 300, 10.0, 64, steps));
     println!("10 s, {steps} steps: ssm {ssm}, mlp {mlp}");
     // Measured: 0.090 and 0.520 with 6,502 numbers, against 0.123 and 0.795 with 14,851.
     assert!(ssm.within < mlp.within && ssm.numbers < mlp.numbers, "{ssm}; {mlp}");
     assert!(1.3 * ssm.ahead < mlp.ahead, "{ssm}; {mlp}");
 }
 
-/// A minute at thirty ticks a second: figures for the documentation, too slow to run every time.
+/// A minute at fifteen moments a second: figures for the documentation, too slow to run every time.
 #[test]
 #[ignore = "a study of minutes"]
 fn a_minute_of_node_paths() {
-    for steps in [300, 1000] {
-        let wide = SsmSpec { mode: Mode::Bidirectional, octaves: 6, ..causal(1800, 60.0) };
-        for (name, spec) in [("causal", causal(1800, 60.0)), ("bidirectional with a clock", wide)] {
+    const MOMENTS: usize = 900;
+    let wide = |ticks| SsmSpec { mode: Mode::Bidirectional, octaves: 6, ..causal(ticks, 60.0) };
+    let ways: [(&str, Path); 2] = [("periodic", path), ("wandering", wander)];
+    for ((way, path), steps) in ways.into_iter().flat_map(|way| [(way, 300), (way, 1000)]) {
+        let told = |name: &str, fit: &dyn Fn() -> Score| {
             let start = std::time::Instant::now();
-            println!("60 s, {steps} steps, {name}: {} in {:.1?}", fit_ssm(&spec, 60.0, steps), start.elapsed());
-        }
-        let start = std::time::Instant::now();
-        println!("60 s, {steps} steps, mlp: {} in {:.1?}", fit_mlp(1800, 60.0, 64, steps), start.elapsed());
+            println!("60 s, {way}, {steps} steps, {name}: {} in {:.1?}", fit(), start.elapsed());
+        };
+        told("spline of 78 keys, as `control` takes", &|| fit_spline(78, path, MOMENTS, 60.0, steps));
+        told("spline of as many numbers", &|| fit_spline(135, path, MOMENTS, 60.0, steps));
+        told("perceptron of as many numbers", &|| fit_mlp(path, MOMENTS, 60.0, 40, steps));
+        told("perceptron of twice as many", &|| fit_mlp(path, MOMENTS, 60.0, 64, steps));
+        told("state space, 90 ticks, as `ssm` takes", &|| fit_ssm(&wide(90), path, MOMENTS, steps));
+        told("state space, 300 ticks", &|| fit_ssm(&wide(300), path, MOMENTS, steps));
+        told("state space, 300 ticks, causal, no clock", &|| fit_ssm(&causal(300, 60.0), path, MOMENTS, steps));
+        let embedded = SsmSpec { embedding: 128, ..wide(300) };
+        told("state space, 300 ticks, embeddings of 128", &|| fit_ssm(&embedded, path, MOMENTS, steps));
     }
 }
