@@ -36,7 +36,7 @@ pub(crate) use count::PairCounts;
 pub use importance::{Importance, Sensitivity};
 pub use project::{Projected, ProjectedGrads, View};
 pub use resident::{
-    KEPT, KeptLayer, KeptNoise, KeptNumbers, KeptRule, KeptStep, KeptStepped, KeptTable, KeptTies, KeptView, Moves,
+    KEPT, KeptCameras, KeptLayer, KeptMotion, KeptNoise, KeptNumbers, KeptRule, KeptStep, KeptStepped, KeptTable, KeptTies, KeptView, Moves,
     Resident, RowWeights,
 };
 
