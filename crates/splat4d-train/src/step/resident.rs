@@ -12,8 +12,8 @@ use crate::loss::terms::KeptLoss;
 use crate::optim::corrections;
 use splat4d::layers::{ALPHA_MIN, ALWAYS};
 use splat4d::render::{
-    Antialias, Backend, KEPT, KeptCameras, KeptLayer, KeptMotion, KeptNoise, KeptRule, KeptStep, KeptStepped, KeptTable,
-    KeptTies, KeptView, Moves, RowWeights, Target,
+    Antialias, Backend, KEPT, KeptCameras, KeptLayer, KeptMotion, KeptNoise, KeptRule, KeptStep, KeptStepped,
+    KeptTable, KeptTies, KeptView, Moves, RowWeights, Target,
 };
 use splat4d::scene::life::LOG_WIDTH;
 use splat4d::scene::{Key, LIFE, LifeKind};
@@ -61,7 +61,16 @@ impl<'a> DeviceEngine<'a> {
     /// An engine that draws with `backend`, and takes steps with it where it keeps tables.
     pub(super) fn new(backend: Box<dyn Backend<f32> + 'a>) -> Self {
         let (cpu, rates) = (CpuEngine::new(backend), Rates::default());
-        Self { cpu, newest: Newest::Learner, given_up: false, told: false, rates, known: Vec::new(), under_way: VecDeque::new(), ready: Vec::new() }
+        Self {
+            cpu,
+            newest: Newest::Learner,
+            given_up: false,
+            told: false,
+            rates,
+            known: Vec::new(),
+            under_way: VecDeque::new(),
+            ready: Vec::new(),
+        }
     }
 
     /// Tells once why the CPU keeps the tables of a device that could.

@@ -345,9 +345,12 @@ impl<'a> Trainer<'a> {
         self.engine.stages()
     }
 
-    /// A fault with the names of the frames that were looked at.
+    /// A fault with the names of the frames that were looked at, where they may be to blame.
     fn named(&self, fault: Fault) -> Fault {
         let Fault(what, blame, frames) = fault;
+        if blame == Blame::Device {
+            return Fault(what, blame, None);
+        }
         let frames = frames.as_deref().unwrap_or(self.batch.seen());
         let names: Vec<String> = frames.iter().map(|&i| self.frames.name(i)).collect();
         Fault(format!("{what} ({})", names.join(", ")), blame, None)

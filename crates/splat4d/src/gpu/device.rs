@@ -133,9 +133,7 @@ impl Gpu {
     }
 
     fn poll(&self, until: wgpu::PollType) -> Result<()> {
-        self.device
-            .poll(until)
-            .map_err(|e| self.error(ErrorKind::Unsupported, e.to_string()))?;
+        self.device.poll(until).map_err(|e| self.error(ErrorKind::Unsupported, e.to_string()))?;
         self.check()
     }
 

@@ -316,11 +316,8 @@ impl GpuRenderer {
         let pixel_rows = pixel_rows(band, shot.camera.height) as u32;
         let limits = [c.alpha_limits()[1] as f32, c.transmittance_min.max(0.0) as f32].map(f32::to_bits);
         let [r, g, b] = shot.background.map(f32::to_bits);
-        let [skipped, plane_rows] = if way.whole {
-            [band.first * TILE, shot.camera.height].map(|rows| rows as u32)
-        } else {
-            [0, pixel_rows]
-        };
+        let [skipped, plane_rows] =
+            if way.whole { [band.first * TILE, shot.camera.height].map(|rows| rows as u32) } else { [0, pixel_rows] };
         let blend = [r, g, b, limits[0], limits[1], first, pixel_rows, way.flags, way.sums_at, skipped, plane_rows, 0];
         put(out, slot::BLEND, &blend);
         for (i, draw) in draws.iter().enumerate() {

@@ -544,7 +544,10 @@ impl Resident for GpuRenderer {
         for (i, layer) in layers.iter().enumerate() {
             let rows = self.page_rows.unwrap_or_else(|| page_rows(gpu, layer));
             if rows < layer.rows && layer.ties.is_some() {
-                return Err(Error::new(ErrorKind::Unsupported, "the tied poses are too many for one buffer of the GPU"));
+                return Err(Error::new(
+                    ErrorKind::Unsupported,
+                    "the tied poses are too many for one buffer of the GPU",
+                ));
             }
             let first = (0..layer.rows.max(1)).step_by(rows);
             pages.extend(first.map(|first| (i, first..layer.rows.min(first + rows))));

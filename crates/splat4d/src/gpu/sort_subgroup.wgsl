@@ -15,9 +15,9 @@ var<workgroup> sort_votes: array<atomic<u32>, SORT_VOTE_WORDS>;
 fn sort_peers(digit: u32, there: bool) -> vec4<u32> {
     var peers = subgroupBallot(there);
     for (var bit = 0u; bit < 8u; bit++) {
-        let set = ((digit >> bit) & 1u) != 0u;
-        let votes = subgroupBallot(set);
-        peers &= select(~votes, votes, set);
+        let one = ((digit >> bit) & 1u) != 0u;
+        let votes = subgroupBallot(one);
+        peers &= select(~votes, votes, one);
     }
     return peers;
 }

@@ -2,8 +2,8 @@
 
 use super::{Comparison, Target};
 use crate::Result;
-use crate::math::Rng;
 use crate::layers::Layer;
+use crate::math::Rng;
 use crate::motion::{Polynomial, Slices};
 use crate::scene::{Camera, GEOMETRY, Key, LIFE, LifeKind, SH, Time};
 

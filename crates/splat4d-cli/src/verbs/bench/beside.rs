@@ -107,7 +107,7 @@ fn export(pinned: &Pinned, held: &Held, order: &[usize], folder: &Path) -> Resul
         "height": camera.height,
         "background": pinned.scene.background,
         "low_pass": config.low_pass,
-        "alpha": config.alpha_limits(),
+        "alpha": [config.alpha_min, config.alpha_max],
         "dssim": training::LAMBDA_DSSIM,
         "warm_up": WARM_UP,
         "timed": TIMED,
@@ -190,8 +190,7 @@ pub(super) fn measure(
     way: Way,
     backend: Box<dyn Backend>,
     device: &str,
-    note: &dyn Fn(&str),
-) -> Result<Row> {
+) -> Result<(Row, Vec<String>)> {
     let folder = folder.join(&pinned.name);
     files::make_folder(&folder)?;
     let pinned = still(pinned)?;
@@ -201,11 +200,9 @@ pub(super) fn measure(
     export(&pinned, &held, &order, &folder)?;
     let text = serde_json::to_string_pretty(&ran).expect("plain data is JSON");
     files::write(&folder.join(OURS), text.as_bytes())?;
-    for verdict in verdicts(&ran, &folder)? {
-        note(&format!("scene {}: {verdict}", pinned.name));
-    }
+    let verdicts = verdicts(&ran, &folder)?;
     let stage = "step, still, beside others".into();
-    Ok(Row { scene: pinned.name, stage, threads: way.threads, ms: ran.ms, ..Row::default() })
+    Ok((Row { scene: pinned.name, stage, threads: way.threads, ms: ran.ms, ..Row::default() }, verdicts))
 }
 
 #[cfg(test)]
@@ -230,13 +227,10 @@ mod tests {
         // The CPU stands for another program.
         let folder = place.path().join("small");
         let cpu = || splat4d::device::cpu(RenderConfig::default());
-        measure(&pinned, place.path(), way, cpu(), "the CPU", &|text| panic!("nobody else is there: {text}")).unwrap();
+        assert!(measure(&pinned, place.path(), way, cpu(), "the CPU").unwrap().1.is_empty(), "nobody else is there");
         std::fs::rename(folder.join(OURS), folder.join("other.json")).unwrap();
-        let told = std::sync::Mutex::new(Vec::new());
-        let note = |text: &str| told.lock().unwrap().push(text.to_owned());
-        let row = measure(&pinned, place.path(), way, Box::new(gpu), "a GPU", &note).unwrap();
+        let (row, said) = measure(&pinned, place.path(), way, Box::new(gpu), "a GPU").unwrap();
         assert!(row.ms > 0.0);
-        let said = std::mem::take(&mut *told.lock().unwrap());
         assert!(said.len() == 1 && said[0].contains("times ours"), "{said:?}");
         let read = |name: &str| std::fs::read(folder.join(name)).unwrap();
         let shape = |name: &str| npy::Npy::read(&read(name)).unwrap().shape;

@@ -166,7 +166,9 @@ pub(super) fn beside(
         let renderer = renderer(Tuning::default())?;
         let name = renderer.gpu().describe();
         note(&format!("scene {} on {name}, beside others ...", pinned.name));
-        let row = pool.install(|| super::beside::measure(pinned, folder, way, Box::new(renderer), &name, note))?;
+        let measured = pool.install(|| super::beside::measure(pinned, folder, way, Box::new(renderer), &name));
+        let (row, verdicts) = measured?;
+        verdicts.iter().for_each(|verdict| note(&format!("scene {}: {verdict}", pinned.name)));
         Ok(Row { device: Some(name), simd: "gpu".into(), ..row })
     };
     scenes.iter().map(one).collect()

@@ -8,8 +8,8 @@ use crate::step::resident::DeviceEngine;
 use splat4d::device::{self, Device};
 use splat4d::layers::ALPHA_MIN;
 use splat4d::render::{
-    Antialias, Backend, Image, ImageGrads, KeptCameras, KeptLayer, KeptNumbers, KeptStep, KeptStepped, RenderConfig, RenderGrads,
-    Resident, Shot, Wanted,
+    Antialias, Backend, Image, ImageGrads, KeptCameras, KeptLayer, KeptNumbers, KeptStep, KeptStepped, RenderConfig,
+    RenderGrads, Resident, Shot, Wanted,
 };
 use splat4d::scene::{GEOMETRY, Table};
 use splat4d::{Error, ErrorKind, Result};

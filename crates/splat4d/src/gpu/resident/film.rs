@@ -18,18 +18,15 @@ const FRAMES: usize = 3;
 const VIEW: u32 = 1;
 
 impl GpuRenderer {
-    /// Draws frames of a scene whose tables stay, as planes on the GPU: seconds from the first submission to the end of the last.
+    /// Draws frames of a scene, which takes the place of whatever is kept, as planes on the GPU: seconds from the first submission to the end of the last.
     /// `None`: the motion of a layer is not known here, or a picture must be drawn in bands. Errors: a driver that failed.
     pub fn film(&mut self, scene: &Scene<f32>, frames: &[(Camera, Time)]) -> Result<Option<f64>> {
         let times: Vec<Time> = frames.iter().map(|f| f.1).collect();
         let Some(known) = scene.layers.iter().map(|l| KeptMotion::new(l, &times)).collect::<Option<Vec<_>>>() else {
             return Ok(None);
         };
-        let stats: Vec<Vec<f32>> = scene
-            .layers
-            .iter()
-            .map(|l| vec![0.0; STATS_WIDTH * l.params.len().next_multiple_of(BLOCK)])
-            .collect();
+        let stats: Vec<Vec<f32>> =
+            scene.layers.iter().map(|l| vec![0.0; STATS_WIDTH * l.params.len().next_multiple_of(BLOCK)]).collect();
         let layers: Vec<KeptLayer<'_>> = scene
             .layers
             .iter()

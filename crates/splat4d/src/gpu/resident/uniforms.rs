@@ -112,13 +112,7 @@ pub(super) struct Rule {
 
 impl Rule {
     /// Of the piece of a table that begins with column `from`.
-    pub(super) fn new(
-        layer: &Kept,
-        table: usize,
-        from: usize,
-        rule: &KeptRule,
-        [counted, word]: [usize; 2],
-    ) -> Self {
+    pub(super) fn new(layer: &Kept, table: usize, from: usize, rule: &KeptRule, [counted, word]: [usize; 2]) -> Self {
         let width = layer.widths[table];
         let ([first, moments_first], [stride, moments_stride]) =
             if table == SH { ([0; 2], [width, moments_width(width)]) } else { (layer.first(table), layer.strides()) };
