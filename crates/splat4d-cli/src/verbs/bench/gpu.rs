@@ -95,8 +95,8 @@ const BACKWARD: [&str; 3] = ["rasterize backward", "gather", "splats backward"];
 /// A whole training step; a frame of a film.
 const STEP: &str = "step";
 const FILM: &str = "frame, nothing read back";
-/// Frames of a film, and how often it is drawn at most: the best counts.
-const FRAMES: usize = 1000;
+/// Frames of a film, times the rounds, of which there are five unless told; and how often it is drawn at most: the best counts.
+const FRAMES: usize = 200;
 const FILMS: usize = 3;
 /// How far a camera looks to either side, radians: five degrees.
 const SWING: f64 = 0.087;
@@ -138,7 +138,9 @@ pub(super) fn measure(
             note(&format!("scene {} on {name}{with} ...", pinned.name));
             let mut here = pool.install(|| stages(pinned, way, &mut renderer(*tuning)?, &best))?;
             here.extend(pool.install(|| steps(pinned, &held, way, renderer(*tuning)?, (&best, &here)))?);
-            here.extend(pool.install(|| film(pinned, way, &mut renderer(*tuning)?, &here))?);
+            if changes.is_none() {
+                here.extend(pool.install(|| film(pinned, way, &mut renderer(*tuning)?, &here))?);
+            }
             for row in here.iter_mut().filter(|_| changes.is_some()) {
                 let default = rows.iter().find(|r| r.scene == row.scene && r.stage == row.stage && r.tuning.is_none());
                 row.against = default.filter(|d| d.ms > 0.0).map(|d| row.ms / d.ms);
@@ -288,20 +290,20 @@ fn floor_of(rows: &[Row], stages: &[&str]) -> f64 {
 
 /// Frames of a moving camera at moving times, none read back; `stages`: rows of what a frame is made of.
 fn film(pinned: &Pinned, way: Way, renderer: &mut GpuRenderer, stages: &[Row]) -> Result<Vec<Row>> {
-    let path: Vec<(Camera, Time)> = (0..FRAMES).map(|i| along(pinned, i)).collect();
+    let frames = FRAMES * way.rounds;
+    let path: Vec<(Camera, Time)> = (0..frames).map(|i| along(pinned, i as f64 / frames as f64)).collect();
     let mut best = f64::MAX;
     for _ in 0..way.rounds.min(FILMS) {
         let Some(seconds) = renderer.film(&pinned.scene, &path)? else { return Ok(Vec::new()) };
-        best = best.min(1e3 * seconds / FRAMES as f64);
+        best = best.min(1e3 * seconds / frames as f64);
     }
     let floor = floor_of(stages, &LISTS) + floor_of(stages, &OF_STEPS[..1]);
     let row = Row { scene: pinned.name.clone(), stage: FILM.into(), threads: way.threads, ms: best, ..Row::default() };
     Ok(vec![Row { ceiling_share: Some(floor / best), ..row }])
 }
 
-/// The camera and the time of a frame: every view in turn, of which each looks from side to side, through the whole clip.
-fn along(pinned: &Pinned, frame: usize) -> (Camera, Time) {
-    let share = frame as f64 / FRAMES as f64;
+/// The camera and the time after a share of the film: every view in turn, of which each looks from side to side, through the whole clip.
+fn along(pinned: &Pinned, share: f64) -> (Camera, Time) {
     let place = share * pinned.views.len() as f64;
     let mut camera = pinned.views[place as usize].camera.clone();
     let (sin, cos) = (SWING * (std::f64::consts::TAU * place).sin()).sin_cos();
@@ -329,8 +331,10 @@ mod tests {
                 return println!("skipped: {e}");
             }
         };
-        let all = [&STAGES[..], &OF_STEPS, &[STEP, FILM]].concat();
-        let stages: Vec<&str> = rows.iter().map(|r| r.stage.as_str()).collect();
+        let all = [&STAGES[..], &OF_STEPS, &[STEP]].concat();
+        let (films, others): (Vec<&Row>, Vec<&Row>) = rows.iter().partition(|r| r.stage == FILM);
+        assert!(films.len() == 1 && films[0].tuning.is_none(), "one film, at the defaults");
+        let stages: Vec<&str> = others.iter().map(|r| r.stage.as_str()).collect();
         assert_eq!(stages, all.repeat(Tuning::sweep().len()));
         for row in &rows {
             assert!(row.ms > 0.0 && row.ms.is_finite() && row.device.is_some() && row.simd == "gpu", "{row:?}");
