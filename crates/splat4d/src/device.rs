@@ -1,7 +1,10 @@
 //! The device that draws: the GPU where there is one that can, else the CPU, and a sentence that says why.
 
+mod kept;
 #[cfg(test)]
 mod tests;
+
+pub use kept::KeptMotion;
 
 use crate::math::{Rng, Se3, sym3};
 use crate::render::{

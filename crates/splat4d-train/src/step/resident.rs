@@ -10,10 +10,11 @@ use crate::Result;
 use crate::learner::{Learner, Parts};
 use crate::loss::terms::KeptLoss;
 use crate::optim::corrections;
+use splat4d::device::KeptMotion;
 use splat4d::layers::{ALPHA_MIN, ALWAYS};
 use splat4d::render::{
-    Antialias, Backend, KEPT, KeptCameras, KeptLayer, KeptMotion, KeptNoise, KeptRule, KeptStep, KeptStepped,
-    KeptTable, KeptTies, KeptView, Moves, RowWeights, Target,
+    Antialias, Backend, KEPT, KeptCameras, KeptLayer, KeptNoise, KeptRule, KeptStep, KeptStepped, KeptTable, KeptTies,
+    KeptView, Moves, RowWeights, Target,
 };
 use splat4d::scene::life::LOG_WIDTH;
 use splat4d::scene::{Key, LIFE, LifeKind};

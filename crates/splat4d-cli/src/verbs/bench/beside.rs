@@ -27,8 +27,10 @@ const WARM_UP: usize = 50;
 const TIMED: usize = 300;
 /// Steps at which losses must agree, and how far apart they may be, relatively: other roundings grow.
 const AGREE: [(usize, f64); 3] = [(1, 1e-3), (10, 1e-2), (100, 1e-2)];
+/// A rate's name, the columns that it is of, which of them, and the rate.
+type RateOf = (&'static str, &'static str, Option<(usize, usize)>, f64);
 /// Rates, columns and their parts (3DGS; positions for an extent of 1).
-const RATES: [(&str, &str, Option<(usize, usize)>, f64); 6] = [
+const RATES: [RateOf; 6] = [
     ("means", "means", None, 1.6e-4),
     ("quats", "quats", None, 1e-3),
     ("scales", "log_scales", None, 5e-3),
@@ -123,10 +125,7 @@ fn export(pinned: &Pinned, held: &Held, order: &[usize], folder: &Path) -> Resul
 fn learn(pinned: &Pinned, held: &Arc<Held>, backend: Box<dyn Backend>, device: &str) -> Result<(Ran, Vec<usize>)> {
     let mut trainer = training::trainer_on(pinned.scene.clone(), held.clone(), backend)?;
     trainer.progress.rate_scale = 1.0;
-    let group = |&(_, column, part, rate): &(&str, &str, Option<(usize, usize)>, f64)| Group {
-        part,
-        ..Group::new(column, Rate::constant(rate))
-    };
+    let group = |&(_, column, part, rate): &RateOf| Group { part, ..Group::new(column, Rate::constant(rate)) };
     trainer.stages[0].groups = RATES.iter().map(group).collect();
     let (mut losses, mut order) = (Vec::new(), Vec::new());
     let failed = |fault: Fault| Error::new(ErrorKind::Diverged, fault.0);

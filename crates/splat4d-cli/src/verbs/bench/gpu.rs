@@ -7,10 +7,12 @@ use super::scenes::Pinned;
 use super::stages::{Way, gradient, zeros};
 use super::training::{self, Held};
 use splat4d::Result;
+use splat4d::device::KeptMotion;
 use splat4d::gpu::{Adapters, Gpu, GpuRenderer, GpuRoofline, GpuStats, GpuTimings, StageClock, Tuning};
+use splat4d::layers::{ALPHA_MIN, Layer};
 use splat4d::math::Se3;
 use splat4d::play::Player;
-use splat4d::render::{Backend, Image, ImageGrads, RenderConfig, RenderGrads, Shot};
+use splat4d::render::{Backend, Image, ImageGrads, KeptLayer, KeptTable, RenderConfig, RenderGrads, Shot};
 use splat4d::scene::{Camera, Splats, Table, Time};
 use std::path::Path;
 use std::sync::Arc;
@@ -293,8 +295,25 @@ fn film(pinned: &Pinned, way: Way, renderer: &mut GpuRenderer, stages: &[Row]) -
     let frames = FRAMES * way.rounds;
     let path: Vec<(Camera, Time)> = (0..frames).map(|i| along(pinned, i as f64 / frames as f64)).collect();
     let mut best = f64::MAX;
+    let times: Vec<Time> = path.iter().map(|p| p.1).collect();
+    let known: Option<Vec<_>> = pinned.scene.layers.iter().map(|l| KeptMotion::new(l, &times)).collect();
+    let Some(known) = known else { return Ok(Vec::new()) };
+    // Three columns a row, in blocks of sixteen.
+    let stats: Vec<Vec<f32>> =
+        pinned.scene.layers.iter().map(|l| vec![0.0; 3 * l.params.len().next_multiple_of(16)]).collect();
+    fn kept<'a>(((layer, known), stats): ((&'a Layer, &KeptMotion), &'a Vec<f32>)) -> KeptLayer<'a> {
+        let tables = known.keys.map(|key| {
+            key.map_or(KeptTable::default(), |key| {
+                let table = &layer.params[key];
+                KeptTable { width: table.width(), params: table.data(), moments: &[] }
+            })
+        });
+        KeptLayer { rows: layer.params.len(), moves: known.moves, life: layer.life, tables, stats, ties: None }
+    }
+    let layers: Vec<KeptLayer<'_>> = pinned.scene.layers.iter().zip(&known).zip(&stats).map(kept).collect();
     for _ in 0..way.rounds.min(FILMS) {
-        let Some(seconds) = renderer.film(&pinned.scene, &path)? else { return Ok(Vec::new()) };
+        let film = renderer.film(&layers, ALPHA_MIN, pinned.scene.background, &path)?;
+        let Some(seconds) = film else { return Ok(Vec::new()) };
         best = best.min(1e3 * seconds / frames as f64);
     }
     let floor = floor_of(stages, &LISTS) + floor_of(stages, &OF_STEPS[..1]);

@@ -3,7 +3,7 @@
 use super::*;
 use crate::gpu::MOST_PAIRS;
 use crate::gpu::tests::{camera, own_renderer, read, renderer};
-use crate::layers::{Evaluation, Layer, Scene};
+use crate::layers::{ALPHA_MIN, Evaluation, Layer, Scene};
 use crate::math::{Real, Rng};
 use crate::motion::native4d::{Native4dSpec, TABLE};
 use crate::motion::{At, Cache, Motion, Slices, Spec, Tape, build_as};
@@ -331,7 +331,15 @@ fn a_film_shows_what_a_picture_does() {
     r.make_room_for_pairs(ROWS).expect("a little room");
     let frames: Vec<(Camera, Time)> =
         [(&far, 0.3), (&near, 0.1), (&near, 0.5)].map(|(c, t): (&Camera, f64)| (c.clone(), Time(t))).to_vec();
-    let seconds = r.film(&scene, &frames).expect("it is drawn").expect("its motion is known");
+    let layer = &scene.layers[0];
+    let table =
+        |key: Key| KeptTable { width: layer.params[key].width(), params: layer.params[key].data(), moments: &[] };
+    let own = layer.params.find(TABLE).expect("the model made it");
+    let tables = [table(GEOMETRY), KeptTable::default(), table(own), KeptTable::default(), table(crate::scene::SH)];
+    let stats = vec![0.0; STATS_WIDTH * ROWS.next_multiple_of(BLOCK)];
+    let moves = moves(layer.motion.as_ref());
+    let kept = KeptLayer { rows: ROWS, moves, life: layer.life, tables, stats: &stats, ties: None };
+    let seconds = r.film(&[kept], ALPHA_MIN, scene.background, &frames).expect("it is drawn").expect("in one piece");
     assert!(seconds > 0.0);
     let filmed: Vec<f32> = read(&r.gpu, &r.buffers.planes, 3 * 150 * 110);
     let mut moment = Evaluation::default();
