@@ -10,6 +10,8 @@ mod chunked;
 mod compress;
 #[path = "cli/convert.rs"]
 mod convert;
+#[path = "cli/device.rs"]
+mod device;
 #[path = "cli/edit.rs"]
 mod edit;
 #[path = "cli/import.rs"]

@@ -131,7 +131,9 @@ fn main() -> Result<()> {
     while !trainer.is_done() {
         // The inner error names a number that was not finite; a run on disk would go back to its last checkpoint.
         let step = trainer.step()?.map_err(|fault| splat4d::Error::input(fault.0))?;
-        mse = if mse == 0.0 { step.mse } else { 0.95 * mse + 0.05 * step.mse };
+        for step in &step.measured {
+            mse = if mse == 0.0 { step.mse } else { 0.95 * mse + 0.05 * step.mse };
+        }
         if trainer.progress.iteration.is_multiple_of(100) {
             let psnr = -10.0 * f64::log10(mse);
             println!("step {}: {psnr:.2} dB, {} Gaussians", trainer.progress.iteration, trainer.scene().len());

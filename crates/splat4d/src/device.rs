@@ -1,7 +1,10 @@
 //! The device that draws: the GPU where there is one that can, else the CPU, and a sentence that says why.
 
+mod kept;
 #[cfg(test)]
 mod tests;
+
+pub use kept::KeptMotion;
 
 use crate::math::{Rng, Se3, sym3};
 use crate::render::{
@@ -277,16 +280,37 @@ fn gpu(_: Device, _: RenderConfig, _: &Wanted, _: Tables) -> Result<(Box<dyn Bac
 
 #[cfg(feature = "gpu")]
 fn gpu(device: Device, config: RenderConfig, wanted: &Wanted, tables: Tables) -> Result<(Box<dyn Backend>, String)> {
-    use crate::gpu::{Adapters, Gpu, GpuRenderer};
+    use crate::gpu::{Adapters, Gpu, GpuRenderer, Tuning};
     // Cheap, where opening a driver takes a moment.
     GpuRenderer::refuses(wanted)?;
-    let gpu = Gpu::open(if device == Device::Gpu { Adapters::Any } else { Adapters::Hardware })?;
-    let name = gpu.describe();
-    let mut renderer = GpuRenderer::new(gpu, config)?;
-    renderer.tables = tables;
-    if wanted.backward {
-        renderer.for_training()?;
-        trusted(&mut renderer).map_err(|e| e.at(&name))?;
+    let adapters = if device == Device::Gpu { Adapters::Any } else { Adapters::Hardware };
+    let gpu = Gpu::open(adapters)?;
+    if !wanted.backward {
+        let name = gpu.describe();
+        let mut renderer = GpuRenderer::new(gpu, config)?;
+        renderer.tables = tables;
+        return Ok((Box::new(renderer), name));
     }
+    to_train(gpu, config, tables, trusted).or_else(|error| {
+        // What subgroups do is the newest part of drivers.
+        let gpu = Gpu::open(adapters)?;
+        let portable = gpu.tuned(Tuning { subgroups: false, ..Tuning::default() });
+        to_train(portable, config, tables, trusted).map_err(|_| error)
+    })
+}
+
+/// A renderer that has passed a test, and its name.
+#[cfg(feature = "gpu")]
+fn to_train(
+    gpu: crate::gpu::Gpu,
+    config: RenderConfig,
+    tables: Tables,
+    test: fn(&mut dyn Backend) -> Result<()>,
+) -> Result<(Box<dyn Backend>, String)> {
+    let name = gpu.describe();
+    let mut renderer = crate::gpu::GpuRenderer::new(gpu, config)?;
+    renderer.tables = tables;
+    renderer.for_training()?;
+    test(&mut renderer).map_err(|e| e.at(&name))?;
     Ok((Box::new(renderer), name))
 }

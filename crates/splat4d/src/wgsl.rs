@@ -11,6 +11,8 @@ pub const RESIDENT: &str = include_str!("format/playback/resident.wgsl");
 pub const SHADE: &str = include_str!("render/shade.wgsl");
 /// One stable pass of a radix sort over (key, value) pairs: `histogram`, `scan`, `scatter`. Bindings in its header.
 pub const SORT: &str = include_str!("gpu/sort.wgsl");
+/// The last dispatch of such a pass with subgroups: `scatter_subgroup`. After [`SORT`].
+pub const SORT_SUBGROUP: &str = include_str!("gpu/sort_subgroup.wgsl");
 /// A row of a scene's tables → shape, colour, mark. After [`PROJECT`] and [`SHADE`].
 pub const SPLATS: &str = include_str!("gpu/splats.wgsl");
 /// Exclusive sums, and the sizes of later dispatches.
@@ -59,6 +61,8 @@ pub const ANSWER: &str = include_str!("gpu/answer.wgsl");
 pub const ANSWER_BACK: &str = include_str!("gpu/answer_back.wgsl");
 /// Gradients of colours → those of SH and means, and statistics. After [`PROJECT`], [`SHADE`] and [`LEARNT`].
 pub const COLORS_BACK: &str = include_str!("gpu/colors_back.wgsl");
+/// What a step leaves of itself: `view_sums`, `cameras`, `record`.
+pub const RECORD: &str = include_str!("gpu/record.wgsl");
 /// A step of Adam on one table.
 pub const ADAM: &str = include_str!("gpu/adam.wgsl");
 /// A splat's records added up.
@@ -78,12 +82,12 @@ mod tests {
     const STORAGE_BUFFERS: usize = 8;
     const WORKGROUP_BYTES: u32 = 16 << 10;
     const INVOCATIONS: u32 = 256;
-    /// The one that needs more than WebGPU's core, on devices that have it.
-    const SUBGROUPS: &str = "rasterize, backward, with subgroups";
+    /// Those that need more than WebGPU's core, on devices that have it.
+    const SUBGROUPS: [&str; 2] = ["rasterize, backward, with subgroups", "sort with subgroups"];
 
     #[test]
     fn every_shader_is_valid_within_webgpus_default_limits() {
-        let shaders: [(&str, &[&str]); 24] = [
+        let shaders: [(&str, &[&str]); 26] = [
             ("project and shade", &[PROJECT, SHADE]),
             ("sort", &[SORT]),
             ("splats", &[PROJECT, SHADE, SPLATS]),
@@ -93,7 +97,9 @@ mod tests {
             ("ranges", &[RANGES]),
             ("rasterize", &[PROJECT, RASTERIZE]),
             ("rasterize, backward", &[PROJECT, BLEND_BACK, RASTERIZE_BACK]),
-            (SUBGROUPS, &[PROJECT, BLEND_BACK, RASTERIZE_BACK_SUBGROUP]),
+            (SUBGROUPS[0], &[PROJECT, BLEND_BACK, RASTERIZE_BACK_SUBGROUP]),
+            (SUBGROUPS[1], &[SORT, SORT_SUBGROUP]),
+            ("record", &[RECORD]),
             ("bytes", &[PROJECT, BYTES]),
             ("loss", &[LOSS]),
             ("answer", &[LEARNT, ANSWER]),
@@ -113,7 +119,7 @@ mod tests {
             let text = files.join("\n");
             let module =
                 naga::front::wgsl::parse_str(&text).unwrap_or_else(|e| panic!("{name}: {}", e.emit_to_string(&text)));
-            let needs = if name == SUBGROUPS { Capabilities::SUBGROUP } else { Capabilities::empty() };
+            let needs = if SUBGROUPS.contains(&name) { Capabilities::SUBGROUP } else { Capabilities::empty() };
             Validator::new(ValidationFlags::all(), needs)
                 .validate(&module)
                 .unwrap_or_else(|e| panic!("{name}: {}", e.emit_to_string(&text)));

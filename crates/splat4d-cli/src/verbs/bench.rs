@@ -1,6 +1,8 @@
 //! `bench`: how long every stage takes on pinned scenes, and how far that is from what this machine could do.
 
 #[cfg(feature = "gpu")]
+mod beside;
+#[cfg(feature = "gpu")]
 mod gpu;
 mod growth;
 mod playback;
@@ -43,6 +45,7 @@ Examples:
   splat4d bench --growth all --plots docs/images  steps with more Gaussians, pixels and frames; memory
   splat4d bench --device gpu --save gpu.json      every stage of a GPU, scenes A, B and C
   splat4d bench --device gpu --sweep --save sweep.json  the same with every value of the kernels' constants
+  splat4d bench --device gpu --beside others      the same training in other programs, docs/gpu.md
   splat4d bench --playback runs/a runs/a-small    frames a second of runs and files, in turns
 
 Times are means over eight views of the best of several rounds. `of ceiling` is the least time in which the stage's
@@ -66,6 +69,10 @@ pub(crate) struct Args {
     /// Measure a GPU with each constant of its kernels at each of its values, one after the other: what to set them to on this card
     #[arg(long)]
     sweep: bool,
+    /// Train still scenes instead as other programs can: writes what they need into this folder, and compares with the runs that they
+    /// left there, where losses agree
+    #[arg(long, value_name = "FOLDER", conflicts_with = "sweep")]
+    beside: Option<PathBuf>,
     /// Folder with the SOG files of scene S
     #[arg(long, value_name = "FOLDER")]
     playbot: Option<PathBuf>,
@@ -147,8 +154,8 @@ pub(crate) fn run(args: &Args, threads: Option<u16>, console: &Console) -> anyho
         return play(args, console);
     }
     // What cannot work is said before anything takes time.
-    if args.sweep && args.device != Measured::Gpu {
-        let error = Error::new(ErrorKind::BadInput, "only a GPU's kernels have constants to sweep");
+    if (args.sweep || args.beside.is_some()) && args.device != Measured::Gpu {
+        let error = Error::new(ErrorKind::BadInput, "--sweep and --beside are of a GPU");
         return Err(error.remedy("Add --device gpu.").into());
     }
     let earlier = args.against.as_deref().map(rows::read).transpose()?;
@@ -179,7 +186,7 @@ pub(crate) fn run(args: &Args, threads: Option<u16>, console: &Console) -> anyho
     }
     let mut rows = if args.device == Measured::Gpu {
         let way = Way { threads: threads[threads.len() - 1], simd: levels[0], rounds: args.rounds };
-        on_gpu(&scenes, way, args.sweep, console)?
+        on_gpu(&scenes, way, args, console)?
     } else if args.growth.is_empty() {
         measure(&scenes, &levels, &threads, args.rounds, console)?
     } else {
@@ -207,12 +214,16 @@ pub(crate) fn run(args: &Args, threads: Option<u16>, console: &Console) -> anyho
 
 /// Measures a GPU, with the most threads beside it.
 #[cfg(feature = "gpu")]
-fn on_gpu(scenes: &[Pinned], way: Way, sweep: bool, console: &Console) -> anyhow::Result<Vec<Row>> {
-    Ok(gpu::measure(scenes, way, sweep, &pool(way.threads)?, &|text| console.note(text))?)
+fn on_gpu(scenes: &[Pinned], way: Way, args: &Args, console: &Console) -> anyhow::Result<Vec<Row>> {
+    let pool = pool(way.threads)?;
+    Ok(match &args.beside {
+        Some(folder) => gpu::beside(scenes, folder, way, &pool, &|text| console.aside(text))?,
+        None => gpu::measure(scenes, way, args.sweep, &pool, &|text| console.note(text))?,
+    })
 }
 
 #[cfg(not(feature = "gpu"))]
-fn on_gpu(_: &[Pinned], _: Way, _: bool, _: &Console) -> anyhow::Result<Vec<Row>> {
+fn on_gpu(_: &[Pinned], _: Way, _: &Args, _: &Console) -> anyhow::Result<Vec<Row>> {
     let error = Error::new(ErrorKind::Unsupported, "this splat4d was built without the feature `gpu`");
     Err(error.remedy("Build it with its default features.").into())
 }

@@ -138,7 +138,8 @@ impl Capture {
 /// A call of the binary.
 pub(crate) struct Call {
     args: Vec<OsString>,
-    path: Option<OsString>,
+    /// Names and values that the program finds in its environment.
+    environment: Vec<(&'static str, OsString)>,
 }
 
 /// How it went.
@@ -151,7 +152,7 @@ pub(crate) struct Answer {
 
 /// The program with these arguments.
 pub(crate) fn splat4d(args: &[&str]) -> Call {
-    Call { args: args.iter().map(OsString::from).collect(), path: None }
+    Call { args: args.iter().map(OsString::from).collect(), environment: Vec::new() }
 }
 
 impl Call {
@@ -164,7 +165,13 @@ impl Call {
     /// Programs are looked for in these folders alone.
     #[cfg(unix)]
     pub(crate) fn path(self, folders: &str) -> Self {
-        Self { path: Some(folders.into()), ..self }
+        self.with("PATH", folders)
+    }
+
+    /// With a variable of the environment.
+    pub(crate) fn with(mut self, name: &'static str, value: &str) -> Self {
+        self.environment.push((name, value.into()));
+        self
     }
 
     /// Runs in the current folder.
@@ -175,9 +182,7 @@ impl Call {
     /// Runs in a folder.
     pub(crate) fn run_in(self, folder: &Path) -> Answer {
         let mut command = Command::new(PROGRAM.expect("cargo builds the program"));
-        if let Some(path) = &self.path {
-            command.env("PATH", path);
-        }
+        command.envs(self.environment.iter().map(|(name, value)| (name, value)));
         let output = command.args(&self.args).current_dir(folder).output().unwrap();
         Answer {
             call: format!("{:?}", self.args),

@@ -63,6 +63,17 @@ impl Exposure {
         self.key
     }
 
+    /// The cameras whose mean is held at the identity.
+    pub(crate) fn trained(&self) -> &[usize] {
+        &self.trained
+    }
+
+    /// Takes over the table and its moments from a device.
+    pub(crate) fn take_over(&mut self, [params, moments]: &[Vec<f32>; 2]) {
+        self.params[self.key].data_mut().copy_from_slice(params);
+        self.moments.table_mut(self.key).data_mut().copy_from_slice(moments);
+    }
+
     /// Forgets what the last views gave.
     pub(crate) fn rest(&mut self) {
         self.grads.clear(&self.params);

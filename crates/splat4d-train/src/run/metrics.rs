@@ -2,7 +2,7 @@
 
 use super::checkpoint::{RunState, write_atomically};
 use crate::Result;
-use crate::step::trainer::{Stepped, Trainer};
+use crate::step::trainer::{Measured, Stepped, Trainer};
 use std::path::Path;
 
 /// Rows of metrics.csv in a whole run, about.
@@ -34,9 +34,16 @@ impl Totals {
     }
 }
 
+/// A row of metrics.csv: what is known of a step when it was begun, and the whole once it was measured.
+struct Row {
+    iteration: usize,
+    begun: Option<[String; 2]>,
+    text: String,
+}
+
 /// metrics.csv: kept in memory, written whole at every checkpoint, so that it never runs ahead of one.
 pub(super) struct Metrics {
-    rows: Vec<(usize, String)>,
+    rows: Vec<Row>,
     every: usize,
 }
 
@@ -46,40 +53,43 @@ impl Metrics {
 
     pub(super) fn open(run: &Path, iteration: usize, iterations: usize) -> Self {
         let text = std::fs::read_to_string(run.join("metrics.csv")).unwrap_or_default();
-        let row = |line: &str| Some((line.split(',').next()?.parse::<usize>().ok()?, line.to_owned()));
-        let rows = text.lines().skip(1).filter_map(row).filter(|(i, _)| *i <= iteration).collect();
+        let row = |line: &str| {
+            Some(Row { iteration: line.split(',').next()?.parse().ok()?, begun: None, text: line.to_owned() })
+        };
+        let rows = text.lines().skip(1).filter_map(row).filter(|row| row.iteration <= iteration).collect();
         Self { rows, every: (iterations / METRIC_ROWS).max(1) }
     }
 
+    /// After a step; whatever it measured may come later.
     pub(super) fn push(&mut self, trainer: &Trainer<'_>, s: &Stepped, state: &RunState) {
         let i = trainer.progress.iteration;
         if !i.is_multiple_of(self.every) && !trainer.is_done() {
             return;
         }
         let ms: Vec<String> = Totals::of(s).iter().map(|t| format!("{:.3}", t * 1e3)).collect();
-        let row = format!(
-            "{i},{},{:.6},{:.6},{:.6},{:.4},{},{:.2},{}",
-            trainer.stage_name(),
-            s.report.loss,
-            s.l1,
-            s.ssim,
-            psnr(s.mse),
-            trainer.scene().len(),
-            state.seconds,
-            ms.join(",")
-        );
-        self.rows.push((i, row));
+        let after = format!("{},{:.2},{}", trainer.scene().len(), state.seconds, ms.join(","));
+        let begun = [format!("{i},{}", trainer.stage_name()), after];
+        self.rows.push(Row { iteration: i, begun: Some(begun), text: String::new() });
+    }
+
+    /// What a step measured.
+    pub(super) fn measured(&mut self, m: &Measured) {
+        if let Some(row) = self.rows.iter_mut().rev().find(|row| row.iteration == m.iteration)
+            && let Some([before, after]) = row.begun.take()
+        {
+            row.text = format!("{before},{:.6},{:.6},{:.6},{:.4},{after}", m.loss, m.l1, m.ssim, psnr(m.mse));
+        }
     }
 
     /// Forgets the rows after an iteration.
     pub(super) fn rewind(&mut self, iteration: usize) {
-        self.rows.retain(|(i, _)| *i <= iteration);
+        self.rows.retain(|row| row.iteration <= iteration);
     }
 
     pub(super) fn write(&self, run: &Path) -> Result<()> {
         let mut text = Self::HEADER.to_owned() + "\n";
-        for (_, row) in &self.rows {
-            text += row;
+        for row in &self.rows {
+            text += &row.text;
             text.push('\n');
         }
         write_atomically(&run.join("metrics.csv"), text.as_bytes())

@@ -208,7 +208,8 @@ impl Probe<'_> {
     }
 
     fn step(&mut self) -> Result<()> {
-        match self.trainer.step()? {
+        // A device is not to be still at it when the clock is looked at.
+        match self.trainer.step()?.and_then(|_| self.trainer.catch_up()) {
             Ok(_) => Ok(()),
             Err(fault) => Err(Error::new(ErrorKind::Diverged, format!("the timing probe failed: {}", fault.0))
                 .remedy("Look for wrong poses with `splat4d info CAPTURE`")),

@@ -15,7 +15,7 @@ use crate::event::{Event, Progress};
 use crate::loss::image::ImageTerm;
 use crate::recipe::Recipe;
 use crate::step::engine::Blame;
-use crate::step::trainer::{Fault, Trainer};
+use crate::step::trainer::{Fault, Measured, Trainer};
 use crate::{Error, ErrorKind, Result};
 use serde_json::json;
 use splat4d::device::Device;
@@ -129,6 +129,17 @@ fn save_checkpoint(
     }
     listen(&Event::Checkpoint { iteration: trainer.progress.iteration, path });
     Ok(())
+}
+
+/// Takes note of what steps measured, in their order.
+fn note(measured: &[Measured], state: &mut RunState, metrics: &mut Metrics) {
+    for m in measured {
+        let fresh = if m.iteration <= 1 { 1.0 } else { SMOOTHING };
+        for (old, new) in state.smooth.iter_mut().zip([m.loss, m.mse]) {
+            *old += fresh * (new - *old);
+        }
+        metrics.measured(m);
+    }
 }
 
 /// Seconds since the last lap, which begins anew.
@@ -281,16 +292,15 @@ impl Session<'_> {
                     });
                 }
             }
-            let fresh = if trainer.progress.iteration <= 1 { 1.0 } else { SMOOTHING };
-            for (old, new) in state.smooth.iter_mut().zip([step.report.loss, step.mse]) {
-                *old += fresh * (new - *old);
-            }
             for message in &step.notices {
                 listen(&Event::Warning { message: message.clone() });
             }
             totals.add(&step);
             metrics.push(trainer, &step, &state);
-            if told.elapsed().as_secs_f64() > PROGRESS_SECONDS || trainer.is_done() {
+            note(&step.measured, &mut state, &mut metrics);
+            // A device's first steps are measured some steps later.
+            let known = state.smooth != [0.0; 2];
+            if known && told.elapsed().as_secs_f64() > PROGRESS_SECONDS || trainer.is_done() {
                 told = Clock::now();
                 listen(&self.progress(trainer, &state, &steps));
             }
@@ -298,10 +308,15 @@ impl Session<'_> {
             // What the start of a later stage did may have taken long: it is not to be done twice.
             let due = i.is_multiple_of(self.recipe.run.checkpoint_interval) || entered && i > 1;
             let looked_at = due || snapshots.as_ref().is_some_and(Snapshots::is_due);
-            if looked_at && let Err(fault) = trainer.settle() {
-                state = self.roll_back(trainer, &fault, listen)?;
-                metrics.rewind(trainer.progress.iteration);
-                continue;
+            if looked_at {
+                match trainer.settle() {
+                    Ok(measured) => note(&measured, &mut state, &mut metrics),
+                    Err(fault) => {
+                        state = self.roll_back(trainer, &fault, listen)?;
+                        metrics.rewind(trainer.progress.iteration);
+                        continue;
+                    }
+                }
             }
             if let Some(event) = snapshots.as_mut().and_then(|s| s.take(trainer)) {
                 listen(&event);
@@ -310,9 +325,12 @@ impl Session<'_> {
                 self.save(trainer, &state, &metrics, &totals, false, listen)?;
             }
         }
-        if let Err(fault) = trainer.settle() {
-            state = self.roll_back(trainer, &fault, listen)?;
-            metrics.rewind(trainer.progress.iteration);
+        match trainer.settle() {
+            Ok(measured) => note(&measured, &mut state, &mut metrics),
+            Err(fault) => {
+                state = self.roll_back(trainer, &fault, listen)?;
+                metrics.rewind(trainer.progress.iteration);
+            }
         }
         let done = trainer.is_done();
         self.save(trainer, &state, &metrics, &totals, done, listen)?;
@@ -417,7 +435,7 @@ impl Session<'_> {
 
     /// Back to the last checkpoint with half the rates; the third time the run is given up.
     fn roll_back(&self, trainer: &mut Trainer<'_>, fault: &Fault, listen: &mut dyn FnMut(&Event)) -> Result<RunState> {
-        let Fault(what, blame) = fault;
+        let Fault(what, blame, _) = fault;
         let (strike, share) = if *blame == Blame::Device { (0, 1.0) } else { (1, ROLLBACK_RATE) };
         let (failed, strikes, rate) =
             (trainer.progress.iteration + 1, trainer.progress.strikes + strike, trainer.progress.rate_scale);

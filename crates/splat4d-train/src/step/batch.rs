@@ -84,11 +84,6 @@ impl Batch {
     pub(super) fn seen(&self) -> &[usize] {
         &self.seen
     }
-
-    /// The frames' names, for messages.
-    pub(super) fn names(&self, frames: &dyn Frames) -> String {
-        self.seen.iter().map(|&i| frames.name(i)).collect::<Vec<_>>().join(", ")
-    }
 }
 
 /// The ways of the points that are seen in frame i, to another training frame of its camera that sees some of them: flow

@@ -37,17 +37,28 @@ pub struct StepPlan<'a> {
     pub min_opacity: f64,
 }
 
-/// The result of a step.
-#[derive(Clone, Debug, Default)]
-pub struct Stepped {
-    /// Losses, timings and gradients to times and cameras.
-    pub report: StepReport,
+/// What a step measured.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Measured {
+    /// Number of the step, from 1.
+    pub iteration: usize,
+    /// Everything that it minimised.
+    pub loss: f64,
     /// L1 of the last view.
     pub l1: f64,
     /// SSIM of the last view.
     pub ssim: f64,
     /// Mean squared error over the step's views.
     pub mse: f64,
+}
+
+/// The result of a step.
+#[derive(Clone, Debug, Default)]
+pub struct Stepped {
+    /// Timings and gradients to times and cameras; losses too, where the step is done.
+    pub report: StepReport,
+    /// What steps measured that are done now and were not before: this one, or, of a device that is still at it, earlier ones.
+    pub measured: Vec<Measured>,
     /// Loading pictures.
     pub load: Duration,
     /// Adam.
@@ -56,8 +67,6 @@ pub struct Stepped {
     pub other: Duration,
     /// Gaussians born, moved, removed.
     pub change: Change,
-    /// Milliseconds of the stages of the last view, where a device that took the whole step tells them.
-    pub stages: Vec<(&'static str, f64)>,
     /// What the user should know of the device that draws.
     pub notices: Vec<String>,
 }
@@ -71,23 +80,35 @@ pub enum Blame {
     Device,
 }
 
-/// A step that was spoilt, so that nothing of the learner is to be trusted any more: what and where, and by what.
+/// A step that was spoilt, so that nothing of the learner is to be trusted any more: what and where, by what, and the numbers of the
+/// frames that it looked at, where it is not the last one that was begun.
 #[derive(Clone, Debug)]
-pub struct Fault(pub String, pub Blame);
+pub struct Fault(pub String, pub Blame, pub Option<Vec<usize>>);
 
 /// Takes steps on a learner.
 pub trait Engine: Send {
-    /// One step: evaluate, draw, compare, back, Adam, noise. Inner error: it was spoilt. Errors: those of what draws.
+    /// One step: evaluate, draw, compare, back, Adam, noise. A device may still be at it afterwards. Inner error: it, or one before it,
+    /// was spoilt. Errors: those of what draws.
     fn step(&mut self, learner: &mut Learner, plan: &mut StepPlan<'_>) -> Result<Result<Stepped, Fault>>;
 
     /// The learner was changed in other ways than by a step (it was settled before), or another stage begins: what is remembered
     /// of it is stale.
     fn changed(&mut self, learner: &Learner);
 
-    /// Brings the learner up to date, where its numbers are kept elsewhere: asked before anybody looks at them. Errors: they
-    /// are lost.
-    fn settle(&mut self, _learner: &mut Learner) -> Result<(), Fault> {
-        Ok(())
+    /// Waits for the steps that a device is still at: what they measured. Errors: one was spoilt.
+    fn catch_up(&mut self, _learner: &Learner) -> Result<Vec<Measured>, Fault> {
+        Ok(Vec::new())
+    }
+
+    /// The same, and brings the learner up to date, where its numbers are kept elsewhere: asked before anybody looks at them. Errors:
+    /// they are lost.
+    fn settle(&mut self, _learner: &mut Learner) -> Result<Vec<Measured>, Fault> {
+        Ok(Vec::new())
+    }
+
+    /// Milliseconds of the stages of the last view that is done, where a device that takes whole steps tells them.
+    fn stages(&mut self) -> Vec<(&'static str, f64)> {
+        Vec::new()
     }
 
     /// As it draws.
@@ -128,14 +149,18 @@ fn rests(progress: f64) -> f64 {
     EXPOSURE_END.powf(((progress - EXPOSURE_RESTS) / (1.0 - EXPOSURE_RESTS)).max(0.0))
 }
 
+/// The rate of the cameras' exposures; 0: they rest.
+pub(super) fn exposure_rate(plan: &StepPlan<'_>) -> f64 {
+    if plan.stage.freeze_exposure { 0.0 } else { plan.exposure_lr * plan.rate_scale * rests(plan.info.progress) }
+}
+
 /// Adam on the cameras' exposures.
-pub(super) fn learn_exposure(learner: &mut Learner, plan: &StepPlan<'_>) {
+fn learn_exposure(learner: &mut Learner, plan: &StepPlan<'_>) {
     if let Some(exposure) = learner.parts_mut().exposure {
         match plan.stage.freeze_exposure {
             true => exposure.rest(),
             false => {
-                let rest = rests(plan.info.progress);
-                let _ = exposure.step(plan.exposure_lr * plan.rate_scale * rest);
+                let _ = exposure.step(exposure_rate(plan));
             }
         }
     }
@@ -211,7 +236,9 @@ impl<'a> CpuEngine<'a> {
         let (backend, grads) = (self.backend.as_mut(), &mut self.grads);
         out.report = self.chain.step(&step, backend, &mut losses, grads, &mut |o| stats.observe(o))?;
         out.notices.extend(std::iter::from_fn(|| self.backend.notice()));
-        (out.l1, out.ssim, out.mse) = (plan.loss.l1, plan.loss.ssim, plan.loss.mse());
+        let (iteration, loss) = (plan.info.iteration + 1, out.report.loss);
+        let TrainLoss { l1, ssim, .. } = *plan.loss;
+        out.measured = vec![Measured { iteration, loss, l1, ssim, mse: plan.loss.mse() }];
         Ok(())
     }
 
@@ -240,14 +267,14 @@ impl<'a> CpuEngine<'a> {
     /// Names the first number that is not finite, if the step was not sound.
     fn sound(&self, scene: &Scene<f32>, report: &StepReport, bad: &[(usize, Key)]) -> Result<(), Fault> {
         let Some(&(layer, key)) = bad.first() else {
-            let fault = || Fault(format!("the loss is {}", report.loss), Blame::Numbers);
+            let fault = || Fault(format!("the loss is {}", report.loss), Blame::Numbers, None);
             return if report.loss.is_finite() { Ok(()) } else { Err(fault()) };
         };
         let params = &scene.layers[layer].params;
         let place = self.grads[layer].table(key).first_non_finite().or_else(|| params[key].first_non_finite());
         let (row, col) = place.unwrap_or((0, 0));
         let column = params.column_name(key, col);
-        Err(Fault(format!("`{column}` of Gaussian {row} of layer {layer} is not finite"), Blame::Numbers))
+        Err(Fault(format!("`{column}` of Gaussian {row} of layer {layer} is not finite"), Blame::Numbers, None))
     }
 
     /// Noise on positions, where the stage has it.

@@ -3,20 +3,22 @@
 
 use super::chain::ImageTerm;
 use super::engine::{
-    Blame, CpuEngine, Engine, Fault, Rates, StepPlan, Stepped, learn_exposure, noise_rate, noise_stream, rates_of,
+    Blame, CpuEngine, Engine, Fault, Measured, Rates, StepPlan, Stepped, exposure_rate, noise_rate, noise_stream,
+    rates_of,
 };
 use crate::Result;
 use crate::learner::{Learner, Parts};
 use crate::loss::terms::KeptLoss;
 use crate::optim::corrections;
-use splat4d::layers::{ALPHA_MIN, ALWAYS, Layer};
-use splat4d::motion::{Polynomial, Slices};
+use splat4d::device::KeptMotion;
+use splat4d::layers::{ALPHA_MIN, ALWAYS};
 use splat4d::render::{
-    Antialias, Backend, KEPT, KeptLayer, KeptNoise, KeptRule, KeptStep, KeptTable, KeptTies, KeptView, Moves,
-    RowWeights, Target,
+    Antialias, Backend, KEPT, KeptCameras, KeptLayer, KeptNoise, KeptRule, KeptStep, KeptStepped, KeptTable, KeptTies,
+    KeptView, Moves, RowWeights, Target,
 };
 use splat4d::scene::life::LOG_WIDTH;
-use splat4d::scene::{GEOMETRY, Key, LIFE, LifeKind, SH, Time};
+use splat4d::scene::{Key, LIFE, LifeKind};
+use std::collections::VecDeque;
 use std::time::Instant as Clock;
 
 /// Who has the newest numbers.
@@ -30,6 +32,15 @@ enum Newest {
     Device,
 }
 
+/// A step that the device is still at.
+struct UnderWay {
+    /// From 1.
+    iteration: usize,
+    /// Share of D-SSIM in the loss, by view, and the frames.
+    dssim: Vec<f64>,
+    frames: Vec<usize>,
+}
+
 /// See the module's documentation.
 pub(super) struct DeviceEngine<'a> {
     cpu: CpuEngine<'a>,
@@ -41,14 +52,26 @@ pub(super) struct DeviceEngine<'a> {
     /// See [`rates_of`].
     rates: Rates,
     /// Tables that are kept, by layer.
-    known: Vec<Known>,
+    known: Vec<KeptMotion>,
+    under_way: VecDeque<UnderWay>,
+    /// What steps measured that are done, not told yet.
+    ready: Vec<Measured>,
 }
 
 impl<'a> DeviceEngine<'a> {
     /// An engine that draws with `backend`, and takes steps with it where it keeps tables.
     pub(super) fn new(backend: Box<dyn Backend<f32> + 'a>) -> Self {
         let (cpu, rates) = (CpuEngine::new(backend), Rates::default());
-        Self { cpu, newest: Newest::Learner, given_up: false, told: false, rates, known: Vec::new() }
+        Self {
+            cpu,
+            newest: Newest::Learner,
+            given_up: false,
+            told: false,
+            rates,
+            known: Vec::new(),
+            under_way: VecDeque::new(),
+            ready: Vec::new(),
+        }
     }
 
     /// Tells once why the CPU keeps the tables of a device that could.
@@ -65,12 +88,17 @@ impl<'a> DeviceEngine<'a> {
         plan: &mut StepPlan<'_>,
         notices: Vec<String>,
     ) -> Result<Result<Stepped, Fault>> {
-        if let Err(fault) = self.settle(learner) {
-            return Ok(Err(fault));
-        }
+        let before = match self.settle(learner) {
+            Ok(measured) => measured,
+            Err(fault) => return Ok(Err(fault)),
+        };
         self.newest = Newest::Learner;
         let stepped = self.cpu.step(learner, plan)?;
-        Ok(stepped.map(|s| Stepped { notices: notices.into_iter().chain(s.notices).collect(), ..s }))
+        Ok(stepped.map(|s| Stepped {
+            notices: notices.into_iter().chain(s.notices).collect(),
+            measured: before.into_iter().chain(s.measured).collect(),
+            ..s
+        }))
     }
 
     /// Hands the tables over, if what is kept is stale.
@@ -80,49 +108,57 @@ impl<'a> DeviceEngine<'a> {
         }
         let scene = learner.scene();
         let ties = plan.stage.params.iter().find_map(|loss| loss.ties(scene));
-        let of_layer = |(i, known): (usize, &Known)| kept(learner, i, known, ties.as_ref().filter(|_| i == 0));
+        let of_layer = |(i, known): (usize, &KeptMotion)| kept(learner, i, known, ties.as_ref().filter(|_| i == 0));
         let layers: Vec<KeptLayer<'_>> = self.known.iter().enumerate().map(of_layer).collect();
         let resident = self.cpu.backend().resident().expect("only such a device keeps tables");
-        resident.keep(&layers, &corrections::<f32>())?;
+        let cameras = learner.exposure.as_ref().map(|exposure| {
+            let (params, moments) = (&exposure.params[exposure.key()], exposure.moments.table(exposure.key()));
+            let table = KeptTable { width: params.width(), params: params.data(), moments: moments.data() };
+            KeptCameras { count: params.rows(), table, held: exposure.trained() }
+        });
+        resident.keep(&layers, cameras.as_ref(), &corrections::<f32>())?;
         self.newest = Newest::Both;
         Ok(())
     }
-}
 
-/// What a device knows of a layer: its motion, and its tables in the order of [`KEPT`].
-#[derive(Clone, Debug, PartialEq)]
-struct Known {
-    moves: Moves,
-    keys: [Option<Key>; KEPT],
-}
+    /// Remembers what steps measured that are done. Errors: one was spoilt.
+    fn take_in(&mut self, learner: &Learner, done: Vec<KeptStepped>) -> std::result::Result<(), Fault> {
+        for stepped in done {
+            let UnderWay { iteration, dssim, frames } =
+                self.under_way.pop_front().expect("what is done was begun before");
+            let views = dssim.len();
+            let mut now = Measured { iteration, loss: stepped.loss, ..Measured::default() };
+            for (dssim, c) in dssim.into_iter().zip(&stepped.comparisons) {
+                now.loss += (1.0 - dssim) * c.l1 + dssim * (1.0 - c.ssim);
+                (now.l1, now.ssim) = (c.l1, c.ssim);
+                now.mse += c.mse / views as f64;
+            }
+            let wrong = match stepped.bad {
+                Some([layer, table, row]) => {
+                    let params = &learner.scene().layers[layer].params;
+                    let column = self.known[layer].keys[table].map_or("?", |key| params.column_name(key, 0));
+                    Some(format!("the table of `{column}` is not finite at Gaussian {row} of layer {layer}"))
+                }
+                None => (!now.loss.is_finite()).then(|| format!("the loss is {}", now.loss)),
+            };
+            if let Some(what) = wrong {
+                return Err(Fault(format!("{what}, at step {iteration}"), Blame::Numbers, Some(frames)));
+            }
+            self.ready.push(now);
+        }
+        Ok(())
+    }
 
-impl Known {
-    /// As all these times see it; none: no device knows such motion.
-    fn new(layer: &Layer<f32>, times: &[Time]) -> Option<Self> {
-        let life = (layer.life != LifeKind::Infinite).then_some(LIFE);
-        let known =
-            |moves, own: [Option<Key>; 2]| Self { moves, keys: [Some(GEOMETRY), life, own[0], own[1], Some(SH)] };
-        let still = Moves::Along { order: 0, rotation: false, detach: false, origin: 0.0 };
-        if let Some(polynomial) = layer.motion.polynomial() {
-            let Polynomial { order, velocities, rotation_rates, origin, detached } = polynomial;
-            let moves = Moves::Along { order, rotation: rotation_rates.is_some(), detach: detached, origin };
-            return Some(known(moves, [velocities, rotation_rates]));
-        }
-        if let Some(Slices { own, speed, floor, ceiling, harmonics, period }) = layer.motion.slices() {
-            return Some(known(Moves::Sliced { speed, floor, ceiling, harmonics, period }, [Some(own), None]));
-        }
-        // Pictures of several frames, or of a time between two, are the CPU's.
-        let page = layer.motion.pose_table(*times.first()?)?;
-        let one = times.iter().all(|t| layer.motion.pose_table(*t) == Some(page));
-        one.then(|| match page {
-            GEOMETRY => known(still, [None; 2]),
-            _ => known(Moves::Posed, [Some(page), None]),
-        })
+    /// The fault of a device that failed with the only numbers.
+    fn gone(&mut self, why: &str) -> Fault {
+        self.given_up = true;
+        let text = format!("the GPU that kept the tables failed, and training goes on on the CPU: {why}");
+        Fault(text, Blame::Device, None)
     }
 }
 
 /// A layer as a device takes it over.
-fn kept<'a>(learner: &'a Learner, index: usize, known: &Known, ties: Option<&'a KeptTies>) -> KeptLayer<'a> {
+fn kept<'a>(learner: &'a Learner, index: usize, known: &KeptMotion, ties: Option<&'a KeptTies>) -> KeptLayer<'a> {
     let layer = &learner.scene().layers[index];
     let table = |key: Option<Key>| {
         key.map_or(KeptTable::default(), |key| {
@@ -141,7 +177,7 @@ fn kept<'a>(learner: &'a Learner, index: usize, known: &Known, ties: Option<&'a 
 }
 
 /// What a device knows of all layers for a step, or why the step is the CPU's.
-fn known(learner: &Learner, plan: &StepPlan<'_>, rates: &Rates) -> std::result::Result<Vec<Known>, String> {
+fn known(learner: &Learner, plan: &StepPlan<'_>, rates: &Rates) -> std::result::Result<Vec<KeptMotion>, String> {
     let (stage, scene) = (&*plan.stage, learner.scene());
     let of_stage = [
         (!stage.probes.is_empty(), "losses look at several times"),
@@ -154,7 +190,7 @@ fn known(learner: &Learner, plan: &StepPlan<'_>, rates: &Rates) -> std::result::
     }
     let mut all = Vec::new();
     for (layer, rates) in scene.layers.iter().zip(rates) {
-        let Some(known) = Known::new(layer, &plan.info.times) else {
+        let Some(known) = KeptMotion::new(layer, &plan.info.times) else {
             return Err(format!("the GPU does not know the motion of `{}`", layer.name));
         };
         let plain = layer.masks.is_none() && layer.span == ALWAYS && layer.cross_fade == [0.0; 2];
@@ -199,8 +235,8 @@ fn noise(plan: &StepPlan<'_>, layer: usize) -> Option<KeptNoise> {
 }
 
 /// By layer and table, how it learns.
-fn rules(learner: &Learner, plan: &StepPlan<'_>, rates: &Rates, known: &[Known]) -> Vec<[Option<KeptRule>; KEPT]> {
-    let of_layer = |(index, known): (usize, &Known)| {
+fn rules(learner: &Learner, plan: &StepPlan<'_>, rates: &Rates, known: &[KeptMotion]) -> Vec<[Option<KeptRule>; KEPT]> {
+    let of_layer = |(index, known): (usize, &KeptMotion)| {
         let (layer, rates) = (&learner.scene().layers[index], &rates[index]);
         known.keys.map(|key| {
             let key = key.filter(|&k| layer.params.info(k).trainable && layer.params[k].width() > 0)?;
@@ -236,8 +272,9 @@ impl Engine for DeviceEngine<'_> {
             }
         };
         if known != self.known {
-            if let Err(fault) = self.settle(learner) {
-                return Ok(Err(fault));
+            match self.settle(learner) {
+                Ok(measured) => self.ready = measured,
+                Err(fault) => return Ok(Err(fault)),
             }
             (self.newest, self.known) = (Newest::Learner, known);
         }
@@ -251,7 +288,7 @@ impl Engine for DeviceEngine<'_> {
             .views
             .iter()
             .zip(targets)
-            .map(|(v, target)| KeptView { camera: v.camera, t: v.t, background: v.background, target })
+            .map(|(v, target)| KeptView { camera: v.camera, t: v.t, background: v.background, target, rig: v.rig })
             .collect();
         let rules = rules(learner, plan, &self.rates, &self.known);
         let noise: Vec<_> = (0..rules.len()).map(|layer| noise(plan, layer)).collect();
@@ -262,69 +299,76 @@ impl Engine for DeviceEngine<'_> {
             rules: &rules,
             rows: row_weights(plan),
             noise: &noise,
+            cameras: exposure_rate(plan),
         };
         let resident = self.cpu.backend().resident().expect("it was there before");
-        let stepped = match resident.step(&step) {
-            Ok(Some(stepped)) => stepped,
+        let done = match resident.step(&step) {
+            Ok(Some(done)) => done,
             // A picture too large for one piece: the CPU's engine draws it in several.
             Ok(None) => return self.step_on_cpu(learner, plan, notices),
             Err(error) => {
-                self.given_up = true;
                 if self.newest == Newest::Both {
                     // Nothing is lost: the learner is as it was before this step.
+                    self.given_up = true;
                     self.newest = Newest::Learner;
                     self.tell(&error.to_string(), &mut notices);
                     return self.step_on_cpu(learner, plan, notices);
                 }
-                return Ok(Err(gone(&error)));
+                return Ok(Err(self.gone(&error.to_string())));
             }
         };
         self.newest = Newest::Device;
-        let stages = self.cpu.backend().resident().map_or_else(Vec::new, |resident| resident.stages());
-        let mut out = Stepped { notices, stages, ..Stepped::default() };
-        let Parts { scene, exposure, .. } = learner.parts_mut();
-        let mut image = plan.loss.of_step(&mut plan.stage.pictures, exposure);
-        for (view, comparison) in plan.views.iter().zip(&stepped.comparisons) {
-            let value = image.compared(view, comparison);
-            out.report.loss += value;
-            out.report.view_losses.push(value);
+        self.under_way.push_back(UnderWay {
+            iteration: plan.info.iteration + 1,
+            dssim: views.iter().map(|v| v.target.dssim).collect(),
+            frames: plan.views.iter().map(|v| v.frame).collect(),
+        });
+        if let Err(fault) = self.take_in(learner, done) {
+            return Ok(Err(fault));
         }
-        out.report.loss += stepped.loss;
-        (out.l1, out.ssim, out.mse) = (plan.loss.l1, plan.loss.ssim, plan.loss.mse());
+        let measured = std::mem::take(&mut self.ready);
+        let mut out = Stepped { notices, measured, ..Stepped::default() };
         out.report.timings.render = clock.elapsed();
-        if let Some([layer, table, row]) = stepped.bad {
-            let params = &scene.layers[layer].params;
-            let column = self.known[layer].keys[table].map_or("?", |key| params.column_name(key, 0));
-            let what = format!("the table of `{column}` is not finite at Gaussian {row} of layer {layer}");
-            return Ok(Err(Fault(what, Blame::Numbers)));
-        }
-        if !out.report.loss.is_finite() {
-            return Ok(Err(Fault(format!("the loss is {}", out.report.loss), Blame::Numbers)));
-        }
-        learn_exposure(learner, plan);
         Ok(Ok(out))
     }
 
     fn changed(&mut self, learner: &Learner) {
         self.newest = Newest::Learner;
+        self.under_way.clear();
+        self.ready.clear();
         self.cpu.changed(learner);
     }
 
-    fn settle(&mut self, learner: &mut Learner) -> Result<(), Fault> {
-        if self.newest != Newest::Device {
-            return Ok(());
+    fn catch_up(&mut self, learner: &Learner) -> std::result::Result<Vec<Measured>, Fault> {
+        if !self.under_way.is_empty() {
+            match self.cpu.backend().resident().map(|resident| resident.finish()) {
+                Some(Ok(done)) => self.take_in(learner, done)?,
+                Some(Err(error)) => return Err(self.gone(&error.to_string())),
+                None => return Err(self.gone("it is no longer there")),
+            }
         }
-        let Parts { scene, moments, stats, .. } = learner.parts_mut();
-        for (index, layer) in scene.layers.iter_mut().enumerate() {
-            let fetched = self.cpu.backend().resident().map(|resident| resident.fetch(index));
-            let numbers = match fetched {
-                Some(Ok(numbers)) => numbers,
-                Some(Err(error)) => {
-                    self.given_up = true;
-                    return Err(gone(&error));
-                }
-                None => return Err(Fault("the GPU that kept the tables is gone".into(), Blame::Device)),
-            };
+        Ok(std::mem::take(&mut self.ready))
+    }
+
+    fn settle(&mut self, learner: &mut Learner) -> std::result::Result<Vec<Measured>, Fault> {
+        let measured = self.catch_up(learner)?;
+        if self.newest != Newest::Device {
+            return Ok(measured);
+        }
+        let Parts { scene, moments, stats, exposure } = learner.parts_mut();
+        let fetched = match self.cpu.backend().resident() {
+            None => Err("it is no longer there".to_owned()),
+            Some(resident) => {
+                let layers: Result<Vec<_>> = (0..scene.layers.len()).map(|layer| resident.fetch(layer)).collect();
+                let all = layers.and_then(|layers| Ok((layers, resident.fetch_cameras()?)));
+                all.map_err(|error| error.to_string())
+            }
+        };
+        let (layers, cameras) = match fetched {
+            Ok(fetched) => fetched,
+            Err(why) => return Err(self.gone(&why)),
+        };
+        for (index, (layer, numbers)) in scene.layers.iter_mut().zip(layers).enumerate() {
             for (table, key) in self.known[index].keys.into_iter().enumerate() {
                 let Some(key) = key.filter(|&k| layer.params[k].width() > 0) else { continue };
                 let [params] = layer.params.get_mut([key]);
@@ -333,17 +377,19 @@ impl Engine for DeviceEngine<'_> {
             }
             stats.tables[index].data_mut().copy_from_slice(&numbers.stats);
         }
+        if let Some(exposure) = exposure {
+            exposure.take_over(&cameras);
+        }
         // Whoever looks may change something, statistics too.
         self.newest = Newest::Learner;
-        Ok(())
+        Ok(measured)
+    }
+
+    fn stages(&mut self) -> Vec<(&'static str, f64)> {
+        self.cpu.backend().resident().map_or_else(Vec::new, |resident| resident.stages())
     }
 
     fn antialias(&self) -> Antialias {
         self.cpu.antialias()
     }
-}
-
-/// The fault of a device that failed with the only numbers.
-fn gone(error: &crate::Error) -> Fault {
-    Fault(format!("the GPU that kept the tables failed, and training goes on on the CPU: {error}"), Blame::Device)
 }

@@ -5,7 +5,7 @@ use super::chain::StepInfo;
 use super::clocks::Look;
 use super::emphasis::Emphasis;
 use super::engine::{Blame, Engine, StepPlan};
-pub use super::engine::{Fault, Stepped};
+pub use super::engine::{Fault, Measured, Stepped};
 use super::loss::TrainLoss;
 use super::pace::Pace;
 use super::resident::DeviceEngine;
@@ -301,23 +301,21 @@ impl<'a> Trainer<'a> {
         let load = clock.elapsed();
         let mut out = match self.learn()? {
             Ok(stepped) => Stepped { load, ..stepped },
-            Err(fault) => {
-                let views = self.batch.names(self.frames.as_ref());
-                return Ok(Err(Fault(format!("{} ({views})", fault.0), fault.1)));
-            }
+            Err(fault) => return Ok(Err(self.named(fault))),
         };
         self.correct(&out)?;
         let clock = Clock::now();
         let (place, next) = (self.progress.stage_step, self.next_place());
-        if self.looked_at_after(place + 1..=next)
-            && let Err(fault) = self.settle()
-        {
-            return Ok(Err(fault));
+        if self.looked_at_after(place + 1..=next) {
+            match self.settle() {
+                Ok(measured) => out.measured.extend(measured),
+                Err(fault) => return Ok(Err(fault)),
+            }
         }
         out.change = self.keep_up(place + 1..=next, |_| true)?;
         if self.scene().is_empty() {
             let what = "not one Gaussian is left: all of them became transparent or huge";
-            return Ok(Err(Fault(what.into(), Blame::Numbers)));
+            return Ok(Err(Fault(what.into(), Blame::Numbers, None)));
         }
         self.progress.iteration += 1;
         self.progress.taken += 1;
@@ -330,9 +328,32 @@ impl<'a> Trainer<'a> {
     }
 
     /// Brings the learner up to date, which a device may keep: before anybody looks at it between steps. It is so by itself at the
-    /// end of every stage. Errors: its numbers are lost, and the run must go back to a checkpoint.
-    pub fn settle(&mut self) -> std::result::Result<(), Fault> {
-        self.engine.settle(&mut self.learner)
+    /// end of every stage. Returns what steps measured that were not done yet. Errors: its numbers are lost, and the run must go back
+    /// to a checkpoint.
+    pub fn settle(&mut self) -> std::result::Result<Vec<Measured>, Fault> {
+        self.engine.settle(&mut self.learner).map_err(|fault| self.named(fault))
+    }
+
+    /// Waits for the steps that a device is still at, and leaves the learner with it. Returns and errors: as of
+    /// [`settle`](Self::settle).
+    pub fn catch_up(&mut self) -> std::result::Result<Vec<Measured>, Fault> {
+        self.engine.catch_up(&self.learner).map_err(|fault| self.named(fault))
+    }
+
+    /// Milliseconds of the stages of the last view that is done, where a device that takes whole steps tells them.
+    pub fn stages(&mut self) -> Vec<(&'static str, f64)> {
+        self.engine.stages()
+    }
+
+    /// A fault with the names of the frames that were looked at, where they may be to blame.
+    fn named(&self, fault: Fault) -> Fault {
+        let Fault(what, blame, frames) = fault;
+        if blame == Blame::Device {
+            return Fault(what, blame, None);
+        }
+        let frames = frames.as_deref().unwrap_or(self.batch.seen());
+        let names: Vec<String> = frames.iter().map(|&i| self.frames.name(i)).collect();
+        Fault(format!("{what} ({})", names.join(", ")), blame, None)
     }
 
     /// Whether upkeep, a hook or another stage looks at the learner after these steps of the stage's schedule.

@@ -1,6 +1,6 @@
 // A step of Adam on one table of a layer. Twin of splat4d-train's optim/adam.rs, where the equations stand.
 //
-// Bindings, group 0: 0 rule; 1 counts ([2]: pairs); 2 params, 3 gradient: buffers of `stride` columns, of which the table has
+// Bindings, group 0: 0 rule; 1 counts ([3]: stopped); 2 params, 3 gradient: buffers of `stride` columns, of which the table has
 // some; 4 moments: a buffer of `moments_stride` columns, first and second moments and the row's step count; 5 alive: the rows that
 // take part; 6 corrections by step count, made by the CPU; 7 status, a word a table: one more than the last row whose number
 // is not finite. Seven storage buffers.
@@ -23,7 +23,7 @@ struct Rule {
     counted: u32,         // entries of corrections
     floor_column: u32,    // lifted to floor_least; none: width
     floor_least: f32,
-    capacity: u32,        // pairs that there is room for
+    first_row: u32,       // of this page of the table
     word: u32,            // of status
     start: u32,           // first column of this piece, and how many it has
     columns: u32,
@@ -49,7 +49,7 @@ fn at(row: u32, column: u32, width: u32) -> u32 {
 @compute @workgroup_size(ROW_THREADS)
 fn adam(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = id.x;
-    if (row >= rule.rows || counts[2] > rule.capacity) {
+    if (row >= rule.rows || counts[3] != 0u) {
         return;
     }
     if (alive[row] == 0u) {
@@ -86,6 +86,6 @@ fn adam(@builtin(global_invocation_id) id: vec3<u32>) {
         }
     }
     if (bad) {
-        atomicMax(&status[rule.word], row + 1u);
+        atomicMax(&status[rule.word], rule.first_row + row + 1u);
     }
 }

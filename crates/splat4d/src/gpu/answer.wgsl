@@ -2,7 +2,7 @@
 // frame of `tracked`, with the life of layers/envelope.rs; learnt.wgsl is put in front of this file.
 //
 // Bindings, group 0: 0 ask; 1 params; out: 2 geometry as splats.wgsl reads it (mean 3, covariance 6, opacity 1; opacity 0
-// where the row is not alive), 3 alive, 1 a row that is alive at the time of any of the step's views. Three storage buffers.
+// where the row is not alive), 3 alive, 1 a row that is alive at the time of any of the step's views; 4 counts ([3]: stopped). Four storage buffers.
 // A thread owns one row.
 
 const GEOMETRY_WIDTH: u32 = 10u;
@@ -11,6 +11,7 @@ const GEOMETRY_WIDTH: u32 = 10u;
 @group(0) @binding(1) var<storage, read> params: array<f32>;
 @group(0) @binding(2) var<storage, read_write> geometry: array<f32>;
 @group(0) @binding(3) var<storage, read_write> alive: array<u32>;
+@group(0) @binding(4) var<storage, read> counts: array<u32>;
 
 // Phrased so that what is not a number is kept and found by Adam, not hidden.
 fn dead(row: u32, opacity: f32, sigma: f32) -> bool {
@@ -29,7 +30,8 @@ fn dead(row: u32, opacity: f32, sigma: f32) -> bool {
 @compute @workgroup_size(ROW_THREADS)
 fn answer(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = id.x;
-    if (row >= ask.rows) {
+    // Who lives in a step that has stopped must stay known.
+    if (row >= ask.rows || counts[3] != 0u) {
         return;
     }
     let g = moved(ask, row, delta_of(ask, row));

@@ -1,7 +1,7 @@
 // From the gradients of a layer's splats to those of its rows. Twin of Motion::backward for `still`, `spacetime` and a frame of
 // `tracked`, of the life's VJP in layers/envelope.rs; learnt.wgsl and put.wgsl are put in front of this file.
 //
-// Bindings, group 0: 0 ask; 1 counts ([2]: pairs); 2 params; 3 back as colors_back.wgsl left it (mean, opacity; covariance);
+// Bindings, group 0: 0 ask; 1 counts ([3]: stopped); 2 params; 3 back as colors_back.wgsl left it (mean, opacity; covariance);
 // out: 4 d_params, laid out as params: overwritten by the step's first view, added to by the others. Four storage buffers.
 // A thread owns one row.
 
@@ -14,7 +14,7 @@
 @compute @workgroup_size(ROW_THREADS)
 fn answer_back(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = id.x;
-    if (row >= ask.rows || counts[2] > ask.capacity) {
+    if (row >= ask.rows || counts[3] != 0u) {
         return;
     }
     let splat = 5u * (ask.first_splat + row);

@@ -4,8 +4,7 @@ use super::buffers::{SPARE, UNIFORM_STRIDE};
 use super::clock::{Recorder, STAGES, TIMES_BYTES};
 use super::frame::{Back, Band, Frame, RECORD_BYTES, TILE, count};
 use super::kernels::BackKernels;
-use super::resident::KeptPass;
-use super::{GpuRenderer, pixel_rows};
+use super::{GpuRenderer, Way, pixel_rows};
 use crate::render::project::{CAMERA, Projection};
 use crate::render::rasterize::CHANNELS;
 use crate::render::shade::{self, ShadeGrads};
@@ -61,8 +60,6 @@ pub(super) struct Came {
     pub counts: Vec<u32>,
     /// What the tiles add to the loss.
     pub partials: Vec<f32>,
-    /// What Adam found of tables that stay.
-    pub words: Vec<u32>,
     /// Milliseconds of the wait, and of the stages.
     pub wait: f64,
     pub stages: [f64; STAGES],
@@ -70,13 +67,11 @@ pub(super) struct Came {
 
 /// Where a way back ends.
 #[derive(Clone, Copy)]
-pub(super) enum End<'a> {
+pub(super) enum End {
     /// At sums of records, to which another band adds.
     Band,
     /// At the splats, whose gradients the CPU reads.
     Splats,
-    /// At tables that stay; the first byte of the words of Adam.
-    Kept(&'a KeptPass<'a>, u64),
 }
 
 impl GpuRenderer {
@@ -136,7 +131,8 @@ impl GpuRenderer {
             let flags = flag(grads.alpha.is_some(), FLAG_ALPHA)
                 | flag(shot.depth && grads.depth.is_some(), FLAG_DEPTH)
                 | flag(self.config.abs_grads, FLAG_ABS);
-            self.write_uniforms(shot, band, across, [flags, sums_at, u32::from(i > 0)])?;
+            let way = Way { flags, sums_at, further: i > 0, ..Way::default() };
+            self.write_uniforms(shot, band, across, way)?;
             self.send_gradient(shot, grads, band);
             let mut came = self.return_band((band, pairs), across, bands.len() > 1, last, &layout)?;
             self.timings.back_wait += came.wait;
@@ -178,17 +174,13 @@ impl GpuRenderer {
         size: [usize; 2],
         partials: usize,
     ) -> Result<Layout> {
-        let (gpu, b) = (&self.gpu, &mut self.buffers);
         let most = |f: &dyn Fn(&(Band, usize)) -> u64| self.drawn.iter().map(f).max().unwrap_or(0);
         let pixels = most(&|(band, _)| (size[0] * pixel_rows(*band, size[1])) as u64);
         let tiles = most(&|(band, _)| (across * band.rows) as u64);
         let records = most(&|(band, pairs)| RECORD_BYTES * *pairs as u64 + 12 * (across * band.rows) as u64);
         let groups: usize = self.upload.draws.iter().map(|draw| draw.groups()).sum();
-        b.d_planes.ensure(gpu, 20 * pixels)?;
-        b.records.ensure(gpu, records)?;
-        b.sums.ensure(gpu, 48 * n as u64)?;
-        b.back.ensure(gpu, (4 * NUMBERS * n) as u64)?;
-        b.cameras.ensure(gpu, (4 * CAMERA * groups) as u64)?;
+        self.make_room_for_gradients(n, pixels, records)?;
+        let (gpu, b) = (&self.gpu, &mut self.buffers);
         let cameras = ((4 * NUMBERS * n) as u64).next_multiple_of(UNIFORM_STRIDE);
         let sums = (cameras + (4 * CAMERA * groups) as u64).next_multiple_of(UNIFORM_STRIDE);
         let times = (sums + 12 * tiles).next_multiple_of(UNIFORM_STRIDE);
@@ -198,6 +190,18 @@ impl GpuRenderer {
         let layout = Layout { cameras, sums, times, counts, partials: partials_at, all };
         b.back_staging.ensure(gpu, layout.all)?;
         Ok(layout)
+    }
+
+    /// Buffers of the gradients to `n` splats and to so many pixels, and of so many bytes of records.
+    pub(super) fn make_room_for_gradients(&mut self, n: usize, pixels: u64, records: u64) -> Result<()> {
+        let (gpu, b) = (&self.gpu, &mut self.buffers);
+        let groups: usize = self.upload.draws.iter().map(|draw| draw.groups()).sum();
+        b.d_planes.ensure(gpu, 20 * pixels)?;
+        b.records.ensure(gpu, records)?;
+        b.sums.ensure(gpu, 48 * n as u64)?;
+        b.back.ensure(gpu, (4 * NUMBERS * n) as u64)?;
+        b.cameras.ensure(gpu, (4 * CAMERA * groups) as u64)?;
+        Ok(())
     }
 
     /// Sends the gradient to a band's planes.
@@ -243,7 +247,7 @@ impl GpuRenderer {
         mut recorder: Recorder<'_>,
         (band, pairs): (Band, usize),
         across: usize,
-        end: End<'_>,
+        end: End,
         layout: &Layout,
     ) -> Result<Came> {
         let last = matches!(end, End::Splats);
@@ -259,10 +263,6 @@ impl GpuRenderer {
             back.splats(&mut recorder, &self.upload)?;
             recorder.copy(b.back.get(), staging, 0, (4 * NUMBERS * n) as u64);
             recorder.copy(b.cameras.get(), staging, layout.cameras, (4 * CAMERA * groups) as u64);
-        }
-        if let End::Kept(kept, words_at) = end {
-            back.splats(&mut recorder, &self.upload)?;
-            kept.learn(gpu, b, &self.upload, words_at, &mut recorder)?;
         }
         recorder.copy_from(b.records.get(), RECORD_BYTES * pairs as u64, staging, layout.sums, 12 * tiles as u64);
         recorder.copy(b.counts.get(), staging, layout.counts, 4 * count::ALL as u64);
@@ -296,7 +296,6 @@ impl GpuRenderer {
             camera,
             counts: bytemuck::pod_collect_to_vec(at(layout.counts, 4 * count::ALL)),
             partials: bytemuck::pod_collect_to_vec(&view[layout.partials as usize..]),
-            words: Vec::new(),
             wait: 0.0,
             stages: if timed { recorder.stages(&stamps) } else { recorder.by_wall },
         };

@@ -29,6 +29,8 @@ struct Blend {
     pixel_rows: u32,
     flags: u32,
     sums_at: u32, // number of the first sum behind the records
+    skipped: u32, // rows of pixels of the planes above the band, and all of theirs
+    plane_rows: u32,
 }
 
 @group(0) @binding(0) var<uniform> view: View;

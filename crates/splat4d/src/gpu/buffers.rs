@@ -24,6 +24,11 @@ impl Grown {
         Self { what, usage, buffer: None }
     }
 
+    /// A buffer that was made already.
+    pub(super) fn of(what: &'static str, buffer: wgpu::Buffer) -> Self {
+        Self { what, usage: buffer.usage(), buffer: Some(buffer) }
+    }
+
     /// Storage that copies may read and write.
     pub(super) fn storage(what: &'static str) -> Self {
         Self::new(what, Usage::STORAGE | Usage::COPY_SRC | Usage::COPY_DST)
@@ -48,6 +53,9 @@ impl Grown {
             let mib = |b: u64| b.div_ceil(1 << 20);
             let text = format!("{} need {} MiB in one GPU buffer, {} MiB are allowed", self.what, mib(size), mib(most));
             return Err(Error::new(ErrorKind::Unsupported, text).remedy("Render on the CPU."));
+        }
+        if gpu.refused == Some(self.what) {
+            return Err(gpu.error(ErrorKind::Memory, format!("{size} bytes of {}", self.what)));
         }
         // The old one goes first: both together may be more than there is.
         self.buffer = None;

@@ -232,24 +232,34 @@ impl<'a> Recorder<'a> {
 
     /// Milliseconds of the stages from the timestamps of [`Recorder::resolve`].
     pub(crate) fn stages(&self, stamps: &[u64]) -> [f64; STAGES] {
-        let period = f64::from(self.gpu.queue.get_timestamp_period()) * 1e-6;
-        let mut out = [0.0; STAGES];
-        for (i, pair) in (self.recorded[0]..self.recorded[1]).zip(stamps.chunks_exact(2)) {
-            out[i] = pair[1].saturating_sub(pair[0]) as f64 * period;
-        }
-        out
+        stages(self.gpu, self.recorded, stamps)
+    }
+
+    /// First and one past the last stage that was recorded.
+    pub(crate) fn recorded(&self) -> [usize; 2] {
+        self.recorded
     }
 
     /// Submits what was recorded so far.
-    pub(crate) fn submit(&mut self) {
+    pub(crate) fn submit(&mut self) -> wgpu::SubmissionIndex {
         let done = std::mem::replace(&mut self.encoder, encoder(self.gpu));
-        self.gpu.queue.submit([done.finish()]);
+        self.gpu.queue.submit([done.finish()])
     }
 
     fn flush(&mut self) -> Result<()> {
         self.submit();
         self.gpu.wait()
     }
+}
+
+/// Milliseconds of the stages that were recorded, from their timestamps.
+pub(super) fn stages(gpu: &Gpu, recorded: [usize; 2], stamps: &[u64]) -> [f64; STAGES] {
+    let period = f64::from(gpu.queue.get_timestamp_period()) * 1e-6;
+    let mut out = [0.0; STAGES];
+    for (i, pair) in (recorded[0]..recorded[1]).zip(stamps.chunks_exact(2)) {
+        out[i] = pair[1].saturating_sub(pair[0]) as f64 * period;
+    }
+    out
 }
 
 fn encoder(gpu: &Gpu) -> wgpu::CommandEncoder {

@@ -2,7 +2,7 @@
 // densification wants to know of it. Twin of the VJP in render/shade.rs and of Stats::observe in splat4d-train's learner.rs;
 // render/project.wgsl, render/shade.wgsl and learnt.wgsl are put in front of this file.
 //
-// Bindings, group 0: 0 view; 1 ask; 2 counts ([2]: pairs); 3 geometry as answer.wgsl wrote it, 4 params: here the SH table; in and
+// Bindings, group 0: 0 view; 1 ask; 2 counts ([3]: stopped); 3 geometry as answer.wgsl wrote it, 4 params: here the SH table; in and
 // out: 5 back as splats_back.wgsl wrote it, whose means are added to; 6 d_sh, as the SH table; 7 stats, three columns a row: sum
 // of |dL/dmean2d|, number of views that drew it, largest radius; 8 weights of the blocks of SH, of which the gradients take the
 // place. Seven storage buffers.
@@ -52,8 +52,8 @@ fn sh_basis_gradient(d: vec3<f32>) -> array<vec3<f32>, 16> {
 @compute @workgroup_size(ROW_THREADS)
 fn colors_back(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = id.x;
-    // With too many pairs there are no gradients: the view is drawn again.
-    if (row >= ask.rows || counts[2] > ask.capacity) {
+    // Where steps have stopped there are no gradients: the view is drawn again.
+    if (row >= ask.rows || counts[3] != 0u) {
         return;
     }
     if ((ask.flags & ASK_FIRST) != 0u) {

@@ -31,6 +31,8 @@ pub struct Gpu {
     pub(super) queue: wgpu::Queue,
     /// Of the kernels that are compiled for it.
     pub(super) tuning: Tuning,
+    /// Buffers for which there is no memory, where tests say so.
+    pub(super) refused: Option<&'static str>,
     info: wgpu::AdapterInfo,
     trouble: Trouble,
 }
@@ -59,6 +61,11 @@ impl Gpu {
                 .remedy("Update its driver, or render on the CPU.")
         };
         let (own, least) = (adapter.limits(), wgpu::Limits::default());
+        if let Some(what) = lacking(&own) {
+            return Err(Error::new(ErrorKind::Unsupported, what)
+                .at(&info.name)
+                .remedy("Update its driver, or render on the CPU."));
+        }
         let limits = wgpu::Limits {
             max_buffer_size: own.max_buffer_size.max(least.max_buffer_size),
             max_storage_buffer_binding_size: own
@@ -82,7 +89,7 @@ impl Gpu {
             };
             first.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert((kind, e.to_string()));
         }));
-        Ok(Self { device, queue, tuning: Tuning::default(), info, trouble })
+        Ok(Self { device, queue, tuning: Tuning::default(), refused: None, info, trouble })
     }
 
     /// The same with other constants in the kernels that are compiled from now on.
@@ -117,9 +124,16 @@ impl Gpu {
 
     /// Waits until all work has been done.
     pub(super) fn wait(&self) -> Result<()> {
-        self.device
-            .poll(wgpu::PollType::wait_indefinitely())
-            .map_err(|e| self.error(ErrorKind::Unsupported, e.to_string()))?;
+        self.poll(wgpu::PollType::wait_indefinitely())
+    }
+
+    /// Waits until some work has been done, and not for what came after it.
+    pub(super) fn wait_for(&self, work: &wgpu::SubmissionIndex) -> Result<()> {
+        self.poll(wgpu::PollType::Wait { submission_index: Some(work.clone()), timeout: None })
+    }
+
+    fn poll(&self, until: wgpu::PollType) -> Result<()> {
+        self.device.poll(until).map_err(|e| self.error(ErrorKind::Unsupported, e.to_string()))?;
         self.check()
     }
 
@@ -131,7 +145,7 @@ impl Gpu {
         }
     }
 
-    fn error(&self, kind: ErrorKind, text: String) -> Error {
+    pub(super) fn error(&self, kind: ErrorKind, text: String) -> Error {
         let what = match kind {
             ErrorKind::Memory => "the GPU has too little memory",
             _ => "the GPU's driver failed",
@@ -147,6 +161,15 @@ fn all_adapters() -> Vec<wgpu::Adapter> {
     descriptor.backends = wgpu::Backends::PRIMARY;
     descriptor.flags = wgpu::InstanceFlags::from_build_config() - wgpu::InstanceFlags::VALIDATION_INDIRECT_CALL;
     block_on(wgpu::Instance::new(descriptor).enumerate_adapters(wgpu::Backends::PRIMARY))
+}
+
+/// The first of WebGPU's default limits that a driver does not have.
+fn lacking(own: &wgpu::Limits) -> Option<String> {
+    let mut first = None;
+    wgpu::Limits::default().check_limits_with_fail_fn(own, true, |limit, needed, allowed| {
+        first = Some(format!("the GPU's driver allows {allowed} of `{limit}`, {needed} are needed"));
+    });
+    first
 }
 
 fn rank(kind: wgpu::DeviceType) -> u8 {
@@ -168,5 +191,19 @@ fn block_on<T>(future: impl Future<Output = T>) -> T {
             return value;
         }
         std::thread::yield_now();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_limit_that_a_driver_lacks_is_named() {
+        let own = wgpu::Limits::default();
+        assert_eq!(lacking(&own), None);
+        let poor = wgpu::Limits { max_storage_buffers_per_shader_stage: 4, ..own };
+        let what = lacking(&poor).expect("four are too few");
+        assert!(what.contains("4 of `max_storage_buffers_per_shader_stage`, 8 are needed"), "{what}");
     }
 }

@@ -41,7 +41,9 @@ pub(super) mod count {
     pub(crate) const SPLATS: usize = 0;
     pub(crate) const VISIBLE: usize = 1;
     pub(crate) const PAIRS: usize = 2;
-    pub(crate) const ALL: usize = 3;
+    /// Where steps on tables that stay have stopped (scan.wgsl, record.wgsl), and the pairs that were wanted.
+    pub(crate) const STOP: usize = 3;
+    pub(crate) const ALL: usize = 5;
 }
 
 /// The two buffers of arguments, and what is in each: triples of u32, first for a thread a thing, then for a workgroup a
@@ -75,11 +77,11 @@ pub(super) fn uniform(buffers: &Buffers, slot: usize, size: u64) -> BindingResou
 /// Bytes of the structures in WGSL.
 pub(super) const VIEW_BYTES: u64 = 128;
 const PIECE_BYTES: u64 = 80;
-const SCAN_BYTES: u64 = 16;
+const SCAN_BYTES: u64 = 32;
 const SORT_BYTES: u64 = 8;
 const BAND_BYTES: u64 = 16;
 const BLEND_BYTES: u64 = 48;
-const LOSS_BYTES: u64 = 128;
+const LOSS_BYTES: u64 = 80;
 
 /// Everything that is bound, made anew when a buffer is.
 #[derive(Debug)]
@@ -312,21 +314,24 @@ pub(super) struct Back<'a> {
 }
 
 impl Back<'_> {
-    /// Compares the planes of the last [`Frame::band`], a whole picture, with a truth, and writes the gradient to them.
+    /// Compares the planes, a whole picture, with a truth, as a camera shows them that responds like one of `responses`, and writes
+    /// the gradient to them.
     pub(super) fn loss(
         &self,
         recorder: &mut Recorder<'_>,
-        truth: &Grown,
+        truth: &wgpu::Buffer,
+        responses: &Grown,
         [across, down]: [usize; 2],
     ) -> crate::Result<()> {
         let (k, b) = (&self.kernels.loss, self.frame.buffers);
         let group = [
             uniform(b, slot::LOSS, LOSS_BYTES),
             b.planes.all(),
-            truth.all(),
+            truth.as_entire_binding(),
             b.maps.all(),
             b.d_planes.all(),
             b.partials.all(),
+            responses.all(),
         ];
         let group = k.bind(self.frame.gpu, &group);
         recorder.stage(Stage::Loss, |pass| {

@@ -107,6 +107,19 @@ pub(super) struct Kernels {
 }
 
 impl Kernels {
+    /// The sort, whose last dispatch has a form with subgroups.
+    pub(super) fn sort(gpu: &Gpu, subgroups: bool) -> Kernel {
+        let last = if subgroups { "scatter_subgroup" } else { "scatter" };
+        let files: &[&str] = if subgroups { &[wgsl::SORT, wgsl::SORT_SUBGROUP] } else { &[wgsl::SORT] };
+        Self::sort_of(gpu, files, last)
+    }
+
+    /// The same from these texts, with the name of its last dispatch.
+    pub(super) fn sort_of(gpu: &Gpu, files: &[&str], last: &str) -> Kernel {
+        let bindings = [Uniform, Read, Read, Read, Write, Write, Write];
+        Kernel::new(gpu, "sort", files, &bindings, &["histogram", "scan", last])
+    }
+
     /// Compiles everything.
     pub(super) fn new(gpu: &Gpu) -> Self {
         Self {
@@ -131,13 +144,7 @@ impl Kernels {
                 &[Read, Read, Read, Read, Write, Write],
                 &["compact"],
             ),
-            sort: Kernel::new(
-                gpu,
-                "sort",
-                &[wgsl::SORT],
-                &[Uniform, Read, Read, Read, Write, Write, Write],
-                &["histogram", "scan", "scatter"],
-            ),
+            sort: Self::sort(gpu, gpu.has_subgroups() && gpu.tuning.sort_subgroups),
             tiles: Kernel::new(
                 gpu,
                 "tiles",
@@ -185,6 +192,8 @@ pub(super) struct ResidentKernels {
     pub adam: Kernel,
     /// shake
     pub shake: Kernel,
+    /// view_sums, cameras, record
+    pub record: Kernel,
 }
 
 impl ResidentKernels {
@@ -195,7 +204,7 @@ impl ResidentKernels {
                 gpu,
                 "answer",
                 &[wgsl::LEARNT, wgsl::ANSWER],
-                &[Uniform, Read, Write, Write],
+                &[Uniform, Read, Write, Write, Read],
                 &["answer"],
             ),
             colors_back: Kernel::new(
@@ -216,7 +225,7 @@ impl ResidentKernels {
                 gpu,
                 "slice",
                 &[wgsl::LEARNT, wgsl::NUMBERS, wgsl::SLICE, wgsl::SLICE_ANSWER],
-                &[Uniform, Read, Write, Write, Write],
+                &[Uniform, Read, Write, Write, Write, Read],
                 &["answer"],
             ),
             slice_back: Kernel::new(
@@ -254,6 +263,13 @@ impl ResidentKernels {
                 &[Uniform, Uniform, Read, Read, Write],
                 &["shake"],
             ),
+            record: Kernel::new(
+                gpu,
+                "record",
+                &[wgsl::RECORD],
+                &[Uniform, Write, Read, Write, Write, Read],
+                &["view_sums", "cameras", "record"],
+            ),
         }
     }
 }
@@ -280,7 +296,7 @@ impl BackKernels {
                 gpu,
                 "loss",
                 &[wgsl::LOSS],
-                &[Uniform, Read, Read, Write, Write, Write],
+                &[Uniform, Read, Read, Write, Write, Write, Read],
                 &["moments", "gradient"],
             ),
             rasterize: Kernel::new(

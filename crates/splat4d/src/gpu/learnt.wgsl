@@ -37,7 +37,7 @@ struct Ask {
     alpha_min: f32,     // least opacity of a row that is alive
     widest: f32,        // widths from the centre at which no row is
     first_splat: u32,
-    capacity: u32,      // pairs that there is room for
+    first_row: u32,     // of this page of the layer
     sh_width: u32,
     blocks: u32,        // of spherical harmonics
     poses_at: u32,      // mean and quaternion: 0, or where the poses of a tracked frame are

@@ -4,9 +4,10 @@
 // Two dispatches, a workgroup a tile of 16 x 16 pixels: `moments` writes the derivatives of SSIM to the local moments, and
 // what the tile adds to the value; `gradient` blurs these derivatives and writes the gradient to the drawn picture.
 // Bindings, group 0: 0 loss; 1 planes as rasterize.wgsl wrote them; 2 truth: a word a pixel with 8 bits for red, green, blue
-// and weight, or four planes of f32 (the weight's is there only where pixels have one); 3 maps: nine planes, three a colour;
-// 4 d_planes: gradient to red, green and blue; 5 partials: sixteen numbers a tile, |error|, SSIM and squared error with
-// weights, one unused, the twelve of the camera's matrix and offsets. Five storage buffers, 14.5 KiB of workgroup memory.
+// and weight, or three planes of f32, behind which is a plane of weights where pixels have some that are not of 8 bits; 3 maps:
+// nine planes, three a colour; 4 d_planes: gradient to red, green and blue; 5 partials: sixteen numbers a tile, |error|, SSIM and
+// squared error with weights, one unused, the twelve of the camera's matrix and offsets; 6 responses: those twelve, a camera after
+// the other, without the identity. Six storage buffers, 14.5 KiB of workgroup memory.
 // A thread owns a pixel; in the passes along rows, every 256th number of the tile and its halo.
 
 const TILE: u32 = 16u;
@@ -25,6 +26,7 @@ const C2: f32 = 9e-4;
 const LOSS_PACKED: u32 = 1u;
 const LOSS_WEIGHTED: u32 = 2u;
 const LOSS_RESPONSE: u32 = 4u;
+const LOSS_PLANE: u32 = 8u; // of weights
 
 struct Loss {
     width: u32,
@@ -32,8 +34,8 @@ struct Loss {
     flags: u32,
     d_l1: f32,   // dL/d sum of w |x - y|
     d_ssim: f32, // dL/d sum of w S
+    response: u32, // the camera's first number
     taps: array<vec4<f32>, 3>,
-    response: array<vec4<f32>, 3>, // a row a channel: matrix without the identity, offset
 }
 
 @group(0) @binding(0) var<uniform> loss: Loss;
@@ -42,6 +44,7 @@ struct Loss {
 @group(0) @binding(3) var<storage, read_write> maps: array<f32>;
 @group(0) @binding(4) var<storage, read_write> d_planes: array<f32>;
 @group(0) @binding(5) var<storage, read_write> partials: array<f32>;
+@group(0) @binding(6) var<storage, read> responses: array<f32>;
 
 // Of `moments` the picture and the truth, of `gradient` three maps.
 var<workgroup> wide: array<array<f32, 676>, 3>;
@@ -56,10 +59,11 @@ fn weight_of(at: u32) -> f32 {
     if ((loss.flags & LOSS_WEIGHTED) == 0u) {
         return 1.0;
     }
-    if ((loss.flags & LOSS_PACKED) != 0u) {
+    if ((loss.flags & LOSS_PLANE) == 0u) {
         return f32(truth[at] >> 24u) / 255.0;
     }
-    return bitcast<f32>(truth[3u * loss.width * loss.height + at]);
+    let planes_before = select(3u, 1u, (loss.flags & LOSS_PACKED) != 0u);
+    return bitcast<f32>(truth[planes_before * loss.width * loss.height + at]);
 }
 
 fn truth_of(at: u32, channel: u32) -> f32 {
@@ -74,13 +78,19 @@ fn drawn_of(at: u32) -> vec3<f32> {
     return vec3<f32>(planes[at], planes[plane + at], planes[2u * plane + at]);
 }
 
+// What the camera makes of the colours: its matrix without the identity, and an offset.
+fn response_of(channel: u32) -> vec4<f32> {
+    let row = loss.response + 3u * channel;
+    return vec4<f32>(responses[row], responses[row + 1u], responses[row + 2u], responses[loss.response + 9u + channel]);
+}
+
 // A channel as the camera shows it.
 fn shown_of(at: u32, channel: u32) -> f32 {
     if ((loss.flags & LOSS_RESPONSE) == 0u) {
         return planes[channel * loss.width * loss.height + at];
     }
     let drawn = drawn_of(at);
-    let row = loss.response[channel];
+    let row = response_of(channel);
     return drawn[channel] + dot(row.xyz, drawn) + row.w;
 }
 
@@ -243,7 +253,7 @@ fn gradient(
             drawn = drawn_of(at);
         }
         for (var channel = 0u; channel < 3u; channel++) {
-            d_drawn += d[channel] * loss.response[channel].xyz;
+            d_drawn += d[channel] * response_of(channel).xyz;
         }
         let to = NUMBERS * (group.y * groups.x + group.x);
         for (var channel = 0u; channel < 3u; channel++) {

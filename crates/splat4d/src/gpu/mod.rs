@@ -40,13 +40,13 @@ use crate::render::{
 use crate::scene::{Planes, Table};
 use crate::{Error, ErrorKind, Result};
 use back::Returned;
-use buffers::{Buffers, UNIFORM_STRIDE, largest_binding};
+use buffers::{Buffers, Grown, UNIFORM_STRIDE, largest_binding};
 use clock::{Queries, Recorder, TIMES_BYTES};
 use frame::{Band, DIGITS, Frame, Groups, RANGE_BYTES, THREADS, TILE, arguments, count, slot};
 use kernels::{BackKernels, Kernels};
 use pictures::Pictures;
 use rayon::prelude::*;
-use resident::Tables as KeptTables;
+use resident::{AHEAD, Flights, Tables as KeptTables};
 use std::time::Instant;
 use upload::Upload;
 
@@ -102,7 +102,14 @@ pub struct GpuRenderer {
     drawn: Vec<(Band, usize)>,
     returned: Returned,
     pictures: Pictures,
+    /// How a camera shows what is drawn, where no tables stay.
+    response: Grown,
     resident: Option<Box<KeptTables>>,
+    flights: Flights,
+    /// Steps that may be under way, rows of tiles of a band in them, and rows of a page of their tables, where tests say so.
+    ahead: usize,
+    band_rows: usize,
+    page_rows: Option<usize>,
 }
 
 impl GpuRenderer {
@@ -130,7 +137,12 @@ impl GpuRenderer {
             drawn: Vec::new(),
             returned: Returned::default(),
             pictures: Pictures::new(),
+            response: Grown::storage("a camera's response"),
             resident: None,
+            flights: Flights::default(),
+            ahead: AHEAD,
+            band_rows: usize::MAX,
+            page_rows: None,
         })
     }
 
@@ -192,11 +204,13 @@ impl GpuRenderer {
         let mut projected = false;
         while let Some(band) = bands.pop() {
             fresh |= self.make_room_for_band(band, across, w)?;
+            let read = counts_at(plane_bytes(band, w)) + UNIFORM_STRIDE + TIMES_BYTES;
+            self.buffers.staging.ensure(&self.gpu, read)?;
             if fresh || self.groups.is_none() {
                 self.groups = Some(Groups::new(&self.gpu, &self.kernels, &self.buffers));
                 fresh = false;
             }
-            self.write_uniforms(shot, band, across, [0; 3])?;
+            self.write_uniforms(shot, band, across, Way::default())?;
             let pairs = self.draw(band, [w, h], !projected, out)?;
             projected = true;
             if pairs <= self.pair_capacity() {
@@ -272,7 +286,6 @@ impl GpuRenderer {
         b.bytes.ensure(gpu, planes / PLANES as u64)?;
         let mut fresh = b.ranges.ensure(gpu, RANGE_BYTES * (band.rows * across) as u64)?;
         fresh |= b.planes.ensure(gpu, planes)?;
-        fresh |= b.staging.ensure(gpu, counts_at(planes) + UNIFORM_STRIDE + TIMES_BYTES)?;
         Ok(fresh)
     }
 
@@ -281,17 +294,16 @@ impl GpuRenderer {
         (self.buffers.pair_keys[0].bytes() / 4) as usize
     }
 
-    /// Writes every uniform of a submission. `back`: of the way back, flags and place of the sums in `Blend`, and whether
-    /// records are added to those of earlier bands.
-    fn write_uniforms(&mut self, shot: &Shot<'_, f32>, band: Band, across: usize, back: [u32; 3]) -> Result<()> {
+    /// Writes every uniform of a submission.
+    fn write_uniforms(&mut self, shot: &Shot<'_, f32>, band: Band, across: usize, way: Way) -> Result<()> {
         let draws = &self.upload.draws;
         self.uniforms.clear();
         self.uniforms.resize((slot::PIECES + draws.len()) * UNIFORM_STRIDE as usize, 0);
         let capacity = self.pair_capacity() as u32;
         let out = &mut self.uniforms;
         put(out, slot::VIEW, &view(shot, &self.config, self.stats.splats));
-        put(out, slot::SCAN_VISIBLE, &[count::SPLATS as u32, count::VISIBLE as u32, 0, u32::MAX]);
-        put(out, slot::SCAN_PAIRS, &[count::VISIBLE as u32, count::PAIRS as u32, 0, capacity]);
+        put(out, slot::SCAN_VISIBLE, &[count::SPLATS as u32, count::VISIBLE as u32, 0, u32::MAX, way.view]);
+        put(out, slot::SCAN_PAIRS, &[count::VISIBLE as u32, count::PAIRS as u32, 0, capacity, way.view]);
         for (pass, slot) in (slot::SORT_DEPTH..slot::SORT_TILE).enumerate() {
             put(out, slot, &[8 * pass as u32, count::VISIBLE as u32]);
         }
@@ -299,12 +311,15 @@ impl GpuRenderer {
             put(out, slot, &[8 * pass as u32, count::PAIRS as u32]);
         }
         let [first, rows, across] = [band.first, band.rows, across].map(|v| v as u32);
-        put(out, slot::BAND, &[first, rows, across, back[2]]);
+        put(out, slot::BAND, &[first, rows, across, u32::from(way.further)]);
         let c = &self.config;
         let pixel_rows = pixel_rows(band, shot.camera.height) as u32;
         let limits = [c.alpha_limits()[1] as f32, c.transmittance_min.max(0.0) as f32].map(f32::to_bits);
         let [r, g, b] = shot.background.map(f32::to_bits);
-        put(out, slot::BLEND, &[r, g, b, limits[0], limits[1], first, pixel_rows, back[0], back[1], 0, 0, 0]);
+        let [skipped, plane_rows] =
+            if way.whole { [band.first * TILE, shot.camera.height].map(|rows| rows as u32) } else { [0, pixel_rows] };
+        let blend = [r, g, b, limits[0], limits[1], first, pixel_rows, way.flags, way.sums_at, skipped, plane_rows, 0];
+        put(out, slot::BLEND, &blend);
         for (i, draw) in draws.iter().enumerate() {
             put(out, slot::PIECES + i, std::slice::from_ref(&draw.piece));
         }
@@ -442,6 +457,20 @@ impl Backend<f32> for GpuRenderer {
     fn name(&self) -> &str {
         self.gpu.name()
     }
+}
+
+/// What a submission does besides drawing a band.
+#[derive(Clone, Copy, Debug, Default)]
+struct Way {
+    /// Of the way back, flags and place of the sums in `Blend`.
+    flags: u32,
+    sums_at: u32,
+    /// Whether records are added to those of earlier bands.
+    further: bool,
+    /// Whether the planes are those of the whole picture, and not of the band.
+    whole: bool,
+    /// 1 + the view of a step on tables that stay (scan.wgsl); 0: of none.
+    view: u32,
 }
 
 /// Where a picture goes.

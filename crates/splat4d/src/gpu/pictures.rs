@@ -14,40 +14,25 @@ pub(super) const PICTURE_BYTES: u64 = 2 << 30;
 /// Bits of `Loss::flags` in loss.wgsl.
 pub(super) const FLAG_PACKED: u32 = 1;
 pub(super) const FLAG_WEIGHTED: u32 = 2;
+/// Weights of pixels in a plane of their own.
+pub(super) const FLAG_PLANE: u32 = 8;
 /// The largest 8-bit sample, and how far a number may be from one that is sent as such: roundings of a division.
 const LARGEST: f32 = 255.0;
 const SAME: f32 = 1e-7;
 
-/// A picture on the GPU.
-#[derive(Debug)]
+/// A picture on the GPU; another handle to the same memory when it is cloned.
+#[derive(Clone, Debug)]
 pub(super) struct Held {
     /// Its samples, as loss.wgsl reads them.
-    pub buffer: Grown,
+    pub buffer: wgpu::Buffer,
     /// Bits of its flags.
     pub flags: u32,
     /// Sum of its pixels' weights.
     pub weight: f64,
-    size: [usize; 2],
-}
-
-impl Held {
-    fn new() -> Self {
-        Self { buffer: Grown::storage("a picture's truth"), flags: 0, weight: 0.0, size: [0; 2] }
-    }
-
-    /// Sends a picture. Errors: too little memory.
-    fn send(&mut self, gpu: &Gpu, words: &[u32], flags: u32, target: &Target<'_, f32>) -> Result<()> {
-        self.buffer.fit(gpu, size_of_val(words) as u64)?;
-        gpu.queue.write_buffer(self.buffer.get(), 0, bytemuck::cast_slice(words));
-        let pixels = target.truth.pixels() as f64;
-        self.weight = target.weight.map_or(pixels, |w| w.data.iter().map(|x| f64::from(*x)).sum());
-        (self.flags, self.size) = (flags, size(target));
-        gpu.check()
-    }
-}
-
-fn size(target: &Target<'_, f32>) -> [usize; 2] {
-    [target.truth.width, target.truth.height]
+    /// Width and height.
+    pub size: [usize; 2],
+    /// Whether it stays until another is sent in its place.
+    stays: bool,
 }
 
 /// Pictures by their number. What fits into the budget stays; what comes later is sent every time.
@@ -57,8 +42,10 @@ pub(super) struct Pictures {
     bytes: u64,
     /// Most bytes kept; lowered where there is too little memory.
     pub budget: u64,
-    /// The last picture that was not kept.
-    once: Held,
+    /// Memory of pictures that are not kept, which nobody uses now.
+    spare: Vec<Grown>,
+    /// Bytes of these and of those in use.
+    passing: u64,
     words: Vec<u32>,
     /// Pictures sent so far.
     pub sent: usize,
@@ -67,52 +54,73 @@ pub(super) struct Pictures {
 impl Pictures {
     /// None yet.
     pub(super) fn new() -> Self {
-        let (kept, words) = (BTreeMap::new(), Vec::new());
-        Self { kept, bytes: 0, budget: PICTURE_BYTES, once: Held::new(), words, sent: 0 }
+        let (kept, spare, words) = (BTreeMap::new(), Vec::new(), Vec::new());
+        Self { kept, bytes: 0, budget: PICTURE_BYTES, spare, passing: 0, words, sent: 0 }
     }
 
     /// Bytes held.
     pub(super) fn bytes(&self) -> u64 {
-        self.bytes + self.once.buffer.bytes()
+        self.bytes + self.passing
     }
 
-    /// Sees to it that a picture is there. Errors: not even this one has room.
-    pub(super) fn hold(&mut self, gpu: &Gpu, target: &Target<'_, f32>) -> Result<()> {
-        let weighted = |held: &Held| (held.flags & FLAG_WEIGHTED != 0) == target.weight.is_some();
-        match self.kept.get(&target.picture).map(|held| held.size == size(target) && weighted(held)) {
-            Some(true) => return Ok(()),
+    /// A picture on the GPU, which is to be [given back](Self::give_back). Errors: not even this one has room.
+    pub(super) fn hold(&mut self, gpu: &Gpu, target: &Target<'_, f32>) -> Result<Held> {
+        let (size, weighted) = ([target.truth.width, target.truth.height], target.weight.is_some());
+        match self.kept.get(&target.picture) {
+            Some(held) if held.size == size && (held.flags & FLAG_WEIGHTED != 0) == weighted => {
+                return Ok(held.clone());
+            }
             // Pictures are of another size from here on.
-            Some(false) => self.forget(),
+            Some(_) => self.forget(),
             None => {}
         }
         let flags = pack(target, &mut self.words);
         self.sent += 1;
-        if self.bytes + size_of_val(&self.words[..]) as u64 <= self.budget {
-            let mut held = Held::new();
-            match held.send(gpu, &self.words, flags, target) {
+        let pixels = target.truth.pixels() as f64;
+        let weight = target.weight.map_or(pixels, |w| w.data.iter().map(|x| f64::from(*x)).sum());
+        let bytes = size_of_val(&self.words[..]) as u64;
+        if self.bytes + bytes <= self.budget {
+            let mut fresh = Grown::storage("a picture's truth");
+            match fresh.fit(gpu, bytes) {
                 Ok(()) => {
-                    self.bytes += held.buffer.bytes();
-                    self.kept.insert(target.picture, held);
-                    return Ok(());
+                    gpu.queue.write_buffer(fresh.get(), 0, bytemuck::cast_slice(&self.words));
+                    let held = Held { buffer: fresh.get().clone(), flags, weight, size, stays: true };
+                    self.bytes += fresh.bytes();
+                    self.kept.insert(target.picture, held.clone());
+                    return Ok(held);
                 }
-                Err(e) if e.kind() == ErrorKind::Memory => {
-                    self.budget = self.bytes / 2;
-                    self.forget();
-                }
+                Err(e) if e.kind() == ErrorKind::Memory => self.shrink(),
                 Err(e) => return Err(e),
             }
         }
-        self.once.send(gpu, &self.words, flags, target)
+        let fits = self.spare.iter().position(|buffer| buffer.bytes() >= bytes);
+        let mut buffer = fits.map_or_else(|| Grown::storage("a picture's truth"), |at| self.spare.swap_remove(at));
+        if fits.is_none() {
+            buffer.fit(gpu, bytes)?;
+            self.passing += buffer.bytes();
+        }
+        gpu.queue.write_buffer(buffer.get(), 0, bytemuck::cast_slice(&self.words));
+        gpu.check()?;
+        Ok(Held { buffer: buffer.get().clone(), flags, weight, size, stays: false })
     }
 
-    /// A picture that was seen to last.
-    pub(super) fn get(&self, picture: usize) -> &Held {
-        self.kept.get(&picture).unwrap_or(&self.once)
+    /// Takes back a picture that nobody compares with any more.
+    pub(super) fn give_back(&mut self, held: Held) {
+        if !held.stays {
+            self.spare.push(Grown::of("a picture's truth", held.buffer));
+        }
+    }
+
+    /// Keeps half of what is kept now, for want of memory.
+    pub(super) fn shrink(&mut self) {
+        self.budget = self.bytes / 2;
+        self.forget();
     }
 
     fn forget(&mut self) {
         self.kept.clear();
         self.bytes = 0;
+        self.passing -= self.spare.drain(..).map(|buffer| buffer.bytes()).sum::<u64>();
     }
 }
 
@@ -122,25 +130,35 @@ fn sample(x: f32) -> Option<u32> {
     ((0.0..=LARGEST).contains(&k) && (k / LARGEST - x).abs() <= SAME).then_some(k as u32)
 }
 
-/// A picture as loss.wgsl reads it: in 8 bits where that is what its samples are. Returns its flags.
+/// A picture as loss.wgsl reads it: in 8 bits where that is what its samples are, and so its weights. Returns its flags.
 fn pack(target: &Target<'_, f32>, words: &mut Vec<u32>) -> u32 {
     let (truth, pixels) = (target.truth, target.truth.pixels());
-    let weighted = if target.weight.is_some() { FLAG_WEIGHTED } else { 0 };
-    words.resize(pixels, 0);
-    let word = |i: usize| {
-        let at = |plane: &Planes<f32>, c: usize| sample(plane.plane(c)[i]);
-        let weight = target.weight.map_or(Some(0), |w| at(w, 0))?;
-        Some(at(truth, 0)? | at(truth, 1)? << 8 | at(truth, 2)? << 16 | weight << 24)
+    let packed = |words: &mut Vec<u32>, weight: Option<&Planes<f32>>| {
+        words.clear();
+        words.resize(pixels, 0);
+        let word = |i: usize| {
+            let at = |plane: &Planes<f32>, c: usize| sample(plane.plane(c)[i]);
+            let weight = weight.map_or(Some(0), |w| at(w, 0))?;
+            Some(at(truth, 0)? | at(truth, 1)? << 8 | at(truth, 2)? << 16 | weight << 24)
+        };
+        words.par_iter_mut().enumerate().with_min_len(1 << 14).all(|(i, to)| {
+            let word = word(i);
+            *to = word.unwrap_or(0);
+            word.is_some()
+        })
     };
-    let packed = words.par_iter_mut().enumerate().with_min_len(1 << 14).all(|(i, to)| {
-        let word = word(i);
-        *to = word.unwrap_or(0);
-        word.is_some()
-    });
-    if packed {
+    let weighted = if target.weight.is_some() { FLAG_WEIGHTED } else { 0 };
+    if packed(words, target.weight) {
         return FLAG_PACKED | weighted;
     }
-    words.clear();
-    words.extend(truth.data.iter().chain(target.weight.iter().flat_map(|w| &w.data)).map(|x| x.to_bits()));
-    weighted
+    let plane = if target.weight.is_some() { FLAG_PLANE } else { 0 };
+    let mut flags = weighted | plane;
+    if target.weight.is_some() && packed(words, None) {
+        flags |= FLAG_PACKED;
+    } else {
+        words.clear();
+        words.extend(truth.data.iter().map(|x| x.to_bits()));
+    }
+    words.extend(target.weight.iter().flat_map(|w| &w.data).map(|x| x.to_bits()));
+    flags
 }

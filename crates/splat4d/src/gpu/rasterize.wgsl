@@ -4,7 +4,7 @@
 // Bindings, group 0: 0 view; 1 blend; 2 ranges (three u32 a tile; the third is written: one past the last pair that some
 // pixel used), 3 values (pairs, sorted by tile, then nearest first), 4 owners (of a pair: splat and quadrants);
 // 5 shapes, 6 colors; out: 7 planes: red, green, blue over the background, alpha, depth (sum of z alpha T), each
-// [rows of the band][width]. Six storage buffers, 12 KiB of workgroup memory.
+// [rows of the planes][width]. Six storage buffers, 12 KiB of workgroup memory.
 // A workgroup owns a tile of 16 x 16 pixels, 64 neighbouring threads a quadrant of it, a thread a pixel; splats are
 // read in batches by all threads together.
 
@@ -26,6 +26,8 @@ struct Blend {
     pixel_rows: u32, // rows of pixels of the band
     flags: u32,      // of rasterize_back.wgsl, as what follows
     sums_at: u32,
+    skipped: u32,    // rows of pixels of the planes above the band, and all of theirs
+    plane_rows: u32,
 }
 
 @group(0) @binding(0) var<uniform> view: View;
@@ -127,8 +129,8 @@ fn rasterize(
         ranges[3u * tile + 2u] = atomicLoad(&last_used);
     }
     if (inside) {
-        let plane = width * blend.pixel_rows;
-        let at = y * width + x;
+        let plane = width * blend.plane_rows;
+        let at = (blend.skipped + y) * width + x;
         let color = sum.xyz + t * blend.background;
         planes[at] = color.x;
         planes[plane + at] = color.y;

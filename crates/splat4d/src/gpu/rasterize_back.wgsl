@@ -46,7 +46,7 @@ fn rasterize_back(
     var open = x < width && y < blend.pixel_rows;
     var own: Seen;
     if (open) {
-        own = seen(y * width + x, width * blend.pixel_rows);
+        own = seen((blend.skipped + y) * width + x, width * blend.plane_rows);
     }
     let g = own.g;
     var rest = own.rest;

@@ -92,7 +92,7 @@ fn rasterize_back(
         open[p] = x < width && y < blend.pixel_rows;
         var own: Seen;
         if (open[p]) {
-            own = seen(y * width + x, width * blend.pixel_rows);
+            own = seen((blend.skipped + y) * width + x, width * blend.plane_rows);
         }
         g[p] = own.g;
         rest[p] = own.rest;

@@ -1,12 +1,18 @@
 //! Tables that stay on the GPU: rows become splats, splats a picture, and its loss steps of Adam, without a number of them
 //! passing through the CPU. Densification, files and whatever else looks at a scene fetch the tables, and hand them back.
+//!
+//! Tables of more rows than a binding holds lie in pages of whole blocks, each with buffers and dispatches of its own; every row
+//! has a thread to itself, so that pages change no bit of the tables.
 
+mod cameras;
+mod film;
+mod flight;
 #[cfg(test)]
 mod tests;
 mod ties;
 mod uniforms;
 
-use super::buffers::{Buffers, Grown, UNIFORM_STRIDE};
+use super::buffers::{Buffers, Grown, UNIFORM_STRIDE, largest_binding};
 use super::clock::{Recorder, Stage};
 use super::device::Gpu;
 use super::frame::{THREADS, count, slot};
@@ -14,14 +20,17 @@ use super::kernels::{Kernel, ResidentKernels};
 use super::upload::Upload;
 use super::{GpuRenderer, MOST_GROUPS};
 use crate::render::{
-    KEPT, KeptLayer, KeptNumbers, KeptStep, KeptStepped, KeptTable, Moves, Resident, RowWeights, Shot,
+    KEPT, KeptCameras, KeptLayer, KeptNumbers, KeptStep, KeptStepped, KeptTable, Moves, Resident, RowWeights,
 };
-use crate::scene::{BLOCK, LifeKind, Splats};
+use crate::scene::{BLOCK, LifeKind};
 use crate::{Error, ErrorKind, Result};
+use cameras::Cameras;
+use flight::Begun;
+pub(super) use flight::{AHEAD, Flights};
 use std::borrow::Cow;
 use std::ops::Range;
 use ties::Tied;
-use uniforms::{Ask, MOST_COLUMNS, Rule};
+use uniforms::{Ask, MOST_COLUMNS, RecordRule, Rule};
 
 /// Number of the SH table; those before it lie side by side in one buffer.
 const SH: usize = KEPT - 1;
@@ -30,7 +39,7 @@ const GEOMETRY_WIDTH: usize = 10;
 const STATS_WIDTH: usize = 3;
 /// Pieces in which Adam takes the widest table: three blocks of SH of degree 3.
 const PIECES: usize = 3;
-/// Structures a layer in the buffer of uniforms: what is asked, a rule a piece of a table, losses on rows, noise, ties.
+/// Structures a page in the buffer of uniforms: what is asked, a rule a piece of a table, losses on rows, noise, ties.
 mod at {
     pub(super) const ASK: usize = 0;
     pub(super) const RULES: usize = 1;
@@ -40,9 +49,16 @@ mod at {
     pub(super) const ALL: usize = ROWS + 3;
 }
 
-/// The tables of one layer.
+/// Words of a step's status that are its own, and those of each of its views (record.wgsl).
+const STEP_WORDS: usize = 8;
+const VIEW_WORDS: usize = 8;
+
+/// The tables of one layer, or of a page of its rows.
 #[derive(Debug)]
 struct Kept {
+    /// Number of the layer, and of its first row here.
+    layer: usize,
+    first_row: usize,
     rows: usize,
     moves: Moves,
     life: LifeKind,
@@ -59,9 +75,11 @@ struct Kept {
 }
 
 impl Kept {
-    fn new(layer: &KeptLayer<'_>) -> Self {
+    fn new(index: usize, layer: &KeptLayer<'_>, page: &Range<usize>) -> Self {
         Self {
-            rows: layer.rows,
+            layer: index,
+            first_row: page.start,
+            rows: page.len(),
             moves: layer.moves,
             life: layer.life,
             widths: layer.tables.each_ref().map(|t| t.width),
@@ -123,63 +141,100 @@ fn moments_width(width: usize) -> usize {
 /// Everything that stays.
 #[derive(Debug)]
 pub(super) struct Tables {
-    layers: Vec<Kept>,
-    /// Geometry and SH of the layers, as they are drawn.
+    layers: usize,
+    /// Page after page of layer after layer.
+    pages: Vec<Kept>,
+    /// Geometry and SH of the pages, as they are drawn.
     upload: Upload,
     kernels: ResidentKernels,
     uniforms: Grown,
     corrections: Grown,
     counted: usize,
+    cameras: Cameras,
+    status: Grown,
     staging: Grown,
 }
 
 impl Tables {
     fn new(gpu: &Gpu) -> Self {
         Self {
-            layers: Vec::new(),
+            layers: 0,
+            pages: Vec::new(),
             upload: Upload::default(),
             kernels: ResidentKernels::new(gpu),
             uniforms: Grown::new("uniforms", wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST),
             corrections: Grown::storage("corrections of Adam"),
             counted: 0,
+            cameras: Cameras::new(),
+            status: Grown::storage("a step's status"),
             staging: Grown::new("tables", wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST),
         }
     }
 
     /// Bytes held.
     pub(super) fn bytes(&self) -> u64 {
-        let own = [&self.uniforms, &self.corrections, &self.staging].map(Grown::bytes);
-        self.upload.bytes() + own.iter().sum::<u64>() + self.layers.iter().map(Kept::bytes).sum::<u64>()
+        let own = [&self.uniforms, &self.corrections, &self.staging, &self.status, self.cameras.buffer()];
+        let own: u64 = own.iter().map(|b| b.bytes()).sum();
+        self.upload.bytes() + own + self.pages.iter().map(Kept::bytes).sum::<u64>()
     }
 
-    /// What steps leave in their status.
-    fn status(&self) -> Status {
-        let groups = |f: &dyn Fn(&Kept) -> usize| -> Vec<usize> { self.layers.iter().map(f).collect() };
-        let rows = groups(&|l| l.groups() as usize);
-        let ties = groups(&|l| l.ties.as_ref().map_or(0, |t| t.groups() as usize));
-        let mut next = self.layers.len() * (KEPT + 1);
+    /// What a step of so many views leaves in the status.
+    fn status(&self, views: usize) -> Status {
+        let bad = STEP_WORDS + VIEW_WORDS * views;
+        let alive = bad + self.layers * KEPT;
+        let mut next = alive + self.layers;
         let mut place = |groups: usize| {
             let first = next;
             next += groups;
             first
         };
-        let sums = rows.iter().zip(&ties).map(|(rows, ties)| [place(*rows), place(*ties)]).collect();
-        Status { bad: 0, alive: self.layers.len() * KEPT, sums, words: next }
+        let groups = |l: &Kept| [l.groups() as usize, l.ties.as_ref().map_or(0, |t| t.groups() as usize)];
+        let sums = self.pages.iter().map(groups).map(|groups| groups.map(&mut place)).collect();
+        Status { bad, alive, sums, words: next }
     }
 
     fn rows(&self) -> usize {
-        self.layers.iter().map(|l| l.rows).sum()
+        self.pages.iter().map(|l| l.rows).sum()
+    }
+
+    fn uniform(&self, at: usize, size: usize) -> wgpu::BindingResource<'_> {
+        wgpu::BindingResource::Buffer(wgpu::BufferBinding {
+            buffer: self.uniforms.get(),
+            offset: at as u64 * UNIFORM_STRIDE,
+            size: std::num::NonZeroU64::new(size as u64),
+        })
+    }
+
+    /// What is asked of a page.
+    fn ask(&self, page: usize) -> wgpu::BindingResource<'_> {
+        self.uniform(page * at::ALL + at::ASK, size_of::<Ask>())
+    }
+
+    /// Rows to splats.
+    fn answer(&self, gpu: &Gpu, b: &Buffers, upload: &Upload, recorder: &mut Recorder<'_>) -> Result<()> {
+        let bind = |(i, page): (usize, &Kept)| {
+            let part = &upload.parts[i];
+            let mut group = vec![self.ask(i), page.params.all(), part.geometry.all(), page.alive.all()];
+            if matches!(page.moves, Moves::Sliced { .. }) {
+                group.push(part.weights.all());
+            }
+            group.push(b.counts.all());
+            let [kernel, _] = page.kernels(&self.kernels);
+            Run::new(gpu, kernel, 0, &group, page.row_groups(gpu))
+        };
+        let runs: Vec<_> = self.pages.iter().enumerate().map(bind).collect();
+        recorder.stage(Stage::Answer, |pass| runs.iter().for_each(|run| run.record(pass)))
     }
 }
 
-/// The words that a step leaves behind the loss's sums, from 0 on.
+/// The words of a step behind those of record.wgsl.
 #[derive(Debug)]
 struct Status {
     /// One a table: one more than the last row whose number is not finite.
     bad: usize,
     /// Rows alive, by layer.
     alive: usize,
-    /// By layer the first sums of losses on rows and of ties, one a workgroup.
+    /// By page the first sums of losses on rows and of ties, one a workgroup.
     sums: Vec<[usize; 2]>,
     /// All of them.
     words: usize,
@@ -198,10 +253,18 @@ fn side_by_side(tables: &[(&[f32], usize)]) -> Vec<f32> {
     out
 }
 
-/// The moments of a table of so many rows: zeros where it has not learnt.
-fn history<'a>(table: &KeptTable<'a>, rows: usize) -> Cow<'a, [f32]> {
-    let numbers = rows * moments_width(table.width);
-    if table.moments.is_empty() { Cow::Owned(vec![0.0; numbers]) } else { Cow::Borrowed(table.moments) }
+/// The rows of a page, of whole blocks, of a table with so many columns.
+fn cut<'a>(data: &'a [f32], width: usize, page: &Range<usize>) -> &'a [f32] {
+    &data[page.start * width..page.end * width]
+}
+
+/// The moments of a page of a table: zeros where it has not learnt.
+fn history<'a>(table: &KeptTable<'a>, page: &Range<usize>) -> Cow<'a, [f32]> {
+    let width = moments_width(table.width);
+    match table.moments.is_empty() {
+        true => Cow::Owned(vec![0.0; page.len() * width]),
+        false => Cow::Borrowed(cut(table.moments, width, page)),
+    }
 }
 
 /// The other way round: some columns of tables that lie side by side.
@@ -221,9 +284,9 @@ fn send<T: bytemuck::NoUninit>(gpu: &Gpu, buffer: &mut Grown, data: &[T]) -> Res
 }
 
 /// One view of a step.
-pub(super) struct KeptPass<'a> {
+struct KeptPass<'a> {
     tables: &'a Tables,
-    step: &'a KeptStep<'a>,
+    step: &'a Begun,
     view: usize,
 }
 
@@ -232,90 +295,81 @@ impl KeptPass<'_> {
         self.view + 1 == self.step.views.len()
     }
 
-    /// Words behind the loss's numbers in its buffer.
-    pub(super) fn words(&self) -> usize {
-        self.tables.status().words
-    }
-
     /// Whether losses look at rows.
     fn has_row_losses(&self) -> bool {
         self.step.rows != RowWeights::default()
     }
 
-    /// Writes what is asked and by which rules is learnt, for so many pairs.
-    pub(super) fn write_uniforms(&self, gpu: &Gpu, capacity: usize) {
+    /// Writes what is asked and by which rules is learnt, of a picture of so many tiles.
+    fn write_uniforms(&self, gpu: &Gpu, tiles: usize) {
         let Self { tables, step, view } = *self;
-        let status = tables.status();
-        let mut out = vec![0u8; tables.layers.len() * at::ALL * UNIFORM_STRIDE as usize];
+        let status = tables.status(step.views.len());
+        let mut out = vec![0u8; (tables.pages.len() * at::ALL + 1) * UNIFORM_STRIDE as usize];
         let mut put =
             |at: usize, bytes: &[u8]| out[at * UNIFORM_STRIDE as usize..][..bytes.len()].copy_from_slice(bytes);
         let mut first_splat = 0;
-        for (i, layer) in tables.layers.iter().enumerate() {
+        for (i, page) in tables.pages.iter().enumerate() {
             let slot = |at: usize| i * at::ALL + at;
-            let ask = Ask::new(layer, step, view, first_splat, capacity);
+            let ask = Ask::new(page, step.views[view].t, view == 0, step.alpha_min, first_splat);
             put(slot(at::ASK), bytemuck::bytes_of(&ask));
-            first_splat += layer.rows;
-            for (table, rule) in step.rules[i].iter().enumerate() {
+            first_splat += page.rows;
+            for (table, rule) in step.rules[page.layer].iter().enumerate() {
                 let Some(rule) = rule else { continue };
-                for (piece, from) in layer.pieces(table).enumerate() {
-                    let [counted, word] = [tables.counted, status.bad + i * KEPT + table];
-                    let rule = Rule::new(layer, table, from, rule, [counted, word, capacity]);
+                for (piece, from) in page.pieces(table).enumerate() {
+                    let word = status.bad + page.layer * KEPT + table;
+                    let rule = Rule::new(page, table, from, rule, [tables.counted, word]);
                     put(slot(at::RULES + table * PIECES + piece), bytemuck::bytes_of(&rule));
                 }
             }
             let [row_sums, tie_sums] = status.sums[i];
-            put(slot(at::ROWS), bytemuck::bytes_of(&uniforms::RowRule::new(&step.rows, [status.alive + i, row_sums])));
-            if let Some(noise) = &step.noise[i] {
+            let rows = uniforms::RowRule::new(&step.rows, [status.alive + page.layer, row_sums]);
+            put(slot(at::ROWS), bytemuck::bytes_of(&rows));
+            if let Some(noise) = &step.noise[page.layer] {
                 put(slot(at::NOISE), bytemuck::bytes_of(&uniforms::Noise::new(noise)));
             }
-            if let Some(ties) = &layer.ties {
+            if let Some(ties) = &page.ties {
                 put(slot(at::TIES), bytemuck::bytes_of(&ties.rule(tie_sums)));
             }
         }
+        let record = RecordRule {
+            tiles: tiles as u32,
+            view: view as u32,
+            camera: step.views[view].rig as u32,
+            cameras: tables.cameras.count() as u32,
+            bad_at: status.bad as u32,
+            bad_words: (status.alive - status.bad) as u32,
+            counted: tables.counted as u32,
+            rate: step.cameras as f32,
+        };
+        put(tables.pages.len() * at::ALL, bytemuck::bytes_of(&record));
         gpu.queue.write_buffer(tables.uniforms.get(), 0, &out);
+        if self.is_last() {
+            let zeros = vec![0u8; 4 * (status.words - status.bad)];
+            gpu.queue.write_buffer(tables.status.get(), 4 * status.bad as u64, &zeros);
+        }
     }
 
     fn uniform(&self, at: usize, size: usize) -> wgpu::BindingResource<'_> {
-        wgpu::BindingResource::Buffer(wgpu::BufferBinding {
-            buffer: self.tables.uniforms.get(),
-            offset: at as u64 * UNIFORM_STRIDE,
-            size: std::num::NonZeroU64::new(size as u64),
-        })
+        self.tables.uniform(at, size)
     }
 
-    /// What is asked of a layer.
-    fn ask(&self, layer: usize) -> wgpu::BindingResource<'_> {
-        self.uniform(layer * at::ALL + at::ASK, size_of::<Ask>())
+    /// What is asked of a page.
+    fn ask(&self, page: usize) -> wgpu::BindingResource<'_> {
+        self.tables.ask(page)
     }
 
-    /// Rows to splats.
-    pub(super) fn answer(&self, gpu: &Gpu, upload: &Upload, recorder: &mut Recorder<'_>) -> Result<()> {
-        let bind = |(i, layer): (usize, &Kept)| {
-            let part = &upload.parts[i];
-            let mut group = vec![self.ask(i), layer.params.all(), part.geometry.all(), layer.alive.all()];
-            if matches!(layer.moves, Moves::Sliced { .. }) {
-                group.push(part.weights.all());
-            }
-            let [kernel, _] = layer.kernels(&self.tables.kernels);
-            Run::new(gpu, kernel, 0, &group, layer.row_groups(gpu))
+    /// The sums of the view, the gradients of splats to those of rows, and, after the step's last view, Adam and the record.
+    fn learn(&self, gpu: &Gpu, b: &Buffers, upload: &Upload, recorder: &mut Recorder<'_>) -> Result<()> {
+        let Tables { pages, kernels: k, status, corrections, cameras, .. } = self.tables;
+        let words = status.all();
+        let record = |entry: usize| {
+            let rule = self.uniform(pages.len() * at::ALL, size_of::<RecordRule>());
+            let (counts, partials) = (b.counts.all(), b.partials.all());
+            let group = [rule, counts, partials, status.all(), cameras.buffer().all(), corrections.all()];
+            Run::new(gpu, &k.record, entry, &group, 1)
         };
-        let runs: Vec<_> = self.tables.layers.iter().enumerate().map(bind).collect();
-        recorder.stage(Stage::Answer, |pass| runs.iter().for_each(|run| run.record(pass)))
-    }
-
-    /// The gradients of splats to those of rows, and, after the step's last view, Adam. `status_at`: where in the loss's buffer the
-    /// words are.
-    pub(super) fn learn(
-        &self,
-        gpu: &Gpu,
-        b: &Buffers,
-        upload: &Upload,
-        status_at: u64,
-        recorder: &mut Recorder<'_>,
-    ) -> Result<()> {
-        let Tables { layers, kernels: k, .. } = self.tables;
-        let mut runs = Vec::new();
-        for (i, layer) in layers.iter().enumerate() {
+        let mut runs = vec![record(0)];
+        for (i, layer) in pages.iter().enumerate() {
             let part = &upload.parts[i];
             let view = super::frame::uniform(b, slot::VIEW, super::frame::VIEW_BYTES);
             let colors = [
@@ -337,47 +391,45 @@ impl KeptPass<'_> {
             rows.push(layer.d_params.all());
             runs.push(Run::new(gpu, layer.kernels(k)[1], 0, &rows, layer.row_groups(gpu)));
         }
-        let words = wgpu::BindingResource::Buffer(wgpu::BufferBinding {
-            buffer: b.partials.get(),
-            offset: status_at,
-            size: std::num::NonZeroU64::new((4 * self.words()) as u64),
-        });
         if self.is_last() {
-            layers.iter().enumerate().for_each(|(i, layer)| self.losses(gpu, b, (i, layer), &words, &mut runs));
+            self.losses(gpu, b, &words, &mut runs);
         }
         recorder.stage(Stage::AnswerBack, |pass| runs.iter().for_each(|run| run.record(pass)))?;
         if !self.is_last() {
             return Ok(());
         }
         let mut runs = Vec::new();
-        for (i, layer) in layers.iter().enumerate() {
+        for (i, layer) in pages.iter().enumerate() {
             self.adam(gpu, b, upload, (i, layer), &words, &mut runs);
-            if self.step.noise[i].is_some() {
+            if self.step.noise[layer.layer].is_some() {
                 let noise = self.uniform(i * at::ALL + at::NOISE, size_of::<uniforms::Noise>());
                 let group = [self.ask(i), noise, b.counts.all(), layer.alive.all(), layer.params.all()];
                 runs.push(Run::new(gpu, &k.shake, 0, &group, layer.row_groups(gpu)));
             }
         }
+        if cameras.count() > 0 {
+            runs.push(record(1));
+        }
+        runs.push(record(2));
         recorder.stage(Stage::Adam, |pass| runs.iter().for_each(|run| run.record(pass)))
     }
 
     /// Losses that look at rows, which add to their gradients.
-    fn losses(
-        &self,
-        gpu: &Gpu,
-        b: &Buffers,
-        (i, layer): (usize, &Kept),
-        words: &wgpu::BindingResource<'_>,
-        runs: &mut Vec<Run>,
-    ) {
-        let k = &self.tables.kernels;
+    fn losses(&self, gpu: &Gpu, b: &Buffers, words: &wgpu::BindingResource<'_>, runs: &mut Vec<Run>) {
+        let (k, pages) = (&self.tables.kernels, &self.tables.pages);
         if self.has_row_losses() {
-            let rule = self.uniform(i * at::ALL + at::ROWS, size_of::<uniforms::RowRule>());
-            let (params, alive, d) = (layer.params.all(), layer.alive.all(), layer.d_params.all());
-            let group = [self.ask(i), rule, b.counts.all(), params, alive, d, words.clone()];
-            runs.extend([0, 1].map(|entry| Run::new(gpu, &k.row_losses, entry, &group, layer.groups())));
+            // All pages of a layer are counted before any takes its share.
+            for entry in [0, 1] {
+                for (i, layer) in pages.iter().enumerate() {
+                    let rule = self.uniform(i * at::ALL + at::ROWS, size_of::<uniforms::RowRule>());
+                    let (params, alive, d) = (layer.params.all(), layer.alive.all(), layer.d_params.all());
+                    let group = [self.ask(i), rule, b.counts.all(), params, alive, d, words.clone()];
+                    runs.push(Run::new(gpu, &k.row_losses, entry, &group, layer.groups()));
+                }
+            }
         }
-        if let Some(ties) = &layer.ties {
+        for (i, layer) in pages.iter().enumerate() {
+            let Some(ties) = &layer.ties else { continue };
             let rule = self.uniform(i * at::ALL + at::TIES, size_of::<uniforms::TieRule>());
             let [before, edges, links, turns] = ties.buffers();
             let (params, d) = (layer.params.all(), layer.d_params.all());
@@ -396,7 +448,7 @@ impl KeptPass<'_> {
         runs: &mut Vec<Run>,
     ) {
         let Tables { kernels: k, corrections, .. } = self.tables;
-        for table in (0..KEPT).filter(|&t| self.step.rules[i][t].is_some()) {
+        for table in (0..KEPT).filter(|&t| self.step.rules[layer.layer][t].is_some()) {
             let (params, d, moments) = if table == SH {
                 (&upload.parts[i].tables[0], &layer.d_sh, &layer.sh_moments)
             } else {
@@ -440,37 +492,6 @@ impl Run {
 }
 
 impl GpuRenderer {
-    /// Does something with the tables that stay, whose drawn parts take the place of the last scene's meanwhile.
-    fn with_tables<T>(&mut self, f: impl FnOnce(&mut Self, &Tables) -> T) -> T {
-        let mut tables = self.resident.take().expect("tables are kept before steps are taken");
-        std::mem::swap(&mut self.upload, &mut tables.upload);
-        let out = f(self, &tables);
-        std::mem::swap(&mut self.upload, &mut tables.upload);
-        self.resident = Some(tables);
-        out
-    }
-
-    fn step_kept(&mut self, tables: &Tables, step: &KeptStep<'_>) -> Result<Option<KeptStepped>> {
-        let mut comparisons = Vec::new();
-        let mut words = Vec::new();
-        let nothing = Splats::default();
-        for (i, view) in step.views.iter().enumerate() {
-            let shot = Shot { sh_degree: step.sh_degree, ..Shot::new(&nothing, view.camera, view.background) };
-            let pass = KeptPass { tables, step, view: i };
-            let Some((came, comparison)) = self.compare_with(&shot, &view.target, tables.rows(), Some(&pass))? else {
-                return Ok(None);
-            };
-            comparisons.push(comparison);
-            words = came.words;
-        }
-        let status = tables.status();
-        let bad = words[..status.alive].iter().position(|w| *w != 0);
-        let bad = bad.map(|at| [at / KEPT, at % KEPT, words[at] as usize - 1]);
-        let first = status.sums.first().map_or(status.words, |sums| sums[0]);
-        let loss = words[first..].iter().map(|bits| f64::from(f32::from_bits(*bits))).sum();
-        Ok(Some(KeptStepped { comparisons, loss, bad }))
-    }
-
     /// Copies of the numbers in a buffer.
     fn fetch_buffer(&self, staging: &mut Grown, buffer: &Grown, numbers: usize) -> Result<Vec<f32>> {
         if numbers == 0 {
@@ -497,57 +518,91 @@ impl GpuRenderer {
 }
 
 impl Resident for GpuRenderer {
-    fn keep(&mut self, layers: &[KeptLayer<'_>], corrections: &[[f32; 2]]) -> Result<()> {
+    fn keep(
+        &mut self,
+        layers: &[KeptLayer<'_>],
+        cameras: Option<&KeptCameras<'_>>,
+        corrections: &[[f32; 2]],
+    ) -> Result<()> {
         self.for_training()?;
+        self.forget_flights()?;
         if self.resident.is_none() {
             self.resident = Some(Box::new(Tables::new(&self.gpu)));
         }
+        self.buffers.counts.ensure(&self.gpu, 4 * count::ALL as u64)?;
+        self.go_on();
         let (gpu, tables) = (&self.gpu, self.resident.as_deref_mut().expect("it was made"));
         gpu.check()?;
-        let most = layers.iter().map(|l| l.rows.div_ceil(gpu.tuning.row_threads.min(THREADS))).max().unwrap_or(0);
-        let wide = layers.iter().flat_map(|l| &l.tables).any(|t| t.width > MOST_COLUMNS * PIECES);
-        if most > MOST_GROUPS || wide {
-            return Err(Error::new(ErrorKind::Unsupported, "the scene's tables are too large for the GPU"));
+        if layers.iter().flat_map(|l| &l.tables).any(|t| t.width > MOST_COLUMNS * PIECES) {
+            return Err(Error::new(ErrorKind::Unsupported, "the scene's tables have too many columns for the GPU"));
         }
         send(gpu, &mut tables.corrections, corrections.as_flattened())?;
         tables.counted = corrections.len();
-        tables.uniforms.ensure(gpu, (layers.len() * at::ALL) as u64 * UNIFORM_STRIDE)?;
-        let sizes: Vec<_> = layers.iter().map(|l| (l.rows, l.tables[SH].width, l.moves.blocks())).collect();
-        tables.upload.keep(gpu, &sizes)?;
-        // The old ones' memory is used again where layers stayed.
-        tables.layers.truncate(layers.len());
+        tables.cameras.keep(gpu, cameras)?;
+        tables.layers = layers.len();
+        let mut pages = Vec::new();
         for (i, layer) in layers.iter().enumerate() {
-            let fresh = Kept::new(layer);
-            if i == tables.layers.len() {
-                tables.layers.push(fresh);
-            } else {
-                let Kept { rows, moves, life, widths, .. } = fresh;
-                let old = &mut tables.layers[i];
-                (old.rows, old.moves, old.life, old.widths) = (rows, moves, life, widths);
+            let rows = self.page_rows.unwrap_or_else(|| page_rows(gpu, layer));
+            if rows < layer.rows && layer.ties.is_some() {
+                return Err(Error::new(
+                    ErrorKind::Unsupported,
+                    "the tied poses are too many for one buffer of the GPU",
+                ));
             }
-            let kept = &mut tables.layers[i];
+            let first = (0..layer.rows.max(1)).step_by(rows);
+            pages.extend(first.map(|first| (i, first..layer.rows.min(first + rows))));
+        }
+        let groups = |page: &Range<usize>| page.len().div_ceil(gpu.tuning.row_threads.min(THREADS));
+        if pages.iter().any(|(_, page)| groups(page) > MOST_GROUPS) {
+            return Err(Error::new(ErrorKind::Unsupported, "the scene's tables have too many rows for the GPU"));
+        }
+        tables.uniforms.ensure(gpu, (pages.len() * at::ALL + 1) as u64 * UNIFORM_STRIDE)?;
+        let size = |(i, page): &(usize, Range<usize>)| {
+            let layer = &layers[*i];
+            (page.len(), layer.tables[SH].width, layer.moves.blocks())
+        };
+        tables.upload.keep(gpu, &pages.iter().map(size).collect::<Vec<_>>())?;
+        // The old ones' memory is used again where pages stayed.
+        tables.pages.truncate(pages.len());
+        for (at, (i, page)) in pages.into_iter().enumerate() {
+            let layer = &layers[i];
+            let fresh = Kept::new(i, layer, &page);
+            if at == tables.pages.len() {
+                tables.pages.push(fresh);
+            } else {
+                let Kept { layer, first_row, rows, moves, life, widths, .. } = fresh;
+                let old = &mut tables.pages[at];
+                (old.layer, old.first_row, old.rows) = (layer, first_row, rows);
+                (old.moves, old.life, old.widths) = (moves, life, widths);
+            }
+            let kept = &mut tables.pages[at];
+            let page = page.start..page.end.next_multiple_of(BLOCK);
             let small = &layer.tables[..SH];
-            let all = |f: &dyn Fn(&KeptTable<'_>) -> usize| small.iter().map(f).collect::<Vec<_>>();
-            let params: Vec<_> = small.iter().map(|t| t.params).zip(all(&|t| t.width)).collect();
-            let padded = layer.rows.next_multiple_of(BLOCK);
-            let histories: Vec<_> = small.iter().map(|t| history(t, padded)).collect();
-            let moments: Vec<_> = histories.iter().map(|m| &m[..]).zip(all(&|t| moments_width(t.width))).collect();
+            let params: Vec<_> = small.iter().map(|t| (cut(t.params, t.width, &page), t.width)).collect();
+            let histories: Vec<_> = small.iter().map(|t| (history(t, &page), moments_width(t.width))).collect();
+            let moments: Vec<_> = histories.iter().map(|(data, width)| (&data[..], *width)).collect();
             let params = side_by_side(&params);
             send(gpu, &mut kept.params, &params)?;
             kept.d_params.ensure(gpu, size_of_val(&params[..]) as u64)?;
             send(gpu, &mut kept.moments, &side_by_side(&moments))?;
-            send(gpu, &mut tables.upload.parts[i].tables[0], layer.tables[SH].params)?;
-            kept.d_sh.ensure(gpu, size_of_val(layer.tables[SH].params) as u64)?;
-            send(gpu, &mut kept.sh_moments, &history(&layer.tables[SH], padded))?;
-            send(gpu, &mut kept.stats, layer.stats)?;
-            kept.alive.ensure(gpu, 4 * layer.rows as u64)?;
+            let sh = &layer.tables[SH];
+            let colors = cut(sh.params, sh.width, &page);
+            send(gpu, &mut tables.upload.parts[at].tables[0], colors)?;
+            kept.d_sh.ensure(gpu, size_of_val(colors) as u64)?;
+            send(gpu, &mut kept.sh_moments, &history(sh, &page))?;
+            send(gpu, &mut kept.stats, cut(layer.stats, STATS_WIDTH, &page))?;
+            kept.alive.ensure(gpu, 4 * kept.rows as u64)?;
             kept.ties = layer.ties.map(|ties| Tied::new(gpu, ties)).transpose()?;
         }
         gpu.check()
     }
 
-    fn step(&mut self, step: &KeptStep<'_>) -> Result<Option<KeptStepped>> {
-        self.with_tables(|renderer, tables| renderer.step_kept(tables, step))
+    fn step(&mut self, step: &KeptStep<'_>) -> Result<Option<Vec<KeptStepped>>> {
+        self.begin(step)
+    }
+
+    fn finish(&mut self) -> Result<Vec<KeptStepped>> {
+        self.land_all()
     }
 
     fn stages(&self) -> Vec<(&'static str, f64)> {
@@ -560,33 +615,49 @@ impl Resident for GpuRenderer {
         self.resident = Some(tables);
         out
     }
+
+    fn fetch_cameras(&mut self) -> Result<[Vec<f32>; 2]> {
+        let mut tables = self.resident.take().expect("tables are kept before they are fetched");
+        let Tables { cameras, staging, .. } = &mut *tables;
+        let numbers = self.fetch_buffer(staging, cameras.buffer(), cameras.numbers());
+        let out = numbers.map(|numbers| cameras.apart(&numbers));
+        self.resident = Some(tables);
+        out
+    }
 }
 
 impl GpuRenderer {
     fn fetch_layer(&self, tables: &mut Tables, layer: usize) -> Result<KeptNumbers> {
-        let Tables { layers, upload, staging, .. } = tables;
-        let kept = &layers[layer];
-        let padded = kept.rows.next_multiple_of(BLOCK);
-        let [stride, moments_stride] = kept.strides();
-        let params = self.fetch_buffer(staging, &kept.params, stride * padded)?;
-        let moments = self.fetch_buffer(staging, &kept.moments, moments_stride * padded)?;
-        let width = kept.widths[SH];
-        let mut out = KeptNumbers {
-            params: std::array::from_fn(|t| {
-                let first = if t == SH { 0 } else { kept.first(t)[0] };
-                if t == SH { Vec::new() } else { apart(&params, stride, first..first + kept.widths[t]) }
-            }),
-            moments: std::array::from_fn(|t| {
-                let first = if t == SH { 0 } else { kept.first(t)[1] };
-                let width = moments_width(kept.widths[t]);
-                if t == SH { Vec::new() } else { apart(&moments, moments_stride, first..first + width) }
-            }),
-            stats: self.fetch_buffer(staging, &kept.stats, STATS_WIDTH * padded)?,
-        };
-        out.params[SH] = self.fetch_buffer(staging, &upload.parts[layer].tables[0], width * padded)?;
-        out.moments[SH] = self.fetch_buffer(staging, &kept.sh_moments, moments_width(width) * padded)?;
+        let Tables { pages, upload, staging, .. } = tables;
+        let mut out = KeptNumbers::default();
+        for (at, kept) in pages.iter().enumerate().filter(|(_, page)| page.layer == layer) {
+            let padded = kept.rows.next_multiple_of(BLOCK);
+            let [stride, moments_stride] = kept.strides();
+            let params = self.fetch_buffer(staging, &kept.params, stride * padded)?;
+            let moments = self.fetch_buffer(staging, &kept.moments, moments_stride * padded)?;
+            for t in 0..SH {
+                let [first, first_moment] = kept.first(t);
+                out.params[t].extend(apart(&params, stride, first..first + kept.widths[t]));
+                let columns = first_moment..first_moment + moments_width(kept.widths[t]);
+                out.moments[t].extend(apart(&moments, moments_stride, columns));
+            }
+            let width = kept.widths[SH];
+            out.stats.extend(self.fetch_buffer(staging, &kept.stats, STATS_WIDTH * padded)?);
+            out.params[SH].extend(self.fetch_buffer(staging, &upload.parts[at].tables[0], width * padded)?);
+            out.moments[SH].extend(self.fetch_buffer(staging, &kept.sh_moments, moments_width(width) * padded)?);
+        }
         Ok(out)
     }
+}
+
+/// Rows of a page of a layer: whole blocks, as many as every one of its buffers has room for.
+fn page_rows(gpu: &Gpu, layer: &KeptLayer<'_>) -> usize {
+    let small = layer.tables[..SH].iter();
+    let [params, moments] = small.fold([0, 0], |[p, m], t| [p + t.width, m + moments_width(t.width)]);
+    let widest = [params, moments, layer.tables[SH].width, moments_width(layer.tables[SH].width), GEOMETRY_WIDTH];
+    let bytes = 4 * widest.into_iter().max().expect("there are some") as u64;
+    let rows = usize::try_from(largest_binding(gpu) / bytes).unwrap_or(usize::MAX);
+    (rows / BLOCK).max(1) * BLOCK
 }
 
 /// Bytes of a layer's geometry as it is drawn.
@@ -594,9 +665,4 @@ pub(super) fn geometry_bytes(rows: usize) -> u64 {
     (4 * GEOMETRY_WIDTH * rows.next_multiple_of(BLOCK)) as u64
 }
 
-/// The words of a step among what came back.
-pub(super) fn words_of(numbers: &[f32]) -> Vec<u32> {
-    numbers.iter().map(|x| x.to_bits()).collect()
-}
-
-const _: () = assert!(count::PAIRS == 2, "the shaders read the pairs there");
+const _: () = assert!(count::PAIRS == 2 && count::STOP == 3, "the shaders read them there");

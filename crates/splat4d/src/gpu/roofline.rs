@@ -15,6 +15,8 @@ const LONG: f64 = 0.03;
 const RUNS: usize = 4;
 /// Bytes of a copy: more than caches hold.
 const COPY: u64 = 1 << 27;
+/// Bytes that are sent and read: a picture of 1080p.
+const BUS: u64 = 1 << 25;
 /// Copies in one submission at most.
 const MOST_COPIES: usize = 1 << 12;
 /// Pixels of a quadrant of a tile.
@@ -27,12 +29,14 @@ pub struct GpuRoofline {
     pub pairs: f64,
     /// Bytes a second, read and written.
     pub bytes: f64,
+    /// Bytes a second from the CPU's memory, and to it.
+    pub bus: [f64; 2],
 }
 
 impl GpuRenderer {
     /// Measures the blend's arithmetic alone, and copies in the GPU's memory. Errors: no memory for it, or a driver that failed.
     pub fn roofline(&self) -> Result<GpuRoofline> {
-        Ok(GpuRoofline { pairs: self.pairs_a_second()?, bytes: self.bytes_a_second()? })
+        Ok(GpuRoofline { pairs: self.pairs_a_second()?, bytes: self.bytes_a_second()?, bus: self.bus()? })
     }
 
     /// Pairs of pixel and Gaussian in the lists of the last render: those of every pixel of a quadrant that a Gaussian may
@@ -43,7 +47,7 @@ impl GpuRenderer {
     }
 
     /// The first `n` numbers of a buffer.
-    fn read_back(&self, buffer: &Grown, n: usize) -> Result<Vec<u32>> {
+    pub(super) fn read_back(&self, buffer: &Grown, n: usize) -> Result<Vec<u32>> {
         if n == 0 {
             return Ok(Vec::new());
         }
@@ -91,6 +95,25 @@ impl GpuRenderer {
             pass.dispatch_workgroups(groups as u32, 1, 1);
         })?;
         Ok(groups * (THREADS * SPLATS) as f64)
+    }
+
+    /// Bytes a second that come up, and go down: as tables are sent and pictures are read.
+    fn bus(&self) -> Result<[f64; 2]> {
+        let data = vec![1u8; BUS as usize];
+        let mut on_gpu = Grown::storage("a copy's target");
+        on_gpu.ensure(&self.gpu, BUS)?;
+        let mut best = [0.0f64; 2];
+        for _ in 0..RUNS {
+            let clock = Instant::now();
+            self.gpu.queue.write_buffer(on_gpu.get(), 0, &data);
+            self.gpu.queue.submit([]);
+            self.gpu.wait()?;
+            best[0] = best[0].max(BUS as f64 / clock.elapsed().as_secs_f64());
+            let clock = Instant::now();
+            let numbers = self.read_back(&on_gpu, data.len() / 4)?;
+            best[1] = best[1].max(4.0 * numbers.len() as f64 / clock.elapsed().as_secs_f64());
+        }
+        Ok(best)
     }
 
     fn bytes_a_second(&self) -> Result<f64> {

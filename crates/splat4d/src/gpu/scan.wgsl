@@ -3,7 +3,8 @@
 // too many.
 //
 // Three dispatches: block_sums (a workgroup a block of 2,048), total (one workgroup), offsets (as block_sums).
-// Bindings, group 0: 0 scan_pass; 1 counts: numbers of things, [count_index] is read and [total_index] written;
+// Bindings, group 0: 0 scan_pass; 1 counts: numbers of things, [count_index] is read and [total_index] written; of steps on
+// tables that stay, [3] stops them all (frame.rs, `count`): 1 + the view that had more things than there is room for, [4];
 // 2 scan_in, 3 scan_out: one a thing; 4 scan_sums: one a block; 5 arguments of indirect dispatches: two triples are
 // written from arguments_at on, one thread a thing and 2,048 things a workgroup. Five storage buffers.
 // A thread owns eight neighbouring numbers; in `total`, a run of neighbouring blocks.
@@ -11,12 +12,18 @@
 const SCAN_THREADS: u32 = 256u;
 const SCAN_RUN: u32 = 8u;
 const SCAN_BLOCK: u32 = 2048u; // SCAN_THREADS x SCAN_RUN
+const STOP: u32 = 3u;
+const WANTED: u32 = 4u;
 
 struct ScanPass {
     count_index: u32,
     total_index: u32,
     arguments_at: u32,
     capacity: u32, // more things than this are not dispatched at all: the total says that they were too many
+    view: u32,     // 1 + the view of a step that stops then, as all that follow it; 0: of no step
+    unused_0: u32,
+    unused_1: u32,
+    unused_2: u32,
 }
 
 @group(0) @binding(0) var<uniform> scan_pass: ScanPass;
@@ -90,7 +97,12 @@ fn total(@builtin(local_invocation_index) thread: u32) {
     }
     if (thread == SCAN_THREADS - 1u) {
         counts[scan_pass.total_index] = before;
-        let things = select(before, 0u, before > scan_pass.capacity);
+        let over = before > scan_pass.capacity;
+        if (over && scan_pass.view > 0u && counts[STOP] == 0u) {
+            counts[STOP] = scan_pass.view;
+            counts[WANTED] = before;
+        }
+        let things = select(before, 0u, over || (scan_pass.view > 0u && counts[STOP] > 0u));
         let at = scan_pass.arguments_at;
         arguments[at] = (things + SCAN_THREADS - 1u) / SCAN_THREADS;
         arguments[at + 1u] = 1u;

@@ -1,7 +1,7 @@
 // Noise on the positions of the rows that are alive, after Adam. Twin of splat4d-train's optim/noise.rs, where the equation stands;
 // learnt.wgsl and numbers.wgsl are put in front of this file.
 //
-// Bindings, group 0: 0 ask; 1 noise; 2 counts ([2]: pairs); 3 alive; in and out: 4 params. Three storage buffers.
+// Bindings, group 0: 0 ask; 1 noise; 2 counts ([3]: stopped); 3 alive; in and out: 4 params. Three storage buffers.
 // A thread owns one row.
 
 struct Noise {
@@ -21,7 +21,7 @@ struct Noise {
 @compute @workgroup_size(ROW_THREADS)
 fn shake(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = id.x;
-    if (row >= ask.rows || counts[2] > ask.capacity) {
+    if (row >= ask.rows || counts[3] != 0u) {
         return;
     }
     let logit = params[at(row, OPACITY, ask.width)];
@@ -31,7 +31,7 @@ fn shake(@builtin(global_invocation_id) id: vec3<u32>) {
     let gate = sigmoid(-noise.slope * (sigmoid(logit) - noise.dead));
     let r = rotation_rows(unit_of(four(ask, row, QUAT)).quat);
     let s = exp(three(ask, row, LOG_SCALE));
-    let key = fork(noise.key, row);
+    let key = fork(noise.key, ask.first_row + row);
     let e = gate * noise.strength * vec3<f32>(normal(key, 0u), normal(key, 1u), normal(key, 2u));
     // R S S R^T e, and r holds the rows of R.
     let along = s * s * vec3<f32>(

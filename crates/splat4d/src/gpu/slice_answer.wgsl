@@ -2,7 +2,7 @@
 // Motion::at for `native4d` and of layers/envelope.rs; learnt.wgsl, numbers.wgsl and slice.wgsl are put in front of this file.
 //
 // Bindings, group 0: 0 ask; 1 params; out: 2 geometry and 3 alive as answer.wgsl writes them, 4 weights as splats.wgsl reads
-// them, [row / 16][block][16], where there are several blocks. Four storage buffers.
+// them, [row / 16][block][16], where there are several blocks; 5 counts ([3]: stopped). Five storage buffers.
 // A thread owns one row.
 
 const GEOMETRY_WIDTH: u32 = 10u;
@@ -12,6 +12,7 @@ const GEOMETRY_WIDTH: u32 = 10u;
 @group(0) @binding(2) var<storage, read_write> geometry: array<f32>;
 @group(0) @binding(3) var<storage, read_write> alive: array<u32>;
 @group(0) @binding(4) var<storage, read_write> weights: array<f32>;
+@group(0) @binding(5) var<storage, read> counts: array<u32>;
 
 fn cov(s: Slice, blur: f32, i: u32, j: u32) -> f32 {
     return dot(s.k[i], s.k[j]) + s.v[i] * s.v[j] * blur;
@@ -20,7 +21,8 @@ fn cov(s: Slice, blur: f32, i: u32, j: u32) -> f32 {
 @compute @workgroup_size(ROW_THREADS)
 fn answer(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = id.x;
-    if (row >= ask.rows) {
+    // Who lives in a step that has stopped must stay known.
+    if (row >= ask.rows || counts[3] != 0u) {
         return;
     }
     let s = slice_of(ask, row);

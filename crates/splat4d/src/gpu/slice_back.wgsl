@@ -1,7 +1,7 @@
 // From the gradients of a layer's splats to those of its Gaussians of space and time. Twin of Motion::backward for `native4d`
 // (slice_backward in motion/native4d/slice.rs); learnt.wgsl, put.wgsl, numbers.wgsl and slice.wgsl are put in front of this file.
 //
-// Bindings, group 0: 0 ask; 1 counts ([2]: pairs); 2 params; 3 back as colors_back.wgsl left it; 4 weights: the gradients that it
+// Bindings, group 0: 0 ask; 1 counts ([3]: stopped); 2 params; 3 back as colors_back.wgsl left it; 4 weights: the gradients that it
 // left there; out: 5 d_params, as answer_back.wgsl writes it. Five storage buffers.
 // A thread owns one row.
 
@@ -17,7 +17,7 @@ const TAU: f32 = 6.283185307179586;
 @compute @workgroup_size(ROW_THREADS)
 fn answer_back(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = id.x;
-    if (row >= ask.rows || counts[2] > ask.capacity) {
+    if (row >= ask.rows || counts[3] != 0u) {
         return;
     }
     let splat = 5u * (ask.first_splat + row);

@@ -27,7 +27,7 @@ pub(super) fn gpu() -> Option<Gpu> {
     }
 }
 
-fn own_renderer() -> Option<GpuRenderer> {
+pub(super) fn own_renderer() -> Option<GpuRenderer> {
     gpu().map(|gpu| GpuRenderer::new(gpu, RenderConfig::default()).expect("the kernels compile"))
 }
 

@@ -14,13 +14,15 @@ pub struct Tuning {
     pub batch: usize,
     /// Whether the blend goes back with subgroups, where the device has them: this alone changes last bits.
     pub subgroups: bool,
+    /// Whether the sorts' last dispatch uses them too: no bit depends on it.
+    pub sort_subgroups: bool,
     /// Splats of a round of its way back without them.
     pub back_round: usize,
 }
 
 impl Default for Tuning {
     fn default() -> Self {
-        Self { row_threads: THREADS, rounds: 8, batch: THREADS, subgroups: true, back_round: 4 }
+        Self { row_threads: THREADS, rounds: 8, batch: THREADS, subgroups: true, sort_subgroups: true, back_round: 4 }
     }
 }
 
@@ -45,6 +47,7 @@ impl Tuning {
         out.extend(with(|t, v| t.row_threads = v, &ROW_THREADS));
         out.extend(with(|t, v| t.rounds = v, &ROUNDS));
         out.extend(with(|t, v| t.batch = v, &BATCHES));
+        out.push(Self { sort_subgroups: false, ..Self::default() });
         let portable = Self { subgroups: false, ..Self::default() };
         out.push(portable);
         out.extend(BACK_ROUNDS.map(|back_round| Self { back_round, ..portable }));
@@ -59,6 +62,7 @@ impl Tuning {
                 ("rounds", t.rounds),
                 ("batch", t.batch),
                 ("subgroups", usize::from(t.subgroups)),
+                ("sort_subgroups", usize::from(t.sort_subgroups)),
                 ("back_round", t.back_round),
             ]
         };
@@ -108,7 +112,7 @@ mod tests {
         for shader in shaders {
             assert_eq!(Tuning::default().text(shader), shader);
             let changed =
-                Tuning { row_threads: 32, rounds: 1, batch: 16, subgroups: false, back_round: 3 }.text(shader);
+                Tuning { row_threads: 32, rounds: 1, batch: 16, back_round: 3, ..Tuning::default() }.text(shader);
             let others = shader.lines().zip(changed.lines()).filter(|(a, b)| a != b).count();
             // A sort and a sum have both rounds and blocks.
             let expected = if shader == wgsl::SORT || shader == wgsl::SCAN { 2 } else { 1 };

@@ -36,8 +36,8 @@ pub(crate) use count::PairCounts;
 pub use importance::{Importance, Sensitivity};
 pub use project::{Projected, ProjectedGrads, View};
 pub use resident::{
-    KEPT, KeptLayer, KeptNoise, KeptNumbers, KeptRule, KeptStep, KeptStepped, KeptTable, KeptTies, KeptView, Moves,
-    Resident, RowWeights,
+    KEPT, KeptCameras, KeptLayer, KeptNoise, KeptNumbers, KeptRule, KeptStep, KeptStepped, KeptTable, KeptTies,
+    KeptView, Moves, Resident, RowWeights,
 };
 
 use crate::math::Real;

@@ -134,6 +134,17 @@ pub struct KeptNoise {
     pub rng: Rng,
 }
 
+/// The cameras' colour matrices, which learn with the tables.
+#[derive(Clone, Copy, Debug)]
+pub struct KeptCameras<'a> {
+    /// Cameras.
+    pub count: usize,
+    /// A table of twelve columns a camera: its matrix without the identity, row by row, then an offset a channel.
+    pub table: KeptTable<'a>,
+    /// Those whose mean is held at the identity.
+    pub held: &'a [usize],
+}
+
 /// What one table learns by.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct KeptRule {
@@ -152,8 +163,10 @@ pub struct KeptView<'a> {
     pub t: Time,
     /// Colour behind the scene.
     pub background: [f32; 3],
-    /// What it is compared with.
+    /// What it is compared with; a response is told by the camera's number alone.
     pub target: Target<'a>,
+    /// Number of the camera, where their colour matrices are kept.
+    pub rig: usize,
 }
 
 /// All that a step is of.
@@ -171,6 +184,8 @@ pub struct KeptStep<'a> {
     pub rows: RowWeights,
     /// By layer.
     pub noise: &'a [Option<KeptNoise>],
+    /// Rate of the cameras' colour matrices; 0: they rest.
+    pub cameras: f64,
 }
 
 /// The result of a step.
@@ -196,23 +211,38 @@ pub struct KeptNumbers {
 }
 
 /// Keeps a scene's tables and takes steps on them: evaluate, draw, compare, back, Adam.
+///
+/// Steps are begun and done later: several may be under way, whose results come in their order. What they come to does not depend on
+/// when anybody looks.
 pub trait Resident {
-    /// Takes over all layers, in place of whatever was kept. `corrections`: Adam's 1/(1 − β₁ⁿ) and 1/(1 − β₂ⁿ) by step count n, the
-    /// last for all that follow.
+    /// Takes over all layers, in place of whatever was kept; steps under way are forgotten. `corrections`: Adam's 1/(1 − β₁ⁿ) and
+    /// 1/(1 − β₂ⁿ) by step count n, the last for all that follow.
     ///
     /// Errors: they are too large for the device, or it failed.
-    fn keep(&mut self, layers: &[KeptLayer<'_>], corrections: &[[f32; 2]]) -> Result<()>;
+    fn keep(
+        &mut self,
+        layers: &[KeptLayer<'_>],
+        cameras: Option<&KeptCameras<'_>>,
+        corrections: &[[f32; 2]],
+    ) -> Result<()>;
 
-    /// One step. `None`: a picture must be drawn in bands, or no pixel of it counts; of what is kept only statistics were changed.
+    /// Begins a step. Returns the results of steps that are done; `None`: a picture is too large to be compared in one piece, or no
+    /// pixel of it counts, and nothing was begun.
     ///
     /// Errors: the device failed, and nothing kept is to be trusted. Panics: nothing is kept.
-    fn step(&mut self, step: &KeptStep<'_>) -> Result<Option<KeptStepped>>;
+    fn step(&mut self, step: &KeptStep<'_>) -> Result<Option<Vec<KeptStepped>>>;
 
-    /// Milliseconds of the stages of the last view by the device's own clock; 0 where it has none.
+    /// The results of all steps that were begun, and not told yet. Errors: as of `step`.
+    fn finish(&mut self) -> Result<Vec<KeptStepped>>;
+
+    /// Milliseconds of the stages of the last view that is done, by the device's own clock; 0 where it has none.
     fn stages(&self) -> Vec<(&'static str, f64)> {
         Vec::new()
     }
 
-    /// The numbers of a layer as they are now. Errors: the device failed. Panics: as of `step`.
+    /// The numbers of a layer, with no step under way. Errors: the device failed. Panics: as of `step`.
     fn fetch(&mut self, layer: usize) -> Result<KeptNumbers>;
+
+    /// The cameras' colour matrices and their moments, in the same way; nothing where none are kept. Errors: as of `fetch`.
+    fn fetch_cameras(&mut self) -> Result<[Vec<f32>; 2]>;
 }

@@ -1,23 +1,31 @@
 //! Times of a GPU: every stage of a picture and of its way back by the GPU's own clock, and whole training steps in which it
 //! draws.
 
-use super::roofline::{Roofline, bytes};
+use super::roofline::bytes;
 use super::rows::Row;
 use super::scenes::Pinned;
 use super::stages::{Way, gradient, zeros};
 use super::training::{self, Held};
 use splat4d::Result;
-use splat4d::gpu::{Adapters, Gpu, GpuRenderer, GpuStats, GpuTimings, StageClock, Tuning};
+use splat4d::device::KeptMotion;
+use splat4d::gpu::{Adapters, Gpu, GpuRenderer, GpuRoofline, GpuStats, GpuTimings, StageClock, Tuning};
+use splat4d::layers::{ALPHA_MIN, Layer};
+use splat4d::math::Se3;
 use splat4d::play::Player;
-use splat4d::render::{Backend, Image, ImageGrads, RenderConfig, RenderGrads, Shot};
-use splat4d::scene::{Splats, Table};
+use splat4d::render::{Backend, Image, ImageGrads, KeptLayer, KeptTable, RenderConfig, RenderGrads, Shot};
+use splat4d::scene::{Camera, Splats, Table, Time};
+use std::path::Path;
 use std::sync::Arc;
+use std::time::Instant;
 
 /// Bytes of a splat's geometry, of what is made of it, of its place in a list, and of what goes back to the CPU.
 const GEOMETRY: usize = 40;
 const SHAPE: usize = 48;
 const NUMBER: usize = 4;
 const BACK: usize = 80;
+/// Planes of a picture (colours, alpha, depth), and those that have a gradient.
+const PLANES: usize = 5;
+const COLORS: usize = 3;
 /// Bytes of a pair in the lists: key, number, owner; and of its record.
 const PAIR: usize = 12;
 const RECORD: usize = 48;
@@ -54,9 +62,16 @@ fn times(t: &GpuTimings) -> [f64; STAGES.len()] {
     out
 }
 
-/// The least milliseconds that each stage could take; 0 where that is not known.
-fn floors(splats: &Splats<'_, f32>, s: GpuStats, evaluations: u64, best: &Roofline) -> [f64; STAGES.len()] {
+/// The least milliseconds that each stage could take.
+fn floors(
+    splats: &Splats<'_, f32>,
+    pixels: usize,
+    s: GpuStats,
+    evaluations: u64,
+    best: &GpuRoofline,
+) -> [f64; STAGES.len()] {
     let moved = |bytes: usize| 1e3 * bytes as f64 / best.bytes;
+    let [up, down] = best.bus.map(|a_second| move |bytes: usize| 1e3 * bytes as f64 / a_second);
     let blend = 1e3 * evaluations as f64 / best.pairs;
     let mut out = [0.0; STAGES.len()];
     out[1] = moved(s.splats * (GEOMETRY + NUMBER) + bytes::shade(splats, s.visible) + s.visible * SHAPE);
@@ -68,9 +83,25 @@ fn floors(splats: &Splats<'_, f32>, s: GpuStats, evaluations: u64, best: &Roofli
     out[8] = blend + moved(2 * s.pairs * RECORD);
     out[9] = moved(s.pairs * RECORD + s.visible * RECORD);
     out[10] = moved(s.splats * (GEOMETRY + NUMBER + BACK) + s.visible * (SHAPE + RECORD));
+    // What passes the bus: tables and planes, their gradients the other way.
+    out[0] = up(s.splats * GEOMETRY + bytes::shade(splats, s.splats));
+    out[7] = out[..7].iter().sum::<f64>() + down(pixels * PLANES * NUMBER);
+    out[11] = out[8..11].iter().sum::<f64>() + up(pixels * COLORS * NUMBER) + down(s.splats * BACK);
+    out[12] = out[7] + out[11];
     out
 }
 
+/// Those of a picture that stays there, and of its way back.
+const LISTS: [&str; 6] = ["project", "compact", "sort splats", "tiles", "sort pairs", "rasterize"];
+const BACKWARD: [&str; 3] = ["rasterize backward", "gather", "splats backward"];
+/// A whole training step; a frame of a film.
+const STEP: &str = "step";
+const FILM: &str = "frame, nothing read back";
+/// Frames of a film, times the rounds, of which there are five unless told; and how often it is drawn at most: the best counts.
+const FRAMES: usize = 200;
+const FILMS: usize = 3;
+/// How far a camera looks to either side, radians: five degrees.
+const SWING: f64 = 0.087;
 /// Stages that only whole training steps on the GPU have.
 const OF_STEPS: [&str; 4] = ["answer", "loss", "answer backward", "adam"];
 
@@ -96,17 +127,22 @@ pub(super) fn measure(
     let first = renderer(Tuning::default())?;
     let (name, r) = (first.gpu().describe(), first.roofline()?);
     drop(first);
-    let best = Roofline { pairs: r.pairs, bytes: r.bytes };
+    let best = r;
     note(&format!("{name}: at best {:.2} G pairs/s and {:.1} GB/s", best.pairs * 1e-9, best.bytes * 1e-9));
     let tunings = if sweep { Tuning::sweep() } else { vec![Tuning::default()] };
     let mut rows: Vec<Row> = Vec::new();
     for pinned in scenes {
+        // Truth is drawn by the CPU, once.
+        let held = Arc::new(pool.install(|| Held::of(pinned, way)));
         for tuning in &tunings {
             let changes = tuning.changes();
             let with = changes.as_ref().map_or_else(String::new, |c| format!(" with {c}"));
             note(&format!("scene {} on {name}{with} ...", pinned.name));
             let mut here = pool.install(|| stages(pinned, way, &mut renderer(*tuning)?, &best))?;
-            here.extend(pool.install(|| steps(pinned, way, renderer(*tuning)?, &best))?);
+            here.extend(pool.install(|| steps(pinned, &held, way, renderer(*tuning)?, (&best, &here)))?);
+            if changes.is_none() {
+                here.extend(pool.install(|| film(pinned, way, &mut renderer(*tuning)?, &here))?);
+            }
             for row in here.iter_mut().filter(|_| changes.is_some()) {
                 let default = rows.iter().find(|r| r.scene == row.scene && r.stage == row.stage && r.tuning.is_none());
                 row.against = default.filter(|d| d.ms > 0.0).map(|d| row.ms / d.ms);
@@ -122,7 +158,27 @@ pub(super) fn measure(
     Ok(rows)
 }
 
-fn stages(pinned: &Pinned, way: Way, renderer: &mut GpuRenderer, best: &Roofline) -> Result<Vec<Row>> {
+/// Trains still scenes as other programs do whose runs lie in a folder, and leaves there what they need for it.
+pub(super) fn beside(
+    scenes: &[Pinned],
+    folder: &Path,
+    way: Way,
+    pool: &rayon::ThreadPool,
+    note: &dyn Fn(&str),
+) -> Result<Vec<Row>> {
+    let one = |pinned: &Pinned| {
+        let renderer = renderer(Tuning::default())?;
+        let name = renderer.gpu().describe();
+        note(&format!("scene {} on {name}, beside others ...", pinned.name));
+        let measured = pool.install(|| super::beside::measure(pinned, folder, way, Box::new(renderer), &name));
+        let (row, verdicts) = measured?;
+        verdicts.iter().for_each(|verdict| note(&format!("scene {}: {verdict}", pinned.name)));
+        Ok(Row { device: Some(name), simd: "gpu".into(), ..row })
+    };
+    scenes.iter().map(one).collect()
+}
+
+fn stages(pinned: &Pinned, way: Way, renderer: &mut GpuRenderer, best: &GpuRoofline) -> Result<Vec<Row>> {
     let (mut image, mut d, mut d_sh) = (Image::default(), RenderGrads::default(), Vec::new());
     let mut player = Player::of_scene(&pinned.scene);
     let mut seen = vec![[f64::MAX; STAGES.len()]; pinned.views.len()];
@@ -143,7 +199,8 @@ fn stages(pinned: &Pinned, way: Way, renderer: &mut GpuRenderer, best: &Roofline
             if round == 0 {
                 let evaluations = renderer.evaluations()?;
                 counted += evaluations;
-                *floor = floors(&splats, renderer.stats(), evaluations, best);
+                let pixels = view.camera.width * view.camera.height;
+                *floor = floors(&splats, pixels, renderer.stats(), evaluations, best);
                 continue;
             }
             seen.iter_mut().zip(times(&renderer.timings())).for_each(|(best, now)| *best = best.min(now));
@@ -166,23 +223,35 @@ fn stages(pinned: &Pinned, way: Way, renderer: &mut GpuRenderer, best: &Roofline
     Ok(STAGES.iter().enumerate().map(row).collect())
 }
 
-/// Whole training steps on the GPU, and those of their stages that drawing alone does not have.
-fn steps(pinned: &Pinned, way: Way, renderer: GpuRenderer, best: &Roofline) -> Result<Vec<Row>> {
-    let held = Arc::new(Held::of(pinned, way));
+/// Whole training steps on the GPU: those of their stages that drawing alone does not have, of steps that are waited for one by
+/// one; and the whole, of rounds in which the GPU is never waited for but at their ends.
+fn steps(
+    pinned: &Pinned,
+    held: &Arc<Held>,
+    way: Way,
+    renderer: GpuRenderer,
+    (best, drawn): (&GpuRoofline, &[Row]),
+) -> Result<Vec<Row>> {
     let mut trainer = training::trainer_on(pinned.scene.clone(), held.clone(), Box::new(renderer))?;
-    // The stages, then the whole step and the time of the calls that draw.
-    const ALL: usize = OF_STEPS.len() + 2;
-    let mut seen = vec![[f64::MAX; ALL]; pinned.views.len()];
+    let mut seen = vec![[f64::MAX; OF_STEPS.len()]; pinned.views.len()];
+    let mut step = f64::MAX;
     for round in 0..=way.rounds {
         for _ in 0..seen.len() {
-            let (stepped, seconds) = training::step(&mut trainer)?;
+            training::step(&mut trainer)?;
+            training::catch_up(&mut trainer)?;
             if round > 0 {
-                let of = |stage: &str| stepped.stages.iter().find(|s| s.0 == stage).map_or(0.0, |s| s.1);
-                let drawn = stepped.report.timings.render + stepped.report.timings.render_backward;
-                let whole = [1e3 * seconds, 1e3 * drawn.as_secs_f64()];
-                let now = OF_STEPS.into_iter().map(of).chain(whole);
-                seen[held.last()].iter_mut().zip(now).for_each(|(best, now)| *best = best.min(now));
+                let stages = trainer.stages();
+                let of = |stage: &str| stages.iter().find(|s| s.0 == stage).map_or(0.0, |s| s.1);
+                seen[held.last()].iter_mut().zip(OF_STEPS.map(of)).for_each(|(best, now)| *best = best.min(now));
             }
+        }
+        let clock = Instant::now();
+        for _ in 0..seen.len() {
+            training::step(&mut trainer)?;
+        }
+        training::catch_up(&mut trainer)?;
+        if round > 0 {
+            step = step.min(1e3 * clock.elapsed().as_secs_f64() / seen.len() as f64);
         }
     }
     let mean = |k: usize| seen.iter().map(|s| s[k]).sum::<f64>() / seen.len() as f64;
@@ -210,9 +279,57 @@ fn steps(pinned: &Pinned, way: Way, renderer: GpuRenderer, best: &Roofline) -> R
         Row { ceiling_share: (ms > 0.0).then(|| floor / ms), ..row(stage, ms) }
     };
     let mut rows: Vec<Row> = OF_STEPS.iter().enumerate().map(of_stage).collect();
-    let [step, drawn] = [ALL - 2, ALL - 1].map(mean);
-    rows.push(Row { outside_share: Some(1.0 - drawn / step), ..row("step", step) });
+    let floor = floor_of(drawn, &[&LISTS[..], &BACKWARD].concat()) + floor_of(&rows, &OF_STEPS);
+    rows.push(Row { ceiling_share: Some(floor / step), ..row(STEP, step) });
     Ok(rows)
+}
+
+/// The least milliseconds of some stages together.
+fn floor_of(rows: &[Row], stages: &[&str]) -> f64 {
+    let floor = |r: &Row| r.ceiling_share.map_or(0.0, |share| share * r.ms);
+    rows.iter().filter(|r| stages.contains(&r.stage.as_str())).map(floor).sum()
+}
+
+/// Frames of a moving camera at moving times, none read back; `stages`: rows of what a frame is made of.
+fn film(pinned: &Pinned, way: Way, renderer: &mut GpuRenderer, stages: &[Row]) -> Result<Vec<Row>> {
+    let frames = FRAMES * way.rounds;
+    let path: Vec<(Camera, Time)> = (0..frames).map(|i| along(pinned, i as f64 / frames as f64)).collect();
+    let mut best = f64::MAX;
+    let times: Vec<Time> = path.iter().map(|p| p.1).collect();
+    let known: Option<Vec<_>> = pinned.scene.layers.iter().map(|l| KeptMotion::new(l, &times)).collect();
+    let Some(known) = known else { return Ok(Vec::new()) };
+    // Three columns a row, in blocks of sixteen.
+    let stats: Vec<Vec<f32>> =
+        pinned.scene.layers.iter().map(|l| vec![0.0; 3 * l.params.len().next_multiple_of(16)]).collect();
+    fn kept<'a>(((layer, known), stats): ((&'a Layer, &KeptMotion), &'a Vec<f32>)) -> KeptLayer<'a> {
+        let tables = known.keys.map(|key| {
+            key.map_or(KeptTable::default(), |key| {
+                let table = &layer.params[key];
+                KeptTable { width: table.width(), params: table.data(), moments: &[] }
+            })
+        });
+        KeptLayer { rows: layer.params.len(), moves: known.moves, life: layer.life, tables, stats, ties: None }
+    }
+    let layers: Vec<KeptLayer<'_>> = pinned.scene.layers.iter().zip(&known).zip(&stats).map(kept).collect();
+    for _ in 0..way.rounds.min(FILMS) {
+        let film = renderer.film(&layers, ALPHA_MIN, pinned.scene.background, &path)?;
+        let Some(seconds) = film else { return Ok(Vec::new()) };
+        best = best.min(1e3 * seconds / frames as f64);
+    }
+    let floor = floor_of(stages, &LISTS) + floor_of(stages, &OF_STEPS[..1]);
+    let row = Row { scene: pinned.name.clone(), stage: FILM.into(), threads: way.threads, ms: best, ..Row::default() };
+    Ok(vec![Row { ceiling_share: Some(floor / best), ..row }])
+}
+
+/// The camera and the time after a share of the film: every view in turn, of which each looks from side to side, through the whole clip.
+fn along(pinned: &Pinned, share: f64) -> (Camera, Time) {
+    let place = share * pinned.views.len() as f64;
+    let mut camera = pinned.views[place as usize].camera.clone();
+    let (sin, cos) = (SWING * (std::f64::consts::TAU * place).sin()).sin_cos();
+    let turn = Se3 { rotation: [[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]], translation: [0.0; 3] };
+    camera.cam_from_world = turn.after(&camera.cam_from_world);
+    let [first, last] = pinned.scene.clip;
+    (camera, Time(first + share * (last - first)))
 }
 
 #[cfg(test)]
@@ -233,12 +350,14 @@ mod tests {
                 return println!("skipped: {e}");
             }
         };
-        let all = [&STAGES[..], &OF_STEPS, &["step"]].concat();
-        let stages: Vec<&str> = rows.iter().map(|r| r.stage.as_str()).collect();
+        let all = [&STAGES[..], &OF_STEPS, &[STEP]].concat();
+        let (films, others): (Vec<&Row>, Vec<&Row>) = rows.iter().partition(|r| r.stage == FILM);
+        assert!(films.len() == 1 && films[0].tuning.is_none(), "one film, at the defaults");
+        let stages: Vec<&str> = others.iter().map(|r| r.stage.as_str()).collect();
         assert_eq!(stages, all.repeat(Tuning::sweep().len()));
         for row in &rows {
             assert!(row.ms > 0.0 && row.ms.is_finite() && row.device.is_some() && row.simd == "gpu", "{row:?}");
-            assert!(row.ceiling_share.is_none_or(|share| share > 0.0), "{row:?}");
+            assert!(row.ceiling_share.is_some_and(|share| share > 0.0), "{row:?}");
             assert_eq!(row.tuning.is_some(), row.against.is_some(), "{row:?}");
         }
         let ms = |stage: &str| rows.iter().find(|r| r.stage == stage).expect("it is there").ms;

@@ -30,7 +30,7 @@ const FOR_EVER: usize = 1 << 40;
 /// Standard deviation of the noise on the truth.
 const NOISE: f64 = 0.02;
 /// Standard share of D-SSIM in the loss (Kerbl et al. 2023).
-const LAMBDA_DSSIM: f64 = 0.2;
+pub(super) const LAMBDA_DSSIM: f64 = 0.2;
 
 /// Pictures in memory.
 pub(super) struct Held {
@@ -180,6 +180,12 @@ pub(super) fn step(trainer: &mut Trainer<'_>) -> Result<(Stepped, f64)> {
     let seconds = clock.elapsed().as_secs_f64();
     let stepped = stepped.map_err(|fault| Error::new(ErrorKind::Diverged, fault.0))?;
     Ok((stepped, seconds))
+}
+
+/// Waits for steps that a device is still at.
+#[cfg(feature = "gpu")]
+pub(super) fn catch_up(trainer: &mut Trainer<'_>) -> Result<()> {
+    trainer.catch_up().map(|_| ()).map_err(|fault| Error::new(ErrorKind::Diverged, fault.0))
 }
 
 /// Parts of a step that have rows of their own, in order.

@@ -148,7 +148,7 @@ fn guided_sampling_finds_a_sky_that_no_gaussian_stands_for() {
         while !t.is_done() {
             let step = t.step().unwrap().expect("no fault");
             added += step.change.added;
-            mse.push(step.mse);
+            mse.push(step.measured[0].mse);
         }
         (added, mse[mse.len() - 8..].iter().sum::<f64>() / mse[..8].iter().sum::<f64>())
     };

@@ -115,7 +115,7 @@ impl Bed {
         while !trainer.is_done() {
             let step = trainer.step().unwrap().unwrap_or_else(|fault| panic!("{line}: {}", fault.0));
             look(&trainer, step.change);
-            mse.push(step.mse);
+            mse.push(step.measured[0].mse);
             rows.push(trainer.scene().len());
             change.added += step.change.added;
             change.moved += step.change.moved;

@@ -47,7 +47,7 @@ pub(super) fn finish(trainer: &mut Trainer<'_>, what: &str) -> (Vec<f64>, Vec<St
     let (mut mse, mut notices) = (Vec::new(), Vec::new());
     while !trainer.is_done() {
         let step = trainer.step().unwrap().unwrap_or_else(|fault| panic!("{what}: {}", fault.0));
-        mse.push(step.mse);
+        mse.extend(step.measured.iter().map(|m| m.mse));
         notices.extend(step.notices);
     }
     (mse, notices)

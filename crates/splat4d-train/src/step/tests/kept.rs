@@ -74,12 +74,12 @@ fn step(
     });
     let stats = learner.stats().tables[0].data();
     let kept = KeptLayer { rows: ROWS, moves: Moves::Posed, life: LifeKind::Infinite, tables, stats, ties };
-    resident.keep(&[kept], &corrections::<f32>()).unwrap();
+    resident.keep(&[kept], None, &corrections::<f32>()).unwrap();
     let away = Se3::look_at([0.0, 0.0, 50.0], [0.0, 0.0, 90.0], [0.0, 1.0, 0.0]);
     let camera = Camera::with_fov_y(away, 0.8, 32, 24);
     let truth = Planes::new(3, 24, 32);
     let target = Target { truth: &truth, weight: None, picture: 0, dssim: 0.2, response: None };
-    let view = KeptView { camera: &camera, t: Time(1.0), background: NO_VIEW, target };
+    let view = KeptView { camera: &camera, t: Time(1.0), background: NO_VIEW, target, rig: 0 };
     let rule = |width: usize| Some(KeptRule { rates: vec![rate; width], floor: None });
     let rules: [Option<KeptRule>; KEPT] = [rule(11), None, rule(POSE), None, None];
     let step = KeptStep {
@@ -89,8 +89,10 @@ fn step(
         rules: &[rules],
         rows,
         noise: &[noise],
+        cameras: 0.0,
     };
-    let stepped = resident.step(&step).unwrap().expect("a small picture");
+    assert!(resident.step(&step).unwrap().expect("a small picture").is_empty(), "it is under way");
+    let stepped = resident.finish().unwrap().remove(0);
     Some((stepped, resident.fetch(0).unwrap()))
 }
 

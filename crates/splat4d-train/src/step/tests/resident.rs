@@ -8,8 +8,8 @@ use crate::step::resident::DeviceEngine;
 use splat4d::device::{self, Device};
 use splat4d::layers::ALPHA_MIN;
 use splat4d::render::{
-    Antialias, Backend, Image, ImageGrads, KeptLayer, KeptNumbers, KeptStep, KeptStepped, RenderConfig, RenderGrads,
-    Resident, Shot, Wanted,
+    Antialias, Backend, Image, ImageGrads, KeptCameras, KeptLayer, KeptNumbers, KeptStep, KeptStepped, RenderConfig,
+    RenderGrads, Resident, Shot, Wanted,
 };
 use splat4d::scene::{GEOMETRY, Table};
 use splat4d::{Error, ErrorKind, Result};
@@ -60,17 +60,20 @@ fn gradients_of_the_whole_chain_equal_the_cpus() {
         let mut cpu = bed.start(&recipe);
         for step in 1..=FEW {
             let stepped = trainer.step().unwrap().unwrap();
-            let expected = cpu.step().unwrap().unwrap();
+            let expected = cpu.step().unwrap().unwrap().measured[0];
             assert!(stepped.notices.is_empty(), "{line}: {:?}", stepped.notices);
+            // Upkeep may have waited for it already.
+            let later = trainer.settle().unwrap();
+            let measured = stepped.measured.iter().chain(&later).copied().next().expect("the step is done");
+            assert_eq!(measured.iteration, step);
             for (a, b) in [
-                (stepped.report.loss, expected.report.loss),
-                (stepped.mse, expected.mse),
-                (stepped.l1, expected.l1),
-                (stepped.ssim, expected.ssim),
+                (measured.loss, expected.loss),
+                (measured.mse, expected.mse),
+                (measured.l1, expected.l1),
+                (measured.ssim, expected.ssim),
             ] {
                 assert!((a - b).abs() < 1e-4 * b.abs(), "{line}, step {step}: {a} {b}");
             }
-            trainer.settle().unwrap();
             let mut worst = 0.0f64;
             for ((name, a, steps), (_, b, expected)) in moments(&trainer).into_iter().zip(moments(&cpu)) {
                 let others = steps.iter().zip(&expected).filter(|(a, b)| a != b).count();
@@ -86,6 +89,13 @@ fn gradients_of_the_whole_chain_equal_the_cpus() {
                 worst = worst.max(off);
             }
             println!("{line}, step {step}: {worst:.1e}");
+            if let (Some(a), Some(b)) = (&trainer.learner.exposure, &cpu.learner.exposure) {
+                let first = |e: &crate::learner::Exposure| e.moments.table(e.key()).column_to_rows(0, 12);
+                let (a, b) = (first(a), first(b));
+                let off: f64 = a.iter().zip(&b).map(|(a, b)| f64::from(a - b).powi(2)).sum();
+                let all: f64 = b.iter().map(|b| f64::from(*b).powi(2)).sum();
+                assert!(all > 0.0 && (off / all).sqrt() < GRADIENT, "{line}: cameras differ by {off:.1e} of {all:.1e}");
+            }
             let stats = [&trainer, &cpu].map(|t| t.learner.stats().tables[0].column_to_rows(0, 3));
             let sums = stats.map(|s| s.chunks_exact(3).map(|r| [r[0], r[1], r[2]].map(f64::from)).collect::<Vec<_>>());
             for c in 0..3 {
@@ -124,6 +134,11 @@ fn repeats_and_resumes(bed: &Bed, recipe: &Recipe) {
     };
     let Some((whole, checkpoints)) = run() else { return };
     assert!(checkpoints.len() == 2 && run() == Some((whole.clone(), checkpoints.clone())), "the same bits again");
+    // Nobody looks in between: as many steps are under way as may be.
+    let mut unseen = on_gpu(bed, recipe).expect("there was a GPU");
+    let (mse, _) = finish(&mut unseen, "unseen");
+    assert!(bytes(unseen.scene()) == whole, "it does not depend on who looks when");
+    assert_eq!(mse.len(), unseen.progress.iteration, "every step is told once");
     for checkpoint in &checkpoints {
         let mut resumed = bed.resumed_on(Device::Gpu, recipe, checkpoint);
         finish(&mut resumed, "resumed");
@@ -143,7 +158,8 @@ fn a_number_that_is_not_finite_is_found_and_named() {
     let (learner, progress) =
         (std::mem::replace(&mut trainer.learner, crate::learner::Learner::new(Default::default())), trainer.progress);
     trainer.restore(learner, progress);
-    let fault = (0..3).find_map(|_| trainer.step().unwrap().err()).expect("it is found");
+    let fault = (0..3).find_map(|_| trainer.step().unwrap().err()).or_else(|| trainer.settle().err());
+    let fault = fault.expect("it is found");
     assert!(fault.1 == Blame::Numbers && fault.0.contains("not finite") && fault.0.contains('7'), "{}", fault.0);
     // As after a rollback.
     let mut resumed = bed.resumed_on(Device::Gpu, &recipe, &before);
@@ -192,17 +208,28 @@ impl Backend for Failing {
 }
 
 impl Resident for Failing {
-    fn keep(&mut self, layers: &[KeptLayer<'_>], corrections: &[[f32; 2]]) -> Result<()> {
-        self.device.resident().expect("a GPU").keep(layers, corrections)
+    fn keep(
+        &mut self,
+        layers: &[KeptLayer<'_>],
+        cameras: Option<&KeptCameras<'_>>,
+        corrections: &[[f32; 2]],
+    ) -> Result<()> {
+        self.device.resident().expect("a GPU").keep(layers, cameras, corrections)
     }
-    fn step(&mut self, step: &KeptStep<'_>) -> Result<Option<KeptStepped>> {
+    fn step(&mut self, step: &KeptStep<'_>) -> Result<Option<Vec<KeptStepped>>> {
         assert_eq!(step.alpha_min, ALPHA_MIN);
         self.steps = self.steps.checked_sub(1).ok_or_else(failed)?;
         self.device.resident().expect("a GPU").step(step)
     }
+    fn finish(&mut self) -> Result<Vec<KeptStepped>> {
+        self.device.resident().expect("a GPU").finish()
+    }
     fn fetch(&mut self, layer: usize) -> Result<KeptNumbers> {
         self.fetches = self.fetches.checked_sub(1).ok_or_else(failed)?;
         self.device.resident().expect("a GPU").fetch(layer)
+    }
+    fn fetch_cameras(&mut self) -> Result<[Vec<f32>; 2]> {
+        self.device.resident().expect("a GPU").fetch_cameras()
     }
 }
 

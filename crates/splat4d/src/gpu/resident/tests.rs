@@ -1,11 +1,13 @@
 //! The kernels of Gaussians of space and time against the motion model, in f64, at the edges of what numbers can stand too.
 
 use super::*;
-use crate::gpu::tests::{camera, read, renderer};
+use crate::gpu::MOST_PAIRS;
+use crate::gpu::tests::{camera, own_renderer, read, renderer};
+use crate::layers::{ALPHA_MIN, Evaluation, Layer, Scene};
 use crate::math::{Real, Rng};
 use crate::motion::native4d::{Native4dSpec, TABLE};
 use crate::motion::{At, Cache, Motion, Slices, Spec, Tape, build_as};
-use crate::render::{KeptRule, KeptView, Target};
+use crate::render::{Backend, Image, KeptNoise, KeptRule, KeptView, RowWeights, Shot, Target};
 use crate::scene::{Camera, GEOMETRY, Grads, Key, Params, Planes, Rows, Space, SplatGrads, Table, Time};
 use std::sync::Arc;
 
@@ -75,10 +77,10 @@ fn slices_equal_the_model_forth_and_back() {
     let tables = [table(GEOMETRY), KeptTable::default(), table(own), KeptTable::default(), table(crate::scene::SH)];
     let stats = vec![0.0; STATS_WIDTH * ROWS.next_multiple_of(BLOCK)];
     let layer = KeptLayer { rows: ROWS, moves, life: LifeKind::Infinite, tables, stats: &stats, ties: None };
-    r.keep(&[layer], &[[1.0; 2]]).expect("a small scene");
+    r.keep(&[layer], None, &[[1.0; 2]]).expect("a small scene");
     let (camera, truth) = (camera([0.0, 0.0, -4.0], 16, 16), Planes::new(3, 16, 16));
     let target = Target { truth: &truth, weight: None, picture: 0, dssim: 0.2, response: None };
-    let view = KeptView { camera: &camera, t: Time(t), background: [0.0; 3], target };
+    let view = KeptView { camera: &camera, t: Time(t), background: [0.0; 3], target, rig: 0 };
     let step = KeptStep {
         views: &[view, view],
         sh_degree: 0,
@@ -86,23 +88,26 @@ fn slices_equal_the_model_forth_and_back() {
         rules: &[[const { None }; KEPT]],
         rows: RowWeights::default(),
         noise: &[None],
+        cameras: 0.0,
     };
+    let step = r.take_over(&step).expect("it is sent").expect("a small picture");
+    r.make_room_for_status(2).expect("room");
     let (geometry, gradient, alive) = r.with_tables(|r, tables| {
         let pass = KeptPass { tables, step: &step, view: 0 };
         r.make_room_for_splats(ROWS).expect("room");
         r.buffers.back.ensure(&r.gpu, (4 * back.len()) as u64).expect("room");
-        r.buffers.partials.ensure(&r.gpu, (4 * pass.words()) as u64).expect("room");
+        r.make_room_for_loss([16, 16], 16).expect("room");
         r.gpu.queue.write_buffer(r.buffers.back.get(), 0, bytemuck::cast_slice(&back));
         pass.write_uniforms(&r.gpu, 1);
         let mut recorder = Recorder::new(&r.gpu, &r.queries, r.clock);
-        pass.answer(&r.gpu, &r.upload, &mut recorder).expect("it runs");
-        pass.learn(&r.gpu, &r.buffers, &r.upload, 0, &mut recorder).expect("it runs");
+        tables.answer(&r.gpu, &r.buffers, &r.upload, &mut recorder).expect("it runs");
+        pass.learn(&r.gpu, &r.buffers, &r.upload, &mut recorder).expect("it runs");
         recorder.submit();
         let padded = ROWS.next_multiple_of(BLOCK);
         (
             read::<f32>(&r.gpu, &r.upload.parts[0].geometry, GEOMETRY_WIDTH * padded),
-            read::<f32>(&r.gpu, &tables.layers[0].d_params, tables.layers[0].strides()[0] * padded),
-            read::<u32>(&r.gpu, &tables.layers[0].alive, ROWS),
+            read::<f32>(&r.gpu, &tables.pages[0].d_params, tables.pages[0].strides()[0] * padded),
+            read::<u32>(&r.gpu, &tables.pages[0].alive, ROWS),
         )
     });
     let column = |data: &[f32], width: usize, c: usize| -> Vec<f64> {
@@ -134,8 +139,11 @@ fn slices_equal_the_model_forth_and_back() {
     of(own, 0..6, 11, "time");
 }
 
-/// A step that these cameras see, with losses on rows; what it was, and the numbers after it.
-fn stepped(r: &mut GpuRenderer, cameras: &[Camera]) -> (KeptStepped, KeptNumbers) {
+/// What steps measured, and the numbers of the layer and of the cameras after them.
+type After = (Vec<KeptStepped>, KeptNumbers, [Vec<f32>; 2]);
+
+/// Steps that each see these cameras, which learn their colours, with losses on rows and noise. `rates`: a step's.
+fn tried(r: &mut GpuRenderer, steps: &[(&[Camera], f64)]) -> Result<After> {
     let spec = Native4dSpec::default();
     let (p, own, motion) = params::<f32>(&spec);
     let moves = moves(motion.as_ref());
@@ -143,57 +151,202 @@ fn stepped(r: &mut GpuRenderer, cameras: &[Camera]) -> (KeptStepped, KeptNumbers
     let tables = [table(GEOMETRY), KeptTable::default(), table(own), KeptTable::default(), table(crate::scene::SH)];
     let stats = vec![0.0; STATS_WIDTH * ROWS.next_multiple_of(BLOCK)];
     let layer = KeptLayer { rows: ROWS, moves, life: LifeKind::Infinite, tables, stats: &stats, ties: None };
-    r.keep(&[layer], &[[1.0; 2]; 3]).expect("a small scene");
+    let colors: Vec<f32> = (0..12 * BLOCK).map(|i| 0.01 * (i % 5) as f32).collect();
+    let table = KeptTable { width: 12, params: &colors, moments: &[] };
+    let cameras = KeptCameras { count: 3, table, held: &[0, 1] };
+    r.keep(&[layer], Some(&cameras), &[[1.0; 2]; 3])?;
     let truth = |camera: &Camera| {
         let mut truth = Planes::new(3, camera.height, camera.width);
         truth.data.iter_mut().enumerate().for_each(|(i, x)| *x = (i % 7) as f32 / 7.0);
         truth
     };
-    let truths: Vec<Planes<f32>> = cameras.iter().map(truth).collect();
-    let view = |(i, camera)| {
-        let target = Target { truth: &truths[i], weight: None, picture: i, dssim: 0.2, response: None };
-        KeptView { camera, t: Time(0.0), background: [0.5; 3], target }
-    };
-    let views: Vec<KeptView<'_>> = cameras.iter().enumerate().map(view).collect();
-    let rule = |width: usize| Some(KeptRule { rates: vec![0.01; width], floor: None });
-    let step = KeptStep {
-        views: &views,
-        sh_degree: 0,
-        alpha_min: 1.0 / 255.0,
-        rules: &[[rule(11), None, rule(6), None, rule(3)]],
-        rows: RowWeights { opacity: 0.1, ..RowWeights::default() },
-        noise: &[None],
-    };
-    let stepped = r.step(&step).expect("it runs").expect("small pictures");
-    assert!(stepped.bad.is_none() && stepped.loss > 0.0 && r.stats().pairs > ROWS, "{:?}", r.stats());
-    let numbers = r.fetch(0).expect("it is read");
+    let mut done = Vec::new();
+    for (number, (cameras, rate)) in steps.iter().enumerate() {
+        let truths: Vec<Planes<f32>> = cameras.iter().map(truth).collect();
+        let view = |(i, camera): (usize, _)| {
+            let picture = 100 * truths[i].width + i;
+            let target = Target { truth: &truths[i], weight: None, picture, dssim: 0.2, response: None };
+            KeptView { camera, t: Time(0.0), background: [0.5; 3], target, rig: i }
+        };
+        let views: Vec<KeptView<'_>> = cameras.iter().enumerate().map(view).collect();
+        let rule = |width: usize| Some(KeptRule { rates: vec![*rate; width], floor: None });
+        let noise = KeptNoise {
+            strength: 0.1,
+            dead: 0.005,
+            slope: 100.0,
+            limit: 0.5,
+            rng: Rng::new(5, "noise", number as u64),
+        };
+        let step = KeptStep {
+            views: &views,
+            sh_degree: 0,
+            alpha_min: 1.0 / 255.0,
+            rules: &[[rule(11), None, rule(6), None, rule(3)]],
+            rows: RowWeights { opacity: 0.1, ..RowWeights::default() },
+            noise: &[Some(noise)],
+            cameras: 1e-3,
+        };
+        done.extend(r.step(&step)?.expect("small pictures"));
+        assert_eq!(done.len(), (number + 1).saturating_sub(r.ahead), "the others are under way");
+    }
+    done.extend(r.finish()?);
+    assert_eq!(done.len(), steps.len());
+    let numbers = r.fetch(0)?;
     assert!(numbers.params[0] != p[GEOMETRY].data(), "something was learnt");
-    (stepped, numbers)
+    Ok((done, numbers, r.fetch_cameras()?))
+}
+
+fn stepped(r: &mut GpuRenderer, steps: &[(&[Camera], f64)]) -> After {
+    tried(r, steps).expect("they are taken")
+}
+
+fn one(camera: &Camera) -> [(&[Camera], f64); 1] {
+    [(std::slice::from_ref(camera), 0.01)]
 }
 
 #[test]
 fn tunings_change_no_bit() {
     let camera = camera([0.0, 0.0, -4.0], 61, 47);
     // Without subgroups and with them.
-    let mut first: [Option<(KeptStepped, KeptNumbers)>; 2] = [None, None];
+    let mut first: [Option<After>; 2] = [None, None];
     for tuning in crate::gpu::Tuning::sweep() {
         let Some(gpu) = crate::gpu::tests::gpu() else { return };
         let mut r = GpuRenderer::new(gpu.tuned(tuning), Default::default()).expect("the kernels compile");
-        let now = stepped(&mut r, std::slice::from_ref(&camera));
+        let now = stepped(&mut r, &one(&camera));
+        assert!(now.0[0].bad.is_none() && now.0[0].loss > 0.0 && r.stats().pairs > ROWS, "{:?}", r.stats());
         let first = first[usize::from(tuning.subgroups)].get_or_insert_with(|| now.clone());
         assert!(*first == now, "{:?} changes bits", tuning.changes());
     }
 }
 
+/// Pictures of few pairs, then of more than there was room for, at a first view and at a later one.
+fn far_and_near() -> [Vec<Camera>; 3] {
+    let [far, near] = [camera([0.0, 0.0, -80.0], 16, 16), camera([0.0, 0.0, -4.0], 150, 110)];
+    [vec![far.clone(), far.clone()], vec![far.clone(), near.clone()], vec![near, far]]
+}
+
 #[test]
-fn room_that_runs_out_at_a_later_view_changes_no_bit() {
-    let Some(mut r) = renderer() else { return };
-    // Few pairs at first, then more than there was room for.
-    let cameras = [camera([0.0, 0.0, -80.0], 16, 16), camera([0.0, 0.0, -4.0], 150, 110)];
-    let plenty = stepped(&mut r, &cameras);
+fn steps_under_way_room_bands_and_pages_change_no_bit() {
+    let Some(mut r) = own_renderer() else { return };
+    let [first, then, last] = far_and_near();
+    let steps: Vec<(&[Camera], f64)> =
+        [&first, &first, &then, &first, &last, &then, &first].iter().map(|c| (&c[..], 0.01)).collect();
+    // One after the other, with all the room they want.
+    r.ahead = 0;
+    stepped(&mut r, &steps);
+    let (again, pairs) = (r.flights.again, r.pair_capacity());
+    let expected = stepped(&mut r, &steps);
+    assert_eq!(r.flights.again, again, "there was room");
+    assert!(expected.0.iter().all(|s| s.bad.is_none() && s.loss > 0.0));
+    assert!(expected.2[0][..BLOCK].iter().any(|x| *x != 0.0), "cameras learn");
+    let poor = |r: &mut GpuRenderer| {
+        (r.buffers, r.groups) = (Buffers::new(), None);
+        r.make_room_for_pairs(ROWS).expect("a little room");
+        assert!(r.pair_capacity() < pairs);
+    };
+    for ahead in [0, 1, 3, AHEAD] {
+        r.ahead = ahead;
+        assert!(stepped(&mut r, &steps) == expected, "{ahead} steps under way change bits");
+        poor(&mut r);
+        let before = r.flights.again;
+        assert!(stepped(&mut r, &steps) == expected, "room that runs out changes bits, {ahead} steps under way");
+        assert!(r.flights.again > before, "the first room was too little");
+    }
+    // Fewer pairs at once than a picture has: bands.
+    stepped(&mut r, &[(&then, 0.01)]);
+    let near = r.stats().pairs;
+    poor(&mut r);
+    r.most_pairs = near / 3;
+    assert!(stepped(&mut r, &steps) == expected, "bands change bits");
+    assert!(r.band_rows < 7, "{} rows of tiles a band", r.band_rows);
+    (r.most_pairs, r.band_rows) = (MOST_PAIRS, usize::MAX);
+    // Sums of losses on rows are by workgroup, of which a page has its own; nothing learns from them.
+    r.page_rows = Some(64);
+    let (done, numbers, cameras) = stepped(&mut r, &steps);
+    assert!(numbers == expected.1 && cameras == expected.2, "pages change bits");
+    for (a, b) in done.iter().zip(&expected.0) {
+        assert!(a.comparisons == b.comparisons && (a.loss - b.loss).abs() < 1e-6 * b.loss);
+    }
+    r.page_rows = None;
+    // A row of tiles that has too many is an error, not a loop.
+    r.most_pairs = 10;
+    poor(&mut r);
+    let error = tried(&mut r, &steps).expect_err("there is no smaller band");
+    assert!(error.to_string().contains("too many"), "{error}");
+}
+
+#[test]
+fn a_number_that_is_none_stops_all_that_follows_and_is_told_of_its_step() {
+    let Some(mut r) = own_renderer() else { return };
+    let [first, then, _] = far_and_near();
+    let steps: [(&[Camera], f64); 5] =
+        [(&first, 0.01), (&first, 0.01), (&first, f64::INFINITY), (&then, 0.01), (&first, 0.01)];
+    for ahead in [0, AHEAD] {
+        r.ahead = ahead;
+        let (done, numbers, _) = stepped(&mut r, &steps);
+        let wrong = done.iter().position(|s| s.bad.is_some());
+        assert_eq!(wrong, Some(2), "{done:?}");
+        assert!(numbers.params[0].iter().any(|x| !x.is_finite()));
+    }
+    // It starts anew as if nothing had been.
+    let steps = &steps[..2];
+    let (a, b) = (stepped(&mut r, steps), stepped(&mut own_renderer().expect("it was there"), steps));
+    assert!(a == b && a.0.iter().all(|s| s.bad.is_none()));
+}
+
+#[test]
+fn a_device_that_is_lost_under_way_is_an_error() {
+    let Some(mut r) = own_renderer() else { return };
+    let camera = camera([0.0, 0.0, -4.0], 33, 20);
+    stepped(&mut r, &one(&camera));
+    r.gpu.device.destroy();
+    assert!(tried(&mut r, &one(&camera)).is_err(), "it is told");
+}
+
+#[test]
+fn memory_that_is_refused_costs_pictures_first_and_is_an_error_then() {
+    let Some(mut r) = own_renderer() else { return };
+    let [first, then, _] = far_and_near();
+    let steps: [(&[Camera], f64); 3] = [(&first, 0.01), (&first, 0.01), (&then, 0.01)];
+    stepped(&mut r, &steps);
     (r.buffers, r.groups) = (Buffers::new(), None);
     r.make_room_for_pairs(ROWS).expect("a little room");
-    let first = r.pair_capacity();
-    assert!(stepped(&mut r, &cameras) == plenty, "room changes bits");
-    assert!(r.pair_capacity() > first, "the first room was too little");
+    let budget = r.pictures.budget;
+    r.gpu.refused = Some("pairs of tile and splat");
+    let error = tried(&mut r, &steps).expect_err("there is too little");
+    assert!(error.kind() == ErrorKind::Memory && error.to_string().contains("too little memory"), "{error}");
+    assert!(r.pictures.budget < budget, "pictures go first");
+    r.gpu.refused = None;
+    stepped(&mut r, &steps);
+}
+
+#[test]
+fn a_film_shows_what_a_picture_does() {
+    let Some(mut r) = own_renderer() else { return };
+    let (p, _, motion) = params::<f32>(&Native4dSpec::default());
+    let layer = Layer::new("all", p, motion, LifeKind::Infinite);
+    let scene = Scene { layers: vec![layer], clip: [0.0, 1.0], ..Scene::default() };
+    let [far, near] = [camera([0.0, 0.0, -80.0], 16, 16), camera([0.0, 0.0, -4.0], 150, 110)];
+    (r.buffers, r.groups) = (Buffers::new(), None);
+    r.make_room_for_pairs(ROWS).expect("a little room");
+    let frames: Vec<(Camera, Time)> =
+        [(&far, 0.3), (&near, 0.1), (&near, 0.5)].map(|(c, t): (&Camera, f64)| (c.clone(), Time(t))).to_vec();
+    let layer = &scene.layers[0];
+    let table =
+        |key: Key| KeptTable { width: layer.params[key].width(), params: layer.params[key].data(), moments: &[] };
+    let own = layer.params.find(TABLE).expect("the model made it");
+    let tables = [table(GEOMETRY), KeptTable::default(), table(own), KeptTable::default(), table(crate::scene::SH)];
+    let stats = vec![0.0; STATS_WIDTH * ROWS.next_multiple_of(BLOCK)];
+    let moves = moves(layer.motion.as_ref());
+    let kept = KeptLayer { rows: ROWS, moves, life: layer.life, tables, stats: &stats, ties: None };
+    let seconds = r.film(&[kept], ALPHA_MIN, scene.background, &frames).expect("it is drawn").expect("in one piece");
+    assert!(seconds > 0.0);
+    let filmed: Vec<f32> = read(&r.gpu, &r.buffers.planes, 3 * 150 * 110);
+    let mut moment = Evaluation::default();
+    scene.at(Time(0.5), &mut moment);
+    let splats = scene.splats(&moment);
+    let mut image = Image::default();
+    r.render(&Shot::new(&splats, &near, scene.background), &mut image).expect("it is drawn");
+    let off = filmed.iter().zip(&image.color.data).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    assert!(off < 2e-3 && image.color.data.iter().any(|x| *x > 0.2), "{off:.1e}");
 }

@@ -1,8 +1,8 @@
 //! The structures of uniforms that the kernels of tables read, filled.
 
 use super::{Kept, SH, moments_width};
-use crate::render::{KeptNoise, KeptRule, KeptStep, Moves, RowWeights};
-use crate::scene::LifeKind;
+use crate::render::{KeptNoise, KeptRule, Moves, RowWeights};
+use crate::scene::{LifeKind, Time};
 
 /// Most columns that Adam takes at once (adam.wgsl).
 pub(super) const MOST_COLUMNS: usize = 48;
@@ -28,7 +28,7 @@ pub(super) struct Ask {
     alpha_min: f32,
     widest: f32,
     first_splat: u32,
-    capacity: u32,
+    first_row: u32,
     sh_width: u32,
     blocks: u32,
     poses_at: u32,
@@ -41,27 +41,28 @@ pub(super) struct Ask {
 }
 
 impl Ask {
-    pub(super) fn new(layer: &Kept, step: &KeptStep<'_>, view: usize, first_splat: usize, capacity: usize) -> Self {
+    /// At a time; `first`: of a step's first view.
+    pub(super) fn new(layer: &Kept, at: Time, first: bool, alpha_min: f64, first_splat: usize) -> Self {
         let flag = |on: bool, flag: u32| if on { flag } else { 0 };
-        let t = step.views[view].t.0;
+        let t = at.0;
         let life = match layer.life {
             LifeKind::Infinite => 0,
             LifeKind::GaussHalf => 1,
             LifeKind::GaussOne => 2,
             LifeKind::Interval => 3,
         };
-        let [_, life_at, first, second, _] = std::array::from_fn(|table| layer.first(table)[0] as u32);
+        let [_, life_at, one, two, _] = std::array::from_fn(|table| layer.first(table)[0] as u32);
         let still = Self {
             rows: layer.rows as u32,
             width: layer.strides()[0] as u32,
-            flags: flag(view == 0, FLAG_FIRST),
+            flags: flag(first, FLAG_FIRST),
             life,
             life_at,
             t: t as f32,
-            alpha_min: step.alpha_min as f32,
-            widest: (2.0 * -step.alpha_min.ln()).sqrt() as f32,
+            alpha_min: alpha_min as f32,
+            widest: (2.0 * -alpha_min.ln()).sqrt() as f32,
             first_splat: first_splat as u32,
-            capacity: capacity as u32,
+            first_row: layer.first_row as u32,
             sh_width: layer.widths[SH] as u32,
             blocks: layer.moves.blocks() as u32,
             ..Self::default()
@@ -70,14 +71,14 @@ impl Ask {
             Moves::Along { order, rotation, detach, origin } => Self {
                 order: order as u32,
                 flags: still.flags | flag(rotation, FLAG_ROTATION) | flag(detach, FLAG_DETACH),
-                velocities_at: first,
-                rates_at: second,
+                velocities_at: one,
+                rates_at: two,
                 delta: (t - origin) as f32,
                 ..still
             },
-            Moves::Posed => Self { poses_at: first, ..still },
+            Moves::Posed => Self { poses_at: one, ..still },
             Moves::Sliced { speed, floor, ceiling, harmonics: _, period } => Self {
-                own_at: first,
+                own_at: one,
                 speed: speed as f32,
                 floor: floor as f32,
                 ceiling: ceiling as f32,
@@ -101,7 +102,7 @@ pub(super) struct Rule {
     counted: u32,
     floor_column: u32,
     floor_least: f32,
-    capacity: u32,
+    first_row: u32,
     word: u32,
     from: u32,
     columns: u32,
@@ -111,13 +112,7 @@ pub(super) struct Rule {
 
 impl Rule {
     /// Of the piece of a table that begins with column `from`.
-    pub(super) fn new(
-        layer: &Kept,
-        table: usize,
-        from: usize,
-        rule: &KeptRule,
-        [counted, word, capacity]: [usize; 3],
-    ) -> Self {
+    pub(super) fn new(layer: &Kept, table: usize, from: usize, rule: &KeptRule, [counted, word]: [usize; 2]) -> Self {
         let width = layer.widths[table];
         let ([first, moments_first], [stride, moments_stride]) =
             if table == SH { ([0; 2], [width, moments_width(width)]) } else { (layer.first(table), layer.strides()) };
@@ -132,7 +127,7 @@ impl Rule {
             counted: counted as u32,
             floor_column: floor_column as u32,
             floor_least: floor_least as f32,
-            capacity: capacity as u32,
+            first_row: layer.first_row as u32,
             word: word as u32,
             from: from as u32,
             columns: (width - from).min(MOST_COLUMNS) as u32,
@@ -202,4 +197,18 @@ pub(super) struct TieRule {
     pub stays: [f32; 2],
     pub up: [f32; 3],
     pub height: f32,
+}
+
+/// `struct Rule` of record.wgsl.
+#[repr(C)]
+#[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+pub(super) struct RecordRule {
+    pub tiles: u32,
+    pub view: u32,
+    pub camera: u32,
+    pub cameras: u32,
+    pub bad_at: u32,
+    pub bad_words: u32,
+    pub counted: u32,
+    pub rate: f32,
 }

@@ -122,13 +122,19 @@ fn value_and_gradient_equal_the_definition_and_the_way_through_the_cpu() {
     let scene = Scenery::new(80, 400, 1.2, 0.08);
     let cameras = [camera([0.0, 0.5, -4.0], 67, 45), skewed(16, 33), camera([0.2, 0.1, -0.8], 5, 3)];
     for (i, camera) in cameras.iter().enumerate() {
-        for (weighted, response, eight) in
-            [(false, None, true), (true, None, true), (false, Some(RESPONSE), false), (true, Some(RESPONSE), false)]
-        {
-            let (splats, (truth, weight)) = (scene.splats(), truth(81 + i as u64, camera, eight));
+        for (weighted, response, eight, more) in [
+            (false, None, true, 1.0),
+            (true, None, true, 1.0),
+            // Colours of 8 bits with weights that are not.
+            (true, None, true, 1.7),
+            (false, Some(RESPONSE), false, 1.0),
+            (true, Some(RESPONSE), false, 1.0),
+        ] {
+            let (splats, (truth, mut weight)) = (scene.splats(), truth(81 + i as u64, camera, eight));
+            weight.data.iter_mut().for_each(|w| *w *= more);
             let shot = Shot::new(&splats, camera, BEHIND);
             let weight = weighted.then_some(&weight);
-            let picture = 10 * i + 4 * usize::from(weighted) + usize::from(eight);
+            let picture = 20 * i + 4 * usize::from(weighted) + usize::from(eight) + if more > 1.0 { 10 } else { 0 };
             let target = Target { truth: &truth, weight, picture, dssim: DSSIM, response };
             let what = format!("camera {i}, {weighted}, {response:?}, {eight}");
             let (got, d, d_sh) = compared(&mut r, &shot, &target);

@@ -1,6 +1,7 @@
 //! Stage by stage.
 
 use super::*;
+use crate::gpu::kernels::Kernel;
 use crate::render::project::{Projection, View};
 use crate::render::{project, shade};
 
@@ -101,7 +102,7 @@ fn colours_equal_the_cpus() {
 }
 
 /// Pairs sorted by the low `passes` bytes of their keys on the GPU.
-fn sorted(gpu: &Gpu, kernels: &Kernels, keys: &[u32], values: &[u32], passes: u32) -> (Vec<u32>, Vec<u32>) {
+fn sorted(gpu: &Gpu, kernel: &Kernel, keys: &[u32], values: &[u32], passes: u32) -> (Vec<u32>, Vec<u32>) {
     let n = keys.len();
     let keys = [storage(gpu, keys), storage(gpu, keys)];
     let values = [storage(gpu, values), storage(gpu, values)];
@@ -114,14 +115,14 @@ fn sorted(gpu: &Gpu, kernels: &Kernels, keys: &[u32], values: &[u32], passes: u3
         gpu.queue.write_buffer(uniform.get(), 0, bytemuck::cast_slice(&[8 * pass, 1]));
         let (from, to) = (pass as usize % 2, 1 - pass as usize % 2);
         let resources = [&uniform, &counts, &keys[from], &values[from], &keys[to], &values[to], &sums].map(Grown::all);
-        let group = kernels.sort.bind(gpu, &resources);
+        let group = kernel.bind(gpu, &resources);
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
         {
             let mut cp = encoder.begin_compute_pass(&Default::default());
             cp.set_bind_group(0, &group, &[]);
             // More workgroups than blocks: the spare ones do nothing.
             let blocks = n.div_ceil(block()) as u32 + 1;
-            for (pipeline, groups) in kernels.sort.pipelines.iter().zip([blocks, DIGITS as u32, blocks]) {
+            for (pipeline, groups) in kernel.pipelines.iter().zip([blocks, DIGITS as u32, blocks]) {
                 cp.set_pipeline(pipeline);
                 cp.dispatch_workgroups(groups, 1, 1);
             }
@@ -133,10 +134,59 @@ fn sorted(gpu: &Gpu, kernels: &Kernels, keys: &[u32], values: &[u32], passes: u3
     (read(gpu, &keys[last], n), read(gpu, &values[last], n))
 }
 
+/// The sort with subgroups of so many threads on any device: votes go through the workgroup's memory.
+fn as_if_subgroups_had(size: u32) -> String {
+    let stand_in = "
+        var<private> stand_in_thread: u32;
+        var<workgroup> stand_in_votes: array<atomic<u32>, 64>;
+        fn stand_in_ballot(vote: bool) -> vec4<u32> {
+            let first = 2u * (stand_in_thread / SIZE);
+            let lane = stand_in_thread % SIZE;
+            workgroupBarrier();
+            if (stand_in_thread < 64u) {
+                atomicStore(&stand_in_votes[stand_in_thread], 0u);
+            }
+            workgroupBarrier();
+            if (vote) {
+                atomicOr(&stand_in_votes[first + lane / 32u], 1u << (lane % 32u));
+            }
+            workgroupBarrier();
+            return vec4<u32>(atomicLoad(&stand_in_votes[first]), atomicLoad(&stand_in_votes[first + 1u]), 0u, 0u);
+        }
+";
+    let parameters = [
+        "    @builtin(subgroup_id) subgroup: u32,\n",
+        "    @builtin(subgroup_size) size: u32,\n",
+        "    @builtin(subgroup_invocation_id) lane: u32,\n",
+    ];
+    let mut text = crate::wgsl::SORT_SUBGROUP.replace("subgroupBallot(", "stand_in_ballot(");
+    for parameter in parameters {
+        assert!(text.contains(parameter));
+        text = text.replace(parameter, "");
+    }
+    let begin = "    let pairs = sort_pairs();\n";
+    assert!(text.contains(begin));
+    let own = format!(
+        "    stand_in_thread = index;\n    let size = {size}u;\n    let subgroup = index / size;\n    let lane = index % size;\n{begin}"
+    );
+    stand_in.replace("SIZE", &format!("{size}u")) + &text.replace(begin, &own)
+}
+
 #[test]
-fn the_sort_is_the_stable_one() {
+fn every_sort_is_the_stable_one() {
     let Some(gpu) = gpu() else { return };
-    let kernels = Kernels::new(&gpu);
+    the_sort_is_the_stable_one(&gpu, &Kernels::sort(&gpu, false), "portable");
+    if gpu.has_subgroups() {
+        the_sort_is_the_stable_one(&gpu, &Kernels::sort(&gpu, true), "with subgroups");
+    }
+    for size in [8, 16, 32, 64] {
+        let text = as_if_subgroups_had(size);
+        let kernel = Kernels::sort_of(&gpu, &[crate::wgsl::SORT, &text], "scatter_subgroup");
+        the_sort_is_the_stable_one(&gpu, &kernel, &format!("as if subgroups had {size} threads"));
+    }
+}
+
+fn the_sort_is_the_stable_one(gpu: &Gpu, kernel: &Kernel, what: &str) {
     let rng = Rng::new(3, "sort", 0);
     for (n, mask) in [
         (0, u32::MAX),
@@ -146,6 +196,7 @@ fn the_sort_is_the_stable_one() {
         (257, u32::MAX),
         (2048, 0xff),
         (2049, 0x00ff_ff00),
+        (5000, 0),
         (70_001, 0x3f),
         (100_000, u32::MAX),
     ] {
@@ -154,16 +205,16 @@ fn the_sort_is_the_stable_one() {
         let values: Vec<u32> = (0..n as u32).map(|i| i ^ 0x5555).collect();
         let mut expected: Vec<(u32, u32)> = keys.iter().copied().zip(values.iter().copied()).collect();
         expected.sort_by_key(|p| p.0);
-        let (keys, values) = sorted(&gpu, &kernels, &keys, &values, 4);
+        let (keys, values) = sorted(gpu, kernel, &keys, &values, 4);
         let got: Vec<(u32, u32)> = keys.into_iter().zip(values).collect();
-        assert!(got == expected, "{n} pairs, mask {mask:x}: the order is not that of a stable sort");
+        assert!(got == expected, "{what}: {n} pairs, mask {mask:x}: the order is not that of a stable sort");
     }
     // One pass sorts by its eight bits alone.
     let keys: Vec<u32> = (0..5000u32).map(|i| i.wrapping_mul(2_654_435_761)).collect();
     let values: Vec<u32> = (0..5000).collect();
     let mut expected = values.clone();
     expected.sort_by_key(|&i| keys[i as usize] & 0xff);
-    assert_eq!(sorted(&gpu, &kernels, &keys, &values, 1).1, expected);
+    assert_eq!(sorted(gpu, kernel, &keys, &values, 1).1, expected, "{what}");
 }
 
 #[test]
@@ -173,13 +224,14 @@ fn sums_are_exclusive_and_stop_at_the_top() {
     let rng = Rng::new(4, "scan", 0);
     for (n, top) in [(0, 3.0), (1, 3.0), (2047, 3.0), (2049, 100.0), (70_001, 5.0), (300_001, 1.0), (5000, 4e6)] {
         let input: Vec<u32> = (0..n as u64).map(|i| (rng.uniform(i) * (top + 1.0)) as u32).collect();
-        let counts = storage(&gpu, &[n as u32, 0, 0]);
+        let counts = storage(&gpu, &[n as u32, 0, 0, 0, 0]);
         let arguments = storage(&gpu, &[0u32; 12]);
         let (scan_in, out) = (storage(&gpu, &input), storage(&gpu, &vec![0u32; n]));
         let sums = storage(&gpu, &vec![0u32; n.div_ceil(block())]);
         let mut uniform = Grown::new("pass", wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST);
-        uniform.ensure(&gpu, 16).expect("a small buffer");
-        gpu.queue.write_buffer(uniform.get(), 0, bytemuck::cast_slice(&[0u32, 2, 6, 1_000_000]));
+        uniform.ensure(&gpu, 32).expect("a small buffer");
+        // Of the second view of a step.
+        gpu.queue.write_buffer(uniform.get(), 0, bytemuck::cast_slice(&[0u32, 2, 6, 1_000_000, 2, 0, 0, 0]));
         let resources = [&uniform, &counts, &scan_in, &out, &sums, &arguments].map(Grown::all);
         let group = kernels.scan.bind(&gpu, &resources);
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
@@ -200,8 +252,8 @@ fn sums_are_exclusive_and_stop_at_the_top() {
             sum = sum.saturating_add(*v);
         }
         assert!(read::<u32>(&gpu, &out, n) == expected, "{n} sums");
-        assert_eq!(read::<u32>(&gpu, &counts, 3), [n as u32, 0, sum], "{n}: the total");
-        let things = if sum > 1_000_000 { 0 } else { sum };
+        let (stop, things) = if sum > 1_000_000 { ([2, sum], 0) } else { ([0, 0], sum) };
+        assert_eq!(read::<u32>(&gpu, &counts, 5), [n as u32, 0, sum, stop[0], stop[1]], "{n}: the total");
         let written = [things.div_ceil(256), 1, 1, things.div_ceil(2048), 1, 1];
         assert_eq!(read::<u32>(&gpu, &arguments, 12)[6..], written, "{n}: sizes of dispatches");
     }
