@@ -257,14 +257,18 @@ mod tests {
         4.0 / (1.0 - u)
     }
 
-    /// Two cameras in one place look at the wall, with points on it; maps say `told` of a column's true depth and its number.
-    fn opened(folder: &Path, kind: &str, told: &dyn Fn(&dyn Fn(usize) -> f64, usize) -> f64) -> OpenCapture {
-        let true_ = |x: usize| wall((x as f64 + 0.5 - 16.0) / FOCAL);
+    /// The wall's depth in a column.
+    fn depth(x: usize) -> f64 {
+        wall((x as f64 + 0.5 - 16.0) / FOCAL)
+    }
+
+    /// Two cameras in one place look at the wall, with points on it; maps say `told` of a column.
+    fn opened(folder: &Path, kind: &str, told: &dyn Fn(usize) -> f64) -> OpenCapture {
         let mut cameras = Vec::new();
         for c in 0..2 {
             let picture = image::RgbImage::from_pixel(SIDE as u32, SIDE as u32, image::Rgb([90, 90, 90]));
             picture.save(folder.join(format!("{c}.png"))).unwrap();
-            let values: Vec<f32> = (0..SIDE * SIDE).map(|p| told(&true_, p % SIDE) as f32).collect();
+            let values: Vec<f32> = (0..SIDE * SIDE).map(|p| told(p % SIDE) as f32).collect();
             let mut file = Vec::new();
             npy::write_f32(&[SIDE, SIDE], &values, &mut file).unwrap();
             std::fs::write(folder.join(format!("d{c}.npy")), file).unwrap();
@@ -300,20 +304,20 @@ mod tests {
         let scales = |o: &OpenCapture| -> Vec<Option<f64>> {
             o.capture.frames.iter().map(|f| f.depth.as_ref().map(|d| d.scale)).collect()
         };
-        let (exact, said) = believed(opened(folder.path(), "metric", &|z, x| z(x)), &recipe).unwrap();
+        let (exact, said) = believed(opened(folder.path(), "metric", &depth), &recipe).unwrap();
         assert_eq!((scales(&exact), said), (vec![Some(1.0); 2], None));
-        let (scaled, said) = believed(opened(folder.path(), "metric", &|z, x| z(x) / 1.3), &recipe).unwrap();
+        let (scaled, said) = believed(opened(folder.path(), "metric", &|x| depth(x) / 1.3), &recipe).unwrap();
         assert!(scales(&scaled).iter().all(|s| s.is_some_and(|s| (s - 1.3).abs() < 0.03)), "{:?}", scales(&scaled));
         assert!(said.is_some_and(|s| s.contains("1.3") && s.contains("depth_scale")));
         let (again, said) = believed(scaled, &recipe).unwrap();
         assert!(said.is_none() && scales(&again)[0].is_some_and(|s| s > 1.2), "what was mended fits");
-        let (mirrored, said) = believed(opened(folder.path(), "metric", &|z, x| z(SIDE - 1 - x)), &recipe).unwrap();
+        let (mirrored, said) = believed(opened(folder.path(), "metric", &|x| depth(SIDE - 1 - x)), &recipe).unwrap();
         assert_eq!(scales(&mirrored), [None, None]);
         assert!(said.is_some_and(|s| s.contains("contradict") && s.contains("mirrored")));
         // What claims no unit is held against the scene alone, and what is not read is not looked at.
-        let relative = opened(folder.path(), "relative", &|z, x| z(SIDE - 1 - x));
+        let relative = opened(folder.path(), "relative", &|x| depth(SIDE - 1 - x));
         assert_eq!(believed(relative, &recipe).unwrap().1, None);
         let off = recipe.with(|r| r.loss.depth = 0.0);
-        assert_eq!(believed(opened(folder.path(), "metric", &|z, x| z(x) / 1.3), &off).unwrap().1, None);
+        assert_eq!(believed(opened(folder.path(), "metric", &|x| depth(x) / 1.3), &off).unwrap().1, None);
     }
 }
