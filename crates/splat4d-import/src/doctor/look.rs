@@ -158,17 +158,32 @@ fn focus(pictures: &[Rgb8]) -> Option<f64> {
     (first > 0.0).then(|| last / first)
 }
 
-fn moved(first: &Grey, last: &Grey) -> Option<f64> {
-    let found = corners(first, None, 120, APART, &[]);
-    let [a, b] = [first, last].map(|g| Pyramid::new(g.clone(), LEVELS));
-    let ends = follow(&a, &b, &found);
-    let way = |(p, q): (&[f64; 2], &Option<[f64; 2]>)| q.map(|q| (p[0] - q[0]).hypot(p[1] - q[1]));
-    let mut ways: Vec<f64> = found.iter().zip(&ends).filter_map(way).collect();
-    if ways.len() < CORNERS {
-        return None;
-    }
-    ways.sort_by(f64::total_cmp);
-    Some(ways[ways.len() / 2])
+/// How far what stands still went from the first pictures to the last, pixels: the median of corners beside which nothing
+/// moves in either of them. `None` if there are too few to tell.
+fn moved(ends: [&[Rgb8]; 2]) -> Option<f64> {
+    let still = ends.map(|end| Grey::of(&median_of(end)));
+    let across = still[0].width.div_ceil(CELL);
+    let restless = [0, 1].map(|k| {
+        let seen = ends[k].iter().map(|p| cells(&Grey::of(p), &still[k]));
+        seen.reduce(|a, b| a.iter().zip(&b).map(|(a, b)| a | b).collect()).unwrap_or_default()
+    });
+    // The cell of a place, and those around it, which its window reaches into.
+    let rests = |k: usize, p: &[f64; 2]| {
+        let [x, y] = p.map(|v| v.max(0.0) as usize / CELL);
+        let down = restless[k].len() / across;
+        (y.saturating_sub(1)..(y + 2).min(down))
+            .all(|y| (x.saturating_sub(1)..(x + 2).min(across)).all(|x| !restless[k][y * across + x]))
+    };
+    let width = still[0].width;
+    let wanted: Vec<bool> =
+        (0..still[0].data.len()).map(|i| rests(0, &[(i % width) as f64, (i / width) as f64])).collect();
+    let found = corners(&still[0], Some(&wanted), 120, APART, &[]);
+    let [a, b] = still.map(|g| Pyramid::new(g, LEVELS));
+    let there = follow(&a, &b, &found);
+    let way =
+        |(p, q): (&[f64; 2], &Option<[f64; 2]>)| q.filter(|q| rests(1, q)).map(|q| (p[0] - q[0]).hypot(p[1] - q[1]));
+    let mut ways: Vec<f64> = found.iter().zip(&there).filter_map(way).collect();
+    (ways.len() >= CORNERS).then(|| median(&mut ways))
 }
 
 pub(super) fn camera(capture: &Capture, store: &ImageStore, camera: usize, options: &Options) -> Result<Seen> {
@@ -199,8 +214,7 @@ pub(super) fn camera(capture: &Capture, store: &ImageStore, camera: usize, optio
     if fixed && same {
         let third = (pictures.len() / 3).min(3);
         if third > 0 {
-            let ends = [&pictures[..third], &pictures[pictures.len() - third..]].map(|p| Grey::of(&median_of(p)));
-            seen.moved = moved(&ends[0], &ends[1]);
+            seen.moved = moved([&pictures[..third], &pictures[pictures.len() - third..]]);
         }
         seen.focus = focus(&pictures);
         let picture = median_of(&pictures);

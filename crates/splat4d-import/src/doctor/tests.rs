@@ -200,6 +200,28 @@ fn a_camera_that_was_pushed_is_found() {
     is_found(&clip, "moved");
 }
 
+/// A camera that stands still before one body that fills most of its picture and drifts, so that most corners are the body's.
+#[test]
+fn a_camera_that_a_large_body_passes_is_not_said_to_have_moved() {
+    let near = |t: f64| {
+        let mut view = camera(ILL);
+        view.intrinsics.cx += 3.0 + 40.0 * t;
+        draw(&view, 0.0)
+    };
+    let mut clip = clean().clone();
+    for (n, picture) in clip[ILL].iter_mut().enumerate() {
+        let body = near(n as f64 / FPS);
+        let [from, to] = [SIZE[0] / 4, SIZE[0]];
+        for y in 0..SIZE[1] {
+            let row = y * SIZE[0] * 3;
+            picture.data[row + from * 3..row + to * 3].copy_from_slice(&body.data[row + from * 3..row + to * 3]);
+        }
+    }
+    let report = says(&clip, 0.0, CAMERAS);
+    assert_eq!(found(&report, "moved"), [""; 0], "{:#?}", report.findings);
+    assert!(report.cameras[ILL].moved.is_some(), "corners at the picture's side still tell");
+}
+
 #[test]
 fn pictures_that_come_twice_are_found() {
     let mut clip = clean().clone();
