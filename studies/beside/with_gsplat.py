@@ -10,6 +10,7 @@ Same Gaussians, cameras, pictures, order, loss, rates and Adam as splat4d's; one
 """
 
 import json
+import math
 import pathlib
 import statistics
 import sys
@@ -35,6 +36,7 @@ def train(folder: pathlib.Path) -> dict:
         return torch.from_numpy(numpy.load(folder / f"{name}.npy")).to(device)
 
     sh = load("sh")
+    degree = math.isqrt(sh.shape[1]) - 1
     parameters = {
         "means": load("means"),
         "quats": load("quats"),
@@ -68,7 +70,7 @@ def train(folder: pathlib.Path) -> dict:
             scene["height"],
             near_plane=views[view]["near"],
             eps2d=scene["low_pass"],
-            sh_degree=3,
+            sh_degree=degree,
             packed=False,
             backgrounds=background,
         )

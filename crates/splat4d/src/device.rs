@@ -6,6 +6,8 @@ mod tests;
 
 pub use kept::KeptMotion;
 
+#[cfg(feature = "gpu")]
+use crate::gpu::{Adapters, Gpu, GpuRenderer, Tuning};
 use crate::math::{Rng, Se3, sym3};
 use crate::render::{
     Backend, Comparison, Image, ImageGrads, RenderConfig, RenderGrads, Renderer, Resident, Shot, Tables, Target, Wanted,
@@ -53,7 +55,12 @@ pub fn open(device: Device, config: RenderConfig, wanted: &Wanted, tables: Table
         let why = format!("drawing on {CPU}");
         return Opened { backend: cpu(config), name: CPU.into(), why, fell_back: false };
     }
-    match gpu(device, config, wanted, tables) {
+    or_cpu(config, gpu(device, config, wanted, tables))
+}
+
+/// A GPU and its name, or, where there is none, the CPU and why.
+fn or_cpu(config: RenderConfig, gpu: Result<(Box<dyn Backend>, String)>) -> Opened {
+    match gpu {
         Ok((backend, name)) => Opened { backend, why: format!("drawing on {name}"), name, fell_back: false },
         Err(reason) => on_cpu(config, &reason),
     }
@@ -118,7 +125,7 @@ impl WithCpu {
         match other.can(&Wanted { backward: true, ..shot.wanted() }) {
             Ok(()) => Some(other),
             Err(refusal) => {
-                let why = refusal.to_string();
+                let why = refusal.cause();
                 if !self.refused.contains(&why) {
                     self.notices.push(format!("the CPU draws what the GPU does not: {why}"));
                     self.refused.push(why);
@@ -131,7 +138,7 @@ impl WithCpu {
     fn leave(&mut self, error: &Error) {
         self.other = None;
         self.name = CPU.into();
-        self.notices.push(format!("training goes on on the CPU: {error}"));
+        self.notices.push(format!("training goes on on the CPU: {}", error.cause()));
     }
 }
 
@@ -270,7 +277,7 @@ fn trusted(backend: &mut dyn Backend) -> Result<()> {
         ErrorKind::Unsupported,
         "the GPU's driver fails a self-test: its picture or its gradients are not the CPU's",
     )
-    .remedy("Update the driver, or use --device cpu."))
+    .remedy("Update the driver, or use the CPU."))
 }
 
 #[cfg(not(feature = "gpu"))]
@@ -280,37 +287,44 @@ fn gpu(_: Device, _: RenderConfig, _: &Wanted, _: Tables) -> Result<(Box<dyn Bac
 
 #[cfg(feature = "gpu")]
 fn gpu(device: Device, config: RenderConfig, wanted: &Wanted, tables: Tables) -> Result<(Box<dyn Backend>, String)> {
-    use crate::gpu::{Adapters, Gpu, GpuRenderer, Tuning};
-    // Cheap, where opening a driver takes a moment.
-    GpuRenderer::refuses(wanted)?;
+    // Cheap, where opening a driver takes a moment. Nobody needs to be told to take the CPU, which is taken.
+    GpuRenderer::refuses(wanted).map_err(|refusal| Error::new(refusal.kind(), refusal.cause()))?;
     let adapters = if device == Device::Gpu { Adapters::Any } else { Adapters::Hardware };
-    let gpu = Gpu::open(adapters)?;
-    if !wanted.backward {
+    let open = || Gpu::open(adapters);
+    if wanted.backward {
+        return to_train(&open, config, tables, &mut trusted);
+    }
+    let gpu = open()?;
+    let name = gpu.describe();
+    let mut renderer = GpuRenderer::new(gpu, config)?;
+    renderer.tables = tables;
+    Ok((Box::new(renderer), name))
+}
+
+/// A test of a renderer.
+#[cfg(feature = "gpu")]
+type SelfTest<'a> = &'a mut dyn FnMut(&mut dyn Backend) -> Result<()>;
+
+/// A renderer that has passed a test, and its name: with subgroups, or else without. Errors: it has passed neither; that of the
+/// first is told.
+#[cfg(feature = "gpu")]
+fn to_train(
+    open: &dyn Fn() -> Result<Gpu>,
+    config: RenderConfig,
+    tables: Tables,
+    test: SelfTest<'_>,
+) -> Result<(Box<dyn Backend>, String)> {
+    let mut tested = |gpu: Gpu| -> Result<(Box<dyn Backend>, String)> {
         let name = gpu.describe();
         let mut renderer = GpuRenderer::new(gpu, config)?;
         renderer.tables = tables;
-        return Ok((Box::new(renderer), name));
-    }
-    to_train(gpu, config, tables, trusted).or_else(|error| {
+        renderer.for_training()?;
+        test(&mut renderer).map_err(|e| e.at(&name))?;
+        Ok((Box::new(renderer), name))
+    };
+    tested(open()?).or_else(|error| {
         // What subgroups do is the newest part of drivers.
-        let gpu = Gpu::open(adapters)?;
-        let portable = gpu.tuned(Tuning { subgroups: false, ..Tuning::default() });
-        to_train(portable, config, tables, trusted).map_err(|_| error)
+        let portable = open()?.tuned(Tuning { subgroups: false, ..Tuning::default() });
+        tested(portable).map_err(|_| error)
     })
-}
-
-/// A renderer that has passed a test, and its name.
-#[cfg(feature = "gpu")]
-fn to_train(
-    gpu: crate::gpu::Gpu,
-    config: RenderConfig,
-    tables: Tables,
-    test: fn(&mut dyn Backend) -> Result<()>,
-) -> Result<(Box<dyn Backend>, String)> {
-    let name = gpu.describe();
-    let mut renderer = crate::gpu::GpuRenderer::new(gpu, config)?;
-    renderer.tables = tables;
-    renderer.for_training()?;
-    test(&mut renderer).map_err(|e| e.at(&name))?;
-    Ok((Box::new(renderer), name))
 }

@@ -69,17 +69,18 @@ impl Error {
     pub fn kind(&self) -> ErrorKind {
         self.kind
     }
+
+    /// Place and cause without the remedy: for lines that say what was done about it.
+    pub fn cause(&self) -> String {
+        let place = if self.place.is_empty() { String::new() } else { format!("{}: ", self.place) };
+        let source = self.source.as_ref().map_or_else(String::new, |source| format!(" ({source})"));
+        format!("{place}{}{source}", self.what)
+    }
 }
 
 impl fmt::Display for Error {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        if !self.place.is_empty() {
-            write!(f, "{}: ", self.place)?;
-        }
-        write!(f, "{}", self.what)?;
-        if let Some(source) = &self.source {
-            write!(f, " ({source})")?;
-        }
+        f.write_str(&self.cause())?;
         if !self.remedy.is_empty() {
             write!(f, ". {}", self.remedy)?;
         }

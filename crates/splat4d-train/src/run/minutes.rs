@@ -7,7 +7,8 @@ use super::open::OpenCapture;
 use crate::event::{Event, Progress};
 use crate::methods::{Stage, program_of, stages};
 use crate::recipe::Recipe;
-use crate::step::trainer::Trainer;
+use crate::step::engine::Blame;
+use crate::step::trainer::{Fault, Trainer};
 use crate::upkeep::{At, Every};
 use crate::{Error, ErrorKind, Result};
 use serde::{Deserialize, Serialize};
@@ -211,6 +212,11 @@ impl Probe<'_> {
         // A device is not to be still at it when the clock is looked at.
         match self.trainer.step()?.and_then(|_| self.trainer.catch_up()) {
             Ok(_) => Ok(()),
+            // The run that follows looks for itself whether there is one.
+            Err(Fault(_, Blame::Device, _)) => {
+                self.trainer.go_on();
+                self.step()
+            }
             Err(fault) => Err(Error::new(ErrorKind::Diverged, format!("the timing probe failed: {}", fault.0))
                 .remedy("Look for wrong poses with `splat4d info CAPTURE`")),
         }
@@ -225,6 +231,24 @@ pub(super) mod tests {
     /// Of steps that take so long [half size, full size] with either number of Gaussians, in every stage.
     pub(crate) fn timing(gaussians: [usize; 2], few: [f64; 2], many: [f64; 2]) -> Timing {
         Timing { stages: [Steps { gaussians, seconds: [few, many] }; 2], scene: 0.0 }
+    }
+
+    #[test]
+    #[cfg(feature = "gpu")]
+    fn a_device_that_is_lost_does_not_end_the_timing() {
+        use crate::run::tests::{Place, recipe};
+        let Some(device) = crate::step::tests::resident::Failing::new([usize::MAX, 3, usize::MAX]) else { return };
+        let (place, recipe) = (Place::new(), recipe(&["motion=spacetime"]).resolve());
+        let opened = OpenCapture::new(place.open(&recipe), &recipe).unwrap();
+        let plan = opened.plan(&recipe);
+        let mut trainer = opened.trainer(&plan, opened.initial_scene(&plan).unwrap()).unwrap();
+        trainer.set_engine(crate::step::resident::DeviceEngine::new(device));
+        let mut probe = Probe { trainer, clock: &Stopwatch::start() };
+        for step in 1..8 {
+            probe.step().unwrap();
+            assert!(probe.trainer.progress.iteration >= step);
+        }
+        assert!(probe.trainer.settle().is_ok(), "the CPU has all there is");
     }
 
     #[test]

@@ -433,7 +433,8 @@ impl Session<'_> {
         write_atomically(&self.run.join("run.json"), text.as_bytes())
     }
 
-    /// Back to the last checkpoint with half the rates; the third time the run is given up.
+    /// Back to the last checkpoint with half the rates; the third time the run is given up. A device that failed is not to blame for
+    /// the numbers: the rates stay.
     fn roll_back(&self, trainer: &mut Trainer<'_>, fault: &Fault, listen: &mut dyn FnMut(&Event)) -> Result<RunState> {
         let Fault(what, blame, _) = fault;
         let (strike, share) = if *blame == Blame::Device { (0, 1.0) } else { (1, ROLLBACK_RATE) };
@@ -449,7 +450,14 @@ impl Session<'_> {
         let (state, _) = restore_newest(self.run, trainer, &self.identity)?;
         trainer.progress.strikes = strikes;
         trainer.progress.rate_scale = rate * share;
-        listen(&Event::RolledBack { iteration: failed, to: trainer.progress.iteration, what: what.to_owned() });
+        let (to, what) = (trainer.progress.iteration, what.to_owned());
+        listen(&match blame {
+            Blame::Numbers => Event::RolledBack { iteration: failed, to, what },
+            Blame::Device => {
+                let message = format!("{what}: training goes on on the CPU, from its last checkpoint, of step {to}");
+                Event::Warning { message }
+            }
+        });
         Ok(state)
     }
 }

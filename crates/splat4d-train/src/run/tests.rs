@@ -140,7 +140,7 @@ impl Place {
         let opened = OpenCapture::new(self.open(&recipe), &recipe)?;
         let plan = opened.plan(&recipe);
         let mut trainer = opened.trainer(&plan, opened.initial_scene(&plan)?)?;
-        trainer.set_engine(crate::step::engine::CpuEngine::new(draw));
+        trainer.set_engine(crate::step::resident::DeviceEngine::new(draw));
         let identity = identity(&opened.capture, &recipe, "");
         let (opened, recipe, run, made_by) = (&opened, &recipe, run.as_path(), TRAIN);
         let session = Session {

@@ -8,6 +8,7 @@ use crate::learner::{Learner, Parts};
 use crate::methods::Stage;
 use crate::optim::Floor;
 use crate::upkeep::Change;
+use splat4d::device;
 use splat4d::layers::Scene;
 use splat4d::math::Rng;
 use splat4d::render::{Antialias, Backend, Wanted};
@@ -209,6 +210,11 @@ impl<'a> CpuEngine<'a> {
     /// What draws.
     pub(super) fn backend(&mut self) -> &mut (dyn Backend<f32> + 'a) {
         self.backend.as_mut()
+    }
+
+    /// Draws on the processor from now on, by the same limits.
+    pub(super) fn leave_device(&mut self) {
+        self.backend = device::cpu(*self.backend.config());
     }
 
     /// Brings what the stage's codec shows up to date.

@@ -8,7 +8,7 @@ pub(crate) mod emphasis;
 pub mod engine;
 pub mod loss;
 pub(crate) mod pace;
-mod resident;
+pub(crate) mod resident;
 pub mod trainer;
 
 #[cfg(test)]

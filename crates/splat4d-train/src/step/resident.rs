@@ -6,10 +6,10 @@ use super::engine::{
     Blame, CpuEngine, Engine, Fault, Measured, Rates, StepPlan, Stepped, exposure_rate, noise_rate, noise_stream,
     rates_of,
 };
-use crate::Result;
 use crate::learner::{Learner, Parts};
 use crate::loss::terms::KeptLoss;
 use crate::optim::corrections;
+use crate::{ErrorKind, Result};
 use splat4d::device::KeptMotion;
 use splat4d::layers::{ALPHA_MIN, ALWAYS};
 use splat4d::render::{
@@ -42,7 +42,7 @@ struct UnderWay {
 }
 
 /// See the module's documentation.
-pub(super) struct DeviceEngine<'a> {
+pub(crate) struct DeviceEngine<'a> {
     cpu: CpuEngine<'a>,
     newest: Newest,
     /// Whether the device has failed, or has no room.
@@ -60,7 +60,7 @@ pub(super) struct DeviceEngine<'a> {
 
 impl<'a> DeviceEngine<'a> {
     /// An engine that draws with `backend`, and takes steps with it where it keeps tables.
-    pub(super) fn new(backend: Box<dyn Backend<f32> + 'a>) -> Self {
+    pub(crate) fn new(backend: Box<dyn Backend<f32> + 'a>) -> Self {
         let (cpu, rates) = (CpuEngine::new(backend), Rates::default());
         Self {
             cpu,
@@ -149,11 +149,11 @@ impl<'a> DeviceEngine<'a> {
         Ok(())
     }
 
-    /// The fault of a device that failed with the only numbers.
+    /// The fault of a device that failed with the only numbers, and is left for good.
     fn gone(&mut self, why: &str) -> Fault {
         self.given_up = true;
-        let text = format!("the GPU that kept the tables failed, and training goes on on the CPU: {why}");
-        Fault(text, Blame::Device, None)
+        self.cpu.leave_device();
+        Fault(format!("the GPU that kept the tables failed ({why})"), Blame::Device, None)
     }
 }
 
@@ -191,7 +191,7 @@ fn known(learner: &Learner, plan: &StepPlan<'_>, rates: &Rates) -> std::result::
     let mut all = Vec::new();
     for (layer, rates) in scene.layers.iter().zip(rates) {
         let Some(known) = KeptMotion::new(layer, &plan.info.times) else {
-            return Err(format!("the GPU does not know the motion of `{}`", layer.name));
+            return Err(format!("the GPU does not know the motion model `{}`", layer.motion.spec().name()));
         };
         let plain = layer.masks.is_none() && layer.span == ALWAYS && layer.cross_fade == [0.0; 2];
         if !plain || !layer.frame.is_identity() {
@@ -280,8 +280,9 @@ impl Engine for DeviceEngine<'_> {
         }
         let clock = Clock::now();
         if let Err(error) = self.keep(learner, plan) {
+            // It may well go on drawing.
             self.given_up = true;
-            self.tell(&error.to_string(), &mut notices);
+            self.tell(&error.cause(), &mut notices);
             return self.step_on_cpu(learner, plan, notices);
         }
         let views: Vec<KeptView<'_>> = plan
@@ -307,14 +308,20 @@ impl Engine for DeviceEngine<'_> {
             // A picture too large for one piece: the CPU's engine draws it in several.
             Ok(None) => return self.step_on_cpu(learner, plan, notices),
             Err(error) => {
-                if self.newest == Newest::Both {
-                    // Nothing is lost: the learner is as it was before this step.
-                    self.given_up = true;
-                    self.newest = Newest::Learner;
-                    self.tell(&error.to_string(), &mut notices);
-                    return self.step_on_cpu(learner, plan, notices);
+                if self.newest != Newest::Both {
+                    return Ok(Err(self.gone(&error.cause())));
                 }
-                return Ok(Err(self.gone(&error.to_string())));
+                // Nothing is lost: the learner is as it was before this step.
+                self.given_up = true;
+                self.newest = Newest::Learner;
+                if error.kind() == ErrorKind::Memory {
+                    // Drawing needs less of it.
+                    self.tell(&error.cause(), &mut notices);
+                } else {
+                    self.cpu.leave_device();
+                    notices.push(format!("training goes on on the CPU: {}", error.cause()));
+                }
+                return self.step_on_cpu(learner, plan, notices);
             }
         };
         self.newest = Newest::Device;
@@ -343,7 +350,7 @@ impl Engine for DeviceEngine<'_> {
         if !self.under_way.is_empty() {
             match self.cpu.backend().resident().map(|resident| resident.finish()) {
                 Some(Ok(done)) => self.take_in(learner, done)?,
-                Some(Err(error)) => return Err(self.gone(&error.to_string())),
+                Some(Err(error)) => return Err(self.gone(&error.cause())),
                 None => return Err(self.gone("it is no longer there")),
             }
         }
@@ -361,7 +368,7 @@ impl Engine for DeviceEngine<'_> {
             Some(resident) => {
                 let layers: Result<Vec<_>> = (0..scene.layers.len()).map(|layer| resident.fetch(layer)).collect();
                 let all = layers.and_then(|layers| Ok((layers, resident.fetch_cameras()?)));
-                all.map_err(|error| error.to_string())
+                all.map_err(|error| error.cause())
             }
         };
         let (layers, cameras) = match fetched {

@@ -10,7 +10,7 @@ mod kept;
 mod limits;
 mod refine;
 #[cfg(feature = "gpu")]
-mod resident;
+pub(crate) mod resident;
 mod resume;
 mod switches;
 

@@ -340,6 +340,11 @@ impl<'a> Trainer<'a> {
         self.engine.catch_up(&self.learner).map_err(|fault| self.named(fault))
     }
 
+    /// Goes on from what the learner holds, whatever a device that failed had besides.
+    pub(crate) fn go_on(&mut self) {
+        self.engine.changed(&self.learner);
+    }
+
     /// Milliseconds of the stages of the last view that is done, where a device that takes whole steps tells them.
     pub fn stages(&mut self) -> Vec<(&'static str, f64)> {
         self.engine.stages()

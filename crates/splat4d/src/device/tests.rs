@@ -177,6 +177,42 @@ fn a_device_that_computes_something_else_is_not_trusted() {
     }
 }
 
+#[test]
+#[cfg(feature = "gpu")]
+fn a_driver_that_fails_the_self_test_is_tried_without_subgroups_and_left_then() {
+    let config = RenderConfig::default();
+    let open = || Gpu::open(Adapters::Any);
+    let whole = match open() {
+        Ok(gpu) => gpu.describe(),
+        Err(e) => {
+            assert!(std::env::var_os("REQUIRE_GPU").is_none(), "REQUIRE_GPU is set: {e}");
+            return println!("skipped: {e}");
+        }
+    };
+    let portable = open().unwrap().tuned(Tuning { subgroups: false, ..Tuning::default() }).describe();
+    // Where a device has none, both attempts are the same.
+    assert_eq!(whole.contains("subgroups"), whole != portable);
+    let wrong = || Error::new(ErrorKind::Unsupported, "it fails a self-test");
+    // Attempts that fail, by how many do; then the truth about what is left.
+    let tried = |bad: usize| {
+        let mut attempts = 0;
+        let mut test = |backend: &mut dyn Backend| {
+            attempts += 1;
+            if attempts > bad { trusted(backend) } else { Err(wrong().at(attempts)) }
+        };
+        let came = to_train(&open, config, Tables::Changing, &mut test);
+        (attempts, or_cpu(config, came))
+    };
+    for (bad, expected) in [(0, &whole), (1, &portable)] {
+        let (attempts, opened) = tried(bad);
+        assert!(attempts == bad + 1 && !opened.fell_back && opened.name == *expected, "{bad}: {}", opened.why);
+    }
+    let (attempts, opened) = tried(2);
+    assert!(attempts == 2 && opened.fell_back && opened.name == CPU && opened.backend.name() == CPU);
+    let first = format!("drawing on the CPU: {whole}: 1: it fails a self-test");
+    assert_eq!(opened.why, first, "what failed first is told");
+}
+
 /// Largest difference of a value from the oracle's, of the largest depth for depth: a splat at the α cut-off may be drawn by
 /// one backend only, which is 1/255 of what is left of the light there.
 const PIXEL: f64 = 5e-3;

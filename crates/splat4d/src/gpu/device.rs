@@ -42,6 +42,11 @@ impl Gpu {
     ///
     /// Errors: there is none (the message says what was found), or its driver refuses WebGPU's default limits.
     pub fn open(adapters: Adapters) -> Result<Self> {
+        Self::open_within(adapters, u64::MAX)
+    }
+
+    /// The same, with no buffer larger than so many bytes, whatever the driver has.
+    pub(super) fn open_within(adapters: Adapters, most: u64) -> Result<Self> {
         let mut found = all_adapters();
         found.retain(|a| adapters == Adapters::Any || a.get_info().device_type != wgpu::DeviceType::Cpu);
         let Some(adapter) = found.into_iter().min_by_key(|a| rank(a.get_info().device_type)) else {
@@ -51,26 +56,28 @@ impl Gpu {
             } else {
                 "no Vulkan, Metal or Direct3D 12 driver was found"
             };
-            return Err(Error::new(ErrorKind::Unsupported, what)
-                .remedy("Install the graphics card's driver, or render on the CPU."));
+            return Err(
+                Error::new(ErrorKind::Unsupported, what).remedy("Install the graphics card's driver, or use the CPU.")
+            );
         };
         let info = adapter.get_info();
         let refused = |e: wgpu::RequestDeviceError| {
             Error::new(ErrorKind::Unsupported, format!("the GPU cannot be opened ({e})"))
                 .at(&info.name)
-                .remedy("Update its driver, or render on the CPU.")
+                .remedy("Free its memory, update its driver, or use the CPU.")
         };
         let (own, least) = (adapter.limits(), wgpu::Limits::default());
         if let Some(what) = lacking(&own) {
             return Err(Error::new(ErrorKind::Unsupported, what)
                 .at(&info.name)
-                .remedy("Update its driver, or render on the CPU."));
+                .remedy("Update its driver, or use the CPU."));
         }
         let limits = wgpu::Limits {
-            max_buffer_size: own.max_buffer_size.max(least.max_buffer_size),
+            max_buffer_size: own.max_buffer_size.max(least.max_buffer_size).min(most),
             max_storage_buffer_binding_size: own
                 .max_storage_buffer_binding_size
-                .max(least.max_storage_buffer_binding_size),
+                .max(least.max_storage_buffer_binding_size)
+                .min(most),
             ..least
         };
         let descriptor = wgpu::DeviceDescriptor {

@@ -27,6 +27,8 @@ const WARM_UP: usize = 50;
 const TIMED: usize = 300;
 /// Steps at which losses must agree, and how far apart they may be, relatively: other roundings grow.
 const AGREE: [(usize, f64); 3] = [(1, 1e-3), (10, 1e-2), (100, 1e-2)];
+/// Ceiling of a splat's alpha: gsplat 1.5.3 has it compiled in (RasterizeToPixels3DGSFwd.cu).
+const ALPHA_MAX: f64 = 0.999;
 /// A rate's name, the columns that it is of, which of them, and the rate.
 type RateOf = (&'static str, &'static str, Option<(usize, usize)>, f64);
 /// Rates, columns and their parts (3DGS; positions for an extent of 1).
@@ -51,6 +53,11 @@ struct Ran {
     ms: f64,
     /// Of every step.
     losses: Vec<f64>,
+}
+
+/// The limits that other programs draw with.
+pub(super) fn config() -> RenderConfig {
+    RenderConfig { alpha_max: ALPHA_MAX, ..RenderConfig::default() }
 }
 
 /// A scene at the time of its first view, seen so by all, as a still one.
@@ -87,7 +94,7 @@ fn export(pinned: &Pinned, held: &Held, order: &[usize], folder: &Path) -> Resul
         let path = folder.join(format!("truth_{i}.npy"));
         write_npy(&path, &[picture.height, picture.width, 3], &interleaved(picture))?;
     }
-    let config = RenderConfig::default();
+    let config = config();
     let view = |v: &View| {
         let (k, pose) = (&v.camera.intrinsics, &v.camera.cam_from_world);
         let row = |i: usize| {
@@ -217,7 +224,7 @@ mod tests {
         let way = Way { threads: 1, simd: Simd::detect(), rounds: 1 };
         let place = tempfile::tempdir().unwrap();
         let gpu = match Gpu::open(Adapters::Any) {
-            Ok(gpu) => GpuRenderer::new(gpu, RenderConfig::default()).unwrap(),
+            Ok(gpu) => GpuRenderer::new(gpu, config()).unwrap(),
             Err(e) => {
                 assert!(std::env::var_os("REQUIRE_GPU").is_none(), "REQUIRE_GPU is set: {e}");
                 return println!("skipped: {e}");
@@ -225,7 +232,7 @@ mod tests {
         };
         // The CPU stands for another program.
         let folder = place.path().join("small");
-        let cpu = || splat4d::device::cpu(RenderConfig::default());
+        let cpu = || splat4d::device::cpu(config());
         assert!(measure(&pinned, place.path(), way, cpu(), "the CPU").unwrap().1.is_empty(), "nobody else is there");
         std::fs::rename(folder.join(OURS), folder.join("other.json")).unwrap();
         let (row, said) = measure(&pinned, place.path(), way, Box::new(gpu), "a GPU").unwrap();

@@ -167,7 +167,8 @@ pub(super) fn beside(
     note: &dyn Fn(&str),
 ) -> Result<Vec<Row>> {
     let one = |pinned: &Pinned| {
-        let renderer = renderer(Tuning::default())?;
+        let mut renderer = renderer(Tuning::default())?;
+        renderer.config = super::beside::config();
         let name = renderer.gpu().describe();
         note(&format!("scene {} on {name}, beside others ...", pinned.name));
         let measured = pool.install(|| super::beside::measure(pinned, folder, way, Box::new(renderer), &name));

@@ -39,3 +39,45 @@ fn a_run_says_on_what_it_trains_and_where_it_goes_on() {
     let (run, options) = (place.run("cpu"), TrainOptions::default());
     train(place.open(&recipe), recipe, &run, &options, &AtomicBool::new(false), &mut silent).unwrap();
 }
+
+#[test]
+#[cfg(feature = "gpu")]
+fn a_gpu_that_is_lost_costs_a_run_one_line_and_no_step() {
+    let place = Place::new();
+    let recipe = recipe(&["motion=spacetime", "antialias=false"]);
+    // It fails at its eighteenth step, or when somebody asks for its tables between the first checkpoint and the second.
+    for (name, left) in [("step", [usize::MAX, 17, usize::MAX]), ("fetch", [usize::MAX, usize::MAX, 3])] {
+        let Some(draw) = crate::step::tests::resident::Failing::new(left) else { return };
+        let (mut warnings, mut rolled) = (Vec::new(), 0);
+        let mut listen = |event: &Event| match event {
+            Event::Warning { message } => warnings.push(message.clone()),
+            Event::RolledBack { .. } => rolled += 1,
+            _ => {}
+        };
+        let outcome = place.train_with(name, &recipe, draw, &AtomicBool::new(false), &mut listen).unwrap();
+        assert!(!outcome.interrupted && outcome.iteration == STEPS);
+        let line = "the GPU that kept the tables failed (the driver is gone): training goes on on the CPU, from its last \
+                    checkpoint, of step 10";
+        assert!(warnings == [line] && rolled == 0, "{name}: {warnings:?}");
+        let info: Value = serde_json::from_str(&read_text(&place.run(name).join("run.json")).unwrap()).unwrap();
+        assert!(info["rollbacks"] == 0 && info["finished"] == true, "{info}");
+        let steps: Vec<String> =
+            place.metrics(name)[1..].iter().map(|l| l.split(',').next().unwrap().to_owned()).collect();
+        assert!(steps.windows(2).all(|w| w[0].parse::<usize>().unwrap() < w[1].parse().unwrap()), "{name}: {steps:?}");
+    }
+    // As a run that was stopped at that checkpoint, and resumed on the CPU.
+    let stop = AtomicBool::new(false);
+    let mut listen = |event: &Event| {
+        if let Event::Checkpoint { iteration: 10, .. } = event {
+            stop.store(true, Ordering::Relaxed);
+        }
+    };
+    let options = TrainOptions { device: Device::Gpu, ..TrainOptions::default() };
+    let outcome =
+        train(place.open(&recipe), recipe.clone(), &place.run("stopped"), &options, &stop, &mut listen).unwrap();
+    assert!(outcome.interrupted && outcome.iteration == 10);
+    resume_with(&place.run("stopped"), &TrainOptions::default(), &AtomicBool::new(false), &mut |_| {}).unwrap();
+    for name in ["step", "fetch"] {
+        assert!(place.scene(name) == place.scene("stopped"), "{name}: what was trained before is there");
+    }
+}

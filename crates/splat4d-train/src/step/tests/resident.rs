@@ -166,15 +166,46 @@ fn a_number_that_is_not_finite_is_found_and_named() {
     resumed.step().unwrap().unwrap();
 }
 
-/// A device that fails after some steps, or while it is asked for its tables.
-struct Failing {
+/// What a device that fails says, and one that has no room.
+const GONE: &str = "the driver is gone";
+const FULL: &str = "too many for one buffer";
+/// As often as anybody asks.
+const ALWAYS: usize = usize::MAX;
+
+/// A device that fails when it has done so much, and does nothing from then on.
+pub(crate) struct Failing {
     device: Box<dyn Backend>,
-    steps: usize,
-    fetches: usize,
+    /// How often it takes tables over, takes steps and hands tables out.
+    left: [usize; 3],
+    /// Whether it tells that it takes tables over.
+    keeps: bool,
+    gone: bool,
 }
 
-fn failed() -> Error {
-    Error::new(ErrorKind::Unsupported, "the driver is gone")
+impl Failing {
+    /// A GPU of any kind; none where there is none.
+    pub(crate) fn new(left: [usize; 3]) -> Option<Box<Self>> {
+        let config = RenderConfig { antialias: Antialias::Off, ..RenderConfig::default() };
+        let opened = device::open_to_train(Device::Gpu, config);
+        if opened.fell_back {
+            assert!(std::env::var_os("REQUIRE_GPU").is_none(), "REQUIRE_GPU is set: {}", opened.why);
+            println!("skipped: {}", opened.why);
+            return None;
+        }
+        Some(Box::new(Self { device: opened.backend, left, keeps: true, gone: false }))
+    }
+
+    fn here(&mut self) -> Result<&mut Box<dyn Backend>> {
+        if self.gone { Err(Error::new(ErrorKind::Unsupported, GONE)) } else { Ok(&mut self.device) }
+    }
+
+    /// Its tables, if it does this once more.
+    fn tables(&mut self, what: usize) -> Result<&mut dyn Resident> {
+        let left = self.left[what].checked_sub(1);
+        self.gone |= left.is_none();
+        self.left[what] = left.unwrap_or(0);
+        Ok(self.here()?.resident().expect("a GPU"))
+    }
 }
 
 impl Backend for Failing {
@@ -182,7 +213,7 @@ impl Backend for Failing {
         self.device.can(wanted)
     }
     fn render(&mut self, shot: &Shot<'_>, out: &mut Image) -> Result<()> {
-        self.device.render(shot, out)
+        self.here()?.render(shot, out)
     }
     fn vjp(
         &mut self,
@@ -191,10 +222,10 @@ impl Backend for Failing {
         d_sh: &mut [Option<&mut Table>],
         d: &mut RenderGrads,
     ) -> Result<()> {
-        self.device.vjp(shot, grads, d_sh, d)
+        self.here()?.vjp(shot, grads, d_sh, d)
     }
     fn resident(&mut self) -> Option<&mut dyn Resident> {
-        Some(self)
+        if self.keeps { Some(self) } else { None }
     }
     fn radii(&self) -> &[f32] {
         self.device.radii()
@@ -214,22 +245,22 @@ impl Resident for Failing {
         cameras: Option<&KeptCameras<'_>>,
         corrections: &[[f32; 2]],
     ) -> Result<()> {
-        self.device.resident().expect("a GPU").keep(layers, cameras, corrections)
+        // Want of room is no failure.
+        self.left[0] = self.left[0].checked_sub(1).ok_or_else(|| Error::new(ErrorKind::Unsupported, FULL))?;
+        self.here()?.resident().expect("a GPU").keep(layers, cameras, corrections)
     }
     fn step(&mut self, step: &KeptStep<'_>) -> Result<Option<Vec<KeptStepped>>> {
         assert_eq!(step.alpha_min, ALPHA_MIN);
-        self.steps = self.steps.checked_sub(1).ok_or_else(failed)?;
-        self.device.resident().expect("a GPU").step(step)
+        self.tables(1)?.step(step)
     }
     fn finish(&mut self) -> Result<Vec<KeptStepped>> {
-        self.device.resident().expect("a GPU").finish()
+        self.here()?.resident().expect("a GPU").finish()
     }
     fn fetch(&mut self, layer: usize) -> Result<KeptNumbers> {
-        self.fetches = self.fetches.checked_sub(1).ok_or_else(failed)?;
-        self.device.resident().expect("a GPU").fetch(layer)
+        self.tables(2)?.fetch(layer)
     }
     fn fetch_cameras(&mut self) -> Result<[Vec<f32>; 2]> {
-        self.device.resident().expect("a GPU").fetch_cameras()
+        self.here()?.resident().expect("a GPU").fetch_cameras()
     }
 }
 
@@ -237,29 +268,57 @@ impl Resident for Failing {
 fn a_device_that_fails_costs_the_steps_since_it_was_settled_and_nothing_else() {
     let bed = Bed::new();
     let recipe = knobs("motion=spacetime strategy=none");
-    for (steps, fetches) in [(0, 9), (3, 9), (9, 0)] {
-        let Some(mut trainer) = on_gpu(&bed, &recipe) else { return };
-        let config = RenderConfig { antialias: Antialias::Off, ..RenderConfig::default() };
-        let device = device::open_to_train(Device::Gpu, config).backend;
-        trainer.set_engine(DeviceEngine::new(Box::new(Failing { device, steps, fetches })));
+    let start = saved(&bed.start(&recipe));
+    let mut on_cpu = bed.start(&recipe);
+    finish(&mut on_cpu, "on the CPU");
+    let expected = bytes(on_cpu.scene());
+    for left in [[ALWAYS, 0, 9], [ALWAYS, 3, 9], [ALWAYS, 9, 0]] {
+        let Some(device) = Failing::new(left) else { return };
+        let mut trainer = bed.start(&recipe);
+        trainer.set_engine(DeviceEngine::new(device));
         let mut notices = Vec::new();
         for _ in 0..3 {
             notices.extend(trainer.step().unwrap().unwrap().notices);
         }
-        if steps == 0 {
-            // The learner had everything: the CPU has taken the same step.
-            assert!(notices.len() == 1 && notices[0].contains("the driver is gone"), "{notices:?}");
+        if left[1] == 0 {
+            // The learner had everything: the CPU has taken the same step, and all that follow.
+            notices.extend(finish(&mut trainer, "on the CPU").1);
+            assert_eq!(notices, [format!("training goes on on the CPU: {GONE}")]);
+            assert!(bytes(trainer.scene()) == expected);
             continue;
         }
         assert!(notices.is_empty());
-        let fault = match fetches {
+        let fault = match left[2] {
             0 => trainer.settle().expect_err("it is gone"),
             _ => trainer.step().unwrap().expect_err("it is gone"),
         };
-        assert!(fault.1 == Blame::Device && fault.0.contains("goes on on the CPU"), "{}", fault.0);
-        // What a run does then: back to a checkpoint, and on with the CPU.
-        let start = saved(&bed.start(&recipe));
+        assert!(fault.1 == Blame::Device && fault.0.contains(GONE), "{}", fault.0);
+        // What a run does then: back to a checkpoint, and on with the CPU, of which it said enough.
         crate::run::checkpoint::read(&start, &mut trainer, &Default::default()).unwrap();
-        finish(&mut trainer, "on the CPU");
+        let (_, notices) = finish(&mut trainer, "on the CPU");
+        assert!(notices.is_empty() && bytes(trainer.scene()) == expected, "{notices:?}");
+    }
+}
+
+#[test]
+fn a_device_without_room_for_the_tables_goes_on_drawing() {
+    let bed = Bed::new();
+    for line in ["motion=tracked strategy=none rigid_neighbours=5", "motion=spacetime strategy=adc"] {
+        let recipe = knobs(line);
+        let run = |keeps: bool| {
+            let mut device = Failing::new([0; 3])?;
+            device.keeps = keeps;
+            let mut trainer = bed.start(&recipe);
+            trainer.set_engine(DeviceEngine::new(device));
+            let (mse, notices) = finish(&mut trainer, line);
+            Some((bytes(trainer.scene()), mse, notices))
+        };
+        let Some((scene, mse, notices)) = run(false) else { return };
+        assert!(notices.is_empty(), "{notices:?}");
+        let told = vec![format!("the CPU keeps the tables and steps: {FULL}")];
+        assert!(run(true) == Some((scene.clone(), mse, told)), "{line}: the same, and one line");
+        let mut on_cpu = bed.start(&recipe);
+        finish(&mut on_cpu, line);
+        assert!(bytes(on_cpu.scene()) != scene, "{line}: the GPU has drawn");
     }
 }

@@ -7,7 +7,7 @@ use crate::layers::{ALPHA_MIN, Evaluation, Layer, Scene};
 use crate::math::{Real, Rng};
 use crate::motion::native4d::{Native4dSpec, TABLE};
 use crate::motion::{At, Cache, Motion, Slices, Spec, Tape, build_as};
-use crate::render::{Backend, Image, KeptNoise, KeptRule, KeptView, RowWeights, Shot, Target};
+use crate::render::{Backend, Image, KeptNoise, KeptRule, KeptTies, KeptView, RowWeights, Shot, Target};
 use crate::scene::{Camera, GEOMETRY, Grads, Key, Params, Planes, Rows, Space, SplatGrads, Table, Time};
 use std::sync::Arc;
 
@@ -142,51 +142,57 @@ fn slices_equal_the_model_forth_and_back() {
 /// What steps measured, and the numbers of the layer and of the cameras after them.
 type After = (Vec<KeptStepped>, KeptNumbers, [Vec<f32>; 2]);
 
-/// Steps that each see these cameras, which learn their colours, with losses on rows and noise. `rates`: a step's.
-fn tried(r: &mut GpuRenderer, steps: &[(&[Camera], f64)]) -> Result<After> {
+/// Hands a layer over, with ties or without, and cameras that learn their colours: its numbers.
+fn kept(r: &mut GpuRenderer, ties: Option<&KeptTies>) -> Result<Params<f32>> {
     let spec = Native4dSpec::default();
     let (p, own, motion) = params::<f32>(&spec);
     let moves = moves(motion.as_ref());
     let table = |key: Key| KeptTable { width: p[key].width(), params: p[key].data(), moments: &[] };
     let tables = [table(GEOMETRY), KeptTable::default(), table(own), KeptTable::default(), table(crate::scene::SH)];
     let stats = vec![0.0; STATS_WIDTH * ROWS.next_multiple_of(BLOCK)];
-    let layer = KeptLayer { rows: ROWS, moves, life: LifeKind::Infinite, tables, stats: &stats, ties: None };
+    let layer = KeptLayer { rows: ROWS, moves, life: LifeKind::Infinite, tables, stats: &stats, ties };
     let colors: Vec<f32> = (0..12 * BLOCK).map(|i| 0.01 * (i % 5) as f32).collect();
     let table = KeptTable { width: 12, params: &colors, moments: &[] };
     let cameras = KeptCameras { count: 3, table, held: &[0, 1] };
     r.keep(&[layer], Some(&cameras), &[[1.0; 2]; 3])?;
+    Ok(p)
+}
+
+/// Begins a step that sees these cameras, with losses on rows and noise: steps that are done.
+fn begun(r: &mut GpuRenderer, number: usize, cameras: &[Camera], rate: f64) -> Result<Vec<KeptStepped>> {
     let truth = |camera: &Camera| {
         let mut truth = Planes::new(3, camera.height, camera.width);
         truth.data.iter_mut().enumerate().for_each(|(i, x)| *x = (i % 7) as f32 / 7.0);
         truth
     };
+    let truths: Vec<Planes<f32>> = cameras.iter().map(truth).collect();
+    let view = |(i, camera): (usize, _)| {
+        let picture = 100 * truths[i].width + i;
+        let target = Target { truth: &truths[i], weight: None, picture, dssim: 0.2, response: None };
+        KeptView { camera, t: Time(0.0), background: [0.5; 3], target, rig: i }
+    };
+    let views: Vec<KeptView<'_>> = cameras.iter().enumerate().map(view).collect();
+    let rule = |width: usize| Some(KeptRule { rates: vec![rate; width], floor: None });
+    let rng = Rng::new(5, "noise", number as u64);
+    let noise = KeptNoise { strength: 0.1, dead: 0.005, slope: 100.0, limit: 0.5, rng };
+    let step = KeptStep {
+        views: &views,
+        sh_degree: 0,
+        alpha_min: 1.0 / 255.0,
+        rules: &[[rule(11), None, rule(6), None, rule(3)]],
+        rows: RowWeights { opacity: 0.1, ..RowWeights::default() },
+        noise: &[Some(noise)],
+        cameras: 1e-3,
+    };
+    Ok(r.step(&step)?.expect("small pictures"))
+}
+
+/// Steps that each see these cameras at a rate.
+fn tried(r: &mut GpuRenderer, steps: &[(&[Camera], f64)]) -> Result<After> {
+    let p = kept(r, None)?;
     let mut done = Vec::new();
     for (number, (cameras, rate)) in steps.iter().enumerate() {
-        let truths: Vec<Planes<f32>> = cameras.iter().map(truth).collect();
-        let view = |(i, camera): (usize, _)| {
-            let picture = 100 * truths[i].width + i;
-            let target = Target { truth: &truths[i], weight: None, picture, dssim: 0.2, response: None };
-            KeptView { camera, t: Time(0.0), background: [0.5; 3], target, rig: i }
-        };
-        let views: Vec<KeptView<'_>> = cameras.iter().enumerate().map(view).collect();
-        let rule = |width: usize| Some(KeptRule { rates: vec![*rate; width], floor: None });
-        let noise = KeptNoise {
-            strength: 0.1,
-            dead: 0.005,
-            slope: 100.0,
-            limit: 0.5,
-            rng: Rng::new(5, "noise", number as u64),
-        };
-        let step = KeptStep {
-            views: &views,
-            sh_degree: 0,
-            alpha_min: 1.0 / 255.0,
-            rules: &[[rule(11), None, rule(6), None, rule(3)]],
-            rows: RowWeights { opacity: 0.1, ..RowWeights::default() },
-            noise: &[Some(noise)],
-            cameras: 1e-3,
-        };
-        done.extend(r.step(&step)?.expect("small pictures"));
+        done.extend(begun(r, number, cameras, *rate)?);
         assert_eq!(done.len(), (number + 1).saturating_sub(r.ahead), "the others are under way");
     }
     done.extend(r.finish()?);
@@ -303,6 +309,48 @@ fn a_device_that_is_lost_under_way_is_an_error() {
     assert!(tried(&mut r, &one(&camera)).is_err(), "it is told");
 }
 
+/// Something that is asked of a renderer.
+type Asked<'a> = &'a dyn Fn(&mut GpuRenderer) -> Result<()>;
+
+#[test]
+fn a_device_that_is_lost_with_steps_under_way_is_an_error_whatever_is_asked() {
+    let camera = camera([0.0, 0.0, -4.0], 33, 20);
+    let finish = |r: &mut GpuRenderer| r.finish().map(|_| ());
+    let fetch = |r: &mut GpuRenderer| r.fetch(0).map(|_| ());
+    let step = |r: &mut GpuRenderer, number| begun(r, number, std::slice::from_ref(&camera), 0.01);
+    // As many as may be under way, and one.
+    let more = |r: &mut GpuRenderer| (2..=r.ahead).try_for_each(|number| step(r, number).map(|_| ()));
+    let ways: [Asked<'_>; 3] = [&finish, &fetch, &more];
+    for (what, ask) in ["finish", "fetch", "more steps"].into_iter().zip(ways) {
+        let Some(mut r) = own_renderer() else { return };
+        stepped(&mut r, &one(&camera));
+        for number in 0..2 {
+            assert!(step(&mut r, number).expect("it is begun").is_empty(), "it is under way");
+        }
+        r.gpu.device.destroy();
+        assert!(ask(&mut r).is_err(), "{what}: it is told");
+        assert!(tried(&mut r, &one(&camera)).is_err(), "{what}: and told again");
+    }
+}
+
+#[test]
+fn ties_of_more_rows_than_a_page_are_refused_and_nothing_else_is() {
+    let Some(mut r) = own_renderer() else { return };
+    r.page_rows = Some(ROWS.next_multiple_of(BLOCK) - BLOCK);
+    let refused = |r: &mut GpuRenderer, ties: Option<&KeptTies>| kept(r, ties).err().map(|e| e.to_string());
+    let ties = KeptTies::default();
+    let error = refused(&mut r, Some(&ties)).expect("it has two pages");
+    assert!(error.contains("tied poses are too many for one buffer"), "{error}");
+    assert_eq!(refused(&mut r, None), None, "rows without ties lie in two pages");
+    assert_eq!(r.resident.as_ref().expect("they are kept").pages.len(), 2);
+    r.page_rows = Some(ROWS.next_multiple_of(BLOCK));
+    assert_eq!(refused(&mut r, Some(&ties)), None, "in one page they are tied");
+    // And it works on as if nothing had been.
+    let camera = camera([0.0, 0.0, -4.0], 33, 20);
+    let fresh = &mut own_renderer().expect("it was there");
+    assert!(stepped(&mut r, &one(&camera)) == stepped(fresh, &one(&camera)));
+}
+
 #[test]
 fn memory_that_is_refused_costs_pictures_first_and_is_an_error_then() {
     let Some(mut r) = own_renderer() else { return };
@@ -339,9 +387,15 @@ fn a_film_shows_what_a_picture_does() {
     let stats = vec![0.0; STATS_WIDTH * ROWS.next_multiple_of(BLOCK)];
     let moves = moves(layer.motion.as_ref());
     let kept = KeptLayer { rows: ROWS, moves, life: layer.life, tables, stats: &stats, ties: None };
-    let seconds = r.film(&[kept], ALPHA_MIN, scene.background, &frames).expect("it is drawn").expect("in one piece");
-    assert!(seconds > 0.0);
-    let filmed: Vec<f32> = read(&r.gpu, &r.buffers.planes, 3 * 150 * 110);
+    let film = |r: &mut GpuRenderer| -> Vec<f32> {
+        let seconds = r.film(&[kept], ALPHA_MIN, scene.background, &frames).expect("it is drawn");
+        assert!(seconds.expect("in one piece") > 0.0);
+        read(&r.gpu, &r.buffers.planes, 3 * 150 * 110)
+    };
+    let filmed = film(&mut r);
+    r.page_rows = Some(64);
+    assert!(film(&mut r) == filmed, "pages change no bit");
+    assert_eq!(r.resident.as_ref().expect("they are kept").pages.len(), ROWS.div_ceil(64));
     let mut moment = Evaluation::default();
     scene.at(Time(0.5), &mut moment);
     let splats = scene.splats(&moment);

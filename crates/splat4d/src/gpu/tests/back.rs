@@ -352,6 +352,50 @@ fn the_way_back_repeats_bit_for_bit_in_bands_too() {
 }
 
 #[test]
+fn small_bindings_cut_tables_and_pictures_and_change_no_bit() {
+    /// Bytes of the largest binding: 2,720 rows of colours of degree 3.
+    const SMALL: u64 = 1 << 19;
+    let Some(mut r) = own_renderer() else { return };
+    let small = Gpu::open_within(Adapters::Any, SMALL).expect("there is one");
+    assert_eq!(largest_binding(&small), SMALL);
+    let mut poor = GpuRenderer::new(small, RenderConfig::default()).expect("the kernels compile");
+    for r in [&mut r, &mut poor] {
+        r.for_training().expect("the kernels compile");
+        r.tables = Tables::Constant;
+    }
+    let (scene, camera) = (Scenery::new(90, 6000, 1.2, 0.02), camera([0.0, 0.5, -4.0], 250, 170));
+    let pulled = Pulled::new(91, &camera);
+    // All rows, then two of three.
+    let ids: Vec<u32> = (0..6000).filter(|i| i % 3 != 1).collect();
+    let some = Scenery::new(92, ids.len(), 1.2, 0.02);
+    for (what, geometry, rows) in [("all", &scene, Rows::All), ("some", &some, Rows::Some(&ids))] {
+        let color = Color::Sh { table: &scene.sh, rows, weights: None, base: true };
+        let splats = Splats { parts: vec![Part::new(&geometry.out, color)], head: None };
+        let shot = shot(&splats, &camera);
+        let (expected, d, d_sh) = back(&mut r, &shot, &pulled.all());
+        assert!(r.upload.draws.len() == 1 && r.stats().bands == 1, "{what}: there is room");
+        // The second time its colours are there.
+        for again in [false, true] {
+            let (image, other, other_sh) = back(&mut poor, &shot, &pulled.all());
+            assert!(poor.upload.draws.len() == 3 && poor.stats().bands > 1, "{what}: {:?}", poor.stats());
+            assert!(image == expected, "{what}, {again}: the picture in pages is the same, bit for bit");
+            for ((name, a), (_, b)) in named(&d, &d_sh).into_iter().zip(named(&other, &other_sh)) {
+                // The camera's are summed by workgroup, of which every page has its own, the background's by band.
+                let most = if ["pose", "focal", "background"].contains(&&*name) { VECTOR } else { 0.0 };
+                let off = apart(b.into_iter(), a.into_iter());
+                assert!(off <= most, "{what}, {again}: {name} differs by {off:.1e}");
+            }
+        }
+        compare(&mut poor, &shot, &pulled.all(), what);
+    }
+    // What no page can hold is an error: here a row of tiles.
+    let wide = Camera { width: 6000, ..camera };
+    let splats = scene.splats();
+    let error = poor.render(&shot(&splats, &wide), &mut Image::default()).expect_err("it is too wide");
+    assert!(error.to_string().contains("too large for the GPU"), "{error}");
+}
+
+#[test]
 fn a_device_that_is_lost_is_an_error_and_not_a_panic() {
     let Some(mut r) = own_renderer() else { return };
     let (scene, camera) = (Scenery::new(70, 200, 1.0, 0.1), camera([0.0, 0.5, -4.0], 40, 30));
