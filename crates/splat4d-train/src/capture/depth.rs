@@ -148,7 +148,7 @@ fn check(map: &Map, file: &DepthFile) -> Result<()> {
     let count = map.values.iter().filter(|v| wrong(v)).count();
     if let Some(p) = map.values.iter().position(wrong) {
         let what = format!(
-            "the depth at pixel ({}, {}) is {} ({count} pixels of {} are like it)",
+            "the depth at pixel ({}, {}) is {} (so are {count} of {} pixels)",
             p % map.width.max(1),
             p / map.width.max(1),
             map.values[p],

@@ -108,8 +108,10 @@ fn table(bytes: &[u8]) -> Result<Vec<Row>> {
         if fields.len() != names.len() {
             return Err(bad(format!("there are {} fields, not {}", fields.len(), names.len())));
         }
-        if visible.is_some_and(|k| ["0", "false", "False"].contains(&fields[k])) {
-            continue;
+        match visible.map(|k| fields[k]) {
+            Some("0" | "false" | "False") => continue,
+            None | Some("1" | "true" | "True") => {}
+            Some(other) => return Err(bad(format!("visible is \"{other:.30}\", not 0 or 1"))),
         }
         let whole = |k: usize| {
             fields[at[k]].parse::<usize>().map_err(|_| bad(format!("\"{:.30}\" is no {}", fields[at[k]], COLUMNS[k])))

@@ -2,6 +2,7 @@
 //! trainer.
 
 use super::dataset::Dataset;
+use crate::capture::frames::{Frames, Picture};
 use crate::capture::{Capture, CaptureOptions, FlowSource, ImageStore, frames};
 use crate::event::Event;
 use crate::init::{self, Seeds, Source};
@@ -20,6 +21,9 @@ use splat4d::render::{Antialias, RenderConfig, Simd};
 use std::ops::Range;
 use std::path::Path;
 use std::sync::Arc;
+
+/// Pictures whose mean colour stands for all of them.
+const LOOKED_AT: usize = 16;
 
 /// Extent of cameras in a single place, scene units.
 const SINGLE_PLACE: f64 = 1e-6;
@@ -145,6 +149,22 @@ pub fn plan(capture: &Capture, recipe: &Recipe) -> Plan {
     }
 }
 
+/// The mean colour of some pictures, evenly chosen; of what lenses filled.
+fn mean_color(frames: &dyn Frames) -> Result<[f32; 3]> {
+    let mut picture = Picture::default();
+    let (mut sums, mut pixels) = ([0.0f64; 3], 0.0f64);
+    let looks = frames.len().min(LOOKED_AT);
+    for k in 0..looks {
+        frames.load(k * frames.len() / looks, &mut picture)?;
+        let filled = |p: usize| picture.weight.as_ref().is_none_or(|w| w.data[p] > 0.0);
+        for p in (0..picture.color.pixels()).filter(|p| filled(*p)) {
+            pixels += 1.0;
+            (0..3).for_each(|c| sums[c] += f64::from(picture.color.plane(c)[p]));
+        }
+    }
+    Ok(sums.map(|s| (s / pixels.max(1.0)) as f32))
+}
+
 /// What of cameras a recipe lets learn. Clocks say nothing where nothing moves, and nothing can be asked between the frames
 /// of a model that is learnt frame by frame.
 pub(crate) fn learnable(recipe: &Recipe) -> RefineSettings {
@@ -190,13 +210,18 @@ impl OpenCapture {
         Ok((recipe.with(|r| r.run.motion = MotionName::of(choice.motion)), choice))
     }
 
-    pub(super) fn background(&self) -> [f32; 3] {
-        self.capture.background.unwrap_or([0.0; 3])
+    /// What shows where no Gaussian is: what pictures were cut out of or, where they fill their frames, their mean colour, which
+    /// is the best guess at what no training camera sees. Errors: a picture cannot be read.
+    pub(super) fn background(&self) -> Result<[f32; 3]> {
+        match self.capture.background {
+            Some(told) => Ok(told),
+            None => mean_color(self.frames.as_ref()),
+        }
     }
 
     pub(crate) fn initial_scene(&self, plan: &Plan) -> Result<Scene<f32>> {
         let seeds = self.seeds(plan)?;
-        init::scene(plan, program_of(&plan.recipe)?.as_ref(), &seeds, self.background(), self.capture.up)
+        init::scene(plan, program_of(&plan.recipe)?.as_ref(), &seeds, self.background()?, self.capture.up)
     }
 
     /// Where the first Gaussians of a plan are.
@@ -260,7 +285,7 @@ impl OpenCapture {
         let settings = Settings {
             seed: r.run.seed,
             limits: Limits { cap: r.densify.max_cap, extent: plan.extent, min_opacity: r.densify.min_opacity },
-            background: self.background(),
+            background: scene.background,
             sh_degree: r.appearance.sh_degree,
             exposure_lr: r.appearance.exposure_lr,
         };

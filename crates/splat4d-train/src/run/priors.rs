@@ -15,6 +15,8 @@ use std::sync::Arc;
 const LOOKED_AT: usize = 8;
 /// Flow shorter than this tells nothing of its direction, pixels.
 const SHORT: f32 = 1.0;
+/// Points from which on a map tells something.
+const FEW: usize = 20;
 /// Pixels from which on a picture tells something.
 const ENOUGH: usize = 200;
 /// Another reading of flow is the right one if it leaves less than this share of the difference between pictures.
@@ -28,11 +30,14 @@ const VISIBLE: f64 = 0.3;
 /// Depths whose closest ratios to the points are spread by more than this either way (logarithm) are not theirs, at whatever
 /// scale: noise of a quarter of the depth does as much, and single-picture networks have less.
 const FOREIGN: f64 = 0.1;
+/// Share of the points that stand before what a metric map shows, by more than [`METRIC_OFF`], from which on it is told: what is before
+/// a point hides it, and what it is itself nothing can be before.
+const BEFORE: f64 = 0.1;
 /// A metric map is believed while the scene is within this share of it (median); others while they correlate by this.
 const METRIC_OFF: f64 = 0.1;
 const CORRELATED: f64 = 0.8;
 
-/// Checks flow before training; returns warnings. Errors: flow that runs backwards, or whose axes are exchanged.
+/// Checks flow and depth before training; returns warnings. Errors: flow that runs backwards, or whose axes are exchanged.
 pub(super) fn before(opened: &OpenCapture, recipe: &Recipe) -> Result<Vec<String>> {
     let capture = &opened.capture;
     let mut warnings = Vec::new();
@@ -45,7 +50,31 @@ pub(super) fn before(opened: &OpenCapture, recipe: &Recipe) -> Result<Vec<String
         }
     }
     warnings.truncate(1);
+    if recipe.loss.depth > 0.0 {
+        warnings.extend(points_before(opened)?);
+    }
     Ok(warnings)
+}
+
+/// What is to be said of metric maps that show surfaces behind points that were seen before them.
+fn points_before(opened: &OpenCapture) -> Result<Option<String>> {
+    let looked = ratios(opened)?;
+    let told = |(i, ratios): &(usize, Vec<f64>)| {
+        let before = ratios.iter().filter(|r| **r < (1.0 - METRIC_OFF).ln()).count() as f64 / ratios.len() as f64;
+        (before > BEFORE).then_some((*i, before))
+    };
+    let found: Vec<(usize, f64)> = looked.iter().filter(|(_, r)| r.len() >= FEW).filter_map(told).collect();
+    Ok(found.first().map(|&(i, before)| {
+        format!(
+            "{} of {} depth maps that were looked at show surfaces behind the capture's points, first that of {}: {:.0} % of the points \
+             in it stand before what it shows. Maps may be mirrored, of other frames, or of another kind (depth_kind, \
+             docs/priors.md); without them: --set loss.depth=0",
+            found.len(),
+            looked.len(),
+            name(&opened.capture, opened.capture.train[i]),
+            100.0 * before
+        )
+    }))
 }
 
 fn chosen(all: &[usize]) -> impl Iterator<Item = &usize> {
@@ -126,27 +155,32 @@ enum Depths {
     Foreign(f64),
 }
 
-/// How the metric depth maps of a capture lie to its points: by where their ratios are densest, since a point that something hides
-/// is farther away than what is seen there.
-fn depths(opened: &OpenCapture) -> Result<Depths> {
+/// By training frame with a metric map, of those that are looked at: ln(z/D) of the points that stand still in it.
+fn ratios(opened: &OpenCapture) -> Result<Vec<(usize, Vec<f64>)>> {
     let capture = &opened.capture;
-    let Some(cloud) = capture.points.as_ref() else { return Ok(Depths::Fit) };
+    let Some(cloud) = capture.points.as_ref() else { return Ok(Vec::new()) };
     let still: Vec<[f64; 3]> =
         (0..cloud.points.len()).filter(|&i| cloud.times[i].is_none()).map(|i| cloud.points[i]).collect();
     let places: Vec<usize> = (0..opened.frames.len()).filter(|&i| is_metric(capture, capture.train[i])).collect();
-    let (mut ratios, mut picture) = (Vec::new(), Picture::default());
+    let (mut all, mut picture) = (Vec::new(), Picture::default());
     for &i in chosen(&places) {
         opened.frames.load(i, &mut picture)?;
         let (Some(depth), camera) = (&picture.depth, opened.frames.camera(i)) else { continue };
-        for &point in &still {
-            let Some(([u, v], z)) = camera.project(point) else { continue };
+        let ratio = |&point: &[f64; 3]| {
+            let ([u, v], z) = camera.project(point)?;
             let inside = (0.0..camera.width as f64).contains(&u) && (0.0..camera.height as f64).contains(&v);
             let told = if inside { depth.values.get(0, v as usize, u as usize) } else { 0.0 };
-            if told > 0.0 {
-                ratios.push((z / f64::from(told)).ln());
-            }
-        }
+            (told > 0.0).then(|| (z / f64::from(told)).ln())
+        };
+        all.push((i, still.iter().filter_map(ratio).collect()));
     }
+    Ok(all)
+}
+
+/// How the metric depth maps of a capture lie to its points: by where their ratios are densest, since a point that something hides
+/// is farther away than what is seen there.
+fn depths(opened: &OpenCapture) -> Result<Depths> {
+    let mut ratios: Vec<f64> = ratios(opened)?.into_iter().flat_map(|(_, ratios)| ratios).collect();
     if ratios.len() < ENOUGH {
         return Ok(Depths::Fit);
     }
@@ -314,6 +348,16 @@ mod tests {
         let (mirrored, said) = believed(opened(folder.path(), "metric", &|x| depth(SIDE - 1 - x)), &recipe).unwrap();
         assert_eq!(scales(&mirrored), [None, None]);
         assert!(said.is_some_and(|s| s.contains("contradict") && s.contains("mirrored")));
+        // Two thirds of a map fit, and the rest shows something behind the points there.
+        let behind = |x: usize| depth(x) * if x < 21 { 1.0 } else { 1.5 };
+        let (behind, said) = believed(opened(folder.path(), "metric", &behind), &recipe).unwrap();
+        assert_eq!((scales(&behind), said), (vec![Some(1.0); 2], None));
+        let said = before(&behind, &recipe).unwrap();
+        assert!(said.len() == 1 && said[0].contains("2 of 2") && said[0].contains("camera c0, frame 0"), "{said:?}");
+        // Something before the points hides them.
+        let (hidden, _) =
+            believed(opened(folder.path(), "metric", &|x| depth(x) * if x < 21 { 1.0 } else { 0.5 }), &recipe).unwrap();
+        assert_eq!(before(&hidden, &recipe).unwrap(), Vec::<String>::new());
         // What claims no unit is held against the scene alone, and what is not read is not looked at.
         let relative = opened(folder.path(), "relative", &|x| depth(SIDE - 1 - x));
         assert_eq!(believed(relative, &recipe).unwrap().1, None);

@@ -192,7 +192,7 @@ pub fn resume_with(
     let (opened, _) = priors::believed(opened, &recipe)?;
     let plan = opened.plan(&recipe);
     let empty =
-        init::scene(&plan, program_of(&recipe)?.as_ref(), &Seeds::default(), opened.background(), opened.capture.up)?;
+        init::scene(&plan, program_of(&recipe)?.as_ref(), &Seeds::default(), opened.background()?, opened.capture.up)?;
     let mut trainer = opened.trainer(&plan, empty)?;
     options.add_loss(&mut trainer);
     let session = Session {

@@ -546,6 +546,33 @@ fn minutes_fix_a_recipe_that_repeats() {
 }
 
 #[test]
+fn where_no_gaussian_is_opaque_pictures_show_their_mean_colour_and_others_what_they_were_cut_out_of() {
+    let (place, recipe) = (Place::new(), recipe(&[]));
+    let shown = |capture: Arc<Capture>| {
+        let opened = OpenCapture::new(capture, &recipe).unwrap();
+        let plan = opened.plan(&recipe);
+        let scene = opened.initial_scene(&plan).unwrap();
+        let background = scene.background;
+        assert_eq!(opened.trainer(&plan, scene).unwrap().settings.background, background);
+        background
+    };
+    let capture = place.open(&recipe);
+    let store = ImageStore::new(capture.clone(), 1 << 20);
+    let mean: [f64; 3] = std::array::from_fn(|c| {
+        let of = |i: &usize| {
+            let color = store.load(*i).unwrap().to_picture().color;
+            color.plane(c).iter().map(|v| f64::from(*v)).sum::<f64>() / color.pixels() as f64
+        };
+        capture.train.iter().map(of).sum::<f64>() / capture.train.len() as f64
+    });
+    let found = shown(capture.clone());
+    // Sixteen pictures stand for all.
+    assert!((0..3).all(|c| (f64::from(found[c]) - mean[c]).abs() < 0.02 && mean[c] > 0.05), "{found:?} {mean:?}");
+    let told = [0.9, 0.1, 0.4];
+    assert_eq!(shown(Arc::new(Capture { background: Some(told), ..Capture::clone(&capture) })), told);
+}
+
+#[test]
 fn photos_of_one_camera_learn_no_exposure_unless_told_and_a_rig_learns_them_from_one_picture_each() {
     let place = Place::new();
     let exposed = |named: bool, changes: &[&str]| {

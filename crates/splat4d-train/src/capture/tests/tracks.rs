@@ -83,6 +83,7 @@ fn wrong_tracks_are_refused_by_point_and_frame() {
     assert_says(&message(&format!("{head}3,1,1\n")), &["line 2", "3 fields, not 4"]);
     assert_says(&message(&format!("{head}-3,1,1,1\n")), &["line 2", "\"-3\" is no point"]);
     assert_says(&message(&format!("{head}3,1,1,1\n3,1,2,2\n")), &["point 3 is given twice in frame 1"]);
+    assert_says(&message("point,frame,x,y,visible\n3,1,1,1,2\n"), &["line 2", "visible is \"2\", not 0 or 1"]);
     assert_says(&message(head), &["tracks.csv", "no point is ever visible"]);
     assert_says(&message("id,t,x,y\n1,1,1,1\n"), &["first line is", "point,frame,x,y"]);
     assert_says(&message(""), &["tracks.csv", "point,frame,x,y"]);

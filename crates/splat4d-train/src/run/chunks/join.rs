@@ -100,11 +100,11 @@ impl Chunked {
         Ok(joined)
     }
 
-    /// The whole take without what was learnt. Errors: the capture cannot be read.
+    /// The whole take without what was learnt. Errors: the capture, or what chunks share, cannot be read.
     pub fn shell(&self) -> Result<Scene<f32>> {
         let [first, end] = self.plan.take;
         let ends = self.capture(vec![first..first + 1, end - 1..end])?;
-        let background = ends.background.unwrap_or([0.0; 3]);
+        let background = shared::read(&self.folder(Part::Shared))?.background;
         Ok(Scene { clip: seconds(&ends, &(first..end)), fps: ends.fps, up: ends.up, background, ..Scene::default() })
     }
 

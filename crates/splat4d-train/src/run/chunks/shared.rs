@@ -54,6 +54,8 @@ const AGREED: f64 = 0.5;
 pub(super) struct Shared {
     /// What stands still, as it was learnt; none: nothing does.
     pub still: Option<Layer<f32>>,
+    /// What shows where no Gaussian is.
+    pub background: [f32; 3],
     exposures: Vec<(String, [f32; 12])>,
     /// Fingerprint of it all.
     pub print: String,
@@ -76,7 +78,7 @@ pub(super) fn train(
         let opened = OpenCapture::new(capture, &chunked.recipe)?;
         if let Some(why) = nothing_still(&opened.capture) {
             listen(&Event::Warning { message: format!("chunks share no still layer: {why}") });
-            write_still(&folder, Scene::default())?;
+            write_still(&folder, Scene { background: opened.background()?, ..Scene::default() })?;
             return Ok(None);
         }
         medians(&opened, &looked_at, &source, &mut listen)?;
@@ -101,7 +103,7 @@ pub(super) fn train(
 pub(super) fn read(folder: &Path) -> Result<Shared> {
     let path = folder.join(FILE);
     let mut bytes = read_file(&path)?;
-    let still = scene::read(&bytes).map_err(|e| e.at(path.display()))?.layers.pop();
+    let Scene { mut layers, background, .. } = scene::read(&bytes).map_err(|e| e.at(path.display()))?;
     let mut exposures = Vec::new();
     if let Some(path) = checkpoint::list(folder).last() {
         let own = read_file(path)?;
@@ -114,7 +116,7 @@ pub(super) fn read(folder: &Path) -> Result<Shared> {
             bytes.extend(bytemuck::cast_slice::<f32, u8>(&rows));
         }
     }
-    Ok(Shared { still, exposures, print: file_print(&bytes) })
+    Ok(Shared { still: layers.pop(), background, exposures, print: file_print(&bytes) })
 }
 
 impl Shared {

@@ -57,7 +57,7 @@ pub(super) fn train(
         first_scene(&opened, &plan, &shared, &neighbours)?
     } else {
         // The checkpoint has it.
-        init::scene(&plan, program.as_ref(), &Seeds::default(), opened.background(), opened.capture.up)?
+        init::scene(&plan, program.as_ref(), &Seeds::default(), shared.background, opened.capture.up)?
     };
     let prints: Vec<&str> =
         std::iter::once(&shared.print).chain(neighbours.iter().map(|n| &n.print)).map(String::as_str).collect();
@@ -138,7 +138,7 @@ fn first_scene(opened: &OpenCapture, plan: &Plan, shared: &Shared, neighbours: &
             seeds.push(params[GEOMETRY].read::<3>(row, 0).map(f64::from), color, Some(time));
         }
     }
-    let mut scene = init::scene(plan, program.as_ref(), &seeds, opened.background(), opened.capture.up)?;
+    let mut scene = init::scene(plan, program.as_ref(), &seeds, shared.background, opened.capture.up)?;
     let own = &mut scene.layers[0].params;
     let mut row = first;
     for params in &taken {
