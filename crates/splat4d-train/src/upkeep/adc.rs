@@ -1,5 +1,5 @@
 //! Adaptive density control: clone small and split large Gaussians whose screen position still wants to move; prune the
-//! transparent. Source: Kerbl et al. 2023 §5.2 and appendix B; the split's opacity as revised by Bulò 2024.
+//! transparent. Source: Kerbl et al. 2023 §5.2 and appendix B; the clone's opacity as revised by Bulò 2024.
 //!
 //! The original also removes Gaussians larger than a tenth of the extent. The extent is the spread of the cameras, and a
 //! wall before a forward-facing rig needs larger ones: removal cost 1.3 dB in a kitchen, 0.3 to 1.6 dB on four other
@@ -127,8 +127,9 @@ impl AdcSettings {
                 layer.params[GEOMETRY].add(j, 0, offset.map(|x| x as f32));
                 layer.resize(j, 1.0 / SPLIT_SHRINK);
             }
-            if grows[r] {
-                // Two halves in one place are as opaque as the whole: 1 − √(1 − o) each.
+            if grows[r] && !splits[r] {
+                // Two halves in one place are as opaque as the whole: 1 − √(1 − o) each. Parts of a split are smaller and
+                // lie beside each other; as faint as this they let training views fall by up to 2 dB (docs/suite.md).
                 layer.params[GEOMETRY].set(j, OPACITY, logit(1.0 - (1.0 - old_opacity[j]).sqrt()));
             }
         }
@@ -179,6 +180,8 @@ mod tests {
         assert_eq!((change.added, change.removed, all.len()), (3, 1, 22));
         let g = &all.layers[0].params[GEOMETRY];
         assert!((g.get(1, 7) - (-1.0 - 1.6f32.ln())).abs() < 1e-5, "the split parent shrinks");
+        let [before, clone, half] = [s.layers[0].params[GEOMETRY].get(0, OPACITY), g.get(0, OPACITY), g.get(1, OPACITY)];
+        assert!(clone < before && half == before, "clones share their opacity, halves keep it");
         let (change, capped) = run(s, settings, 0..4, Limits { cap: 21, ..limits });
         assert_eq!((change.added, capped.len()), (2, 21));
     }
