@@ -22,13 +22,13 @@ pub(crate) const MAX_PIXELS: usize = 1 << 26;
 /// Largest |R Rᵀ − I| that counts as rounding of the file.
 const MAX_SHEAR: f64 = 0.01;
 
-/// Reads the camera and its background (black unless told).
-pub(crate) fn read(path: &Path) -> Result<(Camera, [f32; 3])> {
+/// Reads the camera and its background, if it tells one.
+pub(crate) fn read(path: &Path) -> Result<(Camera, Option<[f32; 3]>)> {
     let text = read_text(path)?;
     parse(&text).map_err(|e| e.at(path.display()))
 }
 
-fn parse(text: &str) -> Result<(Camera, [f32; 3])> {
+fn parse(text: &str) -> Result<(Camera, Option<[f32; 3]>)> {
     let value = json(text)?;
     let Some(object) = value.as_object() else {
         return Err(Error::input("the camera is not a JSON object { ... }").remedy(known_keys()));
@@ -67,11 +67,12 @@ fn parse(text: &str) -> Result<(Camera, [f32; 3])> {
     }
     let cam_from_world = pose(value.get("world_to_camera").ok_or_else(|| missing("world_to_camera"))?)?;
     let background = match value.get("background").filter(|v| !v.is_null()) {
-        None => [0.0; 3],
+        None => None,
         Some(v) => {
-            numbers(v).and_then(|n| <[f64; 3]>::try_from(n).ok()).map(|b| b.map(|x| x as f32)).ok_or_else(|| {
+            let told = numbers(v).and_then(|n| <[f64; 3]>::try_from(n).ok()).map(|b| b.map(|x| x as f32));
+            Some(told.ok_or_else(|| {
                 Error::input(format!("\"background\" is {v}")).remedy("Give red, green and blue, 0 to 1, as [r, g, b].")
-            })?
+            })?)
         }
     };
     let near = if value.get("near").is_some() { number("near")? } else { Camera::NEAR };
@@ -153,7 +154,7 @@ mod tests {
     #[test]
     fn a_camera_is_read_nested_or_flat() {
         let (camera, background) = parse(&good().to_string()).unwrap();
-        assert_eq!((camera.width, camera.height, background), (32, 24, [1.0, 0.5, 0.0]));
+        assert_eq!((camera.width, camera.height, background), (32, 24, Some([1.0, 0.5, 0.0])));
         assert_eq!(camera.cam_from_world.translation, [0.5, 0.0, 4.0]);
         let mut flat = good();
         flat["world_to_camera"] = json!([1, 0, 0, 0.5, 0, 1, 0, 0, 0, 0, 1, 4, 0, 0, 0, 1]);

@@ -104,8 +104,7 @@ fn pictures_are_found_in_a_scene_and_cameras_compared_with_their_truth() {
     let one = json!({"fx": stated["fx"], "fy": stated["fy"], "cx": stated["cx"], "cy": stated["cy"], "w": stated["width"],
         "h": stated["height"], "world_to_camera": stated["world_to_camera"]});
     std::fs::write(&camera, one.to_string()).unwrap();
-    let background = "--background=0,0,0";
-    splat4d(&["render", str(&run), "--camera", str(&camera), "-o", str(&picture), background]).run().ok();
+    splat4d(&["render", str(&run), "--camera", str(&camera), "-o", str(&picture)]).run().ok();
     let said = splat4d(&["localise", str(&run), str(&picture), "-o", str(&found)]).run().ok();
     assert!(said.contains("a.png: at (") && said.contains("of what one plain colour leaves"), "{said}");
     let row = &json_of(&found)[0];

@@ -127,7 +127,7 @@ fn one(args: &Args, path: &Path, camera: &Path, console: &Console) -> anyhow::Re
     args.raw_format.suits(args.channel)?;
     let source = Source::open(path)?;
     let depth = args.channel == Channel::Depth || args.raw.is_some();
-    let background = args.background.unwrap_or(background);
+    let background = args.background.or(background).unwrap_or(source.scene.background);
     let painter = Painter::new(&source.scene, background, antialias(&source), depth);
     let mut painter = channel(painter, args, &source, console)?;
     painter.draw(&camera, args.freeze.unwrap_or(source.scene.clip[0]));
