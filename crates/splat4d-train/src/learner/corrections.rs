@@ -25,12 +25,12 @@ settings! {
         /// Rate of rotations at first: half a degree is within reach of the 50 views that a camera gets in a short run. Three
         /// times as much leaves poses as exact (docs/refine.md).
         rotation_init: f64 = 1e-3 => positive().unit("radians").when(On("refine.poses"));
-        /// Rate of rotations at the end. Lower ones come to rest on the way: 1e-5 left twice the error (docs/refine.md).
-        rotation_final: f64 = 3e-4 => positive().unit("radians").when(On("refine.poses"));
+        /// Rate of rotations at the end. Lower ones come to rest on the way: 1e-5 left half as much error again (docs/refine.md).
+        rotation_final: f64 = 1e-4 => positive().unit("radians").when(On("refine.poses"));
         /// Rate of positions at first.
         position_init: f64 = 1e-3 => positive().unit("extents").when(On("refine.poses"));
         /// Rate of positions at the end.
-        position_final: f64 = 3e-4 => positive().unit("extents").when(On("refine.poses"));
+        position_final: f64 = 1e-4 => positive().unit("extents").when(On("refine.poses"));
         /// Searches of clocks: each compares every camera's pictures with the scene at shifted times. 4 to 20 found clocks
         /// alike (docs/refine.md).
         searches: usize = 8 => any().when(On("refine.times"));

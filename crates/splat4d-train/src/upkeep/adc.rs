@@ -180,7 +180,8 @@ mod tests {
         assert_eq!((change.added, change.removed, all.len()), (3, 1, 22));
         let g = &all.layers[0].params[GEOMETRY];
         assert!((g.get(1, 7) - (-1.0 - 1.6f32.ln())).abs() < 1e-5, "the split parent shrinks");
-        let [before, clone, half] = [s.layers[0].params[GEOMETRY].get(0, OPACITY), g.get(0, OPACITY), g.get(1, OPACITY)];
+        let [before, clone, half] =
+            [s.layers[0].params[GEOMETRY].get(0, OPACITY), g.get(0, OPACITY), g.get(1, OPACITY)];
         assert!(clone < before && half == before, "clones share their opacity, halves keep it");
         let (change, capped) = run(s, settings, 0..4, Limits { cap: 21, ..limits });
         assert_eq!((change.added, capped.len()), (2, 21));

@@ -21,6 +21,9 @@ pub(super) struct Bed {
     frames: Arc<Dataset>,
 }
 
+/// What shows where no Gaussian is: on the pictures' mean colour, the default, little of their error is there to begin with.
+const BLACK: [f32; 3] = [0.0; 3];
+
 /// The result of a short training.
 pub(super) struct Ran {
     pub(super) trainer: Trainer<'static>,
@@ -89,7 +92,8 @@ impl Bed {
         let opened = OpenCapture::with(self.frames.clone()).on(device);
         let plan = opened.plan(recipe);
         program_of(recipe).unwrap().check(&plan).unwrap();
-        opened.trainer(&plan, opened.initial_scene(&plan).unwrap()).unwrap()
+        let scene = Scene { background: BLACK, ..opened.initial_scene(&plan).unwrap() };
+        opened.trainer(&plan, scene).unwrap()
     }
 
     /// As a resume does: an empty scene, and everything from the checkpoint.
@@ -102,7 +106,7 @@ impl Bed {
         let opened = OpenCapture::with(self.frames.clone()).on(device);
         let plan = opened.plan(recipe);
         let program = program_of(recipe).unwrap();
-        let empty = init::scene(&plan, program.as_ref(), &Seeds::default(), [0.0; 3], [0.0, 1.0, 0.0]).unwrap();
+        let empty = init::scene(&plan, program.as_ref(), &Seeds::default(), BLACK, [0.0, 1.0, 0.0]).unwrap();
         let mut trainer = opened.trainer(&plan, empty).unwrap();
         checkpoint::read(checkpoint, &mut trainer, &Identity::default()).unwrap();
         trainer

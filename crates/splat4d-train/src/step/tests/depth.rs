@@ -58,7 +58,8 @@ fn a_map_that_the_pictures_contradict_is_reported() {
     std::fs::write(&points, cloud.to_ply("comment a ball")).unwrap();
     let warnings = |name: &str, scale: f64| {
         write(&place, &made, scale);
-        let r = recipe(&["strategy=none", "loss.depth=0.01"]).with(|r| r.init.source = Source::File(points.clone()));
+        let r = recipe(&["strategy=none", "loss.depth=0.01", "iterations=120"])
+            .with(|r| r.init.source = Source::File(points.clone()));
         let mut told = Vec::new();
         let mut listen = |event: &Event| {
             if let Event::Warning { message } = event {
