@@ -195,7 +195,7 @@ mod tests {
             let passed = pace.done_after(taken);
             for step in place + 1..=passed {
                 let at = upkeep::At { step, steps: STEPS };
-                count = stages[0].upkeep.iter().fold(count, |n, u| (n * u.growth(&at)).min(CAP as f64));
+                count = stages[0].upkeep.iter().fold(count, |n, u| u.grown(&at, n, CAP as f64));
             }
             let progress = Position {
                 iteration: taken,

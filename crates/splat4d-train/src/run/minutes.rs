@@ -119,9 +119,7 @@ impl Timing {
             for i in if number == from[0] { from[1] } else { 0 }..stage.iterations {
                 total += steps.at(stage, i, count);
                 let at = At { step: i + 1, steps: stage.iterations };
-                for growth in stage.upkeep.iter().map(|u| u.growth(&at)).filter(|g| *g != 1.0) {
-                    count = (count * growth).min(cap as f64);
-                }
+                count = stage.upkeep.iter().fold(count, |n, u| u.grown(&at, n, cap as f64));
             }
         }
         total

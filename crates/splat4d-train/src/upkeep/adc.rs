@@ -1,6 +1,10 @@
 //! Adaptive density control: clone small and split large Gaussians whose screen position still wants to move; prune the
 //! transparent. Source: Kerbl et al. 2023 §5.2 and appendix B; the clone's opacity as revised by Bulò 2024.
 //!
+//! Gaussians with a life and a path of their own that leave their own place within that life are split in time instead:
+//! the two halves follow the same path one after the other. What turns or speeds up needs shorter lives, which parts
+//! beside each other do not bring. Gaussians of four dimensions (Yang et al. 2024) split in time as well, at random.
+//!
 //! The original also removes Gaussians larger than a tenth of the extent. The extent is the spread of the cameras, and a
 //! wall before a forward-facing rig needs larger ones: removal cost 1.3 dB in a kitchen, 0.3 to 1.6 dB on four other
 //! captures and nothing on an object (docs/suite.md).
@@ -13,13 +17,17 @@ use crate::learner::Learner;
 use crate::recipe::Recipe;
 use crate::settings::settings;
 use rayon::prelude::*;
+use splat4d::layers::{Layer, Scene};
 use splat4d::math::{Rng, sym3};
-use splat4d::scene::life::CENTER;
+use splat4d::scene::life::{CENTER, LOG_WIDTH};
 use splat4d::scene::params::OPACITY;
-use splat4d::scene::{Born, GEOMETRY, LIFE, RowEdit, Space, Table};
+use splat4d::scene::{Born, GEOMETRY, LIFE, LifeKind, RowEdit, Space, Table};
 
-/// A split's parts are this much smaller than their parent.
+/// A split's parts are this much smaller than their parent, in space or in time.
 const SPLIT_SHRINK: f64 = 1.6;
+/// How far from the centre of the parent's life those of a split in time begin, in widths of the parent's: with
+/// [`SPLIT_SHRINK`] mean and variance of the two lives together are the parent's, √(1 − 1/1.6²).
+const TIME_SHIFT: f64 = 0.78;
 /// Address of the random numbers of [`retime`]; those of splits are addressed by row.
 const RETIME: u64 = u64::MAX;
 
@@ -37,6 +45,11 @@ settings! {
         grad_threshold: f64 = 2e-4;
         /// Gaussians larger than this share of the extent are split, smaller ones cloned.
         percent_dense: f64 = 0.01 => any().unit("extents");
+        /// Share of densification until the cap may be reached: the cloud grows along a parabola (Mallick et al. 2024) and
+        /// those with the largest gradients come first; 0: as fast as gradients ask for it.
+        full_at: f64 = 0.5 => share();
+        /// A Gaussian that goes further than this within its life is split in time; 0: none is.
+        split_in_time: f64 = 1.0 => any().unit("own sizes");
     }
 }
 
@@ -64,19 +77,32 @@ impl Upkeep for Adc {
 
     fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
         let settings = self.settings;
-        Ok(grow(learner, c, |learner, layer, spare, rng| settings.layer(learner, &c.limits, layer, spare, rng)))
+        let share = self.share(&c.at);
+        Ok(grow(learner, c, |learner, layer, spare, rng| settings.layer(learner, &c.limits, layer, (spare, share), rng)))
     }
 
     fn densification(&mut self) -> Option<&mut Every> {
         Some(&mut self.steps)
     }
 
-    fn growth(&self, at: &At) -> f64 {
-        if self.due(at) { GROWTH } else { 1.0 }
+    fn grown(&self, at: &At, count: f64, cap: f64) -> f64 {
+        if self.due(at) { (count * GROWTH).min(count + (cap - count).max(0.0) * self.share(at)) } else { count }
     }
 }
 
 impl Adc {
+    /// The share of the room below the cap that may be taken now: of what was there at first a share (1 − x)² is left when
+    /// the share x of the time until the cap has passed.
+    fn share(&self, at: &At) -> f64 {
+        let Every { first, last, interval } = self.steps;
+        if last == usize::MAX {
+            return 1.0; // Without an end there is no schedule.
+        }
+        let full = first as f64 + last.saturating_sub(first) as f64 * self.settings.full_at;
+        let left = ((full - at.step as f64) / interval as f64).max(0.0) + 1.0;
+        1.0 - ((left - 1.0) / left).powi(2)
+    }
+
     /// As a recipe has it; `None`: another strategy.
     pub(crate) fn of(r: &Recipe) -> Option<Self> {
         let some = || Self { settings: r.adc, steps: r.densify.steps() };
@@ -85,7 +111,21 @@ impl Adc {
 }
 
 impl AdcSettings {
-    fn layer(&self, learner: &mut Learner, limits: &Limits, layer: usize, spare: &mut usize, rng: Rng) -> Change {
+    /// How far from the centre of a row's life those of its halves lie, seconds; 0: it is not split in time.
+    fn part(&self, scene: &Scene<f32>, layer: usize, row: usize, size: f64) -> f64 {
+        let Layer { motion, params, life, .. } = &scene.layers[layer];
+        let Some(path) = motion.polynomial().filter(|_| *life != LifeKind::Infinite && self.split_in_time > 0.0) else {
+            return 0.0;
+        };
+        // A life that is longer than the clip is worth no more than the clip.
+        let clip = 0.5 * (scene.clip[1] - scene.clip[0]);
+        let width = f64::from(params[LIFE].get(row, LOG_WIDTH)).exp().min(clip);
+        let way = path.travel(params, row, width);
+        let goes = way.iter().map(|x| x * x).sum::<f64>().sqrt();
+        if goes > self.split_in_time * size { TIME_SHIFT * width } else { 0.0 }
+    }
+
+    fn layer(&self, learner: &mut Learner, limits: &Limits, layer: usize, (spare, share): (&mut usize, f64), rng: Rng) -> Change {
         let (scene, stats) = (learner.scene(), learner.stats());
         let rows = scene.layers[layer].params.len();
         let covs = covariances(scene, layer);
@@ -100,11 +140,13 @@ impl AdcSettings {
             .map(|r| (stats.gradient(layer, r), r as u32))
             .collect();
         wanting.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
-        wanting.truncate(*spare);
+        wanting.truncate((*spare as f64 * share).ceil() as usize);
         *spare -= wanting.len();
         let mut grows = vec![false; rows];
         wanting.iter().for_each(|&(_, r)| grows[r as usize] = true);
-        let splits: Vec<bool> = (0..rows).map(|r| grows[r] && sizes[r] > self.percent_dense * limits.extent).collect();
+        let parted: Vec<f64> = (0..rows).map(|r| if grows[r] { self.part(scene, layer, r, sizes[r]) } else { 0.0 }).collect();
+        let large = |r: usize| sizes[r] > self.percent_dense * limits.extent;
+        let splits: Vec<bool> = (0..rows).map(|r| grows[r] && (parted[r] > 0.0 || large(r))).collect();
         let mut edit = RowEdit { space: Space::Gaussians, parent: Vec::new(), born: Vec::new() };
         for r in (0..rows).filter(|&r| keep[r]) {
             edit.push(r as u32, if splits[r] { Born::Split } else { Born::Kept });
@@ -120,9 +162,13 @@ impl AdcSettings {
         if self.retime_clones {
             retime(&mut layer.params[LIFE], &edit, clip, rng.fork(RETIME));
         }
+        let mut kept = vec![false; rows];
         for (j, (&parent, born)) in edit.parent.iter().zip(&edit.born).enumerate() {
             let r = parent as usize;
-            if *born == Born::Split {
+            if parted[r] > 0.0 {
+                let later = std::mem::replace(&mut kept[r], true);
+                shorten(layer, j, if later { parted[r] } else { -parted[r] }, clip);
+            } else if *born == Born::Split {
                 let offset = sample(covs[r], rng.fork(j as u64));
                 layer.params[GEOMETRY].add(j, 0, offset.map(|x| x as f32));
                 layer.resize(j, 1.0 / SPLIT_SHRINK);
@@ -135,6 +181,14 @@ impl AdcSettings {
         }
         Change { added: wanting.len(), moved: 0, removed }
     }
+}
+
+/// Makes a row one half of its life: its centre `shift` seconds later, but within the clip, and shorter.
+fn shorten(layer: &mut Layer<f32>, row: usize, shift: f64, [first, last]: [f64; 2]) {
+    let path = layer.motion.polynomial().expect("who was asked how far it goes has a path");
+    let center = f64::from(layer.params[LIFE].get(row, CENTER));
+    path.recentre(&mut layer.params, row, (center + shift).clamp(first, last) - center);
+    layer.params[LIFE].set(row, LOG_WIDTH, (shift.abs() / TIME_SHIFT / SPLIT_SHRINK).ln() as f32);
 }
 
 /// Draws the centre of every clone's life from the clip, uniformly.
@@ -151,8 +205,9 @@ fn retime(life: &mut Table, edit: &RowEdit, [first, last]: [f64; 2], rng: Rng) {
 mod tests {
     use super::super::tests::{context, scene};
     use super::*;
-    use splat4d::layers::Scene;
-    use splat4d::scene::LifeKind;
+    use splat4d::layers::Evaluation;
+    use splat4d::motion::{SpacetimeSpec, Spec, build};
+    use splat4d::scene::{Rows, Time};
 
     /// Runs it on a scene whose rows `seen` have the gradient 0.5, 1, ….
     fn run(s: Scene<f32>, settings: AdcSettings, seen: std::ops::Range<usize>, limits: Limits) -> (Change, Scene<f32>) {
@@ -174,7 +229,7 @@ mod tests {
             g.write(1, 7, [-1.0f32; 3]); // large: split
             g.set(2, OPACITY, -9.0); // dead
         }
-        let settings = AdcSettings { grad_threshold: 0.1, percent_dense: 0.05, retime_clones: false };
+        let settings = AdcSettings { grad_threshold: 0.1, percent_dense: 0.05, retime_clones: false, ..AdcSettings::default() };
         let limits = Limits { cap: 100, extent: 4.0, min_opacity: 0.005 };
         let (change, all) = run(s.clone(), settings, 0..4, limits);
         assert_eq!((change.added, change.removed, all.len()), (3, 1, 22));
@@ -188,6 +243,101 @@ mod tests {
     }
 
     #[test]
+    fn what_leaves_its_place_within_its_life_becomes_two_lives_of_one_path() {
+        let mut s = scene(4);
+        s.clip = [0.0, 4.0];
+        let layer = &mut s.layers[0];
+        let spec = Spec::Spacetime(SpacetimeSpec { order: 2, rotation: true, ..SpacetimeSpec::default() });
+        layer.motion = build(&spec, &mut layer.params).unwrap();
+        layer.life = LifeKind::GaussHalf;
+        layer.params[LIFE] = Table::new(LifeKind::GaussHalf.columns(), 4);
+        let velocities = layer.params.find("velocities").unwrap();
+        let size = (-2.0f32).exp();
+        // Row 0 goes three times its size in a width of its life and row 1 half of it; row 2 lives longer than the clip;
+        // row 3 is fast, but nobody asks for more of it.
+        for (row, [life, way]) in [[0.5, 3.0], [0.5, 0.5], [50.0, 3.0], [0.5, 3.0]].into_iter().enumerate() {
+            layer.params[LIFE].write(row, 0, [2.5, f32::ln(life)]);
+            layer.params[velocities].write(row, 0, [way * size / life.min(2.0), 0.0, 0.0, 0.0, 0.01, 0.0]);
+        }
+        let settings = AdcSettings { grad_threshold: 0.1, percent_dense: 1.0, ..AdcSettings::default() };
+        let limits = Limits { cap: 100, extent: 4.0, min_opacity: 0.005 };
+        let (change, all) = run(s.clone(), settings, 0..3, limits);
+        assert_eq!((change.added, all.len()), (3, 7));
+        let life = |row| all.layers[0].params[LIFE].read::<2>(row, 0);
+        let near = |[center, log_width]: [f32; 2], [c, w]: [f64; 2]| {
+            assert!((f64::from(center) - c).abs() < 1e-5, "{center} is not {c}");
+            assert!((f64::from(log_width).exp() - w).abs() < 1e-5 * w, "{} is not {w}", log_width.exp());
+        };
+        near(life(0), [2.5 - 0.39, 0.5 / 1.6]);
+        near(life(4), [2.5 + 0.39, 0.5 / 1.6]);
+        near(life(2), [2.5 - 1.56, 2.0 / 1.6]);
+        near(life(6), [4.0, 2.0 / 1.6]); // not beyond the clip
+        [1, 3, 5].into_iter().for_each(|row| near(life(row), [2.5, 0.5]));
+        for t in [0.3, 2.2, 3.9] {
+            let [before, after] = [&s, &all].map(|s| {
+                let seen = Evaluation::of_layer(&s.layers[0], Space::Gaussians, Rows::All, Time(t));
+                (0..s.len()).map(|r| seen.tape(0).out().read::<9>(r, 0)).collect::<Vec<_>>()
+            });
+            for (row, parent) in [(0, 0), (4, 0), (2, 2), (6, 2)] {
+                let close = (0..9).all(|c| (after[row][c] - before[parent][c]).abs() < 1e-4);
+                assert!(close, "row {row} at {t} leaves its parent's path: {:?} {:?}", after[row], before[parent]);
+            }
+        }
+        let opacities = |s: &Scene<f32>, r: usize| s.layers[0].params[GEOMETRY].get(r, OPACITY);
+        assert!(opacities(&all, 0) == opacities(&s, 0) && opacities(&all, 4) == opacities(&s, 0));
+        let never = AdcSettings { split_in_time: 0.0, ..settings };
+        let (_, all) = run(s, never, 0..3, limits);
+        assert!((0..7).all(|r| all.layers[0].params[LIFE].get(r, CENTER) == 2.5), "0: nothing is split in time");
+    }
+
+    #[test]
+    fn the_cloud_grows_along_a_parabola_to_its_cap() {
+        let steps = Every { first: 100, last: 300, interval: 10 };
+        let counts = |full_at: f64| {
+            let adc = Adc { settings: AdcSettings { full_at, ..AdcSettings::default() }, steps };
+            let mut count = 1000.0;
+            (1..=300).map(|step| {
+                let at = At { step, steps: 400 };
+                if adc.due(&at) {
+                    count += (9000.0 - count) * adc.share(&at);
+                }
+                count
+            }).collect::<Vec<f64>>()
+        };
+        let half = counts(0.5);
+        assert_eq!((half[98], half[199], half[299]), (1000.0, 9000.0, 9000.0));
+        // Eleven times until it is full, and (k/11)² of the room is left when k of them are to come.
+        for k in 0..11 {
+            let left = 9000.0 - half[199 - 10 * k];
+            assert!((left - 8000.0 * (k as f64 / 11.0).powi(2)).abs() < 1e-6, "{k} times before the cap {left} are left");
+        }
+        assert_eq!(counts(0.0)[99], 9000.0, "at once");
+        let adc = Adc { settings: AdcSettings::default(), steps: Every { last: usize::MAX, ..steps } };
+        assert_eq!(adc.share(&At { step: 100, steps: 400 }), 1.0, "without an end there is no schedule");
+        let adc = Adc { settings: AdcSettings::default(), steps };
+        let at = |step| At { step, steps: 400 };
+        assert_eq!(adc.grown(&at(105), 1000.0, 9000.0), 1000.0);
+        assert!(adc.grown(&at(100), 1000.0, 1e9) == 1200.0, "gradients ask for a fifth more");
+        assert!((adc.grown(&at(100), 8000.0, 9000.0) - 8173.6).abs() < 0.1);
+        assert_eq!(adc.grown(&at(250), 8900.0, 9000.0), 9000.0);
+    }
+
+    #[test]
+    fn a_share_of_the_room_goes_to_those_with_the_largest_gradients() {
+        let mut learner = Learner::new(scene(20));
+        (0..20).for_each(|row| learner.stats_mut().tables[0].write(row, 0, [1.0 + row as f32, 2.0, 5.0]));
+        let settings = AdcSettings { grad_threshold: 0.1, percent_dense: 1.0, ..AdcSettings::default() };
+        let mut adc = Adc { settings, steps: Every { first: 1, last: 9, interval: 1 } };
+        let limits = Limits { cap: 45, extent: 4.0, min_opacity: 0.005 };
+        // The first of five: 1 − (4/5)² of the room for 25.
+        let change = adc.run(&mut learner, &context(limits, 1, 0)).unwrap();
+        assert_eq!(change.added, 9);
+        let s = learner.into_scene();
+        let opacity = |r: usize| s.layers[0].params[GEOMETRY].get(r, OPACITY);
+        assert!((0..20).all(|r| (opacity(r) < 0.0) == (r >= 11)), "clones share what their parent had");
+    }
+
+    #[test]
     fn clones_are_born_anywhere_in_the_clip_and_no_other_row_moves_in_time() {
         let mut s = scene(400);
         s.clip = [2.0, 3.0];
@@ -196,7 +346,7 @@ mod tests {
         layer.params[LIFE] = Table::new(LifeKind::GaussHalf.columns(), 400);
         (0..400).for_each(|r| layer.params[LIFE].write(r, 0, [2.5, 0.0]));
         (0..400).for_each(|r| layer.params[GEOMETRY].write(r, 7, [-6.0f32; 3]));
-        let settings = AdcSettings { grad_threshold: 0.1, percent_dense: 0.05, retime_clones: true };
+        let settings = AdcSettings { grad_threshold: 0.1, percent_dense: 0.05, retime_clones: true, ..AdcSettings::default() };
         let (change, s) = run(s, settings, 0..400, Limits { cap: 800, extent: 4.0, min_opacity: 0.005 });
         assert_eq!(change.added, 400);
         let life = &s.layers[0].params[LIFE];

@@ -74,8 +74,8 @@ impl Upkeep for Mcmc {
         Some(&mut self.steps)
     }
 
-    fn growth(&self, at: &At) -> f64 {
-        if self.due(at) { self.settings.growth } else { 1.0 }
+    fn grown(&self, at: &At, count: f64, cap: f64) -> f64 {
+        if self.due(at) { (count * self.settings.growth).min(cap) } else { count }
     }
 }
 

@@ -197,9 +197,10 @@ pub trait Upkeep: Send + Sync {
         None
     }
 
-    /// The factor by which the cloud may grow at a place in the stage; 1: it does not.
-    fn growth(&self, _at: &At) -> f64 {
-        1.0
+    /// About how many Gaussians there are after a place in the stage, of `count` and at most `cap`: what an estimate of
+    /// time goes by.
+    fn grown(&self, _at: &At, count: f64, _cap: f64) -> f64 {
+        count
     }
 
     /// Whether it belongs into a stage that only tunes a trained scene: it keeps up what the model needs, and adds, moves

@@ -2,9 +2,12 @@
 //! [`motion`](super) into [`Spec`](super::Spec), its names and [`build`](super::build).
 
 use super::Motion;
+use super::spacetime::MAX_ORDER;
 use crate::Result;
 use crate::math::Real;
-use crate::scene::{Key, Params};
+use crate::scene::life::CENTER;
+use crate::scene::params::QUAT;
+use crate::scene::{GEOMETRY, Key, LIFE, Params};
 use std::sync::Arc;
 
 /// A built-in model as plain data: the payload of its entry in the list.
@@ -89,6 +92,44 @@ impl Polynomial {
     /// Whether everything goes along straight lines and nothing turns.
     pub(crate) fn is_straight(&self) -> bool {
         self.order <= 1 && self.rotation_rates.is_none()
+    }
+
+    /// How far a row's mean goes from the centre of its life to `delta` seconds later, scene units.
+    pub fn travel<F: Real>(&self, p: &Params<F>, row: usize, delta: f64) -> [f64; 3] {
+        let mut out = [0.0; 3];
+        let Some(key) = self.velocities else { return out };
+        for k in (0..self.order).rev() {
+            let v = p[key].read::<3>(row, 3 * k);
+            (0..3).for_each(|axis| out[axis] = (out[axis] + v[axis].f64()) * delta);
+        }
+        out
+    }
+
+    /// Moves the centre of a row's life by `shift` seconds and leaves its path and its turning as they are, of every order:
+    /// what it showed at any time it shows still, but for its life. Colours that change with time begin anew at the centre.
+    ///
+    /// Panics: the layer's Gaussians live for ever.
+    pub fn recentre<F: Real>(&self, p: &mut Params<F>, row: usize, shift: f64) {
+        assert!(p[LIFE].width() > 0, "who lives for ever has no centre of life to move");
+        let travel = self.travel(p, row, shift);
+        p[GEOMETRY].add(row, 0, travel.map(F::of));
+        if let Some(key) = self.velocities {
+            // Taylor's shift: of v₁Δ + v₂Δ² + v₃Δ³ around Δ = shift.
+            let mut v = [[0.0; 3]; MAX_ORDER];
+            (0..self.order).for_each(|k| v[k] = p[key].read::<3>(row, 3 * k).map(Real::f64));
+            for axis in 0..3 {
+                let [v1, v2, v3] = v.map(|v| v[axis]);
+                v[0][axis] = v1 + shift * (2.0 * v2 + shift * 3.0 * v3);
+                v[1][axis] = v2 + shift * 3.0 * v3;
+            }
+            (0..self.order).for_each(|k| p[key].write(row, 3 * k, v[k].map(F::of)));
+        }
+        if let Some(key) = self.rotation_rates {
+            let rate = p[key].read::<4>(row, 0);
+            p[GEOMETRY].add(row, QUAT, rate.map(|w| F::of(w.f64() * shift)));
+        }
+        let center = p[LIFE].get(row, CENTER).f64() + shift;
+        p[LIFE].set(row, CENTER, F::of(center));
     }
 }
 

@@ -283,6 +283,23 @@ pub(crate) fn capabilities(spec: &Spec, rows: usize, life: LifeKind) {
             assert!((0..3).all(|i| (mean[i] - shown[i]).abs() < 1e-9), "row {row} at {t}: {mean:?} {shown:?}");
         }
     }
+    if life != LifeKind::Infinite {
+        let mut moved = subject(spec, rows, life, 0.1, 4);
+        for row in 0..rows {
+            let (from, shift) = (moved.p[LIFE].get(row, 0), 0.13 * (row as f64 - 2.5));
+            let [there, back] = [shift, 0.0].map(|delta| path.travel(&moved.p, row, delta));
+            path.recentre(&mut moved.p, row, shift);
+            let mean = s.p[GEOMETRY].read::<3>(row, 0);
+            assert!((moved.p[LIFE].get(row, 0) - from - shift).abs() < 1e-12, "row {row}: the life's centre moves");
+            let now = moved.p[GEOMETRY].read::<3>(row, 0);
+            assert!((0..3).all(|i| back[i] == 0.0 && (now[i] - mean[i] - there[i]).abs() < 1e-12), "row {row}");
+        }
+        for (t, before) in [(0.2, &a), (0.7, &b)] {
+            let after = moved.splats(Space::Gaussians, Rows::All, t);
+            let near = before.data().iter().zip(after.data()).all(|(a, b)| (a - b).abs() < 1e-9);
+            assert!(near, "a life that is moved leaves the path at {t} as it was");
+        }
+    }
     if path.rotation_rates.is_none() {
         assert!((0..rows).all(|row| (3..9).all(|c| (a.get(row, c) - b.get(row, c)).abs() < 1e-12)), "nothing turns");
     }
