@@ -36,7 +36,7 @@ settings! {
         /// Life's centre learns from opacity alone (STG).
         detach: bool = false => any().when(IsNot("life.kind", &["infinite"]));
         /// Rate of velocities at the start, extents a clip.
-        velocity_lr_init: f64 = 5e-3 => positive().unit("extents/clip").when(On("spacetime.order"));
+        velocity_lr_init: f64 = 0.01 => positive().unit("extents/clip").when(On("spacetime.order"));
         /// Rate of velocities at the end, extents a clip.
         velocity_lr_final: f64 = 1.6e-5 => positive().unit("extents/clip").when(On("spacetime.order"));
         /// Rate of quaternion rates, 1/clip.

@@ -69,7 +69,7 @@ settings! {
         /// Rate of life centres, clips.
         center_lr: f64 = 1e-3 => any().unit("clips");
         /// Rate of log life widths.
-        width_lr: f64 = 0.01;
+        width_lr: f64 = 0.02;
         /// Life widths never fall below this many frames.
         min_frames: f64 = 0.5 => any().unit("frames");
     }

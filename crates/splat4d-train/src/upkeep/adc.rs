@@ -78,7 +78,9 @@ impl Upkeep for Adc {
     fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
         let settings = self.settings;
         let share = self.share(&c.at);
-        Ok(grow(learner, c, |learner, layer, spare, rng| settings.layer(learner, &c.limits, layer, (spare, share), rng)))
+        Ok(grow(learner, c, |learner, layer, spare, rng| {
+            settings.layer(learner, &c.limits, layer, (spare, share), rng)
+        }))
     }
 
     fn densification(&mut self) -> Option<&mut Every> {
@@ -125,7 +127,14 @@ impl AdcSettings {
         if goes > self.split_in_time * size { TIME_SHIFT * width } else { 0.0 }
     }
 
-    fn layer(&self, learner: &mut Learner, limits: &Limits, layer: usize, (spare, share): (&mut usize, f64), rng: Rng) -> Change {
+    fn layer(
+        &self,
+        learner: &mut Learner,
+        limits: &Limits,
+        layer: usize,
+        (spare, share): (&mut usize, f64),
+        rng: Rng,
+    ) -> Change {
         let (scene, stats) = (learner.scene(), learner.stats());
         let rows = scene.layers[layer].params.len();
         let covs = covariances(scene, layer);
@@ -144,7 +153,8 @@ impl AdcSettings {
         *spare -= wanting.len();
         let mut grows = vec![false; rows];
         wanting.iter().for_each(|&(_, r)| grows[r as usize] = true);
-        let parted: Vec<f64> = (0..rows).map(|r| if grows[r] { self.part(scene, layer, r, sizes[r]) } else { 0.0 }).collect();
+        let parted: Vec<f64> =
+            (0..rows).map(|r| if grows[r] { self.part(scene, layer, r, sizes[r]) } else { 0.0 }).collect();
         let large = |r: usize| sizes[r] > self.percent_dense * limits.extent;
         let splits: Vec<bool> = (0..rows).map(|r| grows[r] && (parted[r] > 0.0 || large(r))).collect();
         let mut edit = RowEdit { space: Space::Gaussians, parent: Vec::new(), born: Vec::new() };
@@ -229,7 +239,8 @@ mod tests {
             g.write(1, 7, [-1.0f32; 3]); // large: split
             g.set(2, OPACITY, -9.0); // dead
         }
-        let settings = AdcSettings { grad_threshold: 0.1, percent_dense: 0.05, retime_clones: false, ..AdcSettings::default() };
+        let settings =
+            AdcSettings { grad_threshold: 0.1, percent_dense: 0.05, retime_clones: false, ..AdcSettings::default() };
         let limits = Limits { cap: 100, extent: 4.0, min_opacity: 0.005 };
         let (change, all) = run(s.clone(), settings, 0..4, limits);
         assert_eq!((change.added, change.removed, all.len()), (3, 1, 22));
@@ -296,20 +307,25 @@ mod tests {
         let counts = |full_at: f64| {
             let adc = Adc { settings: AdcSettings { full_at, ..AdcSettings::default() }, steps };
             let mut count = 1000.0;
-            (1..=300).map(|step| {
-                let at = At { step, steps: 400 };
-                if adc.due(&at) {
-                    count += (9000.0 - count) * adc.share(&at);
-                }
-                count
-            }).collect::<Vec<f64>>()
+            (1..=300)
+                .map(|step| {
+                    let at = At { step, steps: 400 };
+                    if adc.due(&at) {
+                        count += (9000.0 - count) * adc.share(&at);
+                    }
+                    count
+                })
+                .collect::<Vec<f64>>()
         };
         let half = counts(0.5);
         assert_eq!((half[98], half[199], half[299]), (1000.0, 9000.0, 9000.0));
         // Eleven times until it is full, and (k/11)² of the room is left when k of them are to come.
         for k in 0..11 {
             let left = 9000.0 - half[199 - 10 * k];
-            assert!((left - 8000.0 * (k as f64 / 11.0).powi(2)).abs() < 1e-6, "{k} times before the cap {left} are left");
+            assert!(
+                (left - 8000.0 * (k as f64 / 11.0).powi(2)).abs() < 1e-6,
+                "{k} times before the cap {left} are left"
+            );
         }
         assert_eq!(counts(0.0)[99], 9000.0, "at once");
         let adc = Adc { settings: AdcSettings::default(), steps: Every { last: usize::MAX, ..steps } };
@@ -346,7 +362,8 @@ mod tests {
         layer.params[LIFE] = Table::new(LifeKind::GaussHalf.columns(), 400);
         (0..400).for_each(|r| layer.params[LIFE].write(r, 0, [2.5, 0.0]));
         (0..400).for_each(|r| layer.params[GEOMETRY].write(r, 7, [-6.0f32; 3]));
-        let settings = AdcSettings { grad_threshold: 0.1, percent_dense: 0.05, retime_clones: true, ..AdcSettings::default() };
+        let settings =
+            AdcSettings { grad_threshold: 0.1, percent_dense: 0.05, retime_clones: true, ..AdcSettings::default() };
         let (change, s) = run(s, settings, 0..400, Limits { cap: 800, extent: 4.0, min_opacity: 0.005 });
         assert_eq!(change.added, 400);
         let life = &s.layers[0].params[LIFE];

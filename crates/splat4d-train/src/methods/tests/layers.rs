@@ -11,7 +11,8 @@ pub(super) type Strategy = fn(&mut Stage, Every);
 pub(super) const STRATEGIES: [(&str, Strategy); 2] = [("adc", adc), ("mcmc", mcmc)];
 
 fn adc(stage: &mut Stage, steps: Every) {
-    let settings = AdcSettings { grad_threshold: 1e-6, percent_dense: 0.04, retime_clones: false, ..AdcSettings::default() };
+    let settings =
+        AdcSettings { grad_threshold: 1e-6, percent_dense: 0.04, retime_clones: false, ..AdcSettings::default() };
     stage.keep(Adc { settings, steps });
     stage.keep(MortonOrder { densification: steps });
 }
