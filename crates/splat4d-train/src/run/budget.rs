@@ -171,6 +171,7 @@ mod tests {
             .with(|r| {
                 r.run.iterations = STEPS;
                 r.densify.max_cap = CAP;
+                r.adc.full_at = 0.0;
             })
             .resolve();
         let half_size_steps = STEPS * 2 / 5;
