@@ -31,8 +31,12 @@ pub const RASTERIZE: &str = include_str!("gpu/rasterize.wgsl");
 pub const BYTES: &str = include_str!("gpu/bytes.wgsl");
 /// What both ways back of the blend share. After [`PROJECT`].
 pub const BLEND_BACK: &str = include_str!("gpu/blend_back.wgsl");
-/// The blend's way back with subgroups. After [`BLEND_BACK`].
+/// Sums over subgroups. After [`BLEND_BACK`].
+pub const SUBGROUP_SUMS: &str = include_str!("gpu/subgroup_sums.wgsl");
+/// The blend's way back with subgroups. After [`SUBGROUP_SUMS`].
 pub const RASTERIZE_BACK_SUBGROUP: &str = include_str!("gpu/rasterize_back_subgroup.wgsl");
+/// The same with pixels in vectors. After [`SUBGROUP_SUMS`].
+pub const RASTERIZE_BACK_VECTOR: &str = include_str!("gpu/rasterize_back_vector.wgsl");
 /// The blend's way back: a record a (tile, splat) pair. After [`BLEND_BACK`].
 pub const RASTERIZE_BACK: &str = include_str!("gpu/rasterize_back.wgsl");
 /// A picture compared with its truth: L1, D-SSIM and their gradient: `moments`, `gradient`.
@@ -72,6 +76,8 @@ pub const SPLATS_BACK: &str = include_str!("gpu/splats_back.wgsl");
 
 /// The blend's arithmetic alone, to measure.
 pub const ROOFLINE: &str = include_str!("gpu/roofline.wgsl");
+/// A copy, to measure.
+pub const COPY: &str = include_str!("gpu/copy.wgsl");
 
 #[cfg(test)]
 mod tests {
@@ -83,11 +89,15 @@ mod tests {
     const WORKGROUP_BYTES: u32 = 16 << 10;
     const INVOCATIONS: u32 = 256;
     /// Those that need more than WebGPU's core, on devices that have it.
-    const SUBGROUPS: [&str; 2] = ["rasterize, backward, with subgroups", "sort with subgroups"];
+    const SUBGROUPS: [&str; 3] = [
+        "rasterize, backward, with subgroups",
+        "sort with subgroups",
+        "rasterize, backward, with subgroups and vectors",
+    ];
 
     #[test]
     fn every_shader_is_valid_within_webgpus_default_limits() {
-        let shaders: [(&str, &[&str]); 26] = [
+        let shaders: [(&str, &[&str]); 28] = [
             ("project and shade", &[PROJECT, SHADE]),
             ("sort", &[SORT]),
             ("splats", &[PROJECT, SHADE, SPLATS]),
@@ -97,7 +107,8 @@ mod tests {
             ("ranges", &[RANGES]),
             ("rasterize", &[PROJECT, RASTERIZE]),
             ("rasterize, backward", &[PROJECT, BLEND_BACK, RASTERIZE_BACK]),
-            (SUBGROUPS[0], &[PROJECT, BLEND_BACK, RASTERIZE_BACK_SUBGROUP]),
+            (SUBGROUPS[0], &[PROJECT, BLEND_BACK, SUBGROUP_SUMS, RASTERIZE_BACK_SUBGROUP]),
+            (SUBGROUPS[2], &[PROJECT, BLEND_BACK, SUBGROUP_SUMS, RASTERIZE_BACK_VECTOR]),
             (SUBGROUPS[1], &[SORT, SORT_SUBGROUP]),
             ("record", &[RECORD]),
             ("bytes", &[PROJECT, BYTES]),
@@ -113,6 +124,7 @@ mod tests {
             ("adam", &[ADAM]),
             ("gather", &[GATHER]),
             ("roofline", &[ROOFLINE]),
+            ("copy", &[COPY]),
             ("splats, backward", &[PROJECT, PROJECT_BACK, SPLATS_BACK]),
         ];
         for (name, files) in shaders {

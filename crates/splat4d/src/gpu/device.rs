@@ -19,7 +19,7 @@ pub enum Adapters {
 }
 
 /// Threads of the smallest and the largest subgroup that kernels can work with (rasterize_back_subgroup.wgsl).
-const SUBGROUPS: [u32; 2] = [8, 64];
+pub(super) const SUBGROUPS: [u32; 2] = [8, 64];
 
 /// The first error that the driver reported since it was last asked for.
 type Trouble = Arc<Mutex<Option<(ErrorKind, String)>>>;
@@ -121,6 +121,11 @@ impl Gpu {
     /// Whether the GPU's own clock can be read.
     pub(crate) fn has_timestamps(&self) -> bool {
         self.device.features().contains(wgpu::Features::TIMESTAMP_QUERY)
+    }
+
+    /// Threads of the smallest subgroup that the device may choose.
+    pub(super) fn smallest_subgroup(&self) -> usize {
+        self.info.subgroup_min_size as usize
     }
 
     /// Whether kernels are compiled that exchange numbers within subgroups.

@@ -1,6 +1,7 @@
 //! The compute pipelines, compiled once. Bindings are written out, so that all entry points of a file share one layout.
 
-use super::device::Gpu;
+use super::device::{Gpu, SUBGROUPS};
+use super::tuning::with_constant;
 use crate::wgsl;
 
 /// Kind of a binding.
@@ -274,6 +275,27 @@ impl ResidentKernels {
     }
 }
 
+/// Threads of a workgroup of the blend's way back with subgroups, and splats that it reads at a time where subgroups have 8 threads
+/// (subgroup_sums.wgsl).
+const BACK_THREADS: usize = 64;
+const BACK_SPLATS: usize = 16;
+
+/// The blend's way back that this device and its tuning want.
+fn rasterize_back(gpu: &Gpu) -> String {
+    match (gpu.has_subgroups(), gpu.tuning.back_vectors) {
+        (false, _) => wgsl::RASTERIZE_BACK.into(),
+        (true, false) => [wgsl::SUBGROUP_SUMS, wgsl::RASTERIZE_BACK_SUBGROUP].join("\n"),
+        (true, true) => {
+            // The fewer subgroups there are, the more splats fit into the same workgroup memory. No bit depends on it.
+            let smallest = gpu.smallest_subgroup();
+            let splats = (BACK_SPLATS * smallest / SUBGROUPS[0] as usize).min(BACK_THREADS);
+            let sums = with_constant(wgsl::SUBGROUP_SUMS, "SPLATS", splats);
+            let sums = with_constant(&sums, "MOST_SUBGROUPS", BACK_THREADS / smallest);
+            [sums.as_str(), wgsl::RASTERIZE_BACK_VECTOR].join("\n")
+        }
+    }
+}
+
 /// The kernels of the loss and of the way back.
 #[derive(Debug)]
 pub(super) struct BackKernels {
@@ -290,7 +312,6 @@ pub(super) struct BackKernels {
 impl BackKernels {
     /// Compiles everything.
     pub(super) fn new(gpu: &Gpu) -> Self {
-        let rasterize_back = if gpu.has_subgroups() { wgsl::RASTERIZE_BACK_SUBGROUP } else { wgsl::RASTERIZE_BACK };
         Self {
             loss: Kernel::new(
                 gpu,
@@ -302,7 +323,7 @@ impl BackKernels {
             rasterize: Kernel::new(
                 gpu,
                 "rasterize, backward",
-                &[wgsl::PROJECT, wgsl::BLEND_BACK, rasterize_back],
+                &[wgsl::PROJECT, wgsl::BLEND_BACK, &rasterize_back(gpu)],
                 &[Uniform, Uniform, Read, Read, Read, Read, Read, Read, Read, Write],
                 &["rasterize_back"],
             ),

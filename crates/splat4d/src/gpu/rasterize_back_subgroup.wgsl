@@ -1,61 +1,5 @@
-// The way back through a tile on devices with subgroups of 8 to 64 threads, a power of two: the records of rasterize_back.wgsl,
-// added up in registers and by exchanges between threads, in an order that the size of subgroups alone decides. render/project.wgsl
-// and blend_back.wgsl, where bindings and twin stand, are put in front of this file. 7 KiB of workgroup memory.
-//
-// A workgroup owns a tile and goes front to back; a thread owns four pixels of a column, so that what depends on dx alone is
-// multiplied once. Eight of a splat's sums go through a butterfly in which a thread keeps half of them at each of the first three
-// exchanges and gives away the other half; what subgroups have then is added in their order.
-
-const THREADS: u32 = 64u;
-const PIXELS: u32 = 4u;
-// Splats between two barriers.
-const SPLATS: u32 = 16u;
-// Of 8 threads each.
-const MOST_SUBGROUPS: u32 = 8u;
-
-var<workgroup> parts: array<f32, MOST_SUBGROUPS * SPLATS * NUMBERS>;
-var<workgroup> centers: array<vec2<f32>, SPLATS>;
-var<workgroup> powers: array<vec4<f32>, SPLATS>;
-var<workgroup> lights: array<vec4<f32>, SPLATS>;
-var<workgroup> conics: array<vec4<f32>, SPLATS>;
-var<workgroup> quadrants: array<u32, SPLATS>;
-var<workgroup> pairs: array<u32, SPLATS>;
-
-// The sum over a subgroup.
-fn whole(x: f32, size: u32) -> f32 {
-    var sum = x;
-    for (var step = 1u; step < size; step *= 2u) {
-        sum += subgroupShuffleXor(sum, step);
-    }
-    return sum;
-}
-
-// The sum over a subgroup of one of eight numbers: of number place_of(lane).
-fn share_of_eight(low: vec4<f32>, high: vec4<f32>, lane: u32, size: u32) -> f32 {
-    let first = (lane & 1u) != 0u;
-    let four = select(low, high, first) + subgroupShuffleXor(select(high, low, first), 1u);
-    let second = (lane & 2u) != 0u;
-    let two = select(four.xy, four.zw, second) + subgroupShuffleXor(select(four.zw, four.xy, second), 2u);
-    let third = (lane & 4u) != 0u;
-    var one = select(two.x, two.y, third) + subgroupShuffleXor(select(two.y, two.x, third), 4u);
-    for (var step = 8u; step < size; step *= 2u) {
-        one += subgroupShuffleXor(one, step);
-    }
-    return one;
-}
-
-fn place_of(lane: u32) -> u32 {
-    return 4u * (lane & 1u) + (lane & 2u) + ((lane >> 2u) & 1u);
-}
-
-// Number n of splat i: what all subgroups have of it.
-fn total(i: u32, n: u32, subgroups: u32) -> f32 {
-    var sum = 0.0;
-    for (var s = 0u; s < subgroups; s++) {
-        sum += parts[(s * SPLATS + i) * NUMBERS + n];
-    }
-    return sum;
-}
+// The way back through a tile on devices with subgroups: the records of rasterize_back.wgsl, added up in registers and by exchanges
+// between threads. subgroup_sums.wgsl, where the rest is said, is put in front of this file.
 
 @compute @workgroup_size(64)
 fn rasterize_back(
@@ -162,7 +106,7 @@ fn rasterize_back(
             let high = vec4<f32>(s.y * d.x, s.z, light.x, light.y);
             let eighth = share_of_eight(low, high, lane, size);
             if (lane < 8u) {
-                parts[to + place_of(lane)] = eighth;
+                parts[to + eighth_of(lane)] = eighth;
             }
             let blue = whole(light.z, size);
             var depth = 0.0;

@@ -12,17 +12,27 @@ pub struct Tuning {
     pub rounds: usize,
     /// Splats that a tile reads at a time, to blend them.
     pub batch: usize,
-    /// Whether the blend goes back with subgroups, where the device has them: this alone changes last bits.
+    /// Whether the blend goes back with subgroups, where the device has them: changes last bits.
     pub subgroups: bool,
     /// Whether the sorts' last dispatch uses them too: no bit depends on it.
     pub sort_subgroups: bool,
+    /// Whether its way back with subgroups holds pixels in vectors (rasterize_back_vector.wgsl): changes last bits.
+    pub back_vectors: bool,
     /// Splats of a round of its way back without them.
     pub back_round: usize,
 }
 
 impl Default for Tuning {
     fn default() -> Self {
-        Self { row_threads: THREADS, rounds: 8, batch: THREADS, subgroups: true, sort_subgroups: true, back_round: 4 }
+        Self {
+            row_threads: THREADS,
+            rounds: 8,
+            batch: THREADS,
+            subgroups: true,
+            sort_subgroups: true,
+            back_vectors: false,
+            back_round: 4,
+        }
     }
 }
 
@@ -48,6 +58,7 @@ impl Tuning {
         out.extend(with(|t, v| t.rounds = v, &ROUNDS));
         out.extend(with(|t, v| t.batch = v, &BATCHES));
         out.push(Self { sort_subgroups: false, ..Self::default() });
+        out.push(Self { back_vectors: true, ..Self::default() });
         let portable = Self { subgroups: false, ..Self::default() };
         out.push(portable);
         out.extend(BACK_ROUNDS.map(|back_round| Self { back_round, ..portable }));
@@ -63,6 +74,7 @@ impl Tuning {
                 ("batch", t.batch),
                 ("subgroups", usize::from(t.subgroups)),
                 ("sort_subgroups", usize::from(t.sort_subgroups)),
+                ("back_vectors", usize::from(t.back_vectors)),
                 ("back_round", t.back_round),
             ]
         };
@@ -88,16 +100,19 @@ impl Tuning {
             ("BATCH", self.batch),
             ("ROUND", self.back_round),
         ];
-        let mut out = shader.to_owned();
-        for (name, value) in constants {
-            let before = format!("const {name}: u32 = ");
-            if let Some(at) = out.find(&before).map(|at| at + before.len()) {
-                let end = at + out[at..].find(';').expect("a constant ends");
-                out.replace_range(at..end, &format!("{value}u"));
-            }
-        }
-        out
+        constants.iter().fold(shader.to_owned(), |text, (name, value)| with_constant(&text, name, *value))
     }
+}
+
+/// A shader's text with another value of an integer constant, where it has the constant.
+pub(super) fn with_constant(text: &str, name: &str, value: usize) -> String {
+    let before = format!("const {name}: u32 = ");
+    let mut out = text.to_owned();
+    if let Some(at) = out.find(&before).map(|at| at + before.len()) {
+        let end = at + out[at..].find(';').expect("a constant ends");
+        out.replace_range(at..end, &format!("{value}u"));
+    }
+    out
 }
 
 #[cfg(test)]

@@ -241,6 +241,13 @@ fn without_subgroups_each_kernel_equals_its_twin_too() {
     each_equals_its_twin(&mut GpuRenderer::new(portable, RenderConfig::default()).expect("the kernels compile"));
 }
 
+#[test]
+fn with_pixels_in_vectors_each_kernel_equals_its_twin_too() {
+    let Some(gpu) = gpu() else { return };
+    let vectors = gpu.tuned(Tuning { back_vectors: true, ..Tuning::default() });
+    each_equals_its_twin(&mut GpuRenderer::new(vectors, RenderConfig::default()).expect("the kernels compile"));
+}
+
 fn each_equals_its_twin(r: &mut GpuRenderer) {
     r.config.abs_grads = true;
     for (scene, camera) in [
