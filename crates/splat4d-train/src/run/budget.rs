@@ -171,7 +171,6 @@ mod tests {
             .with(|r| {
                 r.run.iterations = STEPS;
                 r.densify.max_cap = CAP;
-                r.adc.full_at = 0.0;
             })
             .resolve();
         let half_size_steps = STEPS * 2 / 5;
@@ -221,7 +220,8 @@ mod tests {
     #[test]
     fn a_machine_that_keeps_its_speed_keeps_the_plan() {
         let (end, _, rows) = drive(&|_, _| 1.0);
-        assert!(rows.is_empty() && (end - 1.0).abs() < 1e-6, "{end} {rows:?}");
+        // A run has whole Gaussians, a plan while they grow a fraction of one more.
+        assert!(rows.is_empty() && (end - 1.0).abs() < 1e-4, "{end} {rows:?}");
     }
 
     #[test]
