@@ -165,7 +165,7 @@ mod tests {
         let small = [width / 2, height / 2];
         let mut emphasis = Emphasis {
             strength: 1.0,
-            still: [(0, vec![[0; 3]; small[0] * small[1]])].into(),
+            still: [(0, [0, 1, 2].map(|_| vec![0; small[0] * small[1]]))].into(),
             moves: Planes::default(),
         };
         let mut picture = Picture { color: Planes::new(3, height, width), ..Picture::default() };
