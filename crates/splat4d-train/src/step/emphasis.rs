@@ -88,7 +88,7 @@ impl Emphasis {
     }
 }
 
-/// Σ_c ψ(I_c − median_c)/3 of a row of pixels.
+/// Adds Σ_c ψ(I_c − median_c)/3 of a row of pixels.
 struct Moves<'a> {
     color: [&'a [f32]; 3],
     still: [&'a [u8]; 3],

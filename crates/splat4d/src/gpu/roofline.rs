@@ -118,8 +118,8 @@ impl GpuRenderer {
         Ok(best)
     }
 
-    /// By the driver's own copies or by a kernel's, whichever is faster: on an H200 Adam
-    /// alone moved three times what the driver's copies did.
+    /// By the driver's own copies or by a kernel's, whichever is faster: on an H200 Adam alone
+    /// moved three times what the driver's copies did.
     fn bytes_a_second(&self) -> Result<f64> {
         let bytes = COPY.min(largest_binding(&self.gpu)) / COPY_GROUP * COPY_GROUP;
         let (mut from, mut to) = (Grown::storage("a copy's source"), Grown::storage("a copy's target"));
