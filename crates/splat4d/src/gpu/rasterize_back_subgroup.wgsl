@@ -56,18 +56,7 @@ fn rasterize_back(
     for (var start = first; start < end; start += SPLATS) {
         // Everybody has read the last splats and their sums.
         workgroupBarrier();
-        if (thread < SPLATS && start + thread < end) {
-            let pair = values[start + thread];
-            let owner = owners[pair];
-            let splat = owner & OWNER_SPLAT;
-            let conic = shapes[2u * splat + 1u];
-            pairs[thread] = pair;
-            quadrants[thread] = owner >> OWNER_SHIFT;
-            centers[thread] = shapes[2u * splat].xy;
-            conics[thread] = conic;
-            powers[thread] = vec4<f32>(-LOG2_E * vec3<f32>(0.5, 1.0, 0.5) * conic.xyz, log2(conic.w));
-            lights[thread] = colors[splat];
-        }
+        read_splats(start, end, thread);
         workgroupBarrier();
         let count = min(end - start, SPLATS);
         for (var i = 0u; i < count; i++) {
@@ -125,8 +114,6 @@ fn rasterize_back(
             }
         }
         workgroupBarrier();
-        for (var n = thread; n < count * NUMBERS; n += THREADS) {
-            records[pairs[n / NUMBERS] * NUMBERS + n % NUMBERS] = total(n / NUMBERS, n % NUMBERS, subgroups);
-        }
+        write_records(count, thread, subgroups);
     }
 }

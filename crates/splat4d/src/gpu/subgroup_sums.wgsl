@@ -1,6 +1,7 @@
-// What both ways back through a tile with subgroups share: what lies in workgroup memory, and sums over subgroups of 8 to 64 threads,
-// a power of two, in an order that the size of subgroups alone decides. render/project.wgsl and blend_back.wgsl are put in front of
-// this file, rasterize_back_subgroup.wgsl or rasterize_back_vector.wgsl behind it. 7 KiB of workgroup memory.
+// What both ways back through a tile with subgroups share: what lies in workgroup memory, how it is filled and records are written,
+// and sums over subgroups of 8 to 64 threads, a power of two, in an order that the size of subgroups alone decides.
+// render/project.wgsl and blend_back.wgsl are put in front of this file, rasterize_back_subgroup.wgsl or rasterize_back_vector.wgsl
+// behind it. 7 KiB of workgroup memory.
 //
 // A workgroup owns a tile and goes front to back; a thread owns four pixels of a column, so that what depends on dx alone is
 // multiplied once. Sums go through butterflies in which a thread keeps half of its numbers at each of the first exchanges and gives
@@ -71,4 +72,27 @@ fn total(i: u32, n: u32, subgroups: u32) -> f32 {
         sum += parts[(s * SPLATS + i) * NUMBERS + n];
     }
     return sum;
+}
+
+// Reads the splats from `start` on into workgroup memory, one a thread.
+fn read_splats(start: u32, end: u32, thread: u32) {
+    if (thread < SPLATS && start + thread < end) {
+        let pair = values[start + thread];
+        let owner = owners[pair];
+        let splat = owner & OWNER_SPLAT;
+        let conic = shapes[2u * splat + 1u];
+        pairs[thread] = pair;
+        quadrants[thread] = owner >> OWNER_SHIFT;
+        centers[thread] = shapes[2u * splat].xy;
+        conics[thread] = conic;
+        powers[thread] = vec4<f32>(-LOG2_E * vec3<f32>(0.5, 1.0, 0.5) * conic.xyz, log2(conic.w));
+        lights[thread] = colors[splat];
+    }
+}
+
+// Writes the records of the splats that were read.
+fn write_records(count: u32, thread: u32, subgroups: u32) {
+    for (var n = thread; n < count * NUMBERS; n += THREADS) {
+        records[pairs[n / NUMBERS] * NUMBERS + n % NUMBERS] = total(n / NUMBERS, n % NUMBERS, subgroups);
+    }
 }
