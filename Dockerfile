@@ -8,6 +8,6 @@ RUN cargo build --profile dist --locked
 
 FROM alpine:3
 RUN apk add --no-cache ffmpeg
-COPY --from=build /src/target/dist/splat4d /usr/local/bin/splat4d
+COPY --from=build /src/target/dist/splat4d /src/target/dist/s4d /usr/local/bin/
 WORKDIR /work
 ENTRYPOINT ["splat4d"]

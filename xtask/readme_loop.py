@@ -2,7 +2,7 @@
 """Draws the moving picture of README.md with the Python package: a scene and its time line, as an animated PNG.
 
     pip install splat4d numpy
-    python xtask/readme_loop.py examples/knight.splat4d docs/images/knight-loop.png
+    python xtask/readme_loop.py examples/knight.s4d docs/images/knight-loop.png
 """
 
 import struct

@@ -196,13 +196,13 @@ fn clean(path: &Path) -> PathBuf {
 
 /// A page a scene: the player, its scene, and what else there is.
 fn gallery(root: &Path, out: &Path) -> Result<()> {
-    let scenes = list(&root.join("examples"), "splat4d")?;
+    let scenes = list(&root.join("examples"), "s4d")?;
     ensure!(!scenes.is_empty(), "there are no scenes to play in examples/");
     copy(&root.join("crates/splat4d-serve/player"), &out.join("player"))?;
     let mut body = String::from("<script type=\"module\" src=\"player/element.js\"></script>\n<h1>Play</h1>\n");
     for name in &scenes {
         copy(&root.join("examples").join(name), &out.join(name))?;
-        let stem = name.trim_end_matches(".splat4d");
+        let stem = name.trim_end_matches(".s4d");
         body += &format!(
             "<h2>{stem}</h2>\n<splat-4d src=\"{name}\" autoplay speed=\"0.5\" heading=\"{stem}\"></splat-4d>\n"
         );

@@ -96,7 +96,7 @@ pub(crate) fn pack_scene(
     let options = Options { cameras: cameras.iter().map(|v| v.camera.clone()).collect(), ..baking.options.clone() };
     let mut baked = bake(scene, &options, &mut |done, total| console.phase("baking", done, total))?;
     if scene.layers.iter().any(|l| l.masks.is_some()) {
-        console.warn("the scene's masks are not baked along: whom they leave out is drawn. Its own .splat4d has them.");
+        console.warn("the scene's masks are not baked along: whom they leave out is drawn. Its own .s4d has them.");
     }
     let antialias = source.run.as_ref().and_then(|r| r.recipe().ok()).is_some_and(|r| r.appearance.antialias);
     let meta = Meta { title: title.to_owned(), ..meta(scene, &Outline::of_baked(&baked), &stage, &cameras) };

@@ -8,7 +8,7 @@ use crate::measure::{SIZE, Side, Subject, What, in_turns, looks_of};
 use crate::report::compress::{Compressed, Guard, Step, Tried};
 use crate::run_folder::{self, COMPRESS, ORDER, Run, cameras_json};
 use crate::source::{Source, not_empty, read_scene};
-use crate::{files, interrupt, report};
+use crate::{files, interrupt, playable, report};
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 use splat4d::device::Device;
@@ -144,7 +144,7 @@ impl Work {
             finish::amend(&self.dir, [("notes".into(), json!(console.warnings()))])?;
             console.written(&report::write(&Run::open(&self.dir)?)?);
         }
-        console.written(&self.dir.join("scene.splat4d"));
+        console.written(&self.dir.join(playable::FILE));
         console.emit(&json!({"type": "compressed", "run": self.dir, "bytes": file.bytes}));
         Ok(())
     }
@@ -163,8 +163,8 @@ impl Work {
         let read = |path: &Path| -> Result<Arc<[u8]>> {
             Ok(std::fs::read(path).map_err(|e| files::cannot_read(path, e))?.into())
         };
-        let file = read(&self.dir.join("scene.splat4d"))?;
-        let plain = self.order.source.join("scene.splat4d");
+        let file = read(&self.dir.join(playable::FILE))?;
+        let plain = playable::of_run(&self.order.source);
         let plain = if plain.is_file() { Some(read(&plain)?) } else { None };
         let mut subjects = vec![What::Scene(original.scene), What::File(file)];
         subjects.extend(plain.into_iter().map(What::File));
@@ -277,7 +277,7 @@ impl Work {
         Ok(compressed)
     }
 
-    /// Writes `scene.splat4d`.
+    /// Writes `scene.s4d`.
     fn write_file(&self, compressed: &compress::Compressed, console: &Console) -> anyhow::Result<Summary> {
         console.phase("writing", 0, 0);
         let source = Source::open(&self.dir)?;
@@ -293,7 +293,7 @@ impl Work {
         let config = WriteConfig { depths: self.order.settings.depths, ..WriteConfig::default() };
         let mut bytes = Vec::new();
         let summary = write_pages(&draft, &config, &mut bytes)?;
-        files::write(&self.dir.join("scene.splat4d"), &bytes)?;
+        files::write(&self.dir.join(playable::FILE), &bytes)?;
         Ok(summary)
     }
 

@@ -66,7 +66,7 @@ impl Context for Bring<'_> {
             names.dedup();
             names.truncate(12);
             let remedy = if names.is_empty() {
-                "Give a run folder, or a .splat4d that brings its cameras along.".to_owned()
+                "Give a run folder, or a .s4d that brings its cameras along.".to_owned()
             } else {
                 format!("It has: {}.", names.join(", "))
             };

@@ -4,6 +4,7 @@
 use crate::baking::{self, Baking, Outline, Packed, bake_like, poster};
 use crate::console::Console;
 use crate::files::{cannot_read, human_bytes};
+use crate::playable::FILE;
 use crate::run_folder::Run;
 use crate::source::Source;
 use splat4d::format::playback::{Growing, HEADER_BYTES, Index, Meta, finish};
@@ -16,10 +17,8 @@ use std::io::Read;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-/// Name of the file in the run's folder.
-const FILE: &str = "scene.splat4d";
 /// Name of the file that is made of the parts of a take whose file is finished already.
-const AGAIN: &str = ".scene.again.splat4d";
+const AGAIN: &str = ".scene.again.s4d";
 
 /// Appends all parts that are finished and not in the file yet. Nothing happens to a file that is finished.
 pub(crate) fn append(run: &Path, chunked: &Chunked, stop: &AtomicBool, console: &Console) -> anyhow::Result<()> {

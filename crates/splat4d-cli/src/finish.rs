@@ -3,12 +3,12 @@
 use crate::baking::{Baking, bake_into};
 use crate::console::Console;
 use crate::draw::{Channel, Painter};
-use crate::files;
 use crate::paths::{Clock, Route, Stage, orbit_seconds, shots};
 use crate::report::{self, refined_in_words};
 use crate::run_folder::{ORDER, Run};
 use crate::source::{Source, not_empty, read_scene};
 use crate::video::{Film, have_ffmpeg};
+use crate::{files, playable};
 use serde_json::{Value, json};
 use splat4d::device::Device;
 use splat4d::layers::Scene;
@@ -104,7 +104,7 @@ pub(crate) fn all(run: &Path, measure: &Measure, console: &Console) -> anyhow::R
     write_report(run, console)
 }
 
-/// Bakes the run into `scene.splat4d`. What goes wrong is said and never costs the run.
+/// Bakes the run into `scene.s4d`. What goes wrong is said and never costs the run.
 pub fn playback(run: &Path, console: &Console) -> Result<()> {
     // The file of a compression is what was learnt: baking anew would lose its codes, palette and masks.
     // That of a long take was made chunk by chunk.
@@ -114,7 +114,7 @@ pub fn playback(run: &Path, console: &Console) -> Result<()> {
     let baked = Source::open(run).map_err(anyhow::Error::from).and_then(|source| {
         not_empty(&source.scene, run)?;
         let title = Run::open(run)?.name();
-        bake_into(&source, &title, &run.join("scene.splat4d"), &Baking::default(), console)
+        bake_into(&source, &title, &run.join(playable::FILE), &Baking::default(), console)
     });
     console.clear();
     match baked {

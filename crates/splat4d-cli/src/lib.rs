@@ -56,7 +56,7 @@ Examples:
   splat4d eval runs/knight --baseline      measure again, next to a scene that stands still
   splat4d render runs/knight -o turn.mp4   film an orbit through space and time
   splat4d localise runs/knight photo.jpg   from where and when was it taken?
-  splat4d bake runs/knight -o knight.splat4d       one small, seekable file for players
+  splat4d bake runs/knight -o knight.s4d           one small, seekable file for players
   splat4d compress runs/knight             the same many times smaller and faster, and measured
   splat4d view runs/knight                 play it in the browser
   splat4d export runs/knight -o now.ply --time 0.5
@@ -69,9 +69,16 @@ Examples:
 
 Exit codes: 0 done, 1 failed or interrupted, 2 bad input.";
 
+/// What `--version` prints: another program has a command of this name.
+const VERSION: &str = concat!(
+    env!("CARGO_PKG_VERSION"),
+    "\nwrites .s4d, also installed as s4d: https://github.com/splat4d/splat4d\n\
+     (the Python package splats4d is another program, whose command has the same name)"
+);
+
 /// 4D Gaussian splatting on a plain CPU: a posed, moving capture becomes a scene to look at from anywhere, at any time.
 #[derive(Debug, Parser)]
-#[command(name = "splat4d", version, after_help = EXAMPLES, max_term_width = 110)]
+#[command(name = "splat4d", version, long_version = VERSION, after_help = EXAMPLES, max_term_width = 110)]
 struct Cli {
     #[command(flatten)]
     globals: Globals,

@@ -7,11 +7,27 @@ use crate::files::cannot_read;
 use crate::run_folder::Run;
 use crate::source::{Source, not_empty};
 use splat4d::Result;
-use splat4d::format::playback::{HEADER_BYTES, Index, MAGIC};
+use splat4d::format::playback::{EXTENSION, HEADER_BYTES, Index, MAGIC, OLD_EXTENSION};
 use splat4d_serve::Content;
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
+
+/// Name of a run's playback file.
+pub(crate) const FILE: &str = "scene.s4d";
+/// Its name in runs of versions before 0.1.
+const OLD_FILE: &str = "scene.splat4d";
+
+/// Whether a path is named as a playback file.
+pub(crate) fn is_named(path: &Path) -> bool {
+    path.extension().is_some_and(|e| [EXTENSION, OLD_EXTENSION].iter().any(|known| e.eq_ignore_ascii_case(known)))
+}
+
+/// Path of a run's playback file, which may be missing.
+pub(crate) fn of_run(run: &Path) -> PathBuf {
+    let old = run.join(OLD_FILE);
+    if old.is_file() && !run.join(FILE).is_file() { old } else { run.join(FILE) }
+}
 
 /// A playback file and what people call it.
 pub(crate) struct Playable {
@@ -51,7 +67,7 @@ impl Playable {
 fn ready(path: &Path) -> Result<Option<PathBuf>> {
     if Run::is(path) {
         let changed = |p: &Path| p.metadata().and_then(|m| m.modified()).ok();
-        let baked = path.join("scene.splat4d");
+        let baked = of_run(path);
         let scene = Run::open(path)?.scene_file().ok();
         let current = baked.is_file() && scene.is_none_or(|scene| changed(&scene) <= changed(&baked));
         return Ok(current.then_some(baked));
@@ -78,4 +94,23 @@ fn index(path: &Path) -> Result<Index> {
     let mut index = Vec::new();
     (&file).take(place.end - place.start).read_to_end(&mut index).map_err(fail)?;
     Index::of(&header, &index).map_err(|e| e.at(path.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn playback_files_are_known_by_both_extensions() {
+        for (name, named) in [("a.s4d", true), ("A.S4D", true), ("a.splat4d", true), ("a.splat", false), ("s4d", false)]
+        {
+            assert_eq!(is_named(Path::new(name)), named, "{name}");
+        }
+        let run = tempfile::tempdir().unwrap();
+        assert_eq!(of_run(run.path()), run.path().join("scene.s4d"));
+        std::fs::write(run.path().join("scene.splat4d"), b"").unwrap();
+        assert_eq!(of_run(run.path()), run.path().join("scene.splat4d"), "a run of an older version");
+        std::fs::write(run.path().join("scene.s4d"), b"").unwrap();
+        assert_eq!(of_run(run.path()), run.path().join("scene.s4d"));
+    }
 }

@@ -19,11 +19,12 @@ pub(crate) const COMPRESS: &str = "compress.json";
 /// File that holds the settings `compress` was asked for.
 pub(crate) const ORDER: &str = "compress.toml";
 /// Files and folders that splat4d writes into a run; `--force` replaces these and nothing else.
-const OURS: [&str; 29] = [
+const OURS: [&str; 30] = [
     "recipe.toml",
     "run.json",
     "scene.safetensors",
-    "scene.splat4d",
+    "scene.s4d",
+    "scene.splat4d", // its name before version 0.1
     "checkpoints",
     "chunks",
     "metrics.csv",

@@ -1,5 +1,5 @@
 //! Anything that holds a scene: a run folder, a scene file (`.safetensors`, checkpoints too), a playback file
-//! (`.splat4d`), a file or folder of another program's Gaussians, or a sequence of such files.
+//! (`.s4d`), a file or folder of another program's Gaussians, or a sequence of such files.
 
 use crate::files::{cannot_read, either};
 use crate::paths::{Stage, View};
@@ -7,11 +7,11 @@ use crate::run_folder::Run;
 use crate::sequence;
 use splat4d::format::playback::{self, Index, Provenance};
 use splat4d::format::ply::PlyInfo;
-use splat4d::format::{Dialect, Warnings, dialect, sog};
+use splat4d::format::{Dialect, Warnings, dialect, foreign, sog};
 use splat4d::layers::{Layer, Scene};
 use splat4d::scene::Camera;
 use splat4d::scene::time::DEFAULT_FPS;
-use splat4d::{Error, ErrorKind, Result, format};
+use splat4d::{Error, Result, format};
 use std::borrow::Cow;
 use std::path::Path;
 
@@ -25,13 +25,11 @@ const ROOM: f64 = 1.1;
 /// Remedy that lists the files that can be opened, for errors.
 fn remedy() -> String {
     let others = either(&dialect::extensions(|_| true));
-    format!("Give a run folder, a scene.safetensors, a checkpoint, a .splat4d, or a {others} file.")
+    format!("Give a run folder, a scene.safetensors, a checkpoint, a .s4d, or a {others} file.")
 }
 
 /// Marks a folder of SOG scenes, one for each level of detail.
-const SOG_LEVELS: &str = "lod-meta.json";
-/// Endings of formats that people hold and we do not read.
-const UNREAD: [&str; 5] = ["ksplat", "glb", "gltf", "4dgs", "usdz"];
+pub(crate) const SOG_LEVELS: &str = "lod-meta.json";
 
 /// A scene and where it came from.
 pub struct Source {
@@ -72,6 +70,9 @@ impl Source {
         if path.file_name().is_some_and(|n| n == sog::META) {
             return open_sog(path.parent().unwrap_or(Path::new("")));
         }
+        if path.file_name().is_some_and(|n| n == SOG_LEVELS) {
+            return open_sequence(path.parent().unwrap_or(Path::new("")), fps);
+        }
         let bytes = std::fs::read(path).map_err(|e| cannot_read(path, e))?;
         if bytes.starts_with(&playback::MAGIC) {
             let index = Index::parse(&bytes, Some(bytes.len() as u64)).map_err(|e| e.at(path.display()))?;
@@ -79,6 +80,7 @@ impl Source {
             let provenance = playback::provenance(&bytes).map_err(|e| e.at(path.display()))?;
             return Ok(Self { playback: Some(index), provenance, ..Self::own(scene) });
         }
+        let name = path.file_name().map(|n| n.to_string_lossy()).unwrap_or_default();
         let opened = match dialect_of(path, &bytes) {
             Some(kind) => kind.open(&bytes).map(|o| Self {
                 ply: o.ply,
@@ -86,14 +88,10 @@ impl Source {
                 warnings: o.warnings,
                 ..Self::own(o.scene)
             }),
-            None if path.extension().is_some_and(|e| UNREAD.iter().any(|u| e.eq_ignore_ascii_case(u))) => {
-                Err(Error::new(ErrorKind::Unsupported, "this format is not read")
-                    .remedy("Convert it to .ply first, for instance with splat-transform."))
-            }
-            None if path.extension().is_some_and(|e| e != "safetensors") && !looks_own(&bytes) => {
-                Err(Error::input("its first bytes are of no format that splat4d reads").remedy(remedy()))
-            }
-            None => format::scene::read(&bytes).map(Self::own).map_err(|e| e.remedy(remedy())),
+            None if looks_own(&bytes) => format::scene::read(&bytes).map(Self::own).map_err(|e| e.remedy(remedy())),
+            None => Err(foreign::unread(&name, &bytes).unwrap_or_else(|| {
+                Error::input("unknown format: its first bytes match none that splat4d reads").remedy(remedy())
+            })),
         };
         opened.map_err(|e| e.at(path.display()))
     }

@@ -83,7 +83,12 @@ fn help_teaches_and_completions_complete() {
     for shell in ["bash", "zsh", "fish"] {
         assert!(splat4d(&["completions", shell]).run().ok().contains("image-memory"), "{shell}");
     }
-    assert!(splat4d(&["--version"]).run().ok().starts_with("splat4d "));
+    let version = splat4d(&["--version"]).run().ok();
+    assert!(version.starts_with("splat4d ") && version.contains("splats4d"), "{version}");
+    // The second name is the same program, down to the exit code.
+    let second = |arg: &str| std::process::Command::new(env!("CARGO_BIN_EXE_s4d")).arg(arg).output().unwrap();
+    assert_eq!(String::from_utf8(second("--version").stdout).unwrap(), version);
+    assert_eq!(second("--nothing").status.code(), Some(2));
 }
 
 #[test]
@@ -135,7 +140,7 @@ fn a_capture_becomes_a_run_and_everything_follows() {
         "recipe.toml",
         "run.json",
         "scene.safetensors",
-        "scene.splat4d",
+        "scene.s4d",
         "metrics.csv",
         "results.json",
         "per_view.json",
@@ -357,17 +362,17 @@ fn a_scene_becomes_a_page_alone_or_beside_its_file() {
     assert!(html.contains("<title>one &lt;b&gt;</title>") && html.contains("id=\"splat4d-scene\""));
     // The scene's magic in base64: the player gets a playback file.
     assert!(html.contains("\niVM0RA0KGgo"));
-    let linked = work.path().join("a b.splat4d");
+    let linked = work.path().join("a b.s4d");
     splat4d(&["export", str(&file), "--html", "-o", str(&page), "--link", str(&linked)]).run().ok();
     let html = std::fs::read_to_string(&page).unwrap();
-    assert!(html.contains("./a%20b.splat4d") && !html.contains("id=\"splat4d-scene\">"));
+    assert!(html.contains("./a%20b.s4d") && !html.contains("id=\"splat4d-scene\">"));
     assert!(std::fs::read(&linked).unwrap().starts_with(b"\x89S4D"));
     // A playback file is taken as it is.
-    let again = work.path().join("again.splat4d");
+    let again = work.path().join("again.s4d");
     splat4d(&["export", str(&linked), "--html", "-o", str(&page), "--link", str(&again)]).run().ok();
     assert_eq!(std::fs::read(&linked).unwrap(), std::fs::read(&again).unwrap());
     let elsewhere = tempfile::tempdir().unwrap();
-    let above = elsewhere.path().join("x.splat4d");
+    let above = elsewhere.path().join("x.s4d");
     let refused = splat4d(&["export", str(&file), "--html", "-o", str(&page), "--link", str(&above)]).run().refused();
     assert!(refused.contains("--link"), "{refused}");
 }
@@ -404,7 +409,7 @@ fn serve(args: &[&str]) -> (std::process::Child, impl Iterator<Item = String> + 
 fn a_scene_is_served_until_an_interrupt() {
     let work = tempfile::tempdir().unwrap();
     let (mut child, _lines, url) = serve(&["view", str(&one_gaussian(work.path()))]);
-    assert!(get(&url, "/scene.splat4d").starts_with(b"\x89S4D"));
+    assert!(get(&url, "/scene.s4d").starts_with(b"\x89S4D"));
     let config: Value = serde_json::from_slice(&get(&url, "/config.json")).unwrap();
     assert_eq!((&config["title"], &config["live"]), (&json!("one <b>"), &json!(false)));
     assert!(get(&url, "/").starts_with(b"<!doctype html>"));
@@ -602,7 +607,7 @@ fn an_interrupt_saves_and_says_how_to_continue() {
 #[test]
 fn a_playback_file_is_told_exported_and_refused_when_damaged() {
     let work = tempfile::tempdir().unwrap();
-    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../splat4d/tests/data/tiny.splat4d");
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../splat4d/tests/data/tiny.s4d");
     let told: Value = serde_json::from_str(&splat4d(&["info", "--json", str(&file)]).run().ok()).unwrap();
     assert_eq!((&told["type"], &told["gaussians"]), (&json!("playback"), &json!(2)));
     let moments = told["playback"]["moments"].as_array().unwrap();
@@ -621,10 +626,18 @@ fn a_playback_file_is_told_exported_and_refused_when_damaged() {
     let mut bytes = std::fs::read(&file).unwrap();
     let last = bytes.len() - 1;
     bytes[last] ^= 1;
-    let spoilt = work.path().join("spoilt.splat4d");
+    let spoilt = work.path().join("spoilt.s4d");
     std::fs::write(&spoilt, &bytes).unwrap();
     let told = splat4d(&["info", str(&spoilt)]).run().refused();
-    assert!(told.contains("checksum") && told.contains("spoilt.splat4d"), "{told}");
+    assert!(told.contains("checksum") && told.contains("spoilt.s4d"), "{told}");
+
+    // The extension of versions before 0.1, which another program uses for a format of its own.
+    let old = work.path().join("old.splat4d");
+    std::fs::copy(&file, &old).unwrap();
+    assert!(splat4d(&["info", str(&old)]).run().ok().contains("playback file"));
+    std::fs::write(&old, b"SP4D\x01\0\0\0\x0c\x02\0\0{\"n\":40}").unwrap();
+    let told = splat4d(&["info", str(&old)]).run().refused();
+    assert!(told.contains("splats4D") && told.contains("decode"), "{told}");
 }
 
 #[test]
@@ -633,8 +646,8 @@ fn a_run_is_baked_and_the_file_is_as_good() {
     let capture = Capture::new(work.path()).write();
     let run = work.path().join("run");
     let said = splat4d(&["train", str(&capture), "-o", str(&run), "--no-eval"]).args(&TINY).run().ok();
-    assert!(said.contains("scene.splat4d") && said.contains("against its model"), "{said}");
-    let (out, report) = (work.path().join("out.splat4d"), work.path().join("report.json"));
+    assert!(said.contains("scene.s4d") && said.contains("against its model"), "{said}");
+    let (out, report) = (work.path().join("out.s4d"), work.path().join("report.json"));
     let said =
         splat4d(&["bake", str(&run), "-o", str(&out), "--report", str(&report), "--repeat", "3", "--json"]).run().ok();
     assert!(said.lines().any(|l| l.contains("\"type\":\"baked\"")), "{said}");
@@ -645,7 +658,7 @@ fn a_run_is_baked_and_the_file_is_as_good() {
     let played = splat4d::format::playback::read(&std::fs::read(&out).unwrap()).unwrap();
     assert_eq!(played.len() as u64, told["baking"]["primitives"].as_u64().unwrap());
     for (args, reason) in [
-        (vec!["-o", "x.ply"], "splat4d"),
+        (vec!["-o", "x.ply"], ".s4d"),
         (vec!["-o", str(&out), "--tolerance", "0"], "tolerance"),
         (vec!["-o", str(&out), "--repeat", "0"], "repeat"),
         (vec!["-o", str(&out), "--segment", "nan"], "segments"),

@@ -5,7 +5,7 @@ import numpy as np
 
 import splat4d
 
-scene = splat4d.open(sys.argv[1])  # a run, a .splat4d, .ply, .spz, .splatv, ...
+scene = splat4d.open(sys.argv[1])  # a run, a .s4d, .ply, .spz, .splatv, ...
 first, last = scene.clip
 now = scene.at(0.5 * (first + last))
 print(f"{len(now)} of {len(scene)} Gaussians are alive at {now.time:.2f} s")

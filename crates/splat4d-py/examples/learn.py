@@ -12,5 +12,5 @@ def progress(event):
 run = splat4d.train(sys.argv[1], "learnt", iterations=200, downscale=4, progress=progress)
 print("\nheld-out views:", run.evaluate()["PSNR"], "dB")
 scene = run.scene()
-scene.bake("learnt.splat4d")
+scene.bake("learnt.s4d")
 scene.export("learnt.html")  # player and scene as one page

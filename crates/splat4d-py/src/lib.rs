@@ -55,7 +55,7 @@ mod _native {
         py.detach(|| splat4d_cli::main_from(words))
     }
 
-    /// One verb of the command with its options, quietly: `command("bake", "runs/knight", "-o", "knight.splat4d")`.
+    /// One verb of the command with its options, quietly: `command("bake", "runs/knight", "-o", "knight.s4d")`.
     #[pyfunction]
     #[pyo3(signature = (*words))]
     fn command(py: Python<'_>, words: Vec<PathBuf>) -> PyResult<()> {

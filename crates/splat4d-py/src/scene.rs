@@ -181,7 +181,7 @@ impl Scene {
         })
     }
 
-    /// Writes one seekable file that plays anywhere (.splat4d); `tolerance`: largest error of a Gaussian, pixels.
+    /// Writes one seekable file that plays anywhere (.s4d); `tolerance`: largest error of a Gaussian, pixels.
     #[pyo3(signature = (path, *, tolerance=None))]
     fn bake(&self, py: Python<'_>, path: PathBuf, tolerance: Option<f64>) -> PyResult<()> {
         let mut words = vec!["bake".into(), self.path.clone().into_os_string(), "-o".into(), path.into_os_string()];

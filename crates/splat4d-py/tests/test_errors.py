@@ -24,16 +24,16 @@ class Errors(InFolder):
         with self.assertRaisesRegex(splat4d.Error, "nowhere.ply") as caught:
             splat4d.open("nowhere.ply")
         self.assertEqual(caught.exception.kind, "io")
-        broken = self.folder / "broken.splat4d"
+        broken = self.folder / "broken.s4d"
         broken.write_bytes(PLAYABLE.read_bytes()[:1000])
-        self.refuses("broken.splat4d", splat4d.open, broken)
+        self.refuses("broken.s4d", splat4d.open, broken)
         self.refuses("first bytes", splat4d.open, __file__)
-        gone = self.folder / "gone.splat4d"
+        gone = self.folder / "gone.s4d"
         gone.write_bytes(PLAYABLE.read_bytes())
         scene = splat4d.open(gone)
         gone.unlink()
         self.assertGreater(len(scene.at(0.1)), 0, "it is in memory")
-        with self.assertRaisesRegex(splat4d.Error, "gone.splat4d"):
+        with self.assertRaisesRegex(splat4d.Error, "gone.s4d"):
             scene.export(self.folder / "out.ply")
         with self.assertRaisesRegex(splat4d.Error, "ending") as caught:
             splat4d.open(PLAYABLE).export(self.folder / "out.nothing")
@@ -199,4 +199,4 @@ class Errors(InFolder):
     def test_words_of_the_command(self):
         self.refuses("unrecognized subcommand", splat4d.command, "paint")
         with self.assertRaisesRegex(splat4d.Error, "nowhere"):
-            splat4d.command("bake", "nowhere", "-o", self.folder / "x.splat4d")
+            splat4d.command("bake", "nowhere", "-o", self.folder / "x.s4d")

@@ -39,7 +39,7 @@ class Examples(InFolder):
         self.run_example("turn.py", PLAYABLE, "turn0.ppm", "turn7.ppm")
 
     def test_learn(self):
-        self.assertIn("dB", self.run_example("learn.py", KNIGHT, "learnt.splat4d", "learnt.html"))
+        self.assertIn("dB", self.run_example("learn.py", KNIGHT, "learnt.s4d", "learnt.html"))
 
     def test_own_loss(self):
         self.assertIn("50 steps", self.run_example("own_loss.py", KNIGHT))

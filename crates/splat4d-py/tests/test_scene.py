@@ -99,11 +99,11 @@ class Scenes(InFolder):
     def test_files_are_written_that_open_again(self):
         self.scene.export(self.folder / "again.spz", 0.4)
         self.scene.export(self.folder / "again.html")
-        self.scene.bake(self.folder / "again.splat4d", tolerance=1.0)
+        self.scene.bake(self.folder / "again.s4d", tolerance=1.0)
         for file in self.folder.iterdir():
             self.assertGreater(file.stat().st_size, 10_000)
         self.assertEqual(len(splat4d.open(self.folder / "again.spz")), len(self.scene.at(0.4)))
-        self.assertGreater(len(splat4d.open(self.folder / "again.splat4d")), 1000)
+        self.assertGreater(len(splat4d.open(self.folder / "again.s4d")), 1000)
 
     def test_cameras_come_and_go_unchanged(self):
         _, camera = self.scene.cameras[3]

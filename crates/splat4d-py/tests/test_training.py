@@ -101,7 +101,7 @@ class Training(InFolder):
             self.assertFalse(splat4d.Run(self.folder / name).finished)
 
     def test_pictures_in_memory_become_a_capture_and_a_run_that_resumes(self):
-        scene = splat4d.open(KNIGHT.parent / "knight.splat4d")
+        scene = splat4d.open(KNIGHT.parent / "knight.s4d")
         cameras = [camera.downscaled(8) for _, camera in scene.cameras[:4]]
         times = [0.0, 0.3, 0.6]
         images = [[scene.render(camera, t).clip(0, 1) for t in times] for camera in cameras]

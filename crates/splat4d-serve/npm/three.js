@@ -1,4 +1,4 @@
-// A moving scene of Gaussians as an object of three.js (WebGLRenderer): `scene.add(new Splat4D('knight.splat4d'))`.
+// A moving scene of Gaussians as an object of three.js (WebGLRenderer): `scene.add(new Splat4D('knight.s4d'))`.
 //
 // Gaussians are drawn after opaque meshes, the farthest first, each tested against the depth that meshes left: at its centre,
 // so that a mesh cuts through the scene between Gaussians. They write no depth. Colours are blended as they were learnt, in

@@ -531,7 +531,7 @@ export class Editing {
       if (run !== this.#run) return;
       const { version, stale } = await this.ask({ do: 'bake', steps });
       if (run !== this.#run || stale) return;
-      await this.player.load(new URL(`scene.splat4d?v=${version}`, document.baseURI).href, { keep: true });
+      await this.player.load(new URL(`scene.s4d?v=${version}`, document.baseURI).href, { keep: true });
     } catch (error) {
       if (run === this.#run) this.#refused(error);
     }

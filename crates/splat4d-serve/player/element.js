@@ -1,4 +1,4 @@
-// <splat-4d src="scene.splat4d">: the player as an element. Attributes and events: docs/player.md.
+// <splat-4d src="scene.s4d">: the player as an element. Attributes and events: docs/player.md.
 
 import { CHANNELS, Player } from './player.js';
 import { CSS } from './style.js';

@@ -39,7 +39,7 @@ if (title) {
 }
 if (live) {
   // A run that has just begun has no snapshot; the first one is announced.
-  element.follow({ events: live === true ? './events' : live, src: src ?? './scene.splat4d', metrics, version });
+  element.follow({ events: live === true ? './events' : live, src: src ?? './scene.s4d', metrics, version });
 } else if (src instanceof Blob) element.scene = src;
 else if (src) element.setAttribute('src', src);
 else element.invite();

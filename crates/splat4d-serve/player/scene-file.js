@@ -236,7 +236,7 @@ export class SceneFile {
 
   async #start(head, signal) {
     if (head.length < HEAD || MAGIC.some((b, i) => head[i] !== b)) {
-      this.#refuse('This is no .splat4d file', 'Bake or convert the scene to .splat4d first.');
+      this.#refuse('This is no .s4d file', 'Bake or convert the scene to .s4d first.');
     }
     const view = new DataView(head.buffer, head.byteOffset, head.byteLength);
     if (view.getUint32(60, true) !== crc32(head.subarray(0, 60)))

@@ -278,7 +278,7 @@ export class Interface {
     this.notice.replaceChildren(h('section', { class: 'card notice drop', 'aria-label': 'Open a scene' },
       h('div', { class: 'mark' }),
       h('h2', {}, 'Open a moving scene'),
-      h('p', { class: 'note' }, 'Drop a .splat4d file here. It stays on this computer.'),
+      h('p', { class: 'note' }, 'Drop a .s4d file here. It stays on this computer.'),
       button('Choose a file', () => this.pickFile(), { class: 'main' })));
     this.refresh();
   }
@@ -392,7 +392,7 @@ export class Interface {
     }
   }
 
-  pickFile() { pick('.splat4d', file => this.openFile(file)); }
+  pickFile() { pick('.s4d,.splat4d', file => this.openFile(file)); }
 
   addKey() {
     const p = this.player;

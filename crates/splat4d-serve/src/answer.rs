@@ -20,7 +20,7 @@ use tokio::sync::Semaphore;
 /// Listeners of live news at a time; each keeps a connection for itself.
 const MAX_LISTENERS: usize = 64;
 /// Name of the route of the scene.
-const SCENE: &str = "scene.splat4d";
+const SCENE: &str = "scene.s4d";
 /// On every answer. Another origin can neither embed nor read anything; a type is what it is said to be.
 const HEADERS: [(HeaderName, &str); 5] = [
     (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
@@ -187,7 +187,7 @@ fn scene(shared: &Shared, request: &Parts) -> Response<Body> {
     let common = [
         (header::ETAG, version.etag.as_str()),
         (header::ACCEPT_RANGES, "bytes"),
-        (header::CONTENT_TYPE, "application/octet-stream"),
+        (header::CONTENT_TYPE, splat4d::format::playback::MEDIA_TYPE),
         // The player keeps what it needs; a second copy of a large file in the browser's cache helps nobody.
         (header::CACHE_CONTROL, "no-store"),
     ];

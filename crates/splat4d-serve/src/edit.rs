@@ -39,7 +39,7 @@ const LEAST_TOKEN: usize = 16;
 pub struct EditAnswer {
     /// Told to the page.
     pub told: Value,
-    /// The scene from now on, a `.splat4d`; `told` gets its number as `version`.
+    /// The scene from now on, a `.s4d`; `told` gets its number as `version`.
     pub scene: Option<Arc<[u8]>>,
 }
 

@@ -1,6 +1,6 @@
 //! The local web server of splat4d, and the browser's player that it carries.
 //!
-//! It serves one named thing, a `.splat4d` file or bytes in memory, to a page of its own: fixed routes, no folder, so
+//! It serves one named thing, a `.s4d` file or bytes in memory, to a page of its own: fixed routes, no folder, so
 //! that nothing else can be reached. It binds loopback unless told, and because every page in the user's browser can
 //! reach loopback too, it also checks `Host` (a foreign name that resolves to this machine) and `Origin` (a foreign
 //! page). While a run trains it costs one quiet thread with bounds on everything a client can make it hold.
@@ -9,7 +9,7 @@
 //! |---|---|
 //! | `/` | the page |
 //! | `/player/NAME` (also `/NAME`) | modules, shaders |
-//! | `/scene.splat4d` | the scene, by range; `?v=N` names a live version: another one is 410, never a mixture |
+//! | `/scene.s4d` | the scene, by range; `?v=N` names a live version: another one is 410, never a mixture |
 //! | `/config.json` | what the page shows: `{title, scene, live, …}` of [`Config::about`] |
 //! | `/events` | news of a live run as server-sent events; see [`News`] |
 //! | `/metrics.json` | the same news so far, in one piece |
@@ -18,7 +18,7 @@
 //! ```no_run
 //! # fn main() -> splat4d::Result<()> {
 //! use splat4d_serve::{Config, Content, Server};
-//! let config = Config { content: Content::File("scene.splat4d".into()), ..Config::default() };
+//! let config = Config { content: Content::File("scene.s4d".into()), ..Config::default() };
 //! let running = Server::start(config)?;
 //! assert!(running.url().starts_with("http://127.0.0.1:"));
 //! running.stop();

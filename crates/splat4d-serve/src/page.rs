@@ -28,7 +28,7 @@ pub struct Page<'a> {
 /// Where a page's scene is.
 #[derive(Clone, Debug)]
 pub enum SceneIn<'a> {
-    /// In the page: the bytes of a `.splat4d`.
+    /// In the page: the bytes of a `.s4d`.
     Inside(&'a [u8]),
     /// At an address, relative to the page or whole. Such a page needs a web server: browsers refuse pages from a disk
     /// to read other files.
@@ -268,8 +268,8 @@ mod tests {
 
     #[test]
     fn a_linked_scene_is_an_address_and_nothing_more() {
-        let html = Page { title: "t", scene: SceneIn::Linked("a%20b.splat4d") }.assemble(SAMPLE, &sample()).unwrap();
-        assert!(html.contains("\"scene\":\"a%20b.splat4d\"") && !html.contains("splat4d-scene\">"));
+        let html = Page { title: "t", scene: SceneIn::Linked("a%20b.s4d") }.assemble(SAMPLE, &sample()).unwrap();
+        assert!(html.contains("\"scene\":\"a%20b.s4d\"") && !html.contains("splat4d-scene\">"));
     }
 
     #[test]

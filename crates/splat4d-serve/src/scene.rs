@@ -22,7 +22,7 @@ pub enum Content {
     /// Nothing yet: a live run before its first snapshot, or a page that shows a scene from elsewhere.
     #[default]
     Nothing,
-    /// A `.splat4d` file, read by range and never as a whole. It is opened once: a file that takes its place later is
+    /// A `.s4d` file, read by range and never as a whole. It is opened once: a file that takes its place later is
     /// not mixed into it.
     File(PathBuf),
     /// The bytes of one.
@@ -79,7 +79,7 @@ impl Scene {
                 let file = File::open(&path).map_err(fail)?;
                 let meta = file.metadata().map_err(fail)?;
                 if !meta.is_file() {
-                    return Err(Error::input("is not a file").at(path.display()).remedy("Name a .splat4d file."));
+                    return Err(Error::input("is not a file").at(path.display()).remedy("Name a .s4d file."));
                 }
                 let etag = file_etag(&meta);
                 scene.push(Source::File(Arc::new(file)), meta.len(), etag);
@@ -217,7 +217,7 @@ mod tests {
     #[test]
     fn what_is_no_file_is_named() {
         let folder = tempfile::tempdir().unwrap();
-        for path in [folder.path().to_owned(), folder.path().join("none.splat4d")] {
+        for path in [folder.path().to_owned(), folder.path().join("none.s4d")] {
             let error = Scene::new(Content::File(path.clone())).unwrap_err().to_string();
             assert!(error.contains(&path.display().to_string()), "{error}");
         }

@@ -266,9 +266,7 @@ fn origin(url: &str) -> Result<String> {
     if ["http", "https"].contains(&scheme) && !authority.is_empty() && plain && clean {
         return Ok(format!("{scheme}://{authority}"));
     }
-    Err(Error::input("is no address of a web server")
-        .at(url)
-        .remedy("Write for instance https://example.org/a.splat4d."))
+    Err(Error::input("is no address of a web server").at(url).remedy("Write for instance https://example.org/a.s4d."))
 }
 
 async fn accept(listener: TcpListener, shared: Arc<Shared>, mut stopped: watch::Receiver<bool>) {
@@ -331,7 +329,7 @@ mod tests {
 
     #[test]
     fn origins_are_plain() {
-        assert_eq!(origin("https://example.org/a/b.splat4d?x=1").unwrap(), "https://example.org");
+        assert_eq!(origin("https://example.org/a/b.s4d?x=1").unwrap(), "https://example.org");
         assert_eq!(origin("http://[::1]:81").unwrap(), "http://[::1]:81");
         for bad in ["", "ftp://a/b", "https://", "//a", "https://a;script-src *", "https://a b/", "https://u@a/", "x"] {
             assert!(origin(bad).is_err(), "{bad}");

@@ -78,10 +78,11 @@ fn bytes(length: usize) -> Vec<u8> {
 fn ranges_of_files_and_of_memory_are_the_same() {
     let all = bytes(300_000);
     let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("a.splat4d");
+    let path = folder.path().join("a.s4d");
     std::fs::write(&path, &all).unwrap();
     for server in [of_bytes(&all), start(Config { content: Content::File(path), ..Config::default() })] {
-        let whole = get(&server, "/scene.splat4d");
+        let whole = get(&server, "/scene.s4d");
+        assert_eq!(whole.header("content-type"), Some("application/vnd.s4d"));
         assert_eq!((whole.status, whole.header("accept-ranges")), (200, Some("bytes")));
         assert!(whole.body == all);
         for (range, part) in [
@@ -92,7 +93,7 @@ fn ranges_of_files_and_of_memory_are_the_same() {
             ("bytes=299990-", 299_990..300_000),
             ("bytes=-5", 299_995..300_000),
         ] {
-            let reply = ask(&server, "GET", "/scene.splat4d", &[("range", range)]);
+            let reply = ask(&server, "GET", "/scene.s4d", &[("range", range)]);
             assert_eq!(reply.status, 206, "{range}");
             assert!(reply.body == all[part.clone()], "{range}");
             let told = format!("bytes {}-{}/300000", part.start, part.end - 1);
@@ -100,11 +101,11 @@ fn ranges_of_files_and_of_memory_are_the_same() {
             assert_eq!(reply.header("content-length"), Some(part.len().to_string().as_str()));
         }
         for range in ["bytes=300000-", "bytes=-0"] {
-            let reply = ask(&server, "GET", "/scene.splat4d", &[("range", range)]);
+            let reply = ask(&server, "GET", "/scene.s4d", &[("range", range)]);
             assert_eq!((reply.status, reply.header("content-range")), (416, Some("bytes */300000")), "{range}");
         }
         for range in ["bytes=0-1,5-6", "bytes=6-5", "bytes=x-", "cats=1-2"] {
-            let reply = ask(&server, "GET", "/scene.splat4d", &[("range", range)]);
+            let reply = ask(&server, "GET", "/scene.s4d", &[("range", range)]);
             assert!(reply.status == 200 && reply.body == all, "{range}");
         }
         server.stop();
@@ -114,12 +115,12 @@ fn ranges_of_files_and_of_memory_are_the_same() {
 #[test]
 fn head_and_tags() {
     let server = of_bytes(&bytes(1000));
-    let head = ask(&server, "HEAD", "/scene.splat4d", &[("range", "bytes=0-9")]);
+    let head = ask(&server, "HEAD", "/scene.s4d", &[("range", "bytes=0-9")]);
     assert_eq!((head.status, head.header("content-length"), head.body.len()), (200, Some("1000"), 0));
     let tag = head.header("etag").unwrap().to_owned();
     let ranged = |headers: &[(&str, &str)]| {
         let all: Vec<(&str, &str)> = headers.iter().copied().chain([("range", "bytes=0-9")]).collect();
-        ask(&server, "GET", "/scene.splat4d", &all).status
+        ask(&server, "GET", "/scene.s4d", &all).status
     };
     assert_eq!(ranged(&[("if-range", &tag)]), 206);
     assert_eq!(ranged(&[("if-range", "\"another\"")]), 200);
@@ -140,10 +141,10 @@ fn head_and_tags() {
 #[test]
 fn an_empty_scene_and_none() {
     let empty = of_bytes(&[]);
-    assert_eq!(get(&empty, "/scene.splat4d").status, 200);
-    assert_eq!(ask(&empty, "GET", "/scene.splat4d", &[("range", "bytes=0-")]).status, 416);
+    assert_eq!(get(&empty, "/scene.s4d").status, 200);
+    assert_eq!(ask(&empty, "GET", "/scene.s4d", &[("range", "bytes=0-")]).status, 416);
     let none = start(Config { live: true, ..Config::default() });
-    assert_eq!(get(&none, "/scene.splat4d").status, 404);
+    assert_eq!(get(&none, "/scene.s4d").status, 404);
     let config: Value = serde_json::from_slice(&get(&none, "/config.json").body).unwrap();
     assert_eq!(config, json!({"live": true, "scene": null, "version": null}));
 }
@@ -183,7 +184,7 @@ fn a_folder_of_the_player_is_read_at_every_request_and_nothing_beside_it() {
 #[test]
 fn every_answer_keeps_other_origins_out() {
     let server = of_bytes(b"x");
-    for reply in [get(&server, "/"), get(&server, "/scene.splat4d"), get(&server, "/none"), {
+    for reply in [get(&server, "/"), get(&server, "/scene.s4d"), get(&server, "/none"), {
         ask(&server, "GET", "/", &[("host", "evil.example")])
     }] {
         assert_eq!(reply.header("x-content-type-options"), Some("nosniff"));
@@ -203,27 +204,27 @@ fn foreign_hosts_and_origins_get_nothing() {
         &[("origin", "null")],
         &[("sec-fetch-site", "cross-site"), ("sec-fetch-mode", "no-cors")],
     ] {
-        for target in ["/", "/scene.splat4d", "/events", "/config.json"] {
+        for target in ["/", "/scene.s4d", "/events", "/config.json"] {
             let reply = ask(&server, "GET", target, headers);
             assert_eq!(reply.status, 403, "{headers:?}");
             assert!(!reply.body.windows(6).any(|w| w == b"secret"));
         }
     }
     for method in ["POST", "PUT", "DELETE", "OPTIONS", "PATCH", "BREW"] {
-        let reply = ask(&server, method, "/scene.splat4d", &[]);
+        let reply = ask(&server, method, "/scene.s4d", &[]);
         assert_eq!((reply.status, reply.header("allow")), (405, Some("GET, HEAD")), "{method}");
     }
 }
 
 #[test]
 fn a_scene_elsewhere_is_named_and_its_origin_allowed() {
-    let foreign = Some("https://example.org/a.splat4d?x=1".to_owned());
+    let foreign = Some("https://example.org/a.s4d?x=1".to_owned());
     let server = start(Config { foreign, about: json!({"title": "far"}), ..Config::default() });
     let page = get(&server, "/");
     let policy = page.header("content-security-policy").unwrap();
     assert!(policy.contains("connect-src 'self' blob: data: https://example.org;"), "{policy}");
     let config: Value = serde_json::from_slice(&get(&server, "/config.json").body).unwrap();
-    assert_eq!((&config["scene"], &config["title"]), (&json!("https://example.org/a.splat4d?x=1"), &json!("far")));
+    assert_eq!((&config["scene"], &config["title"]), (&json!("https://example.org/a.s4d?x=1"), &json!("far")));
     let bad = Config { foreign: Some("https://a;script-src".into()), ..Config::default() };
     assert!(Server::start(bad).is_err());
 }
@@ -242,14 +243,14 @@ fn paths_lead_nowhere_else() {
         "/player/",
         "/player/player/index.html",
         "//etc/passwd",
-        "/scene.splat4d/",
-        "/SCENE.splat4d",
-        "/scene.splat4d%00",
+        "/scene.s4d/",
+        "/SCENE.s4d",
+        "/scene.s4d%00",
         "/Cargo.toml",
         "/.git/config",
-        "/scene.splat4d?v=-1",
-        "/scene.splat4d?v=99999999999999999999999",
-        "/scene.splat4d?v=2",
+        "/scene.s4d?v=-1",
+        "/scene.s4d?v=99999999999999999999999",
+        "/scene.s4d?v=2",
     ] {
         assert_eq!(get(&server, target).status, 404, "{target}");
     }
@@ -302,7 +303,7 @@ fn broken_requests() -> Vec<Vec<u8>> {
     // Many requests at once, on one connection.
     all.push(b"GET /none HTTP/1.1\r\nhost: localhost\r\n\r\n".repeat(200));
     // Each of these also in every shortened form.
-    let base = b"GET /scene.splat4d HTTP/1.1\r\nhost: localhost\r\nrange: bytes=0-1\r\n\r\n".to_vec();
+    let base = b"GET /scene.s4d HTTP/1.1\r\nhost: localhost\r\nrange: bytes=0-1\r\n\r\n".to_vec();
     all.extend((0..base.len()).step_by(7).map(|n| base[..n].to_vec()));
     all.extend((0..base.len()).step_by(5).map(|n| {
         let mut mutant = base.clone();
@@ -321,7 +322,7 @@ fn broken_requests_break_nothing() {
         if !reply.is_empty() {
             assert!(reply.starts_with(b"HTTP/1."), "{shown:?} got {:?}", String::from_utf8_lossy(&reply));
         }
-        assert_eq!(get(&server, "/scene.splat4d").body, b"scene", "after {shown:?}");
+        assert_eq!(get(&server, "/scene.s4d").body, b"scene", "after {shown:?}");
     }
     let bomb = [b"GET / HTTP/1.1\r\nhost: localhost\r\n".to_vec(), b"x: y\r\n".repeat(1000), b"\r\n".to_vec()].concat();
     let reply = raw(&server, &bomb, false);
@@ -370,9 +371,9 @@ fn news_reach_those_who_come_early_late_and_again() {
     assert_eq!(late.len(), 7);
     let all: Value = serde_json::from_slice(&get(&server, "/metrics.json").body).unwrap();
     assert_eq!(all["news"].as_array().unwrap().len(), 7);
-    assert_eq!(get(&server, "/scene.splat4d").body, [3; 30]);
-    assert_eq!(get(&server, "/scene.splat4d?v=2").body, [2; 20], "a page that is reading it may finish");
-    assert_eq!(get(&server, "/scene.splat4d?v=1").status, 410);
+    assert_eq!(get(&server, "/scene.s4d").body, [3; 30]);
+    assert_eq!(get(&server, "/scene.s4d?v=2").body, [2; 20], "a page that is reading it may finish");
+    assert_eq!(get(&server, "/scene.s4d?v=1").status, 410);
     server.stop();
 }
 
@@ -402,7 +403,7 @@ fn a_thousand_connections_do_not_slow_the_publisher() {
         b"",
         b"GET / HTTP/1.1\r\nhost: loc",
         b"GET /events HTTP/1.1\r\nhost: localhost\r\n\r\n",
-        b"GET /scene.splat4d HTTP/1.1\r\nhost: localhost\r\n\r\n",
+        b"GET /scene.s4d HTTP/1.1\r\nhost: localhost\r\n\r\n",
     ];
     let mut held = Vec::new();
     for i in 0..CONNECTIONS {
@@ -457,7 +458,7 @@ fn a_live_scene_is_replaced_whole() {
             }
         });
         for _ in 0..50 {
-            let body = get(&server, "/scene.splat4d").body;
+            let body = get(&server, "/scene.s4d").body;
             assert!(body.len() == 500_000 && body.iter().all(|b| *b == body[0]), "two versions were mixed");
         }
         stop.store(true, Ordering::Relaxed);
@@ -526,7 +527,7 @@ fn a_page_with_the_token_edits() {
     };
     assert_eq!(told(r#"{"do": "x"}"#), (200, json!({"heard": {"do": "x"}})));
     assert_eq!(told(r#"{"do": "bake"}"#).1["version"], 2, "the scene that pages see is the new one");
-    assert_eq!(get(&server, "/scene.splat4d?v=2").body, [7; 10]);
+    assert_eq!(get(&server, "/scene.s4d?v=2").body, [7; 10]);
     let (status, error) = told(r#"{"do": "fail"}"#);
     assert_eq!((status, error["error"].as_str()), (422, Some("there is nothing to do. Give a step")));
     assert_eq!(told(r#"{"do": "panic"}"#).0, 500);
@@ -575,7 +576,7 @@ fn nobody_else_edits() {
     }
     refused(400, "/edit", &[("content-length", "400")], good);
     for target in
-        ["/edit/", "//edit", "/Edit", "/%65dit", "/./edit", "/edit/../edit", "/player/edit", "/scene.splat4d", "/"]
+        ["/edit/", "//edit", "/Edit", "/%65dit", "/./edit", "/edit/../edit", "/player/edit", "/scene.s4d", "/"]
     {
         refused(405, target, &[], good);
     }
@@ -586,7 +587,7 @@ fn nobody_else_edits() {
         assert_eq!(ask(&server, method, "/edit", &headers).status, 405, "{method}");
     }
     assert_eq!(get(&server, "/edit").status, 404);
-    assert_eq!(get(&server, "/scene.splat4d").body, bytes(1000), "the scene is what it was");
+    assert_eq!(get(&server, "/scene.s4d").body, bytes(1000), "the scene is what it was");
 }
 
 #[test]

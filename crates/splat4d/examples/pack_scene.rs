@@ -1,6 +1,6 @@
 //! Packs a scene into a playback file, and says how small it became and what that cost.
 //!
-//! `cargo run --release -p splat4d --example pack_scene [FILE [OUT.splat4d [CAMERAS.json]]]`: FILE is a scene.safetensors whose
+//! `cargo run --release -p splat4d --example pack_scene [FILE [OUT.s4d [CAMERAS.json]]]`: FILE is a scene.safetensors whose
 //! layers move on straight lines, or a 3DGS .ply. Without one it packs 120,000 made-up moving Gaussians with spherical
 //! harmonics of degree 3. Nothing is pruned: the figures are those of the format alone.
 

@@ -6,7 +6,7 @@
 //! use splat4d::prelude::*;
 //!
 //! # fn main() -> Result<()> {
-//! let bytes = std::fs::read("../../examples/knight.splat4d").expect("the file is there");
+//! let bytes = std::fs::read("../../examples/knight.s4d").expect("the file is there");
 //! let scene = splat4d::open(&bytes)?; // also .ply, .spz, .splatv, SOG and scene.safetensors
 //! let pose = Se3::look_at([3.0, 3.0, 1.5], [0.0, 0.0, 0.8], scene.up);
 //! let camera = Camera::with_fov_y(pose, 0.8, 160, 120);

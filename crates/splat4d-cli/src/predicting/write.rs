@@ -3,14 +3,14 @@
 use super::{Forecast, Told, Work};
 use crate::baking::{Baking, bake_into};
 use crate::console::Console;
-use crate::files;
 use crate::source::Source;
+use crate::{files, playable};
 use splat4d::format::safetensors::{self, Tensor};
 use splat4d_dynamics::paths::Moment;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// `predict.json`, `dynamics.safetensors`, `scene.safetensors` and `scene.splat4d`.
+/// `predict.json`, `dynamics.safetensors`, `scene.safetensors` and `scene.s4d`.
 pub(super) fn all(
     work: &Work,
     folder: &Path,
@@ -29,7 +29,7 @@ pub(super) fn all(
     let title = format!("{}, predicted by {}", work.run.name(), best.model.name());
     // Nodes are straight between frames; a file nearer to the model than the default tolerance serves no prediction.
     let baking = Baking { like: None, ..Baking::default() };
-    bake_into(&source, &title, &folder.join("scene.splat4d"), &baking, console)?;
+    bake_into(&source, &title, &folder.join(playable::FILE), &baking, console)?;
     Ok(())
 }
 

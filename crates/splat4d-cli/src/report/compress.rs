@@ -5,6 +5,7 @@ use super::chart::{Series, bars, escape, lines, short};
 use super::{panels, pictures};
 use crate::files::{grouped, human_bytes, human_seconds};
 use crate::measure::Side;
+use crate::playable;
 use crate::run_folder::{COMPRESS as FILE, Run};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -104,7 +105,7 @@ pub(super) fn section(out: &mut String, run: &Run) {
         out,
         "Where the bytes are, and how it was done",
         [
-            ("Bytes of scene.splat4d", parts(&run.path.join("scene.splat4d"))),
+            ("Bytes of scene.s4d", parts(&playable::of_run(&run.path))),
             ("Stages", stages(&told.stages)),
             ("PSNR over size, as tried, dB", tried(&told.tried)),
         ],

@@ -116,7 +116,7 @@ fn cards(out: &mut String, run: &Run) {
         let text = human_bytes(bytes as u64);
         let (value, unit) = text.split_once(' ').unwrap_or((&text, ""));
         let like = run.number("playback_psnr").map(|p| format!(", {p:.1} dB against the model")).unwrap_or_default();
-        card("", value.into(), unit, &format!("playback file scene.splat4d{like}"));
+        card("", value.into(), unit, &format!("playback file scene.s4d{like}"));
     }
     out.push_str("</div>\n");
     if run.results.is_some() && !["LPIPS", "LPIPS-vgg", "LPIPS-alex"].iter().any(|k| run.score(k).is_some()) {

@@ -2,8 +2,8 @@
 
 use crate::baking::{Baking, LIKE, bake_into, title};
 use crate::console::Console;
-use crate::files;
 use crate::source::{Source, not_empty};
+use crate::{files, playable};
 use splat4d::Error;
 use splat4d::bake::{MAX_REPEAT, Options, SEGMENT, TOLERANCE};
 use splat4d::format::playback::{MAX_PALETTE, WriteConfig};
@@ -11,11 +11,11 @@ use std::path::PathBuf;
 
 const EXAMPLES: &str = "\
 Examples:
-  splat4d bake runs/knight -o knight.splat4d       everything in one small file that plays anywhere
-  splat4d bake runs/knight -o tight.splat4d --tolerance 0.1
-  splat4d bake runs/knight -o long.splat4d --repeat 20    the take twenty times over, to try long takes
+  splat4d bake runs/knight -o knight.s4d           everything in one small file that plays anywhere
+  splat4d bake runs/knight -o tight.s4d --tolerance 0.1
+  splat4d bake runs/knight -o long.s4d --repeat 20        the take twenty times over, to try long takes
 
-`train` does this at its end: the file is RUN/scene.splat4d.";
+`train` does this at its end: the file is RUN/scene.s4d.";
 
 /// Bake a scene into one seekable file for players
 #[derive(Debug, clap::Args)]
@@ -25,7 +25,7 @@ pub(crate) struct Args {
     #[arg(value_name = "RUN|FILE")]
     source: PathBuf,
     /// The file to write
-    #[arg(short, long, value_name = "OUT.splat4d")]
+    #[arg(short, long, value_name = "OUT.s4d")]
     output: PathBuf,
     /// Largest error of a Gaussian, pixels of the capture's cameras; smaller ones cost more pieces [default: 0.25, or
     /// what it takes for 40 dB against the model]
@@ -50,11 +50,8 @@ pub(crate) struct Args {
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let out = &args.output;
-    if out.extension().is_none_or(|e| !e.eq_ignore_ascii_case("splat4d")) && !out.starts_with("/dev") {
-        return Err(Error::input("the name does not end in .splat4d")
-            .at(out.display())
-            .remedy("Use -o NAME.splat4d.")
-            .into());
+    if !playable::is_named(out) && !out.starts_with("/dev") {
+        return Err(Error::input("the name does not end in .s4d").at(out.display()).remedy("Use -o NAME.s4d.").into());
     }
     if !(1..=MAX_REPEAT).contains(&args.repeat) || !(1..=MAX_PALETTE).contains(&args.palette) {
         return Err(Error::input("--repeat or --palette is out of range")

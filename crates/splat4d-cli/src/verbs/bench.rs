@@ -76,7 +76,7 @@ pub(crate) struct Args {
     /// Folder with the SOG files of scene S
     #[arg(long, value_name = "FOLDER")]
     playbot: Option<PathBuf>,
-    /// The scene of T and U: a run, or a file that brings its cameras along [default: examples/knight.splat4d]
+    /// The scene of T and U: a run, or a file that brings its cameras along [default: examples/knight.s4d]
     #[arg(long, value_name = "FILE")]
     file: Option<PathBuf>,
     /// Instructions to use; may be given more than once [default: the best of this machine]
@@ -91,7 +91,7 @@ pub(crate) struct Args {
     /// Folder for pictures of the growth
     #[arg(long, value_name = "FOLDER", requires = "growth")]
     plots: Option<PathBuf>,
-    /// Measure instead how these runs, scenes or .splat4d files play, in turns
+    /// Measure instead how these runs, scenes or .s4d files play, in turns
     #[arg(long, value_name = "FILE|RUN", num_args = 1.., conflicts_with_all = ["scenes", "growth", "simd", "rounds",
         "against"])]
     playback: Vec<PathBuf>,

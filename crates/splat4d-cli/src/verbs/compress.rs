@@ -18,7 +18,7 @@ Examples:
   splat4d compress runs/knight --set rounds=3 --set temporal=width
   splat4d compress --resume runs/knight-compressed continue exactly where it stopped
 
-The result is a run: DIR/scene.splat4d plays anywhere, DIR/report.html compares before and after, and view, render,
+The result is a run: DIR/scene.s4d plays anywhere, DIR/report.html compares before and after, and view, render,
 eval, export and info take DIR like any other run. The original is not touched.";
 
 /// Default of `--guard`, dB: less is not seen in a moving picture.

@@ -7,7 +7,7 @@ use crate::sequence::{self, Pattern};
 use crate::source::{Source, not_empty};
 use serde_json::json;
 use splat4d::format::dialect::{self, WriteOptions};
-use splat4d::format::{self, DIALECTS, Dialect, Warnings, spz};
+use splat4d::format::{self, DIALECTS, Dialect, Warnings, playback, spz};
 use splat4d::layers::{self, Scene, rotation_between};
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
@@ -36,7 +36,7 @@ Examples:
 fn after_help() -> String {
     let read = DIALECTS.iter().filter(|d| !d.is_written()).map(|d| format!("{} ({})", d.name, d.ending));
     format!(
-        "{EXAMPLES}\n\nWritten: .splat4d {} .safetensors.\nRead as well: {}, folders of SOG. docs/formats.md tells what each \
+        "{EXAMPLES}\n\nWritten: .s4d {} .safetensors.\nRead as well: {}, folders of SOG. docs/formats.md tells what each \
          can hold and which axes it assumes.",
         written(|_| true).join(" "),
         read.collect::<Vec<_>>().join(", ")
@@ -127,7 +127,7 @@ enum Target {
     Dialect(Dialect),
     /// scene.safetensors: everything, exactly.
     Scene,
-    /// .splat4d, baked as `bake` does without options.
+    /// .s4d, baked as `bake` does without options.
     Playback,
 }
 
@@ -140,7 +140,7 @@ impl Target {
         }
         let (what, remedy) = match name.rsplit_once('.').map(|n| n.1) {
             Some("safetensors") => return Ok(Self::Scene),
-            Some("splat4d") => return Ok(Self::Playback),
+            Some(playback::EXTENSION | playback::OLD_EXTENSION) => return Ok(Self::Playback),
             Some("ksplat" | "glb" | "4dgs") => ("this format is not written", "Write .ply or .spz.".into()),
             _ => ("has no ending that names a format", format!("Use {}.", written(|_| true).join(" "))),
         };
@@ -408,6 +408,7 @@ mod tests {
         assert_eq!(of("x/a.splatv").unwrap(), Target::Dialect(splatv::DIALECT));
         assert_eq!(of("a.splat").unwrap(), Target::Dialect(splat::DIALECT));
         assert_eq!(of("scene.safetensors").unwrap(), Target::Scene);
+        assert_eq!([of("a.s4d").unwrap(), of("a.SPLAT4D").unwrap()], [Target::Playback; 2]);
         for (name, word) in [("a.sog", "not written"), ("a.glb", ".ply"), ("a", "ending")] {
             assert!(of(name).unwrap_err().to_string().contains(word), "{name}");
         }

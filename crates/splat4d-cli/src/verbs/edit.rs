@@ -18,11 +18,11 @@ const EXAMPLES: &str = "\
 Examples:
   splat4d edit runs/take edits.toml -o clean.safetensors     replay a list of edits
   splat4d edit runs/take --count 'box(-1,-1,0, 1,1,2)'       how many would it be, and when? Nothing is done
-  splat4d edit runs/take --delete 'sphere(0,0,3, 0.5)' -o take.splat4d
-  splat4d edit runs/take --crop 'box(-2,-2,0, 2,2,2)' --save edits.toml -o take.splat4d
+  splat4d edit runs/take --delete 'sphere(0,0,3, 0.5)' -o take.s4d
+  splat4d edit runs/take --crop 'box(-2,-2,0, 2,2,2)' --save edits.toml -o take.s4d
   splat4d edit runs/take --floaters 0.5 -o clean.safetensors     what no view supports; tells PSNR before and after
-  splat4d edit runs/take --subject -o subject.splat4d            by the capture's masks; --background for the rest
-  splat4d edit take.splat4d --layer 'page 3' -o part.ply         one layer alone
+  splat4d edit runs/take --subject -o subject.s4d                by the capture's masks; --background for the rest
+  splat4d edit take.s4d --layer 'page 3' -o part.ply             one layer alone
 
 A list may also recolour, move by key frames, retime, merge scenes and drag: docs/edit.md. Steps run in order, those of options
 behind those of the file. OUT is known by its ending, as `convert` has it, and only replaced when all went well.";
@@ -61,10 +61,10 @@ pub(crate) struct Args {
     /// Delete what few views support and held-out ones do not miss: from 0, nothing, to 1
     #[arg(long, value_name = "STRENGTH")]
     floaters: Option<f64>,
-    /// Your own words, kept in a .splat4d: whom it shows, who may use it
+    /// Your own words, kept in a .s4d: whom it shows, who may use it
     #[arg(long, value_name = "TEXT")]
     note: Option<String>,
-    /// Write no provenance into a .splat4d
+    /// Write no provenance into a .s4d
     #[arg(long, conflicts_with = "note")]
     no_provenance: bool,
     /// Write the list with the steps of these options as well

@@ -23,7 +23,7 @@ Examples:
   splat4d export runs/knight --sequence frames/            frames/frame_00000.ply ...; SuperSplat plays them
   splat4d export runs/knight --sequence frames/ --fps 10 --from 0.2 --to 0.8
   splat4d export runs/knight --html -o knight.html         player and scene in one page: send it, host it, open it
-  splat4d export runs/knight --html -o index.html --link knight.splat4d     for a web server: seeks, starts at once
+  splat4d export runs/knight --html -o index.html --link knight.s4d         for a web server: seeks, starts at once
   splat4d export runs/knight --tracks tracks.csv           where every Gaussian is at every frame; .json too
   splat4d export runs/knight --tracks tracks.json --every 50
   splat4d export runs/knight --tracks hand.csv --near 0.3,1.2,-0.5 --count 20
@@ -120,9 +120,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     if args.html {
         if args.label.is_some() {
             return Err(Error::input("a page shows the whole file")
-                .remedy(
-                    "Make a file of what has the label first: splat4d edit RUN --crop 'label(NAME)' -o part.splat4d.",
-                )
+                .remedy("Make a file of what has the label first: splat4d edit RUN --crop 'label(NAME)' -o part.s4d.")
                 .into());
         }
         return page(path, args, console);
@@ -321,9 +319,9 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         std::fs::create_dir(folder.path().join("a b")).unwrap();
         let at = |name: &str| folder.path().join(name);
-        assert_eq!(address(&at("x.splat4d"), &at("page.html")).unwrap(), "./x.splat4d");
-        assert_eq!(address(&at("a b/ü#?.splat4d"), &at("page.html")).unwrap(), "./a%20b/%C3%BC%23%3F.splat4d");
-        assert!(address(&at("x.splat4d"), &at("a b/page.html")).is_err(), "browsers would ask above the page");
-        assert!(address(&at("none/x.splat4d"), &at("page.html")).is_err());
+        assert_eq!(address(&at("x.s4d"), &at("page.html")).unwrap(), "./x.s4d");
+        assert_eq!(address(&at("a b/ü#?.s4d"), &at("page.html")).unwrap(), "./a%20b/%C3%BC%23%3F.s4d");
+        assert!(address(&at("x.s4d"), &at("a b/page.html")).is_err(), "browsers would ask above the page");
+        assert!(address(&at("none/x.s4d"), &at("page.html")).is_err());
     }
 }

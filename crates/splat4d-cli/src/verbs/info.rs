@@ -7,7 +7,7 @@ use crate::chunked;
 use crate::console::Console;
 use crate::files::{grouped, human_bytes, human_seconds};
 use crate::run_folder::Run;
-use crate::source::{Source, cloud};
+use crate::source::{SOG_LEVELS, Source, cloud};
 use serde_json::{Value, json};
 use splat4d::Error;
 use splat4d::format::sog;
@@ -52,7 +52,7 @@ Examples:
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
-    /// A capture folder, a run, a scene.safetensors, a checkpoint, a .splat4d or a 3DGS .ply
+    /// A capture folder, a run, a scene.safetensors, a checkpoint, a .s4d or a 3DGS .ply
     #[arg(value_name = "ANY")]
     path: PathBuf,
     /// Read a capture with pictures reduced by k
@@ -89,7 +89,8 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             .into());
     }
     let marker = path.extension().is_some_and(|e| e == "json" || e == "npy");
-    let sog = path.join(sog::META).is_file() || path.file_name().is_some_and(|name| name == sog::META);
+    let sog =
+        path.join(sog::META).is_file() || path.file_name().is_some_and(|name| name == sog::META || name == SOG_LEVELS);
     let is_capture = !Run::is(path) && !sog && (path.is_dir() || marker);
     if args.doctor && !is_capture {
         return Err(Error::input("the doctor looks at captures, and this is none")

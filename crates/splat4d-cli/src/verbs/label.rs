@@ -9,7 +9,7 @@ Examples:
   splat4d label runs/take                      from what its capture.json names (docs/labels.md)
   splat4d label runs/take --from segmented/    from another capture's masks, of the same cameras
   splat4d render runs/take --channel label -o labels.mp4
-  splat4d edit runs/take --delete 'not label(hand)' -o hand.splat4d
+  splat4d edit runs/take --delete 'not label(hand)' -o hand.s4d
 
 `train` does it at its end where the capture has labels or features. Shapes, places and colours stay as they are.";
 

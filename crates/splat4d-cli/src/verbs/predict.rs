@@ -22,7 +22,7 @@ Examples:
 
 Models, each a baseline for the next: freeze, velocity, acceleration, extrapolate (what the motion model itself says of later
 times), koopman (swings that fade), causal (state space), graph (messages along edges). RUN/predict holds report.html,
-predict.json, dynamics.safetensors and the predicted scene as scene.splat4d and scene.safetensors, which view, render, bake and
+predict.json, dynamics.safetensors and the predicted scene as scene.s4d and scene.safetensors, which view, render, bake and
 export take. With several models the scene is that of the one whose forecasts from three moments of the observed part were best.";
 
 /// Default of `--nodes`.

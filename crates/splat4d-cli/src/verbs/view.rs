@@ -15,8 +15,8 @@ use std::path::{Path, PathBuf};
 const EXAMPLES: &str = "\
 Examples:
   splat4d view runs/knight              play a run; works while it trains, too (its newest checkpoint)
-  splat4d view scene.splat4d            or a playback file, a scene.safetensors, a 3DGS .ply
-  splat4d view https://example.org/a.splat4d
+  splat4d view scene.s4d                or a playback file, a scene.safetensors, a 3DGS .ply
+  splat4d view https://example.org/a.s4d
   splat4d view runs/knight --edit edits.toml    select, clean, recolour, move, bend; saved as a list (docs/edit.md)
   splat4d view runs/knight --no-open --port 8080
 

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 /// The trained scene that comes with the repository.
 fn knight() -> String {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/knight.splat4d");
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/knight.s4d");
     path.to_str().unwrap().to_owned()
 }
 
@@ -92,7 +92,7 @@ fn what_cannot_be_measured_is_refused_at_once() {
     };
     let broken = file("broken.json", b"[{\"scene\": \"T\"");
     let other = file("other.json", b"{\"type\": \"results\"}");
-    let scene = file("scene.splat4d", b"SPL4D but no more");
+    let scene = file("scene.s4d", b"SPL4D but no more");
     let folder = work.path().join("empty");
     std::fs::create_dir(&folder).unwrap();
     let text = |path: &Path| path.to_str().unwrap().to_owned();
@@ -108,7 +108,7 @@ fn what_cannot_be_measured_is_refused_at_once() {
         (vec!["--against", &nothing(work.path())], "cannot be read"),
         (vec!["--against", &text(&broken)], "bench --save"),
         (vec!["--against", &text(&other)], "bench --save"),
-        (vec!["--scene", "T", "--file", &text(&scene)], "scene.splat4d"),
+        (vec!["--scene", "T", "--file", &text(&scene)], "scene.s4d"),
         (vec!["--scene", "S", "--playbot", &text(&folder)], "empty"),
     ] {
         let told = splat4d(&["bench"]).args(&args).run().refused();

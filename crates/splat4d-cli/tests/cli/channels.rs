@@ -88,8 +88,8 @@ fn what_has_a_label_goes_out_alone() {
     splat4d(&["export", str(&file), "--tracks", str(&at("t.csv")), "--label", "bird"]).run().ok();
     let rows = std::fs::read_to_string(at("t.csv")).unwrap();
     assert!(rows.lines().skip(1).all(|l| l.split(',').nth(1).unwrap().parse::<u32>().unwrap() < 20));
-    splat4d(&["edit", str(&file), "--crop", "label(bird)", "-o", str(&at("bird.splat4d"))]).run().ok();
-    let baked = splat4d::open(&std::fs::read(at("bird.splat4d")).unwrap()).unwrap();
+    splat4d(&["edit", str(&file), "--crop", "label(bird)", "-o", str(&at("bird.s4d"))]).run().ok();
+    let baked = splat4d::open(&std::fs::read(at("bird.s4d")).unwrap()).unwrap();
     let of: Vec<Option<usize>> = baked.layers.iter().flat_map(|l| labels::of(&l.params)).collect();
     assert!(baked.labels == ["air", "bird"] && !of.is_empty() && of.iter().all(|l| *l == Some(1)), "{of:?}");
     let refused = |words: &[&str]| splat4d(words).run().refused();
@@ -122,7 +122,7 @@ fn masks_teach_a_run_its_labels_and_points_are_followed() {
     let scene = scene::read(&std::fs::read(run.join("scene.safetensors")).unwrap()).unwrap();
     assert_eq!(scene.labels, ["left", "right"]);
     assert!(json_of(&run.join("run.json"))["labels"]["accuracy"].as_f64().unwrap() > 0.5);
-    let playback = splat4d::open(&std::fs::read(run.join("scene.splat4d")).unwrap()).unwrap();
+    let playback = splat4d::open(&std::fs::read(run.join("scene.s4d")).unwrap()).unwrap();
     assert_eq!(playback.labels, scene.labels);
     splat4d(&["label", str(&run), "--rounds", "1"]).run().ok();
     splat4d(&["render", str(&run), "--channel", "uncertainty", "--path", "test"])

@@ -25,7 +25,7 @@ fn parts_by_number_and_one_command_make_the_same_scene_and_file() {
     let said = train(&capture, &one, &[]).ok();
     assert!(said.contains("flicker where chunks meet"), "{said}");
     assert!(train(&capture, &parts, &["--chunk=0"]).refused().contains("--chunk shared"));
-    let film = parts.join("scene.splat4d");
+    let film = parts.join("scene.s4d");
     for part in ["shared", "0", "1", "1"] {
         train(&capture, &parts, &[&format!("--chunk={part}")]).ok();
         // It plays as far as it goes, and an older reader refuses it by its version.
@@ -40,7 +40,7 @@ fn parts_by_number_and_one_command_make_the_same_scene_and_file() {
     broken.extend([7; 999]);
     std::fs::write(&film, broken).unwrap();
     splat4d(&["join", str(&parts), "--no-eval"]).run().ok();
-    for file in ["scene.safetensors", "scene.splat4d", "chunks/01/scene.safetensors"] {
+    for file in ["scene.safetensors", "scene.s4d", "chunks/01/scene.safetensors"] {
         assert_eq!(std::fs::read(one.join(file)).unwrap(), std::fs::read(parts.join(file)).unwrap(), "{file}");
     }
     assert!(json_of(&one.join("run.json"))["seams"]["inside"].is_f64());

@@ -17,7 +17,7 @@ fn a_run_becomes_a_smaller_run_and_is_measured_before_and_after() {
     assert_eq!(last["type"], "compressed");
 
     let told = json_of(&dir.join("compress.json"));
-    let file = std::fs::read(dir.join("scene.splat4d")).unwrap();
+    let file = std::fs::read(dir.join("scene.s4d")).unwrap();
     assert_eq!(told["after"]["bytes"].as_u64(), Some(file.len() as u64), "the size told is the file's");
     assert_eq!(last["bytes"].as_u64(), Some(file.len() as u64));
     let gaussians = |side: &str| told[side]["gaussians"].as_u64().unwrap();
@@ -45,7 +45,7 @@ fn a_run_becomes_a_smaller_run_and_is_measured_before_and_after() {
     assert!(page.contains("Compressed") && page.contains("not pruned, same steps"), "the report compares");
     splat4d(&["info", str(&dir)]).run().ok();
     splat4d(&["eval", str(&dir)]).run().ok();
-    assert_eq!(std::fs::read(dir.join("scene.splat4d")).unwrap(), file, "measuring does not bake anew");
+    assert_eq!(std::fs::read(dir.join("scene.s4d")).unwrap(), file, "measuring does not bake anew");
     assert_eq!(
         json_of(&dir.join("results.json"))["ours_8"]["PSNR"],
         told["after"]["psnr"],
@@ -56,7 +56,7 @@ fn a_run_becomes_a_smaller_run_and_is_measured_before_and_after() {
     // A finished compression is told again without a step, and never taken over.
     let again = splat4d(&["compress", "--resume", str(&dir)]).run().ok();
     assert!(again.contains("times smaller"), "{again}");
-    assert_eq!(std::fs::read(dir.join("scene.splat4d")).unwrap(), file);
+    assert_eq!(std::fs::read(dir.join("scene.s4d")).unwrap(), file);
     let taken = compress(&["-o", str(&dir)]).run().refused();
     assert!(taken.contains("--resume") && taken.contains("--force"), "{taken}");
     let train = splat4d(&["train", "--resume", str(&dir)]).run().refused();
@@ -77,7 +77,7 @@ fn a_size_is_kept_or_refused_with_the_smallest_that_is_possible() {
     // What it names is enough.
     let named = least.split("at least ").nth(1).unwrap().trim_end().trim_end_matches('.').to_owned();
     compress(&named, "least").ok();
-    let bytes = std::fs::metadata(work.path().join("least/scene.splat4d")).unwrap().len();
+    let bytes = std::fs::metadata(work.path().join("least/scene.s4d")).unwrap().len();
     assert!(bytes as f64 <= named.parse::<f64>().unwrap() * 1e6, "{bytes} bytes of {named} MB");
 }
 

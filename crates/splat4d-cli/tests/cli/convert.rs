@@ -134,8 +134,8 @@ fn a_scene_with_a_head_is_drawn_and_nothing_else_is_made_of_it() {
     let near = turned.up.iter().zip([0.0, 1.0, 0.0]).all(|(a, b)| (a - b).abs() < 1e-12);
     assert!(turned.head == Head::Features && near, "{:?}", turned.up);
     for args in [
-        &["bake", "full.safetensors", "-o", "a.splat4d"][..],
-        &["convert", "full.safetensors", "a.splat4d"],
+        &["bake", "full.safetensors", "-o", "a.s4d"][..],
+        &["convert", "full.safetensors", "a.s4d"],
         &["convert", "full.safetensors", "a.splatv"],
         &["convert", "full.safetensors", "a.stg.ply"],
         &["convert", "full.safetensors", "a.ply"],

@@ -41,7 +41,7 @@ fn a_list_and_options_make_a_new_file() {
     let of = |words: &[&str]| splat4d(&[&["edit"], words].concat());
     let name = |n: &str| at(n).to_str().unwrap().to_owned();
     let (birds, edits, both) = (name("birds.safetensors"), name("edits.toml"), name("both.safetensors"));
-    let (again, file) = (name("again.toml"), name("birds.splat4d"));
+    let (again, file) = (name("again.toml"), name("birds.s4d"));
     of(&[&birds, &edits, "--save", &again, "--delete", "box(5,-99,-99, 99,99,99) and size(0,0)", "-o", &both])
         .run()
         .refused();
@@ -59,7 +59,7 @@ fn a_list_and_options_make_a_new_file() {
     // Provenance goes along, and away.
     says(of(&[&birds, &edits, "--note", "birds that agreed", "-o", &file]), &["primitives"]);
     says(splat4d(&["info", &file]), &["made with", "merge, recolor", "birds that agreed"]);
-    let kept = name("kept.splat4d");
+    let kept = name("kept.s4d");
     splat4d(&["convert", &file, &kept]).run().ok();
     let told = playback::provenance(&std::fs::read(&kept).unwrap()).unwrap().unwrap();
     assert_eq!((told.edits.len(), told.words.as_deref()), (2, Some("birds that agreed")));

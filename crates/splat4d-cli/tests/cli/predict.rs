@@ -56,7 +56,7 @@ fn a_run_goes_on_and_is_compared_with_what_came() {
     assert_eq!(dynamics.tensor("graph.rotations").unwrap().shape(), [3, 4, 4]);
     assert!(dynamics.tensor("causal.1.drive").is_ok(), "both members are kept");
     // It is a scene like any other: it plays, marked, and exports.
-    let bytes = std::fs::read(folder.join("scene.splat4d")).unwrap();
+    let bytes = std::fs::read(folder.join("scene.s4d")).unwrap();
     let meta = playback::Index::parse(&bytes, Some(bytes.len() as u64)).unwrap().meta;
     let at = |frame: f64| frame / 30.0;
     assert!((meta.predicted.unwrap() - at(6.5)).abs() < 1e-9 && (meta.clip[1] - at(9.0)).abs() < 1e-9, "{meta:?}");

@@ -1,4 +1,4 @@
-"""The command: `splat4d`, or `python -m splat4d`."""
+"""The command: `splat4d`, `s4d`, or `python -m splat4d`."""
 
 import signal
 import sys

@@ -36,7 +36,7 @@ function view(x, y, z, yaw, width = 160, height = 120, f = 150) {
 async function shown(backend, made, body, { before, policy } = {}) {
   const rule = policy ? `<meta http-equiv="Content-Security-Policy" content="${policy}">` : '';
   const html = `<!doctype html>${rule}<body>`;
-  const server = await serve({ files: { 'a.html': html, 'a.splat4d': made.bytes } });
+  const server = await serve({ files: { 'a.html': html, 'a.s4d': made.bytes } });
   const { page, errors } = await open(browser, server.url + 'a.html');
   try {
     if (before) await page.evaluate(before);
@@ -48,7 +48,7 @@ async function shown(backend, made, body, { before, policy } = {}) {
       const [errors, lost] = [[], []];
       const { create } = Object.values(module).find((c) => c?.create);
       const backend = await create(canvas, { onlost: (e) => lost.push(e?.message ?? 'lost') });
-      const file = await SceneFile.open('/a.splat4d');
+      const file = await SceneFile.open('/a.s4d');
       backend.setScene(file.meta);
       const restart = (options) => {
         globalThis.shown.stream?.destroy();

@@ -12,7 +12,7 @@ import { combined, easedKey, History, keysOf, movedTo, placeAt, shiftedKey, turn
   from '../../player/edit-steps.js';
 import { launch } from './browser.mjs';
 
-const KNIGHT = fileURLToPath(new URL('../../../../examples/knight.splat4d', import.meta.url));
+const KNIGHT = fileURLToPath(new URL('../../../../examples/knight.s4d', import.meta.url));
 const PROGRAM = process.env.SPLAT4D;
 const browser = PROGRAM && existsSync(PROGRAM) ? await launch() : null;
 /// A wait that is longer than this, ms, has found a hang. Generous: machines that test are busy.
@@ -148,7 +148,7 @@ test('a lasso over the picture deletes, undo brings it back, and the list is sav
   assert.match(text, /do = "delete"/);
   assert.match(text, /lasso\(/);
   // The same list on the command line makes the same scene.
-  const out = path.join(work, 'out.splat4d');
+  const out = path.join(work, 'out.s4d');
   const said = execFileSync(PROGRAM, ['edit', KNIGHT, list, '-o', out, '--json']).toString();
   assert.match(said, new RegExp(`"selected":${held}`));
   assert.deepEqual(e.errors, []);

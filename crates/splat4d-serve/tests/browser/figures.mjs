@@ -11,7 +11,7 @@ import { launch, open } from './browser.mjs';
 import { serve } from './server.mjs';
 
 const PACKAGE = fileURLToPath(new URL('../../npm/', import.meta.url));
-const KNIGHT = fileURLToPath(new URL('../../../../examples/knight.splat4d', import.meta.url));
+const KNIGHT = fileURLToPath(new URL('../../../../examples/knight.s4d', import.meta.url));
 /// Second of the scene from which it counts as playing.
 const PLAYS = 0.1;
 
@@ -39,9 +39,9 @@ try {
   call('npm', ['install', '--no-audit', '--no-fund', '--no-save', '--prefix', work, tarball], work);
   const installed = path.join(work, 'node_modules/splat4d');
   const page = `<!doctype html><script type="module" src="/splat4d/player/element.js"></script>
-    <splat-4d src="/knight.splat4d" style="display:block;width:400px;height:300px"></splat-4d>`;
+    <splat-4d src="/knight.s4d" style="display:block;width:400px;height:300px"></splat-4d>`;
   const folders = { '/splat4d/': installed };
-  const server = await serve({ files: { 'page.html': page, 'knight.splat4d': readFileSync(KNIGHT) }, folders });
+  const server = await serve({ files: { 'page.html': page, 'knight.s4d': readFileSync(KNIGHT) }, folders });
   await plays(browser, `${server.url}page.html`, begin, 'empty folder, npm install of the tarball, the knight plays');
   await server.close();
   const modules = ['three.js', ...readdirSync(path.join(installed, 'player')).map((f) => `player/${f}`)];

@@ -112,9 +112,9 @@ test('spans say what is drawn, and time is held inside the clip', async () => {
 
 test('a server gives parts, each byte once, neighbours in one request', async () => {
   const { bytes } = sample({ scale: 5, codec: 0 });
-  const server = await serve({ files: { 'a.splat4d': bytes } });
+  const server = await serve({ files: { 'a.s4d': bytes } });
   try {
-    const file = await SceneFile.open(server.url + 'a.splat4d');
+    const file = await SceneFile.open(server.url + 'a.s4d');
     assert.equal(file.bytesRead, 65536);
     const [, b, c] = file.pages;
     await Promise.all([file.page(c.id), file.page(b.id)]);
@@ -275,8 +275,8 @@ test('hostile and foreign files are refused in words', async () => {
       ]),
     ],
     ['degree 4', layout(base, [{ kind: 'PALT', data: Buffer.alloc(12 + 72), count: 1, level: 4 }])],
-    ['no .splat4d', Buffer.from('ply\nformat binary')],
-    ['no .splat4d', Buffer.alloc(0)],
+    ['no .s4d', Buffer.from('ply\nformat binary')],
+    ['no .s4d', Buffer.alloc(0)],
   ];
   for (const [say, bytes] of cases) {
     await assert.rejects(SceneFile.open(bytes), (e) => e instanceof SceneError && e.message.includes(say), say);

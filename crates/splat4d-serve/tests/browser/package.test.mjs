@@ -14,7 +14,7 @@ import { psnr } from './reference.mjs';
 import { serve } from './server.mjs';
 
 const PACKAGE = fileURLToPath(new URL('../../npm/', import.meta.url));
-const KNIGHT = readFileSync(fileURLToPath(new URL('../../../../examples/knight.splat4d', import.meta.url)));
+const KNIGHT = readFileSync(fileURLToPath(new URL('../../../../examples/knight.s4d', import.meta.url)));
 /// Bytes of all its modules, gzipped one by one as servers send them.
 const MOST = 100_000;
 /// The element and the object against each other, dB: one blends in half floats, the other in the canvas' bytes.
@@ -39,7 +39,7 @@ const html = (body) => `<!doctype html><link rel="icon" href="data:,"><style>bod
 /// A page of this body, beside the installed package and a scene.
 async function page(body, t) {
   const folders = { '/splat4d/': installed, '/three/': THREE };
-  const server = await serve({ files: { 'page.html': html(body), 'knight.splat4d': KNIGHT }, folders });
+  const server = await serve({ files: { 'page.html': html(body), 'knight.s4d': KNIGHT }, folders });
   const opened = await open(browser, server.url + 'page.html', { viewport: { width: 400, height: 300 } });
   t.after(() => Promise.all([opened.page.close(), server.close()]));
   return opened;
@@ -56,7 +56,7 @@ test('the package holds what it names, and is small', (t) => {
 });
 
 const needs = (three) => ({ skip: !browser ? 'needs a browser' : three && !existsSync(THREE) ? 'needs three' : false });
-const ELEMENT = `<splat-4d src="/knight.splat4d" backend="webgl2" resolution="1" controls="none"
+const ELEMENT = `<splat-4d src="/knight.s4d" backend="webgl2" resolution="1" controls="none"
   style="display:block;width:400px;height:300px"></splat-4d><script type="module">import 'splat4d';</script>`;
 /// three.js with the knight, seen by the file's camera \`at\`; the page says \`shown\` when it is drawn.
 const OBJECT = `<canvas width="400" height="300"></canvas><script type="module">
@@ -64,7 +64,7 @@ const OBJECT = `<canvas width="400" height="300"></canvas><script type="module">
   import { Splat4D } from 'splat4d/three';
   const renderer = new THREE.WebGLRenderer({ canvas: document.querySelector('canvas'), preserveDrawingBuffer: true });
   renderer.setSize(400, 300, false);
-  const scene = new THREE.Scene(), take = new Splat4D('/knight.splat4d');
+  const scene = new THREE.Scene(), take = new Splat4D('/knight.s4d');
   scene.add(take);
   await take.ready;
   const c = take.meta.cameras[0], m = c.world_from_camera, camera = new THREE.PerspectiveCamera(

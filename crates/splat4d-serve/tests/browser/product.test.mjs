@@ -20,7 +20,7 @@ const FIRST_SHARE = 0.2;
 /// Rounds of the bundled capture: more than 20 seconds.
 const ROUNDS = 21;
 
-const KNIGHT = fileURLToPath(new URL('../../../../examples/knight.splat4d', import.meta.url));
+const KNIGHT = fileURLToPath(new URL('../../../../examples/knight.s4d', import.meta.url));
 const PROGRAM = process.env.SPLAT4D;
 const browser = PROGRAM && existsSync(PROGRAM) ? await launch() : null;
 const options = { skip: browser ? false : 'needs the program (SPLAT4D) and a browser' };
@@ -57,7 +57,7 @@ async function bare(url, attributes, size = { width: 400, height: 300 }) {
   page.on('console', (m) => m.type() === 'error' && errors.push(m.text()));
   page.on('pageerror', (e) => errors.push(e.stack ?? e.message));
   const body = `<!doctype html><link rel="icon" href="data:,"><style>body{margin:0}splat-4d{display:block;width:100vw;height:100vh}</style>
-    <splat-4d src="/scene.splat4d" ${attributes}></splat-4d><script type="module" src="/player/element.js"></script>`;
+    <splat-4d src="/scene.s4d" ${attributes}></splat-4d><script type="module" src="/player/element.js"></script>`;
   await page.route(`${base}/bare.html`, (r) => r.fulfill({ contentType: 'text/html', body }));
   await page.goto(`${base}/bare.html`);
   await page.waitForFunction(() => document.querySelector('splat-4d').statistics?.firstFrame > 0, null, { timeout: 60000 });
@@ -118,15 +118,15 @@ for (const backend of ['webgl2', 'webgpu']) {
       writeFileSync(file, sample({ ...made, ...options }).bytes);
       return file;
     };
-    const url = await view(put('masked.splat4d', {}));
+    const url = await view(put('masked.s4d', {}));
     const { page, errors } = await bare(url, `backend="${backend}" resolution="1" controls="none"`);
     const [c] = await page.evaluate(() => document.querySelector('splat-4d').player.meta.cameras);
-    const whole = put('whole.splat4d', { masks: 0 });
+    const whole = put('whole.s4d', { masks: 0 });
     // Between two key times, and on one.
     for (const time of [2.2, 3.5]) {
       const mine = await seen(page, c, time);
       const picture = path.join(work, `${backend}-masked.png`);
-      const db = psnr(mine, await rendered(page, put('without.splat4d', { without: time }), c.name, time, picture));
+      const db = psnr(mine, await rendered(page, put('without.s4d', { without: time }), c.name, time, picture));
       const unmasked = psnr(mine, await rendered(page, whole, c.name, time, picture));
       t.diagnostic(`at ${time} s: ${db.toFixed(1)} dB, against all Gaussians ${unmasked.toFixed(1)} dB`);
       assert.ok(db >= BOUND && unmasked < BOUND, `at ${time}: ${db} and ${unmasked} dB`);
@@ -155,7 +155,7 @@ for (const backend of ['webgl2', 'webgpu']) {
 }
 
 test('a long take starts with a fraction of its bytes, and a seek fetches its own', options, async (t) => {
-  const long = path.join(work, 'long.splat4d');
+  const long = path.join(work, 'long.s4d');
   run('bake', KNIGHT, '-o', long, '--repeat', String(ROUNDS));
   const { page, errors } = await bare(await view(long), 'backend="webgl2" resolution="0.5" controls="none"');
   const first = await page.evaluate(() => document.querySelector('splat-4d').statistics);
@@ -185,13 +185,13 @@ test('a long take starts with a fraction of its bytes, and a seek fetches its ow
 test('a broken file is a message, not a blank page', options, async () => {
   const bytes = Buffer.from(readFileSync(KNIGHT));
   bytes[70] ^= 1;
-  const file = path.join(work, 'broken.splat4d');
+  const file = path.join(work, 'broken.s4d');
   writeFileSync(file, bytes);
   // The program itself refuses it; a page elsewhere might not.
   assert.throws(() => run('view', file, '--no-open'));
   const url = await view(KNIGHT);
   const page = await browser.newPage();
-  await page.route('**/scene.splat4d*', (r) => r.fulfill({ body: bytes }));
+  await page.route('**/scene.s4d*', (r) => r.fulfill({ body: bytes }));
   await page.goto(url);
   const alert = page.getByRole('alert').first();
   await alert.waitFor({ timeout: 20000 });

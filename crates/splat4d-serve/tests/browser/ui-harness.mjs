@@ -12,7 +12,7 @@ const TYPES = { js: 'text/javascript', html: 'text/html', json: 'application/jso
 
 /** Serves `/` and the player; `pages` are further routes {path: html}; `config` is /config.json. */
 export class Site {
-  config = { title: 'Two knights', scene: 'scene.splat4d', live: false };
+  config = { title: 'Two knights', scene: 'scene.s4d', live: false };
   pages = {};
   listeners = new Set();
   joined = 0;

@@ -23,7 +23,7 @@ after(async () => {
 
 /** A page at `path`, ready; errors on its console fail the test unless `wrong` is set. */
 async function open(path = '', { size = [1000, 700], config, wrong = false, ready = true, ...more } = {}) {
-  site.config = config ?? { title: 'Two knights', scene: 'scene.splat4d', live: false, autoplay: false };
+  site.config = config ?? { title: 'Two knights', scene: 'scene.s4d', live: false, autoplay: false };
   const viewport = { width: size[0], height: size[1] };
   const context = await browser.newContext({ viewport, acceptDownloads: true, ...more });
   const page = await context.newPage();
@@ -228,7 +228,7 @@ test('the element works in a bare page: attributes, events, methods', options, a
     <script>window.heard = []; for (const n of ['load', 'play', 'pause', 'timeupdate', 'camerachange', 'error'])
       addEventListener('DOMContentLoaded', () => document.querySelector('splat-4d')
         .addEventListener(n, e => heard.push([n, e.detail])));</script>
-    <splat-4d src="scene.splat4d" time="2" speed="2" channel="alpha" backend="webgl2" background="#ff8000"
+    <splat-4d src="scene.s4d" time="2" speed="2" channel="alpha" backend="webgl2" background="#ff8000"
       camera="0,1,6 0,1,0 30" heading="Bare" style="width:600px"></splat-4d>`;
   const { page, ask, done } = await open('bare');
   const drawn = await ask(e => ({ ...e.player.backend.drawn, bg: e.player.drawing(10, 10).background, t: e.currentTime,
@@ -264,7 +264,7 @@ test('the element works in a bare page: attributes, events, methods', options, a
   await ask(e => e.setAttribute('channel', 'flow'));
   assert.equal(await ask(e => e.player.channel), 'flow');
   const before = await ask(e => e.player);
-  await ask(e => e.setAttribute('src', 'still.splat4d'));
+  await ask(e => e.setAttribute('src', 'still.s4d'));
   await page.waitForFunction(() => document.querySelector('splat-4d').duration === 0);
   assert.ok(before !== undefined);
   await ask(e => e.remove());
@@ -311,14 +311,14 @@ test('every control has a name, and the keyboard reaches it', options, async () 
 });
 
 test('errors say what, where and what to do; the page recovers', options, async () => {
-  const { page, ask, done } = await open('', { config: { scene: 'broken.splat4d' }, ready: false });
+  const { page, ask, done } = await open('', { config: { scene: 'broken.s4d' }, ready: false });
   const alert = page.getByRole('alert');
   await alert.waitFor();
   const text = await alert.innerText();
-  for (const part of ['The index is damaged', 'broken.splat4d', 'Fetch or bake it again']) {
+  for (const part of ['The index is damaged', 'broken.s4d', 'Fetch or bake it again']) {
     assert.ok(text.includes(part), text);
   }
-  await ask(e => { e.scene = new File([new Uint8Array(9)], 'good.splat4d'); });
+  await ask(e => { e.scene = new File([new Uint8Array(9)], 'good.s4d'); });
   await page.waitForFunction(() => document.querySelector('splat-4d').player.state === 'ready');
   assert.equal(await page.getByRole('alert').count(), 0);
   await done();
@@ -326,7 +326,7 @@ test('errors say what, where and what to do; the page recovers', options, async 
   await empty.page.getByRole('button', { name: 'Choose a file' }).waitFor();
   const chooser = empty.page.waitForEvent('filechooser');
   await empty.page.getByRole('button', { name: 'Choose a file' }).click();
-  await (await chooser).setFiles({ name: 'mine.splat4d', mimeType: '', buffer: Buffer.from([1]) });
+  await (await chooser).setFiles({ name: 'mine.s4d', mimeType: '', buffer: Buffer.from([1]) });
   await empty.page.waitForFunction(() => document.querySelector('splat-4d').player.state === 'ready');
   await empty.done();
 });
@@ -358,14 +358,14 @@ test('a narrow window holds everything without scrolling sideways', options, asy
 });
 
 test('controls rest while it plays and come back; reduced motion does not play by itself', options, async () => {
-  const moving = await open('', { config: { scene: 'scene.splat4d', title: 'x' } });
+  const moving = await open('', { config: { scene: 'scene.s4d', title: 'x' } });
   assert.equal(await moving.ask(e => e.paused), false, 'a page plays by itself');
   await moving.page.mouse.move(500, 200);
   await moving.page.waitForFunction(() => document.querySelector('splat-4d').shadowRoot.querySelector('.root.idle'));
   await moving.page.mouse.move(510, 210);
   assert.equal(await moving.ask(e => e.shadowRoot.querySelector('.root').classList.contains('idle')), false);
   await moving.done();
-  const calm = await open('', { config: { scene: 'scene.splat4d' }, reducedMotion: 'reduce' });
+  const calm = await open('', { config: { scene: 'scene.s4d' }, reducedMotion: 'reduce' });
   assert.equal(await calm.ask(e => e.paused), true);
   await calm.page.keyboard.press('2');
   await settle(calm.page);
@@ -445,7 +445,7 @@ test('training is followed: late join, new snapshots, lost connections', options
   site.history = [];
   for (let i = 1; i <= 20; i++) step(i);
   site.say({ kind: 'snapshot', version: 7 });
-  const config = { title: 'learning', scene: 'scene.splat4d', live: true, autoplay: false };
+  const config = { title: 'learning', scene: 'scene.s4d', live: true, autoplay: false };
   const { page, ask, done } = await open('', { config, wrong: true });
   const card = page.getByRole('region', { name: 'Training' });
   await card.getByText('200').waitFor();

@@ -10,18 +10,18 @@ import { launch } from './browser.mjs';
 import { serve } from './server.mjs';
 
 const IWER = path.join(process.env.PLAYWRIGHT ?? '', 'node_modules/iwer/build/iwer.min.js');
-const KNIGHT = readFileSync(fileURLToPath(new URL('../../../../examples/knight.splat4d', import.meta.url)));
+const KNIGHT = readFileSync(fileURLToPath(new URL('../../../../examples/knight.s4d', import.meta.url)));
 const browser = existsSync(IWER) ? await launch() : null;
 test.after(() => browser?.close());
 
 const PAGE = `<!doctype html><link rel="icon" href="data:,"><style>body{margin:0}splat-4d{display:block;width:320px;height:160px}</style>
-  <splat-4d src="/knight.splat4d" backend="webgl2" resolution="1"></splat-4d><script type="module" src="/player/element.js"></script>`;
+  <splat-4d src="/knight.s4d" backend="webgl2" resolution="1"></splat-4d><script type="module" src="/player/element.js"></script>`;
 
 const options = { skip: browser ? false : 'needs iwer and a browser' };
 
 /// A page with the knight and a simulated headset: {page, errors}.
 async function prepared(t) {
-  const server = await serve({ files: { 'page.html': PAGE, 'knight.splat4d': KNIGHT } });
+  const server = await serve({ files: { 'page.html': PAGE, 'knight.s4d': KNIGHT } });
   const page = await browser.newPage({ viewport: { width: 320, height: 160 } });
   t.after(() => Promise.all([page.close(), server.close()]));
   const errors = [];

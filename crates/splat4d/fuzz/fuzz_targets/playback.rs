@@ -1,5 +1,5 @@
 //! Throws bytes at every reader of the playback file. `cargo fuzz run playback` (needs a nightly compiler); start it with
-//! `crates/splat4d/tests/data/tiny.splat4d` in its corpus.
+//! `crates/splat4d/tests/data/tiny.s4d` in its corpus.
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
@@ -41,9 +41,7 @@ fn crc(bytes: &[u8]) -> [u8; 4] {
 }
 
 fn mend(bytes: &mut [u8]) {
-    let number = |b: &[u8], at: usize| {
-        b.get(at..at + 4).map(|x| u32::from_le_bytes([x[0], x[1], x[2], x[3]]) as usize)
-    };
+    let number = |b: &[u8], at: usize| b.get(at..at + 4).map(|x| u32::from_le_bytes([x[0], x[1], x[2], x[3]]) as usize);
     let Some(index) = number(bytes, 12) else { return };
     if bytes.len() < HEADER_BYTES || index > bytes.len() - HEADER_BYTES {
         return;

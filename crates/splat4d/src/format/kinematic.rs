@@ -153,7 +153,7 @@ fn life(p: &Params, row: usize, column: usize) -> f64 {
 fn cannot_hold(layer: &Layer<f32>, name: &str, what: &str) -> Error {
     let text = format!("{name} cannot hold layer `{}`: it has {what}", layer.name);
     Error::new(ErrorKind::Unsupported, text)
-        .remedy("Write one moment (--time T), a file a frame (--frames), or .splat4d, which holds every motion.")
+        .remedy("Write one moment (--time T), a file a frame (--frames), or .s4d, which holds every motion.")
 }
 
 /// The scene of a file's Gaussians.

@@ -7,6 +7,7 @@
 pub(crate) mod arrays;
 mod bytes;
 pub mod dialect;
+pub mod foreign;
 mod half;
 mod kinematic;
 #[cfg(test)]
@@ -39,7 +40,7 @@ use crate::{Error, Result};
 pub const DIALECTS: &[Dialect] =
     &[ply::DIALECT, ply::COMPRESSED, ply::STG, spz::DIALECT, splat::DIALECT, splatv::DIALECT, sog::DIALECT];
 
-/// The scene in a file of any kind that says by its first bytes what it is: `.splat4d`, .ply (3DGS, compressed, Spacetime
+/// The scene in a file of any kind that says by its first bytes what it is: `.s4d`, .ply (3DGS, compressed, Spacetime
 /// Gaussians), .spz, .splatv, zipped SOG, `scene.safetensors` and checkpoints. A .splat has no mark: [`splat::read`] it.
 ///
 /// What had to be assumed is not told; [`Dialect::open`] tells. Errors: no such kind; the reader's.
@@ -50,10 +51,13 @@ pub fn open(bytes: &[u8]) -> Result<Scene<f32>> {
     if let Some(kind) = Dialect::of(bytes) {
         return kind.open(bytes).map(|opened| opened.scene);
     }
+    if let Some(error) = foreign::unread("", bytes) {
+        return Err(error);
+    }
     // A safetensors file begins with the length of its JSON header.
     if bytes.get(8) != Some(&b'{') {
-        return Err(Error::input("its first bytes are of no format that splat4d reads").remedy(format!(
-            "Give a .splat4d, {} or scene.safetensors",
+        return Err(Error::input("unknown format: its first bytes match none that splat4d reads").remedy(format!(
+            "Give a .s4d, {} or scene.safetensors",
             dialect::extensions(|d| d.mark.is_some()).join(", ")
         )));
     }

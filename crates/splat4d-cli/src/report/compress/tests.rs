@@ -109,7 +109,7 @@ fn the_guard_warns_where_too_much_is_lost() {
 
 #[test]
 fn bytes_are_told_by_part() {
-    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/knight.splat4d");
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/knight.s4d");
     let chart = parts(&file).unwrap();
     for part in ["Gaussians", "palette", "poster", "index"] {
         assert!(chart.contains(part), "{part}");

@@ -142,7 +142,7 @@ mod tests {
             height: 600,
             side: Side { gaussians: 150_000, fps, psnr, ..Side::default() },
         };
-        let rows = [row("runs/a", 20.0, Some(31.254)), row("a.splat4d", 50.0, None)];
+        let rows = [row("runs/a", 20.0, Some(31.254)), row("a.s4d", 50.0, None)];
         let text = table(&rows);
         assert!(text.starts_with("800x600") && text.contains("150,000") && text.contains("2.50x"), "{text}");
         assert!(text.contains("31.25") && !text.contains("where things move"), "{text}");
@@ -150,6 +150,6 @@ mod tests {
         let page = markdown(&rows);
         assert!(page.lines().all(|l| l.matches('|').count() == 4), "{page}");
         let back: Vec<serde_json::Value> = serde_json::from_str(&json(&rows)).unwrap();
-        assert_eq!((back[1]["file"].as_str(), back[1]["fps"].as_f64()), (Some("a.splat4d"), Some(50.0)));
+        assert_eq!((back[1]["file"].as_str(), back[1]["fps"].as_f64()), (Some("a.s4d"), Some(50.0)));
     }
 }

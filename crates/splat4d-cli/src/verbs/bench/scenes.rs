@@ -16,7 +16,7 @@ pub(super) const VIEWS: usize = 8;
 /// Where scene S lies unless told: the robot among the sample files of the project's data folder.
 const PLAYBOT: &str = "../shared/data/gaussian-files/playbot-sog-lod/0_0";
 /// The trained scene of the bundled capture, from the root of the repository.
-const KNIGHT: &str = "examples/knight.splat4d";
+const KNIGHT: &str = "examples/knight.s4d";
 /// Between the cameras of neighbouring views of T and U: coprime to the capture's 20, so that all sides are seen.
 const CAMERA_STEP: usize = 7;
 
@@ -180,7 +180,7 @@ fn of_the_capture(source: &Source, path: &Path, size: usize) -> Result<Vec<View>
     if cameras.is_empty() {
         return Err(Error::input("it names no cameras to look from")
             .at(path.display())
-            .remedy("Give a run, or a .splat4d that was baked from one."));
+            .remedy("Give a run, or a .s4d that was baked from one."));
     }
     let clip = source.scene.clip;
     let view = |k: usize| {

@@ -586,7 +586,7 @@ fn short() -> Error {
 
 fn foreign() -> Error {
     Error::input("this is not a playback file: it does not begin as one")
-        .remedy("Give a .splat4d file; `splat4d bake` makes one from a run")
+        .remedy("Give a .s4d file; `splat4d bake` makes one from a run")
 }
 
 /// A file that does not hold together.

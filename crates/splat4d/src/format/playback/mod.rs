@@ -1,4 +1,4 @@
-//! The playback file `.splat4d`: a moving scene, small, readable in parts, checked. docs/format.md is its specification.
+//! The playback file `.s4d`: a moving scene, small, readable in parts, checked. docs/format.md is its specification.
 //!
 //! [`write()`] takes a [`Draft`] (floats, sorted into time spans by whoever bakes it), orders, quantises and packs it.
 //! [`Index::parse`] understands the start of a file, `decode_page` and [`decode_palette`] any section of it by itself,
@@ -43,6 +43,12 @@ pub use provenance::{Provenance, provenance, with_provenance};
 pub use read::read;
 pub use write::{ErrorStat, Errors, Summary, WriteConfig, write};
 
+/// Extension of playback files.
+pub const EXTENSION: &str = "s4d";
+/// Extension of playback files before version 0.1. Read and accepted; another program writes another format under it.
+pub const OLD_EXTENSION: &str = "splat4d";
+/// Media type of playback files, for servers.
+pub const MEDIA_TYPE: &str = "application/vnd.s4d";
 /// First bytes of a playback file.
 pub const MAGIC: [u8; 8] = *b"\x89S4D\r\n\x1a\n";
 /// The version that this library knows: major, minor. A file states the least that has all it holds.

@@ -17,7 +17,7 @@ use crate::render::{Image, RenderConfig, Renderer, Shot};
 use crate::scene::{Camera, Time};
 
 /// A file that version 1.0 of the writer made from [`tiny`], byte for byte.
-const GOLDEN: &[u8] = include_bytes!("../../../tests/data/tiny.splat4d");
+const GOLDEN: &[u8] = include_bytes!("../../../tests/data/tiny.s4d");
 
 /// A Gaussian of a made-up scene. One in three lives for ever.
 fn primitive(r: Rng) -> Primitive {
@@ -408,7 +408,7 @@ fn a_file_of_version_1_0_stays_readable() {
 #[test]
 fn golden_file_is_written_only_on_request() {
     if std::env::var_os("UPDATE_GOLDEN").is_some() {
-        let place = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/tiny.splat4d");
+        let place = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/tiny.s4d");
         std::fs::write(place, bytes_of(&tiny(), &WriteConfig::default()).0).unwrap();
     }
 }

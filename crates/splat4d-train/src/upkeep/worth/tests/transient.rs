@@ -88,7 +88,7 @@ fn the_orb_and_the_crate_survive() {
     let capture = Arc::new(Capture::open(&place.join("knight"), &CaptureOptions::default()).unwrap());
     let store = Arc::new(ImageStore::new(capture.clone(), 1 << 28));
     let (train, held) = (Dataset::new(store.clone(), capture.train.clone()), Dataset::new(store, capture.held.clone()));
-    let scene = splat4d::format::playback::read(&std::fs::read(place.join("knight.splat4d")).unwrap()).unwrap();
+    let scene = splat4d::format::playback::read(&std::fs::read(place.join("knight.s4d")).unwrap()).unwrap();
     let before = quality(&scene, &held);
     let by = |spatial, temporal, ratio| {
         let config = ScoreConfig { spatial, temporal, volume: false, every: VIEWS, ..ScoreConfig::default() };

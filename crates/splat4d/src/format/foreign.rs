@@ -1,0 +1,132 @@
+//! Files that splat4d does not read: what each is, and what to do with it.
+
+use crate::{Error, ErrorKind};
+
+/// A kind of file that is not read.
+struct Foreign {
+    /// Whether bytes are such a file.
+    is: fn(&[u8]) -> bool,
+    /// What the file is.
+    what: &'static str,
+    /// What to do in its place.
+    remedy: &'static str,
+}
+
+/// Known by their first bytes. Sources: the formats' specifications, or the programs' own readers.
+const FOREIGN: [Foreign; 9] = [
+    Foreign {
+        is: |b| b.starts_with(b"SP4D"),
+        what: "a .splat4d of the program splats4D, another format under a similar name",
+        remedy: "Decode its frames with that program (`splat4d decode FILE --frame N -o N.splat`, where `splat4d` is the \
+                 command of the Python package splats4d) and open the numbered .splat files.",
+    },
+    Foreign {
+        is: |b| b.starts_with(b"\x894DGS"),
+        what: "a .4dgs of the fourdgs libraries",
+        remedy: "Convert it to numbered .ply files with those libraries.",
+    },
+    Foreign {
+        is: |b| b.starts_with(b"glTF"),
+        what: "a binary glTF (.glb)",
+        remedy: "Export .ply or .spz from the program that wrote it.",
+    },
+    Foreign {
+        is: |b| b.starts_with(b"PXR-USDC") || b.starts_with(b"#usda"),
+        what: "a USD stage",
+        remedy: "Export .ply from the program that wrote it.",
+    },
+    Foreign {
+        is: |b| b.starts_with(b"\x93NUMPY"),
+        what: "a NumPy array (.npy), not a scene",
+        remedy: "Write the Gaussians as a 3DGS .ply; gsplat's export_splats does so.",
+    },
+    Foreign {
+        is: |b| b.starts_with(b"LASF"),
+        what: "a point cloud (.las or .laz), not Gaussians",
+        remedy: "Points start a training: give them to a capture as .ply.",
+    },
+    Foreign {
+        is: |b| b.starts_with(b"\x89PNG") || b.starts_with(b"\xff\xd8\xff") || b.starts_with(b"GIF8"),
+        what: "an image, not a scene",
+        remedy: "Give the folder of a capture to read images with their cameras.",
+    },
+    Foreign {
+        is: |b| b.get(4..8) == Some(b"ftyp") || b.starts_with(b"\x1aE\xdf\xa3"),
+        what: "a video, not a scene",
+        remedy: "`splat4d import` makes a capture of videos.",
+    },
+    Foreign {
+        is: |b| b.starts_with(b"<!DOCTYPE") || b.starts_with(b"<!doctype") || b.starts_with(b"<html"),
+        what: "a web page, not a scene",
+        remedy: "Where a download gave it, download the file itself again.",
+    },
+];
+
+/// Endings of formats without a mark.
+const ENDINGS: [(&str, &str, &str); 3] = [
+    (".ksplat", "a .ksplat of GaussianSplats3D", "Convert it to .ply first, for instance with splat-transform."),
+    (".usdz", "a USD archive", "Export .ply from the program that wrote it."),
+    (".gltf", "a glTF", "Export .ply or .spz from the program that wrote it."),
+];
+
+/// Names of files in archives of other programs, by their ends: what such an archive is, and what to do with it.
+const ARCHIVES: [(&str, &str, &str); 3] = [
+    (
+        ".npy",
+        "a NumPy archive (.npz), not a SOG scene",
+        "Write its Gaussians as a 3DGS .ply; gsplat's export_splats does so. Points, depths and tracks in .npz belong to a \
+         capture.",
+    ),
+    ("data.pkl", "a checkpoint of PyTorch, which may hold code and is not read", "Export .ply from its program."),
+    (".usdc", "a USD archive", "Export .ply from the program that wrote it."),
+];
+
+/// Says what a file is that no reader takes. `name`: the file's, for formats without a mark; may be empty.
+pub fn unread(name: &str, bytes: &[u8]) -> Option<Error> {
+    let name = name.to_ascii_lowercase();
+    let by_mark = FOREIGN.iter().find(|f| (f.is)(bytes)).map(|f| (f.what, f.remedy));
+    let named = || ENDINGS.iter().find(|(ending, ..)| name.ends_with(ending)).map(|(_, what, remedy)| (*what, *remedy));
+    let (what, remedy) = by_mark.or_else(named)?;
+    Some(error(what, remedy))
+}
+
+/// Says what a zip archive without the files of a SOG scene is.
+pub(super) fn archive(names: &[String]) -> Option<Error> {
+    let (_, what, remedy) = ARCHIVES.iter().find(|(end, ..)| names.iter().any(|n| n.ends_with(end)))?;
+    Some(error(what, remedy))
+}
+
+fn error(what: &str, remedy: &str) -> Error {
+    Error::new(ErrorKind::Unsupported, format!("this is {what}")).remedy(remedy)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn files_of_other_programs_are_named() {
+        for (bytes, name, says) in [
+            (&b"SP4D\x01\0\0\0\x0c\x02\0\0{\"n\":40}"[..], "a.splat4d", "splats4D"),
+            (b"SP4D", "a.s4d", "splats4D"),
+            (b"\x894DGS1\r\n", "a.4dgs", "fourdgs"),
+            (b"glTF\x02\0\0\0", "a.glb", "glTF"),
+            (b"\0\x01\0\0", "A.KSPLAT", "GaussianSplats3D"),
+            (b"\x93NUMPY\x01\0", "a.npy", "NumPy"),
+            (b"\0\0\0\x18ftypisom", "a.mp4", "import"),
+        ] {
+            let error = unread(name, bytes).map(|e| e.to_string()).unwrap_or_default();
+            assert!(error.contains(says), "{name}: {error}");
+        }
+        assert!(unread("a.ply", b"ply\n").is_none() && unread("", b"").is_none());
+    }
+
+    #[test]
+    fn archives_of_other_programs_are_named() {
+        let names = |names: &[&str]| names.iter().map(|n| (*n).to_owned()).collect::<Vec<_>>();
+        let error = archive(&names(&["means3d.npy", "viewmats.npy"])).unwrap().to_string();
+        assert!(error.contains(".npz"), "{error}");
+        assert!(archive(&names(&["archive/data.pkl"])).unwrap().to_string().contains("PyTorch"));
+        assert!(archive(&names(&["means_l.webp"])).is_none());
+    }
+}
