@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Checks our files against other people's programs: PlayCanvas' splat-transform and gsplat.js, installed from npm into a
-# temporary folder. Not a part of the tests, because it needs a network and Node 20 or newer.
+# temporary folder with the Node 22 that splat-transform 3 needs. Not a part of the tests, because it needs a network.
 #
 #   examples/check-dialects.sh                 made-up Gaussians
 #   examples/check-dialects.sh FILE...         these as well: anything that splat4d opens
@@ -16,9 +16,10 @@ cargo build --release --manifest-path "$here/../Cargo.toml" -p splat4d-cli
 target="$(cargo metadata --format-version 1 --no-deps --manifest-path "$here/../Cargo.toml" |
     node -e 'process.stdout.write(JSON.parse(require("fs").readFileSync(0)).target_directory)')"
 ours="$target/release/splat4d"
-(cd "$work" && npm init -y >/dev/null && npm install --silent --no-fund --no-audit @playcanvas/splat-transform@2 gsplat@1)
-theirs() { node "$work/node_modules/@playcanvas/splat-transform/bin/cli.mjs" -q -w "$@" >/dev/null; }
-theirs_version="$(node "$work/node_modules/@playcanvas/splat-transform/bin/cli.mjs" --version | head -1)"
+(cd "$work" && npm init -y >/dev/null && npm install --silent --no-fund --no-audit node@22 @playcanvas/splat-transform@3 gsplat@1)
+node="$work/node_modules/.bin/node"
+theirs() { "$node" "$work/node_modules/@playcanvas/splat-transform/bin/cli.mjs" -q -w "$@" >/dev/null; }
+theirs_version="$("$node" "$work/node_modules/@playcanvas/splat-transform/bin/cli.mjs" --version | head -1)"
 tool() { node "$here/check-dialects.mjs" "$@"; }
 convert() { "$ours" convert -q "$@" 2>>"$work/warnings"; }
 failed=0

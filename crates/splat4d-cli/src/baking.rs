@@ -160,10 +160,11 @@ pub(crate) fn bake_like(
     console: &Console,
 ) -> anyhow::Result<(Packed, Option<bake::Likeness>)> {
     let scene = &source.scene;
-    let views = source.views()?;
-    let (stage, cameras) = (source.stage(&views), distinct(&views));
+    let cameras = compared(source)?;
+    let compare =
+        |packed: &Packed| likeness(scene, &playback::read(&packed.bytes)?, &cameras, packed.antialias, console);
     let packed = pack(source, title, baking, console)?;
-    let likeness = compare(scene, &packed.bytes, &stage, &cameras, packed.antialias, console)?;
+    let likeness = compare(&packed)?;
     let mut tried = vec![(packed, likeness)];
     let mut looks = baking.options.looks;
     while tried.len() < TRIES {
@@ -180,7 +181,7 @@ pub(crate) fn bake_like(
         }
         strict.options.looks = looks;
         let packed = pack(source, title, &strict, console)?;
-        let likeness = compare(scene, &packed.bytes, &stage, &cameras, packed.antialias, console)?;
+        let likeness = compare(&packed)?;
         let gained = likeness.zip(tried[tried.len() - 1].1).is_some_and(|(new, old)| new.psnr >= old.psnr + WORTH);
         if !gained {
             break;
@@ -242,24 +243,29 @@ fn say(report: &bake::Report, likeness: Option<&bake::Likeness>, bytes: u64, sec
     }
 }
 
-/// Reads the file back and compares what it shows with what the model shows.
-fn compare(
-    scene: &Scene<f32>,
-    bytes: &[u8],
-    stage: &Stage,
-    views: &[&View],
-    antialias: bool,
-    console: &Console,
-) -> anyhow::Result<Option<bake::Likeness>> {
-    let played = playback::read(bytes)?;
-    let mut cameras: Vec<Camera> = views
+/// The cameras by which a file is compared with its scene: those of the data set, else an orbit.
+pub(crate) fn compared(source: &Source) -> anyhow::Result<Vec<Camera>> {
+    let views = source.views()?;
+    let (stage, views) = (source.stage(&views), distinct(&views));
+    let cameras: Vec<Camera> = views
         .iter()
         .step_by(views.len().div_ceil(COMPARED_CAMERAS).max(1))
         .map(|v| v.camera.downscaled(v.camera.width.max(v.camera.height).div_ceil(COMPARED_SIDE).max(1)))
         .collect();
-    if cameras.is_empty() {
-        cameras = (0..COMPARED_CAMERAS).map(|i| stage.orbit(i as f64 / COMPARED_CAMERAS as f64)).collect();
-    }
+    Ok(match cameras[..] {
+        [] => (0..COMPARED_CAMERAS).map(|i| stage.orbit(i as f64 / COMPARED_CAMERAS as f64)).collect(),
+        _ => cameras,
+    })
+}
+
+/// Compares what a file shows with what its scene shows.
+pub(crate) fn likeness(
+    scene: &Scene<f32>,
+    played: &Scene<f32>,
+    cameras: &[Camera],
+    antialias: bool,
+    console: &Console,
+) -> anyhow::Result<Option<bake::Likeness>> {
     let [from, to] = scene.clip;
     // In the middle of equal parts: neither only on frames nor only between them.
     let mut times: Vec<f64> =
@@ -267,7 +273,7 @@ fn compare(
     times.dedup();
     let antialias = if antialias { Antialias::On } else { Antialias::Off };
     let mut cpu = device::cpu(RenderConfig { antialias, ..RenderConfig::default() });
-    Ok(bake::compare(scene, Shown::File(&played), &cameras, &times, cpu.as_mut(), &mut |done, total| {
+    Ok(bake::compare(scene, Shown::File(played), cameras, &times, cpu.as_mut(), &mut |done, total| {
         console.phase("comparing with the model", done, total);
     })?)
 }

@@ -41,6 +41,7 @@ pub mod play;
 pub mod render;
 pub mod scene;
 pub mod simd;
+pub mod text;
 pub mod wgsl;
 
 pub use error::{Error, ErrorKind, Result};

@@ -6,6 +6,7 @@ use crate::files::{self, either, grouped, human_bytes};
 use crate::sequence::{self, Pattern};
 use crate::source::{Source, not_empty};
 use serde_json::json;
+use splat4d::bake::Likeness;
 use splat4d::format::dialect::{self, WriteOptions};
 use splat4d::format::{self, DIALECTS, Dialect, Warnings, playback, spz};
 use splat4d::layers::{self, Scene, rotation_between};
@@ -82,6 +83,9 @@ pub(crate) struct Args {
     /// Leave out what a playback file says of where it comes from
     #[arg(long)]
     no_provenance: bool,
+    /// Refuse a file whose format cannot say when each Gaussian is seen, in place of fitting smooth fades
+    #[arg(long)]
+    exact: bool,
     /// Version of .spz to write
     #[arg(long, value_name = "V", default_value_t = spz::DEFAULT_VERSION,
           value_parser = clap::value_parser!(u32).range(2..=4))]
@@ -168,8 +172,8 @@ impl Args {
     pub(crate) fn plain(input: PathBuf, output: PathBuf) -> Self {
         let spz_version = spz::DEFAULT_VERSION;
         let (time, fps, from, to) = (None, None, None, None);
-        let (frames, up, sh, no_provenance) = (false, None, None, false);
-        Self { input, output, time, frames, fps, from, to, up, sh, no_provenance, spz_version }
+        let (frames, up, sh, no_provenance, exact) = (false, None, None, false, false);
+        Self { input, output, time, frames, fps, from, to, up, sh, no_provenance, exact, spz_version }
     }
 }
 
@@ -214,13 +218,16 @@ pub(crate) fn write(args: &Args, mut source: Source, console: &Console) -> anyho
         }
     }
     let cameras = first_camera(&source);
+    let compared = if target.moves() { baking::compared(&source)? } else { Vec::new() };
     let rotation = rotate(&mut source.scene, args.up, target, console);
-    let cameras: Vec<Camera> = cameras.into_iter().map(|c| rotated(c, &rotation)).collect();
+    let turned = |cameras: Vec<Camera>| cameras.into_iter().map(|c| rotated(c, &rotation)).collect::<Vec<_>>();
+    let (cameras, compared) = (turned(cameras.into_iter().collect()), turned(compared));
     if target == Target::Playback {
         return bake(source, args, rotation != IDENTITY, console);
     }
     let scene = &source.scene;
-    let writer = Writer { target, options: WriteOptions { spz_version: args.spz_version, cameras } };
+    let options = WriteOptions { spz_version: args.spz_version, cameras, exact: args.exact, ..WriteOptions::default() };
+    let writer = Writer { target, options };
     if let Some((pattern, _)) = pattern {
         return write_frames(args, scene, &pattern, &writer, console);
     }
@@ -248,7 +255,20 @@ pub(crate) fn write(args: &Args, mut source: Source, console: &Console) -> anyho
     };
     let (bytes, warnings) = writer.bytes(whole).map_err(|e| e.at(args.input.display()))?;
     warnings.lines().iter().for_each(|w| console.warn(&format!("{w}.")));
+    let likeness = match target {
+        Target::Dialect(dialect) if dialect.moves => like(&source, dialect, &bytes, &compared, console)?,
+        _ => None,
+    };
     files::write(&args.output, &bytes)?;
+    if let Some(l) = &likeness {
+        console.say(&format!(
+            "the file against the scene: {:.2} dB over {} renders, {:.2} dB in the worst ({:.2} s)",
+            l.psnr, l.pictures, l.worst_psnr, l.worst_time
+        ));
+    }
+    if target == Target::Dialect(spz::DIALECT) {
+        console.say(&format!("version {} of .spz {}", args.spz_version, spz::readers(args.spz_version)));
+    }
     let each = bytes.len() as f64 / whole.len().max(1) as f64;
     console.say(&format!(
         "{}: {} Gaussians, {} ({each:.1} bytes each)",
@@ -257,9 +277,24 @@ pub(crate) fn write(args: &Args, mut source: Source, console: &Console) -> anyho
         human_bytes(bytes.len() as u64)
     ));
     console.emit(&json!({"type": "converted", "format": target.name(), "gaussians": whole.len(),
-        "bytes": bytes.len(), "time": moment, "warnings": warnings.lines()}));
+        "bytes": bytes.len(), "time": moment, "likeness": likeness, "warnings": warnings.lines()}));
     console.written(&args.output);
     Ok(())
+}
+
+/// How like the scene a file of it looks.
+fn like(
+    source: &Source,
+    dialect: Dialect,
+    bytes: &[u8],
+    cameras: &[Camera],
+    console: &Console,
+) -> anyhow::Result<Option<Likeness>> {
+    let file = dialect.open(bytes)?.scene;
+    let antialias = source.run.as_ref().and_then(|run| run.recipe().ok()).is_some_and(|r| r.appearance.antialias);
+    let likeness = baking::likeness(&source.scene, &file, cameras, antialias, console)?;
+    console.clear();
+    Ok(likeness)
 }
 
 /// A playback file. The capture's cameras belong to the old axes: a scene that was rotated goes without them.

@@ -21,6 +21,7 @@ use crate::recipe::{MotionName, Recipe};
 use crate::step::tests::Made;
 use crate::{ErrorKind, Result};
 use serde_json::{Value, json};
+use splat4d::format::dialect::WriteOptions;
 use splat4d::layers::Scene;
 use splat4d::math::Rng;
 use splat4d::render::{Backend, Image, ImageGrads, RenderConfig, RenderGrads, Renderer, Shot, Wanted};
@@ -654,8 +655,8 @@ fn scenes_with_a_head_are_judged_with_it_and_refuse_what_cannot_hold_it() {
     for error in [
         bake(&scene, &Options::default(), &mut |_, _| {}).unwrap_err(),
         freeze(&scene, Time(0.1)).unwrap_err(),
-        splat4d::format::ply::write_stg(&scene, &mut Vec::new()).unwrap_err(),
-        splat4d::format::splatv::write(&scene, &[], &mut Vec::new()).unwrap_err(),
+        splat4d::format::ply::write_stg(&scene, &WriteOptions::default(), &mut Vec::new()).unwrap_err(),
+        splat4d::format::splatv::write(&scene, &WriteOptions::default(), &mut Vec::new()).unwrap_err(),
     ] {
         assert!(error.kind() == ErrorKind::Unsupported && error.to_string().contains("features=none"), "{error}");
     }

@@ -231,7 +231,8 @@ fn evaluate(expr: &Expr, scene: &Scene<f32>, looks: &Looks, context: &dyn Contex
             places(&|x| pixel(&camera, x).is_some_and(|(_, z)| z >= near.max(camera.near) && z <= *far))
         }
         Expr::Mask(file, name) => {
-            let (camera, mask) = (context.camera(name)?, context.mask(file)?);
+            let camera = context.camera(name)?;
+            let mask = context.mask(file, &camera)?;
             fits(&mask, &camera, file)?;
             places(&|x| on(&camera, &mask, x) == Some(true))
         }
@@ -305,16 +306,18 @@ fn on(camera: &Camera, mask: &Mask, x: [f64; 3]) -> Option<bool> {
     pixel(camera, x).map(|([u, v], _)| mask.white[v * mask.width + u])
 }
 
-fn fits(mask: &Mask, camera: &Camera, name: &str) -> Result<()> {
-    if [mask.width, mask.height] == [camera.width, camera.height] && mask.white.len() == mask.width * mask.height {
+/// Errors unless a mask of this size, [width, height], is one for pictures of `camera`.
+pub fn mask_fits([width, height]: [usize; 2], camera: &Camera, name: &str) -> Result<()> {
+    if [width, height] == [camera.width, camera.height] {
         return Ok(());
     }
-    Err(Error::input(format!(
-        "the mask has {} x {} pixels, its camera {} x {}",
-        mask.width, mask.height, camera.width, camera.height
-    ))
-    .at(name)
-    .remedy("Give a mask of the size of the camera's pictures"))
+    let what = format!("the mask has {width} x {height} pixels, its camera {} x {}", camera.width, camera.height);
+    Err(Error::input(what).at(name).remedy("Give a mask of the size of the camera's pictures"))
+}
+
+fn fits(mask: &Mask, camera: &Camera, name: &str) -> Result<()> {
+    assert_eq!(mask.white.len(), mask.width * mask.height, "a mask has a pixel for each place");
+    mask_fits([mask.width, mask.height], camera, name)
 }
 
 /// The Gaussians that lie on the subject in most pictures that have masks.

@@ -13,7 +13,7 @@ mod select;
 mod tests;
 
 pub use drag::{DragHandle, DragKey, Dragging};
-pub use look::{Selected, select};
+pub use look::{Selected, mask_fits, select};
 pub use select::{Expr, Lasso, within};
 
 use crate::layers::Scene;
@@ -286,8 +286,8 @@ pub trait Context {
         Err(missing(&format!("camera `{name}`"), "Give a run folder, or a file that brings its cameras along"))
     }
 
-    /// The mask picture of that name.
-    fn mask(&self, name: &str) -> Result<Mask> {
+    /// The mask picture of that name, for pictures of `camera`: of another size it need not be decoded.
+    fn mask(&self, name: &str, _camera: &Camera) -> Result<Mask> {
         Err(missing(&format!("mask `{name}`"), "Give a file that can be read"))
     }
 

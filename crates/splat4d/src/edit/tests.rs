@@ -29,7 +29,7 @@ impl Context for Bench {
     fn camera(&self, name: &str) -> Result<Camera> {
         if name == "front" { Ok(front()) } else { Err(missing(&format!("camera `{name}`"), "It has: front")) }
     }
-    fn mask(&self, _: &str) -> Result<Mask> {
+    fn mask(&self, _: &str, _: &Camera) -> Result<Mask> {
         Ok(self.mask.clone())
     }
     fn subject(&self) -> Result<Vec<(Camera, Time, Mask)>> {

@@ -16,8 +16,6 @@ use std::sync::Arc;
 
 /// Up in worlds whose y points down, as those of .ply.
 pub const Y_DOWN: [f64; 3] = [0.0, -1.0, 0.0];
-/// Up in worlds whose y points up.
-pub(crate) const Y_UP: [f64; 3] = [0.0, 1.0, 0.0];
 
 /// Files of Gaussians that other programs share. docs/formats.md tells what each holds and assumes.
 #[derive(Clone, Copy)]
@@ -27,7 +25,7 @@ pub struct Dialect {
     pub name: &'static str,
     /// How names of its files end, in lower case, dot included. It may end with another one's: the longer one counts.
     pub ending: &'static str,
-    /// The direction that its world calls up, by custom: no file says it.
+    /// The direction that its world calls up, by custom, where the file does not say it.
     pub up: [f64; 3],
     /// Whether it holds a moving scene.
     pub moves: bool,
@@ -57,11 +55,15 @@ pub struct WriteOptions {
     pub spz_version: u32,
     /// Views that a player may offer, in the axes of the scene.
     pub cameras: Vec<Camera>,
+    /// Refuse Gaussians whose fade in time the dialect cannot say exactly, in place of fitting one.
+    pub exact: bool,
+    /// Which way is up, for dialects whose files say so; [`Dialect::write`] takes it from the scene.
+    pub up: [f64; 3],
 }
 
 impl Default for WriteOptions {
     fn default() -> Self {
-        Self { spz_version: spz::DEFAULT_VERSION, cameras: Vec::new() }
+        Self { spz_version: spz::DEFAULT_VERSION, cameras: Vec::new(), exact: false, up: Y_DOWN }
     }
 }
 
@@ -70,6 +72,8 @@ impl Default for WriteOptions {
 pub struct Opened {
     /// The scene, in the file's own axes; `up` says which way they lie.
     pub scene: Scene<f32>,
+    /// Which way is up, where the file itself says so.
+    pub up: Option<[f64; 3]>,
     /// Metadata of a .ply.
     pub ply: Option<PlyInfo>,
     /// Warnings: values that could not be read or had to be assumed.
@@ -78,13 +82,13 @@ pub struct Opened {
 
 impl From<(Scene<f32>, Warnings)> for Opened {
     fn from((scene, warnings): (Scene<f32>, Warnings)) -> Self {
-        Self { scene, ply: None, warnings }
+        Self { scene, up: None, ply: None, warnings }
     }
 }
 
 impl From<(Params, Warnings)> for Opened {
     fn from((params, warnings): (Params, Warnings)) -> Self {
-        Self { scene: still(params), ply: None, warnings }
+        Self { scene: still(params), up: None, ply: None, warnings }
     }
 }
 
@@ -119,7 +123,7 @@ impl Dialect {
     /// Opens a file. Errors: its reader's.
     pub fn open(&self, bytes: &[u8]) -> Result<Opened> {
         let mut opened = (self.read)(bytes)?;
-        opened.scene.up = self.up;
+        opened.scene.up = opened.up.unwrap_or(self.up);
         Ok(opened)
     }
 
@@ -139,9 +143,10 @@ impl Dialect {
     ///
     /// Errors: it is only read; it cannot hold the scene; the sink's.
     pub fn write(&self, scene: &Scene<f32>, options: &WriteOptions, out: &mut dyn Write) -> Result<Warnings> {
+        let options = WriteOptions { up: scene.up, ..options.clone() };
         match self.writer {
-            Writer::Moment(write) => write(&moment(scene, Time(scene.clip[0]))?, options, out),
-            Writer::Moving(write) => write(scene, options, out),
+            Writer::Moment(write) => write(&moment(scene, Time(scene.clip[0]))?, &options, out),
+            Writer::Moving(write) => write(scene, &options, out),
             Writer::None(_) => self.check_written().map(|()| Warnings::default()),
         }
     }

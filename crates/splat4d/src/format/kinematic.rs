@@ -3,9 +3,10 @@
 
 use super::bytes::sound_rows;
 use super::dialect::Y_DOWN;
+use super::fade::Seen;
 use super::warnings::Warnings;
-use crate::layers::{ALWAYS, Layer, Scene, with_polynomial};
-use crate::math::quat;
+use crate::layers::{Layer, Scene, with_polynomial};
+use crate::math::{Real, quat};
 use crate::motion::{Spacetime, SpacetimeSpec};
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::{GEOMETRY, LIFE, LifeKind, Params, SH};
@@ -14,6 +15,8 @@ use std::sync::Arc;
 
 /// Width, in clips, of a fade that stands for "lives for ever": over the clip it dims by 1e-8.
 pub(super) const FOREVER: f64 = 1e4;
+/// Least logit of an opacity that was fitted: nothing is seen of it.
+const LEAST_LOGIT: f64 = -20.0;
 /// Narrowest fade that is believed, in clips: below it lies no number, and nothing to see.
 const NARROWEST: f64 = 1e-7;
 /// Assumed length of a file without a clock of its own: one second.
@@ -85,10 +88,16 @@ impl Moving {
 /// All Gaussians of a scene on the clock of a file called `name`.
 ///
 /// Errors: a layer's motion or life is not of this kind; the message says what to do.
-pub(super) fn rows(scene: &Scene<f32>, clock: Clock, name: &str, warnings: &mut Warnings) -> Result<Vec<Moving>> {
+pub(super) fn rows(
+    scene: &Scene<f32>,
+    clock: Clock,
+    name: &str,
+    exact: bool,
+    warnings: &mut Warnings,
+) -> Result<Vec<Moving>> {
     scene.without_head(name)?;
     let mut out = Vec::with_capacity(scene.len());
-    let mut shaded = 0;
+    let (mut shaded, mut fitted, mut unseen) = (0, 0, 0);
     let powers: [f64; 3] = std::array::from_fn(|k| clock.duration.powi(k as i32 + 1));
     for layer in &scene.layers {
         let converted = with_polynomial(layer).map_err(|e| e.at(format_args!("layer `{}`", layer.name)))?;
@@ -97,12 +106,6 @@ pub(super) fn rows(scene: &Scene<f32>, clock: Clock, name: &str, warnings: &mut 
         let Some(motion) = layer.motion.polynomial() else {
             return Err(cannot_hold(layer, name, &format!("the motion `{}`", layer.motion.spec().name())));
         };
-        if layer.life == LifeKind::Interval {
-            return Err(cannot_hold(layer, name, "lives of the kind `interval`, which have a flat top"));
-        }
-        if layer.span != ALWAYS {
-            return Err(cannot_hold(layer, name, "a span of time outside of which it is not drawn"));
-        }
         shaded += if layer.params[SH].width() > 3 { layer.params.len() } else { 0 };
         let p = &layer.params;
         for row in sound_rows(p, warnings) {
@@ -110,11 +113,30 @@ pub(super) fn rows(scene: &Scene<f32>, clock: Clock, name: &str, warnings: &mut 
             // Raw numbers may be of any length; file programs differ in when they normalise, unit ones suit all.
             let (quat, norm) = quat::normalize(geometry.read::<4>(row, QUAT).map(f64::from));
             let norm = if norm > 0.0 { norm } else { 1.0 };
-            let (center, width) = match layer.life {
-                LifeKind::Infinite => (motion.origin, FOREVER * clock.duration),
-                // exp(−½(Δ/w)²) = exp(−(Δ/s)²) at s = √2·w.
-                LifeKind::GaussHalf => (life(p, row, 0), life(p, row, 1).exp() * std::f64::consts::SQRT_2),
-                _ => (life(p, row, 0), life(p, row, 1).exp()),
+            let columns = layer.life.columns().len();
+            let seen = Seen {
+                kind: layer.life,
+                life: std::array::from_fn(|k| if k < columns { f64::from(p[LIFE].get(row, k)) } else { 0.0 }),
+                opacity: f64::from(geometry.get(row, OPACITY)).sigmoid(),
+                span: layer.span,
+                cross_fade: layer.cross_fade,
+                clip: scene.clip,
+            };
+            // The path is told from the life's centre, or from the layer's own origin.
+            let center = if columns > 0 { seen.life[0] } else { motion.origin };
+            let fade = match seen.exact() {
+                Some(fade) => fade,
+                None if exact => {
+                    return Err(cannot_hold(layer, name, "lives that have a flat top or end at once"));
+                }
+                None => {
+                    let Some(fade) = seen.fit() else {
+                        unseen += 1;
+                        continue;
+                    };
+                    fitted += 1;
+                    fade
+                }
             };
             let mut moving = Moving {
                 mean: geometry.read::<3>(row, 0).map(f64::from),
@@ -125,8 +147,11 @@ pub(super) fn rows(scene: &Scene<f32>, clock: Clock, name: &str, warnings: &mut 
                 path: [[0.0; 3]; 3],
                 turn: [0.0; 4],
                 center: (center - clock.clip[0]) / clock.duration,
-                width: (width / clock.duration).clamp(NARROWEST, FOREVER),
+                width: (fade.width / clock.duration).clamp(NARROWEST, FOREVER),
             };
+            if fade.opacity != seen.opacity {
+                moving.opacity_logit = (fade.opacity / (1.0 - fade.opacity)).ln().max(LEAST_LOGIT) as f32;
+            }
             if let Some(path) = motion.velocities {
                 for (k, power) in powers.iter().enumerate().take(motion.order) {
                     moving.path[k] = p[path].read::<3>(row, 3 * k).map(|v| f64::from(v) * power);
@@ -136,18 +161,18 @@ pub(super) fn rows(scene: &Scene<f32>, clock: Clock, name: &str, warnings: &mut 
                 let rate = p[rates].read::<4>(row, 0);
                 moving.turn = rate.map(|w| f64::from(w) * clock.duration / norm);
             }
-            out.push(moving);
+            let there = (fade.center - clock.clip[0]) / clock.duration;
+            out.push(moving.recentered(there));
         }
     }
+    let what = "have a life with a flat top, or one that ends at once: smooth fades were fitted (--exact refuses them)";
+    warnings.counted(fitted, scene.len(), what);
+    warnings.counted(unseen, scene.len(), "are never seen within the clip and were left out");
     if shaded > 0 {
         let what = "lose their view dependence (spherical harmonics above degree 0)";
         warnings.counted(shaded, scene.len(), &format!("{what}: {name} holds one colour each"));
     }
     Ok(out)
-}
-
-fn life(p: &Params, row: usize, column: usize) -> f64 {
-    f64::from(p[LIFE].get(row, column))
 }
 
 fn cannot_hold(layer: &Layer<f32>, name: &str, what: &str) -> Error {
@@ -186,7 +211,7 @@ pub(super) fn scene(rows: &[Moving], clock: Clock) -> Result<Scene<f32>> {
 pub(super) mod tests {
     use super::*;
     use crate::format::samples::gaussians;
-    use crate::layers::{Evaluation, to_native4d};
+    use crate::layers::{ALWAYS, Evaluation, to_native4d};
     use crate::math::{Rng, Sim3};
     use crate::motion::native4d::Native4dSpec;
     use crate::motion::{Spec, build};
@@ -248,7 +273,7 @@ pub(super) mod tests {
         for life in [LifeKind::Infinite, LifeKind::GaussHalf, LifeKind::GaussOne] {
             for (order, rotation) in [(0, false), (1, true), (3, true)] {
                 let scene = moving(50, life, order, rotation);
-                let rows = rows(&scene, clock, "x", &mut Warnings::default()).unwrap();
+                let rows = rows(&scene, clock, "x", true, &mut Warnings::default()).unwrap();
                 let back = super::scene(&rows, clock).unwrap();
                 let [mean, cov, opacity] = apart(&scene, &back);
                 assert!(mean < 2e-5 && cov < 2e-5 && opacity < 2e-6, "{life:?} {order}: {mean} {cov} {opacity}");
@@ -270,21 +295,30 @@ pub(super) mod tests {
         let mut native = scene.clone();
         native.layers[0] = to_native4d(&scene.layers[0], spec).unwrap();
         for own in [scene, native] {
-            let rows = rows(&own, clock, "x", &mut Warnings::default()).unwrap();
+            let rows = rows(&own, clock, "x", true, &mut Warnings::default()).unwrap();
             let [mean, cov, opacity] = apart(&own, &super::scene(&rows, clock).unwrap());
             assert!(mean < 2e-4 && cov < 2e-4 && opacity < 2e-4, "{:?}: {mean} {cov} {opacity}", own.layers[0]);
         }
     }
 
     #[test]
-    fn what_cannot_be_held_is_named_with_the_way_out() {
+    fn flat_tops_and_cuts_are_fitted_or_refused() {
         let clock = Clock { clip: [2.0, 5.0], fps: 25.0, duration: 3.0 };
-        let scene = moving(5, LifeKind::Interval, 1, false);
-        let message = rows(&scene, clock, ".splatv", &mut Warnings::default()).unwrap_err().to_string();
-        assert!(message.contains("`flying`") && message.contains("interval") && message.contains("--frames"));
-        let mut scene = moving(5, LifeKind::Infinite, 1, false);
-        scene.layers[0].span = [2.0, 3.0];
-        let message = rows(&scene, clock, ".splatv", &mut Warnings::default()).unwrap_err().to_string();
-        assert!(message.contains("span"), "{message}");
+        let mut cut = moving(30, LifeKind::Infinite, 1, true);
+        cut.layers[0].span = [2.0, 3.0];
+        for scene in [moving(30, LifeKind::Interval, 1, true), cut] {
+            let message = rows(&scene, clock, ".splatv", true, &mut Warnings::default()).unwrap_err().to_string();
+            assert!(message.contains("`flying`") && message.contains("flat top") && message.contains("--frames"));
+            let mut warnings = Warnings::default();
+            let rows = rows(&scene, clock, ".splatv", false, &mut warnings).unwrap();
+            assert_eq!(rows.len(), 30);
+            let said = warnings.lines().join("\n");
+            assert!(said.contains("of 30 Gaussians have a life with a flat top"), "{said}");
+            // Paths and shapes are what they were, told from another centre.
+            let back = super::scene(&rows, clock).unwrap();
+            let whole = Scene { layers: vec![Layer { span: ALWAYS, ..scene.layers[0].clone() }], ..scene.clone() };
+            let [mean, cov, _] = apart(&whole, &back);
+            assert!(mean < 1e-4 && cov < 1e-4, "{mean} {cov}");
+        }
     }
 }

@@ -7,6 +7,7 @@
 pub(crate) mod arrays;
 mod bytes;
 pub mod dialect;
+mod fade;
 pub mod foreign;
 mod half;
 mod kinematic;
@@ -73,7 +74,7 @@ mod tests {
         let moving = kinematic::tests::moving(20, crate::scene::LifeKind::GaussOne, 1, false);
         let (mut own, mut foreign) = (Vec::new(), Vec::new());
         scene::write(&moving, &mut own).unwrap();
-        splatv::write(&moving, &[], &mut foreign).unwrap();
+        splatv::write(&moving, &dialect::WriteOptions::default(), &mut foreign).unwrap();
         for bytes in [&own, &foreign] {
             assert_eq!(open(bytes).unwrap().len(), 20);
         }

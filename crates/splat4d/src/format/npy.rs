@@ -13,6 +13,8 @@ const MAGIC: &[u8; 6] = b"\x93NUMPY";
 const ALIGN: usize = 64;
 /// Longest header that is believed; NumPy itself refuses headers above 10,000 bytes.
 const MAX_HEADER: usize = 1 << 16;
+/// Longest array of an archive that is inflated, bytes: as long as a file may be that is not compressed.
+const MAX_MEMBER: usize = 512 << 20;
 /// Most axes; NumPy allows 64.
 const MAX_AXES: usize = 64;
 
@@ -86,13 +88,13 @@ impl Npy {
     ///
     /// Errors: no zip archive, damaged, or without that array; those of [`read`](Self::read).
     pub fn read_member(archive: &[u8], name: &str) -> Result<Self> {
-        let files = super::zip::read(archive)?;
-        let file = files.get(&format!("{name}.npy")).ok_or_else(|| {
-            let have: Vec<&str> = files.keys().map(|n| n.trim_end_matches(".npy")).collect();
+        let files = super::zip::Archive::open(archive)?;
+        let file = files.file(&format!("{name}.npy"), MAX_MEMBER).ok_or_else(|| {
+            let have: Vec<String> = files.names().iter().map(|n| n.trim_end_matches(".npy").to_owned()).collect();
             Error::input(format!("the archive has no array `{name}`, but {}", have.join(", ")))
                 .remedy(format!("Save it with numpy.savez(path, {name}=...)"))
         })?;
-        Self::read(file)
+        Self::read(&file?)
     }
 
     /// How many numbers the array holds.

@@ -8,7 +8,7 @@
 //! Source: antimatter15/splaTV and gsplat.js (MIT), their shaders.
 
 use super::bytes::{Cursor, byte_of_dc, byte_of_logit, dc_of_byte, f32_at, logit_of_byte};
-use super::dialect::{Dialect, Opened, Writer, Y_DOWN};
+use super::dialect::{Dialect, Opened, WriteOptions, Writer, Y_DOWN};
 use super::half::{f16_to_f32, f32_to_f16};
 use super::kinematic::{Clock, Moving, rows, scene};
 use super::warnings::Warnings;
@@ -26,7 +26,7 @@ pub const DIALECT: Dialect = Dialect {
     moves: true,
     mark: Some(|bytes| bytes.starts_with(&MAGIC)),
     read: |bytes| read(bytes).map(Opened::from),
-    writer: Writer::Moving(|scene, options, mut out| write(scene, &options.cameras, &mut out)),
+    writer: Writer::Moving(|scene, options, mut out| write(scene, options, &mut out)),
 };
 
 /// First four bytes.
@@ -40,17 +40,17 @@ const MOST_JSON: usize = 1 << 20;
 /// Smallest linear scale: f16 ends at 6e-8.
 const SMALLEST_SCALE: f32 = 6e-8;
 
-/// Writes a moving scene. `cameras` are offered by the players; without any, the first of [`Scene::clip`] is looked at
-/// from afar.
+/// Writes a moving scene. The options' cameras are offered by the players; without any, the first of [`Scene::clip`] is
+/// looked at from afar.
 ///
-/// Errors: the scene moves or lives in a way that the format cannot say; the sink's.
-pub fn write(scene: &Scene<f32>, cameras: &[Camera], out: &mut impl Write) -> Result<Warnings> {
+/// Errors: the scene moves in a way that the format cannot say, or lives so and may not be fitted; the sink's.
+pub fn write(scene: &Scene<f32>, options: &WriteOptions, out: &mut impl Write) -> Result<Warnings> {
     let mut warnings = Warnings::default();
     let span = scene.clip[1] - scene.clip[0];
     let fps = if scene.fps > 0.0 { scene.fps } else { crate::scene::time::DEFAULT_FPS };
     // A single moment still needs a clock to stand on.
     let clock = Clock { clip: scene.clip, fps, duration: if span > 0.0 { span } else { 1.0 } };
-    let rows = rows(scene, clock, ".splatv", &mut warnings)?;
+    let rows = rows(scene, clock, ".splatv", options.exact, &mut warnings)?;
     let height = (rows.len() * ROW / 16).div_ceil(TEXTURE_WIDTH).max(1);
     let size = height * TEXTURE_WIDTH * 16;
     let mut texture = Vec::with_capacity(size);
@@ -64,7 +64,7 @@ pub fn write(scene: &Scene<f32>, cameras: &[Camera], out: &mut impl Write) -> Re
     texture.resize(size, 0);
     warnings.counted(colored, rows.len(), "had a base colour outside 0 to 1, which was clipped");
     warnings.counted(saturated, rows.len(), "had a path, turn or scale beyond 65504, which was clipped");
-    let cameras: Vec<Value> = match cameras {
+    let cameras: Vec<Value> = match &options.cameras[..] {
         [] => vec![camera_json(0, &default_camera(&rows))],
         some => some.iter().enumerate().map(|(i, c)| camera_json(i, c)).collect(),
     };
@@ -249,7 +249,7 @@ mod tests {
         for life in [LifeKind::Infinite, LifeKind::GaussHalf, LifeKind::GaussOne] {
             let scene = moving(1500, life, 3, true);
             let mut file = Vec::new();
-            write(&scene, &[], &mut file).unwrap();
+            write(&scene, &WriteOptions::default(), &mut file).unwrap();
             let (back, warnings) = read(&file).unwrap();
             assert_eq!((back.len(), back.clip, back.fps), (1500, scene.clip, scene.fps));
             assert!(warnings.lines().is_empty(), "{warnings:?}");
@@ -263,7 +263,7 @@ mod tests {
     fn the_half_in_the_fade_is_converted() {
         let scene = moving(1, LifeKind::GaussHalf, 0, false);
         let mut file = Vec::new();
-        write(&scene, &[], &mut file).unwrap();
+        write(&scene, &WriteOptions::default(), &mut file).unwrap();
         let (back, _) = read(&file).unwrap();
         let [ours, theirs] = [&scene, &back].map(|s| f64::from(s.layers[0].params[LIFE].get(0, 1)).exp());
         assert!((theirs / ours - std::f64::consts::SQRT_2).abs() < 1e-3, "{ours} {theirs}");
@@ -272,7 +272,7 @@ mod tests {
     #[test]
     fn the_layout_is_the_players() {
         let mut file = Vec::new();
-        write(&moving(1025, LifeKind::Infinite, 1, false), &[], &mut file).unwrap();
+        write(&moving(1025, LifeKind::Infinite, 1, false), &WriteOptions::default(), &mut file).unwrap();
         let length = u32::from_le_bytes(file[4..8].try_into().unwrap()) as usize;
         let text: Value = serde_json::from_slice(&file[8..8 + length]).unwrap();
         assert_eq!((&text[0]["texwidth"], &text[0]["texheight"]), (&json!(4096), &json!(2)));
@@ -283,7 +283,7 @@ mod tests {
     #[test]
     fn damaged_files_never_panic() {
         let mut file = Vec::new();
-        write(&moving(40, LifeKind::GaussOne, 3, true), &[], &mut file).unwrap();
+        write(&moving(40, LifeKind::GaussOne, 3, true), &WriteOptions::default(), &mut file).unwrap();
         file.truncate(4096);
         let hand = by_hand();
         for mutant in mutants(&file, 300, "splatv").chain(mutants(&hand, 1000, "splatv hand")) {

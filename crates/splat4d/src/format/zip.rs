@@ -1,5 +1,8 @@
 //! Just enough of zip for `.sog` and `.npz`: stored and deflated files, named in the central directory.
 //!
+//! [`Archive::open`] reads the directory alone and refuses files whose bytes overlap; a file is inflated when it is asked for,
+//! up to the length that its format needs. An archive of 200 kB whose files share one body would otherwise become 200 GB.
+//!
 //! Source: PKWARE's APPNOTE 6.3.10, sections 4.3 and 4.4. Own code, because a general crate brings ciphers and ten other
 //! compressions, and this is a page.
 
@@ -9,6 +12,7 @@ use flate2::read::DeflateDecoder;
 use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::io::Read;
+use std::ops::Range;
 
 /// The files of an archive: name → bytes.
 pub type Files<'a> = BTreeMap<String, Cow<'a, [u8]>>;
@@ -19,6 +23,8 @@ pub const MAGIC: [u8; 4] = *b"PK\x03\x04";
 const ENTRY: [u8; 4] = *b"PK\x01\x02";
 /// First bytes of the end record.
 const END: [u8; 4] = *b"PK\x05\x06";
+/// Length of a local header without name and extra field.
+const LOCAL_HEADER: usize = 30;
 /// Length of the end record without its comment, and the longest comment.
 const END_LENGTH: usize = 22;
 const MOST_COMMENT: usize = 65_535;
@@ -29,43 +35,87 @@ const MOST_RATIO: usize = 1032;
 /// Most files that are looked at: a SOG scene has eight, an archive of arrays an array each.
 const MOST_FILES: u16 = 4096;
 
-/// All files. Errors: damaged, encrypted, or files that claim to be larger than deflate can make them.
-pub(super) fn read(bytes: &[u8]) -> Result<Files<'_>> {
-    let tail = bytes.len().saturating_sub(END_LENGTH + MOST_COMMENT);
-    let end = bytes[tail..].windows(END.len()).rposition(|w| w == END);
-    let end = tail + end.ok_or_else(|| damaged("the zip file has no end: it is cut short"))?;
-    let mut c = Cursor::new(&bytes[end..], "zip file");
-    c.take(10)?;
-    let count = c.u16()?;
-    let (length, offset) = (c.u32()?, c.u32()?);
-    if count == u16::MAX || length == ZIP64 || offset == ZIP64 || count > MOST_FILES {
-        return Err(Error::new(ErrorKind::Unsupported, format!("the zip file holds {count} files or is a zip64"))
-            .remedy("Fewer files and less than 4 GiB are read; save it again."));
-    }
-    let directory = bytes.get(offset as usize..end);
-    let mut c = Cursor::new(directory.ok_or_else(|| damaged("the zip's directory lies outside"))?, "zip directory");
-    let mut files = Files::new();
-    for _ in 0..count {
-        if c.take(4)? != ENTRY {
-            return Err(damaged("the zip's directory has a wrong entry"));
-        }
-        c.take(4)?;
-        let (flags, method) = (c.u16()?, c.u16()?);
-        c.take(8)?;
-        let (packed, plain) = (c.u32()? as usize, c.u32()? as usize);
-        let (name, extra, comment) = (c.u16()?, c.u16()?, c.u16()?);
-        c.take(8)?;
-        let offset = c.u32()? as usize;
-        let name = String::from_utf8_lossy(c.take(name.into())?).into_owned();
-        c.take(usize::from(extra) + usize::from(comment))?;
-        let file = body(bytes, offset, packed).and_then(|b| unpack(b, plain, flags, method));
-        files.insert(name.clone(), file.map_err(|e| e.at(name))?);
-    }
-    Ok(files)
+/// An archive's directory.
+pub(super) struct Archive<'a> {
+    bytes: &'a [u8],
+    entries: BTreeMap<String, Entry>,
 }
 
-/// The packed bytes of the file whose local header stands at `offset`.
-fn body(bytes: &[u8], offset: usize, packed: usize) -> Result<&[u8]> {
+/// A file of the directory.
+struct Entry {
+    /// Where its packed bytes lie.
+    body: Range<usize>,
+    /// Length that the directory states for the plain bytes.
+    plain: usize,
+    flags: u16,
+    method: u16,
+}
+
+impl<'a> Archive<'a> {
+    /// Reads the directory. Errors: damaged, too many files, files whose bytes overlap or whose names are equal.
+    pub(super) fn open(bytes: &'a [u8]) -> Result<Self> {
+        let tail = bytes.len().saturating_sub(END_LENGTH + MOST_COMMENT);
+        let end = bytes[tail..].windows(END.len()).rposition(|w| w == END);
+        let end = tail + end.ok_or_else(|| damaged("the zip file has no end: it is cut short"))?;
+        let mut c = Cursor::new(&bytes[end..], "zip file");
+        c.take(10)?;
+        let count = c.u16()?;
+        let (length, offset) = (c.u32()?, c.u32()?);
+        if count == u16::MAX || length == ZIP64 || offset == ZIP64 || count > MOST_FILES {
+            return Err(Error::new(ErrorKind::Unsupported, format!("the zip file holds {count} files or is a zip64"))
+                .remedy("Fewer files and less than 4 GiB are read; save it again."));
+        }
+        let directory = bytes.get(offset as usize..end);
+        let mut c = Cursor::new(directory.ok_or_else(|| damaged("the zip's directory lies outside"))?, "zip directory");
+        let (mut entries, mut places) = (BTreeMap::new(), Vec::new());
+        for _ in 0..count {
+            if c.take(4)? != ENTRY {
+                return Err(damaged("the zip's directory has a wrong entry"));
+            }
+            c.take(4)?;
+            let (flags, method) = (c.u16()?, c.u16()?);
+            c.take(8)?;
+            let (packed, plain) = (c.u32()? as usize, c.u32()? as usize);
+            let (name, extra, comment) = (c.u16()?, c.u16()?, c.u16()?);
+            c.take(8)?;
+            let start = c.u32()? as usize;
+            let name = String::from_utf8_lossy(c.take(name.into())?).into_owned();
+            c.take(usize::from(extra) + usize::from(comment))?;
+            let body = body(bytes, start, packed).map_err(|e| e.at(&name))?;
+            places.push(start..body.end);
+            if entries.contains_key(&name) {
+                return Err(damaged(format!("it has two files `{name}`")));
+            }
+            entries.insert(name, Entry { body, plain, flags, method });
+        }
+        places.sort_by_key(|p| p.start);
+        // The directory follows the last file.
+        let ends = places.iter().skip(1).map(|p| p.start).chain([offset as usize]);
+        if places.iter().zip(ends).any(|(place, next)| place.end > next) {
+            return Err(damaged("its files overlap"));
+        }
+        Ok(Self { bytes, entries })
+    }
+
+    /// Names of all files.
+    pub(super) fn names(&self) -> Vec<String> {
+        self.entries.keys().cloned().collect()
+    }
+
+    /// Length of a file in the archive, bytes.
+    pub(super) fn packed(&self, name: &str) -> Option<usize> {
+        self.entries.get(name).map(|e| e.body.len())
+    }
+
+    /// A file of at most `most` plain bytes. `None`: no such file. Errors: damaged, encrypted, or longer.
+    pub(super) fn file(&self, name: &str, most: usize) -> Option<Result<Cow<'a, [u8]>>> {
+        let entry = self.entries.get(name)?;
+        Some(entry.unpack(&self.bytes[entry.body.clone()], most).map_err(|e| e.at(name)))
+    }
+}
+
+/// Where the packed bytes of the file lie whose local header stands at `offset`.
+fn body(bytes: &[u8], offset: usize, packed: usize) -> Result<Range<usize>> {
     let mut c = Cursor::new(bytes.get(offset..).unwrap_or_default(), "zip file");
     if c.take(4)? != MAGIC {
         return Err(damaged("the zip's directory points to no file"));
@@ -74,29 +124,39 @@ fn body(bytes: &[u8], offset: usize, packed: usize) -> Result<&[u8]> {
     c.take(22)?;
     let (name, extra) = (c.u16()?, c.u16()?);
     c.take(usize::from(name) + usize::from(extra))?;
-    c.take(packed)
+    let start = offset + LOCAL_HEADER + usize::from(name) + usize::from(extra);
+    c.take(packed)?;
+    Ok(start..start + packed)
 }
 
-fn unpack(body: &[u8], plain: usize, flags: u16, method: u16) -> Result<Cow<'_, [u8]>> {
-    if flags & 1 != 0 {
-        return Err(Error::new(ErrorKind::Unsupported, "the file is encrypted").remedy("Unzip it with its password."));
-    }
-    match method {
-        0 => Ok(Cow::Borrowed(body)),
-        8 => {
-            if plain > MOST_RATIO * body.len() + 1 {
-                return Err(damaged(format!("a file of {} bytes cannot become one of {plain}", body.len())));
-            }
-            let mut out = Vec::new();
-            let read = DeflateDecoder::new(body).take(plain as u64 + 1).read_to_end(&mut out);
-            read.map_err(|e| damaged(format!("a file cannot be inflated ({e})")))?;
-            if out.len() != plain {
-                return Err(damaged(format!("a file should have {plain} bytes, but has {}", out.len())));
-            }
-            Ok(Cow::Owned(out))
+impl Entry {
+    fn unpack<'a>(&self, body: &'a [u8], most: usize) -> Result<Cow<'a, [u8]>> {
+        let Self { plain, flags, method, .. } = *self;
+        if flags & 1 != 0 {
+            return Err(
+                Error::new(ErrorKind::Unsupported, "the file is encrypted").remedy("Unzip it with its password.")
+            );
         }
-        other => Err(Error::new(ErrorKind::Unsupported, format!("the file is compressed by zip method {other}"))
-            .remedy("Zip it again with deflate, or save it again.")),
+        if plain.max(if method == 0 { body.len() } else { 0 }) > most {
+            return Err(damaged(format!("a file of {plain} bytes is longer than the {most} that it can need")));
+        }
+        match method {
+            0 => Ok(Cow::Borrowed(body)),
+            8 => {
+                if plain > MOST_RATIO * body.len() + 1 {
+                    return Err(damaged(format!("a file of {} bytes cannot become one of {plain}", body.len())));
+                }
+                let mut out = Vec::new();
+                let read = DeflateDecoder::new(body).take(plain as u64 + 1).read_to_end(&mut out);
+                read.map_err(|e| damaged(format!("a file cannot be inflated ({e})")))?;
+                if out.len() != plain {
+                    return Err(damaged(format!("a file should have {plain} bytes, but has {}", out.len())));
+                }
+                Ok(Cow::Owned(out))
+            }
+            other => Err(Error::new(ErrorKind::Unsupported, format!("the file is compressed by zip method {other}"))
+                .remedy("Zip it again with deflate, or save it again.")),
+        }
     }
 }
 

@@ -11,7 +11,7 @@ use super::{NORMAL_NAMES, rows};
 use crate::Error;
 use crate::Result;
 use crate::format::bytes::SH_C0;
-use crate::format::dialect::{Dialect, Opened, Writer, Y_DOWN};
+use crate::format::dialect::{Dialect, Opened, WriteOptions, Writer, Y_DOWN};
 use crate::format::kinematic::{Clock, Moving, rows as moving_rows, scene};
 use crate::format::warnings::Warnings;
 use crate::layers::Scene;
@@ -25,7 +25,7 @@ pub const STG: Dialect = Dialect {
     moves: true,
     mark: Some(is_stg),
     read: |bytes| read_stg(bytes).map(Opened::from),
-    writer: Writer::Moving(|scene, _, mut out| write_stg(scene, &mut out)),
+    writer: Writer::Moving(|scene, options, mut out| write_stg(scene, options, &mut out)),
 };
 
 /// Numbers of a row as [`names`] lists them.
@@ -126,13 +126,13 @@ fn unpack(x: &[f64; WIDTH]) -> Moving {
     }
 }
 
-/// Writes a moving scene. Errors: it moves or lives in a way that the format cannot say; the sink's.
-pub fn write_stg(scene: &Scene<f32>, out: &mut impl Write) -> Result<Warnings> {
+/// Writes a moving scene. Errors: it moves in a way that the format cannot say, or lives so and may not be fitted; the sink's.
+pub fn write_stg(scene: &Scene<f32>, options: &WriteOptions, out: &mut impl Write) -> Result<Warnings> {
     let mut warnings = Warnings::default();
     let fps = if scene.fps > 0.0 { scene.fps } else { crate::scene::time::DEFAULT_FPS };
     let clip = scene.clip;
     let clock = Clock { clip, fps, duration: (clip[1] - clip[0]).max(0.0) + 1.0 / fps };
-    let rows = moving_rows(scene, clock, "STG's .ply", &mut warnings)?;
+    let rows = moving_rows(scene, clock, "STG's .ply", options.exact, &mut warnings)?;
     let mut text = format!(
         "ply\nformat binary_little_endian 1.0\ncomment {CLOCK} {} {} fps {fps}\nelement vertex {}\n",
         clip[0],
@@ -172,7 +172,7 @@ mod tests {
         for life in [LifeKind::Infinite, LifeKind::GaussHalf, LifeKind::GaussOne] {
             let scene = moving(300, life, 3, true);
             let mut file = Vec::new();
-            write_stg(&scene, &mut file).unwrap();
+            write_stg(&scene, &WriteOptions::default(), &mut file).unwrap();
             assert!(is_stg(&file));
             let (back, warnings) = read_stg(&file).unwrap();
             assert_eq!((back.len(), back.clip, back.fps), (300, scene.clip, scene.fps));
@@ -217,7 +217,7 @@ mod tests {
     #[test]
     fn damaged_files_never_panic() {
         let mut file = Vec::new();
-        write_stg(&moving(10, LifeKind::GaussOne, 3, true), &mut file).unwrap();
+        write_stg(&moving(10, LifeKind::GaussOne, 3, true), &WriteOptions::default(), &mut file).unwrap();
         for mutant in mutants(&file, 1500, "stg") {
             let _ = is_stg(&mutant);
             if let Ok((scene, _)) = read_stg(&mutant) {

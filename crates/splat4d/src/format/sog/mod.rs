@@ -13,6 +13,7 @@ pub(super) mod tests;
 
 use super::bytes::logit_of_byte;
 use super::dialect::{Dialect, Opened, Writer, Y_DOWN};
+use super::foreign;
 use super::warnings::Warnings;
 use super::zip;
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
@@ -42,6 +43,8 @@ pub const META: &str = "meta.json";
 const PER_BYTE: usize = 1;
 /// Gaussians that are believed in any case, so that tiny files of equal Gaussians can be read.
 const ALWAYS: usize = 4096;
+/// Longest `meta.json` that is read, bytes: its four codebooks take some 20 kB.
+const MOST_META: usize = 4 << 20;
 /// Codes of a codebook.
 const CODES: usize = 256;
 /// Fourth byte of a quaternion whose largest part is w.
@@ -49,17 +52,40 @@ const LARGEST_W: u8 = 252;
 /// Centroids in a row of their picture.
 const ROW_OF_CENTROIDS: usize = 64;
 
-/// The files in a `.sog` file, which is a zip. Errors: damaged, encrypted, or files that claim to be larger than
-/// deflate can make them.
+/// The files of the scene in a `.sog` file, which is a zip: `meta.json`, then what it names, and nothing else.
+///
+/// Errors: damaged, encrypted, an archive of another program, or files longer than such a scene needs.
 pub fn unzip(bytes: &[u8]) -> Result<Files<'_>> {
-    Ok(beside_meta(zip::read(bytes)?))
+    let archive = zip::Archive::open(bytes)?;
+    let names = archive.names();
+    // Some zip a whole folder: names lose what stands before `meta.json`.
+    let folders = names.iter().filter_map(|n| n.strip_suffix(META).filter(|f| f.is_empty() || f.ends_with('/')));
+    let Some(folder) = folders.min_by_key(|f| f.len()) else {
+        return Err(foreign::archive(&names).unwrap_or_else(|| damaged("it has no meta.json")));
+    };
+    let take = |name: &str, most: usize| archive.file(&format!("{folder}{name}"), most);
+    let meta = take(META, MOST_META).expect("it is one of the names")?;
+    let wanted = files_of(&meta)?;
+    // Pictures are compressed before they are zipped.
+    let packed = wanted.iter().filter_map(|n| archive.packed(&format!("{folder}{n}"))).sum();
+    let most = pictures::most_bytes(count_of(&parse(&meta)?, packed)?);
+    let mut files = Files::from([(META.to_owned(), meta)]);
+    for name in wanted {
+        if let (false, Some(file)) = (files.contains_key(&name), take(&name, most)) {
+            files.insert(name, file?);
+        }
+    }
+    Ok(files)
 }
 
-/// Some zip a whole folder: names lose what stands before `meta.json`.
-fn beside_meta(files: Files<'_>) -> Files<'_> {
-    let folder = files.keys().find_map(|n| n.strip_suffix(META).filter(|f| f.ends_with('/')).map(str::to_owned));
-    let Some(folder) = folder.filter(|_| !files.contains_key(META)) else { return files };
-    files.into_iter().filter_map(|(name, f)| Some((name.strip_prefix(&folder)?.to_owned(), f))).collect()
+/// The number of Gaussians. Errors: none is stated, or more than `bytes` of pictures can hold.
+fn count_of(meta: &Value, bytes: usize) -> Result<usize> {
+    let count = meta["count"].as_u64().and_then(|n| usize::try_from(n).ok());
+    let count = count.ok_or_else(|| damaged("its meta.json has no `count`"))?;
+    if count > ALWAYS + PER_BYTE * bytes {
+        return Err(damaged(format!("it claims {count} Gaussians in {bytes} bytes")));
+    }
+    Ok(count)
 }
 
 /// Names of the pictures that a `meta.json` speaks of: what a folder's reader must fetch.
@@ -81,11 +107,7 @@ pub fn read(files: &Files<'_>) -> Result<(Params, Warnings)> {
     };
     let meta = parse(meta)?;
     let total: usize = files.values().map(|f| f.len()).sum();
-    let count = meta["count"].as_u64().and_then(|n| usize::try_from(n).ok());
-    let count = count.ok_or_else(|| damaged("its meta.json has no `count`"))?;
-    if count > ALWAYS + PER_BYTE * total {
-        return Err(damaged(format!("it claims {count} Gaussians in {total} bytes")));
-    }
+    let count = count_of(&meta, total)?;
     let per_gaussian = |group: &str, i: usize| picture(files, &meta, group, i, Needs::Pixels(count));
     let mut warnings = Warnings::default();
     let rest = match meta.get("shN") {

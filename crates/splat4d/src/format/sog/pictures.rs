@@ -10,6 +10,14 @@ const SLACK: usize = 4;
 /// Pixels that any picture may have: a palette of 65,536 entries of 15 coefficients.
 const ALWAYS: usize = 1 << 20;
 
+/// Bytes of a picture beside its pixels: WebP's chunks, EXIF, colour profiles.
+const MOST_CHUNKS: usize = 1 << 20;
+
+/// Longest file of a picture of a scene of `count` Gaussians: lossless WebP never takes more than its RGBA pixels.
+pub(super) fn most_bytes(count: usize) -> usize {
+    4 * ALWAYS.max(SLACK.saturating_mul(count)) + MOST_CHUNKS
+}
+
 /// Which pixels a picture must hold.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Needs {

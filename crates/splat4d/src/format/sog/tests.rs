@@ -123,6 +123,41 @@ fn a_zip_is_the_same_as_a_folder() {
     }
 }
 
+/// Where the entries of a zip's directory begin.
+fn entries(zip: &[u8]) -> Vec<usize> {
+    (0..zip.len() - 4).filter(|&at| zip[at..].starts_with(b"PK\x01\x02")).collect()
+}
+
+#[test]
+fn archives_are_inflated_no_further_than_a_scene_needs() {
+    let error = |zip: &[u8]| unzip(zip).unwrap_err().to_string();
+    let zip = zipped(&files(), "");
+    let at = entries(&zip);
+    // Two names for one body.
+    let mut shared = zip.clone();
+    shared.copy_within(at[0] + 42..at[0] + 46, at[1] + 42);
+    assert!(error(&shared).contains("overlap"), "{}", error(&shared));
+    // A body that reaches into the directory.
+    let mut long = zip.clone();
+    let last = *at.last().unwrap();
+    let packed = u32::from_le_bytes(long[last + 20..last + 24].try_into().unwrap());
+    long[last + 20..last + 24].copy_from_slice(&(packed + 1).to_le_bytes());
+    assert!(error(&long).contains("overlap"), "{}", error(&long));
+    // meta.json is the first: nobody inflates 100 MiB of it.
+    let mut meta = zip.clone();
+    meta[at[0] + 24..at[0] + 28].copy_from_slice(&(100u32 << 20).to_le_bytes());
+    assert!(error(&meta).contains("longer than"), "{}", error(&meta));
+    // Files that the scene does not name stay packed: this one could not be unpacked.
+    let mut more = files();
+    more.insert("zz.bin".into(), Cow::Borrowed(b"something else"));
+    let mut more = zipped(&more, "");
+    let last = *entries(&more).last().unwrap();
+    more[last + 10] = 99;
+    assert_eq!(read(&unzip(&more).unwrap()).unwrap(), read(&files()).unwrap());
+    let twice = zipped(&Files::from([("a.npy".to_owned(), Cow::Borrowed(&b"x"[..]))]), "");
+    assert!(error(&twice).contains(".npz"), "{}", error(&twice));
+}
+
 #[test]
 fn lies_are_errors_with_a_reason() {
     let with = |change: &dyn Fn(&mut Value)| {

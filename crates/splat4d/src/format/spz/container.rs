@@ -1,5 +1,6 @@
 //! How the streams lie in the file: one gzip stream (versions 2, 3) or a table of contents and zstd frames (version 4).
 
+use super::axes::{self, Axes};
 use super::streams::{STREAMS, Streams, lengths};
 use super::{EXTENDED, GZIP_MAGIC, Header, MAGIC, damaged};
 use crate::format::bytes::Cursor;
@@ -19,34 +20,43 @@ const OLD_HEADER: usize = 16;
 const NEW_HEADER: usize = 32;
 /// Bytes of an entry of the table of contents: u64 compressed, u64 plain length.
 const ENTRY: usize = 16;
-/// Deflate shrinks 1032:1 at the very most (zlib technical details); the reference reader grants zstd 1024:1 too.
-const MOST_RATIO: u64 = 1032;
+/// Most Gaussians that are believed, a byte of the file: real ones take eight bytes and more each. (Deflate and zstd would
+/// allow a thousand times that.)
+const PER_BYTE: usize = 1;
+/// Gaussians that are believed in any case, so that small files of equal Gaussians can be read.
+const ALWAYS: usize = 1 << 16;
 /// Bytes of extensions behind the streams that are inflated to get to the checksum.
 const MOST_TAIL: u64 = 1 << 20;
 /// Largest zstd window that is granted, bytes: what RFC 8878 (3.1.1.1.2) asks every decoder to support. A larger one is
 /// granted up to the plain length.
 const WINDOW: u64 = 8 << 20;
-/// Extension that says in which axes the numbers are (Adobe).
-const AXES_EXTENSION: u32 = 0xADBE_0003;
 
-/// Header and plain streams of a file. Nothing is allocated that the length of the file does not bear out.
-pub(super) fn open<'a>(bytes: &'a [u8], warnings: &mut Warnings) -> Result<(Header, Streams<'a>)> {
+/// What a file holds.
+pub(super) struct Opened<'a> {
+    pub(super) header: Header,
+    pub(super) streams: Streams<'a>,
+    /// Its axes, if it names them.
+    pub(super) axes: Option<Axes>,
+}
+
+/// Header, plain streams and axes of a file. Nothing is allocated that the length of the file does not bear out.
+pub(super) fn open<'a>(bytes: &'a [u8], warnings: &mut Warnings) -> Result<Opened<'a>> {
     if bytes.starts_with(&GZIP_MAGIC) {
         let mut unzip = GzDecoder::new(bytes);
         let mut start = [0; OLD_HEADER];
         unzip.read_exact(&mut start).map_err(|e| damaged(format!("its gzip stream cannot be read ({e})")))?;
         let header = old_header(&start)?;
         let body: u64 = lengths(&header).iter().map(|&n| n as u64).sum();
-        if body > MOST_RATIO * bytes.len() as u64 {
-            return Err(too_many(&header, bytes.len()));
-        }
+        believe(&header, bytes.len())?;
         let mut plain = Vec::new();
         let broken = |e| damaged(format!("its gzip stream cannot be read ({e})"));
         (&mut unzip).take(body).read_to_end(&mut plain).map_err(broken)?;
+        let streams = split(&header, Cow::Owned(plain))?;
         // The checksum is compared at the end of the stream, behind extensions if there are any.
-        std::io::copy(&mut unzip.take(MOST_TAIL), &mut std::io::sink()).map_err(broken)?;
-        extensions_ignored(&header, warnings);
-        return Ok((header, split(&header, Cow::Owned(plain))?));
+        let mut tail = Vec::new();
+        unzip.take(MOST_TAIL).read_to_end(&mut tail).map_err(broken)?;
+        let axes = extensions(&header, &tail, warnings);
+        return Ok(Opened { header, streams, axes });
     }
     if !bytes.starts_with(&MAGIC) {
         return Err(Error::input("this is not an .spz file: it begins neither with gzip's bytes nor with `NGSP`")
@@ -57,8 +67,10 @@ pub(super) fn open<'a>(bytes: &'a [u8], warnings: &mut Warnings) -> Result<(Head
     if matches!(cursor.u32()?, 2 | 3) {
         // Nobody should write these versions without gzip, but test data of the field does.
         let header = old_header(cursor_start(bytes)?)?;
-        extensions_ignored(&header, warnings);
-        return Ok((header, split(&header, Cow::Borrowed(&bytes[OLD_HEADER..]))?));
+        let body = &bytes[OLD_HEADER..];
+        let streams = split(&header, Cow::Borrowed(body))?;
+        let tail = &body[lengths(&header).iter().sum::<usize>()..];
+        return Ok(Opened { axes: extensions(&header, tail, warnings), header, streams });
     }
     new_streams(bytes, warnings)
 }
@@ -81,14 +93,17 @@ fn old_header(bytes: &[u8; OLD_HEADER]) -> Result<Header> {
     Ok(header)
 }
 
-fn too_many(header: &Header, bytes: usize) -> Error {
-    damaged(format!("it claims {} Gaussians, more than {bytes} bytes can hold", header.count))
+/// Errors where `bytes` cannot hold as many Gaussians as the header claims.
+fn believe(header: &Header, bytes: usize) -> Result<()> {
+    if header.count > ALWAYS + PER_BYTE * bytes {
+        return Err(damaged(format!("it claims {} Gaussians, more than {bytes} bytes can hold", header.count)));
+    }
+    Ok(())
 }
 
-fn extensions_ignored(header: &Header, warnings: &mut Warnings) {
-    if header.flags & EXTENDED != 0 {
-        warnings.say("the file has vendors' extensions, which are not read; if one says other axes, use --up");
-    }
+/// The axes that the extensions name, where the header says that there are extensions.
+fn extensions(header: &Header, bytes: &[u8], warnings: &mut Warnings) -> Option<Axes> {
+    if header.flags & EXTENDED == 0 { None } else { axes::read(bytes, warnings) }
 }
 
 /// Cuts a plain body into its streams.
@@ -110,7 +125,7 @@ fn split<'a>(header: &Header, body: Cow<'a, [u8]>) -> Result<Streams<'a>> {
 }
 
 /// Version 4.
-fn new_streams<'a>(bytes: &'a [u8], warnings: &mut Warnings) -> Result<(Header, Streams<'a>)> {
+fn new_streams<'a>(bytes: &'a [u8], warnings: &mut Warnings) -> Result<Opened<'a>> {
     let mut c = Cursor::new(bytes, ".spz header");
     c.take(MAGIC.len())?;
     let (version, count) = (c.u32()?, c.u32()? as usize);
@@ -119,10 +134,7 @@ fn new_streams<'a>(bytes: &'a [u8], warnings: &mut Warnings) -> Result<(Header, 
     let stated = usize::from(c.u8()?);
     let contents = c.u32()? as usize;
     let lengths = lengths(&header);
-    let body: u64 = lengths.iter().map(|&n| n as u64).sum();
-    if body > MOST_RATIO * bytes.len() as u64 {
-        return Err(too_many(&header, bytes.len()));
-    }
+    believe(&header, bytes.len())?;
     // Streams without bytes are not in the file.
     let wanted = lengths.iter().filter(|&&n| n > 0).count();
     if stated != wanted {
@@ -131,9 +143,7 @@ fn new_streams<'a>(bytes: &'a [u8], warnings: &mut Warnings) -> Result<(Header, 
     if contents < NEW_HEADER {
         return Err(damaged(format!("its table of contents begins at byte {contents}, within the header")));
     }
-    if flags & EXTENDED != 0 {
-        name_extensions(bytes.get(NEW_HEADER..contents).unwrap_or_default(), warnings);
-    }
+    let axes = extensions(&header, bytes.get(NEW_HEADER..contents).unwrap_or_default(), warnings);
     let table = bytes.get(contents..).and_then(|b| b.get(..wanted * ENTRY));
     let table = table.ok_or_else(|| damaged("it ends within its table of contents"))?;
     let mut entries = Cursor::new(table, "table of contents");
@@ -147,23 +157,7 @@ fn new_streams<'a>(bytes: &'a [u8], warnings: &mut Warnings) -> Result<(Header, 
         let packed = usize::try_from(packed).map_err(|_| damaged("a stream is longer than the file"))?;
         *stream = Cow::Owned(inflate(data.take(packed)?, length)?);
     }
-    Ok((header, streams))
-}
-
-/// Says which extensions are not read. Records are u32 type, u32 length and that many bytes.
-fn name_extensions(bytes: &[u8], warnings: &mut Warnings) {
-    let mut c = Cursor::new(bytes, "extensions");
-    while let (Ok(kind), Ok(length)) = (c.u32(), c.u32()) {
-        warnings.say(match kind {
-            AXES_EXTENSION => "the file says other axes than usual (extension 0xADBE0003), which is not read: \
-                use --up if it comes out lying"
-                .to_owned(),
-            _ => format!("extension {kind:#010X} is not read"),
-        });
-        if c.take(length as usize).is_err() {
-            break;
-        }
-    }
+    Ok(Opened { header, streams, axes })
 }
 
 /// A zstd frame of exactly `length` plain bytes.
@@ -179,8 +173,8 @@ fn inflate(packed: &[u8], length: usize) -> Result<Vec<u8>> {
     Ok(plain)
 }
 
-/// The whole file.
-pub(super) fn close(header: &Header, streams: &Streams<'_>) -> Vec<u8> {
+/// The whole file. `extensions`: their records, where the header's flags say that there are any.
+pub(super) fn close(header: &Header, streams: &Streams<'_>, extensions: &[u8]) -> Vec<u8> {
     let mut out = MAGIC.to_vec();
     out.extend(header.version.to_le_bytes());
     out.extend((header.count as u32).to_le_bytes());
@@ -188,14 +182,16 @@ pub(super) fn close(header: &Header, streams: &Streams<'_>) -> Vec<u8> {
     if header.version < 4 {
         out.push(0);
         streams.iter().for_each(|s| out.extend_from_slice(s));
+        out.extend_from_slice(extensions);
         let mut zip = GzEncoder::new(Vec::new(), Compression::default());
         zip.write_all(&out).expect("memory takes all bytes");
         return zip.finish().expect("memory takes all bytes");
     }
     let there: Vec<&[u8]> = streams.iter().map(|s| &**s).filter(|s| !s.is_empty()).collect();
     out.push(there.len() as u8);
-    out.extend((NEW_HEADER as u32).to_le_bytes());
+    out.extend(((NEW_HEADER + extensions.len()) as u32).to_le_bytes());
     out.resize(NEW_HEADER, 0);
+    out.extend_from_slice(extensions);
     let packed: Vec<Vec<u8>> = there.iter().map(|s| compress_to_vec(*s, CompressionLevel::Fastest)).collect();
     for (plain, packed) in there.iter().zip(&packed) {
         out.extend((packed.len() as u64).to_le_bytes());

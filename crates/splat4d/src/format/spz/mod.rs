@@ -4,17 +4,19 @@
 //! colours (u8, ½ + 0.15·f_dc), log scales (u8, b/16 − 10), rotations, spherical harmonics (u8, (b − 128)/128,
 //! coefficient-major as our tables). Versions 2 and 3 are one gzip stream: header of 16 bytes, then the streams; version
 //! 4 has a plain header of 32 bytes, extensions, a table of contents and a zstd frame a stream. Version 2 stores the
-//! quaternion's x, y, z; later ones its smallest three parts. World axes: x right, **y up**, z back.
+//! quaternion's x, y, z; later ones its smallest three parts. World axes: what an extension names, else as in .ply
+//! (`axes.rs`).
 //!
 //! Source: github.com/nianticlabs/spz (MIT), README and extensions/README.
 
+mod axes;
 mod container;
 mod streams;
 #[cfg(test)]
 mod tests;
 
 use super::bytes::sound_rows;
-use super::dialect::{Dialect, Opened, Writer, Y_UP};
+use super::dialect::{Dialect, Opened, Writer, Y_DOWN};
 use super::warnings::Warnings;
 use crate::math::sh::degree_of;
 use crate::scene::{Params, SH};
@@ -22,20 +24,36 @@ use crate::{Error, ErrorKind, Result};
 use std::io::Write;
 
 /// .spz, versions 2 to 4.
-pub(crate) const DIALECT: Dialect = Dialect {
+pub const DIALECT: Dialect = Dialect {
     name: ".spz",
     ending: ".spz",
-    up: Y_UP,
+    up: Y_DOWN,
     moves: false,
     mark: Some(|bytes| bytes.starts_with(&GZIP_MAGIC) || bytes.starts_with(&MAGIC)),
-    read: |bytes| read(bytes).map(|(params, _, warnings)| Opened::from((params, warnings))),
-    writer: Writer::Moment(|params, options, mut out| write(params, options.spz_version, &mut out)),
+    read: |bytes| {
+        read(bytes).map(|(params, info, warnings)| Opened { up: Some(info.up), ..Opened::from((params, warnings)) })
+    },
+    writer: Writer::Moment(|params, options, mut out| write(params, options.spz_version, options.up, &mut out)),
 };
 
 /// The versions this library reads and writes.
 pub(crate) const VERSIONS: std::ops::RangeInclusive<u32> = 2..=4;
 /// Version written by default: the one that most programs open.
 pub const DEFAULT_VERSION: u32 = 3;
+/// Who reads a version, in words (each program's newest release of November 2026, tried or read in its documentation).
+pub fn readers(version: u32) -> &'static str {
+    match version {
+        2 => "is read by all programs but PlayCanvas' engine (version 4 only); its rotations are coarser",
+        3 => {
+            "is read by most programs, but not by GaussianSplats3D 0.4 and spz-js 1.2 (version 2) nor by PlayCanvas' engine \
+             (version 4): --spz-version"
+        }
+        _ => {
+            "is read by Spark 2.4, PlayCanvas, splat-transform and the SPZ library; older programs want version 2 or 3"
+        }
+    }
+}
+
 /// First bytes of a version 4 file, and of the header inside older ones.
 pub const MAGIC: [u8; 4] = *b"NGSP";
 /// First bytes of a gzip stream (RFC 1952).
@@ -46,7 +64,7 @@ const ANTIALIASED: u8 = 1;
 const EXTENDED: u8 = 2;
 
 /// Metadata of a file, besides its Gaussians.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SpzInfo {
     /// 2, 3 or 4.
     pub version: u32,
@@ -56,6 +74,8 @@ pub struct SpzInfo {
     pub antialiased: bool,
     /// Bits behind the point of a coordinate.
     pub fraction_bits: u8,
+    /// Which way is up: as the file says, else as in .ply.
+    pub up: [f64; 3],
 }
 
 /// The header's numbers, the same in all versions.
@@ -96,8 +116,9 @@ impl Header {
 /// Reads a file of version 2 to 4. Errors: not .spz, another version, truncated, streams of the wrong length.
 pub fn read(bytes: &[u8]) -> Result<(Params, SpzInfo, Warnings)> {
     let mut warnings = Warnings::default();
-    let (header, streams) = container::open(bytes, &mut warnings)?;
-    let params = streams::unpack(&header, &streams)?;
+    let container::Opened { header, streams, axes } = container::open(bytes, &mut warnings)?;
+    let mut params = streams::unpack(&header, &streams)?;
+    let up = axes::settle(axes, &mut params, &mut warnings);
     if header.degree > crate::math::sh::MAX_DEGREE {
         warnings.say("spherical harmonics of degree 4 are left out: degree 3 is the highest here");
     }
@@ -105,15 +126,20 @@ pub fn read(bytes: &[u8]) -> Result<(Params, SpzInfo, Warnings)> {
     if antialiased {
         warnings.say("the file was trained with an anti-aliasing filter: render it with one");
     }
-    let info =
-        SpzInfo { version: header.version, sh_degree: header.degree, antialiased, fraction_bits: header.fraction_bits };
+    let info = SpzInfo {
+        version: header.version,
+        sh_degree: header.degree,
+        antialiased,
+        fraction_bits: header.fraction_bits,
+        up,
+    };
     Ok((params, info, warnings))
 }
 
-/// Writes a file of the given version. Says what was clipped or left out.
+/// Writes a file of the given version that names its axes, where `up` lies along one. Says what was clipped or left out.
 ///
 /// Errors: the sink's; no Gaussians (readers refuse such files). Panics: the version is not one of 2 to 4.
-pub fn write(params: &Params, version: u32, out: &mut impl Write) -> Result<Warnings> {
+pub fn write(params: &Params, version: u32, up: [f64; 3], out: &mut impl Write) -> Result<Warnings> {
     assert!(VERSIONS.contains(&version), "versions 2 to 4 of .spz can be written, not {version}");
     let mut warnings = Warnings::default();
     let rows = sound_rows(params, &mut warnings);
@@ -124,9 +150,14 @@ pub fn write(params: &Params, version: u32, out: &mut impl Write) -> Result<Warn
     }
     let degree = degree_of(params[SH].width() / 3).expect("a layer has at least the base colour");
     let fraction_bits = streams::fraction_bits(params, &rows);
-    let header = Header { version, count: count as usize, degree, fraction_bits, flags: 0 };
+    let axes = axes::Axes::of_up(up);
+    if axes.is_none() {
+        warnings.say("no coordinate system of .spz has this direction up: other programs will assume their own axes");
+    }
+    let flags = if axes.is_some() { EXTENDED } else { 0 };
+    let header = Header { version, count: count as usize, degree, fraction_bits, flags };
     let streams = streams::pack(params, &rows, &header, &mut warnings);
-    let file = container::close(&header, &streams);
+    let file = container::close(&header, &streams, &axes.map(axes::Axes::record).unwrap_or_default());
     out.write_all(&file).map_err(|e| Error::io("the Gaussians could not be written", e))?;
     Ok(warnings)
 }

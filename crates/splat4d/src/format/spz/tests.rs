@@ -78,7 +78,9 @@ fn version_2_by_hand() {
         let q = params[GEOMETRY].read::<4>(0, QUAT);
         assert!((q[0] - 0.8).abs() < 1e-3 && (q[1] + 0.6).abs() < 1e-6 && q[2].abs() < 0.005, "{q:?}");
         assert_eq!((info.version, info.sh_degree, info.fraction_bits), (2, 1, 12));
-        assert!(warnings.lines().is_empty());
+        // No extension names the axes: they are those of .ply.
+        assert_eq!(info.up, Y_DOWN);
+        assert!(warnings.lines().len() == 1 && warnings.lines()[0].contains("assumed"), "{warnings:?}");
     }
 }
 
@@ -107,7 +109,8 @@ fn version_4() -> Vec<u8> {
         body[at - n..at].to_vec()
     });
     let mut extensions = Vec::new();
-    for (kind, payload) in [(0xADBE_0002u32, vec![0; 12]), (0xADBE_0003, vec![1, 0, 0, 0])] {
+    // The second one says right, up, back.
+    for (kind, payload) in [(0xADBE_0002u32, vec![0; 12]), (0xADBE_0003, vec![4, 0, 0, 0])] {
         extensions.extend(kind.to_le_bytes());
         extensions.extend((payload.len() as u32).to_le_bytes());
         extensions.extend(payload);
@@ -134,7 +137,8 @@ fn version_4_by_hand() {
     check_new_rotation(&params);
     assert!(info.antialiased && info.version == 4);
     let said = warnings.lines().join("\n");
-    assert!(said.contains("0xADBE0002") && said.contains("0xADBE0003") && said.contains("anti-aliasing"), "{said}");
+    assert!(said.contains("0xADBE0002") && said.contains("anti-aliasing") && !said.contains("assumed"), "{said}");
+    assert_eq!(info.up, [0.0, 1.0, 0.0]);
 }
 
 #[test]
@@ -143,7 +147,7 @@ fn every_version_and_degree_comes_back_within_its_steps() {
         for coefficients in [1, 4, 9, 16] {
             let p = gaussians(700, coefficients);
             let mut file = Vec::new();
-            write(&p, version, &mut file).unwrap();
+            write(&p, version, Y_DOWN, &mut file).unwrap();
             let (back, info, _) = read(&file).unwrap();
             assert_eq!((info.version, back[SH].width()), (version, 3 * coefficients));
             let w = worst(&p, &back);
@@ -160,11 +164,29 @@ fn every_version_and_degree_comes_back_within_its_steps() {
 #[test]
 fn gzip_streams_end_like_any_other() {
     let mut file = Vec::new();
-    write(&gaussians(100, 4), 3, &mut file).unwrap();
+    write(&gaussians(100, 4), 3, Y_DOWN, &mut file).unwrap();
     let mut plain = Vec::new();
     flate2::read::GzDecoder::new(&file[..]).read_to_end(&mut plain).unwrap();
-    assert_eq!(plain.len(), 16 + 100 * (20 + 9));
+    let streams = 16 + 100 * (20 + 9);
     assert_eq!(plain[..8], *b"NGSP\x03\0\0\0");
+    // The header's flag, and behind the streams the extension that says right, down, front.
+    assert_eq!((plain[14], &plain[streams..]), (EXTENDED, &[3, 0, 0xBE, 0xAD, 4, 0, 0, 0, 6, 0, 0, 0][..]));
+}
+
+#[test]
+fn every_version_says_which_way_is_up() {
+    for version in VERSIONS {
+        for up in [Y_DOWN, [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]] {
+            let mut file = Vec::new();
+            let said = write(&gaussians(5, 4), version, up, &mut file).unwrap();
+            let (_, info, read) = read(&file).unwrap();
+            assert_eq!(info.up, up, "version {version}");
+            assert!(![said, read].iter().any(|w| w.lines().join("").contains("axes")), "version {version}");
+        }
+        let mut file = Vec::new();
+        let said = write(&gaussians(5, 4), version, [0.6, 0.8, 0.0], &mut file).unwrap();
+        assert!(said.lines().join("").contains("coordinate system") && read(&file).unwrap().1.up == Y_DOWN);
+    }
 }
 
 #[test]
@@ -175,11 +197,11 @@ fn what_is_clipped_is_counted() {
     p[SH].set(2, 0, 4.0);
     p[SH].set(3, 5, -1.5);
     let mut file = Vec::new();
-    let said = write(&p, 3, &mut file).unwrap().lines().join("\n");
+    let said = write(&p, 3, Y_DOWN, &mut file).unwrap().lines().join("\n");
     for part in ["farther out", "a scale outside", "base colour", "spherical harmonics above"] {
         assert!(said.contains(&format!("1 of 4 Gaussians {}", sentence(&said, part))), "{part}: {said}");
     }
-    assert!(write(&Params::new(0, 1, &[]), 3, &mut Vec::new()).is_err());
+    assert!(write(&Params::new(0, 1, &[]), 3, Y_DOWN, &mut Vec::new()).is_err());
 }
 
 /// The words of the line that holds `part`, behind "Gaussians ".
@@ -215,7 +237,7 @@ fn lies_are_errors_with_a_reason() {
 fn damaged_files_never_panic() {
     for version in VERSIONS {
         let mut file = Vec::new();
-        write(&gaussians(60, 9), version, &mut file).unwrap();
+        write(&gaussians(60, 9), version, Y_DOWN, &mut file).unwrap();
         for mutant in mutants(&file, 300, "spz") {
             let _ = read(&mutant);
         }
