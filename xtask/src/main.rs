@@ -4,6 +4,7 @@ mod camera;
 mod capture;
 mod count;
 mod files;
+mod fuzz;
 mod glb;
 mod light;
 mod long;
@@ -48,6 +49,8 @@ chores:
   strip-character IN.glb OUT.glb CLIP... [--drop NODE...]
                              keeps the named animation clips of a character, drops the named nodes' meshes
   site OUT [--no-api]        makes the static site in OUT: documents, API, a gallery that plays the example scenes
+  fuzz [--minutes N] [--seed S] [--reader NAME]
+                             mutates sound inputs of every reader and prints how many were read (default: 2 minutes)
   count [FOLDER]             counts lines of code, without tests, comments and blank lines, of the repository FOLDER";
 
 fn main() -> ExitCode {
@@ -66,6 +69,7 @@ fn run(arguments: &[String]) -> Result<()> {
     match chore.as_str() {
         "capture" => capture::command(rest),
         "count" => count::command(rest),
+        "fuzz" => fuzz::command(rest),
         "site" => site::command(rest),
         "strip-character" => strip_character(rest),
         _ => bail!("unknown chore {chore}\n{USAGE}"),

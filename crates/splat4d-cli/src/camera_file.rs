@@ -28,7 +28,7 @@ pub(crate) fn read(path: &Path) -> Result<(Camera, Option<[f32; 3]>)> {
     parse(&text).map_err(|e| e.at(path.display()))
 }
 
-fn parse(text: &str) -> Result<(Camera, Option<[f32; 3]>)> {
+pub(crate) fn parse(text: &str) -> Result<(Camera, Option<[f32; 3]>)> {
     let value = json(text)?;
     let Some(object) = value.as_object() else {
         return Err(Error::input("the camera is not a JSON object { ... }").remedy(known_keys()));

@@ -4,6 +4,7 @@
 use crate::files::{grouped, human_bytes, human_seconds};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde_json::{Value, json};
+use splat4d::text;
 use splat4d_train::event::Event;
 use std::cell::RefCell;
 use std::io::{IsTerminal, Write};
@@ -82,7 +83,7 @@ impl Console {
     /// One JSON line; only with `--json`.
     pub fn emit(&self, value: &Value) {
         if self.json {
-            print(&value.to_string());
+            print(&one_json_line(value));
         }
     }
 
@@ -98,7 +99,7 @@ impl Console {
         if self.json {
             self.emit(&json!({"type": "warning", "message": message}));
         } else {
-            self.above_bar(|| eprint_line(&format!("warning: {message}")));
+            self.above_bar(|| eprint_line(&format!("warning: {}", text::in_line(message))));
         }
     }
 
@@ -135,7 +136,7 @@ impl Console {
         }
         if self.json {
             let value = serde_json::to_value(event).expect("events are plain data");
-            return print(&value.to_string());
+            return print(&one_json_line(&value));
         }
         match event {
             Event::Phase { name, done, total } => self.phase(name, *done, *total),
@@ -244,8 +245,8 @@ impl Console {
             let bar = state.bar.get_or_insert_with(|| bar(total));
             bar.set_length(total.max(done).max(1) as u64);
             bar.set_position(done as u64);
-            bar.set_prefix(name.to_owned());
-            bar.set_message(words.to_owned());
+            bar.set_prefix(text::in_line(name).into_owned());
+            bar.set_message(text::in_line(words).into_owned());
             return;
         }
         let due = state.last_line.is_none_or(|t| t.elapsed() >= PLAIN_INTERVAL);
@@ -283,10 +284,19 @@ fn bar(total: usize) -> ProgressBar {
     bar
 }
 
-/// Prints a line on stdout. A reader that has gone (`| head`) ends the program in peace; a full disk is an error.
-fn print(text: &str) {
+/// JSON in one line, in which no character acts on a terminal: outside strings JSON has none, and inside they are escaped.
+fn one_json_line(value: &Value) -> String {
+    let line = value.to_string();
+    if !line.contains(text::acts) {
+        return line;
+    }
+    line.chars().map(|c| if text::acts(c) { format!("\\u{:04x}", u32::from(c)) } else { c.into() }).collect()
+}
+
+/// Prints a line on stdout, safe for a terminal. A reader that has gone (`| head`) ends the program in peace; a full disk is an error.
+fn print(line: &str) {
     let mut out = std::io::stdout().lock();
-    if let Err(error) = writeln!(out, "{text}").and_then(|()| out.flush()) {
+    if let Err(error) = writeln!(out, "{}", text::shown(line)).and_then(|()| out.flush()) {
         if error.kind() == std::io::ErrorKind::BrokenPipe {
             std::process::exit(0);
         }
@@ -295,7 +305,20 @@ fn print(text: &str) {
     }
 }
 
-/// Prints a line on stderr; where that is closed there is nobody to tell.
-fn eprint_line(text: &str) {
-    let _ = writeln!(std::io::stderr().lock(), "{text}");
+/// Prints a line on stderr, safe for a terminal; where that is closed there is nobody to tell.
+pub(crate) fn eprint_line(line: &str) {
+    let _ = writeln!(std::io::stderr().lock(), "{}", text::shown(line));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn json_lines_hold_nothing_that_a_terminal_obeys() {
+        let value = json!({"title": "a\u{1b}]0;x\u{7}\u{9b}2J\u{202e}\n"});
+        let line = one_json_line(&value);
+        assert!(!line.contains(text::acts), "{line}");
+        assert_eq!(serde_json::from_str::<Value>(&line).unwrap(), value);
+    }
 }

@@ -5,7 +5,7 @@ use crate::files;
 use crate::paths::View;
 use crate::run_folder::Run;
 use crate::source::Source;
-use splat4d::edit::{Context, Edits, Mask, Selected, Step};
+use splat4d::edit::{Context, Edits, Mask, Selected, Step, mask_fits};
 use splat4d::format::playback::Provenance;
 use splat4d::layers::Scene;
 use splat4d::scene::{Camera, Planes, Time};
@@ -74,13 +74,19 @@ impl Context for Bring<'_> {
         })
     }
 
-    fn mask(&self, name: &str) -> Result<Mask> {
+    fn mask(&self, name: &str, camera: &Camera) -> Result<Mask> {
         let path = self.folder.join(name);
-        let bytes = std::fs::read(&path).map_err(|e| files::cannot_read(&path, e))?;
-        let picture = image::load_from_memory(&bytes).map_err(|e| {
-            Error::input(format!("is no picture that can be read ({e})")).at(path.display()).remedy("Give a PNG.")
-        })?;
-        let grey = picture.to_luma8();
+        let unread = |e: image::ImageError| {
+            Error::input(format!("the image cannot be read ({e})")).at(path.display()).remedy("Give a PNG.")
+        };
+        let open = || {
+            let opened = image::ImageReader::new(std::io::BufReader::new(files::open(&path)?));
+            opened.with_guessed_format().map_err(|e| files::cannot_read(&path, e))
+        };
+        // The header's size first: a small file may claim gigabytes of pixels.
+        let (width, height) = open()?.into_dimensions().map_err(unread)?;
+        mask_fits([width as usize, height as usize], camera, name)?;
+        let grey = open()?.decode().map_err(unread)?.to_luma8();
         let (width, height) = (grey.width() as usize, grey.height() as usize);
         Ok(Mask { width, height, white: grey.into_raw().into_iter().map(|v| v >= 128).collect() })
     }

@@ -1,6 +1,7 @@
 //! Writing files so that nobody ever finds half of one.
 
 use splat4d::{Error, Result};
+pub use splat4d_train::files::{open, read, read_text};
 use std::ffi::OsString;
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -30,11 +31,6 @@ pub fn make_folder(path: &Path) -> Result<()> {
 /// The error of a failed write.
 pub fn cannot_write(path: &Path, error: std::io::Error) -> Error {
     Error::io("cannot be written", error).at(path.display()).remedy(WRITE_REMEDY)
-}
-
-/// Reads a text file.
-pub fn read_text(path: &Path) -> Result<String> {
-    std::fs::read_to_string(path).map_err(|e| cannot_read(path, e))
 }
 
 /// The error of a failed read.

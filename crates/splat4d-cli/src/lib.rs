@@ -31,6 +31,7 @@ pub mod run_folder;
 pub mod sequence;
 mod serving;
 pub mod source;
+pub mod texts;
 pub mod verbs;
 mod video;
 
@@ -188,7 +189,13 @@ where
     let (globals, work) = match C::try_parse_from(words) {
         Ok(cli) => work(cli),
         Err(error) => {
-            let _ = error.print();
+            // clap shows the words as they are: a file's name may hold an escape sequence.
+            let text = error.to_string();
+            if text.contains(|c| splat4d::text::acts(c) && c != '\n') {
+                console::eprint_line(text.trim_end());
+            } else {
+                let _ = error.print();
+            }
             return if error.use_stderr() { BAD_INPUT } else { DONE };
         }
     };

@@ -3,13 +3,12 @@
 
 use crate::baking::{Baking, pack, title};
 use crate::console::Console;
-use crate::files::cannot_read;
+use crate::files::{self, cannot_read};
 use crate::run_folder::Run;
 use crate::source::{Source, not_empty};
 use splat4d::Result;
 use splat4d::format::playback::{EXTENSION, HEADER_BYTES, Index, MAGIC, OLD_EXTENSION};
 use splat4d_serve::Content;
-use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
@@ -56,7 +55,7 @@ impl Playable {
     /// The whole file.
     pub(crate) fn bytes(&self) -> Result<Vec<u8>> {
         match &self.content {
-            Content::File(path) => std::fs::read(path).map_err(|e| cannot_read(path, e)),
+            Content::File(path) => files::read(path),
             Content::Bytes(bytes) => Ok(bytes.to_vec()),
             _ => Ok(Vec::new()),
         }
@@ -77,7 +76,7 @@ fn ready(path: &Path) -> Result<Option<PathBuf>> {
         return Ok(None);
     }
     let mut start = Vec::new();
-    let file = File::open(path).map_err(|e| cannot_read(path, e))?;
+    let file = files::open(path)?;
     file.take(MAGIC.len() as u64).read_to_end(&mut start).map_err(|e| cannot_read(path, e))?;
     Ok((start == MAGIC).then(|| path.to_owned()))
 }
@@ -85,7 +84,7 @@ fn ready(path: &Path) -> Result<Option<PathBuf>> {
 /// A playback file's index; the rest is not read. A damaged file is better told of here than in a browser.
 fn index(path: &Path) -> Result<Index> {
     let fail = |e| cannot_read(path, e);
-    let file = File::open(path).map_err(fail)?;
+    let file = files::open(path)?;
     let mut header = Vec::new();
     (&file).take(HEADER_BYTES as u64).read_to_end(&mut header).map_err(fail)?;
     // Behind everything else in a file that grows.

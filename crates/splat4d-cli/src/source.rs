@@ -1,7 +1,7 @@
 //! Anything that holds a scene: a run folder, a scene file (`.safetensors`, checkpoints too), a playback file
 //! (`.s4d`), a file or folder of another program's Gaussians, or a sequence of such files.
 
-use crate::files::{cannot_read, either};
+use crate::files::{self, either};
 use crate::paths::{Stage, View};
 use crate::run_folder::Run;
 use crate::sequence;
@@ -73,7 +73,7 @@ impl Source {
         if path.file_name().is_some_and(|n| n == SOG_LEVELS) {
             return open_sequence(path.parent().unwrap_or(Path::new("")), fps);
         }
-        let bytes = std::fs::read(path).map_err(|e| cannot_read(path, e))?;
+        let bytes = files::read(path)?;
         if bytes.starts_with(&playback::MAGIC) {
             let index = Index::parse(&bytes, Some(bytes.len() as u64)).map_err(|e| e.at(path.display()))?;
             let scene = playback::read(&bytes).map_err(|e| e.at(path.display()))?;
@@ -139,10 +139,7 @@ fn dialect_of(path: &Path, bytes: &[u8]) -> Option<Dialect> {
 
 /// A SOG scene whose files lie in a folder.
 fn open_sog(folder: &Path) -> Result<Source> {
-    let read = |name: &str| {
-        let file = folder.join(name);
-        std::fs::read(&file).map_err(|e| cannot_read(&file, e))
-    };
+    let read = |name: &str| files::read(&folder.join(name));
     let meta = read(sog::META)?;
     let mut files = sog::Files::new();
     for name in sog::files_of(&meta).map_err(|e| e.at(folder.display()))? {
@@ -170,8 +167,9 @@ fn open_sequence(path: &Path, fps: f64) -> Result<Source> {
     }
     let files = sequence::frames(path)?;
     let (mut frames, mut kind, mut warnings) = (Vec::with_capacity(files.len()), None, Warnings::default());
+    let mut up = None;
     for file in &files {
-        let bytes = std::fs::read(file).map_err(|e| cannot_read(file, e))?;
+        let bytes = files::read(file)?;
         let own = dialect_of(file, &bytes).filter(|d| !d.moves);
         let Some(own) = own.filter(|d| kind.is_none_or(|k: Dialect| k.up == d.up)) else {
             return Err(Error::input("is no frame of a sequence like the others")
@@ -181,16 +179,21 @@ fn open_sequence(path: &Path, fps: f64) -> Result<Source> {
         kind = Some(own);
         let mut opened = own.open(&bytes).map_err(|e| e.at(file.display()))?;
         warnings.append(opened.warnings);
+        if *up.get_or_insert(opened.scene.up) != opened.scene.up {
+            return Err(Error::input("the frame's axes differ from those of the frames before it")
+                .at(file.display())
+                .remedy("Convert all frames with the same --up."));
+        }
         frames.push(std::mem::take(&mut opened.scene.layers[0].params));
     }
-    let up = kind.map_or(dialect::Y_DOWN, |d| d.up);
+    let up = up.unwrap_or(dialect::Y_DOWN);
     let scene = format::sequence::join(&frames, fps, up).map_err(|e| e.at(path.display()))?;
     Ok(Source { dialect: kind, warnings, ..Source::own(scene) })
 }
 
 /// Reads a scene file.
 pub fn read_scene(path: &Path) -> Result<Scene<f32>> {
-    let bytes = std::fs::read(path).map_err(|e| cannot_read(path, e))?;
+    let bytes = files::read(path)?;
     format::scene::read(&bytes).map_err(|e| e.at(path.display()))
 }
 

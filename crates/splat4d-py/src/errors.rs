@@ -49,7 +49,7 @@ fn exception(text: &str, kind: Option<ErrorKind>) -> PyErr {
         _ => "failed",
     };
     Python::attach(|py| {
-        let error = Error::new_err(text.to_owned());
+        let error = Error::new_err(splat4d::text::shown(text).into_owned());
         // An exception of our own class takes attributes.
         let _ = error.value(py).setattr("kind", kind);
         error
@@ -60,7 +60,7 @@ fn exception(text: &str, kind: Option<ErrorKind>) -> PyErr {
 pub(crate) fn warn(py: Python<'_>, messages: &[String]) -> PyResult<()> {
     let category = py.get_type::<pyo3::exceptions::PyUserWarning>();
     messages.iter().try_for_each(|message| {
-        let text = std::ffi::CString::new(message.replace('\0', " ")).expect("no zero is left");
+        let text = std::ffi::CString::new(&*splat4d::text::in_line(message)).expect("zeros are spelt out");
         PyErr::warn(py, &category, &text, 1)
     })
 }

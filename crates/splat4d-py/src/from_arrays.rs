@@ -224,7 +224,7 @@ fn cloud(points: &Bound<'_, PyAny>, colors: Option<&Bound<'_, PyAny>>) -> PyResu
         return Err(bad_input(what, "Give [N, 3] from 0 to 1"));
     }
     let times = vec![None; points.len()];
-    Ok(PointCloud { points, colors, times })
+    Ok(PointCloud { points, colors, times, left_out: 0 })
 }
 
 /// A picture [h, w, 3] of a camera's size as samples for a file.

@@ -194,7 +194,7 @@ fn imports<'a>(text: &str, modules: &BTreeMap<&'a str, &'a str>) -> BTreeSet<&'a
 }
 
 fn escape(text: &str) -> String {
-    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+    splat4d::text::in_line(text).replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }
 
 /// Standard base64 (RFC 4648) with padding.

@@ -76,11 +76,12 @@ impl Scene {
                         .at(path.display())
                         .remedy("Check that the file exists and may be read by you.")
                 };
-                let file = File::open(&path).map_err(fail)?;
-                let meta = file.metadata().map_err(fail)?;
-                if !meta.is_file() {
+                // Before it is opened: that alone waits, where a pipe has no writer.
+                if !std::fs::metadata(&path).map_err(fail)?.is_file() {
                     return Err(Error::input("is not a file").at(path.display()).remedy("Name a .s4d file."));
                 }
+                let file = File::open(&path).map_err(fail)?;
+                let meta = file.metadata().map_err(fail)?;
                 let etag = file_etag(&meta);
                 scene.push(Source::File(Arc::new(file)), meta.len(), etag);
             }

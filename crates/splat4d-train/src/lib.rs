@@ -27,6 +27,7 @@ pub mod compress;
 pub mod eval;
 pub mod event;
 pub mod features;
+pub mod files;
 pub mod init;
 pub mod labels;
 pub mod learner;

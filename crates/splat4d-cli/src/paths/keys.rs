@@ -48,7 +48,7 @@ impl Track {
         Self::parse(&read_text(path)?, up).map_err(|e| e.at(path.display()))
     }
 
-    fn parse(text: &str, up: [f64; 3]) -> Result<Self> {
+    pub(super) fn parse(text: &str, up: [f64; 3]) -> Result<Self> {
         let value = json(text)?;
         let fps =
             match value.get("fps").filter(|v| !v.is_null()) {

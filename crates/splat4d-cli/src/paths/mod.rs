@@ -10,6 +10,11 @@ use std::path::{Path, PathBuf};
 
 pub(crate) use orbit::Stage;
 
+/// Reads key frames and says what is wrong with them.
+pub(crate) fn check_keys(text: &str) -> Result<()> {
+    keys::Track::parse(text, [0.0, 1.0, 0.0]).map(drop)
+}
+
 /// One frame of a film.
 #[derive(Clone, Debug)]
 pub(crate) struct Shot {

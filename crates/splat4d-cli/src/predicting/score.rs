@@ -221,7 +221,7 @@ fn read_tracks(work: &Work) -> Result<Option<Vec<Vec<[f64; 3]>>>> {
     if !path.is_file() {
         return Ok(None);
     }
-    let bytes = std::fs::read(&path).map_err(|e| crate::files::cannot_read(&path, e))?;
+    let bytes = crate::files::read(&path)?;
     let array = Npy::read(&bytes).map_err(|e| e.at(path.display()))?;
     let &[frames, points, 3] = array.shape.as_slice() else {
         return Err(Error::input(format!("true tracks have shape {:?}, not [frames, points, 3]", array.shape))

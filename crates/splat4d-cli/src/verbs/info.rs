@@ -15,6 +15,7 @@ use splat4d::layers::{Head, Scene};
 use splat4d::math::sh::degree_of;
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{GEOMETRY, SH};
+use splat4d::text::in_line;
 use splat4d_train::capture::{Capture, Frame, Reach, Severity, Timing};
 use splat4d_train::event::Event;
 use splat4d_train::recipe::Recipe;
@@ -112,7 +113,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         return Ok(());
     }
     for trouble in &told.troubles {
-        let _ = writeln!(told.text, "! {trouble}");
+        let _ = writeln!(told.text, "! {}", in_line(trouble));
     }
     let verdict = if told.troubles.is_empty() { "looks healthy" } else { "does not look healthy, see above" };
     console.result(&format!("{}{verdict}", told.text));
@@ -120,7 +121,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
 }
 
 fn line(out: &mut String, name: &str, value: &str) {
-    let _ = writeln!(out, "{name:<16} {value}");
+    let _ = writeln!(out, "{name:<16} {}", in_line(value));
 }
 
 fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Told> {

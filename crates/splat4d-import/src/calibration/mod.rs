@@ -205,7 +205,7 @@ impl Text {
         if length > MAX_BYTES {
             return Err(Error::input(format!("it is {length} bytes long: no calibration")).at(path.display()));
         }
-        let bytes = std::fs::read(path).map_err(fail)?;
+        let bytes = splat4d_train::files::read(path)?;
         let tree = String::from_utf8(bytes)
             .map_err(|_| Error::input("it is no text").remedy("Give the calibration's own file."))
             .and_then(|body| Tree::parse(&body));

@@ -344,6 +344,7 @@ impl Solved {
             points: self.points.iter().map(|p| p.0).collect(),
             colors: self.points.iter().map(|p| p.1.map(|v| f32::from(v) / 255.0)).collect(),
             times: vec![None; self.points.len()],
+            left_out: 0,
         }
     }
 }

@@ -42,7 +42,7 @@ impl Avi {
         let fail = |e| Error::io("cannot be read", e).at(path.display());
         let other =
             || Error::new(ErrorKind::Unsupported, "only motion JPEG in AVI is read without ffmpeg").at(path.display());
-        let mut file = BufReader::new(File::open(path).map_err(fail)?);
+        let mut file = BufReader::new(splat4d_train::files::open(path)?);
         let end = file.get_ref().metadata().map_err(fail)?.len();
         let mut head = [0; 12];
         if end < 12 {

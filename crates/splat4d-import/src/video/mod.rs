@@ -174,7 +174,7 @@ fn fingerprint_of_file(path: &Path) -> Result<u64> {
     /// Bytes of each of the three places: a video's tables and some of its pictures.
     const PIECE: u64 = 64 << 10;
     let fail = |e| Error::io("cannot be read", e).at(path.display());
-    let mut file = std::fs::File::open(path).map_err(fail)?;
+    let mut file = splat4d_train::files::open(path)?;
     let length = file.metadata().map_err(fail)?.len();
     let mut bytes = length.to_le_bytes().to_vec();
     for at in [0, (length / 2).saturating_sub(PIECE / 2), length.saturating_sub(PIECE)] {

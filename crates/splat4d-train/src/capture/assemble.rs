@@ -1,6 +1,8 @@
 //! From what the files say to a checked capture: poses, sizes, files, duplicates, split, clock.
 
-use super::{Capture, CaptureOptions, Extent, FlowFile, Frame, HoldOut, RawFrame, Rig, Split, Take, Timing};
+use super::{
+    Capture, CaptureOptions, Extent, FlowFile, Frame, HoldOut, PointCloud, RawFrame, Rig, Split, Take, Timing,
+};
 use super::{options, picture, pose};
 use splat4d::math::se3::{norm, normalize, sub};
 use splat4d::scene::{Camera, Lens, Time};
@@ -50,6 +52,7 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
         let full = std::path::absolute(&take.root).unwrap_or_else(|_| take.root.clone());
         full.file_name().map_or_else(|| "capture".into(), |n| n.to_string_lossy().into_owned())
     });
+    take.warnings.extend(take.points.as_ref().and_then(PointCloud::loss));
     let points = take.points.map(|p| p.voxel_downsample(options.max_points)).filter(|p| !p.points.is_empty());
     let mut capture = Capture {
         name,
@@ -319,6 +322,12 @@ fn check_masks(take: &Take, has_alpha: bool) -> Result<()> {
     let masked: Vec<&RawFrame> = take.frames.iter().filter(|f| f.mask.is_some() || has_alpha).collect();
     let Some(first) = masked.first() else { return Ok(()) };
     for frame in &masked {
+        if let Some(mask) = &frame.mask {
+            // Its size is compared before its pixels are read: a small file may claim gigabytes of them.
+            let header = picture::header(mask)?;
+            let sane = picture::check_not_larger("mask", (header.width, header.height), &frame.source);
+            sane.map_err(|e| e.at(mask.display()))?;
+        }
         match picture::any_foreground(frame.mask.as_deref().unwrap_or(&frame.image), frame.mask.is_none()) {
             Ok(true) => return Ok(()),
             Ok(false) => {}

@@ -255,10 +255,8 @@ fn aligned_points(root: &Path, sparse: &Path, frames: &[RawFrame]) -> Result<(Po
 
 fn cloud(points: &[Point]) -> Option<PointCloud> {
     let mut cloud = PointCloud::default();
-    for point in points.iter().filter(|p| p.position.iter().all(|v| v.is_finite())) {
-        cloud.points.push(point.position);
-        cloud.colors.push(point.color.map(|v| f32::from(v) / 255.0));
-        cloud.times.push(None);
+    for point in points {
+        cloud.push(point.position, point.color.map(|v| f32::from(v) / 255.0), None);
     }
     (!cloud.points.is_empty()).then_some(cloud)
 }

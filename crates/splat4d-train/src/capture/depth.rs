@@ -50,9 +50,9 @@ pub struct DepthFile {
 /// A frame's depth, [height, width] of its view, 0: not known. Errors: no depth map, of another shape than the picture,
 /// numbers that are none.
 pub(super) fn read(file: &DepthFile, frame: &Frame, downscale: usize) -> Result<Vec<f32>> {
-    let map = Map::read(file)?;
-    check(&map, file)?;
     let source = &frame.source;
+    let map = Map::read(file, source)?;
+    check(&map, file)?;
     if (map.width, map.height) != (source.width, source.height) && !picture::is_resized((map.width, map.height), source)
     {
         let what =
@@ -94,15 +94,18 @@ struct Map {
 }
 
 impl Map {
-    fn read(file: &DepthFile) -> Result<Self> {
+    /// `source` is the picture's camera: a file that claims to be far larger is refused before it is decoded.
+    fn read(file: &DepthFile, source: &Camera) -> Result<Self> {
         let path = &file.path;
         let mut map = match path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase).as_deref() {
             Some("npy") => Self::npy(path)?,
             Some("exr") => {
-                let (width, height, values) = exr::read(&json::read_bytes(path)?).map_err(|e| e.at(path.display()))?;
+                let sane = |size| picture::check_not_larger("depth map", size, source);
+                let read = exr::read(&json::read_bytes(path)?, sane).map_err(|e| e.at(path.display()));
+                let (width, height, values) = read?;
                 Self { width, height, values }
             }
-            _ => Self::picture(file)?,
+            _ => Self::picture(file, source)?,
         };
         let known = |v: f32| if v >= NOWHERE { 0.0 } else { (f64::from(v) * file.scale) as f32 };
         map.values.iter_mut().for_each(|v| *v = known(*v));
@@ -122,7 +125,10 @@ impl Map {
         Ok(Self { width, height, values: array.to_f32() })
     }
 
-    fn picture(file: &DepthFile) -> Result<Self> {
+    fn picture(file: &DepthFile, source: &Camera) -> Result<Self> {
+        let header = picture::header(&file.path)?;
+        let sane = picture::check_not_larger("depth map", (header.width, header.height), source);
+        sane.map_err(|e| e.at(file.path.display()))?;
         let raster = picture::decode(&file.path, None)?;
         let bad = |what: String| {
             Err(Error::input(what)

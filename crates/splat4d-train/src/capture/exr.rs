@@ -1,36 +1,67 @@
 //! The first channel of an OpenEXR file that may be a depth, as 32-bit floats.
 
-use exr::prelude::{self, FlatSamples, ReadChannels, ReadLayers};
+use exr::meta::header::Header;
+use exr::meta::{BlockDescription, MetaData};
+use exr::prelude::{self, ReadChannels, ReadLayers, ReadSpecificChannel};
 use splat4d::{Error, Result};
+use std::io::Cursor;
 
 /// Channels by which renderers and tools call depth, in this order; else a file's only channel.
 const NAMES: [&str; 5] = ["Z", "depth", "Depth.Z", "Y", "R"];
+/// Most scan lines that a compression packs together (DWAB; OpenEXR's documentation of compressions).
+const MOST_LINES: usize = 256;
+/// Most bytes of a block of all channels, which is decompressed as a whole.
+const MOST_BLOCK: usize = 256 << 20;
 
-/// Width, height and numbers. Errors: damage, no channel that is known for depth.
-pub(super) fn read(bytes: &[u8]) -> Result<(usize, usize, Vec<f32>)> {
+/// Width, height and numbers. `check` sees the size before anything of that size is allocated.
+///
+/// Errors: damage, no channel that is known for depth, those of `check`.
+pub(super) fn read(bytes: &[u8], check: impl Fn((usize, usize)) -> Result<()>) -> Result<(usize, usize, Vec<f32>)> {
     let bad = |what: String| Error::input(what).remedy("Write one channel Z (or depth) of 16 or 32-bit floats");
+    let unreadable = |e: exr::error::Error| bad(format!("the OpenEXR file cannot be read ({e})"));
+    let meta = MetaData::read_from_buffered(Cursor::new(bytes), false).map_err(unreadable)?;
+    let layers = || meta.headers.iter().filter(|h| !h.deep);
+    let Some((header, name)) = layers().find_map(|h| Some((h, depth_channel(h)?))) else {
+        let have: Vec<String> = layers().flat_map(|h| &h.channels.list).map(|c| c.name.to_string()).collect();
+        return Err(bad(format!("no channel of the OpenEXR file is known for depth: it has {}", have.join(", "))));
+    };
+    let (width, height) = (header.layer_size.width(), header.layer_size.height());
+    check((width, height))?;
+    let (across, lines) = match header.blocks {
+        BlockDescription::ScanLines => (width, MOST_LINES),
+        BlockDescription::Tiles(tiles) => (tiles.tile_size.width(), tiles.tile_size.height()),
+    };
+    let block = across.min(width) * lines.min(height);
+    if block.saturating_mul(header.channels.bytes_per_pixel) > MOST_BLOCK {
+        let what = format!("the OpenEXR file has {} channels of {width}x{height}", header.channels.list.len());
+        return Err(bad(format!("{what}: too much to unpack")));
+    }
     let image = prelude::read()
         .no_deep_data()
         .largest_resolution_level()
-        .all_channels()
+        .specific_channels()
+        .required(name)
+        .collect_pixels(
+            |size, _| (size.width(), vec![0.0; size.area()]),
+            |(width, values): &mut (usize, Vec<f32>), at, (value,): (f32,)| values[at.y() * *width + at.x()] = value,
+        )
         .first_valid_layer()
         .all_attributes()
         .non_parallel()
-        .from_buffered(std::io::Cursor::new(bytes))
-        .map_err(|e| bad(format!("the OpenEXR file cannot be read ({e})")))?;
-    let layer = image.layer_data;
-    let channels = &layer.channel_data.list;
+        .from_buffered(Cursor::new(bytes))
+        .map_err(unreadable)?;
+    let (_, values) = image.layer_data.channel_data.pixels;
+    if values.len() != width * height {
+        return Err(bad("the layers of the OpenEXR file differ in size".into()));
+    }
+    Ok((width, height, values))
+}
+
+/// Name of the channel that holds depth.
+fn depth_channel(header: &Header) -> Option<prelude::Text> {
+    let channels = &header.channels.list;
     let named = NAMES.iter().find_map(|name| channels.iter().find(|c| c.name.to_string() == *name));
     let ending = || channels.iter().find(|c| c.name.to_string().ends_with(".Z"));
     let only = || channels.first().filter(|_| channels.len() == 1);
-    let channel = named.or_else(ending).or_else(only).ok_or_else(|| {
-        let have: Vec<String> = channels.iter().map(|c| c.name.to_string()).collect();
-        bad(format!("no channel of the OpenEXR file is known for depth: it has {}", have.join(", ")))
-    })?;
-    let values = match &channel.sample_data {
-        FlatSamples::F16(v) => v.iter().map(|x| x.to_f32()).collect(),
-        FlatSamples::F32(v) => v.clone(),
-        FlatSamples::U32(v) => v.iter().map(|&x| x as f32).collect(),
-    };
-    Ok((layer.size.width(), layer.size.height(), values))
+    named.or_else(ending).or_else(only).map(|c| c.name.clone())
 }

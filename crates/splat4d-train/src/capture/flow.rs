@@ -163,8 +163,7 @@ pub(crate) fn to_picture(flow: &Planes<f32>) -> image::ImageBuffer<image::Rgb<u1
 }
 
 fn decode_picture(path: &Path, camera: &Camera) -> Result<Vec<Code>> {
-    let raster = picture::decode(path, None)?;
-    picture::check_beside(path, "flow", (raster.width, raster.height), camera)?;
+    let raster = picture::decode_beside(path, "flow", camera)?;
     let bad = |what: &str| {
         Err(Error::input(format!("the flow picture has {what}"))
             .at(path.display())

@@ -1,5 +1,6 @@
 //! JSON with named places: every error says which key of which file is wrong and, for a misspelt key, what was meant.
 
+use crate::files;
 use serde_json::Value;
 use splat4d::{Error, Result};
 use std::path::Path;
@@ -9,16 +10,13 @@ const MAX_BYTES: u64 = 512 << 20;
 
 /// Reads a text or binary file of at most [`MAX_BYTES`].
 pub(super) fn read_bytes(path: &Path) -> Result<Vec<u8>> {
-    let fail = |e| {
-        Error::io("cannot be read", e).at(path.display()).remedy("Check that the file exists and may be read by you.")
-    };
-    let length = std::fs::metadata(path).map_err(fail)?.len();
+    let length = std::fs::metadata(path).map_or(0, |m| m.len());
     if length > MAX_BYTES {
         return Err(Error::input(format!("is {length} bytes long, more than the {MAX_BYTES} that are accepted"))
             .at(path.display())
             .remedy("Check that this is the right file, or split the take."));
     }
-    std::fs::read(path).map_err(fail)
+    files::read(path)
 }
 
 /// Reads and parses a JSON file.

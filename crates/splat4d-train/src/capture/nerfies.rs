@@ -216,10 +216,8 @@ fn points(root: &Path, framing: &Framing) -> Result<Option<PointCloud>> {
             .remedy("Delete the file: points are then found in the pictures."));
     }
     let mut cloud = PointCloud::default();
-    for x in array.to_f64().chunks_exact(3).filter(|x| x.iter().all(|v| v.is_finite())) {
-        cloud.points.push(framing.apply([x[0], x[1], x[2]]));
-        cloud.colors.push([GREY; 3]);
-        cloud.times.push(None);
+    for x in array.to_f64().chunks_exact(3) {
+        cloud.push(framing.apply([x[0], x[1], x[2]]), [GREY; 3], None);
     }
-    Ok((!cloud.points.is_empty()).then_some(cloud))
+    Ok(Some(cloud))
 }

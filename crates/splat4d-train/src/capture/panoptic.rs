@@ -135,10 +135,8 @@ fn read_archive(path: &Path) -> Result<PointCloud> {
         }
     };
     let mut cloud = PointCloud::default();
-    for row in array.to_f64().chunks_exact(columns).filter(|r| r[..6].iter().all(|v| v.is_finite())) {
-        cloud.points.push([row[0], row[1], row[2]]);
-        cloud.colors.push([row[3], row[4], row[5]].map(|v| v.clamp(0.0, 1.0) as f32));
-        cloud.times.push(None);
+    for row in array.to_f64().chunks_exact(columns) {
+        cloud.push([row[0], row[1], row[2]], [row[3], row[4], row[5]].map(|v| v as f32), None);
     }
     Ok(cloud)
 }

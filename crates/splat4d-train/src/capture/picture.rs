@@ -1,11 +1,11 @@
 //! Picture files: headers without pixels, and upright pixels in planes. JPEG, PNG and WebP; EXIF orientation honoured.
 
 use super::{json, pose};
+use crate::files;
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageReader};
 use splat4d::scene::Camera;
 use splat4d::{Error, Result};
-use std::fs::File;
 use std::io::{BufRead, BufReader, Cursor, Seek};
 use std::path::Path;
 use zune_core::colorspace::ColorSpace;
@@ -76,7 +76,7 @@ pub(super) fn header(path: &Path) -> Result<Header> {
     let fail = |e| {
         Error::io("cannot be read", e).at(path.display()).remedy("Check that the file exists and may be read by you.")
     };
-    let mut file = BufReader::new(File::open(path).map_err(fail)?);
+    let mut file = BufReader::new(files::open(path)?);
     let jpeg = is_jpeg(file.fill_buf().map_err(fail)?);
     let (width, height, alpha, orientation) = if jpeg {
         let mut decoder = JpegDecoder::new(file);
@@ -138,6 +138,27 @@ pub(super) fn check_beside(path: &Path, what: &str, size: (usize, usize), camera
     Err(Error::input(format!("the {what} is {}x{}, its picture {}x{}", size.0, size.1, camera.width, camera.height))
         .at(path.display())
         .remedy("Write it in the size of the stored picture"))
+}
+
+/// How many times as long as its picture's the sides of a map may be; a larger one is a mistake, or a trap for memory.
+const MOST_TIMES: usize = 8;
+
+/// An error where what lies beside a picture, `what` in words, is far larger than that picture.
+pub(super) fn check_not_larger(what: &str, size: (usize, usize), camera: &Camera) -> Result<()> {
+    if size.0 <= MOST_TIMES * camera.width && size.1 <= MOST_TIMES * camera.height {
+        return Ok(());
+    }
+    let what = format!("the {what} is {}x{}, its picture {}x{}", size.0, size.1, camera.width, camera.height);
+    Err(Error::input(what)
+        .remedy(format!("Write it in the size of the picture; at most {MOST_TIMES} times its sides.")))
+}
+
+/// Decodes what lies beside a picture, `what` in words. Errors before its pixels are read where its size is not that of the
+/// stored picture.
+pub(super) fn decode_beside(path: &Path, what: &str, camera: &Camera) -> Result<Raster> {
+    let header = header(path)?;
+    check_beside(path, what, (header.width, header.height), camera)?;
+    decode(path, None)
 }
 
 /// Decodes a picture, upright. Fails before any large allocation if its size is impossible or, where given, not

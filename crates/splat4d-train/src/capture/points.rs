@@ -9,8 +9,11 @@ use std::path::Path;
 /// Colour of points that have none.
 const GREY: f32 = 0.5;
 
-/// Reads the points of a .ply file with their colours and, where it says them, their times. Points that are not finite are
-/// left out.
+/// Farthest coordinate of a point that is believed, scene units: sums of squares and cubes of it still fit 32-bit floats.
+/// Metres of a map are a hundred thousand times smaller.
+const FARTHEST: f64 = 1e12;
+
+/// Reads the points of a .ply file with their colours and, where it says them, their times.
 pub(super) fn read_ply(path: &Path) -> Result<PointCloud> {
     cloud(&read_bytes(path)?).map_err(|e| e.at(path.display()))
 }
@@ -22,13 +25,7 @@ fn cloud(bytes: &[u8]) -> Result<PointCloud> {
         let seen = read.times.get(i).copied();
         // No number: the point was not seen at one time.
         let seen = seen.filter(|t| !t.is_nan());
-        if point.iter().chain(&seen).all(|v| v.is_finite()) {
-            let color = read.colors.get(i).copied().unwrap_or([GREY; 3]);
-            cloud.points.push(*point);
-            // A colour that is no number must not spread.
-            cloud.colors.push(color.map(|v| if v.is_nan() { GREY } else { v.clamp(0.0, 1.0) }));
-            cloud.times.push(seen);
-        }
+        cloud.push(*point, read.colors.get(i).copied().unwrap_or([GREY; 3]), seen);
     }
     Ok(cloud)
 }
@@ -42,6 +39,8 @@ pub struct PointCloud {
     pub colors: Vec<[f32; 3]>,
     /// Seconds, one per point; `None` where the point was not seen at one time.
     pub times: Vec<Option<f64>>,
+    /// Points of the file that were left out: with coordinates that are not finite, or too far away to compute with.
+    pub left_out: usize,
 }
 
 /// Cells along the longest side of the finest voxel grid that is tried: finer than any cloud resolves, and three cell
@@ -51,6 +50,29 @@ const MAX_CELLS: f64 = (1u64 << 20) as f64;
 const STEPS: usize = 16;
 
 impl PointCloud {
+    /// Adds a point that a file holds, or counts it as left out.
+    pub(super) fn push(&mut self, point: [f64; 3], color: [f32; 3], time: Option<f64>) {
+        if !point.iter().all(|v| v.abs() <= FARTHEST) || time.is_some_and(|t| !t.is_finite()) {
+            self.left_out += 1;
+            return;
+        }
+        self.points.push(point);
+        // A colour that is not a number must not spread.
+        self.colors.push(color.map(|v| if v.is_nan() { GREY } else { v.clamp(0.0, 1.0) }));
+        self.times.push(time);
+    }
+
+    /// What was left out of the file, for a warning.
+    pub(crate) fn loss(&self) -> Option<String> {
+        let all = self.points.len() + self.left_out;
+        (self.left_out > 0).then(|| {
+            format!(
+                "{} of {all} initial points are left out: their coordinates are not finite, or beyond {FARTHEST:.0e} units.",
+                self.left_out
+            )
+        })
+    }
+
     /// All of it as a binary .ply file, from which it comes back bit by bit; `comment`: lines for its header.
     pub fn to_ply(&self, comment: &str) -> Vec<u8> {
         let mut out = format!(
@@ -141,7 +163,7 @@ mod tests {
                      end_header\n255 0 51 1.5 -2 3 0.5\n0 255 0 nan 0 0 0\n9 9 9 0 0 0 inf\n";
         let read = cloud(ascii.as_bytes()).unwrap();
         assert_eq!((read.points.as_slice(), read.times[0]), (&[[1.5, -2.0, 3.0]][..], Some(0.5)));
-        assert_eq!(read.colors, [[1.0, 0.0, 0.2]]);
+        assert_eq!((read.colors.as_slice(), read.left_out), (&[[1.0, 0.0, 0.2]][..], 2));
         let mut binary = ascii[..ascii.find("255 0").unwrap()].replace("ascii", "binary_little_endian").into_bytes();
         for (x, time) in [(1.5, 0.5), (f64::NAN, 0.0), (0.0, f32::INFINITY)] {
             binary.extend([255, 0, 51]);
@@ -161,10 +183,26 @@ mod tests {
             points: vec![[0.1, -2e-9, 3e7], [1.0 / 3.0, 0.0, -0.7]],
             colors: vec![[0.1, 0.2, 1.0], [0.0, 0.7, 1.0 / 3.0]],
             times: vec![None, Some(0.3)],
+            left_out: 0,
         };
         assert_eq!(super::cloud(&cloud.to_ply("comment made up")).unwrap(), cloud);
         let none = PointCloud::default();
         assert_eq!(super::cloud(&none.to_ply("comment made up")).unwrap(), none);
+    }
+
+    #[test]
+    fn points_that_cannot_be_computed_with_are_left_out_and_counted() {
+        let mut cloud = PointCloud::default();
+        assert_eq!(cloud.loss(), None);
+        for x in [0.0, 5.4e6, -1e12, 1e13, -1e300, f64::INFINITY, f64::NAN] {
+            cloud.push([0.0, x, 0.0], [f32::NAN, 2.0, 0.0], None);
+        }
+        cloud.push([0.0; 3], [0.0; 3], Some(f64::INFINITY));
+        assert_eq!((cloud.points.len(), cloud.left_out, cloud.colors[0]), (3, 5, [GREY, 1.0, 0.0]));
+        assert!(cloud.loss().unwrap().contains("5 of 8"), "{:?}", cloud.loss());
+        let ply = "ply\nformat ascii 1.0\nelement vertex 2\nproperty double x\nproperty double y\nproperty double z\n\
+                   end_header\n1e39 0 0\n0 0 0\n";
+        assert_eq!(super::cloud(ply.as_bytes()).unwrap().left_out, 1, "beyond 32-bit floats");
     }
 
     #[test]

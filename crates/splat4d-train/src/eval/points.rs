@@ -154,7 +154,7 @@ fn visibility(capture: &Capture, truth: &Truth) -> Result<Option<Visible>> {
     if !path.is_file() {
         return Ok(None);
     }
-    let bytes = std::fs::read(&path).map_err(|e| Error::io("cannot be read", e).at(path.display()))?;
+    let bytes = crate::files::read(&path)?;
     let array = Npy::read(&bytes).map_err(|e| e.at(path.display()))?;
     let wanted = [capture.cameras.len(), truth.frames, truth.points];
     if array.shape != wanted {

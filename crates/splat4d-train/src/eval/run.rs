@@ -21,10 +21,10 @@ use super::colour::{ColourSums, IDENTITY};
 use super::metrics::{self, Flicker, TemporalMean};
 use super::report::METHOD;
 use super::{CameraScores, Conditions, InputScaling, Lpips, Report, Score, Split, View, ViewContext, score_view};
+use crate::Result;
 use crate::capture::{Capture, ImageStore, StoredPicture};
 use crate::event::Event;
 use crate::run::checkpoint::write_atomically;
-use crate::{Error, Result};
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
 use rayon::prelude::*;
@@ -462,9 +462,7 @@ fn foreground(stored: &StoredPicture) -> Option<Vec<bool>> {
 }
 
 fn load_lpips(path: &Path) -> Result<Lpips> {
-    let bytes = std::fs::read(path).map_err(|e| {
-        Error::io("the LPIPS weights cannot be read", e).at(path.display()).remedy("Check the path of --lpips-weights")
-    })?;
+    let bytes = crate::files::read(path).map_err(|e| e.at("the LPIPS weights"))?;
     let file = SafeTensors::read(&bytes).map_err(|e| e.at(path.display()))?;
     let tensor = |name: &str| {
         let tensor = file.tensor(name).ok()?;

@@ -72,8 +72,7 @@ impl Truth {
         if !path.is_file() {
             return Ok(None);
         }
-        let bytes =
-            std::fs::read(&path).map_err(|e| Error::io("the true tracks cannot be read", e).at(path.display()))?;
+        let bytes = crate::files::read(&path)?;
         Self::read(&bytes).map(Some).map_err(|e| e.at(path.display()))
     }
 

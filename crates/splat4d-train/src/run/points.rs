@@ -151,7 +151,8 @@ mod tests {
         let file = run.join(FILE);
         let text = String::from_utf8_lossy(&std::fs::read(&file).unwrap()).into_owned();
         let mark = text.lines().find(|l| l.starts_with("comment")).unwrap().to_owned();
-        let cloud = PointCloud { points: vec![[0.1, 0.2, 0.3]; 9], colors: vec![[0.5; 3]; 9], times: vec![None; 9] };
+        let (points, colors) = (vec![[0.1, 0.2, 0.3]; 9], vec![[0.5; 3]; 9]);
+        let cloud = PointCloud { points, colors, times: vec![None; 9], left_out: 0 };
         std::fs::write(&file, cloud.to_ply(&mark)).unwrap();
         assert!(!train());
         assert_eq!(open_run(&run).unwrap().1.points, Some(cloud.clone()));

@@ -105,6 +105,38 @@ fn openexr_is_read_by_its_depth_channel() {
     assert_says(&load(&sample, 1, 2).unwrap_err().to_string(), &["cam01", "frame 0", "0005.exr", "OpenEXR"]);
 }
 
+/// Places of "i32 right, i32 bottom" of the data window and the display window of an OpenEXR file.
+fn windows(bytes: &[u8]) -> Vec<usize> {
+    let name = b"Window\0box2i\0\x10\0\0\0";
+    (0..bytes.len() - name.len()).filter(|&at| bytes[at..].starts_with(name)).map(|at| at + name.len() + 8).collect()
+}
+
+#[test]
+fn sizes_are_compared_with_the_picture_before_anything_is_decoded() {
+    use exr::prelude::*;
+    let sample = sample();
+    let mut bytes = std::io::Cursor::new(Vec::new());
+    let channel = AnyChannel::new("Z", FlatSamples::F32(vec![1.0; WIDTH * HEIGHT]));
+    let channels = AnyChannels::sort([channel].into_iter().collect());
+    let layer = Layer::new((WIDTH, HEIGHT), LayerAttributes::named("depth"), Encoding::SMALL_LOSSLESS, channels);
+    Image::from_layer(layer).write().non_parallel().to_buffered(&mut bytes).unwrap();
+    let mut bytes = bytes.into_inner();
+    let places = windows(&bytes);
+    assert_eq!(places.len(), 2, "data and display window");
+    // A width of 2²⁹ would take 2 GB a scan line.
+    places.iter().for_each(|&at| bytes[at..at + 4].copy_from_slice(&(1i32 << 29).to_le_bytes()));
+    (0..2).for_each(|frame| sample.write(&name(frame, "exr"), &bytes));
+    sample.edit("capture.json", |v| v["cameras"][1]["depth"] = json!("depth/cam01/%04d.exr"));
+    assert_says(&load(&sample, 1, 2).unwrap_err().to_string(), &["0005.exr", "536870913x", "its picture"]);
+    // The same for PNG.
+    let mut png = std::io::Cursor::new(Vec::new());
+    let side = 9 * WIDTH as u32;
+    ImageBuffer::<Luma<u16>, _>::new(side, 1).write_to(&mut png, image::ImageFormat::Png).unwrap();
+    (0..2).for_each(|frame| sample.write(&name(frame, "png"), png.get_ref()));
+    sample.edit("capture.json", |v| v["cameras"][1]["depth"] = json!("depth/cam01/%04d.png"));
+    assert_says(&load(&sample, 1, 2).unwrap_err().to_string(), &["0005.png", "its picture", "8 times"]);
+}
+
 #[test]
 fn nerfstudio_maps_are_thousandths() {
     let sample = samples::nerfstudio();

@@ -1,0 +1,22 @@
+//! The texts that people give to verbs, read: for the fuzz targets.
+
+use crate::{asked, camera_file, paths};
+use splat4d::Result;
+use splat4d::scene::Camera;
+
+/// Reads a camera, as `--camera` does.
+pub fn camera(text: &str) -> Result<()> {
+    camera_file::parse(text).map(drop)
+}
+
+/// Reads key frames, as `--path` does.
+pub fn path(text: &str) -> Result<()> {
+    paths::check_keys(text)
+}
+
+/// Reads points that are asked for, as `--points` does; of a scene of one second with one camera, `cam1`.
+pub fn points(text: &str) -> Result<()> {
+    let camera = Camera::with_fov_y(splat4d::math::Se3::IDENTITY, 0.8, 8, 6);
+    let view = paths::View { camera, name: "cam1".into(), time: 0.0, held: false };
+    asked::read(text, &[view], [0.0, 1.0]).map(drop)
+}

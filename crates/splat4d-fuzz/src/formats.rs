@@ -1,0 +1,236 @@
+//! Files of scenes and arrays.
+
+use crate::Reader;
+use flate2::Compression;
+use flate2::read::GzDecoder;
+use flate2::write::GzEncoder;
+use splat4d::format::dialect::{WriteOptions, still};
+use splat4d::format::playback::{self, HEADER_BYTES, Index};
+use splat4d::format::{DIALECTS, npy, ply, safetensors, scene, sog, splat};
+use splat4d::layers::{Evaluation, Layer, Scene};
+use splat4d::math::Rng;
+use splat4d::motion::{Spacetime, SpacetimeSpec};
+use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
+use splat4d::scene::{GEOMETRY, LIFE, LifeKind, Params, SH, Time};
+use std::borrow::Cow;
+use std::io::{Read, Write};
+use std::sync::Arc;
+
+pub(crate) const READERS: &[Reader] = &[
+    Reader { name: "playback", seeds: playback_seeds, read: playback_file },
+    Reader { name: "ply", seeds: || written(".ply"), read: open },
+    Reader { name: "ply_points", seeds: point_seeds, read: |b| drop(ply::read_points(b)) },
+    Reader { name: "ply_compressed", seeds: || written(".compressed.ply"), read: open },
+    Reader { name: "stg_ply", seeds: || written(".stg.ply"), read: open },
+    Reader { name: "spz", seeds: || written(".spz"), read: open },
+    Reader { name: "spz_gzip", seeds: spz_bodies, read: |b| open(&gzip(b)) },
+    Reader { name: "splat", seeds: || written(".splat"), read: |b| drop(splat::read(b)) },
+    Reader { name: "splatv", seeds: || written(".splatv"), read: open },
+    Reader { name: "sog_zip", seeds: sog_seeds, read: open },
+    Reader { name: "sog_meta", seeds: meta_seeds, read: sog_meta },
+    Reader { name: "scene", seeds: scene_seeds, read: open },
+    Reader { name: "safetensors", seeds: scene_seeds, read: |b| drop(safetensors::SafeTensors::read(b)) },
+    Reader { name: "npy", seeds: npy_seeds, read: |b| drop(npy::Npy::read(b)) },
+    Reader { name: "npz", seeds: npz_seeds, read: |b| drop(npy::Npy::read_member(b, "data")) },
+];
+
+/// A SOG scene of some Gaussians, made by splat-transform 3.7 of numbers of our own.
+const SOG: &[u8] = include_bytes!("../seeds/few.sog");
+
+/// Opens a file of any kind and shows a moment of it.
+fn open(bytes: &[u8]) {
+    if let Ok(scene) = splat4d::open(bytes) {
+        show(&scene);
+    }
+}
+
+fn show(scene: &Scene<f32>) {
+    scene.at(Time(scene.clip[0]), &mut Evaluation::default());
+}
+
+fn numbers(rows: usize, coefficients: usize, life: LifeKind) -> Params {
+    let mut p = Params::new(rows, coefficients, life.columns());
+    let rng = Rng::new(1, "fuzz seeds", 0);
+    for row in 0..rows {
+        let n = |i: u64| rng.fork(row as u64).normal(i) as f32;
+        p[GEOMETRY].write(row, 0, [n(0), n(1), n(2)]);
+        p[GEOMETRY].write(row, QUAT, [n(3), n(4), n(5), n(6)]);
+        p[GEOMETRY].write(row, LOG_SCALE, [n(7) - 4.0, n(8) - 4.0, n(9) - 4.0]);
+        p[GEOMETRY].set(row, OPACITY, n(10));
+        (0..3 * coefficients).for_each(|k| p[SH].set(row, k, 0.2 * n(20 + k as u64)));
+        (0..life.columns().len()).for_each(|k| p[LIFE].set(row, k, 0.3 * n(80 + k as u64)));
+    }
+    p
+}
+
+fn standing() -> Scene<f32> {
+    still(numbers(5, 4, LifeKind::Infinite))
+}
+
+fn moving() -> Scene<f32> {
+    let mut params = numbers(5, 1, LifeKind::GaussHalf);
+    let spec = SpacetimeSpec { order: 1, rotation: true, detach: false, origin: 0.5, features: None };
+    let motion = Spacetime::new(spec, &mut params).expect("the order is known");
+    let layer = Layer::new("moving", params, Arc::new(motion), LifeKind::GaussHalf);
+    Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 10.0, up: [0.0, -1.0, 0.0], ..Scene::default() }
+}
+
+/// What the dialect with this ending writes, in every version.
+fn written(ending: &str) -> Vec<Vec<u8>> {
+    let dialect = DIALECTS.iter().find(|d| d.ending == ending).expect("the ending is a dialect's");
+    let scene = if dialect.moves { moving() } else { standing() };
+    let mut out = Vec::new();
+    for spz_version in 2..=4 {
+        let mut bytes = Vec::new();
+        let options = WriteOptions { spz_version, ..WriteOptions::default() };
+        dialect.write(&scene, &options, &mut bytes).expect("memory takes all bytes");
+        out.push(bytes);
+    }
+    out.dedup();
+    out
+}
+
+fn point_seeds() -> Vec<Vec<u8>> {
+    let header = "ply\nformat ascii 1.0\nelement vertex 2\nproperty double x\nproperty double y\nproperty double z\n\
+                  property uchar red\nproperty uchar green\nproperty uchar blue\nproperty float time\nelement face 1\n\
+                  property list uchar int vertex_indices\nend_header\n0 1 2 255 0 9 0.5\n1e3 -2 3 1 2 3 nan\n3 0 1 1\n";
+    let mut all = written(".ply");
+    all.push(header.into());
+    all
+}
+
+fn gzip(bytes: &[u8]) -> Vec<u8> {
+    let mut zip = GzEncoder::new(Vec::new(), Compression::fast());
+    zip.write_all(bytes).expect("memory takes all bytes");
+    zip.finish().expect("memory takes all bytes")
+}
+
+/// What lies inside the gzip streams of versions 2 and 3: damage reaches it past the checksum.
+fn spz_bodies() -> Vec<Vec<u8>> {
+    let inside = |file: Vec<u8>| {
+        let mut body = Vec::new();
+        GzDecoder::new(&file[..]).read_to_end(&mut body).ok().map(|_| body)
+    };
+    written(".spz").into_iter().filter_map(inside).collect()
+}
+
+fn scene_seeds() -> Vec<Vec<u8>> {
+    [standing(), moving()]
+        .map(|s| {
+            let mut bytes = Vec::new();
+            scene::write(&s, &mut bytes).expect("memory takes all bytes");
+            bytes
+        })
+        .into()
+}
+
+fn sog_seeds() -> Vec<Vec<u8>> {
+    vec![SOG.to_vec()]
+}
+
+fn meta_seeds() -> Vec<Vec<u8>> {
+    vec![sog::unzip(SOG).expect("the seed is sound")[sog::META].to_vec()]
+}
+
+/// Another `meta.json` for the seed's pictures.
+fn sog_meta(bytes: &[u8]) {
+    let mut files = sog::unzip(SOG).expect("the seed is sound");
+    files.insert(sog::META.into(), Cow::Borrowed(bytes));
+    drop(sog::files_of(bytes));
+    drop(sog::read(&files));
+}
+
+fn array(shape: &[usize]) -> Vec<u8> {
+    let (mut out, count) = (Vec::new(), shape.iter().product::<usize>());
+    let data: Vec<f32> = (0..count).map(|i| i as f32).collect();
+    npy::write_f32(shape, &data, &mut out).expect("memory takes all bytes");
+    out
+}
+
+fn npy_seeds() -> Vec<Vec<u8>> {
+    // Big-endian integers, column by column.
+    let dict = b"{'descr': '>i2', 'fortran_order': True, 'shape': (2, 3), }\n";
+    let columns = [b"\x93NUMPY\x01\0", &(dict.len() as u16).to_le_bytes()[..], dict, &[0; 12]].concat();
+    vec![array(&[2, 3]), array(&[7]), array(&[]), columns]
+}
+
+/// A zip of one file.
+fn npz(name: &str, plain: &[u8], deflate: bool) -> Vec<u8> {
+    let mut packed = plain.to_vec();
+    if deflate {
+        let mut zip = flate2::write::DeflateEncoder::new(Vec::new(), Compression::fast());
+        zip.write_all(plain).expect("memory takes all bytes");
+        packed = zip.finish().expect("memory takes all bytes");
+    }
+    let mut shared = vec![20, 0, 0, 0, if deflate { 8 } else { 0 }, 0];
+    shared.extend([0; 8]);
+    shared.extend((packed.len() as u32).to_le_bytes());
+    shared.extend((plain.len() as u32).to_le_bytes());
+    shared.extend((name.len() as u16).to_le_bytes());
+    shared.extend([0, 0]);
+    let mut out = [b"PK\x03\x04", &shared[..], name.as_bytes(), &packed].concat();
+    let directory = [b"PK\x01\x02\x14\0", &shared[..], &[0; 14], name.as_bytes()].concat();
+    let at = out.len() as u32;
+    out.extend(&directory);
+    out.extend(b"PK\x05\x06\0\0\0\0\x01\0\x01\0");
+    out.extend((directory.len() as u32).to_le_bytes());
+    out.extend(at.to_le_bytes());
+    out.extend([0, 0]);
+    out
+}
+
+fn npz_seeds() -> Vec<Vec<u8>> {
+    [false, true].map(|deflate| npz("data.npy", &array(&[4, 7]), deflate)).into()
+}
+
+fn playback_seeds() -> Vec<Vec<u8>> {
+    vec![include_bytes!("../../splat4d/tests/data/tiny.s4d").to_vec()]
+}
+
+/// Reads a playback file as it is, and with its checksums mended: almost every input would stop at these.
+fn playback_file(bytes: &[u8]) {
+    let look = |bytes: &[u8]| {
+        let _ = Index::needed(bytes);
+        let _ = Index::parse(bytes, Some(bytes.len() as u64));
+        let _ = playback::provenance(bytes);
+        if let Ok(scene) = playback::read(bytes) {
+            show(&scene);
+        }
+    };
+    look(bytes);
+    let mut mended = bytes.to_vec();
+    mend(&mut mended);
+    look(&mended);
+}
+
+/// Bytes of an entry of the table of sections.
+const ENTRY: usize = 64;
+
+fn crc(bytes: &[u8]) -> [u8; 4] {
+    let mut crc = flate2::Crc::new();
+    crc.update(bytes);
+    crc.sum().to_le_bytes()
+}
+
+/// Writes the checksums that fit (docs/format.md, "Layout").
+fn mend(bytes: &mut [u8]) {
+    let number = |b: &[u8], at: usize| {
+        b.get(at..at.checked_add(4)?).map(|x| u32::from_le_bytes([x[0], x[1], x[2], x[3]]) as usize)
+    };
+    let Some(index) = number(bytes, 12) else { return };
+    if bytes.len() < HEADER_BYTES || index > bytes.len() - HEADER_BYTES {
+        return;
+    }
+    let end = HEADER_BYTES + index;
+    let table = number(bytes, HEADER_BYTES).and_then(|json| json.checked_add(HEADER_BYTES + 8)).unwrap_or(end);
+    for at in (table..(end + 1).saturating_sub(ENTRY)).step_by(ENTRY) {
+        let (Some(offset), Some(size)) = (number(bytes, at + 8), number(bytes, at + 16)) else { continue };
+        if let Some(sum) = bytes.get(offset..offset.saturating_add(size)).map(crc) {
+            bytes[at + 24..at + 28].copy_from_slice(&sum);
+        }
+    }
+    let sum = crc(&bytes[HEADER_BYTES..end]);
+    bytes[24..28].copy_from_slice(&sum);
+    let sum = crc(&bytes[..HEADER_BYTES - 4]);
+    bytes[HEADER_BYTES - 4..HEADER_BYTES].copy_from_slice(&sum);
+}
