@@ -2,6 +2,7 @@
 
 mod camera;
 mod capture;
+mod chaos;
 mod count;
 mod files;
 mod glb;
@@ -48,6 +49,9 @@ chores:
   strip-character IN.glb OUT.glb CLIP... [--drop NODE...]
                              keeps the named animation clips of a character, drops the named nodes' meshes
   site OUT [--no-api]        makes the static site in OUT: documents, API, a gallery that plays the example scenes
+  chaos [--trials N] [--seed N] [--verb NAME] [--program FILE]
+                             disturbs every verb that writes (kill -9, full disk, two owners, clock jumps, read-only
+                             folders) and compares its result with the undisturbed one; wants the release build
   count [FOLDER]             counts lines of code, without tests, comments and blank lines, of the repository FOLDER";
 
 fn main() -> ExitCode {
@@ -65,6 +69,7 @@ fn run(arguments: &[String]) -> Result<()> {
     let (chore, rest) = arguments.split_first().context(USAGE)?;
     match chore.as_str() {
         "capture" => capture::command(rest),
+        "chaos" => chaos::command(rest),
         "count" => count::command(rest),
         "site" => site::command(rest),
         "strip-character" => strip_character(rest),
