@@ -40,7 +40,7 @@ pub(super) fn disturb(
     undisturbed: &Undisturbed,
     random: &mut Random,
 ) -> Result<String> {
-    let time = |random: &mut Random| Duration::from_secs_f64(1.05 * undisturbed.seconds * random.share());
+    let time = |random: &mut Random| Duration::from_secs_f64(undisturbed.seconds * random.share());
     Ok(match kind {
         Disturbance::Kill => {
             let (mut kills, most) = (0, 1 + (random.share() * KILLS as f64) as usize);

@@ -7,9 +7,9 @@ use serde_json::{Value, json};
 use std::path::Path;
 
 const CAMERAS: usize = 4;
-const SIZE: [usize; 2] = [32, 24];
-/// Pixels.
-const FOCAL: f64 = 30.0;
+/// Pixels: the least that `import` takes.
+const SIZE: [usize; 2] = [48, 36];
+const FOCAL: f64 = 45.0;
 const DISTANCE: f64 = 3.0;
 /// Angle between neighbouring cameras, radians.
 const APART: f64 = 0.35;
@@ -54,7 +54,7 @@ fn camera(folder: &Path, number: usize, frames: usize) -> Result<Value> {
     }
     let row = |i: usize| [rotation[i][0], rotation[i][1], rotation[i][2], if i == 2 { DISTANCE } else { 0.0 }];
     Ok(json!({
-        "name": format!("cam{number}"), "width": SIZE[0], "height": SIZE[1], "fx": FOCAL, "fy": FOCAL, "cx": 16, "cy": 12,
+        "name": format!("cam{number}"), "width": SIZE[0], "height": SIZE[1], "fx": FOCAL, "fy": FOCAL, "cx": SIZE[0] / 2, "cy": SIZE[1] / 2,
         "world_to_camera": [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]],
         "images": format!("images/cam{number}/%04d.png"), "labels": format!("labels/cam{number}/%04d.png"),
         "frames": frames,

@@ -175,7 +175,7 @@ pub(super) const VERBS: [Verb; 14] = [
         name: "edit",
         users_file: false,
         prepare: nothing,
-        words: |s, at| words("edit {} --delete sphere(0,0,0,0.2) -o {}", &[&s.run, &at.join("out.safetensors")]),
+        words: |s, at| words("edit {} --delete box(-9,-9,-9,0,9,9) -o {}", &[&s.run, &at.join("out.safetensors")]),
     },
     Verb {
         name: "bake",

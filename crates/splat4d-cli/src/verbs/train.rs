@@ -211,7 +211,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         recipe.refuse_idle(typed).map_err(|e| e.at("--set"))?;
         console.phase("reading the capture", 0, 0);
         // Of a long take no more is listed than tells that it is one.
-        let capture = open_frames(&source, &recipe, look_ahead(&recipe))?;
+        let capture = Arc::new(open_frames(&source, &recipe, look_ahead(&recipe))?);
         let output = again.as_ref().map(|(run, _)| run).or(args.output.as_ref());
         let asked = Asked::new(&capture.root, &recipe, minutes, predict);
         let place = || place(args, output, &capture, &asked, console);
@@ -226,7 +226,6 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
                 (recipe.unresolved().with(|r| r.run.iterations = steps), None)
             }
         };
-        let capture = Arc::new(capture);
         let outlook = match at_once {
             true => None,
             false => Outlook::new(&capture, &recipe, minutes, false, &clock, &mut |event| console.event(event))?,

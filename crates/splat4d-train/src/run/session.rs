@@ -192,8 +192,9 @@ impl Session<'_> {
     pub(super) fn begin(&self, trainer: &Trainer<'_>, listen: &mut dyn FnMut(&Event)) -> Result<RunState> {
         self.write_recipe(self.recipe)?;
         let state = RunState::default();
-        save_checkpoint(self.run, trainer, &self.identity, &state, listen)?;
+        // Where there is a checkpoint, there is all that continuing needs.
         self.write_info(&Totals::default(), trainer, &state, false)?;
+        save_checkpoint(self.run, trainer, &self.identity, &state, listen)?;
         Ok(state)
     }
 
