@@ -13,11 +13,12 @@ use splat4d_cli::console::Console;
 use splat4d_cli::draw::antialias;
 use splat4d_cli::files::{self, human_seconds};
 use splat4d_cli::interrupt;
-use splat4d_cli::run_folder::{self, Run};
+use splat4d_cli::run_folder::Run;
 use splat4d_cli::source::read_scene;
 use splat4d_train::capture::{Capture, ImageStore};
 use splat4d_train::eval::run::{EvalOptions, assess};
 use splat4d_train::event::Event;
+use splat4d_train::output::OutputFolder;
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::open_capture;
 use splat4d_train::run::{self, TrainOptions, checkpoint};
@@ -218,6 +219,7 @@ fn judge(
     console: &Console,
 ) -> anyhow::Result<Option<Found>> {
     files::make_folder(folder)?;
+    let owned = OutputFolder::amend(folder, "e02")?;
     // The run has been announced: that it begins and ends is no news.
     let mut listen = |event: &Event| {
         if !matches!(event, Event::Started { .. } | Event::Finished { .. }) {
@@ -225,7 +227,7 @@ fn judge(
         }
     };
     let outcome = if checkpoint::list(folder).is_empty() {
-        run_folder::clear(folder)?;
+        owned.clear_inner("")?;
         let recipe = order.recipe.clone();
         run::train(capture.clone(), recipe, folder, &TrainOptions::default(), stop, &mut listen)?
     } else {

@@ -2,6 +2,7 @@
 
 mod camera;
 mod capture;
+mod chaos;
 mod count;
 mod files;
 mod fuzz;
@@ -51,6 +52,9 @@ chores:
   site OUT [--no-api]        makes the static site in OUT: documents, API, a gallery that plays the example scenes
   fuzz [--minutes N] [--seed S] [--reader NAME]
                              mutates sound inputs of every reader and prints how many were read (default: 2 minutes)
+  chaos [--trials N] [--seed N] [--verb NAME] [--program FILE]
+                             disturbs every verb that writes (kill -9, full disk, two owners, clock jumps, read-only
+                             folders) and compares its result with the undisturbed one; wants the release build
   count [FOLDER]             counts lines of code, without tests, comments and blank lines, of the repository FOLDER";
 
 fn main() -> ExitCode {
@@ -68,6 +72,7 @@ fn run(arguments: &[String]) -> Result<()> {
     let (chore, rest) = arguments.split_first().context(USAGE)?;
     match chore.as_str() {
         "capture" => capture::command(rest),
+        "chaos" => chaos::command(rest),
         "count" => count::command(rest),
         "fuzz" => fuzz::command(rest),
         "site" => site::command(rest),

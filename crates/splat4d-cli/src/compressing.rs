@@ -18,6 +18,7 @@ use splat4d::{Error, ErrorKind, Result};
 use splat4d_train::capture::{Capture, ImageStore};
 use splat4d_train::compress::{self, Compression, Job};
 use splat4d_train::eval::run::{EvalOptions, Scores, assess};
+use splat4d_train::output::{Found, Input, Mixes, OutputFolder, Request};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::{TrainOptions, checkpoint};
 use std::path::{Path, PathBuf};
@@ -34,6 +35,7 @@ const GENTLER: f64 = 0.5;
 #[serde(deny_unknown_fields)]
 pub(crate) struct Order {
     /// The run that is compressed.
+    #[serde(with = "splat4d_train::path_text")]
     pub source: PathBuf,
     pub level: u8,
     /// Most dB that training views may lose; 0: no guard.
@@ -53,9 +55,19 @@ pub(crate) struct Order {
     pub settings: Compression,
 }
 
+impl Order {
+    fn text(&self) -> String {
+        toml::to_string(self).expect("an order is plain data")
+    }
+}
+
+/// What an owner's record calls this verb.
+const COMMAND: &str = "compress";
+
 /// A compression in its folder.
 pub(crate) struct Work {
     dir: PathBuf,
+    folder: OutputFolder,
     order: Order,
     /// Whether this call began it.
     fresh: bool,
@@ -64,10 +76,18 @@ pub(crate) struct Work {
 }
 
 impl Work {
-    /// A new compression. Errors: the folder cannot be written.
-    pub(crate) fn begin(dir: PathBuf, order: Order) -> Result<Self> {
-        files::make_folder(&dir)?;
-        let work = Self { dir, order, fresh: true, device: Device::Cpu };
+    /// A new compression, or what the same order left unfinished. Errors: the folder cannot be written, or is not to be.
+    pub(crate) fn begin(dir: PathBuf, order: Order, force: bool) -> Result<Self> {
+        let asked = order.text();
+        let capture = Run::open(&order.source)?.capture();
+        let mut inputs = vec![Input::new(&order.source, "the run")];
+        inputs.extend(capture.as_deref().map(|c| Input::new(c, "the run's capture")));
+        let request = Request { command: COMMAND, inputs: &inputs, asked: &asked, force, mixes: Mixes::Anything };
+        let (folder, found) = OutputFolder::begin(&dir, &request)?;
+        if found == Found::Unfinished && dir.join(ORDER).is_file() {
+            return Self::opened(&dir, folder);
+        }
+        let work = Self { dir, folder, order, fresh: true, device: Device::Cpu };
         work.save()?;
         Ok(work)
     }
@@ -85,34 +105,39 @@ impl Work {
                 .at(dir.display())
                 .remedy("Give the folder that `splat4d compress` wrote, or begin anew: splat4d compress RUN."));
         }
+        Self::opened(dir, OutputFolder::amend(dir, COMMAND)?)
+    }
+
+    fn opened(dir: &Path, folder: OutputFolder) -> Result<Self> {
+        let path = dir.join(ORDER);
         let order: Order = toml::from_str(&files::read_text(&path)?).map_err(|e| {
             Error::input(format!("it is not readable: {}", e.message()))
                 .at(path.display())
                 .remedy("Begin anew: splat4d compress RUN.")
         })?;
         order.settings.check().map_err(|e| e.at(path.display()))?;
-        Ok(Self { dir: dir.to_owned(), order, fresh: false, device: Device::Cpu })
+        Ok(Self { dir: dir.to_owned(), folder, order, fresh: false, device: Device::Cpu })
     }
 
     fn save(&self) -> Result<()> {
-        let text = toml::to_string(&self.order).expect("an order is plain data");
-        files::write(&self.dir.join(ORDER), text.as_bytes())
+        files::write(&self.dir.join(ORDER), self.order.text().as_bytes())
     }
 
     /// Compresses, measures and reports. What fails before the first step leaves nothing behind.
-    pub(crate) fn run(self, eval: bool, measure: &Measure, console: &Console) -> anyhow::Result<()> {
-        let (dir, fresh) = (self.dir.clone(), self.fresh);
+    pub(crate) fn run(mut self, eval: bool, measure: &Measure, console: &Console) -> anyhow::Result<()> {
         let done = self.work(eval, measure, console);
-        if done.is_err() && fresh && checkpoint::list(&dir).is_empty() {
-            run_folder::clear(&dir)?;
-            // Fails where the user keeps files of their own there, as it should.
-            let _ = std::fs::remove_dir(&dir);
+        if done.is_err() && self.fresh && checkpoint::list(&self.dir).is_empty() {
+            self.folder.abandon();
+        } else if done.is_ok() {
+            self.folder.finished();
+        } else {
+            self.folder.begun();
         }
         done
     }
 
     /// Until size and guard are content.
-    fn work(mut self, eval: bool, measure: &Measure, console: &Console) -> anyhow::Result<()> {
+    fn work(&mut self, eval: bool, measure: &Measure, console: &Console) -> anyhow::Result<()> {
         let stop = interrupt::flag("stopping: a checkpoint is being saved");
         let source = Source::open(&self.order.source)?;
         not_empty(&source.scene, &self.order.source)?;
@@ -145,7 +170,7 @@ impl Work {
             console.written(&report::write(&Run::open(&self.dir)?)?);
         }
         console.written(&self.dir.join(playable::FILE));
-        console.emit(&json!({"type": "compressed", "run": self.dir, "bytes": file.bytes}));
+        console.emit(&json!({"type": "compressed", "run": self.dir.to_string_lossy(), "bytes": file.bytes}));
         Ok(())
     }
 
@@ -269,7 +294,10 @@ impl Work {
         files::write(&self.dir.join("cameras.json"), &serde_json::to_vec(&cameras_json(&original.capture))?)?;
         let job = original.job(&self.order.settings);
         let options = TrainOptions { device: self.device, ..TrainOptions::default() };
-        let compressed = compress::compress(&job, &self.dir, &options, stop, &mut |event| console.event(event))?;
+        let compressed = compress::compress(&job, &self.dir, &options, stop, &mut |event| {
+            run_folder::hear(&self.folder, event);
+            console.event(event);
+        })?;
         console.clear();
         if compressed.outcome.interrupted {
             return Err(self.interrupted(compressed.outcome.iteration).into());
@@ -327,7 +355,7 @@ impl Work {
         console.say(&format!("again, with {:.0} % pruned instead of {:.0} %", 100.0 * next, 100.0 * prune));
         self.order.tried.push(Tried { prune, bytes, psnr: is });
         self.order.settings.prune = next;
-        run_folder::clear(&self.dir)?;
+        self.folder.clear()?;
         self.save()?;
         Ok(true)
     }

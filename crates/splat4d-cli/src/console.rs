@@ -90,7 +90,7 @@ impl Console {
     /// A file was written.
     pub fn written(&self, path: &std::path::Path) {
         self.say(&format!("wrote {}", path.display()));
-        self.emit(&json!({"type": "written", "path": path}));
+        self.emit(&json!({"type": "written", "path": path.to_string_lossy()}));
     }
 
     /// A warning: always said, and kept for the report.
@@ -301,7 +301,7 @@ fn print(line: &str) {
             std::process::exit(0);
         }
         eprint_line(&format!("error: standard output cannot be written ({error}). {}", crate::files::WRITE_REMEDY));
-        std::process::exit(crate::BAD_INPUT.into());
+        std::process::exit(crate::FAILED.into());
     }
 }
 

@@ -739,6 +739,26 @@ mod tests {
         assert!(bench.refused(json!({"do": "show", "steps": [], "view": wide, "t": 0.0})).contains("camera"));
     }
 
+    /// What would have taken all memory, or made numbers of none: the server answers, and goes on with the page's steps.
+    #[test]
+    fn what_is_too_much_is_refused_and_the_rest_goes_on() {
+        let bench = Bench::new();
+        let good = json!({"do": "delete", "select": "box(-9,-9,-9, 0,9,9)"});
+        for (bad, word) in [
+            (vec![json!({"do": "retime", "rate": 1e-300})], "frames"),
+            (vec![json!({"do": "retime", "rate": 1e-12})], "frames"),
+            (vec![json!({"do": "move", "select": "all", "to": {"shift": [1e39, 0, 0]}})], "too large"),
+        ] {
+            let steps: Vec<Value> = [vec![good.clone()], bad].concat();
+            for what in ["bake", "save"] {
+                let said = bench.refused(json!({"do": what, "steps": steps}));
+                assert!(said.contains(word), "{said}");
+            }
+            bench.ask(json!({"do": "save", "steps": [good]}));
+            assert_eq!(editing::read(&bench.list()).unwrap().steps.len(), 1);
+        }
+    }
+
     #[test]
     fn nodes_are_pulled_and_the_picture_follows() {
         let bench = Bench::new();

@@ -2,9 +2,9 @@
 
 use splat4d::{Error, Result};
 pub use splat4d_train::files::{open, read, read_text};
-use std::ffi::OsString;
+use splat4d_train::output::Staged;
 use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// Remedy when a file cannot be written.
 pub(crate) const WRITE_REMEDY: &str =
@@ -12,7 +12,7 @@ pub(crate) const WRITE_REMEDY: &str =
 
 /// Writes a file: to a temporary name in the same folder, then renamed. Devices and pipes are written directly.
 pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
-    let out = Output::new(path)?;
+    let out = Staged::new(path)?;
     let fail = |e| cannot_write(path, e);
     let mut file = std::fs::File::create(out.path()).map_err(fail)?;
     file.write_all(bytes).map_err(fail)?;
@@ -23,72 +23,21 @@ pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
 
 /// Makes a folder and its parents.
 pub fn make_folder(path: &Path) -> Result<()> {
-    std::fs::create_dir_all(path).map_err(|e| Error::io("the folder cannot be made", e).at(path.display())).map_err(
-        |e| e.remedy("Choose another place with -o: one where you may write, below a folder and not below a file."),
-    )
+    std::fs::create_dir_all(path)
+        .map_err(|e| Error::environment("the folder cannot be made", e).at(path.display()))
+        .map_err(|e| {
+            e.remedy("Choose another place with -o: one where you may write, below a folder and not below a file.")
+        })
 }
 
 /// The error of a failed write.
 pub fn cannot_write(path: &Path, error: std::io::Error) -> Error {
-    Error::io("cannot be written", error).at(path.display()).remedy(WRITE_REMEDY)
+    Error::environment("cannot be written", error).at(path.display()).remedy(WRITE_REMEDY)
 }
 
 /// The error of a failed read.
 pub fn cannot_read(path: &Path, error: std::io::Error) -> Error {
     Error::io("cannot be read", error).at(path.display()).remedy("Check that the file exists and may be read by you.")
-}
-
-/// A file under a temporary name beside its place; [`keep`](Self::keep) renames it, dropping it removes it.
-#[derive(Debug)]
-pub(crate) struct Output {
-    temporary: Option<PathBuf>,
-    target: PathBuf,
-}
-
-impl Output {
-    /// Prepares to write `path`. Errors: a folder stands there.
-    pub(crate) fn new(path: &Path) -> Result<Self> {
-        // A link is followed, so that the file behind it is replaced and not the link.
-        let target = std::fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
-        if target.is_dir() {
-            return Err(Error::input("is a folder").at(path.display()).remedy("Give the name of a file."));
-        }
-        let Some(name) = target.file_name() else {
-            return Err(Error::input("is no file name").at(path.display()).remedy("Give the name of a file."));
-        };
-        // A device or pipe (/dev/stdout, /dev/null) must not be replaced by a file.
-        let special = target.metadata().is_ok_and(|m| !m.is_file());
-        let temporary = (!special).then(|| {
-            let mut hidden = OsString::from(format!(".{}.", std::process::id()));
-            hidden.push(name);
-            target.with_file_name(hidden)
-        });
-        Ok(Self { temporary, target })
-    }
-
-    /// Where to write now.
-    pub(crate) fn path(&self) -> &Path {
-        self.temporary.as_deref().unwrap_or(&self.target)
-    }
-
-    /// Gives the file its name.
-    pub(crate) fn keep(mut self) -> Result<()> {
-        if let Some(temporary) = self.temporary.take() {
-            std::fs::rename(&temporary, &self.target).map_err(|e| {
-                let _ = std::fs::remove_file(&temporary);
-                cannot_write(&self.target, e)
-            })?;
-        }
-        Ok(())
-    }
-}
-
-impl Drop for Output {
-    fn drop(&mut self) {
-        if let Some(temporary) = &self.temporary {
-            let _ = std::fs::remove_file(temporary);
-        }
-    }
 }
 
 /// Standard base64 (RFC 4648) with padding, for data URIs.

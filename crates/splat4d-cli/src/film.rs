@@ -10,7 +10,7 @@ use crate::source::Source;
 use splat4d::format::playback::{Growing, HEADER_BYTES, Index, Meta, finish};
 use splat4d::layers::Scene;
 use splat4d::{Error, Result};
-use splat4d_train::run::checkpoint::write_atomically_with;
+use splat4d_train::output::{note, write_atomically_with};
 use splat4d_train::run::chunks::{ChunkPlan, Chunked, Part};
 use std::fs::File;
 use std::io::Read;
@@ -120,6 +120,7 @@ fn append_to(path: &Path, run: &Path, chunked: &Chunked, thorough: bool, console
         let file = match growing.as_mut() {
             Some(file) => file,
             None => {
+                note(path)?;
                 let file =
                     File::options().read(true).write(true).create(true).truncate(true).open(path).map_err(place)?;
                 growing.insert(Growing::begin(file, next.clone())?)

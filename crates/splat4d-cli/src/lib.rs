@@ -37,7 +37,7 @@ mod video;
 
 use clap::{Parser, Subcommand};
 use console::{Console, Loudness};
-use splat4d::{Error, ErrorKind};
+use splat4d::Error;
 use std::ffi::OsString;
 use std::process::ExitCode;
 
@@ -237,12 +237,10 @@ pub fn told(error: &anyhow::Error) -> String {
     })
 }
 
-/// 2 where the user's data, files or options are at fault, 1 for everything else.
+/// 2 where the user's data, files or options are at fault, 1 for everything else: also for what the machine cannot, such as
+/// write to a full disk.
 fn exit_code(error: &anyhow::Error) -> u8 {
-    match error.downcast_ref::<Error>().map(Error::kind) {
-        Some(ErrorKind::BadInput | ErrorKind::Io | ErrorKind::Unsupported) => BAD_INPUT,
-        _ => FAILED,
-    }
+    if error.downcast_ref::<Error>().is_some_and(Error::is_users) { BAD_INPUT } else { FAILED }
 }
 
 /// The whole command, for completions and help.
@@ -253,6 +251,7 @@ fn command() -> clap::Command {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use splat4d::ErrorKind;
 
     #[test]
     fn the_command_line_is_consistent() {

@@ -1,13 +1,17 @@
 //! What a run folder holds, read back: `recipe.toml`, `run.json`, `metrics.csv`, `results.json`, `per_view.json`,
 //! `cameras.json`, `scene.safetensors` and checkpoints. Everything but the folder may be missing.
 
-use crate::files::{cannot_read, read_text};
+use crate::files::read_text;
 use crate::paths::View;
+use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use splat4d::math::Se3;
 use splat4d::scene::{Camera, Intrinsics, Lens};
 use splat4d::{Error, Result};
 use splat4d_train::capture::{Capture, Split};
+use splat4d_train::event::Event;
+use splat4d_train::output::{Found, Input, Mixes, OutputFolder, Owner, Request, STATE};
+use splat4d_train::path_text::of_text;
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::checkpoint;
 use std::path::{Path, PathBuf};
@@ -18,40 +22,6 @@ const MARKERS: [&str; 4] = ["recipe.toml", "run.json", "scene.safetensors", "che
 pub(crate) const COMPRESS: &str = "compress.json";
 /// File that holds the settings `compress` was asked for.
 pub(crate) const ORDER: &str = "compress.toml";
-/// Files and folders that splat4d writes into a run; `--force` replaces these and nothing else.
-const OURS: [&str; 30] = [
-    "recipe.toml",
-    "run.json",
-    "scene.safetensors",
-    "scene.s4d",
-    "scene.splat4d", // its name before version 0.1
-    "checkpoints",
-    "chunks",
-    "metrics.csv",
-    "results.json",
-    "refined.json",
-    "per_view.json",
-    "predict",
-    COMPRESS,
-    "cameras.json",
-    "test",
-    "test-white",
-    "test-black",
-    "val",
-    "val-white",
-    "val-black",
-    "train",
-    "train-white",
-    "train-black",
-    "orbit.mp4",
-    "orbit.png",
-    "report.html",
-    "baseline",
-    "renders",
-    ORDER,
-    "unpruned",
-];
-
 /// One row of `metrics.csv`.
 #[derive(Clone, Debug, Default)]
 pub struct Metrics {
@@ -219,7 +189,7 @@ impl Run {
 
     /// The capture it was trained on.
     pub(crate) fn capture(&self) -> Option<PathBuf> {
-        self.info.get("capture").and_then(Value::as_str).map(PathBuf::from)
+        self.info.get("capture").and_then(Value::as_str).map(of_text)
     }
 
     /// Warnings and notes about the run: those of the capture's reader, and those since, in that order.
@@ -359,59 +329,85 @@ pub fn usual_folder(capture: &str) -> PathBuf {
     Path::new("runs").join(if name.is_empty() { "run" } else { name })
 }
 
-/// Refuses a folder that holds anything, because a run would mix with it.
-pub fn check_unused(run: &Path) -> Result<()> {
-    if !std::fs::read_dir(run).is_ok_and(|mut d| d.next().is_some()) {
-        return Ok(());
-    }
-    let error = if Run::is(run) {
-        let what = if Run::is_finished(run) { "a finished run" } else { "an unfinished run" };
-        Error::input(format!("holds {what} already")).remedy(format!(
-            "Continue it with --resume {}, replace it with --force, or choose another folder with -o.",
-            run.display()
-        ))
-    } else {
-        Error::input("is not empty and is no run").remedy("Choose another folder with -o.")
-    };
-    Err(error.at(run.display()))
+/// What a training run was asked for: the same command continues it, from whatever state a crash left.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Asked {
+    version: String,
+    /// The capture's real path.
+    #[serde(with = "splat4d_train::path_text")]
+    pub capture: PathBuf,
+    /// The recipe before anything was chosen or planned, TOML.
+    recipe: String,
+    /// Minutes to keep to.
+    pub minutes: Option<f64>,
+    /// Whether the time is foretold.
+    pub predict: bool,
 }
 
-/// Removes a run that failed before its first checkpoint after the start: there is nothing in it to continue.
-pub fn clear_unbegun(run: &Path) -> Result<()> {
-    let begun = checkpoint::list(run).iter().any(|path| *path != checkpoint::path(run, 0));
-    if !begun {
-        clear(run)?;
-        // Fails where the user keeps files of their own there, as it should.
-        let _ = std::fs::remove_dir(run);
+impl Asked {
+    pub fn new(capture: &Path, recipe: &Recipe, minutes: Option<f64>, predict: bool) -> Self {
+        let capture = capture.canonicalize().unwrap_or_else(|_| capture.to_owned());
+        Self { version: env!("CARGO_PKG_VERSION").into(), capture, recipe: recipe.to_toml(), minutes, predict }
     }
-    Ok(())
+
+    /// Of a run that ended before its first checkpoint, so that there is nothing else to continue from.
+    pub fn unbegun(run: &Path) -> Option<Self> {
+        let text = checkpoint::list(run).is_empty().then(|| OutputFolder::asked(run))??;
+        serde_json::from_str(&text).ok()
+    }
+
+    pub fn recipe(&self) -> Result<Recipe> {
+        Recipe::from_toml(&self.recipe)
+    }
+
+    /// Takes the folder of the run for a new training or the rest of one. What is there of one that took no step is removed.
+    pub fn begin(&self, run: &Path, force: bool, command: &str) -> Result<(OutputFolder, Found)> {
+        let asked = serde_json::to_string(self).expect("it is plain data");
+        let inputs = [Input::new(&self.capture, "the capture")];
+        let request = Request { command, inputs: &inputs, asked: &asked, force, mixes: Mixes::Anything };
+        let (folder, found) = OutputFolder::begin(run, &request)?;
+        if found == Found::Unfinished && checkpoint::list(run).is_empty() {
+            folder.clear()?;
+            return Ok((folder, Found::Nothing));
+        }
+        Ok((folder, found))
+    }
+}
+
+/// Takes note of an event of a run that is written into a folder: from its first step on the run is kept.
+pub fn hear(folder: &OutputFolder, event: &Event) {
+    match event {
+        Event::Checkpoint { iteration: 1.., .. } | Event::Finished { .. } => folder.begun(),
+        _ => {}
+    }
+}
+
+/// Leaves the folder of a training that ended: one that failed before its first checkpoint after the start leaves nothing to
+/// continue.
+pub fn left<T>(folder: OutputFolder, run: &Path, trained: &Result<T>) -> Option<OutputFolder> {
+    let begun = checkpoint::list(run).iter().any(|path| *path != checkpoint::path(run, 0));
+    if trained.is_err() && !begun {
+        folder.abandon();
+        return None;
+    }
+    folder.begun();
+    Some(folder)
 }
 
 /// Where a new run goes: the wanted folder, or with a number behind it if that is taken.
 pub fn free_folder(wanted: &Path) -> PathBuf {
-    let taken = |p: &Path| p.is_file() || std::fs::read_dir(p).is_ok_and(|mut d| d.next().is_some());
+    let holds = |p: &Path| std::fs::read_dir(p).is_ok_and(|d| d.flatten().any(|e| e.file_name() != STATE));
+    let taken = |p: &Path| p.is_file() || holds(p) || Owner::holder(p).is_some();
     if !taken(wanted) {
         return wanted.to_owned();
     }
-    let name = wanted.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
-    (2usize..).map(|i| wanted.with_file_name(format!("{name}-{i}"))).find(|p| !taken(p)).expect("some number is free")
-}
-
-/// Removes what splat4d wrote into a run, and nothing else.
-pub fn clear(run: &Path) -> Result<()> {
-    for name in OURS {
-        let path = run.join(name);
-        let removed = if path.is_dir() && !path.is_symlink() {
-            std::fs::remove_dir_all(&path)
-        } else {
-            std::fs::remove_file(&path)
-        };
-        match removed {
-            Err(e) if e.kind() != std::io::ErrorKind::NotFound => return Err(cannot_read(&path, e)),
-            _ => {}
-        }
-    }
-    Ok(())
+    let name = wanted.file_name().unwrap_or_default();
+    let numbered = |i: usize| {
+        let mut name = name.to_owned();
+        name.push(format!("-{i}"));
+        wanted.with_file_name(name)
+    };
+    (2usize..).map(numbered).find(|p| !taken(p)).expect("some number is free")
 }
 
 /// An entry `ours_N` of `results.json` beside the one that the run is judged by.
@@ -468,9 +464,6 @@ mod tests {
         assert_eq!(free_folder(&wanted), wanted, "an empty folder is free");
         std::fs::write(wanted.join("recipe.toml"), "").unwrap();
         assert_eq!(free_folder(&wanted), folder.path().join("knight-2"));
-        std::fs::write(wanted.join("mine.txt"), "").unwrap();
-        clear(&wanted).unwrap();
-        assert!(wanted.join("mine.txt").exists() && !wanted.join("recipe.toml").exists());
     }
 
     #[test]

@@ -96,6 +96,14 @@ impl Source {
         opened.map_err(|e| e.at(path.display()))
     }
 
+    /// Leaves out Gaussians whose numbers are not finite: files of other programs have such, and no writer takes them.
+    pub(crate) fn finite(mut self) -> Self {
+        let all = self.scene.len();
+        let dropped = self.scene.drop_non_finite();
+        self.warnings.counted(dropped, all, "hold NaN or infinity and were left out");
+        self
+    }
+
     /// A scene of our own, without a run.
     pub(crate) fn own(scene: Scene<f32>) -> Self {
         let warnings = Warnings::default();
@@ -165,10 +173,13 @@ fn open_sequence(path: &Path, fps: f64) -> Result<Source> {
             .at(path.display())
             .remedy(format!("Give the folder of one level, for instance {}.", path.join("0_0").display())));
     }
-    let files = sequence::frames(path)?;
-    let (mut frames, mut kind, mut warnings) = (Vec::with_capacity(files.len()), None, Warnings::default());
+    let found = sequence::frames(path)?;
+    let (mut frames, mut kind, mut warnings) = (Vec::with_capacity(found.files.len()), None, Warnings::default());
     let mut up = None;
-    for file in &files {
+    if let Some(missing) = &found.missing {
+        warnings.say(format!("frames are missing: {missing}. Nothing is shown at their times, which are kept"));
+    }
+    for file in &found.files {
         let bytes = files::read(file)?;
         let own = dialect_of(file, &bytes).filter(|d| !d.moves);
         let Some(own) = own.filter(|d| kind.is_none_or(|k: Dialect| k.up == d.up)) else {
@@ -187,7 +198,7 @@ fn open_sequence(path: &Path, fps: f64) -> Result<Source> {
         frames.push(std::mem::take(&mut opened.scene.layers[0].params));
     }
     let up = up.unwrap_or(dialect::Y_DOWN);
-    let scene = format::sequence::join(&frames, fps, up).map_err(|e| e.at(path.display()))?;
+    let scene = format::sequence::join_at(&frames, &found.numbers, fps, up).map_err(|e| e.at(path.display()))?;
     Ok(Source { dialect: kind, warnings, ..Source::own(scene) })
 }
 

@@ -1,8 +1,9 @@
 //! Films: mp4 through the `ffmpeg` program, animated PNG (plays in every browser, needs nothing), or a folder of PNGs.
 
-use crate::files::{self, Output, cannot_write};
+use crate::files::{self, cannot_write};
 use anyhow::{Context, bail};
 use splat4d::Error;
+use splat4d_train::output::Staged;
 use std::fs::File;
 use std::io::{BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
@@ -54,7 +55,7 @@ pub(crate) enum Film {
     /// Through ffmpeg.
     Mp4 {
         /// The temporary file.
-        output: Output,
+        output: Staged,
         /// The program.
         child: Child,
         /// Where frames go.
@@ -65,7 +66,7 @@ pub(crate) enum Film {
     /// Animated PNG.
     Apng {
         /// The temporary file.
-        output: Output,
+        output: Staged,
         /// Writes frames one by one.
         writer: Box<png::Writer<BufWriter<File>>>,
     },
@@ -98,7 +99,7 @@ impl Film {
     }
 
     fn ffmpeg(path: &Path, ending: &str, [width, height]: [usize; 2], fps: f64) -> anyhow::Result<Self> {
-        let output = Output::new(path)?;
+        let output = Staged::new(path)?;
         // ffmpeg would report an unwritable place only after the first frame, in its own words.
         File::create(output.path()).map_err(|e| cannot_write(path, e))?;
         let container = if ending == "mkv" { "matroska" } else { ending };
@@ -109,9 +110,9 @@ impl Film {
         command.args(["-vf", "crop=max(2\\,trunc(iw/2)*2):max(2\\,trunc(ih/2)*2)", "-c:v", "libx264", "-crf", CRF]);
         command.args(["-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", container]).arg(output.path());
         command.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped());
-        let mut child = command
-            .spawn()
-            .map_err(|e| Error::io("the program ffmpeg, which writes films, cannot be started", e).remedy(INSTEAD))?;
+        let mut child = command.spawn().map_err(|e| {
+            Error::environment("the program ffmpeg, which writes films, cannot be started", e).remedy(INSTEAD)
+        })?;
         let pipe = child.stdin.take();
         let words = child.stderr.take().map(|mut stderr| {
             std::thread::spawn(move || {
@@ -127,7 +128,7 @@ impl Film {
     }
 
     fn apng(path: &Path, [width, height]: [usize; 2], fps: f64, frames: usize) -> anyhow::Result<Self> {
-        let output = Output::new(path)?;
+        let output = Staged::new(path)?;
         let file = File::create(output.path()).map_err(|e| cannot_write(path, e))?;
         let mut encoder = png::Encoder::new(BufWriter::new(file), width as u32, height as u32);
         encoder.set_color(png::ColorType::Rgb);
@@ -194,7 +195,7 @@ impl Film {
         let last: Vec<&str> = last.into_iter().rev().collect();
         if said.contains("No space left") {
             let error = std::io::Error::from(std::io::ErrorKind::StorageFull);
-            return Error::io("the film cannot be written", error).remedy(files::WRITE_REMEDY).into();
+            return Error::environment("the film cannot be written", error).remedy(files::WRITE_REMEDY).into();
         }
         anyhow::anyhow!(
             "ffmpeg could not write the film ({}). {INSTEAD}",

@@ -14,6 +14,8 @@ mod convert;
 mod device;
 #[path = "cli/edit.rs"]
 mod edit;
+#[path = "cli/folders.rs"]
+mod folders;
 #[path = "cli/import.rs"]
 mod import;
 #[path = "cli/predict.rs"]

@@ -9,9 +9,10 @@ use crate::scene::named;
 use crate::settings::set;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use splat4d::{Error, Result};
+use splat4d::Result;
 use splat4d_cli::run_folder;
 use splat4d_train::event::Event;
+use splat4d_train::output::{Found, OutputFolder};
 use splat4d_train::recipe::{MotionName, Quality, Recipe};
 use splat4d_train::run::{self, Outcome, Stopwatch, TrainOptions, open_capture};
 use std::path::{Path, PathBuf};
@@ -56,20 +57,26 @@ pub(crate) fn train(
     let listener = Listener::new(progress, loss);
     listener.drive(py, options, |options, listen| {
         let capture = open_capture(&path, &recipe)?;
-        let run = match out {
-            Some(out) => {
-                run_folder::check_unused(&out)?;
-                out
-            }
-            None => run_folder::free_folder(&run_folder::usual_folder(&capture.name)),
-        };
-        std::fs::create_dir_all(&run).map_err(|e| Error::io("the folder cannot be made", e).at(run.display()))?;
-        let cameras = run_folder::cameras_json(&capture).to_string();
-        run::checkpoint::write_atomically(&run.join("cameras.json"), cameras.as_bytes())?;
+        let run = out.unwrap_or_else(|| run_folder::free_folder(&run_folder::usual_folder(&capture.name)));
+        let asked = run_folder::Asked::new(&capture.root, &recipe, minutes, false);
+        let (folder, found) = asked.begin(&run, false, "train (Python)")?;
         let stop = &listener.raised.stop;
-        let trained = run::train(Arc::new(capture), recipe, &run, options, stop, listen);
-        if trained.is_err() {
-            run_folder::clear_unbegun(&run)?;
+        let mut hear = |event: &Event| {
+            run_folder::hear(&folder, event);
+            listen(event);
+        };
+        let trained = if found == Found::Unfinished {
+            run::resume_with(&run, options, stop, &mut hear)
+        } else {
+            run::checkpoint::write_atomically(&run.join("recipe.toml"), recipe.to_toml().as_bytes())?;
+            let cameras = run_folder::cameras_json(&capture).to_string();
+            run::checkpoint::write_atomically(&run.join("cameras.json"), cameras.as_bytes())?;
+            run::train(Arc::new(capture), recipe, &run, options, stop, &mut hear)
+        };
+        if let Some(folder) = run_folder::left(folder, &run, &trained)
+            && trained.as_ref().is_ok_and(|outcome| !outcome.interrupted)
+        {
+            folder.finished();
         }
         trained
     })
@@ -91,7 +98,10 @@ pub(crate) fn resume(
     };
     let options = TrainOptions { device: named(device)?, clock: Stopwatch::start(), ..TrainOptions::default() };
     let listener = Listener::new(progress, loss);
-    listener.drive(py, options, |options, listen| run::resume_with(&path, options, &listener.raised.stop, listen))
+    listener.drive(py, options, |options, listen| {
+        let _folder = path.is_dir().then(|| OutputFolder::amend(&path, "resume (Python)")).transpose()?;
+        run::resume_with(&path, options, &listener.raised.stop, listen)
+    })
 }
 
 /// Who hears of a run, and may end it.

@@ -111,12 +111,12 @@ impl Server {
     pub fn start(config: Config) -> Result<Running> {
         let scene = Scene::new(config.content)?;
         let foreign = config.foreign.map(|url| origin(&url).map(|origin| (url, origin))).transpose()?;
-        let runtime = runtime(config.background).map_err(|e| Error::io("the server cannot be started", e))?;
+        let runtime = runtime(config.background).map_err(|e| Error::environment("the server cannot be started", e))?;
         let listener = {
             let _inside = runtime.enter();
             listen(&config.host, config.port)?
         };
-        let address = listener.local_addr().map_err(|e| Error::io("the server has no address", e))?;
+        let address = listener.local_addr().map_err(|e| Error::environment("the server has no address", e))?;
         let guard = Guard::new(&config.host, !address.ip().is_loopback());
         let mut shared = Shared::new(scene, guard, config.about, config.live, foreign);
         shared.player_folder = config.player_folder;
@@ -131,7 +131,7 @@ impl Server {
                 runtime.block_on(accept(listener, at_work, stopped));
                 runtime.shutdown_timeout(GRACE);
             })
-            .map_err(|e| Error::io("the server's thread cannot be started", e))?;
+            .map_err(|e| Error::environment("the server's thread cannot be started", e))?;
         let url = url(&config.host, address);
         Ok(Running { shared, address, url, stop, thread: Some(thread) })
     }
@@ -232,7 +232,7 @@ fn listen(host: &str, port: Option<u16>) -> Result<TcpListener> {
         }
     }
     let (port, error) = failed.expect("at least one port was tried");
-    Err(Error::io("cannot listen", error)
+    Err(Error::environment("cannot listen", error)
         .at(place(port))
         .remedy("Choose another --port (0: any free one), and a --host that is an address of this machine."))
 }

@@ -142,7 +142,8 @@ fn main() -> Result<()> {
     if let Some(path) = std::env::args().nth(1) {
         let mut bytes = Vec::new();
         splat4d::format::scene::write(trainer.scene(), &mut bytes)?;
-        std::fs::write(&path, bytes).map_err(|e| splat4d::Error::io("the scene cannot be written", e).at(&path))?;
+        std::fs::write(&path, bytes)
+            .map_err(|e| splat4d::Error::environment("the scene cannot be written", e).at(&path))?;
     }
     Ok(())
 }

@@ -35,6 +35,7 @@ pub enum Event {
     /// Training begins.
     Started {
         /// Where the run is written.
+        #[serde(serialize_with = "crate::path_text::lossy")]
         run: PathBuf,
         /// First iteration (not 0 after a resume).
         iteration: usize,
@@ -107,6 +108,7 @@ pub enum Event {
         /// Steps taken.
         iteration: usize,
         /// The file.
+        #[serde(serialize_with = "crate::path_text::lossy")]
         path: PathBuf,
     },
     /// Something the user should know.

@@ -34,6 +34,8 @@ pub mod learner;
 pub mod loss;
 pub mod methods;
 pub mod optim;
+pub mod output;
+pub mod path_text;
 pub mod recipe;
 pub mod run;
 pub mod sampler;

@@ -11,7 +11,8 @@ pub type Result<T, E = Error> = std::result::Result<T, E>;
 pub enum ErrorKind {
     /// The user's data or options are wrong (exit code 2).
     BadInput,
-    /// A file could not be read or written (exit code 2).
+    /// A file could not be read (exit code 2 where it is not there or not what it should be, else 1), or written (exit
+    /// code 1).
     Io,
     /// A valid file that this version cannot handle (exit code 2).
     Unsupported,
@@ -31,12 +32,14 @@ pub struct Error {
     place: String,
     remedy: String,
     source: Option<Box<dyn std::error::Error + Send + Sync>>,
+    /// Whether the machine is at fault, whatever the user gave.
+    environment: bool,
 }
 
 impl Error {
     /// An error of `kind`; `what` is a clause without a final full stop.
     pub fn new(kind: ErrorKind, what: impl Into<String>) -> Self {
-        Self { kind, what: what.into(), place: String::new(), remedy: String::new(), source: None }
+        Self { kind, what: what.into(), place: String::new(), remedy: String::new(), source: None, environment: false }
     }
 
     /// Bad user data.
@@ -44,9 +47,14 @@ impl Error {
         Self::new(ErrorKind::BadInput, what)
     }
 
-    /// A failed read or write.
+    /// A failed read of what the user named.
     pub fn io(what: impl Into<String>, source: std::io::Error) -> Self {
         Self { source: Some(Box::new(source)), ..Self::new(ErrorKind::Io, what) }
+    }
+
+    /// A failed write, or a program that cannot be started: no space, no rights, a folder that is not there.
+    pub fn environment(what: impl Into<String>, source: std::io::Error) -> Self {
+        Self { environment: true, ..Self::io(what, source) }
     }
 
     /// Names the place. Called again further out, the outer place is put in front.
@@ -70,6 +78,20 @@ impl Error {
         self.kind
     }
 
+    /// Whether the user's data, files or options are at fault (exit code 2), and not the machine (exit code 1).
+    pub fn is_users(&self) -> bool {
+        use std::io::ErrorKind::{InvalidData, InvalidFilename, InvalidInput, IsADirectory, NotADirectory, NotFound};
+        match self.kind {
+            ErrorKind::BadInput | ErrorKind::Unsupported => true,
+            ErrorKind::Io if !self.environment => {
+                let source = self.source.as_ref().and_then(|s| s.downcast_ref::<std::io::Error>());
+                let named = [NotFound, NotADirectory, IsADirectory, InvalidData, InvalidInput, InvalidFilename];
+                source.is_some_and(|s| named.contains(&s.kind()))
+            }
+            _ => false,
+        }
+    }
+
     /// Place and cause without the remedy: for lines that say what was done about it.
     pub fn cause(&self) -> String {
         let place = if self.place.is_empty() { String::new() } else { format!("{}: ", self.place) };
@@ -91,5 +113,20 @@ impl fmt::Display for Error {
 impl std::error::Error for Error {
     fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
         self.source.as_ref().map(|s| s.as_ref() as _)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::io;
+
+    #[test]
+    fn what_the_user_named_wrongly_is_told_from_what_the_machine_cannot() {
+        let io = |kind: io::ErrorKind| Error::io("cannot be read", kind.into()).is_users();
+        assert!(io(io::ErrorKind::NotFound) && io(io::ErrorKind::IsADirectory));
+        assert!(!io(io::ErrorKind::PermissionDenied) && !io(io::ErrorKind::StorageFull) && !io(io::ErrorKind::Other));
+        assert!(!Error::environment("cannot be written", io::ErrorKind::NotFound.into()).is_users());
+        assert!(Error::input("x").is_users() && !Error::new(ErrorKind::Io, "is in use").is_users());
     }
 }

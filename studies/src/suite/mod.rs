@@ -12,12 +12,13 @@ use serde_json::json;
 use splat4d::{Error, ErrorKind, Result};
 use splat4d_cli::console::Console;
 use splat4d_cli::files::{self, human_seconds};
-use splat4d_cli::run_folder::{self, Run};
+use splat4d_cli::run_folder::Run;
 use splat4d_cli::source::read_scene;
 use splat4d_cli::{finish, interrupt};
 use splat4d_train::capture::{Capture, ImageStore};
 use splat4d_train::eval::run::{EvalOptions, Scores, assess};
 use splat4d_train::event::Event;
+use splat4d_train::output::OutputFolder;
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::{self, TrainOptions, checkpoint, open_capture, with_found};
 use std::path::{Path, PathBuf};
@@ -245,7 +246,8 @@ fn measure(order: &Order<'_>, args: &Args, stop: &AtomicBool, console: &Console)
     let blank = Found { capture: order.entry.name.clone(), steps, print: order.print.clone(), ..Found::default() };
     let run = args.output.join("runs").join(format!("{}-{steps}", order.entry.name));
     files::make_folder(&run)?;
-    run_folder::clear(&run)?;
+    let folder = OutputFolder::amend(&run, "suite")?;
+    folder.clear_inner("")?;
     let found = trained(order, &run, blank.clone(), stop, console);
     let interrupted = |e: &Error| e.kind() == ErrorKind::Interrupted;
     let mut found = match found {

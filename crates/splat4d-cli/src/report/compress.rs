@@ -22,6 +22,7 @@ const VIEWS: usize = 4;
 #[serde(default)]
 pub(crate) struct Compressed {
     /// The run that was compressed.
+    #[serde(with = "splat4d_train::path_text")]
     pub source: PathBuf,
     /// 0, 1 or 2; `None` where knobs were told instead.
     pub level: Option<u8>,

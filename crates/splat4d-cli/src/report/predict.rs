@@ -12,6 +12,7 @@ use std::path::{Path, PathBuf};
 /// The content of `predict.json`.
 #[derive(Debug, Serialize)]
 pub(crate) struct Told {
+    #[serde(serialize_with = "splat4d_train::path_text::lossy")]
     pub run: PathBuf,
     /// The last observed second.
     pub until: f64,

@@ -7,6 +7,7 @@ use crate::finish;
 use crate::run_folder::{self, Run};
 use splat4d::{Error, Result};
 use splat4d_train::compress::{Compression, Level, MOST_PRUNED};
+use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "\
@@ -38,7 +39,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "DIR", conflicts_with_all = ["run", "output", "level", "prune", "score", "max_mb",
         "fine_tune", "set", "force", "guard", "unpruned"])]
     resume: Option<PathBuf>,
-    /// Replace the run in the -o folder
+    /// Replace the run in the -o folder: the files that splat4d wrote there, once the new run has taken its first steps
     #[arg(long)]
     force: bool,
     /// 0: the plain file; 1: quantised and fine-tuned; 2: pruned and filtered too, coarser codes, a smaller palette
@@ -108,7 +109,7 @@ fn begin(args: &Args, console: &Console) -> anyhow::Result<Work> {
         tried: Vec::new(),
     };
     let dir = place(args, source, console)?;
-    Ok(Work::begin(dir, order)?)
+    Ok(Work::begin(dir, order, args.force)?)
 }
 
 /// The level, then the options, then every --set.
@@ -142,31 +143,13 @@ fn settings(args: &Args, iterations: usize) -> Result<Compression> {
 /// Where the result goes. A folder that the user named is never silently taken over.
 fn place(args: &Args, source: &Path, console: &Console) -> Result<PathBuf> {
     let Some(dir) = &args.output else {
-        let name = source.file_name().map_or_else(|| "run".into(), |n| n.to_string_lossy().into_owned());
-        let dir = run_folder::free_folder(&source.with_file_name(format!("{name}-compressed")));
+        let mut name = source.file_name().unwrap_or(OsStr::new("run")).to_owned();
+        name.push("-compressed");
+        let dir = run_folder::free_folder(&source.with_file_name(name));
         console.say(&format!("the result goes to {}", dir.display()));
         return Ok(dir);
     };
-    if same(dir, source) {
-        return Err(Error::input("is the run itself").at(dir.display()).remedy("Choose another folder with -o."));
-    }
-    let used = std::fs::read_dir(dir).is_ok_and(|mut d| d.next().is_some());
-    if used && args.force && Run::is(dir) {
-        run_folder::clear(dir)?;
-    } else if used {
-        let remedy = if Run::is(dir) {
-            format!("Continue it with --resume {}, replace it with --force, or choose another folder.", dir.display())
-        } else {
-            "Choose another folder with -o.".to_owned()
-        };
-        let what = if Run::is(dir) { "holds a run already" } else { "is not empty and is no run" };
-        return Err(Error::input(what).at(dir.display()).remedy(remedy));
-    }
     Ok(dir.clone())
-}
-
-fn same(a: &Path, b: &Path) -> bool {
-    matches!((a.canonicalize(), b.canonicalize()), (Ok(a), Ok(b)) if a == b)
 }
 
 fn number(text: &str, fits: impl Fn(f64) -> bool, need: &str) -> Result<f64, String> {

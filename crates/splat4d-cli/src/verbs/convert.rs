@@ -3,6 +3,7 @@
 use crate::baking::{self, Baking};
 use crate::console::Console;
 use crate::files::{self, either, grouped, human_bytes};
+use crate::run_folder::Run;
 use crate::sequence::{self, Pattern};
 use crate::source::{Source, not_empty};
 use serde_json::json;
@@ -65,6 +66,9 @@ pub(crate) struct Args {
     /// One file a frame
     #[arg(long)]
     frames: bool,
+    /// Replace a sequence that splat4d wrote to the folder, also a longer one
+    #[arg(long, requires = "frames")]
+    force: bool,
     /// Frames a second: of a sequence that is read (30), or of --frames (those of the scene)
     #[arg(long, value_name = "N")]
     fps: Option<f64>,
@@ -172,8 +176,8 @@ impl Args {
     pub(crate) fn plain(input: PathBuf, output: PathBuf) -> Self {
         let spz_version = spz::DEFAULT_VERSION;
         let (time, fps, from, to) = (None, None, None, None);
-        let (frames, up, sh, no_provenance, exact) = (false, None, None, false, false);
-        Self { input, output, time, frames, fps, from, to, up, sh, no_provenance, exact, spz_version }
+        let (frames, force, up, sh, no_provenance, exact) = (false, false, None, None, false, false);
+        Self { input, output, time, frames, force, fps, from, to, up, sh, no_provenance, exact, spz_version }
     }
 }
 
@@ -184,7 +188,7 @@ pub(crate) fn check_output(output: &Path) -> Result<()> {
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     asked(args)?;
-    let source = Source::open_at(&args.input, args.fps.unwrap_or(DEFAULT_FPS))?;
+    let source = Source::open_at(&args.input, args.fps.unwrap_or(DEFAULT_FPS))?.finite();
     not_empty(&source.scene, &args.input)?;
     source.warnings.lines().iter().for_each(|w| console.warn(&format!("{w}.")));
     write(args, source, console)
@@ -229,7 +233,7 @@ pub(crate) fn write(args: &Args, mut source: Source, console: &Console) -> anyho
     let options = WriteOptions { spz_version: args.spz_version, cameras, exact: args.exact, ..WriteOptions::default() };
     let writer = Writer { target, options };
     if let Some((pattern, _)) = pattern {
-        return write_frames(args, scene, &pattern, &writer, console);
+        return write_frames(args, scene, source.run.as_ref(), &pattern, &writer, console);
     }
     let moment = match args.time {
         Some(time) => Some(time),
@@ -333,14 +337,14 @@ fn frames_pattern(args: &Args) -> Result<Option<(Pattern, PathBuf)>> {
 fn write_frames(
     args: &Args,
     scene: &Scene<f32>,
+    run: Option<&Run>,
     pattern: &Pattern,
     writer: &Writer,
     console: &Console,
 ) -> anyhow::Result<()> {
     let (fps, times) = sequence::moments(scene, args.fps, [args.from, args.to])?;
-    if !pattern.folder().as_os_str().is_empty() {
-        files::make_folder(pattern.folder())?;
-    }
+    let read = sequence::Read { path: &args.input, run };
+    let owned = sequence::take(&[pattern], times.len(), &read, "convert", args.force)?;
     let mut total = 0;
     for (i, &time) in times.iter().enumerate() {
         let (bytes, warnings) =
@@ -352,6 +356,7 @@ fn write_frames(
         total += bytes.len();
         console.phase("converting", i + 1, times.len());
     }
+    owned.finished();
     console.clear();
     console.say(&format!(
         "{} files, {fps} a second, from {} to {} s, {} together",

@@ -93,7 +93,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     }
     let listed = args.edits.as_deref().map(editing::read).transpose()?.unwrap_or_default();
     let edits = editing::with_steps(listed, args.steps());
-    let mut source = Source::open(&args.scene)?;
+    let mut source = Source::open(&args.scene)?.finite();
     not_empty(&source.scene, &args.scene)?;
     source.warnings.lines().iter().for_each(|w| console.warn(&format!("{w}.")));
     let title = title(&source, &args.scene);

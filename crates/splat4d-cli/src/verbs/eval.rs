@@ -8,9 +8,10 @@ use crate::source::read_scene;
 use serde_json::{Value, json};
 use splat4d::ErrorKind;
 use splat4d_train::eval::run::{EvalOptions, Measured};
+use splat4d_train::output::OutputFolder;
 use splat4d_train::recipe::MotionName;
 use splat4d_train::run::{self, TrainOptions};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 
 const EXAMPLES: &str = "\
@@ -25,6 +26,9 @@ Examples:
 Results are in RUN/results.json and RUN/per_view.json (keys as 3DGS writes them), pictures in RUN/test/ours_N. With --split
 or --background only scores are made; what is not the test split on the run's own background stands under an entry and in a
 folder of its own, such as `val` or `test-black`.";
+
+/// Folder of the still scene, in the run.
+const BASELINE: &str = "baseline";
 
 /// What transparent pixels are composited on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -110,6 +114,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let path = args.run.as_ref().or(args.model.as_ref()).expect("clap asks for a run");
     let run = Run::open(path)?;
     run.scene_file()?;
+    let folder = OutputFolder::amend(path, "eval")?;
     if let Some(truth) = &args.truth {
         return finish::trajectory(path, truth, console);
     }
@@ -120,7 +125,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         return finish::write_page(path, console);
     }
     if args.baseline {
-        baseline(path, &run, &measure, console)?;
+        baseline(&folder, &run, &measure, console)?;
     }
     if args.no_film {
         let scene = read_scene(&run.scene_file()?)?;
@@ -131,14 +136,15 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
 }
 
 /// Trains the still scene unless it is there, and measures it.
-fn baseline(path: &Path, run: &Run, measure: &finish::Measure, console: &Console) -> anyhow::Result<()> {
-    let folder = path.join("baseline");
+fn baseline(out: &OutputFolder, run: &Run, measure: &finish::Measure, console: &Console) -> anyhow::Result<()> {
+    let path = out.path();
+    let folder = path.join(BASELINE);
     let recipe = run.recipe()?.with(|r| r.run.motion = MotionName::of("still"));
     let cached = Run::is_finished(&folder)
         && Run::open(&folder).and_then(|b| b.recipe()).is_ok_and(|b| b.resolve() == recipe.resolve());
     if !cached {
         console.say("training a still scene with the same recipe, to compare");
-        crate::run_folder::clear(&folder)?;
+        out.clear_inner(BASELINE)?;
         let (capture, _) = run.open_capture()?;
         crate::files::make_folder(&folder)?;
         crate::files::write(&folder.join("cameras.json"), &serde_json::to_vec(&cameras_json(&capture))?)?;

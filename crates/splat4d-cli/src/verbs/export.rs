@@ -52,6 +52,9 @@ pub(crate) struct Args {
     /// A folder for one file a frame
     #[arg(long, value_name = "FOLDER", conflicts_with = "output")]
     sequence: Option<PathBuf>,
+    /// Replace a sequence that splat4d wrote to the folder, also a longer one
+    #[arg(long, requires = "sequence")]
+    force: bool,
     /// Files a second of a sequence, moments a second of tracks [default: the capture's frames a second]
     #[arg(long, value_name = "N")]
     fps: Option<f64>,
@@ -151,11 +154,13 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     if let Some(folder) = &args.sequence {
         let (fps, times) = sequence::moments(scene, args.fps, [args.from, args.to])?;
         let pattern = sequence::Pattern::in_folder(folder);
-        files::make_folder(folder)?;
+        let read = sequence::Read { path, run: source.run.as_ref() };
+        let owned = sequence::take(&[&pattern], times.len(), &read, "export", args.force)?;
         for (i, &time) in times.iter().enumerate() {
             write(time, &pattern.file(i))?;
             console.phase("exporting", i + 1, times.len());
         }
+        owned.finished();
         console.clear();
         let (from, to) = (times[0], times[times.len() - 1]);
         console.say(&format!("{} files, {fps} a second, from {from} to {to} s", times.len()));

@@ -12,6 +12,7 @@ use splat4d_import::take::{self, CameraReport, Report, Request, Rig};
 use splat4d_import::video::Selection;
 use splat4d_import::write::Format;
 use splat4d_train::event::Progress;
+use splat4d_train::output::{Input, OutputFolder, check_apart};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::open_capture;
 use std::fmt::Write;
@@ -131,6 +132,10 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             .remedy("Give another folder with -o.")
             .into());
     }
+    let inputs: Vec<Input<'_>> =
+        args.videos.iter().chain(&args.masks).map(|v| Input::new(v, "what is imported,")).collect();
+    check_apart(folder, &inputs)?;
+    let _owned = OutputFolder::amend(folder, "import")?;
     let request = Request {
         inputs: args.videos.clone(),
         folder: folder.clone(),

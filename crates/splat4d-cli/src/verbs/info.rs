@@ -18,6 +18,7 @@ use splat4d::scene::{GEOMETRY, SH};
 use splat4d::text::in_line;
 use splat4d_train::capture::{Capture, Frame, Reach, Severity, Timing};
 use splat4d_train::event::Event;
+use splat4d_train::path_text::to_text;
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::chunks::Outlook;
 use splat4d_train::run::{Stopwatch, memory_estimate, open_capture};
@@ -306,7 +307,7 @@ fn of_run(path: &Path) -> anyhow::Result<Told> {
         line(&mut text, "held-out scores", "not measured yet: splat4d eval RUN");
     }
     let mut json = json!({
-        "type": "run", "name": run.name(), "capture": run.capture(), "finished": finished, "iteration": done,
+        "type": "run", "name": run.name(), "capture": run.capture().map(|c| to_text(&c)), "finished": finished, "iteration": done,
         "iterations": total, "changed_knobs": changed, "info": run.info, "results": run.all_results,
     });
     if let Ok(file) = run.scene_file() {

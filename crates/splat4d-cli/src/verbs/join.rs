@@ -3,6 +3,7 @@
 use crate::chunked;
 use crate::console::Console;
 use crate::{finish, interrupt};
+use splat4d_train::output::OutputFolder;
 use splat4d_train::run::chunks::Chunked;
 use std::path::PathBuf;
 
@@ -28,5 +29,7 @@ pub(crate) struct Args {
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     args.measure.check()?;
     let stop = interrupt::flag("stopping");
-    chunked::join(&args.run, &Chunked::open(&args.run)?, args.no_eval, &args.measure, &stop, console)
+    let chunked = Chunked::open(&args.run)?;
+    let _folder = OutputFolder::amend(&args.run, "join")?;
+    chunked::join(&args.run, &chunked, args.no_eval, &args.measure, &stop, console)
 }

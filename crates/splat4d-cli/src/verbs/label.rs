@@ -1,7 +1,9 @@
 //! `label`: labels and features learnt into a trained run from masks and pictures of features.
 
 use crate::console::Console;
+use crate::run_folder::Run;
 use crate::{finish, labelling};
+use splat4d_train::output::OutputFolder;
 use std::path::PathBuf;
 
 const EXAMPLES: &str = "\
@@ -29,6 +31,8 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
+    Run::open(&args.run)?;
+    let _folder = OutputFolder::amend(&args.run, "label")?;
     labelling::label(&args.run, args.from.as_deref(), args.rounds.map(usize::from), console)?;
     finish::playback(&args.run, console)?;
     finish::write_page(&args.run, console)

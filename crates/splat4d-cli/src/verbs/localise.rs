@@ -67,10 +67,11 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         let row = row(&located, &name, found.len());
         if located.is_sure() {
             console.say(&in_words(&located, &name));
-            console.emit(&json!({"type": "located", "picture": path, "camera": row}));
+            console.emit(&json!({"type": "located", "picture": path.to_string_lossy(), "camera": row}));
             found.push(row);
         } else {
-            console.emit(&json!({"type": "not_located", "picture": path, "residual": located.residual,
+            console
+                .emit(&json!({"type": "not_located", "picture": path.to_string_lossy(), "residual": located.residual,
                 "share": located.share()}));
             lost.push(format!("{name} ({:.0} % of a plain colour's difference)", 100.0 * located.share()));
         }

@@ -3,11 +3,13 @@
 use crate::console::Console;
 use crate::files;
 use crate::predicting::{Order, Work};
+use crate::run_folder::Run;
 use splat4d::{Error, Result};
 use splat4d_dynamics::actions::Actions;
 use splat4d_dynamics::learnt::Training;
 use splat4d_dynamics::models::Model;
 use splat4d_dynamics::nodes::MAX_NODES;
+use splat4d_train::output::OutputFolder;
 use std::path::PathBuf;
 
 const EXAMPLES: &str = "\
@@ -91,5 +93,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         oracle: args.oracle.clone(),
         film: !args.no_film,
     };
+    Run::open(&args.run)?;
+    let _folder = OutputFolder::amend(&args.run, "predict")?;
     Work::open(order, console)?.run(console)
 }

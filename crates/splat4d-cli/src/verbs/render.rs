@@ -5,12 +5,14 @@ use crate::device::Device;
 use crate::draw::{Channel, Painter};
 use crate::paths::{self, Clock, Route, parse_size, shots};
 use crate::raw::RawFormat;
+use crate::sequence::{self, Pattern};
 use crate::source::{Source, not_empty};
 use crate::video::{self, Film};
 use crate::{camera_file, files};
 use clap::ValueEnum;
 use splat4d::scene::Planes;
 use splat4d::{Error, format};
+use splat4d_train::output::OutputFolder;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -90,6 +92,9 @@ pub(crate) struct Args {
     /// (Σ zαT), unclamped, and those of another --channel as P.CHANNEL.npy; of a film the channel's as numbered files in P
     #[arg(long, value_name = "P", help_heading = "Picture")]
     raw: Option<PathBuf>,
+    /// Replace numbered files that splat4d wrote to the folder, also more of them
+    #[arg(long, conflicts_with = "camera")]
+    force: bool,
     /// How the channel's numbers are written
     #[arg(long, value_enum, default_value = "npy", requires = "raw", help_heading = "Picture")]
     raw_format: RawFormat,
@@ -237,9 +242,7 @@ fn film(args: &Args, path: &Path, console: &Console) -> anyhow::Result<()> {
     {
         files::make_folder(folder)?;
     }
-    if let Some(raw) = &args.raw {
-        files::make_folder(raw)?;
-    }
+    let owned = folders(args, &output, shots.len(), &sequence::Read { path, run: source.run.as_ref() })?;
     let mut film = Film::create(&output, size, clock.fps, shots.len())?;
     let mut drawing = Duration::ZERO;
     for (i, shot) in shots.iter().enumerate() {
@@ -258,6 +261,7 @@ fn film(args: &Args, path: &Path, console: &Console) -> anyhow::Result<()> {
         console.phase("rendering", i + 1, shots.len());
     }
     film.finish()?;
+    owned.into_iter().for_each(OutputFolder::finished);
     console.clear();
     if let Some([low, high]) = (!plain && range != NO_RANGE).then_some(range) {
         console.detail(&format!("colours of {} from {low:.4} to {high:.4}", args.channel.name()));
@@ -275,6 +279,20 @@ fn film(args: &Args, path: &Path, console: &Console) -> anyhow::Result<()> {
     ));
     console.written(&output);
     Ok(())
+}
+
+/// Takes the folders of frames: of pictures, where the output is no single file, and of numbers.
+fn folders(args: &Args, output: &Path, count: usize, read: &sequence::Read<'_>) -> splat4d::Result<Vec<OutputFolder>> {
+    let pictures = output.extension().is_none().then(|| Pattern::plain(output, "png"));
+    let numbers = args.raw.as_deref().map(|raw| Pattern::plain(raw, args.raw_format.ending()));
+    let place = |p: &Pattern| p.folder().canonicalize().or_else(|_| std::path::absolute(p.folder())).ok();
+    let all: Vec<&Pattern> = pictures.iter().chain(&numbers).collect();
+    let groups = match all[..] {
+        [a, b] if place(a) != place(b) => vec![vec![a], vec![b]],
+        [] => Vec::new(),
+        _ => vec![all],
+    };
+    groups.iter().map(|group| sequence::take(group, count, read, "render", args.force)).collect()
 }
 
 /// One range for the whole film, so that its colours do not flicker.

@@ -4,13 +4,14 @@ use crate::chunked::{self, Wanted};
 use crate::console::Console;
 use crate::device::{self, Device};
 use crate::files::{self, human_bytes, parse_bytes};
-use crate::run_folder::{self, Run, cameras_json};
+use crate::run_folder::{self, Asked, Run, cameras_json};
 use crate::serving::{self, Place, Watch};
 use crate::{finish, interrupt, labelling};
 use serde_json::json;
 use splat4d::{Error, ErrorKind};
 use splat4d_train::capture::{Capture, Severity, Timing};
 use splat4d_train::event::Event;
+use splat4d_train::output::{Found, OutputFolder, Owner};
 use splat4d_train::recipe::{MotionName, Quality, Recipe};
 use splat4d_train::run::chunks::{Chunked, Outlook, look_ahead};
 use splat4d_train::run::{self, Outcome, Stopwatch, TrainOptions};
@@ -18,11 +19,17 @@ use splat4d_train::run::{memory_estimate, open_capture, open_frames};
 use splat4d_train::settings::{Knob, nearest};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 /// A new picture of the learning scene about so often: sooner than anybody would reload, later than they could follow.
 const SNAPSHOT_INTERVAL: Duration = Duration::from_secs(3);
+
+/// Time between two looks whether the worker that begins a long take is done with that.
+const WAIT: Duration = Duration::from_millis(200);
+/// What an owner's record calls this verb, and `join`.
+const TRAIN: &str = "train";
+const JOIN: &str = "join";
 
 const EXAMPLES: &str = "\
 Examples:
@@ -72,7 +79,7 @@ pub struct Args {
     #[arg(long, value_name = "RUN", conflicts_with_all = ["capture", "output", "motion", "minutes", "quality", "recipe", "set",
         "downscale", "hold_out", "observe", "chunk_frames", "overlap", "chunk", "image_memory", "memory_limit", "seed", "source", "iterations", "force"])]
     resume: Option<PathBuf>,
-    /// Replace the run in the -o folder
+    /// Replace the run in the -o folder: the files that splat4d wrote there, once the new run has taken its first steps
     #[arg(long)]
     force: bool,
     /// How Gaussians move: auto (chosen by the capture), still, spacetime, deform-mlp, hexplane, tracked, native4d,
@@ -179,82 +186,122 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     };
     if let Some(run) = args.resume.as_ref().filter(|run| Chunked::is(run)) {
         let watch = watch(&Run::open(run)?.name());
+        let _folder = OutputFolder::shared(run)?;
         let chunked = Chunked::open(run)?;
         return in_chunks(args, run, &chunked, clock, &stop, &watch, console);
     }
-    let (run, watch, trained) = if let Some(run) = &args.resume {
+    // A run that ended before its first checkpoint begins again, as it was asked for.
+    let again = args.resume.as_ref().and_then(|run| Some((run.clone(), Asked::unbegun(run)?)));
+    let (folder, run, watch, trained) = if let Some(run) = args.resume.as_ref().filter(|_| again.is_none()) {
         let watch = watch(&Run::open(run)?.name());
+        let folder = OutputFolder::amend(run, "train --resume")?;
         let device = device::to_train(args.device, console);
         let options = TrainOptions { device, snapshots: snapshots(&watch), clock, ..TrainOptions::default() };
         let trained = run::resume_with(run, &options, &stop, &mut |event| listen(event, &watch));
-        (run.clone(), watch, trained)
+        (folder, run.clone(), watch, trained)
     } else {
-        let recipe = recipe(args)?;
+        let (source, recipe, minutes, predict) = match &again {
+            Some((_, asked)) => (asked.capture.clone(), asked.recipe()?, asked.minutes, asked.predict),
+            None => {
+                let source = args.capture.as_ref().or(args.source.as_ref()).expect("clap asks for a capture");
+                (source.clone(), recipe(args)?, args.minutes, args.quality.is_some())
+            }
+        };
         let typed = args.set.iter().filter_map(|a| Some(a.split_once('=')?.0));
         recipe.refuse_idle(typed).map_err(|e| e.at("--set"))?;
-        let source = args.capture.as_ref().or(args.source.as_ref()).expect("clap asks for a capture");
         console.phase("reading the capture", 0, 0);
         // Of a long take no more is listed than tells that it is one.
-        let capture = open_frames(source, &recipe, look_ahead(&recipe))?;
+        let capture = Arc::new(open_frames(&source, &recipe, look_ahead(&recipe))?);
+        let output = again.as_ref().map(|(run, _)| run).or(args.output.as_ref());
+        let asked = Asked::new(&capture.root, &recipe, minutes, predict);
+        let place = || place(args, output, &capture, &asked, console);
         // A take that is not told to be cut keeps to its minutes at once.
-        let at_once = args.minutes.is_some() && recipe.chunks.frames == 0;
-        let begun = args.output.as_ref().filter(|run| Chunked::is(run) && !args.force);
+        let at_once = minutes.is_some() && recipe.chunks.frames == 0;
+        let is_begun = || output.filter(|run| Chunked::is(run) && !args.force);
         // Steps that were fitted to minutes are those of the worker that began.
-        let (recipe, minutes) = match begun.filter(|_| args.minutes.is_some() && !at_once) {
-            None => (recipe, args.minutes),
+        let (recipe, minutes) = match is_begun().filter(|_| minutes.is_some() && !at_once) {
+            None => (recipe, minutes),
             Some(run) => {
                 let steps = Chunked::open(run)?.recipe().run.iterations;
                 (recipe.unresolved().with(|r| r.run.iterations = steps), None)
             }
         };
-        let mut capture = Arc::new(capture);
         let outlook = match at_once {
             true => None,
             false => Outlook::new(&capture, &recipe, minutes, false, &clock, &mut |event| console.event(event))?,
         };
         console.clear();
         if let Some(outlook) = outlook {
-            let run = begun.map_or_else(|| place(args, &capture, console), |run| Ok(run.clone()))?;
+            // Of workers that start at the same time one begins, and the others find it begun.
+            let busy = |run: &Path| Owner::holder(run).flatten().is_some_and(|who| who.command == TRAIN);
+            let folder = loop {
+                if let Some(run) = is_begun() {
+                    break Err(OutputFolder::shared(run)?);
+                }
+                match place() {
+                    Ok((folder, _)) => break Ok(folder),
+                    Err(_) if output.is_some_and(|run| busy(run)) && !args.force => std::thread::sleep(WAIT),
+                    Err(error) => return Err(error),
+                }
+            };
+            let run = folder.as_ref().unwrap_or_else(|shared| shared).path().to_owned();
             describe(&capture, outlook.memory, console);
             console.say(&chunked::in_words(&outlook));
-            files::make_folder(&run)?;
-            if begun.is_none() {
-                files::write(&run.join("cameras.json"), &serde_json::to_vec(&cameras_json(&once(&capture)))?)?;
-            }
             let watch = watch(&capture.name);
             let begun = Chunked::begin(&capture, &outlook.recipe, &run, &mut |event| listen(event, &watch))?;
             let chunked = begun.expect("a take that has a plan is learnt by it");
+            let _folder = match folder {
+                Ok(own) => {
+                    files::write(&run.join("cameras.json"), &serde_json::to_vec(&cameras_json(&once(&capture)))?)?;
+                    own.share()
+                }
+                Err(shared) => shared,
+            };
             return in_chunks(args, &run, &chunked, clock, &stop, &watch, console);
         }
-        if capture.frames.len() < capture.take.pictures {
-            capture = Arc::new(open_capture(source, &recipe)?);
-        }
+        let whole = match capture.frames.len() < capture.take.pictures {
+            true => Arc::new(open_capture(&source, &recipe)?),
+            false => capture.clone(),
+        };
         if args.chunk.is_some() {
             return Err(Error::input("the take fits one chunk, and has no parts")
                 .at("--chunk")
                 .remedy("Train it without --chunk, or ask for shorter chunks with --chunk-frames")
                 .into());
         }
-        let run = place(args, &capture, console)?;
-        describe(&capture, memory_estimate(&capture, &recipe), console);
-        files::make_folder(&run)?;
-        let cameras = serde_json::to_vec(&cameras_json(&capture))?;
-        files::write(&run.join("cameras.json"), &cameras)?;
-        let watch = watch(&capture.name);
+        let (folder, found) = place()?;
+        let run = folder.path().to_owned();
+        describe(&whole, memory_estimate(&whole, &recipe), console);
+        let watch = watch(&whole.name);
         let options = TrainOptions {
             device: device::to_train(args.device, console),
-            minutes: args.minutes,
-            finish: finish::steps(&capture, args.no_eval),
-            predict: args.quality.is_some(),
+            minutes,
+            finish: finish::steps(&whole, args.no_eval),
+            predict,
             clock,
             own_loss: None,
             snapshots: snapshots(&watch),
         };
-        let trained = run::train(capture, recipe, &run, &options, &stop, &mut |event| listen(event, &watch));
-        if trained.is_err() {
-            run_folder::clear_unbegun(&run)?;
+        let mut hear = |event: &Event| {
+            run_folder::hear(&folder, event);
+            listen(event, &watch);
+        };
+        let trained = if found == Found::Unfinished {
+            console.say(&format!("{} holds what the same command left unfinished: it is continued", run.display()));
+            run::resume_with(&run, &options, &stop, &mut hear)
+        } else {
+            // The recipe first: whatever comes to pass from here on, the folder is known for what it is.
+            files::write(&run.join("recipe.toml"), recipe.to_toml().as_bytes())?;
+            files::write(&run.join("cameras.json"), &serde_json::to_vec(&cameras_json(&whole))?)?;
+            run::train(whole, recipe, &run, &options, &stop, &mut hear)
+        };
+        match run_folder::left(folder, &run, &trained) {
+            Some(folder) => (folder, run, watch, trained),
+            None => {
+                console.clear();
+                return Err(trained.err().expect("only what failed leaves nothing").into());
+            }
         }
-        (run, watch, trained)
     };
     console.clear();
     let outcome: Outcome = trained?;
@@ -277,8 +324,9 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     } else {
         finish::all(&run, &args.measure, console)?;
     }
+    folder.finished();
     watch.show(&run, outcome.iteration);
-    console.emit(&json!({"type": "done", "run": run}));
+    console.emit(&json!({"type": "done", "run": run.to_string_lossy()}));
     if watch.is_on() && console.terminal() {
         console.say("the player stays until Ctrl-C");
         serving::wait(&stop);
@@ -314,10 +362,12 @@ fn in_chunks(
             .into());
     }
     match args.chunk {
-        Some(_) => console.emit(&json!({"type": "done", "run": run})),
+        Some(_) => console.emit(&json!({"type": "done", "run": run.to_string_lossy()})),
         None => {
+            // The other workers are done with it, or wait for the same.
+            let _owner = Owner::wait(run, JOIN, &mut |_| !stop.load(Ordering::Relaxed))?;
             chunked::join(run, chunked, args.no_eval, &args.measure, stop, console)?;
-            console.emit(&json!({"type": "done", "run": run}));
+            console.emit(&json!({"type": "done", "run": run.to_string_lossy()}));
         }
     }
     Ok(())
@@ -360,15 +410,16 @@ fn recipe(args: &Args) -> anyhow::Result<Recipe> {
     Ok(recipe)
 }
 
-/// Where the run goes. A folder that the user named is never silently taken over.
-fn place(args: &Args, capture: &Capture, console: &Console) -> anyhow::Result<PathBuf> {
-    if let Some(run) = &args.output {
-        if args.force {
-            run_folder::clear(run)?;
-        } else {
-            run_folder::check_unused(run)?;
-        }
-        return Ok(run.clone());
+/// Takes the folder of the run. One that the user named is never silently taken over.
+fn place(
+    args: &Args,
+    output: Option<&PathBuf>,
+    capture: &Capture,
+    asked: &Asked,
+    console: &Console,
+) -> anyhow::Result<(OutputFolder, Found)> {
+    if let Some(run) = output {
+        return Ok(asked.begin(run, args.force, TRAIN)?);
     }
     let wanted = run_folder::usual_folder(&capture.name);
     let run = run_folder::free_folder(&wanted);
@@ -380,7 +431,7 @@ fn place(args: &Args, capture: &Capture, console: &Console) -> anyhow::Result<Pa
         };
         console.say(&format!("{} is taken{hint}: this run goes to {}", wanted.display(), run.display()));
     }
-    Ok(run)
+    Ok(asked.begin(&run, args.force, TRAIN)?)
 }
 
 /// Every fixed camera once: a long take has too many pictures to name them all.

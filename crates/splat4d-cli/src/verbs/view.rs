@@ -10,6 +10,7 @@ use crate::source::{Source, not_empty};
 use serde_json::json;
 use splat4d::Error;
 use splat4d_serve::{Config, Content, Editing};
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "\
@@ -29,7 +30,7 @@ by the browser itself: that server must allow it (Access-Control-Allow-Origin, a
 pub(crate) struct Args {
     /// The run, scene file, .ply, playback file, or the address of a playback file
     #[arg(value_name = "RUN|FILE|URL")]
-    source: String,
+    source: OsString,
     /// Let the page edit, and save its list of edits in this file; it is made where it is not there
     #[arg(long, value_name = "FILE")]
     edit: Option<PathBuf>,
@@ -38,20 +39,20 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
-    let foreign = ["http://", "https://"].iter().any(|scheme| args.source.starts_with(scheme));
+    let address = args.source.to_str().filter(|s| ["http://", "https://"].iter().any(|scheme| s.starts_with(scheme)));
     let mut token = None;
     let config = if let Some(file) = &args.edit {
-        if foreign {
+        if let Some(address) = address {
             return Err(Error::input("a scene on another server cannot be edited")
-                .at(&args.source)
+                .at(address)
                 .remedy("Download it first.")
                 .into());
         }
         token = Some(editor::token()?);
         editing(Path::new(&args.source), file, token.clone().expect("it was just made"), console)?
-    } else if foreign {
-        let name = args.source.split(['?', '#']).next().and_then(|path| path.rsplit('/').next()).unwrap_or_default();
-        Config { foreign: Some(args.source.clone()), about: json!({ "title": name }), ..Config::default() }
+    } else if let Some(address) = address {
+        let name = address.split(['?', '#']).next().and_then(|path| path.rsplit('/').next()).unwrap_or_default();
+        Config { foreign: Some(address.to_owned()), about: json!({ "title": name }), ..Config::default() }
     } else {
         let Playable { title, content } = Playable::open(Path::new(&args.source), console)?;
         Config { content, about: json!({ "title": title }), ..Config::default() }
@@ -66,7 +67,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
 
 /// A server whose pages may edit the scene by a list.
 fn editing(path: &Path, file: &Path, token: String, console: &Console) -> anyhow::Result<Config> {
-    let source = Source::open(path)?;
+    let source = Source::open(path)?.finite();
     not_empty(&source.scene, path)?;
     source.warnings.lines().iter().for_each(|w| console.warn(&format!("{w}.")));
     let title = title(&source, path);

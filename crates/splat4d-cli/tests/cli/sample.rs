@@ -162,6 +162,12 @@ impl Call {
         self
     }
 
+    /// More arguments, which need not be text.
+    pub(crate) fn paths(mut self, paths: &[&Path]) -> Self {
+        self.args.extend(paths.iter().map(|p| p.as_os_str().to_owned()));
+        self
+    }
+
     /// Programs are looked for in these folders alone.
     #[cfg(unix)]
     pub(crate) fn path(self, folders: &str) -> Self {
@@ -214,7 +220,16 @@ impl Answer {
 
     /// The one-paragraph error of a call that was refused for bad input.
     pub(crate) fn refused(self) -> String {
-        assert_eq!(self.code, Some(2), "{}: {}{}", self.call, self.stdout, self.stderr);
+        self.ended(2)
+    }
+
+    /// The one-paragraph error of a call that failed through no fault of its input.
+    pub(crate) fn failed(self) -> String {
+        self.ended(1)
+    }
+
+    fn ended(self, code: i32) -> String {
+        assert_eq!(self.code, Some(code), "{}: {}{}", self.call, self.stdout, self.stderr);
         let errors: Vec<&str> = self.stderr.lines().filter(|l| l.starts_with("error: ")).collect();
         assert_eq!(errors.len(), 1, "{}: one paragraph, not {:?}", self.call, self.stderr);
         assert!(!self.stderr.contains("panicked"), "{}", self.stderr);

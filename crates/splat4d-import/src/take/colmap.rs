@@ -99,7 +99,7 @@ pub(super) fn calibrate(
 fn helps() -> Result<Vec<String>> {
     let help = |step: &Step| {
         let out = Command::new(PROGRAM).args([step.name, "--help"]).stdin(Stdio::null()).output();
-        let out = out.map_err(|e| Error::io("the program colmap cannot be started", e).remedy(INSTALL))?;
+        let out = out.map_err(|e| Error::environment("the program colmap cannot be started", e).remedy(INSTALL))?;
         Ok(String::from_utf8_lossy(&[out.stdout, out.stderr].concat()).into_owned())
     };
     STEPS.iter().map(help).collect()
@@ -107,7 +107,7 @@ fn helps() -> Result<Vec<String>> {
 
 /// Writes what the program works on: of each camera its median, where people vanish, and its mask.
 fn prepare(stored: &Stored<'_>, work: &Path, progress: &mut Progress<'_>) -> Result<()> {
-    let fail = |e| Error::io("the folder cannot be made anew", e).at(work.display());
+    let fail = |e| Error::environment("the folder cannot be made anew", e).at(work.display());
     if work.exists() {
         std::fs::remove_dir_all(work).map_err(fail)?;
     }
@@ -131,8 +131,8 @@ fn prepare(stored: &Stored<'_>, work: &Path, progress: &mut Progress<'_>) -> Res
 
 fn run(step: &Step, help: &str, work: &Path, masks: bool, stop: &dyn Fn() -> bool) -> Result<()> {
     let log = work.join(format!("{}.txt", step.name));
-    let file = File::create(&log).map_err(|e| Error::io("the log cannot be written", e).at(log.display()))?;
-    let copy = file.try_clone().map_err(|e| Error::io("the log cannot be written", e).at(log.display()))?;
+    let file = File::create(&log).map_err(|e| Error::environment("the log cannot be written", e).at(log.display()))?;
+    let copy = file.try_clone().map_err(|e| Error::environment("the log cannot be written", e).at(log.display()))?;
     let mut command = Command::new(PROGRAM);
     command.arg(step.name).arg("--database_path").arg(work.join("database.db"));
     if step.name != "exhaustive_matcher" {
@@ -153,9 +153,9 @@ fn run(step: &Step, help: &str, work: &Path, masks: bool, stop: &dyn Fn() -> boo
         .stdout(file)
         .stderr(copy)
         .spawn()
-        .map_err(|e| Error::io("the program colmap cannot be started", e).remedy(INSTALL))?;
+        .map_err(|e| Error::environment("the program colmap cannot be started", e).remedy(INSTALL))?;
     let status = loop {
-        if let Some(status) = child.try_wait().map_err(|e| Error::io("the program colmap was lost", e))? {
+        if let Some(status) = child.try_wait().map_err(|e| Error::environment("the program colmap was lost", e))? {
             break status;
         }
         if stop() {

@@ -106,7 +106,8 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
     let folder = &request.folder;
     let mut cameras = open(request)?;
     let names: Vec<String> = cameras.iter().map(|c| c.name.clone()).collect();
-    std::fs::create_dir_all(folder).map_err(|e| Error::io("the folder cannot be made", e).at(folder.display()))?;
+    std::fs::create_dir_all(folder)
+        .map_err(|e| Error::environment("the folder cannot be made", e).at(folder.display()))?;
     let mut corrections = Corrections::read(folder, &names)?;
     let mut wanted = corrections.cameras.iter().map(|c| c.wanted);
     cameras.retain(|_| wanted.next().unwrap_or(true));

@@ -15,6 +15,7 @@ const FILE: &str = "import/report.json";
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Report {
     /// The capture's file.
+    #[serde(serialize_with = "splat4d_train::path_text::lossy")]
     pub capture: PathBuf,
     /// A row for each camera.
     pub cameras: Vec<CameraReport>,

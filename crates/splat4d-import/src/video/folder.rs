@@ -45,6 +45,14 @@ impl Folder {
         let steps = steps(&files.iter().map(|f| name(f)).collect::<Vec<_>>());
         let size = [picture.width, picture.height];
         let times: Vec<f64> = steps.iter().map(|s| s / fps).collect();
+        let gaps = steps.windows(2).filter(|w| w[1] - w[0] > 1.5).count();
+        let warnings = match steps.windows(2).position(|w| w[1] - w[0] > 1.5) {
+            None => Vec::new(),
+            Some(first) => vec![format!(
+                "numbers are missing in the names of its pictures, in {gaps} places, first after {}: their times are kept",
+                name(&files[first])
+            )],
+        };
         let info = Info {
             name: stem(path),
             size,
@@ -60,7 +68,7 @@ impl Folder {
             interlaced: false,
             color: Color { matrix: None, tagged: true, range: Range::Full, transfer: Transfer::Standard },
             sound: false,
-            warnings: Vec::new(),
+            warnings,
         };
         Ok(Self { info, files: files.into_iter().zip(times).collect() })
     }
@@ -138,7 +146,7 @@ impl Reader for Pictures<'_> {
     }
 
     fn warnings(&self) -> &[String] {
-        &[]
+        &self.folder.info.warnings
     }
 }
 
@@ -239,6 +247,7 @@ mod tests {
         std::fs::write(folder.path().join("notes.txt"), "no picture").unwrap();
         let source = super::super::open(folder.path(), 10.0).unwrap();
         assert_eq!((source.info().size, source.info().frames), ([40, 32], Some(5)));
+        assert!(source.info().warnings[0].contains("in 2 places, first after f4.png"), "{:?}", source.info().warnings);
         let mut frames = source.frames(&Selection { from: Some(0.1), size: Some(16), ..Selection::default() }).unwrap();
         let (mut frame, mut seen) = (Frame::default(), Vec::new());
         while frames.next(&mut frame).unwrap() {

@@ -84,7 +84,7 @@ impl Tools {
             "-i",
         ]);
         command.arg(file(path)).stdin(Stdio::null());
-        let out = command.output().map_err(|e| Error::io("ffprobe cannot be started", e).remedy(INSTALL))?;
+        let out = command.output().map_err(|e| Error::environment("ffprobe cannot be started", e).remedy(INSTALL))?;
         if !out.status.success() {
             let said = String::from_utf8_lossy(&out.stderr);
             // The last line says that it did not work, the one before why.
@@ -113,7 +113,8 @@ impl Tools {
         ]);
         command.args(input).arg("-i").arg(file(path)).args(output).arg("pipe:1");
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
-        let mut child = command.spawn().map_err(|e| Error::io("ffmpeg cannot be started", e).remedy(INSTALL))?;
+        let mut child =
+            command.spawn().map_err(|e| Error::environment("ffmpeg cannot be started", e).remedy(INSTALL))?;
         let stdout = child.stdout.take().expect("standard output is a pipe");
         let stderr = child.stderr.take().expect("standard error is a pipe");
         let (send, stamps) = channel();

@@ -289,5 +289,5 @@ fn clear(folder: &Path) -> Result<()> {
 }
 
 fn remove(path: &Path) -> Result<()> {
-    std::fs::remove_file(path).map_err(|e| Error::io("an old picture cannot be removed", e).at(path.display()))
+    std::fs::remove_file(path).map_err(|e| Error::environment("an old picture cannot be removed", e).at(path.display()))
 }

@@ -27,7 +27,7 @@ impl Recipe {
     }
 
     /// As TOML; reading it back gives the same recipe.
-    pub(crate) fn to_toml(&self) -> String {
+    pub fn to_toml(&self) -> String {
         let mut text = String::new();
         for (name, table) in self.tables() {
             if !text.is_empty() {

@@ -15,8 +15,9 @@ use splat4d::format::scene::{self, METADATA};
 use splat4d::layers::Layer;
 use splat4d::scene::{Key, Params, Table};
 use std::collections::BTreeMap;
-use std::io::Write;
 use std::path::{Path, PathBuf};
+
+pub use crate::output::{write_atomically, write_atomically_with};
 
 /// Version of the checkpoint's own metadata.
 const VERSION: u64 = 3;
@@ -268,44 +269,6 @@ fn load(file: &SafeTensors<'_>, name: &str, table: &mut Table<f32>) -> Result<()
     }
     table.column_from_rows(0, table.width(), &tensor.as_f32()?);
     Ok(())
-}
-
-/// Writes a file so that a crash leaves the old one or the new one, never half: a temporary name in the same folder, then
-/// a rename. A device or a pipe is written to and never replaced: as root, a rename would put a file in its place. Folders
-/// on the way are made. Errors: nobody may write there, no space.
-pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<()> {
-    write_atomically_with(path, &mut |file| {
-        file.write_all(bytes).map_err(|e| Error::io("the file cannot be written", e).remedy(NO_SPACE))
-    })
-}
-
-/// What to do about a file that cannot be written.
-const NO_SPACE: &str = "Check that the folder exists, is writable and has space";
-
-/// The same for what need not be in memory as a whole. Errors: those of `write`, and as [`write_atomically`].
-pub fn write_atomically_with(path: &Path, write: &mut dyn FnMut(&mut dyn Write) -> Result<()>) -> Result<()> {
-    let place = |e: std::io::Error, what: &str| Error::io(what, e).at(path.display()).remedy(NO_SPACE);
-    // Folders fall through to the rename, which refuses to replace them.
-    if std::fs::metadata(path).is_ok_and(|m| !m.is_file() && !m.is_dir()) {
-        let file = std::fs::OpenOptions::new().write(true).open(path);
-        let mut file = file.map_err(|e| place(e, "the file cannot be written"))?;
-        return write(&mut file).map_err(|e| e.at(path.display()));
-    }
-    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    std::fs::create_dir_all(folder).map_err(|e| place(e, "the folder cannot be made"))?;
-    let name = path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
-    let temporary = folder.join(format!(".{name}.{}.tmp", std::process::id()));
-    let failed = |e| place(e, "the file cannot be written");
-    let written = (|| {
-        let mut file = std::io::BufWriter::new(std::fs::File::create(&temporary).map_err(failed)?);
-        write(&mut file).map_err(|e| e.at(path.display()))?;
-        let file = file.into_inner().map_err(|e| failed(e.into_error()))?;
-        file.sync_all().map_err(failed)?;
-        std::fs::rename(&temporary, path).map_err(failed)
-    })();
-    written.inspect_err(|_| {
-        let _ = std::fs::remove_file(&temporary);
-    })
 }
 
 /// The run's checkpoints, oldest first.

@@ -105,6 +105,16 @@ impl Few {
     }
 }
 
+/// Bytes of memory that the system could give a program now, within what its group may take; `None`: it does not say.
+pub fn available_memory() -> Option<u64> {
+    let number = |path: &str| std::fs::read_to_string(path).ok()?.trim().parse::<u64>().ok();
+    let text = std::fs::read_to_string("/proc/meminfo").ok()?;
+    let line = text.lines().find_map(|l| l.strip_prefix("MemAvailable:"))?;
+    let system = line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()? << 10;
+    let group = number("/sys/fs/cgroup/memory.max").zip(number("/sys/fs/cgroup/memory.current"));
+    Some(group.map_or(system, |(most, now)| system.min(most.saturating_sub(now))))
+}
+
 /// Peak resident memory of this process, bytes; 0 where the system does not tell.
 pub fn peak_memory() -> u64 {
     std::fs::read_to_string("/proc/self/status")

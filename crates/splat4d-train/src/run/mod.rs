@@ -23,7 +23,7 @@ mod start;
 pub(crate) mod tests;
 
 pub use clock::Stopwatch;
-pub use memory::{memory_estimate, peak_memory};
+pub use memory::{available_memory, memory_estimate, peak_memory};
 #[cfg(test)]
 pub(crate) use open::OpenCapture;
 pub use open::{capture_options, open_capture, open_frames, plan, training_frames};

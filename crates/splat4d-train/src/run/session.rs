@@ -13,6 +13,7 @@ use super::snapshot::Snapshots;
 use super::start::read_info;
 use crate::event::{Event, Progress};
 use crate::loss::image::ImageTerm;
+use crate::path_text::to_text;
 use crate::recipe::Recipe;
 use crate::step::engine::Blame;
 use crate::step::trainer::{Fault, Measured, Trainer};
@@ -191,8 +192,9 @@ impl Session<'_> {
     pub(super) fn begin(&self, trainer: &Trainer<'_>, listen: &mut dyn FnMut(&Event)) -> Result<RunState> {
         self.write_recipe(self.recipe)?;
         let state = RunState::default();
-        save_checkpoint(self.run, trainer, &self.identity, &state, listen)?;
+        // Where there is a checkpoint, there is all that continuing needs.
         self.write_info(&Totals::default(), trainer, &state, false)?;
+        save_checkpoint(self.run, trainer, &self.identity, &state, listen)?;
         Ok(state)
     }
 
@@ -409,7 +411,7 @@ impl Session<'_> {
             "version": env!("CARGO_PKG_VERSION"),
             "made_by": self.made_by,
             "own_loss": self.own_loss,
-            "capture": root,
+            "capture": to_text(&root),
             "capture_name": capture.name,
             "capture_fingerprint": fingerprint(capture),
             "motion": recipe.run.motion.as_str(),

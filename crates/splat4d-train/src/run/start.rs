@@ -14,6 +14,7 @@ use crate::capture::Capture;
 use crate::event::Event;
 use crate::init::{self, Seeds};
 use crate::methods::program_of;
+use crate::path_text::of_text;
 use crate::recipe::Recipe;
 use crate::{Error, ErrorKind, Result};
 use std::path::Path;
@@ -222,7 +223,7 @@ pub fn open_run(run: &Path) -> Result<(Recipe, Capture)> {
     let path = info["capture"].as_str().ok_or_else(|| {
         Error::input("it does not name its capture").at(run.join("run.json").display()).remedy("Train again")
     })?;
-    let capture = open_capture(Path::new(path), &recipe)
+    let capture = open_capture(&of_text(path), &recipe)
         .map_err(|e| e.remedy("The run needs its capture where it was when it was trained"))?;
     let capture = flows::with_found(points::with_found(capture, &recipe, run)?, &recipe, run);
     Ok((recipe, capture))

@@ -325,7 +325,13 @@ fn a_killed_run_resumes_from_whatever_is_on_disk() {
             // A crash in the middle of a write: a stale temporary file. A disk that lost blocks: a newest checkpoint cut
             // short, beyond the sound one.
             std::fs::write(run.join("checkpoints/.00000099.safetensors.123.tmp"), &newest[..newest.len() / 3]).unwrap();
-            std::fs::write(run.join("checkpoints/00000038.safetensors"), &newest[..newest.len() / 2]).unwrap();
+            let mut damaged = newest[..newest.len() / 2].to_vec();
+            if i % 2 == 1 {
+                // Or one that flipped some bits of its numbers, and nothing of its header.
+                damaged = newest.clone();
+                (0..40).for_each(|k| damaged[newest.len() - 1 - k * (newest.len() / 80)] ^= 1 << (k % 8));
+            }
+            std::fs::write(run.join("checkpoints/00000038.safetensors"), &damaged).unwrap();
             let mut warned = 0;
             let stop = AtomicBool::new(false);
             resume(&run, &stop, &mut |e| warned += usize::from(matches!(e, Event::Warning { .. }))).unwrap();

@@ -1,6 +1,7 @@
 //! What the steps do to a scene.
 
-use super::clock::{retime, window};
+use super::clock::{retime, seen_in, window};
+use super::limits::{Size, check_clip, check_room};
 use super::{Context, Expr, Place, PlaceKey, Selected, Step, drag, select};
 use crate::layers::{ALWAYS, Layer, Scene};
 use crate::math::se3::{add, norm, sub};
@@ -86,6 +87,9 @@ pub(super) fn run(step: &Step, scene: &mut Scene<f32>, context: &dyn Context) ->
         }
         Step::Duplicate { select, name } => {
             let (selected, count) = find(select, scene)?;
+            let chosen = scene.layers.iter().zip(&selected);
+            let copied = chosen.map(|(layer, s)| Size::part(layer, s.iter().filter(|s| **s).count()));
+            check_room(copied.fold(Size::of_all(&scene.layers), Size::plus), context)?;
             let copies: Vec<Layer<f32>> = scene
                 .layers
                 .iter()
@@ -119,12 +123,13 @@ pub(super) fn run(step: &Step, scene: &mut Scene<f32>, context: &dyn Context) ->
         }
         Step::Retime { rate, from, to } => {
             let [start, end] = scene.clip;
-            retime_part(scene, *rate, [from.unwrap_or(start), to.unwrap_or(end)])?;
+            retime_part(scene, *rate, [from.unwrap_or(start), to.unwrap_or(end)], context)?;
             Ok(scene.len())
         }
         Step::Merge { scene: file, name, at, to } => {
             let other = context.scene(file)?;
             let count = other.len();
+            check_room(Size::of_all(&scene.layers).plus(Size::of_all(&other.layers)), context)?;
             merge(scene, other, name, *at, &similarity(to)?)?;
             Ok(count)
         }
@@ -337,13 +342,14 @@ fn color_map(exposure: f64, tint: Option<[f64; 3]>, saturation: Option<f64>, cur
     Ok(map)
 }
 
-fn retime_part(scene: &mut Scene<f32>, rate: f64, [from, to]: [f64; 2]) -> Result<()> {
+fn retime_part(scene: &mut Scene<f32>, rate: f64, [from, to]: [f64; 2], context: &dyn Context) -> Result<()> {
     span(from, to)?;
     if !(rate != 0.0 && rate.is_finite()) {
         return Err(Error::input(format!("a rate of {rate}")).remedy("1 is as it is, 0.5 half as fast, -1 backwards"));
     }
     let [start, end] = scene.clip;
     let longer = (to - from) / rate.abs() - (to - from);
+    check_clip([start, end + longer], scene.fps)?;
     // Inside it is s = rate·t + offset.
     let offset = if rate > 0.0 { from - rate * from } else { to - rate * from };
     if from <= start && to >= end {
@@ -351,6 +357,10 @@ fn retime_part(scene: &mut Scene<f32>, rate: f64, [from, to]: [f64; 2]) -> Resul
             retime(layer, rate, offset)?;
         }
     } else {
+        let parts = [[f64::NEG_INFINITY, from], [from, to], [to, f64::INFINITY]];
+        let of = |layer: &Layer<f32>| parts.map(|part| Size::part(layer, seen_in(layer, part)));
+        let sizes = scene.layers.iter().flat_map(of);
+        check_room(sizes.fold(Size::default(), Size::plus), context)?;
         let mut layers = Vec::new();
         for layer in &scene.layers {
             if layer.span == ALWAYS
@@ -385,6 +395,7 @@ fn merge(scene: &mut Scene<f32>, mut other: Scene<f32>, name: &str, at: Option<f
     }
     let frame = |s: &Scene<f32>| if s.fps > 0.0 && s.fps.is_finite() { 1.0 / s.fps } else { 0.0 };
     let clip = [scene.clip[0].min(other.clip[0] + later), scene.clip[1].max(other.clip[1] + later)];
+    check_clip(clip, scene.fps)?;
     if later != 0.0 {
         for layer in &mut other.layers {
             retime(layer, 1.0, -later)?;

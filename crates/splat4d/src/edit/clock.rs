@@ -28,6 +28,16 @@ pub(super) fn window(layer: &Layer<f32>, [from, to]: [f64; 2]) -> Option<Layer<f
     Some(out)
 }
 
+/// How many of the layer's Gaussians [`window`] keeps.
+pub(super) fn seen_in(layer: &Layer<f32>, [from, to]: [f64; 2]) -> usize {
+    let span = [layer.span[0].max(from), layer.span[1].min(to)];
+    if span[0] >= span[1] {
+        return 0;
+    }
+    // As they live, whatever the window: those that live in it.
+    layer.spans().iter().filter(|[first, last]| first.max(span[0]) <= last.min(span[1])).count()
+}
+
 /// The layer on another clock: what it showed at s = rate·t + offset it shows at t.
 ///
 /// Errors: a filter around a model whose motion hangs on its lives.

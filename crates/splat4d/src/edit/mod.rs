@@ -7,6 +7,7 @@
 mod act;
 mod clock;
 mod drag;
+mod limits;
 mod look;
 mod select;
 #[cfg(test)]
@@ -301,6 +302,11 @@ pub trait Context {
         Err(missing(&format!("scene `{name}`"), "Give a file that can be read"))
     }
 
+    /// Bytes of memory that are available; `None`: nobody knows.
+    fn memory(&self) -> Option<u64> {
+        None
+    }
+
     /// Gaussians of `scene` that float before cameras.
     fn floaters(&self, _scene: &Scene<f32>, _strength: f64) -> Result<Selected> {
         Err(missing("training view", "Give the run folder of a capture that is still there"))
@@ -335,7 +341,7 @@ pub struct Done {
 /// Runs the steps on a scene, in order. The scene is what is left of it; on an error it is lost, so that callers keep theirs.
 ///
 /// Errors: a step's, with its number and name: selections that cannot be read or select nothing, names that there are not,
-/// numbers out of range, what a pixel head cannot show.
+/// numbers out of range, numbers that overflow, more Gaussians than memory holds, what a pixel head cannot show.
 pub fn replay(
     steps: &[Step],
     scene: Scene<f32>,
@@ -355,10 +361,12 @@ pub fn replay_after(
     context: &dyn Context,
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<(Scene<f32>, Vec<Done>)> {
+    scene.check_finite()?;
     for (i, step) in steps.iter().enumerate() {
         progress(i, steps.len());
         let at = |e: Error| e.at(format!("edit {} ({})", done.len() + 1, step.name()));
-        let selected = act::run(step, &mut scene, context).map_err(at)?;
+        let selected =
+            act::run(step, &mut scene, context).and_then(|n| limits::check_sound(&scene).map(|()| n)).map_err(at)?;
         done.push(Done { step: step.name(), selected, gaussians: scene.len() });
     }
     if scene.is_empty() {

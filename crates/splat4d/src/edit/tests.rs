@@ -658,3 +658,85 @@ fn what_is_bent_under_the_hand_is_what_the_step_makes_of_it() {
         }
     }
 }
+
+/// What a step would multiply beyond memory, or stretch beyond use, is refused before it is made.
+#[test]
+fn what_grows_beyond_memory_or_time_is_refused_before() {
+    struct Small(Bench);
+    impl Context for Small {
+        fn memory(&self) -> Option<u64> {
+            Some(1 << 20)
+        }
+        fn follow(
+            &self,
+            scene: &Scene<f32>,
+            among: &Selected,
+            start: &[[f64; 3]],
+            times: &[f64],
+            first: usize,
+        ) -> Result<Vec<Vec<[f64; 3]>>> {
+            self.0.follow(scene, among, start, times, first)
+        }
+    }
+    let small = Small(Bench::empty());
+    let scene = walker();
+    let refused = |text: &str, context: &dyn Context| {
+        replay(&steps(text), scene.clone(), context, &mut |_, _| {}).map(|_| ()).expect_err(text)
+    };
+    let double = r#"{"do": "duplicate", "select": "all", "name": "copy"}"#;
+    let many = format!("[{}]", [double; 60].join(","));
+    let error = refused(&many, &small);
+    let text = error.to_string();
+    assert!(error.kind() == ErrorKind::Memory && text.contains("duplicate") && text.contains("Gaussians"), "{text}");
+    assert!(text.contains("0.0 GiB of memory are available"), "{text}");
+    // Cuts of the clock divide layers in three, of which each may hold most of it.
+    let cut = r#"{"do": "retime", "rate": 1.01, "from": 0.4, "to": 0.5}"#;
+    let text = refused(&format!("[{}]", [cut; 60].join(",")), &small).to_string();
+    assert!(text.contains("retime") && text.contains("GiB"), "{text}");
+    let bench = Bench::empty();
+    for rate in ["1e-9", "-1e-9", "1e-300"] {
+        let text = refused(&format!(r#"[{{"do": "retime", "rate": {rate}}}]"#), &bench).to_string();
+        assert!(text.contains("edit 1 (retime)") && text.contains("frames"), "{text}");
+    }
+    let bench = Bench { other: of(vec![layer("b", &Spec::Still, 5, 1)]), ..Bench::empty() };
+    let text = refused(r#"[{"do": "merge", "scene": "b", "name": "b", "at": 1e12}]"#, &bench).to_string();
+    assert!(text.contains("edit 1 (merge)") && text.contains("frames"), "{text}");
+}
+
+#[test]
+fn an_overflow_is_refused_and_names_its_step() {
+    let hide = r#"{"do": "opacity", "select": "all", "factor": 0.9}"#;
+    for step in [
+        r#"{"do": "move", "select": "all", "to": {"shift": [1e39, 0, 0]}}"#,
+        r#"{"do": "move", "select": "all", "to": {"scale": 1e39}}"#,
+        r#"{"do": "move", "select": "all", "to": {"scale": 1e-60, "about": [1e30, 0, 0]}}"#,
+        r#"{"do": "move", "select": "all", "keys": [{"t": 0, "shift": [0, 0, 0]}, {"t": 1, "shift": [0, 1e39, 0]}]}"#,
+        r#"{"do": "move", "select": "all", "keys": [{"t": 0, "scale": 1e39}, {"t": 1, "scale": 1}]}"#,
+        r#"{"do": "recolor", "select": "all", "exposure": 200}"#,
+        r#"{"do": "recolor", "select": "all", "tint": [1e200, 1, 1]}"#,
+    ] {
+        for scene in scenes() {
+            let text = format!("[{hide}, {step}]");
+            let error = match run(&text, &scene) {
+                // What does not overflow is no NaN either.
+                Ok(edited) => {
+                    let written = crate::format::scene::write(&edited, &mut Vec::new());
+                    assert!(written.is_ok(), "{step}: {written:?}");
+                    assert!(draw(&edited, 1.0).iter().all(|x| x.is_finite()), "{step}");
+                    continue;
+                }
+                Err(error) => error.to_string(),
+            };
+            assert!(error.contains("edit 2 ("), "{step}: {error}");
+        }
+    }
+    let refused = run(r#"[{"do": "move", "select": "all", "to": {"shift": [1e39, 0, 0]}}]"#, &scenes()[0]).unwrap_err();
+    assert!(refused.to_string().contains("too large"), "{refused}");
+    // Changes over time, one on another, can be read again.
+    let pan =
+        r#"{"do": "move", "select": "all", "keys": [{"t": 0, "shift": [0, 0, 0]}, {"t": 1, "shift": [0, 0.1, 0]}]}"#;
+    let many = |n: usize| run(&format!("[{}]", vec![pan; n].join(",")), &scenes()[0]);
+    assert_eq!(crate::format::scene::read(&bytes(&many(20).unwrap())).unwrap().len(), 150);
+    let error = many(100).unwrap_err().to_string();
+    assert!(error.contains("one on another"), "{error}");
+}

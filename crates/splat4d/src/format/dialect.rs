@@ -141,11 +141,16 @@ impl Dialect {
     /// Writes a scene, whose axes are taken as they are; of a scene that moves, a dialect that does not gets the clip's
     /// first moment. Says what was left out.
     ///
-    /// Errors: it is only read; it cannot hold the scene; the sink's.
+    /// Errors: it is only read; it cannot hold the scene; a number is NaN or infinite; the sink's.
     pub fn write(&self, scene: &Scene<f32>, options: &WriteOptions, out: &mut dyn Write) -> Result<Warnings> {
+        scene.check_finite()?;
         let options = WriteOptions { up: scene.up, ..options.clone() };
         match self.writer {
-            Writer::Moment(write) => write(&moment(scene, Time(scene.clip[0]))?, &options, out),
+            Writer::Moment(write) => {
+                let params = moment(scene, Time(scene.clip[0]))?;
+                params.check_finite()?;
+                write(&params, &options, out)
+            }
             Writer::Moving(write) => write(scene, &options, out),
             Writer::None(_) => self.check_written().map(|()| Warnings::default()),
         }

@@ -9,6 +9,7 @@
 //! array.
 
 use crate::{Error, ErrorKind, Result};
+use flate2::Crc;
 use serde::de::{Deserialize, Deserializer, MapAccess, Visitor};
 use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet};
@@ -19,6 +20,9 @@ use std::io::Write;
 const MAX_HEADER: usize = 100_000_000;
 /// The header's key for free text.
 const METADATA: &str = "__metadata__";
+/// The metadata's key for checksums: JSON, a CRC-32 in hexadecimal for the bytes of every array, and under the empty name for
+/// all other metadata. Other readers pass over it.
+const CHECKSUMS: &str = "splat4d-crc32";
 /// The header is padded with spaces to a multiple of this, so that the first array is aligned.
 const ALIGN: usize = 8;
 
@@ -163,7 +167,8 @@ impl<'a> SafeTensors<'a> {
     /// Reads a file; the arrays borrow its bytes.
     ///
     /// Errors: a header that is too long, not JSON or names an array twice; an unknown type; a shape that does not
-    /// match its bytes; arrays that overlap, leave holes, or do not end where the file ends.
+    /// match its bytes; arrays that overlap, leave holes, or do not end where the file ends; an array or metadata that is not
+    /// what a checksum was made of.
     pub fn read(bytes: &'a [u8]) -> Result<Self> {
         let Some((length, rest)) = bytes.split_first_chunk::<8>() else {
             return Err(broken("the file is shorter than its header's length"));
@@ -191,7 +196,33 @@ impl<'a> SafeTensors<'a> {
                 data.len()
             )));
         }
-        Ok(Self { metadata: header.metadata, tensors })
+        let mut file = Self { metadata: header.metadata, tensors };
+        if let Some(sums) = file.metadata.remove(CHECKSUMS) {
+            file.verify(&sums)?;
+        }
+        Ok(file)
+    }
+
+    /// Compares with the checksums that the file states.
+    fn verify(&self, sums: &str) -> Result<()> {
+        let sums: BTreeMap<String, String> =
+            serde_json::from_str(sums).map_err(|e| broken(format!("its checksums cannot be read: {e}")))?;
+        for (name, sum) in sums {
+            let found = match name.as_str() {
+                "" => metadata_sum(&self.metadata),
+                _ => checksum(self.tensor(&name)?.bytes()),
+            };
+            if hexadecimal(found) != sum {
+                let what = if name.is_empty() { "the metadata".to_owned() } else { format!("array `{name}`") };
+                return Err(Error::input(format!(
+                    "{what} is damaged: its checksum is another than when it was written"
+                ))
+                .remedy(format!(
+                    "Copy the file again. A program that changes it on purpose leaves `{CHECKSUMS}` out of the metadata"
+                )));
+            }
+        }
+        Ok(())
     }
 
     /// The free text of the header.
@@ -226,10 +257,55 @@ impl<'a> SafeTensors<'a> {
 pub fn write(tensors: &[Tensor<'_>], metadata: &BTreeMap<String, String>, out: &mut impl Write) -> Result<()> {
     let mut order: Vec<&Tensor<'_>> = tensors.iter().collect();
     order.sort_by(|a, b| b.dtype.size().cmp(&a.dtype.size()).then_with(|| a.name.cmp(&b.name)));
+    let metadata = &sealed(metadata, order.iter().map(|t| (t.name.clone(), checksum(&t.bytes))));
     let head = header(order.iter().map(|t| (t.name.as_str(), t.dtype, t.shape.as_slice())), metadata);
-    let mut write = |bytes: &[u8]| out.write_all(bytes).map_err(|e| Error::io("the arrays could not be written", e));
+    let mut write =
+        |bytes: &[u8]| out.write_all(bytes).map_err(|e| Error::environment("the arrays could not be written", e));
     write(&head)?;
     order.iter().try_for_each(|t| write(&t.bytes))
+}
+
+/// The CRC-32 of an array's bytes.
+pub(crate) fn checksum(bytes: &[u8]) -> u32 {
+    let mut crc = Crc::new();
+    crc.update(bytes);
+    crc.sum()
+}
+
+fn metadata_sum(metadata: &BTreeMap<String, String>) -> u32 {
+    let mut crc = Crc::new();
+    metadata.iter().flat_map(|(k, v)| [k, v]).for_each(|text| {
+        crc.update(&(text.len() as u64).to_le_bytes());
+        crc.update(text.as_bytes());
+    });
+    crc.sum()
+}
+
+fn hexadecimal(sum: u32) -> String {
+    format!("{sum:08x}")
+}
+
+/// Metadata with the checksums of a file's arrays and of itself; a file without metadata goes without.
+pub(crate) fn sealed(
+    metadata: &BTreeMap<String, String>,
+    sums: impl Iterator<Item = (String, u32)>,
+) -> BTreeMap<String, String> {
+    let mut out = metadata.clone();
+    if !metadata.is_empty() {
+        let own = (String::new(), metadata_sum(metadata));
+        let all: BTreeMap<String, String> = sums.chain([own]).map(|(name, sum)| (name, hexadecimal(sum))).collect();
+        out.insert(CHECKSUMS.into(), serde_json::to_string(&all).expect("a map of strings is JSON"));
+    }
+    out
+}
+
+/// A file whose checksums nobody looks at, for tests of what else is looked at.
+#[cfg(test)]
+pub(crate) fn unsealed(mut bytes: Vec<u8>) -> Vec<u8> {
+    let key = CHECKSUMS.as_bytes();
+    let at = bytes.windows(key.len()).position(|w| w == key).expect("it has checksums");
+    bytes[at + key.len() - 1] = b'x';
+    bytes
 }
 
 /// Length and header of a file of these arrays (name, type, shape) in this order.

@@ -7,7 +7,7 @@
 //! `layers.0.quats` `[N,4]` wxyz, `layers.0.sh` `[N,K,3]`, `layers.0.velocities` `[N,3·order]` … Seconds and scene units.
 
 use super::arrays::MASKS;
-use super::safetensors::{Dtype, SafeTensors, Tensor, header};
+use super::safetensors::{Dtype, SafeTensors, Tensor, checksum, header, sealed};
 use super::{params_to_arrays, tensors_to_loaded};
 use crate::layers::{ALWAYS, Head, Layer, Scene};
 use crate::math::Sim3;
@@ -129,13 +129,34 @@ pub fn masks(scene: &Scene<f32>) -> Vec<Tensor<'_>> {
     scene.layers.iter().enumerate().filter_map(of).collect()
 }
 
-/// Writes a scene. Errors: the sink's.
+/// Writes a scene. Errors: a number in it is NaN or infinite; the sink's.
 pub fn write(scene: &Scene<f32>, out: &mut impl Write) -> Result<()> {
+    check(scene)?;
     let arrays = arrays(scene);
     let mut tensors: Vec<Tensor<'_>> = arrays.iter().map(|a| a.tensor()).collect();
     tensors.extend(masks(scene));
     let metadata = BTreeMap::from([(METADATA.to_owned(), metadata(scene).to_string())]);
     super::safetensors::write(&tensors, &metadata, out)
+}
+
+/// Errors: a number of a scene, or of one of its motion models, is NaN or infinite, which no reader takes.
+fn check(scene: &Scene<f32>) -> Result<()> {
+    scene.check_finite()?;
+    for layer in &scene.layers {
+        let spec = layer.motion.spec();
+        if spec.is_built_in() {
+            // JSON has no such numbers, and readers take no deeper nesting than theirs.
+            let text = spec_to_json(&spec).to_string();
+            let same = serde_json::from_str(&text).is_ok_and(|v| spec_from_json(&v).is_ok_and(|s| s == spec));
+            if !same {
+                let what = "its motion has numbers that are NaN or infinite, or is nested too deeply to be read again";
+                return Err(Error::input(what)
+                    .at(format!("layer `{}`", layer.name))
+                    .remedy("Take back the last edits"));
+            }
+        }
+    }
+    Ok(())
 }
 
 /// Writes a scene whose layers do not fit into memory together: the bytes of [`write()`]. `scene` has no layers; `layer` is
@@ -155,18 +176,24 @@ pub fn write_by_layer(
         all.sort_by(|a, b| a.name.cmp(&b.name));
         all
     };
-    let (mut stated, mut order) = (Vec::new(), Vec::new());
+    let (mut stated, mut order, mut sums) = (Vec::new(), Vec::new(), Vec::new());
     for i in 0..count {
         let l = layer(i)?;
+        check(&Scene { layers: vec![l.clone()], ..scene.clone() })?;
         stated.push(Stated::of(&l));
         order.push((format!("layers.{i}."), i, Vec::new()));
-        order[i].2.extend(arrays_of(i, &l).into_iter().map(|a| (a.name, a.shape)));
+        for array in arrays_of(i, &l) {
+            sums.push((array.name.clone(), checksum(array.tensor().bytes())));
+            order[i].2.push((array.name, array.shape));
+        }
     }
     order.sort();
     let metadata = BTreeMap::from([(METADATA.to_owned(), about(scene, stated).to_string())]);
+    let metadata = sealed(&metadata, sums.into_iter());
     let named = order.iter().flat_map(|(.., arrays)| arrays);
     let head = header(named.map(|(name, shape)| (name.as_str(), Dtype::F32, shape.as_slice())), &metadata);
-    let mut put = |bytes: &[u8]| out.write_all(bytes).map_err(|e| Error::io("the arrays could not be written", e));
+    let mut put =
+        |bytes: &[u8]| out.write_all(bytes).map_err(|e| Error::environment("the arrays could not be written", e));
     put(&head)?;
     for (_, i, arrays) in &order {
         let found = arrays_of(*i, &layer(*i)?);
@@ -374,6 +401,7 @@ fn numbers<const N: usize>(v: &Value, key: &str) -> Result<[f64; N]> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::format::safetensors::unsealed;
     use crate::math::Rng;
     use crate::motion::SpacetimeSpec;
     use crate::scene::Time;
@@ -440,6 +468,7 @@ mod tests {
         );
         assert_eq!(metadata(&s)["version"], json!(FADING));
         assert_eq!(metadata(&scene())["version"], json!(UNFRAMED), "other scenes stay readable");
+        let mut bytes = unsealed(bytes);
         let at = bytes.windows(10).position(|w| w == b"cross_fade").unwrap();
         let minus = bytes[at..].iter().position(|b| *b == b'[').unwrap() + at + 1;
         bytes[minus] = b'-';
@@ -529,6 +558,7 @@ mod tests {
         let mut bytes = Vec::new();
         write(&scene(), &mut bytes).unwrap();
         assert!(!String::from_utf8_lossy(&bytes).contains("features"));
+        let mut bytes = unsealed(bytes);
         let at = bytes.windows(8).position(|w| w == b"identity").unwrap();
         bytes[at..at + 8].copy_from_slice(b"identitx");
         let error = read(&bytes).unwrap_err();
@@ -539,6 +569,7 @@ mod tests {
     fn what_does_not_fit_is_named() {
         let mut bytes = Vec::new();
         write(&scene(), &mut bytes).unwrap();
+        let bytes = unsealed(bytes);
         let with = |from: &str, to: &str| {
             assert_eq!(from.len(), to.len());
             let at = bytes.windows(from.len()).position(|w| w == from.as_bytes()).unwrap();
@@ -567,9 +598,34 @@ mod tests {
     }
 
     #[test]
+    fn what_is_not_finite_is_not_written() {
+        let refused = |s: &Scene<f32>| {
+            let mut bytes = Vec::new();
+            let error = write(s, &mut bytes).unwrap_err().to_string();
+            assert!(bytes.is_empty(), "not one byte");
+            error
+        };
+        let mut s = scene();
+        s.layers[1].params[crate::scene::GEOMETRY].set(7, 1, f32::NAN);
+        let error = refused(&s);
+        assert!(error.contains("layer 2") && error.contains("means") && error.contains("Gaussian 7"), "{error}");
+        assert!(refused(&Scene { fps: f64::INFINITY, ..scene() }).contains("fps"));
+        assert!(refused(&Scene { clip: [0.0, f64::NAN], ..scene() }).contains("clip"));
+        let mut s = scene();
+        s.layers[0].frame.translation[2] = f64::INFINITY;
+        assert!(refused(&s).contains("layer 1"));
+        let mut s = scene();
+        s.layers[1].params[crate::scene::GEOMETRY].set(7, 1, f32::INFINITY);
+        s.layers[1].params[crate::scene::GEOMETRY].set(9, 1, f32::NAN);
+        assert_eq!((s.drop_non_finite(), s.layers[1].params.len()), (2, 35));
+        write(&s, &mut Vec::new()).unwrap();
+    }
+
+    #[test]
     fn mutated_files_never_panic() {
         let mut bytes = Vec::new();
         write(&scene(), &mut bytes).unwrap();
+        let bytes = unsealed(bytes);
         let rng = Rng::new(5, "mutants", 0);
         for i in 0..400u64 {
             let mut b = bytes.clone();

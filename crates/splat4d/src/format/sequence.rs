@@ -16,6 +16,15 @@ const SOFT: f64 = 1e-3;
 ///
 /// Errors: no frames; more than 2^32 Gaussians. Panics: `fps` is not positive.
 pub fn join(frames: &[Params], fps: f64, up: [f64; 3]) -> Result<Scene<f32>> {
+    join_at(frames, &(0..frames.len() as u64).collect::<Vec<_>>(), fps, up)
+}
+
+/// The same for frames with numbers that rise, not always by one: frame i is seen at numbers\[i]/fps, and between frames whose
+/// numbers leave a gap nothing is.
+///
+/// Errors, panics: as [`join`]. Panics: there are more or fewer numbers than frames.
+pub fn join_at(frames: &[Params], numbers: &[u64], fps: f64, up: [f64; 3]) -> Result<Scene<f32>> {
+    assert_eq!(frames.len(), numbers.len(), "every frame has a number");
     assert!(fps > 0.0 && fps.is_finite(), "a sequence needs a positive number of frames a second, not {fps}");
     if frames.is_empty() {
         return Err(Error::input("a sequence needs at least one frame").remedy("Give a folder with numbered files."));
@@ -31,17 +40,17 @@ pub fn join(frames: &[Params], fps: f64, up: [f64; 3]) -> Result<Scene<f32>> {
     let [geometry, colors, life] = params.get_mut([GEOMETRY, SH, LIFE]);
     let (half, soft) = ((0.5 / fps).ln() as f32, (SOFT / fps).ln() as f32);
     let mut row = 0;
-    for (i, frame) in frames.iter().enumerate() {
+    for (&number, frame) in numbers.iter().zip(frames) {
         let own = &frame[SH];
         for from in 0..frame.len() {
             geometry.write(row, 0, frame[GEOMETRY].read::<11>(from, 0));
             (0..own.width().min(3 * coefficients)).for_each(|k| colors.set(row, k, own.get(from, k)));
-            life.write(row, 0, [(i as f64 / fps) as f32, half, soft]);
+            life.write(row, 0, [(number as f64 / fps) as f32, half, soft]);
             row += 1;
         }
     }
     let layer = Layer::new("frames", params, Arc::new(Still), kind);
-    let clip = [0.0, (frames.len() - 1) as f64 / fps];
+    let clip = [0.0, numbers[numbers.len() - 1] as f64 / fps];
     Ok(Scene { layers: vec![layer], clip, fps, up, ..Scene::default() })
 }
 
@@ -73,5 +82,13 @@ mod tests {
             }
         }
         assert!(join(&[], 25.0, [0.0; 3]).is_err());
+        // Without frame 2 the others keep their times.
+        let some = [0, 1, 3].map(|i: usize| frames[i].clone());
+        let gap = join_at(&some, &[0, 1, 3], 25.0, [0.0, -1.0, 0.0]).unwrap();
+        assert_eq!(gap.clip, scene.clip);
+        for (number, rows) in [(1.0, 20), (2.0, 0), (3.0, 10)] {
+            gap.at(Time(number / 25.0), &mut instant);
+            assert_eq!(instant.tape(0).out().rows(), rows, "frame {number}");
+        }
     }
 }

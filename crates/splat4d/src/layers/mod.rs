@@ -4,6 +4,7 @@ mod convert;
 mod cross_fade;
 mod envelope;
 mod evaluation;
+mod finite;
 mod frame;
 mod freeze;
 mod rotate;

@@ -28,6 +28,6 @@ pub(super) fn of(capture: &Capture, folder: &Path, console: &Console) -> anyhow:
     let troubles = report.findings.iter().filter(|f| f.grade > Grade::Note).map(sentence).collect();
     let mut json = serde_json::to_value(&report)?;
     json["type"] = json!("doctor");
-    json["page"] = json!(html);
+    json["page"] = json!(html.to_string_lossy());
     Ok(Told { json, text, troubles })
 }

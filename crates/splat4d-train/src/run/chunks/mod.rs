@@ -7,7 +7,6 @@
 //! frames); the cross-fade and the order are ours.
 
 mod budget;
-mod claim;
 mod join;
 mod plan;
 mod shared;
@@ -27,10 +26,11 @@ use super::session::{Outcome, TrainOptions};
 use super::start::{read_info, read_text};
 use crate::capture::Capture;
 use crate::event::Event;
+use crate::output::Owner;
+use crate::path_text::{of_text, to_text};
 use crate::recipe::Recipe;
 use crate::settings::settings;
 use crate::{Error, ErrorKind, Result};
-use claim::Claim;
 use serde_json::json;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -90,7 +90,7 @@ impl std::fmt::Display for Part {
 }
 
 /// The right to write what workers share; given back when it is dropped.
-pub struct Turn(#[expect(dead_code, reason = "it is held, not looked at")] Claim);
+pub struct Turn(#[expect(dead_code, reason = "it is held, not looked at")] Owner);
 
 /// A run of a long take.
 pub struct Chunked {
@@ -163,7 +163,7 @@ impl Chunked {
                 .remedy("Put it back as the run wrote it, or train into another folder"));
         }
         let info = read_info(run)?;
-        let source = info["capture"].as_str().map(PathBuf::from).ok_or_else(|| {
+        let source = info["capture"].as_str().map(of_text).ok_or_else(|| {
             Error::input("it does not name its capture").at(run.join("run.json").display()).remedy("Train again")
         })?;
         Ok(Self { run: run.to_owned(), source, recipe, plan })
@@ -252,12 +252,8 @@ impl Chunked {
                 .at(self.run.display())
                 .remedy(format!("Do these first: {}", names.join(", "))));
         }
-        match Claim::new(&self.folder(part))? {
-            Ok(_claim) => self.claimed(part, options, stop, listen),
-            Err(owner) => Err(Error::new(ErrorKind::Io, format!("another worker has it: {owner}"))
-                .at(self.folder(part).display())
-                .remedy("Wait for it, or give this worker another chunk")),
-        }
+        let _owner = Owner::of(&self.folder(part), MADE_BY)?;
+        self.claimed(part, options, stop, listen)
     }
 
     /// Waits for the right to write the playback file, which workers append to one at a time.
@@ -265,8 +261,8 @@ impl Chunked {
     /// Errors: the folder cannot be written; `stop` is set.
     pub fn turn(&self, stop: &AtomicBool) -> Result<Turn> {
         loop {
-            if let Ok(claim) = Claim::new(&self.run.join(FOLDER).join(FILM))? {
-                return Ok(Turn(claim));
+            if let Ok(owner) = Owner::take(&self.run.join(FOLDER).join(FILM), MADE_BY)? {
+                return Ok(Turn(owner));
             }
             if stop.load(Ordering::Relaxed) {
                 return Err(Error::new(
@@ -305,13 +301,13 @@ impl Chunked {
             }
             let mut busy = false;
             for part in open.into_iter().filter(|p| self.waits_for(*p).is_empty()) {
-                let Ok(claim) = Claim::new(&self.folder(part))? else { continue };
+                let Ok(owner) = Owner::take(&self.folder(part), MADE_BY)? else { continue };
                 busy = true;
                 let outcome = self.claimed(part, options, stop, &mut listen)?;
                 if outcome.as_ref().is_some_and(|o| o.interrupted) {
                     return Ok(outcome);
                 }
-                drop(claim);
+                drop(owner);
                 finished()?;
                 // What was waited for may be there now.
                 break;
@@ -360,7 +356,7 @@ impl Chunked {
         let mut info = json!({
             "version": env!("CARGO_PKG_VERSION"),
             "made_by": MADE_BY,
-            "capture": self.source,
+            "capture": to_text(&self.source),
             "capture_name": name,
             "motion": self.recipe.run.motion.as_str(),
             "seed": self.recipe.run.seed,

@@ -90,9 +90,9 @@ fn what_is_missing_or_of_another_take_is_named() {
     assert!(run.join().unwrap_err().to_string().contains("--chunk shared"));
     run.work(Part::Shared, &options, &never, &mut |_| {}).unwrap();
     assert!(work(Part::Chunk(1)).contains("--chunk 0, --chunk 2"));
-    let claim = Claim::new(&run.folder(Part::Chunk(0))).unwrap().ok();
-    assert!(work(Part::Chunk(0)).contains("another worker"));
-    drop(claim);
+    let owner = Owner::take(&run.folder(Part::Chunk(0)), MADE_BY).unwrap().ok();
+    assert!(work(Part::Chunk(0)).contains("in use by"));
+    drop(owner);
     run.work_all(&options, &never, &mut || Ok(()), &mut |_| {}).unwrap();
     run.join().unwrap();
     // Another recipe in the same folder; a chunk of another recipe; one of another version.

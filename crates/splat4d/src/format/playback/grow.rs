@@ -204,5 +204,6 @@ fn unread(e: std::io::Error) -> Error {
 }
 
 fn unwritten(e: std::io::Error) -> Error {
-    Error::io("the scene could not be written", e).remedy("Check that there is space, and run the same command again")
+    Error::environment("the scene could not be written", e)
+        .remedy("Check that there is space, and run the same command again")
 }

@@ -224,7 +224,8 @@ impl Sections {
         let head = self.file.bytes(GENERATOR);
         self.summary.bytes = self.file.file_len;
         self.summary.errors.finish();
-        let mut write = |bytes: &[u8]| out.write_all(bytes).map_err(|e| Error::io("the scene could not be written", e));
+        let mut write =
+            |bytes: &[u8]| out.write_all(bytes).map_err(|e| Error::environment("the scene could not be written", e));
         write(&head)?;
         self.bodies.iter().try_for_each(|b| write(b))?;
         Ok(self.summary)

@@ -164,8 +164,9 @@ pub fn read_points(bytes: &[u8]) -> Result<PlyPoints> {
 
 /// Writes Gaussians in the plain layout, little-endian; normals are zero and other tables are left out.
 ///
-/// Errors: the sink's. Panics: the layer's SH coefficients are not 1, 4, 9 or 16 (degree 0-3).
+/// Errors: a number is NaN or infinite; the sink's. Panics: the layer's SH coefficients are not 1, 4, 9 or 16 (degree 0-3).
 pub fn write(params: &Params, out: &mut impl Write) -> Result<()> {
+    params.check_finite()?;
     let width = params[SH].width();
     let Some(f_rest) = F_REST_COUNTS.into_iter().find(|n| n + 3 == width) else {
         panic!("a layer has 3 times 1, 4, 9 or 16 SH columns, not {width}");

@@ -110,3 +110,22 @@ fn mutants_are_read_or_refused() {
     let read = mutants(&sample(), 1000, "safetensors").filter(|m| SafeTensors::read(m).is_ok()).count();
     assert!(0 < read && read < 1000, "{read} of 1000 mutants were readable");
 }
+
+/// One bit anywhere: the file is refused, or says what it said.
+#[test]
+fn a_flipped_bit_is_found_by_the_checksums() {
+    let whole = sample();
+    let read = SafeTensors::read(&whole).unwrap();
+    assert!(!read.metadata().contains_key(CHECKSUMS), "what is checked is not told");
+    let mut refused = 0;
+    for at in 0..whole.len() {
+        let mut flipped = whole.clone();
+        flipped[at] ^= 1 << (at % 8);
+        match SafeTensors::read(&flipped) {
+            Ok(same) => assert_eq!(same, read, "byte {at}"),
+            Err(error) => refused += usize::from(error.to_string().contains("checksum is another")),
+        }
+    }
+    let numbers = read.tensors().map(|t| t.bytes().len()).sum::<usize>();
+    assert!(refused >= numbers, "{refused} of {numbers} bytes of numbers");
+}

@@ -1,0 +1,153 @@
+//! Output folders, as a user meets them; what is behind them is tested where it is (`splat4d_train::output`).
+
+use crate::sample::{Capture, splat4d};
+use crate::{TINY, str};
+use splat4d::format::ply;
+use splat4d::scene::params::QUAT;
+use splat4d::scene::{GEOMETRY, LifeKind, Params};
+use splat4d_cli::run_folder::Asked;
+use splat4d_train::output::Owner;
+use splat4d_train::recipe::{MotionName, Recipe};
+use std::path::Path;
+
+/// A file of one Gaussian.
+fn write_ply(path: &Path, x: f32) {
+    let mut params = Params::new(1, 1, LifeKind::Infinite.columns());
+    params[GEOMETRY].write(0, 0, [x, 0.0, 4.0]);
+    params[GEOMETRY].write(0, QUAT, [1.0, 0.0, 0.0, 0.0]);
+    let mut bytes = Vec::new();
+    ply::write(&params, &mut bytes).unwrap();
+    std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+    std::fs::write(path, bytes).unwrap();
+}
+
+fn count(folder: &Path) -> usize {
+    let files = std::fs::read_dir(folder).unwrap().flatten();
+    files.map(|e| if e.path().is_dir() { count(&e.path()) } else { 1 }).sum()
+}
+
+#[test]
+fn force_never_removes_a_capture() {
+    let work = tempfile::tempdir().unwrap();
+    let capture = Capture::new(work.path()).write();
+    // As a Blender capture has them.
+    for name in ["train", "test", "val"] {
+        std::fs::create_dir_all(capture.join(name)).unwrap();
+        std::fs::copy(capture.join("images/cam0/0000.png"), capture.join(name).join("r_0.png")).unwrap();
+    }
+    std::fs::write(capture.join("recipe.toml"), "").unwrap();
+    let before = count(&capture);
+    for (out, how) in [
+        (capture.clone(), "is the capture"),
+        (work.path().to_owned(), "contains"),
+        (capture.join("run"), "lies inside"),
+    ] {
+        let said = splat4d(&["train", str(&capture), "-o", str(&out), "--force"]).args(&TINY).run().refused();
+        assert!(said.contains(how), "{said}");
+    }
+    // Another folder of the user's.
+    let other = work.path().join("other");
+    std::fs::create_dir_all(other.join("train")).unwrap();
+    std::fs::write(other.join("train/r_0.png"), "mine").unwrap();
+    let said = splat4d(&["train", str(&capture), "-o", str(&other), "--force"]).args(&TINY).run().refused();
+    assert!(said.contains("did not write") && said.contains("train"), "{said}");
+    assert_eq!((count(&capture), count(&other)), (before, 1));
+}
+
+#[test]
+fn a_folder_in_use_is_refused_and_read() {
+    let work = tempfile::tempdir().unwrap();
+    let capture = Capture::new(work.path()).write();
+    let run = work.path().join("run");
+    std::fs::create_dir(&run).unwrap();
+    let owner = Owner::of(&run, "train").unwrap();
+    let told = format!("in use by `splat4d train`, process {}", std::process::id());
+    for force in [&["--quiet"][..], &["--force"]] {
+        let said = splat4d(&["train", str(&capture), "-o", str(&run)]).args(&TINY).args(force).run().failed();
+        assert!(said.contains(&told) && said.contains("since 20"), "{said}");
+    }
+    drop(owner);
+    // What a kill right after the start leaves: `--resume` begins again, as the command asked for it.
+    splat4d(&["train", str(&capture), "-o", str(&run), "--no-eval"]).args(&TINY).run().ok();
+    let wanted = std::fs::read(run.join("scene.safetensors")).unwrap();
+    assert!(!run.join(".splat4d/asked").exists(), "what is done is not continued");
+    std::fs::remove_dir_all(run.join("checkpoints")).unwrap();
+    std::fs::remove_file(run.join("scene.safetensors")).unwrap();
+    let capture = capture.canonicalize().unwrap();
+    let recipe = Recipe::default().with(|r| r.run.motion = MotionName::AUTO);
+    let recipe = TINY.iter().filter_map(|s| s.strip_prefix("--set=")).chain(["seed=3"]).fold(recipe, |mut r, s| {
+        r.set(s).unwrap();
+        r
+    });
+    let asked = serde_json::to_string(&Asked::new(&capture, &recipe, None, false)).unwrap();
+    std::fs::write(run.join(".splat4d/asked"), asked).unwrap();
+    splat4d(&["train", "--resume", str(&run), "--no-eval"]).run().ok();
+    assert!(std::fs::read(run.join("scene.safetensors")).unwrap() == wanted);
+}
+
+#[test]
+fn a_sequence_keeps_its_gaps_and_takes_over_no_tail() {
+    let work = tempfile::tempdir().unwrap();
+    let at = |name: &str| work.path().join(name);
+    for n in [1, 2, 4] {
+        write_ply(&at(&format!("frames/f{n}.ply")), n as f32);
+    }
+    let out = at("out");
+    let convert = |fps: &str, more: &[&str]| {
+        splat4d(&["convert", str(&at("all.safetensors")), str(&out), "--frames", "--fps", fps]).args(more).run()
+    };
+    let told = splat4d(&["convert", str(&at("frames")), str(&at("all.safetensors")), "--fps", "10"]).run().told();
+    assert!(told.contains("frames are missing: 3"), "{told}");
+    convert("10", &[]).ok();
+    assert_eq!(count(&out) - count(&out.join(".splat4d")), 4, "with the frame that is missing, of nothing");
+    convert("20", &[]).ok();
+    let said = convert("10", &[]).refused();
+    assert!(said.contains("frame_00004.ply") && said.contains("--force"), "{said}");
+    convert("10", &["--force"]).ok();
+    assert_eq!(count(&out) - count(&out.join(".splat4d")), 4);
+}
+
+#[test]
+fn the_machines_faults_are_one_and_the_users_two() {
+    let work = tempfile::tempdir().unwrap();
+    let at = |name: &str| work.path().join(name);
+    write_ply(&at("a.ply"), 0.0);
+    let convert = |from: &str, to: &str| splat4d(&["convert", str(&at(from)), str(&at(to))]).run();
+    assert!(convert("a.ply", "nowhere/b.ply").failed().contains("nowhere"));
+    assert!(convert("nowhere.ply", "b.ply").refused().contains("nowhere.ply"));
+    if Path::new("/dev/full").exists() {
+        let said = splat4d(&["export", str(&at("a.ply")), "-o", "/dev/full"]).run().failed();
+        assert!(said.contains("disk"), "{said}");
+    }
+}
+
+/// Bytes that are no UTF-8, in what is read and in what is written.
+#[cfg(target_os = "linux")]
+#[test]
+fn names_that_are_not_text_work_everywhere() {
+    use std::os::unix::ffi::OsStrExt;
+    let work = tempfile::tempdir().unwrap();
+    let at = |name: &[u8]| work.path().join(std::ffi::OsStr::from_bytes(name));
+    let file = at(b"\xff.ply");
+    write_ply(&file, 0.0);
+    for (verb, out) in [("convert", &b"\xfe.spz"[..]), ("convert", b"\xfe.safetensors"), ("convert", b"\xfe.splat4d")] {
+        let said = splat4d(&[verb, "--json"]).paths(&[&file, &at(out)]).run().ok();
+        assert!(said.contains("written") && at(out).is_file(), "{said}");
+    }
+    let scene = at(b"\xfe.safetensors");
+    splat4d(&["bake", "--json", "-o"]).paths(&[&at(b"b\xff.splat4d"), &scene]).run().ok();
+    splat4d(&["edit", "--json", "--crop", "all", "-o"]).paths(&[&at(b"e\xff.ply"), &scene]).run().ok();
+    splat4d(&["export", "--json", "--sequence"]).paths(&[&at(b"s\xff"), &scene]).run().ok();
+    splat4d(&["convert", "--json", "--frames"]).paths(&[&scene, &at(b"s\xff/f\xff_%d.spz")]).run().ok();
+    splat4d(&["export", "--json", "--html", "-o"]).paths(&[&at(b"p\xff.html"), &scene]).run().ok();
+    splat4d(&["info", "--json"]).paths(&[&scene]).run().ok();
+    // A capture and its run.
+    let capture = Capture::new(&at(b"c\xff")).write();
+    let run = at(b"r\xff");
+    splat4d(&["train", "--no-eval", "--json", "-o"]).paths(&[&run, &capture]).args(&TINY).run().ok();
+    splat4d(&["eval", "--json", "--no-film"]).paths(&[&run]).run().ok();
+    splat4d(&["train", "--json", "--no-eval", "--resume"]).paths(&[&run]).run().ok();
+    splat4d(&["compress", "--json", "--no-eval", "--level", "1", "--fine-tune", "4"]).paths(&[&run]).run().ok();
+    splat4d(&["render", "--json", "--path", "test", "--device", "cpu", "-o"]).paths(&[&at(b"v\xff"), &run]).run().ok();
+    assert!(at(b"r\xff-compressed").join("scene.splat4d").is_file());
+}

@@ -1,0 +1,383 @@
+//! Who writes into a folder: a lock of the operating system, and a record of the owner with a heartbeat.
+//!
+//! On one machine the lock decides: the system releases it when its process ends, however that happens, so that neither a
+//! reused process number nor a clock that was set plays a part. A lock that is free although the record names another
+//! machine may only mean that the file system does not share locks; then the heartbeat decides. Its age is measured by the
+//! folder's own clock, and where that says "long ago" or "in the future" the record is watched for some beats before it is
+//! taken over: a clock that jumps makes no owner dead.
+
+use super::date::rfc3339;
+use super::{STATE, write};
+use crate::{Error, Result};
+use serde::{Deserialize, Serialize};
+use std::fs::{File, TryLockError};
+use std::io::{Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Condvar, Mutex};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant, SystemTime};
+
+/// File that is locked; it is empty, and stays.
+const LOCK: &str = "lock";
+/// File that says who has the lock.
+const RECORD: &str = "owner.json";
+/// Time between two heartbeats.
+const BEAT: Duration = Duration::from_secs(5);
+/// An owner on another machine whose heart has not beaten for so long is taken for dead: a dozen beats, so that a busy file
+/// server is not.
+const DEAD: Duration = Duration::from_secs(60);
+/// So long a record is watched before it is taken over: three beats.
+const WATCH: Duration = Duration::from_secs(15);
+/// Time between two looks at a record that is watched, or at a lock that is waited for.
+const LOOK: Duration = Duration::from_millis(100);
+
+/// The owner of a folder, as its record states it.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Standing {
+    /// The command, for instance `train`.
+    pub command: String,
+    /// Process number.
+    pub process: u32,
+    /// Name of the machine.
+    pub host: String,
+    /// UTC.
+    pub since: String,
+    /// What tells the machine, as long as it has been running, from all others; empty where the system does not say.
+    machine: String,
+    /// Heartbeats so far, always as many digits, so that the record never changes its length.
+    beat: String,
+}
+
+impl Standing {
+    fn new(command: &str) -> Self {
+        Self {
+            command: command.into(),
+            process: std::process::id(),
+            host: host(),
+            since: rfc3339(SystemTime::now()),
+            machine: machine(),
+            beat: beat(0),
+        }
+    }
+
+    fn read(path: &Path) -> Option<Self> {
+        serde_json::from_slice(&std::fs::read(path).ok()?).ok()
+    }
+
+    fn bytes(&self) -> Vec<u8> {
+        serde_json::to_vec(self).expect("a record is plain data")
+    }
+}
+
+impl std::fmt::Display for Standing {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "`splat4d {}`, process {} on {}, since {}", self.command, self.process, self.host, self.since)
+    }
+}
+
+/// The right to write into a folder, until it is dropped or the process ends.
+#[derive(Debug)]
+pub struct Owner {
+    record: PathBuf,
+    standing: Standing,
+    /// Held, not read: closing it releases the lock.
+    lock: Option<File>,
+    done: Arc<(Mutex<bool>, Condvar)>,
+    heart: Option<JoinHandle<()>>,
+}
+
+/// How long a dead owner's record is believed, and watched.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Patience {
+    pub(super) dead: Duration,
+    pub(super) watch: Duration,
+}
+
+impl Owner {
+    /// Makes the folder's state and takes the folder; the inner error is who has it; `None`: its record cannot be read.
+    ///
+    /// Errors: the folder cannot be written.
+    pub fn take(folder: &Path, command: &str) -> Result<Result<Self, Option<Standing>>> {
+        Self::with_patience(folder, command, Patience { dead: DEAD, watch: WATCH })
+    }
+
+    pub(super) fn with_patience(
+        folder: &Path,
+        command: &str,
+        patience: Patience,
+    ) -> Result<Result<Self, Option<Standing>>> {
+        let state = folder.join(STATE);
+        let fail = |e| write::cannot_write(folder, e);
+        let record = state.join(RECORD);
+        let lock = loop {
+            std::fs::create_dir_all(&state).map_err(fail)?;
+            let opened = File::options().read(true).write(true).create(true).truncate(false).open(state.join(LOCK));
+            let lock = match opened {
+                // Its owner has just removed the state of a folder in which nothing was begun.
+                Err(e) if e.kind() == std::io::ErrorKind::NotFound && folder.exists() => continue,
+                opened => opened.map_err(fail)?,
+            };
+            match lock.try_lock() {
+                // A file system without locks: the heartbeat alone decides.
+                Ok(()) | Err(TryLockError::Error(_)) => {}
+                Err(TryLockError::WouldBlock) => return Ok(Err(Standing::read(&record))),
+            }
+            if is_at(&lock, &state.join(LOCK)) {
+                break lock;
+            }
+        };
+        let before = Standing::read(&record);
+        if let Some(before) = before.filter(|b| b.machine != machine() && lives(&state, &record, b, patience)) {
+            return Ok(Err(Some(before)));
+        }
+        // What a dead owner left half-written. Workers on parts of a folder have folders and locks of their own.
+        write::remove_leftovers(folder);
+        let standing = Standing::new(command);
+        let mut file = File::options().write(true).create(true).truncate(true).open(&record).map_err(fail)?;
+        file.write_all(&standing.bytes()).map_err(fail)?;
+        let done = Arc::new((Mutex::new(false), Condvar::new()));
+        let heart = std::thread::spawn({
+            let (standing, done) = (standing.clone(), done.clone());
+            move || pulse(&mut file, standing, &done)
+        });
+        Ok(Ok(Self { record, standing, lock: Some(lock), done, heart: Some(heart) }))
+    }
+
+    /// The same; that another process has it is an error that says who.
+    pub fn of(folder: &Path, command: &str) -> Result<Self> {
+        Self::take(folder, command)?.map_err(|who| in_use(folder, who.as_ref()))
+    }
+
+    /// Waits for the folder as long as `go_on` says so of whoever has it. Errors: the folder cannot be written; it is in use.
+    pub fn wait(folder: &Path, command: &str, go_on: &mut dyn FnMut(Option<&Standing>) -> bool) -> Result<Self> {
+        loop {
+            match Self::take(folder, command)? {
+                Ok(owner) => return Ok(owner),
+                Err(who) if go_on(who.as_ref()) => std::thread::sleep(LOOK),
+                Err(who) => return Err(in_use(folder, who.as_ref())),
+            }
+        }
+    }
+
+    /// Gives the folder back and removes all that says that it was ever owned: while the lock is held, so that nobody else has it.
+    pub(super) fn remove(mut self, folder: &Path) {
+        self.rest();
+        let state = folder.join(STATE);
+        let _ = std::fs::remove_file(state.join(LOCK));
+        let _ = std::fs::remove_dir(&state);
+    }
+
+    /// Ends the heartbeat and the record.
+    fn rest(&mut self) {
+        *self.done.0.lock().unwrap_or_else(|e| e.into_inner()) = true;
+        self.done.1.notify_all();
+        let Some(heart) = self.heart.take() else { return };
+        let _ = heart.join();
+        let own = |s: Standing| s.process == self.standing.process && s.machine == self.standing.machine;
+        if Standing::read(&self.record).is_some_and(own) {
+            let _ = std::fs::remove_file(&self.record);
+        }
+    }
+
+    /// Who has the folder now, without a trace in it; the inner `None`: somebody whose record cannot be read.
+    pub fn holder(folder: &Path) -> Option<Option<Standing>> {
+        let record = folder.join(STATE).join(RECORD);
+        let lock = File::open(folder.join(STATE).join(LOCK)).ok()?;
+        if let Err(TryLockError::WouldBlock) = lock.try_lock_shared() {
+            return Some(Standing::read(&record));
+        }
+        let other = Standing::read(&record).filter(|s| s.machine != machine())?;
+        age(&record, SystemTime::now()).is_some_and(|age| age <= DEAD).then_some(Some(other))
+    }
+}
+
+impl Drop for Owner {
+    fn drop(&mut self) {
+        self.rest();
+        drop(self.lock.take());
+    }
+}
+
+pub(super) fn in_use(folder: &Path, who: Option<&Standing>) -> Error {
+    let who = who.map_or_else(|| "another process".to_owned(), ToString::to_string);
+    Error::new(crate::ErrorKind::Io, format!("is in use by {who}"))
+        .at(folder.display())
+        .remedy("Wait for it, stop it, or choose another folder")
+}
+
+/// Whether an open file is still the one of that name.
+#[cfg(unix)]
+fn is_at(file: &File, path: &Path) -> bool {
+    use std::os::unix::fs::MetadataExt;
+    let same = |a: std::fs::Metadata, b: std::fs::Metadata| (a.dev(), a.ino()) == (b.dev(), b.ino());
+    file.metadata().ok().zip(std::fs::metadata(path).ok()).is_some_and(|(a, b)| same(a, b))
+}
+
+#[cfg(not(unix))]
+fn is_at(_: &File, path: &Path) -> bool {
+    path.exists()
+}
+
+fn beat(count: u64) -> String {
+    format!("{count:010}")
+}
+
+/// Beats until the owner is dropped. Written through the open file: if another process replaced the record, nothing of
+/// its own is touched. The time of the file is then that of the machine whose folder it is.
+fn pulse(file: &mut File, mut standing: Standing, (done, changed): &(Mutex<bool>, Condvar)) {
+    let mut over = done.lock().unwrap_or_else(|e| e.into_inner());
+    for count in 1u64.. {
+        over = changed.wait_timeout_while(over, BEAT, |over| !*over).unwrap_or_else(|e| e.into_inner()).0;
+        if *over {
+            return;
+        }
+        standing.beat = beat(count);
+        // A beat that fails, on a full or read-only disk, is followed by others.
+        let _ = file.seek(SeekFrom::Start(0)).and_then(|_| file.write_all(&standing.bytes()));
+    }
+}
+
+/// Whether the owner of another machine, or of one that was restarted since, lives.
+fn lives(state: &Path, record: &Path, before: &Standing, patience: Patience) -> bool {
+    let fresh = |age: Option<Duration>| age.is_some_and(|age| age <= patience.dead);
+    if fresh(age(record, now(state))) {
+        return true;
+    }
+    let began = Instant::now();
+    while began.elapsed() < patience.watch {
+        match Standing::read(record) {
+            Some(now) if now.beat == before.beat && now.since == before.since => std::thread::sleep(LOOK),
+            // It ended in peace meanwhile.
+            None if !record.exists() => return false,
+            _ => return true,
+        }
+    }
+    false
+}
+
+/// How long ago, or how far in the future, a file was last written; `None`: nobody can say.
+fn age(path: &Path, now: SystemTime) -> Option<Duration> {
+    let written = std::fs::metadata(path).and_then(|m| m.modified()).ok()?;
+    Some(now.duration_since(written).unwrap_or_else(|future| future.duration()))
+}
+
+/// Now, by the clock of the folder's machine: clocks of machines differ.
+fn now(state: &Path) -> SystemTime {
+    let probe = state.join(format!("now-{}-{:?}", std::process::id(), std::thread::current().id()));
+    let told = std::fs::write(&probe, b"").and_then(|()| std::fs::metadata(&probe)).and_then(|m| m.modified());
+    let _ = std::fs::remove_file(&probe);
+    told.unwrap_or_else(|_| SystemTime::now())
+}
+
+/// Name of this machine, for people.
+fn host() -> String {
+    let name = ["/proc/sys/kernel/hostname", "/etc/hostname"].iter().find_map(|f| std::fs::read_to_string(f).ok());
+    name.map_or_else(|| "this machine".into(), |n| n.trim().to_owned())
+}
+
+/// What tells this machine, as long as it runs, from others: Linux' boot id, which containers share with their host as they
+/// share its locks.
+fn machine() -> String {
+    let id = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").unwrap_or_default();
+    id.trim().to_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::sync::atomic::{AtomicBool, Ordering};
+
+    const QUICK: Patience = Patience { dead: Duration::from_millis(200), watch: Duration::from_millis(1000) };
+
+    fn elsewhere(folder: &Path, beat: &str) -> Standing {
+        let state = folder.join(STATE);
+        std::fs::create_dir_all(&state).unwrap();
+        let other = Standing { host: "elsewhere".into(), machine: "other".into(), ..Standing::new("train") };
+        let other = Standing { beat: beat.into(), ..other };
+        std::fs::write(state.join(RECORD), other.bytes()).unwrap();
+        other
+    }
+
+    fn set_time(folder: &Path, at: SystemTime) {
+        let file = File::options().write(true).open(folder.join(STATE).join(RECORD)).unwrap();
+        file.set_modified(at).unwrap();
+    }
+
+    #[test]
+    fn a_folder_has_one_owner_who_is_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let owner = Owner::of(folder.path(), "train").unwrap();
+        assert_eq!(Owner::holder(folder.path()).unwrap().unwrap().command, "train");
+        let error = Owner::of(folder.path(), "eval").unwrap_err();
+        let text = error.to_string();
+        assert_eq!(error.kind(), crate::ErrorKind::Io, "the user's input is not at fault");
+        let process = format!("`splat4d train`, process {} on {}, since 20", std::process::id(), host());
+        assert!(text.contains("in use by") && text.contains(&process), "{text}");
+        drop(owner);
+        assert!(Owner::holder(folder.path()).is_none() && !folder.path().join(STATE).join(RECORD).exists());
+        drop(Owner::of(folder.path(), "eval").unwrap());
+    }
+
+    /// A record of a process that was killed: whoever comes takes over at once, also where its number was given to another process.
+    #[test]
+    fn a_dead_owner_of_this_machine_is_replaced_at_once() {
+        let folder = tempfile::tempdir().unwrap();
+        let state = folder.path().join(STATE);
+        std::fs::create_dir_all(&state).unwrap();
+        for process in [u32::MAX, 1] {
+            let dead = Standing { process, ..Standing::new("train") };
+            std::fs::write(state.join(RECORD), dead.bytes()).unwrap();
+            let began = Instant::now();
+            drop(Owner::of(folder.path(), "train").unwrap());
+            assert!(began.elapsed() < WATCH, "nothing is watched");
+        }
+        // Half a record, as a kill may leave it.
+        std::fs::write(state.join(RECORD), &Standing::new("train").bytes()[..20]).unwrap();
+        drop(Owner::of(folder.path(), "train").unwrap());
+    }
+
+    #[test]
+    fn an_owner_elsewhere_lives_as_long_as_its_heart_beats_whatever_clocks_say() {
+        let folder = tempfile::tempdir().unwrap();
+        let hour = Duration::from_secs(3600);
+        let take = || Owner::with_patience(folder.path(), "train", QUICK).unwrap();
+        elsewhere(folder.path(), "1");
+        assert_eq!(take().unwrap_err().unwrap().host, "elsewhere", "it beat just now");
+        // Clocks that jumped an hour forth or back: the record is watched, and beats.
+        for at in [SystemTime::now() - hour, SystemTime::now() + hour] {
+            elsewhere(folder.path(), "1");
+            set_time(folder.path(), at);
+            let ended = AtomicBool::new(false);
+            std::thread::scope(|s| {
+                s.spawn(|| {
+                    for beat in 2.. {
+                        if ended.load(Ordering::Relaxed) {
+                            break;
+                        }
+                        elsewhere(folder.path(), &beat.to_string());
+                        set_time(folder.path(), at);
+                        std::thread::sleep(QUICK.watch / 50);
+                    }
+                });
+                let took = take();
+                ended.store(true, Ordering::Relaxed);
+                assert!(took.is_err(), "it lives");
+            });
+            // And does not any more.
+            assert!(take().is_ok(), "it is dead");
+        }
+    }
+
+    #[test]
+    fn of_many_who_find_a_dead_owner_one_takes_over() {
+        let folder = tempfile::tempdir().unwrap();
+        elsewhere(folder.path(), "1");
+        set_time(folder.path(), SystemTime::now() - Duration::from_secs(3600));
+        let took: Vec<_> = std::thread::scope(|s| {
+            let one = || Owner::with_patience(folder.path(), "train", QUICK).unwrap();
+            let all: Vec<_> = (0..8).map(|_| s.spawn(one)).collect();
+            all.into_iter().map(|w| w.join().unwrap()).collect()
+        });
+        assert_eq!(took.iter().filter(|c| c.is_ok()).count(), 1);
+    }
+}

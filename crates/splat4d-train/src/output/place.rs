@@ -1,0 +1,134 @@
+//! Where an output folder lies, compared with what is read.
+//!
+//! Folders are compared by what the file system says they are (device and number), so that links, mounts, `..` and names
+//! that only differ in case are seen through.
+
+use crate::{Error, Result};
+use std::path::{Path, PathBuf};
+
+/// A file or folder that is read.
+#[derive(Clone, Copy, Debug)]
+pub struct Input<'a> {
+    /// Its path.
+    pub path: &'a Path,
+    /// What it is, for errors: `the capture`.
+    pub what: &'a str,
+    /// Whether the output may lie in it, as renders lie in their run.
+    pub may_hold: bool,
+}
+
+impl<'a> Input<'a> {
+    /// An input that no output may lie in.
+    pub fn new(path: &'a Path, what: &'a str) -> Self {
+        Self { path, what, may_hold: false }
+    }
+}
+
+/// Refuses an output folder that equals, contains or lies inside an input. Inputs that are not there are left to whoever reads
+/// them.
+pub fn check_apart(output: &Path, inputs: &[Input<'_>]) -> Result<()> {
+    let above_output = ids(output);
+    for input in inputs {
+        let Ok(real) = input.path.canonicalize() else { continue };
+        let above_input = ids(&real);
+        let [own, others] = [&above_input, &above_output];
+        let (Some(input_id), Some(output_id)) = (own.first().cloned().flatten(), others.first().cloned()) else {
+            continue;
+        };
+        // Of an output that is not there yet only the folders above it are known.
+        let how = match output_id {
+            Some(id) if id == input_id => "is",
+            Some(id) if own.contains(&Some(id.clone())) => "contains",
+            _ if others.contains(&Some(input_id)) && !input.may_hold => "lies inside",
+            _ => continue,
+        };
+        return Err(Error::input(format!("the output folder {how} {} {}", input.what, input.path.display()))
+            .at(output.display())
+            .remedy("Choose a folder apart from everything that is read, with -o"));
+    }
+    Ok(())
+}
+
+/// What the file system calls a file or folder.
+#[cfg(unix)]
+type Id = (u64, u64);
+#[cfg(not(unix))]
+type Id = String;
+
+#[cfg(unix)]
+fn id(path: &Path) -> Option<Id> {
+    use std::os::unix::fs::MetadataExt;
+    std::fs::metadata(path).ok().map(|m| (m.dev(), m.ino()))
+}
+
+/// The real path in lower case: systems without numbers of files mostly do not tell case apart.
+#[cfg(not(unix))]
+fn id(path: &Path) -> Option<Id> {
+    path.canonicalize().ok().map(|p| p.to_string_lossy().to_lowercase())
+}
+
+/// A path's identity and those of all folders above it, nearest first; `None` where nothing is there yet.
+fn ids(path: &Path) -> Vec<Option<Id>> {
+    let path = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
+    // Behind links and `..` the real folders above count: those of the deepest part that is there.
+    let mut missing = Vec::new();
+    let mut there: PathBuf = path.clone();
+    let real = loop {
+        match there.canonicalize() {
+            Ok(real) => break real,
+            Err(_) => {
+                missing.push(None);
+                if !there.pop() {
+                    break path;
+                }
+            }
+        }
+    };
+    missing.into_iter().chain(real.ancestors().map(id)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_output_lies_apart_from_what_is_read() {
+        let work = tempfile::tempdir().unwrap();
+        let at = |name: &str| work.path().join(name);
+        std::fs::create_dir_all(at("capture/images")).unwrap();
+        std::fs::create_dir_all(at("other/deep")).unwrap();
+        let capture = at("capture");
+        let check = |output: &Path, may_hold: bool| {
+            let input = Input { may_hold, ..Input::new(&capture, "the capture") };
+            check_apart(output, &[input]).map_err(|e| e.to_string())
+        };
+        let refused = |output: &Path, how: &str| {
+            let text = check(output, false).unwrap_err();
+            assert!(text.contains(how) && text.contains("the capture"), "{}: {text}", output.display());
+        };
+        refused(&capture, "is the capture");
+        refused(&at("capture/../capture/."), "is the capture");
+        refused(&at("other/../capture"), "is the capture");
+        refused(work.path(), "contains");
+        refused(&at("capture/images"), "lies inside");
+        refused(&at("capture/new/run"), "lies inside");
+        for apart in ["other", "other/deep/run", "capture-2", "new"] {
+            assert_eq!(check(&at(apart), false), Ok(()), "{apart}");
+        }
+        assert_eq!(check(&at("capture/new"), true), Ok(()), "renders may lie in their run");
+        assert!(check(&capture, true).is_err() && check(work.path(), true).is_err());
+        #[cfg(unix)]
+        {
+            std::os::unix::fs::symlink(&capture, at("link")).unwrap();
+            std::os::unix::fs::symlink(work.path(), at("other/up")).unwrap();
+            refused(&at("link"), "is the capture");
+            refused(&at("link/run"), "lies inside");
+            refused(&at("other/up"), "contains");
+            // The capture behind a link, the output at its real place.
+            let link = at("link");
+            let input = [Input::new(&link, "the capture")];
+            assert!(check_apart(&capture, &input).is_err() && check_apart(&at("capture/run"), &input).is_err());
+        }
+        assert!(check_apart(&at("x"), &[Input::new(&at("nowhere"), "the capture")]).is_ok(), "readers say that");
+    }
+}

@@ -1,0 +1,242 @@
+//! Writes files so that nobody ever finds half of one: under a temporary name in the same folder, then renamed.
+
+use super::list;
+use crate::{Error, Result};
+use std::collections::BTreeSet;
+use std::ffi::{OsStr, OsString};
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+/// What to do about a file that cannot be written.
+const NO_SPACE: &str = "Check that the folder exists, that you may write there and that the disk is not full";
+/// Ending of temporary names.
+const ENDING: &str = ".splat4d-tmp";
+/// Most bytes of a file's own name in its temporary one: names have 255 on all common systems.
+const NAME_BYTES: usize = 180;
+/// A temporary file of another machine is left over when it was not written for so long.
+const LEFT_OVER: Duration = Duration::from_secs(3600);
+/// Numbers of this process's temporary files.
+static NUMBER: AtomicU64 = AtomicU64::new(0);
+/// Folders in which this process has looked for leftovers.
+static LOOKED: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
+
+/// The error of a failed write.
+pub(super) fn cannot_write(path: &Path, error: std::io::Error) -> Error {
+    Error::environment("cannot be written", error).at(path.display()).remedy(NO_SPACE)
+}
+
+/// A file under a temporary name beside its place; [`keep`](Self::keep) renames it, dropping it removes it.
+#[derive(Debug)]
+pub struct Staged {
+    temporary: Option<PathBuf>,
+    target: PathBuf,
+}
+
+impl Staged {
+    /// Prepares to write `path`. A link is followed, so that the file behind it is replaced and not the link; a device or
+    /// a pipe is written to.
+    ///
+    /// Errors: a folder is there; the list of the folder's files cannot be written.
+    pub fn new(path: &Path) -> Result<Self> {
+        Self::at(std::fs::canonicalize(path).unwrap_or_else(|_| path.to_owned()), path)
+    }
+
+    fn at(target: PathBuf, named: &Path) -> Result<Self> {
+        if target.is_dir() {
+            return Err(Error::input("is a folder").at(named.display()).remedy("Give the name of a file."));
+        }
+        let Some(name) = target.file_name() else {
+            return Err(Error::input("is not a file name").at(named.display()).remedy("Give the name of a file."));
+        };
+        // A device or pipe (/dev/stdout, /dev/null) must not be replaced by a file.
+        if target.metadata().is_ok_and(|m| !m.is_file()) {
+            return Ok(Self { temporary: None, target });
+        }
+        if !list::note_folder(&target)? {
+            remove_leftovers_once(&target);
+        }
+        let temporary = target.with_file_name(temporary_name(name));
+        Ok(Self { temporary: Some(temporary), target })
+    }
+
+    /// Where to write now.
+    pub fn path(&self) -> &Path {
+        self.temporary.as_deref().unwrap_or(&self.target)
+    }
+
+    /// Gives the file its name. Errors: it cannot be renamed or listed.
+    pub fn keep(mut self) -> Result<()> {
+        if let Some(temporary) = &self.temporary {
+            list::note(&self.target)?;
+            std::fs::rename(temporary, &self.target).map_err(|e| cannot_write(&self.target, e))?;
+            self.temporary = None;
+        }
+        Ok(())
+    }
+}
+
+impl Drop for Staged {
+    fn drop(&mut self) {
+        if let Some(temporary) = &self.temporary {
+            let _ = std::fs::remove_file(temporary);
+        }
+    }
+}
+
+/// Writes a file so that a crash leaves the old one or the new one, never half, and what is left is on the disk. Folders on
+/// the way are made. A device or a pipe is written to and never replaced. Errors: missing rights, no space.
+pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<()> {
+    write_atomically_with(path, &mut |file| {
+        file.write_all(bytes).map_err(|e| Error::environment("the file cannot be written", e).remedy(NO_SPACE))
+    })
+}
+
+/// The same for what need not be in memory as a whole. Errors: those of `write`, and as [`write_atomically`].
+pub fn write_atomically_with(path: &Path, write: &mut dyn FnMut(&mut dyn Write) -> Result<()>) -> Result<()> {
+    let place = |e: std::io::Error, what: &str| Error::environment(what, e).at(path.display()).remedy(NO_SPACE);
+    let failed = |e| place(e, "the file cannot be written");
+    if std::fs::metadata(path).is_ok_and(|m| !m.is_file() && !m.is_dir()) {
+        let mut file = std::fs::OpenOptions::new().write(true).open(path).map_err(failed)?;
+        return write(&mut file).map_err(|e| e.at(path.display()));
+    }
+    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    std::fs::create_dir_all(folder).map_err(|e| place(e, "the folder cannot be made"))?;
+    if path.is_dir() {
+        return Err(failed(std::io::ErrorKind::IsADirectory.into()));
+    }
+    let staged = Staged::at(path.to_owned(), path)?;
+    let mut file = std::io::BufWriter::new(std::fs::File::create(staged.path()).map_err(failed)?);
+    write(&mut file).map_err(|e| e.at(path.display()))?;
+    let file = file.into_inner().map_err(|e| failed(e.into_error()))?;
+    file.sync_all().map_err(failed)?;
+    drop(file);
+    staged.keep()
+}
+
+/// `.NAME.MACHINE-PROCESS-NUMBER.splat4d-tmp`, of a long name only the beginning.
+fn temporary_name(name: &OsStr) -> OsString {
+    let own = format!("{}-{}-{}", machine(), std::process::id(), NUMBER.fetch_add(1, Ordering::Relaxed));
+    let mut out = OsString::from(".");
+    if name.len() <= NAME_BYTES {
+        out.push(name);
+    } else {
+        out.push(name.to_string_lossy().chars().take(NAME_BYTES / 4).collect::<String>());
+    }
+    out.push(format!(".{own}{ENDING}"));
+    out
+}
+
+/// Whether this is the temporary name of a file that nobody writes any more.
+fn is_left_over(path: &Path) -> bool {
+    let Some(name) = path.file_name().map(OsStr::to_string_lossy) else { return false };
+    let Some(name) = name.strip_prefix('.').and_then(|n| n.strip_suffix(ENDING)) else { return false };
+    let mut parts = name.rsplit('.').next().unwrap_or_default().split('-');
+    let (Some(of), Some(Ok(process))) = (parts.next(), parts.next().map(str::parse::<u32>)) else { return false };
+    // Of a process of this machine, as long as that runs, it is known; of others the time tells.
+    let procs = Path::new("/proc/self").exists();
+    if of == machine() && procs {
+        return process != std::process::id() && !Path::new(&format!("/proc/{process}")).exists();
+    }
+    let written = std::fs::symlink_metadata(path).and_then(|m| m.modified());
+    written.is_ok_and(|at| at.elapsed().is_ok_and(|age| age > LEFT_OVER))
+}
+
+/// Removes what dead processes left half-written in a folder and in those that its list names.
+pub(super) fn remove_leftovers(folder: &Path) {
+    for folder in list::folders(folder) {
+        for path in std::fs::read_dir(folder).into_iter().flatten().flatten().map(|e| e.path()) {
+            if is_left_over(&path) {
+                let _ = std::fs::remove_file(path);
+            }
+        }
+    }
+}
+
+/// The same for the folder of a file whose folder is not owned: once for each process.
+fn remove_leftovers_once(file: &Path) {
+    let folder = file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    if LOOKED.lock().unwrap_or_else(|e| e.into_inner()).insert(folder.to_owned()) {
+        remove_leftovers(folder);
+    }
+}
+
+/// Whether this is a name that [`Staged`] makes up.
+pub(super) fn is_temporary(name: &OsStr) -> bool {
+    name.as_encoded_bytes().ends_with(ENDING.as_bytes())
+}
+
+/// Tells processes of this machine, as long as it runs, from those of others: Linux' boot id and space of process numbers.
+fn machine() -> String {
+    const OFFSET: u64 = 0xcbf2_9ce4_8422_2325;
+    const PRIME: u64 = 0x0000_0100_0000_01b3;
+    let boot = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").unwrap_or_default();
+    let space = std::fs::read_link("/proc/self/ns/pid").unwrap_or_default();
+    let text = format!("{boot}{}", space.display());
+    let print = text.bytes().fold(OFFSET, |h, b| (h ^ u64::from(b)).wrapping_mul(PRIME));
+    format!("{:08x}", print >> 32)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::fs::File;
+    use std::time::SystemTime;
+
+    #[test]
+    fn what_dead_processes_left_is_removed_and_nothing_else() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: String| folder.path().join(name);
+        let own = std::process::id();
+        let left = [format!(".a.ply.{}-{}-7{ENDING}", machine(), u32::MAX), format!(".b.0badcafe-1-0{ENDING}")];
+        let stays = [
+            format!(".a.ply.{}-{own}-7{ENDING}", machine()),
+            format!(".b.0badcafe-1-1{ENDING}"),
+            format!("a{ENDING}"),
+            ".a.ply.123.tmp".into(),
+            "a.ply".into(),
+        ];
+        for name in left.iter().chain(&stays) {
+            std::fs::write(at(name.clone()), b"x").unwrap();
+        }
+        File::options().write(true).open(at(left[1].clone())).unwrap().set_modified(SystemTime::UNIX_EPOCH).unwrap();
+        let staged = Staged::new(&at("new.ply".into())).unwrap();
+        std::fs::write(staged.path(), b"new").unwrap();
+        for name in &left {
+            assert!(!at(name.clone()).exists(), "{name}");
+        }
+        for name in &stays {
+            assert!(at(name.clone()).exists() || name.contains("0badcafe-1-1"), "{name}");
+        }
+        let half = staged.path().to_owned();
+        drop(staged);
+        assert!(!half.exists() && !at("new.ply".into()).exists());
+    }
+
+    #[test]
+    fn long_names_are_written() {
+        let folder = tempfile::tempdir().unwrap();
+        for name in ["x".repeat(250), "ü".repeat(120)] {
+            write_atomically(&folder.path().join(&name), b"x").unwrap();
+            assert!(folder.path().join(&name).is_file());
+        }
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn names_that_are_not_text_are_written() {
+        use std::os::unix::ffi::OsStrExt;
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join(OsStr::from_bytes(b"sc\xffne.ply"));
+        write_atomically(&path, b"x").unwrap();
+        let staged = Staged::new(&path).unwrap();
+        std::fs::write(staged.path(), b"y").unwrap();
+        staged.keep().unwrap();
+        assert_eq!(
+            (std::fs::read(&path).unwrap(), std::fs::read_dir(folder.path()).unwrap().count()),
+            (b"y".to_vec(), 1)
+        );
+    }
+}

@@ -1,0 +1,127 @@
+//! Calling the program, and a place to do it in.
+
+use anyhow::{Context, Result, bail};
+use std::ffi::OsString;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+/// A call that takes longer hangs.
+const HANGS: Duration = Duration::from_secs(120);
+/// Time between two looks whether a call has ended.
+const LOOK: Duration = Duration::from_millis(2);
+/// Threads of a call: the machine may be shared.
+const THREADS: &str = "2";
+
+/// How a call ended.
+pub(crate) struct Ending {
+    pub(crate) code: Option<i32>,
+    /// What it said on stderr.
+    pub(crate) said: String,
+}
+
+/// The program under test.
+pub(crate) struct Program(pub(crate) PathBuf);
+
+impl Program {
+    fn command(&self, words: &[OsString], place: &Path, limit: Option<u64>) -> Command {
+        let mut command = match limit {
+            None => Command::new(&self.0),
+            // A quota for every file, in kilobytes: what writes more gets an error, as on a full disk.
+            Some(kilobytes) => {
+                let mut shell = Command::new("bash");
+                let text = format!("trap '' XFSZ; ulimit -f {kilobytes}; exec \"$@\"");
+                shell.args(["-c", &text, "bash"]).arg(&self.0);
+                shell
+            }
+        };
+        command.args(words).args(["--quiet", "--threads", THREADS]).current_dir(place);
+        command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped());
+        command
+    }
+
+    /// Starts a call.
+    pub(crate) fn start(&self, words: &[OsString], place: &Path, limit: Option<u64>) -> Result<Call> {
+        let mut child = self.command(words, place, limit).spawn().context("the program cannot be started")?;
+        let mut pipe = child.stderr.take().expect("it was asked for");
+        let said = std::thread::spawn(move || {
+            let mut bytes = Vec::new();
+            let _ = pipe.read_to_end(&mut bytes);
+            String::from_utf8_lossy(&bytes).into_owned()
+        });
+        Ok(Call { child, said: Some(said), words: words.to_vec() })
+    }
+
+    /// A call to its end.
+    pub(crate) fn run(&self, words: &[OsString], place: &Path, limit: Option<u64>) -> Result<Ending> {
+        self.start(words, place, limit)?.end()
+    }
+}
+
+/// A call under way.
+pub(crate) struct Call {
+    child: Child,
+    said: Option<std::thread::JoinHandle<String>>,
+    words: Vec<OsString>,
+}
+
+impl Call {
+    /// Waits so long, or until it ends. Returns whether it is still under way.
+    pub(crate) fn wait(&mut self, time: Duration) -> Result<bool> {
+        let began = Instant::now();
+        while began.elapsed() < time {
+            if self.child.try_wait()?.is_some() {
+                return Ok(false);
+            }
+            std::thread::sleep(LOOK);
+        }
+        Ok(self.child.try_wait()?.is_none())
+    }
+
+    /// kill -9.
+    pub(crate) fn kill(mut self) -> Result<()> {
+        self.child.kill()?;
+        self.child.wait()?;
+        Ok(())
+    }
+
+    pub(crate) fn end(mut self) -> Result<Ending> {
+        if self.wait(HANGS)? {
+            let _ = self.child.kill();
+            bail!("it hangs: {:?}", self.words);
+        }
+        let code = self.child.wait()?.code();
+        let said = self.said.take().and_then(|s| s.join().ok()).unwrap_or_default();
+        Ok(Ending { code, said })
+    }
+}
+
+impl Drop for Call {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// A folder of this process that goes at the end.
+pub(crate) struct Scratch(PathBuf);
+
+impl Scratch {
+    pub(crate) fn new() -> Result<Self> {
+        let path = std::env::temp_dir().join(format!("splat4d-chaos-{}", std::process::id()));
+        let _ = std::fs::remove_dir_all(&path);
+        std::fs::create_dir_all(&path).with_context(|| path.display().to_string())?;
+        Ok(Self(path.canonicalize()?))
+    }
+
+    pub(crate) fn path(&self) -> &Path {
+        &self.0
+    }
+}
+
+impl Drop for Scratch {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_dir_all(&self.0);
+    }
+}
