@@ -32,9 +32,11 @@ pub fn cannot_write(path: &Path, error: std::io::Error) -> Error {
     Error::io("cannot be written", error).at(path.display()).remedy(WRITE_REMEDY)
 }
 
-/// Reads a text file.
+/// Reads a text file, with or without byte-order mark.
 pub fn read_text(path: &Path) -> Result<String> {
-    std::fs::read_to_string(path).map_err(|e| cannot_read(path, e))
+    let bytes = std::fs::read(path).map_err(|e| cannot_read(path, e))?;
+    let text = splat4d_train::text::decode(&bytes).map_err(|e| e.at(path.display()))?;
+    Ok(text.into_owned())
 }
 
 /// The error of a failed read.
