@@ -125,7 +125,7 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<T
         timing: Timing::Told,
         hold_out,
         fps,
-        points: top.opt("points")?.map(|n| read_ply(&root.join(n.text()?))).transpose()?,
+        points: top.opt("points")?.map(|n| read_ply(&lookup.file(n.text()?)?)).transpose()?,
         background: read_background(top)?,
         up: top.opt("up")?.map(|n| n.numbers::<3>()).transpose()?,
         labels,
@@ -279,6 +279,9 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
         }
     }
     let bases = context.lookup.bases();
+    let path = |files: &Option<Files>, index: usize| {
+        files.as_ref().map(|f| f.path(context.lookup, start, index)).transpose().map(Option::flatten)
+    };
     let (first, mut there, mut missing) = (frames.len(), 0, 0);
     let most = if let Files::List(names) = &images { names.len() } else { usize::MAX };
     for index in 0..count.unwrap_or(most) {
@@ -324,17 +327,18 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
                 return Err(node.error(what).remedy("Give one time per frame, in seconds, or \"frames\"."));
             }
         };
+        let beside = |files: &Option<Files>| path(files, index).map_err(|e| node.at(e));
         frames.push(RawFrame {
             camera: context.camera,
             source: Camera { cam_from_world, intrinsics, lens, width, height, near: Camera::NEAR },
             time: time + offset,
             index,
             image,
-            mask: masks.as_ref().and_then(|m| m.name(context.root, start, index)),
-            depth: depth.as_ref().and_then(|d| d.file(context.root, start, index)),
-            flow: flow.as_ref().and_then(|f| f.name(context.root, start, index)),
-            labels: labels.as_ref().and_then(|l| l.name(context.root, start, index)),
-            features: features.as_ref().and_then(|f| f.name(context.root, start, index)),
+            mask: beside(&masks)?,
+            depth: depth.as_ref().map(|d| d.file(context.lookup, start, index)).transpose()?.flatten(),
+            flow: beside(&flow)?,
+            labels: beside(&labels)?,
+            features: beside(&features)?,
             tracks: None,
             split: Split::Train,
         });
@@ -344,7 +348,7 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
         last.flow = None;
     }
     if let Some(file) = node.opt("tracks")? {
-        let tracks = Arc::new(Tracks::read(&context.root.join(file.text()?), [width, height], there)?);
+        let tracks = Arc::new(Tracks::read(&context.lookup.file(file.text()?)?, [width, height], there)?);
         frames[first..].iter_mut().for_each(|f| f.tracks = Some(tracks.clone()));
     }
     Ok(there)
@@ -389,8 +393,9 @@ impl Depth {
         Ok(Self { files, kind, scale: scale.unwrap_or(1.0) })
     }
 
-    fn file(&self, root: &Path, start: usize, index: usize) -> Option<DepthFile> {
-        Some(DepthFile { path: self.files.name(root, start, index)?, scale: self.scale, kind: self.kind })
+    fn file(&self, lookup: &Lookup, start: usize, index: usize) -> Result<Option<DepthFile>> {
+        let path = self.files.path(lookup, start, index)?;
+        Ok(path.map(|path| DepthFile { path, scale: self.scale, kind: self.kind }))
     }
 }
 
@@ -461,8 +466,9 @@ impl Files {
         Ok(Self::Pattern { before: before.into(), digits, after: after.into() })
     }
 
-    fn name(&self, root: &Path, start: usize, index: usize) -> Option<PathBuf> {
-        self.text(start, index).map(|name| root.join(name))
+    /// The file of a frame, or where it should be.
+    fn path(&self, lookup: &Lookup, start: usize, index: usize) -> Result<Option<PathBuf>> {
+        self.text(start, index).map(|name| lookup.file(&name)).transpose()
     }
 
     /// The file's name as the capture writes it.

@@ -37,9 +37,10 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
     let several = marker.file_name().is_some_and(|name| name == TRAIN);
     let (mut warnings, mut notes, mut account) = (Vec::new(), Vec::new(), Account::default());
     let lookup = Lookup::new(root, options)?;
+    let mut size = None;
     let mut read = |path: &Path, split: Split| {
         let value = json::read(path)?;
-        let read = Document::read(&lookup, &Node::root(&value), split, options, &mut account);
+        let read = Document::read((&lookup, &mut size), &Node::root(&value), split, options, &mut account);
         read.map_err(|e| e.at(path.display()))
     };
     let first = read(marker, Split::Train)?;
@@ -153,7 +154,7 @@ struct Document {
 
 impl Document {
     fn read(
-        lookup: &Lookup,
+        (lookup, size): (&Lookup, &mut Option<(usize, usize)>),
         top: &Node<'_>,
         split: Split,
         options: &CaptureOptions,
@@ -176,8 +177,8 @@ impl Document {
             let name = node.value.get("file_path")?.as_str()?;
             picture::header(&lookup.image(&bases, name).ok()??).ok()
         };
-        let size = nodes.iter().find_map(there).map(|header| header.upright());
-        let file = frame::File { lookup, bases: &bases, top, poses: options.poses, size };
+        *size = nodes.iter().find_map(there).map(|header| header.upright()).or(*size);
+        let file = frame::File { lookup, bases: &bases, top, poses: options.poses, size: *size };
         let mut entries = nodes.iter().map(|node| frame::read(&file, node)).collect::<Result<Vec<_>>>()?;
         match split {
             Split::Train => splits::apply(top, &mut entries, account)?,
