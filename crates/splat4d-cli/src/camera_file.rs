@@ -4,7 +4,7 @@
 //! {"fx": 500, "fy": 500, "cx": 320, "cy": 240, "w": 640, "h": 480, "background": [0, 0, 0],
 //!  "world_to_camera": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]}
 //! ```
-//! The pose is a row-major 4x4 in OpenCV axes (x right, y down, z forward); pixel centres are at +0.5.
+//! `width` and `height` may stand for `w` and `h`. The pose is a row-major 4x4 in OpenCV axes (x right, y down, z forward); pixel centres are at +0.5.
 
 use crate::files::read_text;
 use serde_json::Value;
@@ -14,7 +14,7 @@ use splat4d::{Error, Result};
 use splat4d_train::settings::nearest;
 use std::path::Path;
 
-const KEYS: [&str; 9] = ["fx", "fy", "cx", "cy", "w", "h", "world_to_camera", "near", "background"];
+const KEYS: [&str; 11] = ["fx", "fy", "cx", "cy", "w", "h", "width", "height", "world_to_camera", "near", "background"];
 /// Longest side of a picture that is drawn, pixels.
 pub(crate) const MAX_SIDE: usize = 16_384;
 /// Most pixels of a picture that is drawn: 8K video twice over; about 4 GiB of working memory.
@@ -47,7 +47,15 @@ pub(crate) fn parse(text: &str) -> Result<(Camera, Option<[f32; 3]>)> {
             Error::input(format!("\"{key}\" is {value}, not a finite number")).remedy("Write a plain number.")
         })
     };
-    let side = |key: &str| {
+    // capture.json and Python write the whole words.
+    let side = |key: &'static str, word: &'static str| {
+        let key = match (value.get(key), value.get(word)) {
+            (Some(a), Some(b)) if a != b => {
+                return Err(Error::input(format!("\"{key}\" is {a} and \"{word}\" is {b}")).remedy("Give one of them."));
+            }
+            (None, Some(_)) => word,
+            _ => key,
+        };
         let n = number(key)?;
         if !(1.0..=MAX_SIDE as f64).contains(&n) || n.fract() != 0.0 {
             return Err(Error::input(format!("\"{key}\" is {n}"))
@@ -60,7 +68,7 @@ pub(crate) fn parse(text: &str) -> Result<(Camera, Option<[f32; 3]>)> {
         return Err(Error::input(format!("the focal length is {} x {}", intrinsics.fx, intrinsics.fy))
             .remedy("Give \"fx\" and \"fy\" in pixels, above zero."));
     }
-    let (width, height) = (side("w")?, side("h")?);
+    let (width, height) = (side("w", "width")?, side("h", "height")?);
     if width * height > MAX_PIXELS {
         return Err(Error::input(format!("a picture of {width}x{height} is too large"))
             .remedy(format!("At most {MAX_PIXELS} pixels are drawn at once.")));
@@ -159,6 +167,12 @@ mod tests {
         let mut flat = good();
         flat["world_to_camera"] = json!([1, 0, 0, 0.5, 0, 1, 0, 0, 0, 0, 1, 4, 0, 0, 0, 1]);
         assert_eq!(parse(&flat.to_string()).unwrap().0, camera);
+        let mut words = good();
+        let object = words.as_object_mut().unwrap();
+        [("w", "width"), ("h", "height")].map(|(key, word)| object.remove(key).map(|v| object.insert(word.into(), v)));
+        assert_eq!(parse(&words.to_string()).unwrap().0, camera);
+        words["w"] = json!(31);
+        assert!(parse(&words.to_string()).unwrap_err().to_string().contains("\"width\" is 32"));
         flat["near"] = json!(0.3);
         assert_eq!((camera.near, parse(&flat.to_string()).unwrap().0.near), (Camera::NEAR, 0.3));
     }

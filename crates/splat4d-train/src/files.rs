@@ -1,5 +1,6 @@
 //! Files of the user, opened: regular ones only.
 
+use crate::text;
 use splat4d::{Error, Result};
 use std::fs::File;
 use std::path::Path;
@@ -26,13 +27,10 @@ pub fn read(path: &Path) -> Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// Reads a text file. Errors: those of [`read`]; bytes that are no UTF-8.
+/// Reads a text file, with or without byte-order mark. Errors: those of [`read`] and of [`text::decode`].
 pub fn read_text(path: &Path) -> Result<String> {
-    String::from_utf8(read(path)?).map_err(|e| {
-        Error::input(format!("is not a text in UTF-8: byte {}", e.utf8_error().valid_up_to()))
-            .at(path.display())
-            .remedy("Save it as UTF-8.")
-    })
+    let bytes = read(path)?;
+    Ok(text::decode(&bytes).map_err(|e| e.at(path.display()))?.into_owned())
 }
 
 #[cfg(test)]
@@ -46,7 +44,7 @@ mod tests {
         std::fs::write(&file, "text").unwrap();
         assert_eq!(read_text(&file).unwrap(), "text");
         std::fs::write(&file, b"a\xff").unwrap();
-        assert!(read_text(&file).unwrap_err().to_string().contains("byte 1"));
+        assert!(read_text(&file).unwrap_err().to_string().contains("UTF-8"));
         let mut odd = vec![folder.path().to_owned()];
         if cfg!(unix) {
             odd.push("/dev/zero".into());

@@ -41,6 +41,7 @@ pub mod run;
 pub mod sampler;
 pub mod settings;
 pub mod step;
+pub mod text;
 pub mod training;
 pub mod upkeep;
 pub mod vision;

@@ -16,7 +16,7 @@ use splat4d::math::sh::degree_of;
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{GEOMETRY, SH};
 use splat4d::text::in_line;
-use splat4d_train::capture::{Capture, Frame, Reach, Severity, Timing};
+use splat4d_train::capture::{Aspect, Capture, Finding, Frame, Reach, Severity, Timing};
 use splat4d_train::event::Event;
 use splat4d_train::path_text::to_text;
 use splat4d_train::recipe::Recipe;
@@ -63,6 +63,12 @@ pub(crate) struct Args {
     /// Read a capture with these views held out: camera=0,10 or every=8 or none
     #[arg(long, value_name = "RULE")]
     hold_out: Option<String>,
+    /// Read a capture with the images of this folder, such as images_4
+    #[arg(long, value_name = "NAME")]
+    images: Option<String>,
+    /// Read a capture's poses in this convention: opencv, opengl, inverse, transposed or xyzw, or several joined by +
+    #[arg(long, value_name = "CONVENTION")]
+    poses: Option<String>,
     /// Read a capture with a knob of the recipe set, such as capture.sequence=photos; may be repeated
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
@@ -80,6 +86,8 @@ struct Told {
     text: String,
     /// Why it does not look healthy.
     troubles: Vec<String>,
+    /// More of that, which the text lists already.
+    listed: Vec<String>,
 }
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
@@ -107,8 +115,10 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     } else {
         of_file(path)?
     };
+    let healthy = told.troubles.is_empty() && told.listed.is_empty();
     if console.json() {
-        told.json["healthy"] = json!(told.troubles.is_empty());
+        told.troubles.append(&mut told.listed);
+        told.json["healthy"] = json!(healthy);
         told.json["troubles"] = json!(told.troubles);
         console.emit(&told.json);
         return Ok(());
@@ -116,7 +126,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     for trouble in &told.troubles {
         let _ = writeln!(told.text, "! {}", in_line(trouble));
     }
-    let verdict = if told.troubles.is_empty() { "looks healthy" } else { "does not look healthy, see above" };
+    let verdict = if healthy { "looks healthy" } else { "does not look healthy, see above" };
     console.result(&format!("{}{verdict}", told.text));
     Ok(())
 }
@@ -132,6 +142,11 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
     }
     if let Some(rule) = &args.hold_out {
         recipe.set(&format!("hold_out={}", toml::Value::String(rule.clone())))?;
+    }
+    for (knob, value) in [("capture.images", &args.images), ("capture.poses", &args.poses)] {
+        if let Some(value) = value {
+            recipe.set(&format!("{knob}={}", toml::Value::String(value.clone())))?;
+        }
     }
     for assignment in &args.set {
         recipe.set(assignment).map_err(|e| e.at("--set"))?;
@@ -155,7 +170,10 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
     let outlook = Outlook::new(&capture, &recipe, None, true, &Stopwatch::start(), &mut listen)?;
     console.clear();
     let memory = outlook.as_ref().map_or_else(|| memory_estimate(&capture, &recipe), |o| o.memory);
-    let findings = capture.preflight();
+    let checked = capture.check_poses();
+    let written_as = checked.written_as.map(|p| p.to_string());
+    let mut findings = capture.preflight();
+    findings.push(checked.finding);
     let fixed = capture.cameras.iter().filter(|c| c.fixed).count();
     let moving = capture.cameras.len() - fixed;
     let held: Vec<String> = held_cameras(&capture);
@@ -201,11 +219,24 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
     if let Some(outlook) = &outlook {
         line(&mut text, "training", &chunked::in_words(outlook));
     }
-    let mut troubles = Vec::new();
-    for finding in &findings {
+    let (mut troubles, mut listed) = (Vec::new(), Vec::new());
+    let sentence = |f: &Finding| format!("{} {}", f.what, f.remedy).trim_end().to_owned();
+    for finding in findings.iter().filter(|f| f.aspect.is_none()) {
         match finding.severity {
-            Severity::Warning => troubles.push(format!("{} {}", finding.what, finding.remedy)),
-            Severity::Note => line(&mut text, "note", format!("{} {}", finding.what, finding.remedy).trim_end()),
+            Severity::Warning => troubles.push(sentence(finding)),
+            Severity::Note => line(&mut text, "note", &sentence(finding)),
+        }
+    }
+    // One block: what was not found, not read, assumed or not checked; warnings come first.
+    for (name, aspect) in Aspect::ALL {
+        let mut of: Vec<&Finding> = findings.iter().filter(|f| f.aspect == Some(aspect)).collect();
+        of.sort_by_key(|f| std::cmp::Reverse(f.severity));
+        for finding in of {
+            let mark = if finding.severity == Severity::Warning { "! " } else { "" };
+            line(&mut text, name, &format!("{mark}{}", sentence(finding)));
+            if finding.severity == Severity::Warning {
+                listed.push(sentence(finding));
+            }
         }
     }
     let json = json!({
@@ -217,12 +248,12 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
         "held_out_cameras": held, "masks": masks, "points": capture.points.as_ref().map(|p| p.points.len()),
         "priors": priors, "views_hold": reach.map(|r| json!({"center": r.center, "degrees": r.degrees,
             "distances": r.distances, "held_out_cameras": r.held[0], "held_out_cameras_beyond": r.held[1]})),
-        "memory_estimate": memory, "chunks": outlook.as_ref().map(|o| o.plan.len()),
+        "poses_written_as": written_as, "memory_estimate": memory, "chunks": outlook.as_ref().map(|o| o.plan.len()),
         "training_seconds": outlook.as_ref().and_then(|o| o.seconds),
         "findings": findings.iter().map(|f| json!({"severity": format!("{:?}", f.severity).to_lowercase(),
-            "what": f.what, "remedy": f.remedy})).collect::<Vec<_>>(),
+            "about": f.aspect.map(Aspect::name), "what": f.what, "remedy": f.remedy})).collect::<Vec<_>>(),
     });
-    Ok(Told { json, text, troubles })
+    Ok(Told { json, text, troubles, listed })
 }
 
 /// What lies beside the pictures, in words.
@@ -317,7 +348,7 @@ fn of_run(path: &Path) -> anyhow::Result<Told> {
         troubles.extend(inner.troubles);
         json["scene"] = inner.json;
     }
-    Ok(Told { json, text, troubles })
+    Ok(Told { json, text, troubles, listed: Vec::new() })
 }
 
 fn of_file(path: &Path) -> anyhow::Result<Told> {
@@ -361,7 +392,7 @@ fn of_file(path: &Path) -> anyhow::Result<Told> {
         json["type"] = json!("playback");
         json["playback"] = told.json;
     }
-    Ok(Told { json, text, troubles: inner.troubles })
+    Ok(Told { json, text, troubles: inner.troubles, listed: Vec::new() })
 }
 
 /// Names of edits, one after the other.
@@ -469,7 +500,7 @@ fn of_scene(scene: &Scene<f32>) -> Told {
         "middle": center, "radius": radius, "opacity_histogram": {"edges": OPACITY_EDGES, "counts": opacity},
         "scale_histogram": {"edges_log10_radii": SCALE_EDGES, "counts": scales},
     });
-    Told { json, text, troubles }
+    Told { json, text, troubles, listed: Vec::new() }
 }
 
 fn bucket(edges: &[f64], value: f64) -> usize {

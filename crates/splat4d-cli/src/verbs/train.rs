@@ -77,7 +77,7 @@ pub struct Args {
     output: Option<PathBuf>,
     /// Continue this run exactly where its newest checkpoint is
     #[arg(long, value_name = "RUN", conflicts_with_all = ["capture", "output", "motion", "minutes", "quality", "recipe", "set",
-        "downscale", "hold_out", "observe", "chunk_frames", "overlap", "chunk", "image_memory", "memory_limit", "seed", "source", "iterations", "force"])]
+        "downscale", "hold_out", "images", "poses", "observe", "chunk_frames", "overlap", "chunk", "image_memory", "memory_limit", "seed", "source", "iterations", "force"])]
     resume: Option<PathBuf>,
     /// Replace the run in the -o folder: the files that splat4d wrote there, once the new run has taken its first steps
     #[arg(long)]
@@ -112,6 +112,13 @@ pub struct Args {
     /// Views kept from training: camera=0,10 or every=8 or none [default: the data set's convention]
     #[arg(long, value_name = "RULE", help_heading = "What is read")]
     hold_out: Option<String>,
+    /// Folder of images in place of the one that the capture names, such as images_4
+    #[arg(long, value_name = "NAME", help_heading = "What is read")]
+    images: Option<String>,
+    /// Convention in which poses are written where it is not the layout's: opencv or opengl (camera axes), inverse, transposed
+    /// or xyzw (quaternions), or several joined by +
+    #[arg(long, value_name = "CONVENTION", help_heading = "What is read")]
+    poses: Option<String>,
     /// Train on the first SHARE of the clip only; what comes later scores `predict` and is not looked at [default: 1]
     #[arg(long, value_name = "SHARE", help_heading = "What is read")]
     observe: Option<f64>,
@@ -396,6 +403,8 @@ fn recipe(args: &Args) -> anyhow::Result<Recipe> {
     set("seed", args.seed.map(|v| v.to_string()))?;
     set("downscale", args.downscale.map(|v| v.to_string()))?;
     set("hold_out", args.hold_out.as_ref().map(quoted))?;
+    set("capture.images", args.images.as_ref().map(quoted))?;
+    set("capture.poses", args.poses.as_ref().map(quoted))?;
     set("capture.observe", args.observe.map(|v| v.to_string()))?;
     set("chunks.frames", args.chunk_frames.map(|v| v.to_string()))?;
     set("chunks.overlap", args.overlap.map(|v| v.to_string()))?;
@@ -471,7 +480,8 @@ fn describe(capture: &Capture, memory: u64, console: &Console) {
         }
     ));
     console.detail(&format!("memory estimate: {}", human_bytes(memory)));
-    for finding in capture.preflight() {
+    let poses = capture.check_poses().finding;
+    for finding in capture.preflight().into_iter().chain([poses]) {
         let text = format!("{} {}", finding.what, finding.remedy).trim_end().to_owned();
         match finding.severity {
             Severity::Warning => console.warn(&text),

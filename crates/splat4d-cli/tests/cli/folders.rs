@@ -149,5 +149,5 @@ fn names_that_are_not_text_work_everywhere() {
     splat4d(&["train", "--json", "--no-eval", "--resume"]).paths(&[&run]).run().ok();
     splat4d(&["compress", "--json", "--no-eval", "--level", "1", "--fine-tune", "4"]).paths(&[&run]).run().ok();
     splat4d(&["render", "--json", "--path", "test", "--device", "cpu", "-o"]).paths(&[&at(b"v\xff"), &run]).run().ok();
-    assert!(at(b"r\xff-compressed").join("scene.splat4d").is_file());
+    assert!(at(b"r\xff-compressed").join("scene.s4d").is_file());
 }

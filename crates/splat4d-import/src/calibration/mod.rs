@@ -206,8 +206,8 @@ impl Text {
             return Err(Error::input(format!("it is {length} bytes long: no calibration")).at(path.display()));
         }
         let bytes = splat4d_train::files::read(path)?;
-        let tree = String::from_utf8(bytes)
-            .map_err(|_| Error::input("it is no text").remedy("Give the calibration's own file."))
+        let tree = splat4d_train::text::decode(&bytes)
+            .map_err(|e| e.remedy("Give the calibration's own file."))
             .and_then(|body| Tree::parse(&body));
         Ok(Self { path: path.to_path_buf(), tree: tree.map_err(|e| e.at(path.display()))? })
     }

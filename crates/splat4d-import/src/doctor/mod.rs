@@ -168,7 +168,10 @@ pub fn examine(capture: &Capture, options: &Options, progress: &mut Progress<'_>
     }
     let store = ImageStore::new(Arc::new(capture.clone()), STORE);
     let mut report = Report { capture: capture.name.clone(), ..Report::default() };
-    for finding in capture.preflight() {
+    let poses = capture.check_poses();
+    let misread = poses.written_as.is_some();
+    let checked = |f: &splat4d_train::capture::Finding| f.severity == Severity::Warning;
+    for finding in capture.preflight().into_iter().chain([poses.finding].into_iter().filter(checked)) {
         let grade = if finding.severity == Severity::Warning { Grade::Warning } else { Grade::Note };
         report.findings.push(Finding {
             grade,
@@ -194,6 +197,11 @@ pub fn examine(capture: &Capture, options: &Options, progress: &mut Progress<'_>
             check::memory(forecast.memory, options.memory.or_else(machine_memory), &mut report);
         }
         Err(e) => report.left.push(format!("What training takes cannot be told: {e}")),
+    }
+    if misread {
+        // Cameras that are read in another convention are not bad ones.
+        report.findings.retain(|f| f.check != "epipolar");
+        report.leave_out.clear();
     }
     report.findings.sort_by_key(|f| std::cmp::Reverse(f.grade));
     Ok(report)

@@ -1,13 +1,17 @@
 //! From what the files say to a checked capture: poses, sizes, files, duplicates, split, clock.
 
+use super::account::{Aspect, Remark, first_names};
+use super::preflight::Severity;
 use super::{
-    Capture, CaptureOptions, Extent, FlowFile, Frame, HoldOut, PointCloud, RawFrame, Rig, Split, Take, Timing,
+    Capture, CaptureKind, CaptureOptions, Exif, Extent, FlowFile, Frame, HoldOut, PointCloud, RawFrame, Rig, Split, Take, Timing,
 };
-use super::{options, picture, pose};
+use super::{evidence, lookup, masks, options, picture, pose};
 use splat4d::math::se3::{norm, normalize, sub};
 use splat4d::scene::{Camera, Lens, Time};
 use splat4d::{Error, Result};
+use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
 
 /// Poses closer than this, relative to the distance from the origin, are one pose.
 const SAME_POSE: f64 = 1e-9;
@@ -27,6 +31,8 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
         ));
     }
     options::check_rate("frame rate", take.fps).map_err(located)?;
+    skip_missing(&mut take, options).map_err(located)?;
+    masks::fill(&mut take)?;
     for frame in &mut take.frames {
         check_frame(frame, &take.cameras[frame.camera], options)?;
     }
@@ -40,14 +46,18 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
     let cameras = rigs(&take);
     check_poses(&mut take, &cameras)?;
     check_duplicates(&mut take, &cameras).map_err(located)?;
-    let has_alpha = fit_pictures(&mut take)?;
+    shared_images(&mut take);
+    let (has_alpha, turned, unsure) = fit_pictures(&mut take, options)?;
     check_masks(&take, has_alpha)?;
     let background = options.background.or(take.background).or(has_alpha.then_some(WHITE)).filter(|_| has_alpha);
     let (train, held, validation) = split(&mut take, &cameras, options).map_err(located)?;
     let up = take.up.map(normalize).filter(|u| norm(*u) > 0.0).unwrap_or_else(|| estimate_up(&take.frames));
     let flows = flows(&mut take.frames);
     let frames = take.frames.into_iter().zip(flows);
-    let frames: Vec<Frame> = frames.map(|(raw, flow)| Frame { flow, ..finish(raw, options.downscale) }).collect();
+    let frames: Vec<Frame> = frames
+        .zip(turned)
+        .map(|((raw, flow), upright)| Frame { flow, upright, ..finish(raw, options.downscale) })
+        .collect();
     let name = take.name.unwrap_or_else(|| {
         let full = std::path::absolute(&take.root).unwrap_or_else(|_| take.root.clone());
         full.file_name().map_or_else(|| "capture".into(), |n| n.to_string_lossy().into_owned())
@@ -73,9 +83,17 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
         up,
         labels: take.labels,
         downscale: options.downscale,
+        convention: take.convention,
+        poses: options.poses,
+        account: take.account.remarks,
         warnings: take.warnings,
         notes: take.notes,
     };
+    settle_orientation(&mut capture, &unsure);
+    for remark in &capture.account {
+        let list = if remark.severity == Severity::Warning { &mut capture.warnings } else { &mut capture.notes };
+        list.push(remark.what.clone());
+    }
     let near = near(&capture, options.near);
     capture.frames.iter_mut().for_each(|f| f.view.near = near);
     // Last: all else is told by the whole take.
@@ -126,6 +144,7 @@ fn finish(raw: RawFrame, downscale: usize) -> Frame {
         time: Time(raw.time),
         index: raw.index,
         image: raw.image,
+        upright: true,
         mask: raw.mask,
         depth: raw.depth,
         flow: None,
@@ -282,15 +301,102 @@ fn check_duplicates(take: &mut Take, cameras: &[Rig]) -> Result<()> {
     Ok(())
 }
 
+/// Takes out the frames whose image is missing. Errors: too many are.
+fn skip_missing(take: &mut Take, options: &CaptureOptions) -> Result<()> {
+    let there: Vec<bool> = take.frames.iter().map(|f| f.image.is_file()).collect();
+    let all = there.len();
+    let shown = |f: &RawFrame| f.image.strip_prefix(&take.root).unwrap_or(&f.image).display().to_string();
+    let missing: Vec<String> = take.frames.iter().zip(&there).filter(|(_, t)| !**t).map(|(f, _)| shown(f)).collect();
+    let share = missing.len() as f64 / all as f64;
+    if missing.is_empty() {
+        return Ok(());
+    }
+    let what = format!("{} of {all} images are missing: {}", missing.len(), first_names(&missing));
+    if missing.len() == all {
+        return Err(Error::input(what)
+            .remedy("Put them there, or say with --images NAME which folder of the capture holds them."));
+    }
+    if share > options.max_missing {
+        let allowed = (100.0 * share).ceil() / 100.0;
+        return Err(Error::input(what)
+            .remedy(format!("Restore them, or train without them: --set capture.max_missing={allowed}.")));
+    }
+    take.account.add(Aspect::NotFound, Severity::Warning, format!("{what}. They are skipped."));
+    let mut there = there.into_iter();
+    take.frames.retain(|_| there.next().unwrap_or(true));
+    Ok(())
+}
+
+/// Says which frames have one image and different poses: one of them shows something else.
+fn shared_images(take: &mut Take) {
+    let mut first: BTreeMap<&Path, usize> = BTreeMap::new();
+    let mut twice = Vec::new();
+    for (i, frame) in take.frames.iter().enumerate() {
+        match first.entry(&frame.image) {
+            Entry::Vacant(slot) => drop(slot.insert(i)),
+            Entry::Occupied(slot) => {
+                if !same_pose(&take.frames[*slot.get()].source, &frame.source) {
+                    twice.push((*slot.get(), i));
+                }
+            }
+        }
+    }
+    let Some((a, b)) = twice.first() else { return };
+    let name = |i: usize| {
+        let frame = &take.frames[i];
+        format!("camera {}, frame {}", take.cameras[frame.camera], frame.index)
+    };
+    let what = format!(
+        "{} frames have the image of another frame, but another pose: {} and {} both have {}.",
+        twice.len(),
+        name(*a),
+        name(*b),
+        take.frames[*a].image.display()
+    );
+    take.account.add(Aspect::Assumed, Severity::Warning, what);
+}
+
+/// Whether a picture of `size` is, or was resized to, what a camera describes.
+fn fits(size: (usize, usize), camera: &Camera) -> bool {
+    size == (camera.width, camera.height) || picture::is_resized(size, camera)
+}
+
 /// Compares the sizes of the pictures with their intrinsics, and scales those where pictures were resized; returns
-/// whether any picture has an alpha channel.
-fn fit_pictures(take: &mut Take) -> Result<bool> {
+/// whether any picture has an alpha channel, for each whether its EXIF orientation is applied, and those of which sizes do
+/// not say so.
+fn fit_pictures(take: &mut Take, options: &CaptureOptions) -> Result<(bool, Vec<bool>, Vec<usize>)> {
     let mut alpha = false;
     let mut resized = Vec::new();
+    let mut upright = Vec::with_capacity(take.frames.len());
+    // Turned images whose sizes say which pixels are described, and those whose sizes do not.
+    let (mut by_size, mut unsure) = ([0; 2], Vec::new());
+    // COLMAP reads pixels as they are stored, and so do the scripts that write these layouts.
+    let of_colmap = matches!(take.kind, CaptureKind::Colmap | CaptureKind::N3dv | CaptureKind::Llff);
+    let mut as_stored = 0;
     for frame in &mut take.frames {
         let header = picture::header(&frame.image)?;
         alpha |= header.alpha;
-        let (size, source) = ((header.width, header.height), &mut frame.source);
+        let source = &mut frame.source;
+        let turn = match options.exif {
+            _ if !header.is_turned() => true,
+            Exif::Stored => false,
+            Exif::Upright => true,
+            Exif::Auto if of_colmap => {
+                as_stored += 1;
+                false
+            }
+            Exif::Auto => {
+                let (as_stored, turned) = (fits(header.stored, source), fits(header.upright(), source));
+                match (as_stored, turned) {
+                    (true, true) => unsure.push(upright.len()),
+                    (true, false) => by_size[0] += 1,
+                    _ => by_size[1] += 1,
+                }
+                turned || !as_stored
+            }
+        };
+        upright.push(turn);
+        let size = if turn { header.upright() } else { header.stored };
         let stated = (source.width, source.height);
         if size != stated && picture::is_resized(size, source) {
             let (x, y) = (size.0 as f64 / stated.0 as f64, size.1 as f64 / stated.1 as f64);
@@ -303,7 +409,7 @@ fn fit_pictures(take: &mut Take) -> Result<bool> {
             .map_err(|e| e.at(format!("camera {}", take.cameras[frame.camera])))?;
     }
     if let Some((image, size, stated)) = resized.first() {
-        take.warnings.push(format!(
+        let what = format!(
             "{} pictures are of another size than their intrinsics are for, which are scaled to them: {} is {}x{}, not \
              {}x{}.",
             resized.len(),
@@ -312,9 +418,51 @@ fn fit_pictures(take: &mut Take) -> Result<bool> {
             size.1,
             stated.0,
             stated.1
-        ));
+        );
+        // Reduced copies are meant to be smaller.
+        let meant =
+            resized.iter().all(|(image, ..)| image.ancestors().any(lookup::is_reduced)) || options.images.is_some();
+        take.account.add(Aspect::Assumed, if meant { Severity::Note } else { Severity::Warning }, what);
     }
-    Ok(alpha)
+    tell_of_orientation(take, as_stored, by_size);
+    Ok((alpha, upright, unsure))
+}
+
+/// Says what was done with EXIF orientations of COLMAP's images, and of those whose sizes decide.
+fn tell_of_orientation(take: &mut Take, as_stored: usize, by_size: [usize; 2]) {
+    let all = take.frames.len();
+    let mut say = |n: usize, what: &str| {
+        if n > 0 {
+            let what = format!("{n} of {all} images have an EXIF orientation. {what}");
+            take.account.add(Aspect::Assumed, Severity::Note, what);
+        }
+    };
+    say(
+        as_stored,
+        "It is not applied: COLMAP's poses describe the pixels as stored. Otherwise say --set capture.exif=upright.",
+    );
+    say(by_size[0], "It is not applied: only the pixels as stored have the size of their intrinsics.");
+    say(by_size[1], "It is applied: only the upright images have the size of their intrinsics.");
+}
+
+/// Decides by points and features whether EXIF orientations are applied where sizes do not say so, and says it.
+fn settle_orientation(capture: &mut Capture, unsure: &[usize]) {
+    if unsure.is_empty() {
+        return;
+    }
+    let upright = evidence::upright(capture, unsure);
+    let (severity, what) = match upright {
+        Some(true) => (Severity::Note, "It is applied: points and features agree with the upright images."),
+        Some(false) => (Severity::Note, "It is not applied: points and features agree with the pixels as stored."),
+        None => (
+            Severity::Warning,
+            "It is applied; neither sizes nor points nor features say whether poses describe the upright images or the pixels \
+             as stored. If results are bad, say --set capture.exif=stored.",
+        ),
+    };
+    let what = format!("{} of {} images have an EXIF orientation. {what}", unsure.len(), capture.frames.len());
+    unsure.iter().for_each(|&i| capture.frames[i].upright = upright.unwrap_or(true));
+    capture.account.push(Remark { aspect: Aspect::Assumed, severity, what });
 }
 
 /// An error if masks exist and not one of them shows anything; stops at the first that does.

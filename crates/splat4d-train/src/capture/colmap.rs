@@ -4,52 +4,69 @@
 //! only one registered picture, the other pictures of that camera on disk share its pose: the usual way to calibrate a
 //! fixed rig is to reconstruct one instant.
 
+mod multiview;
+mod unregistered;
+
+use super::account::Account;
 use super::colmap_files::{self, Point, Registered};
+use super::convention::{Convention, Poses};
+use super::lookup::{self, Lookup};
 use super::{CaptureKind, CaptureOptions, Extent, PointCloud, RawFrame, Split, Take, beside, rig, sequence};
 use splat4d::math::{Se3, quat};
 use splat4d::scene::Camera;
 use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::{Error, Result};
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// The folder of models: the marker.
 pub(super) const SPARSE: &str = "sparse";
+/// The same, where Nerfstudio keeps it.
+pub(super) const NESTED: &str = "colmap/sparse";
+/// The model of 4DGaussians' "multipleview" layout.
+pub(super) const MULTIVIEW: &str = "sparse_";
 /// Where a model may lie beside poses of another layout: COLMAP's habit and Nerfstudio's.
-const BESIDE: [&str; 2] = [SPARSE, "colmap/sparse"];
-/// Below this part of registered pictures the reconstruction is probably incomplete, and below the second broken.
-const FEW_REGISTERED: [f64; 2] = [0.9, 0.7];
+const BESIDE: [&str; 2] = [SPARSE, NESTED];
+/// Names of folders between a capture's folder and a model's files, besides numbers.
+const MODEL_FOLDERS: [&str; 5] = [SPARSE, MULTIVIEW, "colmap", "distorted", "undistorted"];
 /// Mean reprojection error above which poses blur the result, pixels.
 const LARGE_ERROR: f64 = 1.5;
 
-/// Reads the reconstruction below `marker` (the folder `sparse`) with the most pictures.
+/// Reads the reconstruction at `marker`: a folder with models, of which the one with most images is taken, or a model's
+/// own file.
 pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
     let fps = options.fps.unwrap_or(DEFAULT_FPS);
-    let mut warnings = Vec::new();
-    let (folder, registered) = best_model(marker, &mut warnings)?;
+    let (mut warnings, mut notes, mut account) = (Vec::new(), Vec::new(), Account::default());
+    let models = if marker.is_file() { marker.parent().unwrap_or(root) } else { marker };
+    let root = &capture_folder(models);
+    let lookup = Lookup::new(root, options)?;
+    let (folder, registered) = best_model(models, &mut warnings)?;
     let points = colmap_files::points(&folder)?;
-    let base = image_folder(root, &registered);
-    let mut shots = sources(&folder, &registered)?;
-    let listed = shots.len();
-    add_siblings(&base, &mut shots);
-    if shots.len() == listed {
-        check_registration(&base, &registered, &mut warnings);
+    let mut shots = sources(&folder, &registered, options.poses)?;
+    let of_rig = multiview::rename(root, &mut shots, &mut account);
+    let names: Vec<&str> = shots.iter().map(|(name, _)| name.as_str()).collect();
+    let base = if of_rig { root.clone() } else { lookup.folder_of(&names) };
+    let mut files = files(&lookup, &base, &names)?;
+    // Names tell cameras apart by forward slashes.
+    shots.iter_mut().for_each(|(name, _)| *name = name.replace('\\', "/"));
+    if !of_rig {
+        unregistered::settle(&base, &mut shots, &mut files, options, &mut account);
     }
     check_errors(&points, &mut warnings);
     let names: Vec<&str> = shots.iter().map(|(name, _)| name.as_str()).collect();
     let poses: Vec<Se3> = shots.iter().map(|(_, source)| source.cam_from_world).collect();
-    let mut notes = Vec::new();
     let order = sequence::order(&names, &poses, options.sequence, fps, &mut warnings, &mut notes);
     let mut frames: Vec<RawFrame> = shots
         .iter()
+        .zip(files)
         .zip(&order.frames)
-        .map(|((name, source), &(camera, index, time))| RawFrame {
+        .map(|(((_, source), image), &(camera, index, time))| RawFrame {
             camera,
             source: source.clone(),
             time,
             index,
-            image: base.join(name),
-            mask: mask_of(root, name),
+            image,
+            mask: None,
             depth: None,
             flow: None,
             labels: None,
@@ -59,6 +76,8 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         })
         .collect();
     frames.sort_by(|a, b| (a.camera, a.index, &a.image).cmp(&(b.camera, b.index, &b.image)));
+    lookup.tell(&mut account);
+    let cloud = cloud(&points);
     Ok(Take {
         name: None,
         root: root.to_path_buf(),
@@ -70,20 +89,66 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         timing: order.timing,
         hold_out: None,
         fps,
-        points: cloud(&points),
+        points: if cloud.is_some() { cloud } else { multiview::points(root)? },
         background: None,
         up: None,
         labels: Vec::new(),
         warnings,
         notes,
+        account,
+        convention: Convention::COLMAP,
     })
+}
+
+/// The capture's folder of a model: the nearest one with images, of itself and those above while they are named as folders
+/// of models are.
+fn capture_folder(models: &Path) -> PathBuf {
+    let has_images = |folder: &Path| {
+        let below = rig::file_names(folder).iter().any(|n| lookup::is_image_folder(n) && folder.join(n).is_dir());
+        below || !rig::image_names(folder).is_empty() || multiview::applies(folder)
+    };
+    let mut folder = models.to_path_buf();
+    loop {
+        if has_images(&folder) {
+            return folder;
+        }
+        let name = folder.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let of_models = MODEL_FOLDERS.contains(&name.as_str()) || name.parse::<u32>().is_ok();
+        if folder != models && !of_models {
+            return folder;
+        }
+        folder = match folder.parent() {
+            Some(above) if !above.as_os_str().is_empty() => above.to_path_buf(),
+            Some(_) if folder.is_relative() && folder != Path::new(".") => PathBuf::from("."),
+            _ => return folder,
+        };
+    }
+}
+
+/// The image of every shot, or where it should be.
+fn files(lookup: &Lookup, base: &Path, names: &[&str]) -> Result<Vec<PathBuf>> {
+    let bases = [base.to_path_buf()];
+    let found: Vec<Option<PathBuf>> = names.iter().map(|name| lookup.image(&bases, name)).collect::<Result<_>>()?;
+    if found.iter().all(Option::is_none) && lookup::is_reduced(base) {
+        // LLFF's reduced copies are numbered anew, in the order of the originals.
+        let images = rig::image_names(base);
+        if images.len() == names.len() {
+            let mut order: Vec<usize> = (0..names.len()).collect();
+            order.sort_by_key(|&i| names[i]);
+            let mut out = vec![PathBuf::new(); names.len()];
+            order.into_iter().zip(images).for_each(|(i, image)| out[i] = base.join(image));
+            return Ok(out);
+        }
+    }
+    let place = |(found, name): (Option<PathBuf>, &&str)| found.unwrap_or_else(|| base.join(name));
+    Ok(found.into_iter().zip(names).map(place).collect())
 }
 
 /// A picture's name and its camera.
 pub(super) type Shot = (String, Camera);
 
 /// Name and camera of every registered picture.
-fn sources(folder: &Path, registered: &[Registered]) -> Result<Vec<Shot>> {
+fn sources(folder: &Path, registered: &[Registered], poses: Poses) -> Result<Vec<Shot>> {
     let optics = colmap_files::cameras(folder)?;
     let mut shots = Vec::with_capacity(registered.len());
     for picture in registered {
@@ -92,7 +157,7 @@ fn sources(folder: &Path, registered: &[Registered]) -> Result<Vec<Shot>> {
             place(Error::input(format!("its camera {} is not in the cameras file", picture.camera)))
                 .remedy("Export the reconstruction again.")
         })?;
-        let cam_from_world = pose_of(picture).map_err(place)?;
+        let cam_from_world = pose_of(picture).and_then(|p| Convention::COLMAP.read_as(p, poses)).map_err(place)?;
         let source = Camera {
             cam_from_world,
             intrinsics: camera.intrinsics,
@@ -109,12 +174,22 @@ fn sources(folder: &Path, registered: &[Registered]) -> Result<Vec<Shot>> {
 /// The registered pictures of the largest model in a folder, and its points; no picture is looked at.
 pub(super) fn shots(folder: &Path) -> Result<(Vec<Shot>, Option<PointCloud>)> {
     let (folder, registered) = best_model(folder, &mut Vec::new())?;
-    Ok((sources(&folder, &registered)?, cloud(&colmap_files::points(&folder)?)))
+    Ok((sources(&folder, &registered, Poses::STATED)?, cloud(&colmap_files::points(&folder)?)))
 }
 
 /// Whether a folder is a model, or holds some.
 pub(super) fn is_model(folder: &Path) -> bool {
     has_cameras(folder) || rig::file_names(folder).iter().any(|n| has_cameras(&folder.join(n)))
+}
+
+/// Whether a marker of models is one: a folder that holds some, or a model's file with the other two.
+pub(super) fn is_marker(marker: &Path) -> bool {
+    let with_images = |folder: &Path| ["images.bin", "images.txt"].iter().any(|n| folder.join(n).is_file());
+    match marker.is_file() {
+        true => marker.parent().is_some_and(with_images),
+        // An empty `sparse` is said to be empty.
+        false => true,
+    }
 }
 
 fn has_cameras(folder: &Path) -> bool {
@@ -155,51 +230,6 @@ fn pose_of(picture: &Registered) -> Result<Se3> {
             .remedy("Reconstruct again, or remove that picture."));
     }
     Ok(Se3 { rotation: quat::to_rotation(unit), translation: picture.translation })
-}
-
-/// `images/`, unless the pictures lie elsewhere.
-fn image_folder(root: &Path, registered: &[Registered]) -> PathBuf {
-    let Some(first) = registered.first() else { return root.join("images") };
-    let folders = ["images", "input", "."].map(|f| root.join(f));
-    let found = folders.iter().find(|f| f.join(&first.name).is_file());
-    found.unwrap_or(&folders[0]).clone()
-}
-
-/// Where every camera has exactly one registered picture, adds the other pictures of its folder (or, for `cam_frameN`,
-/// of its prefix).
-fn add_siblings(base: &Path, shots: &mut Vec<(String, Camera)>) {
-    let names: Vec<&str> = shots.iter().map(|(n, _)| n.as_str()).collect();
-    let naming = rig::naming(&names);
-    if !naming.told || naming.cameras.len() != shots.len() {
-        return;
-    }
-    let mut listings: BTreeMap<String, Vec<String>> = BTreeMap::new();
-    let registered = shots.clone();
-    for (i, (name, source)) in registered.iter().enumerate() {
-        let folder = name.rsplit_once('/').map_or("", |(folder, _)| folder);
-        let listing = listings.entry(folder.to_string()).or_insert_with(|| rig::image_names(&base.join(folder)));
-        let camera = &naming.cameras[naming.frames[i].0];
-        for file in listing {
-            let path = if folder.is_empty() { file.clone() } else { format!("{folder}/{file}") };
-            let same = rig::naming(&[&path]);
-            if path != *name && same.told && same.cameras[0] == *camera {
-                shots.push((path, source.clone()));
-            }
-        }
-    }
-}
-
-/// Warns where pictures on disk were not registered.
-fn check_registration(base: &Path, registered: &[Registered], warnings: &mut Vec<String>) {
-    let folders: BTreeSet<&str> = registered.iter().map(|r| r.name.rsplit_once('/').map_or("", |(f, _)| f)).collect();
-    let on_disk: usize = folders.iter().map(|f| rig::image_names(&base.join(f)).len()).sum();
-    let part = registered.len() as f64 / on_disk.max(1) as f64;
-    if part >= FEW_REGISTERED[0] {
-        return;
-    }
-    let advice =
-        if part < FEW_REGISTERED[1] { "the reconstruction is probably broken" } else { "parts may be missing" };
-    warnings.push(format!("COLMAP registered only {} of {on_disk} pictures: {advice}.", registered.len()));
 }
 
 fn check_errors(points: &[Point], warnings: &mut Vec<String>) {
@@ -259,11 +289,4 @@ fn cloud(points: &[Point]) -> Option<PointCloud> {
         cloud.push(point.position, point.color.map(|v| f32::from(v) / 255.0), None);
     }
     (!cloud.points.is_empty()).then_some(cloud)
-}
-
-/// `masks/name.jpg.png` (COLMAP's habit) or `masks/name.png`.
-fn mask_of(root: &Path, name: &str) -> Option<PathBuf> {
-    let masks = root.join("masks");
-    let appended = masks.join(format!("{name}.png"));
-    [appended, masks.join(name).with_extension("png")].into_iter().find(|p| p.is_file())
 }

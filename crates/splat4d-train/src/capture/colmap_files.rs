@@ -1,5 +1,6 @@
 //! COLMAP's three files, binary and text. Counts are compared with the file's length before anything is reserved.
 
+use crate::text;
 use splat4d::scene::{Intrinsics, Lens};
 use splat4d::{Error, ErrorKind, Result};
 use std::collections::BTreeMap;
@@ -174,11 +175,7 @@ fn load<T>(folder: &Path, stem: &str, bin: fn(&[u8]) -> Result<T>, txt: fn(&str)
     let (binary, text) = (folder.join(format!("{stem}.bin")), folder.join(format!("{stem}.txt")));
     let path = if binary.is_file() { &binary } else { &text };
     let bytes = read_bytes(path)?;
-    let read = if path == &binary {
-        bin(&bytes)
-    } else {
-        std::str::from_utf8(&bytes).map_err(|_| Error::input("the file is no text")).and_then(txt)
-    };
+    let read = if path == &binary { bin(&bytes) } else { text::decode(&bytes).and_then(|text| txt(&text)) };
     read.map_err(|e| e.at(path.display()).remedy("Export the reconstruction again (colmap model_converter)."))
 }
 
@@ -263,7 +260,7 @@ fn cameras_txt(text: &str) -> Result<BTreeMap<u32, Optics>> {
 
 fn images_txt(text: &str) -> Result<Vec<Registered>> {
     let mut images = Vec::new();
-    let mut lines = lines(text);
+    let mut lines = lines(text).peekable();
     while let Some((line, text)) = lines.next() {
         if text.is_empty() {
             continue;
@@ -274,10 +271,17 @@ fn images_txt(text: &str) -> Result<Vec<Registered>> {
         let camera = word(&mut words, line, "camera id")?;
         let name: String = word(&mut words, line, "picture name")?;
         images.push(Registered { quat, translation, camera, name: name.trim().to_string() });
-        // The picture's 2D points follow on a line of their own, which may be empty.
-        lines.next();
+        // The image's 2D points follow on a line of their own, which may be empty. Scripts that have poses only leave it out.
+        lines.next_if(|(_, next)| !is_image_line(next));
     }
     Ok(images)
+}
+
+/// Whether a line of `images.txt` is an image's, not one of 2D points: its tenth word is a name, and no number.
+fn is_image_line(text: &str) -> bool {
+    let mut words = text.split_ascii_whitespace();
+    let numbers = words.by_ref().take(9).filter(|w| w.parse::<f64>().is_ok()).count();
+    numbers == 9 && words.next().is_some_and(|name| name.parse::<f64>().is_err())
 }
 
 fn points_txt(text: &str) -> Result<Vec<Point>> {

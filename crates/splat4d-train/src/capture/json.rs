@@ -1,6 +1,8 @@
 //! JSON with named places: every error says which key of which file is wrong and, for a misspelt key, what was meant.
 
 use crate::files;
+use super::convention::Poses;
+use crate::text;
 use serde_json::Value;
 use splat4d::{Error, Result};
 use std::path::Path;
@@ -22,8 +24,8 @@ pub(super) fn read_bytes(path: &Path) -> Result<Vec<u8>> {
 /// Reads and parses a JSON file.
 pub(super) fn read(path: &Path) -> Result<Value> {
     let bytes = read_bytes(path)?;
-    serde_json::from_slice(&bytes).map_err(|e| {
-        let text = String::from_utf8_lossy(&bytes);
+    let text = text::decode(&bytes).map_err(|e| e.at(path.display()))?;
+    serde_json::from_str(&text).map_err(|e| {
         let remedy = if ["NaN", "Infinity"].iter().any(|word| text.contains(word)) {
             "It holds NaN or Infinity, which JSON does not know: calibrate that camera again or leave it out."
         } else if e.is_eof() {
@@ -144,14 +146,28 @@ impl<'a> Node<'a> {
 
     /// A 4x4 matrix, or the upper 3x4 of one.
     pub(crate) fn matrix4(&self) -> Result<[[f64; 4]; 4]> {
-        let rows = self.rows::<4>(3..=4)?;
-        let last = rows.get(3).copied().unwrap_or([0.0, 0.0, 0.0, 1.0]);
-        if last != [0.0, 0.0, 0.0, 1.0] {
-            return Err(self
-                .error("the last row of the pose is not 0 0 0 1")
-                .remedy("Write poses row by row: a transposed matrix has its translation there."));
+        self.pose4(Poses::STATED)
+    }
+
+    /// The matrix of a pose. One that is written column by column has its translation in the last row: it is moved to the
+    /// last column where `poses` say so, which leaves the rotation transposed.
+    pub(crate) fn pose4(&self, poses: Poses) -> Result<[[f64; 4]; 4]> {
+        const LAST: [f64; 4] = [0.0, 0.0, 0.0, 1.0];
+        let mut rows = self.rows::<4>(3..=4)?;
+        if rows.get(3).is_some_and(|last| *last != LAST) {
+            let by_columns = (0..4).all(|i| rows[i][3] == LAST[i]);
+            if !(by_columns && poses.transposed) {
+                let error = self.error("the last row of the pose is not 0 0 0 1");
+                return Err(error.remedy(match by_columns {
+                    true => {
+                        "It is written column by column, with its translation in the last row: say --poses transposed."
+                    }
+                    false => "Write poses row by row: a transposed matrix has its translation there.",
+                }));
+            }
+            (0..3).for_each(|i| rows[i][3] = rows[3][i]);
         }
-        Ok([rows[0], rows[1], rows[2], last])
+        Ok([rows[0], rows[1], rows[2], LAST])
     }
 
     /// An error for every key that is not in `known`, with the nearest known one.

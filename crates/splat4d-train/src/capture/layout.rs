@@ -17,7 +17,14 @@ const READERS: &[(&str, Reader)] = &[
     (nerfies::MARKER, nerfies::read),
     (BOUNDS, n3dv::read),
     (colmap::SPARSE, colmap::read),
+    (colmap::NESTED, colmap::read),
+    (colmap::MULTIVIEW, colmap::read),
+    ("cameras.bin", colmap::read),
+    ("cameras.txt", colmap::read),
 ];
+
+/// Markers of COLMAP models; poses of another layout use them for their points.
+const MODELS: &[&str] = &[colmap::SPARSE, colmap::NESTED, colmap::MULTIVIEW, "cameras.bin", "cameras.txt"];
 
 /// N3DV's marker, which single-camera LLFF folders have too.
 const BOUNDS: &str = "poses_bounds.npy";
@@ -43,24 +50,29 @@ pub(super) fn read(path: &Path, options: &CaptureOptions) -> Result<Take> {
         let (_, reader) = known.ok_or_else(|| unknown_layout(root, path))?;
         return reader(root, path, options);
     }
+    // The folder of models itself (`sparse`), or one of them with numbered folders.
+    if MODELS[..3].iter().any(|name| path.ends_with(name)) && colmap::is_model(path) {
+        return colmap::read(path, path, options);
+    }
     let there: Vec<&(&str, Reader)> = READERS.iter().filter(|(marker, _)| is_there(path, marker)).collect();
     let Some(((marker, reader), others)) = there.split_first() else {
-        let model = path.ancestors().take(2).find(|p| p.file_name().is_some_and(|name| name == colmap::SPARSE));
-        let sparse = model.filter(|_| colmap::is_model(path)).ok_or_else(|| unknown_layout(path, path))?;
-        return colmap::read(sparse.parent().unwrap_or(Path::new(".")), sparse, options);
+        return Err(unknown_layout(path, path));
     };
     let mut take = reader(path, &path.join(marker), options)?;
-    let others: Vec<&str> = others.iter().map(|(marker, _)| *marker).collect();
+    // Of several models the first is the capture's.
+    let models = |m: &&str| MODELS.contains(m) && MODELS.contains(marker);
+    let others: Vec<&str> = others.iter().map(|(marker, _)| *marker).filter(|m| !models(m)).collect();
     remark(&mut take, path, marker, &others);
     Ok(take)
 }
 
 fn is_there(path: &Path, marker: &str) -> bool {
-    // A single camera's LLFF folder is read from its COLMAP model.
-    let llff = || path.join(colmap::SPARSE).is_dir() && !n3dv::applies(path);
+    // A single camera's LLFF folder (LLFF, Mip-NeRF 360) is read from its COLMAP model.
+    let llff = || MODELS.iter().any(|model| path.join(model).exists()) && !n3dv::applies(path);
     // Others call their files so too.
     let foreign = marker == nerfies::MARKER && !nerfies::applies(path);
-    path.join(marker).exists() && !(marker == BOUNDS && llff()) && !foreign
+    let model = !MODELS.contains(&marker) || colmap::is_marker(&path.join(marker));
+    path.join(marker).exists() && !(marker == BOUNDS && llff()) && !foreign && model
 }
 
 /// Says which of several layouts was read, why, and how to choose another.
@@ -69,7 +81,7 @@ fn remark(take: &mut Take, path: &Path, marker: &str, others: &[&str]) {
     let family = [transforms::TRAIN, transforms::ALL];
     let (same, foreign): (Vec<&str>, Vec<&str>) = others
         .iter()
-        .filter(|other| !(family.contains(&marker) && **other == colmap::SPARSE))
+        .filter(|other| !(family.contains(&marker) && MODELS.contains(other)))
         .partition(|other| family.contains(&marker) && family.contains(other));
     let list = |names: &[&str]| names.join(", ");
     let choose = |other: &str| format!("To read another, give its path: {}.", path.join(other).display());

@@ -6,11 +6,14 @@
 //! [`ImageStore`] decodes on demand within a byte budget. Every reader produces a `Take` (what the files say) and
 //! `assemble` alone turns takes into captures, so that all layouts are checked alike.
 
+mod account;
 mod assemble;
 mod beside;
 mod colmap;
 mod colmap_files;
+mod convention;
 mod depth;
+mod evidence;
 mod exr;
 pub(crate) mod features;
 pub(crate) mod flow;
@@ -19,6 +22,9 @@ mod json;
 pub(crate) mod labels;
 mod layout;
 mod lens;
+mod llff;
+mod lookup;
+mod masks;
 mod n3dv;
 mod nerfies;
 mod observe;
@@ -37,10 +43,15 @@ mod store;
 mod tracks;
 mod transforms;
 
+pub use account::{Aspect, Remark};
+pub use convention::{Convention, Poses};
 pub use depth::{DepthFile, DepthKind};
+pub use evidence::PoseCheck;
 pub(crate) use flow::{FlowFile, to_picture as flow_picture};
 pub use lens::Distortion;
-pub use options::{CaptureOptions, CaptureSettings, FlowSource, HoldOut, MAX_POINTS, Sequence};
+pub use options::{
+    CaptureOptions, CaptureSettings, Exif, FlowSource, HoldOut, MAX_POINTS, Sequence, Text, Times, Unregistered,
+};
 pub use points::PointCloud;
 pub use posed::{PosedCamera, check_intrinsics, colmap_cameras, is_colmap, rigid, transforms_cameras};
 pub use preflight::{Finding, Reach, Severity};
@@ -49,6 +60,7 @@ pub use sequence::Timing;
 pub use store::{ImageStore, Picture, StoredPicture};
 pub use tracks::Tracks;
 
+use account::Account;
 use splat4d::Result;
 use splat4d::math::se3::{norm, sub};
 use splat4d::scene::{Camera, Time};
@@ -72,6 +84,8 @@ pub enum CaptureKind {
     Colmap,
     /// N3DV: `poses_bounds.npy` and a folder of frames per camera.
     N3dv,
+    /// LLFF: `poses_bounds.npy` and one folder of images.
+    Llff,
     /// Nerfies and HyperNeRF: `dataset.json`, `metadata.json` and a camera file a picture.
     Nerfies,
 }
@@ -92,6 +106,8 @@ pub struct Frame {
     pub index: usize,
     /// The picture file.
     pub image: PathBuf,
+    /// Whether its EXIF orientation is applied; else its camera describes the pixels as stored.
+    pub upright: bool,
     /// The foreground mask file (white = foreground).
     pub mask: Option<PathBuf>,
     /// How far away what its pixels show is.
@@ -193,6 +209,12 @@ pub struct Capture {
     pub labels: Vec<String>,
     /// The k of [`CaptureOptions::downscale`].
     pub downscale: usize,
+    /// What the layout says that poses are.
+    pub convention: Convention,
+    /// What they were read as instead.
+    pub poses: Poses,
+    /// What was not found, not read or assumed.
+    pub account: Vec<Remark>,
     /// The reader's warnings, a sentence or two each.
     pub warnings: Vec<String>,
     /// What the reader chose or assumed that is no cause for worry, a sentence or two each.
@@ -220,6 +242,9 @@ struct Take {
     labels: Vec<String>,
     warnings: Vec<String>,
     notes: Vec<String>,
+    account: Account,
+    /// What the layout says that poses are.
+    convention: Convention,
 }
 
 /// A frame as a reader found it.

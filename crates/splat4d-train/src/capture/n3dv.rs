@@ -1,14 +1,18 @@
 //! N3DV captures (Li 2022): `poses_bounds.npy`, one row per camera, and a folder of frames per camera.
 
+use super::account::{Account, Aspect, first_names};
+use super::convention::{Convention, Poses};
 use super::layout::{ffmpeg_command, videos};
 use super::points::read_ply;
-use super::{CaptureKind, CaptureOptions, Extent, RawFrame, Split, Take, Timing};
-use super::{json, picture, pose, rig};
+use super::preflight::Severity;
+use super::{CaptureKind, CaptureOptions, Extent, PointCloud, RawFrame, Split, Take, Timing};
+use super::{json, llff, picture, pose, rig, sequence};
 use splat4d::format::npy::Npy;
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::scene::{Camera, Intrinsics, Lens};
 use splat4d::{Error, Result};
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 /// Values of a row: a 3x5 matrix [down | right | back | centre | height, width, focal], then near and far (LLFF).
@@ -29,29 +33,45 @@ pub(super) fn applies(root: &Path) -> bool {
     !folders(root).is_empty() || !videos(root).is_empty()
 }
 
-/// Reads poses and frame folders; the first camera is held out.
-pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
-    let fps = options.fps.unwrap_or(DEFAULT_FPS);
+/// The rows of `poses_bounds.npy`.
+pub(super) fn rows(marker: &Path) -> Result<Vec<Vec<f64>>> {
     let place = |e: Error| e.at(marker.display());
     let array = Npy::read(&json::read_bytes(marker)?).map_err(place)?;
-    let rows = match array.shape[..] {
-        [n, ROW] => n,
+    match array.shape[..] {
+        [_, ROW] => Ok(array.to_f64().chunks_exact(ROW).map(<[f64]>::to_vec).collect()),
         _ => {
             let what = format!("expected an array of shape [cameras, {ROW}], found {:?}", array.shape);
-            return Err(place(Error::input(what).remedy("Save it as LLFF's imgs2poses does.")));
+            Err(place(Error::input(what).remedy("Save it as LLFF's imgs2poses does.")))
         }
-    };
+    }
+}
+
+/// The cloud that prepared data sets keep beside the poses.
+pub(super) fn points(root: &Path) -> Result<Option<PointCloud>> {
+    POINTS.iter().map(|name| root.join(name)).find(|p| p.is_file()).map(|p| read_ply(&p)).transpose()
+}
+
+/// Reads poses and frame folders; the first camera is held out. Without such folders it is LLFF's layout.
+pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
+    if !applies(root) {
+        return llff::read(root, marker, options);
+    }
+    let fps = options.fps.unwrap_or(DEFAULT_FPS);
+    let place = |e: Error| e.at(marker.display());
+    let rows = rows(marker)?;
     let folders = folders(root);
     let films = videos(root);
-    if folders.len() != rows {
-        return Err(place(mismatch(rows, &folders, &films)));
+    if folders.len() != rows.len() {
+        return Err(place(mismatch(rows.len(), &folders, &films)));
     }
+    let mut account = Account::default();
+    let numbers = numbers(&folders, &mut account);
     let mut frames = Vec::new();
-    for (camera, (folder, row)) in folders.iter().zip(array.to_f64().chunks_exact(ROW)).enumerate() {
+    for (camera, (folder, row)) in folders.iter().zip(&rows).enumerate() {
         let in_row = |e: Error| e.at(format!("{} row {camera} (camera {})", marker.display(), folder.name));
         let header = picture::header(&folder.images[0])?;
-        let source = camera_of(row, header.width, header.height).map_err(in_row)?;
-        for (index, image) in folder.images.iter().enumerate() {
+        let source = camera_of(row, header.stored, options.poses).map_err(in_row)?;
+        for (&index, image) in numbers[camera].iter().zip(&folder.images) {
             frames.push(RawFrame {
                 camera,
                 source: source.clone(),
@@ -64,11 +84,10 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
                 labels: None,
                 features: None,
                 tracks: None,
-                split: if camera == 0 && rows > 1 { Split::Held } else { Split::Train },
+                split: if camera == 0 && rows.len() > 1 { Split::Held } else { Split::Train },
             });
         }
     }
-    let points = POINTS.iter().map(|name| root.join(name)).find(|p| p.is_file());
     Ok(Take {
         name: None,
         root: root.to_path_buf(),
@@ -80,13 +99,50 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         timing: Timing::Told,
         hold_out: None,
         fps,
-        points: points.map(|p| read_ply(&p)).transpose()?,
+        points: points(root)?,
         background: None,
         up: None,
         labels: Vec::new(),
         warnings: Vec::new(),
         notes: Vec::new(),
+        account,
+        convention: Convention::NERF,
     })
+}
+
+/// The frame numbers of every folder's images: as named, counted from the smallest of all, so that a lost frame does not
+/// shift those after it; else their order.
+fn numbers(folders: &[Folder], account: &mut Account) -> Vec<Vec<usize>> {
+    let named = |image: &PathBuf| rig::trailing_number(&image.file_name()?.to_string_lossy());
+    let told: Option<Vec<Vec<usize>>> =
+        folders.iter().map(|f| f.images.iter().map(named).collect::<Option<Vec<usize>>>()).collect();
+    let in_order = || folders.iter().map(|f| (0..f.images.len()).collect()).collect();
+    let Some(mut told) = told else { return in_order() };
+    let all: BTreeSet<usize> = told.iter().flatten().copied().collect();
+    let (Some(&first), Some(&last)) = (all.first(), all.last()) else { return in_order() };
+    // Cameras that number their frames apart, or share a number, say nothing of each other's time.
+    let apart = (0..told.len()).any(|c| {
+        let others: BTreeSet<usize> =
+            told.iter().enumerate().filter(|(k, _)| *k != c).flat_map(|(_, n)| n.clone()).collect();
+        let shared = told[c].iter().filter(|n| others.contains(n)).count();
+        told[c].windows(2).any(|w| w[0] == w[1]) || told.len() > 1 && 2 * shared < told[c].len()
+    });
+    if apart || last - first > rig::MAX_SPAN {
+        return in_order();
+    }
+    let lost: Vec<String> = (folders.iter().zip(&told))
+        .filter(|(_, numbers)| numbers.len() < all.len())
+        .map(|(f, numbers)| format!("{} ({})", f.name, all.len() - numbers.len()))
+        .collect();
+    if !lost.is_empty() {
+        let what = format!(
+            "Frames that other cameras have: {}. The others keep their times: names number frames {first} to {last}.",
+            first_names(&lost)
+        );
+        account.add(Aspect::NotFound, Severity::Warning, what);
+    }
+    told.iter_mut().flatten().for_each(|n| *n -= first);
+    told
 }
 
 fn mismatch(rows: usize, folders: &[Folder], films: &[String]) -> Error {
@@ -107,31 +163,42 @@ fn folders(root: &Path) -> Vec<Folder> {
     let within = |base: PathBuf| -> Vec<Folder> {
         let named = rig::file_names(&base).into_iter().filter_map(|name| {
             let folder = base.join(&name);
-            let plain = ["images", "masks", "sparse", "colmap"].contains(&name.as_str());
             let deeper = folder.join("images");
             let folder = if deeper.is_dir() { deeper } else { folder };
-            let mut images: Vec<String> = if plain { Vec::new() } else { rig::image_names(&folder) };
+            let mut images: Vec<String> = if is_other(&name) { Vec::new() } else { rig::image_names(&folder) };
             // 10.png follows 9.png, padded or not.
             images.sort_by_key(|n| (rig::trailing_number(n), n.clone()));
             let images: Vec<PathBuf> = images.iter().map(|n| folder.join(n)).collect();
             (!images.is_empty()).then_some(Folder { name, images })
         });
-        named.collect()
+        let mut found: Vec<Folder> = named.collect();
+        // Scripts leave folders of other images there; cameras are then those named so.
+        let camera = |f: &Folder| sequence::are_cameras(std::slice::from_ref(&f.name));
+        if found.iter().any(camera) {
+            found.retain(camera);
+        }
+        found
     };
     let (direct, inner) = (within(root.to_path_buf()), within(root.join("images")));
     if direct.len() >= inner.len() { direct } else { inner }
 }
 
-fn camera_of(row: &[f64], width: usize, height: usize) -> Result<Camera> {
+/// Whether a folder's images are not the frames of one camera.
+fn is_other(name: &str) -> bool {
+    ["masks", "mask", "depth", "sparse", "sparse_", "colmap", "image_colmap"].contains(&name) || rig::is_plain(name)
+}
+
+/// The camera of a row, for images of this size.
+pub(super) fn camera_of(row: &[f64], (width, height): (usize, usize), poses: Poses) -> Result<Camera> {
     let at = |r: usize, c: usize| row[5 * r + c];
     if row.iter().any(|v| !v.is_finite()) {
         return Err(Error::input("the pose holds NaN or infinity").remedy("Calibrate that camera again."));
     }
     let [stated_height, stated_width, focal] = [at(0, 4), at(1, 4), at(2, 4)];
-    // Right, down, forward from down, right, back.
-    let rotation = std::array::from_fn(|r| [at(r, 1), at(r, 0), -at(r, 2)]);
+    // Right, up, back (OpenGL's axes) from down, right, back.
+    let rotation = std::array::from_fn(|r| [at(r, 1), -at(r, 0), at(r, 2)]);
     let world_from_cam = Se3 { rotation, translation: std::array::from_fn(|r| at(r, 3)) };
-    let cam_from_world = pose::checked(world_from_cam)?.inverse();
+    let cam_from_world = Convention::NERF.read_as(pose::checked(world_from_cam)?, poses)?;
     let aspect = (width as f64 / height as f64) / (stated_width / stated_height);
     if aspect.is_nan() || (aspect - 1.0).abs() > MAX_ASPECT_CHANGE {
         let what = format!("the pose is for pictures of {stated_width}x{stated_height}, not {width}x{height}");

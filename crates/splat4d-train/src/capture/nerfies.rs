@@ -5,7 +5,11 @@
 //! `pixel_aspect_ratio`, `principal_point`, `radial_distortion`, `tangential_distortion` and `image_size` [width, height] of
 //! the pictures at 1x. `scene.json` brings the world to about a unit: x becomes (x − center)·scale, cameras and points alike.
 
+use super::account::{Account, Aspect, first_names};
+use super::convention::{Convention, Poses};
 use super::json::{self, Node};
+use super::lookup::Lookup;
+use super::preflight::Severity;
 use super::{CaptureKind, CaptureOptions, Extent, PointCloud, RawFrame, Split, Take, Timing, pose};
 use splat4d::format::npy::Npy;
 use splat4d::math::Se3;
@@ -20,8 +24,8 @@ pub(super) const MARKER: &str = "dataset.json";
 const METADATA: &str = "metadata.json";
 /// By how much the pictures of each folder are reduced, finest first.
 const SCALES: [usize; 5] = [1, 2, 4, 8, 16];
-/// Endings that pictures have.
-const ENDINGS: [&str; 3] = ["png", "jpg", "jpeg"];
+/// DyCheck's folder of split lists.
+const SPLITS: &str = "splits";
 /// Skew above this bends pictures visibly, and is not modelled, pixels.
 const MOST_SKEW: f64 = 0.5;
 /// Colour of points, which the layout gives none.
@@ -58,28 +62,71 @@ impl Framing {
     }
 }
 
+/// The lists of a capture's pictures: all of them, those to train on, those to hold out.
+struct Lists {
+    ids: Vec<String>,
+    train: Vec<String>,
+    held: Vec<String>,
+}
+
+impl Lists {
+    /// From `dataset.json`, and DyCheck's `splits/train.json` and `splits/val.json`, which go first.
+    fn read(root: &Path, marker: &Path, account: &mut Account) -> Result<Self> {
+        let list = |path: &Path, key: &str| -> Result<Vec<String>> {
+            let value = json::read(path)?;
+            let names = |n: Node<'_>| n.list()?.iter().map(|n| n.text().map(str::to_owned)).collect();
+            Node::root(&value).opt(key)?.map_or(Ok(Vec::new()), names).map_err(|e: Error| e.at(path.display()))
+        };
+        let split = |name: &str, key: &str| -> Result<Vec<String>> {
+            let path = root.join(SPLITS).join(format!("{name}.json"));
+            if path.is_file() { list(&path, "frame_names") } else { list(marker, key) }
+        };
+        let mut ids = list(marker, "ids")?;
+        let (train, held) = (split("train", "train_ids")?, split("val", "val_ids")?);
+        if ids.is_empty() {
+            // HyperNeRF's own scenes, and others', list splits alone.
+            ids = train.iter().chain(&held).cloned().collect::<BTreeSet<_>>().into_iter().collect();
+        }
+        let known: BTreeSet<&String> = ids.iter().collect();
+        let lost: Vec<&String> = train.iter().chain(&held).filter(|id| !known.contains(id)).collect();
+        if !lost.is_empty() {
+            let name = marker.file_name().unwrap_or_default().to_string_lossy();
+            let names = first_names(&lost);
+            let what = format!("{} names of the split lists are not among the ids of {name}: {names}.", lost.len());
+            account.add(Aspect::NotFound, Severity::Warning, what);
+        }
+        Ok(Self { ids, train, held })
+    }
+}
+
+/// The frame rate of DyCheck's captures.
+fn stated_rate(root: &Path) -> Result<Option<f64>> {
+    let path = root.join("extra.json");
+    if !path.is_file() {
+        return Ok(None);
+    }
+    let value = json::read(&path)?;
+    let fps = Node::root(&value).opt("fps")?.map(|n| n.number()).transpose().map_err(|e| e.at(path.display()))?;
+    if let Some(fps) = fps {
+        super::options::check_rate("frame rate", fps).map_err(|e| e.at(path.display()))?;
+    }
+    Ok(fps)
+}
+
 /// Reads a capture.
 pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
-    let fps = options.fps.unwrap_or(DEFAULT_FPS);
-    let value = json::read(marker)?;
-    let top = Node::root(&value);
-    let list = |key: &str| -> Result<Vec<String>> {
-        let names = |n: Node<'_>| n.list()?.iter().map(|n| n.text().map(str::to_owned)).collect();
-        top.opt(key)?.map_or(Ok(Vec::new()), names).map_err(|e: Error| e.at(marker.display()))
-    };
-    let (ids, train, held) = (list("ids")?, list("train_ids")?, list("val_ids")?);
-    let known: BTreeSet<&String> = ids.iter().collect();
-    if let Some(other) = train.iter().chain(&held).find(|id| !known.contains(id)) {
-        return Err(Error::input(format!("\"{other:.80}\" is to be trained or held out, and not among \"ids\""))
-            .at(marker.display())
-            .remedy("List every picture in \"ids\"."));
-    }
+    let lookup = Lookup::new(root, options)?;
+    let mut account = Account::default();
+    let stated = stated_rate(root)?;
+    let fps = options.fps.or(stated).unwrap_or(DEFAULT_FPS);
+    let Lists { ids, train, held } = Lists::read(root, marker, &mut account)?;
     let framing = Framing::read(root)?;
     let path = root.join(METADATA);
     let metadata = json::read(&path)?;
     let about = Node::root(&metadata);
     let [for_train, for_held]: [BTreeSet<&String>; 2] = [&train, &held].map(|l| l.iter().collect());
-    let (folder, smaller) = pictures(root)?;
+    let (folder, smaller) = pictures(root, options)?;
+    let folders = [folder];
     let (mut frames, mut cameras) = (Vec::new(), Vec::<u64>::new());
     let mut left_out = 0;
     for id in &ids {
@@ -112,9 +159,9 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         });
         let file = root.join("camera").join(format!("{id}.json"));
         let value = json::read(&file)?;
-        let source = camera_of(&Node::root(&value), &framing).map_err(|e| e.at(file.display()))?.downscaled(smaller);
-        let image = ENDINGS.iter().map(|e| folder.join(format!("{id}.{e}"))).find(|p| p.is_file());
-        let image = image.unwrap_or_else(|| folder.join(format!("{id}.png")));
+        let source = camera_of(&Node::root(&value), &framing, options.poses);
+        let source = source.map_err(|e| e.at(file.display()))?.downscaled(smaller);
+        let image = lookup.image(&folders, id)?.unwrap_or_else(|| folders[0].join(format!("{id}.png")));
         let time = index as f64 / fps;
         frames.push(RawFrame {
             camera,
@@ -131,11 +178,21 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
             split,
         });
     }
-    let mut notes =
-        vec![format!("The layout states no frame rate: {fps} pictures a second of each camera are taken for it.")];
+    let last = frames.iter().map(|f| f.index).max().unwrap_or(0);
+    let first = frames.iter().map(|f| f.index).min().unwrap_or(0);
+    let length = (last - first) as f64 / fps;
+    let rate = match (options.fps, stated) {
+        (None, None) => format!("The layout states no frame rate: frames {first} to {last} at {fps} a second"),
+        (None, Some(_)) => format!("Frames {first} to {last} at the {fps} a second of extra.json"),
+        (Some(_), _) => format!("Frames {first} to {last} at {fps} a second, as told"),
+    };
+    account.add(Aspect::Assumed, Severity::Note, format!("{rate}: {length:.3} s."));
     if left_out > 0 {
-        notes.push(format!("{left_out} pictures are neither trained on nor held out by dataset.json, and left out."));
+        let what =
+            format!("{left_out} of {} images are neither trained on nor held out by the split lists.", ids.len());
+        account.add(Aspect::NotRead, Severity::Note, what);
     }
+    lookup.tell(&mut account);
     let named = cameras.len() > 1;
     Ok(Take {
         name: None,
@@ -153,12 +210,18 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         up: None,
         labels: Vec::new(),
         warnings: Vec::new(),
-        notes,
+        notes: Vec::new(),
+        account,
+        convention: Convention::NERFIES,
     })
 }
 
 /// The finest folder of pictures, and by how much they are reduced. Errors: there is none.
-fn pictures(root: &Path) -> Result<(PathBuf, usize)> {
+fn pictures(root: &Path, options: &CaptureOptions) -> Result<(PathBuf, usize)> {
+    if let Some(name) = &options.images {
+        let smaller = Path::new(name).file_name().and_then(|n| n.to_str()?.strip_suffix('x')?.parse().ok());
+        return Ok((root.join(name), smaller.filter(|k| *k > 0).unwrap_or(1)));
+    }
     let all = SCALES.map(|k| (root.join("rgb").join(format!("{k}x")), k));
     all.into_iter().find(|(p, _)| p.is_dir()).ok_or_else(|| {
         Error::input("there are no pictures: none of 1x, 2x, 4x, 8x and 16x is there")
@@ -167,11 +230,15 @@ fn pictures(root: &Path) -> Result<(PathBuf, usize)> {
     })
 }
 
-fn camera_of(node: &Node<'_>, framing: &Framing) -> Result<Camera> {
+fn camera_of(node: &Node<'_>, framing: &Framing, poses: Poses) -> Result<Camera> {
     let rotation = node.get("orientation")?.matrix3()?;
     let center = framing.apply(node.get("position")?.numbers::<3>()?);
     let translation = std::array::from_fn(|r| -(0..3).map(|c| rotation[r][c] * center[c]).sum::<f64>());
-    let cam_from_world = pose::checked(Se3 { rotation, translation }).map_err(|e| node.at(e))?;
+    let stated = pose::checked(Se3 { rotation, translation }).map_err(|e| node.at(e))?;
+    let cam_from_world = match poses {
+        Poses::STATED => stated,
+        poses => Convention::NERFIES.reread(&stated, poses)?,
+    };
     let [width, height] = node.get("image_size")?.numbers::<2>()?;
     let [cx, cy] = node.get("principal_point")?.numbers::<2>()?;
     let focal = node.get("focal_length")?.number()?;

@@ -1,5 +1,6 @@
 //! Options of a capture besides where it lies.
 
+use super::convention::Poses;
 use crate::settings::{Value, choices, settings};
 use splat4d::{Error, Result};
 use std::ops::Range;
@@ -84,6 +85,44 @@ choices! {
 }
 
 choices! {
+    /// Whose pixels poses and intrinsics describe where images have an EXIF orientation.
+    pub enum Exif {
+        /// By the layout, else by the images' sizes.
+        Auto = "auto",
+        /// The pixels as stored; the orientation is not applied.
+        Stored = "stored",
+        /// The upright image; the orientation is applied.
+        Upright = "upright",
+    }
+}
+
+choices! {
+    /// What the times of a capture count.
+    pub enum Times {
+        /// As their range, steps and the images' names show.
+        Auto = "auto",
+        /// Seconds.
+        Seconds = "seconds",
+        /// Parts of the capture, from 0 to 1.
+        Fractions = "fractions",
+        /// Frame numbers.
+        Frames = "frames",
+    }
+}
+
+choices! {
+    /// What becomes of images without a pose of their own, whose camera has another image with one.
+    pub enum Unregistered {
+        /// They share that pose where names show a fixed rig (`cam00/0001.png`), else they are left out.
+        Auto = "auto",
+        /// They share the pose: cameras are fixed.
+        Share = "share",
+        /// They are left out.
+        Leave = "leave",
+    }
+}
+
+choices! {
     /// Where the optical flow of pictures is from.
     pub enum FlowSource {
         /// The capture's files; where it brings none there is none.
@@ -114,6 +153,20 @@ settings! {
         near: f64 = NEAR => below_one().unit("extents");
         /// Share of the used part of the clip that training may see; what comes later only scores predictions. 1: all.
         observe: f64 = 1.0 => share();
+        /// Folder of images, in place of the one that the capture names, such as "images_4"; empty: the capture's.
+        images: Text = Text::default();
+        /// What poses are written as where it is not what the layout states: opencv or opengl (camera axes), inverse,
+        /// transposed or xyzw (quaternions), joined by +; empty: as the layout states.
+        poses: Poses = Poses::STATED;
+        /// Pixels that poses describe where images have an EXIF orientation: stored, upright, or auto (as stored for
+        /// COLMAP, else by the sizes).
+        exif: Exif = Exif::Auto;
+        /// What times count: seconds, fractions (of the capture), frames, or auto (by their range, steps and names).
+        times: Times = Times::Auto;
+        /// Images without a pose whose camera has one: share it, leave them out, or auto (by names).
+        unregistered: Unregistered = Unregistered::Auto;
+        /// Share of the images that may be missing; they are skipped.
+        max_missing: f64 = MAX_MISSING => share();
         /// First frame of the take that is used.
         first_frame: usize = 0 => any().unit("frames");
         /// RGBA captures composite on white; false: on black.
@@ -142,9 +195,38 @@ pub struct CaptureOptions {
     /// How near to a camera splats are drawn, as a share of the cameras' extent; less where the capture's points come
     /// nearer, and a quarter of it where it has none.
     pub near: f64,
+    /// The folder of images below the capture's, in place of the one that the capture names.
+    pub images: Option<String>,
+    /// What poses are written as where it is not what the layout states.
+    pub poses: Poses,
+    /// Whose pixels poses and intrinsics describe.
+    pub exif: Exif,
+    /// What times count.
+    pub times: Times,
+    /// What becomes of images without a pose of their own.
+    pub unregistered: Unregistered,
+    /// Share of the images that may be missing.
+    pub max_missing: f64,
     /// Only pictures with these frame numbers are listed, so that memory does not grow with the take; empty: all. What they
     /// are for (training, held out) is what it is in the whole take.
     pub frames: Vec<Range<usize>>,
+}
+
+/// Share of the images that may be missing by default: a few were deleted; more is probably another folder.
+const MAX_MISSING: f64 = 0.2;
+
+/// A text of the recipe.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Text(pub String);
+
+impl Value for Text {
+    fn to_toml(&self) -> toml::Value {
+        toml::Value::String(self.0.clone())
+    }
+
+    fn from_toml(value: &toml::Value) -> std::result::Result<Self, String> {
+        value.as_str().map(|s| Self(s.to_owned())).ok_or_else(|| "a text".into())
+    }
 }
 
 /// Most points an initial cloud keeps by default.
@@ -161,6 +243,12 @@ impl Default for CaptureOptions {
             unit_time_seconds: None,
             max_points: MAX_POINTS,
             near: NEAR,
+            images: None,
+            poses: Poses::STATED,
+            exif: Exif::Auto,
+            times: Times::Auto,
+            unregistered: Unregistered::Auto,
+            max_missing: MAX_MISSING,
             frames: Vec::new(),
         }
     }

@@ -1,6 +1,9 @@
 //! Our own `capture.json`: what a user with a rig writes by hand. docs/capture-format.md is its specification.
 
+use super::account::Account;
+use super::convention::Convention;
 use super::json::{self, Node};
+use super::lookup::Lookup;
 use super::points::read_ply;
 use super::{
     CaptureKind, CaptureOptions, DepthFile, DepthKind, Extent, HoldOut, RawFrame, Split, Take, Timing, Tracks, pose,
@@ -59,6 +62,8 @@ const CAMERA_KEYS: &[&str] = &[
     "comment",
     "extra",
 ];
+/// Missing images of a camera from which a stated number of frames is doubted, if most are missing.
+const MOST_MISSING: usize = 100;
 /// Most digits that a pattern may pad to.
 const MAX_DIGITS: usize = 32;
 
@@ -94,18 +99,21 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<T
     let hold_out = top.opt("hold_out")?.map(|n| read_hold_out(&n)).transpose()?;
     let labels = top.opt("labels")?.map(|n| read_labels(&n)).transpose()?.unwrap_or_default();
     let nodes = top.get("cameras")?.list()?;
+    let lookup = Lookup::new(root, options)?;
+    let inverse = nodes.iter().any(|n| n.value.get("camera_to_world").is_some());
     let in_part = in_part(top, &nodes, options.hold_out.as_ref().or(hold_out.as_ref()), options)?;
     for node in nodes {
         let name = node.get("name")?.text()?.to_string();
         if cameras.contains(&name) {
             return Err(node.error(format!("the camera name \"{name:.80}\" is given twice")).remedy("Rename one."));
         }
-        let listed = in_part.then_some(options);
-        let context = Context { root, top, opengl, fps, camera: cameras.len(), listed };
+        let context = Context { root, top, opengl, fps, camera: cameras.len(), options, in_part, lookup: &lookup };
         let count = read_camera(&context, &node, &mut frames).map_err(|e| e.at(format!("camera {name:.80}")))?;
         take.add(0..count);
         cameras.push(name);
     }
+    let mut account = Account::default();
+    lookup.tell(&mut account);
     Ok(Take {
         name: top.opt("name")?.map(|n| n.text()).transpose()?.map(str::to_string),
         root: root.to_path_buf(),
@@ -117,12 +125,14 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<T
         timing: Timing::Told,
         hold_out,
         fps,
-        points: top.opt("points")?.map(|n| read_ply(&root.join(n.text()?))).transpose()?,
+        points: top.opt("points")?.map(|n| read_ply(&lookup.file(n.text()?)?)).transpose()?,
         background: read_background(top)?,
         up: top.opt("up")?.map(|n| n.numbers::<3>()).transpose()?,
         labels,
         warnings: Vec::new(),
         notes: Vec::new(),
+        account,
+        convention: Convention { world_to_camera: !inverse, opengl, quaternions: false },
     })
 }
 
@@ -187,8 +197,10 @@ struct Context<'a> {
     opengl: bool,
     fps: f64,
     camera: usize,
-    /// What of the take is listed; none: all.
-    listed: Option<&'a CaptureOptions>,
+    options: &'a CaptureOptions,
+    /// Whether only the part of the take that the options name is listed.
+    in_part: bool,
+    lookup: &'a Lookup,
 }
 
 impl Context<'_> {
@@ -199,19 +211,10 @@ impl Context<'_> {
     }
 
     fn pose(&self, node: &Node<'_>, inverted: bool) -> Result<Se3> {
-        let rows = node.matrix4()?;
-        let mut pose = pose::checked(Se3::from_rows(&rows)).map_err(|e| node.at(e))?;
-        if inverted {
-            pose = pose.inverse();
-        }
-        if self.opengl {
-            // The camera's y and z axes point the other way: rows of world-to-camera.
-            for i in [1, 2] {
-                pose.rotation[i] = pose.rotation[i].map(|v| -v);
-                pose.translation[i] = -pose.translation[i];
-            }
-        }
-        Ok(pose)
+        let rows = node.pose4(self.options.poses)?;
+        let pose = pose::checked(Se3::from_rows(&rows)).map_err(|e| node.at(e))?;
+        let stated = Convention { world_to_camera: !inverted, opengl: self.opengl, quaternions: false };
+        stated.read_as(pose, self.options.poses)
     }
 }
 
@@ -275,24 +278,37 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
             return Err(node.error(what).remedy("List one file per frame, or correct \"frames\"."));
         }
     }
-    let (first, mut there) = (frames.len(), 0);
+    let bases = context.lookup.bases();
+    let path = |files: &Option<Files>, index: usize| {
+        files.as_ref().map(|f| f.path(context.lookup, start, index)).transpose().map(Option::flatten)
+    };
+    let (first, mut there, mut missing) = (frames.len(), 0, 0);
     let most = if let Files::List(names) = &images { names.len() } else { usize::MAX };
     for index in 0..count.unwrap_or(most) {
-        let listed = context.listed.is_none_or(|o| o.lists(index));
+        let listed = !context.in_part || context.options.lists(index);
         let ends = count.is_none() && matches!(images, Files::Pattern { .. }) && index > 0;
         if !listed && !ends {
             there = index + 1;
             continue;
         }
-        let Some(image) = images.name(context.root, start, index) else { break };
-        if !image.is_file() {
+        let Some(name) = images.text(start, index) else { break };
+        let found = context.lookup.image(&bases, &name).map_err(|e| node.at(e))?;
+        if found.is_none() {
             if ends {
                 break;
             }
-            return Err(Error::input(format!("the picture of frame {index} is missing"))
-                .at(image.display())
-                .remedy("Restore the file, or correct \"images\", \"start\" and \"count\"."));
+            missing += 1;
+            // A number of frames that is a slip must not be counted through.
+            if missing > MOST_MISSING && missing > index / 2 {
+                return Err(Error::input(format!(
+                    "the image of frame {index} is missing, like {} others",
+                    missing - 1
+                ))
+                .at(context.root.join(&name).display())
+                .remedy("Restore the files, or correct \"images\", \"start\" and \"frames\"."));
+            }
         }
+        let image = found.unwrap_or_else(|| bases[0].join(&name));
         there = index + 1;
         if !listed {
             continue;
@@ -311,17 +327,18 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
                 return Err(node.error(what).remedy("Give one time per frame, in seconds, or \"frames\"."));
             }
         };
+        let beside = |files: &Option<Files>| path(files, index).map_err(|e| node.at(e));
         frames.push(RawFrame {
             camera: context.camera,
             source: Camera { cam_from_world, intrinsics, lens, width, height, near: Camera::NEAR },
             time: time + offset,
             index,
             image,
-            mask: masks.as_ref().and_then(|m| m.name(context.root, start, index)),
-            depth: depth.as_ref().and_then(|d| d.file(context.root, start, index)),
-            flow: flow.as_ref().and_then(|f| f.name(context.root, start, index)),
-            labels: labels.as_ref().and_then(|l| l.name(context.root, start, index)),
-            features: features.as_ref().and_then(|f| f.name(context.root, start, index)),
+            mask: beside(&masks)?,
+            depth: depth.as_ref().map(|d| d.file(context.lookup, start, index)).transpose()?.flatten(),
+            flow: beside(&flow)?,
+            labels: beside(&labels)?,
+            features: beside(&features)?,
             tracks: None,
             split: Split::Train,
         });
@@ -331,7 +348,7 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
         last.flow = None;
     }
     if let Some(file) = node.opt("tracks")? {
-        let tracks = Arc::new(Tracks::read(&context.root.join(file.text()?), [width, height], there)?);
+        let tracks = Arc::new(Tracks::read(&context.lookup.file(file.text()?)?, [width, height], there)?);
         frames[first..].iter_mut().for_each(|f| f.tracks = Some(tracks.clone()));
     }
     Ok(there)
@@ -376,8 +393,9 @@ impl Depth {
         Ok(Self { files, kind, scale: scale.unwrap_or(1.0) })
     }
 
-    fn file(&self, root: &Path, start: usize, index: usize) -> Option<DepthFile> {
-        Some(DepthFile { path: self.files.name(root, start, index)?, scale: self.scale, kind: self.kind })
+    fn file(&self, lookup: &Lookup, start: usize, index: usize) -> Result<Option<DepthFile>> {
+        let path = self.files.path(lookup, start, index)?;
+        Ok(path.map(|path| DepthFile { path, scale: self.scale, kind: self.kind }))
     }
 }
 
@@ -448,12 +466,18 @@ impl Files {
         Ok(Self::Pattern { before: before.into(), digits, after: after.into() })
     }
 
-    fn name(&self, root: &Path, start: usize, index: usize) -> Option<PathBuf> {
+    /// The file of a frame, or where it should be.
+    fn path(&self, lookup: &Lookup, start: usize, index: usize) -> Result<Option<PathBuf>> {
+        self.text(start, index).map(|name| lookup.file(&name)).transpose()
+    }
+
+    /// The file's name as the capture writes it.
+    fn text(&self, start: usize, index: usize) -> Option<String> {
         match self {
-            Self::List(names) => names.get(index).map(|n| root.join(n)),
+            Self::List(names) => names.get(index).cloned(),
             Self::Pattern { before, digits, after } => {
                 let number = start.checked_add(index)?;
-                Some(root.join(format!("{before}{number:0digits$}{after}")))
+                Some(format!("{before}{number:0digits$}{after}"))
             }
         }
     }

@@ -1,7 +1,10 @@
 //! PanopticSports captures (Luiten 2024): `train_meta.json`, `test_meta.json`, `ims/`, `seg/`; fixed cameras, OpenCV
 //! axes, world to camera.
 
+use super::account::Account;
+use super::convention::Convention;
 use super::json::{self, Node};
+use super::lookup::{self, Lookup};
 use super::points::read_ply;
 use super::{CaptureKind, CaptureOptions, Extent, PointCloud, RawFrame, Split, Take, Timing, rig};
 use splat4d::format::npy::Npy;
@@ -17,12 +20,14 @@ const UP: [f64; 3] = [0.0, -1.0, 0.0];
 /// Reads both files; the cameras of `test_meta.json` are held out.
 pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
     let fps = options.fps.unwrap_or(DEFAULT_FPS);
+    let lookup = Lookup::new(root, options)?;
     let mut found: Vec<(usize, RawFrame)> = Vec::new();
     let test = root.join("test_meta.json");
     for (path, split) in [(marker, Split::Train), (&test, Split::Held)] {
         if path.exists() {
             let value = json::read(path)?;
-            read_meta(root, &Node::root(&value), split, fps, &mut found).map_err(|e| e.at(path.display()))?;
+            read_meta(&lookup, &Node::root(&value), split, (fps, options), &mut found)
+                .map_err(|e| e.at(path.display()))?;
         }
     }
     let mut ids: Vec<usize> = found.iter().map(|(id, _)| *id).collect();
@@ -34,6 +39,8 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
     found.sort_by_key(|(_, f)| (f.camera, f.index));
     let mut warnings = Vec::new();
     let points = read_points(root, &mut warnings)?;
+    let mut account = Account::default();
+    lookup.tell(&mut account);
     Ok(Take {
         name: None,
         root: root.to_path_buf(),
@@ -51,10 +58,18 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         labels: Vec::new(),
         warnings,
         notes: Vec::new(),
+        account,
+        convention: Convention::OPENCV,
     })
 }
 
-fn read_meta(root: &Path, top: &Node<'_>, split: Split, fps: f64, out: &mut Vec<(usize, RawFrame)>) -> Result<()> {
+fn read_meta(
+    lookup: &Lookup,
+    top: &Node<'_>,
+    split: Split,
+    (fps, options): (f64, &CaptureOptions),
+    out: &mut Vec<(usize, RawFrame)>,
+) -> Result<()> {
     let (width, height) = (top.get("w")?.count()?, top.get("h")?.count()?);
     let columns = ["k", "w2c", "fn", "cam_id"].map(|key| top.get(key).and_then(|n| n.list()));
     let [k, w2c, names, ids] = columns;
@@ -62,6 +77,7 @@ fn read_meta(root: &Path, top: &Node<'_>, split: Split, fps: f64, out: &mut Vec<
     if [w2c.len(), names.len(), ids.len()].iter().any(|&n| n != k.len()) {
         return Err(top.error("the lists k, w2c, fn and cam_id are not equally long").remedy("Export the file again."));
     }
+    let (images, masks) = ([lookup.folder("ims")], [lookup.root().join("seg")]);
     for t in 0..k.len() {
         let (k, w2c, names, ids) = (k[t].list()?, w2c[t].list()?, names[t].list()?, ids[t].list()?);
         if [w2c.len(), names.len(), ids.len()].iter().any(|&n| n != k.len()) {
@@ -71,17 +87,17 @@ fn read_meta(root: &Path, top: &Node<'_>, split: Split, fps: f64, out: &mut Vec<
         for c in 0..k.len() {
             let m = k[c].matrix3()?;
             let name = names[c].text()?;
-            let mask = Path::new("seg").join(name).with_extension("png");
+            let stated = Se3::from_rows(&w2c[c].pose4(options.poses)?);
             let source = Camera {
-                cam_from_world: Se3::from_rows(&w2c[c].matrix4()?),
+                cam_from_world: Convention::OPENCV.read_as(stated, options.poses)?,
                 intrinsics: Intrinsics { fx: m[0][0], fy: m[1][1], cx: m[0][2], cy: m[1][2] },
                 lens: Lens::Pinhole,
                 width,
                 height,
                 near: Camera::NEAR,
             };
-            let mask = Some(root.join(mask)).filter(|m| m.is_file());
-            let image = root.join("ims").join(name);
+            let mask = lookup.image(&masks, &format!("{}.png", lookup::without_ending(name)))?;
+            let image = lookup.image_or_place(&images, name)?;
             let raw = RawFrame {
                 camera: 0,
                 source,

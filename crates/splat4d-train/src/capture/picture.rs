@@ -14,12 +14,25 @@ use zune_jpeg::JpegDecoder;
 
 /// Contents of a picture's header.
 pub(super) struct Header {
-    /// Pixels across, upright.
-    pub width: usize,
-    /// Pixels down, upright.
-    pub height: usize,
+    /// Pixels across and down, as stored.
+    pub stored: (usize, usize),
     /// Whether there is an alpha channel.
     pub alpha: bool,
+    /// What EXIF says is to be done with the pixels.
+    orientation: Orientation,
+}
+
+impl Header {
+    /// The size after its EXIF orientation is applied.
+    pub(super) fn upright(&self) -> (usize, usize) {
+        let (width, height) = self.stored;
+        if swaps_sides(self.orientation) { (height, width) } else { (width, height) }
+    }
+
+    /// Whether EXIF says that pixels are to be turned or mirrored.
+    pub(super) fn is_turned(&self) -> bool {
+        self.orientation != Orientation::NoTransforms
+    }
 }
 
 /// Decoded samples.
@@ -90,9 +103,8 @@ pub(super) fn header(path: &Path) -> Result<Header> {
         let orientation = decoder.orientation().ok();
         (width as usize, height as usize, decoder.color_type().has_alpha(), orientation)
     };
-    let turned = swaps_sides(orientation.unwrap_or(Orientation::NoTransforms));
-    let (width, height) = if turned { (height, width) } else { (width, height) };
-    Ok(Header { width, height, alpha })
+    let orientation = orientation.unwrap_or(Orientation::NoTransforms);
+    Ok(Header { stored: (width, height), alpha, orientation })
 }
 
 fn swaps_sides(orientation: Orientation) -> bool {
@@ -126,7 +138,8 @@ pub(super) fn check_size(path: &Path, size: (usize, usize), camera: &Camera) -> 
         size.0, size.1, camera.width, camera.height
     );
     Err(Error::input(what).at(path.display()).remedy(
-        "Give the intrinsics of the pictures as they are stored (upright, after EXIF rotation), or resize them.",
+        "Give the intrinsics of these pictures, or resize them. Where they have an EXIF orientation, --set capture.exif=stored \
+         or upright says which pixels the intrinsics describe.",
     ))
 }
 
@@ -164,12 +177,22 @@ pub(super) fn decode_beside(path: &Path, what: &str, camera: &Camera) -> Result<
 /// Decodes a picture, upright. Fails before any large allocation if its size is impossible or, where given, not
 /// `expected`.
 pub(super) fn decode(path: &Path, expected: Option<&Camera>) -> Result<Raster> {
-    decode_bytes(&json::read_bytes(path)?, path, expected)
+    decode_as(path, expected, true)
+}
+
+/// [`decode`] of pixels as stored, unless `upright`.
+pub(super) fn decode_as(path: &Path, expected: Option<&Camera>, upright: bool) -> Result<Raster> {
+    decode_either(&json::read_bytes(path)?, path, expected, upright)
 }
 
 /// [`decode`] of a file's bytes; errors name `path`.
 pub(super) fn decode_bytes(bytes: &[u8], path: &Path, expected: Option<&Camera>) -> Result<Raster> {
-    if is_jpeg(bytes) { decode_jpeg(bytes, path, expected) } else { decode_other(bytes, path, expected) }
+    decode_either(bytes, path, expected, true)
+}
+
+fn decode_either(bytes: &[u8], path: &Path, expected: Option<&Camera>, upright: bool) -> Result<Raster> {
+    let kept = |orientation: Orientation| if upright { orientation } else { Orientation::NoTransforms };
+    if is_jpeg(bytes) { decode_jpeg(bytes, path, expected, kept) } else { decode_other(bytes, path, expected, kept) }
 }
 
 fn admit(path: &Path, size: (usize, usize), turned: bool, expected: Option<&Camera>) -> Result<()> {
@@ -180,7 +203,12 @@ fn admit(path: &Path, size: (usize, usize), turned: bool, expected: Option<&Came
     }
 }
 
-fn decode_jpeg(bytes: &[u8], path: &Path, expected: Option<&Camera>) -> Result<Raster> {
+fn decode_jpeg(
+    bytes: &[u8],
+    path: &Path,
+    expected: Option<&Camera>,
+    kept: impl Fn(Orientation) -> Orientation,
+) -> Result<Raster> {
     if !jpeg_ends(bytes) {
         return Err(broken(path, "the end-of-image mark is missing"));
     }
@@ -192,7 +220,7 @@ fn decode_jpeg(bytes: &[u8], path: &Path, expected: Option<&Camera>) -> Result<R
     decoder.decode_headers().map_err(|e| broken(path, e))?;
     let info = decoder.info().ok_or_else(|| broken(path, "no header"))?;
     let orientation = decoder.exif().and_then(|e| Orientation::from_exif_chunk(e));
-    let orientation = orientation.unwrap_or(Orientation::NoTransforms);
+    let orientation = kept(orientation.unwrap_or(Orientation::NoTransforms));
     let (width, height) = (usize::from(info.width), usize::from(info.height));
     admit(path, (width, height), swaps_sides(orientation), expected)?;
     let pixels = decoder.decode().map_err(|e| broken(path, e))?;
@@ -224,10 +252,15 @@ fn jpeg_ends(bytes: &[u8]) -> bool {
     bytes.get(at..).is_some_and(|rest| rest.windows(2).any(|w| w == [0xFF, 0xD9]))
 }
 
-fn decode_other(bytes: &[u8], path: &Path, expected: Option<&Camera>) -> Result<Raster> {
+fn decode_other(
+    bytes: &[u8],
+    path: &Path,
+    expected: Option<&Camera>,
+    kept: impl Fn(Orientation) -> Orientation,
+) -> Result<Raster> {
     let mut decoder = open(Cursor::new(bytes), path)?;
     let (width, height) = decoder.dimensions();
-    let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
+    let orientation = kept(decoder.orientation().unwrap_or(Orientation::NoTransforms));
     admit(path, (width as usize, height as usize), swaps_sides(orientation), expected)?;
     let picture = DynamicImage::from_decoder(decoder).map_err(|e| broken(path, e))?;
     Ok(upright(picture, orientation))

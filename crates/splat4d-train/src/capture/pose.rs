@@ -47,16 +47,6 @@ fn nearest_rotation(mut r: [[f64; 3]; 3]) -> [[f64; 3]; 3] {
     r
 }
 
-/// `cam_from_world` from a camera-to-world matrix in OpenGL axes (x right, y up, z backward), as NeRF data has it.
-pub(super) fn from_opengl(m: &[[f64; 4]; 4]) -> Result<Se3> {
-    let mut world_from_cam = Se3::from_rows(m);
-    for row in &mut world_from_cam.rotation {
-        row[1] = -row[1];
-        row[2] = -row[2];
-    }
-    Ok(checked(world_from_cam)?.inverse())
-}
-
 /// Checks focal lengths, principal point and size.
 pub(super) fn check_intrinsics(k: &Intrinsics, width: usize, height: usize) -> Result<()> {
     let [fx, fy] = [k.fx, k.fy];
@@ -101,13 +91,5 @@ mod tests {
         let mut nan = good;
         nan.translation[1] = f64::NAN;
         assert!(checked(nan).unwrap_err().to_string().contains("NaN"));
-    }
-
-    #[test]
-    fn opengl_camera_at_the_origin_looks_along_minus_z() {
-        let identity: [[f64; 4]; 4] = std::array::from_fn(|i| std::array::from_fn(|j| f64::from(u8::from(i == j))));
-        let pose = from_opengl(&identity).unwrap();
-        let p = pose.apply([0.1, 0.2, -3.0]);
-        assert!((p[0] - 0.1).abs() < 1e-12 && (p[1] + 0.2).abs() < 1e-12 && (p[2] - 3.0).abs() < 1e-12);
     }
 }

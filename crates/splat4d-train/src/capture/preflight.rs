@@ -1,6 +1,6 @@
 //! Checks of a capture before hours of training: few cameras, narrow coverage, uneven clocks.
 
-use super::{Capture, Frame};
+use super::{Aspect, Capture, Frame};
 use splat4d::math::mat3::solve;
 use splat4d::math::se3::{dot, norm, normalize, sub};
 
@@ -18,6 +18,8 @@ pub enum Severity {
 pub struct Finding {
     /// How bad it is.
     pub severity: Severity,
+    /// What of reading the capture it is about; `None`: of something else.
+    pub aspect: Option<Aspect>,
     /// The finding, a sentence.
     pub what: String,
     /// The remedy, a sentence; empty where the finding says all.
@@ -90,14 +92,20 @@ impl Capture {
     /// Looks for what commonly spoils results. Cheap: opens no picture.
     pub fn preflight(&self) -> Vec<Finding> {
         let mut findings = Vec::new();
+        let aspect = |text: &String| self.account.iter().find(|r| r.what == *text).map(|r| r.aspect);
         for warning in &self.warnings {
-            findings.push(finding(
-                Severity::Warning,
-                warning.clone(),
-                "docs/capture-format.md says what the layout expects.",
-            ));
+            let remedy = match aspect(warning) {
+                // The remark says what to do.
+                Some(_) => "",
+                None => "docs/capture-format.md says what the layout expects.",
+            };
+            let found = finding(Severity::Warning, warning.clone(), remedy);
+            findings.push(Finding { aspect: aspect(warning), ..found });
         }
-        findings.extend(self.notes.iter().map(|note| finding(Severity::Note, note.clone(), "")));
+        for note in &self.notes {
+            let found = finding(Severity::Note, note.clone(), "");
+            findings.push(Finding { aspect: Some(aspect(note).unwrap_or(Aspect::Assumed)), ..found });
+        }
         let views = self.training_views();
         self.check_views(&views, &mut findings);
         self.check_clock(&mut findings);
@@ -200,7 +208,7 @@ impl Capture {
 }
 
 fn finding(severity: Severity, what: String, remedy: &str) -> Finding {
-    Finding { severity, what, remedy: remedy.into() }
+    Finding { severity, aspect: None, what, remedy: remedy.into() }
 }
 
 /// The point nearest to all optical axes (least squares); the cameras' centroid moved ahead if they are parallel.

@@ -43,7 +43,7 @@ pub(super) struct Naming {
 }
 
 /// Widest range of numbers that are frame numbers, not time stamps: nine hours at 30 frames per second.
-const MAX_SPAN: usize = 1_000_000;
+pub(super) const MAX_SPAN: usize = 1_000_000;
 /// Folders that hold pictures but name no camera.
 const PLAIN_FOLDERS: &[&str] = &["images", "image", "frames", "rgb", "input", "train", "test", "val", "."];
 

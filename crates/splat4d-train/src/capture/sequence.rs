@@ -34,6 +34,8 @@ const FILM_WORDS: [&str; 12] =
     ["", "frame", "frames", "image", "img", "out", "output", "video", "thumb", "rgb", "color", "f"];
 /// The one that telephones and cameras write for photos.
 const PHOTO_WORD: &str = "IMG";
+/// What Nerfstudio renames every image to, photos and frames alike: a word and five digits. It says nothing of time.
+const RENAMED: (&str, usize) = ("frame_", 5);
 /// Words before the number in the names of a rig's cameras.
 const CAMERA_WORDS: [&str; 2] = ["cam", "camera"];
 /// Part of the steps from number to number that are alike where a film was cut into frames; some pictures may not have
@@ -54,7 +56,9 @@ pub(super) fn order(
     let mut groups = vec![Vec::new(); naming.cameras.len()];
     naming.frames.iter().enumerate().for_each(|(i, f)| groups[f.0].push(i));
     let one_each = rig && naming.cameras.len() == names.len();
-    let film = !one_each && groups.iter().all(|group| is_film(group, names, poses));
+    let renamed = !rig && names.iter().all(|name| is_renamed(name));
+    let film =
+        !one_each && groups.iter().all(|group| is_film(group, names, poses) && (!renamed || still(group, poses)));
     let moment = match sequence {
         Sequence::Auto => !film,
         Sequence::Photos => true,
@@ -126,10 +130,23 @@ fn film_word(name: &str) -> Option<&str> {
     (known && word != PHOTO_WORD).then_some(word)
 }
 
+/// Whether Nerfstudio gave an image its name.
+fn is_renamed(name: &str) -> bool {
+    let file = name.rsplit_once('/').map_or(name, |(_, file)| file);
+    let number = file.rsplit_once('.').map_or(file, |(stem, _)| stem).strip_prefix(RENAMED.0);
+    number.is_some_and(|n| n.len() == RENAMED.1 && n.bytes().all(|b| b.is_ascii_digit()))
+}
+
 /// Whether pictures are called by the cameras of a rig (`cam07`).
 pub(super) fn are_cameras(stems: &[String]) -> bool {
     let known = |word: &str| CAMERA_WORDS.contains(&word.to_ascii_lowercase().as_str());
     stems.iter().all(|stem| word_before_number(stem).is_some_and(known))
+}
+
+/// Whether names are those of a rig's cameras: one word before different numbers (`cam07`, `gopro1`), or numbers alone.
+pub(super) fn name_a_rig(cameras: &[String]) -> bool {
+    let words: BTreeSet<Option<&str>> = cameras.iter().map(|name| word_before_number(name)).collect();
+    words.len() == 1 && !words.contains(&None)
 }
 
 /// The last word of a name before the number that it ends in; `None`: it ends in none.

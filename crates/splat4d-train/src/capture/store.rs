@@ -363,9 +363,9 @@ fn prepare(frame: &Frame, capture: &Capture) -> Result<StoredPicture> {
         let camera = &capture.cameras[frame.camera].name;
         e.at(format!("camera {camera}, frame {}", frame.index))
     };
-    let raster = picture::decode(&frame.image, Some(&frame.source)).map_err(place)?;
+    let raster = picture::decode_as(&frame.image, Some(&frame.source), frame.upright).map_err(place)?;
     let background = capture.background.unwrap_or(WHITE);
-    let mask = frame.mask.as_deref().map(|m| read_mask(m, &frame.source)).transpose().map_err(place)?;
+    let mask = frame.mask.as_deref().map(|m| read_mask(m, frame)).transpose().map_err(place)?;
     let mask = mask.or_else(|| raster.alpha().map(|_| picture::mask_values(&raster, true)));
     let depth = frame.depth.as_ref();
     let depth = depth.map(|d| Ok((depth::read(d, frame, capture.downscale)?, d.kind))).transpose().map_err(place)?;
@@ -401,9 +401,21 @@ fn to_byte(v: f32) -> u8 {
     (v.clamp(0.0, 1.0) * 255.0).round() as u8
 }
 
-fn read_mask(path: &Path, camera: &Camera) -> Result<Vec<f32>> {
-    let raster = picture::decode(path, Some(camera))?;
-    Ok(picture::mask_values(&raster, false))
+/// A mask's values in the size of its picture; one of another size, but the same shape, is resampled (nearest pixel).
+fn read_mask(path: &Path, frame: &Frame) -> Result<Vec<f32>> {
+    let (width, height) = (frame.source.width, frame.source.height);
+    let raster = picture::decode_as(path, None, frame.upright)?;
+    let size = (raster.width, raster.height);
+    let values = picture::mask_values(&raster, false);
+    if size == (width, height) {
+        return Ok(values);
+    }
+    if !picture::is_resized(size, &frame.source) {
+        picture::check_beside(path, "mask", size, &frame.source)?;
+    }
+    let near = |i: usize, from: usize, to: usize| ((2 * i + 1) * from / (2 * to)).min(from - 1);
+    let at = |p: usize| values[near(p / width, size.1, height) * size.0 + near(p % width, size.0, width)];
+    Ok((0..width * height).map(at).collect())
 }
 
 /// Interleaved samples to three planes; grey becomes three equal ones, alpha is dropped.

@@ -8,5 +8,6 @@ mod labels;
 mod layouts;
 mod mutants;
 mod pictures;
-mod samples;
+pub(super) mod samples;
 mod tracks;
+mod variants;

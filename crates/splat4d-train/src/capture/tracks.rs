@@ -93,7 +93,7 @@ type Row = (usize, usize, [f32; 2]);
 
 fn table(bytes: &[u8]) -> Result<Vec<Row>> {
     let remedy = "Write a header point,frame,x,y (or point,frame,x,y,visible) and a row for each point and frame";
-    let text = std::str::from_utf8(bytes).map_err(|_| Error::input("the tracks are not text").remedy(remedy))?;
+    let text = crate::text::decode(bytes).map_err(|e| e.remedy(remedy))?;
     let mut lines = text.lines().enumerate().map(|(n, line)| (n + 1, line.trim())).filter(|(_, line)| !line.is_empty());
     let names: Vec<&str> = lines.next().map_or_else(Vec::new, |(_, line)| line.split(',').map(str::trim).collect());
     let column = |name: &str| names.iter().position(|n| *n == name);

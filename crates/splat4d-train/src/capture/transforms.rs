@@ -6,11 +6,16 @@
 
 mod clock;
 mod frame;
+mod splits;
 
+use super::account::{Account, Aspect, first_names};
+use super::convention::{Convention, Poses};
 use super::json::{self, Node};
+use super::lookup::Lookup;
 use super::points::read_ply;
+use super::preflight::Severity;
 use super::sequence::{self, Order};
-use super::{CaptureKind, CaptureOptions, Extent, PointCloud, RawFrame, Sequence, Split, Take, colmap};
+use super::{CaptureKind, CaptureOptions, Extent, PointCloud, RawFrame, Sequence, Split, Take, colmap, picture};
 use frame::Entry;
 use splat4d::Result;
 use splat4d::scene::Camera;
@@ -30,9 +35,15 @@ const BLENDER_UP: [f64; 3] = [0.0, 0.0, 1.0];
 /// poses; times come from `time`, else from what `sequence` makes of the names.
 pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
     let several = marker.file_name().is_some_and(|name| name == TRAIN);
-    let (mut warnings, mut notes) = (Vec::new(), Vec::new());
-    let value = json::read(marker)?;
-    let first = Document::read(root, &Node::root(&value), Split::Train, options).map_err(|e| e.at(marker.display()))?;
+    let (mut warnings, mut notes, mut account) = (Vec::new(), Vec::new(), Account::default());
+    let lookup = Lookup::new(root, options)?;
+    let mut size = None;
+    let mut read = |path: &Path, split: Split| {
+        let value = json::read(path)?;
+        let read = Document::read((&lookup, &mut size), &Node::root(&value), split, options, &mut account);
+        read.map_err(|e| e.at(path.display()))
+    };
+    let first = read(marker, Split::Train)?;
     if several && first.entries.is_empty() {
         let remedy = "Check that it was exported completely.";
         return Err(splat4d::Error::input("the capture has no frames").at(marker.display()).remedy(remedy));
@@ -40,16 +51,14 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
     let mut entries = first.entries;
     for (name, split) in OTHERS {
         let path = root.join(name);
-        if !path.exists() {
-            continue;
+        if path.exists() {
+            add(&mut entries, read(&path, split)?.entries, several);
         }
-        let value = json::read(&path)?;
-        let more = Document::read(root, &Node::root(&value), split, options).map_err(|e| e.at(path.display()))?;
-        add(&mut entries, more.entries, several);
     }
-    let order = match clock::told(&entries, first.fps, options, several, (&mut warnings, &mut notes)) {
-        Some(order) => order,
-        None => untimed(&entries, options, several, (&mut warnings, &mut notes), first.fps),
+    let rate = clock::Rate { fps: first.fps, stated: first.stated };
+    let (order, fps) = match clock::told(&entries, rate, options, several, &mut account) {
+        Some(told) => told,
+        None => (untimed(&entries, options, several, (&mut warnings, &mut notes), first.fps), first.fps),
     };
     let Order { cameras, frames: places, named, timing } = order;
     let blender = several && entries.iter().all(|e| e.by_angle);
@@ -73,6 +82,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         None => colmap::points_beside(root, marker, &frames, &mut warnings, &mut notes),
     };
     warnings.extend(first.warning);
+    lookup.tell(&mut account);
     Ok(Take {
         name: None,
         root: root.to_path_buf(),
@@ -83,19 +93,23 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         named,
         timing,
         hold_out: None,
-        fps: first.fps,
+        fps,
         points,
         background: None,
         up: blender.then_some(BLENDER_UP),
         labels: Vec::new(),
         warnings,
         notes,
+        account,
+        convention: Convention::NERF,
     })
 }
 
 /// Names and cameras of all frames of a file; no picture is looked at that states its size.
 pub(super) fn posed_frames(root: &Path, top: &Node<'_>) -> Result<Vec<(String, Camera)>> {
-    top.get("frames")?.list()?.iter().map(|node| frame::posed(root, top, node)).collect()
+    let lookup = Lookup::new(root, &CaptureOptions::default())?;
+    let file = frame::File { lookup: &lookup, bases: &lookup.bases(), top, poses: Poses::STATED, size: None };
+    top.get("frames")?.list()?.iter().map(|node| frame::posed(&file, node)).collect()
 }
 
 /// Adds the frames of a file beside. One file with all frames may list them too, for the same purpose or none.
@@ -132,12 +146,21 @@ fn untimed(
 struct Document {
     entries: Vec<Entry>,
     fps: f64,
+    /// Whether the file, or the user, states the rate.
+    stated: bool,
     points: Option<PointCloud>,
     warning: Option<String>,
 }
 
 impl Document {
-    fn read(root: &Path, top: &Node<'_>, split: Split, options: &CaptureOptions) -> Result<Self> {
+    fn read(
+        (lookup, size): (&Lookup, &mut Option<(usize, usize)>),
+        top: &Node<'_>,
+        split: Split,
+        options: &CaptureOptions,
+        account: &mut Account,
+    ) -> Result<Self> {
+        let stated = options.fps.is_some() || top.opt("fps")?.is_some();
         let fps = match (options.fps, top.opt("fps")?) {
             (Some(fps), _) => fps,
             (None, Some(fps)) => fps.number()?,
@@ -147,52 +170,34 @@ impl Document {
         if let Some(applied) = top.opt("applied_transform")? {
             applied.matrix4()?;
         }
-        let splits = Splits::read(top)?;
-        let mut entries = Vec::new();
-        for node in top.get("frames")?.list()? {
-            let mut entry = frame::read(root, top, &node)?;
-            entry.split = if split == Split::Train { splits.of(&entry.name) } else { split };
-            entries.push(entry);
+        let nodes = top.get("frames")?.list()?;
+        let bases = lookup.bases();
+        // Where no size is stated, an image that is there tells that of missing ones.
+        let there = |node: &Node<'_>| {
+            let name = node.value.get("file_path")?.as_str()?;
+            picture::header(&lookup.image(&bases, name).ok()??).ok()
+        };
+        *size = nodes.iter().find_map(there).map(|header| header.upright()).or(*size);
+        let file = frame::File { lookup, bases: &bases, top, poses: options.poses, size: *size };
+        let mut entries = nodes.iter().map(|node| frame::read(&file, node)).collect::<Result<Vec<_>>>()?;
+        match split {
+            Split::Train => splits::apply(top, &mut entries, account)?,
+            other => entries.iter_mut().for_each(|e| e.split = other),
+        }
+        let unread = frame::unread(top);
+        if !unread.is_empty() {
+            let what = format!("{} keys of the transforms file: {}.", unread.len(), first_names(&unread));
+            account.add(Aspect::NotRead, Severity::Note, what);
         }
         let (mut points, mut warning) = (None, None);
         if let Some(name) = top.opt("ply_file_path")? {
-            let path = root.join(name.text()?);
+            let path = lookup.file(name.text()?)?;
             if path.is_file() {
                 points = Some(read_ply(&path)?);
             } else {
                 warning = Some(format!("The initial points that ply_file_path names are missing: {}.", path.display()));
             }
         }
-        Ok(Self { entries, fps, points, warning })
-    }
-}
-
-/// The optional lists of file names by split.
-struct Splits<'a> {
-    test: Vec<&'a str>,
-    validation: Vec<&'a str>,
-}
-
-impl<'a> Splits<'a> {
-    fn read(top: &Node<'a>) -> Result<Self> {
-        let names = |key: &str| -> Result<Vec<&'a str>> {
-            let list = top.opt(key)?.map(|n| n.list()).transpose()?.unwrap_or_default();
-            let mut names = list.iter().map(|n| n.text()).collect::<Result<Vec<_>>>()?;
-            names.sort_unstable();
-            Ok(names)
-        };
-        let (test, validation) = (names("test_filenames")?, names("val_filenames")?);
-        // Only a validation list: that is what there is to measure on.
-        Ok(if test.is_empty() { Self { test: validation, validation: test } } else { Self { test, validation } })
-    }
-
-    fn of(&self, name: &str) -> Split {
-        if self.test.binary_search(&name).is_ok() {
-            Split::Held
-        } else if self.validation.binary_search(&name).is_ok() {
-            Split::Validation
-        } else {
-            Split::Train
-        }
+        Ok(Self { entries, fps, stated, points, warning })
     }
 }

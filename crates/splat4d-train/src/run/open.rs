@@ -37,6 +37,12 @@ pub fn capture_options(recipe: &Recipe) -> Result<CaptureOptions> {
         sequence: recipe.capture.sequence,
         background: (!recipe.capture.white_background).then_some([0.0; 3]),
         near: recipe.capture.near,
+        images: Some(recipe.capture.images.0.clone()).filter(|name| !name.is_empty()),
+        poses: recipe.capture.poses,
+        exif: recipe.capture.exif,
+        times: recipe.capture.times,
+        unregistered: recipe.capture.unregistered,
+        max_missing: recipe.capture.max_missing,
         ..CaptureOptions::default()
     })
 }

@@ -29,5 +29,5 @@ pub(super) fn of(capture: &Capture, folder: &Path, console: &Console) -> anyhow:
     let mut json = serde_json::to_value(&report)?;
     json["type"] = json!("doctor");
     json["page"] = json!(html.to_string_lossy());
-    Ok(Told { json, text, troubles })
+    Ok(Told { json, text, troubles, listed: Vec::new() })
 }

@@ -49,8 +49,11 @@ fn no_capture_and_no_frames() {
 #[test]
 fn missing_and_truncated_pictures() {
     let sample = samples::own();
-    std::fs::remove_file(sample.path("images/cam00/0005.png")).unwrap();
-    assert_says(&message(&sample), &["camera cam00", "frame 0", "0005.png", "Restore"]);
+    for name in ["0005", "0006"] {
+        std::fs::remove_file(sample.path(&format!("images/cam00/{name}.png"))).unwrap();
+    }
+    sample.edit("capture.json", |v| v["frames"] = json!(2));
+    assert_says(&message(&sample), &["2 of 6 images", "images/cam00/0005.png", "Restore", "capture.max_missing=0.34"]);
     let sample = samples::own();
     std::fs::remove_file(sample.path("masks/cam01/0006.png")).unwrap();
     assert_says(&message(&sample), &["mask", "cam01", "0006.png"]);
@@ -199,7 +202,7 @@ fn absurd_counts() {
     }
     let sample = samples::own();
     sample.edit("capture.json", |v| v["frames"] = json!(1_000_000_000_000u64));
-    assert_says(&message(&sample), &["cam00", "frame 2", "missing"]);
+    assert_says(&message(&sample), &["cam00", "0107.png", "frame 102", "missing", "\"frames\""]);
     let sample = samples::own();
     let ply = std::fs::read_to_string(sample.path("points.ply")).unwrap().replace("vertex 2", "vertex 99999999999");
     sample.write("points.ply", ply.as_bytes());

@@ -235,8 +235,8 @@ fn broken_transforms_say_what_and_where() {
     };
     let rows = broken(&|v| v["frames"][4]["transform_matrix"] = json!([[1, 0, 0], [0, 1, 0], [0, 0, 1]]));
     assert_says(&rows, &["transforms.json", "frames[4].transform_matrix", "4x4 matrix"]);
-    let missing = broken(&|v| v["frames"][5]["file_path"] = json!("images/gone.png"));
-    assert_says(&missing, &["images/gone.png", "missing", "Restore"]);
+    let missing = broken(&|v| (0..5).for_each(|i| v["frames"][i]["file_path"] = json!(format!("images/gone{i}.png"))));
+    assert_says(&missing, &["5 of 9 images are missing", "images/gone0.png", "capture.max_missing=0.56"]);
     assert_says(&broken(&|v| v["fl_x"] = json!(0)), &["frames[0]", "focal length is 0 x 20", "above zero"]);
     assert_says(&broken(&|v| v["frames"][3]["fl_y"] = json!(-2)), &["frames[3]", "focal length", "-2"]);
     assert_says(

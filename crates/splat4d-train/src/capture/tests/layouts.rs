@@ -55,8 +55,10 @@ fn nerfies_and_hypernerf() {
     let points = capture.points.as_ref().unwrap();
     assert_eq!(points.points, [[0.0; 3]], "a point that is no number is left out");
     let say = |sample: &Sample| Capture::open(sample.root(), &CaptureOptions::default()).unwrap_err().to_string();
-    sample.edit("dataset.json", |v| v["val_ids"] = json!(["000009"]));
-    assert!(say(&sample).contains("000009") && say(&sample).contains("dataset.json"));
+    sample.edit("dataset.json", |v| v["val_ids"] = json!(["000002", "000009"]));
+    let lost = open(&sample);
+    let named = |w: &String| w.contains("000009") && w.contains("dataset.json");
+    assert!(lost.held == [2] && lost.warnings.iter().any(named), "{:?}", lost.warnings);
     sample.edit("dataset.json", |v| v["val_ids"] = json!([]));
     sample.edit("camera/000001.json", |v| v["skew"] = json!(3.0));
     assert!(say(&sample).contains("000001.json") && say(&sample).contains("skew"), "{}", say(&sample));

@@ -11,17 +11,17 @@ pub(super) const HEIGHT: usize = 16;
 pub(super) const FOCAL: f64 = 20.0;
 
 /// A folder and the metadata files in it.
-pub(super) struct Sample {
+pub(in crate::capture) struct Sample {
     pub dir: TempDir,
     pub files: Vec<&'static str>,
 }
 
 impl Sample {
-    fn new(files: &[&'static str]) -> Self {
+    pub(in crate::capture) fn new(files: &[&'static str]) -> Self {
         Self { dir: tempfile::tempdir().unwrap(), files: files.to_vec() }
     }
 
-    pub(super) fn root(&self) -> &Path {
+    pub(in crate::capture) fn root(&self) -> &Path {
         self.dir.path()
     }
 
@@ -36,7 +36,7 @@ impl Sample {
         self.write(name, value.to_string().as_bytes());
     }
 
-    pub(super) fn write(&self, name: &str, bytes: &[u8]) {
+    pub(in crate::capture) fn write(&self, name: &str, bytes: &[u8]) {
         let path = self.path(name);
         std::fs::create_dir_all(path.parent().unwrap()).unwrap();
         std::fs::write(path, bytes).unwrap();
@@ -56,8 +56,11 @@ impl Sample {
         self.save(name, ImageBuffer::from_fn(WIDTH as u32, HEIGHT as u32, |x, y| Luma([pixel(x, y)])));
     }
 
-    pub(super) fn save<P: image::PixelWithColorType>(&self, name: &str, picture: ImageBuffer<P, Vec<P::Subpixel>>)
-    where
+    pub(in crate::capture) fn save<P: image::PixelWithColorType>(
+        &self,
+        name: &str,
+        picture: ImageBuffer<P, Vec<P::Subpixel>>,
+    ) where
         [P::Subpixel]: image::EncodableLayout,
     {
         let path = self.path(name);

@@ -1,54 +1,178 @@
 //! Times of a transforms file, and the cameras that took its frames.
 
+use super::super::account::{Account, Aspect};
+use super::super::frames::half_frame;
+use super::super::preflight::Severity;
 use super::super::sequence::{Order, Timing};
-use super::super::{CaptureOptions, Sequence, assemble, rig};
+use super::super::{CaptureOptions, Sequence, Times, assemble, rig};
 use super::frame::Entry;
 use splat4d::math::Se3;
 use std::collections::BTreeMap;
 
 /// Rounding that a time of 1 may have.
 const ROUNDING: f64 = 1e-6;
+/// How far steps may be from one frame, of it: rounding to two digits.
+const NEAR_STEP: f64 = 0.02;
+/// Part of the unit that fractions fill at least; a capture shorter than a second, in seconds, mostly does not.
+const FILLED: f64 = 0.9;
+/// Frame rates of cameras, frames per second.
+const RATES: [f64; 13] = [23.976, 24.0, 25.0, 29.97, 30.0, 48.0, 50.0, 59.94, 60.0, 90.0, 100.0, 120.0, 240.0];
+/// How much shorter than a frame the usual step of a camera may be: frame rates that vary.
+const FEWER: f64 = 0.2;
+/// Frames between neighbouring instants from which another unit than seconds is likelier than a time lapse.
+const MANY_FRAMES: f64 = 29.5;
 
-/// Cameras, frame numbers and seconds where every frame has a time: parts of the take from 0 to 1, seconds where any is
-/// above. `None`: not every frame has one.
+/// Frames per second.
+#[derive(Clone, Copy)]
+pub(super) struct Rate {
+    pub fps: f64,
+    /// Whether the file, or the user, states it.
+    pub stated: bool,
+}
+
+/// What times count, the seconds of one, and why it is not sure.
+struct Reading {
+    times: Times,
+    scale: f64,
+    /// Frames per second, where the steps tell them.
+    fps: f64,
+    doubt: Option<String>,
+}
+
+/// Cameras, frame numbers and seconds where every frame has a time, and the frame rate. `None`: not every frame has one.
 pub(super) fn told(
     entries: &[Entry],
-    fps: f64,
+    rate: Rate,
     options: &CaptureOptions,
     several: bool,
-    (warnings, notes): (&mut Vec<String>, &mut Vec<String>),
-) -> Option<Order> {
+    account: &mut Account,
+) -> Option<(Order, f64)> {
     let told: Option<Vec<f64>> = entries.iter().map(|e| e.time).collect();
     let Some(times) = told.filter(|t| !t.is_empty()) else {
-        if entries.iter().any(|e| e.time.is_some()) {
-            warnings.push("Some frames have a time and some have none: no time is used.".into());
+        let without = entries.iter().filter(|e| e.time.is_none()).count();
+        if without < entries.len() {
+            let what = format!("{without} of {} frames have no time: no time is used.", entries.len());
+            account.add(Aspect::NotRead, Severity::Warning, what);
         }
         return None;
     };
     if options.sequence != Sequence::Auto {
-        warnings.push("The capture states its times: capture.sequence changes nothing.".into());
+        let what = "The capture states its times: capture.sequence changes nothing.".into();
+        account.add(Aspect::NotRead, Severity::Warning, what);
     }
     // Files of their own for what is held out: the clock is that of the training frames (D-NeRF).
     let counts = |e: &Entry| !several || e.split == super::Split::Train;
     let mut instants: Vec<f64> = entries.iter().zip(&times).filter(|(e, _)| counts(e)).map(|(_, t)| *t).collect();
     instants.sort_by(f64::total_cmp);
     instants.dedup();
-    let unit = times.iter().all(|t| (-ROUNDING..=1.0 + ROUNDING).contains(t));
-    let scale = match (unit, options.unit_time_seconds) {
-        (true, Some(seconds)) => seconds,
-        (true, None) => instants.len().saturating_sub(1) as f64 / fps,
-        (false, _) => 1.0,
-    };
-    if unit && options.unit_time_seconds.is_none() && instants.len() > 1 {
-        notes.push(format!(
-            "Times run from 0 to 1; they are taken as parts of a take of {} instants at {fps} frames per second \
-             ({scale:.3} s).",
-            instants.len()
-        ));
-    }
     let (cameras, of, named) = cameras(entries, &times);
-    let frames = of.into_iter().zip(&times).map(|(camera, &t)| (camera, nearest(&instants, t), t * scale)).collect();
-    Some(Order { cameras, frames, named, timing: Timing::Told })
+    let reading = read(entries, (&times, &instants, &of), rate, options);
+    tell(&reading, &instants, rate, account);
+    let place = |(camera, &t): (usize, &f64)| (camera, nearest(&instants, t), t * reading.scale);
+    let frames = of.into_iter().zip(&times).map(place).collect();
+    Some((Order { cameras, frames, named, timing: Timing::Told }, reading.fps))
+}
+
+/// Whether a step is one frame at this rate.
+fn is_frame(step: f64, fps: f64) -> bool {
+    (step * fps - 1.0).abs() <= NEAR_STEP
+}
+
+/// What the times count.
+fn read(
+    entries: &[Entry],
+    (times, instants, of_camera): (&[f64], &[f64], &[usize]),
+    rate: Rate,
+    options: &CaptureOptions,
+) -> Reading {
+    let fps = rate.fps;
+    let step = instants.windows(2).map(|w| w[1] - w[0]).fold(f64::INFINITY, f64::min);
+    let count = instants.len();
+    let of = |times: Times| Reading {
+        times,
+        scale: match times {
+            Times::Fractions => options.unit_time_seconds.unwrap_or(count.saturating_sub(1) as f64 / fps),
+            Times::Frames => 1.0 / fps,
+            _ => 1.0,
+        },
+        fps,
+        doubt: None,
+    };
+    let doubt = |times: Times, doubt: String| Reading { doubt: Some(doubt), ..of(times) };
+    match options.times {
+        Times::Auto => {}
+        chosen => return of(chosen),
+    }
+    let unit = times.iter().all(|t| (-ROUNDING..=1.0 + ROUNDING).contains(t));
+    if unit {
+        if options.unit_time_seconds.is_some() || count < 2 {
+            return of(Times::Fractions);
+        }
+        if rate.stated && is_frame(step, fps) && count > 2 {
+            return of(Times::Seconds);
+        }
+        let filled = (instants[count - 1] - instants[0]) * count as f64 / (count - 1) as f64;
+        if filled >= FILLED {
+            return of(Times::Fractions);
+        }
+        let usual = RATES.iter().filter(|r| is_frame(step, **r));
+        let nearest = usual.min_by(|a, b| (step * *a - 1.0).abs().total_cmp(&(step * *b - 1.0).abs()));
+        return match nearest {
+            Some(_) if rate.stated => of(Times::Seconds),
+            Some(&fps) => Reading { fps, ..of(Times::Seconds) },
+            None => doubt(Times::Fractions, format!("they fill {:.0} % of the range from 0 to 1 only", 100.0 * filled)),
+        };
+    }
+    let whole = times.iter().all(|t| t.fract() == 0.0);
+    if whole {
+        let offset = |(e, t): (&Entry, &f64)| rig::trailing_number(&e.name).map(|n| n as f64 - t);
+        let offsets: Vec<Option<f64>> = entries.iter().zip(times).map(offset).collect();
+        if offsets[0].is_some() && offsets.iter().all(|o| *o == offsets[0]) {
+            return of(Times::Frames);
+        }
+    }
+    let even = whole && step == 1.0 && count > 2;
+    if even && rate.stated {
+        return doubt(Times::Frames, format!("they are whole numbers in a row, and {fps} frames a second are stated"));
+    }
+    if even {
+        return doubt(Times::Seconds, "they are whole numbers in a row, like frame numbers".into());
+    }
+    let frames = step * fps;
+    if frames.is_finite() && frames >= MANY_FRAMES {
+        return doubt(Times::Seconds, format!("a step of {step} s is {frames:.0} frames at {fps} frames a second"));
+    }
+    // Cameras of a rig, whose shutters do not open at once, are compared each with itself.
+    let own = 2.0 * half_frame(of_camera.iter().copied().zip(times.iter().copied()));
+    if rate.stated && own > 0.0 && own * fps < 1.0 - FEWER {
+        return doubt(Times::Seconds, format!("steps of {own:.4} s do not fit {fps} frames a second"));
+    }
+    of(Times::Seconds)
+}
+
+/// Says what times were read as, and how else they can be.
+fn tell(reading: &Reading, instants: &[f64], rate: Rate, account: &mut Account) {
+    let [Some(first), Some(last)] = [instants.first(), instants.last()] else { return };
+    if first == last {
+        return;
+    }
+    let word = match reading.times {
+        Times::Fractions => "parts of the capture from 0 to 1",
+        Times::Frames => "frame numbers",
+        _ => "seconds",
+    };
+    let from = if rate.stated { "stated" } else { "not stated" };
+    let doubt = reading.doubt.as_ref().map_or_else(String::new, |d| {
+        format!(" This is not sure: {d}. Else say --set capture.times=seconds, fractions or frames.")
+    });
+    let what = format!(
+        "Times are read as {word}: {} instants from {first} to {last} at {} frames a second ({from}): {:.3} s.{doubt}",
+        instants.len(),
+        reading.fps,
+        (last - first) * reading.scale
+    );
+    let severity = if doubt.is_empty() { Severity::Note } else { Severity::Warning };
+    account.add(Aspect::Assumed, severity, what);
 }
 
 /// The number of the instant that is nearest to `t`, of two the later.

@@ -1,10 +1,14 @@
 //! One frame of a transforms file: its picture, pose, lens and time. What a frame says of itself goes before what the
 //! file says for all.
 
+use super::super::convention::{Convention, Poses};
 use super::super::json::Node;
-use super::super::{DepthFile, DepthKind, Split, picture, pose, rig};
+use super::super::lookup::Lookup;
+use super::super::{DepthFile, DepthKind, Split, picture, pose};
+use splat4d::math::Se3;
 use splat4d::scene::{Camera, Intrinsics, Lens};
 use splat4d::{Error, ErrorKind, Result};
+use std::collections::BTreeSet;
 use std::f64::consts::PI;
 use std::path::{Path, PathBuf};
 
@@ -28,42 +32,62 @@ pub(super) struct Entry {
     pub split: Split,
 }
 
-/// Reads `node`, a frame of the file `top`.
-pub(super) fn read(root: &Path, top: &Node<'_>, node: &Node<'_>) -> Result<Entry> {
+/// A transforms file that is being read.
+pub(super) struct File<'a> {
+    /// Its folder, and how its files are found.
+    pub lookup: &'a Lookup,
+    /// Where images are looked for.
+    pub bases: &'a [PathBuf],
+    /// The whole file.
+    pub top: &'a Node<'a>,
+    /// What poses are written as.
+    pub poses: Poses,
+    /// The size of an image that is there: that of missing ones where none is stated.
+    pub size: Option<(usize, usize)>,
+}
+
+/// Reads `node`, a frame of the file.
+pub(super) fn read(file: &File<'_>, node: &Node<'_>) -> Result<Entry> {
     let name = node.get("file_path")?.text()?;
-    let image = image_path(root, name)?;
-    let (source, by_angle) = camera(top, node, &|| Ok(image.clone()))?;
+    let image = file.lookup.image_or_place(file.bases, name).map_err(|e| node.at(e))?;
+    let (source, by_angle) = camera(file, node, &image)?;
     let time = node.opt("time")?.map(|n| n.number()).transpose()?;
-    let mask = node.opt("mask_path")?.map(|n| Ok(root.join(n.text()?))).transpose()?;
-    let depth = node.opt("depth_file_path")?.map(|n| depth(root, top, node, n.text()?)).transpose()?;
-    Ok(Entry { name: name.into(), image, source, by_angle, time, mask, depth, split: Split::Train })
+    let beside = |n: Node<'_>| file.lookup.file(n.text()?).map_err(|e| n.at(e));
+    let mask = node.opt("mask_path")?.map(beside).transpose()?;
+    let depth = node.opt("depth_file_path")?.map(|n| depth(file.top, node, beside(n)?)).transpose()?;
+    // Names tell cameras apart by forward slashes.
+    Ok(Entry { name: name.replace('\\', "/"), image, source, by_angle, time, mask, depth, split: Split::Train })
 }
 
 /// Units of the scene a stored number of a depth map where a file does not say: thousandths, as Nerfstudio has it.
 const DEPTH_UNIT: f64 = 1e-3;
 
 /// A depth map in units of `depth_unit_scale_factor`, whatever its kind of file (Nerfstudio).
-fn depth(root: &Path, top: &Node<'_>, node: &Node<'_>, name: &str) -> Result<DepthFile> {
+fn depth(top: &Node<'_>, node: &Node<'_>, path: PathBuf) -> Result<DepthFile> {
     let key = "depth_unit_scale_factor";
     let scale = number(top, node, key)?.unwrap_or(DEPTH_UNIT);
     if scale <= 0.0 {
         let what = format!("{key} is {scale}");
         return Err(node.error(what).remedy("Give the scene units of a stored number, for instance 0.001"));
     }
-    Ok(DepthFile { path: root.join(name), scale, kind: DepthKind::Metric })
+    Ok(DepthFile { path, scale, kind: DepthKind::Metric })
 }
 
-/// The name and camera of a frame whose picture need not be there where the size is stated.
-pub(super) fn posed(root: &Path, top: &Node<'_>, node: &Node<'_>) -> Result<(String, Camera)> {
+/// The name and camera of a frame whose image need not be there where the size is stated.
+pub(super) fn posed(file: &File<'_>, node: &Node<'_>) -> Result<(String, Camera)> {
     let name = node.get("file_path")?.text()?;
-    Ok((name.to_owned(), camera(top, node, &|| image_path(root, name))?.0))
+    let image = file.lookup.image_or_place(file.bases, name).map_err(|e| node.at(e))?;
+    Ok((name.replace('\\', "/"), camera(file, node, &image)?.0))
 }
 
-/// Pose, intrinsics and lens, and whether the focal length is an angle of view. `image` is asked where no size is stated.
-fn camera(top: &Node<'_>, node: &Node<'_>, image: &dyn Fn() -> Result<PathBuf>) -> Result<(Camera, bool)> {
+/// Pose, intrinsics and lens, and whether the focal length is an angle of view. `image` is looked at where no size is
+/// stated.
+fn camera(file: &File<'_>, node: &Node<'_>, image: &Path) -> Result<(Camera, bool)> {
+    let top = file.top;
     let matrix = node.get("transform_matrix")?;
-    let cam_from_world = pose::from_opengl(&matrix.matrix4()?).map_err(|e| matrix.at(e))?;
-    let (width, height) = size(top, node, image)?;
+    let raw = pose::checked(Se3::from_rows(&matrix.pose4(file.poses)?)).map_err(|e| matrix.at(e))?;
+    let cam_from_world = Convention::NERF.read_as(raw, file.poses)?;
+    let (width, height) = size(file, node, image)?;
     let fx = focal(top, node, ["fl_x", "camera_angle_x", "x_fov"], width)?;
     let (fx, by_angle) = fx.ok_or_else(|| {
         node.error("neither fl_x nor camera_angle_x is given")
@@ -87,14 +111,21 @@ fn number(top: &Node<'_>, node: &Node<'_>, key: &str) -> Result<Option<f64>> {
     value(top, node, key)?.map(|n| n.number()).transpose()
 }
 
-/// The size that the intrinsics are for: as it is stated, else the picture's.
-fn size(top: &Node<'_>, node: &Node<'_>, image: &dyn Fn() -> Result<PathBuf>) -> Result<(usize, usize)> {
-    let side = |key: &str| value(top, node, key)?.map(|n| n.count()).transpose();
+/// The size that the intrinsics are for: as it is stated, else the image's.
+fn size(file: &File<'_>, node: &Node<'_>, image: &Path) -> Result<(usize, usize)> {
+    let side = |key: &str| value(file.top, node, key)?.map(|n| n.count()).transpose();
     if let (Some(width), Some(height)) = (side("w")?, side("h")?) {
         return Ok((width, height));
     }
-    let header = picture::header(&image()?)?;
-    Ok((header.width, header.height))
+    if let Some(size) = file.size.filter(|_| !image.is_file()) {
+        return Ok(size);
+    }
+    if !image.is_file() {
+        return Err(Error::input("the image is missing, and no size (w, h) is stated")
+            .at(image.display())
+            .remedy("Restore the image, or state the size."));
+    }
+    picture::header(image).map(|header| header.upright())
 }
 
 /// The focal length along a side, pixels, and whether it comes from an angle of view. `keys`: pixels, radians, degrees
@@ -121,43 +152,134 @@ fn focal(top: &Node<'_>, node: &Node<'_>, keys: [&str; 3], side: usize) -> Resul
 
 fn lens(top: &Node<'_>, node: &Node<'_>) -> Result<Lens> {
     let term = |key: &str| -> Result<f64> { Ok(number(top, node, key)?.unwrap_or(0.0)) };
-    let k = [term("k1")?, term("k2")?, term("k3")?, term("k4")?];
-    let p = [term("p1")?, term("p2")?];
+    let mut k = [term("k1")?, term("k2")?, term("k3")?, term("k4")?, term("k5")?, term("k6")?];
+    let mut p = [term("p1")?, term("p2")?];
+    let s = [term("s1")?, term("s2")?, term("s3")?, term("s4")?];
+    if let Some(list) = value(top, node, "distortion_params")? {
+        // Nerfstudio: k1 k2 k3 k4 p1 p2, in place of the single keys.
+        let given = list.numbers::<6>()?;
+        k = [given[0], given[1], given[2], given[3], 0.0, 0.0];
+        p = [given[4], given[5]];
+    }
+    let unsupported = |what: String| {
+        node.at(Error::new(ErrorKind::Unsupported, what))
+            .remedy("Undistort the images to pinhole ones first (colmap image_undistorter).")
+    };
+    let other = FOREIGN_LENSES.iter().find(|key| {
+        let given = value(top, node, key).ok().flatten();
+        given.is_some_and(|n| n.value.as_bool() == Some(true) || n.value.as_f64().is_some_and(|x| x != 0.0))
+    });
+    if let Some(key) = other {
+        return Err(unsupported(format!("the lens of \"{key}\" is not read")));
+    }
     // instant-ngp's word for it.
     let fisheye = value(top, node, "is_fisheye")?.is_some_and(|n| n.value.as_bool() == Some(true));
     let model = value(top, node, "camera_model")?.map(|n| n.text()).transpose()?;
-    let unsupported = |what: String| {
-        node.at(Error::new(ErrorKind::Unsupported, what))
-            .remedy("Undistort the pictures to pinhole ones first (colmap image_undistorter).")
-    };
     match model.unwrap_or(if fisheye { "OPENCV_FISHEYE" } else { "OPENCV" }) {
-        "OPENCV_FISHEYE" => Ok(Lens::Fisheye { k }),
-        "PINHOLE" | "SIMPLE_PINHOLE" | "OPENCV" | "SIMPLE_RADIAL" | "RADIAL" | "PERSPECTIVE" => {
-            if k == [0.0; 4] && p == [0.0; 2] {
+        "OPENCV_FISHEYE" if k[4..] != [0.0; 2] || p != [0.0; 2] || s != [0.0; 4] => {
+            Err(unsupported("a fisheye lens has k1 to k4; k5, k6, p1, p2 or s1 to s4 are not zero".into()))
+        }
+        "OPENCV_FISHEYE" => Ok(Lens::Fisheye { k: [k[0], k[1], k[2], k[3]] }),
+        "PINHOLE" | "SIMPLE_PINHOLE" | "OPENCV" | "FULL_OPENCV" | "SIMPLE_RADIAL" | "RADIAL" | "PERSPECTIVE" => {
+            if k == [0.0; 6] && p == [0.0; 2] && s == [0.0; 4] {
                 return Ok(Lens::Pinhole);
             }
-            if k[3] != 0.0 {
+            // With k5 or k6 the terms are those of OpenCV's rational lens.
+            let rational = k[4..] != [0.0; 2] || model == Some("FULL_OPENCV");
+            if k[3] != 0.0 && !rational {
                 // Nerfstudio's k4 multiplies r⁸ there, which OpenCV's model (ours) does not have.
                 return Err(unsupported("k4 of the perspective camera is not zero".into()));
             }
-            Ok(Lens::Brown { k: [k[0], k[1], k[2], 0.0, 0.0, 0.0], p, s: [0.0; 4] })
+            Ok(Lens::Brown { k, p, s })
         }
         other => Err(unsupported(format!("the camera model {other:.40} is not read"))),
     }
 }
 
-/// `file_path` with or without its ending, and with either slash.
-fn image_path(root: &Path, text: &str) -> Result<PathBuf> {
-    let path = root.join(text.strip_prefix("./").unwrap_or(text));
-    let slashes = root.join(text.replace('\\', "/"));
-    if let Some(found) = [&path, &slashes].into_iter().find(|p| p.is_file()) {
-        return Ok(found.clone());
-    }
-    let named = |ending: &&str| PathBuf::from(format!("{}.{ending}", path.display()));
-    let found = rig::IMAGE_ENDINGS.iter().map(named).find(|p| p.is_file());
-    found.ok_or_else(|| {
-        Error::input("the picture is missing (also with .png, .jpg, .jpeg and .webp)")
-            .at(path.display())
-            .remedy("Restore the file, or take the frame out of the transforms file.")
-    })
+/// Keys of lenses that are not modelled: instant-ngp's, and OpenCV's tilted sensor.
+const FOREIGN_LENSES: &[&str] = &[
+    "latlong",
+    "is_latlong",
+    "equirectangular",
+    "is_equirectangular",
+    "orthographic",
+    "ftheta_p0",
+    "ftheta_p1",
+    "ftheta_p2",
+    "ftheta_p3",
+    "ftheta_p4",
+    "tx",
+    "ty",
+    "taux",
+    "tauy",
+];
+/// Keys that are read, at the top or in a frame.
+const READ: &[&str] = &[
+    "frames",
+    "file_path",
+    "transform_matrix",
+    "fl_x",
+    "fl_y",
+    "camera_angle_x",
+    "camera_angle_y",
+    "x_fov",
+    "y_fov",
+    "cx",
+    "cy",
+    "w",
+    "h",
+    "camera_model",
+    "is_fisheye",
+    "k1",
+    "k2",
+    "k3",
+    "k4",
+    "k5",
+    "k6",
+    "p1",
+    "p2",
+    "s1",
+    "s2",
+    "s3",
+    "s4",
+    "distortion_params",
+    "time",
+    "mask_path",
+    "depth_file_path",
+    "depth_unit_scale_factor",
+    "fps",
+    "train_filenames",
+    "test_filenames",
+    "val_filenames",
+    "ply_file_path",
+    "applied_transform",
+];
+/// Keys that say nothing of poses, lenses and times: sizes of other programs' volumes, statistics, names.
+const HARMLESS: &[&str] = &[
+    "aabb_scale",
+    "aabb",
+    "scale",
+    "offset",
+    "sharpness",
+    "colmap_im_id",
+    "camera_id",
+    "id",
+    "name",
+    "applied_scale",
+    "orientation_override",
+    "rotation",
+    "render_aabb",
+    "up",
+    "from_na",
+    "n_extra_learnable_dims",
+    "comment",
+];
+
+/// Keys of a file that are not read and might matter, each once.
+pub(super) fn unread(top: &Node<'_>) -> Vec<String> {
+    let frames = top.value.get("frames").and_then(|v| v.as_array()).map_or(&[][..], Vec::as_slice);
+    let objects = frames.iter().chain([top.value]).filter_map(|v| v.as_object());
+    let known = |key: &&String| [READ, HARMLESS, FOREIGN_LENSES].iter().any(|keys| keys.contains(&key.as_str()));
+    let keys: BTreeSet<&String> = objects.flat_map(|o| o.keys()).filter(|k| !known(k)).collect();
+    keys.into_iter().map(|k| format!("{k:.40}")).collect()
 }

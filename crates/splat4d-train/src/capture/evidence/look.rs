@@ -1,0 +1,152 @@
+//! A few images, made small: their colours, foregrounds and features.
+
+use super::super::lens::Distortion;
+use super::super::picture::{self, Raster};
+use super::super::{Capture, Frame};
+use crate::vision::features::{Feature, Limits, find};
+use crate::vision::raster::grey;
+use rayon::prelude::*;
+use splat4d::math::Se3;
+use splat4d::scene::{Camera, Planes};
+
+/// Longest side of what is looked at, pixels.
+const SIDE: usize = 320;
+/// Features of an image.
+const FEATURES: usize = 350;
+/// Least contrast of a feature, as structure from motion takes it.
+const CONTRAST: f64 = 0.004;
+/// Foreground below this share of an image, or above the other, says nothing of a place.
+const FOREGROUND: [f64; 2] = [0.001, 0.6];
+
+/// A feature: what it looks like, and its ray without distortion (x/z, y/z).
+pub(super) struct Mark {
+    pub(super) feature: Feature,
+    pub(super) ray: [f64; 2],
+}
+
+/// A small image.
+pub(super) struct Look {
+    /// Its frame of the capture.
+    pub(super) frame: usize,
+    /// The camera of the image file.
+    camera: Camera,
+    lens: Distortion,
+    color: Planes<f32>,
+    /// Pixels of the file along one of the small image's.
+    factor: usize,
+    /// The ray to the middle of its foreground, where it has one.
+    pub(super) foreground: Option<[f64; 2]>,
+    pub(super) marks: Vec<Mark>,
+}
+
+/// Reads the images of these frames; those that cannot be read are left out.
+pub(super) fn take(capture: &Capture, frames: &[usize]) -> Vec<Look> {
+    frames.par_iter().filter_map(|&i| Look::read(i, &capture.frames[i], capture.background)).collect()
+}
+
+/// The image of a frame with or without its EXIF orientation.
+pub(super) fn one(capture: &Capture, frame: usize, upright: bool) -> Option<Look> {
+    Look::read(frame, &Frame { upright, ..capture.frames[frame].clone() }, capture.background)
+}
+
+/// Finds the features of all.
+pub(super) fn describe(looks: &mut [Look]) {
+    looks.par_iter_mut().for_each(|look| {
+        let limits = Limits { contrast: CONTRAST, most: FEATURES };
+        let found = find(&grey(&look.color), limits, &|_, _| true);
+        let mark = |feature: Feature| Some(Mark { ray: look.ray(feature.pixel)?, feature });
+        look.marks = found.into_iter().filter_map(mark).collect();
+    });
+}
+
+/// Means of boxes of one channel (or of alpha) of an image.
+fn reduced(raster: &Raster, channel: usize, k: usize) -> Vec<f32> {
+    let (width, height) = (raster.width / k, raster.height / k);
+    let mut out = vec![0.0; width * height];
+    for y in 0..height * k {
+        for x in 0..width * k {
+            out[y / k * width + x / k] += raster.get(y * raster.width + x, channel);
+        }
+    }
+    out.iter_mut().for_each(|v| *v /= (k * k) as f32);
+    out
+}
+
+impl Look {
+    fn read(number: usize, frame: &Frame, background: Option<[f32; 3]>) -> Option<Self> {
+        let raster = picture::decode_as(&frame.image, Some(&frame.source), frame.upright).ok()?;
+        let factor = raster.width.max(raster.height).div_ceil(SIDE).max(1);
+        let (width, height) = (raster.width / factor, raster.height / factor);
+        if width == 0 || height == 0 {
+            return None;
+        }
+        let alpha = raster.alpha().map(|a| reduced(&raster, a, factor));
+        let mut color = Planes::new(3, height, width);
+        let under = background.unwrap_or([1.0; 3]);
+        for c in 0..3 {
+            let plane = reduced(&raster, if raster.channels < 3 { 0 } else { c }, factor);
+            let out = &mut color.data[c * width * height..(c + 1) * width * height];
+            for (p, v) in out.iter_mut().enumerate() {
+                let a = alpha.as_ref().map_or(1.0, |a| a[p]);
+                *v = plane[p] * a + under[c] * (1.0 - a);
+            }
+        }
+        let mask = || {
+            let mask = picture::decode_as(frame.mask.as_deref()?, None, frame.upright).ok()?;
+            let same = (mask.width, mask.height) == (raster.width, raster.height);
+            same.then(|| reduced(&mask, 0, factor))
+        };
+        let shown = alpha.or_else(mask);
+        let lens = Distortion::new(frame.source.lens);
+        let camera = frame.source.clone();
+        let mut look = Self { frame: number, camera, lens, color, factor, foreground: None, marks: Vec::new() };
+        look.foreground = shown.and_then(|weights| look.middle(&weights));
+        Some(look)
+    }
+
+    /// The ray to the middle of a foreground; `None`: it is nearly nothing, or nearly everything.
+    fn middle(&self, weights: &[f32]) -> Option<[f64; 2]> {
+        let (width, most) = (self.color.width, weights.iter().copied().fold(0.0f32, f32::max));
+        let (mut sum, mut at) = (0.0, [0.0; 2]);
+        for (p, w) in weights.iter().enumerate() {
+            let w = f64::from(w / most.max(f32::MIN_POSITIVE));
+            sum += w;
+            at[0] += w * ((p % width) as f64 + 0.5);
+            at[1] += w * ((p / width) as f64 + 0.5);
+        }
+        let share = sum / weights.len() as f64;
+        (FOREGROUND[0]..=FOREGROUND[1]).contains(&share).then(|| self.ray(at.map(|v| v / sum)))?
+    }
+
+    /// The ray (x/z, y/z) of a pixel of the small image.
+    fn ray(&self, [u, v]: [f64; 2]) -> Option<[f64; 2]> {
+        let (k, f) = (&self.camera.intrinsics, self.factor as f64);
+        self.lens.undistort([(u * f - k.cx) / k.fx, (v * f - k.cy) / k.fy])
+    }
+
+    /// Focal length of the small image, pixels.
+    pub(super) fn focal(&self) -> f64 {
+        self.camera.intrinsics.fx / self.factor as f64
+    }
+
+    /// The colour at which a point of the world is seen from `pose`; `None`: outside.
+    pub(super) fn color_of(&self, pose: &Se3, point: [f64; 3]) -> Option<[f32; 3]> {
+        let [u, v] = pixel_of(&self.camera, &self.lens, pose, point)?;
+        let (x, y) = (u as usize / self.factor, v as usize / self.factor);
+        let inside = x < self.color.width && y < self.color.height;
+        inside.then(|| std::array::from_fn(|c| self.color.get(c, y, x)))
+    }
+}
+
+/// Where a point is seen in the image file; `None`: behind the camera or outside.
+pub(super) fn pixel_of(camera: &Camera, lens: &Distortion, pose: &Se3, point: [f64; 3]) -> Option<[f64; 2]> {
+    let [x, y, z] = pose.apply(point);
+    if z <= 0.0 {
+        return None;
+    }
+    let k = &camera.intrinsics;
+    let [x, y] = lens.distort([x / z, y / z])?;
+    let at = [k.fx * x + k.cx, k.fy * y + k.cy];
+    let inside = (0.0..camera.width as f64).contains(&at[0]) && (0.0..camera.height as f64).contains(&at[1]);
+    inside.then_some(at)
+}

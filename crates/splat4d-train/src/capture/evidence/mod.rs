@@ -1,0 +1,231 @@
+//! Evidence that poses can be right: initial points in front of the cameras and in their images, their colours there,
+//! features of neighbouring images on each other's epipolar lines, and foregrounds that look at one place.
+//!
+//! Each is measured for the poses as they are read, and as they would be in the other conventions that files of the layout
+//! are found in. A finding needs a convention that fits clearly better; nothing else is an alarm.
+
+mod look;
+mod pairs;
+mod points;
+mod silhouettes;
+#[cfg(test)]
+mod tests;
+
+use super::preflight::{Finding, Severity};
+use super::{Aspect, Capture, Frame, Poses};
+use look::Look;
+use splat4d::math::Se3;
+
+/// Images that are looked at, at most; and at least, where they are large.
+const LOOKS: [usize; 2] = [4, 10];
+/// Pixels that are decoded, at most: a second of one core.
+const PIXELS: usize = 40_000_000;
+/// Part of a moving camera's frames between two that are looked at: neighbours overlap, and are apart.
+const STRIDE: usize = 50;
+
+/// The measures of one convention.
+#[derive(Clone, Copy, Debug, Default)]
+struct Measure {
+    points: points::Measure,
+    pairs: pairs::Measure,
+    foreground: Option<f64>,
+}
+
+/// What [`Capture::check_poses`] found.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct PoseCheck {
+    /// The convention that the poses are probably written in; `None`: as they were read, or it could not be told.
+    pub written_as: Option<Poses>,
+    /// What was found, or why nothing could be.
+    pub finding: Finding,
+}
+
+impl Capture {
+    /// Compares poses with points and images. Opens a few images; images that cannot be read are passed over.
+    pub fn check_poses(&self) -> PoseCheck {
+        self.judge(&mut look::take(self, &self.looked_at()), &mut None)
+    }
+
+    /// The verdict by these images; features are found and matched if points do not say enough.
+    fn judge(&self, looks: &mut [Look], matches: &mut Option<Vec<pairs::Match>>) -> PoseCheck {
+        let mut conventions = vec![Poses::STATED];
+        conventions.extend(self.convention.others());
+        let posed = |f: &Frame, p: Poses| match p {
+            Poses::STATED => Some(f.source.cam_from_world),
+            p => self.convention.reread(&f.source.cam_from_world, p).ok(),
+        };
+        let all = |frames: &[usize], p: Poses| -> Option<Vec<Se3>> {
+            frames.iter().map(|&i| posed(&self.frames[i], p)).collect()
+        };
+        let mut measures = vec![Measure::default(); conventions.len()];
+        let spread = points::frames(self);
+        let seen: Vec<usize> = looks.iter().map(|l| l.frame).collect();
+        let poses: Vec<Option<Vec<Se3>>> = conventions.iter().map(|&p| all(&seen, p)).collect();
+        for ((m, &p), poses) in measures.iter_mut().zip(&conventions).zip(&poses) {
+            let (Some(spread_poses), Some(poses)) = (all(&spread, p), poses) else { continue };
+            m.points = points::measure(self, (&spread, &spread_poses), (looks, poses));
+            m.foreground = silhouettes::measure(looks, poses);
+        }
+        // Points whose colours agree say enough.
+        if !measures[0].points.convinces() {
+            let matches = matches.get_or_insert_with(|| {
+                look::describe(looks);
+                pairs::matches(looks)
+            });
+            pairs::measure(matches, looks, &poses).into_iter().zip(&mut measures).for_each(|(p, m)| m.pairs = p);
+        }
+        self.conclude(&conventions, &measures)
+    }
+
+    /// The frames that are looked at: cameras of one instant in their order, or frames of a moving camera in a row.
+    fn looked_at(&self) -> Vec<usize> {
+        let pixels = self.frames.first().map_or(1, |f| f.source.width * f.source.height).max(1);
+        let most = (PIXELS / pixels).clamp(LOOKS[0], LOOKS[1]);
+        let mut counts = std::collections::BTreeMap::<usize, Vec<usize>>::new();
+        for &i in &self.train {
+            counts.entry(self.frames[i].index).or_default().push(i);
+        }
+        let fullest = counts.into_values().rev().max_by_key(Vec::len).unwrap_or_default();
+        if fullest.len() >= LOOKS[0].min(self.train.len()) {
+            return fullest.into_iter().take(most).collect();
+        }
+        // Two runs of frames, a little apart from one another within each.
+        let mut frames = self.train.clone();
+        frames.sort_by(|&a, &b| self.frames[a].time.0.total_cmp(&self.frames[b].time.0));
+        let stride = frames.len().div_ceil(STRIDE);
+        let run = most.div_ceil(2);
+        let starts = [0, frames.len() / 2];
+        let mut out: Vec<usize> = starts
+            .iter()
+            .flat_map(|&s| (0..run).filter_map(|k| frames.get(s + k * stride).copied()).collect::<Vec<_>>())
+            .collect();
+        out.sort_unstable();
+        out.dedup();
+        out
+    }
+
+    fn conclude(&self, conventions: &[Poses], measures: &[Measure]) -> PoseCheck {
+        let stated = &measures[0];
+        let found = (1..measures.len())
+            .filter(|&k| {
+                points::prefers(&measures[k].points, &stated.points, &measures[k].pairs)
+                    || pairs::prefers(&measures[k].pairs)
+                    || silhouettes::prefers(measures[k].foreground, stated.foreground)
+            })
+            // The first of equals has the fewest changes.
+            .rev()
+            .max_by(|&a, &b| measures[a].score().total_cmp(&measures[b].score()));
+        let Some(best) = found.filter(|&k| measures[k].score() > stated.score()) else {
+            return PoseCheck { written_as: None, finding: stated.agrees() };
+        };
+        let (m, poses) = (&measures[best], conventions[best]);
+        let mut parts = Vec::new();
+        if m.points.asked > 0 {
+            parts.push(format!(
+                "{:.0} % of the initial points are in front of the cameras and in their images (as read {:.0} %)",
+                100.0 * m.points.seen,
+                100.0 * stated.points.seen
+            ));
+        }
+        if let Some(gain) = m.points.gain {
+            let own = stated.points.gain.map_or_else(String::new, |g| format!(", {:.0} % as read", 100.0 * g.max(0.0)));
+            parts.push(format!("colours of points fit their images by {:.0} %{own}", 100.0 * gain));
+        }
+        if m.pairs.matches > 0 {
+            parts.push(format!(
+                "{} of {} matches between images fit (as read {})",
+                m.pairs.fitting, m.pairs.matches, stated.pairs.fitting
+            ));
+        }
+        if let (Some(here), Some(there)) = (m.foreground, stated.foreground) {
+            let percent = |x: f64| 100.0 * x;
+            parts.push(format!(
+                "the foregrounds of {:.0} % of the images are at one place (as read {:.0} %)",
+                percent(here),
+                percent(there)
+            ));
+        }
+        let what = format!(
+            "Poses are probably written in another convention than the layout states: if {}, {}.",
+            poses.in_words(self.convention),
+            parts.join(", ")
+        );
+        let (written_as, remedy) = match self.poses == Poses::STATED {
+            true => (Some(poses), format!("Read them so: --poses {poses}.")),
+            false => (None, format!("They are read as --poses {} says: leave it out, or give another.", self.poses)),
+        };
+        PoseCheck {
+            written_as,
+            finding: Finding { severity: Severity::Warning, aspect: Some(Aspect::Assumed), what, remedy },
+        }
+    }
+}
+
+/// Whether poses describe upright images (with their EXIF orientation applied), by colours of points and by matches between
+/// images; `None`: it cannot be told. `unsure` are frames whose sizes do not tell.
+pub(super) fn upright(capture: &Capture, unsure: &[usize]) -> Option<bool> {
+    let others = (0..capture.frames.len()).filter(|i| !unsure.contains(i)).take(LOOKS[0]);
+    let some: Vec<usize> = unsure.iter().copied().take(LOOKS[1] - LOOKS[0]).collect();
+    let measured = [true, false].map(|upright| {
+        let asked = some.iter().filter_map(|&i| look::one(capture, i, upright));
+        let sure = others.clone().filter_map(|i| look::one(capture, i, true));
+        let mut looks: Vec<Look> = asked.chain(sure).collect();
+        let pose = |l: &Look| capture.frames[l.frame].source.cam_from_world;
+        let poses: Vec<Se3> = looks.iter().map(pose).collect();
+        let count = looks.iter().filter(|l| some.contains(&l.frame)).count();
+        let gain = points::gain_of(capture, &looks[..count], &poses[..count]);
+        look::describe(&mut looks);
+        let matches = pairs::matches(&looks);
+        (gain, pairs::measure(&matches, &looks, &[Some(poses)])[0])
+    });
+    let [(gain, pairs), (stored_gain, stored_pairs)] = measured;
+    if let (Some(a), Some(b)) = (gain, stored_gain)
+        && (a - b).abs() >= points::BETTER
+    {
+        return Some(a > b);
+    }
+    let [a, b] = [&pairs, &stored_pairs].map(|p| if p.convinces() { p.fitting } else { 0 });
+    (a.max(b) > 2 * a.min(b)).then_some(a > b)
+}
+
+impl Measure {
+    /// How well a convention fits, for comparison of those that fit at all.
+    fn score(&self) -> f64 {
+        let points = self.points.seen * (0.1 + self.points.gain.unwrap_or(0.0).max(0.0));
+        points + self.pairs.share() + 0.5 * self.foreground.unwrap_or(0.0)
+    }
+
+    /// What speaks for the poses as they are read, or why nothing does.
+    fn agrees(&self) -> Finding {
+        let mut parts = Vec::new();
+        if self.points.convinces() {
+            parts.push(format!(
+                "{:.0} % of the initial points are in front of the cameras and in their images, and colours of points fit these \
+                 by {:.0} %",
+                100.0 * self.points.seen,
+                100.0 * self.points.gain.unwrap_or(0.0)
+            ));
+        }
+        if self.pairs.convinces() {
+            parts.push(format!("{} of {} matches between images fit", self.pairs.fitting, self.pairs.matches));
+        }
+        if let Some(share) = self.foreground.filter(|s| *s >= silhouettes::CONVINCES) {
+            parts.push(format!("the foregrounds of {:.0} % of the images are at one place", 100.0 * share));
+        }
+        let (aspect, what) = match parts.is_empty() {
+            false => (None, format!("Poses agree with the images: {}.", parts.join(", "))),
+            true => (
+                Some(Aspect::NotChecked),
+                format!(
+                    "Whether the poses are right: {} initial points, of which {:.0} % are in images, and {} matches between \
+                     images, of which {} fit, say too little.",
+                    self.points.asked,
+                    100.0 * self.points.seen,
+                    self.pairs.matches,
+                    self.pairs.fitting
+                ),
+            ),
+        };
+        Finding { severity: Severity::Note, aspect, what, remedy: String::new() }
+    }
+}

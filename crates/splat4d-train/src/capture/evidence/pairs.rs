@@ -1,0 +1,166 @@
+//! Features that two images share, and whether poses put them on each other's epipolar lines, in front of both cameras.
+
+use super::look::{Look, Mark};
+use rayon::prelude::*;
+use splat4d::math::Se3;
+use splat4d::math::se3::{cross, dot, mat_vec, norm, normalize, sub, transpose};
+
+/// The second best match is this many times farther away (Lowe 2004).
+const RATIO: f64 = 0.8;
+/// Distance from an epipolar line, pixels of the small image.
+const NEAR: f64 = 1.5;
+/// Angle between rays below which nothing says which side of the cameras they meet on, radians.
+const PARALLEL: f64 = 0.006;
+/// Of the cameras' spread: cameras nearer to one another stand in one place.
+const ONE_PLACE: f64 = 1e-6;
+/// Matches that one convention fits and the other does not, at least, and how many times as many as the other way round.
+const MORE: (usize, usize) = (20, 4);
+/// Share of the matches that a right convention fits at least: many are chance.
+const FITTING: f64 = 0.2;
+
+/// Two features that look alike, of these looks: their rays.
+pub(super) struct Match {
+    looks: [usize; 2],
+    rays: [[f64; 2]; 2],
+}
+
+/// What matches say of one convention.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Measure {
+    pub(super) matches: usize,
+    pub(super) fitting: usize,
+    /// Matches that it fits and the poses as read do not, and the other way round.
+    gained: usize,
+    lost: usize,
+}
+
+impl Measure {
+    /// Part of the matches that fits.
+    pub(super) fn share(&self) -> f64 {
+        self.fitting as f64 / self.matches.max(1) as f64
+    }
+
+    /// Whether poses are right by this.
+    pub(super) fn convinces(&self) -> bool {
+        self.fitting >= MORE.0 && self.share() >= FITTING
+    }
+
+    /// Whether matches say that the poses as read are better.
+    pub(super) fn contradicts(&self) -> bool {
+        self.lost >= MORE.0 && self.lost >= MORE.1 * self.gained
+    }
+}
+
+/// Whether matches say that poses are written in this convention.
+pub(super) fn prefers(m: &Measure) -> bool {
+    m.convinces() && m.gained >= MORE.0 && m.gained >= MORE.1 * m.lost
+}
+
+/// Mutual best matches of all pairs of looks.
+pub(super) fn matches(looks: &[Look]) -> Vec<Match> {
+    let pairs: Vec<[usize; 2]> = (0..looks.len()).flat_map(|a| (a + 1..looks.len()).map(move |b| [a, b])).collect();
+    pairs.par_iter().flat_map_iter(|&[a, b]| between([a, b], &looks[a].marks, &looks[b].marks)).collect()
+}
+
+fn between(looks: [usize; 2], from: &[Mark], to: &[Mark]) -> Vec<Match> {
+    let mut back = vec![(u32::MAX, 0); to.len()];
+    let mut forth = Vec::with_capacity(from.len());
+    for (i, a) in from.iter().enumerate() {
+        let (mut first, mut second) = ((u32::MAX, 0), u32::MAX);
+        for (j, b) in to.iter().enumerate() {
+            let d = a.feature.distance(&b.feature);
+            back[j] = back[j].min((d, i));
+            if d < first.0 {
+                // A place may have two features, of two directions: they are no rivals.
+                if first.0 < u32::MAX && to[first.1].feature.pixel != b.feature.pixel {
+                    second = first.0;
+                }
+                first = (d, j);
+            } else if d < second && to[first.1].feature.pixel != b.feature.pixel {
+                second = d;
+            }
+        }
+        forth.push((first, second));
+    }
+    let good = |(i, ((d, j), second)): (usize, ((u32, usize), u32))| {
+        let clear = f64::from(d).sqrt() < RATIO * f64::from(second).sqrt();
+        (d < u32::MAX && clear && back[j].1 == i).then(|| Match { looks, rays: [from[i].ray, to[j].ray] })
+    };
+    forth.into_iter().enumerate().filter_map(good).collect()
+}
+
+/// Measures every convention; `poses` are those of the looks in each, the first as read.
+pub(super) fn measure(matches: &[Match], looks: &[Look], poses: &[Option<Vec<Se3>>]) -> Vec<Measure> {
+    let fits: Vec<Vec<bool>> = poses
+        .iter()
+        .map(|poses| match poses {
+            Some(poses) => {
+                let centers: Vec<[f64; 3]> = poses.iter().map(|p| p.inverse().translation).collect();
+                let spread = centers.iter().map(|&c| norm(sub(c, centers[0]))).fold(0.0, f64::max);
+                let least = ONE_PLACE * (spread + norm(centers.first().copied().unwrap_or_default()));
+                matches.iter().map(|m| fits(m, looks, poses, least)).collect()
+            }
+            None => vec![false; matches.len()],
+        })
+        .collect();
+    let count = |f: &dyn Fn(usize) -> bool| (0..matches.len()).filter(|&k| f(k)).count();
+    fits.iter()
+        .map(|own| Measure {
+            matches: matches.len(),
+            fitting: count(&|k| own[k]),
+            gained: count(&|k| own[k] && !fits[0][k]),
+            lost: count(&|k| !own[k] && fits[0][k]),
+        })
+        .collect()
+}
+
+/// Whether two rays meet in front of both cameras.
+fn fits(m: &Match, looks: &[Look], poses: &[Se3], least: f64) -> bool {
+    let [a, b] = m.looks;
+    let motion = poses[b].after(&poses[a].inverse());
+    let tolerance = NEAR * 2.0 / (looks[a].focal() + looks[b].focal());
+    let [p, q] = m.rays.map(|[x, y]| [x, y, 1.0]);
+    let turned = mat_vec(&motion.rotation, p);
+    let baseline = norm(motion.translation);
+    if baseline <= least {
+        // One place: the ray is only turned.
+        let at = [turned[0] / turned[2], turned[1] / turned[2]];
+        return turned[2] > 0.0 && (at[0] - q[0]).hypot(at[1] - q[1]) <= tolerance;
+    }
+    let t = motion.translation.map(|v| v / baseline);
+    // q · (t × R p), to first order of the distance from the epipolar lines in both images (Sampson).
+    let line = cross(t, turned);
+    let back = mat_vec(&transpose(&motion.rotation), cross(q, t));
+    let slope = line[0].hypot(line[1]).hypot(back[0].hypot(back[1]));
+    if dot(q, line).abs() > tolerance * slope.max(f64::MIN_POSITIVE) {
+        return false;
+    }
+    let (from, to) = (normalize(turned), normalize(q));
+    let normal = cross(from, to);
+    if norm(normal) < PARALLEL {
+        // Far away, or along the baseline: both look the same way at least.
+        return dot(from, to) > 0.0;
+    }
+    // t + s·from = r·to, in the plane of the rays.
+    let s = dot(cross(to, t), normal);
+    let r = dot(cross(from, t), normal);
+    s > 0.0 && r > 0.0
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rays_meet_in_front_or_behind() {
+        let motion =
+            Se3 { rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], translation: [-1.0, 0.0, 0.0] };
+        // A point at (0.2, 0.1, 4) before the first camera is at (-0.8, 0.1, 4) before the second.
+        let ([s, r], point) = ([4.0f64, 4.0], [0.2, 0.1, 4.0]);
+        let (from, to) = (normalize(point), normalize([point[0] - 1.0, point[1], point[2]]));
+        let (t, normal) = (motion.translation, cross(from, to));
+        let depth = |v: f64| v / dot(normal, normal);
+        assert!((depth(dot(cross(to, t), normal)) * from[2] - s).abs() < 1e-9);
+        assert!((depth(dot(cross(from, t), normal)) * to[2] - r).abs() < 1e-9);
+    }
+}

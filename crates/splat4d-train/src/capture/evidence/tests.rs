@@ -1,0 +1,212 @@
+//! Poses in every convention, with and without points: named, and right ones not.
+
+use super::super::tests::samples::Sample;
+use super::super::{CaptureKind, CaptureOptions, Convention};
+use super::*;
+use image::{ImageBuffer, Rgb, Rgba};
+use serde_json::json;
+use splat4d::math::se3::{add, dot, mat_mul, norm, scale, sub, transpose};
+use std::sync::OnceLock;
+
+const WIDTH: u32 = 160;
+const HEIGHT: u32 = 120;
+const FOCAL: f64 = 140.0;
+/// Cameras, and degrees between them.
+const CAMERAS: usize = 12;
+const STEP: f64 = 9.0;
+
+/// Noise from 0 to 1 that is smooth over a unit.
+fn noise(p: [f64; 3], salt: u64) -> f64 {
+    let lattice = |c: [i64; 3]| {
+        let mut h = salt.wrapping_mul(0x9E37_79B9_7F4A_7C15);
+        for v in c {
+            h = (h ^ v as u64).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+            h ^= h >> 29;
+        }
+        (h >> 40) as f64 / (1u64 << 24) as f64
+    };
+    let base = p.map(f64::floor);
+    let part: [f64; 3] = std::array::from_fn(|k| p[k] - base[k]);
+    let mut out = 0.0;
+    for corner in 0..8 {
+        let bit: [usize; 3] = std::array::from_fn(|k| corner >> k & 1);
+        let weight: f64 = (0..3).map(|k| if bit[k] == 1 { part[k] } else { 1.0 - part[k] }).product();
+        out += weight * lattice(std::array::from_fn(|k| base[k] as i64 + bit[k] as i64));
+    }
+    out
+}
+
+fn texture(p: [f64; 3]) -> [f32; 3] {
+    std::array::from_fn(|c| (0.6 * noise(scale(p, 4.0), c as u64) + 0.4 * noise(scale(p, 11.0), 9 + c as u64)) as f32)
+}
+
+/// What a ray shows: a ball on a floor; and whether it is the ball.
+fn hit(center: [f64; 3], ray: [f64; 3]) -> Option<([f64; 3], bool)> {
+    let (a, b, c) = (dot(ray, ray), dot(center, ray), dot(center, center) - 1.0);
+    let root = b * b - a * c;
+    if root > 0.0 && -b > root.sqrt() {
+        return Some((add(center, scale(ray, (-b - root.sqrt()) / a)), true));
+    }
+    let t = (-1.0 - center[2]) / ray[2];
+    (t > 0.0).then(|| (add(center, scale(ray, t)), false))
+}
+
+fn pose(i: usize) -> Se3 {
+    let angle = (i as f64 * STEP).to_radians();
+    let up_and_down = 1.2 + 0.35 * (i % 3) as f64;
+    Se3::look_at([4.0 * angle.cos(), 4.0 * angle.sin(), up_and_down], [0.1, 0.0, -0.2], [0.05, 0.0, 1.0])
+}
+
+/// The point of a pixel.
+fn shown(i: usize, x: u32, y: u32) -> Option<([f64; 3], bool)> {
+    let back = pose(i).inverse();
+    let at = [(f64::from(x) + 0.5 - 80.0) / FOCAL, (f64::from(y) + 0.5 - 60.0) / FOCAL, 1.0];
+    hit(back.translation, sub(back.apply(at), back.translation))
+}
+
+/// Photos of the scene, with initial points or without: rendered once.
+fn photos(points: bool) -> Capture {
+    static MADE: OnceLock<(Sample, Capture)> = OnceLock::new();
+    let (_, made) = MADE.get_or_init(|| capture(true, false));
+    Capture { points: made.points.clone().filter(|_| points), ..made.clone() }
+}
+
+/// Photos of the scene in a transforms.json; `cut`: the ball alone, with alpha.
+fn capture(points: bool, cut: bool) -> (Sample, Capture) {
+    let sample = Sample::new(&["transforms.json"]);
+    let mut frames = Vec::new();
+    let mut ply = String::new();
+    let mut count = 0;
+    for i in 0..CAMERAS {
+        let byte = |v: f32| (v * 255.0).round() as u8;
+        let color = |x: u32, y: u32| shown(i, x, y).map_or([90, 120, 200], |(p, _)| texture(p).map(byte));
+        let name = format!("images/cam{i:02}.png");
+        if cut {
+            let pixel = |x: u32, y: u32| {
+                let [r, g, b] = color(x, y);
+                Rgba([r, g, b, if shown(i, x, y).is_some_and(|(_, ball)| ball) { 255 } else { 0 }])
+            };
+            sample.save(&name, ImageBuffer::from_fn(WIDTH, HEIGHT, pixel));
+        } else {
+            sample.save(&name, ImageBuffer::from_fn(WIDTH, HEIGHT, |x, y| Rgb(color(x, y))));
+        }
+        for k in (0..WIDTH * HEIGHT).step_by(997).filter(|_| points) {
+            if let Some((p, _)) = shown(i, k % WIDTH, k / WIDTH) {
+                let [r, g, b] = color(k % WIDTH, k / WIDTH);
+                ply += &format!("{} {} {} {r} {g} {b}\n", p[0], p[1], p[2]);
+                count += 1;
+            }
+        }
+        let world_from_cam = pose(i).inverse();
+        let row = |k: usize| {
+            let r = world_from_cam.rotation[k];
+            json!([r[0], -r[1], -r[2], world_from_cam.translation[k]])
+        };
+        frames.push(json!({"file_path": name, "transform_matrix": [row(0), row(1), row(2), [0, 0, 0, 1]]}));
+    }
+    let mut top = json!({"w": WIDTH, "h": HEIGHT, "fl_x": FOCAL, "fl_y": FOCAL, "cx": 80, "cy": 60, "frames": frames});
+    if points {
+        top["ply_file_path"] = json!("points.ply");
+        let header = "property float x\nproperty float y\nproperty float z\nproperty uchar red\nproperty uchar green\n\
+                      property uchar blue\nend_header\n";
+        let text = format!("ply\nformat ascii 1.0\nelement vertex {count}\n{header}{ply}");
+        sample.write("points.ply", text.as_bytes());
+    }
+    sample.write("transforms.json", top.to_string().as_bytes());
+    let capture = Capture::open(sample.root(), &CaptureOptions::default()).unwrap();
+    assert_eq!((capture.kind, capture.frames.len()), (CaptureKind::Nerfstudio, CAMERAS));
+    (sample, capture)
+}
+
+/// How far relative poses are from those of the truth: what no convention of the whole world changes.
+fn apart(poses: &[Se3]) -> f64 {
+    let relative = |p: &[Se3], i: usize| p[i].after(&p[0].inverse());
+    let truth: Vec<Se3> = (0..poses.len()).map(pose).collect();
+    let one = |i: usize| {
+        let (a, b) = (relative(poses, i), relative(&truth, i));
+        let turn = mat_mul(&a.rotation, &transpose(&b.rotation));
+        norm(sub(a.translation, b.translation)) + (3.0 - turn[0][0] - turn[1][1] - turn[2][2]).abs()
+    };
+    (0..poses.len()).map(one).fold(0.0, f64::max)
+}
+
+/// The capture as if its files were of another layout and written as `poses` say.
+fn misread(capture: &Capture, stated: Convention, poses: Poses) -> Capture {
+    let mut out = Capture { convention: stated, ..capture.clone() };
+    for (i, frame) in out.frames.iter_mut().enumerate() {
+        frame.source.cam_from_world = stated.misread(&pose(i), poses);
+    }
+    out
+}
+
+/// Conventions that are named right, of how many, and how many are named that are right.
+fn named(capture: &Capture, conventions: &[Convention]) -> (usize, usize) {
+    let mut looks = look::take(capture, &capture.looked_at());
+    let mut matches = None;
+    let (mut right, mut all) = (0, 0);
+    for &stated in conventions {
+        let good = misread(capture, stated, Poses::STATED).judge(&mut looks, &mut matches);
+        assert_eq!(good.written_as, None, "{stated:?}: {}", good.finding.what);
+        assert_eq!(good.finding.severity, Severity::Note);
+        assert!(good.finding.what.contains("agree"), "{}", good.finding.what);
+        for poses in stated.others() {
+            let wrong = misread(capture, stated, poses);
+            let before: Vec<Se3> = wrong.frames.iter().map(|f| f.source.cam_from_world).collect();
+            let moved = capture.points.is_some() || apart(&before) > 1e-3;
+            if !moved {
+                continue;
+            }
+            all += 1;
+            let verdict = wrong.judge(&mut looks, &mut matches);
+            let Some(found) = verdict.written_as else {
+                eprintln!("{stated:?} {poses}: {}", verdict.finding.what);
+                continue;
+            };
+            let after: Vec<Se3> = before.iter().map(|p| stated.reread(p, found).unwrap()).collect();
+            if apart(&after) < 1e-6 {
+                right += 1;
+                assert!(verdict.finding.remedy.contains(&format!("--poses {found}")));
+            } else {
+                eprintln!("{stated:?} {poses} taken for {found}: {}", verdict.finding.what);
+            }
+        }
+    }
+    (right, all)
+}
+
+const ALL: [Convention; 3] = [Convention::NERF, Convention::COLMAP, Convention::OPENCV];
+
+#[test]
+fn conventions_are_named_by_points() {
+    let capture = photos(true);
+    let (right, all) = named(&capture, &ALL);
+    assert!(all >= 20 && right == all, "{right} of {all}");
+}
+
+#[test]
+fn conventions_are_named_by_features() {
+    let capture = photos(false);
+    let (right, all) = named(&capture, &ALL);
+    assert!(all >= 20 && right == all, "{right} of {all}");
+}
+
+#[test]
+fn conventions_are_named_by_foregrounds() {
+    let (_sample, mut capture) = capture(false, true);
+    // What is seen of the ball alone by cameras far apart has no features in common.
+    capture.train.retain(|i| i % 3 == 0);
+    let mut looks = look::take(&capture, &capture.looked_at());
+    let flipped: Poses = "opencv".parse().unwrap();
+    let wrong = misread(&capture, Convention::NERF, flipped);
+    assert_eq!(wrong.judge(&mut looks, &mut Some(Vec::new())).written_as, Some(flipped));
+    let right = misread(&capture, Convention::NERF, Poses::STATED).judge(&mut looks, &mut Some(Vec::new()));
+    assert!(right.written_as.is_none() && right.finding.what.contains("foregrounds"), "{}", right.finding.what);
+}
+
+#[test]
+fn what_says_too_little_is_not_checked() {
+    let mut capture = photos(false);
+    capture.train.truncate(1);
+    let check = capture.check_poses();
+    assert_eq!((check.written_as, check.finding.aspect), (None, Some(Aspect::NotChecked)));
+}

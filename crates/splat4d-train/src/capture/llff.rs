@@ -1,0 +1,74 @@
+//! LLFF captures: `poses_bounds.npy`, one row per image, and the images of one camera in a folder, in the order of the rows.
+
+use super::account::Account;
+use super::convention::Convention;
+use super::lookup::Lookup;
+use super::{CaptureKind, CaptureOptions, Extent, RawFrame, Split, Take};
+use super::{n3dv, picture, rig, sequence};
+use splat4d::math::Se3;
+use splat4d::scene::time::DEFAULT_FPS;
+use splat4d::{Error, Result};
+use std::path::{Path, PathBuf};
+
+/// Reads poses and images; names say whether they show one moment.
+pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
+    let fps = options.fps.unwrap_or(DEFAULT_FPS);
+    let rows = n3dv::rows(marker)?;
+    let lookup = Lookup::new(root, options)?;
+    let folders: Vec<(PathBuf, Vec<String>)> =
+        lookup.folders().into_iter().map(|folder| (rig::image_names(&folder), folder)).map(|(n, f)| (f, n)).collect();
+    let Some((folder, names)) = folders.iter().find(|(_, names)| names.len() == rows.len()) else {
+        let found: Vec<String> =
+            folders.iter().map(|(f, names)| format!("{} ({})", f.display(), names.len())).collect();
+        let what = format!("it has {} poses, but no folder has as many images: {}", rows.len(), found.join(", "));
+        return Err(Error::input(what).at(marker.display()).remedy(
+            "Keep one image per row, in the order of the rows; or the frames of each camera in a folder of its own (cam00/).",
+        ));
+    };
+    let mut shots = Vec::new();
+    for (name, row) in names.iter().zip(&rows) {
+        let image = folder.join(name);
+        let size = picture::header(&image)?.stored;
+        let source = n3dv::camera_of(row, size, options.poses)
+            .map_err(|e| e.at(format!("{} row {} ({name})", marker.display(), shots.len())))?;
+        shots.push((image, source));
+    }
+    let (mut warnings, mut notes) = (Vec::new(), Vec::new());
+    let short: Vec<&str> = names.iter().map(String::as_str).collect();
+    let poses: Vec<Se3> = shots.iter().map(|(_, source)| source.cam_from_world).collect();
+    let order = sequence::order(&short, &poses, options.sequence, fps, &mut warnings, &mut notes);
+    let frame = |((image, source), &(camera, index, time)): ((PathBuf, _), &(usize, usize, f64))| RawFrame {
+        camera,
+        source,
+        time,
+        index,
+        image,
+        mask: None,
+        depth: None,
+        flow: None,
+        labels: None,
+        features: None,
+        tracks: None,
+        split: Split::Train,
+    };
+    Ok(Take {
+        name: None,
+        root: root.to_path_buf(),
+        kind: CaptureKind::Llff,
+        cameras: order.cameras,
+        frames: shots.into_iter().zip(&order.frames).map(frame).collect(),
+        take: Extent::default(),
+        named: order.named,
+        timing: order.timing,
+        hold_out: None,
+        fps,
+        points: n3dv::points(root)?,
+        background: None,
+        up: None,
+        labels: Vec::new(),
+        warnings,
+        notes,
+        account: Account::default(),
+        convention: Convention::NERF,
+    })
+}

@@ -1,0 +1,412 @@
+//! Finds the files that a capture names: one lookup for every layout.
+//!
+//! Captures travel between programs and systems. Names then differ from the files by slashes, letter case, ending, Unicode
+//! normal form (macOS decomposes umlauts) and leading folders (absolute paths of another machine). The exact name goes
+//! first; else the one file that fits is taken, and one remark counts such names. Several files that fit are an error.
+
+use super::account::{Account, Aspect};
+use super::preflight::Severity;
+use super::{CaptureOptions, rig};
+use splat4d::{Error, Result};
+use std::cell::RefCell;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::rc::Rc;
+use unicode_normalization::UnicodeNormalization;
+
+/// Folders in which images usually lie, below that of the capture.
+const IMAGE_FOLDERS: [&str; 3] = ["images", "input", "image"];
+/// Names of images compared when a folder is looked for: enough to tell folders apart.
+const SAMPLE: usize = 32;
+/// Endings of images, readable ones first; a name with one of the others may be an image converted since.
+const KNOWN_ENDINGS: &[&str] = &[
+    "png", "jpg", "jpeg", "webp", "tif", "tiff", "bmp", "heic", "heif", "dng", "arw", "cr2", "nef", "ppm", "exr", "tga",
+];
+
+/// How a name differs from the file found for it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+enum Way {
+    Slashes,
+    Folders,
+    Ending,
+    Case,
+    Unicode,
+}
+
+impl Way {
+    fn in_words(self) -> &'static str {
+        match self {
+            Self::Slashes => "backslashes",
+            Self::Folders => "leading folders",
+            Self::Ending => "the ending",
+            Self::Case => "letter case",
+            Self::Unicode => "Unicode form",
+        }
+    }
+}
+
+/// Names of one folder, by what they have in common with other spellings.
+#[derive(Default)]
+struct Listing {
+    names: BTreeMap<String, Vec<String>>,
+    /// Images by their names without endings.
+    stems: BTreeMap<String, Vec<String>>,
+}
+
+/// Looks files up below a capture's folder.
+pub(super) struct Lookup {
+    root: PathBuf,
+    /// The folder of images that the user chose.
+    chosen: Option<PathBuf>,
+    listings: RefCell<BTreeMap<PathBuf, Rc<Listing>>>,
+    /// Files that were not found by their exact name, and the name that led there.
+    loose: RefCell<BTreeMap<PathBuf, String>>,
+    ways: RefCell<BTreeMap<Way, usize>>,
+}
+
+/// A name as all its spellings have it: composed (NFC) and in lower case.
+pub(super) fn fold(name: &str) -> String {
+    if name.is_ascii() { name.to_ascii_lowercase() } else { name.nfc().collect::<String>().to_lowercase() }
+}
+
+/// A file's name without the ending of an image.
+pub(super) fn without_ending(name: &str) -> &str {
+    match name.rsplit_once('.') {
+        Some((stem, ending)) if KNOWN_ENDINGS.iter().any(|e| ending.eq_ignore_ascii_case(e)) => stem,
+        _ => name,
+    }
+}
+
+/// A path's parts, whichever slashes it has; and whether it is absolute.
+fn parts(name: &str) -> (Vec<&str>, bool) {
+    let drive = name.as_bytes().get(1) == Some(&b':');
+    let plain = if drive { &name[2..] } else { name };
+    let parts = plain.split(['/', '\\']).filter(|p| !p.is_empty() && *p != ".").collect();
+    (parts, drive || plain.starts_with(['/', '\\']))
+}
+
+/// A path as lists of names are compared: composed, lower case, forward slashes, without folders of all images and
+/// without ending.
+pub(super) fn key(name: &str) -> String {
+    let (mut parts, _) = parts(name);
+    let file = parts.pop().unwrap_or_default();
+    let of_all = |part: &str| IMAGE_FOLDERS.contains(&part) || reduction(part).is_some();
+    let folders = parts.iter().filter(|p| !of_all(p));
+    folders.map(|p| fold(p)).chain([fold(without_ending(file))]).collect::<Vec<_>>().join("/")
+}
+
+impl Lookup {
+    /// A lookup below `root`. Errors: the folder of images that was asked for is not there.
+    pub(super) fn new(root: &Path, options: &CaptureOptions) -> Result<Self> {
+        let chosen = options.images.as_ref().map(|name| root.join(name));
+        if let Some(folder) = chosen.as_ref().filter(|f| !f.is_dir()) {
+            let there: Vec<String> = rig::file_names(root).into_iter().filter(|n| root.join(n).is_dir()).collect();
+            return Err(Error::input("the folder of images that --images names is not there")
+                .at(folder.display())
+                .remedy(format!("Folders here are: {}.", there.join(", "))));
+        }
+        Ok(Self {
+            root: root.to_path_buf(),
+            chosen,
+            listings: RefCell::default(),
+            loose: RefCell::default(),
+            ways: RefCell::default(),
+        })
+    }
+
+    /// Where names relative to the capture's folder lead.
+    pub(super) fn bases(&self) -> Vec<PathBuf> {
+        let mut bases = self.folders();
+        // The capture's own folder goes first: names may hold that of the images.
+        bases.sort_by_key(|folder| *folder != self.root);
+        bases
+    }
+
+    /// Folders that may hold the images: the usual ones, the capture's own, and reduced copies last.
+    pub(super) fn folders(&self) -> Vec<PathBuf> {
+        if let Some(folder) = &self.chosen {
+            return vec![folder.clone()];
+        }
+        let usual = IMAGE_FOLDERS.iter().map(|name| self.root.join(name));
+        let all = usual.chain([self.root.clone()]).chain(reduced_folders(&self.root));
+        all.filter(|folder| folder.is_dir()).collect()
+    }
+
+    /// The folder that holds most of `names`, which are relative to it; the first of equals.
+    pub(super) fn folder_of(&self, names: &[&str]) -> PathBuf {
+        let sample: Vec<&&str> = names.iter().step_by(names.len().div_ceil(SAMPLE).max(1)).collect();
+        let mut best: Option<(usize, PathBuf)> = None;
+        for folder in self.folders() {
+            let exact = sample.iter().filter(|name| folder.join(name).is_file()).count();
+            let loose =
+                || sample.iter().filter(|name| matches!(self.walk(&folder, &parts(name).0), Ok(Some(_)))).count();
+            let count = if exact == sample.len() { exact } else { loose() };
+            if count > best.as_ref().map_or(0, |(most, _)| *most) {
+                best = Some((count, folder));
+            }
+        }
+        let usual = || self.chosen.clone().unwrap_or_else(|| self.root.join(IMAGE_FOLDERS[0]));
+        best.map_or_else(usual, |(_, folder)| folder)
+    }
+
+    /// The capture's folder.
+    pub(super) fn root(&self) -> &Path {
+        &self.root
+    }
+
+    /// A layout's own folder of images, unless the user chose another.
+    pub(super) fn folder(&self, name: &str) -> PathBuf {
+        self.chosen.clone().unwrap_or_else(|| self.root.join(name))
+    }
+
+    /// The image that `name` stands for, below the first of `bases` that has it. `None`: it is missing. Errors: several
+    /// files fit, or two names fit one file.
+    pub(super) fn image(&self, bases: &[PathBuf], name: &str) -> Result<Option<PathBuf>> {
+        let plain = name.strip_prefix("./").unwrap_or(name);
+        let exact = bases.iter().map(|base| base.join(plain)).find(|p| p.is_file());
+        if exact.is_some() {
+            return Ok(exact);
+        }
+        let (parts, absolute) = parts(name);
+        for skip in 0..parts.len() {
+            if !absolute && !parts[..skip].iter().all(|p| rig::is_plain(p)) {
+                break;
+            }
+            for base in bases {
+                let Some(found) = self.walk(base, &parts[skip..])? else { continue };
+                let known = self.loose.borrow_mut().entry(found.clone()).or_insert_with(|| name.to_owned()).clone();
+                if known != name {
+                    return Err(Error::input(format!("\"{known:.200}\" and \"{name:.200}\" both fit one file"))
+                        .at(found.display())
+                        .remedy("Give each image a name of its own, or write the exact names."));
+                }
+                self.note(name, &parts[skip..], skip, base, &found);
+                return Ok(Some(found));
+            }
+        }
+        Ok(None)
+    }
+
+    /// [`Self::image`], or where it should be.
+    pub(super) fn image_or_place(&self, bases: &[PathBuf], name: &str) -> Result<PathBuf> {
+        let place = || bases.first().unwrap_or(&self.root).join(name.strip_prefix("./").unwrap_or(name));
+        Ok(self.image(bases, name)?.unwrap_or_else(place))
+    }
+
+    /// Another file that the capture names (points, a mask, depth): found like an image; else where it should be.
+    pub(super) fn file(&self, name: &str) -> Result<PathBuf> {
+        self.image_or_place(std::slice::from_ref(&self.root), name)
+    }
+
+    fn listing(&self, folder: &Path) -> Rc<Listing> {
+        if let Some(known) = self.listings.borrow().get(folder) {
+            return known.clone();
+        }
+        let mut listing = Listing::default();
+        for name in rig::file_names(folder) {
+            if rig::is_image(&name) {
+                listing.stems.entry(fold(without_ending(&name))).or_default().push(name.clone());
+            }
+            listing.names.entry(fold(&name)).or_default().push(name);
+        }
+        let listing = Rc::new(listing);
+        self.listings.borrow_mut().insert(folder.to_path_buf(), listing.clone());
+        listing
+    }
+
+    /// The file below `base` that `parts` lead to, whatever their spelling.
+    fn walk(&self, base: &Path, parts: &[&str]) -> Result<Option<PathBuf>> {
+        let Some((file, folders)) = parts.split_last() else { return Ok(None) };
+        let mut folder = base.to_path_buf();
+        for part in folders {
+            if *part == ".." {
+                folder.pop();
+                continue;
+            }
+            let listing = self.listing(&folder);
+            let Some(name) = one(listing.names.get(&fold(part)), part, &folder)? else { return Ok(None) };
+            folder.push(name);
+        }
+        let listing = self.listing(&folder);
+        if let Some(name) = one(listing.names.get(&fold(file)), file, &folder)? {
+            let path = folder.join(name);
+            return Ok(path.is_file().then_some(path));
+        }
+        let stem = fold(without_ending(file));
+        let images = listing.stems.get(&stem);
+        if without_ending(file) == *file {
+            // No ending is stated: the usual order of endings decides.
+            let ends = |name: &&String, ending: &str| fold(name).ends_with(&format!(".{ending}"));
+            let found = rig::IMAGE_ENDINGS.iter().find_map(|e| images?.iter().find(|n| ends(n, e)));
+            return Ok(found.map(|name| folder.join(name)));
+        }
+        Ok(one(images, file, &folder)?.map(|name| folder.join(name)))
+    }
+
+    /// Counts how a name differs from the file that was found.
+    fn note(&self, name: &str, parts: &[&str], skip: usize, base: &Path, found: &Path) {
+        let written = parts.join("/");
+        let actual = found.strip_prefix(base).unwrap_or(found).to_string_lossy().replace('\\', "/");
+        let bare = without_ending(&written) == written;
+        let actual = if bare { without_ending(&actual).to_owned() } else { actual };
+        let mut ways = self.ways.borrow_mut();
+        let mut add = |way: Way, differs: bool| {
+            if differs {
+                *ways.entry(way).or_default() += 1;
+            }
+        };
+        let (a, b) = (without_ending(&written), without_ending(&actual));
+        let ending = |path: &str| path.rsplit_once('.').map_or_else(String::new, |(_, e)| e.to_ascii_lowercase());
+        add(Way::Slashes, name.contains('\\'));
+        add(Way::Folders, skip > 0);
+        add(Way::Ending, !bare && fold(&written) != fold(&actual) && ending(&written) != ending(&actual));
+        let cased = |s: &str| s.nfc().collect::<String>();
+        add(Way::Case, cased(a) != cased(b) || !bare && fold(&written) == fold(&actual) && written != actual && a == b);
+        add(Way::Unicode, a != b && fold(a) == fold(b) && a.to_lowercase() != b.to_lowercase());
+    }
+
+    /// Says in one remark which names were not exact.
+    pub(super) fn tell(&self, account: &mut Account) {
+        let (loose, ways) = (self.loose.borrow(), self.ways.borrow());
+        let Some((file, name)) = loose.iter().next().filter(|_| !ways.is_empty()) else { return };
+        let ways: Vec<String> = ways.iter().map(|(way, n)| format!("{} ({n})", way.in_words())).collect();
+        let file = file.strip_prefix(&self.root).unwrap_or(file);
+        let what = format!(
+            "{} names differ from their files by {}, for instance {name:.200}: {} is read.",
+            loose.len(),
+            ways.join(", "),
+            file.display()
+        );
+        account.add(Aspect::Assumed, Severity::Note, what);
+    }
+}
+
+/// The only name of those that fit, or the exact one. Errors: several fit.
+fn one<'a>(fitting: Option<&'a Vec<String>>, name: &str, folder: &Path) -> Result<Option<&'a String>> {
+    let Some(fitting) = fitting else { return Ok(None) };
+    if let Some(exact) = fitting.iter().find(|n| *n == name) {
+        return Ok(Some(exact));
+    }
+    match &fitting[..] {
+        [] => Ok(None),
+        [only] => Ok(Some(only)),
+        several => Err(Error::input(format!("\"{name:.200}\" is not there, and several fit: {}", several.join(", ")))
+            .at(folder.display())
+            .remedy("Rename the one that is meant, or remove the others.")),
+    }
+}
+
+/// Whether a name is that of a folder in which images usually lie.
+pub(super) fn is_image_folder(name: &str) -> bool {
+    IMAGE_FOLDERS.contains(&name) || reduction(name).is_some()
+}
+
+/// Whether a folder holds reduced copies of images (`images_4`: Mip-NeRF 360, Nerfstudio, LLFF).
+pub(super) fn is_reduced(folder: &Path) -> bool {
+    reduction(&folder.file_name().unwrap_or_default().to_string_lossy()).is_some()
+}
+
+fn reduction(name: &str) -> Option<usize> {
+    name.strip_prefix("images_")?.parse().ok()
+}
+
+/// Folders of reduced copies, the largest images first.
+fn reduced_folders(root: &Path) -> Vec<PathBuf> {
+    let mut found: Vec<(usize, PathBuf)> =
+        rig::file_names(root).iter().filter_map(|n| Some((reduction(n)?, root.join(n)))).collect();
+    found.sort();
+    found.into_iter().map(|(_, folder)| folder).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn touch(root: &Path, name: &str) {
+        let path = root.join(name);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::fs::write(path, b"x").unwrap();
+    }
+
+    fn lookup(files: &[&str]) -> (tempfile::TempDir, Lookup) {
+        let dir = tempfile::tempdir().unwrap();
+        files.iter().for_each(|f| touch(dir.path(), f));
+        let lookup = Lookup::new(dir.path(), &CaptureOptions::default()).unwrap();
+        (dir, lookup)
+    }
+
+    /// What `name` leads to, relative to the folder, and the remark about it.
+    fn find(files: &[&str], name: &str) -> (Option<String>, String) {
+        let (dir, lookup) = lookup(files);
+        let found = lookup.image(&lookup.bases(), name).unwrap();
+        let mut account = Account::default();
+        lookup.tell(&mut account);
+        let relative = found.map(|f| f.strip_prefix(dir.path()).unwrap().to_str().unwrap().to_owned());
+        (relative, account.remarks.first().map_or_else(String::new, |r| r.what.clone()))
+    }
+
+    #[test]
+    fn every_spelling_of_a_name_leads_to_its_file() {
+        let cases = [
+            ("images/cam0/0001.jpg", "images/cam0/0001.jpg", ""),
+            ("images/cam0/0001.jpg", "cam0/0001.jpg", ""),
+            ("images/cam0/0001.jpg", "./images/cam0/0001", ""),
+            ("images/cam0/0001.jpg", "cam0\\0001.jpg", "backslashes (1)"),
+            ("images/cam0/0001.JPG", "images/cam0/0001.jpg", "letter case (1)"),
+            ("images/Cam0/A.jpg", "images/cam0/a.jpg", "letter case (1)"),
+            ("images/cam0/0001.png", "cam0/0001.jpg", "the ending (1)"),
+            ("images/cam0/0001.png", "cam0/0001.TIFF", "the ending (1)"),
+            ("images/u\u{308}ber.jpg", "\u{fc}ber.jpg", "Unicode form (1)"),
+            ("images/\u{fc}ber.jpg", "images/u\u{308}ber.jpg", "Unicode form (1)"),
+            ("images/cam0/0001.jpg", "/home/me/scan/cam0/0001.jpg", "leading folders (1)"),
+            ("images/cam0/0001.jpg", "C:\\scan\\images\\cam0\\0001.jpg", "backslashes (1), leading folders (1)"),
+            ("cam0/0001.jpg", "images/cam0/0001.jpg", "leading folders (1)"),
+        ];
+        for (file, name, way) in cases {
+            let (found, said) = find(&[file], name);
+            assert_eq!(found.as_deref(), Some(file), "{name}");
+            assert!(said.contains(way) && said.is_empty() == way.is_empty(), "{name}: {said}");
+        }
+        for gone in ["cam1/0001.jpg", "cam0/0002.jpg", "cam0/0001.jpg/x", ""] {
+            assert_eq!(find(&["images/cam0/0001.jpg"], gone).0, None, "{gone}");
+        }
+        // A folder that names a camera says which image is meant.
+        assert_eq!(find(&["images/0001.jpg"], "cam0/0001.jpg").0, None);
+    }
+
+    #[test]
+    fn what_could_be_either_is_refused() {
+        let (_dir, there) = lookup(&["images/a.PNG", "images/A.png", "images/b.webp", "images/b.png"]);
+        let refuse = |name: &str| there.image(&there.bases(), name).unwrap_err().to_string();
+        assert!(refuse("a.png").contains("A.png, a.PNG") && refuse("b.jpg").contains("b.png, b.webp"));
+        assert!(there.image(&there.bases(), "b").unwrap().unwrap().ends_with("b.png"), "no ending is stated");
+        let (_dir, there) = lookup(&["images/0001.jpg"]);
+        assert!(there.image(&there.bases(), "/x/cam0/0001.jpg").unwrap().is_some());
+        let two = there.image(&there.bases(), "/x/cam1/0001.jpg").unwrap_err().to_string();
+        assert!(two.contains("cam0") && two.contains("cam1") && two.contains("both fit one file"), "{two}");
+    }
+
+    #[test]
+    fn the_folder_with_most_images_is_theirs() {
+        let (dir, there) = lookup(&["images/a.jpg", "images/b.jpg", "images_2/a.jpg", "images_2/b.jpg", "b.jpg"]);
+        assert_eq!(there.folder_of(&["a.jpg", "b.jpg"]), dir.path().join("images"));
+        let (dir, there) = lookup(&["images_4/a.png", "images_8/a.png", "x.txt"]);
+        assert_eq!(there.folder_of(&["a.jpg"]), dir.path().join("images_4"));
+        let (dir, there) = lookup(&["a.jpg"]);
+        assert_eq!(there.folder_of(&["a.jpg"]), dir.path());
+        let of = |name: &str| CaptureOptions { images: Some(name.into()), ..CaptureOptions::default() };
+        let (dir, _) = lookup(&["images/a.jpg", "images_8/a.jpg"]);
+        let there = Lookup::new(dir.path(), &of("images_8")).unwrap();
+        let found = there.image(&there.bases(), "images/a.jpg").unwrap();
+        assert_eq!(found, Some(dir.path().join("images_8/a.jpg")));
+        let gone = Lookup::new(dir.path(), &of("images_3")).err().unwrap().to_string();
+        assert!(gone.contains("images_3") && gone.contains("images_8"), "{gone}");
+    }
+
+    #[test]
+    fn lists_of_names_are_compared_by_what_they_name() {
+        for name in ["./images/Cam0/0001.PNG", "images\\cam0\\0001.png", "cam0/0001", "cam0/0001.jpg"] {
+            assert_eq!(key(name), "cam0/0001", "{name}");
+        }
+    }
+}

@@ -1,0 +1,168 @@
+//! Masks that lie beside the images of any layout: found by the usual names, and those that fit nothing are counted.
+//!
+//! For the image `cam0/a.jpg` these are, in `masks/` or `mask/`: `cam0/a.jpg.png` (COLMAP), `cam0/a.png`, `cam0/a_mask.png`,
+//! `cam0/mask_a.png` and `cam0/a.mask.png` (Metashape), with any ending of images.
+
+use super::account::{Aspect, first_names};
+use super::lookup::{fold, key, without_ending};
+use super::preflight::Severity;
+use super::{CaptureKind, Take, rig};
+use splat4d::{Error, Result};
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+/// Folders of masks.
+const FOLDERS: [&str; 2] = ["masks", "mask"];
+/// What names of masks have besides those of their images.
+const SUFFIXES: [&str; 4] = ["_mask", "-mask", ".mask", "_seg"];
+const PREFIXES: [&str; 2] = ["mask_", "mask-"];
+/// How deep folders of masks are looked through.
+const MOST_LEVELS: usize = 4;
+
+/// Gives frames without a mask theirs. Errors: two masks of one image.
+pub(super) fn fill(take: &mut Take) -> Result<()> {
+    let Some(folder) = FOLDERS.iter().map(|name| take.root.join(name)).find(|f| f.is_dir()) else { return Ok(()) };
+    let mut files = Vec::new();
+    list(&folder, String::new(), 0, &mut files);
+    if files.is_empty() {
+        return Ok(());
+    }
+    let stated: BTreeSet<PathBuf> = take.frames.iter().filter_map(|f| f.mask.clone()).collect();
+    let unused = |name: &String| !stated.contains(&folder.join(name));
+    if take.kind == CaptureKind::Own {
+        // What a capture.json does not name is not used: it names masks camera by camera.
+        let unused: Vec<&String> = files.iter().filter(|n| unused(n)).collect();
+        if !unused.is_empty() && stated.is_empty() {
+            let what =
+                format!("{} files in {}: capture.json names no masks (key \"masks\").", unused.len(), folder.display());
+            take.account.add(Aspect::NotRead, Severity::Note, what);
+        }
+        return Ok(());
+    }
+    let mut by_name: BTreeMap<String, Vec<&String>> = BTreeMap::new();
+    for file in files.iter().filter(|n| unused(n)) {
+        by_name.entry(image_key(file)).or_default().push(file);
+    }
+    // Where folders differ (`rgb/1x`), a name that only one image has is enough.
+    let short = |image: &Path| fold(without_ending(&image.file_name().unwrap_or_default().to_string_lossy()));
+    let mut names: BTreeMap<String, usize> = BTreeMap::new();
+    take.frames.iter().for_each(|f| *names.entry(short(&f.image)).or_default() += 1);
+    let mut used: BTreeSet<&String> = BTreeSet::new();
+    let mut filled = 0;
+    for frame in take.frames.iter_mut().filter(|f| f.mask.is_none()) {
+        let relative = frame.image.strip_prefix(&take.root).unwrap_or(&frame.image).to_string_lossy().into_owned();
+        let alone = || by_name.get(&short(&frame.image)).filter(|_| names.get(&short(&frame.image)) == Some(&1));
+        let Some(fitting) = by_name.get(&key(&relative)).or_else(alone) else { continue };
+        let name = relative.rsplit(['/', '\\']).next().unwrap_or_default();
+        let rank = |mask: &str| rank(mask, name);
+        let best = fitting.iter().map(|m| rank(m)).min().unwrap_or(0);
+        let mut first = fitting.iter().filter(|m| rank(m) == best);
+        let (Some(mask), None) = (first.next(), first.next()) else {
+            let names: Vec<&str> = fitting.iter().map(|m| m.as_str()).collect();
+            return Err(Error::input(format!("several masks fit one image: {}", names.join(", ")))
+                .at(frame.image.display())
+                .remedy(format!("Keep one of them in {}.", folder.display())));
+        };
+        frame.mask = Some(folder.join(mask));
+        used.extend(fitting.iter().copied());
+        filled += 1;
+    }
+    tell(take, &folder, (files.len(), &by_name, &used, filled));
+    Ok(())
+}
+
+/// Says how many masks and images have no counterpart.
+fn tell(
+    take: &mut Take,
+    folder: &Path,
+    (all, by_name, used, filled): (usize, &BTreeMap<String, Vec<&String>>, &BTreeSet<&String>, usize),
+) {
+    let idle: Vec<&String> = by_name.values().flatten().filter(|m| !used.contains(*m)).copied().collect();
+    let name = folder.strip_prefix(&take.root).unwrap_or(folder).display();
+    if filled == 0 && used.is_empty() && idle.len() == all {
+        let example =
+            take.frames.first().map(|f| f.image.file_name().unwrap_or_default().to_string_lossy().into_owned());
+        let example = example.unwrap_or_default();
+        let stem = without_ending(&example);
+        let what = format!(
+            "None of the {all} files in {name}/ fits an image ({}). Expected for instance {example}.png, {stem}.png or \
+             {stem}_mask.png: training runs without masks.",
+            first_names(&idle)
+        );
+        take.account.add(Aspect::NotRead, Severity::Warning, what);
+    } else if !idle.is_empty() {
+        let what =
+            format!("{} of {all} files in {name}/ fit no image of the capture: {}.", idle.len(), first_names(&idle));
+        take.account.add(Aspect::NotRead, Severity::Note, what);
+    }
+    let without = take.frames.iter().filter(|f| f.mask.is_none()).count();
+    if filled > 0 && without > 0 {
+        let what = format!("Masks of {without} of {} images.", take.frames.len());
+        take.account.add(Aspect::NotFound, Severity::Note, what);
+    }
+}
+
+/// Which of several masks of an image goes first: COLMAP's name, the image's own, then the others.
+fn rank(mask: &str, image: &str) -> usize {
+    let file = mask.rsplit('/').next().unwrap_or(mask);
+    let (own, appended) = (fold(without_ending(file)), fold(file));
+    match () {
+        () if own == fold(image) => 0,
+        () if appended == format!("{}.png", fold(without_ending(image))) => 1,
+        () if own == fold(without_ending(image)) => 2,
+        () => 3,
+    }
+}
+
+/// Names of the images below a folder, relative to it, with forward slashes.
+fn list(folder: &Path, below: String, level: usize, out: &mut Vec<String>) {
+    for name in rig::file_names(folder) {
+        let path = folder.join(&name);
+        if rig::is_image(&name) {
+            out.push(format!("{below}{name}"));
+        } else if level < MOST_LEVELS && path.is_dir() {
+            list(&path, format!("{below}{name}/"), level + 1, out);
+        }
+    }
+}
+
+/// The [`key`] of the image that a mask is named after.
+fn image_key(mask: &str) -> String {
+    let whole = key(mask);
+    let (folders, file) = whole.rsplit_once('/').map_or(("", whole.as_str()), |(folders, file)| (folders, file));
+    // `a.jpg.png` is of `a.jpg`.
+    let mut stem = without_ending(file);
+    if let Some(short) = SUFFIXES.iter().find_map(|s| stem.strip_suffix(s)) {
+        stem = without_ending(short);
+    } else if let Some(short) = PREFIXES.iter().find_map(|p| stem.strip_prefix(p)) {
+        stem = short;
+    }
+    if folders.is_empty() { stem.to_owned() } else { format!("{folders}/{stem}") }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn usual_names_of_masks_lead_to_their_images() {
+        let names = [
+            "cam0/a.jpg.png",
+            "cam0/a.png",
+            "cam0/a.jpg",
+            "cam0/A.PNG",
+            "cam0/a_mask.png",
+            "cam0/mask_a.png",
+            "cam0/a.mask.png",
+            "images/cam0/a.png",
+            "cam0/a.jpg_mask.png",
+        ];
+        for name in names {
+            assert_eq!(image_key(name), "cam0/a", "{name}");
+        }
+        assert_ne!(image_key("cam0/b.png"), "cam0/a");
+        assert!(
+            rank("a.jpg.png", "a.jpg") < rank("a.png", "a.jpg") && rank("a.png", "a.jpg") < rank("a_mask.png", "a.jpg")
+        );
+    }
+}
