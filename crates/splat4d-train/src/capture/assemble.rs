@@ -1,7 +1,7 @@
 //! From what the files say to a checked capture: poses, sizes, files, duplicates, split, clock.
 
 use super::{Capture, CaptureOptions, Extent, FlowFile, Frame, HoldOut, RawFrame, Rig, Split, Take, Timing};
-use super::{options, picture, pose};
+use super::{options, panorama, picture, pose};
 use splat4d::math::se3::{norm, normalize, sub};
 use splat4d::scene::{Camera, Lens, Time};
 use splat4d::{Error, Result};
@@ -25,6 +25,7 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
         ));
     }
     options::check_rate("frame rate", take.fps).map_err(located)?;
+    panorama::split(&mut take, options.hold_out.as_ref())?;
     for frame in &mut take.frames {
         check_frame(frame, &take.cameras[frame.camera], options)?;
     }
@@ -35,6 +36,7 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
         take.frames.iter().for_each(|f| all.add(f.index..f.index + 1));
         take.take = all;
     }
+    let offset = super::offset::subtract(&mut take);
     let cameras = rigs(&take);
     check_poses(&mut take, &cameras)?;
     check_duplicates(&mut take, &cameras).map_err(located)?;
@@ -68,6 +70,7 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
         points,
         background,
         up,
+        offset,
         labels: take.labels,
         downscale: options.downscale,
         warnings: take.warnings,
@@ -288,15 +291,18 @@ fn fit_pictures(take: &mut Take) -> Result<bool> {
         let header = picture::header(&frame.image)?;
         alpha |= header.alpha;
         let (size, source) = ((header.width, header.height), &mut frame.source);
-        let stated = (source.width, source.height);
-        if size != stated && picture::is_resized(size, source) {
+        let whole = panorama::stored(source);
+        let stated = (whole.width, whole.height);
+        if size != stated && panorama::resize(source, size) {
+            resized.push((&frame.image, size, stated));
+        } else if size != stated && picture::is_resized(size, source) {
             let (x, y) = (size.0 as f64 / stated.0 as f64, size.1 as f64 / stated.1 as f64);
             let k = &mut source.intrinsics;
             (k.fx, k.cx, k.fy, k.cy) = (k.fx * x, k.cx * x, k.fy * y, k.cy * y);
             (source.width, source.height) = size;
             resized.push((&frame.image, size, stated));
         }
-        picture::check_size(&frame.image, size, source)
+        picture::check_size(&frame.image, size, &panorama::stored(source))
             .map_err(|e| e.at(format!("camera {}", take.cameras[frame.camera])))?;
     }
     if let Some((image, size, stated)) = resized.first() {

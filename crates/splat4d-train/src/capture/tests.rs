@@ -2,11 +2,12 @@
 
 mod bad_input;
 mod depth;
+mod far;
 mod flow;
 mod forgiving;
 mod labels;
 mod layouts;
 mod mutants;
 mod pictures;
-mod samples;
+pub(super) mod samples;
 mod tracks;

@@ -7,8 +7,10 @@
 pub(crate) mod arrays;
 mod bytes;
 pub mod dialect;
+pub mod gltf;
 mod half;
 mod kinematic;
+pub mod mend;
 #[cfg(test)]
 mod mutate;
 pub mod npy;
@@ -29,6 +31,7 @@ mod zip;
 
 pub(crate) use arrays::{params_to_arrays, tensors_to_loaded};
 pub use dialect::Dialect;
+pub use mend::{Linear, Mended};
 pub use warnings::Warnings;
 
 use crate::layers::Scene;
@@ -36,8 +39,16 @@ use crate::{Error, Result};
 
 /// The files of Gaussians that other programs share. What is known of a dialect stands in its own file; nothing else lists
 /// them. Where two know a file by its bytes, the later one is right: a layout inside another one stands behind it.
-pub const DIALECTS: &[Dialect] =
-    &[ply::DIALECT, ply::COMPRESSED, ply::STG, spz::DIALECT, splat::DIALECT, splatv::DIALECT, sog::DIALECT];
+pub const DIALECTS: &[Dialect] = &[
+    ply::DIALECT,
+    ply::COMPRESSED,
+    ply::STG,
+    spz::DIALECT,
+    splat::DIALECT,
+    splatv::DIALECT,
+    sog::DIALECT,
+    gltf::DIALECT,
+];
 
 /// The scene in a file of any kind that says by its first bytes what it is: `.splat4d`, .ply (3DGS, compressed, Spacetime
 /// Gaussians), .spz, .splatv, zipped SOG, `scene.safetensors` and checkpoints. A .splat has no mark: [`splat::read`] it.

@@ -2,7 +2,7 @@
 //! file says for all.
 
 use super::super::json::Node;
-use super::super::{DepthFile, DepthKind, Split, picture, pose, rig};
+use super::super::{DepthFile, DepthKind, Split, panorama, picture, pose, rig};
 use splat4d::scene::{Camera, Intrinsics, Lens};
 use splat4d::{Error, ErrorKind, Result};
 use std::f64::consts::PI;
@@ -39,6 +39,9 @@ pub(super) fn read(root: &Path, top: &Node<'_>, node: &Node<'_>) -> Result<Entry
     Ok(Entry { name: name.into(), image, source, by_angle, time, mask, depth, split: Split::Train })
 }
 
+/// Nerfstudio's name for equirectangular panoramas, whose focal lengths say nothing.
+const PANORAMA: &str = "EQUIRECTANGULAR";
+
 /// Units of the scene a stored number of a depth map where a file does not say: thousandths, as Nerfstudio has it.
 const DEPTH_UNIT: f64 = 1e-3;
 
@@ -64,6 +67,11 @@ fn camera(top: &Node<'_>, node: &Node<'_>, image: &dyn Fn() -> Result<PathBuf>) 
     let matrix = node.get("transform_matrix")?;
     let cam_from_world = pose::from_opengl(&matrix.matrix4()?).map_err(|e| matrix.at(e))?;
     let (width, height) = size(top, node, image)?;
+    let model = value(top, node, "camera_model")?.map(|n| n.text()).transpose()?;
+    if model == Some(PANORAMA) {
+        let (intrinsics, lens) = panorama::whole([width, height]);
+        return Ok((Camera { cam_from_world, intrinsics, lens, width, height, near: Camera::NEAR }, false));
+    }
     let fx = focal(top, node, ["fl_x", "camera_angle_x", "x_fov"], width)?;
     let (fx, by_angle) = fx.ok_or_else(|| {
         node.error("neither fl_x nor camera_angle_x is given")

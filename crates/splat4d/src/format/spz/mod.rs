@@ -30,6 +30,7 @@ pub(crate) const DIALECT: Dialect = Dialect {
     mark: Some(|bytes| bytes.starts_with(&GZIP_MAGIC) || bytes.starts_with(&MAGIC)),
     read: |bytes| read(bytes).map(|(params, _, warnings)| Opened::from((params, warnings))),
     writer: Writer::Moment(|params, options, mut out| write(params, options.spz_version, &mut out)),
+    world: false,
 };
 
 /// The versions this library reads and writes.
