@@ -66,7 +66,7 @@ const ORDER: [(&str, &[&str]); 8] = [
     ),
     (
         "crates/splat4d-import",
-        &["board", "calibration", "video", "sync", "sfm", "corrections", "write", "take", "doctor"],
+        &["board", "calibration", "video", "sync", "sfm", "corrections", "write", "shipped", "take", "doctor"],
     ),
     (
         "crates/splat4d-serve",
@@ -607,7 +607,8 @@ fn nobody_asks_which_motion_model_it_is() {
 /// The list of file dialects, in whose folder each declares itself.
 const DIALECT_LIST: &str = "crates/splat4d/src/format/mod.rs";
 /// Files elsewhere that may name one of them, each with its reason.
-const DIALECT_NAMES: [(&str, &str); 1] = [("crates/splat4d-cli/src/source.rs", "a SOG scene may lie in a folder")];
+const DIALECT_NAMES: [(&str, &str); 1] =
+    [("crates/splat4d-cli/src/source/foreign.rs", "a SOG scene may lie in a folder")];
 
 /// A new dialect is its own file and its entry in the list: nobody else may name one. Its properties answer what others
 /// need to know.

@@ -325,6 +325,7 @@ pub(crate) fn meta(scene: &Scene<f32>, outline: &Outline, stage: &Stage, views: 
         clip: outline.clip,
         fps,
         up: scene.up,
+        offset: scene.offset,
         background: scene.background,
         sh_degree: outline.sh_degree,
         bounds: outline.bounds,

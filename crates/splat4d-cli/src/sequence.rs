@@ -18,6 +18,12 @@ const MAX_DIGITS: usize = 9;
 const NAMED_GAPS: usize = 8;
 /// The name of a frame in a folder, without a pattern.
 const DEFAULT_NAME: &str = "frame_%05d.ply";
+/// The folder of results in an output folder of 3DGS and of what grew out of it.
+const RESULTS: &str = "point_cloud";
+/// A folder there: `iteration_30000`.
+const ITERATION: &str = "iteration_";
+/// The Gaussians of an iteration.
+const GAUSSIANS: &str = "point_cloud.ply";
 
 /// A file name with a place for a number: `frame_%05d.ply`. Names need not be UTF-8.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -155,6 +161,9 @@ pub(crate) fn frames(path: &Path) -> Result<Frames> {
         let number = pattern.as_ref().map_or_else(|| number_in(&name), |p| p.number(&name));
         found.extend(number.map(|n| (n, name)));
     }
+    if found.is_empty() && pattern.is_none() {
+        found = folders(folder);
+    }
     found.sort();
     let ending = |name: &OsStr| Path::new(name).extension().map(OsStr::to_ascii_lowercase);
     if let Some((_, other)) = found.iter().find(|(_, name)| ending(name) != ending(&found[0].1)) {
@@ -207,6 +216,48 @@ fn in_words(gaps: &[(u64, u64)]) -> String {
         words.push(format!("and {} more gaps", gaps.len() - NAMED_GAPS));
     }
     words.join(", ")
+}
+
+/// Numbered folders with a frame in each, as `000/point_cloud.ply`.
+fn folders(folder: &Path) -> Vec<(u64, String)> {
+    let Ok(entries) = std::fs::read_dir(folder) else { return Vec::new() };
+    let frame = |entry: std::fs::DirEntry| {
+        let name = entry.file_name().into_string().ok()?;
+        let number = name[name.trim_end_matches(|c: char| c.is_ascii_digit()).len()..].parse().ok()?;
+        let file = only_scene(&entry.path(), &endings())?;
+        Some((number, file.strip_prefix(folder).ok()?.to_str()?.to_owned()))
+    };
+    entries.flatten().filter_map(frame).collect()
+}
+
+/// The file of the newest iteration below an output folder, its folder of results, or one iteration.
+pub(crate) fn newest(folder: &Path) -> Option<(PathBuf, Option<u64>)> {
+    let iterations = |results: &Path| {
+        let entries = std::fs::read_dir(results).ok()?;
+        let number = |name: &str| name.strip_prefix(ITERATION)?.parse::<u64>().ok();
+        let found = entries.flatten().filter_map(|e| {
+            let (number, file) = (number(e.file_name().to_str()?)?, e.path().join(GAUSSIANS));
+            file.is_file().then_some((file, Some(number)))
+        });
+        found.max_by_key(|(_, number)| *number)
+    };
+    let alone = folder.join(GAUSSIANS);
+    iterations(&folder.join(RESULTS))
+        .or_else(|| iterations(folder))
+        .or_else(|| alone.is_file().then_some((alone, None)))
+}
+
+/// The scene file that stands for a folder in a sequence of folders: a result of 3DGS, or the only scene file in it.
+fn only_scene(folder: &Path, endings: &[&str]) -> Option<PathBuf> {
+    if let Some((file, _)) = newest(folder) {
+        return Some(file);
+    }
+    let fits = |path: &PathBuf| {
+        let name = path.file_name().and_then(|n| n.to_str()).unwrap_or_default();
+        !name.starts_with('.') && endings.iter().any(|e| name.to_ascii_lowercase().ends_with(e)) && path.is_file()
+    };
+    let mut found = std::fs::read_dir(folder).ok()?.flatten().map(|e| e.path()).filter(fits);
+    found.next().filter(|_| found.next().is_none())
 }
 
 /// Endings of files that may be frames: those of one moment, of the kinds that `--frames` writes.

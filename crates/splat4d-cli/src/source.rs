@@ -1,6 +1,8 @@
 //! Anything that holds a scene: a run folder, a scene file (`.safetensors`, checkpoints too), a playback file
 //! (`.s4d`), a file or folder of another program's Gaussians, or a sequence of such files.
 
+pub(crate) mod bundle;
+
 use crate::files::{self, either};
 use crate::paths::{Stage, View};
 use crate::run_folder::Run;
@@ -9,10 +11,9 @@ use splat4d::format::playback::{self, Index, Provenance};
 use splat4d::format::ply::PlyInfo;
 use splat4d::format::{Dialect, Warnings, dialect, foreign, sog};
 use splat4d::layers::{Layer, Scene};
-use splat4d::scene::Camera;
 use splat4d::scene::time::DEFAULT_FPS;
+use splat4d::scene::{Camera, GEOMETRY};
 use splat4d::{Error, Result, format};
-use std::borrow::Cow;
 use std::path::Path;
 
 /// Share of a cloud, outermost first, that does not count for its size: a few far Gaussians must not shrink the rest.
@@ -28,8 +29,6 @@ fn remedy() -> String {
     format!("Give a run folder, a scene.safetensors, a checkpoint, a .s4d, or a {others} file.")
 }
 
-/// Marks a folder of SOG scenes, one for each level of detail.
-pub(crate) const SOG_LEVELS: &str = "lod-meta.json";
 
 /// A scene and where it came from.
 pub struct Source {
@@ -60,18 +59,22 @@ impl Source {
             return open_sequence(path, fps);
         }
         if path.is_dir() && !Run::is(path) {
-            return if path.join(sog::META).is_file() { open_sog(path) } else { open_sequence(path, fps) };
+            if path.join(sog::META).is_file() {
+                return bundle::open_sog(path);
+            }
+            return bundle::open(path, fps)?.map_or_else(|| open_sequence(path, fps), Ok);
         }
         if path.is_dir() {
             let run = Run::open(path)?;
             let scene = read_scene(&run.scene_file()?)?;
             return Ok(Self { run: Some(run), ..Self::own(scene) });
         }
+        let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
         if path.file_name().is_some_and(|n| n == sog::META) {
-            return open_sog(path.parent().unwrap_or(Path::new("")));
+            return bundle::open_sog(folder);
         }
-        if path.file_name().is_some_and(|n| n == SOG_LEVELS) {
-            return open_sequence(path.parent().unwrap_or(Path::new("")), fps);
+        if path.file_name().is_some_and(|n| n == sog::levels::LEVELS) {
+            return bundle::open(folder, fps).map(|s| s.expect("the folder has the file"));
         }
         let bytes = files::read(path)?;
         if bytes.starts_with(&playback::MAGIC) {
@@ -79,6 +82,9 @@ impl Source {
             let scene = playback::read(&bytes).map_err(|e| e.at(path.display()))?;
             let provenance = playback::provenance(&bytes).map_err(|e| e.at(path.display()))?;
             return Ok(Self { playback: Some(index), provenance, ..Self::own(scene) });
+        }
+        if let Some(source) = bundle::open_archive(path, &bytes)? {
+            return Ok(source);
         }
         let name = path.file_name().map(|n| n.to_string_lossy()).unwrap_or_default();
         let opened = match dialect_of(path, &bytes) {
@@ -145,37 +151,13 @@ fn dialect_of(path: &Path, bytes: &[u8]) -> Option<Dialect> {
     Dialect::of_file(&name, bytes)
 }
 
-/// A SOG scene whose files lie in a folder.
-fn open_sog(folder: &Path) -> Result<Source> {
-    let read = |name: &str| files::read(&folder.join(name));
-    let meta = read(sog::META)?;
-    let mut files = sog::Files::new();
-    for name in sog::files_of(&meta).map_err(|e| e.at(folder.display()))? {
-        // The list comes from the file: it must not lead out of the folder.
-        if Path::new(&name).components().any(|c| !matches!(c, std::path::Component::Normal(_))) {
-            return Err(Error::input(format!("names the file `{name}`, which lies elsewhere"))
-                .at(folder.join(sog::META).display())
-                .remedy("Export the scene again."));
-        }
-        let bytes = read(&name)?;
-        files.insert(name, Cow::Owned(bytes));
-    }
-    files.insert(sog::META.into(), Cow::Owned(meta));
-    let (params, warnings) = sog::read(&files).map_err(|e| e.at(folder.display()))?;
-    let scene = Scene { up: sog::DIALECT.up, ..dialect::still(params) };
-    Ok(Source { dialect: Some(sog::DIALECT), warnings, ..Source::own(scene) })
-}
-
 /// Files of one frame each.
 fn open_sequence(path: &Path, fps: f64) -> Result<Source> {
-    if path.join(SOG_LEVELS).is_file() {
-        return Err(Error::input("holds a scene in several levels of detail")
-            .at(path.display())
-            .remedy(format!("Give the folder of one level, for instance {}.", path.join("0_0").display())));
-    }
     let found = sequence::frames(path)?;
     let (mut frames, mut kind, mut warnings) = (Vec::with_capacity(found.files.len()), None, Warnings::default());
     let mut up = None;
+    // Frames far from the origin may each have an offset: that of the first is the scene's.
+    let mut offset = None;
     if let Some(missing) = &found.missing {
         warnings.say(format!("frames are missing: {missing}. Nothing is shown at their times, which are kept"));
     }
@@ -195,10 +177,18 @@ fn open_sequence(path: &Path, fps: f64) -> Result<Source> {
                 .at(file.display())
                 .remedy("Convert all frames with the same --up."));
         }
-        frames.push(std::mem::take(&mut opened.scene.layers[0].params));
+        let mut params = std::mem::take(&mut opened.scene.layers[0].params);
+        let first = *offset.get_or_insert(opened.scene.offset);
+        let off = std::array::from_fn::<f64, 3, _>(|k| opened.scene.offset[k] - first[k]);
+        if off != [0.0; 3] {
+            let table = &mut params[GEOMETRY];
+            (0..table.rows()).for_each(|row| table.add(row, 0, off.map(|x| x as f32)));
+        }
+        frames.push(params);
     }
     let up = up.unwrap_or(dialect::Y_DOWN);
-    let scene = format::sequence::join_at(&frames, &found.numbers, fps, up).map_err(|e| e.at(path.display()))?;
+    let joined = format::sequence::join_at(&frames, &found.numbers, fps, up).map_err(|e| e.at(path.display()))?;
+    let scene = Scene { offset: offset.unwrap_or_default(), ..joined };
     Ok(Source { dialect: kind, warnings, ..Source::own(scene) })
 }
 

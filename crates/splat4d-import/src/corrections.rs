@@ -136,7 +136,9 @@ impl Camera {
         let (k, p, fisheye) = match lens {
             Lens::Brown { k, p, .. } => (short(k), short(p), false),
             Lens::Fisheye { k } => (short(k), Vec::new(), true),
-            _ => (Vec::new(), Vec::new(), false),
+            Lens::Pinhole => (Vec::new(), Vec::new(), false),
+            // Only a calibration has others, which stands in its own file.
+            _ => return,
         };
         let Intrinsics { fx, fy, cx, cy } = *intrinsics;
         self.lens = Some(Intrinsic { fx, fy: (fx != fy).then_some(fy), cx, cy, k, p, fisheye });

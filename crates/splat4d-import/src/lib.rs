@@ -6,6 +6,7 @@ pub mod calibration;
 pub mod corrections;
 pub mod doctor;
 pub mod sfm;
+pub mod shipped;
 pub mod sync;
 pub mod take;
 pub mod video;

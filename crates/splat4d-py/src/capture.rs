@@ -142,6 +142,12 @@ impl Capture {
         self.capture.up
     }
 
+    /// World coordinates of the origin; zero unless the capture is far from it.
+    #[getter]
+    fn offset(&self) -> [f64; 3] {
+        self.capture.offset
+    }
+
     /// What was assumed or looks wrong, a sentence or two each.
     #[getter]
     fn warnings(&self) -> Vec<String> {

@@ -69,6 +69,12 @@ impl Scene {
         self.source.scene.up
     }
 
+    /// World coordinates of the scene's origin; zero unless they are far from it.
+    #[getter]
+    fn offset(&self) -> [f64; 3] {
+        self.source.scene.offset
+    }
+
     /// Colour behind the scene.
     #[getter]
     fn background(&self) -> [f32; 3] {

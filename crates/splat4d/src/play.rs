@@ -184,6 +184,7 @@ impl<'a> Player<'a> {
             clip: scene.clip,
             fps: scene.fps,
             up: scene.up,
+            offset: scene.offset,
             background: scene.background,
             gaussians: scene.len(),
             ..Meta::default()

@@ -9,7 +9,8 @@ use crate::source::{Source, not_empty};
 use serde_json::json;
 use splat4d::bake::Likeness;
 use splat4d::format::dialect::{self, WriteOptions};
-use splat4d::format::{self, DIALECTS, Dialect, Warnings, playback, spz};
+use splat4d::format::mend::from_linear;
+use splat4d::format::{self, DIALECTS, Dialect, Linear, Warnings, playback, spz};
 use splat4d::layers::{self, Scene, rotation_between};
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
@@ -32,7 +33,9 @@ Examples:
   splat4d convert runs/knight knight.splatv           moving: splaTV and gsplat.js play it
   splat4d convert runs/knight now.spz --time 0.5      one moment
   splat4d convert runs/knight 'frames/f_%04d.spz' --frames
-  splat4d convert frames/ all.safetensors --fps 25    numbered files become one moving scene";
+  splat4d convert frames/ all.safetensors --fps 25    numbered files become one moving scene
+  splat4d convert runs/field field.ply --world        positions of the map that the capture is in
+  splat4d convert lengths.ply scene.ply --linear scales --linear opacities";
 
 /// What stands under the help: examples, and the formats of the list.
 fn after_help() -> String {
@@ -90,6 +93,12 @@ pub(crate) struct Args {
     /// Refuse a file whose format cannot say when each Gaussian is seen, in place of fitting smooth fades
     #[arg(long)]
     exact: bool,
+    /// Add the scene's offset: positions of the capture's world, in double precision (.ply)
+    #[arg(long)]
+    world: bool,
+    /// Read these values of the input as they are, not as logarithms or logits; may be repeated
+    #[arg(long, value_name = "WHAT", value_enum)]
+    linear: Vec<LinearValues>,
     /// Version of .spz to write
     #[arg(long, value_name = "V", default_value_t = spz::DEFAULT_VERSION,
           value_parser = clap::value_parser!(u32).range(2..=4))]
@@ -127,6 +136,15 @@ impl Up {
             Self::MinusZ => [0.0, 0.0, -1.0],
         })
     }
+}
+
+/// Values that some programs do not store as logarithms or logits.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum LinearValues {
+    /// Scales are lengths
+    Scales,
+    /// Opacities are alphas from 0 to 1
+    Opacities,
 }
 
 /// Format of the file that is written.
@@ -176,8 +194,9 @@ impl Args {
     pub(crate) fn plain(input: PathBuf, output: PathBuf) -> Self {
         let spz_version = spz::DEFAULT_VERSION;
         let (time, fps, from, to) = (None, None, None, None);
-        let (frames, force, up, sh, no_provenance, exact) = (false, false, None, None, false, false);
-        Self { input, output, time, frames, force, fps, from, to, up, sh, no_provenance, exact, spz_version }
+        let (frames, force, up, sh, no_provenance) = (false, false, None, None, false);
+        let (exact, world, linear) = (false, false, Vec::new());
+        Self { input, output, time, frames, force, fps, from, to, up, sh, no_provenance, exact, world, linear, spz_version }
     }
 }
 
@@ -188,10 +207,26 @@ pub(crate) fn check_output(output: &Path) -> Result<()> {
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     asked(args)?;
-    let source = Source::open_at(&args.input, args.fps.unwrap_or(DEFAULT_FPS))?.finite();
+    let mut source = Source::open_at(&args.input, args.fps.unwrap_or(DEFAULT_FPS))?.finite();
     not_empty(&source.scene, &args.input)?;
+    read_linear(&mut source, &args.linear);
     source.warnings.lines().iter().for_each(|w| console.warn(&format!("{w}.")));
     write(args, source, console)
+}
+
+/// Reads values as they are where the options say so.
+fn read_linear(source: &mut Source, linear: &[LinearValues]) {
+    for what in linear {
+        let what = match what {
+            LinearValues::Scales => Linear::Scales,
+            LinearValues::Opacities => Linear::Opacities,
+        };
+        // The reader's own doubt about them is settled.
+        source.warnings.drop(&format!("--linear {}", what.name()));
+        for layer in &mut source.scene.layers {
+            source.warnings.append(from_linear(layer, what));
+        }
+    }
 }
 
 /// With --frames the pattern; and the format. Errors: options that do not fit together.
@@ -200,6 +235,11 @@ fn asked(args: &Args) -> Result<(Option<(Pattern, PathBuf)>, Target)> {
     let target = Target::of(pattern.as_ref().map_or(&args.output, |p| p.1.as_path()))?;
     if args.time.is_some_and(|t| !t.is_finite()) || args.fps.is_some_and(|f| !(0.01..=1000.0).contains(&f)) {
         return Err(Error::input("--time or --fps is out of range").remedy("Give a plain, sensible number."));
+    }
+    if args.world && !matches!(target, Target::Dialect(_)) {
+        return Err(Error::input(format!("a {} stores the offset beside its positions", target.name()))
+            .at(args.output.display())
+            .remedy("Leave --world out, or write .ply."));
     }
     if target == Target::Playback && (args.time.is_some() || args.frames) {
         return Err(Error::input("a playback file holds the whole take")
@@ -230,8 +270,20 @@ pub(crate) fn write(args: &Args, mut source: Source, console: &Console) -> anyho
         return bake(source, args, rotation != IDENTITY, console);
     }
     let scene = &source.scene;
-    let options = WriteOptions { spz_version: args.spz_version, cameras, exact: args.exact, ..WriteOptions::default() };
+    let options = WriteOptions {
+        spz_version: args.spz_version,
+        cameras,
+        exact: args.exact,
+        world: args.world,
+        ..WriteOptions::default()
+    };
     let writer = Writer { target, options };
+    if matches!(target, Target::Dialect(_)) && !args.world && scene.offset != [0.0; 3] {
+        let [x, y, z] = scene.offset;
+        console.warn(&format!(
+            "positions are relative to the scene's offset ({x} {y} {z}); .ply can hold those of the world: --world."
+        ));
+    }
     if let Some((pattern, _)) = pattern {
         return write_frames(args, scene, source.run.as_ref(), &pattern, &writer, console);
     }
@@ -257,6 +309,12 @@ pub(crate) fn write(args: &Args, mut source: Source, console: &Console) -> anyho
         }
         None => scene,
     };
+    if whole.is_empty() {
+        return Err(Error::input("nothing is alive at that time: the file would be empty")
+            .at(args.input.display())
+            .remedy(format!("Choose a --time from {} to {} s.", scene.clip[0], scene.clip[1]))
+            .into());
+    }
     let (bytes, warnings) = writer.bytes(whole).map_err(|e| e.at(args.input.display()))?;
     warnings.lines().iter().for_each(|w| console.warn(&format!("{w}.")));
     let likeness = match target {
@@ -406,7 +464,7 @@ fn rotated(camera: Camera, r: &[[f64; 3]; 3]) -> Camera {
 /// A scene that stands still as `scene` does at `time`.
 fn one_moment(scene: &Scene<f32>, time: f64) -> Result<Scene<f32>> {
     let still = dialect::still(layers::moment(scene, Time(time))?);
-    Ok(Scene { up: scene.up, background: scene.background, ..still })
+    Ok(Scene { up: scene.up, offset: scene.offset, background: scene.background, ..still })
 }
 
 /// Writes one file of a kind.

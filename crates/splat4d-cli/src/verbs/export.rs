@@ -74,6 +74,9 @@ pub(crate) struct Args {
     /// Only Gaussians with this label
     #[arg(long, value_name = "NAME")]
     label: Option<String>,
+    /// Add the scene's offset: positions of the capture's world, in double precision (.ply, tracks of Gaussians)
+    #[arg(long, conflicts_with_all = ["html", "points"])]
+    world: bool,
     /// Only every N-th Gaussian's track
     #[arg(long, value_name = "N", requires = "tracks", conflicts_with = "near",
           value_parser = clap::value_parser!(u32).range(1..))]
@@ -141,7 +144,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let write = |time: f64, out: &Path| -> anyhow::Result<usize> {
         let params = freeze(scene, Time(time))?;
         let mut bytes = Vec::new();
-        format::ply::write(&params, &mut bytes)?;
+        format::ply::write_placed(&params, (scene.offset, args.world), &mut bytes)?;
         files::write(out, &bytes)?;
         Ok(params.len())
     };
@@ -260,7 +263,8 @@ fn tracks(scene: &Scene<f32>, args: &Args, out: &Path, console: &Console) -> any
         console.warn(&format!("nothing is alive at {} s: the file holds no track", times[0]));
     }
     let followed = Tracks::follow(scene, &members, &times);
-    let text = if json { followed.to_json(scene) } else { followed.to_csv(scene) };
+    let offset = if args.world { scene.offset } else { [0.0; 3] };
+    let text = if json { followed.to_json(scene, offset) } else { followed.to_csv(scene, offset) };
     files::write(out, text.as_bytes())?;
     console.say(&format!("{} tracks of {} moments", files::grouped(members.len()), times.len()));
     console.emit(&json!({"type": "exported", "tracks": members.len(), "moments": times.len()}));

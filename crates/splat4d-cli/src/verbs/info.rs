@@ -7,7 +7,7 @@ use crate::chunked;
 use crate::console::Console;
 use crate::files::{grouped, human_bytes, human_seconds};
 use crate::run_folder::Run;
-use crate::source::{SOG_LEVELS, Source, cloud};
+use crate::source::{Source, bundle, cloud};
 use serde_json::{Value, json};
 use splat4d::Error;
 use splat4d::format::sog;
@@ -99,9 +99,10 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             .into());
     }
     let marker = path.extension().is_some_and(|e| e == "json" || e == "npy");
-    let sog =
-        path.join(sog::META).is_file() || path.file_name().is_some_and(|name| name == sog::META || name == SOG_LEVELS);
-    let is_capture = !Run::is(path) && !sog && (path.is_dir() || marker);
+    let sog = path.join(sog::META).is_file() || path.file_name().is_some_and(|name| name == sog::META);
+    let levels = path.file_name().is_some_and(|name| name == sog::levels::LEVELS);
+    let foreign = sog || levels || (path.is_dir() && bundle::is_scene(path));
+    let is_capture = !Run::is(path) && !foreign && (path.is_dir() || marker);
     if args.doctor && !is_capture {
         return Err(Error::input("the doctor looks at captures, and this is none")
             .at(path.display())
@@ -482,6 +483,10 @@ fn of_scene(scene: &Scene<f32>) -> Told {
             &format!("{:.3} to {:.3} s, {} frames a second", scene.clip[0], scene.clip[1], scene.fps),
         );
     }
+    if scene.offset != [0.0; 3] {
+        let [x, y, z] = scene.offset;
+        line(&mut text, "offset", &format!("{x} {y} {z}: add it to positions for those of the world"));
+    }
     let finite = low[0] <= high[0];
     if finite {
         let corner = |c: [f64; 3]| format!("{:.3} {:.3} {:.3}", c[0], c[1], c[2]);
@@ -496,7 +501,7 @@ fn of_scene(scene: &Scene<f32>) -> Told {
         "type": "scene", "gaussians": n, "damaged_rows": damaged, "zero_rotations": zero_quats,
         "layers": layers.iter().map(|l| json!({"name": l.0, "motion": l.1, "life": l.2, "gaussians": l.3,
             "sh_degree": l.4})).collect::<Vec<_>>(),
-        "head": scene.head.name(), "clip": scene.clip, "fps": scene.fps, "bounds": finite.then_some([low, high]),
+        "offset": scene.offset, "head": scene.head.name(), "clip": scene.clip, "fps": scene.fps, "bounds": finite.then_some([low, high]),
         "middle": center, "radius": radius, "opacity_histogram": {"edges": OPACITY_EDGES, "counts": opacity},
         "scale_histogram": {"edges_log10_radii": SCALE_EDGES, "counts": scales},
     });

@@ -64,10 +64,13 @@ fn camera(tree: &Tree, opengl: bool) -> Result<Part> {
             let (k, p, s) = (terms(distortion, "k")?, terms(distortion, "p")?, terms(distortion, "s")?);
             if k == [0.0; 6] && p == [0.0; 2] && s == [0.0; 4] { Lens::Pinhole } else { Lens::Brown { k, p, s } }
         }
-        Some("fisheye") => Lens::Fisheye { k: terms(distortion, "k")? },
         Some(other) => {
-            return Err(Error::new(ErrorKind::Unsupported, format!("the distortion model {other:.40} is not known"))
-                .remedy("Write opencv, fisheye or pinhole."));
+            let (k, p, s) = (terms::<6>(distortion, "k")?, terms::<2>(distortion, "p")?, terms::<4>(distortion, "s")?);
+            Lens::of_terms(other, [&k, &p, &s]).ok_or_else(|| {
+                let names = Lens::MODELS.map(|(name, _)| name).join(", ");
+                Error::new(ErrorKind::Unsupported, format!("the distortion model {other:.40} is not known"))
+                    .remedy(format!("Write one of {names}."))
+            })?
         }
     };
     let (key, value) = POSES

@@ -17,7 +17,7 @@ mod tags;
 mod way;
 mod world;
 
-pub use inputs::find;
+pub use inputs::{Input, find};
 pub use report::{CameraReport, Report};
 
 use crate::board::Board;
@@ -353,11 +353,12 @@ fn sound_goes(
 
 /// Opens all inputs; no file twice.
 fn open(request: &Request) -> Result<Vec<Camera>> {
-    let paths = find(&request.inputs)?;
-    let mut sources = Vec::with_capacity(paths.len());
-    let mut prints: Vec<(String, &Path)> = Vec::with_capacity(paths.len());
-    for path in &paths {
-        let source = video::open(path, request.fps)?;
+    let inputs = find(&request.inputs)?;
+    let mut sources = Vec::with_capacity(inputs.len());
+    let mut prints: Vec<(String, &Path)> = Vec::with_capacity(inputs.len());
+    for input in &inputs {
+        let path = &input.files[0];
+        let source = video::open_all(&input.files, request.fps)?;
         let print = source.fingerprint()?;
         if let Some((_, other)) = prints.iter().find(|(p, _)| *p == print) {
             return Err(Error::input(format!("it is the same as {}", other.display()))
@@ -367,7 +368,9 @@ fn open(request: &Request) -> Result<Vec<Camera>> {
         prints.push((print, path));
         sources.push(source);
     }
-    let wanted: Vec<&str> = sources.iter().map(|s| s.info().name.as_str()).collect();
+    let named = |(s, i): (&Box<dyn Source>, &Input)| i.name.clone().unwrap_or_else(|| s.info().name.clone());
+    let wanted: Vec<String> = sources.iter().zip(&inputs).map(named).collect();
+    let wanted: Vec<&str> = wanted.iter().map(String::as_str).collect();
     let names = write::camera_names(&wanted);
     Ok(names.into_iter().zip(sources).map(|(name, source)| Camera { name, source }).collect())
 }

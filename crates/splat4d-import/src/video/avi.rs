@@ -111,6 +111,7 @@ fn info(path: &Path, interval: f64, warnings: Vec<String>) -> Info {
         interlaced: false,
         color: Color { matrix: Some("bt601"), tagged: true, range: Range::Full, transfer: Transfer::Standard },
         sound: false,
+        alpha: false,
         warnings,
     }
 }
@@ -204,7 +205,7 @@ impl Reader for Pictures<'_> {
             // An empty frame shows the one before again; the first one is never empty.
             let shown = (0..=number).rev().find(|&i| self.avi.frames[i].1 > 0).expect("the first frame is not empty");
             let picture = scaled(self.avi.decode(shown)?, &self.selection);
-            *frame = Frame { number, time: self.times[number], picture };
+            *frame = Frame { number, time: self.times[number], picture, alpha: Vec::new() };
             return Ok(true);
         }
         if self.counted == 0 {

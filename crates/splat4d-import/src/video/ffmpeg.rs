@@ -31,7 +31,13 @@ impl Video {
     /// Asks ffprobe what it is.
     pub(super) fn open(path: &Path, tools: Tools) -> Result<Self> {
         let json = tools.probe(path)?;
-        let probe = probe::parse(&json, stem(path)).map_err(|e| e.at(path.display()))?;
+        let mut probe = probe::parse(&json, stem(path)).map_err(|e| e.at(path.display()))?;
+        if let Some(decoder) = probe.alpha_decoder.filter(|d| !tools.decodes(d)) {
+            (probe.alpha_decoder, probe.info.alpha) = (None, false);
+            probe.info.warnings.push(format!(
+                "Its pixels may be transparent, but this ffmpeg lacks {decoder}, which reads that: they are taken for opaque."
+            ));
+        }
         Ok(Self { path: path.to_owned(), tools, probe })
     }
 
@@ -60,6 +66,9 @@ impl Source for Video {
         let Chain { text, size, mut warnings } = filters::chain(info, selection, self.tools.tone_mapping);
         warnings.splice(0..0, info.warnings.iter().cloned());
         let mut input = Vec::new();
+        if let Some(decoder) = self.probe.alpha_decoder {
+            input.extend(["-c:v".into(), decoder.into()]);
+        }
         let seek = selection.from.map_or(0.0, |from| (from - SEEK_MARGIN).max(0.0));
         if seek > 0.0 {
             // Its own clock is kept: shifted to the place that was sought, time stamps are rounded to ticks of the file, and those of
@@ -72,7 +81,8 @@ impl Source for Video {
         }
         let mut output = vec!["-map".into(), format!("0:{}", self.probe.picture), "-vf".into(), text];
         output.extend(self.tools.passthrough().map(String::from));
-        output.extend(["-f", "rawvideo", "-pix_fmt", "rgb24"].map(String::from));
+        let pixels = if info.alpha { "rgba" } else { "rgb24" };
+        output.extend(["-f", "rawvideo", "-pix_fmt", pixels].map(String::from));
         let running = self.tools.start(&self.path, &input, &output)?;
         let selection = selection.clone();
         Ok(Box::new(Pictures {
@@ -84,6 +94,7 @@ impl Source for Video {
             times: Vec::new(),
             told: 0,
             given: 0,
+            raw: Vec::new(),
             warnings,
             done: false,
             guessed: false,
@@ -137,6 +148,8 @@ struct Pictures<'a> {
     told: usize,
     /// How many were given away.
     given: usize,
+    /// Pixels with alpha, as they come.
+    raw: Vec<u8>,
     warnings: Vec<String>,
     done: bool,
     /// Whether a time had to be made up.
@@ -227,7 +240,16 @@ impl Reader for Pictures<'_> {
             let picture = &mut frame.picture;
             (picture.width, picture.height) = (width, height);
             picture.data.resize(width * height * 3, 0);
-            if self.running.fill(&mut picture.data) < width * height * 3 {
+            if self.video.probe.info.alpha {
+                self.raw.resize(width * height * 4, 0);
+                if self.running.fill(&mut self.raw) < self.raw.len() {
+                    break;
+                }
+                let pixels = picture.data.as_chunks_mut::<3>().0.iter_mut().zip(self.raw.as_chunks::<4>().0);
+                pixels.for_each(|(to, [r, g, b, _])| *to = [*r, *g, *b]);
+                frame.alpha.clear();
+                frame.alpha.extend(self.raw.iter().skip(3).step_by(4));
+            } else if self.running.fill(&mut picture.data) < width * height * 3 {
                 break;
             }
             let Some(time) = self.next_stamp() else { break };

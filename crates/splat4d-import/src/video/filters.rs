@@ -57,7 +57,7 @@ pub(super) fn chain(info: &Info, selection: &Selection, tone_mapping: bool) -> C
     let range = if color.range == Range::Full { "full" } else { "limited" };
     let matrix = color.matrix.map(|m| format!(":in_color_matrix={m}:in_range={range}")).unwrap_or_default();
     parts.push(format!("scale={}:{}:flags={SCALING}{matrix}", size[0], size[1]));
-    parts.push("format=rgb24".into());
+    parts.push(if info.alpha { "format=rgba" } else { "format=rgb24" }.into());
     Chain { text: parts.join(","), size, warnings }
 }
 
@@ -105,6 +105,7 @@ mod tests {
             interlaced: false,
             color,
             sound: false,
+            alpha: false,
             warnings: Vec::new(),
         }
     }

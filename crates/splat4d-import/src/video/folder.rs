@@ -69,6 +69,7 @@ impl Folder {
             color: Color { matrix: None, tagged: true, range: Range::Full, transfer: Transfer::Standard },
             sound: false,
             warnings,
+            alpha: Rgb8::read_alpha(first)?.1.is_some(),
         };
         Ok(Self { info, files: files.into_iter().zip(times).collect() })
     }
@@ -121,7 +122,7 @@ impl Reader for Pictures<'_> {
             if !(self.counted - 1).is_multiple_of(self.selection.every) {
                 continue;
             }
-            let picture = Rgb8::read(path)?;
+            let (picture, alpha) = Rgb8::read_alpha(path)?;
             let [width, height] = self.folder.info.size;
             if [picture.width, picture.height] != [width, height] {
                 let what = format!(
@@ -132,7 +133,8 @@ impl Reader for Pictures<'_> {
                     .at(path.display())
                     .remedy("Give each camera a folder of its own, with pictures of one size."));
             }
-            *frame = Frame { number, time: *time, picture: scaled(picture, &self.selection) };
+            let alpha = alpha.map_or_else(Vec::new, |a| scaled_plane(a, [width, height], &self.selection));
+            *frame = Frame { number, time: *time, picture: scaled(picture, &self.selection), alpha };
             return Ok(true);
         }
         if self.counted == 0 {
@@ -161,6 +163,17 @@ pub(super) fn scaled(picture: Rgb8, selection: &Selection) -> Rgb8 {
     // The same kind of curve as ffmpeg's; both widen it where pictures get smaller.
     let data = resize(&whole, width as u32, height as u32, FilterType::CatmullRom).into_raw();
     Rgb8 { width, height, data }
+}
+
+/// An alpha channel in the size that was asked for.
+fn scaled_plane(alpha: Vec<u8>, size: [usize; 2], selection: &Selection) -> Vec<u8> {
+    let [width, height] = selection.scaled(size);
+    if [width, height] == size {
+        return alpha;
+    }
+    let whole = image::GrayImage::from_raw(size[0] as u32, size[1] as u32, alpha);
+    let whole = whole.expect("there is a sample for each pixel");
+    resize(&whole, width as u32, height as u32, FilterType::CatmullRom).into_raw()
 }
 
 fn name(path: &Path) -> String {

@@ -5,6 +5,7 @@
 //! and in sRGB; one frame is in memory at a time.
 
 mod avi;
+mod chapters;
 mod clock;
 mod ffmpeg;
 mod filters;
@@ -12,6 +13,7 @@ mod folder;
 mod probe;
 mod program;
 
+pub use chapters::{Chapter, open_all};
 pub use clock::{Clock, Gap, mean_difference};
 pub(crate) use folder::ENDINGS as PICTURE_ENDINGS;
 pub use folder::Folder;
@@ -99,6 +101,8 @@ pub struct Frame {
     pub time: f64,
     /// Its pixels.
     pub picture: Rgb8,
+    /// How opaque each of them is, 0 to 255; empty: all are.
+    pub alpha: Vec<u8>,
 }
 
 /// Frames in the order of time, one in memory at a time.

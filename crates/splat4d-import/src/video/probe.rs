@@ -74,6 +74,8 @@ pub struct Info {
     pub color: Color,
     /// Whether there is sound.
     pub sound: bool,
+    /// Whether pixels may be transparent.
+    pub alpha: bool,
     /// What was assumed or is odd, a sentence each.
     pub warnings: Vec<String>,
 }
@@ -88,6 +90,8 @@ pub(super) struct Probe {
     pub sound: Option<usize>,
     /// Whether the duration is that of the picture stream, and not of the longest one.
     pub own_duration: bool,
+    /// The decoder that gives alpha, where the usual one leaves it out (VP8 and VP9 store it in packets of its own).
+    pub alpha_decoder: Option<&'static str>,
 }
 
 /// Understands what ffprobe wrote. Errors: no picture stream, no codec that is known, no size.
@@ -129,6 +133,13 @@ pub(super) fn parse(json: &str, name: String) -> Result<Probe> {
     let own = number(&film["duration"]).or_else(|| film["tags"]["DURATION"].as_str().and_then(clock_time));
     let pixels = text("pix_fmt").to_owned();
     let color = color(film, &codec, &pixels, [width, height]);
+    // Matroska's mark for alpha beside the pictures.
+    let beside = ["alpha_mode", "ALPHA_MODE"].iter().any(|tag| film["tags"][*tag] == "1");
+    let alpha_decoder = match codec.as_str() {
+        "vp8" if beside => Some("libvpx"),
+        "vp9" if beside => Some("libvpx-vp9"),
+        _ => None,
+    };
     let nominal_rate = ratio(text("r_frame_rate"));
     let average_rate = ratio(text("avg_frame_rate"));
     let info = Info {
@@ -146,10 +157,18 @@ pub(super) fn parse(json: &str, name: String) -> Result<Probe> {
         interlaced: matches!(text("field_order"), "tt" | "bb" | "tb" | "bt"),
         color,
         sound: of("audio").next().is_some(),
+        alpha: has_alpha(&text("pix_fmt").to_ascii_lowercase()) || alpha_decoder.is_some(),
         warnings,
     };
     let index = |s: &Value| s["index"].as_u64().unwrap_or(0) as usize;
-    Ok(Probe { info, picture: index(film), sound: of("audio").next().map(index), own_duration: own.is_some() })
+    let sound = of("audio").next().map(index);
+    Ok(Probe { info, picture: index(film), sound, own_duration: own.is_some(), alpha_decoder })
+}
+
+/// Whether a pixel format, as ffmpeg names it, has alpha.
+fn has_alpha(pixels: &str) -> bool {
+    let begins = ["rgba", "bgra", "argb", "abgr", "gbrap", "ya8", "ya16", "ayuv", "vuya"];
+    pixels.starts_with("yuva") || begins.iter().any(|b| pixels.starts_with(b))
 }
 
 /// Degrees clockwise, 0 to 359. The matrix in the side data turns the other way; older versions have a tag.
@@ -281,6 +300,25 @@ mod tests {
             let film = phone(|f| f["field_order"] = json!(order));
             assert_eq!(probe(&[film]).unwrap().info.interlaced, interlaced, "{order}");
         }
+    }
+
+    #[test]
+    fn alpha_is_seen_in_formats_and_marks() {
+        let of = |codec: &str, pixels: &str, mark: bool| {
+            let film = phone(|f| {
+                (f["codec_name"], f["pix_fmt"]) = (json!(codec), json!(pixels));
+                if mark {
+                    f["tags"] = json!({"alpha_mode": "1"});
+                }
+            });
+            let found = probe(&[film]).unwrap();
+            (found.info.alpha, found.alpha_decoder)
+        };
+        assert_eq!(of("prores", "yuva444p12le", false), (true, None));
+        assert_eq!(of("qtrle", "argb", false), (true, None));
+        assert_eq!(of("vp9", "yuv420p", true), (true, Some("libvpx-vp9")));
+        assert_eq!(of("vp9", "yuv420p", false), (false, None));
+        assert_eq!(of("hevc", "gbrp", false), (false, None));
     }
 
     #[test]

@@ -69,6 +69,13 @@ impl Tools {
         if self.version.is_none_or(|v| v >= FPS_MODE_SINCE) { ["-fps_mode", "passthrough"] } else { ["-vsync", "0"] }
     }
 
+    /// Whether there is a decoder of this name.
+    pub(super) fn decodes(&self, name: &str) -> bool {
+        let out = Command::new(&self.ffmpeg).args(["-hide_banner", "-decoders"]).stdin(Stdio::null()).output();
+        let named = |line: &str| line.split_whitespace().nth(1) == Some(name);
+        out.is_ok_and(|out| String::from_utf8_lossy(&out.stdout).lines().any(named))
+    }
+
     /// What ffprobe tells of a file, as JSON. Errors: nothing that it knows, damage.
     pub(super) fn probe(&self, path: &Path) -> Result<String> {
         let mut command = Command::new(&self.ffprobe);

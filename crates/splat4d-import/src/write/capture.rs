@@ -5,7 +5,7 @@ use crate::sync::graph::Offset;
 use serde_json::{Map, Value, json};
 use splat4d::math::Se3;
 use splat4d::scene::{Intrinsics, Lens};
-use splat4d::{Error, Result};
+use splat4d::{Error, ErrorKind, Result};
 use splat4d_train::run::checkpoint::write_atomically;
 use std::path::{Path, PathBuf};
 
@@ -113,11 +113,12 @@ fn camera(camera: &Placed) -> Result<Value> {
             return Err(place(Error::input(what).remedy("Import it again.")));
         }
     };
-    let distortion = match lens {
-        Lens::Brown { k, p, s } => json!({"model": "opencv", "k": k, "p": p, "s": s}),
-        Lens::Fisheye { k } => json!({"model": "fisheye", "k": k}),
-        _ => json!({"model": "pinhole"}),
-    };
+    let (model, terms) = lens.terms().ok_or_else(|| {
+        place(Error::new(ErrorKind::Unsupported, "panoramas of moving scenes are not imported"))
+            .remedy("Cut perspective videos out of them first (ffmpeg's filter v360).")
+    })?;
+    let mut distortion = json!({"model": model});
+    ["k", "p", "s"].iter().zip(terms).filter(|(_, t)| !t.is_empty()).for_each(|(key, t)| distortion[key] = json!(t));
     let tick = |t: f64| (t * TICKS).round() / TICKS;
     let known: Vec<usize> = match poses {
         Poses::Fixed(_) => (0..pictures.shots.len()).collect(),

@@ -46,9 +46,17 @@ impl Format {
         }
     }
 
-    fn encode(self, picture: &Rgb8) -> Result<Vec<u8>> {
+    fn encode(self, picture: &Rgb8, alpha: &[u8]) -> Result<Vec<u8>> {
         let mut bytes = Vec::new();
         let (width, height) = (picture.width as u32, picture.height as u32);
+        if !alpha.is_empty() {
+            let pixels = picture.data.chunks_exact(3).zip(alpha);
+            let rgba: Vec<u8> = pixels.flat_map(|(rgb, a)| [rgb[0], rgb[1], rgb[2], *a]).collect();
+            PngEncoder::new_with_quality(&mut bytes, CompressionType::Fast, FilterType::Adaptive)
+                .write_image(&rgba, width, height, ExtendedColorType::Rgba8)
+                .map_err(|e| Error::input(format!("a picture of {width}x{height} cannot be stored ({e})")))?;
+            return Ok(bytes);
+        }
         let done = match self {
             Self::Jpeg(quality) => JpegEncoder::new_with_quality(&mut bytes, quality).write_image(
                 &picture.data,
@@ -171,7 +179,28 @@ pub fn pictures(
     Ok(out)
 }
 
+/// Pixels of the shorter side at which a video is looked through for transparent ones.
+const LOOKED_AT: usize = 32;
+
+/// Whether any pixel of a clip is transparent: many formats have alpha, and few files use it.
+fn is_transparent(clip: &Clip<'_>) -> Result<bool> {
+    if !clip.source.info().alpha {
+        return Ok(false);
+    }
+    let mut reader = clip.source.frames(&Selection { size: Some(LOOKED_AT), ..clip.selection.clone() })?;
+    let mut frame = Frame::default();
+    while reader.next(&mut frame)? {
+        if frame.alpha.iter().any(|a| *a < u8::MAX) {
+            return Ok(true);
+        }
+    }
+    Ok(false)
+}
+
 fn camera(folder: &Path, clip: &Clip<'_>, format: Format, stop: &dyn Fn() -> bool) -> Result<Pictures> {
+    let transparent = is_transparent(clip)?;
+    // Nothing else holds alpha.
+    let format = if transparent { Format::Png } else { format };
     let place = folder.join("images").join(&clip.name);
     let notes = folder.join(NOTES).join(format!("{}.json", clip.name));
     let made_of = format!("{} {:?} {format:?} {VERSION}", clip.source.fingerprint()?, clip.selection);
@@ -199,6 +228,9 @@ fn camera(folder: &Path, clip: &Clip<'_>, format: Format, stop: &dyn Fn() -> boo
     loop {
         let mut frame = Frame::default();
         let more = reader.next(&mut frame)?;
+        if !transparent {
+            frame.alpha.clear();
+        }
         if more {
             if let Some(last) = &last
                 && frame.number == last.number + 1
@@ -215,7 +247,11 @@ fn camera(folder: &Path, clip: &Clip<'_>, format: Format, stop: &dyn Fn() -> boo
             batch.par_iter().enumerate().try_for_each(|(i, frame)| {
                 let path = file(first + i);
                 // A file under this name is a whole one of the same making.
-                if path.is_file() { Ok(()) } else { write_atomically(&path, &format.encode(&frame.picture)?) }
+                if path.is_file() {
+                    Ok(())
+                } else {
+                    write_atomically(&path, &format.encode(&frame.picture, &frame.alpha)?)
+                }
             })?;
             batch.clear();
         }
@@ -232,6 +268,9 @@ fn camera(folder: &Path, clip: &Clip<'_>, format: Format, stop: &dyn Fn() -> boo
     note.dropped = clock.dropped.iter().map(|g| [g.after, g.missing]).collect();
     note.doubled = clock.doubled;
     note.warnings = reader.warnings().to_vec();
+    if transparent {
+        note.warnings.push("Some of its pixels are transparent: its pictures are stored as PNG with alpha.".into());
+    }
     // Left from a time when more of the same could be read.
     let mut number = note.shots.len();
     while file(number).is_file() {

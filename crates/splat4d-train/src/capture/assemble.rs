@@ -5,7 +5,7 @@ use super::preflight::Severity;
 use super::{
     Capture, CaptureKind, CaptureOptions, Exif, Extent, FlowFile, Frame, HoldOut, PointCloud, RawFrame, Rig, Split, Take, Timing,
 };
-use super::{evidence, lookup, masks, options, picture, pose};
+use super::{evidence, lookup, masks, options, panorama, picture, pose};
 use splat4d::math::se3::{norm, normalize, sub};
 use splat4d::scene::{Camera, Lens, Time};
 use splat4d::{Error, Result};
@@ -33,6 +33,7 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
     options::check_rate("frame rate", take.fps).map_err(located)?;
     skip_missing(&mut take, options).map_err(located)?;
     masks::fill(&mut take)?;
+    panorama::split(&mut take, options.hold_out.as_ref())?;
     for frame in &mut take.frames {
         check_frame(frame, &take.cameras[frame.camera], options)?;
     }
@@ -43,6 +44,7 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
         take.frames.iter().for_each(|f| all.add(f.index..f.index + 1));
         take.take = all;
     }
+    let offset = super::offset::subtract(&mut take);
     let cameras = rigs(&take);
     check_poses(&mut take, &cameras)?;
     check_duplicates(&mut take, &cameras).map_err(located)?;
@@ -81,6 +83,7 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
         points,
         background,
         up,
+        offset,
         labels: take.labels,
         downscale: options.downscale,
         convention: take.convention,
@@ -376,7 +379,7 @@ fn fit_pictures(take: &mut Take, options: &CaptureOptions) -> Result<(bool, Vec<
     for frame in &mut take.frames {
         let header = picture::header(&frame.image)?;
         alpha |= header.alpha;
-        let source = &mut frame.source;
+        let whole = panorama::stored(&frame.source);
         let turn = match options.exif {
             _ if !header.is_turned() => true,
             Exif::Stored => false,
@@ -386,7 +389,7 @@ fn fit_pictures(take: &mut Take, options: &CaptureOptions) -> Result<(bool, Vec<
                 false
             }
             Exif::Auto => {
-                let (as_stored, turned) = (fits(header.stored, source), fits(header.upright(), source));
+                let (as_stored, turned) = (fits(header.stored, &whole), fits(header.upright(), &whole));
                 match (as_stored, turned) {
                     (true, true) => unsure.push(upright.len()),
                     (true, false) => by_size[0] += 1,
@@ -397,15 +400,18 @@ fn fit_pictures(take: &mut Take, options: &CaptureOptions) -> Result<(bool, Vec<
         };
         upright.push(turn);
         let size = if turn { header.upright() } else { header.stored };
-        let stated = (source.width, source.height);
-        if size != stated && picture::is_resized(size, source) {
+        let source = &mut frame.source;
+        let stated = (whole.width, whole.height);
+        if size != stated && panorama::resize(source, size) {
+            resized.push((&frame.image, size, stated));
+        } else if size != stated && picture::is_resized(size, source) {
             let (x, y) = (size.0 as f64 / stated.0 as f64, size.1 as f64 / stated.1 as f64);
             let k = &mut source.intrinsics;
             (k.fx, k.cx, k.fy, k.cy) = (k.fx * x, k.cx * x, k.fy * y, k.cy * y);
             (source.width, source.height) = size;
             resized.push((&frame.image, size, stated));
         }
-        picture::check_size(&frame.image, size, source)
+        picture::check_size(&frame.image, size, &panorama::stored(source))
             .map_err(|e| e.at(format!("camera {}", take.cameras[frame.camera])))?;
     }
     if let Some((image, size, stated)) = resized.first() {

@@ -7,6 +7,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use super::json::read_bytes;
+use super::panorama;
 
 /// A camera's intrinsics.
 #[derive(Clone, Debug)]
@@ -46,7 +47,7 @@ pub(super) struct Point {
 }
 
 /// The models of COLMAP's `sensor/models.h`: name and number of parameters, by id.
-const MODELS: [(&str, usize); 11] = [
+const MODELS: [(&str, usize); 18] = [
     ("SIMPLE_PINHOLE", 3),
     ("PINHOLE", 4),
     ("SIMPLE_RADIAL", 4),
@@ -58,11 +59,18 @@ const MODELS: [(&str, usize); 11] = [
     ("SIMPLE_RADIAL_FISHEYE", 4),
     ("RADIAL_FISHEYE", 5),
     ("THIN_PRISM_FISHEYE", 12),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    ("SIMPLE_DIVISION", 4),
+    ("DIVISION", 5),
+    ("SIMPLE_FISHEYE", 3),
+    ("FISHEYE", 4),
+    ("EUCM", 6),
+    ("EQUIRECTANGULAR", 2),
 ];
 
-/// Least bytes of one entry in a binary file: camera (id, model, size, 3 parameters), image (id, pose, camera, empty
+/// Least bytes of one entry in a binary file: camera (id, model, size, 2 parameters), image (id, pose, camera, empty
 /// name, count), point (id, position, colour, error, track length).
-const LEAST: [usize; 3] = [4 + 4 + 16 + 24, 4 + 56 + 4 + 1 + 8, 8 + 24 + 3 + 8 + 8];
+const LEAST: [usize; 3] = [4 + 4 + 16 + 16, 4 + 56 + 4 + 1 + 8, 8 + 24 + 3 + 8 + 8];
 /// Longest picture name.
 const MAX_NAME: usize = 4096;
 
@@ -118,6 +126,16 @@ impl<'a> Cursor<'a> {
     }
 }
 
+/// A model that COLMAP has got since.
+fn unknown_model(name: &str) -> Error {
+    Error::new(ErrorKind::Unsupported, format!("the camera model {name:.40} is not known"))
+        .remedy("Undistort with `colmap image_undistorter`, or reconstruct with OPENCV or OPENCV_FISHEYE.")
+}
+
+fn lens_of(name: &str, terms: [&[f64]; 3]) -> Lens {
+    Lens::of_terms(name, terms).expect("the models are those of the list")
+}
+
 fn optics(id: u32, model: usize, size: [u64; 2], p: &[f64]) -> Result<Optics> {
     let named = |e: Error| e.at(format!("camera {id}"));
     let (name, _) = MODELS[model];
@@ -134,12 +152,23 @@ fn optics(id: u32, model: usize, size: [u64; 2], p: &[f64]) -> Result<Optics> {
         "OPENCV_FISHEYE" => double(Lens::Fisheye { k: [p[4], p[5], p[6], p[7]] }),
         "SIMPLE_RADIAL_FISHEYE" => single(Lens::Fisheye { k: [p[3], 0.0, 0.0, 0.0] }),
         "RADIAL_FISHEYE" => single(Lens::Fisheye { k: [p[3], p[4], 0.0, 0.0] }),
-        other => {
-            return Err(named(
-                Error::new(ErrorKind::Unsupported, format!("the camera model {other} is not read"))
-                    .remedy("Undistort with `colmap image_undistorter`, or reconstruct with OPENCV or OPENCV_FISHEYE."),
-            ));
+        "FOV" => double(lens_of("fov", [&p[4..5], &[], &[]])),
+        "THIN_PRISM_FISHEYE" => {
+            double(lens_of("thin_prism_fisheye", [&[p[4], p[5], p[8], p[9]], &p[6..8], &p[10..12]]))
         }
+        "RAD_TAN_THIN_PRISM_FISHEYE" => {
+            double(lens_of("rad_tan_thin_prism_fisheye", [&p[4..10], &p[10..12], &p[12..16]]))
+        }
+        "SIMPLE_DIVISION" => single(Lens::Division { k: p[3] }),
+        "DIVISION" => double(Lens::Division { k: p[4] }),
+        "SIMPLE_FISHEYE" => single(Lens::Fisheye { k: [0.0; 4] }),
+        "FISHEYE" => double(Lens::Fisheye { k: [0.0; 4] }),
+        "EUCM" => double(Lens::Eucm { alpha: p[4], beta: p[5] }),
+        "EQUIRECTANGULAR" => {
+            let size = size.map(|v| usize::try_from(v).unwrap_or(usize::MAX));
+            panorama::whole(size)
+        }
+        other => return Err(named(unknown_model(other))),
     };
     if p.iter().any(|v| !v.is_finite()) {
         return Err(named(Error::input("a parameter is NaN or infinite").remedy("Reconstruct that camera again.")));
@@ -186,7 +215,7 @@ fn cameras_bin(bytes: &[u8]) -> Result<BTreeMap<u32, Optics>> {
         let (id, model) = (cursor.u32()?, cursor.u32()? as usize);
         let size = [cursor.u64()?, cursor.u64()?];
         let (_, count) =
-            *MODELS.get(model).ok_or_else(|| Error::input(format!("camera {id} has no known model ({model})")))?;
+            *MODELS.get(model).ok_or_else(|| unknown_model(&format!("{model}")).at(format!("camera {id}")))?;
         let parameters = (0..count).map(|_| Ok(cursor.f64s::<1>()?[0])).collect::<Result<Vec<f64>>>()?;
         cameras.insert(id, optics(id, model, size, &parameters)?);
     }
@@ -248,8 +277,7 @@ fn cameras_txt(text: &str) -> Result<BTreeMap<u32, Optics>> {
         let id = word(&mut words, line, "camera id")?;
         let model: String = word(&mut words, line, "camera model")?;
         let known = MODELS.iter().position(|(name, _)| *name == model);
-        let model =
-            known.ok_or_else(|| Error::input(format!("line {line}: the camera model {model:.40} is not known")))?;
+        let model = known.ok_or_else(|| unknown_model(&model).at(format!("line {line}")))?;
         let size = [word(&mut words, line, "width")?, word(&mut words, line, "height")?];
         let parameters =
             (0..MODELS[model].1).map(|_| word(&mut words, line, "camera parameter")).collect::<Result<Vec<_>>>()?;
@@ -327,6 +355,30 @@ mod tests {
             assert!(k.fx == 5.0 && (k.fy == 5.0 || k.fy == 6.0) && k.cx == 4.0 && k.cy == 3.0, "{k:?}");
         }
         assert_eq!(cameras.len(), 9);
-        assert!(cameras_txt("1 FOV 8 6 5 6 4 3 .1\n").unwrap_err().to_string().contains("FOV"));
+        let text = "1 FOV 8 6 5 6 4 3 .9\n2 THIN_PRISM_FISHEYE 8 6 5 6 4 3 .1 .2 .3 .4 .5 .6 .7 .8\n\
+                    3 RAD_TAN_THIN_PRISM_FISHEYE 8 6 5 6 4 3 .1 .2 .3 .4 .5 .6 .7 .8 .9 1 1.1 1.2\n\
+                    4 SIMPLE_DIVISION 8 6 5 4 3 -.1\n5 DIVISION 8 6 5 6 4 3 -.1\n6 SIMPLE_FISHEYE 8 6 5 4 3\n\
+                    7 FISHEYE 8 6 5 6 4 3\n8 EUCM 8 6 5 6 4 3 .6 1.1\n9 FOV 8 6 5 6 4 3 0\n";
+        let lenses = [
+            Lens::Fov { omega: 0.9 },
+            Lens::ThinPrismFisheye { k: [0.1, 0.2, 0.5, 0.6], p: [0.3, 0.4], s: [0.7, 0.8] },
+            Lens::RadTanThinPrismFisheye { k: [0.1, 0.2, 0.3, 0.4, 0.5, 0.6], p: [0.7, 0.8], s: [0.9, 1.0, 1.1, 1.2] },
+            Lens::Division { k: -0.1 },
+            Lens::Division { k: -0.1 },
+            Lens::Fisheye { k: [0.0; 4] },
+            Lens::Fisheye { k: [0.0; 4] },
+            Lens::Eucm { alpha: 0.6, beta: 1.1 },
+            Lens::Pinhole,
+        ];
+        assert_eq!(cameras_txt(text).unwrap().values().map(|c| c.lens).collect::<Vec<_>>(), lenses);
+        let panorama = cameras_txt("1 EQUIRECTANGULAR 80 40 80 40\n").unwrap().remove(&1).unwrap();
+        assert!(matches!(panorama.lens, Lens::Equirectangular { size: [80, 40], .. }));
+        for error in [
+            cameras_txt("1 NEWER 8 6 5\n"),
+            cameras_bin(&[&1u64.to_le_bytes()[..], &[1, 0, 0, 0, 18], &[0; 43]].concat()),
+        ] {
+            let error = error.unwrap_err().to_string();
+            assert!(error.contains("is not known") && error.contains("image_undistorter"), "{error}");
+        }
     }
 }

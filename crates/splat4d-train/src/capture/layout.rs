@@ -1,7 +1,7 @@
 //! Which layout a folder has: markers in a stated order, what lies beside the one that is taken, and what to do where there
 //! is none.
 
-use super::{CaptureOptions, Take, colmap, n3dv, nerfies, own, panoptic, rig, transforms};
+use super::{CaptureOptions, Take, colmap, foreign, n3dv, nerfies, own, panoptic, rig, transforms};
 use splat4d::{Error, ErrorKind, Result};
 use std::path::Path;
 
@@ -47,7 +47,9 @@ pub(super) fn read(path: &Path, options: &CaptureOptions) -> Result<Take> {
     if path.is_file() {
         let root = path.parent().unwrap_or(Path::new("."));
         let known = READERS.iter().find(|(marker, _)| path.file_name().is_some_and(|name| name == *marker));
-        let (_, reader) = known.ok_or_else(|| unknown_layout(root, path))?;
+        let Some((_, reader)) = known else {
+            return foreign::read(path, options).unwrap_or_else(|| Err(unknown_layout(root, path)));
+        };
         return reader(root, path, options);
     }
     // The folder of models itself (`sparse`), or one of them with numbered folders.
@@ -56,7 +58,7 @@ pub(super) fn read(path: &Path, options: &CaptureOptions) -> Result<Take> {
     }
     let there: Vec<&(&str, Reader)> = READERS.iter().filter(|(marker, _)| is_there(path, marker)).collect();
     let Some(((marker, reader), others)) = there.split_first() else {
-        return Err(unknown_layout(path, path));
+        return foreign::read(path, options).unwrap_or_else(|| Err(unknown_layout(path, path)));
     };
     let mut take = reader(path, &path.join(marker), options)?;
     // Of several models the first is the capture's.

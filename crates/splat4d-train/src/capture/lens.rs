@@ -18,11 +18,12 @@ const TOLERANCE: f64 = 1e-10;
 
 /// A lens with the radius at which its radial map stops growing.
 ///
-/// Sources: OpenCV's camera model (Brown 1966; rational and thin-prism terms); Kannala and Brandt 2006.
+/// Sources: OpenCV's camera model (Brown 1966; rational and thin-prism terms); Kannala and Brandt 2006; COLMAP's
+/// `sensor/models.h` for the others, with which the tests' numbers were made (pycolmap 4.2.1).
 #[derive(Clone, Copy, Debug)]
 pub struct Distortion {
     lens: Lens,
-    /// Largest x/z-radius (Brown) or angle in radians (fisheye) that is still imaged.
+    /// Largest x/z-radius or angle in radians (fisheyes) that is still imaged.
     limit: f64,
 }
 
@@ -31,7 +32,13 @@ impl Distortion {
     pub fn new(lens: Lens) -> Self {
         let limit = match lens {
             Lens::Brown { k, .. } => first_fold(MAX_RADIUS, |r| brown_slope(&k, r)),
-            Lens::Fisheye { k } => first_fold(MAX_ANGLE, |theta| fisheye_slope(&k, theta)),
+            Lens::Fisheye { k } | Lens::ThinPrismFisheye { k, .. } => {
+                first_fold(MAX_ANGLE, |theta| fisheye_slope(&k, theta))
+            }
+            Lens::RadTanThinPrismFisheye { k, .. } => first_fold(MAX_ANGLE, |theta| even(&k, theta).1),
+            Lens::Fov { .. } | Lens::Division { .. } | Lens::Eucm { .. } => {
+                first_fold(MAX_RADIUS, |r| radial(&lens, r).1)
+            }
             _ => f64::INFINITY,
         };
         Self { lens, limit }
@@ -58,6 +65,21 @@ impl Distortion {
                 let scale = if r > 1e-12 { fisheye_radius(&k, theta) / r } else { 1.0 };
                 (theta <= self.limit).then_some([x * scale, y * scale])
             }
+            Lens::ThinPrismFisheye { k, p, s } => {
+                let theta = r.atan();
+                let flat = along([x, y], theta);
+                let (out, jacobian) = bend(fisheye_ratio(&k), &p, &[s[0], 0.0, s[1], 0.0], flat);
+                (theta <= self.limit && det(&jacobian) > 0.0).then_some(out)
+            }
+            Lens::RadTanThinPrismFisheye { k, p, s } => {
+                let theta = r.atan();
+                let flat = along([x, y], even(&k, theta).0);
+                let (out, jacobian) = bend(|_| (1.0, 0.0), &swapped(p), &s, flat);
+                (theta <= self.limit && det(&jacobian) > 0.0).then_some(out)
+            }
+            Lens::Fov { .. } | Lens::Division { .. } | Lens::Eucm { .. } => {
+                (r <= self.limit).then(|| along([x, y], radial(&self.lens, r).0))
+            }
             _ => Some([x, y]),
         }
     }
@@ -66,46 +88,87 @@ impl Distortion {
     /// fisheyes also where the ray is 90° or more off the axis).
     pub fn undistort(&self, target: [f64; 2]) -> Option<[f64; 2]> {
         match self.lens {
-            Lens::Brown { k, p, s } => self.undistort_brown(&k, &p, &s, target),
+            Lens::Brown { k, p, s } => {
+                // The radial part alone is solved safely first; the tangential rest is small, so that Newton converges.
+                let start = invert(self.limit, length(target), |r| (r * brown_factor(&k, r * r), brown_slope(&k, r)));
+                solve(target, start.unwrap_or(self.limit), self.limit, |ray| brown(&k, &p, &s, ray))
+            }
+            Lens::ThinPrismFisheye { k, p, s } => {
+                let radius = |t: f64| (fisheye_radius(&k, t), fisheye_slope(&k, t));
+                let start = invert(self.limit, length(target), radius).unwrap_or(self.limit);
+                let s = [s[0], 0.0, s[1], 0.0];
+                let flat = solve(target, start, self.limit, |at| bend(fisheye_ratio(&k), &p, &s, at))?;
+                ahead(flat, length(flat))
+            }
+            Lens::RadTanThinPrismFisheye { k, p, s } => {
+                let most = even(&k, self.limit).0;
+                let flat =
+                    solve(target, length(target).min(most), most, |at| bend(|_| (1.0, 0.0), &swapped(p), &s, at))?;
+                ahead(flat, invert(self.limit, length(flat), |t| even(&k, t))?)
+            }
+            Lens::Fov { .. } | Lens::Division { .. } | Lens::Eucm { .. } => {
+                let radius = invert(self.limit, length(target), |r| radial(&self.lens, r))?;
+                Some(along(target, radius))
+            }
             Lens::Fisheye { k } => {
                 let radius = target[0].hypot(target[1]);
                 let theta = invert(self.limit, radius, |t| (fisheye_radius(&k, t), fisheye_slope(&k, t)))?;
-                if theta >= std::f64::consts::FRAC_PI_2 {
-                    return None;
-                }
-                let scale = if radius > 1e-12 { theta.tan() / radius } else { 1.0 };
-                Some([target[0] * scale, target[1] * scale])
+                ahead(target, theta)
             }
             _ => Some(target),
         }
     }
+}
 
-    fn undistort_brown(&self, k: &[f64; 6], p: &[f64; 2], s: &[f64; 4], target: [f64; 2]) -> Option<[f64; 2]> {
-        // The radial part alone is solved safely first; the tangential rest is small, so that Newton converges.
-        let radius = target[0].hypot(target[1]);
-        let start =
-            invert(self.limit, radius, |r| (r * brown_factor(k, r * r), brown_slope(k, r))).unwrap_or(self.limit);
-        let scale = if radius > 1e-12 { start / radius } else { 1.0 };
-        let mut ray = [target[0] * scale, target[1] * scale];
-        for _ in 0..MAX_STEPS {
-            let (image, j) = brown(k, p, s, ray);
-            let miss = [image[0] - target[0], image[1] - target[1]];
-            let d = det(&j);
-            if miss[0].hypot(miss[1]) < TOLERANCE {
-                return (ray[0].hypot(ray[1]) <= self.limit && d > 0.0).then_some(ray);
-            }
-            if d.abs() <= 1e-12 || d.is_nan() {
-                return None;
-            }
-            ray[0] -= (j[1][1] * miss[0] - j[0][1] * miss[1]) / d;
-            ray[1] -= (j[0][0] * miss[1] - j[1][0] * miss[0]) / d;
-            let r = ray[0].hypot(ray[1]);
-            if r > self.limit {
-                ray = ray.map(|v| v * self.limit / r);
-            }
+fn length([x, y]: [f64; 2]) -> f64 {
+    x.hypot(y)
+}
+
+/// The point in the direction of `at` whose distance from the axis is `radius`.
+fn along(at: [f64; 2], radius: f64) -> [f64; 2] {
+    let own = length(at);
+    let scale = if own > 1e-12 { radius / own } else { 1.0 };
+    at.map(|v| v * scale)
+}
+
+/// The ray (x, y, 1) at the angle `theta` in the direction of `at`; none from 90 degrees on.
+fn ahead(at: [f64; 2], theta: f64) -> Option<[f64; 2]> {
+    (theta < std::f64::consts::FRAC_PI_2).then(|| along(at, theta.tan()))
+}
+
+/// RAD_TAN_THIN_PRISM_FISHEYE numbers its tangential terms the other way round than Brown does.
+fn swapped([p0, p1]: [f64; 2]) -> [f64; 2] {
+    [p1, p0]
+}
+
+/// Newton's method for the point within `limit` of the axis that `map` takes to `target`, from the radius `start`.
+fn solve(
+    target: [f64; 2],
+    start: f64,
+    limit: f64,
+    map: impl Fn([f64; 2]) -> ([f64; 2], [[f64; 2]; 2]),
+) -> Option<[f64; 2]> {
+    let radius = length(target);
+    let scale = if radius > 1e-12 { start / radius } else { 1.0 };
+    let mut ray = [target[0] * scale, target[1] * scale];
+    for _ in 0..MAX_STEPS {
+        let (image, j) = map(ray);
+        let miss = [image[0] - target[0], image[1] - target[1]];
+        let d = det(&j);
+        if miss[0].hypot(miss[1]) < TOLERANCE {
+            return (ray[0].hypot(ray[1]) <= limit && d > 0.0).then_some(ray);
         }
-        None
+        if d.abs() <= 1e-12 || d.is_nan() {
+            return None;
+        }
+        ray[0] -= (j[1][1] * miss[0] - j[0][1] * miss[1]) / d;
+        ray[1] -= (j[0][0] * miss[1] - j[1][0] * miss[0]) / d;
+        let r = ray[0].hypot(ray[1]);
+        if r > limit {
+            ray = ray.map(|v| v * limit / r);
+        }
     }
+    None
 }
 
 /// The first place in (0, end] where the slope is no longer positive; `end` if there is none.
@@ -167,10 +230,14 @@ fn brown_slope(k: &[f64; 6], r: f64) -> f64 {
 }
 
 /// The distorted point and ∂(x_d, y_d)/∂(x, y).
-fn brown(k: &[f64; 6], p: &[f64; 2], s: &[f64; 4], [x, y]: [f64; 2]) -> ([f64; 2], [[f64; 2]; 2]) {
+fn brown(k: &[f64; 6], p: &[f64; 2], s: &[f64; 4], at: [f64; 2]) -> ([f64; 2], [[f64; 2]; 2]) {
+    bend(|r2| (brown_factor(k, r2), brown_factor_slope(k, r2)), p, s, at)
+}
+
+/// Radial, tangential and thin-prism terms; `radial`: the factor ρ and dρ/d(r²) at r². The point and its Jacobian.
+fn bend(radial: impl Fn(f64) -> (f64, f64), p: &[f64; 2], s: &[f64; 4], [x, y]: [f64; 2]) -> ([f64; 2], [[f64; 2]; 2]) {
     let r2 = x * x + y * y;
-    let rho = brown_factor(k, r2);
-    let slope = brown_factor_slope(k, r2);
+    let (rho, slope) = radial(r2);
     let out = [
         rho * x + 2.0 * p[0] * x * y + p[1] * (r2 + 2.0 * x * x) + s[0] * r2 + s[1] * r2 * r2,
         rho * y + p[0] * (r2 + 2.0 * y * y) + 2.0 * p[1] * x * y + s[2] * r2 + s[3] * r2 * r2,
@@ -206,9 +273,138 @@ fn fisheye_slope(k: &[f64; 4], theta: f64) -> f64 {
     1.0 + t2 * (3.0 * k[0] + t2 * (5.0 * k[1] + t2 * (7.0 * k[2] + t2 * 9.0 * k[3])))
 }
 
+/// 1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸ and its derivative by r².
+fn fisheye_ratio(k: &[f64; 4]) -> impl Fn(f64) -> (f64, f64) {
+    move |r2| {
+        let ratio = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * (k[2] + r2 * k[3])));
+        (ratio, k[0] + r2 * (2.0 * k[1] + r2 * (3.0 * k[2] + r2 * 4.0 * k[3])))
+    }
+}
+
+/// r(θ) = θ (1 + Σ kᵢ θ^(2i+2)) and dr/dθ.
+fn even(k: &[f64; 6], theta: f64) -> (f64, f64) {
+    let t2 = theta * theta;
+    let (mut ratio, mut slope, mut power) = (1.0, 1.0, 1.0);
+    for (i, k) in k.iter().enumerate() {
+        power *= t2;
+        ratio += k * power;
+        slope += (2 * i + 3) as f64 * k * power;
+    }
+    (theta * ratio, slope)
+}
+
+/// The radius on the sensor of a ray at the radius r, and its derivative, for lenses that are nothing but that.
+fn radial(lens: &Lens, r: f64) -> (f64, f64) {
+    match *lens {
+        Lens::Fov { omega } => {
+            let wide = 2.0 * (0.5 * omega).tan();
+            ((r * wide).atan() / omega, wide / (1.0 + r * r * wide * wide) / omega)
+        }
+        Lens::Division { k } => {
+            // The smaller root of k r r_d² − r_d + r = 0; NaN beyond the last ray.
+            let out = 2.0 * r / (1.0 + (1.0 - 4.0 * k * r * r).sqrt());
+            (out, (1.0 + k * out * out) / (1.0 - 2.0 * k * r * out))
+        }
+        Lens::Eucm { alpha, beta } => {
+            let d = (beta * r * r + 1.0).sqrt();
+            let below = alpha * d + 1.0 - alpha;
+            (r / below, (below - alpha * beta * r * r / d) / (below * below))
+        }
+        _ => (r, 1.0),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Pixels of five rays by pycolmap 4.2.1 (`Camera.img_from_cam`), f = (300, 310), c = (320, 240).
+    const RAYS: [[f64; 2]; 5] = [[0.1, -0.2], [0.7, 0.3], [-1.1, 0.9], [0.0, 1.6], [-2.5, -1.2]];
+
+    #[test]
+    fn lenses_project_as_colmap_does() {
+        let thin =
+            Lens::ThinPrismFisheye { k: [0.03, -0.012, 0.004, -0.001], p: [0.0011, -0.0007], s: [0.0021, -0.0013] };
+        let rad_tan = Lens::RadTanThinPrismFisheye {
+            k: [0.03, -0.012, 0.004, -0.001, 0.0006, -0.0002],
+            p: [0.0011, -0.0007],
+            s: [0.0021, -0.0013, 0.0004, -0.0009],
+        };
+        let known: [(Lens, [[f64; 2]; 5]); 6] = [
+            (
+                Lens::Fov { omega: 0.9 },
+                [
+                    [351.716282319, 174.453016541],
+                    [514.347072483, 326.067989243],
+                    [77.1470808198, 445.321104398],
+                    [320.0, 583.268653351],
+                    [-44.6819907219, 59.1177326019],
+                ],
+            ),
+            (
+                thin,
+                [
+                    [349.560002795, 178.948333693],
+                    [501.545087259, 320.293478127],
+                    [93.099142254, 432.103158926],
+                    [320.430307972, 561.112373359],
+                    [-19.4814501988, 71.2117494028],
+                ],
+            ),
+            (
+                rad_tan,
+                [
+                    [349.616750912, 178.881267736],
+                    [501.935511432, 320.327242736],
+                    [94.3159093177, 430.937077473],
+                    [320.580647631, 559.734160776],
+                    [-19.6074103315, 70.4357543562],
+                ],
+            ),
+            (
+                Lens::Division { k: -0.1 },
+                [
+                    [349.851481509, 178.306938216],
+                    [519.056382315, 328.15354074],
+                    [38.5043596811, 477.991768633],
+                    [320.0, 649.464991393],
+                    [-176.86797659, -6.44651638863],
+                ],
+            ),
+            (
+                Lens::Eucm { alpha: 0.6, beta: 1.1 },
+                [
+                    [349.519448252, 178.99314028],
+                    [499.808953869, 319.62967957],
+                    [96.5735047131, 428.896946015],
+                    [320.0, 555.506559063],
+                    [-14.0267373715, 74.3227382638],
+                ],
+            ),
+            (
+                Lens::Fisheye { k: [0.0; 4] },
+                [
+                    [349.514484301, 179.003399111],
+                    [499.473041622, 319.480918433],
+                    [97.6436201795, 427.99221203],
+                    [320.0, 553.78107355],
+                    [-11.2289988994, 75.7104165459],
+                ],
+            ),
+        ];
+        for (lens, pixels) in known {
+            let lens = Distortion::new(lens);
+            for (ray, pixel) in RAYS.into_iter().zip(pixels) {
+                let [x, y] = lens.distort(ray).unwrap_or_else(|| panic!("{lens:?} loses {ray:?}"));
+                let own = [300.0 * x + 320.0, 310.0 * y + 240.0];
+                assert!((0..2).all(|k| (own[k] - pixel[k]).abs() < 1e-6), "{lens:?} {ray:?}: {own:?}, not {pixel:?}");
+                let back = lens.undistort([x, y]).unwrap_or_else(|| panic!("{lens:?} loses {pixel:?}"));
+                assert!((0..2).all(|k| (back[k] - ray[k]).abs() < 1e-8), "{lens:?} {ray:?}: {back:?}");
+            }
+        }
+        let end = Distortion::new(Lens::Division { k: 0.25 });
+        assert!(end.distort([0.9, 0.0]).is_some() && end.distort([1.1, 0.0]).is_none(), "1/(2√k) is the last ray");
+    }
 
     #[test]
     fn distort_and_undistort_are_inverse() {

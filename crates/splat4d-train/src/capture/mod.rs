@@ -17,6 +17,7 @@ mod evidence;
 mod exr;
 pub(crate) mod features;
 pub(crate) mod flow;
+mod foreign;
 pub mod frames;
 mod json;
 pub(crate) mod labels;
@@ -28,9 +29,11 @@ mod masks;
 mod n3dv;
 mod nerfies;
 mod observe;
+mod offset;
 mod options;
 mod own;
 mod panoptic;
+mod panorama;
 mod picture;
 mod points;
 mod pose;
@@ -88,6 +91,14 @@ pub enum CaptureKind {
     Llff,
     /// Nerfies and HyperNeRF: `dataset.json`, `metadata.json` and a camera file a picture.
     Nerfies,
+    /// Agisoft Metashape's cameras as XML.
+    Metashape,
+    /// RealityScan's (RealityCapture's) camera parameters as CSV.
+    RealityScan,
+    /// Polycam's raw data, `keyframes/`.
+    Polycam,
+    /// Record3D's images with `metadata.json`.
+    Record3d,
 }
 
 /// One picture of the take.
@@ -203,6 +214,9 @@ pub struct Capture {
     pub points: Option<PointCloud>,
     /// The background of transparent pixels, sRGB from 0 to 1; `None`: the pictures have no alpha.
     pub background: Option<[f32; 3]>,
+    /// What was subtracted from the world coordinates of poses and points, because f32 resolves them badly; zero near the
+    /// origin ([`splat4d::scene::offset`]).
+    pub offset: [f64; 3],
     /// Upwards in the world (unit); estimated from the cameras where the data set states none.
     pub up: [f64; 3],
     /// Names of what masks of labels number; empty: there are none.

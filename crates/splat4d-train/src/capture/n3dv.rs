@@ -150,8 +150,10 @@ fn mismatch(rows: usize, folders: &[Folder], films: &[String]) -> Error {
         films.iter().filter(|v| !folders.iter().any(|f| v.starts_with(&format!("{}.", f.name)))).collect();
     let what = format!("it has {rows} cameras, but there are {} folders of frames", folders.len());
     match missing.first() {
-        Some(video) => Error::input(format!("{what}; {} videos are not extracted", missing.len()))
-            .remedy(format!("Extract the frames of every video, for example `{}`.", ffmpeg_command(video))),
+        Some(video) => Error::input(format!("{what}; {} videos are not extracted", missing.len())).remedy(format!(
+            "`splat4d train FOLDER` extracts them, or you do, for example with `{}`.",
+            ffmpeg_command(video)
+        )),
         None => Error::input(what).remedy(
             "Keep the frames of each camera in a folder of its own (cam00/, cam01/, ...), in the order of the rows.",
         ),

@@ -419,22 +419,19 @@ fn read_lens(node: &Node<'_>) -> Result<Lens> {
         values.resize(most, 0.0);
         Ok(values)
     };
-    match node.get("model")?.text()? {
-        "none" | "pinhole" => Ok(Lens::Pinhole),
-        "opencv" => {
-            node.only(&["model", "k", "p", "s"])?;
-            let (k, p, s) = (coefficients("k", 6)?, coefficients("p", 2)?, coefficients("s", 4)?);
-            Ok(Lens::Brown { k: std::array::from_fn(|i| k[i]), p: [p[0], p[1]], s: std::array::from_fn(|i| s[i]) })
-        }
-        "fisheye" => {
-            node.only(&["model", "k"])?;
-            let k = coefficients("k", 4)?;
-            Ok(Lens::Fisheye { k: std::array::from_fn(|i| k[i]) })
-        }
-        other => Err(node
-            .error(format!("the distortion model \"{other:.30}\" is not known"))
-            .remedy("Write \"opencv\" (k1..k6, p1 p2, s1..s4), \"fisheye\" (k1..k4) or \"pinhole\".")),
-    }
+    let name = node.get("model")?.text()?;
+    let name = if name == "none" { "pinhole" } else { name };
+    let Some((_, most)) = Lens::MODELS.iter().find(|(known, _)| *known == name) else {
+        let names: Vec<&str> = Lens::MODELS.iter().map(|(name, _)| *name).collect();
+        return Err(node
+            .error(format!("the distortion model \"{name:.30}\" is not known"))
+            .remedy(format!("Write one of {}; docs/capture-format.md lists their coefficients.", names.join(", "))));
+    };
+    let keys = ["k", "p", "s"];
+    let used: Vec<&str> = keys.into_iter().zip(most).filter(|(_, most)| **most > 0).map(|(key, _)| key).collect();
+    node.only(&[&["model"], &used[..]].concat())?;
+    let [k, p, s] = [0, 1, 2].map(|i| coefficients(keys[i], most[i]));
+    Ok(Lens::of_terms(name, [&k?, &p?, &s?]).expect("the model is listed"))
 }
 
 /// The files of a camera: a printf pattern or a list.

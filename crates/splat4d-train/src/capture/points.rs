@@ -73,6 +73,13 @@ impl PointCloud {
         })
     }
 
+    /// Makes positions relative to `offset`.
+    pub(crate) fn subtract(&mut self, offset: [f64; 3]) {
+        if offset != [0.0; 3] {
+            self.points.iter_mut().for_each(|p| *p = std::array::from_fn(|k| p[k] - offset[k]));
+        }
+    }
+
     /// All of it as a binary .ply file, from which it comes back bit by bit; `comment`: lines for its header.
     pub fn to_ply(&self, comment: &str) -> Vec<u8> {
         let mut out = format!(

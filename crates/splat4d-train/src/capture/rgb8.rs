@@ -23,6 +23,14 @@ impl Rgb8 {
         Ok(Self::of(&picture::decode(path, None)?))
     }
 
+    /// The same, and its alpha channel, where it has one: width·height samples.
+    pub fn read_alpha(path: &Path) -> Result<(Self, Option<Vec<u8>>)> {
+        let raster = picture::decode(path, None)?;
+        let byte = |v: f32| (255.0 * v).round() as u8;
+        let alpha = raster.alpha().map(|a| (0..raster.width * raster.height).map(|p| byte(raster.get(p, a))).collect());
+        Ok((Self::of(&raster), alpha))
+    }
+
     /// The picture that the bytes of a JPEG, PNG or WebP file hold, as [`read`](Self::read). Errors name `place`.
     pub fn decode(bytes: &[u8], place: &Path) -> Result<Self> {
         Ok(Self::of(&picture::decode_bytes(bytes, place, None)?))

@@ -7,10 +7,10 @@
 
 use super::lens::Distortion;
 use super::picture::{self, Raster, Samples};
-use super::{Capture, DepthKind, Frame, depth, flow};
+use super::{Capture, DepthKind, Frame, depth, flow, panorama};
 use rayon::prelude::*;
 use splat4d::Result;
-use splat4d::scene::{Camera, Planes};
+use splat4d::scene::{Camera, Lens, Planes};
 use splat4d::simd::{Pass, Simd, dispatch_pass};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::path::Path;
@@ -363,9 +363,10 @@ fn prepare(frame: &Frame, capture: &Capture) -> Result<StoredPicture> {
         let camera = &capture.cameras[frame.camera].name;
         e.at(format!("camera {camera}, frame {}", frame.index))
     };
-    let raster = picture::decode_as(&frame.image, Some(&frame.source), frame.upright).map_err(place)?;
+    let stored = panorama::stored(&frame.source);
+    let raster = picture::decode_as(&frame.image, Some(&stored), frame.upright).map_err(place)?;
     let background = capture.background.unwrap_or(WHITE);
-    let mask = frame.mask.as_deref().map(|m| read_mask(m, frame)).transpose().map_err(place)?;
+    let mask = frame.mask.as_deref().map(|m| read_mask(m, &stored, frame.upright)).transpose().map_err(place)?;
     let mask = mask.or_else(|| raster.alpha().map(|_| picture::mask_values(&raster, true)));
     let depth = frame.depth.as_ref();
     let depth = depth.map(|d| Ok((depth::read(d, frame, capture.downscale)?, d.kind))).transpose().map_err(place)?;
@@ -377,17 +378,17 @@ fn prepare(frame: &Frame, capture: &Capture) -> Result<StoredPicture> {
         let color = Samples::Eight(planar(samples, raster.channels));
         return Ok(StoredPicture { width: raster.width, height: raster.height, color, mask, valid: None, depth, flow });
     }
-    let (width, height) = (raster.width, raster.height);
+    let (stored_width, stored_height) = (raster.width, raster.height);
     let mut planes = composite(&raster, background);
     drop(raster);
     planes.extend(mask);
     let mut valid = None;
     if !lens.is_pinhole() {
         let map = UndistortMap::new(&lens, &frame.source);
-        planes = planes.iter().map(|p| map.apply(p, width, height)).collect();
+        planes = planes.iter().map(|p| map.apply(p, stored_width, stored_height)).collect();
         valid = map.valid();
     }
-    let k = capture.downscale;
+    let (k, width, height) = (capture.downscale, frame.source.width, frame.source.height);
     planes.iter_mut().chain(&mut valid).for_each(|p| *p = box_mean(p, width, height, k));
     let bytes = |plane: Vec<f32>| plane.iter().map(|&v| to_byte(v)).collect();
     let mask = (planes.len() == 4).then(|| planes.pop()).flatten().map(bytes);
@@ -402,16 +403,16 @@ fn to_byte(v: f32) -> u8 {
 }
 
 /// A mask's values in the size of its picture; one of another size, but the same shape, is resampled (nearest pixel).
-fn read_mask(path: &Path, frame: &Frame) -> Result<Vec<f32>> {
-    let (width, height) = (frame.source.width, frame.source.height);
-    let raster = picture::decode_as(path, None, frame.upright)?;
+fn read_mask(path: &Path, camera: &Camera, upright: bool) -> Result<Vec<f32>> {
+    let (width, height) = (camera.width, camera.height);
+    let raster = picture::decode_as(path, None, upright)?;
     let size = (raster.width, raster.height);
     let values = picture::mask_values(&raster, false);
     if size == (width, height) {
         return Ok(values);
     }
-    if !picture::is_resized(size, &frame.source) {
-        picture::check_beside(path, "mask", size, &frame.source)?;
+    if !picture::is_resized(size, camera) {
+        picture::check_beside(path, "mask", size, camera)?;
     }
     let near = |i: usize, from: usize, to: usize| ((2 * i + 1) * from / (2 * to)).min(from - 1);
     let at = |p: usize| values[near(p / width, size.1, height) * size.0 + near(p % width, size.0, width)];
@@ -475,6 +476,10 @@ impl UndistortMap {
         let at = |i: usize| {
             let (x, y) = ((i % camera.width) as f64 + 0.5, (i / camera.width) as f64 + 0.5);
             let outside = [f32::NAN; 2];
+            if let Lens::Equirectangular { turn, size } = &camera.lens {
+                let [u, v] = panorama::pixel(turn, *size, [(x - k.cx) / k.fx, (y - k.cy) / k.fy]);
+                return [(u - 0.5) as f32, (v - 0.5) as f32];
+            }
             let Some([x, y]) = lens.distort([(x - k.cx) / k.fx, (y - k.cy) / k.fy]) else { return outside };
             let (u, v) = (k.fx * x + k.cx, k.fy * y + k.cy);
             let inside = (0.0..=width).contains(&u) && (0.0..=height).contains(&v);

@@ -2,6 +2,7 @@
 
 mod bad_input;
 mod depth;
+mod far;
 mod flow;
 mod forgiving;
 mod labels;

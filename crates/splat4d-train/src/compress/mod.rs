@@ -142,7 +142,7 @@ fn draft(
 
 /// The scene's own metadata.
 fn meta(scene: &Scene<f32>) -> Meta {
-    let Scene { clip, fps, up, background, .. } = *scene;
+    let Scene { clip, fps, up, offset, background, .. } = *scene;
     let (labels, features) = (scene.labels.clone(), feature_ranges(scene));
-    Meta { clip, fps, up, background, labels, features, ..Meta::default() }
+    Meta { clip, fps, up, offset, background, labels, features, ..Meta::default() }
 }

@@ -297,7 +297,8 @@ pub fn scene(
     program.init(plan, &beginnings, &mut params);
     let head = if HeadKeys::of(&params).is_some() { Head::Features } else { Head::Identity };
     let layer = Layer::new("scene", params, motion, life);
-    Ok(Scene { layers: vec![layer], background, clip: plan.clip, fps: plan.fps, up, head, labels: Vec::new() })
+    let (layers, clip, fps) = (vec![layer], plan.clip, plan.fps);
+    Ok(Scene { layers, background, clip, fps, up, head, ..Scene::default() })
 }
 
 /// Centre and width (seconds) of the life that a Gaussian at a seed starts with.

@@ -8,7 +8,7 @@ use crate::event::Event;
 use crate::init::{self, Seeds, Source};
 use crate::learner::{Corrections, Exposure, Origin, RefineSettings, Scale};
 use crate::loss::image::terms;
-use crate::methods::{Plan, Stage, auto, program_of, stages};
+use crate::methods::{Plan, Program, Stage, auto, program_of, stages};
 use crate::recipe::{MotionName, Recipe};
 use crate::step::emphasis::Emphasis;
 use crate::step::loss::TrainLoss;
@@ -227,7 +227,19 @@ impl OpenCapture {
 
     pub(crate) fn initial_scene(&self, plan: &Plan) -> Result<Scene<f32>> {
         let seeds = self.seeds(plan)?;
-        init::scene(plan, program_of(&plan.recipe)?.as_ref(), &seeds, self.background()?, self.capture.up)
+        self.scene(plan, program_of(&plan.recipe)?.as_ref(), &seeds, self.background()?)
+    }
+
+    /// The capture's scene with Gaussians at these seeds.
+    pub(super) fn scene(
+        &self,
+        plan: &Plan,
+        program: &dyn Program,
+        seeds: &Seeds,
+        background: [f32; 3],
+    ) -> Result<Scene<f32>> {
+        let scene = init::scene(plan, program, seeds, background, self.capture.up)?;
+        Ok(Scene { offset: self.capture.offset, ..scene })
     }
 
     /// Where the first Gaussians of a plan are.
@@ -235,7 +247,9 @@ impl OpenCapture {
         let program = program_of(&plan.recipe)?;
         let moving = program.capabilities(plan).moves && plan.times > 1;
         let points = if let Source::File(path) = &plan.recipe.init.source {
-            Some(Seeds::of(&crate::capture::read_points(path)?))
+            let mut cloud = crate::capture::read_points(path)?;
+            cloud.subtract(self.capture.offset);
+            Some(Seeds::of(&cloud))
         } else {
             self.capture.points.as_ref().map(Seeds::of)
         };

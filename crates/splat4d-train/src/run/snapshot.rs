@@ -81,6 +81,7 @@ impl Snapshots {
             clip: baked.clip,
             fps: if scene.fps > 0.0 && scene.fps.is_finite() { scene.fps } else { DEFAULT_FPS },
             up: scene.up,
+            offset: scene.offset,
             background: scene.background,
             sh_degree: baked.sh_degree,
             title: self.title.clone(),

@@ -12,7 +12,7 @@ use super::priors;
 use super::session::{Outcome, Session, TrainOptions};
 use crate::capture::Capture;
 use crate::event::Event;
-use crate::init::{self, Seeds};
+use crate::init::Seeds;
 use crate::methods::program_of;
 use crate::path_text::of_text;
 use crate::recipe::Recipe;
@@ -192,8 +192,7 @@ pub fn resume_with(
     // As it was settled at the start.
     let (opened, _) = priors::believed(opened, &recipe)?;
     let plan = opened.plan(&recipe);
-    let empty =
-        init::scene(&plan, program_of(&recipe)?.as_ref(), &Seeds::default(), opened.background()?, opened.capture.up)?;
+    let empty = opened.scene(&plan, program_of(&recipe)?.as_ref(), &Seeds::default(), opened.background()?)?;
     let mut trainer = opened.trainer(&plan, empty)?;
     options.add_loss(&mut trainer);
     let session = Session {

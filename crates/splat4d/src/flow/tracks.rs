@@ -62,8 +62,8 @@ impl Tracks {
         &self.points[member * self.times.len()..(member + 1) * self.times.len()]
     }
 
-    /// As JSON: `{"version": 1, "times": [s], "tracks": [{"layer": name, "gaussian": row, "points": [[x, y, z] or null]}]}`.
-    pub fn to_json<F: Real>(&self, scene: &Scene<F>) -> String {
+    /// With `offset` added in f64. As JSON: `{"version": 1, "times": [s], "tracks": [{"layer": name, "gaussian": row, "points": [[x, y, z] or null]}]}`.
+    pub fn to_json<F: Real>(&self, scene: &Scene<F>, offset: [f64; 3]) -> String {
         let mut out = format!("{{\"version\":1,\"times\":{:?},\"tracks\":[", self.times);
         for (i, m) in self.members.iter().enumerate() {
             let name = serde_json::Value::from(scene.layers[m.layer].name.as_str());
@@ -72,7 +72,10 @@ impl Tracks {
             for (k, point) in self.track(i).iter().enumerate() {
                 let comma = if k > 0 { "," } else { "" };
                 let _ = match point {
-                    Some([x, y, z]) => write!(out, "{comma}[{x},{y},{z}]"),
+                    Some(p) => {
+                        let [x, y, z] = placed(*p, offset);
+                        write!(out, "{comma}[{x},{y},{z}]")
+                    }
                     None => write!(out, "{comma}null"),
                 };
             }
@@ -82,19 +85,28 @@ impl Tracks {
         out
     }
 
-    /// As CSV: a header `layer,gaussian,time,x,y,z` and a line for every moment at which a Gaussian is alive.
-    pub fn to_csv<F: Real>(&self, scene: &Scene<F>) -> String {
+    /// With `offset` added in f64. As CSV: a header `layer,gaussian,time,x,y,z` and a line for every moment at which a Gaussian is alive.
+    pub fn to_csv<F: Real>(&self, scene: &Scene<F>, offset: [f64; 3]) -> String {
         let mut out = "layer,gaussian,time,x,y,z\n".to_owned();
         for (i, m) in self.members.iter().enumerate() {
             let name = quoted(&scene.layers[m.layer].name);
             for (t, point) in self.times.iter().zip(self.track(i)) {
-                if let Some([x, y, z]) = point {
+                if let Some(p) = point {
+                    let [x, y, z] = placed(*p, offset);
                     let _ = writeln!(out, "{name},{},{t},{x},{y},{z}", m.row);
                 }
             }
         }
         out
     }
+}
+
+/// A position with the offset added in f64, as text; the shortest of f32 where there is none.
+fn placed(p: [f32; 3], offset: [f64; 3]) -> [String; 3] {
+    std::array::from_fn(|k| match offset[k] == 0.0 {
+        true => p[k].to_string(),
+        false => (f64::from(p[k]) + offset[k]).to_string(),
+    })
 }
 
 /// A field as CSV takes it (RFC 4180).
@@ -175,10 +187,10 @@ mod tests {
         assert_eq!(tracks.members.iter().map(|m| m.row).collect::<Vec<_>>(), [0, 2, 4]);
         assert_eq!(tracks.track(1), [Some([2.0, 0.0, 0.0]), Some([2.0, 0.5, 0.0])]);
         assert_eq!(tracks.track(2), [Some([4.0, 0.0, 0.0]), None], "it is dead by then");
-        let csv = tracks.to_csv(&s);
+        let csv = tracks.to_csv(&s, [0.0; 3]);
         assert_eq!(csv.lines().count(), 6, "{csv}");
         assert!(csv.contains("\n\"a, b\",2,1,2,0.5,0\n"), "{csv}");
-        let json: serde_json::Value = serde_json::from_str(&tracks.to_json(&s)).unwrap();
+        let json: serde_json::Value = serde_json::from_str(&tracks.to_json(&s, [0.0; 3])).unwrap();
         assert_eq!(json["tracks"][1]["points"][1][1], 0.5);
         assert_eq!(json["tracks"][2]["layer"], "a, b");
         assert!(json["tracks"][2]["points"][1].is_null() && json["times"][1] == 1.0);

@@ -2,6 +2,8 @@
 //! file, and [`DIALECTS`] lists them.
 
 use super::DIALECTS;
+use super::bytes::sound_rows;
+use super::mend::{self, Mended};
 use super::ply::PlyInfo;
 use super::spz;
 use super::warnings::Warnings;
@@ -35,6 +37,8 @@ pub struct Dialect {
     pub read: fn(&[u8]) -> Result<Opened>,
     /// How it is written.
     pub writer: Writer,
+    /// Whether it can be written with positions of the world, in double precision ([`WriteOptions::world`]).
+    pub world: bool,
 }
 
 /// How a dialect is written. Writers say what was left out.
@@ -59,11 +63,22 @@ pub struct WriteOptions {
     pub exact: bool,
     /// Which way is up, for dialects whose files say so; [`Dialect::write`] takes it from the scene.
     pub up: [f64; 3],
+    /// The scene's offset; [`Dialect::write`] sets it.
+    pub offset: [f64; 3],
+    /// Write positions of the world: the offset is added, in double precision. Only .ply can.
+    pub world: bool,
 }
 
 impl Default for WriteOptions {
     fn default() -> Self {
-        Self { spz_version: spz::DEFAULT_VERSION, cameras: Vec::new(), exact: false, up: Y_DOWN }
+        Self {
+            spz_version: spz::DEFAULT_VERSION,
+            cameras: Vec::new(),
+            exact: false,
+            up: Y_DOWN,
+            offset: [0.0; 3],
+            world: false,
+        }
     }
 }
 
@@ -124,6 +139,12 @@ impl Dialect {
     pub fn open(&self, bytes: &[u8]) -> Result<Opened> {
         let mut opened = (self.read)(bytes)?;
         opened.scene.up = opened.up.unwrap_or(self.up);
+        let (of, mut mended) = (opened.scene.len(), opened.ply.as_ref().map(|p| p.mended).unwrap_or_default());
+        for layer in &mut opened.scene.layers {
+            mended += Mended::of(&mut layer.params);
+            mend::say_coarse(&layer.params, &mut opened.warnings);
+        }
+        mended.say(of, &mut opened.warnings);
         Ok(opened)
     }
 
@@ -141,10 +162,15 @@ impl Dialect {
     /// Writes a scene, whose axes are taken as they are; of a scene that moves, a dialect that does not gets the clip's
     /// first moment. Says what was left out.
     ///
-    /// Errors: it is only read; it cannot hold the scene; a number is NaN or infinite; the sink's.
+    /// Errors: it is only read; it cannot hold the scene, or what it should of it; a number is NaN or infinite; the sink's.
     pub fn write(&self, scene: &Scene<f32>, options: &WriteOptions, out: &mut dyn Write) -> Result<Warnings> {
         scene.check_finite()?;
-        let options = WriteOptions { up: scene.up, ..options.clone() };
+        let options = WriteOptions { up: scene.up, offset: scene.offset, ..options.clone() };
+        if options.world && !self.world {
+            let what = format!("{} has no place for positions in double precision", self.name);
+            return Err(Error::new(ErrorKind::Unsupported, what)
+                .remedy("Leave the offset out (no --world), or write .ply, scene.safetensors or .s4d."));
+        }
         match self.writer {
             Writer::Moment(write) => {
                 let params = moment(scene, Time(scene.clip[0]))?;
@@ -187,7 +213,7 @@ mod tests {
     use super::*;
     use crate::format::kinematic::tests::moving as moving_scene;
     use crate::format::samples::gaussians;
-    use crate::format::{ply, sog, splat, splatv};
+    use crate::format::{gltf, ply, sog, splat, splatv};
 
     /// A scene that every dialect can hold.
     fn sample(moves: bool) -> Scene<f32> {
@@ -197,7 +223,8 @@ mod tests {
     #[test]
     fn every_dialect_is_written_told_and_opened() {
         // What is not written needs a file made by hand.
-        let by_hand = [(sog::DIALECT, sog::tests::sample(), 2)];
+        let glb = gltf::tests::sample(&gaussians(20, 4), [0.0; 3]);
+        let by_hand = [(sog::DIALECT, sog::tests::sample(), 2), (gltf::DIALECT, glb, 20)];
         for dialect in DIALECTS {
             let (scene, mut bytes, mut count) = (sample(dialect.moves), Vec::new(), 20);
             let written = dialect.write(&scene, &WriteOptions::default(), &mut bytes);

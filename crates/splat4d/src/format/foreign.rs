@@ -13,7 +13,7 @@ struct Foreign {
 }
 
 /// Known by their first bytes. Sources: the formats' specifications, or the programs' own readers.
-const FOREIGN: [Foreign; 9] = [
+const FOREIGN: [Foreign; 8] = [
     Foreign {
         is: |b| b.starts_with(b"SP4D"),
         what: "a .splat4d of the program splats4D, another format under a similar name",
@@ -24,11 +24,6 @@ const FOREIGN: [Foreign; 9] = [
         is: |b| b.starts_with(b"\x894DGS"),
         what: "a .4dgs of the fourdgs libraries",
         remedy: "Convert it to numbered .ply files with those libraries.",
-    },
-    Foreign {
-        is: |b| b.starts_with(b"glTF"),
-        what: "a binary glTF (.glb)",
-        remedy: "Export .ply or .spz from the program that wrote it.",
     },
     Foreign {
         is: |b| b.starts_with(b"PXR-USDC") || b.starts_with(b"#usda"),

@@ -9,8 +9,10 @@ mod bytes;
 pub mod dialect;
 mod fade;
 pub mod foreign;
+pub mod gltf;
 mod half;
 mod kinematic;
+pub mod mend;
 #[cfg(test)]
 mod mutate;
 pub mod npy;
@@ -27,10 +29,11 @@ pub mod splat;
 pub mod splatv;
 pub mod spz;
 pub(crate) mod warnings;
-mod zip;
+pub mod zip;
 
 pub(crate) use arrays::{params_to_arrays, tensors_to_loaded};
 pub use dialect::Dialect;
+pub use mend::{Linear, Mended};
 pub use warnings::Warnings;
 
 use crate::layers::Scene;
@@ -38,8 +41,16 @@ use crate::{Error, Result};
 
 /// The files of Gaussians that other programs share. What is known of a dialect stands in its own file; nothing else lists
 /// them. Where two know a file by its bytes, the later one is right: a layout inside another one stands behind it.
-pub const DIALECTS: &[Dialect] =
-    &[ply::DIALECT, ply::COMPRESSED, ply::STG, spz::DIALECT, splat::DIALECT, splatv::DIALECT, sog::DIALECT];
+pub const DIALECTS: &[Dialect] = &[
+    ply::DIALECT,
+    ply::COMPRESSED,
+    ply::STG,
+    spz::DIALECT,
+    splat::DIALECT,
+    splatv::DIALECT,
+    sog::DIALECT,
+    gltf::DIALECT,
+];
 
 /// The scene in a file of any kind that says by its first bytes what it is: `.s4d`, .ply (3DGS, compressed, Spacetime
 /// Gaussians), .spz, .splatv, zipped SOG, `scene.safetensors` and checkpoints. A .splat has no mark: [`splat::read`] it.

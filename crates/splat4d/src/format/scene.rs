@@ -1,7 +1,7 @@
 //! `scene.safetensors`: the lossless learnable state of a scene.
 //!
-//! Metadata `splat4d` holds JSON: version, clip, fps, up, background, head, `labels` (names) where Gaussians have some, and
-//! a list of layers with name, rows, SH
+//! Metadata `splat4d` holds JSON: version, clip, fps, up, background, head, `labels` (names) where Gaussians have some,
+//! `offset` (world coordinates of the scene's origin) where it is not zero, and a list of layers with name, rows, SH
 //! coefficients, life and motion, `frame` where the layer's axes are not the world's, and
 //! `cross_fade` (seconds at the span's beginning and end) where it fades. Every column group of every table is one row-major array: `layers.0.means` `[N,3]`,
 //! `layers.0.quats` `[N,4]` wxyz, `layers.0.sh` `[N,K,3]`, `layers.0.velocities` `[N,3·order]` … Seconds and scene units.
@@ -89,6 +89,10 @@ fn about(scene: &Scene<f32>, layers: Vec<Stated>) -> Value {
     });
     if !scene.labels.is_empty() {
         out["labels"] = json!(scene.labels);
+    }
+    // Scenes near the origin keep the bytes of older versions.
+    if scene.offset != [0.0; 3] {
+        out["offset"] = json!(scene.offset);
     }
     out
 }
@@ -227,6 +231,7 @@ pub fn from_tensors(file: &SafeTensors<'_>) -> Result<Scene<f32>> {
         clip: [start, end],
         fps: number(&meta, "fps")?,
         up: numbers::<3>(&meta, "up")?,
+        offset: if meta["offset"].is_null() { [0.0; 3] } else { numbers::<3>(&meta, "offset")? },
         background: numbers::<3>(&meta, "background")?.map(|x| x as f32),
         head: head(&meta)?,
         layers: Vec::new(),
@@ -436,6 +441,7 @@ mod tests {
             clip: [0.0, 0.1 + 0.2],
             fps: 30.0,
             up: [0.0, -1.0, 0.0],
+            offset: [0.0; 3],
             head: Head::Identity,
             labels: Vec::new(),
         }
@@ -473,6 +479,19 @@ mod tests {
         let minus = bytes[at..].iter().position(|b| *b == b'[').unwrap() + at + 1;
         bytes[minus] = b'-';
         assert!(read(&bytes).is_err());
+    }
+
+    #[test]
+    fn an_offset_comes_back_exactly_and_near_scenes_say_nothing_of_it() {
+        let mut s = scene();
+        let near = metadata(&s).to_string();
+        s.offset = [431_234.1, 5_412_345.6, -310.2];
+        let mut bytes = Vec::new();
+        write(&s, &mut bytes).unwrap();
+        assert_eq!(read(&bytes).unwrap().offset, s.offset);
+        assert!(!near.contains("offset"));
+        s.rotate(&[[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]);
+        assert_eq!(s.offset, [-5_412_345.6, 431_234.1, -310.2], "it turns with the scene");
     }
 
     #[test]

@@ -21,6 +21,7 @@ pub const DIALECT: Dialect = Dialect {
     mark: None,
     read: |bytes| read(bytes).map(Opened::from),
     writer: Writer::Moment(|params, _, mut out| write(params, &mut out)),
+    world: false,
 };
 
 /// Bytes a Gaussian.

@@ -27,6 +27,7 @@ pub const DIALECT: Dialect = Dialect {
     mark: Some(|bytes| bytes.starts_with(&MAGIC)),
     read: |bytes| read(bytes).map(Opened::from),
     writer: Writer::Moving(|scene, options, mut out| write(scene, options, &mut out)),
+    world: false,
 };
 
 /// First four bytes.

@@ -25,6 +25,11 @@ impl Warnings {
         &self.lines
     }
 
+    /// Leaves out sentences that hold `text`: what they say was settled.
+    pub fn drop(&mut self, text: &str) {
+        self.lines.retain(|line| !line.contains(text));
+    }
+
     /// Adds those of another collection, leaving out repetitions.
     pub fn append(&mut self, other: Warnings) {
         for line in other.lines {

@@ -36,7 +36,7 @@ const MOST_RATIO: usize = 1032;
 const MOST_FILES: u16 = 4096;
 
 /// An archive's directory.
-pub(super) struct Archive<'a> {
+pub struct Archive<'a> {
     bytes: &'a [u8],
     entries: BTreeMap<String, Entry>,
 }
@@ -53,7 +53,7 @@ struct Entry {
 
 impl<'a> Archive<'a> {
     /// Reads the directory. Errors: damaged, too many files, files whose bytes overlap or whose names are equal.
-    pub(super) fn open(bytes: &'a [u8]) -> Result<Self> {
+    pub fn open(bytes: &'a [u8]) -> Result<Self> {
         let tail = bytes.len().saturating_sub(END_LENGTH + MOST_COMMENT);
         let end = bytes[tail..].windows(END.len()).rposition(|w| w == END);
         let end = tail + end.ok_or_else(|| damaged("the zip file has no end: it is cut short"))?;
@@ -98,17 +98,17 @@ impl<'a> Archive<'a> {
     }
 
     /// Names of all files.
-    pub(super) fn names(&self) -> Vec<String> {
+    pub fn names(&self) -> Vec<String> {
         self.entries.keys().cloned().collect()
     }
 
     /// Length of a file in the archive, bytes.
-    pub(super) fn packed(&self, name: &str) -> Option<usize> {
+    pub fn packed(&self, name: &str) -> Option<usize> {
         self.entries.get(name).map(|e| e.body.len())
     }
 
     /// A file of at most `most` plain bytes. `None`: no such file. Errors: damaged, encrypted, or longer.
-    pub(super) fn file(&self, name: &str, most: usize) -> Option<Result<Cow<'a, [u8]>>> {
+    pub fn file(&self, name: &str, most: usize) -> Option<Result<Cow<'a, [u8]>>> {
         let entry = self.entries.get(name)?;
         Some(entry.unpack(&self.bytes[entry.body.clone()], most).map_err(|e| e.at(name)))
     }

@@ -411,6 +411,9 @@ pub struct Scene<F: Real = f32> {
     pub fps: f64,
     /// The direction that is up in the world (unit).
     pub up: [f64; 3],
+    /// World coordinates of the scene's origin ([`scene::offset`](crate::scene::offset)): add it to positions of the scene
+    /// for those of the world that its capture or file is in. Zero unless they are far from the origin.
+    pub offset: [f64; 3],
     /// How blended channels become colour.
     pub head: Head,
     /// Names of the labels that its Gaussians have logits for ([`scene::labels`](crate::scene::labels)); empty: none.

@@ -36,7 +36,7 @@ pub fn rotation_between(from: [f64; 3], to: [f64; 3]) -> Option<[[f64; 3]; 3]> {
 
 impl Scene<f32> {
     /// Rotates everything by `r` (rows): the layers' frames, into the tables of models that can take them in
-    /// ([`Layer::absorb_frame`](super::Layer::absorb_frame)), the rays that a head sees, and `up`.
+    /// ([`Layer::absorb_frame`](super::Layer::absorb_frame)), the rays that a head sees, `up` and `offset`.
     pub fn rotate(&mut self, r: &[[f64; 3]; 3]) {
         for layer in &mut self.layers {
             layer.frame = Sim3::from_rotation(*r).after(&layer.frame);
@@ -46,6 +46,7 @@ impl Scene<f32> {
             rotate_head(&mut self.layers[layer].params, keys, r);
         }
         self.up = se3::mat_vec(r, self.up);
+        self.offset = se3::mat_vec(r, self.offset);
     }
 
     /// Leaves out spherical harmonics above `degree` (0-3). Returns the highest degree that any layer had.

@@ -35,7 +35,111 @@ pub enum Lens {
         /// k1..k4
         k: [f64; 4],
     },
+    /// Field-of-view model (Devernay and Faugeras 2001): r_d = atan(2 r tan(ω/2))/ω.
+    Fov {
+        /// ω, radians
+        omega: f64,
+    },
+    /// Division model (Fitzgibbon 2001): r = r_d/(1 + k r_d²).
+    Division {
+        /// k
+        k: f64,
+    },
+    /// Enhanced unified camera model (Khomutenko 2016): (x, y)/(α √(β r² + 1) + 1 − α).
+    Eucm {
+        /// α
+        alpha: f64,
+        /// β
+        beta: f64,
+    },
+    /// Fisheye with tangential and thin-prism terms, all in the plane of angles (COLMAP's THIN_PRISM_FISHEYE).
+    ThinPrismFisheye {
+        /// k1..k4, as of a fisheye
+        k: [f64; 4],
+        /// p1, p2
+        p: [f64; 2],
+        /// sx1, sy1
+        s: [f64; 2],
+    },
+    /// Fisheye whose tangential and thin-prism terms act after the radial ones (Project Aria, COLMAP's
+    /// RAD_TAN_THIN_PRISM_FISHEYE).
+    RadTanThinPrismFisheye {
+        /// k0..k5: r = θ(1 + Σ kᵢ θ^(2i+2))
+        k: [f64; 6],
+        /// p0, p1
+        p: [f64; 2],
+        /// s0..s3
+        s: [f64; 4],
+    },
+    /// A pinhole view of an equirectangular panorama: longitude across, latitude down, its centre straight ahead. The
+    /// camera's intrinsics are the view's.
+    Equirectangular {
+        /// The panorama's axes from the view's, row-major rotation.
+        turn: [[f64; 3]; 3],
+        /// Pixels of the panorama across and down.
+        size: [usize; 2],
+    },
 }
+
+impl Lens {
+    /// The models of `capture.json`: their names, and the most coefficients k, p and s that they have.
+    pub const MODELS: [(&'static str, [usize; 3]); 8] = [
+        ("pinhole", [0, 0, 0]),
+        ("opencv", [6, 2, 4]),
+        ("fisheye", [4, 0, 0]),
+        ("fov", [1, 0, 0]),
+        ("division", [1, 0, 0]),
+        ("eucm", [2, 0, 0]),
+        ("thin_prism_fisheye", [4, 2, 2]),
+        ("rad_tan_thin_prism_fisheye", [6, 2, 4]),
+    ];
+
+    /// The model's name in `capture.json` and its coefficients k, p and s; `None`: panoramas, which have none.
+    pub fn terms(&self) -> Option<(&'static str, [Vec<f64>; 3])> {
+        let none = Vec::new;
+        Some(match *self {
+            Lens::Pinhole => ("pinhole", [none(), none(), none()]),
+            Lens::Brown { k, p, s } => ("opencv", [k.to_vec(), p.to_vec(), s.to_vec()]),
+            Lens::Fisheye { k } => ("fisheye", [k.to_vec(), none(), none()]),
+            Lens::Fov { omega } => ("fov", [vec![omega], none(), none()]),
+            Lens::Division { k } => ("division", [vec![k], none(), none()]),
+            Lens::Eucm { alpha, beta } => ("eucm", [vec![alpha, beta], none(), none()]),
+            Lens::ThinPrismFisheye { k, p, s } => ("thin_prism_fisheye", [k.to_vec(), p.to_vec(), s.to_vec()]),
+            Lens::RadTanThinPrismFisheye { k, p, s } => {
+                ("rad_tan_thin_prism_fisheye", [k.to_vec(), p.to_vec(), s.to_vec()])
+            }
+            Lens::Equirectangular { .. } => return None,
+        })
+    }
+
+    /// The lens of a model's name and coefficients; those left out are 0. `None`: no such model.
+    pub fn of_terms(name: &str, [k, p, s]: [&[f64]; 3]) -> Option<Self> {
+        fn fill<const N: usize>(values: &[f64]) -> [f64; N] {
+            std::array::from_fn(|i| values.get(i).copied().unwrap_or(0.0))
+        }
+        Some(match name {
+            "pinhole" => Lens::Pinhole,
+            "opencv" => Lens::Brown { k: fill(k), p: fill(p), s: fill(s) },
+            "fisheye" => Lens::Fisheye { k: fill(k) },
+            // Without an angle the model bends nothing, and its formula divides by it.
+            "fov" => match fill::<1>(k) {
+                [omega] if omega.abs() > SMALLEST_OMEGA => Lens::Fov { omega },
+                _ => Lens::Pinhole,
+            },
+            "division" => Lens::Division { k: fill::<1>(k)[0] },
+            "eucm" => {
+                let [alpha, beta] = fill(k);
+                Lens::Eucm { alpha, beta }
+            }
+            "thin_prism_fisheye" => Lens::ThinPrismFisheye { k: fill(k), p: fill(p), s: fill(s) },
+            "rad_tan_thin_prism_fisheye" => Lens::RadTanThinPrismFisheye { k: fill(k), p: fill(p), s: fill(s) },
+            _ => return None,
+        })
+    }
+}
+
+/// Angles of the field-of-view model below this bend a ray by less than 10⁻⁹.
+const SMALLEST_OMEGA: f64 = 1e-5;
 
 /// A posed camera.
 #[derive(Clone, Debug, PartialEq)]

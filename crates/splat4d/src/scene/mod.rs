@@ -6,6 +6,7 @@ pub mod head;
 pub mod labels;
 pub mod life;
 pub(crate) mod masks;
+pub mod offset;
 pub mod params;
 pub(crate) mod planes;
 pub mod splats;

@@ -193,6 +193,7 @@ fn capture(pinned: &Pinned, root: &Path, pictures: &[PathBuf], count: usize) -> 
         points: None,
         background: None,
         up: pinned.scene.up,
+        offset: [0.0; 3],
         labels: Vec::new(),
         downscale: 1,
         warnings: Vec::new(),

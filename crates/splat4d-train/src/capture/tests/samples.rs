@@ -6,9 +6,9 @@ use splat4d::math::{Se3, quat};
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 
-pub(super) const WIDTH: usize = 24;
-pub(super) const HEIGHT: usize = 16;
-pub(super) const FOCAL: f64 = 20.0;
+pub(in crate::capture) const WIDTH: usize = 24;
+pub(in crate::capture) const HEIGHT: usize = 16;
+pub(in crate::capture) const FOCAL: f64 = 20.0;
 
 /// A folder and the metadata files in it.
 pub(in crate::capture) struct Sample {
@@ -25,12 +25,12 @@ impl Sample {
         self.dir.path()
     }
 
-    pub(super) fn path(&self, name: &str) -> PathBuf {
+    pub(in crate::capture) fn path(&self, name: &str) -> PathBuf {
         self.root().join(name)
     }
 
     /// Changes a JSON file.
-    pub(super) fn edit(&self, name: &str, change: impl FnOnce(&mut Value)) {
+    pub(in crate::capture) fn edit(&self, name: &str, change: impl FnOnce(&mut Value)) {
         let mut value = serde_json::from_slice(&std::fs::read(self.path(name)).unwrap()).unwrap();
         change(&mut value);
         self.write(name, value.to_string().as_bytes());
@@ -43,16 +43,16 @@ impl Sample {
     }
 
     /// An opaque picture that tells cameras and frames apart.
-    pub(super) fn rgb(&self, name: &str, camera: usize, frame: usize) {
+    pub(in crate::capture) fn rgb(&self, name: &str, camera: usize, frame: usize) {
         let pixel = |x: u32, y: u32| Rgb([(x * 10) as u8, (y * 15) as u8, (camera * 40 + frame * 7) as u8]);
         self.save(name, ImageBuffer::from_fn(WIDTH as u32, HEIGHT as u32, pixel));
     }
 
-    pub(super) fn rgba(&self, name: &str, pixel: impl Fn(u32, u32) -> [u8; 4]) {
+    pub(in crate::capture) fn rgba(&self, name: &str, pixel: impl Fn(u32, u32) -> [u8; 4]) {
         self.save(name, ImageBuffer::from_fn(WIDTH as u32, HEIGHT as u32, |x, y| Rgba(pixel(x, y))));
     }
 
-    pub(super) fn mask(&self, name: &str, pixel: impl Fn(u32, u32) -> u8) {
+    pub(in crate::capture) fn mask(&self, name: &str, pixel: impl Fn(u32, u32) -> u8) {
         self.save(name, ImageBuffer::from_fn(WIDTH as u32, HEIGHT as u32, |x, y| Luma([pixel(x, y)])));
     }
 
@@ -70,18 +70,18 @@ impl Sample {
 }
 
 /// The pose of camera i.
-pub(super) fn pose(i: usize) -> Se3 {
+pub(in crate::capture) fn pose(i: usize) -> Se3 {
     let angle = i as f64 * 0.9;
     Se3::look_at([4.0 * angle.cos(), 4.0 * angle.sin(), 1.0 + 0.2 * i as f64], [0.0, 0.0, 0.3], [0.0, 0.0, 1.0])
 }
 
-pub(super) fn rows(p: &Se3) -> Value {
+pub(in crate::capture) fn rows(p: &Se3) -> Value {
     let row = |i: usize| json!([p.rotation[i][0], p.rotation[i][1], p.rotation[i][2], p.translation[i]]);
     json!([row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]])
 }
 
 /// Camera to world in OpenGL axes.
-pub(super) fn opengl(i: usize) -> Value {
+pub(in crate::capture) fn opengl(i: usize) -> Value {
     let mut p = pose(i).inverse();
     for row in &mut p.rotation {
         row[1] = -row[1];
@@ -91,12 +91,12 @@ pub(super) fn opengl(i: usize) -> Value {
 }
 
 /// Two coloured points.
-pub(super) const PLY: &str = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n\
+pub(in crate::capture) const PLY: &str = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n\
                    property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n\
                    0 0 0.3 255 0 0\n0.5 0 0 0 0 255\n";
 
 /// Three cameras, two frames, masks, points.
-pub(super) fn own() -> Sample {
+pub(in crate::capture) fn own() -> Sample {
     let sample = Sample::new(&["capture.json", "points.ply"]);
     let cameras: Vec<Value> = (0..3)
         .map(|c| {
@@ -119,7 +119,7 @@ pub(super) fn own() -> Sample {
 }
 
 /// Three training pictures, one validation, one test.
-pub(super) fn dnerf() -> Sample {
+pub(in crate::capture) fn dnerf() -> Sample {
     let sample = Sample::new(&["transforms_train.json", "transforms_val.json", "transforms_test.json"]);
     for (split, times, first) in [("train", &[0.0, 0.5, 1.0][..], 0), ("val", &[0.25], 3), ("test", &[0.75], 4)] {
         let frames: Vec<Value> = times
@@ -140,7 +140,7 @@ pub(super) fn dnerf() -> Sample {
 }
 
 /// Cameras 1, 3 train, 2 is measured; two frames.
-pub(super) fn panoptic() -> Sample {
+pub(in crate::capture) fn panoptic() -> Sample {
     let sample = Sample::new(&["train_meta.json", "test_meta.json", "cloud.ply"]);
     for (name, ids) in [("train_meta.json", &[1usize, 3][..]), ("test_meta.json", &[2])] {
         let per = |value: &dyn Fn(usize, usize) -> Value| -> Value {
@@ -167,7 +167,7 @@ pub(super) fn panoptic() -> Sample {
 
 /// A camera that moves, in HyperNeRF's layout: three moments to train on, one held out; the world is twice as large and
 /// elsewhere.
-pub(super) fn nerfies() -> Sample {
+pub(in crate::capture) fn nerfies() -> Sample {
     let sample = Sample::new(&["dataset.json", "metadata.json", "scene.json", "camera/000001.json"]);
     let mut metadata = serde_json::Map::new();
     for i in 0..4 {
@@ -195,7 +195,7 @@ pub(super) fn nerfies() -> Sample {
 }
 
 /// Two cameras by folder, two frames with time, one distorted.
-pub(super) fn nerfstudio() -> Sample {
+pub(in crate::capture) fn nerfstudio() -> Sample {
     let sample = Sample::new(&["transforms.json", "sparse_pc.ply"]);
     let mut frames = Vec::new();
     for (c, t) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
@@ -231,7 +231,7 @@ fn colmap_pictures(sample: &Sample) -> Vec<String> {
 }
 
 /// Binary model of one instant.
-pub(super) fn colmap_bin() -> Sample {
+pub(in crate::capture) fn colmap_bin() -> Sample {
     let sample = Sample::new(&["sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin"]);
     let names = colmap_pictures(&sample);
     let mut cameras = 2u64.to_le_bytes().to_vec();
@@ -268,7 +268,7 @@ pub(super) fn colmap_bin() -> Sample {
 }
 
 /// The same as text.
-pub(super) fn colmap_txt() -> Sample {
+pub(in crate::capture) fn colmap_txt() -> Sample {
     let sample = Sample::new(&["sparse/0/cameras.txt", "sparse/0/images.txt", "sparse/0/points3D.txt"]);
     let names = colmap_pictures(&sample);
     let cameras = format!(
@@ -291,7 +291,11 @@ pub(super) fn colmap_txt() -> Sample {
 
 /// Pictures of one place each, by the names that `name` gives them in `images/`, in a `transforms.json` and, where
 /// `model` brings that world into another, a COLMAP model of the same. No times.
-pub(super) fn photos(count: usize, name: impl Fn(usize) -> String, model: Option<&splat4d::math::Sim3>) -> Sample {
+pub(in crate::capture) fn photos(
+    count: usize,
+    name: impl Fn(usize) -> String,
+    model: Option<&splat4d::math::Sim3>,
+) -> Sample {
     let sample = Sample::new(&["transforms.json"]);
     let (mut frames, mut images) = (Vec::new(), String::new());
     for c in 0..count {
@@ -319,7 +323,7 @@ pub(super) fn photos(count: usize, name: impl Fn(usize) -> String, model: Option
 }
 
 /// Two cameras calibrated at twice the size of the frames.
-pub(super) fn n3dv() -> Sample {
+pub(in crate::capture) fn n3dv() -> Sample {
     let sample = Sample::new(&["poses_bounds.npy"]);
     let header = "{'descr': '<f8', 'fortran_order': False, 'shape': (2, 17), }\n";
     let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
@@ -342,7 +346,7 @@ pub(super) fn n3dv() -> Sample {
 }
 
 /// One sample of every layout.
-pub(super) fn all() -> Vec<(&'static str, Sample)> {
+pub(in crate::capture) fn all() -> Vec<(&'static str, Sample)> {
     vec![
         ("own", own()),
         ("dnerf", dnerf()),

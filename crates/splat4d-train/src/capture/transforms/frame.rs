@@ -4,7 +4,7 @@
 use super::super::convention::{Convention, Poses};
 use super::super::json::Node;
 use super::super::lookup::Lookup;
-use super::super::{DepthFile, DepthKind, Split, picture, pose};
+use super::super::{DepthFile, DepthKind, Split, panorama, picture, pose};
 use splat4d::math::Se3;
 use splat4d::scene::{Camera, Intrinsics, Lens};
 use splat4d::{Error, ErrorKind, Result};
@@ -59,6 +59,9 @@ pub(super) fn read(file: &File<'_>, node: &Node<'_>) -> Result<Entry> {
     Ok(Entry { name: name.replace('\\', "/"), image, source, by_angle, time, mask, depth, split: Split::Train })
 }
 
+/// Nerfstudio's name for equirectangular panoramas, whose focal lengths say nothing.
+const PANORAMA: &str = "EQUIRECTANGULAR";
+
 /// Units of the scene a stored number of a depth map where a file does not say: thousandths, as Nerfstudio has it.
 const DEPTH_UNIT: f64 = 1e-3;
 
@@ -88,6 +91,11 @@ fn camera(file: &File<'_>, node: &Node<'_>, image: &Path) -> Result<(Camera, boo
     let raw = pose::checked(Se3::from_rows(&matrix.pose4(file.poses)?)).map_err(|e| matrix.at(e))?;
     let cam_from_world = Convention::NERF.read_as(raw, file.poses)?;
     let (width, height) = size(file, node, image)?;
+    let model = value(top, node, "camera_model")?.map(|n| n.text()).transpose()?;
+    if model == Some(PANORAMA) {
+        let (intrinsics, lens) = panorama::whole([width, height]);
+        return Ok((Camera { cam_from_world, intrinsics, lens, width, height, near: Camera::NEAR }, false));
+    }
     let fx = focal(top, node, ["fl_x", "camera_angle_x", "x_fov"], width)?;
     let (fx, by_angle) = fx.ok_or_else(|| {
         node.error("neither fl_x nor camera_angle_x is given")

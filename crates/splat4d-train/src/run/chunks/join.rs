@@ -105,7 +105,8 @@ impl Chunked {
         let [first, end] = self.plan.take;
         let ends = self.capture(vec![first..first + 1, end - 1..end])?;
         let background = shared::read(&self.folder(Part::Shared))?.background;
-        Ok(Scene { clip: seconds(&ends, &(first..end)), fps: ends.fps, up: ends.up, background, ..Scene::default() })
+        let (clip, fps, up, offset) = (seconds(&ends, &(first..end)), ends.fps, ends.up, ends.offset);
+        Ok(Scene { clip, fps, up, offset, background, ..Scene::default() })
     }
 
     /// The seconds in which a cut's neighbours fade into each other.

@@ -6,7 +6,7 @@ use super::{Chunked, MADE_BY, Part, SCENE};
 use crate::Result;
 use crate::capture::Capture;
 use crate::event::Event;
-use crate::init::{self, Seeds};
+use crate::init::Seeds;
 use crate::methods::{Plan, program_of, stages};
 use crate::recipe::Recipe;
 use crate::run::checkpoint;
@@ -57,7 +57,7 @@ pub(super) fn train(
         first_scene(&opened, &plan, &shared, &neighbours)?
     } else {
         // The checkpoint has it.
-        init::scene(&plan, program.as_ref(), &Seeds::default(), shared.background, opened.capture.up)?
+        opened.scene(&plan, program.as_ref(), &Seeds::default(), shared.background)?
     };
     let prints: Vec<&str> =
         std::iter::once(&shared.print).chain(neighbours.iter().map(|n| &n.print)).map(String::as_str).collect();
@@ -138,7 +138,7 @@ fn first_scene(opened: &OpenCapture, plan: &Plan, shared: &Shared, neighbours: &
             seeds.push(params[GEOMETRY].read::<3>(row, 0).map(f64::from), color, Some(time));
         }
     }
-    let mut scene = init::scene(plan, program.as_ref(), &seeds, shared.background, opened.capture.up)?;
+    let mut scene = opened.scene(plan, program.as_ref(), &seeds, shared.background)?;
     let own = &mut scene.layers[0].params;
     let mut row = first;
     for params in &taken {

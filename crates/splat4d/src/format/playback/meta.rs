@@ -16,6 +16,9 @@ pub struct Meta {
     pub fps: f64,
     /// The direction that is up, unit.
     pub up: [f64; 3],
+    /// World coordinates of the scene's origin; zero unless they are far from the origin of their world.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub offset: [f64; 3],
     /// Colour behind everything, 0 to 1.
     pub background: [f32; 3],
     /// Degree of the spherical harmonics, 0 to 3.
@@ -92,6 +95,10 @@ pub struct NamedCamera {
     /// Nothing as near as this or nearer is drawn, scene units; readers that do not know it draw a little more.
     #[serde(default = "nothing_nearer")]
     pub near: f64,
+}
+
+fn is_zero(offset: &[f64; 3]) -> bool {
+    *offset == [0.0; 3]
 }
 
 fn nothing_nearer() -> f64 {
@@ -174,6 +181,9 @@ impl Meta {
         if !finite(&self.up) || self.up == [0.0; 3] {
             return wrong("`up` is not a direction");
         }
+        if !finite(&self.offset) {
+            return wrong("`offset` is not finite");
+        }
         if !self.background.iter().all(|x| x.is_finite()) {
             return wrong("`background` is not a colour");
         }
@@ -195,8 +205,8 @@ impl Meta {
 
     /// Layers as the scene that this is about.
     pub(super) fn scene(&self, layers: Vec<Layer<f32>>) -> Scene<f32> {
-        let Self { background, clip, fps, up, .. } = *self;
-        Scene { layers, background, clip, fps, up, head: Head::Identity, labels: self.labels.clone() }
+        let Self { background, clip, fps, up, offset, .. } = *self;
+        Scene { layers, background, clip, fps, up, offset, head: Head::Identity, labels: self.labels.clone() }
     }
 }
 

@@ -9,6 +9,7 @@ use super::header::{Element, Header, broken};
 use super::{PlyInfo, degree, f_rest_columns, is_compressed, non_finite, open, rows, write_compressed};
 use crate::format::bytes::{SH_C0, logit_of_byte};
 use crate::format::dialect::{Dialect, Writer, Y_DOWN};
+use crate::format::mend::Mended;
 use crate::scene::params::{GEOMETRY, LOG_SCALE, OPACITY, Params, QUAT, SH};
 use crate::scene::table::Table;
 use crate::{Error, ErrorKind, Result};
@@ -22,6 +23,7 @@ pub const COMPRESSED: Dialect = Dialect {
     mark: Some(is_compressed),
     read: open,
     writer: Writer::Moment(|params, _, mut out| write_compressed(params, &mut out)),
+    world: false,
 };
 
 /// Gaussians that share their bounds.
@@ -109,6 +111,9 @@ pub(super) fn read(header: &Header, bytes: &[u8]) -> Result<(Params, PlyInfo)> {
         sh_degree: degree(1 + f_rest.len() / 3),
         non_finite_rows,
         compressed: true,
+        mended: Mended::default(),
+        rgb: false,
+        offset: [0.0; 3],
         comments: header.comments.clone(),
         extra_properties: extra.cloned().collect(),
     };

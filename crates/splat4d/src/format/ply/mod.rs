@@ -12,8 +12,11 @@ mod pack;
 mod rows;
 mod stg;
 
+use crate::format::bytes::SH_C0;
 use crate::format::dialect::{Dialect, Opened, Writer, Y_DOWN};
+use crate::format::mend::{self, Mended};
 use crate::format::warnings::Warnings;
+use crate::scene::offset::offset_of;
 use crate::scene::params::{GEOMETRY, GEOMETRY_COLUMNS, Params, SH};
 use crate::scene::table::{BLOCK, Table};
 use crate::{Error, ErrorKind, Result};
@@ -34,7 +37,11 @@ pub const DIALECT: Dialect = Dialect {
     moves: false,
     mark: Some(|bytes| bytes.starts_with(b"ply")),
     read: open,
-    writer: Writer::Moment(|params, _, mut out| write(params, &mut out).map(|()| Warnings::default())),
+    writer: Writer::Moment(|params, options, mut out| {
+        let offset = (options.offset, options.world);
+        write_placed(params, offset, &mut out).map(|()| Warnings::default())
+    }),
+    world: true,
 };
 
 /// f_rest properties of SH degree 0, 1, 2 and 3: three channels of the coefficients above the first.
@@ -50,6 +57,8 @@ const NORMAL_NAMES: [&str; 3] = ["nx", "ny", "nz"];
 const RGB_NAMES: [&str; 3] = ["red", "green", "blue"];
 /// The same, as some tools shorten them.
 const SHORT_RGB_NAMES: [&str; 3] = ["r", "g", "b"];
+/// Comment of files whose positions are relative to an offset: `comment splat4d offset X Y Z`.
+const OFFSET: &str = "splat4d offset";
 /// Blocks of rows that one task converts.
 const BLOCKS_PER_TASK: usize = 64;
 /// Rows that the writer formats at a time.
@@ -57,14 +66,20 @@ const ROWS_PER_WRITE: usize = 4096;
 const _: () = assert!(GEOMETRY_COLUMNS.len() == 4, "GEOMETRY_NAMES names these columns");
 
 /// Metadata of a file, besides its numbers.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct PlyInfo {
     /// Rows.
     pub gaussians: usize,
     /// Degree of the spherical harmonics, 0-3.
     pub sh_degree: usize,
-    /// Rows that hold a NaN or an infinity; they are kept as they are.
+    /// Rows that hold a NaN or an infinity without a meaning; they are kept as they are.
     pub non_finite_rows: usize,
+    /// Infinities that mean something, now finite.
+    pub mended: Mended,
+    /// Whether base colours are RGB (`red green blue`), not coefficients.
+    pub rgb: bool,
+    /// What was subtracted from positions in double precision that are far from the origin, or what the file says was.
+    pub offset: [f64; 3],
     /// Whether the numbers were quantised (PlayCanvas' compressed layout).
     pub compressed: bool,
     /// The header's comments.
@@ -97,19 +112,33 @@ pub fn read(bytes: &[u8]) -> Result<(Params, PlyInfo)> {
     if compressed::is_packed(vertex) {
         return compressed::read(&header, bytes);
     }
-    let (geometry, sh) = gaussian_columns(vertex)?;
+    let (geometry, sh, rgb) = gaussian_columns(vertex)?;
     let [rows] = rows::find(&header, bytes, ["vertex"])?;
     let rows = rows.expect("the element was found above");
     let mut params = Params::new(rows.len(), sh.len() / 3, &[]);
     let mut bad = vec![0; rows.len().div_ceil(BLOCK)];
     fill(&mut params[GEOMETRY], &geometry, &rows, &mut bad);
     fill(&mut params[SH], &sh, &rows, &mut bad);
+    let offset = subtract_offset(&mut params[GEOMETRY], &geometry, vertex, &rows).or_else(|| stated_offset(&header));
+    if rgb {
+        let white: Vec<f32> = sh[..3].iter().map(|&c| vertex.white(c) as f32).collect();
+        let table = &mut params[SH];
+        (0..rows.len())
+            .for_each(|row| (0..3).for_each(|c| table.set(row, c, (table.get(row, c) / white[c] - 0.5) / SH_C0)));
+    }
+    let mended = Mended::of(&mut params);
+    if mended != Mended::default() {
+        count_bad(&params, &mut bad);
+    }
     let is_used = |i: &usize| geometry.contains(i) || sh.contains(i);
     let extra = vertex.properties.iter().enumerate().filter(|(i, _)| !is_used(i)).map(|(_, p)| p.name.clone());
     let info = PlyInfo {
         gaussians: rows.len(),
         sh_degree: degree(sh.len() / 3),
         non_finite_rows: bad.iter().map(|mask| mask.count_ones() as usize).sum(),
+        mended,
+        rgb,
+        offset: offset.unwrap_or_default(),
         compressed: false,
         extra_properties: extra.filter(|name| !NORMAL_NAMES.contains(&name.as_str())).collect(),
         comments: header.comments,
@@ -120,7 +149,17 @@ pub fn read(bytes: &[u8]) -> Result<(Params, PlyInfo)> {
 /// Opens a plain or compressed file.
 fn open(bytes: &[u8]) -> Result<Opened> {
     let (params, info) = read(bytes)?;
-    Ok(Opened { ply: Some(info), ..Opened::from((params, Warnings::default())) })
+    let mut warnings = Warnings::default();
+    if info.rgb {
+        warnings.say("base colours are read from RGB (red, green, blue), as there are no f_dc_0..2");
+    }
+    for (what, evidence) in mend::doubts(&params) {
+        warnings.say(format!("{evidence}. If so, convert the file with --linear {}", what.name()));
+    }
+    let offset = info.offset;
+    let mut opened = Opened { ply: Some(info), ..Opened::from((params, warnings)) };
+    opened.scene.offset = offset;
+    Ok(opened)
 }
 
 /// Whether a .ply file has PlayCanvas' compressed layout. False for anything unreadable.
@@ -153,7 +192,7 @@ pub fn read_points(bytes: &[u8]) -> Result<PlyPoints> {
         let color = |(row, c): (usize, usize)| (rows.get(row, c) / vertex.white(c)) as f32;
         join(rgb).map(|row| row.map(color)).collect()
     } else if let Some(dc) = all(DC_NAMES) {
-        join(dc).map(|row| row.map(|(row, c)| 0.5 + super::bytes::SH_C0 * rows.get(row, c) as f32)).collect()
+        join(dc).map(|row| row.map(|(row, c)| 0.5 + SH_C0 * rows.get(row, c) as f32)).collect()
     } else {
         Vec::new()
     };
@@ -166,7 +205,13 @@ pub fn read_points(bytes: &[u8]) -> Result<PlyPoints> {
 ///
 /// Errors: a number is NaN or infinite; the sink's. Panics: the layer's SH coefficients are not 1, 4, 9 or 16 (degree 0-3).
 pub fn write(params: &Params, out: &mut impl Write) -> Result<()> {
+    write_placed(params, ([0.0; 3], false), out)
+}
+
+/// The same of a scene with an offset: added in double precision where `world`, else a comment from which it is read back.
+pub fn write_placed(params: &Params, (offset, world): ([f64; 3], bool), out: &mut impl Write) -> Result<()> {
     params.check_finite()?;
+    let world = world && offset != [0.0; 3];
     let width = params[SH].width();
     let Some(f_rest) = F_REST_COUNTS.into_iter().find(|n| n + 3 == width) else {
         panic!("a layer has 3 times 1, 4, 9 or 16 SH columns, not {width}");
@@ -175,9 +220,14 @@ pub fn write(params: &Params, out: &mut impl Write) -> Result<()> {
     let rest: Vec<String> = (0..f_rest).map(|i| format!("f_rest_{i}")).collect();
     let names = ["x", "y", "z"].into_iter().chain(NORMAL_NAMES).chain(DC_NAMES).chain(rest.iter().map(String::as_str));
     let names = names.chain(["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]);
-    let mut text = format!("ply\nformat binary_little_endian 1.0\nelement vertex {}\n", params.len());
-    for name in names {
-        text.push_str(&format!("property float {name}\n"));
+    let mut text = "ply\nformat binary_little_endian 1.0\n".to_owned();
+    if !world && offset != [0.0; 3] {
+        text.push_str(&format!("comment {OFFSET} {} {} {}\n", offset[0], offset[1], offset[2]));
+    }
+    text.push_str(&format!("element vertex {}\n", params.len()));
+    for (i, name) in names.enumerate() {
+        let kind = if world && i < 3 { "double" } else { "float" };
+        text.push_str(&format!("property {kind} {name}\n"));
     }
     text.push_str("end_header\n");
     let mut write = |bytes: &[u8]| out.write_all(bytes).map_err(|e| Error::io("the Gaussians could not be written", e));
@@ -188,8 +238,11 @@ pub fn write(params: &Params, out: &mut impl Write) -> Result<()> {
         buffer.clear();
         for row in first..params.len().min(first + ROWS_PER_WRITE) {
             let g: [f32; 11] = geometry.read(row, 0);
+            if world {
+                (0..3).for_each(|k| buffer.extend_from_slice(&(f64::from(g[k]) + offset[k]).to_le_bytes()));
+            }
             let mut put = |x: f32| buffer.extend_from_slice(&x.to_le_bytes());
-            g[..3].iter().for_each(|&x| put(x));
+            g[..3].iter().filter(|_| !world).for_each(|&x| put(x));
             NORMAL_NAMES.iter().for_each(|_| put(0.0));
             (0..3).for_each(|c| put(sh.get(row, c)));
             for c in 0..3 {
@@ -203,12 +256,16 @@ pub fn write(params: &Params, out: &mut impl Write) -> Result<()> {
     Ok(())
 }
 
-/// The property of each column of the geometry and SH tables.
-fn gaussian_columns(vertex: &Element) -> Result<(Vec<usize>, Vec<usize>)> {
-    let wanted: Vec<&str> = GEOMETRY_NAMES.into_iter().chain(DC_NAMES).collect();
+/// The property of each column of the geometry and SH tables, and whether the base colour is RGB.
+fn gaussian_columns(vertex: &Element) -> Result<(Vec<usize>, Vec<usize>, bool)> {
+    let all = |names: [&str; 3]| names.iter().all(|n| vertex.find(n).is_some());
+    let rgb = [RGB_NAMES, SHORT_RGB_NAMES].into_iter().find(|names| !all(DC_NAMES) && all(*names));
+    let colors = rgb.unwrap_or(DC_NAMES);
+    let wanted: Vec<&str> = GEOMETRY_NAMES.into_iter().chain(colors).collect();
     let missing: Vec<&str> = wanted.iter().copied().filter(|n| vertex.find(n).is_none()).collect();
     let is_position = |n: &&str| ["x", "y", "z"].contains(n);
-    if missing.len() == wanted.len() - 3 && !missing.iter().any(is_position) {
+    let without = GEOMETRY_NAMES.len() - 3 + if rgb.is_some() { 0 } else { DC_NAMES.len() };
+    if missing.len() == without && !missing.iter().any(is_position) {
         let names: Vec<&str> = vertex.properties.iter().map(|p| p.name.as_str()).take(8).collect();
         return Err(Error::input(format!(
             "this is a point cloud without Gaussians: its points have {} only, no scale, rotation or opacity",
@@ -217,14 +274,15 @@ fn gaussian_columns(vertex: &Element) -> Result<(Vec<usize>, Vec<usize>)> {
         .remedy("A point cloud can start a training, but it cannot be drawn; give a trained .ply"));
     }
     if !missing.is_empty() {
-        return Err(Error::input(format!("the element `vertex` lacks the properties {}", missing.join(", ")))
-            .remedy("A file of 3D Gaussians has x y z, f_dc_0..2, opacity, scale_0..2 and rot_0..3"));
+        return Err(Error::input(format!("the element `vertex` lacks the properties {}", missing.join(", "))).remedy(
+            "A file of 3D Gaussians has x y z, f_dc_0..2 (or red green blue), opacity, scale_0..2 and rot_0..3",
+        ));
     }
     let index = |name: &str| vertex.find(name).expect("checked above");
     let geometry = GEOMETRY_NAMES.map(index).to_vec();
-    let mut sh = DC_NAMES.map(index).to_vec();
+    let mut sh = colors.map(index).to_vec();
     sh.extend(f_rest_columns(vertex)?);
-    Ok((geometry, sh))
+    Ok((geometry, sh, rgb.is_some()))
 }
 
 /// The f_rest properties of an element, in coefficient-major order.
@@ -268,6 +326,42 @@ fn fill(table: &mut Table, columns: &[usize], rows: &Rows<'_>, bad: &mut [u16]) 
             }
         }
     });
+}
+
+/// Counts again which rows hold numbers that are not finite.
+fn count_bad(params: &Params, bad: &mut [u16]) {
+    bad.fill(0);
+    for table in [&params[GEOMETRY], &params[SH]] {
+        for row in 0..table.rows() {
+            let finite = (0..table.width()).all(|c| table.get(row, c).is_finite());
+            bad[row / BLOCK] |= u16::from(!finite) << (row % BLOCK);
+        }
+    }
+}
+
+/// Makes positions that are far from the origin relative to an offset, where the file has them in double precision.
+fn subtract_offset(table: &mut Table, columns: &[usize], vertex: &Element, rows: &Rows<'_>) -> Option<[f64; 3]> {
+    let double = |&c: &usize| vertex.properties[c].kind == header::Kind::Scalar(header::Scalar::F64);
+    if !columns[..3].iter().all(double) {
+        return None;
+    }
+    let position = |row: usize| -> [f64; 3] { std::array::from_fn(|k| rows.get(row, columns[k])) };
+    let all: Vec<[f64; 3]> = (0..rows.len()).map(position).collect();
+    let offset = offset_of(&[], &all);
+    if offset == [0.0; 3] {
+        return None;
+    }
+    for (row, p) in all.iter().enumerate() {
+        table.write(row, 0, std::array::from_fn::<f32, 3, _>(|k| (p[k] - offset[k]) as f32));
+    }
+    Some(offset)
+}
+
+/// The offset that a comment of ours states.
+fn stated_offset(header: &Header) -> Option<[f64; 3]> {
+    let numbers = header.comments.iter().find_map(|c| c.strip_prefix(OFFSET))?;
+    let numbers: Vec<f64> = numbers.split_whitespace().map_while(|w| w.parse().ok()).collect();
+    <[f64; 3]>::try_from(numbers).ok().filter(|o| o.iter().all(|x| x.is_finite()))
 }
 
 /// A bit for each number (at most 16) that is NaN or infinite.

@@ -26,6 +26,7 @@ pub const STG: Dialect = Dialect {
     mark: Some(is_stg),
     read: |bytes| read_stg(bytes).map(Opened::from),
     writer: Writer::Moving(|scene, options, mut out| write_stg(scene, options, &mut out)),
+    world: false,
 };
 
 /// Numbers of a row as [`names`] lists them.

@@ -1,5 +1,7 @@
 use super::*;
+use crate::format::dialect::WriteOptions;
 use crate::format::mutate::mutants;
+use crate::format::samples::gaussians;
 use crate::math::Rng;
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use std::time::Instant;
@@ -124,6 +126,96 @@ fn a_foreign_big_endian_file_is_read() {
     assert_eq!(p[GEOMETRY].read::<3>(1, 0), [100.0, 101.0, 102.0]);
     assert_eq!((p[GEOMETRY].get(1, OPACITY), p[GEOMETRY].get(1, LOG_SCALE)), (103.0, 104.0));
     assert_eq!(p[GEOMETRY].read::<4>(0, QUAT), [7.0, 8.0, 9.0, 10.0]);
+}
+
+/// A text file of one Gaussian a row: `types` and names of its properties, rows of numbers.
+fn text(properties: &[(&str, &str)], rows: &[&str]) -> Vec<u8> {
+    let lines: Vec<String> = properties.iter().map(|(kind, name)| format!("property {kind} {name}\n")).collect();
+    let (count, rows) = (rows.len(), rows.join("\n"));
+    format!("ply\nformat ascii 1.0\nelement vertex {count}\n{}end_header\n{rows}\n", lines.concat()).into_bytes()
+}
+
+const SHAPE: [(&str, &str); 8] = [
+    ("float", "opacity"),
+    ("float", "scale_0"),
+    ("float", "scale_1"),
+    ("float", "scale_2"),
+    ("float", "rot_0"),
+    ("float", "rot_1"),
+    ("float", "rot_2"),
+    ("float", "rot_3"),
+];
+
+#[test]
+fn rgb_colours_are_base_colours() {
+    for (kind, row) in [("uchar", "255 0 51"), ("float", "1 0 0.2")] {
+        let rgb = ["red", "green", "blue"].map(|n| (kind, n));
+        let properties = [&["x", "y", "z"].map(|n| ("float", n))[..], &rgb, &SHAPE].concat();
+        let opened = DIALECT.open(&text(&properties, &[&format!("1 2 3 {row} 0.5 -4 -5 -6 1 0 0 0")])).unwrap();
+        let colour = opened.scene.layers[0].params[SH].read::<3>(0, 0).map(|dc| 0.5 + SH_C0 * dc);
+        assert!((0..3).all(|k| (colour[k] - [1.0, 0.0, 0.2][k]).abs() < 1e-6), "{colour:?}");
+        let info = opened.ply.unwrap();
+        assert!(info.rgb && info.extra_properties.is_empty() && opened.warnings.lines()[0].contains("RGB"));
+    }
+    // Coefficients go first, and a cloud of points stays one.
+    let colors = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "red", "green", "blue"].map(|n| ("float", n));
+    let both = [&colors[..], &SHAPE];
+    let (p, info) = read(&text(&both.concat(), &["1 2 3 0.1 0.2 0.3 9 9 9 0.5 -4 -5 -6 1 0 0 0"])).unwrap();
+    assert_eq!((p[SH].read::<3>(0, 0), info.rgb), ([0.1, 0.2, 0.3], false));
+    let cloud = ["x", "y", "z", "red", "green", "blue"].map(|n| ("float", n));
+    assert!(read(&text(&cloud, &["1 2 3 0 0 0"])).unwrap_err().to_string().contains("point cloud"));
+}
+
+#[test]
+fn infinities_that_mean_something_are_no_damage() {
+    let mut p = gaussians(4, 1);
+    p[GEOMETRY].set(1, OPACITY, f32::INFINITY);
+    p[GEOMETRY].set(2, LOG_SCALE, f32::NEG_INFINITY);
+    p[GEOMETRY].set(3, 0, f32::INFINITY);
+    let (back, info) = read(&written(&p)).unwrap();
+    assert_eq!((info.mended.opaque, info.mended.flat, info.non_finite_rows), (1, 1, 1));
+    assert!(back[GEOMETRY].get(1, OPACITY) > 10.0 && back[GEOMETRY].get(2, LOG_SCALE) < -10.0);
+    let said = DIALECT.open(&written(&p)).unwrap().warnings;
+    assert!(said.lines()[0].contains("1 of 4 Gaussians have opacity +infinity"), "{said:?}");
+    // Nothing that can be drawn: no file.
+    let mut lost = gaussians(2, 1);
+    (0..2).for_each(|row| lost[GEOMETRY].set(row, 0, f32::NAN));
+    let (scene, mut out) = (crate::format::dialect::still(lost), Vec::new());
+    for dialect in crate::format::DIALECTS.iter().filter(|d| d.is_written() && !d.moves) {
+        let error = dialect.write(&scene, &WriteOptions::default(), &mut out).unwrap_err().to_string();
+        assert!(error.contains("nothing would be written"), "{dialect:?}: {error}");
+    }
+}
+
+#[test]
+fn positions_of_a_map_keep_their_digits() {
+    let center = [431_234.5, 5_412_345.6, 310.2];
+    let mut scene = crate::format::dialect::still(gaussians(40, 1));
+    scene.offset = center;
+    let write = |world: bool| {
+        let mut bytes = Vec::new();
+        let options = WriteOptions { world, ..WriteOptions::default() };
+        DIALECT.write(&scene, &options, &mut bytes).unwrap();
+        bytes
+    };
+    let relative = DIALECT.open(&write(false)).unwrap().scene;
+    assert_eq!((relative.offset, &relative.layers[0].params), (center, &scene.layers[0].params));
+    let world = write(true);
+    assert!(String::from_utf8_lossy(&world[..200]).contains("property double x"));
+    assert!((read_points(&world).unwrap().positions[0][1] - center[1]).abs() < 20.0);
+    let far = DIALECT.open(&world).unwrap();
+    let place = |s: &crate::layers::Scene<f32>, row: usize| -> [f64; 3] {
+        let own = s.layers[0].params[GEOMETRY].read::<3>(row, 0);
+        std::array::from_fn(|k| f64::from(own[k]) + s.offset[k])
+    };
+    let apart = (0..40).flat_map(|row| (0..3).map(move |k| (row, k)));
+    let apart = apart.map(|(row, k)| (place(&far.scene, row)[k] - place(&scene, row)[k]).abs()).fold(0.0, f64::max);
+    assert!(apart < 1e-6 && far.scene.offset != [0.0; 3], "{apart}");
+    assert!(far.warnings.lines().is_empty(), "{:?}", far.warnings);
+    // Other formats have no room for such numbers.
+    let options = WriteOptions { world: true, ..WriteOptions::default() };
+    let refused = crate::format::splat::DIALECT.write(&scene, &options, &mut Vec::new()).unwrap_err();
+    assert!(refused.to_string().contains("double precision"), "{refused}");
 }
 
 #[test]

@@ -7,6 +7,7 @@
 //! 16 bits; label l has its coefficients at row l/64, columns (l mod 64)·K on of the centroids, codes of a codebook.
 //! World axes as in .ply: y down. Source: playcanvas/splat-transform (MIT), its reader.
 
+pub mod levels;
 mod pictures;
 #[cfg(test)]
 pub(super) mod tests;
@@ -33,6 +34,7 @@ pub const DIALECT: Dialect = Dialect {
     mark: Some(|bytes| bytes.starts_with(&ZIP_MAGIC)),
     read: |bytes| read(&unzip(bytes)?).map(Opened::from),
     writer: Writer::None("Write .compressed.ply or .spz; splat-transform makes SOG of either."),
+    world: false,
 };
 
 /// The version this library reads.

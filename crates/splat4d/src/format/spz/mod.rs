@@ -34,6 +34,7 @@ pub const DIALECT: Dialect = Dialect {
         read(bytes).map(|(params, info, warnings)| Opened { up: Some(info.up), ..Opened::from((params, warnings)) })
     },
     writer: Writer::Moment(|params, options, mut out| write(params, options.spz_version, options.up, &mut out)),
+    world: false,
 };
 
 /// The versions this library reads and writes.

@@ -3,6 +3,7 @@
 use super::Header;
 use crate::Result;
 use crate::format::bytes::{byte_of_logit, logit_of_byte, to_byte};
+use crate::format::mend::{VISIBLE, median_size};
 use crate::format::warnings::Warnings;
 use crate::math::{quat, sh};
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
@@ -23,8 +24,6 @@ const MOST: f64 = 8_388_607.0;
 const USUAL_FRACTION_BITS: u8 = 12;
 /// Most bits behind the point that we use; more would compress badly and buy nothing that can be seen.
 const MOST_FRACTION_BITS: u8 = 18;
-/// A step is made no longer than this share of the size of the median Gaussian: shifts of a tenth of σ are invisible.
-const STEP_SHARE: f64 = 0.1;
 /// Colour byte: 255·(½ + 0.15·f_dc), wider than 0..1.
 const COLOR_SCALE: f32 = 0.15;
 /// Log scale byte: 16·(s + 10).
@@ -103,16 +102,7 @@ fn smallest_three(word: u32) -> [f32; 4] {
 pub(super) fn fraction_bits(params: &Params, rows: &[usize]) -> u8 {
     let geometry = &params[GEOMETRY];
     let far = rows.iter().flat_map(|&r| geometry.read::<3>(r, 0)).fold(0.0f32, |m, x| m.max(x.abs()));
-    let mut sizes: Vec<f32> = rows
-        .iter()
-        .map(|&r| {
-            let s = geometry.read::<3>(r, LOG_SCALE);
-            s[0].max(s[1]).max(s[2])
-        })
-        .collect();
-    let middle = sizes.len() / 2;
-    let (_, median, _) = sizes.select_nth_unstable_by(middle, f32::total_cmp);
-    let wanted = STEP_SHARE * f64::from(*median).exp();
+    let wanted = VISIBLE * median_size(params).unwrap_or(1.0);
     let mut bits = USUAL_FRACTION_BITS;
     while bits < MOST_FRACTION_BITS && f64::from(1u32 << bits) * wanted < 1.0 {
         bits += 1;
@@ -130,11 +120,14 @@ pub(super) fn pack(params: &Params, rows: &[usize], header: &Header, warnings: &
     let [positions, alphas, colors, scales, rotations, rest] = &mut streams;
     let per_unit = f64::from(1u32 << header.fraction_bits);
     let [mut far, mut sized, mut colored, mut shaded] = [0; 4];
+    let (mut reach, mut moved) = (0.0f64, 0.0f64);
     for &row in rows {
         let mut outside = [false; 4];
         for x in geometry.read::<3>(row, 0) {
             let steps = (f64::from(x) * per_unit).round();
             outside[0] |= steps.abs() > MOST;
+            reach = reach.max(f64::from(x).abs());
+            moved = moved.max((steps.clamp(-MOST, MOST) / per_unit - f64::from(x)).abs());
             positions.extend_from_slice(&(steps.clamp(-MOST, MOST) as i32).to_le_bytes()[..3]);
         }
         alphas.push(byte_of_logit(geometry.get(row, OPACITY)));
@@ -157,6 +150,14 @@ pub(super) fn pack(params: &Params, rows: &[usize], header: &Header, warnings: &
     }
     let of = rows.len();
     warnings.counted(far, of, "lay farther out than .spz can say, and were moved to its edge");
+    if let Some(size) = median_size(params).filter(|size| moved > VISIBLE * size) {
+        warnings.say(format!(
+            "positions reach {reach}: the 24 bits of .spz leave steps of {}, and moved them by up to {moved:.3}, {:.2} of the \
+             size of the median Gaussian. Move the scene to the origin first, or write .ply",
+            1.0 / per_unit,
+            moved / size
+        ));
+    }
     warnings.counted(sized, of, "had a scale outside e^-10 to e^5.94, which was clipped");
     warnings.counted(colored, of, "had a base colour coefficient outside -3.33 to 3.33, which was clipped");
     warnings.counted(shaded, of, "had spherical harmonics above degree 0 outside -1 to 1, which were clipped");

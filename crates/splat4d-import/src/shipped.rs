@@ -1,0 +1,160 @@
+//! Captures that are shipped as a video per camera and their poses: Neural 3D Video (`cam00.mp4` …, `poses_bounds.npy`).
+//! Frames are extracted once, below the capture, where its reader looks for them.
+
+use crate::video::{self, Info, Selection, Source};
+use crate::write::{self, Clip, Format};
+use splat4d::format::npy::Npy;
+use splat4d::{Error, ErrorKind, Result};
+use splat4d_train::event::Progress;
+use std::path::{Path, PathBuf};
+
+/// The poses: one row per camera, in the order of the videos' names.
+const POSES: &str = "poses_bounds.npy";
+/// Endings of the videos.
+const VIDEOS: [&str; 5] = ["mp4", "mov", "mkv", "avi", "webm"];
+/// Pixels of the shorter side that frames have at most. Sides are divided by a whole number, so that intrinsics scale
+/// exactly: Neural 3D Video's 2704x2028 become the 1352x1014 that its papers train on.
+const SIDE: usize = 1080;
+/// Folder of the notes that [`write::pictures`] keeps of what it stored.
+const NOTES: &str = "import";
+
+/// What was extracted.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Extracted {
+    /// Cameras.
+    pub cameras: usize,
+    /// Frames of all of them.
+    pub frames: usize,
+    /// Pixels across and down.
+    pub size: [usize; 2],
+    /// Frames a second of the first video, where its file states them.
+    pub rate: Option<f64>,
+    /// What was odd, a sentence or two each.
+    pub warnings: Vec<String>,
+}
+
+/// The videos of a capture that is shipped so and whose frames nobody has extracted in another way; empty: it is no such
+/// capture.
+pub fn videos(root: &Path) -> Vec<PathBuf> {
+    if !root.join(POSES).is_file() || root.join("capture.json").is_file() {
+        return Vec::new();
+    }
+    let Ok(entries) = std::fs::read_dir(root) else { return Vec::new() };
+    let is_video = |p: &PathBuf| {
+        let name = p.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+        let ending = p.extension().map(|e| e.to_string_lossy().to_ascii_lowercase()).unwrap_or_default();
+        !name.starts_with('.') && VIDEOS.contains(&ending.as_str()) && p.is_file()
+    };
+    let mut all: Vec<PathBuf> = entries.filter_map(|e| e.ok().map(|e| e.path())).filter(is_video).collect();
+    all.sort();
+    let elsewhere = |video: &PathBuf| {
+        let name = stem(video);
+        let stored = root.join("images").join(&name);
+        let noted = root.join(NOTES).join(format!("{name}.json")).is_file();
+        root.join(&name).is_dir() || (stored.is_dir() && !noted)
+    };
+    if all.iter().any(elsewhere) { Vec::new() } else { all }
+}
+
+fn stem(video: &Path) -> String {
+    video.file_stem().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default()
+}
+
+/// Extracts the frames of such a capture into its folder `images/`; what is there already is left, and work that was
+/// interrupted goes on. `None`: it is no such capture. `stop` is asked after every few frames.
+///
+/// Errors: other poses than videos, a video that cannot be read, no space; of kind `Interrupted` where `stop` said so.
+pub fn extract(root: &Path, progress: &mut Progress<'_>, stop: &dyn Fn() -> bool) -> Result<Option<Extracted>> {
+    let videos = videos(root);
+    if videos.is_empty() {
+        return Ok(None);
+    }
+    check_poses(&root.join(POSES), &videos)?;
+    // Poses state no frame rate; folders are not among the videos.
+    let sources = videos.iter().map(|path| video::open(path, 1.0)).collect::<Result<Vec<Box<dyn Source>>>>()?;
+    let clips: Vec<Clip<'_>> = videos
+        .iter()
+        .zip(&sources)
+        .map(|(path, source)| {
+            let selection = Selection { size: Some(side(source.info())), ..Selection::default() };
+            Clip { name: stem(path), source: &**source, selection }
+        })
+        .collect();
+    let pictures = write::pictures(root, &clips, Format::default(), progress, stop).map_err(|e| match e.kind() {
+        ErrorKind::Interrupted => e,
+        _ => e.remedy(
+            "Frames are stored in the folder `images` of the capture: copy it to a disk with room where you may write.",
+        ),
+    })?;
+    let mut warnings: Vec<String> = Vec::new();
+    for p in &pictures {
+        warnings.extend(p.warnings.iter().map(|w| format!("{}: {w}", p.name)));
+    }
+    Ok(Some(Extracted {
+        cameras: pictures.len(),
+        frames: pictures.iter().map(|p| p.shots.len()).sum(),
+        size: pictures[0].size,
+        rate: sources[0].info().average_rate,
+        warnings,
+    }))
+}
+
+/// Pixels of the frames' shorter side.
+fn side(info: &Info) -> usize {
+    let own = info.size[0].min(info.size[1]);
+    own / own.div_ceil(SIDE).max(1)
+}
+
+/// Extraction takes minutes: poses of another number of cameras are told before.
+fn check_poses(path: &Path, videos: &[PathBuf]) -> Result<()> {
+    let bytes = std::fs::read(path).map_err(|e| Error::io("cannot be read", e).at(path.display()))?;
+    let rows = Npy::read(&bytes).map_err(|e| e.at(path.display()))?.shape.first().copied().unwrap_or(0);
+    if rows == videos.len() {
+        return Ok(());
+    }
+    let what = format!("it has {rows} cameras, but there are {} videos", videos.len());
+    Err(Error::input(what).at(path.display()).remedy(
+        "Keep exactly the videos that the poses are of, in the order of their names (cam00.mp4, cam01.mp4, …).",
+    ))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::process::Command;
+
+    #[test]
+    fn frames_are_extracted_once_and_incomplete_work_goes_on() {
+        let dir = tempfile::tempdir().unwrap();
+        let root = dir.path();
+        let mut poses = Vec::new();
+        splat4d::format::npy::write_f32(&[2, 17], &[0.5; 34], &mut poses).unwrap();
+        std::fs::write(root.join(POSES), &poses).unwrap();
+        let make = |name: &str| {
+            let input = "-v error -f lavfi -i testsrc=s=64x48:r=10:d=0.5 -c:v mpeg4 -y".split_whitespace();
+            Command::new("ffmpeg").args(input).arg(root.join(name)).status().is_ok_and(|s| s.success())
+        };
+        if !make("cam00.mp4") {
+            eprintln!("skipped: there is no ffmpeg here");
+            return;
+        }
+        let mut told = |_: &splat4d_train::event::Event| {};
+        let mut progress = Progress(&mut told);
+        let few = extract(root, &mut progress, &|| false).unwrap_err().to_string();
+        assert!(few.contains("2 cameras") && few.contains("1 videos"), "{few}");
+        assert!(make("cam01.mp4"));
+        let stopped = extract(root, &mut progress, &|| true);
+        assert!(stopped.is_err_and(|e| e.kind() == ErrorKind::Interrupted));
+        let found = extract(root, &mut progress, &|| false).unwrap().unwrap();
+        assert_eq!((found.cameras, found.frames, found.size, found.rate), (2, 10, [64, 48], Some(10.0)));
+        let frame = root.join("images/cam01/000004.jpg");
+        let written = std::fs::metadata(&frame).unwrap().modified().unwrap();
+        std::fs::remove_file(root.join("images/cam00/000002.jpg")).unwrap();
+        assert_eq!(extract(root, &mut progress, &|| false).unwrap().unwrap(), found);
+        assert!(root.join("images/cam00/000002.jpg").is_file());
+        assert_eq!(std::fs::metadata(&frame).unwrap().modified().unwrap(), written, "what was there is left");
+        // Frames of another program are the capture's own.
+        std::fs::remove_dir_all(root.join(NOTES)).unwrap();
+        assert!(extract(root, &mut progress, &|| false).unwrap().is_none());
+    }
+}

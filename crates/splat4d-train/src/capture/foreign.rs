@@ -1,0 +1,195 @@
+//! Exports of capture programs and telephones: Metashape, RealityScan, Polycam, Record3D. Each is a file that says where
+//! poses and images are; what is common to them is here. They were built from public documentation and synthetic samples.
+
+mod metashape;
+mod polycam;
+mod realityscan;
+mod record3d;
+#[cfg(test)]
+mod tests;
+
+use super::points::read_ply;
+use super::{CaptureKind, CaptureOptions, DepthFile, Extent, PointCloud, RawFrame, Split, Take, Timing, rig, sequence};
+use splat4d::math::Se3;
+use splat4d::scene::Camera;
+use splat4d::scene::time::DEFAULT_FPS;
+use splat4d::{Error, Result};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// A kind of export.
+struct Export {
+    /// Its file (or folder) in a capture's folder; `None`: it is not there.
+    find: fn(&Path) -> Option<PathBuf>,
+    /// Whether a path that somebody gives is such a file.
+    is: fn(&Path) -> bool,
+    /// Reads the capture in a folder from that file.
+    read: fn(&Path, &Path, &CaptureOptions) -> Result<Take>,
+}
+
+/// In the order in which they are looked for: those that are told by their content come last.
+const EXPORTS: [Export; 4] = [polycam::EXPORT, record3d::EXPORT, metashape::EXPORT, realityscan::EXPORT];
+
+/// Reads the export in a folder, or that a file is. `None`: it is none.
+pub(super) fn read(path: &Path, options: &CaptureOptions) -> Option<Result<Take>> {
+    if path.is_file() {
+        let root = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        return EXPORTS.iter().find(|e| (e.is)(path)).map(|e| (e.read)(root, path, options));
+    }
+    EXPORTS.iter().find_map(|e| (e.find)(path).map(|file| (e.read)(path, &file, options)))
+}
+
+/// A posed image.
+struct Shot {
+    /// Its name, for messages and for the order of images without times.
+    name: String,
+    image: PathBuf,
+    source: Camera,
+    /// Seconds; all shots have one, or none.
+    time: Option<f64>,
+    depth: Option<DepthFile>,
+}
+
+/// What an export says besides its shots.
+struct Said {
+    kind: CaptureKind,
+    fps: Option<f64>,
+    points: Option<PointCloud>,
+    up: Option<[f64; 3]>,
+    warnings: Vec<String>,
+    notes: Vec<String>,
+}
+
+/// The take of some shots: of one moving camera where they have times, else as their names say.
+fn take(root: &Path, mut shots: Vec<Shot>, said: Said, options: &CaptureOptions) -> Result<Take> {
+    let Said { kind, fps, points, up, mut warnings, mut notes } = said;
+    let fps = options.fps.or(fps).unwrap_or(DEFAULT_FPS);
+    let timed = !shots.is_empty() && shots.iter().all(|s| s.time.is_some());
+    shots.sort_by(|a, b| a.time.partial_cmp(&b.time).unwrap_or(std::cmp::Ordering::Equal).then(a.name.cmp(&b.name)));
+    let names: Vec<&str> = shots.iter().map(|s| s.name.as_str()).collect();
+    let order = if timed {
+        let first = shots[0].time.unwrap_or_default();
+        let frame = |(index, s): (usize, &Shot)| (0, index, s.time.unwrap_or_default() - first);
+        let frames = shots.iter().enumerate().map(frame).collect();
+        sequence::Order { cameras: vec!["moving".into()], frames, named: false, timing: Timing::Told }
+    } else {
+        let poses: Vec<Se3> = shots.iter().map(|s| s.source.cam_from_world).collect();
+        sequence::order(&names, &poses, options.sequence, fps, &mut warnings, &mut notes)
+    };
+    let sequence::Order { cameras, frames: places, named, timing } = order;
+    let frame = |(shot, (camera, index, time)): (Shot, (usize, usize, f64))| RawFrame {
+        camera,
+        source: shot.source,
+        time,
+        index,
+        image: shot.image,
+        mask: None,
+        depth: shot.depth,
+        flow: None,
+        labels: None,
+        features: None,
+        tracks: None,
+        split: Split::Train,
+    };
+    Ok(Take {
+        name: None,
+        root: root.to_path_buf(),
+        kind,
+        cameras,
+        frames: shots.into_iter().zip(places).map(frame).collect(),
+        take: Extent::default(),
+        named,
+        timing,
+        hold_out: None,
+        fps,
+        points,
+        background: None,
+        up,
+        labels: Vec::new(),
+        warnings,
+        notes,
+    })
+}
+
+/// How folders begin whose images are not the photos: masks, depth, reduced copies.
+const OTHERS: [&str; 4] = ["mask", "depth", "images_", "."];
+
+/// Images by their names without endings, in lower case; from a folder, its folder `images`, and what lies in folders there.
+struct Images(BTreeMap<String, Vec<PathBuf>>);
+
+impl Images {
+    fn below(root: &Path) -> Self {
+        let mut found = BTreeMap::new();
+        let mut add = |folder: &Path| {
+            for name in rig::image_names(folder) {
+                found.entry(key(&name)).or_insert_with(Vec::new).push(folder.join(name));
+            }
+        };
+        add(root);
+        let folders = |of: &Path| -> Vec<PathBuf> {
+            let names = rig::file_names(of).into_iter().filter(|n| !OTHERS.iter().any(|o| n.starts_with(o)));
+            names.map(|n| of.join(n)).filter(|p| p.is_dir()).collect()
+        };
+        for folder in folders(root) {
+            add(&folder);
+            folders(&folder).iter().for_each(|inner| add(inner));
+        }
+        Self(found)
+    }
+
+    /// The image that an export calls `name`, with or without folders and ending. Errors: none, or several.
+    fn named(&self, name: &str) -> Result<&Path> {
+        match self.0.get(&key(name)).map_or(&[][..], Vec::as_slice) {
+            [one] => Ok(one),
+            [] => Err(Error::input(format!("there is no image of the name {name:.200}"))
+                .remedy("Put the images next to the export, in this folder or one below it.")),
+            [first, second, ..] => {
+                let what = format!(
+                    "there are several images of the name {name:.200}: {} and {}",
+                    first.display(),
+                    second.display()
+                );
+                // A copy in another size would be as good; which one is meant is the user's to say.
+                Err(Error::input(what).remedy("Move the others out of the capture's folder."))
+            }
+        }
+    }
+}
+
+/// A name without folders and ending, in lower case.
+fn key(name: &str) -> String {
+    let file = name.rsplit(['/', '\\']).next().unwrap_or(name);
+    let stem = match file.rsplit_once('.') {
+        Some((stem, ending)) if rig::IMAGE_ENDINGS.iter().any(|e| ending.eq_ignore_ascii_case(e)) => stem,
+        _ => file,
+    };
+    stem.to_lowercase()
+}
+
+/// The only point cloud in a folder; several are none, and a note says so.
+fn only_points(root: &Path, notes: &mut Vec<String>) -> Result<Option<PointCloud>> {
+    let clouds: Vec<String> =
+        rig::file_names(root).into_iter().filter(|n| n.to_lowercase().ends_with(".ply")).collect();
+    match &clouds[..] {
+        [] => Ok(None),
+        [one] => {
+            notes.push(format!("The initial points are those of {one}."));
+            read_ply(&root.join(one)).map(Some)
+        }
+        several => {
+            notes.push(format!(
+                "There are {} point clouds ({}): none is taken. Name one with --set init=FILE.",
+                several.len(),
+                several.join(", ")
+            ));
+            Ok(None)
+        }
+    }
+}
+
+/// Says how many images of an export have no pose.
+fn without_pose(count: usize, of: usize, warnings: &mut Vec<String>) {
+    if count > 0 {
+        warnings.push(format!("{count} of {of} images have no pose and are left out: they were not aligned."));
+    }
+}

@@ -1,0 +1,118 @@
+//! Camera parameters of RealityScan (RealityCapture) as CSV: "Internal/External camera parameters".
+//!
+//! A line per image: name, position, heading, pitch and roll in degrees, the focal length and the principal point's distance
+//! from the middle for a film 36 mm wide, Brown's terms. The world has z up. Source: the columns and conventions as
+//! Nerfstudio's documentation of its RealityCapture import describes them.
+
+use super::{Export, Images, Said, Shot, only_points, take};
+use crate::capture::{CaptureKind, CaptureOptions, Take, json, picture, pose, rig};
+use splat4d::math::se3::mat_mul;
+use splat4d::scene::{Camera, Intrinsics, Lens};
+use splat4d::{Error, ErrorKind, Result};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+pub(super) const EXPORT: Export = Export { find, is, read };
+
+/// Columns that such a file has.
+const COLUMNS: [&str; 10] = ["name", "x", "y", "alt", "heading", "pitch", "roll", "f", "px", "py"];
+/// Width of the film that lengths refer to, millimetres.
+const FILM: f64 = 36.0;
+/// Bytes at the beginning of a file in which its columns are named.
+const HEAD: usize = 1024;
+const Z_UP: [f64; 3] = [0.0, 0.0, 1.0];
+
+fn find(root: &Path) -> Option<PathBuf> {
+    let csv = rig::file_names(root).into_iter().filter(|n| n.to_lowercase().ends_with(".csv"));
+    csv.map(|n| root.join(n)).find(|p| is(p))
+}
+
+fn is(path: &Path) -> bool {
+    use std::io::Read;
+    let mut head = Vec::new();
+    let read = std::fs::File::open(path).and_then(|f| f.take(HEAD as u64).read_to_end(&mut head));
+    let text = String::from_utf8_lossy(&head);
+    let columns = columns(text.lines().next().unwrap_or_default());
+    read.is_ok() && COLUMNS.iter().all(|c| columns.contains_key(*c))
+}
+
+/// Names of columns and their places.
+fn columns(line: &str) -> BTreeMap<String, usize> {
+    let line = line.trim_start_matches('\u{feff}').trim_start_matches('#');
+    line.split(',').enumerate().map(|(i, name)| (name.trim().trim_matches('"').to_lowercase(), i)).collect()
+}
+
+fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
+    let bytes = json::read_bytes(marker)?;
+    let text = String::from_utf8_lossy(&bytes);
+    let place = |e: Error| e.at(marker.display());
+    let mut lines = text.lines().enumerate().map(|(i, l)| (i + 1, l.trim())).filter(|(_, l)| !l.is_empty());
+    let columns = columns(lines.next().map_or("", |l| l.1));
+    let missing: Vec<&str> = COLUMNS.into_iter().filter(|c| !columns.contains_key(*c)).collect();
+    if !missing.is_empty() {
+        return Err(place(Error::input(format!("it lacks the columns {}", missing.join(", "))))
+            .remedy("Export the registration as \"Internal/External camera parameters\"."));
+    }
+    let images = Images::below(root);
+    let mut shots = Vec::new();
+    for (number, line) in lines {
+        let row = Row { columns: &columns, words: line.split(',').map(|w| w.trim().trim_matches('"')).collect() };
+        shots.push(row.shot(&images).map_err(|e| place(e.at(format!("line {number}"))))?);
+    }
+    let (warnings, mut notes) = (Vec::new(), Vec::new());
+    let points = only_points(root, &mut notes)?;
+    let said = Said { kind: CaptureKind::RealityScan, fps: None, points, up: Some(Z_UP), warnings, notes };
+    take(root, shots, said, options)
+}
+
+struct Row<'a> {
+    columns: &'a BTreeMap<String, usize>,
+    words: Vec<&'a str>,
+}
+
+impl Row<'_> {
+    /// A number; 0 where there is no such column.
+    fn number(&self, name: &str) -> Result<f64> {
+        let Some(&column) = self.columns.get(name) else { return Ok(0.0) };
+        let word = self.words.get(column).copied().unwrap_or_default();
+        word.parse().ok().filter(|x: &f64| x.is_finite()).ok_or_else(|| {
+            Error::input(format!("{name} is \"{word:.40}\", not a number")).remedy("Export the cameras again.")
+        })
+    }
+
+    fn shot(&self, images: &Images) -> Result<Shot> {
+        let name = self.words.get(self.columns["name"]).copied().unwrap_or_default();
+        let image = images.named(name)?.to_owned();
+        let header = picture::header(&image)?;
+        let (width, height) = (header.width as f64, header.height as f64);
+        let angle = |name: &str| Ok::<_, Error>(self.number(name)?.to_radians().sin_cos());
+        let ((sh, ch), (sp, cp), (sr, cr)) = (angle("heading")?, angle("pitch")?, angle("roll")?);
+        // Heading is clockwise from above.
+        let heading = [[ch, sh, 0.0], [-sh, ch, 0.0], [0.0, 0.0, 1.0]];
+        let pitch = [[1.0, 0.0, 0.0], [0.0, cp, -sp], [0.0, sp, cp]];
+        let roll = [[cr, 0.0, sr], [0.0, 1.0, 0.0], [-sr, 0.0, cr]];
+        let r = mat_mul(&heading, &mat_mul(&pitch, &roll));
+        let t = [self.number("x")?, self.number("y")?, self.number("alt")?];
+        let row = |i: usize| [r[i][0], r[i][1], r[i][2], t[i]];
+        let cam_from_world = pose::from_opengl(&[row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]])?;
+        let pixels = width.max(height) / FILM;
+        let f = self.number("f")? * pixels;
+        let intrinsics = Intrinsics {
+            fx: f,
+            fy: f,
+            cx: 0.5 * width + self.number("px")? * pixels,
+            cy: 0.5 * height + self.number("py")? * pixels,
+        };
+        pose::check_intrinsics(&intrinsics, header.width, header.height)?;
+        let k = [self.number("k1")?, self.number("k2")?, self.number("k3")?, 0.0, 0.0, 0.0];
+        let p = [self.number("t1")?, self.number("t2")?];
+        if self.number("k4")? != 0.0 {
+            return Err(Error::new(ErrorKind::Unsupported, "its lens has a term k4, which is not read")
+                .remedy("Align with the distortion model Brown 3, or export undistorted images."));
+        }
+        let lens = if k == [0.0; 6] && p == [0.0; 2] { Lens::Pinhole } else { Lens::Brown { k, p, s: [0.0; 4] } };
+        let (width, height) = (header.width, header.height);
+        let source = Camera { cam_from_world, intrinsics, lens, width, height, near: Camera::NEAR };
+        Ok(Shot { name: name.to_owned(), image, source, time: None, depth: None })
+    }
+}
