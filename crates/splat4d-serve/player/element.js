@@ -157,7 +157,7 @@ export class Splat4D extends HTMLElement {
   get player() { return this.#player; }
   get face() { return this.#ui; }
   get paused() { return !this.#player?.playing; }
-  get currentTime() { return this.#player?.shown ?? 0; }
+  get currentTime() { return this.#player?.time ?? 0; }
   set currentTime(t) { this.seek(t); }
   get duration() { return this.#player?.duration ?? 0; }
   get statistics() { return this.#player?.statistics; }
