@@ -30,7 +30,7 @@ const modulo = (x, n) => ((x % n) + n) % n;
 
 /// Requests orders from an `Order` and says which of them are rendered.
 export class Schedule {
-  /// The order that is rendered from now on: {time, epoch, view}; null before the first one of a scene.
+  /// The newest order that is to be rendered: {time, epoch, view}; null before the first one of a scene.
   current = null;
   /// What the newest image shows: {time, epoch}.
   shown = null;
@@ -58,6 +58,7 @@ export class Schedule {
   want(wanted, now) {
     if (wanted.epoch !== this.#wanted?.epoch) this.#due = -Infinity;
     this.#wanted = wanted;
+    if (this.fresh && this.#rendered && this.#skips(this.current)) this.current = this.#rendered;
     if (now - this.#frameAt < SAME_FRAME) return;
     this.#interval = now - this.#frameAt || Infinity;
     this.#frameAt = now;
@@ -93,13 +94,19 @@ export class Schedule {
     return true;
   }
 
-  /// An order came. Returns whether it is rendered from now on: one that was requested ahead of a clock which jumped or
-  /// stopped meanwhile is not, but never twice in a row, so that a clock that keeps jumping is followed.
+  /// An order that was requested ahead of a clock which jumped or stopped meanwhile is not rendered; but never two in a row,
+  /// so that a clock that keeps jumping is followed.
+  #skips({ ahead, epoch }) {
+    if (!ahead || epoch === this.#wanted?.epoch || this.#skipped) return false;
+    this.#skipped = true;
+    return true;
+  }
+
+  /// An order came. Returns whether it is `current`, and rendered next. What the newest image was rendered from must be kept
+  /// until then: `want` may return to it.
   arrived(now) {
     const asked = this.#asked;
-    if (asked.generation < this.#least) return false;
-    this.#skipped = asked.ahead && asked.epoch !== this.#wanted?.epoch && !this.#skipped;
-    if (this.#skipped) return false;
+    if (asked.generation < this.#least || this.#skips(asked)) return false;
     this.current = { ...asked, took: now - asked.now };
     return true;
   }
@@ -116,6 +123,7 @@ export class Schedule {
       const sample = Math.min(now - current.now, OUTLIER * this.latency, LATENCY_MAX);
       if (current.ahead) this.latency += SMOOTH * (sample - this.latency);
       this.#rendered = current;
+      this.#skipped = false;
     }
     this.shown = { time: current.time, epoch: current.epoch };
   }

@@ -58,11 +58,13 @@ export class WebGL2Backend {
   /// Rows of dropped pages: [{row, count, generation}]. The order on the screen may still name them.
   #retired = [];
   #clip = [0, 0];
-  /// The worker's orders, in two textures in turn: `#front` is drawn, its first `#count` numbers.
+  /// The worker's orders, in two textures in turn: `#front` is rendered, its first `#count` numbers; the other one holds the
+  /// order that is rendered next, with its figures.
   #order;
   #orders = [0, 1].map(() => ({ texture: null, rows: 0 }));
   #front = 0;
   #count = 0;
+  #next = null;
   #schedule;
   /// What PROJECT_FRAGMENT writes, and what is blended: {frame, texture(s), …}.
   #splats = null;
@@ -371,11 +373,7 @@ export class WebGL2Backend {
       gl.bindTexture(gl.TEXTURE_2D, back.texture);
       gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ORDER_WIDTH, rows, gl.RED_INTEGER, gl.UNSIGNED_INT, order, 0);
     }
-    this.#front = 1 - this.#front;
-    this.#count = count;
-    Object.assign(this.stats, { active, drawn: count, sortMs: ms });
-    // What this order no longer names may be overwritten.
-    this.#retired = this.#retired.filter((r) => r.generation > generation || (this.#rows.give(r.row, r.count), false));
+    this.#next = { count, active, ms, generation };
     this.#schedule.ask(now);
     this.#wake();
     this.#onorder();
@@ -402,6 +400,7 @@ export class WebGL2Backend {
     if (!force && !schedule.fresh && look === this.#look) return false;
     this.#look = target ? null : look;
     const begin = performance.now();
+    if (schedule.fresh) this.#turn();
     if (schedule.current) schedule.rendered(begin);
     this.#timer.begin();
     const { width, height } = view;
@@ -423,6 +422,16 @@ export class WebGL2Backend {
     // Where the browser tells nothing, at least what giving the orders took.
     this.stats.drawMs = this.#timer.ms || performance.now() - begin;
     return true;
+  }
+
+  /// Takes up the order that came last.
+  #turn() {
+    const { count, active, ms, generation } = this.#next;
+    this.#front = 1 - this.#front;
+    this.#count = count;
+    Object.assign(this.stats, { active, drawn: count, sortMs: ms });
+    // What this order no longer names may be overwritten.
+    this.#retired = this.#retired.filter((r) => r.generation > generation || (this.#rows.give(r.row, r.count), false));
   }
 
   /// Gives `made` (a program that computes splats) the view, and the textures it reads.
