@@ -159,6 +159,7 @@ export class Splat4D extends HTMLElement {
   get paused() { return !this.#player?.playing; }
   get currentTime() { return this.#player?.time ?? 0; }
   set currentTime(t) { this.seek(t); }
+  get seeking() { return this.#player?.seeking ?? false; }
   get duration() { return this.#player?.duration ?? 0; }
   get statistics() { return this.#player?.statistics; }
   /** {position, quat (world from camera, wxyz), target, fov degrees}; setting takes any of them. */

@@ -718,7 +718,7 @@ export class Player extends EventTarget {
     await this.backend?.settled();
   }
 
-  link() { return linkText({ camera: this.camera, time: this.time, channel: this.channel, playing: this.playing }); }
+  link() { return linkText({ camera: this.camera, time: this.target, channel: this.channel, playing: this.playing }); }
 
   get statistics() {
     const { width, height } = this.canvas;

@@ -399,7 +399,7 @@ export class Interface {
   addKey() {
     const p = this.player;
     if (!p.file) return;
-    p.track.add(p.camera, p.still ? null : p.time);
+    p.track.add(p.camera, p.still ? null : p.target);
     this.toast(`Key ${p.track.keys.length} added`);
     this.refresh();
   }
