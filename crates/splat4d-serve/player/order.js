@@ -26,7 +26,7 @@ export class Order {
     this.#near = near;
     this.#onorder = onorder;
     try {
-      this.#worker = worker('sort.worker.js');
+      this.#worker = worker('sort.worker.js', () => new Worker(new URL('./sort.worker.js', import.meta.url)));
     } catch {
       return void this.#here();
     }

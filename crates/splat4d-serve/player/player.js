@@ -21,10 +21,8 @@ const SCALE_SOFTWARE = 0.5;
 const FLYING_MAX = 2, SLOW = 40;
 /** Pixel ratios above 2 cost a lot and show nothing. */
 const RATIO_MAX = 2;
-/** Longest that the first image waits for more than the coarsest tiers, ms: a sharp poster stays that long. */
+/** Longest that the first image of a scene waits for more than the coarsest tiers, ms: a poster or the last image is sharp. */
 const PATIENCE = 3000;
-/** Longest a reload keeps the old picture while pages of the new arrive, ms. */
-const HOLD_MAX = 1500;
 /** Seconds of a camera's way to a new place. */
 const GLIDE = 0.5;
 /** Longest step of the clock, s: a page that was blocked for longer goes on where it was. */
@@ -100,7 +98,9 @@ export class Player extends EventTarget {
   #told = { time: null };
   #xr = false;
   #starting = null;
+  /** The last image of the previous scene, and its time. */
   #still = null;
+  #stillTime = null;
 
   constructor(stage) {
     super();
@@ -141,7 +141,7 @@ export class Player extends EventTarget {
   get scale() { return this.resolution === 'auto' ? this.#pace.scale : this.resolution; }
 
   /** The second that the newest image shows; before the first one, where the clock is. */
-  get time() { return this.backend?.shown?.time ?? Math.min(this.clock, this.last); }
+  get time() { return this.backend?.shown?.time ?? this.#stillTime ?? Math.min(this.clock, this.last); }
   /** Whether the image of a jump of the clock is still to come. */
   get seeking() { return !!this.backend?.shown && this.backend.shown.epoch !== this.#epoch; }
 
@@ -170,6 +170,8 @@ export class Player extends EventTarget {
       if (run !== this.#run) return file.close();
       this.#adopt(file, { keep, start });
       if (!keep) this.#poster(file, run);
+      // What is there plays; that it is not all is an error all the same.
+      if (file.truncated) this.emit('trouble', { error: cutShort(file, source), lasting: true });
       this.figures.opened = performance.now() - began;
       await this.#firstPicture(run, began, keep);
       if (run === this.#run) this.emit('load', { meta: file.meta, milliseconds: this.figures.firstFrame });
@@ -189,7 +191,7 @@ export class Player extends EventTarget {
     this.meta = file.meta;
     if (!keep) this.labels = { colors: false, only: null };
     this.#attach();
-    this.#held = keep ? performance.now() + HOLD_MAX : 0;
+    this.#held = keep ? performance.now() + PATIENCE : 0;
     this.#epoch++;
     this.#coarseAt = 0;
     if (keep) this.clock = clamp(this.clock, this.first, this.last);
@@ -213,6 +215,7 @@ export class Player extends EventTarget {
     // A canvas can be copied only in the task that rendered it.
     if (!this.#stream || !this.canvas.width || !this.#paint(this.#paintedScale, { force: true })) return;
     this.#still?.remove();
+    this.#stillTime = this.time;
     const still = this.#still = document.createElement('canvas');
     [still.width, still.height] = [this.canvas.width, this.canvas.height];
     still.getContext('2d').drawImage(this.canvas, 0, 0);
@@ -265,6 +268,7 @@ export class Player extends EventTarget {
 
   fail(error, source) {
     this.#still?.remove();
+    this.#stillTime = null;
     const where = typeof source === 'string' ? source : source?.name;
     const told = error instanceof SceneError ? error : Object.assign(new SceneError(
       error.message || String(error), where ?? 'player',
@@ -421,7 +425,7 @@ export class Player extends EventTarget {
       this.#freeze();
       this.#stream?.destroy();
       this.#attach();
-      this.#held = performance.now() + HOLD_MAX;
+      this.#held = performance.now() + PATIENCE;
     }
     this.redraw();
     this.emit('labelschange', { colors: this.labels.colors, only: at < 0 ? null : only });
@@ -633,7 +637,10 @@ export class Player extends EventTarget {
     }
     this.#drawnAt = performance.now();
     // The image of the previous scene goes with the first one of the next.
-    if (!force) this.#still?.remove();
+    if (!force) {
+      this.#still?.remove();
+      this.#stillTime = null;
+    }
     this.#tellTime();
     return true;
   }
@@ -663,7 +670,7 @@ export class Player extends EventTarget {
 
   #tellTime() {
     const { time } = this;
-    if (this.#told.time === time) return;
+    if (!this.backend?.shown || this.#told.time === time) return;
     this.#told.time = time;
     this.emit('timeupdate', { time });
   }
@@ -751,6 +758,13 @@ export class Player extends EventTarget {
     this.file?.close();
     this.file = null;
   }
+}
+
+/** A file that ends before its length: an upload or a copy that broke off. */
+function cutShort({ bytesTotal, length }, source) {
+  const where = typeof source === 'string' ? source : source?.name;
+  return new SceneError(`The file is cut short: ${bytesTotal} of ${length} bytes are there, and some of its Gaussians are missing`,
+    where || 'the file', 'Copy or export it again.');
 }
 
 /** Whether WebGL says that it is computed on the CPU. */

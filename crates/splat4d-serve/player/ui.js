@@ -125,6 +125,11 @@ export class Interface {
     for (const name of ['play', 'pause', 'ratechange', 'channelchange', 'labelschange', 'film', 'mode', 'backend']) {
       on(name, () => this.refresh());
     }
+    on('scene', () => {
+      // What lies behind the scene, also where a poster leaves it free and before the first image.
+      const back = p.background ?? p.meta.background;
+      this.stage.style.background = `rgb(${back.map(x => Math.round(255 * clamp(x, 0, 1)))})`;
+    });
     on('scene', () => { this.notice.replaceChildren(); this.refresh(); this.#showTime(); });
     on('progress', () => this.#progress());
     on('waiting', () => this.#progress());
