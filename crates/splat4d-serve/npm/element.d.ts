@@ -24,7 +24,10 @@ export class Splat4D extends HTMLElement {
   pause(): void;
   seek(seconds: number): void;
   step(frames: number): void;
+  /** The second that is shown; set it to seek. */
   currentTime: number;
+  /** The frame of the last seek is still to come. */
+  readonly seeking: boolean;
   readonly duration: number;
   readonly paused: boolean;
   get camera(): CameraState;
@@ -32,7 +35,7 @@ export class Splat4D extends HTMLElement {
   set scene(source: File | Blob | ArrayBuffer);
   /** Labels as colours, or the label with this name alone. */
   setLabels(show: { colors?: boolean; only?: string | null }): void;
-  screenshot(): Promise<Blob>;
+  screenshot(): Promise<Blob & { time: number }>;
   settled(): Promise<void>;
   readonly link: string;
   readonly statistics: Record<string, unknown>;

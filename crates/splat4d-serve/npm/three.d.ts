@@ -1,10 +1,12 @@
-import { Mesh } from 'three';
+import { Matrix4, Mesh } from 'three';
 
 export interface Splat4DOptions {
   /** A better picture can be drawn: pages came, or a new order. */
   onchange?: () => void;
   /** Bytes of Gaussians that stay in memory. */
   budget?: number;
+  /** The object's axis that points up as the file's up does; null keeps the file's axes. 'y' where left out. */
+  up?: 'x' | 'y' | 'z' | null;
 }
 
 /** A moving scene of Gaussians as an object of three.js; works with WebGLRenderer. */
@@ -14,11 +16,22 @@ export class Splat4D extends Mesh {
   /** The file's metadata, once `ready` is. */
   readonly meta: { clip: [number, number]; fps: number; up: [number, number, number]; title?: string } | null;
   readonly ready: Promise<void>;
-  /** Second on the scene's clock. */
+  /** Where the clock is, s. Set it each frame, or play. */
   time: number;
+  /** The second that the newest image shows. */
+  readonly renderedTime: number;
+  play(): void;
+  /** Stops at the image that is shown. */
+  pause(): void;
+  readonly paused: boolean;
+  loop: boolean;
+  /** 0.1 to 4. */
+  speed: number;
+  /** Takes positions of the file to the object's. */
+  readonly objectFromFile: Matrix4;
   readonly duration: number;
   readonly drawn: number;
-  /** Resolves when this moment is loaded and in the order of the last picture. */
+  /** Resolves when `time` is loaded and the next image shows it. */
   settled(): Promise<void>;
   dispose(): void;
 }

@@ -8,6 +8,7 @@ import * as THREE from 'three';
 import { NEAR } from './player/camera.js';
 import { BATCH, CHANNELS, ORDER_WIDTH, SPLAT } from './player/glsl.js';
 import { Order } from './player/order.js';
+import { Follower, Schedule, advance } from './player/schedule.js';
 import { SceneFile } from './player/scene-file.js';
 import { Stream } from './player/stream.js';
 import { BLOCKS_WIDTH, J_MARGIN, WIDTH, blockTexels, corners, paletteTexels } from './player/texels.js';
@@ -16,6 +17,12 @@ import { Rows } from './player/gl.js';
 const { ROW } = globalThis.splat4dSort;
 /// Rows of the words' texture to begin with.
 const FIRST_ROWS = 32;
+/// Longest step of a playing clock, s: a page that was hidden goes on where it was.
+const STEP_MAX = 1;
+const SPEED_RANGE = [0.1, 4];
+const AXES = { x: [1, 0, 0], y: [0, 1, 0], z: [0, 0, 1] };
+/// Stands for a clock that waits for pages: no other time can be rendered.
+const HOLD = () => null;
 
 // The picture's rows go up here, so that `focal.y` is negative; `origin`: where the viewport begins.
 const VERTEX =
@@ -74,7 +81,22 @@ export class Splat4D extends THREE.Mesh {
   meta = null;
   /// A promise: the index is read and `meta` is there. Rejects where there is no such file, or it is damaged.
   ready;
+  /// Whether it begins again at the end; played once, it stops at the last frame.
+  loop = true;
+  /// Takes what the file calls up, once it is open, to the object's `up`; multiply a pose of the file by it.
+  objectFromFile = new THREE.Matrix4();
   #time = 0;
+  #playing = false;
+  #speed = 1;
+  /// The frame of the renderer that the clock was last moved for, and when, ms.
+  #frame = -1;
+  #now = NaN;
+  /// Jumps and stops of the clock: its own, and those of a page that sets `time`.
+  #epoch = 0;
+  #follower = new Follower();
+  #schedule;
+  /// The order that is rendered next: {order, count, generation}.
+  #next = {};
   #file = null;
   #stream = null;
   #order;
@@ -90,8 +112,9 @@ export class Splat4D extends THREE.Mesh {
   #scratch = { view: new THREE.Matrix4(), viewport: new THREE.Vector4(), rows: new Float64Array(12) };
 
   /// `source`: an address, File, Blob or ArrayBuffer. `onchange()` is called when a better picture can be drawn: pages came,
-  /// or a new order; whoever draws on demand draws then. `budget`: bytes of Gaussians that stay in memory.
-  constructor(source, { onchange = () => {}, budget } = {}) {
+  /// or a new order; whoever draws on demand draws then. `budget`: bytes of Gaussians that stay in memory. `up`: the object's
+  /// axis ('x', 'y', 'z') that points up as the file's up does; null keeps the file's axes.
+  constructor(source, { onchange = () => {}, budget, up = 'y' } = {}) {
     const geometry = new THREE.InstancedBufferGeometry();
     geometry.setIndex(new THREE.BufferAttribute(corners(), 1));
     geometry.instanceCount = 0;
@@ -123,23 +146,75 @@ export class Splat4D extends THREE.Mesh {
     this.frustumCulled = false;
     this.#onchange = onchange;
     this.#order = new Order(NEAR, (answer) => this.#ordered(answer));
+    this.#schedule = new Schedule(this.#order);
     this.ready = SceneFile.open(source).then((file) => {
       if (this.#gone) return file.close();
       this.#file = file;
       this.meta = file.meta;
       this.#time ||= file.meta.clip[0];
+      if (up) {
+        const [from, to] = [file.meta.up, AXES[up]].map((axis) => new THREE.Vector3(...axis).normalize());
+        this.objectFromFile.makeRotationFromQuaternion(new THREE.Quaternion().setFromUnitVectors(from, to));
+      }
       this.#stream = new Stream(file, this, { ...(budget ? { budget } : {}), onchange: () => this.#onchange() });
       this.#onchange();
     });
     this.ready.catch(() => {});
   }
 
-  /// Second on the scene's clock, `meta.clip[0]` to `meta.clip[1]`; outside it is clamped.
+  /// Where the clock is, s: `meta.clip[0]` to `meta.clip[1]`, outside it is clamped. Set it each frame, or `play()`.
   get time() {
     return this.#time;
   }
   set time(t) {
     this.#time = t;
+    if (this.#playing) this.#epoch++;
+  }
+
+  /// The second that the newest image shows: a frame is rendered at the time that its order was computed for.
+  get renderedTime() {
+    return this.#schedule.shown?.time ?? this.#time;
+  }
+
+  /// Plays by itself from now on, as often as it is rendered.
+  play() {
+    if (this.#playing) return;
+    const [first, last] = this.meta?.clip ?? [0, Infinity];
+    if (!this.loop && this.#time >= last) this.#time = first;
+    this.#playing = true;
+    this.#now = NaN;
+    this.#epoch++;
+  }
+
+  /// Stops at the image that is shown.
+  pause() {
+    this.#anchor();
+    this.#playing = false;
+  }
+
+  get paused() {
+    return !this.#playing;
+  }
+
+  /// Speed of `play()`, 0.1 to 4.
+  get speed() {
+    return this.#speed;
+  }
+  set speed(x) {
+    this.#anchor();
+    this.#speed = Math.min(Math.max(+x || 1, SPEED_RANGE[0]), SPEED_RANGE[1]);
+  }
+
+  /// The playing clock goes on from what is shown: images that were requested ahead are not rendered.
+  #anchor() {
+    if (!this.#playing) return;
+    const { shown } = this.#schedule;
+    if (shown?.epoch === this.#epochs) this.#time = shown.time;
+    this.#epoch++;
+  }
+
+  get #epochs() {
+    return this.#epoch + this.#follower.epoch;
   }
 
   /// Seconds that it lasts; 0 until it is open.
@@ -152,11 +227,16 @@ export class Splat4D extends THREE.Mesh {
     return this.#drawn;
   }
 
-  /// Resolves when the pages of this moment are there and their order is that of the last picture.
+  /// Resolves when the pages of `time` are there and the next image shows it, seen as in the last one.
   async settled() {
     await this.ready;
     await this.#stream?.settled(this.#time);
-    while (!this.#gone && this.#ask()) await new Promise((done) => this.#waiting.push(done));
+    const [first, last] = this.meta.clip;
+    while (!this.#gone) {
+      this.#want(Math.min(Math.max(this.#time, first), last), null, performance.now());
+      if (!this.#schedule.ask(performance.now())) return;
+      await new Promise((done) => this.#waiting.push(done));
+    }
   }
 
   dispose() {
@@ -175,15 +255,15 @@ export class Splat4D extends THREE.Mesh {
   onBeforeRender = (renderer, _scene, camera) => {
     if (!this.#stream) return;
     const { meta } = this,
-      u = this.material.uniforms;
-    const t = Math.min(Math.max(this.#time, meta.clip[0]), meta.clip[1]);
-    this.#stream.update(t);
+      u = this.material.uniforms,
+      now = performance.now();
+    this.#tick(renderer.info.render.frame, now);
     // Camera axes x right, y down, z forward; the object may be turned, moved and scaled, alike in all directions.
-    const view = this.#scratch.view.multiplyMatrices(camera.matrixWorldInverse, this.matrixWorld),
+    const view = this.#scratch.view.multiplyMatrices(camera.matrixWorldInverse, this.matrixWorld).multiply(this.objectFromFile),
       e = view.elements,
       m = this.#scratch.rows;
     for (let row = 0; row < 3; row++) for (let k = 0; k < 4; k++) m[4 * row + k] = (row ? -1 : 1) * e[4 * k + row];
-    this.#ask();
+    const shown = this.#follow(now);
     u.rotation.value.set(m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10]);
     u.translation.value.set(m[3], m[7], m[11]);
     u.eye.value.setFromMatrixPosition(view.invert());
@@ -204,18 +284,69 @@ export class Splat4D extends THREE.Mesh {
     // Depth as the projection makes it of z: (P22 z + P23) / -z with z = -depth.
     u.depth_row.value.set(p[10], p[14]);
     u.near.value = Math.max(camera.near, NEAR);
-    u.time.value = t - meta.clip[0];
+    u.time.value = shown - meta.clip[0];
     this.material.uniformsNeedUpdate = true;
   };
 
-  #ask() {
-    const [from, to] = this.meta.clip;
-    return this.#order.ask(Math.min(Math.max(this.#time, from), to), this.#scratch.rows);
+  /// Moves the clock, once for all views of a frame.
+  #tick(frame, now) {
+    if (frame === this.#frame) return;
+    this.#frame = frame;
+    const { clip } = this.meta;
+    if (!this.#playing) return this.#follower.set(this.#time, now, clip);
+    const step = Math.min((now - this.#now) / 1000 || 0, STEP_MAX);
+    this.#now = now;
+    if (!this.#stream.playable(this.#time)) return;
+    const { time, ended } = advance(this.#time, step * this.#speed, this.#clip);
+    this.#time = time;
+    if (ended) this.#playing = false;
+  }
+
+  get #clip() {
+    const { clip, fps } = this.meta;
+    return { first: clip[0], last: clip[1], frameTime: 1 / (fps || 30), loop: this.loop };
+  }
+
+  /// Requests the next order and returns the second that this image shows, which is that of the newest order.
+  #follow(now) {
+    const { clip } = this.meta,
+      [first, last] = clip,
+      time = Math.min(Math.max(this.#time, first), last);
+    const ahead = this.#playing
+      ? (ms) => advance(this.#time, ((ms - this.#now) / 1000) * this.#speed, this.#clip).time
+      : this.#follower.at(clip);
+    this.#stream.update(time, { playing: !!ahead, speed: this.#speed, loop: this.loop });
+    const at = ahead && ((ms) => ((t) => (this.#stream.playable(t) ? t : null))(Math.min(ahead(ms), last)));
+    this.#want(time, this.#stream.playable(time) ? at : HOLD, now);
+    if (this.#schedule.fresh) this.#turn();
+    if (this.#schedule.current) this.#schedule.rendered(now);
+    this.#schedule.ask(now);
+    return this.#schedule.current?.time ?? time;
+  }
+
+  #want(time, at, now) {
+    this.#schedule.want({ time, at, epoch: this.#epochs, view: { cameraFromWorld: this.#scratch.rows } }, now);
   }
 
   #ordered({ order, count, generation }) {
     if (this.#gone) return;
-    const u = this.material.uniforms,
+    const now = performance.now(),
+      accepted = this.#schedule.arrived(now);
+    if (accepted) {
+      // The order goes back to the worker.
+      if (!(this.#next.order?.length >= order.length)) this.#next.order = new Uint32Array(order.length);
+      this.#next.order.set(order.subarray(0, count));
+      Object.assign(this.#next, { count, generation });
+    }
+    this.#schedule.ask(now);
+    for (const done of this.#waiting.splice(0)) done();
+    if (accepted) this.#onchange();
+  }
+
+  /// Takes up the order that came last.
+  #turn() {
+    const { order, count, generation } = this.#next,
+      u = this.material.uniforms,
       rows = Math.max(Math.ceil(count / ORDER_WIDTH), 1);
     if (u.order.value.image.height < rows) {
       u.order.value.dispose();
@@ -227,8 +358,6 @@ export class Splat4D extends THREE.Mesh {
     this.geometry.instanceCount = Math.ceil(count / BATCH);
     // What this order no longer names may be overwritten.
     this.#retired = this.#retired.filter((r) => r.generation > generation || (this.#rows.give(r.row, r.count), false));
-    for (const done of this.#waiting.splice(0)) done();
-    this.#onchange();
   }
 
   // The stream gives pages to whoever draws them.

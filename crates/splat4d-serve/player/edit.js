@@ -114,7 +114,7 @@ export class Editing {
 
   /** Whether nothing is asked for, and the scene is that of the list. */
   get idle() { return !this.#busy && !this.#standing && !this.overlay.shows; }
-  get time() { return this.player.shown; }
+  get time() { return this.player.time; }
   get steps() { return this.history.steps; }
   get step() { return this.steps[this.active]; }
   /** The steps before the one that is being set, or all: what selections are of. */

@@ -53,6 +53,11 @@ export class Splat4D extends HTMLElement {
     for (const name of EVENTS) {
       player.addEventListener(name, e => this.dispatchEvent(new CustomEvent(name, { detail: e.detail })));
     }
+    // What is wrong with the file for good is an error for the page as well; what only takes another try is not.
+    player.addEventListener('trouble', ({ detail: { error, lasting } }) => {
+      const { what, where, remedy } = error;
+      if (lasting) this.dispatchEvent(new CustomEvent('error', { detail: { error, what, where, remedy } }));
+    });
     player.addEventListener('scene', () => {
       ui.setTitle(this.getAttribute('heading') ?? player.meta.title ?? this.#scene?.name);
     });
@@ -157,8 +162,9 @@ export class Splat4D extends HTMLElement {
   get player() { return this.#player; }
   get face() { return this.#ui; }
   get paused() { return !this.#player?.playing; }
-  get currentTime() { return this.#player?.shown ?? 0; }
+  get currentTime() { return this.#player?.time ?? 0; }
   set currentTime(t) { this.seek(t); }
+  get seeking() { return this.#player?.seeking ?? false; }
   get duration() { return this.#player?.duration ?? 0; }
   get statistics() { return this.#player?.statistics; }
   /** {position, quat (world from camera, wxyz), target, fov degrees}; setting takes any of them. */

@@ -1,13 +1,13 @@
-// The order in which Gaussians are drawn, asked of a worker; on this thread where the page may start none.
+// The order in which Gaussians are rendered, computed by a worker; on this thread where the page may start none.
 
 import { worker } from './assets.js';
 import './sort.worker.js';
 
 const { Sorter } = globalThis.splat4dSort;
 
-/// One order is on its way at a time; what is asked meanwhile waits for the next.
+/// One order is on its way at a time. schedule.js decides which one is requested and when.
 export class Order {
-  /// Counts pages that came and went, and masks; an order carries the number it knew.
+  /// Counts pages that came and went, and masks; an order carries the number it was computed with.
   generation = 0;
   /// Whether an order is on its way.
   busy = false;
@@ -17,18 +17,16 @@ export class Order {
   #sorter = null;
   /// [message, what moves with it], until the worker says that it runs: a page's policy may forbid workers.
   #early = [];
-  #asked = { time: NaN, depth: [NaN, 0, 0, 0], generation: -1 };
-  #request;
   /// The array that goes back and forth.
   #array = null;
 
-  /// `onorder({order, count, active, ms, generation})`: the first `count` of `order` are the visible Gaussians, the
-  /// farthest first; it is valid during the call only.
+  /// `onorder({order, count, active, ms, generation})`: the first `count` of `order` are the Gaussians that are visible at
+  /// the requested time, the farthest first; it is valid during the call only.
   constructor(near, onorder) {
-    this.#request = { time: 0, depth: [0, 0, 0, 0], near };
+    this.#near = near;
     this.#onorder = onorder;
     try {
-      this.#worker = worker('sort.worker.js');
+      this.#worker = worker('sort.worker.js', () => new Worker(new URL('./sort.worker.js', import.meta.url)));
     } catch {
       return void this.#here();
     }
@@ -62,24 +60,13 @@ export class Order {
     this.#tell({ page, mask: { keys, rows, stride } }, [keys.buffer, rows.buffer]);
   }
 
-  /// Asks for the order at `time` seen by `m` (camera from world, 3x4), where the last one asked for is not that one.
-  /// Returns whether one is on its way.
+  /// Requests the order at `time` seen by `m` (camera from world, 3x4); none may be on its way.
   ask(time, m) {
-    if (this.busy) return true;
-    const { depth } = this.#asked;
-    let same = this.#asked.time === time && this.#asked.generation === this.generation;
-    for (let k = 0; k < 4; k++) same &&= depth[k] === m[8 + k];
-    if (same) return false;
-    this.#asked.generation = this.generation;
-    for (const o of [this.#asked, this.#request]) {
-      o.time = time;
-      for (let k = 0; k < 4; k++) o.depth[k] = m[8 + k];
-    }
     this.busy = true;
-    const array = this.#array;
+    const array = this.#array,
+      sort = { time, depth: [m[8], m[9], m[10], m[11]], near: this.#near };
     this.#array = null;
-    this.#tell({ sort: this.#request, generation: this.generation, order: array }, array ? [array.buffer] : []);
-    return true;
+    this.#tell({ sort, generation: this.generation, order: array }, array ? [array.buffer] : []);
   }
 
   destroy() {

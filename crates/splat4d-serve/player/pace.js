@@ -17,6 +17,64 @@ const GAIN = 1.1;
 /** Share of the newest frame in the mean. */
 const SMOOTH = 0.15;
 
+/** Images that the graphics processor works on, and how long it took for the newest finished one. */
+export class Flight {
+  count = 0;
+  ms = 0;
+  #begun = [];
+  #ended = 0;
+
+  begin(now) {
+    this.#begun.push(now);
+    this.count++;
+  }
+
+  /** The oldest is finished; the time that it waited behind another does not count. */
+  end(now) {
+    this.ms = now - Math.max(this.#begun.shift(), this.#ended);
+    this.#ended = now;
+    this.count--;
+  }
+}
+
+/** Share of a slower frame in the cost of its scale; a faster one counts at once: what was slow before was something else. */
+const SLOWER = 0.2;
+
+/** What a frame costs at a scale: milliseconds that every frame takes, and others that grow with the pixels. */
+export class Cost {
+  /** scale → ms. */
+  #seen = new Map();
+  #newest = 0;
+
+  /** A frame at `scale` took `ms`. */
+  record(scale, ms) {
+    const mean = this.#seen.get(scale);
+    this.#seen.set(scale, ms < (mean ?? Infinity) ? ms : mean + SLOWER * (ms - mean));
+    this.#newest = scale;
+  }
+
+  /** Milliseconds at `scale`; 0 where nothing is known. */
+  at(scale) {
+    const [here, perPixel] = this.#line();
+    return here + perPixel * (scale ** 2 - this.#newest ** 2);
+  }
+
+  /** The largest scale, 1 at most and `least` at least, at which a frame takes `ms`. */
+  within(ms, least) {
+    const [here, perPixel] = this.#line();
+    if (!(perPixel > 0)) return 1;
+    return Math.min(1, Math.max(least, Math.sqrt(Math.max(0, (ms - here) / perPixel + this.#newest ** 2))));
+  }
+
+  /** Milliseconds at the newest scale, and how they grow; of a single scale all of it is taken to be the pixels'. */
+  #line() {
+    const scale = this.#newest, here = this.#seen.get(scale) ?? 0;
+    const far = [...this.#seen.keys()].reduce((a, b) => (Math.abs(b - scale) > Math.abs(a - scale) ? b : a), scale);
+    if (far === scale) return [here, scale ? here / scale ** 2 : 0];
+    return [here, Math.max(0, (this.#seen.get(far) - here) / (far ** 2 - scale ** 2))];
+  }
+}
+
 export class Pace {
   scale = 1;
   /** Mean milliseconds of a frame. */

@@ -1,11 +1,12 @@
-// The player without a face: clock, camera, streaming, choice of the backend, resolution and figures. It draws only
-// when something has changed.
+// The player without a face: clock, camera, streaming, choice of the backend, resolution and figures. It renders only
+// when something has changed. `clock` runs; `time` is what the newest image shows (schedule.js).
 
 import { Camera, NEAR, bounds, clamp, datasetCamera, dot, add, firstCamera, linkText } from './camera.js';
 import { Controls } from './controls.js';
-import { Pace } from './pace.js';
+import { Cost, Pace } from './pace.js';
 import { SceneError } from './errors.js';
 import { SceneFile } from './scene-file.js';
+import { advance } from './schedule.js';
 import { Stream } from './stream.js';
 import { Track } from './track.js';
 
@@ -13,20 +14,28 @@ export const CHANNELS = ['color', 'depth', 'alpha', 'flow'];
 export const SPEED_RANGE = [0.1, 4];
 /** Where pictures are drawn without a GPU, the first one should not take seconds either. */
 const SCALE_SOFTWARE = 0.5;
-/** Pictures that may be on their way in WebGPU's queue: more would only be shown later. */
-const FLYING_MAX = 2;
+/**
+ * Images that the graphics processor may work on: more would only be shown later. Two keep a fast one busy; where one takes
+ * longer than `SLOW`, ms, the second would only make what follows late.
+ */
+const FLYING_MAX = 2, SLOW = 40;
 /** Pixel ratios above 2 cost a lot and show nothing. */
 const RATIO_MAX = 2;
-/** Share of a moment's Gaussians below which playing waits: the most important tier makes a fair picture. */
-const ENOUGH = 0.25;
-/** Longest a reload keeps the old picture while pages of the new arrive, ms. */
-const HOLD = 1500;
+/** Longest that the first image of a scene waits for more than the coarsest tiers, ms: a poster or the last image is sharp. */
+const PATIENCE = 3000;
 /** Seconds of a camera's way to a new place. */
 const GLIDE = 0.5;
-/** Longest step of the clock, s: a tab that slept goes on where it was. */
-const STEP_MAX = 0.25;
-/** A still picture is refined twice: after a rest, ms, as far as one drawing should take at most so long, ms. */
-const REFINE = [[300, 400], [1500, 4000]];
+/** Longest step of the clock, s: a page that was blocked for longer goes on where it was. */
+const STEP_MAX = 1;
+/**
+ * An image at rest is rendered at full resolution: at once when the clock stops, so long after the last move, ms. Where one
+ * frame would take longer than `AT_ONCE`, a quick one of `FIRST_STEP` comes first, and the next so long after it, ms.
+ */
+const REST = 150, AT_ONCE = 1000, FIRST_STEP = 400, NEXT_STEP = 300;
+/** What changed: only what is shown, or that something moves as well, which then counts as not at rest. */
+const CONTENT = 1, MOTION = 2;
+/** Stands for a clock that waits for pages: no other time can be rendered. */
+const HOLD = () => null;
 /** A move of half the picture's height in a second shows at full strength in the flow view. */
 const FLOW_SHARE = 0.5;
 /** Beyond this share of the way to what is looked at nothing is cut off. */
@@ -44,8 +53,10 @@ export class Player extends EventTarget {
   labels = { colors: false, only: null };
   background = null;
   state = 'empty';
-  time = 0;
+  /** Where the clock is, s; the image follows it (`time`). */
+  clock = 0;
   playing = false;
+  /** The clock stands because pages of its time are missing. */
   waiting = false;
   loop = true;
   meta = null;
@@ -66,17 +77,17 @@ export class Player extends EventTarget {
   #stream = null;
   #run = 0;
   #abort = null;
-  #dirty = true;
-  /** How often the still picture was refined. */
-  #refined = 0;
-  #dirtyAt = 0;
+  #dirty = MOTION;
+  /** When something last moved, and whether the quick image of one at rest is rendered. */
+  #movedAt = 0;
+  #quick = false;
   #paintedScale = 0;
-  #flying = 0;
-  #awake = 0;
-  #due = 0;
-  /** Milliseconds that a picture at full resolution would take. */
-  #cost = 0;
+  #cost = new Cost();
   #drawnAt = 0;
+  /** Jumps and stops of the clock. */
+  #epoch = 0;
+  /** When the coarsest tiers of the first image were there. */
+  #coarseAt = 0;
   #last = 0;
   #glide = null;
   #held = 0;
@@ -87,7 +98,9 @@ export class Player extends EventTarget {
   #told = { time: null };
   #xr = false;
   #starting = null;
+  /** The last image of the previous scene, and its time. */
   #still = null;
+  #stillTime = null;
 
   constructor(stage) {
     super();
@@ -104,8 +117,8 @@ export class Player extends EventTarget {
     this.resizes.observe(stage);
     this.sight = new IntersectionObserver(list => { this.#seen = list.at(-1).isIntersecting; this.redraw(); });
     this.sight.observe(stage);
-    // Frames that a hidden tab left out were not slow.
-    this.sleeps = () => { this.#interval = this.#awake = 0; };
+    // Frames that a hidden tab left out were not slow, and its clock stood.
+    this.sleeps = () => { this.#interval = this.#last = 0; };
     document.addEventListener('visibilitychange', this.sleeps);
     const loop = now => { this.#frame = requestAnimationFrame(loop); this.#tick(now); };
     this.#frame = requestAnimationFrame(loop);
@@ -121,12 +134,22 @@ export class Player extends EventTarget {
   get still() { return this.duration <= 0; }
   get speed() { return this.#speed; }
   set speed(x) {
+    this.#stop();
     this.#speed = clamp(+x || 1, ...SPEED_RANGE);
     this.emit('ratechange');
   }
   get scale() { return this.resolution === 'auto' ? this.#pace.scale : this.resolution; }
 
-  redraw() { this.#dirty = true; }
+  /** The second that the newest image shows; before the first one, where the clock is. */
+  get time() { return this.backend?.shown?.time ?? this.#stillTime ?? Math.min(this.clock, this.last); }
+  /** Whether the image of a jump of the clock is still to come. */
+  get seeking() { return !!this.backend?.shown && this.backend.shown.epoch !== this.#epoch; }
+
+  /** Where the image is or will be next: what a step or a slider goes on from. */
+  get target() { return this.seeking ? this.clock : this.time; }
+
+  /** Renders again, as something that moves; `what` CONTENT: as it is. */
+  redraw(what = MOTION) { this.#dirty = Math.max(this.#dirty, what); }
 
   // Loading.
 
@@ -147,6 +170,8 @@ export class Player extends EventTarget {
       if (run !== this.#run) return file.close();
       this.#adopt(file, { keep, start });
       if (!keep) this.#poster(file, run);
+      // What is there plays; that it is not all is an error all the same.
+      if (file.truncated) this.emit('trouble', { error: cutShort(file, source), lasting: true });
       this.figures.opened = performance.now() - began;
       await this.#firstPicture(run, began, keep);
       if (run === this.#run) this.emit('load', { meta: file.meta, milliseconds: this.figures.firstFrame });
@@ -166,10 +191,12 @@ export class Player extends EventTarget {
     this.meta = file.meta;
     if (!keep) this.labels = { colors: false, only: null };
     this.#attach();
-    this.#held = keep ? performance.now() + HOLD : 0;
-    if (keep) this.time = clamp(this.time, this.first, this.last);
+    this.#held = keep ? performance.now() + PATIENCE : 0;
+    this.#epoch++;
+    this.#coarseAt = 0;
+    if (keep) this.clock = clamp(this.clock, this.first, this.last);
     else {
-      this.time = clamp(start.time ?? this.first, this.first, this.last);
+      this.clock = clamp(start.time ?? this.first, this.first, this.last);
       this.film = null;
       this.camera = firstCamera(this.meta);
       if (start.camera) this.camera.set(start.camera);
@@ -185,10 +212,10 @@ export class Player extends EventTarget {
 
   /** The picture of now stays over the canvas until the next scene has one of its own. */
   #freeze() {
-    if (!this.#stream || !this.canvas.width) return;
-    // A canvas can be copied only in the task that drew it.
-    this.#paint(this.scale);
+    // A canvas can be copied only in the task that rendered it.
+    if (!this.#stream || !this.canvas.width || !this.#paint(this.#paintedScale, { force: true })) return;
     this.#still?.remove();
+    this.#stillTime = this.time;
     const still = this.#still = document.createElement('canvas');
     [still.width, still.height] = [this.canvas.width, this.canvas.height];
     still.getContext('2d').drawImage(this.canvas, 0, 0);
@@ -202,7 +229,7 @@ export class Player extends EventTarget {
     const budget = matchMedia('(pointer: coarse)').matches ? { budget: 2 ** 27 } : {};
     this.#stream = new Stream(this.file, this.backend, {
       ...budget,
-      onchange: () => { this.redraw(); this.#bufferAt = 0; },
+      onchange: () => { this.redraw(CONTENT); this.#bufferAt = 0; },
       onerror: error => this.#pageFailed(error),
       onleft: gaussians => this.emit('leftout', { gaussians }),
       show: this.labels.colors || this.labels.only !== null ? this.labels : null,
@@ -229,7 +256,6 @@ export class Player extends EventTarget {
     }
     if (run !== this.#run || this.state === 'error') return;
     if (!keep) this.figures.firstFrame = performance.now() - began;
-    this.#still?.remove();
     this.#become('ready');
   }
 
@@ -242,6 +268,7 @@ export class Player extends EventTarget {
 
   fail(error, source) {
     this.#still?.remove();
+    this.#stillTime = null;
     const where = typeof source === 'string' ? source : source?.name;
     const told = error instanceof SceneError ? error : Object.assign(new SceneError(
       error.message || String(error), where ?? 'player',
@@ -288,13 +315,14 @@ export class Player extends EventTarget {
     for (const name of wanted) {
       const { canvas } = this;
       const onlost = reason => canvas === this.canvas && this.#lost(reason);
+      const onorder = () => this.redraw(CONTENT);
       try {
         if (name !== 'webgl2') {
           if (!navigator.gpu) throw new Error(isSecureContext ? 'not offered' : 'needs https or this computer');
           this.backend = await (await import('./webgpu.js')).WebGPUBackend.create(this.canvas, {
             onlost, hardware: name === 'card',
           });
-        } else this.backend = await (await import('./webgl2.js')).WebGL2Backend.create(this.canvas, { onlost });
+        } else this.backend = await (await import('./webgl2.js')).WebGL2Backend.create(this.canvas, { onlost, onorder });
         this.figures.fallback = reasons.join('; ');
         if (software(this.backend.gl)) this.#pace.scale = SCALE_SOFTWARE;
         return this.emit('backend', { name: this.backend.name });
@@ -330,7 +358,6 @@ export class Player extends EventTarget {
     this.#stream = null;
     const old = this.backend;
     this.backend = this.#starting = null;
-    this.#flying = 0;
     try { old?.destroy(); } catch { /* A lost device may refuse; it is gone anyway. */ }
     this.#newCanvas();
     try {
@@ -344,27 +371,40 @@ export class Player extends EventTarget {
 
   play() {
     if (this.still || !this.file) return;
-    if (!this.loop && this.time >= this.last - 1e-6) this.seek(this.first);
+    if (!this.loop && this.clock >= this.last - 1e-6) this.seek(this.first);
     if (!this.playing) { this.playing = true; this.emit('play'); }
   }
 
+  /** Stops at the image that is shown. */
   pause() {
-    if (this.playing) { this.playing = false; this.emit('pause'); }
-    this.waiting = false;
+    if (!this.playing) return;
+    this.#stop();
+    this.playing = false;
+    this.emit('pause');
+  }
+
+  /** The clock goes on from what is shown, if it goes on: images that were requested ahead are not rendered. */
+  #stop() {
+    if (!this.playing && !this.film) return;
+    if (!this.seeking) this.clock = this.time;
+    this.#epoch++;
+    this.#movedAt = -Infinity;
+    this.redraw(CONTENT);
   }
 
   toggle() { this.playing ? this.pause() : this.play(); }
 
   seek(time) {
     if (!isFinite(time)) return;
-    this.time = clamp(time, this.first, this.last);
+    this.clock = clamp(time, this.first, this.last);
+    this.#epoch++;
     this.redraw();
   }
 
   /** To the next frame's or an earlier frame's very time. */
   step(frames) {
     this.pause();
-    const at = Math.round((this.time - this.first) / this.frameTime);
+    const at = Math.round((this.target - this.first) / this.frameTime);
     this.seek(this.first + (at + frames) * this.frameTime);
   }
 
@@ -382,8 +422,10 @@ export class Player extends EventTarget {
     const at = this.meta?.labels.indexOf(only) ?? -1;
     this.labels = { colors: !!colors, only: at < 0 ? null : at };
     if (this.file && this.backend) {
+      this.#freeze();
       this.#stream?.destroy();
       this.#attach();
+      this.#held = performance.now() + PATIENCE;
     }
     this.redraw();
     this.emit('labelschange', { colors: this.labels.colors, only: at < 0 ? null : only });
@@ -448,12 +490,14 @@ export class Player extends EventTarget {
     if (!track) return;
     this.controls.still();
     this.#glide = null;
+    this.pause();
     this.film = { track, seconds: 0, frozen, back: this.camera.clone() };
-    if (frozen) this.pause();
+    this.#epoch++;
     this.emit('film');
   }
 
   stopFilm() {
+    if (!this.film?.frozen) this.#stop();
     this.film = null;
     this.emit('film');
   }
@@ -461,20 +505,12 @@ export class Player extends EventTarget {
   // A frame.
 
   #tick(now) {
-    const dt = Math.min((now - this.#last) / 1000, STEP_MAX);
+    const dt = this.#last ? Math.min((now - this.#last) / 1000, STEP_MAX) : 0;
     this.#last = now;
-    // A picture that takes long makes the next frame late, also one that the backend draws by itself.
-    const at = performance.now();
-    let gap = this.#awake ? at - this.#awake : 0;
-    this.#awake = at;
-    if (this.backend) gap = Math.max(gap, this.#graphicsMs);
-    this.#cost = Math.max(gap / (this.#paintedScale || 1) ** 2, this.#due ? this.#cost / 2 : this.#cost);
-    this.#due = 0;
     if (!this.file || !this.backend || !this.#stream || this.#xr || this.state === 'error') return;
     this.controls.tick(dt);
     this.#moveCamera(dt);
     this.#moveTime(dt);
-    this.#stream.update(this.time, { playing: this.playing, speed: this.#speed, loop: this.loop });
     this.#draw(now);
     this.#tell(now);
   }
@@ -489,89 +525,124 @@ export class Player extends EventTarget {
     }
     const film = this.film;
     if (!film) return;
-    film.seconds += dt;
+    if (!this.waiting) film.seconds += dt;
     const over = film.seconds >= film.track.seconds;
-    if (over && this.loop && film.track.seconds > 0) film.seconds %= film.track.seconds;
+    film.seconds = this.#filmSeconds(0);
     const { camera, sceneTime } = film.track.at(film.seconds);
     this.camera = camera;
     if (!film.frozen && sceneTime !== null) {
-      this.time = clamp(sceneTime, this.first, this.last);
+      this.clock = clamp(sceneTime, this.first, this.last);
       this.playing = false;
     }
     this.#cameraMoved();
-    if (over && !this.loop) this.stopFilm();
+    if (!over || this.loop) return;
+    // It ends at its end; what was requested ahead lies before it.
+    this.film = null;
+    this.emit('film');
+  }
+
+  /** Second of the film's path in `ahead` seconds. */
+  #filmSeconds(ahead) {
+    const { seconds, track } = this.film, t = seconds + ahead;
+    if (t < track.seconds) return t;
+    return this.loop && track.seconds > 0 ? t % track.seconds : track.seconds;
   }
 
   #moveTime(dt) {
-    if (!this.playing || this.state !== 'ready') return;
-    const waiting = this.#stream.ready(this.time) < ENOUGH;
+    this.#stream.update(this.clock, { playing: this.playing, speed: this.#speed, loop: this.loop });
+    const waiting = !this.#stream.playable(this.clock);
     if (waiting !== this.waiting) { this.waiting = waiting; this.emit('waiting', { waiting }); }
-    if (waiting) return;
-    let t = this.time + dt * this.#speed;
-    // The last frame is shown as long as the others.
-    const end = this.last + this.frameTime;
-    if (t >= end || (!this.loop && t >= this.last)) {
-      if (this.loop) t = this.first + (t - this.first) % (end - this.first);
-      else { t = this.last; this.pause(); this.emit('ended'); }
-    }
-    this.time = t;
+    if (!this.playing || waiting || this.state !== 'ready') return;
+    const { time, ended } = advance(this.clock, dt * this.#speed, this.#clip);
+    this.clock = time;
     this.redraw();
+    if (!ended) return;
+    this.playing = false;
+    this.emit('pause');
+    this.emit('ended');
   }
 
-  /** Time as it is shown: within the clip also while the last frame stands. */
-  get shown() { return Math.min(this.time, this.last); }
+  get #clip() { return { first: this.first, last: this.last, frameTime: this.frameTime, loop: this.loop }; }
+
+  /** Whether the clock runs, by itself or along a path. */
+  get #running() { return this.state === 'ready' && (this.playing || (!!this.film && !this.film.frozen)); }
+
+  /** Where the clock will be at `ms` of performance.now(); null where no image of that can be rendered yet. */
+  #ahead = ms => {
+    const seconds = Math.max(0, (ms - this.#last) / 1000);
+    const along = this.film && this.film.track.at(this.#filmSeconds(seconds)).sceneTime;
+    const t = this.film ? along ?? this.clock : advance(this.clock, seconds * this.#speed, this.#clip).time;
+    const time = clamp(t, this.first, this.last);
+    return this.#stream.playable(time) ? time : null;
+  };
 
   #draw(now) {
-    const ready = this.#stream.ready(this.time);
-    if (this.state === 'loading' && ready <= 0) return this.emit('progress', { ready });
+    const { waiting } = this, ready = this.#stream.ready(this.clock);
+    if (this.state === 'loading') {
+      if (!waiting) this.#coarseAt ||= now;
+      if (waiting || (ready < 0.999 && now - this.#coarseAt < PATIENCE)) return this.emit('progress', { ready });
+    }
     if (this.#held) {
-      if (ready < 0.999 && now < this.#held) return;
+      if (waiting || (ready < 0.999 && now < this.#held)) return;
       this.#held = 0;
       this.redraw();
     }
-    if (!this.#dirty) this.#refine(now);
-    if (!this.#dirty || !this.#seen) { this.#interval = 0; return; }
-    if (this.#flying >= FLYING_MAX) return;
-    this.#dirty = false;
-    this.#dirtyAt = now;
-    this.#refined = 0;
-    this.#measure(now);
-    this.#paint(this.scale);
+    if (!this.#seen) { this.#interval = 0; return; }
+    // While pages of the clock's time are missing, the last whole image stays.
+    if (waiting && !this.#stream.playable(this.time)) return;
+    const { count = 0, ms = 0 } = this.backend.flight ?? {};
+    if (count >= (ms > SLOW ? 1 : FLYING_MAX)) return;
+    const moving = this.playing || this.film || this.#glide || this.controls.busy;
+    if (moving || this.#dirty === MOTION) {
+      // A clock that stops later is at rest at once.
+      this.#movedAt = this.#dirty === MOTION && !this.playing ? now : -Infinity;
+      this.#quick = false;
+    }
+    const scale = moving ? this.scale : this.#restScale(now);
+    const dirty = this.#dirty || (scale > this.#paintedScale && !moving);
+    this.#dirty = 0;
+    if (dirty && this.#paint(scale) && moving) this.#measure(now);
+    if (!moving) this.#interval = 0;
   }
 
-  /** What stands still is shown better than what moves. */
-  #refine(now) {
-    const [rest, budget] = REFINE[this.#refined] ?? [Infinity];
-    const moving = this.playing || this.film || this.controls.busy;
-    if (this.resolution !== 'auto' || moving || now - this.#dirtyAt < rest || !this.#seen) return;
-    this.#refined++;
-    const scale = Math.min(1, Math.sqrt(budget / (this.#cost || 1)));
-    if (scale > this.#paintedScale) this.#paint(scale);
+  /** Share of the screen's pixels for an image that stands still. */
+  #restScale(now) {
+    const { scale } = this;
+    if (this.resolution !== 'auto' || now - this.#movedAt < REST) return scale;
+    const least = Math.max(scale, this.#paintedScale);
+    if (this.#cost.at(1) <= AT_ONCE) return 1;
+    if (this.#quick) return now - this.#drawnAt < NEXT_STEP ? this.#paintedScale : 1;
+    this.#quick = true;
+    return this.#cost.within(FIRST_STEP, least);
   }
 
-  #paint(scale) {
-    this.#paintedScale = scale;
+  /** Renders at a share of the screen's pixels; returns whether there was something to render. */
+  #paint(scale, { force = false } = {}) {
     const ratio = Math.min(devicePixelRatio || 1, RATIO_MAX) * scale;
     const { clientWidth, clientHeight } = this.stage;
-    if (!clientWidth || !clientHeight) return;
+    if (!clientWidth || !clientHeight) return false;
     const size = [clientWidth, clientHeight].map(x => Math.max(1, Math.round(x * ratio)));
+    const { backend } = this;
+    if (backend.flight?.ms && this.state === 'ready') this.#cost.record(this.#paintedScale, backend.flight.ms);
     if (this.#told.size !== size.join()) {
       this.#told.size = size.join();
-      this.backend.resize(...size);
+      backend.resize(...size);
     }
-    const { backend } = this;
-    try { backend.draw(this.drawing(...size)); } catch (error) { return this.#lost(error); }
-    if (backend.name === 'webgpu') {
-      this.#flying++;
-      backend.settled().catch(() => {}).then(() => { if (backend === this.backend) this.#flying--; });
+    this.#paintedScale = scale;
+    try {
+      if (backend.draw({ ...this.drawing(...size), force }) === false) return false;
+    } catch (error) {
+      this.#lost(error);
+      return false;
     }
-    this.#drawnAt = this.#due = performance.now();
-  }
-
-  /** What the newest picture took where the browser's frames do not show it: WebGPU's commands wait in a queue. */
-  get #graphicsMs() {
-    const { name, stats } = this.backend;
-    return name === 'webgpu' ? stats.drawMs + stats.sortMs : 0;
+    this.#drawnAt = performance.now();
+    // The image of the previous scene goes with the first one of the next.
+    if (!force) {
+      this.#still?.remove();
+      this.#stillTime = null;
+    }
+    this.#tellTime();
+    return true;
   }
 
   /** What a backend is told to draw now, at a size in px. */
@@ -581,8 +652,11 @@ export class Player extends EventTarget {
     // The capture's cameras saw no haze right before them. Who comes closer to look at something wants to see it.
     const least = this.meta.near ?? NEAR;
     const near = camera.lens ? least : Math.min(least, NEAR_SHARE * camera.distance);
+    // While pages are missing, what is shown stays, seen by the newest camera.
+    const { waiting } = this, time = waiting ? this.time : Math.min(this.clock, this.last);
+    const epoch = waiting ? this.backend.shown?.epoch : this.#epoch;
     return {
-      time: this.shown, view: { ...camera.view(width, height), near }, channel: this.channel,
+      time, epoch, at: waiting ? HOLD : this.#running ? this.#ahead : null, view: { ...camera.view(width, height), near }, channel: this.channel,
       background: this.background ?? this.meta.background,
       depthRange: [Math.max(middle - radius, 0.02 * radius), Math.max(middle, 0) + radius],
       flowScale: FLOW_SHARE * height,
@@ -590,16 +664,19 @@ export class Player extends EventTarget {
   }
 
   #measure(now) {
-    const ms = Math.max(now - this.#interval, this.#graphicsMs);
-    if (this.#interval && this.state === 'ready') this.#pace.frame(ms, now, this.resolution !== 'auto');
+    if (this.#interval && this.state === 'ready') this.#pace.frame(now - this.#interval, now, this.resolution !== 'auto');
     this.#interval = now;
   }
 
+  #tellTime() {
+    const { time } = this;
+    if (!this.backend?.shown || this.#told.time === time) return;
+    this.#told.time = time;
+    this.emit('timeupdate', { time });
+  }
+
   #tell(now) {
-    if (this.#told.time !== this.shown) {
-      this.#told.time = this.shown;
-      this.emit('timeupdate', { time: this.shown });
-    }
+    this.#tellTime();
     if (this.#told.camera) {
       this.#told.camera = false;
       this.emit('camerachange', { camera: this.camera.toJSON() });
@@ -607,7 +684,7 @@ export class Player extends EventTarget {
     if (now - this.#bufferAt > BUFFER_EVERY) {
       this.#bufferAt = now;
       this.#buffer();
-      this.emit('progress', { ready: this.#stream.ready(this.time) });
+      this.emit('progress', { ready: this.#stream.ready(this.clock) });
     }
   }
 
@@ -616,7 +693,7 @@ export class Player extends EventTarget {
     const out = [];
     for (let i = 0; i < BUFFER_POINTS && !this.still; i++) {
       const [a, b] = [i / BUFFER_POINTS, (i + 1) / BUFFER_POINTS];
-      if (this.#stream.ready(this.first + (a + b) / 2 * this.duration) < ENOUGH) continue;
+      if (!this.#stream.playable(this.first + (a + b) / 2 * this.duration)) continue;
       if (out.at(-1)?.[1] === a) out.at(-1)[1] = b;
       else out.push([a, b]);
     }
@@ -625,36 +702,38 @@ export class Player extends EventTarget {
 
   // What others ask for.
 
-  /** A PNG of the picture, as shown but always at full resolution. */
+  /** A PNG of the image, as shown but always at full resolution; its `time` is the second that it shows. */
   async screenshot() {
     if (!this.file || !this.backend) {
       throw new SceneError('There is no picture yet', 'screenshot', 'Wait for the scene.');
     }
-    this.#paint(1);
+    this.#paint(1, { force: true });
     await this.backend.settled();
-    const { width, height, data } = await this.backend.readPixels();
+    // Meanwhile another image may have been rendered, at another resolution.
+    this.#paint(1, { force: true });
+    const { time } = this, { width, height, data } = await this.backend.readPixels();
     const canvas = new OffscreenCanvas(width, height);
     canvas.getContext('2d').putImageData(new ImageData(data, width, height), 0, 0);
     this.redraw();
-    return canvas.convertToBlob({ type: 'image/png' });
+    return Object.assign(await canvas.convertToBlob({ type: 'image/png' }), { time });
   }
 
-  /** Resolves when this moment is complete and drawn. */
+  /** Resolves when the clock's time is complete and rendered. */
   async settled() {
-    await this.#stream?.settled(this.time);
+    await this.#stream?.settled(this.clock);
     await new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)));
     await this.backend?.settled();
   }
 
-  link() { return linkText({ camera: this.camera, time: this.shown, channel: this.channel, playing: this.playing }); }
+  link() { return linkText({ camera: this.camera, time: this.target, channel: this.channel, playing: this.playing }); }
 
   get statistics() {
     const { width, height } = this.canvas;
     const { fps, frameMs } = this.#pace;
     return {
-      ...this.figures, fps, frameMs, atRest: performance.now() - this.#dirtyAt > 1000, ...this.backend?.stats,
+      ...this.figures, fps, frameMs, atRest: performance.now() - this.#drawnAt > 1000, ...this.backend?.stats,
       backend: this.backend?.name ?? null, width, height, scale: this.scale,
-      gaussians: this.meta?.gaussians ?? 0, ready: this.ready(this.time),
+      gaussians: this.meta?.gaussians ?? 0, ready: this.ready(this.clock),
       leftOut: this.#stream?.left ?? 0, bytesRead: this.file?.bytesRead ?? 0, bytesTotal: this.file?.bytesTotal ?? 0,
     };
   }
@@ -662,8 +741,9 @@ export class Player extends EventTarget {
   /** While a headset draws, the page does not. */
   set immersed(on) { this.#xr = on; this.#told.size = null; this.redraw(); }
   advance(dt) {
-    this.#moveTime(dt);
-    this.#stream?.update(this.time, { playing: this.playing, speed: this.#speed, loop: this.loop });
+    this.#last = performance.now();
+    if (this.#stream) this.#moveTime(dt);
+    this.#tellTime();
   }
 
   destroy() {
@@ -678,6 +758,13 @@ export class Player extends EventTarget {
     this.file?.close();
     this.file = null;
   }
+}
+
+/** A file that ends before its length: an upload or a copy that broke off. */
+function cutShort({ bytesTotal, length }, source) {
+  const where = typeof source === 'string' ? source : source?.name;
+  return new SceneError(`The file is cut short: ${bytesTotal} of ${length} bytes are there, and some of its Gaussians are missing`,
+    where || 'the file', 'Copy or export it again.');
 }
 
 /** Whether WebGL says that it is computed on the CPU. */

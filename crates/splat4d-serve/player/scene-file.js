@@ -74,7 +74,8 @@ class Decoder {
       return idle ?? this.#workers.reduce((a, b) => (b.load < a.load ? b : a));
     }
     try {
-      const lane = { worker: worker('decode.worker.js'), load: 0, proven: false };
+      const started = worker('decode.worker.js', () => new Worker(new URL('./decode.worker.js', import.meta.url)));
+      const lane = { worker: started, load: 0, proven: false };
       lane.worker.onmessage = ({ data: { ticket, result, error } }) => {
         lane.proven = true;
         lane.load--;
@@ -154,6 +155,8 @@ export class SceneFile {
 
   /// Length of the file, bytes.
   bytesTotal = 0;
+  /// Bytes that the file says it has: more than there are where it was cut short.
+  length = 0;
 
   /// Fetches, checks and decodes page `id`: {id, count, headers: Float32Array(24·blocks), words: Uint32Array(8·count),
   /// word w of Gaussian i at [8i + w]}.
@@ -247,6 +250,7 @@ export class SceneFile {
     }
     const indexBytes = view.getUint32(12, true);
     const length = long(view, 16);
+    this.length = length;
     this.growing = major === GROWING;
     const at = this.growing ? long(view, 28) : HEAD;
     this.bytesTotal = Math.min(length, this.#source.size);

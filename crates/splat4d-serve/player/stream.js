@@ -60,6 +60,9 @@ export class Stream {
   #over = false;
   #starts;
   #ends;
+  /// Pages of the coarsest tier of their span, and those of now that the budget has no room for.
+  #coarse;
+  #leftOut = new Set();
 
   /// `file`: SceneFile. `backend`: of PLAYER's interface; it owns the arrays it is given. `budget`: bytes of words.
   /// `onchange()` after each page that came or went, `onerror(SceneError)` for a page that is given up for now,
@@ -73,6 +76,12 @@ export class Stream {
     this.#onchange = onchange ?? (() => {});
     this.#onerror = onerror ?? (() => {});
     this.#onleft = onleft ?? (() => {});
+    const coarsest = new Map();
+    for (const { from, to, tier } of file.pages) {
+      const span = `${from} ${to}`;
+      coarsest.set(span, Math.min(tier, coarsest.get(span) ?? tier));
+    }
+    this.#coarse = new Set(file.pages.filter((p) => p.tier === coarsest.get(`${p.from} ${p.to}`)).map((p) => p.id));
     this.#starts = Float64Array.from(file.pages, (p) => p.from).sort();
     this.#ends = Float64Array.from(file.pages, (p) => p.to).sort();
   }
@@ -117,13 +126,26 @@ export class Stream {
   ready(time) {
     let all = 0,
       there = 0;
-    const t = this.#file.clamp(time);
-    const now = before(this.#starts, t) === this.#begun && before(this.#ends, t) === this.#ended;
-    for (const page of now ? this.#active : this.#file.activePages(t)) {
+    for (const page of this.#pagesOf(time)) {
       all += page.count;
       if (this.#resident.has(page.id)) there += page.count;
     }
     return all ? there / all : 1;
+  }
+
+  /// Whether an image of `time` would be whole: of every span the coarsest tier is resident, or it was given up, or the budget
+  /// has no room for it.
+  playable(time) {
+    return this.#pagesOf(time).every(({ id }) => {
+      if (!this.#coarse.has(id) || this.#resident.has(id) || this.#leftOut.has(id)) return true;
+      return this.#failed.get(id)?.tries >= TRIES;
+    });
+  }
+
+  #pagesOf(time) {
+    const t = this.#file.clamp(time);
+    const now = before(this.#starts, t) === this.#begun && before(this.#ends, t) === this.#ended;
+    return now ? this.#active : this.#file.activePages(t);
   }
 
   /// Resolves when all pages of `time` are resident, or given up, or more than the budget holds.
@@ -169,6 +191,7 @@ export class Stream {
     let room = this.#budget;
     const fits = (page) => (cost(page) <= room ? ((room -= cost(page)), true) : false);
     this.#now = now.filter(fits);
+    this.#leftOut = new Set(now.filter((page) => !this.#now.includes(page)).map((page) => page.id));
     const sum = (pages) => pages.reduce((n, page) => n + page.count, 0),
       left = sum(now) - sum(this.#now);
     if (left && !this.left) this.#onleft(left);

@@ -24,7 +24,7 @@ export const CSS = `
  border:2px solid var(--accent)}
 canvas{display:block}
 .stage>canvas{position:absolute;inset:0;width:100%;height:100%}
-.poster{position:absolute;inset:0;width:100%;height:100%;object-fit:contain;pointer-events:none;opacity:0;
+.poster{position:absolute;inset:0;width:100%;height:100%;object-fit:cover;pointer-events:none;opacity:0;
  transition:opacity .35s}
 .poster.on{opacity:1}
 button,select,input{font:inherit;color:inherit}

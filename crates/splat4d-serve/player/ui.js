@@ -115,6 +115,7 @@ export class Interface {
   #userSeek(time) {
     if (this.player.film && !this.player.film.frozen) this.player.stopFilm();
     this.player.seek(time);
+    this.#showTime();
   }
 
   #listen() {
@@ -124,6 +125,11 @@ export class Interface {
     for (const name of ['play', 'pause', 'ratechange', 'channelchange', 'labelschange', 'film', 'mode', 'backend']) {
       on(name, () => this.refresh());
     }
+    on('scene', () => {
+      // What lies behind the scene, also where a poster leaves it free and before the first image.
+      const back = p.background ?? p.meta.background;
+      this.stage.style.background = `rgb(${back.map(x => Math.round(255 * clamp(x, 0, 1)))})`;
+    });
     on('scene', () => { this.notice.replaceChildren(); this.refresh(); this.#showTime(); });
     on('progress', () => this.#progress());
     on('waiting', () => this.#progress());
@@ -195,9 +201,10 @@ export class Interface {
   }
 
   #showTime() {
-    const p = this.player, at = p.shown - p.first;
+    // The clock says what is shown; the slider is where it was put.
+    const p = this.player, at = p.target - p.first;
     const u = p.duration > 0 ? clamp(at / p.duration, 0, 1) : 0;
-    this.now.textContent = clock(at, p.duration);
+    this.now.textContent = clock(p.time - p.first, p.duration);
     this.end.textContent = ` / ${clock(p.duration)}`;
     this.done.style.width = this.knob.style.left = `${100 * u}%`;
     const from = p.meta?.predicted, predicted = Number.isFinite(from) && p.duration > 0;
@@ -206,7 +213,7 @@ export class Interface {
     const s = this.scrub;
     s.setAttribute('aria-valuemax', p.duration.toFixed(2));
     s.setAttribute('aria-valuenow', at.toFixed(2));
-    s.setAttribute('aria-valuetext', `${at.toFixed(2)} of ${p.duration.toFixed(2)} seconds${predicted && p.shown >= from ? ', predicted' : ''}`);
+    s.setAttribute('aria-valuetext', `${at.toFixed(2)} of ${p.duration.toFixed(2)} seconds${predicted && p.target >= from ? ', predicted' : ''}`);
   }
 
   #progress() {
@@ -221,7 +228,7 @@ export class Interface {
       this.there[i].style.left = `${100 * a}%`;
       this.there[i].style.width = `${100 * (b - a)}%`;
     });
-    const loading = p.state === 'loading', busy = loading || (p.waiting && p.playing);
+    const loading = p.state === 'loading', busy = loading || p.waiting;
     if (busy && !this.busySince) this.busySince = performance.now();
     if (!busy) this.busySince = 0;
     this.ring.hidden = !busy || performance.now() - this.busySince < QUICK;
@@ -375,7 +382,7 @@ export class Interface {
   async screenshot() {
     try {
       const name = (this.title.textContent || 'scene').replace(/[^\w-]+/g, '-').toLowerCase();
-      save(await this.player.screenshot(), `${name}-${this.player.shown.toFixed(2)}s.png`);
+      save(await this.player.screenshot(), `${name}-${this.player.time.toFixed(2)}s.png`);
       this.toast('Picture saved');
     } catch (error) { this.toast(error.what ?? error.message, 2 * TOAST); }
   }
@@ -397,7 +404,7 @@ export class Interface {
   addKey() {
     const p = this.player;
     if (!p.file) return;
-    p.track.add(p.camera, p.still ? null : p.shown);
+    p.track.add(p.camera, p.still ? null : p.target);
     this.toast(`Key ${p.track.keys.length} added`);
     this.refresh();
   }
@@ -495,13 +502,13 @@ export class Interface {
   #scrubKey(key) {
     const p = this.player, steps = { PageDown: -1, PageUp: 1 };
     if (!(key in steps)) return false;
-    this.#userSeek(p.shown + steps[key] * p.duration / 10);
+    this.#userSeek(p.target + steps[key] * p.duration / 10);
     return true;
   }
 
   #actions() {
     const p = this.player;
-    const seek = way => this.#userSeek(p.shown + way * Math.min(SEEK, p.duration / 10));
+    const seek = way => this.#userSeek(p.target + way * Math.min(SEEK, p.duration / 10));
     const faster = way => {
       const list = way > 0 ? SPEEDS : [...SPEEDS].reverse();
       p.speed = list.find(s => (s - p.speed) * way > 1e-6) ?? clamp(p.speed, ...SPEED_RANGE);

@@ -1,4 +1,5 @@
-// The WebGL2 backend: words in textures, order from a worker, blending in half floats where that is to be had.
+// The WebGL2 backend: words in textures, order from a worker, blending in half floats where that is to be had. Every image
+// shows the time that its order was computed for (schedule.js).
 
 import { NEAR } from './camera.js';
 import { SceneError } from './errors.js';
@@ -15,6 +16,8 @@ import {
   SHOW_VERTEX,
 } from './glsl.js';
 import { Order } from './order.js';
+import { Flight } from './pace.js';
+import { Schedule } from './schedule.js';
 import './sort.worker.js';
 import { BLOCKS_WIDTH, J_MARGIN, WIDTH, blockTexels, corners, paletteTexels } from './texels.js';
 
@@ -24,9 +27,10 @@ const { ROW } = globalThis.splat4dSort;
 const FIRST_ROWS = 256;
 
 export class WebGL2Backend {
-  /// Throws SceneError where WebGL2 is not to be had. `onlost(SceneError)` is called when the browser takes it away.
-  static async create(canvas, { onlost } = {}) {
-    return new WebGL2Backend(canvas, onlost);
+  /// Throws SceneError where WebGL2 is not to be had. `onlost(SceneError)` is called when the browser takes it away,
+  /// `onorder()` when the next `draw` has something new to show.
+  static async create(canvas, { onlost, onorder } = {}) {
+    return new WebGL2Backend(canvas, onlost, onorder);
   }
 
   name = 'webgl2';
@@ -34,6 +38,7 @@ export class WebGL2Backend {
   #canvas;
   #gl;
   #lost;
+  #onorder;
   #destroyed = false;
   /// Programs: {program, at: places of uniforms}. `#project` is null where every corner computes its splat.
   #project = null;
@@ -53,29 +58,33 @@ export class WebGL2Backend {
   /// Rows of dropped pages: [{row, count, generation}]. The order on the screen may still name them.
   #retired = [];
   #clip = [0, 0];
-  /// The worker's orders, in two textures in turn: `#front` is drawn, its first `#count` numbers.
+  /// The worker's orders, in two textures in turn: `#front` is rendered, its first `#count` numbers; the other one holds the
+  /// order that is rendered next, with its figures.
   #order;
   #orders = [0, 1].map(() => ({ texture: null, rows: 0 }));
   #front = 0;
   #count = 0;
-  /// Orders of an earlier scene carry a smaller generation.
-  #least = 0;
+  #next = null;
+  #schedule;
   /// What PROJECT_FRAGMENT writes, and what is blended: {frame, texture(s), …}.
   #splats = null;
   #sums;
   #timer;
+  /// Images that are being rendered, and what says that they are finished.
+  #flight = new Flight();
+  #fences = [];
   #size = [0, 0];
   /// Vertex arrays: none at all, and quads; the latter's corners.
   #empty;
   #quads;
   #corners;
-  /// What the last `draw` was given, whether something came since that picture, and the frame that will show it.
+  /// What the last `draw` was given, and the look of the newest image; null where that must be rendered again anyway.
   #last = null;
-  #stale = false;
-  #frame = 0;
+  #look = null;
   #waiting = [];
 
-  constructor(canvas, onlost) {
+  constructor(canvas, onlost, onorder = () => {}) {
+    this.#onorder = onorder;
     const options = {
       alpha: false,
       antialias: false,
@@ -124,6 +133,7 @@ export class WebGL2Backend {
     gl.bindVertexArray(null);
     this.#timer = new Timer(gl);
     this.#order = new Order(NEAR, (answer) => this.#ordered(answer));
+    this.#schedule = new Schedule(this.#order);
     check(gl, 'The graphics memory did not suffice to begin');
   }
 
@@ -138,9 +148,24 @@ export class WebGL2Backend {
     this.#palettes.clear();
     this.#paletteRows = 0;
     this.#clip = meta.clip;
-    this.#last = null;
+    this.#last = this.#look = null;
     this.#count = 0;
-    this.#least = this.#order.generation;
+    this.#schedule.reset();
+  }
+
+  /// What the newest image shows: {time, epoch}; null before the first one of the scene.
+  get shown() {
+    return this.#schedule.shown;
+  }
+
+  /// Images that the graphics processor still works on: {count, ms: what the newest finished one took}.
+  get flight() {
+    const gl = this.#gl;
+    while (this.#fences.length && gl.clientWaitSync(this.#fences[0], 0, 0) !== gl.TIMEOUT_EXPIRED) {
+      gl.deleteSync(this.#fences.shift());
+      this.#flight.end(performance.now());
+    }
+    return this.#flight;
   }
 
   /// `palette`: of SceneFile.palette.
@@ -196,14 +221,12 @@ export class WebGL2Backend {
     this.#pages.set(id, { row, rows, count });
     this.stats.resident += count;
     this.#order.add(page, entry, row);
-    this.#refresh();
   }
 
   /// `mask`: of SceneFile.mask, the key masks of a resident page; its arrays are the backend's from now on.
   addMask(id, mask) {
     if (!this.#pages.has(id)) return;
     this.#order.mask(id, mask);
-    this.#refresh();
   }
 
   dropPage(id) {
@@ -213,7 +236,6 @@ export class WebGL2Backend {
     this.stats.resident -= page.count;
     this.#order.drop(id);
     this.#retired.push({ row: page.row, count: page.rows, generation: this.#order.generation });
-    this.#refresh();
   }
 
   /// Size of the drawing buffer, px.
@@ -222,31 +244,35 @@ export class WebGL2Backend {
     [width, height] = [Math.max(width, 1), Math.max(height, 1)];
     this.#canvas.width = width;
     this.#canvas.height = height;
+    this.#look = null;
     this.#room(width, height);
   }
 
-  /// Draws with the newest order there is, and asks for a better one where time or camera moved. `target` {framebuffer,
-  /// x, y}: where the picture goes instead of the canvas (a headset's). `background` null: nothing, premultiplied.
-  draw({ time, view, channel = 'color', background = [0, 0, 0], depthRange = [0, 1], flowScale = 100, target = null }) {
-    this.#last = {
-      time: Math.min(Math.max(time, this.#clip[0]), this.#clip[1]),
-      view,
-      channel,
-      background,
-      depthRange,
-      flowScale,
-      target,
-    };
-    this.#ask();
-    this.#redraw();
+  /// Renders the newest order at its time with the newest camera, and requests the next one: `time`, `at` and `epoch` are
+  /// what Schedule.want takes. Returns false where there is nothing new to show, or no order yet; `force` renders what there
+  /// is in any case. `target` {framebuffer, x, y}: where the image goes instead of the canvas (a headset's). `background`
+  /// null: nothing, premultiplied.
+  draw({
+    time, at = null, epoch = 0, view, channel = 'color', background = [0, 0, 0], depthRange = [0, 1], flowScale = 100,
+    target = null, force = false,
+  }) {
+    const clamped = (t) => (t === null ? t : Math.min(Math.max(t, this.#clip[0]), this.#clip[1]));
+    const now = performance.now();
+    this.#last = { view, channel, background, depthRange, flowScale, target, moving: !!at };
+    this.#schedule.want({ time: clamped(time), at: at && ((ms) => clamped(at(ms))), epoch, view }, now);
+    // First the order that is there: the request that follows takes the newest latency and camera.
+    const drawn = this.#redraw(force || !!target);
+    this.#schedule.ask(now);
+    return drawn;
   }
 
-  /// Resolves when the picture of the last `draw` is in its final order.
+  /// Resolves when the image of the last `draw` is there in its final order; while a clock runs, the next image.
   async settled() {
-    while (this.#last && !this.#destroyed && !this.#gl.isContextLost() && this.#ask()) {
+    while (this.#last && !this.#destroyed && !this.#gl.isContextLost() && this.#schedule.ask(performance.now())) {
       await new Promise((done) => this.#waiting.push(done));
+      if (this.#last?.moving && this.#schedule.fresh) break;
     }
-    if (this.#stale) this.#redraw();
+    this.#redraw(false);
   }
 
   /// The picture of the last `draw`: {width, height, data: RGBA bytes, rows from the top}.
@@ -254,7 +280,7 @@ export class WebGL2Backend {
     const gl = this.#gl,
       [width, height] = this.#size;
     const data = new Uint8ClampedArray(width * height * 4);
-    if (!this.#last || gl.isContextLost()) return { width, height, data };
+    if (!this.#last || !this.shown || gl.isContextLost()) return { width, height, data };
     const target = texture(gl, gl.RGBA8, width, height),
       frame = gl.createFramebuffer();
     gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
@@ -270,7 +296,6 @@ export class WebGL2Backend {
   destroy() {
     this.#destroyed = true;
     this.#order.destroy();
-    cancelAnimationFrame(this.#frame);
     this.#wake();
     this.#canvas.removeEventListener('webglcontextlost', this.#lost);
     const gl = this.#gl;
@@ -328,12 +353,13 @@ export class WebGL2Backend {
 
   // Order
 
-  #ask() {
-    return this.#order.ask(this.#last.time, this.#last.view.cameraFromWorld);
-  }
-
   #ordered({ order, count, active, ms, generation }) {
+    const now = performance.now();
     if (this.#gl.isContextLost()) return this.#wake();
+    if (!this.#schedule.arrived(now)) {
+      this.#schedule.ask(now);
+      return this.#wake();
+    }
     const gl = this.#gl,
       back = this.#orders[1 - this.#front],
       rows = Math.ceil(count / ORDER_WIDTH);
@@ -347,62 +373,72 @@ export class WebGL2Backend {
       gl.bindTexture(gl.TEXTURE_2D, back.texture);
       gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ORDER_WIDTH, rows, gl.RED_INTEGER, gl.UNSIGNED_INT, order, 0);
     }
-    this.#front = 1 - this.#front;
-    this.#count = generation < this.#least ? 0 : count;
-    Object.assign(this.stats, { active, drawn: count, sortMs: ms });
-    // What this order no longer names may be overwritten.
-    this.#stale = true;
-    this.#retired = this.#retired.filter((r) => r.generation > generation || (this.#rows.give(r.row, r.count), false));
-    if (this.#last) this.#ask();
+    this.#next = { count, active, ms, generation };
+    this.#schedule.ask(now);
     this.#wake();
-    this.#refresh();
+    this.#onorder();
   }
 
   #wake() {
     for (const done of this.#waiting.splice(0)) done();
   }
 
-  /// Draws again at the next frame, where nobody else does before: a page arrived or a better order.
-  #refresh() {
-    if (!this.#last || this.#frame || this.#last.target) return;
-    this.#frame = requestAnimationFrame(() => {
-      this.#frame = 0;
-      if (this.#destroyed || !this.#last) return;
-      this.#ask();
-      this.#redraw();
-    });
-  }
+  // Images
 
-  // Pictures
-
-  #redraw() {
+  /// Renders the current order, unless the newest image shows it so already; `force`: in any case. Returns whether it did.
+  #redraw(force) {
     const last = this.#last,
-      gl = this.#gl;
-    if (!last || this.#destroyed || gl.isContextLost()) return;
-    if (this.#frame) cancelAnimationFrame(this.#frame);
-    this.#frame = 0;
-    this.#stale = false;
+      gl = this.#gl,
+      schedule = this.#schedule;
+    if (!last || this.#destroyed || gl.isContextLost()) return false;
+    const { target } = last;
+    // Without an order the canvas keeps its image; a headset's frame begins empty.
+    if (!schedule.current && !target) return false;
+    const view = schedule.current && !target ? schedule.viewOf(last.view) : last.view;
+    const look = [...view.cameraFromWorld, view.fx, view.fy, view.cx, view.cy, view.width, view.height, view.near,
+      last.channel, ...(last.background ?? []), ...last.depthRange, last.flowScale].join();
+    if (!force && !schedule.fresh && look === this.#look) return false;
+    this.#look = target ? null : look;
     const begin = performance.now();
+    if (schedule.fresh) this.#turn();
+    if (schedule.current) schedule.rendered(begin);
     this.#timer.begin();
-    const { view, target } = last,
-      { width, height } = view;
+    const { width, height } = view;
     if (this.#size[0] !== width || this.#size[1] !== height) this.#room(width, height);
-    if (this.#count && this.#project) this.#projected();
+    if (this.#count && this.#project) this.#projected(view);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.#sums.frame);
     gl.viewport(0, 0, width, height);
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT);
-    if (this.#count) this.#blend();
+    if (this.#count) this.#blend(view);
     this.#resolve(target?.framebuffer ?? null, target?.x ?? 0, target?.y ?? 0, height);
     this.#timer.end();
+    const fence = target ? null : gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    if (fence) {
+      this.#fences.push(fence);
+      this.#flight.begin(begin);
+      gl.flush();
+    }
     // Where the browser tells nothing, at least what giving the orders took.
     this.stats.drawMs = this.#timer.ms || performance.now() - begin;
+    return true;
+  }
+
+  /// Takes up the order that came last.
+  #turn() {
+    const { count, active, ms, generation } = this.#next;
+    this.#front = 1 - this.#front;
+    this.#count = count;
+    Object.assign(this.stats, { active, drawn: count, sortMs: ms });
+    // What this order no longer names may be overwritten.
+    this.#retired = this.#retired.filter((r) => r.generation > generation || (this.#rows.give(r.row, r.count), false));
   }
 
   /// Gives `made` (a program that computes splats) the view, and the textures it reads.
-  #look({ program, at }) {
+  #setView({ program, at }, view) {
     const gl = this.#gl,
-      { time, view, channel, depthRange, flowScale } = this.#last,
+      { channel, depthRange, flowScale } = this.#last,
+      { time } = this.#schedule.current,
       m = view.cameraFromWorld;
     const { width, height, fx, fy, cx, cy } = view;
     gl.useProgram(program);
@@ -439,7 +475,7 @@ export class WebGL2Backend {
   }
 
   /// Computes every splat of the order, a texel each.
-  #projected() {
+  #projected(view) {
     const gl = this.#gl,
       splats = this.#splats,
       rows = Math.ceil(this.#count / ORDER_WIDTH);
@@ -456,13 +492,13 @@ export class WebGL2Backend {
       gl.drawBuffers(points);
     }
     gl.viewport(0, 0, ORDER_WIDTH, rows);
-    this.#look(this.#project);
+    this.#setView(this.#project, view);
     gl.bindVertexArray(this.#empty);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
   /// Blends the splats over one another, the farthest first.
-  #blend() {
+  #blend(view) {
     const gl = this.#gl,
       { program, at } = this.#draw,
       [width, height] = this.#size;
@@ -471,7 +507,7 @@ export class WebGL2Backend {
       gl.uniform2f(at.size, width, height);
       ['shapes', 'places', 'tints'].forEach((name, i) => this.#bind(at, name, i, this.#splats.textures[i]));
     } else {
-      this.#look(this.#draw);
+      this.#setView(this.#draw, view);
     }
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);

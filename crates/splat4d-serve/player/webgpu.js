@@ -4,6 +4,7 @@
 
 import { NEAR } from './camera.js';
 import { SceneError } from './errors.js';
+import { Flight } from './pace.js';
 import { CULL, DRAW, PROJECT, RESIDENT, SHADE, SORT } from './shaders.js';
 import './sort.worker.js';
 
@@ -87,6 +88,11 @@ const SOFTWARE = /swiftshader|llvmpipe|lavapipe|software|basic render/i;
 export class WebGPUBackend {
   name = 'webgpu';
   stats = { resident: 0, active: 0, drawn: 0, sortMs: 0, drawMs: 0 };
+  /// What the newest image shows: {time, epoch}; null before the first one of the scene. Culling and sorting run on the GPU in
+  /// the frame that they are for, so that this is what `draw` was given.
+  shown = null;
+  /// Images that the graphics processor still works on.
+  flight = new Flight();
 
   #canvas; #context; #device; #queue; #format; #pipelines; #onlost;
   #error = null;
@@ -207,6 +213,7 @@ export class WebGPUBackend {
     this.#paletteUsed = 0;
     this.#runs = new Runs(this.#runs.size);
     this.stats.resident = 0;
+    this.shown = null;
     this.#changed();
   }
 
@@ -285,10 +292,11 @@ export class WebGPUBackend {
   }
 
   /// Culls and sorts only where view, time or pages changed, and blends only where anything did; the canvas is always
-  /// filled, because the browser may empty it once it was shown.
-  draw({ time, view, channel = 'color', background = [0, 0, 0], depthRange = [0, 1], flowScale = 1 }) {
-    if (this.#gone) return;
+  /// filled, because the browser may empty it once it was shown. Returns whether there is an image.
+  draw({ time, epoch = 0, view, channel = 'color', background = [0, 0, 0], depthRange = [0, 1], flowScale = 1 }) {
+    if (this.#gone) return false;
     const at = Math.min(Math.max(time, this.#meta.clip[0]), this.#meta.clip[1]);
+    this.shown = { time: at, epoch };
     this.#select(at);
     this.#writeFrame({ time: at, view, channel, background, depthRange, flowScale });
     const bits = this.#frameBits, last = this.#last;
@@ -318,6 +326,8 @@ export class WebGPUBackend {
     const measured = cull && this.#copyStats(encoder);
     const start = performance.now();
     this.#queue.submit([encoder.finish()]);
+    this.flight.begin(start);
+    this.#queue.onSubmittedWorkDone().catch(() => {}).then(() => this.flight.end(performance.now()));
     if (measured) this.#readStats(start);
     this.#drawnOnce = true;
     culled.valid = true;
@@ -325,6 +335,7 @@ export class WebGPUBackend {
       culled.channel = kind;
       culled.flowScale = flowScale;
     }
+    return true;
   }
 
   /// Resolves when the last picture is complete. Throws what the device complained about.

@@ -40,6 +40,7 @@ const FILES: &[(&str, &str)] = player![
     "player.js",
     "ranges.js",
     "scene-file.js",
+    "schedule.js",
     "shaders.js",
     "sort.worker.js",
     "stream.js",

@@ -146,6 +146,41 @@ test('a page that fails is tried again, then reported; the rest goes on', async 
   assert.equal(stream.ready(5.5), 2 / 3);
 });
 
+test('an image is whole when the coarsest tier of every span is there, or will not come', async () => {
+  const r = recorded(),
+    stream = new Stream(r.file, r.backend);
+  stream.update(5.5);
+  assert.equal(stream.playable(5.5), false);
+  // The root alone, half of all Gaussians and more, lacks whoever moves.
+  for (const id of [0, 1]) r.open.get(id)();
+  await r.tick();
+  assert.deepEqual([stream.playable(5.5), stream.ready(5.5)], [false, 2 / 3]);
+  r.open.get(7)();
+  await r.tick();
+  assert.deepEqual([stream.playable(5.5), stream.playable(6.5), stream.playable(15.5)], [true, false, false]);
+  await r.all();
+  assert.deepEqual([stream.playable(6.5), stream.playable(4.5)], [true, true], 'what lies ahead is asked in advance');
+  const fine = recorded(),
+    coarse = new Stream(fine.file, fine.backend);
+  coarse.update(5.5);
+  for (const id of [0, 7]) fine.open.get(id)();
+  await fine.tick();
+  assert.equal(coarse.playable(5.5), true, 'finer tiers may come later');
+  const failing = recorded(),
+    given = new Stream(failing.file, failing.backend);
+  failing.bad.add(7);
+  const settled = given.settled(5.5);
+  await failing.tick();
+  await failing.all();
+  await settled;
+  assert.equal(given.playable(5.5), true, 'a page that fails does not stop the clock for ever');
+  const small = recorded(),
+    tight = new Stream(small.file, small.backend, { budget: 32_000 });
+  tight.update(5.5);
+  await small.all();
+  assert.equal(tight.playable(5.5), true, 'nor one that the budget has no room for');
+});
+
 test('masks are asked for with their pages, which do not wait for them', async () => {
   const r = recorded(20, 2, true),
     stream = new Stream(r.file, r.backend);

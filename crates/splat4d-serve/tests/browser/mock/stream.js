@@ -17,6 +17,7 @@ export class Stream {
     }
   }
   ready(time) { return this.file.activePages(time).every(p => this.#here.has(p.id)) ? 1 : 0; }
+  playable(time) { return this.ready(time) === 1; }
   async settled(time) { while (!this.ready(time)) await new Promise(done => setTimeout(done, 10)); }
   destroy() {}
 }

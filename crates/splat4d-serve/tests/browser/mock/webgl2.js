@@ -11,12 +11,13 @@ export class WebGL2Backend {
     backend.g = canvas.getContext('2d', { willReadFrequently: true });
     return backend;
   }
-  setScene(meta) { this.meta = meta; this.stats.resident = 0; }
+  setScene(meta) { this.meta = meta; this.stats.resident = 0; this.shown = null; }
   addPalette() {}
   addPage(page) { this.stats.resident += page.count; }
   dropPage() {}
   resize(width, height) { Object.assign(this.canvas, { width, height }); }
-  draw({ time, view, channel, background }) {
+  draw({ time, epoch, view, channel, background }) {
+    this.shown = { time, epoch };
     const { g } = this, m = view.cameraFromWorld;
     const css = c => `rgb(${c.map(x => Math.round(255 * x)).join()})`;
     g.fillStyle = channel === 'color' ? css(background) : '#000';
