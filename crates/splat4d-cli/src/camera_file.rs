@@ -169,7 +169,10 @@ mod tests {
         assert_eq!(parse(&flat.to_string()).unwrap().0, camera);
         let mut words = good();
         let object = words.as_object_mut().unwrap();
-        [("w", "width"), ("h", "height")].map(|(key, word)| object.remove(key).map(|v| object.insert(word.into(), v)));
+        for (key, word) in [("w", "width"), ("h", "height")] {
+            let value = object.remove(key).unwrap();
+            object.insert(word.into(), value);
+        }
         assert_eq!(parse(&words.to_string()).unwrap().0, camera);
         words["w"] = json!(31);
         assert!(parse(&words.to_string()).unwrap_err().to_string().contains("\"width\" is 32"));

@@ -71,8 +71,10 @@ pub(crate) struct Work {
     order: Order,
     /// Whether this call began it.
     fresh: bool,
-    /// What draws while it is tuned. No part of the order: it may go on on another device.
+    /// Renders while it is tuned. Not part of the order: it may continue on another device.
     device: Device,
+    /// Image size at which playback is timed. Not part of the order: it changes no result.
+    size: [usize; 2],
 }
 
 impl Work {
@@ -87,7 +89,7 @@ impl Work {
         if found == Found::Unfinished && dir.join(ORDER).is_file() {
             return Self::opened(&dir, folder);
         }
-        let work = Self { dir, folder, order, fresh: true, device: Device::Cpu };
+        let work = Self { dir, folder, order, fresh: true, device: Device::Cpu, size: SIZE };
         work.save()?;
         Ok(work)
     }
@@ -95,6 +97,11 @@ impl Work {
     /// The same, tuned on this device.
     pub(crate) fn on(self, device: Device) -> Self {
         Self { device, ..self }
+    }
+
+    /// The same, with playback timed at this image size (width, height).
+    pub(crate) fn timed_at(self, size: [usize; 2]) -> Self {
+        Self { size, ..self }
     }
 
     /// The compression in a folder, to continue it. Errors: there is none.
@@ -116,7 +123,7 @@ impl Work {
                 .remedy("Begin anew: splat4d compress RUN.")
         })?;
         order.settings.check().map_err(|e| e.at(path.display()))?;
-        Ok(Self { dir: dir.to_owned(), folder, order, fresh: false, device: Device::Cpu })
+        Ok(Self { dir: dir.to_owned(), folder, order, fresh: false, device: Device::Cpu, size: SIZE })
     }
 
     fn save(&self) -> Result<()> {
@@ -164,7 +171,7 @@ impl Work {
         };
         if let (Some(before), Some(after)) = (before, after) {
             let told = self.compare(&source, &original, [&before, &after], &stop, console)?;
-            say(&told, console);
+            say(&told, self.size, console);
             files::write(&self.dir.join(COMPRESS), serde_json::to_string_pretty(&told)?.as_bytes())?;
             finish::amend(&self.dir, [("notes".into(), json!(console.warnings()))])?;
             console.written(&report::write(&Run::open(&self.dir)?)?);
@@ -195,7 +202,7 @@ impl Work {
         subjects.extend(plain.into_iter().map(What::File));
         subjects.extend(unpruned.iter().map(|(scene, _)| What::Scene(scene)));
         let subjects: Vec<Subject<'_>> = subjects.into_iter().map(|what| Subject { what, antialias: smooth }).collect();
-        let looks = looks_of(source, SIZE)?;
+        let looks = looks_of(source, self.size)?;
         let sides = in_turns(&subjects, &looks, &mut |done, total| console.phase("playing", done, total))?;
         console.clear();
         let mut sides = sides.into_iter();
@@ -414,7 +421,7 @@ fn steps(run: &Run) -> Vec<Step> {
 }
 
 /// Before and after in a few lines.
-fn say(told: &Compressed, console: &Console) {
+fn say(told: &Compressed, size: [usize; 2], console: &Console) {
     let fair = told.fair();
     let name = if told.unpruned.is_some() { "unpruned, as many steps more" } else { "before" };
     let line = |name: &str, side: &Side| {
@@ -429,8 +436,8 @@ fn say(told: &Compressed, console: &Console) {
             number(side.psnr_dynamic, 2),
             number(side.ssim, 4),
             side.fps,
-            SIZE[0],
-            SIZE[1],
+            size[0],
+            size[1],
         )
     };
     console.say(&line(name, fair));

@@ -219,13 +219,13 @@ fn in_words(gaps: &[(u64, u64)]) -> String {
 }
 
 /// Numbered folders with a frame in each, as `000/point_cloud.ply`.
-fn folders(folder: &Path) -> Vec<(u64, String)> {
+fn folders(folder: &Path) -> Vec<(u64, OsString)> {
     let Ok(entries) = std::fs::read_dir(folder) else { return Vec::new() };
     let frame = |entry: std::fs::DirEntry| {
         let name = entry.file_name().into_string().ok()?;
         let number = name[name.trim_end_matches(|c: char| c.is_ascii_digit()).len()..].parse().ok()?;
         let file = only_scene(&entry.path(), &endings())?;
-        Some((number, file.strip_prefix(folder).ok()?.to_str()?.to_owned()))
+        Some((number, file.strip_prefix(folder).ok()?.as_os_str().to_owned()))
     };
     entries.flatten().filter_map(frame).collect()
 }

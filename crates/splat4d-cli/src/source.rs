@@ -29,7 +29,6 @@ fn remedy() -> String {
     format!("Give a run folder, a scene.safetensors, a checkpoint, a .s4d, or a {others} file.")
 }
 
-
 /// A scene and where it came from.
 pub struct Source {
     pub scene: Scene<f32>,

@@ -57,7 +57,8 @@ pub(crate) fn open_archive(path: &Path, bytes: &[u8]) -> Result<Option<Source>> 
     }
     // macOS keeps a shadow of every file.
     let endings = dialect::extensions(|_| true);
-    let is_scene = |name: &&String| !name.starts_with("__MACOSX/") && endings.iter().any(|e| name.to_lowercase().ends_with(e));
+    let is_scene =
+        |name: &&String| !name.starts_with("__MACOSX/") && endings.iter().any(|e| name.to_lowercase().ends_with(e));
     let scenes: Vec<&String> = names.iter().filter(is_scene).collect();
     let name = match scenes[..] {
         [] => return Ok(None),

@@ -4,6 +4,7 @@ use crate::compressing::{Order, Work};
 use crate::console::Console;
 use crate::device::{self, Device};
 use crate::finish;
+use crate::paths::parse_size;
 use crate::run_folder::{self, Run};
 use splat4d::{Error, Result};
 use splat4d_train::compress::{Compression, Level, MOST_PRUNED};
@@ -70,6 +71,9 @@ pub(crate) struct Args {
     /// Only compress: no evaluation, no guard, no comparison, no report
     #[arg(long)]
     no_eval: bool,
+    /// Image size at which playback is timed [default: 800x800]
+    #[arg(long, value_name = "WxH", value_parser = parse_size)]
+    size: Option<[usize; 2]>,
     /// What draws while it is tuned; the rest is done by the CPU
     #[arg(long, value_enum, default_value = "cpu", help_heading = "What computes")]
     device: Device,
@@ -83,6 +87,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         Some(dir) => Work::reopen(dir)?,
         None => begin(args, console)?,
     };
+    let work = work.timed_at(args.size.unwrap_or(crate::measure::SIZE));
     work.on(device::to_train(args.device, console)).run(!args.no_eval, &args.measure, console)
 }
 

@@ -196,7 +196,23 @@ impl Args {
         let (time, fps, from, to) = (None, None, None, None);
         let (frames, force, up, sh, no_provenance) = (false, false, None, None, false);
         let (exact, world, linear) = (false, false, Vec::new());
-        Self { input, output, time, frames, force, fps, from, to, up, sh, no_provenance, exact, world, linear, spz_version }
+        Self {
+            input,
+            output,
+            time,
+            frames,
+            force,
+            fps,
+            from,
+            to,
+            up,
+            sh,
+            no_provenance,
+            exact,
+            world,
+            linear,
+            spz_version,
+        }
     }
 }
 

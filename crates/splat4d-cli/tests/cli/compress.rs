@@ -10,7 +10,7 @@ fn a_run_becomes_a_smaller_run_and_is_measured_before_and_after() {
     let run = work.path().join("run");
     train(&Capture::new(work.path()).write(), &run).ok();
     let dir = work.path().join("small");
-    let steps = ["--fine-tune", "8", "--guard", "0"];
+    let steps = ["--fine-tune", "8", "--guard", "0", "--size", "32x24"];
     let compress = |extra: &[&str]| splat4d(&["compress", str(&run)]).args(&steps).args(extra);
     let lines = compress(&["-o", str(&dir), "--prune", "0.5", "--unpruned", "--json"]).run().ok();
     let last: Value = serde_json::from_str(lines.lines().last().unwrap()).unwrap();
@@ -70,7 +70,7 @@ fn a_size_is_kept_or_refused_with_the_smallest_that_is_possible() {
     train(&Capture::new(work.path()).write(), &run).ok();
     let compress = |mb: &str, dir: &str| {
         let out = work.path().join(dir);
-        splat4d(&["compress", str(&run), "-o", str(&out), "--fine-tune", "4", "--max-mb", mb]).run()
+        splat4d(&["compress", str(&run), "-o", str(&out), "--fine-tune", "4", "--size", "32x24", "--max-mb", mb]).run()
     };
     let least = compress("0.001", "none").refused();
     assert!(least.contains("Give --max-mb at least"), "{least}");

@@ -17,12 +17,17 @@ fn bundled() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/knight")
 }
 
-/// Folders of pictures, cut out of the bundled capture.
+/// Folders of images, cut out of the bundled capture.
 fn filmed(to: &Path) {
-    for (name, begin) in CAMERAS {
+    filmed_by(&CAMERAS, FRAMES, to);
+}
+
+/// The same of some cameras and frames: tests of what follows from clocks and poses take few.
+fn filmed_by(cameras: &[(&str, usize)], frames: usize, to: &Path) {
+    for (name, begin) in cameras {
         let folder = to.join(name);
         std::fs::create_dir_all(&folder).unwrap();
-        for k in 0..FRAMES {
+        for k in 0..frames {
             let from = bundled().join(format!("images/{name}/{:04}.jpg", begin + k));
             std::fs::copy(from, folder.join(format!("{k:04}.jpg"))).unwrap();
         }
@@ -108,7 +113,7 @@ fn videos_with_sound_become_a_capture_whose_clocks_were_heard() {
     let (films, take) = (dir.path().join("films"), dir.path().join("take"));
     std::fs::create_dir_all(&films).unwrap();
     let taken = 20;
-    for (k, (name, begin)) in CAMERAS.iter().enumerate() {
+    for (k, (name, begin)) in CAMERAS[..5].iter().enumerate() {
         let wave = dir.path().join(format!("{name}.wav"));
         let seconds = taken as f64 / SLOW as f64;
         std::fs::write(&wave, heard(*begin as f64 / SLOW as f64, seconds, k as u64)).unwrap();
@@ -126,7 +131,7 @@ fn videos_with_sound_become_a_capture_whose_clocks_were_heard() {
     }
     splat4d(&["import", str(&films), "-o", str(&take), "--no-doctor"]).run().ok();
     let report = json_of(&take.join("import/report.json"));
-    for (k, (name, begin)) in CAMERAS.iter().enumerate() {
+    for (k, (name, begin)) in CAMERAS[..5].iter().enumerate() {
         let camera = &report["cameras"][k];
         let by: Vec<&str> = camera["by"].as_array().unwrap().iter().map(|v| v.as_str().unwrap()).collect();
         assert!(by.contains(&"sound"), "{name}: {by:?}");
@@ -170,9 +175,11 @@ fn a_calibration_places_cameras_and_clocks_are_found() {
     let dir = tempfile::tempdir().unwrap();
     let at = |name: &str| dir.path().join(name);
     let films = at("films");
-    filmed(&films);
-    let names: Vec<&str> = CAMERAS.iter().map(|c| c.0).collect();
-    let told = told();
+    // Four cameras: geometry needs three pairs to agree.
+    let cameras = &CAMERAS[..4];
+    filmed_by(cameras, FRAMES, &films);
+    let names: Vec<&str> = cameras.iter().map(|c| c.0).collect();
+    let told = told()[..4].to_vec();
     std::fs::write(at("calibration.toml"), toml(&told, &names)).unwrap();
     // A mask for each camera: its upper quarter does not count.
     std::fs::create_dir(at("masks")).unwrap();
@@ -199,7 +206,7 @@ fn a_calibration_places_cameras_and_clocks_are_found() {
             }
         }
         let report = json_of(&take.join("import/report.json"));
-        for (k, (name, begin)) in CAMERAS.iter().enumerate() {
+        for (k, (name, begin)) in cameras.iter().enumerate() {
             let row = &report["cameras"][k];
             let offset = |k: usize| report["cameras"][k]["offset"].as_f64().unwrap();
             let off = (offset(k) - offset(0)) * 30.0 - *begin as f64;
@@ -321,7 +328,7 @@ fn colmap_is_called_where_it_is_asked_for_and_its_model_is_taken() {
 fn clocks_that_nothing_confirms_are_refused_and_can_be_told() {
     let dir = tempfile::tempdir().unwrap();
     let (films, take) = (dir.path().join("films"), dir.path().join("take"));
-    filmed(&films);
+    filmed_by(&CAMERAS[1..4], 8, &films);
     let three: Vec<PathBuf> = ["cam07", "cam08", "cam09"].iter().map(|c| films.join(c)).collect();
     let import = |more: &[&str]| {
         let mut all = vec!["import"];

@@ -3,7 +3,8 @@
 use super::account::{Aspect, Remark, first_names};
 use super::preflight::Severity;
 use super::{
-    Capture, CaptureKind, CaptureOptions, Exif, Extent, FlowFile, Frame, HoldOut, PointCloud, RawFrame, Rig, Split, Take, Timing,
+    Capture, CaptureKind, CaptureOptions, Exif, Extent, FlowFile, Frame, HoldOut, PointCloud, RawFrame, Rig, Split,
+    Take, Timing,
 };
 use super::{evidence, lookup, masks, options, panorama, picture, pose};
 use splat4d::math::se3::{norm, normalize, sub};
@@ -479,7 +480,7 @@ fn check_masks(take: &Take, has_alpha: bool) -> Result<()> {
         if let Some(mask) = &frame.mask {
             // Its size is compared before its pixels are read: a small file may claim gigabytes of them.
             let header = picture::header(mask)?;
-            let sane = picture::check_not_larger("mask", (header.width, header.height), &frame.source);
+            let sane = picture::check_not_larger("mask", header.upright(), &frame.source);
             sane.map_err(|e| e.at(mask.display()))?;
         }
         match picture::any_foreground(frame.mask.as_deref().unwrap_or(&frame.image), frame.mask.is_none()) {

@@ -127,7 +127,7 @@ impl Map {
 
     fn picture(file: &DepthFile, source: &Camera) -> Result<Self> {
         let header = picture::header(&file.path)?;
-        let sane = picture::check_not_larger("depth map", (header.width, header.height), source);
+        let sane = picture::check_not_larger("depth map", header.upright(), source);
         sane.map_err(|e| e.at(file.path.display()))?;
         let raster = picture::decode(&file.path, None)?;
         let bad = |what: String| {

@@ -8,7 +8,10 @@ mod record3d;
 #[cfg(test)]
 mod tests;
 
+use super::account::Account;
+use super::convention::{Convention, Poses};
 use super::points::read_ply;
+use super::pose;
 use super::{CaptureKind, CaptureOptions, DepthFile, Extent, PointCloud, RawFrame, Split, Take, Timing, rig, sequence};
 use splat4d::math::Se3;
 use splat4d::scene::Camera;
@@ -53,6 +56,8 @@ struct Shot {
 /// What an export says besides its shots.
 struct Said {
     kind: CaptureKind,
+    /// What its poses are, as its program writes them.
+    convention: Convention,
     fps: Option<f64>,
     points: Option<PointCloud>,
     up: Option<[f64; 3]>,
@@ -60,10 +65,19 @@ struct Said {
     notes: Vec<String>,
 }
 
+/// `cam_from_world` of a camera-to-world matrix in OpenGL axes.
+fn opengl_pose(rows: &[[f64; 4]; 4]) -> Result<Se3> {
+    Convention::NERF.read_as(pose::checked(Se3::from_rows(rows))?, Poses::STATED)
+}
+
 /// The take of some shots: of one moving camera where they have times, else as their names say.
 fn take(root: &Path, mut shots: Vec<Shot>, said: Said, options: &CaptureOptions) -> Result<Take> {
-    let Said { kind, fps, points, up, mut warnings, mut notes } = said;
+    let Said { kind, convention, fps, points, up, mut warnings, mut notes } = said;
     let fps = options.fps.or(fps).unwrap_or(DEFAULT_FPS);
+    for shot in &mut shots {
+        let pose = &mut shot.source.cam_from_world;
+        *pose = convention.reread(pose, options.poses).map_err(|e| e.at(shot.image.display()))?;
+    }
     let timed = !shots.is_empty() && shots.iter().all(|s| s.time.is_some());
     shots.sort_by(|a, b| a.time.partial_cmp(&b.time).unwrap_or(std::cmp::Ordering::Equal).then(a.name.cmp(&b.name)));
     let names: Vec<&str> = shots.iter().map(|s| s.name.as_str()).collect();
@@ -108,6 +122,8 @@ fn take(root: &Path, mut shots: Vec<Shot>, said: Said, options: &CaptureOptions)
         labels: Vec::new(),
         warnings,
         notes,
+        account: Account::default(),
+        convention,
     })
 }
 

@@ -1,7 +1,7 @@
 //! JSON with named places: every error says which key of which file is wrong and, for a misspelt key, what was meant.
 
-use crate::files;
 use super::convention::Poses;
+use crate::files;
 use crate::text;
 use serde_json::Value;
 use splat4d::{Error, Result};

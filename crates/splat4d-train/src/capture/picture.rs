@@ -170,7 +170,7 @@ pub(super) fn check_not_larger(what: &str, size: (usize, usize), camera: &Camera
 /// stored picture.
 pub(super) fn decode_beside(path: &Path, what: &str, camera: &Camera) -> Result<Raster> {
     let header = header(path)?;
-    check_beside(path, what, (header.width, header.height), camera)?;
+    check_beside(path, what, header.upright(), camera)?;
     decode(path, None)
 }
 

@@ -262,39 +262,25 @@ fn cameras_that_are_held_out_do_not_count_for_the_plan() {
     assert_eq!([fixed("hold_out=none"), fixed("hold_out=camera=0,1")], [CAMERAS, CAMERAS - 2]);
 }
 
+/// One whole run on one thread; another is stopped on two threads at a random step and resumed on three.
 #[test]
-fn any_number_of_threads_gives_the_same_bytes() {
+fn neither_threads_nor_a_stop_at_any_step_change_a_byte() {
     let place = Place::new();
+    let on = |threads: usize| rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+    let [one, two, three] = [1, 2, 3].map(on);
     for (k, recipe) in recipes().iter().enumerate() {
-        for threads in 1..=3 {
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            pool.install(|| place.train(&format!("{k}-{threads}"), recipe)).unwrap();
-        }
-        for threads in 2..=3 {
-            assert!(place.scene(&format!("{k}-1")) == place.scene(&format!("{k}-{threads}")), "{k}, {threads} threads");
-        }
-    }
-}
-
-#[test]
-fn a_run_stopped_at_any_step_resumes_to_the_same_bytes() {
-    let place = Place::new();
-    for (k, recipe) in recipes().iter().enumerate() {
-        let whole = format!("{k}-whole");
-        place.train(&whole, recipe).unwrap();
-        for round in 0..2 {
-            let name = format!("{k}-{round}");
-            let at = 1 + Rng::new(8, "stop", k as u64).below(round, (STEPS - 2) * recipe.run.batch_size);
-            let stop = Arc::new(AtomicBool::new(false));
-            let (flag, steps) = (stop.clone(), at.div_ceil(recipe.run.batch_size));
-            let draw = meddled(move |n, _| flag.store(n >= at, Ordering::Relaxed));
-            let outcome = place.train_with(&name, recipe, draw, &stop, &mut |_| {}).unwrap();
-            assert!(outcome.interrupted && outcome.iteration == steps, "{outcome:?}");
-            assert!(!place.run(&name).join("scene.safetensors").exists(), "a stopped run has no scene yet");
-            assert!(!resume_quietly(&place.run(&name)).unwrap().interrupted);
-            assert!(place.scene(&name) == place.scene(&whole), "recipe {k} stopped after {steps} steps");
-            assert_eq!(place.metrics(&name), place.metrics(&whole), "recipe {k} stopped after {steps} steps");
-        }
+        let (whole, name) = (format!("{k}-whole"), format!("{k}-stopped"));
+        one.install(|| place.train(&whole, recipe)).unwrap();
+        let at = 1 + Rng::new(8, "stop", k as u64).below(0, (STEPS - 2) * recipe.run.batch_size);
+        let stop = Arc::new(AtomicBool::new(false));
+        let (flag, steps) = (stop.clone(), at.div_ceil(recipe.run.batch_size));
+        let draw = meddled(move |n, _| flag.store(n >= at, Ordering::Relaxed));
+        let outcome = two.install(|| place.train_with(&name, recipe, draw, &stop, &mut |_| {})).unwrap();
+        assert!(outcome.interrupted && outcome.iteration == steps, "{outcome:?}");
+        assert!(!place.run(&name).join("scene.safetensors").exists(), "a stopped run has no scene yet");
+        assert!(!three.install(|| resume_quietly(&place.run(&name))).unwrap().interrupted);
+        assert!(place.scene(&name) == place.scene(&whole), "recipe {k} stopped after {steps} steps");
+        assert_eq!(place.metrics(&name), place.metrics(&whole), "recipe {k} stopped after {steps} steps");
     }
 }
 

@@ -2,7 +2,6 @@
 //! file, and [`DIALECTS`] lists them.
 
 use super::DIALECTS;
-use super::bytes::sound_rows;
 use super::mend::{self, Mended};
 use super::ply::PlyInfo;
 use super::spz;
@@ -18,6 +17,8 @@ use std::sync::Arc;
 
 /// Up in worlds whose y points down, as those of .ply.
 pub const Y_DOWN: [f64; 3] = [0.0, -1.0, 0.0];
+/// Upwards in files whose y axis points up (glTF).
+pub(crate) const Y_UP: [f64; 3] = [0.0, 1.0, 0.0];
 
 /// Files of Gaussians that other programs share. docs/formats.md tells what each holds and assumes.
 #[derive(Clone, Copy)]

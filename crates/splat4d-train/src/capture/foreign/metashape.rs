@@ -5,7 +5,7 @@
 //! the other way round than OpenCV has them; b1 added to f across. Source: Metashape Professional user manual, "Camera
 //! models", and Agisoft's description of the format.
 
-use super::{Export, Images, Said, Shot, only_points, take, without_pose};
+use super::{Convention, Export, Images, Said, Shot, only_points, take, without_pose};
 use crate::capture::{CaptureKind, CaptureOptions, Take, json, panorama, pose, rig};
 use roxmltree::{Document, Node};
 use splat4d::math::{Se3, Sim3};
@@ -56,7 +56,15 @@ fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
     let (mut warnings, mut notes) = (Vec::new(), Vec::new());
     let shots = shots(&document, &images, &mut warnings).map_err(place)?;
     let points = only_points(root, &mut notes)?;
-    let said = Said { kind: CaptureKind::Metashape, fps: None, points, up: None, warnings, notes };
+    let said = Said {
+        kind: CaptureKind::Metashape,
+        convention: Convention::NERFIES,
+        fps: None,
+        points,
+        up: None,
+        warnings,
+        notes,
+    };
     take(root, shots, said, options)
 }
 

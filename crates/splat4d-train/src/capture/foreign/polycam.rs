@@ -4,7 +4,7 @@
 //! up, z backward in the camera; y up in the world). `corrected_images/` and `corrected_cameras/` are those that Polycam
 //! optimised; they are preferred. `depth/TIMESTAMP.png` is in millimetres. Source: PolyCam/polyform's description.
 
-use super::{Export, Said, Shot, only_points, take};
+use super::{Convention, Export, Said, Shot, only_points, take};
 use crate::capture::json::{self, Node};
 use crate::capture::{CaptureKind, CaptureOptions, DepthFile, DepthKind, Take, pose, rig};
 use splat4d::scene::{Camera, Intrinsics, Lens};
@@ -58,7 +58,15 @@ fn read(root: &Path, folder: &Path, options: &CaptureOptions) -> Result<Take> {
         warnings.push("There are no corrected cameras: poses are those of the telephone, not optimised ones.".into());
     }
     let points = only_points(root, &mut notes)?;
-    let said = Said { kind: CaptureKind::Polycam, fps: None, points, up: Some(Y_UP), warnings, notes };
+    let said = Said {
+        kind: CaptureKind::Polycam,
+        convention: Convention::NERF,
+        fps: None,
+        points,
+        up: Some(Y_UP),
+        warnings,
+        notes,
+    };
     take(root, shots, said, options)
 }
 
@@ -70,7 +78,7 @@ fn camera_of(node: &Node<'_>) -> Result<Camera> {
             *cell = number(&format!("t_{i}{j}"))?;
         }
     }
-    let cam_from_world = pose::from_opengl(&rows).map_err(|e| node.at(e))?;
+    let cam_from_world = super::opengl_pose(&rows).map_err(|e| node.at(e))?;
     let (width, height) = (node.get("width")?.count()?, node.get("height")?.count()?);
     let intrinsics = Intrinsics { fx: number("fx")?, fy: number("fy")?, cx: number("cx")?, cy: number("cy")? };
     pose::check_intrinsics(&intrinsics, width, height).map_err(|e| node.at(e))?;

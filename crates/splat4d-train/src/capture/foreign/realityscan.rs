@@ -4,7 +4,7 @@
 //! from the middle for a film 36 mm wide, Brown's terms. The world has z up. Source: the columns and conventions as
 //! Nerfstudio's documentation of its RealityCapture import describes them.
 
-use super::{Export, Images, Said, Shot, only_points, take};
+use super::{Convention, Export, Images, Said, Shot, only_points, take};
 use crate::capture::{CaptureKind, CaptureOptions, Take, json, picture, pose, rig};
 use splat4d::math::se3::mat_mul;
 use splat4d::scene::{Camera, Intrinsics, Lens};
@@ -61,7 +61,15 @@ fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
     }
     let (warnings, mut notes) = (Vec::new(), Vec::new());
     let points = only_points(root, &mut notes)?;
-    let said = Said { kind: CaptureKind::RealityScan, fps: None, points, up: Some(Z_UP), warnings, notes };
+    let said = Said {
+        kind: CaptureKind::RealityScan,
+        convention: Convention::NERF,
+        fps: None,
+        points,
+        up: Some(Z_UP),
+        warnings,
+        notes,
+    };
     take(root, shots, said, options)
 }
 
@@ -84,7 +92,8 @@ impl Row<'_> {
         let name = self.words.get(self.columns["name"]).copied().unwrap_or_default();
         let image = images.named(name)?.to_owned();
         let header = picture::header(&image)?;
-        let (width, height) = (header.width as f64, header.height as f64);
+        let size = header.upright();
+        let (width, height) = (size.0 as f64, size.1 as f64);
         let angle = |name: &str| Ok::<_, Error>(self.number(name)?.to_radians().sin_cos());
         let ((sh, ch), (sp, cp), (sr, cr)) = (angle("heading")?, angle("pitch")?, angle("roll")?);
         // Heading is clockwise from above.
@@ -94,7 +103,7 @@ impl Row<'_> {
         let r = mat_mul(&heading, &mat_mul(&pitch, &roll));
         let t = [self.number("x")?, self.number("y")?, self.number("alt")?];
         let row = |i: usize| [r[i][0], r[i][1], r[i][2], t[i]];
-        let cam_from_world = pose::from_opengl(&[row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]])?;
+        let cam_from_world = super::opengl_pose(&[row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]])?;
         let pixels = width.max(height) / FILM;
         let f = self.number("f")? * pixels;
         let intrinsics = Intrinsics {
@@ -103,7 +112,7 @@ impl Row<'_> {
             cx: 0.5 * width + self.number("px")? * pixels,
             cy: 0.5 * height + self.number("py")? * pixels,
         };
-        pose::check_intrinsics(&intrinsics, header.width, header.height)?;
+        pose::check_intrinsics(&intrinsics, size.0, size.1)?;
         let k = [self.number("k1")?, self.number("k2")?, self.number("k3")?, 0.0, 0.0, 0.0];
         let p = [self.number("t1")?, self.number("t2")?];
         if self.number("k4")? != 0.0 {
@@ -111,7 +120,7 @@ impl Row<'_> {
                 .remedy("Align with the distortion model Brown 3, or export undistorted images."));
         }
         let lens = if k == [0.0; 6] && p == [0.0; 2] { Lens::Pinhole } else { Lens::Brown { k, p, s: [0.0; 4] } };
-        let (width, height) = (header.width, header.height);
+        let (width, height) = size;
         let source = Camera { cam_from_world, intrinsics, lens, width, height, near: Camera::NEAR };
         Ok(Shot { name: name.to_owned(), image, source, time: None, depth: None })
     }

@@ -5,7 +5,7 @@
 //! camera), one an image; `K` is column-major; `perFrameIntrinsicCoeffs` are fx fy cx cy of each image. It is the film of one
 //! moving camera. Source: record3d's documentation of its formats.
 
-use super::{Export, Said, Shot, only_points, take};
+use super::{Convention, Export, Said, Shot, only_points, take};
 use crate::capture::json::{self, Node};
 use crate::capture::{CaptureKind, CaptureOptions, DepthFile, DepthKind, Take, picture, pose, rig};
 use splat4d::math::quat;
@@ -54,9 +54,9 @@ fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
             .remedy("Export the recording again, with all of its images."));
     }
     let shared: [f64; 9] = top.get("K").and_then(|n| n.numbers()).map_err(place)?;
-    let header = picture::header(&folder.join(&images[0]))?;
+    let size = picture::header(&folder.join(&images[0]))?.upright();
     let side = |key: &str, own: usize| top.opt(key)?.map_or(Ok(own), |n| n.count());
-    let (width, height) = (side("w", header.width).map_err(place)?, side("h", header.height).map_err(place)?);
+    let (width, height) = (side("w", size.0).map_err(place)?, side("h", size.1).map_err(place)?);
     let mut shots = Vec::with_capacity(images.len());
     for (i, name) in images.iter().enumerate() {
         let [fx, fy, cx, cy] = match own.as_ref().and_then(|o| o.get(i)) {
@@ -73,7 +73,7 @@ fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
         let r = quat::to_rotation(q);
         let t = [px, py, pz];
         let row = |i: usize| [r[i][0], r[i][1], r[i][2], t[i]];
-        let cam_from_world = pose::from_opengl(&[row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]]).map_err(place)?;
+        let cam_from_world = super::opengl_pose(&[row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]]).map_err(place)?;
         let time = match times.as_ref().and_then(|t| t.get(i)) {
             Some(node) => node.number().map_err(place)?,
             None => i as f64 / fps,
@@ -86,6 +86,14 @@ fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
     }
     let (warnings, mut notes) = (Vec::new(), Vec::new());
     let points = only_points(root, &mut notes)?;
-    let said = Said { kind: CaptureKind::Record3d, fps: Some(fps), points, up: Some(Y_UP), warnings, notes };
+    let said = Said {
+        kind: CaptureKind::Record3d,
+        convention: Convention::NERF,
+        fps: Some(fps),
+        points,
+        up: Some(Y_UP),
+        warnings,
+        notes,
+    };
     take(root, shots, said, options)
 }

@@ -103,6 +103,9 @@ fn recipe(motion: &str, life: &str) -> Recipe {
         r.densify.max_cap = 1000;
         r.init.source = Source::Points;
         r.init.opacity = 0.3;
+        // Small networks and planes: three balls are to be learnt.
+        r.deform.width = 64;
+        (r.hexplane.plane_channels, r.hexplane.plane_resolution, r.hexplane.net_width) = (16, 16, 32);
     });
     small.resolve()
 }

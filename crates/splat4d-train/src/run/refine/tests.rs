@@ -154,13 +154,10 @@ fn any_number_of_threads_any_stop_and_any_crash_give_the_same_bytes() {
     assert!(seen == whole.1, "the run's scene is what the file will show");
     assert!(learnt.layers.len() > bed.source.layers.len() && learnt.len() < bed.source.len());
     assert!(learnt.layers.iter().all(|l| l.masks.is_some()));
-    for threads in [1, 3] {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        let name = format!("{threads} threads");
-        assert!(pool.install(|| bed.finish(&name, bed.job(no_meddler))) == whole, "{name}");
-    }
-    // Within both stages, at the end of one, after the first step of the next.
-    for (at, starts) in [(1, 1), (7, 1), (FLOATS, 1), (FLOATS + 1, 0), (FLOATS + 9, 0)] {
+    let on = |threads: usize| rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+    let [one, three] = [1, 3].map(on);
+    // Within both stages, at the end of one, after the first step of the next; on one thread, and on with three.
+    for (at, starts) in [(7, 1), (FLOATS, 1), (FLOATS + 1, 0)] {
         let name = format!("stop {at}");
         let stop = Arc::new(AtomicBool::new(false));
         let meddle = || {
@@ -168,11 +165,11 @@ fn any_number_of_threads_any_stop_and_any_crash_give_the_same_bytes() {
             let f = move |_: &mut [Grads<f32>]| stop.store(true, Ordering::Relaxed);
             Some(Box::new(Meddle { at, f }) as Box<dyn ParamLoss<f32>>)
         };
-        let stopped = bed.run(&name, bed.job(meddle).refine, &stop, &mut |_| {}).unwrap().outcome;
+        let stopped = one.install(|| bed.run(&name, bed.job(meddle).refine, &stop, &mut |_| {})).unwrap().outcome;
         assert!(stopped.interrupted && stopped.iteration == at, "{stopped:?}");
         let job = bed.job(no_meddler);
         let begun = job.begun.clone();
-        assert!(bed.finish(&name, job) == whole, "{name}");
+        assert!(three.install(|| bed.finish(&name, job)) == whole, "{name}");
         assert_eq!(begun.load(Ordering::Relaxed), if at < FLOATS { 1 } else { starts }, "{name}: nothing begins twice");
     }
     // Crashes: whatever is on disk when a checkpoint was written.

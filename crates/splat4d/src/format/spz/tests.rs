@@ -73,9 +73,9 @@ const NEW_ROTATION: u32 = 2 << 30 | (1 << 9 | 255) << 20 | 511;
 fn positions_that_24_bits_cannot_hold_are_reported_with_their_error() {
     let mut p = gaussians(50, 1);
     let mut out = Vec::new();
-    assert!(!write(&p, 3, &mut out).unwrap().lines().iter().any(|w| w.contains("24 bits")));
+    assert!(!write(&p, 3, Y_DOWN, &mut out).unwrap().lines().iter().any(|w| w.contains("24 bits")));
     (0..50).for_each(|row| p[GEOMETRY].add(row, 0, [431_234.0, 312_345.0, 310.0]));
-    let said = write(&p, 3, &mut out).unwrap();
+    let said = write(&p, 3, Y_DOWN, &mut out).unwrap();
     assert!(said.lines().iter().any(|w| w.contains("24 bits") && w.contains("of the size of the median")), "{said:?}");
 }
 

@@ -74,10 +74,10 @@ fn quality(scene: &Scene<f32>, held: &Dataset) -> [f64; 2] {
     [0, 1].map(|k| sums[k] / counts[k])
 }
 
-/// The remains of the orb and the crate of a scene of which a share is pruned.
-fn left(scene: &Scene<f32>, train: &Dataset, held: &Dataset, config: &ScoreConfig, ratio: f64) -> [f64; 2] {
+/// The remains of the orb and the crate of a scene of which a share is pruned by its scores.
+fn left(scene: &Scene<f32>, held: &Dataset, scores: &Scores, ratio: f64) -> [f64; 2] {
     let mut scene = scene.clone();
-    let edits = prune(&scene, &scored(&scene, train, config), ratio);
+    let edits = prune(&scene, scores, ratio);
     edit(&mut scene, &edits);
     quality(&scene, held)
 }
@@ -85,25 +85,25 @@ fn left(scene: &Scene<f32>, train: &Dataset, held: &Dataset, config: &ScoreConfi
 #[test]
 fn the_orb_and_the_crate_survive() {
     let place = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples");
-    let capture = Arc::new(Capture::open(&place.join("knight"), &CaptureOptions::default()).unwrap());
+    let capture = Arc::new(Capture::open(&place.join("knight"), &CaptureOptions { downscale: 2, ..CaptureOptions::default() }).unwrap());
     let store = Arc::new(ImageStore::new(capture.clone(), 1 << 28));
     let (train, held) = (Dataset::new(store.clone(), capture.train.clone()), Dataset::new(store, capture.held.clone()));
     let scene = splat4d::format::playback::read(&std::fs::read(place.join("knight.s4d")).unwrap()).unwrap();
     let before = quality(&scene, &held);
-    let by = |spatial, temporal, ratio| {
+    let scores = |spatial, temporal| {
         let config = ScoreConfig { spatial, temporal, volume: false, every: VIEWS, ..ScoreConfig::default() };
-        left(&scene, &train, &held, &config, ratio)
+        scored(&scene, &train, &config)
     };
-    let few = by(Spatial::Change, Temporal::InstantAbs, FEW);
-    let half = by(Spatial::Change, Temporal::InstantAbs, 0.5);
+    let change = scores(Spatial::Change, Temporal::InstantAbs);
+    let [few, half] = [FEW, 0.5].map(|ratio| left(&scene, &held, &change, ratio));
     for k in 0..2 {
         assert!(few[k] > before[k] - LOST, "{before:?} dB, without a share of {FEW} of the Gaussians {few:?}");
         assert!(half[k] > GONE + 3.0, "with half {half:?}");
     }
     // Variance as the score of a life: what does not last goes whatever it shows.
-    let lasting = by(Spatial::Share, Temporal::Width, 0.5);
+    let lasting = left(&scene, &held, &scores(Spatial::Share, Temporal::Width), 0.5);
     assert!(lasting[0] < GONE, "{lasting:?} where length counts");
     // Coverage alone: the orb is small, and nothing else is gone so fast.
-    let share = by(Spatial::Share, Temporal::InstantAbs, 0.5);
+    let share = left(&scene, &held, &scores(Spatial::Share, Temporal::InstantAbs), 0.5);
     assert!(share[0] > GONE + 3.0 && share[0] < half[0] - 2.0, "{share:?} by share, {half:?} by change");
 }

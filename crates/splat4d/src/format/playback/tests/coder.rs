@@ -2,7 +2,6 @@
 
 use super::*;
 use crate::layers::Layer;
-use crate::motion::spacetime::{ROTATION_RATES, VELOCITIES};
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::{GEOMETRY, LIFE, SH};
 
@@ -266,32 +265,4 @@ fn a_file_of_several_palettes_is_no_file_to_work_on() {
     twice.extend_from_slice(bodies[at]);
     assert_eq!(read(&twice).unwrap().len(), 400);
     assert!(read_pages(&twice).unwrap_err().to_string().contains("several palettes"));
-}
-
-/// How long the coder takes; run it in a release build with `--ignored --nocapture`.
-#[test]
-#[ignore = "a measurement"]
-fn nanoseconds_a_row() {
-    for degree in [0, 1, 3] {
-        let mut pages = trained(160_000, degree, 40);
-        for layer in &mut pages.layers {
-            let find = |n| layer.params.find(n).unwrap();
-            let (v, w) = (find(VELOCITIES), find(ROTATION_RATES));
-            assert!(layer.params[v].width() == 3 && layer.params[w].width() == 4);
-        }
-        let mut shown = pages.layers.clone();
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
-        let mut best = f64::INFINITY;
-        for _ in 0..7 {
-            let start = std::time::Instant::now();
-            pool.install(|| {
-                for ((layer, labels), shown) in pages.layers.iter().zip(&pages.labels).zip(&mut shown) {
-                    Coder::default().show(layer, labels, pages.palette.as_ref(), &|_| true, shown);
-                }
-            });
-            best = best.min(start.elapsed().as_secs_f64());
-        }
-        let rows: usize = pages.layers.iter().map(|l| l.params.len()).sum();
-        println!("degree {degree}: {:.0} ns a row on one core", best * 1e9 / rows as f64);
-    }
 }
