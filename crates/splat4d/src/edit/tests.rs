@@ -720,7 +720,7 @@ fn an_overflow_is_refused_and_names_its_step() {
             let error = match run(&text, &scene) {
                 // What does not overflow is no NaN either.
                 Ok(edited) => {
-                    let written = format::scene::write(&edited, &mut Vec::new());
+                    let written = write(&edited, &mut Vec::new());
                     assert!(written.is_ok(), "{step}: {written:?}");
                     assert!(draw(&edited, 1.0).iter().all(|x| x.is_finite()), "{step}");
                     continue;
@@ -736,7 +736,7 @@ fn an_overflow_is_refused_and_names_its_step() {
     let pan =
         r#"{"do": "move", "select": "all", "keys": [{"t": 0, "shift": [0, 0, 0]}, {"t": 1, "shift": [0, 0.1, 0]}]}"#;
     let many = |n: usize| run(&format!("[{}]", vec![pan; n].join(",")), &scenes()[0]);
-    assert_eq!(format::scene::read(&bytes(&many(20).unwrap())).unwrap().len(), 150);
+    assert_eq!(read(&bytes(&many(20).unwrap())).unwrap().len(), 150);
     let error = many(100).unwrap_err().to_string();
     assert!(error.contains("one on another"), "{error}");
 }
