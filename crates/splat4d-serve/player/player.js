@@ -213,7 +213,7 @@ export class Player extends EventTarget {
   /** The picture of now stays over the canvas until the next scene has one of its own. */
   #freeze() {
     // A canvas can be copied only in the task that rendered it.
-    if (!this.#stream || !this.canvas.width || !this.#paint(this.#paintedScale, { force: true })) return;
+    if (!this.#stream || !this.#paintedScale || !this.#paint(this.#paintedScale, { force: true })) return;
     this.#still?.remove();
     this.#stillTime = this.time;
     const still = this.#still = document.createElement('canvas');
@@ -324,6 +324,7 @@ export class Player extends EventTarget {
           });
         } else this.backend = await (await import('./webgl2.js')).WebGL2Backend.create(this.canvas, { onlost, onorder });
         this.figures.fallback = reasons.join('; ');
+        this.#cost = new Cost();
         if (software(this.backend.gl)) this.#pace.scale = SCALE_SOFTWARE;
         return this.emit('backend', { name: this.backend.name });
       } catch (error) {
@@ -569,7 +570,7 @@ export class Player extends EventTarget {
 
   /** Where the clock will be at `ms` of performance.now(); null where no image of that can be rendered yet. */
   #ahead = ms => {
-    const seconds = Math.max(0, (ms - this.#last) / 1000);
+    const seconds = this.#last ? Math.max(0, (ms - this.#last) / 1000) : 0;
     const along = this.film && this.film.track.at(this.#filmSeconds(seconds)).sceneTime;
     const t = this.film ? along ?? this.clock : advance(this.clock, seconds * this.#speed, this.#clip).time;
     const time = clamp(t, this.first, this.last);
@@ -656,7 +657,8 @@ export class Player extends EventTarget {
     const { waiting } = this, time = waiting ? this.time : Math.min(this.clock, this.last);
     const epoch = waiting ? this.backend.shown?.epoch : this.#epoch;
     return {
-      time, epoch, at: waiting ? HOLD : this.#running ? this.#ahead : null, view: { ...camera.view(width, height), near }, channel: this.channel,
+      time, epoch, at: waiting ? HOLD : this.#running ? this.#ahead : null,
+      view: { ...camera.view(width, height), near }, channel: this.channel,
       background: this.background ?? this.meta.background,
       depthRange: [Math.max(middle - radius, 0.02 * radius), Math.max(middle, 0) + radius],
       flowScale: FLOW_SHARE * height,

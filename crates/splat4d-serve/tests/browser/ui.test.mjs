@@ -6,7 +6,7 @@ import assert from 'node:assert/strict';
 import { readFileSync } from 'node:fs';
 import { after, before, test } from 'node:test';
 import { launch } from './browser.mjs';
-import { Pace } from '../../player/pace.js';
+import { Cost, Flight, Pace } from '../../player/pace.js';
 import { Site } from './ui-harness.mjs';
 
 /** Seconds on the mock's clock: its clip begins at 1 and lasts 4, 25 frames a second. */
@@ -82,6 +82,25 @@ test('the picture shrinks as far as it must and helps, and grows again', () => {
   assert.ok(busy.filter(s => s < 1).length < busy.length / 4, 'where pixels are not what is slow, they stay');
   assert.ok(play(new Pace(), 2, 6).every(s => s === 1));
   assert.equal(Math.min(...play(new Pace(), 1, 5000, 60)), 0.25);
+});
+
+test('what a frame would cost at another resolution is known from two', () => {
+  const cost = new Cost();
+  assert.equal(cost.at(1), 0);
+  // 80 ms for every frame and 240 for the pixels, as on a slow device; the first frame also waits for shaders.
+  const frame = scale => 80 + 240 * scale ** 2;
+  cost.record(0.5, 900);
+  near(cost.at(1), 3600);
+  cost.record(0.5, frame(0.5));
+  cost.record(0.25, frame(0.25));
+  near(cost.at(1), frame(1), 1e-6);
+  near(cost.at(0.25), frame(0.25), 1e-6);
+  near(frame(cost.within(200, 0.25)), 200, 1e-6);
+  assert.deepEqual([cost.within(10, 0.25), cost.within(9000, 0.25)], [0.25, 1]);
+  const flight = new Flight();
+  // The second waits for the first.
+  for (const [what, now] of [['begin', 0], ['begin', 10], ['end', 100], ['end', 180]]) flight[what](now);
+  assert.deepEqual([flight.count, flight.ms], [0, 80]);
 });
 
 test('keys play, seek, step, change speed, picture and camera', options, async () => {
