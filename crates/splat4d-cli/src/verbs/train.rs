@@ -2,6 +2,7 @@
 
 use crate::chunked::{self, Wanted};
 use crate::console::Console;
+use crate::deadline::Deadline;
 use crate::device::{self, Device};
 use crate::files::{self, human_bytes, parse_bytes};
 use crate::run_folder::{self, Run, cameras_json};
@@ -185,6 +186,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let (run, watch, trained) = if let Some(run) = &args.resume {
         let watch = watch(&Run::open(run)?.name());
         let device = device::to_train(args.device, console);
+        let clock = clock.clone();
         let options = TrainOptions { device, snapshots: snapshots(&watch), clock, ..TrainOptions::default() };
         let trained = run::resume_with(run, &options, &stop, &mut |event| listen(event, &watch));
         (run.clone(), watch, trained)
@@ -244,9 +246,9 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         let options = TrainOptions {
             device: device::to_train(args.device, console),
             minutes: args.minutes,
-            finish: finish::steps(&capture, args.no_eval),
+            finish: finish::steps(&capture, &recipe, args.no_eval),
             predict: args.quality.is_some(),
-            clock,
+            clock: clock.clone(),
             own_loss: None,
             snapshots: snapshots(&watch),
         };
@@ -272,10 +274,14 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     if labelling::has_any(&Run::open(&run)?.open_capture()?.0) {
         labelling::label(&run, None, None, console)?;
     }
+    let deadline = match &args.resume {
+        Some(run) => finish::rest_of(&Run::open(run)?, clock),
+        None => Deadline::of(clock, args.minutes),
+    };
     if args.no_eval {
-        finish::playback(&run, console)?;
+        finish::playback_by(&run, &deadline, console)?;
     } else {
-        finish::all(&run, &args.measure, console)?;
+        finish::all(&run, &args.measure, &deadline, console)?;
     }
     watch.show(&run, outcome.iteration);
     console.emit(&json!({"type": "done", "run": run}));

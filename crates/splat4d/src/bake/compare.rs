@@ -94,22 +94,26 @@ pub enum Shown<'a> {
     File(&'a Scene<f32>),
 }
 
-/// Draws the baked scene and the model as every camera sees them at every time, and compares. `None`: nothing to compare.
-/// Errors: the backend's.
+/// Renders the baked scene and the model as every camera sees them at every time, and compares. `progress` hears how many
+/// images of how many are done; `false` ends the comparison with those. `None`: nothing was compared. Errors: the backend's.
 pub fn compare(
     scene: &Scene<f32>,
     baked: Shown<'_>,
     cameras: &[Camera],
     times: &[f64],
     backend: &mut dyn Backend,
-    progress: &mut dyn FnMut(usize, usize),
+    progress: &mut dyn FnMut(usize, usize) -> bool,
 ) -> Result<Option<Likeness>> {
     let (mut instant, mut moment) = (Evaluation::default(), Moment::default());
     let (mut truth, mut copy) = (Image::default(), Image::default());
     let mut played = Evaluation::default();
     let (mut sum, mut pixels, mut done) = (0.0, 0.0, 0);
     let mut worst = (f64::INFINITY, 0.0, 0);
+    let mut goes_on = true;
     for &time in times {
+        if !goes_on {
+            break;
+        }
         scene.at(Time(time), &mut instant);
         match baked {
             Shown::Nodes(nodes) => moment.fill(nodes, scene.clip, time),
@@ -131,7 +135,10 @@ pub fn compare(
                 worst = (own, time, i);
             }
             (sum, pixels, done) = (sum + error, pixels + count, done + 1);
-            progress(done, times.len() * cameras.len());
+            goes_on = progress(done, times.len() * cameras.len());
+            if !goes_on {
+                break;
+            }
         }
     }
     Ok((done > 0 && pixels > 0.0).then(|| Likeness {

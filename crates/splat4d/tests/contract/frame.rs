@@ -207,7 +207,7 @@ fn baked(own: &Layer<f32>, placed: &Layer<f32>) {
         let baked = bake(&scene, &options, &mut |_, _| {}).expect("there is no head");
         let times = [0.0, 0.3, 0.5, 0.9];
         let mut backend = splat4d::device::cpu(RenderConfig::default());
-        compare(&scene, Shown::Nodes(&baked.nodes), &[camera], &times, backend.as_mut(), &mut |_, _| {})
+        compare(&scene, Shown::Nodes(&baked.nodes), &[camera], &times, backend.as_mut(), &mut |_, _| true)
             .expect("the CPU draws everything")
             .expect("there are pictures")
             .psnr
