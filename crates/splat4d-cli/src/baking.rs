@@ -23,9 +23,12 @@ use splat4d::render::{Antialias, RenderConfig};
 use splat4d::scene::{Camera, GEOMETRY, Time};
 use std::path::Path;
 
-/// Cameras and times at which baked and model are compared; every one costs two renders.
+/// Cameras that stand still and times at which baked and model are compared; every one costs two renders.
 const COMPARED_CAMERAS: usize = 4;
 const COMPARED_TIMES: usize = 6;
+/// The same of poses of a camera that moves, each at its own time; and of cameras that stand still beside it.
+const COMPARED_POSES: usize = 12;
+const COMPARED_BESIDE: usize = 2;
 /// Longer side of those renders, pixels.
 const COMPARED_SIDE: usize = 800;
 /// Most bytes of a poster: it comes before everything else.
@@ -133,8 +136,10 @@ pub(crate) fn pack_scene(
 
 /// The options with the source's cameras, and as many samples of the model as the time allows.
 fn options(scene: &Scene<f32>, baking: &Baking, views: &[View]) -> Options {
-    let cameras = poses(views).iter().map(|v| v.camera.clone()).collect();
-    let mut options = Options { cameras, ..baking.options.clone() };
+    let Cameras { still, path } = Cameras::of(views);
+    let cameras = still.iter().map(|v| v.camera.clone()).collect();
+    let path = path.iter().map(|v| (v.time, v.camera.clone())).collect();
+    let mut options = Options { cameras, path, ..baking.options.clone() };
     let deadline = &baking.deadline;
     if deadline.is_set() {
         let mut instant = Evaluation::default();
@@ -303,7 +308,7 @@ pub(crate) fn bake_like(
 ) -> anyhow::Result<Cooked> {
     let (scene, deadline) = (&source.scene, &baking.deadline);
     let views = source.views()?;
-    let (stage, cameras) = (source.stage(&views), poses(&views));
+    let stage = source.stage(&views);
     let options = options(scene, baking, &views);
     let kitchen = Kitchen { scene, source, views: &views, title, baking, console };
     let mut bakery = Bakery::new(scene, &options)?;
@@ -314,7 +319,7 @@ pub(crate) fn bake_like(
     for round in 1..=CUTS {
         let began = deadline.now();
         let packed = kitchen.pack(&bakery, curve.as_ref(), price)?;
-        let likeness = compare(scene, &packed.bytes, &stage, &cameras, packed.antialias, deadline, console)?;
+        let likeness = compare(scene, &packed.bytes, &stage, &views, packed.antialias, deadline, console)?;
         let bytes = packed.bytes.len() as f64;
         let mut needs = None;
         let mut next = None;
@@ -388,7 +393,7 @@ fn compare(
     scene: &Scene<f32>,
     bytes: &[u8],
     stage: &Stage,
-    views: &[&View],
+    views: &[View],
     antialias: bool,
     deadline: &Deadline,
     console: &Console,
@@ -398,12 +403,23 @@ fn compare(
         return Ok(None);
     }
     let played = playback::read(bytes)?;
-    let mut cameras: Vec<Camera> = views
-        .iter()
-        .step_by(views.len().div_ceil(COMPARED_CAMERAS).max(1))
-        .map(|v| v.camera.downscaled(v.camera.width.max(v.camera.height).div_ceil(COMPARED_SIDE).max(1)))
-        .collect();
-    if cameras.is_empty() {
+    let shots = shots(scene, stage, views);
+    let antialias = if antialias { Antialias::On } else { Antialias::Off };
+    let mut cpu = device::cpu(RenderConfig { antialias, ..RenderConfig::default() });
+    Ok(bake::compare(scene, Shown::File(&played), &shots, cpu.as_mut(), &mut |done, total| {
+        console.phase("comparing with the model", done, total);
+        deadline.left() > 0.0
+    })?)
+}
+
+/// Cameras and times of a comparison: cameras that stand still at times over the clip, one that moves where it was at each.
+fn shots(scene: &Scene<f32>, stage: &Stage, views: &[View]) -> Vec<(f64, Camera)> {
+    let small = |c: &Camera| c.downscaled(c.width.max(c.height).div_ceil(COMPARED_SIDE).max(1));
+    let Cameras { still, path } = Cameras::of(views);
+    let most = if path.is_empty() { COMPARED_CAMERAS } else { COMPARED_BESIDE };
+    let mut cameras: Vec<Camera> =
+        still.iter().step_by(still.len().div_ceil(most).max(1)).map(|v| small(&v.camera)).collect();
+    if views.is_empty() {
         cameras = (0..COMPARED_CAMERAS).map(|i| stage.orbit(i as f64 / COMPARED_CAMERAS as f64)).collect();
     }
     let [from, to] = scene.clip;
@@ -411,22 +427,38 @@ fn compare(
     let mut times: Vec<f64> =
         (0..COMPARED_TIMES).map(|i| from + (to - from) * (i as f64 + 0.5) / COMPARED_TIMES as f64).collect();
     times.dedup();
-    let antialias = if antialias { Antialias::On } else { Antialias::Off };
-    let mut cpu = device::cpu(RenderConfig { antialias, ..RenderConfig::default() });
-    Ok(bake::compare(scene, Shown::File(&played), &cameras, &times, cpu.as_mut(), &mut |done, total| {
-        console.phase("comparing with the model", done, total);
-        deadline.left() > 0.0
-    })?)
+    let mut shots: Vec<(f64, Camera)> =
+        times.iter().flat_map(|t| cameras.iter().map(|camera| (*t, camera.clone()))).collect();
+    // The same of poses: every second one on its way to the next frame.
+    let part = if scene.fps > 0.0 && scene.fps.is_finite() { 0.5 / scene.fps } else { 0.0 };
+    let poses = path.iter().step_by(path.len().div_ceil(COMPARED_POSES).max(1)).enumerate();
+    shots.extend(poses.map(|(i, v)| ((v.time + part * (i % 2) as f64).min(to), small(&v.camera))));
+    shots.sort_by(|a, b| a.0.total_cmp(&b.0));
+    shots
 }
 
-/// Every camera once, from each place where it stood.
-fn poses(views: &[View]) -> Vec<&View> {
-    let mut seen = std::collections::BTreeSet::new();
-    let place = |v: &View| {
-        let pose = &v.camera.cam_from_world;
-        [pose.rotation[0], pose.rotation[1], pose.rotation[2], pose.translation].map(|row| row.map(f64::to_bits))
-    };
-    views.iter().filter(|v| seen.insert((v.name.as_str(), place(v)))).collect()
+/// Cameras that stand still, each once, and the poses of cameras that move, by time.
+#[derive(Debug)]
+struct Cameras<'a> {
+    still: Vec<&'a View>,
+    path: Vec<&'a View>,
+}
+
+impl<'a> Cameras<'a> {
+    fn of(views: &'a [View]) -> Self {
+        let mut first = std::collections::BTreeMap::new();
+        let mut moves = std::collections::BTreeSet::new();
+        for view in views {
+            let pose = view.camera.cam_from_world;
+            if *first.entry(view.name.as_str()).or_insert(pose) != pose {
+                moves.insert(view.name.as_str());
+            }
+        }
+        let still = distinct(views).into_iter().filter(|v| !moves.contains(v.name.as_str())).collect();
+        let mut path: Vec<&View> = views.iter().filter(|v| moves.contains(v.name.as_str())).collect();
+        path.sort_by(|a, b| a.time.total_cmp(&b.time));
+        Self { still, path }
+    }
 }
 
 /// Every camera once, by name, spread over the rig where there are too many.

@@ -157,7 +157,8 @@ impl<'a> Bakery<'a> {
             return Err(Error::input(format!("{} rounds", options.repeat)).remedy(format!("Give 1 to {MAX_REPEAT}.")));
         }
         let tree = Tree::new(scene.clip, scene.fps, options.looks, options.segment, usize::MAX)?;
-        let lookout = Lookout::new(&options.cameras, &means(scene));
+        let cameras: Vec<_> = options.cameras.iter().chain(options.path.iter().map(|(_, camera)| camera)).cloned().collect();
+        let lookout = Lookout::new(&cameras, &means(scene));
         let mut bakery = Self { scene, options, tree, lookout, weights: None, kept: Vec::new() };
         bakery.tree = bakery.tree_of(options.looks)?;
         Ok(bakery)
@@ -178,7 +179,8 @@ impl<'a> Bakery<'a> {
         if !self.is_curved() {
             return Ok(None);
         }
-        self.weights = Some(Weights::measure(self.scene, &self.options.cameras, &mut |_, _| progress(0, total)));
+        let Options { cameras, path, .. } = self.options;
+        self.weights = Some(Weights::measure(self.scene, cameras, path, &mut |_, _| progress(0, total)));
         self.refine(&layers)?;
         let numbers = |l: &Cow<'_, Layer<f32>>| {
             let curved = Curved::new(l, &self.tree);

@@ -59,13 +59,15 @@ pub struct Options {
     pub samples: usize,
     /// The take is played so many times over.
     pub repeat: usize,
-    /// The cameras whose pixels count. None: a 1080p picture that the scene fills.
+    /// The cameras whose pixels count, at all times. No camera and no path: a 1080p image that the scene fills.
     pub cameras: Vec<Camera>,
+    /// Times and poses of a camera that moves: its pixels count at these times. Times rise.
+    pub path: Vec<(f64, Camera)>,
 }
 
 impl Default for Options {
     fn default() -> Self {
-        Self { tolerance: TOLERANCE, segment: SEGMENT, looks: LOOKS, samples: SAMPLES, repeat: 1, cameras: Vec::new() }
+        Self { tolerance: TOLERANCE, segment: SEGMENT, looks: LOOKS, samples: SAMPLES, repeat: 1, cameras: Vec::new(), path: Vec::new() }
     }
 }
 

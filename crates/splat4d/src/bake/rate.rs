@@ -124,7 +124,8 @@ impl<'a> Sums<'a> {
             after.copy_from_slice(before);
             let Some(v) = look(k) else { continue };
             let alpha = f64::from(v[9]);
-            let (t, w) = (tree.time(k) - tree.time(first), (alpha / peak).powi(2) + FAINT);
+            let share = weight.share(tree.time(k));
+            let (t, w) = (tree.time(k) - tree.time(first), share * (alpha / peak).powi(2) + FAINT);
             let x: [f64; 3] = std::array::from_fn(|k| f64::from(v[k]) - origin[k]);
             let mean: [f64; 3] = std::array::from_fn(|c| (c..3).map(|r| weight.mean[r][c] * x[r]).sum());
             let cov = inside(&axes, &sizes, std::array::from_fn(|k| f64::from(v[3 + k])));
@@ -136,11 +137,11 @@ impl<'a> Sums<'a> {
                 (at::WTT, w * t * t),
                 (at::MEAN_SQUARE, w * mean.iter().map(|m| m * m).sum::<f64>()),
                 (at::COV_SQUARE, w * square),
-                (at::COUNT, 1.0),
-                (at::ALPHA, alpha),
-                (at::ALPHA_SQUARE, alpha * alpha),
-                (at::ALPHA_SIGMA, alpha * sigma),
-                (at::SIGMA_SQUARE, sigma * sigma),
+                (at::COUNT, share),
+                (at::ALPHA, share * alpha),
+                (at::ALPHA_SQUARE, share * alpha * alpha),
+                (at::ALPHA_SIGMA, share * alpha * sigma),
+                (at::SIGMA_SQUARE, share * sigma * sigma),
             ] {
                 after[place] += value;
             }
@@ -199,7 +200,7 @@ impl<'a> Sums<'a> {
             0 => 0.0,
             n => about(sum(at::COLOR_SQUARE), &mut (0..n).map(|c| sum(NUMBERS + c))),
         };
-        let Weight { opacity, color: of_color, .. } = self.weight;
+        let Weight { opacity, color: of_color, .. } = &self.weight;
         let parts = [mean, SHAPE * opacity * cov, opacity * alpha, of_color * color];
         // What rounding turned negative, or what is no number, costs nothing.
         parts.into_iter().map(|x| if x > 0.0 { x } else { 0.0 }).sum()

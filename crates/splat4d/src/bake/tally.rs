@@ -2,7 +2,7 @@
 
 use super::fit::Piece;
 use super::lookout::Lookout;
-use super::tree::{Span, Tree};
+use super::tree::Span;
 use super::{Errors, TOLERANCE};
 use crate::format::playback::{Node, Primitive, primitives};
 use crate::layers::Layer;
@@ -88,7 +88,7 @@ pub(super) fn page(layer: &Layer<f32>, lookout: &Lookout, tally: &mut Tally) -> 
 }
 
 /// What is left of a node of a layer that is seen during `window` only.
-fn cut(mut node: Node, [first, last]: [f64; 2]) -> Option<Node> {
+pub(super) fn cut(mut node: Node, [first, last]: [f64; 2]) -> Option<Node> {
     let (from, to) = (node.from.max(first), node.to.min(last));
     if [from, to] != [node.from, node.to] {
         // What lives for ever counts from the middle, so that nothing is far from where it was rounded.
@@ -104,7 +104,7 @@ fn cut(mut node: Node, [first, last]: [f64; 2]) -> Option<Node> {
 
 /// Nodes by their beginning; of those that begin together the longest, which holds the others, comes first. Those of one
 /// span are one.
-fn in_order(mut nodes: Vec<Node>) -> Vec<Node> {
+pub(super) fn in_order(mut nodes: Vec<Node>) -> Vec<Node> {
     nodes.sort_by(|a, b| a.from.total_cmp(&b.from).then(b.to.total_cmp(&a.to)));
     let mut out: Vec<Node> = Vec::with_capacity(nodes.len());
     for node in nodes {

@@ -3,8 +3,8 @@
 
 use super::*;
 use crate::device;
-use crate::format::playback::{Draft, Meta, WriteConfig, read, write};
-use crate::layers::{ALPHA_MIN, Evaluation};
+use crate::format::playback::{Draft, Meta, Primitive, WriteConfig, read, write};
+use crate::layers::{ALPHA_MIN, Evaluation, Layer};
 use crate::math::{Rng, Se3};
 use crate::motion::spacetime::VELOCITIES;
 use crate::motion::still::activate;
@@ -12,7 +12,7 @@ use crate::motion::{At, Cache, Motion, SpacetimeSpec, Spec, Tape, build, fill_ro
 use crate::render::RenderConfig;
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::splats::SPLAT_OPACITY;
-use crate::scene::{Color, Grads, LIFE, LifeKind, Params, SH, SplatGrads, Table, Time};
+use crate::scene::{Color, GEOMETRY, Grads, LIFE, LifeKind, Params, SH, SplatGrads, Table, Time};
 use std::sync::Arc;
 
 /// Rounding of f32 parameters against the model's own f32 arithmetic, as a share of the cloud's size.
@@ -70,6 +70,11 @@ fn cameras() -> Vec<Camera> {
     [0.3, 2.1, 4.4].map(|a| Camera::with_fov_y(pose(a), 0.8, 96, 72)).to_vec()
 }
 
+/// Every camera at every time.
+fn shots(times: &[f64]) -> Vec<(f64, Camera)> {
+    times.iter().flat_map(|t| cameras().into_iter().map(|camera| (*t, camera))).collect()
+}
+
 fn options(tolerance: f64) -> Options {
     Options { tolerance, cameras: cameras(), ..Options::default() }
 }
@@ -87,7 +92,7 @@ fn likeness_after(scene: &Scene<f32>, baked: &Baked, part: f64) -> Likeness {
     let frames = ((scene.clip[1] - scene.clip[0]) * FPS).round() as usize + 1;
     let times: Vec<f64> = (0..frames).step_by(frames.div_ceil(9)).map(|k| (k as f64 + part) / FPS).collect();
     let mut cpu = device::cpu(RenderConfig::default());
-    compare(scene, Shown::Nodes(&baked.nodes), &cameras(), &times, cpu.as_mut(), &mut |_, _| true).unwrap().unwrap()
+    compare(scene, Shown::Nodes(&baked.nodes), &shots(&times), cpu.as_mut(), &mut |_, _| true).unwrap().unwrap()
 }
 
 /// (mean, covariance, opacity) of everything that is visible, sorted by its mean.
@@ -356,7 +361,7 @@ fn a_file_is_as_good_and_can_be_baked_again() {
     let like = |file: &Scene<f32>| {
         let times: Vec<f64> = (0..57).step_by(5).map(|k| f64::from(k) / FPS).collect();
         let mut cpu = device::cpu(RenderConfig::default());
-        compare(&scene, Shown::File(file), &cameras(), &times, cpu.as_mut(), &mut |_, _| true).unwrap().unwrap()
+        compare(&scene, Shown::File(file), &shots(&times), cpu.as_mut(), &mut |_, _| true).unwrap().unwrap()
     };
     let played = file(&first);
     assert!(like(&played).psnr > 40.0, "{:?} {:?}", like(&played), likeness(&scene, &first));
@@ -405,6 +410,30 @@ fn segments_go_where_images_gain_most() {
     let (segments, psnr) = within(&scene, &options(0.25), by_tolerance.report.primitives as f64);
     assert!(segments <= by_tolerance.report.primitives);
     assert!(psnr > likeness(&scene, &by_tolerance).psnr + 1.0, "{psnr} dB, {:?}", likeness(&scene, &by_tolerance));
+}
+
+/// A camera that moves sees each Gaussian for a while: segments go there, and none of it is lost elsewhere.
+#[test]
+fn segments_go_to_when_a_moving_camera_looks() {
+    let scene = leaps(80, 30.0);
+    let looking = |t: f64| {
+        let a = 2.0 * t;
+        let eye = [4.0 * a.cos(), 0.7, 4.0 * a.sin()];
+        let aside = [2.0 * (a + 1.5).cos(), 0.0, 2.0 * (a + 1.5).sin()];
+        (t, Camera::with_fov_y(Se3::look_at(eye, aside, [0.0, 1.0, 0.0]), 0.4, 96, 72))
+    };
+    let path: Vec<_> = (0..30).map(|k| looking(f64::from(k) / FPS)).collect();
+    let like = |options: &Options| {
+        let mut bakery = Bakery::new(&scene, options).unwrap();
+        let curve = bakery.measure(&mut |_, _| {}).unwrap().unwrap();
+        let baked = bakery.bake(Cut::Price(curve.price_of(700.0)), &mut |_, _| {}).unwrap();
+        assert!((500..=715).contains(&baked.report.primitives), "{}", baked.report.primitives);
+        let mut cpu = device::cpu(RenderConfig::default());
+        compare(&scene, Shown::Nodes(&baked.nodes), &path, cpu.as_mut(), &mut |_, _| true).unwrap().unwrap().psnr
+    };
+    let moving = like(&Options { path: path.clone(), ..Options::default() });
+    let anywhere = like(&options(0.25));
+    assert!(moving > anywhere + 1.0, "{moving} dB on the path, {anywhere} dB when it is not known");
 }
 
 /// The curve tells of what is baked.
