@@ -300,12 +300,7 @@ pub(crate) struct Cooked {
 
 /// Bakes and packs a scene within its bytes and time, and compares it with its model. Cuts it again where the first cut was
 /// further off than a comparison can tell, without sampling the model again.
-pub(crate) fn bake_like(
-    source: &Source,
-    title: &str,
-    baking: &Baking,
-    console: &Console,
-) -> anyhow::Result<Cooked> {
+pub(crate) fn bake_like(source: &Source, title: &str, baking: &Baking, console: &Console) -> anyhow::Result<Cooked> {
     let (scene, deadline) = (&source.scene, &baking.deadline);
     let views = source.views()?;
     let stage = source.stage(&views);

@@ -23,11 +23,6 @@ impl Deadline {
         Self { clock, end: minutes.map_or(f64::INFINITY, |m| 60.0 * m) }
     }
 
-    /// The same, so many seconds earlier: what is kept for something else.
-    pub(crate) fn earlier(&self, seconds: f64) -> Self {
-        Self { clock: self.clock.clone(), end: self.end - seconds }
-    }
-
     /// Whether there is one.
     pub(crate) fn is_set(&self) -> bool {
         self.end.is_finite()

@@ -157,7 +157,8 @@ impl Times {
         painter.draw(&view.camera, view.time);
         let step = (deadline.now() - began) / FILM_STEPS;
         let held = views.iter().filter(|v| v.held).count() + EvalOptions::default().train_views;
-        let frames = orbit_seconds(scene.clip[1] - scene.clip[0]) * if have_ffmpeg() { ORBIT_FPS } else { ORBIT_FPS_PNG };
+        let frames =
+            orbit_seconds(scene.clip[1] - scene.clip[0]) * if have_ffmpeg() { ORBIT_FPS } else { ORBIT_FPS_PNG };
         Ok(Self {
             scores: step * HELD_STEPS * held as f64,
             playback: step * BAKE_STEPS,

@@ -98,7 +98,10 @@ fn a_file_keeps_to_its_bytes_and_says_what_it_would_need() {
     assert_eq!(words, "32.1 dB against the model at 8.0 MiB; 40 dB needs about 60.0 MiB (--size)");
     // The default is what was learnt, and a rate.
     let default = budget(&source(&Leaps::default()).scene) as f64;
-    assert!((default - (4.0 * 14.0 * GAUSSIANS as f64 + BYTES_A_SECOND * (FRAMES - 1.0) / FPS)).abs() < 2.0, "{default}");
+    assert!(
+        (default - (4.0 * 14.0 * GAUSSIANS as f64 + BYTES_A_SECOND * (FRAMES - 1.0) / FPS)).abs() < 2.0,
+        "{default}"
+    );
 }
 
 /// All looks at the model would take three times the minutes there are.

@@ -24,6 +24,8 @@ const STRAIGHT_RUN: usize = 1 << 16;
 const KEPT: usize = 128 << 20;
 /// Rows of a task that measures.
 const ROWS: usize = 128;
+/// The time between samples is not halved beyond so many of them: 30,000 Gaussians at 266 times.
+const REFINED: usize = 8_000_000;
 /// Gaussians of a layer whose motion between time samples is looked at.
 const PROBED: usize = 400;
 /// Mean squared error of images by motion between time samples that is let pass: 46 dB, a quarter of what 40 dB allow.
@@ -150,14 +152,16 @@ impl<'a> Bakery<'a> {
         scene.without_head("a playback file")?;
         // An endless tolerance is allowed: nothing is split then.
         if options.tolerance.is_nan() || options.tolerance <= 0.0 {
-            return Err(Error::input(format!("a tolerance of {} pixels", options.tolerance))
-                .remedy("Give pixels above 0."));
+            return Err(
+                Error::input(format!("a tolerance of {} pixels", options.tolerance)).remedy("Give pixels above 0.")
+            );
         }
         if !(1..=MAX_REPEAT).contains(&options.repeat) {
             return Err(Error::input(format!("{} rounds", options.repeat)).remedy(format!("Give 1 to {MAX_REPEAT}.")));
         }
         let tree = Tree::new(scene.clip, scene.fps, options.looks, options.segment, usize::MAX)?;
-        let cameras: Vec<_> = options.cameras.iter().chain(options.path.iter().map(|(_, camera)| camera)).cloned().collect();
+        let cameras: Vec<_> =
+            options.cameras.iter().chain(options.path.iter().map(|(_, camera)| camera)).cloned().collect();
         let lookout = Lookout::new(&cameras, &means(scene));
         let mut bakery = Self { scene, options, tree, lookout, weights: None, kept: Vec::new() };
         bakery.tree = bakery.tree_of(options.looks)?;
@@ -310,7 +314,8 @@ impl<'a> Bakery<'a> {
         loop {
             let finer = self.tree_of(2.0 * self.tree.rate())?;
             // Every second sample of the finer tree is one of this tree's: a segment over two of its steps misses the middle.
-            if finer.frames() < 2 * self.tree.frames() - 1 {
+            let gaussians: usize = layers.iter().filter(|l| self.is_split(l)).map(|l| l.params.len()).sum();
+            if finer.frames() < 2 * self.tree.frames() - 1 || gaussians * finer.frames() > REFINED {
                 return Ok(());
             }
             let mut error = 0.0;
@@ -343,7 +348,9 @@ impl<'a> Bakery<'a> {
         row: &'s Row,
     ) -> Option<Sums<'s>> {
         let weights = self.weights.as_ref().expect("weights are measured before anything else");
-        Sums::new(tree, samples, row, curved.lives.envelope(row.id), |look| weights.of(layer, row.id, look, &self.lookout))
+        Sums::new(tree, samples, row, curved.lives.envelope(row.id), |look| {
+            weights.of(layer, row.id, look, &self.lookout)
+        })
     }
 
     /// A layer whose motion is not straight.

@@ -67,7 +67,15 @@ pub struct Options {
 
 impl Default for Options {
     fn default() -> Self {
-        Self { tolerance: TOLERANCE, segment: SEGMENT, looks: LOOKS, samples: SAMPLES, repeat: 1, cameras: Vec::new(), path: Vec::new() }
+        Self {
+            tolerance: TOLERANCE,
+            segment: SEGMENT,
+            looks: LOOKS,
+            samples: SAMPLES,
+            repeat: 1,
+            cameras: Vec::new(),
+            path: Vec::new(),
+        }
     }
 }
 

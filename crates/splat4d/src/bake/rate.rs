@@ -14,11 +14,11 @@ use super::weights::Weight;
 use crate::math::sym3;
 
 /// Prices of the ladder.
-pub(super) const PRICES: usize = 72;
+pub(super) const PRICES: usize = 32;
 /// The lowest price, mean squared error of an image over the clip, and the factor from price to price: from what nobody
 /// could see of a million segments to more than one Gaussian can be worth.
-const LOWEST: f64 = 1e-16;
-const FACTOR: f64 = 1.6;
+const LOWEST: f64 = 1e-14;
+const FACTOR: f64 = 2.5;
 /// Share of a Gaussian's energy by which a relative change of its covariance by 1 (Frobenius) changes images: (tr² + 2‖·‖²)/16
 /// of a bell, between the values of a change along the axes and of a shear.
 const SHAPE: f64 = 0.125;
@@ -129,7 +129,8 @@ impl<'a> Sums<'a> {
             let x: [f64; 3] = std::array::from_fn(|k| f64::from(v[k]) - origin[k]);
             let mean: [f64; 3] = std::array::from_fn(|c| (c..3).map(|r| weight.mean[r][c] * x[r]).sum());
             let cov = inside(&axes, &sizes, std::array::from_fn(|k| f64::from(v[3 + k])));
-            let square: f64 = cov.iter().map(|c| c * c).sum::<f64>() + OFF_DIAGONAL.map(|k| cov[k] * cov[k]).iter().sum::<f64>();
+            let square: f64 =
+                cov.iter().map(|c| c * c).sum::<f64>() + OFF_DIAGONAL.map(|k| cov[k] * cov[k]).iter().sum::<f64>();
             let sigma = life.sigma(tree.time(k));
             for (place, value) in [
                 (at::W, w),
@@ -170,10 +171,11 @@ impl<'a> Sums<'a> {
         if span[1] - span[0] <= 1 || a >= b {
             return 0.0;
         }
-        let sum = |place: usize| {
-            let at = |k: usize| self.sums[(k - first) * self.width + place];
-            0.5 * (at(b + 1) - at(a) + at(b) - at(a + 1))
-        };
+        let before = |k: usize| &self.sums[(k - first) * self.width..(k + 1 - first) * self.width];
+        let [s0, s1, s2, s3] = [a, a + 1, b, b + 1].map(before);
+        let between = |place: usize| 0.5 * (s3[place] - s0[place] + s2[place] - s1[place]);
+        let sums: [f64; NUMBERS] = std::array::from_fn(between);
+        let sum = |place: usize| sums[place];
         let w = sum(at::W);
         if w <= 0.0 {
             return 0.0;
@@ -198,12 +200,17 @@ impl<'a> Sums<'a> {
         let alpha = constant.min(own) / (self.peak * self.peak);
         let color = match self.colors {
             0 => 0.0,
-            n => about(sum(at::COLOR_SQUARE), &mut (0..n).map(|c| sum(NUMBERS + c))),
+            n => about(sum(at::COLOR_SQUARE), &mut (0..n).map(|c| between(NUMBERS + c))),
         };
         let Weight { opacity, color: of_color, .. } = &self.weight;
-        let parts = [mean, SHAPE * opacity * cov, opacity * alpha, of_color * color];
+        let positive = |x: f64| if x > 0.0 { x } else { 0.0 };
         // What rounding turned negative, or what is no number, costs nothing.
-        parts.into_iter().map(|x| if x > 0.0 { x } else { 0.0 }).sum()
+        let [mean, cov] = [mean, SHAPE * opacity * cov].map(positive);
+        let [alpha, color] = [opacity * alpha, of_color * color].map(positive);
+        // Being further off than a Gaussian is wide is no worse.
+        let (off, most) = (mean + cov, w * self.weight.most);
+        let off = if off > 0.0 { off * most / (off + most) } else { 0.0 };
+        off + alpha + color
     }
 
     /// Segments and error of the best cut below a span, at every price. Errors count by the share of the clip.
@@ -253,8 +260,9 @@ impl<'a> Sums<'a> {
 /// A covariance along axes of these sizes.
 fn inside(axes: &[[f64; 3]; 3], sizes: &[f64; 3], c: [f64; 6]) -> [f64; 6] {
     let full = [[c[0], c[1], c[2]], [c[1], c[3], c[4]], [c[2], c[4], c[5]]];
-    let half: [[f64; 3]; 3] =
-        std::array::from_fn(|i| std::array::from_fn(|k| (0..3).map(|j| full[i][j] * axes[j][k]).sum::<f64>() / sizes[k]));
+    let half: [[f64; 3]; 3] = std::array::from_fn(|i| {
+        std::array::from_fn(|k| (0..3).map(|j| full[i][j] * axes[j][k]).sum::<f64>() / sizes[k])
+    });
     let entry = |a: usize, b: usize| (0..3).map(|i| axes[i][a] * half[i][b]).sum::<f64>() / sizes[a];
     [entry(0, 0), entry(0, 1), entry(0, 2), entry(1, 1), entry(1, 2), entry(2, 2)]
 }

@@ -25,7 +25,7 @@ const ISOTROPIC: f64 = 0.1;
 /// Share of the weight by size and opacity alone that is kept where no render sees the Gaussian, and of its greatest weight
 /// at times at which the moving camera does not.
 const UNSEEN: f64 = 0.02;
-/// Squared contrast to the background that is assumed there, each channel.
+/// Squared contrast to what is around it that is assumed where none is known, each channel.
 const CONTRAST: f64 = 0.05;
 /// Low-pass of the projection, pixels² (CONVENTIONS.md).
 const LOW_PASS: f64 = 0.3;
@@ -72,6 +72,8 @@ pub(super) struct Weight {
     pub opacity: f64,
     /// For a change of colour by 1.
     pub color: f64,
+    /// The most that it can cost to be somewhere else: it is missing where it should be, and wrong where it is.
+    pub most: f64,
     /// Its share at other times: seconds and share. Empty: 1 at all times.
     shares: Vec<(f64, f64)>,
 }
@@ -184,12 +186,8 @@ impl Weights {
             (*t, (here / (measured + guessed)).max(UNSEEN))
         });
         let shares = if measured > 0.0 { shares.collect() } else { Vec::new() };
-        Weight {
-            mean: cholesky(form),
-            opacity: measured + guessed,
-            color: color * part + alone * area * square,
-            shares,
-        }
+        let (opacity, color) = (measured + guessed, color * part + alone * area * square);
+        Weight { mean: cholesky(form), opacity, color, most: opacity + CONTRAST * color, shares }
     }
 }
 
@@ -230,7 +228,7 @@ mod tests {
 
     #[test]
     fn a_weight_lasts_from_render_to_render() {
-        let of = |shares| Weight { mean: [[0.0; 3]; 3], opacity: 1.0, color: 1.0, shares };
+        let of = |shares| Weight { mean: [[0.0; 3]; 3], opacity: 1.0, color: 1.0, most: 2.0, shares };
         let weight = of(vec![(0.0, 0.1), (1.0, 1.0), (2.0, 0.2), (3.0, 0.02)]);
         assert_eq!([-1.0, 0.5, 1.0, 1.5, 2.5, 9.0].map(|t| weight.share(t)), [0.1, 1.0, 1.0, 1.0, 0.2, 0.02]);
         assert_eq!(of(Vec::new()).share(3.0), 1.0);
