@@ -1,6 +1,11 @@
 //! A scene becomes a playback file: baked, written, read back and compared with its model.
+//!
+//! How finely motion is cut follows from the bytes that the file may have and from how like its model it is to be: the
+//! model is sampled once, [`Curve`] gives the segments and the error at every price of a segment, and one comparison of
+//! renders calibrates it. Nothing is sampled twice.
 
 use crate::console::Console;
+use crate::deadline::Deadline;
 use crate::draw::{Painter, color_rgb};
 use crate::files::{self, grouped, human_bytes};
 use crate::paths::{Stage, View};
@@ -8,21 +13,23 @@ use crate::run_folder::Run;
 use crate::source::Source;
 use image::codecs::jpeg::JpegEncoder;
 use serde_json::{Value, json};
-use splat4d::bake::{self, Options, Shown, bake};
+use splat4d::bake::{self, Bakery, Curve, Cut, Options, Shown};
 use splat4d::device;
 use splat4d::format::playback::{
     self, Draft, Meta, NamedCamera, Pages, PathKey, Viewpoint, WriteConfig, feature_ranges,
 };
-use splat4d::layers::Scene;
+use splat4d::layers::{Evaluation, Scene};
 use splat4d::render::{Antialias, RenderConfig};
-use splat4d::scene::{Camera, GEOMETRY};
+use splat4d::scene::{Camera, GEOMETRY, Time};
 use std::path::Path;
-use std::time::Instant;
 
-/// Cameras and moments at which baked and model are compared; every one costs two pictures.
+/// Cameras that stand still and times at which baked and model are compared; every one costs two renders.
 const COMPARED_CAMERAS: usize = 4;
 const COMPARED_TIMES: usize = 6;
-/// Longer side of those pictures, pixels.
+/// The same of poses of a camera that moves, each at its own time; and of cameras that stand still beside it.
+const COMPARED_POSES: usize = 12;
+const COMPARED_BESIDE: usize = 2;
+/// Longer side of those renders, pixels.
 const COMPARED_SIDE: usize = 800;
 /// Most bytes of a poster: it comes before everything else.
 const POSTER_BYTES: usize = 30 << 10;
@@ -36,37 +43,63 @@ const PATH_STEP: f64 = 0.75;
 
 /// A file is to be so like its model, dB: what is lost by baking then hides behind what training leaves.
 pub(crate) const LIKE: f64 = 40.0;
-/// Bakings that are tried for it, each with a smaller tolerance.
-const TRIES: usize = 5;
-/// What a smaller tolerance aims at beyond that, dB.
+/// What a cut aims at beyond that, dB.
 const MARGIN: f64 = 0.3;
-/// dB gained for each that the tolerance is reduced by (20 log₁₀): of the first try, and the bounds of what is believed
-/// of earlier ones. 1 where every Gaussian errs as much as it may; most err less. Measured on networks: 0.46 to 0.58.
-const SLOPE: f64 = 0.55;
-const SLOPES: [f64; 2] = [0.25, 1.0];
-/// Most by which a tolerance is reduced at once.
-const REDUCED: f64 = 0.15;
-/// Where one primitive of so many lasts one look at the model only, a smaller tolerance has nothing left to split there: the
-/// model is looked at twice as often instead. Measured on a network that a hand-held camera's take taught (docs/suite.md).
-const SHORT_LIVED: usize = 10;
-/// A smaller tolerance that gains less than this, dB, costs more than it is worth: what is missing is the rounding's.
-const WORTH: f64 = 0.5;
+/// A file may have the bytes of the learned scene and so many for each second of the clip: 12 Mbit/s, the rate of a
+/// streamed film of 1080 to 2160 lines.
+const BYTES_A_SECOND: f64 = 1.5e6;
+/// Bytes of a primitive, its share of the palette included, until the first file is written (docs/format.md: 32 before
+/// deflate).
+const BYTES_A_PRIMITIVE: f64 = 28.0;
+/// Cuts that are tried: the first, one that is calibrated by it, and one that mends what that missed.
+const CUTS: usize = 3;
+/// A file this much larger than it may be is cut again.
+const TOO_LARGE: f64 = 1.03;
+/// A finer cut is tried where it may have this many times the primitives.
+const FINER: f64 = 1.05;
+/// Of the seconds that are left for baking, what the first sampling of the model may take. Sampling between frames, fitting,
+/// packing and comparing take the rest.
+const SAMPLING: f64 = 0.25;
+/// Seconds in which a primitive is fitted and packed, on a slow machine; and the share of what is left that may go into it.
+const SECONDS_A_PRIMITIVE: f64 = 4e-5;
+const FITTING: f64 = 0.4;
+/// Another cut takes about as long as the last one took, and this many times it is kept for it.
+const AGAIN: f64 = 1.3;
 
 /// Settings of baking and packing a scene.
 #[derive(Clone, Debug)]
 pub(crate) struct Baking {
     pub options: Options,
-    /// How like its model the file is to be, dB: the tolerance is reduced for it. None: the tolerance as it is.
-    pub like: Option<f64>,
+    /// Split by this error, pixels, whatever it costs. None: by bytes and likeness.
+    pub tolerance: Option<f64>,
+    /// Most bytes of the file. None: [`budget`].
+    pub bytes: Option<u64>,
     /// Most entries of the palette.
     pub palette: usize,
     pub poster: bool,
+    /// When it is to be done.
+    pub deadline: Deadline,
 }
 
 impl Default for Baking {
     fn default() -> Self {
-        Self { options: Options::default(), like: Some(LIKE), palette: WriteConfig::default().palette, poster: true }
+        Self {
+            options: Options::default(),
+            tolerance: None,
+            bytes: None,
+            palette: WriteConfig::default().palette,
+            poster: true,
+            deadline: Deadline::default(),
+        }
     }
+}
+
+/// Bytes that the file of a scene may have: those of its tables in 32-bit floats, and a rate for its clip.
+pub(crate) fn budget(scene: &Scene<f32>) -> u64 {
+    let numbers = |l: &splat4d::layers::Layer| l.params.keys().map(|k| l.params[k].data().len()).sum::<usize>();
+    let learned = 4 * scene.layers.iter().map(numbers).sum::<usize>();
+    let seconds = scene.clip[1] - scene.clip[0];
+    learned as u64 + if seconds > 0.0 { (BYTES_A_SECOND * seconds) as u64 } else { 0 }
 }
 
 /// A baked scene as a file's bytes, and what became of it.
@@ -75,6 +108,8 @@ pub(crate) struct Packed {
     pub baked: bake::Baked,
     summary: playback::Summary,
     antialias: bool,
+    /// The price of a segment, and what the curve says of it: primitives and error.
+    at: Option<(f64, [f64; 2])>,
 }
 
 /// Bakes a scene and packs it, without a look at how well. The options' cameras are the source's.
@@ -91,22 +126,98 @@ pub(crate) fn pack_scene(
     console: &Console,
 ) -> anyhow::Result<Packed> {
     let views = source.views()?;
-    let stage = source.stage(&views);
-    let cameras = distinct(&views);
-    let options = Options { cameras: cameras.iter().map(|v| v.camera.clone()).collect(), ..baking.options.clone() };
-    let mut baked = bake(scene, &options, &mut |done, total| console.phase("baking", done, total))?;
-    if scene.layers.iter().any(|l| l.masks.is_some()) {
-        console.warn("the scene's masks are not baked along: whom they leave out is drawn. Its own .s4d has them.");
+    let options = options(scene, baking, &views);
+    let kitchen = Kitchen { scene, source, views: &views, title, baking, console };
+    let mut bakery = Bakery::new(scene, &options)?;
+    let curve = kitchen.curve(&mut bakery)?;
+    let price = curve.as_ref().map(|curve| kitchen.first_price(curve));
+    kitchen.pack(&bakery, curve.as_ref(), price)
+}
+
+/// The options with the source's cameras, and as many samples of the model as the time allows.
+fn options(scene: &Scene<f32>, baking: &Baking, views: &[View]) -> Options {
+    let Cameras { still, path } = Cameras::of(views);
+    let cameras = still.iter().map(|v| v.camera.clone()).collect();
+    let path = path.iter().map(|v| (v.time, v.camera.clone())).collect();
+    let mut options = Options { cameras, path, ..baking.options.clone() };
+    let deadline = &baking.deadline;
+    if deadline.is_set() {
+        let mut instant = Evaluation::default();
+        let middle = Time(0.5 * (scene.clip[0] + scene.clip[1]));
+        // The first one makes room.
+        scene.at(middle, &mut instant);
+        let began = deadline.now();
+        scene.at(middle, &mut instant);
+        let seconds = (deadline.now() - began).max(f64::MIN_POSITIVE);
+        let most = SAMPLING * deadline.left().max(0.0) / seconds * scene.len() as f64;
+        options.samples = options.samples.min(most as usize);
     }
-    let antialias = source.run.as_ref().and_then(|r| r.recipe().ok()).is_some_and(|r| r.appearance.antialias);
-    let meta = Meta { title: title.to_owned(), ..meta(scene, &Outline::of_baked(&baked), &stage, &cameras) };
-    let poster = baking.poster.then(|| poster(scene, &stage, antialias)).flatten();
-    console.phase("writing", 0, 0);
-    let draft = Draft { meta, nodes: std::mem::take(&mut baked.nodes), poster };
-    let config = WriteConfig { palette: baking.palette, ..WriteConfig::default() };
-    let mut bytes = Vec::new();
-    let summary = playback::write(&draft, &config, &mut bytes)?;
-    Ok(Packed { bytes, baked, summary, antialias })
+    options
+}
+
+/// A scene that is made into files.
+struct Kitchen<'a> {
+    scene: &'a Scene<f32>,
+    source: &'a Source,
+    views: &'a [View],
+    title: &'a str,
+    baking: &'a Baking,
+    console: &'a Console,
+}
+
+impl Kitchen<'_> {
+    /// What segments cost, where they are not cut by a tolerance.
+    fn curve(&self, bakery: &mut Bakery<'_>) -> anyhow::Result<Option<Curve>> {
+        match self.baking.tolerance {
+            Some(_) => Ok(None),
+            None => Ok(bakery.measure(&mut |done, total| self.console.phase("sampling the motion", done, total))?),
+        }
+    }
+
+    /// Most primitives of a file, by its bytes and by the time that is left.
+    fn most(&self, bytes_a_primitive: f64) -> f64 {
+        let bytes = self.baking.bytes.unwrap_or_else(|| budget(self.scene)) as f64;
+        let left = self.baking.deadline.left().max(0.0);
+        (bytes / bytes_a_primitive).min(FITTING * left / SECONDS_A_PRIMITIVE)
+    }
+
+    /// The price that the curve asks for, before anything was compared.
+    fn first_price(&self, curve: &Curve) -> f64 {
+        let wanted = curve.price_for(mse(LIKE + MARGIN)).unwrap_or(0.0);
+        wanted.max(curve.price_of(self.most(BYTES_A_PRIMITIVE)))
+    }
+
+    fn pack(&self, bakery: &Bakery<'_>, curve: Option<&Curve>, price: Option<f64>) -> anyhow::Result<Packed> {
+        let (scene, console, baking) = (self.scene, self.console, self.baking);
+        let cut = match price {
+            Some(price) => Cut::Price(price),
+            None => Cut::Tolerance(baking.tolerance.unwrap_or(baking.options.tolerance)),
+        };
+        let mut baked = bakery.bake(cut, &mut |done, total| console.phase("baking", done, total))?;
+        if scene.layers.iter().any(|l| l.masks.is_some()) {
+            console.warn("the scene's masks are not baked along: whom they leave out is drawn. Its own .s4d has them.");
+        }
+        let antialias = self.source.run.as_ref().and_then(|r| r.recipe().ok()).is_some_and(|r| r.appearance.antialias);
+        let (stage, named) = (self.source.stage(self.views), distinct(self.views));
+        let meta = meta(scene, &Outline::of_baked(&baked), &stage, &named);
+        let poster = baking.poster.then(|| poster(scene, &stage, antialias)).flatten();
+        console.phase("writing", 0, 0);
+        let draft = Draft {
+            meta: Meta { title: self.title.to_owned(), ..meta },
+            nodes: std::mem::take(&mut baked.nodes),
+            poster,
+        };
+        let config = WriteConfig { palette: baking.palette, ..WriteConfig::default() };
+        let mut bytes = Vec::new();
+        let summary = playback::write(&draft, &config, &mut bytes)?;
+        let at = price.zip(curve).map(|(price, curve)| (price, curve.at(price)));
+        Ok(Packed { bytes, baked, summary, antialias, at })
+    }
+}
+
+/// The mean squared error of a PSNR.
+fn mse(psnr: f64) -> f64 {
+    10f64.powf(-0.1 * psnr)
 }
 
 /// Bakes into the file `out` and says how well; returns the report. The options' cameras are the source's.
@@ -117,14 +228,14 @@ pub(crate) fn bake_into(
     baking: &Baking,
     console: &Console,
 ) -> anyhow::Result<Value> {
-    let started = Instant::now();
-    let (packed, likeness) = bake_like(source, title, baking, console)?;
-    let Packed { mut bytes, baked, summary, antialias } = packed;
+    let started = baking.deadline.now();
+    let Cooked { packed, likeness, needs } = bake_like(source, title, baking, console)?;
+    let Packed { mut bytes, baked, summary, antialias, .. } = packed;
     if source.provenance.is_some() {
         bytes = playback::with_provenance(&bytes, source.provenance.as_ref())?;
     }
     files::write(out, &bytes)?;
-    let seconds = started.elapsed().as_secs_f64();
+    let seconds = baking.deadline.now() - started;
     console.clear();
     let report = &baked.report;
     let quantised: serde_json::Map<String, Value> = summary
@@ -138,9 +249,12 @@ pub(crate) fn bake_into(
         "bytes_per_primitive": summary.bytes as f64 / report.primitives.max(1) as f64,
         "pages": summary.pages, "page_bytes": summary.page_bytes, "palette_entries": summary.palette_entries,
         "palette_bytes": summary.palette_bytes, "poster_bytes": summary.poster_bytes, "baking": report,
-        "likeness": likeness, "quantisation": quantised,
+        "likeness": likeness, "needs": needs, "quantisation": quantised,
     });
     say(report, likeness.as_ref(), summary.bytes, seconds, console);
+    if let (Some(needs), Some(l)) = (needs, &likeness) {
+        console.say(&needs.in_words(l.psnr, summary.bytes));
+    }
     if antialias {
         console.warn(
             "the run was trained with antialias = true, which playback files cannot hold: thin things look stronger \
@@ -152,62 +266,85 @@ pub(crate) fn bake_into(
     Ok(value)
 }
 
-/// Bakes and packs a scene, again with a smaller tolerance where the file is less like its model than is wanted.
-pub(crate) fn bake_like(
-    source: &Source,
-    title: &str,
-    baking: &Baking,
-    console: &Console,
-) -> anyhow::Result<(Packed, Option<bake::Likeness>)> {
-    let scene = &source.scene;
-    let cameras = compared(source)?;
-    let compare =
-        |packed: &Packed| likeness(scene, &playback::read(&packed.bytes)?, &cameras, packed.antialias, console);
-    let packed = pack(source, title, baking, console)?;
-    let likeness = compare(&packed)?;
-    let mut tried = vec![(packed, likeness)];
-    let mut looks = baking.options.looks;
-    while tried.len() < TRIES {
-        let known: Vec<(f64, f64)> =
-            tried.iter().filter_map(|(p, like)| Some((p.baked.report.tolerance, like.as_ref()?.psnr))).collect();
-        // What is straight already has no pieces to add.
-        let splits = tried[0].0.baked.report.errors.worst > 0.0;
-        let Some(tolerance) = closer(baking.like.filter(|_| splits), &known) else { break };
-        let last = &tried[tried.len() - 1].0.baked.report;
-        let mut strict = baking.clone();
-        strict.options.tolerance = tolerance;
-        if SHORT_LIVED * last.key_states >= last.primitives {
-            looks *= 2.0;
-        }
-        strict.options.looks = looks;
-        let packed = pack(source, title, &strict, console)?;
-        let likeness = compare(&packed)?;
-        let gained = likeness.zip(tried[tried.len() - 1].1).is_some_and(|(new, old)| new.psnr >= old.psnr + WORTH);
-        if !gained {
-            break;
-        }
-        // One file at a time: those before are not needed again.
-        let last = tried.len() - 1;
-        tried[last].0.bytes = Vec::new();
-        tried.push((packed, likeness));
-    }
-    Ok(tried.pop().expect("one file was packed"))
+/// What a file that is less like its model than wanted would need.
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
+pub(crate) struct Needs {
+    /// dB.
+    psnr: f64,
+    /// Bytes of such a file, about.
+    bytes: u64,
+    /// Whether it needs more than that: the curve ends before.
+    more: bool,
 }
 
-/// The tolerance with which a file that is less like its model than wanted is baked again, by what tolerances (pixels) came
-/// to so far (dB). Errors that many Gaussians share, as of a wall that is carried along by the motion of a camera, shift
-/// the whole picture and cost more than those of Gaussians that err on their own: what a tolerance costs is known
-/// afterwards only. None: the last one is good enough.
-fn closer(like: Option<f64>, tried: &[(f64, f64)]) -> Option<f64> {
-    let &(tolerance, psnr) = tried.last()?;
-    let missing = like? - psnr;
-    let slope = match tried {
-        [.., (before, less), _] => (psnr - less) / (20.0 * (before / tolerance).log10()),
-        _ => SLOPE,
-    };
-    let slope = if slope.is_finite() { slope.clamp(SLOPES[0], SLOPES[1]) } else { SLOPE };
-    let reduced = 10f64.powf(-(missing + MARGIN) / (20.0 * slope)).max(REDUCED);
-    (missing > 0.0).then_some(tolerance * reduced)
+impl Needs {
+    fn in_words(self, psnr: f64, bytes: u64) -> String {
+        let more = if self.more { "more than" } else { "about" };
+        format!(
+            "{psnr:.1} dB against the model at {}; {} dB needs {more} {} (--size)",
+            human_bytes(bytes),
+            self.psnr,
+            human_bytes(self.bytes)
+        )
+    }
+}
+
+/// A file, how like its model it is, and what it would take to be as like it as wanted, where it is not.
+pub(crate) struct Cooked {
+    pub packed: Packed,
+    pub likeness: Option<bake::Likeness>,
+    pub needs: Option<Needs>,
+}
+
+/// Bakes and packs a scene within its bytes and time, and compares it with its model. Cuts it again where the first cut was
+/// further off than a comparison can tell, without sampling the model again.
+pub(crate) fn bake_like(source: &Source, title: &str, baking: &Baking, console: &Console) -> anyhow::Result<Cooked> {
+    let (scene, deadline) = (&source.scene, &baking.deadline);
+    let views = source.views()?;
+    let stage = source.stage(&views);
+    let options = options(scene, baking, &views);
+    let kitchen = Kitchen { scene, source, views: &views, title, baking, console };
+    let mut bakery = Bakery::new(scene, &options)?;
+    let curve = kitchen.curve(&mut bakery)?;
+    let mut price = curve.as_ref().map(|curve| kitchen.first_price(curve));
+    let mut best: Option<Cooked> = None;
+    let most = baking.bytes.unwrap_or_else(|| budget(scene)) as f64;
+    for round in 1..=CUTS {
+        let began = deadline.now();
+        let packed = kitchen.pack(&bakery, curve.as_ref(), price)?;
+        let likeness = compare(scene, &packed.bytes, &stage, &views, packed.antialias, deadline, console)?;
+        let bytes = packed.bytes.len() as f64;
+        let mut needs = None;
+        let mut next = None;
+        if let (Some(curve), Some((at, [pieces, error])), Some(like)) = (&curve, packed.at, &likeness) {
+            // What the file differs by beyond what its segments do is the rounding's, and stays.
+            let scale = mse(like.psnr) / error.max(f64::MIN_POSITIVE);
+            let wanted = curve.price_for(mse(LIKE + MARGIN) / scale);
+            let each = bytes / packed.baked.report.primitives.max(1) as f64;
+            let affordable = curve.price_of(kitchen.most(each));
+            let then = wanted.unwrap_or(0.0).max(affordable);
+            let [more, _] = curve.at(then);
+            if bytes > TOO_LARGE * most && more < pieces || like.psnr < LIKE && more > FINER * pieces {
+                next = Some(then).filter(|then| *then != at);
+            }
+            if like.psnr < LIKE {
+                let [pieces, _] = curve.at(wanted.unwrap_or(0.0));
+                needs = Some(Needs { psnr: LIKE, bytes: (each * pieces) as u64, more: wanted.is_none() });
+            }
+        }
+        let better = best.as_ref().is_none_or(|b| {
+            let psnr = |c: &Option<bake::Likeness>| c.as_ref().map_or(0.0, |l| l.psnr);
+            b.packed.bytes.len() as f64 > TOO_LARGE * most || psnr(&likeness) > psnr(&b.likeness)
+        });
+        if better {
+            best = Some(Cooked { packed, likeness, needs });
+        }
+        let Some(then) = next.filter(|_| round < CUTS && deadline.left() > AGAIN * (deadline.now() - began)) else {
+            break;
+        };
+        price = Some(then);
+    }
+    Ok(best.expect("one file was packed"))
 }
 
 fn say(report: &bake::Report, likeness: Option<&bake::Likeness>, bytes: u64, seconds: f64, console: &Console) {
@@ -230,52 +367,106 @@ fn say(report: &bake::Report, likeness: Option<&bake::Likeness>, bytes: u64, sec
     console.say(&words);
     let e = &report.errors;
     if e.worst > 0.0 {
+        let tolerance = report.tolerance.map(|t| format!(" (tolerance {t} px)")).unwrap_or_default();
         console.say(&format!(
-            "error a Gaussian: median {:.3} px, 99 of 100 below {:.3} px, worst {:.3} px (tolerance {} px)",
-            e.median, e.p99, e.worst, report.tolerance
+            "error a Gaussian: median {:.3} px, 99 of 100 below {:.3} px, worst {:.3} px{tolerance}",
+            e.median, e.p99, e.worst
         ));
     }
     if let Some(l) = likeness {
         console.say(&format!(
-            "the file against its model: {:.2} dB over {} pictures, {:.2} dB in the worst ({:.2} s)",
+            "the file against its model: {:.2} dB over {} renders, {:.2} dB in the worst ({:.2} s)",
             l.psnr, l.pictures, l.worst_psnr, l.worst_time
         ));
     }
 }
 
-/// The cameras by which a file is compared with its scene: those of the data set, else an orbit.
-pub(crate) fn compared(source: &Source) -> anyhow::Result<Vec<Camera>> {
-    let views = source.views()?;
-    let (stage, views) = (source.stage(&views), distinct(&views));
-    let cameras: Vec<Camera> = views
-        .iter()
-        .step_by(views.len().div_ceil(COMPARED_CAMERAS).max(1))
-        .map(|v| v.camera.downscaled(v.camera.width.max(v.camera.height).div_ceil(COMPARED_SIDE).max(1)))
-        .collect();
-    Ok(match cameras[..] {
-        [] => (0..COMPARED_CAMERAS).map(|i| stage.orbit(i as f64 / COMPARED_CAMERAS as f64)).collect(),
-        _ => cameras,
+/// Reads the file back and compares what it shows with what the model shows, as far as there is time.
+fn compare(
+    scene: &Scene<f32>,
+    bytes: &[u8],
+    stage: &Stage,
+    views: &[View],
+    antialias: bool,
+    deadline: &Deadline,
+    console: &Console,
+) -> anyhow::Result<Option<bake::Likeness>> {
+    if deadline.left() <= 0.0 {
+        console.say("the file is not compared with its model: nothing is left of --minutes");
+        return Ok(None);
+    }
+    likeness(scene, &playback::read(bytes)?, &shots(scene, stage, views), antialias, &mut |done, total| {
+        console.phase("comparing with the model", done, total);
+        deadline.left() > 0.0
     })
 }
 
-/// Compares what a file shows with what its scene shows.
+/// Compares what a file shows with what its scene shows, until `go_on` says no; it is given how many renders are done, of how many.
 pub(crate) fn likeness(
     scene: &Scene<f32>,
     played: &Scene<f32>,
-    cameras: &[Camera],
+    shots: &[(f64, Camera)],
     antialias: bool,
-    console: &Console,
+    go_on: &mut dyn FnMut(usize, usize) -> bool,
 ) -> anyhow::Result<Option<bake::Likeness>> {
+    let antialias = if antialias { Antialias::On } else { Antialias::Off };
+    let mut cpu = device::cpu(RenderConfig { antialias, ..RenderConfig::default() });
+    Ok(bake::compare(scene, Shown::File(played), shots, cpu.as_mut(), go_on)?)
+}
+
+/// Cameras and times by which a file is compared with its scene: those of the data set, else an orbit.
+pub(crate) fn compared(source: &Source) -> anyhow::Result<Vec<(f64, Camera)>> {
+    let views = source.views()?;
+    Ok(shots(&source.scene, &source.stage(&views), &views))
+}
+
+/// Cameras and times of a comparison: cameras that stand still at times over the clip, one that moves where it was at each.
+fn shots(scene: &Scene<f32>, stage: &Stage, views: &[View]) -> Vec<(f64, Camera)> {
+    let small = |c: &Camera| c.downscaled(c.width.max(c.height).div_ceil(COMPARED_SIDE).max(1));
+    let Cameras { still, path } = Cameras::of(views);
+    let most = if path.is_empty() { COMPARED_CAMERAS } else { COMPARED_BESIDE };
+    let mut cameras: Vec<Camera> =
+        still.iter().step_by(still.len().div_ceil(most).max(1)).map(|v| small(&v.camera)).collect();
+    if views.is_empty() {
+        cameras = (0..COMPARED_CAMERAS).map(|i| stage.orbit(i as f64 / COMPARED_CAMERAS as f64)).collect();
+    }
     let [from, to] = scene.clip;
     // In the middle of equal parts: neither only on frames nor only between them.
     let mut times: Vec<f64> =
         (0..COMPARED_TIMES).map(|i| from + (to - from) * (i as f64 + 0.5) / COMPARED_TIMES as f64).collect();
     times.dedup();
-    let antialias = if antialias { Antialias::On } else { Antialias::Off };
-    let mut cpu = device::cpu(RenderConfig { antialias, ..RenderConfig::default() });
-    Ok(bake::compare(scene, Shown::File(played), cameras, &times, cpu.as_mut(), &mut |done, total| {
-        console.phase("comparing with the model", done, total);
-    })?)
+    let mut shots: Vec<(f64, Camera)> =
+        times.iter().flat_map(|t| cameras.iter().map(|camera| (*t, camera.clone()))).collect();
+    // The same of poses: every second one on its way to the next frame.
+    let part = if scene.fps > 0.0 && scene.fps.is_finite() { 0.5 / scene.fps } else { 0.0 };
+    let poses = path.iter().step_by(path.len().div_ceil(COMPARED_POSES).max(1)).enumerate();
+    shots.extend(poses.map(|(i, v)| ((v.time + part * (i % 2) as f64).min(to), small(&v.camera))));
+    shots.sort_by(|a, b| a.0.total_cmp(&b.0));
+    shots
+}
+
+/// Cameras that stand still, each once, and the poses of cameras that move, by time.
+#[derive(Debug)]
+struct Cameras<'a> {
+    still: Vec<&'a View>,
+    path: Vec<&'a View>,
+}
+
+impl<'a> Cameras<'a> {
+    fn of(views: &'a [View]) -> Self {
+        let mut first = std::collections::BTreeMap::new();
+        let mut moves = std::collections::BTreeSet::new();
+        for view in views {
+            let pose = view.camera.cam_from_world;
+            if *first.entry(view.name.as_str()).or_insert(pose) != pose {
+                moves.insert(view.name.as_str());
+            }
+        }
+        let still = distinct(views).into_iter().filter(|v| !moves.contains(v.name.as_str())).collect();
+        let mut path: Vec<&View> = views.iter().filter(|v| moves.contains(v.name.as_str())).collect();
+        path.sort_by(|a, b| a.time.total_cmp(&b.time));
+        Self { still, path }
+    }
 }
 
 /// Every camera once, by name, spread over the rig where there are too many.
@@ -370,24 +561,4 @@ pub(crate) fn title(source: &Source, path: &Path) -> String {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_file_that_is_not_like_its_model_is_baked_again_with_less_tolerance() {
-        // A model of files: so many dB for each of the tolerance's, up to what rounding leaves.
-        for (slope, ceiling) in [(0.5, 60.0), (0.9, 60.0), (0.3, 60.0), (1.0, 45.0)] {
-            let file = |tolerance: f64| f64::min(34.0 + slope * 20.0 * (0.25 / tolerance).log10(), ceiling);
-            let mut tried = vec![(0.25, file(0.25))];
-            while let Some(tolerance) = closer(Some(LIKE), &tried).filter(|_| tried.len() < TRIES) {
-                tried.push((tolerance, file(tolerance)));
-            }
-            let (tolerance, psnr) = tried[tried.len() - 1];
-            assert!((LIKE..LIKE + 6.0).contains(&psnr), "{slope}: {psnr} dB with {tolerance} px");
-        }
-        assert!(closer(Some(LIKE), &[(0.25, 0.0)]).unwrap() > 0.03, "never too much at once");
-        assert_eq!(closer(Some(LIKE), &[(0.25, 40.1)]), None, "good enough");
-        assert_eq!(closer(None, &[(0.25, 30.0)]), None, "a tolerance that was asked for stays");
-        assert_eq!(closer(Some(LIKE), &[]), None, "nothing was compared");
-    }
-}
+mod tests;

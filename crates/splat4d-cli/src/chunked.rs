@@ -1,6 +1,7 @@
 //! Long takes in chunks: the work behind `train --chunk` and `join`.
 
 use crate::console::Console;
+use crate::deadline::Deadline;
 use crate::files::{grouped, human_bytes, human_seconds};
 use crate::{film, finish};
 use serde_json::json;
@@ -124,5 +125,5 @@ pub(crate) fn join(
             ("join_peak_memory".into(), json!(run::peak_memory())),
         ],
     )?;
-    if no_eval { Ok(()) } else { finish::all(run, measure, console) }
+    if no_eval { Ok(()) } else { finish::all(run, measure, &Deadline::default(), console) }
 }

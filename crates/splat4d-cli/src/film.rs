@@ -1,7 +1,7 @@
 //! The playback file of a long take: parts are appended as they are finished, so that it plays as far as it goes; at the end it
 //! is written anew as any other file.
 
-use crate::baking::{self, Baking, Outline, Packed, bake_like, poster};
+use crate::baking::{self, Baking, Outline, bake_like, poster};
 use crate::console::Console;
 use crate::files::{cannot_read, human_bytes};
 use crate::playable::FILE;
@@ -101,7 +101,7 @@ fn append_to(path: &Path, run: &Path, chunked: &Chunked, thorough: bool, console
         let (bytes, theirs) = if source.scene.is_empty() {
             (None, Meta::default())
         } else {
-            let (Packed { bytes, .. }, _) = bake_like(&source, &title, &baking, console)?;
+            let bytes = bake_like(&source, &title, &baking, console)?.packed.bytes;
             let index = Index::parse(&bytes, None)?;
             (Some(bytes), index.meta)
         };

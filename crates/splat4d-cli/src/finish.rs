@@ -1,33 +1,36 @@
-//! What follows training: scores and pictures of held-out views, an orbit film, the playback file and the report.
+//! What follows training: scores and renders of held-out views, the playback file, an orbit film and the report, within what is
+//! left of `--minutes`.
 
 use crate::baking::{Baking, bake_into};
 use crate::console::Console;
+use crate::deadline::Deadline;
 use crate::draw::{Channel, Painter};
+use crate::files::{self, human_seconds};
 use crate::paths::{Clock, Route, Stage, orbit_seconds, shots};
+use crate::playable;
 use crate::report::{self, refined_in_words};
 use crate::run_folder::{ORDER, Run};
 use crate::source::{Source, not_empty, read_scene};
 use crate::video::{Film, have_ffmpeg};
-use crate::{files, playable};
 use serde_json::{Value, json};
+use splat4d::bake;
 use splat4d::device::Device;
 use splat4d::layers::Scene;
 use splat4d::{Error, Result};
-use splat4d_train::capture::{Capture, CaptureKind, CaptureOptions, ImageStore};
+use splat4d_train::capture::{Capture, CaptureKind, CaptureOptions, ImageStore, Timing};
 use splat4d_train::eval::Align;
 use splat4d_train::eval::flow::flow_error;
 use splat4d_train::eval::points::point_errors;
 use splat4d_train::eval::run::{EvalOptions, Measured, Scores, evaluate};
 use splat4d_train::eval::tracks::track_error;
 use splat4d_train::eval::trajectory::trajectory_error;
-use splat4d_train::recipe::Recipe;
+use splat4d_train::recipe::{MotionName, Recipe};
 use splat4d_train::run::chunks::Chunked;
-use splat4d_train::run::{capture_options, corrected};
+use splat4d_train::run::{Stopwatch, capture_options, corrected};
 use splat4d_train::{features, labels};
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Instant;
 
 /// Frames a second of the orbit film: cinema's, and a fifth less work than 30.
 const ORBIT_FPS: f64 = 24.0;
@@ -36,7 +39,7 @@ const ORBIT_FPS_PNG: f64 = 10.0;
 /// Longer side of an animated PNG, pixels.
 const ORBIT_SIDE_PNG: usize = 400;
 
-/// Training steps that take as long as what follows training: a held-out view drawn, measured and written; a frame of the
+/// Training steps that take as long as what follows training: a held-out view rendered, measured and written; a frame of the
 /// film; the playback file, baked and compared with the scene. By the knight's 120 held-out views and 144 frames: 8 s where a
 /// step takes 25 ms (docs/benchmarks.md), and the same shares on a machine that hardly got any time.
 const HELD_STEPS: f64 = 1.5;
@@ -44,22 +47,34 @@ const HELD_STEPS: f64 = 1.5;
 const FILM_STEPS: f64 = 0.5;
 /// See [`HELD_STEPS`].
 const BAKE_STEPS: f64 = 60.0;
+/// The same of a model whose motion is not straight: a time sample of it, and all that follows sampling.
+const SAMPLE_STEPS: f64 = 0.4;
+/// See [`SAMPLE_STEPS`].
+const CUT_STEPS: f64 = 100.0;
+/// Motion models whose motion is straight, or nearly.
+const STRAIGHT: [&str; 3] = ["still", "spacetime", "native4d"];
 
 /// See [`HELD_STEPS`]: a picture with a mask of labels or a picture of features, drawn and taken back once.
 const LABEL_STEPS: f64 = 1.0;
 
 /// The time of what follows training, in training steps at full size: `--minutes` leaves room for it.
-pub(crate) fn steps(capture: &Capture, only_playback: bool) -> f64 {
+pub(crate) fn steps(capture: &Capture, recipe: &Recipe, only_playback: bool) -> f64 {
     let frames = || capture.train.iter().map(|&i| &capture.frames[i]);
     let masks = frames().filter(|f| f.labels.is_some()).count().min(labels::MOST_PICTURES);
     let featured = frames().filter(|f| f.features.is_some()).count().min(features::MOST_PICTURES);
     let labels = (labels::ROUNDS * masks + (features::ROUNDS + 1) * featured) as f64 * LABEL_STEPS;
-    if only_playback {
-        return BAKE_STEPS + labels;
-    }
     let (first, last) = capture.time_range();
+    // What `auto` chooses where cameras move is a network.
+    let motion = recipe.run.motion;
+    let moves = capture.cameras.iter().any(|c| !c.fixed) && capture.timing != Timing::Moment;
+    let straight = STRAIGHT.iter().any(|name| motion == *name) || motion == MotionName::AUTO.as_str() && !moves;
+    let samples = ((last - first) * capture.fps.max(bake::LOOKS)).max(0.0);
+    let bake = if straight { BAKE_STEPS } else { CUT_STEPS + SAMPLE_STEPS * samples };
+    if only_playback {
+        return bake + labels;
+    }
     let fps = if have_ffmpeg() { ORBIT_FPS } else { ORBIT_FPS_PNG };
-    labels + capture.held.len() as f64 * HELD_STEPS + orbit_seconds(last - first) * fps * FILM_STEPS + BAKE_STEPS
+    labels + capture.held.len() as f64 * HELD_STEPS + orbit_seconds(last - first) * fps * FILM_STEPS + bake
 }
 
 /// Options of measuring.
@@ -85,27 +100,96 @@ impl Measure {
     }
 }
 
-/// Scores, film, playback file and report.
-pub(crate) fn all(run: &Path, measure: &Measure, console: &Console) -> anyhow::Result<()> {
-    let scene = read_scene(&Run::open(run)?.scene_file()?)?;
-    let started = Instant::now();
-    scores(run, &scene, measure, console)?;
-    amend(run, [("evaluation_seconds".into(), json!(started.elapsed().as_secs_f64()))])?;
-    let started = Instant::now();
-    match orbit(run, &scene, console) {
-        Ok(film) => {
-            console.written(&film);
-            amend(run, [("orbit_seconds".into(), json!(started.elapsed().as_secs_f64()))])?;
-        }
-        // The scene and its scores stand without the film.
-        Err(error) => console.warn(&format!("there is no orbit film: {error:#}")),
+/// Scores, playback file, film and report, as far as the time allows: the file always, within what is left.
+pub(crate) fn all(run: &Path, measure: &Measure, deadline: &Deadline, console: &Console) -> anyhow::Result<()> {
+    let opened = Run::open(run)?;
+    let scene = read_scene(&opened.scene_file()?)?;
+    let time = Times::estimate(&opened, &scene, deadline)?;
+    if Times::leaves("the held-out views are not scored", [time.scores, time.playback], run, deadline, console) {
+        let started = deadline.now();
+        scores(run, &scene, measure, console)?;
+        amend(run, [("evaluation_seconds".into(), json!(deadline.now() - started))])?;
     }
-    playback(run, console)?;
+    playback_by(run, deadline, console)?;
+    if Times::leaves("there is no orbit film", [time.film, 0.0], run, deadline, console) {
+        let started = deadline.now();
+        match orbit(run, &scene, console) {
+            Ok(film) => {
+                console.written(&film);
+                amend(run, [("orbit_seconds".into(), json!(deadline.now() - started))])?;
+            }
+            // The scene and its scores stand without the film.
+            Err(error) => console.warn(&format!("there is no orbit film: {error:#}")),
+        }
+    }
     write_report(run, console)
 }
 
-/// Bakes the run into `scene.s4d`. What goes wrong is said and never costs the run.
+/// What is left of the minutes of a run that was resumed: what its commands took until training was over does not count anew,
+/// and time between them not at all.
+pub(crate) fn rest_of(run: &Run, clock: Stopwatch) -> Deadline {
+    let budget = &run.info["budget"];
+    let left = || Some(60.0 * budget["minutes"].as_f64()? - budget["before"].as_f64()? - run.number("seconds")?);
+    match left() {
+        Some(left) => Deadline::of(clock.clone(), Some((clock.seconds() + left) / 60.0)),
+        None => Deadline::of(clock, None),
+    }
+}
+
+/// Seconds that parts of what follows training take, by a render that is timed; zero where nobody asks.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+struct Times {
+    scores: f64,
+    playback: f64,
+    film: f64,
+}
+
+impl Times {
+    fn estimate(run: &Run, scene: &Scene<f32>, deadline: &Deadline) -> Result<Self> {
+        if !deadline.is_set() {
+            return Ok(Self::default());
+        }
+        let views = run.views()?;
+        let Some(view) = views.iter().find(|v| v.held).or(views.first()) else { return Ok(Self::default()) };
+        let mut painter = Painter::new(scene, scene.background, false, false);
+        // The first one makes room.
+        painter.draw(&view.camera, view.time);
+        let began = deadline.now();
+        painter.draw(&view.camera, view.time);
+        let step = (deadline.now() - began) / FILM_STEPS;
+        let held = views.iter().filter(|v| v.held).count() + EvalOptions::default().train_views;
+        let frames =
+            orbit_seconds(scene.clip[1] - scene.clip[0]) * if have_ffmpeg() { ORBIT_FPS } else { ORBIT_FPS_PNG };
+        Ok(Self {
+            scores: step * HELD_STEPS * held as f64,
+            playback: step * BAKE_STEPS,
+            film: step * FILM_STEPS * frames,
+        })
+    }
+
+    /// Whether what takes `seconds` fits, and what is kept for later with it; says so in one line where it does not.
+    fn leaves(missing: &str, [seconds, kept]: [f64; 2], run: &Path, deadline: &Deadline, console: &Console) -> bool {
+        let left = deadline.left();
+        if !deadline.is_set() || seconds + kept <= left {
+            return true;
+        }
+        console.warn(&format!(
+            "{missing}: about {} are needed, and {} are left of --minutes. `splat4d eval {}` makes up for it.",
+            human_seconds(seconds),
+            human_seconds(left - kept),
+            run.display()
+        ));
+        false
+    }
+}
+
+/// Bakes the run into `scene.s4d`, whatever it takes. What goes wrong is said and never costs the run.
 pub fn playback(run: &Path, console: &Console) -> Result<()> {
+    playback_by(run, &Deadline::default(), console)
+}
+
+/// The same, within a time.
+pub(crate) fn playback_by(run: &Path, deadline: &Deadline, console: &Console) -> Result<()> {
     // The file of a compression is what was learnt: baking anew would lose its codes, palette and masks.
     // That of a long take was made chunk by chunk.
     if run.join(ORDER).is_file() || Chunked::is(run) {
@@ -114,7 +198,8 @@ pub fn playback(run: &Path, console: &Console) -> Result<()> {
     let baked = Source::open(run).map_err(anyhow::Error::from).and_then(|source| {
         not_empty(&source.scene, run)?;
         let title = Run::open(run)?.name();
-        bake_into(&source, &title, &run.join(playable::FILE), &Baking::default(), console)
+        let baking = Baking { deadline: deadline.clone(), ..Baking::default() };
+        bake_into(&source, &title, &run.join(playable::FILE), &baking, console)
     });
     console.clear();
     match baked {

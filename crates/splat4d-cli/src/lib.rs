@@ -12,6 +12,7 @@ mod camera_file;
 mod chunked;
 mod compressing;
 pub mod console;
+mod deadline;
 mod device;
 pub mod draw;
 mod editing;

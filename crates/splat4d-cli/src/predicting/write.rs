@@ -27,9 +27,7 @@ pub(super) fn all(
     let source =
         Source { run: Some(crate::run_folder::Run::open(&work.order.run)?), ..Source::own(best.scene.clone()) };
     let title = format!("{}, predicted by {}", work.run.name(), best.model.name());
-    // Nodes are straight between frames; a file nearer to the model than the default tolerance serves no prediction.
-    let baking = Baking { like: None, ..Baking::default() };
-    bake_into(&source, &title, &folder.join(playable::FILE), &baking, console)?;
+    bake_into(&source, &title, &folder.join(playable::FILE), &Baking::default(), console)?;
     Ok(())
 }
 

@@ -1,9 +1,10 @@
 //! `bake`: a run or a scene becomes one file for playback.
 
-use crate::baking::{Baking, LIKE, bake_into, title};
+use crate::baking::{Baking, bake_into, title};
 use crate::console::Console;
+use crate::files::{self, parse_bytes};
 use crate::source::{Source, not_empty};
-use crate::{files, playable};
+use crate::playable;
 use splat4d::Error;
 use splat4d::bake::{MAX_REPEAT, Options, SEGMENT, TOLERANCE};
 use splat4d::format::playback::{MAX_PALETTE, WriteConfig};
@@ -12,6 +13,7 @@ use std::path::PathBuf;
 const EXAMPLES: &str = "\
 Examples:
   splat4d bake runs/knight -o knight.s4d           everything in one small file that plays anywhere
+  splat4d bake runs/knight -o small.s4d --size 4MB      what moves is split as finely as that allows
   splat4d bake runs/knight -o tight.s4d --tolerance 0.1
   splat4d bake runs/knight -o long.s4d --repeat 20        the take twenty times over, to try long takes
 
@@ -27,9 +29,12 @@ pub(crate) struct Args {
     /// The file to write
     #[arg(short, long, value_name = "OUT.s4d")]
     output: PathBuf,
-    /// Largest error of a Gaussian, pixels of the capture's cameras; smaller ones cost more pieces [default: 0.25, or
-    /// what it takes for 40 dB against the model]
-    #[arg(long, value_name = "PX")]
+    /// Most bytes of the file: motion is split into as many segments as fit, but no more than 40 dB against the model
+    /// need [default: the learned scene's bytes, and 1.5 MB for each second]
+    #[arg(long, value_name = "SIZE", value_parser = parse_bytes)]
+    size: Option<u64>,
+    /// Split whatever misses by more than so many pixels of the capture's cameras, whatever it costs
+    #[arg(long, value_name = "PX", conflicts_with = "size")]
     tolerance: Option<f64>,
     /// About how many seconds are fetched for a seek
     #[arg(long, value_name = "S", default_value_t = SEGMENT)]
@@ -67,9 +72,11 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             repeat: args.repeat,
             ..Options::default()
         },
-        like: args.tolerance.is_none().then_some(LIKE),
+        tolerance: args.tolerance,
+        bytes: args.size,
         palette: args.palette,
         poster: !args.no_poster,
+        ..Baking::default()
     };
     let report = bake_into(&source, &title(&source, &args.source), out, &baking, console)?;
     if let Some(path) = &args.report {

@@ -48,9 +48,9 @@ Examples:
   splat4d bench --device gpu --beside others      the same training in other programs, docs/gpu.md
   splat4d bench --playback runs/a runs/a-small    frames a second of runs and files, in turns
 
-Times are means over eight views of the best of several rounds. `of ceiling` is the least time in which the stage's
+Times are means over eight views of the best of several rounds. `lower bound` is the least time in which the stage's
 compulsory work could be done (blending at the speed of its arithmetic alone, bytes at the speed of memory, both
-measured first), as a share of the time it took. Playback is drawn from 24 of the first scene's own cameras over its clip
+measured first), and its share of the time it took. Playback is drawn from 24 of the first scene's own cameras over its clip
 with its vertical field of view, by all threads or --threads of them: end to end is looking up who is alive, motion, drawing and 8-bit
 colours; the best of five rounds counts, picture by picture, and all files take turns. Measure on an idle machine:
 docs/benchmarks.md.";

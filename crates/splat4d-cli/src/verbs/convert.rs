@@ -281,7 +281,8 @@ pub(crate) fn write(args: &Args, mut source: Source, console: &Console) -> anyho
     let compared = if target.moves() { baking::compared(&source)? } else { Vec::new() };
     let rotation = rotate(&mut source.scene, args.up, target, console);
     let turned = |cameras: Vec<Camera>| cameras.into_iter().map(|c| rotated(c, &rotation)).collect::<Vec<_>>();
-    let (cameras, compared) = (turned(cameras.into_iter().collect()), turned(compared));
+    let cameras = turned(cameras.into_iter().collect());
+    let compared: Vec<(f64, Camera)> = compared.into_iter().map(|(t, c)| (t, rotated(c, &rotation))).collect();
     if target == Target::Playback {
         return bake(source, args, rotation != IDENTITY, console);
     }
@@ -365,12 +366,15 @@ fn like(
     source: &Source,
     dialect: Dialect,
     bytes: &[u8],
-    cameras: &[Camera],
+    shots: &[(f64, Camera)],
     console: &Console,
 ) -> anyhow::Result<Option<Likeness>> {
     let file = dialect.open(bytes)?.scene;
     let antialias = source.run.as_ref().and_then(|run| run.recipe().ok()).is_some_and(|r| r.appearance.antialias);
-    let likeness = baking::likeness(&source.scene, &file, cameras, antialias, console)?;
+    let likeness = baking::likeness(&source.scene, &file, shots, antialias, &mut |done, total| {
+        console.phase("comparing with the scene", done, total);
+        true
+    })?;
     console.clear();
     Ok(likeness)
 }

@@ -1,6 +1,7 @@
 //! `eval`: measures a run again, perhaps next to a scene that stands still.
 
 use crate::console::Console;
+use crate::deadline::Deadline;
 use crate::device::{self, Device};
 use crate::finish;
 use crate::run_folder::{Run, cameras_json};
@@ -132,7 +133,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         finish::scores(path, &scene, &measure, console)?;
         return finish::write_report(path, console);
     }
-    finish::all(path, &measure, console)
+    finish::all(path, &measure, &Deadline::default(), console)
 }
 
 /// Trains the still scene unless it is there, and measures it.

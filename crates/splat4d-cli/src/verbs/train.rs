@@ -2,6 +2,7 @@
 
 use crate::chunked::{self, Wanted};
 use crate::console::Console;
+use crate::deadline::Deadline;
 use crate::device::{self, Device};
 use crate::files::{self, human_bytes, parse_bytes};
 use crate::run_folder::{self, Asked, Run, cameras_json};
@@ -207,6 +208,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         let watch = watch(&Run::open(run)?.name());
         let folder = OutputFolder::amend(run, "train --resume")?;
         let device = device::to_train(args.device, console);
+        let clock = clock.clone();
         let options = TrainOptions { device, snapshots: snapshots(&watch), clock, ..TrainOptions::default() };
         let trained = run::resume_with(run, &options, &stop, &mut |event| listen(event, &watch));
         (folder, run.clone(), watch, trained)
@@ -290,9 +292,9 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         let options = TrainOptions {
             device: device::to_train(args.device, console),
             minutes,
-            finish: finish::steps(&whole, args.no_eval),
+            finish: finish::steps(&whole, &recipe, args.no_eval),
             predict,
-            clock,
+            clock: clock.clone(),
             own_loss: None,
             snapshots: snapshots(&watch),
         };
@@ -333,10 +335,14 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     if labelling::has_any(&Run::open(&run)?.open_capture()?.0) {
         labelling::label(&run, None, None, console)?;
     }
+    let deadline = match &args.resume {
+        Some(run) => finish::rest_of(&Run::open(run)?, clock),
+        None => Deadline::of(clock, args.minutes),
+    };
     if args.no_eval {
-        finish::playback(&run, console)?;
+        finish::playback_by(&run, &deadline, console)?;
     } else {
-        finish::all(&run, &args.measure, console)?;
+        finish::all(&run, &args.measure, &deadline, console)?;
     }
     folder.finished();
     watch.show(&run, outcome.iteration);

@@ -1,4 +1,4 @@
-//! Baked against model: both drawn, from some cameras at some frames.
+//! Baked against model: both rendered, from some cameras at some times.
 
 use crate::Result;
 use crate::format::playback::{Node, Primitive};
@@ -22,8 +22,6 @@ pub struct Likeness {
     pub worst_psnr: f64,
     /// Second of the worst picture.
     pub worst_time: f64,
-    /// Which camera saw it.
-    pub worst_camera: usize,
     /// Pictures compared.
     pub pictures: usize,
 }
@@ -94,22 +92,22 @@ pub enum Shown<'a> {
     File(&'a Scene<f32>),
 }
 
-/// Draws the baked scene and the model as every camera sees them at every time, and compares. `None`: nothing to compare.
-/// Errors: the backend's.
+/// Renders the baked scene and the model from these cameras at these times, and compares. `progress` hears how many images
+/// of how many are done; `false` ends the comparison with those. `None`: nothing was compared. Errors: the backend's.
 pub fn compare(
     scene: &Scene<f32>,
     baked: Shown<'_>,
-    cameras: &[Camera],
-    times: &[f64],
+    shots: &[(f64, Camera)],
     backend: &mut dyn Backend,
-    progress: &mut dyn FnMut(usize, usize),
+    progress: &mut dyn FnMut(usize, usize) -> bool,
 ) -> Result<Option<Likeness>> {
     let (mut instant, mut moment) = (Evaluation::default(), Moment::default());
     let (mut truth, mut copy) = (Image::default(), Image::default());
     let mut played = Evaluation::default();
     let (mut sum, mut pixels, mut done) = (0.0, 0.0, 0);
-    let mut worst = (f64::INFINITY, 0.0, 0);
-    for &time in times {
+    let mut worst = (f64::INFINITY, 0.0);
+    for of_time in shots.chunk_by(|a, b| a.0 == b.0) {
+        let time = of_time[0].0;
         scene.at(Time(time), &mut instant);
         match baked {
             Shown::Nodes(nodes) => moment.fill(nodes, scene.clip, time),
@@ -120,7 +118,7 @@ pub fn compare(
             Shown::File(file) => file.splats(&played),
         };
         let model = scene.splats(&instant);
-        for (i, camera) in cameras.iter().enumerate() {
+        for (_, camera) in of_time {
             backend.render(&Shot::new(&model, camera, scene.background), &mut truth)?;
             backend.render(&Shot::new(&splats, camera, scene.background), &mut copy)?;
             let square = |(a, b): (&f32, &f32)| f64::from(a.clamp(0.0, 1.0) - b.clamp(0.0, 1.0)).powi(2);
@@ -128,19 +126,19 @@ pub fn compare(
             let count = truth.color.data.len() as f64;
             let own = psnr(error / count.max(1.0));
             if own < worst.0 {
-                worst = (own, time, i);
+                worst = (own, time);
             }
             (sum, pixels, done) = (sum + error, pixels + count, done + 1);
-            progress(done, times.len() * cameras.len());
+            if !progress(done, shots.len()) {
+                return Ok(likeness(sum, pixels, worst, done));
+            }
         }
     }
-    Ok((done > 0 && pixels > 0.0).then(|| Likeness {
-        psnr: psnr(sum / pixels),
-        worst_psnr: worst.0,
-        worst_time: worst.1,
-        worst_camera: worst.2,
-        pictures: done,
-    }))
+    Ok(likeness(sum, pixels, worst, done))
+}
+
+fn likeness(sum: f64, pixels: f64, (worst_psnr, worst_time): (f64, f64), pictures: usize) -> Option<Likeness> {
+    (pixels > 0.0).then(|| Likeness { psnr: psnr(sum / pixels), worst_psnr, worst_time, pictures })
 }
 
 fn psnr(mse: f64) -> f64 {

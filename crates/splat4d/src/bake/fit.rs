@@ -40,8 +40,10 @@ pub(super) struct Piece {
 pub(super) struct Fitter<'a> {
     pub tree: &'a Tree,
     pub lookout: &'a Lookout,
-    /// Pixels.
+    /// Errors of shape and life that need not be improved, pixels.
     pub tolerance: f64,
+    /// Largest error that is not split further, pixels.
+    pub accepted: f64,
 }
 
 /// One Gaussian and everything that was seen of it.
@@ -67,10 +69,10 @@ struct Look {
 }
 
 impl Fitter<'_> {
-    /// All pieces of one Gaussian, in time order.
-    pub(super) fn pieces(&self, subject: &Subject<'_>) -> Vec<Piece> {
+    /// The pieces of one Gaussian in a span, in time order.
+    pub(super) fn pieces(&self, subject: &Subject<'_>, span: Span) -> Vec<Piece> {
         let mut out = Vec::new();
-        self.place(subject, self.tree.root(), &mut out);
+        self.place(subject, span, &mut out);
         out
     }
 
@@ -82,7 +84,7 @@ impl Fitter<'_> {
             Place::Here => {}
         }
         match (self.fit(subject, span), self.tree.split(span)) {
-            (Some((primitive, error)), _) if error <= self.tolerance => out.push(Piece { span, primitive, error }),
+            (Some((primitive, error)), _) if error <= self.accepted => out.push(Piece { span, primitive, error }),
             // Where nothing could be fitted a half may still hold a frame that is sound.
             (_, Some(halves)) => halves.into_iter().for_each(|half| self.place(subject, half, out)),
             (Some((primitive, error)), None) => out.push(Piece { span, primitive, error }),
@@ -90,7 +92,8 @@ impl Fitter<'_> {
         }
     }
 
-    /// The best primitive of a node, and its error in pixels. None: not one look is finite.
+    /// The best primitive of a node, and its error in pixels. None: not one look is finite, or the node is split whatever its
+    /// shape is.
     fn fit(&self, subject: &Subject<'_>, span: Span) -> Option<(Primitive, f64)> {
         let looks = self.looks(subject, span);
         let single = span[1] - span[0] == 1;
@@ -111,24 +114,33 @@ impl Fitter<'_> {
 
         let (life, opacity) = self.life(subject, span, held);
         let pixels = self.lookout.pixels(mean);
-        let shape = self.shape(subject, &looks, held, life.center, pixels);
         let colors = colors(subject, held);
         let center: [f64; 3] = std::array::from_fn(|k| mean[k] + velocity[k] * (life.center - time));
-        let mut error = 0.0f64;
-        for look in held {
-            let delta = look.time - life.center;
-            let at: [f64; 3] = std::array::from_fn(|k| center[k] + velocity[k] * delta);
-            let level = (opacity * life.sigma(look.time) - look.alpha).abs();
-            let strength = look.alpha.max(opacity * life.sigma(look.time));
-            let mut off = norm(sub(at, look.mean)).max(difference(shape.covariance(delta), look.cov)) * pixels;
-            if subject.colors.is_none() {
-                let seen = &subject.samples.at(subject.row, look.frame)[GEOMETRY..];
-                off = off.max(LEVEL_PIXELS * color_difference(&colors, seen));
+        let worst = |shape: Option<&Shape>| {
+            let mut error = 0.0f64;
+            for look in held {
+                let delta = look.time - life.center;
+                let at: [f64; 3] = std::array::from_fn(|k| center[k] + velocity[k] * delta);
+                let level = (opacity * life.sigma(look.time) - look.alpha).abs();
+                let strength = look.alpha.max(opacity * life.sigma(look.time));
+                let outline = shape.map_or(0.0, |shape| difference(shape.covariance(delta), look.cov));
+                let mut off = norm(sub(at, look.mean)).max(outline) * pixels;
+                if subject.colors.is_none() {
+                    let seen = &subject.samples.at(subject.row, look.frame)[GEOMETRY..];
+                    off = off.max(LEVEL_PIXELS * color_difference(&colors, seen));
+                }
+                // NaN must end as an error, not as a fit.
+                let worst = (strength * off).max(LEVEL_PIXELS * level);
+                error = if worst.is_finite() { error.max(worst) } else { f64::INFINITY };
             }
-            // NaN must end as an error, not as a fit.
-            let worst = (strength * off).max(LEVEL_PIXELS * level);
-            error = if worst.is_finite() { error.max(worst) } else { f64::INFINITY };
+            error
+        };
+        // Shapes take most of the time of a fit.
+        if !single && worst(None) > self.accepted {
+            return None;
         }
+        let shape = self.shape(subject, &looks, held, life.center, pixels);
+        let error = worst(Some(&shape));
         let ends = self.shown(subject, span);
         let share = ((ends[1] - ends[0]) / (self.tree.border(span[1]) - self.tree.border(span[0]))).clamp(0.0, 1.0);
         let sound = first.mean.iter().chain(&velocity).chain(&shape.scales).all(|x| x.is_finite());
@@ -314,7 +326,7 @@ pub(super) fn primitive(
 }
 
 /// How a node and a Gaussian's time lie to each other.
-enum Place {
+pub(super) enum Place {
     /// Nothing is to be seen in the node.
     Nowhere,
     /// All of it lies in this half, and the node is longer than a segment.
@@ -323,7 +335,7 @@ enum Place {
     Here,
 }
 
-fn narrow(tree: &Tree, seen: [f64; 2], span: Span) -> Place {
+pub(super) fn narrow(tree: &Tree, seen: [f64; 2], span: Span) -> Place {
     let [from, to] = [tree.border(span[0]), tree.border(span[1])];
     if !(seen[1] >= from && seen[0] < to) {
         return Place::Nowhere;

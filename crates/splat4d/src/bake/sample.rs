@@ -64,7 +64,7 @@ impl Framed {
 }
 
 /// All looks at one run of rows.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(super) struct Samples {
     /// The rows, ids rising.
     pub rows: Vec<Row>,

@@ -3,8 +3,8 @@
 
 use super::*;
 use crate::device;
-use crate::format::playback::{Draft, Meta, WriteConfig, read, write};
-use crate::layers::{ALPHA_MIN, Evaluation};
+use crate::format::playback::{Draft, Meta, Primitive, WriteConfig, read, write};
+use crate::layers::{ALPHA_MIN, Evaluation, Layer};
 use crate::math::{Rng, Se3};
 use crate::motion::spacetime::VELOCITIES;
 use crate::motion::still::activate;
@@ -12,7 +12,7 @@ use crate::motion::{At, Cache, Motion, SpacetimeSpec, Spec, Tape, build, fill_ro
 use crate::render::RenderConfig;
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::splats::SPLAT_OPACITY;
-use crate::scene::{Color, Grads, LIFE, LifeKind, Params, SH, SplatGrads, Table, Time};
+use crate::scene::{Color, GEOMETRY, Grads, LIFE, LifeKind, Params, SH, SplatGrads, Table, Time};
 use std::sync::Arc;
 
 /// Rounding of f32 parameters against the model's own f32 arithmetic, as a share of the cloud's size.
@@ -70,6 +70,11 @@ fn cameras() -> Vec<Camera> {
     [0.3, 2.1, 4.4].map(|a| Camera::with_fov_y(pose(a), 0.8, 96, 72)).to_vec()
 }
 
+/// Every camera at every time.
+fn shots(times: &[f64]) -> Vec<(f64, Camera)> {
+    times.iter().flat_map(|t| cameras().into_iter().map(|camera| (*t, camera))).collect()
+}
+
 fn options(tolerance: f64) -> Options {
     Options { tolerance, cameras: cameras(), ..Options::default() }
 }
@@ -87,7 +92,7 @@ fn likeness_after(scene: &Scene<f32>, baked: &Baked, part: f64) -> Likeness {
     let frames = ((scene.clip[1] - scene.clip[0]) * FPS).round() as usize + 1;
     let times: Vec<f64> = (0..frames).step_by(frames.div_ceil(9)).map(|k| (k as f64 + part) / FPS).collect();
     let mut cpu = device::cpu(RenderConfig::default());
-    compare(scene, Shown::Nodes(&baked.nodes), &cameras(), &times, cpu.as_mut(), &mut |_, _| {}).unwrap().unwrap()
+    compare(scene, Shown::Nodes(&baked.nodes), &shots(&times), cpu.as_mut(), &mut |_, _| true).unwrap().unwrap()
 }
 
 /// (mean, covariance, opacity) of everything that is visible, sorted by its mean.
@@ -191,10 +196,7 @@ fn key_states_turn_on_to_the_next_frame() {
 
 #[test]
 fn leaps_become_key_states() {
-    let mut params = Params::new(60, 4, LifeKind::Infinite.columns());
-    cloud(&mut params, 60);
-    let leaping = Layer::new("leaps", params, Arc::new(Leaps), LifeKind::Infinite);
-    let scene = scene(vec![leaping], 19.0 / FPS);
+    let scene = leaps(60, 20.0);
     let baked = baked(&scene, &options(0.25));
     let visible = 60 - baked.report.unseen;
     assert!(baked.report.key_states * 10 > visible * 20 * 9, "{:?}", baked.report);
@@ -244,6 +246,16 @@ fn any_number_of_threads_bakes_the_same() {
     let (one, three) = (with(1), with(3));
     assert_eq!(one.nodes, three.nodes);
     assert_eq!(one.report, three.report);
+    let within = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| {
+            let options = options(0.25);
+            let mut bakery = Bakery::new(&scene, &options).unwrap();
+            let price = bakery.measure(&mut |_, _| {}).unwrap().unwrap().price_of(400.0);
+            bakery.bake(Cut::Price(price), &mut |_, _| {}).unwrap().nodes
+        })
+    };
+    assert_eq!(within(1), within(3));
 }
 
 #[test]
@@ -349,7 +361,7 @@ fn a_file_is_as_good_and_can_be_baked_again() {
     let like = |file: &Scene<f32>| {
         let times: Vec<f64> = (0..57).step_by(5).map(|k| f64::from(k) / FPS).collect();
         let mut cpu = device::cpu(RenderConfig::default());
-        compare(&scene, Shown::File(file), &cameras(), &times, cpu.as_mut(), &mut |_, _| {}).unwrap().unwrap()
+        compare(&scene, Shown::File(file), &shots(&times), cpu.as_mut(), &mut |_, _| true).unwrap().unwrap()
     };
     let played = file(&first);
     assert!(like(&played).psnr > 40.0, "{:?} {:?}", like(&played), likeness(&scene, &first));
@@ -357,6 +369,108 @@ fn a_file_is_as_good_and_can_be_baked_again() {
     let pages = again.report.primitives as f64 / first.report.primitives as f64;
     assert!((0.9..1.3).contains(&pages), "{:?}\n{:?}", first.report, again.report);
     assert!(like(&file(&again)).psnr > 38.0, "{:?}", like(&file(&again)));
+}
+
+/// Segments, and PSNR of the nodes against the model, of a scene cut by a budget of segments.
+fn within(scene: &Scene<f32>, options: &Options, segments: f64) -> (usize, f64) {
+    let mut bakery = Bakery::new(scene, options).unwrap();
+    let curve = bakery.measure(&mut |_, _| {}).unwrap().expect("not all of it is straight");
+    let baked = bakery.bake(Cut::Price(curve.price_of(segments)), &mut |_, _| {}).unwrap();
+    assert_eq!(baked.report.tolerance, None);
+    (baked.report.primitives, likeness(scene, &baked).psnr)
+}
+
+fn leaps(n: usize, frames: f64) -> Scene<f32> {
+    let mut params = Params::new(n, 4, LifeKind::Infinite.columns());
+    cloud(&mut params, n);
+    scene(vec![Layer::new("leaps", params, Arc::new(Leaps), LifeKind::Infinite)], (frames - 1.0) / FPS)
+}
+
+/// The worst there is: every Gaussian is somewhere else in every frame. A file still has a size.
+#[test]
+fn a_budget_of_segments_is_kept_whatever_moves() {
+    let scene = leaps(60, 20.0);
+    let (mut last, mut like) = (0, 0.0);
+    for segments in [60.0, 150.0, 400.0, 900.0] {
+        let (found, psnr) = within(&scene, &options(0.25), segments);
+        assert!((0.75 * segments - 10.0..=1.02 * segments).contains(&(found as f64)), "{found} of {segments}");
+        assert!(found >= last && psnr >= like - 0.2, "{psnr} dB of {found} segments, {like} dB of {last}");
+        (last, like) = (found, psnr);
+    }
+    assert!(last > 3 * 60);
+    // Fewer than there are Gaussians cannot be.
+    assert!(within(&scene, &options(0.25), 1.0).0 <= 60);
+}
+
+/// As many segments where they matter most are better than where one error is largest.
+#[test]
+fn segments_go_where_images_gain_most() {
+    let scene = scene(vec![layer(&spacetime(3, true), LifeKind::Infinite, 120, 0.4, 1.9)], 1.9);
+    let by_tolerance = baked(&scene, &options(1.0));
+    let (segments, psnr) = within(&scene, &options(0.25), by_tolerance.report.primitives as f64);
+    assert!(segments <= by_tolerance.report.primitives);
+    assert!(psnr > likeness(&scene, &by_tolerance).psnr + 1.0, "{psnr} dB, {:?}", likeness(&scene, &by_tolerance));
+}
+
+/// A camera that moves sees each Gaussian for a while: segments go there, and none of it is lost elsewhere.
+#[test]
+fn segments_go_to_when_a_moving_camera_looks() {
+    let scene = leaps(80, 30.0);
+    let looking = |t: f64| {
+        let a = 2.0 * t;
+        let eye = [4.0 * a.cos(), 0.7, 4.0 * a.sin()];
+        let aside = [2.0 * (a + 1.5).cos(), 0.0, 2.0 * (a + 1.5).sin()];
+        (t, Camera::with_fov_y(Se3::look_at(eye, aside, [0.0, 1.0, 0.0]), 0.4, 96, 72))
+    };
+    let path: Vec<_> = (0..30).map(|k| looking(f64::from(k) / FPS)).collect();
+    let like = |options: &Options| {
+        let mut bakery = Bakery::new(&scene, options).unwrap();
+        let curve = bakery.measure(&mut |_, _| {}).unwrap().unwrap();
+        let baked = bakery.bake(Cut::Price(curve.price_of(700.0)), &mut |_, _| {}).unwrap();
+        assert!((500..=715).contains(&baked.report.primitives), "{}", baked.report.primitives);
+        let mut cpu = device::cpu(RenderConfig::default());
+        compare(&scene, Shown::Nodes(&baked.nodes), &path, cpu.as_mut(), &mut |_, _| true).unwrap().unwrap().psnr
+    };
+    let moving = like(&Options { path: path.clone(), ..Options::default() });
+    let anywhere = like(&options(0.25));
+    assert!(moving > anywhere + 1.0, "{moving} dB on the path, {anywhere} dB when it is not known");
+}
+
+/// The curve tells of what is baked.
+#[test]
+fn the_curve_says_how_many_segments_which_error_costs() {
+    let scene = scene(vec![layer(&spacetime(3, true), LifeKind::GaussHalf, 120, 0.4, 1.9)], 1.9);
+    let options = options(0.25);
+    let mut bakery = Bakery::new(&scene, &options).unwrap();
+    let curve = bakery.measure(&mut |_, _| {}).unwrap().unwrap();
+    for wanted in [1e-3, 1e-4, 1e-5] {
+        let price = curve.price_for(wanted).unwrap();
+        let baked = bakery.bake(Cut::Price(price), &mut |_, _| {}).unwrap();
+        let [pieces, error] = curve.at(price);
+        assert!((0.9..1.1).contains(&(pieces / baked.report.primitives as f64)), "{pieces} {:?}", baked.report);
+        // Gaussians do not err independently, and fits are not what they are judged by: some decibels.
+        let psnr = likeness(&scene, &baked).psnr;
+        assert!((psnr + 10.0 * error.log10()).abs() < 4.0, "{psnr} dB, foretold {}", -10.0 * error.log10());
+    }
+    assert_eq!(curve.price_for(0.0), None);
+    assert!(curve.at(curve.price_of(1e9))[0] >= curve.least());
+}
+
+#[test]
+fn straight_scenes_have_nothing_to_choose() {
+    let scene = scene(vec![layer(&spacetime(1, false), LifeKind::Interval, 50, 0.3, 1.0)], 1.0);
+    let options = options(0.25);
+    let mut bakery = Bakery::new(&scene, &options).unwrap();
+    assert!(bakery.measure(&mut |_, _| {}).unwrap().is_none());
+}
+
+/// What takes too long to sample is sampled less often.
+#[test]
+fn time_samples_are_bounded() {
+    let scene = leaps(60, 40.0);
+    let few = Options { samples: 60 * 5, ..options(0.25) };
+    let (segments, _) = within(&scene, &few, 1e6);
+    assert!(segments <= 60 * 5, "{segments}");
 }
 
 /// Another model, unrecognisable.

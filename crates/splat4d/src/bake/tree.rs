@@ -29,8 +29,9 @@ pub(super) struct Tree {
 }
 
 impl Tree {
-    /// At least `looks` frames a second. Errors: the clip or the segment's length is no sensible number.
-    pub(super) fn new(clip: [f64; 2], fps: f64, looks: f64, segment: f64) -> Result<Self> {
+    /// At least `looks` frames a second, but at most `most` of them (and at least two, where the clip has a length). Errors:
+    /// the clip or the segment's length is no sensible number.
+    pub(super) fn new(clip: [f64; 2], fps: f64, looks: f64, segment: f64, most: usize) -> Result<Self> {
         let fps = if fps > 0.0 && fps.is_finite() { fps } else { DEFAULT_FPS };
         let after = 1.0 / fps;
         // 30 frames a second are enough where 29.97 are.
@@ -43,7 +44,11 @@ impl Tree {
         if !(segment > 0.0 && segment.is_finite()) {
             return Err(Error::input(format!("segments of {segment} s")).remedy("Give seconds above zero, such as 1."));
         }
-        let (frames, step) = (frames as usize, 1.0 / fps);
+        let (mut frames, mut step) = (frames as usize, 1.0 / fps);
+        let most = most.max(2);
+        if frames > most {
+            (frames, step) = (most, (clip[1] - clip[0]) / (most - 1) as f64);
+        }
         let segments = ((frames as f64 * step / segment).round() as usize).clamp(1, frames);
         let grid = (0..=segments).map(|i| (i * frames + segments / 2) / segments).collect();
         Ok(Self { clip, step, after, frames, grid })
@@ -52,6 +57,11 @@ impl Tree {
     /// Frames of the clip.
     pub(super) fn frames(&self) -> usize {
         self.frames
+    }
+
+    /// Frames a second.
+    pub(super) fn rate(&self) -> f64 {
+        1.0 / self.step
     }
 
     /// First and last second.
@@ -118,7 +128,7 @@ mod tests {
     #[test]
     fn halves_tile_their_parent_down_to_single_frames() {
         for (frames, segment) in [(1usize, 1.0), (2, 1.0), (30, 1.0), (47, 0.3), (301, 1.0), (20, 0.01)] {
-            let tree = Tree::new([2.0, 2.0 + (frames - 1) as f64 / 30.0], 30.0, 30.0, segment).unwrap();
+            let tree = Tree::new([2.0, 2.0 + (frames - 1) as f64 / 30.0], 30.0, 30.0, segment, usize::MAX).unwrap();
             assert_eq!(tree.frames(), frames);
             let mut spans = Vec::new();
             all(&tree, tree.root(), &mut spans);
@@ -136,7 +146,7 @@ mod tests {
 
     #[test]
     fn segments_last_about_as_long_as_asked() {
-        let tree = Tree::new([0.0, 10.0 - 1.0 / 30.0], 30.0, 30.0, 1.0).unwrap();
+        let tree = Tree::new([0.0, 10.0 - 1.0 / 30.0], 30.0, 30.0, 1.0, usize::MAX).unwrap();
         assert_eq!(tree.grid, (0..=10).map(|i| 30 * i).collect::<Vec<_>>());
         assert!((tree.border(300) - 10.0).abs() < 1e-12);
     }
@@ -147,7 +157,7 @@ mod tests {
             [(10.0, 30.0, 3), (29.97, 30.0, 1), (24.0, 30.0, 2), (60.0, 30.0, 1), (10.0, 0.0, 1), (1e-6, 30.0, 32)]
         {
             let last = 11.0 / fps;
-            let tree = Tree::new([0.0, last], fps, looks, 1e9).unwrap();
+            let tree = Tree::new([0.0, last], fps, looks, 1e9, usize::MAX).unwrap();
             assert_eq!(tree.frames(), 11 * parts + 1, "{fps} frames/s");
             assert!(
                 (0..=11).all(|k| (tree.time(k * parts) - k as f64 / fps).abs() <= 1e-12 * last),
@@ -163,9 +173,18 @@ mod tests {
     #[test]
     fn a_clock_that_is_no_clock_is_refused() {
         for clip in [[0.0, f64::NAN], [1.0, 0.0], [0.0, 1e9], [f64::NEG_INFINITY, 0.0]] {
-            assert!(Tree::new(clip, 30.0, 30.0, 1.0).is_err(), "{clip:?}");
+            assert!(Tree::new(clip, 30.0, 30.0, 1.0, usize::MAX).is_err(), "{clip:?}");
         }
-        assert!(Tree::new([0.0, 1.0], 30.0, 30.0, 0.0).is_err());
-        assert_eq!(Tree::new([0.0, 1.0], 0.0, 30.0, 1.0).unwrap().frames(), 31, "no rate: the default one");
+        assert!(Tree::new([0.0, 1.0], 30.0, 30.0, 0.0, usize::MAX).is_err());
+        assert_eq!(Tree::new([0.0, 1.0], 0.0, 30.0, 1.0, usize::MAX).unwrap().frames(), 31, "no rate: the default one");
+    }
+
+    #[test]
+    fn frames_are_as_many_as_are_allowed() {
+        let tree = Tree::new([1.0, 11.0], 30.0, 30.0, 1.0, 41).unwrap();
+        assert_eq!((tree.frames(), tree.time(40), tree.time(20)), (41, 11.0, 6.0));
+        assert!((tree.rate() - 4.0).abs() < 1e-12);
+        assert_eq!(Tree::new([0.0, 1.0], 30.0, 30.0, 1.0, 0).unwrap().frames(), 2);
+        assert_eq!(Tree::new([0.0, 0.0], 30.0, 30.0, 1.0, 0).unwrap().frames(), 1);
     }
 }

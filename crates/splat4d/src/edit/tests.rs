@@ -484,9 +484,8 @@ fn edited_scenes_are_files_and_bake() {
         let options = Options { cameras: vec![front()], tolerance: 0.1, ..Options::default() };
         let baked = bake(&edited, &options, &mut |_, _| {}).unwrap();
         let mut cpu = device::cpu(RenderConfig::default());
-        let times = [0.05, 0.3, 0.7, 1.0];
-        let like =
-            compare(&edited, Shown::Nodes(&baked.nodes), &[front()], &times, cpu.as_mut(), &mut |_, _| {}).unwrap();
+        let shots = [0.05, 0.3, 0.7, 1.0].map(|t| (t, front()));
+        let like = compare(&edited, Shown::Nodes(&baked.nodes), &shots, cpu.as_mut(), &mut |_, _| true).unwrap();
         let psnr = like.expect("pictures were compared").psnr;
         assert!(psnr >= 45.0, "{name}: {psnr} dB");
     }

@@ -205,9 +205,9 @@ fn baked(own: &Layer<f32>, placed: &Layer<f32>) {
         let camera = Camera::with_fov_y(pose, 0.9, 40, 32);
         let options = Options { cameras: vec![camera.clone()], ..Options::default() };
         let baked = bake(&scene, &options, &mut |_, _| {}).expect("there is no head");
-        let times = [0.0, 0.3, 0.5, 0.9];
+        let shots = [0.0, 0.3, 0.5, 0.9].map(|t| (t, camera.clone()));
         let mut backend = splat4d::device::cpu(RenderConfig::default());
-        compare(&scene, Shown::Nodes(&baked.nodes), &[camera], &times, backend.as_mut(), &mut |_, _| {})
+        compare(&scene, Shown::Nodes(&baked.nodes), &shots, backend.as_mut(), &mut |_, _| true)
             .expect("the CPU draws everything")
             .expect("there are pictures")
             .psnr

@@ -17,7 +17,7 @@ pub(super) struct Row {
     pub simd: String,
     /// Mean over the scene's views of the best of several rounds.
     pub ms: f64,
-    /// The least time that its compulsory work takes at the ceilings of this machine, as a share of `ms`.
+    /// The lower bound, the least time that its compulsory work takes at the rates of this machine, as a share of `ms`.
     pub ceiling_share: Option<f64>,
     /// Pairs of pixel and Gaussian that the blend loop evaluated, mean over the views.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -149,7 +149,7 @@ fn stage_cells(rows: &[Row]) -> Vec<Vec<String>> {
     if threads.len() > 1 {
         head.push("gain".into());
     }
-    head.push("of ceiling".into());
+    head.push("lower bound, ms".into());
     if compared {
         head.push("to earlier".into());
     }
@@ -170,7 +170,8 @@ fn stage_cells(rows: &[Row]) -> Vec<Vec<String>> {
         }
         let joined =
             |f: &dyn Fn(&Row) -> Option<String>| here.iter().filter_map(|r| f(r)).collect::<Vec<_>>().join(", ");
-        line.push(joined(&|r| r.ceiling_share.map(|share| format!("{:.0} %", 100.0 * share))));
+        let bound = |share: f64, ms: f64| format!("{} ({:.0} %)", milliseconds(share * ms), 100.0 * share);
+        line.push(joined(&|r| r.ceiling_share.map(|share| bound(share, r.ms))));
         if compared {
             line.push(joined(&|r| r.against.map(|a| format!("{a:.2}"))));
         }
@@ -286,6 +287,9 @@ mod tests {
         let lines: Vec<&str> = text.lines().collect();
         assert_eq!(lines.len(), 3, "{text}");
         assert!(lines[1].contains("blend") && lines[1].contains("2.00x"), "{text}");
+        let bound = Row { ceiling_share: Some(0.25), ..row("blend", 1, 2.0) };
+        let page = markdown(&[bound]);
+        assert!(page.contains("| lower bound, ms |") && page.contains("| 2.00 | 0.500 (25 %) |"), "{page}");
         assert!(lines[2].contains("step") && lines[2].contains("1.25x"), "{text}");
         let page = markdown(&rows);
         assert!(page.lines().all(|l| l.starts_with('|') && l.ends_with('|')), "{page}");

@@ -1,10 +1,13 @@
 //! Weighted k-means for palettes, in two levels so that thousands of entries take seconds: coarse clusters first, then
-//! each is divided by itself, and at last every point looks for its entry in the coarse clusters nearest to it.
+//! each is divided by itself, and finally every point searches the coarse clusters nearest to it for its entry.
 //!
-//! Points are assigned in parallel, sums are taken in the order of the points: any number of threads gives the same bits.
+//! Identical points are merged into one with the sum of their weights first: the segments of a Gaussian share its colours.
+//! Points are assigned in parallel, and every cluster is summed in the order of its points: any number of threads gives the
+//! same bits.
 
 use crate::math::Rng;
 use rayon::prelude::*;
+use std::collections::HashMap;
 
 /// Numbers in a point are padded to a multiple of this, one AVX2 register.
 const LANES: usize = 8;
@@ -18,6 +21,8 @@ const COARSE_ROUNDS: usize = 4;
 const NEAREST: usize = 3;
 /// Points a task assigns.
 const TASK: usize = 1024;
+/// Clusters a task sums. Every task reads all labels, so that fewer clusters would cost more than they spread.
+const SUMMED: usize = 64;
 
 /// Result of the clustering.
 pub(super) struct Clusters {
@@ -27,18 +32,22 @@ pub(super) struct Clusters {
     pub labels: Vec<u32>,
 }
 
-/// Divides `points` [n, width] into at most `k` clusters that minimise Σ weight·distance². Weights are positive.
+/// Divides `points` into at most `k` clusters that minimise Σ weight·distance². Weights are positive. Memory: that of the
+/// points that differ.
 ///
 /// Panics: no point, k = 0, or lengths that do not fit.
-pub(super) fn cluster(points: &[f32], width: usize, weights: &[f32], k: usize, rounds: usize, rng: Rng) -> Clusters {
-    let n = weights.len();
-    assert!(n > 0 && k > 0 && points.len() == n * width, "{n} points of {width} numbers, {} given", points.len());
+pub(super) fn cluster<'a>(
+    points: impl Iterator<Item = (&'a [f32], f32)>,
+    width: usize,
+    k: usize,
+    rounds: usize,
+    rng: Rng,
+) -> Clusters {
     let stride = width.next_multiple_of(LANES);
-    let mut data = vec![0.0; n * stride];
-    for (to, from) in data.chunks_exact_mut(stride).zip(points.chunks_exact(width)) {
-        to[..width].copy_from_slice(from);
-    }
-    let set = Set { data: &data, stride, weights };
+    let Merged { data, weights, places } = merge(points, width, stride);
+    let n = weights.len();
+    assert!(n > 0 && k > 0, "{n} points in {k} clusters");
+    let set = Set { data: &data, stride, weights: &weights };
     let all: Vec<u32> = (0..n as u32).collect();
     let (centroids, labels) = if k <= ONE_LEVEL {
         let level = set.lloyd(&all, k, rounds, rng);
@@ -47,7 +56,39 @@ pub(super) fn cluster(points: &[f32], width: usize, weights: &[f32], k: usize, r
         set.two_levels(&all, k, rounds, rng)
     };
     let (centroids, labels) = set.settle(centroids, labels);
-    Clusters { centroids: centroids.chunks_exact(stride).flat_map(|c| &c[..width]).copied().collect(), labels }
+    Clusters {
+        centroids: centroids.chunks_exact(stride).flat_map(|c| &c[..width]).copied().collect(),
+        labels: places.iter().map(|&place| labels[place as usize]).collect(),
+    }
+}
+
+/// Points that differ, in the order in which each first came.
+struct Merged {
+    /// [points, stride], padded with zeros.
+    data: Vec<f32>,
+    /// Sums of the weights of identical points.
+    weights: Vec<f32>,
+    /// Of every point that was given, which of these it is.
+    places: Vec<u32>,
+}
+
+/// Merges points of the same bits.
+fn merge<'a>(points: impl Iterator<Item = (&'a [f32], f32)>, width: usize, stride: usize) -> Merged {
+    let mut known: HashMap<Vec<u32>, u32> = HashMap::new();
+    let (mut data, mut sums, mut places) = (Vec::new(), Vec::<f64>::new(), Vec::new());
+    for (point, weight) in points {
+        assert!(point.len() == width, "a point of {} numbers among those of {width}", point.len());
+        let next = sums.len() as u32;
+        let place = *known.entry(point.iter().map(|x| x.to_bits()).collect()).or_insert(next);
+        if place == next {
+            data.extend_from_slice(point);
+            data.resize(sums.len() * stride + stride, 0.0);
+            sums.push(0.0);
+        }
+        sums[place as usize] += f64::from(weight);
+        places.push(place);
+    }
+    Merged { data, weights: sums.into_iter().map(|w| w as f32).collect(), places }
 }
 
 struct Set<'a> {
@@ -98,24 +139,33 @@ impl Set<'_> {
 
     /// Weighted means of the clusters; a cluster without points keeps its centroid. Returns how many points each has.
     fn means(&self, ids: &[u32], labels: impl Iterator<Item = u32>, centroids: &mut [f32]) -> Vec<u32> {
-        let k = centroids.len() / self.stride;
-        let mut sums = vec![0.0f64; k * self.stride];
-        let (mut mass, mut counts) = (vec![0.0f64; k], vec![0; k]);
-        for (&id, label) in ids.iter().zip(labels) {
-            let (label, w) = (label as usize, f64::from(self.weights[id as usize]));
-            mass[label] += w;
-            counts[label] += 1;
-            for (s, x) in sums[label * self.stride..(label + 1) * self.stride].iter_mut().zip(self.point(id)) {
-                *s += w * f64::from(*x);
+        let labels: Vec<u32> = labels.collect();
+        let part = |(part, centroids): (usize, &mut [f32])| {
+            let (first, k) = (part * SUMMED, centroids.len() / self.stride);
+            let mut sums = vec![0.0f64; k * self.stride];
+            let (mut mass, mut counts) = (vec![0.0f64; k], vec![0; k]);
+            for (&id, label) in ids.iter().zip(&labels) {
+                let label = (*label as usize).wrapping_sub(first);
+                if label >= k {
+                    continue;
+                }
+                let w = f64::from(self.weights[id as usize]);
+                mass[label] += w;
+                counts[label] += 1;
+                for (s, x) in sums[label * self.stride..(label + 1) * self.stride].iter_mut().zip(self.point(id)) {
+                    *s += w * f64::from(*x);
+                }
             }
-        }
-        for i in (0..k).filter(|&i| counts[i] > 0) {
-            let range = i * self.stride..(i + 1) * self.stride;
-            for (c, s) in centroids[range.clone()].iter_mut().zip(&sums[range]) {
-                *c = (s / mass[i]) as f32;
+            for i in (0..k).filter(|&i| counts[i] > 0) {
+                let range = i * self.stride..(i + 1) * self.stride;
+                for (c, s) in centroids[range.clone()].iter_mut().zip(&sums[range]) {
+                    *c = (s / mass[i]) as f32;
+                }
             }
-        }
-        counts
+            counts
+        };
+        let parts: Vec<Vec<u32>> = centroids.par_chunks_mut(SUMMED * self.stride).enumerate().map(part).collect();
+        parts.concat()
     }
 
     /// Lloyd's rounds. Starts from points drawn by weight; a cluster that runs empty moves to the point that is worst off.
@@ -133,7 +183,12 @@ impl Set<'_> {
             if !empty.is_empty() {
                 let error = |i: usize| nearest[i].1 * self.weights[ids[i] as usize];
                 let mut worst: Vec<usize> = (0..ids.len()).filter(|&i| error(i) > 0.0).collect();
-                worst.sort_by(|&a, &b| error(b).total_cmp(&error(a)).then(a.cmp(&b)));
+                let worse = |a: &usize, b: &usize| error(*b).total_cmp(&error(*a)).then(a.cmp(b));
+                if worst.len() > empty.len() {
+                    worst.select_nth_unstable_by(empty.len(), worse);
+                    worst.truncate(empty.len());
+                }
+                worst.sort_unstable_by(worse);
                 for (c, i) in empty.into_iter().zip(worst) {
                     centroids[c * self.stride..(c + 1) * self.stride].copy_from_slice(self.point(ids[i]));
                 }
@@ -178,10 +233,18 @@ impl Set<'_> {
         let find = |&id: &u32| {
             let x = self.point(id);
             let score = |c: usize| dot(x, &coarse.centroids[c * self.stride..(c + 1) * self.stride]) - half_coarse[c];
-            let mut near: Vec<(f32, usize)> = (0..count).map(|c| (score(c), c)).collect();
-            near.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+            // The best few so far, best first; of equals the first stays before the later one.
+            let mut near = [(f32::NEG_INFINITY, usize::MAX); NEAREST];
+            for c in 0..count {
+                let score = score(c);
+                let place = near.iter().position(|n| score.total_cmp(&n.0).is_gt());
+                if let Some(place) = place {
+                    near[place..].rotate_right(1);
+                    near[place] = (score, c);
+                }
+            }
             let mut best = (0, f32::NEG_INFINITY);
-            for &(_, c) in near.iter().take(NEAREST) {
+            for &(_, c) in near.iter().filter(|n| n.1 < count) {
                 let (i, score) = self.nearest(x, &fine[c].centroids, &half_fine[c]);
                 if score > best.1 {
                     best = (firsts[c] + i, score);
@@ -233,6 +296,10 @@ mod tests {
         (0..n).flat_map(|i| (0..width).map(move |d| number(i, d) as f32)).collect()
     }
 
+    fn cluster(points: &[f32], width: usize, weights: &[f32], k: usize, rounds: usize, rng: Rng) -> Clusters {
+        super::cluster(points.chunks_exact(width).zip(weights.iter().copied()), width, k, rounds, rng)
+    }
+
     fn error(points: &[f32], width: usize, weights: &[f32], c: &Clusters) -> f64 {
         let one = |(i, x): (usize, &[f32])| {
             let e = &c.centroids[c.labels[i] as usize * width..][..width];
@@ -260,6 +327,7 @@ mod tests {
         assert!(one.labels == three.labels && one.centroids == three.centroids, "any number of threads, the same bits");
         assert!(one.centroids.len() / 24 > 280);
         let whole: Vec<u32> = (0..6000).collect();
+        assert!(merge(points.chunks_exact(24).zip(weights.iter().copied()), 24, 24).data == points, "none are equal");
         let set = Set { data: &points, stride: 24, weights: &weights };
         let flat = set.lloyd(&whole, 300, 5, Rng::new(1, "k", 0));
         let (centroids, labels) = set.settle(flat.centroids, flat.nearest.iter().map(|n| n.0).collect());
@@ -275,6 +343,21 @@ mod tests {
         let points: Vec<f32> = (0..20).map(|i| i as f32).collect();
         let c = cluster(&points, 1, &[1.0; 20], 8192, 4, Rng::new(1, "k", 0));
         assert_eq!(error(&points, 1, &[1.0; 20], &c), 0.0);
+    }
+
+    /// The segments of a Gaussian have its colours: they count as one point of their weight, wherever they are listed.
+    #[test]
+    fn identical_points_are_one_point_of_their_weight() {
+        let points = clouds(900, 9, 900, 0.0);
+        let weights: Vec<f32> = (0..900).map(|i| 1.0 + (i % 3) as f32).collect();
+        let merged = cluster(&points, 9, &weights, 300, 4, Rng::new(1, "k", 0));
+        let copies: Vec<usize> = (0..3).flat_map(|round| (0..900).filter(move |i| i % 3 >= round)).collect();
+        let many: Vec<f32> = copies.iter().flat_map(|&i| &points[9 * i..9 * i + 9]).copied().collect();
+        let apart = cluster(&many, 9, &vec![1.0; copies.len()], 300, 4, Rng::new(1, "k", 0));
+        assert_eq!(merged.centroids, apart.centroids);
+        assert!(copies.iter().zip(&apart.labels).all(|(&i, label)| merged.labels[i] == *label));
+        let Merged { data, weights, places } = merge(many.chunks_exact(9).map(|p| (p, 1.0)), 9, 16);
+        assert!(data.len() == 16 * 900 && weights.len() == 900 && places.len() == copies.len());
     }
 
     #[test]

@@ -396,15 +396,13 @@ fn palette(draft: &Draft, config: &WriteConfig) -> (Option<Palette>, Vec<Vec<u16
     if width == 0 || n == 0 {
         return (None, Vec::new());
     }
-    let points: Vec<f32> = all().flat_map(|p| &p.sh_rest[..width]).copied().collect();
     let importance = |p: &super::Primitive| f64::from(p.importance.max(0.0));
     let mean = all().map(importance).sum::<f64>() / n as f64;
     let weight = |p| if mean > 0.0 { (importance(p) / mean) as f32 } else { 1.0 };
-    let weights: Vec<f32> = all().map(|p| weight(p).clamp(WEIGHTS[0], WEIGHTS[1])).collect();
+    let points = all().map(|p| (&p.sh_rest[..width], weight(p).clamp(WEIGHTS[0], WEIGHTS[1])));
     let worth = (n / GAUSSIANS_PER_ENTRY).max(SMALL_PALETTE);
     let entries = config.palette.clamp(1, MAX_PALETTE).min(worth);
-    let clusters =
-        cluster(&points, width, &weights, entries, config.kmeans_rounds, Rng::new(config.seed, "palette", 0));
+    let clusters = cluster(points, width, entries, config.kmeans_rounds, Rng::new(config.seed, "palette", 0));
     let mut labels = clusters.labels.iter().map(|&l| l as u16);
     let by_node = draft.nodes.iter().map(|n| labels.by_ref().take(n.primitives.len()).collect()).collect();
     (Some(Palette::new(degree, &clusters.centroids)), by_node)

@@ -85,7 +85,9 @@ fn left(scene: &Scene<f32>, held: &Dataset, scores: &Scores, ratio: f64) -> [f64
 #[test]
 fn the_orb_and_the_crate_survive() {
     let place = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples");
-    let capture = Arc::new(Capture::open(&place.join("knight"), &CaptureOptions { downscale: 2, ..CaptureOptions::default() }).unwrap());
+    let capture = Arc::new(
+        Capture::open(&place.join("knight"), &CaptureOptions { downscale: 2, ..CaptureOptions::default() }).unwrap(),
+    );
     let store = Arc::new(ImageStore::new(capture.clone(), 1 << 28));
     let (train, held) = (Dataset::new(store.clone(), capture.train.clone()), Dataset::new(store, capture.held.clone()));
     let scene = splat4d::format::playback::read(&std::fs::read(place.join("knight.s4d")).unwrap()).unwrap();
