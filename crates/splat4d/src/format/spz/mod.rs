@@ -24,7 +24,7 @@ use crate::{Error, ErrorKind, Result};
 use std::io::Write;
 
 /// .spz, versions 2 to 4.
-pub const DIALECT: Dialect = Dialect {
+pub(crate) const DIALECT: Dialect = Dialect {
     name: ".spz",
     ending: ".spz",
     up: Y_DOWN,
@@ -40,20 +40,6 @@ pub const DIALECT: Dialect = Dialect {
 pub(crate) const VERSIONS: std::ops::RangeInclusive<u32> = 2..=4;
 /// Version written by default: the one that most programs open.
 pub const DEFAULT_VERSION: u32 = 3;
-/// Who reads a version, in words (each program's newest release of November 2026, tried or read in its documentation).
-pub fn readers(version: u32) -> &'static str {
-    match version {
-        2 => "is read by all programs but PlayCanvas' engine (version 4 only); its rotations are coarser",
-        3 => {
-            "is read by most programs, but not by GaussianSplats3D 0.4 and spz-js 1.2 (version 2) nor by PlayCanvas' engine \
-             (version 4): --spz-version"
-        }
-        _ => {
-            "is read by Spark 2.4, PlayCanvas, splat-transform and the SPZ library; older programs want version 2 or 3"
-        }
-    }
-}
-
 /// First bytes of a version 4 file, and of the header inside older ones.
 pub const MAGIC: [u8; 4] = *b"NGSP";
 /// First bytes of a gzip stream (RFC 1952).
