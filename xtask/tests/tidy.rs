@@ -97,6 +97,7 @@ const ORDER: [(&str, &[&str]); 8] = [
             "texts",
             "verbs",
             "main",
+            "bin",
         ],
     ),
     (

@@ -95,7 +95,7 @@ impl Seen {
         let center = if self.kind == LifeKind::Infinite { 0.5 * (first + last) } else { self.life[0] };
         let low = first.max(self.span[0]).max(center - reach);
         let high = last.min(self.span[1]).min(center + reach);
-        if !(low <= high) {
+        if low > high || (low + high).is_nan() {
             return None;
         }
         let length = (high - low).max(f64::MIN_POSITIVE);
