@@ -10,8 +10,8 @@ const ORDER: [(&str, &[&str]); 8] = [
     (
         "crates/splat4d",
         &[
-            "error", "wgsl", "simd", "math", "scene", "nn", "motion", "layers", "render", "gpu", "device", "flow",
-            "channels", "format", "bake", "play", "edit",
+            "error", "text", "wgsl", "simd", "math", "scene", "nn", "motion", "layers", "render", "gpu", "device",
+            "flow", "channels", "format", "bake", "play", "edit",
         ],
     ),
     (
@@ -23,6 +23,8 @@ const ORDER: [(&str, &[&str]); 8] = [
             "settings",
             "recipe",
             "event",
+            "text",
+            "files",
             "output",
             "capture",
             "vision",
@@ -114,8 +116,10 @@ const ORDER: [(&str, &[&str]); 8] = [
             "predicting",
             "editing",
             "editor",
+            "texts",
             "verbs",
             "main",
+            "bin",
         ],
     ),
     (
@@ -179,7 +183,7 @@ const UNSAFE_FILES: [(&str, &str); 3] = [
 /// Words that only the shells (the command and the chores) may say: libraries neither print nor exit nor look around.
 const SHELL_WORDS: [&str; 9] =
     ["println!", "eprintln!", "print!", "eprint!", "dbg!", "process::exit", "env::args", "env::var", "stdin()"];
-const SHELLS: [&str; 3] = ["crates/splat4d-cli/", "studies/", "xtask/"];
+const SHELLS: [&str; 4] = ["crates/splat4d-cli/", "crates/splat4d-fuzz/", "studies/", "xtask/"];
 
 /// Words that `splat4d` may not say: it reads bytes, not paths.
 const PATH_WORDS: [&str; 3] = ["std::fs", "std::path", "File::open"];

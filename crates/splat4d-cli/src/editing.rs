@@ -250,6 +250,8 @@ pub(crate) fn provenance(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::console::Loudness;
+    use splat4d::math::Se3;
 
     #[test]
     fn edits_are_toml_and_come_back() {
@@ -283,5 +285,20 @@ mod tests {
         std::fs::write(&path, "version = 1\n[[edit]]\ndo = \"explode\"\n").unwrap();
         let error = read(&path).unwrap_err().to_string();
         assert!(error.contains("edits.toml") && error.contains("explode"), "{error}");
+    }
+
+    #[test]
+    fn a_mask_of_another_size_is_refused_by_its_header() {
+        let folder = tempfile::tempdir().unwrap();
+        // A header that claims 400 million pixels, and nothing behind it.
+        let file = std::fs::File::create(folder.path().join("m.png")).unwrap();
+        drop(png::Encoder::new(file, 20_000, 20_000).write_header().unwrap());
+        let (source, console) = (Source::own(Scene::default()), Console::new(Loudness::Quiet, false));
+        let edits = folder.path().join("edits.toml");
+        let bring = Bring::new(&source, Some(&edits), &console).unwrap();
+        let camera = Camera::with_fov_y(Se3::IDENTITY, 0.8, 40, 30);
+        let error = bring.mask("m.png", &camera).unwrap_err().to_string();
+        assert!(error.contains("20000 x 20000") && error.contains("40 x 30"), "{error}");
+        assert!(bring.mask("none.png", &camera).is_err());
     }
 }

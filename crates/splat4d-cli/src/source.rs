@@ -246,3 +246,30 @@ pub(crate) fn cloud(scene: &Scene<f32>) -> ([f64; 3], f64) {
     let index = ((far.len() as f64 * (1.0 - OUTLIERS)) as usize).min(far.len() - 1);
     (center, far[index].max(1e-6))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_scene_names_no_file_outside_its_folder() {
+        let folder = tempfile::tempdir().unwrap();
+        for name in ["../x.webp", "/etc/hostname", "a/../../x.webp"] {
+            let meta = format!(r#"{{"version": 2, "count": 1, "means": {{"files": ["{name}"]}}}}"#);
+            std::fs::write(folder.path().join(sog::META), meta).unwrap();
+            let error = Source::open(folder.path()).err().map(|e| e.to_string()).unwrap_or_default();
+            assert!(error.contains("elsewhere"), "{name}: {error}");
+        }
+    }
+
+    #[test]
+    fn levels_of_detail_are_named_by_folder_and_by_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join(SOG_LEVELS);
+        std::fs::write(&file, "{}").unwrap();
+        for path in [folder.path(), &file] {
+            let error = Source::open(path).err().map(|e| e.to_string()).unwrap_or_default();
+            assert!(error.contains("levels of detail"), "{error}");
+        }
+    }
+}

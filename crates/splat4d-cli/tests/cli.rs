@@ -633,6 +633,24 @@ fn a_playback_file_is_told_exported_and_refused_when_damaged() {
     let told = splat4d(&["info", str(&spoilt)]).run().refused();
     assert!(told.contains("checksum") && told.contains("spoilt.s4d"), "{told}");
 
+    // What a file is called is shown, and no terminal obeys it.
+    #[cfg(unix)]
+    {
+        let odd = work.path().join("a\u{1b}]0;b\u{7}\u{9b}2J.s4d");
+        std::fs::copy(&file, &odd).unwrap();
+        let gone = odd.with_extension("gone");
+        for said in [
+            splat4d(&["info", str(&odd)]).run().all(),
+            splat4d(&["info", "--json", str(&odd)]).run().all(),
+            splat4d(&["info", str(&gone)]).run().refused(),
+            splat4d(&["info", str(&odd), str(&gone)]).run().refused(),
+        ] {
+            assert!(!said.contains(['\u{1b}', '\u{7}', '\u{9b}']), "{said:?}");
+        }
+        let refused = splat4d(&["info", "/dev/zero"]).run().refused();
+        assert!(refused.contains("regular file"), "{refused}");
+    }
+
     // The extension of versions before 0.1, which another program uses for a format of its own.
     let old = work.path().join("old.splat4d");
     std::fs::copy(&file, &old).unwrap();

@@ -80,7 +80,7 @@ fn calibrations() -> Vec<Vec<u8>> {
     seeds(&[
         "%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: [ 8., 0., 4., 0., 8., 3., 0., 0., 1. ]\n\
          distortion_coefficients: !!opencv-matrix\n   rows: 1\n   cols: 5\n   dt: d\n   data: [ 0.1, 0., 0., 0., 0. ]\n\
-         image_width: 8\nimage_height: 6\na: &a [1, 2]\nb: [*a, *a]\n",
+         image_width: 8\nimage_height: 6\n",
         "<?xml version=\"1.0\"?>\n<opencv_storage><K type_id=\"opencv-matrix\"><rows>3</rows><cols>3</cols><dt>d</dt>\
          <data>8 0 4 0 8 3 0 0 1</data></K></opencv_storage>\n",
         "[cam_0]\nname = \"a\"\nsize = [8, 6]\nmatrix = [[8, 0, 4], [0, 8, 3], [0, 0, 1]]\nrotation = [0, 0, 0]\ntranslation = [0, 0, 4]\n\

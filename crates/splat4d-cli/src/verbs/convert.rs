@@ -99,7 +99,7 @@ pub(crate) struct Args {
     /// Read these values of the input as they are, not as logarithms or logits; may be repeated
     #[arg(long, value_name = "WHAT", value_enum)]
     linear: Vec<LinearValues>,
-    /// Version of .spz to write
+    /// Version of .spz to write: 3 is read by most programs, 2 also by GaussianSplats3D and spz-js, 4 alone by PlayCanvas' engine
     #[arg(long, value_name = "V", default_value_t = spz::DEFAULT_VERSION,
           value_parser = clap::value_parser!(u32).range(2..=4))]
     spz_version: u32,
@@ -344,9 +344,6 @@ pub(crate) fn write(args: &Args, mut source: Source, console: &Console) -> anyho
             "the file against the scene: {:.2} dB over {} renders, {:.2} dB in the worst ({:.2} s)",
             l.psnr, l.pictures, l.worst_psnr, l.worst_time
         ));
-    }
-    if target == Target::Dialect(spz::DIALECT) {
-        console.say(&format!("version {} of .spz {}", args.spz_version, spz::readers(args.spz_version)));
     }
     let each = bytes.len() as f64 / whole.len().max(1) as f64;
     console.say(&format!(

@@ -24,7 +24,7 @@ use crate::{Error, ErrorKind, Result};
 use std::io::Write;
 
 /// .spz, versions 2 to 4.
-pub const DIALECT: Dialect = Dialect {
+pub(crate) const DIALECT: Dialect = Dialect {
     name: ".spz",
     ending: ".spz",
     up: Y_DOWN,
@@ -41,20 +41,8 @@ pub const DIALECT: Dialect = Dialect {
 pub(crate) const VERSIONS: std::ops::RangeInclusive<u32> = 2..=4;
 /// Version written by default: the one that most programs open.
 pub const DEFAULT_VERSION: u32 = 3;
-/// Who reads a version, in words (each program's newest release of November 2026, tried or read in its documentation).
-pub fn readers(version: u32) -> &'static str {
-    match version {
-        2 => "is read by all programs but PlayCanvas' engine (version 4 only); its rotations are coarser",
-        3 => {
-            "is read by most programs, but not by GaussianSplats3D 0.4 and spz-js 1.2 (version 2) nor by PlayCanvas' engine \
-             (version 4): --spz-version"
-        }
-        _ => {
-            "is read by Spark 2.4, PlayCanvas, splat-transform and the SPZ library; older programs want version 2 or 3"
-        }
-    }
-}
-
+/// First version that names its axes when it is written: readers of version 2 (spz-js 1.2) refuse bytes behind the streams.
+const NAMES_AXES: u32 = 3;
 /// First bytes of a version 4 file, and of the header inside older ones.
 pub const MAGIC: [u8; 4] = *b"NGSP";
 /// First bytes of a gzip stream (RFC 1952).
@@ -151,9 +139,10 @@ pub fn write(params: &Params, version: u32, up: [f64; 3], out: &mut impl Write) 
     }
     let degree = degree_of(params[SH].width() / 3).expect("a layer has at least the base colour");
     let fraction_bits = streams::fraction_bits(params, &rows);
-    let axes = axes::Axes::of_up(up);
-    if axes.is_none() {
-        warnings.say("no coordinate system of .spz has this direction up: other programs will assume their own axes");
+    let axes = axes::Axes::of_up(up).filter(|_| version >= NAMES_AXES);
+    if axes.is_none() && up != Y_DOWN {
+        let what = "the file does not name its axes (version 2, or up lies along none of them)";
+        warnings.say(format!("{what}: other programs will take y as down, as in .ply"));
     }
     let flags = if axes.is_some() { EXTENDED } else { 0 };
     let header = Header { version, count: count as usize, degree, fraction_bits, flags };
