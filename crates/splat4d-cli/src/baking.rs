@@ -245,7 +245,7 @@ pub(crate) fn bake_into(
         .map(|(name, e)| ((*name).to_owned(), json!({"rms": e.rms, "max": e.max})))
         .collect();
     let value = json!({
-        "type": "baked", "file": out, "bytes": bytes.len(), "seconds": seconds, "clip": baked.clip,
+        "type": "baked", "file": out.to_string_lossy(), "bytes": bytes.len(), "seconds": seconds, "clip": baked.clip,
         "bytes_per_primitive": summary.bytes as f64 / report.primitives.max(1) as f64,
         "pages": summary.pages, "page_bytes": summary.page_bytes, "palette_entries": summary.palette_entries,
         "palette_bytes": summary.palette_bytes, "poster_bytes": summary.poster_bytes, "baking": report,

@@ -259,13 +259,13 @@ impl Drop for OutputFolder {
             return;
         }
         let state = self.path.join(STATE);
-        let kept = state.join(ASIDE).exists();
-        let _ = clear(&self.path, &self.list);
-        let _ = std::fs::remove_file(state.join(ASKED));
-        if kept {
+        if state.join(ASIDE).exists() {
+            // Which list is the new output's and which the old one's, `recover` knows.
             let _ = recover(&self.path);
             return;
         }
+        let _ = clear(&self.path, &self.list);
+        let _ = std::fs::remove_file(state.join(ASKED));
         // Nothing of ours is left: the lock, which is still held, goes last.
         if let Some(owner) = self.owner.take() {
             self.give_back(owner);
@@ -408,7 +408,8 @@ fn put_back(from: &Path, to: &Path) -> Result<()> {
         if entry.file_type().is_ok_and(|t| t.is_dir()) {
             std::fs::create_dir_all(&target).map_err(failed)?;
             put_back(&path, &target)?;
-        } else {
+        } else if std::fs::symlink_metadata(&target).is_err() {
+            // What the user put there meanwhile stays.
             std::fs::rename(&path, &target).map_err(failed)?;
         }
     }

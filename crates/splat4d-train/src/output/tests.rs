@@ -110,6 +110,31 @@ fn copy(from: &Path, to: &Path) {
     }
 }
 
+/// Where the old run cannot be moved away as a whole, all of it stays.
+#[cfg(target_os = "linux")]
+#[test]
+fn a_run_that_cannot_be_set_aside_stays() {
+    let work = tempfile::tempdir().unwrap();
+    let folder = work.path().join("run");
+    run(&folder, "old");
+    // A path that is just short enough where it is, and too long in `.splat4d/aside`.
+    const PATH_MAX: usize = 4096;
+    let mut deep = folder.clone();
+    while deep.as_os_str().len() + 120 < PATH_MAX {
+        deep.push("z".repeat(100));
+    }
+    deep.push("f".repeat(PATH_MAX - 6 - deep.as_os_str().len()));
+    std::fs::create_dir_all(deep.parent().unwrap()).unwrap();
+    std::fs::write(&deep, "old").unwrap();
+    let list = folder.join(STATE).join(FILE);
+    let line = deep.strip_prefix(&folder).unwrap().display().to_string();
+    std::fs::write(&list, std::fs::read_to_string(&list).unwrap() + &line + "\n").unwrap();
+    let before = tree(&folder);
+    assert_eq!(before.len(), 4);
+    assert!(OutputFolder::begin(&folder, &request("second", true)).is_err());
+    assert_eq!(tree(&folder), before);
+}
+
 #[test]
 fn force_is_refused_where_there_is_no_run() {
     let work = tempfile::tempdir().unwrap();

@@ -14,6 +14,8 @@ use std::sync::Arc;
 
 /// Weights of red, green and blue in brightness (ITU-R BT.709).
 const LUMA: [f64; 3] = [0.2126, 0.7152, 0.0722];
+/// Most that colours are multiplied by: 20 stops, beyond any display, and far from what f32 holds.
+const BRIGHTEST: f64 = 1e6;
 /// Opacities are kept this far from 0 and 1, where logits are infinite.
 const MARGIN: f64 = 1e-6;
 
@@ -333,6 +335,10 @@ fn color_map(exposure: f64, tint: Option<[f64; 3]>, saturation: Option<f64>, cur
     };
     let matrix = std::array::from_fn(|i| std::array::from_fn(|j| cell(i, j)));
     let map = ColorMap { matrix, offset: [0.0; 3], curve: curve.to_vec() };
+    if map.matrix.as_flattened().iter().any(|x| x.abs() > BRIGHTEST) {
+        return Err(Error::input(format!("it makes colours too large: more than {BRIGHTEST:.0e} times as bright"))
+            .remedy("Give a smaller exposure, tint or saturation"));
+    }
     if !map.is_sound() || curve.len() == 1 {
         return Err(Error::input(
             "colours are mapped by numbers that are not finite, or a curve whose corners do not rise",
