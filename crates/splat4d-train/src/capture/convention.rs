@@ -22,7 +22,7 @@ impl Convention {
     /// COLMAP: world to camera, OpenCV axes, quaternions.
     pub(crate) const COLMAP: Self = Self { world_to_camera: true, opengl: false, quaternions: true };
     /// World to camera, OpenCV axes, matrices.
-    pub(crate) const OPENCV: Self = Self { quaternions: false, ..Self::COLMAP };
+    pub const OPENCV: Self = Self { quaternions: false, ..Self::COLMAP };
     /// Nerfies: the rotation of world to camera and the camera's position, OpenCV axes: what is mistaken there is the rotation's
     /// direction, as with camera to world.
     pub(crate) const NERFIES: Self = Self { world_to_camera: false, opengl: false, quaternions: false };

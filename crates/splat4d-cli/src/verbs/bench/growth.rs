@@ -21,7 +21,7 @@ use splat4d::scene::life::{CENTER, LOG_WIDTH};
 use splat4d::scene::params::{LOG_SCALE, QUAT};
 use splat4d::scene::{Camera, GEOMETRY, LIFE, LifeKind, Params, Planes, SH, Table, Time};
 use splat4d::{Error, Result};
-use splat4d_train::capture::{Capture, CaptureKind, Extent, Frame, ImageStore, Rig, Timing};
+use splat4d_train::capture::{Capture, CaptureKind, Convention, Extent, Frame, ImageStore, Poses, Rig, Timing};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::dataset::Dataset;
 use splat4d_train::run::peak_memory;
@@ -168,6 +168,7 @@ fn capture(pinned: &Pinned, root: &Path, pictures: &[PathBuf], count: usize) -> 
             time,
             index: i,
             image,
+            upright: true,
             depth: None,
             flow: None,
             labels: None,
@@ -195,6 +196,9 @@ fn capture(pinned: &Pinned, root: &Path, pictures: &[PathBuf], count: usize) -> 
         up: pinned.scene.up,
         labels: Vec::new(),
         downscale: 1,
+        convention: Convention::OPENCV,
+        poses: Poses::STATED,
+        account: Vec::new(),
         warnings: Vec::new(),
         notes: Vec::new(),
     }
