@@ -81,6 +81,9 @@ pub(crate) struct Args {
 }
 
 /// Output of the verb: a JSON object, and the same for people.
+/// What readers say of values that cannot be right as they were read; all else that they say is a note.
+const DOUBTS: [&str; 2] = ["--linear", "where single precision has steps"];
+
 struct Told {
     json: Value,
     text: String,
@@ -381,8 +384,11 @@ fn of_file(path: &Path) -> anyhow::Result<Told> {
             line(&mut text, "comment", comment);
         }
     }
-    source.warnings.lines().iter().for_each(|w| line(&mut text, "note", w));
-    let inner = of_scene(&source.scene);
+    let (doubts, notes): (Vec<&String>, Vec<&String>) =
+        source.warnings.lines().iter().partition(|w| DOUBTS.iter().any(|d| w.contains(d)));
+    notes.into_iter().for_each(|w| line(&mut text, "note", w));
+    let mut inner = of_scene(&source.scene);
+    inner.troubles.extend(doubts.into_iter().map(|w| format!("{w}.")));
     text.push_str(&inner.text);
     let mut json = inner.json;
     json["provenance"] = json!(source.provenance);

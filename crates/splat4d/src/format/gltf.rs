@@ -46,13 +46,13 @@ fn unsupported(what: impl std::fmt::Display) -> Error {
 }
 
 /// A file's JSON and its binary chunk.
-struct File<'a> {
+struct Glb<'a> {
     json: Value,
     bin: &'a [u8],
 }
 
 fn read(bytes: &[u8]) -> Result<Opened> {
-    let file = File::open(bytes)?;
+    let file = Glb::open(bytes)?;
     let mut layers = Vec::new();
     let mut warnings = Warnings::default();
     for (mesh, frame) in file.placed()? {
@@ -86,7 +86,7 @@ fn read(bytes: &[u8]) -> Result<Opened> {
     Ok(Opened::from((scene, warnings)))
 }
 
-impl<'a> File<'a> {
+impl<'a> Glb<'a> {
     fn open(bytes: &'a [u8]) -> Result<Self> {
         let word = |at: usize| {
             let b = bytes.get(at..at + 4).ok_or_else(|| damaged("it is cut short"))?;
