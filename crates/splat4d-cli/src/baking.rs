@@ -57,6 +57,8 @@ const CUTS: usize = 3;
 const TOO_LARGE: f64 = 1.03;
 /// A finer cut is tried where it may have this many times the primitives.
 const FINER: f64 = 1.05;
+/// A file this much more like its model than wanted, dB, is cut again, coarser.
+const SPARE: f64 = 2.0;
 /// Of the seconds that are left for baking, what the first sampling of the model may take. Sampling between frames, fitting,
 /// packing and comparing take the rest.
 const SAMPLING: f64 = 0.25;
@@ -296,6 +298,15 @@ pub(crate) struct Cooked {
     pub needs: Option<Needs>,
 }
 
+impl Cooked {
+    /// Greater is better: within its bytes, then as like its model as wanted, then small.
+    fn rank(&self, most: f64) -> [f64; 3] {
+        let bytes = self.packed.bytes.len() as f64;
+        let psnr = self.likeness.as_ref().map_or(0.0, |l| l.psnr);
+        [f64::from(u8::from(bytes <= TOO_LARGE * most)), psnr.min(LIKE), -bytes]
+    }
+}
+
 /// Bakes and packs a scene within its bytes and time, and compares it with its model. Cuts it again where the first cut was
 /// further off than a comparison can tell, without sampling the model again.
 pub(crate) fn bake_like(source: &Source, title: &str, baking: &Baking, console: &Console) -> anyhow::Result<Cooked> {
@@ -324,7 +335,8 @@ pub(crate) fn bake_like(source: &Source, title: &str, baking: &Baking, console: 
             let affordable = curve.price_of(kitchen.most(each));
             let then = wanted.unwrap_or(0.0).max(affordable);
             let [more, _] = curve.at(then);
-            if bytes > TOO_LARGE * most && more < pieces || like.psnr < LIKE && more > FINER * pieces {
+            let coarser = bytes > TOO_LARGE * most || like.psnr > LIKE + SPARE;
+            if coarser && FINER * more < pieces || like.psnr < LIKE && more > FINER * pieces {
                 next = Some(then).filter(|then| *then != at);
             }
             if like.psnr < LIKE {
@@ -332,12 +344,9 @@ pub(crate) fn bake_like(source: &Source, title: &str, baking: &Baking, console: 
                 needs = Some(Needs { psnr: LIKE, bytes: (each * pieces) as u64, more: wanted.is_none() });
             }
         }
-        let better = best.as_ref().is_none_or(|b| {
-            let psnr = |c: &Option<bake::Likeness>| c.as_ref().map_or(0.0, |l| l.psnr);
-            b.packed.bytes.len() as f64 > TOO_LARGE * most || psnr(&likeness) > psnr(&b.likeness)
-        });
-        if better {
-            best = Some(Cooked { packed, likeness, needs });
+        let cooked = Cooked { packed, likeness, needs };
+        if best.as_ref().is_none_or(|b| cooked.rank(most) > b.rank(most)) {
+            best = Some(cooked);
         }
         let Some(then) = next.filter(|_| round < CUTS && deadline.left() > AGAIN * (deadline.now() - began)) else {
             break;

@@ -348,7 +348,7 @@ mod tests {
     /// The segments of a Gaussian have its colours: they count as one point of their weight, wherever they are listed.
     #[test]
     fn identical_points_are_one_point_of_their_weight() {
-        let points = clouds(900, 9, 900, 0.0);
+        let points = clouds(900, 9, 900, 0.5);
         let weights: Vec<f32> = (0..900).map(|i| 1.0 + (i % 3) as f32).collect();
         let merged = cluster(&points, 9, &weights, 300, 4, Rng::new(1, "k", 0));
         let copies: Vec<usize> = (0..3).flat_map(|round| (0..900).filter(move |i| i % 3 >= round)).collect();
