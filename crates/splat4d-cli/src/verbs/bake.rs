@@ -3,8 +3,8 @@
 use crate::baking::{Baking, bake_into, title};
 use crate::console::Console;
 use crate::files::{self, parse_bytes};
-use crate::source::{Source, not_empty};
 use crate::playable;
+use crate::source::{Source, not_empty};
 use splat4d::Error;
 use splat4d::bake::{MAX_REPEAT, Options, SEGMENT, TOLERANCE};
 use splat4d::format::playback::{MAX_PALETTE, WriteConfig};

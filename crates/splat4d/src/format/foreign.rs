@@ -105,7 +105,6 @@ mod tests {
             (&b"SP4D\x01\0\0\0\x0c\x02\0\0{\"n\":40}"[..], "a.splat4d", "splats4D"),
             (b"SP4D", "a.s4d", "splats4D"),
             (b"\x894DGS1\r\n", "a.4dgs", "fourdgs"),
-            (b"glTF\x02\0\0\0", "a.glb", "glTF"),
             (b"\0\x01\0\0", "A.KSPLAT", "GaussianSplats3D"),
             (b"\x93NUMPY\x01\0", "a.npy", "NumPy"),
             (b"\0\0\0\x18ftypisom", "a.mp4", "import"),

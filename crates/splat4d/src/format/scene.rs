@@ -594,7 +594,7 @@ mod tests {
             let at = bytes.windows(from.len()).position(|w| w == from.as_bytes()).unwrap();
             let mut b = bytes.clone();
             b[at..at + to.len()].copy_from_slice(to.as_bytes());
-            read(&b).unwrap_err().to_string()
+            read(&b).expect_err(to).to_string()
         };
         assert!(with("\\\"spacetime\\\"", "\\\"spacetimf\\\"").contains("spacetimf"));
         assert!(with("\\\"version\\\":1", "\\\"version\\\":9").contains("version 9"));

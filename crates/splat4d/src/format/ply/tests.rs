@@ -168,14 +168,20 @@ fn rgb_colours_are_base_colours() {
 
 #[test]
 fn infinities_that_mean_something_are_no_damage() {
+    // No writer of ours writes infinities: they take the place of numbers that occur once.
+    let marks =
+        [(1, OPACITY, 1234.5, f32::INFINITY), (2, LOG_SCALE, 2345.5, f32::NEG_INFINITY), (3, 0, 3456.5, f32::INFINITY)];
     let mut p = gaussians(4, 1);
-    p[GEOMETRY].set(1, OPACITY, f32::INFINITY);
-    p[GEOMETRY].set(2, LOG_SCALE, f32::NEG_INFINITY);
-    p[GEOMETRY].set(3, 0, f32::INFINITY);
-    let (back, info) = read(&written(&p)).unwrap();
+    marks.iter().for_each(|&(row, column, mark, _)| p[GEOMETRY].set(row, column, mark));
+    let mut bytes = written(&p);
+    for (.., mark, value) in marks {
+        let at = bytes.windows(4).position(|w| w == f32::to_le_bytes(mark)).unwrap();
+        bytes[at..at + 4].copy_from_slice(&value.to_le_bytes());
+    }
+    let (back, info) = read(&bytes).unwrap();
     assert_eq!((info.mended.opaque, info.mended.flat, info.non_finite_rows), (1, 1, 1));
     assert!(back[GEOMETRY].get(1, OPACITY) > 10.0 && back[GEOMETRY].get(2, LOG_SCALE) < -10.0);
-    let said = DIALECT.open(&written(&p)).unwrap().warnings;
+    let said = DIALECT.open(&bytes).unwrap().warnings;
     assert!(said.lines()[0].contains("1 of 4 Gaussians have opacity +infinity"), "{said:?}");
     // Nothing that can be drawn: no file.
     let mut lost = gaussians(2, 1);
@@ -183,7 +189,7 @@ fn infinities_that_mean_something_are_no_damage() {
     let (scene, mut out) = (crate::format::dialect::still(lost), Vec::new());
     for dialect in crate::format::DIALECTS.iter().filter(|d| d.is_written() && !d.moves) {
         let error = dialect.write(&scene, &WriteOptions::default(), &mut out).unwrap_err().to_string();
-        assert!(error.contains("nothing would be written"), "{dialect:?}: {error}");
+        assert!(error.contains("NaN or infinite"), "{dialect:?}: {error}");
     }
 }
 

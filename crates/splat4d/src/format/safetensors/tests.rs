@@ -122,6 +122,10 @@ fn a_flipped_bit_is_found_by_the_checksums() {
         let mut flipped = whole.clone();
         flipped[at] ^= 1 << (at % 8);
         match SafeTensors::read(&flipped) {
+            // In the name under which the checksums stand: then there are none.
+            Ok(same) if same.metadata().len() > read.metadata().len() => {
+                assert!(same.tensors().eq(read.tensors()), "byte {at}");
+            }
             Ok(same) => assert_eq!(same, read, "byte {at}"),
             Err(error) => refused += usize::from(error.to_string().contains("checksum is another")),
         }
