@@ -44,8 +44,7 @@ pub(crate) fn open(folder: &Path, fps: f64) -> Result<Option<Source>> {
     Ok(Some(source))
 }
 
-/// Opens an archive with one scene in it; none where it is a zipped SOG scene, which is a dialect of its own, or holds no
-/// scene: that dialect's reader says what it is.
+/// Opens an archive with one scene in it; none where it is a zipped SOG scene, which is a dialect of its own, such.
 pub(crate) fn open_archive(path: &Path, bytes: &[u8]) -> Result<Option<Source>> {
     if !bytes.starts_with(&zip::MAGIC) {
         return Ok(None);
@@ -61,7 +60,12 @@ pub(crate) fn open_archive(path: &Path, bytes: &[u8]) -> Result<Option<Source>> 
         |name: &&String| !name.starts_with("__MACOSX/") && endings.iter().any(|e| name.to_lowercase().ends_with(e));
     let scenes: Vec<&String> = names.iter().filter(is_scene).collect();
     let name = match scenes[..] {
-        [] => return Ok(None),
+        [] => {
+            let error = splat4d::format::foreign::archive(&names).unwrap_or_else(|| {
+                Error::input("is an archive without a scene file").remedy("Unpack it and give one file.")
+            });
+            return Err(error.at(path.display()));
+        }
         [name] => name,
         _ => {
             let some: Vec<&str> = scenes.iter().map(|n| n.as_str()).take(4).collect();

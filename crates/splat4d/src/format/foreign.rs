@@ -86,7 +86,7 @@ pub fn unread(name: &str, bytes: &[u8]) -> Option<Error> {
 }
 
 /// Says what a zip archive without the files of a SOG scene is.
-pub(super) fn archive(names: &[String]) -> Option<Error> {
+pub fn archive(names: &[String]) -> Option<Error> {
     let (_, what, remedy) = ARCHIVES.iter().find(|(end, ..)| names.iter().any(|n| n.ends_with(end)))?;
     Some(error(what, remedy))
 }
