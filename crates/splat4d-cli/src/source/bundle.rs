@@ -44,7 +44,7 @@ pub(crate) fn open(folder: &Path, fps: f64) -> Result<Option<Source>> {
     Ok(Some(source))
 }
 
-/// Opens an archive with one scene in it; none where it is a zipped SOG scene, which is a dialect of its own, such.
+/// Opens an archive with one scene in it; none where it is a zipped SOG scene, which is a dialect of its own.
 pub(crate) fn open_archive(path: &Path, bytes: &[u8]) -> Result<Option<Source>> {
     if !bytes.starts_with(&zip::MAGIC) {
         return Ok(None);
