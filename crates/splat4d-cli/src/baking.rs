@@ -98,7 +98,8 @@ impl Default for Baking {
 
 /// Bytes that the file of a scene may have: those of its tables in 32-bit floats, and a rate for its clip.
 pub(crate) fn budget(scene: &Scene<f32>) -> u64 {
-    let numbers = |l: &splat4d::layers::Layer| l.params.keys().map(|k| l.params[k].data().len()).sum::<usize>();
+    let numbers =
+        |l: &splat4d::layers::Layer| l.params.keys().map(|k| l.params[k].rows() * l.params[k].width()).sum::<usize>();
     let learned = 4 * scene.layers.iter().map(numbers).sum::<usize>();
     let seconds = scene.clip[1] - scene.clip[0];
     learned as u64 + if seconds > 0.0 { (BYTES_A_SECOND * seconds) as u64 } else { 0 }
