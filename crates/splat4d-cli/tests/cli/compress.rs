@@ -97,7 +97,7 @@ fn wrong_orders_are_refused_before_any_work() {
         (vec![run_text, "--set", "temporal=sometimes"], "sometimes"),
         (vec![run_text, "--set", "depths.color=9"], "color"),
         (vec![run_text, "--max-mb=-1"], "megabytes"),
-        (vec![run_text, "-o", run_text], "the run itself"),
+        (vec![run_text, "-o", run_text], "is the run"),
         (vec![str(&capture)], "not a run"),
         (vec!["nowhere"], "no such run"),
         (vec!["--resume", run_text], "no compression"),

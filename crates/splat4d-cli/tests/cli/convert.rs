@@ -1,6 +1,6 @@
 //! Files go between the formats of other programs, and what is lost is said.
 
-use crate::sample::splat4d;
+use crate::sample::{shown, splat4d};
 use splat4d::format::{Dialect, ply, scene, splatv};
 use splat4d::layers::{Head, Layer, Scene, rotation_between};
 use splat4d::math::{Rng, Sim3, quat, sym3};
@@ -98,9 +98,9 @@ fn a_moving_scene_goes_everywhere() {
     assert!(at("frames/f_000.spz").is_file() && at("frames/f_004.spz").is_file() && !at("frames/f_005.spz").exists());
     convert("frames", "joined.safetensors", &["--fps", "4"]);
     let joined = scene::read(&std::fs::read(at("joined.safetensors")).unwrap()).unwrap();
-    assert_eq!((joined.clip, joined.len(), joined.up), ([0.0, 1.0], 5 * 40, [0.0, 1.0, 0.0]));
-    let refused = splat4d(&["convert", "frames", "x.splatv"]).run_in(work.path()).refused();
-    assert!(refused.contains("interval") && refused.contains("--frames"), "{refused}");
+    assert_eq!((joined.clip, joined.len(), joined.up), ([0.0, 1.0], 5 * 40, [0.0, -1.0, 0.0]));
+    let refused = splat4d(&["convert", "frames", "x.splatv", "--exact"]).run_in(work.path()).refused();
+    assert!(refused.contains("--exact"), "{refused}");
 }
 
 #[test]
@@ -119,9 +119,7 @@ fn a_scene_with_a_head_is_drawn_and_nothing_else_is_made_of_it() {
     let draw = |name: &str, out: &str, device: &str| {
         let scene = format!("{name}.safetensors");
         let said = run(&["render", &scene, "-o", out, "--size", "40x30", "--fps", "4", "--device", device]).told();
-        let mut pictures: Vec<_> =
-            std::fs::read_dir(work.path().join(out)).unwrap().map(|e| e.unwrap().path()).collect();
-        pictures.sort();
+        let pictures = shown(&work.path().join(out));
         (said, pictures.into_iter().map(|p| std::fs::read(p).unwrap()).collect::<Vec<_>>())
     };
     let (_, drawn) = draw("full", "cpu", "cpu");

@@ -280,7 +280,7 @@ fn colmap_is_called_where_it_is_asked_for_and_its_model_is_taken() {
     let folder = str(&program).to_owned();
     let import =
         |path: &str| splat4d(&["import", str(&films), "-o", str(&take), "--colmap", "--no-doctor"]).path(path).run();
-    let missing = import("/nonexistent").refused();
+    let missing = import("/nonexistent").failed();
     assert!(missing.contains("colmap cannot be started") && missing.contains("leave --colmap out"), "{missing}");
     stand_in(&program, "if [ -z \"$1\" ]; then :; fi; echo 'out of features' >&2; exit 3");
     let failed = import(&folder).refused();

@@ -135,6 +135,14 @@ impl Capture {
     }
 }
 
+/// Files of a folder that a user sees, in the order of their names: without the record of what splat4d wrote there.
+pub(crate) fn shown(folder: &Path) -> Vec<PathBuf> {
+    let all = std::fs::read_dir(folder).unwrap().map(|e| e.unwrap().path());
+    let mut files: Vec<PathBuf> = all.filter(|p| !p.file_name().unwrap().to_string_lossy().starts_with('.')).collect();
+    files.sort();
+    files
+}
+
 /// A call of the binary.
 pub(crate) struct Call {
     args: Vec<OsString>,
