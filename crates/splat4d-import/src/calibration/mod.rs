@@ -269,6 +269,12 @@ fn whole(part: Part) -> Result<Calibrated> {
             ),
         ));
     };
+    if matches!(lens, Lens::Equirectangular { .. }) {
+        return Err(place(
+            Error::input("its model EQUIRECTANGULAR is not read for videos")
+                .remedy("Cut perspective videos out of the panoramas first."),
+        ));
+    }
     let [width, height] = part.size.unwrap_or([ANY_SIDE; 2]);
     check_intrinsics(&intrinsics, width, height).map_err(place)?;
     let pose = part.pose.map(rigid).transpose().map_err(place)?;
