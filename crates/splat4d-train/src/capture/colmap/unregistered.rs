@@ -23,17 +23,18 @@ pub(super) fn settle(
 ) {
     let names: Vec<&str> = shots.iter().map(|(name, _)| name.as_str()).collect();
     let naming = rig::naming(&names);
-    let folder =
-        |name: &str| name.rsplit_once(['/', '\\']).map_or(String::new(), |(folder, _)| folder.replace('\\', "/"));
-    let folders: BTreeSet<String> = names.iter().map(|name| folder(name)).collect();
+    // Folders as they were found, and as names have them: those may be absolute paths of another machine.
+    let of_name = |name: &str| name.rsplit_once('/').map_or(String::new(), |(folder, _)| format!("{folder}/"));
+    let of_file = |file: &PathBuf| file.parent().unwrap_or(base).to_path_buf();
+    let folders: BTreeMap<PathBuf, String> =
+        files.iter().zip(&names).map(|(file, name)| (of_file(file), of_name(name))).collect();
     let known: BTreeSet<&PathBuf> = files.iter().collect();
     let mut others: Vec<(String, PathBuf)> = Vec::new();
-    for folder in &folders {
-        let path = if folder.is_empty() { base.to_path_buf() } else { base.join(folder) };
-        for file in rig::image_names(&path) {
+    for (path, folder) in &folders {
+        for file in rig::image_names(path) {
             let image = path.join(&file);
             if !known.contains(&image) {
-                others.push((if folder.is_empty() { file } else { format!("{folder}/{file}") }, image));
+                others.push((format!("{folder}{file}"), image));
             }
         }
     }
