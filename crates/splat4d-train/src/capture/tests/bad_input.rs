@@ -243,11 +243,11 @@ fn layouts_say_what_they_miss() {
     let text = std::fs::read_to_string(sample.path("sparse/0/cameras.txt")).unwrap();
     sample.write(
         "sparse/0/cameras.txt",
-        text.replace("2 OPENCV", "2 THIN_PRISM_FISHEYE").replace("-0.001", "0 0 0 0 0").as_bytes(),
+        text.replace("2 OPENCV", "2 SPLINED").replace("-0.001", "0 0 0 0 0").as_bytes(),
     );
     let error = Capture::open(sample.root(), &CaptureOptions::default()).unwrap_err();
     assert_eq!(error.kind(), ErrorKind::Unsupported);
-    assert_says(&error.to_string(), &["THIN_PRISM_FISHEYE", "image_undistorter"]);
+    assert_says(&error.to_string(), &["SPLINED", "image_undistorter"]);
     let hold = CaptureOptions { hold_out: Some("camera=left".parse().unwrap()), ..CaptureOptions::default() };
     assert_says(&message_with(&samples::own(), &hold), &["left", "cam00, cam01, cam02"]);
     let all = CaptureOptions { hold_out: Some("camera=0,1,2".parse().unwrap()), ..CaptureOptions::default() };
