@@ -265,11 +265,11 @@ mod tests {
     #[test]
     fn levels_of_detail_are_named_by_folder_and_by_file() {
         let folder = tempfile::tempdir().unwrap();
-        let file = folder.path().join(SOG_LEVELS);
+        let file = folder.path().join(sog::levels::LEVELS);
         std::fs::write(&file, "{}").unwrap();
         for path in [folder.path(), &file] {
             let error = Source::open(path).err().map(|e| e.to_string()).unwrap_or_default();
-            assert!(error.contains("levels of detail"), "{error}");
+            assert!(error.contains(sog::levels::LEVELS), "{error}");
         }
     }
 }

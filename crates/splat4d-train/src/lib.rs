@@ -29,6 +29,7 @@ pub mod event;
 pub mod features;
 pub mod files;
 pub mod init;
+pub mod keypoints;
 pub mod labels;
 pub mod learner;
 pub mod loss;

@@ -2,15 +2,15 @@
 //!
 //! Everything is measured in pixels, angles and ratios: scenes may be in millimetres or kilometres.
 
-pub mod features;
 pub mod flow;
 mod matching;
-pub mod raster;
 #[cfg_attr(not(test), expect(dead_code, reason = "sizes to prune and near distances are to be measured by it"))]
 pub(crate) mod scale;
 mod sweep;
 pub mod triangulate;
 pub(crate) mod view;
+
+pub use crate::keypoints::{features, raster};
 
 use crate::Result;
 use crate::capture::frames::Frames;

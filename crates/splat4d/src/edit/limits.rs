@@ -2,7 +2,6 @@
 
 use super::Context;
 use crate::layers::{Evaluation, Layer, Scene};
-use crate::motion::Spec;
 use crate::scene::Time;
 use crate::scene::time::DEFAULT_FPS;
 use crate::{Error, ErrorKind, Result};
@@ -80,15 +79,8 @@ pub(super) fn check_clip(clip: [f64; 2], fps: f64) -> Result<()> {
 
 /// How many changes are around a layer's model, each inside the next.
 fn depth(layer: &Layer<f32>) -> usize {
-    let (mut spec, mut depth) = (layer.motion.spec(), 0);
-    loop {
-        spec = match spec {
-            Spec::Edited(s) => *s.inner,
-            Spec::Filtered(s) => *s.inner,
-            _ => return depth,
-        };
-        depth += 1;
-    }
+    let spec = layer.motion.spec();
+    std::iter::successors(spec.inner(), |inner| inner.inner()).count()
 }
 
 /// Errors: numbers of a scene overflowed, in its tables or when it moves; changes that are nested too deeply.

@@ -172,6 +172,14 @@ macro_rules! registry {
                 }
             }
 
+            /// The model inside a wrapper. `None`: it wraps none.
+            pub fn inner(&self) -> Option<&Spec> {
+                match self {
+                    $(Spec::$w_variant(spec) => Some(&spec.inner),)*
+                    _ => None,
+                }
+            }
+
             /// Whether [`build`] can make it.
             pub fn is_built_in(&self) -> bool {
                 !matches!(self, Spec::Custom(_))

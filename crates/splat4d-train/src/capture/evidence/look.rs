@@ -3,8 +3,8 @@
 use super::super::lens::Distortion;
 use super::super::picture::{self, Raster};
 use super::super::{Capture, Frame};
-use crate::vision::features::{Feature, Limits, find};
-use crate::vision::raster::grey;
+use crate::keypoints::features::{Feature, Limits, find};
+use crate::keypoints::raster::grey;
 use rayon::prelude::*;
 use splat4d::math::Se3;
 use splat4d::scene::{Camera, Planes};

@@ -241,10 +241,8 @@ fn layouts_say_what_they_miss() {
     assert_says(&message(&sample), &["1 videos are not extracted", "ffmpeg -i cam01.mp4"]);
     let sample = samples::colmap_txt();
     let text = std::fs::read_to_string(sample.path("sparse/0/cameras.txt")).unwrap();
-    sample.write(
-        "sparse/0/cameras.txt",
-        text.replace("2 OPENCV", "2 SPLINED").replace("-0.001", "0 0 0 0 0").as_bytes(),
-    );
+    sample
+        .write("sparse/0/cameras.txt", text.replace("2 OPENCV", "2 SPLINED").replace("-0.001", "0 0 0 0 0").as_bytes());
     let error = Capture::open(sample.root(), &CaptureOptions::default()).unwrap_err();
     assert_eq!(error.kind(), ErrorKind::Unsupported);
     assert_says(&error.to_string(), &["SPLINED", "image_undistorter"]);
