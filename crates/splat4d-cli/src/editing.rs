@@ -291,8 +291,12 @@ mod tests {
     fn a_mask_of_another_size_is_refused_by_its_header() {
         let folder = tempfile::tempdir().unwrap();
         // A header that claims 400 million pixels, and nothing behind it.
-        let file = std::fs::File::create(folder.path().join("m.png")).unwrap();
-        drop(png::Encoder::new(file, 20_000, 20_000).write_header().unwrap());
+        let mut bytes = Vec::new();
+        drop(png::Encoder::new(&mut bytes, 20_000, 20_000).write_header().unwrap());
+        // An empty chunk of pixels, with its checksum, in place of the end.
+        bytes.truncate(bytes.len() - 12);
+        bytes.extend(b"\0\0\0\0IDAT\x35\xaf\x06\x1e");
+        std::fs::write(folder.path().join("m.png"), bytes).unwrap();
         let (source, console) = (Source::own(Scene::default()), Console::new(Loudness::Quiet, false));
         let edits = folder.path().join("edits.toml");
         let bring = Bring::new(&source, Some(&edits), &console).unwrap();
