@@ -425,7 +425,7 @@ fn transforms_captures_and_colmap_are_read_without_pictures() {
     let found = folder(&text).unwrap();
     same(&found, &truth);
     assert_eq!(found.dialects, ["COLMAP"]);
-    refused(&[("cameras.txt", first.replace("FULL_OPENCV", "FOV")), ("images.txt", second.clone())], "FOV");
+    refused(&[("cameras.txt", first.replace("FULL_OPENCV", "SPLINED")), ("images.txt", second.clone())], "SPLINED");
     refused(&[("cameras.txt", first), ("images.txt", second.replace("right.png", "left.png"))], "several places");
     let dir = tempfile::tempdir().unwrap();
     let [first, second] = colmap_binary(&truth);
