@@ -304,7 +304,7 @@ impl<'a> Bakery<'a> {
     /// The tree with so many samples a second, as far as their number is allowed.
     fn tree_of(&self, looks: f64) -> Result<Tree> {
         let rows: usize = self.scene.layers.iter().filter(|l| self.is_split(l)).map(|l| l.params.len()).sum();
-        let most = if rows > 0 { self.options.samples / rows } else { usize::MAX };
+        let most = self.options.samples.checked_div(rows).unwrap_or(usize::MAX);
         let Scene { clip, fps, .. } = *self.scene;
         Tree::new(clip, fps, looks, self.options.segment, most)
     }
