@@ -283,6 +283,7 @@ fn machine() -> String {
 }
 
 #[cfg(test)]
+#[allow(clippy::result_large_err)] // the error of the crate, in closures of tests
 mod tests {
     use super::*;
     use std::sync::atomic::{AtomicBool, Ordering};

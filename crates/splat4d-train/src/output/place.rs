@@ -38,7 +38,7 @@ pub fn check_apart(output: &Path, inputs: &[Input<'_>]) -> Result<()> {
         // Of an output that is not there yet only the folders above it are known.
         let how = match output_id {
             Some(id) if id == input_id => "is",
-            Some(id) if own.contains(&Some(id.clone())) => "contains",
+            Some(id) if own.iter().any(|o| o.as_ref() == Some(&id)) => "contains",
             _ if others.contains(&Some(input_id)) && !input.may_hold => "lies inside",
             _ => continue,
         };
