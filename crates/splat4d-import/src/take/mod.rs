@@ -368,8 +368,8 @@ fn open(request: &Request) -> Result<Vec<Camera>> {
         prints.push((print, path));
         sources.push(source);
     }
-    let named = |(s, i): (&Box<dyn Source>, &Input)| i.name.clone().unwrap_or_else(|| s.info().name.clone());
-    let wanted: Vec<String> = sources.iter().zip(&inputs).map(named).collect();
+    let named = |(s, i): (&dyn Source, &Input)| i.name.clone().unwrap_or_else(|| s.info().name.clone());
+    let wanted: Vec<String> = sources.iter().map(|s| &**s).zip(&inputs).map(named).collect();
     let wanted: Vec<&str> = wanted.iter().map(String::as_str).collect();
     let names = write::camera_names(&wanted);
     Ok(names.into_iter().zip(sources).map(|(name, source)| Camera { name, source }).collect())
