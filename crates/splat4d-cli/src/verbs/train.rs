@@ -315,7 +315,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             Some(folder) => (folder, run, watch, trained),
             None => {
                 console.clear();
-                return Err(trained.err().expect("only what failed leaves nothing").into());
+                return Err(trained.expect_err("only what failed leaves nothing").into());
             }
         }
     };
