@@ -63,8 +63,8 @@ pub fn finest(index: &[u8]) -> Result<Finest> {
 pub fn join(pieces: &[(Params, Option<Vec<Range<usize>>>)]) -> Result<Params> {
     let mut rows: Vec<(usize, usize)> = Vec::new();
     for (i, (params, ranges)) in pieces.iter().enumerate() {
-        let all = std::slice::from_ref(&(0..params.len())).to_vec();
-        for range in ranges.as_deref().unwrap_or(&all) {
+        let all = 0..params.len();
+        for range in ranges.as_deref().unwrap_or(std::slice::from_ref(&all)) {
             if range.end > params.len() {
                 let what = format!("its {LEVELS} names Gaussians {range:?} of a piece of {}", params.len());
                 return Err(damaged(what));
