@@ -260,7 +260,7 @@ mod tests {
         std::fs::write(folder.path().join("notes.txt"), "no picture").unwrap();
         let source = super::super::open(folder.path(), 10.0).unwrap();
         assert_eq!((source.info().size, source.info().frames), ([40, 32], Some(5)));
-        assert!(source.info().warnings[0].contains("in 2 places, first after f4.png"), "{:?}", source.info().warnings);
+        assert!(source.info().warnings[0].contains("in 2 places, first after f4:"), "{:?}", source.info().warnings);
         let mut frames = source.frames(&Selection { from: Some(0.1), size: Some(16), ..Selection::default() }).unwrap();
         let (mut frame, mut seen) = (Frame::default(), Vec::new());
         while frames.next(&mut frame).unwrap() {
