@@ -192,6 +192,10 @@ impl Console {
                 self.clear();
                 self.say(&format!("motion model: {motion}, because {why}"));
             }
+            Event::Counted { gaussians, why } => {
+                self.clear();
+                self.say(&format!("at most {} Gaussians: {why}", grouped(*gaussians)));
+            }
             Event::Checkpoint { iteration, path } => {
                 self.detail(&format!("checkpoint of step {} in {}", grouped(*iteration), path.display()));
             }

@@ -103,6 +103,13 @@ pub enum Event {
         /// One sentence on what the capture is.
         why: String,
     },
+    /// The number that `densify.max_cap = 0` has become.
+    Counted {
+        /// Gaussians at most.
+        gaussians: usize,
+        /// What of the capture it follows from.
+        why: String,
+    },
     /// A checkpoint is on disk.
     Checkpoint {
         /// Steps taken.

@@ -27,11 +27,11 @@ and warned about where it comes from a file; a value that switches off what is o
 
 `--quality` sets a few knobs at once; those that are typed win over it, and the recipe records what was in effect:
 
-| | `run.iterations` | `densify.max_cap` | `capture.downscale` |
+| | `run.iterations` | `densify.count_scale` | `capture.downscale` |
 |---|---|---|---|
-| `draft` | 2,500 | 15,000 | twice the recipe's |
-| `standard` (the default) | 7,000 | 30,000 | the recipe's |
-| `best` | 20,000 | 60,000 | the recipe's |
+| `draft` | 2,500 | 0.5 | twice the recipe's |
+| `standard` (the default) | 7,000 | 1 | the recipe's |
+| `best` | 20,000 | 2 | the recipe's |
 
 `--minutes M` wins over the steps of either. It covers the command from its start to the report: reading, initial points, a
 few timed steps (about 6 % of the time, more where a step takes a second), training, and measuring, filming and baking as far

@@ -2,6 +2,7 @@
 //! serve.
 
 use super::depth::{self, DepthKind};
+use super::evidence::Agreement;
 use super::tracks::Tracks;
 use crate::Result;
 use splat4d::scene::{Camera, Planes, Time};
@@ -153,6 +154,10 @@ pub trait Frames: Send + Sync {
     /// Whether frames have metric depth maps.
     fn has_depth(&self) -> bool {
         false
+    }
+    /// How far matches of frames of moving cameras agree with a static scene; `None`: that cannot be told.
+    fn agreement(&self) -> Option<Agreement> {
+        None
     }
     /// The tracks of the camera of frame i.
     fn tracked(&self, _i: usize) -> Option<Tracked<'_>> {

@@ -49,7 +49,7 @@ mod transforms;
 pub use account::{Aspect, Remark};
 pub use convention::{Convention, Poses};
 pub use depth::{DepthFile, DepthKind};
-pub use evidence::PoseCheck;
+pub use evidence::{Agreement, PoseCheck};
 pub(crate) use flow::{FlowFile, to_picture as flow_picture};
 pub use lens::Distortion;
 pub use options::{

@@ -2,6 +2,7 @@
 
 use super::{PROGRAMS, Plan};
 use crate::Result;
+use crate::capture::Agreement;
 use crate::capture::frames::{Frames, Picture};
 use splat4d::scene::Planes;
 
@@ -23,6 +24,9 @@ pub struct Seen {
     /// Share of the pixels of fixed cameras that change from one of their frames to the next; none where that cannot be
     /// told.
     pub changing: Option<f64>,
+    /// How far matches of frames of a moving camera agree with a static scene; none where cameras are fixed, or too little
+    /// matches.
+    pub agreement: Option<Agreement>,
     /// Fewest pictures of fixed cameras at a moment.
     pub fewest: usize,
     /// Pictures have masks.
@@ -41,6 +45,7 @@ impl Seen {
             times: plan.times,
             cameras: frames.len() as f64 / plan.times.max(1) as f64,
             changing: if looks { motion_energy(frames)? } else { None },
+            agreement: if plan.times > 1 && plan.fixed_cameras == 0 { frames.agreement() } else { None },
             fewest: plan.moments.iter().map(|m| m.1).min().unwrap_or(0),
             masks: frames.has_masks(),
             depth: frames.has_depth(),

@@ -2,6 +2,7 @@
 
 use super::auto::Seen;
 use super::{Group, Plan, Program, Rate, Stage};
+use crate::capture::Agreement;
 use crate::loss::neighbourhood::{MotionWeights, Neighbourhood};
 use crate::loss::scene::{MeanOpacity, MeanScale, OpacityEntropy};
 use crate::loss::terms::{ParamLoss, ProbeLoss};
@@ -102,6 +103,13 @@ impl Program for StillProgram {
     fn suits(&self, seen: &Seen) -> Option<String> {
         if seen.times <= 1 {
             return Some("all pictures are of one moment".into());
+        }
+        if let Some(agreement) = seen.agreement.filter(Agreement::is_static) {
+            return Some(format!(
+                "{:.1} % of the {} features that match over time agree with a static scene, filmed by a moving camera",
+                100.0 * agreement.share,
+                agreement.matches
+            ));
         }
         let percent = 100.0 * seen.changing.filter(|share| *share < MOVING)?;
         Some(format!("cameras stand still and only {percent:.3} % of their pixels ever change"))

@@ -17,14 +17,15 @@ pub enum Quality {
 /// Steps of a draft: at half the size of its pictures a kitchen has 31.2 dB after 2,500 steps where 7,000 have 31.0
 /// (docs/suite.md).
 const DRAFT_STEPS: usize = 2500;
-/// Most Gaussians of a draft: half the default's, for a quarter of the pixels.
-const DRAFT_CAP: usize = 15_000;
+/// Factor on the number of Gaussians of a draft.
+const DRAFT_COUNT: f64 = 0.5;
 /// Times that a draft's pictures are reduced, besides what the recipe does.
 const DRAFT_DOWNSCALE: usize = 2;
-/// Steps and most Gaussians of the best: basketball gains 1.5 dB by them over 8,000 and 30,000 (docs/benchmarks.md).
+/// Steps and the factor on the number of Gaussians of the best: basketball gains 1.5 dB by 20,000 and 60,000 over 8,000 and
+/// 30,000 (docs/benchmarks.md).
 const BEST_STEPS: usize = 20_000;
 /// See [`BEST_STEPS`].
-const BEST_CAP: usize = 60_000;
+const BEST_COUNT: f64 = 2.0;
 
 impl Quality {
     /// All, from the fastest on.
@@ -53,16 +54,17 @@ impl std::str::FromStr for Quality {
 }
 
 impl Recipe {
-    /// This recipe with a quality's steps, Gaussians and size of pictures. `Standard` sets the default's steps and
-    /// Gaussians. Schedules that followed from the length follow from the new one.
+    /// This recipe with a quality's steps, number of Gaussians and image size. The number follows from the capture, whatever
+    /// the recipe states. Schedules that followed from the length follow from the new one.
     #[must_use]
     pub fn of_quality(&self, quality: Quality) -> Self {
         let standard = Self::default();
         self.unresolved().with(|r| {
-            (r.run.iterations, r.densify.max_cap) = match quality {
-                Quality::Draft => (DRAFT_STEPS, DRAFT_CAP),
-                Quality::Standard => (standard.run.iterations, standard.densify.max_cap),
-                Quality::Best => (BEST_STEPS, BEST_CAP),
+            r.densify.max_cap = standard.densify.max_cap;
+            (r.run.iterations, r.densify.count_scale) = match quality {
+                Quality::Draft => (DRAFT_STEPS, DRAFT_COUNT),
+                Quality::Standard => (standard.run.iterations, standard.densify.count_scale),
+                Quality::Best => (BEST_STEPS, BEST_COUNT),
             };
             if quality == Quality::Draft {
                 r.capture.downscale *= DRAFT_DOWNSCALE;

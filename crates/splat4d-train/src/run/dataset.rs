@@ -2,7 +2,7 @@
 
 use crate::Result;
 use crate::capture::frames::{Depth, Flow, Frames, Picture, Tracked};
-use crate::capture::{Capture, DepthKind, ImageStore};
+use crate::capture::{Agreement, Capture, DepthKind, ImageStore};
 use splat4d::scene::{Camera, Planes, Time};
 use std::sync::Arc;
 
@@ -54,6 +54,10 @@ impl Frames for Dataset {
     fn has_depth(&self) -> bool {
         let metric = |&i: &usize| self.capture.frames[i].depth.as_ref().is_some_and(|d| d.kind == DepthKind::Metric);
         self.frames.iter().any(metric)
+    }
+
+    fn agreement(&self) -> Option<Agreement> {
+        self.capture.agreement()
     }
 
     fn tracked(&self, i: usize) -> Option<Tracked<'_>> {

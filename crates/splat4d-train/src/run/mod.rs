@@ -5,6 +5,7 @@ pub mod checkpoint;
 pub mod chunks;
 mod clock;
 pub mod corrected;
+mod count;
 pub mod dataset;
 mod flows;
 mod identity;

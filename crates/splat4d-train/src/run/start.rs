@@ -2,6 +2,7 @@
 
 use super::budget::{Budget, PROBES};
 use super::checkpoint;
+use super::count::settled;
 use super::flows;
 use super::identity::identity;
 use super::memory::memory_estimate;
@@ -118,18 +119,34 @@ fn timed(
     listen: &mut dyn FnMut(&Event),
 ) -> Result<Timed> {
     let TrainOptions { minutes, finish, predict, ref clock, .. } = *options;
+    let mut listen = listen;
     if minutes.is_none() && !predict {
-        return Ok(Timed { recipe, seconds: None, budget: None });
+        return Ok(Timed { recipe: opened.counted(recipe, &mut listen)?, seconds: None, budget: None });
     }
     if let Some(m) = minutes.filter(|m| !(*m > 0.0 && m.is_finite())) {
         return Err(Error::input(format!("--minutes cannot be {m}")).remedy("Give a positive number, for instance 3"));
     }
-    let timing = Timing::measure(opened, &recipe, clock, minutes.map_or(PREDICTION, |m| 60.0 * PROBES * m), listen)?;
+    // How many steps there will be follows from the minutes, and is not known yet.
+    let steps = minutes.map_or(recipe.run.iterations as f64, |_| f64::INFINITY);
+    let needed = if recipe.densify.max_cap == 0 { Some(opened.needed(&recipe, steps)?) } else { None };
+    let with = |count: usize| recipe.clone().with(|r| r.densify.max_cap = count);
+    let most = needed.as_ref().map_or(recipe.densify.max_cap, |n| n.0);
+    let seconds = minutes.map_or(PREDICTION, |m| 60.0 * PROBES * m);
+    let timing = Timing::measure(opened, &with(most), clock, seconds, &mut listen)?;
     let before = clock.seconds() + timing.scene;
-    let recipe = match minutes {
-        Some(m) => timing.fit(opened, &recipe, 60.0 * m - before, finish)?,
-        None => recipe,
+    let fit = |count: usize| match minutes {
+        Some(m) => timing.fit(opened, &with(count), 60.0 * m - before, finish),
+        None => Ok(with(count)),
     };
+    let count = match (&needed, minutes) {
+        (Some(_), Some(_)) => settled(most, recipe.densify.count_scale, |n| Ok(fit(n)?.run.iterations))?,
+        _ => most,
+    };
+    if let Some((_, why)) = needed {
+        let more = if count < most { ", and the steps that fit the minutes can train no more" } else { "" };
+        listen(&Event::Counted { gaussians: count, why: why + more });
+    }
+    let recipe = fit(count)?;
     let [steps, last] = timing.of(opened, &recipe)?;
     let budget = minutes.map(|minutes| Budget { minutes, before, finish, timing });
     Ok(Timed { recipe, seconds: Some(before + steps + finish * last), budget })
@@ -149,6 +166,8 @@ pub struct Forecast {
     pub why: String,
     /// Steps.
     pub iterations: usize,
+    /// Gaussians at most.
+    pub gaussians: usize,
     /// Bytes of memory at most, estimated.
     pub memory: u64,
 }
@@ -160,9 +179,10 @@ pub fn forecast(capture: Arc<Capture>, listen: &mut dyn FnMut(&Event)) -> Result
     let recipe = Recipe::default();
     let opened = OpenCapture::new(capture, &recipe)?;
     let (recipe, choice) = opened.chosen(recipe, listen)?;
-    let recipe = recipe.resolve();
+    let (gaussians, _) = opened.needed(&recipe, recipe.run.iterations as f64)?;
+    let recipe = recipe.with(|r| r.densify.max_cap = gaussians).resolve();
     let memory = memory_estimate(&opened.capture, &recipe);
-    Ok(Forecast { motion: choice.motion, why: choice.why, iterations: recipe.run.iterations, memory })
+    Ok(Forecast { motion: choice.motion, why: choice.why, iterations: recipe.run.iterations, gaussians, memory })
 }
 
 /// As [`resume`]; of the options only `device`, `own_loss`, `snapshots` and `clock` count, the rest was settled at the start. A run with

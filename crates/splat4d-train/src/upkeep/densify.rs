@@ -20,8 +20,10 @@ settings! {
     pub struct DensifySettings {
         /// Densification: adc, mcmc or none.
         strategy: Strategy = Strategy::Adc;
-        /// Never more Gaussians than this.
-        max_cap: usize = 30_000 => at_least(1);
+        /// Most Gaussians; 0: follows from the pixels of all distinct views, the steps and the memory, at least 30,000.
+        max_cap: usize = 0;
+        /// Factor on the number of Gaussians that follows from the capture; without effect where `max_cap` is set.
+        count_scale: f64 = 1.0 => positive();
         /// Iterations between densifications; 0: iterations/60, at least 50.
         interval: usize = 0
             => any().unit("iterations").when(Any(&[On("densify.strategy"), On("relocate.interval"), On("nodes.adapt_interval")]));
@@ -42,9 +44,16 @@ const MCMC_DEAD_OPACITY: f64 = 0.005;
 /// capture.
 const ADC_DEAD_OPACITY: f64 = 0.02;
 
+/// Gaussians that small captures are tuned for (docs/suite.md); what a capture's own number never falls below, and what
+/// holds where no capture was looked at.
+pub(crate) const LEAST: usize = 30_000;
+
 impl DensifySettings {
-    /// Fills what follows from the strategy.
+    /// Fills what follows from the strategy, and the number of Gaussians if no capture has set it.
     pub(crate) fn resolve(&mut self) {
+        if self.max_cap == 0 {
+            self.max_cap = ((self.count_scale * LEAST as f64) as usize).max(1);
+        }
         if self.min_opacity == 0.0 {
             self.min_opacity = if self.strategy == Strategy::Mcmc { MCMC_DEAD_OPACITY } else { ADC_DEAD_OPACITY };
         }

@@ -23,6 +23,7 @@ pub(crate) mod tests;
 pub mod worth;
 
 pub(crate) use adc::{Adc, AdcSettings};
+pub(crate) use densify::LEAST;
 pub use densify::{DensifySettings, Strategy};
 pub(crate) use floaters::{FloaterSettings, Floaters};
 pub(crate) use guided::{Guided, GuidedSettings};

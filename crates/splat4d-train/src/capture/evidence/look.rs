@@ -124,6 +124,11 @@ impl Look {
         self.lens.undistort([(u * f - k.cx) / k.fx, (v * f - k.cy) / k.fy])
     }
 
+    /// Height of the small image, pixels.
+    pub(super) fn height(&self) -> f64 {
+        self.color.height as f64
+    }
+
     /// Focal length of the small image, pixels.
     pub(super) fn focal(&self) -> f64 {
         self.camera.intrinsics.fx / self.factor as f64

@@ -5,6 +5,7 @@
 //! are found in. A finding needs a convention that fits clearly better; nothing else is an alarm.
 
 mod look;
+mod motion;
 mod pairs;
 mod points;
 mod silhouettes;
@@ -14,6 +15,7 @@ mod tests;
 use super::preflight::{Finding, Severity};
 use super::{Aspect, Capture, Frame, Poses};
 use look::Look;
+pub use motion::Agreement;
 use splat4d::math::Se3;
 
 /// Images that are looked at, at most; and at least, where they are large.

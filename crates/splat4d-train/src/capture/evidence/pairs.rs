@@ -62,7 +62,8 @@ pub(super) fn matches(looks: &[Look]) -> Vec<Match> {
     pairs.par_iter().flat_map_iter(|&[a, b]| between([a, b], &looks[a].marks, &looks[b].marks)).collect()
 }
 
-fn between(looks: [usize; 2], from: &[Mark], to: &[Mark]) -> Vec<Match> {
+/// Mutual best matches of two images.
+pub(super) fn between(looks: [usize; 2], from: &[Mark], to: &[Mark]) -> Vec<Match> {
     let mut back = vec![(u32::MAX, 0); to.len()];
     let mut forth = Vec::with_capacity(from.len());
     for (i, a) in from.iter().enumerate() {
@@ -114,28 +115,47 @@ pub(super) fn measure(matches: &[Match], looks: &[Look], poses: &[Option<Vec<Se3
         .collect()
 }
 
+/// The distance of a match from the place or line where a static scene has it, pixels of the small image.
+pub(super) fn distance(m: &Match, looks: &[Look], poses: &[Se3]) -> f64 {
+    let [a, b] = m.looks;
+    let motion = poses[b].after(&poses[a].inverse());
+    let centers = [a, b].map(|k| norm(poses[k].inverse().translation));
+    let baseline = norm(motion.translation);
+    let in_one_place = baseline <= ONE_PLACE * (centers[0] + centers[1] + baseline);
+    0.5 * (looks[a].focal() + looks[b].focal()) * offset(m, &motion, in_one_place)
+}
+
+/// The Sampson distance of a match from its epipolar line, or of the turned ray where the cameras stand in one place; in
+/// units of the focal length.
+fn offset(m: &Match, motion: &Se3, in_one_place: bool) -> f64 {
+    let [p, q] = m.rays.map(|[x, y]| [x, y, 1.0]);
+    let turned = mat_vec(&motion.rotation, p);
+    if in_one_place {
+        let at = [turned[0] / turned[2], turned[1] / turned[2]];
+        return if turned[2] > 0.0 { (at[0] - q[0]).hypot(at[1] - q[1]) } else { f64::INFINITY };
+    }
+    let t = normalize(motion.translation);
+    // q · (t × R p), to first order of the distance from the epipolar lines in both images.
+    let line = cross(t, turned);
+    let back = mat_vec(&transpose(&motion.rotation), cross(q, t));
+    let slope = line[0].hypot(line[1]).hypot(back[0].hypot(back[1]));
+    dot(q, line).abs() / slope.max(f64::MIN_POSITIVE)
+}
+
 /// Whether two rays meet in front of both cameras.
 fn fits(m: &Match, looks: &[Look], poses: &[Se3], least: f64) -> bool {
     let [a, b] = m.looks;
     let motion = poses[b].after(&poses[a].inverse());
     let tolerance = NEAR * 2.0 / (looks[a].focal() + looks[b].focal());
+    let in_one_place = norm(motion.translation) <= least;
+    let near = offset(m, &motion, in_one_place) <= tolerance;
+    if !near || in_one_place {
+        return near;
+    }
     let [p, q] = m.rays.map(|[x, y]| [x, y, 1.0]);
-    let turned = mat_vec(&motion.rotation, p);
-    let baseline = norm(motion.translation);
-    if baseline <= least {
-        // One place: the ray is only turned.
-        let at = [turned[0] / turned[2], turned[1] / turned[2]];
-        return turned[2] > 0.0 && (at[0] - q[0]).hypot(at[1] - q[1]) <= tolerance;
-    }
-    let t = motion.translation.map(|v| v / baseline);
-    // q · (t × R p), to first order of the distance from the epipolar lines in both images (Sampson).
-    let line = cross(t, turned);
-    let back = mat_vec(&transpose(&motion.rotation), cross(q, t));
-    let slope = line[0].hypot(line[1]).hypot(back[0].hypot(back[1]));
-    if dot(q, line).abs() > tolerance * slope.max(f64::MIN_POSITIVE) {
-        return false;
-    }
-    let (from, to) = (normalize(turned), normalize(q));
+    let t = normalize(motion.translation);
+    let [p, q] = m.rays.map(|[x, y]| [x, y, 1.0]);
+    let (from, to) = (normalize(mat_vec(&motion.rotation, p)), normalize(q));
     let normal = cross(from, to);
     if norm(normal) < PARALLEL {
         // Far away, or along the baseline: both look the same way at least.

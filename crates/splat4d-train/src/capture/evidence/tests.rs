@@ -174,6 +174,53 @@ fn named(capture: &Capture, conventions: &[Convention]) -> (usize, usize) {
     (right, all)
 }
 
+/// A film of the scene by one camera that moves; `speed`: the ball turns by so many radians from frame to frame.
+fn film(speed: f64) -> (Sample, Capture) {
+    const FRAMES: usize = 24;
+    let sample = Sample::new(&["transforms.json"]);
+    let pose = |i: usize| {
+        let angle = (2.0 * i as f64).to_radians();
+        Se3::look_at([4.0 * angle.cos(), 4.0 * angle.sin(), 1.5], [0.1, 0.0, -0.2], [0.0, 0.0, 1.0])
+    };
+    let mut frames = Vec::new();
+    for i in 0..FRAMES {
+        let back = pose(i).inverse();
+        let (sin, cos) = (speed * i as f64).sin_cos();
+        let color = |x: u32, y: u32| {
+            let at = [(f64::from(x) + 0.5 - 80.0) / FOCAL, (f64::from(y) + 0.5 - 60.0) / FOCAL, 1.0];
+            let Some((p, ball)) = hit(back.translation, sub(back.apply(at), back.translation)) else {
+                return Rgb([90, 120, 200]);
+            };
+            let turned = [cos * p[0] - sin * p[2], p[1], sin * p[0] + cos * p[2]];
+            Rgb(texture(if ball { turned } else { p }).map(|v| (v * 255.0).round() as u8))
+        };
+        let name = format!("images/f{i:02}.png");
+        sample.save(&name, ImageBuffer::from_fn(WIDTH, HEIGHT, color));
+        let row = |k: usize| {
+            let r = back.rotation[k];
+            json!([r[0], -r[1], -r[2], back.translation[k]])
+        };
+        let time = i as f64 / 10.0;
+        let matrix = [row(0), row(1), row(2), json!([0, 0, 0, 1])];
+        frames.push(json!({"file_path": name, "transform_matrix": matrix, "time": time}));
+    }
+    let top = json!({"w": WIDTH, "h": HEIGHT, "fl_x": FOCAL, "fl_y": FOCAL, "cx": 80, "cy": 60, "frames": frames});
+    sample.write("transforms.json", top.to_string().as_bytes());
+    let capture = Capture::open(sample.root(), &CaptureOptions::default()).unwrap();
+    (sample, capture)
+}
+
+#[test]
+fn what_moves_before_a_moving_camera_is_seen() {
+    let (_folder, still) = film(0.0);
+    let found = still.agreement().expect("the scene is full of features");
+    assert!(found.is_static() && found.share > 0.99, "{found:?}");
+    let (_folder, moving) = film(0.06);
+    let found = moving.agreement().expect("the floor is full of features");
+    assert!(!found.is_static() && found.share < 0.95, "{found:?}");
+    assert_eq!(photos(true).agreement(), None, "one moment");
+}
+
 const ALL: [Convention; 3] = [Convention::NERF, Convention::COLMAP, Convention::OPENCV];
 
 #[test]

@@ -2,7 +2,7 @@
 //! fewer Gaussians, and the steps of a chunk.
 
 use super::shared::STEPS;
-use super::{ChunkPlan, beginning, check};
+use super::{ChunkPlan, beginning, check, chosen};
 use crate::capture::Capture;
 use crate::event::Event;
 use crate::recipe::Recipe;
@@ -58,10 +58,7 @@ impl Outlook {
         let Some(plan) = ChunkPlan::even(capture, recipe)? else { return Ok(None) };
         let mut listen = listen;
         let mut recipe = recipe.clone();
-        if recipe.run.motion.is_auto() {
-            let first = Arc::new(beginning(capture, &plan));
-            recipe = OpenCapture::new(first, &recipe)?.choose(recipe, &mut listen)?;
-        }
+        recipe = chosen(&Arc::new(beginning(capture, &plan)), recipe, &mut listen)?;
         recipe.check()?;
         check(&recipe)?;
         let (mut recipe, plan, memory) = within_memory(capture, recipe, plan)?;

@@ -114,10 +114,7 @@ impl Chunked {
         let mut listen = listen;
         // What is looked at before the first step is the take's beginning, however much of it the caller has listed.
         let first = Arc::new(beginning(capture, &even));
-        let recipe = match recipe.run.motion.is_auto() {
-            true => OpenCapture::new(first.clone(), recipe)?.choose(recipe.clone(), &mut listen)?,
-            false => recipe.clone(),
-        };
+        let recipe = chosen(&first, recipe.clone(), &mut listen)?;
         recipe.check()?;
         check(&recipe)?;
         let recipe = recipe.resolve();
@@ -386,6 +383,16 @@ pub fn look_ahead(recipe: &Recipe) -> Vec<Range<usize>> {
     let first = recipe.capture.first_frame;
     let look = first..first.saturating_add(recipe.chunks.frames.max(WHOLE)).saturating_add(1);
     vec![look]
+}
+
+/// The recipe with a motion model and a number of Gaussians that suit the beginning of a capture, where it states none.
+fn chosen(first: &Arc<Capture>, recipe: Recipe, listen: &mut dyn FnMut(&Event)) -> Result<Recipe> {
+    if !recipe.run.motion.is_auto() && recipe.densify.max_cap > 0 {
+        return Ok(recipe);
+    }
+    let (opened, mut listen) = (OpenCapture::new(first.clone(), &recipe)?, listen);
+    let recipe = if recipe.run.motion.is_auto() { opened.choose(recipe, &mut listen)? } else { recipe };
+    opened.counted(recipe, &mut listen)
 }
 
 /// Errors: what a recipe asks for that chunks cannot have together.

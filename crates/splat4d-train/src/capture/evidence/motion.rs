@@ -1,0 +1,94 @@
+//! Whether anything moves in front of moving cameras: matches of frames that are apart in time either agree with one static
+//! scene, or lie beside their epipolar lines.
+//!
+//! A wrong match lies anywhere, a feature that moved lies near its line: what lies near it in excess of what chance explains
+//! has moved.
+
+use super::super::Capture;
+use super::look;
+use super::pairs::{self, Match};
+use rayon::prelude::*;
+use splat4d::math::Se3;
+
+/// Frames that are compared with later ones, evenly chosen.
+const STARTS: usize = 10;
+/// Parts of the film between a frame and the two that it is compared with: the first shares most of its image, the second
+/// gives motion time.
+const GAPS: [usize; 2] = [40, 12];
+/// Distances from the epipolar line within which a match agrees, beyond which it does not, and up to which it is a feature
+/// that moved and not a wrong match; pixels of the small image.
+const BANDS: [f64; 3] = [1.5, 3.0, 40.0];
+/// Fewest matches that agree of a pair that counts, and of all pairs together.
+const FEWEST: [usize; 2] = [15, 200];
+/// Share of the matches beside their lines up to which a scene is static: swaying leaves, reflections and inexact poses
+/// leave about half of it.
+const STATIC: f64 = 0.02;
+
+/// How far matches of frames at different times agree with one static scene.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Agreement {
+    /// Matches that count: those that agree, and those of features that moved.
+    pub matches: usize,
+    /// Share of them that agrees, in [0, 1].
+    pub share: f64,
+}
+
+impl Agreement {
+    /// Whether nothing moves.
+    pub fn is_static(&self) -> bool {
+        self.share >= 1.0 - STATIC
+    }
+}
+
+impl Capture {
+    /// Compares training frames of moving cameras over time. `None`: too few features match, or no camera moves.
+    pub fn agreement(&self) -> Option<Agreement> {
+        let mut frames: Vec<usize> =
+            self.train.iter().copied().filter(|&i| !self.cameras[self.frames[i].camera].fixed).collect();
+        frames.sort_by(|&a, &b| self.frames[a].time.0.total_cmp(&self.frames[b].time.0));
+        let count = frames.len();
+        let mut pairs = Vec::new();
+        for k in 0..STARTS.min(count) {
+            let from = k * count / STARTS.min(count);
+            for gap in GAPS {
+                let to = from + count.div_ceil(gap);
+                if to < count && self.frames[frames[from]].time != self.frames[frames[to]].time {
+                    pairs.push([from, to]);
+                }
+            }
+        }
+        pairs.dedup();
+        let mut wanted: Vec<usize> = pairs.iter().flatten().map(|&k| frames[k]).collect();
+        wanted.sort_unstable();
+        wanted.dedup();
+        let mut looks = look::take(self, &wanted);
+        look::describe(&mut looks);
+        let poses: Vec<Se3> = looks.iter().map(|l| self.frames[l.frame].source.cam_from_world).collect();
+        let place = |k: usize| looks.iter().position(|l| l.frame == frames[k]);
+        let pairs: Vec<[usize; 2]> = pairs.iter().filter_map(|&[a, b]| Some([place(a)?, place(b)?])).collect();
+        let counts: Vec<[f64; 2]> = pairs
+            .par_iter()
+            .map(|&[a, b]| {
+                let matches = pairs::between([a, b], &looks[a].marks, &looks[b].marks);
+                counts(&matches, looks[a].height(), |m| pairs::distance(m, &looks, &poses))
+            })
+            .collect();
+        let [agree, moved] = counts.iter().fold([0.0; 2], |s, c| [s[0] + c[0], s[1] + c[1]]);
+        let all = agree + moved.max(0.0);
+        (agree >= FEWEST[1] as f64).then(|| Agreement { matches: all as usize, share: agree / all })
+    }
+}
+
+/// Matches of one pair that agree with a static scene, and those that moved in excess of chance.
+fn counts(matches: &[Match], side: f64, distance: impl Fn(&Match) -> f64) -> [f64; 2] {
+    let distances: Vec<f64> = matches.iter().map(distance).collect();
+    let within = |low: f64, high: f64| distances.iter().filter(|d| (low..high).contains(*d)).count() as f64;
+    let [near, beside, far] = BANDS;
+    let agree = within(0.0, near);
+    if agree < FEWEST[0] as f64 {
+        return [0.0; 2];
+    }
+    // Wrong matches are spread over the image: as many a pixel as beyond the reach of motion.
+    let chance = within(far, f64::INFINITY) * (far - beside) / (side - far).max(far);
+    [agree, within(beside, far) - chance]
+}
