@@ -6,11 +6,11 @@
 
 use super::memory::{available_memory, memory_estimate};
 use super::open::OpenCapture;
-use crate::capture::frames::Picture;
+use crate::Result;
+use crate::capture::frames::{Frames, Picture};
 use crate::event::Event;
 use crate::recipe::Recipe;
 use crate::upkeep::LEAST;
-use crate::Result;
 use std::collections::BTreeSet;
 
 /// Pixels of distinct views for one Gaussian. Source: published recipes give a real room 0.2 to 1.2 million Gaussians for
@@ -76,7 +76,11 @@ impl OpenCapture {
     fn distinct_views(&self) -> Vec<usize> {
         let c = &self.capture;
         let mut fixed = BTreeSet::new();
-        c.train.iter().copied().filter(|&i| !c.cameras[c.frames[i].camera].fixed || fixed.insert(c.frames[i].camera)).collect()
+        c.train
+            .iter()
+            .copied()
+            .filter(|&i| !c.cameras[c.frames[i].camera].fixed || fixed.insert(c.frames[i].camera))
+            .collect()
     }
 
     fn pixels(&self, frame: usize) -> f64 {

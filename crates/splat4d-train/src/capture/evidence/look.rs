@@ -9,10 +9,19 @@ use rayon::prelude::*;
 use splat4d::math::Se3;
 use splat4d::scene::{Camera, Planes};
 
-/// Longest side of what is looked at, pixels.
-const SIDE: usize = 320;
-/// Features of an image.
-const FEATURES: usize = 350;
+/// How closely images are looked at.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Detail {
+    /// Longest side of the small image, pixels.
+    pub(super) side: usize,
+    /// Features of an image.
+    pub(super) features: usize,
+}
+
+/// What poses are checked with.
+pub(super) const COARSE: Detail = Detail { side: 320, features: 350 };
+/// What motion is looked for with: a mover is a small part of an image.
+pub(super) const FINE: Detail = Detail { side: 640, features: 800 };
 /// Least contrast of a feature, as structure from motion takes it.
 const CONTRAST: f64 = 0.004;
 /// Foreground below this share of an image, or above the other, says nothing of a place.
@@ -40,19 +49,19 @@ pub(super) struct Look {
 }
 
 /// Reads the images of these frames; those that cannot be read are left out.
-pub(super) fn take(capture: &Capture, frames: &[usize]) -> Vec<Look> {
-    frames.par_iter().filter_map(|&i| Look::read(i, &capture.frames[i], capture.background)).collect()
+pub(super) fn take(capture: &Capture, frames: &[usize], detail: Detail) -> Vec<Look> {
+    frames.par_iter().filter_map(|&i| Look::read(i, &capture.frames[i], capture.background, detail.side)).collect()
 }
 
 /// The image of a frame with or without its EXIF orientation.
 pub(super) fn one(capture: &Capture, frame: usize, upright: bool) -> Option<Look> {
-    Look::read(frame, &Frame { upright, ..capture.frames[frame].clone() }, capture.background)
+    Look::read(frame, &Frame { upright, ..capture.frames[frame].clone() }, capture.background, COARSE.side)
 }
 
 /// Finds the features of all.
-pub(super) fn describe(looks: &mut [Look]) {
+pub(super) fn describe(looks: &mut [Look], detail: Detail) {
     looks.par_iter_mut().for_each(|look| {
-        let limits = Limits { contrast: CONTRAST, most: FEATURES };
+        let limits = Limits { contrast: CONTRAST, most: detail.features };
         let found = find(&grey(&look.color), limits, &|_, _| true);
         let mark = |feature: Feature| Some(Mark { ray: look.ray(feature.pixel)?, feature });
         look.marks = found.into_iter().filter_map(mark).collect();
@@ -73,9 +82,9 @@ fn reduced(raster: &Raster, channel: usize, k: usize) -> Vec<f32> {
 }
 
 impl Look {
-    fn read(number: usize, frame: &Frame, background: Option<[f32; 3]>) -> Option<Self> {
+    fn read(number: usize, frame: &Frame, background: Option<[f32; 3]>, side: usize) -> Option<Self> {
         let raster = picture::decode_as(&frame.image, Some(&frame.source), frame.upright).ok()?;
-        let factor = raster.width.max(raster.height).div_ceil(SIDE).max(1);
+        let factor = raster.width.max(raster.height).div_ceil(side).max(1);
         let (width, height) = (raster.width / factor, raster.height / factor);
         if width == 0 || height == 0 {
             return None;
@@ -122,11 +131,6 @@ impl Look {
     fn ray(&self, [u, v]: [f64; 2]) -> Option<[f64; 2]> {
         let (k, f) = (&self.camera.intrinsics, self.factor as f64);
         self.lens.undistort([(u * f - k.cx) / k.fx, (v * f - k.cy) / k.fy])
-    }
-
-    /// Height of the small image, pixels.
-    pub(super) fn height(&self) -> f64 {
-        self.color.height as f64
     }
 
     /// Focal length of the small image, pixels.

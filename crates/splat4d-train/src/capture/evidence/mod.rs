@@ -45,7 +45,7 @@ pub struct PoseCheck {
 impl Capture {
     /// Compares poses with points and images. Opens a few images; images that cannot be read are passed over.
     pub fn check_poses(&self) -> PoseCheck {
-        self.judge(&mut look::take(self, &self.looked_at()), &mut None)
+        self.judge(&mut look::take(self, &self.looked_at(), look::COARSE), &mut None)
     }
 
     /// The verdict by these images; features are found and matched if points do not say enough.
@@ -71,7 +71,7 @@ impl Capture {
         // Points whose colours agree say enough.
         if !measures[0].points.convinces() {
             let matches = matches.get_or_insert_with(|| {
-                look::describe(looks);
+                look::describe(looks, look::COARSE);
                 pairs::matches(looks)
             });
             pairs::measure(matches, looks, &poses).into_iter().zip(&mut measures).for_each(|(p, m)| m.pairs = p);
@@ -176,7 +176,7 @@ pub(super) fn upright(capture: &Capture, unsure: &[usize]) -> Option<bool> {
         let poses: Vec<Se3> = looks.iter().map(pose).collect();
         let count = looks.iter().filter(|l| some.contains(&l.frame)).count();
         let gain = points::gain_of(capture, &looks[..count], &poses[..count]);
-        look::describe(&mut looks);
+        look::describe(&mut looks, look::COARSE);
         let matches = pairs::matches(&looks);
         (gain, pairs::measure(&matches, &looks, &[Some(poses)])[0])
     });

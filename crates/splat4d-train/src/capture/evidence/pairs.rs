@@ -7,6 +7,8 @@ use splat4d::math::se3::{cross, dot, mat_vec, norm, normalize, sub, transpose};
 
 /// The second best match is this many times farther away (Lowe 2004).
 const RATIO: f64 = 0.8;
+/// The same where a wrong match would be taken for motion: half as many are wrong.
+pub(super) const STRICT: f64 = 0.7;
 /// Distance from an epipolar line, pixels of the small image.
 const NEAR: f64 = 1.5;
 /// Angle between rays below which nothing says which side of the cameras they meet on, radians.
@@ -59,11 +61,11 @@ pub(super) fn prefers(m: &Measure) -> bool {
 /// Mutual best matches of all pairs of looks.
 pub(super) fn matches(looks: &[Look]) -> Vec<Match> {
     let pairs: Vec<[usize; 2]> = (0..looks.len()).flat_map(|a| (a + 1..looks.len()).map(move |b| [a, b])).collect();
-    pairs.par_iter().flat_map_iter(|&[a, b]| between([a, b], &looks[a].marks, &looks[b].marks)).collect()
+    pairs.par_iter().flat_map_iter(|&[a, b]| between([a, b], &looks[a].marks, &looks[b].marks, RATIO)).collect()
 }
 
-/// Mutual best matches of two images.
-pub(super) fn between(looks: [usize; 2], from: &[Mark], to: &[Mark]) -> Vec<Match> {
+/// Mutual best matches of two images whose second best is 1/`ratio` times farther away.
+pub(super) fn between(looks: [usize; 2], from: &[Mark], to: &[Mark], ratio: f64) -> Vec<Match> {
     let mut back = vec![(u32::MAX, 0); to.len()];
     let mut forth = Vec::with_capacity(from.len());
     for (i, a) in from.iter().enumerate() {
@@ -84,7 +86,7 @@ pub(super) fn between(looks: [usize; 2], from: &[Mark], to: &[Mark]) -> Vec<Matc
         forth.push((first, second));
     }
     let good = |(i, ((d, j), second)): (usize, ((u32, usize), u32))| {
-        let clear = f64::from(d).sqrt() < RATIO * f64::from(second).sqrt();
+        let clear = f64::from(d).sqrt() < ratio * f64::from(second).sqrt();
         (d < u32::MAX && clear && back[j].1 == i).then(|| Match { looks, rays: [from[i].ray, to[j].ray] })
     };
     forth.into_iter().enumerate().filter_map(good).collect()
@@ -154,7 +156,6 @@ fn fits(m: &Match, looks: &[Look], poses: &[Se3], least: f64) -> bool {
     }
     let [p, q] = m.rays.map(|[x, y]| [x, y, 1.0]);
     let t = normalize(motion.translation);
-    let [p, q] = m.rays.map(|[x, y]| [x, y, 1.0]);
     let (from, to) = (normalize(mat_vec(&motion.rotation, p)), normalize(q));
     let normal = cross(from, to);
     if norm(normal) < PARALLEL {

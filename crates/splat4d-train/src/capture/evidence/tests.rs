@@ -141,7 +141,7 @@ fn misread(capture: &Capture, stated: Convention, poses: Poses) -> Capture {
 
 /// Conventions that are named right, of how many, and how many are named that are right.
 fn named(capture: &Capture, conventions: &[Convention]) -> (usize, usize) {
-    let mut looks = look::take(capture, &capture.looked_at());
+    let mut looks = look::take(capture, &capture.looked_at(), look::COARSE);
     let mut matches = None;
     let (mut right, mut all) = (0, 0);
     for &stated in conventions {
@@ -242,7 +242,7 @@ fn conventions_are_named_by_foregrounds() {
     let (_sample, mut capture) = capture(false, true);
     // What is seen of the ball alone by cameras far apart has no features in common.
     capture.train.retain(|i| i % 2 == 1);
-    let mut looks = look::take(&capture, &capture.looked_at());
+    let mut looks = look::take(&capture, &capture.looked_at(), look::COARSE);
     let flipped: Poses = "opencv".parse().unwrap();
     let wrong = misread(&capture, Convention::NERF, flipped);
     assert_eq!(wrong.judge(&mut looks, &mut Some(Vec::new())).written_as, Some(flipped));
