@@ -3,6 +3,25 @@
 //! Each verb is a file in `verbs`. Only the shells print, parse arguments or exit: 0 done, 1 failed, 2 bad input. A library
 //! for the sake of the workspace's studies and of the Python package, which share the console, run folders and measurements:
 //! no published interface.
+//!
+//! # Code map
+//!
+//! A module imports only modules above it; `xtask/tests/tidy.rs` checks the order.
+//!
+//! | module | content |
+//! |---|---|
+//! | `console.rs`, `run_folder.rs`, `camera_file.rs`, `video.rs` | output, run folders, camera files, films |
+//! | `paths/` | orbits, data-set cameras and key-framed camera paths |
+//! | `source.rs`, `source/` | scenes of other programs that are folders or archives |
+//! | `raw.rs`, `asked.rs` | channel values as files; files of queried points and their results |
+//! | `measure.rs`, `measure/` | how scenes and files play, for `compress`, the studies and `bench --playback` |
+//! | `baking.rs`, `baking/` | the playback file at the end of a run |
+//! | `report/`, `report/compress/` | `report.html`, drawn without a library |
+//! | `film.rs` | the playback file of a long capture, which grows during training |
+//! | `labelling.rs`, `chunked.rs`, `compressing.rs`, `predicting.rs`, `predicting/`, `editing.rs`, `editor.rs` | the work of `label`, `train --chunk` and `join`, `compress`, `predict`, `edit`, `view --edit` |
+//! | `verbs/`, `verbs/info/` | one file per command |
+//! | `verbs/bench/` | pinned scenes, stages, training steps, growth, GPU stages, other programs (`studies/beside/with_gsplat.py`); each time with its lower bound |
+//! | `bin/` | `s4d`, the command's second name: a launcher |
 
 #![allow(missing_docs)] // nobody outside the workspace reads it
 

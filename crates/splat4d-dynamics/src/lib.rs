@@ -7,6 +7,24 @@
 //! over whole rollouts; `score` tells how much each is worth.
 //!
 //! Nothing here sees a time after the last observed one, but for the scores.
+//!
+//! # Code map
+//!
+//! A module imports only modules above it; `xtask/tests/tidy.rs` checks the order.
+//!
+//! | module | content |
+//! |---|---|
+//! | `actions.rs`, `paths.rs` | actions, a row of named numbers per frame; poses of nodes at even ticks |
+//! | `worlds.rs` | worlds with known physics, for tests and `xtask capture --world` |
+//! | `smooth.rs`, `optimise.rs` | smoothing splines by generalised cross-validation; Adam for the networks |
+//! | `ballistic.rs`, `koopman.rs` | baselines that learn nothing; optimised dynamic mode decomposition, stable by construction |
+//! | `learnt.rs` | the contract of a network that predicts accelerations, its training over whole rollouts, its forecasts |
+//! | `causal.rs`, `graph.rs`, `graph/` | the two networks: equivariant state space, equivariant messages along edges |
+//! | `models.rs`, `models/` | the models, by name |
+//! | `score.rs` | node errors, skill, win rates, divergence, ensembles and their calibration |
+//! | `nodes.rs`, `nodes/` | nodes with identity on dynamic regions, followed through any motion model |
+//! | `future.rs` | the predicted scene: layers that begin where the observed ones end |
+//! | `assimilate.rs`, `assimilate/` | correction by each new frame |
 
 pub mod actions;
 pub mod assimilate;

@@ -1,5 +1,17 @@
 //! The extension module of the Python package `splat4d` (docs/python.md): scenes as NumPy arrays, captures, training, and the
 //! command itself. Python's lock is given up while anything long works; errors become `splat4d.Error` with their own text.
+//!
+//! # Code map
+//!
+//! A module imports only modules above it; `xtask/tests/tidy.rs` checks the order.
+//!
+//! | module | content |
+//! |---|---|
+//! | `errors.rs`, `arrays.rs`, `plain.rs`, `settings.rs` | errors, NumPy in and out, plain values, settings by name |
+//! | `camera.rs`, `gaussians.rs`, `scene.rs` | cameras, Gaussians at a time, scenes |
+//! | `from_arrays.rs` | images in memory become a capture on disk |
+//! | `metrics.rs`, `loss.rs` | metrics; losses written in Python |
+//! | `run.rs`, `capture.rs`, `train.rs` | runs, captures, training |
 
 mod arrays;
 mod camera;

@@ -25,6 +25,21 @@
 //! # Ok(())
 //! # }
 //! ```
+//!
+//! # Code map
+//!
+//! A module imports only modules above it; `xtask/tests/tidy.rs` checks the order.
+//!
+//! | module | content |
+//! |---|---|
+//! | `write_timeout.rs`, `body.rs`, `range.rs`, `reply.rs` | timeouts, request bodies, byte ranges, responses |
+//! | `guard.rs` | who may send requests |
+//! | `scene.rs` | the one thing served: a file by range, or bytes that a live run replaces |
+//! | `edit.rs` | the one guarded request that accepts input: edits, with a token |
+//! | `assets.rs`, `page.rs` | the player's files; player and scene as one static page |
+//! | `events.rs` | events of a live run: one bounded log |
+//! | `answer.rs`, `server.rs` | routes and headers; start, stop, accept: one thread, bounded memory |
+//! | `../player/` | the browser player: plain ES modules. A frame is rendered at the time of its order and active set: `schedule.js` requests them from `sort.worker.js` ahead of the clock by the measured latency and drops those of a clock that jumped; WebGPU culls and sorts within the frame. `stream.js` states which times are complete; the others hold the last frame |
 
 mod answer;
 mod assets;

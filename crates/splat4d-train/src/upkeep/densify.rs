@@ -16,11 +16,11 @@ choices! {
 }
 
 settings! {
-    /// Where Gaussians are added and removed.
+    /// Density control: how Gaussians are added and removed.
     pub struct DensifySettings {
         /// Densification: adc, mcmc or none.
         strategy: Strategy = Strategy::Adc;
-        /// Never more Gaussians than this.
+        /// Largest number of Gaussians.
         max_cap: usize = 30_000 => at_least(1);
         /// Iterations between densifications; 0: iterations/60, at least 50.
         interval: usize = 0
@@ -31,7 +31,7 @@ settings! {
         /// Last iteration that densifies; 0: 3/4 of iterations.
         until: usize = 0
             => any().unit("iterations").when(Any(&[On("densify.strategy"), On("relocate.interval"), On("nodes.adapt_interval")]));
-        /// Opacity below which a Gaussian is dead; 0: 0.02 for adc, 0.005 for mcmc.
+        /// Opacity below which a Gaussian is removed; 0: 0.02 for adc, 0.005 for mcmc.
         min_opacity: f64 = 0.0 => share().when(On("densify.strategy"));
     }
 }

@@ -58,15 +58,15 @@ const SCENE: &str = "scene.safetensors";
 pub(super) const MADE_BY: &str = "train --chunk";
 
 settings! {
-    /// Long takes in chunks.
+    /// Long captures in chunks.
     #[derive(Copy)]
     pub struct ChunkSettings {
-        /// Frames of a chunk: a longer take is learnt chunk by chunk. 0: 60 where fixed cameras film more than 300 frames and
-        /// nothing is asked for that chunks cannot have, else the take is learnt at once. Iterations are those of a chunk.
+        /// Frames per chunk; longer captures train chunk by chunk. 0: 60 if fixed cameras have more than 300 frames and
+        /// the recipe supports chunks, otherwise no chunks. Iterations are those of a chunk.
         frames: usize = 0 => any().unit("frames");
-        /// Frames that neighbouring chunks share, in which they fade into each other; an even number.
+        /// Frames that neighbouring chunks share and in which they cross-fade; an even number.
         overlap: usize = 16 => any().unit("frames");
-        /// Weight of the difference (L1) between an odd chunk's pictures and its neighbours' where they overlap.
+        /// Weight of the difference (L1) between an odd chunk's renders and its neighbours' in the overlap.
         consistency: f64 = 2.0;
     }
 }
